@@ -56,10 +56,10 @@ class Mesh(BaseMesh, ShownAsHtml):
     """
 
     @property
-    def bounds(self) -> NDArray[np.float64] | None:
-        """Lowest and highest corner of the box round the vertices, shape (2, 3), LPS mm; None without vertices."""
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner of the box round the vertices, shape (2, 3), LPS mm; NaN without vertices."""
         if not self.vertex_count:
-            return None
+            return np.full((2, 3), np.nan)
         return np.array(find_bounds(self.vertices), dtype=np.float64)
 
     @property
@@ -125,6 +125,34 @@ class Mesh(BaseMesh, ShownAsHtml):
         own = copy.copy(self)
         own.report = dict(self.report)
         return select_components(own, count)
+
+    def merge(self, *others: Mesh) -> Mesh:
+        """Return this mesh and others as one, each as it is: no vertex is joined and nothing is cut.
+
+        What only some have is NaN elsewhere (`values`) or left out (normals, facts of the scan).  Unions of solids are
+        those of trimesh: ``clrecon.Mesh.from_trimesh(trimesh.boolean.union([a.to_trimesh(), b.to_trimesh()]))``.
+        A `UsageError` where one is no Mesh.
+        """
+        parts = (self, *others)
+        if (wrong := next((each for each in others if not isinstance(each, Mesh)), None)) is not None:
+            raise UsageError(f"merge takes meshes, not {type(wrong).__name__}: of a list mesh.merge(*others)")
+        starts = np.cumsum([0, *(part.vertex_count for part in parts)])
+        triangles = [part.triangles.astype(np.int64) + start for part, start in zip(parts, starts, strict=False)]
+        normals = [part.normals for part in parts if part.normals is not None]
+        steps = [part.voxel_mm for part in parts if part.voxel_mm is not None]
+        facts = {
+            name: value for name, value in self.report.items() if all(part.report.get(name) == value for part in parts)
+        }
+        made = Mesh(
+            np.concatenate([part.vertices for part in parts]),
+            np.concatenate(triangles),
+            np.concatenate(normals) if len(normals) == len(parts) else None,
+            facts | ({"voxel_mm": min(steps)} if steps else {}),
+        )
+        for name in dict.fromkeys(name for part in parts for name in part.values):
+            numbers = [part.values.get(name, np.full(part.vertex_count, np.nan, np.float32)) for part in parts]
+            made.values[name] = np.concatenate(numbers)
+        return made
 
     @explains_arguments
     def clip(self, point: ArrayLike, normal: ArrayLike, *, capped: bool = True) -> Mesh:

@@ -201,10 +201,10 @@ class PointCloud(Message, ShownAsHtml):
         return self._ijk is not None
 
     @property
-    def bounds(self) -> NDArray[np.float64] | None:
-        """Lowest and highest corner of the box around the points, shape (2, 3), LPS mm; None without points."""
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner of the box around the points, shape (2, 3), LPS mm; NaN without points."""
         if not len(self):
-            return None
+            return np.full((2, 3), np.nan)
         return np.array([self._points.min(axis=0), self._points.max(axis=0)], np.float64)
 
     def __len__(self) -> int:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clrecon.errors import ClreconError
+from clrecon.system.arguments import ViewName
 from clrecon.system.log import get_logger
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ def _show_volume(volume: Volume) -> str:
     from clrecon.operators.reformat.cut import cut_slice
 
     try:
-        views = ("axial", "coronal", "sagittal")
+        views: tuple[ViewName, ...] = ("axial", "coronal", "sagittal")
         slices = [cut_slice(volume, view, _SLICE_SIZE).annotated(letters=True, scale_bar=True) for view in views]
         pictures = "".join(map(_image, slices))
     except ClreconError as error:  # no device: what is known of the volume is still shown

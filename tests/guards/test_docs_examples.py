@@ -22,10 +22,13 @@ from clrecon.proof.phantom import PhantomSettings, write_phantom
 FENCED = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^ {4}\S.*\n(?:\n? {4,}\S.*\n)*)", re.MULTILINE)
 SHELL = re.compile(r"^(clrecon|python3?|pip) ", re.MULTILINE)
-FOR_A_RELEASE = {"clouds", "corridor", "inside", "measures", "transfer_functions"}
+FOR_A_RELEASE = {"clouds", "corridor", "inside", "measures", "tasks", "transfer_functions"}
 """Pages that take long; every day their calls are compared with the signatures, and jobs' own tests make the same."""
 ELSEWHERE = {"certificate", "python", "tour", "view"}
 """Pages with tests of their own, and without Python that begins by itself."""
+
+OPTIONAL = ("dask", "pandas", "pyacvd", "tetgen")
+"""What a block may import that is installed for a release alone; without it the block is left out."""
 
 SMALLER = {
     '"CT_FOLDER"': '"ct"',
@@ -123,7 +126,10 @@ def test_the_python_of_a_page_runs(name: str, series: Path, device: Any, monkeyp
     if name in ("rendering", "regions"):  # whose text says what `volume` is
         made["volume"] = clrecon.read_volume("ct")
     before, files = set(made), set(os.listdir())
+    missing = [package for package in OPTIONAL if find_spec(package) is None]
     for block in PAGES[name]:
+        if any(re.search(rf"^(import|from) {package}\b", block, re.MULTILINE) for package in missing):
+            continue
         for long, short in SMALLER.items():
             block = block.replace(long, short)
         exec(compile(block, f"docs/{name}.md", "exec"), made)

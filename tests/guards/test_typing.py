@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -21,7 +23,7 @@ import clrecon
 def surfaces(folder: Path) -> list[clrecon.Mesh]:
     volume = clrecon.read_volume(folder)
     with clrecon.DeviceVolume(volume, device="cpu") as kept:
-        meshes = clrecon.extract_isosurfaces(kept, [150, (200, 300)], topology="separated")
+        meshes = clrecon.extract_isosurfaces(kept, [150, (200, 300), (300, None), "auto"], topology="separated")
         part: clrecon.DeviceVolume = kept[4:9]
         meshes.append(clrecon.extract_isosurface(part, 226.0, vertex_rule="golden"))
     return meshes
@@ -49,6 +51,10 @@ def pictures(volume: clrecon.Volume) -> clrecon.Rendering:
     image = clrecon.render(volume, clrecon.Projection("mip", window=(0, 1000)), view="left", size=(64, 64))
     image.to_pyvista("plane")
     clrecon.cut_slice(volume, "axial", thickness=5.0, combine="max").save("a.png")
+    clrecon.render(volume, "surface", iso_value=300.0, color="orange", clip=clrecon.Clip(), view="left")
+    clrecon.render(volume, preset="spine", labels=None, zoom=2.0, background="white")
+    extent: tuple[float, float, float, float] = clrecon.cut_slice(volume, "coronal", window="lung").extent
+    print(extent)
     return clrecon.render(volume, view=(30, 15), device=clrecon.device())
 
 
@@ -99,24 +105,66 @@ WRONG = [
     "mesh.quality().closed_edges",
     "clrecon.rendr(volume)",
     "clrecon.render(volume, size=64)",
+    'clrecon.render(volume, "mipp")',
+    'clrecon.render(volume, "mip", windw=(0, 1000))',
+    'clrecon.render(volume, "mip", window="lungs")',
+    'clrecon.render(volume, preset="bones")',
+    'clrecon.render(volume, "surface", iso_value="300")',
+    'clrecon.render(mesh, color_by="volume")',
+    'clrecon.render(volume, view="behind")',
+    'clrecon.cut_slice(volume, "transverse")',
+    'clrecon.VolumeLook("boen")',
     "cloud.denoise()",
     'clrecon.reformat_curve(volume, kind="bent")',
 ]
 """Words that no choice has, kinds of arguments, parameters that are gone or never were."""
 
 
+def python_of(page: str) -> str:
+    """The blocks of a page that use clrecon, as one script; those of SimpleITK and VTK alone are theirs to type."""
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / f"{page}.md").read_text("utf-8"), re.M | re.S)
+    return "\n".join(block for block in blocks if "vtk" not in block and "itk_" not in block)
+
+
+def checked_by_mypy(folder: Path) -> list[str]:
+    """Lines of errors, each beginning with the file and the number of a line."""
+    settings = "[mypy]\npython_version = 3.10\nstrict = true\nfollow_imports = silent\n"
+    settings += f"mypy_path = {ROOT}\nignore_missing_imports = true\nuntyped_calls_exclude = SimpleITK,dask\n"
+    (folder / "mypy.ini").write_text(settings, encoding="utf-8")
+    command = [sys.executable, "-m", "mypy", "--config-file", "mypy.ini", *(path.name for path in folder.glob("*.py"))]
+    said = subprocess.run(command, cwd=folder, capture_output=True, text=True).stdout
+    return [line for line in said.splitlines() if ": error: " in line]
+
+
+def checked_by_pyright(folder: Path) -> list[str]:
+    """The same of basedpyright, which brings its own Node.js."""
+    pytest.importorskip("basedpyright")
+    chosen = {
+        "typeCheckingMode": "standard",
+        "pythonVersion": "3.10",
+        "extraPaths": [str(ROOT)],
+        "reportMissingImports": False,
+    }
+    (folder / "pyrightconfig.json").write_text(json.dumps(chosen), encoding="utf-8")
+    command = [sys.executable, "-m", "basedpyright", "--outputjson", "--pythonpath", sys.executable]
+    said = json.loads(subprocess.run(command, cwd=folder, capture_output=True, text=True).stdout)
+    found = [each for each in said["generalDiagnostics"] if each["severity"] == "error"]
+    return [f"{Path(each['file']).name}:{each['range']['start']['line'] + 1}: {each['message']}" for each in found]
+
+
 @pytest.mark.release
 @pytest.mark.untraced
-def test_right_scripts_are_clean_and_each_wrong_call_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("check", [checked_by_mypy, checked_by_pyright])
+def test_right_scripts_are_clean_and_each_wrong_call_is_named(
+    check: Callable[[Path], list[str]], tmp_path: Path
+) -> None:
     (tmp_path / "right.py").write_text(RIGHT, encoding="utf-8")
+    for page in ("tasks", "coming_from", "tour"):
+        (tmp_path / f"{page}.py").write_text(python_of(page), encoding="utf-8")
     (tmp_path / "wrong.py").write_text(SETUP + "\n".join(WRONG) + "\n", encoding="utf-8")
-    settings = f"[mypy]\npython_version = 3.10\nstrict = true\nfollow_imports = silent\nmypy_path = {ROOT}\n"
-    (tmp_path / "mypy.ini").write_text(settings, encoding="utf-8")
-    command = [sys.executable, "-m", "mypy", "--config-file", "mypy.ini", "right.py", "wrong.py"]
-    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stdout
-    errors = [line for line in said.splitlines() if ": error: " in line]
+    errors = check(tmp_path)
     assert [line for line in errors if not line.startswith("wrong.py:")] == []
     named = {int(found[1]) for line in errors if (found := re.match(r"wrong\.py:(\d+):", line))}
     first = SETUP.count("\n") + 1
     assert [call for number, call in enumerate(WRONG, first) if number not in named] == []
-    assert min(named) == first, said
+    assert min(named) == first, errors

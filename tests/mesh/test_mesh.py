@@ -173,3 +173,20 @@ def test_numbers_that_fit_no_vertex_are_refused(values, words, tmp_path):
     with pytest.raises(UsageError, match=words):
         mesh.save(tmp_path / "a.ply")
     assert not list(tmp_path.iterdir())
+
+
+def test_merged_meshes_keep_their_arrays_and_numbers_and_the_shortest_voxel():
+    one = Mesh(*samples.box(), report={"voxel_mm": 0.5, "iso_value_hu": 226, "device": "a"})
+    other = Mesh(*samples.box((5.0, 0.0, 0.0)), report={"voxel_mm": 2.0, "iso_value_hu": 226, "device": "b"})
+    one.values["HU"], other.values["mm"] = np.arange(8.0), np.ones(8)
+    both = one.merge(other, one)
+    assert both.vertices.tolist() == [*one.vertices.tolist(), *other.vertices.tolist(), *one.vertices.tolist()]
+    assert both.triangles[12:24].tolist() == (other.triangles + 8).tolist() and both.volume == pytest.approx(3.0)
+    np.testing.assert_array_equal(both.values["HU"], [*range(8), *[np.nan] * 8, *range(8)])
+    np.testing.assert_array_equal(both.values["mm"], [*[np.nan] * 8, *[1.0] * 8, *[np.nan] * 8])
+    assert both.report == {"iso_value_hu": 226, "voxel_mm": 0.5} and both.normals is None
+    assert one.values.keys() == {"HU"} and len(one.split()) == 1 and len(both.split()) == 3
+    turned = Mesh(one.vertices, one.triangles, np.tile([0.0, 0.0, 1.0], (8, 1)))
+    assert turned.merge(turned).normals.shape == (16, 3) and turned.merge(one).normals is None
+    with pytest.raises(UsageError, match=r"merge takes meshes, not list: of a list mesh.merge\(\*others\)"):
+        one.merge([other])

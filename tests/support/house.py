@@ -131,7 +131,8 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "points": frozenset({"open3d"}),
     "rendering": frozenset({"scipy", "PIL", "skimage", "imageio_ffmpeg", "pyvista", "vtk", "vtkmodules"}),
     "opencl": frozenset({"pyopencl"}),
-    "operators": frozenset({"pyopencl", "SimpleITK", "skimage"}),
+    # typing_extensions: for type checkers alone, which bring it.
+    "operators": frozenset({"pyopencl", "SimpleITK", "skimage", "typing_extensions"}),
     "jobs": frozenset({"PIL"}),
     "viewer": frozenset({"aiohttp", "PIL", "pyvista", "vtk", "vtkmodules"}),
     # vtkmodules: peers of the bench and of the comparison, whose page has plots and pictures.

@@ -220,12 +220,12 @@ class MaskBits:
         return float(np.count_nonzero(self.to_numpy(), axis=(1, 2)) @ each)
 
     @property
-    def bounds(self) -> Float64Array | None:
-        """Lowest and highest corner of the box around the chosen voxels, shape (2, 3), LPS mm; None without any."""
+    def bounds(self) -> Float64Array:
+        """Lowest and highest corner of the box around the chosen voxels, shape (2, 3), LPS mm; NaN without any."""
         chosen = self.to_numpy()
         k, j = np.nonzero(chosen.any(axis=2))
         if not len(k):
-            return None
+            return np.full((2, 3), np.nan)
         rows = chosen[k, j]  # the ends of a row hold all between them
         ends = (rows.argmax(axis=1), rows.shape[1] - 1 - rows[:, ::-1].argmax(axis=1))
         places = np.concatenate([self.scan.ijk_to_lps(np.column_stack([i, j, k])) for i in ends])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
@@ -15,22 +15,25 @@ from clrecon.operators.rays.volume_renderer import Place, VolumeRenderer
 from clrecon.points import PointCloud
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
-from clrecon.rendering.pictures.modes import find_style
+from clrecon.rendering.pictures.modes import Look, find_style
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import SlicesInSpace, Style, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size, default_view
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import ModeName, ViewName, explains_arguments
 from clrecon.system.progress import Progress
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack  # of Python 3.11
 
 
 @explains_arguments
 def render(
     shown: Subject | Sequence[Subject | tuple[Subject, Style]],
-    style: Style | str | None = None,
+    style: Style | ModeName | None = None,
     *,
     camera: Camera | None = None,
-    view: str | Sequence[float] | None = None,
+    view: ViewName | Sequence[float] | None = None,
     up: str | Sequence[float] | None = None,
     zoom: float | None = None,
     view_angle: float | None = None,
@@ -40,7 +43,7 @@ def render(
     device: Device | str | int | None = None,
     memory: int | None = None,
     progress: Progress | None = None,
-    **look: object,
+    **look: Unpack[Look],
 ) -> Rendering:
     """Make a picture of a volume, of a point cloud, of a mesh, or of several of them in one place.
 
@@ -108,7 +111,7 @@ def render(
 
 
 def _name_objects(
-    shown: PointCloud | Mesh | Sequence[Any], style: Style | str | None, look: dict[str, object]
+    shown: PointCloud | Mesh | Sequence[Any], style: Style | str | None, look: Look
 ) -> list[tuple[Any, Style]]:
     if isinstance(shown, Sequence):
         if style is not None or look:

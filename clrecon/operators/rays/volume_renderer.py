@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.pictures.label_style import LabelStyle
-from clrecon.rendering.pictures.modes import check_known, find_style
+from clrecon.rendering.pictures.modes import Look, check_known, find_style
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.sheets import SHEET_SIZE
 from clrecon.rendering.pictures.styles import (
@@ -43,9 +43,12 @@ from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.clip import ShownLabels, check_center, find_seen_box
 from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, checked_size, default_view
 from clrecon.rendering.views.reformation import find_plane
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import ModeName, ViewName, explains_arguments
 from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack  # of Python 3.11
 
 MASKED_BY = ("field_of_view", "remove_table", "region", LEFT_OUT)
 """Entries of the report of a volume of which a part was turned into air, or left out."""
@@ -174,10 +177,10 @@ class VolumeRenderer(Closing):
     @explains_arguments
     def render(
         self,
-        style: Style | str | None = None,
+        style: Style | ModeName | None = None,
         *,
         camera: Camera | None = None,
-        view: str | Sequence[float] | None = None,
+        view: ViewName | Sequence[float] | None = None,
         up: str | Sequence[float] | None = None,
         zoom: float | None = None,
         view_angle: float | None = None,
@@ -185,7 +188,7 @@ class VolumeRenderer(Closing):
         size: Sequence[int] | None = None,
         background: str | Sequence[float] = "black",
         progress: Progress | None = None,
-        **look: object,
+        **look: Unpack[Look],
     ) -> Rendering:
         """Make one picture, see the function `render`."""
         style = find_style(style, look)

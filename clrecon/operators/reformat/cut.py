@@ -35,7 +35,7 @@ from clrecon.rendering.views.reformation import (
     stretched_length,
     stretched_sheet,
 )
-from clrecon.system.arguments import Combination, CurvedKind, explains_arguments
+from clrecon.system.arguments import Combination, CurvedKind, ViewName, WindowName, explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 
 DEFAULT_WIDTH_MM = 120.0
@@ -53,7 +53,7 @@ look at."""
 @explains_arguments
 def cut_slice(
     volume: Volume | DeviceVolume,
-    plane: Camera | str | Sequence[float] = "axial",
+    plane: Camera | ViewName | Sequence[float] = "axial",
     size: Sequence[int] = DEFAULT_SIZE,
     *,
     device: Device | str | int | None = None,
@@ -63,7 +63,7 @@ def cut_slice(
     offset_mm: float = 0.0,
     thickness: float = 0.0,
     combine: Combination = "mean",
-    window: Sequence[float] | str | None = None,
+    window: Sequence[float] | WindowName | None = None,
     background: str | Sequence[float] = "black",
     memory: int | None = None,
     progress: Progress | None = None,
@@ -178,14 +178,14 @@ def reformat_curve(
     size: Sequence[int] | None = None,
     *,
     device: Device | str | int | None = None,
-    view: str | Sequence[float] = "left",
+    view: ViewName | Sequence[float] = "left",
     up: str | ArrayLike | None = None,
     angle: float = 0.0,
     pixel_mm: float | None = None,
     width_mm: float | None = None,
     thickness: float = 0.0,
     combine: Combination = "mean",
-    window: Sequence[float] | str | None = None,
+    window: Sequence[float] | WindowName | None = None,
     background: str | Sequence[float] = "black",
     memory: int | None = None,
     progress: Progress | None = None,

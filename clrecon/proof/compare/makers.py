@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +111,7 @@ DEVICE_PARTS = ("build", "upload", "kernels", "download")
 TWIN_SIZE = (128, 128)
 """Pixels of ray casting in numpy, which takes seconds for them, and of the device beside it."""
 
-RAYS_PRESET = "bone"
+RAYS_PRESET: Final = "bone"
 
 
 @dataclass

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypedDict
 
 from clrecon.errors import UsageError
 from clrecon.rendering.looks.presets import find_preset
@@ -19,8 +19,18 @@ from clrecon.rendering.pictures.styles import (
     VolumeLook,
 )
 from clrecon.rendering.views.directions import hint_at_sheet
-from clrecon.system.arguments import name_parameter
+from clrecon.system.arguments import Combination, CurvedKind, ModeName, PresetName, WindowName, name_parameter
 from clrecon.system.text import unknown_name
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from clrecon.labels import LabelMap
+    from clrecon.rendering.looks.lighting import Lighting
+    from clrecon.rendering.looks.transfer_function import TransferFunction
+    from clrecon.rendering.pictures.styles import ByLabel, Color
+    from clrecon.rendering.views.centre_line import Curve
+    from clrecon.rendering.views.clip import Clip
 
 
 class Mode(NamedTuple):
@@ -43,6 +53,45 @@ MODES = {
     "points": Mode(PointLook, "the points of a cloud, coloured by HU, label or what was removed"),
     "mesh": Mode(MeshLook, "the triangles of a mesh, shaded"),
 }
+
+
+class Look(TypedDict, total=False):
+    """The keywords of `render` in place of a style, of all modes; None means the default."""
+
+    mode: ModeName | None
+    preset: PresetName | None
+    transfer_function: TransferFunction | PresetName | None
+    lighting: Lighting | None
+    ray_step: float | None
+    clip: Clip | None
+    labels: LabelMap | None
+    label_colors: ByLabel[Color] | None
+    label_opacity: ByLabel[float] | None
+    jitter: bool
+    window: Sequence[float] | WindowName | None
+    keep_air: bool
+    iso_value: float
+    color: Color | None
+    shadows: bool
+    depth_cue: float | None
+    slices: int | Sequence[int] | None
+    slice_opacity: float
+    lowest_hu: float
+    thickness: float
+    combine: Combination
+    pixel_mm: float | None
+    offset_mm: float
+    sheet: int | str | None
+    curve: Curve | ArrayLike | str
+    cpr: CurvedKind
+    angle: float
+    width_mm: float | None
+    opacity: float
+    flat: bool
+    vertex_colors: ArrayLike | None
+    color_by: Literal["thickness", "error", "distance", "hu", "label", "removed"] | None
+    radius_mm: float | None
+
 
 _RAYS = ("dvr", "mip", "minip", "mean", "drr", "surface", "slices")
 _CAMERAS = (*_RAYS, "points", "mesh")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, field
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,10 +16,10 @@ from clrecon.rendering.looks.colors import ColorScale, find_color, round_up
 from clrecon.rendering.looks.lighting import Lighting
 from clrecon.rendering.looks.window import checked_window
 from clrecon.rendering.pictures import style_checks as checks
-from clrecon.rendering.pictures.styles import DEFAULT_COLOR, Style, style_field
+from clrecon.rendering.pictures.styles import DEFAULT_COLOR, Color, Style, style_field
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.reformation import positive_mm
-from clrecon.system.arguments import name_parameter
+from clrecon.system.arguments import WindowName, name_parameter
 from clrecon.system.light_dataclass import dataclass
 
 
@@ -69,14 +69,14 @@ class MeshLook(Style):
 
     _mode: ClassVar[str] = "mesh"
 
-    color: str | Sequence[float] | None = style_field(None, checks.color)
+    color: Color | None = style_field(None, checks.color)
     _: KW_ONLY
     opacity: float = style_field(
         1.0, checks.number("the opacity of a mesh lies above 0 and up to 1, not at", lambda share: 0.0 < share <= 1.0)
     )
     flat: bool = style_field(False, partial(checks.flag, "flat"))
     vertex_colors: ArrayLike | None = field(default=None, compare=False, metadata={"check": _vertex_colors})
-    color_by: str | None = style_field(
+    color_by: Literal["thickness", "error", "distance"] | None = style_field(
         None, checks.one_of(tuple(MESH_COLORS), f"meshes are coloured by one of {', '.join(MESH_COLORS)}")
     )
     lighting: Lighting | None = style_field(None, checks.instance_of("lighting", Lighting))
@@ -147,11 +147,11 @@ class PointLook(Style):
     _mode: ClassVar[str] = "points"
 
     radius_mm: float | None = style_field(None, partial(positive_mm, "the radius of points"))
-    color_by: str | None = style_field(
+    color_by: Literal["hu", "label", "removed"] | None = style_field(
         None, checks.one_of(POINT_COLORS, f"points are coloured by one of {', '.join(POINT_COLORS)}")
     )
-    color: str | Sequence[float] | None = style_field(None, checks.color)
-    window: Sequence[float] | str | None = style_field(None, checked_window)
+    color: Color | None = style_field(None, checks.color)
+    window: Sequence[float] | WindowName | None = style_field(None, checked_window)
     lighting: Lighting | None = style_field(None, checks.instance_of("lighting", Lighting))
     clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
 

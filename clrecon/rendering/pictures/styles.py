@@ -30,12 +30,12 @@ from clrecon.rendering.pictures.style_checks import SPINE
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.reformation import checked_offset, checked_thickness, positive_mm
-from clrecon.system.arguments import Combination, CurvedKind, ProjectionKind, name_parameter
+from clrecon.system.arguments import Combination, CurvedKind, PresetName, ProjectionKind, WindowName, name_parameter
 from clrecon.system.light_dataclass import dataclass
 
 _T = TypeVar("_T")
-_ByLabel = Mapping[int, _T] | Mapping[str, _T] | Mapping[int | str, _T]
-_Color = str | Sequence[float]
+ByLabel = Mapping[int, _T] | Mapping[str, _T] | Mapping[int | str, _T]
+Color = str | Sequence[float]
 
 PROJECTIONS, COMBINATIONS, CURVED_KINDS = (get_args(words) for words in (ProjectionKind, Combination, CurvedKind))
 
@@ -85,8 +85,8 @@ class _Labelled(Style):
     """Base of styles in which labels can look different."""
 
     labels: LabelMap | None = style_field(None, checks.instance_of("labels", LabelMap))
-    label_colors: _ByLabel[_Color] | None = style_field(None, checks.mapping("colours"))
-    label_opacity: _ByLabel[float] | None = style_field(None, checks.mapping("opacities"))
+    label_colors: ByLabel[Color] | None = style_field(None, checks.mapping("colours"))
+    label_opacity: ByLabel[float] | None = style_field(None, checks.mapping("opacities"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,7 +101,7 @@ class _Labelled(Style):
         """Colour and opacity of each label, None without labels."""
         if self.labels is None:
             return None
-        colors = cast("Mapping[int | str, _Color] | None", self.label_colors)
+        colors = cast("Mapping[int | str, Color] | None", self.label_colors)
         return LabelStyle.of(self.labels, colors, cast("Mapping[int | str, float] | None", self.label_opacity))
 
 
@@ -145,7 +145,7 @@ class VolumeLook(_Lit):
 
     _mode: ClassVar[str] = "dvr"
 
-    transfer_function: TransferFunction | str = style_field(DEFAULT_PRESET, checks.preset_or_function)
+    transfer_function: TransferFunction | PresetName = style_field(DEFAULT_PRESET, checks.preset_or_function)
     _: KW_ONLY
     jitter: bool = style_field(False, partial(checks.flag, "jitter"))
 
@@ -185,7 +185,7 @@ class Projection(Style):
         "mip", checks.one_of(PROJECTIONS, f"a projection is one of {', '.join(PROJECTIONS)}"), "mode"
     )
     _: KW_ONLY
-    window: Sequence[float] | str | None = style_field(None, checked_window)
+    window: Sequence[float] | WindowName | None = style_field(None, checked_window)
     ray_step: float | None = style_field(None, checks.ray_step)
     keep_air: bool = style_field(False, partial(checks.flag, "keep_air"))
     clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
@@ -241,7 +241,7 @@ class SurfaceLook(_Lit):
 
     iso_value: float = style_field(DEFAULT_ISO_VALUE, checked_iso_value)
     _: KW_ONLY
-    color: _Color | None = style_field(None, checks.color)
+    color: Color | None = style_field(None, checks.color)
     shadows: bool = style_field(False, partial(checks.flag, "shadows"))
     depth_cue: float | None = style_field(
         None,
@@ -292,7 +292,7 @@ class SlicesInSpace(Style):
         checks.number("the opacity of a slice lies above 0 and up to 1, not at", lambda share: 0.0 < share <= 1.0),
         "slice_opacity",
     )
-    window: Sequence[float] | str | None = style_field(None, checked_window)
+    window: Sequence[float] | WindowName | None = style_field(None, checked_window)
     transfer_function: TransferFunction | None = style_field(
         None, checks.instance_of("transfer function", TransferFunction)
     )
@@ -315,7 +315,7 @@ class _Cut(_Labelled):
     combine: Combination = style_field(
         "mean", checks.one_of(COMBINATIONS, f"samples of a thick slice are combined by {', '.join(COMBINATIONS)}")
     )
-    window: Sequence[float] | str | None = style_field(None, checked_window)
+    window: Sequence[float] | WindowName | None = style_field(None, checked_window)
     pixel_mm: float | None = style_field(None, partial(positive_mm, "the size of a pixel"))
 
 

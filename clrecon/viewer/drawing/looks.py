@@ -67,7 +67,7 @@ class Looks:
             return self._keep(key, SlicesInSpace(window=state.picture_window, clip=clip))
         look = {"ray_step": ray_step, "clip": clip, **_label_fields(labelled, whole.opacity)}
         if mode.kind == "volume":
-            return self._keep(key, VolumeLook(mode.style, jitter=True, **look))
+            return self._keep(key, VolumeLook(mode.style, jitter=True, **look))  # type: ignore[arg-type]
         level = label_level if mode.kind == "labels" else state.iso_value
         return self._keep(key, SurfaceLook(level, color=whole.color, **look))
 

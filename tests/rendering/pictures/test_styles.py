@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import pickle
+import re
 from dataclasses import FrozenInstanceError, fields, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ import pytest
 from clrecon.errors import UsageError
 from clrecon.labels import LabelMap
 from clrecon.rendering import Lighting, TransferFunction, find_preset
-from clrecon.rendering.pictures.modes import MODES, check_known, find_style, keywords_of, make_style
+from clrecon.rendering.looks.presets import PRESETS
+from clrecon.rendering.looks.window import WINDOWS
+from clrecon.rendering.pictures.modes import MODES, Look, check_known, find_style, keywords_of, make_style
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import (
     CurveCut,
@@ -25,6 +28,9 @@ from clrecon.rendering.pictures.styles import (
     VolumeLook,
 )
 from clrecon.rendering.views.clip import Clip
+from clrecon.rendering.views.directions import DIRECTIONS
+from clrecon.rendering.views.reformation import PLANES
+from clrecon.system.arguments import ModeName, PresetName, ViewName, WindowName
 
 GLASS = TransferFunction([(0, 1, 1, 1, 0.1), (500, 1, 1, 1, 0.4)])
 LABELS = LabelMap(np.array([[[0, 1], [2, 2]]], np.uint8), np.eye(4), {1: "L1", 2: "L2"})
@@ -268,3 +274,20 @@ def test_keywords_are_fields() -> None:
     check_known("mip", "values")
     with pytest.raises(UsageError, match="clip_box means nothing in mode cpr"):
         check_known("cpr", "clip", "clip_box")
+
+
+def test_the_typed_keywords_of_render_are_those_of_all_styles_with_the_types_of_their_fields():
+    def parts(annotation: str) -> set[str]:
+        return {part.strip() for part in re.sub(r"Literal\[(.*?)\]", r"\1", annotation).replace(",", "|").split("|")}
+
+    typed = {name: parts(str(getattr(each, "__forward_arg__", each))) for name, each in Look.__annotations__.items()}
+    fields_of: dict[str, set[str]] = {}
+    for mode in MODES.values():
+        for own in fields(mode.style):
+            fields_of.setdefault(own.metadata.get("keyword", own.name), set()).update(parts(str(own.type)))
+    beside = {"mode": {"ModeName", "None"}, "preset": {"PresetName", "None"}}
+    assert {name: each | {"None"} for name, each in typed.items()} == {
+        name: each | {"None"} for name, each in (fields_of | beside).items()
+    }
+    assert get_args(ModeName) == tuple(MODES) and get_args(PresetName) == tuple(PRESETS)
+    assert get_args(WindowName) == tuple(WINDOWS) and {*DIRECTIONS, *PLANES} == set(get_args(ViewName))
