@@ -70,8 +70,8 @@ def draw_chest(folder: str) -> np.ndarray:
     volume = clrecon.read_volume(folder)
     look = clrecon.VolumeLook("bone", ray_step=0.35 * min(volume.spacing))
     with clrecon.VolumeRenderer(volume) as renderer:
-        front = renderer.render(look, view="25,10", size=(520, 620), zoom=1.12)
-        behind = renderer.render(look, view="150,12", size=(480, 620), zoom=1.12)
+        front = renderer.render(look, view=(25, 10), size=(520, 620), zoom=1.12)
+        behind = renderer.render(look, view=(150, 12), size=(480, 620), zoom=1.12)
     return np.hstack([front.image[..., :3], behind.annotated(scale_bar=True).image[..., :3]])
 
 

@@ -48,7 +48,7 @@ def main() -> None:
             found = []
             for view in VIEWS:
                 pictures = [
-                    renderer.render(preset=name, view=view, size=SIZE, ray_step=ray_step).image
+                    renderer.render(preset=name, view=view, size=SIZE, ray_step=ray_step).image  # type: ignore[arg-type]
                     for ray_step in (step, step / FINER)
                 ]
                 found.append("{:.4f} whole {:.4f} shown".format(*compare(*pictures)))

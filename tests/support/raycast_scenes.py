@@ -206,7 +206,7 @@ class DeviceCaster:
             settings |= {"transfer_function": transfer_function, "lighting": lighting}
         elif mode == "surface":
             settings |= {"color": (1.0, 1.0, 1.0), "lighting": lighting}
-        found = render(volume, mode, device=self.device, background="transparent", **settings)
+        found = render(volume, mode, device=self.device, background="transparent", **settings)  # type: ignore[arg-type]
         values = np.full(found.depth.shape, np.nan) if found.values is None else found.values
         return Shot(found.image, found.depth, found.expected_depth, values)
 
