@@ -271,22 +271,23 @@ def _warn_of_whole(part: Part, settings: MeshSettings) -> list[str]:
         if settings.seeds or not (settings.keep_largest is not None or _means_bone(settings)):
             return []
         return [f"{where} {_looks(judged)}; {name_parameter('keep', 'bone')} keeps what looks like bone"]
-    if part.bones is not None and part.bones.other is not None and part.bones.other_share >= OTHER_SHARE:
-        share = 100.0 * part.bones.other_share
+    other = None if part.bones is None or part.bones.other_share < OTHER_SHARE else part.bones.other
+    even = judged["contrast_share"] >= CONTRAST_SHARE
+    if part.bones is not None and other is not None and not (even and other["looks_like"] == "contrast medium"):
         return [
-            f"{where} is in part no bone: one of {count_of(part.bones.components, 'component')}, {share:.0f} % of the"
-            f" surface, {_looks(part.bones.other)}. {name_parameter('remove_table', True)} takes a table away,"
-            f" {name_parameter('keep', 'bone')} leaves out what touches no bone"
+            f"{where} is in part no bone: one of {count_of(part.bones.components, 'component')},"
+            f" {100.0 * part.bones.other_share:.0f} % of the surface, {_looks(other)}."
+            f" {name_parameter('remove_table', True)} takes a table away, {name_parameter('keep', 'bone')} leaves out"
+            " what touches no bone"
         ]
-    if judged["contrast_share"] < CONTRAST_SHARE:
+    if not even:
         return []
-    joined = settings.keep == "bone"
     apart = "a higher iso value parts them"
     if not settings.remove_table:
         apart += (
             f"; where it is a table that touches bone, {name_parameter('remove_table', True)} takes that away first"
         )
-    advice = apart if joined else f"{name_parameter('keep', 'bone')} leaves out what touches no bone"
+    advice = apart if settings.keep == "bone" else f"{name_parameter('keep', 'bone')} leaves out what touches no bone"
     return [
         f"{where} is in part like heart, vessels or organs with contrast medium (about"
         f" {100.0 * judged['contrast_share']:.0f} % is even beneath and far from compact bone): {advice}"

@@ -79,7 +79,7 @@ def test_the_command_line(tmp_path, capsys):
         ),
     ],
 )
-def test_a_print_stops_where_values_are_not_hu(tmp_path, device, capsys, values, level):
+def test_a_print_needs_a_level_where_values_are_not_hu(tmp_path, device, capsys, values, level):
     folder = str(write_values(tmp_path / "ct", make_body(), Plan(shape=SHAPE), **values))
     out = tmp_path / "a.stl"
     command = ["mesh", folder, "-o", str(out), "--for", "print", "--device", str(device.index)]
@@ -89,6 +89,6 @@ def test_a_print_stops_where_values_are_not_hu(tmp_path, device, capsys, values,
         assert "a print needs a level of bone, and the values of this scan are not known to be HU" in text
         assert "(--hu N)" in text and "(--rescale SLOPE,INTERCEPT)" in text
         assert not out.exists()
-    assert main([*command, "--hu", str(level)]) == 7 and out.exists()
+    assert main([*command, "--hu", str(level)]) == 0 and out.exists()
     out.unlink()
     assert main([*command, "--rescale", "1,-1024"]) == 0 and out.exists()
