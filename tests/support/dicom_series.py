@@ -125,7 +125,7 @@ def save_dataset(ds: Dataset, path: Path) -> None:
     """Write a dataset as pydicom does, which takes 3 ms, with what it wrote for elements that came before."""
     path.parent.mkdir(parents=True, exist_ok=True)
     elements = list(ds.values())
-    meta = getattr(ds, "file_meta", {})
+    meta = getattr(ds, "file_meta", FileMetaDataset())
     if not (
         set(meta.keys()) == TAGS_OF_A_HEAD
         and meta.TransferSyntaxUID in (ExplicitVRLittleEndian, ImplicitVRLittleEndian)
