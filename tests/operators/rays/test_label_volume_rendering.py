@@ -8,6 +8,7 @@ import tolerances
 from variants import daily
 
 from clrecon import Camera, LabelMap, TransferFunction, UsageError, Volume, render
+from clrecon.operators.rays.ray_slabs import GROWN
 from clrecon.rendering.looks.lighting import UNSHADED
 
 SPACING = (0.7, 0.5, 1.1)
@@ -47,7 +48,7 @@ def test_labels_change_opacity_and_colour_as_they_say(device, memory):
     assert (made.report["slabs"] > 1) == (memory is not None)
     row = made.image[2].astype(float)
     through = SHAPE[1] * SPACING[1] / GREY.unit_distance
-    for columns, factor in ((slice(1, 9), 0.25), (slice(11, 14), 0.5), (slice(16, 19), 1.0)):
+    for columns, factor in ((slice(1, 9), 0.25), (slice(11, 15 + GROWN), 0.5), (slice(15 + GROWN, 19), 1.0)):
         expected = 255.0 * (1.0 - (1.0 - factor * 0.1) ** through)
         assert np.abs(row[columns, 3] - expected).max() <= tolerances.RAY_SAME_255, factor
     grey, red = row[1:9, :3], row[11:14, :3]
