@@ -39,8 +39,8 @@ def run_in_turn(steps: Steps, environment: dict[str, str]) -> list[str]:
     return failed
 
 
-def run_beside(steps: Steps, command: list[str], environment: dict[str, str]) -> list[str]:
-    """Run `command`, pytest, with the steps beside it, and return the names of those that failed.
+def run_beside(steps: Steps, command: list[str], environment: dict[str, str], again: list[str]) -> list[str]:
+    """Run `command`, pytest, with the steps beside it, `again` if it fails, and return the names of those that failed.
 
     What pytest prints comes as it is printed, that of the steps after it, and pytest's closing line last.
     """
@@ -60,6 +60,8 @@ def run_beside(steps: Steps, command: list[str], environment: dict[str, str]) ->
         closing = show_but_closing(tests.stdout)
         if tests.wait():
             failed.append("pytest")
+            print("== what failed, once more, with the values of its asserts", flush=True)
+            subprocess.run(again, cwd=ROOT, env=environment)
         for name, (process, said) in beside.items():
             print(f"== {name}", flush=True)
             if process.wait():
@@ -113,15 +115,17 @@ def main() -> int:
     # Much of the suite's time is the building of kernels, on one core.  Each process gets a part of the tests in order.
     # A process that is done takes half of the rest of another, so that none waits for the longest file.  A process that
     # crashes ends the run: pytest-xdist 3.8 would wait for ever for a process in its place.
+    # Asserts that can show their values take each process 10 s to compile: what fails runs once more with such.
     cores = min(os.cpu_count() or 1, MOST_PROCESSES)
-    options = ["-n", str(cores), "--dist", "worksteal", "--max-worker-restart", "0"]
+    options = ["-n", str(cores), "--dist", "worksteal", "--max-worker-restart", "0", "--assert=plain"]
     tests = [python, "-m", "pytest", "-q", *(options if cores > 1 and not arguments else []), *arguments]
+    again = [python, "-m", "pytest", "-q", "--last-failed", "--last-failed-no-failures", "none"]
     environment = {**os.environ, "CLRECON_REQUIRE_TESTS": "1", "CLRECON_FAST_TESTS": "1" if fast else ""}
     # Hundreds of tests start a process that imports clrecon: it is compiled once, whatever the machine's habit.
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     failed = run_in_turn(quick_checks(folder), environment)
     if cores > 1 and not arguments:
-        failed += run_beside(steps, tests, environment)
+        failed += run_beside(steps, tests, environment, again)
     else:
         failed += run_in_turn({**steps, "pytest": tests}, environment)
     if failed:

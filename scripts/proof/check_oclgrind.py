@@ -30,7 +30,7 @@ def default_command() -> list[str]:
     """Command for all tests marked ``oclgrind``; only files that name the mark are collected, which saves time."""
     files = sorted(path for path in (ROOT / "tests").rglob("test_*.py") if "mark.oclgrind" in path.read_text("utf-8"))
     marked = [str(path.relative_to(ROOT)) for path in files]
-    return [sys.executable, "-m", "pytest", "-q", "-m", "oclgrind", "-p", "no:cacheprovider", *marked]
+    return [sys.executable, "-m", "pytest", "-q", "-m", "oclgrind", "--assert=plain", "-p", "no:cacheprovider", *marked]
 
 
 def run_under_oclgrind(command: list[str], uninitialized: bool = False) -> tuple[int, str]:
