@@ -28,15 +28,17 @@ def make_command(text, code=0):
                                      "no tests ran in 0.12s"])  # fmt: skip
 def test_closing_line_comes_last(runner, capfd, closing):
     steps = {"one": make_command("of one"), "two": make_command("of two", 3)}
-    failed = runner.run_beside(steps, make_command(f"....  [100%]\n{closing}\nafterwards"), dict(os.environ))
+    failed = runner.run_beside(steps, make_command(f"....  [100%]\n{closing}\nafterwards"), dict(os.environ), [])
     lines = capfd.readouterr().out.splitlines()
     assert failed == ["two"]
     assert lines == ["== pytest", "....  [100%]", "afterwards", "== one", "of one", "== two", "of two", closing]
 
 
 def test_tests_that_fail_are_named_and_print_all(runner, capfd):
-    assert runner.run_beside({}, make_command("no closing line", 4), dict(os.environ)) == ["pytest"]
-    assert capfd.readouterr().out.splitlines() == ["== pytest", "no closing line"]
+    again = make_command("its values", 1)
+    assert runner.run_beside({}, make_command("no closing line", 4), dict(os.environ), again) == ["pytest"]
+    said = capfd.readouterr().out.splitlines()
+    assert said[:2] == ["== pytest", "no closing line"] and said[2].startswith("== ") and said[3:] == ["its values"]
 
 
 def test_steps_run_in_turn(runner, capfd):
