@@ -193,8 +193,8 @@ class LineJudge:
         least = segment_distances(first, last, self.walls)
         # no point of a line is farther from one that is known than its ends are, and all else is farther than `reach`
         aside, _ = self.known.query(np.hstack((first, last)))
-        unsure = least > self.reach - aside - 0.01
-        least[unsure] = segment_distances(first[unsure], last[unsure], self.surface)
+        undecided = least > self.reach - aside - 0.01
+        least[undecided] = segment_distances(first[undecided], last[undecided], self.surface)
         return least
 
     def score(self, lines: Float64Array, above: Float64Array | None = None) -> Float64Array:
