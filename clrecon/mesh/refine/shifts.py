@@ -199,16 +199,12 @@ class _Near:
         self._high = np.maximum.reduceat(np.maximum(was[1], now[1]), self._at.starts)
 
     def touching(self, vertices: IntArray) -> NDArray[np.int64]:
-        """Return the triangles that have one of these vertices."""
         flags = np.zeros(len(self._moved), dtype=bool)
         flags[vertices] = True
         return self._at.find(flags)
 
     def find_spoilt(self, vertices: IntArray) -> IntArray:
-        """Find the vertices of spoilt triangles after these vertices went back.
-
-        What is spoilt elsewhere has nothing around it that could still be taken back.
-        """
+        """Find the vertices of spoilt triangles after these vertices went back."""
         moved, changed = self._moved, self.touching(vertices)
         boxes = find_boxes(moved, self._triangles[changed])
         rows = self._at.rows_of(find_boxes_beside(self._low, self._high, *boxes))
