@@ -15,7 +15,11 @@
  *
  * An item looks at the entries behind its own of its level, and at all of the levels with longer triangles: each pair
  * is seen once.  Both of its triangles are marked, by atomic_or(), unless float32 shows that they do not cut each other:
- * signs of volumes and areas that exceed their rounding are those of exact arithmetic. */
+ * signs of volumes and areas that exceed their rounding are those of exact arithmetic.
+ *
+ * LANES entries are looked at together: boxes, and sides of both planes, which leave few pairs. */
+#include "include/lanes.h"
+
 
 /* Share of a volume's sum of absolute terms that its rounding does not reach. */
 #define ROUNDING 0x1p-20f
@@ -42,17 +46,46 @@ static inline int side_of(const plane *flat, const float3 point)
     return (int)(volume > bound) - (int)(volume < -bound);
 }
 
-/* Sides of a plane on which corners lie. */
-static inline int3 sides_of(const plane *flat, const float3 a, const float3 b, const float3 c)
+/* Planes of LANES triangles at once, and points. */
+typedef struct { floats x, y, z; } points;
+typedef struct { points corner, normal, terms; } planes;
+
+static inline points spread(const float3 p)
 {
-    return (int3)(side_of(flat, a), side_of(flat, b), side_of(flat, c));
+    const points found = {(floats)(p.x), (floats)(p.y), (floats)(p.z)};
+    return found;
 }
 
-/* True where all corners surely lie on one side, but for those that are common: float32 cannot tell of these. */
-static inline int apart(const int3 sides, const int common)
+static inline points away(const points p, const points q)
 {
-    const int sum = sides.x + sides.y + sides.z;
-    return common + sum == 3 || common - sum == 3;
+    const points found = {p.x - q.x, p.y - q.y, p.z - q.z};
+    return found;
+}
+
+static inline planes planes_of(const points a, const points b, const points c)
+{
+    const points p = away(b, a), q = away(c, a);
+    const floats yz = p.y * q.z, zy = p.z * q.y, zx = p.z * q.x, xz = p.x * q.z, xy = p.x * q.y, yx = p.y * q.x;
+    const planes found = {
+        a, {yz - zy, zx - xz, xy - yx}, {fabs(yz) + fabs(zy), fabs(zx) + fabs(xz), fabs(xy) + fabs(yx)}};
+    return found;
+}
+
+/* As side_of(). */
+static inline ints sides_of(const planes *flat, const points point)
+{
+    const points r = away(point, flat->corner);
+    const floats volume = flat->normal.x * r.x + flat->normal.y * r.y + flat->normal.z * r.z;
+    const floats bound
+        = ROUNDING * (flat->terms.x * fabs(r.x) + flat->terms.y * fabs(r.y) + flat->terms.z * fabs(r.z));
+    return choose(volume > bound, (ints)(1), (ints)(0)) - choose(volume < -bound, (ints)(1), (ints)(0));
+}
+
+/* True where the corners a, b and c surely lie on one side, but for those that are common: float32 cannot tell of these. */
+static inline ints lie_apart(const planes *flat, const points a, const points b, const points c, const ints common)
+{
+    const ints sum = sides_of(flat, a) + sides_of(flat, b) + sides_of(flat, c);
+    return (common + sum == 3) | (common - sum == 3);
 }
 
 /* Axis along which the triangle a, b, c looks largest. */
@@ -90,7 +123,8 @@ static inline int apart_in_shadow(
             || (turn_of(b, c, p) == -inside && turn_of(b, c, q) == -inside)
             || (turn_of(c, a, p) == -inside && turn_of(c, a, q) == -inside)))
         return 1;
-    return apart((int3)(turn_of(p, q, a), turn_of(p, q, b), turn_of(p, q, c)), 0);
+    const int sum = turn_of(p, q, a) + turn_of(p, q, b) + turn_of(p, q, c);
+    return sum == 3 || sum == -3;
 }
 
 /* False where the line from p to q surely passes beside the triangle a, b, c, or where p and q lie on the same side. */
@@ -114,10 +148,25 @@ static inline int may_be_folded(const float3 a, const float3 b, const float3 c, 
     return turn_of(from, to, shadow(a, axis)) * turn_of(from, to, shadow(d, axis)) >= 0;
 }
 
-/* The triangle turned so that the corner whose flag is set comes first. */
-static inline uint3 turned(const uint3 triangle, const int3 flags)
+/* A triangle, and the names of its corners. */
+typedef struct { float3 a, b, c; uint3 names; } triangle;
+
+static inline triangle triangle_at(
+    __global const float *restrict places, __global const uint *restrict names, const uint stride, const uint entry)
 {
-    return flags.x ? triangle : flags.y ? triangle.yzx : triangle.zxy;
+    const size_t row = stride;
+    __global const float *at = places + entry;
+    const triangle found = {(float3)(at[0], at[row], at[2 * row]), (float3)(at[3 * row], at[4 * row], at[5 * row]),
+        (float3)(at[6 * row], at[7 * row], at[8 * row]),
+        (uint3)(names[entry], names[row + entry], names[2 * row + entry])};
+    return found;
+}
+
+/* The triangle turned so that the corner whose flag is set comes first. */
+static inline triangle turned(const triangle t, const int3 flags)
+{
+    const triangle next = {t.b, t.c, t.a, t.names.yzx}, last = {t.c, t.a, t.b, t.names.zxy};
+    return flags.x ? t : flags.y ? next : last;
 }
 
 /* One for each corner of a triangle that is a corner of the other, too. */
@@ -126,65 +175,122 @@ static inline int3 common_corners(const uint3 one, const uint3 other)
     return -((one == other) | (one == other.yzx) | (one == other.zxy));
 }
 
-/* False where triangles surely have nothing in common but `count` corners, flagged in `common`.  Of two with a common
- * corner only the edges opposite to it can pass through the other triangle. */
-static inline int may_cut(
-    const uint3 one, const uint3 two, const int3 common, const int count, __global const float *restrict vertices)
+/* False where triangles surely have nothing in common but their common corners.  Of two with a common corner only the
+ * edges opposite to it can pass through the other triangle. */
+static inline int may_cut(const triangle one, const triangle two)
 {
-    const int3 flags = common_corners(two, one);
-    const uint3 own = turned(one, count == 2 ? 1 - common : common), its = turned(two, count == 2 ? 1 - flags : flags);
-    const float3 a = vload3(own.x, vertices), b = vload3(own.y, vertices), c = vload3(own.z, vertices);
-    const float3 d = vload3(its.x, vertices), e = vload3(its.y, vertices), f = vload3(its.z, vertices);
+    const int3 common = common_corners(one.names, two.names), flags = common_corners(two.names, one.names);
+    const int count = common.x + common.y + common.z;
+    const triangle own = turned(one, count == 2 ? 1 - common : common), its = turned(two, count == 2 ? 1 - flags : flags);
+    const float3 a = own.a, b = own.b, c = own.c, d = its.a, e = its.b, f = its.c;
     if (count == 2)
         return may_be_folded(a, b, c, d);
     const plane here = plane_of(a, b, c), there = plane_of(d, e, f);
-    const int3 ours = sides_of(&there, a, b, c), theirs = sides_of(&here, d, e, f);
-    if (may_pass(b, c, ours.y, ours.z, d, e, f) || may_pass(e, f, theirs.y, theirs.z, a, b, c))
+    const int our_a = side_of(&there, a), our_b = side_of(&there, b), our_c = side_of(&there, c);
+    const int its_d = side_of(&here, d), its_e = side_of(&here, e), its_f = side_of(&here, f);
+    if (may_pass(b, c, our_b, our_c, d, e, f) || may_pass(e, f, its_e, its_f, a, b, c))
         return 1;
     return count == 0
-        && (may_pass(a, b, ours.x, ours.y, d, e, f) || may_pass(c, a, ours.z, ours.x, d, e, f)
-            || may_pass(d, e, theirs.x, theirs.y, a, b, c) || may_pass(f, d, theirs.z, theirs.x, a, b, c));
+        && (may_pass(a, b, our_a, our_b, d, e, f) || may_pass(c, a, our_c, our_a, d, e, f)
+            || may_pass(d, e, its_d, its_e, a, b, c) || may_pass(f, d, its_f, its_d, a, b, c));
 }
 
-/* Parameters  vertices  in   (vertices, 3) coordinates, of which the largest has a magnitude of 1024 to 2048
- *             corners   in   (n, 3) vertices of the triangle of each entry
- *             low high  in   (n, 3) box of each entry
+/* Entries from place on that may cut the triangle: its box overlaps theirs, and neither lies on one side of the other's
+ * plane. */
+static inline ints not_apart(
+    __global const float *restrict places, __global const uint *restrict names, const uint stride, const uint place,
+    const ints counts, const triangle *own, const plane *flat, const float3 begin, const float3 end)
+{
+    floats at[9];
+    for (int n = 0; n < 9; ++n)
+        at[n] = load_lanes(places + (size_t)n * stride + place);
+    const points d = {at[0], at[1], at[2]}, e = {at[3], at[4], at[5]}, f = {at[6], at[7], at[8]};
+    ints left = counts & (greater(greater(d.x, e.x), f.x) >= begin.x) & (lesser(lesser(d.x, e.x), f.x) <= end.x);
+    left &= (greater(greater(d.y, e.y), f.y) >= begin.y) & (lesser(lesser(d.y, e.y), f.y) <= end.y);
+    left &= (greater(greater(d.z, e.z), f.z) >= begin.z) & (lesser(lesser(d.z, e.z), f.z) <= end.z);
+    if (!ANY_LANE(left))
+        return left;
+    ints common = (ints)(0);
+    for (int n = 0; n < 3; ++n) {
+        const ints name = load_lanes((__global const int *)names + (size_t)n * stride + place);
+        common += choose(
+            (name == (int)own->names.x) | (name == (int)own->names.y) | (name == (int)own->names.z), (ints)(1), (ints)(0));
+    }
+    const planes here = {spread(flat->corner), spread(flat->normal), spread(flat->terms)};
+    left &= (common != 3) & (lie_apart(&here, d, e, f, common) == 0);
+    if (!ANY_LANE(left))
+        return left;
+    const planes there = planes_of(d, e, f);
+    return left & (lie_apart(&there, spread(own->a), spread(own->b), spread(own->c), common) == 0);
+}
+
+/* Parameters  vertices   in   (vertices, 3) coordinates, of which the largest has a magnitude of 1024 to 2048
+ *             triangles  in   (count, 3) their corners
+ *             order      in   (count,) triangle of each entry
+ *             places     out  (10, stride) coordinates of the corners of each entry, x y z of the first, of the second, of
+ *                             the third; the lowest x
+ *             names      out  (3, stride) corners of each entry
+ * Launch      global = stride rounded up by the host, any local
+ * Guarantees  entries from count on lie at infinity */
+__kernel void enter_triangles(
+    __global const float *restrict vertices, __global const uint *restrict triangles, __global const uint *restrict order,
+    __global float *restrict places, __global uint *restrict names, const uint count, const uint stride)
+{
+    const uint entry = get_global_id(0);
+    if (entry >= stride)
+        return;
+    float low = INFINITY;
+    for (uint corner = 0; corner < 3; ++corner) {
+        const uint name = entry < count ? triangles[3 * (size_t)order[entry] + corner] : 0;
+        const float3 at = entry < count ? vload3(name, vertices) : (float3)(INFINITY);
+        names[(size_t)corner * stride + entry] = name;
+        __global float *row = places + 3 * (size_t)corner * stride + entry;
+        row[0] = at.x;
+        row[stride] = at.y;
+        row[2 * (size_t)stride] = at.z;
+        low = fmin(low, at.x);
+    }
+    places[9 * (size_t)stride + entry] = low;
+}
+
+/* Parameters  places names  in   (10, stride), (3, stride) see enter_triangles
  *             starts    in   (rows + 1,) first entry of each row; those of a level side by side, z * ny + y
  *             levels    in   (levels, 4) first row, rows along y, rows along z, and the end of the entries of each level
- *             edges     in   (levels,) width of the rows, at least 1, ascending
+ *             edges     in   (levels, 2) width of the rows, ascending, and longest side of the boxes
  *             origin_y origin_z   lowest corner of all boxes
  *             marks     in and out  (n + 31 / 32,) bits of entries
- *             first items   the entries of this launch;  level_count: levels
+ *             first items   the entries of this launch;  level_count: levels;  stride: at least n + LANES
  * Launch      global = items rounded up by the host, any local
- * Assumes     entries in the order of level, row and low x; boxes at most 0.998 edges long; at most 4096 rows along an axis
+ * Assumes     entries in the order of level, row and low x; at most 4096 rows along an axis
  * Guarantees  a bit is set for both triangles of each pair that cuts each other; bits are only added.
  *             Races: marks by atomic_or() alone */
 __kernel void mark_crossings(
-    __global const float *restrict vertices, __global const uint *restrict corners, __global const float *restrict low,
-    __global const float *restrict high, __global const uint *restrict starts, __global const uint *restrict levels,
-    __global const float *restrict edges, __global uint *restrict marks, const float origin_y, const float origin_z,
-    const uint first, const uint items, const uint level_count)
+    __global const float *restrict places, __global const uint *restrict names, __global const uint *restrict starts,
+    __global const uint *restrict levels, __global const float *restrict edges, __global uint *restrict marks,
+    const float origin_y, const float origin_z, const uint first, const uint items, const uint level_count,
+    const uint stride)
 {
     if (get_global_id(0) >= items)
         return;
     const uint entry = first + get_global_id(0);
-    const float3 begin = vload3(entry, low), end = vload3(entry, high);
-    const uint3 this = vload3(entry, corners);
-    const float3 a = vload3(this.x, vertices), b = vload3(this.y, vertices), c = vload3(this.z, vertices);
-    const plane own = plane_of(a, b, c);
+    __global const float *low_x = places + 9 * (size_t)stride;
+    const triangle own = triangle_at(places, names, stride, entry);
+    const float3 begin = fmin(fmin(own.a, own.b), own.c), end = fmax(fmax(own.a, own.b), own.c);
+    const plane flat = plane_of(own.a, own.b, own.c);
     uint own_level = 0;
     while (entry >= levels[4 * own_level + 3])
         ++own_level;
     for (uint level = own_level; level < level_count; ++level) {
         const uint first_row = levels[4 * level];
         const int ny = (int)levels[4 * level + 1], nz = (int)levels[4 * level + 2];
-        const float edge = edges[level], per_edge = 1.0f / edge;
-        const float from_y = (begin.y - origin_y) * per_edge, from_z = (begin.z - origin_z) * per_edge;
-        const int y0 = max((int)floor(from_y - 1.0f - SLACK), 0);
+        const float per_edge = 1.0f / edges[2 * level], reach = (1.0f + SLACK) * edges[2 * level + 1];
+        const float from_y = (begin.y - reach - origin_y) * per_edge;
+        const float from_z = (begin.z - (level == own_level ? 0.0f : reach) - origin_z) * per_edge;
+        const int y0 = max((int)floor(from_y - SLACK), 0);
         const int y1 = min((int)floor((end.y - origin_y) * per_edge + SLACK), ny - 1);
-        const int z0 = max((int)floor(from_z - (level == own_level ? SLACK : 1.0f + SLACK)), 0);
+        const int z0 = max((int)floor(from_z - SLACK), 0);
         const int z1 = min((int)floor((end.z - origin_z) * per_edge + SLACK), nz - 1);
-        const float least_x = begin.x - (1.0f + SLACK) * edge;
+        const float least_x = begin.x - reach;
         for (int z = z0; z <= z1; ++z)
             for (int y = y0; y <= y1; ++y) {
                 const uint row = first_row + (uint)z * (uint)ny + (uint)y;
@@ -195,27 +301,24 @@ __kernel void mark_crossings(
                 uint beyond = row_end;
                 while (place < beyond) { /* the first entry that begins at least_x or later */
                     const uint middle = place + (beyond - place) / 2u;
-                    if (low[3 * middle] < least_x)
+                    if (low_x[middle] < least_x)
                         place = middle + 1u;
                     else
                         beyond = middle;
                 }
-                for (; place < row_end && low[3 * place] <= end.x; ++place) {
-                    const float3 its_low = vload3(place, low), its_high = vload3(place, high);
-                    if (its_high.x < begin.x || its_low.y > end.y || its_high.y < begin.y || its_low.z > end.z
-                        || its_high.z < begin.z)
+                for (; place < row_end && low_x[place] <= end.x; place += LANES) {
+                    const ints counts = LANE_NUMBERS < (float)(row_end - place);
+                    const ints left = not_apart(places, names, stride, place, counts, &own, &flat, begin, end);
+                    if (!ANY_LANE(left))
                         continue;
-                    const uint3 that = vload3(place, corners);
-                    const int3 common = common_corners(this, that);
-                    const int count = common.x + common.y + common.z;
-                    const float3 d = vload3(that.x, vertices), e = vload3(that.y, vertices);
-                    const float3 f = vload3(that.z, vertices);
-                    if (count == 3 || apart(sides_of(&own, d, e, f), count))
-                        continue;
-                    const plane other = plane_of(d, e, f);
-                    if (!apart(sides_of(&other, a, b, c), count) && may_cut(this, that, common, count, vertices)) {
-                        atomic_or(&marks[entry / 32u], 1u << entry % 32u);
-                        atomic_or(&marks[place / 32u], 1u << place % 32u);
+                    int lanes[LANES];
+                    store_lanes(left, lanes);
+                    for (uint lane = 0; lane < LANES; ++lane) {
+                        const uint other = place + lane;
+                        if (lanes[lane] && may_cut(own, triangle_at(places, names, stride, other))) {
+                            atomic_or(&marks[entry / 32u], 1u << entry % 32u);
+                            atomic_or(&marks[other / 32u], 1u << other % 32u);
+                        }
                     }
                 }
             }

@@ -93,31 +93,19 @@ class Fans:
         found[self.around(vertices)[0]] = True
         return np.flatnonzero(found)
 
-
-class NeighbourSums:
-    """Sums over the neighbours of vertices, from the triangles that they share."""
-
-    def __init__(self, triangles: NDArray[np.uint32], count: int):
-        from scipy.sparse import csr_array
-
-        corners = triangles.astype(np.int32)
-        one = np.concatenate([corners[:, 0], corners[:, 1], corners[:, 2]])
-        other = np.concatenate([corners[:, 1], corners[:, 2], corners[:, 0]])
-        self._next = csr_array((np.ones(len(one), np.float32), (one, other)), shape=(count, count))
-
-    def sums(self, values: NDArray[np.floating], rows: IntArray | None = None) -> NDArray[Any]:
-        """Return the sum over each vertex, or each of `rows`, and its neighbours, shape (n, ...) as given."""
-        if rows is None:
-            return np.asarray(values + self._next @ values)
-        return np.asarray(values[rows] + self._next[rows] @ values)
-
-    def means(self, values: NDArray[np.floating], rows: IntArray) -> NDArray[Any]:
-        """Return the means over vertices `rows` and their neighbours, of values (n, k)."""
-        counts = 1 + np.diff(self._next.indptr)[rows]
-        return np.asarray(self.sums(values, rows) / counts[:, None])
+    def sums(self, values: NDArray[np.floating], triangles: NDArray[np.uint32], vertices: IntArray) -> NDArray[Any]:
+        """Return sums of values (n, k) over all corners of the triangles around vertices: neighbours count twice."""
+        rows, count = self.around(vertices)
+        found = np.zeros((len(vertices), values.shape[1]), values.dtype)
+        used = count > 0
+        if used.any():
+            of_rows = values[triangles[rows]].sum(axis=1)
+            found[used] = np.add.reduceat(of_rows, (np.cumsum(count) - count)[used])
+        return found
 
 
 def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:
+    """Group the half-edges by edge."""
     start = triangles.reshape(-1)
     end = triangles[:, (1, 2, 0)].reshape(-1)
     upward = start < end
@@ -144,7 +132,10 @@ def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:
 
 
 def opposite_half_edges(triangles: NDArray[np.uint32], edges: Edges) -> IntArray | None:
-    """Return the half-edge opposite each, (3 * m,); None unless every edge has two faces, oppositely run."""
+    """Return the half-edge on the other side of each half-edge, shape (3 * m,).
+
+    None unless every edge has two faces that run along it in opposite directions and no face has a vertex twice.
+    """
     clean = edges.oriented and edges.boundary == 0 and edges.nonmanifold == 0
     if not clean or len(edges.half_edges) != triangles.size:
         return None
@@ -256,7 +247,10 @@ def _connect(one: NDArray[np.integer], other: NDArray[np.integer], size: int) ->
 
 
 def count_duplicate_faces(triangles: NDArray[np.uint32], vertex_count: int, opposite: IntArray | None = None) -> int:
-    """Count triangles with the vertices of an earlier one, neighbours on all sides where given `opposite`."""
+    """Count the triangles that have the three vertices of an earlier one, in any order.
+
+    Where every edge has two faces (`opposite`), two triangles with the same vertices are neighbours on all three sides.
+    """
     if opposite is not None:
         return len(find_faces_back_to_back(opposite)) // 2
     found = find_duplicate_faces(triangles, vertex_count)

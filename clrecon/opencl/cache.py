@@ -78,7 +78,10 @@ def make_private(folder: Path) -> None:
 
 
 def find_fault(folder: Path) -> str:
-    """Return why built kernels in `folder`, made if absent, cannot be trusted, as the end of a sentence, or ""."""
+    """Return why built kernels in `folder` cannot be trusted or kept, as the end of a sentence; empty if they can.
+
+    The folder is made where it is not there.
+    """
     if not folder.is_absolute():
         return _RELATIVE
     try:
@@ -266,7 +269,10 @@ def read_binary(key: str) -> bytes | None:
 
 
 def store_binary(key: str, binary: bytes) -> None:
-    """Keep `binary` under `key`, whole or not at all, in place of the oldest; a folder that refuses is no error."""
+    """Keep `binary` under `key`, as a whole or not at all; the oldest binaries are removed when there are many.
+
+    A folder that cannot be written gives no error: this process has the program, and the next one builds it again.
+    """
     folder = prepare_caches().binaries
     if folder is None:
         return

@@ -327,7 +327,10 @@ def choose_name(cpuinfo: str) -> str:
 
 
 class NameOfCpu:
-    """The `address` where a PoCL device keeps the name of its CPU, and the name to write there."""
+    """The place where a PoCL device keeps the name of its CPU, and the name to write there.
+
+    address: Address of the driver's structure of the device (its ``cl_device_id``).
+    """
 
     def __init__(self, address: int):
         try:
@@ -338,6 +341,7 @@ class NameOfCpu:
             raise LookupError(str(error)) from error
 
     def write(self) -> None:
+        """Write the name, if it is not there yet."""
         try:
             with _Memory() as memory:
                 if memory.read_text(self._place) != self.name.encode():

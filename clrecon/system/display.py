@@ -70,7 +70,11 @@ class NoDisplayError(UsageError):
 
 @dataclass(frozen=True)
 class Display:
-    """What OpenGL's `driver` calls itself, and the `fault`, the end of a sentence, if no window can be opened."""
+    """What was found.
+
+    fault: Why no window can be opened, as the end of a sentence; None where one can.
+    driver: What OpenGL says that it draws with; empty where it says nothing.
+    """
 
     fault: str | None = None
     driver: str = ""

@@ -49,7 +49,11 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "keys": (("sorted_keys[place] = key;", "sorted_keys[place] = ~key;"),),
         "values": (("= numbered ? index : values[index];", "= ~(numbered ? index : values[index]);"),),
     },
-    "mark_crossings": {"marks": (("&& may_cut(this,", "&& !may_cut(this,"),)},
+    "enter_triangles": {
+        "places": (("row[0] = at.x;", "row[0] = -at.x;"),),
+        "names": (("stride + entry] = name;", "stride + entry] = name + 1;"),),
+    },
+    "mark_crossings": {"marks": (("&& may_cut(own,", "&& !may_cut(own,"),)},
     "clear_labels": {"labels": (("= UNUSED;", "= ~UNUSED;"),)},
     "hook_corners": {"labels": (("min(corner.x, min(corner.y, corner.z))", "max(corner.x, max(corner.y, corner.z))"),)},
     "jump_labels": {"labels": ((": follow_labels(", ": n - 1 - follow_labels("),)},

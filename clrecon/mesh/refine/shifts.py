@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import as_stored, find_coincident
-from clrecon.mesh.connectivity import find_edges, label_components
+from clrecon.mesh.connectivity import Fans, find_edges, label_components
 from clrecon.mesh.intersections import (
     FindCrossings,
     find_beside,
@@ -17,7 +17,6 @@ from clrecon.mesh.intersections import (
     find_changed_intersections,
     find_self_intersections,
 )
-from clrecon.mesh.refine.topology import TriangleFinder
 from clrecon.mesh.triangles import cross_products
 from clrecon.system.light_dataclass import dataclass
 
@@ -33,6 +32,9 @@ _ROUNDS = 40
 
 _SMALLEST_SHARE = 0.2
 """Least share of a step after halving; a step that would be shorter is not made at all."""
+
+_IN_A_ROW = 64
+"""Triangles that follow each other, which are near each other mostly, and are sorted out together."""
 
 _ROUNDS_OF_ITS_OWN = 3
 """After this many rounds the vertices around an offending place are taken back too."""
@@ -152,6 +154,7 @@ def move_vertices(
     step: Float64Array,
     find_crossings: FindCrossings = find_self_intersections,
     find_changed: Callable[[NDArray[np.floating], Float64Array], IntArray] | None = None,
+    fans: Fans | None = None,
 ) -> tuple[NDArray[np.floating], int]:
     """Move vertices, but by less or not at all where triangles would cut, lose their area or share a place.
 
@@ -168,7 +171,7 @@ def move_vertices(
     near: _Near | None = None
     for turn in range(_ROUNDS):
         if turn >= _ROUNDS_OF_ITS_OWN and near is not None:
-            spoilt = np.unique(triangles[near.touching(spoilt)])
+            spoilt = np.unique(triangles[near.fans.touching(spoilt)])
         spoilt = spoilt[share[spoilt] > 0.0]
         if len(spoilt):
             share[spoilt] *= 0.5
@@ -179,9 +182,9 @@ def move_vertices(
             share[spoilt] = 0.0
         if len(spoilt) == 0:
             break
-        near = near or _Near(vertices, moved, triangles)
+        near = near or _Near(vertices, moved, triangles, fans or Fans(triangles, len(moved)))
         moved[spoilt] = vertices[spoilt] + share[spoilt, None] * step[spoilt]
-        spoilt = near.find_spoilt(spoilt)
+        spoilt = near.find_spoilt(spoilt, find_crossings)
     return moved, int(np.count_nonzero(share < 1.0))
 
 
@@ -191,27 +194,29 @@ class _Near:
     vertices, moved: mm. Where vertices were, and are; between two calls of `find_spoilt` some go back on their way.
     """
 
-    def __init__(self, vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32]):
-        self._moved, self._triangles = moved, triangles
-        self._at = TriangleFinder(triangles)
+    def __init__(
+        self, vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans
+    ):
+        self._moved, self._triangles, self.fans = moved, triangles, fans
+        starts = np.arange(0, len(triangles), _IN_A_ROW)
         was, now = (find_boxes(places, triangles) for places in (vertices, moved))
-        self._low = np.minimum.reduceat(np.minimum(was[0], now[0]), self._at.starts)
-        self._high = np.maximum.reduceat(np.maximum(was[1], now[1]), self._at.starts)
+        self._low = np.minimum.reduceat(np.minimum(was[0], now[0]), starts)
+        self._high = np.maximum.reduceat(np.maximum(was[1], now[1]), starts)
 
-    def touching(self, vertices: IntArray) -> NDArray[np.int64]:
-        flags = np.zeros(len(self._moved), dtype=bool)
-        flags[vertices] = True
-        return self._at.find(flags)
+    def find_spoilt(self, vertices: IntArray, find_crossings: FindCrossings) -> IntArray:
+        """Find the vertices of spoilt triangles after these vertices went back.
 
-    def find_spoilt(self, vertices: IntArray) -> IntArray:
-        """Find the vertices of spoilt triangles after these vertices went back."""
-        moved, changed = self._moved, self.touching(vertices)
+        What is spoilt elsewhere has nothing around it that could still be taken back.
+        """
+        moved, changed = self._moved, np.zeros(len(self._triangles), dtype=bool)
+        changed[self.fans.touching(vertices)] = True
         boxes = find_boxes(moved, self._triangles[changed])
-        rows = self._at.rows_of(find_boxes_beside(self._low, self._high, *boxes))
-        rows = rows[find_beside(moved, self._triangles[rows], np.isin(rows, changed))]
+        pieces = find_boxes_beside(self._low, self._high, *boxes)
+        rows = np.flatnonzero(np.repeat(pieces, _IN_A_ROW)[: len(changed)])
+        rows = rows[find_beside(moved, self._triangles[rows], changed[rows])]
         used, local = np.unique(self._triangles[rows], return_inverse=True)
         corners = local.reshape(-1, 3).astype(np.uint32)
-        return used[_find_spoilt(moved[used], corners, np.isin(rows, changed), find_self_intersections)]
+        return used[_find_spoilt(moved[used], corners, changed[rows], find_crossings)]
 
 
 def _find_spoilt(

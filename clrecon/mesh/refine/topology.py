@@ -22,7 +22,10 @@ LISTED = 20
 
 @dataclass(frozen=True, eq=False)
 class Topology:
-    """Euler numbers of components, 2 less a tunnel, their faces, and the edges that are not in two faces."""
+    """Euler numbers of the components of a surface, their faces, and the edges that are not in two faces.
+
+    euler: Vertices - edges + faces of each: 2 for a closed surface without tunnels, and 2 less for each tunnel.
+    """
 
     euler: NDArray[np.int64]
     faces: NDArray[np.int64]
@@ -95,30 +98,6 @@ def any_corner(flags: NDArray[np.bool_], triangles: IntArray) -> NDArray[np.bool
     return np.asarray(one | two | three)
 
 
-class TriangleFinder:
-    """Triangles, (m, 3), found by their vertices in pieces of some hundred in a row."""
-
-    PIECE = 256
-
-    def __init__(self, triangles: IntArray):
-        self._triangles = triangles
-        self.starts = np.arange(0, len(triangles), self.PIECE)
-        self._first = np.minimum.reduceat(triangles.min(axis=1), self.starts)
-        self._last = np.maximum.reduceat(triangles.max(axis=1), self.starts)
-
-    def find(self, flags: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Return the triangles, in order, that have a corner whose flag is set."""
-        vertices = np.flatnonzero(flags)
-        pieces = np.searchsorted(vertices, self._first) < np.searchsorted(vertices, self._last, "right")
-        if 2 * np.count_nonzero(pieces) > len(pieces):
-            return np.flatnonzero(any_corner(flags, self._triangles))
-        rows = self.rows_of(pieces)
-        return rows[any_corner(flags, self._triangles[rows])]
-
-    def rows_of(self, pieces: NDArray[np.bool_]) -> NDArray[np.int64]:
-        return np.flatnonzero(np.repeat(pieces, self.PIECE)[: len(self._triangles)])
-
-
 def find_sheets(faces: NDArray[np.uint32], size: int, edges: Edges) -> list[IntArray]:
     """Find the vertices at edges with several sheets, of doubled faces and of several fans of faces."""
     faults = _find_ridges(faces, edges)
@@ -140,7 +119,10 @@ def _find_ridges(faces: NDArray[np.uint32], edges: Edges) -> list[IntArray]:
 
 
 def find_faults_beside(faces: NDArray[np.uint32], new: NDArray[np.bool_]) -> IntArray:
-    """Find the faults of `find_sheets` that the vertices `new`, which every new face has one of, can have made."""
+    """Find the same faults as `find_sheets`, but only those that new vertices can have made.
+
+    new: Vertices that were not there, or elsewhere: every face that is new has one of them.
+    """
     touched = np.zeros(len(new), dtype=bool)
     touched[faces[any_corner(new, faces)]] = True
     # With their neighbours: the fans around the touched vertices and the faces along their edges are complete.

@@ -68,7 +68,9 @@ CELLS_AN_ITEM = 32
 
 @dataclass(frozen=True, eq=False)
 class FreeClusters:
-    """Result of `cluster_free_points`: clusters, by their first core point, -1 for noise, and facts for a report."""
+    """The result of `cluster_free_points`: clusters, numbered by their first core point, -1 for noise, and facts for a
+    report.
+    """
 
     labels: NDArray[np.int32]
     cores: NDArray[np.bool_]

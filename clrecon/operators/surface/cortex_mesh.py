@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
-from clrecon.mesh.connectivity import NeighbourSums
+from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.refine.shifts import move_vertices
-from clrecon.mesh.refine.topology import TriangleFinder
 from clrecon.mesh.triangles import cross_product, vertex_normals
 from clrecon.opencl import Device, Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
@@ -82,68 +81,67 @@ class CortexReport(Record):
     thickness_mm: dict[str, float]
 
 
-def choose_shifts(fit: CortexFit, rings: NeighbourSums) -> NDArray[np.float32]:
+def choose_shifts(fit: CortexFit, triangles: NDArray[np.uint32], fans: Fans) -> NDArray[np.float32]:
     """Return the shift of each vertex, mm: that of the fit; 0 where there is no wall.
 
     What is badly fitted lies where its neighbours say, with the weights 1 / error^2.  Others are not smoothed: shifts
     undo the waves of the level's surface, and means of them keep these (0.15 mm became 0.17 at a noise of 50 HU).
     """
-    fitted, doubtful = fit.states == FITTED, fit.states == BADLY_FITTED
+    fitted, doubtful = fit.states == FITTED, np.flatnonzero(fit.states == BADLY_FITTED)
     shifts = np.where(fitted, fit.shift_mm, 0.0).astype(np.float32)
-    if doubtful.any():
-        weights = np.where(fitted, 1.0 / np.square(np.maximum(fit.error_mm, 1e-3)), 0.0).astype(np.float32)
-        summed = rings.sums(np.column_stack([weights, weights * shifts]))
-        known = doubtful & (summed[:, 0] > 0.0)
-        shifts[known] = summed[known, 1] / summed[known, 0]
+    weights = np.where(fitted, 1.0 / np.square(np.maximum(fit.error_mm, 1e-3)), 0.0)
+    weight, weighted = fans.sums(np.column_stack([weights, weights * shifts]), triangles, doubtful).T
+    known = weight > 0.0
+    shifts[doubtful[known]] = weighted[known] / weight[known]
     return np.clip(shifts, -MOST_SHIFT_MM, MOST_SHIFT_MM)
 
 
 def calm_vertices(
-    vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32], rings: NeighbourSums
+    vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans
 ) -> NDArray[np.float64]:
     """Return moved vertices with no triangle turned over: the corners of such go to the mean of their neighbours, and
     after some rounds back half the way, and at last all of it.
     """
     places = moved.astype(np.float64)
-    before, at = _crosses(vertices, triangles), TriangleFinder(triangles)
-    rows = np.arange(len(triangles))
+    rows = np.flatnonzero(find_turned(vertices, places, triangles))
     for turn in range(CALM_ROUNDS + SHORT_ROUNDS + 1):
-        turned = _turned(places, triangles[rows], before[:, rows])
-        if not turned.any():
+        if not len(rows):
             break
-        bad = np.zeros(len(vertices), bool)
-        bad[triangles[rows[turned]]] = True
+        bad = np.unique(triangles[rows])
         if turn == CALM_ROUNDS + SHORT_ROUNDS:
-            bad[triangles[at.find(bad)]] = True
+            bad = np.unique(triangles[fans.touching(bad)])
             places[bad] = vertices[bad]
         elif turn >= CALM_ROUNDS:
             places[bad] = 0.5 * (places[bad] + vertices[bad])
         else:
-            places[bad] = rings.means(places, np.flatnonzero(bad))
-        rows = at.find(bad)
+            count = np.diff(fans.begin)[bad, None]
+            beside = 0.5 * (fans.sums(places, triangles, bad) - count * places[bad])
+            places[bad] = (places[bad] + beside) / (1.0 + count)
+        rows = fans.touching(bad)
+        rows = rows[find_turned(vertices, places, triangles[rows])]
     return places
 
 
-def _crosses(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Return the cross products of the triangles' edges, shape (3, m)."""
-    found = np.empty((3, len(triangles)))
+def find_turned(
+    vertices: NDArray[np.floating], places: Float64Array, triangles: NDArray[np.uint32]
+) -> NDArray[np.bool_]:
+    """Mark the triangles that turn by more than `LEAST_TURN` lets, where their vertices go to these places."""
+    found = np.empty(len(triangles), bool)
 
     def work(where: slice) -> None:
-        one, two, three = (vertices.take(corners, axis=0).T.astype(np.float64) for corners in triangles[where].T)
-        found[:, where] = cross_product(two - one, three - one)
+        before, after = (
+            cross_product(two - one, three - one)
+            for one, two, three in (
+                (points.take(corners, axis=0).T.astype(np.float64) for corners in triangles[where].T)
+                for points in (vertices, places)
+            )
+        )
+        along = np.einsum("an,an->n", after, before)
+        squares = np.einsum("an,an->n", after, after) * np.einsum("an,an->n", before, before)
+        found[where] = along <= LEAST_TURN * np.sqrt(squares)
 
     in_threads(work, len(triangles))
     return found
-
-
-def _turned(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], before: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Mark the triangles that turned by more than `LEAST_TURN` lets."""
-    after = _crosses(vertices, triangles)
-    along = np.einsum("an,an->n", after, before)
-    squares = np.einsum("an,an->n", after, after) * np.einsum("an,an->n", before, before)
-    return np.asarray(along <= LEAST_TURN * np.sqrt(squares))
 
 
 @explains_arguments
@@ -215,13 +213,13 @@ def fit_mesh(
     fit = fit_walls(resident, mesh.vertices, normals, stopwatch=Stopwatch(), constants=constants)
     _refuse_few(int(np.count_nonzero(fit.states == FITTED)), len(fit.states))
     steps.take()
-    rings = NeighbourSums(mesh.triangles, mesh.vertex_count)
-    shifts = choose_shifts(fit, rings)
+    fans = Fans(mesh.triangles, mesh.vertex_count)
+    shifts = choose_shifts(fit, mesh.triangles, fans)
     wanted = mesh.vertices + shifts[:, None] * normals.astype(np.float64)
-    calm = calm_vertices(mesh.vertices, wanted, mesh.triangles, rings)
+    calm = calm_vertices(mesh.vertices, wanted, mesh.triangles, fans)
     steps.take()
     vertices, _ = move_vertices(
-        mesh.vertices, mesh.triangles, calm - mesh.vertices, partial(find_crossings, resident.device)
+        mesh.vertices, mesh.triangles, calm - mesh.vertices, partial(find_crossings, resident.device), fans=fans
     )
     steps.take()
     fitted = fit.states == FITTED

@@ -22,6 +22,7 @@ from clrecon.mesh.refine.deviation import WITNESSES, SurfaceBounds
 from clrecon.opencl import (
     Device,
     Program,
+    allocate,
     check_budget,
     describe_shortage,
     download,
@@ -51,8 +52,12 @@ FINEST = 0.97
 """Share of the triangles that belong to the finest level.  With a half, extracted and decimated surfaces took 1.2 to
 1.5 times the time: each level is looked through by itself."""
 
-LONGEST = 1.0 / 0.998
-"""Edge of a level for the longest box in it: what the kernel needs for the rounding of rows."""
+ROW_BOXES = 2.0
+"""Width of the rows in boxes as long as `FINEST` has them.  With one or three, rows are looked up or looked through
+for a tenth longer."""
+
+MOST_LANES = 8
+"""Entries that the kernel looks at together."""
 
 PIECE = 1 << 17
 """Triangles of a launch; progress is reported between launches."""
@@ -65,24 +70,27 @@ class CrossingPlan:
     """Triangles in the rows of levels, as the kernel reads them.
 
     vertices: ndarray, shape (v, 3), float32. Scaled by a power of two, which changes no digit.
-    order, corners: ndarray, shape (n,) int64, (n, 3) uint32. Triangle of each entry, and its corners.
-    low, high: ndarray, shape (n, 3), float32. Boxes of the entries.
+    triangles: ndarray, shape (n, 3), uint32
+    order: ndarray, shape (n,), uint32. Triangle of each entry.
     starts: ndarray, uint32. First entry of each row, and the number of entries.
     levels, edges: ndarray, shape (levels, 4) uint32, (levels,) float32
     """
 
     vertices: Float32Array
-    order: NDArray[np.int64]
-    corners: NDArray[np.uint32]
-    low: Float32Array
-    high: Float32Array
+    triangles: NDArray[np.uint32]
+    order: NDArray[np.uint32]
+    origin: Float32Array
     starts: NDArray[np.uint32]
     levels: NDArray[np.uint32]
     edges: Float32Array
 
+    @property
+    def stride(self) -> int:
+        return len(self.order) + MOST_LANES
+
     def needs(self) -> dict[str, int]:
-        tables = ("vertices", "corners", "low", "high", "starts", "levels", "edges")
-        return {"triangles in rows": sum(getattr(self, name).nbytes for name in tables), "marks": len(self.order) // 8}
+        given = self.vertices.nbytes + self.triangles.nbytes + self.order.nbytes
+        return {"triangles in rows": given + 52 * self.stride + self.starts.nbytes, "marks": len(self.order) // 8}
 
 
 def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> CrossingPlan:
@@ -90,50 +98,47 @@ def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> Cro
     scaled = np.ldexp(vertices, 11 - int(np.frexp(np.abs(vertices).max())[1]))
     low, high = find_boxes(scaled, triangles)
     box = (high - low).T
-    longest = LONGEST * np.maximum(np.maximum(box[0], box[1]), box[2]).astype(np.float64)
+    longest = np.maximum(np.maximum(box[0], box[1]), box[2]).astype(np.float64)
     origin, beyond = (corner.astype(np.float64) for corner in find_bounds(low))
-    edge = max(1.0, float(np.quantile(longest[:: max(1, len(longest) // 10_000)], FINEST)))
+    edge = max(1.0, ROW_BOXES * float(np.quantile(longest[:: max(1, len(longest) // 10_000)], FINEST)))
     while np.prod(np.floor((beyond - origin)[1:] / edge) + 1.0) > MOST_ROWS:
         edge *= 1.25
     level = np.ceil(np.log2(np.maximum(longest / edge, 1.0))).astype(np.int64)
     edges = (edge * 2.0 ** np.arange(int(level.max()) + 1)).astype(np.float32)
-    # An edge rounded to float32 is far nearer to the edge than the longest box.
     size = (np.floor((beyond - origin)[1:] / edges[:, None].astype(np.float64)) + 1.0).astype(np.int64)  # y, z
     first_row = np.concatenate([[0], np.cumsum(size.prod(axis=1))])
     row = first_row.take(level)
     width = edges.astype(np.float64).take(level)
     row += ((low[:, 1] - origin[1]) / width).astype(np.int64)
     row += size[:, 0].take(level) * ((low[:, 2] - origin[2]) / width).astype(np.int64)
-    bits = np.ascontiguousarray(low[:, 0]).view(np.int32)
-    along = np.where(bits < 0, bits ^ 0x7FFFFFFF, bits)  # in the order of the numbers
-    order = _order_by(along)
-    order = order.take(_order_by(row.take(order)))
+    bits = np.ascontiguousarray(low[:, 0]).view(np.int32).astype(np.int64)
+    order = np.argsort(row << 32 | np.where(bits < 0, ~bits, bits + (1 << 31)))  # by row, then by number
     starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=first_row[-1]))]).astype(np.uint32)
     levels = np.column_stack([first_row[:-1], size, starts[first_row[1:]]]).astype(np.uint32)
-    low, high = low.take(order, axis=0), high.take(order, axis=0)
-    return CrossingPlan(scaled, order, triangles.take(order, axis=0), low, high, starts, levels, edges)
-
-
-def _order_by(numbers: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Return the stable order of numbers of 32 bits; sorting them with their places is far faster than `argsort`."""
-    return np.sort(numbers.astype(np.int64) << 32 | np.arange(len(numbers))) & 0xFFFFFFFF
+    longest_of = np.zeros(len(edges))
+    np.maximum.at(longest_of, level, longest)
+    table = np.column_stack([edges, longest_of]).astype(np.float32)
+    return CrossingPlan(scaled, triangles, order.astype(np.uint32), origin.astype(np.float32), starts, levels, table)
 
 
 def mark_crossings(device: Device, plan: CrossingPlan, *, steps: Steps | None = None) -> NDArray[np.bool_]:
     """Mark the triangles that may cut another one, shape (n,), in the order of the mesh."""
     count = len(plan.order)
-    kernel = load_program(device, "surface/crossings.cl")["mark_crossings"]
+    program = load_program(device, "surface/crossings.cl", {"LANES": device.kernel_variants["LANES"]})
+    places_d, names_d = (allocate(device, 4 * rows * plan.stride) for rows in (10, 3))
+    launch(
+        device, program["enter_triangles"], plan.stride, vertices=upload(device, plan.vertices),
+        triangles=upload(device, plan.triangles), order=upload(device, plan.order), places=places_d, names=names_d,
+        count=count, stride=plan.stride,
+    )  # fmt: skip
     marks_d = zero_words(device, (count + 31) // 32)
-    buffers = {
-        name: upload(device, getattr(plan, name))
-        for name in ("vertices", "corners", "low", "high", "starts", "levels", "edges")
-    }
-    origin = find_bounds(plan.low)[0]
+    starts_d, levels_d, edges_d = (upload(device, table) for table in (plan.starts, plan.levels, plan.edges))
     for first in range(0, count, PIECE):
         items = min(PIECE, count - first)
         launch(
-            device, kernel, items, **buffers, marks=marks_d, origin_y=origin[1],
-            origin_z=origin[2], first=first, items=items, level_count=len(plan.edges),
+            device, program["mark_crossings"], items, places=places_d, names=names_d, starts=starts_d, levels=levels_d,
+            edges=edges_d, marks=marks_d, origin_y=plan.origin[1], origin_z=plan.origin[2], first=first, items=items,
+            level_count=len(plan.edges), stride=plan.stride,
         )  # fmt: skip
         if steps is not None:
             wait(device)

@@ -17,7 +17,9 @@ MESH, CLOUD, PICTURE = "mesh", "cloud", "picture"
 
 @dataclass(frozen=True)
 class Compared:
-    """A method that is compared, by a `peer` or clrecon, on the device or not: a "mesh", "cloud" or "picture"."""
+    """A method that is compared; it makes a "mesh", "cloud" or "picture", on the device or not, by a `peer` or by
+    clrecon.
+    """
 
     name: str
     title: str

@@ -34,7 +34,9 @@ def _check_crossings(device: Device) -> str:
     return f"{int(found.sum()):,} of {len(found):,} triangles that cut another one"
 
 
-CROSSING_CHECKS = (Check("triangles that cut each other", ("mark_crossings", "clear_words"), _check_crossings),)
+CROSSING_CHECKS = (
+    Check("triangles that cut each other", ("enter_triangles", "mark_crossings", "clear_words"), _check_crossings),
+)
 
 
 SIZE = 40

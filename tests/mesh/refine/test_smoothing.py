@@ -17,7 +17,6 @@ from clrecon.mesh.refine import shifts
 from clrecon.mesh.refine.decimation import default_deviation
 from clrecon.mesh.refine.shifts import move_vertices, shorten_steps
 from clrecon.mesh.refine.smoothing import Filter, Rings, sinc_terms, smooth_mesh
-from clrecon.mesh.refine.topology import TriangleFinder
 from clrecon.mesh.triangles import vertex_normals
 
 pytestmark = pytest.mark.unit
@@ -231,13 +230,10 @@ def test_steps_are_taken_back_as_if_all_triangles_were_looked_at_after_each_roun
         return find_spoilt(places, faces, *more)
 
     class All:
-        def __init__(self, before, places, faces):
-            self.places, self.faces = places, faces
+        def __init__(self, before, places, faces, fans):
+            self.places, self.faces, self.fans = places, faces, fans
 
-        def touching(self, those):
-            return np.flatnonzero(np.isin(self.faces, those).any(axis=1))
-
-        def find_spoilt(self, those):
+        def find_spoilt(self, those, find_crossings):
             changed = np.isin(self.faces, those).any(axis=1)
             return find_spoilt(self.places, self.faces, changed, find_self_intersections)
 
@@ -255,7 +251,7 @@ def test_steps_are_taken_back_as_if_all_triangles_were_looked_at_after_each_roun
 
 def test_what_is_in_the_way_back_is_found(monkeypatch):
     """A box that would go into a wall finds another half way, of which nothing lies where it was to go."""
-    monkeypatch.setattr(TriangleFinder, "PIECE", 4)
+    monkeypatch.setattr(shifts, "_IN_A_ROW", 4)
     walls = [samples.box((place, -5, -5), (0.2, 10, 10)) for place in (8.4, 4.4)]
     vertices, triangles = samples.join(samples.box(), *walls)
     step = np.zeros((24, 3))

@@ -15,10 +15,11 @@ from clrecon.geometry import Volume
 from clrecon.jobs.mesh.choices import LabelChoice
 from clrecon.jobs.mesh.make import _try_steps
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.intersections import find_self_intersections
 from clrecon.opencl.launching import launch
-from clrecon.operators.surface import cortex, cortex_mesh, decimation
-from clrecon.operators.surface.cortex_mesh import NeighbourSums, calm_vertices
+from clrecon.operators.surface import cortex, decimation
+from clrecon.operators.surface.cortex_mesh import calm_vertices, find_turned
 from clrecon.operators.surface.extract import extract_isosurface
 
 MIDDLE = np.array([19.5, 19.0, 18.0])
@@ -77,14 +78,21 @@ def test_what_is_said(fitted, level):
 def test_triangles_that_would_turn_over_are_calmed(level):
     random = np.random.default_rng(4)
     wild = level.vertices + random.normal(0.0, 0.4, level.vertices.shape)
-    calm = calm_vertices(level.vertices, wild, level.triangles, NeighbourSums(level.triangles, level.vertex_count))
-    before = cortex_mesh._crosses(level.vertices, level.triangles)
-    assert cortex_mesh._turned(wild, level.triangles, before).mean() > 0.05
-    assert not cortex_mesh._turned(calm, level.triangles, before).any()
-    same = calm_vertices(
-        level.vertices, level.vertices, level.triangles, NeighbourSums(level.triangles, level.vertex_count)
-    )
+    fans = Fans(level.triangles, level.vertex_count)
+    calm = calm_vertices(level.vertices, wild, level.triangles, fans)
+    assert find_turned(level.vertices, wild, level.triangles).mean() > 0.05
+    assert not find_turned(level.vertices, calm, level.triangles).any()
+    same = calm_vertices(level.vertices, level.vertices, level.triangles, fans)
     assert np.array_equal(same, level.vertices)
+
+
+def test_sums_over_triangles_are_twice_those_over_neighbours(level):
+    fans, some = Fans(level.triangles, level.vertex_count + 1), np.array([4, 7, level.vertex_count, 90])
+    values = np.random.default_rng(1).normal(size=(level.vertex_count + 1, 2))
+    for vertex, found in zip(some, fans.sums(values, level.triangles, some), strict=True):
+        own = level.triangles[(level.triangles == vertex).any(axis=1)]
+        beside = np.setdiff1d(own, [vertex])
+        np.testing.assert_allclose(found, len(own) * values[vertex] + 2.0 * values[beside].sum(axis=0), atol=1e-12)
 
 
 def test_values_go_with_their_vertices_into_parts_and_files(fitted, tmp_path):
@@ -160,7 +168,7 @@ def test_the_trial_run_launches_the_kernels_of_the_cortex(labels, device, monkey
         monkeypatch.setattr(module, "launch", note)
     choice = LabelChoice("labels.nii.gz") if labels else None
     _try_steps(device, MeshSettings(surface="cortex", labels=choice))
-    assert launched == {"sample_profiles", "fit_profiles", "mark_crossings"}
+    assert launched == {"sample_profiles", "fit_profiles", "enter_triangles", "mark_crossings"}
 
 
 def test_a_print_lies_on_the_bone(shell, tmp_path, capsys):
