@@ -59,7 +59,6 @@ def _voxels_of_a_cell(volume: Volume) -> tuple[int, int, int]:
 
 
 def count_cells(volume: Volume) -> tuple[int, int, int]:
-    """Return the number of cells along k, j, i."""
     sizes = zip(volume.shape_ijk, _voxels_of_a_cell(volume), strict=True)
     ci, cj, ck = (-(-size // step) for size, step in sizes)
     return ck, cj, ci

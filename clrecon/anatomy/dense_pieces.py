@@ -144,10 +144,7 @@ INSIDE, HARD_INSIDE = 0.5, 0.25
 
 @dataclass(frozen=True)
 class DensePieces:
-    """Decision on all dense pieces: cells (ck, cj, ci) of the body beside those found by thickness, and those of bone.
-
-    specimen: The scan shows dry bone without soft tissue.
-    """
+    """Decision on all dense pieces: cells (ck, cj, ci) of the body, and of bone; `specimen` is bone without tissue."""
 
     specimen: bool
     added: Mask
@@ -188,7 +185,6 @@ def _label(cells: Cells, mask: Mask) -> _Pieces:
 
 
 def _sum_by(labels: NDArray[np.int32], of: NDArray[Any], count: int) -> Float64Array:
-    """Return the sum for each label; 0 for label 0."""
     labelled = labels > 0
     return np.bincount(labels[labelled], weights=of[labelled], minlength=count + 1).astype(np.float64)
 
@@ -323,10 +319,7 @@ def _room(cells: Cells, pieces: _Pieces, chosen: Mask) -> Float64Array:
 
 
 def judge_bone(cells: Cells, pieces: DensePieces, kept: Mask) -> tuple[dict[str, Any], Gate]:
-    """Count the dense voxels that stay in the body with its margin (`kept`), and judge ``bone_kept`` by `BONE_KEPT`.
-
-    ``bone_voxels`` are above 300 HU in pieces that count, ``other_voxels_removed`` in tables and cables.
-    """
+    """Count the dense voxels that stay in the body (`kept`), and judge ``bone_kept`` by `BONE_KEPT`."""
     bone = int(cells.dense[pieces.counted].sum(dtype=np.int64))
     lost = int(cells.dense[pieces.counted & ~kept].sum(dtype=np.int64))
     removed = int(cells.dense[~kept].sum(dtype=np.int64))

@@ -160,10 +160,7 @@ def _walk(
 
 
 def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float, float]:
-    """Leave out edges that end in flat, faint plateaus (contrast medium), unless most do.
-
-    Returns also the shares of the contrast that were left out, and that are flat and faint.
-    """
+    """Leave out edges of contrast medium, unless most are; return also the shares left out, and flat and faint."""
     total = edges.contrast.sum()
     share = float(edges.contrast[edges.flat].sum() / total) if total else 0.0
     if share > LARGEST_FLAT_SHARE:
@@ -410,7 +407,6 @@ def _no_bone(found: _Look) -> str:
 
 
 def _median(values: NDArray[Any], weights: NDArray[Any], share: float = 0.5) -> float:
-    """Return the weighted median; 0 for an empty array."""
     if not len(values):
         return 0.0
     order = np.argsort(values, kind="stable")

@@ -169,10 +169,7 @@ def lies_in_air(volume: Volume) -> bool:
 
 
 class OwnScale(NamedTuple):
-    """A scale of values that are not HU, by two values and the HU that they stand for.
-
-    said: Where the two values come from.
-    """
+    """A scale of values that are not HU, by two values and the HU that they stand for; `said`: where these are from."""
 
     low: float
     high: float
@@ -205,7 +202,6 @@ class OwnScale(NamedTuple):
         return (self.high_hu - self.low_hu) / (self.high - self.low)
 
     def to_hu(self, values: NDArray[Any]) -> NDArray[np.float32]:
-        """Return a slice in HU."""
         return (np.asarray(values, np.float32) - np.float32(self.low)) * np.float32(self.slope) + np.float32(
             self.low_hu
         )

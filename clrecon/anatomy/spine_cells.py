@@ -240,7 +240,6 @@ class Likeness:
     first: tuple[int, int]
 
     def box_of(self, cells: SpineCells) -> SpineCells:
-        """Return the box of the cells that was measured."""
         (row, column), (_, ny, nx) = self.first, self.worth.shape
         return SpineCells(cells.values[:, row : row + ny, column : column + nx], cells.origin)
 

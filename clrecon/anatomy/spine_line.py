@@ -71,10 +71,7 @@ class SpineEnd:
 
 
 def follow(likeness: Likeness, path: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Follow the canal beyond both ends of a path (n, 3) of cells (k, j, i) of the likeness, one a slice, k ascending.
-
-    New slices have the traits of `STILL`, but for gaps up to `GAP_MM` between them.
-    """
+    """Follow the canal beyond both ends of a path (n, 3) of cells (k, j, i) by the traits of `STILL`, over `GAP_MM`."""
     below = _beyond(likeness, path[0], -1)[::-1]
     above = _beyond(likeness, path[-1], 1)
     return np.concatenate([below, path, above])

@@ -255,7 +255,6 @@ def add_fields(container: argparse._ActionsContainer, settings: type, *groups: s
 
 
 def add_output(parser: argparse._ActionsContainer, text: str, metavar: str = "OUT", required: bool = True) -> None:
-    """Add -o."""
     parser.add_argument("-o", "--output", metavar=metavar, required=required, help=text, first=True)
 
 

@@ -138,7 +138,6 @@ _REDRAW_SECONDS = 0.1
 
 
 def describe_stage(stage: str) -> str:
-    """Return the words for a stage of the progress."""
     return _STAGES.get(stage, stage)
 
 
@@ -329,10 +328,7 @@ _PIECE = 1 << 20
 
 @contextmanager
 def filled_streams(command: str, options: argparse.Namespace, console: Console) -> Iterator[None]:
-    """Let a command run in the block; what it should write to ``-`` goes to standard output once it is done.
-
-    A file is made as a whole first, checked as any other, and then copied: nothing of it appears if the command fails.
-    """
+    """Let a command run in the block; files meant for ``-`` go to standard output, whole, once it is done."""
     wanted = {name: str(getattr(options, name, None) or "") for name in _FILES}
     wanted = {name: value for name, value in wanted.items() if value == DASH or value.startswith(f"{DASH}.")}
     has_report = getattr(options, "report", None) == DASH

@@ -204,11 +204,7 @@ class _Sink(io.StringIO):
 def render_listing(
     listing: dict[str, Any], certificate: Sequence[tuple[str, str]], refused: int | None = None
 ) -> list[str]:
-    """Lay out a listing for stdout; with styles only if that is a terminal and ``NO_COLOR`` is not set.
-
-    certificate: Description of the series that was judged.
-    refused: Number of a series whose problems are said elsewhere.
-    """
+    """Lay out a listing, styled on a terminal; `certificate` is of the judged series, `refused` was said elsewhere."""
     terminal = is_terminal(sys.stdout)
     width = max(shutil.get_terminal_size().columns, _NARROWEST) if terminal else _UNLIMITED
     entries = listing["series"]  # in the order of their numbers: by patient, study and number in the study

@@ -314,7 +314,6 @@ def _show_meshes_alone(options: argparse.Namespace) -> None:
 
 
 def describe_report(report: dict[str, Any]) -> list[str]:
-    """Describe a report for people: the input, the pictures, the device, the time."""
     return [
         f"input    {_describe_input(report)}",
         f"picture  {_describe_look(report)}",

@@ -66,7 +66,6 @@ def checked_affine(affine: ArrayLike) -> Float64Array:
 
 
 def apply_affine(affine: Float64Array, points: ArrayLike) -> Float64Array:
-    """Map points (n, 3) through an affine, in float64."""
     return checked_points(points) @ affine[:3, :3].T + affine[:3, 3]
 
 
@@ -110,10 +109,7 @@ def tilt_degrees(affine: Float64Array) -> float:
 
 
 def signed_tilt(affine: Float64Array) -> float:
-    """Angle of `tilt_degrees` with a sign: positive where the front edge of a slice lies nearer the head than its back.
-
-    Stacks that do not run along the patient's long axis have no such edges; their angle is positive.
-    """
+    """Signed `tilt_degrees`: positive where a slice's front edge lies nearer the head, and off the long axis."""
     step, normal = affine[:3, 2] / np.linalg.norm(affine[:3, 2]), slice_normal(affine)
     forward = np.array((0.0, -1.0, 0.0)) + normal[1] * normal  # anterior, within the slice
     leans_back = float(forward @ step) * float(np.sign(step[2])) < 0.0

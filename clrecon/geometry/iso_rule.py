@@ -348,10 +348,7 @@ def layer_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
 
 
 def takes_parts(volume: Volume, ray_step: float) -> bool:
-    """True where ray steps of `ray_step` mm pass through every cell on their way: no index changes by more than 1.
-
-    Between two samples of this kind values are nearly linear: volume rendering may divide the segment between them.
-    """
+    """True where ray steps of `ray_step` mm pass through every cell: no index changes by more than 1."""
     steps_per_mm = np.linalg.norm(layer_normal_matrices(volume, border=0), axis=1)
     return bool(ray_step * steps_per_mm.max() <= 1.0)
 

@@ -146,7 +146,6 @@ def air_of(dtype: np.dtype[Any]) -> float:
 
 
 def resample_volume(volume: Own, to: float | Sequence[float] | BaseVolume, *, progress: Progress | None = None) -> Own:
-    """See `Volume.resample`."""
     report, air = progress or ignore_progress, air_of(volume.dtype)
     figures: dict[str, Any] = {"method": "trilinear"}
     if isinstance(to, BaseVolume):

@@ -141,10 +141,7 @@ def warnings_of_far(volume: Volume) -> list[str]:
 
 
 def find_vertex_origin(volume: Volume) -> Float64Array | None:
-    """Return the point (3,) in LPS mm that float32 vertices are counted from; None for the origin of the frame.
-
-    Whole millimetres near the centre of a volume that reaches `FAR_MM` or more.
-    """
+    """Return whole mm (3,), LPS, that float32 vertices count from if the volume reaches `FAR_MM`, else None."""
     if largest_coordinate(volume) < FAR_MM:
         return None
     centre = (np.array(volume.shape_ijk, dtype=np.float64) - 1.0) / 2.0

@@ -215,7 +215,6 @@ def _choose_level(volume: Volume, settings: CorridorSettings, progress: Progress
 
 
 def _check_inside(share: float, name: str) -> None:
-    """Refuse a label that goes on beyond the scan."""
     if share < 1.0:
         raise RefusedInputError(
             f"{name} is cut off: {100.0 * (1.0 - share):.3g} % of its label lie outside of the scan; corridors need the"

@@ -78,7 +78,6 @@ def parse_levels(text: str, whole: str | None = None) -> tuple[float, ...]:
 
 
 def parse_label_color(text: str) -> tuple[str, str]:
-    """Read ``LABEL=COLOUR``."""
     label, _, color = text.rpartition("=")
     if not label or not color:
         raise ValueError(f"{text!r} is not LABEL=COLOUR, such as L2=red or 20=#ff8000")
@@ -110,8 +109,6 @@ def parse_bytes(text: str) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceSettings:
-    """The device for the computation."""
-
     device: str | None = option(
         "--device D",
         'OpenCL device: an index of "clrecon devices", "cpu", "gpu" or a part of its name'
@@ -152,7 +149,6 @@ def changed_fields(settings: InputSettings) -> list[str]:
 
 
 def label_map_option(**how: Any) -> Any:
-    """Declare a field for the file of a label map."""
     return option(
         "--labels FILE|FOLDER",
         "label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
@@ -167,7 +163,6 @@ def space_option(text: str, **how: Any) -> Any:
 
 
 def preset_option() -> Any:
-    """Declare a field for the iso value by tissue."""
     return option(
         "--preset NAME",
         f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
@@ -183,7 +178,6 @@ def closed_option() -> Any:
 
 
 def mesh_space_option(text: str = "files that do not name theirs") -> Any:
-    """Declare a field for the patient frame of meshes that do not name theirs."""
     return option("--mesh-space lps|ras", f"patient frame of {text} (default: lps, with a warning)", parse=str.lower)
 
 

@@ -120,10 +120,7 @@ def _is_bare_data_set(path: str | Path) -> bool:
 
 
 def count_leftovers(output: str | Path, paths: Sequence[str | Path]) -> int:
-    """Count the numbered files of `output` that are not among `paths`: components of an earlier run that had more.
-
-    The job must not remove them, but a user who takes all files of that name would mix them up with the new ones.
-    """
+    """Count the numbered files of `output` that an earlier run left: not in `paths`, and not ours to remove."""
     stem, extension = os.path.splitext(os.path.basename(output))
     numbered = re.compile(rf"{re.escape(stem)}(?:_.+)?_[0-9]{{3,}}{re.escape(extension)}")
     own = {_identity(path) for path in paths}

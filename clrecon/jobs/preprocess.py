@@ -273,8 +273,6 @@ def preprocess_volume(
 
 
 class _StepRun:
-    """The steps of one job, with what they say."""
-
     def __init__(self, settings: InputSettings, bands: Sequence[Band], progress: Progress):
         self._settings, self._bands, self._progress = settings, bands, progress
         self._level: float | None = None

@@ -255,10 +255,7 @@ class Run(Laps):
         self._stack.__exit__(*error)
 
     def keeping(self) -> AbstractContextManager[None]:
-        """In the ``with`` block, files that exist stay if the run was asked for it.
-
-        Nothing but checks and staging belongs there: the caches of kernels are files too.
-        """
+        """In the ``with`` block, of checks and staging alone, files that exist stay if the run was asked for it."""
         return keep_existing(self.no_clobber)
 
     def check(self, outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | Path | None) -> None:

@@ -34,10 +34,7 @@ def check_space(space: str | None) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class InfoSettings(Selection):
-    """What is judged: a series that is named, or the reader's choice; any usable series is enough then.
-
-    strict: A listing without a chosen series is a problem too.
-    """
+    """What is judged: a series that is named, or, unless `strict`, any usable one."""
 
     pixels: bool = option(
         "--pixels",
@@ -104,8 +101,6 @@ MOST_SAMPLES = 10_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class DistanceSettings(DeviceSettings):
-    """Settings of the job of distances."""
-
     mesh_space: Space | None = mesh_space_option("files that do not name theirs")
     samples: int | None = option("--samples N", "points on each mesh, evenly by area (default: 50000)")
     range_mm: float | None = option(
@@ -150,10 +145,7 @@ def _parse_band(text: str) -> tuple[float | None, float | None]:
 
 @dataclass(frozen=True, kw_only=True)
 class InsideSettings(ScanSettings, DeviceSettings):
-    """Settings of the job that looks into vertebrae.
-
-    dense: (low, high). None leaves an end open.
-    """
+    """Settings of the job that looks into vertebrae; None in `dense`, (low, high), leaves an end open."""
 
     labels: str | Path = label_map_option(required=True)
     label: Sequence[str | int] = option(
@@ -196,7 +188,6 @@ class InsideSettings(ScanSettings, DeviceSettings):
 
 
 def _parse_name(text: str) -> tuple[tuple[float, ...], str]:
-    """Read ``X,Y,Z=L3``."""
     point, equals, level = text.rpartition("=")
     if not equals or not level.strip():
         raise ValueError(f"{text!r} is no named point: write it as X,Y,Z=L3")

@@ -38,7 +38,6 @@ def measure_stats(
     csv_path: str | Path | None = None,
     **how: Any,
 ) -> StatsReport:
-    """Read a scan and its label map, and measure each label."""
     with Run(settings, **how) as run:
         run.check([("the report", report_path), ("the table", csv_path)], source, settings.labels)
         label = tuple(settings.label) or None

@@ -47,10 +47,7 @@ def make_vertebrae(
     report_path: str | Path | None = None,
     **how: Any,
 ) -> VertebraeReport:
-    """Read a CT series, find its vertebrae, and write a label map and a picture of the discs and labels.
-
-    picture_path: PNG; by default beside the label map, with its name.
-    """
+    """Read a CT series, find its vertebrae, and write a label map, and a PNG, by default beside it."""
     from clrecon.spine import split_vertebrae
 
     settings = settings or VertebraeSettings()

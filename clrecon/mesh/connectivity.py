@@ -105,7 +105,6 @@ class Fans:
 
 
 def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:
-    """Group the half-edges by edge."""
     start = triangles.reshape(-1)
     end = triangles[:, (1, 2, 0)].reshape(-1)
     upward = start < end
@@ -132,10 +131,7 @@ def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:
 
 
 def opposite_half_edges(triangles: NDArray[np.uint32], edges: Edges) -> IntArray | None:
-    """Return the half-edge on the other side of each half-edge, shape (3 * m,).
-
-    None unless every edge has two faces that run along it in opposite directions and no face has a vertex twice.
-    """
+    """Return the half-edge opposite each, (3 * m,); None unless every edge has two faces, oppositely run."""
     clean = edges.oriented and edges.boundary == 0 and edges.nonmanifold == 0
     if not clean or len(edges.half_edges) != triangles.size:
         return None
@@ -247,10 +243,7 @@ def _connect(one: NDArray[np.integer], other: NDArray[np.integer], size: int) ->
 
 
 def count_duplicate_faces(triangles: NDArray[np.uint32], vertex_count: int, opposite: IntArray | None = None) -> int:
-    """Count the triangles that have the three vertices of an earlier one, in any order.
-
-    Where every edge has two faces (`opposite`), two triangles with the same vertices are neighbours on all three sides.
-    """
+    """Count triangles with the vertices of an earlier one, neighbours on all sides where given `opposite`."""
     if opposite is not None:
         return len(find_faces_back_to_back(opposite)) // 2
     found = find_duplicate_faces(triangles, vertex_count)

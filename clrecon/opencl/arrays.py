@@ -60,7 +60,6 @@ class MemoryLimits:
         return sum(sizes) <= self.device_bytes and max(sizes, default=0) <= self.device_buffer_bytes
 
     def describe(self) -> str:
-        """Describe the available memory for messages."""
         if self.asked_bytes is not None:
             return f"{_mib(self.asked_bytes)} are allowed on {self.label} by {name_parameter('memory')}"
         return f"{self.label} has {_mib(self.device_bytes)}, at most {_mib(self.device_buffer_bytes)} in one buffer"
@@ -104,10 +103,7 @@ def require_room(limits: MemoryLimits, buffers: Mapping[str, int], consequence: 
 def check_budget(
     device: Device, buffers: Mapping[str, int], memory: int | None = None, *, less_may_fit: bool = False
 ) -> int:
-    """Check that all `buffers`, bytes by description, fit the device together and each alone; return the sum.
-
-    less_may_fit: The caller can do the work in smaller parts.
-    """
+    """Check that `buffers`, bytes by name, fit the device, together and alone; return the sum."""
     limits = memory_limits(device, memory)
     shortage = describe_shortage(limits, buffers)
     if shortage:

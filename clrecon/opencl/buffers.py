@@ -30,10 +30,7 @@ class LentBuffer:
 
 
 class BufferPool:
-    """Buffers of a device with memory of its own: the driver of an H200 takes 0.1 ms for one, a surface has 17.
-
-    pyopencl's own pool ends the process when several threads use it.
-    """
+    """Buffers of a device with memory of its own; pyopencl's own pool fails with several threads."""
 
     def __init__(self, device: Device):
         self._device = device
@@ -42,7 +39,6 @@ class BufferPool:
 
     @property
     def spare_bytes(self) -> int:
-        """Bytes that are free for the next buffer."""
         with self._lock:
             return sum(buffer.size for buffer in self._spare)
 

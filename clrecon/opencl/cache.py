@@ -78,10 +78,7 @@ def make_private(folder: Path) -> None:
 
 
 def find_fault(folder: Path) -> str:
-    """Return why built kernels in `folder` cannot be trusted or kept, as the end of a sentence; empty if they can.
-
-    The folder is made where it is not there.
-    """
+    """Return why built kernels in `folder`, made if absent, cannot be trusted, as the end of a sentence, or ""."""
     if not folder.is_absolute():
         return _RELATIVE
     try:
@@ -269,10 +266,7 @@ def read_binary(key: str) -> bytes | None:
 
 
 def store_binary(key: str, binary: bytes) -> None:
-    """Keep `binary` under `key`, as a whole or not at all; the oldest binaries are removed when there are many.
-
-    A folder that cannot be written gives no error: this process has the program, and the next one builds it again.
-    """
+    """Keep `binary` under `key`, whole or not at all, in place of the oldest; a folder that refuses is no error."""
     folder = prepare_caches().binaries
     if folder is None:
         return

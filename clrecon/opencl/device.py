@@ -60,14 +60,12 @@ class Commands:
         _all.append(self)
 
     def add(self, what: str, event: Any, queue: Any, *held: Any) -> Command:
-        """Add a command that was enqueued, and return it."""
         command = Command(what, event, queue, held)
         self._waiting.append(command)
         return command
 
     @property
     def last(self) -> Command | None:
-        """The command that ends last."""
         try:
             return self._waiting[-1]
         except IndexError:
@@ -117,10 +115,7 @@ _kept: list[Any] = []
 
 
 def has_hung_commands() -> bool:
-    """True where a command that was given up still runs on any device.
-
-    To free what belongs to its context, or to end the driver, may then take for ever.
-    """
+    """True where a command that was given up still runs on any device: to free its context may take for ever."""
     found = any(commands.has_hung for commands in _all)
     if not found:
         _kept.clear()
@@ -171,7 +166,6 @@ def describe_error(error: Exception) -> str:
 
 
 def _version_numbers(text: str) -> tuple[int, ...]:
-    """Return the numbers of a version, so that 10 comes after 9."""
     return tuple(int(number) for number in re.findall(r"[0-9]+", text))
 
 

@@ -327,10 +327,7 @@ def choose_name(cpuinfo: str) -> str:
 
 
 class NameOfCpu:
-    """The place where a PoCL device keeps the name of its CPU, and the name to write there.
-
-    address: Address of the driver's structure of the device (its ``cl_device_id``).
-    """
+    """The `address` where a PoCL device keeps the name of its CPU, and the name to write there."""
 
     def __init__(self, address: int):
         try:
@@ -341,7 +338,6 @@ class NameOfCpu:
             raise LookupError(str(error)) from error
 
     def write(self) -> None:
-        """Write the name, if it is not there yet."""
         try:
             with _Memory() as memory:
                 if memory.read_text(self._place) != self.name.encode():

@@ -134,10 +134,7 @@ class Program:
 
 
 def load_program(device: Device, name: str, variants: Mapping[str, str] | None = None) -> Program:
-    """Build a kernel file, such as ``"surface/marching_cubes.cl"``, or return what an earlier call built.
-
-    variants: ``-D`` definitions; only for variants such as the element type, never for sizes.
-    """
+    """Build a kernel file, ``"surface/marching_cubes.cl"``, with ``-D`` `variants`, never sizes, or return it built."""
     chosen = (f"-D{macro}={value}" for macro, value in sorted((variants or {}).items()))
     options = (*device.build_options, *chosen)
     key = (name, options)

@@ -127,10 +127,7 @@ _QUALIFIERS = {"const", "restrict", "volatile", "unsigned", "__global", "__const
 
 @dataclass(frozen=True)
 class KernelArgument:
-    """One argument of a kernel, with its type in OpenCL C; for a buffer the type of its elements.
-
-    is_written: A buffer whose elements are not const.
-    """
+    """One argument of a kernel, with its type, or its elements', in OpenCL C; `is_written`: elements are not const."""
 
     name: str
     type: str

@@ -39,10 +39,7 @@ VOLUME_SHARE = 2e-3
 
 
 def check_ball(device: Device) -> str:
-    """Extract the surface of a ball and compare it with the ball.
-
-    Returns: What is wrong; empty if nothing is.
-    """
+    """Extract the surface of a ball and compare it; return what is wrong, empty if nothing is."""
     k, j, i = np.ogrid[:SIZE, :SIZE, :SIZE]
     distance = np.sqrt((i - CENTRE[0]) ** 2 + (j - CENTRE[1]) ** 2 + (k - CENTRE[2]) ** 2)
     volume = Volume(np.rint(STEEPNESS * (RADIUS - distance)).astype(np.int16), np.eye(4))

@@ -79,10 +79,7 @@ class GhostSlices:
 def judge_slices(
     counts: NDArray[np.int64], area: int, hu: tuple[float, float], warnings: tuple[str, ...] = ()
 ) -> GhostSlices:
-    """Tell the ghosts from the counts (3, nk) of voxels in each slice, in common with the next and with the one after.
-
-    `area` counts all voxels of a slice.
-    """
+    """Tell the ghosts by counts (3, nk): voxels of a slice of `area`, in common with the next, and the one after."""
     points, nk = counts[0], counts.shape[1]
     nearest, around, within = np.full((3, nk), np.nan)
     if nk >= 3:

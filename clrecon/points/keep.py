@@ -89,7 +89,6 @@ class _Runs:
         np.add.at(sizes, self._labels, 1 if self._starts is None else self._lengths)
 
     def add(self, sums: NDArray[np.float64], values: NDArray[np.float64]) -> None:
-        """Add values of points to the sums of their clusters."""
         np.add.at(sums, self._labels, values if self._starts is None else np.add.reduceat(values, self._starts))
 
     def widen(self, low: NDArray[np.floating], high: NDArray[np.floating], values: NDArray[np.floating]) -> None:
@@ -98,7 +97,6 @@ class _Runs:
             extreme.at(ends, self._labels, values if self._starts is None else extreme.reduceat(values, self._starts))
 
     def spread(self, figures: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each point the figure of its cluster."""
         of_runs = figures.take(self._labels)
         return of_runs if self._starts is None else np.repeat(of_runs, self._lengths)
 
@@ -280,7 +278,6 @@ def _judge_clusters(
 
 
 def _find_cluster(cloud: PointCloud, seed: tuple[float, ...], cores: ArrayLike | None) -> tuple[int, float]:
-    """Return the cluster of the point nearest to a seed, and their distance."""
     labels = np.asarray(cloud.labels)
     allowed = labels >= 0
     if cores is not None:

@@ -110,9 +110,7 @@ def _look(device: str) -> RenderSettings:
 
 
 def check_sphere(device: Device) -> dict[str, Any]:
-    """Mesh a sphere in anisotropic voxels, tilted gantry and oblique frame, and compare with geometry;
-    ``radius_error_max_mm`` is the largest distance of a vertex from the sphere.
-    """
+    """Mesh a sphere in an anisotropic, tilted, oblique volume; return its largest ``radius_error_max_mm`` too."""
     import numpy as np
 
     from clrecon.geometry import Volume

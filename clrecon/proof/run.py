@@ -171,7 +171,6 @@ class _Child:
         self.end()
 
     def end(self) -> None:
-        """End the process, whatever it does."""
         self._process.kill()
         self._process.wait()
 
@@ -181,7 +180,6 @@ class _Child:
         self._lines.put(b"")
 
     def results(self, silent_seconds: float) -> Iterator[dict[str, Any]]:
-        """Yield results until the process ends or hangs."""
         while True:
             try:
                 line = self._lines.get(timeout=silent_seconds)
@@ -209,7 +207,6 @@ class _Child:
         return time.perf_counter() - self._since
 
     def describe_end(self) -> str:
-        """Describe how the process ended, and in what."""
         if self.hangs:
             return f"the driver hangs: nothing for {self._silent:g} s in {self._doing}"
         code = self._process.returncode
@@ -220,11 +217,7 @@ class _Child:
 
 
 def run_check(device: Device, check: Check) -> dict[str, Any]:
-    """Run one check.
-
-    Return ``operator`` (name of the check), ``passed``, ``detail`` (what was compared, or what is wrong) and
-    ``seconds``, kernel builds included.
-    """
+    """Run one check; return ``operator``, ``passed``, ``detail`` (what was compared or is wrong) and ``seconds``."""
     start = time.perf_counter()
     try:
         passed, detail = True, check.run(device)

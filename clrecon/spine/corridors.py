@@ -452,7 +452,6 @@ def _measure(
     bone: SolidBone, frame: VertebraFrame, surface: Float64Array, wall: Float64Array, side: str, line: Line | None,
     span: Span,
 ) -> Corridor:  # fmt: skip
-    """Measure a line, or say why there is no corridor."""
     if line is None:
         return Corridor(
             side,

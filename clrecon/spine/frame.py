@@ -68,7 +68,6 @@ class VertebraFrame:
         return (points - self.origin) @ self.axes.T
 
     def to_lps(self, points: Float64Array) -> Float64Array:
-        """Map mm in the frame (n, 3) to LPS mm."""
         return self.origin + points @ self.axes
 
     def canal_at(self, z: Float64Array) -> Float64Array:
@@ -165,7 +164,6 @@ def find_frame(bone: SolidBone, what: str) -> VertebraFrame:
 
 
 def _point_front(middle: Float64Array, canal: Float64Array, up: Float64Array) -> Float64Array:
-    """Return the axes with the body in front of the canal."""
     back = canal - middle
     back -= (back @ up) * up
     back /= np.linalg.norm(back)

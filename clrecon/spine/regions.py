@@ -393,10 +393,7 @@ def _ramp(value: float, nothing: float, all_of_it: float) -> float:
 def judge(
     piece: Piece, gaps: Sequence[float], scan: Field, looks: Looks, course: Course, usual: NDArray[np.float64]
 ) -> Traits:
-    """Judge a piece by itself and by `gaps`, the heights of whole ones beside it, up to two each way, mm.
-
-    usual: Depth of a usual disc at each place, HU.
-    """
+    """Judge a piece by itself, by `gaps`, heights of whole neighbours in mm, and the `usual` depth of discs in HU."""
     height = piece.end - piece.begin
     traits: Traits = {}
     for name, bound in (("upper", piece.upper), ("lower", piece.lower)):

@@ -50,7 +50,6 @@ LEVELS = (
 
 
 def check_level(name: str) -> str:
-    """Return the name of a level as `LEVELS` has it."""
     level = str(name).strip().upper()
     if not re.fullmatch(r"[CTL][0-9]{1,2}", level) or level not in LEVELS:
         raise UsageError(f"there is no vertebra {str(name)[:20]!r}: they are C1 to C7, T1 to T12 and L1 to L6")
@@ -58,7 +57,6 @@ def check_level(name: str) -> str:
 
 
 def check_landmark(name_at: tuple[Sequence[float], str] | None, first: str | None) -> str | None:
-    """Return the level of the landmark as `LEVELS` has it, None without one."""
     if name_at is not None and first is not None:
         raise UsageError(
             f"{name_parameter('first')} and {name_parameter('name_at')} both name levels: give one of them"

@@ -42,10 +42,7 @@ _speaker: Speaker = in_python
 
 
 def name_parameter(parameter: str, value: object = None) -> str:
-    """Name a parameter of Python in its words or those of the command line, with a value if one is given.
-
-    value: True, a number, a text, or capital letters that stand for one: ``"N"``.
-    """
+    """Name a parameter in words of Python or the command line, with a value, or capitals such as ``"N"`` for one."""
     return _speaker(parameter, value)
 
 

@@ -70,11 +70,7 @@ class NoDisplayError(UsageError):
 
 @dataclass(frozen=True)
 class Display:
-    """What was found.
-
-    fault: Why no window can be opened, as the end of a sentence; None where one can.
-    driver: What OpenGL says that it draws with; empty where it says nothing.
-    """
+    """What OpenGL's `driver` calls itself, and the `fault`, the end of a sentence, if no window can be opened."""
 
     fault: str | None = None
     driver: str = ""

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 else:
 
     def dataclass(cls=None, /, *, frozen=False, eq=True, repr=True, kw_only=False):  # noqa: A002
-        """Make a class a dataclass, as `dataclasses.dataclass` does."""
         if cls is None:
             return lambda own: dataclass(own, frozen=frozen, eq=eq, repr=repr, kw_only=kw_only)
         cls.__doc__ = cls.__doc__ or cls.__name__  # in place of a text from the signature, which takes time too

@@ -169,10 +169,7 @@ class Mapping:
             self.file.madvise(mmap.MADV_DONTNEED, first, end - first)
 
     def place(self, part: NDArray[Any]) -> FilePlace | None:
-        """Return where `part`, a C-contiguous view of the mapping, is in the file, to which changes are written first.
-
-        None where the path no longer names the mapped file.
-        """
+        """Return where `part`, C-contiguous, is in the file, after writing changes; None if the path names another."""
         if self.path is None or self.identity is None:
             return None
         if self.writeable:

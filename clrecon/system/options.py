@@ -51,7 +51,6 @@ def option(
 
 
 def options_of(settings: type, group: str = "") -> Iterator[Option]:
-    """Yield the options of a group, in the order of the fields."""
     for own in fields(settings):
         flags, declared, how = own.metadata.get(_KEY, ([], None, {}))
         if declared == group:
@@ -60,10 +59,7 @@ def options_of(settings: type, group: str = "") -> Iterator[Option]:
 
 
 def parse_numbers(text: str, *, ends: bool = False) -> tuple[float, ...] | None:
-    """Read numbers with commas between them, None where one is none.
-
-    ends: An empty one is an open side: an infinite number, downward and upward in turns.
-    """
+    """Read numbers with commas between, None where one is none; with `ends` an empty one is infinite, -, + in turns."""
     words = [word.strip() for word in text.split(",")]
     try:
         return tuple(

@@ -271,10 +271,7 @@ def _link_new(temporary: Path, target: Path) -> None:
 
 
 def place_folder(made: Path, folder: Path, path: str | os.PathLike[str], *, keep: bool) -> None:
-    """Rename a finished folder to its place; an older one gets the temporary name, and its owner removes it.
-
-    As `place_file`, but an empty folder is replaced in any case.
-    """
+    """Rename a finished folder to its place; an older one gets the temporary name for its owner to remove."""
     with system_errors(path):
         if keep:
             with contextlib.suppress(OSError):

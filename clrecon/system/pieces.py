@@ -66,10 +66,7 @@ def side_by_side(one: Callable[[], _One], other: Callable[[], _Other]) -> tuple[
 
 
 def find_bounds(points: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Return the lowest and the highest coordinates of points, shape (n, 3), at least one.
-
-    Column by column: numpy takes ten times as long along the first of such axes.
-    """
+    """Return the lowest and highest coordinates of points, (n, 3), column by column, which is ten times faster."""
     return np.array([column.min() for column in points.T]), np.array([column.max() for column in points.T])
 
 

@@ -25,7 +25,6 @@ class Record(dict[str, Any]):
         dict.update(self, self._entries())
 
     def _entries(self) -> dict[str, Any]:
-        """The entries in their order: the fields."""
         own = _fields_of(self)
         return {name: value for name, value in own.items() if value is not None or name not in self._LEFT_OUT}
 
@@ -63,11 +62,7 @@ def _as_plain(value: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Gate(Record):
-    """A figure and its bound; `measured` and `ok` are None where it was not measured.
-
-    unit: None for counts, shares and flags.
-    text: One line without patient data.
-    """
+    """A figure and its bound, in `unit` or None, in a line of `text`; `measured` and `ok` are None if not measured."""
 
     name: str
     measured: float | bool | None
@@ -84,7 +79,6 @@ def none_of(name: str, count: int, what: str, ok: bool | None = None) -> Gate:
 
 
 def is_true(name: str, flag: bool, what: str) -> Gate:
-    """Gate: a statement must be true."""
     says = what if flag else f"this does not hold: {what}"
     return Gate(name, bool(flag), True, None, bool(flag), says)
 

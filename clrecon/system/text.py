@@ -14,10 +14,7 @@ LARGEST_HU, LARGEST_WRITTEN = 1e6, 1e15
 
 
 def escape_text(text: str, limit: int = TEXT_LIMIT) -> str:
-    """Return `text` in one printable line of at most `limit` characters.
-
-    Control characters, line breaks, terminal escapes and direction marks come out as ``\\xNN`` or ``\\uNNNN``.
-    """
+    r"""Return `text` in one printable line of at most `limit` characters, others as ``\xNN`` or ``\uNNNN``."""
     if text.isprintable() and len(text) <= limit:
         return text
     safe = "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode("ascii") for c in text)

@@ -34,10 +34,7 @@ log = get_logger(__name__)
 
 
 def make_cloud(source: str | Path, files: CloudFiles, settings: CloudSettings | None = None, **how: Any) -> CloudReport:
-    """Read a CT series or a cloud, run the steps that are asked for, and write the cloud that is left.
-
-    Checks come first: the outputs, then the device, then the input.
-    """
+    """Read a CT series or a cloud, run the steps that are asked for, and write the cloud that is left."""
     settings = settings or CloudSettings()
     with Run(settings, **how) as run:
         files.check_formats()
@@ -68,7 +65,6 @@ def make_cloud(source: str | Path, files: CloudFiles, settings: CloudSettings | 
 
 
 def _check_kind(settings: CloudSettings, is_cloud: bool) -> None:
-    """Refuse settings that mean nothing for the kind of input."""
     if is_cloud:
         refuse_scan_settings(settings, OF_SCANS)
     elif settings.input_space is not None:
@@ -172,7 +168,6 @@ class CloudFiles:
 
     @property
     def named(self) -> list[tuple[str, str | Path | None]]:
-        """Description and path of each file."""
         return [
             ("the cloud", self.output),
             ("the cloud of removed points", self.removed),
@@ -220,7 +215,6 @@ class CloudReport(RunReport):
 
 
 def describe_file(what: str, path: str | Path, file: Staged) -> dict[str, Any]:
-    """Return one entry of ``outputs``."""
     return {"what": what, "format": extension_of(path)[1:], "bytes": file.size}
 
 

@@ -230,7 +230,6 @@ class CloudSettings(InputSettings):
 
     @property
     def kind(self) -> PointKind:
-        """The kind of points that is taken from a scan."""
         return self.points or ("voxels" if self.is_band else "surface")
 
     @property

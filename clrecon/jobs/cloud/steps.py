@@ -182,7 +182,6 @@ def find_ghosts(resident: DeviceVolume, level: float, settings: CloudSettings, p
 
 
 def drop_ghosts(steps: CloudSteps, found: GhostSlices, volume: Volume) -> None:
-    """Remove the points of ghost slices."""
     from clrecon.points.ghost_slices import drop_ghost_slices
 
     step = drop_ghost_slices(steps.cloud, found, volume=volume)
@@ -190,7 +189,6 @@ def drop_ghosts(steps: CloudSteps, found: GhostSlices, volume: Volume) -> None:
 
 
 def warn_of_ghosts(steps: CloudSteps, found: GhostSlices) -> None:
-    """Warn of ghost slices whose points stay."""
     if not found.slices:
         return
     names = ", ".join(map(str, found.slices[:MOST_NAMED]))

@@ -37,10 +37,7 @@ def find_bone(
     mesh: Mesh, volume: Volume, surface: Surface, labelled: Labelled, *, without_table: bool = False, advice: str,
     must: bool = True,
 ) -> NDArray[np.bool_] | None:  # fmt: skip
-    """Return which components (count,) look like bone or, if none does, the one that holds the spinal canal.
-
-    Not `must`: None, with a warning, where none does and the values of the scan are not known to be HU.
-    """
+    """Return which components (count,) look like bone, else the canal's; None if not `must` and values may be no HU."""
     from clrecon.mesh.compare.iso_distance import rule_of_report
 
     rule = rule_of_report(mesh.report)
@@ -76,9 +73,7 @@ def find_bone(
 def _tell_bone(
     mesh: Mesh, volume: Volume, rule: IsoRule, labelled: Labelled, fewest: int = 0
 ) -> tuple[list[WallLook | None], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Judge the components of a surface, of `fewest` vertices or more; say which are bone, and which would be, but are
-    rails of a table.
-    """
+    """Say which components, of `fewest` vertices or more, are bone, and which would be, but are rails of a table."""
     import numpy as np
 
     from clrecon.mesh.compare.walls import FEWEST_VERTICES, find_rails, judge_components, looks_like_bone
@@ -192,9 +187,7 @@ def judge_surfaces(
 
 
 def _count_bones(mesh: Mesh, volume: Volume, rule: IsoRule, labelled: Labelled) -> Bones:
-    """Count the components of a surface that look like bone, among the large ones, where one of these does, else among
-    all, and judge the largest of the others.
-    """
+    """Count the components that look like bone, among the large ones if one does, and judge the largest other one."""
     import numpy as np
 
     for fewest in (int(OTHER_SHARE * mesh.vertex_count), 0):

@@ -55,7 +55,6 @@ class LabelChoice:
             )
 
     def numbers_of(self, labels: LabelMap) -> list[int]:
-        """Return the numbers of the labels that become meshes."""
         hidden = {labels.find(label) for label in self.hidden}
         wanted = [labels.find(label) for label in self.label] or list(labels.numbers)
         left = [number for number in wanted if number not in hidden]
@@ -92,7 +91,6 @@ LABEL_SEED = "label:"
 
 
 def is_label_seed(seed: object) -> bool:
-    """Return whether a seed is a label of the label map."""
     return isinstance(seed, str) and seed.startswith(LABEL_SEED)
 
 

@@ -110,10 +110,7 @@ def _read_inputs(
 
 
 def _try_steps(device: Device, settings: MeshSettings) -> None:
-    """Build the kernels by making the surface of a small cube, or of a label of it.
-
-    What only some jobs need is imported in its branch: the scan is read beside this, and waits for each import.
-    """
+    """Build the kernels by making the surface of a small cube, or of a label of it, beside the reading."""
     if settings.labels is not None and settings.labels_pick:
         meshes = _try_labels(device, settings.labels)
     else:
@@ -214,10 +211,7 @@ def mask_and_preprocess(
 def fill_solid(
     volume: Volume, surfaces: Sequence[Surface], settings: MeshSettings, device: Device, progress: Progress
 ) -> Volume:
-    """Return the volume with what the only surface encloses filled.
-
-    At levels of bone, spaces that are too wide for marrow stay open, and such that hold air.
-    """
+    """Fill what the only surface encloses; at levels of bone, wide spaces and such that hold air stay open."""
     from clrecon.operators.masks.enclosed import LARGEST_MARROW_MM, fill_enclosed
 
     level = surfaces[0].iso_value

@@ -29,10 +29,7 @@ SHIFT_SHARE, FEWEST_TOLD = 0.1, 0.5
 
 
 def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress: Progress = ignore_progress) -> Mesh:
-    """Smooth and decimate as the settings say; return the mesh itself if they ask for neither.
-
-    Distances are bounded on the device, unless the settings limit its memory: what they allow is for the surface.
-    """
+    """Smooth and decimate as asked, on the device unless its memory is limited; else return the mesh itself."""
     if not settings.refines:
         return mesh
     from clrecon.mesh.compare.distances import compare_meshes
@@ -103,9 +100,7 @@ def _may_be_bone(part: Part) -> bool:
 
 
 def warn_of_shift(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
-    """Return a warning for each closed mesh whose level, unless the scan gave it, lies outside of the bone by so much
-    that its volume is too large.
-    """
+    """Warn of each closed mesh whose level, not given by the scan, lies too far outside of the bone for its volume."""
     if settings.half_way == "auto" or not settings.closed:
         return []
     warnings = []
@@ -144,9 +139,7 @@ def measure_parts(
     device: Device | None = None,
     progress: Progress = ignore_progress,
 ) -> None:
-    """Measure the `quality` of each part and how far it lies from the scan, at once, and with `strict`, on the device
-    meanwhile, triangles that cut each other.
-    """
+    """Measure the `quality` of each part and its distances from the scan; with `strict` triangles that cut others."""
     if not settings.strict:
         steps = Steps(progress, "measure", len(parts))
         for part in parts:

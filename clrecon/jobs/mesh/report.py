@@ -31,10 +31,7 @@ _SAID_ABOVE = ("vertices", "triangles", "closed", "manifold", "components", "are
 
 
 def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], space: str) -> dict[str, Any]:
-    """Return one object of ``meshes``; entries that were not measured are None.
-
-    Bounds are in the patient frame `space`, also for formats that store another frame (GLB: metres, Y up).
-    """
+    """Return one object of ``meshes``, bounds in the frame `space`; entries that were not measured are None."""
     quality: dict[str, Any] = part.quality or {}
     origin = part.mesh.report
     return {
@@ -224,12 +221,10 @@ def _around(boxes: list[list[list[float]]]) -> list[list[float]]:
 
 
 def _common(values: Iterable[Any]) -> Any:
-    """Return the value that all have in common, None if they differ."""
     found = list(values)
     return found[0] if all(value == found[0] for value in found) else None
 
 
 def _unless_unknown(combine: Callable[[list[Any]], Any], values: Iterable[Any]) -> Any:
-    """Apply `combine` to the values; None if one of them is None."""
     found = list(values)
     return None if any(value is None for value in found) else combine(found)

@@ -431,12 +431,10 @@ class MeshSettings(InputSettings):
 
     @property
     def seed_labels(self) -> tuple[str, ...]:
-        """Labels that surfaces grow from."""
         return tuple(str(seed)[len(LABEL_SEED) :] for seed in self.grow_from if is_label_seed(seed))
 
     @property
     def method_used(self) -> MethodName:
-        """The method of marching cubes."""
         return self.method or ("i-mc" if self.grow_from else "t-mc")
 
     @property
@@ -462,7 +460,6 @@ class MeshSettings(InputSettings):
 
     @property
     def refines(self) -> bool:
-        """True where the surface is smoothed or decimated."""
         return self.smooth is not None or self.decimate_used is not None
 
     @property

@@ -49,10 +49,7 @@ class Surface:
 
 
 class Bones(NamedTuple):
-    """The components of a surface: all, those that look like bone, and rails of a table, which would.
-
-    other: Judgement of the largest that is neither; `other_share` is its part of the vertices.
-    """
+    """Components of a surface: all, bones, and rails; the largest `other`'s judgement and share of the vertices."""
 
     components: int
     bone: int
@@ -111,7 +108,6 @@ VALUE_GATES = ("hu_known", "hu_scale", "stored_sign")
 
 
 def list_failed_values(volume: Volume) -> list[dict[str, Any]]:
-    """Return the gates of `VALUE_GATES` that failed."""
     return [gate for gate in volume.report.get("gates", ()) if gate["name"] in VALUE_GATES and gate["ok"] is False]
 
 

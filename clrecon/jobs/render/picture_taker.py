@@ -131,7 +131,6 @@ class PictureTaker(Closing):
         return self.style.light if isinstance(self.style, shaded) else None
 
     def take_view(self, view: str) -> Rendering:
-        """Take the picture of one view, with its annotations."""
         settings = self._settings
         if not isinstance(self.style, CurveCut):
             return self.take(settings.camera(self.box, view))

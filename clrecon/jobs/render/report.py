@@ -80,7 +80,6 @@ _NOUNS = {"points": "cloud", "mesh": "mesh"}
 
 
 def find_emptiness(picture: Rendering) -> str | None:
-    """Say why a picture is empty; None if it is not."""
     import numpy as np
 
     values = None if picture.values is None else picture.values[np.isfinite(picture.values)]

@@ -82,7 +82,6 @@ _parse_vector = numbers_reader(3, "is not a side of the patient, nor a direction
 
 
 def parse_direction(text: str) -> str | tuple[float, ...]:
-    """Read a name, or ``X,Y,Z``."""
     return _parse_vector(text) if "," in text else text.lower()
 
 
@@ -357,7 +356,6 @@ class RenderSettings(InputSettings):
 
     @property
     def views_used(self) -> tuple[str, ...]:
-        """The views of the pictures, defaults included."""
         return tuple(self.views) or (DEFAULT_VIEWS.get(self.mode, ANTERIOR),)
 
     @property
@@ -426,10 +424,8 @@ def _find_clip(box: Box | None, planes: Sequence[Sequence[float]]) -> Clip | Non
 
 
 def describe_modes() -> dict[str, str]:
-    """Return the names of the modes, each with a description."""
     return {name: mode.description for name, mode in MODES.items()}
 
 
 def describe_presets() -> dict[str, str]:
-    """Return the names of the presets, each with a description."""
     return {preset.name: preset.description for preset in PRESETS.values()}

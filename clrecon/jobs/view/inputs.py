@@ -55,10 +55,7 @@ _LEAST_EMPTY = 0.2
 
 @dataclass(frozen=True, eq=False)
 class OpenedInput:
-    """What was read of an input.
-
-    said: What has to be said of it: its certificate's warnings, the frame that it was turned from.
-    """
+    """What was read of an input; `said`: warnings of its certificate, and the frame that it was turned from."""
 
     subject: Volume | Mesh | PointCloud | LabelMap
     said: tuple[str, ...] = ()

@@ -168,7 +168,6 @@ def _describe_scan(path: str | Path, volume: Volume, meshes: Sequence[Mesh], run
 
 
 def _name_and_color(shown: Sequence[_ShownInput], settings: ViewSettings) -> list[Mesh]:
-    """Return all meshes with the names and colours under which they are shown."""
     colors = distinct_colors(len(shown))
     for number, one in enumerate(shown, start=1):
         given = settings.names[number - 1] if number <= len(settings.names) else ""

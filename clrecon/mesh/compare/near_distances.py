@@ -116,10 +116,7 @@ class NearDistance:
         return self._frames
 
     def find_around(self, points: Points, near: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return distances to the triangles around several vertices for each point, shape (k, v), and their rows.
-
-        Infinity and -1 where there are no triangles.
-        """
+        """Return distances to the triangles around several vertices of each point, (k, v), and their rows."""
         found, rows = self._around(points, near[:, 0], triangle_distances)
         for others in near.T[1:]:
             length, row = self._around(points, others, triangle_distances)
@@ -160,10 +157,7 @@ class NearDistance:
         return found, rows
 
     def _pairs(self, near: NDArray[np.integer]) -> tuple[IntArray, IntArray, IntArray, NDArray[np.bool_]]:
-        """List the pairs of a vertex and a triangle around it: place of the vertex in `near`, and triangle.
-
-        Then for each vertex where its pairs begin, and whether it has any.
-        """
+        """List pairs of a place in `near` and a triangle around it; where each vertex's pairs begin, if it has any."""
         row, count = self._fans.around(near)
         return np.repeat(np.arange(len(count)), count), row, np.cumsum(count) - count, count > 0
 

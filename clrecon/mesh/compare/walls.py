@@ -105,7 +105,6 @@ class WallLook(Record):
 
 
 def judge_walls(walls: Walls) -> WallLook:
-    """Judge the material of a surface by its walls."""
     median, p90, p99 = (float(value) for value in np.percentile(walls.wall, (50, 90, 99)))
     compact = walls.wall >= COMPACT_HU
     compact_share = float(compact.mean())
@@ -130,7 +129,6 @@ def judge_walls(walls: Walls) -> WallLook:
 
 
 def looks_like_bone(judged: WallLook | None) -> bool:
-    """True for a surface of bone, faint or not."""
     return judged is not None and judged.looks_like in ("bone", "faint bone")
 
 

@@ -171,7 +171,6 @@ class Clusters:
         return len(members)
 
     def _place(self, members: IntArray) -> None:
-        """Place the clusters of these vertices, which are all of theirs."""
         names = self._names[members]
         size = np.bincount(names, minlength=len(self._names))
         # The border of an open surface has no planes that would hold it.
@@ -184,7 +183,6 @@ class Clusters:
             self._places[heads] = self._rounded(self._quadrics.best_places(clusters, merged, len(heads)))
 
     def _touching(self, vertices: IntArray) -> IntArray:
-        """Return the given triangles that have one of these vertices."""
         if len(vertices) <= _FEW * len(self._names):
             return self.fans.touching(vertices)
         flags = np.zeros(len(self._names), dtype=bool)
@@ -336,10 +334,7 @@ class Clusters:
         return np.unique(named[np.arange(len(named)), last])
 
     def find_left_behind(self, deviation: Deviation) -> IntArray:
-        """Find names of clusters with vertices that are too far from the surface around the name.
-
-        Only vertices with changed faces around their name are examined, and no triangles: `find_far` is exact.
-        """
+        """Find names of clusters with vertices too far from the changed faces around them; `find_far` is exact."""
         beside, near = (np.zeros(len(self._names), dtype=bool) for _ in range(2))
         beside[self._named[self._face_rows(self._new_to_vertices)]] = True
         self._new_to_vertices[:] = False

@@ -32,11 +32,7 @@ def last_of_collapses(collapses: NDArray[np.integer], count: int) -> NDArray[np.
 
 
 class Collapses:
-    """Collapses that stand, in the order in which they were made.
-
-    Every collapse joins two clusters, so those of a cluster form a tree: without the last of them it is two clusters
-    again, each as it was before.
-    """
+    """Collapses that stand, in order: those of a cluster form a tree, so that the last of them can be undone."""
 
     def __init__(self, count: int):
         # In columns: each is looked through by itself, several dozen times.

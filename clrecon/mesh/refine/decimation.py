@@ -71,7 +71,6 @@ def default_deviation(mesh: Mesh) -> float:
 
 
 def check_refinement(mesh: Mesh, max_deviation_mm: float | None) -> float:
-    """Check a mesh before refinement and return the bound in mm."""
     bound = default_deviation(mesh) if max_deviation_mm is None else float(max_deviation_mm)
     if not (math.isfinite(bound) and bound > 0.0):
         raise UsageError(f"the largest deviation is a length in mm above 0, not {bound:g}")
@@ -183,10 +182,7 @@ def _with_volumes(
     longest: float,
     find_crossings: FindCrossings,
 ) -> tuple[NDArray[np.floating], NDArray[np.uint32], int]:
-    """Return the surface of clusters as it is stored, each closed component with its original volume.
-
-    Where a component needs a shift longer than `longest` for it, collapses are undone; their number is returned too.
-    """
+    """Return the surface with its components' volumes, and the collapses undone where that moves over `longest`."""
     count, labels, border = clusters.components()
     wanted = measure_volumes(mesh.vertices - origin, mesh.triangles, count, labels, border)
     collapsed = clusters.collapsed_count
@@ -228,10 +224,7 @@ def _mend_roughly(clusters: Clusters, deviation: Deviation) -> None:
 def _collapse(
     clusters: Clusters, left_share: float, bound: float, error: float = _ERROR, aggressiveness: float = _AGGRESSIVENESS
 ) -> None:
-    """Make one round of fast-simplification on the present surface.
-
-    It leaves `left_share` of the triangles, or more where the quadric error reaches `error` squares of the bound.
-    """
+    """Make one round of fast-simplification, to `left_share` of the triangles or an `error` of squares of the bound."""
     from fast_simplification import simplify
 
     # In iteration i it collapses edges of an error up to 1e-9 * (i + 3)**agg.  Coordinates are scaled so that the last

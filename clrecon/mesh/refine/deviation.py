@@ -202,10 +202,7 @@ class Deviation:
         self._step = total / max(triangles.size, 1)
 
     def can_be_far(self, rows: IntArray, names: IntArray, places: Float64Array) -> NDArray[np.bool_]:
-        """Mark triangles that have changed, or have a corner that moved farther than the bound.
-
-        In the others no point has moved farther than the corners.
-        """
+        """Mark triangles that have changed, or a corner that moved farther than the bound: no others can be far."""
         triangles = self._triangles[rows]
         a, b, c = names[triangles].T
         changed = (a == b) | (b == c) | (c == a)
@@ -293,10 +290,7 @@ class Deviation:
     def _find_far_within(
         self, places: Float64Array, corners: NDArray[np.uint32], near: IntArray, look_at: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Mark edges (n, 2) or triangles (n, 3) that have a point inside that is too far away.
-
-        `near`, of the same shape, are vertices of the original surface near them.
-        """
+        """Mark edges (n, 2) or triangles (n, 3) with a point inside too far from the original near vertices `near`."""
         columns = [places.take(corner, axis=0) for corner in corners.T]
         longest = np.zeros(len(corners))
         for one, other in zip(columns, columns[1:] + columns[:1], strict=True):

@@ -204,10 +204,7 @@ class _Near:
         self._high = np.maximum.reduceat(np.maximum(was[1], now[1]), starts)
 
     def find_spoilt(self, vertices: IntArray, find_crossings: FindCrossings) -> IntArray:
-        """Find the vertices of spoilt triangles after these vertices went back.
-
-        What is spoilt elsewhere has nothing around it that could still be taken back.
-        """
+        """Find the vertices of spoilt triangles after these vertices went back."""
         moved, changed = self._moved, np.zeros(len(self._triangles), dtype=bool)
         changed[self.fans.touching(vertices)] = True
         boxes = find_boxes(moved, self._triangles[changed])

@@ -99,10 +99,7 @@ class Rings:
 
 
 class Filter:
-    """A low pass over a surface, and its components: the twin of `cl/surface/smoothing.cl`.
-
-    Sums are in the order of corners, in float32, so that both have the same bits.
-    """
+    """A low pass over a surface, and its components: twin of `cl/surface/smoothing.cl`, to the bit."""
 
     def __init__(self, rings: Rings):
         self._rings = rings
@@ -112,10 +109,7 @@ class Filter:
         return label_components(triangles, len(self._rings.weights))
 
     def measure_bends(self, places: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """Return how far each vertex (n, 3) lies from the mean of its neighbours, mm, and its normal.
-
-        Normals are twice the sum of the areas around each vertex, mm2.
-        """
+        """Return how far each vertex lies from the mean of its neighbours, (n, 3) mm, and its normal, of length mm2."""
         rings = self._rings
         own = np.repeat(places, np.diff(rings.begin), axis=0)
         after, before = places.take(rings.after, axis=0) - own, places.take(rings.before, axis=0) - own
@@ -281,10 +275,7 @@ class _Components:
         return np.asarray(pending & (np.abs(value) <= _VOLUME_SLACK * np.abs(self._volumes)))
 
     def find_changed(self, vertices: Float64Array, share: Float64Array) -> IntArray:
-        """Find the vertices of the components that have lost their volume where steps were taken back.
-
-        share: ndarray, shape (n,). Of each step that is made.
-        """
+        """Find the vertices of components that lost volume where of each step only `share`, (n,), is made."""
         touched = np.zeros(self._count + 1, bool)
         touched[self._labels[share < 1.0]] = True
         touched &= self._is_closed

@@ -22,10 +22,7 @@ LISTED = 20
 
 @dataclass(frozen=True, eq=False)
 class Topology:
-    """Euler numbers of the components of a surface, their faces, and the edges that are not in two faces.
-
-    euler: Vertices - edges + faces of each: 2 for a closed surface without tunnels, and 2 less for each tunnel.
-    """
+    """Euler numbers of components, 2 less a tunnel, their faces, and the edges that are not in two faces."""
 
     euler: NDArray[np.int64]
     faces: NDArray[np.int64]
@@ -119,10 +116,7 @@ def _find_ridges(faces: NDArray[np.uint32], edges: Edges) -> list[IntArray]:
 
 
 def find_faults_beside(faces: NDArray[np.uint32], new: NDArray[np.bool_]) -> IntArray:
-    """Find the same faults as `find_sheets`, but only those that new vertices can have made.
-
-    new: Vertices that were not there, or elsewhere: every face that is new has one of them.
-    """
+    """Find the faults of `find_sheets` that the vertices `new`, which every new face has one of, can have made."""
     touched = np.zeros(len(new), dtype=bool)
     touched[faces[any_corner(new, faces)]] = True
     # With their neighbours: the fans around the touched vertices and the faces along their edges are complete.

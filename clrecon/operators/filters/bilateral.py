@@ -58,7 +58,6 @@ class SlicesThere:
 
 
 def row_words(ni: int) -> int:
-    """Return the words of 32 groups for a row."""
     return -(-ni // (32 * NEAR_GROUP))
 
 

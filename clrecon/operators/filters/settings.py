@@ -280,7 +280,6 @@ def _positive(name: str, value: float, what: str) -> float:
 
 
 def checked_length(name: str, value: float, volume: Volume) -> float:
-    """Return a length in mm."""
     length = _positive(name, value, "a length in mm above 0")
     sides = [n * step for n, step in zip(volume.shape_ijk, volume.spacing, strict=True)]
     if length > max(sides):

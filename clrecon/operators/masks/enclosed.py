@@ -35,10 +35,7 @@ WIDE_ML = 20.0
 
 @dataclass(frozen=True)
 class Spaces:
-    """The components of what is not in a mask that it encloses, see `find_spaces`; arrays of shape (n,).
-
-    `numbers` are theirs among all components, ascending; `at_ends` tells where an end of the volume cuts the space.
-    """
+    """Components, (n,) each, that a mask encloses: ascending `numbers` among all; `at_ends` of the volume."""
 
     volume: Volume
     numbers: NDArray[np.intp]
@@ -99,14 +96,12 @@ def _sum_hu(runs: RunList, volume: Volume, count: int) -> NDArray[np.float64]:
 
 
 def _find_middle(runs: RunList) -> tuple[int, int, int]:
-    """Return i, j, k of a voxel in the middle of the middle slice."""
     at = np.flatnonzero(runs.k == runs.k[len(runs.k) // 2])
     one = at[len(at) // 2]
     return int(runs.first[one] + runs.last[one]) // 2, int(runs.j[one]), int(runs.k[one])
 
 
 def _hold_ball(runs: RunList, volume: Volume, radius_mm: float) -> bool:
-    """Tell whether a ball fits into these voxels."""
     lows = [int(low.min()) for low in (runs.k, runs.j, runs.first)]
     highs = [int(high.max()) + 1 for high in (runs.k, runs.j, runs.last)]
     steps = np.zeros([high - low for low, high in zip(lows, highs, strict=True)] + np.array([0, 0, 1]), np.int8)
@@ -325,9 +320,7 @@ def _default_seal(volume: Volume, bone: Mask) -> float:
 
 
 def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, steps: Steps) -> Volume:
-    """Fill what a mask encloses, see `fill_enclosed`; `how` is the radius of the seal, that of wide spaces, and whether
-    air stays.
-    """
+    """Fill what a mask encloses; `how`: radius of the seal, that of wide spaces, whether air stays."""
     volume = bone.scan
     seal_mm, largest_mm, keep_air = how
     # Near the ends of the volume no ball fits; there discs close what lies in the end slices themselves.

@@ -122,10 +122,7 @@ def _rows(
 def _capsule(
     volume: Volume, begin: Float64Array, end: Float64Array, radius: float, j: NDArray[np.int64], k: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], Float64Array, Float64Array]:
-    """Return rows, and where each enters and leaves the points within `radius` of a piece of a line.
-
-    These points are convex: two balls and a cylinder between them, and what a row has of each makes one span.
-    """
+    """Return rows, and where each enters and leaves the points within `radius` of a piece of a line, convex."""
     nj = volume.shape_ijk[1]
     starts = volume.slice_origins()[k] + j[:, None] * volume.affine[:3, 1]
     step = volume.affine[:3, 0]

@@ -29,8 +29,6 @@ def prepare_runs(device: Device) -> Program:
 
 @dataclass(frozen=True)
 class StencilTable:
-    """A stencil on a device."""
-
     rows_d: Any
     tables_d: Any
 
@@ -164,7 +162,6 @@ class RunList:
 
     @classmethod
     def read(cls, device: Device, found: Components, shape_ijk: tuple[int, int, int]) -> RunList:
-        """Read the runs of components from the device."""
         count, (_, nj, nk) = found.runs.count, shape_ijk
         ends = download(device, np.empty((count, 2), np.uint16), found.runs.runs_d).astype(np.int64)
         starts = download(device, np.empty(nj * nk + 1, np.uint32), found.runs.row_counts_d)
@@ -178,14 +175,12 @@ class RunList:
         return self.last - self.first + 1
 
     def where(self, which: NDArray[np.bool_]) -> RunList:
-        """Return some of the runs; `which` has shape (n,)."""
         return RunList(self.j[which], self.k[which], self.first[which], self.last[which], self.numbers[which])
 
     def of(self, number: int) -> RunList:
         return self.where(self.numbers == number)
 
     def sum_ml(self, volume: Volume, count: int) -> NDArray[np.float64]:
-        """Return the volume of each of `count` components, ml."""
         return np.bincount(self.numbers, self.lengths * slice_voxel_ml(volume)[self.k], count).astype(np.float64)
 
 

@@ -56,9 +56,7 @@ ANY_NUMBER = 1 << 30
 
 
 def ball_of(volume: Volume, radius: float, *, by_slice: bool = False) -> Stencil:
-    """Return the voxels within ``radius * (1 + 1e-6)`` mm of a voxel, by their places, in the volume or in its own
-    slice.
-    """
+    """Return the voxels within ``radius * (1 + 1e-6)`` mm of a voxel, in the volume or in its own slice."""
     return _checked(make_stencil(Lattice.of(volume), radius), volume, radius, by_slice)
 
 

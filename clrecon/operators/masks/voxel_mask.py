@@ -282,7 +282,6 @@ def count_bits(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int]) -> 
 
 
 def find_extents(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int]) -> VoxelMask:
-    """Return the mask with the extents of its rows."""
     words, rows = _words(shape_ijk)
     extents_d = allocate(device, 4 * rows)
     launch(
@@ -307,6 +306,5 @@ def replace_outside(
 
 
 def _words(shape_ijk: tuple[int, int, int]) -> tuple[int, int]:
-    """Return the words of a row, and the rows."""
     ni, nj, nk = shape_ijk
     return -(-ni // 32), nj * nk

@@ -154,8 +154,6 @@ def _cluster_volume(
 
 @dataclass(frozen=True)
 class _Request:
-    """What is looked for on one lattice."""
-
     lattice: Lattice
     eps: float
     samples: int
@@ -343,7 +341,6 @@ def _find_numbered(cloud: PointCloud, volume: Volume | None) -> tuple[Order, Lat
 
 
 def _find_listed(cloud: PointCloud, volume: Volume | None) -> tuple[Order, Lattice, NDArray[np.int32]]:
-    """Return order, lattice and voxels of any cloud of voxels."""
     assert cloud.ijk is not None
     order, ijk = _order_voxels(cloud.ijk)
     lattice, first = _find_lattice(cloud, volume)
@@ -388,7 +385,6 @@ def _restore_order(
 
 
 def _find_lattice(cloud: PointCloud, volume: Volume | None) -> tuple[Lattice, NDArray[np.int32]]:
-    """Return the lattice of a cloud's voxels, and the voxel that it begins with."""
     assert cloud.ijk is not None
     low, high = _corners(cloud.ijk)
     some = cloud.ijk[:: _stride(cloud)]

@@ -255,8 +255,6 @@ class _Settings:
 
 
 class _Run:
-    """All iterations on one device."""
-
     def __init__(self, settings: _Settings, device: Device, memory: int | None, progress: Progress):
         self.settings, self.device, self.memory, self.progress = settings, device, memory, progress
         self.stopwatch = Stopwatch()
@@ -329,7 +327,6 @@ class _Run:
             )  # fmt: skip
 
     def describe(self, cloud: PointCloud, moved: NDArray[np.floating], warnings: tuple[str, ...]) -> PointStep:
-        """Return the step, with the figures of all moves together."""
         settings = self.settings
         away = moved - cloud.points
         squares = np.einsum("ni,ni->n", away, away)

@@ -54,7 +54,6 @@ class Masks:
 
     @property
     def total(self) -> int:
-        """Words of a mask."""
         return self.words * self.rows
 
     def make(self) -> Any:
@@ -81,7 +80,6 @@ class Signs:
 
     @property
     def share_against(self) -> float:
-        """Share of the votes that were against the winner."""
         return self.against / self.votes if self.votes else 0.0
 
 
@@ -124,7 +122,6 @@ class _Decision:
         return _Runs(offsets.offsets_d, firsts_d, lasts_d, offsets.total)
 
     def number_regions(self, runs: _Runs) -> tuple[int, NDArray[np.int64]]:
-        """Return the number of regions, and that of each run."""
         masks, rows = self.masks, self.masks.rows
         of = {"offsets": runs.offsets_d, "firsts": runs.firsts_d, "lasts": runs.lasts_d}
         sizes = {"ny": masks.shape[1], "rows": rows, "runs": runs.count}
@@ -249,7 +246,6 @@ class Nodes:
 
     @property
     def words(self) -> int:
-        """Words of 32 nodes in a row of the masks."""
         return -(-self.shape[0] // 32)
 
     @property
@@ -262,17 +258,14 @@ class Nodes:
 
     @property
     def brick_words(self) -> int:
-        """Words of 32 bricks in a row of the mask of bricks."""
         return -(-self.bricks[0] // 32)
 
     @property
     def layer_bytes(self) -> int:
-        """Bytes of the volume in a layer of bricks."""
         return 4 * self.shape[0] * self.shape[1] * BRICK[2]
 
     @property
     def corner_and_spacing(self) -> tuple[float, float, float, float]:
-        """The float4 of kernels."""
         x, y, z = map(float, self.corner)
         return x, y, z, float(self.spacing)
 
@@ -285,7 +278,6 @@ class Nodes:
 
 
 def plan_nodes(points: GridPlan, settings: FieldSettings) -> Nodes:
-    """Lay nodes around the points of a grid."""
     h = np.float32(settings.spacing)
     margin = settings.bridge + float(h)
     low, high = points.points.min(axis=0).astype(np.float64), points.points.max(axis=0).astype(np.float64)
@@ -497,7 +489,6 @@ class NodeField:
 
 
 def _largest(most: int, fits: Callable[[int], bool]) -> int:
-    """Return the largest number up to `most` that fits; 0 where 1 does not."""
     if fits(most):
         return most
     low, high = 0, most

@@ -68,9 +68,7 @@ CELLS_AN_ITEM = 32
 
 @dataclass(frozen=True, eq=False)
 class FreeClusters:
-    """The result of `cluster_free_points`: clusters, numbered by their first core point, -1 for noise, and facts for a
-    report.
-    """
+    """Result of `cluster_free_points`: clusters, by their first core point, -1 for noise, and facts for a report."""
 
     labels: NDArray[np.int32]
     cores: NDArray[np.bool_]

@@ -78,7 +78,6 @@ class GridPlan:
 
     @property
     def total_words(self) -> int:
-        """Words of all rows."""
         return self.words * self.shape[1] * self.shape[2]
 
     def needs(self, device: Device) -> dict[str, int]:

@@ -185,11 +185,7 @@ def check_neighbours(k: int, points: int, fewest: int = 1) -> tuple[int, tuple[s
 
 
 class NeighbourSearch:
-    """A grid over at least `k` points, and the kernel that lists neighbours by it, in parts of some `PART_POINTS`
-    points.
-
-    `needs` are bytes of further buffers, for the forecast.
-    """
+    """A grid over at least `k` points, and the kernel that lists neighbours in parts of some `PART_POINTS` points."""
 
     def __init__(
         self,

@@ -228,8 +228,6 @@ def _check_viewpoint(viewpoint: ArrayLike) -> NDArray[np.float64]:
 
 @dataclass
 class _Run:
-    """One estimate on one device."""
-
     cloud: PointCloud
     k: int
     device: Device

@@ -52,7 +52,6 @@ class Walls:
 
     @property
     def share(self) -> float:
-        """Share of all faces that are walls."""
         return float(self.walls.sum() / max(int(self.faces.sum()), 1))
 
     @property

@@ -159,10 +159,7 @@ class ClusterSearch:
         )  # fmt: skip
 
     def label(self, numbers: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
-        """Return the cluster of each point in the order k, j, i, -1 for noise: (points,) int32.
-
-        With `numbers`, (runs,) int32, others than those of the clusters; border points take the lowest of these.
-        """
+        """Return the cluster of each point, or its `numbers` (runs,), order k, j, i, -1 for noise: (points,) int32."""
         labels, labels_d = empty_output(self._device, (self.points,), np.int32)
         if not self.runs:
             labels.fill(-1)

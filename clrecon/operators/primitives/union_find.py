@@ -112,7 +112,6 @@ class _Rounds:
         launch(self._device, self._program[kernel], items, **arguments)
 
     def start(self) -> None:
-        """Clear the flags; the labels are there."""
         self.run("clear_labels", 1, labels=allocate(self._device, 4), flags=self._flags_d, n=1)
 
     def number(self, labels_d: Any, spare_d: Any, n: int) -> tuple[int, Any]:
@@ -131,7 +130,6 @@ class _Rounds:
             self.jump("jump_roots", self._roots.count, roots=self._roots.positions_d, count=self._roots.count)
 
     def hook_by(self, hook: Callable[[Any, Any, Any, int], None]) -> tuple[Any, Any]:
-        """Run the rounds of `hook_in_rounds`."""
         self.run(
             "jump_labels", self._nodes,
             labels=self._labels_d, jumped=self._other_d, flags=self._flags_d, n=self._nodes,
@@ -153,7 +151,6 @@ class _Rounds:
             )  # fmt: skip
 
     def _hook(self, corners_d: Any, count: int) -> bool:
-        """Hook roots to other roots; return whether there were any."""
         number = self._next_pass()
         self.run(
             "hook_roots", count,
@@ -195,8 +192,6 @@ class _Rounds:
 
 
 class _Search(_Rounds):
-    """The rounds on a mesh."""
-
     def __init__(self, device: Device, triangles: NDArray[np.uint32], vertex_count: int, memory: int | None):
         self._limits = memory_limits(device, memory)
         self._faces, self._vertices = len(triangles), vertex_count

@@ -166,7 +166,6 @@ class _Splats:
         stopwatch: Stopwatch,
         progress: Progress,
     ) -> SplatPicture:
-        """Draw the picture with `count` points at a time."""
         device, (width, height) = self.device, self.size
         program = load_program(device, "rays/splats.cl")
         pixels, n = width * height, len(points)

@@ -198,9 +198,7 @@ def composite_slab(
     stopwatch: Stopwatch,
     between: Between | None = None,
 ) -> None:
-    """Blend one slab into a picture, and wait; of a part of the rays, `between`, only the states of `output` are
-    written.
-    """
+    """Blend one slab into a picture, and wait; of a part of the rays, `between`, write only the states of `output`."""
     device = resident.device
     variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
     if tables.steepness.is_steep and takes_parts(resident.volume, view.ray_step):
@@ -290,7 +288,6 @@ _NO_BODY = "no body was found in the scan: the lowest values are those of all of
 
 
 def take_picture(resident: DeviceVolume, style: VolumeLook | Projection, shot: Shot, ray_step: float) -> Rendering:
-    """Take one picture of a volume on a device."""
     for attempt in resident.with_fallback():
         with attempt as (_, warnings):
             made = _Job(resident, style, shot, ray_step, warnings).run()
@@ -305,10 +302,7 @@ def take_with_layers(
     beside: Mapping[str, int],
     draw: Callable[[DrawnVolume], Rendering],
 ) -> Rendering:
-    """Take a picture of a volume with what lies in it, whose buffers take bytes `beside` it.
-
-    `draw` is called again where the device has no room, or another one takes over.
-    """
+    """Picture a volume with what lies in it; `draw` is called again where room is short or another device works."""
 
     for attempt in resident.with_fallback():
         with attempt as (device, warnings):

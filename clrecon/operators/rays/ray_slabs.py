@@ -360,7 +360,6 @@ class SlabPicture(ABC):
             return output.download(), number
 
     def describe(self, mode: str, slabs: int, **own: Any) -> dict[str, Any]:
-        """Return the report of the picture."""
         device = self.resident.device
         return {
             "mode": mode,

@@ -82,10 +82,7 @@ def overlay_with_layers(
     beside: Mapping[str, int],
     draw: Callable[[DrawnVolume], Rendering],
 ) -> Rendering:
-    """Show slices of a volume in space with what lies between them, whose buffers take bytes `beside` it.
-
-    `draw` is called again where the device has no room, or another one takes over.
-    """
+    """Show slices of a volume with what lies between; `draw` is called again as in `take_with_layers`."""
     for attempt in resident.with_fallback():
         with attempt as (device, warnings):
             overlay = _Overlay(resident, style, shot, warnings)
@@ -116,9 +113,7 @@ class _Colors(NamedTuple):
 
 
 def _sort_slices(volume: Volume, camera: Camera, chosen: Sequence[int]) -> list[int]:
-    """Sort slices in the order in which rays cross them, all alike: parallel ones up or down, others away from the
-    camera.
-    """
+    """Sort slices as rays cross them, all alike: parallel ones up or down, others away from the camera."""
     heights = _heights(volume, volume.slice_origins()[list(chosen)])
     if camera.is_parallel:
         along = heights * np.sign(_heights(volume, camera.basis().forward[None])[0] or 1.0)
@@ -176,7 +171,6 @@ class _Overlay:
             self._draw(self.order[first : first + slices], 0, output, between)
 
     def take(self, slices: int) -> Rendering:
-        """Take the picture, so many slices at a time."""
         stopwatch, device = self.stopwatch, self.resident.device
         parts = [self.order[first : first + slices] for first in range(0, len(self.order), slices)]
         output = PictureBuffers(device, self.shot.size, self.shot.background, len(parts) > 1)

@@ -265,7 +265,6 @@ class CutJob:
         report: dict[str, Any],
         background: str | Sequence[float],
     ) -> Rendering:
-        """Return the picture before its background."""
         if depth is None:
             depth = np.full(values.shape, np.nan, np.float32)
         if numbers is not None and self.look is not None:

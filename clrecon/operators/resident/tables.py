@@ -64,7 +64,6 @@ class FieldFrame:
         return cls(inverse[:3, :3], inverse[:3, 3])
 
     def places(self, points: Float64Array) -> Float64Array:
-        """Return the field coordinates (n, 3) of LPS points (n, 3)."""
         return points @ self.matrix.T + self.offset
 
     def planes(self, planes: Float64Array) -> Float64Array:

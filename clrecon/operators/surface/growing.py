@@ -157,9 +157,7 @@ class Runs:
 
 @dataclass(frozen=True)
 class Components:
-    """Components of runs on the device: the root of each run; at roots the cells of the component, and 1 where it is
-    chosen; and sums over all of them.
-    """
+    """Components of runs on the device: the root of each run; at roots their cells, and 1 if chosen; and all sums."""
 
     roots_d: Any
     cells_d: Any
@@ -299,7 +297,6 @@ class _Search:
         return Runs(active_d, starts_d, words_d, extents_d, scanned.offsets_d, scanned.total)
 
     def join(self, runs: Runs) -> Components:
-        """Join runs to components, none of which is chosen."""
         device, n = self.device, runs.total
         parents_d, cells_d, chosen_d, roots_d = (allocate(device, 4 * n) for _ in range(4))
         sums_d = allocate(device, 4 * SUMS["SUMS"])

@@ -156,7 +156,6 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
         self.levels: dict[int, int] = {}
 
     def programs(self) -> tuple[Program, Program]:
-        """The kernels, see `prepare_label_masks`."""
         with self.stopwatch.timed("build"):
             return prepare_label_masks(self.device, self.labels.voxels.dtype)
 
@@ -304,16 +303,13 @@ class StartedMesh:
     emission: marching_cubes.Emission
 
     def place(self, level: int) -> None:
-        """Write the vertices at this level."""
         held = self.held
         biases_d = upload(self.run.device, level_biases(self.run.levels, self.run.labels.numbers[-1] + 1))
         with self.run.stopwatch.running(self.run.device):
             self.emission.vertices(level, map=held.map_d, label=self.number, occupied=held.occupied_d, biases=biases_d)
 
     def enclosed_mm3(self, level: int) -> float:
-        """Return the volume that the mesh encloses at a level: the device sums some hundred triangles at a time, the
-        host the rest.
-        """
+        """Return the volume that the mesh encloses at a level: the device sums pieces, the host the rest."""
         self.place(level)
         device, stopwatch, placement = self.run.device, self.run.stopwatch, self.run.placement
         middle = [[(part.start + part.stop - 1) / 2 for part in self.box[::-1]]]

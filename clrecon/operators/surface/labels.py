@@ -199,8 +199,6 @@ def prepare_labels(
 
 
 class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
-    """One extraction: the data that its labels share."""
-
     def __init__(
         self,
         resident: DeviceVolume,
@@ -223,7 +221,6 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
         self.share_by_hu = 1.0  # of the vertices of the label that was extracted last
 
     def programs(self) -> tuple[Program, Program]:
-        """The kernels, see `prepare_labels`."""
         with self.stopwatch.timed("build"):
             return prepare_labels(self.device, self.resident.dtype, self.labels.dtype, self.volume.uneven)
 
@@ -449,7 +446,6 @@ def _make_meshes(
     label: Sequence[int | str] | int | str | None,
     progress: Progress,
 ) -> dict[int, Mesh]:
-    """Make the meshes of labels that have one; a label that was named must have one."""
     chosen = labels.choose(label)
     boxes = find_boxes(taken.voxels, chosen, run.growth.reach)
     refuse = None if label is None else partial(_refuse_label, run.volume, taken, labels, run.rule)

@@ -67,9 +67,7 @@ class Classified:
 
 @dataclass(frozen=True)
 class Counted:
-    """The results of `count` for one slab, on the device, and the totals of the slab's own rows; `cells` with the
-    topology of the trilinear field.
-    """
+    """Results of `count` for a slab, on the device, and totals of its own rows; `cells` of the trilinear field."""
 
     row_offsets_d: Any
     word_vertices_d: Any
@@ -173,7 +171,6 @@ def prepare_marching_cubes(
 
 
 def pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return rows of three as rows of four float32, for float4."""
     padded = np.zeros((*rows.shape[:-1], 4), dtype=np.float32)
     padded[..., :3] = rows
     return padded
@@ -246,7 +243,6 @@ def classify(
 
 
 def too_many(vertices: int, triangles: int) -> DeviceError:
-    """Return the error for a surface whose vertices or triangles 32 bits cannot number."""
     return DeviceError(
         f"the surface has {vertices:,} vertices and {triangles:,} triangles:"
         " more than 32 bits can number; choose another iso value or a part of the volume"

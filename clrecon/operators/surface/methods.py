@@ -117,9 +117,7 @@ DECIMATED_SHARE = 0.9
 
 @dataclass(frozen=True)
 class Method:
-    """A method of marching cubes: by the kernels, or in numpy as a row for comparisons; it decimates "", "quadric",
-    "bounded".
-    """
+    """A method of marching cubes, by kernels or in numpy; it decimates "", "quadric", "bounded"."""
 
     name: str
     what: str

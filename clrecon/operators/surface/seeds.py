@@ -70,7 +70,6 @@ class Seeds:
 
 
 def _split(grow_from: Any) -> list[Any]:
-    """Return the items of ``grow_from``: one seed is a list of one."""
     if isinstance(grow_from, str) or hasattr(grow_from, "to_numpy") or hasattr(grow_from, "numbers"):
         return [grow_from]
     if isinstance(grow_from, np.ndarray):
@@ -120,7 +119,6 @@ def _describe_point(point: ArrayLike) -> str:
 
 
 def check_points(volume: Volume, points: NDArray[np.float64]) -> None:
-    """Refuse points outside of the volume."""
     if not len(points):
         return
     size = np.array(volume.shape_ijk)

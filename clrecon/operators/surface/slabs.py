@@ -17,10 +17,7 @@ BRICKS = "brick ranges"
 
 @dataclass(frozen=True)
 class SampleGrid:
-    """The samples of a volume with its border, and their packing in the inside mask.
-
-    If only a part of the surface is made (`grows`), bits of the whole grid stay on the device.
-    """
+    """The samples of a volume with its border, packed in the inside mask; kept for the whole grid where it `grows`."""
 
     volume: Volume
     rule: IsoRule
@@ -50,7 +47,6 @@ class SampleGrid:
 
     @property
     def flag_words(self) -> int:
-        """32-bit words in a row of one flag for each word."""
         return 1 << (self.row_shift - 5)
 
     @property
@@ -82,7 +78,6 @@ class Slab:
 
     @property
     def mask_slices(self) -> int:
-        """Slices that are classified."""
         return min(self.end + 2, self.grid.shape[2]) - self.first
 
     @property
@@ -92,7 +87,6 @@ class Slab:
 
     @property
     def mask_rows(self) -> int:
-        """Rows that are classified."""
         return self.mask_slices * self.grid.shape[1]
 
     @property
@@ -138,7 +132,6 @@ class Slab:
         }
 
     def volume_bytes(self) -> int:
-        """Bytes of the slices of the volume that the slab reads."""
         first, end = self.voxel_slices
         ni, nj, _ = self.grid.volume.shape_ijk
         return (end - first) * ni * nj * int(self.grid.volume.voxels.dtype.itemsize)

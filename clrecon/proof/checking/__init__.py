@@ -48,9 +48,7 @@ def require_close(found: ArrayLike, expected: ArrayLike, allowed: float, what: s
 
 
 def require_share(found: ArrayLike, expected: ArrayLike, allowed: float, share: float, what: str) -> float:
-    """Refuse numbers of which more than a share is more than `allowed` apart, as float32 takes the other side of an
-    edge at some elements; return the largest distance of the others.
-    """
+    """Refuse where more than a share is more than `allowed` apart; return the largest distance of the others."""
     one, other = np.asarray(found, dtype=np.float64), np.asarray(expected, dtype=np.float64)
     if one.shape != other.shape:
         raise DeviceError(f"{what}: {_describe_shape(one)} in place of {_describe_shape(other)}")
@@ -118,7 +116,6 @@ def noise(shape: tuple[int, int, int], dtype: str, high: int = 6) -> NDArray[Any
 
 
 def centre_of(volume: Volume) -> NDArray[np.float64]:
-    """Return the middle of a volume in mm."""
     return np.asarray(volume.ijk_to_lps([(np.array(volume.shape_ijk) - 1) / 2])[0])
 
 

@@ -42,10 +42,7 @@ Segments = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane across an `axis` (of i, j, k) of the volume at an index coordinate.
-
-    The axes `across` and `down` run to the right and down in the picture, with `flip` the latter upward.
-    """
+    """A plane across an `axis` (i, j, k) at an index; `across` runs to the right and `down` down, with `flip` up."""
 
     name: str
     axis: int
@@ -82,7 +79,6 @@ def inside_box(volume: Volume, iso_value: float) -> NDArray[np.float64]:
 
 
 def cut_mesh(mesh: Mesh, volume: Volume, plane: Plane) -> Segments:
-    """Return the lines in which a mesh cuts a plane."""
     ijk = volume.lps_to_ijk(mesh.vertices)
     height = ijk[:, plane.axis] - plane.at
     above = height[mesh.triangles] > 0.0
@@ -116,7 +112,6 @@ def read_plane(volume: Volume, plane: Plane) -> NDArray[np.uint8]:
 
 
 def to_grey(values: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return HU as grey values of the window."""
     low, high = WINDOW_HU
     return np.rint(255.0 * np.clip((values - low) / (high - low), 0.0, 1.0)).astype(np.uint8)
 
@@ -355,7 +350,6 @@ class Figures:
     paper: dict[str, Any] | None = None
 
     def complete(self, records: Sequence[MethodRecord]) -> list[MethodRecord]:
-        """Return the records with what pictures say, and the files of pictures."""
         likeness = compare_pictures(
             {name: view for name, view in self.views.items() if self._is_like(name)}, self.reference
         )

@@ -307,7 +307,6 @@ def _of_truth(done: Rows) -> Iterator[str]:
 
 
 def find_worse(method: MethodRecord, reference: MethodRecord | None) -> list[str]:
-    """Return in which measures a method is worse than the reference, in words."""
     if reference is None or not method.is_done or method.name == reference.name:
         return []
     if method.makes != "mesh":

@@ -45,7 +45,6 @@ class Judge:
 
     @cached_property
     def reference(self) -> Mesh | None:
-        """The mesh that others are compared with."""
         return None if self._reference is None else load_mesh(self._folder, self._reference)
 
     @cached_property

@@ -149,7 +149,6 @@ def make(scene: Scene) -> Made:
 
 
 def _joined(reports: list[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the last report, with the kernels of all of them."""
     kernels: dict[str, float] = {}
     for report in reports:
         for name, spent in report.get("kernel_seconds", {}).items():

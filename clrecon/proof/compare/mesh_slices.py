@@ -275,7 +275,6 @@ class Lattice:
 
     @classmethod
     def over(cls, volume: Volume, rule: IsoRule, finer: int, offsets: tuple[float, float, float]) -> Lattice:
-        """Return the lattice over a volume and its border."""
         ni, nj, nk = (size + 2 * rule.border - 1 for size in volume.shape_ijk)
         return cls(finer, offsets, rule.border, (ni, nj, nk))
 

@@ -17,9 +17,7 @@ MESH, CLOUD, PICTURE = "mesh", "cloud", "picture"
 
 @dataclass(frozen=True)
 class Compared:
-    """A method that is compared; it makes a "mesh", "cloud" or "picture", on the device or not, by a `peer` or by
-    clrecon.
-    """
+    """A method that is compared, by a `peer` or clrecon, on the device or not: a "mesh", "cloud" or "picture"."""
 
     name: str
     title: str

@@ -20,7 +20,6 @@ from clrecon.proof.compare.table import main_table, paper_table, shown_columns, 
 
 
 def _read(name: str) -> str:
-    """Return a file beside this one."""
     return (files(__package__) / name).read_text(encoding="utf-8")
 
 

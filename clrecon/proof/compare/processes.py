@@ -29,10 +29,7 @@ _VOXELS, _PLACE = "voxels.npy", "place.npz"
 
 @dataclass(frozen=True)
 class Request:
-    """What one process does with a method: the volume is in `folder`, which gets the results.
-
-    Of `repeat` warm runs; `along` is a view along the slices, for the table of the paper.
-    """
+    """What a process does with a method and the volume in `folder`, `repeat` warm runs; `along`: view for the paper."""
 
     method: str
     folder: str
@@ -106,7 +103,6 @@ MOST_JUDGES = 4
 
 
 def _start(command: Sequence[str], told: Mapping[str, Any]) -> subprocess.Popen[bytes]:
-    """Start a process of this interpreter, and tell it what to do."""
     if getattr(sys, "frozen", False) or not sys.executable:
         raise DeviceError("methods are compared in processes of a Python interpreter, and this program has none")
     try:
@@ -156,11 +152,7 @@ def _describe_end(code: int) -> str:
 
 
 def measure_in_processes(told: Mapping[str, Any], methods: Mapping[str, int]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Measure what methods made in a process a core, and yield names with figures, see `Judge`, or only with
-    ``reasons``.
-
-    `methods` tells by name how much there is to measure.
-    """
+    """Measure products, a process a core; yield names with figures, see `Judge`, or ``reasons``."""
     parts = _share(methods, min(usable_cores(), MOST_JUDGES))
     lines: queue.Queue[tuple[int, bytes]] = queue.Queue()
     processes: list[subprocess.Popen[bytes]] = []

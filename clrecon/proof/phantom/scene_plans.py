@@ -144,9 +144,7 @@ FAT_HU = -100.0
 
 
 def _leg(x: float, y: float, size: float) -> list[Part]:
-    """Plan a lower leg without ends, `size` times that of a large person: skin and fat, muscle, tibia and fibula as
-    tubes.
-    """
+    """Plan a leg without ends, `size` times a large person's: skin and fat, muscle, tibia and fibula."""
 
     def bone(dx: float, dy: float, radius: float, wall: float) -> list[Part]:
         lean = 12.0 * size

@@ -126,9 +126,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Plan:
-    """The parts of a body in order, with the y of its front and back surfaces, against which a table may lie, and the
-    middle (x, z) of the head, for a head rest.
-    """
+    """The parts of a body in order, y of its front and back for a table, and the head's middle (x, z) for a rest."""
 
     parts: Sequence[Part]
     front: float
@@ -195,10 +193,7 @@ def facts_of_parts(voxels: NDArray[np.int16], labels: LabelArray, affine: Float6
 
 
 def bone_depth(parts: Sequence[Part], points_mm: Float64Array, *materials: str) -> Float32Array:
-    """Return how deep points, (n, 3) LPS mm, lie in the parts of these materials, mm, negative outside.
-
-    Exact for rods and balls, and to the first order for the other shapes.
-    """
+    """Return how deep points, (n, 3) LPS mm, lie in parts of these materials, mm; exact for rods and balls."""
     x, y, z = np.ascontiguousarray((points_mm - CENTRE_LPS_MM).T, dtype=np.float32)
     depth = np.full(len(points_mm), -np.inf, dtype=np.float32)
     for part in parts:

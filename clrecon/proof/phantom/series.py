@@ -130,7 +130,6 @@ _PHASE_SECONDS = 3
 
 
 def slice_file_name(index: int) -> str:
-    """Name of the file of slice `index`, counted from 0."""
     return f"IM{index + 1:04d}.dcm"
 
 
@@ -156,7 +155,6 @@ def _make_headers(settings: PhantomSettings, placement: Placement, phase: int) -
 
 
 def _make_header(settings: PhantomSettings, placement: Placement, phase: int) -> FileDataset:
-    """Make what the slices of a phase have in common."""
     from pydicom.dataset import FileDataset, FileMetaDataset
     from pydicom.uid import PYDICOM_IMPLEMENTATION_UID, UID
 

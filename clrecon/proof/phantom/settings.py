@@ -44,9 +44,7 @@ def ghost_places(slices: int) -> tuple[int, int]:
 
 
 def draw_ghosts(voxels: NDArray[np.int16], seed: int) -> dict[str, Any]:
-    """Replace two slices of a stack in place, by a screen capture and by a sagittal view of the stack itself, and
-    return what the truth says of them.
-    """
+    """Replace two slices by a screen capture and a sagittal view; return what the truth says of them."""
     capture, sagittal = ghost_places(len(voxels))
     view = _sagittal(voxels)
     rows = np.arange(voxels.shape[1]) * view.shape[0] // voxels.shape[1]
@@ -486,11 +484,7 @@ class PhantomSettings:
         return self.slices, self.size[1], self.size[0]
 
     def as_dict(self) -> dict[str, Any]:
-        """All settings as plain JSON types.
-
-        UIDs are derived from these texts, so defaults of table, spine and series are left out: phantoms of earlier
-        versions keep their UIDs.
-        """
+        """All settings as JSON types; UIDs derive from them: later settings are left out where default."""
         plain = {
             name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()
         }

@@ -70,10 +70,7 @@ def _draw_organs(
     canvas: Field, anatomy: Anatomy, cavity: Field, x: Field, y: Field, z: Field, ramp: float, seed: int,
     blood_hu: float,
 ) -> Field:  # fmt: skip
-    """Draw abdominal organs in fat and, above the diaphragm, lungs; return the distance into the lungs.
-
-    `x` and `y` count from the middle of the trunk.
-    """
+    """Draw organs and lungs at x, y from the middle of the trunk; return the distance into the lungs."""
     wide, deep = anatomy.half_width - 28.0, anatomy.half_depth - 28.0
     low = np.float32(anatomy.level_z("L1"))
     _blend(canvas, coverage(cavity, ramp), FAT_HU + 8.0)

@@ -237,9 +237,7 @@ class Outline:
 
 
 def plan_outline(chain: Chain, half_width: float, half_depth: float) -> Outline | None:
-    """Plan the outline round a chain; None round a straight trunk: its ellipse, of these half axes in mm, has its
-    middle at x = y = 0 at all heights.
-    """
+    """Plan the outline round a chain; None for a straight trunk: an ellipse of these half axes at x = y = 0."""
     with_neck = chain.names[0] == "C1"
     if not with_neck and not chain.moved.any():
         return None
@@ -336,5 +334,4 @@ class Anatomy:
     outline: Outline | None = None
 
     def level_z(self, name: str) -> float:
-        """Return z of the centre of a level's vertebral body."""
         return float(self.centres[name][2])

@@ -29,7 +29,6 @@ Float64Array = NDArray[np.float64]
 
 
 def _rotation(oblique: tuple[float, float, float]) -> Float64Array:
-    """Return the rotation about x, then y, then z, degrees."""
     matrix = np.eye(3)
     for axis, angle in enumerate(oblique):
         c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
@@ -132,7 +131,6 @@ def _plan_discs(vertebrae: list[Vertebra]) -> list[Disc]:
 
 
 def _plan_ribs(vertebrae: list[Vertebra], moved: Float64Array, half_width: float, half_depth: float) -> list[Rib]:
-    """Plan the ribs of a straight trunk, and move each with its vertebra."""
     ribs = []
     for vertebra, away in zip(vertebrae, moved, strict=True):
         for side in (1, -1):
@@ -219,9 +217,7 @@ def spine_choice(
     levels: tuple[str, ...], bend: tuple[float, float], facet_gap_mm: float | None, *, centred: bool,
     directions: tuple[float, tuple[float, float, float], bool], length_mm: float | None,
 ) -> SpineChoice:  # fmt: skip
-    """Return a choice, bent by (kyphosis, scoliosis), for slices of directions (tilt, oblique, prone), see
-    `slice_directions`, and a volume of a length along their normal.
-    """
+    """Return a choice, bent by (kyphosis, scoliosis), for slices of directions (tilt, oblique, prone) and a length."""
     row, column, _ = slice_directions(*directions)
     x, y, z = (float(value) for value in np.cross(row, column))
     return SpineChoice(levels, *bend, facet_gap_mm, centred, (x, y, z), length_mm)

@@ -174,9 +174,7 @@ class BoneSurface:
         return np.asarray(distance, dtype=np.float64)
 
     def _foot(self, n: int, points: Float64Array, starts: Float64Array) -> Float64Array:
-        """Return the distance from points to the feet of their perpendiculars on the parts of the surface that are
-        nearest at `starts`; infinite where the foot is cut away.
-        """
+        """Return distances to the feet of perpendiculars on the parts nearest at `starts`; infinite where cut away."""
         shape = self._shapes[n]
         found = np.full(len(points), np.inf)
         values = np.abs(shape.parts(starts))

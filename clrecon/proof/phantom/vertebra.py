@@ -118,9 +118,7 @@ def _axis(vertebra: Vertebra, side: Field, y: Field, z: Field) -> tuple[Field, l
 
 
 def _typical(vertebra: Vertebra, side: Field, y: Field, z: Field) -> tuple[Field, list[Field]]:
-    """C3 to C7: uncinate processes, articular pillars, forked transverse processes with foramina; C3 to C6 have a
-    short spinous process with two tips, C7 a long one with one.
-    """
+    """C3 to C7: uncinate processes, pillars, forked transverse processes; C7 alone has one long spinous tip."""
     half_x, half_y, half_z = vertebra.width / 2.0, vertebra.depth / 2.0, vertebra.height / 2.0
     wide, middle = vertebra.canal_half_width, half_y + vertebra.canal_half_depth
     rear = middle + vertebra.canal_half_depth
@@ -202,9 +200,7 @@ def _mix(thoracic: tuple[float, ...], lumbar: tuple[float, ...], share: float) -
 
 
 def _arch_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
-    """Return the distance to pedicles, articular processes, laminae, transverse and spinous processes; |x| serves both
-    sides.
-    """
+    """Return the distance to pedicles, laminae and all processes; |x| serves both sides."""
     side = np.abs(x)
     wide, deep, high = vertebra.canal_half_width, vertebra.canal_half_depth, vertebra.height
     middle = vertebra.depth / 2.0 + deep
@@ -275,9 +271,7 @@ def upper_facet_seats(vertebra: Vertebra) -> list[tuple[float, float, float]]:
 
 
 def vertebra_shape(vertebra: Vertebra, x: Field, y: Field, z: Field) -> tuple[Field, list[Field]]:
-    """Return the distance to the bone before cutting, and those to what is cut out of it, mm, positive inside; x, y, z
-    are local mm.
-    """
+    """Return distances, mm, positive inside, at local x, y, z: to the uncut bone, and to what is cut out of it."""
     if vertebra.is_cervical:
         bone, cuts = cervical_shape(vertebra, x, y, z)
     else:
@@ -387,9 +381,7 @@ def _distance_to(vertebra: Vertebra, points: Float64Array) -> Float64Array:
 
 
 def close_facets(vertebrae: Sequence[Vertebra], gap_mm: float) -> list[Vertebra]:
-    """Widen the upper articular processes of vertebrae, from top to bottom, by balls `gap_mm` from the vertebra above,
-    where that is the neighbour in the spine.
-    """
+    """Widen upper articular processes, from top to bottom, by balls `gap_mm` from the neighbour above."""
     closed = list(vertebrae[:1])
     for lower in vertebrae[1:]:
         upper = closed[-1]

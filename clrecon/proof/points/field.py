@@ -124,9 +124,7 @@ def decide_signs(
 def fill_nodes(
     field: FieldTwin, near: NDArray[np.bool_], signs: SignsTwin, far_value: float, least: float
 ) -> NDArray[np.float64]:
-    """Return the volume whose surface at 0 is the result, positive inside: near nodes have |f|, from `least` to
-    `far_value`, all others `far_value`.
-    """
+    """Return the volume, positive inside: near nodes have |f|, `least` to `far_value`, all others `far_value`."""
     size = np.where(near, np.clip(np.abs(field.value), least, far_value), far_value)
     return np.where(signs.inside, size, -size)
 

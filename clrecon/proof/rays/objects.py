@@ -61,7 +61,6 @@ def find_splats(
 def _coordinate(
     points: NDArray[np.floating], axis: Float64Array, position: tuple[float, float, float]
 ) -> NDArray[np.float32]:
-    """Return the coordinates along an axis of the camera, from its position, in float32."""
     p, (a, b, c) = points.astype(np.float32), axis.astype(np.float32)
     return ((a * p[:, 0] + b * p[:, 1]) + c * p[:, 2]) + np.float32(-(axis @ np.array(position)))
 

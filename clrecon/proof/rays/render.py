@@ -243,7 +243,6 @@ class _SteepSegments:
         self.last = np.inf if end == TABLE_NODES else float(end)
 
     def nodes(self, values: Float64Array) -> NDArray[np.int64]:
-        """Convert values to fractional nodes of the table."""
         return np.clip(values, 0, TABLE_NODES - 1).astype(np.int64)
 
     def sample(self, number: float | Float64Array, ray: NDArray[np.int64]) -> Float64Array:

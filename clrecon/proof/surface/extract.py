@@ -39,9 +39,7 @@ def sample_grid(volume: Volume, rule: IsoRule, layers: int) -> NDArray[np.float6
 
 
 def gradients(field: NDArray[np.float64], closed: bool) -> NDArray[np.float64]:
-    """Return the gradient per index step (d/di, d/dj, d/dk) at every sample, central, one-sided at an open border, of a
-    field with one more layer on every side.
-    """
+    """Return the gradient per index step at every sample, one-sided at an open border, of a padded field."""
     parts = []
     for axis in (2, 1, 0):
         change = np.diff(field, axis=axis)

@@ -33,9 +33,7 @@ def find_active(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def find_mixed(inside: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
-    """Mark the mixed faces between each cell and the next one along an axis (0, 1, 2: k, j, i): those with one, two or
-    three corners inside, cases (a), (b) and (c) of the paper.
-    """
+    """Mark mixed faces between each cell and the next along an axis: cases (a), (b) and (c) of the paper."""
     inner = [slice(None)] * 3
     inner[axis] = slice(1, -1)
     faces = inside[tuple(inner)]

@@ -191,9 +191,7 @@ def _volume_mm3(vertices: NDArray[np.float64], triangles: NDArray[np.uint32]) ->
 def choose_level(
     labels: NDArray[Any], affine: NDArray[np.float64], number: int, enclosed: Mapping[int, int] | None = None
 ) -> int:
-    """Choose the level at which the mesh of a label encloses the volume of its voxels; `enclosed` as
-    `extract_label_mask`.
-    """
+    """Choose the level at which the mesh of a label encloses the volume of its voxels, as `extract_label_mask`."""
     if enclosed and number in enclosed:
         return enclosed[number]
     wanted = np.count_nonzero(labels == number) * abs(np.linalg.det(affine[:3, :3]))

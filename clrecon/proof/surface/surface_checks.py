@@ -78,10 +78,7 @@ def compare_mesh(volume: Volume, mesh: Mesh, expected: Surface, what: str) -> fl
 
 
 def _compare(device: Device, volume: Volume, levels: tuple[Level, ...], what: str, **options: Any) -> float:
-    """Compare surfaces of a volume one after the other: from the second on, bricks of the volume are known.
-
-    The first is made as often as it takes until they are worth measuring.
-    """
+    """Compare surfaces of a volume; the first is made as often as it takes until bricks are worth measuring."""
     worst = 0.0
     first_by_bricks = MEASURED_FROM[device.kernel_variants["LANES"]]
     with SurfaceExtractor(volume, device=device) as extractor:
@@ -355,7 +352,6 @@ where two walls are as good, or whose cost hardly changes along a valley of thic
 
 
 def twin_scale(sampler: ProfileSampler) -> cortex_twin.Scale:
-    """Return the samples of profiles, for the twin."""
     return cortex_twin.Scale(sampler.scale.first_mm, sampler.scale.step_mm, sampler.scale.weights)
 
 

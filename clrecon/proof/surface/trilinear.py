@@ -151,9 +151,7 @@ def _place_centre(row: Row, values: Sequence[int], margin: NDArray[np.float64]) 
 
 
 def _place_waist(row: Row, values: Sequence[int], margin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners, on the surface, of the box between the roots of the three parabolas, which keeps a margin
-    from the faces and is at least two margins wide.
-    """
+    """Return the corners of the box between the roots of the parabolas, a margin from the faces, two wide."""
     sides = np.empty((3, 2))
     for axis in range(3):
         q = _find_parabola(values, axis)

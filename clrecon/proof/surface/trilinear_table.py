@@ -53,10 +53,7 @@ Loop = tuple[int, ...]
 
 @dataclass(frozen=True)
 class Tunnel:
-    """A tube through the cell, from corner `diagonal` (0 to 3) to corner ``7 - diagonal``, with loops at its two ends.
-
-    With `inside` it joins inside corners, else outside ones.
-    """
+    """A tube between corners `diagonal` and ``7 - diagonal``, loops at its ends; joins inside corners if `inside`."""
 
     inside: bool
     diagonal: int

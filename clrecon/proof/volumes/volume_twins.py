@@ -93,7 +93,6 @@ def fill_holes(chosen: ArrayLike, by_slice: bool = False) -> NDArray[np.bool_]:
 
 
 def grow(chosen: ArrayLike, voxels: ArrayLike) -> NDArray[np.bool_]:
-    """Return the components of the chosen voxels that hold a voxel (k, j, i) of a list."""
     bits = np.asarray(chosen, dtype=bool)
     found = np.zeros_like(bits)
     for voxel in np.asarray(voxels).tolist():

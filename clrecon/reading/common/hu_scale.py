@@ -45,7 +45,6 @@ class ValueSample:
         return cls(np.sort(values)) if len(values) >= LEAST_SAMPLE else None
 
     def between(self, low: float, high: float) -> float:
-        """Return the share with ``low <= value < high``."""
         first, end = np.searchsorted(self.values, (low, high))
         return float(end - first) / len(self.values)
 
@@ -91,7 +90,6 @@ class Peak(NamedTuple):
 
     @property
     def height(self) -> float:
-        """The share for each HU of the width."""
         return self.share / self.width
 
 

@@ -91,7 +91,6 @@ class SeriesEntry:
     dropped: dict[str, int] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """The entry as a dict of JSON types."""
         return asdict(self)
 
 

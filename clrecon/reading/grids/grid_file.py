@@ -224,7 +224,6 @@ class GridFile:
             raise RefusedInputError(f"{self.name} cannot be read: {error.strerror or error}") from error
 
     def place(self, k: int) -> str:
-        """Describe slice `k` for messages."""
         return f"slice {k + 1} of {self.shape_ijk[2]}"
 
 

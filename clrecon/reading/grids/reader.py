@@ -64,7 +64,6 @@ def tell_kind(path: Path) -> str | None:
 
 
 def _inflate(start: bytes) -> bytes:
-    """Return the first bytes, inflated if they are gzip."""
     if start[:2] != b"\x1f\x8b":
         return start
     try:
@@ -122,8 +121,6 @@ def read_values(grid: GridFile, progress: Progress | None = None) -> GridValues:
 
 
 class _Filling:
-    """A volume that is filled slice by slice."""
-
     def __init__(self, grid: GridFile):
         self._grid = grid
         self._step = 0  # index into LADDER

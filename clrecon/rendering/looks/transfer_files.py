@@ -431,7 +431,6 @@ def take_object(
 
 
 def take_list(value: Any, where: str) -> list[Any]:
-    """Return a list that is not empty."""
     if not isinstance(value, list) or not value:
         raise RefusedInputError(
             f"{where} is {'empty' if value == [] else _show_value(value)}, not a list with something in it"
@@ -440,7 +439,6 @@ def take_list(value: Any, where: str) -> list[Any]:
 
 
 def take_number(value: Any, where: str) -> float:
-    """Return a finite number."""
     try:
         number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
     except OverflowError:

@@ -194,7 +194,6 @@ class _Page:
         self._boxes: list[tuple[float, float, float, float]] = []
 
     def draw_edge(self, edge: str, text: str) -> None:
-        """Draw letters at the middle of an edge."""
         width, height = self._size
         gap = self._margin + self._stroke
         # Anchors of Pillow: left, middle, right; top, middle, baseline.  Capitals have no descender.

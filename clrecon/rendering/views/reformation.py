@@ -151,7 +151,6 @@ def find_plane(
 
 
 def checked_thickness(thickness: float) -> float:
-    """Check the thickness of a slice in mm and return it as a float."""
     size = number_or_nan(thickness)
     if not 0.0 <= size < np.inf:
         raise UsageError(f"the thickness of a slice is a length in mm, 0 for a plane without one, not {thickness!r}")
@@ -167,7 +166,6 @@ def checked_offset(offset_mm: float) -> float:
 
 
 def positive_mm(what: str, value: float) -> float:
-    """Check a length in mm and return it as a float."""
     number = number_or_nan(value)
     if not 0.0 < number < np.inf:
         raise UsageError(f"{what} is a length in mm, not {value!r}")

@@ -41,7 +41,6 @@ def parameters_from_vtk(source: Any, size: Sequence[int] | None = None) -> dict[
 def make_pyvista_camera(
     position: Point, focal_point: Point, up: Point, view_angle: float | None, parallel_scale: float | None
 ) -> Any:
-    """Make a `pyvista.Camera` from the parameters of a `Camera`; its view angle is the vertical one."""
     import pyvista
 
     made = pyvista.Camera()

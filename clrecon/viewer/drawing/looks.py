@@ -55,7 +55,6 @@ class Looks:
     def scan(
         self, state: ViewState, mode: ViewMode, whole: ShownPart, labelled: LabelledLook | None, ray_step: float | None
     ) -> Style:
-        """Return the style of a scan, as a surface where the mode is not for it."""
         clip = state.clip
         key = ("scan", mode.name, state.iso_value, state.picture_window, clip, whole, _key(labelled), ray_step)
         if (known := self._known(key)) is not None:

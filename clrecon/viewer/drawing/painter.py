@@ -55,14 +55,11 @@ COARSE_TRIANGLES = 200_000
 
 
 def never() -> bool:
-    """Return False: not cancelled."""
     return False
 
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """An object with its look."""
-
     number: int
     subject: DeviceVolume | Mesh | PointCloud
     style: Style

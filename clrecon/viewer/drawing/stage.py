@@ -220,7 +220,6 @@ class Stage(Closing):
     # What is drawn
 
     def resident(self, number: int, state: ViewState) -> DeviceVolume:
-        """Return a scan on the device, as the state shows it."""
         scan = next(each for each in self.objects if each.number == number and isinstance(each, ShownScan))
         with self.lock:
             return self._resident(scan, state.table)
@@ -243,7 +242,6 @@ class Stage(Closing):
         return resident.bring(labelled.labels).voxels
 
     def _clustered(self) -> list[ShownScan]:
-        """Return the scans that are divided into clusters."""
         return [each for each in self.objects if isinstance(each, ShownScan) and self._map_of(each.number) is None]
 
     def _map_of(self, scan: int) -> ShownLabels | None:

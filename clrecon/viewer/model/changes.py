@@ -139,7 +139,6 @@ class ChangingView:
 
     @property
     def camera(self) -> Camera:
-        """The camera, LPS mm."""
         return self.state.camera
 
     # Camera
@@ -194,13 +193,11 @@ class ChangingView:
         self._change("perspective", "the perspective", camera=made)
 
     def toggle_perspective(self) -> None:
-        """Change between a parallel and a perspective camera."""
         self.set_perspective(self.camera.is_parallel)
 
     # Parts
 
     def show(self, key: str, visible: bool) -> None:
-        """Show or hide a part."""
         part = self._part(key)
         self._change_part(part, f"the part {part.name}", visible=bool(visible))
 
@@ -334,7 +331,6 @@ class ChangingView:
 
 
 def checked_numbers(what: str, *values: Any) -> list[float]:
-    """Return finite numbers as floats."""
     found = []
     for value in values:
         is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)

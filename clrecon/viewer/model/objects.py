@@ -106,8 +106,6 @@ class ShownMesh(ShownObject):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShownCloud(ShownObject):
-    """A cloud of points."""
-
     kind = "cloud"
     cloud: PointCloud
 

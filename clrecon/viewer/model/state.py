@@ -241,7 +241,6 @@ class ViewState:
         return next((each for each in self.parts if each.key == key), None)
 
     def parts_of(self, number: int) -> list[ShownPart]:
-        """Return the parts of an object but for itself as a whole."""
         return [each for each in self.parts if each.object == number and not each.is_whole]
 
     def whole(self, number: int) -> ShownPart | None:

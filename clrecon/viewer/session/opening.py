@@ -45,7 +45,6 @@ class OpenedView(Closing):
         self.painter = Painter(self.objects, device=scan.device, memory=scan.memory)
 
     def session(self, on_change: Callable[[], None] | None = None) -> ViewSession:
-        """Open a view, see `ViewSession`."""
         return ViewSession(
             self.objects,
             self.painter,

@@ -329,7 +329,6 @@ class ViewSession(Closing):
         self.save(path, size=size)
 
     def cancel(self) -> None:
-        """Stop the work in the background."""
         for kind in _WORDS:
             if kind != "prepare":
                 self._work.cancel(kind)

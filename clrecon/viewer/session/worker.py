@@ -41,10 +41,7 @@ class Job:
 
 
 class Worker:
-    """A thread with one place for each kind of work.
-
-    on_error: Called with the kind and the words of an error, in the thread.
-    """
+    """A thread with one place for each kind of work; `on_error` gets kind and words of an error."""
 
     def __init__(self, name: str, on_error: Callable[[str, str], None], on_change: Callable[[], None] = lambda: None):
         self._on_error, self._on_change = on_error, on_change
@@ -86,7 +83,6 @@ class Worker:
 
     @property
     def busy(self) -> list[str]:
-        """Kinds of work that run or wait."""
         with self._wake:
             running = [] if self._running is None else [self._running.kind]
             return [*running, *(kind for kind in self._waiting if kind not in running)]

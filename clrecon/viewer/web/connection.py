@@ -73,7 +73,6 @@ class Downloads:
         shutil.rmtree(download.path.parent, ignore_errors=True)
 
     def close(self) -> None:
-        """Remove what was not fetched."""
         for ticket in list(self._waiting):
             self.drop(self._waiting.pop(ticket))
 
@@ -360,7 +359,6 @@ class Connection:
         return facts
 
     def _later(self, function: Callable[..., None], *arguments: Any) -> None:
-        """Call a function in the thread of the server; from any thread."""
         with contextlib.suppress(RuntimeError):  # it has ended meanwhile
             self._loop.call_soon_threadsafe(self._if_open, function, *arguments)
 

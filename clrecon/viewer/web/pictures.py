@@ -29,10 +29,7 @@ class Asked(NamedTuple):
 
 
 class Pace:
-    """What is stale in one browser.
-
-    moving: Something was changed a moment ago; set by `change` and cleared by `rest`.
-    """
+    """What is stale in one browser; `moving` from a `change` to the next `rest`."""
 
     def __init__(self) -> None:
         self.moving = False

@@ -184,10 +184,7 @@ OpenSession = Callable[[Callable[[], None]], ViewSession]
 
 
 class WebServer:
-    """The server of a view, a context manager; its `address` holds the secret.
-
-    The port is taken at once, so that one that is not free is said before a scan is read.
-    """
+    """The server of a view, a context manager; its port is taken at once, its `address` holds the secret."""
 
     def __init__(
         self, port: int | None = None, *, save_as: Sequence[str] = (), wrote: Callable[[str], object] = ignore_line
@@ -218,7 +215,6 @@ class WebServer:
             asyncio.run(self._serve(open_session, ready))
 
     def stop(self) -> None:
-        """End `serve`, from any thread."""
         with contextlib.suppress(RuntimeError):  # it has ended by itself
             if self._end is not None:
                 self._end()

@@ -379,7 +379,6 @@ def count_frames(values: Values, sop_class: str) -> int:
 
 
 def find_places(values: Values, sop_class: str, frames: int) -> FramePlaces:
-    """Find the places of two frames or more."""
     image = f"multi-frame image of {frames} frames, SOP class {sop_class}"
     needed = ("ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing")
     missing = [keyword for keyword in needed if keyword not in values]

@@ -309,7 +309,6 @@ class FileStart(NamedTuple):
 
 
 def read_start(path: str | Path, limit: int = PREFIX_BYTES) -> FileStart:
-    """Read the start of a regular file."""
     descriptor = os.open(path, _OPEN_FLAGS)
     try:
         facts = os.fstat(descriptor)

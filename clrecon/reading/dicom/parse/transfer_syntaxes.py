@@ -137,7 +137,6 @@ def find_end(file: BinaryIO, start: int, file_bytes: int) -> int:
 
 
 def read_pieces(file: BinaryIO, pieces: Pieces) -> bytes:
-    """Read the fragments of one frame."""
     return b"".join([_read(file, place, length) for place, length in pieces])
 
 

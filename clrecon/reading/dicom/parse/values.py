@@ -486,7 +486,6 @@ def decode_number(raw: bytes, form: str, little_endian: bool) -> float | int | N
 
 
 def name_tag(tag: int) -> str:
-    """Keyword and tag for a message."""
     from pydicom.datadict import keyword_for_tag
 
     return f"{keyword_for_tag(tag)} {_name_number(tag)}".lstrip()

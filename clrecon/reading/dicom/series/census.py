@@ -54,7 +54,6 @@ class Census:
 def take_census(
     slices: Mapping[str, Sequence[SliceHeader]], others: Mapping[str, Sequence[OtherImage]]
 ) -> dict[str, Census]:
-    """Return the census of each series, by its key."""
     found: dict[str, Census] = {}
     studies: dict[str, list[str]] = defaultdict(list)
     for key in {**slices, **others}:

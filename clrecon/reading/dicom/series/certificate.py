@@ -263,7 +263,6 @@ def _compare_letters(stack: Stack) -> str | None:
 
 
 def count_unknown(headers: Sequence[SliceHeader]) -> int:
-    """Count slices whose values are not known to be HU."""
     return sum(
         not (h.has_slope and h.has_intercept) or h.rescale_type not in ("", "HU") or h.modality_lut for h in headers
     )

@@ -323,10 +323,7 @@ def _number_patients_and_studies(found: Sequence[Series]) -> None:
 
 
 def _owner_key(found: Sequence[Series]) -> Callable[[Series], tuple[float, float]]:
-    """Return a sort key by patient and by study, where there are several; unknown ones come last.
-
-    The patient of objects other than CT is not read, but a study has one patient.
-    """
+    """Return a sort key by patient and by study, where there are several; unknown ones come last."""
     owners = {series.study: series.patient for series in found if series.study and series.patient}
     for series in found:
         series.patient = series.patient or owners.get(series.study, 0)

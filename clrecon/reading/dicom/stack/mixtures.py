@@ -63,10 +63,7 @@ def values_of(header: SliceHeader, keywords: Sequence[str]) -> tuple[str, ...]:
 def find_mixture(
     headers: Sequence[SliceHeader],
 ) -> tuple[tuple[str, ...], Mapping[tuple[str, ...], Sequence[SliceHeader]]] | None:
-    """Find the keyword that divides a stack into volumes that lie between each other, and the slices of each value.
-
-    Each group has at least three slices, and all have a value.
-    """
+    """Find the keyword that divides a stack into volumes of three slices or more, and the slices of each value."""
     for keyword, values in _values_along(headers, (*CERTAIN, *POSSIBLE)):
         groups = _find_interleaved(values, headers)
         if groups and (keyword in CERTAIN or not _is_even(headers) and all(map(_is_even, groups.values()))):
@@ -75,7 +72,6 @@ def find_mixture(
 
 
 def _values_along(headers: Sequence[SliceHeader], keywords: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
-    """Return the keywords whose values differ along the slices, with these values."""
     own = [dict(header.phase) for header in headers]
     for keyword in keywords:
         values = [one.get(keyword, "") for one in own]
