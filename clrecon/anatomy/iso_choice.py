@@ -199,6 +199,7 @@ class IsoChoice:
     seen_at_lps_mm: A place where an edge has both materials.
     """
 
+    _SHOWN = ("iso_value", "bone_hu", "tissue_hu", "method")
     iso_value: float
     bone_hu: float
     tissue_hu: float

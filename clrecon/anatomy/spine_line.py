@@ -165,6 +165,7 @@ class SpineLine:
     upper, lower: Its ends: those of the scan, or where it was lost; None where only the sure part was asked for.
     """
 
+    _SHOWN = ("height_mm", "searched_mm", "sure_share", "sure_mm")
     points: Float64Array
     sure_share: float
     searched_mm: float

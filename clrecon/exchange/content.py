@@ -178,11 +178,13 @@ class Pieces:
 class Content(PointContent):
     """A mesh as it goes into a file, with name, colour (red, green, blue, 0 to 1) and pieces where a format has them.
 
+    face_values: Numbers at the triangles by name, (m,), in PLY and VTP; NaN where there is none.
     color: None: the colour of the format's writer.
     vertex_colors: (n, 3). A colour for each vertex, in PLY, in place of `color`.
     """
 
     triangles: NDArray[np.uint32]
+    face_values: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     name: str | None = None
     color: tuple[float, float, float] | None = None
     vertex_colors: NDArray[np.uint8] | None = None

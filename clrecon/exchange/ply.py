@@ -26,13 +26,12 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, RefusedInputError
 from clrecon.exchange.content import Content, PointContent, check_same
-from clrecon.exchange.raw_content import Part, RawCloud, RawMesh, read_remarks, say_cut
+from clrecon.exchange.raw_content import Part, RawCloud, RawMesh, numbers_of, read_remarks, say_cut
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.paths import open_regular
 from clrecon.system.pieces import chunks
 from clrecon.system.text import escape_text
 
-_FACE = np.dtype([("count", "u1"), ("corners", "<i4", (3,))])
 _CHUNK = 1 << 14
 
 
@@ -52,6 +51,7 @@ def _header(content: PointContent) -> bytes:
     ]
     if isinstance(content, Content):
         lines += [f"element face {len(content.triangles)}", "property list uchar int vertex_indices"]
+        lines += [f"property float scalar_{name}" for name in content.face_values]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
@@ -86,11 +86,16 @@ def _vertex(content: PointContent) -> np.dtype[Any]:
     return np.dtype([(name, form, shape) for name, (_, form, shape) in _columns(content).items()])
 
 
+def _face(content: Content) -> np.dtype[Any]:
+    numbers = [(f"scalar_{name}", "<f4") for name in content.face_values]
+    return np.dtype([("count", "u1"), ("corners", "<i4", (3,)), *numbers])
+
+
 def estimate(content: PointContent) -> int:
     """Return the exact size of the file in bytes."""
     rows = _vertex(content).itemsize * len(content.vertices)
-    faces = len(content.triangles) if isinstance(content, Content) else 0
-    return len(_header(content)) + rows + _FACE.itemsize * faces
+    faces = _face(content).itemsize * len(content.triangles) if isinstance(content, Content) else 0
+    return len(_header(content)) + rows + faces
 
 
 def write(stream: BinaryIO, content: PointContent) -> None:
@@ -101,9 +106,10 @@ def write(stream: BinaryIO, content: PointContent) -> None:
     columns = {name: values for name, (values, _, _) in _columns(content).items()}
     _write_rows(stream, np.empty(_CHUNK, dtype=_vertex(content)), columns, len(content.vertices))
     if isinstance(content, Content):
-        faces = np.empty(_CHUNK, dtype=_FACE)
+        faces = np.empty(_CHUNK, dtype=_face(content))
         faces["count"] = 3
-        _write_rows(stream, faces, {"corners": content.triangles}, len(content.triangles))
+        numbers = {f"scalar_{name}": values for name, values in content.face_values.items()}
+        _write_rows(stream, faces, {"corners": content.triangles, **numbers}, len(content.triangles))
 
 
 def _write_rows(stream: BinaryIO, rows: NDArray[Any], columns: Mapping[str, NDArray[Any]], count: int) -> None:
@@ -283,7 +289,7 @@ _CORNERS = ("vertex_indices", "vertex_index")
 
 
 def read_mesh(path: Path) -> RawMesh:
-    """Read the triangles of a PLY file, its vertices with their normals, and the numbers ``scalar_NAME`` at them."""
+    """Read the triangles of a PLY file, its vertices with their normals, and the numbers ``scalar_NAME`` at both."""
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:
@@ -293,11 +299,11 @@ def read_mesh(path: Path) -> RawMesh:
             size = path.stat().st_size
             if header.order:
                 found = read_binary(stream, header, vertex, name, size)
-                triangles = _read_faces(stream, header, face, name, size)
+                triangles, at_faces = _read_faces(stream, header, face, name, size)
             else:
                 text = stream.read()
                 found = read_text(io.BytesIO(text), vertex, name, size)
-                triangles = _read_lines(io.BytesIO(text), vertex, face, name)
+                triangles, at_faces = _read_lines(io.BytesIO(text), vertex, face, name)
     except (OSError, ValueError, OverflowError, MemoryError) as error:
         raise say_cut(name, error) from error
     points = np.stack([found.pop(axis) for axis in ("x", "y", "z")], axis=1)
@@ -306,12 +312,16 @@ def read_mesh(path: Path) -> RawMesh:
     said = read_remarks(header.comments)
     color = _one_color(found)
     parts = [] if color is None else [Part("", len(triangles), color)]
-    warnings = [f"numbers at faces left out: {escape_text(', '.join(face.types))}"] if face.types else []
-    named = {own[7:]: column for own, column in found.items() if own.startswith("scalar_") and own.isascii()}
-    with np.errstate(all="ignore"):  # harmed bits
-        values = {own: column.astype(np.float32) for own, column in named.items() if own.isidentifier()}
-    warnings += cloud.warnings
-    return RawMesh("PLY", points, triangles, normals, warnings=warnings, parts=parts, values=values, **said)
+    values, face_values = (
+        numbers_of({own[7:]: column for own, column in each.items() if own.startswith("scalar_")})
+        for each in (found, at_faces)
+    )
+    others = [own for own in face.types if not own.startswith("scalar_")]
+    warnings = [f"numbers at faces left out: {escape_text(', '.join(others))}"] if others else []
+    return RawMesh(
+        "PLY", points, triangles, normals,
+        warnings=warnings + cloud.warnings, parts=parts, values=values, face_values=face_values, **said,
+    )  # fmt: skip
 
 
 def _one_color(columns: Mapping[str, NDArray[Any]]) -> tuple[float, float, float] | None:
@@ -334,40 +344,47 @@ def _find_faces(header: Header, vertex: Element, name: str) -> Element:
     return face
 
 
-def _read_faces(stream: BinaryIO, header: Header, face: Element, name: str, size: int) -> NDArray[Any]:
-    ((count, corner),) = face.lists.values()
-    numbers = [(f"own {name_of}", header.order + kind) for name_of, kind in face.types.items()]
-    corners = [("count", header.order + count), ("corners", header.order + corner, (3,))]
-    row = np.dtype([*numbers[: face.leading], *corners, *numbers[face.leading :]])
+Faces = tuple[NDArray[Any], dict[str, NDArray[Any]]]
+"""Triangles, and the numbers at them by name."""
+
+
+def _read_faces(stream: BinaryIO, header: Header, face: Element, name: str, size: int) -> Faces:
+    row = _face_row(face, *next(iter(face.lists.values())), face.types, header.order)
     left = size - stream.tell()
     if face.count * row.itemsize > left:
         raise RefusedInputError(
             f"{name} is cut or corrupt: {face.count:,} triangles of {row.itemsize} bytes cannot come from"
             f" {left:,} bytes"
         )
-    rows = np.frombuffer(stream.read(row.itemsize * face.count), dtype=row)
-    _check_triangles(rows["count"], name)
-    return np.ascontiguousarray(rows["corners"]).astype(np.int64)
+    return _take_faces(np.frombuffer(stream.read(row.itemsize * face.count), dtype=row), face, name)
 
 
-def _read_lines(text: BinaryIO, vertex: Element, face: Element, name: str) -> NDArray[Any]:
+def _read_lines(text: BinaryIO, vertex: Element, face: Element, name: str) -> Faces:
     if face.count == 0:
-        return np.zeros((0, 3), np.int64)
+        return np.zeros((0, 3), np.int64), {}
+    row = _face_row(face, "i8", "i8", dict.fromkeys(face.types, "f8"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about empty lines
-        table = np.loadtxt(
-            io.TextIOWrapper(text, encoding="latin-1"), comments=None, ndmin=2, dtype=np.int64, skiprows=vertex.count,
-            max_rows=face.count, usecols=range(face.leading, face.leading + 4) if face.types else None,
+        rows = np.loadtxt(
+            io.TextIOWrapper(text, encoding="latin-1"), comments=None, ndmin=1, dtype=row, skiprows=vertex.count,
+            max_rows=face.count, usecols=range(len(face.types) + 4),
         )  # fmt: skip
-    if len(table) != face.count or table.shape[1] != 4:
-        raise RefusedInputError(f"{name} is cut or corrupt, or has faces that are not triangles")
-    _check_triangles(table[:, 0], name)
-    return table[:, 1:]
+    if len(rows) != face.count:
+        raise RefusedInputError(f"{name} is cut or corrupt: {face.count:,} faces are needed, it has {len(rows):,}")
+    return _take_faces(rows, face, name)
 
 
-def _check_triangles(counts: NDArray[Any], name: str) -> None:
-    wrong = np.flatnonzero(counts != 3)
+def _face_row(face: Element, count: str, corner: str, numbers: Mapping[str, str], order: str = "") -> np.dtype[Any]:
+    own = [(f"own {name}", order + kind) for name, kind in numbers.items()]
+    corners = [("count", order + count), ("corners", order + corner, (3,))]
+    return np.dtype([*own[: face.leading], *corners, *own[face.leading :]])
+
+
+def _take_faces(rows: NDArray[Any], face: Element, name: str) -> Faces:
+    wrong = np.flatnonzero(rows["count"] != 3)
     if len(wrong):
         raise RefusedInputError(
-            f"face {int(wrong[0]):,} of {name} has {int(counts[wrong[0]])} corners: only triangles are read"
+            f"face {int(wrong[0]):,} of {name} has {int(rows['count'][wrong[0]])} corners: only triangles are read"
         )
+    triangles = np.ascontiguousarray(rows["corners"]).astype(np.int64)
+    return triangles, {own: rows[f"own {own}"] for own in face.types}

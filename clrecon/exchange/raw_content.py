@@ -108,6 +108,17 @@ def columns_of(values: NDArray[Any], names: Sequence[str]) -> dict[str, NDArray[
     return {name: values[:, place] for place, name in enumerate(names)}
 
 
+def numbers_of(columns: Mapping[str, Any]) -> dict[str, NDArray[np.float32]]:
+    """Return the columns of one number each that can be `values` of a mesh, copied: named by letters, digits and _."""
+    arrays = {name: np.asarray(column) for name, column in columns.items() if name.isascii() and name.isidentifier()}
+    with np.errstate(all="ignore"):  # harmed bits
+        return {
+            name: each.astype(np.float32)
+            for name, each in arrays.items()
+            if each.ndim == 1 and each.dtype.kind in "biuf"
+        }
+
+
 def read_remarks(lines: Iterable[str]) -> dict[str, Any]:
     """Return what comments say: ``space``, ``iso_value_hu`` and ``certificate``, as entries of a `RawCloud`."""
     found: dict[str, Any] = {"certificate": []}
@@ -165,6 +176,7 @@ class RawMesh:
     unit: str = "mm"
     parts: Sequence[Part] = ()
     values: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    face_values: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
 
 def frame_of_file(raw: RawCloud | RawMesh, asked: str | None, name: str) -> tuple[str, str]:

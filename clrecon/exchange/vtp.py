@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, RefusedInputError, UsageError
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, PointContent, refuse_file
-from clrecon.exchange.raw_content import Part, PlacedShapes, RawCloud, RawMesh, Shape, columns_of, say_cut
+from clrecon.exchange.raw_content import Part, PlacedShapes, RawCloud, RawMesh, Shape, columns_of, numbers_of, say_cut
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
@@ -72,17 +72,23 @@ def make_polydata(
     else:
         polydata.SetPolys(cells)
     data = polydata.GetPointData()
-    for name, numbers, put in (
-        ("Normals", normals, data.SetNormals),
-        ("HU", hu, data.SetScalars),
-        ("label", labels, data.AddArray),
-        *((name, each, data.AddArray) for name, each in values.items()),
-    ):
+    add_arrays(data, {"Normals": normals, "HU": hu, "label": labels} | dict(values))
+    if normals is not None:
+        data.SetActiveNormals("Normals")
+    if hu is not None:
+        data.SetActiveScalars("HU")
+    return polydata
+
+
+def add_arrays(data: Any, arrays: Mapping[str, NDArray[Any] | None]) -> None:
+    """Add arrays to the data of points or cells by name, sharing their memory."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+
+    for name, numbers in arrays.items():
         if numbers is not None:
             array = numpy_to_vtk(numbers)
             array.SetName(name)
-            put(array)
-    return polydata
+            data.AddArray(array)
 
 
 _END = b"</VTKFile>"
@@ -123,22 +129,32 @@ def _join(content: PointContent | Assembly) -> PointContent:
     parts = content.parts
     begins = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     normals = [part.normals for part in parts if part.normals is not None]
-    common = [name for name in parts[0].values if all(name in part.values for part in parts)]
     return replace(
         parts[0],
         vertices=np.concatenate([part.vertices for part in parts]),
         triangles=np.concatenate([part.triangles + np.uint32(at) for part, at in zip(parts, begins, strict=True)]),
         normals=np.concatenate(normals) if len(normals) == len(parts) else None,
-        values={name: np.concatenate([part.values[name] for part in parts]) for name in common},
+        values=_common([part.values for part in parts]),
+        face_values=_common([part.face_values for part in parts]),
     )
+
+
+def _common(pieces: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    """Join the arrays that all pieces have, with as many components each."""
+    forms = [{name: values.shape[1:] for name, values in own.items()} for own in pieces]
+    names = [name for name, form in forms[0].items() if all(own.get(name) == form for own in forms)]
+    return {name: np.concatenate([own[name] for own in pieces]) for name in names}
 
 
 def estimate(content: PointContent | Assembly) -> int:
     """Return the size of the data in bytes, without the XML: the indices and an offset for each triangle or point."""
     if isinstance(content, Assembly):
         return sum(estimate(part) + 7 * len(part.triangles) for part in content.parts)
-    arrays = (content.vertices, content.normals, content.hu, content.labels, *content.values.values())
-    cells = 16 * len(content.triangles) if isinstance(content, Content) else 8 * len(content.vertices)
+    arrays = [content.vertices, content.normals, content.hu, content.labels, *content.values.values()]
+    cells = 8 * len(content.vertices)
+    if isinstance(content, Content):
+        arrays += content.face_values.values()
+        cells = 16 * len(content.triangles)
     return sum(array.nbytes for array in arrays if array is not None) + cells
 
 
@@ -154,6 +170,8 @@ def write(stream: BinaryIO, content: PointContent | Assembly) -> None:
     polydata = make_polydata(
         content.vertices, _triangles(content), content.normals, content.hu, content.labels, content.values
     )
+    if isinstance(content, Content):
+        add_arrays(polydata.GetCellData(), content.face_values)
     for array in _field_arrays(content):
         polydata.GetFieldData().AddArray(array)
     if isinstance(assembly, Assembly):
@@ -174,18 +192,13 @@ def write(stream: BinaryIO, content: PointContent | Assembly) -> None:
 
 
 def _add_parts(polydata: Any, parts: Sequence[Content]) -> None:
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-
     counts = [len(part.triangles) for part in parts]
     colors = np.array([BONE_COLOR if part.color is None else part.color for part in parts])
     arrays = {
         "PART": np.repeat(np.arange(len(parts), dtype=np.int32), counts),
         "COLOR": np.repeat(np.rint(255.0 * colors).astype(np.uint8), counts, axis=0),
     }
-    for name, values in arrays.items():
-        array = numpy_to_vtk(values, deep=True)
-        array.SetName(name)
-        polydata.GetCellData().AddArray(array)
+    add_arrays(polydata.GetCellData(), arrays)
     names = [part.name or f"object {number}" for number, part in enumerate(parts, start=1)]
     polydata.GetFieldData().AddArray(_strings("PART_NAMES", names))
 
@@ -328,12 +341,8 @@ def _collect_points(document: Document, name: str) -> RawCloud:
             continue
         points.append(read_numbers(document, array, count, 3))
         data = piece.find("PointData")
-        own = {}
-        for each in () if data is None else data.iterfind("DataArray"):
-            if each.get("type") in _TYPES:
-                own[each.get("Name", "")] = read_numbers(document, each, count)
         normals = normals or (None if data is None else data.get("Normals"))
-        columns.append(own)
+        columns.append(_arrays(document, piece, "PointData", count))
         left_out += sum(read_count(piece, f"NumberOf{kind}") for kind in ("Lines", "Strips", "Polys"))
     if not points:
         raise RefusedInputError(f"{name} has no points")
@@ -354,10 +363,7 @@ def _collect_points(document: Document, name: str) -> RawCloud:
 def _named(pieces: Sequence[dict[str, NDArray[Any]]], normals: str | None) -> dict[str, NDArray[Any]]:
     """Join the arrays that all pieces have; one of several components becomes as many columns."""
     columns: dict[str, NDArray[Any]] = {}
-    for own in pieces[0]:
-        if not all(own in piece and piece[own].shape[1] == pieces[0][own].shape[1] for piece in pieces):
-            continue
-        values = np.concatenate([piece[own] for piece in pieces])
+    for own, values in _common(pieces).items():
         width = values.shape[1]
         if width == 1:
             columns[own] = values[:, 0]
@@ -366,6 +372,12 @@ def _named(pieces: Sequence[dict[str, NDArray[Any]]], normals: str | None) -> di
         else:
             columns |= columns_of(values, [f"{own}:{place}" for place in range(width)])
     return columns
+
+
+def _arrays(document: Document, piece: ElementTree.Element, what: str, count: int) -> dict[str, NDArray[Any]]:
+    """Return the arrays of numbers at the points or cells of a piece, (count, components) each."""
+    found = [array for array in piece.iterfind(f"{what}/DataArray") if array.get("type") in _TYPES]
+    return {array.get("Name", ""): read_numbers(document, array, count) for array in found}
 
 
 def read_fields(document: Document) -> tuple[dict[str, tuple[str, ...]], dict[str, NDArray[Any]]]:
@@ -481,6 +493,7 @@ def _unpack(document: Document, source: _Raw | _From64) -> bytes:
 def _collect_triangles(document: Document, name: str) -> RawMesh:
     shapes, left_out = PlacedShapes(), 0
     warnings: list[str] = []
+    points: list[dict[str, NDArray[Any]]] = []
     cells: list[dict[str, NDArray[Any]]] = []
     for piece in document.root.iterfind("PolyData/Piece"):
         if read_count(piece, "NumberOfStrips"):
@@ -490,9 +503,10 @@ def _collect_triangles(document: Document, name: str) -> RawMesh:
         left_out += sum(lines.values())
         if count == 0:
             continue
-        shape = _read_shape(document, piece, count, name, warnings)
+        points.append(_arrays(document, piece, "PointData", read_count(piece, "NumberOfPoints")))
+        shape = _read_shape(document, piece, count, name, warnings, points[-1])
         shapes.add(shape, np.eye(4), Part("", count))
-        cells.append({} if any(lines.values()) else _cell_arrays(document, piece, count))
+        cells.append({} if any(lines.values()) else _arrays(document, piece, "CellData", count))
     if left_out:
         warnings.append(f"elements left out: {left_out:,} points and lines")
     if not cells:
@@ -500,13 +514,19 @@ def _collect_triangles(document: Document, name: str) -> RawMesh:
     mesh = shapes.joined()
     texts, numbers = read_fields(document)
     iso_value = numbers.get("ISO_VALUE_HU")
-    number = _joined(cells, "PART", 1)
+    at_cells, at_points = _common(cells), _common(points)
+    colors = at_cells.pop("COLOR", None)
+    values, face_values = (
+        {own: numbers[:, 0] for own, numbers in each.items() if numbers.shape[1] == 1} for each in (at_points, at_cells)
+    )
+    number = face_values.pop("PART", None)
     triangles, parts = mesh.triangles, []
     if number is not None:
         # Each part's triangles are to follow one another.
-        order = np.argsort(number[:, 0], kind="stable")
+        order = np.argsort(number, kind="stable")
         triangles = triangles[order]
-        parts = _parts(number[order, 0], _joined(cells, "COLOR", 3), order, texts.get("PART_NAMES", ()))
+        face_values = {own: numbers[order] for own, numbers in face_values.items()}
+        parts = _parts(number[order], colors, order, texts.get("PART_NAMES", ()))
     return RawMesh(
         "VTP",
         mesh.vertices,
@@ -517,10 +537,19 @@ def _collect_triangles(document: Document, name: str) -> RawMesh:
         texts.get("CERTIFICATE", ()),
         warnings,
         parts=parts,
+        values=numbers_of(values),
+        face_values=numbers_of(face_values),
     )
 
 
-def _read_shape(document: Document, piece: ElementTree.Element, count: int, name: str, warnings: list[str]) -> Shape:
+def _read_shape(
+    document: Document,
+    piece: ElementTree.Element,
+    count: int,
+    name: str,
+    warnings: list[str],
+    at_points: Mapping[str, NDArray[Any]],
+) -> Shape:
     points = piece.find("Points/DataArray")
     arrays = {array.get("Name"): array for array in piece.iterfind("Polys/DataArray")}
     if points is None or not {"connectivity", "offsets"} <= set(arrays):
@@ -534,32 +563,13 @@ def _read_shape(document: Document, piece: ElementTree.Element, count: int, name
         raise RefusedInputError(f"polygon {first:,} of {name} has {corners} corners: only triangles are read")
     triangles = read_numbers(document, arrays["connectivity"], 3 * count, 1).astype(np.int64).reshape(-1, 3)
     data = piece.find("PointData")
-    active = "Normals" if data is None else data.get("Normals", "Normals")
-    normals = None
-    for array in piece.iterfind("PointData/DataArray"):
-        if array.get("Name") == active and array.get("NumberOfComponents") == "3":
-            values = read_numbers(document, array, len(vertices), 3)
-            cloud = RawCloud("VTP", vertices, columns_of(values, ("nx", "ny", "nz")))
-            normals = cloud.normals()
-            warnings += cloud.warnings
+    values = at_points.get("Normals" if data is None else data.get("Normals", "Normals"))
+    if values is None or values.shape[1] != 3:
+        return Shape(vertices, triangles)
+    cloud = RawCloud("VTP", vertices, columns_of(values, ("nx", "ny", "nz")))
+    normals = cloud.normals()
+    warnings += cloud.warnings
     return Shape(vertices, triangles, normals)
-
-
-def _cell_arrays(document: Document, piece: ElementTree.Element, count: int) -> dict[str, NDArray[Any]]:
-    """Return the arrays of the triangles by which ours tell their parts."""
-    found = {array.get("Name"): array for array in piece.iterfind("CellData/DataArray")}
-    return {
-        name: read_numbers(document, found[name], count, width)
-        for name, width in (("PART", 1), ("COLOR", 3))
-        if name in found and (read_count(found[name], "NumberOfComponents") or 1) == width
-    }
-
-
-def _joined(cells: list[dict[str, NDArray[Any]]], name: str, width: int) -> NDArray[Any] | None:
-    """Return an array of all pieces; None where one has it not."""
-    if not all(name in own and own[name].shape[1] == width for own in cells):
-        return None
-    return np.concatenate([own[name] for own in cells])
 
 
 def _parts(
@@ -568,7 +578,7 @@ def _parts(
     parts = []
     for number, first, count in zip(*np.unique(numbers, return_index=True, return_counts=True), strict=True):
         color = None
-        if colors is not None and colors.dtype == np.uint8:
+        if colors is not None and colors.dtype == np.uint8 and colors.shape[1] == 3:
             red, green, blue = (colors[order[first]] / 255.0).tolist()
             color = (red, green, blue)
         name = names[int(number)] if 0 <= number < len(names) else ""

@@ -29,6 +29,7 @@ class Certificate(Record):
         ``field_of_view``, ``outside_air``) and filters (``filtered``); each is an entry of its own.
     """
 
+    _SHOWN = ("format", "shape_ijk", "spacing_mm")
     format: str
     series: Mapping[str, Any]
     phase: Mapping[str, Any] | None = None

@@ -136,8 +136,9 @@ class LabelMap(Grid, ShownAsHtml):
     ----------
     voxels : array_like, shape (nk, nj, ni)
         Whole numbers from 0 to 65,535, indexed ``voxels[k, j, i]``.
-    affine : array_like, shape (4, 4)
-        Index (i, j, k) to LPS mm, as for a `Volume`; the grid may differ from that of the volume.
+    affine : array_like, shape (4, 4), or Volume or LabelMap
+        Index (i, j, k) to LPS mm, as for a `Volume`; the grid may differ from that of the volume.  Of a volume or
+        another map of the same shape: its places and its frame of reference.
     names : mapping of int to str, optional
         Names of the numbers; a number without a name is called ``label_N``.
     frame_of_reference_hash : str, optional
@@ -149,20 +150,28 @@ class LabelMap(Grid, ShownAsHtml):
     ------
     UsageError
         ``voxels`` has not three axes, is empty, or holds other values than whole numbers in range; ``affine`` is not an
-        affine; or a name is not text.
+        affine, or of another shape or uneven slices; or a name is not text.
     """
 
     @explains_arguments
     def __init__(
         self,
         voxels: ArrayLike,
-        affine: ArrayLike,
+        affine: ArrayLike | Grid,
         names: Mapping[int, str] | None = None,
         *,
         frame_of_reference_hash: str | None = None,
         warnings: Sequence[str] = (),
     ):
-        super().__init__(_checked_voxels(voxels), checked_affine(affine))
+        checked = _checked_voxels(voxels)
+        if isinstance(affine, Grid):
+            _check_even(affine)
+            if affine.shape != checked.shape:
+                raise UsageError(f"the labels have shape {checked.shape}, the grid they are to lie on {affine.shape}")
+            facts = vars(affine) if isinstance(affine, LabelMap) else getattr(affine, "report", {})
+            frame_of_reference_hash = frame_of_reference_hash or facts.get("frame_of_reference_hash")
+            affine = affine.affine
+        super().__init__(checked, checked_affine(affine))
         self._names = {int(number): check_name(name) for number, name in (names or {}).items()}
         self.frame_of_reference_hash = frame_of_reference_hash
         self.warnings = tuple(warnings)
@@ -262,8 +271,7 @@ class LabelMap(Grid, ShownAsHtml):
 
         Uneven slices are refused, and else what that refuses.
         """
-        if to.uneven:
-            raise UsageError("the slices of the volume are uneven, no label map has such: clrecon.resample_labels")
+        _check_even(to)
         taken = public_function("resample_labels")(self, to)
         return self.changed(taken.voxels, affine=to.affine, warnings=taken.warnings)
 
@@ -446,6 +454,11 @@ def _as_whole(voxels: NDArray[Any]) -> NDArray[Any]:
     if voxels.dtype.kind != "f" or not (voxels == np.rint(voxels)).all() or abs(voxels).max() > LARGEST_NUMBER:
         return voxels
     return voxels.astype(np.int32)
+
+
+def _check_even(grid: Grid) -> None:
+    if getattr(grid, "uneven", False):
+        raise UsageError("the slices of the volume are uneven, no label map has such: clrecon.resample_labels")
 
 
 def _checked_voxels(voxels: ArrayLike) -> NDArray[Any]:

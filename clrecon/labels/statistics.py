@@ -42,6 +42,7 @@ class LabelFigures(Record):
     percentiles_hu: ``{"5": ...}``: the least HU up to which at least this percentage of the volume lies.
     """
 
+    _SHOWN = ("number", "name", "ml", "mean_hu", "sd_hu")
     number: int
     name: str
     voxels: int

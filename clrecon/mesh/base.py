@@ -79,6 +79,8 @@ class BaseMesh(Message):
         self.values: dict[str, NDArray[np.floating]] = {}
         """Numbers at the vertices by name, (n,) each, such as ``thickness_mm``, or ``HU`` of `Volume.sample`; written
         to the formats that hold some."""
+        self.face_values: dict[str, NDArray[np.floating]] = {}
+        """Numbers at the triangles by name, (m,) each; written to PLY and VTP."""
         if not trusted:
             self.check()
 
@@ -126,20 +128,27 @@ class BaseMesh(Message):
                 row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
                 raise UsageError(f"{name} {row:,} is not finite: {values[row].tolist()}")
 
-    def checked_values(self) -> dict[str, NDArray[np.float32]]:
-        """Return `values` as float32, refusing those that are no number a vertex, or have a name that no file holds."""
+    def checked_values(self, own: str = "values") -> dict[str, NDArray[np.float32]]:
+        """Return `values` or `face_values` as float32; refuse those of another length or a name that no file holds."""
         checked = {}
-        for name, values in self.values.items():
+        what, count = ("vertex", self.vertex_count) if own == "values" else ("triangle", self.triangle_count)
+        for name, values in getattr(self, own).items():
             array = np.asarray(values)
-            if array.shape != (self.vertex_count,) or array.dtype.kind not in "biuf":
+            if array.shape != (count,) or array.dtype.kind not in "biuf":
                 raise UsageError(
-                    f"values[{name!r}] are {array.dtype} of shape {array.shape}: one number a vertex is needed,"
-                    f" ({self.vertex_count},)"
+                    f"{own}[{name!r}] are {array.dtype} of shape {array.shape}: one number a {what} is needed,"
+                    f" ({count},)"
                 )
             if not isinstance(name, str) or not (name.isascii() and name.isidentifier()):
                 raise UsageError(f"values have names of letters, digits and _ that begin with a letter, not {name!r}")
             checked[name] = np.ascontiguousarray(array, np.float32)
         return checked
+
+    def give_values(self, to: Own, vertices: Any = slice(None), triangles: Any = slice(None)) -> Own:
+        """Give a mesh made of some vertices and triangles of this one, by index, their numbers; return it."""
+        to.values = {name: values[vertices] for name, values in self.values.items()}
+        to.face_values = {name: values[triangles] for name, values in self.face_values.items()}
+        return to
 
     @explains_arguments
     def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:
@@ -181,9 +190,7 @@ class BaseMesh(Message):
             report["voxel_mm"] = self.voxel_mm * float(np.linalg.svd(checked[:3, :3], compute_uv=False).min())
         report["moved_by"] = (checked if before is None else checked @ np.array(before)).tolist()
         triangles = self._triangles[:, ::-1] if mirrored else self._triangles
-        made = type(self)(apply_affine(checked, self._vertices), triangles, normals, report)
-        made.values = dict(self.values)
-        return made
+        return self.give_values(type(self)(apply_affine(checked, self._vertices), triangles, normals, report))
 
     def describe(self, space: str, *, keep_ids: bool = False) -> Content:
         """Return the contents of a file of the mesh in `space`; nothing else of `report` is ever written.
@@ -200,6 +207,7 @@ class BaseMesh(Message):
             name=None if name is None else str(name),
             color=None if color is None else (float(color[0]), float(color[1]), float(color[2])),
             values=self.checked_values(),
+            face_values=self.checked_values("face_values"),
             **facts,
         )
 

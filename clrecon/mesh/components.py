@@ -107,8 +107,7 @@ def keep_triangles(mesh: Own, kept: NDArray[np.bool_]) -> Own:
     made = type(mesh)(
         mesh.vertices[used], number[triangles].astype(np.uint32), normals, dict(mesh.report), trusted=True
     )  # fmt: skip
-    made.values = {name: values[used] for name, values in mesh.values.items()}
-    return made
+    return mesh.give_values(made, used, kept)
 
 
 def split_components(
@@ -147,11 +146,11 @@ def split_components(
     parts = []
     for part in range(len(kept)):
         own = vertex_order[vertex_ends[part] : vertex_ends[part + 1]]
-        faces = mesh.triangles[triangle_order[triangle_ends[part] : triangle_ends[part + 1]]]
-        triangles = (number[faces] - vertex_ends[part]).astype(np.uint32)
+        faces = triangle_order[triangle_ends[part] : triangle_ends[part + 1]]
+        triangles = (number[mesh.triangles[faces]] - vertex_ends[part]).astype(np.uint32)
         normals = None if mesh.normals is None else mesh.normals[own]
-        parts.append(type(mesh)(mesh.vertices[own], triangles, normals, {**mesh.report, **chosen.facts}))
-        parts[-1].values = {name: values[own] for name, values in mesh.values.items()}
+        made = type(mesh)(mesh.vertices[own], triangles, normals, {**mesh.report, **chosen.facts})
+        parts.append(mesh.give_values(made, own, faces))
     return parts
 
 

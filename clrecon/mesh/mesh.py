@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.geometry.affine import choose_space, frame_from_lps
+from clrecon.exchange.raw_content import RawMesh, numbers_of, turn_to_lps
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import choose_space
 from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.connectivity import find_edges
@@ -27,6 +29,15 @@ def _finite_points(points: ArrayLike, name: str, *, one: bool = False) -> NDArra
     if rows.shape[-1:] != (3,) or rows.ndim > (1 if one else 2) or not np.isfinite(rows).all():
         raise UsageError(f"{name} must be three finite numbers{'' if one else ' each'}, these have shape {rows.shape}")
     return rows.reshape(-1, 3)
+
+
+def _joined(parts: list[tuple[dict[str, NDArray[np.floating]], int]]) -> dict[str, NDArray[np.floating]]:
+    """Join numbers by name, of so many vertices or triangles each; NaN where a part has none."""
+    names = dict.fromkeys(name for own, _ in parts for name in own)
+    return {
+        name: np.concatenate([own.get(name, np.full(count, np.nan, np.float32)) for own, count in parts])
+        for name in names
+    }
 
 
 class Mesh(BaseMesh, ShownAsHtml):
@@ -149,28 +160,50 @@ class Mesh(BaseMesh, ShownAsHtml):
             np.concatenate(normals) if len(normals) == len(parts) else None,
             facts | ({"voxel_mm": min(steps)} if steps else {}),
         )
-        for name in dict.fromkeys(name for part in parts for name in part.values):
-            numbers = [part.values.get(name, np.full(part.vertex_count, np.nan, np.float32)) for part in parts]
-            made.values[name] = np.concatenate(numbers)
+        made.values = _joined([(part.values, part.vertex_count) for part in parts])
+        made.face_values = _joined([(part.face_values, part.triangle_count) for part in parts])
+        return made
+
+    @explains_arguments
+    def sample(self, volume: Volume, name: str = "HU", order: int = 1, outside: float = float("nan")) -> Mesh:
+        """Return the mesh with what `Volume.sample` gives at its vertices in ``values[name]``.
+
+        PLY, VTP and `to_pyvista` keep them; so does GLB as ``_NAME``, with -1 for NaN, which glTF does not know.
+
+        Parameters
+        ----------
+        volume : Volume or DeviceVolume
+        name : str
+            Letters, digits and _; numbers of that name are replaced.
+        order : {0, 1, 3}
+            Nearest voxel, trilinear, cubic spline.
+        outside : float
+            Value beyond the voxels.
+        """
+        made = self.give_values(copy.copy(self))
+        made.report = dict(self.report)
+        made.values[name] = Volume.sample(volume, self.vertices, order=order, outside=outside).astype(np.float32)
+        made.checked_values()
         return made
 
     @explains_arguments
     def clip(self, point: ArrayLike, normal: ArrayLike, *, capped: bool = True) -> Mesh:
-        """Return the part on the side of a plane that its normal points to, cut by VTK: with report and `values`.
+        """Return the part on the side of a plane that its normal points to, cut by VTK: with report and all values.
 
         Parameters
         ----------
         point, normal : array_like, shape (3,)
             A point of the plane, LPS mm, and a vector of any length but 0.
         capped : bool
-            True: the cut is filled, so that a closed mesh stays closed; an open one is refused.  False: it ends open.
+            True: the cut is filled, so that a closed mesh stays closed; an open one is refused.  Its `face_values`
+            are NaN.  False: it ends open.
 
         Raises
         ------
         NoSurfaceError
             Nothing lies on that side.
         """
-        from clrecon.mesh.vtk import clip_surface, unwrap_polydata
+        from clrecon.mesh.vtk import CellLocator, clip_surface, unwrap_polydata
 
         surface, at, along, origin = self._cut_by(point, normal)
         if capped and find_edges(self.triangles, self.vertex_count).boundary:
@@ -179,9 +212,16 @@ class Mesh(BaseMesh, ShownAsHtml):
         if not part.GetNumberOfCells():
             off = float(((at + origin - self.vertices) @ along).min())
             raise NoSurfaceError(f"nothing of the mesh lies on that side of the plane: it ends {abs(off):.4g} mm off")
-        vertices, triangles, _, values, *_ = unwrap_polydata(part)
-        made = Mesh(vertices + origin, triangles, report=dict(self.report))
-        made.values = {name: values[name].astype(np.float32) for name in self.values}
+        raw, _ = unwrap_polydata(part)
+        made = Mesh(raw.vertices + origin, raw.triangles, report=dict(self.report))
+        made.values = {name: raw.values[name] for name in self.values}
+        if not capped:
+            made.face_values = {name: raw.face_values[name] for name in self.face_values}
+        elif self.face_values:
+            middles = raw.vertices[raw.triangles].mean(axis=1, dtype=np.float64)
+            _, rows, _ = CellLocator(self.vertices - origin, self.triangles).nearest(middles)
+            cap = raw.face_values["Labels"] > 0
+            made.face_values = {name: np.where(cap, np.nan, own[rows]) for name, own in self.face_values.items()}
         return made
 
     @explains_arguments
@@ -209,7 +249,9 @@ class Mesh(BaseMesh, ShownAsHtml):
             raise UsageError("the normal of a plane has length 0: it has no side")
         along = along / np.abs(along).max()  # whose square is neither infinite nor 0
         origin = self._origin()
-        surface = wrap_polydata(self.vertices - origin, self.triangles, None, self.checked_values())
+        surface = wrap_polydata(
+            self.vertices - origin, self.triangles, None, self.checked_values(), self.checked_values("face_values")
+        )
         return surface, at - origin, along / np.linalg.norm(along), origin
 
     def _origin(self) -> NDArray[np.float64]:
@@ -261,8 +303,8 @@ class Mesh(BaseMesh, ShownAsHtml):
     def to_pyvista(self) -> Any:
         """Return the mesh as ``pyvista.PolyData`` in LPS mm, sharing the memory of vertices and normals.
 
-        The normals are the active point normals, named ``Normals``; `values` are point arrays; the field arrays
-        ``SPACE`` and ``UNIT`` name frame and unit.
+        The normals are the active point normals, named ``Normals``; `values` are point arrays, `face_values` cell
+        arrays; the field arrays ``SPACE`` and ``UNIT`` name frame and unit.
 
         Raises
         ------
@@ -272,7 +314,8 @@ class Mesh(BaseMesh, ShownAsHtml):
         from clrecon.mesh.vtk import wrap_polydata
 
         self.check()
-        return wrap_polydata(self._vertices, self._triangles, self._normals, self.checked_values(), self.voxel_mm)
+        values, face_values = self.checked_values(), self.checked_values("face_values")
+        return wrap_polydata(self._vertices, self._triangles, self._normals, values, face_values, self.voxel_mm)
 
     @classmethod
     @explains_arguments
@@ -282,8 +325,8 @@ class Mesh(BaseMesh, ShownAsHtml):
         Parameters
         ----------
         polydata : pyvista.PolyData or vtkPolyData
-            In mm.  Its point normals, if it has any that are named ``Normals``, are taken over, and its point arrays of
-            one number each, whose names are letters, digits and _, become `values`.
+            In mm.  Its point normals, if it has any that are named ``Normals``, are taken over; its point and cell
+            arrays of one number each, whose names are letters, digits and _, become `values` and `face_values`.
         space : {"lps", "ras"}, optional
             Patient frame of the points; None: that of the field array ``SPACE``, which `to_pyvista` and 3D Slicer
             write, else LPS.
@@ -295,15 +338,14 @@ class Mesh(BaseMesh, ShownAsHtml):
         """
         from clrecon.mesh.vtk import unwrap_polydata
 
-        vertices, triangles, normals, values, named, voxel = unwrap_polydata(polydata)
-        made = cls._of_others(vertices, triangles, normals, choose_space(space, named, "the PolyData"), voxel)
-        made.values = values
-        return made
+        raw, voxel = unwrap_polydata(polydata)
+        return cls._of_others(raw, choose_space(space, raw.space, "the PolyData"), voxel)
 
     def to_trimesh(self) -> Any:
         """Return the mesh as ``trimesh.Trimesh`` in LPS mm, its ``units`` "mm" and ``metadata["SPACE"]`` "LPS".
 
-        Vertices and triangles keep their order and number (``process=False``).
+        Vertices and triangles keep their order and number (``process=False``); `values` and `face_values` are its
+        ``vertex_attributes`` and ``face_attributes``.
 
         Raises
         ------
@@ -317,6 +359,8 @@ class Mesh(BaseMesh, ShownAsHtml):
             self.triangles.astype(np.int64),
             vertex_normals=None if self.normals is None else self.normals.astype(np.float64),
             metadata={"SPACE": "LPS", "UNIT": "mm", "VOXEL_MM": self.voxel_mm},
+            vertex_attributes=self.checked_values(),
+            face_attributes=self.checked_values("face_values"),
             process=False,
         )
         made.units = "mm"
@@ -330,7 +374,8 @@ class Mesh(BaseMesh, ShownAsHtml):
         Parameters
         ----------
         mesh : trimesh.Trimesh
-            In mm.  Its normals are not taken over: trimesh makes them of the triangles when they are asked for.
+            In mm.  Its attributes of one number each become `values` and `face_values`.  Its normals are not taken
+            over: trimesh makes them of the triangles when they are asked for.
         space : {"lps", "ras"}, optional
             Patient frame of the vertices; None: that of ``metadata["SPACE"]``, which `to_trimesh` sets, else LPS.
 
@@ -350,18 +395,22 @@ class Mesh(BaseMesh, ShownAsHtml):
             raise UsageError(f"the mesh is in {units}, clrecon's are in mm: call its convert_units('mm') first")
         facts = getattr(mesh, "metadata", None) or {}
         frame = choose_space(space, facts.get("SPACE"), "the Trimesh")
-        return cls._of_others(np.asarray(vertices), np.asarray(faces), None, frame, facts.get("VOXEL_MM"))
+        raw = RawMesh(
+            "Trimesh",
+            np.asarray(vertices),
+            np.asarray(faces),
+            values=numbers_of(mesh.vertex_attributes),
+            face_values=numbers_of(mesh.face_attributes),
+        )
+        return cls._of_others(raw, frame, facts.get("VOXEL_MM"))
 
     @classmethod
-    def _of_others(
-        cls, vertices: NDArray[Any], triangles: NDArray[Any], normals: NDArray[Any] | None, space: str, voxel: Any
-    ) -> Mesh:
+    def _of_others(cls, raw: RawMesh, space: str, voxel: Any) -> Mesh:
         """Make a mesh of arrays in ``space``, of a scan whose shortest voxel step is known or None."""
-        if space != "LPS":
-            signs = np.diag(frame_from_lps(space))
-            vertices = vertices * signs.astype(vertices.dtype)
-            normals = None if normals is None else normals * signs.astype(normals.dtype)
-        return cls(vertices, triangles, normals, None if voxel is None else {"voxel_mm": float(voxel)})
+        vertices, normals = turn_to_lps(space, raw.vertices, raw.normals)
+        made = cls(vertices, raw.triangles, normals, None if voxel is None else {"voxel_mm": float(voxel)})
+        made.values, made.face_values = dict(raw.values), dict(raw.face_values)
+        return made
 
     def show(self) -> None:
         """Show the mesh in a window of pyvista, until it is closed; see `clrecon.show`.

@@ -40,8 +40,8 @@ def read_mesh(path: str | os.PathLike[str], *, space: Space | None = None) -> Me
         In LPS mm.  Entries of ``report["file"]``: ``kind``, ``space``, ``space_from`` ("file", "argument" or
         "assumed"), ``unit`` (of the file), ``triangles``, ``parts`` (``name``, ``triangles`` and ``color`` of each
         object, whose triangles follow one another) and ``warnings``.  The name and the colour of a file's only object
-        are the mesh's own: ``report["part_name"]``, ``report["color"]``.  Numbers ``scalar_NAME`` at the vertices of a
-        PLY file are ``values[NAME]``.
+        are the mesh's own: ``report["part_name"]``, ``report["color"]``.  Numbers at the vertices and triangles of PLY
+        (``scalar_NAME``) and VTP files are ``values[NAME]`` and ``face_values[NAME]``.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def read_mesh(path: str | os.PathLike[str], *, space: Space | None = None) -> Me
         mesh = Mesh(vertices, raw.triangles, normals, report)
     except UsageError as error:
         raise RefusedInputError(f"{name} is corrupt: {error}") from error
-    mesh.values = dict(raw.values)
+    mesh.values, mesh.face_values = dict(raw.values), dict(raw.face_values)
     log.info("%s file read: %d triangles", raw.kind, mesh.triangle_count)
     log_warnings(log, raw.warnings)
     return mesh

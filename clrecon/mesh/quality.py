@@ -47,6 +47,7 @@ class MeshQuality(Record):
         as CGAL counts them.  ``mesh.quality()`` does not look for them: None.  A strict mesh job does.
     """
 
+    _SHOWN = ("triangles", "closed", "manifold", "components", "volume_ml")
     vertices: int
     triangles: int
     closed: bool

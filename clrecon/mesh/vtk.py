@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.exchange.vtp import make_polydata
+from clrecon.exchange.raw_content import RawMesh, numbers_of
+from clrecon.exchange.vtp import add_arrays, make_polydata
 
 Points = NDArray[np.float64]
 
@@ -59,7 +60,10 @@ class CellLocator:
 
 
 def clip_surface(surface: Any, point: Points, normal: Points, capped: bool) -> Any:
-    """Return the part of a ``pyvista.PolyData`` on the side of a plane that the normal points to."""
+    """Return the part of a ``pyvista.PolyData`` on the side of a plane that the normal points to.
+
+    Capped, its cell array ``Labels`` is 1 in the cap and 0 elsewhere, and other cell arrays are lost.
+    """
     from vtkmodules.vtkCommonDataModel import vtkPlane, vtkPlaneCollection
     from vtkmodules.vtkFiltersGeneral import vtkClipClosedSurface
 
@@ -68,6 +72,7 @@ def clip_surface(surface: Any, point: Points, normal: Points, capped: bool) -> A
     planes = vtkPlaneCollection()
     planes.AddItem(vtkPlane(origin=point, normal=normal))
     clipper: Any = vtkClipClosedSurface(clipping_planes=planes, pass_point_data=True)  # that of pyvista loses them
+    clipper.SetScalarModeToLabels()
     clipper.SetInputData(surface)
     clipper.Update()
     return clipper.GetOutput()
@@ -96,12 +101,14 @@ def wrap_polydata(
     triangles: NDArray[np.uint32],
     normals: NDArray[np.float32] | None,
     values: Mapping[str, NDArray[np.float32]],
+    face_values: Mapping[str, NDArray[np.float32]],
     voxel_mm: float | None = None,
 ) -> Any:
     """``pyvista.PolyData`` in LPS mm that shares the memory of vertices and normals; see `Mesh.to_pyvista`."""
     import pyvista
 
     polydata = pyvista.wrap(make_polydata(vertices, triangles, normals, values=values))
+    add_arrays(polydata.GetCellData(), face_values)
     polydata.field_data["SPACE"] = ["LPS"]
     polydata.field_data["UNIT"] = ["mm"]
     if voxel_mm is not None:
@@ -109,10 +116,8 @@ def wrap_polydata(
     return polydata
 
 
-def unwrap_polydata(
-    polydata: Any,
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, dict[str, NDArray[Any]], str | None, float | None]:
-    """Points, triangles, normals, numbers, frame and voxel step of a ``pyvista.PolyData``; see `Mesh.from_pyvista`."""
+def unwrap_polydata(polydata: Any) -> tuple[RawMesh, float | None]:
+    """Return what a ``pyvista.PolyData`` holds, and its voxel step; see `Mesh.from_pyvista`."""
     import pyvista
 
     found = pyvista.wrap(polydata) if hasattr(polydata, "GetPolys") else polydata
@@ -125,10 +130,13 @@ def unwrap_polydata(
     faces = np.asarray(found.faces)
     if not len(faces):
         raise UsageError(f"the PolyData has {found.n_points:,} points and no faces: it is no surface")
-    normals = found.point_data["Normals"] if "Normals" in found.point_data else None
-    named = found.field_data["SPACE"][0] if "SPACE" in found.field_data else None
-    arrays = {name: np.asarray(found.point_data[name]) for name in found.point_data if name.isidentifier()}
-    values = {name: np.array(array) for name, array in arrays.items() if array.ndim == 1 and array.dtype.kind in "biuf"}
-    triangles = faces.reshape(-1, 4)[:, 1:]
-    voxel = float(found.field_data["VOXEL_MM"][0]) if "VOXEL_MM" in found.field_data else None
-    return np.array(found.points), triangles, normals, values, None if named is None else str(named), voxel
+    raw = RawMesh(
+        "PolyData",
+        np.array(found.points),
+        faces.reshape(-1, 4)[:, 1:],
+        found.point_data["Normals"] if "Normals" in found.point_data else None,
+        str(found.field_data["SPACE"][0]) if "SPACE" in found.field_data else None,
+        values=numbers_of(found.point_data),
+        face_values=numbers_of(found.cell_data),
+    )
+    return raw, float(found.field_data["VOXEL_MM"][0]) if "VOXEL_MM" in found.field_data else None

@@ -13,7 +13,7 @@ from clrecon.errors import UsageError
 from clrecon.exchange.content import PointContent, facts_for_file
 from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_cloud
-from clrecon.geometry import frame_from_lps
+from clrecon.geometry import Volume, frame_from_lps
 from clrecon.geometry.affine import choose_space
 from clrecon.system.arguments import Space, explains_arguments
 from clrecon.system.base_classes import Message
@@ -269,6 +269,11 @@ class PointCloud(Message, ShownAsHtml):
         of_points = {"normals": self._normals, "hu": self._hu, "labels": self._labels, "ijk": self._ijk}
         taken = {name: _take_values(values, numbers) for name, values in of_points.items() if values is not None}
         return PointCloud.of_known(points, **taken, report=dict(self.report))
+
+    @explains_arguments
+    def sample(self, volume: Volume, order: int = 1, outside: float = float("nan")) -> PointCloud:
+        """Return the cloud with the values of a volume at its points as `hu`; see `Volume.sample`."""
+        return self.changed(hu=Volume.sample(volume, self.points, order=order, outside=outside))
 
     @explains_arguments
     def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:

@@ -108,6 +108,7 @@ class Vertebra(Record):
     volume_ml : float
     """
 
+    _SHOWN = ("number", "name", "confidence", "whole", "volume_ml")
     number: int
     name: str
     confidence: float
@@ -171,6 +172,7 @@ class VertebraSplit(Message):
     plane : MiddlePlane
     """
 
+    _SHOWN = ("labels", "level_hu", "left_out")
     labels: LabelMap
     vertebrae: list[Vertebra]
     discs_mm: NDArray[np.float64]

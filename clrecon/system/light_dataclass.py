@@ -73,7 +73,11 @@ def _set_fields(self: Any, /, *args: Any, **given: Any) -> None:
 
 @reprlib.recursive_repr()
 def _show_fields(self: Any) -> str:
-    shown = (f"{own.name}={getattr(self, own.name)!r}" for own in fields(self) if own.repr)
+    if names := getattr(self, "_SHOWN", None):  # of a class with many fields those that one looks for
+        values = {name: getattr(self, name) for name in names}
+        shown = [f"{name}={f'{each:.6g}' if isinstance(each, float) else repr(each)}" for name, each in values.items()]
+        return f"{type(self).__qualname__}({', '.join(shown)}, ...)"
+    shown = [f"{own.name}={getattr(self, own.name)!r}" for own in fields(self) if own.repr]
     return f"{type(self).__qualname__}({', '.join(shown)})"
 
 

@@ -344,13 +344,15 @@ FACE_ROW = [("shade", "f4"), ("count", "u1"), ("corners", "i4", (3,)), ("red", "
 FACE_HEAD = """property float shade
 property list uchar int vertex_indices
 property uchar red
-property short flag
+property short scalar_flag
 end_header
 """
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_numbers_at_the_faces_of_a_ply_file_are_left_out_with_a_warning(tmp_path: Path, form: str) -> None:
+def test_numbers_at_the_faces_of_a_ply_file_that_are_no_scalars_are_left_out_with_a_warning(
+    tmp_path: Path, form: str
+) -> None:
     """MeshLab writes colours, flags and qualities at faces, before or after the list of corners."""
     points, faces = (np.array(each) for each in TETRA)
     order = ">" if "big" in form else "<"
@@ -366,7 +368,8 @@ def test_numbers_at_the_faces_of_a_ply_file_are_left_out_with_a_warning(tmp_path
     (tmp_path / "a.ply").write_bytes(head.encode() + body)
     mesh = clrecon.read_mesh(tmp_path / "a.ply")
     assert np.array_equal(mesh.vertices, points) and np.array_equal(mesh.triangles, faces)
-    assert "numbers at faces left out: shade, red, flag" in mesh.report["file"]["warnings"]
+    assert "numbers at faces left out: shade, red" in mesh.report["file"]["warnings"]
+    assert {name: values.tolist() for name, values in mesh.face_values.items()} == {"flag": [-7.0] * 4}
 
 
 def test_faces_of_four_corners_beside_numbers_are_refused(tmp_path: Path) -> None:

@@ -120,3 +120,19 @@ def test_a_map_on_the_grid_of_a_volume_is_what_resampling_says() -> None:
     uneven = clrecon.Volume(np.zeros((3, 4, 5), np.int16), OBLIQUE, slice_positions=places)
     with pytest.raises(UsageError, match="the slices of the volume are uneven"):
         labels.resample(uneven)
+
+
+def test_an_array_takes_the_places_of_a_volume_or_of_another_map() -> None:
+    volume = clrecon.Volume(np.zeros((3, 4, 5), np.int16), SHEARED, {"frame_of_reference_hash": "f", "warnings": []})
+    array = np.ones(volume.shape, np.uint8)
+    made = LabelMap(array, volume, {1: "bone"})
+    again = LabelMap(array, made)
+    for labels in (made, again):
+        assert np.array_equal(labels.affine, SHEARED) and labels.frame_of_reference_hash == "f"
+    assert made.names == {1: "bone"} and again.names == {1: "label_1"}
+    assert LabelMap(array, made, frame_of_reference_hash="g").frame_of_reference_hash == "g"
+    with pytest.raises(UsageError, match=r"the labels have shape \(3, 4, 5\), the grid they are to lie on \(2, 4, 5\)"):
+        LabelMap(array, volume[1:])
+    uneven = clrecon.Volume(array, np.eye(4), slice_positions=[(0, 0, 0), (0, 0, 1), (0, 0, 3)])
+    with pytest.raises(UsageError, match="the slices of the volume are uneven, no label map has such"):
+        LabelMap(array, uneven)

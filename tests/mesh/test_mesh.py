@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 
+from clrecon import PointCloud, Volume, read_mesh, read_points
 from clrecon.errors import UsageError
 from clrecon.mesh import Mesh
 
@@ -190,3 +191,58 @@ def test_merged_meshes_keep_their_arrays_and_numbers_and_the_shortest_voxel():
     assert turned.merge(turned).normals.shape == (16, 3) and turned.merge(one).normals is None
     with pytest.raises(UsageError, match=r"merge takes meshes, not list: of a list mesh.merge\(\*others\)"):
         one.merge([other])
+
+
+def test_the_values_of_a_volume_are_sampled_at_vertices_and_points_and_kept_by_files(tmp_path):
+    volume = Volume(np.arange(4 * 5 * 6, dtype=np.int16).reshape(4, 5, 6), np.diag([0.5, 0.7, 2.0, 1.0]))
+    mesh = Mesh(*samples.box((0.3, 0.6, 1.0)), report={"iso_value_hu": 226})
+    made = mesh.sample(volume).sample(volume, "nearest", 0).sample(volume[:1], "first", outside=-1024)
+    assert mesh.values == {} and made.report == mesh.report and made.report is not mesh.report
+    np.testing.assert_array_equal(made.values["HU"], volume.sample(mesh.vertices).astype(np.float32))
+    np.testing.assert_array_equal(made.values["nearest"], volume.sample(mesh.vertices, order=0))
+    assert made.values["first"].min() == -1024 and np.isfinite(made.values["HU"]).all()
+    for name in ("a.ply", "a.vtp"):
+        made.save(tmp_path / name)
+        back = read_mesh(tmp_path / name).values
+        assert {name: values.tolist() for name, values in back.items()} == {
+            name: values.tolist() for name, values in made.values.items()
+        }
+    made.save(tmp_path / "a.glb")
+    assert b'"_HU":' in (tmp_path / "a.glb").read_bytes()
+    cloud = PointCloud(mesh.vertices, labels=np.arange(8)).sample(volume)
+    cloud.save(tmp_path / "a.npz")
+    again = read_points(tmp_path / "a.npz")
+    assert again.hu.tolist() == made.values["HU"].tolist() and again.labels.tolist() == list(range(8))
+    for asked in (mesh, cloud):
+        with pytest.raises(UsageError, match="volume must be a Volume"):
+            asked.sample(mesh)
+    with pytest.raises(UsageError, match="values have names of letters, digits and _"):
+        mesh.sample(volume, "mean HU")
+
+
+def test_numbers_at_faces_go_with_the_mesh_and_its_files(tmp_path):
+    pytest.importorskip("trimesh")
+    mesh = Mesh(*samples.box()).merge(Mesh(*samples.box((5.0, 0.0, 0.0), (2.0, 2.0, 2.0))))
+    assert mesh.face_values == {}
+    mesh.face_values["stress"], mesh.values["HU"] = np.arange(24), np.arange(16.0)
+    np.testing.assert_array_equal(mesh.keep_largest().face_values["stress"], np.arange(12, 24))
+    assert [part.face_values["stress"][0] for part in mesh.split()] == [12, 0]
+    mirrored = mesh.transformed(np.diag([-1.0, 1.0, 1.0, 1.0]))
+    np.testing.assert_array_equal(mirrored.face_values["stress"], np.arange(24))
+    both = mesh.merge(Mesh(*samples.box()))
+    np.testing.assert_array_equal(both.face_values["stress"], [*range(24), *[np.nan] * 12])
+    for name in ("a.ply", "a.vtp"):
+        mirrored.save(tmp_path / name)
+    for back in (
+        read_mesh(tmp_path / "a.ply"),
+        read_mesh(tmp_path / "a.vtp"),
+        Mesh.from_pyvista(mirrored.to_pyvista()),
+        Mesh.from_trimesh(mirrored.to_trimesh()),
+    ):
+        np.testing.assert_array_equal(back.triangles, mirrored.triangles)
+        assert back.face_values["stress"].tolist() == list(range(24))
+        assert back.values["HU"].tolist() == list(range(16))
+        assert back.values.keys() == {"HU"} and back.face_values.keys() == {"stress"}
+    mesh.face_values["stress"] = np.zeros(16)
+    with pytest.raises(UsageError, match=r"face_values\['stress'\] are .* one number a triangle is needed, \(24,\)"):
+        mesh.save(tmp_path / "b.vtp")

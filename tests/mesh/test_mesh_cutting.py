@@ -46,6 +46,19 @@ def test_an_open_cut_lacks_its_cap_alone() -> None:
     assert part.clip((0, 1, 0), (0, 1, 0), capped=False).area == pytest.approx(4.0)
 
 
+def test_numbers_at_faces_follow_a_cut_and_a_cap_has_none() -> None:
+    mesh = box(AFAR)
+    mesh.face_values["side"] = np.repeat(np.arange(6.0), 2)
+    for capped in (True, False):
+        part = mesh.clip(AFAR + (0.3, 0.2, 1.0), (0, 0.1, 1), capped=capped)
+        corners = (part.vertices - AFAR)[part.triangles]
+        known = part.face_values["side"]
+        for side, (axis, place) in {1: (2, 4), 2: (1, 0), 3: (1, 2), 4: (0, 0), 5: (0, 1)}.items():
+            np.testing.assert_array_equal(known == side, np.isclose(corners[:, :, axis], place).all(axis=1))
+        assert np.isnan(known).any() == capped and 0 not in known
+    assert np.isnan(mesh.clip(AFAR + (0, 0, -3), (0, 0, 1)).face_values["side"]).sum() == 0
+
+
 def test_planes_beside_a_mesh_leave_it_or_are_refused() -> None:
     assert box().clip((0, 0, -3), (0, 0, 1)).volume == pytest.approx(8.0)
     with pytest.raises(NoSurfaceError, match="nothing of the mesh lies on that side of the plane: it ends 3 mm off"):

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import copy
 import json
-from dataclasses import FrozenInstanceError, dataclass
+from dataclasses import FrozenInstanceError, dataclass, fields
 from importlib import import_module
 from typing import Any
 
+import numpy as np
 import pytest
 from house import package_modules
 
+from clrecon.anatomy.iso_choice import IsoChoice
+from clrecon.anatomy.spine_line import SpineLine
 from clrecon.geometry.certificate import Certificate, amend
+from clrecon.labels.statistics import LabelFigures
+from clrecon.mesh.quality import MeshQuality
+from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing
+from clrecon.spine.split import Vertebra, VertebraSplit
 from clrecon.system.records import Gate, Record, at_most
 
 
@@ -115,3 +122,19 @@ def test_every_record_compares_as_a_dict() -> None:
     assert {Certificate, Gate} <= set(kinds)
     for kind in kinds:
         assert kind.__eq__ is dict.__eq__, f"{kind.__name__} is made without eq=False"
+
+
+def test_a_record_of_many_fields_shows_some_in_one_line_and_has_all_as_entries() -> None:
+    figures = LabelFigures(
+        number=28, name="vertebrae_L4", voxels=250_200, ml=39.09375, label_ml=39.09375000000001, inside_share=1.0,
+        unmeasured=0, mean_hu=364.7322142286171, sd_hu=194.14300870016297, min_hu=-69.0, max_hu=1777.0,
+        percentiles_hu=dict.fromkeys("12345", 1.0),
+    )  # fmt: skip
+    said = "LabelFigures(number=28, name='vertebrae_L4', ml=39.0938, mean_hu=364.732, sd_hu=194.143, ...)"
+    assert repr(figures) == said and len(figures) == 12
+    for kind in (Certificate, IsoChoice, LabelFigures, MeshQuality, SeriesEntry, SpineLine, Vertebra, VertebraSplit):
+        own = kind.__new__(kind)
+        vars(own).update(dict.fromkeys((field.name for field in fields(kind)), 12345.678), points=np.zeros((2, 3)))
+        assert len(repr(own)) < 120 and "\n" not in repr(own)
+    listing = SeriesListing(["x" * 999] * 3, 2, {}, [])
+    assert repr(listing) == "SeriesListing(3 series, chosen=2, 0 warnings)"

@@ -68,6 +68,7 @@ class SeriesEntry:
     dropped: Maps a reason to the number of slices left out of the stack.
     """
 
+    _SHOWN = ("number", "modality", "slices", "shape_ijk", "spacing_mm")
     number: int
     uid_hash: str | None
     description: str
@@ -109,3 +110,6 @@ class SeriesListing(ShownAsHtml):
     warnings: list[str]
     certificate: Certificate | None = None
     refusal: ClreconError | None = None
+
+    def __repr__(self) -> str:
+        return f"SeriesListing({len(self.series)} series, chosen={self.chosen}, {len(self.warnings)} warnings)"

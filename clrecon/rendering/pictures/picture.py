@@ -48,7 +48,7 @@ class Rendering(PictureData):
 
     def __repr__(self) -> str:
         width, height = self.size
-        return f"<Rendering {self.mode}, {width} x {height} pixels, camera {self.camera}>"
+        return f"Rendering({self.mode}, {width} x {height} pixels)"
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         """Return ``image``, for numpy and for ``matplotlib.pyplot.imshow(rendering)``."""
