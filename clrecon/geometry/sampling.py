@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import BaseVolume, Grid
+from clrecon.system.pieces import CHUNK, in_threads
 from clrecon.system.progress import Progress, ignore_progress
 
 ORDERS = (0, 1, 3)
@@ -20,34 +21,73 @@ SPLINE_MARGIN = 16
 
 
 def sample_volume(volume: BaseVolume, points: Float64Array, order: int, outside: float) -> Float64Array:
-    """Return HU at points (n, 3) in LPS mm, shape (n,); `outside` beyond the voxels and where a point is not finite."""
-    from scipy import ndimage
+    """Return HU at points (n, 3) in LPS mm, shape (n,); `outside` beyond the voxels and where a point is not finite.
 
+    By numpy, in pieces that stay in the processor's cache: a kernel with its uploads takes as long (docs/geometry.md).
+    """
     if order not in ORDERS:
         raise UsageError(f"the order of an interpolation is one of {', '.join(map(str, ORDERS))}, not {order!r}")
-    places = volume.lps_to_ijk(np.where(np.isfinite(points).all(axis=1, keepdims=True), points, np.nan))
-    is_inside = find_inside(places, volume)
-    values = np.full(len(places), float(outside))
-    if not is_inside.any():
-        return values
-    places = np.clip(places[is_inside], 0.0, np.array(volume.shape_ijk) - 1.0)
-    if order == 0:
-        i, j, k = np.floor(places + 0.5).astype(np.intp).T
-        values[is_inside] = volume.voxels[k, j, i]
-        return values
-    margin = SPLINE_MARGIN if order == 3 else 1
-    first = np.maximum(np.floor(places.min(axis=0)).astype(int) - margin, 0)
-    end = np.ceil(places.max(axis=0)).astype(int) + margin + 1
-    block = volume.voxels[tuple(slice(low, high) for low, high in zip(first[::-1], end[::-1], strict=True))]
-    at = (places - first)[:, ::-1].T
-    values[is_inside] = ndimage.map_coordinates(block, at, np.float64, order=order, mode="nearest")
+    values = np.full(len(points), float(outside))
+    interpolate = {0: _nearest, 1: _trilinear, 3: _spline}[order]
+
+    def sample(where: slice) -> None:
+        own = points[where]
+        if not np.isfinite(own).all():
+            own = np.where(np.isfinite(own).all(axis=1, keepdims=True), own, np.nan)
+        places = volume.lps_to_ijk(own)
+        is_inside = find_inside(places, volume)
+        if is_inside.any():
+            rows = np.ascontiguousarray((places if is_inside.all() else places[is_inside]).T)
+            np.clip(rows, 0.0, np.array(volume.shape_ijk)[:, None] - 1.0, out=rows)
+            values[where][is_inside] = interpolate(volume.voxels, rows)
+
+    in_threads(sample, len(points), max(len(points), 1) if order == 3 else CHUNK)
     return values
+
+
+def _nearest(voxels: NDArray[Any], places: Float64Array) -> NDArray[Any]:
+    """Return the values of the voxels nearest to places (3, n) in i, j and k within the volume."""
+    i, j, k = np.floor(places + 0.5).astype(np.intp)
+    return voxels[k, j, i]
+
+
+def _trilinear(voxels: NDArray[Any], places: Float64Array) -> Float64Array:
+    nk, nj, ni = voxels.shape
+    strides, last = (1, ni, nj * ni), (ni - 1, nj - 1, nk - 1)
+    low, values = np.floor(places), voxels.reshape(-1)
+    parts = places - low
+    rests = 1.0 - parts
+    steps = [np.where(low[axis] < last[axis], strides[axis], 0) for axis in range(3)]
+
+    def blend(numbers: NDArray[np.intp], axis: int) -> Float64Array:
+        if axis < 0:
+            return values.take(numbers).astype(np.float64)
+        one, other = blend(numbers, axis - 1), blend(numbers + steps[axis], axis - 1)
+        one *= rests[axis]
+        other *= parts[axis]
+        one += other
+        return one
+
+    return blend((low[0] + ni * (low[1] + nj * low[2])).astype(np.intp), 2)
+
+
+def _spline(voxels: NDArray[Any], places: Float64Array) -> Float64Array:
+    from scipy import ndimage
+
+    first = np.maximum(np.floor(places.min(axis=1)).astype(int) - SPLINE_MARGIN, 0)
+    end = np.ceil(places.max(axis=1)).astype(int) + SPLINE_MARGIN + 1
+    block = voxels[tuple(slice(low, high) for low, high in zip(first[::-1], end[::-1], strict=True))]
+    at = (places - first[:, None])[::-1]
+    return np.asarray(ndimage.map_coordinates(block, at, np.float64, order=3, mode="nearest"))
 
 
 def find_inside(places: Float64Array, grid: Grid) -> NDArray[np.bool_]:
     """Tell which places (..., 3) in i, j and k lie within the voxels: at most half of one beyond their centres."""
+    is_inside = np.ones(places.shape[:-1], bool)
     with np.errstate(invalid="ignore"):
-        return np.asarray(((places >= -0.5) & (places <= np.array(grid.shape_ijk) - 0.5)).all(axis=-1))
+        for axis, count in enumerate(grid.shape_ijk):
+            is_inside &= (places[..., axis] >= -0.5) & (places[..., axis] <= count - 0.5)
+    return is_inside
 
 
 def sample_onto(
