@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from clrecon.geometry.iso_rule import IsoRule, data_range
 from clrecon.geometry.vertices import warnings_of_far, warnings_of_rule
 from clrecon.opencl import Device, Program, Stopwatch, result_pages
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.resident.tables import BrickStates, brick_bytes, compare_bricks, measure_bricks
+from clrecon.operators.resident.tables import BrickRanges, BrickStates, brick_bytes, compare_bricks, measure_bricks
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.growing import Grown, grow, growing_needs, join_slabs, prepare_growing
 from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement, count
@@ -92,8 +93,15 @@ def _join(parts: list[Part]) -> Part:
     return joined[0], joined[1], joined[2]
 
 
-MEASURED_FROM = {"8": 8, "1": 2}
-"""Surface of a volume, by LANES, before which its bricks are measured: on a CPU that costs what four surfaces save."""
+MEASURED_FROM = 2
+"""Surface of a volume before which a GPU measures its bricks; a CPU gains less from 40 surfaces of a scan."""
+
+
+def keep_bricks(resident: DeviceVolume, voxels_d: Any) -> BrickRanges:
+    """Return the ranges of the bricks of a whole volume, measured where they are not kept."""
+    shape, dtype = resident.volume.shape_ijk, resident.volume.voxels.dtype
+    measure = partial(measure_bricks, resident.device, voxels_d, shape, dtype)
+    return resident.keep(BRICKS, None, brick_bytes(shape, dtype), measure)
 
 
 class Extraction:
@@ -212,19 +220,14 @@ class Extraction:
     def _compare_bricks(self, slab: Slab, voxels_d: Any) -> BrickStates | None:
         """Compare the bricks of a whole volume with the only level; None if measuring them is not worth it yet.
 
-        Measuring takes as long as the first pass over the volume, so the first surfaces of a volume are made without.
-        So are surfaces of ranges and of values below a level: all voxels are read for them.
+        Measuring takes as long as the first pass over the volume, so the first surface of a volume is made without.  So
+        are surfaces of ranges and of values below a level: all voxels are read for them.
         """
-        first = MEASURED_FROM[self.device.kernel_variants["LANES"]]
-        if not slab.is_whole or self.resident.surfaces < first or slab.grid.rule.inside != "above":
+        waits = self.resident.surfaces < MEASURED_FROM or self.device.kernel_variants["LANES"] != "1"
+        if not slab.is_whole or slab.grid.rule.inside != "above" or (waits and not self.resident.kept_bytes(BRICKS)):
             return None
-        volume, _stopwatch = self.grid.volume, self.stopwatch
-        ranges = self.resident.keep(
-            BRICKS, None, brick_bytes(volume.shape_ijk, volume.voxels.dtype),
-            lambda: measure_bricks( self.device, voxels_d, volume.shape_ijk, volume.voxels.dtype ),
-        )  # fmt: skip
-        ni, border = volume.shape_ijk[0], slab.grid.rule.border
-        return compare_bricks(self.device, ranges, self.levels[0], ni, border)
+        ranges = keep_bricks(self.resident, voxels_d)
+        return compare_bricks(self.device, ranges, self.levels[0], self.grid.volume.shape_ijk[0], slab.grid.rule.border)
 
     def _check_output(self, slab: Slab, counted: Counted) -> None:
         """Refuse a slab whose mesh does not fit beside the other buffers; record the memory of the slab."""

@@ -21,8 +21,8 @@ from clrecon.mesh import Mesh
 from clrecon.opencl import Device, Stopwatch, allocate, download, launch, upload
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.cortex import CORTEX_SPREAD, SAMPLES, ProfileSampler, expected_precisions
-from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
-from clrecon.operators.surface.extraction import MEASURED_FROM
+from clrecon.operators.surface.extract import extract_isosurface
+from clrecon.operators.surface.extraction import keep_bricks
 from clrecon.operators.surface.label_masks import extract_label_masks, prepare_label_masks, survey_labels
 from clrecon.operators.surface.labels import extract_labels
 from clrecon.operators.surface.seeds import AUTO, AUTO_SHARE
@@ -78,14 +78,13 @@ def compare_mesh(volume: Volume, mesh: Mesh, expected: Surface, what: str) -> fl
 
 
 def _compare(device: Device, volume: Volume, levels: tuple[Level, ...], what: str, **options: Any) -> float:
-    """Compare surfaces of a volume; the first is made as often as it takes until bricks are worth measuring."""
+    """Compare surfaces of a volume one after the other: from the second on, bricks of the volume are known."""
     worst = 0.0
-    first_by_bricks = MEASURED_FROM[device.kernel_variants["LANES"]]
-    with SurfaceExtractor(volume, device=device) as extractor:
+    with DeviceVolume(volume, device=device) as resident:
         for number, level in enumerate(levels):
-            for _ in range(first_by_bricks - 2 if number == 1 else 0):
-                extractor.extract(levels[0], **options)
-            mesh = extractor.extract(level, **options)
+            if number == 1:
+                keep_bricks(resident, resident.whole(Stopwatch()))
+            mesh = extract_isosurface(resident, level, **options)
             words = f"{what}, surface {number + 1}" if len(levels) > 1 else what
             worst = max(worst, compare_mesh(volume, mesh, extract_twin(volume, level, **options), words))
     return worst

@@ -8,10 +8,11 @@ from surface_volumes import OBLIQUE, random_volume, smooth_volume
 from variants import VOXEL_TYPES
 
 from clrecon.geometry import Volume
-from clrecon.opencl import download, upload
+from clrecon.opencl import Stopwatch, download, upload
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import compare_bricks, measure_bricks
-from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
-from clrecon.operators.surface.extraction import MEASURED_FROM
+from clrecon.operators.surface.extract import extract_isosurface
+from clrecon.operators.surface.extraction import keep_bricks
 from clrecon.proof.volumes import volume_twins as twin
 
 SHAPES = [(1, 1, 1), (3, 9, 7), (8, 8, 8), (9, 7, 8), (17, 16, 33), (8, 9, 100)]
@@ -45,12 +46,12 @@ def test_the_surface_is_the_same_with_and_without(device, shape, dtype, closed):
     voxels = np.kron(blocks, np.ones((6, 6, 6)))[tuple(slice(n) for n in shape)].astype(dtype)
     voxels[random.integers(0, 50, shape) == 0] = 2
     volume = Volume(voxels, OBLIQUE)
-    with SurfaceExtractor(volume, device=device) as extractor:
-        first = MEASURED_FROM[device.kernel_variants["LANES"]]
-        for number in range(1, first + 1):
-            assert ("measure_bricks" in extractor.extract(1).report["kernel_seconds"]) == (number == first)
+    with DeviceVolume(volume, device=device) as resident:
+        measured = ["measure_bricks" in extract_isosurface(resident, 1).report["kernel_seconds"] for _ in range(9)]
+        assert measured == [number == 1 and device.kernel_variants["LANES"] == "1" for number in range(9)]
+        keep_bricks(resident, resident.whole(Stopwatch()))
         for iso_value in (1, 2, 3, 1.5):
-            mesh = extractor.extract(iso_value, closed=closed)
+            mesh = extract_isosurface(resident, iso_value, closed=closed)
             expected = extract_isosurface(volume, iso_value, device=device, closed=closed)
             assert np.array_equal(mesh.triangles, expected.triangles)
             assert np.array_equal(mesh.vertices, expected.vertices)
@@ -66,6 +67,8 @@ def test_a_single_extraction_measures_no_bricks(device):
 def test_bricks_stay_within_their_buffers(device):
     for shape in [(9, 3, 7), (3, 10, 33)]:
         volume = random_volume(shape)
-        with SurfaceExtractor(volume, device=device) as extractor:
-            first, second = extractor.extract(3), extractor.extract(3)
+        with DeviceVolume(volume, device=device) as resident:
+            first = extract_isosurface(resident, 3)
+            keep_bricks(resident, resident.whole(Stopwatch()))
+            second = extract_isosurface(resident, 3)
         assert np.array_equal(first.triangles, second.triangles)

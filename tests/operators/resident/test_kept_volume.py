@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from device_work import label_boxes
 from surface_volumes import smooth_volume
 
 import clrecon
+from clrecon.opencl import arrays
+from clrecon.opencl.program import Kernel
 from clrecon.operators.resident.device_volume import DeviceVolume
 
 
@@ -68,3 +72,37 @@ def test_parts_of_a_kept_volume_are_kept_on_its_device(volume, labels, device, t
     assert DeviceVolume(kept, device=device).volume is volume
     assert repr(kept).startswith("DeviceVolume(Volume(45 x 26 x 22 ")
     assert not {"keep", "plan", "attempts", "upload"} & set(dir(kept)) and {"crop", "close", "volume"} <= set(dir(kept))
+
+
+@pytest.mark.first_device
+def test_ten_surfaces_of_a_kept_volume_take_no_more_than_ten_of_new_ones(volume, device, monkeypatch):
+    """Kernels and buffers, counted: of a CPU all but the voxels are the same, a GPU has bricks from the second on."""
+    kernels: list[str] = []
+    buffers: list[int] = []
+    order, make = Kernel.order, arrays._make_buffer
+
+    def count_order(self, given):
+        kernels.append(self.name)
+        return order(self, given)
+
+    def count_buffer(device, flags, size, host=None):
+        buffers.append(size)
+        return make(device, flags, size, host)
+
+    levels = range(-200, 300, 50)
+    clrecon.extract_isosurface(volume, 0, device=device)  # whose device may be checked at first use
+    monkeypatch.setattr(Kernel, "order", count_order)
+    monkeypatch.setattr(arrays, "_make_buffer", count_buffer)
+    new = [clrecon.extract_isosurface(volume, level, device=device) for level in levels]
+    taken = Counter(kernels), Counter(buffers)
+    kernels.clear()
+    buffers.clear()
+    with DeviceVolume(volume, device=device) as kept:
+        made = [clrecon.extract_isosurface(kept, level) for level in levels]
+        assert kept.uploaded_bytes == volume.voxels.nbytes
+    assert all(np.array_equal(one.vertices, other.vertices) for one, other in zip(new, made, strict=True))
+    if device.kernel_variants["LANES"] == "1":
+        assert Counter(kernels)["measure_bricks"] == 1
+    else:
+        assert Counter(kernels) == taken[0]
+        assert taken[1] - Counter(buffers) == {volume.voxels.nbytes: 9} and not Counter(buffers) - taken[1]
