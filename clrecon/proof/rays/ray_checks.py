@@ -19,6 +19,7 @@ from clrecon.operators.rays.ray_pictures import MainWay, enter_tiles, look_ahead
 from clrecon.operators.rays.ray_slabs import (
     BRICK_CELLS,
     FARTHEST,
+    GROWN,
     LeapMap,
     RaySlab,
     find_leaps,
@@ -252,7 +253,7 @@ def _stripes(dtype: str) -> tuple[Volume, LabelMap, Camera]:
 
 
 def _check_composite_labels(device: Device) -> str:
-    """Labels scale the opacity of a block of known thickness, and tint it; a pixel is a column of voxels."""
+    """Labels, which reach beyond their voxels, scale the opacity of a block of known thickness, and tint it."""
     grey = TransferFunction([(0, 0.5, 0.5, 0.5, 0.1), (200, 0.5, 0.5, 0.5, 0.1)], unit_distance=2.0)
     for dtype in ("uint8", "uint16"):
         volume, labels, camera = _stripes(dtype)
@@ -261,12 +262,14 @@ def _check_composite_labels(device: Device) -> str:
         )
         found = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), 0.3)
         require_whole(found.report)
-        column = np.arange(SIZE[0]) // 8 % 4
+        at = np.arange(SIZE[0])
+        grown = [(at >= 32) & (at % 32 < GROWN), (at % 32 >= 8 - GROWN) & (at % 32 < 8)]
+        column = np.select(grown, [3, 1], at // 8 % 4)
         factor = np.choose(column, (1.0, 0.25, 1.0, 0.5))
         opacity = 1.0 - (1.0 - 0.1 * factor) ** (10 * 0.5 / grey.unit_distance)
         tint = np.where((column == 3)[:, None], (0.9, 0.1, 0.1), (0.5, 0.5, 0.5))
         row = 255.0 * np.concatenate([tint * opacity[:, None], opacity[:, None]], axis=1)
-        inner = (np.arange(SIZE[0]) % 8 > 0) & (np.arange(SIZE[0]) % 8 < 7)
+        inner = (column == np.roll(column, 1)) & (column == np.roll(column, -1))
         away = np.abs(_premultiplied(found.image) - row)[:, inner].max(axis=-1)
         require_close(away, np.zeros_like(away), COLOR_255, f"colours of labels of type {dtype}, of 255")
     return f"2 pictures with labels of {SIZE[0]} x {SIZE[1]} pixels as computed"
