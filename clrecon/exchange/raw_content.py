@@ -195,11 +195,12 @@ def frame_of_file(raw: RawCloud | RawMesh, asked: str | None, name: str) -> tupl
 def turn_to_lps(
     frame: str, points: NDArray[Any], normals: NDArray[np.float32] | None
 ) -> tuple[NDArray[Any], NDArray[np.float32] | None]:
-    """Return points (n, 3) and normals (n, 3) of a frame in LPS."""
-    if frame == "LPS":
-        return points, normals
+    """Return points (n, 3) and normals (n, 3) of a frame in LPS, or those of LPS in that frame."""
     signs = np.diag(frame_from_lps(frame))
-    points = points * signs.astype(points.dtype if points.dtype.kind == "f" else np.float64)
+    if (signs > 0.0).all():
+        return points, normals
+    # Adding 0 turns -0 into 0; text formats would show -0.
+    points = points * signs.astype(points.dtype if points.dtype.kind == "f" else np.float64) + points.dtype.type(0)
     return points, None if normals is None else normals * signs.astype(np.float32) + np.float32(0)
 
 

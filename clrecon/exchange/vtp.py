@@ -194,7 +194,7 @@ def write(stream: BinaryIO, content: PointContent | Assembly) -> None:
 def _add_parts(polydata: Any, parts: Sequence[Content]) -> None:
     counts = [len(part.triangles) for part in parts]
     colors = np.array([BONE_COLOR if part.color is None else part.color for part in parts])
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "PART": np.repeat(np.arange(len(parts), dtype=np.int32), counts),
         "COLOR": np.repeat(np.rint(255.0 * colors).astype(np.uint8), counts, axis=0),
     }

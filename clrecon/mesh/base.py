@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -13,7 +14,7 @@ from clrecon.errors import UsageError
 from clrecon.exchange.content import Content, facts_for_file
 from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_mesh
-from clrecon.geometry import frame_from_lps
+from clrecon.exchange.raw_content import turn_to_lps
 from clrecon.geometry.affine import apply_affine, checked_affine, column_spacing, normal_matrix
 from clrecon.mesh.quality import find_pieces
 from clrecon.mesh.triangles import vertex_normals
@@ -52,6 +53,22 @@ def _as_indices(values: ArrayLike) -> NDArray[np.uint32]:
         if low < 0 or high >= _MOST_VERTICES:
             raise UsageError(f"triangles hold indices from {low} to {high}: they must fit 32 bits without a sign")
     return np.ascontiguousarray(array, dtype=np.uint32)
+
+
+def _checked_columns(
+    own: str, columns: Mapping[str, NDArray[np.floating]], what: str, count: int
+) -> dict[str, NDArray[np.float32]]:
+    checked = {}
+    for name, values in columns.items():
+        array = np.asarray(values)
+        if array.shape != (count,) or array.dtype.kind not in "biuf":
+            raise UsageError(
+                f"{own}[{name!r}] are {array.dtype} of shape {array.shape}: one number a {what} is needed, ({count},)"
+            )
+        if not isinstance(name, str) or not (name.isascii() and name.isidentifier()):
+            raise UsageError(f"values have names of letters, digits and _ that begin with a letter, not {name!r}")
+        checked[name] = np.ascontiguousarray(array, np.float32)
+    return checked
 
 
 class BaseMesh(Message):
@@ -128,27 +145,13 @@ class BaseMesh(Message):
                 row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
                 raise UsageError(f"{name} {row:,} is not finite: {values[row].tolist()}")
 
-    def checked_values(self, own: str = "values") -> dict[str, NDArray[np.float32]]:
-        """Return `values` or `face_values` as float32; refuse those of another length or a name that no file holds."""
-        checked = {}
-        what, count = ("vertex", self.vertex_count) if own == "values" else ("triangle", self.triangle_count)
-        for name, values in getattr(self, own).items():
-            array = np.asarray(values)
-            if array.shape != (count,) or array.dtype.kind not in "biuf":
-                raise UsageError(
-                    f"{own}[{name!r}] are {array.dtype} of shape {array.shape}: one number a {what} is needed,"
-                    f" ({count},)"
-                )
-            if not isinstance(name, str) or not (name.isascii() and name.isidentifier()):
-                raise UsageError(f"values have names of letters, digits and _ that begin with a letter, not {name!r}")
-            checked[name] = np.ascontiguousarray(array, np.float32)
-        return checked
+    def checked_values(self) -> dict[str, NDArray[np.float32]]:
+        """Return `values` as float32, refusing those that are no number a vertex, or have a name that no file holds."""
+        return _checked_columns("values", self.values, "vertex", self.vertex_count)
 
-    def give_values(self, to: Own, vertices: Any = slice(None), triangles: Any = slice(None)) -> Own:
-        """Give a mesh made of some vertices and triangles of this one, by index, their numbers; return it."""
-        to.values = {name: values[vertices] for name, values in self.values.items()}
-        to.face_values = {name: values[triangles] for name, values in self.face_values.items()}
-        return to
+    def checked_face_values(self) -> dict[str, NDArray[np.float32]]:
+        """Return `face_values`, checked as `values`."""
+        return _checked_columns("face_values", self.face_values, "triangle", self.triangle_count)
 
     @explains_arguments
     def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:
@@ -159,12 +162,7 @@ class BaseMesh(Message):
         Returns:
         vertices: ndarray, shape (n, 3), mm, of the type of `vertices`
         """
-        signs = np.diag(frame_from_lps(space)).astype(np.float32)
-        if space.lower() == "lps":
-            return self._vertices, self._normals
-        # Adding 0 turns -0 into 0; text formats would show -0.
-        vertices = self._vertices * signs + np.float32(0)
-        return vertices, None if self._normals is None else self._normals * signs + np.float32(0)
+        return turn_to_lps(space, self._vertices, self._normals)  # a half turn is its own inverse
 
     def transformed(self: Own, matrix: ArrayLike) -> Own:
         """Return the mesh moved, turned or scaled by an affine; this one stays as it is.
@@ -190,7 +188,7 @@ class BaseMesh(Message):
             report["voxel_mm"] = self.voxel_mm * float(np.linalg.svd(checked[:3, :3], compute_uv=False).min())
         report["moved_by"] = (checked if before is None else checked @ np.array(before)).tolist()
         triangles = self._triangles[:, ::-1] if mirrored else self._triangles
-        return self.give_values(type(self)(apply_affine(checked, self._vertices), triangles, normals, report))
+        return give_values(self, type(self)(apply_affine(checked, self._vertices), triangles, normals, report))
 
     def describe(self, space: str, *, keep_ids: bool = False) -> Content:
         """Return the contents of a file of the mesh in `space`; nothing else of `report` is ever written.
@@ -207,7 +205,7 @@ class BaseMesh(Message):
             name=None if name is None else str(name),
             color=None if color is None else (float(color[0]), float(color[1]), float(color[2])),
             values=self.checked_values(),
-            face_values=self.checked_values("face_values"),
+            face_values=self.checked_face_values(),
             **facts,
         )
 
@@ -240,3 +238,10 @@ class BaseMesh(Message):
         """
         with keep_existing(no_clobber):
             return write_mesh(self, path, space, keep_ids=keep_ids)
+
+
+def give_values(mesh: BaseMesh, to: Own, vertices: Any = slice(None), triangles: Any = slice(None)) -> Own:
+    """Give a mesh made of some vertices and triangles of another, by index, the numbers at these; return it."""
+    to.values = {name: values[vertices] for name, values in mesh.values.items()}
+    to.face_values = {name: values[triangles] for name, values in mesh.face_values.items()}
+    return to

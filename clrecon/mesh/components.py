@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.coordinates import rounding_step
-from clrecon.mesh.base import BaseMesh
+from clrecon.mesh.base import BaseMesh, give_values
 from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.quality import measure_components
 from clrecon.mesh.triangles import find_nearest_triangle
@@ -107,7 +107,7 @@ def keep_triangles(mesh: Own, kept: NDArray[np.bool_]) -> Own:
     made = type(mesh)(
         mesh.vertices[used], number[triangles].astype(np.uint32), normals, dict(mesh.report), trusted=True
     )  # fmt: skip
-    return mesh.give_values(made, used, kept)
+    return give_values(mesh, made, used, kept)
 
 
 def split_components(
@@ -150,7 +150,7 @@ def split_components(
         triangles = (number[mesh.triangles[faces]] - vertex_ends[part]).astype(np.uint32)
         normals = None if mesh.normals is None else mesh.normals[own]
         made = type(mesh)(mesh.vertices[own], triangles, normals, {**mesh.report, **chosen.facts})
-        parts.append(mesh.give_values(made, own, faces))
+        parts.append(give_values(mesh, made, own, faces))
     return parts
 
 

@@ -13,7 +13,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.raw_content import RawMesh, numbers_of, turn_to_lps
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import choose_space
-from clrecon.mesh.base import BaseMesh
+from clrecon.mesh.base import BaseMesh, give_values
 from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.connectivity import find_edges
 from clrecon.mesh.intersections import find_self_intersections
@@ -180,7 +180,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         outside : float
             Value beyond the voxels.
         """
-        made = self.give_values(copy.copy(self))
+        made = give_values(self, copy.copy(self))
         made.report = dict(self.report)
         made.values[name] = Volume.sample(volume, self.vertices, order=order, outside=outside).astype(np.float32)
         made.checked_values()
@@ -250,7 +250,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         along = along / np.abs(along).max()  # whose square is neither infinite nor 0
         origin = self._origin()
         surface = wrap_polydata(
-            self.vertices - origin, self.triangles, None, self.checked_values(), self.checked_values("face_values")
+            self.vertices - origin, self.triangles, None, self.checked_values(), self.checked_face_values()
         )
         return surface, at - origin, along / np.linalg.norm(along), origin
 
@@ -314,7 +314,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         from clrecon.mesh.vtk import wrap_polydata
 
         self.check()
-        values, face_values = self.checked_values(), self.checked_values("face_values")
+        values, face_values = self.checked_values(), self.checked_face_values()
         return wrap_polydata(self._vertices, self._triangles, self._normals, values, face_values, self.voxel_mm)
 
     @classmethod
@@ -360,7 +360,7 @@ class Mesh(BaseMesh, ShownAsHtml):
             vertex_normals=None if self.normals is None else self.normals.astype(np.float64),
             metadata={"SPACE": "LPS", "UNIT": "mm", "VOXEL_MM": self.voxel_mm},
             vertex_attributes=self.checked_values(),
-            face_attributes=self.checked_values("face_values"),
+            face_attributes=self.checked_face_values(),
             process=False,
         )
         made.units = "mm"

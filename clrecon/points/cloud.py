@@ -13,7 +13,8 @@ from clrecon.errors import UsageError
 from clrecon.exchange.content import PointContent, facts_for_file
 from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_cloud
-from clrecon.geometry import Volume, frame_from_lps
+from clrecon.exchange.raw_content import turn_to_lps
+from clrecon.geometry import Volume
 from clrecon.geometry.affine import choose_space
 from clrecon.system.arguments import Space, explains_arguments
 from clrecon.system.base_classes import Message
@@ -289,12 +290,7 @@ class PointCloud(Message, ShownAsHtml):
         points : ndarray, shape (n, 3), mm, of the type of `points`
         normals : ndarray, shape (n, 3), float32, or None
         """
-        signs = np.diag(frame_from_lps(space)).astype(np.float32)
-        if space.lower() == "lps":
-            return self._points, self._normals
-        # Adding 0 turns -0 into 0; text formats would show -0.
-        points = self._points * signs + np.float32(0)
-        return points, None if self._normals is None else self._normals * signs + np.float32(0)
+        return turn_to_lps(space, self._points, self._normals)  # a half turn is its own inverse
 
     def describe(self, space: str, *, keep_ids: bool = False, with_ijk: bool = True) -> PointContent:
         """Return the contents of a file of the cloud in ``space``; nothing else of ``report`` is ever written.
@@ -406,15 +402,11 @@ class PointCloud(Message, ShownAsHtml):
     @classmethod
     def _of_others(cls, arrays: Mapping[str, NDArray[Any] | None], space: str) -> PointCloud:
         """Make a cloud of the arrays of another library, in `space`; a column counts as a list."""
-        if arrays.get("points") is None:
+        if (found := arrays.get("points")) is None:
             raise UsageError("there are no points")
-        signs = np.diag(frame_from_lps(space))
-        turned: dict[str, Any] = {
-            name: values * signs.astype(values.dtype) if name in ("points", "normals") else np.ravel(values)
-            for name, values in arrays.items()
-            if values is not None
-        }
-        return cls(**turned)
+        points, normals = turn_to_lps(space, found, arrays.get("normals"))
+        hu, labels = (None if (each := arrays.get(name)) is None else np.ravel(each) for name in ("hu", "labels"))
+        return cls(points, normals, hu, labels)
 
     def to_open3d(self) -> Any:
         """Return the cloud as ``open3d.t.geometry.PointCloud`` in LPS mm, with copies of the arrays.
