@@ -263,7 +263,6 @@ def _describe_dense(cells: Cells) -> str:
 
 
 def _fill_holes(mask: Mask) -> None:
-    """Fill what a mask encloses in each slice, in place."""
     from scipy import ndimage
 
     rows, columns = (np.flatnonzero(mask.any(axis=axes)) for axes in ((0, 2), (0, 1)))

@@ -43,7 +43,6 @@ class Cells:
 
     @property
     def voxel_ml(self) -> float:
-        """Volume of a voxel, ml, for slices spaced as `size_mm` says."""
         return math.prod(self.size_mm) / math.prod(self.step) / 1000.0
 
     @property

@@ -141,7 +141,7 @@ def _measure_slice(padded: NDArray[Any], axis: int, background: Background, k: i
 
 
 def _walk(
-    values: NDArray[Any], start: NDArray[np.intp], step: NDArray[np.intp], falling: bool = False
+    values: NDArray[Any], start: NDArray[np.intp], step: NDArray[np.intp], *, falling: bool = False
 ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
     """Walk from each start by `step` while the values rise (or fall); return the end and the steepest step."""
     end, steepest = start.copy(), np.zeros(len(start), dtype=np.float32)
@@ -359,7 +359,6 @@ def _leave_metal(voxels: NDArray[Any], sampled: Sequence[int]) -> Sequence[int]:
 
 
 def _describe(found: _Look, slice_step: int) -> IsoChoice:
-    """Make the choice that follows from what slices show."""
     background, edges, left_out, flat_share, _, slices = found
     bone, tissue = found.materials
     digits = max(0, 3 - math.floor(math.log10(bone - tissue)))  # of values that are not HU

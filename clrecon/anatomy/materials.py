@@ -1,7 +1,4 @@
-"""The materials of a scan by its histogram: what bone lies in, and two of any scale.
-
-Soft tissue and the air round a specimen have modes of their own in HU; bone has none.  Values that are not HU are read
-by two values that they share with HU."""
+"""The materials of a scan by its histogram: what bone lies in, and two of any scale, for values that are not HU."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The coarse grid on which the spinal canal is looked for, and what its middle looks like in each cell.
-
-A cell has the mean HU along the patient's axes; traits are figures of 0 to 1, worked out slice by slice.
-"""
+"""The coarse grid on which the spinal canal is looked for, and traits, 0 to 1, of the middle of each cell."""
 
 from __future__ import annotations
 
@@ -59,7 +56,6 @@ class Lattice:
 
 
 def plan_cells(volume: Volume) -> Lattice:
-    """Place cells in the box around a volume."""
     size = np.array(volume.shape_ijk)
     block = np.maximum(1, np.rint(np.minimum(CELL_MM, 2.5) / volume.spacing)).astype(int)
     corners = volume.ijk_to_lps(

@@ -77,7 +77,7 @@ def follow(likeness: Likeness, path: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.concatenate([below, path, above])
 
 
-def _beyond(likeness: Likeness, last: NDArray[np.int64], step: int, stop: bool = True) -> NDArray[np.int64]:
+def _beyond(likeness: Likeness, last: NDArray[np.int64], step: int, *, stop: bool = True) -> NDArray[np.int64]:
     """Return the cells from the last one on, one a slice; with `stop` only as far as the canal goes on."""
     k, j, i = (int(n) for n in last)
     cells: list[tuple[int, int, int]] = []
@@ -116,7 +116,9 @@ def _lacking(cells: SpineCells, place: NDArray[np.int64]) -> str:
         reach = round(CANAL_RADIUS / CELL_MM[0])
         around = cells.values[k, max(j - reach, 0) : j + reach + 1, max(i - reach, 0) : i + reach + 1]
         hu = float(around.mean())
-        what = "bone" if hu >= SOFT_HU[1] else "air or fat" if hu <= SOFT_HU[0] else "bone beside soft tissue"
+        what = "bone" if hu >= SOFT_HU[1] else "bone beside soft tissue"
+        if hu <= SOFT_HU[0]:
+            what = "air or fat"
         parts.append(f"{what} in its place ({hu:.0f} HU)")
     if traits["wall"] < STILL["wall"]:
         parts.append(

@@ -142,7 +142,7 @@ def _neighbours() -> Iterator[tuple[Any, Any]]:
         yield tuple(low), tuple(high)
 
 
-def _shrink(mask: Mask, cells: float, border: bool = True) -> Mask:
+def _shrink(mask: Mask, cells: float, *, border: bool = True) -> Mask:
     """Erode slice by slice; the border of the scan erodes too where `border` is False."""
     from scipy import ndimage
 

@@ -24,9 +24,9 @@ examples:
   clrecon render went.ply -o went.png --color removed"""
 
 
-def _epilog() -> str:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     width = max(map(len, STEPS))
-    return "\n".join(
+    parser.epilog = "\n".join(
         (
             "The steps run in this order, whatever the order of the options:",
             *(f"  {name:<{width}}  {text}" for name, text in STEPS.items()),
@@ -37,10 +37,6 @@ def _epilog() -> str:
             _EXAMPLES,
         )
     )
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = _epilog()
     kinds = ", ".join(CLOUD_INPUTS)
     common.add_input(parser, f"{common.SCAN_FOLDER}; {common.GRID_FILE}; or a cloud of points ({kinds})")
     common.add_output(parser, "cloud file: .ply .vtp .npz .xyz or .las")
@@ -83,7 +79,6 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def describe_cloud_job(report: dict[str, Any]) -> list[str]:
-    """Describe a report for people: the input, each step with what it took away, the cloud, the time."""
     return [
         f"input    {_describe_input(report)}",
         *_describe_steps(report["steps"]),

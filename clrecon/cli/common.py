@@ -177,8 +177,6 @@ def _find_examples(epilog: str) -> list[str]:
 
 
 class _FullHelp(argparse.Action):
-    """Print the help with all options, and stop."""
-
     def __call__(self, parser: argparse.ArgumentParser, *values: object) -> NoReturn:  # type: ignore[override]
         assert isinstance(parser, Parser)
         parser._print_message(parser.format_full_help(), sys.stdout)
@@ -254,16 +252,20 @@ def add_fields(container: argparse._ActionsContainer, settings: type, *groups: s
             container.add_argument(*own.flags, dest=own.name, **own.how)
 
 
-def add_output(parser: argparse._ActionsContainer, text: str, metavar: str = "OUT", required: bool = True) -> None:
+def add_output(parser: argparse._ActionsContainer, text: str, metavar: str = "OUT", *, required: bool = True) -> None:
     parser.add_argument("-o", "--output", metavar=metavar, required=required, help=text, first=True)
 
 
-def add_report(container: argparse._ActionsContainer, what: str, first: bool = True) -> None:
+def add_picture(container: argparse._ActionsContainer, text: str, metavar: str = "FILE") -> None:
+    container.add_argument("--picture", metavar=metavar, help=text, first=True)
+
+
+def add_report(container: argparse._ActionsContainer, what: str, *, first: bool = True) -> None:
     """Add --report, which writes `what` as JSON."""
     container.add_argument("--report", metavar="FILE", help=f"write {what} as JSON", first=first)
 
 
-def add_no_clobber(container: argparse._ActionsContainer, with_ids: bool = True) -> None:
+def add_no_clobber(container: argparse._ActionsContainer, *, with_ids: bool = True) -> None:
     """Add --no-clobber, and --keep-ids where something of a scan is written."""
     container.add_argument(
         "--no-clobber",
@@ -274,7 +276,7 @@ def add_no_clobber(container: argparse._ActionsContainer, with_ids: bool = True)
         add_fields(container, ScanSettings, "ids")
 
 
-def add_device(container: argparse._ActionsContainer, computes: bool = True, memory: bool = True) -> None:
+def add_device(container: argparse._ActionsContainer, *, computes: bool = True, memory: bool = True) -> None:
     """Add --device, --timeout where the command computes on it, and --memory where that is limited."""
     add_fields(container, DeviceSettings, "device")
     if computes:
@@ -316,7 +318,7 @@ Whole voxels outside of the box are left out, after --remove-table and --fov and
 Surfaces end there as at the ends of a scan. Of several boxes, what is in all of them stays."""
 
 
-def add_masking(parser: argparse.ArgumentParser, crop: bool = False) -> None:
+def add_masking(parser: argparse.ArgumentParser, *, crop: bool = False) -> None:
     """Add the options that turn parts of the scan into air or work on its voxels, and those that cut it."""
     add_fields(parser.add_argument_group("masking"), InputSettings, "masking")
     if crop:

@@ -58,11 +58,6 @@ def write_script(shell: str) -> str:
     """Return the script of a shell, made from the parsers of all commands."""
     if shell not in SHELLS:
         raise UsageError(f"no completion for {shell!r:.60}{guess_word(shell, SHELLS)}: use one of {', '.join(SHELLS)}")
-    return {"bash": _write_bash, "zsh": _write_zsh, "fish": _write_fish}[shell](_survey())
-
-
-def _survey() -> dict[str, _Words]:
-    """Collect what can be said: every command with its options."""
     from clrecon.cli.main import COMMANDS, HELP
 
     found = {}
@@ -73,7 +68,7 @@ def _survey() -> dict[str, _Words]:
         found[name] = _Words(command.help, [_describe(action) for action in parser._actions if action.option_strings])
     found["completion"].first = list(SHELLS)
     found[HELP] = _Words("show all options of a command", first=list(COMMANDS))
-    return found
+    return {"bash": _write_bash, "zsh": _write_zsh, "fish": _write_fish}[shell](found)
 
 
 def _describe(action: argparse.Action) -> _Option:
@@ -131,14 +126,9 @@ def _write_bash(commands: dict[str, _Words]) -> str:
     )
 
 
-def _quote(text: str) -> str:
-    """Quote a text for a shell: between single quotes nothing is special but the quote itself."""
-    return "'" + text.replace("'", "'\\''") + "'"
-
-
 def _write_zsh(commands: dict[str, _Words]) -> str:
     def entry(word: str, said: str) -> str:
-        return _quote(f"{word}:{said}" if said else word)
+        return "'" + (f"{word}:{said}" if said else word).replace("'", "'\\''") + "'"
 
     lines = [
         "#compdef clrecon",
@@ -181,7 +171,9 @@ def _write_fish(commands: dict[str, _Words]) -> str:
             lines.append(f"{seen} -f -a '{' '.join(command.first)}'")
         for option in command.options:
             names = " ".join(f"-l {one[2:]}" if one.startswith("--") else f"-s {one[1:]}" for one in option.names)
-            value = (f" -x -a '{' '.join(option.words)}'" if option.words else " -r") if option.takes_value else ""
+            value = " -r" if option.takes_value else ""
+            if option.takes_value and option.words:
+                value = f" -x -a '{' '.join(option.words)}'"
             said = f" -d {_fish_quote(option.help)}" if option.help else ""
             lines.append(f"{seen} {names}{value}{said}")
     return "\n".join((*lines, ""))

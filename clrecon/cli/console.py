@@ -156,7 +156,7 @@ class Console:
     It is not an error if a reader closes stdout early (``| head``).
     """
 
-    def __init__(self, as_json: bool = False):
+    def __init__(self, *, as_json: bool = False):
         self.as_json, self.quiet, self.verbose = as_json, False, False
         self.has_result = False
         self._streams_result, self._said_on_stderr = False, False
@@ -182,7 +182,6 @@ class Console:
         self._said_on_stderr, self._hidden_name, self._shown_name = True, path, name
 
     def send(self, piece: bytes) -> None:
-        """Write bytes of a file to stdout."""
         self.clear()
         self._guard_stdout(lambda: sys.stdout.buffer.write(piece))
 
@@ -208,7 +207,7 @@ class Console:
         if self.as_json:
             self.result(value)
 
-    def warn(self, text: str, with_json: bool = False) -> None:
+    def warn(self, text: str, *, with_json: bool = False) -> None:
         """Print a warning; with ``--json`` only if the JSON object has no place for it (`with_json`)."""
         if not self.quiet and (with_json or not self.as_json):
             self._to_stderr(f"clrecon: warning: {printable(text)}")
@@ -230,7 +229,6 @@ class Console:
         self._stage = stage
 
     def clear(self) -> None:
-        """Remove the moving line."""
         if self._drawn and sys.stderr is not None:
             _write(sys.stderr, "\r" + " " * self._drawn + "\r")
             self._drawn = 0

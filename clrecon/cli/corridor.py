@@ -41,9 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     screws.add_argument("--screws", dest="file", metavar="FILE", help="screws as JSON or CSV, see docs/corridor.md")
     output = parser.add_argument_group("files")
     common.add_output(output, f"meshes: OUT_L3, OUT_L3_left and OUT_L3_right; {MESH_FILES}", required=False)
-    output.add_argument(
-        "--picture", metavar="FILE", help="slices through each corridor: .png, .jpg or .tif", first=True
-    )
+    common.add_picture(output, "slices through each corridor: .png, .jpg or .tif")
     common.add_report(output, "all figures")
     common.add_fields(output, CorridorSettings, "space")
     common.add_no_clobber(output)

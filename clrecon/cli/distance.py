@@ -29,9 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_fields(parser, DistanceSettings)
     output = parser.add_argument_group("files")
     common.add_output(output, "write A coloured by its distance from B: .ply", metavar="PLY", required=False)
-    output.add_argument(
-        "--picture", metavar="FILE", help="picture of it with its scale: .png, .jpg or .tif", first=True
-    )
+    common.add_picture(output, "picture of it with its scale: .png, .jpg or .tif")
     common.add_fields(output, DistanceSettings, "picture")
     common.add_report(output, "all figures")
     common.add_no_clobber(output, with_ids=False)

@@ -253,10 +253,8 @@ def _columns(entries: Sequence[dict[str, Any]], chosen: int | None) -> Iterator[
     yield _Column("extent mm", [_format_known_lengths(entry["extent_mm"], ".0f") for entry in entries], left_out=1)
     thickness = [entry["slice_thickness_mm"] for entry in entries]
     yield _Column("thick", ["-" if t is None else f"{t:.4g}" for t in thickness], left_out=2, right=True)
-    tilts = [None if (tilt := entry["tilt_deg"]) is None else round(tilt, 2) for entry in entries]
-    yield _Column(
-        "tilt", ["-" if tilt is None else f"{tilt:+.2f}" if tilt else "0" for tilt in tilts], left_out=4, right=True
-    )
+    tilts = ["-" if entry["tilt_deg"] is None else _format_tilt(entry["tilt_deg"]) for entry in entries]
+    yield _Column("tilt", tilts, left_out=4, right=True)
     yield _Column("description", [printable(entry["description"] or "") for entry in entries], folds=True)
 
 
@@ -264,6 +262,10 @@ def _kind(entry: dict[str, Any]) -> str:
     """Return the modality, and the kind of object if it is not a stack of slices."""
     modality = printable(entry["modality"])
     return modality if entry["kind"] in ("stack", "other") else f"{modality} {entry['kind']}"
+
+
+def _format_tilt(degrees: float) -> str:
+    return f"{degrees:+.2f}" if round(degrees, 2) else "0"
 
 
 def _format_known_lengths(lengths: Sequence[float] | None, form: str) -> str:

@@ -33,12 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_output(parser, f"mesh files: {MESH_FILES}")
     common.add_fields(parser, InsideSettings)
     pictures = parser.add_argument_group("pictures")
-    pictures.add_argument(
-        "--picture",
-        metavar="FILE",
-        help="a picture of each part, opaque, with others faded: .png, .jpg or .tif; inside.png becomes"
+    common.add_picture(
+        pictures,
+        "a picture of each part, opaque, with others faded: .png, .jpg or .tif; inside.png becomes"
         " inside_canal.png and so on",
-        first=True,
     )
     common.add_fields(pictures, InsideSettings, "pictures")
     common.add_fields(parser.add_argument_group("parts"), InsideSettings, "parts")
@@ -101,9 +99,10 @@ def _describe_vertebra(vertebra: dict[str, Any]) -> list[str]:
     volumes, (low, high) = vertebra["volumes_ml"], vertebra["dense_hu"]
     level = vertebra["iso_value_hu"]
     of = "label" if level is None else f"{level:g} HU"
-    band = (
-        f"{low:g} HU and above" if high is None else f"up to {high:g} HU" if low is None else f"{low:g} to {high:g} HU"
-    )
+    if low is None:
+        band = f"up to {high:g} HU"
+    else:
+        band = f"{low:g} HU and above" if high is None else f"{low:g} to {high:g} HU"
     canal, height = volumes["canal"], vertebra["canal_height_mm"]
     of_canal = "no canal: arch not closed" if canal is None else f"canal {format_volume(canal)}, {height:.3g} mm high"
     return [

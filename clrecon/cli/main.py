@@ -52,7 +52,8 @@ def speaker_of(parser: argparse.ArgumentParser) -> Speaker:
         option = options[name]
         part = _PARTS.get(parameter, "")
         if part:
-            return f"{option} {part}{'MM' if value is None and parameter == 'eps' else 'N' if value is None else value}"
+            unit = "MM" if parameter == "eps" else "N"
+            return f"{option} {part}{unit if value is None else value}"
         if value is None or value is True or (parameter == "closed" and value is False):
             return option
         words = str(value).strip("()").replace(", ", ",")

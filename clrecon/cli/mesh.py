@@ -126,7 +126,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.say(f"wrote    {_describe_files(options.output, report, together=together)}")
     if options.report:
         console.say(f"report   {printable(options.report)}")
-    return finish_with_gates(report, console, settings.strict, settings.is_for_print and names_level(settings))
+    return finish_with_gates(
+        report, console, settings.strict, own_units=settings.is_for_print and names_level(settings)
+    )
 
 
 def describe_mesh(report: dict[str, Any]) -> list[str]:
@@ -349,7 +351,6 @@ def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
 
 
 def _describe_smoothing(found: dict[str, Any]) -> str:
-    """Describe the iterations, how much smoother the surface is, and what was not smoothed."""
     rough, smooth = found["roughness_before_mm"], found["roughness_after_mm"]
     parts = [count_of(found["iterations"], "iteration"), f"roughness {rough:.3f} to {smooth:.3f} mm"]
     if found["components_left"]:
@@ -410,7 +411,7 @@ GATES_OF_AFFINE = ("grid_residual",)
 """Gates for the fit of the affine to the slices.  Meshes do not need it: they use the position of each slice."""
 
 
-def finish_with_gates(report: dict[str, Any], console: Console, strict: bool, own_units: bool = False) -> int:
+def finish_with_gates(report: dict[str, Any], console: Console, strict: bool, *, own_units: bool = False) -> int:
     """Print the warnings of a report; returns the exit code.
 
     With `strict` a failed gate of the volume or of a mesh is an error, which is printed even with ``--quiet`` and

@@ -37,7 +37,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.proof.phantom import write_phantom
 
     settings = common.make_settings(PhantomSettings, options)
-    with keep_existing(options.no_clobber):
+    with keep_existing(keep=options.no_clobber):
         truth = write_phantom(options.output, settings, progress=console.progress)
     console.result(truth)
     for line in _summary(truth, options.output):

@@ -6,6 +6,7 @@ import argparse
 import math
 import os
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from clrecon.cli import common
@@ -52,24 +53,6 @@ examples:
   clrecon render CT_FOLDER -o both.png --preset muscle --mesh l3.stl=orange --mesh l4.stl=,0.4"""
 
 
-def _epilog() -> str:
-    modes, presets = describe_modes(), describe_presets()
-    width = max(map(len, (*modes, *presets)))
-    return "\n".join(
-        (
-            "modes:",
-            *(f"  {name:<{width}}  {text}" for name, text in modes.items()),
-            "",
-            "presets:",
-            *(f"  {name:<{width}}  {text}" for name, text in presets.items()),
-            "",
-            "The patient's left is at the right of an anterior view. Every file is written as a whole or not at all.",
-            "",
-            _EXAMPLES,
-        )
-    )
-
-
 _parse_ends = numbers_reader(2, "is not a window: the HU that are black and white, LOW,HIGH, such as -450,1050")
 
 
@@ -102,6 +85,9 @@ def parse_mesh(text: str) -> tuple[str, str | None, float]:
     if not path or not (color or comma) or math.isnan(opacity):
         raise ValueError(f"{text!r} is not FILE[=COLOUR[,OPACITY]], such as l3.stl=orange,0.4 or l3.stl=,0.4")
     return path, color or None, opacity
+
+
+_slices_option = partial(option, group="slices")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,49 +154,38 @@ class Looks:
         ),
         action="append",
     )
-    thickness: float | None = option("--thickness MM", "of a thick slice (default: 0, a plane)", group="slices")
-    combine: str | None = option(
+    thickness: float | None = _slices_option("--thickness MM", "of a thick slice (default: 0, a plane)")
+    combine: str | None = _slices_option(
         "--combine HOW",
         "mean, max or min of a thick slice (default: mean)",
-        group="slices",
         parse=str.lower,
         words=("mean", "max", "min"),
     )
-    offset_mm: float | None = option("--offset MM", "move the slice away from the camera by so much", group="slices")
-    slices: int | Sequence[int] | None = option(
+    offset_mm: float | None = _slices_option("--offset MM", "move the slice away from the camera by so much")
+    slices: int | Sequence[int] | None = _slices_option(
         "--slices N|K,K,...",
         "of mode slices and of a sheet: every N-th, or with a comma those numbers, from 0 (default: about twelve)",
-        group="slices",
         parse=_parse_slices,
     )
-    sheet: int | str | None = option(
+    sheet: int | str | None = _slices_option(
         "--sheet N|MMmm",
         f"contact sheet of mode slice: N slices side by side (default: {SHEET_SLICES}), or one every so many mm, such"
         " as 5mm; --view says in which plane, --slices which planes of voxels",
-        group="slices",
         nargs="?",
         const=SHEET_SLICES,
     )
-    slice_opacity: float | None = option(
-        "--slice-opacity SHARE", "of each slice of mode slices (default: 0.5)", group="slices"
-    )
-    curve: str | None = option(
+    slice_opacity: float | None = _slices_option("--slice-opacity SHARE", "of each slice of mode slices (default: 0.5)")
+    curve: str | None = _slices_option(
         "--curve FILE|auto",
         "centre line: a text, CSV or JSON file of points in LPS mm, or markups of 3D Slicer; auto: the spinal canal,"
         " found in the scan",
-        group="slices",
     )
-    cpr: str | None = option(
-        "--cpr KIND",
-        "straightened or stretched (default: straightened)",
-        group="slices",
-        parse=str.lower,
-        words=CURVED_KINDS,
+    cpr: str | None = _slices_option(
+        "--cpr KIND", "straightened or stretched (default: straightened)", parse=str.lower, words=CURVED_KINDS
     )
 
 
 def add_meshes(parser: argparse.ArgumentParser) -> None:
-    """Add the options for meshes that are shown with the input."""
     group = parser.add_argument_group("meshes with the input")
     group.add_argument(
         "--mesh",
@@ -225,19 +200,22 @@ def add_meshes(parser: argparse.ArgumentParser) -> None:
     common.add_fields(group, RenderSettings, "meshes")
 
 
-def add_motion(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("motion")
-    group.add_argument(
-        "--turntable",
-        metavar="OUT",
-        help="turn round the patient: .mp4, .gif, .apng, or a folder of PNG files",
-        first=True,
-    )
-    common.add_fields(group, Turntable)
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = _epilog()
+    modes, presets = describe_modes(), describe_presets()
+    width = max(map(len, (*modes, *presets)))
+    parser.epilog = "\n".join(
+        (
+            "modes:",
+            *(f"  {name:<{width}}  {text}" for name, text in modes.items()),
+            "",
+            "presets:",
+            *(f"  {name:<{width}}  {text}" for name, text in presets.items()),
+            "",
+            "The patient's left is at the right of an anterior view. Every file is written as a whole or not at all.",
+            "",
+            _EXAMPLES,
+        )
+    )
     others = f"a cloud of points ({', '.join(CLOUD_INPUTS)}); or a mesh ({', '.join(MESH_INPUTS)}; of .ply and .vtp say"
     text = f"{common.SCAN_FOLDER}; {common.GRID_FILE}; {others} --mode mesh); may be left out with --mesh"
     common.add_input(parser, text, nargs="?")
@@ -253,7 +231,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_fields(parser.add_argument_group("slices and curved reformations"), Looks, "slices")
     common.add_fields(parser.add_argument_group("labels"), LabelLook)
     add_meshes(parser)
-    add_motion(parser)
+    group = parser.add_argument_group("motion")
+    group.add_argument(
+        "--turntable",
+        metavar="OUT",
+        help="turn round the patient: .mp4, .gif, .apng, or a folder of PNG files",
+        first=True,
+    )
+    common.add_fields(group, Turntable)
     common.add_reading(parser)
     common.add_masking(parser)
     device = parser.add_argument_group("device")

@@ -32,12 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     common.add_input(parser)
     common.add_output(parser, "label map: .nii.gz, .nii, or .dcm (DICOM SEG)")
-    parser.add_argument(
-        "--picture",
-        metavar="PNG",
-        help="picture of discs and labels (default: beside the map, with its name)",
-        first=True,
-    )
+    common.add_picture(parser, "picture of discs and labels (default: beside the map, with its name)", "PNG")
     common.add_reading(parser)
     common.add_fields(parser.add_argument_group("vertebrae"), VertebraeSettings, "vertebrae")
     checks = parser.add_argument_group("checks")

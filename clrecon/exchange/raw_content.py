@@ -189,7 +189,9 @@ def frame_of_file(raw: RawCloud | RawMesh, asked: str | None, name: str) -> tupl
         raise UsageError(
             f"{name} says that its coordinates are {named}, {asked.upper()} was asked for: leave the space out"
         )
-    return (named, "file") if named else (asked.upper(), "argument") if asked else ("LPS", "assumed")
+    if named:
+        return named, "file"
+    return (asked.upper(), "argument") if asked else ("LPS", "assumed")
 
 
 def turn_to_lps(

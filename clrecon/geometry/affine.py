@@ -33,10 +33,7 @@ _LONG_AXIS = 0.5
 
 
 def compose_affine(i_step: ArrayLike, j_step: ArrayLike, k_step: ArrayLike, origin: ArrayLike) -> Float64Array:
-    """Build the affine (4, 4) from its three steps and the position of voxel (0, 0, 0), LPS mm.
-
-    `i_step` is the row cosines times PixelSpacing[1], `j_step` the column cosines times PixelSpacing[0].
-    """
+    """Build the affine (4, 4) from its steps (i: row cosines times PixelSpacing[1]) and voxel (0, 0, 0), LPS mm."""
     affine = np.eye(4)
     for column, vector in enumerate((i_step, j_step, k_step, origin)):
         affine[:3, column] = vector

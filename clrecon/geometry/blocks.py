@@ -1,7 +1,4 @@
-"""Parts of a volume: blocks of whole voxels, cut in millimetres or by indices, and what a certificate says of them.
-
-``volume[k0:k1, j0:j1, i0:i1]`` and crops leave voxels at their places in the patient.
-"""
+"""Parts of a volume: blocks of whole voxels, which keep their places, and what a certificate says of them."""
 
 from __future__ import annotations
 

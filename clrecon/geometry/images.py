@@ -1,7 +1,4 @@
-"""Volumes as images of other libraries, whose axes are even and at right angles: as they are, or resampled.
-
-ITK places voxel centres in LPS mm, as clrecon does.  Arrays of nibabel run (i, j, k), and its affines lead to RAS.
-"""
+"""Volumes as images of other libraries, whose axes are even and at right angles: as they are, or resampled."""
 
 from __future__ import annotations
 

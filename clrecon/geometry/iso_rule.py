@@ -103,10 +103,7 @@ class IsoRule:
         return f"of what lies {self.describe()}" if self.inside == "below" else f"at {self.describe()}"
 
     def as_report(self) -> dict[str, Any]:
-        """Return the entries of a mesh's report: what is inside, and where the surface lies, HU.
-
-        Of a range ``inside_hu`` and ``inside_levels_hu`` are ``[low, high]``, None for an end that is open.
-        """
+        """Return the entries of a mesh's report: what is inside, and where the surface lies, HU; None: an open end."""
         value, level = self.iso_value, self.iso_level
         ends: dict[str, tuple[list[float | None], list[float | None]]] = {
             "above": ([value, None], [level, None]),
@@ -166,9 +163,9 @@ class ValueRange:
 def choose_iso_rule(
     volume: Volume,
     iso_value: Level,
+    *,
     closed: bool = True,
     topology: str = "separated",
-    *,
     below: bool = False,
     vertex_rule: str = "linear",
     values: ValueRange | None = None,
@@ -249,8 +246,7 @@ def _choose_outside(rule: IsoRule, low: float, dtype: DTypeLike) -> float:
     return level - least if is_float else float(max(rule.lowest_inside - 1, LOWEST_OUTSIDE))
 
 
-def check_topology(topology: str, ranged: bool = False) -> None:
-    """Refuse an unknown topology, and "trilinear" for a range."""
+def check_topology(topology: str, *, ranged: bool = False) -> None:
     if topology not in TOPOLOGIES:
         raise UsageError(f"there is no topology {topology!r}: it is one of {', '.join(TOPOLOGIES)}")
     if ranged and topology == "trilinear":

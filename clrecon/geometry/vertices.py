@@ -35,7 +35,6 @@ SEARCH_STEPS = 24
 
 
 def check_vertex_rule(vertex_rule: str, topology: str = "separated") -> None:
-    """Refuse an unknown rule, and one that does not go with the topology."""
     if vertex_rule not in VERTEX_RULES:
         raise UsageError(f"{name_parameter('vertex_rule')} is one of {', '.join(VERTEX_RULES)}, not {vertex_rule!r}")
     if vertex_rule != "linear" and topology == "trilinear":
@@ -92,10 +91,7 @@ def cubic_value(
 def search_fraction(
     before: ArrayLike, value: ArrayLike, next_value: ArrayLike, after: ArrayLike, level: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return where the cubic through four values crosses the level between the middle two, by golden sections.
-
-    Each step keeps the part of the edge whose ends lie on both sides of the level: one of three crossings is found too.
-    """
+    """Return where the cubic through four values crosses the level between the middle two, by golden sections."""
     levels, rises = np.asarray(level), np.asarray(next_value) > np.asarray(value)
     low = np.zeros(np.broadcast(value, levels).shape)
     high = np.ones_like(low)

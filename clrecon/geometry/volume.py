@@ -195,7 +195,7 @@ class Volume(BaseVolume, ShownAsHtml):
         UsageError, OutputError
             As `clrecon.write_volume`.
         """
-        with keep_existing(no_clobber):
+        with keep_existing(keep=no_clobber):
             write_volume = public_function("write_volume")
             return int(write_volume(self, path, resample=resample, keep_ids=keep_ids, progress=progress))
 

@@ -131,7 +131,13 @@ def make_corridors(
     """Find the corridors through the pedicles of labelled vertebrae, and grade given screws."""
     files = files or MeshFiles()
     with Run(settings, **how) as run:
-        _check_formats(files)
+        from clrecon.exchange.formats import check_format
+        from clrecon.rendering.pictures.picture import check_image_path
+
+        if files.output is not None:
+            check_format(files.output)
+        if files.picture is not None:
+            check_image_path(files.picture)
         run.check(files.named("the mesh"), source, settings.labels)
         volume, labels = run.read_labelled(source)
         run.lap("read")
@@ -176,16 +182,6 @@ def make_corridors(
             affine_ijk_to_lps_mm=volume.affine.tolist(),
         )
         return run.finish(report, files.report)
-
-
-def _check_formats(files: MeshFiles) -> None:
-    from clrecon.exchange.formats import check_format
-    from clrecon.rendering.pictures.picture import check_image_path
-
-    if files.output is not None:
-        check_format(files.output)
-    if files.picture is not None:
-        check_image_path(files.picture)
 
 
 def _picture_paths(files: MeshFiles, names: Sequence[str]) -> list[str | Path]:
@@ -250,7 +246,6 @@ def _draw_sheets(
     level: float,
     files: MeshFiles,
 ) -> list[dict[str, Any]]:
-    """Write the picture of each vertebra, and return their entries."""
     outputs = []
     for path, each, own in zip(_picture_paths(files, [each.name for each in found]), found, graded, strict=False):
         footer = [

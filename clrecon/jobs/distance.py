@@ -16,11 +16,10 @@ from clrecon.jobs.run import JobReport, Run
 from clrecon.jobs.settings import DistanceSettings
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SAMPLES, DistanceSummary
-from clrecon.mesh.compare.signed import MeshDeviation, SideDistance, measure_distance, measure_vertex_distances
+from clrecon.mesh.compare.signed import SideDistance, measure_distance, measure_vertex_distances
 from clrecon.mesh.mesh_reader import read_mesh
 from clrecon.system.arguments import Space
 from clrecon.system.light_dataclass import dataclass, replace
-from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text, format_digits
 
 if TYPE_CHECKING:
@@ -79,7 +78,11 @@ def measure_meshes(
         found = measure_distance(meshes[0], meshes[1], settings.samples or SAMPLES, names=names, progress=run.progress)
         colored = None
         if files.output is not None or files.picture is not None:
-            colored = _color_mesh(meshes[0], meshes[1], found, settings, run.progress)
+            from clrecon.rendering.looks.colors import ColorScale, round_up
+
+            distances, signed = measure_vertex_distances(meshes[0], meshes[1], progress=run.progress)
+            limit = settings.range_mm or round_up(max(found.to_reference_mm.p95, _LEAST_RANGE_MM))
+            colored = _Colored(distances, ColorScale(limit, signed))
         run.lap("measure")
         drawn = None
         if device is not None and colored is not None:
@@ -124,8 +127,6 @@ def _check_formats(files: MeshFiles) -> None:
 
 @dataclass(frozen=True)
 class _Colored:
-    """Distances of the vertices of A, and their colours."""
-
     distances: NDArray[np.float64]
     scale: ColorScale
 
@@ -136,16 +137,6 @@ class _Colored:
     def describe(self) -> dict[str, Any]:
         beyond = float(np.mean(np.abs(self.distances) > self.scale.limit))
         return {"range_mm": self.scale.limit, "signed": self.scale.signed, "beyond_share": beyond}
-
-
-def _color_mesh(
-    mesh: Mesh, reference: Mesh, found: MeshDeviation, settings: DistanceSettings, progress: Progress
-) -> _Colored:
-    from clrecon.rendering.looks.colors import ColorScale, round_up
-
-    distances, signed = measure_vertex_distances(mesh, reference, progress=progress)
-    limit = settings.range_mm or round_up(max(found.to_reference_mm.p95, _LEAST_RANGE_MM))
-    return _Colored(distances, ColorScale(limit, signed))
 
 
 def _draw_mesh(mesh: Mesh, colored: _Colored, other: str, settings: DistanceSettings, device: Device) -> Rendering:

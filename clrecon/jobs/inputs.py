@@ -63,7 +63,6 @@ def refuse_scan_settings(settings: InputSettings, also: Sequence[str] = (), noun
 
 
 def describe_cloud(cloud: PointCloud) -> dict[str, Any]:
-    """Return the report's entry of a cloud: its points, and what is known of them."""
     known = {name: getattr(cloud, name) is not None for name in ("normals", "hu", "labels")}
     return {"points": len(cloud), **known, "file": cloud.report.get("file")}
 

@@ -90,11 +90,7 @@ def make_inside(
     report_path: str | Path | None = None,
     **how: Any,
 ) -> InsideReport:
-    """Read a CT series and its labels, look into vertebrae, and write the surfaces of their parts.
-
-    ``inside.stl`` becomes ``inside_solid.stl`` and so on, with several vertebrae ``inside_L3_solid.stl``; so do
-    pictures.
-    """
+    """Read a CT series and its labels, look into vertebrae, and write the surfaces of their parts, a file each."""
     from clrecon.labels import file_suffixes
     from clrecon.operators.vertebrae.inside import PARTS
     from clrecon.operators.vertebrae.solid import CLOSE_MM

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
@@ -107,6 +108,10 @@ def parse_bytes(text: str) -> int:
     return int(size)
 
 
+_masking_option = partial(option, group="masking")
+_crop_option = partial(option, group="crop")
+
+
 @dataclass(frozen=True, kw_only=True)
 class DeviceSettings:
     device: str | None = option(
@@ -177,8 +182,14 @@ def closed_option() -> Any:
     return option("--open", "leave the surface open at the border of the volume", group="surface", default=True)
 
 
-def mesh_space_option(text: str = "files that do not name theirs") -> Any:
-    return option("--mesh-space lps|ras", f"patient frame of {text} (default: lps, with a warning)", parse=str.lower)
+def mesh_space_option(text: str, group: str = "") -> Any:
+    text = f"patient frame of {text} (default: lps, with a warning)"
+    return option("--mesh-space lps|ras", text, group=group, parse=str.lower)
+
+
+def label_color_option(text: str) -> Any:
+    text = f"colour of a label{text}; may be given again"
+    return option("--label-color LABEL=COLOUR", text, default=(), parse=parse_label_color, action="append")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,62 +201,52 @@ class InputSettings(ScanSettings, DeviceSettings):
         side open.
     """
 
-    remove_table: bool = option(
-        "--remove-table",
-        "turn what is not the patient's body into air first: table, blankets, cables",
-        group="masking",
-        first=True,
+    remove_table: bool = _masking_option(
+        "--remove-table", "turn what is not the patient's body into air first: table, blankets, cables", first=True
     )
-    allow_bone_loss: bool = option(
+    allow_bone_loss: bool = _masking_option(
         "--allow-bone-loss",
         "go on where --remove-table takes more than 2 %% of the bone, or a step of --preprocess more than half of"
         " what is at the level and above, which else is refused",
-        group="masking",
     )
-    field_of_view: float | str | None = option(
+    field_of_view: float | str | None = _masking_option(
         "--fov RADIUS_MM",
         "turn what lies further from the centre of the slices into air first (without a number: the largest circle"
         " that fits the slice)",
-        group="masking",
         parse=_parse_radius,
         nargs="?",
         const="auto",
     )
-    clip_box: Sequence[float] | None = option(
+    clip_box: Sequence[float] | None = _crop_option(
         "--clip-box X0,X1,Y0,Y1,Z0,Z1",
         "keep a box; a side that is left empty is open",
-        group="crop",
         parse=numbers_reader(
             6, "is no box: X0,X1,Y0,Y1,Z0,Z1 in mm, a side that stays open empty, such as ,,-50,20,,", ends=True
         ),
     )
-    between: Sequence[float] | None = option(
+    between: Sequence[float] | None = _crop_option(
         "--between Z0,Z1",
         "keep what lies between two heights",
-        group="crop",
         parse=numbers_reader(
             2, "are no two heights: Z0,Z1 in mm, one of them may be empty, such as -450,-400", ends=True
         ),
     )
-    around: Sequence[float] | None = option(
+    around: Sequence[float] | None = _crop_option(
         "--around X,Y,Z,R",
         "keep a cube: R mm from a point to each side",
-        group="crop",
         parse=numbers_reader(4, "is no point and length: X,Y,Z,R in mm, such as 10,-124,-424,30"),
     )
-    region: Sequence[str] | None = option(
+    region: Sequence[str] | None = _masking_option(
         "--region RULE",
         f"turn what lies outside of the region of interest into air first: {REGION_FORMS}; several of one kind add"
         " up, of different kinds cut each other; a seed grows within the others; a tube without a file goes along the"
         " spinal canal",
-        group="masking",
         action="append",
     )
-    preprocess: str | Sequence[str] | None = option(
+    preprocess: str | Sequence[str] | None = _masking_option(
         "--preprocess STEP[,STEP...]",
         f"steps before the surface, in this order: {PREPROCESS_FORMS}; morphology works on what is at the iso"
         " value and above, or at level:HU; region is the place of --region, which else comes first",
-        group="masking",
     )
 
     def __post_init__(self) -> None:
@@ -268,7 +269,6 @@ class InputSettings(ScanSettings, DeviceSettings):
 
     @property
     def crop(self) -> Box | None:
-        """The box that the scan is cropped to; None without a crop."""
         from clrecon.geometry.boxes import crop_box  # loads numpy, which the help does without
 
         return crop_box(self.clip_box, self.between, self.around)
@@ -310,7 +310,6 @@ class RegionRule:
     name: str | None = None
 
     def __str__(self) -> str:
-        """Describe the rule in its own form; a file by its name alone."""
         from clrecon.system.text import escape_text
 
         numbers = ",".join("" if math.isinf(number) else f"{number:g}" for number in self.numbers)
@@ -391,7 +390,6 @@ class PreprocessStep:
     numbers: tuple[float, ...] = ()
 
     def __str__(self) -> str:
-        """Write the step in its own form."""
         return ":".join((self.name, *(f"{number:g}" for number in self.numbers)))
 
 

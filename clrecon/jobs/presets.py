@@ -50,7 +50,6 @@ PRESETS: dict[str, IsoPreset] = {
 
 
 def find_iso_preset(name: str) -> IsoPreset:
-    """Return the preset called `name`, in upper or lower case."""
     try:
         return PRESETS[name.lower()]
     except (KeyError, AttributeError):

@@ -1,7 +1,4 @@
-"""What every job does beside its own work: its times, the device that opens beside the input, and the report.
-
-The report is strict JSON and the commit mark of a job: when it exists, all files that it describes are complete.
-"""
+"""What every job does beside its own work: its times, the device, and the report, which is its commit mark."""
 
 from __future__ import annotations
 
@@ -170,10 +167,7 @@ _OWN_STATUS = Path("/proc/self/status")
 
 
 def peak_memory_bytes(status: Path = _OWN_STATUS) -> int | None:
-    """Return the largest resident memory of this process so far, None if the system does not tell.
-
-    Linux tells it of this program alone; in its usage of resources the memory of the process that started it counts.
-    """
+    """Return the largest resident memory of this process so far, by Linux of it alone, None if it is not told."""
     try:
         lines = status.read_text(encoding="ascii", errors="replace").splitlines()
     except OSError:  # not Linux
@@ -256,7 +250,7 @@ class Run(Laps):
 
     def keeping(self) -> AbstractContextManager[None]:
         """In the ``with`` block, of checks and staging alone, files that exist stay if the run was asked for it."""
-        return keep_existing(self.no_clobber)
+        return keep_existing(keep=self.no_clobber)
 
     def check(self, outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | Path | None) -> None:
         """Refuse outputs that are the same file, cannot be written, or would replace one of the inputs."""
@@ -306,13 +300,11 @@ class Run(Laps):
         return self.stage(stage_file(path, lambda stream: stream.write(content), expected_bytes=len(content)))
 
     def write_picture(self, path: str | Path, picture: PictureData) -> StagedFile:
-        """Write a picture under a temporary name."""
         from clrecon.rendering.pictures.picture import encode_image
 
         return self.write(path, encode_image(picture, extension_of(path)))
 
     def write_meshes(self, meshes: Sequence[Mesh], paths: Sequence[str | Path]) -> list[StagedFile]:
-        """Write each mesh under a temporary name."""
         from clrecon.exchange.formats import stage_mesh
         from clrecon.system.files import allow_open_files
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,10 @@ def check_space(space: str | None) -> None:
 
     if space is not None:
         frame_from_lps(space)
+
+
+_parts_option = partial(option, group="parts")
+_vertebrae_option = partial(option, group="vertebrae")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,20 +163,15 @@ class InsideSettings(ScanSettings, DeviceSettings):
         default=INSIDE_VIEW,
         words=("anterior", "posterior", "left", "right", "superior", "inferior"),
     )
-    iso_value: float | None = option(
-        "--hu N",
-        "level of the solid bone, within one voxel of the label (default: the label's own voxels)",
-        group="parts",
-        first=True,
+    iso_value: float | None = _parts_option(
+        "--hu N", "level of the solid bone, within one voxel of the label (default: the label's own voxels)", first=True
     )
-    dense: Sequence[float | None] | None = option(
-        "--dense A[:B]", "HU of dense bone, from A on or from A to B (default: 450)", group="parts", parse=_parse_band
+    dense: Sequence[float | None] | None = _parts_option(
+        "--dense A[:B]", "HU of dense bone, from A on or from A to B (default: 450)", parse=_parse_band
     )
-    close_mm: float | None = option("--close MM", "pores that close by balls (default: 1.5)", group="parts")
-    grow_mm: float | None = option(
-        "--grow MM",
-        "with --hu: dense voxels this near to the label are its own (default: one voxel each way)",
-        group="parts",
+    close_mm: float | None = _parts_option("--close MM", "pores that close by balls (default: 1.5)")
+    grow_mm: float | None = _parts_option(
+        "--grow MM", "with --hu: dense voxels this near to the label are its own (default: one voxel each way)"
     )
     space: Space = space_option("patient frame of the meshes", group="parts")
 
@@ -198,36 +198,30 @@ def _parse_name(text: str) -> tuple[tuple[float, ...], str]:
 class VertebraeSettings(ScanSettings):
     """Settings of the search for vertebrae; see `clrecon.split_vertebrae`."""
 
-    level: float | None = option(
-        "--hu N",
-        "bone is N HU and more (default: half way between discs and marrow, 120 to 226)",
-        group="vertebrae",
-        first=True,
+    level: float | None = _vertebrae_option(
+        "--hu N", "bone is N HU and more (default: half way between discs and marrow, 120 to 226)", first=True
     )
-    seeds: Sequence[Sequence[float]] = option(
+    seeds: Sequence[Sequence[float]] = _vertebrae_option(
         "--seed X,Y,Z",
         "a point in the body of a vertebra, LPS mm; one for each vertebra, in place of the search for discs",
-        group="vertebrae",
         default=(),
         parse=parse_point,
         action="append",
         first=True,
     )
-    name_at: tuple[Sequence[float], str] | None = option(
+    name_at: tuple[Sequence[float], str] | None = _vertebrae_option(
         "--name-at X,Y,Z=L3",
         "name the level of the vertebra at this point (LPS mm), and from it all others",
-        group="vertebrae",
         parse=_parse_name,
         first=True,
     )
-    first: str | None = option(
+    first: str | None = _vertebrae_option(
         "--first LEVEL",
         "name the level of the uppermost vertebra that is found (T1), and from it all others; without --first and"
         " --name-at they are numbered from the head",
-        group="vertebrae",
         first=True,
     )
-    keep_unsure: bool = option("--keep-unsure", "write vertebrae of low confidence too", group="vertebrae")
+    keep_unsure: bool = _vertebrae_option("--keep-unsure", "write vertebrae of low confidence too")
 
     def __post_init__(self) -> None:
         from clrecon.spine.split import check_landmark

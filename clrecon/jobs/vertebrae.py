@@ -134,7 +134,6 @@ NIFTI, SEGMENTATION = ("nii", "nii.gz"), ("dcm",)
 
 
 def map_format(path: str | Path) -> str:
-    """Return ``nii``, ``nii.gz`` or ``dcm``."""
     name = os.path.basename(os.fspath(path)).lower()
     for kind in (*NIFTI[::-1], *SEGMENTATION):
         if name.endswith(f".{kind}") and name != f".{kind}":
@@ -159,10 +158,7 @@ NAMES_MM = 62
 
 
 def draw_vertebrae(split: VertebraSplit) -> bytes:
-    """Return the picture as PNG: from the side, names and confidence, and from the front.
-
-    The spine is straightened along the canal, a row a millimetre; vertebrae of low confidence are hatched in red.
-    """
+    """Return a PNG of the straightened spine, side and front, a row a mm; low confidence is hatched in red."""
     load_pillow()
     from PIL import Image, ImageDraw
 

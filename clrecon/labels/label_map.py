@@ -310,7 +310,7 @@ class LabelMap(Grid, ShownAsHtml):
         if not name.endswith((".nii", ".nii.gz")):
             raise UsageError(f"a label map is written as .nii.gz or .nii, not {escape_text(name[-40:])!r}")
         content = encode_nifti(self, packed=name.endswith(".gz"))
-        with keep_existing(no_clobber):
+        with keep_existing(keep=no_clobber):
             return replace_file(path, lambda stream: stream.write(content), expected_bytes=len(content))
 
     def to_sitk(self) -> Any:

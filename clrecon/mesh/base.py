@@ -236,7 +236,7 @@ class BaseMesh(Message):
 
         Returns: Size of the file in bytes.
         """
-        with keep_existing(no_clobber):
+        with keep_existing(keep=no_clobber):
             return write_mesh(self, path, space, keep_ids=keep_ids)
 
 

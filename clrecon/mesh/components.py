@@ -68,25 +68,20 @@ def select_components(
     labelled: Labelled | None = None,
     among: NDArray[np.bool_] | None = None,
 ) -> Own:
-    """Keep the largest components of a surface, or those at given points.
+    """Keep the largest components of a surface, or those at given points; the mesh itself when nothing is dropped.
 
-    First, small components (`min_volume_ml`) are dropped, then those that are not nearest to a seed, then all but the
-    largest of the rest (`keep_largest`). Components are ranked by area, not by volume: a part that is open at the
-    border of the scan encloses nothing, and the wall of a cavity has a negative volume.  The wall of a cavity is a
-    component of its own; where it is dropped, the cavity is filled.
+    First, small components are dropped, then those that are not nearest to a seed, then all but the largest of the
+    rest. Components are ranked by area, not by volume: a part that is open at the border of the scan encloses nothing,
+    and the wall of a cavity has a negative volume; where it is dropped, the cavity is filled.
 
-    keep_largest: Keep this number of components, those of largest area.  If areas are equal within the rounding of the
-        coordinates, the first component in the mesh is kept.
-    min_volume_ml: Keep components that enclose at least this volume, regardless of sign.  The volume of an open
-        component is measured as if its rim were joined to the mean of its corners.
-    seeds: sequence of (x, y, z). Keep the components whose surface lies nearest to one of these points, LPS mm.
-    labelled: (int, ndarray). Result of `label_components` for this mesh, if it is already known (a device finds it
-        faster).
+    keep_largest: This many of largest area; of equal ones, within rounding, the first in the mesh.
+    min_volume_ml: Enclosed, regardless of sign; of an open one as if its rim were joined to the mean of its corners.
+    seeds: sequence of (x, y, z). The components whose surface lies nearest to one of these points, LPS mm.
+    labelled: (int, ndarray). Result of `label_components` for this mesh, if it is already known.
     among: ndarray, shape (count,), bool. True for components of `labelled` that may be kept.
 
-    Returns: Vertices and triangles keep their order, normals and report are taken over; the mesh itself when nothing is
-        dropped.  Its report has ``components_found`` and ``components_kept``, and with seeds ``seed_distances_mm``: how
-        far the surface lies from each.
+    Returns: A mesh whose report has ``components_found`` and ``components_kept``, and with seeds
+        ``seed_distances_mm``: how far the surface lies from each.
     """
     chosen = _choose_components(mesh, keep_largest, min_volume_ml, seeds, labelled, among)
     if chosen.keep.all():
@@ -98,7 +93,6 @@ def select_components(
 
 
 def keep_triangles(mesh: Own, kept: NDArray[np.bool_]) -> Own:
-    """Return the mesh with some of its triangles, and the vertices that they need."""
     triangles = mesh.triangles[kept]
     used = np.zeros(mesh.vertex_count, dtype=bool)
     used[triangles] = True
@@ -120,10 +114,7 @@ def split_components(
     among: NDArray[np.bool_] | None = None,
     most: int | None = None,
 ) -> list[Own]:
-    """Split a surface into its components, the largest area first (the first of equal ones); see `select_components`.
-
-    Vertices and triangles keep their order, normals and report are taken over.  More than `most` are refused.
-    """
+    """Split a surface into components, the largest area first; see `select_components`; over `most` are refused."""
     chosen = _choose_components(mesh, keep_largest, min_volume_ml, seeds, labelled, among, rank=True)
     kept = np.flatnonzero(chosen.keep)
     if most is not None and len(kept) > most:
@@ -212,10 +203,7 @@ def _choose_components(
 
 
 def _rank_areas(areas: NDArray[np.float64], step: float) -> NDArray[np.int64]:
-    """Components from the largest area, mm2, to the smallest, those of equal area in their own order.
-
-    Areas are equal when they differ from the first of their group by no more than rounding explains.
-    """
+    """Components from the largest area to the smallest, those equal within rounding in their own order."""
     ranked = np.argsort(-areas, kind="stable")
     falling = areas[ranked]
     least = falling - _ROUNDING_OF_AREA * step * np.sqrt(falling)

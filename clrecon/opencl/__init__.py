@@ -1,7 +1,4 @@
-"""OpenCL: devices and their memory, kernel sources and programs, arrays and launches.
-
-Only this package searches for drivers and knows where the kernel files are.
-"""
+"""OpenCL: devices and their memory, kernel sources and programs, arrays and launches; drivers are found here alone."""
 
 from clrecon.opencl.arrays import (
     MemoryLimits,

@@ -29,7 +29,7 @@ from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass, replace
 
 
-def _mib(size: int, up: bool = False) -> str:
+def _mib(size: int, *, up: bool = False) -> str:
     if size < 2**20:
         return f"{size:,} bytes"
     return f"{-(-size // 2**20) if up else round(size / 2**20):,} MiB"
@@ -147,7 +147,6 @@ class PagePool:
 
     @property
     def spare_bytes(self) -> int:
-        """Bytes that are free for the next result."""
         with self._lock:
             return sum(map(len, self._spare))
 

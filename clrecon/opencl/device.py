@@ -103,7 +103,6 @@ class Commands:
 
     @property
     def has_hung(self) -> bool:
-        """True where a command that was given up still runs."""
         with self._lock:
             self._given_up = [command for command in self._given_up if command.is_running]
             return bool(self._given_up)
@@ -146,7 +145,7 @@ _LOST_LATE = (-5, *_LOST)
 """OUT_OF_RESOURCES of a command that was accepted says that it was stopped, by a watchdog or a fault."""
 
 
-def kind_of_error(error: Exception, is_late: bool = False) -> type[DeviceError]:
+def kind_of_error(error: Exception, *, is_late: bool = False) -> type[DeviceError]:
     """Return the class of error for an error of the driver; `is_late`: it came while the device worked."""
     try:
         code = int(error.code)  # type: ignore[attr-defined]
@@ -392,7 +391,7 @@ class Device:
         """
         self.give_up()
         log.info("%s on %s: %s; its context is given up", what, self.label, describe_error(error))
-        return kind_of_error(error, is_late)(f"{what} on {self.label}: {describe_error(error)}")
+        return kind_of_error(error, is_late=is_late)(f"{what} on {self.label}: {describe_error(error)}")
 
     def describe(self) -> dict[str, Any]:
         """Properties for listings and reports."""

@@ -80,14 +80,12 @@ def _take_helper() -> _Helper:
 
 
 def wait(device: Device) -> None:
-    """Wait until the device has finished all commands."""
     last = device.commands.last
     if last is not None:
         wait_for(device, last)
 
 
 def wait_for(device: Device, last: Command) -> None:
-    """Wait until the device has finished the commands up to `last`."""
     try:
         last.queue.flush()
         if not _ends_soon(last):
@@ -150,10 +148,7 @@ def _describe_hang(device: Device, what: str, limit: float) -> str:
 
 
 def settle(device: Device, error: BaseException) -> None:
-    """Wait, after an error, until the device no longer works in memory that the caller frees.
-
-    After an interrupt that is a short time, after a time limit none: what still runs then keeps its memory.
-    """
+    """Wait, after an error, until the device no longer works in memory that the caller frees; not for a hung one."""
     if isinstance(error, DeviceTimeoutError):
         return
     seconds = device_seconds() if isinstance(error, Exception) else GRACE_SECONDS

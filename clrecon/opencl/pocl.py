@@ -85,7 +85,8 @@ class KnownGood:
             recorded = self._read(key)
             with suppress(OSError):  # a folder that was removed meanwhile holds nothing to check
                 self._check(recorded)
-            start = self._now()
+            os.utime(self._handle if os.utime in os.supports_fd else self._folder / "in-use")
+            start = os.fstat(self._handle).st_mtime_ns
             yield
             with suppress(OSError):
                 self._used.setdefault(key, set()).update(self._find_used(recorded, start))
@@ -179,11 +180,6 @@ class KnownGood:
                 with suppress(OSError):
                     os.unlink(self._folder / name)
             self._share()
-
-    def _now(self) -> int:
-        """Return the present time in ns, by the clock of the files."""
-        os.utime(self._handle if os.utime in os.supports_fd else self._folder / "in-use")
-        return os.fstat(self._handle).st_mtime_ns
 
     def _warn(self, text: str) -> None:
         if text not in self.warnings:

@@ -136,7 +136,6 @@ class KernelArgument:
 
 
 def definitions_of(options: tuple[str, ...]) -> dict[str, str]:
-    """Return the macros that the options of a build define, with their values."""
     given = (option[2:].partition("=") for option in options if option.startswith("-D"))
     return {name: value if equals else "1" for name, equals, value in given}
 

@@ -1,8 +1,4 @@
-"""The check of a device at its first use: the surface of a ball, which is known exactly.
-
-It builds what most surfaces need, and what it finds is remembered by `clrecon.opencl.select`.  `clrecon selftest`
-checks every kernel.
-"""
+"""The check of a device at its first use: the surface of a ball; `clrecon selftest` checks every kernel."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Clouds of points: the class `PointCloud`, what a step made of one, and which clusters are kept.
-
-The names are loaded when first used, so that the command line learns the kinds of points without numpy.
-"""
+"""Clouds of points: `PointCloud`, its steps, and which clusters are kept; names are loaded when first used."""
 
 from __future__ import annotations
 

@@ -336,7 +336,7 @@ class PointCloud(Message, ShownAsHtml):
         OutputError
             The file cannot be written; an older one of that name is intact.
         """
-        with keep_existing(no_clobber):
+        with keep_existing(keep=no_clobber):
             return write_cloud(self, path, space, keep_ids=keep_ids)
 
     def to_pyvista(self) -> Any:

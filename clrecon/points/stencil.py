@@ -130,11 +130,7 @@ def checked_eps(eps: float) -> float:
 
 
 def make_stencil(lattice: Lattice, eps: float) -> Stencil:
-    """Find the voxels within `eps` mm (see `SLACK`) of a voxel, for each slice of a lattice.
-
-    Where slices are uneven, the places of both count.  Offsets that lead out of the volume from everywhere are left
-    out.
-    """
+    """Find the voxels within `eps` mm (see `SLACK`) of a voxel, for each slice; none out of the volume everywhere."""
     eps = checked_eps(eps)
     nk = lattice.shape_ijk[2]
     plane = _Plane(lattice, eps * (1.0 + SLACK))

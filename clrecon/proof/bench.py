@@ -101,27 +101,18 @@ def run_bench(
 ) -> dict[str, Any]:
     """Time the stages from a CT series to its surface on one device or on all devices.
 
-    The surface is open at the border of the volume, like that of flying edges.  Both programs work in turn, on the same
-    voxels at the same level.
+    The surface is open at the border of the volume, like that of flying edges, which work in turn on the same voxels.
 
     source: DICOM folder or file; None makes a phantom of the spine, 512 x 512 x 149 voxels.
-    iso_value: HU; default: that of the preset "bone", for the phantom its suggested value.
     device: As in `choose_device`; "all" means every usable device except simulators, one after the other.
     runs: Timed pairs of clrecon and flying edges, 1 to 1000.
-    series: The series of `source` to read.
-    report_path: JSON file for the result.
-    no_clobber: A report that exists stays and is an `OutputError`, before any work.
-    progress: ``progress(stage, done, total)``.
-
-    Returns: ``input, iso_value_hu, iso_level_hu, runs, seconds, devices, processor, cores, free_cores, platform,
-        version, warnings``, see docs/contract.md.  It holds no patient data and no name of a file.
     """
     progress = progress or ignore_progress
     _check_arguments(source, iso_value, runs, series)
     if report_path is not None:
         from clrecon.system.files import check_writable
 
-        with keep_existing(no_clobber):
+        with keep_existing(keep=no_clobber):
             check_writable(report_path)
         check_kept([("the report", report_path)], source)
     progress("device", 0, 0)
@@ -153,7 +144,7 @@ def run_bench(
     result["seconds"] = {**watch.seconds, "total": watch.total()}
     result["warnings"] = _collect_warnings(result, volume, devices)
     if report_path is not None:
-        with keep_existing(no_clobber), stage_report(report_path, result) as staged:
+        with keep_existing(keep=no_clobber), stage_report(report_path, result) as staged:
             staged.commit()
     return result
 

@@ -52,7 +52,7 @@ def make_demo(
     from clrecon.operators import choose_device
 
     folder = resolve_target(output)
-    with keep_existing(no_clobber):
+    with keep_existing(keep=no_clobber):
         _check_replaceable(folder, output)
         chosen = choose_device(device)
         with ExitStack() as stack:
@@ -68,7 +68,6 @@ def make_demo(
 
 
 def _fill(folder: Path, chosen: Device, progress: Progress | None) -> dict[str, Any]:
-    """Write everything into a folder; returns the outcome."""
     from clrecon.proof.phantom import PhantomSettings, write_phantom
 
     watch = Laps()

@@ -134,8 +134,6 @@ def _failed(check: Check, detail: str, seconds: float) -> dict[str, Any]:
 
 
 class _Child:
-    """The process, and what it said last."""
-
     def __init__(self, device: Device, checks: Sequence[Check]):
         self.hangs = False
         self._device = device
@@ -203,7 +201,6 @@ class _Child:
 
     @property
     def seconds(self) -> float:
-        """Seconds since the last check began."""
         return time.perf_counter() - self._since
 
     def describe_end(self) -> str:

@@ -1,8 +1,4 @@
-"""Timing of two programs in turn, and facts about the computer for readers of the times.
-
-No fact identifies the computer.
-
-Pairs of runs take turns, so that changes of the machine's speed affect both."""
+"""Timing of two programs in turn, and facts about the computer that do not identify it."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""`read_volume` and `list_series` for every kind of input: a folder or file of DICOM, or one file of another format.
-
-The kind is told from the content of the file; its name is not trusted.
-"""
+"""`read_volume` and `list_series` for every kind of input, told from its content, not its name."""
 
 from __future__ import annotations
 
@@ -48,7 +45,7 @@ def list_selected(
     if kind is None:
         from clrecon.reading.dicom.reader import list_scan
 
-        return list_scan(path, selection, pixels, progress)
+        return list_scan(path, selection, pixels=pixels, progress=progress)
     _refuse_options(kind, selection)
     from clrecon.reading.grids import list_grid
 

@@ -161,7 +161,7 @@ def write_animation(
     OutputError
         The file cannot be written; an older one is intact.
     """
-    with keep_existing(no_clobber), stage_animation(frames, path, fps, total=total, progress=progress) as staged:
+    with keep_existing(keep=no_clobber), stage_animation(frames, path, fps, total=total, progress=progress) as staged:
         staged.commit()
     return staged.size
 

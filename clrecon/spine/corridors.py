@@ -106,15 +106,11 @@ class Line:
     tried: int
 
 
-def _directions(medial_deg: Float64Array, sagittal_deg: Float64Array, side: float) -> Float64Array:
-    """Return directions (n, 3) with y of -1, forward, not of unit length."""
-    medial, sagittal = np.radians(medial_deg), np.radians(sagittal_deg)
-    return np.stack((-side * np.tan(medial), np.full(np.shape(medial), -1.0), np.tan(sagittal)), axis=-1)
-
-
 def line_points(lines: Float64Array, span: Span) -> Float64Array:
     """Return points (n, m, 3) of lines (n, 4: x, z, medial, sagittal), from the back plane to the tip."""
-    direction = _directions(lines[:, 2], lines[:, 3], span.side)
+    # y of -1, forward, not of unit length
+    medial, sagittal = np.radians(lines[:, 2]), np.radians(lines[:, 3])
+    direction = np.stack((-span.side * np.tan(medial), np.full(np.shape(medial), -1.0), np.tan(sagittal)), axis=-1)
     start = np.stack((lines[:, 0], np.full(len(lines), span.pass_y), lines[:, 1]), axis=1)
     count = int(np.ceil((span.back - span.tip) / ALONG_MM)) + 1
     way = span.pass_y - np.linspace(span.back, span.tip, count)
@@ -198,10 +194,7 @@ class LineJudge:
         return least
 
     def score(self, lines: Float64Array, above: Float64Array | None = None) -> Float64Array:
-        """Return what is made largest: the radius with a little of the mean; below 0 for lines that leave the bone.
-
-        So it is for those that by their quick distance do not score `above` some others (n,).
-        """
+        """Return the radius with a little of the mean; below 0 out of the bone; only for lines that may be `above`."""
         least, mean = _least_and_mean(self.depth, lines, self.span)
         score = np.minimum(least, 0.0) - 1.0
         hopeful = least > (0.0 if above is None else np.maximum(above - QUICK_OFF_MM, 0.0))

@@ -78,16 +78,12 @@ def follow_canal(points: Float64Array, volume: Grid) -> Course:
     down /= np.linalg.norm(down, axis=1, keepdims=True)
     ahead = np.array([0.0, -1.0, 0.0]) - down * -down[:, 1:2]
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    inside = _inside(volume, line)
+    ijk = volume.lps_to_ijk(line)
+    inside = np.asarray(((ijk >= -0.5) & (ijk <= np.array(volume.shape_ijk) - 0.5)).all(axis=1))
     begin, end = int(inside.argmax()), len(inside) - int(inside[::-1].argmax())
     part = slice(begin, end)
     reaches = (begin > 0, end < len(inside))
     return Course(line[part], down[part], ahead[part], np.cross(down, ahead)[part], known[part], reaches)
-
-
-def _inside(volume: Grid, places: Float64Array) -> NDArray[np.bool_]:
-    ijk = volume.lps_to_ijk(places)
-    return np.asarray(((ijk >= -0.5) & (ijk <= np.array(volume.shape_ijk) - 0.5)).all(axis=1))
 
 
 def sample_course(
@@ -293,10 +289,7 @@ def choose_discs(looks: Looks) -> tuple[list[Bound], NDArray[np.float64]]:
 
 
 def _usual_depth(best: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the depth of a usual disc at each place: that of the scan, or less where all within reach are shallower.
-
-    Discs of the neck and the upper chest are thinner than those below, and partial volume fills them.
-    """
+    """Return the depth of a usual disc at each place: the scan's, or less where all within reach are shallower."""
     from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
     near = GAPS_MM[0] // 2

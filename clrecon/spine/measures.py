@@ -113,10 +113,7 @@ def find_exit(bone: SolidBone, start: Float64Array, direction: Float64Array, rea
 
 
 def measure_bias(bone: SolidBone, frame: VertebraFrame, first: Float64Array, last: Float64Array) -> Bias | None:
-    """Measure how far the surface lies from the half maximum of the pedicle's wall, on rays square to a line.
-
-    Returns None where less than a quarter of the rays meets a wall that HU show.
-    """
+    """Measure the surface from the half maximum of the pedicle's wall on rays; None if under a quarter meet one."""
     medial, up = _across(last - first, 1.0)
     turns = np.linspace(0.0, 2.0 * np.pi, RAYS, endpoint=False)
     spokes = np.cos(turns)[:, None] * medial + np.sin(turns)[:, None] * up
@@ -253,16 +250,17 @@ def grade_screw(bone: SolidBone, frame: VertebraFrame, screw: Screw, what: str) 
     surface = frame.to_frame(bone.surface)
     begin = first + max(0.0, (frame.canal[1] - first[1]) / way[1]) * way
     end = first + min(1.0, (middle - first[1]) / way[1]) * way
-    room = margins(surface, begin, end, side)
+    room: dict[str, float | None] = {}
+    for name, value in margins(surface, begin, end, side).items():
+        room[name] = None if value is None else value - screw.diameter / 2.0
+        if breaches[name] > 0.0:
+            room[name] = -breaches[name]
     return ScrewGrade(
         grade_breach(breach),
         breach,
         max(breaches, key=lambda name: breaches[name]) if breach > 0.0 else None,
         breaches,
-        {
-            name: -breaches[name] if breaches[name] > 0.0 else None if value is None else value - screw.diameter / 2.0
-            for name, value in room.items()
-        },
+        room,
         float(outside[points[:, 1] < middle].max(initial=0.0)),
         "left" if side > 0.0 else "right",
     )

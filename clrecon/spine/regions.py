@@ -368,7 +368,6 @@ class Piece:
 
     @property
     def whole(self) -> bool:
-        """True where both planes are there."""
         return self.upper is not None and self.lower is not None
 
 
@@ -409,7 +408,9 @@ def judge(
     marrow, dark = _marrow(scan, looks, piece)
     traits["marrow"] = _ramp(marrow, MARROW_HU - 20.0, MARROW_HU + 20.0), f"the middle of its body has {marrow:.0f} HU"
     traits["dark"] = _ramp(dark, 0.1, 0.0), f"{100 * dark:.0f} % of the middle of its body is fat or air"
-    canal = _canal(scan, piece)
+    tube = scan[piece.begin : piece.end, :4][:, :, np.abs(ASIDE_MM) <= 3.0]
+    measured = tube[np.isfinite(tube)]
+    canal = float(((measured > 250.0) | (measured < -150.0)).mean()) if measured.size else 1.0
     traits["canal"] = _ramp(canal, 0.35, 0.0), f"{100 * canal:.0f} % of its canal is filled with bone or air"
     seen = float(course.known[piece.begin : piece.end].mean())
     traits["line"] = _ramp(seen, 0.4, 0.75), f"its canal was seen on {100 * seen:.0f} % of its height"
@@ -473,13 +474,6 @@ def _marrow(scan: Field, looks: Looks, piece: Piece) -> tuple[float, float]:
     core = scan[rows][:, ahead][:, :, np.abs(ASIDE_MM) <= 8.0]
     known = core[np.isfinite(core)]
     return (float(np.median(known)), float((known < -60.0).mean())) if known.size else (-1000.0, 1.0)
-
-
-def _canal(scan: Field, piece: Piece) -> float:
-    """Return the share of the middle of the canal that is bone or air."""
-    tube = scan[piece.begin : piece.end, :4][:, :, np.abs(ASIDE_MM) <= 3.0]
-    known = tube[np.isfinite(tube)]
-    return float(((known > 250.0) | (known < -150.0)).mean()) if known.size else 1.0
 
 
 def beside_share(scan: Field, looks: Looks, piece: Piece, level: float) -> float:

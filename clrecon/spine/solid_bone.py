@@ -226,7 +226,11 @@ def _sample(
     hu = np.full(lattice.shape, AIR_HU, np.float32)
     mask, solid = np.zeros(lattice.shape, bool), np.zeros(lattice.shape, bool)
     shares = [part.astype(np.float32) for part in parts]
-    near = _widen(parts[1], volume.spacing)
+    # the voxels within `MARGIN_MM` of the label, and one more
+    from scipy.ndimage import maximum_filter
+
+    size = tuple(2 * (int(np.ceil(MARGIN_MM / step)) + 1) + 1 for step in volume.spacing[::-1])
+    near = np.asarray(maximum_filter(parts[1].view(np.uint8), size), dtype=bool)
     y, x = (part.ravel() for part in np.indices((ny, nx)))
     last = np.array(voxels.shape)[:, None] - 0.5
     for z in range(nz):
@@ -242,14 +246,6 @@ def _sample(
         at = within.reshape(ny, nx)
         hu[z][at], mask[z][at], solid[z][at] = values, label >= 0.5, inside
     return hu, mask, solid
-
-
-def _widen(own: NDArray[np.bool_], spacing: tuple[float, float, float]) -> NDArray[np.bool_]:
-    """Mark the voxels within `MARGIN_MM` of some, and one voxel more."""
-    from scipy.ndimage import maximum_filter
-
-    size = tuple(2 * (int(np.ceil(MARGIN_MM / step)) + 1) + 1 for step in spacing[::-1])
-    return np.asarray(maximum_filter(own.view(np.uint8), size), dtype=bool)
 
 
 def _largest(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:

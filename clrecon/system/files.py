@@ -222,10 +222,7 @@ def _temporary_file(folder: Path) -> Iterator[tuple[Path, BinaryIO]]:
 
 @contextlib.contextmanager
 def temporary_folder(parent: Path) -> Iterator[Path]:
-    """Make a folder with a random name, for the owner only, and remove it at the end unless it was renamed.
-
-    Folders of dead processes are removed by the next process that writes into `parent`, as files are.
-    """
+    """Make a folder with a random name, removed unless renamed; those of dead processes go at the next writing."""
     _sweep(parent)
     with contextlib.ExitStack() as stack:
         while True:

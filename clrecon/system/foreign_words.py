@@ -24,14 +24,17 @@ _lock = threading.RLock()
 
 
 @contextlib.contextmanager
-def own_streams(show: bool = False) -> Iterator[None]:
+def own_streams(*, show: bool = False) -> Iterator[None]:
     """In the ``with`` block, standard output belongs to Python alone, and warnings of libraries are left out.
 
     What a library in C writes to standard output comes out on standard error, unless `hush` takes it.  With `show` all
     foreign words come out there.
     """
     global _owned
-    _fill_closed_descriptors()
+    # where a standard stream is closed, the next file would get what is written to it
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
     with contextlib.ExitStack() as stack:
         if not show:
             stack.enter_context(warnings.catch_warnings())
@@ -52,13 +55,6 @@ def _log() -> logging.Logger:
     from clrecon.system.log import get_logger  # loads logging, which takes milliseconds
 
     return get_logger(__name__)
-
-
-def _fill_closed_descriptors() -> None:
-    """Open the null device where a standard stream is closed: else the next file would get what is written to it."""
-    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass
-    os.close(descriptor)
 
 
 def _move_stdout(stack: contextlib.ExitStack) -> None:

@@ -102,10 +102,7 @@ def _free_in(folder: Path, limit: str, used: str, reclaimable: str) -> int | Non
 
 
 def aligned_empty(shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
-    """Return an uninitialised C-contiguous array that begins at the start of a memory page.
-
-    CPU drivers use the memory of such an array directly (Intel's copies others), and kernels may read it as vectors.
-    """
+    """Return an uninitialised C-contiguous array at the start of a memory page, which CPU drivers use directly."""
     dtype = np.dtype(dtype)
     size = int(np.prod(shape, dtype=object)) * dtype.itemsize
     raw = np.empty(size + mmap.PAGESIZE, np.uint8)
@@ -148,10 +145,7 @@ class FilePlace:
 
 @dataclass(frozen=True)
 class Mapping:
-    """A memory mapping of a file, from its first byte in memory and in the file on.
-
-    identity: Device and number of the file when the mapping was found: another file may take its name later.
-    """
+    """A memory mapping of a file, from its first byte on; `identity`: device and number, when it was found."""
 
     file: mmap.mmap
     address: int

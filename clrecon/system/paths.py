@@ -93,7 +93,7 @@ _KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
 
 
 @contextlib.contextmanager
-def keep_existing(keep: bool = True) -> Iterator[None]:
+def keep_existing(*, keep: bool = True) -> Iterator[None]:
     """In the ``with`` block, refuse every target that exists; with False, replace it, which is the default."""
     token = _existing_stay.set(keep)
     try:
@@ -103,7 +103,6 @@ def keep_existing(keep: bool = True) -> Iterator[None]:
 
 
 def existing_stay() -> bool:
-    """True in a block of `keep_existing`."""
     return _existing_stay.get()
 
 
@@ -172,10 +171,7 @@ def resolve_target(path: str | os.PathLike[str]) -> Path:
 
 
 def _is_open_stream(absolute: str) -> bool:
-    """True where a path leads, by links, to an entry of the folder of a process's open files.
-
-    Behind such an entry is a pipe, or a file whose replacement the process that writes to it would not see.
-    """
+    """True where a path leads to an open file of a process: a pipe, or one whose replacement is not seen."""
     for _ in range(_MOST_LINKS):
         folder = os.path.realpath(os.path.dirname(absolute))
         if _OPEN_FILES.fullmatch(folder):

@@ -32,7 +32,6 @@ class Steps:
         self._progress(stage, 0, total)
 
     def take(self, count: int = 1) -> None:
-        """Report that so many more steps are done."""
         self.done = min(self.done + count, self.total)  # work that another device takes over is counted again
         self._progress(self._stage, self.done, self.total)
 

@@ -84,13 +84,11 @@ def is_true(name: str, flag: bool, what: str) -> Gate:
 
 
 def at_most(name: str, measured: float, bound: float, unit: str | None, what: str) -> Gate:
-    """Gate: a figure must not be larger than its bound."""
     text = f"{what}: {_say(measured, bound, 3)}{' ' * bool(unit)}{unit or ''}, at most {bound:.3g}"
     return Gate(name, measured, bound, unit, measured <= bound, text)
 
 
 def at_least(name: str, measured: float, bound: float, unit: str | None, what: str) -> Gate:
-    """Gate: a figure must not be smaller than its bound."""
     text = f"{what}: {_say(measured, bound, 4)}{' ' * bool(unit)}{unit or ''}, at least {bound:g}"
     return Gate(name, measured, bound, unit, measured >= bound, text)
 

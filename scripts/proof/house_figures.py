@@ -93,7 +93,7 @@ def _option_places(modules: dict[str, tuple[str, list[ast.AST]]]) -> Counter[str
     for name, (_, nodes) in modules.items():
         for node in nodes:
             called = getattr(node, "func", None)
-            if getattr(called, "attr", "") == "add_argument" or getattr(called, "id", "") == "option":
+            if getattr(called, "attr", "") == "add_argument" or getattr(called, "id", "").endswith("option"):
                 texts = [getattr(word, "values", [word])[0] for word in getattr(node, "args", ())]
                 words = [str(text.value).split() for text in texts if isinstance(text, ast.Constant)]
                 places |= {(flag, name) for flag, *_ in filter(None, words) if flag.startswith("--")}

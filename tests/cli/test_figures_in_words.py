@@ -106,9 +106,9 @@ def test_lines_that_are_one_text_are_put_together() -> None:
 def test_warnings_are_said_once(
     as_json: bool, quiet: bool, with_json: bool, is_said: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made = Console(as_json)
+    made = Console(as_json=as_json)
     made.set_loudness(quiet, False)
-    made.warn("cold", with_json)
+    made.warn("cold", with_json=with_json)
     assert capsys.readouterr().err == ("clrecon: warning: cold\n" if is_said else "")
 
 
@@ -219,7 +219,7 @@ def test_a_gate_of_the_mesh_decides_the_code(scan: bool, of_mesh: bool, strict: 
 def test_a_level_in_the_values_own_units_leaves_gates_of_hu_warnings(name: str, own_units: bool, code: int) -> None:
     gate = {"name": name, "ok": False, "text": "t", "measured": 1, "bound": 0, "unit": None}
     report = {"volume": {"gates": [gate]}, "gates": [], "warnings": []}
-    assert mesh_command.finish_with_gates(report, Console(), True, own_units) == code
+    assert mesh_command.finish_with_gates(report, Console(), True, own_units=own_units) == code
 
 
 def test_a_simulator_is_named_as_one() -> None:

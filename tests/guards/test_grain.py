@@ -11,11 +11,11 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 92_804,
+    "lines": 92_171,
     "modules": 417,
-    "small_modules_with_one_reader": 10,
+    "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
-    "options_in_several_files": 19,
+    "options_in_several_files": 16,
     "modules_with_own_all": 0,
 }
 """Who takes something away lowers the figure in the same commit; who needs more says why in the commit."""

@@ -33,7 +33,7 @@ def find_filled(volume: Volume, bone: Bits, seal_mm: float, bone_ml: float) -> B
     """Return the voxels that bone encloses, shape (nk, nj, ni), whatever they hold and however wide they are."""
     sealed = bone.copy()
     for by_slice in (False, True):
-        sealed |= erode(volume, dilate(volume, bone, seal_mm, by_slice), seal_mm, by_slice)
+        sealed |= erode(volume, dilate(volume, bone, seal_mm, by_slice=by_slice), seal_mm, by_slice=by_slice)
     padded = np.pad(sealed, 1)  # an end of the volume is a way out but where a slice of its own is closed
     for axis in range(3):
         for inner, outer in ((0, 0), (-1, -1)):

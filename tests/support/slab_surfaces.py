@@ -23,7 +23,7 @@ def extract_in_slabs(
     **options: Any,
 ) -> Any:
     resident = DeviceVolume(volume, device=device)
-    rule = choose_iso_rule(volume, iso_value, closed, topology, **options)
+    rule = choose_iso_rule(volume, iso_value, closed=closed, topology=topology, **options)
     resident.most_slices[SampleGrid(volume, rule).kind] = slices
     return extract_isosurface(resident, iso_value, closed=closed, topology=topology, **options)
 

@@ -176,7 +176,6 @@ class CloudFiles:
         ]
 
     def check_formats(self) -> None:
-        """Refuse formats that cannot be written."""
         from clrecon.exchange.formats import check_cloud_format, check_format
 
         check_cloud_format(self.output)
@@ -238,6 +237,8 @@ def report_of(
     read = describe_cloud(subject) if isinstance(subject, PointCloud) else None
     of_file = ((read or {}).get("file") or {}).get("warnings", ())
     of_surface = () if surface is None else surface.report["warnings"]
+    # an axis at a time: ten times as fast as along axis 0
+    points, _ = cloud.in_space(settings.space)
     return run.report(
         CloudReport,
         [*of_file, *device.warnings, *steps.warnings, *of_surface, *losses],
@@ -255,7 +256,7 @@ def report_of(
         normals=cloud.normals is not None,
         has_hu=cloud.hu is not None,
         labels=cloud.labels is not None,
-        bounds_mm=_bounds(cloud, settings.space),
+        bounds_mm=[[float(column.min()) for column in points.T], [float(column.max()) for column in points.T]],
         space=settings.space,
         paper=settings.paper,
         steps=steps.entries,
@@ -270,8 +271,3 @@ def _describe_surface(mesh: Mesh) -> dict[str, Any]:
     names = ("spacing_mm", "bridge_mm", "votes_against_share", "wall_share", "lost_share", "open_cubes", "warnings")
     facts = {name: mesh.report.get(name) for name in names}
     return {"vertices": mesh.vertex_count, "triangles": mesh.triangle_count, **facts}
-
-
-def _bounds(cloud: PointCloud, space: str) -> list[list[float]]:
-    points, _ = cloud.in_space(space)  # an axis at a time: ten times as fast as along axis 0
-    return [[float(column.min()) for column in points.T], [float(column.max()) for column in points.T]]

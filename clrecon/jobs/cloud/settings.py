@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,10 @@ def _parse_denoisers(text: str) -> tuple[str, ...]:
     return tuple(part.strip().lower() for part in text.split(","))
 
 
+_points_option = partial(option, group="points")
+_steps_option = partial(option, group="steps")
+
+
 @dataclass(frozen=True)
 class CloudSettings(InputSettings):
     """Settings of the cloud job; options say in their help what they do.  `keep` alone has the default clusters."""
@@ -98,83 +103,74 @@ class CloudSettings(InputSettings):
         "patient frame of a cloud file that does not say its own (default: lps)",
         parse=str.lower,
     )
-    points: PointKind | None = option(
+    points: PointKind | None = _points_option(
         f"--points {'|'.join(POINT_KINDS)}",
         "surface: where the HU cross the iso value, between the voxels; voxels: the centres of those within; shell: of"
         " these the outer ones (default: surface, with a band voxels)",
-        group="points",
         parse=str.lower,
         first=True,
     )
-    hu: float | Sequence[float] | None = option(
+    hu: float | Sequence[float] | None = _points_option(
         "--hu N|LO,HI",
         "iso value, inside is N and above; or a band, both ends included (default: that of bone)",
-        group="points",
         parse=_parse_level,
         first=True,
     )
     labels: str | Path | None = label_map_option(group="points")
-    label: str | None = option("--label NAME|N", "points of this label only (default: of all)", group="points")
-    paper: bool = option(
-        "--paper", "place and filter voxels as the papers print it, and say by how much that is wrong", group="points"
+    label: str | None = _points_option("--label NAME|N", "points of this label only (default: of all)")
+    paper: bool = _points_option(
+        "--paper", "place and filter voxels as the papers print it, and say by how much that is wrong"
     )
-    ghost_slices: str = option(
+    ghost_slices: str = _steps_option(
         f"--ghost-slices {'|'.join(GHOSTS)}",
         "slices inside the stack that are unlike both neighbours, as screen captures and localizers are: drop takes"
         f" their points away, keep warns of them (default: {GHOSTS[0]})",
-        group="steps",
         default=GHOSTS[0],
         parse=str.lower,
     )
-    clusters: Clustering | None = option(
+    clusters: Clustering | None = _steps_option(
         "--cluster eps=MM,min=N",
         "density clusters (DBSCAN) without noise: neighbours are within eps, and a core point has min of them, itself"
         " included; min=plane+1 makes noise of lone slices (default: 1.5 times the largest voxel step, 6)",
-        group="steps",
         parse=_parse_clusters,
         nargs="?",
         const={},
         first=True,
     )
-    keep: Sequence[str] = option(
+    keep: Sequence[str] = _steps_option(
         "--keep RULE",
         "clusters that stay: largest, largest:N, min:POINTS, seed:X,Y,Z (the nearest), no-sheets (tables and image"
         " planes go); may be given again",
-        group="steps",
         default=(),
         action="append",
         first=True,
     )
-    outliers: float | None = option(
+    outliers: float | None = _steps_option(
         "--outliers SD",
         "points go whose mean distance to the 15 nearest is SD standard deviations over the mean (without a number: 2)",
-        group="steps",
         nargs="?",
         const=2.0,
     )
-    denoise: Sequence[str] = option(
+    denoise: Sequence[str] = _steps_option(
         f"--denoise {','.join(DENOISERS)}",
         "grid: points alone in a cell of a grid go; bilateral: points move along their normals to the weighted mean"
         " height of their neighbours, edges stay",
-        group="steps",
         default=(),
         parse=_parse_denoisers,
         first=True,
     )
-    normals: bool = option(
+    normals: bool = _steps_option(
         "--normals",
         "unit normals that point out of bone; points of a surface have those of the scan until they are moved",
-        group="steps",
         first=True,
     )
-    viewpoint: Sequence[float] | None = option(
+    viewpoint: Sequence[float] | None = _steps_option(
         "--viewpoint X,Y,Z",
         "a point inside of the object, mm in the frame of --space: normals of a cloud that was read point away from it"
         " (a scan turns its own by HU)",
-        group="steps",
         parse=parse_point,
     )
-    spacing: float | None = option("--spacing MM", "keep one point for each cell of that size", group="steps")
+    spacing: float | None = _steps_option("--spacing MM", "keep one point for each cell of that size")
     allow_point_loss: bool = option(
         "--allow-point-loss",
         "go on where a step that should take noise alone takes more than half of the points, which else is refused",
@@ -208,9 +204,8 @@ class CloudSettings(InputSettings):
             raise UsageError("as printed all slices fall into one plane, where clusters mean nothing: leave them out")
 
     def _check_hu(self) -> None:
-        ends = self.hu if isinstance(self.hu, Sequence) else () if self.hu is None else (self.hu,)
-        for value in ends:
-            if not math.isfinite(value):
+        for value in self.hu if isinstance(self.hu, Sequence) else (self.hu,):
+            if value is not None and not math.isfinite(value):
                 raise UsageError(f"HU are finite numbers, not {value}")
         if isinstance(self.hu, Sequence):
             if len(self.hu) != 2:

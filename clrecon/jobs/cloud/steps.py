@@ -53,7 +53,10 @@ def take_points(
             ghosts = find_ghosts(resident, iso_value_of(settings), settings, progress)
         steps = _extract_cloud(resident, labels, settings, progress)
         if settings.ghost_slices == "drop":
-            drop_ghosts(steps, ghosts, subject)
+            from clrecon.points.ghost_slices import drop_ghost_slices
+
+            step = drop_ghost_slices(steps.cloud, ghosts, volume=subject)
+            steps.add("ghost slices", step, takes_noise=True)
         else:
             warn_of_ghosts(steps, ghosts)
         run_steps(steps, settings, device, resident, progress)
@@ -150,7 +153,6 @@ def _with_volume(resident: DeviceVolume | None, shared: dict[str, Any]) -> dict[
 
 
 def in_lps(point: Sequence[float], space: str) -> tuple[float, ...]:
-    """Return a point of the frame of the output, mm, in LPS."""
     x, y, z = point
     return (x, y, z) if space == "lps" else (-x, -y, z)
 
@@ -179,13 +181,6 @@ def find_ghosts(resident: DeviceVolume, level: float, settings: CloudSettings, p
 
     band = settings.hu if isinstance(settings.hu, Sequence) else (level, math.inf)
     return find_ghost_slices(resident, band, progress=progress)
-
-
-def drop_ghosts(steps: CloudSteps, found: GhostSlices, volume: Volume) -> None:
-    from clrecon.points.ghost_slices import drop_ghost_slices
-
-    step = drop_ghost_slices(steps.cloud, found, volume=volume)
-    steps.add("ghost slices", step, takes_noise=True)
 
 
 def warn_of_ghosts(steps: CloudSteps, found: GhostSlices) -> None:

@@ -153,10 +153,7 @@ def _holds_spine(mesh: Mesh, volume: Volume, count: int, labels: NDArray[np.int6
 def judge_surfaces(
     parts: Sequence[Part], volume: Volume, settings: MeshSettings, label: Callable[[Mesh], Labelled]
 ) -> None:
-    """Store in the `facts` of each part the judgement of its walls: ``walls``, None for other surfaces than bone.
-
-    label: Numbers the components of a mesh; they are judged one by one where some of it has no wall of compact bone.
-    """
+    """Store in the `facts` of each part ``walls``, the judgement of bone; `label` numbers components judged alone."""
     import numpy as np
 
     from clrecon.mesh.compare.iso_distance import rule_of_report
@@ -239,7 +236,6 @@ def _warn_of_no_bone(part: Part, settings: MeshSettings) -> list[str]:
 
 
 def _means_bone(settings: MeshSettings) -> bool:
-    """True where the surface was asked for as that of bone."""
     return settings.half_way == "auto" or settings.preset_used == "bone"
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.options import label_map_option, parse_label_color
+from clrecon.jobs.options import label_color_option, label_map_option
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import MISSING, dataclass
 from clrecon.system.options import option
@@ -28,12 +28,8 @@ class LabelChoice:
     hidden: tuple[str | int, ...] = option(
         "--hide-label NAME|N", "not this label; may be given again", default=(), action="append"
     )
-    colors: tuple[tuple[str | int, str], ...] = option(
-        "--label-color LABEL=COLOUR",
-        "colour of a label in .ply and in the formats of several objects, such as L3=orange; may be given again",
-        default=(),
-        parse=parse_label_color,
-        action="append",
+    colors: tuple[tuple[str | int, str], ...] = label_color_option(
+        " in .ply and in the formats of several objects, such as L3=orange"
     )
     surface: str = "hu"
     grow_mm: float | None = option(

@@ -22,7 +22,7 @@ from clrecon.jobs.mesh.refinement import (
 )
 from clrecon.jobs.mesh.report import MeshReport, describe_part, report_of
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.mesh.surfaces import Part, Surface, plan_surfaces
+from clrecon.jobs.mesh.surfaces import Part, plan_surfaces
 from clrecon.jobs.outputs import check_kept, check_outputs, count_leftovers, name_outputs, refuse_files, refuse_numbered
 from clrecon.jobs.run import Run
 from clrecon.system.log import get_logger
@@ -57,7 +57,16 @@ def make_mesh(
     with Run(settings, **how) as run:
         surfaces = plan_surfaces(settings.levels, below=settings.below is not None)
         with run.keeping():
-            _check_files(source, output, report_path, surfaces, settings)
+            if settings.one_file:
+                from clrecon.exchange.formats import check_assembly
+
+                check_assembly(output)
+            outputs = check_outputs(
+                output, report_path, [""] if settings.one_file else first_names(surfaces, settings.split)
+            )
+            if settings.split and not settings.one_file:
+                refuse_numbered(output)
+            check_kept(outputs, source, None if settings.labels is None else settings.labels.path)
 
         def check_map(labels: LabelMap) -> None:
             if settings.labels is not None and run.no_clobber and not settings.one_file:
@@ -103,24 +112,6 @@ def makes_objects(output: str | Path) -> bool:
     return extension_of(output) == ".3mf"
 
 
-def _check_files(
-    source: str | Path,
-    output: str | Path,
-    report_path: str | Path | None,
-    surfaces: Sequence[Surface],
-    settings: MeshSettings,
-) -> None:
-    """Refuse outputs that cannot be written or would replace an input."""
-    if settings.one_file:
-        from clrecon.exchange.formats import check_assembly
-
-        check_assembly(output)
-    outputs = check_outputs(output, report_path, [""] if settings.one_file else first_names(surfaces, settings.split))
-    if settings.split and not settings.one_file:
-        refuse_numbered(output)
-    check_kept(outputs, source, None if settings.labels is None else settings.labels.path)
-
-
 def _name_objects(parts: Sequence[Part]) -> None:
     """Give each mesh the name and the colour that it has as an object of a file; those of labels stay."""
     from clrecon.rendering.pictures.label_style import distinct_colors
@@ -132,7 +123,6 @@ def _name_objects(parts: Sequence[Part]) -> None:
 
 
 def _refine_and_measure(run: Run, made: MadeParts, measure: bool) -> list[dict[str, Any]]:
-    """Refine and measure each part as far as wanted; return the gates."""
     settings: MeshSettings = run.settings
     place_on_cortex(made, settings, measure, run.progress)
     run.lap("cortex")

@@ -139,10 +139,7 @@ def describe_label(origin: dict[str, Any]) -> dict[str, Any]:
 
 
 def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, Any]]:
-    """Compare the meshes of each label, all components together, with the volume of its voxels in the CT.
-
-    Each part of a label gets ``label_mesh_ml`` and ``label_compared_ml`` among its `facts`.
-    """
+    """Compare each label's meshes with its voxels in the CT: ``label_mesh_ml`` and ``label_compared_ml``."""
     from clrecon.mesh.compare.mesh_gates import judge_label_volume
     from clrecon.mesh.triangles import enclosed_ml
 

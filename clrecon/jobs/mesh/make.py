@@ -27,9 +27,6 @@ from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.text import format_hu, format_ml
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from clrecon.anatomy.iso_choice import IsoChoice
     from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
@@ -187,10 +184,7 @@ def _bands_of(surfaces: Sequence[Surface]) -> list[Band]:
 def mask_parts(
     volume: Volume, surfaces: Sequence[Surface], settings: MeshSettings, device: Device, progress: Progress
 ) -> Volume:
-    """Return the volume with air outside of the body, the field of view and the region, as the settings ask for it.
-
-    Where the surfaces lie below a level, the region comes later: the air around the patient has to go before.
-    """
+    """Return the volume with air outside of the body, the field of view and, but below a level, the region."""
     volume = mask_volume(volume, settings, progress)
     if settings.below is not None:
         return volume
@@ -336,7 +330,12 @@ def _select_parts(
             no_bone = measure_pieces(mesh.vertices, other)
             mesh.report.update(not_bone=no_bone["pieces"], not_bone_ml=no_bone["pieces_ml"])
     if settings.all_parts:
-        among = _without_cavities(mesh, labelled, among)
+        # walls of cavities are no bodies: what they enclose is filled
+        from clrecon.mesh.refine.shifts import enclosed_mm3
+        from clrecon.system.pieces import local_origin
+
+        is_body = enclosed_mm3(mesh.vertices - local_origin(mesh.vertices), mesh.triangles, *labelled) >= 0.0
+        among = is_body if among is None else among & is_body
     steps.take()
     try:
         if not settings.split:
@@ -359,16 +358,6 @@ def label_parts(mesh: Mesh, device: Device, settings: MeshSettings) -> Labelled:
     except DeviceFailedError as error:  # the result is the same, it only takes longer
         mesh.report.setdefault("warnings", []).append(f"{error}: they were found without it")
         return label_on_host(mesh.triangles, mesh.vertex_count)
-
-
-def _without_cavities(mesh: Mesh, labelled: Labelled, among: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    """Return the components, of `among` if given, that are no walls of cavities; what is left is filled there."""
-
-    from clrecon.mesh.refine.shifts import enclosed_mm3
-    from clrecon.system.pieces import local_origin
-
-    is_body = enclosed_mm3(mesh.vertices - local_origin(mesh.vertices), mesh.triangles, *labelled) >= 0.0
-    return is_body if among is None else among & is_body
 
 
 def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings, device: Device) -> list[str]:

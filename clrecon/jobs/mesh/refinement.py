@@ -170,10 +170,7 @@ def _measure_distance(part: Part, volume: Volume) -> IsoDistance | None:
 
 
 def judge_parts(parts: Sequence[Part], settings: MeshSettings) -> list[dict[str, Any]]:
-    """Judge the parts of a job by the gates, and store the measures in the `facts` of each.
-
-    A part that was not measured has only the gates of refinement.  Gates have ``mesh``, the name of their part or None.
-    """
+    """Judge the parts by the gates, each with its ``mesh``; store measures in the `facts`, where there are some."""
     if not (settings.refines or any(part.quality for part in parts)):
         for part in parts:
             part.facts |= {"iso_distance": None, "refinement": None}

@@ -138,6 +138,9 @@ def report_of(
     of_one: dict[str, Any] = {name: meshes[0][name] if len(meshes) == 1 else None for name in _OF_ONE}
     for part in _DEVICE_PARTS:
         run.seconds[part] = sum(float(origin.get("seconds", {}).get(part, 0.0)) for origin in made.origins)
+    largest: dict[str, int] = {}
+    for own in (part.mesh.report.get("device_bytes", {}) for part in parts):
+        largest.update({what: max(size, largest.get(what, 0)) for what, size in own.items()})
     report = run.report(
         MeshReport,
         [*_warn_of_meshes(parts, meshes), *level_warnings, *warnings],
@@ -163,7 +166,7 @@ def report_of(
         split=settings.split,
         purpose=settings.purpose,
         slabs=max((part.mesh.report.get("slabs", 1) for part in parts), default=1),
-        device_bytes=_largest(part.mesh.report.get("device_bytes", {}) for part in parts),
+        device_bytes=largest,
         **of_one,
         meshes=list(meshes),
         output={"format": meshes[0]["output"]["format"], "bytes": sum(file.size for file in run.files)},
@@ -195,14 +198,6 @@ def _describe_all(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> di
         "components_kept": _unless_unknown(sum, (mesh["components_kept"] for mesh in of_surface)),
         "bounds_mm": _unless_unknown(_around, (mesh["bounds_mm"] for mesh in meshes)),
     }
-
-
-def _largest(taken: Iterable[dict[str, int]]) -> dict[str, int]:
-    """Return the most bytes that one of several surfaces took, by purpose."""
-    largest: dict[str, int] = {}
-    for own in taken:
-        largest.update({what: max(size, largest.get(what, 0)) for what, size in own.items()})
-    return largest
 
 
 def _bounds(mesh: Mesh, space: str) -> list[list[float]] | None:

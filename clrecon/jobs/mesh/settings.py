@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.choices import LABEL_SEED, LabelChoice, check_growing, check_point, is_label_seed
@@ -33,12 +34,12 @@ SCAN_GATE_FAILED, GATE_FAILED = 7, 8
 
 def _describe_purpose(purpose: Purpose) -> str:
     """Describe a purpose by the options that it stands for."""
-    options = [
-        f"--{field.replace('_', '-')}"
-        + ("" if value is True else f" {' '.join(value)}" if isinstance(value, tuple) else f" {value}")
-        for field, value in purpose.settings.items()
-    ]
-    return f"{purpose.name}: {' '.join(options)}: {purpose.description}".replace("%", "%%")
+    words = []
+    for field, value in purpose.settings.items():
+        words.append(f"--{field.replace('_', '-')}")
+        if value is not True:
+            words += value if isinstance(value, tuple) else [f"{value}"]
+    return f"{purpose.name}: {' '.join(words)}: {purpose.description}".replace("%", "%%")
 
 
 def _parse_seed(text: str) -> str | tuple[float, ...]:
@@ -56,6 +57,13 @@ def _parse_seed(text: str) -> str | tuple[float, ...]:
 def name_level(level: float | Sequence[float]) -> str:
     """Write an iso value or a range as text: ``200``, ``100:300``."""
     return ":".join(f"{value:g}" for value in level) if isinstance(level, Sequence) else f"{level:g}"
+
+
+_inside_option = partial(option, group="inside")
+_method_option = partial(option, group="method")
+_selection_option = partial(option, group="selection")
+_files_option = partial(option, group="files")
+_refinement_option = partial(option, group="refinement")
 
 
 @dataclass(frozen=True)
@@ -93,19 +101,16 @@ class MeshSettings(InputSettings):
     )
     preset: str | None = preset_option()
     half_way: str | Sequence[float] | None = None
-    keep_outside: bool = option("--keep-outside", "with --below: leave the air round the patient in", group="inside")
-    solid: bool = option(
+    keep_outside: bool = _inside_option("--keep-outside", "with --below: leave the air round the patient in")
+    solid: bool = _inside_option(
         "--solid",
         "fill what the bone encloses: marrow, and canals that the ends of the scan cut; the brain, the chest and air"
         " stay out; with --labels: what is less dense within a label",
-        group="inside",
         action="yes-no",
         first=True,
     )
-    seal_mm: float | None = option(
-        "--seal MM",
-        "with --solid: close pores up to twice as wide, less one voxel (default: 2.5 to 3, by the voxels)",
-        group="inside",
+    seal_mm: float | None = _inside_option(
+        "--seal MM", "with --solid: close pores up to twice as wide, less one voxel (default: 2.5 to 3, by the voxels)"
     )
     surface: str = option(
         "--surface hu|cortex|mask",
@@ -127,81 +132,69 @@ class MeshSettings(InputSettings):
         words=("separated", "trilinear"),
     )
     closed: bool = closed_option()
-    method: MethodName | None = option(
+    method: MethodName | None = _method_option(
         f"--method {'|'.join(METHOD_NAMES)}",
         "t-mc: every cell (default); i-mc: only what hangs together with seeds; g-mc: t-mc, then quadric collapse"
         " without a bound; s-mc: t-mc, then decimation within a bound; t-mc-soup, skimage: on the CPU, to compare with",
-        group="method",
         parse=str.lower,
     )
-    grow_from: Sequence[str | Sequence[float]] = option(
+    grow_from: Sequence[str | Sequence[float]] = _method_option(
         "--grow-from auto|X,Y,Z|label:NAME",
         "seeds of i-mc: auto takes the parts with at least 1/20 of the cells of the largest; a point in mm of the"
         " frame of --space, at most 10 mm from the surface; a label of --labels. May be given again",
-        group="method",
         default=(),
         parse=_parse_seed,
         action="append",
     )
-    vertex_rule: VertexRule = option(
+    vertex_rule: VertexRule = _method_option(
         "--vertex-rule linear|golden|golden-search",
         "where on an edge a vertex lies: linear (default); golden: at 0.618 whatever the HU, up to 0.6 voxels off;"
         " golden-search: where a cubic crosses the iso value, no better than linear",
-        group="method",
         default="linear",
         parse=str.lower,
     )
-    keep: str | None = option(
+    keep: str | None = _selection_option(
         "--keep bone",
         "bone: keep the components whose walls look like bone, not heart and vessels with contrast medium, nor a table",
-        group="selection",
         parse=str.lower,
     )
-    keep_largest: int | None = option(
-        "--keep-largest N", "keep the N largest components only", group="selection", first=True
+    keep_largest: int | None = _selection_option("--keep-largest N", "keep the N largest components only", first=True)
+    min_volume_ml: float | None = _selection_option(
+        "--min-volume ML", "keep components of at least ML millilitres only", first=True
     )
-    min_volume_ml: float | None = option(
-        "--min-volume ML", "keep components of at least ML millilitres only", group="selection", first=True
-    )
-    seeds: Sequence[Sequence[float]] = option(
+    seeds: Sequence[Sequence[float]] = _selection_option(
         "--seed X,Y,Z",
         "keep the component whose surface lies nearest to this point, in mm of the frame of --space; repeat it for"
         " several",
-        group="selection",
         default=(),
         parse=parse_point,
         action="append",
     )
-    all_parts: bool = option(
+    all_parts: bool = _files_option(
         "--all-parts",
         "with --for print: keep all bones, not the largest alone; named objects of a .3mf, one mesh in other formats",
-        group="files",
     )
-    split: bool = option("--split", "write one file a component, the largest first", group="files")
-    one_file: bool = option(
+    split: bool = _files_option("--split", "write one file a component, the largest first")
+    one_file: bool = _files_option(
         "--one-file",
         f"labels, components of --split or several iso values in one file ({OBJECT_FILES}), each an object with its"
         " name and a colour of its own",
-        group="files",
     )
     labels: LabelChoice | None = None
-    smooth: int | None = option(
+    smooth: int | None = _refinement_option(
         "--smooth N",
         f"smooth with N iterations of a windowed sinc filter (default: {_ITERATIONS})",
-        group="refinement",
         nargs="?",
         const=_ITERATIONS,
     )
-    decimate: float | None = option(
+    decimate: float | None = _refinement_option(
         "--decimate SHARE",
         "take away this share of the triangles, such as 0.9, or as much as the largest deviation lets",
-        group="refinement",
         first=True,
     )
-    max_deviation_mm: float | None = option(
+    max_deviation_mm: float | None = _refinement_option(
         "--max-deviation MM",
         "smoothing and decimation each move nothing further (default: a quarter of the shortest voxel step)",
-        group="refinement",
     )
     strict: bool = option(
         "--strict",

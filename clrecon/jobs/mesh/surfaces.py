@@ -77,7 +77,7 @@ class Part:
     bones: Bones | None = None
 
 
-def plan_surfaces(levels: Sequence[float | tuple[float, ...]], below: bool = False) -> list[Surface]:
+def plan_surfaces(levels: Sequence[float | tuple[float, ...]], *, below: bool = False) -> list[Surface]:
     """Plan one surface for each iso value or range (HU), in order; without any, the surface of a mask."""
     if len(levels) < 2:
         return [Surface("", levels[0] if levels else None, below=below)]
@@ -144,7 +144,6 @@ def choose_level(volume: Volume, settings: MeshSettings, progress: Progress = ig
 def describe_level(
     volume: Volume, settings: MeshSettings, choice: IsoChoice | None
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the entries of the report, and warnings."""
     if not settings.follows_hu:
         return {"iso_value_reason": "none: the masks of the labels", "iso_value_choice": None}, []
     if choice is None:

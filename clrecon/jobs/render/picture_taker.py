@@ -95,7 +95,6 @@ class PictureTaker(Closing):
         self._box: Grid | None = None
 
     def close(self) -> None:
-        """Free the memory of the device."""
         self._stack.close()
 
     @property
@@ -126,7 +125,6 @@ class PictureTaker(Closing):
 
     @property
     def lighting(self) -> Lighting | None:
-        """The light of shaded pictures, None in modes without shading."""
         shaded = VolumeLook | SurfaceLook | PointLook | MeshLook
         return self.style.light if isinstance(self.style, shaded) else None
 

@@ -92,9 +92,9 @@ def find_emptiness(picture: Rendering) -> str | None:
         )
     is_water = picture.mode == "drr"
     low, high = picture.report.get("window_mm_water" if is_water else "window_hu") or (-np.inf, np.inf)
-    shade = "black" if values.max() <= low else "white" if values.min() >= high else None
-    if shade is None:
+    if not (values.max() <= low or values.min() >= high):
         return None
+    shade = "black" if values.max() <= low else "white"
     shown, unit = f"{values.min():g} to {values.max():g}", "mm of water" if is_water else "HU"
     kept = picture.mode == "minip" and "left_out" not in picture.report
     air = f": the air round the body is the lowest, do not keep it ({name_parameter('keep_air')})" if kept else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.boxes import CROPS, Box, crop_box
 from clrecon.geometry.grid import Grid
-from clrecon.jobs.options import InputSettings, label_map_option, parse_label_color
+from clrecon.jobs.options import InputSettings, label_color_option, label_map_option, mesh_space_option
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import COLORS as COLORS
 from clrecon.rendering.looks.colors import find_color
@@ -53,7 +54,6 @@ _CALLED = {"light": "lighting", "labels": "labels", "clip_planes": "clip"}
 
 
 def _parse_size(text: str) -> tuple[int, int]:
-    """Read ``512`` or ``512x384`` as width and height."""
     parts = text.lower().split("x")
     try:
         width, height = (int(part) for part in (parts if len(parts) == 2 else (*parts, *parts)))
@@ -96,6 +96,9 @@ def _parse_label_opacity(text: str) -> tuple[str, float]:
     return label, opacity
 
 
+_camera_option = partial(option, group="camera")
+
+
 @dataclass(frozen=True)
 class Turntable:
     """Settings of a turntable, a moving picture of a turning volume."""
@@ -110,13 +113,7 @@ class LabelLook:
     """A label map and the look of its labels, by number or name; of opacities "0" is for all that has no label."""
 
     path: str = label_map_option(default=MISSING)
-    colors: Mapping[str, str] = option(
-        "--label-color LABEL=COLOUR",
-        "colour of a label, by name or number; may be given again",
-        default=(),
-        parse=parse_label_color,
-        action="append",
-    )
+    colors: Mapping[str, str] = label_color_option(", by name or number")
     opacities: Mapping[str, float] = option(
         "--label-opacity LABEL=SHARE",
         "factor on the opacity of a label, 0 to 1, label 0 is all without a label; over slices the share of its colour"
@@ -181,58 +178,44 @@ class RenderSettings(InputSettings):
     curve: str | None = None
     labels: LabelLook | None = None
     meshes: Sequence[MeshFile] = ()
-    mesh_space: Space | None = option(
-        "--mesh-space lps|ras",
-        "patient frame of meshes whose files do not name theirs (default: lps, with a warning)",
-        group="meshes",
-    )
+    mesh_space: Space | None = mesh_space_option("meshes whose files do not name theirs", "meshes")
     light: str | Sequence[float] | None = None
-    views: Sequence[str] = option(
+    views: Sequence[str] = _camera_option(
         "--view V[,V...]|AZ,EL",
         f"where the camera stands: {', '.join(VIEWS)}; or degrees from anterior to the patient's left and to the head;"
         " of slices also axial, coronal, sagittal (default: anterior; of mode slice axial, of slices 30,30, of cpr"
         " left); several make a picture each: out_left.png; may be given again",
-        group="camera",
         default=(),
         parse=_parse_views,
         action="append",
         first=True,
         words=(*DIRECTIONS, *PLANES),
     )
-    up: str | Sequence[float] | None = option(
-        "--up SIDE|X,Y,Z",
-        "what is at the top (default: superior, else anterior)",
-        group="camera",
-        parse=parse_direction,
+    up: str | Sequence[float] | None = _camera_option(
+        "--up SIDE|X,Y,Z", "what is at the top (default: superior, else anterior)", parse=parse_direction
     )
-    zoom: float = option("--zoom F", "2 shows everything twice as large", group="camera", default=1.0)
-    center: Sequence[float] | None = option(
+    zoom: float = _camera_option("--zoom F", "2 shows everything twice as large", default=1.0)
+    center: Sequence[float] | None = _camera_option(
         "--center X,Y,Z",
         "LPS mm in the middle of the picture, of a slice too (default: the middle of what is shown)",
-        group="camera",
         parse=numbers_reader(3, "is not a place X,Y,Z in LPS mm, such as -12,40,310"),
     )
-    size: tuple[int, int] | None = option(
-        "--size W[xH]", "pixels of the picture (default: 1024x1024)", group="camera", parse=_parse_size, first=True
+    size: tuple[int, int] | None = _camera_option(
+        "--size W[xH]", "pixels of the picture (default: 1024x1024)", parse=_parse_size, first=True
     )
-    view_angle: float | None = option(
+    view_angle: float | None = _camera_option(
         "--perspective DEGREES",
         f"perspective of so many degrees from bottom to top ({DEFAULT_VIEW_ANGLE:g} without a number; default:"
         " parallel)",
-        group="camera",
         nargs="?",
         const=DEFAULT_VIEW_ANGLE,
     )
-    background: str = option(
-        "--background C",
-        "colour, such as white or #102030, or transparent",
-        group="camera",
-        default="black",
-        words=COLORS,
+    background: str = _camera_option(
+        "--background C", "colour, such as white or #102030, or transparent", default="black", words=COLORS
     )
-    letters: bool = option("--letters", "draw the sides of the patient: L, R, A, P, S, I", group="camera")
-    scale_bar: bool = option("--scale-bar", "draw a bar of a round length in mm", group="camera")
-    caption: str | None = option("--caption TEXT", "draw a line of text at the top left", group="camera")
+    letters: bool = _camera_option("--letters", "draw the sides of the patient: L, R, A, P, S, I")
+    scale_bar: bool = _camera_option("--scale-bar", "draw a bar of a round length in mm")
+    caption: str | None = _camera_option("--caption TEXT", "draw a line of text at the top left")
     turntable: Turntable | None = None
 
     @classmethod
@@ -371,7 +354,6 @@ class RenderSettings(InputSettings):
 
     @property
     def files_read(self) -> tuple[str, ...]:
-        """Files that the job reads in addition to the scan."""
         function = self.transfer_function or ""
         curve = "" if self.curve in (None, *SPINES) else self.curve
         look = "" if self.labels is None else self.labels.path
@@ -386,7 +368,7 @@ class RenderSettings(InputSettings):
             looks = [replace(look, lighting=lighting) for look in looks]
         return looks
 
-    def camera(self, volume: Grid, view: str, turning: bool = False) -> Camera:
+    def camera(self, volume: Grid, view: str, *, turning: bool = False) -> Camera:
         """Place the camera of one view; with `turning` the whole volume stays in it while the camera orbits."""
         if isinstance(self.style, PlaneCut):
             return find_plane(volume, view, self.size_used, zoom=self.zoom, up=self.up, center=self.center)

@@ -47,10 +47,7 @@ class _ShownInput:
 def write_view(
     inputs: Sequence[str | Path], output: str | Path, settings: ViewSettings | None = None, **how: Any
 ) -> ViewReport:
-    """Write a page that shows scans and meshes together, each in its place.
-
-    One mesh without labels is divided into its components, which can be switched; of several meshes each is a part.
-    """
+    """Write a page of scans and meshes, each in its place; one mesh alone is divided into its components."""
     settings = settings or ViewSettings()
     with Run(settings.scan, **how) as run:
         _check_inputs(inputs, output, settings)

@@ -244,10 +244,7 @@ def _summarise(distances: Float64Array, unit_mm: float = 1.0) -> DistanceSummary
 
 
 def _find_near_metal(volume: Volume, rule: IsoRule, points: Float64Array) -> NDArray[np.bool_]:
-    """Return which points have a voxel above `METAL_HU` within `METAL_REACH` voxels along each axis.
-
-    None has where the level itself is one of metal: the surface is that of an implant then, or values are no HU.
-    """
+    """Return which points have a voxel above `METAL_HU` within `METAL_REACH`; none at a level of metal."""
     near = np.zeros(len(points), np.bool_)
     if max(rule.levels) >= METAL_HU or volume.hu_range is None or volume.hu_range[1] <= METAL_HU:
         return near

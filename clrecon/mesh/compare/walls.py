@@ -66,7 +66,9 @@ class Walls:
 def sample_walls(vertices: NDArray[np.floating], normals: NDArray[np.floating], volume: Volume, rule: IsoRule) -> Walls:
     """Sample values below the vertices (n, 3) of a mesh that was extracted from a volume, along their normals."""
     points, inward = vertices.astype(np.float64), -normals.astype(np.float64)
-    longer = np.maximum(_step_along(inward, volume), 1.0)
+    # mm from one plane of voxels to the next, for the axis crossed soonest
+    steps = inward @ np.linalg.inv(volume.affine[:3, :3]).T
+    longer = np.maximum(1.0 / np.maximum(np.abs(steps).max(axis=1), 1e-9), 1.0)
 
     def look_beneath(depths_mm: Sequence[float], times: NDArray[np.float64]) -> NDArray[np.float64]:
         ways = (points + (depth * times)[:, None] * inward for depth in depths_mm)
@@ -77,12 +79,6 @@ def sample_walls(vertices: NDArray[np.floating], normals: NDArray[np.floating], 
     low, high = deep.min(axis=0), deep.max(axis=0)
     flat = (wall < COMPACT_HU) & (low > rule.iso_level) & (high - low < FLAT_HU)
     return Walls(points, wall, flat, max(NEAR_MM, NEAR_STEPS * max(volume.spacing)))
-
-
-def _step_along(directions: NDArray[np.float64], volume: Volume) -> NDArray[np.float64]:
-    """Return the mm along unit vectors (n, 3) from one plane of voxels to the next, for the axis crossed soonest."""
-    steps = directions @ np.linalg.inv(volume.affine[:3, :3]).T
-    return np.asarray(1.0 / np.maximum(np.abs(steps).max(axis=1), 1e-9))
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +169,9 @@ def find_rails(
     ends = np.searchsorted(label_of_vertex[order], np.arange(len(chosen) + 1))
     for one in np.flatnonzero(chosen):
         rows = order[ends[one] : ends[one + 1]]
-        rails[one] = _is_rail(volume.lps_to_ijk(mesh.vertices[rows].astype(np.float64)), volume.spacing, last)
+        # it is blurred by about a voxel
+        width = _measure_section(volume.lps_to_ijk(mesh.vertices[rows].astype(np.float64)), volume.spacing, last)
+        rails[one] = width is not None and bool((width - volume.spacing[:2]).min() <= RAIL_MM)
     return rails
 
 
@@ -183,12 +181,6 @@ def is_straight(points: NDArray[np.float64], volume: Volume) -> bool:
     if last * volume.spacing[2] < STRAIGHT_MM:
         return False
     return _measure_section(volume.lps_to_ijk(points), volume.spacing, last) is not None
-
-
-def _is_rail(points: NDArray[np.float64], spacing: tuple[float, float, float], last: int) -> bool:
-    """True for a cross section that is thin and equal from the first slice to the last; points in index coordinates."""
-    width = _measure_section(points, spacing, last)
-    return width is not None and bool((width - spacing[:2]).min() <= RAIL_MM)  # it is blurred by about a voxel
 
 
 def _measure_section(

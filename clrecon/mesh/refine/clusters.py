@@ -211,7 +211,7 @@ class Clusters:
         is_elsewhere = (self._places[names] != self._original[names]).any(axis=2)
         return np.asarray(((names != corners) | is_elsewhere).any(axis=1))
 
-    def find_faults(self, everywhere: bool = False) -> IntArray:
+    def find_faults(self, *, everywhere: bool = False) -> IntArray:
         """Find the names of clusters that have spoilt the surface.
 
         These are clusters at non-manifold edges and vertices, at faces without area or doubled, at places that two
@@ -258,7 +258,6 @@ class Clusters:
         return *self._components, self._is_border
 
     def compare_topology(self) -> TopologyChange:
-        """Compare the topology of the present surface with that of the given one."""
         count, labels = self._components
         return compare_topology(self._topology, measure_topology(self.faces(), labels, count))
 

@@ -156,7 +156,11 @@ def _collapse_in_rounds(
             share = max(wanted / left, _FIRST_SHARE)
             _collapse(clusters, share, bound, _FIRST_ERROR, _FIRST_AGGRESSIVENESS)
             collapsed = clusters.collapsed_count
-            _mend_roughly(clusters, deviation)
+            # the rest of the faults is left to the next round
+            for _ in range(_ROUGH_TURNS):
+                clusters.undo(clusters.find_faults())
+                if not clusters.undo(clusters.find_left_behind(deviation)):
+                    break
             taken_back += collapsed - clusters.collapsed_count
             left, rounds = len(clusters.faces()), 1
         if left > wanted:
@@ -210,14 +214,6 @@ def _mend(clusters: Clusters, deviation: Deviation, tell: Callable[[], None] = l
         if clusters.undo(clusters.find_crossing()):
             continue
         if not clusters.undo(clusters.find_faults(everywhere=True)):
-            break
-
-
-def _mend_roughly(clusters: Clusters, deviation: Deviation) -> None:
-    """Undo collapses where there are faults or vertices beyond the bound; the rest is left to the next round."""
-    for _ in range(_ROUGH_TURNS):
-        clusters.undo(clusters.find_faults())
-        if not clusters.undo(clusters.find_left_behind(deviation)):
             break
 
 

@@ -131,10 +131,7 @@ def _gates_of_topology(found: TopologyChange) -> list[Gate]:
 def measure_farthest(
     mesh: Mesh, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], also: NDArray[np.integer] | None = None
 ) -> float:
-    """Return the largest distance found between a mesh and another surface, in mm.
-
-    also: Vertices of the mesh to measure from besides points that cover each surface evenly; default: all.
-    """
+    """Return the largest distance in mm, from vertices `also` (default: all) and points that cover both surfaces."""
     origin = local_origin(mesh.vertices)
     before, after = mesh.vertices - origin, vertices - origin
     seen = np.concatenate([sample_surface(before, mesh.triangles), before if also is None else before[also]])

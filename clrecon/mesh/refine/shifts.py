@@ -85,10 +85,7 @@ def enclosed_mm3(
     vertices: Float64Array, triangles: NDArray[np.uint32], count: int, labels: NDArray[np.int64],
     cross_of: Float64Array | None = None,
 ) -> Float64Array:  # fmt: skip
-    """Return the volume of each component, shape (count,), as `Volumes` has it; vertices in mm from a point near them.
-
-    cross_of: ndarray, shape (3, m). Gets the cross product of each triangle's edges, mm2.
-    """
+    """Return the volume of each component, vertices in mm near 0; `cross_of` (3, m) gets the cross products."""
     six_volumes = np.zeros(count)
     for where, corner, cross in cross_products(vertices, triangles, np.zeros(3), max(count, 1 << 14)):
         six_volumes += np.bincount(labels[triangles[where, 0]], np.einsum("ij,ij->j", corner, cross), count)
@@ -189,10 +186,7 @@ def move_vertices(
 
 
 class _Near:
-    """Search for what is spoilt around vertices that were taken back, among the triangles that can touch theirs.
-
-    vertices, moved: mm. Where vertices were, and are; between two calls of `find_spoilt` some go back on their way.
-    """
+    """Search for what is spoilt around vertices that were taken back, from `moved` towards `vertices`, in mm."""
 
     def __init__(
         self, vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans

@@ -54,7 +54,6 @@ class TopologyChange(Record):
 def measure_topology(
     triangles: NDArray[np.uint32], labels: NDArray[np.int64], count: int, edges: Edges | None = None
 ) -> Topology:
-    """Measure the Euler number of each component."""
     edges = find_edges(triangles, len(labels)) if edges is None else edges
     used = np.zeros(len(labels), dtype=bool)
     used[triangles.reshape(-1)] = True

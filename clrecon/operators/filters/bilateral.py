@@ -113,11 +113,6 @@ TAPS_A_LAUNCH = 1 << 32
 """Taps of all voxels of a launch: about a second of work, after which progress is told."""
 
 
-def prepare_bilateral(device: Device, dtype: DTypeLike = np.int16) -> Program:
-    variants = {**voxel_variants(dtype), "LANES": device.kernel_variants["LANES"]}
-    return load_program(device, "filters/bilateral.cl", variants)
-
-
 @explains_arguments
 def filter_bilateral(
     volume: VolumeKind,
@@ -291,7 +286,8 @@ class _Run:
     def run(self, slices: int) -> Filtered:
         device, stopwatch = self.resident.device, self.stopwatch
         with stopwatch.timed("build"):
-            self.program = prepare_bilateral(device, self.dtype)
+            variants = {**voxel_variants(self.dtype), "LANES": device.kernel_variants["LANES"]}
+            self.program = load_program(device, "filters/bilateral.cl", variants)
             if self.settings.near is not None:
                 prepare_near_level(device, self.dtype)
         window = self.window

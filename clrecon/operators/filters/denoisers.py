@@ -39,9 +39,7 @@ _INSTALLED_AS = {"skimage": "scikit-image"}
 
 @dataclass(frozen=True)
 class _Denoiser:
-    """A filter of the module `package`: `run` takes it, the volume and all parameters, and returns voxels as floats,
-    and what it used.  With `needs_grid` it takes the volume for a grid at right angles with even steps.
-    """
+    """A filter of the module `package`: `run` returns voxels as floats and its facts; it may need an even grid."""
 
     package: str
     defaults: dict[str, Any]

@@ -126,7 +126,6 @@ def _lattice(box: NDArray[np.int64]) -> NDArray[np.int32]:
 
 
 def _exponents(volume: Volume, offsets: NDArray[np.int32], sigma_mm: float) -> Float64Array:
-    """Return the logarithms of the weights, (tables, n)."""
     per_square = -1.0 / (2.0 * math.log(2.0) * sigma_mm * sigma_mm)
     if not volume.uneven or not offsets[:, 2].any():
         return per_square * _squares(offsets, volume.affine[:3, :3])[None]

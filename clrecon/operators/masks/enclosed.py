@@ -1,7 +1,4 @@
-"""Solid bodies without labels: what bone encloses, its marrow, joins the voxels of the bone.
-
-Spaces that a mask encloses are measured first: which they are, how large and how wide, and what HU they hold.
-"""
+"""Solid bodies without labels: what bone encloses joins the bone; its spaces are measured first."""
 
 from __future__ import annotations
 

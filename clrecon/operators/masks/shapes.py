@@ -89,7 +89,10 @@ def whole_ball_of(volume: Volume, radius: float, *, by_slice: bool = False) -> S
 
 def _checked(ball: Stencil, volume: Volume, radius: float, by_slice: bool) -> Stencil:
     if by_slice:
-        ball = _flat(ball)
+        # the rows of each voxel's own slice
+        own = ball.rows[:, 1] == 0
+        before = np.concatenate([[0], np.cumsum(own)]).astype(np.int32)
+        ball = replace(ball, rows=ball.rows[own], tables=before[ball.tables])
     visits = float((ball.tables[:, 1] - ball.tables[:, 0]).sum(dtype=np.int64)) * volume.shape_ijk[1]
     if visits > MOST_VISITS:
         raise UsageError(
@@ -97,13 +100,6 @@ def _checked(ball: Stencil, volume: Volume, radius: float, by_slice: bool) -> St
             " choose a smaller radius"
         )
     return ball
-
-
-def _flat(ball: Stencil) -> Stencil:
-    """Return the rows of each voxel's own slice."""
-    own = ball.rows[:, 1] == 0
-    before = np.concatenate([[0], np.cumsum(own)]).astype(np.int32)
-    return replace(ball, rows=ball.rows[own], tables=before[ball.tables])
 
 
 def _split(rows: NDArray[np.int32], most: int | None) -> NDArray[np.int32]:
@@ -419,7 +415,7 @@ class MaskComponents(MaskShapes):
     """A mask whose components are looked at; what `clrecon.Mask` is made of."""
 
     @explains_arguments
-    def fill_holes(self: ComponentMask, by_slice: bool = False) -> ComponentMask:
+    def fill_holes(self: ComponentMask, *, by_slice: bool = False) -> ComponentMask:
         """Choose the voxels that chosen ones enclose too.
 
         Enclosed is what no way over faces of voxels that are not chosen joins with the border of the volume.

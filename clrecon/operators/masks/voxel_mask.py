@@ -263,7 +263,6 @@ def combine(device: Device, a_d: Any, b_d: Any, shape_ijk: tuple[int, int, int],
 
 
 def invert(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int]) -> Any:
-    """Return the words of the voxels that are not set."""
     words, rows = _words(shape_ijk)
     inverted_d = allocate(device, 4 * words * rows)
     launch(
@@ -274,7 +273,6 @@ def invert(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int]) -> Any:
 
 
 def count_bits(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int]) -> int:
-    """Return the number of set voxels."""
     words, rows = _words(shape_ijk)
     counts, counts_d = empty_output(device, (rows,), np.uint32)
     launch(device, prepare_logic(device)["count_row_bits"], rows, mask=mask_d, counts=counts_d, rows=rows, words=words)

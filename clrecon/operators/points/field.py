@@ -224,10 +224,7 @@ class FieldSettings:
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """The nodes of a field: whole bricks (x, y, z), at least B and a spacing beyond the points on each side.
-
-    `corner` is node (0, 0, 0) in mm, float32, relative to `base`, (3,) float64, LPS mm, as of the grid.
-    """
+    """Nodes of a field: bricks (x, y, z) around the points; `corner`, float32 mm, is relative to `base`, LPS mm."""
 
     corner: NDArray[np.float32]
     base: NDArray[np.float64]
@@ -339,7 +336,6 @@ class NodeField:
 
     @property
     def bricks(self) -> int:
-        """Number of bricks that points reach."""
         return len(self._list)
 
     def _kept(self, n: int) -> dict[str, int]:
@@ -451,7 +447,6 @@ class NodeField:
         del self.grid, self._normals_d
 
     def release(self) -> None:
-        """Free everything on the device."""
         del self._values, self._list_d, self.masks
 
     def fill(self, signs: Signs, progress: Callable[[int, int], None] | None = None) -> NDArray[np.float32]:

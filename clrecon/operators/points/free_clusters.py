@@ -161,10 +161,7 @@ def find_clusters(
     memory: int | None = None,
     progress: Progress = ignore_progress,
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], int, int]:
-    """Return labels, cores, and the number of clusters and of cells of a plan that `plan_cells` made for `eps`.
-
-    The result does not depend on `per_chunk`, the cells of a chunk, a multiple of `CELLS_AN_ITEM`.
-    """
+    """Return labels, cores, numbers of clusters and cells of a plan; equal for any `per_chunk` of `CELLS_AN_ITEM`."""
     n = len(plan.points)
     needs = {**plan.needs(device), "clusters": 23 * n}
     require_room(memory_limits(device, memory), needs, "the clusters of the points cannot be found")

@@ -73,7 +73,6 @@ class GridPlan:
 
     @property
     def words(self) -> int:
-        """Words of 32 cells in a row along x."""
         return -(-self.shape[0] // 32)
 
     @property
@@ -94,22 +93,17 @@ class GridPlan:
 
 @dataclass(frozen=True, eq=False)
 class PointGrid:
-    """A grid over points on a device: cubic cells, the points sorted by cell; cl/points/grid.h shows how it is read.
+    """A grid over `n` points on a device: cubic cells, points sorted by cell; cl/points/grid.h shows how it is read.
 
-    n: Number of points.
     edge: mm, a float32.
-    origin: ndarray, shape (3,), float64. LPS mm of the corner of cell (0, 0, 0).
-    base: ndarray, shape (3,), float64. LPS mm; coordinates on the device are relative to it.
+    origin: (3,), float64. LPS mm of the corner of cell (0, 0, 0).
+    base: (3,), float64. LPS mm; coordinates on the device are relative to it.
     shape: (nx, ny, nz). Number of cells; at most 2^31 in all, and 2^17 along an axis.
-    words: Words of 32 cells in a row along x.
-    mask_d: buffer, (nz, ny, words) uint32. A bit for each cell with points.
-    ranks_d: buffer, (nz, ny, words) uint32. Number of cells with points before each word.
-    cells: Number of cells with points.
-    starts_d: buffer, (cells + 1,) uint32. First sorted point of each cell with points, then `n`.
-    order_d: buffer, (n,) uint32. Number of the point at each place of the sorted order; those of a cell as in the
-        input.
-    x_d, y_d, z_d: buffer, (n + PADDING,) float32. Sorted coordinates in mm relative to `base`; the last ones are
-        undefined, so that a vector can be read from any point on.
+    mask_d: (nz, ny, words) uint32. A bit for each cell with points; `words` of 32 cells in a row along x.
+    ranks_d: (nz, ny, words) uint32. Number of cells with points before each word; of all cells `cells`.
+    starts_d: (cells + 1,) uint32. First sorted point of each cell with points, then `n`.
+    order_d: (n,) uint32. Number of the point at each place of the sorted order; those of a cell as in the input.
+    x_d, y_d, z_d: (n + PADDING,) float32. Sorted mm relative to `base`; a vector can be read from any point on.
     """
 
     device: Device

@@ -27,7 +27,6 @@ from clrecon.opencl import (
 from clrecon.operators.points.grid import (
     MOST_CELLS_ALONG,
     MOST_PAIRS,
-    GridPlan,
     PointGrid,
     fill_grid,
     find_box,
@@ -214,7 +213,9 @@ class NeighbourSearch:
             self._program = load_program(device, "points/neighbours.cl", {"LANES": lanes})
         with stopwatch.running(device):
             self.grid = fill_grid(device, plan, memory=memory)
-        self._margin = _rounding_of(plan)
+        # beyond the rounding of a cell's faces and of distances to them
+        extent = np.abs(plan.corner).max() + float(plan.edge) * max(plan.shape)
+        self._margin = ROUNDING * float(extent)
         starts = download(device, np.empty(self.grid.cells + 1, np.uint32), self.grid.starts_d)
         _check_pairs(self.grid, starts)
         self.parts = _split(starts, self._part_points)
@@ -254,12 +255,6 @@ class NeighbourSearch:
                 yield part
             done += part.place_count
             progress(stage, done, self.grid.n)
-
-
-def _rounding_of(plan: GridPlan) -> float:
-    """Return a length in mm beyond the rounding of a cell's faces and of distances to them."""
-    extent = np.abs(plan.corner).max() + float(plan.edge) * max(plan.shape)
-    return ROUNDING * float(extent)
 
 
 def _split(starts: NDArray[np.uint32], points: int) -> list[Part]:

@@ -79,18 +79,9 @@ def prepare_voxels(device: Device, dtype: DTypeLike, labels: DTypeLike | None = 
     return load_program(device, "points/emit.cl", {**voxel_variants(dtype), **device.kernel_variants, **own})
 
 
-def _double_float(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return numbers as the nearest float32 and the rest, on a new axis before the last."""
-    nearest = values.astype(np.float32).astype(np.float64)
-    return np.stack([nearest, values - nearest], axis=-2)
-
-
 @dataclass
 class VoxelEmission:
-    """The points of one volume, slab by slab, with fewer slices in a slab if the device has no room for more.
-
-    `marked` voxels are in the band, before labels and shells take some away; positions are counted from `origin`.
-    """
+    """The points of a volume, slab by slab; `marked` voxels are in the band; positions count from `origin`."""
 
     resident: DeviceVolume
     selection: Selection
@@ -107,7 +98,9 @@ class VoxelEmission:
         places = volume.slice_origins()
         if self.selection.paper:
             places = np.broadcast_to(places[0], places.shape)
-        self._origins = pad4(_double_float(places if self.origin is None else places - self.origin))
+        values = places if self.origin is None else places - self.origin
+        nearest = values.astype(np.float32).astype(np.float64)
+        self._origins = pad4(np.stack([nearest, values - nearest], axis=-2))
         self._steps = pad4(np.stack([part for step in (0, 1) for part in split_steps(volume.affine[:3, step])]))
         self._next = 0
         self._parts: list[Points] = []
@@ -132,11 +125,6 @@ class VoxelEmission:
             return _join(self._parts)
         except MemoryError as error:
             raise DeviceError(f"the cloud does not fit the memory of this computer: {error}") from error
-
-    def _around(self, first: int, end: int) -> tuple[int, int]:
-        """Slices that a slab reads: those of a shell need their neighbours."""
-        border = int(self.selection.shell)
-        return max(first - border, 0), min(end + border, self.volume.shape_ijk[2])
 
     def needs(self, slices: int, points: int = 0) -> dict[str, int]:
         """Return the bytes of every buffer of a slab in the middle of the volume, by description."""
@@ -183,7 +171,9 @@ class VoxelEmission:
 
     def _one_slab(self, first: int, end: int) -> tuple[Points, int]:
         device, stopwatch, (ni, nj, nk) = self.resident.device, self.stopwatch, self.volume.shape_ijk
-        begin, stop = self._around(first, end)
+        # slices of a shell need their neighbours
+        border = int(self.selection.shell)
+        begin, stop = max(first - border, 0), min(end + border, self.volume.shape_ijk[2])
         is_whole = (begin, stop) == (0, nk)
         voxels_d = self.resident.whole(stopwatch) if is_whole else self.resident.part(begin, stop, stopwatch)
         words, rows = -(-ni // 32), (end - first) * nj

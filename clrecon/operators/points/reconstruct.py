@@ -1,7 +1,4 @@
-"""A closed surface from a cloud with normals.
-
-Where it is a wall that no points support, `find_walls` says what holes in the cloud leave of it.
-"""
+"""A closed surface from a cloud with normals; `find_walls` finds where no points support it."""
 
 from __future__ import annotations
 
@@ -80,7 +77,8 @@ def find_walls(near: Words, negative: Words, inside: Words, nx: int) -> Walls:
     nz, ny, words = near.shape
     shape = (-(-nz // CUBE), -(-ny // CUBE), words)
     faces, walls, enclosed = np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(shape)
-    valid = _valid_bits(nx, words)
+    bits = np.arange(32 * words).reshape(words, 32) < nx
+    valid = np.packbits(bits, axis=1, bitorder="little").view(np.uint32).ravel()
     for layer, first in enumerate(range(0, nz, CUBE)):
         parts = [mask[first : first + CUBE + 1] for mask in (near, negative, inside)]
         places, normals, cubes = [], [], []
@@ -104,11 +102,6 @@ def find_walls(near: Words, negative: Words, inside: Words, nx: int) -> Walls:
 def count_bits(words: Words) -> int:
     """Return the number of set bits of a mask, layer by layer."""
     return sum(int(_BITS[layer.view(np.uint16)].sum(dtype=np.int64)) for layer in words)
-
-
-def _valid_bits(nx: int, words: int) -> Words:
-    bits = np.arange(32 * words).reshape(words, 32) < nx
-    return np.packbits(bits, axis=1, bitorder="little").view(np.uint32).ravel()
 
 
 def _compare(parts: list[Words], layers: int, valid: Words) -> Iterator[tuple[int, Words, Words, Words]]:
@@ -316,7 +309,6 @@ def _own_spacing(cloud: PointCloud) -> float:
 
 
 def _check_cloud(cloud: PointCloud) -> NDArray[np.float32]:
-    """Return the normals of a cloud as unit vectors."""
     if len(cloud) < FEWEST_POINTS:
         raise UsageError(f"the cloud has {len(cloud)} points: a closed surface needs at least {FEWEST_POINTS}")
     if cloud.normals is None:
@@ -358,8 +350,6 @@ def _choose_lengths(
 
 
 class _Reconstruction:
-    """One surface of a cloud on a device."""
-
     def __init__(
         self,
         cloud: PointCloud,

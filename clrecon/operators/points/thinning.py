@@ -140,8 +140,6 @@ def choose_edge(cloud: PointCloud, *, device: Device | str | int | None = None, 
 
 @dataclass(frozen=True, eq=False)
 class _Grown:
-    """What becomes of each point, and the figures of it."""
-
     removed: NDArray[np.uint8]
     facts: dict[str, Any]
 

@@ -182,10 +182,7 @@ class Between:
 
 
 class DrawnVolume(NamedTuple):
-    """A volume for a picture of layers, whose rays begin at `near_mm`, see `VIEW_NEAR` in cl/rays/view.h.
-
-    `sample` adds what it shows between two layers to the states of the rays, and waits; without a volume it is None.
-    """
+    """A volume for layers, rays from `near_mm`; `sample` adds it to the states between two layers; None: no volume."""
 
     device: Device
     sample: Callable[[Between], None] | None

@@ -64,10 +64,7 @@ _SHADINGS = {
 
 
 class SplatPicture(NamedTuple):
-    """A picture of points: (h, w, 4) uint8, and their depth, (h, w) float32, mm along the ray, NaN where none is.
-
-    `shading` is "none", "normals" or "depths"; the cloud went through the device in `parts`.
-    """
+    """A picture: (h, w, 4) uint8, depth (h, w) float32 mm, NaN: none; `shading` by what; the cloud's `parts`."""
 
     image: NDArray[np.uint8]
     depth: NDArray[np.float32]
@@ -91,16 +88,12 @@ def draw_splats(
     progress: Progress = ignore_progress,
     stopwatch: Stopwatch | None = None,
 ) -> SplatPicture:
-    """Draw each point as a disc that faces the camera; the nearest disc is seen.
+    """Draw each point, (n, 3) float32 mm from `base`, as a disc that faces the camera; the nearest disc is seen.
 
-    points: ndarray, shape (n, 3), float32. Mm from `base`, else the origin, finite; at most 2^32 - 2.
-    colors: ndarray, shape (n, 4), uint8. Red, green, blue, 255.
-    normals: ndarray, shape (n, 3), float32. Unit vectors, LPS.  Without them points are shaded by what lies around
-        them, see cl/rays/splats.cl.
+    colors: (n, 4) uint8. Red, green, blue, 255.
+    normals: (n, 3) float32. Unit vectors, LPS; without them points are shaded by what lies around them.
     radius_mm: Of the discs; on the picture it is at least 0.7 and at most 128 pixels.
-    lighting: One that does not shade leaves the colours as they are.
     memory: A cloud over it goes through in parts, and gives the same picture.
-    progress: Called as ``progress("points", done, total)``, a point counted for each of the three passes.
     """
     job = _Splats(device, camera, size, radius_mm, base, lighting or Lighting(), background, normals is not None)
     count = job.plan(len(points), memory)
@@ -130,7 +123,8 @@ class _Splats:
         has_normals: bool,
     ):
         self.device, self.size, self.radius, self.lighting = device, size, np.float32(radius_mm), lighting
-        self.shading = ("normals" if has_normals else "depths") if lighting.shades else "none"
+        shading = "normals" if has_normals else "depths"
+        self.shading = shading if lighting.shades else "none"
         self.table = eye_table(camera, size, lighting, np.zeros(3) if base is None else base)
         self.background = np.zeros(4, np.float32)
         if background is not None:

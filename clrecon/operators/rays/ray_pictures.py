@@ -70,13 +70,10 @@ class TransferTables:
     """A transfer function in tables for one ray step; buffers of (NODES,) float32 where nothing else is said.
 
     colors_d: int32. Red, green and blue, 10 bits each.
-    opacities_d, clears_d: Opacities over one ray step, and transparency of one of its `PARTS` parts.
-    changes_d: Sum of the changes of the opacity, up and down, from the first node to each node.
-    shown: ndarray, shape (NODES,), bool
-    steepness: Steepness of `opacities_d`.
+    opacities_d, clears_d: Opacities, `steepness` among them, over one step; transparency of one of its `PARTS`.
+    changes_d: Sum of the changes of the opacity, up and down, from the first node to each node; `shown` tells nodes.
     low, scale: Nearest node to v: ``floor((v - low) * scale + 0.5)``.
-    factors_d: buffer, (GRADIENT_NODES,). Factors on the opacity, by magnitude of the gradient times `factor_scale`;
-        used if it is `weighed`.
+    factors_d: (GRADIENT_NODES,). Factors on the opacity, by gradient times `factor_scale`; used if it is `weighed`.
     steps_per_unit: Number of ray steps in the unit distance.
     """
 

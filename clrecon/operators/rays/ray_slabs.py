@@ -34,7 +34,8 @@ def choose_brick_cells(volume: Volume) -> tuple[int, int, int]:
     """Return the cells of a brick along i, j, k: fewer along k where slices are farther apart than voxels in them."""
     di, dj, dk = volume.spacing
     across = dk / max(di, dj)
-    return BRICK_CELLS, BRICK_CELLS, 1 if across >= 3.0 else 2 if across >= 1.5 else BRICK_CELLS
+    along = 2 if across >= 1.5 else BRICK_CELLS
+    return BRICK_CELLS, BRICK_CELLS, 1 if across >= 3.0 else along
 
 
 GROWN = 2
@@ -186,7 +187,7 @@ def ray_slabs(resident: DeviceVolume, slices: int, entry_k: float, stopwatch: St
 
 
 def slab_labels(
-    resident: DeviceVolume, slab: RaySlab, labels: ResampledLabels, stopwatch: Stopwatch, grown: bool = False
+    resident: DeviceVolume, slab: RaySlab, labels: ResampledLabels, stopwatch: Stopwatch, *, grown: bool = False
 ) -> Any:
     """Return the labels of a slab's voxels on the device, grown by `GROWN` voxels or not; those of a whole one stay."""
 

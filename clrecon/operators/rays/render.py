@@ -141,5 +141,6 @@ def _styled(given: Any) -> tuple[Any, Style]:
         if len(given) != 2 or not isinstance(given[1], Style):
             raise UsageError("an object of a picture stands alone, or in a pair (object, style)")
         return given
-    own = MeshLook() if isinstance(given, Mesh) else PointLook() if isinstance(given, PointCloud) else VolumeLook()
-    return given, own
+    if isinstance(given, Mesh):
+        return given, MeshLook()
+    return given, PointLook() if isinstance(given, PointCloud) else VolumeLook()

@@ -73,10 +73,7 @@ class Still(NamedTuple):
 
 
 class LayeredPicture(NamedTuple):
-    """A picture of layers, (h, w, 4) uint8, with depths, (h, w) float32, mm along the ray, NaN where nothing is.
-
-    `open_pixels` may have further layers than those that were drawn, which are left out.
-    """
+    """A picture of layers: (h, w, 4) uint8, depths (h, w) float32 mm, NaN: none; `open_pixels` may have more layers."""
 
     image: NDArray[np.uint8]
     depth: NDArray[np.float32]

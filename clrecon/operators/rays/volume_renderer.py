@@ -1,7 +1,4 @@
-"""`VolumeRenderer`: one volume on a device, any number of pictures in any mode.
-
-The camera fits the whole volume, or where parts of it are masked, cut or hidden, the box of what is shown.
-"""
+"""`VolumeRenderer`: one volume on a device, any number of pictures in any mode, framed by what is shown."""
 
 from __future__ import annotations
 
@@ -25,7 +22,6 @@ from clrecon.operators.reformat.cut import take_contact_sheet, take_curve, take_
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
-from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.pictures.label_style import LabelStyle
 from clrecon.rendering.pictures.modes import Look, check_known, find_style
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
@@ -66,10 +62,7 @@ def framing_key(volume: Volume, style: Style) -> tuple[object, ...]:
 
 
 def shown_box(shown: Volume | DeviceVolume, style: Style) -> Grid:
-    """Return the grid that cameras fit: the volume itself where all of it is shown, or nothing, else `find_seen_box`.
-
-    A `DeviceVolume` brings labels to the grid of the volume once for all pictures.
-    """
+    """Return the grid that cameras fit: the volume itself, where all or nothing shows, else `find_seen_box`."""
     volume = shown.volume if isinstance(shown, DeviceVolume) else shown
     clip = getattr(style, "clip", None)
     labels = _shown_labels(shown, style)
@@ -104,19 +97,14 @@ def _band(style: Style, volume: Volume) -> tuple[float, float]:
     if isinstance(style, SlicesInSpace):
         return style.lowest_hu, math.inf
     if isinstance(style, VolumeLook):
-        return _band_of(style.function)
+        hu, opacity = style.function.points[:, 0], style.function.points[:, -1]
+        shown = np.flatnonzero(opacity > 0.0)
+        if not len(shown):
+            return -math.inf, math.inf
+        low = -math.inf if shown[0] == 0 else float(hu[shown[0] - 1])
+        high = math.inf if shown[-1] == len(hu) - 1 else float(hu[shown[-1] + 1])
+        return low, high
     return AIR_HU + AIR_ROOM_HU, math.inf
-
-
-def _band_of(function: TransferFunction) -> tuple[float, float]:
-    """Return the HU between which the opacity of a transfer function is not 0."""
-    hu, opacity = function.points[:, 0], function.points[:, -1]
-    shown = np.flatnonzero(opacity > 0.0)
-    if not len(shown):
-        return -math.inf, math.inf
-    low = -math.inf if shown[0] == 0 else float(hu[shown[0] - 1])
-    high = math.inf if shown[-1] == len(hu) - 1 else float(hu[shown[-1] + 1])
-    return low, high
 
 
 SMALLEST_STEP = 0.01
@@ -202,7 +190,8 @@ class VolumeRenderer(Closing):
         if isinstance(style, CurveCut):
             return take_curve(self._resident, style, place.view, place.up, size, background, progress)
         is_sheet = isinstance(style, PlaneCut) and style.sheet is not None
-        size = checked_size((SHEET_SIZE if is_sheet else DEFAULT_SIZE) if size is None else size)
+        own_size = SHEET_SIZE if is_sheet else DEFAULT_SIZE
+        size = checked_size(own_size if size is None else size)
         if isinstance(style, Projection) and style.leaves_out and LEFT_OUT not in self.volume.report:
             return self._within(progress).render(
                 style, camera=camera, view=view, up=up, zoom=zoom, view_angle=view_angle, center=center,

@@ -439,9 +439,7 @@ def take_contact_sheet(
 
 
 def _turn_to_slices(volume: Volume, plane: Camera, warnings: list[str]) -> Camera:
-    """Return a camera across the planes of voxels that lie nearest to its own, so that a tilted stack is shown as it
-    was taken, or the same one where none lie within `MOST_TURNED` degrees.
-    """
+    """Return a camera across the nearest planes of voxels, or the same one if none lie within `MOST_TURNED` degrees."""
     forward = plane.basis()[2]
     columns = volume.affine[:3, :3]
     normals = [np.cross(columns[:, (axis + 1) % 3], columns[:, (axis + 2) % 3]) for axis in range(3)]

@@ -62,7 +62,7 @@ class Reformation:
     device_bytes: int
 
 
-def prepare_reformat(device: Device, dtype: DTypeLike = np.int16, uneven: bool = False) -> Program:
+def prepare_reformat(device: Device, dtype: DTypeLike = np.int16, *, uneven: bool = False) -> Program:
     """Build the kernel for volumes of `dtype`, with `uneven` for those whose slices no affine places."""
     return load_program(device, "reformat/sample.cl", {**voxel_variants(dtype), "UNEVEN": str(int(uneven))})
 
@@ -150,7 +150,7 @@ class _Run:
         places, shape = self.places, (self.sheet.height, self.sheet.width)
         takes_whole = self.takes_whole and slices == self.volume.shape_ijk[2]
         with self.stopwatch.timed("build"):
-            program = prepare_reformat(self.device, self.resident.dtype, self.volume.uneven)
+            program = prepare_reformat(self.device, self.resident.dtype, uneven=self.volume.uneven)
         rows_d, slices_d = upload(self.device, places.rows), upload(self.device, places.slices)
         values_d, weights_d = (
             allocate(self.device, 4 * shape[0] * shape[1]),

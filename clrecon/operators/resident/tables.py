@@ -93,10 +93,7 @@ MOST_LAYERS = 1 << 16
 
 @dataclass(frozen=True)
 class StackTable:
-    """The place of each slice: the arguments of kernels with STACK_PARAMETERS, none for even volumes.
-
-    `slope`, (4,) float32, is the largest number of index steps along i, j and k per mm of height.
-    """
+    """Arguments for STACK_PARAMETERS, none for even volumes; `slope` (4,) float32: most index steps per mm of z."""
 
     arguments: dict[str, Any]
     slope: NDArray[np.float32]

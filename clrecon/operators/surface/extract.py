@@ -158,7 +158,13 @@ class SurfaceExtractor(Closing):
     ) -> SampleGrid:
         volume = self.volume
         rule = choose_iso_rule(
-            volume, iso_value, closed, topology, below=below, vertex_rule=vertex_rule, values=self._resident.values
+            volume,
+            iso_value,
+            closed=closed,
+            topology=topology,
+            below=below,
+            vertex_rule=vertex_rule,
+            values=self._resident.values,
         )
         grid = SampleGrid(volume, rule)
         if topology == "trilinear":

@@ -105,10 +105,7 @@ def keep_bricks(resident: DeviceVolume, voxels_d: Any) -> BrickRanges:
 
 
 class Extraction:
-    """One extraction, slab by slab, with fewer slices in a slab if the device has no room for more.
-
-    With `vertices_only` it stops after the vertices: the part of a slab then has no triangles.
-    """
+    """One extraction, slab by slab, as the device has room; with `vertices_only` without triangles."""
 
     def __init__(
         self,
@@ -141,8 +138,8 @@ class Extraction:
         progress("build", 0, 1)
         with self.stopwatch.timed("build"):
             prepare_isosurface(
-                self.device, volume.voxels.dtype, rule.topology, volume.uneven, rule.inside, rule.vertex_rule,
-                self.grid.grows,
+                self.device, volume.voxels.dtype, rule.topology, uneven=volume.uneven, inside=rule.inside,
+                vertex_rule=rule.vertex_rule, grown=self.grid.grows,
             )  # fmt: skip
             if self.grid.grows:
                 prepare_growing(self.device)
@@ -286,6 +283,7 @@ def prepare_isosurface(
     device: Device,
     dtype: DTypeLike = np.int16,
     topology: str = "separated",
+    *,
     uneven: bool = False,
     inside: str = "above",
     vertex_rule: str = "linear",

@@ -1,7 +1,4 @@
-"""Iso surfaces of labels: the label selects the cells, HU place the vertices.
-
-The host side of cl/surface/labels.cl; counting and writing are those of cl/surface/marching_cubes.cl.
-"""
+"""Iso surfaces of labels: the label selects the cells, HU place the vertices; the host of cl/surface/labels.cl."""
 
 from __future__ import annotations
 
@@ -190,12 +187,12 @@ class HeldSlices:
 
 
 def prepare_labels(
-    device: Device, dtype: DTypeLike = np.int16, label_dtype: DTypeLike = np.uint8, uneven: bool = False
+    device: Device, dtype: DTypeLike = np.int16, label_dtype: DTypeLike = np.uint8, *, uneven: bool = False
 ) -> tuple[Program, Program]:
     """Build the kernels for volumes and labels of these types: those that find what is inside, those of the surface."""
     variants = {**voxel_variants(dtype), **label_variants(label_dtype)}
     own = load_program(device, "surface/labels.cl", variants)
-    return own, marching_cubes.prepare_marching_cubes(device, dtype, label_dtype, uneven)
+    return own, marching_cubes.prepare_marching_cubes(device, dtype, label_dtype, uneven=uneven)
 
 
 class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
@@ -222,7 +219,7 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
 
     def programs(self) -> tuple[Program, Program]:
         with self.stopwatch.timed("build"):
-            return prepare_labels(self.device, self.resident.dtype, self.labels.dtype, self.volume.uneven)
+            return prepare_labels(self.device, self.resident.dtype, self.labels.dtype, uneven=self.volume.uneven)
 
     def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
         """Return first and end of the slices of the volume that these labels need; all if they are on the device."""
@@ -415,7 +412,7 @@ def extract_labels(
     with open_volume(volume, device, memory, "a surface of a label") as resident:
         taken = resident.bring(labels)
         level, chosen = settle_level(resident.volume, iso_value)
-        rule = choose_iso_rule(resident.volume, level, closed, values=resident.values)
+        rule = choose_iso_rule(resident.volume, level, closed=closed, values=resident.values)
         marching_cubes.check_row(resident.volume.shape_ijk[0])
         growth = Growth.of(resident.volume, grow_mm)
 
@@ -465,7 +462,13 @@ def _make_meshes(
 
 def _as_mesh(run: LabelExtraction, taken: ResampledLabels, report: dict[str, Any], part: Part) -> Mesh:
     report["vertices_by_hu_share"] = run.share_by_hu
-    report["warnings"] += _warn(taken, report)
+    warnings = list(taken.warnings)
+    if report["label_inside_share"] < 1.0:
+        share = 100.0 * (1.0 - report["label_inside_share"])
+        warnings.append(
+            f"{share:.3g} % of label {report['label']} lie outside the CT: its surface ends where the CT does"
+        )
+    report["warnings"] += warnings
     positions, normals, triangles = part
     mesh = Mesh(run.placement.to_lps(positions), triangles, normals, report, trusted=True)
     if SKIN_HU[0] <= run.rule.iso_value <= SKIN_HU[1]:
@@ -482,13 +485,3 @@ def _describe_label(volume: Volume, labels: LabelMap, taken: ResampledLabels, nu
         "label_ml": label_ml(labels, number),
         "label_taken_ml": count_ml(taken.voxels, number, box, slice_voxel_ml(volume)),
     }
-
-
-def _warn(taken: ResampledLabels, report: dict[str, Any]) -> list[str]:
-    warnings = list(taken.warnings)
-    if report["label_inside_share"] < 1.0:
-        share = 100.0 * (1.0 - report["label_inside_share"])
-        warnings.append(
-            f"{share:.3g} % of label {report['label']} lie outside the CT: its surface ends where the CT does"
-        )
-    return warnings

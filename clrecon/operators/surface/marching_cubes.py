@@ -33,7 +33,7 @@ from clrecon.operators.surface.trilinear import CellVertices, count_cells, emit_
 from clrecon.system.light_dataclass import dataclass
 
 
-def load_cells(device: Device, grown: bool = False) -> Program:
+def load_cells(device: Device, *, grown: bool = False) -> Program:
     """Build the kernels, which are the same for every type of voxels; with `grown`, those for parts of a surface."""
     variants = {**device.kernel_variants, "GROWN": "1"} if grown else device.kernel_variants
     return load_program(device, "surface/cells.cl", variants)
@@ -89,7 +89,7 @@ def count(device: Device, slab: Slab, classified: Classified, voxels_d: Any = No
     The topology of the trilinear field needs slices ``slab.voxel_slices`` of the volume.
     """
     grid, rows = slab.grid, slab.counted_rows
-    program = load_cells(device, classified.is_part)
+    program = load_cells(device, grown=classified.is_part)
     gi, gj, _ = grid.shape
     row_counts_d = allocate(device, 12 * rows)
     word_vertices_d, word_triangles_d = (allocate(device, 2 * rows * grid.words) for _ in range(2))
@@ -140,9 +140,9 @@ def prepare_marching_cubes(
     device: Device,
     dtype: DTypeLike,
     labels: DTypeLike | None = None,
+    *,
     uneven: bool = False,
     inside: str = "above",
-    *,
     masks: bool = False,
     vertex_rule: str = "linear",
     grown: bool = False,
@@ -153,7 +153,7 @@ def prepare_marching_cubes(
     surfaces of label masks, whose volumes are occupancies; with `grown`, for parts of a surface.
     """
     prepare_scan(device)
-    load_cells(device, grown)
+    load_cells(device, grown=grown)
     variants = {**voxel_variants(dtype), **device.kernel_variants}
     if inside == "between":
         variants["RANGE"] = "1"
@@ -297,7 +297,7 @@ class Emission:
             return
         slab, counted = self._slab, self._counted
         gi, gj, _ = slab.grid.shape
-        program = load_cells(self._device, self._classified.is_part)
+        program = load_cells(self._device, grown=self._classified.is_part)
         launch(
             self._device, program["emit_triangles"], self._items,
             word_triangles=counted.word_triangles_d, triangles=self.triangles_d, first_vertex=first_vertex,

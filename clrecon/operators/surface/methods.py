@@ -218,10 +218,11 @@ def extract_by_method(
     if not chosen.on_device:
         mesh = _extract_on_host(volume, level, method, closed)
     else:
+        seeds = AUTO if grow_from is None else grow_from
         with SurfaceExtractor(volume, device=device, memory=memory) as extractor:
             mesh = extractor.extract(
                 level, closed=closed, vertex_rule=vertex_rule, progress=progress,
-                grow_from=(AUTO if grow_from is None else grow_from) if chosen.grows else None,
+                grow_from=seeds if chosen.grows else None,
             )  # fmt: skip
     if chosen.decimates:
         from clrecon.mesh.refine.quadric import collapse_quadric
@@ -239,7 +240,7 @@ def extract_by_method(
 def _extract_on_host(volume: Volume | DeviceVolume, iso_value: Level, method: str, closed: bool) -> Mesh:
     """Extract without a device: the rows of comparisons."""
     scan = volume.volume if isinstance(volume, DeviceVolume) else volume
-    rule = choose_iso_rule(scan, iso_value, closed)
+    rule = choose_iso_rule(scan, iso_value, closed=closed)
     started = time.perf_counter()
     if method == "skimage":
         vertices, triangles = _extract_by_skimage(scan, rule)

@@ -51,10 +51,7 @@ def _field_arguments(slab: Slab) -> dict[str, Any]:
 def count_cells(
     device: Device, slab: Slab, voxels_d: Any, mask_d: Any, flags_d: Any, row_counts_d: Any, word_triangles_d: Any
 ) -> CellVertices:
-    """Count the slab's triangles again, in place, and the vertices inside cells, which follow those of each slice.
-
-    Of count_rows are: words with work, counts of each row, triangles of the row before each word.
-    """
+    """Count triangles again, in place, and vertices inside cells; of count_rows: words, counts, triangles before."""
     grid, rows = slab.grid, slab.counted_rows
     row_vertices_d = allocate(device, 4 * rows)
     word_places_d = allocate(device, 2 * slab.rows * grid.words)
@@ -84,10 +81,7 @@ def emit_cells(
     output: dict[str, Any],
     first_vertex: int,
 ) -> None:
-    """Write triangles and vertices inside cells, after `first_vertex` vertices of earlier slabs.
-
-    `tables` are as emit_vertices takes them; `output` has the buffers ``positions``, ``normals`` and ``triangles``.
-    """
+    """Write triangles and vertices inside cells after `first_vertex`; `tables` are those of emit_vertices."""
     program = prepare_trilinear(device, slab.grid.volume.voxels.dtype)
     cells: CellVertices = counted.cells
     active = counted.active_words

@@ -1,7 +1,4 @@
-"""The solid bone of one vertebra: its label, or an iso level within it, closed and filled, with the canal left open.
-
-It is made in the part of the volume around the label, with slices across the patient's long axis.
-"""
+"""The solid bone of one vertebra: its label, or a level within it, closed and filled, with the canal left open."""
 
 from __future__ import annotations
 
@@ -221,7 +218,7 @@ def _inside(resident: DeviceVolume, crop: LabelCrop, iso_value: float, grow_mm: 
     """Mark the voxels that are inside of the label at an iso value, as surfaces of solid labels have them."""
     volume = crop.volume
     taken = resident.bring(crop.labels)
-    rule = choose_iso_rule(volume, iso_value, True, values=resident.values)
+    rule = choose_iso_rule(volume, iso_value, closed=True, values=resident.values)
     growth = Growth.of(volume, grow_mm)
     boxes = find_boxes(taken.voxels, (crop.number,), growth.reach)
     inside = np.zeros(taken.voxels.shape, taken.voxels.dtype)

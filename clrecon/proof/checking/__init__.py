@@ -89,7 +89,7 @@ def random_integers(shape: tuple[int, ...], dtype: str, high: int) -> NDArray[An
     return np.random.default_rng(20).integers(0, high, shape).astype(dtype)
 
 
-def stack(voxels: NDArray[Any], affine: NDArray[np.float64], uneven: bool = False) -> Volume:
+def stack(voxels: NDArray[Any], affine: NDArray[np.float64], *, uneven: bool = False) -> Volume:
     """Return a volume; with `uneven`, its slices have gaps of their own and lie aside."""
     if not uneven:
         return Volume(voxels, affine)
@@ -119,9 +119,9 @@ def centre_of(volume: Volume) -> NDArray[np.float64]:
     return np.asarray(volume.ijk_to_lps([(np.array(volume.shape_ijk) - 1) / 2])[0])
 
 
-def blobs(shape: tuple[int, int, int], affine: NDArray[np.float64], dtype: str, uneven: bool = False) -> Volume:
+def blobs(shape: tuple[int, int, int], affine: NDArray[np.float64], dtype: str, *, uneven: bool = False) -> Volume:
     """Return something smooth from -700 to about 1200 HU with structure in all directions."""
-    volume = stack(np.zeros(shape, np.int8), affine, uneven)
+    volume = stack(np.zeros(shape, np.int8), affine, uneven=uneven)
     k, j, i = np.indices(shape).reshape(3, -1)
     x, y, z = (volume.ijk_to_lps(np.stack([i, j, k], axis=1)) - centre_of(volume)).T / 3.0
     values = 700.0 * np.sin(x) * np.cos(0.8 * y + 0.3) * np.cos(0.7 * z) + 500.0 * np.exp(-(x**2 + y**2 + z**2) / 9.0)
@@ -132,7 +132,7 @@ def blobs(shape: tuple[int, int, int], affine: NDArray[np.float64], dtype: str, 
 
 
 def look_at(
-    volume: Volume, towards: Sequence[float], half_height: float, perspective: bool = False, distance: float = 150.0
+    volume: Volume, towards: Sequence[float], half_height: float, *, perspective: bool = False, distance: float = 150.0
 ) -> Camera:
     """Return a camera `distance` mm before the middle of a volume; `half_height` mm of it reach the picture's top."""
     centre, forward = centre_of(volume), np.array(towards, dtype=np.float64) / np.linalg.norm(towards)

@@ -207,9 +207,7 @@ CONTROLS = {
 
 
 def along_slices(volume: Volume) -> dict[str, Any]:
-    """Return camera and size of a picture that looks along the slices from before the first one, pixel for pixel with
-    the middle one and with what runs along a row to the right, as there.
-    """
+    """Return camera and size of a picture along the slices from before the first, pixel for pixel the middle one."""
     ni, nj, nk = volume.shape_ijk
     di, dj, _ = volume.spacing
     width = min(ni, MOST_PIXELS)

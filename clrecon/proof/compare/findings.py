@@ -15,7 +15,9 @@ def seconds(value: float) -> str:
     """Write seconds with two digits that count: ``0.021``, ``0.39``, ``7.2``, ``42``."""
     if value >= 10.0:
         return f"{value:.0f}"
-    return f"{value:.1f}" if value >= 1.0 else f"{value:.2f}" if value >= 0.1 else f"{value:.3f}"
+    if value >= 1.0:
+        return f"{value:.1f}"
+    return f"{value:.2f}" if value >= 0.1 else f"{value:.3f}"
 
 
 def milliseconds(value: float) -> str:
@@ -42,7 +44,9 @@ def signed(value: float, digits: int = 3) -> str:
 
 def ratio(value: float) -> str:
     """Write a ratio of two positive numbers: ``1.3``, ``54``."""
-    return f"{value:,.0f}" if value >= 10.0 else f"{value:.1f}" if math.isfinite(value) else "many"
+    if value >= 10.0:
+        return f"{value:,.0f}"
+    return f"{value:.1f}" if math.isfinite(value) else "many"
 
 
 def join(names: list[str]) -> str:

@@ -122,7 +122,7 @@ def make_comparison(
     progress = progress or ignore_progress
     watch = Laps()
     truth = None if settings.truth is None else _check_truth(Path(settings.truth))
-    with keep_existing(no_clobber):
+    with keep_existing(keep=no_clobber):
         folder = check_report_folder(output)
     check_kept([("the report", output)], source, settings.truth)
     volume, device, read_s = _open(source, settings, progress, watch)
@@ -148,7 +148,7 @@ def make_comparison(
             volume, settings, device, records, figures, level=level, reason=reason, read_s=read_s,
             warnings=[*warnings, *device.warnings], watch=watch,
         )  # fmt: skip
-        with keep_existing(no_clobber):
+        with keep_existing(keep=no_clobber):
             made = stack.enter_context(stage_report_folder(output))
             with system_errors(output):
                 draw_figures(figures, made.path)

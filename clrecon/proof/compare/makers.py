@@ -37,14 +37,6 @@ def draw_mesh(mesh: Mesh, camera: Camera, size: tuple[int, int], *, device: Devi
     return flatten(picture.image)
 
 
-def draw_points(cloud: PointCloud, camera: Camera, size: tuple[int, int], *, device: Device | None = None) -> Image:
-    from clrecon.operators.rays.point_pictures import PointPictures
-    from clrecon.rendering.pictures.object_looks import PointLook
-
-    with PointPictures(cloud, device=device) as pictures:
-        return flatten(pictures.take(PointLook(color="bone"), camera, size, BACKGROUND).image)
-
-
 def flatten(image: NDArray[Any]) -> Image:
     """Put a picture with opacity before black: (h, w, 4) uint8, not premultiplied, becomes (h, w, 3) uint8."""
     colour, opacity = image[..., :3].astype(np.uint16), image[..., 3:].astype(np.uint16)
@@ -55,16 +47,13 @@ FILTERS = {"vtk-mc": "vtkMarchingCubes", "vtk-fe": "vtkFlyingEdges3D"}
 
 
 def extract_by_vtk(volume: Volume, iso_value: float, name: str, closed: bool) -> Mesh:
-    """Extract a surface by VTK's filter "vtk-mc" or "vtk-fe", with its own normals on, on all cores where it can.
-
-    With `closed` a layer of air lies around the volume.  The report has ``cells`` and ``seconds`` {extract, place}.
-    """
+    """Extract by "vtk-mc" or "vtk-fe", with normals; `closed`: a layer of air; report: ``cells``, ``seconds``."""
     from vtkmodules import vtkFiltersCore
     from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkSMPTools
     from vtkmodules.vtkCommonDataModel import vtkImageData
 
-    rule = choose_iso_rule(volume, iso_value, closed)
+    rule = choose_iso_rule(volume, iso_value, closed=closed)
     start = perf_counter()
     voxels = volume.voxels
     if rule.closed:
@@ -145,15 +134,11 @@ def make(scene: Scene) -> Made:
         for part in DEVICE_PARTS:
             seconds[part] += float(own.get(part, 0.0))
     seconds["host"] = max(0.0, total - sum(seconds.values()))
-    return Made(product, seconds, _joined(reports))
-
-
-def _joined(reports: list[Mapping[str, Any]]) -> dict[str, Any]:
     kernels: dict[str, float] = {}
     for report in reports:
         for name, spent in report.get("kernel_seconds", {}).items():
             kernels[name] = kernels.get(name, 0.0) + spent
-    return {**reports[-1], "kernel_seconds": kernels}
+    return Made(product, seconds, {**reports[-1], "kernel_seconds": kernels})
 
 
 Product = tuple[Any, list[Mapping[str, Any]]]
@@ -251,7 +236,11 @@ def draw(scene: Scene, product: Any, view: str) -> Any:
     if isinstance(product, Mesh):
         return draw_mesh(product, camera, size, device=scene.device)
     if isinstance(product, PointCloud):
-        return draw_points(product, camera, size, device=scene.device)
+        from clrecon.operators.rays.point_pictures import PointPictures
+        from clrecon.rendering.pictures.object_looks import PointLook
+
+        with PointPictures(product, device=scene.device) as pictures:
+            return flatten(pictures.take(PointLook(color="bone"), camera, size, BACKGROUND).image)
     if view == "view":
         return flatten(product.image)
     return flatten(_cast(scene, camera, size).image)

@@ -222,7 +222,10 @@ def _check_place(ijk: NDArray[np.float64], grid: Grid) -> None:
 
 def _cells_of(triangles: Triangles, margin: float) -> Iterator[IntArray]:
     """Yield cells of triangles, shape (n, 3), some of them several times."""
-    corners = lifted = _lift_flat(triangles, margin)
+    # triangles in a plane between cells count for the upper cells
+    plane = np.rint(triangles[:, :1])
+    flat = (np.abs(triangles - plane) <= margin).all(axis=1, keepdims=True)
+    corners = lifted = np.where(flat, plane + 0.5, triangles)
     owner = np.arange(len(corners))
     reached = np.zeros(len(corners), dtype=bool)
     while len(corners):
@@ -240,13 +243,6 @@ def _cells_of(triangles: Triangles, margin: float) -> Iterator[IntArray]:
         corners, owner = _divide(corners[many]), np.repeat(owner[many], 4)
     # Slivers along an edge between cells reach farther into none of them than coordinates are rounded.
     yield np.floor(lifted[~reached].mean(axis=1)).astype(np.int64)
-
-
-def _lift_flat(corners: Triangles, margin: float) -> Triangles:
-    """Return triangles; those in a plane between cells are moved to the middle of the upper cells."""
-    plane = np.rint(corners[:, :1])
-    flat = (np.abs(corners - plane) <= margin).all(axis=1, keepdims=True)
-    return np.where(flat, plane + 0.5, corners)
 
 
 def _divide(corners: Triangles) -> Triangles:

@@ -110,7 +110,7 @@ def measure_slices(
     shifts = _check_lattice(finer, offsets)
     if np.ndim(iso_value):
         raise UsageError(f"slices are compared at one iso value, not at {iso_value!r}")
-    rule = choose_iso_rule(volume, iso_value, closed)
+    rule = choose_iso_rule(volume, iso_value, closed=closed)
     ijk = volume.lps_to_ijk(mesh.vertices)
     _check_place(ijk, volume, rule)
     told = progress or ignore_progress
@@ -262,11 +262,7 @@ Keys = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Lattice:
-    """Points that divide each cell between voxel centres alike, `finer` along each axis, from `offsets` (0 to below 1)
-    on.
-
-    `cells_ijk` are the cells along each axis, with `border` layers of samples around the voxels.
-    """
+    """Points `finer` along each axis of cells (`cells_ijk`, `border` layers around) from `offsets` (0 to 1) on."""
 
     finer: int
     offsets: tuple[float, float, float]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 
 from clrecon.errors import UsageError
@@ -68,47 +69,36 @@ MOST_REPEATS = 100
 
 
 def _parse_names(text: str) -> tuple[str, ...]:
-    """Read names with commas between them."""
     names = tuple(name.strip().lower() for name in text.split(","))
     if not all(names):
         raise ValueError(f"{text!r} has an empty name: write methods with single commas between them")
     return names
 
 
+_comparison_option = partial(option, group="comparison")
+
+
 @dataclass(frozen=True)
 class CompareSettings(InputSettings):
     """Settings of the compare job; the reference always runs, at one level, above which is inside."""
 
-    methods: Sequence[str] = option(
-        "--methods M[,M...]",
-        "methods to compare; see below (default: all)",
-        group="comparison",
-        default=(),
-        parse=_parse_names,
-        first=True,
+    methods: Sequence[str] = _comparison_option(
+        "--methods M[,M...]", "methods to compare; see below (default: all)", default=(), parse=_parse_names, first=True
     )
-    reference: str = option(
-        "--reference M", "method to compare with (default: t-mc)", group="comparison", default="t-mc", parse=str.lower
+    reference: str = _comparison_option(
+        "--reference M", "method to compare with (default: t-mc)", default="t-mc", parse=str.lower
     )
-    truth: str | Path | None = option(
-        "--truth FILE",
-        "truth.json of a phantom: errors against its true surface are measured too",
-        group="comparison",
-        first=True,
+    truth: str | Path | None = _comparison_option(
+        "--truth FILE", "truth.json of a phantom: errors against its true surface are measured too", first=True
     )
-    paper: bool = option(
+    paper: bool = _comparison_option(
         "--paper",
         "also compare a picture of each method with the middle slice by SSIM and MSE, as a paper does, beside controls"
         " that show what this is worth",
-        group="comparison",
         first=True,
     )
-    repeat: int = option(
-        "--repeat N",
-        "warm runs of each method; the median counts (default: 3)",
-        group="comparison",
-        default=3,
-        first=True,
+    repeat: int = _comparison_option(
+        "--repeat N", "warm runs of each method; the median counts (default: 3)", default=3, first=True
     )
     iso_value: float | None = option(
         "--hu N|auto|half:B,T",
@@ -134,7 +124,6 @@ class CompareSettings(InputSettings):
 
     @property
     def chosen(self) -> tuple[Compared, ...]:
-        """The methods that run, in the order of the page."""
         return choose_methods(self.methods, self.reference)
 
     def as_mesh(self) -> MeshSettings:

@@ -196,9 +196,13 @@ def _finish(figure: Any, name: str) -> str:
 
 
 def make_page(report: CompareReport, figures: Figures) -> str:
+    note = (
+        "Bold: the best of the surfaces. Grey: libraries of others. Bars, pictures and contours have the colour"
+        " beside the name."
+    )
     parts = (
         _section("What the numbers say", _findings(report)),
-        _section("All methods", _main(report)),
+        _section("All methods", f'{main_table(report, COLORS)}\n<p class="note">{note}</p>\n{small_table(report)}'),
         _section("Where the time goes", _times(report)),
         _section("Triangles and error", _accuracy(report)),
         _section("The same view", _views(report, figures)),
@@ -252,14 +256,6 @@ def _findings(report: CompareReport) -> str:
     warnings = "\n".join(f"<li>{escape(text)}</li>" for text in report.warnings)
     said = f"<h3>Warnings</h3>\n<ul>\n{warnings}\n</ul>" if warnings else ""
     return f'<ul class="findings">\n{items}\n</ul>\n{said}'
-
-
-def _main(report: CompareReport) -> str:
-    note = (
-        "Bold: the best of the surfaces. Grey: libraries of others. Bars, pictures and contours have the colour"
-        " beside the name."
-    )
-    return f'{main_table(report, COLORS)}\n<p class="note">{note}</p>\n{small_table(report)}'
 
 
 def _times(report: CompareReport) -> str:

@@ -89,7 +89,6 @@ def save_mesh(folder: Path, name: str, mesh: Mesh) -> None:
 
 
 def load_mesh(folder: Path, name: str) -> Mesh | None:
-    """Read the mesh of a method; None if it made none."""
     vertices, triangles = (load_array(folder, name, what) for what in ("vertices", "triangles"))
     if vertices is None or triangles is None:
         return None
@@ -143,7 +142,6 @@ def run_in_process(request: Request) -> dict[str, Any]:
 
 
 def _describe_end(code: int) -> str:
-    """Describe how a process ended that said nothing."""
     if code >= 0:
         return f"its process ended with exit code {code}"
     name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"

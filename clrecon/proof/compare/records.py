@@ -120,13 +120,19 @@ def compose_report(
     if free < BUSY_SHARE * cores:
         said.append(f"only {free:.1f} of {cores} cores are free: times are of a busy computer, their ratios count")
     watch.lap("report")
+    versions = {"Python": platform.python_version(), "clrecon": package_version()}
+    for title, name in LIBRARIES.items():
+        try:
+            versions[title] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
     return CompareReport(
         affine_ijk_to_lps_mm=volume.affine.tolist(),
         date=datetime.date.today().isoformat(),
         shape_ijk=list(volume.shape_ijk),
         spacing_mm=[float(step) for step in volume.spacing],
         iso_value_hu=level,
-        iso_level_hu=float(choose_iso_rule(volume, level, settings.closed).iso_level),
+        iso_level_hu=float(choose_iso_rule(volume, level, closed=settings.closed).iso_level),
         iso_value_reason=reason,
         closed_at_border=settings.closed,
         reference=settings.reference,
@@ -135,7 +141,7 @@ def compose_report(
         processor=processor_name(),
         cores=cores,
         free_cores=round(free, 2),
-        versions=_find_versions(),
+        versions=versions,
         read_s=dict(read_s),
         findings=find_findings(records, settings.reference, with_truth=settings.truth is not None),
         methods=list(records),
@@ -153,13 +159,3 @@ def compose_report(
         seconds={part: round(spent, 4) for part, spent in {**watch.seconds, "total": watch.total()}.items()},
         peak_memory_bytes=peak_memory_bytes(),
     )
-
-
-def _find_versions() -> dict[str, str]:
-    versions = {"Python": platform.python_version(), "clrecon": package_version()}
-    for title, name in LIBRARIES.items():
-        try:
-            versions[title] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return versions

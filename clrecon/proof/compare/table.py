@@ -233,7 +233,6 @@ def small_table(report: CompareReport) -> str:
 
 
 def paper_table(report: CompareReport) -> str:
-    """Return the table of the paper, with its controls; empty without it."""
     if report.paper is None:
         return ""
     rows = []

@@ -1,8 +1,4 @@
-"""Phantoms, CT series with known surfaces: analytic bodies, a realistic spine and unusual bodies, as voxels or as a
-DICOM CT series.
-
-The names are loaded when first used, so that importing this package costs nothing.
-"""
+"""Phantoms, CT series with known surfaces, as voxels or DICOM; names are loaded when first used."""
 
 from __future__ import annotations
 

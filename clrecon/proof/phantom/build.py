@@ -130,7 +130,9 @@ def _make(
     scanner = KINDS[settings.kind].scanner
     if KINDS[settings.kind].is_scene:
         field, labels = draw_scene(plan_scene(settings), settings, affine, progress)
-        half_maximum = _half_maximum(settings)
+        kind = KINDS[settings.kind]
+        pair = kind.bone_and_tissue_hu
+        half_maximum = None if pair is None else round(kind.scanner.to_values(sum(pair) / 2.0), 1)
     elif settings.kind == "spine":
         blood = BLOOD_HU + _PHASE_HU * phase
         field, anatomy = draw_spine(settings, affine, progress, places=places, blood_hu=blood)
@@ -180,13 +182,6 @@ def _make(
         truth["series"] = series
         truth["shape_ijk"][2] = len(series["slice_positions_lps_mm"])
     return voxels, truth, labels
-
-
-def _half_maximum(settings: PhantomSettings) -> float | None:
-    """Return the value half way between bone and tissue of a scene, None where it has several."""
-    kind = KINDS[settings.kind]
-    pair = kind.bone_and_tissue_hu
-    return None if pair is None else round(kind.scanner.to_values(sum(pair) / 2.0), 1)
 
 
 def _iso_value(settings: PhantomSettings, half_maximum: float | None) -> float:

@@ -45,7 +45,6 @@ def ellipse(x: Field, y: Field, half_x: float | Field, half_y: float | Field) ->
 
 
 def ellipsoid(x: Field, y: Field, z: Field, half: Point) -> Field:
-    """Distance to an ellipsoid about the origin."""
     u, v, w = x / half[0], y / half[1], z / half[2]
     radius = np.sqrt(u * u + v * v + w * w)
     slope = np.sqrt((u / half[0]) ** 2 + (v / half[1]) ** 2 + (w / half[2]) ** 2)

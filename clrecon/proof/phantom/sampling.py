@@ -118,15 +118,11 @@ def sample_occupancy(
     return share
 
 
-def _gaussian_weights(sigma: float) -> Float64Array:
-    """Return half of a normalised Gaussian, from the centre outwards, cut off at four sigma."""
-    weights = np.exp(-0.5 * (np.arange(int(4.0 * sigma + 0.5) + 1) / max(sigma, 1e-9)) ** 2)
-    return weights / (weights[0] + 2.0 * weights[1:].sum())
-
-
 def _blur_axis(field: Float32Array, sigma: float, axis: int) -> Float32Array:
     """Blur along one axis with a Gaussian, sigma in steps; the edge value is continued outside."""
-    weights = _gaussian_weights(sigma)
+    # half of a normalised Gaussian, from the centre outwards, cut off at four sigma
+    weights = np.exp(-0.5 * (np.arange(int(4.0 * sigma + 0.5) + 1) / max(sigma, 1e-9)) ** 2)
+    weights = weights / (weights[0] + 2.0 * weights[1:].sum())
     radius, extent = len(weights) - 1, field.shape[axis]
     if radius == 0:
         return field

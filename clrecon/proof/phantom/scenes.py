@@ -206,13 +206,11 @@ Distance = Callable[[Field, Field, Field], Field]
 
 
 def ball(material: str, hu: float, center: Point, half: Point) -> Part:
-    """Make an ellipsoid with the half axes `half`."""
     low = (-half[0], -half[1], -half[2])
     return Part(material, hu, lambda x, y, z: ellipsoid(x, y, z, half), low, half, center)
 
 
 def rod(material: str, hu: float, a: Point, b: Point, radius_a: float, radius_b: float | None = None) -> Part:
-    """Make a rod with round ends from `a` to `b`."""
     end = radius_a if radius_b is None else radius_b
     wide = max(radius_a, end)
     low, high = np.minimum(a, b) - wide, np.maximum(a, b) + wide
@@ -242,7 +240,6 @@ def column(
 
 
 def box(material: str, hu: float, low: Point, high: Point) -> Part:
-    """Make a box along the axes."""
     half = tuple((b - a) / 2.0 for a, b in zip(low, high, strict=True))
     middle = tuple((b + a) / 2.0 for a, b in zip(low, high, strict=True))
 

@@ -217,10 +217,7 @@ def write_series(
     folder: Path, voxels: NDArray[np.int16], settings: PhantomSettings, placement: Placement,
     progress: Progress | None = None, phase: int = 0,
 ) -> None:  # fmt: skip
-    """Write one file for each slice that is not missing into an existing folder and read each back.
-
-    HU are at most 32767 + `RESCALE_INTERCEPT`; the files of a phase, from 0, follow those of the phase before.
-    """
+    """Write a file for each slice that is not missing, after those of earlier phases, and read each back."""
     for k, header in enumerate(_make_headers(settings, placement, phase)):
         if k + 1 not in settings.missing:
             _write_image(folder / slice_file_name(phase * settings.slices + k), header, voxels[k])

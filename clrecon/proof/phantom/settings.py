@@ -8,6 +8,7 @@ import dataclasses
 import re
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -261,6 +262,9 @@ def parse_missing(text: str) -> tuple[int, ...]:
     return tuple(numbers)
 
 
+_spine_option = partial(option, group="spine")
+
+
 @dataclass(frozen=True)
 class PhantomSettings:
     """What a phantom shows and how it is sampled.
@@ -341,25 +345,17 @@ class PhantomSettings:
     table_gap_mm: float = option("--table-gap MM", "between body and table (default: 0, they touch)", default=0.0)
     prone: bool = option("--prone", "the patient lies on the face")
     ghosts: bool = option("--ghosts", "of a spine: two foreign slices, and a localizer")
-    levels: str | None = option(
-        "--levels C1-L5", "vertebrae to show, like L4-L5 or C3-C7,T1-T5", group="spine", first=True
+    levels: str | None = _spine_option("--levels C1-L5", "vertebrae to show, like L4-L5 or C3-C7,T1-T5", first=True)
+    facet_gap_mm: float | None = _spine_option("--facet-gap MM", "distance of neighbours in the facet joints")
+    kyphosis_deg: float = _spine_option(
+        "--kyphosis DEG", "angle between the first and the last level; positive: the back is round", default=0.0
     )
-    facet_gap_mm: float | None = option("--facet-gap MM", "distance of neighbours in the facet joints", group="spine")
-    kyphosis_deg: float = option(
-        "--kyphosis DEG",
-        "angle between the first and the last level; positive: the back is round",
-        group="spine",
-        default=0.0,
-    )
-    scoliosis_deg: float = option(
+    scoliosis_deg: float = _spine_option(
         "--scoliosis DEG",
         "angle between the first and the last level; positive: the middle lies to the left",
-        group="spine",
         default=0.0,
     )
-    uneven_mm: float = option(
-        "--uneven MM", "the gaps of the slices vary by up to this much", group="spine", default=0.0
-    )
+    uneven_mm: float = _spine_option("--uneven MM", "the gaps of the slices vary by up to this much", default=0.0)
     missing: tuple[int, ...] = option(
         "--missing N,M-O",
         "numbers of slices that are left out, like 20-22,40",
@@ -367,9 +363,7 @@ class PhantomSettings:
         default=(),
         parse=parse_missing,
     )
-    phases: int = option(
-        "--phases N", "series at the same places, with ever more contrast medium", group="spine", default=1
-    )
+    phases: int = _spine_option("--phases N", "series at the same places, with ever more contrast medium", default=1)
     transfer_syntax: str = "explicit"
 
     def __post_init__(self) -> None:
@@ -480,7 +474,6 @@ class PhantomSettings:
 
     @property
     def shape_kji(self) -> tuple[int, int, int]:
-        """(slices, rows, columns), the shape of the voxels."""
         return self.slices, self.size[1], self.size[0]
 
     def as_dict(self) -> dict[str, Any]:

@@ -274,15 +274,11 @@ _MARGIN_STEPS = 1.5
 """Steps of background kept between the body and the faces of the volume."""
 
 
-def _sub_voxel_centre(affine: NDArray[np.float64], settings: PhantomSettings) -> NDArray[np.float64]:
-    offset = np.random.default_rng((settings.seed, 7)).uniform(-0.5, 0.5, 3)
-    middle = (np.array(settings.shape_kji[::-1], dtype=np.float64) - 1.0) / 2.0
-    return apply_affine(affine, (middle + offset)[None])[0]
-
-
 def choose_body(affine: NDArray[np.float64], settings: PhantomSettings) -> Body:
     """Make the body of `settings` wholly inside a volume with this affine, a voxel of background on every side."""
-    centre = _sub_voxel_centre(affine, settings)
+    offset = np.random.default_rng((settings.seed, 7)).uniform(-0.5, 0.5, 3)
+    middle = (np.array(settings.shape_kji[::-1], dtype=np.float64) - 1.0) / 2.0
+    centre = apply_affine(affine, (middle + offset)[None])[0]
     # distances between opposite faces of the volume, halved: rows of the inverse are the faces' normals per step
     per_step = 1.0 / np.linalg.norm(np.linalg.inv(affine)[:3, :3], axis=1)
     reach = float(((np.array(settings.shape_kji[::-1]) / 2.0 - _MARGIN_STEPS) * per_step).min())

@@ -342,10 +342,7 @@ def draw_spine(
     places: Float64Array | None = None,
     blood_hu: float = BLOOD_HU,
 ) -> tuple[Float32Array, Anatomy]:
-    """Draw the spine phantom in HU without point spread and noise, and return its plan, in mm about `CENTRE_LPS_MM`.
-
-    `places` are k of each slice in the affine, else 0, 1, 2 and so on; `blood_hu` are HU of heart and vessels.
-    """
+    """Draw the spine in HU at `places` k; return its plan about `CENTRE_LPS_MM` too; `blood_hu` are of vessels."""
     shape = settings.shape_kji
     di, dj, dk = column_spacing(affine)
     subslices = int(np.clip(round(dk / math.sqrt(di * dj)), 1, 4))

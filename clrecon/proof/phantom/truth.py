@@ -58,13 +58,6 @@ def _lattice(low: Float64Array, high: Float64Array, step: float) -> Float64Array
     return np.stack([part.ravel() for part in np.meshgrid(*axes, indexing="ij")], axis=1)
 
 
-def _around(points: Float64Array, step: float, count: int) -> Float64Array:
-    """Return for each point `count`^3 points `step` apart with it in the middle."""
-    offsets = (np.arange(count) - (count - 1) / 2.0) * step
-    cube = np.stack(np.meshgrid(offsets, offsets, offsets, indexing="ij"), axis=-1).reshape(-1, 3)
-    return (points[:, None] + cube).reshape(-1, 3)
-
-
 class _Shape:
     """The functions of one vertebra at points (n, 3) in its own frame."""
 
@@ -88,7 +81,10 @@ class _Shape:
         coarse = _lattice(low, high, _COARSE * _STEP_MM)
         reach = _STEEPEST * np.sqrt(3.0) / 2.0
         near = coarse[np.abs(self(coarse)) < reach * _COARSE * _STEP_MM]
-        fine = _around(near, _STEP_MM, _COARSE)
+        # a cube of finer points around each
+        offsets = (np.arange(_COARSE) - (_COARSE - 1) / 2.0) * _STEP_MM
+        cube = np.stack(np.meshgrid(offsets, offsets, offsets, indexing="ij"), axis=-1).reshape(-1, 3)
+        fine = (near[:, None] + cube).reshape(-1, 3)
         value, *cuts = self.parts(fine)
         rims = [self._rim(n, fine[(np.abs(value) < _STEP_MM) & (np.abs(cut) < _STEP_MM)]) for n, cut in enumerate(cuts)]
         for cut in cuts:

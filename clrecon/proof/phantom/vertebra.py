@@ -284,10 +284,7 @@ def vertebra_shape(vertebra: Vertebra, x: Field, y: Field, z: Field) -> tuple[Fi
 
 
 def vertebra_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
-    """Return the distance to the outer surface of the bone, mm, positive inside; x, y, z are local mm.
-
-    It is exact on the surface and of first order near it; `clrecon.proof.phantom.truth` has true distances.
-    """
+    """Return the distance to the outer surface, mm, positive inside, exact on it, at local x, y, z."""
     bone, cuts = vertebra_shape(vertebra, x, y, z)
     for cut in cuts:
         bone = np.minimum(bone, -cut)
@@ -358,13 +355,6 @@ _LARGEST_BALL_MM = 6.0
 _ROUNDS = 40
 
 
-def _directions() -> Float64Array:
-    """Return unit vectors (26, 3): the neighbours in a cube."""
-    grid = np.stack(np.meshgrid(*[(-1.0, 0.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    grid = grid[np.any(grid != 0.0, axis=1)]
-    return grid / np.linalg.norm(grid, axis=1)[:, None]
-
-
 def _distance_to(vertebra: Vertebra, points: Float64Array) -> Float64Array:
     """Return the distance from points (n, 3) outside of a vertebra and near it, in mm of the plan, to its surface."""
 
@@ -372,7 +362,10 @@ def _distance_to(vertebra: Vertebra, points: Float64Array) -> Float64Array:
         return np.asarray(vertebra_distance(vertebra, *local.T), dtype=np.float64)
 
     local = (points - vertebra.center) @ vertebra.axes.T
-    ways = _directions()
+    # the 26 neighbours in a cube
+    grid = np.stack(np.meshgrid(*[(-1.0, 0.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = grid[np.any(grid != 0.0, axis=1)]
+    ways = grid / np.linalg.norm(grid, axis=1)[:, None]
     # starts at three distances in all directions: the processes of the vertebra may lie on any side
     starts = np.concatenate([local[:, None] + reach * ways for reach in (2.0, 4.0, 7.0)], axis=1)
     targets = np.repeat(local, starts.shape[1], axis=0)

@@ -189,7 +189,7 @@ def _check_normals(device: Device) -> str:
 
 def _check_oriented(device: Device) -> str:
     """Compare normals of points in a volume of random HU: any of them may be doubtful."""
-    volume = stack(random_integers((12, 40, 45), "int16", 100), np.eye(4), False)
+    volume = stack(random_integers((12, 40, 45), "int16", 100), np.eye(4), uneven=False)
     points = (_bumpy_sheet(2_500) + np.array([2.0, 2.0, 5.0], np.float32)).astype(np.float32)
     gradients = gradients_twin.find_gradients(volume, points, 0.0)
     axes, eigenvalues = filter_twin.principal_axes(points, filter_twin.find_neighbours(points, K)[0])
@@ -206,7 +206,7 @@ def _check_oriented(device: Device) -> str:
 def _check_gradients(device: Device, types: tuple[str, ...], uneven: bool) -> str:
     worst = 0.0
     for dtype in types:
-        volume: Volume = stack(random_integers((9, 17, 15), dtype, 100), OBLIQUE, uneven)
+        volume: Volume = stack(random_integers((9, 17, 15), dtype, 100), OBLIQUE, uneven=uneven)
         last = np.array(volume.shape_ijk) - 1.0
         points = volume.ijk_to_lps(np.random.default_rng(5).uniform(-1.0, last + 1.0, (2_000, 3)))
         resident = DeviceVolume(volume, device=device)

@@ -53,9 +53,7 @@ SEVERAL_ROOTS = np.uint32(0xFFFFFFFE)
 
 
 def join_chunks(grid: GridTwin, cores: NDArray[np.bool_], reach: float, per_chunk: int) -> NDArray[np.uint32]:
-    """Label the core cells, (cells,): the least cell of the same chunk of `per_chunk` that each is linked with, by
-    cells of that chunk; `NO_CELL` for cells without core points, which `cores` tells in the sorted order.
-    """
+    """Label core cells, (cells,), with the least cell linked in their chunk of `per_chunk`; else `NO_CELL`."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree

@@ -141,9 +141,7 @@ LEAST_RANGE_MM = 1e-6
 def filter_scales(
     points: NDArray[np.floating], normals: NDArray[np.floating], indices: NDArray[np.integer], range_factor: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return sigma_c and sigma_s of each point, mm: the distance to the kth neighbour, and `range_factor` times the
-    standard deviation (population) of the neighbours' projections on the normal.
-    """
+    """Return sigma_c, the distance to the kth neighbour, and sigma_s, `range_factor` deviations along the normal."""
     away = points[:, None].astype(np.float64) - points.astype(np.float64)[indices]
     heights = np.einsum("nki,ni->nk", away, normals)
     return np.linalg.norm(away[:, -1], axis=1), range_factor * heights.std(axis=1)

@@ -45,7 +45,7 @@ def _volume(uneven: bool) -> Volume:
     voxels = noise(SHAPE, "int16", 100)
     voxels[: SHAPE[0] // 3] += 30
     voxels[-4:] -= 25
-    return stack(voxels, OBLIQUE, uneven)
+    return stack(voxels, OBLIQUE, uneven=uneven)
 
 
 def _bits(device: Device, mask: VoxelMask) -> NDArray[np.bool_]:
@@ -124,7 +124,7 @@ BAND = (20.0, 70.0)
 
 
 def _compare(device: Device, dtype: str, uneven: bool, kind: Any, labels: str | None) -> float:
-    volume = stack(noise(WIDE, dtype, 100), OBLIQUE, uneven)
+    volume = stack(noise(WIDE, dtype, 100), OBLIQUE, uneven=uneven)
     chosen = None if labels is None else random_integers(WIDE, labels, 3)
     label_map = None if chosen is None else LabelMap(chosen, OBLIQUE)
     number = 2 if labels == "uint8" else 0

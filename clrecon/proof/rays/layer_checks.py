@@ -183,7 +183,7 @@ def _check_between(device: Device, slices: bool) -> str:
 
     for perspective in (False, True):
         volume = blobs((16, 26, 22), OBLIQUE, "int16")
-        camera = look_at(volume, (0.4, 0.9, -0.5), 7.0, perspective)
+        camera = look_at(volume, (0.4, 0.9, -0.5), 7.0, perspective=perspective)
         step = 0.5 * min(volume.spacing)
         mesh, before, behind = _screen(volume, camera)
         look: VolumeLook | SlicesInSpace = VolumeLook(function, lighting=FIXED)

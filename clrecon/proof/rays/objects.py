@@ -116,10 +116,7 @@ FAR_ENOUGH_MM = 0.1
 
 
 class Meetings(NamedTuple):
-    """Where rays meet triangles, sorted by pixel, and in a pixel by depth and then by the number of the triangle.
-
-    Depths are mm across the view; shares, (n, 3), of the corners, in sum 1.
-    """
+    """Where rays meet triangles, by pixel, depth across the view in mm, and number; shares (n, 3) of the corners."""
 
     pixels: NDArray[np.int64]
     triangles: NDArray[np.int64]

@@ -140,7 +140,7 @@ def _check_tiles(device: Device) -> str:
     voxels = np.where(np.arange(nk)[:, None, None] >= stair, 1000, np.zeros((nk, nj, ni))).astype(np.int16)
     size, distance, stopwatch = (ni * TILE, nj * TILE), 50.0, Stopwatch()
     for uneven in (False, True):
-        volume = stack(voxels, np.eye(4), uneven)
+        volume = stack(voxels, np.eye(4), uneven=uneven)
         resident, slab = _open(device, volume)
         middle = np.array([(ni - 1) / 2, (nj - 1) / 2, 0.0])
         camera = Camera(tuple(middle - (0.0, 0.0, distance)), tuple(middle), (0.0, -1.0, 0.0), parallel_scale=nj / 2)
@@ -224,14 +224,14 @@ def _cut(volume: Volume) -> Clip:
 def _check_composite(device: Device, scenes: tuple[tuple[str, TransferFunction, bool, dict[str, Any]], ...]) -> str:
     worst = 0.0
     for dtype, function, uneven, options in scenes:
-        volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven)
+        volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
         lighting, jitter = options.get("lighting", FIXED), options.get("jitter", False)
         clip = _cut(volume) if options.get("cut") else None
-        camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, options.get("perspective", True))
+        camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=options.get("perspective", True))
         step = options.get("step", 0.5 * min(volume.spacing))
         style = VolumeLook(function, lighting=lighting, jitter=jitter, clip=clip)
         found = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
-        twin = cast_rays(volume, function, camera, SIZE, step, lighting, clip, "dvr", jitter)
+        twin = cast_rays(volume, function, camera, SIZE, step, lighting, clip, "dvr", jitter=jitter)
         image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
         worst = max(worst, _compare(found, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}"))
     return f"{len(scenes)} pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
@@ -279,7 +279,7 @@ def _check_projections(device: Device, kinds: tuple[str, ...], uneven: bool) -> 
     worst = 0.0
     for kind in kinds:
         for dtype in ("int16", "float32") if uneven else ("int16", "uint8", "float32"):
-            volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven)
+            volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
             clip = _cut(volume) if dtype == "float32" else None
             camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=dtype != "uint8")
             step = 0.5 * min(volume.spacing)
@@ -300,7 +300,7 @@ def _check_projections(device: Device, kinds: tuple[str, ...], uneven: bool) -> 
 def _check_surfaces(device: Device, uneven: bool) -> str:
     worst = 0.0
     for dtype, iso_value, shadows in (("int16", 100.0, False), ("uint8", 75.0, False), ("float32", 100.0, True)):
-        volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven)
+        volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
         clip = _cut(volume) if dtype == "float32" else None
         camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=dtype == "float32")
         step = 0.5 * min(volume.spacing)
@@ -338,7 +338,7 @@ def _check_slices(device: Device) -> str:
         return np.clip((hu - window[0]) / (window[1] - window[0]), 0.0, 1.0)[:, None].repeat(3, axis=1)
 
     for dtype, uneven in (("int16", False), ("uint8", False), ("float32", True)):
-        volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven)
+        volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
         camera, chosen = look_at(volume, (0.4, 0.8, -0.7), 7.0, perspective=uneven), [1, 4, 7, 12]
         clip = _cut(volume) if uneven else None
         style = SlicesInSpace(chosen, opacity=0.4, lowest_hu=-300.0, window=window, clip=clip)

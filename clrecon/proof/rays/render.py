@@ -100,6 +100,7 @@ def cast_rays(
     lighting: Lighting | None = None,
     clip: Planes | None = None,
     mode: str = "dvr",
+    *,
     jitter: bool = False,
 ) -> RayPicture:
     """Send a ray through each pixel.
@@ -138,9 +139,7 @@ Found = tuple[Float64Array, Float64Array, Float64Array, Float64Array]
 
 
 def look_up(transfer_function: TransferFunction, hu: Float64Array) -> Float64Array:
-    """Return red, green, blue, opacity (n, 4) as in the device's table, float32 values as float64, at the nearest of
-    `TABLE_NODES` evenly spaced HU, which cover the function's range with both ends.
-    """
+    """Return colour and opacity (n, 4) of the nearest of `TABLE_NODES` even HU over the function's range, float32."""
     low, high = transfer_function.range_hu
     nodes = transfer_function.table(low, high, TABLE_NODES).astype(np.float64)
     number = np.floor((hu - low) * ((TABLE_NODES - 1) / (high - low)) + 0.5)

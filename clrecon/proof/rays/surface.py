@@ -56,6 +56,7 @@ def cast_surface(
     lighting: Lighting | None = None,
     clip: Planes | None = None,
     colour: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    *,
     shadows: bool = False,
 ) -> RayPicture:
     """Find the surface along the ray of each pixel; both depths are that of the hit, and there are no values.

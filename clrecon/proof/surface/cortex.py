@@ -1,7 +1,4 @@
-"""Twin of cl/surface/cortex.cl in float64: profiles by trilinear interpolation, and walls fitted to them.
-
-The normal distribution is that of the C library, and plateaus come from numpy's solver.
-"""
+"""Twin of cl/surface/cortex.cl in float64: profiles, and walls fitted to them."""
 
 from __future__ import annotations
 
@@ -125,10 +122,7 @@ def fit_profiles(
     precisions: tuple[float, float, float],
     rise: float,
 ) -> Float64Array:
-    """Return the results of cl/surface/cortex.cl, shape (10, n), of profiles (SAMPLES + 2, n).
-
-    precisions: Of outer HU around the cortex, of cortex and inner HU, in units of a sample's weight.
-    """
+    """Return results (10, n) of profiles (SAMPLES + 2, n); `precisions` of the HU around, of cortex and inside."""
     steep, gap = profiles[SAMPLES], profiles[SAMPLES + 1]
     over = np.maximum(blur_mm**2 + (across_mm**2 - blur_mm**2) * gap, 0.1 * blur_mm**2)
     width = np.sqrt(blur_mm**2 * (1.0 - steep) + over * steep)

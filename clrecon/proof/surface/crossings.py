@@ -9,11 +9,7 @@ Float64Array = NDArray[np.float64]
 
 
 def mark_crossings(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.bool_]:
-    """Mark the triangles that cut another one, none of which lies in the plane of another.
-
-    An edge without a common corner passes through the inside of the other triangle, or one of its edges through the
-    inside of this one.
-    """
+    """Mark triangles that cut another one by an edge through its inside; none lies in the plane of another."""
     corners = vertices.astype(np.float64)[triangles]
     marked = np.zeros(len(triangles), bool)
     for number, own in enumerate(corners):

@@ -57,7 +57,6 @@ def gradients(field: NDArray[np.float64], closed: bool) -> NDArray[np.float64]:
 
 
 def _find_cases(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the case of every cell, indexed (k, j, i)."""
     gk, gj, gi = inside.shape
     cases = np.zeros((gk - 1, gj - 1, gi - 1), dtype=np.int64)
     for corner, (x, y, z) in enumerate(CORNERS):
@@ -147,7 +146,7 @@ def extract_isosurface(
     vertex_rule: {"linear", "golden", "golden-search"}
     grown: Function from the samples that are inside, (gk, gj, gi), to the cells whose triangles are wanted; None: all.
     """
-    rule = choose_iso_rule(volume, iso_value, closed, topology, below=below, vertex_rule=vertex_rule)
+    rule = choose_iso_rule(volume, iso_value, closed=closed, topology=topology, below=below, vertex_rule=vertex_rule)
     inside = rule.mark_inside(sample_grid(volume, rule, rule.border))
     if rule.closed:
         inside[[0, -1]] = inside[:, [0, -1]] = inside[:, :, [0, -1]] = False

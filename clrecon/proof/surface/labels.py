@@ -56,7 +56,7 @@ def find_solid(
     solid: tuple[int, ...] = (),
 ) -> NDArray[np.uint16]:
     """Return for each sample the label that it is inside of: its owner where HU reach the iso value, 0 elsewhere."""
-    rule = choose_iso_rule(volume, iso_value, closed)
+    rule = choose_iso_rule(volume, iso_value, closed=closed)
     labels = labels.astype(np.uint16)
     inside = np.where(volume.voxels >= rule.lowest_inside, own_labels(labels, volume, grow_mm), 0).astype(np.uint16)
     for number, box in find_boxes(labels, solid, Growth.of(volume, grow_mm).reach).items():
@@ -73,7 +73,7 @@ def extract_label(
     surface without labels.  Everywhere else (beside another label, or beside dense samples without a label) it lies
     half way, and its normal follows the label, not HU.
     """
-    rule = choose_iso_rule(volume, iso_value, closed)
+    rule = choose_iso_rule(volume, iso_value, closed=closed)
     grown = np.pad(inside, rule.border)
     dense = sample_grid(volume, rule, rule.border) >= rule.lowest_inside
     if rule.closed:

@@ -108,11 +108,11 @@ def _check_types(device: Device) -> str:
 
 def _check_variant(
     device: Device, make: Callable[[tuple[int, int, int], str], NDArray[Any]], shape: tuple[int, int, int],
-    level: Level, uneven: bool = False, types: tuple[str, ...] = ("int16", "float32"), **options: Any,
+    level: Level, *, uneven: bool = False, types: tuple[str, ...] = ("int16", "float32"), **options: Any,
 ) -> str:  # fmt: skip
     worst = 0.0
     for dtype in types:
-        volume = stack(make(shape, dtype), OBLIQUE, uneven)
+        volume = stack(make(shape, dtype), OBLIQUE, uneven=uneven)
         worst = max(worst, _compare(device, volume, (level,), f"{dtype} voxels", **options))
     return f"{len(types)} surfaces: triangles equal, vertices within {worst:.1e} voxel"
 
@@ -146,10 +146,7 @@ class _GrownTwin:
 
 
 def _grains() -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return grains of one voxel, many before the only large one, and a mark in the one at an edge of the volume.
-
-    Each grain has four runs of cells, that at the edge one, in row 10: the large grain begins with run 521.
-    """
+    """Return grains of a voxel and a large one, run 521 on, and a mark in the one at an edge of the volume."""
     voxels, marked = np.zeros((24, 12, 40), np.int16), np.zeros((24, 12, 40), bool)
     places = [(k, j, i) for k in (2, 5, 8, 11) for j in (2, 5, 8) for i in range(2, 38, 3)]
     for place in places[:130]:
@@ -257,7 +254,7 @@ def _check_labels(device: Device) -> str:
         ("int16", "uint8", False, True, True),
         ("float32", "uint16", True, False, False),
     ):
-        volume = stack(waves(WIDE, dtype), OBLIQUE, uneven)
+        volume = stack(waves(WIDE, dtype), OBLIQUE, uneven=uneven)
         big = 2 if label_dtype == "uint8" else 300
         numbers = _blocks(label_dtype, (big, big, big, big, big, big, 0))
         label_map = LabelMap(numbers, volume.affine)
@@ -365,7 +362,7 @@ def scatter_profiles(volume: Volume, seed: int) -> tuple[NDArray[np.float32], ND
 
 
 def _check_profiles(device: Device, dtype: str, uneven: bool) -> str:
-    volume = blobs((30, 34, 38), OBLIQUE, dtype, uneven)
+    volume = blobs((30, 34, 38), OBLIQUE, dtype, uneven=uneven)
     points, normals = scatter_profiles(volume, 31)
     with DeviceVolume(volume, device=device) as resident:
         sampler = ProfileSampler(resident, Stopwatch())

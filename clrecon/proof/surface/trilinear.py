@@ -104,13 +104,9 @@ def decide_interior(values: Sequence[int]) -> int | None:
         inside = z.a > 0
     else:
         return None
-    return int(inside) + 2 * _find_diagonal(values)
-
-
-def _find_diagonal(values: Sequence[int]) -> int:
-    """Find the diagonal 0 to 3 along which a tunnel runs: each axis tells which of its columns are joined."""
+    # each axis tells which of its columns the tunnel joins
     corner = sum((_find_parabola(values, axis).a > 0) << axis for axis in range(3))
-    return min(corner, 7 - corner)
+    return int(inside) + 2 * min(corner, 7 - corner)
 
 
 def find_row(case: int, heights: Sequence[float]) -> Row:

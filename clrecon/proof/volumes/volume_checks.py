@@ -156,7 +156,7 @@ def _check_logic(device: Device) -> str:
 def _check_regions(device: Device) -> str:
     said = 0
     for uneven in (False, True):
-        volume = stack(noise(MASK_SHAPE, "int16", 100), OBLIQUE, uneven)
+        volume = stack(noise(MASK_SHAPE, "int16", 100), OBLIQUE, uneven=uneven)
         places = twin.find_places(volume)
         low, high = places[2, 3, 4], places[-4, -5, -6]
         sides = np.stack([np.minimum(low, high), np.maximum(low, high)], axis=1)
@@ -174,7 +174,7 @@ def _check_balls(device: Device) -> str:
     for uneven, columns in ((False, 70), (True, 70), (False, 530)):
         shape = (*MASK_SHAPE[:2], columns) if columns == MASK_SHAPE[2] else (9, 60, columns)
         affine = OBLIQUE if columns == MASK_SHAPE[2] else np.diag((0.6, 0.6, 1.5, 1.0))
-        volume = stack(noise(shape, "int16", 100), affine, uneven)
+        volume = stack(noise(shape, "int16", 100), affine, uneven=uneven)
         few, many = volume.voxels > 97, volume.voxels > 2
         with DeviceVolume(volume, device=device) as resident:
             one, other = Mask.from_array(resident, few), Mask.from_array(resident, many)
@@ -224,7 +224,7 @@ FLOAT_HU = 2e-3
 def _check_bilateral(device: Device, types: tuple[str, ...], uneven: bool) -> str:
     worst = 0.0
     for dtype in types:
-        volume = stack(random_integers(FILTER_SHAPE, dtype, 120), OBLIQUE, uneven)
+        volume = stack(random_integers(FILTER_SHAPE, dtype, 120), OBLIQUE, uneven=uneven)
         for dimensions, taps in ((3, 120), (2, 13)):
             settings = BilateralSettings.checked(volume, 0.8, 40.0, dimensions, None, False, taps)
             found = run_bilateral(DeviceVolume(volume, device=device), settings)
@@ -294,7 +294,7 @@ PLANES = (("axial", 0.0, "mean"), ((20.0, 30.0), 2.3, "max"), ("sagittal", 4.0, 
 def _check_sheets(device: Device, types: tuple[str, ...], uneven: bool) -> str:
     worst = 0.0
     for dtype in types:
-        volume = stack(random_integers((12, 17, 15), dtype, 100), OBLIQUE, uneven)
+        volume = stack(random_integers((12, 17, 15), dtype, 100), OBLIQUE, uneven=uneven)
         for view, thickness, combine in PLANES:
             sheet, _ = plane_sheet(find_plane(volume, view, SIZE), SIZE, 0.1)
             samples = slab_samples(volume, thickness)

@@ -76,14 +76,14 @@ def compare_bricks(
             first, end = max(32 * word - border, 0), min(32 * word - border + 32, ni)
             if first < end:
                 low, high = ranges[k, j, first // brick : (end - 1) // brick + 1].T
-                states[k, j, word] = 0 if high.max() < level else 1 if low.min() >= level else 2
+                states[k, j, word] = 0 if high.max() < level else 2 - (low.min() >= level)
         used = np.flatnonzero(states[k, j])
         if len(used):
             extents[k, j] = used[0], used[-1] + 1
     return states, extents
 
 
-def fill_holes(chosen: ArrayLike, by_slice: bool = False) -> NDArray[np.bool_]:
+def fill_holes(chosen: ArrayLike, *, by_slice: bool = False) -> NDArray[np.bool_]:
     """Return the chosen voxels and those that they enclose, (nk, nj, ni): what a flood from beyond never meets."""
     bits = np.asarray(chosen, dtype=bool)
     if by_slice:
@@ -149,12 +149,12 @@ def find_in_tube(volume: Volume, points: ArrayLike, radius_mm: float) -> NDArray
 Bits = NDArray[np.bool_]
 
 
-def dilate(volume: Volume, chosen: ArrayLike, mm: float, by_slice: bool = False) -> Bits:
+def dilate(volume: Volume, chosen: ArrayLike, mm: float, *, by_slice: bool = False) -> Bits:
     """Return the voxels within ``mm * (1 + 1e-6)`` of a chosen one, shape (nk, nj, ni)."""
     return _spread(find_places(volume), np.asarray(chosen, dtype=bool), mm, by_slice)
 
 
-def erode(volume: Volume, chosen: ArrayLike, mm: float, by_slice: bool = False, beyond: bool = False) -> Bits:
+def erode(volume: Volume, chosen: ArrayLike, mm: float, *, by_slice: bool = False, beyond: bool = False) -> Bits:
     """Return the voxels without one within ``mm * (1 + 1e-6)`` that is not chosen; `beyond`: those beyond are."""
     bits = np.asarray(chosen, dtype=bool)
     if beyond:
@@ -177,9 +177,9 @@ def _border(volume: Volume, mm: float) -> tuple[int, int, int]:
     return i, j, k
 
 
-def close(volume: Volume, chosen: ArrayLike, mm: float, by_slice: bool = False) -> Bits:
+def close(volume: Volume, chosen: ArrayLike, mm: float, *, by_slice: bool = False) -> Bits:
     """Return a dilation, eroded as if all beyond the volume were chosen."""
-    return erode(volume, dilate(volume, chosen, mm, by_slice), mm, by_slice, beyond=True)
+    return erode(volume, dilate(volume, chosen, mm, by_slice=by_slice), mm, by_slice=by_slice, beyond=True)
 
 
 def _spread(

@@ -181,7 +181,7 @@ class _Doubt(NamedTuple):
 
 
 def judge_scale(
-    sample: ValueSample | None, facts: PixelFacts, slopes: Sequence[float] = (1.0,), known: bool = True
+    sample: ValueSample | None, facts: PixelFacts, slopes: Sequence[float] = (1.0,), *, known: bool = True
 ) -> tuple[Gate, dict[str, float]]:
     """Judge the gate ``hu_scale``; where it fails, return the places of ``air`` and ``soft_tissue`` too.
 

@@ -91,9 +91,11 @@ def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool |
     parts = tilt_deg is not None and abs(tilt_deg) <= TILT_REPORT_DEG
     count = len(voxels)
     if uneven or count <= WINDOW * WINDOWS:
-        return measure_likeness(voxels, parts)
+        return measure_likeness(voxels, parts=parts)
     starts = [(count - WINDOW) * place // (WINDOWS - 1) for place in range(WINDOWS)]
-    found = [one for first in starts if (one := measure_likeness(voxels[first : first + WINDOW], parts)) is not None]
+    found = [
+        one for first in starts if (one := measure_likeness(voxels[first : first + WINDOW], parts=parts)) is not None
+    ]
     if not found:
         return None
     second = sorted(one.part or 0.0 for one in found)[-2] if parts and len(found) > 1 else None
@@ -101,7 +103,7 @@ def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool |
     return replace(whole, part=None if whole.part is None else second)
 
 
-def measure_likeness(voxels: NDArray[Any], parts: bool = True) -> Likeness | None:
+def measure_likeness(voxels: NDArray[Any], *, parts: bool = True) -> Likeness | None:
     """Compare slices (nk, nj, ni) of HU with their neighbours and those farther on; None for too few slices or pixels.
 
     `parts` of the picture are examined too, but not of a tilted gantry: scanners that measure several slices in one

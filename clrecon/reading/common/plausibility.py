@@ -145,11 +145,7 @@ def examine_voxels(
     known: bool,
     stored: Sequence[StoredValues] = (),
 ) -> VoxelFindings:
-    """Examine the values that were read; of DICOM with the slices in the order of k, else as `stored` if those are
-    whole.
-
-    `known` is False where the header does not say that the values are HU, or where they surely are not.
-    """
+    """Examine values, of DICOM with its slices by k, else as `stored`; `known`: nothing says that they are no HU."""
     if facts.hu_min == facts.hu_max:
         what = "padding" if facts.padding_share == 1.0 else f"{facts.hu_min:g} HU"
         raise RefusedInputError(f"all {voxels.size:,} voxels are {what}: the volume is constant and holds no image")
@@ -158,7 +154,7 @@ def examine_voxels(
         unknown = unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: the sign of the values is lost")
         return VoxelFindings([], [unknown, sign, shown])
     sample = ValueSample.of(voxels, facts)
-    scale, materials = judge_scale(sample, facts, [one.slope for one in slices] or [1.0], known)
+    scale, materials = judge_scale(sample, facts, [one.slope for one in slices] or [1.0], known=known)
     warnings = [facts.padding_text] if facts.padding_text else []
     if facts.blank:
         named = ", ".join(str(k + 1) for k in facts.blank[:BLANK_SHOWN]) + ", ..." * (len(facts.blank) > BLANK_SHOWN)

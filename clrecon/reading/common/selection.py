@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 from clrecon.errors import UsageError
@@ -13,40 +14,37 @@ from clrecon.system.options import numbers_reader, option
 LARGEST = 1e6
 
 
+_reading_option = partial(option, group="reading")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Selection:
     """The part of an input that is read."""
 
-    series: int | str | None = option(
+    series: int | str | None = _reading_option(
         "--series S",
         'number, hash, UID (or the start of one) or description of the series, see "clrecon info" (default: the CT'
         " series with most slices; of similar ones original before derived, then the thinnest)",
-        group="reading",
         first=True,
     )
-    phase: int | None = option(
-        "--phase N", "number of the phase, of a series with several volumes at one place", group="reading"
+    phase: int | None = _reading_option(
+        "--phase N", "number of the phase, of a series with several volumes at one place"
     )
-    allow_gaps: bool = option(
-        "--allow-gaps",
-        "read a stack with missing slices: what is there is placed exactly, surfaces bridge the gap",
-        group="reading",
+    allow_gaps: bool = _reading_option(
+        "--allow-gaps", "read a stack with missing slices: what is there is placed exactly, surfaces bridge the gap"
     )
-    force: bool = option(
+    force: bool = _reading_option(
         "--force",
         "read data sets without preamble or meta header too, their encoding guessed; leave out what is left"
         " over behind the pixels",
-        group="reading",
     )
-    follow_links: bool = option(
+    follow_links: bool = _reading_option(
         "--follow-links",
         "read the files and folders that symbolic links out of the folder lead to (git-annex, DataLad)",
-        group="reading",
     )
-    rescale: tuple[float, float] | None = option(
+    rescale: tuple[float, float] | None = _reading_option(
         "--rescale SLOPE,INTERCEPT",
         "compute HU as SLOPE x stored value + INTERCEPT, regardless of the files, like 1,-1024",
-        group="reading",
         parse=numbers_reader(2, "is no slope and intercept: SLOPE,INTERCEPT, such as 1,-1024"),
     )
 

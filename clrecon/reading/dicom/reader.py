@@ -97,7 +97,7 @@ def read_series(path: str | os.PathLike[str], selection: Selection, progress: Pr
         scan, found = _scan_and_group(path, selection, progress)
         choice = choose_series(found, selection.series)
         left = describe_left(found, choice, selection.series)
-        chosen = choice.series.choose(_checked_phase(selection), selection.allow_gaps)
+        chosen = choice.series.choose(_checked_phase(selection), allow_gaps=selection.allow_gaps)
         stack = chosen.stack
         if chosen.problems or stack is None or stack.affine is None:
             raise RefusedInputError(_describe_refusal(chosen))
@@ -122,7 +122,7 @@ def list_slices(path: str | os.PathLike[str], selection: Selection) -> list[tupl
     with _quiet_warnings():
         _, found = _scan_and_group(path, selection, None)
         choice = choose_series(found, selection.series)
-        chosen = choice.series.choose(_checked_phase(selection), selection.allow_gaps)
+        chosen = choice.series.choose(_checked_phase(selection), allow_gaps=selection.allow_gaps)
         if chosen.problems or chosen.stack is None:
             raise RefusedInputError(_describe_refusal(chosen))
         return [(header.file, header.frame, header.frames) for header in chosen.stack.slices]
@@ -136,7 +136,7 @@ def _checked_phase(selection: Selection) -> int | None:
 
 
 def list_scan(
-    path: str | os.PathLike[str], selection: Selection, pixels: bool = False, progress: Progress | None = None
+    path: str | os.PathLike[str], selection: Selection, *, pixels: bool = False, progress: Progress | None = None
 ) -> SeriesListing:
     """List the series at a path with their problems, and the certificate of the chosen one, for `pixels` read too."""
     phase = _checked_phase(selection)
@@ -153,7 +153,7 @@ def list_scan(
             chosen = choice.series
             number = chosen.number
             warnings += describe_left(found, choice, selection.series)
-            judged = chosen.choose(phase, selection.allow_gaps)
+            judged = chosen.choose(phase, allow_gaps=selection.allow_gaps)
             found = [judged if one is chosen else one for one in found]
             certificate = _certify_chosen(judged, scan, warnings, pixels, progress)
         entries = [make_entry(one, collect_series_warnings(one)) for one in found]
@@ -209,7 +209,7 @@ def _scan_and_group(
         raise UsageError(f"a path is a string or a path object, not {type(path).__name__}") from error
     if empty:
         raise UsageError("the input path is empty")
-    scan = scan_path(folder, progress, selection.force, selection.follow_links)
+    scan = scan_path(folder, progress, force=selection.force, follow_links=selection.follow_links)
     rescale = check_rescale(selection.rescale)
     if rescale is not None:
         scan.rescale = rescale

@@ -202,7 +202,6 @@ class _Header:
         return value in ("true", "t", "1")
 
     def data_file(self, path: Path) -> Path:
-        """Return the one file beside the header that holds the voxels."""
         named = self.fields["ElementDataFile"]
         if not named or named.upper().split()[0] == "LIST" or "%" in named:
             raise self.wrong("ElementDataFile", "LOCAL or one file, not several")

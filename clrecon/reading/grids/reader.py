@@ -98,10 +98,7 @@ LEAST_SPAN = 100.0
 
 @dataclass(frozen=True)
 class GridValues:
-    """Voxels (nk, nj, ni) int16, int32 or float32, with facts, and reasons (`doubts`) why they may not be HU.
-
-    `likeness` is that of the slices along the axis of the longest step; None where there are too few.
-    """
+    """Voxels (nk, nj, ni) int16, int32 or float32, facts, `doubts` of HU, `likeness` along the longest step."""
 
     voxels: NDArray[Any]
     facts: PixelFacts

@@ -92,7 +92,6 @@ class ColorScale:
 
     @property
     def low(self) -> float:
-        """The number of the first colour."""
         return -self.limit if self.signed else 0.0
 
     @property

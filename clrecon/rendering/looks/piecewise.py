@@ -41,7 +41,9 @@ def check_share(what: str, value: float, at: int, advice: str = "") -> None:
         raise UsageError(f"{what} of point {at + 1} is {value:g}, and must lie between 0 and 1{advice}")
 
 
-def evaluate_curve(positions: Float64Array, values: Float64Array, at: Float64Array, left: bool = False) -> Float64Array:
+def evaluate_curve(
+    positions: Float64Array, values: Float64Array, at: Float64Array, *, left: bool = False
+) -> Float64Array:
     """Return values (..., k) of a curve at positions (...,); with `left`, a step has the value of its first point."""
     if left:  # mirrored, it is the second point
         positions, values, at = -positions[::-1], values[::-1], -at
@@ -57,7 +59,11 @@ def merge_curves(first: tuple[Float64Array, Float64Array], second: tuple[Float64
         at = np.array([position])
         # Elsewhere both sides are equal except for rounding.
         for left in (True, False) if float(position) in steps else (False,):
-            rows.append(np.concatenate([at, evaluate_curve(*first, at, left)[0], evaluate_curve(*second, at, left)[0]]))
+            rows.append(
+                np.concatenate(
+                    [at, evaluate_curve(*first, at, left=left)[0], evaluate_curve(*second, at, left=left)[0]]
+                )
+            )
     return np.array(rows)
 
 

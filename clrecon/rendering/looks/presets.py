@@ -219,7 +219,6 @@ PRESETS: dict[str, Preset] = {
 
 
 def find_preset(name: str) -> Preset:
-    """Return the rendering preset called `name`, in upper or lower case."""
     try:
         return PRESETS[name.lower()]
     except (KeyError, TypeError, AttributeError):

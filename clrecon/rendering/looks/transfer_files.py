@@ -115,7 +115,8 @@ def _entries(data: bytes) -> list[Entry]:
     if start in ("{", "["):
         return _json_entries(parse_json(text))
     if start.isdigit():
-        return read_slicer_text(text)
+        lines = dict(zip(_LINES, text.splitlines(), strict=False))
+        return [("", lambda: _slicer_parameters(lines, lambda name: f"line {_LINES.index(name) + 1} ({name})"))]
     raise RefusedInputError(
         "its form is not known: JSON of clrecon, 3D Slicer's .vp, .vp.json and presets.xml, and ParaView's .json are"
     )
@@ -246,12 +247,6 @@ def _slicer_parameters(texts: Mapping[str, str], place: Callable[[str], str]) ->
             number("ambient", 0.1), number("diffuse", 0.7), number("specular", 0.2), number("specularPower", 10.0)
         )
     return {"points": merge_curves(colors, opacity), "gradient_opacity": gradient, "lighting": lighting}
-
-
-def read_slicer_text(text: str) -> list[Entry]:
-    """Read a .vp file: nine lines, of which empty ones mean the default."""
-    lines = dict(zip(_LINES, text.splitlines(), strict=False))
-    return [("", lambda: _slicer_parameters(lines, lambda name: f"line {_LINES.index(name) + 1} ({name})"))]
 
 
 def read_slicer_xml(data: bytes) -> list[Entry]:

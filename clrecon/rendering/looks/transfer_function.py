@@ -345,7 +345,7 @@ class TransferFunction(Message):
         gradient = None if self.gradient_opacity is None else self.gradient_opacity.tolist()
         text = transfer_text(head, self.points.tolist(), gradient).encode("utf-8")
 
-        with keep_existing(no_clobber):
+        with keep_existing(keep=no_clobber):
             replace_file(path, lambda stream: stream.write(text))
 
     def _key(self) -> tuple[Any, ...]:

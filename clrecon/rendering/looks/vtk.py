@@ -22,7 +22,7 @@ COLORS_A_PART = 64
 
 
 def curve_from_nodes(
-    what: str, nodes: Iterable[ArrayLike], clamped: bool = True, steps: bool = False
+    what: str, nodes: Iterable[ArrayLike], *, clamped: bool = True, steps: bool = False
 ) -> tuple[Float64Array, Float64Array]:
     """Make a curve from VTK's nodes, each (position, values..., midpoint, sharpness).
 
@@ -61,7 +61,7 @@ def _nodes(function: Any, width: int) -> list[list[float]]:
 
 
 def _opacity_curve(what: str, function: Any) -> tuple[Float64Array, Float64Array]:
-    return curve_from_nodes(what, _nodes(function, 4), bool(function.GetClamping()))
+    return curve_from_nodes(what, _nodes(function, 4), clamped=bool(function.GetClamping()))
 
 
 def _color_curve(function: Any) -> tuple[Float64Array, Float64Array]:
@@ -75,7 +75,7 @@ def _color_curve(function: Any) -> tuple[Float64Array, Float64Array]:
         nodes = [[x, *function.GetColor(x), 0.5, 0.0] for x in np.concatenate([*ways, positions[-1:]]).tolist()]
     if function.GetScale() != 0:  # VTK_CTF_LINEAR
         raise UsageError("its colour function is logarithmic: HU have no logarithm")
-    return curve_from_nodes(what, nodes, bool(function.GetClamping()), steps=True)
+    return curve_from_nodes(what, nodes, clamped=bool(function.GetClamping()), steps=True)
 
 
 def _check_voxel(voxel_mm: float) -> None:

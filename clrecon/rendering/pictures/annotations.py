@@ -34,7 +34,6 @@ class PictureData(Message):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
         return self.image.shape[1], self.image.shape[0]
 
     @property

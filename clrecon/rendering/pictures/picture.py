@@ -1,7 +1,4 @@
-"""`Rendering`: a picture with its depths and its camera, the merging of it with a scene, and its files.
-
-Files hold no patient data, date or path; the same picture gives the same bytes.
-"""
+"""`Rendering`: a picture with depths and camera, its merging with a scene, and its files, without patient data."""
 
 from __future__ import annotations
 
@@ -166,8 +163,9 @@ class Rendering(PictureData):
             The file cannot be written; an older file of that name is intact.
         """
 
-        with keep_existing(no_clobber):
-            return write_image(self, path, quality)
+        with keep_existing(keep=no_clobber):
+            content = encode_image(self, check_image_path(path), quality)
+            return _replace_image(path, content)
 
     @explains_arguments
     def save_depth(self, path: str | os.PathLike[str], *, expected: bool = False, no_clobber: bool = False) -> int:
@@ -187,7 +185,7 @@ class Rendering(PictureData):
             Size of the file in bytes.
         """
 
-        with keep_existing(no_clobber):
+        with keep_existing(keep=no_clobber):
             return write_floats(self.expected_depth if expected else self.depth, path, self.pixel_mm)
 
     @explains_arguments
@@ -203,7 +201,7 @@ class Rendering(PictureData):
         if self.values is None:
             having = "mip, minip, mean, drr, slice and cpr"
             raise UsageError(f"a picture of mode {self.mode} has no values: {having} have them")
-        with keep_existing(no_clobber):
+        with keep_existing(keep=no_clobber):
             return write_floats(self.values, path, self.pixel_mm)
 
     @explains_arguments
@@ -317,12 +315,6 @@ def check_image_path(path: str | os.PathLike[str]) -> str:
     return find_extension(path, IMAGE_FORMATS, "picture", hint)
 
 
-def write_image(rendering: PictureData, path: str | os.PathLike[str], quality: int = 95) -> int:
-    """Write a picture to a file; see `Rendering.save`."""
-    content = encode_image(rendering, check_image_path(path), quality)
-    return _replace_image(path, content)
-
-
 def encode_image(rendering: PictureData, extension: str, quality: int = 95) -> bytes:
     """Return the bytes of a file with an extension of `IMAGE_FORMATS`; the quality of JPEG is 1 to 100."""
     load_pillow()
@@ -356,7 +348,6 @@ def write_floats(array: NDArray[np.float32], path: str | os.PathLike[str], pixel
 
 
 def check_float_path(path: str | os.PathLike[str]) -> str:
-    """Return the extension of a file of depths or values in lower case."""
     return find_extension(path, FLOAT_FORMATS, "depth or value")
 
 

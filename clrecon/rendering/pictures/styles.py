@@ -107,8 +107,6 @@ class _Labelled(Style):
 
 @dataclass(frozen=True, kw_only=True)
 class _Lit(_Labelled):
-    """Base of shaded styles."""
-
     lighting: Lighting | None = style_field(None, checks.instance_of("lighting", Lighting))
     ray_step: float | None = style_field(None, checks.ray_step)
     clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))

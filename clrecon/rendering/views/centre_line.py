@@ -123,7 +123,6 @@ class Curve(Message):
         return Curve(self.points[::-1])
 
     def check_within(self, volume: Volume) -> None:
-        """Check that all points lie within the box of a volume."""
         ijk = volume.lps_to_ijk(self.points)
         outside = np.flatnonzero(((ijk < -0.5 - 1e-6) | (ijk > np.array(volume.shape_ijk) - 0.5 + 1e-6)).any(axis=1))
         if len(outside) == 0:

@@ -40,7 +40,6 @@ def number_or_nan(value: Any) -> float:
 
 
 def as_point(vector: Any) -> tuple[float, float, float]:
-    """Return three numbers as floats."""
     x, y, z = (float(value) for value in vector)
     return x, y, z
 
@@ -57,7 +56,6 @@ def checked_vector(what: str, value: ArrayLike) -> tuple[float, float, float]:
 
 
 def checked_size(size: Sequence[int]) -> tuple[int, int]:
-    """Return the size of a picture as (width, height)."""
     try:
         width, height = size
         if int(width) == width and int(height) == height:
@@ -81,7 +79,12 @@ def find_view(view: str | Sequence[float]) -> tuple[Float64Array, Float64Array]:
         up = DIRECTIONS["superior"] if named[2] == 0.0 else DIRECTIONS["anterior"]
         return np.array(named), np.array(up)
     azimuth, elevation = _find_angles(view)
-    around = _turned_anterior(azimuth)
+    # anterior, turned by the azimuth to the left; exact at quarter turns
+    quarters, rest = divmod(azimuth, 90.0)
+    sine, cosine = np.sin(np.radians(rest)), np.cos(np.radians(rest))
+    for _ in range(int(quarters) % 4):
+        sine, cosine = cosine, -sine
+    around = np.array([sine, -cosine, 0.0])
     if abs(elevation) == 90.0:
         return np.array([0.0, 0.0, np.sign(elevation)]), around
     radians = np.radians(elevation)
@@ -103,15 +106,6 @@ def hint_at_sheet(word: object) -> str:
     if not isinstance(word, str) or word.strip().lower() not in ("sheet", "sheets", "contact-sheet"):
         return ""
     return f"; a contact sheet of slices is asked for with {name_parameter('sheet')}"
-
-
-def _turned_anterior(azimuth: float) -> Float64Array:
-    """Return the anterior direction, turned by `azimuth` degrees to the left; exact at quarter turns."""
-    quarters, rest = divmod(azimuth, 90.0)
-    sine, cosine = np.sin(np.radians(rest)), np.cos(np.radians(rest))
-    for _ in range(int(quarters) % 4):
-        sine, cosine = cosine, -sine
-    return np.array([sine, -cosine, 0.0])
 
 
 def _find_angles(view: str | Sequence[float]) -> tuple[float, float]:

@@ -158,7 +158,6 @@ def checked_thickness(thickness: float) -> float:
 
 
 def checked_offset(offset_mm: float) -> float:
-    """Check the offset of a slice along the view, mm, and return it as a float."""
     offset = number_or_nan(offset_mm)
     if not np.isfinite(offset):
         raise UsageError(f"the offset of a slice is a length in mm, not {offset_mm!r}")
@@ -218,10 +217,6 @@ def _fine_arcs(length: float, pixel: float) -> Float64Array:
     return np.linspace(0.0, length, count + 1, dtype=np.float64)
 
 
-def _interpolate(at: Float64Array, places: Float64Array, values: Float64Array) -> Float64Array:
-    return np.stack([np.interp(at, places, column) for column in values.T], axis=1)
-
-
 def _unit_vectors(vectors: Float64Array) -> Float64Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
@@ -256,7 +251,7 @@ def straightened_sheet(
     arc = _row_places(curve.length, height, pixel)
     within = (arc >= 0.0) & (arc <= curve.length)
     tangent = curve.tangents(arc)
-    right = _interpolate(arc, arcs, rights)
+    right = np.stack([np.interp(arc, arcs, column) for column in rights.T], axis=1)
     right = _unit_vectors(right - (right * tangent).sum(axis=1, keepdims=True) * tangent)
     middle = 0.5 * (width - 1)
     sheet = Sheet(curve.at(arc) - middle * pixel * right, pixel * right, np.cross(right, tangent), width)

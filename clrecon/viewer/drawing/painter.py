@@ -67,10 +67,7 @@ class _Drawn:
 
 
 class Painter(Stage):
-    """Draws states of views; safe for several threads and views, which take turns; a context manager.
-
-    memory: Bytes that may be taken on the device.  A scan that does not fit goes through in slabs, which is slow.
-    """
+    """Draws states of views, which take turns; a context manager; a scan over `memory` goes through in slabs."""
 
     def __init__(
         self, objects: Sequence[ShownObject], *, device: Device | str | int | None = None, memory: int | None = None
@@ -81,7 +78,6 @@ class Painter(Stage):
         self._coarse: dict[int, Mesh] = {}
 
     def close(self) -> None:
-        """Free everything on the device."""
         with self.lock:
             if self._scene is not None:
                 self._scene[1].close()
@@ -215,7 +211,7 @@ class Painter(Stage):
                     _stop(cancelled)
                     self._coarse[each.number] = coarsen_mesh(each.mesh, COARSE_TRIANGLES)
 
-    def _drawn(self, state: ViewState, sharp: bool, opaque: bool = False) -> list[_Drawn]:
+    def _drawn(self, state: ViewState, sharp: bool, *, opaque: bool = False) -> list[_Drawn]:
         """Return what a state shows, with looks, in the order of the objects; meshes opaque where that is enough."""
         mode = find_modes()[state.mode]
         made: list[_Drawn] = []
@@ -308,10 +304,6 @@ class Painter(Stage):
             # The window of a projection without one is chosen from all of the picture.
             whole = isinstance(style, Projection) and style.window is None
             return take(camera, size) if whole else take_strips(take, camera, size)
-        return self._open_scene(drawn).take(camera, size, None, check)
-
-    def _open_scene(self, drawn: Sequence[_Drawn]) -> ScenePictures:
-        """Return the scene of these objects and looks; the last one is kept."""
         key = tuple((id(each.subject), id(each.style)) for each in drawn)
         if self._scene is None or self._scene[0] != key:
             if self._scene is not None:
@@ -319,7 +311,7 @@ class Painter(Stage):
             objects = [(each.subject, each.style) for each in drawn]
             made = ScenePictures(objects, device=self._device, memory=self.memory, takers=self._takers)
             self._scene = key, made
-        return self._scene[1]
+        return self._scene[1].take(camera, size, None, check)
 
     def _empty(self, state: ViewState, size: tuple[int, int], mode: str, camera: Camera) -> Rendering:
         width, height = size

@@ -110,7 +110,7 @@ def save_shown(
     meshes = painter.mesh_of_shown(state, progress)
     triangles = sum(mesh.triangle_count for mesh in meshes)
     if Path(path).suffix.lower() in ASSEMBLIES and len(meshes) > 1:
-        with keep_existing(no_clobber), stage_assembly(meshes, path, space, keep_ids=keep_ids) as staged:
+        with keep_existing(keep=no_clobber), stage_assembly(meshes, path, space, keep_ids=keep_ids) as staged:
             staged.commit()
         written = staged.size
     else:

@@ -51,11 +51,7 @@ def cut_mesh(mesh: Mesh, clip: Clip) -> Mesh:
 
 
 def _cut(mesh: Mesh, plane: NDArray[np.float64]) -> Mesh:
-    """Cut by one plane.
-
-    Of a triangle across the plane one corner is alone on its side.  Turned so that it comes first, the triangle is cut
-    along two of its edges, and what is kept is a triangle or the rest, made of two.
-    """
+    """Cut by a plane; a triangle is turned so that the corner that is alone on its side comes first."""
     heights = mesh.vertices @ plane[:3] - plane[3]
     inside = heights >= 0.0
     corners = inside[mesh.triangles]

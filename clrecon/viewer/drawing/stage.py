@@ -83,7 +83,9 @@ def warm_kernels(objects: Sequence[ShownObject], device: Device, progress: Progr
                 done.add(kind)
                 _warm_scan(_ball(*kind), device, tell)
     if any(isinstance(each, ShownMesh) for each in objects):
-        _warm_mesh(device)
+        mesh = Mesh(np.eye(3), [(0, 1, 2)], np.tile([0.0, 0.0, 1.0], (3, 1)))
+        with ScenePictures([(mesh, MeshLook())], device=device) as scene:
+            scene.take(Camera((0.3, 0.3, 5.0), (0.3, 0.3, 0.3), (0.0, 1.0, 0.0), parallel_scale=1.0), PICTURE)
 
 
 def _ball(dtype: np.dtype, uneven: bool) -> Volume:
@@ -122,12 +124,6 @@ def _warm_scan(volume: Volume, device: Device, tell: Progress) -> None:
             renderer.render(style, camera=camera, size=PICTURE, background="transparent")
 
 
-def _warm_mesh(device: Device) -> None:
-    mesh = Mesh(np.eye(3), [(0, 1, 2)], np.tile([0.0, 0.0, 1.0], (3, 1)))
-    with ScenePictures([(mesh, MeshLook())], device=device) as scene:
-        scene.take(Camera((0.3, 0.3, 5.0), (0.3, 0.3, 0.3), (0.0, 1.0, 0.0), parallel_scale=1.0), PICTURE)
-
-
 MOST_FOUND, MOST_FOUND_BYTES = 6, 1 << 29
 """Sets of parts kept, of all views together, and bytes of their label maps; two are kept whatever their size."""
 
@@ -150,7 +146,6 @@ class Stage(Closing):
         self._blank: dict[int, LabelledLook] = {}
 
     def close(self) -> None:
-        """Free everything on the device."""
         with self.lock:
             for taker in self._takers.values():
                 taker.close()

@@ -169,7 +169,6 @@ class ChangingView:
         self._change("zoom", "the zoom", camera=zoom_camera(self.camera, factor, (x, y)))
 
     def roll(self, degrees: float) -> None:
-        """Turn the picture clockwise."""
         self._change("roll", "the roll", camera=roll_camera(self.camera, *checked_numbers("a roll", degrees)))
 
     def look(self, view: str | Sequence[float] = "anterior") -> None:
@@ -226,7 +225,7 @@ class ChangingView:
             raise UsageError(f"{part.name} keeps the colours of the mode: it can be hidden, and made translucent")
         self._change_part(part, f"the colour of {part.name}", f"color {key}", color=color)
 
-    def color_parts(self, distinct: bool = True) -> None:
+    def color_parts(self, *, distinct: bool = True) -> None:
         """Give every part of scans a colour of its own, or none."""
         numbered = [each for each in self.state.parts if each.kind == "cluster"]
         if not numbered:
@@ -240,7 +239,7 @@ class ChangingView:
 
     def toggle_colors(self) -> None:
         """Give every part of scans a colour of its own, or take the colours away."""
-        self.color_parts(not any(each.color for each in self.state.parts if each.kind == "cluster"))
+        self.color_parts(distinct=not any(each.color for each in self.state.parts if each.kind == "cluster"))
 
     def set_opacity(self, key: str, value: float) -> None:
         """Make a part translucent: 0 to 1; at 0 it is not seen, but stays in the list as shown."""

@@ -232,7 +232,6 @@ class ViewModel(ChangingView):
         self._set_clip(n, replace(plane, flipped=not plane.flipped), "flip")
 
     def remove_clip(self, n: int) -> None:
-        """Drop the plane of number n."""
         self._clip(n)
         self._change("clips", "the clip plane", clips=(*self.state.clips[:n], *self.state.clips[n + 1 :]))
 
@@ -311,7 +310,6 @@ class ViewModel(ChangingView):
         return is_new or all(each.number in divided for each in self.scans)
 
     def _notes(self, mode: ViewMode) -> list[str]:
-        """Return what is not shown as one might think."""
         notes = []
         hidden = [each.name for each in self.objects if each.kind != "labels"][1:]
         if not mode.joins and hidden:

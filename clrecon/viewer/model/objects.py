@@ -46,7 +46,6 @@ class ViewMode:
 
 @cache
 def find_modes() -> dict[str, ViewMode]:
-    """Return all modes by name, in the order in which they are listed."""
     modes = [ViewMode("surface", "the surface at the iso value", "surface")]
     modes += [
         ViewMode(preset.name, preset.description, "volume", preset.name)

@@ -182,6 +182,7 @@ def _describe_parts(
         low, high = (runs.first[own].min(), j.min(), k.min()), (runs.last[own].max(), j.max(), k.max())
         several = len(sizes) - MOST_CLUSTERS
         name = f"part {number}" if number < SMALLER else f"{several:,} smaller part{'s' * (several > 1)}"
+        x, y, z = volume.ijk_to_lps([middle])[0].tolist()
         parts.append(
             ShownPart(
                 key=f"{scan}/{number}",
@@ -192,16 +193,11 @@ def _describe_parts(
                 ml=count * voxel_ml,
                 count=count,
                 box=_box_of(volume, low, high),
-                inside=_place(volume, middle),
+                inside=(x, y, z),
             )  # fmt: skip
         )
     below = f"below {format_hu(iso_value)} HU"
     return (*parts, ShownPart(key=f"{scan}/0", name=below, kind="rest", object=scan, number=0))
-
-
-def _place(volume: Volume, ijk: Sequence[int]) -> Point:
-    x, y, z = volume.ijk_to_lps([ijk])[0].tolist()
-    return x, y, z
 
 
 def _box_of(volume: Volume, low: Sequence[int], high: Sequence[int]) -> Box:

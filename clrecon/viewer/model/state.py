@@ -177,7 +177,6 @@ class ShownPart:
         return self.visible and self.color is None and self.opacity >= 1.0
 
     def describe(self) -> dict[str, Any]:
-        """Return what lists show, for JSON."""
         return {
             "key": self.key,
             "name": self.name,
@@ -223,7 +222,6 @@ class ViewState:
 
     @property
     def clip(self) -> Clip | None:
-        """The part of space that is shown; None: all."""
         rows = [each.row for each in self.clips]
         clip = Clip(np.array(rows)) if rows else Clip()
         if self.clip_box is not None:

@@ -118,7 +118,10 @@ class ViewSession(Closing):
                 now, share = self.model.state if moving else state, self._share
             made = self.painter.picture(now, (width, height), sharp=not moving, share=share, cancelled=job.cancelled)
             if moving:
-                self._steer(made, (width, height))
+                took = max(1.0, made.report["ms"])
+                share = made.size[0] / width * math.sqrt(MOVING_MS / took)
+                with self._lock:
+                    self._share = min(1.0, max(LEAST_SHARE, share))
             with self._lock:
                 self._timing = {
                     "ms": round(made.report["ms"], 1),
@@ -173,10 +176,7 @@ class ViewSession(Closing):
     # Commands
 
     def do(self, command: Mapping[str, Any]) -> dict[str, Any]:
-        """Do a command, such as ``{"do": "set_iso", "hu": 250}``; see `clrecon.viewer.session.commands.COMMANDS`.
-
-        Returns: `facts`, and what the command itself has to say: ``"pick"``, ``"undone"``, ``"measure"``.
-        """
+        """Do a command of `COMMANDS`; return `facts`, and its own ``"pick"``, ``"undone"`` or ``"measure"``."""
         found, arguments = check_command(command)
         with self._lock:
             said = found.call(self, **arguments)
@@ -245,7 +245,6 @@ class ViewSession(Closing):
         self._work.ask("table", remove, rank=3)
 
     def toggle_table(self) -> None:
-        """Take the table away, or show it."""
         self.set_table(not self.model.state.table)
 
     def _apply_table(self, shown: bool) -> None:
@@ -334,7 +333,6 @@ class ViewSession(Closing):
                 self._work.cancel(kind)
 
     def dismiss(self) -> None:
-        """Drop the words of the last error and of what was said."""
         self._error = self._said = None
 
     def wait(self, timeout: float | None = None) -> bool:
@@ -395,13 +393,6 @@ class ViewSession(Closing):
         mode = self.model.modes[state.mode]
         expected = mode.kind not in ("surface", "labels")
         return seen_pieces(self._shown, [np.array(line) for line in lines if len(line) > 1], expected=expected)
-
-    def _steer(self, made: Rendering, size: tuple[int, int]) -> None:
-        """Choose the width of the next coarse picture by the time of this one."""
-        took = max(1.0, made.report["ms"])
-        share = made.size[0] / size[0] * math.sqrt(MOVING_MS / took)
-        with self._lock:
-            self._share = min(1.0, max(LEAST_SHARE, share))
 
     def _warnings(self) -> list[str]:
         said = [text for each in self.model.objects for text in each.said]

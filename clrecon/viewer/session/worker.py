@@ -31,7 +31,6 @@ class Job:
         return self._stop.is_set()
 
     def cancel(self) -> None:
-        """Ask the work to end."""
         self._stop.set()
 
     def progress(self, stage: str, done: int = 0, total: int = 0) -> None:

@@ -69,7 +69,6 @@ class Downloads:
         return self._waiting.pop(ticket, None)
 
     def drop(self, download: Download) -> None:
-        """Remove a file with its folder."""
         shutil.rmtree(download.path.parent, ignore_errors=True)
 
     def close(self) -> None:

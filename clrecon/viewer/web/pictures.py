@@ -21,8 +21,6 @@ from clrecon.viewer.session.picture_facts import VIEWS
 
 
 class Asked(NamedTuple):
-    """A picture to draw next."""
-
     view: str
     size: tuple[int, int]
     moving: bool
@@ -107,10 +105,7 @@ def encode_picture(picture: Rendering, ground: tuple[int, int, int], sharp: bool
 
 
 def facts_of_camera(camera: Camera | None) -> dict[str, Any] | None:
-    """Return what a page needs to draw points of the patient over a picture; None for a picture without a camera.
-
-    ``half_height`` is that of the picture in mm, of a perspective one in mm per mm of distance along the view.
-    """
+    """Return what a page needs to draw points; ``half_height`` in mm, or per mm of distance; None: no camera."""
     if camera is None:
         return None
     right, up, forward = (vector.tolist() for vector in camera.basis())

@@ -84,10 +84,7 @@ class Page(NamedTuple):
 
 
 def compose_page(host: str) -> Page:
-    """Return the page for a server under the name `host`, as the browser calls it, with its port.
-
-    The page may run its own script and style, show pictures that it received, and talk to this server.  Nothing else.
-    """
+    """Return the page for a server under `host`, with port: own script and style, pictures, this server alone."""
     content, script, style = _compose()
     policy = (
         f"default-src 'none'; script-src '{script}'; style-src '{style}'; img-src blob: data:; connect-src 'self'"

@@ -112,7 +112,7 @@ def test_a_flat_field_has_no_surface_nearby():
 def test_vertices_of_an_extracted_surface_lie_on_it(iso_value, closed):
     volume = noise_volume()
     vertices, _, triangles = extract_isosurface(volume, iso_value, closed=closed)
-    found = measure_iso_distance(Mesh(vertices, triangles), volume, choose_iso_rule(volume, iso_value, closed))
+    found = measure_iso_distance(Mesh(vertices, triangles), volume, choose_iso_rule(volume, iso_value, closed=closed))
     assert found["vertices_voxel"]["max"] < tolerances.ISO_VERTEX_VOXEL
     assert found["centres_voxel"]["p95"] > 0.01  # flat triangles on noise
     assert found["vertices_mm"]["max"] == pytest.approx(found["vertices_voxel"]["max"] * smallest_voxel_mm(volume))

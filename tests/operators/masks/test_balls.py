@@ -34,10 +34,13 @@ def volume_of(shape: tuple[int, int, int], affine: np.ndarray | None) -> Volume:
 def check_all(device, volume: Volume, chosen: np.ndarray, mm: float, by_slice: bool = False) -> None:
     mask = clrecon.Mask.from_array(volume, chosen, device=device)
     for made, expected in (
-        (mask.dilate(mm, by_slice=by_slice), twin.dilate(volume, chosen, mm, by_slice)),
-        (mask.erode(mm, by_slice=by_slice), twin.erode(volume, chosen, mm, by_slice)),
-        (mask.open(mm, by_slice=by_slice), twin.dilate(volume, twin.erode(volume, chosen, mm, by_slice), mm, by_slice)),
-        (mask.close(mm, by_slice=by_slice), twin.close(volume, chosen, mm, by_slice)),
+        (mask.dilate(mm, by_slice=by_slice), twin.dilate(volume, chosen, mm, by_slice=by_slice)),
+        (mask.erode(mm, by_slice=by_slice), twin.erode(volume, chosen, mm, by_slice=by_slice)),
+        (
+            mask.open(mm, by_slice=by_slice),
+            twin.dilate(volume, twin.erode(volume, chosen, mm, by_slice=by_slice), mm, by_slice=by_slice),
+        ),
+        (mask.close(mm, by_slice=by_slice), twin.close(volume, chosen, mm, by_slice=by_slice)),
     ):
         np.testing.assert_array_equal(made.to_numpy(), expected)
         assert made.count == expected.sum()  # bits beyond the rows stay 0

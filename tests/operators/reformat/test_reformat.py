@@ -259,7 +259,7 @@ def test_bad_input_is_refused(device, arguments, says):
 def test_the_kernel_file_builds_alone(device):
     assert "reformat/sample.cl" in kernel_files()
     for unevenly in (False, True):
-        assert prepare_reformat(device, np.int16, unevenly).kernel_names == ["reformat_rows"]
+        assert prepare_reformat(device, np.int16, uneven=unevenly).kernel_names == ["reformat_rows"]
 
 
 @pytest.mark.oclgrind

@@ -78,7 +78,7 @@ def test_constants_are_those_of_the_scan(device):
 )
 def test_slabs_change_nothing(device, uneven, few):
     even = hollow_ball(thickness=2.0)
-    volume = stack(even.voxels, OBLIQUE, uneven)
+    volume = stack(even.voxels, OBLIQUE, uneven=uneven)
     mesh, whole = fit_surface(volume, device)
     places = 140 * cortex.SMALLEST_PIECE if few else 140 * cortex.stride_of(mesh.vertex_count)
     limit = volume.voxels.nbytes // 2 + places

@@ -189,7 +189,7 @@ def test_slabs_make_the_same_part(slices: int, closed: bool, device: Any) -> Non
     volume = smooth_volume((19, 20, 40))
     expected = extract_isosurface(volume, 300, device=device, closed=closed, grow_from="auto")
     resident = DeviceVolume(volume, device=device)
-    grid = SampleGrid(volume, choose_iso_rule(volume, 300, closed), grows=True)
+    grid = SampleGrid(volume, choose_iso_rule(volume, 300, closed=closed), grows=True)
     resident.most_slices[grid.kind] = slices
     mesh = extract_isosurface(resident, 300, closed=closed, grow_from="auto")
     assert mesh.report["slabs"] > 1 and mesh.report["cells"] == expected.report["cells"]

@@ -28,7 +28,7 @@ SHEARED = np.array([[0.7, 0.0, 0.4, -80.0], [0.0, 0.8, 0.5, 3.0], [0.0, 0.1, 2.0
 def test_it_is_the_nearest_of_all(affine: Any, closed: bool, device: Any) -> None:
     made = smooth_volume((19, 30, 90))
     volume = uneven(made.voxels[4:10]) if affine is None else Volume(made.voxels, affine)
-    rule = choose_iso_rule(volume, 300, closed)
+    rule = choose_iso_rule(volume, 300, closed=closed)
     grid, watch = SampleGrid(volume, rule), Stopwatch()
     with watch.running(device), DeviceVolume(volume, device=device) as resident:
         level = (volume.voxels.dtype.type(rule.lowest_inside),)

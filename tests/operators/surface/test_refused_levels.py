@@ -20,7 +20,7 @@ def test_a_range_has_a_surface_where_voxels_lie_within_and_without(device: Any, 
     voxels = np.zeros(27, np.int16)
     voxels[:marked] = 100
     volume = Volume(voxels.reshape(3, 3, 3), np.eye(4))
-    error = _refuse_level(device, volume, choose_iso_rule(volume, (50, 150), closed))
+    error = _refuse_level(device, volume, choose_iso_rule(volume, (50, 150), closed=closed))
     has_surface = 0 < marked < 27 or (marked == 27 and closed)
     assert isinstance(error, DeviceError if has_surface else NoSurfaceError)
     words = "it computes wrongly" if has_surface else f"{'every' if marked else 'no'} voxel lies within"

@@ -47,7 +47,7 @@ def points_of(lattice: Lattice) -> np.ndarray:
 def test_runs_are_those_of_the_trilinear_field(monkeypatch, made, finer, offsets, closed):
     volume = made()
     level = float(np.median(volume.voxels)) + 0.37  # which no point has: float32 and float64 agree
-    rule = choose_iso_rule(volume, level, closed)
+    rule = choose_iso_rule(volume, level, closed=closed)
     lattice = Lattice.over(volume, rule, finer, offsets)
     wanted = trilinear_values(volume, rule, points_of(lattice)) >= rule.iso_level
     ni, nj, _ = volume.shape_ijk
@@ -64,7 +64,7 @@ def test_runs_are_those_of_the_trilinear_field(monkeypatch, made, finer, offsets
 def test_nothing_and_everything_inside():
     for value, closed, inside in ((0, True, 0), (0, False, 0), (9, False, 3 * 4 * 5), (9, True, 3 * 4 * 5)):
         volume = Volume(np.full((4, 5, 6), value, np.int16), OBLIQUE)
-        rule = choose_iso_rule(volume, 5.0, closed)
+        rule = choose_iso_rule(volume, 5.0, closed=closed)
         lattice = Lattice.over(volume, rule, 1, (0.0, 0.0, 0.0))
         found = count_points(find_level_runs(volume, rule, lattice, lambda _: None))
         assert found == (4 * 5 * 6 if closed and inside else inside)

@@ -70,10 +70,10 @@ def _share_halves(orientation: tuple[float, ...]) -> tuple[tuple[float, float, f
 
 
 def read_headers(
-    path: Path, start: FileStart | None = None, force: bool = False
+    path: Path, start: FileStart | None = None, *, force: bool = False
 ) -> list[SliceHeader] | OtherImage | None:
     """Read one file as `read_elements` does: a header for each frame, or None for a DICOMDIR, which only lists."""
-    elements = read_elements(path, WANTED_TAGS, start, force)
+    elements = read_elements(path, WANTED_TAGS, start, force=force)
     values = Values(elements)
     if elements.media_class == DICOMDIR_CLASS:
         if elements.pixel_tag is None and "SOPClassUID" not in values:
@@ -109,7 +109,7 @@ def read_headers(
         frames = count_frames(values, sop_class)
         places = find_places(values, sop_class, frames) if frames > 1 else None
         header = _validate(values, series, path, name, frames=frames)
-        said = check_surplus(elements, header, force)
+        said = check_surplus(elements, header, force=force)
         header = replace(header, warnings=(*header.warnings, *said)) if said else header
         return [header] if places is None else list(spread_frames(header, places))
     except ValueProblem as problem:
@@ -132,7 +132,7 @@ def _read_frames(
                 raise frame.problem
             header = _validate(Values(frame.elements), series, path, place, frames=frames)
             if number == 0:
-                said = check_surplus(elements, header, force)
+                said = check_surplus(elements, header, force=force)
             headers.append(
                 replace(
                     header,
@@ -241,7 +241,6 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
 
 
 def _read_stated_lengths(values: Values, warnings: list[str]) -> dict[str, float | None]:
-    """Return the lengths that place no slice, where they are numbers."""
     lengths: dict[str, float | None] = {}
     for field, keyword, tag in _STATED_LENGTHS:
         try:

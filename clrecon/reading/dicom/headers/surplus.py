@@ -38,7 +38,7 @@ SHEARED = 0.98
 _CHUNK = 2**20
 
 
-def check_surplus(elements: DicomElements, header: SliceHeader, force: bool = False) -> tuple[str, ...]:
+def check_surplus(elements: DicomElements, header: SliceHeader, *, force: bool = False) -> tuple[str, ...]:
     """Examine the surplus bytes of a file, by its first header; `force` takes other ones than zeros as padding."""
     if is_encapsulated(header.transfer_syntax):
         return _check_encapsulated(elements, header, force)
@@ -75,7 +75,6 @@ def _check_encapsulated(elements: DicomElements, header: SliceHeader, force: boo
 
 
 def _judge_excess(file: BinaryIO, header: SliceHeader, expected: int, found: int, force: bool) -> str:
-    """Judge pixel data that are longer than their pixels."""
     frames = f"{header.frames} x " if header.frames > 1 else ""
     counts = (
         f"Pixel Data has {header.pixel_length} bytes, {frames}{header.columns} x {header.rows} x "
@@ -116,11 +115,12 @@ def _find_hidden_columns(file: BinaryIO, header: SliceHeader, found: int) -> int
         return 0
     rows = min(header.rows, MOST_PADDING_BYTES // (columns * item))
     file.seek(header.pixel_offset)
-    kind = "f" if header.float_pixels else "i" if header.signed else "u"
     data = file.read(rows * columns * item)
     if rows < 2 or len(data) < rows * columns * item:
         return 0
-    pixels = np.frombuffer(data, f"{'<' if header.little_endian else '>'}{kind}{item}").astype(np.float64)
+    whole = "i" if header.signed else "u"
+    kind = f"{'<' if header.little_endian else '>'}{'f' if header.float_pixels else whole}{item}"
+    pixels = np.frombuffer(data, kind).astype(np.float64)
     told = _measure_steps(pixels[: rows * header.columns].reshape(rows, header.columns))
     other = _measure_steps(pixels.reshape(rows, columns))
     return columns if other < SHEARED * told else 0

@@ -74,15 +74,12 @@ def describe_way_out() -> str:
     return f"{name_parameter('force', True)} guesses it"
 
 
-def find_program(start: bytes) -> str:
-    """Return the kind of program that a file begins with, or "": the preamble is free for any use (PS3.10 7.1)."""
-    return next((name for mark, name in PROGRAMS.items() if start.startswith(mark)), "")
-
-
 def restore_start(data: bytes) -> Start | None:
     """Return the standard start for a file with these first bytes; None where it has one, or is no data set."""
     marked = data[128:MARK_END] == b"DICM"
-    skip = MARK_END if marked else 4 if data[:4] == b"DICM" else 0
+    skip = 4 if data[:4] == b"DICM" else 0
+    if marked:
+        skip = MARK_END
     if data[skip : skip + 2] == b"\x02\0" and data[skip + 4 : skip + 6].isalpha():
         return None if marked else Start(PREAMBLE, skip, "no preamble: read on demand")
     syntax = _guess_syntax(data[skip : skip + 8])
@@ -325,7 +322,7 @@ def has_dicom_mark(prefix: bytes) -> bool:
 
 
 def read_elements(
-    path: Path, wanted: tuple[int, ...] | None, start: FileStart | None = None, force: bool = False
+    path: Path, wanted: tuple[int, ...] | None, start: FileStart | None = None, *, force: bool = False
 ) -> DicomElements:
     """Read the raw elements of a DICOM file: of the wanted tags, or all whose length is defined.
 
@@ -341,7 +338,7 @@ def read_elements(
     if restored is not None:
         raise CorruptFileError(f"no meta header ({describe_way_out()})")
     elements = _read_marked(path, prefix, size, wanted)
-    program = find_program(prefix)
+    program = next((name for mark, name in PROGRAMS.items() if prefix.startswith(mark)), "")
     if program:
         remark = f"the preamble starts a program ({program}): neither run nor copied"
         elements = elements._replace(remarks=(remark, *elements.remarks))

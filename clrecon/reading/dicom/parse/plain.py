@@ -151,10 +151,7 @@ class _Everything(dict[int, int]):
 
 
 def parse_plainly(data: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomElements | None:
-    """Parse the start of a file of `size` bytes; None where the header has another form, or its end is not in `data`.
-
-    wanted: Tags to keep; SpecificCharacterSet (0008,0005) is among them.  None keeps all of defined length.
-    """
+    """Parse the start of a file of `size` bytes, `wanted` tags or all; None for another form or an end beyond it."""
     try:
         return _parse(data, size, wanted)
     except (_NotPlainError, CorruptFileError, struct.error):
@@ -203,7 +200,7 @@ def _keys(tags: tuple[int, ...] | None) -> dict[int, int]:
 
 
 def _walk_explicit(
-    data: bytes, place: int, wanted: dict[int, int], meta: bool = False
+    data: bytes, place: int, wanted: dict[int, int], *, meta: bool = False
 ) -> tuple[dict[int, bytes], dict[int, str | None], int]:
     """Walk to the pixel data, or the meta header's end; return values, VRs and the offset, perhaps beyond `data`."""
     values: dict[int, bytes] = {}

@@ -330,10 +330,7 @@ _UNKNOWN = _make_encoding(implicit=True, little=True)
 def read_sequences(
     data: bytes, start: int, schema: Schema, *, implicit: bool, little_endian: bool, items_limit: int
 ) -> Item:
-    """Read the wanted values and sequences of a data set, from `start` to its pixel data, within which `data` may end.
-
-    items_limit: Most items that all wanted sequences may hold together.
-    """
+    """Read wanted values and sequences, `items_limit` items together, from `start` to the pixel data."""
     walk = _Walk(data, items_limit)
     top, _ = walk.read_data_set(start, len(data), schema, _make_encoding(implicit, little_endian), "", top=True)
     top.repeated = walk.repeated

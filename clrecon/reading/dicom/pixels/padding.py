@@ -158,18 +158,14 @@ def count_masked_tissue(header: SliceHeader, stored: NDArray[Any], padding: NDAr
     # Padding below air is the usual case and needs no search.  NaN is not above air either.
     if not max(low * header.slope, high * header.slope) + header.intercept > AIR_RANGE_HU[1]:
         return 0
-    suspect = padding & ~_find_outer_runs(padding) | padding & (stored > low) & (stored < high)
-    values = stored[suspect] * np.float64(header.slope) + header.intercept
-    return int(np.count_nonzero(values > AIR_RANGE_HU[1]))
-
-
-def _find_outer_runs(padding: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the padding that reaches an edge of the picture along its row or its column."""
+    # the padding that reaches an edge of the picture along its row or its column
     outer = np.zeros_like(padding)
     for axis in (0, 1):
         outer |= np.logical_and.accumulate(padding, axis=axis)
         outer |= np.flip(np.logical_and.accumulate(np.flip(padding, axis), axis=axis), axis)
-    return outer
+    suspect = padding & ~outer | padding & (stored > low) & (stored < high)
+    values = stored[suspect] * np.float64(header.slope) + header.intercept
+    return int(np.count_nonzero(values > AIR_RANGE_HU[1]))
 
 
 def describe_masked_tissue(count: int) -> str:

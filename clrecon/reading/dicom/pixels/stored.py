@@ -70,7 +70,7 @@ class Codestream:
     @property
     def dtype(self) -> str:
         """The type that decoders return, in native byte order."""
-        width = 1 if self.bits <= 8 else 2 if self.bits <= 16 else 4
+        width = next(width for width in (1, 2, 4) if self.bits <= 8 * width or width == 4)
         return f"{'i' if self.signed else 'u'}{width}"
 
 
@@ -206,10 +206,7 @@ class StoredPixels(Closing):
         self._pool.kill()
 
     def load(self, header: SliceHeader, out: NDArray[Any]) -> NDArray[Any]:
-        """Read one slice, in the type that the header declares, unused bits included, in native byte order.
-
-        out: C-contiguous (rows, columns); memory that may be used for the result where its type has the same width.
-        """
+        """Read one slice as declared, in native byte order, into C-contiguous `out` where its type is as wide."""
         dtype = stored_dtype(header.float_pixels, header.signed, header.bits_allocated)
         fits = out.dtype.itemsize == dtype.itemsize and (out.dtype.kind == "f") == (dtype.kind == "f")
         stored = out.view(dtype) if fits else np.empty(out.shape, dtype)
@@ -276,7 +273,8 @@ class StoredPixels(Closing):
 @cache
 def stored_dtype(floating: bool, signed: bool, bits_allocated: int) -> np.dtype[Any]:
     """Return the type of stored values, in native byte order."""
-    return np.dtype(f"{'f' if floating else 'i' if signed else 'u'}{bits_allocated // 8}")
+    whole = "i" if signed else "u"
+    return np.dtype(f"{'f' if floating else whole}{bits_allocated // 8}")
 
 
 def _read_into(file: Any, stored: NDArray[Any]) -> None:

@@ -80,10 +80,7 @@ def judge_series(
     likeness: Likeness | None = None,
     value_gates: Sequence[Gate] | None = None,
 ) -> list[Gate]:
-    """Judge a series, its slices stacked as they are read, by the gates; those on what is None are not measured.
-
-    value_gates: Gates of the values of the voxels, see `clrecon.reading.common.plausibility.examine_voxels`.
-    """
+    """Judge a series by the gates, and the `value_gates` of `examine_voxels`; those on None are not measured."""
     refused = len(series.problems)
     gates = [
         none_of("usable", refused, "reasons to refuse the series"),

@@ -121,8 +121,6 @@ class Stranger(NamedTuple):
 
 @dataclass
 class _Slices:
-    """Names and sizes of the slices in one folder."""
-
     names: set[str] = field(default_factory=set)
     sizes: list[int] = field(default_factory=list)
 
@@ -169,10 +167,7 @@ def describe_start(start: bytes) -> str:
 
 
 def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int | None]]) -> list[tuple[Path, str]]:
-    """Find the files that may be remains of a slice, each with the reason, which contains no names.
-
-    slices: Path and bytes of the files that hold CT slices; None where they are no measure for others.
-    """
+    """Find files, by reason, that may be remains of `slices`, {path: bytes}; None: sizes are no measure."""
     folders: dict[str, _Slices] = defaultdict(_Slices)
     paths: set[str] = set()  # of the slices: patterns of names and folders
     for file, size in slices:
@@ -193,7 +188,8 @@ def _judge(stranger: Stranger, folders: dict[str, _Slices], paths: set[str]) -> 
     if stranger.what in (DAMAGED_MARK, DAMAGED_START):
         return stranger.what
     known = folders.get(folder)
-    whole, added = _strip_added(name)
+    stem, point, suffix = name.rpartition(".")
+    whole, added = (stem, suffix) if point and suffix.lower() in _ADDED else (name, "")
     if known is None:
         path = f"{_pattern(os.path.basename(folder))}/{_pattern(whole)}"
         alike = "#" in path and path in paths
@@ -208,11 +204,6 @@ def _judge(stranger: Stranger, folders: dict[str, _Slices], paths: set[str]) -> 
     if (stranger.what == UNKNOWN or stranger.what.startswith("blank")) and known.has_size_like(stranger.size):
         return f"as large as the slices beside it, but {_say(stranger.what)}"
     return ""
-
-
-def _strip_added(name: str) -> tuple[str, str]:
-    stem, point, suffix = name.rpartition(".")
-    return (stem, suffix) if point and suffix.lower() in _ADDED else (name, "")
 
 
 def _say(what: str) -> str:

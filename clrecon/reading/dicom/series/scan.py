@@ -190,7 +190,7 @@ class Scan:
     is_file: bool = False
 
 
-def scan_path(path: Path, progress: Progress | None = None, force: bool = False, follow_links: bool = False) -> Scan:
+def scan_path(path: Path, progress: Progress | None = None, *, force: bool = False, follow_links: bool = False) -> Scan:
     """Read the headers of all DICOM files at `path`, a file or a folder with its subfolders.
 
     force: Also accept data sets without preamble or meta header.
@@ -225,7 +225,7 @@ def _take_file(file: str, start: FileStart | OSError, scan: Scan, force: bool) -
     try:
         if isinstance(start, OSError):
             raise start
-        headers = read_headers(Path(file), start, force)
+        headers = read_headers(Path(file), start, force=force)
     except CorruptFileError as error:
         scan.skipped["corrupt"] += 1
         scan.corrupt.append(CorruptFile(Path(file), str(error)))

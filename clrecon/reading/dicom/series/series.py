@@ -131,7 +131,6 @@ class Series:
 
     @property
     def count(self) -> int:
-        """Number of slices, counting the frames of multi-frame images."""
         return len(self.headers) + sum(image.frames for image in self.others)
 
     @property
@@ -166,7 +165,7 @@ class Series:
             headers = choose_phase(places, self.phase or 1).headers
         elif places.problem:
             headers = headers[:1]
-        return measure_stack(headers, self.allow_gaps)
+        return measure_stack(headers, allow_gaps=self.allow_gaps)
 
     def find_doubt(self) -> str:
         """Describe an alternation along the stack that may still be one volume; empty if there is none."""
@@ -187,7 +186,7 @@ class Series:
         counts = {"copy of another slice": places.copies, "other phase": left}
         return {reason: count for reason, count in counts.items() if count}
 
-    def choose(self, phase: int | None = None, allow_gaps: bool = False) -> Series:
+    def choose(self, phase: int | None = None, *, allow_gaps: bool = False) -> Series:
         """Return the series with a phase chosen and gaps allowed, after a closer examination.
 
         Interleaved volumes are found by any element that alternates in the headers, which are read again for this;

@@ -21,7 +21,7 @@ from clrecon.geometry import compose_affine, signed_tilt
 from clrecon.geometry.affine import TILT_REPORT_DEG, Float64Array
 from clrecon.geometry.grid import fit_line, position_tolerance
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
-from clrecon.reading.dicom.stack.spacing import Holes, Rounding, find_holes, find_rounding, median
+from clrecon.reading.dicom.stack.spacing import Holes, find_holes, find_rounding, median
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.text import join_names
@@ -141,7 +141,7 @@ class Stack:
         return self.positions_mm if self.line.uneven else None
 
 
-def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> Stack:
+def measure_stack(headers: Sequence[SliceHeader], *, allow_gaps: bool = False) -> Stack:
     """Sort slices, one at a place, find problems, which raise no error (gaps may be allowed), and fit the affine."""
     problems = find_mixed_values(headers)
     warnings: list[str] = []
@@ -157,7 +157,10 @@ def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> S
         rounding = find_rounding(slices, distances, normal, line.tolerance_mm or 0.0)
         off = line.residual_max_mm or 0.0
         if rounding is not None and off <= rounding.unit_mm and (holes.places or line.uneven):
-            line, holes = _round_line(line, distances, rounding), Holes()
+            # the step of the even places that were rounded, not that of the written numbers
+            k = np.arange(len(distances)) - (len(distances) - 1) / 2.0
+            step = float(k @ distances / np.sum(k**2))
+            line, holes = replace(line, gap_median_mm=step, tolerance_mm=rounding.unit_mm, uneven=False), Holes()
             warnings.append(f"{rounding}; placed by even steps of {line.gap_median_mm:.6g} mm")
         if holes.places and allow_gaps:
             warnings.append(f"{holes.describe()}: what is there is placed exactly, surfaces bridge the gap")
@@ -203,13 +206,6 @@ def measure_line(positions: Float64Array, distances: Float64Array) -> Line:
         worst_slice=int(residuals.argmax()),
         uneven=bool(residuals.max() > tolerance),
     )
-
-
-def _round_line(line: Line, distances: Float64Array, rounding: Rounding) -> Line:
-    """Return the line of positions that are rounded even steps: its step, not that of the written numbers."""
-    k = np.arange(len(distances)) - (len(distances) - 1) / 2.0
-    step = float(k @ distances / np.sum(k**2))
-    return replace(line, gap_median_mm=step, tolerance_mm=rounding.unit_mm, uneven=False)
 
 
 def _measure_sideways(positions: Float64Array, distances: Float64Array) -> float:

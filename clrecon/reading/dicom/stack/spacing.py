@@ -128,10 +128,7 @@ class Rounding:
 
 
 def measure_unit(headers: Sequence[SliceHeader], normal: Float64Array) -> tuple[float, int]:
-    """Return the unit in mm of the last digit of the positions along the normal, and the decimals of its main axis.
-
-    Writers leave out zeros at the end, so the slice with most digits counts.
-    """
+    """Return the last digit of positions along the normal in mm, by the slice with most digits, and its decimals."""
     digits = np.max([header.position_digits for header in headers], axis=0)
     return float(np.abs(normal) @ 10.0 ** -digits.astype(np.float64)), int(digits[np.argmax(np.abs(normal))])
 
