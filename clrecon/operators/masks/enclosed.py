@@ -13,7 +13,7 @@ from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.iso_rule import choose_iso_rule
-from clrecon.opencl import Device, download, upload
+from clrecon.opencl import Device, download, result_pages, upload, wait
 from clrecon.operators.masks.mask import Mask
 from clrecon.operators.masks.regions import checked_mm
 from clrecon.operators.masks.runs import Components, RunList, find_components, mark_with_voxels, write_runs
@@ -122,8 +122,8 @@ def find_spaces(mask: Mask) -> Spaces:
     found = find_components(device, rest, beside=2 * rest.needs()["mask of the voxels"], memory=mask.memory)
     none = np.empty(0)
     if not found.count:
-        empty = np.empty(0, np.int64)
-        runs = RunList(empty, empty, empty, empty, empty.astype(np.int32))
+        empty = np.empty(0, np.int32)
+        runs = RunList(empty, empty, empty, empty, empty)
         return Spaces(volume, none.astype(np.intp), none, none, none.astype(bool), runs, found, mask)
     marks_d, _ = mark_with_voxels(device, found, shape, _open_ends(mask))
     outside = download(device, np.empty(found.count, np.uint8), marks_d) != 0
@@ -168,6 +168,7 @@ def find_joints(mask: Mask, reach_mm: float, least_ml: float) -> Mask:
             )
             sides.append(Mask(volume, side_d, "bones", device=device, memory=mask.memory).dilate(reach_mm))
         joints = joints | (sides[0] & sides[1])
+        wait(device)  # the masks of commands that wait in the queue are all in memory
     return joints
 
 
@@ -333,6 +334,13 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
     left = kinds["wide"] | kinds["air"]
     body = sealed | spaces.choose(~left)
     room = body - bone
+    found = {
+        "spaces": int(np.count_nonzero(~left)),
+        "at_ends": int(np.count_nonzero(spaces.at_ends & ~left)),
+        "largest_ml": float(spaces.ml[~left].max(initial=0.0)),
+        "open": {kind: spaces.describe(which) for kind, which in kinds.items()},
+    }
+    del spaces  # its runs take as much memory as the volume, where bone is spongy
 
     ml = slice_voxel_ml(volume)
     bone_ml = _measure_ml(bone, ml)
@@ -341,6 +349,8 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
     filled = room - (~body | joints).dilate_within(room, seal_mm)
     steps.take()
     value = _mean_inside(volume, bone, lowest_inside)
+    del room, body, joints
+    result_pages.clear()  # of the masks that are gone: the new voxels take as much memory as the volume
     voxels, airy_count = np.empty_like(volume.voxels), np.zeros(len(volume.voxels), np.int64)
     for k, (layer, own) in enumerate(zip(volume.voxels, filled.layers(), strict=True)):
         voxels[k] = np.where(own, value, layer)
@@ -358,10 +368,7 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
         "metal_ml": _filled_at_metal(bone, filled, METAL_STEPS * seal_mm, ml),
         "filled_air_ml": float(airy_count @ ml),
         "filled_hu": float(value),
-        "spaces": int(np.count_nonzero(~left)),
-        "at_ends": int(np.count_nonzero(spaces.at_ends & ~left)),
-        "largest_ml": float(spaces.ml[~left].max(initial=0.0)),
-        "open": {kind: spaces.describe(which) for kind, which in kinds.items()},
+        **found,
     }
     made = volume.with_voxels(voxels)
     report = volume.report

@@ -154,24 +154,24 @@ class Components:
 class RunList:
     """Runs of voxels on the host: j, k, first and last i and component of each, shapes (n,), row by row."""
 
-    j: NDArray[np.int64]
-    k: NDArray[np.int64]
-    first: NDArray[np.int64]
-    last: NDArray[np.int64]
+    j: NDArray[np.int32]
+    k: NDArray[np.int32]
+    first: NDArray[np.int32]
+    last: NDArray[np.int32]
     numbers: NDArray[np.int32]
 
     @classmethod
     def read(cls, device: Device, found: Components, shape_ijk: tuple[int, int, int]) -> RunList:
         count, (_, nj, nk) = found.runs.count, shape_ijk
-        ends = download(device, np.empty((count, 2), np.uint16), found.runs.runs_d).astype(np.int64)
+        ends = download(device, np.empty((count, 2), np.uint16), found.runs.runs_d)
         starts = download(device, np.empty(nj * nk + 1, np.uint32), found.runs.row_counts_d)
         numbers = download(device, np.empty(count, np.int32), found.numbers_d)
-        counts = starts[1:].astype(np.int64) - starts[:-1].astype(np.int64)
-        rows = np.repeat(np.arange(nj * nk), counts)
-        return cls(rows % nj, rows // nj, ends[:, 0], ends[:, 1], numbers)
+        rows = np.repeat(np.arange(nj * nk, dtype=np.int32), np.diff(starts))
+        first, last = (ends[:, side].astype(np.int32) for side in (0, 1))
+        return cls(rows % nj, rows // nj, first, last, numbers)
 
     @property
-    def lengths(self) -> NDArray[np.int64]:
+    def lengths(self) -> NDArray[np.int32]:
         return self.last - self.first + 1
 
     def where(self, which: NDArray[np.bool_]) -> RunList:
