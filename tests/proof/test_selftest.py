@@ -51,11 +51,9 @@ ASKED_BY_OPERATORS = frozenset({
 device, for a release on all.  They too are for a release: a driver takes minutes to build what they need, and their
 twins are slow."""
 
-EVERY_DAY = frozenset({
-    "exclusive_scan", "distances to a surface", "projections", "slices", "balls", "nearest points",
-})  # fmt: skip
-"""Those of them that run every day on further devices: of each room one that is built in seconds.  Surfaces are made by
-what no operator's test asks: golden sections."""
+EVERY_DAY = frozenset({"exclusive_scan", "distances to a surface", "radiographs", "slices"})
+"""Those of them that run every day on further devices: of each room one that is built in seconds.  Surfaces, points and
+masks are made by what no operator's test asks: golden sections, links of free points, logic of masks."""
 
 OF_TYPES = {"VOXEL", "VALUE", "LABEL", "VOXEL_IS_SHORT"}
 OF_DEVICES = {"LANES", "WORDS_PER_ITEM", "HAS_BUILTIN_PREFETCH", "SCAN_GROUP", "CPU_NAME", "ATOMIC_LOADS"}
