@@ -49,9 +49,8 @@ _FILES_OF_OTHERS = 200
 
 _TEMPORARY = re.compile(r"\.clrecon-[0-9a-f]{16}\.(?:tmp|folder)")
 
-_own_names: set[str] = set()
-"""Names of the temporary files and folders that this process is writing, which are not examined: a thousand take
-long."""
+_own_folders: dict[str, Path] = {}
+"""Where the temporary files and folders that this process is writing lie, by their names."""
 
 
 def _log() -> logging.Logger:
@@ -206,7 +205,7 @@ def _temporary_file(folder: Path) -> Iterator[tuple[Path, BinaryIO]]:
             with os.fdopen(os.open(temporary, flags, 0o600), "wb") as stream:
                 if not _lock_new(stream):
                     continue
-                _own_names.add(temporary.name)
+                _own_folders[temporary.name] = folder
                 try:
                     yield temporary, stream
                 except BaseException:
@@ -215,7 +214,7 @@ def _temporary_file(folder: Path) -> Iterator[tuple[Path, BinaryIO]]:
                     raise
                 return
         finally:
-            _own_names.discard(temporary.name)
+            _own_folders.pop(temporary.name, None)
             with contextlib.suppress(OSError):
                 temporary.unlink()
 
@@ -227,8 +226,8 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
     with contextlib.ExitStack() as stack:
         while True:
             made = parent / f".clrecon-{secrets.token_hex(8)}.folder"
-            stack.callback(_own_names.discard, made.name)
-            _own_names.add(made.name)
+            stack.callback(_own_folders.pop, made.name, None)
+            _own_folders[made.name] = parent
             stack.callback(shutil.rmtree, made, ignore_errors=True)
             made.mkdir(mode=0o700)
             if sys.platform == "win32" or _lock_folder(stack, made):
@@ -265,11 +264,14 @@ def _lock_new(stream: BinaryIO) -> bool:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove temporary files and folders of dead processes: names of our pattern that no process has locked."""
-    if sys.platform == "win32":
+    """Remove temporary files and folders of dead processes: names of our pattern that no process has locked.
+
+    Where this process is writing already, that has been done: with a thousand files it would take long for each.
+    """
+    if sys.platform == "win32" or folder in _own_folders.values():
         return
     with os.scandir(folder) as entries:
-        names = [entry.name for entry in entries if _TEMPORARY.fullmatch(entry.name) and entry.name not in _own_names]
+        names = [entry.name for entry in entries if _TEMPORARY.fullmatch(entry.name)]
     for name in names:
         temporary = folder / name
         # Vanished meanwhile, owned by another user, or locked by a living process: left alone.

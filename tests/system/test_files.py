@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import shutil
@@ -358,3 +359,16 @@ def test_a_file_swept_before_it_was_locked_is_made_again(tmp_path, monkeypatch):
     assert replace_file(tmp_path / "x", lambda stream: stream.write(b"abc")) == 3
     assert len(calls) == 2
     assert (tmp_path / "x").read_bytes() == b"abc"
+
+
+def test_a_folder_is_searched_once_for_files_that_belong_together(tmp_path, monkeypatch):
+    """Each search lists the folder: with one a file, a thousand files took a million looks."""
+    searched = []
+    scan = os.scandir
+    monkeypatch.setattr(os, "scandir", lambda folder: searched.append(folder) or scan(folder))
+    with contextlib.ExitStack() as stack:
+        for number in range(5):
+            stack.enter_context(stage_file(tmp_path / f"{number}.bin", lambda stream: stream.write(b"x")))
+    assert searched == [tmp_path]
+    with stage_file(tmp_path / "later.bin", lambda stream: stream.write(b"x")):
+        assert searched == [tmp_path, tmp_path]

@@ -17,10 +17,9 @@ from clrecon.system.progress import Progress, Steps, ignore_progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
+    from clrecon.geometry.iso_rule import IsoRule
     from clrecon.jobs.mesh.make import MadeParts
     from clrecon.mesh import Mesh
-    from clrecon.mesh.compare.iso_distance import IsoDistance
-    from clrecon.mesh.quality import MeshQuality
     from clrecon.opencl import Device
 
 
@@ -140,33 +139,44 @@ def measure_parts(
     progress: Progress = ignore_progress,
 ) -> None:
     """Measure the `quality` of each part and its distances from the scan; with `strict` triangles that cut others."""
-    if not settings.strict:
-        steps = Steps(progress, "measure", len(parts))
-        for part in parts:
-            part.quality, distance = side_by_side(part.mesh.quality, partial(_measure_distance, part, volume))
-            part.facts["iso_distance"] = distance
-            steps.take()
-        return
-    steps = Steps(progress, "crossings", sum(part.mesh.triangle_count for part in parts))
-    for part in parts:
-        (quality, distance), crossings = side_by_side(
-            partial(_measure_on_host, part, volume), partial(_count_crossings, part.mesh, device, steps)
+    if settings.strict:
+        steps = Steps(progress, "crossings", sum(part.mesh.triangle_count for part in parts))
+        _, crossings = side_by_side(
+            partial(_measure_on_host, parts, volume, ignore_progress),
+            lambda: [_count_crossings(part.mesh, device, steps) for part in parts],
         )
-        part.quality = quality.changed(self_intersections=crossings)
-        part.facts["iso_distance"] = distance
+        for part, count in zip(parts, crossings, strict=True):
+            assert part.quality is not None
+            part.quality = part.quality.changed(self_intersections=count)
+    else:
+        _measure_on_host(parts, volume, progress)
 
 
-def _measure_on_host(part: Part, volume: Volume) -> tuple[MeshQuality, IsoDistance | None]:
-    return part.mesh.quality(), _measure_distance(part, volume)
+def _measure_on_host(parts: Sequence[Part], volume: Volume, progress: Progress) -> None:
+    steps = Steps(progress, "measure", len(parts))
+
+    def measure_qualities() -> None:
+        for part in parts:
+            part.quality = part.mesh.quality()
+            steps.take()
+
+    side_by_side(partial(_measure_distances, parts, volume), measure_qualities)
 
 
-def _measure_distance(part: Part, volume: Volume) -> IsoDistance | None:
-    """Measure how far a part lies from the scan, None where no level of HU places it."""
-    from clrecon.mesh.compare.iso_distance import measure_iso_distance, rule_of_report
+def _measure_distances(parts: Sequence[Part], volume: Volume) -> None:
+    """Measure how far parts lie from the scan; None where no level of HU places one."""
+    from clrecon.mesh.compare.iso_distance import measure_iso_distances, rule_of_report
 
-    moved = (part.mesh.report.get("cortex") or {}).get("moved", False)
-    rule = None if moved or part.surface.label is not None else rule_of_report(part.mesh.report)
-    return None if rule is None else measure_iso_distance(part.mesh, volume, rule)
+    placed: dict[IsoRule, list[Part]] = {}
+    for part in parts:
+        part.facts["iso_distance"] = None
+        moved = (part.mesh.report.get("cortex") or {}).get("moved", False)
+        rule = None if moved or part.surface.label is not None else rule_of_report(part.mesh.report)
+        if rule is not None:
+            placed.setdefault(rule, []).append(part)
+    for rule, own in placed.items():
+        for part, found in zip(own, measure_iso_distances([part.mesh for part in own], volume, rule), strict=True):
+            part.facts["iso_distance"] = found
 
 
 def judge_parts(parts: Sequence[Part], settings: MeshSettings) -> list[dict[str, Any]]:

@@ -265,3 +265,19 @@ def test_where_most_is_metal_all_is_judged():
     volume, mesh = metal_volume(3071, 4)
     found = measure_iso_distance(mesh, volume, choose_iso_rule(volume, 200, closed=False))
     assert (found["near_metal"], found["away_from_metal_voxel"]) == (4, None)
+
+
+def test_meshes_are_measured_together_as_each_alone(monkeypatch):
+    volume = noise_volume()
+    rule = choose_iso_rule(volume, 100)
+    vertices, _, triangles = extract_isosurface(volume, 100)
+    meshes = [Mesh(vertices, triangles[start::7]) for start in range(7)]
+    alone = [measure_iso_distance(mesh, volume, rule).as_dict() for mesh in meshes]
+    calls = []
+    measure = iso_distance.distances_to_iso_surface
+    monkeypatch.setattr(
+        iso_distance, "distances_to_iso_surface", lambda *given: calls.append(len(given[2])) or measure(*given)
+    )
+    together = [found.as_dict() for found in iso_distance.measure_iso_distances(meshes, volume, rule)]
+    assert together == alone, "figures of meshes that were measured together"
+    assert len(calls) == 1, calls
