@@ -272,12 +272,14 @@ def test_meshes_are_measured_together_as_each_alone(monkeypatch):
     rule = choose_iso_rule(volume, 100)
     vertices, _, triangles = extract_isosurface(volume, 100)
     meshes = [Mesh(vertices, triangles[start::7]) for start in range(7)]
-    alone = [measure_iso_distance(mesh, volume, rule).as_dict() for mesh in meshes]
+    alone = [measure_iso_distance(mesh, volume, rule) for mesh in meshes]
     calls = []
     measure = iso_distance.distances_to_iso_surface
     monkeypatch.setattr(
         iso_distance, "distances_to_iso_surface", lambda *given: calls.append(len(given[2])) or measure(*given)
     )
-    together = [found.as_dict() for found in iso_distance.measure_iso_distances(meshes, volume, rule)]
-    assert together == alone, "figures of meshes that were measured together"
+    for one, other in zip(iso_distance.measure_iso_distances(meshes, volume, rule), alone, strict=True):
+        assert one["samples"] == other["samples"], "samples of a mesh among others"
+        for of in ("vertices_mm", "centres_mm", "centres_voxel"):
+            assert dict(one[of]) == pytest.approx(other[of], rel=1e-9), of
     assert len(calls) == 1, calls
