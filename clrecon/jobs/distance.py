@@ -145,9 +145,9 @@ def _draw_mesh(mesh: Mesh, colored: _Colored, other: str, settings: DistanceSett
     from clrecon.rendering.pictures.object_looks import MeshLook
     from clrecon.rendering.pictures.sheets import add_scale
     from clrecon.rendering.views.camera import Camera
-    from clrecon.rendering.views.directions import DEFAULT_SIZE
+    from clrecon.rendering.views.directions import DEFAULT_SIZE, read_view
 
-    camera = Camera.fit(box_around([mesh_corners(mesh)]), settings.view)
+    camera = Camera.fit(box_around([mesh_corners(mesh)]), read_view(settings.view))
     look = MeshLook(vertex_colors=colored.colors)
     with ScenePictures([(mesh, look)], device=device, memory=settings.memory) as scene:
         picture: Rendering = scene.take(camera, DEFAULT_SIZE, "white")

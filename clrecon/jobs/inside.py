@@ -39,11 +39,11 @@ def check_pictures(picture: str | Path, view: str) -> None:
     """Refuse pictures that cannot be made, before any work is done."""
     from clrecon.rendering.pictures.picture import check_image_path
     from clrecon.rendering.pictures.pillow import load_pillow
-    from clrecon.rendering.views.directions import find_view
+    from clrecon.rendering.views.directions import find_view, read_view
 
     load_pillow()
     check_image_path(picture)
-    find_view(view)
+    find_view(read_view(view))
 
 
 def draw_parts(
@@ -54,9 +54,9 @@ def draw_parts(
     from clrecon.operators.rays.scene import ScenePictures
     from clrecon.rendering.pictures.object_looks import MeshLook
     from clrecon.rendering.views.camera import Camera
-    from clrecon.rendering.views.directions import DEFAULT_SIZE
+    from clrecon.rendering.views.directions import DEFAULT_SIZE, read_view
 
-    camera = Camera.fit(box_around([mesh_corners(mesh) for mesh in meshes.values()]), view)
+    camera = Camera.fit(box_around([mesh_corners(mesh) for mesh in meshes.values()]), read_view(view))
     pictures = {}
     for part, mesh in meshes.items():
         shown = [(mesh, MeshLook(COLORS[part]))]

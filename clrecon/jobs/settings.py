@@ -120,7 +120,7 @@ class DistanceSettings(DeviceSettings):
     space: Space = space_option("patient frame of the coloured mesh", group="picture")
 
     def __post_init__(self) -> None:
-        from clrecon.rendering.views.directions import find_view
+        from clrecon.rendering.views.directions import find_view, read_view
 
         check_space(self.space)
         check_space(self.mesh_space)
@@ -128,7 +128,7 @@ class DistanceSettings(DeviceSettings):
             raise UsageError(f"distances need 1 to {MOST_SAMPLES:,} samples on each mesh, not {self.samples:,}")
         if self.range_mm is not None and not (math.isfinite(self.range_mm) and self.range_mm > 0.0):
             raise UsageError(f"the colours span a number of mm above 0, not {self.range_mm:g}")
-        find_view(self.view)
+        find_view(read_view(self.view))
         super().__post_init__()
 
 

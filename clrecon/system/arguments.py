@@ -69,11 +69,12 @@ CurvedKind = Literal["straightened", "stretched"]
 ModeName = Literal["dvr", "mip", "minip", "mean", "drr", "surface", "slices", "slice", "cpr", "points", "mesh"]
 PresetName = Literal["bone", "spine", "skin", "lung", "vessels", "muscle", "metal", "x-ray", "mip", "minip"]
 WindowName = Literal["bone", "soft", "lung", "abdomen", "mediastinum", "brain"]
+DirectionName = Literal["anterior", "posterior", "left", "right", "superior", "inferior"]
 ViewName = Literal["anterior", "posterior", "left", "right", "superior", "inferior", "axial", "coronal", "sagittal"]
 Features = Literal["paper", "variation"]
 """Words of which only some are possible; the functions refuse others."""
 _CHOICES = "Space Topology VertexRule MethodName FilterName PointKind Combination CurvedKind Features Literal".split()
-_CHOICES += ["ModeName", "PresetName", "WindowName", "ViewName"]
+_CHOICES += ["ModeName", "PresetName", "WindowName", "ViewName", "DirectionName"]
 
 _CLASSES = (
     "Volume", "DeviceVolume", "Mesh", "LabelMap", "PointCloud", "Mask", "Camera", "GridCells", "GhostSlices",

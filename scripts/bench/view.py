@@ -118,7 +118,8 @@ def measure_picks(job: Job) -> dict[str, Any]:
     places, size, seconds = [], (SIDE, SIDE), 0.0
     with Painter(objects, device=job.device) as painter:
         (mesh,) = painter.mesh_of_shown(model.state)
-        for view in ("anterior", "left", "40,25"):
+        angles: list[Any] = ["anterior", "left", (40, 25)]
+        for view in angles:
             model.look(view)
             state = model.state
             rows, columns = np.nonzero(painter.picture(state, size).image[..., 3])

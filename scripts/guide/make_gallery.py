@@ -31,11 +31,11 @@ def draw_modes(renderer: clrecon.VolumeRenderer, ray_step: float) -> np.ndarray:
     """Draw six modes, each with its name in a corner; (h, w, 3) uint8."""
     light = clrecon.Lighting(direction=(-0.3, -1.0, 0.6))
     pictures: dict[str, dict[str, Any]] = {
-        "dvr, preset spine": {"preset": "spine", "view": "35,15", "ray_step": ray_step, "zoom": 1.25},
-        "surface, shadows": {"mode": "surface", "view": "20,10", "shadows": True, "lighting": light, "zoom": 1.25},
-        "mip": {"mode": "mip", "view": "35,15", "zoom": 1.25},
+        "dvr, preset spine": {"preset": "spine", "view": (35, 15), "ray_step": ray_step, "zoom": 1.25},
+        "surface, shadows": {"mode": "surface", "view": (20, 10), "shadows": True, "lighting": light, "zoom": 1.25},
+        "mip": {"mode": "mip", "view": (35, 15), "zoom": 1.25},
         "drr, preset x-ray": {"preset": "x-ray"},
-        "slices": {"mode": "slices", "slices": 10, "view": "40,25", "zoom": 1.25},
+        "slices": {"mode": "slices", "slices": 10, "view": (40, 25), "zoom": 1.25},
         "slice, 5 mm thick": {"mode": "slice", "view": "sagittal", "thickness": 5.0, "zoom": 1.3},
     }
     tiles = [
@@ -52,7 +52,7 @@ def draw_beside_vtk(renderer: clrecon.VolumeRenderer) -> np.ndarray:
     from skimage.metrics import structural_similarity
 
     volume, bone = renderer.volume, find_preset("bone")
-    camera = clrecon.Camera.fit(volume, "25,10", 1.2, size=BESIDE)
+    camera = clrecon.Camera.fit(volume, (25, 10), 1.2, size=BESIDE)
     step = 0.5 * min(volume.spacing)
     light = replace(bone.lighting, soft_gradient=0.0)  # as VTK does
     ours = renderer.render(preset="bone", camera=camera, size=BESIDE, ray_step=step, lighting=light).image[..., :3]

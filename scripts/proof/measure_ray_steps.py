@@ -21,7 +21,7 @@ import clrecon  # noqa: E402
 from clrecon.rendering.looks.presets import PRESETS  # noqa: E402
 
 SIZE = (512, 512)
-VIEWS = ("anterior", "30,20")
+VIEWS = ("anterior", (30.0, 20.0))
 FINER = 10.0
 
 

@@ -16,6 +16,7 @@ RIGHT = """\
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 import clrecon
 
@@ -66,6 +67,16 @@ def filtered(volume: clrecon.Volume) -> clrecon.PointCloud:
     first: clrecon.Device = clrecon.devices()[0]
     print(values, first.label, median.spacing[0] + 1.0)
     return cloud[cloud.points[:, 2] > 3.0]
+
+
+def sampled(mesh: clrecon.Mesh, volume: clrecon.Volume, found: NDArray[np.uint8]) -> float:
+    with_hu = mesh.sample(volume).sample(volume, "near", order=0)
+    with_hu.face_values["height"] = with_hu.vertices[with_hu.triangles].mean(axis=(1, 2))
+    tumour = clrecon.LabelMap(found, volume, {1: "tumour"}) & clrecon.Mask.from_band(volume, (None, 300))
+    camera = clrecon.Camera.fit(volume, (25, 10), up="superior").zoomed(1.5)
+    clrecon.render(with_hu, camera=camera).save("mesh.png")
+    cloud: clrecon.PointCloud = clrecon.extract_points(volume, "auto").sample(volume, outside=-1024.0)
+    return float(with_hu.values["HU"].mean()) + len(cloud) + tumour.spacing[0]
 """
 
 SETUP = """\
@@ -116,14 +127,22 @@ WRONG = [
     'clrecon.VolumeLook("boen")',
     "cloud.denoise()",
     'clrecon.reformat_curve(volume, kind="bent")',
+    'clrecon.Camera.fit(volume, "25,10")',
+    'clrecon.render(volume, view="25,10")',
+    "mesh.sample(labels)",
+    "clrecon.LabelMap(labels.voxels)",
 ]
 """Words that no choice has, kinds of arguments, parameters that are gone or never were."""
 
 
-def python_of(page: str) -> str:
-    """The blocks of a page that use clrecon, as one script; those of SimpleITK and VTK alone are theirs to type."""
+PAGES = "tasks coming_from tour distance inside masks slices solid statistics".split()
+PAGES += [f"guide/{page}" for page in ("concepts", "labels_to_meshes", "other_programs", "quickstart")]
+
+
+def python_of(page: str) -> list[str]:
+    """The blocks of a page that use clrecon, which run from top to bottom; those of SimpleITK and VTK alone are not."""
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / f"{page}.md").read_text("utf-8"), re.M | re.S)
-    return "\n".join(block for block in blocks if "vtk" not in block and "itk_" not in block)
+    return [block for block in blocks if "vtk" not in block and "itk_" not in block]
 
 
 def checked_by_mypy(folder: Path) -> list[str]:
@@ -159,8 +178,10 @@ def test_right_scripts_are_clean_and_each_wrong_call_is_named(
     check: Callable[[Path], list[str]], tmp_path: Path
 ) -> None:
     (tmp_path / "right.py").write_text(RIGHT, encoding="utf-8")
-    for page in ("tasks", "coming_from", "tour"):
-        (tmp_path / f"{page}.py").write_text(python_of(page), encoding="utf-8")
+    blocks = {page: python_of(page) for page in PAGES}
+    for page, own in blocks.items():
+        (tmp_path / f"{page.replace('/', '_')}.py").write_text("\n".join(own), encoding="utf-8")
+    assert RIGHT.count("\ndef ") + sum(map(len, blocks.values())) >= 30
     (tmp_path / "wrong.py").write_text(SETUP + "\n".join(WRONG) + "\n", encoding="utf-8")
     errors = check(tmp_path)
     assert [line for line in errors if not line.startswith("wrong.py:")] == []

@@ -14,7 +14,7 @@ from clrecon.rendering.pictures.label_style import NO_LABEL
 from clrecon.rendering.pictures.object_looks import MESH_COLORS, MeshLook, PointLook
 from clrecon.rendering.pictures.styles import SPINE, CurveCut, SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.clip import check_center
-from clrecon.rendering.views.directions import default_view
+from clrecon.rendering.views.directions import default_view, read_view, say_view
 from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress
 
@@ -102,7 +102,7 @@ class PictureTaker(Closing):
         """The views of the pictures; without any, that from which the slices of this scan show."""
         if self._settings.views or not isinstance(self.style, SlicesInSpace):
             return self._settings.views_used
-        return (default_view(self.style.mode, cast("Volume", self._subject)),)
+        return (say_view(default_view(self.style.mode, cast("Volume", self._subject))),)
 
     @property
     def box(self) -> Grid:
@@ -134,7 +134,7 @@ class PictureTaker(Closing):
             return self.take(settings.camera(self.box, view))
         if self.style.curve == SPINE:
             self._progress("curve", 0, 0)
-        return self._render(view=view, up=settings.up, size=settings.size)
+        return self._render(view=read_view(view), up=settings.up, size=settings.size)
 
     def take(self, camera: Camera) -> Rendering:
         return self._render(camera=camera, size=self._settings.size_used)

@@ -35,14 +35,22 @@ from clrecon.rendering.pictures.styles import CURVED_KINDS as CURVED_KINDS
 from clrecon.rendering.pictures.styles import SPINE, CurveCut, PlaneCut, SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import DEFAULT_VIEW_ANGLE, Camera
 from clrecon.rendering.views.clip import Clip
-from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, DIRECTIONS, SLICES_VIEWS, checked_size
+from clrecon.rendering.views.directions import (
+    ANTERIOR,
+    DEFAULT_SIZE,
+    DIRECTIONS,
+    SLICES_VIEWS,
+    checked_size,
+    read_view,
+    say_view,
+)
 from clrecon.rendering.views.reformation import PLANES, find_plane
 from clrecon.system.arguments import Space, name_parameter
 from clrecon.system.light_dataclass import MISSING, dataclass, fields, replace
 from clrecon.system.options import numbers_reader, option
 from clrecon.system.text import unknown_name
 
-DEFAULT_VIEWS = {"slice": "axial", "cpr": "left", "slices": SLICES_VIEWS[0]}
+DEFAULT_VIEWS = {"slice": "axial", "cpr": "left", "slices": say_view(SLICES_VIEWS[0])}
 """Default view of the modes whose default is not the view from the front; that of slices suits the scan."""
 SPINES = (SPINE, "auto")
 """Values of a curve that stand for the spinal canal, which is found in the scan."""
@@ -371,9 +379,9 @@ class RenderSettings(InputSettings):
     def camera(self, volume: Grid, view: str, *, turning: bool = False) -> Camera:
         """Place the camera of one view; with `turning` the whole volume stays in it while the camera orbits."""
         if isinstance(self.style, PlaneCut):
-            return find_plane(volume, view, self.size_used, zoom=self.zoom, up=self.up, center=self.center)
+            return find_plane(volume, read_view(view), self.size_used, zoom=self.zoom, up=self.up, center=self.center)
         return Camera.fit(
-            volume, view, self.zoom,
+            volume, read_view(view), self.zoom,
             up=self.up, view_angle=self.view_angle, size=self.size_used, turning=turning, center=self.center,
         )  # fmt: skip
 

@@ -39,7 +39,7 @@ from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.clip import ShownLabels, check_center, find_seen_box
 from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, checked_size, default_view
 from clrecon.rendering.views.reformation import find_plane
-from clrecon.system.arguments import ModeName, ViewName, explains_arguments
+from clrecon.system.arguments import DirectionName, ModeName, ViewName, explains_arguments
 from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
 
@@ -292,7 +292,7 @@ class Place(NamedTuple):
     """The view of a picture as the caller described it."""
 
     camera: Camera | None
-    view: str | Sequence[float]
+    view: DirectionName | Sequence[float]
     up: str | Sequence[float] | None
     zoom: float
     view_angle: float | None
@@ -303,7 +303,7 @@ class Place(NamedTuple):
         cls,
         style: Style,
         camera: Camera | None,
-        view: str | Sequence[float] | None,
+        view: Any,
         up: str | Sequence[float] | None,
         zoom: float | None,
         view_angle: float | None,

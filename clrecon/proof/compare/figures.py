@@ -25,6 +25,7 @@ from clrecon.proof.compare.methods import COMPARED
 from clrecon.proof.compare.processes import load_array, load_mesh
 from clrecon.rendering.pictures.likeness import make_control_pictures, measure_pictures
 from clrecon.rendering.views.camera import Camera
+from clrecon.system.arguments import DirectionName
 
 WINDOW_HU = (-200.0, 800.0)
 BETWEEN = 0.487
@@ -258,7 +259,7 @@ def measure_against_slice(
     }
 
 
-VIEW = "anterior"
+VIEW: DirectionName = "anterior"
 SIZE = (480, 480)
 QUALITY = 80
 """Of WebP; PNG beside the page is exact."""

@@ -20,7 +20,7 @@ from clrecon.rendering.views.directions import (
     find_view,
     number_or_nan,
 )
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import DirectionName, explains_arguments
 from clrecon.system.light_dataclass import dataclass, replace
 
 DEFAULT_VIEW_ANGLE = 30.0
@@ -123,7 +123,7 @@ class Camera:
     def fit(
         cls,
         volume: Grid,
-        view: str | Sequence[float] = "anterior",
+        view: DirectionName | Sequence[float] = "anterior",
         zoom: float = 1.0,
         *,
         up: str | ArrayLike | None = None,
@@ -141,7 +141,7 @@ class Camera:
             May be sheared or uneven.
         view : str or (float, float)
             anterior, posterior, left, right, superior, inferior: the side where the camera stands; or azimuth and
-            elevation in degrees, as a pair or text ``"AZ,EL"``, see ``clrecon.rendering.views.directions.find_view``.
+            elevation in degrees, see ``clrecon.rendering.views.directions.find_view``.
         zoom : float
             2 shows everything twice as large, see `zoomed`.
         up : str or array_like, shape (3,), optional

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
-from clrecon.system.arguments import name_parameter
+from clrecon.system.arguments import DirectionName, name_parameter
 from clrecon.system.text import unknown_name
 
 DIRECTIONS: dict[str, tuple[float, float, float]] = {
@@ -71,8 +71,8 @@ def find_view(view: str | Sequence[float]) -> tuple[Float64Array, Float64Array]:
 
     The top is the head; for a view along the body, the side of the azimuth, which is anterior for the views by name.
 
-    view: A name of `DIRECTIONS`, or azimuth and elevation in degrees, as a pair or as text ``"AZ,EL"``: azimuth turns
-        the camera from anterior towards the patient's left, elevation (-90 to 90) lifts it to the head.
+    view: A name of `DIRECTIONS`, or azimuth and elevation in degrees: azimuth turns the camera from anterior towards
+        the patient's left, elevation (-90 to 90) lifts it to the head.
     """
     named = DIRECTIONS.get(view.strip().lower()) if isinstance(view, str) else None
     if named is not None:
@@ -108,30 +108,40 @@ def hint_at_sheet(word: object) -> str:
     return f"; a contact sheet of slices is asked for with {name_parameter('sheet')}"
 
 
-def _find_angles(view: str | Sequence[float]) -> tuple[float, float]:
-    parts: Sequence[str | float] = view.split(",") if isinstance(view, str) else view
+def read_view(text: str) -> DirectionName | tuple[float, float]:
+    """Return the view that an option says: a name, or the pair of angles of ``AZ,EL``."""
+    return _find_angles(text.split(","), text) if "," in text else cast("DirectionName", text)
+
+
+def say_view(view: str | tuple[float, float]) -> str:
+    """Return the text that `read_view` takes."""
+    return view if isinstance(view, str) else f"{view[0]:g},{view[1]:g}"
+
+
+def _find_angles(view: str | Sequence[str | float], said: str | None = None) -> tuple[float, float]:
     try:
-        azimuth, elevation = (float(part) for part in parts)
+        azimuth, elevation = (float(part) for part in (() if isinstance(view, str) else view))
     except (TypeError, ValueError, OverflowError):
         azimuth = elevation = float("nan")
     if not (np.isfinite(azimuth) and abs(elevation) <= 90.0):
+        form, example = ("(azimuth, elevation)", "(30, 15)") if said is None else ("AZIMUTH,ELEVATION", "30,15")
         raise UsageError(
-            f"{unknown_name('view', view, DIRECTIONS)}, or AZIMUTH,ELEVATION in degrees,"
-            f" elevation from -90 to 90, such as 30,15{hint_at_sheet(view)}"
+            f"{unknown_name('view', said or view, DIRECTIONS)}, or {form} in degrees,"
+            f" elevation from -90 to 90, such as {example}{hint_at_sheet(view)}"
         )
     return azimuth, elevation
 
 
-ANTERIOR = "anterior"
+ANTERIOR: DirectionName = "anterior"
 
-SLICES_VIEWS = ("30,30", "-60,30", "75,-30")
+SLICES_VIEWS = ((30.0, 30.0), (-60.0, 30.0), (75.0, -30.0))
 """Views of slices in space, the first for any axis.  Slices that are edge-on in one of them show in another."""
 
 LEAST_COSINE = 0.25
 """Slices are shown by a view where its cosine to their normal is at least this: a quarter of their height is seen."""
 
 
-def default_view(mode: str, grid: Grid) -> str:
+def default_view(mode: str, grid: Grid) -> DirectionName | tuple[float, float]:
     """Return the view of a mode in `render`: anterior, and for slices in space one from which they show."""
     if mode != "slices":
         return ANTERIOR

@@ -16,6 +16,7 @@ line that bends with radius r, lengths along the line towards the centre of the 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -133,20 +134,22 @@ def find_plane(
         picture of the whole volume, for which `Camera.fit` leaves room in every direction.
     pixel_mm: Side of a pixel; default: so that the box fits.
     """
+    seen_from: Any = view
     if isinstance(view, str):
         name = view.strip().lower()
-        view = PLANES.get(name, name)
-        if "," not in view and view not in DIRECTIONS:
-            raise UsageError(f"{unknown_name('plane', name, [*PLANES, *DIRECTIONS])}, or AZIMUTH,ELEVATION in degrees")
+        seen_from = PLANES.get(name, name)
+        if seen_from not in DIRECTIONS:
+            words = unknown_name("plane", name, [*PLANES, *DIRECTIONS])
+            raise UsageError(f"{words}, or (azimuth, elevation) in degrees")
     width, height = checked_size(size)
-    camera = Camera.fit(volume, view, up=up, size=size)
+    camera = Camera.fit(volume, seen_from, up=up, size=size)
     right, top, _ = camera.basis()
     seen = box_corners(volume) - camera.focal_point
     half = max(float(np.abs(seen @ top).max()), float(np.abs(seen @ right).max()) * height / width)
     if pixel_mm is not None:
         half = 0.5 * height * positive_mm("the size of a pixel", pixel_mm)
     if center is not None:
-        camera = Camera.fit(volume, view, up=up, size=size, center=center)
+        camera = Camera.fit(volume, seen_from, up=up, size=size, center=center)
     return replace(camera, parallel_scale=half).zoomed(zoom)
 
 

@@ -20,6 +20,7 @@ from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.views.camera import Camera, rotation_about
 from clrecon.rendering.views.directions import DIRECTIONS, as_point, checked_vector
 from clrecon.rendering.views.reformation import PLANES
+from clrecon.system.arguments import DirectionName
 from clrecon.system.text import unknown_name
 from clrecon.viewer.model.objects import ShownObject, ShownScan
 from clrecon.viewer.model.parts import FoundParts, carry_looks
@@ -30,7 +31,7 @@ FIT_PIXELS = 1000
 
 
 def fit_camera(
-    points: Float64Array, view: str | Sequence[float], aspect: float, view_angle: float | None = None
+    points: Float64Array, view: DirectionName | Sequence[float], aspect: float, view_angle: float | None = None
 ) -> Camera:
     """Return a camera from a side of the patient so that points (n, 3) fit; `aspect` is width by height."""
     size = (max(1, round(aspect * FIT_PIXELS)), FIT_PIXELS)
@@ -171,7 +172,7 @@ class ChangingView:
     def roll(self, degrees: float) -> None:
         self._change("roll", "the roll", camera=roll_camera(self.camera, *checked_numbers("a roll", degrees)))
 
-    def look(self, view: str | Sequence[float] = "anterior") -> None:
+    def look(self, view: DirectionName | Sequence[float] = "anterior") -> None:
         """Look from a side of the patient, so that what is shown fits; see `clrecon.Camera.fit` for the sides."""
         parallel = self.camera.is_parallel
         camera = fit_camera(self._shown_corners(), view, self.aspect, None if parallel else self.camera.view_angle)

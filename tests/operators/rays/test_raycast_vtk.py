@@ -88,7 +88,7 @@ def draw(volume: Volume, camera: Camera, shaded: bool, device: Any) -> tuple[np.
 @pytest.mark.parametrize("axes", AXES)
 def test_smooth_bodies_look_as_vtk_draws_them(device, axes, shaded, view_angle):
     volume = blobs(axes)
-    camera = Camera.fit(volume, "30,20", 1.5, view_angle=view_angle, size=SIZE)
+    camera = Camera.fit(volume, (30, 20), 1.5, view_angle=view_angle, size=SIZE)
     ours, theirs = draw(volume, camera, shaded, device)
     assert (theirs.max(axis=2) > 20).mean() > 0.1
     assert likeness(ours, theirs) >= tolerances.VTK_LIKENESS_SMOOTH
@@ -98,6 +98,6 @@ def test_smooth_bodies_look_as_vtk_draws_them(device, axes, shaded, view_angle):
 @pytest.mark.release
 def test_a_spine_looks_as_vtk_draws_it(device):
     volume = spine()
-    camera = Camera.fit(volume, "30,20", size=SIZE)
+    camera = Camera.fit(volume, (30, 20), size=SIZE)
     assert likeness(*draw(volume, camera, True, device)) >= tolerances.VTK_LIKENESS_SPINE
     assert likeness(*draw(volume, camera, False, device)) >= tolerances.VTK_LIKENESS_SPINE_UNSHADED

@@ -166,7 +166,7 @@ def test_slices_show_without_a_view_and_in_a_scene_too(device, axis):
         picture = clrecon.render(shown, size=(64, 64), device=device, **style)
         assert not [text for text in picture.report["warnings"] if "edge-on" in text]
         assert np.isfinite(picture.depth).mean() > 0.25
-        assert np.allclose(picture.camera.basis().forward, -find_view("30,30")[0])
+        assert np.allclose(picture.camera.basis().forward, -find_view((30, 30))[0])
 
 
 def test_slices_are_chosen_evenly_or_by_number():

@@ -82,7 +82,7 @@ def test_oblique_slices_have_a_distance_and_no_number(device: Any) -> None:
     picture = take(oblique, device, sheet=4)
     assert {tile["slice"] for tile in picture.report["tiles"]} == {None} and len(picture.report["tiles"]) == 4
     with pytest.raises(UsageError, match="planes of voxels do not lie in this view"):
-        take(oblique, device, "45,45", slices=2)
+        take(oblique, device, (45, 45), slices=2)
 
 
 def test_slices_of_a_tilted_gantry_are_shown_as_they_were_taken(device: Any) -> None:

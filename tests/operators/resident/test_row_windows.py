@@ -164,7 +164,7 @@ for shape in (tuple(int(n) for n in text.split(",")) for text in sys.argv[2:]):
     assert volume.voxels.ctypes.data == first
     seen = 0
     with clrecon.VolumeRenderer(volume, device=int(sys.argv[1])) as renderer:
-        for view in ("anterior", "superior", "left", "3,2", "183,88"):
+        for view in ("anterior", "superior", "left", (3, 2), (183, 88)):
             for angle in (None, 30.0):
                 picture = renderer.render(preset="bone", view=view, view_angle=angle, size=(80, 60))
                 seen += int((picture.image > 0).sum())

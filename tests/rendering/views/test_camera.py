@@ -10,7 +10,7 @@ from variants import daily
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.rendering.views.camera import Camera, box_corners
-from clrecon.rendering.views.directions import DIRECTIONS
+from clrecon.rendering.views.directions import DIRECTIONS, read_view, say_view
 from clrecon.rendering.views.reformation import plane_sheet
 
 CENTRE = np.array([12.0, -30.0, 850.0])
@@ -64,24 +64,31 @@ def test_each_view_has_the_sides_of_the_patient_where_a_radiologist_expects_them
 
 @pytest.mark.parametrize(
     ("angles", "name"),
-    [("0,0", "anterior"), ((90, 0), "left"), ("180, 0", "posterior"), ("-90,0", "right"), ("270,0", "right")]
-    + [((0.0, 90.0), "superior"), ("0,-90", "inferior"), (" Anterior ", "anterior")],
+    [((0, 0), "anterior"), ((90, 0), "left"), ((180, 0), "posterior"), ((-90, 0), "right"), ([270, 0], "right")]
+    + [((0.0, 90.0), "superior"), ((0, -90), "inferior"), (" Anterior ", "anterior")],
 )
 def test_angles_name_the_same_views(angles, name):
     assert Camera.fit(box(), angles) == Camera.fit(box(), name)
 
 
 def test_azimuth_goes_to_the_left_and_elevation_to_the_head():
-    camera = Camera.fit(box(), "30,20")
+    camera = Camera.fit(box(), (30, 20))
     towards = np.subtract(camera.position, camera.focal_point) / camera.distance
     cosine = np.cos(np.radians(20.0))
     assert towards == pytest.approx([0.5 * cosine, -np.sqrt(0.75) * cosine, np.sin(np.radians(20.0))])
     assert camera.up == (0.0, 0.0, 1.0)
 
 
+def test_an_option_says_angles_with_a_comma_and_is_said_so():
+    for text, view in (("left", "left"), ("25,-10.5", (25.0, -10.5))):
+        assert read_view(text) == view and say_view(read_view(text)) == text
+    with pytest.raises(UsageError, match="unknown view '1,2,3': .*, or AZIMUTH,ELEVATION in degrees.* such as 30,15"):
+        read_view("1,2,3")
+
+
 def test_over_the_head_the_side_of_the_azimuth_is_at_the_top():
-    assert Camera.fit(box(), "90,90").up == DIRECTIONS["left"]
-    assert Camera.fit(box(), "180,-90").up == DIRECTIONS["posterior"]
+    assert Camera.fit(box(), (90, 90)).up == DIRECTIONS["left"]
+    assert Camera.fit(box(), (180, -90)).up == DIRECTIONS["posterior"]
 
 
 def test_the_top_can_be_chosen():
@@ -111,7 +118,7 @@ def test_the_whole_volume_is_in_the_picture_of_any_view(make, perspective, size)
 
 
 @pytest.mark.parametrize("perspective", [None, 50.0])
-@pytest.mark.parametrize("view", ["anterior", "left", "superior", "35,20"])
+@pytest.mark.parametrize("view", ["anterior", "left", "superior", (35, 20)])
 @pytest.mark.parametrize("size", [(400, 300), (300, 400)])
 def test_a_fitted_volume_fills_the_picture_but_for_a_margin(perspective, view, size):
     volume = box()
@@ -139,7 +146,7 @@ def test_slices_that_stick_out_of_an_uneven_stack_are_in_the_picture_too():
 
 @pytest.mark.parametrize("perspective", [None, 35.0])
 def test_points_on_rays_project_to_their_pixels(perspective):
-    camera = Camera.fit(sheared(), "40,-25", view_angle=perspective, size=(7, 5)).zoomed(1.7)
+    camera = Camera.fit(sheared(), (40, -25), view_angle=perspective, size=(7, 5)).zoomed(1.7)
     origins, directions = camera.rays((7, 5))
     assert origins.shape == directions.shape == (5, 7, 3)
     depth = np.random.default_rng(1).uniform(0.1, 300.0, (5, 7))
@@ -200,9 +207,13 @@ def test_zoom_magnifies():
         assert Camera.fit(box(), zoom=2.5, view_angle=perspective, size=SIZE) == camera.zoomed(2.5)
 
 
-@pytest.mark.parametrize("view", ["front", "", "1,2,3", "10", (1,), (0, 91), "nan,0", "inf,0", 5, None, ("a", "b")])
+@pytest.mark.parametrize(
+    "view", ["front", "", "1,2,3", "10", (1,), (0, 91), "25,10", (np.nan, 0), (np.inf, 0), 5, None, ("a", "b")]
+)
 def test_unknown_views_list_the_known_ones(view):
-    with pytest.raises(UsageError, match="anterior, posterior, left, right, superior, inferior, or AZIMUTH,ELEVATION"):
+    with pytest.raises(
+        UsageError, match="anterior, posterior, left, right, superior, inferior, or .azimuth, elevation. in"
+    ):
         Camera.fit(box(), view)
 
 
@@ -272,7 +283,7 @@ def test_a_number_too_large_for_a_float_is_refused(make, words):
         make(Camera.fit(box()))
 
 
-@pytest.mark.parametrize("view", [*DIRECTIONS, "30,40"])
+@pytest.mark.parametrize("view", [*DIRECTIONS, (30, 40)])
 def test_a_parallel_camera_with_a_centre_stays_outside_of_the_volume(view):
     """Wherever in the volume the centre is, and beyond it."""
     volume = sheared()

@@ -19,7 +19,7 @@ def stack(normal: np.ndarray) -> Grid:
 
 @pytest.mark.parametrize("normal", np.eye(3))
 def test_slices_across_the_axes_of_the_patient_are_seen_from_the_first_view(normal: np.ndarray) -> None:
-    assert default_view("slices", stack(normal)) == SLICES_VIEWS[0] == "30,30"
+    assert default_view("slices", stack(normal)) == SLICES_VIEWS[0] == (30.0, 30.0)
 
 
 def test_whatever_way_slices_lie_they_show() -> None:
