@@ -55,7 +55,7 @@ LENGTHS = {
     "operators/rays/point_pictures.py": "the object: the spacing of the cloud where it has one",
     "operators/reformat/cut.py": ADULTS,
     "operators/surface/cortex.py": "the voxel: lengths are at a voxel of 1 mm3 and scale with it",
-    "operators/surface/cortex_mesh.py": "nothing: float32 in mm",
+    "operators/surface/cortex_mesh.py": "nothing: float32 in mm, and how far is searched",
     "operators/surface/growing.py": "nothing: how far is searched",
     "operators/surface/seeds.py": ADULTS,
     "operators/vertebrae/inside.py": "the object: vertebrae of adults",

@@ -11,7 +11,9 @@ from clrecon.geometry import Volume
 from clrecon.opencl import Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import cortex
-from clrecon.operators.surface.cortex import FITTED, METAL, NO_ROOM, NOT_BONE, ProfileSampler, fit_walls
+from clrecon.operators.surface.cortex import ProfileSampler
+from clrecon.operators.surface.cortex_constants import MOST_WALLS
+from clrecon.operators.surface.cortex_mesh import FITTED, METAL, NO_ROOM, NOT_BONE, fit_walls
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.proof.checking import OBLIQUE, stack
 from clrecon.proof.surface.surface_checks import CORTEX_CHECKS
@@ -70,7 +72,7 @@ def test_constants_are_those_of_the_scan(device):
     # Interpolation between voxels of 1 mm blurs further: by about 0.4 mm, in squares.
     assert found.blur_mm == pytest.approx(0.88, abs=0.08) and found.blur_across_mm == pytest.approx(0.88, abs=0.08)
     assert found.cortex_hu == pytest.approx(1000.0, rel=0.04)
-    assert found.places == cortex.MOST_WALLS and found.thick > 100
+    assert found.places == MOST_WALLS and found.thick > 100
 
 
 @pytest.mark.parametrize(
@@ -114,6 +116,39 @@ def test_thin_walls_alone_do_not_show_their_density(device):
     away, _ = outer_places(mesh, fit, 13.0)
     assert fit.constants.cortex_hu < 800.0
     assert 0.1 < np.mean(away) < 0.35  # the walls are taken for thicker, less dense ones
+
+
+def test_the_shell_of_a_table_says_nothing_of_bone(device):
+    """Sheets of 250 HU between air rise by more than bone does, and have more vertices."""
+    voxels = hollow_ball(thickness=3.0).voxels.copy()
+    for beside in (slice(0, 5), slice(-5, None)):
+        voxels[:, :, beside] = -900
+        voxels[:, beside] = -900
+    voxels[:, :, (2, -3)] = 250
+    voxels[:, (2, -3)] = 250
+    constants = fit_surface(Volume(voxels, np.eye(4)), device)[1].constants
+    assert constants.cortex_hu == pytest.approx(1000.0, rel=0.05) and constants.thick > 300
+    assert constants.blur_mm == pytest.approx(0.8, abs=0.1)
+
+
+def test_bones_of_different_density_have_constants_each(device):
+    volumes = [hollow_ball(thickness=4.0, cortex=cortex) for cortex in (1400.0, 900.0)]
+    volume = Volume(np.concatenate([one.voxels for one in volumes]), np.eye(4))
+    mesh = extract_isosurface(volume, 200.0, device=device)
+    second = (mesh.vertices[:, 2] > len(volumes[0].voxels)).astype(np.int64)
+    with DeviceVolume(volume, device=device) as resident:
+        one, each = (
+            fit_walls(resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch(), components=components)
+            for components in (None, second)
+        )
+    assert one.own_cortex_hu == () and each.own_cortex_hu[-1] == pytest.approx(900.0, rel=0.05)
+    middle = MIDDLE + [0.0, 0.0, len(volumes[0].voxels)]
+    away = [
+        np.linalg.norm(mesh.vertices + fit.shift_mm[:, None] * mesh.normals - middle, axis=1) - 13.0
+        for fit in (one, each)
+    ]
+    outer = (second == 1) & (np.linalg.norm(mesh.vertices - middle, axis=1) > 12.5)
+    assert np.abs(away[1][outer]).mean() < 0.06 < np.abs(away[0][outer]).mean()
 
 
 def test_a_scan_without_bone_has_no_cortex(device):

@@ -1,0 +1,197 @@
+"""Constants of a scan that its walls of bone are fitted with: blur and density of the cortex, from some profiles."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.anatomy.noise import measure_noise
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import METAL_HU, Volume
+from clrecon.mesh.compare.walls import COMPACT_HU
+from clrecon.operators.surface.cortex import (
+    CENTRE,
+    SAMPLES,
+    SILENT_HU,
+    CortexConstants,
+    Float32Array,
+    ProfileSampler,
+    WallProfiles,
+    blurs_of,
+)
+from clrecon.system.light_dataclass import dataclass
+
+FEWEST_WALLS = 60
+"""Profiles across walls below which nothing is known of a scan's cortex."""
+
+MOST_WALLS, LOOKED_AT = 500, 4000
+"""Profiles that the constants are measured in, and vertices among which they are searched."""
+
+LEAST_CONTRAST, LEAST_CORTEX_HU = 0.4, 350.0
+"""A wall is as high, and rises by as much, as this share of the 90th percentile of those of compact bone, or of those
+that reach the second: the shell of a table rises from air, but is low. Fewer than `FEWEST_WALLS` show no bone."""
+
+TRIMMED = 0.8
+"""Share of the profiles, those fitted best, by which blurs are compared: others touch a second bone or a vessel."""
+
+SEARCH_STEPS = (1.3, 1.12, 1.05)
+"""Factors by which a blur is changed as long as that helps, one after the other."""
+
+LEAST_SHARE, DIFFERENT = 0.03, 0.1
+"""Components with this share of a surface's vertices are looked at by themselves, and have constants of their own if
+their compact bone differs from that of all by the second share."""
+
+THICK_BLURS, SHARP, WIDE_SPREAD, DENSE_PERCENTILE, FEWEST_THICK = 2.0, 1.25, 0.3, 75.0, 12
+"""Walls thicker than so many blurs show their HU where the blur is at most the second times that within the slices, if
+the fit leaves the cortex free within the third; of these the percentile, since walls differ and blur only ever lowers
+them."""
+
+LEAST_BLUR_ERROR, LEAST_CORTEX_ERROR, THIN_CORTEX_ERROR = 0.02, 0.05, 0.3
+"""Shares below which constants are not known: phantoms differ from their own by as much.  The third holds where all
+walls are so thin that blur and density are one."""
+
+
+@dataclass
+class _Trial:
+    """Constants as far as they are found."""
+
+    blur_mm: float
+    across_mm: float
+    cortex_hu: float
+
+    def changed(self, place: int, factor: float) -> _Trial:
+        blurs = [self.blur_mm, self.across_mm]
+        blurs[place] *= factor
+        return _Trial(blurs[0], blurs[1], self.cortex_hu)
+
+
+def measure_constants(
+    sampler: ProfileSampler, volume: Volume, points: NDArray[np.floating], normals: NDArray[np.floating]
+) -> CortexConstants:
+    """Measure blur and cortex of a scan in profiles at some of the points.
+
+    The blur is that which leaves the least of the profiles, the cortex what thick walls show.  Their uncertainties are
+    half the spread over four parts of the profiles, and not less than `LEAST_BLUR_ERROR` and `LEAST_CORTEX_ERROR`.
+    """
+    rows = np.unique(np.linspace(0, len(points) - 1, min(len(points), LOOKED_AT)).astype(np.int64))
+    values = sampler.values(points[rows], normals[rows])
+    walls, peaks = _find_walls(values)
+    if len(walls) < FEWEST_WALLS:
+        raise NoSurfaceError(
+            f"the surface has no walls of bone that the cortex could be measured in: {len(walls)} of"
+            f" {len(rows):,} profiles across it, at least {FEWEST_WALLS} are needed"
+        )
+    values, peaks = values[:, walls], peaks[walls]
+    try:
+        noise = measure_noise(volume).hu
+    except UsageError:  # a specimen in air
+        noise = None
+    step = volume.spacing
+    dense = float(np.percentile(peaks, 95.0))
+    usual = 1.2 * float(np.percentile(peaks, DENSE_PERCENTILE))
+    start = _Trial(
+        0.7 * float(np.sqrt(step[0] * step[1])) ** 0.5, max(0.7 * step[2] ** 0.5, 0.45 * step[2]),
+        min(1.03 * dense, usual),
+    )  # fmt: skip
+    known = noise if noise is not None else SILENT_HU
+    found = start
+    for first in range(len(SEARCH_STEPS)):
+        found = _search_blurs(sampler.take(values), found, known, SEARCH_STEPS[first:])
+        found.cortex_hu, thick = _measure_cortex(sampler.take(values), values, found, known)
+    parts = []
+    for part in range(4):
+        profiles = sampler.take(values[:, part::4])
+        one = _search_blurs(profiles, found, known, SEARCH_STEPS[1:])
+        parts.append((one.blur_mm, one.across_mm, _measure_cortex(profiles, values[:, part::4], found, known)[0]))
+    of_cortex = LEAST_CORTEX_ERROR if thick >= FEWEST_THICK else THIN_CORTEX_ERROR
+    least = np.array([LEAST_BLUR_ERROR, LEAST_BLUR_ERROR, of_cortex])
+    spread = np.maximum(np.std(parts, axis=0) / 2.0, least * np.mean(parts, axis=0))
+    residual = sampler.take(values).fit(found.blur_mm, found.across_mm, found.cortex_hu, known).residual_hu
+    errors = [float(value) for value in spread]
+    return CortexConstants(
+        blur_mm=found.blur_mm,
+        blur_across_mm=found.across_mm,
+        cortex_hu=found.cortex_hu,
+        blur_error_mm=errors[0],
+        blur_across_error_mm=errors[1],
+        cortex_error_hu=errors[2],
+        noise_hu=noise,
+        residual_hu=float(np.sqrt(np.mean(np.square(residual)))),
+        places=values.shape[1],
+        thick=thick,
+    )
+
+
+def find_groups(
+    sampler: ProfileSampler,
+    volume: Volume,
+    points: NDArray[np.floating],
+    normals: NDArray[np.floating],
+    components: NDArray[np.integer],
+    scan: CortexConstants,
+) -> list[tuple[NDArray[np.intp], CortexConstants]]:
+    """Return the rows of points that share constants, and these: those of the scan for all rows that are left over.
+
+    components: ndarray, shape (n,). Component of each point, -1 for none.
+    """
+    groups, left = [], np.ones(len(points), bool)
+    sizes = np.bincount(components[components >= 0], minlength=1)
+    large = np.flatnonzero(sizes >= LEAST_SHARE * len(points))
+    for component in large if len(large) > 1 else []:
+        rows = np.flatnonzero(components == component)
+        try:
+            own = measure_constants(sampler, volume, points[rows], normals[rows])
+        except NoSurfaceError:  # a table
+            continue
+        is_bone = own.thick >= FEWEST_THICK and own.cortex_hu >= COMPACT_HU
+        if is_bone and abs(own.cortex_hu - scan.cortex_hu) > DIFFERENT * scan.cortex_hu:
+            groups.append((rows, own))
+            left[rows] = False
+    return [(np.flatnonzero(left), scan), *groups]
+
+
+def _find_walls(values: Float32Array) -> tuple[NDArray[np.intp], Float32Array]:
+    """Return up to `MOST_WALLS` profiles across walls of bone, and the highest value of each profile."""
+    whole = np.isfinite(values[:SAMPLES]).all(axis=0)
+    peaks = np.where(
+        whole, values[: CENTRE + 2].max(axis=0, initial=-np.inf, where=np.isfinite(values[: CENTRE + 2])), 0
+    )
+    rise = peaks - values[CENTRE:SAMPLES].min(axis=0, initial=np.inf, where=np.isfinite(values[CENTRE:SAMPLES]))
+    usable = whole & (peaks < METAL_HU)
+    of_bone = peaks[usable & (peaks >= LEAST_CORTEX_HU)]
+    if len(of_bone) < FEWEST_WALLS:
+        return np.zeros(0, np.intp), peaks
+    compact = of_bone[of_bone >= COMPACT_HU]
+    least = LEAST_CONTRAST * float(np.percentile(compact if len(compact) >= FEWEST_WALLS else of_bone, 90.0))
+    walls = np.flatnonzero(usable & (np.minimum(rise, peaks) > least))
+    return walls[np.unique(np.linspace(0, len(walls) - 1, min(len(walls), MOST_WALLS)).astype(np.intp))], peaks
+
+
+def _search_blurs(profiles: WallProfiles, found: _Trial, noise_hu: float, factors: tuple[float, ...]) -> _Trial:
+    """Return the blurs that leave least of the profiles, from those of a trial on."""
+
+    def left(trial: _Trial) -> float:
+        fits = profiles.fit(trial.blur_mm, trial.across_mm, trial.cortex_hu, noise_hu, cortex_spread=0.02)
+        squares = np.sort(np.square(fits.residual_hu, dtype=np.float64))
+        return float(np.mean(squares[: max(1, int(TRIMMED * len(squares)))]))
+
+    least = left(found)
+    for factor in factors:
+        for place in (0, 1):
+            for change in (factor, 1.0 / factor):
+                while (value := left(trial := found.changed(place, change))) < 0.9999 * least:
+                    found, least = trial, value
+                    if not 0.05 < trial.blur_mm < 4.0 or not 0.05 < trial.across_mm < 8.0:
+                        return found
+    return found
+
+
+def _measure_cortex(profiles: WallProfiles, values: Float32Array, found: _Trial, noise_hu: float) -> tuple[float, int]:
+    """Return the HU of compact bone, and how many walls are thick enough to show it."""
+    fits = profiles.fit(found.blur_mm, found.across_mm, found.cortex_hu, noise_hu, cortex_spread=WIDE_SPREAD)
+    blurs = blurs_of(values, found.blur_mm, found.across_mm)
+    thick = (fits.thickness_mm > THICK_BLURS * blurs) & (blurs < SHARP * found.blur_mm)
+    if np.count_nonzero(thick) < FEWEST_THICK:
+        return found.cortex_hu, int(np.count_nonzero(thick))
+    shown = float(np.percentile(fits.cortex_hu[thick], DENSE_PERCENTILE))
+    return float(np.clip(shown, found.cortex_hu / 1.25, found.cortex_hu * 1.25)), int(np.count_nonzero(thick))
