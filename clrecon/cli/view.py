@@ -133,8 +133,17 @@ def _show(options: argparse.Namespace, console: Console) -> int:
 
 
 def _serve(options: argparse.Namespace, settings: ViewSettings, console: Console) -> int:
-    """Serve until Ctrl-C, which is how it ends: exit code 0."""
+    """Serve until Ctrl-C, which is how it ends: exit code 0.  Faults, after which the view goes on, are shown with
+    their traces.
+    """
+    import logging
+
     from clrecon.viewer.web.server import serve_view
+
+    faults = logging.StreamHandler()
+    faults.setLevel(logging.ERROR)
+    log = logging.getLogger("clrecon.viewer")
+    log.addHandler(faults)
 
     def ready(server: Any, view: Any, warnings: list[str]) -> None:
         device = view.painter.device.label
@@ -146,16 +155,19 @@ def _serve(options: argparse.Namespace, settings: ViewSettings, console: Console
         console.say("         for browsers of this computer; whoever has this address can see the scan; Ctrl-C ends")
         console.finish()
 
-    serve_view(
-        options.inputs,
-        settings,
-        port=options.port,
-        opens=options.opens,
-        save_as=options.save_as,
-        wrote=lambda line: console.say(f"wrote    {printable(line)}"),
-        progress=console.progress,
-        ready=ready,
-    )
+    try:
+        serve_view(
+            options.inputs,
+            settings,
+            port=options.port,
+            opens=options.opens,
+            save_as=options.save_as,
+            wrote=lambda line: console.say(f"wrote    {printable(line)}"),
+            progress=console.progress,
+            ready=ready,
+        )
+    finally:
+        log.removeHandler(faults)
     return 0
 
 

@@ -141,12 +141,22 @@ LEAST_COSINE = 0.25
 """Slices are shown by a view where its cosine to their normal is at least this: a quarter of their height is seen."""
 
 
+def shows_slices(direction: Float64Array, grid: Grid) -> bool:
+    """Tell whether slices of a grid are seen, and not edge-on, along a direction: a unit vector, LPS."""
+    return _cosine_to_normal(direction, grid) >= LEAST_COSINE
+
+
+def _cosine_to_normal(direction: Float64Array, grid: Grid) -> float:
+    normal = np.cross(grid.affine[:3, 0], grid.affine[:3, 1])
+    return abs(float(direction @ normal)) / float(np.linalg.norm(normal))
+
+
 def default_view(mode: str, grid: Grid) -> DirectionName | tuple[float, float]:
     """Return the view of a mode in `render`: anterior, and for slices in space one from which they show."""
     if mode != "slices":
         return ANTERIOR
-    normal = np.cross(grid.affine[:3, 0], grid.affine[:3, 1])
-    normal = normal / np.linalg.norm(normal)
-    cosines = [abs(float(find_view(view)[0] @ normal)) for view in SLICES_VIEWS]
-    shown = [n for n, cosine in enumerate(cosines) if cosine >= LEAST_COSINE]
-    return SLICES_VIEWS[shown[0] if shown else int(np.argmax(cosines))]
+    directions = {view: find_view(view)[0] for view in SLICES_VIEWS}
+    for view, direction in directions.items():
+        if shows_slices(direction, grid):
+            return view
+    return max(directions, key=lambda view: _cosine_to_normal(directions[view], grid))

@@ -174,9 +174,10 @@ class ChangingView:
 
     def look(self, view: DirectionName | Sequence[float] = "anterior") -> None:
         """Look from a side of the patient, so that what is shown fits; see `clrecon.Camera.fit` for the sides."""
-        parallel = self.camera.is_parallel
-        camera = fit_camera(self._shown_corners(), view, self.aspect, None if parallel else self.camera.view_angle)
-        self._change("look", f"the view {view if isinstance(view, str) else ''}".strip(), camera=camera)
+        self._change("look", f"the view {view if isinstance(view, str) else ''}".strip(), camera=self._fitted(view))
+
+    def _fitted(self, view: str | Sequence[float]) -> Camera:
+        return fit_camera(self._shown_corners(), view, self.aspect, self.camera.view_angle)
 
     def set_perspective(self, on: bool) -> None:
         """Take a perspective camera, or a parallel one, with the same size at the focal point."""

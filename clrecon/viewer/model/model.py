@@ -16,7 +16,7 @@ from clrecon.rendering.looks.window import BONE_WINDOW
 from clrecon.rendering.pictures.annotations import edge_letters
 from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
 from clrecon.rendering.views.clip import Clip
-from clrecon.rendering.views.directions import as_point, checked_vector
+from clrecon.rendering.views.directions import as_point, checked_vector, default_view, shows_slices
 from clrecon.rendering.views.reformation import PLANES
 from clrecon.system.arguments import Space
 from clrecon.system.text import format_hu, unknown_name
@@ -122,9 +122,17 @@ class ViewModel(ChangingView):
         self.set_iso(min(max(self.state.iso_value + step, low), high))
 
     def set_mode(self, name: str) -> None:
+        """Show a mode; slices that are edge-on as the camera stands are looked at as `clrecon.render` does."""
         if name not in self.modes:
             raise UsageError(unknown_name("mode", name, self.modes))
-        self._change("mode", f"the mode {self.state.mode}", mode=name, picture_window=None)
+        camera = self.camera
+        if self._is_edge_on(self.modes[name]):
+            camera = self._fitted(default_view("slices", self.scans[0].volume))
+        self._change("mode", f"the mode {self.state.mode}", mode=name, picture_window=None, camera=camera)
+
+    def _is_edge_on(self, mode: ViewMode) -> bool:
+        """Tell whether slices in space would not be seen: the camera looks along them."""
+        return mode.kind == "slices" and not shows_slices(self.camera.basis().forward, self.scans[0].volume)
 
     def step_mode(self, steps: int) -> None:
         """Go to a mode further down the list, behind the last one to the first."""
@@ -317,6 +325,8 @@ class ViewModel(ChangingView):
         elif mode.kind in ("volume", "slices") and len(self.scans) > 1:
             others = ", ".join(each.name for each in self.scans[1:])
             notes.append(f"one scan is shown in mode {mode.name}, {others} by the surface")
+        if self._is_edge_on(mode):
+            notes.append("slices are hardly seen along their planes: turn the picture")
         return notes
 
     def say_place(self, point: Sequence[float]) -> str:

@@ -150,6 +150,8 @@ class Connection:
                     break
                 try:
                     await self._take(json.loads(message.data))
+                except UsageError as error:
+                    self._say(error=str(error))
                 except (ValueError, TypeError, KeyError, AttributeError):
                     self._say(error="this message cannot be read: load the page again")
         finally:
@@ -368,6 +370,9 @@ class Connection:
 
 def _fit(size: Any) -> tuple[int, int]:
     """Return a size that a picture may have, of the same shape."""
-    width, height = (max(1.0, float(value)) for value in size)
+    try:
+        width, height = (min(max(1.0, float(value)), 1e6) for value in size)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"a size is width and height in pixels, not {size!r:.60}") from error
     share = min(1.0, LARGEST_SIDE / max(width, height))
     return max(1, round(share * width)), max(1, round(share * height))

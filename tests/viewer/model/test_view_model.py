@@ -368,3 +368,26 @@ def test_the_search_for_parts_tells_every_step(monkeypatch):
     told = []
     parts.find_clusters(SimpleNamespace(volume=scenes.make_scan()), 1, 300.0, True, lambda *step: told.append(step))
     assert told == [("parts", done, parts.STEPS) for done in range(parts.STEPS + 1)]
+
+
+def test_slices_that_are_edge_on_turn_the_camera_and_are_told():
+    model = make_model(scenes.make_scan())
+    start = model.camera
+    model.set_mode("slices")
+    normal = np.cross(*model.scans[0].volume.affine[:3, :2].T)
+    along = model.camera.basis().forward @ normal / np.linalg.norm(normal)
+    assert abs(along) >= 0.25, along
+    assert model.facts()["notes"] == []
+    model.look("anterior")
+    assert "turn the picture" in model.facts()["notes"][0]
+    model.undo()
+    model.undo()
+    assert (model.camera, model.state.mode) == (start, "surface"), "one change has mode and camera"
+
+
+def test_slices_that_are_seen_leave_the_camera():
+    model = make_model(scenes.make_scan())
+    model.look("superior")
+    start = model.camera
+    model.set_mode("slices")
+    assert model.camera == start

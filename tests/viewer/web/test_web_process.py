@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -139,3 +140,19 @@ def test_a_port_that_is_taken_is_said_before_anything_is_read(capsys: pytest.Cap
 def test_an_input_that_is_not_there_ends_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["view", "no_such_folder"]) in (2, 3)
     assert "no_such_folder" in capsys.readouterr().err
+
+
+@pytest.mark.unit
+def test_a_fault_behind_the_page_is_shown_with_its_trace(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def serve(*given: Any, **named: Any) -> None:
+        try:
+            raise ValueError("a number of another kind")
+        except ValueError:
+            logging.getLogger("clrecon.viewer.session.worker").exception("mesh failed")
+
+    monkeypatch.setattr("clrecon.viewer.web.server.serve_view", serve)
+    assert main(["view", "scan.nii.gz"]) == 0, "the view goes on"
+    said = capsys.readouterr().err
+    assert "mesh failed" in said, said
+    assert "in serve" in said and "ValueError: a number of another kind" in said, said
+    assert not logging.getLogger("clrecon.viewer").handlers, "what listened is gone with the view"
