@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
 from typing import Any
@@ -89,11 +89,7 @@ def trilinear_field(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[F
     it.
     """
     value, gradient = np.zeros(len(ijk)), np.zeros((3, len(ijk)))
-    cell, shares = _split_cells(volume, rule, ijk)
-    voxels, weights = _Voxels(volume, rule, cell, range(2)), [(1.0 - share, share) for share in shares.T.copy()]
-    for corner in _CORNERS:
-        sample = voxels.at(corner)
-        x, y, z = (both[bit] for both, bit in zip(weights, corner, strict=True))
+    for corner, sample, (x, y, z) in _corners(volume, rule, ijk):
         value += sample * (x * y * z)
         for along, bit, others in zip(gradient, corner, (y * z, z * x, x * y), strict=True):
             along += (sample if bit else -sample) * others
@@ -103,12 +99,17 @@ def trilinear_field(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[F
 def trilinear_values(volume: Volume, rule: IsoRule, ijk: Float64Array) -> Float64Array:
     """Return only the values of `trilinear_field`, in less time."""
     value = np.zeros(len(ijk))
+    for _, sample, (x, y, z) in _corners(volume, rule, ijk):
+        value += sample * (x * y * z)
+    return value
+
+
+def _corners(volume: Volume, rule: IsoRule, ijk: Float64Array) -> Iterator[tuple[Any, Float64Array, Any]]:
+    """Yield the corners of the points' cells, i, j, k each 0 or 1, with their voxels and their weights along i, j, k."""
     cell, shares = _split_cells(volume, rule, ijk)
     voxels, weights = _Voxels(volume, rule, cell, range(2)), [(1.0 - share, share) for share in shares.T.copy()]
     for corner in _CORNERS:
-        x, y, z = (both[bit] for both, bit in zip(weights, corner, strict=True))
-        value += voxels.at(corner) * (x * y * z)
-    return value
+        yield corner, voxels.at(corner), [both[bit] for both, bit in zip(weights, corner, strict=True)]
 
 
 def _split_cells(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[NDArray[np.int64], Float64Array]:
