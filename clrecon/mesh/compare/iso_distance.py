@@ -105,7 +105,7 @@ def trilinear_values(volume: Volume, rule: IsoRule, ijk: Float64Array) -> Float6
 
 
 def _corners(volume: Volume, rule: IsoRule, ijk: Float64Array) -> Iterator[tuple[Any, Float64Array, Any]]:
-    """Yield the corners of the points' cells, i, j, k each 0 or 1, with their voxels and their weights along i, j, k."""
+    """Yield the corners of the cells, i, j, k each 0 or 1, with the voxels there and the weights along i, j, k."""
     cell, shares = _split_cells(volume, rule, ijk)
     voxels, weights = _Voxels(volume, rule, cell, range(2)), [(1.0 - share, share) for share in shares.T.copy()]
     for corner in _CORNERS:
