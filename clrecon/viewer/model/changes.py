@@ -176,7 +176,7 @@ class ChangingView:
         """Look from a side of the patient, so that what is shown fits; see `clrecon.Camera.fit` for the sides."""
         self._change("look", f"the view {view if isinstance(view, str) else ''}".strip(), camera=self._fitted(view))
 
-    def _fitted(self, view: str | Sequence[float]) -> Camera:
+    def _fitted(self, view: DirectionName | Sequence[float]) -> Camera:
         return fit_camera(self._shown_corners(), view, self.aspect, self.camera.view_angle)
 
     def set_perspective(self, on: bool) -> None:
