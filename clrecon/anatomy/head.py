@@ -129,11 +129,7 @@ def shows_face(volume: Volume, hu: float) -> bool:
 
 
 def find_head(volume: Volume) -> bool | None:
-    """Tell, once for each volume, whether a scan shows a head: True where slices show the vault of a skull.
-
-    It is False where every slice with a body shows a trunk or is filled by it, so that no skin shows; None for all
-    else, such as a leg.
-    """
+    """Tell whether slices show the vault of a skull; False where a trunk fills every slice; None for all else."""
     if volume not in _judged:
         _judged[volume] = _judge(volume)
     return _judged[volume]

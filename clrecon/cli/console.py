@@ -150,11 +150,7 @@ def printable(text: object) -> str:
 
 
 class Console:
-    """The output streams of one command; with `as_json` stdout gets one JSON object and nothing else.
-
-    stdout: the result.  stderr: errors, warnings, progress; the moving line only if stderr is a terminal.
-    It is not an error if a reader closes stdout early (``| head``).
-    """
+    """The output streams of one command: stdout has the result, or with `as_json` one JSON object; stderr all else."""
 
     def __init__(self, *, as_json: bool = False):
         self.as_json, self.quiet, self.verbose = as_json, False, False

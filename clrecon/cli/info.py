@@ -1,7 +1,4 @@
-"""``clrecon info``: the listing of an input, with its series and certificate, as a table that fits the terminal.
-
-If stdout is not a terminal, the text is plain and as wide as necessary, so that nothing is cut or folded that a script
-looks for.  Texts from files are put into the table as plain text: they cannot act as markup or terminal sequences."""
+"""``clrecon info``: the listing of an input, a table that fits the terminal, plain and uncut where stdout is none."""
 
 from __future__ import annotations
 

@@ -293,6 +293,6 @@ def hash_code(text: str) -> str:
 
 
 @cache
-def read_page_code(name: str) -> str:
-    """Return a file of the page: ``page.html``, ``page.css``, ``page.js``, ``page_shared.js``."""
-    return (files(__package__) / name).read_text(encoding="utf-8").strip()
+def read_page_code(name: str, package: str = __package__) -> str:
+    """Return a file of a page: ``page.html``, ``page.css``, ``page.js``, ``page_shared.js``."""
+    return (files(package) / name).read_text(encoding="utf-8").strip()

@@ -18,7 +18,7 @@ from clrecon.exchange.content import PointContent, check_same, refuse_file, writ
 from clrecon.exchange.raw_content import RawCloud, columns_of, read_remarks, say_cut
 from clrecon.system.paths import open_regular
 from clrecon.system.pieces import chunks
-from clrecon.system.text import escape_text
+from clrecon.system.text import escape_text, is_number
 
 _CHUNK = 1 << 14
 _PIECE = 1 << 22
@@ -99,7 +99,7 @@ def read_cloud(path: Path) -> RawCloud:
         f"line {number} holds words and numbers and is left out, {escape_text(' '.join(_words(line)))!r}: if it is a"
         " point, correct it; if not, mark it as a comment with #"
         for number, line in enumerate(head, start=1)
-        if not _is_comment(line) and any(map(_is_number, _words(line)))
+        if not _is_comment(line) and any(map(is_number, _words(line)))
     ][:_MOST_WARNINGS]
     words = _words(head[-1].lstrip("#/% \t")) if head else []
     fits = len(words) == count and [word.lower() for word in words[:3]] == ["x", "y", "z"]
@@ -119,8 +119,8 @@ def read_cloud(path: Path) -> RawCloud:
 def _check_head(line: str, number: int, name: str) -> None:
     """Refuse a line before the first point that begins with a number and is no point."""
     words = _words(line)
-    if words and not _is_comment(line) and _is_number(words[0]):
-        wrong = next(word for word in words if not _is_number(word))
+    if words and not _is_comment(line) and is_number(words[0]):
+        wrong = next(word for word in words if not is_number(word))
         raise RefusedInputError(
             f"{name} has {escape_text(wrong)!r} in place of a number in line {number + 1}: correct the point, or mark"
             " the line as a comment with #"
@@ -138,12 +138,4 @@ def _words(line: str) -> list[str]:
 def _numbers_in(line: str) -> int:
     """Return the count of numbers in a line; 0 if one of its words is not a number."""
     words = _words(line)
-    return len(words) if all(map(_is_number, words)) else 0
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+    return len(words) if all(map(is_number, words)) else 0

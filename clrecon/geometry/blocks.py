@@ -62,11 +62,7 @@ def find_block(grid: Grid, origins: Float64Array, low: ArrayLike, high: ArrayLik
 
 
 def place_block(affine: Float64Array, origins: Float64Array, uneven: bool, block: Block) -> tuple[Any, Any]:
-    """Return the affine of a block, and the positions (n, 3) of its slices where they are uneven, else None.
-
-    Slices of an uneven grid that are even among themselves, by the rule of the reader, have an affine alone: that which
-    they have when they are read without the others.
-    """
+    """Return the affine of a block, and positions (n, 3) of its slices, None where these are even among themselves."""
     placed = np.array(affine)
     aside = affine[:3, 0] * block.first[0] + affine[:3, 1] * block.first[1]
     positions = origins[block.first[2] : block.end[2]] + aside
@@ -190,11 +186,7 @@ MM3_PER_ML = 1000.0
 
 
 def slice_voxel_ml(volume: BaseVolume) -> Float64Array:
-    """Return the volume of one voxel of each slice, shape (nk,), ml.
-
-    A slice reaches half way to both of its neighbours along the normal, the end slices as far outward as inward.  Shear
-    moves slices within their planes and changes no volume.
-    """
+    """Return the volume of a voxel of each slice, (nk,) ml: half way to both neighbours along the normal."""
     area = float(np.linalg.norm(np.cross(volume.affine[:3, 0], volume.affine[:3, 1])))
     heights = volume.slice_origins(border=1) @ slice_normal(volume.affine)
     return area * np.abs(heights[2:] - heights[:-2]) / 2.0 / MM3_PER_ML

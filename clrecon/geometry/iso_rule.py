@@ -329,11 +329,7 @@ def _largest_and_unit(volume: Volume, border: int) -> tuple[float, float]:
 
 
 def slice_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
-    """Return for each slice from ``-border`` to ``nk - 1 + border`` the matrix from gradients per step to those per mm.
-
-    Gradients are central differences, so the step along k is the mean of the steps to both neighbours.  This is exact
-    for a linear field, even with uneven slices.
-    """
+    """Return for slices from ``-border`` on the matrix from gradients per step, central, to those per mm."""
     origins = volume.slice_origins(border + 1)
     return _normal_matrices(volume, border, 0.5 * (origins[2:] - origins[:-2]))
 

@@ -372,7 +372,8 @@ class _Memory:
 def _find_name(memory: _Memory, address: int) -> int:
     """Return the address of the only string of the structure that is a CPU's name after a target's name."""
     names = (UNKNOWN, *(name.encode() for name, _ in CPU_NAMES))
-    pointers = [place for (place,) in _POINTER.iter_unpack(_whole_words(memory.read(address, _STRUCT_BYTES)))]
+    content = memory.read(address, _STRUCT_BYTES)
+    pointers = [place for (place,) in _POINTER.iter_unpack(content[: len(content) // _POINTER.size * _POINTER.size])]
     places = [
         cpu
         for target, cpu in zip(pointers, pointers[1:], strict=False)
@@ -381,7 +382,3 @@ def _find_name(memory: _Memory, address: int) -> int:
     if len(places) != 1:
         raise LookupError(f"{len(places)} names of CPUs were found in its memory, not one")
     return places[0]
-
-
-def _whole_words(content: bytes) -> bytes:
-    return content[: len(content) // _POINTER.size * _POINTER.size]

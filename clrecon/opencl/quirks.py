@@ -91,11 +91,7 @@ def is_software_gpu(device_name: str) -> bool:
 
 
 def shares_host_memory(platform_name: str, device_type: str) -> bool:
-    """True when a kernel may work in numpy's own memory without a copy.
-
-    CPU drivers do.  Rusticl on llvmpipe keeps a shadow copy of host pointers and simulators check bounds of
-    buffers that they own, so both get buffers and copies like a GPU.
-    """
+    """True when a kernel may work in numpy's own memory without a copy: CPU drivers, not Rusticl or simulators."""
     return device_type == "cpu" and not is_simulator(platform_name) and "rusticl" not in platform_name.lower()
 
 

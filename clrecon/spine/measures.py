@@ -44,10 +44,7 @@ class Bias:
 
 
 def line_angles(direction: Float64Array, side: float) -> tuple[float, float]:
-    """Return the medial and the sagittal angle of a direction (left, posterior, cranial) that runs forward, degrees.
-
-    They are those of its projections, on the axial plane towards the midline, on the sagittal plane towards cranial.
-    """
+    """Return the medial and the sagittal angle, degrees, of a direction (left, posterior, cranial) that is forward."""
     x, y, z = (float(part) for part in direction)
     return float(np.degrees(np.arctan2(-side * x, -y))), float(np.degrees(np.arctan2(z, -y)))
 

@@ -113,12 +113,7 @@ def stage_file(
     *,
     expected_bytes: int = 0,
 ) -> Iterator[StagedFile]:
-    """Write a file under a temporary name, as `replace_file`; `StagedFile.commit` in the ``with`` block puts it in
-    place.
-
-    For files that belong together: stage all of them, then commit one after the other.  The others are removed at the
-    end.
-    """
+    """Write a file under a temporary name; `StagedFile.commit` in the block puts it in place, one after the other."""
     target = checked_target(path)
     with contextlib.ExitStack() as stack:
         with system_errors(path):

@@ -112,11 +112,7 @@ def aligned_empty(shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class FilePlace:
-    """The place of a C-contiguous array in a file, `offset` bytes in, and the state of the file at that time.
-
-    dtype: With the byte order, as ``numpy.dtype.str`` has it.
-    file_bytes, changed_ns: Size of the file, and when it was changed last (ns since 1970).
-    """
+    """The place of a C-contiguous array in a file, `offset` bytes in, and the file's size and change then."""
 
     path: str
     offset: int

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,7 @@ def side_by_side(one: Callable[[], _One], other: Callable[[], _Other]) -> tuple[
         return first.result(), second
 
 
-def find_bounds(points: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+def find_bounds(points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the lowest and highest coordinates of points, (n, 3), column by column, which is ten times faster."""
     return np.array([column.min() for column in points.T]), np.array([column.max() for column in points.T])
 

@@ -82,6 +82,14 @@ def format_band(low: float, high: float, unit: str = "HU") -> str:
     return f"{low:g} {unit} and more" if math.isinf(high) else f"{low:g} to {high:g} {unit}"
 
 
+def is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 def format_share(share: float, places: int = 0) -> str:
     """Return a share, 0 to 1, as ``31 %``, with so many digits behind the point."""
     return f"{100.0 * share:.{places}f} %"

@@ -1,8 +1,4 @@
-"""What a notebook shows of a mesh, a volume, a cloud, a label map or a listing: HTML that needs nothing from outside.
-
-A mesh is the page of `clrecon.exchange.page` in a sandboxed frame, which works offline and in what nbconvert writes.
-Where the page is too large, and for clouds and volumes, it is a picture.
-"""
+"""What a notebook shows of meshes, volumes, clouds, label maps and listings: HTML that works offline."""
 
 from __future__ import annotations
 

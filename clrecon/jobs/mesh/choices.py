@@ -64,22 +64,18 @@ class LabelChoice:
         """Return the colours of labels: those given, and where wanted distinct ones for all others."""
         from clrecon.rendering.looks.colors import find_color
         from clrecon.rendering.pictures.label_style import distinct_colors
+        from clrecon.rendering.views.directions import as_point
 
         given = {}
         for label, color in self.colors:
             number = labels.find(label)
             if number in given:
                 raise UsageError(f"label {number} {labels.name(number)} has two colours")
-            given[number] = _as_tuple(find_color(color))
+            given[number] = as_point(find_color(color))
         if not distinct:
             return given
         own = distinct_colors(len(numbers))
-        return {number: _as_tuple(color) for number, color in zip(numbers, own, strict=True)} | given
-
-
-def _as_tuple(color: Any) -> tuple[float, float, float]:
-    red, green, blue = (float(value) for value in color)
-    return red, green, blue
+        return {number: as_point(color) for number, color in zip(numbers, own, strict=True)} | given
 
 
 LABEL_SEED = "label:"

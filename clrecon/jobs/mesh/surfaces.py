@@ -24,12 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface to extract.
-
-    name: Part of its file names, for example ``"200hu"``; empty if it is the only one.
-    iso_value: HU; or the two ends of a range; None: it is a label's own.
-    below: It encloses the values below the iso value.
-    """
+    """A surface to extract; `name` is for its file; the level of a range is a pair, of a label's own surface None."""
 
     name: str
     iso_value: float | tuple[float, ...] | None

@@ -66,11 +66,7 @@ def read_look(look: LabelLook | None, volume: Volume | None = None, *, follow_li
 
 
 class PictureTaker(Closing):
-    """Taker of the pictures that settings ask for; a context manager that frees the memory of the device.
-
-    function: Transfer function from a file; None means that of the preset.
-    curve: ndarray, shape (n, 3). Centre line in LPS mm; None means that of the style.
-    """
+    """Takes the pictures of settings, and frees the device; None: `function` of the preset, `curve` of the style."""
 
     def __init__(
         self,

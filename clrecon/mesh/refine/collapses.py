@@ -105,11 +105,7 @@ class Quadrics:
         self._vertices, self._sums = vertices, around.T @ planes
 
     def best_places(self, clusters: IntArray, members: IntArray, count: int) -> Float64Array:
-        """Return the places, shape (count, 3), mm, with the least sum of squares for clusters of vertices.
-
-        clusters: ndarray, shape (k,). Cluster of each member, from 0 to ``count - 1``; each cluster has members.
-        members: ndarray, shape (k,). Vertices.
-        """
+        """Return places (count, 3), mm, of the least sum of squares of `clusters` (k,), from 0 on, of `members`."""
         from scipy.sparse import csr_array
 
         shape = (count, len(self._vertices))

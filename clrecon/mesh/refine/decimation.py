@@ -1,8 +1,4 @@
-"""Decimation within an error bound in mm of the original surface.
-
-fast-simplification chooses which edges are collapsed.  This module adds the bound and the topology: places where the
-result would violate them are undone, and further collapses are tried.
-"""
+"""Decimation by fast-simplification within a bound in mm: what violates bound or topology is undone."""
 
 from __future__ import annotations
 

@@ -129,11 +129,7 @@ class SurfaceBounds(NearDistance):
         witnesses: IntArray,
         left: NDArray[np.uint8],
     ) -> None:
-        """Look at the middles of triangles and edges, see `find_witnesses`, of the triangles `rest` of a piece.
-
-        near, names: Faces nearest to the corners, shape (3, k), names, shape (k, 3).
-        witnesses, left: Of this piece; changed in place.
-        """
+        """Look at middles, see `find_witnesses`, of the triangles `rest`; `witnesses` and `left` change in place."""
         one, two, three = (corner[:, rest] for corner in corners)
         half = np.float32(0.5)
         points = np.concatenate(

@@ -140,11 +140,7 @@ def measure_farthest(
 
 
 def _farthest_point(points: Points, vertices: Points, triangles: NDArray[np.uint32]) -> float:
-    """Return the distance of the farthest of some points from a surface.
-
-    Distances to the triangles around the nearest vertices are never less than those to the surface: only points where
-    they are large are measured exactly, the farthest first.
-    """
+    """Return the distance of the farthest of some points, measured exactly where that to near triangles is large."""
     from scipy.spatial import cKDTree
 
     used = np.unique(triangles)

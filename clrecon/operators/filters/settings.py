@@ -75,7 +75,10 @@ def choose_window(volume: Volume, sigma_mm: float, dimensions: int, most_taps: i
     and 9. Below the number of the first ring the middle stays alone.
     """
     box = _box(volume, RADIUS_OF_SIGMA * sigma_mm, dimensions)
-    whole = _lattice(np.minimum(box, 3 * LARGEST_REACH))
+    k, j, i = np.meshgrid(
+        *(np.arange(-n, n + 1) for n in np.minimum(box, 3 * LARGEST_REACH)[::-1].tolist()), indexing="ij"
+    )
+    whole = np.column_stack([i.ravel(), j.ravel(), k.ravel()]).astype(np.int32)
     squares = _squares(whole, _nominal_steps(volume))
     is_kept = np.asarray((np.abs(whole) <= np.minimum(box, LARGEST_REACH)).all(axis=1))
     if np.count_nonzero(is_kept) > most_taps:
@@ -117,12 +120,6 @@ def _box(volume: Volume, radius_mm: float, dimensions: int) -> NDArray[np.int64]
     # Rounding adds no voxels to a radius of whole steps.
     box: NDArray[np.int64] = np.ceil(np.minimum(radius_mm * reach, 1e6) - 1e-9).astype(np.int64)
     return box
-
-
-def _lattice(box: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return all steps of a box, sorted by k, j and i."""
-    k, j, i = np.meshgrid(*(np.arange(-n, n + 1) for n in box[::-1].tolist()), indexing="ij")
-    return np.column_stack([i.ravel(), j.ravel(), k.ravel()]).astype(np.int32)
 
 
 def _exponents(volume: Volume, offsets: NDArray[np.int32], sigma_mm: float) -> Float64Array:

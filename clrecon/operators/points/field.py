@@ -176,10 +176,7 @@ class _Decision:
 def decide_signs(
     masks: Masks, limits: MemoryLimits, rounds: int, *, memory: int | None = None, taken: int = 0
 ) -> Signs:
-    """Decide which nodes are inside, signs flooding `rounds` nodes; see its twin in `clrecon.proof.points.field`.
-
-    The `negative_d` of the masks is used up; `taken` are bytes that are taken already, those of the masks among them.
-    """
+    """Decide which nodes are inside, signs flooding `rounds` nodes; `negative_d` is used up; `taken` bytes are gone."""
     decision = _Decision(masks, limits, memory, taken)
     runs = decision.find_runs()
     count, regions = decision.number_regions(runs)
@@ -322,7 +319,9 @@ class NodeField:
         # Cells are found by coordinates in float32.
         extent = float(np.ptp(plan.points, axis=0).max()) + 2.0 * settings.bridge
         self._within = settings.reach + 1e-3 * settings.spacing + 4.0 * CELL_ROUNDING * extent
-        self._check_first(device, plan)
+        n = len(plan.points)
+        needs = {**plan.needs(device), **self._kept(n), "normals as given": 12 * n, "nodes": self.nodes.layer_bytes}
+        require_room(self.limits, needs, "no surface can be made of the cloud")
         self._program = load_program(device, "points/field.cl", {"LANES": device.kernel_variants["LANES"]})
         self.grid = fill_grid(device, plan, memory=memory)
         self._normals_d = self._sort_normals(normals)
@@ -341,11 +340,6 @@ class NodeField:
     def _kept(self, n: int) -> dict[str, int]:
         """Return the bytes of what stays while slabs are worked on, beside the grid."""
         return {"normals": 12 * n, "masks of nodes": Masks.COUNT * self.nodes.mask_bytes}
-
-    def _check_first(self, device: Device, plan: GridPlan) -> None:
-        n = len(plan.points)
-        needs = {**plan.needs(device), **self._kept(n), "normals as given": 12 * n, "nodes": self.nodes.layer_bytes}
-        require_room(self.limits, needs, "no surface can be made of the cloud")
 
     def _sort_normals(self, normals: NDArray[np.float32]) -> tuple[Any, Any, Any]:
         n = self.grid.n

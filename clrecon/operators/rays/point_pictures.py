@@ -30,7 +30,7 @@ from clrecon.opencl import (
     upload,
     with_fallback,
 )
-from clrecon.operators.rays.picture_buffers import highlight_table
+from clrecon.operators.rays.picture_buffers import Shot, highlight_table
 from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
 from clrecon.rendering import Lighting, Rendering
@@ -77,15 +77,12 @@ def draw_splats(
     points: NDArray[np.float32],
     colors: NDArray[np.uint8],
     normals: NDArray[np.float32] | None,
-    camera: Camera,
-    size: tuple[int, int],
+    shot: Shot,
     radius_mm: float,
     *,
     base: Float64Array | None = None,
     lighting: Lighting | None = None,
-    background: str | Sequence[float] | None = None,
     memory: int | None = None,
-    progress: Progress = ignore_progress,
     stopwatch: Stopwatch | None = None,
 ) -> SplatPicture:
     """Draw each point, (n, 3) float32 mm from `base`, as a disc that faces the camera; the nearest disc is seen.
@@ -95,12 +92,12 @@ def draw_splats(
     radius_mm: Of the discs; on the picture it is at least 0.7 and at most 128 pixels.
     memory: A cloud over it goes through in parts, and gives the same picture.
     """
-    job = _Splats(device, camera, size, radius_mm, base, lighting or Lighting(), background, normals is not None)
+    job = _Splats(device, shot, radius_mm, base, lighting or Lighting(), normals is not None)
     count = job.plan(len(points), memory)
     stopwatch = stopwatch or Stopwatch()
     while True:
         try:
-            return job.draw(points, colors, normals, count, stopwatch, progress)
+            return job.draw(points, colors, normals, count, stopwatch)
         except DeviceMemoryError as error:
             settle(device, error)
             if count <= FEWEST_POINTS:
@@ -114,22 +111,21 @@ class _Splats:
     def __init__(
         self,
         device: Device,
-        camera: Camera,
-        size: tuple[int, int],
+        shot: Shot,
         radius_mm: float,
         base: Float64Array | None,
         lighting: Lighting,
-        background: str | Sequence[float] | None,
         has_normals: bool,
     ):
-        self.device, self.size, self.radius, self.lighting = device, size, np.float32(radius_mm), lighting
+        camera, self.size, background, self.progress = shot
+        self.device, self.radius, self.lighting = device, np.float32(radius_mm), lighting
         shading = "normals" if has_normals else "depths"
         self.shading = shading if lighting.shades else "none"
-        self.table = eye_table(camera, size, lighting, np.zeros(3) if base is None else base)
+        self.table = eye_table(camera, self.size, lighting, np.zeros(3) if base is None else base)
         self.background = np.zeros(4, np.float32)
         if background is not None:
             self.background[:] = *find_color(background), 1.0
-        self.disc_pixels = min(max(radius_mm / camera.pixel_mm(size), SMALLEST_DISC), LARGEST_DISC)
+        self.disc_pixels = min(max(radius_mm / camera.pixel_mm(self.size), SMALLEST_DISC), LARGEST_DISC)
 
     def plan(self, points: int, memory: int | None) -> int:
         """Return the points of a part: what fits beside the picture, and no more pixels than a launch should have."""
@@ -158,7 +154,6 @@ class _Splats:
         normals: NDArray[np.float32] | None,
         count: int,
         stopwatch: Stopwatch,
-        progress: Progress,
     ) -> SplatPicture:
         device, (width, height) = self.device, self.size
         program = load_program(device, "rays/splats.cl")
@@ -171,7 +166,7 @@ class _Splats:
         picture: dict[str, Any] = {"view": view_d, "width": width, "height": height}
 
         def tell(done: int) -> None:
-            progress("points", done, 3 * n)
+            self.progress("points", done, 3 * n)
 
         def hold(first: int) -> Any:
             nonlocal whole_d
@@ -313,21 +308,21 @@ class PointPictures(Closing):
         progress: Progress | None = None,
     ) -> Rendering:
         radius = self._radius(style)
-        colors = self._colors_of(style)
+        if self._colors is None or self._colors[0] != style:
+            self._colors = style, _color_points(self.cloud, style)
+        colors = self._colors[1]
         cloud, points = self.cloud, self._points
         table, normals = colors.table, cloud.normals
         if style.clip is not None:
             kept = style.clip.contains(cloud.points)
             points, table = points[kept], table[kept]
             normals = None if normals is None else normals[kept]
-        stopwatch = Stopwatch()
-
+        stopwatch, shot = Stopwatch(), Shot(camera, size, background, progress or ignore_progress)
         for attempt in with_fallback(self._device):
             with attempt as (device, told):
                 found = draw_splats(
-                    device, points, table, normals, camera, size, radius, base=self._base, lighting=style.light,
-                    background=background, memory=self.memory, progress=progress or ignore_progress,
-                    stopwatch=stopwatch,
+                    device, points, table, normals, shot, radius, base=self._base, lighting=style.light,
+                    memory=self.memory, stopwatch=stopwatch,
                 )  # fmt: skip
         report = {
             "mode": "points",
@@ -353,11 +348,6 @@ class PointPictures(Closing):
         if self._spacing is None:
             self._spacing = mean_spacing(self._points)
         return self._spacing or LONE_POINT_MM
-
-    def _colors_of(self, style: PointLook) -> _Colors:
-        if self._colors is None or self._colors[0] != style:
-            self._colors = style, _color_points(self.cloud, style)
-        return self._colors[1]
 
 
 def _warn_of_radius(radius: float, camera: Camera, size: tuple[int, int]) -> list[str]:

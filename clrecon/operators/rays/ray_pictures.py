@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from clrecon.anatomy.surroundings import LEFT_OUT, count_left_out
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import takes_parts
-from clrecon.labels.resample import ResampledLabels
-from clrecon.opencl import Device, Stopwatch, allocate, kernel_constant, kernel_number, launch, upload
+from clrecon.opencl import Device, allocate, kernel_constant, kernel_number, launch, upload
 from clrecon.operators.rays.picture_buffers import (
     NEAR_ROW,
     Between,
@@ -47,7 +46,6 @@ from clrecon.rendering.looks.window import (
     choose_window,
     grey_image,
 )
-from clrecon.rendering.pictures.label_style import LabelStyle
 from clrecon.rendering.pictures.styles import Projection, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.light_dataclass import dataclass
@@ -181,53 +179,6 @@ class MainWay:
         return {"main_axis": self.axis, "ahead": self.ahead, "eye": self.eye, "aside": self.aside}
 
 
-def composite_slab(
-    resident: DeviceVolume,
-    slab: RaySlab,
-    view: RayView,
-    tables: TransferTables,
-    leaps: LeapMap,
-    lighting: Lighting,
-    jitter: bool,
-    labels: ResampledLabels | None,
-    style: LabelStyle | None,
-    output: PictureBuffers,
-    stopwatch: Stopwatch,
-    between: Between | None = None,
-) -> None:
-    """Blend one slab into a picture, and wait; of a part of the rays, `between`, write only the states of `output`."""
-    device = resident.device
-    variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
-    if tables.steepness.is_steep and takes_parts(resident.volume, view.ray_step):
-        variants |= {"TAKES_PARTS": "1"}
-    label_tables: dict[str, Any] = {}
-    if labels is not None and style is not None:
-        variants |= {"LABELS": "1", **label_variants(labels.voxels.dtype)}
-        label_tables = {
-            "labels": slab_labels(resident, slab, labels, stopwatch, grown=True),
-            "label_colors": upload(device, style.table),
-        }
-    shortened: dict[str, Any] = {}
-    if between is not None:
-        variants |= {"BETWEEN": "1"}
-        shortened = {"nearest": between.nearest_d, "farthest": between.farthest_d, "stage": 0}
-    program = resident.program("rays/composite.cl", **variants)
-    lanes = int(device.kernel_variants["LANES"])
-    queues = count_queues(device)
-    last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
-    with stopwatch.running(device):  # wait: CPU devices read host arrays that are freed here
-        entries_d = enter_tiles(resident, slab, view, leaps, output)
-        way = MainWay.of(resident, slab, view.camera)
-        ways_d = look_ahead(resident, slab, way, leaps)
-        launch(
-            device, program["composite_rays"], output.items(queues, lanes),
-            ways=ways_d, entries=entries_d, highlights=upload(device, highlight_table(lighting)),
-            view=upload(device, view.table), last_place=last, slope=resident.stack.slope, shaded=lighting.shades,
-            jitter=jitter, queues=queues, **{**slab.arguments, **shortened}, **tables.arguments, **output.arguments,
-            **view.arguments, **way.arguments, **label_tables, **resident.stack.arguments,
-        )  # fmt: skip
-
-
 def enter_tiles(resident: DeviceVolume, slab: RaySlab, view: RayView, leaps: LeapMap, output: PictureBuffers) -> Any:
     """Return for each tile the distance in mm before which its rays meet nothing visible, on the device."""
     device = resident.device
@@ -355,17 +306,40 @@ class _Job(SlabPicture):
     def _composite(
         self, slab: RaySlab, style: VolumeLook, output: PictureBuffers, between: Between | None = None
     ) -> None:
-        resident, stopwatch = self.resident, self.stopwatch
+        """Blend a slab into the picture, and wait; of a part of the rays, `between`, write only the states."""
+        resident, device, stopwatch = self.resident, self.resident.device, self.stopwatch
         key = (style.function, self.ray_step)
-        tables = resident.keep("transfer function", key, 0, lambda: TransferTables.of(resident.device, *key))
-        with stopwatch.running(resident.device):
+        tables = resident.keep("transfer function", key, 0, lambda: TransferTables.of(device, *key))
+        with stopwatch.running(device):
             leaps = find_leaps(resident, slab, key, tables.shown, tables.low, tables.scale)
         nothing = (self.box[1], self.box[1])
         view = self._view(nothing if leaps.box is None else leaps.box)
-        composite_slab(
-            resident, slab, view, tables, leaps, self.lighting, style.jitter, self.labels, style.label_style,
-            output, stopwatch, between,
-        )  # fmt: skip
+        variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
+        if tables.steepness.is_steep and takes_parts(resident.volume, view.ray_step):
+            variants |= {"TAKES_PARTS": "1"}
+        more: dict[str, Any] = {**slab.arguments}
+        look = style.label_style
+        if self.labels is not None and look is not None:
+            variants |= {"LABELS": "1", **label_variants(self.labels.voxels.dtype)}
+            more["labels"] = slab_labels(resident, slab, self.labels, stopwatch, grown=True)
+            more["label_colors"] = upload(device, look.table)
+        if between is not None:
+            variants |= {"BETWEEN": "1"}
+            more |= {"nearest": between.nearest_d, "farthest": between.farthest_d, "stage": 0}
+        program = resident.program("rays/composite.cl", **variants)
+        queues = count_queues(device)
+        last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
+        with stopwatch.running(device):  # wait: CPU devices read host arrays that are freed here
+            entries_d = enter_tiles(resident, slab, view, leaps, output)
+            way = MainWay.of(resident, slab, view.camera)
+            ways_d = look_ahead(resident, slab, way, leaps)
+            launch(
+                device, program["composite_rays"], output.items(queues, int(device.kernel_variants["LANES"])),
+                ways=ways_d, entries=entries_d, highlights=upload(device, highlight_table(self.lighting)),
+                view=upload(device, view.table), last_place=last, slope=resident.stack.slope,
+                shaded=self.lighting.shades, jitter=style.jitter, queues=queues, **more, **tables.arguments,
+                **output.arguments, **view.arguments, **way.arguments, **resident.stack.arguments,
+            )  # fmt: skip
 
     def _finish_projection(
         self, style: Projection, values: NDArray[np.float32], depths: NDArray[np.float32], report: dict[str, Any]

@@ -4,6 +4,7 @@ which they lie.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -85,17 +86,14 @@ class LayeredPicture(NamedTuple):
 def draw_layers(
     device: Device,
     parts: Sequence[MeshPart],
-    camera: Camera,
-    size: tuple[int, int],
+    shot: Shot,
     *,
     still: Still | None = None,
     volume: Callable[[Between], None] | None = None,
     near_mm: float = 0.0,
     most: int = LAYERS,
-    background: str | Sequence[float] | None = None,
     memory: int | None = None,
     stopwatch: Stopwatch | None = None,
-    progress: Progress | None = None,
 ) -> LayeredPicture:
     """Draw triangles, with what lies before, between and behind them.
 
@@ -105,10 +103,10 @@ def draw_layers(
     near_mm: Where the volume's rays begin, see `VIEW_NEAR` in cl/rays/view.h.
     most: Most layers; there is progress before each.
     """
-    needs = {"picture": PIXEL_BYTES * size[0] * size[1], "triangles": sum(part.device_bytes for part in parts)}
+    pixels = math.prod(shot.size)
+    needs = {"picture": PIXEL_BYTES * pixels, "triangles": sum(part.device_bytes for part in parts)}
     check_budget(device, needs, memory)
-    job = _Layers(device, parts, camera, size, still, near_mm, stopwatch or Stopwatch())
-    return job.run(volume, most, background, progress or ignore_progress)
+    return _Layers(device, parts, shot, still, near_mm, stopwatch or Stopwatch()).run(volume, most)
 
 
 class _Layers:
@@ -118,12 +116,12 @@ class _Layers:
         self,
         device: Device,
         parts: Sequence[MeshPart],
-        camera: Camera,
-        size: tuple[int, int],
+        shot: Shot,
         still: Still | None,
         near_mm: float,
         stopwatch: Stopwatch,
     ):
+        camera, size, *_ = self.shot = shot
         self.device, self.size, self.stopwatch, self.near_mm = device, size, stopwatch, near_mm
         self.has_still = still is not None
         self.pixels = size[0] * size[1]
@@ -146,21 +144,15 @@ class _Layers:
         self.depths_d, self.nearest_d = allocate(device, 4 * self.pixels), allocate(device, 4 * self.pixels)
         self.states_d, self.marks_d = allocate(device, 32 * self.pixels), allocate(device, 16 * self.pixels)
 
-    def run(
-        self,
-        volume: Callable[[Between], None] | None,
-        most: int,
-        background: str | Sequence[float] | None,
-        progress: Progress,
-    ) -> LayeredPicture:
-        device, (width, height) = self.device, self.size
+    def run(self, volume: Callable[[Between], None] | None, most: int) -> LayeredPicture:
+        device, (width, height), background = self.device, self.size, self.shot.background
         with self.stopwatch.running(device):
             floors = {"floor_keys": self.keys.floor_keys_d, "floor_numbers": self.keys.floor_numbers_d}
             self._launch("clear_rays", pixels=self.pixels, **self._rays, **floors)
         open_pixels, drawn = self.pixels if self.triangles or self.has_still else 0, 0
         is_first = True
         while open_pixels and drawn < most:
-            progress("layers", drawn, most)
+            self.shot.progress("layers", drawn, most)
             self._draw_layer()
             open_pixels = 0 if self.is_single else self._count_open()
             if volume is not None:
@@ -382,9 +374,8 @@ class ScenePictures(Closing):
     def _finish(self, drawn: list[Rendering], shot: Shot, volume: DrawnVolume) -> Rendering:
         device, stopwatch = volume.device, volume.stopwatch
         found = draw_layers(
-            device, self._parts, shot.camera, shot.size, still=_join_stills(drawn), volume=volume.sample,
-            near_mm=volume.near_mm, background=shot.background, memory=self.memory, stopwatch=stopwatch,
-            progress=shot.progress,
+            device, self._parts, shot, still=_join_stills(drawn), volume=volume.sample, near_mm=volume.near_mm,
+            memory=self.memory, stopwatch=stopwatch,
         )  # fmt: skip
         warnings = [*device.warnings, *volume.warnings]
         for each in drawn:

@@ -1,9 +1,4 @@
-"""Decimation within an error bound, and what a device finds for it: triangles that cut each other, and upper bounds of
-distances.
-
-The device marks the triangles that may cut another one, in float32; `clrecon.mesh.intersections` then looks at these
-alone, in float64.  The pairs are those that it finds among all triangles.
-"""
+"""Decimation within a bound, and what a device finds for it: triangles that may cut others; distances."""
 
 from __future__ import annotations
 

@@ -289,11 +289,7 @@ def prepare_isosurface(
     vertex_rule: str = "linear",
     grown: bool = False,
 ) -> Program:
-    """Build the kernels for volumes of `dtype` now, so that a later `extract_isosurface` with `topology` does not wait.
-
-    With `uneven`, for volumes with uneven slices; `inside` and `vertex_rule` as in `IsoRule`; with `grown`, for parts
-    of a surface.
-    """
+    """Build the kernels of `extract_isosurface` for volumes of `dtype`; `grown`: for parts of a surface."""
     if topology == "trilinear":
         prepare_trilinear(device, dtype)
     return marching_cubes.prepare_marching_cubes(

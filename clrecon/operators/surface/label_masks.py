@@ -1,9 +1,4 @@
-"""Surfaces of label masks: the mask tells which samples are inside, its smoothed occupancy places the vertices, at the
-level that keeps its volume.
-
-The host side of cl/surface/label_survey.cl and cl/surface/label_masks.cl; counting and writing are those of
-cl/surface/marching_cubes.cl.  If the device has no room for the survey of a whole map, numpy computes it.
-"""
+"""Surfaces of label masks: smoothed occupancy places the vertices, at the level that keeps the volume."""
 
 from __future__ import annotations
 

@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import DTypeLike
 
 from clrecon.anatomy.head import SKIN_HU, warn_of_skin
 from clrecon.anatomy.iso_choice import settle_level
@@ -63,11 +62,7 @@ def each_label(
     extract: Callable[[Held, int, Box], Made],
     warnings: list[str],
 ) -> Iterator[tuple[int, Made]]:
-    """Yield labels with what `extract` makes of one, in order; `hold` uploads what a group of them shares.
-
-    If the device has no room for a group, its remaining labels are processed one by one; a single label is tried once
-    more, with nothing else on the device.
-    """
+    """Yield labels with what `extract` makes of one; `hold` uploads for a group, or for one where room is short."""
     waiting, retried = list(groups), set[int]()
     while waiting:
         left = dict(waiting.pop(0))
@@ -186,15 +181,6 @@ class HeldSlices:
     inside_d: Any
 
 
-def prepare_labels(
-    device: Device, dtype: DTypeLike = np.int16, label_dtype: DTypeLike = np.uint8, *, uneven: bool = False
-) -> tuple[Program, Program]:
-    """Build the kernels for volumes and labels of these types: those that find what is inside, those of the surface."""
-    variants = {**voxel_variants(dtype), **label_variants(label_dtype)}
-    own = load_program(device, "surface/labels.cl", variants)
-    return own, marching_cubes.prepare_marching_cubes(device, dtype, label_dtype, uneven=uneven)
-
-
 class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
     def __init__(
         self,
@@ -219,7 +205,13 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
 
     def programs(self) -> tuple[Program, Program]:
         with self.stopwatch.timed("build"):
-            return prepare_labels(self.device, self.resident.dtype, self.labels.dtype, uneven=self.volume.uneven)
+            dtype = self.resident.dtype
+            label_dtype = self.labels.dtype
+            variants = {**voxel_variants(dtype), **label_variants(label_dtype)}
+            own = load_program(self.device, "surface/labels.cl", variants)
+            return own, marching_cubes.prepare_marching_cubes(
+                self.device, dtype, label_dtype, uneven=self.volume.uneven
+            )
 
     def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
         """Return first and end of the slices of the volume that these labels need; all if they are on the device."""

@@ -1,7 +1,4 @@
-"""Draw the spine phantom in HU, slice by slice: soft tissue, lungs, vessels, discs, ribs, vertebrae, marker and table.
-
-Every interface is a linear ramp of about one voxel (partial volume), not a threshold.  Bone is drawn on thin
-sub-slices and averaged, so that thick slices blur endplates as a scanner does."""
+"""Draw the spine phantom in HU, slice by slice; interfaces are ramps, bone is averaged from thin sub-slices."""
 
 from __future__ import annotations
 

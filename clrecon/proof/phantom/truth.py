@@ -53,11 +53,6 @@ def _workers() -> int:
     return max(1, min(os.cpu_count() or 1, 8))
 
 
-def _lattice(low: Float64Array, high: Float64Array, step: float) -> Float64Array:
-    axes = [np.arange(a, b + step, step) for a, b in zip(low, high, strict=True)]
-    return np.stack([part.ravel() for part in np.meshgrid(*axes, indexing="ij")], axis=1)
-
-
 class _Shape:
     """The functions of one vertebra at points (n, 3) in its own frame."""
 
@@ -78,7 +73,9 @@ class _Shape:
     def cover(self) -> Float64Array:
         """Return points of the surface and of the rims where cuts leave it, shape (n, 3)."""
         low, high = (np.array(corner) for corner in local_bounds(self.vertebra))
-        coarse = _lattice(low, high, _COARSE * _STEP_MM)
+        step = _COARSE * _STEP_MM
+        axes = [np.arange(a, b + step, step) for a, b in zip(low, high, strict=True)]
+        coarse = np.stack([part.ravel() for part in np.meshgrid(*axes, indexing="ij")], axis=1)
         reach = _STEEPEST * np.sqrt(3.0) / 2.0
         near = coarse[np.abs(self(coarse)) < reach * _COARSE * _STEP_MM]
         # a cube of finer points around each

@@ -333,11 +333,7 @@ def bone_extent(vertebrae: Sequence[Vertebra], direction: ArrayLike) -> tuple[fl
 
 
 def centring_shift(vertebrae: Sequence[Vertebra], choice: SpineChoice) -> Float64Array:
-    """Return the shift along z that puts vertebrae into the middle of the volume.
-
-    The whole bones are centred, or the bodies alone where the volume is too short for the bones.  Slices that run
-    nearly along the spine do not decide where it lies along z.
-    """
+    """Return the shift along z that puts the bones, or in a short volume the bodies alone, into its middle."""
     normal = np.array(choice.normal)
     slope = float(normal[2])
     if abs(slope) < 0.5:

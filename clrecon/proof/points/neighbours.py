@@ -101,11 +101,7 @@ def principal_axes(
 def orient_by_gradients(
     axes: NDArray[np.floating], gradients: NDArray[np.floating]
 ) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
-    """Turn normals towards lower HU; where there is none the gradient is zero or NaN.
-
-    Where the axis and the gradient are nearly at a right angle, the normal is the direction of falling HU itself, and
-    doubtful, which is returned too.
-    """
+    """Turn normals towards lower HU; near a right angle they are the direction of falling HU, and doubtful."""
     length = np.linalg.norm(gradients, axis=1)
     known = length > 0.0
     down = np.divide(-gradients, length[:, None], out=np.zeros_like(axes), where=known[:, None])

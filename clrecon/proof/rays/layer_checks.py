@@ -13,7 +13,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, download
 from clrecon.operators.rays.mesh_pictures import make_part
-from clrecon.operators.rays.picture_buffers import Between
+from clrecon.operators.rays.picture_buffers import Between, Shot
 from clrecon.operators.rays.scene import LayeredPicture, ScenePictures, Still, draw_layers
 from clrecon.proof.checking import (
     OBLIQUE,
@@ -132,10 +132,10 @@ def _check_layers(device: Device) -> str:
             held = (between.nearest_d, between.farthest_d)
             ways.append([download(device, np.empty(SIZE[::-1], np.float32), each) for each in held])
 
-        found = draw_layers(device, parts, camera, SIZE, still=still, volume=note)
+        found = draw_layers(device, parts, Shot(camera, SIZE), still=still, volume=note)
         layers, rgba, depth, mean = _blend(mesh, colors, camera, still)
         _compare_ways(ways, layers, found)
-        first = draw_layers(device, parts, camera, SIZE, still=still, most=1)
+        first = draw_layers(device, parts, Shot(camera, SIZE), still=still, most=1)
         more = np.isfinite(layers[0]) & (first.image[..., 3] < 255)
         require_equal(first.open_pixels, np.count_nonzero(more), "pixels that may have a second layer")
         require_close(found.depth, depth, DEPTH_MM, "depths of triangles, in mm")

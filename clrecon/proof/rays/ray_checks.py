@@ -359,7 +359,7 @@ def _check_points(device: Device) -> str:
     for perspective, own in ((False, None), (True, normals.astype(np.float32))):
         scale = {"view_angle": 9.0} if perspective else {"parallel_scale": 7.0}
         camera = Camera((-30.0, -80.0, 25.0), (0.3, 0.2, 0.1), (0.1, 0.2, 1.0), **scale)
-        found = draw_splats(device, points, colors, own, camera, SIZE, radius, lighting=FIXED)
+        found = draw_splats(device, points, colors, own, Shot(camera, SIZE), radius, lighting=FIXED)
         require_equal(found.parts, 1, "parts of a cloud of 3,000 points")
         depth, numbers = find_splats(points, camera, SIZE, radius)
         apart = round(radius / camera.pixel_mm(SIZE))

@@ -163,11 +163,6 @@ def _trilinear_volume(case: int) -> Fraction:
     return Fraction(int(np.sum(field > half) + np.sum(field >= half)), 2 * _SAMPLES**3)
 
 
-def _chords(triangles: list[Triangle]) -> list[tuple[int, ...]]:
-    """Return the triangles without direction, sorted: a case and its complement that are cut alike give the same."""
-    return sorted(tuple(sorted(triangle)) for triangle in triangles)
-
-
 def _choose_triangles(case: int) -> tuple[Triangle, ...]:
     """Choose the fans of a case by the rule at the head of this module; the first of equal ones."""
     loops = case_loops(case)
@@ -184,7 +179,10 @@ def _choose_triangles(case: int) -> tuple[Triangle, ...]:
     def error(triangles: list[Triangle]) -> Fraction:
         return abs(Fraction(_volume_at_faces(case) + _enclosed_volume(triangles), 48) - wanted)
 
-    nearest = min(choices, key=lambda triangles: (error(triangles), _chords(triangles)))
+    # a case and its complement that are cut alike sort alike
+    nearest = min(
+        choices, key=lambda triangles: (error(triangles), sorted(tuple(sorted(triangle)) for triangle in triangles))
+    )
     return tuple(nearest)
 
 

@@ -34,11 +34,7 @@ def radix_sort(keys: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], NDArray[np
 
 
 def label_components(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[int, NDArray[np.int64]]:
-    """Number the components of a mesh by label propagation, in order of the first vertex; -1 for unused vertices.
-
-    Every vertex takes the smallest label in any of its triangles, until no label changes: the label of a component is
-    then its smallest vertex.
-    """
+    """Number components by label propagation, in order of the first vertex; -1 for unused vertices."""
     roots = np.arange(vertex_count)
     while True:
         before = roots.copy()

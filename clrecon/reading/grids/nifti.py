@@ -1,9 +1,4 @@
-"""NIfTI-1 and NIfTI-2 (.nii, .nii.gz, and pairs of .hdr and .img) to read, NIfTI-1 to write.
-
-nibabel parses the header.  NIfTI's frame is RAS mm; `nifti_affine` converts it to LPS, and no other module sees it.
-
-Source: the NIfTI-1 and NIfTI-2 definitions (nifti1.h, nifti2.h).
-"""
+"""NIfTI-1 and NIfTI-2 to read, by nibabel, NIfTI-1 to write (nifti1.h, nifti2.h); its RAS becomes LPS here."""
 
 from __future__ import annotations
 

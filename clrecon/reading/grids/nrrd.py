@@ -1,10 +1,4 @@
-"""NRRD: .nrrd, and .nhdr with the voxels in one file beside it.
-
-pynrrd parses the header, in which a path could name any file: only one in the folder of the header is read.  It also
-writes: the affine as space directions and origin, the certificate as fields of its own.
-
-Source: the NRRD format definition (teem.sourceforge.net/nrrd/format.html).
-"""
+"""NRRD (teem.sourceforge.net/nrrd/format.html) by pynrrd: .nrrd, and .nhdr with voxels in a file of its folder."""
 
 from __future__ import annotations
 

@@ -136,7 +136,11 @@ class _Filling:
         if measured.size:
             low, high = measured.min().item(), measured.max().item()
             self._low, self._high = min(self._low, low), max(self._high, high)
-            self._widen(k, self._step_for(k, measured, low, high))
+            step = self._step_for(k, measured, low, high)
+            if step > self._step:
+                narrow, self._step = self._voxels, step
+                self._voxels = allocate_voxels(self._grid.shape_ijk[::-1], LADDER[step], self._grid.name)
+                self._voxels[:k] = narrow[:k]
         np.copyto(self._voxels[k], values, casting="unsafe")  # the type holds all these values
 
     def _step_for(self, k: int, measured: NDArray[Any], low: float, high: float) -> int:
@@ -159,13 +163,6 @@ class _Filling:
                 " numbers"
             )
         return 2
-
-    def _widen(self, k: int, step: int) -> None:
-        """Change to a wider type, and copy the first `k` slices."""
-        if step > self._step:
-            narrow, self._step = self._voxels, step
-            self._voxels = allocate_voxels(self._grid.shape_ijk[::-1], LADDER[step], self._grid.name)
-            self._voxels[:k] = narrow[:k]
 
     def finish(self) -> GridValues:
         voxels, low, high = self._voxels, self._low, self._high

@@ -1,8 +1,4 @@
-"""`write_volume`: a volume as NIfTI, NRRD or MetaImage, with its affine and its certificate.
-
-Whole numbers are written as int16 where they fit, else int32, and other values as float32: nothing is rounded.  The
-same volume gives the same bytes.
-"""
+"""`write_volume`: a volume as NIfTI, NRRD or MetaImage with its certificate; nothing is rounded."""
 
 from __future__ import annotations
 

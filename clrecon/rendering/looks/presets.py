@@ -1,8 +1,4 @@
-"""Rendering presets: transfer function, light, mode and window for pictures of one tissue.
-
-Do not confuse them with the presets of iso values in `clrecon.jobs.presets`. Some have the same name, because they
-show the same tissue: there as a surface, here through opacities.
-"""
+"""Rendering presets: transfer function, light, mode and window of one tissue; not the presets of iso values."""
 
 from __future__ import annotations
 

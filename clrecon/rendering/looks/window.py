@@ -71,10 +71,7 @@ def choose_window(values: NDArray[Any]) -> tuple[float, float]:
 
 
 def choose_mip_window(values: NDArray[Any]) -> tuple[float, float]:
-    """Choose a window as `choose_window` from the rays of a maximum projection that meet the body, else from all.
-
-    Air beside the body would otherwise be black, and soft tissue, which every ray through the body meets, half white.
-    """
+    """Choose a window from the rays of a maximum projection that meet the body, so that air is not the black end."""
     of_body = values[values >= BODY_HU]
     return choose_window(of_body if len(of_body) else values)
 

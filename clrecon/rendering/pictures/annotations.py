@@ -91,11 +91,7 @@ def edge_letters(camera: Camera) -> dict[str, str]:
 
 
 def sheet_letters(sheet: Sheet, rows: NDArray[np.bool_]) -> dict[str, str]:
-    """Letters of the edges of a picture whose rows turn along a curve; empty where no letter is true for all of it.
-
-    They are those with which the directions of all `rows` that show something begin, so that the first is everywhere
-    the side to which the edge looks most.
-    """
+    """Letters of the edges of a sheet along a curve, of sides all `rows` look at; empty where none is true for all."""
     right = sheet.steps[rows]
     up = np.cross(right, sheet.normals[rows])
     edges = {"left": -right, "right": right, "top": up, "bottom": -up}

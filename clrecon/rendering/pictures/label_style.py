@@ -124,11 +124,7 @@ OUTLINE_SHARE = 1 / 400
 
 
 def labels_on_sheet(labels: LabelMap, sheet: Sheet) -> NDArray[Any]:
-    """Return the label in which the centre of each pixel of a sheet lies, (h, w); 0 where none is, and beyond the map.
-
-    The place of a pixel in mm is looked up in the map itself, whatever slices the scan has: neither tilted nor uneven
-    ones move a label.
-    """
+    """Return the label at the centre of each pixel of a sheet, (h, w), looked up in the map in mm; 0: none."""
     size = np.array(labels.shape_ijk)
     found = np.zeros((sheet.height, sheet.width), labels.voxels.dtype)
     for first in range(0, sheet.height, ROWS_AT_ONCE):

@@ -16,7 +16,7 @@ from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import Space, explains_arguments
 from clrecon.system.base_classes import Message
 from clrecon.system.paths import read_regular
-from clrecon.system.text import escape_text
+from clrecon.system.text import escape_text, is_number
 
 SAME_PLACE_MM = 1e-6
 """Distance up to which a point counts as the same as the one before."""
@@ -255,14 +255,6 @@ def _parse_triple(where: str, parts: list[str]) -> list[float]:
     return values
 
 
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def _split_line(line: str) -> list[str]:
     for separator in (";", ","):
         if separator in line:
@@ -277,7 +269,7 @@ def _read_lines(name: str, lines: list[str]) -> list[list[float]]:
         parts = _split_line(line.partition("#")[0].strip())
         if not any(parts):
             continue
-        if not rows and columns is None and not any(map(_is_number, parts)):
+        if not rows and columns is None and not any(map(is_number, parts)):
             columns = _find_columns(f"{name}, line {number}", parts)
             continue
         if columns is not None:

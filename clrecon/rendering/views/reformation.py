@@ -175,11 +175,7 @@ def positive_mm(what: str, value: float) -> float:
 
 
 def plane_sheet(camera: Camera, size: Sequence[int], offset_mm: float = 0.0) -> tuple[Sheet, Camera]:
-    """Make the plane through a camera's focal point across its view, and the parallel camera of its pixels.
-
-    camera: For a perspective camera its scale at the focal point is used.
-    offset_mm: Moves the plane along the view, away from the camera.
-    """
+    """Make the plane through a focal point, `offset_mm` away from the camera, and the parallel camera of its pixels."""
     width, height = checked_size(size)
     right, up, forward = camera.basis()
     pixel = camera.pixel_mm(size)
@@ -199,11 +195,7 @@ FRAME_STEP_MM = 0.25
 
 @dataclass(frozen=True)
 class CurvedSheet:
-    """The sheet of a picture along a curve.
-
-    arc: ndarray, shape (h,). Arc length of the curve in mm at each row; NaN for rows beyond its ends.
-    columns: ndarray, shape (h,). Column in which each row shows the curve, pixel centres at whole numbers.
-    """
+    """The sheet along a curve: `arc`, (h,) mm, NaN beyond its ends; `columns`, (h,), in which rows show it."""
 
     sheet: Sheet
     arc: Float64Array

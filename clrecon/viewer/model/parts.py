@@ -56,12 +56,7 @@ class ClusterMap(LabelMap):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FoundParts:
-    """The parts of a scan, with or without its table, by the number of the object.
-
-    labels: Clusters by number, grown by one voxel; 0 is all else.
-    placed: The same, on the grid of the scan.
-    parts: The clusters, the smaller ones together, and what lies below the iso value.
-    """
+    """The parts of a scan by its number: `labels`, grown by a voxel, and `placed` on its grid; 0 is all else."""
 
     scan: int
     iso_value: float

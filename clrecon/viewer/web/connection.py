@@ -1,8 +1,4 @@
-"""One browser: its commands go to its own session, and pictures and facts come back, no more than it can take.
-
-A picture is drawn while the one before is on its way, and sent when the browser has shown that one.  So at most one
-picture is under way and one waits, however slow the connection is.
-"""
+"""One browser: commands go to its session; of pictures one at most is under way, and one waits."""
 
 from __future__ import annotations
 

@@ -29,7 +29,6 @@ import webbrowser
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from functools import cache
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -96,15 +95,11 @@ def compose_page(host: str) -> Page:
 @cache
 def _compose() -> tuple[bytes, str, str]:
     """Return the document and the hashes of its script and style."""
-    script = "\n".join((read_page_code("page_shared.js"), _code("page.js")))
-    style = "\n".join((read_page_code("page.css"), _code("page.css")))
+    script = "\n".join((read_page_code("page_shared.js"), read_page_code("page.js", __package__)))
+    style = "\n".join((read_page_code("page.css"), read_page_code("page.css", __package__)))
     filled = {"STYLE": style, "SCRIPT": script}
-    document = re.sub("@([A-Z]+)@", lambda place: filled[place[1]], _code("page.html") + "\n")
+    document = re.sub("@([A-Z]+)@", lambda place: filled[place[1]], read_page_code("page.html", __package__) + "\n")
     return document.encode(), hash_code(script), hash_code(style)
-
-
-def _code(name: str) -> str:
-    return (files(__package__) / name).read_text(encoding="utf-8").strip()
 
 
 LARGEST_PORT = 65535

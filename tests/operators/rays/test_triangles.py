@@ -16,6 +16,7 @@ from clrecon import Mesh, MeshLook
 from clrecon.errors import DeviceError, UsageError
 from clrecon.operators.rays import mesh_pictures, scene
 from clrecon.operators.rays.mesh_pictures import make_part
+from clrecon.operators.rays.picture_buffers import Shot
 from clrecon.operators.rays.scene import LAYERS, PIXEL_BYTES, Still, draw_layers
 from clrecon.proof.rays.objects import find_meetings, nth_layer, shade_layer
 from clrecon.rendering import UNSHADED, Lighting
@@ -73,7 +74,7 @@ def test_every_layer_is_that_of_the_twin(device: Any, name: str, lighting: Light
     meetings = find_meetings(mesh.vertices, mesh.triangles, camera, SIZE)
     for normals in (mesh.normals, None):
         look = MeshLook(vertex_colors=colors, lighting=lighting, flat=normals is None)
-        found = draw_layers(device, [make_part(mesh, look)], camera, SIZE)
+        found = draw_layers(device, [make_part(mesh, look)], Shot(camera, SIZE))
         rgb, depth = shade_layer(
             meetings, nth_layer(meetings, 0, SIZE), mesh.vertices, mesh.triangles, normals, colors / 255.0, camera,
             lighting,
@@ -97,7 +98,7 @@ def test_translucent_layers_are_blended_in_the_order_of_the_twin(device: Any, na
     most = int(np.bincount(meetings.pixels).max())
     assert 3 <= most <= LAYERS
     look = MeshLook(vertex_colors=colors, lighting=UNSHADED, opacity=opacity)
-    found = draw_layers(device, [make_part(mesh, look)], camera, SIZE)
+    found = draw_layers(device, [make_part(mesh, look)], Shot(camera, SIZE))
     premultiplied, seen, way = np.zeros(SIZE[::-1]), np.zeros(SIZE[::-1]), np.zeros(SIZE[::-1])
     for layer in range(most):
         rgb, depth = shade_layer(
@@ -174,9 +175,9 @@ def test_large_and_small_triangles_and_pieces_of_them(device: Any) -> None:
         np.concatenate([screen.vertices, specks.vertices]), np.concatenate([screen.triangles, specks.triangles + 3])
     )
     look = MeshLook(flat=True, lighting=FIXED)
-    found = draw_layers(device, [make_part(both, look)], camera, size)
-    apart = draw_layers(device, [make_part(specks, look), make_part(screen, look)], camera, size)
-    again = draw_layers(device, [make_part(both, look)], camera, size)
+    found = draw_layers(device, [make_part(both, look)], Shot(camera, size))
+    apart = draw_layers(device, [make_part(specks, look), make_part(screen, look)], Shot(camera, size))
+    again = draw_layers(device, [make_part(both, look)], Shot(camera, size))
     assert found.image.tobytes() == again.image.tobytes() == apart.image.tobytes()
     assert found.depth.tobytes() == again.depth.tobytes() == apart.depth.tobytes()
     meetings = find_meetings(both.vertices, both.triangles, camera, size)
@@ -186,15 +187,17 @@ def test_large_and_small_triangles_and_pieces_of_them(device: Any) -> None:
     assert np.allclose(found.depth, meetings.depths[places] / along, rtol=tolerances.RAY_LENGTH_SHARE, atol=0.0)
     colors = np.zeros((both.vertex_count, 3), np.uint8)
     colors[:, :2] = np.repeat(np.arange(both.triangle_count, dtype="<u2"), 3).view(np.uint8).reshape(-1, 2)
-    numbered = draw_layers(device, [make_part(both, MeshLook(vertex_colors=colors, lighting=UNSHADED))], camera, size)
+    numbered = draw_layers(
+        device, [make_part(both, MeshLook(vertex_colors=colors, lighting=UNSHADED))], Shot(camera, size)
+    )
     assert np.array_equal(numbered.image[..., 0] + 256 * numbered.image[..., 1].astype(int), meetings.triangles[places])
 
 
 def test_of_triangles_in_one_place_the_first_is_seen(device: Any) -> None:
     first, second = quad(-20.0, 20.0, 3.0), quad(-20.0, 20.0, 3.0)
     parts = [make_part(mesh, MeshLook(color, lighting=UNSHADED)) for mesh, color in ((first, "red"), (second, "blue"))]
-    assert (draw_layers(device, parts, FRONT, (17, 17)).image == (255, 0, 0, 255)).all()
-    assert (draw_layers(device, parts[::-1], FRONT, (17, 17)).image == (0, 0, 255, 255)).all()
+    assert (draw_layers(device, parts, Shot(FRONT, (17, 17))).image == (255, 0, 0, 255)).all()
+    assert (draw_layers(device, parts[::-1], Shot(FRONT, (17, 17))).image == (0, 0, 255, 255)).all()
 
 
 def test_what_is_beside_behind_or_as_small_as_a_pixel(device: Any) -> None:
@@ -265,7 +268,7 @@ def test_bytes_a_pixel_are_those_of_the_buffers(device: Any, monkeypatch: pytest
     def bytes_of(width: int, height: int) -> int:
         taken.clear()
         still = Still(np.zeros((height, width, 4), np.uint8), np.zeros((height, width), np.float32))
-        draw_layers(device, [make_part(quad(-9.0, 9.0, 3.0), MeshLook())], FRONT, (width, height), still=still)
+        draw_layers(device, [make_part(quad(-9.0, 9.0, 3.0), MeshLook())], Shot(FRONT, (width, height)), still=still)
         return sum(taken)
 
     assert bytes_of(61, 47) - bytes_of(11, 47) == PIXEL_BYTES * 50 * 47

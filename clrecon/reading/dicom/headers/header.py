@@ -1,8 +1,4 @@
-"""Validated slice headers from the raw elements of a file: strict checks between the parser and the geometry.
-
-No value of a file gets past this module unchecked: numbers are finite, in the right count and within a plausible range,
-or a problem names the file and the tag.
-"""
+"""Validated slice headers from the raw elements of a file: no value gets past this module unchecked."""
 
 from __future__ import annotations
 

@@ -324,11 +324,7 @@ def has_dicom_mark(prefix: bytes) -> bool:
 def read_elements(
     path: Path, wanted: tuple[int, ...] | None, start: FileStart | None = None, *, force: bool = False
 ) -> DicomElements:
-    """Read the raw elements of a DICOM file: of the wanted tags, or all whose length is defined.
-
-    start: The result of `read_start` for this file, so that it is not read twice.
-    force: Also read a data set without preamble or meta header.
-    """
+    """Read the raw elements of a DICOM file, wanted ones or all; `start` was read before; `force` guesses the form."""
     prefix, size = start or read_start(path)
     restored = restore_start(prefix)
     if restored is not None and force:

@@ -109,10 +109,7 @@ and fewest values there."""
 
 
 def fill_disc_padding(voxels: NDArray[Any]) -> tuple[float, int, float] | None:
-    """Fill, in place, the outside of a round field of view of one value above air, as declared padding is filled.
-
-    Returns the value, the number of its voxels outside, what they were filled with; None where there is no such disc.
-    """
+    """Fill outside a round field of view of a value above air; return it, voxels and filling; None: no disc."""
     nk, nj, ni = voxels.shape
     value = voxels[0, 0, 0]
     if min(nj, ni) < SMALLEST or value <= AIR_RANGE_HU[1]:

@@ -191,11 +191,7 @@ class Scan:
 
 
 def scan_path(path: Path, progress: Progress | None = None, *, force: bool = False, follow_links: bool = False) -> Scan:
-    """Read the headers of all DICOM files at `path`, a file or a folder with its subfolders.
-
-    force: Also accept data sets without preamble or meta header.
-    follow_links: Also read the files and folders that links out of the folder lead to.
-    """
+    """Read headers of all DICOM files at a path; `force`: of bare data sets too; `follow_links`: out of the folder."""
     scan = Scan()
     with DiskReader(progress) as disk:
         files = disk.run(lambda: _list_files(path, scan, disk, follow_links))
