@@ -220,8 +220,9 @@ def _shows_hu(volume: Volume) -> bool:
 def find_two_materials(volume: Volume) -> tuple[float, float] | None:
     """Return the values of what is densest and of what lies around it, on any scale; None where there is no such pair.
 
-    The histogram of every fourth value is smoothed over `MATERIAL_BINS` and its peaks are found, a valley between each
-    two.  What rises far above the last peak is the dense material, else the last peak itself.
+    The histogram of every fourth value is smoothed over `MATERIAL_BINS` and its peaks are found, with a valley of half
+    their height on either side, however wide noise makes them.  What rises far above the last peak is the dense
+    material, else the last peak itself.
     """
     sampled = sample_slices(volume)
     values = np.concatenate([np.asarray(volume.voxels[k])[::2, ::2].ravel() for k in sampled]).astype(np.float64)
@@ -235,11 +236,7 @@ def find_two_materials(volume: Volume) -> tuple[float, float] | None:
     counts, ends = np.histogram(values, MATERIAL_BINS, (float(low), float(high)))
     weights = np.exp(-0.5 * (np.arange(-12, 13) / 4.0) ** 2)
     smooth = np.convolve(np.pad(counts, 12), weights / weights.sum(), mode="valid")
-    peaks = [
-        k
-        for k in np.flatnonzero((smooth >= np.pad(smooth, (1, 0))[:-1]) & (smooth > np.pad(smooth, (0, 1))[1:]))
-        if smooth[k] >= 0.02 * smooth.max() and smooth[k] > 2.0 * np.median(smooth[max(k - 40, 0) : k + 40])
-    ]
+    peaks = [k for k in _find_peaks(smooth) if smooth[k] >= 0.02 * smooth.max()]
     if not peaks:
         return None
     places = [float((ends[k] + ends[k + 1]) / 2.0) for k in peaks]
@@ -247,3 +244,15 @@ def find_two_materials(volume: Volume) -> tuple[float, float] | None:
         dense = float(np.median(values[values > (places[-1] + high) / 2.0]))
         return places[-1], dense
     return (places[-2], places[-1]) if len(places) > 1 else None
+
+
+def _find_peaks(counts: Float64Array) -> list[int]:
+    """Return the places of peaks that fall to half on both sides, to the ends or before anything is higher."""
+    found = []
+    padded = np.concatenate([[0.0], counts, [0.0]])
+    for k in np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:])) + 1:
+        sides = padded[k::-1], padded[k:]
+        ways = (side[: int(np.argmax(side > padded[k]))] if (side > padded[k]).any() else side for side in sides)
+        if all(way.min() <= 0.5 * padded[k] for way in ways):
+            found.append(int(k) - 1)
+    return found
