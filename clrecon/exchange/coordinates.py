@@ -5,12 +5,34 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from clrecon.errors import UsageError
 from clrecon.geometry.vertices import float32_step, is_far
 from clrecon.system.pieces import find_bounds
 
 _MOST_STEPS_APART = 64
+
+
+def rows_of_three(
+    values: ArrayLike, name: str, *, one: bool = False, kinds: str = "fiu", words: str = "are numbers"
+) -> NDArray[Any]:
+    """Return numbers as an array (n, 3), also none or `one` row (3,); refuse other shapes and what is no number."""
+    array = as_array(values, name)
+    if (array.size == 0 and array.ndim < 2) or (one and array.shape == (3,)):
+        array = array.reshape(-1, 3)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise UsageError(f"{name} have shape (n, 3), these have {array.shape}")
+    if array.size and array.dtype.kind not in kinds:
+        raise UsageError(f"{name} {words}, these are {array.dtype}")
+    return array
+
+
+def as_array(values: ArrayLike, name: str) -> NDArray[Any]:
+    try:
+        return np.asarray(values)
+    except ValueError as error:
+        raise UsageError(f"{name} are rows of unequal length") from error
 
 
 def as_stored(points: NDArray[Any]) -> NDArray[np.floating]:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.exchange.content import Content, facts_for_file
-from clrecon.exchange.coordinates import as_stored
+from clrecon.exchange.coordinates import as_stored, rows_of_three
 from clrecon.exchange.formats import write_mesh
 from clrecon.exchange.raw_content import turn_to_lps
 from clrecon.geometry.affine import apply_affine, checked_affine, column_spacing, normal_matrix
@@ -27,26 +27,8 @@ _MOST_VERTICES = 2**32
 Own = TypeVar("Own", bound="BaseMesh")
 
 
-def _rows_of_three(values: ArrayLike, name: str) -> NDArray[Any]:
-    array = np.asarray(values)
-    if array.size == 0 and array.ndim < 2:
-        return array.reshape(0, 3)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise UsageError(f"{name} have shape (n, 3), these have {array.shape}")
-    return array
-
-
-def _checked_numbers(values: ArrayLike, name: str) -> NDArray[Any]:
-    array = _rows_of_three(values, name)
-    if array.dtype.kind not in "fiu":
-        raise UsageError(f"{name} are numbers, these are {array.dtype}")
-    return array
-
-
 def _as_indices(values: ArrayLike) -> NDArray[np.uint32]:
-    array = _rows_of_three(values, "triangles")
-    if array.size and array.dtype.kind not in "iu":
-        raise UsageError(f"triangles hold indices of vertices (integers), these are {array.dtype}")
+    array = rows_of_three(values, "triangles", kinds="iu", words="hold indices of vertices (integers)")
     # Only other types can hold values that uint32 cannot; arrays from a device are uint32 and need no check.
     if array.size and array.dtype != np.uint32:
         low, high = int(array.min()), int(array.max())
@@ -83,10 +65,10 @@ class BaseMesh(Message):
         *,
         trusted: bool = False,
     ):
-        self._vertices = as_stored(_checked_numbers(vertices, "vertices"))
+        self._vertices = as_stored(rows_of_three(vertices, "vertices"))
         self._triangles = _as_indices(triangles)
         self._normals = (
-            None if normals is None else np.ascontiguousarray(_checked_numbers(normals, "normals"), dtype=np.float32)
+            None if normals is None else np.ascontiguousarray(rows_of_three(normals, "normals"), dtype=np.float32)
         )
         if len(self._vertices) > _MOST_VERTICES:
             raise UsageError(f"a mesh has at most {_MOST_VERTICES} vertices, this one has {len(self._vertices)}")

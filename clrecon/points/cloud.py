@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.exchange.content import PointContent, facts_for_file
-from clrecon.exchange.coordinates import as_stored
+from clrecon.exchange.coordinates import as_array, as_stored, rows_of_three
 from clrecon.exchange.formats import write_cloud
 from clrecon.exchange.raw_content import turn_to_lps
 from clrecon.geometry import Volume
@@ -26,13 +26,6 @@ MOST_POINTS = 2**31 - 1
 """Most points of a cloud, so that their numbers fit a signed 32-bit integer."""
 
 
-def _as_array(values: ArrayLike, name: str) -> NDArray[Any]:
-    try:
-        return np.asarray(values)
-    except ValueError as error:
-        raise UsageError(f"{name} are rows of unequal length") from error
-
-
 def _as_numbers(array: NDArray[Any], name: str, dtype: DTypeLike) -> NDArray[Any]:
     """Return an array in the type in which a cloud keeps it, which must hold its values."""
     if dtype is np.int32 and not (array.dtype.kind in "iu" and np.can_cast(array.dtype, np.int32)):
@@ -40,19 +33,6 @@ def _as_numbers(array: NDArray[Any], name: str, dtype: DTypeLike) -> NDArray[Any
             if not np.array_equal(array.astype(np.int32), array):
                 raise UsageError(f"{name} are whole numbers of 32 bits, some of these are not")
     return np.ascontiguousarray(array, dtype=dtype)
-
-
-def _rows(values: ArrayLike, name: str) -> NDArray[Any]:
-    array = _as_array(values, name)
-    if array.size == 0 and array.ndim < 2:
-        array = array.reshape(0, 3)
-    if array.shape == (3,):  # one point
-        array = array[None]
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise UsageError(f"{name} have shape (n, 3), these have {array.shape}")
-    if array.dtype.kind not in "fiu":
-        raise UsageError(f"{name} are numbers, these are {array.dtype}")
-    return array
 
 
 def _check_finite(points: NDArray[np.floating], name: str) -> None:
@@ -104,7 +84,7 @@ class PointCloud(Message, ShownAsHtml):
         ijk: ArrayLike | None = None,
         report: dict[str, Any] | None = None,
     ):
-        self._points = as_stored(_rows(points, "points"))
+        self._points = as_stored(rows_of_three(points, "points", one=True))
         if len(self._points) > MOST_POINTS:
             raise UsageError(f"a cloud has at most {MOST_POINTS:,} points, this one has {len(self._points):,}")
         _check_finite(self._points, "points")
@@ -143,7 +123,7 @@ class PointCloud(Message, ShownAsHtml):
         if name == "labels":
             return self._values(values, name, np.int32, "iu")
         dtype: DTypeLike = np.float32 if name == "normals" else np.int32
-        vectors = _as_numbers(_rows(values, name), name, dtype)
+        vectors = _as_numbers(rows_of_three(values, name, one=True), name, dtype)
         if len(vectors) != len(self._points):
             raise UsageError(f"{len(vectors):,} {name} for {len(self._points):,} points: one a point is needed")
         if name == "normals":
@@ -151,7 +131,7 @@ class PointCloud(Message, ShownAsHtml):
         return vectors
 
     def _values(self, values: ArrayLike, name: str, dtype: DTypeLike, kinds: str) -> NDArray[Any]:
-        array = _as_array(values, name)
+        array = as_array(values, name)
         if array.shape != (len(self._points),):
             raise UsageError(f"{name} have shape ({len(self._points)},), one value a point; these have {array.shape}")
         if array.size and array.dtype.kind not in kinds:
