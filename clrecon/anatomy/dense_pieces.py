@@ -95,10 +95,7 @@ def _is_bar(piece: Mask, hu: NDArray[np.float32], size_mm: tuple[float, ...]) ->
 def _measure_sections(
     along: Float64Array, across: Float64Array, weights: Float64Array, cell_mm: float
 ) -> tuple[Float64Array, Float64Array]:
-    """Divide a bar, without its ends, into sections; return their middles, (n, 2) mm, and the sums of the weights.
-
-    Each cell is spread over its own length along the bar, so that the steps of the cells do not count.
-    """
+    """Divide a bar, without its ends, in sections; return middles, (n, 2) mm, and weights, cells spread along it."""
     ends = along.min() + 0.5 * cell_mm, along.max() - 0.5 * cell_mm
     edges = np.linspace(*ends, max(2, int((ends[1] - ends[0]) / SECTION_MM) + 1))
     shares = np.clip((edges[:, None] - along + 0.5 * cell_mm) / cell_mm, 0.0, 1.0)

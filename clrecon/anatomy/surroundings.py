@@ -56,7 +56,14 @@ def leave_outside_air(volume: Volume, levels: Sequence[float], *, progress: Prog
     except RefusedInputError as error:
         way_out = f"{name_parameter('keep_outside', True)} takes all"
         raise RefusedInputError(f"{error}: what is outside of it is not known ({way_out})") from None
-    body = _close_along_k(body, int(OPEN_MM / (2.0 * step[2] * volume.spacing[2])))
+    # gaps along k close where voxels above and below, at most `reach` slices away, are inside
+    reach = int(OPEN_MM / (2.0 * step[2] * volume.spacing[2]))
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    size, around = 2 * reach + 1, ((reach, reach), (0, 0), (0, 0))
+    grown = maximum_filter1d(np.pad(body, around).view(np.uint8), size, axis=0, mode="constant")
+    closed = minimum_filter1d(grown, size, axis=0, mode="constant", cval=1)
+    body = np.asarray(closed[reach : len(closed) - reach].astype(bool))
     across = math.sqrt(step[0] * volume.spacing[0] * step[1] * volume.spacing[1])
     unmeasured = find_unmeasured(volume.voxels)
     steps.take()
@@ -150,16 +157,6 @@ def _shrink(mask: Mask, cells: float, *, border: bool = True) -> Mask:
         shape = ndimage.generate_binary_structure(2, 1 + turn % 2)[None]
         mask = ndimage.binary_erosion(mask, shape, border_value=border)
     return mask
-
-
-def _close_along_k(mask: Mask, reach: int) -> Mask:
-    """Close gaps along k: a voxel is inside when voxels above and below, at most `reach` slices away, are inside."""
-    from scipy.ndimage import maximum_filter1d, minimum_filter1d
-
-    size, around = 2 * reach + 1, ((reach, reach), (0, 0), (0, 0))
-    grown = maximum_filter1d(np.pad(mask, around).view(np.uint8), size, axis=0, mode="constant")
-    closed = minimum_filter1d(grown, size, axis=0, mode="constant", cval=1)
-    return np.asarray(closed[reach : len(closed) - reach].astype(bool))
 
 
 def _to_voxels(cells: Mask, step: tuple[int, int, int], volume: Volume) -> Mask:

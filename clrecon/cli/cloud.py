@@ -79,9 +79,13 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def describe_cloud_job(report: dict[str, Any]) -> list[str]:
+    lines: list[str] = []
+    for step in report["steps"]:
+        head = "steps    " if not lines else "         "
+        lines.append(f"{head}{step['step']}: {_describe_step(step)}, {step['seconds']:.2f} s")
     return [
         f"input    {_describe_input(report)}",
-        *_describe_steps(report["steps"]),
+        *lines,
         *_describe_removed(report),
         f"cloud    {count_of(report['points'], 'point')}{_describe_known(report)}",
         *_describe_surface(report["surface"]),
@@ -100,14 +104,6 @@ def _describe_input(report: dict[str, Any]) -> str:
         else ""
     )
     return f"{report['cloud_read']['points']:,} points{frame}"
-
-
-def _describe_steps(steps: list[dict[str, Any]]) -> list[str]:
-    lines: list[str] = []
-    for step in steps:
-        head = "steps    " if not lines else "         "
-        lines.append(f"{head}{step['step']}: {_describe_step(step)}, {step['seconds']:.2f} s")
-    return lines
 
 
 def _describe_step(step: dict[str, Any]) -> str:

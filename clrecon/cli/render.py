@@ -279,7 +279,19 @@ def run(options: argparse.Namespace, console: Console) -> int:
     report = make_pictures(
         options.input, files, render_settings(options), no_clobber=options.no_clobber, progress=console.progress
     )
-    common.show_report(report, describe_report(report) + _describe_files(report, files), options, console)
+    from clrecon.jobs.render.job import path_of
+
+    lines = []
+    for what, path in (("output", files.picture), ("depth_output", files.depth), ("values_output", files.values)):
+        for picture in report["pictures"]:
+            if path is not None and what in picture:
+                named = path_of(path, picture["name"] or "")
+                lines.append(f"wrote    {printable(named)}, {common.megabytes(picture[what]['bytes'])}")
+    if report["turntable"]:
+        lines.append(
+            f"wrote    {printable(files.turntable)}, {common.megabytes(report['turntable']['output']['bytes'])}"
+        )
+    common.show_report(report, describe_report(report) + lines, options, console)
     return 0
 
 
@@ -386,19 +398,3 @@ def _describe_picture(picture: dict[str, Any]) -> str:
         wide, high = picture["tile_size"]
         shown += f", {count_of(many, 'slice')} of {wide} x {high} pixels"
     return f"{picture['view']}: {width} x {height}, {scale}{shown}"
-
-
-def _describe_files(report: dict[str, Any], files: Any) -> list[str]:
-    from clrecon.jobs.render.job import path_of
-
-    lines = []
-    for what, path in (("output", files.picture), ("depth_output", files.depth), ("values_output", files.values)):
-        for picture in report["pictures"]:
-            if path is not None and what in picture:
-                named = path_of(path, picture["name"] or "")
-                lines.append(f"wrote    {printable(named)}, {common.megabytes(picture[what]['bytes'])}")
-    if report["turntable"]:
-        lines.append(
-            f"wrote    {printable(files.turntable)}, {common.megabytes(report['turntable']['output']['bytes'])}"
-        )
-    return lines

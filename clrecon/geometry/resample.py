@@ -149,7 +149,13 @@ def resample_volume(volume: Own, to: float | Sequence[float] | BaseVolume, *, pr
     report, air = progress or ignore_progress, air_of(volume.dtype)
     figures: dict[str, Any] = {"method": "trilinear"}
     if isinstance(to, BaseVolume):
-        _check_overlap(volume, to)
+        (low, high), (first, last) = find_extent(volume), find_extent(to)
+        away = np.maximum(first - high, low - last)
+        if (away > 0.0).any():
+            axis = int(np.argmax(away))
+            raise UsageError(
+                f"the two volumes have no place in common: along {'xyz'[axis]} they lie {away[axis]:.1f} mm apart"
+            )
         positions = to.slice_origins() if to.uneven else None
         made = volume.alike(sample_onto(volume, to, air, report), to.affine, None, positions)
         what = "the voxels of another volume"
@@ -169,14 +175,3 @@ def resample_volume(volume: Own, to: float | Sequence[float] | BaseVolume, *, pr
     said = f"resampled (trilinear) from {'uneven slices' if volume.uneven else f'{before} mm'} to {what}"
     take_report(made, volume, said, resampled=figures)
     return made
-
-
-def _check_overlap(volume: BaseVolume, target: BaseVolume) -> None:
-    """Refuse volumes whose boxes around the voxel centres have nothing in common."""
-    (low, high), (first, last) = find_extent(volume), find_extent(target)
-    away = np.maximum(first - high, low - last)
-    if (away > 0.0).any():
-        axis = int(np.argmax(away))
-        raise UsageError(
-            f"the two volumes have no place in common: along {'xyz'[axis]} they lie {away[axis]:.1f} mm apart"
-        )

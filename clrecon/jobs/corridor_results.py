@@ -193,11 +193,7 @@ def _across(
 def draw_corridors(
     volume: Volume, found: VertebraCorridors, screws: Sequence[Screw], margin: float, footer: Sequence[str]
 ) -> PictureData:
-    """Draw the corridors of a vertebra, with a row for each side.
-
-    A row has the slice through line and left-right direction, the one through line and cranial direction, and the one
-    square to the line at the narrowest section of the pedicle; without a corridor, through the vertebra's middle.
-    """
+    """Draw a row for each side: two slices through the line, and one square to it at its narrowest section."""
     rows = [
         _draw_row(
             volume, found, corridor, [screw for screw in screws if _side_of(found, screw) == corridor.side], margin

@@ -64,7 +64,16 @@ def measure_meshes(
 
     files, settings = files or MeshFiles(), settings or DistanceSettings()
     with Run(settings, **how) as run:
-        _check_formats(files)
+        from clrecon.rendering.pictures.picture import check_image_path
+        from clrecon.rendering.pictures.pillow import load_pillow
+
+        if files.output is not None and not os.fspath(files.output).lower().endswith(".ply"):
+            raise UsageError(
+                f"a mesh coloured by distance is a .ply file, not {os.path.basename(os.fspath(files.output))[-40:]!r}"
+            )
+        if files.picture is not None:
+            load_pillow()
+            check_image_path(files.picture)
         run.check(files.named("the coloured mesh"), mesh, reference)
         device = None if files.picture is None else take_device(settings.device)
         run.progress("read", 0, 0)
@@ -110,19 +119,6 @@ def measure_meshes(
             device=None if device is None else device.current.label,
         )
         return run.finish(report, files.report)
-
-
-def _check_formats(files: MeshFiles) -> None:
-    from clrecon.rendering.pictures.picture import check_image_path
-    from clrecon.rendering.pictures.pillow import load_pillow
-
-    if files.output is not None and not os.fspath(files.output).lower().endswith(".ply"):
-        raise UsageError(
-            f"a mesh coloured by distance is a .ply file, not {os.path.basename(os.fspath(files.output))[-40:]!r}"
-        )
-    if files.picture is not None:
-        load_pillow()
-        check_image_path(files.picture)
 
 
 @dataclass(frozen=True)

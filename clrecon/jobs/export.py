@@ -43,11 +43,7 @@ def export_volume(
     report_path: str | Path | None = None,
     **how: Any,
 ) -> ExportReport:
-    """Read a CT series and write its volume: masked, cropped, preprocessed and resampled as the settings ask for it.
-
-    A device is opened for a region and for preprocessing only.  Where the format cannot hold the volume and it is not
-    resampled, that is refused before the device works.
-    """
+    """Read a CT series and write its volume: masked, cropped, preprocessed and resampled as the settings ask."""
     settings = settings or ExportSettings()
     with Run(settings, **how) as run:
         extension = check_volume_format(output)

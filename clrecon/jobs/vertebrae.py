@@ -76,9 +76,16 @@ def make_vertebrae(
             {"centre_mm": [round(float(v), 2) for v in centre], "normal": [round(float(v), 4) for v in normal]}
             for centre, normal in zip(split.discs_mm, split.disc_normals, strict=True)
         ]
+        fate = "is in the label map all the same" if settings.keep_unsure else "is not in the label map"
+        warnings = [
+            f"{one.name} has low confidence ({one.confidence:.2f}) and {fate}: {'; '.join(one.doubts)}"
+            for one in split.low_confidence
+        ]
+        if (settings.name_at or settings.first) is not None and split.low_confidence:
+            warnings.append("names are counted past vertebrae of low confidence: check them with the picture")
         report = run.report(
             VertebraeReport,
-            _warn_of_confidence(split, settings),
+            warnings,
             volume,
             vertebrae=split.vertebrae,
             low_confidence=len(split.low_confidence),
@@ -117,17 +124,6 @@ def _encode_map(labels: LabelMap, output: str | Path, source: str | Path, settin
     from clrecon.labels.label_map import encode_nifti
 
     return encode_nifti(labels, packed=kind.endswith(".gz"))
-
-
-def _warn_of_confidence(split: VertebraSplit, settings: VertebraeSettings) -> list[str]:
-    fate = "is in the label map all the same" if settings.keep_unsure else "is not in the label map"
-    warnings = [
-        f"{one.name} has low confidence ({one.confidence:.2f}) and {fate}: {'; '.join(one.doubts)}"
-        for one in split.low_confidence
-    ]
-    if (settings.name_at or settings.first) is not None and split.low_confidence:
-        warnings.append("names are counted past vertebrae of low confidence: check them with the picture")
-    return warnings
 
 
 NIFTI, SEGMENTATION = ("nii", "nii.gz"), ("dcm",)

@@ -66,11 +66,7 @@ def enclosed_ml(
 
 
 def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.float32]:
-    """Return the mean of the face normals, weighted by the angle of each face at the vertex, as unit vectors (n, 3).
-
-    These normals do not depend on how the surface is divided into triangles (Thuermer and Wuethrich 1998).  They are
-    (0, 0, 1) where a vertex has no face or its faces cancel.
-    """
+    """Return unit normals (n, 3), weighted by the angle of each face (Thuermer and Wuethrich 1998), else (0, 0, 1)."""
     columns = np.ascontiguousarray(vertices.T.astype(np.float64))
     total = np.zeros((3, len(vertices)))
     parts: dict[int, tuple[int, NDArray[np.float64]]] = {}

@@ -34,11 +34,7 @@ def processor_name(cpuinfo: Path = _CPUINFO) -> str:
 
 
 def free_cores(seconds: float = 0.2) -> float:
-    """Number of cores that are free now: the work of all threads together, divided by the work of one thread alone.
-
-    The threads compute checksums of memory that fits the cache, so that memory bandwidth has no influence.  On a quiet
-    computer a core that shares its units with another (hyperthreads) counts as about 0.6.
-    """
+    """Number of cores that are free now: the work of all threads together, divided by that of one thread alone."""
     block = bytes(1 << 20)
 
     def work(done: list[int]) -> None:

@@ -215,11 +215,6 @@ def look_at_bodies(scan: Field) -> Looks:
         middle_hu = _median(_lines(core, along, ahead), least=0.75)
         walls_hu = _mean(_lines(walls, along, ahead), axis=1, least=0.75)
         brightness[:, place] = (1.0 - WALL_SHARE) * middle_hu + WALL_SHARE * walls_hu
-    return Looks(brightness, core, _depths(brightness, front - BACK_WALL_MM), middle, front, side)
-
-
-def _depths(brightness: Field, body_depth_mm: NDArray[np.float64]) -> Field:
-    """Return how much darker each plane is than the end plates beside it, for the likeliest thickness of a disc."""
     depth = np.full_like(brightness, np.nan)
     for half in HALF_THICKNESS_MM:
         centre = _mean(np.stack([_shifted(brightness, shift) for shift in range(1 - half, half)]), axis=0)
@@ -228,9 +223,9 @@ def _depths(brightness: Field, body_depth_mm: NDArray[np.float64]) -> Field:
         ]
         found = np.minimum(*plates) - centre
         found[~(np.minimum(*plates) >= BONE_HU) | ~(centre >= FAT_HU)] = np.nan
-        found[half > np.maximum(MOST_HALF_THICKNESS * body_depth_mm, 2.0)] = np.nan
+        found[half > np.maximum(MOST_HALF_THICKNESS * (front - BACK_WALL_MM), 2.0)] = np.nan
         depth = np.fmax(depth, found)
-    return depth
+    return Looks(brightness, core, depth, middle, front, side)
 
 
 def _shifted(field: Field, shift: int) -> Field:

@@ -22,7 +22,7 @@ from clrecon.jobs.mesh.refinement import (
 )
 from clrecon.jobs.mesh.report import MeshReport, describe_part, report_of
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.mesh.surfaces import Part, plan_surfaces
+from clrecon.jobs.mesh.surfaces import plan_surfaces
 from clrecon.jobs.outputs import check_kept, check_outputs, count_leftovers, name_outputs, refuse_files, refuse_numbered
 from clrecon.jobs.run import Run
 from clrecon.system.log import get_logger
@@ -90,7 +90,12 @@ def make_mesh(
         run.lap("measure")
         meshes = [part.mesh for part in parts]
         if settings.one_file:
-            _name_objects(parts)
+            from clrecon.rendering.pictures.label_style import distinct_colors
+
+            for part, color in zip(parts, distinct_colors(len(parts)), strict=True):
+                given = part.mesh.report
+                given["part_name"] = part.name or given.get("part_name")
+                given.setdefault("color", [float(value) for value in color])
             files = [run.write_together(meshes, output)] * len(parts)
         else:
             files = run.write_meshes(meshes, paths)
@@ -110,16 +115,6 @@ def make_mesh(
 def makes_objects(output: str | Path) -> bool:
     """Tell whether all parts of a print become objects of a file of this name."""
     return extension_of(output) == ".3mf"
-
-
-def _name_objects(parts: Sequence[Part]) -> None:
-    """Give each mesh the name and the colour that it has as an object of a file; those of labels stay."""
-    from clrecon.rendering.pictures.label_style import distinct_colors
-
-    for part, color in zip(parts, distinct_colors(len(parts)), strict=True):
-        given = part.mesh.report
-        given["part_name"] = part.name or given.get("part_name")
-        given.setdefault("color", [float(value) for value in color])
 
 
 def _refine_and_measure(run: Run, made: MadeParts, measure: bool) -> list[dict[str, Any]]:

@@ -43,11 +43,7 @@ log = get_logger(__name__)
 def make_pictures(
     source: str | Path, files: PictureFiles, settings: RenderSettings | None = None, **how: Any
 ) -> PictureReport:
-    """Read a scan, a cloud (mode points) or a mesh (mode mesh), and take the pictures that are asked for.
-
-    Checks come in this order: the outputs, the settings files (transfer function, centre line, meshes), the device, the
-    input.  An empty folder of frames is filled, whatever `Run` does with files that exist.
-    """
+    """Read a scan, a cloud (mode points) or a mesh (mode mesh), and take the pictures that are asked for."""
     settings = settings or RenderSettings()
     if (files.turntable is None) != (settings.turntable is None):
         raise UsageError("a turntable needs both: where it goes, and how it turns")

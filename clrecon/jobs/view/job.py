@@ -58,7 +58,16 @@ def write_view(
         found = {place: _read_input(inputs[place], settings, run) for place in order}
         shown = [found[place] for place in range(len(inputs))]
         meshes = _name_and_color(shown, settings)
-        warnings = [text for one in shown for text in one.warnings] + _doubt_frames(shown)
+        placed = [
+            (mesh, {"name": one.entry["name"], "space_from": one.entry["space_from"], "bounds_mm": mesh.bounds})
+            for one in shown
+            for mesh in one.meshes[:1]
+        ]
+        doubts = []
+        for mesh, entry in placed[1:]:
+            pair = [{**own, "bounds_mm": own["bounds_mm"].tolist()} for own in (placed[0][1], entry)]
+            doubts += doubt_frames([placed[0][0], mesh], pair)
+        warnings = [text for one in shown for text in one.warnings] + doubts
         file = run.write_meshes(meshes, [output])[0] if len(meshes) == 1 else run.write_together(meshes, output)
         run.lap("write")
         commit_all(run.files)
@@ -176,20 +185,6 @@ def _name_and_color(shown: Sequence[_ShownInput], settings: ViewSettings) -> lis
             if len(shown) > 1 and "color" not in mesh.report:
                 mesh.report["color"] = [float(value) for value in colors[number - 1]]
     return [mesh for one in shown for mesh in one.meshes]
-
-
-def _doubt_frames(shown: Sequence[_ShownInput]) -> list[str]:
-    """Return what speaks against the inputs lying in one frame, each compared with the first."""
-    placed = [
-        (mesh, {"name": one.entry["name"], "space_from": one.entry["space_from"], "bounds_mm": mesh.bounds})
-        for one in shown
-        for mesh in one.meshes[:1]
-    ]
-    doubts = []
-    for mesh, entry in placed[1:]:
-        pair = [{**own, "bounds_mm": own["bounds_mm"].tolist()} for own in (placed[0][1], entry)]
-        doubts += doubt_frames([placed[0][0], mesh], pair)
-    return doubts
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

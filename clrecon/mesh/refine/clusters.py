@@ -74,10 +74,7 @@ class Clusters:
         return as_stored(places + self._origin).astype(np.float64) - self._origin
 
     def collapse(self, collapses: IntArray, points: Float64Array, faces: IntArray) -> None:
-        """Apply a round of collapses (c, 2): the second vertex of the present `surface` is merged into the first.
-
-        points, faces: The mesh afterwards; its vertices are those that remain and have faces, in their order.
-        """
+        """Merge the second vertices of collapses (c, 2) into the first; return `points` and `faces` afterwards."""
         standing = self.standing()
         into = last_of_collapses(collapses, len(standing))
         rename = np.arange(len(self._names))

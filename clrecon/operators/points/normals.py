@@ -115,9 +115,7 @@ _STATES = {
 
 
 class PlaneFits:
-    """Planes through the neighbours of the points of one part after another: neighbours_d (most places of a part, k)
-    int32, normals_d (3, place_count) float32, variations_d (place_count,) float32.
-    """
+    """Planes of parts: neighbours_d (places, k) int32, normals_d (3, places), variations_d (places,) float32."""
 
     def __init__(self, search: NeighbourSearch, stopwatch: Stopwatch):
         self._search, self._stopwatch, device = search, stopwatch, search.device

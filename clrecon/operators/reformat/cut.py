@@ -430,7 +430,14 @@ def take_contact_sheet(
         drawn, labels = job.draw(made.values, sheet)
         if numbers is not None and labels is not None:
             numbers[part] = labels
-        image[part] = write_on_tile(drawn, _name_place(place, middle, forward), edges)
+        axis = int(np.abs(forward).argmax())
+        if abs(forward[axis]) > PARALLEL:
+            texts = [f"{'xyz'[axis]} {middle[axis]:.1f} mm", f"{middle[axis]:.1f}"]
+        else:
+            texts = [f"{place.offset_mm:+.1f} mm", f"{place.offset_mm:+.1f}"]
+        if place.number is not None:
+            texts.insert(0, f"{place.number}: {texts[0]}")
+        image[part] = write_on_tile(drawn, tuple(texts), edges)
         tiles.append({"slice": place.number, "middle_lps_mm": middle.round(3).tolist(), "left": left, "top": top})
     progress("render", len(places), len(places))
     assert made is not None
@@ -504,15 +511,3 @@ def _voxel_planes(volume: Volume, plane: Camera) -> Float64Array | None:
                 origins = volume.affine[:3, 3] + np.arange(volume.shape_ijk[axis])[:, None] * columns[:, axis]
             return np.asarray((origins - plane.focal_point) @ forward)
     return None
-
-
-def _name_place(place: _Place, middle: Float64Array, forward: Float64Array) -> tuple[str, ...]:
-    """Return texts for a slice, the longest first: its number and its place along the axis that it crosses."""
-    axis = int(np.abs(forward).argmax())
-    if abs(forward[axis]) > PARALLEL:
-        texts = [f"{'xyz'[axis]} {middle[axis]:.1f} mm", f"{middle[axis]:.1f}"]
-    else:
-        texts = [f"{place.offset_mm:+.1f} mm", f"{place.offset_mm:+.1f}"]
-    if place.number is not None:
-        texts.insert(0, f"{place.number}: {texts[0]}")
-    return tuple(texts)

@@ -147,11 +147,7 @@ def prepare_marching_cubes(
     vertex_rule: str = "linear",
     grown: bool = False,
 ) -> Program:
-    """Build the kernels for volumes of `dtype`, and return emit_vertices; with `labels` (their type) it takes labels.
-
-    With `uneven`, for volumes with uneven slices; `inside` and `vertex_rule` as in `IsoRule`; with `masks`, for
-    surfaces of label masks, whose volumes are occupancies; with `grown`, for parts of a surface.
-    """
+    """Build the kernels for `dtype`; return emit_vertices, of `labels` (a type) or label `masks`."""
     prepare_scan(device)
     load_cells(device, grown=grown)
     variants = {**voxel_variants(dtype), **device.kernel_variants}

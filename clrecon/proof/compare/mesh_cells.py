@@ -240,17 +240,13 @@ def _cells_of(triangles: Triangles, margin: float) -> Iterator[IntArray]:
             reached[owner[row]] = True
             yield cells
         many = count > _MOST_CANDIDATES
-        corners, owner = _divide(corners[many]), np.repeat(owner[many], 4)
+        # four triangles between corners and middles of edges of each
+        a, b, c = (corners[many][:, corner] for corner in range(3))
+        ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+        parts = [np.stack(part, axis=1) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        corners, owner = np.stack(parts, axis=1).reshape(-1, 3, 3), np.repeat(owner[many], 4)
     # Slivers along an edge between cells reach farther into none of them than coordinates are rounded.
     yield np.floor(lifted[~reached].mean(axis=1)).astype(np.int64)
-
-
-def _divide(corners: Triangles) -> Triangles:
-    """Return the four triangles between corners and middles of edges of each, shape (4 n, 3, 3)."""
-    a, b, c = (corners[:, corner] for corner in range(3))
-    ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
-    parts = [np.stack(part, axis=1) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-    return np.stack(parts, axis=1).reshape(-1, 3, 3)
 
 
 def _tested(

@@ -200,6 +200,19 @@ def make_page(report: CompareReport, figures: Figures) -> str:
         "Bold: the best of the surfaces. Grey: libraries of others. Bars, pictures and contours have the colour"
         " beside the name."
     )
+    memory = "all of the device" if report.memory_allowed_bytes is None else f"{report.memory_allowed_bytes:,} bytes"
+    rows = [
+        ("level", f"{report.iso_value_hu:g} HU; the surface lies at {report.iso_level_hu:g} HU"),
+        ("border", "closed with air" if report.closed_at_border else "open"),
+        ("reference", _title_of(report, report.reference)),
+        ("warm runs", f"{report.repeat} at most, none begins after {LONG_SECONDS:g} s of them"),
+        ("memory on the device", memory),
+        ("truth", "that of the phantom" if report.with_truth else "not known"),
+        ("read the input", f"{report.read_s['first']:.2f} s first, {report.read_s['warm']:.2f} s again"),
+        ("whole comparison", f"{report.seconds['total']:.0f} s"),
+        ("platform", report.platform),
+    ]
+    items = "\n".join(f"<dt>{escape(name)}</dt><dd>{escape(said)}</dd>" for name, said in rows)
     parts = (
         _section("What the numbers say", _findings(report)),
         _section("All methods", f'{main_table(report, COLORS)}\n<p class="note">{note}</p>\n{small_table(report)}'),
@@ -209,7 +222,7 @@ def make_page(report: CompareReport, figures: Figures) -> str:
         _section("Slices with contours", _slices(report, figures)),
         _section("Against the middle slice, as a paper does", _paper(report)),
         _section("How each number is defined", _definitions(report)),
-        _section("Settings", _settings(report)),
+        _section("Settings", f'<dl class="definitions">\n{items}\n</dl>'),
     )
     done = sum(record.is_done for record in report.methods)
     ni, nj, nk = report.shape_ijk
@@ -375,22 +388,5 @@ def _definitions(report: CompareReport) -> str:
     )
     if any(record.small and record.small["scaled_s"] for record in report.methods):
         rows.append(("scaled", "Reckoned from the small picture by the number of pixels, not measured."))
-    items = "\n".join(f"<dt>{escape(name)}</dt><dd>{escape(said)}</dd>" for name, said in rows)
-    return f'<dl class="definitions">\n{items}\n</dl>'
-
-
-def _settings(report: CompareReport) -> str:
-    memory = "all of the device" if report.memory_allowed_bytes is None else f"{report.memory_allowed_bytes:,} bytes"
-    rows = [
-        ("level", f"{report.iso_value_hu:g} HU; the surface lies at {report.iso_level_hu:g} HU"),
-        ("border", "closed with air" if report.closed_at_border else "open"),
-        ("reference", _title_of(report, report.reference)),
-        ("warm runs", f"{report.repeat} at most, none begins after {LONG_SECONDS:g} s of them"),
-        ("memory on the device", memory),
-        ("truth", "that of the phantom" if report.with_truth else "not known"),
-        ("read the input", f"{report.read_s['first']:.2f} s first, {report.read_s['warm']:.2f} s again"),
-        ("whole comparison", f"{report.seconds['total']:.0f} s"),
-        ("platform", report.platform),
-    ]
     items = "\n".join(f"<dt>{escape(name)}</dt><dd>{escape(said)}</dd>" for name, said in rows)
     return f'<dl class="definitions">\n{items}\n</dl>'

@@ -162,11 +162,7 @@ def _stack(sizes: dict[str, Float64Array], frames: list[Float64Array], anchor: i
 
 
 def lay_chain(generator: np.random.Generator, seed: int, half_depth: float, choice: SpineChoice | None) -> Chain:
-    """Lay the levels out, the middle of T12 a little below the middle of the volume; no choice: T1 to L5, straight.
-
-    The generator changes the curve of chest and loin a little, the seed that of the neck, which is planned for a
-    cervical level.  Spinous processes end about 20 mm under the skin of a trunk of twice `half_depth` mm.
-    """
+    """Lay the levels out, T12 a little below the middle of the volume; the generator and the seed bend the curves."""
     count = len(THORACOLUMBAR)
     sizes = {key: np.interp(np.arange(count), _KEYS, values) for key, values in _SIZES.items()}
     leans = np.radians(sizes["lean_degrees"] + generator.normal(0.0, 0.6, count))

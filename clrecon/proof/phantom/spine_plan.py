@@ -28,18 +28,6 @@ from clrecon.proof.phantom.vertebra import body_extent, bone_extent, centring_sh
 Float64Array = NDArray[np.float64]
 
 
-def _rotation(oblique: tuple[float, float, float]) -> Float64Array:
-    matrix = np.eye(3)
-    for axis, angle in enumerate(oblique):
-        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-        first, second = (axis + 1) % 3, (axis + 2) % 3
-        turn = np.eye(3)
-        turn[[first, second], [first, second]] = c
-        turn[first, second], turn[second, first] = -s, s
-        matrix = turn @ matrix
-    return matrix
-
-
 def slice_directions(
     tilt_deg: float, oblique: tuple[float, float, float], prone: bool, gap_mm: float = 1.0
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
@@ -49,7 +37,14 @@ def slice_directions(
     The frame is then rotated by `oblique` degrees (about_x, about_y, about_z); prone, rows and columns turn half round.
     """
     tilt = math.radians(tilt_deg)
-    rotation = _rotation(oblique)
+    rotation = np.eye(3)
+    for axis, angle in enumerate(oblique):
+        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        turn = np.eye(3)
+        turn[[first, second], [first, second]] = c
+        turn[first, second], turn[second, first] = -s, s
+        rotation = turn @ rotation
     if prone:
         rotation = rotation @ np.diag((-1.0, -1.0, 1.0))
     row = rotation @ (1.0, 0.0, 0.0)
@@ -117,19 +112,6 @@ def _plan_vertebrae(chain: Chain, generator: np.random.Generator, seed: int, ste
     ]
 
 
-def _plan_discs(vertebrae: list[Vertebra]) -> list[Disc]:
-    discs = []
-    for upper, lower in zip(vertebrae[:-1], vertebrae[1:], strict=True):
-        if upper.name == "C1":
-            continue  # a joint without a disc
-        gap = upper.center - lower.center
-        length = float(np.linalg.norm(gap))
-        axes = lean_and_roll(math.asin(gap[1] / length), math.asin(gap[0] / length))
-        half = 0.515 * (upper.width + lower.width) / 2.0, 0.515 * (upper.depth + lower.depth) / 2.0
-        discs.append(Disc((upper.center + lower.center) / 2.0, axes, half[0], half[1], length / 2.0))
-    return discs
-
-
 def _plan_ribs(vertebrae: list[Vertebra], moved: Float64Array, half_width: float, half_depth: float) -> list[Rib]:
     ribs = []
     for vertebra, away in zip(vertebrae, moved, strict=True):
@@ -163,7 +145,15 @@ def plan_anatomy(
         shift = centring_shift(shown, choice) if choice.centred else np.zeros(3)
         chain = dataclasses.replace(chain, centres=chain.centres + shift)
         vertebrae = [dataclasses.replace(v, center=v.center + shift, room=_ROOM_MM.get(v.name, 2.0)) for v in vertebrae]
-    discs = _plan_discs(vertebrae)
+    discs = []
+    for upper, lower in zip(vertebrae[:-1], vertebrae[1:], strict=True):
+        if upper.name == "C1":
+            continue  # a joint without a disc
+        gap = upper.center - lower.center
+        length = float(np.linalg.norm(gap))
+        axes = lean_and_roll(math.asin(gap[1] / length), math.asin(gap[0] / length))
+        half = 0.515 * (upper.width + lower.width) / 2.0, 0.515 * (upper.depth + lower.depth) / 2.0
+        discs.append(Disc((upper.center + lower.center) / 2.0, axes, half[0], half[1], length / 2.0))
     ribs = _plan_ribs(vertebrae, chain.moved, half_width, half_depth)
     z = chain.centres[:, 2] / 100.0
     outline = plan_outline(chain, half_width, half_depth)

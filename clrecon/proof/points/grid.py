@@ -60,12 +60,7 @@ def choose_points(points: NDArray[np.float32], spacing: float) -> NDArray[np.uin
 def grow_cells(
     points: NDArray[np.float32], edge: float, fewest: int, threshold: int, largest: bool
 ) -> NDArray[np.uint8]:
-    """Say for each point what becomes of it: 0: kept, 1: in a cell with few points, 2: not reached by growth, 3: in a
-    smaller component.
-
-    fewest, threshold: Fewest points of a cell that stays, and of one where growth begins.
-    largest: Keep the component with the most cells alone; of several the one with the most points, then the first.
-    """
+    """Say of each point: 0 kept, 1 in a cell with few points, 2 not reached by growth, 3 in a smaller component."""
     from scipy import ndimage
 
     grid = make_grid(points, edge)

@@ -221,11 +221,7 @@ def _composite(
 
 
 class _SteepSegments:
-    """Divides segments into parts where the transfer function is steep between their sample and the neighbouring ones.
-
-    Values in between come from a parabola through the three samples, limited to the range of the samples.  The parts
-    are blended, and their common colour is lit at their mean visible place.
-    """
+    """Divides segments where the transfer function is steep, by a parabola through three samples, and blends them."""
 
     def __init__(self, rays: _Rays, function: TransferFunction, step: float, part: Float64Array):
         self.rays, self.function, self.step, self.part = rays, function, step, part

@@ -155,14 +155,7 @@ def erode(volume: Volume, chosen: ArrayLike, mm: float, *, by_slice: bool = Fals
     bits = np.asarray(chosen, dtype=bool)
     if beyond:
         return ~_spread(find_places(volume), ~bits, mm, by_slice)
-    border = _border(volume, mm)
-    padded = np.pad(~bits, [(n, n) for n in border[::-1]], constant_values=True)
-    inner = tuple(slice(n, n + size) for n, size in zip(border[::-1], bits.shape, strict=True))
-    return ~_spread(find_places(volume, border), padded, mm, by_slice, inner)
-
-
-def _border(volume: Volume, mm: float) -> tuple[int, int, int]:
-    """Return enough voxels along i, j and k that those beyond them are farther than `mm` from the volume."""
+    # enough voxels that those beyond them are farther than `mm` from the volume
     steps = volume.affine[:3, :3].copy()
     ends = np.diff(volume.slice_origins(1), axis=0)[[0, -1]]
     borders = []
@@ -170,7 +163,10 @@ def _border(volume: Volume, mm: float) -> tuple[int, int, int]:
         steps[:, 2] = end
         borders.append(2 + np.ceil(mm * np.linalg.norm(np.linalg.inv(steps), axis=1)).astype(int))
     i, j, k = np.max(borders, axis=0).tolist()
-    return i, j, k
+    border = i, j, k
+    padded = np.pad(~bits, [(n, n) for n in border[::-1]], constant_values=True)
+    inner = tuple(slice(n, n + size) for n, size in zip(border[::-1], bits.shape, strict=True))
+    return ~_spread(find_places(volume, border), padded, mm, by_slice, inner)
 
 
 def close(volume: Volume, chosen: ArrayLike, mm: float, *, by_slice: bool = False) -> Bits:

@@ -82,7 +82,11 @@ def judge_sign(voxels: NDArray[Any], facts: PixelFacts, slices: Sequence[StoredV
         span = header.slope * 2.0**header.bits_stored
         if header.bits_stored < FEWEST_BITS or facts.hu_max - facts.hu_min < (1.0 - CLOSE) * span or span <= 0.0:
             continue
-        left, right = _find_crossings(voxels[k], header)
+        picture = voxels[k]
+        half = 0.0 if header.signed else 2.0 ** (header.bits_stored - 1)
+        above = picture >= half * header.slope + header.intercept
+        crossing = above[:, 1:] != above[:, :-1]
+        left, right = picture[:, :-1][crossing].astype(np.float64), picture[:, 1:][crossing].astype(np.float64)
         apart = np.abs(left - right)
         close += int(np.count_nonzero(apart < CLOSE * span))
         wrapped = apart > (1.0 - CLOSE) * span
@@ -103,14 +107,6 @@ def judge_sign(voxels: NDArray[Any], facts: PixelFacts, slices: Sequence[StoredV
         f"neighbouring values nearly {count:,} apart, the whole range of {first.bits_stored} stored bits, and {why}"
         f" {wrong}; write the files anew with PixelRepresentation {right_one}. Pairs found in the sampled slices",
     )
-
-
-def _find_crossings(picture: NDArray[Any], header: StoredValues) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return both values of each pair of neighbours in a row of which one has the highest stored bit set."""
-    half = 0.0 if header.signed else 2.0 ** (header.bits_stored - 1)
-    above = picture >= half * header.slope + header.intercept
-    crossing = above[:, 1:] != above[:, :-1]
-    return picture[:, :-1][crossing].astype(np.float64), picture[:, 1:][crossing].astype(np.float64)
 
 
 CEILING_BITS = 12

@@ -139,7 +139,13 @@ def annotate(
             if text:
                 page.draw_edge(edge, text)
     if scale_bar:
-        page.draw_bar(*_bar_of(rendering))
+        camera, pixel_mm, where = rendering.camera, rendering.pixel_mm, ""
+        if camera is not None and not camera.is_parallel:
+            pixel_mm, where = camera.pixel_mm(rendering.size), " (focal plane)"
+        if pixel_mm is None:
+            raise UsageError("the size of this picture's pixels is not known: leave the scale bar out")
+        length = bar_length(pixel_mm * rendering.size[0])
+        page.draw_bar(*(length / pixel_mm, f"{length:g} mm{where}"))
     if caption:
         page.draw_caption(caption)
     return page.finish()
@@ -156,17 +162,6 @@ def check_caption(caption: str | None) -> None:
     ]
     if absent:
         raise UsageError(f"captions cannot be drawn with {' '.join(absent)}: the font has plain Latin letters only")
-
-
-def _bar_of(rendering: PictureData) -> tuple[float, str]:
-    """Return the length of the bar in pixels, and the text over it."""
-    camera, pixel_mm, where = rendering.camera, rendering.pixel_mm, ""
-    if camera is not None and not camera.is_parallel:
-        pixel_mm, where = camera.pixel_mm(rendering.size), " (focal plane)"
-    if pixel_mm is None:
-        raise UsageError("the size of this picture's pixels is not known: leave the scale bar out")
-    length = bar_length(pixel_mm * rendering.size[0])
-    return length / pixel_mm, f"{length:g} mm{where}"
 
 
 class _Page:

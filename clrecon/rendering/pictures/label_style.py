@@ -160,7 +160,17 @@ def draw_labels(
         shares[find_shown(look.labels, label)] = share
     own = drawn[numbers] & (image[..., 3] > 0)
     wide = max(1, round(OUTLINE_SHARE * min(numbers.shape))) if width is None else width
-    amount = np.where(_label_edges(numbers, wide), np.float32(1.0), shares[numbers])[..., None]
+    # pixels from which another label, or none, is at most `wide` steps away
+    edges = np.zeros(numbers.shape, dtype=bool)
+    for step in range(1, wide + 1):
+        for axis in (0, 1):
+            if step < numbers.shape[axis]:
+                here, there = [slice(None)] * 2, [slice(None)] * 2
+                here[axis], there[axis] = slice(None, -step), slice(step, None)
+                differ = numbers[tuple(here)] != numbers[tuple(there)]
+                edges[tuple(here)] |= differ
+                edges[tuple(there)] |= differ
+    amount = np.where(edges, np.float32(1.0), shares[numbers])[..., None]
     colors = 255.0 * table[numbers][..., :3]
     made = image.copy()
     mixed = amount * colors + (1.0 - amount) * image[..., :3]
@@ -182,17 +192,3 @@ def facts_of_overlay(numbers: NDArray[Any], look: LabelStyle) -> list[dict[str, 
         }
         for n in shown
     ]
-
-
-def _label_edges(numbers: NDArray[Any], wide: int) -> NDArray[np.bool_]:
-    """Return the pixels from which another label, or none, is at most `wide` steps away along rows and columns."""
-    edges = np.zeros(numbers.shape, dtype=bool)
-    for step in range(1, wide + 1):
-        for axis in (0, 1):
-            if step < numbers.shape[axis]:
-                here, there = [slice(None)] * 2, [slice(None)] * 2
-                here[axis], there[axis] = slice(None, -step), slice(step, None)
-                differ = numbers[tuple(here)] != numbers[tuple(there)]
-                edges[tuple(here)] |= differ
-                edges[tuple(there)] |= differ
-    return edges

@@ -24,7 +24,12 @@ def parameters_from_vtk(source: Any, size: Sequence[int] | None = None) -> dict[
     camera = getattr(source, "camera", source)
     if not hasattr(camera, "GetFocalPoint"):
         raise UsageError(f"{type(source).__name__} is no PyVista plotter, PyVista camera or VTK camera")
-    _refuse_distortion(camera)
+    transform = camera.GetUserViewTransform() or camera.GetUserTransform()
+    shear, centre = camera.GetViewShear(), camera.GetWindowCenter()
+    if transform is not None or tuple(shear) != (0.0, 0.0, 1.0) or tuple(centre) != (0.0, 0.0):
+        raise UsageError("this VTK camera has a transform, a shear or a window centre of its own: reset them first")
+    if camera.GetUseOffAxisProjection():
+        raise UsageError("this VTK camera projects off its axis (for walls of screens): turn that off first")
     placed = {"position": camera.GetPosition(), "focal_point": camera.GetFocalPoint(), "up": camera.GetViewUp()}
     if camera.GetParallelProjection():
         return {**placed, "parallel_scale": camera.GetParallelScale()}
@@ -57,12 +62,3 @@ def make_pyvista_camera(
     near, far = NEAR_AND_FAR
     made.SetClippingRange(near * distance, far * distance)
     return made
-
-
-def _refuse_distortion(camera: Any) -> None:
-    transform = camera.GetUserViewTransform() or camera.GetUserTransform()
-    shear, centre = camera.GetViewShear(), camera.GetWindowCenter()
-    if transform is not None or tuple(shear) != (0.0, 0.0, 1.0) or tuple(centre) != (0.0, 0.0):
-        raise UsageError("this VTK camera has a transform, a shear or a window centre of its own: reset them first")
-    if camera.GetUseOffAxisProjection():
-        raise UsageError("this VTK camera projects off its axis (for walls of screens): turn that off first")

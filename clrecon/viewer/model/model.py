@@ -269,6 +269,15 @@ class ViewModel(ChangingView):
         """Return all that panels show, for JSON; places are in `space`, those for other commands in LPS."""
         state = self.state
         mode = self.modes[state.mode]
+        notes = []
+        hidden = [each.name for each in self.objects if each.kind != "labels"][1:]
+        if not mode.joins and hidden:
+            notes.append(f"a picture of mode {mode.name} shows one scan alone: {', '.join(hidden)} left out")
+        elif mode.kind in ("volume", "slices") and len(self.scans) > 1:
+            others = ", ".join(each.name for each in self.scans[1:])
+            notes.append(f"one scan is shown in mode {mode.name}, {others} by the surface")
+        if self._is_edge_on(mode):
+            notes.append("slices are hardly seen along their planes: turn the picture")
         return {
             "version": self.version,
             "space": self.space.upper(),
@@ -306,7 +315,7 @@ class ViewModel(ChangingView):
                 * (1.0 if state.camera.is_parallel else state.camera.distance),
             },
             "undo": self._undo[-1][1] if self._undo else None,
-            "notes": self._notes(mode),
+            "notes": notes,
         }
 
     @property
@@ -316,18 +325,6 @@ class ViewModel(ChangingView):
         divided = [each.within for each in self.label_maps]
         is_new = state.parts_at == state.iso_value and state.parts_table == state.table
         return is_new or all(each.number in divided for each in self.scans)
-
-    def _notes(self, mode: ViewMode) -> list[str]:
-        notes = []
-        hidden = [each.name for each in self.objects if each.kind != "labels"][1:]
-        if not mode.joins and hidden:
-            notes.append(f"a picture of mode {mode.name} shows one scan alone: {', '.join(hidden)} left out")
-        elif mode.kind in ("volume", "slices") and len(self.scans) > 1:
-            others = ", ".join(each.name for each in self.scans[1:])
-            notes.append(f"one scan is shown in mode {mode.name}, {others} by the surface")
-        if self._is_edge_on(mode):
-            notes.append("slices are hardly seen along their planes: turn the picture")
-        return notes
 
     def say_place(self, point: Sequence[float]) -> str:
         """Return a place, LPS mm, as words in `space`."""

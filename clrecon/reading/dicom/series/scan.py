@@ -277,7 +277,14 @@ def _list_files(path: Path, scan: Scan, disk: DiskReader, follow_links: bool) ->
         try:
             with os.scandir(folder) as entries:
                 for entry in entries:
-                    _sort_entry(entry, found, scan)
+                    if entry.is_symlink():
+                        _sort_link(entry, found, scan)
+                    elif entry.is_file(follow_symlinks=False):
+                        found.files.append(entry.path)
+                    elif entry.is_dir(follow_symlinks=False):
+                        found.folders.append(entry.path)
+                    else:
+                        scan.skipped["not a regular file"] += 1
         except OSError:
             scan.skipped["folder not readable"] += 1
             scan.corrupt.append(CorruptFile(Path(folder), "folder not readable"))
@@ -297,17 +304,6 @@ class _Found:
     follow_links: bool
     folders: list[str]
     files: list[str] = field(default_factory=list)
-
-
-def _sort_entry(entry: os.DirEntry[str], found: _Found, scan: Scan) -> None:
-    if entry.is_symlink():
-        _sort_link(entry, found, scan)
-    elif entry.is_file(follow_symlinks=False):
-        found.files.append(entry.path)
-    elif entry.is_dir(follow_symlinks=False):
-        found.folders.append(entry.path)
-    else:
-        scan.skipped["not a regular file"] += 1
 
 
 def _sort_link(entry: os.DirEntry[str], found: _Found, scan: Scan) -> None:

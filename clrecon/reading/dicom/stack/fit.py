@@ -36,11 +36,7 @@ ORIENTATION_SPREAD_RAD = 1e-4
 
 @dataclass(frozen=True)
 class Directions:
-    """Mean directions of a stack, orthonormal (3,), LPS; x and y, for sorting, if one exceeds `ORIENTATION_LIMIT`.
-
-    deviations: Of each slice's stored directions (n,) from unit length and right angle.
-    angles_rad: Between the directions of each slice (n,) and the mean; NaN where there is no mean.
-    """
+    """Mean directions of a stack, (3,) LPS, `deviations` (n,) of the stored ones, and `angles_rad` (n,) to the mean."""
 
     row: Float64Array
     column: Float64Array
