@@ -1,4 +1,4 @@
-"""Cases of steps that a user waits for beside the surface: canal, table, and triangles that cut each other."""
+"""Cases of steps that a user waits for beside the surface: canal, table, triangles that cut each other, fit to bone."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from measure import busy_seconds, spread
 from registry import Job, case
 from wall_and_cpu import alternate_twice
 
-__all__ = ["measure_canal", "measure_crossings", "measure_table"]
+__all__ = ["measure_canal", "measure_crossings", "measure_fitted", "measure_table"]
 
 
 @case("canal", "search for the spinal canal: seconds, processor seconds and memory above the scan; it has no peer")
@@ -67,6 +67,29 @@ def measure_crossings(job: Job) -> dict[str, Any]:
         "pairs": len(ours),
         "equal": sorted(map(sorted, ours.tolist())) == sorted(map(sorted, theirs.tolist())),
         "memory_bytes": _peak_above(lambda: find_crossings(job.device, *arrays)),
+    }
+
+
+@case("surface-cortex", "a surface fitted to the cortex, against the same surface at its level")
+def measure_fitted(job: Job) -> dict[str, Any]:
+    """Time `extract_isosurface` and `fit_cortex` beside `extract_isosurface` alone; the ratio is what the fit costs."""
+    import clrecon
+
+    volume = job.input.volume()
+
+    def extract() -> clrecon.Mesh:
+        return clrecon.extract_isosurface(volume, job.hu, device=job.device)
+
+    def fit() -> clrecon.Mesh:
+        return clrecon.fit_cortex(extract(), volume, device=job.device)
+
+    found = fit().report["cortex"]
+    sides = alternate_twice(fit, extract, job.pairs, job.limit_s)
+    return {
+        "ratios": {name: side["ratio"] for name, side in sides.items()},
+        "sides": sides,
+        "memory_bytes": _peak_above(fit),
+        "result": {name: found[name] for name in ("vertices", "fitted", "kept", "outside_mm", "error_mm", "bias_mm")},
     }
 
 

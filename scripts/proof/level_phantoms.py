@@ -16,6 +16,7 @@ from unittest import mock
 
 import numpy as np
 from numpy.typing import NDArray
+from thin_walls import SHAPES, draw_shape
 
 from clrecon.geometry import Volume
 from clrecon.proof.phantom import (
@@ -44,6 +45,7 @@ __all__ = [
     "PHANTOMS",
     "REACH_MM",
     "SCANNING",
+    "THIN",
     "Phantom",
     "Profiles",
     "draw_phantom",
@@ -75,10 +77,13 @@ class Phantom:
     density: float = 1.0
     vessels_hu: float | None = None
     enhance: float = 0.0
+    shape: str | None = None
 
     @property
     def scale(self) -> float:
         """What lengths are multiplied by that fit voxels of 0.6 mm and more: finer ones have smaller bones."""
+        if self.group == THIN:  # walls and gaps of millimetres, however fine the voxels
+            return 1.0
         finest = min(PhantomSettings(**self.settings).spacing)
         return 1.0 if finest >= FINE_MM else finest / 0.8
 
@@ -91,15 +96,16 @@ def _trunk(**changes: Any) -> dict[str, Any]:
     return {**_TRUNK, **changes}
 
 
-SCANNING, BODIES, DRY, NOTHING, KINDS_OF_SCAN = (
+SCANNING, BODIES, DRY, NOTHING, KINDS_OF_SCAN, THIN = (
     "one body, scanned in ten ways",
     "other bodies",
     "dry specimens",
     "no bone",
     "other kinds of scan",
+    "thin walls and narrow joints",
 )
 
-NOT_IN_TISSUE = (DRY, NOTHING, KINDS_OF_SCAN)
+NOT_IN_TISSUE = (DRY, NOTHING, KINDS_OF_SCAN, THIN)
 
 KINDS_MATERIALS = {
     "jaw": (1470.0, 390.0),
@@ -137,7 +143,14 @@ PHANTOMS = (
     Phantom("water", NOTHING, {"kind": "water", "slices": 60}),
     Phantom("empty table", NOTHING, {"kind": "empty", "slices": 60}),
     *(Phantom(kind, KINDS_OF_SCAN, {"kind": kind}, *materials) for kind, materials in KINDS_MATERIALS.items()),
-)
+    *(Phantom(name, THIN, {}, shape.bone_hu, shape.tissue_hu, shape=name) for name, shape in SHAPES.items()),
+    Phantom("osteoporotic: x 0.4", THIN, _trunk(), bone_hu=380.0, density=0.4),
+    Phantom(
+        "cone beam, 0.3 mm", THIN,
+        {"levels": "L3", "size": (300, 300), "slices": 160, "spacing": (0.3, 0.3, 0.3), "point_spread_mm": 0.35,
+         "noise": 60.0},
+    ),
+)  # fmt: skip
 
 
 @dataclass
@@ -210,6 +223,8 @@ def find_on_mesh(
 
 def draw_phantom(phantom: Phantom) -> Volume:
     """Draw the body with its bones' density, its vessels and the enhancement of edges."""
+    if phantom.shape is not None:
+        return draw_shape(SHAPES[phantom.shape], phantom.settings.get("seed", 1))
     settings = PhantomSettings(**phantom.settings)
     if phantom.group == KINDS_OF_SCAN:  # auto asks what its certificate says of the scale
         with tempfile.TemporaryDirectory() as folder:
@@ -230,8 +245,17 @@ def draw_phantom(phantom: Phantom) -> Volume:
     return Volume(voxels, affine)
 
 
-def _truth_of(settings: PhantomSettings) -> tuple[IsBone, IsBone, NDArray[np.bool_], NDArray[np.bool_]]:
+def _truth_of(phantom: Phantom, volume: Volume) -> tuple[IsBone, IsBone, NDArray[np.bool_], NDArray[np.bool_]]:
     """Return what tells of points (LPS mm) whether they are in bone and in metal, and both for the voxels."""
+    if phantom.shape is not None:
+        shape = SHAPES[phantom.shape]
+        k, j, i = (index.reshape(-1) for index in np.indices(volume.shape))
+        x, y, z = volume.affine[:3, :3] @ np.stack([i, j, k]) + volume.affine[:3, 3:]
+        bone = shape.is_bone(x, y, z).reshape(volume.shape)
+        return (
+            (lambda p: shape.is_bone(*p.T)), (lambda p: np.zeros(len(p), dtype=bool)), bone, np.zeros_like(bone)
+        )  # fmt: skip
+    settings = PhantomSettings(**phantom.settings)
     affine = place_slices(settings).affine
     if KINDS[settings.kind].is_scene:
         parts = plan_scene(settings)
@@ -268,8 +292,7 @@ def sample_profiles(phantom: Phantom, volume: Volume, seed: int = 1) -> Profiles
     """Sample the volume across the true surface, at places where edges of the grid cross it."""
     from scipy.ndimage import map_coordinates
 
-    settings = PhantomSettings(**phantom.settings)
-    is_bone, is_metal, bone, metal = _truth_of(settings)
+    is_bone, is_metal, bone, metal = _truth_of(phantom, volume)
     affine = volume.affine
     generator = np.random.default_rng(seed)
     starts, ends = [], []

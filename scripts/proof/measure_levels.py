@@ -38,6 +38,7 @@ from level_phantoms import (  # noqa: E402
     PHANTOMS,
     REACH_MM,
     SCANNING,
+    THIN,
     Phantom,
     Profiles,
     draw_phantom,
@@ -219,7 +220,7 @@ def _moved(volume: Volume, one: float, other: float) -> float:
 def summarise(figures: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
     """Return means, the worst case, and the spread over one body's scans, by rule: of all with bone but other kinds."""
     summary = {}
-    with_bone = [one for one in figures if "best" in one and one["group"] != KINDS_OF_SCAN]
+    with_bone = [one for one in figures if "best" in one and one["group"] not in (KINDS_OF_SCAN, THIN)]
     shares = [f"{100.0 * float(share):.0f} % of the way" for share in with_bone[0]["shares"]]
     flat = [
         {**one, **{f"{hu} HU": row for hu, row in one["fixed"].items()},

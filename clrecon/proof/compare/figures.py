@@ -320,8 +320,8 @@ def _as_pillow(image: Any) -> Any:
 COLORS = dict(
     zip(
         COMPARED,
-        ("#ff3b30", "#9a9a9a", "#ffd60a", "#ff9f0a", "#c46a3a", "#0a84ff", "#bf5af2", "#30d158", "#64d2ff", "#a2845e",
-         "#ff7ac6", "#8e8cff", "#b8b04a"),
+        ("#ff3b30", "#9a9a9a", "#ffd60a", "#ff9f0a", "#c46a3a", "#0a84ff", "#bf5af2", "#30d158", "#64d2ff", "#00b8a9",
+         "#a2845e", "#ff7ac6", "#8e8cff", "#b8b04a"),
         strict=True,
     )
 )  # fmt: skip

@@ -155,6 +155,19 @@ def _surface(scene: Scene, method: Any, **more: Any) -> Product:
     return mesh, [mesh.report]
 
 
+def _fitted(scene: Scene) -> Product:
+    """Marching cubes, and the surface moved onto the bone; the volume goes to the device once."""
+    from clrecon.operators.resident.device_volume import DeviceVolume
+    from clrecon.operators.surface.cortex_mesh import fit_cortex
+    from clrecon.operators.surface.extract import extract_isosurface
+
+    request = scene.request
+    with DeviceVolume(scene.volume, device=scene.device, memory=request.memory) as resident:
+        mesh = extract_isosurface(resident, request.iso_value, closed=request.closed)
+        fitted = fit_cortex(mesh, resident)
+    return fitted, [mesh.report]
+
+
 def _vtk(scene: Scene) -> Product:
 
     request = scene.request
@@ -220,6 +233,7 @@ def _plain(scene: Scene) -> Product:
 _MAKERS: dict[str, Callable[[Scene], Product]] = {
     **dict.fromkeys(("t-mc", "t-mc-soup", "skimage", "i-mc", "g-mc", "s-mc"), _plain),
     "i-mc-golden": lambda scene: _surface(scene, "i-mc", vertex_rule="golden"),
+    "cortex": _fitted,
     "vtk-mc": _vtk,
     "vtk-fe": _vtk,
     "cloud": _cloud,

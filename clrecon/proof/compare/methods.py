@@ -40,6 +40,7 @@ COMPARED = {
         Compared("i-mc-golden", "I-MC, golden", "the same, vertices at the golden section of their edge"),
         Compared("g-mc", "G-MC", "T-MC, then quadric collapse without a bound"),
         Compared("s-mc", "S-MC", "T-MC, then decimation within a bound, topology kept"),
+        Compared("cortex", "Fitted", "T-MC, each vertex moved onto the bone, read from the HU across its wall"),
         Compared("cloud-surface", "Cloud surface", "closed surface around the points of the cloud"),
         Compared("cloud", "Cloud", "voxels at the border of what is at the level and above, by the affine", CLOUD),
         Compared("rays", "Ray casting", "samples along rays, preset bone, with light", PICTURE),
