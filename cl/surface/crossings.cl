@@ -152,7 +152,7 @@ static inline int may_be_folded(const float3 a, const float3 b, const float3 c, 
 typedef struct { float3 a, b, c; uint3 names; } triangle;
 
 static inline triangle triangle_at(
-    __global const float *restrict places, __global const uint *restrict names, const uint stride, const uint entry)
+    __global const float *places, __global const uint *names, const uint stride, const uint entry)
 {
     const size_t row = stride;
     __global const float *at = places + entry;
@@ -198,7 +198,7 @@ static inline int may_cut(const triangle one, const triangle two)
 /* Entries from place on that may cut the triangle: its box overlaps theirs, and neither lies on one side of the other's
  * plane. */
 static inline ints not_apart(
-    __global const float *restrict places, __global const uint *restrict names, const uint stride, const uint place,
+    __global const float *places, __global const uint *names, const uint stride, const uint place,
     const ints counts, const triangle *own, const plane *flat, const float3 begin, const float3 end)
 {
     floats at[9];

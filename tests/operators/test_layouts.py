@@ -33,7 +33,7 @@ from clrecon.operators.primitives.scan import (
     sort_bytes,
 )
 from clrecon.operators.rays import ray_pictures
-from clrecon.operators.rays.picture_buffers import TILE, PictureBuffers
+from clrecon.operators.rays.picture_buffers import TILE, PictureBuffers, Shot
 from clrecon.operators.rays.point_pictures import DARKEST_SHARE, LARGEST_DISC, SMALLEST_DISC, _choose_window, _Splats
 from clrecon.operators.resident import tables as stack_table
 from clrecon.operators.resident.tables import FieldFrame
@@ -286,7 +286,7 @@ def test_voxels_of_a_box_of_more_than_2_to_the_31_are_told_apart():
 def test_discs_in_pixels(radius, pixels):
     """Half a mm a pixel."""
     camera = Camera((0.0, -50.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), parallel_scale=11.75)
-    splats = _Splats(device(1), camera, (61, 47), radius, None, Lighting(), None, True)
+    splats = _Splats(device(1), Shot(camera, (61, 47)), radius, None, Lighting(), True)
     assert splats.disc_pixels == pytest.approx(pixels)
 
 
