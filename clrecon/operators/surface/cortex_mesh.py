@@ -354,12 +354,14 @@ def fit_mesh(
 
 
 def measure_outside(mesh: Mesh, resident: DeviceVolume, *, constants: CortexConstants | None = None) -> CortexReport:
-    """Measure how far a surface at a level lies outside of the bone, at up to `MOST_LOOKED_AT` of its vertices."""
+    """Measure how far a surface at a level lies outside of the bone, at up to `MOST_LOOKED_AT` of its vertices.
+
+    With the constants of the scan alone: those of each component take as long as all else that a mesh does.
+    """
     _refuse_few(mesh.vertex_count, mesh.vertex_count)
     rows = np.unique(np.linspace(0, mesh.vertex_count - 1, min(mesh.vertex_count, MOST_LOOKED_AT)).astype(np.int64))
     points, normals = mesh.vertices[rows], _normals_of(mesh)[rows]
-    components = _label(mesh, resident)[rows]
-    fit = fit_walls(resident, points, normals, stopwatch=Stopwatch(), constants=constants, components=components)
+    fit = fit_walls(resident, points, normals, stopwatch=Stopwatch(), constants=constants)
     _refuse_few(int(np.count_nonzero(fit.states == FITTED)), len(fit.states))
     return _describe(fit, resident, points, normals, False, 0)
 
