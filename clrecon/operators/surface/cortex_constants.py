@@ -66,9 +66,13 @@ class _Trial:
 
 
 def measure_constants(
-    sampler: ProfileSampler, volume: Volume, points: NDArray[np.floating], normals: NDArray[np.floating]
+    sampler: ProfileSampler,
+    volume: Volume,
+    points: NDArray[np.floating],
+    normals: NDArray[np.floating],
+    scan: CortexConstants | None = None,
 ) -> CortexConstants:
-    """Measure blur and cortex of a scan in profiles at some of the points.
+    """Measure blur and cortex in profiles at some of the points; the noise is that of the scan, if it is known.
 
     The blur is that which leaves the least of the profiles, the cortex what thick walls show.  Their uncertainties are
     half the spread over four parts of the profiles, and not less than `LEAST_BLUR_ERROR` and `LEAST_CORTEX_ERROR`.
@@ -83,7 +87,7 @@ def measure_constants(
         )
     values, peaks = values[:, walls], peaks[walls]
     try:
-        noise = measure_noise(volume).hu
+        noise = measure_noise(volume).hu if scan is None else scan.noise_hu
     except UsageError:  # a specimen in air
         noise = None
     step = volume.spacing
@@ -140,7 +144,7 @@ def find_groups(
     for component in large if len(large) > 1 else []:
         rows = np.flatnonzero(components == component)
         try:
-            own = measure_constants(sampler, volume, points[rows], normals[rows])
+            own = measure_constants(sampler, volume, points[rows], normals[rows], scan)
         except NoSurfaceError:  # a table
             continue
         is_bone = own.thick >= FEWEST_THICK and own.cortex_hu >= COMPACT_HU
