@@ -15,10 +15,11 @@ from clrecon.jobs.settings import StatsSettings
 
 _EPILOG = """\
 Each voxel counts with its own volume: slices that lie unevenly are right. A label map on another grid is brought to
-the scan's, voxel by voxel the nearest label in mm. No OpenCL device is needed. See docs/statistics.md.
+the scan's, voxel by voxel the nearest label in mm. Only --surface needs an OpenCL device. See docs/statistics.md.
 
 examples:
   clrecon stats CT_FOLDER --labels spine.nii.gz
+  clrecon stats CT_FOLDER --labels spine.nii.gz --surface cortex --csv walls.csv
   clrecon stats CT_FOLDER --labels organs.seg.nrrd --label liver --csv liver.csv --report liver.json
   clrecon stats ct.nii.gz --labels organs.nii.gz --percentiles 2.5,50,97.5"""
 
@@ -30,6 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     common.add_input(parser)
     common.add_fields(parser, StatsSettings)
+    surface = parser.add_argument_group("surface of each label, filled")
+    common.add_fields(surface, StatsSettings, "surface")
+    common.add_device(surface)
     output = parser.add_argument_group("files")
     output.add_argument("--csv", metavar="FILE", help="write the figures as a table, one line a label", first=True)
     common.add_report(output, "figures, certificate of the scan and warnings")
@@ -54,6 +58,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         *(["labels   brought to the grid of the scan: the nearest label in mm"] if report["resampled"] else []),
         "figures  volume in ml, the rest in HU: mean, standard deviation, least, percentiles, largest",
         *_lay_out(report, width),
+        *_lay_out_surfaces(report["labels"]),
         f"time     {report['seconds']['total']:.2f} s",
         *([f"wrote    {printable(options.csv)}"] if options.csv is not None else []),
     ]
@@ -80,6 +85,32 @@ def _lay_out(report: dict[str, Any], width: int | None) -> list[str]:
     if width is None or max(map(len, whole)) <= width:
         return whole
     return [*_fit(names, volumes, width), "", *_fit(names, spread, width)]
+
+
+def _lay_out_surfaces(labels: Sequence[dict[str, Any]]) -> list[str]:
+    """Lay out the figures of the labels' surfaces as a table; no line without any."""
+    from clrecon.jobs.stats import surface_cells
+
+    of = [one["surface"] for one in labels if one["surface"]]
+    if not of:
+        return []
+    fitted = of[0]["kind"] == "cortex"
+    head = ["surface", "cm2", "ml", *(["walls 5 %", "50 %", "95 %", "error", "fitted"] if fitted else [])]
+    rows = []
+    for one in labels:
+        area, ml, *walls, share = surface_cells(one["surface"])
+        cells = ["none" if area is None else f"{area / 100.0:,.1f}", "none" if ml is None else _ml(ml)]
+        if fitted:
+            cells += ["none" if value is None else f"{value:.2f}" for value in walls]
+            cells.append("none" if share is None else f"{100.0 * share:.0f} %")
+        rows.append([printable(one["name"]), *cells])
+    kind = "moved onto the bone from" if fitted else "at"
+    walls = "; walls and their error in mm, share of the vertices that lie on the bone" if fitted else ""
+    return [
+        "",
+        f"surface  {kind} {of[0]['iso_value_hu']:g} HU, filled{walls}",
+        *common.table([head, *rows], range(1, 8)),
+    ]
 
 
 def _fit(names: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[str]:

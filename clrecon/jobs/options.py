@@ -177,6 +177,30 @@ def preset_option() -> Any:
     )
 
 
+def surface_option(of_hu: str, more: str = "", **how: Any) -> Any:
+    """Declare a field for the kind of a surface of bone; `more` is one beside ``hu`` and ``cortex``, with its text."""
+    words = ("hu", "cortex", *(more.split(":")[:1] if more else ()))
+    return option(
+        f"--surface {'|'.join(words)}",
+        f"hu: {of_hu}; cortex: each vertex is moved onto the bone, whose place is read from the whole profile of HU"
+        f" across its wall (docs/iso_value.md){f'; {more}' if more else ''}",
+        parse=str.lower,
+        words=words,
+        **how,
+    )
+
+
+def check_surface(surface: str | None, *more: str) -> None:
+    words = ("hu", "cortex", *more)
+    if surface is not None and surface not in words:
+        raise UsageError(f"there is no surface {surface!r}: it is {', '.join(words[:-1])} or {words[-1]}")
+
+
+def check_level(level: float | None) -> None:
+    if level is not None and not math.isfinite(level):
+        raise UsageError(f"the level is a finite number of HU, not {level}")
+
+
 def closed_option() -> Any:
     """Declare a field for surfaces that are closed where they meet the border of the volume: outside is air."""
     return option("--open", "leave the surface open at the border of the volume", group="surface", default=True)

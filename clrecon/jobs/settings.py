@@ -13,16 +13,23 @@ from clrecon.jobs.options import (
     DeviceSettings,
     InputSettings,
     ScanSettings,
+    check_level,
+    check_surface,
     label_map_option,
     mesh_space_option,
     parse_levels,
     parse_point,
     space_option,
+    surface_option,
 )
+from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset
 from clrecon.reading import Selection
 from clrecon.system.arguments import Space, name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.options import numbers_reader, option
+
+FITTED_FROM_HU = find_iso_preset(DEFAULT_PRESET).iso_value
+"""Level that shows the walls which are fitted, if no other is given."""
 
 
 def check_space(space: str | None) -> None:
@@ -80,8 +87,8 @@ class ExportSettings(InputSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StatsSettings(ScanSettings):
-    """Settings of the job of statistics; without `label` all labels are measured."""
+class StatsSettings(ScanSettings, DeviceSettings):
+    """Settings of the job of statistics; without `label` all labels are measured, without `surface` their voxels."""
 
     labels: str | Path = label_map_option(required=True)
     label: Sequence[str | int] = option(
@@ -94,11 +101,26 @@ class StatsSettings(ScanSettings):
         first=True,
     )
 
+    surface: str | None = surface_option(
+        "measure the surface of each label at the level too: area and volume", group="surface", first=True
+    )
+    iso_value: float | None = option(
+        "--hu N", f"level of the surface (default: that of bone, {FITTED_FROM_HU:g})", group="surface"
+    )
+
     def __post_init__(self) -> None:
         from clrecon.labels.statistics import check_percentiles  # numpy: not loaded before a job starts
 
+        super().__post_init__()
         if self.percentiles is not None:
             check_percentiles(self.percentiles)
+        check_surface(self.surface)
+        check_level(self.iso_value)
+        if self.iso_value is not None and self.surface is None:
+            raise UsageError(
+                f"a level is that of a surface: ask for one ({name_parameter('surface', 'hu')}), or leave"
+                f" {name_parameter('iso_value')} out"
+            )
 
 
 MOST_SAMPLES = 10_000_000
@@ -277,7 +299,6 @@ class CorridorSettings(ScanSettings, DeviceSettings):
             raise UsageError(f"name the vertebrae: {name_parameter('label', 'L3')}, once for each")
         if not (math.isfinite(self.margin) and 0.0 <= self.margin <= LARGEST_MARGIN_MM):
             raise UsageError(f"the margin is a length from 0 to {LARGEST_MARGIN_MM:g} mm, not {self.margin:g}")
-        if self.iso_value is not None and not math.isfinite(self.iso_value):
-            raise UsageError(f"the level is a finite number of HU, not {self.iso_value}")
+        check_level(self.iso_value)
         check_space(self.space)
         super().__post_init__()

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.run import Run, ScanReport
-from clrecon.jobs.settings import StatsSettings
+from clrecon.jobs.settings import FITTED_FROM_HU, StatsSettings
 from clrecon.labels import resample_labels
 from clrecon.labels.statistics import PERCENTILES, check_percentiles, measure_resampled, name_percentile
 from clrecon.system.light_dataclass import dataclass
 
 if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.labels import LabelMap
     from clrecon.labels.statistics import LabelFigures
+    from clrecon.opencl import Device
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -28,6 +32,7 @@ class StatsReport(ScanReport):
     percentiles: list[float]
     resampled: bool
     affine_ijk_to_lps_mm: list[list[float]]
+    device: str | None
 
 
 def measure_stats(
@@ -47,6 +52,13 @@ def measure_stats(
         percentiles = check_percentiles(PERCENTILES if settings.percentiles is None else settings.percentiles)
         figures = measure_resampled(volume, labels, taken, label, percentiles=percentiles, progress=run.progress)
         run.lap("measure")
+        device = None
+        if settings.surface is not None:
+            from clrecon.operators import take_device
+
+            device = take_device(settings.device)
+            figures = _measure_surfaces(run, volume, labels, figures, device)
+            run.lap("surface")
         report = run.report(
             StatsReport,
             [*taken.warnings, *(text for one in figures for text in one.warnings)],
@@ -55,10 +67,54 @@ def measure_stats(
             percentiles=list(percentiles),
             resampled=not taken.exact,
             affine_ijk_to_lps_mm=volume.affine.tolist(),
+            device=None if device is None else device.current.label,
         )
         if csv_path is not None:
             run.write(csv_path, as_csv(report).encode("utf-8"))
         return run.finish(report, report_path)
+
+
+def _measure_surfaces(
+    run: Run, volume: Volume, labels: LabelMap, figures: Sequence[LabelFigures], device: Device
+) -> list[LabelFigures]:
+    """Return the figures with those of the filled surface of each label: at its level, or moved onto the bone."""
+    from clrecon.mesh.quality import measure_triangles
+    from clrecon.operators.resident.device_volume import DeviceVolume
+    from clrecon.operators.surface.cortex_mesh import fit_labels
+    from clrecon.operators.surface.labels import extract_labels
+
+    settings: StatsSettings = run.settings
+    level = FITTED_FROM_HU if settings.iso_value is None else settings.iso_value
+    with DeviceVolume(volume, device=device, memory=settings.memory) as resident:
+        if settings.surface == "cortex":
+            meshes = fit_labels(resident, labels, level, progress=run.progress)
+        else:
+            meshes = extract_labels(resident, labels, level, solid=True, progress=run.progress)
+    found = []
+    for one in figures:
+        surface: dict[str, Any] = {"kind": settings.surface, "iso_value_hu": level, "area_mm2": None, "ml": None}
+        mesh = meshes.get(one.number) if one.max_hu is not None and one.max_hu >= level else None  # not filled alone
+        if mesh is not None:
+            area, mm3 = measure_triangles(mesh.vertices, mesh.triangles)[:2]
+            surface |= {"area_mm2": area, "ml": mm3 / 1000.0}
+        found.append(one.changed(surface=surface | {"cortex": mesh and mesh.report.get("cortex")}))
+    return found
+
+
+SURFACE_CELLS = ("area_mm2", "ml", "thickness_p5_mm", "thickness_p50_mm", "thickness_p95_mm", "error_p50_mm", "fitted")
+"""Columns of the table of a surface, before which stands ``surface_``."""
+
+
+def surface_cells(surface: Mapping[str, Any]) -> list[Any]:
+    """Return the figures of a surface by `SURFACE_CELLS`; None for what was not measured."""
+    cortex = surface["cortex"] or {}
+    if not cortex.get("vertices"):
+        return [surface["area_mm2"], surface["ml"], *[None] * (len(SURFACE_CELLS) - 2)]
+    walls = cortex["thickness_mm"]
+    return [
+        *(surface["area_mm2"], surface["ml"], walls["p5"], walls["p50"], walls["p95"]),
+        *(cortex["error_mm"]["p50"], cortex["fitted"] / cortex["vertices"]),
+    ]
 
 
 def as_csv(report: StatsReport) -> str:
@@ -68,8 +124,10 @@ def as_csv(report: StatsReport) -> str:
     wanted = [name_percentile(percent) for percent in report.percentiles]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*own, *(f"p{name}_hu" for name in wanted)])
+    of_surface = [f"surface_{name}" for name in SURFACE_CELLS] if any(one.surface for one in report.labels) else []
+    writer.writerow([*own, *(f"p{name}_hu" for name in wanted), *of_surface])
     for one in report.labels:
         cells = [*(one[name] for name in own), *(one["percentiles_hu"][name] for name in wanted)]
+        cells += surface_cells(one.surface) if one.surface else []
         writer.writerow([round(cell, 6) if isinstance(cell, float) else cell for cell in cells])
     return text.getvalue()

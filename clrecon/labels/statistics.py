@@ -40,6 +40,7 @@ class LabelFigures(Record):
     unmeasured: Voxels without a finite value; the figures of HU leave them out.
     mean_hu, sd_hu: Over the volume (divided by the whole, not by one voxel less); None without voxels.
     percentiles_hu: ``{"5": ...}``: the least HU up to which at least this percentage of the volume lies.
+    surface: Figures of its surface, if statistics of surfaces were asked for; see docs/statistics.md.
     """
 
     _SHOWN = ("number", "name", "ml", "mean_hu", "sd_hu")
@@ -55,6 +56,7 @@ class LabelFigures(Record):
     min_hu: float | None
     max_hu: float | None
     percentiles_hu: Mapping[str, float | None]
+    surface: Mapping[str, Any] | None = None
 
     @property
     def warnings(self) -> list[str]:

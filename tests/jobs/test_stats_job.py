@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from command_lines import check_refused
 from label_files import write_nifti
+from scipy.special import ndtr
 
 from clrecon.cli.main import main
 from clrecon.cli.stats import _lay_out
@@ -81,6 +82,8 @@ def test_a_narrow_window_gets_two_tables(files: dict[str, str], capsys: Any) -> 
         (["--labels", "LABELS", "--label", "spleen"], 3, "spleen"),
         (["--labels", "no.nii"], 3, "no label map"),
         (["--labels", "LABELS", "--percentiles", "5;50"], 3, "5,50,95"),
+        (["--labels", "LABELS", "--hu", "300"], 3, "--surface hu"),
+        (["--labels", "LABELS", "--surface", "mask"], 3, "hu or cortex"),
         (["--labels", "LABELS", "--percentiles", "500"], 3, "from 0 to 100"),
         (["--labels", "LABELS", "--csv", "a.json", "--report", "a.json"], 3, "same file"),
         (["--labels", "LABELS", "--csv", "no/a.csv"], 6, "no"),
@@ -103,3 +106,41 @@ def test_what_exists_stays_with_no_clobber(files: dict[str, str], tmp_path: Path
     assert "a.csv" in capsys.readouterr().err and (tmp_path / "a.csv").read_text() == "mine"
     assert main(given) == 0
     assert (tmp_path / "a.csv").read_text().startswith("number,name,voxels,ml")
+
+
+@pytest.fixture(scope="module")
+def shells(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Two shells of bone, radius 13 and 9 mm, 2 and 3 mm thick, blurred by 0.7 mm, with marrow; and a dim label."""
+    k, j, i = np.indices((36, 36, 60))
+    values, labels = np.full(k.shape, 50.0), np.zeros(k.shape, np.uint8)
+    for number, (x, radius, thickness) in enumerate(((18.3, 13.0, 2.0), (45.2, 9.0, 3.0)), start=1):
+        far = np.sqrt((i - x) ** 2 + (j - 17.6) ** 2 + (k - 18.1) ** 2)
+        outer, inner = ndtr((far - radius) / 0.7), ndtr((radius - thickness - far) / 0.7)
+        values += 950.0 * (1.0 - outer - inner) + 150.0 * inner
+        labels[far < radius] = number
+    labels[2:5, 2:5, 2:5] = 3
+    folder, grid = tmp_path_factory.mktemp("shells"), np.diag([1.0, 1.0, 1.0, 1.0])
+    scan = write_nifti(folder / "ct.nii", np.rint(values).astype(np.int16), grid)
+    return {"ct": str(scan), "labels": str(write_nifti(folder / "l.nii", labels, grid))}
+
+
+def test_the_surface_of_each_label_has_the_area_volume_and_walls_of_the_bone(
+    shells: dict[str, str], tmp_path: Path, capsys: Any, device: Any
+) -> None:
+    table = tmp_path / "walls.csv"
+    given = ["stats", shells["ct"], "--labels", shells["labels"], "--device", str(device.index)]
+    assert main([*given, "--surface", "hu", "--json"]) == 0
+    at_level = json.loads(capsys.readouterr().out)["labels"]
+    assert main([*given, "--surface", "cortex", "--csv", str(table)]) == 0
+    shown = capsys.readouterr().out
+    with table.open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    for row, level, radius, thickness in zip(rows, at_level, (13.0, 9.0), (2.0, 3.0), strict=False):
+        ml, area = 4.0 / 3.0 * np.pi * radius**3 / 1000.0, 4.0 * np.pi * radius**2
+        assert level["surface"]["ml"] > 1.09 * ml and level["surface"]["cortex"] is None  # what a level costs
+        assert float(row["surface_ml"]) == pytest.approx(ml, rel=0.025)
+        assert float(row["surface_area_mm2"]) == pytest.approx(area, rel=0.03)
+        assert float(row["surface_thickness_p50_mm"]) == pytest.approx(thickness, abs=0.3)
+        assert float(row["surface_fitted"]) > 0.9 and 0.0 < float(row["surface_error_p50_mm"]) < 0.2
+    assert rows[2]["surface_ml"] == "" and at_level[2]["surface"]["ml"] is None
+    assert "moved onto the bone from 200 HU" in shown and "label_3  none  none" in shown

@@ -58,33 +58,31 @@ def place_on_cortex(
     """Move the meshes onto the bone, if the settings ask for it, or say how far they lie from it: without `measure` the
     largest alone, and only where the scan has not given its level.
 
-    The constants of the scan are measured once, in its largest mesh.  A mesh that shows no bone stays as it is and gets
-    ``{"reason": words}`` in place of figures; where the largest was to be moved, that is an error.
+    Constants of the scan are measured once, in its largest mesh.  One that shows no bone gets ``{"reason": words}``
+    in place of figures; that none shows any is an error where they were to be moved.
     """
-    moves = settings.surface == "cortex"
-    parts = sorted(made.parts, key=lambda part: -part.mesh.vertex_count)
+    moves, parts = settings.surface == "cortex", made.parts
     if not moves:
-        parts = [part for part in parts if _may_be_bone(part)]
+        parts = sorted(filter(_may_be_bone, parts), key=lambda part: -part.mesh.vertex_count)
         if not measure:
             parts = [] if settings.half_way == "auto" else parts[:1]
     if not parts:
         return
     from clrecon.operators.resident.device_volume import DeviceVolume
-    from clrecon.operators.surface.cortex_mesh import fit_mesh, measure_outside
+    from clrecon.operators.surface.cortex_mesh import fit_meshes, measure_outside
 
     with DeviceVolume(made.volume, device=made.device, memory=settings.memory) as resident:
+        if moves:
+            fitted = fit_meshes([part.mesh for part in parts], resident, progress=progress)
+            for part, mesh in zip(parts, fitted, strict=True):
+                part.mesh = mesh
+            return
         constants = None
         for part in parts:
             try:
-                if moves:
-                    part.mesh = fit_mesh(part.mesh, resident, constants=constants, progress=progress)
-                    constants = part.mesh.report["cortex"].constants
-                else:
-                    found = measure_outside(part.mesh, resident, constants=constants)
-                    part.mesh.report["cortex"], constants = found, found.constants
+                found = measure_outside(part.mesh, resident, constants=constants)
+                part.mesh.report["cortex"], constants = found, found.constants
             except (NoSurfaceError, DeviceError) as error:
-                if moves and (constants is None or isinstance(error, DeviceError)):
-                    raise
                 part.mesh.report["cortex"] = {"reason": str(error)}
                 if constants is None:
                     break

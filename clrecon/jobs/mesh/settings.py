@@ -11,12 +11,14 @@ from clrecon.jobs.mesh.choices import LABEL_SEED, LabelChoice, check_growing, ch
 from clrecon.jobs.options import (
     LEVELS_HELP,
     InputSettings,
+    check_surface,
     closed_option,
     parse_hu,
     parse_levels,
     parse_point,
     preset_option,
     space_option,
+    surface_option,
 )
 from clrecon.jobs.outputs import OBJECT_FILES
 from clrecon.jobs.presets import DEFAULT_PRESET, PURPOSES, Purpose, find_iso_preset, find_purpose
@@ -112,14 +114,11 @@ class MeshSettings(InputSettings):
     seal_mm: float | None = _inside_option(
         "--seal MM", "with --solid: close pores up to twice as wide, less one voxel (default: 2.5 to 3, by the voxels)"
     )
-    surface: str = option(
-        "--surface hu|cortex|mask",
-        "hu: vertices lie at the level (default); cortex: each is moved onto the bone, whose place is read from the"
-        " whole profile of HU across its wall (docs/iso_value.md); mask: with --labels the label's own surface,"
-        " whatever the HU: organs, lungs, what HU do not show",
+    surface: str = surface_option(
+        "vertices lie at the level (default)",
+        "mask: with --labels the label's own surface, whatever the HU: organs, lungs, what HU do not show",
         group="kind",
         default="hu",
-        parse=str.lower,
     )
     space: Space = space_option("patient frame of the mesh", group="surface")
     topology: Topology = option(
@@ -248,6 +247,7 @@ class MeshSettings(InputSettings):
 
     def _check_surface(self) -> None:
         """Refuse an unknown kind of surface, and `cortex` where HU do not place the outer surface of bone."""
+        check_surface(self.surface, "mask")
         if self.surface == "hu":
             return
         name = name_parameter("surface", self.surface)
@@ -255,8 +255,6 @@ class MeshSettings(InputSettings):
             if self.labels is None:
                 raise UsageError(f"{name} is that of labels: give their file with {name_parameter('labels')}")
             return
-        if self.surface != "cortex":
-            raise UsageError(f"there is no surface {self.surface!r}: it is hu, cortex or mask")
         if not self.follows_hu:
             raise UsageError(f"{name} is read from the HU: the surface of a mask does not depend on them")
         if self.inside != "above":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import METAL_HU, Volume
+from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.connectivity import label_components as label_on_host
@@ -28,6 +30,7 @@ from clrecon.operators.surface.cortex import (
 )
 from clrecon.operators.surface.cortex_constants import find_groups, measure_constants
 from clrecon.operators.surface.decimation import find_crossings
+from clrecon.operators.surface.labels import extract_labels
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import in_threads
@@ -309,10 +312,7 @@ def fit_cortex(
     """
     progress = progress or ignore_progress
     with open_volume(volume, device, memory, "the cortex") as resident:
-        for attempt in resident.with_fallback():
-            with attempt:
-                fitted = fit_mesh(mesh, resident, progress=progress)
-    return fitted
+        return fit_meshes([mesh], resident, progress=progress)[0]
 
 
 def fit_mesh(
@@ -351,6 +351,40 @@ def fit_mesh(
     }
     steps.take()
     return made
+
+
+def fit_meshes(meshes: Sequence[Mesh], resident: DeviceVolume, *, progress: Progress = ignore_progress) -> list[Mesh]:
+    """Do what `fit_cortex` does with meshes of one scan: its constants are those of the largest that shows bone.
+
+    Those that show none stay as they are, with ``{"reason": words}`` in place of figures; that none does is an error.
+    """
+    constants, fitted, refused = None, list(meshes), []
+    for row in sorted(range(len(meshes)), key=lambda row: -meshes[row].vertex_count):
+        try:
+            for attempt in resident.with_fallback():
+                with attempt:
+                    fitted[row] = fit_mesh(meshes[row], resident, constants=constants, progress=progress)
+            constants = fitted[row].report["cortex"].constants
+        except NoSurfaceError as error:
+            refused.append(error)
+            fitted[row].report["cortex"] = {"reason": str(error)}
+    if constants is None and refused:
+        raise refused[0]
+    return fitted
+
+
+def fit_labels(
+    resident: DeviceVolume,
+    labels: LabelMap,
+    level: float,
+    label: Sequence[int | str] | int | str | None = None,
+    *,
+    grow_mm: float | None = None,
+    progress: Progress = ignore_progress,
+) -> dict[int, Mesh]:
+    """Return the filled surfaces of labels at a low level of HU, moved onto the bone."""
+    meshes = extract_labels(resident, labels, level, label=label, grow_mm=grow_mm, solid=True, progress=progress)
+    return dict(zip(meshes, fit_meshes([*meshes.values()], resident, progress=progress), strict=True))
 
 
 def measure_outside(mesh: Mesh, resident: DeviceVolume, *, constants: CortexConstants | None = None) -> CortexReport:
