@@ -45,6 +45,11 @@ CHECKS = {
         "every mutation of every kernel is caught by the self-test, where .ci/run draws a few; on PoCL 3.1",
         ("scripts/proof/mutate_kernels.py", "--device", "0", "--results", str(KEPT / "kernels.json")),
     ),
+    "gpu": ReleaseCheck(
+        "what compilers for cards of NVIDIA, AMD and Intel make of every kernel: nothing spilled, no more memory and no"
+        " fewer lanes than recorded; needs Debian 12, where .ci/run looks at the largest kernels with what is there",
+        ("scripts/proof/check_gpu.py", "--tools", str(KEPT / "gpu_tools"), "--fetch"),
+    ),
     "python": ReleaseCheck(
         "at most 5 % of the changes of a room survive its tests; needs the extra mutation",
         ("scripts/proof/mutate_python.py", "--changes", "70", "--json", str(KEPT / "changes.json"), "--resume"),

@@ -221,7 +221,7 @@ __kernel void count_links(
     __global uint *restrict row_links, const int nj, const int nk, const uint part_rows)
 {
     const uint row = get_global_id(0);
-    if (row >= nj * nk)
+    if (row >= (uint)(nj * nk))
         return;
     const uint end_row = (row / part_rows + 1) * part_rows;
     row_links[row] = find_links(runs, row_counts, stencil, tables, labels, 0, nj, nk, row, end_row);
@@ -239,7 +239,7 @@ __kernel void list_links(
     const uint part_rows)
 {
     const uint row = get_global_id(0);
-    if (row >= nj * nk)
+    if (row >= (uint)(nj * nk))
         return;
     const uint end_row = (row / part_rows + 1) * part_rows;
     find_links(runs, row_counts, stencil, tables, labels, links + 3 * (size_t)row_links[row], nj, nk, row, end_row);
@@ -259,7 +259,7 @@ __kernel void mark_border_runs(
     const int by_slice)
 {
     const uint row = get_global_id(0);
-    if (row >= nj * nk)
+    if (row >= (uint)(nj * nk))
         return;
     const int j = row % nj, k = row / nj;
     const int all = j == 0 || j == nj - 1 || (!by_slice && (k == 0 || k == nk - 1));

@@ -207,6 +207,9 @@ static inline void write_vertices(
     const ints along_j = axis == 1, along_k = axis == 2;
     const floats value = to_floats(load_lanes(group->value));
     const floats next_value = to_floats(load_lanes(group->next_value));
+#ifdef GOLDEN
+    floats t = (floats)(GOLDEN_SECTION);
+#else
     const floats keep = choose(
         along_k, (floats)(frame->margin.z), choose(along_j, (floats)(frame->margin.y), (floats)(frame->margin.x)));
 #ifdef RANGE
@@ -216,12 +219,11 @@ static inline void write_vertices(
 #else
     const float level = frame->iso_level;
 #endif
-#ifdef GOLDEN
-    floats t = (floats)(GOLDEN_SECTION);
-#elif defined(GOLDEN_SEARCH)
+#ifdef GOLDEN_SEARCH
     floats t = clamp(search_crossing(group, axis, value, next_value, level), keep, 1.0f - keep);
 #else
     floats t = clamp((level - value) / (next_value - value), keep, 1.0f - keep);
+#endif
 #endif
     floats value_scale = (floats)(frame->value_scale);
 #ifdef LABELS
