@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
 __all__ = ["PointCloud", "PointStep", "drop_ghost_slices", "fill_ghost_slices", "keep_clusters"]
 
-POINT_KINDS = ("surface", "shell", "voxels")
+POINT_KINDS = ("surface", "cortex", "shell", "voxels")
+SURFACE_KINDS = POINT_KINDS[:2]
 """See `clrecon.extract_points`."""
 
 _MODULES = {

@@ -39,3 +39,21 @@ def assert_sound(mesh: Any) -> None:
     assert quality["volume_ml"] > 0.0
     assert quality["zero_area_faces"] == 0
     assert quality["unused_vertices"] == 0
+
+
+MIDDLE = np.array([19.5, 19.0, 18.0])
+
+
+def hollow_ball(
+    radius: float = 13.0, thickness: float = 2.0, blur: float = 0.7, cortex: float = 1000.0, inner: float = 200.0,
+    spacing: Sequence[float] = (1.0, 1.0, 1.0),
+) -> Volume:  # fmt: skip
+    """A blurred shell of bone in tissue of 50 HU, its middle at `MIDDLE` mm."""
+    from scipy.special import ndtr
+
+    shape = [round(39.0 / step) + 1 for step in spacing]
+    i, j, k = (np.arange(n) * step for n, step in zip(shape, spacing, strict=True))
+    far = np.sqrt((i - MIDDLE[0]) ** 2 + ((j - MIDDLE[1]) ** 2)[:, None] + ((k - MIDDLE[2]) ** 2)[:, None, None])
+    outer, hollow = ndtr((far - radius) / blur), ndtr((radius - thickness - far) / blur)
+    values = 50.0 * outer + inner * hollow + cortex * (1.0 - outer - hollow)
+    return Volume(np.rint(values).astype(np.int16), np.diag([*spacing, 1.0]))

@@ -14,6 +14,7 @@ from clrecon.jobs.cloud.steps import CloudSteps, find_ghosts, iso_value_of, name
 from clrecon.jobs.inputs import describe_cloud, is_cloud_file, refuse_other_clouds, refuse_scan_settings
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.run import Run, RunReport
+from clrecon.points import SURFACE_KINDS
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
@@ -71,7 +72,7 @@ def _check_kind(settings: CloudSettings, is_cloud: bool) -> None:
         raise UsageError(
             f"a scan says its own frame: leave out {name_parameter('input_space')}, which is for clouds of points"
         )
-    elif settings.paper and settings.kind == "surface":
+    elif settings.paper and settings.kind in SURFACE_KINDS:
         raise UsageError(
             "the formulas of the papers are for voxel centres, not for points of a surface: give a band too"
             f" ({name_parameter('hu')}), or {name_parameter('points', 'voxels')}"

@@ -10,7 +10,7 @@ from typing import Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.options import InputSettings, label_map_option, parse_point, space_option
-from clrecon.points import POINT_KINDS
+from clrecon.points import POINT_KINDS, SURFACE_KINDS
 from clrecon.system.arguments import PointKind, Space, name_parameter
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.options import option, parse_numbers
@@ -105,7 +105,8 @@ class CloudSettings(InputSettings):
     )
     points: PointKind | None = _points_option(
         f"--points {'|'.join(POINT_KINDS)}",
-        "surface: where the HU cross the iso value, between the voxels; voxels: the centres of those within; shell: of"
+        "surface: where the HU cross the iso value, between the voxels; cortex: each of these moved onto the bone"
+        " (docs/iso_value.md); voxels: the centres of those within; shell: of"
         " these the outer ones (default: surface, with a band voxels)",
         parse=str.lower,
         first=True,
@@ -212,7 +213,7 @@ class CloudSettings(InputSettings):
                 raise UsageError(f"a band of HU has two ends, not {len(self.hu)}")
             if self.hu[0] > self.hu[1]:
                 raise UsageError(f"the band {self.hu[0]:g},{self.hu[1]:g} HU holds nothing: give its lower end first")
-            if self.points == "surface":
+            if self.points in SURFACE_KINDS:
                 raise UsageError("a surface has one iso value, not a band: give one number of HU, or other points")
 
     def _check_viewpoint(self) -> None:

@@ -201,7 +201,7 @@ LEAST_KEPT = 0.5
 """Least share of its points that a step must keep which is there to take noise away."""
 
 _EXTRACTED = (
-    *("kind", "iso_value_hu", "band_hu", "voxels", "voxels_in_band"),
+    *("kind", "iso_value_hu", "band_hu", "voxels", "voxels_in_band", "cortex"),
     *("share", "label", "paper", "slabs", "device_bytes"),
 )
 """Entries of the first cloud's report that its step tells."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -33,7 +33,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.resident.tables import label_variants, voxel_variants
 from clrecon.operators.surface.marching_cubes import pad4, split_steps
 from clrecon.operators.surface.slabs import OUTPUT_SHARE
-from clrecon.points import POINT_KINDS, PointCloud
+from clrecon.points import POINT_KINDS, SURFACE_KINDS, PointCloud
 from clrecon.points.cloud import MOST_POINTS, VoxelNumbers
 from clrecon.system.arguments import PointKind, explains_arguments, name_parameter
 from clrecon.system.light_dataclass import dataclass, field
@@ -301,9 +301,9 @@ def extract_points(
     """Extract a cloud of points in LPS mm from a volume.
 
     ``surface`` are the vertices of `extract_isosurface`, with normals and without triangles: they lie between voxels,
-    where the values cross the iso value.  ``voxels`` are the centres of all voxels in a band of HU, each its own
-    product of index and affine, tilt and uneven slices included.  ``shell`` are those of them with one of six
-    neighbours outside; beyond the volume all is outside.
+    where the values cross the iso value.  ``cortex`` are the same moved onto the bone by `fit_cortex`.  ``voxels`` are
+    the centres of all voxels in a band of HU, each its own product of index and affine, tilt and uneven slices
+    included.  ``shell`` are those of them with one of six neighbours outside; beyond the volume all is outside.
 
     Parameters
     ----------
@@ -312,8 +312,9 @@ def extract_points(
         `clrecon.remove_table`.
     iso_value : float or "auto", optional
         HU; for voxels the lower end of a band without an upper one.  "auto", and None unless ``hu`` is given: that of
-        `clrecon.choose_iso_value`; the report says why.
-    kind : {"surface", "shell", "voxels"}, optional
+        `clrecon.choose_iso_value`; the report says why.  The cortex needs a low one, such as 200, which shows its
+        walls.
+    kind : {"surface", "cortex", "shell", "voxels"}, optional
         None: "voxels" where ``hu`` is given, else "surface".
     hu : (float or None, float or None), optional
         Lowest and highest value of a band, both included; None: no such end.  For "surface" both ends are levels.
@@ -332,11 +333,12 @@ def extract_points(
     -------
     PointCloud
         Voxels in the order k, j, i, with ``hu`` and ``ijk``; surfaces in the order of the mesh, with ``normals`` and,
-        at one iso value, ``hu``.  Places are exact to the rounding of float32, 1.5e-5 mm within 512 mm of the origin;
-        from 4096 mm on they are float64.  Entries of ``PointCloud.report``: ``kind``, ``iso_value_hu`` or ``band_hu``,
-        ``voxels`` (of the volume), ``points``, and of voxels ``voxels_in_band`` and ``share`` (points of all voxels);
-        ``label``; the affine, the certificate, device, ``slabs``, ``device_bytes``, seconds and warnings as in
-        ``Mesh.report``; with ``paper`` ``paper``: ``nonzero_voxels``, ``error_max_mm`` and ``error_rms_mm``.
+        at one iso value, ``hu``, but those of the cortex, whose report has ``cortex`` as a mesh has it.  Places are
+        exact to the rounding of float32, 1.5e-5 mm within 512 mm of the origin; from 4096 mm on they are float64.
+        Entries of ``PointCloud.report``: ``kind``, ``iso_value_hu`` or ``band_hu``, ``voxels`` (of the volume),
+        ``points``, and of voxels ``voxels_in_band`` and ``share`` (points of all voxels); ``label``; the affine, the
+        certificate, device, ``slabs``, ``device_bytes``, seconds and warnings as in ``Mesh.report``; with ``paper``
+        ``paper``: ``nonzero_voxels``, ``error_max_mm`` and ``error_rms_mm``.
 
     Raises
     ------
@@ -353,8 +355,8 @@ def extract_points(
     kind = _check(iso_value, kind, hu, labels, label, paper)
     with open_volume(volume, device, memory, "a cloud of points") as resident:
         level, chosen = settle_level(resident.volume, "auto" if iso_value is None and hu is None else iso_value)
-        if kind == "surface":
-            cloud = _surface(resident, level if hu is None else hu, labels, label, progress)
+        if kind in SURFACE_KINDS:
+            cloud = _surface(resident, level if hu is None else hu, labels, label, kind == "cortex", progress)
         else:
             band = checked_band((level, None) if hu is None else hu)
             cloud = _voxels(resident, band, kind == "shell", labels, label, paper, progress)
@@ -372,7 +374,9 @@ def _check(
         raise UsageError(f"there are no points of the kind {kind!r}: use one of {', '.join(POINT_KINDS)}")
     if label is not None and labels is None:
         raise UsageError(f"{name_parameter('label')} needs {name_parameter('labels')}: the map that has it")
-    if paper and kind == "surface":
+    if kind == "cortex" and iso_value in (None, "auto"):
+        raise UsageError("the cortex is looked for from a low level on, which shows its walls: give it, such as 200 HU")
+    if paper and kind in SURFACE_KINDS:
         raise UsageError(f"{name_parameter('paper', True)} places voxels: ask for voxels or shell")
     return kind
 
@@ -448,25 +452,37 @@ def _measure_paper(volume: Volume, numbers: NDArray[Any]) -> dict[str, float]:
 
 
 def _surface(
-    resident: DeviceVolume, level: Any, labels: LabelMap | None, label: int | str | None, progress: Progress
+    resident: DeviceVolume,
+    level: Any,
+    labels: LabelMap | None,
+    label: int | str | None,
+    fitted: bool,
+    progress: Progress,
 ) -> PointCloud:
-    if labels is None:
-        from clrecon.operators.surface.extract import SurfaceExtractor  # which voxels need not wait for
-
-        with SurfaceExtractor(resident) as extractor:
-            return extractor.extract_vertices(level, progress=progress)
+    from clrecon.operators.surface.extract import SurfaceExtractor  # which voxels need not wait for
     from clrecon.operators.surface.labels import extract_labels
 
-    if np.ndim(level) != 0:
+    if labels is not None and np.ndim(level) != 0:
         raise UsageError("the surface of a label has one iso value, no band: ask for voxels, or leave the labels out")
-    numbers = None if label is None else [label]
-    meshes = extract_labels(resident, labels, level, label=numbers, progress=progress)
-    report: Mapping[str, Any] = next(iter(meshes.values())).report
+    if labels is not None:
+        numbers = None if label is None else [label]
+        meshes = extract_labels(resident, labels, level, label=numbers, progress=progress)
+    else:
+        with SurfaceExtractor(resident) as extractor:
+            if not fitted:
+                return extractor.extract_vertices(level, progress=progress)
+            meshes = {0: extractor.extract(level, progress=progress)}
+    if fitted:
+        from clrecon.operators.surface.cortex_mesh import fit_meshes
+
+        meshes = dict(zip(meshes, fit_meshes([*meshes.values()], resident, progress=progress), strict=True))
+    facts: dict[str, Any] = dict(next(iter(meshes.values())).report)
+    of_label = None
+    if labels is not None:
+        facts = {name: value for name, value in facts.items() if label is not None or not name.startswith("label")}
+        facts["label"] = facts.get("label")
+        of_label = np.concatenate([np.full(mesh.vertex_count, number, np.int32) for number, mesh in meshes.items()])
     points = np.concatenate([mesh.vertices for mesh in meshes.values()])
     normals = np.concatenate([mesh.normals for mesh in meshes.values() if mesh.normals is not None])
-    of_label = np.concatenate([np.full(mesh.vertex_count, number, np.int32) for number, mesh in meshes.items()])
-    hu = np.full(len(points), report["iso_value_hu"], np.float32)
-    facts = dict(report) if label is not None else {k: v for k, v in report.items() if not k.startswith("label")}
-    return PointCloud.of_known(
-        points, normals, hu, of_label, None, {**facts, "label": report["label"] if label else None}
-    )
+    hu = None if fitted else np.full(len(points), facts["iso_value_hu"], np.float32)
+    return PointCloud.of_known(points, normals, hu, of_label, None, facts)

@@ -209,7 +209,7 @@ def test_a_rule_may_take_what_it_likes(scan: Path, tmp_path: Path, cloud_command
 
 
 WRONG = (
-    (["--points", "vertices"], "points are one of surface, shell, voxels"),
+    (["--points", "vertices"], "points are one of surface, cortex, shell, voxels"),
     (["--hu", "bone"], "no iso value N and no band LO,HI"),
     (["--hu", "1,2,3"], "no iso value N and no band LO,HI"),
     (["--hu", "300,200"], "holds nothing: give its lower end first"),

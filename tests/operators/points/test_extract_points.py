@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
+from surface_volumes import MIDDLE, hollow_ball
 from variants import VOXEL_TYPES
 
-from clrecon import LabelMap, Volume, extract_isosurface, extract_labels
+from clrecon import LabelMap, Volume, extract_isosurface, extract_labels, fit_cortex
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.operators.points.point_extraction import Selection, VoxelEmission, _join, extract_points
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -244,7 +245,7 @@ def test_nothing_found_is_an_error(device, choice, words):
     ("choice", "words"),
     [
         ({"iso_value": 1, "hu": (1, 2)}, "give an iso value or hu=.*, not both"),
-        ({"kind": "dots", "hu": (1, 2)}, "no points of the kind 'dots': use one of surface, shell, voxels"),
+        ({"kind": "dots", "hu": (1, 2)}, "no points of the kind 'dots': use one of surface, cortex, shell, voxels"),
         ({"hu": (5,)}, "a band is two numbers in HU"),
         ({"hu": (5, 1)}, "a band is two numbers in HU, the lower one first"),
         ({"hu": (float("nan"), 1)}, "a band is two numbers in HU"),
@@ -262,3 +263,32 @@ def test_the_twin_of_shells_on_a_cube():
     cube[1:4, 1:4, 1:4] = True
     assert mark_shell(cube).sum() == 26 and not mark_shell(cube)[2, 2, 2]
     assert mark_shell(np.ones((3, 4, 5), bool)).sum() == 60 - 1 * 2 * 3
+
+
+def test_points_of_the_cortex_lie_on_the_bone(device):
+    volume = hollow_ball(thickness=3.0)
+    level, cloud = (extract_points(volume, 200.0, kind=kind, device=device) for kind in ("surface", "cortex"))
+    outer = np.linalg.norm(level.points - MIDDLE, axis=1) > 12.5
+    off, away = (np.linalg.norm(each.points[outer] - MIDDLE, axis=1) - 13.0 for each in (level, cloud))
+    assert off.mean() > 0.4 and np.abs(away).mean() < 0.1 and abs(away.mean()) < 0.06
+    outward = np.einsum("na,na->n", cloud.normals[outer], cloud.points[outer] - MIDDLE)
+    assert (outward > 0.0).all() and cloud.hu is None and cloud.labels is None
+    assert cloud.report["kind"] == "cortex" and cloud.report["cortex"]["fitted"] > 0.9 * outer.sum()
+
+
+def test_points_of_the_cortex_of_labels_are_those_of_their_meshes(device):
+    volume = hollow_ball(thickness=3.0)
+    numbers = np.ones(volume.voxels.shape, np.uint8)
+    numbers[:18] = 2
+    labels = LabelMap(numbers, volume.affine)
+    cloud = extract_points(volume, 200.0, kind="cortex", labels=labels, device=device)
+    meshes = extract_labels(volume, labels, 200.0, device=device)
+    assert np.array_equal(np.bincount(cloud.labels)[1:], [meshes[1].vertex_count, meshes[2].vertex_count])
+    known = np.concatenate([fit_cortex(mesh, volume, device=device).vertices for mesh in meshes.values()])
+    assert np.percentile(np.linalg.norm(cloud.points - known, axis=1), 95) < 0.05  # constants of each
+
+
+@pytest.mark.parametrize("what", [{}, {"iso_value": "auto"}, {"hu": (200, 900)}])
+def test_the_cortex_needs_a_low_level(device, what):
+    with pytest.raises(UsageError, match="such as 200"):
+        extract_points(hollow_ball(), kind="cortex", device=device, **what)

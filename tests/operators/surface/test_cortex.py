@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.special import ndtr
+from surface_volumes import MIDDLE, hollow_ball
 
 from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume
@@ -17,18 +18,6 @@ from clrecon.operators.surface.cortex_mesh import FITTED, METAL, NO_ROOM, NOT_BO
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.proof.checking import OBLIQUE, stack
 from clrecon.proof.surface.surface_checks import CORTEX_CHECKS
-
-MIDDLE = np.array([19.5, 19.0, 18.0])
-
-
-def hollow_ball(radius=13.0, thickness=2.0, blur=0.7, cortex=1000.0, inner=200.0, spacing=(1.0, 1.0, 1.0)) -> Volume:
-    """A blurred shell of bone in tissue of 50 HU, its middle at `MIDDLE` mm."""
-    shape = [round(39.0 / step) + 1 for step in spacing]
-    i, j, k = (np.arange(n) * step for n, step in zip(shape, spacing, strict=True))
-    far = np.sqrt((i - MIDDLE[0]) ** 2 + ((j - MIDDLE[1]) ** 2)[:, None] + ((k - MIDDLE[2]) ** 2)[:, None, None])
-    outer, hollow = ndtr((far - radius) / blur), ndtr((radius - thickness - far) / blur)
-    values = 50.0 * outer + inner * hollow + cortex * (1.0 - outer - hollow)
-    return Volume(np.rint(values).astype(np.int16), np.diag([*spacing, 1.0]))
 
 
 def fit_surface(volume: Volume, device, level=200.0, constants=None):
