@@ -14,7 +14,8 @@ from clrecon.system.text import format_volume
 
 _EPILOG = """\
 parts, each a mesh of its own:
-  solid       all bone: the label, or what is at --hu and above in it, closed and filled, without the canal
+  solid       all bone: the label, or what is at --hu and above in it, or within the surface fitted to the cortex
+              (--surface cortex); closed and filled, without the canal
   dense       what of it lies in the band --dense: no measure of cortex, which looks thicker than it is
   trabecular  the rest of the solid bone
   canal       the hole of the arch, at the height of the pedicles; left out, with a warning, where no arch is closed
@@ -24,6 +25,7 @@ The files are named by their parts: inside_solid.stl, inside_dense.stl; of sever
 examples:
   clrecon inside CT_FOLDER --labels spine.nii.gz --label L3 -o inside.stl --picture inside.png
   clrecon inside CT_FOLDER --labels spine.nii.gz --label L3 --label L4 --hu 300 -o spine.ply --report inside.json
+  clrecon inside CT_FOLDER --labels spine.nii.gz --label L3 --surface cortex -o inside.stl
   clrecon inside CT_FOLDER --labels spine.nii.gz --label T12 --dense 350:900 -o t12.glb"""
 
 
@@ -99,6 +101,9 @@ def _describe_vertebra(vertebra: dict[str, Any]) -> list[str]:
     volumes, (low, high) = vertebra["volumes_ml"], vertebra["dense_hu"]
     level = vertebra["iso_value_hu"]
     of = "label" if level is None else f"{level:g} HU"
+    if (cortex := vertebra["cortex"]) is not None:
+        error, told = cortex["error_mm"]["p50"], 100.0 * cortex["fitted"] / cortex["vertices"]
+        of = f"fitted to the bone from {of}, {told:.0f} % of it, error {error:.2f} mm"
     if low is None:
         band = f"up to {high:g} HU"
     else:

@@ -194,8 +194,8 @@ def _look_inside(
 
     given = {name: getattr(settings, name) for name in ("dense", "close_mm") if getattr(settings, name) is not None}
     return vertebra_inside(
-        volume, labels, number, settings.iso_value, grow_mm=settings.grow_mm, device=device, memory=settings.memory,
-        **given,
+        volume, labels, number, settings.solid_from, surface=settings.surface, grow_mm=settings.grow_mm, device=device,
+        memory=settings.memory, **given,
     )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from clrecon.jobs.options import (
 )
 from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset
 from clrecon.reading import Selection
-from clrecon.system.arguments import Space, name_parameter
+from clrecon.system.arguments import Space, SurfaceKind, name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.options import numbers_reader, option
 
@@ -186,7 +186,13 @@ class InsideSettings(ScanSettings, DeviceSettings):
         words=("anterior", "posterior", "left", "right", "superior", "inferior"),
     )
     iso_value: float | None = _parts_option(
-        "--hu N", "level of the solid bone, within one voxel of the label (default: the label's own voxels)", first=True
+        "--hu N",
+        "level of the solid bone, within one voxel of the label (default: the label's own voxels; of the cortex"
+        f" {FITTED_FROM_HU:g})",
+        first=True,
+    )
+    surface: SurfaceKind = surface_option(
+        "the solid bone ends at the label or the level (default)", group="parts", default="hu", first=True
     )
     dense: Sequence[float | None] | None = _parts_option(
         "--dense A[:B]", "HU of dense bone, from A on or from A to B (default: 450)", parse=_parse_band
@@ -202,11 +208,17 @@ class InsideSettings(ScanSettings, DeviceSettings):
         if not self.label:
             raise UsageError(f"choose the vertebrae by their labels: {name_parameter('label', 'L3')}")
         super().__post_init__()
-        if self.grow_mm is not None and self.iso_value is None:
+        check_surface(self.surface)
+        if self.grow_mm is not None and self.solid_from is None:
             raise UsageError(
                 f"the labels' own voxels do not grow: leave {name_parameter('grow_mm')} out, or give an iso value"
                 f" ({name_parameter('iso_value', 'N')})"
             )
+
+    @property
+    def solid_from(self) -> float | None:
+        """Level of the solid bone, HU; None: the label's own voxels."""
+        return FITTED_FROM_HU if self.iso_value is None and self.surface == "cortex" else self.iso_value
 
 
 def _parse_name(text: str) -> tuple[tuple[float, ...], str]:

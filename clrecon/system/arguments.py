@@ -62,6 +62,7 @@ Topology = Literal["separated", "trilinear"]
 VertexRule = Literal["linear", "golden", "golden-search"]
 MethodName = Literal["t-mc", "i-mc", "g-mc", "s-mc", "t-mc-soup", "skimage"]
 FilterName = Literal["median", "gaussian", "curvature-flow", "non-local-means"]
+SurfaceKind = Literal["hu", "cortex"]
 PointKind = Literal["surface", "cortex", "shell", "voxels"]
 ProjectionKind = Literal["mip", "minip", "mean", "drr"]
 Combination = Literal["mean", "max", "min"]
@@ -74,7 +75,7 @@ ViewName = Literal["anterior", "posterior", "left", "right", "superior", "inferi
 Features = Literal["paper", "variation"]
 """Words of which only some are possible; the functions refuse others."""
 _CHOICES = "Space Topology VertexRule MethodName FilterName PointKind Combination CurvedKind Features Literal".split()
-_CHOICES += ["ModeName", "PresetName", "WindowName", "ViewName", "DirectionName"]
+_CHOICES += ["SurfaceKind", "ModeName", "PresetName", "WindowName", "ViewName", "DirectionName"]
 
 _CLASSES = (
     "Volume", "DeviceVolume", "Mesh", "LabelMap", "PointCloud", "Mask", "Camera", "GridCells", "GhostSlices",

@@ -11,8 +11,8 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 92_182,
-    "modules": 418,
+    "lines": 92_311,
+    "modules": 419,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
     "options_in_several_files": 16,

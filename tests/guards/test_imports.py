@@ -49,7 +49,7 @@ def test_help_loads_nothing_heavy(tmp_path: Path) -> None:
 
 
 def test_help_of_clouds_names_the_kinds_of_points_without_numpy(tmp_path: Path) -> None:
-    code = HELP.replace('"--help"', '"cloud", "--help"').replace('"mesh"', '"surface|shell|voxels"')
+    code = HELP.replace('"--help"', '"cloud", "--help"').replace('"mesh"', '"surface|cortex|shell|voxels"')
     assert loaded_after(code, tmp_path) & HEAVY == set()
 
 

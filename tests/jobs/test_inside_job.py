@@ -78,6 +78,18 @@ def test_several_vertebrae_have_names_of_their_own(
         assert [line for line in warnings if line.startswith(f"{name}: ") and "next voxel outside" in line]
 
 
+def test_solid_bone_ends_at_the_surface_fitted_to_it(inside: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    found = {}
+    for options in ((), ("--hu", "200"), ("--surface", "cortex")):
+        assert inside("--label", "L1", *options, "--json", output=f"{len(options)}{options[-1:]}.stl") == 0
+        (found[options],) = json.loads(capsys.readouterr().out)["vertebrae"]
+    true, level, fitted = (one["volumes_ml"]["solid"] for one in found.values())
+    assert level > 1.1 * true and fitted == pytest.approx(true, rel=0.03)
+    report = found["--surface", "cortex"]
+    assert (report["solid_of"], report["iso_value_hu"]) == ("cortex", 200.0) and report["cortex"]["moved"]
+    assert "200 HU, " in _describe_vertebra(report)[1] and "error 0." in _describe_vertebra(report)[1]
+
+
 def test_what_is_there_stays_with_no_clobber(inside: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "in_L2_canal.stl").write_text("kept")
     assert inside("--label", "L1", "--label", "L2", "--no-clobber") == 6
@@ -173,6 +185,7 @@ def test_small_volumes_are_said_in_cubic_millimetres() -> None:
         "volumes_ml": {"solid": 0.0123, "dense": 0.004, "trabecular": None, "canal": 0.1},
         "dense_hu": (300.0, None),
         "iso_value_hu": None,
+        "cortex": None,
         "canal_height_mm": 2.0,
         "dense_thickness": {"limit_mm": 0.1, "median_mm": None},
     }

@@ -19,9 +19,10 @@ from clrecon.mesh import Mesh
 from clrecon.opencl import Device
 from clrecon.operators.masks.mask import Mask
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.surface.cortex_mesh import CortexReport
 from clrecon.operators.surface.label_masks import extract_label_masks
 from clrecon.operators.vertebrae.solid import CLOSE_MM, LabelCrop, crop_label, label_margin, make_solid
-from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.arguments import SurfaceKind, explains_arguments, name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.records import Record
 from clrecon.system.text import format_volume
@@ -121,6 +122,8 @@ class VertebraInside:
     thickness : ShellThickness
         Of the dense bone.
     canal_found : Canal or None
+    cortex : CortexReport or None
+        What the fit of the solid bone's surface found, where it was asked for.
     warnings : list of str
     """
 
@@ -136,6 +139,7 @@ class VertebraInside:
     inside_share: float
     thickness: ShellThickness
     canal_found: Canal | None
+    cortex: CortexReport | None
     warnings: list[str]
 
     def __reduce__(self) -> NoReturn:
@@ -206,7 +210,7 @@ class VertebraInside:
             "label": self.label,
             "name": self.name,
             "label_inside_share": self.inside_share,
-            "solid_of": "label" if self.iso_value is None else "iso value",
+            "solid_of": "label" if self.iso_value is None else "cortex" if self.cortex else "iso value",
             "iso_value_hu": self.iso_value,
             "dense_hu": [None if math.isinf(end) else end for end in self.dense_hu],
             "spacing_mm": list(self.volume.spacing),
@@ -214,6 +218,7 @@ class VertebraInside:
             "dense_thickness": self.thickness.as_dict(),
             "canal_height_mm": None if canal is None else canal.height_mm,
             "canal_closed_slices": None if canal is None else canal.closed_slices,
+            "cortex": self.cortex and self.cortex.as_dict(),
             "warnings": list(self.warnings),
         }
 
@@ -235,6 +240,7 @@ def vertebra_inside(
     label: int | str,
     iso_value: float | None = None,
     *,
+    surface: SurfaceKind = "hu",
     dense: Sequence[float | None] = DENSE_HU,
     close_mm: float = CLOSE_MM,
     grow_mm: float | None = None,
@@ -256,6 +262,8 @@ def vertebra_inside(
     iso_value : float, optional
         HU; the solid bone is what is at this level and above within the label, closed and filled.  None: the label's
         own voxels.
+    surface : {"hu", "cortex"}
+        Where the solid bone ends, as `vertebra_solid` takes it.
     dense : (low, high)
         Band of HU, both ends included; None leaves an end open.
     close_mm : float
@@ -286,7 +294,7 @@ def vertebra_inside(
     band = _checked_dense(dense)
     crop = crop_label(volume, labels, label, label_margin(volume, close_mm, grow_mm))
     with DeviceVolume(crop.volume, device=device, memory=memory) as resident:
-        solid, others = make_solid(resident, crop, iso_value, close_mm, grow_mm)
+        solid, others, cortex = make_solid(resident, crop, iso_value, surface, close_mm, grow_mm)
         in_band = _mark_band(resident, band, solid, crop)
         dense_bone = in_band & solid
         if not dense_bone.count:
@@ -305,7 +313,7 @@ def vertebra_inside(
         warnings += _warn_of_missed(in_band, dense_bone, solid, others, band)
     return VertebraInside(
         crop.number, crop.name, crop.volume, solid, dense_bone, trabecular, canal, band, iso_value,
-        crop.inside_share, measure_thickness(dense_bone), found, warnings,
+        crop.inside_share, measure_thickness(dense_bone), found, cortex, warnings,
     )  # fmt: skip
 
 

@@ -12,12 +12,14 @@ from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.labels import LabelMap
 from clrecon.labels.label_bodies import Growth, find_boxes
 from clrecon.labels.resample import check_together, warn_of_place
+from clrecon.mesh.scanlines import fill_surface
 from clrecon.opencl import Device, download
 from clrecon.operators.masks.mask import Mask
 from clrecon.operators.masks.regions import checked_mm
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.surface.cortex_mesh import CortexReport, fit_labels
 from clrecon.operators.surface.labels import LabelExtraction
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import SurfaceKind, explains_arguments, name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.text import format_hu
 
@@ -124,6 +126,7 @@ def vertebra_solid(
     label: int | str,
     iso_value: float | None = None,
     *,
+    surface: SurfaceKind = "hu",
     close_mm: float = CLOSE_MM,
     grow_mm: float | None = None,
     device: Device | str | int | None = None,
@@ -144,6 +147,9 @@ def vertebra_solid(
         Number or name, as `LabelMap.find` takes it.
     iso_value : float, optional
         HU; None: the label's own voxels, whatever their HU.
+    surface : {"hu", "cortex"}
+        "cortex": the surface at the iso value, a low one such as 200, is moved onto the bone as `fit_cortex` does; its
+        voxels are those whose centres lie within.
     close_mm : float
         Radius of the ball, mm.  Below every step of the voxels it closes nothing.
     grow_mm : float, optional
@@ -173,7 +179,7 @@ def vertebra_solid(
     """
     crop = crop_label(volume, labels, label, label_margin(volume, close_mm, grow_mm))
     with DeviceVolume(crop.volume, device=device, memory=memory) as resident:
-        return make_solid(resident, crop, iso_value, close_mm, grow_mm)[0]
+        return make_solid(resident, crop, iso_value, surface, close_mm, grow_mm)[0]
 
 
 def label_margin(volume: Volume, close_mm: float, grow_mm: float | None) -> float:
@@ -184,14 +190,32 @@ def label_margin(volume: Volume, close_mm: float, grow_mm: float | None) -> floa
 
 
 def make_solid(
-    resident: DeviceVolume, crop: LabelCrop, iso_value: float | None, close_mm: float, grow_mm: float | None
-) -> tuple[Mask, Mask]:
-    """Return the solid bone of a cropped label, and the voxels of all other labels."""
+    resident: DeviceVolume,
+    crop: LabelCrop,
+    iso_value: float | None,
+    surface: SurfaceKind,
+    close_mm: float,
+    grow_mm: float | None,
+) -> tuple[Mask, Mask, CortexReport | None]:
+    """Return the solid bone of a cropped label, the voxels of all other labels, and what was found of the cortex."""
+    if surface not in ("hu", "cortex"):
+        raise UsageError(f"there is no surface {surface!r}: it is hu or cortex")
+    if surface == "cortex" and iso_value is None:
+        raise UsageError(
+            f"the cortex is looked for from a low level on, which shows its walls: give it"
+            f" ({name_parameter('iso_value', 200)})"
+        )
     if iso_value is None and grow_mm is not None:
         raise UsageError("the label's own voxels do not grow: leave the growth out, or give an iso value")
     numbers = resident.bring(crop.labels).voxels
     others = Mask.from_array(resident, (numbers != 0) & (numbers != crop.number))
-    own = numbers == crop.number if iso_value is None else _inside(resident, crop, iso_value, grow_mm)
+    cortex, own = None, numbers == crop.number
+    if iso_value is not None:
+        own = _inside(resident, crop, iso_value, grow_mm)
+    if iso_value is not None and surface == "cortex" and own.any():
+        mesh = fit_labels(resident, crop.labels, iso_value, crop.number, grow_mm=grow_mm)[crop.number]
+        places = crop.volume.lps_to_ijk(mesh.vertices)[:, ::-1]
+        cortex, own = mesh.report["cortex"], fill_surface(places, mesh.triangles, own.shape)
     if not own.any():
         raise _refuse_empty(crop, numbers == crop.number, iso_value)
     bone = Mask.from_array(resident, own)
@@ -199,8 +223,9 @@ def make_solid(
     closed = bone.dilate(close_mm).erode(close_mm) | bone
     solid = (closed - others).fill_holes() - others
     what = "label" if iso_value is None else f"{iso_value:g} HU in label"
+    what = f"the cortex from {what}" if cortex else what
     solid.name = f"solid bone of {what} {crop.name}, closed by {close_mm:g} mm"
-    return solid, others
+    return solid, others, cortex
 
 
 def _refuse_empty(crop: LabelCrop, own: NDArray[np.bool_], iso_value: float | None) -> NoSurfaceError:

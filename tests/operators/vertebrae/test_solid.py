@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from surface_volumes import MIDDLE, hollow_ball
 from variants import daily_rows
 
 import clrecon
@@ -62,19 +63,33 @@ def test_the_label_alone_is_closed_and_filled_and_its_canal_stays_open(device):
             (226, (0.10, 0.16), 0.93),
             (300, (0.06, 0.12), 0.95),
             (400, (0.0, 0.05), 0.975),
+            ("cortex", (-0.02, 0.02), 0.985),
         ],
     ),
 )
 def test_volumes_of_a_phantom_are_those_of_its_truth_and_what_the_level_adds(spine, device, level, more_ml, dice):
     # half of 850 HU of the cortex and 50 HU around is 450 HU: lower levels lie farther out
     volume, labels, ml = spine
-    solid = vertebra_solid(volume, labels, "L1", level, device=device)
+    of = {"surface": level, "iso_value": 200} if level == "cortex" else {"iso_value": level}
+    solid = vertebra_solid(volume, labels, "L1", **of, device=device)
     truth = clrecon.Mask.from_labels(solid.scan, labels, ["L1"], device=device)
     assert truth.count == labels.counts[20]  # nothing of the label is cut off
     more = solid.count / truth.count - 1.0
     assert more_ml[0] <= more <= more_ml[1]
     assert 2 * (solid & truth).count / (solid.count + truth.count) >= dice
     assert not (solid & clrecon.Mask.from_labels(solid.scan, labels, ["L2"], device=device)).count
+
+
+def test_the_solid_bone_of_the_cortex_is_what_its_surface_encloses(device):
+    volume = hollow_ball(thickness=3.0)
+    k, j, i = np.indices(volume.voxels.shape)
+    far = np.sqrt((i - MIDDLE[0]) ** 2 + (j - MIDDLE[1]) ** 2 + (k - MIDDLE[2]) ** 2)
+    labels = LabelMap((far < 12.5).astype(np.uint8), volume.affine, {1: "ball"})  # ends before the bone does
+    true = 4.0 / 3.0 * np.pi * 13.0**3
+    level, cortex = (vertebra_solid(volume, labels, 1, 200, surface=kind, device=device) for kind in ("hu", "cortex"))
+    assert level.count > 1.09 * true and cortex.count == pytest.approx(true, rel=0.015)
+    with pytest.raises(UsageError, match="low level"):
+        vertebra_solid(volume, labels, 1, surface="cortex", device=device)
 
 
 def test_the_order_of_axes_and_the_grid_of_the_map_do_not_matter(spine, device):
