@@ -21,6 +21,7 @@ operation. Exit code 8 where a side has no corridor, with the reason.
 examples:
   clrecon corridor CT_FOLDER --labels spine.seg.nrrd --label L3
   clrecon corridor CT_FOLDER --labels spine.nii.gz --label L1 --label L2 --margin 1.5 --picture l.png --report l.json
+  clrecon corridor CT_FOLDER --labels spine.nii.gz --label L3 --surface cortex --report l3.json
   clrecon corridor CT_FOLDER --labels spine.nii.gz --label L3 --screw 15,-123,-448,7,-166,-446,4.5
   clrecon corridor CT_FOLDER --labels spine.nii.gz --label L3 --screws screws.csv -o l3.glb"""
 
@@ -46,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_fields(output, CorridorSettings, "space")
     common.add_no_clobber(output)
     common.add_reading(parser)
-    common.add_device(parser.add_argument_group("device, for the mesh of the vertebra alone"))
+    common.add_device(parser.add_argument_group("device, for --surface cortex and the mesh of the vertebra alone"))
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -74,7 +75,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
 def describe_report(report: dict[str, Any]) -> list[str]:
     lines = [
         f"input    {describe_volume(report['volume'])}",
-        f"surface  {report['iso_value_hu']:g} HU, {report['iso_value_reason']}",
+        f"surface  {'fitted to the bone from ' if report['surface'] == 'cortex' else ''}{report['iso_value_hu']:g} HU,"
+        f" {report['iso_value_reason']}",
     ]
     for each in report["vertebrae"]:
         for side in each["corridors"]:
@@ -117,7 +119,9 @@ def _describe_side(name: str, side: dict[str, Any], report: dict[str, Any]) -> l
         return [f"{head}no corridor, {side['refused']}"]
     bias, low_high = side["level_bias_mm"], side["sagittal_angle_range_deg"]
     margins = ", ".join(f"{place} {_number(value)}" for place, value in side["margins_mm"].items())
-    if bias is None:
+    if report["surface"] == "cortex":
+        of_level = "none: the surface is fitted"
+    elif bias is None:
         of_level = "not measured: too few walls beside the line stand out"
     else:
         way = "outside" if bias["median"] >= 0.0 else "inside"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import frame_from_lps
 from clrecon.jobs.corridor_results import (
     KNOWN_BIAS,
+    KNOWN_CORTEX_BIAS,
     NOT_FOR_PLANNING,
     CorridorReport,
     cylinder_meshes,
@@ -23,11 +25,12 @@ from clrecon.jobs.corridor_results import (
 )
 from clrecon.jobs.outputs import MeshFiles, check_files, name_outputs
 from clrecon.jobs.run import Run
-from clrecon.jobs.settings import CorridorSettings
+from clrecon.jobs.settings import FITTED_FROM_HU, CorridorSettings
 from clrecon.labels.label_map import file_suffixes
 from clrecon.labels.resample import resample_labels
 from clrecon.spine.corridors import VertebraCorridors, measure_corridors
 from clrecon.spine.measures import SCALE, Screw, ScrewGrade, grade_screw
+from clrecon.spine.solid_bone import FittedLattice, Lattice
 from clrecon.system.paths import read_regular
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
@@ -148,17 +151,20 @@ def make_corridors(
         level, choice = _choose_level(volume, settings, run.progress)
         run.lap("choose")
         taken = resample_labels(labels, volume)
+        fitted = _fit_vertebrae(run, volume, labels, numbers, level) if settings.surface == "cortex" else {}
+        run.lap("cortex")
         found = []
         for done, number in enumerate(numbers):
             run.progress("corridors", done, len(numbers))
             _check_inside(taken.inside[number], names[number])
-            found.append(measure_corridors(volume, taken.voxels, number, level, names[number]))
+            of_fit = partial(lay_on_lattice, fitted[number]) if fitted else None
+            found.append(measure_corridors(volume, taken.voxels, number, level, names[number], of_fit))
         graded = _grade_screws(found, labels, numbers, settings.screws)
         run.lap("corridors")
         outputs = _draw_sheets(run, volume, found, graded, level, files)
         if files.output is not None:
             outputs += _write_meshes(
-                run, volume, labels, dict(zip(numbers, found, strict=True)), graded, level, files.output
+                run, volume, labels, dict(zip(numbers, found, strict=True)), graded, level, files.output, fitted
             )
         run.lap("write")
         vertebrae = [
@@ -170,7 +176,7 @@ def make_corridors(
             [*taken.warnings, *_warn_of_corridors(found)],
             volume,
             notice=NOT_FOR_PLANNING,
-            level_bias=KNOWN_BIAS,
+            level_bias=KNOWN_CORTEX_BIAS if fitted else KNOWN_BIAS,
             iso_value_hu=level,
             iso_value_reason="as given" if choice is None else choice.reason,
             iso_value_choice=None if choice is None else choice.measurements(),
@@ -178,6 +184,7 @@ def make_corridors(
             margin_mm=float(settings.margin),
             grade_scale=SCALE if any(graded) else None,
             vertebrae=vertebrae,
+            surface=settings.surface,
             outputs=outputs,
             affine_ijk_to_lps_mm=volume.affine.tolist(),
         )
@@ -202,12 +209,45 @@ def _name_files(files: MeshFiles, names: Sequence[str]) -> None:
 
 
 def _choose_level(volume: Volume, settings: CorridorSettings, progress: Progress) -> tuple[float, IsoChoice | None]:
-    if settings.iso_value is not None:
-        return float(settings.iso_value), None
+    if settings.iso_value is not None or settings.surface == "cortex":
+        return float(FITTED_FROM_HU if settings.iso_value is None else settings.iso_value), None
     from clrecon.anatomy.iso_choice import choose_iso_value
 
     choice = choose_iso_value(volume, progress=progress)
     return choice.iso_value, choice
+
+
+def _fit_vertebrae(run: Run, volume: Volume, labels: LabelMap, numbers: Sequence[int], level: float) -> dict[int, Mesh]:
+    from clrecon.operators.resident.device_volume import DeviceVolume
+    from clrecon.operators.surface.cortex_mesh import fit_labels
+
+    settings: CorridorSettings = run.settings
+    with DeviceVolume(volume, device=settings.device, memory=settings.memory) as resident:
+        return fit_labels(resident, labels, level, numbers, progress=run.progress)
+
+
+def lay_on_lattice(mesh: Mesh, lattice: Lattice) -> FittedLattice:
+    """Return what lies within a fitted surface, and where it crosses the steps of a lattice along each axis."""
+    from clrecon.mesh.scanlines import cross_lines, fill_lines
+
+    known = np.isfinite(mesh.values["thickness_mm"])[mesh.triangles].all(axis=1)
+    places = lattice.indices(mesh.vertices.astype(np.float64)).T
+    solid, shares, placed = np.zeros(lattice.shape, bool), [], []
+    for axis in range(3):
+        order = [other for other in range(3) if other != axis] + [axis]
+        shape = [lattice.shape[each] for each in order]
+        lines, along, rows = cross_lines(np.ascontiguousarray(places[:, order]), mesh.triangles, shape)
+        if axis == 2:
+            solid = fill_lines(lines, along, shape)
+        step = np.floor(along).astype(np.int64)
+        within = (step >= 0) & (step < shape[2] - 1)
+        steps = (*shape[:2], shape[2] - 1)
+        share, is_known = np.full(steps, 0.5, np.float32), np.zeros(steps, bool)
+        at = (lines[within] // shape[1], lines[within] % shape[1], step[within])
+        share[at], is_known[at] = (along - step)[within], known[rows[within]]
+        shares.append(np.moveaxis(share, 2, axis))
+        placed.append(np.moveaxis(is_known, 2, axis))
+    return FittedLattice(solid, shares, placed)
 
 
 def _check_inside(share: float, name: str) -> None:
@@ -253,7 +293,8 @@ def _draw_sheets(
             + (f", {grade.breach_mm:.1f} mm {grade.direction}" if grade.direction else "")
             for screw, grade in own[:6]
         ]
-        footer += [f"surface at {level:g} HU; green: corridor, yellow: largest screw, red: given screw"]
+        surface = "fitted to the bone from" if run.settings.surface == "cortex" else "at"
+        footer += [f"surface {surface} {level:g} HU; green: corridor, yellow: largest screw, red: given screw"]
         footer += [NOT_FOR_PLANNING]
         picture = draw_corridors(volume, each, [screw for screw, _ in own], run.settings.margin, footer)
         outputs.append({"kind": "picture", "name": each.name, "bytes": run.write_picture(path, picture).size})
@@ -268,11 +309,12 @@ def _write_meshes(
     graded: Sequence[list[tuple[Screw, ScrewGrade]]],
     level: float,
     output: str | Path,
+    fitted: Mapping[int, Mesh],
 ) -> list[dict[str, Any]]:
     """Write vertebrae, filled as the mesh job does with solid labels, and cylinders; return their entries."""
     from clrecon.operators.surface.labels import extract_labels
 
-    vertebrae = extract_labels(
+    vertebrae = fitted or extract_labels(
         volume, labels, level, device=run.settings.device, label=list(found), solid=True,
         memory=run.settings.memory, progress=run.progress,
     )  # fmt: skip

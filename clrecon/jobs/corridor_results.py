@@ -18,14 +18,18 @@ from clrecon.spine.measures import SCALE, Bias, Screw, ScrewGrade
 from clrecon.spine.solid_bone import sample_volume
 from clrecon.system.light_dataclass import dataclass
 
-NOT_FOR_PLANNING = "not for planning an operation: a measurement on one surface at one level, checked on phantoms alone"
+NOT_FOR_PLANNING = "not for planning an operation: a measurement on one surface, checked on phantoms alone"
 
 KNOWN_BIAS = (
     "on phantoms with slices up to 2 mm the radius along a line is 0.5 mm too small to 0.2 too large at the half level"
     " and 0.4 to 0.7 mm too large at 226 HU; with 2 x 2 x 3 mm 0.3 mm too small to 0.6 mm too large, and 0.5 to 1.2 mm"
     " too large; with 3 mm up to 1.4 and 1.9 mm too large"
 )
-"""What is known of the surface at a level; docs/corridor.md has the table."""
+KNOWN_CORTEX_BIAS = (
+    "on phantoms the radius along a line is at most 0.1 mm too large with slices of 1.25 mm, 0.3 with 1.4 x 1.4 x 2 mm"
+    " and 0.5 with 2 x 2 x 3 mm"
+)
+"""What is known of the surface at a level, and of the one fitted to the bone; docs/corridor.md has the table."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,6 +38,7 @@ class CorridorReport(ScanReport):
 
     notice: str
     level_bias: str
+    surface: str
     iso_value_hu: float
     iso_value_reason: str
     iso_value_choice: Mapping[str, Any] | None

@@ -293,10 +293,12 @@ class CorridorSettings(ScanSettings, DeviceSettings):
     )
     iso_value: float | None = option(
         "--hu auto|N",
-        "HU at which the bone's surface lies (default: auto, half way between bone and the tissue beside it)",
+        "HU at which the bone's surface lies (default: auto, half way between bone and the tissue beside it; of the"
+        f" cortex {FITTED_FROM_HU:g})",
         parse=_parse_level,
         first=True,
     )
+    surface: SurfaceKind = surface_option("the surface lies at the level (default)", default="hu", first=True)
     margin: float = option(
         "--margin MM",
         "distance that a screw of the largest diameter keeps from the surface (default: 1)",
@@ -311,6 +313,7 @@ class CorridorSettings(ScanSettings, DeviceSettings):
             raise UsageError(f"name the vertebrae: {name_parameter('label', 'L3')}, once for each")
         if not (math.isfinite(self.margin) and 0.0 <= self.margin <= LARGEST_MARGIN_MM):
             raise UsageError(f"the margin is a length from 0 to {LARGEST_MARGIN_MM:g} mm, not {self.margin:g}")
+        check_surface(self.surface)
         check_level(self.iso_value)
         check_space(self.space)
         super().__post_init__()

@@ -23,7 +23,7 @@ from clrecon.labels import LabelMap
 from clrecon.labels.resample import resample_labels
 from clrecon.spine.frame import VertebraFrame, find_frame
 from clrecon.spine.measures import Bias, canal_wall, find_exit, line_angles, margins, measure_bias, segment_offsets
-from clrecon.spine.solid_bone import SolidBone, fill_vertebra
+from clrecon.spine.solid_bone import Fitted, SolidBone, fill_vertebra
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 
@@ -328,7 +328,7 @@ class Corridor:
     medial_lps_deg, sagittal_lps_deg: The same in the patient's frame.
     medial_range_deg, sagittal_range_deg: Angles, in the vertebra's frame, of lines whose radius is at most 0.1 mm less.
     margins, canal: Least distances from the surface by quarter, and from the wall of the vertebral canal, mm.
-    bias: How far the level lies from the half maximum of this pedicle's wall.
+    bias: How far the level lies from the half maximum of this pedicle's wall; None for a fitted surface.
     by_hu_share: Share of the walls' points that HU place and not the label.
     width_voxels: Width of the corridor in voxels, across its nearest wall.
     tried: Lines whose distance was taken.
@@ -408,9 +408,11 @@ def find_corridors(
     return measure_corridors(volume, taken.voxels, number, checked_iso_value(level), labels.name(number))
 
 
-def measure_corridors(volume: Volume, labels: NDArray[Any], number: int, level: float, name: str) -> VertebraCorridors:
+def measure_corridors(
+    volume: Volume, labels: NDArray[Any], number: int, level: float, name: str, fitted: Fitted | None = None
+) -> VertebraCorridors:
     """Find the corridors of a vertebra, label `number` on the volume's own grid; `name` is for messages."""
-    bone = fill_vertebra(volume, labels, number, level, name)
+    bone = fill_vertebra(volume, labels, number, level, name, fitted)
     try:
         frame = find_frame(bone, name)
     except RefusedInputError as error:
@@ -479,7 +481,7 @@ def _measure(
         side, None, line.radius, exit_point, start, frame.to_lps(pass_point[None])[0], tip,
         float(np.linalg.norm(tip - exit_point)), medial, sagittal, medial_lps, sagittal_lps, line.medial_range,
         line.sagittal_range, margins(surface, first, last, span.side), canal,
-        measure_bias(bone, frame, first, middle), by_hu, voxels, line.tried,
+        None if bone.fitted else measure_bias(bone, frame, first, middle), by_hu, voxels, line.tried,
     )  # fmt: skip
 
 

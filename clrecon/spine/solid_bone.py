@@ -6,6 +6,7 @@ Where HU cross the level between two points of the lattice, the surface lies at 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -48,6 +49,24 @@ class Lattice:
     def indices(self, points: Float64Array) -> Float64Array:
         """Return array coordinates, shape (3, n), in the order z, y, x, of LPS mm (n, 3)."""
         return np.ascontiguousarray(((points - self.origin) / self.step).T[::-1])
+
+
+@dataclass(frozen=True)
+class FittedLattice:
+    """What a surface fitted to the bone is on a lattice.
+
+    solid: Points within it.
+    shares, placed: For each axis, one point shorter along it: part of the step at which the surface crosses it, and
+        whether its place was fitted there.
+    """
+
+    solid: NDArray[np.bool_]
+    shares: Sequence[NDArray[np.float32]]
+    placed: Sequence[NDArray[np.bool_]]
+
+
+Fitted = Callable[[Lattice], FittedLattice]
+"""Finds the solid points and the crossings of a surface that takes the place of the level's."""
 
 
 def sample_volume(volume: Volume, points: Float64Array) -> NDArray[np.float32]:
@@ -98,8 +117,9 @@ class SolidBone:
 
     hu: At the points of the lattice within `MARGIN_MM` of the label; elsewhere `AIR_HU`.
     mask: True in the label itself, whatever the HU.
-    by_hu: True where HU cross the level at a point of the surface; False where the label ends or fills the bone.
+    by_hu: True where HU place a point of the surface, by the level or by a fit; False where the label ends or fills.
     steps: Columns: the steps of the scan's voxels along i, j, k, mm.
+    fitted: The surface was fitted to the bone, from that at the level on.
     cut: Voxels (m, 3) of the label in the outermost layer of the scan, LPS mm: beyond them the vertebra may go on.
     """
 
@@ -112,6 +132,7 @@ class SolidBone:
     level: float
     steps: Float64Array
     cut: Float64Array
+    fitted: bool = False
 
     @cached_property
     def _tree(self) -> Any:
@@ -170,8 +191,12 @@ class SolidBone:
         return np.asarray(found, dtype=np.float64)
 
 
-def fill_vertebra(volume: Volume, labels: NDArray[Any], number: int, level: float, what: str) -> SolidBone:
+def fill_vertebra(
+    volume: Volume, labels: NDArray[Any], number: int, level: float, what: str, fitted: Fitted | None = None
+) -> SolidBone:
     """Make the solid bone of one label on the volume's own grid; `what` names it in messages.
+
+    With `fitted` its surface is the one that was fitted to the bone, from that at the level on.
 
     Inside is what has the level, HU, and is the label's own (or one voxel beyond), and what that encloses, see
     `clrecon.labels.label_bodies.fill_solid`.  The canal is open above and below, and so stays outside.
@@ -205,11 +230,15 @@ def fill_vertebra(volume: Volume, labels: NDArray[Any], number: int, level: floa
     filled = (solid_voxels != 0) & (dense == 0)
     parts = (mask == number, own, solid_voxels != 0, filled)
     hu, label, solid = _sample(volume, start, voxels, parts, lattice, level)
-    solid = _largest(solid)
-    surface, by_hu = _cross(lattice, hu, solid, level)
+    laid = None if fitted is None else fitted(lattice)
+    solid = _largest(solid if laid is None else laid.solid)
+    surface, by_hu = _cross(lattice, hu, solid, level, laid)
     if not len(surface):
         raise RefusedInputError(f"nothing of {what} is left at {level:g} HU")
-    return SolidBone(lattice, hu, solid, label, surface, by_hu, level, np.array(volume.affine[:3, :3]), places[ends])
+    return SolidBone(
+        lattice, hu, solid, label, surface, by_hu, level, np.array(volume.affine[:3, :3]), places[ends],
+        laid is not None,
+    )  # fmt: skip
 
 
 def _sample(
@@ -261,7 +290,7 @@ def _largest(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _cross(
-    lattice: Lattice, hu: NDArray[np.float32], solid: NDArray[np.bool_], level: float
+    lattice: Lattice, hu: NDArray[np.float32], solid: NDArray[np.bool_], level: float, fitted: FittedLattice | None
 ) -> tuple[Float64Array, NDArray[np.bool_]]:
     """Return the points where the steps of the lattice leave the solid, and whether HU place them."""
     points, placed = [], []
@@ -275,8 +304,11 @@ def _cross(
         one, other = hu[tuple(at.T)].astype(np.float64), hu[tuple(ends.T)].astype(np.float64)
         outward = first[tuple(at.T)]
         inner, outer = np.where(outward, one, other), np.where(outward, other, one)
-        by_hu = (inner >= level) & (outer < level)
-        share = np.where(by_hu, (one - level) / np.where(one == other, 1.0, one - other), 0.5)
+        if fitted is None:
+            by_hu = (inner >= level) & (outer < level)
+            share = np.where(by_hu, (one - level) / np.where(one == other, 1.0, one - other), 0.5)
+        else:
+            by_hu, share = fitted.placed[axis][tuple(at.T)], fitted.shares[axis][tuple(at.T)]
         where = at.astype(np.float64)
         where[:, axis] += share
         points.append(lattice.points(where))

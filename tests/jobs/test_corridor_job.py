@@ -6,6 +6,7 @@ import io
 import json
 import os
 from contextlib import redirect_stdout
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,18 +14,23 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
+from box_vertebra import BoxVertebra, grid_around
 from made_once import make_once
 from variants import daily_rows
 
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.jobs.corridor import parse_screw, read_screws
+from clrecon.jobs.corridor import lay_on_lattice, parse_screw, read_screws
 from clrecon.jobs.corridor_results import GIVEN, cylinder_mesh, draw_corridors
+from clrecon.labels import LabelMap
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.surface.cortex_mesh import fit_labels
 from clrecon.proof.phantom import PhantomSettings, phantom_truth, write_phantom
 from clrecon.spine.corridors import Corridor
 from clrecon.spine.frame import VertebraFrame
 from clrecon.spine.measures import Screw
+from clrecon.spine.solid_bone import fill_vertebra
 
 pytestmark = pytest.mark.untraced
 pytest.importorskip("nrrd")
@@ -35,6 +41,32 @@ SETTINGS = PhantomSettings(levels="L1-L2", size=(150, 150), spacing=(0.9, 0.9, 1
 @pytest.fixture(scope="module")
 def ct(shared_folder: Path) -> Path:
     return make_once(shared_folder, "phantom-of-corridors", lambda folder: write_phantom(folder, SETTINGS))
+
+
+def test_the_bone_of_a_vertebra_ends_where_the_fitted_surface_lies(device: Any) -> None:
+    vertebra = BoxVertebra()
+    affine, shape = grid_around(vertebra, spacing=(1.0, 1.0, 1.0))
+    volume, labels = vertebra.scan(affine, shape)
+    with DeviceVolume(volume, device=device) as resident:
+        mesh = fit_labels(resident, LabelMap(labels, affine), 150.0, 3)[3]
+    bone = fill_vertebra(volume, labels, 3, 150.0, "L3", partial(lay_on_lattice, mesh))
+    off = vertebra.depth(bone.surface)
+    assert abs(np.median(off)) < 0.06 and np.abs(off).mean() < 0.12  # at the level 0.35
+    assert bone.fitted and bone.by_hu.mean() > 0.95
+    some = np.random.default_rng(1).integers(0, bone.solid.shape, (20_000, 3))
+    depth, solid = vertebra.depth(bone.lattice.points(some)), bone.solid[tuple(some.T)]
+    assert solid[depth > 0.5].mean() > 0.999 and solid[depth < -0.5].mean() < 0.001
+
+
+@pytest.mark.release
+def test_corridors_of_the_fitted_bone_are_those_of_the_truth(ct: Path, tmp_path: Path, device: Any) -> None:
+    options = ("--labels", ct / "levels.nrrd", "--label", "L1", "--surface", "cortex", "--device", device.index)
+    assert run(ct, *options, "-o", tmp_path / "l1.ply", "--report", tmp_path / "r.json") == 0
+    report = load(tmp_path / "r.json")
+    assert (report["surface"], report["iso_value_hu"]) == ("cortex", 200.0)
+    for side in report["vertebrae"][0]["corridors"]:
+        assert side["radius_mm"] == pytest.approx(true_radius_mm(side), abs=0.2)
+        assert side["level_bias_mm"] is None and side["placed_by_hu_share"] > 0.9
 
 
 def run(*arguments: object) -> int:

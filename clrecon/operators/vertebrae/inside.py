@@ -257,19 +257,10 @@ def vertebra_inside(
     volume : Volume
     labels : LabelMap
         On any grid, with filled labels.
-    label : int or str
-        Number or name, as `LabelMap.find` takes it.
-    iso_value : float, optional
-        HU; the solid bone is what is at this level and above within the label, closed and filled.  None: the label's
-        own voxels.
-    surface : {"hu", "cortex"}
-        Where the solid bone ends, as `vertebra_solid` takes it.
+    label, iso_value, surface, close_mm, grow_mm
+        Of the solid bone, as `vertebra_solid` takes them.
     dense : (low, high)
         Band of HU, both ends included; None leaves an end open.
-    close_mm : float
-        Radius of the balls that close the solid bone, mm.
-    grow_mm : float, optional
-        With an iso value: distance of growth, see `extract_labels`.
     device : Device, str or int, optional
         See `clrecon.device`.
     memory : int, optional
