@@ -1,4 +1,4 @@
-"""``clrecon distance``: how far two meshes lie apart."""
+"""``clrecon distance``: how far two meshes lie apart, or a mesh and the bone of a scan."""
 
 from __future__ import annotations
 
@@ -19,21 +19,24 @@ use clrecon compare.
 examples:
   clrecon distance printed.stl bone.stl
   clrecon distance bone.3mf bone.glb
+  clrecon distance printed.stl CT_FOLDER --surface cortex
   clrecon distance a.ply b.ply -o a_to_b.ply --picture a_to_b.png --range 2 --report a_to_b.json"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("mesh", metavar="A", help=f"mesh: {', '.join(MESH_INPUTS)}")
-    parser.add_argument("reference", metavar="B", help="mesh that it is measured against")
+    parser.add_argument("reference", metavar="B", help="mesh that it is measured against; with --surface a scan")
     common.add_fields(parser, DistanceSettings)
+    common.add_fields(parser.add_argument_group("scan"), DistanceSettings, "scan")
     output = parser.add_argument_group("files")
     common.add_output(output, "write A coloured by its distance from B: .ply", metavar="PLY", required=False)
     common.add_picture(output, "picture of it with its scale: .png, .jpg or .tif")
     common.add_fields(output, DistanceSettings, "picture")
     common.add_report(output, "all figures")
-    common.add_no_clobber(output, with_ids=False)
-    common.add_device(parser.add_argument_group("device, for the picture alone"))
+    common.add_no_clobber(output)
+    common.add_reading(parser)
+    common.add_device(parser.add_argument_group("device, for pictures and the surface of a scan"))
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -84,12 +87,19 @@ def _describe(report: dict[str, Any]) -> list[str]:
 
 
 def _describe_mesh(letter: str, entry: dict[str, Any]) -> list[str]:
+    made = []
+    if entry["iso_value_hu"] is not None:
+        made = [f"         bone {'fitted from' if entry['cortex'] else 'at'} {entry['iso_value_hu']:g} HU"]
+    if entry["cortex"]:
+        share = 100.0 * entry["cortex"]["fitted"] / entry["cortex"]["vertices"]
+        made[0] += f", {share:.0f} % of it, error {entry['cortex']['error_mm']['p50']:.2f} mm"
     size = f"{entry['triangles']:,} triangles, "
     size += "not closed" if entry["volume_ml"] is None else f"closed, {format_volume(entry['volume_ml'])}"
     turned = ", turned to LPS" if entry["space"] != "LPS" else ""
     source = {"file": "named by the file", "argument": "as you say", "assumed": "assumed"}[entry["space_from"]]
     return [
         f"{letter:<9}{printable(entry['name'])}",
+        *made,
         f"         {size}",
         f"         {entry['space']}, {source}{turned}",
     ]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.jobs.outputs import MeshFiles
 from clrecon.jobs.run import JobReport, Run
-from clrecon.jobs.settings import DistanceSettings
+from clrecon.jobs.settings import FITTED_FROM_HU, DistanceSettings
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SAMPLES, DistanceSummary
 from clrecon.mesh.compare.signed import SideDistance, measure_distance, measure_vertex_distances
@@ -59,7 +59,7 @@ def measure_meshes(
     settings: DistanceSettings | None = None,
     **how: Any,
 ) -> DistanceReport:
-    """Measure how far two meshes lie apart, files A and B."""
+    """Measure how far two meshes lie apart, files A and B, or a mesh and the bone of a scan."""
     from clrecon.operators import take_device
 
     files, settings = files or MeshFiles(), settings or DistanceSettings()
@@ -75,9 +75,13 @@ def measure_meshes(
             load_pillow()
             check_image_path(files.picture)
         run.check(files.named("the coloured mesh"), mesh, reference)
-        device = None if files.picture is None else take_device(settings.device)
+        device = take_device(settings.device) if files.picture is not None or settings.surface is not None else None
         run.progress("read", 0, 0)
-        meshes = [read_side(path, settings.mesh_space) for path in (mesh, reference)]
+        meshes = [read_side(mesh, settings.mesh_space)]
+        if settings.surface is None or device is None:
+            meshes.append(read_side(reference, settings.mesh_space))
+        else:
+            meshes.append(_make_side(run, reference, device))
         entries = [describe_mesh(own, path) for own, path in zip(meshes, (mesh, reference), strict=True)]
         for entry in entries:
             if not entry["area_mm2"]:
@@ -94,7 +98,7 @@ def measure_meshes(
             colored = _Colored(distances, ColorScale(limit, signed))
         run.lap("measure")
         drawn = None
-        if device is not None and colored is not None:
+        if device is not None and colored is not None and files.picture is not None:
             run.progress("render", 0, 0)
             drawn = _draw_mesh(meshes[0], colored, names[1], settings, device)
             run.lap("render")
@@ -190,6 +194,28 @@ def read_side(path: str | Path, space: Space | None) -> Mesh:
     return mesh
 
 
+def _make_side(run: Run, source: str | Path, device: Device) -> Mesh:
+    """Return the surface of the bone of a scan: at its level, or moved onto the bone."""
+    from clrecon.exchange.content import certificate_lines
+    from clrecon.operators.resident.device_volume import DeviceVolume
+    from clrecon.operators.surface.cortex_mesh import fit_meshes
+    from clrecon.operators.surface.extract import SurfaceExtractor
+
+    settings: DistanceSettings = run.settings
+    volume = run.read(source)
+    run.lap("read")
+    level = FITTED_FROM_HU if settings.iso_value is None else settings.iso_value
+    with DeviceVolume(volume, device=device, memory=settings.memory) as resident:
+        with SurfaceExtractor(resident) as extractor:
+            mesh = extractor.extract(level, progress=run.progress)
+        if settings.surface == "cortex":
+            (mesh,) = fit_meshes([mesh], resident, progress=run.progress)
+    run.lap("surface")
+    file = {"kind": "scan", "space": "LPS", "space_from": "file", "warnings": volume.report.get("warnings", ())}
+    mesh.report |= {"file": file, "certificate_lines": certificate_lines(volume.report, keep_ids=True)}
+    return mesh
+
+
 def describe_mesh(mesh: Mesh, path: str | Path) -> dict[str, Any]:
     """Return the report's entry of a mesh; the name of its file without folders."""
     quality = mesh.quality()
@@ -206,6 +232,8 @@ def describe_mesh(mesh: Mesh, path: str | Path) -> dict[str, Any]:
         "area_mm2": quality.area_mm2,
         "volume_ml": abs(quality.volume_ml) if closed else None,
         "bounds_mm": quality.bounds_mm,
+        "iso_value_hu": mesh.report.get("iso_value_hu") if file["kind"] == "scan" else None,
+        "cortex": mesh.report.get("cortex"),
     }
 
 

@@ -40,6 +40,16 @@ def check_space(space: str | None) -> None:
         frame_from_lps(space)
 
 
+def _check_surface_level(settings: StatsSettings | DistanceSettings) -> None:
+    check_surface(settings.surface)
+    check_level(settings.iso_value)
+    if settings.iso_value is not None and settings.surface is None:
+        raise UsageError(
+            f"a level is that of a surface: ask for one ({name_parameter('surface', 'hu')}), or leave"
+            f" {name_parameter('iso_value')} out"
+        )
+
+
 _parts_option = partial(option, group="parts")
 _vertebrae_option = partial(option, group="vertebrae")
 
@@ -101,7 +111,7 @@ class StatsSettings(ScanSettings, DeviceSettings):
         first=True,
     )
 
-    surface: str | None = surface_option(
+    surface: SurfaceKind | None = surface_option(
         "measure the surface of each label at the level too: area and volume", group="surface", first=True
     )
     iso_value: float | None = option(
@@ -114,22 +124,24 @@ class StatsSettings(ScanSettings, DeviceSettings):
         super().__post_init__()
         if self.percentiles is not None:
             check_percentiles(self.percentiles)
-        check_surface(self.surface)
-        check_level(self.iso_value)
-        if self.iso_value is not None and self.surface is None:
-            raise UsageError(
-                f"a level is that of a surface: ask for one ({name_parameter('surface', 'hu')}), or leave"
-                f" {name_parameter('iso_value')} out"
-            )
+        _check_surface_level(self)
 
 
 MOST_SAMPLES = 10_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistanceSettings(DeviceSettings):
+class DistanceSettings(ScanSettings, DeviceSettings):
+    """Settings of the job of distances; with `surface` the reference is a scan, of whose bone that surface is made."""
+
     mesh_space: Space | None = mesh_space_option("files that do not name theirs")
     samples: int | None = option("--samples N", "points on each mesh, evenly by area (default: 50000)")
+    surface: SurfaceKind | None = surface_option(
+        "B is a scan, and measured against is the surface of its bone at the level", group="scan", first=True
+    )
+    iso_value: float | None = option(
+        "--hu N", f"level of that surface (default: that of bone, {FITTED_FROM_HU:g})", group="scan"
+    )
     range_mm: float | None = option(
         "--range MM",
         "distance at which the colours end (default: 1, 2 or 5 x 10^n mm that hold 95 %% of the distances)",
@@ -146,6 +158,7 @@ class DistanceSettings(DeviceSettings):
 
         check_space(self.space)
         check_space(self.mesh_space)
+        _check_surface_level(self)
         if self.samples is not None and not 1 <= self.samples <= MOST_SAMPLES:
             raise UsageError(f"distances need 1 to {MOST_SAMPLES:,} samples on each mesh, not {self.samples:,}")
         if self.range_mm is not None and not (math.isfinite(self.range_mm) and self.range_mm > 0.0):

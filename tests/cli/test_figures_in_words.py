@@ -57,6 +57,8 @@ def test_colours_of_distances_say_what_lies_beyond() -> None:
     mesh = {
         "triangles": 4,
         "volume_ml": None,
+        "iso_value_hu": None,
+        "cortex": None,
         "name": "a.stl",
         "components": 1,
         "area_mm2": 1.0,
@@ -81,7 +83,7 @@ def test_the_ranges_of_a_corridor_are_both_ends() -> None:
         "screw_diameter_mm": 4.0, "medial_angle_deg": 10.0, "medial_angle_lps_deg": 11.0, "sagittal_angle_deg": 1.0,
         "sagittal_angle_lps_deg": 2.0, "entry_mm": point, "tip_mm": point, "canal_mm": 2.0,
     }  # fmt: skip
-    lines = corridor._describe_side("L3", side, {"space": "lps", "margin_mm": 1.0})
+    lines = corridor._describe_side("L3", side, {"space": "lps", "margin_mm": 1.0, "surface": "hu"})
     assert lines[1].strip() == (
         "medial 10 degrees (5 to 15 within 0.1 mm; LPS 11), sagittal not determined: -9 to 8 within 0.1 mm, line at 1"
         " (LPS 2)"
@@ -246,7 +248,7 @@ def test_help_alone_and_of_a_command() -> None:
 def test_volumes_of_a_vertebra(ml: float | None, words: str) -> None:
     vertebra = {
         "volumes_ml": {"canal": None, "solid": 9.0, "dense": 3.0, "trabecular": ml}, "dense_hu": (300.0, None),
-        "iso_value_hu": 200.0, "canal_height_mm": None, "name": "L3",
+        "iso_value_hu": 200.0, "canal_height_mm": None, "cortex": None, "name": "L3",
         "dense_thickness": {"median_mm": None, "limit_mm": 2.0},
     }  # fmt: skip
     lines = inside._describe_vertebra(vertebra)

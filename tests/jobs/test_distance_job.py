@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from command_lines import check_refused
 from sample_meshes import ball, box
+from surface_volumes import MIDDLE, hollow_ball
 
 import clrecon
 from clrecon.cli.main import main
@@ -59,6 +60,23 @@ def test_a_file_without_a_frame_is_doubted_until_it_is_said(files: dict[str, str
     code, report = run(files["plain.stl"], files["b.ply"], "--mesh-space", "ras")
     assert code == 0 and report["hausdorff_mm"] == pytest.approx(2.0, abs=0.05) and report["warnings"] == []
     assert report["a"]["space_from"] == "argument"
+
+
+def test_a_mesh_is_measured_against_the_bone_of_a_scan(tmp_path: Path, capsys: Any, device: Any) -> None:
+    volume = hollow_ball(thickness=3.0)
+    volume.save(tmp_path / "ct.nrrd")
+    vertices, triangles = ball(13.5, 30)
+    mesh = str(tmp_path / "a.stl")
+    Mesh(vertices + MIDDLE, triangles).save(mesh)
+    found = {}
+    for kind in ("hu", "cortex"):
+        code, found[kind] = run(mesh, str(tmp_path / "ct.nrrd"), "--surface", kind, "--device", str(device.index))
+        assert code == 0 and (found[kind]["b"]["kind"], found[kind]["b"]["iso_value_hu"]) == ("scan", 200.0)
+    level, fitted = (found[kind]["a_to_b_signed_mm"]["mean"] for kind in ("hu", "cortex"))
+    assert fitted == pytest.approx(0.5, abs=0.08) and level < 0.1
+    assert found["cortex"]["b"]["cortex"]["moved"] and found["hu"]["b"]["cortex"] is None
+    assert main(["distance", mesh, str(tmp_path / "ct.nrrd"), "--surface", "cortex", "--samples", "500"]) == 0
+    assert "bone fitted from 200 HU, 100 % of it, error 0." in capsys.readouterr().out
 
 
 def test_an_open_mesh_and_one_in_metres_are_said(files: dict[str, str]) -> None:
