@@ -162,6 +162,16 @@ def label_map_option(**how: Any) -> Any:
     )
 
 
+def label_option(text: str = "this label only; may be given again", **how: Any) -> Any:
+    """Declare a field for chosen labels of a map."""
+    return option("--label NAME|N", text, action="append", **how)
+
+
+def grow_option(when: str = "", **how: Any) -> Any:
+    text = f"{when}dense voxels this near to a label are its own (default: one voxel each way)"
+    return option("--grow MM", text, **how)
+
+
 def space_option(text: str, **how: Any) -> Any:
     """Declare a field for the patient frame of what is written."""
     return option("--space lps|ras", f"{text} (default: lps)", default="lps", parse=str.lower, **how)

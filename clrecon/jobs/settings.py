@@ -15,7 +15,9 @@ from clrecon.jobs.options import (
     ScanSettings,
     check_level,
     check_surface,
+    grow_option,
     label_map_option,
+    label_option,
     mesh_space_option,
     parse_levels,
     parse_point,
@@ -75,12 +77,7 @@ class ExportSettings(InputSettings):
         "resample (trilinear) to a regular grid with this step along all axes; without it voxels stay as they are",
         first=True,
     )
-    space: Space = option(
-        "--space lps|ras",
-        "patient frame of the numbers of crop and region (default: lps); that of the file is its format's",
-        default="lps",
-        parse=str.lower,
-    )
+    space: Space = space_option("patient frame of the numbers of crop and region; the file's is its format's")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,9 +98,7 @@ class StatsSettings(ScanSettings, DeviceSettings):
     """Settings of the job of statistics; without `label` all labels are measured, without `surface` their voxels."""
 
     labels: str | Path = label_map_option(required=True)
-    label: Sequence[str | int] = option(
-        "--label NAME|N", "this label only; may be given again", default=(), action="append", first=True
-    )
+    label: Sequence[str | int] = label_option(default=(), first=True)
     percentiles: Sequence[float] | None = option(
         "--percentiles P,P",
         "percentiles of HU, from 0 to 100 (default: 5,25,50,75,95)",
@@ -188,9 +183,7 @@ class InsideSettings(ScanSettings, DeviceSettings):
     """Settings of the job that looks into vertebrae; None in `dense`, (low, high), leaves an end open."""
 
     labels: str | Path = label_map_option(required=True)
-    label: Sequence[str | int] = option(
-        "--label NAME|N", "label of a vertebra; may be given again", action="append", required=True, first=True
-    )
+    label: Sequence[str | int] = label_option("label of a vertebra; may be given again", required=True, first=True)
     view: str = option(
         "--view V",
         f"anterior, posterior, left, right, superior, inferior, or AZ,EL in degrees (default: {INSIDE_VIEW})",
@@ -211,9 +204,7 @@ class InsideSettings(ScanSettings, DeviceSettings):
         "--dense A[:B]", "HU of dense bone, from A on or from A to B (default: 450)", parse=_parse_band
     )
     close_mm: float | None = _parts_option("--close MM", "pores that close by balls (default: 1.5)")
-    grow_mm: float | None = _parts_option(
-        "--grow MM", "with --hu: dense voxels this near to the label are its own (default: one voxel each way)"
-    )
+    grow_mm: float | None = grow_option("with --hu: ", group="parts")
     space: Space = space_option("patient frame of the meshes", group="parts")
 
     def __post_init__(self) -> None:
@@ -301,9 +292,7 @@ class CorridorSettings(ScanSettings, DeviceSettings):
     """Settings of the corridor job; without `iso_value` it is half way, measured in the scan."""
 
     labels: str | Path = label_map_option(required=True)
-    label: Sequence[str | int] = option(
-        "--label NAME|N", "a vertebra of the map; may be given again", default=(), action="append", first=True
-    )
+    label: Sequence[str | int] = label_option("a vertebra of the map; may be given again", default=(), first=True)
     iso_value: float | None = option(
         "--hu auto|N",
         "HU at which the bone's surface lies (default: auto, half way between bone and the tissue beside it; of the"

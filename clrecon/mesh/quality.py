@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,9 +18,9 @@ from clrecon.mesh.connectivity import (
     label_components,
     opposite_half_edges,
 )
-from clrecon.mesh.triangles import corner_edges, cross_product, cross_products
+from clrecon.mesh.triangles import cross_product, cross_products, take_edges
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import CHUNK, find_bounds, local_origin
+from clrecon.system.pieces import CHUNK, find_bounds, in_threads, local_origin
 from clrecon.system.records import Record
 
 
@@ -134,18 +136,23 @@ def measure_triangles(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 ) -> tuple[float, float, int, float | None]:
     """Measure area in mm2, signed volume in mm3, number of triangles without area, shortest edge in mm."""
-    twice_area = six_volumes = 0.0
-    zero_area = 0
-    shortest = np.inf
-    for _, corner, p, q in corner_edges(vertices, triangles, local_origin(vertices)):
+    columns, origin = np.ascontiguousarray(vertices.T.astype(np.float64)), local_origin(vertices)
+    pieces: dict[int, tuple[float, ...]] = {}
+
+    def measure(where: slice) -> None:
+        corner, p, q = take_edges(columns, triangles[where], origin)
         cross = cross_product(p, q)
         squares = np.einsum("ij,ij->j", cross, cross)
-        twice_area += float(np.sqrt(squares).sum())
-        six_volumes += float(np.einsum("ij,ij->", corner, cross))
-        zero_area += int(np.count_nonzero(squares == 0.0))
-        for edge in (p, q, q - p):
-            shortest = min(shortest, float(np.einsum("ij,ij->j", edge, edge).min()))
-    return twice_area / 2.0, six_volumes / 6.0, zero_area, float(np.sqrt(shortest)) if len(triangles) else None
+        shortest = min(np.einsum("ij,ij->j", edge, edge).min() for edge in (p, q, q - p))
+        volume = np.einsum("ij,ij->", corner, cross)
+        pieces[where.start] = np.sqrt(squares).sum(), volume, np.count_nonzero(squares == 0.0), shortest
+
+    in_threads(measure, len(triangles))
+    if not pieces:
+        return 0.0, 0.0, 0, None
+    rows = np.array([pieces[start] for start in sorted(pieces)])
+    twice_area, six_volumes, zero_area, _ = rows.sum(axis=0).tolist()
+    return twice_area / 2.0, six_volumes / 6.0, int(zero_area), math.sqrt(rows[:, 3].min())
 
 
 def find_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], most: int) -> Pieces:

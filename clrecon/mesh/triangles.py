@@ -26,13 +26,19 @@ def corner_edges(
     """
     columns = np.ascontiguousarray(vertices.T.astype(np.float64))
     for where in chunks(len(triangles), size):
-        a, b, c = triangles[where].T.astype(np.intp)
-        # "clip" is three times as fast as numpy's default check; callers have checked the indices.
-        corner, p, q = (np.take(columns, index, axis=1, mode="clip") for index in (a, b, c))
-        p -= corner
-        q -= corner
-        corner -= origin[:, None]
-        yield where, corner, p, q
+        yield where, *take_edges(columns, triangles[where], origin)
+
+
+def take_edges(
+    columns: NDArray[np.float64], triangles: NDArray[np.uint32], origin: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return first corner and edges as `corner_edges` yields them, from the vertices in columns, (3, n)."""
+    # "clip" is three times as fast as numpy's default check; callers have checked the indices.
+    corner, p, q = (np.take(columns, index, axis=1, mode="clip") for index in triangles.T.astype(np.intp))
+    p -= corner
+    q -= corner
+    corner -= origin[:, None]
+    return corner, p, q
 
 
 def cross_product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:

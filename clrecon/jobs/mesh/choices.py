@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.options import label_color_option, label_map_option
+from clrecon.jobs.options import grow_option, label_color_option, label_map_option, label_option
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import MISSING, dataclass
 from clrecon.system.options import option
@@ -22,9 +22,7 @@ class LabelChoice:
     """The labels of a map, by numbers or names, that become meshes; without `label` all that have a surface."""
 
     path: str | Path = label_map_option(default=MISSING)
-    label: tuple[str | int, ...] = option(
-        "--label NAME|N", "this label only; may be given again (default: all)", default=(), action="append"
-    )
+    label: tuple[str | int, ...] = label_option(default=())
     hidden: tuple[str | int, ...] = option(
         "--hide-label NAME|N", "not this label; may be given again", default=(), action="append"
     )
@@ -32,9 +30,7 @@ class LabelChoice:
         " in .ply and in the formats of several objects, such as L3=orange"
     )
     surface: str = "hu"
-    grow_mm: float | None = option(
-        "--grow MM", "dense voxels this near to a label are its own (default: one voxel each way)"
-    )
+    grow_mm: float | None = grow_option()
     solid: bool = False
 
     def __post_init__(self) -> None:

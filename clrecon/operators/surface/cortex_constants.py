@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,15 +15,15 @@ from clrecon.geometry import METAL_HU, Volume
 from clrecon.mesh.compare.walls import COMPACT_HU
 from clrecon.operators.surface.cortex import (
     CENTRE,
+    CORTEX_SPREAD,
     SAMPLES,
     SILENT_HU,
     CortexConstants,
     Float32Array,
     ProfileSampler,
-    WallProfiles,
+    WallFits,
     blurs_of,
 )
-from clrecon.system.light_dataclass import dataclass
 
 FEWEST_WALLS = 60
 """Profiles across walls below which nothing is known of a scan's cortex."""
@@ -31,8 +35,9 @@ LEAST_CONTRAST, LEAST_CORTEX_HU = 0.4, 350.0
 """A wall is as high, and rises by as much, as this share of the 90th percentile of those of compact bone, or of those
 that reach the second: the shell of a table rises from air, but is low. Fewer than `FEWEST_WALLS` show no bone."""
 
-TRIMMED = 0.8
-"""Share of the profiles, those fitted best, by which blurs are compared: others touch a second bone or a vessel."""
+TRIMMED, NARROW_SPREAD = 0.8, 0.02
+"""Share of the profiles, those fitted best, by which blurs are compared: others touch a second bone or a vessel. Share
+by which the cortex of a place may differ there."""
 
 SEARCH_STEPS = (1.3, 1.12, 1.05)
 """Factors by which a blur is changed as long as that helps, one after the other."""
@@ -51,8 +56,7 @@ LEAST_BLUR_ERROR, LEAST_CORTEX_ERROR, THIN_CORTEX_ERROR = 0.02, 0.05, 0.3
 walls are so thin that blur and density are one."""
 
 
-@dataclass
-class _Trial:
+class _Trial(NamedTuple):
     """Constants as far as they are found."""
 
     blur_mm: float
@@ -62,7 +66,11 @@ class _Trial:
     def changed(self, place: int, factor: float) -> _Trial:
         blurs = [self.blur_mm, self.across_mm]
         blurs[place] *= factor
-        return _Trial(blurs[0], blurs[1], self.cortex_hu)
+        return _Trial(*blurs, self.cortex_hu)
+
+
+_Fit = Callable[[_Trial, float], WallFits]
+"""Fits all walls with the constants of a trial and a spread of the cortex."""
 
 
 def measure_constants(
@@ -98,19 +106,25 @@ def measure_constants(
         min(1.03 * dense, usual),
     )  # fmt: skip
     known = noise if noise is not None else SILENT_HU
+    profiles = sampler.take(values)
+
+    @functools.cache
+    def fit(trial: _Trial, cortex_spread: float) -> WallFits:
+        return profiles.fit(*trial, known, cortex_spread=cortex_spread)
+
     found = start
     for first in range(len(SEARCH_STEPS)):
-        found = _search_blurs(sampler.take(values), found, known, SEARCH_STEPS[first:])
-        found.cortex_hu, thick = _measure_cortex(sampler.take(values), values, found, known)
+        found = _search_blurs(fit, slice(None), found, SEARCH_STEPS[first:])
+        cortex_hu, thick = _measure_cortex(fit, values, slice(None), found)
+        found = found._replace(cortex_hu=cortex_hu)
     parts = []
-    for part in range(4):
-        profiles = sampler.take(values[:, part::4])
-        one = _search_blurs(profiles, found, known, SEARCH_STEPS[1:])
-        parts.append((one.blur_mm, one.across_mm, _measure_cortex(profiles, values[:, part::4], found, known)[0]))
+    for part in (slice(first, None, 4) for first in range(4)):
+        one = _search_blurs(fit, part, found, SEARCH_STEPS[1:])
+        parts.append((one.blur_mm, one.across_mm, _measure_cortex(fit, values, part, found)[0]))
     of_cortex = LEAST_CORTEX_ERROR if thick >= FEWEST_THICK else THIN_CORTEX_ERROR
     least = np.array([LEAST_BLUR_ERROR, LEAST_BLUR_ERROR, of_cortex])
     spread = np.maximum(np.std(parts, axis=0) / 2.0, least * np.mean(parts, axis=0))
-    residual = sampler.take(values).fit(found.blur_mm, found.across_mm, found.cortex_hu, known).residual_hu
+    residual = fit(found, CORTEX_SPREAD).residual_hu
     errors = [float(value) for value in spread]
     return CortexConstants(
         blur_mm=found.blur_mm,
@@ -171,12 +185,11 @@ def _find_walls(values: Float32Array) -> tuple[NDArray[np.intp], Float32Array]:
     return walls[np.unique(np.linspace(0, len(walls) - 1, min(len(walls), MOST_WALLS)).astype(np.intp))], peaks
 
 
-def _search_blurs(profiles: WallProfiles, found: _Trial, noise_hu: float, factors: tuple[float, ...]) -> _Trial:
-    """Return the blurs that leave least of the profiles, from those of a trial on."""
+def _search_blurs(fit: _Fit, part: slice, found: _Trial, factors: tuple[float, ...]) -> _Trial:
+    """Return the blurs that leave least of a part of the profiles, from those of a trial on."""
 
     def left(trial: _Trial) -> float:
-        fits = profiles.fit(trial.blur_mm, trial.across_mm, trial.cortex_hu, noise_hu, cortex_spread=0.02)
-        squares = np.sort(np.square(fits.residual_hu, dtype=np.float64))
+        squares = np.sort(np.square(fit(trial, NARROW_SPREAD).residual_hu[part], dtype=np.float64))
         return float(np.mean(squares[: max(1, int(TRIMMED * len(squares)))]))
 
     least = left(found)
@@ -190,12 +203,12 @@ def _search_blurs(profiles: WallProfiles, found: _Trial, noise_hu: float, factor
     return found
 
 
-def _measure_cortex(profiles: WallProfiles, values: Float32Array, found: _Trial, noise_hu: float) -> tuple[float, int]:
-    """Return the HU of compact bone, and how many walls are thick enough to show it."""
-    fits = profiles.fit(found.blur_mm, found.across_mm, found.cortex_hu, noise_hu, cortex_spread=WIDE_SPREAD)
-    blurs = blurs_of(values, found.blur_mm, found.across_mm)
-    thick = (fits.thickness_mm > THICK_BLURS * blurs) & (blurs < SHARP * found.blur_mm)
+def _measure_cortex(fit: _Fit, values: Float32Array, part: slice, found: _Trial) -> tuple[float, int]:
+    """Return the HU of compact bone in a part of the profiles, and how many walls are thick enough to show it."""
+    fits = fit(found, WIDE_SPREAD)
+    blurs = blurs_of(values[:, part], found.blur_mm, found.across_mm)
+    thick = (fits.thickness_mm[part] > THICK_BLURS * blurs) & (blurs < SHARP * found.blur_mm)
     if np.count_nonzero(thick) < FEWEST_THICK:
         return found.cortex_hu, int(np.count_nonzero(thick))
-    shown = float(np.percentile(fits.cortex_hu[thick], DENSE_PERCENTILE))
+    shown = float(np.percentile(fits.cortex_hu[part][thick], DENSE_PERCENTILE))
     return float(np.clip(shown, found.cortex_hu / 1.25, found.cortex_hu * 1.25)), int(np.count_nonzero(thick))
