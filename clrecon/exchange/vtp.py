@@ -1,8 +1,8 @@
-"""VTP, the XML PolyData of VTK: written by VTK, raw binary data after the XML, with 64-bit headers.
+"""VTP, the XML PolyData of VTK: raw binary data after the XML, with 64-bit headers.
 
-VTK writes to a string, which is then written to our stream: VTK itself leaves a truncated file on a full disk.  The
-field arrays ``SPACE``, ``UNIT``, ``ISO_VALUE_HU``, ``AFFINE_IJK_TO_LPS_MM`` (16 numbers, row by row) and
-``CERTIFICATE`` (one text for each fact) tell what the coordinates are; 3D Slicer reads ``SPACE``.
+The writer is own code because VTK leaves a truncated file on a full disk, or makes a copy of it in memory.  The field
+arrays ``SPACE``, ``UNIT``, ``ISO_VALUE_HU``, ``AFFINE_IJK_TO_LPS_MM`` (16 numbers, row by row) and ``CERTIFICATE`` (one
+text for each fact) tell what the coordinates are; 3D Slicer reads ``SPACE``.
 
 The readers take files of any program; of meshes each polygon is a triangle.  Own code because VTK crashes on harmed
 files: it follows offsets and counts wherever they lead.  Arrays may be text, base64 or raw bytes after the XML, plain
@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import OutputError, RefusedInputError, UsageError
+from clrecon.errors import RefusedInputError, UsageError
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, PointContent, refuse_file
 from clrecon.exchange.raw_content import Part, PlacedShapes, RawCloud, RawMesh, Shape, columns_of, numbers_of, say_cut
 from clrecon.system.light_dataclass import dataclass, replace
@@ -164,80 +164,102 @@ def write(stream: BinaryIO, content: PointContent | Assembly) -> None:
     Each triangle of several meshes has the number of its mesh, from 0 on, in the cell array ``PART``, and its colour in
     ``COLOR``; the field array ``PART_NAMES`` has the names in this order.
     """
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+    parts = content.parts if isinstance(content, Assembly) else []
+    content = _join(content)
+    faces = content.triangles if isinstance(content, Content) else None
+    corners = np.arange(len(content.vertices))[:, None] if faces is None else faces
+    whole = np.int32 if max(len(content.vertices), corners.size) < 2**31 else np.int64
+    ends = np.arange(corners.shape[1], corners.size + 1, corners.shape[1])
+    cells = {"Verts": 0, "Lines": 0, "Strips": 0, "Polys": 0} | {"Verts" if faces is None else "Polys": len(corners)}
+    counts = {f"NumberOf{kind}": str(count) for kind, count in {"Points": len(content.vertices), **cells}.items()}
+    of_points: dict[str, NDArray[Any] | None] = {
+        "Normals": content.normals,
+        "HU": content.hu,
+        "label": content.labels,
+        **content.values,
+    }
+    active = {"Scalars": "HU", "Normals": "Normals"}
+    of_faces = content.face_values if isinstance(content, Content) else {}
 
-    assembly, content = content, _join(content)
-    polydata = make_polydata(
-        content.vertices, _triangles(content), content.normals, content.hu, content.labels, content.values
+    blocks: list[NDArray[Any]] = []
+    root = ElementTree.Element(
+        "VTKFile", type="PolyData", version="1.0", byte_order="LittleEndian", header_type="UInt64"
     )
-    if isinstance(content, Content):
-        add_arrays(polydata.GetCellData(), content.face_values)
-    for array in _field_arrays(content):
-        polydata.GetFieldData().AddArray(array)
-    if isinstance(assembly, Assembly):
-        _add_parts(polydata, assembly.parts)
-    writer = vtkXMLPolyDataWriter()
-    writer.SetInputData(polydata)
-    writer.SetDataModeToAppended()
-    writer.EncodeAppendedDataOff()
-    writer.SetCompressorTypeToNone()
-    writer.SetHeaderTypeToUInt64()
-    writer.SetByteOrderToLittleEndian()
-    writer.WriteToOutputStringOn()
-    if writer.Write() != 1:
-        raise OutputError(f"VTK could not write the file, its error code is {writer.GetErrorCode()}")
-    text = writer.GetOutputString()
-    # VTK's Python returns str if the bytes happen to be UTF-8, else bytes.
-    stream.write(text.encode("utf-8") if isinstance(text, str) else text)
+    surface = ElementTree.SubElement(root, "PolyData")
+    field = ElementTree.SubElement(surface, "FieldData")
+    for name, facts in _facts(content, parts).items():
+        _append(blocks, field, name, facts, is_row=True)
+    piece = ElementTree.SubElement(surface, "Piece", counts)
+    given = {kind: name for kind, name in active.items() if of_points[name] is not None}
+    data = ElementTree.SubElement(piece, "PointData", given)
+    for name, numbers in of_points.items():
+        if numbers is not None:
+            _append(blocks, data, name, numbers)
+    data = ElementTree.SubElement(piece, "CellData")
+    for name, numbers in {**of_faces, **_numbers_of_parts(parts)}.items():
+        _append(blocks, data, name, numbers)
+    _append(blocks, ElementTree.SubElement(piece, "Points"), "Points", content.vertices)
+    for kind, count in cells.items():
+        data = ElementTree.SubElement(piece, kind)
+        for name, numbers in (("connectivity", corners.reshape(-1)), ("offsets", ends)):
+            _append(blocks, data, name, np.asarray(numbers if count else numbers[:0], whole))
+    xml = ElementTree.tostring(root, encoding="us-ascii", xml_declaration=True)
+    stream.write(xml.removesuffix(_END) + b'<AppendedData encoding="raw">_')
+    for block in blocks:
+        stream.write(np.uint64(block.nbytes).astype("<u8").tobytes())
+        stream.write(block.reshape(-1).view(np.uint8).data)
+    stream.write(b"</AppendedData>" + _END)
 
 
-def _add_parts(polydata: Any, parts: Sequence[Content]) -> None:
+_NAMES_OF_TYPES = {"i": "Int", "u": "UInt", "f": "Float"}
+
+
+def _append(
+    blocks: list[NDArray[Any]], parent: ElementTree.Element, name: str, values: Any, *, is_row: bool = False
+) -> None:
+    """Name an array in the XML, with its place after it; `is_row`: its texts or its numbers, those of one row."""
+    offset = str(sum(8 + block.nbytes for block in blocks))
+    told = {"Name": name, "format": "appended", "offset": offset}
+    if is_row and isinstance(values[0], str):
+        block = np.frombuffer(b"".join(text.encode() + b"\0" for text in values), np.uint8)
+        ElementTree.SubElement(parent, "Array", {"type": "String", "NumberOfTuples": str(len(values)), **told})
+    else:
+        numbers = np.asarray(values)
+        block = np.ascontiguousarray(numbers, numbers.dtype.newbyteorder("<"))
+        kind = f"{_NAMES_OF_TYPES[numbers.dtype.kind]}{8 * numbers.itemsize}"
+        size = {"NumberOfTuples": "1"} if is_row else {}
+        width = numbers.size if is_row else numbers[:1].size if numbers.ndim > 1 else 1
+        ElementTree.SubElement(parent, "DataArray", {"type": kind, "NumberOfComponents": str(width), **size, **told})
+    blocks.append(block)
+
+
+def _numbers_of_parts(parts: Sequence[Content]) -> dict[str, NDArray[Any]]:
+    """Return the arrays of the triangles of several meshes."""
+    if not parts:
+        return {}
     counts = [len(part.triangles) for part in parts]
     colors = np.array([BONE_COLOR if part.color is None else part.color for part in parts])
-    arrays: dict[str, NDArray[Any]] = {
+    return {
         "PART": np.repeat(np.arange(len(parts), dtype=np.int32), counts),
         "COLOR": np.repeat(np.rint(255.0 * colors).astype(np.uint8), counts, axis=0),
     }
-    add_arrays(polydata.GetCellData(), arrays)
-    names = [part.name or f"object {number}" for number, part in enumerate(parts, start=1)]
-    polydata.GetFieldData().AddArray(_strings("PART_NAMES", names))
 
 
-def _strings(name: str, texts: Sequence[str]) -> Any:
-    from vtkmodules.vtkCommonCore import vtkStringArray
-
-    strings = vtkStringArray()
-    strings.SetName(name)
-    for text in texts:
-        strings.InsertNextValue(text)
-    return strings
-
-
-def _triangles(content: PointContent) -> NDArray[np.uint32] | None:
-    return content.triangles if isinstance(content, Content) else None
-
-
-def _field_arrays(content: PointContent) -> list[Any]:
-    from vtkmodules.vtkCommonCore import vtkDoubleArray
-
-    arrays: list[Any] = []
+def _facts(content: PointContent, parts: Sequence[Content]) -> dict[str, Any]:
+    """Return the field arrays by name: texts, or numbers of one row; none is empty."""
     inside = () if content.inside is None else (content.inside,)
-    texts_by_name = {"SPACE": (content.space,), "UNIT": ("mm",), "INSIDE": inside, "CERTIFICATE": content.certificate}
-    for name, texts in texts_by_name.items():
-        if texts:
-            arrays.append(_strings(name, texts))
-    numbers: list[tuple[str, list[float]]] = []
+    facts: dict[str, Any] = {
+        "SPACE": (content.space,),
+        "UNIT": ("mm",),
+        "INSIDE": inside,
+        "CERTIFICATE": content.certificate,
+    }
     if content.iso_value_hu is not None:
-        numbers.append(("ISO_VALUE_HU", [content.iso_value_hu]))
+        facts["ISO_VALUE_HU"] = np.array([content.iso_value_hu], np.float64)
     if content.affine is not None:
-        numbers.append(("AFFINE_IJK_TO_LPS_MM", content.affine.ravel().tolist()))
-    for name, values in numbers:
-        doubles = vtkDoubleArray()
-        doubles.SetName(name)
-        doubles.SetNumberOfComponents(len(values))
-        doubles.InsertNextTuple(values)
-        arrays.append(doubles)
-    return arrays
+        facts["AFFINE_IJK_TO_LPS_MM"] = content.affine.ravel().astype(np.float64)
+    facts["PART_NAMES"] = [part.name or f"object {number}" for number, part in enumerate(parts, start=1)]
+    return {name: values for name, values in facts.items() if len(values)}
 
 
 def verify(path: Path, content: PointContent | Assembly) -> None:
@@ -247,7 +269,7 @@ def verify(path: Path, content: PointContent | Assembly) -> None:
         head = stream.read(8192).decode("latin-1")
         stream.seek(max(path.stat().st_size - 64, 0))
         end = stream.read()
-    points, triangles = len(content.vertices), _triangles(content)
+    points, triangles = len(content.vertices), content.triangles if isinstance(content, Content) else None
     cells = ("NumberOfVerts", points) if triangles is None else ("NumberOfPolys", len(triangles))
     for name, count in (("NumberOfPoints", points), cells):
         match = re.search(rf'{name}="(\d+)"', head)

@@ -18,6 +18,7 @@ from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.connectivity import find_edges
 from clrecon.mesh.intersections import find_self_intersections
 from clrecon.mesh.quality import MeshQuality, measure_quality, measure_triangles
+from clrecon.mesh.triangle_tree import TriangleTree
 from clrecon.system.arguments import Space, as_numbers, explains_arguments
 from clrecon.system.packages import ShownAsHtml, import_package, public_function
 from clrecon.system.pieces import find_bounds, local_origin
@@ -203,7 +204,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         NoSurfaceError
             Nothing lies on that side.
         """
-        from clrecon.mesh.vtk import CellLocator, clip_surface, unwrap_polydata
+        from clrecon.mesh.vtk import clip_surface, unwrap_polydata
 
         surface, at, along, origin = self._cut_by(point, normal)
         if capped and find_edges(self.triangles, self.vertex_count).boundary:
@@ -219,7 +220,7 @@ class Mesh(BaseMesh, ShownAsHtml):
             made.face_values = {name: raw.face_values[name] for name in self.face_values}
         elif self.face_values:
             middles = raw.vertices[raw.triangles].mean(axis=1, dtype=np.float64)
-            _, rows, _ = CellLocator(self.vertices - origin, self.triangles).nearest(middles)
+            _, rows, _ = TriangleTree(self.vertices - origin, self.triangles).nearest(middles)
             cap = raw.face_values["Labels"] > 0
             made.face_values = {name: np.where(cap, np.nan, own[rows]) for name, own in self.face_values.items()}
         return made
@@ -268,10 +269,8 @@ class Mesh(BaseMesh, ShownAsHtml):
         nearest, distances, triangles : ndarray, shape (n, 3), (n,) and (n,)
             LPS mm; mm without a sign, which `measure_vertex_distances` has; rows of the triangles.
         """
-        from clrecon.mesh.vtk import CellLocator
-
         asked, origin = _finite_points(points, "points"), self._origin()
-        nearest, rows, distances = CellLocator(self.vertices - origin, self.triangles).nearest(asked - origin)
+        nearest, rows, distances = TriangleTree(self.vertices - origin, self.triangles).nearest(asked - origin)
         return nearest + origin, distances, rows
 
     @explains_arguments
@@ -283,8 +282,6 @@ class Mesh(BaseMesh, ShownAsHtml):
         start, direction : array_like, shape (n, 3) or (3,)
             LPS mm, and vectors of any length but 0; one alone is that of all rays.
         """
-        from clrecon.mesh.vtk import CellLocator
-
         starts, ways = _finite_points(start, "start"), _finite_points(direction, "direction")
         if len(ways) not in (1, len(starts)) or not ways.any(axis=1).all():
             raise UsageError(
@@ -294,7 +291,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         ways = ways / np.abs(ways).max(axis=1, keepdims=True)
         begin, unit = starts - origin, ways / np.linalg.norm(ways, axis=1, keepdims=True)
         far = np.linalg.norm(begin, axis=1, keepdims=True) + 2.0 * np.abs(self.vertices - origin).max()
-        return CellLocator(self.vertices - origin, self.triangles).first_hits(begin, begin + far * unit) + origin
+        return TriangleTree(self.vertices - origin, self.triangles).first_hits(begin, begin + far * unit) + origin
 
     def self_intersections(self) -> NDArray[np.int64]:
         """Find the pairs of triangles that cut each other, as rows of `triangles`, shape (k, 2), exactly."""

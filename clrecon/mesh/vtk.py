@@ -1,4 +1,4 @@
-"""VTK's work on meshes: finding the nearest triangle, the first one on a line; arrays in and out."""
+"""VTK's work on meshes: parts and cuts at planes; arrays in and out."""
 
 from __future__ import annotations
 
@@ -13,50 +13,6 @@ from clrecon.exchange.raw_content import RawMesh, numbers_of
 from clrecon.exchange.vtp import add_arrays, make_polydata
 
 Points = NDArray[np.float64]
-
-LINE_TOLERANCE = 1e-9
-"""Tolerance of `vtkStaticCellLocator`, in its own units: distance from a line at which a triangle counts as hit."""
-
-
-class CellLocator:
-    """Search for triangles of a surface, in mm near zero, by place, with `vtkStaticCellLocator`."""
-
-    def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
-        from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
-
-        self._polydata = make_polydata(vertices, np.ascontiguousarray(triangles), None)
-        self._locator = vtkStaticCellLocator()
-        self._locator.SetDataSet(self._polydata)
-        self._locator.BuildLocator()
-
-    def nearest(self, points: Points) -> tuple[Points, NDArray[np.int64], NDArray[np.float64]]:
-        """Return the nearest points of the surface, (k, 3), the rows of their triangles and the distances in mm."""
-        from vtkmodules.vtkCommonCore import reference
-        from vtkmodules.vtkCommonDataModel import vtkGenericCell
-
-        closest = [0.0, 0.0, 0.0]
-        triangle: Any = reference(0)
-        square: Any = reference(0.0)
-        others: tuple[Any, ...] = (vtkGenericCell(), triangle, reference(0), square)
-        places, rows, squares = np.empty((len(points), 3)), np.empty(len(points), dtype=np.int64), np.empty(len(points))
-        find: Any = self._locator.FindClosestPoint
-        for row, point in enumerate(points.tolist()):
-            find(point, closest, *others)
-            places[row], rows[row], squares[row] = closest, triangle.get(), square.get()
-        return places, rows, np.sqrt(squares)
-
-    def first_hits(self, starts: Points, ends: Points) -> Points:
-        """Return where lines from `starts` to `ends`, shape (k, 3), first meet the surface; NaN where they do not."""
-        from vtkmodules.vtkCommonCore import reference
-
-        hit = [0.0, 0.0, 0.0]
-        others: tuple[Any, ...] = (reference(0.0), hit, [0.0, 0.0, 0.0], reference(0), reference(0))
-        intersect: Any = self._locator.IntersectWithLine
-        found = np.full((len(starts), 3), np.nan)
-        for row, (start, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
-            if intersect(start, end, LINE_TOLERANCE, *others):
-                found[row] = hit
-        return found
 
 
 def clip_surface(surface: Any, point: Points, normal: Points, capped: bool) -> Any:

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh.mesh import Mesh
+from clrecon.mesh.triangle_tree import TriangleTree
 from clrecon.mesh.triangles import cross_products, enclosed_ml
-from clrecon.mesh.vtk import CellLocator
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import local_origin
@@ -55,11 +55,11 @@ class SurfaceDistance:
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
         self._origin = local_origin(vertices)
-        self._locator = CellLocator(vertices - self._origin, triangles)
+        self._tree = TriangleTree(vertices - self._origin, triangles)
 
     def __call__(self, points: Points) -> NDArray[np.float64]:
         """Distances in mm, shape (k,), from `points`, shape (k, 3), mm."""
-        return self._locator.nearest(points - self._origin)[2]
+        return self._tree.nearest(points - self._origin)[2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +178,7 @@ def wall_thickness(
     normals = np.cross(b - a, c - a)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     farthest = float(np.linalg.norm(near.max(axis=0) - near.min(axis=0))) + 1.0
-    found = CellLocator(near, triangles).first_hits(points - _INWARD * normals, points - farthest * normals)
+    found = TriangleTree(near, triangles).first_hits(points - _INWARD * normals, points - farthest * normals)
     return np.asarray(np.linalg.norm(found - points, axis=1))
 
 

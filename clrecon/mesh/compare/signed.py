@@ -22,8 +22,8 @@ from clrecon.mesh.compare.distances import (
 from clrecon.mesh.connectivity import find_edges, opposite_half_edges
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.quality import MeshQuality, measure_quality
+from clrecon.mesh.triangle_tree import TriangleTree
 from clrecon.mesh.triangles import cross_products, vertex_normals
-from clrecon.mesh.vtk import CellLocator
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import chunks, local_origin
@@ -54,7 +54,7 @@ class SignedDistance:
         self._origin = local_origin(vertices)
         self._vertices = (vertices - self._origin).astype(np.float64)
         self._triangles = triangles
-        self._locator = CellLocator(vertices - self._origin, triangles)
+        self._tree = TriangleTree(vertices - self._origin, triangles)
         self._sign = 1.0 if outward else -1.0
         faces = np.zeros((len(triangles), 3))
         for where, _, cross in cross_products(vertices, triangles, np.zeros(3)):
@@ -67,7 +67,7 @@ class SignedDistance:
     def __call__(self, points: Points) -> NDArray[np.float64]:
         """Distances in mm, shape (k,), from `points`, shape (k, 3), mm; positive outside."""
         local = points - self._origin
-        nearest, rows, _ = self._locator.nearest(local)
+        nearest, rows, _ = self._tree.nearest(local)
         away = local - nearest
         distance = np.sqrt(np.einsum("ij,ij->i", away, away))
         side = np.einsum("ij,ij->i", away, self._normals_at(nearest, rows))

@@ -1,0 +1,284 @@
+"""Search for triangles of a surface by place: the nearest to each point, the first on each line.
+
+A tree of boxes (Ericson 2005, chapter 6): triangles in the order of a curve through space (Morton 1966), some to a
+leaf, `FAN` boxes to the next above.  Points and lines go down it together, level by level.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.mesh.triangles import cross_product
+from clrecon.system.pieces import find_bounds, in_threads
+
+LEAF, FAN = 4, 8
+"""Triangles in a leaf, and boxes in a node."""
+
+PIECE, MOST_PAIRS = 1 << 11, 1 << 18
+"""Points that go down together, and pairs of a point and a box beyond which they part: each point far from a surface is
+about as near to many of its boxes."""
+
+CURVE_BITS = 10
+"""Bits of a place along each axis, by which triangles are put in order."""
+
+REACHES = (1 / 64, 1 / 16, 1 / 4, 1.0)
+"""Shares of a line that are searched in turn: the first triangle is near, most boxes on the line are not."""
+
+LEAST_SINE = 1e-5
+"""Sine of the angle between two edges below which a triangle is as good as its edges: its plane is not known."""
+
+BESIDE = 1e-9
+"""Share of a triangle by which a line may miss it: no line passes between two triangles with a common edge."""
+
+Points = NDArray[np.float64]
+Columns = NDArray[np.float64]
+"""Shape (3, k): one row each for x, y, z."""
+
+
+class TriangleTree:
+    """The tree of a surface with at least one triangle.
+
+    vertices: ndarray, shape (n, 3). mm, near zero: digits of coordinates far from it are lost.
+    """
+
+    def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
+        self._columns = np.ascontiguousarray(vertices.T, dtype=np.float64)
+        corners = np.ascontiguousarray(triangles.T).astype(np.intp)
+        low, high = np.empty((2, 3, len(triangles)))
+        for axis, column in enumerate(self._columns):
+            a, b, c = (column.take(corner, mode="clip") for corner in corners)
+            np.minimum(np.minimum(a, b), c, out=low[axis])
+            np.maximum(np.maximum(a, b), c, out=high[axis])
+        self._curve = _Curve(low + high)
+        codes = self._curve.codes(low + high)
+        order = np.argsort(codes, kind="stable")
+        order = np.concatenate([order, np.full(-len(order) % LEAF, order[-1])])
+        self._rows, self._firsts = order.reshape(-1, LEAF), codes[order[::LEAF]]
+        self._corners = corners
+        # Rounded outwards: no triangle is left out for the digits of its box.
+        lows = np.nextafter(low[:, self._rows].min(axis=2), -np.inf, dtype=np.float32)
+        highs = np.nextafter(high[:, self._rows].max(axis=2), np.inf, dtype=np.float32)
+        self._levels: list[NDArray[np.float32]] = []
+        while not self._levels or len(self._levels[0]) > 1:
+            empty = ((0, 0), (0, -lows.shape[1] % FAN))
+            lows = np.pad(lows, empty, constant_values=np.inf).reshape(3, -1, FAN)
+            highs = np.pad(highs, empty, constant_values=-np.inf).reshape(3, -1, FAN)
+            self._levels.insert(0, np.ascontiguousarray(np.concatenate([lows, highs]).swapaxes(0, 1)))
+            lows, highs = lows.min(axis=2), highs.max(axis=2)
+
+    def nearest(self, points: Points) -> tuple[Points, NDArray[np.int64], NDArray[np.float64]]:
+        """Return the nearest places of the surface (k, 3), the rows of their triangles and the distances in mm."""
+        places, rows = np.empty((len(points), 3)), np.empty(len(points), np.int64)
+        squares = np.empty(len(points))
+
+        def work(where: slice) -> None:
+            places[where], rows[where], squares[where] = self._find_nearest(points[where])
+
+        in_threads(work, len(points), PIECE)
+        return places, rows, np.sqrt(squares)
+
+    def first_hits(self, starts: Points, ends: Points) -> Points:
+        """Return where lines from `starts` to `ends`, shape (k, 3), first meet the surface; NaN where they do not."""
+        shares = np.full(len(starts), np.inf)
+
+        def work(where: slice) -> None:
+            for reach in REACHES:
+                left = np.flatnonzero(np.isinf(shares[where]))
+                lines = starts[where][left], ends[where][left] - starts[where][left]
+                shares[where][left] = self._find_first(*lines, reach)
+
+        in_threads(work, len(starts), PIECE)
+        return np.where(np.isinf(shares), np.nan, shares)[:, None] * (ends - starts) + starts
+
+    def _find_nearest(self, points: Points) -> tuple[Points, NDArray[np.int64], NDArray[np.float64]]:
+        columns, every = np.ascontiguousarray(points.T), np.arange(len(points))
+        start = np.maximum(np.searchsorted(self._firsts, self._curve.codes(2.0 * columns), side="right") - 1, 0)
+        found = self._measure(columns, every, start)
+        pairs = self._descend(
+            lambda items, boxes: _squares_to_boxes(columns[:, items], boxes),
+            found[2].copy(),
+            lambda items, boxes: _squares_to_corners(columns[:, items], boxes),
+        )
+        if pairs is None:
+            halves = [self._find_nearest(half) for half in np.array_split(points, 2)]
+            places, rows, squares = (np.concatenate(both) for both in zip(*halves, strict=True))
+            return places, rows, squares
+        items, leaves, bounds = pairs
+        for some in (_least_of(items, bounds)[1], slice(None)):  # the nearest box of each first: it rules out others
+            near = bounds[some] < found[2][items[some]]
+            here = items[some][near]
+            other = self._measure(columns[:, here], here, leaves[some][near])
+            here, best = _least_of(here, other[2])
+            nearer = other[2][best] < found[2][here]
+            for values, others in zip(found, other, strict=True):
+                values[here[nearer]] = others[best[nearer]]
+        return found
+
+    def _measure(
+        self, columns: Columns, items: NDArray[np.intp], leaves: NDArray[np.intp]
+    ) -> tuple[Points, NDArray[np.int64], NDArray[np.float64]]:
+        """Return the places nearest to points on the triangles of one leaf each, with rows and squares."""
+        rows = self._rows[leaves].reshape(-1)
+        a, b, c = (self._columns.take(corner.take(rows), axis=1, mode="clip") for corner in self._corners)
+        b -= a
+        c -= a
+        away = (columns[:, :, None] - a.reshape(3, -1, LEAF)).reshape(3, -1)
+        u, v, gain = nearest_shares(away, b, c)
+        gain += np.einsum("ij,ij->j", away, away)
+        best = LEAF * np.arange(len(leaves)) + gain.reshape(-1, LEAF).argmin(axis=1)
+        places = a[:, best] + u[best] * b[:, best] + v[best] * c[:, best]
+        away = columns - places
+        return places.T, rows[best], np.einsum("ij,ij->j", away, away)
+
+    def _find_first(self, starts: Points, ways: Points, reach: float) -> NDArray[np.float64]:
+        """Return the share of each way at which a line first meets the surface, infinity beyond `reach`."""
+        begin, way = np.ascontiguousarray(starts.T), np.ascontiguousarray(ways.T)
+        way[way == 0.0] = np.finfo(float).tiny
+        pairs = self._descend(
+            lambda items, boxes: _enter_boxes(begin[:, items], way[:, items], boxes), np.full(len(starts), reach)
+        )
+        if pairs is None:
+            halves = zip(np.array_split(starts, 2), np.array_split(ways, 2), strict=True)
+            return np.concatenate([self._find_first(*half, reach) for half in halves])
+        items, rows = pairs[0].repeat(LEAF), self._rows[pairs[1]].reshape(-1)
+        a, b, c = (self._columns.take(corner.take(rows), axis=1, mode="clip") for corner in self._corners)
+        shares = _shares_of_lines(begin[:, items], ways.T[:, items], a, b - a, c - a)
+        shares[~(shares <= reach)] = np.inf
+        found = np.full(len(starts), np.inf)
+        items, best = _least_of(items, shares)
+        found[items] = shares[best]
+        return found
+
+    def _descend(
+        self,
+        lowest: Callable[[NDArray[np.intp], NDArray[np.float32]], NDArray[np.float64]],
+        limits: NDArray[np.float64],
+        highest: Callable[[NDArray[np.intp], NDArray[np.float32]], NDArray[np.float64]] | None = None,
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]] | None:
+        """Return pairs of an item and a leaf, in the order of items, and their bounds; None: too many for one piece.
+
+        lowest: Bounds of items in the boxes (k, 6, `FAN`) of a node, which they go down where these are below limits.
+        highest: Bounds in boxes (k, 6) from which their triangles keep below: no limit needs to be higher.
+        """
+        items, nodes, bounds = np.arange(len(limits)), np.zeros(len(limits), np.intp), np.zeros(len(limits))
+        for level in self._levels:
+            boxes = level[nodes]
+            every = lowest(items, boxes)
+            pair, child = np.nonzero(every <= limits[items, None])
+            items, nodes, bounds = items[pair], FAN * nodes[pair] + child, every[pair, child]
+            if highest is not None and len(items):
+                some, best = _least_of(items, far := highest(items, boxes[pair, :, child]))
+                limits[some] = np.minimum(limits[some], far[best])
+            if len(items) > MOST_PAIRS and len(limits) > 1:
+                return None
+        return items, nodes, bounds
+
+
+class _Curve:
+    """A Morton curve through the box around points (3, k)."""
+
+    def __init__(self, columns: Columns):
+        self._low, high = (end[:, None] for end in find_bounds(columns.T))
+        size = np.where(high > self._low, high - self._low, np.inf)
+        self._steps = (2**CURVE_BITS - 1) / size
+        number = np.arange(2**CURVE_BITS, dtype=np.uint32)
+        self._spread = np.bitwise_or.reduce([(number >> bit & 1) << 3 * bit for bit in range(CURVE_BITS)])
+
+    def codes(self, columns: Columns) -> NDArray[np.uint32]:
+        """Return the place on the curve of each point, (k,); of those beside the box that of its border."""
+        cells = np.clip((columns - self._low) * self._steps, 0, 2**CURVE_BITS - 1).astype(np.intp)
+        x, y, z = self._spread[cells]
+        return np.asarray(x | y << 1 | z << 2)
+
+
+def _squares_to_boxes(columns: Columns, boxes: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return squared distances (k, `FAN`) of points (3, k) from boxes (k, 6, `FAN`); infinity for those left empty."""
+    squares = np.zeros((len(boxes), FAN))
+    for axis, column in enumerate(columns):
+        away = np.maximum(boxes[:, axis] - column[:, None], column[:, None] - boxes[:, axis + 3])
+        np.maximum(away, 0.0, out=away)
+        squares += np.square(away, out=away)
+    return squares
+
+
+def _squares_to_corners(columns: Columns, boxes: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return squared distances (k,) of points (3, k) from the farthest corners of boxes (k, 6)."""
+    squares = np.zeros(len(boxes))
+    for axis, column in enumerate(columns):
+        squares += np.square(np.maximum(column - boxes[:, axis], boxes[:, axis + 3] - column))
+    return squares
+
+
+def _enter_boxes(begin: Columns, way: Columns, boxes: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the share of its way at which each line (3, k) enters boxes (k, 6, `FAN`), infinity if it does not."""
+    enter, leave = np.zeros((len(boxes), FAN)), np.full((len(boxes), FAN), np.inf)
+    with np.errstate(over="ignore"):
+        for axis in range(3):
+            sides = [(boxes[:, side] - begin[axis, :, None]) / way[axis, :, None] for side in (axis, axis + 3)]
+            np.maximum(enter, np.minimum(*sides), out=enter)
+            np.minimum(leave, np.maximum(*sides), out=leave)
+    return np.where((enter <= leave) & (boxes[:, 0] <= boxes[:, 3]), enter, np.inf)
+
+
+def nearest_shares(
+    away: Columns, b: Columns, c: Columns
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the shares of the edges b and c (3, k) from a corner whose sum is the place nearest to a point, `away`
+    from the corner, and by how much this is nearer than the corner, as a negative difference of squares.
+    """
+    bb, bc, cc, to_b, to_c = (np.einsum("ij,ij->j", *pair) for pair in ((b, b), (b, c), (c, c), (b, away), (c, away)))
+    square = bb * cc - bc * bc
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = (cc * to_b - bc * to_c) / square, (bb * to_c - bc * to_b) / square
+        inside = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (square > LEAST_SINE**2 * bb * cc)
+        gain = -u * to_b - v * to_c
+        rest = np.flatnonzero(~inside)
+        bb, bc, cc, to_b, to_c = (each[rest] for each in (bb, bc, cc, to_b, to_c))
+        dd, to_d = bb + cc - 2.0 * bc, to_c - to_b + bb - bc  # of the third edge, from b to c
+        on_b, on_c, on_d = (
+            np.clip(np.nan_to_num(to / own), 0.0, 1.0) for to, own in ((to_b, bb), (to_c, cc), (to_d, dd))
+        )
+    gains = np.stack(
+        [
+            on_b * (on_b * bb - 2.0 * to_b),
+            on_c * (on_c * cc - 2.0 * to_c),
+            on_d * (on_d * dd - 2.0 * to_d) + bb - 2.0 * to_b,
+        ]
+    )
+    edge = gains.argmin(axis=0)
+    u[rest], v[rest] = np.choose(edge, (on_b, 0.0, 1.0 - on_d)), np.choose(edge, (0.0, on_c, on_d))
+    gain[rest] = gains.min(axis=0)
+    return u, v, gain
+
+
+def _shares_of_lines(begin: Columns, way: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
+    """Return the share of its way at which each line meets its triangle, else infinity (Moeller and Trumbore 1997).
+
+    b, c: The edges from the corner a.
+    """
+    across = cross_product(way, c)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        inverse = 1.0 / np.einsum("ij,ij->j", b, across)
+        there = begin - a
+        u = np.einsum("ij,ij->j", there, across) * inverse
+        across = cross_product(there, b)
+        v = np.einsum("ij,ij->j", way, across) * inverse
+        share = np.einsum("ij,ij->j", c, across) * inverse
+        meets = (u >= -BESIDE) & (v >= -BESIDE) & (u + v <= 1.0 + BESIDE) & (share >= 0.0)
+    return np.where(meets, share, np.inf)
+
+
+def _least_of(items: NDArray[np.intp], values: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the items, of ascending ones given, and for each the row of its least value, the first of equals."""
+    first = np.flatnonzero(np.diff(items, prepend=-1))
+    if not len(first):
+        return items, first
+    least = np.minimum.reduceat(values, first)
+    group = np.repeat(np.arange(len(first)), np.diff(first, append=len(items)))
+    equal = np.flatnonzero(values == least[group])[::-1]  # backwards: the first of equals wins
+    best = np.empty(len(first), np.intp)
+    best[group[equal]] = equal
+    return items[first], best
