@@ -12,6 +12,7 @@ or packed by zlib (VTK's "XML file formats").  Several pieces become one cloud.
 from __future__ import annotations
 
 import binascii
+import math
 import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -172,46 +173,40 @@ def write(stream: BinaryIO, content: PointContent | Assembly) -> None:
     ends = np.arange(corners.shape[1], corners.size + 1, corners.shape[1])
     cells = {"Verts": 0, "Lines": 0, "Strips": 0, "Polys": 0} | {"Verts" if faces is None else "Polys": len(corners)}
     counts = {f"NumberOf{kind}": str(count) for kind, count in {"Points": len(content.vertices), **cells}.items()}
-    of_points: dict[str, NDArray[Any] | None] = {
-        "Normals": content.normals,
-        "HU": content.hu,
-        "label": content.labels,
-        **content.values,
-    }
+    own = {"Normals": content.normals, "HU": content.hu, "label": content.labels}
     active = {"Scalars": "HU", "Normals": "Normals"}
     of_faces = content.face_values if isinstance(content, Content) else {}
+    sections: list[tuple[str, dict[str, str], dict[str, Any]]] = [
+        (
+            "PointData",
+            {kind: name for kind, name in active.items() if own[name] is not None},
+            {**own, **content.values},
+        ),
+        ("CellData", {}, {**of_faces, **_numbers_of_parts(parts)}),
+        ("Points", {}, {"Points": content.vertices}),
+    ]
+    for kind, count in cells.items():
+        pair = {"connectivity": corners.reshape(-1), "offsets": ends}
+        sections.append((kind, {}, {name: np.asarray(all_of if count else [], whole) for name, all_of in pair.items()}))
 
-    blocks: list[NDArray[Any]] = []
-    root = ElementTree.Element(
-        "VTKFile", type="PolyData", version="1.0", byte_order="LittleEndian", header_type="UInt64"
-    )
+    about = {"type": "PolyData", "version": "1.0", "byte_order": "LittleEndian", "header_type": "UInt64"}
+    root = ElementTree.Element("VTKFile", about)
     surface = ElementTree.SubElement(root, "PolyData")
-    field = ElementTree.SubElement(surface, "FieldData")
+    field, blocks = ElementTree.SubElement(surface, "FieldData"), list[NDArray[Any]]()
     for name, facts in _facts(content, parts).items():
         _append(blocks, field, name, facts, is_row=True)
     piece = ElementTree.SubElement(surface, "Piece", counts)
-    given = {kind: name for kind, name in active.items() if of_points[name] is not None}
-    data = ElementTree.SubElement(piece, "PointData", given)
-    for name, numbers in of_points.items():
-        if numbers is not None:
-            _append(blocks, data, name, numbers)
-    data = ElementTree.SubElement(piece, "CellData")
-    for name, numbers in {**of_faces, **_numbers_of_parts(parts)}.items():
-        _append(blocks, data, name, numbers)
-    _append(blocks, ElementTree.SubElement(piece, "Points"), "Points", content.vertices)
-    for kind, count in cells.items():
-        data = ElementTree.SubElement(piece, kind)
-        for name, numbers in (("connectivity", corners.reshape(-1)), ("offsets", ends)):
-            _append(blocks, data, name, np.asarray(numbers if count else numbers[:0], whole))
-    xml = ElementTree.tostring(root, encoding="us-ascii", xml_declaration=True)
-    stream.write(xml.removesuffix(_END) + b'<AppendedData encoding="raw">_')
+    for tag, attributes, arrays in sections:
+        section = ElementTree.SubElement(piece, tag, attributes)
+        for name, numbers in arrays.items():
+            if numbers is not None:
+                _append(blocks, section, name, numbers)
+    xml = ElementTree.tostring(root, "us-ascii", xml_declaration=True).removesuffix(_END)
+    stream.write(xml + b'<AppendedData encoding="raw">_')
     for block in blocks:
-        stream.write(np.uint64(block.nbytes).astype("<u8").tobytes())
+        stream.write(block.nbytes.to_bytes(8, "little"))
         stream.write(block.reshape(-1).view(np.uint8).data)
     stream.write(b"</AppendedData>" + _END)
-
-
-_NAMES_OF_TYPES = {"i": "Int", "u": "UInt", "f": "Float"}
 
 
 def _append(
@@ -226,15 +221,14 @@ def _append(
     else:
         numbers = np.asarray(values)
         block = np.ascontiguousarray(numbers, numbers.dtype.newbyteorder("<"))
-        kind = f"{_NAMES_OF_TYPES[numbers.dtype.kind]}{8 * numbers.itemsize}"
-        size = {"NumberOfTuples": "1"} if is_row else {}
-        width = numbers.size if is_row else numbers[:1].size if numbers.ndim > 1 else 1
-        ElementTree.SubElement(parent, "DataArray", {"type": kind, "NumberOfComponents": str(width), **size, **told})
+        kind = {"i": "Int", "u": "UInt", "f": "Float"}[numbers.dtype.kind] + str(8 * numbers.itemsize)
+        width = numbers.size if is_row else math.prod(numbers.shape[1:])
+        told |= {"type": kind, "NumberOfComponents": str(width)} | ({"NumberOfTuples": "1"} if is_row else {})
+        ElementTree.SubElement(parent, "DataArray", told)
     blocks.append(block)
 
 
 def _numbers_of_parts(parts: Sequence[Content]) -> dict[str, NDArray[Any]]:
-    """Return the arrays of the triangles of several meshes."""
     if not parts:
         return {}
     counts = [len(part.triangles) for part in parts]
@@ -248,12 +242,8 @@ def _numbers_of_parts(parts: Sequence[Content]) -> dict[str, NDArray[Any]]:
 def _facts(content: PointContent, parts: Sequence[Content]) -> dict[str, Any]:
     """Return the field arrays by name: texts, or numbers of one row; none is empty."""
     inside = () if content.inside is None else (content.inside,)
-    facts: dict[str, Any] = {
-        "SPACE": (content.space,),
-        "UNIT": ("mm",),
-        "INSIDE": inside,
-        "CERTIFICATE": content.certificate,
-    }
+    facts: dict[str, Any] = {"SPACE": (content.space,), "UNIT": ("mm",), "INSIDE": inside}
+    facts["CERTIFICATE"] = content.certificate
     if content.iso_value_hu is not None:
         facts["ISO_VALUE_HU"] = np.array([content.iso_value_hu], np.float64)
     if content.affine is not None:
@@ -269,8 +259,8 @@ def verify(path: Path, content: PointContent | Assembly) -> None:
         head = stream.read(8192).decode("latin-1")
         stream.seek(max(path.stat().st_size - 64, 0))
         end = stream.read()
-    points, triangles = len(content.vertices), content.triangles if isinstance(content, Content) else None
-    cells = ("NumberOfVerts", points) if triangles is None else ("NumberOfPolys", len(triangles))
+    points = len(content.vertices)
+    cells = ("NumberOfPolys", len(content.triangles)) if isinstance(content, Content) else ("NumberOfVerts", points)
     for name, count in (("NumberOfPoints", points), cells):
         match = re.search(rf'{name}="(\d+)"', head)
         if match is None or int(match[1]) != count:
