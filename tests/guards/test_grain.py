@@ -11,11 +11,11 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 92_441,
+    "lines": 92_711,
     "modules": 419,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
-    "options_in_several_files": 16,
+    "options_in_several_files": 15,
     "modules_with_own_all": 0,
 }
 """Who takes something away lowers the figure in the same commit; who needs more says why in the commit."""
