@@ -12,7 +12,7 @@ from house_figures import count_grain
 
 CEILINGS = {
     "lines": 92_711,
-    "modules": 419,
+    "modules": 420,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
     "options_in_several_files": 15,
