@@ -25,6 +25,8 @@ from clrecon.system.pieces import side_by_side
 _FEW = 0.05
 """Share of the vertices or triangles up to which it is faster to look at the triangles around each than at all."""
 
+_CHECKS = ("cuts", "distances", "faults", "components", "vertices", "volumes")
+
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
 
@@ -47,26 +49,27 @@ class Clusters:
         find_crossings: FindCrossings = find_self_intersections,
     ):
         self._triangles, self._origin, self._find_crossings = triangles, origin, find_crossings
-        self._names, self._original = np.arange(len(vertices)), self._rounded(vertices)
-        self._places = self._original.copy()
+        self._original = self._rounded(vertices)
+        self.names: IntArray = np.arange(len(vertices))
+        """For each vertex the one that represents its cluster, shape (n,)."""
+        self.places = self._original.copy()
+        """Places of the vertices that represent a cluster, shape (n, 3), relative to the origin; others are unused."""
         self._collapses = Collapses(len(vertices))
         self._named, self._is_face = triangles.copy(), _are_faces(triangles)
         self._faces: NDArray[np.uint32] | None = None
-        self._quadrics, edges = side_by_side(
-            lambda: Quadrics(self._original, triangles), lambda: find_edges(triangles, len(vertices))
-        )
         self.fans = Fans(triangles, len(vertices))
         """Fans of the given surface."""
+        self._quadrics, edges = side_by_side(
+            lambda: Quadrics(self._original, triangles, self.fans), lambda: find_edges(triangles, len(vertices))
+        )
         self._components = label_components(triangles, len(vertices), edges)
         self._topology = measure_topology(triangles, self._components[1], self._components[0], edges)
         self._is_border = edges.border(len(vertices))
         # For each original triangle, faces that show that it lies within the bound (witnesses); -1 where none is known.
         itself = np.where(self._is_face, np.arange(len(triangles), dtype=np.int32), np.int32(-1))
         self._witnesses = np.repeat(itself[None], WITNESSES, axis=0)
-        # Vertices whose name or place has changed since the surface was last examined.
-        self._new_to_cuts, self._new_to_distances, self._new_to_faults, self._new_to_vertices = (
-            np.zeros(len(vertices), dtype=bool) for _ in range(4)
-        )
+        # Vertices whose name or place has changed since each of these looked at them.
+        self._new = {check: np.zeros(len(vertices), dtype=bool) for check in _CHECKS}
         # Whether all of the surface has been examined for faults since the last collapses, and whether none were there.
         self._examined = self._sound = False
 
@@ -77,9 +80,9 @@ class Clusters:
         """Merge the second vertices of collapses (c, 2) into the first; return `points` and `faces` afterwards."""
         standing = self.standing()
         into = last_of_collapses(collapses, len(standing))
-        rename = np.arange(len(self._names))
+        rename = np.arange(len(self.names))
         rename[standing] = standing[into]
-        names, places = rename[self._names], self._places.copy()
+        names, places = rename[self.names], self.places.copy()
         named = names.astype(np.uint32)[self._triangles]
         is_face = _are_faces(named)
         left = named[is_face]
@@ -93,26 +96,17 @@ class Clusters:
         moved = going_on[gained]
         places[moved] = self._rounded(points[gained])
         self._collapses.add(standing[collapses])
-        self._names, self._places = names, places
+        self.names, self.places = names, places
         self._named, self._is_face, self._faces = named, is_face, left
-        for fresh in (self._new_to_cuts, self._new_to_distances, self._new_to_vertices):
-            fresh[moved] = True
+        for check, new in self._new.items():
+            new[moved] |= check != "faults"
+        self._new["components"][rename != np.arange(len(rename))] = True  # of a component that is gone none has moved
         self._examined = self._sound = False
 
     @property
     def collapsed_count(self) -> int:
         """Number of vertices that were merged into another."""
-        return int(np.count_nonzero(self._names != np.arange(len(self._names))))
-
-    @property
-    def names(self) -> IntArray:
-        """For each vertex the one that represents its cluster, shape (n,)."""
-        return self._names
-
-    @property
-    def places(self) -> Float64Array:
-        """Places of the vertices that represent a cluster, shape (n, 3), relative to the origin; others are unused."""
-        return self._places
+        return int(np.count_nonzero(self.names != np.arange(len(self.names))))
 
     def faces(self) -> NDArray[np.uint32]:
         """Triangles with three different names, shape (k, 3)."""
@@ -122,34 +116,49 @@ class Clusters:
 
     def standing(self) -> IntArray:
         """The vertices that represent a cluster and have faces, in their order."""
-        used = np.zeros(len(self._names), dtype=bool)
-        used[self.faces().reshape(-1)] = True
-        return np.flatnonzero(used)
+        return self.numbered()[0]
 
-    def surface(self) -> tuple[Float64Array, NDArray[np.uint32]]:
-        """Places relative to the origin, and triangles, numbered without gaps."""
-        standing, faces = self._without_gaps()
-        return self._places[standing], faces
-
-    def _without_gaps(self) -> tuple[IntArray, NDArray[np.uint32]]:
-        """Return the vertices as of `standing`, and the faces as rows of these, shape (k, 3)."""
-        standing = self.standing()
-        number = np.zeros(len(self._names), dtype=np.uint32)
+    def numbered(self, part: NDArray[np.bool_] | None = None) -> tuple[IntArray, NDArray[np.uint32]]:
+        """Return the vertices as of `standing`, and the faces as rows of these, shape (k, 3); of components, (count,),
+        if a part is given.
+        """
+        faces = self.faces()
+        if part is not None:
+            faces = faces[part[self._components[1].take(faces[:, 0])]]
+        used = np.zeros(len(self.names), dtype=bool)
+        used[faces.reshape(-1)] = True
+        standing = np.flatnonzero(used)
+        number = np.zeros(len(used), dtype=np.uint32)
         number[standing] = np.arange(len(standing), dtype=np.uint32)
-        return standing, number.take(self.faces(), mode="clip")
+        return standing, number.take(faces, mode="clip")
+
+    def _take_new(self, check: str) -> NDArray[np.bool_]:
+        """Return the vertices that are new to a check, and note that it has seen them."""
+        new, self._new[check] = self._new[check], np.zeros(len(self.names), dtype=bool)
+        return new
+
+    def _changed_components(self, new: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        count, labels = self._components
+        found = np.zeros(count + 1, dtype=bool)
+        found[labels[new]] = True  # -1, the last, is that of vertices without triangles
+        return found[:-1]
+
+    def take_changed(self) -> tuple[IntArray, NDArray[np.uint32]]:
+        """Return what is `numbered` of the components that changed since the last call."""
+        return self.numbered(self._changed_components(self._take_new("volumes")))
 
     def undo(self, names: IntArray) -> int:
         """Undo the last collapses of these clusters; return the number of vertices in those that had collapses."""
         if len(names) == 0:
             return 0
-        marked = np.zeros(len(self._names), dtype=bool)
+        marked = np.zeros(len(self.names), dtype=bool)
         marked[names] = True
-        undone, left = self._collapses.undo(marked, self._names)
-        moved = undone[self._names]
+        undone, left = self._collapses.undo(marked, self.names)
+        moved = undone[self.names]
         members = np.flatnonzero(moved)
         if len(members) == 0:
             return 0
-        into = np.arange(len(self._names))
+        into = np.arange(len(self.names))
         into[left[:, 1]] = left[:, 0]
         while True:
             back = into[members]
@@ -157,38 +166,38 @@ class Clusters:
             if np.array_equal(further, back):
                 break
             into[members] = further
-        self._names[members] = back
+        self.names[members] = back
         self._place(members)
-        for fresh in (self._new_to_cuts, self._new_to_distances, self._new_to_faults, self._new_to_vertices):
-            fresh[back] = True
+        for new in self._new.values():
+            new[back] = True
         rows = self._touching(members)
-        self._named[rows] = self._names[self._triangles[rows]]
+        self._named[rows] = self.names[self._triangles[rows]]
         self._is_face[rows] = _are_faces(self._named[rows])
         self._faces = None
         return len(members)
 
     def _place(self, members: IntArray) -> None:
-        names = self._names[members]
-        size = np.bincount(names, minlength=len(self._names))
+        names = self.names[members]
+        size = np.bincount(names, minlength=len(self.names))
         # The border of an open surface has no planes that would hold it.
         alone = (size == 1) | self._is_border
         at_home = names[alone[names]]
-        self._places[at_home] = self._original[at_home]
+        self.places[at_home] = self._original[at_home]
         merged = members[~alone[names]]
-        heads, clusters = np.unique(self._names[merged], return_inverse=True)
+        heads, clusters = np.unique(self.names[merged], return_inverse=True)
         if len(heads):
-            self._places[heads] = self._rounded(self._quadrics.best_places(clusters, merged, len(heads)))
+            self.places[heads] = self._rounded(self._quadrics.best_places(clusters, merged, len(heads)))
 
     def _touching(self, vertices: IntArray) -> IntArray:
-        if len(vertices) <= _FEW * len(self._names):
+        if len(vertices) <= _FEW * len(self.names):
             return self.fans.touching(vertices)
-        flags = np.zeros(len(self._names), dtype=bool)
+        flags = np.zeros(len(self.names), dtype=bool)
         flags[vertices] = True
         return np.flatnonzero(any_corner(flags, self._triangles))
 
     def _named_rows(self, flags: NDArray[np.bool_]) -> IntArray:
         """Return the given triangles that have a corner with a flagged name."""
-        return self._touching(np.flatnonzero(flags[self._names]))
+        return self._touching(np.flatnonzero(flags[self.names]))
 
     def _face_rows(self, flags: NDArray[np.bool_]) -> IntArray:
         rows = self._named_rows(flags)
@@ -196,16 +205,16 @@ class Clusters:
 
     def _has_moved(self) -> NDArray[np.bool_]:
         """Mark vertices that have another name than at first, or a name with another place."""
-        x, y, z = (self._places != self._original).T
-        return np.asarray((self._names != np.arange(len(self._names))) | (x | y | z)[self._names])
+        x, y, z = (self.places != self._original).T
+        return np.asarray((self.names != np.arange(len(self.names))) | (x | y | z)[self.names])
 
     def _have_moved(self, rows: IntArray) -> NDArray[np.bool_]:
         """Mark those of some given triangles that have a corner that has moved."""
         corners = self._triangles[rows]
         if len(rows) > _FEW * len(self._triangles):
             return any_corner(self._has_moved(), corners)
-        names = self._names[corners]
-        is_elsewhere = (self._places[names] != self._original[names]).any(axis=2)
+        names = self.names[corners]
+        is_elsewhere = (self.places[names] != self._original[names]).any(axis=2)
         return np.asarray(((names != corners) | is_elsewhere).any(axis=1))
 
     def find_faults(self, *, everywhere: bool = False) -> IntArray:
@@ -218,11 +227,11 @@ class Clusters:
             of it has been, until they are sound, and then all of it until it is so once in this round.
         """
         found: IntArray = np.zeros(0, dtype=np.int64)
-        if self._examined and self._new_to_faults.any():
-            touched = np.zeros(len(self._names), dtype=bool)
-            touched[self._named[self._face_rows(self._new_to_faults)]] = True
-            found = find_faults_beside(self._named[self._face_rows(touched)], self._new_to_faults)
-        self._new_to_faults[:] = False
+        new = self._take_new("faults")
+        if self._examined and new.any():
+            touched = np.zeros(len(self.names), dtype=bool)
+            touched[self._named[self._face_rows(new)]] = True
+            found = find_faults_beside(self._named[self._face_rows(touched)], new)
         if len(found) or (self._sound and not everywhere):
             return found
         found = self._find_faults_everywhere()
@@ -230,25 +239,31 @@ class Clusters:
         return found
 
     def _find_faults_everywhere(self) -> IntArray:
-        standing, faces = self._without_gaps()
-        if len(faces) == 0:
-            return np.unique(self._names[self._triangles])
+        """Find the faults of components that changed since the last call that looked for all of them."""
+        part = self._changed_components(self._new["components"])
+        standing, faces = self.numbered(part)
         edges = find_edges(faces, len(standing))
         faults = find_sheets(faces, len(standing), edges)
         if any(map(len, faults)):  # the other faults can only be found, or cost less, after these are repaired
             return np.asarray(standing[np.unique(np.concatenate(faults).astype(np.int64))])
-        stored = as_stored(self._places[standing] + self._origin)
-        placed = standing[np.concatenate([*_find_flat(stored, faces), find_coincident(stored)]).astype(np.int64)]
-        faults = [placed, self._find_lost(standing, faces, edges), self._find_torn(standing, faces, edges)]
+        self._take_new("components")
+        stored, everywhere = self._stored(), self.standing()
+        faults = [
+            *(standing[flat] for flat in _find_flat(stored[standing], faces)),
+            everywhere[find_coincident(stored[everywhere])],  # also in the place of one that did not change
+            self._find_lost(standing, faces, edges, part),
+            self._find_torn(standing, faces, edges),
+        ]
         return np.unique(np.concatenate(faults).astype(np.int64))
 
     def _find_torn(self, standing: IntArray, faces: NDArray[np.uint32], edges: Edges) -> IntArray:
-        """Find names where components have got another Euler number."""
+        """Find names where components that are still there have got another Euler number."""
         count, labels = self._components
-        differ = measure_topology(faces, labels[standing], count, edges).euler != self._topology.euler
+        now = measure_topology(faces, labels[standing], count, edges)
+        differ = (now.euler != self._topology.euler) & (now.faces > 0)
         if not differ.any():
             return np.zeros(0, dtype=np.int64)
-        return find_torn(self._triangles[differ[labels[self._triangles[:, 0]]]], self._names)
+        return find_torn(self._triangles[differ[labels[self._triangles[:, 0]]]], self.names)
 
     def components(self) -> tuple[int, NDArray[np.int64], NDArray[np.bool_]]:
         """Return the number of components of the given surface, the one of each vertex, and its vertices at borders."""
@@ -258,7 +273,9 @@ class Clusters:
         count, labels = self._components
         return compare_topology(self._topology, measure_topology(self.faces(), labels, count))
 
-    def _find_lost(self, standing: IntArray, faces: NDArray[np.uint32], edges: Edges) -> IntArray:
+    def _find_lost(
+        self, standing: IntArray, faces: NDArray[np.uint32], edges: Edges, within: NDArray[np.bool_]
+    ) -> IntArray:
         """Find names of components without a face, and of all but the largest part of those that came apart."""
         count, labels = self._components
         now, parts = label_components(faces, len(standing), edges)
@@ -269,17 +286,17 @@ class Clusters:
         largest = np.full(count, -1)
         found, first = np.unique(whole[order], return_index=True)
         largest[found] = order[first]
-        of_name = np.full(len(self._names), -1)
+        of_name = np.full(len(self.names), -1)
         of_name[standing] = parts
-        part = of_name[self._names]
-        lost = (labels >= 0) & ((part < 0) | (largest[labels] != part))
+        part = of_name[self.names]
+        lost = np.append(within, False)[labels] & ((part < 0) | (largest[labels] != part))
         if not lost.any():
             return np.zeros(0, dtype=np.int64)
         # With their surroundings: a part that has come apart can consist of vertices without clusters.
-        return np.unique(self._names[self._triangles[lost[self._triangles].any(axis=1)]])
+        return np.unique(self.names[self._triangles[lost[self._triangles].any(axis=1)]])
 
     def _stored(self) -> NDArray[np.floating]:
-        return as_stored(self._places + self._origin)
+        return as_stored(self.places + self._origin)
 
     def find_crossing(self) -> IntArray:
         """Find names of clusters at faces that cut each other after coordinates are rounded.
@@ -288,8 +305,7 @@ class Clusters:
         first again, as others may have moved to where they were not.
         """
         faces = self.faces()
-        changed = any_corner(self._new_to_cuts, faces)
-        self._new_to_cuts[:] = False
+        changed = any_corner(self._take_new("cuts"), faces)
         return np.unique(faces[find_changed_intersections(self._stored(), faces, changed, self._find_crossings)])
 
     def find_far(self, deviation: Deviation) -> IntArray:
@@ -298,26 +314,26 @@ class Clusters:
         Only faces that changed since the last call are examined.  Of the corners of a triangle that is too far away,
         the one with the last collapse is named: collapses come in order of their error.
         """
-        if not self._new_to_distances.any():
+        moved = self._take_new("distances")
+        if not moved.any():
             return np.zeros(0, dtype=np.int64)
-        named, changed = self._named, self._named_rows(self._new_to_distances)
-        self._new_to_distances[:] = False
+        named, changed = self._named, self._named_rows(moved)
         new = np.zeros(len(named), dtype=bool)
         new[changed] = True
 
         rows = np.flatnonzero(_any_witness(new, self._witnesses))
         self._witnesses[:, rows] = rows
         rows = rows[self._have_moved(rows)]
-        rows = rows[deviation.can_be_far(rows, self._names, self._places)]
-        near = np.zeros(len(self._names), dtype=bool)
+        rows = rows[deviation.can_be_far(rows, self.names, self.places)]
+        near = np.zeros(len(self.names), dtype=bool)
         near[named[rows]] = True
         around = self._face_rows(near)
         from_rows = changed[self._is_face[changed]]
         from_rows = from_rows[self._have_moved(from_rows)]
         now = named[from_rows]
         (is_left_behind, seen), is_away = side_by_side(
-            lambda: deviation.is_far_from(rows, self._names, self._places, named[around]),
-            lambda: deviation.are_far(self._places, now, from_rows),
+            lambda: deviation.is_far_from(rows, self.names, self.places, named[around]),
+            lambda: deviation.are_far(self.places, now, from_rows),
         )
         self._witnesses[:, rows] = np.append(around, -1)[seen]
         return self._pick(np.concatenate([named[rows[is_left_behind]], now[is_away]]))
@@ -326,18 +342,17 @@ class Clusters:
         """Return the names with the last collapses in each row of names, shape (k, v)."""
         if len(named) == 0:
             return np.zeros(0, dtype=np.int64)
-        last = self._collapses.latest(self._names)[named].argmax(axis=1)
+        last = self._collapses.latest(self.names)[named].argmax(axis=1)
         return np.unique(named[np.arange(len(named)), last])
 
     def find_left_behind(self, deviation: Deviation) -> IntArray:
         """Find names of clusters with vertices too far from the changed faces around them; `find_far` is exact."""
-        beside, near = (np.zeros(len(self._names), dtype=bool) for _ in range(2))
-        beside[self._named[self._face_rows(self._new_to_vertices)]] = True
-        self._new_to_vertices[:] = False
-        rows = np.flatnonzero(beside[self._names] & self._has_moved())
-        near[self._names[rows]] = True
+        beside, near = (np.zeros(len(self.names), dtype=bool) for _ in range(2))
+        beside[self._named[self._face_rows(self._take_new("vertices"))]] = True
+        rows = np.flatnonzero(beside[self.names] & self._has_moved())
+        near[self.names[rows]] = True
         faces = self._named[self._face_rows(near)]
-        return np.unique(self._names[rows[deviation.are_left_behind(rows, self._names, self._places, faces)]])
+        return np.unique(self.names[rows[deviation.are_left_behind(rows, self.names, self.places, faces)]])
 
 
 def _are_faces(named: IntArray) -> NDArray[np.bool_]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.mesh.connectivity import order_by_number
-from clrecon.mesh.triangles import cross_product
+from clrecon.mesh.connectivity import Fans, order_by_number
+from clrecon.mesh.triangles import cross_products
+from clrecon.system.pieces import in_threads
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
@@ -86,23 +87,23 @@ class Collapses:
 class Quadrics:
     """Squared distances to the planes of the triangles around each vertex (Garland and Heckbert 1997), near zero."""
 
-    def __init__(self, vertices: Float64Array, triangles: NDArray[np.uint32]):
-        from scipy.sparse import csr_array
+    def __init__(self, vertices: Float64Array, triangles: NDArray[np.uint32], fans: Fans):
+        planes = np.empty((len(triangles), 4))
+        for where, corner, normal in cross_products(vertices, triangles, np.zeros(3)):
+            length = np.sqrt(np.einsum("ij,ij->j", normal, normal))
+            normal /= np.where(length > 0.0, length, 1.0)
+            planes[where, :3], planes[where, 3] = normal.T, np.einsum("ij,ij->j", normal, corner)
+        self._vertices, self._sums = vertices, np.zeros((len(vertices), 9))
 
-        columns = np.ascontiguousarray(vertices.T)
-        one, two, three = (columns.take(corner, axis=1) for corner in triangles.T.astype(np.intp))
-        two -= one
-        three -= one
-        normal = cross_product(two, three)
-        length = np.sqrt(np.einsum("ij,ij->j", normal, normal))
-        normal /= np.where(length > 0.0, length, 1.0)
-        x, y, z = normal
-        along = np.einsum("ij,ij->j", normal, one)
-        planes = np.stack([x * x, x * y, x * z, y * y, y * z, z * z, x * along, y * along, z * along], axis=1)
-        ones = np.ones(triangles.size)
-        begin = np.arange(0, triangles.size + 1, 3, dtype=np.int32)
-        around = csr_array((ones, triangles.reshape(-1).astype(np.int32), begin), shape=(len(triangles), len(vertices)))
-        self._vertices, self._sums = vertices, around.T @ planes
+        def work(where: slice) -> None:
+            begin = fans.begin[where.start : where.stop + 1]
+            around = planes.take(fans.rows[begin[0] : begin[-1]], axis=0)
+            products = around[:, [0, 0, 0, 1, 1, 2, 0, 1, 2]] * around[:, [0, 1, 2, 1, 2, 2, 3, 3, 3]]
+            used = np.diff(begin) > 0
+            if used.any():
+                self._sums[where][used] = np.add.reduceat(products, (begin[:-1] - begin[0])[used])
+
+        in_threads(work, len(vertices))
 
     def best_places(self, clusters: IntArray, members: IntArray, count: int) -> Float64Array:
         """Return places (count, 3), mm, of the least sum of squares of `clusters` (k,), from 0 on, of `members`."""

@@ -13,7 +13,7 @@ from clrecon.mesh.compare.near_distances import NearDistance
 from clrecon.mesh.connectivity import Fans, find_edges
 from clrecon.mesh.refine.topology import any_corner
 from clrecon.mesh.triangles import corner_edges
-from clrecon.system.pieces import in_threads
+from clrecon.system.pieces import chunks, in_threads
 
 WITNESSES = 7
 """Most faces that are needed to show that a triangle is within the bound: for its corners, its middle and its edges."""
@@ -161,6 +161,9 @@ class SurfaceBounds(NearDistance):
 _MOST_STEPS = 12
 """Most parts into which an edge of the present surface is divided for points."""
 
+_POINTS = 1 << 18
+"""Points that are made and measured together: many would take more memory than both surfaces."""
+
 _NEAREST = 6
 """Most vertices near a point around which the original surface is looked for by upper bounds."""
 
@@ -265,10 +268,10 @@ class Deviation:
         far = np.zeros(len(faces), dtype=bool)
         if len(faces) == 0:
             return far
-        is_far = np.zeros(len(places), dtype=bool)
-        is_far[faces] = True
-        used = np.flatnonzero(is_far)
-        is_far[used] = self._find_far(places[used], used[:, None])
+        is_used, is_far = np.zeros((2, len(places)), dtype=bool)
+        is_used[faces] = True
+        used = np.flatnonzero(is_used)
+        is_far[used[self._find_far(places[used], used[:, None])]] = True
         far |= any_corner(is_far, faces)
 
         edges = find_edges(faces, len(places))
@@ -287,31 +290,30 @@ class Deviation:
         self, places: Float64Array, corners: NDArray[np.uint32], near: IntArray, look_at: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
         """Mark edges (n, 2) or triangles (n, 3) with a point inside too far from the original near vertices `near`."""
-        columns = [places.take(corner, axis=0) for corner in corners.T]
-        longest = np.zeros(len(corners))
-        for one, other in zip(columns, columns[1:] + columns[:1], strict=True):
-            side = one - other
-            np.maximum(longest, np.einsum("na,na->n", side, side), out=longest)
-        steps = np.clip(2 * np.ceil(np.sqrt(longest) / (4.0 * self._step)), 2, _MOST_STEPS).astype(int)
-        points, hints, of = [np.zeros((0, 3))], [near[:0]], [np.zeros(0, dtype=np.int64)]
-        for count in np.unique(steps[look_at]):
-            these = np.flatnonzero((steps == count) & look_at)
-            weights = _inner_weights(int(count), corners.shape[1])
-            flat = np.stack([column[these].reshape(-1) for column in columns])
-            points.append((weights @ flat).reshape(-1, 3))
-            hints.append(np.tile(near[these], (len(weights), 1)))
-            of.append(np.tile(these, len(weights)))
+        steps: NDArray[np.int8] = np.empty(len(corners), dtype=np.int8)
+        for where in chunks(len(corners)):
+            sides = places[corners[where]]
+            sides -= np.roll(sides, 1, axis=1)
+            longest = np.sqrt(np.einsum("nca,nca->nc", sides, sides).max(axis=1))
+            steps[where] = np.clip(2 * np.ceil(longest / (4.0 * self._step)), 2, _MOST_STEPS)
         far = np.zeros(len(corners), dtype=bool)
-        far[np.concatenate(of)[self._find_far(np.concatenate(points), np.concatenate(hints))]] = True
+        for count in np.unique(steps[look_at]):
+            rows = np.flatnonzero((steps == count) & look_at)
+            weights = _inner_weights(int(count), corners.shape[1])
+            for where in chunks(len(rows), max(_POINTS // len(weights), 1)):
+                these = rows[where]
+                ends = places[corners[these].T].reshape(corners.shape[1], -1)
+                points = (weights @ ends).reshape(-1, 3)
+                hints = np.tile(near[these], (len(weights), 1))
+                far[these[self._find_far(points, hints) % len(these)]] = True
         return far
 
-    def _find_far(self, points: Float64Array, hints: IntArray) -> NDArray[np.bool_]:
-        """Mark points that are farther than the bound from the original surface.
+    def _find_far(self, points: Float64Array, hints: IntArray) -> IntArray:
+        """Return the rows of points that are farther than the bound from the original surface.
 
         Around vertices that may be near them, shape (k, v), it is looked for first, then around the nearest corner of
         the nearest triangle there, and around the nearest vertices; what upper bounds do not decide is measured.
         """
-        is_left = np.zeros(len(points), dtype=bool)
         left = self._not_within(np.arange(len(points)), points, hints, _WALKS)
         for several in (1, _NEAREST):
             if len(left):
@@ -320,8 +322,8 @@ class Deviation:
                 left = self._not_within(left, points[left], near)
         if len(left):
             self._exact = self._exact or SurfaceDistance(self._vertices, self._triangles)
-            is_left[left] = self._exact(points[left]) > self._bound
-        return is_left
+            left = left[self._exact(points[left]) > self._bound]
+        return left
 
     def _not_within(self, rows: IntArray, points: Float64Array, near: IntArray, walks: int = 0) -> IntArray:
         """Return those of some rows whose points no upper bound shows to lie within the bound."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 
+from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.refine.collapses import Collapses, Quadrics, last_of_collapses
 
 pytestmark = pytest.mark.unit
@@ -66,9 +67,14 @@ def test_parts_of_a_cluster_have_had_as_many_turns():
     assert undone(collapses, [8], names) == ([8], (half[:4] + 8).tolist())  # its fifth: two more
 
 
+def quadrics_of(vertices: np.ndarray, triangles: np.ndarray) -> Quadrics:
+    faces = triangles.astype(np.uint32)
+    return Quadrics(vertices, faces, Fans(faces, len(vertices)))
+
+
 def test_three_planes_meet_in_the_best_place():
     vertices, triangles = samples.box()
-    quadrics = Quadrics(vertices, triangles.astype(np.uint32))
+    quadrics = quadrics_of(vertices, triangles)
     found = quadrics.best_places(np.arange(8), np.arange(8), 8)
     np.testing.assert_allclose(found, vertices, atol=1e-12)
     # Two corners: along the edge between them the mean, across it what all planes leave.
@@ -81,7 +87,7 @@ def test_three_planes_meet_in_the_best_place():
 
 def test_in_a_plane_the_best_place_is_the_mean():
     vertices = np.array([[0.0, 0.0, 3.0], [4.0, 0.0, 3.0], [0.0, 4.0, 3.0], [9.0, 9.0, 9.0]])
-    quadrics = Quadrics(vertices, np.array([[0, 1, 2]], dtype=np.uint32))
+    quadrics = quadrics_of(vertices, np.array([[0, 1, 2]]))
     found = quadrics.best_places(np.array([1, 1, 1, 0]), np.array([0, 1, 2, 3]), 2)
     np.testing.assert_allclose(found, [[9.0, 9.0, 9.0], [4 / 3, 4 / 3, 3.0]], atol=1e-12)  # the last is in no triangle
 
@@ -89,5 +95,5 @@ def test_in_a_plane_the_best_place_is_the_mean():
 def test_faces_without_area_have_no_plane():
     vertices, triangles = samples.box()
     flat = np.array([[0, 1, 1], [2, 2, 2]])
-    both = Quadrics(vertices, np.concatenate([triangles, flat]).astype(np.uint32))
+    both = quadrics_of(vertices, np.concatenate([triangles, flat]))
     np.testing.assert_allclose(both.best_places(np.arange(8), np.arange(8), 8), vertices, atol=1e-12)

@@ -197,7 +197,7 @@ def test_clusters_are_undone_from_the_last_collapse_on():
     assert clusters.undo(np.array([a])) == 3  # all of the cluster gets new names and places
     assert (clusters.collapsed_count, len(clusters.faces())) == (1, len(triangles) - 2)
     assert clusters.names[[a, b, c]].tolist() == [a, a, c]
-    best = Quadrics(vertices, faces).best_places(np.zeros(2, int), np.array([a, b]), 1)[0]
+    best = Quadrics(vertices, faces, clusters.fans).best_places(np.zeros(2, int), np.array([a, b]), 1)[0]
     np.testing.assert_allclose(clusters.places[a], best, atol=1e-5)
     np.testing.assert_allclose(clusters.places[c], vertices[c], atol=1e-6)
     assert clusters.undo(np.array([a])) == 2

@@ -51,7 +51,7 @@ def test_triangles_can_be_far_where_they_are_gone_or_a_corner_has_moved_by_more_
         np.testing.assert_array_equal(still, np.isin(triangles, (one, other)).sum(axis=1) == 2)
 
 
-def test_points_between_the_middle_and_the_corners_are_tested():
+def test_points_between_the_middle_and_the_corners_are_tested(monkeypatch):
     """A flat sheet over a surface with a dent at one of its vertices: two large faces stand for 288."""
     size = 13
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(size), np.arange(size)))
@@ -70,6 +70,9 @@ def test_points_between_the_middle_and_the_corners_are_tested():
         found = deviation.are_far(flat, faces, np.array([0, 1]))
         # Where a face came from only says where to look first.
         np.testing.assert_array_equal(found, deviation.are_far(flat, faces, np.array([287, 100])))
+        with monkeypatch.context() as patch:
+            patch.setattr("clrecon.mesh.refine.deviation._POINTS", 20)  # less than the points of one face
+            np.testing.assert_array_equal(found, deviation.are_far(flat, faces, np.array([0, 1])))
         return found.tolist()
 
     assert far() == [False, False]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 
-from clrecon.mesh.connectivity import find_edges
+from clrecon.mesh.connectivity import Edges, find_edges
 from clrecon.mesh.refine.clusters import Clusters
 from clrecon.mesh.refine.topology import find_faults_beside, find_sheets, find_torn
 
@@ -129,9 +129,42 @@ def test_all_of_a_surface_is_examined_before_what_is_new(monkeypatch):
     monkeypatch.setattr("clrecon.mesh.refine.clusters.find_faults_beside", beside)
     vertices, triangles = samples.box()
     clusters = Clusters(np.asarray(vertices, np.float64), np.asarray(triangles, np.uint32), np.zeros(3))
-    clusters._new_to_faults[0] = True
-    assert clusters.find_faults().tolist() == [] and not clusters._new_to_faults.any()
+    clusters._new["faults"][0] = True
+    assert clusters.find_faults().tolist() == [] and not clusters._new["faults"].any()
     assert clusters.find_faults().tolist() == []  # nothing is new
-    clusters._new_to_faults[0] = True
+    clusters._new["faults"][0] = True
     with pytest.raises(AssertionError, match="surroundings"):
         clusters.find_faults()
+
+
+def test_components_that_did_not_change_are_not_examined_again(monkeypatch):
+    one, other = samples.box(), samples.box()
+    vertices, triangles = samples.join(one, (other[0] + 5.0, other[1]))
+    clusters = Clusters(np.asarray(vertices, np.float64), np.asarray(triangles, np.uint32), np.zeros(3))
+    a, b = (int(corner) for corner in triangles[-1, :2])
+    names = np.where(np.arange(16) == b, a, np.arange(16))
+    left = names[triangles]
+    left = left[(left != left[:, (1, 2, 0)]).all(axis=1)]
+    standing = np.unique(left)
+    clusters.collapse(np.array([[a, b]]), vertices[standing], np.searchsorted(standing, left))
+    seen = []
+
+    def look(faces: np.ndarray, count: int) -> Edges:
+        seen.append((len(faces), count))
+        return find_edges(faces, count)
+
+    monkeypatch.setattr("clrecon.mesh.refine.clusters.find_edges", look)
+    assert clusters.find_faults().tolist() == [] and clusters.find_faults(everywhere=True).tolist() == []
+    assert seen == [(10, 7), (0, 0)]
+    standing, faces = clusters.take_changed()
+    assert standing.tolist() == [row for row in range(8, 16) if row != b]
+    np.testing.assert_array_equal(standing[faces], clusters.faces()[12:])
+    assert len(clusters.take_changed()[0]) == 0
+
+
+def test_a_component_that_is_gone_is_found_though_none_of_its_vertices_stands():
+    vertices, triangles = samples.join(samples.box(), (samples.box()[0] + 5.0, samples.box()[1]))
+    clusters = Clusters(np.asarray(vertices, np.float64), np.asarray(triangles, np.uint32), np.zeros(3))
+    pairs = np.column_stack([np.full(7, 8), np.arange(9, 16)])
+    clusters.collapse(pairs, np.asarray(vertices, np.float64)[:8], np.asarray(triangles)[:12])
+    assert clusters.find_faults().tolist() == [8]
