@@ -39,6 +39,23 @@ static inline float read_closed(const closed_field *f, const int i, const int j,
     return beyond ? f->outside : value;
 }
 
+/* Central differences per index step at the corners (i or i + 1, j or j + 1) of slice k, weighed by the parts. */
+static inline float4 mix_closed_differences(
+    const closed_field *f, const int i, const int j, const int k, const float part_i, const float part_j)
+{
+    float4 mean = (float4)(0.0f);
+    for (int b = 0; b < 2; ++b)
+        for (int a = 0; a < 2; ++a) {
+            const float weight = (a ? part_i : 1.0f - part_i) * (b ? part_j : 1.0f - part_j);
+            const int x = i + a, y = j + b;
+            mean += 0.5f * weight
+                * (float4)(read_closed(f, x + 1, y, k) - read_closed(f, x - 1, y, k),
+                           read_closed(f, x, y + 1, k) - read_closed(f, x, y - 1, k),
+                           read_closed(f, x, y, k + 1) - read_closed(f, x, y, k - 1), 0.0f);
+        }
+    return mean;
+}
+
 /* Central differences per index step, interpolated within the slices below and above a place: see find_differences(),
  * which serves where no neighbour is beyond the border. */
 static inline float find_closed_differences(const closed_field *f, const float3 place, float4 *below, float4 *above)
@@ -51,21 +68,8 @@ static inline float find_closed_differences(const closed_field *f, const float3 
     const int i = min((int)floor(at.x), (int)last.x), j = min((int)floor(at.y), (int)last.y);
     const int k = min((int)floor(at.z), (int)last.z);
     const float part_i = at.x - (float)i, part_j = at.y - (float)j;
-    float4 mean[2];
-    for (int c = 0; c < 2; ++c) {
-        mean[c] = (float4)(0.0f);
-        for (int b = 0; b < 2; ++b)
-            for (int a = 0; a < 2; ++a) {
-                const float weight = (a ? part_i : 1.0f - part_i) * (b ? part_j : 1.0f - part_j);
-                const int x = i + a, y = j + b, z = k + c;
-                mean[c] += 0.5f * weight
-                    * (float4)(read_closed(f, x + 1, y, z) - read_closed(f, x - 1, y, z),
-                               read_closed(f, x, y + 1, z) - read_closed(f, x, y - 1, z),
-                               read_closed(f, x, y, z + 1) - read_closed(f, x, y, z - 1), 0.0f);
-            }
-    }
-    *below = mean[0];
-    *above = mean[1];
+    *below = mix_closed_differences(f, i, j, k, part_i, part_j);
+    *above = mix_closed_differences(f, i, j, k + 1, part_i, part_j);
     return at.z - (float)k;
 }
 

@@ -396,15 +396,17 @@ __kernel void composite_rays(
             shows = ANY_LANE(may_show & (n < end));
             if (shows) {
                 for (int sample = 0; sample < AT_ONCE; ++sample) {
+                    /* A GPU would keep an array in memory for an index of run time: there the values move up. */
+                    const int at = LANES == 1 ? 0 : sample;
                     const float segment = n + (float)sample;
                     const ints counts = segment < end;
                     if (!ANY_LANE(counts))
                         break;
 #if TAKES_PARTS
-                    const segment_values v = { value[sample], value[sample + 1], value[sample + 2],
+                    const segment_values v = { value[at], value[at + 1], value[at + 2],
                         segment > 0.0f ? 2.0f : 1.0f, may_be_steep };
 #else
-                    const segment_values v = { value[sample] };
+                    const segment_values v = { value[at] };
 #endif
                     floats number, seen_value;
                     const floats opacity = find_opacity(
@@ -415,6 +417,8 @@ __kernel void composite_rays(
                             &seen);
                         end = choose(seen.opacity < OPAQUE, end, (floats)(0.0f));
                     }
+                    for (int next = 1; LANES == 1 && next < AT_ONCE + 2 * BESIDE; ++next)
+                        value[next - 1] = value[next];
                 }
             }
             n += (float)AT_ONCE;

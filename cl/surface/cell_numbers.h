@@ -15,6 +15,7 @@
 #define CLRECON_CELL_NUMBERS_H
 
 #include "include/mask_rows.h"
+#include "surface/picks.h"
 
 /* The crossed edges owned by one row of samples, and their numbers. */
 typedef struct {
@@ -73,8 +74,19 @@ static inline void number_rows(
 #undef FIRST
 }
 
+/* Vertex numbers of the 12 edges of a cell. */
+typedef struct {
+    uint8 along_xy;
+    uint4 along_z;
+} cell_numbers;
+
+static inline uint pick_number(const cell_numbers numbers, uint edge)
+{
+    return (uint)(edge & 8 ? pick_4(as_int4(numbers.along_z), edge) : pick_8(as_int8(numbers.along_xy), edge));
+}
+
 /* Vertex numbers of the 12 edges of cell b of the word; those of edges that are not crossed mean nothing. */
-static inline void number_cell(uint numbers[16], const numbered_rows *edges, uint b)
+static inline cell_numbers number_cell(const numbered_rows *edges, uint b)
 {
 #define BIT(window, at) ((uint)((window) >> (at)) & 1)
     const uint at0 = number_at(&edges->y0z0, b), at1 = number_at(&edges->y1z0, b), at2 = number_at(&edges->y0z1, b);
@@ -83,19 +95,13 @@ static inline void number_cell(uint numbers[16], const numbered_rows *edges, uin
     const uint after0 = at0 + x0 + y0 + (edges->y0z0.z >> b & 1) + BIT(edges->y0z0.x_window, b + 1);
     const uint after1 = at1 + x1 + y1 + (edges->y1z0.z >> b & 1) + BIT(edges->y1z0.x_window, b + 1);
     const uint after2 = at2 + x2 + y2 + (edges->y0z1.z >> b & 1) + BIT(edges->y0z1.x_window, b + 1);
-    numbers[0] = at0;
-    numbers[1] = at1;
-    numbers[2] = at2;
-    numbers[3] = number_at(&edges->y1z1, b);
-    numbers[4] = at0 + x0;
-    numbers[5] = after0;
-    numbers[6] = at2 + x2;
-    numbers[7] = after2;
-    numbers[8] = at0 + x0 + y0;
-    numbers[9] = after0 + BIT(edges->y0z0.y_window, b + 1);
-    numbers[10] = at1 + x1 + y1;
-    numbers[11] = after1 + BIT(edges->y1z0.y_window, b + 1);
+    const cell_numbers numbers = {
+        (uint8)(at0, at1, at2, number_at(&edges->y1z1, b), at0 + x0, after0, at2 + x2, after2),
+        (uint4)(at0 + x0 + y0, after0 + BIT(edges->y0z0.y_window, b + 1), at1 + x1 + y1,
+            after1 + BIT(edges->y1z0.y_window, b + 1))
+    };
 #undef BIT
+    return numbers;
 }
 
 #endif

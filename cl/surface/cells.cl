@@ -233,13 +233,15 @@ __kernel void emit_triangles(
         number_rows(&edges, &rows, &kept, mask, row_offsets, word_vertices, first_vertex, j, k, w, gi, gj, gk, words);
         for (; rest != 0; rest &= rest - 1) {
             const uint b = lowest_bit(rest);
-            uint numbers[16];
-            number_cell(numbers, &edges, b);
+            const cell_numbers edge_numbers = number_cell(&edges, b);
             const ulong packed = MC_TRIANGLES[cell_case(rows, b)];
             const uint count = (uint)packed & 15;
 #if LANES > 1
             /* Two triangles whether they count or not, the rest where there are more: wrong guesses cost more. */
             __private uint *out = waiting + 3 * waits;
+            uint numbers[16];
+            vstore8(edge_numbers.along_xy, 0, numbers);
+            vstore4(edge_numbers.along_z, 2, numbers);
 #define PUT(n) \
             out[3 * n] = numbers[packed >> (4 + 12 * n + first_shift) & 15]; \
             out[3 * n + 1] = numbers[packed >> (8 + 12 * n) & 15]; \
@@ -258,8 +260,9 @@ __kernel void emit_triangles(
 #else
             for (uint n = 0; n < count; ++n) {
                 const uint corners = (uint)(packed >> (4 + 12 * n));
-                vstore3((uint3)(numbers[corners >> first_shift & 15], numbers[corners >> 4 & 15],
-                    numbers[corners >> last_shift & 15]), triangle++, triangles);
+                vstore3((uint3)(pick_number(edge_numbers, corners >> first_shift & 15),
+                    pick_number(edge_numbers, corners >> 4 & 15),
+                    pick_number(edge_numbers, corners >> last_shift & 15)), triangle++, triangles);
             }
 #endif
         }

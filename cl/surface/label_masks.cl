@@ -82,13 +82,25 @@ __kernel void smooth_rows(
 #undef AT
 }
 
+/* The 5 x 5 rows around a row of samples: where those of its slice begin, and its slice k of `nk`, of which the buffer
+ * has those from `first` on. */
+typedef struct {
+    size_t along_j[2 * REACH + 1], slice;
+    int k, nk, first;
+} rows_around;
+
+/* Place in the buffer of row (d, n) of them. */
+static inline size_t row_around(const rows_around *around, const int d, const int n)
+{
+    return (size_t)(clamp(around->k + d - REACH, 0, around->nk - 1) - around->first) * around->slice + around->along_j[n];
+}
+
 /* Occupancies of the 16 samples of a strip, from the sums of 5 x 5 rows. */
-static inline void smooth_strip(
-    __global const ushort *rows, const size_t *along_j, const size_t *along_k, __global short *out)
+static inline void smooth_strip(__global const ushort *rows, const rows_around *around, __global short *out)
 {
     ushort16 sum = 0;
     for (int d = 0; d <= 2 * REACH; ++d) {
-#define ROW(n) vload16(0, rows + along_k[d] + along_j[n])
+#define ROW(n) vload16(0, rows + row_around(around, d, n))
         const ushort16 plane = ROW(0) + ROW(4) + (ushort)4 * (ROW(1) + ROW(3)) + (ushort)6 * ROW(2);
 #undef ROW
         sum += (ushort)weigh(d - REACH) * plane;
@@ -98,13 +110,13 @@ static inline void smooth_strip(
 
 /* The same of the last samples of a row, from `first` on. */
 static inline void smooth_rest(
-    __global const ushort *rows, const size_t *along_j, const size_t *along_k, __global short *out, int first, int ni)
+    __global const ushort *rows, const rows_around *around, __global short *out, int first, int ni)
 {
     for (int i = first; i < ni; ++i) {
         int sum = 0;
         for (int d = 0; d <= 2 * REACH; ++d)
             for (int n = 0; n <= 2 * REACH; ++n)
-                sum += weigh(d - REACH) * weigh(n - REACH) * rows[along_k[d] + along_j[n] + i];
+                sum += weigh(d - REACH) * weigh(n - REACH) * rows[row_around(around, d, n) + i];
         out[i] = (short)(FINENESS * sum);
     }
 }
@@ -130,23 +142,25 @@ __kernel void smooth_across(
         return;
     const int j = begin_j + (int)(item % height), k = first_slice + (int)(item / height);
     __global short *out = occupancy + voxel_index(0, j, k - first_row_slice, ni, nj);
-    size_t along_j[5], along_k[5];
-    for (int d = -REACH; d <= REACH; ++d) {
-        along_j[d + REACH] = voxel_index(0, clamp(j + d, 0, nj - 1), 0, ni, nj);
-        along_k[d + REACH] = voxel_index(0, 0, clamp(k + d, 0, nk - 1) - first_row_slice, ni, nj);
-    }
+    rows_around around;
+    for (int n = 0; n <= 2 * REACH; ++n)
+        around.along_j[n] = voxel_index(0, clamp(j + n - REACH, 0, nj - 1), 0, ni, nj);
+    around.slice = voxel_index(0, 0, 1, ni, nj);
+    around.k = k;
+    around.nk = nk;
+    around.first = first_row_slice;
     const int flag_words = (ni + 32 * STRIP - 1) / (32 * STRIP);
     for (int w = begin_i / (32 * STRIP); 32 * STRIP * w < end_i; ++w) {
         uint2 flags = 0; /* where all sums are 0, or all are WHOLE, no border is near */
         for (int d = 0; d <= 2 * REACH; ++d)
             for (int n = 0; n <= 2 * REACH; ++n)
-                flags |= strips[(along_k[d] + along_j[n]) / ni * flag_words + w];
+                flags |= strips[row_around(&around, d, n) / ni * flag_words + w];
         for (uint busy = flags.x & flags.y; busy != 0; busy &= busy - 1) {
             const int first = STRIP * (32 * w + (int)lowest_bit(busy));
             if (first + STRIP <= ni)
-                smooth_strip(rows + first, along_j, along_k, out + first);
+                smooth_strip(rows + first, &around, out + first);
             else
-                smooth_rest(rows, along_j, along_k, out, first, ni);
+                smooth_rest(rows, &around, out, first, ni);
         }
     }
 }

@@ -49,6 +49,66 @@
 #define WORDS_PER_ITEM 1
 #endif
 
+/* The vertices of a word, one after the other: 4 * sample + axis. */
+#if LANES == 1
+typedef struct {
+    uint x, y, z, owners, sample, axes; /* owners that are still to come; the one before them, and its axes likewise */
+    uint left;
+} word_vertex_list;
+
+static inline void list_vertices(word_vertex_list *list, uint x, uint y, uint z)
+{
+    list->x = x;
+    list->y = y;
+    list->z = z;
+    list->owners = x | y | z;
+    list->axes = 0;
+    list->left = popcount(x) + popcount(y) + popcount(z);
+}
+
+static inline uint next_vertex(word_vertex_list *list)
+{
+    if (list->axes == 0) {
+        const uint b = lowest_bit(list->owners);
+        list->sample = b;
+        list->axes = (list->x >> b & 1) | (list->y >> b & 1) << 1 | (list->z >> b & 1) << 2;
+        list->owners &= list->owners - 1;
+    }
+    const uint axis = list->axes & 1 ? 0 : list->axes & 2 ? 1 : 2;
+    list->axes &= list->axes - 1;
+    --list->left;
+    return 4 * list->sample + axis;
+}
+#else
+typedef struct {
+    ushort crossed[96];
+    uint at, left;
+} word_vertex_list;
+
+static inline void list_vertices(word_vertex_list *list, uint x, uint y, uint z)
+{
+    /* Without branches: whether an axis has its vertex is as good as random, and wrong guesses cost more. */
+    uint count = 0;
+    for (uint owners = x | y | z; owners != 0; owners &= owners - 1) {
+        const uint b = lowest_bit(owners);
+        list->crossed[count] = (ushort)(4 * b);
+        count += x >> b & 1;
+        list->crossed[count] = (ushort)(4 * b + 1);
+        count += y >> b & 1;
+        list->crossed[count] = (ushort)(4 * b + 2);
+        count += z >> b & 1;
+    }
+    list->at = 0;
+    list->left = count;
+}
+
+static inline uint next_vertex(word_vertex_list *list)
+{
+    --list->left;
+    return list->crossed[list->at++];
+}
+#endif
+
 /* Parameters  voxels          in   slices of the volume from first_slice on
  *             mask            in   (gk, gj, words)
  *             active_words    in   (active,)
@@ -175,29 +235,20 @@ void emit_vertices(
         const uint kept = ~0u;
 #endif
         const uint x = (uint)edges.x & kept, y = (uint)edges.y & kept, z = (uint)edges.z & kept;
-        /* Without branches: whether an axis has its vertex is as good as random, and wrong guesses cost more. */
-        ushort crossed[96]; /* 4 * sample + axis */
-        uint count = 0;
-        for (uint owners = x | y | z; owners != 0; owners &= owners - 1) {
-            const uint b = lowest_bit(owners);
-            crossed[count] = (ushort)(4 * b);
-            count += x >> b & 1;
-            crossed[count] = (ushort)(4 * b + 1);
-            count += y >> b & 1;
-            crossed[count] = (ushort)(4 * b + 2);
-            count += z >> b & 1;
-        }
+        word_vertex_list list;
+        list_vertices(&list, x, y, z);
         const int vi = (int)(32 * w) - border, vj = (int)j - border, vk = (int)k + first_sample_slice - border;
         const int row_is_inner = vj >= 1 && vj < nj - 2 && vk >= 1 && vk < nk - 2;
-        for (uint m = 0; m < count; ++m) {
-            const int i = vi + (crossed[m] >> 2);
+        while (list.left != 0) {
+            const uint vertex = next_vertex(&list);
+            const int i = vi + (int)(vertex >> 2), axis = vertex & 3;
             const int inner = row_is_inner && i >= 1 && i < ni - 2;
-            gather_vertex(&group, gathered, &volume, i, vj, vk, crossed[m] & 3, inner);
+            gather_vertex(&group, gathered, &volume, i, vj, vk, axis, inner);
 #ifdef LABELS
-            half_way += gather_border(&group, gathered, &volume, &labels, iso_level, i, vj, vk, crossed[m] & 3);
+            half_way += gather_border(&group, gathered, &volume, &labels, iso_level, i, vj, vk, axis);
 #endif
 #ifdef MASKS
-            gather_mask_border(&group, gathered, &masks, i, vj, vk, crossed[m] & 3, inner);
+            gather_mask_border(&group, gathered, &masks, i, vj, vk, axis, inner);
 #endif
             ++gathered;
             if (gathered == LANES) {

@@ -15,6 +15,7 @@
  *   2. find_witnesses    triangles of another surface: faces that show that all of a triangle is near enough */
 
 #include "surface/near_faces.h"
+#include "surface/picks.h"
 
 #define WITNESSES 7 /* of a triangle: for its corners, its middle and the middles of its edges */
 #define MIDDLES 4
@@ -65,15 +66,17 @@ __kernel void find_near_faces(
     rows[number] = nearest;
 }
 
-/* True where one face is nearer than `enough` to all corners of a triangle: that of one of them, in `row`. */
+/* True where one face is nearer than `enough` to all corners a, b, c of a triangle: that of one of them, in `row`. */
 static inline int has_common_face(
-    __global const float *restrict places, __global const uint *restrict faces, const float3 *corner, const int *row,
-    const float enough)
+    __global const float *restrict places, __global const uint *restrict faces, const float3 a, const float3 b,
+    const float3 c, const int3 row, const float enough)
 {
     for (int one = 0; one < 3; ++one) {
+        const int face = PICK_3(row.x, row.y, row.z, one);
         int all = 1;
         for (int other = 0; other < 3 && all; ++other)
-            all = row[other] == row[one] || square_to_row(places, faces, corner[other], row[one]) < enough;
+            all = PICK_3(row.x, row.y, row.z, other) == face
+                || square_to_row(places, faces, PICK_3(a, b, c, other), face) < enough;
         if (all)
             return 1;
     }
@@ -102,34 +105,30 @@ __kernel void find_witnesses(
     const uint number = get_global_id(0);
     if (number >= count)
         return;
-    uint vertex[3];
-    int row[3];
-    float3 corner[3];
-    int known = 1;
-    for (int i = 0; i < 3; ++i) {
-        vertex[i] = triangles[3u * number + (uint)i];
-        row[i] = beside[vertex[i]];
-        corner[i] = place_of(vertices, vertex[i]);
-        known = known && row[i] != NO_FACE;
-        witnesses[(uint)i * count + number] = row[i];
-    }
+    const uint3 vertex = vload3(number, triangles);
+    const int3 row = (int3)(beside[vertex.x], beside[vertex.y], beside[vertex.z]);
+    const float3 a = place_of(vertices, vertex.x), b = place_of(vertices, vertex.y), c = place_of(vertices, vertex.z);
+    witnesses[number] = row.x;
+    witnesses[count + number] = row.y;
+    witnesses[2u * count + number] = row.z;
     for (uint middle = 0; middle < MIDDLES; ++middle)
-        witnesses[(3u + middle) * count + number] = row[0];
+        witnesses[(3u + middle) * count + number] = row.x;
+    const int known = row.x != NO_FACE && row.y != NO_FACE && row.z != NO_FACE;
     uint undecided = 0;
-    if (known && !has_common_face(places, faces, corner, row, enough)) {
+    if (known && !has_common_face(places, faces, a, b, c, row, enough)) {
         for (int middle = 0; middle < MIDDLES; ++middle) {
-            const int first = middle == 0 ? 0 : middle - 1, second = first == 2 ? 0 : first + 1;
-            const float3 point = middle == 0 ? (corner[0] + corner[1] + corner[2]) * (1.0f / 3.0f)
-                                             : (corner[first] + corner[second]) * 0.5f;
+            const float3 point
+                = middle == 0 ? (a + b + c) * (1.0f / 3.0f) : PICK_3(a + b, b + c, c + a, middle - 1) * 0.5f;
             float least = MAXFLOAT;
             int nearest = NO_FACE;
             for (int i = 0; i < 3 && !(least < enough); ++i)
-                least = min(least, square_to_row(places, faces, point, row[i]));
+                least = min(least, square_to_row(places, faces, point, PICK_3(row.x, row.y, row.z, i)));
             if (least < enough)
                 continue;
             least = MAXFLOAT;
             for (int i = 0; i < 3 && !(least < enough); ++i)
-                look_around(places, faces, begin, around, point, names[vertex[i]], 0.0f, &least, &nearest);
+                look_around(places, faces, begin, around, point, names[PICK_3(vertex.x, vertex.y, vertex.z, i)], 0.0f,
+                    &least, &nearest);
             if (least < enough)
                 witnesses[(3u + (uint)middle) * count + number] = nearest;
             else

@@ -20,9 +20,7 @@
 /* Entry of TRILINEAR_ROWS of cell (i, j, k) of the volume, whose case has a choice. */
 static inline uint find_row(uint cell_case, const volume_part *volume, int i, int j, int k, float iso_level)
 {
-    float heights[8];
-    load_heights(heights, volume, i, j, k, iso_level);
-    return choose_row(cell_case, heights);
+    return choose_row(cell_case, load_heights(volume, i, j, k, iso_level));
 }
 
 /* Active cells of a word whose case has a choice: those with a face that has two diagonal inside corners, and those
@@ -125,28 +123,29 @@ static inline uint first_cell_vertex(
 /* Write the triangles of a cell by the case table; returns how many.  The shifts say where in a packed triangle its
  * first and its last corner stand. */
 static inline uint write_table_cell(
-    uint cell_case, const uint numbers[16], uint first_shift, uint last_shift, __global uint *out)
+    uint cell_case, const cell_numbers numbers, uint first_shift, uint last_shift, __global uint *out)
 {
     const uint count = (uint)MC_TRIANGLES[cell_case] & 15;
     ulong packed = MC_TRIANGLES[cell_case] >> 4;
     for (uint n = 0; n < count; ++n, packed >>= 12, out += 3) {
-        out[0] = numbers[packed >> first_shift & 15];
-        out[1] = numbers[packed >> 4 & 15];
-        out[2] = numbers[packed >> last_shift & 15];
+        const uint corners = (uint)packed;
+        out[0] = pick_number(numbers, corners >> first_shift & 15);
+        out[1] = pick_number(numbers, corners >> 4 & 15);
+        out[2] = pick_number(numbers, corners >> last_shift & 15);
     }
     return count;
 }
 
 /* Write the triangles of a row of TRILINEAR_ROWS; returns how many.  `cell_vertex` is the number of the cell's first
  * vertex inside. */
-static inline uint write_row(uint row, const uint numbers[16], uint cell_vertex, int mirrored, __global uint *out)
+static inline uint write_row(uint row, const cell_numbers numbers, uint cell_vertex, int mirrored, __global uint *out)
 {
     const uint count = row_triangles_of(row);
     for (uint n = 0; n < count; ++n, out += 3) {
         const uint packed = TRILINEAR_TRIANGLES[(row & 0xffff) + n];
         for (uint c = 0; c < 3; ++c) {
             const uint vertex = packed >> (5 * c) & 31;
-            out[mirrored ? 2 - c : c] = vertex < CELL_VERTEX ? numbers[vertex] : cell_vertex + vertex - CELL_VERTEX;
+            out[mirrored ? 2 - c : c] = vertex < CELL_VERTEX ? pick_number(numbers, vertex) : cell_vertex + vertex - CELL_VERTEX;
         }
     }
     return count;
@@ -202,8 +201,7 @@ __kernel void emit_cell_triangles(
     __global uint *out = triangles + 3 * ((size_t)row_triangle + word_triangles[(size_t)row * words + w]);
     for (; rest != 0; rest &= rest - 1) {
         const uint b = lowest_bit(rest), number = cell_case(rows, b);
-        uint numbers[16];
-        number_cell(numbers, &edges, b);
+        const cell_numbers numbers = number_cell(&edges, b);
         if (choices >> b & 1) {
             const uint found = find_row(number, &volume, (int)(32 * w + b) - border, (int)j - border,
                 (int)k + first_sample_slice - border, iso_level);
@@ -217,7 +215,7 @@ __kernel void emit_cell_triangles(
 
 /* Write one vertex inside the cell that begins at sample (i, j) of the frame's slice. */
 static inline void write_cell_vertex(
-    const slice_frame *frame, float i, float j, float3 point, const long values[8], size_t vertex,
+    const slice_frame *frame, float i, float j, float3 point, const int8 values, size_t vertex,
     __global float *positions, __global float *normals)
 {
     float3 place, slope, up;
@@ -282,13 +280,12 @@ __kernel void emit_cell_vertices(
     for (uint rest = find_choices(&rows, find_active_cells(rows, w, gi)); rest != 0; rest &= rest - 1) {
         const uint b = lowest_bit(rest), number = cell_case(rows, b);
         const int i = (int)(32 * w + b) - border;
-        float heights[8];
-        load_heights(heights, &volume, i, (int)j - border, (int)k + first_sample_slice - border, iso_level);
+        const float8 heights
+            = load_heights(&volume, i, (int)j - border, (int)k + first_sample_slice - border, iso_level);
         const uint found = choose_row(number, heights);
         if (row_vertices_of(found) == 0)
             continue;
-        long values[8];
-        sign_values(values, number, heights);
+        const int8 values = sign_values(number, heights);
         float3 lower, upper;
         if (row_vertices_of(found) == 1)
             lower = upper = place_centre(found, values, frame.margin);

@@ -25,6 +25,7 @@
 #define CLRECON_TRILINEAR_CELL_H
 
 #include "include/volume.h"
+#include "surface/picks.h"
 #include "surface/trilinear_tables.h"
 
 #define FACE_BITS 30
@@ -46,37 +47,41 @@ static inline ulong scale_height(float height, uint largest, uint bits)
 }
 
 /* Heights of the corners of cell (i, j, k) of the volume; i, j, k may be -1. */
-static inline void load_heights(float heights[8], const volume_part *volume, int i, int j, int k, float iso_level)
+static inline float8 load_heights(const volume_part *volume, int i, int j, int k, float iso_level)
 {
-    for (int corner = 0; corner < 8; ++corner)
-        heights[corner] = -iso_level
-            + convert_float(sample_volume(volume, i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)));
+#define SAMPLE(x, y, z) convert_float(sample_volume(volume, i + x, j + y, k + z))
+    const float8 samples = (float8)(SAMPLE(0, 0, 0), SAMPLE(1, 0, 0), SAMPLE(0, 1, 0), SAMPLE(1, 1, 0),
+        SAMPLE(0, 0, 1), SAMPLE(1, 0, 1), SAMPLE(0, 1, 1), SAMPLE(1, 1, 1));
+#undef SAMPLE
+    return samples - iso_level;
 }
 
 /* Whether face f (2 axis: lower, 2 axis + 1: upper) joins its two diagonal inside corners: the product of their heights
  * is above that of the outside corners. */
-static inline int face_joins(uint cell_case, const float heights[8], uint face)
+static inline int face_joins(uint cell_case, const float8 heights, uint face)
 {
     const uint axis = face >> 1, u = 1u << (axis + 1) % 3, v = 1u << (axis + 2) % 3;
     const uint a = (face & 1) << axis, b = a | u, c = a | u | v, d = a | v;
-    const uint largest = max(max(find_exponent(heights[a]), find_exponent(heights[b])),
-        max(find_exponent(heights[c]), find_exponent(heights[d])));
-#define SIZE(corner) scale_height(heights[corner], largest, FACE_BITS)
-    const ulong ac = SIZE(a) * SIZE(c), bd = SIZE(b) * SIZE(d);
+    const int8 of = as_int8(heights);
+    const float4 at = as_float4((int4)(pick_8(of, a), pick_8(of, b), pick_8(of, c), pick_8(of, d)));
+    const uint largest = max(max(find_exponent(at.x), find_exponent(at.y)), max(find_exponent(at.z), find_exponent(at.w)));
+#define SIZE(height) scale_height(height, largest, FACE_BITS)
+    const ulong ac = SIZE(at.x) * SIZE(at.z), bd = SIZE(at.y) * SIZE(at.w);
 #undef SIZE
     return cell_case >> a & 1 ? ac > bd : bd > ac;
 }
 
 /* Heights as whole numbers of CELL_BITS bits with the signs that the case says. */
-static inline void sign_values(long values[8], uint cell_case, const float heights[8])
+static inline int8 sign_values(uint cell_case, const float8 heights)
 {
-    uint largest = 0;
-    for (int corner = 0; corner < 8; ++corner)
-        largest = max(largest, find_exponent(heights[corner]));
-    for (int corner = 0; corner < 8; ++corner) {
-        const long size = (long)scale_height(heights[corner], largest, CELL_BITS);
-        values[corner] = cell_case >> corner & 1 ? size : -size;
-    }
+    const uint8 exponents = max(as_uint8(heights) >> 23 & 255, (uint8)(1)); /* as find_exponent */
+    const uint4 of_halves = max(exponents.lo, exponents.hi);
+    const uint largest = max(max(of_halves.x, of_halves.y), max(of_halves.z, of_halves.w));
+#define SIZE(n) (int)scale_height(heights.s##n, largest, CELL_BITS)
+    const int8 sizes = (int8)(SIZE(0), SIZE(1), SIZE(2), SIZE(3), SIZE(4), SIZE(5), SIZE(6), SIZE(7));
+#undef SIZE
+    const int8 corners = (int8)(1, 2, 4, 8, 16, 32, 64, 128);
+    return ((int)cell_case & corners) != 0 ? sizes : -sizes;
 }
 
 /* Q(t) = a t^2 + b t + c of the planes across one axis: the product of the field at two diagonal cell edges along the
@@ -93,12 +98,13 @@ static inline uint column(uint axis, uint n)
     return (n == 1 || n == 2 ? u : 0) | (n >= 2 ? v : 0);
 }
 
-static inline void find_parabola(parabola *q, const long values[8], uint axis)
+static inline void find_parabola(parabola *q, const int8 values, uint axis)
 {
     long low[4], rise[4];
     for (uint n = 0; n < 4; ++n) {
-        low[n] = values[column(axis, n)];
-        rise[n] = values[column(axis, n) | 1u << axis] - low[n];
+        const uint corner = column(axis, n);
+        low[n] = pick_8(values, corner);
+        rise[n] = pick_8(values, corner | 1u << axis) - low[n];
     }
     const long c = low[0] * low[2] - low[1] * low[3];
     q->a = rise[0] * rise[2] - rise[1] * rise[3];
@@ -110,7 +116,7 @@ static inline void find_parabola(parabola *q, const long values[8], uint axis)
 
 /* Code of the tunnel that the cell has if its faces allow one, -1 without: signs alternate around the plane at the
  * vertex of the parabola, and it has two roots. */
-static inline int find_tunnel(const long values[8])
+static inline int find_tunnel(const int8 values)
 {
     parabola q;
     find_parabola(&q, values, 2);
@@ -122,7 +128,7 @@ static inline int find_tunnel(const long values[8])
         return -1;
     int signs[4];
     for (uint n = 0; n < 4; ++n) {
-        const long low = values[column(2, n)], high = values[column(2, n) | 4];
+        const long low = pick_4(values.lo, column(2, n)), high = pick_4(values.hi, column(2, n));
         const long there = low * bottom + (high - low) * top;
         signs[n] = (there > 0) - (there < 0);
     }
@@ -138,7 +144,7 @@ static inline int find_tunnel(const long values[8])
 }
 
 /* Entry of TRILINEAR_ROWS of a cell whose case has a choice. */
-static inline uint choose_row(uint cell_case, const float heights[8])
+static inline uint choose_row(uint cell_case, const float8 heights)
 {
     const uint entry = TRILINEAR_CASES[cell_case];
     uint state = entry & 0xffff, bit = 1;
@@ -151,9 +157,7 @@ static inline uint choose_row(uint cell_case, const float heights[8])
     const uint row = TRILINEAR_STATES[state] & 0xffff, tunnels = TRILINEAR_STATES[state] >> 16;
     if (tunnels == 0)
         return TRILINEAR_ROWS[row];
-    long values[8];
-    sign_values(values, cell_case, heights);
-    const int code = find_tunnel(values);
+    const int code = find_tunnel(sign_values(cell_case, heights));
     return TRILINEAR_ROWS[code < 0 ? row : row + (tunnels >> (2 * code) & 3)];
 }
 

@@ -11,22 +11,19 @@
 #define FLAT_SQUARE 16777216.0f
 
 /* The field between the corners and its gradient per step. */
-static inline float field_at(const long values[8], float3 p, float3 *gradient)
+static inline float field_at(const int8 values, float3 p, float3 *gradient)
 {
-    float along[4], rise[4];
-    for (int n = 0; n < 4; ++n) {
-        rise[n] = convert_float(values[2 * n + 1] - values[2 * n]);
-        along[n] = convert_float(values[2 * n]) + p.x * rise[n];
-    }
-    const float low = along[0] + p.y * (along[1] - along[0]), high = along[2] + p.y * (along[3] - along[2]);
-    const float low_x = rise[0] + p.y * (rise[1] - rise[0]), high_x = rise[2] + p.y * (rise[3] - rise[2]);
-    const float low_y = along[1] - along[0], high_y = along[3] - along[2];
+    const float4 rise = convert_float4(values.odd - values.even);
+    const float4 along = convert_float4(values.even) + p.x * rise;
+    const float low = along.x + p.y * (along.y - along.x), high = along.z + p.y * (along.w - along.z);
+    const float low_x = rise.x + p.y * (rise.y - rise.x), high_x = rise.z + p.y * (rise.w - rise.z);
+    const float low_y = along.y - along.x, high_y = along.w - along.z;
     *gradient = (float3)(low_x + p.z * (high_x - low_x), low_y + p.z * (high_y - low_y), high - low);
     return low + p.z * (high - low);
 }
 
 /* The vertex in the middle of a fan: the mean of those around it, taken to the surface by some steps of Newton. */
-static inline float3 place_centre(uint row, const long values[8], float3 margin)
+static inline float3 place_centre(uint row, const int8 values, float3 margin)
 {
     float3 point = (float3)(0.0f);
     float around = 0.0f;
@@ -38,9 +35,9 @@ static inline float3 place_centre(uint row, const long values[8], float3 margin)
         /* Lower corner of an edge: its number among those of its axis, spread over the two other bits. */
         const uint place = edge & 3;
         const uint low = axis == 0 ? place << 1 : axis == 1 ? (place & 1) | (place & 2) << 1 : place;
-        const long rise = values[low | 1u << axis] - values[low];
+        const int height = pick_8(values, low), rise = pick_8(values, low | 1u << axis) - height;
         const float keep = axis == 0 ? margin.x : axis == 1 ? margin.y : margin.z;
-        const float t = rise == 0 ? 0.5f : clamp(convert_float(-values[low]) / convert_float(rise), keep, 1.0f - keep);
+        const float t = rise == 0 ? 0.5f : clamp(convert_float(-height) / convert_float(rise), keep, 1.0f - keep);
         point += (float3)(axis == 0 ? t : (float)(low & 1), axis == 1 ? t : (float)(low >> 1 & 1),
             axis == 2 ? t : (float)(low >> 2));
         around += 1.0f;
@@ -58,9 +55,9 @@ static inline float3 place_centre(uint row, const long values[8], float3 margin)
 
 /* The box whose corners are the waist of a tunnel: the roots of the three parabolas.  It keeps a margin from the faces
  * and is at least two margins wide. */
-static inline void place_waist(const long values[8], float3 margin, float3 *lower, float3 *upper)
+static inline void place_waist(const int8 values, float3 margin, float3 *lower, float3 *upper)
 {
-    float low[3], high[3];
+    *lower = *upper = (float3)(0.0f);
     for (uint axis = 0; axis < 3; ++axis) {
         parabola q;
         find_parabola(&q, values, axis);
@@ -73,11 +70,10 @@ static inline void place_waist(const long values[8], float3 margin, float3 *lowe
         float middle = q.a != 0 ? convert_float(-q.b) / twice : 0.5f;
         half_width = clamp(half_width, keep, 0.5f - keep);
         middle = clamp(middle, keep + half_width, 1.0f - keep - half_width);
-        low[axis] = middle - half_width;
-        high[axis] = middle + half_width;
+        const int3 here = (int3)(0, 1, 2) == (int)axis;
+        *lower = here ? (float3)(middle - half_width) : *lower;
+        *upper = here ? (float3)(middle + half_width) : *upper;
     }
-    *lower = (float3)(low[0], low[1], low[2]);
-    *upper = (float3)(high[0], high[1], high[2]);
 }
 
 /* One coordinate in mm of a point of the cell at sample (i, j): an exact sum of the origin and the steps, plus the

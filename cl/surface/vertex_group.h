@@ -66,7 +66,7 @@ static inline VALUE double_gradient(VALUE before, VALUE after, int at, int n, in
 
 /* Gather the vertex on the edge from sample (i, j, k) along `axis` (0, 1, 2: towards i + 1, j + 1, k + 1) as lane n.
  * `inner` says that every value around the edge is a voxel of the volume. */
-static inline void gather_vertex(
+static inline __attribute__((always_inline)) void gather_vertex( /* else a group lies in memory where two call it */
     vertex_group *group, uint n, const volume_part *volume, int i, int j, int k, int axis, int inner)
 {
     group->i[n] = i;
@@ -75,8 +75,7 @@ static inline void gather_vertex(
     if (inner) {
         const size_t row = volume->ni, slice = row * (size_t)volume->nj;
         __global const VOXEL *at = volume->voxels + voxel_index(i, j, k - volume->first_k, volume->ni, volume->nj);
-        const size_t strides[3] = {1, row, slice};
-        __global const VOXEL *next = at + strides[axis];
+        __global const VOXEL *next = at + (axis == 0 ? 1 : axis == 1 ? row : slice);
         group->value[n] = *at;
         group->next_value[n] = *next;
         group->gradient_i[n] = (VALUE)at[1] - (VALUE)*(at - 1);
@@ -210,8 +209,10 @@ static inline void write_vertices(
 #ifdef GOLDEN
     floats t = (floats)(GOLDEN_SECTION);
 #else
-    const floats keep = choose(
-        along_k, (floats)(frame->margin.z), choose(along_j, (floats)(frame->margin.y), (floats)(frame->margin.x)));
+    /* A sum, since compilers make an index of run time of choices among the elements of a vector. */
+    const floats none = 0.0f;
+    const floats keep = choose(axis == 0, (floats)(frame->margin.x), none)
+        + (choose(along_j, (floats)(frame->margin.y), none) + choose(along_k, (floats)(frame->margin.z), none));
 #ifdef RANGE
     /* One end is inside: the other one lies above the range where the larger of both does. */
     const ints above = greater(value, next_value) > frame->highest;

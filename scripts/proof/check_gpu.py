@@ -186,6 +186,7 @@ def compile_amd(text: Text, chip: str) -> Figures:
     run_tool(
         *CLANG, "-cl-std=CL1.2", "-O3", ROUNDED, "--target=amdgcn-amd-amdhsa", f"-mcpu={chip}", "-S",
         "-Xclang", "-mlink-builtin-bitcode", "-Xclang", LIBCLC / "amdgcn--amdhsa.bc", "-Wno-linker-warnings",
+        "-mllvm", "-amdgpu-limit-to-128-vgprs=0",  # LLVM 15 limits gfx1100, later versions do not
         *text.options, text.path, "-o", made,
     )  # fmt: skip
     figures: Figures = {}

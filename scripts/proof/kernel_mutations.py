@@ -159,9 +159,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "rows": (("rows[number] = nearest;", "rows[number] = ~nearest;"),),
     },
     "find_witnesses": {
-        "witnesses": (
-            ("witnesses[(uint)i * count + number] = row[i];", "witnesses[(uint)i * count + number] = ~row[i];"),
-        ),
+        "witnesses": (("witnesses[number] = row.x;", "witnesses[number] = ~row.x;"),),
         "left": (("left[number] = (uchar)undecided;", "left[number] = (uchar)~undecided;"),),
     },
     "sample_profiles": {"profiles": (("? under + fk * (over - under) : NAN", "? -under - fk * (over - under) : NAN"),)},

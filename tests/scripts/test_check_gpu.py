@@ -106,6 +106,15 @@ def test_every_kernel_of_every_variant_is_recorded() -> None:
         assert recorded == kernels, f"{target}: scripts/proof/check_gpu.py --record --only FILE"
 
 
+def test_no_kernel_keeps_an_array_in_memory() -> None:
+    """But for the results of a function that one calls four times, which makers' compilers put in its place."""
+    figures = check_gpu.read_record()["figures"]
+    for target in ("gfx90a", "gfx1030", "gfx1100", "sm_86", "sm_90"):
+        kernels = [kernel for variant in figures[target].values() for kernel in variant.items()]
+        assert len(kernels) > 100
+        assert {name for name, told in kernels if told["stack"] or told["spills"]} <= {"fit_profiles"}
+
+
 SAMPLE = [Variant("surface/marching_cubes.cl"), Variant("surface/cells.cl"), Variant("rays/surface.cl", ("UNEVEN",))]
 """Those that had most in memory."""
 
