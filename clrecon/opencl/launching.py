@@ -232,32 +232,37 @@ _running: ContextVar[Stopwatch | None] = ContextVar("running", default=None)
 """The stopwatch in whose `running` block this thread is."""
 
 
-def launch(device: Device, kernel: Kernel, items: int, /, **arguments: Any) -> None:
+def launch(device: Device, kernel: Kernel, items: int, most: int | None = None, /, **arguments: Any) -> None:
     """Enqueue `kernel` over at least `items` work-items; the stopwatch that is running has its time.
 
     items: Rounded up to whole groups of `Device.group_size`, so kernels check their bounds first.
+    most: Items of a launch; if there are more, several follow each other.
     **arguments: The kernel's arguments, by their names in its source: buffers, numbers, and four numbers for a float4.
         Numbers are converted to the types in the source.
     """
     cl = import_pyopencl()
     group = device.group_size
     rounded = -(-items // group) * group
+    part = max(rounded if most is None else most // group * group, group)
     values = kernel.order(arguments)
     if device.trace is not None:
         device.trace(f"kernel {kernel.name} ({rounded:,} items)")
         _check_written(kernel, values)
-    try:
-        with device.lock:
-            queue = device.queue
-            event = kernel.enqueue(queue, rounded, group, values)
-            device.commands.add(f"kernel {kernel.name}", event, queue, values, arguments)
-    except cl.Error as error:
-        what = f"kernel {kernel.name} ({rounded:,} items in groups of {group}) failed"
-        raise device.fail(what, error) from error
-    if device.trace is not None:
-        wait(device)  # what crashes or hangs is then the kernel that was told last
-    if (stopwatch := _running.get()) is not None:
-        stopwatch.record(kernel.name, event)
+    for first in range(0, max(rounded, 1), part):
+        try:
+            with device.lock:
+                queue = device.queue
+                event = kernel.enqueue(queue, min(part, rounded - first), group, values, first)
+                device.commands.add(f"kernel {kernel.name}", event, queue, values, arguments)
+                if part < rounded:
+                    queue.flush()  # what a driver sends together counts as one for watchdogs
+        except cl.Error as error:
+            what = f"kernel {kernel.name} ({rounded:,} items in groups of {group}) failed"
+            raise device.fail(what, error) from error
+        if device.trace is not None:
+            wait(device)  # what crashes or hangs is then the kernel that was told last
+        if (stopwatch := _running.get()) is not None:
+            stopwatch.record(kernel.name, event)
 
 
 def _check_written(kernel: Kernel, values: Sequence[Any]) -> None:

@@ -74,13 +74,15 @@ class Kernel:
         self._takers = tuple((argument.name, _taker(argument)) for argument in arguments)
         self._launches = 0
 
-    def enqueue(self, queue: Any, items: int, group: int, values: tuple[Any, ...]) -> Any:
-        """Launch the kernel over `items` work-items with the result of `order`; the caller holds the device's lock."""
+    def enqueue(self, queue: Any, items: int, group: int, values: tuple[Any, ...], first: int = 0) -> Any:
+        """Launch the kernel over `items` work-items from number `first` on with the result of `order`; the caller holds
+        the device's lock.
+        """
         self._launches += 1
         if self._launches == LAUNCHES_BEFORE_TYPES:
             types = [None if argument.is_buffer else _TYPES[argument.type] for argument in self.arguments]
             self.cl_kernel.set_scalar_arg_dtypes(types)
-        return self.cl_kernel(queue, (items,), (group,), *values)
+        return self.cl_kernel(queue, (items,), (group,), *values, global_offset=(first,) if first else None)
 
     def order(self, values: Mapping[str, Any]) -> tuple[Any, ...]:
         """Return the arguments as the driver takes them: in the kernel's order, with numbers in its types."""

@@ -31,7 +31,7 @@ TURNS, WANTED = int(sys.argv.pop(1)), sys.argv.pop(1)
 true_enqueue = Kernel.enqueue
 kept = []
 
-def enqueue(kernel, queue, items, group, values):
+def enqueue(kernel, queue, items, group, values, first):
     if kernel.name == WANTED and not kept:
         cl = import_pyopencl()
         spin = cl.Program(queue.context, SOURCE).build().spin
@@ -41,7 +41,7 @@ def enqueue(kernel, queue, items, group, values):
         spin(queue, (group,), (group,), numbers, numpy.uint32(TURNS))
         queue.flush()
         print("the kernel spins", file=sys.stderr, flush=True)
-    return true_enqueue(kernel, queue, items, group, values)
+    return true_enqueue(kernel, queue, items, group, values, first)
 
 Kernel.enqueue = enqueue
 from clrecon.cli.main import run

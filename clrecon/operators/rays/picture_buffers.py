@@ -32,12 +32,17 @@ NEAR_ROW = kernel_constant("rays/view.h", "VIEW_NEAR")
 ENDLESS = 1e30
 """Offset of a clip plane that nothing reaches, in float32."""
 
+SAMPLES_A_LAUNCH = 1 << 28
+"""Most samples of a launch on a part of a processor, which draws the screen too, were all rays as long as the longest:
+systems stop kernels that block a display for seconds.  Cards of their own are faster, and take eight times as many."""
+
 
 @dataclass(frozen=True)
 class RayView:
     """The rays of a picture for a device: a table, (rows, 4) float32, with `planes` rows of clip planes at its end.
 
-    `spread` is the largest distance in field coordinates between a ray of a tile and its middle one, plus a ray step.
+    `spread` is the largest distance in field coordinates between a ray of a tile and its middle one, plus a ray step;
+    `longest` are the samples of the longest ray.
     """
 
     camera: Camera
@@ -46,6 +51,12 @@ class RayView:
     table: NDArray[np.float32]
     planes: int
     spread: Float64Array
+    longest: float
+
+    def rays_a_launch(self, device: Device) -> int | None:
+        """Return the most rays of a launch, None for any number."""
+        samples = SAMPLES_A_LAUNCH * (8 if device.has_own_memory else 1)
+        return int(samples / self.longest) if device.type == "gpu" else None
 
     @property
     def arguments(self) -> dict[str, int]:
@@ -119,7 +130,8 @@ class RayView:
             across, along = _perspective_spread(camera, size, float(np.linalg.norm(corners - position, axis=1).max()))
         axes = np.abs(frame.matrix @ np.column_stack([right, up, forward]))
         spread = axes @ (across, across, along) + ray_step * np.linalg.norm(frame.matrix, axis=1)
-        return cls(camera, size, ray_step, table.astype(np.float32), count, spread)
+        longest = 1.0 + float(np.linalg.norm(np.ptp(corners, axis=0))) / ray_step
+        return cls(camera, size, ray_step, table.astype(np.float32), count, spread, longest)
 
     def widened(self) -> NDArray[np.float32]:
         """Return the table without clip planes, with the focus, enlarged by the spread on all sides, as its box."""

@@ -226,6 +226,7 @@ def project_slab(resident: DeviceVolume, slab: RaySlab, view: RayView, mode: str
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
     launch(
         device, resident.program("rays/project.cl", **variants)["project_rays"], output.items(queues, lanes),
+        view.rays_a_launch(device),
         ranges=measure_cells(resident, slab), view=upload(device, view.table),
         states=output.states_d, depths=output.depths_d, values=output.means_d, last_place=last,
         which=PROJECTIONS[mode], queues=queues, **slab.arguments, **view.arguments, **resident.stack.arguments,
@@ -335,6 +336,7 @@ class _Job(SlabPicture):
             ways_d = look_ahead(resident, slab, way, leaps)
             launch(
                 device, program["composite_rays"], output.items(queues, int(device.kernel_variants["LANES"])),
+                view.rays_a_launch(device),
                 ways=ways_d, entries=entries_d, highlights=upload(device, highlight_table(self.lighting)),
                 view=upload(device, view.table), last_place=last, slope=resident.stack.slope,
                 shaded=self.lighting.shades, jitter=style.jitter, queues=queues, **more, **tables.arguments,

@@ -93,6 +93,7 @@ class _Job(SlabPicture):
             view = self._view(leaps)
             launch(
                 device, resident.program("rays/surface.cl", **variants)["trace_surface"], output.items(queues, lanes),
+                view.rays_a_launch(device),
                 leaps=leaps.distances_d, view=upload(device, view.table),
                 highlights=upload(device, highlight_table(look.light)), last_place=_float4(*last),
                 slope=resident.stack.slope, level=rule.iso_level, outside=rule.outside, color=_float4(*look.rgb),
