@@ -126,7 +126,7 @@ def _refine_and_measure(run: Run, made: MadeParts, measure: bool) -> list[dict[s
             part.mesh = refine_surface(part.mesh, settings, made.device, run.progress)
         run.lap("refine")
     if measure:
-        measure_parts(made.parts, made.solid, settings, made.device, run.progress)
+        measure_parts(made.parts, made.solid([part.mesh for part in made.parts]), settings, made.device, run.progress)
     gates = judge_parts(made.parts, settings)
     return gates + (judge_label_volumes(made.parts, settings.closed) if settings.labels_pick else [])
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,15 +40,16 @@ if TYPE_CHECKING:
 class MadeParts:
     """What `make_parts` made.
 
-    volume: The scan, masked and cropped as the settings say.
-    solid: The same with what is filled, of which the surfaces were extracted.
+    volume: The scan, masked and cropped as the settings say, with the report of what was filled.
+    solid: Makes the volume of which the surfaces were extracted again, its slices around meshes: the scan, and what was
+        filled.
     device: Its `current` is the one that works: a stand-in may have taken over.
     choice: The choice of the iso value, if it was neither given nor a preset.
     origins: The report of each surface as it was extracted.
     """
 
     volume: Volume
-    solid: Volume
+    solid: Callable[[Sequence[Mesh]], Volume]
     parts: list[Part]
     device: Device
     choice: IsoChoice | None
@@ -85,7 +87,36 @@ def make_parts(source: str | Path, run: Run, check_map: Callable[[LabelMap], Non
     for place, (surface, mesh) in enumerate(zip(surfaces, extracted, strict=True), start=1):
         parts += select_parts(surface, mesh, settings, device.current, volume, steps)
         steps.take(SELECT_STEPS * place - steps.done)
-    return MadeParts(volume, solid, parts, device, choice, origins)
+    return MadeParts(volume, _remember_filled(volume, solid), parts, device, choice, origins)
+
+
+BESIDE_SLICES = 16
+"""Slices on each side of meshes within which their distances from the scan are measured."""
+
+
+def _remember_filled(volume: Volume, solid: Volume) -> Callable[[Sequence[Mesh]], Volume]:
+    """Return what makes slices of a solid volume again: one bit a voxel, while meshes need the memory of a volume."""
+    if solid is volume:
+        return lambda meshes: volume
+    import numpy as np
+
+    from clrecon.opencl import result_pages
+
+    places = [np.packbits(own != layer) for own, layer in zip(solid.voxels, volume.voxels, strict=True)]
+    volume.report, filled_hu = solid.report, solid.report["solid"]["filled_hu"]
+    result_pages.clear()  # of the solid volume's mesh
+
+    def make(meshes: Sequence[Mesh]) -> Volume:
+        corners = np.concatenate([list(product(*np.transpose(mesh.bounds))) for mesh in meshes])
+        heights = volume.lps_to_ijk(corners)[:, 2]
+        first = max(int(heights.min()) - BESIDE_SLICES, 0)
+        part = volume[first : int(heights.max()) + BESIDE_SLICES]
+        voxels = part.voxels.copy()
+        for layer, bits in zip(voxels, places[first:], strict=False):
+            layer[np.unpackbits(bits, count=layer.size).view(bool).reshape(layer.shape)] = filled_hu
+        return part.with_voxels(voxels)
+
+    return make
 
 
 def _read_inputs(

@@ -133,7 +133,7 @@ def report_of(
     """Make the report of a job; its `warnings` come after those of the volume and the meshes."""
     settings: MeshSettings = run.settings
     parts = made.parts
-    level, level_warnings = describe_level(made.solid, settings, made.choice)
+    level, level_warnings = describe_level(made.volume, settings, made.choice)
     preset = settings.preset_used
     of_one: dict[str, Any] = {name: meshes[0][name] if len(meshes) == 1 else None for name in _OF_ONE}
     for part in _DEVICE_PARTS:
@@ -144,9 +144,9 @@ def report_of(
     report = run.report(
         MeshReport,
         [*_warn_of_meshes(parts, meshes), *level_warnings, *warnings],
-        made.solid,
+        made.volume,
         on=made.device.current,
-        affine_ijk_to_lps_mm=made.solid.affine.tolist(),
+        affine_ijk_to_lps_mm=made.volume.affine.tolist(),
         **{name: _common(mesh[name] for mesh in meshes) for name in _OF_LEVEL},
         outside_hu=_common(part.mesh.report.get("outside_hu") for part in parts),
         **level,
