@@ -16,7 +16,7 @@ from clrecon.mesh.intersections import FindCrossings, find_self_intersections
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.refine.clusters import Clusters
 from clrecon.mesh.refine.deviation import Deviation, MakeBounds, SurfaceBounds
-from clrecon.mesh.refine.shifts import measure_volumes, move_vertices, restore_volumes
+from clrecon.mesh.refine.shifts import Volumes, measure_volumes, move_vertices, restore_volumes
 from clrecon.mesh.triangles import vertex_normals
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress
@@ -54,6 +54,9 @@ there is one more: it costs little, as little changes."""
 
 _SHARE_SLACK = 0.005
 """The wanted number of triangles counts as reached when it is exceeded by this share or less."""
+
+_MOVES = 3
+"""Most attempts to restore volumes beside vertices that cannot move as far."""
 
 _SHARE_FOR_VOLUME = 0.1
 """Share of the bound that is kept for the shift that restores the volume of components."""
@@ -186,19 +189,56 @@ def _with_volumes(
     count, labels, border = clusters.components()
     wanted = measure_volumes(mesh.vertices - origin, mesh.triangles, count, labels, border)
     collapsed, steps = clusters.collapsed_count, np.zeros((mesh.vertex_count, 3))
+    fresh = np.zeros(count, dtype=bool)
     for _ in range(_TRIES):
         standing, triangles = clusters.take_changed()
+        fresh[labels[standing]] = True
         places, step = clusters.places[standing], np.zeros((len(standing), 3))
         restore_volumes(places, step, triangles, labels[standing], wanted, longest)
         steps[standing] = step
         now = measure_volumes(places + step, triangles, count, labels[standing], border[standing])
         if not clusters.undo(standing[wanted.differ(now)[labels[standing]]]):
-            break
+            vertices, triangles, held, spoilt = _move(clusters, wanted, origin, longest, steps, fresh, find_crossings)
+            fresh[:] = False
+            fresh[labels[spoilt]] = True
+            if not clusters.undo(held) and not clusters.undo(spoilt):
+                break
         _mend(clusters, deviation)
-    standing, triangles = clusters.numbered()
-    stored = as_stored(clusters.places[standing] + origin)
-    vertices = move_vertices(stored, triangles, steps[standing], find_crossings)[0]
     return vertices, triangles, collapsed - clusters.collapsed_count
+
+
+def _move(
+    clusters: Clusters,
+    wanted: Volumes,
+    origin: NDArray[np.float64],
+    longest: float,
+    steps: NDArray[np.float64],
+    fresh: NDArray[np.bool_],
+    find_crossings: FindCrossings,
+) -> tuple[NDArray[np.floating], NDArray[np.uint32], NDArray[np.integer], NDArray[np.integer]]:
+    """Move the surface by the steps; what one of a component is held back by, the others make up for.
+
+    steps: Of each vertex of the given surface, mm; changed in place to those that were made, but where volume is lost.
+    fresh: Components whose steps have not been made.
+    Returns the surface; of components that have still lost their volume so the vertices held back, and all.
+    """
+    standing, triangles = clusters.numbered()
+    count, labels, border = clusters.components()
+    labels, places, step = labels[standing], clusters.places[standing], steps[standing]
+    held, look_at = np.zeros(len(standing), dtype=bool), fresh[labels[triangles[:, 0]]]
+    for _ in range(_MOVES):
+        vertices = move_vertices(as_stored(places + origin), triangles, step, find_crossings, look_at=look_at)[0]
+        moved = vertices - origin - places
+        held |= np.abs(moved - step).max(axis=1) > rounding_step(vertices)
+        now = measure_volumes(places + moved, triangles, count, labels, border[standing])
+        spoilt = wanted.differ(now) & (np.bincount(labels[held], minlength=count) > 0)
+        if not spoilt.any():
+            break
+        step, look_at = moved, spoilt[labels[triangles[:, 0]]]
+        restore_volumes(places, step, triangles[look_at], labels, wanted, longest, held | ~spoilt[labels])
+    kept = ~spoilt[labels]
+    steps[standing[kept]] = moved[kept]
+    return vertices, triangles, standing[~kept & held], standing[~kept]
 
 
 def _mend(clusters: Clusters, deviation: Deviation, tell: Callable[[], None] = lambda: None) -> None:

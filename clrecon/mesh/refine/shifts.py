@@ -23,9 +23,9 @@ from clrecon.system.light_dataclass import dataclass
 _VOLUME_STEPS = 4
 """Newton steps along the normals; the first leaves about a hundredth of the missing volume."""
 
-_VOLUME_SLACK = 0.004
-"""Share of its volume by which a component may differ where that shift is too short.  A few dozen triangles can enclose
-several percent less after a collapse; the gate of the mesh job fails at 0.5 %."""
+_VOLUME_SLACK = 0.0005
+"""Share of its volume by which a component may differ where that shift is too short: collapses are undone then.  Of a
+speck the rounding of its coordinates can be more."""
 
 _ROUNDS = 40
 """Most rounds of taking steps back; each halves steps or widens the place, and CT needs 2 to 5."""
@@ -101,16 +101,17 @@ def restore_volumes(
     labels: NDArray[np.int64],
     wanted: Volumes,
     longest: float,
+    held: NDArray[np.bool_] | None = None,
 ) -> None:
     """Change steps so that each closed component gets the volume it had, by a shift along the normals.
 
     A small shift is a large share of the volume of a thin sheet: in a thin-walled bone at voxels of 3 mm, 6 % of the
     volume were 0.03 voxel.
 
-    step: ndarray, shape (n, 3), mm. Changed in place; no step becomes longer than `longest`.
+    step: ndarray, shape (n, 3), mm. Changed in place; no step becomes longer than `longest`, and those `held` stay.
     """
     count = len(wanted.mm3)
-    moving = np.flatnonzero((labels >= 0) & ~np.append(wanted.is_open, True)[labels])
+    moving = np.flatnonzero(~np.append(wanted.is_open, True)[labels] & ~(np.zeros(1, bool) if held is None else held))
     for _ in range(_VOLUME_STEPS):
         volumes, gradient = _volumes(vertices + step, triangles, labels, count)
         length = np.sqrt(np.einsum("an,an->n", gradient, gradient))
@@ -152,10 +153,11 @@ def move_vertices(
     find_crossings: FindCrossings = find_self_intersections,
     find_changed: Callable[[NDArray[np.floating], Float64Array], IntArray] | None = None,
     fans: Fans | None = None,
+    look_at: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.floating], int]:
     """Move vertices, but by less or not at all where triangles would cut, lose their area or share a place.
 
-    All triangles are looked at once, and then those around what is taken back.
+    All triangles, or those of `look_at`, are looked at once, and then those around what is taken back.
 
     find_changed: Given places and the share of each step that is made, finds vertices that are not to move at all.
     Returns:
@@ -164,7 +166,8 @@ def move_vertices(
     """
     share = np.ones(len(vertices))
     moved = as_stored(vertices + step)
-    spoilt: IntArray = _find_spoilt(moved, triangles, np.ones(len(triangles), dtype=bool), find_crossings)
+    look_at = np.ones(len(triangles), dtype=bool) if look_at is None else look_at
+    spoilt: IntArray = _find_spoilt(moved, triangles, look_at, find_crossings)
     near: _Near | None = None
     for turn in range(_ROUNDS):
         if turn >= _ROUNDS_OF_ITS_OWN and near is not None:
