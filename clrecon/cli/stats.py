@@ -106,11 +106,8 @@ def _lay_out_surfaces(labels: Sequence[dict[str, Any]]) -> list[str]:
         rows.append([printable(one["name"]), *cells])
     kind = "moved onto the bone from" if fitted else "at"
     units = "; walls and their error in mm, share of the vertices that lie on the bone" if fitted else ""
-    return [
-        "",
-        f"surface  {kind} {of[0]['iso_value_hu']:g} HU, filled{units}",
-        *common.table([head, *rows], range(1, 8)),
-    ]
+    text = f"surface  {kind} {of[0]['iso_value_hu']:g} HU, filled{units}"
+    return ["", text, *common.table([head, *rows], range(1, 8))]
 
 
 def _fit(names: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[str]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clrecon.errors import RefusedInputError, UsageError
+from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
 from clrecon.geometry import frame_from_lps
 from clrecon.jobs.corridor_results import (
     KNOWN_BIAS,
@@ -223,7 +223,11 @@ def _fit_vertebrae(run: Run, volume: Volume, labels: LabelMap, numbers: Sequence
 
     settings: CorridorSettings = run.settings
     with DeviceVolume(volume, device=settings.device, memory=settings.memory) as resident:
-        return fit_labels(resident, labels, level, numbers, progress=run.progress)
+        fitted: dict[int, Mesh] = fit_labels(resident, labels, level, numbers, progress=run.progress)
+    for number, mesh in fitted.items():
+        if not mesh.values:
+            raise NoSurfaceError(f"{labels.name(number)}: {mesh.report['cortex']['reason']}")
+    return fitted
 
 
 def lay_on_lattice(mesh: Mesh, lattice: Lattice) -> FittedLattice:

@@ -111,10 +111,8 @@ def surface_cells(surface: Mapping[str, Any]) -> list[Any]:
     if not cortex.get("vertices"):
         return [surface["area_mm2"], surface["ml"], *[None] * (len(SURFACE_CELLS) - 2)]
     walls = cortex["thickness_mm"]
-    return [
-        *(surface["area_mm2"], surface["ml"], walls["p5"], walls["p50"], walls["p95"]),
-        *(cortex["error_mm"]["p50"], cortex["fitted"] / cortex["vertices"]),
-    ]
+    error, fitted = cortex["error_mm"]["p50"], cortex["fitted"] / cortex["vertices"]
+    return [surface["area_mm2"], surface["ml"], walls["p5"], walls["p50"], walls["p95"], error, fitted]
 
 
 def as_csv(report: StatsReport) -> str:

@@ -99,7 +99,8 @@ class Fans:
         found = np.zeros((len(vertices), values.shape[1]), values.dtype)
         used = count > 0
         if used.any():
-            of_rows = values[triangles[rows]].sum(axis=1)
+            one, two, three = (values[corners] for corners in triangles[rows].T)
+            of_rows = one + two + three
             found[used] = np.add.reduceat(of_rows, (np.cumsum(count) - count)[used])
         return found
 

@@ -145,7 +145,7 @@ def measure_triangles(
         squares = np.einsum("ij,ij->j", cross, cross)
         shortest = min(np.einsum("ij,ij->j", edge, edge).min() for edge in (p, q, q - p))
         volume = np.einsum("ij,ij->", corner, cross)
-        pieces[where.start] = np.sqrt(squares).sum(), volume, np.count_nonzero(squares == 0.0), shortest
+        pieces[where.start] = np.sqrt(squares).sum(), volume, int(np.count_nonzero(squares == 0.0)), shortest
 
     in_threads(measure, len(triangles))
     if not pieces:

@@ -66,7 +66,6 @@ class FittedLattice:
 
 
 Fitted = Callable[[Lattice], FittedLattice]
-"""Finds the solid points and the crossings of a surface that takes the place of the level's."""
 
 
 def sample_volume(volume: Volume, points: Float64Array) -> NDArray[np.float32]:

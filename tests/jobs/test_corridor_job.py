@@ -15,14 +15,17 @@ import numpy as np
 import pytest
 import tolerances
 from box_vertebra import BoxVertebra, grid_around
+from label_files import write_nifti
 from made_once import make_once
+from surface_volumes import hollow_ball
 from variants import daily_rows
 
 from clrecon.cli.main import main
-from clrecon.errors import UsageError
+from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.jobs.corridor import lay_on_lattice, parse_screw, read_screws
+from clrecon.jobs.corridor import lay_on_lattice, make_corridors, parse_screw, read_screws
 from clrecon.jobs.corridor_results import GIVEN, cylinder_mesh, draw_corridors
+from clrecon.jobs.settings import CorridorSettings
 from clrecon.labels import LabelMap
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.cortex_mesh import fit_labels
@@ -56,6 +59,17 @@ def test_the_bone_of_a_vertebra_ends_where_the_fitted_surface_lies(device: Any) 
     some = np.random.default_rng(1).integers(0, bone.solid.shape, (20_000, 3))
     depth, solid = vertebra.depth(bone.lattice.points(some)), bone.solid[tuple(some.T)]
     assert solid[depth > 0.5].mean() > 0.999 and solid[depth < -0.5].mean() < 0.001
+
+
+def test_a_label_without_bone_beside_one_with_it_is_refused_in_words(tmp_path: Path, device: Any) -> None:
+    voxels = hollow_ball(thickness=3.0).voxels.copy()
+    numbers = (voxels > 190).astype(np.uint8)
+    voxels[6:9, 6:9, -4:-1], numbers[6:9, 6:9, -4:-1] = 260, 2  # too little to be fitted
+    write_nifti(tmp_path / "ct.nii", voxels, np.eye(4))
+    write_nifti(tmp_path / "l.nii", numbers, np.eye(4))
+    settings = CorridorSettings(labels=tmp_path / "l.nii", label=(1, 2), surface="cortex", device=str(device.index))
+    with pytest.raises(NoSurfaceError, match="label_2: .* no walls of bone"):
+        make_corridors(tmp_path / "ct.nii", settings)
 
 
 @pytest.mark.release

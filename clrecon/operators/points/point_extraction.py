@@ -452,13 +452,9 @@ def _measure_paper(volume: Volume, numbers: NDArray[Any]) -> dict[str, float]:
 
 
 def _surface(
-    resident: DeviceVolume,
-    level: Any,
-    labels: LabelMap | None,
-    label: int | str | None,
-    fitted: bool,
+    resident: DeviceVolume, level: Any, labels: LabelMap | None, label: int | str | None, fitted: bool,
     progress: Progress,
-) -> PointCloud:
+) -> PointCloud:  # fmt: skip
     from clrecon.operators.surface.extract import SurfaceExtractor  # which voxels need not wait for
     from clrecon.operators.surface.labels import extract_labels
 

@@ -66,7 +66,7 @@ class _Trial(NamedTuple):
     def changed(self, place: int, factor: float) -> _Trial:
         blurs = [self.blur_mm, self.across_mm]
         blurs[place] *= factor
-        return _Trial(*blurs, self.cortex_hu)
+        return _Trial(blurs[0], blurs[1], self.cortex_hu)
 
 
 _Fit = Callable[[_Trial, float], WallFits]

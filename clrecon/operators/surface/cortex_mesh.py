@@ -45,8 +45,6 @@ STATES = ("fitted", "not bone", "metal", "badly fitted", "no room")
 volume just outside of it."""
 
 FITTED, NOT_BONE, METAL, BADLY_FITTED, NO_ROOM = range(len(STATES))
-
-
 THINNEST_BLURS, EDGE_SHARE = 0.2, 0.6
 """A wall thinner than so many blurs, before something of less than this share of the cortex' HU, is an edge without a
 wall: a vessel, an organ, marrow.  Of true walls 1 to 3 % are as thin."""
@@ -233,7 +231,7 @@ def calm_vertices(
         elif turn >= CALM_ROUNDS:
             places[bad] = 0.5 * (places[bad] + vertices[bad])
         else:
-            count = np.diff(fans.begin)[bad, None]
+            count = (fans.begin[bad + 1] - fans.begin[bad])[:, None]
             beside = 0.5 * (fans.sums(places, triangles, bad) - count * places[bad])
             places[bad] = (places[bad] + beside) / (1.0 + count)
         rows = fans.touching(bad)

@@ -34,7 +34,7 @@ from clrecon.opencl import (
 from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import chunks, find_bounds
+from clrecon.system.pieces import chunks
 from clrecon.system.progress import Progress, Steps
 
 FEWEST = 20_000
@@ -91,27 +91,30 @@ class CrossingPlan:
 def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> CrossingPlan:
     """Enter at least one triangle into rows."""
     scaled = np.ldexp(vertices, 11 - int(np.frexp(np.abs(vertices).max())[1]))
-    low, high = find_boxes(scaled, triangles)
-    box = (high - low).T
-    longest = np.maximum(np.maximum(box[0], box[1]), box[2]).astype(np.float64)
-    origin, beyond = (corner.astype(np.float64) for corner in find_bounds(low))
-    edge = max(1.0, ROW_BOXES * float(np.quantile(longest[:: max(1, len(longest) // 10_000)], FINEST)))
+    low, high = (np.ascontiguousarray(corner.T) for corner in find_boxes(scaled, triangles))
+    high -= low
+    longest = np.maximum(np.maximum(high[0], high[1]), high[2])
+    origin, beyond = low.min(axis=1).astype(np.float64), low.max(axis=1).astype(np.float64)
+    some = longest[:: max(1, len(longest) // 10_000)].astype(np.float64)
+    edge = max(1.0, ROW_BOXES * float(np.quantile(some, FINEST)))
     while np.prod(np.floor((beyond - origin)[1:] / edge) + 1.0) > MOST_ROWS:
         edge *= 1.25
-    level = np.ceil(np.log2(np.maximum(longest / edge, 1.0))).astype(np.int64)
+    level = np.zeros(len(longest), np.int8)
+    coarse = np.flatnonzero(longest > edge)
+    level[coarse] = np.ceil(np.log2(longest[coarse].astype(np.float64) / edge))
     edges = (edge * 2.0 ** np.arange(int(level.max()) + 1)).astype(np.float32)
     size = (np.floor((beyond - origin)[1:] / edges[:, None].astype(np.float64)) + 1.0).astype(np.int64)  # y, z
     first_row = np.concatenate([[0], np.cumsum(size.prod(axis=1))])
-    row = first_row.take(level)
-    width = edges.astype(np.float64).take(level)
-    row += ((low[:, 1] - origin[1]) / width).astype(np.int64)
-    row += size[:, 0].take(level) * ((low[:, 2] - origin[2]) / width).astype(np.int64)
-    bits = np.ascontiguousarray(low[:, 0]).view(np.int32).astype(np.int64)
-    order = np.argsort(row << 32 | np.where(bits < 0, ~bits, bits + (1 << 31)))  # by row, then by number
+    row, longest_of = np.empty(len(longest), np.int64), np.zeros(len(edges))
+    for each, width in enumerate(edges.astype(np.float64)):
+        own = np.flatnonzero(level == each) if each else slice(None)  # coarse ones are entered anew
+        y, z = (((low[axis, own] - origin[axis]) / width).astype(np.int64) for axis in (1, 2))
+        row[own] = first_row[each] + y + size[each, 0] * z
+        longest_of[each] = longest[level == each].max(initial=0.0)
+    bits = low[0].view(np.int32)
+    order = np.argsort(row << 32 | np.where(bits < 0, ~bits, bits ^ np.int32(-(2**31))).view(np.uint32))
     starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=first_row[-1]))]).astype(np.uint32)
     levels = np.column_stack([first_row[:-1], size, starts[first_row[1:]]]).astype(np.uint32)
-    longest_of = np.zeros(len(edges))
-    np.maximum.at(longest_of, level, longest)
     table = np.column_stack([edges, longest_of]).astype(np.float32)
     return CrossingPlan(scaled, triangles, order.astype(np.uint32), origin.astype(np.float32), starts, levels, table)
 
