@@ -43,6 +43,8 @@ def _describe_survey(survey: dict[str, Any]) -> list[str]:
         lines.append(f"{'':18}{device['compute_units']} compute units, {memory}{own}, largest buffer {largest}")
         driver = f"{device['platform']}, {device['version']}, driver {device['driver']}"
         lines.append(f"{'':18}{printable(driver)}")
+        if device["chosen"]:
+            lines.append(f"{'':18}taken {survey['reason']}")
         if device["shortcoming"]:
             lines.append(f"{'':18}cannot be used: {printable(device['shortcoming'])}")
         if device["fault"]:

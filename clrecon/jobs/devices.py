@@ -11,14 +11,16 @@ from clrecon.errors import DeviceError
 def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError | None]:
     """List every OpenCL platform and device, as docs/contract.md says, and which would be used, or why none would."""
     from clrecon.opencl import cache_warnings, choose_remembered, list_devices, list_platforms, remembered_fault
+    from clrecon.opencl.select import explain_choice
 
     devices = list_devices()
     problem: DeviceError | None = None
     chosen: int | None = None
+    reason: str | None = None
     warnings: Sequence[str] = cache_warnings()
     try:
         device = choose_remembered(name)
-        chosen, warnings = device.index, device.warnings
+        chosen, reason, warnings = device.index, explain_choice(name), device.warnings
     except DeviceError as error:
         problem = error
     survey = {
@@ -28,6 +30,7 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
             for device in devices
         ],
         "chosen": chosen,
+        "reason": reason,
         "warnings": list(warnings),
     }
     return survey, problem

@@ -312,6 +312,26 @@ def choose_remembered(name: str | int | None = None) -> Device:
     return next(sound, devices[0]) if is_automatic else devices[0]
 
 
+_REASONS = (
+    *("GPUs come before accelerators, CPUs and software", "it has memory of its own", "it has more compute units"),
+    *("its driver is newer", "it has more memory", "it is listed first"),
+)
+"""What the entries of `Device.score` say of the better device."""
+
+
+def explain_choice(name: str | int | None = None) -> str:
+    """Return why `choose_remembered` takes its device, and before which one."""
+    devices, is_automatic = find_candidates(name)
+    chosen = choose_remembered(name)
+    named = "" if is_automatic else "named, "
+    others = [device for device in devices if device is not chosen and not (is_automatic and remembered_fault(device))]
+    if not others:
+        return f"{named}no other one"
+    other = max(others, key=lambda device: device.score)
+    each = zip(_REASONS, chosen.score, other.score, strict=True)
+    return f"{named}before {other.index}: {next(why for why, one, two in each if one != two)}"
+
+
 def choose_unchecked(name: str | int | None = None) -> Device:
     """Choose as `choose_device` does, whether the device computes rightly or not; nothing runs on it."""
     return find_candidates(name)[0][0]

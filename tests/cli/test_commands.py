@@ -238,6 +238,7 @@ def test_devices_lists_each(device: Any, capsys: pytest.CaptureFixture[str]) -> 
     assert main(["devices", "--device", str(device.index)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith(f"* {device.index}  ") and device.name in line for line in lines)
+    assert f"taken {survey['reason']}" in [line.strip() for line in lines] and survey["reason"].startswith("named, ")
 
 
 @pytest.mark.parametrize("command", ["devices", "selftest", "mesh"])

@@ -230,7 +230,11 @@ def test_a_simulator_is_named_as_one() -> None:
         "max_allocation_bytes": 10**6, "index": 0, "name": "N", "compute_units": 2, "platform": "P", "version": "V",
         "driver": "D", "shortcoming": "", "fault": "",
     }  # fmt: skip
-    survey = {"devices": [device, {**device, "simulator": False, "chosen": False}], "platforms": []}
+    survey = {
+        "devices": [device, {**device, "simulator": False, "chosen": False}],
+        "platforms": [],
+        "reason": "no other one",
+    }
     lines = devices._describe_survey(survey)
     assert [line[:14].strip() for line in lines if line[4:14].strip()[:3] in ("sim", "cpu")] == [
         "* 0  simulator",

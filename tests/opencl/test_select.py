@@ -25,7 +25,7 @@ class FakeDevice:
         self.warnings: list[str] = []
         self.remark = self.warnings.append
         rank = 0 if software else {"gpu": 3, "accelerator": 2, "cpu": 1}.get(kind, 0)
-        self.score = (rank, memory, "1", -index)
+        self.score = (rank, False, 1, (1,), memory, -index)
 
 
 @pytest.fixture
@@ -119,6 +119,23 @@ def test_row_57_what_is_remembered_chooses_the_device_that_is_shown(machine, mon
     assert select.choose_remembered("h200").name == select.choose_remembered("gpu").name == "H200"
     found.update({device.name: "wrong sums" for device in machine})
     assert select.choose_remembered().name == "H200"  # none is better
+
+
+def test_the_choice_is_explained(machine, monkeypatch):
+    monkeypatch.setattr(select, "remembered_fault", lambda device: "")
+    assert select.explain_choice() == "before 2: it has more memory"
+    assert select.explain_choice("gpu") == "named, before 2: it has more memory"
+    assert select.explain_choice("radeon") == "named, no other one"
+    radeon = machine[2]
+    for at, value, why in ((3, (2,), "its driver is newer"), (2, 2, "it has more compute units"),
+                           (1, True, "it has memory of its own")):  # fmt: skip
+        radeon.score = (*radeon.score[:at], value, *radeon.score[at + 1 :])
+        assert select.explain_choice() == f"before 3: {why}"
+    del machine[2:4]
+    monkeypatch.setattr(select, "list_devices", lambda: machine)
+    assert select.explain_choice() == "before 4: GPUs come before accelerators, CPUs and software"
+    monkeypatch.setattr(select, "remembered_fault", lambda device: "wrong sums" if device.index == 4 else "")
+    assert select.explain_choice() == "no other one"
 
 
 def test_row_57_a_device_that_computes_wrongly_is_passed_over_or_refused(machine, monkeypatch):

@@ -15,7 +15,7 @@ import clrecon
 from clrecon.opencl import allocate, buffers, copy_buffer, download, download_all, transfers, upload
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.transfers import LEAST_BYTES, PIECE_BYTES, PIECES, PinnedPieces
-from clrecon.rendering.pictures.styles import VolumeLook
+from clrecon.rendering.pictures.styles import Projection, VolumeLook
 
 
 @pytest.fixture
@@ -192,12 +192,18 @@ def test_what_a_surface_and_a_picture_ask_of_the_driver(apart):
     assert np.array_equal(again.vertices, mesh.vertices)
     assert counts["launches"] == 9
     assert counts["blocking reads"] <= 2 and counts["allocations"] <= 1 and counts["uploads"] <= 3
+    assert counts["uploads, bytes"] <= volume.voxels.nbytes + 8192
+    totals, arrays = 32, mesh.vertices.nbytes + mesh.normals.nbytes + mesh.triangles.nbytes
+    assert counts["blocking reads, bytes"] <= arrays + totals
     with clrecon.VolumeRenderer(volume, device=apart) as renderer:
         for angle in (0, 10):
             renderer.render(VolumeLook("bone"), view=(angle, 0), size=(64, 64))
         with counting_calls() as counts:
             renderer.render(VolumeLook("bone"), view=(20, 0), size=(64, 64))
+        with counting_calls() as of_projection:
+            renderer.render(Projection("mip"), view=(20, 0), size=(64, 64))
     assert counts["launches"] == 3 and counts["blocking reads"] == 1 and counts["allocations"] == 0
+    assert counts["blocking reads, bytes"] == 12 * 64 * 64 and of_projection["blocking reads, bytes"] == 8 * 64 * 64
 
 
 @pytest.mark.seconds

@@ -258,9 +258,8 @@ class PictureBuffers:
         width, height = self.size
         return -(-width // TILE) * -(-height // TILE)
 
-    def download(self) -> Pixels:
-        """Wait for the device and return image, depths and means."""
-        download_all(
-            self.device, (self.image, self.image_d, 0), (self.depths, self.depths_d, 0), (self.means, self.means_d, 0)
-        )
+    def download(self, *, has_image: bool = True) -> Pixels:
+        """Wait for the device and return image, depths and means; an image that no kernel made is not brought."""
+        images = [(self.image, self.image_d, 0)] if has_image else []
+        download_all(self.device, *images, (self.depths, self.depths_d, 0), (self.means, self.means_d, 0))
         return self.image, self.depths, self.means

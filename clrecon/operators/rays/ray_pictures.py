@@ -271,6 +271,7 @@ class _Job(SlabPicture):
         label_style = style.label_style if isinstance(style, VolumeLook) else None
         super().__init__(resident, shot, ray_step, label_style, warnings)
         self.style = style
+        self.makes_image = isinstance(style, VolumeLook)  # those of projections are made of their values
         self.lighting = style.light if isinstance(style, VolumeLook) else Lighting()
         self.box = volume_box(resident.volume)
         self.planes = None if style.clip is None else style.clip.planes

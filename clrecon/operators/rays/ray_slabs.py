@@ -320,6 +320,8 @@ def _find_box(volume: Volume, marked: NDArray[np.bool_], slab: RaySlab) -> tuple
 class SlabPicture(ABC):
     """A picture of a volume whose slabs are drawn one after the other."""
 
+    makes_image = True
+
     def __init__(
         self, resident: DeviceVolume, shot: Shot, ray_step: float, style: LabelStyle | None, warnings: list[str]
     ):
@@ -358,7 +360,7 @@ class SlabPicture(ABC):
             self.draw(slab, output)
             tell("slabs", min(number * slices, nk), nk)
         with self.stopwatch.timed("download"):
-            return output.download(), number
+            return output.download(has_image=self.makes_image), number
 
     def describe(self, mode: str, slabs: int, **own: Any) -> dict[str, Any]:
         device = self.resident.device
