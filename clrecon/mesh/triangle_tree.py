@@ -46,21 +46,20 @@ class TriangleTree:
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
         self._columns = np.ascontiguousarray(vertices.T, dtype=np.float64)
-        corners = np.ascontiguousarray(triangles.T).astype(np.intp)
-        low, high = np.empty((2, 3, len(triangles)))
+        self._triangles = triangles
+        # Rounded outwards: no triangle is left out for the digits of its box.
+        lows, highs = np.empty((2, 3, len(triangles)), np.float32)
         for axis, column in enumerate(self._columns):
-            a, b, c = (column.take(corner, mode="clip") for corner in corners)
-            np.minimum(np.minimum(a, b), c, out=low[axis])
-            np.maximum(np.maximum(a, b), c, out=high[axis])
-        self._curve = _Curve(low + high)
-        codes = self._curve.codes(low + high)
+            a, b, c = (column.take(corner, mode="clip") for corner in triangles.T)
+            np.nextafter(np.minimum(np.minimum(a, b), c), -np.inf, out=lows[axis], dtype=np.float32)
+            np.nextafter(np.maximum(np.maximum(a, b), c), np.inf, out=highs[axis], dtype=np.float32)
+        self._curve = _Curve(lows + highs)
+        codes = self._curve.codes(lows + highs)
         order = np.argsort(codes, kind="stable")
         order = np.concatenate([order, np.full(-len(order) % LEAF, order[-1])])
         self._rows, self._firsts = order.reshape(-1, LEAF), codes[order[::LEAF]]
-        self._corners = corners
-        # Rounded outwards: no triangle is left out for the digits of its box.
-        lows = np.nextafter(low[:, self._rows].min(axis=2), -np.inf, dtype=np.float32)
-        highs = np.nextafter(high[:, self._rows].max(axis=2), np.inf, dtype=np.float32)
+        lows = np.array([column[self._rows].min(axis=1) for column in lows])
+        highs = np.array([column[self._rows].max(axis=1) for column in highs])
         self._levels: list[NDArray[np.float32]] = []
         while not self._levels or len(self._levels[0]) > 1:
             empty = ((0, 0), (0, -lows.shape[1] % FAN))
@@ -122,7 +121,7 @@ class TriangleTree:
     ) -> tuple[Points, NDArray[np.int64], NDArray[np.float64]]:
         """Return the places nearest to points on the triangles of one leaf each, with rows and squares."""
         rows = self._rows[leaves].reshape(-1)
-        a, b, c = (self._columns.take(corner.take(rows), axis=1, mode="clip") for corner in self._corners)
+        a, b, c = self._corners(rows)
         b -= a
         c -= a
         away = (columns[:, :, None] - a.reshape(3, -1, LEAF)).reshape(3, -1)
@@ -132,6 +131,9 @@ class TriangleTree:
         places = a[:, best] + u[best] * b[:, best] + v[best] * c[:, best]
         away = columns - places
         return places.T, rows[best], np.einsum("ij,ij->j", away, away)
+
+    def _corners(self, rows: NDArray[np.intp]) -> tuple[Columns, ...]:
+        return tuple(self._columns.take(corner, axis=1, mode="clip") for corner in self._triangles.take(rows, axis=0).T)
 
     def _find_first(self, starts: Points, ways: Points, reach: float) -> NDArray[np.float64]:
         """Return the share of each way at which a line first meets the surface, infinity beyond `reach`."""
@@ -144,7 +146,7 @@ class TriangleTree:
             halves = zip(np.array_split(starts, 2), np.array_split(ways, 2), strict=True)
             return np.concatenate([self._find_first(*half, reach) for half in halves])
         items, rows = pairs[0].repeat(LEAF), self._rows[pairs[1]].reshape(-1)
-        a, b, c = (self._columns.take(corner.take(rows), axis=1, mode="clip") for corner in self._corners)
+        a, b, c = self._corners(rows)
         shares = _shares_of_lines(begin[:, items], ways.T[:, items], a, b - a, c - a)
         shares[~(shares <= reach)] = np.inf
         found = np.full(len(starts), np.inf)
@@ -180,21 +182,23 @@ class TriangleTree:
 class _Curve:
     """A Morton curve through the box around points (3, k)."""
 
-    def __init__(self, columns: Columns):
+    def __init__(self, columns: NDArray[np.floating]):
         self._low, high = (end[:, None] for end in find_bounds(columns.T))
         size = np.where(high > self._low, high - self._low, np.inf)
         self._steps = (2**CURVE_BITS - 1) / size
         number = np.arange(2**CURVE_BITS, dtype=np.uint32)
         self._spread = np.bitwise_or.reduce([(number >> bit & 1) << 3 * bit for bit in range(CURVE_BITS)])
 
-    def codes(self, columns: Columns) -> NDArray[np.uint32]:
+    def codes(self, columns: NDArray[np.floating]) -> NDArray[np.uint32]:
         """Return the place on the curve of each point, (k,); of those beside the box that of its border."""
-        cells = np.clip((columns - self._low) * self._steps, 0, 2**CURVE_BITS - 1).astype(np.intp)
-        x, y, z = self._spread[cells]
-        return np.asarray(x | y << 1 | z << 2)
+        codes = np.zeros(columns.shape[1], np.uint32)
+        for axis, column in enumerate(columns):
+            cells = np.clip((column - self._low[axis]) * self._steps[axis], 0, 2**CURVE_BITS - 1)
+            codes |= self._spread[cells.astype(np.intp)] << np.uint32(axis)
+        return codes
 
 
-def _squares_to_boxes(columns: Columns, boxes: NDArray[np.float32]) -> NDArray[np.float64]:
+def _squares_to_boxes(columns: NDArray[np.floating], boxes: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return squared distances (k, `FAN`) of points (3, k) from boxes (k, 6, `FAN`); infinity for those left empty."""
     squares = np.zeros((len(boxes), FAN))
     for axis, column in enumerate(columns):

@@ -81,13 +81,15 @@ def make_parts(source: str | Path, run: Run, check_map: Callable[[LabelMap], Non
     else:
         extracted = extract_surfaces(solid, surfaces, device, settings, run.progress, labels)
     origins = [mesh.report for mesh in extracted]
+    make_solid = _remember_filled(volume, solid)
+    del solid
     run.lap("surface")
     steps = Steps(run.progress if settings.selects else None, "select", SELECT_STEPS * len(surfaces))
     parts: list[Part] = []
     for place, (surface, mesh) in enumerate(zip(surfaces, extracted, strict=True), start=1):
         parts += select_parts(surface, mesh, settings, device.current, volume, steps)
         steps.take(SELECT_STEPS * place - steps.done)
-    return MadeParts(volume, _remember_filled(volume, solid), parts, device, choice, origins)
+    return MadeParts(volume, make_solid, parts, device, choice, origins)
 
 
 BESIDE_SLICES = 16
