@@ -86,7 +86,7 @@ static inline uint pick_number(const cell_numbers numbers, uint edge)
 }
 
 /* Vertex numbers of the 12 edges of cell b of the word; those of edges that are not crossed mean nothing. */
-static inline cell_numbers number_cell(const numbered_rows *edges, uint b)
+static inline void number_cell(cell_numbers *numbers, const numbered_rows *edges, uint b)
 {
 #define BIT(window, at) ((uint)((window) >> (at)) & 1)
     const uint at0 = number_at(&edges->y0z0, b), at1 = number_at(&edges->y1z0, b), at2 = number_at(&edges->y0z1, b);
@@ -95,13 +95,11 @@ static inline cell_numbers number_cell(const numbered_rows *edges, uint b)
     const uint after0 = at0 + x0 + y0 + (edges->y0z0.z >> b & 1) + BIT(edges->y0z0.x_window, b + 1);
     const uint after1 = at1 + x1 + y1 + (edges->y1z0.z >> b & 1) + BIT(edges->y1z0.x_window, b + 1);
     const uint after2 = at2 + x2 + y2 + (edges->y0z1.z >> b & 1) + BIT(edges->y0z1.x_window, b + 1);
-    const cell_numbers numbers = {
-        (uint8)(at0, at1, at2, number_at(&edges->y1z1, b), at0 + x0, after0, at2 + x2, after2),
-        (uint4)(at0 + x0 + y0, after0 + BIT(edges->y0z0.y_window, b + 1), at1 + x1 + y1,
-            after1 + BIT(edges->y1z0.y_window, b + 1))
-    };
+    numbers->along_xy
+        = (uint8)(at0, at1, at2, number_at(&edges->y1z1, b), at0 + x0, after0, at2 + x2, after2);
+    numbers->along_z = (uint4)(at0 + x0 + y0, after0 + BIT(edges->y0z0.y_window, b + 1), at1 + x1 + y1,
+        after1 + BIT(edges->y1z0.y_window, b + 1));
 #undef BIT
-    return numbers;
 }
 
 #endif

@@ -233,7 +233,8 @@ __kernel void emit_triangles(
         number_rows(&edges, &rows, &kept, mask, row_offsets, word_vertices, first_vertex, j, k, w, gi, gj, gk, words);
         for (; rest != 0; rest &= rest - 1) {
             const uint b = lowest_bit(rest);
-            const cell_numbers edge_numbers = number_cell(&edges, b);
+            cell_numbers edge_numbers;
+            number_cell(&edge_numbers, &edges, b);
             const ulong packed = MC_TRIANGLES[cell_case(rows, b)];
             const uint count = (uint)packed & 15;
 #if LANES > 1

@@ -201,7 +201,8 @@ __kernel void emit_cell_triangles(
     __global uint *out = triangles + 3 * ((size_t)row_triangle + word_triangles[(size_t)row * words + w]);
     for (; rest != 0; rest &= rest - 1) {
         const uint b = lowest_bit(rest), number = cell_case(rows, b);
-        const cell_numbers numbers = number_cell(&edges, b);
+        cell_numbers numbers;
+        number_cell(&numbers, &edges, b);
         if (choices >> b & 1) {
             const uint found = find_row(number, &volume, (int)(32 * w + b) - border, (int)j - border,
                 (int)k + first_sample_slice - border, iso_level);
