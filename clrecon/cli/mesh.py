@@ -401,8 +401,8 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
     if left_out["not_bone"] is not None:
         bone = left_out["pieces"] + facts["pieces"] - left_out["not_bone"]
         lines.append(
-            f"         kept {facts['pieces']:,} of {bone:,} pieces with walls like bone; {left_out['not_bone']:,} of"
-            f" {format_ml(left_out['not_bone_ml'])} are not, or are crumbs"
+            f"         kept {facts['pieces']:,} of {bone:,} pieces with walls like bone;"
+            f" {count_of(left_out['not_bone'], 'piece')} without, or crumbs, of {format_ml(left_out['not_bone_ml'])}"
         )
     return lines
 
