@@ -330,6 +330,11 @@ def add_cropping(parser: argparse.ArgumentParser, frame: str) -> None:
     add_fields(parser.add_argument_group(f"crop, in mm {frame}", _CROP), InputSettings, "crop")
 
 
+def describe_fit(cortex: dict[str, Any]) -> str:
+    share = 100.0 * cortex["fitted"] / cortex["vertices"]
+    return f"{share:.0f} % of it, error {cortex['error_mm']['p50']:.2f} mm"
+
+
 def show_report(report: dict[str, Any], lines: Iterable[str], options: argparse.Namespace, console: Console) -> None:
     """Print a report: as JSON or its lines for people, and its warnings."""
     console.result(report)

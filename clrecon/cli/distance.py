@@ -91,8 +91,7 @@ def _describe_mesh(letter: str, entry: dict[str, Any]) -> list[str]:
     if entry["iso_value_hu"] is not None:
         made = [f"         bone {'fitted from' if entry['cortex'] else 'at'} {entry['iso_value_hu']:g} HU"]
     if entry["cortex"]:
-        share = 100.0 * entry["cortex"]["fitted"] / entry["cortex"]["vertices"]
-        made[0] += f", {share:.0f} % of it, error {entry['cortex']['error_mm']['p50']:.2f} mm"
+        made[0] += f", {common.describe_fit(entry['cortex'])}"
     size = f"{entry['triangles']:,} triangles, "
     size += "not closed" if entry["volume_ml"] is None else f"closed, {format_volume(entry['volume_ml'])}"
     turned = ", turned to LPS" if entry["space"] != "LPS" else ""

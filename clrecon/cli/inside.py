@@ -101,9 +101,8 @@ def _describe_vertebra(vertebra: dict[str, Any]) -> list[str]:
     volumes, (low, high) = vertebra["volumes_ml"], vertebra["dense_hu"]
     level = vertebra["iso_value_hu"]
     of = "label" if level is None else f"{level:g} HU"
-    if (cortex := vertebra["cortex"]) is not None:
-        error, told = cortex["error_mm"]["p50"], 100.0 * cortex["fitted"] / cortex["vertices"]
-        of = f"fitted to the bone from {of}, {told:.0f} % of it, error {error:.2f} mm"
+    if vertebra["cortex"] is not None:
+        of = f"fitted to the bone from {of}, {common.describe_fit(vertebra['cortex'])}"
     if low is None:
         band = f"up to {high:g} HU"
     else:

@@ -200,13 +200,10 @@ def surface_option(of_hu: str, more: str = "", **how: Any) -> Any:
     )
 
 
-def check_surface(surface: str | None, *more: str) -> None:
+def check_surface(surface: str | None, level: float | None = None, *more: str) -> None:
     words = ("hu", "cortex", *more)
     if surface is not None and surface not in words:
         raise UsageError(f"there is no surface {surface!r}: it is {', '.join(words[:-1])} or {words[-1]}")
-
-
-def check_level(level: float | None) -> None:
     if level is not None and not math.isfinite(level):
         raise UsageError(f"the level is a finite number of HU, not {level}")
 

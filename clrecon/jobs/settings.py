@@ -13,7 +13,6 @@ from clrecon.jobs.options import (
     DeviceSettings,
     InputSettings,
     ScanSettings,
-    check_level,
     check_surface,
     grow_option,
     label_map_option,
@@ -43,8 +42,7 @@ def check_space(space: str | None) -> None:
 
 
 def _check_surface_level(settings: StatsSettings | DistanceSettings) -> None:
-    check_surface(settings.surface)
-    check_level(settings.iso_value)
+    check_surface(settings.surface, settings.iso_value)
     if settings.iso_value is not None and settings.surface is None:
         raise UsageError(
             f"a level is that of a surface: ask for one ({name_parameter('surface', 'hu')}), or leave"
@@ -315,7 +313,6 @@ class CorridorSettings(ScanSettings, DeviceSettings):
             raise UsageError(f"name the vertebrae: {name_parameter('label', 'L3')}, once for each")
         if not (math.isfinite(self.margin) and 0.0 <= self.margin <= LARGEST_MARGIN_MM):
             raise UsageError(f"the margin is a length from 0 to {LARGEST_MARGIN_MM:g} mm, not {self.margin:g}")
-        check_surface(self.surface)
-        check_level(self.iso_value)
+        check_surface(self.surface, self.iso_value)
         check_space(self.space)
         super().__post_init__()

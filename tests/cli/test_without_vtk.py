@@ -6,8 +6,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from clrecon import read_mesh
 from clrecon.cli.main import main
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
@@ -37,3 +39,7 @@ def test_meshes_are_smoothed_decimated_printed_compared_and_written(
         assert main([*command.split(), *([] if "distance" in command else ["--device", str(device.index)])]) == 0, (
             command
         )
+    mesh = read_mesh("b.ply")
+    assert mesh.closest_points(mesh.vertices[:3])[1] == pytest.approx(0.0, abs=1e-6)
+    middle = mesh.vertices[mesh.triangles[:3]].mean(axis=1)
+    assert np.isfinite(mesh.ray(middle + [0.0, 0.0, 500.0], middle - (middle + [0.0, 0.0, 500.0]))).all()

@@ -247,7 +247,7 @@ class MeshSettings(InputSettings):
 
     def _check_surface(self) -> None:
         """Refuse an unknown kind of surface, and `cortex` where HU do not place the outer surface of bone."""
-        check_surface(self.surface, "mask")
+        check_surface(self.surface, None, "mask")
         if self.surface == "hu":
             return
         name = name_parameter("surface", self.surface)
