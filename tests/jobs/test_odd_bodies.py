@@ -17,7 +17,7 @@ from clrecon.jobs.mesh.purposes import LEFT_SHARE, settings_for
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.render.job import PictureFiles, make_pictures
 from clrecon.jobs.render.settings import RenderSettings
-from clrecon.system.text import format_ml
+from clrecon.system.text import count_of, format_ml
 
 BONY = [name for name in BODIES if name not in ("water", "empty")]
 SELDOM = ("skull-prone", "head", "pair", "contrast")
@@ -277,7 +277,8 @@ def test_a_print_is_of_bone_and_says_what_is_none(odd: OddBodies, device: Any, t
     assert (report["keep"], report["components"]) == ("bone", 1)
     left_out, kept_ml = report["print"]["left_out"], report["print"]["pieces_ml"]
     assert 0.0 <= left_out["not_bone_ml"] <= left_out["pieces_ml"]
-    assert any(f"{left_out['not_bone']:,} of" in line and "kept 1 of" in line for line in describe_purposes([report]))
+    without = f"{count_of(left_out['not_bone'], 'piece')} without"
+    assert any(without in line and "kept 1 of" in line for line in describe_purposes([report])), without
     warned = any("bone that was left out encloses" in warning for warning in report["warnings"])
     assert warned == (left_out["pieces_ml"] - left_out["not_bone_ml"] > LEFT_SHARE * kept_ml)
 
