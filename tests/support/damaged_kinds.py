@@ -57,14 +57,7 @@ DAMAGES: dict[str, Callable[[Any], None]] = {
     BLANK: blank,
 }
 
-KNOWN, SCALE, BOTH, REFUSED, WARNED, SILENT = (
-    "hu_known",
-    "hu_scale",
-    "hu_known, hu_scale",
-    "refused",
-    "warned",
-    "nothing",
-)
+KNOWN, SCALE, BOTH, REFUSED, WARNED = "hu_known", "hu_scale", "hu_known, hu_scale", "refused", "warned"
 SAID = {
     "sound": (SCALE, KNOWN, "", "", "", ""),
     "no slope and intercept": (KNOWN, KNOWN, BOTH, BOTH, BOTH, BOTH),
@@ -72,7 +65,7 @@ SAID = {
     "intercept - 1024": (SCALE, KNOWN, SCALE, SCALE, SCALE, SCALE),
     "intercept + 400": (SCALE, KNOWN, SCALE, SCALE, SCALE, SCALE),
     "0.6 of the values + 400": (SCALE, KNOWN, SCALE, SCALE, SCALE, SCALE),
-    "half the values": (SCALE, KNOWN, SILENT, SILENT, SILENT, SILENT),
+    "half the values": (SCALE, KNOWN, SCALE, SCALE, SCALE, SCALE),
     "RescaleType US": (KNOWN, KNOWN, KNOWN, KNOWN, KNOWN, KNOWN),
     LOST: (REFUSED,) * 6,
     BLANK: (f"{WARNED}, {SCALE}", f"{WARNED}, {KNOWN}", WARNED, WARNED, WARNED, WARNED),
@@ -101,7 +94,7 @@ def damage(scan: Path, folder: Path, name: str) -> Path:
 def list_damages() -> str:
     """Return the table of the page."""
     lines = [f"| damage | {' | '.join(SLICES)} |", "|---|" + "---|" * len(SLICES)]
-    named = {KNOWN: f"`{KNOWN}`", SCALE: f"`{SCALE}`", SILENT: f"**{SILENT}**"}
+    named = {KNOWN: f"`{KNOWN}`", SCALE: f"`{SCALE}`"}
     for name, said in SAID.items():
         cells = [", ".join(named.get(word, word) for word in cell.split(", ")) for cell in said]
         lines.append(f"| {name} | {' | '.join(cells)} |")

@@ -98,7 +98,7 @@ THICK_SLICES_MM = 2.5
 """Spacing from which on the half-way level can be too high: at 3 mm it loses blurred thin walls (docs/iso_value.md)."""
 
 
-VALUE_GATES = ("hu_known", "hu_scale", "stored_sign")
+VALUE_GATES = ("hu_known", "plausible_hu", "hu_scale", "stored_sign")
 """Gates of a volume that fail where its values are not HU."""
 
 

@@ -78,7 +78,8 @@ TAILS = 0.0005
 """Share of the values that is left out at either end."""
 VALLEY = 0.5
 """Two peaks are two where the histogram between them falls below this share of the lower one."""
-LEAST_PEAK_SHARE = 0.02
+LEAST_PEAK_SHARE, SMALL_PEAK_SHARE = 0.02, 0.004
+"""Least share of a peak, and that of one of soft tissue around bone in a wide field."""
 
 
 class Peak(NamedTuple):
@@ -94,7 +95,7 @@ class Peak(NamedTuple):
 
 
 def find_peaks(values: NDArray[Any]) -> list[Peak]:
-    """Return the peaks of sorted values that hold `LEAST_PEAK_SHARE` of them, from the lowest to the highest."""
+    """Return the peaks of sorted values that hold `SMALL_PEAK_SHARE` of them, from the lowest to the highest."""
     end = int(TAILS * len(values))
     inner = values[end : len(values) - end].astype(np.float64)
     low, high = float(inner[0]), float(inner[-1])
@@ -109,7 +110,7 @@ def find_peaks(values: NDArray[Any]) -> list[Peak]:
         below, above = (np.flatnonzero(half <= smooth[top] / 2.0) for half in (smooth[:top], smooth[top:]))
         first, last = (int(below[-1]) if len(below) else 0), top + (int(above[0]) if len(above) else len(smooth))
         share = float(smooth[first : last + 1].sum()) / len(values)
-        if share >= LEAST_PEAK_SHARE:
+        if share >= SMALL_PEAK_SHARE:
             peaks.append(Peak(low + (top - border + 0.5) * width, (last - first) * width, share))
     return peaks
 
@@ -148,11 +149,16 @@ LUNG_HU, LUNG_WIDTH = -700, 115
 """Lung may be as low as this; its peak is wider than that."""
 STEP_HU, CT_STEP_HU = (450, 1200), (850, 1200)
 """Range of the step from air to soft tissue, and that of a CT, from fat to blood."""
+LEAST_STEP_HU, HIGHEST_AMONG_HU = 300, 500
+"""Least step from air to the soft tissue around bone on any scale, and up to where fat, water or spongy bone may be, so
+that it is that of a CT."""
+AS_LUNG_HU, ABOVE_LUNG_HU = -600, 150
+"""Up to where "air" may be lung, around which soft tissue is lower than this."""
 FAT_STEP_HU, MUSCLE_STEP_HU = (860, 940), (1000, 1130)
 BELOW_AIR_HU, MOST_BEYOND = 150, 0.002
 """So far below the peak of air is at most this share, and so it is in other ranges that a shift leaves empty."""
 
-INTERCEPT_HU = 1024
+INTERCEPT_HU, MISSING = 1024, "the rescale intercept seems to be missing"
 LEAST_SHARE, LEAST_TISSUE, TISSUE_PART = 0.02, 0.1, 0.6
 """Least share of air (within 100 HU) and, for a shift by `INTERCEPT_HU`, of soft tissue (within 150 HU): of all values,
 and of those as dense or denser.  Brain and its skull are no air and soft tissue."""
@@ -172,6 +178,79 @@ STRETCHED_HU, NARROW, DENSE, LEAST_DENSE = 300, 0.08, (1.25, 2.3), 0.02
 its step from air, and at least the last share of it at these multiples of the step, as of bone."""
 
 
+CALMED, RING = 3, 2
+"""Width of the mean that takes the noise out of a slice, and distance of the ring round what is dense, voxels."""
+LEAST_CORE, DENSER, ALIKE, NEAR_AIR = 0.01, 0.2, 0.2, 0.3
+"""Least share of a body that is denser than soft tissue, by how much, how much soft tissue varies, and how far up from
+air the border of a body reaches: shares of the step from air to soft tissue."""
+WIDER, WIDEST_TISSUE = 1.3, 0.3
+"""Lung is so many times wider than the peak of soft tissue; that of bone is wider than this share of the step."""
+LEAST_AROUND, MOST_AIR_AROUND = 0.5, 0.1
+"""Least share of soft tissue and largest share of air in the ring.  Sound scans and phantoms have 0.54 to 1.00 and 0 to
+0.09, dry bones 0 to 0.08 and 0.49 to 0.87."""
+
+
+class Layers:
+    """Sampled slices of a volume: whether bone lies in soft tissue, and not in what may be air."""
+
+    def __init__(self, voxels: NDArray[Any]):
+        self.voxels = voxels
+        self._calm: list[NDArray[np.float32]] = []
+
+    def find_enclosing(self, air: Peak, above: Sequence[Peak]) -> Peak | None:
+        """Return the soft tissue that lies around bone, of the peaks above one that may be air; None without any."""
+        around = []
+        for peak in above:
+            step = peak.at - air.at
+            is_lung, is_bone = air.width > max(LUNG_WIDTH, WIDER * peak.width), peak.width > WIDEST_TISSUE * step
+            off = None if is_lung or is_bone or step < LEAST_STEP_HU else self._measure_around(air.at, peak.at)
+            if off is not None:
+                around.append((off, peak))
+        if not around:
+            return None
+        found = min(around)[1]
+        if air.at < AS_LUNG_HU and found.at < ABOVE_LUNG_HU:
+            return None
+        among = air.at < AS_LUNG_HU or OFFSET_AIR_HU[1] < air.at <= HIGHEST_AMONG_HU
+        return found if not among or CT_STEP_HU[0] <= found.at - air.at <= CT_STEP_HU[1] else None
+
+    def _measure_around(self, air: float, tissue: float) -> float | None:
+        """Return how far what is around dense parts lies from `tissue`; None where it is something else."""
+        self._calm = self._calm or [_calm(self.voxels[k]) for k in sample_slices(len(self.voxels))]
+        step = tissue - air
+        core, body, ring = 0, 0, []
+        for picture in self._calm:
+            dense = picture > tissue + DENSER * step
+            core += int(np.count_nonzero(dense))
+            body += int(np.count_nonzero(picture > air + step / 2.0))
+            ring.append(picture[_grow(dense, RING) & ~_grow(dense, RING - 1)])
+        around = np.concatenate(ring)
+        if core < LEAST_CORE * body or not len(around):
+            return None
+        off = np.abs(around - tissue)
+        alike, beside = np.mean(off < ALIKE * step), np.mean(around < air + NEAR_AIR * step)
+        return float(np.median(off)) if alike >= LEAST_AROUND and beside <= MOST_AIR_AROUND else None
+
+
+def _calm(picture: NDArray[Any]) -> NDArray[np.float32]:
+    calm = np.asarray(picture, np.float32)
+    for axis in (0, 1):
+        calm = _windows(calm, CALMED // 2, axis).mean(axis=-1)
+    return calm
+
+
+def _grow(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    for axis in (0, 1):
+        mask = _windows(mask, reach, axis).any(axis=-1)
+    return mask
+
+
+def _windows(picture: NDArray[Any], reach: int, axis: int) -> NDArray[Any]:
+    """Return the ``2 * reach + 1`` values around each place of an axis, as a last axis."""
+    widths = [(reach, reach) if other == axis else (0, 0) for other in (0, 1)]
+    return np.lib.stride_tricks.sliding_window_view(np.pad(picture, widths, mode="edge"), 2 * reach + 1, axis)
+
+
 class _Doubt(NamedTuple):
     """Air and soft tissue as found, on a scale that is not that of HU, and the likely reason."""
 
@@ -181,7 +260,7 @@ class _Doubt(NamedTuple):
 
 
 def judge_scale(
-    sample: ValueSample | None, facts: PixelFacts, slopes: Sequence[float] = (1.0,), *, known: bool = True
+    sample: ValueSample | None, layers: Layers, facts: PixelFacts, slopes: Sequence[float] = (1.0,), *, known: bool
 ) -> tuple[Gate, dict[str, float]]:
     """Judge the gate ``hu_scale``; where it fails, return the places of ``air`` and ``soft_tissue`` too.
 
@@ -191,12 +270,15 @@ def judge_scale(
     if sample is None or len(sample.values) < FEWEST_VALUES:
         return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: too few voxels"), {}
     doubt = _find_shift(sample, facts)
-    if doubt is None and not known:
-        return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: the values are not known to be HU"), {}
     peaks: list[Peak] = []
     if doubt is None:
         measured = sample.without_spikes(LOWEST_AIR_HU, HIGHEST_AIR_HU)
-        peaks = find_peaks(measured.values) if measured is not None else []
+        small = find_peaks(measured.values) if measured is not None else []
+        peaks = [peak for peak in small if peak.share >= LEAST_PEAK_SHARE]
+        doubt = _find_body(sample, layers, peaks[0], small, known) if peaks else None
+    if doubt is None and not known:
+        return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: the values are not known to be HU"), {}
+    if doubt is None:
         doubt = _find_doubt(sample, peaks, slopes, facts.disc)
     if doubt is not None:
         text = (
@@ -221,15 +303,36 @@ def _is_tissue(peak: Peak) -> bool:
 
 def _find_shift(sample: ValueSample, facts: PixelFacts) -> _Doubt | None:
     """Find an intercept that is missing or was applied twice, for which the values need not be known to be HU."""
-    raw = not _fits(sample, 0) and sample.between(-np.inf, LEAST_RAW_HU) < MOST_BEYOND
     if facts.hu_min < LOWEST_AIR_HU and _fits(sample, -INTERCEPT_HU) and not _is_padded_specimen(sample):
-        shift, reason = -INTERCEPT_HU, "have been applied twice"
-    elif raw and _fits(sample, INTERCEPT_HU):
-        shift, reason = INTERCEPT_HU, "be missing"
+        shift, reason = -INTERCEPT_HU, "the rescale intercept seems to have been applied twice"
+    elif _may_be_raw(sample) and _fits(sample, INTERCEPT_HU):
+        shift, reason = INTERCEPT_HU, MISSING
     else:
         return None
     air, tissue = sample.median_between(shift - 1100, shift - 900), sample.median_between(shift - 150, shift + 150)
-    return _Doubt(air, tissue, f"the rescale intercept seems to {reason}")
+    return _Doubt(air, tissue, reason)
+
+
+def _find_body(sample: ValueSample, layers: Layers, air: Peak, peaks: Sequence[Peak], known: bool) -> _Doubt | None:
+    """Take the lowest peak for air that lies too high, where the bone above it has soft tissue around it.
+
+    Of values that are not known to be HU only a missing intercept is told.
+    """
+    raw = abs(air.at + 1000.0 - INTERCEPT_HU) <= 100.0 and _may_be_raw(sample)
+    if air.at < OFFSET_AIR_HU[0] or not (known or raw) or not _is_lowest(sample, air):
+        return None
+    tissue = layers.find_enclosing(air, [peak for peak in peaks if peak.at > air.at])
+    if tissue is None:
+        return None
+    return _Doubt(air.at, tissue.at, MISSING) if raw else _describe_step(air, tissue)
+
+
+def _is_lowest(sample: ValueSample, air: Peak) -> bool:
+    return sample.between(-np.inf, air.at - max(BELOW_AIR_HU, 1.3 * air.width)) < MOST_BEYOND
+
+
+def _may_be_raw(sample: ValueSample) -> bool:
+    return not _fits(sample, 0) and sample.between(-np.inf, LEAST_RAW_HU) < MOST_BEYOND
 
 
 def _fits(sample: ValueSample, shift: int) -> bool:
@@ -267,11 +370,10 @@ def _find_offset(sample: ValueSample, air: Peak, above: Sequence[Peak], disc: fl
     A round field of view that is filled with a value far above it tells it anywhere.  Among fat and water nothing else
     does, and above these the step of a CT alone.
     """
-    lower = sample.between(-np.inf, air.at - max(BELOW_AIR_HU, 1.3 * air.width))
     lung = air.at < LUNG_HU and air.width > LUNG_WIDTH
     padded = disc is not None and disc >= air.at + BELOW_AIR_HU
     among = OFFSET_AIR_HU[1] < air.at <= TISSUE_HU[1] and not padded
-    if air.at < OFFSET_AIR_HU[0] or among or lower >= MOST_BEYOND or lung:
+    if air.at < OFFSET_AIR_HU[0] or among or not _is_lowest(sample, air) or lung:
         return None
     low, high = CT_STEP_HU if air.at > TISSUE_HU[1] and not padded else STEP_HU
     fitting = [peak for peak in above if low <= peak.at - air.at <= high]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import METAL_HU
-from clrecon.reading.common.hu_scale import LOWEST_AIR_HU, SCALE_SAID, ValueSample, judge_scale, sample_slices
+from clrecon.reading.common.hu_scale import LOWEST_AIR_HU, SCALE_SAID, Layers, ValueSample, judge_scale, sample_slices
 from clrecon.reading.common.likeness import SHOWN_SAID, judge_shown_places
 from clrecon.reading.common.source_facts import PixelFacts, StoredValues
 from clrecon.system.light_dataclass import dataclass, field
@@ -150,7 +150,8 @@ def examine_voxels(
         unknown = unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: the sign of the values is lost")
         return VoxelFindings([], [unknown, sign, shown])
     sample = ValueSample.of(voxels, facts)
-    scale, materials = judge_scale(sample, facts, [one.slope for one in slices] or [1.0], known=known)
+    slopes = [one.slope for one in slices] or [1.0]
+    scale, materials = judge_scale(sample, Layers(voxels), facts, slopes, known=known)
     warnings = [facts.padding_text] if facts.padding_text else []
     if facts.blank:
         named = ", ".join(str(k + 1) for k in facts.blank[:BLANK_SHOWN]) + ", ..." * (len(facts.blank) > BLANK_SHOWN)

@@ -71,13 +71,14 @@ def test_both_peaks_in_wrong_places_fail(slope, offset, air, tissue, reason, noi
     assert re.sub(r"\d+ HU", "N HU", reason) in re.sub(r"\d+ HU", "N HU", gate.text)
 
 
-@pytest.mark.parametrize(("slope", "offset"), [(0.8, 140), (0.8, 750), (0.5, 0)])
-def test_a_disc_filled_far_above_the_lowest_peak_tells_air_among_other_materials(slope, offset):
+@pytest.mark.parametrize(("slope", "offset", "alone"), [(0.8, 140, True), (0.8, 750, True), (0.5, 0, False)])
+def test_a_disc_filled_far_above_the_lowest_peak_tells_air_among_other_materials(slope, offset, alone):
+    """`alone`: the verdict without the disc."""
     hu = make_body() * slope + offset
     gate = judge(hu, disc=offset)
     found = [int(word) for word in gate.text.split() if word.lstrip("-").isdigit()][:2]
     assert gate.ok is False and found == pytest.approx([offset - 1000 * slope, offset + 50 * slope], abs=12)
-    assert judge(hu).ok and judge(make_body(), disc=0).ok
+    assert judge(hu).ok is alone and judge(make_body(), disc=0).ok
 
 
 @pytest.mark.parametrize("shift", [-100, -60, 60, 100])
@@ -141,8 +142,46 @@ def test_raw_values_are_not_judged(raw):
     assert gate.ok is None and "not known to be HU" in gate.text
 
 
-def test_raw_values_that_are_called_hu_are_not_taken_for_air():
-    assert judge(make_layers(8000, (40, 21000), (30, 30000), noise=900)).ok is None
+def test_raw_values_that_are_called_hu_are_judged_by_what_lies_around_the_densest():
+    assert judge(make_layers(8000, (40, 30000), (30, 21000), noise=900)).ok is None
+    assert judge(make_layers(8000, (40, 21000), (30, 30000), noise=900)).ok is False
+
+
+def make_limb(radius=13, tissue=60.0, bone=1300.0, background=-1000.0):
+    """A finger: soft tissue fills less than a tenth of the picture."""
+    return make_layers(background, (radius, tissue), (6, bone))
+
+
+@pytest.mark.parametrize(
+    ("slope", "offset", "reason"),
+    [
+        (1, 1024, "the rescale intercept seems to be missing"),
+        (1, 600, "the rescale intercept seems to be 600 HU too high"),
+        (1, 500, "the rescale intercept seems to be 500 HU too high"),
+        (0.5, 0, "the rescale slope seems to be wrong, or the scanner has a scale of its own"),
+        (10, 20000, "the rescale slope seems to be wrong, or the scanner has a scale of its own"),
+    ],
+)
+def test_a_small_body_on_another_scale_is_told_by_the_tissue_around_its_bone(slope, offset, reason):
+    hu = make_limb()
+    assert np.mean(hu > -300) < 0.07 and judge(hu).ok
+    gate = judge(hu * slope + offset)
+    assert gate.ok is False
+    found = [int(word) for word in gate.text.split() if word.lstrip("-").isdigit()][:2]
+    assert found == pytest.approx([offset - 1000 * slope, offset + 60 * slope], abs=15 * max(slope, 1))
+    assert re.sub(r"\d+ HU", "N HU", reason) in re.sub(r"\d+ HU", "N HU", gate.text)
+
+
+def test_a_missing_intercept_of_a_small_body_is_told_where_no_header_says_hu():
+    assert judge(make_limb() + 1024, known=False).ok is False
+
+
+def test_bone_in_water_is_no_body_without_its_intercept():
+    """Water at 24 and cortex near 1064 with denser noise; of a body, soft tissue lies around what is denser."""
+    cortex = make_layers(24, (13, 1064), (6, 24), noise=120)
+    dense = make_layers(24, (13, 1900), (10, 1064), noise=30)
+    assert judge(cortex).ok and judge(dense).ok
+    assert judge(make_limb() + 1024).ok is False
 
 
 def test_a_stated_slope_tells_a_stretched_body_from_a_specimen(tmp_path):
