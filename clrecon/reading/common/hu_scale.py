@@ -154,7 +154,6 @@ LEAST_STEP_HU, HIGHEST_AMONG_HU = 300, 500
 that it is that of a CT."""
 AS_LUNG_HU, ABOVE_LUNG_HU = -600, 150
 """Up to where "air" may be lung, around which soft tissue is lower than this."""
-FAT_STEP_HU, MUSCLE_STEP_HU = (860, 940), (1000, 1130)
 BELOW_AIR_HU, MOST_BEYOND = 150, 0.002
 """So far below the peak of air is at most this share, and so it is in other ranges that a shift leaves empty."""
 
@@ -382,13 +381,7 @@ def _find_offset(sample: ValueSample, air: Peak, above: Sequence[Peak], disc: fl
         return None
     first, last = max(EMPTY_HU[0], air.at + 1.5 * air.width), EMPTY_HU[1]
     empty = sample.between(first, max(first, last)) < MOST_IN_EMPTY * sample.between(tissue.at - 100, tissue.at + 100)
-    if padded or (tissue.at > TISSUE_HU[1] and empty):
-        return _describe_step(air, tissue)
-    steps = [peak.at - air.at for peak in above[:2]]  # fat and muscle together tell that what lies at 100 HU is fat
-    pair = len(steps) == 2 and all(
-        low <= step <= high for step, (low, high) in zip(steps, (FAT_STEP_HU, MUSCLE_STEP_HU), strict=True)
-    )
-    return _describe_step(air, above[1]) if pair else None
+    return _describe_step(air, tissue) if padded or (tissue.at > TISSUE_HU[1] and empty) else None
 
 
 def _find_wrong_slope(sample: ValueSample, air: Peak, above: Sequence[Peak], slopes: Sequence[float]) -> _Doubt | None:
