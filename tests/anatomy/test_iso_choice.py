@@ -289,14 +289,15 @@ def test_what_has_no_two_materials_is_refused(name) -> None:
     assert not lies_in_air(as_volume(field))
 
 
-def add_cut_air(field: np.ndarray) -> np.ndarray:
+def add_cut_air(field: np.ndarray, rows: int = 30, noise: float = 90.0) -> np.ndarray:
     """Add noisy air that the scale of the file cuts off: a spike at the lowest value."""
-    air = -450.0 + 90.0 * np.random.default_rng(2).standard_normal((len(field), 30, field.shape[2]))
+    air = -450.0 + noise * np.random.default_rng(2).standard_normal((len(field), rows, field.shape[2]))
     return np.maximum(np.concatenate([field, air], axis=1), -410.0)
 
 
 RAW = {
     "noise beside cut air": (add_cut_air(make_ball(1040.0, 0.0, 0.8, 90.0)), 0.0, 1040.0),
+    "beside three times as much air": (add_cut_air(make_ball(1040.0, 0.0, 0.8, 30.0), 140, 30.0), 0.0, 1040.0),
     "CT without its intercept": (make_ball(1040.0, 40.0) + 1024.0, 1064.0, 2064.0),
     "16 bits of micro-CT": (make_ball(30_000.0, 9000.0, 0.8, 400.0), 9000.0, 30_000.0),
     "8 bits": (make_ball(200.0, 30.0, 0.8, 3.0), 30.0, 200.0),

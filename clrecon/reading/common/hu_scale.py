@@ -20,7 +20,7 @@ SAMPLED_SLICES, SAMPLED_VOXELS = 16, 1 << 16
 LEAST_SAMPLE = 1000
 """Least number of sampled voxels for stating a share."""
 SPIKE_SHARE, SPIKE_RATIO = 0.01, 10.0
-"""A value that so many voxels have, so many times more than have the values next to it, was not measured."""
+"""A value that so many voxels have, so many times more than has one of the values next to it, was not measured."""
 
 
 def sample_slices(count: int) -> range:
@@ -61,12 +61,11 @@ class ValueSample:
         found, counts = np.unique(low, return_counts=True)
         return float(found[counts.argmax()]), float(counts.max()) / len(self.values)
 
-    def without_spikes(self, low: float, high: float) -> ValueSample | None:
+    def without_spikes(self, low: float = np.inf, high: float = -np.inf) -> ValueSample | None:
         """Leave out values outside of a range that stand out of those beside them; None where too few are left."""
         found, counts = np.unique(self.values, return_counts=True)
         before, after = np.pad(counts, (1, 0))[:-1], np.pad(counts, (0, 1))[1:]
-        beside = (before + after) / 2.0
-        spikes = (counts >= SPIKE_SHARE * len(self.values)) & (counts >= SPIKE_RATIO * beside)
+        spikes = (counts >= SPIKE_SHARE * len(self.values)) & (counts >= SPIKE_RATIO * np.minimum(before, after))
         spikes &= (found < low) | (found > high)
         values = self.values[np.repeat(~spikes, counts)]
         return ValueSample(values) if len(values) >= LEAST_SAMPLE else None
@@ -269,14 +268,12 @@ def judge_scale(
     if sample is None or len(sample.values) < FEWEST_VALUES:
         return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: too few voxels"), {}
     doubt = _find_shift(sample, facts)
-    peaks: list[Peak] = []
     if doubt is None:
-        measured = sample.without_spikes(LOWEST_AIR_HU, HIGHEST_AIR_HU)
-        small = find_peaks(measured.values) if measured is not None else []
-        peaks = [peak for peak in small if peak.share >= LEAST_PEAK_SHARE]
-        doubt = _find_body(sample, layers, peaks[0], small, known) if peaks else None
+        doubt = _find_body(sample.without_spikes(), layers, known)
     if doubt is None and not known:
         return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: the values are not known to be HU"), {}
+    measured = sample.without_spikes(LOWEST_AIR_HU, HIGHEST_AIR_HU)
+    peaks = _find_large_peaks(measured)
     if doubt is None:
         doubt = _find_doubt(sample, peaks, slopes, facts.disc)
     if doubt is not None:
@@ -312,18 +309,26 @@ def _find_shift(sample: ValueSample, facts: PixelFacts) -> _Doubt | None:
     return _Doubt(air, tissue, reason)
 
 
-def _find_body(sample: ValueSample, layers: Layers, air: Peak, peaks: Sequence[Peak], known: bool) -> _Doubt | None:
+def _find_body(measured: ValueSample | None, layers: Layers, known: bool) -> _Doubt | None:
     """Take the lowest peak for air that lies too high, where the bone above it has soft tissue around it.
 
-    Of values that are not known to be HU only a missing intercept is told.
+    Values that many voxels share are left out: outside of a round field of view lies what is no air on this scale. Of
+    values that are not known to be HU only a missing intercept is told.
     """
-    raw = abs(air.at + 1000.0 - INTERCEPT_HU) <= 100.0 and _may_be_raw(sample)
-    if air.at < OFFSET_AIR_HU[0] or not (known or raw) or not _is_lowest(sample, air):
+    peaks = find_peaks(measured.values) if measured is not None else []
+    air = next((peak for peak in peaks if peak.share >= LEAST_PEAK_SHARE), None)
+    if measured is None or air is None or air.at < OFFSET_AIR_HU[0] or not _is_lowest(measured, air):
         return None
-    tissue = layers.find_enclosing(air, [peak for peak in peaks if peak.at > air.at])
+    raw = abs(air.at + 1000.0 - INTERCEPT_HU) <= 100.0 and _may_be_raw(measured)
+    tissue = layers.find_enclosing(air, [peak for peak in peaks if peak.at > air.at]) if known or raw else None
     if tissue is None:
         return None
     return _Doubt(air.at, tissue.at, MISSING) if raw else _describe_step(air, tissue)
+
+
+def _find_large_peaks(measured: ValueSample | None) -> list[Peak]:
+    found = find_peaks(measured.values) if measured is not None else []
+    return [peak for peak in found if peak.share >= LEAST_PEAK_SHARE]
 
 
 def _is_lowest(sample: ValueSample, air: Peak) -> bool:

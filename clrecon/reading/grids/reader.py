@@ -23,6 +23,7 @@ from clrecon.geometry import AIR_HU, Volume
 from clrecon.geometry.affine import column_spacing, facts_of_orientation, signed_tilt, slice_normal, tilt_degrees
 from clrecon.geometry.certificate import Certificate
 from clrecon.reading.common.likeness import Likeness, judge_slices
+from clrecon.reading.common.padding import fill_disc_padding
 from clrecon.reading.common.plausibility import (
     PADDING_SHARE,
     VoxelFindings,
@@ -169,6 +170,13 @@ class _Filling:
         if self._holes == voxels.size:
             raise RefusedInputError(f"{self._grid.name} holds no values: all of its voxels are NaN")
         doubts, warnings = _doubts(voxels, low, high), []
+        disc = None if self._holes else fill_disc_padding(voxels)
+        if disc is not None:
+            facts = PixelFacts(
+                disc.voxels / voxels.size, min(low, disc.filled), high, disc.filled,
+                padding_text=disc.describe(voxels.size), disc=disc.value,
+            )  # fmt: skip
+            return GridValues(voxels, facts, warnings, doubts, _judge_likeness(voxels, self._grid))
         share = self._holes / voxels.size
         if self._holes:
             warnings = [

@@ -10,6 +10,7 @@ from dicom_series import Plan
 from value_series import (
     SHAPE,
     make_body,
+    make_jaw,
     make_layers,
     radius_from,
     write_signed_as_unsigned,
@@ -270,6 +271,15 @@ def test_a_grid_file_on_another_scale(tmp_path):
     assert gates_of(report)["hu_scale"]["ok"] is False and gates_of(report)["stored_sign"]["ok"]
     assert gates_of(report)["hu_scale"]["text"] in report["warnings"]
     assert gates_of(list_series(path, pixels=True).certificate) == gates_of(report)
+
+
+@pytest.mark.parametrize("outside", [0.0, -1024.0], ids=["as the scanner wrote it", "as it was exported"])
+def test_a_cone_beam_in_a_grid_file_is_on_its_own_scale_whatever_fills_the_outside(tmp_path, outside):
+    path = tmp_path / "a.nii.gz"
+    Volume(make_jaw(0.8, 360.0, outside).astype(np.int16), np.diag([1.0, 1.0, 2.0, 1.0])).save(path)
+    report = read_volume(path).report
+    assert "air lies near -4" in gates_of(report)["hu_scale"]["text"]
+    assert (report["padding_share"] > 0.2) == (outside == 0.0)
 
 
 @pytest.mark.release

@@ -8,7 +8,7 @@ from dicom_series import Plan
 from value_series import SHAPE, make_body, make_jaw, make_layers, radius_from, write_values
 
 from clrecon import choose_iso_value, read_volume
-from clrecon.reading.dicom.pixels.padding import fill_disc_padding
+from clrecon.reading.common.padding import fill_disc_padding
 
 
 def read(folder, hu):

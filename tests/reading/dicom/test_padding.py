@@ -12,7 +12,7 @@ from dicom_series import Plan, set_values, write_series
 from clrecon.geometry import AIR_HU
 from clrecon.proof.surface.extract import extract_isosurface
 from clrecon.reading import read_volume
-from clrecon.reading.dicom.pixels.padding import SAMPLED_SLICES, PaddingMasks, pack_mask
+from clrecon.reading.common.padding import SAMPLED_SLICES, PaddingMasks, pack_mask
 
 SHAPE = (6, 40, 40)
 CENTRE, RADIUS = 19.5, 18.0

@@ -12,11 +12,11 @@ import pytest
 
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.grid import POSITION_TOLERANCE_GAPS, POSITION_TOLERANCE_MM
+from clrecon.reading.common.padding import PaddingMasks, pack_mask
 from clrecon.reading.dicom.headers.slice_header import Concatenation
 from clrecon.reading.dicom.pixels import stored
 from clrecon.reading.dicom.pixels import voxels as stray_bits
 from clrecon.reading.dicom.pixels.decoder_pool import _find_modules
-from clrecon.reading.dicom.pixels.padding import PaddingMasks, pack_mask
 from clrecon.reading.dicom.pixels.voxels import _describe_unfit, _fill_slice, _fits_stored_bits
 from clrecon.reading.dicom.series import certificate
 from clrecon.reading.dicom.series.certificate import _judge_thickness

@@ -22,16 +22,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.common.source_facts import PixelFacts
-from clrecon.reading.dicom.headers.slice_header import SliceHeader
-from clrecon.reading.dicom.parse.elements import CorruptFileError, NotDicomError, read_elements
-from clrecon.reading.dicom.pixels.padding import (
+from clrecon.reading.common.padding import (
     PaddingMasks,
     count_masked_tissue,
     describe_masked_tissue,
     fill_disc_padding,
     pack_mask,
 )
+from clrecon.reading.common.source_facts import PixelFacts
+from clrecon.reading.dicom.headers.slice_header import SliceHeader
+from clrecon.reading.dicom.parse.elements import CorruptFileError, NotDicomError, read_elements
 from clrecon.reading.dicom.pixels.stored import StoredPixels
 from clrecon.system.memory import allocate_voxels
 from clrecon.system.pieces import count_readers
@@ -189,16 +189,12 @@ def _fill_volume(
     padded, said = padding.count, describe_masked_tissue(tissue)
     disc = fill_disc_padding(voxels) if padding_hu is None else None
     if disc is not None:
-        value, padded, padding_hu = disc
-        said = (
-            f"{100.0 * padded / voxels.size:.3g} % of the voxels, all outside of a round field of view, are at"
-            f" {value:g} HU: padding that the files do not declare, {padding_hu:g} HU is taken for it"
-        )
+        padded, padding_hu, said = disc.voxels, disc.filled, disc.describe(voxels.size)
     if padding_hu is not None:
         low, high = min(low, padding_hu), max(high, padding_hu)
     count, text = describe_stray_bits(stray, slices)
     return PixelFacts(
-        padded / voxels.size, float(low), float(high), padding_hu, count, text, said, disc and disc[0],
+        padded / voxels.size, float(low), float(high), padding_hu, count, text, said, disc and disc.value,
         tuple(find_between(sorted(blank), len(slices))),
     )  # fmt: skip
 
@@ -220,7 +216,9 @@ def _fill_slice(source: StoredPixels, header: SliceHeader, out: NDArray[Any]) ->
     if header.padding is not None and not whole_cell:
         padding = _find_padding(header, stored)
     packed = None if padding is None else pack_mask(padding)
-    tissue = 0 if padding is None else count_masked_tissue(header, stored, padding)
+    tissue = 0
+    if padding is not None and header.padding is not None:
+        tissue = count_masked_tissue(header.padding, header, stored, padding)
     if padding is not None and packed is not None:
         if packed[1] == padding.size:
             return _SliceFacts(packed, np.inf, -np.inf, stray, tissue)

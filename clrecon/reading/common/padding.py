@@ -19,13 +19,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import AIR_HU
-from clrecon.reading.dicom.headers.slice_header import SliceHeader
+from clrecon.reading.common.source_facts import StoredValues
 
 AIR_RANGE_HU = (-1100, -900)
 """Range of air beside the padding.  The table and a blanket are denser; noise exceeds both ends alike."""
@@ -108,8 +108,22 @@ LEAST_PART, LEAST_OUTSIDE, MOST_IN_RIM, FEWEST_VALUES = 0.05, 0.999, 0.05, 16
 and fewest values there."""
 
 
-def fill_disc_padding(voxels: NDArray[Any]) -> tuple[float, int, float] | None:
-    """Fill outside a round field of view of a value above air; return it, voxels and filling; None: no disc."""
+class Disc(NamedTuple):
+    """Padding outside of a round field of view: its value, how many voxels, what they were filled with."""
+
+    value: float
+    voxels: int
+    filled: float
+
+    def describe(self, total: int) -> str:
+        return (
+            f"{100.0 * self.voxels / total:.3g} % of the voxels, all outside of a round field of view, are at"
+            f" {self.value:g} HU: padding that the files do not declare, {self.filled:g} HU is taken for it"
+        )
+
+
+def fill_disc_padding(voxels: NDArray[Any]) -> Disc | None:
+    """Fill outside a round field of view of a value above air; None where there is no disc."""
     nk, nj, ni = voxels.shape
     value = voxels[0, 0, 0]
     if min(nj, ni) < SMALLEST or value <= AIR_RANGE_HU[1]:
@@ -121,8 +135,8 @@ def fill_disc_padding(voxels: NDArray[Any]) -> tuple[float, int, float] | None:
     masks = PaddingMasks(voxels)
     for k, picture in enumerate(voxels):
         masks.add(k, pack_mask((picture == value) & (distance >= RIM[1])))
-    count, filled = masks.count, masks.fill()
-    return float(value), count, float(value if filled is None else filled)
+    filled = masks.fill()
+    return Disc(float(value), masks.count, float(value if filled is None else filled))
 
 
 def _measure_disc(measured: NDArray[np.bool_]) -> NDArray[np.float64] | None:
@@ -148,10 +162,14 @@ def _is_disc(picture: NDArray[Any], value: Any, distance: NDArray[np.float64]) -
     )
 
 
-def count_masked_tissue(header: SliceHeader, stored: NDArray[Any], padding: NDArray[np.bool_]) -> int:
-    """Count voxels of the padding of a slice (rows, columns) that are tissue by their stored value and place."""
-    assert header.padding is not None
-    low, high = header.padding
+def count_masked_tissue(
+    ends: tuple[float, float], header: StoredValues, stored: NDArray[Any], padding: NDArray[np.bool_]
+) -> int:
+    """Count voxels of the padding of a slice (rows, columns) that are tissue by their stored value and place.
+
+    `ends`: the lowest and the highest stored value that are padding.
+    """
+    low, high = ends
     # Padding below air is the usual case and needs no search.  NaN is not above air either.
     if not max(low * header.slope, high * header.slope) + header.intercept > AIR_RANGE_HU[1]:
         return 0
