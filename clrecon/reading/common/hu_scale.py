@@ -239,7 +239,7 @@ def _calm(picture: NDArray[Any]) -> NDArray[np.float32]:
 
 def _grow(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
     for axis in (0, 1):
-        mask = _windows(mask, reach, axis).any(axis=-1)
+        mask = np.any(_windows(mask, reach, axis), axis=-1)
     return mask
 
 

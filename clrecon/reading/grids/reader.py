@@ -169,7 +169,8 @@ class _Filling:
         voxels, low, high = self._voxels, self._low, self._high
         if self._holes == voxels.size:
             raise RefusedInputError(f"{self._grid.name} holds no values: all of its voxels are NaN")
-        doubts, warnings = _doubts(voxels, low, high), []
+        doubts = _doubts(voxels, low, high)
+        warnings: list[str] = []
         disc = None if self._holes else fill_disc_padding(voxels)
         if disc is not None:
             facts = PixelFacts(
