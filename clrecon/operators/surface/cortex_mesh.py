@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import METAL_HU, Volume
-from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.connectivity import label_components as label_on_host
@@ -29,13 +29,14 @@ from clrecon.operators.surface.cortex import (
     unexplained_hu,
 )
 from clrecon.operators.surface.cortex_constants import find_groups, measure_constants
-from clrecon.operators.surface.decimation import find_crossings
-from clrecon.operators.surface.labels import extract_labels
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import in_threads
 from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.records import Record
+
+if TYPE_CHECKING:
+    from clrecon.labels import LabelMap
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
@@ -321,6 +322,8 @@ def fit_mesh(
     progress: Progress = ignore_progress,
 ) -> Mesh:
     """Do what `fit_cortex` does, with constants of the scan that are known."""
+    from clrecon.operators.surface.decimation import find_crossings
+
     steps = Steps(progress, "cortex", 4)
     _refuse_few(mesh.vertex_count, mesh.vertex_count)
     normals = _normals_of(mesh)
@@ -381,6 +384,8 @@ def fit_labels(
     progress: Progress = ignore_progress,
 ) -> dict[int, Mesh]:
     """Return the filled surfaces of labels at a low level of HU, moved onto the bone."""
+    from clrecon.operators.surface.labels import extract_labels
+
     meshes = extract_labels(resident, labels, level, label=label, grow_mm=grow_mm, solid=True, progress=progress)
     return dict(zip(meshes, fit_meshes([*meshes.values()], resident, progress=progress), strict=True))
 
