@@ -276,7 +276,7 @@ __kernel void fit_profiles(
     find_wall(p.values, stride, rise, &p.low, &p.high, &peak);
     const floats nearest = first_mm + step_mm * to_floats(p.low), room = first_mm + step_mm * to_floats(p.high);
     const floats thinnest = (floats)(0.05f * width), thickest = (floats)(step_mm * (float)SAMPLES);
-    const float ease_x = 1e-12f * cortex * cortex, ease_t = 3e-11f * cortex * cortex;
+    const float ease_x = 2.5e-13f * cortex * cortex / (step_mm * step_mm), ease_t = 30.0f * ease_x;
     /* The best of a thin, a usual and a thick wall is where the search begins. */
     wall_fit now = fit_plateaus(&p, between_lanes(-1.1f * width, nearest, room), 0.9f * width);
     for (int start = 1; start < 3; ++start) {
@@ -300,7 +300,9 @@ __kernel void fit_profiles(
     floats total = (floats)(1e-6f);
     for (int n = 0; n < SAMPLES; ++n)
         total += choose((p.low <= n) & (p.high >= n), (floats)(weights[n]), (floats)(0.0f));
-    const floats tt = now.tt + ease_t, xx = now.xx + ease_x, scale = 1e-6f / (xx * tt - now.xt * now.xt);
+    /* Rounding leaves less than nothing of a wall that has hardly any thickness. */
+    const floats tt = greater(now.tt, (floats)(0.0f)) + ease_t, xx = greater(now.xx, (floats)(0.0f)) + ease_x;
+    const floats scale = 1e-6f / greater(xx * tt - now.xt * now.xt, 1e-6f * xx * tt);
     __global float *fit = fits + item;
     store_lanes(now.x0, fit);
     store_lanes(now.t, fit + stride);

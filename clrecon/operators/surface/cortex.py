@@ -54,7 +54,7 @@ PIECE, SMALLEST_PIECE = 1 << 18, 1 << 8
 STEP_MM = 0.5
 """Step of a profile where voxels have 1 mm3; half of it gave the same places to 0.003 mm."""
 
-SMALLEST_SCALE, LARGEST_SCALE = 0.15, 1.4
+SMALLEST_SCALE, LARGEST_SCALE = 0.001, 1.4
 """Bounds of the edge of a voxel's cube, mm, by which profiles are scaled."""
 
 WEIGHT_MM = 2.2

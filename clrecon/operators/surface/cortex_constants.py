@@ -42,6 +42,13 @@ by which the cortex of a place may differ there."""
 SEARCH_STEPS = (1.3, 1.12, 1.05)
 """Factors by which a blur is changed as long as that helps, one after the other."""
 
+FARTHEST = 8.0
+"""Factor by which a search leaves its start at most: a blur that nothing shows goes anywhere."""
+
+THICK_SHARE, CORTEX_STEP, CLEARLY_LESS = 0.5, 1.03, 0.97
+"""Where this share of the walls is thick, the cortex is what leaves least of the profiles, in steps of the second from
+what they show on: their percentile holds noise, which the blurs follow, and it them (11 % too much at 40 HU)."""
+
 LEAST_SHARE, DIFFERENT = 0.03, 0.1
 """Components with this share of a surface's vertices are looked at by themselves, and have constants of their own if
 their compact bone differs from that of all by the second share."""
@@ -102,7 +109,7 @@ def measure_constants(
     dense = float(np.percentile(peaks, 95.0))
     usual = 1.2 * float(np.percentile(peaks, DENSE_PERCENTILE))
     start = _Trial(
-        0.7 * float(np.sqrt(step[0] * step[1])) ** 0.5, max(0.7 * step[2] ** 0.5, 0.45 * step[2]),
+        _usual_blur(float(np.sqrt(step[0] * step[1]))), max(_usual_blur(step[2]), 0.45 * step[2]),
         min(1.03 * dense, usual),
     )  # fmt: skip
     known = noise if noise is not None else SILENT_HU
@@ -112,11 +119,7 @@ def measure_constants(
     def fit(trial: _Trial, cortex_spread: float) -> WallFits:
         return profiles.fit(*trial, known, cortex_spread=cortex_spread)
 
-    found = start
-    for first in range(len(SEARCH_STEPS)):
-        found = _search_blurs(fit, slice(None), found, SEARCH_STEPS[first:])
-        cortex_hu, thick = _measure_cortex(fit, values, slice(None), found)
-        found = found._replace(cortex_hu=cortex_hu)
+    found, thick = _search(fit, values, start)
     parts = []
     for part in (slice(first, None, 4) for first in range(4)):
         one = _search_blurs(fit, part, found, SEARCH_STEPS[1:])
@@ -168,6 +171,11 @@ def find_groups(
     return [(np.flatnonzero(left), scan), *groups]
 
 
+def _usual_blur(step_mm: float) -> float:
+    """Return the blur from which on that of voxels with this edge is searched, mm."""
+    return min(0.7 * step_mm**0.5, step_mm)
+
+
 def _find_walls(values: Float32Array) -> tuple[NDArray[np.intp], Float32Array]:
     """Return up to `MOST_WALLS` profiles across walls of bone, and the highest value of each profile."""
     whole = np.isfinite(values[:SAMPLES]).all(axis=0)
@@ -185,20 +193,42 @@ def _find_walls(values: Float32Array) -> tuple[NDArray[np.intp], Float32Array]:
     return walls[np.unique(np.linspace(0, len(walls) - 1, min(len(walls), MOST_WALLS)).astype(np.intp))], peaks
 
 
+def _search(fit: _Fit, values: Float32Array, start: _Trial) -> tuple[_Trial, int]:
+    """Return the constants that describe the profiles, and how many walls are thick enough to show their HU."""
+    found = _search_blurs(fit, slice(None), start, SEARCH_STEPS)
+    cortex_hu, thick = _measure_cortex(fit, values, slice(None), found)
+    shown = thick >= THICK_SHARE * values.shape[1]
+    for first in range(1, len(SEARCH_STEPS)):
+        other = _search_blurs(fit, slice(None), found._replace(cortex_hu=cortex_hu), SEARCH_STEPS[first:])
+        if shown and _left(fit, slice(None), other) >= _left(fit, slice(None), found):
+            break
+        found = other
+        cortex_hu, thick = _measure_cortex(fit, values, slice(None), found)
+    if not shown:
+        return found._replace(cortex_hu=cortex_hu), thick
+    while True:
+        other = found._replace(cortex_hu=found.cortex_hu / CORTEX_STEP)
+        other = _search_blurs(fit, slice(None), other, SEARCH_STEPS[2:])
+        if _left(fit, slice(None), other) >= CLEARLY_LESS * _left(fit, slice(None), found):
+            return found, thick
+        found = other
+
+
+def _left(fit: _Fit, part: slice, trial: _Trial) -> float:
+    """Return the mean square of what a trial leaves of a part of the profiles."""
+    squares = np.sort(np.square(fit(trial, NARROW_SPREAD).residual_hu[part], dtype=np.float64))
+    return float(np.mean(squares[: max(1, int(TRIMMED * len(squares)))]))
+
+
 def _search_blurs(fit: _Fit, part: slice, found: _Trial, factors: tuple[float, ...]) -> _Trial:
     """Return the blurs that leave least of a part of the profiles, from those of a trial on."""
-
-    def left(trial: _Trial) -> float:
-        squares = np.sort(np.square(fit(trial, NARROW_SPREAD).residual_hu[part], dtype=np.float64))
-        return float(np.mean(squares[: max(1, int(TRIMMED * len(squares)))]))
-
-    least = left(found)
+    first, least = found, _left(fit, part, found)
     for factor in factors:
         for place in (0, 1):
             for change in (factor, 1.0 / factor):
-                while (value := left(trial := found.changed(place, change))) < 0.9999 * least:
+                while (value := _left(fit, part, trial := found.changed(place, change))) < 0.9999 * least:
                     found, least = trial, value
-                    if not 0.05 < trial.blur_mm < 4.0 or not 0.05 < trial.across_mm < 8.0:
+                    if not all(1.0 / FARTHEST < new / old < FARTHEST for new, old in zip(trial, first, strict=True)):
                         return found
     return found
 

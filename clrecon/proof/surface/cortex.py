@@ -158,7 +158,7 @@ def fit_profiles(
 
     nearest, room = places[first], places[last]
     thickest = scale.step_mm * SAMPLES
-    ease = np.array([1e-12, 3e-11]) * cortex_hu**2
+    ease = np.array([2.5e-13, 7.5e-12]) * (cortex_hu / scale.step_mm) ** 2
     begins = [fit(np.clip(x * width, nearest, room), t * width) for x, t in STARTS]
     now = begins[0].replaced(begins[1]).replaced(begins[2])
     damping = np.full(len(width), 0.01)

@@ -64,6 +64,25 @@ def test_constants_are_those_of_the_scan(device):
     assert found.places == MOST_WALLS and found.thick > 100
 
 
+def test_noise_makes_no_cortex_denser(device):
+    """Thick walls' percentile holds noise, the blur follows it, and it the blur: 15 % and 0.13 mm inwards."""
+    quiet = hollow_ball(thickness=2.6, blur=0.5)
+    noise = np.random.default_rng(3).normal(0.0, 40.0, quiet.voxels.shape)
+    mesh, fit = fit_surface(quiet.with_voxels(np.rint(quiet.voxels + noise).astype(np.int16)), device, level=500.0)
+    assert fit.constants.cortex_hu == pytest.approx(1000.0, rel=0.04)
+    assert fit.constants.blur_mm == pytest.approx(0.64, abs=0.08)  # with that of the interpolation
+    assert abs(np.mean(outer_places(mesh, fit, 13.0)[0])) < 0.05
+
+
+def test_a_fit_scales_with_the_voxels(device):
+    large = hollow_ball(thickness=3.0)
+    fits = [fit_surface(Volume(large.voxels, np.diag([mm, mm, mm, 1.0])), device)[1] for mm in (1.0, 0.02)]
+    for name in ("shift_mm", "thickness_mm", "error_mm"):
+        one, small = (getattr(fit, name)[fit.states == FITTED].mean() for fit in fits)
+        assert small / 0.02 == pytest.approx(one, rel=0.03, abs=0.01), name
+    assert fits[1].constants.blur_mm / 0.02 == pytest.approx(fits[0].constants.blur_mm, rel=0.05)
+
+
 @pytest.mark.parametrize(
     ("uneven", "few"), [(False, False), (True, False), (False, True)], ids=["even", "uneven", "few places at a time"]
 )
