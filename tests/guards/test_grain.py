@@ -11,7 +11,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 93_019,
+    "lines": 93_027,
     "modules": 420,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,

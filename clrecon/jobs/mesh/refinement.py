@@ -194,6 +194,7 @@ def judge_parts(parts: Sequence[Part], settings: MeshSettings) -> list[dict[str,
             closed=settings.closed,
             outward=not settings.split,
             iso_distance=iso_distance,
+            extracted=not refinement,
             deviation=refinement and refinement["deviation"],
             voxel_mm=refinement and refinement["voxel_mm"],
         )

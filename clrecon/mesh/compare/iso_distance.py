@@ -211,7 +211,9 @@ class IsoDistance(Record):
     samples: ``vertices`` and ``centres`` that were measured.
     not_found: Points from which no surface was reached; the figures are of the others.
     near_metal: Measured vertices within `METAL_REACH` voxels of a voxel above `METAL_HU`.
-    away_from_metal_voxel: Without those near metal; None where these are none, or more than half.
+    surface_voxel: Of vertices and centres together: decimation leaves vertices outside of what is round, and centres
+        inside, so that neither alone is how far the surface lies.
+    away_from_metal_voxel: The same without those near metal; None where these are none, or more than half.
     """
 
     voxel_mm: float
@@ -221,6 +223,7 @@ class IsoDistance(Record):
     vertices_voxel: DistanceSummary | None
     centres_mm: DistanceSummary | None
     centres_voxel: DistanceSummary | None
+    surface_voxel: DistanceSummary | None
     near_metal: int = 0
     away_from_metal_voxel: DistanceSummary | None = None
 
@@ -248,9 +251,9 @@ def measure_iso_distances(
         waiting.append(mesh.vertices[triangles].mean(axis=1, dtype=np.float64))
         if place == len(meshes) or sum(map(len, waiting)) >= samples:
             distances = distances_to_iso_surface(volume, rule, np.concatenate(waiting))
-            near = _find_near_metal(volume, rule, np.concatenate(waiting[::2]))
-            parts, marks = _split_as(waiting, distances), _split_as(waiting[::2], near)
-            found += map(partial(_sum_up, smallest_voxel_mm(volume)), parts[::2], parts[1::2], marks)
+            near = _find_near_metal(volume, rule, np.concatenate(waiting))
+            parts, marks = _split_as(waiting, distances), _split_as(waiting, near)
+            found += map(partial(_sum_up, smallest_voxel_mm(volume)), parts[::2], parts[1::2], marks[::2], marks[1::2])
             waiting.clear()
     return found
 
@@ -261,21 +264,21 @@ def _split_as(points: Sequence[Float64Array], values: NDArray[Any]) -> list[NDAr
 
 
 def _sum_up(
-    voxel: float, of_vertices: Float64Array, of_centres: Float64Array, near_metal: NDArray[np.bool_]
+    voxel: float, of_vertices: Float64Array, of_centres: Float64Array, *near_metal: NDArray[Any]
 ) -> IsoDistance:
-    count, away = int(np.count_nonzero(near_metal)), None
-    if 0 < 2 * count <= len(near_metal):
-        away = _summarise(of_vertices[~near_metal], voxel)
+    count, near = int(np.count_nonzero(near_metal[0])), np.concatenate(near_metal)
+    both = np.concatenate([of_vertices, of_centres])
     return IsoDistance(
         voxel,
         {"vertices": len(of_vertices), "centres": len(of_centres)},
-        sum(int(np.count_nonzero(~np.isfinite(distances))) for distances in (of_vertices, of_centres)),
+        int(np.count_nonzero(~np.isfinite(both))),
         vertices_mm=_summarise(of_vertices),
         vertices_voxel=_summarise(of_vertices, voxel),
         centres_mm=_summarise(of_centres),
         centres_voxel=_summarise(of_centres, voxel),
+        surface_voxel=_summarise(both, voxel),
         near_metal=count,
-        away_from_metal_voxel=away,
+        away_from_metal_voxel=_summarise(both[~near], voxel) if 0 < 2 * count <= len(of_vertices) else None,
     )
 
 

@@ -28,6 +28,7 @@ def judge_mesh(
     closed: bool = True,
     outward: bool = True,
     iso_distance: Mapping[str, Any] | None = None,
+    extracted: bool = False,
     deviation: Mapping[str, Any] | None = None,
     voxel_mm: float | None = None,
 ) -> list[Gate]:
@@ -36,6 +37,7 @@ def judge_mesh(
     closed: The surface should be closed.  A surface left open at the border of the scan has no gates on closedness,
         outside and volume.
     outward: The surface should enclose a volume above zero, unlike the wall of a cavity by itself.
+    extracted: Nothing was smoothed or decimated: what flat triangles leave of noise is the voxels', and not judged.
     deviation: From the surface before smoothing and decimation.
     voxel_mm: Shortest voxel step, the unit of the bounds; needed with `deviation`.
     """
@@ -43,7 +45,7 @@ def judge_mesh(
     if quality:
         gates += _gates_of_quality(quality, closed, outward)
     if iso_distance:
-        gates += _gates_of_iso_distance(iso_distance)
+        gates += _gates_of_iso_distance(iso_distance, extracted)
     if deviation and voxel_mm:
         gates += _gates_of_deviation(deviation, voxel_mm, closed)
     return gates
@@ -82,14 +84,16 @@ def _gates_of_quality(quality: Mapping[str, Any], closed: bool, outward: bool) -
         yield none_of("self_intersections", intersections, "pairs of triangles that cut each other")
 
 
-def _gates_of_iso_distance(iso_distance: Mapping[str, Any]) -> Iterator[Gate]:
+def _gates_of_iso_distance(iso_distance: Mapping[str, Any], extracted: bool) -> Iterator[Gate]:
     what = "vertices and centres of triangles from which no trilinear iso surface was reached"
     yield none_of("iso_distance_found", iso_distance["not_found"], what)
-    what = "distance of the vertices from the trilinear iso surface"
+    points = "the vertices" if extracted else "vertices and centres of triangles"
+    what = f"distance of {points} from the trilinear iso surface"
     measures = (("p95", DEVIATION_P95_VOXEL, "95 % of them"), ("mean", DEVIATION_MEAN_VOXEL, "mean"))
-    found, near = iso_distance["vertices_voxel"], iso_distance.get("near_metal", 0)
-    away = iso_distance.get("away_from_metal_voxel")
-    metal = f"{near:,} of {iso_distance['samples']['vertices']:,} near metal (above {METAL_HU:g} HU)" if near else ""
+    found = iso_distance["vertices_voxel" if extracted else "surface_voxel"]
+    near, away = iso_distance.get("near_metal", 0), None if extracted else iso_distance.get("away_from_metal_voxel")
+    of = f"of {iso_distance['samples']['vertices']:,} vertices" if near else ""
+    metal = f"{near:,} {of} near metal (above {METAL_HU:g} HU)" if near else ""
     for name, bound, which in measures:
         if away:
             aside = f"without {metal}, with them {found[name]:.3g}"

@@ -180,11 +180,11 @@ def test_metal_is_named_and_distances_are_judged_without_it(device: Any, tmp_pat
     assert 0.3 < found["near_metal"] / found["samples"]["vertices"] < 0.5
     for name, bound in (("p95", 0.25), ("mean", 0.1)):
         whole, away, gate = (
-            found["vertices_voxel"][name],
+            found["surface_voxel"][name],
             found["away_from_metal_voxel"][name],
             gates[f"iso_distance_{name}"],
         )
         assert whole > bound > 1.5 * away
         assert (gate["measured"], gate["ok"]) == (away, True)
-        metal = f"{found['near_metal']:,} of {found['samples']['vertices']:,} near metal (above 2000 HU)"
+        metal = f"{found['near_metal']:,} of {found['samples']['vertices']:,} vertices near metal (above 2000 HU)"
         assert f"(without {metal}, with them {whole:.3g})" in gate["text"]

@@ -94,22 +94,24 @@ def test_a_deviation_in_voxels(radius, expected):
 
 def test_vertices_off_the_iso_surface():
     def at(p95: float, mean: float) -> set[str]:
-        return failed(judge_mesh(iso_distance={"vertices_voxel": {"p95": p95, "mean": mean}, "not_found": 0}))
+        return failed(judge_mesh(iso_distance={"surface_voxel": {"p95": p95, "mean": mean}, "not_found": 0}))
 
     assert (at(0.25, 0.1), at(0.26, 0.1), at(0.25, 0.11)) == (set(), {"iso_distance_p95"}, {"iso_distance_mean"})
-    assert failed(judge_mesh(iso_distance={"vertices_voxel": None, "not_found": 3})) == {"iso_distance_found"}
+    assert failed(judge_mesh(iso_distance={"surface_voxel": None, "not_found": 3})) == {"iso_distance_found"}
+    rough = {"vertices_voxel": {"p95": 0.0, "mean": 0.0}, "surface_voxel": {"p95": 0.3, "mean": 0.2}, "not_found": 0}
+    assert failed(judge_mesh(iso_distance=rough, extracted=True)) == set() != failed(judge_mesh(iso_distance=rough))
 
 
 def test_distances_are_judged_away_from_metal_and_both_figures_are_said():
-    figures = {"vertices_voxel": {"p95": 0.3, "mean": 0.2}, "not_found": 0, "samples": {"vertices": 4000}}
+    figures = {"surface_voxel": {"p95": 0.3, "mean": 0.2}, "not_found": 0, "samples": {"vertices": 4000}}
     figures |= {"near_metal": 1500, "away_from_metal_voxel": {"p95": 0.2, "mean": 0.11}}
     _, p95, mean = judge_mesh(iso_distance=figures)
     assert (p95["measured"], p95["ok"], mean["measured"], mean["ok"]) == (0.2, True, 0.11, False)
-    aside = "(without 1,500 of 4,000 near metal (above 2000 HU), with them 0.3)"
+    aside = "(without 1,500 of 4,000 vertices near metal (above 2000 HU), with them 0.3)"
     assert p95["text"].endswith(f", 95 % of them {aside}: 0.2 voxel, at most 0.25")
     _, p95, mean = judge_mesh(iso_distance={**figures, "near_metal": 2500, "away_from_metal_voxel": None})
     assert (p95["measured"], p95["ok"], mean["ok"]) == (0.3, False, False)
-    assert "(2,500 of 4,000 near metal (above 2000 HU))" in p95["text"]
+    assert "(2,500 of 4,000 vertices near metal (above 2000 HU))" in p95["text"]
 
 
 def test_the_volume_of_a_label():
@@ -139,7 +141,7 @@ def test_a_surface_that_is_open_once_vertices_at_one_place_are_joined():
 def test_points_that_reach_no_iso_surface_fail_their_gate():
     figures = {"mean": 0.01, "rms": 0.02, "p95": 0.03, "max": 0.1}
     for found, count in ((figures, 0), (figures, 1), (None, 20)):
-        gates = judge_mesh(iso_distance={"vertices_voxel": found, "not_found": count})
+        gates = judge_mesh(iso_distance={"surface_voxel": found, "not_found": count})
         assert [gate["name"] for gate in gates] == ["iso_distance_found", "iso_distance_p95", "iso_distance_mean"]
         assert failed(gates) == ({"iso_distance_found"} if count else set())
         assert gates[1]["ok"] is (True if found else None)

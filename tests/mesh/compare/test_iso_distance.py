@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import sample_meshes as samples
 import tolerances
 from scipy.ndimage import map_coordinates
 
@@ -18,6 +19,7 @@ from clrecon.mesh.compare.iso_distance import (
     smallest_voxel_mm,
     trilinear_field,
 )
+from clrecon.mesh.compare.mesh_gates import DEVIATION_MEAN_VOXEL, judge_mesh
 from clrecon.proof.surface.extract import extract_isosurface
 
 pytestmark = pytest.mark.unit
@@ -258,13 +260,31 @@ def test_vertices_near_metal_are_counted_and_left_out(level, iso_value, near):
         return
     away = distances_to_iso_surface(volume, rule, mesh.vertices[3:].astype(np.float64))
     assert np.isfinite(away).sum() >= 2
-    assert found["away_from_metal_voxel"]["max"] == np.nanmax(away)
+    assert found["away_from_metal_voxel"]["max"] == np.nanmax(away)  # the centre of the second triangle is near
 
 
 def test_where_most_is_metal_all_is_judged():
     volume, mesh = metal_volume(3071, 4)
     found = measure_iso_distance(mesh, volume, choose_iso_rule(volume, 200, closed=False))
     assert (found["near_metal"], found["away_from_metal_voxel"]) == (4, None)
+
+
+def test_few_triangles_of_a_ball_are_judged_by_their_surface_not_by_their_corners():
+    """Corners lie outside of what is round where the volume is right: their mean alone is past the bound."""
+    far = np.linalg.norm(np.indices((15, 15, 15)).reshape(3, -1).T - 7.0, axis=1).reshape(15, 15, 15)
+    volume = Volume(np.rint(1000.0 - 150.0 * (far - 4.5)).astype(np.int16), np.eye(4))
+    rule = choose_iso_rule(volume, 1000.0)
+    ball = Mesh(*samples.sphere(radius=4.5, rounds=2))
+    right = (4.0 / 3.0 * np.pi * 4.5**3 / (1000.0 * ball.quality()["volume_ml"])) ** (1.0 / 3.0)
+    measured = {
+        larger: measure_iso_distance(Mesh(7.0 + larger * right * ball.vertices, ball.triangles), volume, rule)
+        for larger in (1.0, 1.03, 0.95)
+    }
+    of_vertices = {larger: one["vertices_voxel"]["mean"] for larger, one in measured.items()}
+    assert of_vertices[1.0] > DEVIATION_MEAN_VOXEL > of_vertices[0.95]
+    gates = {larger: judge_mesh(iso_distance=one)[2] for larger, one in measured.items()}
+    assert {larger: gate["ok"] for larger, gate in gates.items()} == {1.0: True, 1.03: False, 0.95: False}
+    assert {gate["name"] for gate in gates.values()} == {"iso_distance_mean"}
 
 
 def test_meshes_are_measured_together_as_each_alone(monkeypatch):
