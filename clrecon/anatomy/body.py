@@ -337,7 +337,7 @@ def find_unmeasured(cells: NDArray[Any]) -> Mask:
 
     def mark(where: slice) -> None:
         for layer, out in zip(cells[where], found[where], strict=True):
-            for corner in {layer[j, i].item() for j in (0, -1) for i in (0, -1)}:
+            for corner in set(layer[np.ix_((0, -1), (0, -1))].flat):
                 out |= layer == corner
             if np.count_nonzero(out) < FEWEST_UNMEASURED:
                 out[...] = False

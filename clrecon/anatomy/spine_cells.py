@@ -302,7 +302,7 @@ def _steps(right: float, back: float) -> tuple[int, int]:
 def _moved(field: Field, ways: list[tuple[float, float]]) -> list[Field]:
     """Return, for each way, the values `right` and `back` mm further in the slices; 0 beyond the ends."""
     steps = [_steps(*way) for way in ways]
-    reach = max(abs(n) for step in steps for n in step)
+    reach = int(np.abs(steps).max())
     padded = with_border(field, reach)
     return [shifted(padded, reach, dy, dx) for dy, dx in steps]
 

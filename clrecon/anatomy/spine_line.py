@@ -15,6 +15,7 @@ The search is meant for the spine of an adult, in a scan whose axes are those of
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -287,7 +288,7 @@ def _best_path(gain: Field) -> NDArray[np.int64]:
 
     It begins and ends where the sum is best: slices that count against it lie only between slices that count for it.
     """
-    steps = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+    steps = list(product((-1, 0, 1), repeat=2))
     sums = gain[0].copy()
     came = np.full(gain.shape, -1, np.int8)
     best, end = float(sums.max()), (0, *np.unravel_index(sums.argmax(), sums.shape))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 from clrecon.cli import common
@@ -63,7 +64,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     report = make_comparison(
         options.input, options.output, settings, no_clobber=options.no_clobber, progress=console.progress
     )
-    named = [method[which] for method in report["methods"] for which in ("picture", "difference")]
+    named = [method[which] for method, which in product(report["methods"], ("picture", "difference"))]
     pictures = sum(name is not None for name in named) + 2 * len(report["slices"])
     written = f"wrote    {printable(options.output)}: index.html, report.json and {pictures} pictures"
     common.show_report(report, [*_describe(report), written], options, console)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from importlib import import_module
+from itertools import chain
 
 from clrecon.cli import common
 from clrecon.cli.console import Console
@@ -105,7 +106,7 @@ def _write_bash(commands: dict[str, _Words]) -> str:
         for option in command.options:
             if option.takes_value:  # without words nothing is offered, and the shell completes files
                 lines.append(f'                {"|".join(option.names)}) words="{" ".join(option.words)}" ;;')
-        flags = " ".join(one for option in command.options for one in option.names if one.startswith("--"))
+        flags = " ".join(name for name in chain(*(option.names for option in command.options)) if name.startswith("--"))
         lines += [
             "                *)",
             f'                    if [[ $current == -* ]]; then words="{flags}"',

@@ -12,6 +12,7 @@ import textwrap
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,8 @@ def is_terminal(stream: Any) -> bool:
 
 def fit(text: str, stream: Any) -> str:
     """Break the lines of a text for a terminal; for files and pipes it stays as it is, a line a fact."""
-    return _fit_lines(text, shutil.get_terminal_size().columns) if is_terminal(stream) else text
+    width = max(shutil.get_terminal_size().columns, 20)
+    return "\n".join(chain(*(_fit_line(line, width) for line in text.split("\n")))) if is_terminal(stream) else text
 
 
 def fit_help(text: str, stream: Any) -> str:
@@ -58,7 +60,7 @@ def _find_paragraphs(lines: list[str]) -> list[list[str]]:
 
 def _fit_paragraph(lines: list[str], width: int) -> str:
     if _COMMAND.match(lines[0]) or max(map(len, lines)) <= width:
-        return "\n".join(part for line in lines for part in _fit_line(line, width))
+        return "\n".join(chain(*(_fit_line(line, width) for line in lines)))
     text = " ".join([lines[0].rstrip(), *(line.strip() for line in lines[1:])])
     hang = _hang_of(lines[0]) if _hang_of(lines[0]) <= width // 2 else _indent_of(lines[0])
     return "\n".join(_wrap(text, width, hang))
@@ -77,10 +79,6 @@ def _hang_of(line: str) -> int:
     """Return where the text of a line begins, after its indentation or its label."""
     label = _LABEL.match(line)
     return len(label[0]) if label else 0
-
-
-def _fit_lines(text: str, width: int) -> str:
-    return "\n".join(part for line in text.split("\n") for part in _fit_line(line, max(width, 20)))
 
 
 def _fit_line(line: str, width: int) -> list[str]:

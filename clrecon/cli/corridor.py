@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from itertools import chain
 from typing import Any
 
 from clrecon.cli import common
@@ -68,7 +69,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     files = _name_files(report, options.output, options.picture)
     written = [f"wrote    {printable(path)}, {common.megabytes(size)}" for path, size in files]
     common.show_report(report, describe_report(report) + written, options, console)
-    refused = [side for each in report["vertebrae"] for side in each["corridors"] if side["refused"]]
+    refused = [side for side in chain(*(each["corridors"] for each in report["vertebrae"])) if side["refused"]]
     return PARTLY_DONE if refused else 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from itertools import chain
 from typing import Any
 
 from clrecon.cli import common
@@ -61,7 +62,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
-    files = [mesh for vertebra in report["vertebrae"] for mesh in vertebra["meshes"]]
+    files = list(chain(*(vertebra["meshes"] for vertebra in report["vertebrae"])))
     size = common.megabytes(sum(mesh["bytes"] for mesh in files))
     space = common.describe_space(options.output, report["space"])
     written = [f"wrote    {_name_files(options.output, report, 'meshes')}, {size}, {space}"]

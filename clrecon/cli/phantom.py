@@ -13,11 +13,12 @@ from clrecon.system.text import format_ml
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    kinds = "\n".join(f"  {name:<9} {kind.said}" for name, kind in KINDS.items())
     parser.epilog = (
         "Writes a real DICOM series and truth.json with the affine and the exact area and volume, or with the voxels\n"
         "of each material and the label map materials.nrrd; with chosen levels also the label map levels.nrrd. Same\n"
         "settings and seed, same files.\n\n"
-        f"kinds:\n{_list_kinds()}\n\n"
+        f"kinds:\n{kinds}\n\n"
         "examples:\n  clrecon phantom phantom/ --kind torus --spacing 0.7 0.5 2.5 --tilt 12 --oblique 10 -5 30\n"
         "  clrecon phantom phantom/ --kind skull --table headrest --table-gap 4\n"
         "  clrecon phantom phantom/ --levels C1-L5 --scoliosis 35 --facet-gap 0.3 --spacing 0.7 0.7 1"
@@ -27,10 +28,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_fields(parser.add_argument_group("of a spine"), PhantomSettings, "spine")
     common.add_fields(parser, PhantomSettings, "missing", "seed")
     common.add_no_clobber(parser, with_ids=False)
-
-
-def _list_kinds() -> str:
-    return "\n".join(f"  {name:<9} {kind.said}" for name, kind in KINDS.items())
 
 
 def run(options: argparse.Namespace, console: Console) -> int:

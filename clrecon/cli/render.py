@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Sequence
 from functools import partial
+from itertools import chain
 from typing import Any
 
 from clrecon.cli import common
@@ -254,7 +255,7 @@ def render_settings(options: argparse.Namespace) -> RenderSettings:
     given = {name: getattr(options, name, None) for name in RenderSettings.keywords()} | {
         "color": None if named else options.color,
         "color_by": options.color if named else None,
-        "views": tuple(view for views in options.views or () for view in views),
+        "views": tuple(chain(*options.views or ())),
         "thickness": options.thickness or None,  # 0 is the same as no thickness
         "offset_mm": options.offset_mm or None,
         "labels": common.make_part(LabelLook, options, options.path, look),
@@ -354,9 +355,8 @@ def _describe_legend(pictures: list[dict[str, Any]]) -> list[str]:
 
 def _describe_labels(pictures: list[dict[str, Any]]) -> list[str]:
     """Name the labels that are drawn over the slices of any picture, and their colours, in a line each."""
-    drawn = {
-        (entry["color"], entry["label"]): entry["label_number"] for each in pictures for entry in each["labels"] or ()
-    }
+    entries = chain(*(picture["labels"] or () for picture in pictures))
+    drawn = {(entry["color"], entry["label"]): entry["label_number"] for entry in entries}
     lines = [f"{color} {printable(label)} ({number})" for (color, label), number in drawn.items()]
     more = len(lines) - _LABELS_LISTED
     return lines if more <= 0 else [*lines[:_LABELS_LISTED], f"and {more} more labels, see the report"]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import islice
+from itertools import chain, islice
 from typing import IO, Any, Protocol
 
 import numpy as np
@@ -73,7 +73,7 @@ def _facts(report: Mapping[str, Any], keep_ids: bool) -> Iterator[str]:
         yield f"axes {axes}"
     affine = report.get("affine_ijk_to_lps_mm")
     if isinstance(affine, list) and len(affine) == 4 and all(isinstance(row, list) for row in affine):
-        yield from _line("affine_ijk_to_lps_mm", [("", value) for row in affine for value in row])
+        yield from _line("affine_ijk_to_lps_mm", [("", value) for value in chain(*affine)])
     frame = report.get("frame_of_reference_hash")
     if keep_ids and isinstance(frame, str) and _HASH.fullmatch(frame):
         yield f"frame_of_reference {frame}"

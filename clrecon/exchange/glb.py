@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import json
 import struct
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -307,7 +308,7 @@ def _roots(file: _File) -> list[Any]:
     if file.document.get("scenes"):
         return list(file.entry("scenes", file.document.get("scene", 0)).get("nodes", ()))
     nodes = file.document.get("nodes", [])
-    children = {child for node in nodes for child in node.get("children", ())}
+    children = set(chain(*(node.get("children", ()) for node in nodes)))
     return [number for number in range(len(nodes)) if number not in children]
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import codecs
 import io
 import re
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
@@ -91,7 +92,7 @@ def read_cloud(path: Path) -> RawCloud:
             if count < 3:
                 raise RefusedInputError(f"{name} has {count} numbers a line, a point has three at least")
             mark = next((mark for mark in ";," if mark in first), None)
-            rest = (line for part in ([first], stream) for line in part)
+            rest = chain([first], stream)
             table = np.loadtxt(rest, comments="#", delimiter=mark, ndmin=2, dtype=np.float64)
     except (ValueError, OSError, OverflowError, MemoryError) as error:
         raise say_cut(name, error) from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Mapping
+from itertools import product
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -177,7 +178,7 @@ def _certify(volume: Own, cropped: Own, block: Block, box: np.ndarray, space: st
 def find_extent(volume: BaseVolume) -> tuple[Float64Array, Float64Array]:
     """Return the lowest and highest (x, y, z) of the box of the voxels' centres, LPS mm."""
     ni, nj, _ = volume.shape_ijk
-    in_plane = np.array([(i, j) for i in (0, ni - 1) for j in (0, nj - 1)]) @ volume.affine[:3, :2].T
+    in_plane = np.array(list(product((0, ni - 1), (0, nj - 1)))) @ volume.affine[:3, :2].T
     corners = (volume.slice_origins()[:, None] + in_plane).reshape(-1, 3)
     return corners.min(axis=0), corners.max(axis=0)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any
 
 from clrecon.system.light_dataclass import dataclass, field, fields
@@ -73,8 +74,8 @@ class Certificate(Record):
         entries = super()._entries()
         masked = entries.pop("masked")
         if self.format != "DICOM":
-            moved = {name: entries.pop(name) for names in _ELSEWHERE.values() for name in names}
-            order = [place for name in entries for place in (name, *_ELSEWHERE.get(name, ()))]
+            moved = {name: entries.pop(name) for name in chain(*_ELSEWHERE.values())}
+            order = list(chain(*((name, *_ELSEWHERE.get(name, ())) for name in entries)))
             entries = {name: moved[name] if name in moved else entries[name] for name in order}
         return {**entries, **masked}
 

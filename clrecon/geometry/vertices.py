@@ -12,6 +12,7 @@ Cubes Algorithm", J. Harbin Inst. Technol. (New Series) 26(6), eq. 6-11 (golden 
 from __future__ import annotations
 
 import math
+from itertools import product
 from typing import TYPE_CHECKING, get_args
 
 import numpy as np
@@ -119,7 +120,7 @@ def float32_step(largest: float) -> float:
 def largest_coordinate(volume: Volume, origin: Float64Array | None = None, border: int = 1) -> float:
     """Largest coordinate in mm in the volume's slices, relative to `origin`, with `border` layers around it."""
     ni, nj, _ = volume.shape_ijk
-    steps = np.array([(i, j) for i in (-border, ni - 1 + border) for j in (-border, nj - 1 + border)], dtype=np.float64)
+    steps = np.array(list(product((-border, ni - 1 + border), (-border, nj - 1 + border))), dtype=np.float64)
     origins = volume.slice_origins(border)
     corners = origins[:, None] + steps @ volume.affine[:3, :2].T
     return float(np.abs(corners if origin is None else corners - origin).max())

@@ -200,7 +200,7 @@ class Volume(BaseVolume, ShownAsHtml):
             return int(write_volume(self, path, resample=resample, keep_ids=keep_ids, progress=progress))
 
     @explains_arguments
-    def to_pyvista(self, resample: bool = False) -> Any:
+    def to_pyvista(self, *, resample: bool = False) -> Any:
         """Return the volume as ``pyvista.ImageData`` in LPS mm, its HU as the active point data ``HU``.
 
         The points lie where ``ijk_to_lps`` puts the voxels, i runs fastest.  The image shares the memory of the voxels:
@@ -259,7 +259,7 @@ class Volume(BaseVolume, ShownAsHtml):
         return cls._of(*take_image_data(image, name, space))
 
     @explains_arguments
-    def to_sitk(self, resample: bool = False) -> Any:
+    def to_sitk(self, *, resample: bool = False) -> Any:
         """Return the volume as ``SimpleITK.Image``, a copy in LPS mm, ITK's own frame.
 
         The type stays, left-handed axes too.  The certificate does not go with it: `save` writes it.
@@ -293,7 +293,7 @@ class Volume(BaseVolume, ShownAsHtml):
         return cls._of(*take_sitk(image))
 
     @explains_arguments
-    def to_nibabel(self, resample: bool = False) -> Any:
+    def to_nibabel(self, *, resample: bool = False) -> Any:
         """Return the volume as ``nibabel.Nifti1Image``: array (i, j, k) on the memory of the voxels, affine to RAS mm.
 
         Sheared and left-handed axes stay as they are.  The certificate does not go with it: `save` writes it.

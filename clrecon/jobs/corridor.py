@@ -7,6 +7,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -202,7 +203,7 @@ def _name_files(files: MeshFiles, names: Sequence[str]) -> None:
     pictures = [("the picture", path) for path in _picture_paths(files, names)]
     meshes: list[tuple[str, str | Path]] = []
     if files.output is not None:
-        ends = [f"{name}{end}" for name in names for end in ("", "_left", "_right")]
+        ends = ["".join(pair) for pair in product(names, ("", "_left", "_right"))]
         meshes = [("the mesh", path) for path in name_outputs(files.output, ends)]
     report = [] if files.report is None else [("the report", files.report)]
     check_files(pictures, meshes, report)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,7 +105,7 @@ def measure_meshes(
             run.lap("render")
         outputs = _write_files(run, meshes[0], colored, drawn, files, settings)
         run.lap("write")
-        warnings = [text for own in meshes for text in own.report["file"]["warnings"]]
+        warnings = list(chain(*(mesh.report["file"]["warnings"] for mesh in meshes)))
         report = run.report(
             DistanceReport,
             [*warnings, *doubt_frames(meshes, entries), *found.warnings],

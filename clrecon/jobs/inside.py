@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -106,7 +107,7 @@ def make_inside(
         suffixes = list(file_suffixes({number: labels.name(number) for number in numbers}).values())
         several = len(suffixes) > 1
         if run.no_clobber:
-            names = [name_part(suffix, part, several=several) for suffix in suffixes for part in PARTS]
+            names = [name_part(suffix, part, several=several) for suffix, part in product(suffixes, PARTS)]
             refuse_files(name_outputs(output, names) + ([] if picture is None else name_outputs(picture, names)))
         run.lap("read")
         found: list[_FoundVertebra] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,7 +62,7 @@ def measure_stats(
             run.lap("surface")
         report = run.report(
             StatsReport,
-            [*taken.warnings, *(text for one in figures for text in one.warnings)],
+            [*taken.warnings, *chain(*(label.warnings for label in figures))],
             volume,
             labels=list(figures),
             percentiles=list(percentiles),

@@ -9,6 +9,7 @@ neighbours, never to both: the lower end of an interval is inside, the upper end
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +109,7 @@ def unite_contours(
     unique = list({_canonical(corners, pixel_mm): corners for corners in contours}.values())
     repeated = len(contours) - len(unique)
     near = _find_near(unique, shape)
-    patches = {n: _fill_patch(unique[n], shape, pixel_mm) for n in sorted({n for pair in near for n in pair})}
+    patches = {n: _fill_patch(unique[n], shape, pixel_mm) for n in sorted(set(chain(*near)))}
     crossing, nested, again = [], [], []
     for a, b in near:
         one, other = patches[a], patches[b]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -171,7 +172,7 @@ def _list_files(folder: Path, follow_links: bool) -> Iterator[Path]:
     yield from kept if follow_links else ()
 
 
-def open_masks(folder: Path, follow_links: bool = False) -> dict[str, GridFile]:
+def open_masks(folder: Path, *, follow_links: bool = False) -> dict[str, GridFile]:
     """Read the headers of a folder's masks, by structure in alphabetical order; hidden and other files are left out."""
     shown = escape_text(folder.name)
     masks: dict[str, GridFile] = {}
@@ -231,7 +232,7 @@ def read_masks(folder: Path, masks: dict[str, GridFile], wanted: Wanted, progres
 def _check_same(first: GridFile, other: GridFile) -> None:
     shapes = [" x ".join(map(str, grid.shape_ijk)) for grid in (first, other)]
     end = np.append(np.array(first.shape_ijk) - 1.0, 1.0)
-    corners = np.array([[i, j, k, 1.0] for i in (0.0, end[0]) for j in (0.0, end[1]) for k in (0.0, end[2])])
+    corners = np.array(list(product(*((0.0, last) for last in end[:3]), (1.0,))))
     off = float(np.linalg.norm(corners @ (other.affine - first.affine).T, axis=1).max())
     if shapes[0] != shapes[1] or off > SAME_GRID_MM:
         raise RefusedInputError(

@@ -159,7 +159,7 @@ def _read_grid(kind: str, path: Path, wanted: Wanted, volume: Grid | None, progr
 
 
 def _read_folder(follow_links: bool, path: Path, wanted: Wanted, volume: Grid | None, progress: Progress) -> LabelMap:
-    masks = open_masks(path, follow_links)
+    masks = open_masks(path, follow_links=follow_links)
     for grid in masks.values():
         _check_proportion(grid.name, volume, grid.shape_ijk, _stored_bytes(grid))
     return read_masks(path, masks, wanted, progress)

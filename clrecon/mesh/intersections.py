@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -314,7 +315,7 @@ def _meet(
     """True where one of these edges of either triangle has a point of the other triangle."""
     found = np.zeros(one.shape[1], dtype=bool)
     rows = np.arange(one.shape[1])
-    ends = sorted({end for edge in edges for end in edge})
+    ends = sorted(set(chain(*edges)))
     for _ in range(2):
         sides = np.zeros((3, len(rows)), dtype=np.int8)
         for end in ends:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ def _finite_points(points: ArrayLike, name: str, *, one: bool = False) -> NDArra
 
 def _joined(parts: list[tuple[dict[str, NDArray[np.floating]], int]]) -> dict[str, NDArray[np.floating]]:
     """Join numbers by name, of so many vertices or triangles each; NaN where a part has none."""
-    names = dict.fromkeys(name for own, _ in parts for name in own)
+    names = dict.fromkeys(chain(*(names for names, _ in parts)))
     return {
         name: np.concatenate([own.get(name, np.full(count, np.nan, np.float32)) for own, count in parts])
         for name in names

@@ -37,6 +37,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +121,7 @@ class KnownGood:
         """
         names = {name for name in names if self._list(name)}
         if names:
-            names -= {name for path in self._records.iterdir() if path.name != key for name in self._read(path.name)}
+            names -= set(chain(*(self._read(path.name) for path in self._records.iterdir() if path.name != key)))
         return {name: before[name] for name in sorted(names)}
 
     def record_when_due(self) -> None:
@@ -160,7 +161,7 @@ class KnownGood:
         if not self._is_alone():
             return
         try:
-            known: dict[str, set[str]] = {name: set() for names in self._used.values() for name in names}
+            known: dict[str, set[str]] = {name: set() for name in chain(*self._used.values())}
             for path in self._records.iterdir():
                 for name, files in self._read(path.name).items():
                     known.setdefault(name, set()).update(files)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -304,7 +305,7 @@ def _time_resident(device: Device, volume: Volume, hu: float, runs: int) -> dict
 
 def _collect_warnings(result: dict[str, Any], volume: Volume, devices: list[Device]) -> list[str]:
     warnings = [str(text) for text in volume.report.get("warnings", [])]
-    warnings += [text for device in devices for text in device.warnings]
+    warnings += chain(*(device.warnings for device in devices))
     if result["free_cores"] < BUSY_SHARE * result["cores"]:
         warnings.append(
             f"only {result['free_cores']:.1f} of {result['cores']} cores are free: end other programs and run again"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -88,11 +89,8 @@ def _fill(folder: Path, chosen: Device, progress: Progress | None) -> dict[str, 
     watch.lap("mesh")
     check = check_sphere(chosen)
     watch.lap("check")
-    errors = [
-        abs(found - true)
-        for row, true_row in zip(report["affine_ijk_to_lps_mm"], truth["affine_ijk_to_lps_mm"], strict=True)
-        for found, true in zip(row, true_row, strict=True)
-    ]
+    entries = zip(*(chain(*found["affine_ijk_to_lps_mm"]) for found in (report, truth)), strict=True)
+    errors = [abs(found - true) for found, true in entries]
     seconds = {**watch.seconds, "total": watch.total()}
     return {
         "files": list(DEMO_FILES),

@@ -7,6 +7,7 @@ body, give the cranial direction.  The median plane is that by which the label i
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -112,7 +113,7 @@ def _look_through(points: Float64Array) -> tuple[float, Float64Array, Float64Arr
     step = COARSE_DEG
     leans = np.arange(-WIDEST_LEAN_DEG, WIDEST_LEAN_DEG + 0.1, step)
     rolls = np.arange(-WIDEST_ROLL_DEG, WIDEST_ROLL_DEG + 0.1, step)
-    tried = [(float(lean), float(roll)) for lean in leans for roll in rolls]
+    tried = [(float(lean), float(roll)) for lean, roll in product(leans, rolls)]
     middle = np.zeros(2)
     for number in range(4):
         pixel = PIXELS_MM[min(number, 1)]
@@ -125,7 +126,7 @@ def _look_through(points: Float64Array) -> tuple[float, Float64Array, Float64Arr
         middle = good[np.abs(good - pairs[radii.argmax()]).max(axis=1) <= 2.0 * step].mean(axis=0)
         step /= 2.0
         offsets = np.arange(-2, 3) * step
-        tried = [(middle[0] + a, middle[1] + b) for a in offsets for b in offsets]
+        tried = [(middle[0] + a, middle[1] + b) for a, b in product(offsets, repeat=2)]
     basis = _basis(*middle)
     radius, centre = _hole(points, basis, PIXELS_MM[1])
     return radius, basis, centre

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,7 +104,7 @@ def cut_part(volume: Volume, course: Course, looks: Looks) -> Part:
     """Cut out the box of the volume that can hold the vertebrae."""
     from scipy.ndimage import maximum_filter1d
 
-    sides = [(x, y) for x in (-RIB_MM[1], RIB_MM[1]) for y in (-FRONT_MM, BEHIND_MM)]
+    sides = list(product((-RIB_MM[1], RIB_MM[1]), (-FRONT_MM, BEHIND_MM)))
     corners = np.concatenate([course.canal + np.array([x, y, 0.0]) for x, y in sides])
     ijk = volume.lps_to_ijk(corners)
     low = np.clip(np.floor(ijk.min(axis=0)).astype(int), 0, np.array(volume.shape_ijk) - 1)

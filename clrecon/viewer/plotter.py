@@ -6,6 +6,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -102,7 +103,7 @@ def show_inputs(
     iso_value = choose_iso(objects, settings.scan, progress)
     scan = settings.scan
     with open_plotter(objects, iso_value=iso_value, device=scan.device, memory=scan.memory) as plotter:
-        ready(list(dict.fromkeys(text for each in objects for text in each.said)))
+        ready(list(dict.fromkeys(chain(*(each.said for each in objects)))))
         _run(plotter, display)
 
 

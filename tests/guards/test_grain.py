@@ -1,4 +1,4 @@
-"""The house grows no finer and no longer than it is: figures with ceilings that only fall."""
+"""The house grows no finer and no longer than it is, and no harder to read: figures with ceilings that only fall."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from count_habits import find_habits
 from house import ROOT
 from house_figures import count_grain
 
@@ -19,6 +20,57 @@ CEILINGS = {
     "modules_with_own_all": 0,
 }
 """Who takes something away lowers the figure in the same commit; who needs more says why in the commit."""
+
+HABITS = {
+    "functions_with_pronouns": 1_216,
+    "functions_without_object": 240,
+    "assignments_of_three": 220,
+    "nested_conditionals": 0,
+    "comprehensions_of_two_loops": 23,
+    "positional_flags": 0,
+    "functions_of_many_parameters": 49,
+    "equal_functions": 6,
+    "constants_of_one_file": 823,
+    "kernels_with_branches": 18,
+    "tests_of_wording": 1_107,
+    "tables_without_ids": 107,
+    "patches_of_private_names": 165,
+}
+"""Places of each habit that makes code hard to read; see scripts/proof/count_habits.py."""
+
+BAD = {
+    "clrecon/a.py": """\
+def take(a, b, c, d, e, f, g, flag=True):
+    found, low, high = a, b, c
+    kind = 1 if d else 2 if e else 3
+    return [x for y in found for x in y], low, high, kind
+def f(own):
+    return compare(own.first, own.second, own.third)
+LENGTH = 3
+""",
+    "clrecon/b.py": "def g(other):\n    return compare(other.first, other.second, other.third)\n",
+    "cl/a.cl": "__kernel void k()\n{\n#if A\n  a();\n#else\n  b();\n#endif\n}\n",
+    "tests/test_a.py": """\
+@pytest.mark.parametrize("row", [(1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 7), (7, 8), (8, 9)])
+def test_words(row, monkeypatch):
+    monkeypatch.setattr(module, "LIMIT", 2)
+    with pytest.raises(ValueError, match="too large"):
+        check(row)
+""",
+}
+
+
+@pytest.mark.parametrize("habit", HABITS)
+def test_habits_that_are_hard_to_read_become_no_more(habit: str) -> None:
+    assert len(find_habits()[habit]) <= HABITS[habit], f"see scripts/proof/count_habits.py {habit}"
+
+
+def test_each_habit_is_found(tmp_path: Path) -> None:
+    for name, text in BAD.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    counts = {habit: len(places) for habit, places in find_habits(tmp_path).items()}
+    assert counts == dict.fromkeys(HABITS, 1) | {"functions_with_pronouns": 3}
 
 
 @pytest.mark.parametrize("figure", CEILINGS)

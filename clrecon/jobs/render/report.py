@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from clrecon.anatomy.head import SKIN_SEEN_HU, warn_of_face
@@ -168,7 +169,7 @@ def report_of(
         [*device.warnings, *taker.warnings, *face],
         volume,
         on=device,
-        before=[text for file in files for text in file.get("warnings", ())],
+        before=list(chain(*(file.get("warnings", ()) for file in files))),
         affine_ijk_to_lps_mm=subject.report.get("affine_ijk_to_lps_mm") if volume is None else volume.affine.tolist(),
         mode=style.mode,
         preset=settings.preset_used,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -265,7 +266,7 @@ class RenderSettings(InputSettings):
     @classmethod
     def keywords(cls) -> set[str]:
         """The keywords that `of` accepts; the looks of labels are part of `labels`."""
-        look = {keyword for mode in MODES for keyword in keywords_of(mode)} - {"label_colors", "label_opacity"}
+        look = set(chain(*map(keywords_of, MODES))) - {"label_colors", "label_opacity"}
         return {own.name for own in fields(cls)} | look | {"preset", "clip_planes"}
 
     def __post_init__(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,7 +68,7 @@ def write_view(
         for mesh, entry in placed[1:]:
             pair = [{**own, "bounds_mm": own["bounds_mm"].tolist()} for own in (placed[0][1], entry)]
             doubts += doubt_frames([placed[0][0], mesh], pair)
-        warnings = [text for one in shown for text in one.warnings] + doubts
+        warnings = [*chain(*(one.warnings for one in shown)), *doubts]
         file = run.write_meshes(meshes, [output])[0] if len(meshes) == 1 else run.write_together(meshes, output)
         run.lap("write")
         commit_all(run.files)
@@ -134,10 +135,7 @@ def _read_input(path: str | Path, settings: ViewSettings, run: Run) -> _ShownInp
             **_describe_scan(path, made.volume, meshes, run),
             "surface": ", ".join(dict.fromkeys(part.surface.describe() for part in made.parts)),
         },
-        [
-            *made.volume.report.get("warnings", ()),
-            *(text for mesh in meshes for text in mesh.report.get("warnings", ())),
-        ],
+        [*made.volume.report.get("warnings", ()), *chain(*(mesh.report.get("warnings", ()) for mesh in meshes))],
         made.device.current.label,
     )
 
@@ -184,7 +182,7 @@ def _name_and_color(shown: Sequence[_ShownInput], settings: ViewSettings) -> lis
                 mesh.report["part_name"] = words
             if len(shown) > 1 and "color" not in mesh.report:
                 mesh.report["color"] = [float(value) for value in colors[number - 1]]
-    return [mesh for one in shown for mesh in one.meshes]
+    return list(chain(*(one.meshes for one in shown)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

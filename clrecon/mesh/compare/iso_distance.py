@@ -178,7 +178,7 @@ def _distances_along_lines(volume: Volume, rule: IsoRule, level: float, points: 
     A trilinear field has its extremes at the corners of the cells.  So if the level passes through the cell of a point
     or a neighbouring cell, one of the 64 surrounding voxels lies on the other side, and the line to it meets the level.
     """
-    corners = np.array([[i, j, k] for i in range(-1, 3) for j in range(-1, 3) for k in range(-1, 3)], float)
+    corners = np.array(list(product(range(-1, 3), repeat=3)), float)
     distances = np.full(len(points), np.nan)
     for where in chunks(len(points), 1024):
         start = volume.lps_to_ijk(points[where])

@@ -101,7 +101,7 @@ class VoxelEmission:
         values = places if self.origin is None else places - self.origin
         nearest = values.astype(np.float32).astype(np.float64)
         self._origins = pad4(np.stack([nearest, values - nearest], axis=-2))
-        self._steps = pad4(np.stack([part for step in (0, 1) for part in split_steps(volume.affine[:3, step])]))
+        self._steps = pad4(np.concatenate([split_steps(volume.affine[:3, step]) for step in (0, 1)]))
         self._next = 0
         self._parts: list[Points] = []
 

@@ -5,6 +5,7 @@ common.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -96,7 +97,7 @@ def _place_rows(volume: Volume, sheet: Sheet, samples: SlabSamples) -> _Places:
         origins = volume.lps_to_ijk(sheet.origins)
     steps, depths = sheet.steps @ to_places.T, samples.step * (sheet.normals @ to_places.T)
     last, half = (sheet.width - 1) * steps, samples.intervals // 2 * depths
-    corners = np.stack([origins + across + along for across in (0.0 * last, last) for along in (-half, half)])
+    corners = np.stack([origins + across + along for across, along in product((0.0 * last, last), (-half, half))])
     if np.abs(corners).max() >= FARTHEST:
         raise UsageError(
             "the picture reaches more than a thousand kilometres beyond the volume: check its place and size"

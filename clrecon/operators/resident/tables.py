@@ -5,6 +5,7 @@ slices (cl/rays/stack.h), and the ranges of its bricks, which are measured once 
 from __future__ import annotations
 
 import math
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -82,7 +83,7 @@ def enclose(volume: Volume, low: Float64Array, high: Float64Array) -> tuple[Floa
     if not volume.uneven:
         return low, high
     ks = {low[2], high[2], *range(math.ceil(low[2]), math.floor(high[2]) + 1)}
-    corners = [(i, j, k) for k in ks for i in (low[0], high[0]) for j in (low[1], high[1])]
+    corners = [(i, j, k) for k, i, j in product(ks, (low[0], high[0]), (low[1], high[1]))]
     places = FieldFrame.of(volume).places(volume.ijk_to_lps(corners))
     return places.min(axis=0), places.max(axis=0)
 

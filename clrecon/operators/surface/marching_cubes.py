@@ -202,7 +202,7 @@ class Placement:
         normals = slice_normal_matrices(volume, border), layer_normal_matrices(volume, border)
         frames = pad4(np.concatenate([*parts, *normals], axis=1))
         frames[:, 2, 3] = layer_margins(volume, border)
-        steps = pad4(np.stack([part for step in (0, 1) for part in split_steps(volume.affine[:3, step])]))
+        steps = pad4(np.concatenate([split_steps(volume.affine[:3, step]) for step in (0, 1)]))
         return cls(frames, steps, pad4(vertex_margin(volume, border)), origin)
 
     def to_lps(self, positions: NDArray[np.float32]) -> NDArray[np.floating]:

@@ -206,11 +206,12 @@ class VertebraInside:
     def as_dict(self) -> dict[str, Any]:
         """Return what was found as plain JSON types."""
         canal = self.canal_found
+        surface = "cortex" if self.cortex else "iso value"
         return {
             "label": self.label,
             "name": self.name,
             "label_inside_share": self.inside_share,
-            "solid_of": "label" if self.iso_value is None else "cortex" if self.cortex else "iso value",
+            "solid_of": "label" if self.iso_value is None else surface,
             "iso_value_hu": self.iso_value,
             "dense_hu": [None if math.isinf(end) else end for end in self.dense_hu],
             "spacing_mm": list(self.volume.spacing),

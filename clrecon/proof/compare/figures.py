@@ -10,6 +10,7 @@ import base64
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -216,7 +217,7 @@ def along_slices(volume: Volume) -> dict[str, Any]:
     middle = volume.ijk_to_lps([[(ni - 1) / 2, (nj - 1) / 2, nk // 2]])[0]
     right, down = volume.affine[:3, 0] / di, volume.affine[:3, 1] / dj
     forward = np.cross(right, down)
-    corners = [(i, j, k) for i in (0, ni - 1) for j in (0, nj - 1) for k in (0, nk - 1)]
+    corners = list(product((0, ni - 1), (0, nj - 1), (0, nk - 1)))
     away = 1.5 * float(np.linalg.norm(volume.ijk_to_lps(corners) - middle, axis=1).max()) + 10.0
     camera = {
         "position": [float(x) for x in middle - away * forward],

@@ -9,6 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
+from itertools import chain, product
 from string import Template
 from typing import Any
 
@@ -115,7 +116,7 @@ def _set_ranges(axes: Any, across: Sequence[float], up: Sequence[float]) -> None
     axes.set_xlim(low, high)
     room = max(max(up) - min(up), 0.02 * max(up), 1e-6)
     axes.set_ylim(max(0.0, min(up) - 0.35 * room), max(up) + 0.2 * room)
-    steps = [step * 10**power for power in range(12) for step in (1, 2, 5)]
+    steps = [step * 10**power for power, step in product(range(12), (1, 2, 5))]
     shown = [step for step in steps if low <= step <= high]
     axes.set_xticks(shown, [f"{step:,}" for step in shown])
     axes.set_xticks([], minor=True)
@@ -337,7 +338,7 @@ def _slices(report: CompareReport, figures: Figures) -> str:
     if not report.slices:
         return ""
     titles = {record.name: record.title for record in report.methods}
-    drawn = {name for entry in report.slices for name in entry["lines"]}
+    drawn = set(chain(*(entry["lines"] for entry in report.slices)))
     own = {titles[name]: COLORS[name] for name in titles if name in drawn and name not in figures.same}
     reference = titles[report.reference]
     if figures.same and reference in own:

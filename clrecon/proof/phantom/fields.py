@@ -52,9 +52,10 @@ def ellipsoid(x: Field, y: Field, z: Field, half: Point) -> Field:
 
 
 def capsule(
-    x: Field, y: Field, z: Field, a: Point, b: Point, radius_a: float, radius_b: float, flatten: float = 1.0
+    at: tuple[Field, Field, Field], a: Point, b: Point, radius_a: float, radius_b: float, flatten: float = 1.0
 ) -> Field:
     """Distance to a rod from `a` to `b`, its radii `radius_a` and `radius_b`, its height its width / `flatten`."""
+    x, y, z = at
     ax, ay, az = a[0], a[1], a[2] * flatten
     dx, dy, dz = b[0] - ax, b[1] - ay, b[2] * flatten - az
     length2 = dx * dx + dy * dy + dz * dz

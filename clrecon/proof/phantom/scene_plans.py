@@ -35,10 +35,6 @@ def _wall(x: Field, y: Field, z: Field) -> Field:
     return np.float32(3.0) + np.float32(5.0) * np.clip(np.abs(y) / np.float32(VAULT[1]), 0.0, 1.0)
 
 
-def _above_floor(x: Field, y: Field, z: Field) -> Field:
-    return np.asarray(z - np.float32(FLOOR_Z), dtype=np.float32)
-
-
 def _depth_in_vault(x: Field, y: Field, z: Field) -> Field:
     """Return the distance to the inner surface of the vault, positive within it."""
     return np.asarray(ellipsoid(x, y, z, VAULT) - _wall(x, y, z), dtype=np.float32)
@@ -60,7 +56,7 @@ def _vault(material: str, hu: float) -> list[Part]:
         dataclasses.replace(cut(whole, _depth_in_diploe), hu=DIPLOE_HU),
         dataclasses.replace(cut(whole, _depth_in_vault), material=material, hu=hu),
     )
-    return [cut(layer, _above_floor) for layer in layers]
+    return [cut(layer, lambda x, y, z: z - np.float32(FLOOR_Z)) for layer in layers]
 
 
 def _base() -> list[Part]:
@@ -378,7 +374,7 @@ def plan_hand() -> Plan:
             bones.append(([_point(start), _point(at - radius * way)], radius))
             at = at + 2.8 * way
         flesh.append(rod("tissue", 60.0, base, _point(at), 10.0, 8.0))
-    places = [(x, y, z) for z, y in ((-51.0, 0.0), (-63.5, 1.0)) for x in (-22.0, -8.0, 6.0, 20.0)]
+    places = [(x, y, z) for (z, y), x in itertools.product(((-51.0, 0.0), (-63.5, 1.0)), (-22.0, -8.0, 6.0, 20.0))]
     wrist = [([(x - 0.7, y, z), (x + 0.7, y, z)], 5.0) for x, y, z in places]
     palm = ball("tissue", 60.0, (-4.0, 0.0, -30.0), (40.0, 13.0, 34.0))
     arm = column("tissue", 60.0, (-2.0, 0.0), (30.0, 13.0), (-1e4, -40.0))

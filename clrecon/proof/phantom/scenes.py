@@ -217,7 +217,7 @@ def rod(material: str, hu: float, a: Point, b: Point, radius_a: float, radius_b:
     return Part(
         material,
         hu,
-        lambda x, y, z: capsule(x, y, z, a, b, radius_a, end),
+        lambda x, y, z: capsule((x, y, z), a, b, radius_a, end),
         (float(low[0]), float(low[1]), float(low[2])),
         (float(high[0]), float(high[1]), float(high[2])),
     )

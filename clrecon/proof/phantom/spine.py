@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,41 +37,47 @@ TABLE_SHELL_HU = 130.0
 TABLE_CORE_HU = -930.0
 
 
-def _blend(canvas: Field, share: Field, hu: float) -> None:
-    canvas += share * (np.float32(hu) - canvas)
+@dataclass(frozen=True)
+class _Painter:
+    """What draws one slice, or a band of its rows, onto ``canvas``; interfaces are `ramp` mm wide."""
+
+    canvas: Field
+    ramp: float
+    seed: int
+    blood_hu: float
+
+    def fill(self, distance: Field, hu: float, share: float | Field = 1.0) -> None:
+        """Give the inside of a shape, where its distance is positive, a share of its HU."""
+        part = share * coverage(distance, self.ramp)
+        np.add(self.canvas, part * (np.float32(hu) - self.canvas), out=self.canvas)
 
 
-def _draw_couch(canvas: Field, anatomy: Anatomy, x: Field, y: Field, ramp: float) -> None:
+def _draw_couch(painter: _Painter, anatomy: Anatomy, x: Field, y: Field) -> None:
     """Draw a curved carbon couch under the back: a thin shell around foam, endless along z; `y` runs downwards."""
     top = y - np.float32(anatomy.half_depth + 2.0)
     bowed = top + np.float32(0.16 / anatomy.half_width) * x * x
     shell = np.minimum(np.minimum(bowed, 32.0 - top), np.float32(0.95 * anatomy.half_width) - np.abs(x))
-    _blend(canvas, coverage(shell, ramp), TABLE_SHELL_HU)
-    _blend(canvas, coverage(shell - np.float32(1.6), ramp), TABLE_CORE_HU)
+    painter.fill(shell, TABLE_SHELL_HU)
+    painter.fill(shell - np.float32(1.6), TABLE_CORE_HU)
 
 
-def _draw_wall(
-    canvas: Field, half_width: float | Field, half_depth: float | Field, x: Field, y: Field, ramp: float
-) -> Field:
+def _draw_wall(painter: _Painter, half_width: float | Field, half_depth: float | Field, x: Field, y: Field) -> Field:
     """Draw skin, fat and muscle; return the distance into the body cavity."""
     skin = ellipse(x, y, half_width, half_depth)
-    _blend(canvas, coverage(skin, ramp), SKIN_HU)
-    _blend(canvas, coverage(skin - np.float32(1.8), ramp), FAT_HU)
+    painter.fill(skin, SKIN_HU)
+    painter.fill(skin - np.float32(1.8), FAT_HU)
     # The flanks and the belly have more fat than the ribs of the back.
     fat = np.float32(11.0) - np.float32(3.0) * np.clip(y / np.asarray(half_depth, dtype=np.float32), -1.0, 1.0)
     muscle = skin - fat
-    _blend(canvas, coverage(muscle, ramp), MUSCLE_HU)
+    painter.fill(muscle, MUSCLE_HU)
     return muscle - np.float32(13.0)
 
 
-def _draw_organs(
-    canvas: Field, anatomy: Anatomy, cavity: Field, x: Field, y: Field, z: Field, ramp: float, seed: int,
-    blood_hu: float,
-) -> Field:  # fmt: skip
+def _draw_organs(painter: _Painter, anatomy: Anatomy, cavity: Field, x: Field, y: Field, z: Field) -> Field:
     """Draw organs and lungs at x, y from the middle of the trunk; return the distance into the lungs."""
     wide, deep = anatomy.half_width - 28.0, anatomy.half_depth - 28.0
     low = np.float32(anatomy.level_z("L1"))
-    _blend(canvas, coverage(cavity, ramp), FAT_HU + 8.0)
+    painter.fill(cavity, FAT_HU + 8.0)
     # The domes of the diaphragm are highest over the middle of each half of the chest.
     half = np.abs(x) - np.float32(0.5 * wide)
     dome = low + np.float32(62.0) * np.maximum(
@@ -82,13 +89,14 @@ def _draw_organs(
     lowest, highest = float(z.min()), float(z.max())
 
     def organ(center: tuple[float, float, float], half_axes: tuple[float, float, float], hu: float) -> None:
-        if lowest > center[2] + half_axes[2] + 2.0 * ramp or highest < center[2] - half_axes[2] - 2.0 * ramp:
+        reach = half_axes[2] + 2.0 * painter.ramp
+        if lowest > center[2] + reach or highest < center[2] - reach:
             return
         shape = ellipsoid(x - np.float32(center[0]), y - np.float32(center[1]), z - np.float32(center[2]), half_axes)
-        _blend(canvas, coverage(np.minimum(shape, abdomen), ramp), hu)
+        painter.fill(np.minimum(shape, abdomen), hu)
 
     mid, kidney = anatomy.level_z("T12"), anatomy.level_z("L2")
-    generator = np.random.default_rng((seed, 13))
+    generator = np.random.default_rng((painter.seed, 13))
     for n in range(9):
         spot = (generator.uniform(-0.6, 0.7) * wide, generator.uniform(-0.75, -0.1) * deep, kidney - 22.0 * n + 25.0)
         size = tuple(generator.uniform(14.0, 26.0, 3))
@@ -107,7 +115,7 @@ def _draw_organs(
 
     mediastinum = ellipse(x - np.float32(6.0), y + np.float32(0.25 * deep), 0.34 * wide + 6.0, 0.85 * deep)
     # Heart and great vessels are one piece, in a rim of fat.
-    _blend(canvas, coverage(np.minimum(np.minimum(mediastinum - np.float32(4.0), above), cavity), ramp), blood_hu)
+    painter.fill(np.minimum(np.minimum(mediastinum - np.float32(4.0), above), cavity), painter.blood_hu)
     lung = np.minimum(np.minimum(cavity + np.float32(9.0), above), -mediastinum)
     return lung
 
@@ -116,39 +124,35 @@ _BAND = 24000
 """Pixels drawn at once: temporaries stay in the cache, and below the size at which the system maps memory anew."""
 
 
-def draw_tissue(
-    anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, seed: int, table: Sequence[Part] | None, prone: bool,
-    *, blood_hu: float = BLOOD_HU,
-) -> Field:  # fmt: skip
-    """Draw one slice without bone, in bands of rows, HU, (nj, ni), at x, y, z in mm of the plan.
+def _draw_tissue(
+    painter: _Painter, anatomy: Anatomy, x: Field, y: Field, z: Field, table: Sequence[Part] | None, prone: bool
+) -> None:
+    """Draw one slice without bone, in bands of rows, at x, y, z in mm of the plan, onto air.
 
-    Interfaces are `ramp` mm wide.  Without a table the body lies on a couch of its own, if prone under the front.
+    Without a table the body lies on a couch of its own, if prone under the front.
     """
-    canvas = np.full(x.shape, AIR_HU, dtype=np.float32)
     rows = max(1, _BAND // x.shape[1])
     for start in range(0, x.shape[0], rows):
         band = slice(start, start + rows)
+        part_painter = replace(painter, canvas=painter.canvas[band])
         if table is None:
-            _draw_couch(canvas[band], anatomy, x[band], -y[band] if prone else y[band], ramp)
+            _draw_couch(part_painter, anatomy, x[band], -y[band] if prone else y[band])
         for part in table or ():
-            _blend(canvas[band], coverage(part.distance_at(x[band], y[band], z[band]), ramp), part.hu)
-        _draw_band(canvas[band], anatomy, x[band], y[band], z[band], ramp, seed, blood_hu)
-    return canvas
+            part_painter.fill(part.distance_at(x[band], y[band], z[band]), part.hu)
+        _draw_band(part_painter, anatomy, x[band], y[band], z[band])
 
 
-def _draw_band(
-    canvas: Field, anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, seed: int, blood_hu: float
-) -> None:
-    """Draw onto `canvas`, which already holds air and the couch."""
+def _draw_band(painter: _Painter, anatomy: Anatomy, x: Field, y: Field, z: Field) -> None:
+    """Draw onto a canvas that already holds air and the couch."""
     neck: float | Field = 0.0
     if anatomy.outline is None:
-        cavity = _draw_wall(canvas, anatomy.half_width, anatomy.half_depth, x, y, ramp)
-        lung = _draw_organs(canvas, anatomy, cavity, x, y, z, ramp, seed, blood_hu)
+        cavity = _draw_wall(painter, anatomy.half_width, anatomy.half_depth, x, y)
+        lung = _draw_organs(painter, anatomy, cavity, x, y, z)
     else:
         middle_x, middle_y, half_width, half_depth, neck = anatomy.outline.at(z)
         body_x, body_y = x - middle_x, y - middle_y
-        cavity = _draw_wall(canvas, half_width, half_depth, body_x, body_y, ramp)
-        lung = _draw_organs(canvas, anatomy, cavity, body_x, body_y, z, ramp, seed, blood_hu)
+        cavity = _draw_wall(painter, half_width, half_depth, body_x, body_y)
+        lung = _draw_organs(painter, anatomy, cavity, body_x, body_y, z)
         lung = np.minimum(lung, np.float32(60.0) * (np.float32(0.2) - neck))  # no lungs in the neck
 
     height = np.clip(z, *anatomy.curve_z) * np.float32(0.01)
@@ -161,54 +165,46 @@ def _draw_band(
     column = ellipse(from_x, from_y - np.float32(34.0), 66.0, 37.0)
     front = ellipse(from_x, from_y, 29.0, 27.0)
     lung = np.minimum(lung, -np.maximum(column, front))
-    _blend(canvas, coverage(np.minimum(column, cavity + np.float32(13.0)), ramp), MUSCLE_HU)
-    _blend(canvas, coverage(lung, ramp), LUNG_HU)
+    painter.fill(np.minimum(column, cavity + np.float32(13.0)), MUSCLE_HU)
+    painter.fill(lung, LUNG_HU)
     # Planes of fat: under the skin between the muscle bellies, and beside the transverse processes.
     cleft = np.minimum(3.0 - np.abs(from_x), from_y - 56.0)
-    _blend(canvas, coverage(np.minimum(cleft, cavity + np.float32(13.0)), ramp), FAT_HU)
+    painter.fill(np.minimum(cleft, cavity + np.float32(13.0)), FAT_HU)
     belly = np.abs(ellipse(np.abs(from_x) - np.float32(27.0), from_y - np.float32(42.0), 25.0, 17.0))
-    _blend(canvas, np.float32(0.6) * coverage(np.float32(0.7) - belly, ramp), FAT_HU)
+    painter.fill(np.float32(0.7) - belly, FAT_HU, np.float32(0.6))
 
     top, bottom = anatomy.level_z("T12"), anatomy.level_z("L5")
     lean = float(np.polyval(anatomy.curve_y, bottom / 100.0))
     start = float(np.polyval(anatomy.curve_y, top / 100.0))
-    psoas = capsule(np.abs(from_x), y, z, (24.0, start + 6.0, top - 12.0), (44.0, lean - 6.0, bottom), 3.0, 21.0)
-    _blend(canvas, coverage(psoas, ramp), MUSCLE_HU + 4.0)
+    psoas = capsule((np.abs(from_x), y, z), (24.0, start + 6.0, top - 12.0), (44.0, lean - 6.0, bottom), 3.0, 21.0)
+    painter.fill(psoas, MUSCLE_HU + 4.0)
     fat_round = ellipse(from_x - np.float32(2.0), from_y + np.float32(29.0), 34.0, 14.0)
-    _blend(canvas, coverage(np.minimum(fat_round, -lung), ramp), FAT_HU + 20.0)
-    _draw_vessels(canvas, from_x, from_y, z, neck, ramp, seed, blood_hu)
+    painter.fill(np.minimum(fat_round, -lung), FAT_HU + 20.0)
+    _draw_vessels(painter, from_x, from_y, z, neck)
     # The canal lies nearer to the middle of the small bodies of the neck.
     behind = np.float32(9.5) * neck
     canal = ellipse(from_x, from_y - np.float32(24.3) + behind, 11.5, 8.3)
-    _blend(canvas, coverage(canal, ramp), FAT_HU + 40.0)
+    painter.fill(canal, FAT_HU + 40.0)
     sac = ellipse(from_x, from_y - np.float32(24.0) + behind, 8.5, 6.6)
-    _blend(canvas, coverage(sac, ramp), FLUID_HU)
-    _blend(canvas, coverage(np.minimum(sac - np.float32(3.0), z - np.float32(anatomy.level_z("L1"))), ramp), CORD_HU)
+    painter.fill(sac, FLUID_HU)
+    painter.fill(np.minimum(sac - np.float32(3.0), z - np.float32(anatomy.level_z("L1"))), CORD_HU)
 
 
-def _draw_vessels(
-    canvas: Field, from_x: Field, from_y: Field, z: Field, neck: float | Field, ramp: float, seed: int, blood_hu: float
-) -> None:
+def _draw_vessels(painter: _Painter, from_x: Field, from_y: Field, z: Field, neck: float | Field) -> None:
     """Draw aorta and vena cava in front of the spine, and in the neck the windpipe."""
     trunk = np.float32(1.0) - neck
     aorta = ellipse(from_x - np.float32(13.0), from_y + np.float32(29.0), 10.0, 10.0)
     # Plaques: spots of the left and rear wall, at intervals along the vessel.
-    plaque = (
-        1.1
-        - np.abs(aorta - np.float32(1.0))
-        - np.float32(3.0)
-        * np.maximum(
-            0.84 - np.cos(z * np.float32(0.23) + np.float32(seed % 7)) * np.cos((from_x - from_y) * np.float32(0.25)),
-            0.0,
-        )
-    )
-    _blend(canvas, trunk * coverage(aorta, ramp), blood_hu)
-    _blend(canvas, trunk * coverage(np.minimum(plaque, from_x - np.float32(13.0)), ramp), CALCIUM_HU)
+    along = np.cos(z * np.float32(0.23) + np.float32(painter.seed % 7))
+    spots = 0.84 - along * np.cos((from_x - from_y) * np.float32(0.25))
+    plaque = 1.1 - np.abs(aorta - np.float32(1.0)) - np.float32(3.0) * np.maximum(spots, 0.0)
+    painter.fill(aorta, painter.blood_hu, trunk)
+    painter.fill(np.minimum(plaque, from_x - np.float32(13.0)), CALCIUM_HU, trunk)
     vein = ellipse(from_x + np.float32(16.0), from_y + np.float32(27.0), 12.5, 8.5)
-    _blend(canvas, trunk * coverage(vein, ramp), blood_hu)
+    painter.fill(vein, painter.blood_hu, trunk)
     if not isinstance(neck, float):
         windpipe = ellipse(from_x, from_y + np.float32(27.0), 8.0, 8.0)
-        _blend(canvas, coverage(np.minimum(windpipe, np.float32(60.0) * (neck - np.float32(0.5))), ramp), AIR_HU)
+        painter.fill(np.minimum(windpipe, np.float32(60.0) * (neck - np.float32(0.5))), AIR_HU)
 
 
 Float64Array = NDArray[np.float64]
@@ -280,7 +276,7 @@ class _Scene:
             scratch[placed.region] = -1e3
         for a, b, placed in active:
             at = placed.window(k)
-            rod = capsule(at.x, at.y, at.z, tuple(a), tuple(b), 3.5, 3.5, 0.55)
+            rod = capsule((at.x, at.y, at.z), tuple(a), tuple(b), 3.5, 3.5, 0.55)
             view = scratch[placed.region]
             np.maximum(view, rod, out=view)
         rows = slice(min(p.region[0].start for *_, p in active), max(p.region[0].stop for *_, p in active))
@@ -300,7 +296,7 @@ class _Scene:
         marrow = waves_at(at.x, at.y, at.z, vertebra.waves) * np.float32(TRABECULAR_TEXTURE_HU)
         marrow += np.float32(TRABECULAR_HU) + np.float32(ARCH_MARROW_HU - TRABECULAR_HU) * arch
         # basivertebral vein, from the middle of the back wall into the body
-        vein = capsule(at.x, at.y, at.z, (0.0, vertebra.depth / 2.0, 0.0), (0.0, 2.0, 0.0), 2.4, 1.0, 1.0)
+        vein = capsule((at.x, at.y, at.z), (0.0, vertebra.depth / 2.0, 0.0), (0.0, 2.0, 0.0), 2.4, 1.0, 1.0)
         marrow += coverage(vein, 1.5) * (np.float32(VEIN_HU) - marrow)
         shell = np.float32(BODY_CORTEX_HU) + np.float32(CORTEX_HU - BODY_CORTEX_HU) * arch
         paint(canvas, at.region, coverage(bone, self.ramp), shell)
@@ -354,9 +350,9 @@ def draw_spine(
 
     def draw(k: int, place: float) -> None:
         full = Window((slice(0, shape[1]), slice(0, shape[2])), grid, place)
-        tissue = draw_tissue(
-            anatomy, full.x, full.y, full.z, ramp, settings.seed, table, settings.prone, blood_hu=blood_hu
-        )
+        tissue = np.full(shape[1:], AIR_HU, dtype=np.float32)
+        painter = _Painter(tissue, ramp, settings.seed, blood_hu)
+        _draw_tissue(painter, anatomy, full.x, full.y, full.z, table, settings.prone)
         scratch = np.full(shape[1:], -1e3, dtype=np.float32)
         voxels[k] = 0.0
         for offset in offsets:

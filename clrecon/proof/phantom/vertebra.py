@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import reduce
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -72,18 +73,18 @@ def _atlas(side: Field, y: Field, z: Field) -> tuple[Field, list[Field]]:
     """Two arches, lateral masses with hollow joint faces, and long transverse processes; no body."""
     parts = [
         # anterior arch, with its tubercle
-        capsule(side, y, z, (0.0, -12.0, 0.0), (12.5, -7.0, 0.0), 2.6, 3.0, 0.62),
-        capsule(side, y, z, (0.0, -13.6, -0.5), (0.0, -12.6, 0.0), 2.2, 2.6, 0.7),
+        capsule((side, y, z), (0.0, -12.0, 0.0), (12.5, -7.0, 0.0), 2.6, 3.0, 0.62),
+        capsule((side, y, z), (0.0, -13.6, -0.5), (0.0, -12.6, 0.0), 2.2, 2.6, 0.7),
         # lateral mass
-        capsule(side, y, z, (15.0, -5.5, 0.0), (16.5, 3.5, 0.5), 4.2, 4.4, 0.80),
+        capsule((side, y, z), (15.0, -5.5, 0.0), (16.5, 3.5, 0.5), 4.2, 4.4, 0.80),
         # posterior arch, with its tubercle
-        capsule(side, y, z, (16.0, 4.0, 1.0), (13.5, 15.0, 0.5), 2.6, 2.2, 0.62),
-        capsule(side, y, z, (13.5, 15.0, 0.5), (7.0, 23.5, 0.0), 2.2, 2.2, 0.60),
-        capsule(side, y, z, (7.0, 23.5, 0.0), (0.0, 26.0, 0.0), 2.2, 2.6, 0.60),
-        capsule(side, y, z, (0.0, 26.0, 0.0), (0.0, 29.0, 0.0), 2.4, 2.0, 0.7),
+        capsule((side, y, z), (16.0, 4.0, 1.0), (13.5, 15.0, 0.5), 2.6, 2.2, 0.62),
+        capsule((side, y, z), (13.5, 15.0, 0.5), (7.0, 23.5, 0.0), 2.2, 2.2, 0.60),
+        capsule((side, y, z), (7.0, 23.5, 0.0), (0.0, 26.0, 0.0), 2.2, 2.6, 0.60),
+        capsule((side, y, z), (0.0, 26.0, 0.0), (0.0, 29.0, 0.0), 2.4, 2.0, 0.7),
         # transverse process, a plate that holds the foramen
-        capsule(side, y, z, (18.0, -0.5, 0.0), (30.0, 2.0, -0.5), 5.2, 4.6, 1.5),
-        capsule(side, y, z, (30.0, 2.0, -0.5), (35.0, 3.5, -1.0), 4.0, 3.0, 1.0),
+        capsule((side, y, z), (18.0, -0.5, 0.0), (30.0, 2.0, -0.5), 5.2, 4.6, 1.5),
+        capsule((side, y, z), (30.0, 2.0, -0.5), (35.0, 3.5, -1.0), 4.0, 3.0, 1.0),
     ]
     return _unite(parts, 2.0), [_foramen(side, y, (25.0, 0.8), (2.9, 2.7))]
 
@@ -99,20 +100,20 @@ def _axis(vertebra: Vertebra, side: Field, y: Field, z: Field) -> tuple[Field, l
     parts = [
         body,
         # dens: a neck and a head with a rounded tip
-        capsule(side, y, z, (0.0, -0.5, half_z - 2.0), (0.0, -1.5, half_z + 6.5), 5.4, 4.2),
-        capsule(side, y, z, (0.0, -1.5, half_z + 6.5), (0.0, -1.0, half_z + 11.0), 4.4, 3.4),
+        capsule((side, y, z), (0.0, -0.5, half_z - 2.0), (0.0, -1.5, half_z + 6.5), 5.4, 4.2),
+        capsule((side, y, z), (0.0, -1.5, half_z + 6.5), (0.0, -1.0, half_z + 11.0), 4.4, 3.4),
         # upper joint faces, sloping down to the sides
-        capsule(side, y, z, (7.5, 0.5, half_z - 4.5), (13.0, 0.5, half_z - 5.6), 4.8, 4.2, 1.10),
+        capsule((side, y, z), (7.5, 0.5, half_z - 4.5), (13.0, 0.5, half_z - 5.6), 4.8, 4.2, 1.10),
         # pedicle and pars, to the lower articular process
-        capsule(side, y, z, (9.0, 3.0, 1.0), (wide + 3.0, middle + 1.0, -2.0), 3.6, 3.2),
-        capsule(side, y, z, (wide + 3.0, middle + 1.0, -2.0), (wide + 3.4, middle + 6.0, -7.0), 3.2, 2.3),
+        capsule((side, y, z), (9.0, 3.0, 1.0), (wide + 3.0, middle + 1.0, -2.0), 3.6, 3.2),
+        capsule((side, y, z), (wide + 3.0, middle + 1.0, -2.0), (wide + 3.4, middle + 6.0, -7.0), 3.2, 2.3),
         # lamina
-        capsule(side, y, z, (wide + 1.5, middle + 4.5, -2.0), (0.0, rear + 4.0, -3.0), 2.5, 2.8, 0.45),
+        capsule((side, y, z), (wide + 1.5, middle + 4.5, -2.0), (0.0, rear + 4.0, -3.0), 2.5, 2.8, 0.45),
         # spinous process with two tips
-        capsule(side, y, z, (0.0, rear + 3.0, -3.0), (0.0, rear + 13.0, -6.0), 3.0, 3.0, 0.55),
-        capsule(side, y, z, (0.5, rear + 12.0, -6.0), (4.6, rear + 18.0, -8.5), 2.6, 2.0, 0.70),
+        capsule((side, y, z), (0.0, rear + 3.0, -3.0), (0.0, rear + 13.0, -6.0), 3.0, 3.0, 0.55),
+        capsule((side, y, z), (0.5, rear + 12.0, -6.0), (4.6, rear + 18.0, -8.5), 2.6, 2.0, 0.70),
         # transverse process
-        capsule(side, y, z, (9.0, 2.5, -2.5), (19.5, 5.0, -5.5), 4.4, 4.0, 1.30),
+        capsule((side, y, z), (9.0, 2.5, -2.5), (19.5, 5.0, -5.5), 4.4, 4.0, 1.30),
     ]
     return _unite(parts, 2.0), [_canal(vertebra, side, y), _foramen(side, y, (15.4, 2.6), (2.2, 2.2))]
 
@@ -135,30 +136,30 @@ def _typical(vertebra: Vertebra, side: Field, y: Field, z: Field) -> tuple[Field
         body,
         # uncinate process, on the rim of the upper plate
         capsule(
-            side, y, z, (half_x - 1.2, -0.05 * half_y, half_z - 1.4), (half_x - 0.8, 0.55 * half_y, half_z - 0.8),
+            (side, y, z), (half_x - 1.2, -0.05 * half_y, half_z - 1.4), (half_x - 0.8, 0.55 * half_y, half_z - 0.8),
             1.6, 1.6,
         ),
         # pedicle
-        capsule(side, y, z, (half_x - 2.5, 0.4 * half_y, 0.6), (wide + 3.2, middle - 0.5, 0.6), 2.5, 2.6, 0.85),
+        capsule((side, y, z), (half_x - 2.5, 0.4 * half_y, 0.6), (wide + 3.2, middle - 0.5, 0.6), 2.5, 2.6, 0.85),
         # articular pillar: its joint faces look up and back, and down and forwards
-        capsule(side, y, z, (wide + 3.6, middle - 1.0, 3.6), (wide + 3.4, middle + 3.6, -0.8), 2.3, 2.8),
-        capsule(side, y, z, (wide + 3.4, middle + 3.6, -0.8), (wide + 3.0, middle + down[0], down[1]), 2.8, 2.1),
+        capsule((side, y, z), (wide + 3.6, middle - 1.0, 3.6), (wide + 3.4, middle + 3.6, -0.8), 2.3, 2.8),
+        capsule((side, y, z), (wide + 3.4, middle + 3.6, -0.8), (wide + 3.0, middle + down[0], down[1]), 2.8, 2.1),
         # lamina
-        capsule(side, y, z, (wide + 2.0, middle + 4.6, -0.6), (0.0, rear + 3.2, -1.8), 1.9, 2.1, 0.62),
+        capsule((side, y, z), (wide + 2.0, middle + 4.6, -0.6), (0.0, rear + 3.2, -1.8), 1.9, 2.1, 0.62),
         # transverse process: a plate round the foramen with two tips
-        capsule(side, y, z, (half_x - 1.0, 0.15 * half_y, -0.4), (root, 0.35 * half_y, -1.6), 4.0, 4.4, 1.6),
-        capsule(side, y, z, (root, 0.35 * half_y - 2.8, -1.8), (root + 3.4, 0.35 * half_y - 4.0, -2.4), 1.8, 1.5),
+        capsule((side, y, z), (half_x - 1.0, 0.15 * half_y, -0.4), (root, 0.35 * half_y, -1.6), 4.0, 4.4, 1.6),
+        capsule((side, y, z), (root, 0.35 * half_y - 2.8, -1.8), (root + 3.4, 0.35 * half_y - 4.0, -2.4), 1.8, 1.5),
         capsule(
-            side, y, z, (root, 0.35 * half_y + 2.8, -1.8), (root + 4.2 + tip, 0.35 * half_y + 4.6 + 0.6 * tip, -2.8),
+            (side, y, z), (root, 0.35 * half_y + 2.8, -1.8), (root + 4.2 + tip, 0.35 * half_y + 4.6 + 0.6 * tip, -2.8),
             2.0, 1.8,
         ),
     ]  # fmt: skip
     if last:
-        parts += [capsule(side, y, z, (0.0, rear + 2.6, -2.0), (0.0, rear + 26.0, -9.5), 2.3, 3.0, 0.62)]
+        parts += [capsule((side, y, z), (0.0, rear + 2.6, -2.0), (0.0, rear + 26.0, -9.5), 2.3, 3.0, 0.62)]
     else:
         parts += [
-            capsule(side, y, z, (0.0, rear + 2.6, -1.8), (0.0, rear + 9.0, -3.0), 2.0, 1.9, 0.75),
-            capsule(side, y, z, (0.4, rear + 8.5, -3.0), (3.6, rear + 13.5, -4.0), 1.7, 1.5, 0.85),
+            capsule((side, y, z), (0.0, rear + 2.6, -1.8), (0.0, rear + 9.0, -3.0), 2.0, 1.9, 0.75),
+            capsule((side, y, z), (0.4, rear + 8.5, -3.0), (3.6, rear + 13.5, -4.0), 1.7, 1.5, 0.85),
         ]
     wide_hole = 1.7 if last else 2.5
     holes = [_foramen(side, y, (half_x + 4.4, 0.25 * half_y), (wide_hole + 0.2, wide_hole))]
@@ -211,7 +212,7 @@ def _arch_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
 
     def rod(thoracic: tuple[float, ...], lumbar_rod: tuple[float, ...], across: Field = side) -> Field:
         ax, ay, az, bx, by, bz, radius_a, radius_b, flatten = _mix(thoracic, lumbar_rod, lumbar)
-        return capsule(across, y, z, (ax, ay, az * high), (bx, by, bz * high), radius_a, radius_b, flatten)
+        return capsule((across, y, z), (ax, ay, az * high), (bx, by, bz * high), radius_a, radius_b, flatten)
 
     inner = 0.29 * vertebra.width, 0.24 * vertebra.depth
     distance = rod(
@@ -375,7 +376,7 @@ def close_facets(vertebrae: Sequence[Vertebra], gap_mm: float) -> list[Vertebra]
     for lower in vertebrae[1:]:
         upper = closed[-1]
         if level_number(lower.name) == level_number(upper.name) + 1:
-            seats = np.array([(side * x, y, z) for x, y, z in upper_facet_seats(lower) for side in (1.0, -1.0)])
+            seats = np.array([(side * x, y, z) for (x, y, z), side in product(upper_facet_seats(lower), (1.0, -1.0))])
             free = _distance_to(upper, lower.center + seats @ lower.axes)
             radii = np.minimum(free - gap_mm, _LARGEST_BALL_MM)
             lower = dataclasses.replace(lower, facets=np.column_stack((seats, radii))[radii > 0.5])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -92,7 +94,7 @@ def count_pairs(grid: GridTwin, edge: float, min_samples: int) -> NDArray[np.flo
     x, y, z = find_cells(grid.points[grid.starts[:-1]], grid.corner, np.float32(edge)).T
     around = np.zeros((nz + 4, ny + 4, nx + 4))
     around[z + 2, y + 2, x + 2] = counts
-    offsets = [(dz, dy, dx) for dz in range(-2, 3) for dy in range(-2, 3) for dx in range(-2, 3)]
+    offsets = list(product(range(-2, 3), repeat=3))
     sums = {offset: around[z + 2 + offset[0], y + 2 + offset[1], x + 2 + offset[2]] for offset in offsets}
     after = sum(sums[offset] for offset in offsets if offset > (0, 0, 0))
     return np.asarray(counts * (after + np.where(counts < min_samples, sum(sums.values()), 0)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 FAR = np.float32(np.inf)
 """Squared distance of nodes that no point reaches."""
 
-_SIDES = tuple((axis, way) for axis in range(3) for way in (1, -1))
+_SIDES = tuple(product(range(3), (1, -1)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -176,11 +177,6 @@ def _check_between(device: Device, slices: bool) -> str:
     worst, opacity, color = 0.0, 0.4, np.array([0.2, 0.9, 0.4])
     function = TransferFunction([(-300, 0.9, 0.2, 0.1, 0.0), (200, 1, 0.7, 0.4, 0.15), (900, 1, 1, 0.9, 0.6)])
     screen = MeshLook(tuple(color.tolist()), opacity=opacity, lighting=UNSHADED)
-    window, chosen = (-500.0, 700.0), [1, 4, 7, 9, 12]
-
-    def grey(hu: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.clip((hu - window[0]) / (window[1] - window[0]), 0.0, 1.0)[:, None].repeat(3, axis=1)
-
     for perspective in (False, True):
         volume = blobs((16, 26, 22), OBLIQUE, "int16")
         camera = look_at(volume, (0.4, 0.9, -0.5), 7.0, perspective=perspective)
@@ -188,14 +184,14 @@ def _check_between(device: Device, slices: bool) -> str:
         mesh, before, behind = _screen(volume, camera)
         look: VolumeLook | SlicesInSpace = VolumeLook(function, lighting=FIXED)
         if slices:
-            look = SlicesInSpace(chosen, opacity=0.4, lowest_hu=-300.0, window=window)
+            look = SlicesInSpace([1, 4, 7, 9, 12], opacity=0.4, lowest_hu=-300.0, window=(-500.0, 700.0))
         with ScenePictures([(volume, look), (mesh, screen)], device=device) as pictures:
             found = pictures.take(camera, WITH_VOLUME)
         require_whole(found.report)
         sides = []
         for clip in (before, behind):
-            if slices:
-                rgba, _ = overlay_twin(volume, camera, WITH_VOLUME, chosen, 0.4, -300.0, grey, clip.planes)
+            if isinstance(look, SlicesInSpace):
+                rgba, _ = overlay_twin(volume, camera, WITH_VOLUME, replace(look, clip=clip))
             else:
                 rgba = cast_rays(volume, function, camera, WITH_VOLUME, step, FIXED, clip).rgba
             sides.append(np.clip(rgba, 0.0, 1.0))

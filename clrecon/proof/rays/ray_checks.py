@@ -332,20 +332,14 @@ def _check_surface_labels(device: Device) -> str:
 
 
 def _check_slices(device: Device) -> str:
-    worst, window = 0.0, (-500.0, 700.0)
-
-    def grey(hu: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.clip((hu - window[0]) / (window[1] - window[0]), 0.0, 1.0)[:, None].repeat(3, axis=1)
-
+    worst = 0.0
     for dtype, uneven in (("int16", False), ("uint8", False), ("float32", True)):
         volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
-        camera, chosen = look_at(volume, (0.4, 0.8, -0.7), 7.0, perspective=uneven), [1, 4, 7, 12]
+        camera = look_at(volume, (0.4, 0.8, -0.7), 7.0, perspective=uneven)
         clip = _cut(volume) if uneven else None
-        style = SlicesInSpace(chosen, opacity=0.4, lowest_hu=-300.0, window=window, clip=clip)
+        style = SlicesInSpace([1, 4, 7, 12], opacity=0.4, lowest_hu=-300.0, window=(-500.0, 700.0), clip=clip)
         found = overlay_slices(DeviceVolume(volume, device=device), style, Shot(camera, SIZE))
-        rgba, depth = overlay_twin(
-            volume, camera, SIZE, chosen, 0.4, -300.0, grey, None if clip is None else clip.planes
-        )
+        rgba, depth = overlay_twin(volume, camera, SIZE, style)
         worst = max(worst, _compare(found, 255.0 * rgba, depth, f"slices of {dtype} voxels"))
     return f"3 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 

@@ -7,7 +7,7 @@ of outside, its surface at the level of `clrecon.geometry.iso_rule.IsoRule`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from clrecon.geometry.iso_rule import choose_iso_rule, slice_normal_matrices
 from clrecon.proof.rays.rays import Planes, box_of, find_interval, sample_field, voxel_gradients
 from clrecon.proof.rays.render import RayPicture, shade
 from clrecon.rendering import Lighting
+from clrecon.rendering.pictures.styles import SlicesInSpace
 from clrecon.rendering.views.camera import Camera
 
 HALVINGS = 10
@@ -126,40 +127,30 @@ def _first_inside(
 
 
 def overlay_slices(
-    volume: Volume,
-    camera: Camera,
-    size: Sequence[int],
-    slices: Sequence[int],
-    opacity: float,
-    lowest_hu: float,
-    colors: Callable[[Float64Array], Float64Array],
-    clip: Float64Array | None = None,
+    volume: Volume, camera: Camera, size: Sequence[int], style: SlicesInSpace
 ) -> tuple[Float64Array, Float64Array]:
     """Find where each ray crosses the planes of slices, from front to back, and blend them: (h, w, 4), premultiplied,
-    and mm to the first visible slice, (h, w), NaN without one.
-
-    opacity: Of a slice where its value is `lowest_hu` or more; elsewhere it is transparent.
-    colors: Function from HU (n,) to red, green and blue (n, 3).
-    clip: ndarray, shape (n, 4). Half-spaces that are kept: ``normal . p >= offset``.
-    """
+    and mm to the first visible slice, (h, w), NaN without one.  The style has a window of two numbers."""
     width, height = size
+    slices = np.asarray(style.slices, dtype=np.int64).ravel()
+    black, white = np.asarray(style.window)
     origins, directions = (rays.reshape(-1, 3) for rays in camera.rays(size))
     normal = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
-    starts = volume.slice_origins()[list(slices)]
+    starts = volume.slice_origins()[slices]
     with np.errstate(divide="ignore", invalid="ignore"):
         crossings = ((starts[:, None] - origins) @ normal) / (directions @ normal)
     rgba, depth = np.zeros((len(origins), 4)), np.full(len(origins), np.nan)
     for order in np.argsort(crossings, axis=0):
         t = np.take_along_axis(crossings, order[None], axis=0)[0]
-        k = np.asarray(slices)[order]
+        k = slices[order]
         there = np.isfinite(t) & (camera.is_parallel | (t >= 0.0))
         points = origins + np.where(there, t, 0.0)[:, None] * directions
-        if clip is not None:
-            there &= (points @ clip[:, :3].T >= clip[:, 3]).all(axis=1)
+        if style.clip is not None:
+            there &= (points @ style.clip.planes[:, :3].T >= style.clip.planes[:, 3]).all(axis=1)
         value, inside = _read_slices(volume, points, k)
-        there &= inside & (value >= lowest_hu)
-        weight = np.where(there, (1.0 - rgba[:, 3]) * opacity, 0.0)
-        rgba[:, :3] += weight[:, None] * colors(value)
+        there &= inside & (value >= style.lowest_hu)
+        weight = np.where(there, (1.0 - rgba[:, 3]) * style.opacity, 0.0)
+        rgba[:, :3] += (weight * np.clip((value - black) / (white - black), 0.0, 1.0))[:, None]
         rgba[:, 3] += weight
         depth = np.where(there & np.isnan(depth), t, depth)
     return rgba.reshape(height, width, 4), depth.reshape(height, width)

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 from functools import lru_cache
-from itertools import product
+from itertools import chain, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,9 +166,7 @@ def _trilinear_volume(case: int) -> Fraction:
 def _choose_triangles(case: int) -> tuple[Triangle, ...]:
     """Choose the fans of a case by the rule at the head of this module; the first of equal ones."""
     loops = case_loops(case)
-    choices: list[list[Triangle]] = [
-        [triangle for fan in fans for triangle in fan] for fans in product(*(_find_fans(loop) for loop in loops))
-    ]
+    choices: list[list[Triangle]] = [list(chain(*fans)) for fans in product(*map(_find_fans, loops))]
     if not loops:
         return ()
     if len(loops[0]) == _LONGEST_LOOP:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 def _corners(inside: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
     gk, gj, gi = inside.shape
     return [
-        inside[z : gk - 1 + z, y : gj - 1 + y, x : gi - 1 + x] for z in (0, 1) for y in (0, 1) for x in (0, 1)
+        inside[z : gk - 1 + z, y : gj - 1 + y, x : gi - 1 + x] for z, y, x in product((0, 1), repeat=3)
     ]  # fmt: skip
 
 

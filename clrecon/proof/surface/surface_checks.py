@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -148,7 +149,7 @@ class _GrownTwin:
 def _grains() -> tuple[NDArray[Any], NDArray[Any]]:
     """Return grains of a voxel and a large one, run 521 on, and a mark in the one at an edge of the volume."""
     voxels, marked = np.zeros((24, 12, 40), np.int16), np.zeros((24, 12, 40), bool)
-    places = [(k, j, i) for k in (2, 5, 8, 11) for j in (2, 5, 8) for i in range(2, 38, 3)]
+    places = list(product((2, 5, 8, 11), (2, 5, 8), range(2, 38, 3)))
     for place in places[:130]:
         voxels[place] = 100
     voxels[14:20, 3:9, 10:16] = 100

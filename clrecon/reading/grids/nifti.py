@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import math
 import re
+from itertools import product
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -193,7 +194,7 @@ def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[F
         shown = [" x ".join(f"{unit * step:.4g}" for step in steps) for steps in (stated, sides)]
         warnings.append(f"pixdim says a spacing of {shown[0]} mm, the affine {shown[1]} mm: the affine is used")
     if sform is not None and qform is not None:
-        corners = np.array([[i, j, k, 1] for i in (0, shape[0]) for j in (0, shape[1]) for k in (0, shape[2])])
+        corners = np.array(list(product(*((0, length) for length in shape[:3]), (1,))))
         apart = unit * np.linalg.norm(corners @ (sform - qform).T, axis=1).max()
         if not apart <= AFFINES_DIFFER_MM:
             warnings.append(f"sform and qform lie {apart:.3g} mm apart: the sform is used")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
+from itertools import chain
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypedDict
 
 from clrecon.errors import UsageError
@@ -162,7 +163,7 @@ def make_style(mode: str | None = None, preset: str | None = None, **look: objec
     """
     given = {keyword: value for keyword, value in look.items() if value is not None and value is not False}
     mode = choose_mode(mode, preset, **given)
-    known = dict.fromkeys(keyword for name in MODES for keyword in keywords_of(name))
+    known = dict.fromkeys(chain(*map(keywords_of, MODES)))
     for keyword in given:
         if keyword not in known:
             raise UsageError(f"a picture has no option {keyword!r}: it is one of {', '.join(known)}")

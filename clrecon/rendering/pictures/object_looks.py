@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.affine import Float64Array
-from clrecon.rendering.looks.colors import ColorScale, find_color, round_up
+from clrecon.rendering.looks.colors import ColorScale, round_up
 from clrecon.rendering.looks.lighting import Lighting
 from clrecon.rendering.looks.window import checked_window
 from clrecon.rendering.pictures import style_checks as checks
-from clrecon.rendering.pictures.styles import DEFAULT_COLOR, Color, Style, style_field
+from clrecon.rendering.pictures.styles import Color, Lit, Style, style_field
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.reformation import positive_mm
 from clrecon.system.arguments import WindowName, name_parameter
@@ -44,7 +43,7 @@ _LEAST_LIMIT_MM = 1e-3
 
 
 @dataclass(frozen=True)
-class MeshLook(Style):
+class MeshLook(Style, Lit):
     """The triangles of a mesh, shaded; both sides of a surface are lit.
 
     Parameters
@@ -87,16 +86,6 @@ class MeshLook(Style):
         if sum(given is not None for given in (self.color, self.vertex_colors, self.color_by)) > 1:
             raise UsageError("a mesh has one colour, a colour for each vertex, or is coloured by numbers at them")
 
-    @property
-    def light(self) -> Lighting:
-        """The lighting that is used."""
-        return self.lighting or Lighting()
-
-    @property
-    def rgb(self) -> Float64Array:
-        """The colour: red, green and blue, each from 0 to 1."""
-        return find_color(DEFAULT_COLOR if self.color is None else self.color)
-
     def find_scale(self, values: Mapping[str, NDArray[np.floating]]) -> tuple[ColorScale, NDArray[np.floating]]:
         """Return the scale of `color_by` for a mesh with these numbers at its vertices, and those that it shows."""
         name = f"{self.color_by}_mm"
@@ -119,7 +108,7 @@ POINT_COLORS = ("hu", "label", "removed")
 
 
 @dataclass(frozen=True, kw_only=True)
-class PointLook(Style):
+class PointLook(Style, Lit):
     """Points of a cloud, each a disc that faces the camera; the nearest disc hides the others.
 
     Points with normals are lit after Phong.  Those without are darkened where what surrounds them is nearer, which is
@@ -162,8 +151,3 @@ class PointLook(Style):
         if self.window is not None and (self.color is not None or self.color_by not in (None, "hu")):
             grey = name_parameter("color_by", "hu")
             raise UsageError(f"a window says which HU are black and white: colour the points by them ({grey})")
-
-    @property
-    def light(self) -> Lighting:
-        """The lighting that is used."""
-        return self.lighting or Lighting()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -124,7 +125,7 @@ def draw_sheet(
     load_pillow()
     from PIL import Image, ImageDraw
 
-    panels = [panel for row in rows for panel in row]
+    panels = list(chain(*rows))
     if not panels or len({(panel.values.shape, panel.pixel_mm) for panel in panels}) != 1:
         raise UsageError("a sheet needs panels of one size")
     height, width = panels[0].values.shape

@@ -56,6 +56,23 @@ def style_field(default: Any, check: Callable[[Any], Any], keyword: str | None =
     return field(default=default, metadata={"check": check} | ({"keyword": keyword} if keyword else {}))
 
 
+class Lit:
+    """Lighting and colour of a style where none are given."""
+
+    lighting: Lighting | None
+    color: Color | None
+
+    @property
+    def light(self) -> Lighting:
+        """The lighting that is used."""
+        return self.lighting or Lighting()
+
+    @property
+    def rgb(self) -> Float64Array:
+        """The colour: red, green and blue, each from 0 to 1."""
+        return find_color(DEFAULT_COLOR if self.color is None else self.color)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Style:
     """Base of all styles: every field is checked on construction.
@@ -106,14 +123,10 @@ class _Labelled(Style):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Lit(_Labelled):
+class _Lit(_Labelled, Lit):
     lighting: Lighting | None = style_field(None, checks.instance_of("lighting", Lighting))
     ray_step: float | None = style_field(None, checks.ray_step)
     clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
-
-    @property
-    def light(self) -> Lighting:
-        return self.lighting or Lighting()
 
 
 @dataclass(frozen=True)
@@ -245,11 +258,6 @@ class SurfaceLook(_Lit):
         None,
         checks.number("the depth cue is a share of the brightness from 0 to 1, not", lambda share: 0.0 <= share <= 1.0),
     )
-
-    @property
-    def rgb(self) -> Float64Array:
-        """The colour: red, green and blue, each from 0 to 1."""
-        return find_color(DEFAULT_COLOR if self.color is None else self.color)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -236,5 +237,5 @@ def _corners_of_extents(volume: Volume, found: Float64Array, reach: float) -> Fl
         (np.maximum(low_j - 1.0, -0.5), np.minimum(high_j + 1.0, most[1])),
         (np.maximum(k - reach, -0.5), np.minimum(k + reach, most[2])),
     ]
-    points = [np.column_stack((i, j, at)) for i in ends[0] for j in ends[1] for at in ends[2]]
+    points = [np.column_stack(corner) for corner in product(*ends)]
     return volume.ijk_to_lps(np.concatenate(points))

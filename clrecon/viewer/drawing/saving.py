@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,7 @@ def free_name(wanted: str | Path) -> Path:
 
 def check_names(names: Sequence[str]) -> None:
     """Refuse names of files that cannot be written, before anything is read."""
-    known = [ending for endings in KINDS.values() for ending in endings]
+    known = list(chain(*KINDS.values()))
     for name in names:
         if not any(name.lower().endswith(ending) for ending in known):
             raise UsageError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -198,7 +199,7 @@ def _describe_parts(
 def _box_of(volume: Volume, low: Sequence[int], high: Sequence[int]) -> Box:
     """Return the box in LPS around a block of voxels, half a voxel more on each side."""
     (i0, j0, k0), (i1, j1, k1) = low, high
-    corners = [(i, j, k) for i in (i0 - 0.5, i1 + 0.5) for j in (j0 - 0.5, j1 + 0.5) for k in (k0 - 0.5, k1 + 0.5)]
+    corners = list(product((i0 - 0.5, i1 + 0.5), (j0 - 0.5, j1 + 0.5), (k0 - 0.5, k1 + 0.5)))
     places = volume.ijk_to_lps(corners)
     (x0, y0, z0), (x1, y1, z1) = places.min(axis=0).tolist(), places.max(axis=0).tolist()
     return (x0, y0, z0), (x1, y1, z1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
 
 from clrecon.jobs.mesh.settings import MeshSettings
@@ -39,7 +40,7 @@ class OpenedView(Closing):
     def __init__(self, inputs: Sequence[str | Path], settings: ViewSettings, progress: Progress = ignore_progress):
         scan = settings.scan
         self.objects = read_objects(inputs, settings, progress)
-        self.said = list(dict.fromkeys(text for each in self.objects for text in each.said))
+        self.said = list(dict.fromkeys(chain(*(each.said for each in self.objects))))
         self._iso_value = choose_iso(self.objects, scan, progress)
         self._space, self._keep_ids = scan.space, scan.keep_ids
         self.painter = Painter(self.objects, device=scan.device, memory=scan.memory)

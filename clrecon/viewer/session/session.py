@@ -6,6 +6,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from itertools import chain
 from time import monotonic
 from typing import Any
 
@@ -395,7 +396,7 @@ class ViewSession(Closing):
         return seen_pieces(self._shown, [np.array(line) for line in lines if len(line) > 1], expected=expected)
 
     def _warnings(self) -> list[str]:
-        said = [text for each in self.model.objects for text in each.said]
+        said = list(chain(*(each.said for each in self.model.objects)))
         if self._timing.get("slabs", 1) > 1:
             said.append("the scan does not fit the device: every picture takes it through in slabs, which is slow")
         for each in self.model.objects:

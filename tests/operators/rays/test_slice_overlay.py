@@ -25,21 +25,14 @@ SIZE = (56, 48)
 WINDOW = (-500.0, 700.0)
 
 
-def grey(hu: np.ndarray) -> np.ndarray:
-    return np.clip((hu - WINDOW[0]) / (WINDOW[1] - WINDOW[0]), 0.0, 1.0)[:, None].repeat(3, axis=1)
-
-
 def overlay_slices(resident, camera, size, *, background=None, **look):
     return operator.overlay_slices(resident, SlicesInSpace(**look), Shot(camera, size, background))
 
 
 def assert_twin(device, volume, camera, slices, clip=None, opacity=0.4, lowest=-300.0, **settings):
-    found = overlay_slices(
-        DeviceVolume(volume, device=device), camera, SIZE,
-        slices=slices, opacity=opacity, lowest_hu=lowest, window=WINDOW, clip=clip, **settings,
-    )  # fmt: skip
-    planes = None if clip is None else clip.planes
-    rgba, depth = overlay_twin(volume, camera, SIZE, slices, opacity, lowest, grey, planes)
+    style = SlicesInSpace(slices, opacity=opacity, lowest_hu=lowest, window=WINDOW, clip=clip, **settings)
+    found = operator.overlay_slices(DeviceVolume(volume, device=device), style, Shot(camera, SIZE))
+    rgba, depth = overlay_twin(volume, camera, SIZE, style)
     assert (rgba[..., 3] > 0).mean() > 0.2
     away = np.abs(premultiplied(found.image) - 255.0 * rgba).max(axis=-1)
     assert (away <= 2.0).mean() >= 1.0 - tolerances.SLICE_EDGE_SHARE
@@ -77,7 +70,7 @@ def test_a_few_slices_under_the_simulator(device):
     volume = make_volume(blobs, "sheared", 6.0, np.int16)
     camera = look(volume, (0.4, 0.8, -0.7), 5.0)
     found = overlay_slices(DeviceVolume(volume, device=device), camera, (12, 9), slices=[0, 2, 4], window=WINDOW)
-    rgba, _ = overlay_twin(volume, camera, (12, 9), [0, 2, 4], 0.5, -300.0, grey)
+    rgba, _ = overlay_twin(volume, camera, (12, 9), SlicesInSpace([0, 2, 4], window=WINDOW))
     assert (np.abs(premultiplied(found.image) - 255.0 * rgba).max(axis=-1) <= 2.0).mean() > 0.95
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -298,7 +299,7 @@ def collect_series_warnings(series: Series) -> list[str]:
         return []
     headers = series.stack.slices
     warnings = [*_describe_what_was_left(series), *series.stack.warnings]
-    for text in dict.fromkeys(text for header in headers for text in header.warnings):
+    for text in dict.fromkeys(chain(*(header.warnings for header in headers))):
         warnings.append(f"{text} ({_place(series.stack, lambda h, text=text: text in h.warnings)})")  # type: ignore[misc]
     checks: tuple[tuple[Callable[[SliceHeader], bool], str], ...] = (
         (lambda h: not h.has_slope, "no RescaleSlope: slope 1, intercept {intercept} taken: maybe not HU"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 
@@ -82,7 +82,7 @@ def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHe
     sorted_out = [_sort_copies(slices, same) for slices in places]
     kept = [[copies[0] for copies in found] for found in sorted_out]
     count = sum(map(len, places))
-    headers = tuple(header for slices in kept for header in slices)
+    headers = tuple(chain(*kept))
     if len(places) == 1 and count > 1:
         phases = _find_phases(sorted_out)
         problem = _describe_one_place(count, headers, phases)
@@ -93,7 +93,7 @@ def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHe
     phases = _find_phases(sorted_out)
     if phases:
         # A slice that is equal in two phases (air, at the ends) is a copy, but belongs to both.
-        headers = tuple(header for phase in phases for header in phase.headers)
+        headers = tuple(chain(*(phase.headers for phase in phases)))
         return Places(headers, count - len(headers), phases)
     crowded = [slices for slices in kept if len(slices) > 1]
     shown = "; ".join(join_names(header.name for header in slices) for slices in crowded[:PLACES_SHOWN])
@@ -204,14 +204,14 @@ def _find_phases(places: Sequence[Sequence[Sequence[SliceHeader]]]) -> tuple[Pha
         clean, most = True, 0
         for found in places:
             here = [{values_of(header, keywords): header for header in reversed(copies)} for copies in found]
-            values = [value for one in here for value in one]
+            values = list(chain(*here))
             clean, most = clean and len(set(values)) == len(values), max(most, len(values))
             for one in here:
                 for value, header in one.items():
                     groups[value].append(header)
         if clean and (len(groups) == most or min(map(len, groups.values())) >= SMALLEST_PHASE):
             return _part((keywords, groups))
-    everything = [[header for copies in found for header in copies] for found in places]
+    everything = [list(chain(*slices)) for slices in places]
     return _rank_by_time(kept) or _rank_by_time(everything)
 
 
@@ -267,10 +267,10 @@ def _are_passes(values: Sequence[Sequence[tuple[str, ...]]], keywords: tuple[str
     of reconstruction tell nothing about stops.  Without a date, times around midnight have no order.
     """
     if keywords in (("AcquisitionTime",), ("ContentTime",)):
-        seconds = [_seconds(value[0]) or 0.0 for visits in values for value in visits]
+        seconds = [_seconds(value[0]) or 0.0 for value in chain(*values)]
         if max(seconds) - min(seconds) > HALF_A_DAY_S:
             return False
-    ranks = {value: rank for rank, value in enumerate(sorted({v for visits in values for v in visits}, key=_order))}
+    ranks = {value: rank for rank, value in enumerate(sorted(set(chain(*values)), key=_order))}
     times = np.array([[ranks[value] for value in visits] for visits in values])
     times = times[np.argsort(times[:, 0], kind="stable")]
     if keywords[-1] == "ContentTime":
@@ -327,7 +327,7 @@ def describe_phases(places: Places) -> str:
 
 def describe_spacing(phases: Sequence[Phase], chosen: Phase) -> str:
     """Say what the choice of one of several interleaved phases does to the distance of the slices."""
-    everything = [header for phase in phases for header in phase.headers]
+    everything = list(chain(*(phase.headers for phase in phases)))
     return (
         f"slices of phase {chosen.number} lie {measure_gap(chosen.headers):.4g} mm apart, those of all phases "
         f"{measure_gap(everything):.4g} mm"

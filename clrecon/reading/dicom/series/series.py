@@ -358,9 +358,9 @@ def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:
         if series.kind == "stack":
             own = folders[series.key]
             spread = len(own) > 1
-            near = [files[folder] for files in (corrupt, suspects) for folder in own if folder in files]
+            near = [files[folder] for files, folder in itertools.product((corrupt, suspects), own) if folder in files]
             blamed = [part for part in (*near, loose_corrupt, loose_suspects if spread else []) if part]
-            series.corrupt = blamed[0] if len(blamed) == 1 else [file for part in blamed for file in part]
+            series.corrupt = blamed[0] if len(blamed) == 1 else list(itertools.chain(*blamed))
 
 
 def _sort_by_holder(
