@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  clrecon bench\n"
         "  clrecon bench CT_FOLDER --hu 250 --device all --report bench.json"
     )
-    parser.add_argument("input", metavar="INPUT", nargs="?", help="DICOM folder or file (default: a made-up spine)")
+    parser.add_argument("input", metavar="INPUT", nargs="?", help="DICOM folder or file (default: a synthetic spine)")
     parser.add_argument("--hu", type=float, metavar="N", help="iso value in HU (default: the preset bone)", first=True)
     parser.add_argument("--series", metavar="S", help='number or hash of the series, see "clrecon info"')
     common.add_device(parser, memory=False)

@@ -12,7 +12,7 @@ from clrecon.cli.mesh import describe_mesh
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "Writes a made-up CT series of a spine to OUT/ct, a picture of it to OUT/bone.png, its bone surface to\n"
+        "Writes a synthetic CT series of a spine to OUT/ct, a picture of it to OUT/bone.png, its bone surface to\n"
         "OUT/bone.stl and the report to OUT/report.json, and holds a sphere of known size against its mesh.\n"
         "A second run replaces the first."
     )

@@ -80,7 +80,7 @@ COMMANDS = {
     "distance": _Command("clrecon.cli.distance", "measure how far two meshes lie apart, in mm and in colours"),
     "info": _Command("clrecon.cli.info", "show which series a folder holds and whether they can be used"),
     "devices": _Command("clrecon.cli.devices", "show the OpenCL devices and which one would be used"),
-    "phantom": _Command("clrecon.cli.phantom", "write a made-up CT series with a known surface"),
+    "phantom": _Command("clrecon.cli.phantom", "write a synthetic CT series with a known surface"),
     "selftest": _Command("clrecon.cli.selftest", "check that a device computes rightly"),
     "bench": _Command("clrecon.cli.bench", "time every stage on this computer, beside VTK's flying edges"),
     "compare": _Command("clrecon.cli.compare", "compare methods of surfaces and clouds on your own scan, as a page"),

@@ -269,7 +269,7 @@ def _describe(meshes: Sequence[Content], coded: CodedSurface) -> list[str]:
         which = f" {number}" if len(certificates) > 1 else ""
         lines.append(f"Certificate{which}: {'; '.join(certificate)}.")
     if not certificates:
-        lines.append("No certificate: nothing vouches for where the voxels lay.")
+        lines.append("No certificate: the positions of the voxels were not verified.")
     return [*lines, f"clrecon {package_version()}. Not a medical device."]
 
 

@@ -238,7 +238,7 @@ class Volume(BaseVolume, ShownAsHtml):
     def from_pyvista(cls: type[Own], image: Any, name: str | None = None, space: Space | None = None) -> Own:
         """Make a volume of a ``pyvista.ImageData``, or ``vtkImageData``; its voxels are a copy.
 
-        It has no certificate: nothing vouches for its HU.  What `to_pyvista` turned round comes back as it was.
+        It has no certificate: its HU are not verified.  What `to_pyvista` turned round comes back as it was.
 
         Parameters
         ----------
@@ -283,7 +283,7 @@ class Volume(BaseVolume, ShownAsHtml):
     def from_sitk(cls: type[Own], image: Any) -> Own:
         """Make a volume of a ``SimpleITK.Image`` of three axes, LPS mm; its voxels are a copy.
 
-        It has no certificate, and nothing of the image's metadata: nothing vouches for its HU.
+        It has no certificate, and nothing of the image's metadata: its HU are not verified.
 
         Raises
         ------
@@ -318,7 +318,7 @@ class Volume(BaseVolume, ShownAsHtml):
         """Make a volume of an image of nibabel: its affine leads to RAS, that of the volume to LPS mm.
 
         Values are as slope and intercept of the header make them; whole numbers stay whole.  It has no certificate:
-        nothing vouches for its HU.  `clrecon.read_volume` of a file also says where sform, qform and pixdim disagree.
+        its HU are not verified.  `clrecon.read_volume` of a file also says where sform, qform and pixdim disagree.
 
         Raises
         ------

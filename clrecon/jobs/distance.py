@@ -245,8 +245,8 @@ def doubt_frames(meshes: Sequence[Mesh], entries: Sequence[dict[str, Any]]) -> l
     a, b = (entry["name"] for entry in entries)
     if None not in hashes and hashes[0] != hashes[1]:
         doubts.append(
-            f"{a} and {b} are from different frames of reference ({hashes[0]}, {hashes[1]}, hashes): nothing vouches"
-            " that they lie together"
+            f"{a} and {b} are from different frames of reference ({hashes[0]}, {hashes[1]}, hashes): it is not"
+            " verified that their coordinates agree"
         )
     boxes = [np.array(entry["bounds_mm"]) for entry in entries if entry["bounds_mm"]]
     if len(boxes) < 2:

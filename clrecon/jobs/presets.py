@@ -35,7 +35,7 @@ PRESETS: dict[str, IsoPreset] = {
             "all bone: high enough to leave muscle and organs out, low enough to keep thin cortex whole",
             "dicom2stl, tissue 'bone'; thin vertebral cortex in slices of 4 mm needs 150 to 200 HU",
         ),
-        IsoPreset("spongy-bone", 148.0, "cortical and spongy bone, with some contrast-filled vessels",
+        IsoPreset("spongy-bone", 148.0, "cortical and trabecular bone, with some contrast-filled vessels",
                   f"{_INVESALIUS} 'Spongial Bone (Adult)'"),
         IsoPreset("cortical-bone", 662.0, "dense bone only", f"{_INVESALIUS} 'Compact Bone (Adult)'"),
         IsoPreset("enamel", 1553.0, "teeth", f"{_INVESALIUS} 'Enamel (Adult)'"),

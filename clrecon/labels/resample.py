@@ -148,8 +148,8 @@ def check_together(labels: LabelMap, volume: Volume) -> dict[int, float]:
     ours, theirs = volume.report.get("frame_of_reference_hash"), labels.frame_of_reference_hash
     if ours is not None and theirs is not None and ours != theirs:
         raise RefusedInputError(
-            f"the label map belongs to frame of reference {theirs}, the CT to {ours} (hashes): the scanner does not"
-            " vouch that they lie together; choose the labels of this series"
+            f"the label map belongs to frame of reference {theirs}, the CT to {ours} (hashes): it is not verified that"
+            " their coordinates agree; choose the labels of this series"
         )
     shares = _shares_inside(labels, volume)
     _check_overlap(labels, volume, shares)

@@ -166,7 +166,7 @@ def _check_frames(name: str, structures: dict[int, _Structure], volume: Volume) 
     if strange:
         raise RefusedInputError(
             f"{len(strange)} of {len(structures)} ROIs of {name} belong to frame of reference {strange[0].frame_hash},"
-            f" the CT to {ours} (hashes): the scanner does not vouch that they lie together; choose the RTSTRUCT of"
+            f" the CT to {ours} (hashes): it is not verified that their coordinates agree; choose the RTSTRUCT of"
             " this series"
         )
 

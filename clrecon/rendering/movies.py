@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 ANIMATIONS = (".mp4", ".gif", ".apng")
-"""Extensions of moving pictures; a name without extension is a folder of PNG files."""
+"""Extensions of animations; a name without extension is a folder of PNG files."""
 
 MOST_FRAMES = 10_000
 """Most frames: five minutes at 30 frames per second.  More are a typing error."""
@@ -85,24 +85,24 @@ def turntable_cameras(camera: Camera, frames: int, degrees: float = 360.0) -> li
 
 
 def animation_kind(path: str | os.PathLike[str]) -> str:
-    """Return the extension of a moving picture in lower case; empty for a folder: none, a final slash, or a folder."""
+    """Return the extension of an animation in lower case; empty for a folder: none, a final slash, or a folder."""
     text = os.fspath(path)
     is_folder = text.endswith(tuple(filter(None, (os.sep, os.altsep)))) or os.path.isdir(text)
     return "" if is_folder else os.path.splitext(text)[1].lower()
 
 
 def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
-    """Refuse a moving picture that cannot be written, before a frame is computed; return its `animation_kind`."""
+    """Refuse an animation that cannot be written, before a frame is computed; return its `animation_kind`."""
     try:
         text = os.fspath(path)
     except TypeError as error:
-        raise UsageError(f"a moving picture is named by a string or a path, not {type(path).__name__}") from error
+        raise UsageError(f"an animation is named by a string or a path, not {type(path).__name__}") from error
     if not text:
-        raise UsageError("the name of the moving picture is empty")
+        raise UsageError("the name of the animation is empty")
     extension = animation_kind(text)
     if extension and extension not in ANIMATIONS:
         raise UsageError(
-            f"a moving picture is not written as {extension!r}{guess_word(extension, ANIMATIONS)}: use one of"
+            f"an animation is not written as {extension!r}{guess_word(extension, ANIMATIONS)}: use one of"
             f" {', '.join(ANIMATIONS)}, or a name without extension for a folder of PNG files"
         )
     if not isinstance(fps, (int, float)) or not SLOWEST <= fps <= FASTEST[extension]:
@@ -127,7 +127,7 @@ def write_animation(
     total: int = 0,
     progress: Progress | None = None,
 ) -> int:
-    """Write frames as a moving picture, whole or not at all.
+    """Write frames as an animation, whole or not at all.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def stage_animation(
     total: int = 0,
     progress: Progress | None = None,
 ) -> Iterator[Staged]:
-    """Write a moving picture under a temporary name; ``commit`` of the yielded object moves it to its place."""
+    """Write an animation under a temporary name; ``commit`` of the yielded object moves it to its place."""
     extension = check_animation(path, fps)
     checked = _checked_frames(frames, extension, total, progress)
     if extension == "":
@@ -217,7 +217,7 @@ def _checked_frames(
         if progress is not None:
             progress("frames", done, total)
     if done == 0:
-        raise UsageError("a moving picture needs at least one frame")
+        raise UsageError("an animation needs at least one frame")
 
 
 _FRAME = re.compile(r"frame_[0-9]{4,}\.png")

@@ -55,7 +55,7 @@ def test_no_encoder_is_said_before_anything_is_read(
         (["--keep-air"], "--keep-air means nothing in mode dvr: it belongs to minip"),
         (["--view", "sheet"], "a contact sheet of slices is asked for with --sheet"),
         (["--mode", "sheet"], "a contact sheet of slices is asked for with --sheet"),
-        (["-o", "a.gif"], "the extension '.gif' of moving pictures, for which there is --turntable: use one of .png"),
+        (["-o", "a.gif"], "the extension '.gif' of animations, for which there is --turntable: use one of .png"),
     ],
 )
 def test_a_message_names_the_option_that_was_meant(

@@ -44,7 +44,7 @@ def test_the_current_folder_is_not_replaced(name: str, older: Path, monkeypatch:
 
 def test_no_name_is_not_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UsageError, match="name of the moving picture is empty"):
+    with pytest.raises(UsageError, match="name of the animation is empty"):
         write_animation(frames(), "")
     assert names(tmp_path) == []
 

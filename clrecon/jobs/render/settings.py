@@ -110,7 +110,7 @@ _camera_option = partial(option, group="camera")
 
 @dataclass(frozen=True)
 class Turntable:
-    """Settings of a turntable, a moving picture of a turning volume."""
+    """Settings of a turntable, an animation of a turning volume."""
 
     frames: int = option("--frames N", "frames of the turn (default: 100)", default=100)
     fps: float = option("--fps N", "frames a second (default: 25)", default=25.0)

@@ -130,7 +130,7 @@ METHODS = {
     method.name: method
     for method in (
         Method("t-mc", "every cell, shared vertices"),
-        Method("i-mc", "only cells that hang together with seeds", grows=True),
+        Method("i-mc", "only cells that are connected with seeds", grows=True),
         Method("g-mc", "t-mc, then quadric collapse without a bound", decimates="quadric"),
         Method("s-mc", "t-mc, then decimation within a bound, topology kept", decimates="bounded"),
         Method("t-mc-soup", "every cell, triangles of their own, welded afterwards (numpy)", on_device=False),

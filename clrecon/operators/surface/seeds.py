@@ -40,7 +40,7 @@ class Seeds:
         """Read the parameter ``grow_from`` of `extract_isosurface`: "auto", (3,) float, LabelMap, (LabelMap, label),
         Mask, or a list of these.
 
-        Only those parts of the surface are made whose cells hang together with a seed, through faces of which one to
+        Only those parts of the surface are made whose cells are connected with a seed, through faces of which one to
         three corners are inside; triangles of other parts are never made.  A point in LPS mm grows from the nearest
         cell of the surface, which is not more than `SEED_REACH_MM` away. A label or mask grows all parts that have one
         of its voxels at their inner side.  "auto" takes the parts with at least `AUTO_SHARE` of the cells of the

@@ -228,7 +228,7 @@ def _doubts(voxels: NDArray[Any], low: float, high: float) -> list[str]:
 
 
 MODALITY = "unknown"
-NOT_DICOM = "not DICOM: position, spacing and the meaning of the values are as the file says, nothing vouches for them"
+NOT_DICOM = "not DICOM: position, spacing and the meaning of the values are as the file says and are not verified"
 
 
 def judge_spacing(grid: GridFile) -> Gate:

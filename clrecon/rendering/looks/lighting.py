@@ -46,7 +46,7 @@ class Lighting:
         HU per mm, 0 to 10,000: the gradient that gets half of its shading in volume rendering; 0 shades all gradients
         alike, except in flat fields (``LEAST_SOFT_GRADIENT``).
     direction : (float, float, float) or None
-        Direction from the patient towards a fixed light, LPS, kept as a unit vector; None is a light at the camera.
+        Direction from the patient towards a fixed light, LPS, kept as a unit vector; None is a headlight.
 
     Raises
     ------

@@ -311,7 +311,7 @@ _MOST_PER_METRE = 2**31 - 1
 def check_image_path(path: str | os.PathLike[str]) -> str:
     """Return the extension of a picture file in lower case."""
     moves = str(path).lower().endswith((".gif", ".apng", ".mp4"))
-    hint = f" of moving pictures, for which there is {name_parameter('turntable')}" if moves else ""
+    hint = f" of animations, for which there is {name_parameter('turntable')}" if moves else ""
     return find_extension(path, IMAGE_FORMATS, "picture", hint)
 
 

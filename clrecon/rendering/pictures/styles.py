@@ -264,7 +264,7 @@ class SurfaceLook(_Lit):
         if self.shadows and (self.lighting is None or self.lighting.direction is None):
             direction = name_parameter("direction", (0.5, -1, 1))
             raise UsageError(
-                "shadows need a light that stands still: with a light at the camera none is seen; give lighting a"
+                "shadows need a light that stands still: with a headlight none is seen; give lighting a"
                 f" direction, such as {direction}"
             )
 
