@@ -47,14 +47,14 @@ LONG_MM = 100.0
 """Thin parts that hang on the body are kept when they are shorter than this: an ear, not a table."""
 SMALL_MM2 = 2500.0
 """Largest area of an enclosed region of a slice that is always filled: bowel gas, sinuses, the airways."""
-LUNG_WALL, AIR_WALL = 0.2, 0.7
+_LUNG_WALL, _AIR_WALL = 0.2, 0.7
 """Least share of a cavity's wall that must be thick tissue: for lung, and for larger regions of air."""
 LUNG_HU, MOST_AIR = -950.0, 0.2
 """A region is lung when less than `MOST_AIR` of its cells is below `LUNG_HU`; air, foam and blankets have more."""
 FOAM_HU, FOAM_WALL, FOAM_MM = -900.0, 0.3, 10.0
 """Foam that fits a body closely is not lung.  A region is foam when most of it is below `FOAM_HU`, at most the share
 `FOAM_WALL` of its wall is thick, and it is nowhere thicker than 2 `FOAM_MM`, unlike the lungs of three scans."""
-FEWEST_UNMEASURED = 16
+_FEWEST_UNMEASURED = 16
 """Least number of connected cells of one value that count as unmeasured; smaller groups occur by chance."""
 MARGIN_MM = 3.0
 """Width of the untouched margin around the body: it contains the blurred edge of the skin."""
@@ -318,12 +318,12 @@ def _find_cavities(cells: NDArray[np.float32], tissue: Mask, thick: Mask, across
     size = np.bincount(regions.ravel(), minlength=count + 1)
     is_lung = np.bincount(regions[cells < LUNG_HU], minlength=count + 1) < MOST_AIR * size
     small = size * across**2 < SMALL_MM2
-    foam = is_lung & ~small & (thick_wall > LUNG_WALL) & (thick_wall <= FOAM_WALL)
+    foam = is_lung & ~small & (thick_wall > _LUNG_WALL) & (thick_wall <= FOAM_WALL)
     foam &= np.bincount(regions[cells < FOAM_HU], minlength=count + 1) > 0.5 * size
     foam[0] = False
     if foam.any():
         foam[regions[grow(foam[regions], -FOAM_MM / across)]] = False
-    kept = np.where(is_lung, thick_wall > LUNG_WALL, ~is_open & (small | (thick_wall > AIR_WALL)))
+    kept = np.where(is_lung, thick_wall > _LUNG_WALL, ~is_open & (small | (thick_wall > _AIR_WALL)))
     kept &= ~foam
     kept[0] = False
     return np.asarray(kept[regions])
@@ -339,14 +339,14 @@ def find_unmeasured(cells: NDArray[Any]) -> Mask:
         for layer, out in zip(cells[where], found[where], strict=True):
             for corner in set(layer[np.ix_((0, -1), (0, -1))].flat):
                 out |= layer == corner
-            if np.count_nonzero(out) < FEWEST_UNMEASURED:
+            if np.count_nonzero(out) < _FEWEST_UNMEASURED:
                 out[...] = False
                 continue
             pieces, count = ndimage.label(out)
             outer = np.zeros(count + 1, dtype=bool)
             for side in (pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]):
                 outer[side] = True
-            outer &= np.bincount(pieces.ravel(), minlength=count + 1) >= FEWEST_UNMEASURED
+            outer &= np.bincount(pieces.ravel(), minlength=count + 1) >= _FEWEST_UNMEASURED
             outer[0] = False
             np.take(outer, pieces, out=out)
 

@@ -35,15 +35,15 @@ BAR_MM, BAR_RATIO = 50.0, 3.0
 """Least length of a bar, in mm and in its larger thickness."""
 SECTION_MM = 12.0
 """Least length of the sections in which a bar is measured."""
-SECTION_SPREAD, EVEN_SECTIONS = 0.1, 0.75
+_SECTION_SPREAD, _EVEN_SECTIONS = 0.1, 0.75
 """At least this share of the sections of a bar differ by at most the first number, a share, from their median."""
-BEND_CELLS = 0.5
+_BEND_CELLS = 0.5
 """Largest distance of the middles of these sections from the axis, root mean square, in cells."""
 THIN_MM = 10.0
 """A thicker bar is solid along its axis: shafts of bones as thick are hollow."""
 FEWEST_CELLS = 8
 """Smaller pieces have no shape."""
-RING_CELLS, SOFT_RING = 2, 0.8
+_RING_CELLS, _SOFT_RING = 2, 0.8
 """A piece lies in soft tissue if at least this share of the cells within so many cells of it is tissue."""
 
 
@@ -54,14 +54,14 @@ def find_equipment(cells: Cells, labels: NDArray[np.int32], chosen: Mask, tissue
     found = np.zeros_like(chosen)
     boxes = ndimage.find_objects(labels)
     for number in np.flatnonzero(chosen):
-        box = tuple(slice(max(0, part.start - RING_CELLS), part.stop + RING_CELLS) for part in boxes[number - 1])
+        box = tuple(slice(max(0, part.start - _RING_CELLS), part.stop + _RING_CELLS) for part in boxes[number - 1])
         piece = labels[box] == number
         metal = cells.metal[box] > 0
         # A clip on a rail is one piece with it: without the metal a bar is left.
         bar = piece & ~ndimage.binary_dilation(metal)
         if _is_metal(cells, box, piece) or _is_bar(bar, cells.mean[box], cells.size_mm[::-1]):
-            ring = ndimage.binary_dilation(piece, iterations=RING_CELLS) & ~piece
-            found[number] = not ring.any() or tissue[box][ring].mean() < SOFT_RING
+            ring = ndimage.binary_dilation(piece, iterations=_RING_CELLS) & ~piece
+            found[number] = not ring.any() or tissue[box][ring].mean() < _SOFT_RING
     return found
 
 
@@ -84,11 +84,11 @@ def _is_bar(piece: Mask, hu: NDArray[np.float32], size_mm: tuple[float, ...]) ->
     if length < max(BAR_MM, BAR_RATIO * widths.max()):
         return False
     middles, sums = _measure_sections(along, across, weights, float(np.abs(axes[:, 2]) @ size_mm))
-    even = np.abs(sums - np.median(sums)) <= SECTION_SPREAD * np.median(sums)
-    if even.mean() < EVEN_SECTIONS or np.mean(np.sum(middles[even] ** 2, axis=1)) > (BEND_CELLS * cell) ** 2:
+    even = np.abs(sums - np.median(sums)) <= _SECTION_SPREAD * np.median(sums)
+    if even.mean() < _EVEN_SECTIONS or np.mean(np.sum(middles[even] ** 2, axis=1)) > (_BEND_CELLS * cell) ** 2:
         return False
     on_axis = np.sum(across**2, axis=1) <= cell**2
-    is_solid = len(np.unique(along[on_axis] // SECTION_MM)) >= EVEN_SECTIONS * length / SECTION_MM
+    is_solid = len(np.unique(along[on_axis] // SECTION_MM)) >= _EVEN_SECTIONS * length / SECTION_MM
     return bool(is_solid or widths.min() <= THIN_MM)
 
 
@@ -109,13 +109,13 @@ Piece = tuple[int, tuple[float, ...]]
 
 BONE_KEPT = 0.98
 """Least share of the bone that must stay; if less stays, the body was not found."""
-HARD_SHARE = 0.005
+_HARD_SHARE = 0.005
 """Least share of hard voxels in a piece of bone.  Tables have none; a thin cortex in coarse voxels has 0.02."""
 SOLID_HU = 200.0
 """Cells with a higher mean are bone.  The mean is used because noise lifts single voxels over any bound."""
-SOFT_PER_SOLID = 0.5
+_SOFT_PER_SOLID = 0.5
 """Cells of soft tissue for each cell of bone; patients have 2 or more (a head), dry specimens less than 0.1."""
-STRAIGHT_SHARE = 0.95
+_STRAIGHT_SHARE = 0.95
 """A column of cells belongs to a table when at least this share of it is dense enough."""
 STRAIGHT_MM = 60.0
 """Least height of a scan in which tables are looked for; in shorter scans bones are as straight as a table."""
@@ -131,11 +131,11 @@ LONG_MM = 150.0
 """Thin pieces without hard voxels beside a specimen, and wide thin plates, are equipment from this length on."""
 GROWTH_MM = 6.0
 """Less dense tissue that touches a bone of a specimen belongs to the bone up to this distance."""
-MOST_SAID = 3
+_MOST_SAID = 3
 """Most pieces that are named."""
 BONELESS_ML = 3.0
 """Smaller pieces of the body without bone are not named."""
-INSIDE, HARD_INSIDE = 0.5, 0.25
+INSIDE, _HARD_INSIDE = 0.5, 0.25
 """Least share of a piece within the body if it belongs to the patient; for hard pieces the second, lower value."""
 
 
@@ -159,7 +159,7 @@ class _Pieces:
     @property
     def is_hard(self) -> Mask:
         """Pieces of bone or metal.  If no piece is hard, hardness tells nothing and all pieces count."""
-        hard = (self.hard >= HARD_SHARE * self.dense) & (self.dense > 0)
+        hard = (self.hard >= _HARD_SHARE * self.dense) & (self.dense > 0)
         return np.asarray(hard if hard.any() else self.dense > 0)
 
     def share_in(self, cells: Cells, mask: Mask) -> Float64Array:
@@ -196,7 +196,7 @@ def find_dense_pieces(cells: Cells, tissue: Mask, thick: Mask, body: Mask) -> De
 
     solid = cells.mean > SOLID_HU
     soft = thick & ~ndimage.binary_dilation(solid, iterations=2)
-    specimen = np.count_nonzero(soft) < SOFT_PER_SOLID * np.count_nonzero(solid)
+    specimen = np.count_nonzero(soft) < _SOFT_PER_SOLID * np.count_nonzero(solid)
     return _of_specimen(cells, tissue) if specimen else _of_patient(cells, tissue, body)
 
 
@@ -210,8 +210,8 @@ def _of_patient(cells: Cells, tissue: Mask, body: Mask) -> DensePieces:
     pieces = _label(cells, cells.dense > 0)
     hard = pieces.is_hard
     inside = pieces.share_in(cells, body)
-    added = (inside >= INSIDE) | (hard & (inside >= HARD_INSIDE))
-    straight = np.broadcast_to((tissue & ~body).mean(axis=0) >= STRAIGHT_SHARE, body.shape)
+    added = (inside >= INSIDE) | (hard & (inside >= _HARD_INSIDE))
+    straight = np.broadcast_to((tissue & ~body).mean(axis=0) >= _STRAIGHT_SHARE, body.shape)
     loose = hard & ~added & (pieces.share_in(cells, straight) < 0.5)
     loose &= ~find_equipment(cells, pieces.labels, loose, tissue)
     apart = loose & (inside == 0.0)
@@ -252,11 +252,11 @@ def _straight_plates(cells: Cells, tissue: Mask) -> Mask:
     """
     from scipy import ndimage
 
-    straight = np.asarray(tissue.mean(axis=0) >= STRAIGHT_SHARE)
+    straight = np.asarray(tissue.mean(axis=0) >= _STRAIGHT_SHARE)
     if tissue.shape[0] * cells.size_mm[2] < STRAIGHT_MM or not straight.any():
         return np.zeros_like(straight)
     dense, hard = (of.sum(axis=0, dtype=np.float64) for of in (cells.dense, cells.hard))
-    table = straight & (hard < HARD_SHARE * np.maximum(dense, 1.0))
+    table = straight & (hard < _HARD_SHARE * np.maximum(dense, 1.0))
     firm = straight & ~table
     if not firm.any():
         return table
@@ -356,11 +356,11 @@ def find_boneless(cells: Cells, kept: Mask, tissue: Mask) -> list[Piece]:
 
 
 def _list_largest(cells: Cells, labels: NDArray[np.int32], voxels: Float64Array, weights: NDArray[Any]) -> list[Piece]:
-    """Return the pieces with the most voxels, at most `MOST_SAID`, with their middles."""
+    """Return the pieces with the most voxels, at most `_MOST_SAID`, with their middles."""
     from scipy import ndimage
 
     found = []
-    for number in np.argsort(-voxels, kind="stable")[:MOST_SAID]:
+    for number in np.argsort(-voxels, kind="stable")[:_MOST_SAID]:
         if voxels[number]:
             middle = ndimage.center_of_mass(weights, labels, int(number))[::-1]
             ijk = tuple((place + 0.5) * step - 0.5 for place, step in zip(middle, cells.step, strict=True))
@@ -374,7 +374,7 @@ def judge_circle(cells: Cells, inside: Mask) -> tuple[dict[str, Any], Gate]:
     ``bone_voxels`` are above 300 HU in pieces of bone, ``bone_voxels_apart`` in pieces that lie wholly outside.
     """
     pieces = _label(cells, cells.dense > 0)
-    hard = (pieces.hard >= HARD_SHARE * pieces.dense) & (pieces.dense > 0)
+    hard = (pieces.hard >= _HARD_SHARE * pieces.dense) & (pieces.dense > 0)
     stays = pieces.share_in(cells, np.broadcast_to(inside, cells.dense.shape))
     bone = int(pieces.dense[hard].sum())
     lost = round(float((pieces.dense * (1.0 - stays))[hard].sum()))

@@ -44,7 +44,7 @@ VAULT_SLICES_MM = 12.0
 TRUNK_CM2 = 330.0
 """Area of a slice of the body above which it is a trunk: the largest slice of a head has about 250."""
 
-CUT_SHARE = 0.75
+_CUT_SHARE = 0.75
 """Share of the border of a slice that is body from which the body counts as cut all round."""
 
 SKIN_CM2 = 40.0
@@ -142,7 +142,7 @@ def _judge(volume: Volume) -> bool | None:
         area = float((plane > AIR_HU).sum()) * pixels_mm[0] * pixels_mm[1] / 100.0
         border = np.concatenate([plane[0], plane[-1], plane[1:-1, 0], plane[1:-1, -1]])
         bodies += area > 0.0
-        trunk += area >= TRUNK_CM2 or float((border > AIR_HU).mean()) >= CUT_SHARE
+        trunk += area >= TRUNK_CM2 or float((border > AIR_HU).mean()) >= _CUT_SHARE
     if vault >= VAULT_SLICES_MM:
         return True
     return False if bodies and trunk == bodies else None

@@ -55,14 +55,14 @@ CONTRAST_MEDIUM_HU = 600
 
 REACH = 8
 """Longest walk in steps: at a blur of 2 voxels it reaches the plateau."""
-FLAT = 4
+_FLAT = 4
 """A plateau is flat when values stay level for so many steps beyond the maximum, as vessels do; cortex falls off."""
-FLAT_SIGMAS = 3.5
-LARGEST_FLAT_SHARE = 0.75
+_FLAT_SIGMAS = 3.5
+_LARGEST_FLAT_SHARE = 0.75
 """When more than this share of the contrast ends in flat plateaus, these are bone (a homogeneous body)."""
-MOST_EDGES = 200_000
+_MOST_EDGES = 200_000
 """Largest number of edges taken from one slice and axis, so that noise cannot use up the memory."""
-LEAST_BONE_SHARE = 0.2
+_LEAST_BONE_SHARE = 0.2
 """Least share of the edges that must end below metal.  A lone implant has some of these: its rim is blurred."""
 
 
@@ -88,31 +88,31 @@ def measure_edges(slices: Slices, background: Background) -> BoneEdges:
     """Measure the plateaus on both sides of the edges of bone in slices, along rows and along columns."""
     found = []
     for k, values in slices:
-        padded = np.pad(values, REACH + FLAT, mode="edge")
+        padded = np.pad(values, REACH + _FLAT, mode="edge")
         with np.errstate(invalid="ignore"):  # two infinite neighbours
             found += [_measure_slice(padded, axis, background, k) for axis in (0, 1)]
     every = BoneEdges(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
     edges = every.where((every.tissue >= background.lowest) & (every.tissue <= background.highest))
     bone = edges.where(edges.bone <= METAL_HU)
     # These edges are the blurred rim of metal, not bone.
-    return bone if len(bone.bone) >= LEAST_BONE_SHARE * len(edges.bone) else bone.where(bone.bone < -math.inf)
+    return bone if len(bone.bone) >= _LEAST_BONE_SHARE * len(edges.bone) else bone.where(bone.bone < -math.inf)
 
 
 def _measure_slice(padded: NDArray[Any], axis: int, background: Background, k: int) -> tuple[NDArray[Any], ...]:
     """Measure bone, tissue, steepest step, flatness and place of the edges of a slice along its columns (axis 0) or
     rows (1).
 
-    It is continued by its border values, p = `REACH` + `FLAT` voxels each way: every walk ends where values are
+    It is continued by its border values, p = `REACH` + `_FLAT` voxels each way: every walk ends where values are
     constant.
     """
-    border = REACH + FLAT
+    border = REACH + _FLAT
     inside = padded >= background.seed
     inner = (slice(border, -border),) * 2
     along, across = (padded.shape[1], 1) if axis == 0 else (1, padded.shape[1])
     first = inside[inner]
     last = np.roll(inside, -1, axis)[inner]
     crossing = np.flatnonzero(first != last)  # border values are continued: no crossing
-    crossing = crossing[:: max(1, -(-len(crossing) // MOST_EDGES))]
+    crossing = crossing[:: max(1, -(-len(crossing) // _MOST_EDGES))]
     places = np.column_stack((np.full(len(crossing), k), *np.divmod(crossing, first.shape[1]))).astype(np.int32)
     low = (places[:, 1].astype(np.intp) + border) * padded.shape[1] + places[:, 2] + border
     flat_values, flat_inside = padded.ravel(), inside.ravel()
@@ -135,8 +135,8 @@ def _measure_slice(padded: NDArray[Any], axis: int, background: Background, k: i
     bottom, steep_down = _walk(flat_values, low, -uphill, falling=True)
     bone = values(top)
     flat = bone < CONTRAST_MEDIUM_HU
-    for beyond in range(1, FLAT + 1):
-        flat &= np.abs(values(top + beyond * uphill) - bone) <= FLAT_SIGMAS * background.noise
+    for beyond in range(1, _FLAT + 1):
+        flat &= np.abs(values(top + beyond * uphill) - bone) <= _FLAT_SIGMAS * background.noise
     return bone, values(bottom), np.maximum(step, np.maximum(steep_up, steep_down)), flat, places[kept]
 
 
@@ -163,7 +163,7 @@ def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float, float]:
     """Leave out edges of contrast medium, unless most are; return also the shares left out, and flat and faint."""
     total = edges.contrast.sum()
     share = float(edges.contrast[edges.flat].sum() / total) if total else 0.0
-    if share > LARGEST_FLAT_SHARE:
+    if share > _LARGEST_FLAT_SHARE:
         return edges, 0.0, share
     return edges.where(~edges.flat), share, share
 
@@ -174,8 +174,8 @@ of bone.  Streaks spread the levels of single edges: without metal slices these 
 
 CONTRAST_SAID = 0.05
 """Least share of the contrast in flat plateaus that is reported; scans without contrast medium have up to 0.02."""
-FEWEST_EDGES = 64
-LEAST_CONTRAST_SIGMAS = 6.0
+_FEWEST_EDGES = 64
+_LEAST_CONTRAST_SIGMAS = 6.0
 
 
 @dataclass(frozen=True)
@@ -315,8 +315,8 @@ class _Look(NamedTuple):
     @property
     def shows_bone(self) -> bool:
         bone, tissue = self.materials
-        least = max(SEED_ABOVE_TISSUE_HU, LEAST_CONTRAST_SIGMAS * self.background.noise)
-        return len(self.edges.bone) >= FEWEST_EDGES and bone - tissue >= least
+        least = max(SEED_ABOVE_TISSUE_HU, _LEAST_CONTRAST_SIGMAS * self.background.noise)
+        return len(self.edges.bone) >= _FEWEST_EDGES and bone - tissue >= least
 
     @property
     def level(self) -> float:

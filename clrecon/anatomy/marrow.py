@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 BLOCK_MM, FINE_MM = 2.0, 1.0
 """Side of the blocks by which the width of a space is measured, and near the limit."""
-BLOCKS_OFF, FINE_BLOCKS_OFF = 2.0, 0.75
+_BLOCKS_OFF, _FINE_BLOCKS_OFF = 2.0, 0.75
 """Blocks by which the width can be wrong, and that of a ball too low, as its middle need not be that of a block."""
 
 
@@ -18,10 +18,10 @@ def holds_ball(
 ) -> bool:
     """Tell whether a ball of this radius, or one smaller by a voxel or 1 mm, fits into a body; see `measure_width`."""
     width = measure_width(body, ends, steps)
-    if abs(width - radius_mm) > BLOCKS_OFF * max(BLOCK_MM, *steps):
+    if abs(width - radius_mm) > _BLOCKS_OFF * max(BLOCK_MM, *steps):
         return width > radius_mm
     width = measure_width(body, ends, steps, FINE_MM)
-    return width + FINE_BLOCKS_OFF * max(FINE_MM, *steps) >= radius_mm
+    return width + _FINE_BLOCKS_OFF * max(FINE_MM, *steps) >= radius_mm
 
 
 def measure_width(

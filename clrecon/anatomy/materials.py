@@ -29,18 +29,18 @@ SOFT_TISSUE_HU = (-30, 150)
 """Range in which muscle, organs, blood and water have their mode."""
 FAT_HU = (-150, -31)
 """Range in which fat has its mode: the background of scans that show no other soft tissue."""
-AIR, SOFT_TISSUE = -1000.0, 40.0
+AIR, _SOFT_TISSUE = -1000.0, 40.0
 """HU of the two materials by which a scan with a scale of its own is read."""
 DENSE = 1240.0
 """HU that the denser of two materials is read as, where nothing is known of the values."""
-MATERIAL_BINS, MATERIAL_TAILS, TAIL_SHARE = 400, (0.0005, 0.9995), 0.35
+_MATERIAL_BINS, _MATERIAL_TAILS, _TAIL_SHARE = 400, (0.0005, 0.9995), 0.35
 """Bins of a histogram of any values, the shares left out at its ends, and how far above its last peak what is denser
 reaches, as a share of the range."""
 AIR_MODE_HU = -700
 """Modes below this are air."""
 SEED_ABOVE_TISSUE_HU = 100
 """Least distance of bone from the soft-tissue mode: discs, clots and organs end below."""
-SEED_SIGMAS = 4.0
+_SEED_SIGMAS = 4.0
 WIDEST_MODE_HU = 150.0
 """Widest accepted mode: more noise than this hides the tissues, and a ramp between two materials looks wider still."""
 SPECIMEN_SEED_HU = 150
@@ -125,7 +125,7 @@ def find_background(histogram: Float64Array) -> Background:
     tissue = _find_mode(smooth, *SOFT_TISSUE_HU) or _find_mode(smooth, *FAT_HU)
     if tissue is not None:
         mode, noise = tissue
-        seed = math.ceil(mode + max(SEED_ABOVE_TISSUE_HU, SEED_SIGMAS * noise))
+        seed = math.ceil(mode + max(SEED_ABOVE_TISSUE_HU, _SEED_SIGMAS * noise))
         return Background("soft tissue", mode, noise, seed, mode - FAT_BELOW_TISSUE_HU, mode + 2.0 * noise)
     air = _find_mode(smooth, LOWEST_HU, AIR_MODE_HU)
     if air is not None:
@@ -184,7 +184,7 @@ class OwnScale(NamedTuple):
         air, tissue = rescale.get("air"), rescale.get("soft_tissue")
         if air is not None and tissue is not None:
             said = f"on the scan's own scale, with air near {air:.0f} and soft tissue near {tissue:.0f}"
-            return cls(air, tissue, AIR, SOFT_TISSUE, said)
+            return cls(air, tissue, AIR, _SOFT_TISSUE, said)
         known = {gate["name"]: gate["ok"] for gate in volume.report.get("gates", ())}.get("hu_known")
         if known or (known is None and _shows_hu(volume)):
             return None
@@ -192,7 +192,7 @@ class OwnScale(NamedTuple):
         if found is None:
             return None
         said = f"on the scan's own scale, with two materials near {found[0]:.4g} and {found[1]:.4g}"
-        return cls(*found, SOFT_TISSUE, DENSE, said)
+        return cls(*found, _SOFT_TISSUE, DENSE, said)
 
     @property
     def slope(self) -> float:
@@ -221,7 +221,7 @@ def _shows_hu(volume: Volume) -> bool:
 def find_two_materials(volume: Volume) -> tuple[float, float] | None:
     """Return the values of what is densest and of what lies around it, on any scale; None where there is no such pair.
 
-    The histogram of every fourth value is smoothed over `MATERIAL_BINS` and its peaks are found, with a valley of half
+    The histogram of every fourth value is smoothed over `_MATERIAL_BINS` and its peaks are found, with a valley of half
     their height on either side, however wide noise makes them.  What rises far above the last peak is the dense
     material, else the last peak itself.
     """
@@ -231,17 +231,17 @@ def find_two_materials(volume: Volume) -> tuple[float, float] | None:
     values = values[np.isfinite(values) & (values != padding)] if padding is not None else values[np.isfinite(values)]
     if not len(values):
         return None
-    low, high = np.quantile(values, MATERIAL_TAILS)
+    low, high = np.quantile(values, _MATERIAL_TAILS)
     if high <= low:
         return None
-    counts, ends = np.histogram(values, MATERIAL_BINS, (float(low), float(high)))
+    counts, ends = np.histogram(values, _MATERIAL_BINS, (float(low), float(high)))
     weights = np.exp(-0.5 * (np.arange(-12, 13) / 4.0) ** 2)
     smooth = np.convolve(np.pad(counts, 12), weights / weights.sum(), mode="valid")
     peaks = [k for k in _find_peaks(smooth) if smooth[k] >= 0.02 * smooth.max()]
     if not peaks:
         return None
     places = [float((ends[k] + ends[k + 1]) / 2.0) for k in peaks]
-    if high - places[-1] > TAIL_SHARE * (high - low):
+    if high - places[-1] > _TAIL_SHARE * (high - low):
         dense = float(np.median(values[values > (places[-1] + high) / 2.0]))
         return places[-1], dense
     return (places[-2], places[-1]) if len(places) > 1 else None

@@ -21,9 +21,9 @@ BLOCK = 6
 MOST_SLICES = 24
 """Slices that are looked at, evenly over the volume."""
 
-FEWEST_BLOCKS = 50
+_FEWEST_BLOCKS = 50
 
-QUARTILE_OF_NOISE = 0.9149
+_QUARTILE_OF_NOISE = 0.9149
 """First quartile of the standard deviation of 36 normal numbers without their plane (33 degrees of freedom), over the
 standard deviation of the numbers: sqrt(27.62 / 33), with 27.62 the first quartile of chi squared."""
 
@@ -69,13 +69,13 @@ def measure_noise(volume: Volume) -> Noise:
     ks = np.unique(np.linspace(0, nk - 1, min(nk, MOST_SLICES)).round().astype(int)).tolist()
     found = [_block_deviations(volume.voxels[k]) for k in ks]
     deviations = np.concatenate(found)
-    if len(deviations) < FEWEST_BLOCKS:
+    if len(deviations) < _FEWEST_BLOCKS:
         low, high = SOFT_TISSUE_HU
         raise UsageError(
             f"the noise cannot be measured: {len(deviations)} blocks of {BLOCK} x {BLOCK} voxels in {len(ks)} slices"
-            f" lie from {low:g} to {high:g} HU as soft tissue does, at least {FEWEST_BLOCKS} are needed"
+            f" lie from {low:g} to {high:g} HU as soft tissue does, at least {_FEWEST_BLOCKS} are needed"
         )
-    return Noise(float(np.percentile(deviations, 25.0)) / QUARTILE_OF_NOISE, len(deviations), len(ks))
+    return Noise(float(np.percentile(deviations, 25.0)) / _QUARTILE_OF_NOISE, len(deviations), len(ks))
 
 
 def _block_deviations(layer: NDArray[Any]) -> NDArray[np.float64]:

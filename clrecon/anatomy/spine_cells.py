@@ -216,7 +216,7 @@ SOFT_HU = (-80.0, 130.0)
 """Between these lies what a canal holds: fluid, nerves and fat around them."""
 TISSUE_HU = -300.0
 """Rows and columns of cells without a value above this are not looked at; values are cut there for the mirror."""
-BORDER = 10
+_BORDER = 10
 """Cells around the tissue that are looked at too: farther from it nothing that is measured here is above 0."""
 PIECE = 4
 """Slices that are worked out together: what is made of them stays in the processor's cache."""
@@ -268,7 +268,7 @@ def _extent(values: Field, axis: int) -> slice:
     if not has.any():
         return slice(0, count)
     first, last = int(has.argmax()), count - 1 - int(has[::-1].argmax())
-    return slice(max(first - BORDER, 0), min(last + 1 + BORDER, count))
+    return slice(max(first - _BORDER, 0), min(last + 1 + _BORDER, count))
 
 
 def _look(cells: SpineCells, first: int, end: int) -> tuple[Field, dict[str, Field]]:

@@ -142,12 +142,12 @@ def missing_traits(cells: SpineCells, likeness: Likeness, path: NDArray[np.int64
     return " and ".join(filter(None, (", ".join(lacking[:-1]), *lacking[-1:])))
 
 
-WORST = 0.6
+_WORST = 0.6
 """Most that a slice counts against the path, so that one slice with an artefact does not end it."""
-BEND_COST = 0.05
-DEEPER_AHEAD = 1.2
+_BEND_COST = 0.05
+_DEEPER_AHEAD = 1.2
 """A trunk is at least this many times deeper in front of the canal than behind it; a neck need not be."""
-FORWARD = 0.12
+_FORWARD = 0.12
 """A spine is worth at least so much more than the same scan with front and back exchanged; necks 0.2 to 0.3, trunks 0.4
 to 0.5, lower legs less than 0.08."""
 SHORTEST_MM = 35.0
@@ -210,7 +210,7 @@ def find_spine_line(volume: Volume, *, sure_only: bool = False, progress: Progre
     steps = Steps(progress, "curve", lattice.blocks(volume) + 2 * int(lattice.count[2]))
     cells = average_cells(volume, lattice, steps.take_slice)
     likeness = measure_likeness(cells, steps.take_slice)
-    path = _best_path(np.clip(likeness.worth - WORTH, -WORST, None))
+    path = _best_path(np.clip(likeness.worth - WORTH, -_WORST, None))
     sure = likeness.sure[tuple(path.T)]
     begin, end = _longest_run(sure)
     searched, height = len(cells.values) * CELL_MM[2], (end - begin) * CELL_MM[2]
@@ -223,7 +223,7 @@ def find_spine_line(volume: Volume, *, sure_only: bool = False, progress: Progre
         )
     path = path[begin:end]
     ahead, behind = _depths(cells, path + (0, *likeness.first))
-    if behind is not None and ahead < DEEPER_AHEAD * behind and not _faces_forward(cells, likeness, path):
+    if behind is not None and ahead < _DEEPER_AHEAD * behind and not _faces_forward(cells, likeness, path):
         raise RefusedInputError(
             f"what looks like a spine has {ahead:.0f} mm of the body in front and {behind:.0f} mm behind, and it looks"
             " as much like one with front and back exchanged: it is none, or the affine of the scan has front and back"
@@ -243,7 +243,7 @@ def _faces_forward(cells: SpineCells, likeness: Likeness, path: NDArray[np.int64
     slices = slice(int(path[0, 0]), int(path[-1, 0]) + 1)
     exchanged = measure_likeness(SpineCells(np.ascontiguousarray(cells.values[:, ::-1]), cells.origin), lambda _: None)
     own, other = (one.worth[slices].max(axis=(1, 2)) for one in (likeness, exchanged))
-    return bool(np.median(own - other) >= FORWARD)
+    return bool(np.median(own - other) >= _FORWARD)
 
 
 def _describe_run(cells: SpineCells, run: NDArray[np.int64], searched: float) -> str:
@@ -297,7 +297,7 @@ def _best_path(gain: Field) -> NDArray[np.int64]:
         # Where nothing before is worth more than 0, the path begins.
         before = np.zeros_like(sums)
         for n, (dy, dx) in enumerate(steps):
-            cost = np.float32(BEND_COST * np.hypot(dy, dx))
+            cost = np.float32(_BEND_COST * np.hypot(dy, dx))
             reached = padded[1 + dy : 1 + dy + sums.shape[0], 1 + dx : 1 + dx + sums.shape[1]] - cost
             better = reached > before
             np.copyto(before, reached, where=better)

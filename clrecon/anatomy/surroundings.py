@@ -37,7 +37,7 @@ DEEP_MM = 5.0
 OPEN_MM = 12.0
 """Slices in which an airway is open (parted lips) get the outline of the slices above and below, up to this height."""
 
-OWN_STEPS = 6
+_OWN_STEPS = 6
 """Steps after the search for the body, as progress counts them."""
 
 
@@ -50,7 +50,7 @@ def leave_outside_air(volume: Volume, levels: Sequence[float], *, progress: Prog
     measured) and ``filled_hu`` (the new value).
     """
     level = min(max(levels), TISSUE_HU)
-    steps = Steps(progress, "mask", count_cells(volume)[0] + BODY_STEPS + OWN_STEPS)
+    steps = Steps(progress, "mask", count_cells(volume)[0] + BODY_STEPS + _OWN_STEPS)
     try:
         body, step = find_body(volume, steps=steps)
     except RefusedInputError as error:
@@ -79,10 +79,10 @@ def leave_outside_air(volume: Volume, levels: Sequence[float], *, progress: Prog
         np.less(layer, level, out=air[k])
         volume.release_slices(k, k + 1)
     steps.take()
-    kept = _find_cavities(air, within & ~unmeasured, deep)
+    cavities = _find_cavities(air, within & ~unmeasured, deep)
     steps.take()
-    outside = air & ~kept
-    opening = _touching_mm2(kept, outside & ~unmeasured, volume)
+    outside = air & ~cavities
+    opening = _touching_mm2(cavities, outside & ~unmeasured, volume)
     steps.take()
 
     filled = _value_above(max(levels), volume.voxels.dtype)

@@ -19,7 +19,7 @@ from clrecon.system.options import options_of
 from clrecon.system.progress import DEFAULT_SECONDS, check_time_limit
 from clrecon.system.text import guess_word
 
-INTERRUPTED = 130
+_INTERRUPTED = 130
 
 Settings = TypeVar("Settings")
 
@@ -379,7 +379,7 @@ def _report_error(error: BaseException, console: Console, debug: bool) -> int:
         traceback.print_exception(type(error), error, error.__traceback__, file=sys.stderr)
     if isinstance(error, KeyboardInterrupt):
         console.error("interrupted")
-        return INTERRUPTED
+        return _INTERRUPTED
     if isinstance(error, ClreconError):
         known = error
     elif isinstance(error, MemoryError):

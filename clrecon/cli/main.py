@@ -90,7 +90,7 @@ COMMANDS = {
 
 HELP = "help"
 
-UNUSED_MODULES = ("requests", "PIL")
+_UNUSED_MODULES = ("requests", "PIL")
 """Hidden from pydicom by ``None`` in `sys.modules`: reading does not need them, and their import takes as long as it.
 `clrecon.rendering.pictures.pillow` makes Pillow available again.
 """
@@ -98,9 +98,9 @@ UNUSED_MODULES = ("requests", "PIL")
 _MOST_SECONDS_TO_END = 1.0
 """Time for the removal of temporary folders after a kernel has hung."""
 
-DESCRIPTION = "Surfaces in patient millimetres from CT series, computed on any OpenCL device."
+_DESCRIPTION = "Surfaces in patient millimetres from CT series, computed on any OpenCL device."
 
-EPILOG = f"""\
+_EPILOG = f"""\
 example:    clrecon mesh CT_FOLDER -o bone.stl
             clrecon help mesh
 
@@ -123,7 +123,7 @@ def run() -> None:
     signal.signal(signal.SIGTERM, _interrupt)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # not under nohup
         signal.signal(signal.SIGHUP, _interrupt)
-    for name in UNUSED_MODULES:
+    for name in _UNUSED_MODULES:
         sys.modules.setdefault(name, None)  # type: ignore[arg-type]
     code = main()
     for stream in (sys.stdout, sys.stderr):
@@ -145,7 +145,7 @@ def _dispatch(arguments: list[str], console: Console) -> int:
     from clrecon.cli import common
 
     arguments = _as_help_option(arguments)
-    parser = Parser(prog="clrecon", description=DESCRIPTION, epilog=EPILOG)
+    parser = Parser(prog="clrecon", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("-V", "--version", action="store_true", help="print the version and stop")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", parser_class=Parser)
     called = next((argument for argument in arguments if not argument.startswith("-")), None)

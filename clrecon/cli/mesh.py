@@ -407,7 +407,7 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-GATES_OF_AFFINE = ("grid_residual",)
+_GATES_OF_AFFINE = ("grid_residual",)
 """Gates for the fit of the affine to the slices.  Meshes do not need it: they use the position of each slice."""
 
 
@@ -415,13 +415,13 @@ def finish_with_gates(report: dict[str, Any], console: Console, strict: bool, *,
     """Print the warnings of a report; returns the exit code.
 
     With `strict` a failed gate of the volume or of a mesh is an error, which is printed even with ``--quiet`` and
-    ``--json``; that of a mesh decides the code.  A failed gate of `GATES_OF_AFFINE` (uneven slices) stays a warning,
+    ``--json``; that of a mesh decides the code.  A failed gate of `_GATES_OF_AFFINE` (uneven slices) stays a warning,
     and so does one that the values are HU, where a print has a level in the values' `own_units`.
     """
     from clrecon.jobs.mesh.refinement import warn_of_gates
     from clrecon.jobs.mesh.surfaces import VALUE_GATES
 
-    settled = GATES_OF_AFFINE + VALUE_GATES * own_units
+    settled = _GATES_OF_AFFINE + VALUE_GATES * own_units
     gates = [gate for gate in report["volume"].get("gates", ()) if gate["name"] not in settled]
     of_volume = [{"mesh": "volume", **gate} for gate in gates]
     failed_scan = warn_of_gates(of_volume) if strict else []

@@ -11,7 +11,7 @@ from clrecon.cli.mesh import describe_volume
 from clrecon.jobs.settings import VertebraeSettings
 from clrecon.system.text import count_of
 
-PARTLY = 8
+_PARTLY = 8
 _NAMING = "numbers, counted from the head: name the levels with --first T1 or --name-at X,Y,Z=L3"
 
 _EPILOG = """\
@@ -62,7 +62,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     if with_picture:
         lines.append(f"picture  {printable(options.picture or picture_beside(options.output))}: look at it")
     common.show_report(report, lines, options, console)
-    return PARTLY if report["low_confidence"] else 0
+    return _PARTLY if report["low_confidence"] else 0
 
 
 def _describe(report: dict[str, Any]) -> list[str]:

@@ -23,10 +23,10 @@ from clrecon.system.pieces import chunks
 
 LINE_LENGTH = 256
 """Longest line.  Readers of PLY keep comments in buffers of fixed size; a widely used one has 1024 bytes."""
-LINES_READ = 64
+_LINES_READ = 64
 """Most lines that are taken over from a file: no certificate of ours has more."""
 WARNINGS_WRITTEN = 20
-RUNS_WRITTEN = 12
+_RUNS_WRITTEN = 12
 _NUMBERS = (
     "grid_residual_max_mm",
     "grid_residual_rms_mm",
@@ -48,8 +48,8 @@ def certificate_lines(report: Mapping[str, Any], *, keep_ids: bool = False) -> t
 
 
 def plain_lines(lines: Iterable[object]) -> tuple[str, ...]:
-    """Return lines that a file had, at most `LINES_READ` of them, in the form that `certificate_lines` gives them."""
-    return tuple(_plain(str(line)) for line in islice(lines, LINES_READ))
+    """Return lines that a file had, at most `_LINES_READ` of them, in the form that `certificate_lines` gives them."""
+    return tuple(_plain(str(line)) for line in islice(lines, _LINES_READ))
 
 
 def _facts(report: Mapping[str, Any], keep_ids: bool) -> Iterator[str]:
@@ -57,7 +57,7 @@ def _facts(report: Mapping[str, Any], keep_ids: bool) -> Iterator[str]:
         yield from _line(name, [("", report.get(name))])
     gaps, dropped, runs = _mapping(report.get("gap_mm")), _mapping(report.get("dropped")), report.get("gap_runs")
     yield from _line("gap_mm", [(end, gaps.get(end)) for end in ("min", "max", "median")])
-    if isinstance(runs, list) and 0 < len(runs) <= RUNS_WRITTEN:
+    if isinstance(runs, list) and 0 < len(runs) <= _RUNS_WRITTEN:
         pairs = [(word, _mapping(run).get(key)) for run in runs for word, key in (("", "count"), ("x", "gap_mm"))]
         yield from _line("gap_runs", pairs)
     overlap = _mapping(_mapping(report.get("thickness")).get("overlap_mm"))

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from clrecon.exchange.content import Assembly, Content, PointContent, Writable
     from clrecon.exchange.raw_content import RawCloud
 
-FOUR_GIB = 2**32 - 1
+_FOUR_GIB = 2**32 - 1
 NO_LIMIT = 2**62
 
 
@@ -55,11 +55,11 @@ class FileFormat:
 
 
 # STL: the format could hold more, but many programs keep offsets in 32 bits.  GLB: its length field has 32 bits.
-REGISTRY = {
-    ".stl": FileFormat(module="stl", meshes=True, most_bytes=FOUR_GIB),
+_REGISTRY = {
+    ".stl": FileFormat(module="stl", meshes=True, most_bytes=_FOUR_GIB),
     ".ply": FileFormat(module="ply", meshes=True, clouds=True),
     ".obj": FileFormat(module="obj", meshes=True, holds_many=True),
-    ".glb": FileFormat(module="glb", meshes=True, holds_many=True, most_bytes=FOUR_GIB),
+    ".glb": FileFormat(module="glb", meshes=True, holds_many=True, most_bytes=_FOUR_GIB),
     ".vtp": FileFormat(module="vtp", meshes=True, clouds=True, holds_many=True),
     ".3mf": FileFormat(module="threemf", meshes=True, holds_many=True),
     ".html": FileFormat(module="page", meshes=True, holds_many=True, is_read=False),
@@ -69,8 +69,8 @@ REGISTRY = {
 }
 """The formats by the extensions of their files, in the order in which messages and help name them."""
 
-FORMATS = {extension: own for extension, own in REGISTRY.items() if own.meshes}
-CLOUD_FORMATS = {extension: own for extension, own in REGISTRY.items() if own.clouds}
+FORMATS = {extension: own for extension, own in _REGISTRY.items() if own.meshes}
+CLOUD_FORMATS = {extension: own for extension, own in _REGISTRY.items() if own.clouds}
 ASSEMBLIES = tuple(extension for extension, own in FORMATS.items() if own.holds_many)
 MESH_INPUTS = tuple(extension for extension, own in FORMATS.items() if own.is_read)
 CLOUD_INPUTS = (*CLOUD_FORMATS, ".csv", ".txt", ".asc")

@@ -34,7 +34,7 @@ from clrecon.system.paths import open_regular
 from clrecon.system.pieces import local_origin
 from clrecon.system.text import escape_text
 
-NAMELESS = "surface"
+_NAMELESS = "surface"
 """Name of a node and mesh that have no other."""
 
 _METRES_PER_MM = 0.001
@@ -74,7 +74,7 @@ def _document(content: Content | Assembly) -> dict[str, Any]:
     for number, part in enumerate(parts):
         primitive, start = _describe_part(part, number, start, views, accessors)
         rotation = _SCENE_FROM_LPS @ part.to_lps
-        name = part.name or NAMELESS
+        name = part.name or _NAMELESS
         nodes.append({"name": name, "mesh": number, "matrix": _column_major(rotation, _METRES_PER_MM, _origin(part))})
         meshes.append({"name": name, "primitives": [primitive]})
         color = [*BONE_COLOR, 1.0] if part.color is None else [_linear(value) for value in part.color] + [1.0]
@@ -318,7 +318,7 @@ def _add_mesh(
     """Add the triangles of a mesh; return the number of its primitives that are no triangles."""
     mesh = file.entry("meshes", node["mesh"])
     name = str(node.get("name") or mesh.get("name") or "")
-    if not joins and name == NAMELESS:
+    if not joins and name == _NAMELESS:
         name = ""
     left_out = 0
     for primitive in mesh.get("primitives", ()):

@@ -19,7 +19,7 @@ from clrecon.exchange.raw_content import RawCloud, read_remarks, say_cut
 from clrecon.system.packages import install_command
 from clrecon.system.text import escape_text
 
-SCALE_MM = 1e-4
+_SCALE_MM = 1e-4
 """Step of the coordinates: they are rounded by 5e-5 mm at most."""
 _USER = "clrecon"
 _HEAD_BYTES = 375
@@ -62,12 +62,12 @@ def write(stream: BinaryIO, content: PointContent) -> None:
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.generating_software, header.system_identifier = "clrecon", ""
     low, high = (end.astype(np.float64) for end in (content.vertices.min(axis=0), content.vertices.max(axis=0)))
-    if (high - low).max() / SCALE_MM / 2 > _MOST_STEPS:
+    if (high - low).max() / _SCALE_MM / 2 > _MOST_STEPS:
         raise OutputError(
-            f"the cloud is {(high - low).max():.6g} mm long, LAS in steps of {SCALE_MM:g} mm holds"
-            f" {2 * _MOST_STEPS * SCALE_MM:.6g} mm: write PLY or VTP"
+            f"the cloud is {(high - low).max():.6g} mm long, LAS in steps of {_SCALE_MM:g} mm holds"
+            f" {2 * _MOST_STEPS * _SCALE_MM:.6g} mm: write PLY or VTP"
         )
-    header.scales, header.offsets = np.full(3, SCALE_MM), np.rint((low + high) / 2)
+    header.scales, header.offsets = np.full(3, _SCALE_MM), np.rint((low + high) / 2)
     extra = _extra(content)
     header.add_extra_dims([laspy.ExtraBytesParams(name, type=form) for name, (form, _) in extra.items()])
     text = "\n".join(content.remarks).encode("ascii")[:_LONGEST_RECORD]

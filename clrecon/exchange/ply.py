@@ -309,7 +309,7 @@ def read_mesh(path: Path) -> RawMesh:
     points = np.stack([found.pop(axis) for axis in ("x", "y", "z")], axis=1)
     cloud = RawCloud("PLY", points, found)
     normals = cloud.normals()
-    said = read_remarks(header.comments)
+    remarks = read_remarks(header.comments)
     color = _one_color(found)
     parts = [] if color is None else [Part("", len(triangles), color)]
     values, face_values = (
@@ -320,7 +320,7 @@ def read_mesh(path: Path) -> RawMesh:
     warnings = [f"numbers at faces left out: {escape_text(', '.join(others))}"] if others else []
     return RawMesh(
         "PLY", points, triangles, normals,
-        warnings=warnings + cloud.warnings, parts=parts, values=values, face_values=face_values, **said,
+        warnings=warnings + cloud.warnings, parts=parts, values=values, face_values=face_values, **remarks,
     )  # fmt: skip
 
 

@@ -14,10 +14,10 @@ from clrecon.geometry.affine import SPACES, frame_from_lps
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.text import escape_text, join_names
 
-HU_NAMES = ("hu", "scalar_hu", "ct", "scalar", "intensity", "scalar_intensity")
-LABEL_NAMES = ("label", "labels", "scalar_label", "cluster", "scalar_cluster", "classification")
-NORMAL_NAMES = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("normalx", "normaly", "normalz"))
-UNIT_TOLERANCE = 1e-3
+_HU_NAMES = ("hu", "scalar_hu", "ct", "scalar", "intensity", "scalar_intensity")
+_LABEL_NAMES = ("label", "labels", "scalar_label", "cluster", "scalar_cluster", "classification")
+_NORMAL_NAMES = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("normalx", "normaly", "normalz"))
+_UNIT_TOLERANCE = 1e-3
 """Largest difference of a normal's length from 1 that rounding in text files explains."""
 
 
@@ -48,7 +48,7 @@ class RawCloud:
 
     def normals(self) -> NDArray[np.float32] | None:
         """Return unit normals, shape (n, 3), or None where the file has none that can be used."""
-        found = next((columns for names in NORMAL_NAMES if (columns := self._take(names))), None)
+        found = next((columns for names in _NORMAL_NAMES if (columns := self._take(names))), None)
         if found is None:
             return None
         with np.errstate(all="ignore"):  # harmed bits
@@ -58,7 +58,7 @@ class RawCloud:
             self.warnings.append(f"{wrong:,} normals are not finite: the normals are left out")
             return None
         length = np.linalg.norm(normals, axis=1)
-        off = (np.abs(length - 1.0) > UNIT_TOLERANCE) & (length > 0)
+        off = (np.abs(length - 1.0) > _UNIT_TOLERANCE) & (length > 0)
         if off.any():
             self.warnings.append(f"{int(off.sum()):,} normals are not of length 1: they are scaled")
             normals[off] /= length[off, None]
@@ -68,10 +68,10 @@ class RawCloud:
 
     def hu(self) -> NDArray[np.float32] | None:
         """Return the HU, shape (n,), or None."""
-        for place, name in enumerate(HU_NAMES):
+        for place, name in enumerate(_HU_NAMES):
             found = self._take([name])
             if found is not None:
-                if place >= HU_NAMES.index("scalar"):
+                if place >= _HU_NAMES.index("scalar"):
                     self.warnings.append(f"HU is taken from the column '{escape_text(self._by_name[name])}'")
                 with np.errstate(all="ignore"):
                     return found[0].astype(np.float32)
@@ -79,7 +79,7 @@ class RawCloud:
 
     def labels(self) -> NDArray[np.int32] | None:
         """Return the labels, shape (n,), or None where there are none or they are no whole numbers of 32 bits."""
-        for name in LABEL_NAMES:
+        for name in _LABEL_NAMES:
             found = self._take([name])
             if found is not None:
                 values = found[0]
@@ -209,11 +209,11 @@ def turn_to_lps(
 MOST_LEVELS = 32
 """Most levels of objects within objects; more are refused, as is an object within itself."""
 
-MOST_SHAPES = 10_000
+_MOST_SHAPES = 10_000
 """Most shapes of a file: a few lines of objects within objects can ask for any number."""
 
 _MOST_CORNERS = 1 << 30
-"""Most corners of triangles: as for `MOST_SHAPES`."""
+"""Most corners of triangles: as for `_MOST_SHAPES`."""
 
 _SNAP = 1e-12
 """Numbers of a rotation this close to a whole one are that: two matrices that undo each other change no vertex."""
@@ -241,14 +241,14 @@ class PlacedShapes:
     def count_step(self) -> None:
         """Count an object that was looked at; ValueError where that does not end."""
         self._steps += 1
-        if self._steps > 10 * MOST_SHAPES:
-            raise ValueError(f"more than {10 * MOST_SHAPES:,} objects within objects")
+        if self._steps > 10 * _MOST_SHAPES:
+            raise ValueError(f"more than {10 * _MOST_SHAPES:,} objects within objects")
 
     def add(self, shape: Shape, matrix: NDArray[np.float64], part: Part) -> None:
         """Add a shape that `matrix`, shape (4, 4), places; a mirror turns its triangles round."""
         self._corners += max(shape.triangles.size, shape.vertices.size)
-        if len(self.parts) == MOST_SHAPES or self._corners > _MOST_CORNERS:
-            raise ValueError(f"more than {MOST_SHAPES:,} shapes or {_MOST_CORNERS:,} corners")
+        if len(self.parts) == _MOST_SHAPES or self._corners > _MOST_CORNERS:
+            raise ValueError(f"more than {_MOST_SHAPES:,} shapes or {_MOST_CORNERS:,} corners")
         if not np.isfinite(matrix).all() or matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
             raise ValueError("a transform that is no affine of finite numbers")
         turn = matrix[:3, :3]

@@ -16,7 +16,7 @@ from clrecon.geometry.affine import Float64Array, facts_of_orientation, frame_fr
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.grid import BaseVolume, Grid, fit_even
 
-ON_EDGE_MM = 1e-6
+_ON_EDGE_MM = 1e-6
 """A voxel centre this near to the side of a box lies in the box."""
 
 
@@ -39,7 +39,7 @@ def find_block(grid: Grid, origins: Float64Array, low: ArrayLike, high: ArrayLik
     origins: LPS mm of voxel (0, 0, k) of each slice, (nk, 3).
     """
     ni, nj, nk = grid.shape_ijk
-    low, high = np.asarray(low, np.float64) - ON_EDGE_MM, np.asarray(high, np.float64) + ON_EDGE_MM
+    low, high = np.asarray(low, np.float64) - _ON_EDGE_MM, np.asarray(high, np.float64) + _ON_EDGE_MM
     # In each row (k, j) the voxels in the box are an interval of i: that which lies within all three pairs of sides.
     first, last = np.zeros((nk, nj)), np.full((nk, nj), ni - 1.0)
     for a in range(3):

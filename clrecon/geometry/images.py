@@ -94,7 +94,7 @@ MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
 """Millimetres of each code of the spatial unit: unknown (read as mm, as other programs do), metre, mm, micron."""
 
 MM = 2
-SCANNER = 1
+_SCANNER = 1
 """Codes of NIfTI: lengths in mm, positions as the scanner gave them."""
 
 
@@ -102,9 +102,9 @@ def place_in_header(header: Any, affine: Float64Array) -> None:
     """Write the place of the voxels, given their affine to LPS mm, into a header of nibabel."""
     ras = lps_affine_from_ras(affine)
     header.set_xyzt_units(MM)
-    header.set_sform(ras, SCANNER)
+    header.set_sform(ras, _SCANNER)
     if _is_rigid(ras):
-        header.set_qform(ras, SCANNER)  # cannot hold a shear
+        header.set_qform(ras, _SCANNER)  # cannot hold a shear
     else:
         header["pixdim"][1:4] = column_spacing(affine)
 

@@ -28,13 +28,13 @@ from clrecon.system.text import format_digits
 LARGEST_INTEGER = 2**23
 """Integer voxels are interpolated in float32, which holds multiples of 0.5 exactly up to here."""
 
-LOWEST_OUTSIDE = -(2**30)
+_LOWEST_OUTSIDE = -(2**30)
 """Lowest value beyond the border: differences from integer voxels stay within 32 bits."""
 
 LARGEST_FLOAT = 1e30
 """Largest float voxel: differences, and their squares after scaling, stay within float32."""
 
-TOPOLOGIES: tuple[str, ...] = get_args(Topology)
+_TOPOLOGIES: tuple[str, ...] = get_args(Topology)
 """How inside samples are joined where the corners of a cell leave it open; see `IsoRule.topology`."""
 
 Level = float | Sequence[float | None]
@@ -240,15 +240,15 @@ def _choose_outside(rule: IsoRule, low: float, dtype: DTypeLike) -> float:
         if is_float:
             return level + max(level - low, least)
         mirrored = min(math.ceil(2.0 * level - low), LARGEST_INTEGER)
-        return float(min(max(rule.lowest_inside, mirrored), -LOWEST_OUTSIDE))
+        return float(min(max(rule.lowest_inside, mirrored), -_LOWEST_OUTSIDE))
     if low < level:
         return low
-    return level - least if is_float else float(max(rule.lowest_inside - 1, LOWEST_OUTSIDE))
+    return level - least if is_float else float(max(rule.lowest_inside - 1, _LOWEST_OUTSIDE))
 
 
 def check_topology(topology: str, *, ranged: bool = False) -> None:
-    if topology not in TOPOLOGIES:
-        raise UsageError(f"there is no topology {topology!r}: it is one of {', '.join(TOPOLOGIES)}")
+    if topology not in _TOPOLOGIES:
+        raise UsageError(f"there is no topology {topology!r}: it is one of {', '.join(_TOPOLOGIES)}")
     if ranged and topology == "trilinear":
         raise UsageError(
             "the topology trilinear follows one level, a range has two: leave it out, or give one iso value"
@@ -286,7 +286,7 @@ def checked_iso_value(iso_value: float) -> float:
     return number
 
 
-LARGEST_MARGIN = 0.25
+_LARGEST_MARGIN = 0.25
 """Largest margin, in index steps; beyond it a vertex no longer tells where on its edge it lies."""
 
 
@@ -302,7 +302,7 @@ def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
     steps = np.array(volume.spacing)
     steps[2] = np.linalg.norm(np.diff(volume.slice_origins(border=1), axis=0), axis=1).min()
     margin = 4.0 * unit / steps
-    if margin.max() > LARGEST_MARGIN:
+    if margin.max() > _LARGEST_MARGIN:
         raise UsageError(
             f"the volume reaches {format_digits(largest)} mm from its centre with steps of {format_digits(steps.min())}"
             f" mm: float32 vertices come in steps of {format_digits(unit, 2)} mm there; take a part of it"

@@ -13,10 +13,10 @@ from clrecon.geometry.grid import BaseVolume, Grid
 from clrecon.system.pieces import CHUNK, in_threads
 from clrecon.system.progress import Progress, ignore_progress
 
-ORDERS = (0, 1, 3)
+_ORDERS = (0, 1, 3)
 """Nearest voxel, trilinear, cubic spline."""
 
-SPLINE_MARGIN = 16
+_SPLINE_MARGIN = 16
 """Voxels around the points that a spline looks at: those further away count for less than 1e-9 of a voxel's value."""
 
 
@@ -25,8 +25,8 @@ def sample_volume(volume: BaseVolume, points: Float64Array, order: int, outside:
 
     By numpy, in pieces that stay in the processor's cache: a kernel with its uploads takes as long (docs/geometry.md).
     """
-    if order not in ORDERS:
-        raise UsageError(f"the order of an interpolation is one of {', '.join(map(str, ORDERS))}, not {order!r}")
+    if order not in _ORDERS:
+        raise UsageError(f"the order of an interpolation is one of {', '.join(map(str, _ORDERS))}, not {order!r}")
     values = np.full(len(points), float(outside))
     interpolate = {0: _nearest, 1: _trilinear, 3: _spline}[order]
 
@@ -74,8 +74,8 @@ def _trilinear(voxels: NDArray[Any], places: Float64Array) -> Float64Array:
 def _spline(voxels: NDArray[Any], places: Float64Array) -> Float64Array:
     from scipy import ndimage
 
-    first = np.maximum(np.floor(places.min(axis=1)).astype(int) - SPLINE_MARGIN, 0)
-    end = np.ceil(places.max(axis=1)).astype(int) + SPLINE_MARGIN + 1
+    first = np.maximum(np.floor(places.min(axis=1)).astype(int) - _SPLINE_MARGIN, 0)
+    end = np.ceil(places.max(axis=1)).astype(int) + _SPLINE_MARGIN + 1
     block = voxels[tuple(slice(low, high) for low, high in zip(first[::-1], end[::-1], strict=True))]
     at = (places - first[:, None])[::-1]
     return np.asarray(ndimage.map_coordinates(block, at, np.float64, order=3, mode="nearest"))

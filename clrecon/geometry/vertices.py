@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from clrecon.geometry.volume import Volume
 
 
-VERTEX_RULES: tuple[str, ...] = get_args(VertexRule)
+_VERTEX_RULES: tuple[str, ...] = get_args(VertexRule)
 
 GOLDEN = 0.6180340
 """(sqrt(5) - 1) / 2 in the digits of the paper, which float32 holds to its last place."""
@@ -36,8 +36,8 @@ SEARCH_STEPS = 24
 
 
 def check_vertex_rule(vertex_rule: str, topology: str = "separated") -> None:
-    if vertex_rule not in VERTEX_RULES:
-        raise UsageError(f"{name_parameter('vertex_rule')} is one of {', '.join(VERTEX_RULES)}, not {vertex_rule!r}")
+    if vertex_rule not in _VERTEX_RULES:
+        raise UsageError(f"{name_parameter('vertex_rule')} is one of {', '.join(_VERTEX_RULES)}, not {vertex_rule!r}")
     if vertex_rule != "linear" and topology == "trilinear":
         raise UsageError(
             f"{name_parameter('vertex_rule', vertex_rule)} and {name_parameter('topology', 'trilinear')} exclude each"

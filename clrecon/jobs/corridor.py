@@ -43,11 +43,11 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
 
 
-CSV_COLUMNS = ("entry_x", "entry_y", "entry_z", "tip_x", "tip_y", "tip_z", "diameter")
+_CSV_COLUMNS = ("entry_x", "entry_y", "entry_z", "tip_x", "tip_y", "tip_z", "diameter")
 """Columns of a CSV file, beside ``name`` and ``label``, which may be left out."""
 
-MOST_SCREWS = 200
-LARGEST_FILE = 1 << 20
+_MOST_SCREWS = 200
+_LARGEST_FILE = 1 << 20
 
 
 def parse_screw(text: str, space: str, number: int = 1) -> Screw:
@@ -75,14 +75,14 @@ def read_screws(path: str | Path, space: str) -> tuple[Screw, ...]:
     """
     shown = escape_text(Path(path).name)
     try:
-        text = read_regular(path, LARGEST_FILE).decode("utf-8-sig")
+        text = read_regular(path, _LARGEST_FILE).decode("utf-8-sig")
     except OSError as error:
         raise UsageError(f"the screws in {shown} cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise UsageError(f"{shown} is no text: screws are JSON or CSV") from error
     rows = _json_rows(text, shown) if text.lstrip()[:1] in ("[", "{") else _csv_rows(text, shown)
-    if not 0 < len(rows) <= MOST_SCREWS:
-        raise UsageError(f"{shown} has {len(rows):,} screws: 1 to {MOST_SCREWS} can be graded")
+    if not 0 < len(rows) <= _MOST_SCREWS:
+        raise UsageError(f"{shown} has {len(rows):,} screws: 1 to {_MOST_SCREWS} can be graded")
     screws = []
     for number, row in enumerate(rows, start=1):
         try:
@@ -116,11 +116,11 @@ def _json_rows(text: str, shown: str) -> list[dict[str, Any]]:
 
 def _csv_rows(text: str, shown: str) -> list[dict[str, Any]]:
     reader = csv.DictReader(io.StringIO(text))
-    missing = [name for name in CSV_COLUMNS if name not in (reader.fieldnames or ())]
+    missing = [name for name in _CSV_COLUMNS if name not in (reader.fieldnames or ())]
     if missing:
-        raise UsageError(f"{shown} has no column {missing[0]}: screws have {', '.join(CSV_COLUMNS)}")
+        raise UsageError(f"{shown} has no column {missing[0]}: screws have {', '.join(_CSV_COLUMNS)}")
     return [
-        {"numbers": [row[name] for name in CSV_COLUMNS], "name": row.get("name"), "label": row.get("label")}
+        {"numbers": [row[name] for name in _CSV_COLUMNS], "name": row.get("name"), "label": row.get("label")}
         for row in reader
     ]
 

@@ -149,18 +149,18 @@ def describe_grade(screw: Screw, grade: ScrewGrade, space: str) -> dict[str, Any
 
 Float64Array = NDArray[np.float64]
 
-WIDTH_MM = 96.0
+_WIDTH_MM = 96.0
 PIXELS = 400
-CORRIDOR, LIMIT, GIVEN = (90, 230, 120), (255, 190, 60), (255, 90, 90)
+_CORRIDOR, LIMIT, GIVEN = (90, 230, 120), (255, 190, 60), (255, 90, 90)
 """Colours of corridor, largest screw and given screws."""
 
-LEAST_RISE = 1e-6
+_LEAST_RISE = 1e-6
 """Rise of an axis over a plane, as a share of its length, below which the axis lies in the plane."""
 
 
 def _sample_plane(volume: Volume, centre: Float64Array, right: Float64Array, down: Float64Array) -> NDArray[np.float32]:
-    """Return HU (trilinear) of a plane of `WIDTH_MM`, shape (`PIXELS`, `PIXELS`); air beyond the scan."""
-    way = (np.arange(PIXELS) - (PIXELS - 1) / 2.0) * (WIDTH_MM / PIXELS)
+    """Return HU (trilinear) of a plane of `_WIDTH_MM`, shape (`PIXELS`, `PIXELS`); air beyond the scan."""
+    way = (np.arange(PIXELS) - (PIXELS - 1) / 2.0) * (_WIDTH_MM / PIXELS)
     points = centre + way[:, None, None] * down + way[None, :, None] * right
     return sample_volume(volume, points.reshape(-1, 3)).reshape(PIXELS, PIXELS)
 
@@ -188,7 +188,7 @@ def _across(
     """Return the circle where a cylinder's axis meets the plane; of one that lies in the plane, its section."""
     normal = np.cross(right, down)
     height, other = (ends - centre) @ normal
-    if abs(other - height) > LEAST_RISE * float(np.linalg.norm(ends[1] - ends[0])):
+    if abs(other - height) > _LEAST_RISE * float(np.linalg.norm(ends[1] - ends[0])):
         crossing = ends[0] + height / (height - other) * (ends[1] - ends[0])
         return [Stroke(_flatten_points(crossing[None], centre, right, down), color, radius)]
     half_width = np.sqrt(max(radius**2 - height**2, 0.0))
@@ -249,7 +249,7 @@ def _draw_row(
         panels.append(
             Panel(
                 _sample_plane(volume, centre, right, down),
-                WIDTH_MM / PIXELS,
+                _WIDTH_MM / PIXELS,
                 [*lines, caption] if number == 0 else [caption],
                 strokes,
                 edges,  # type: ignore[arg-type]
@@ -264,7 +264,7 @@ def _cylinders(
     """Return radius, ends and colour of what is drawn: corridor, largest screw, given screws."""
     drawn = []
     if corridor.radius is not None:
-        drawn.append((corridor.radius, ends, CORRIDOR))
+        drawn.append((corridor.radius, ends, _CORRIDOR))
         if corridor.radius > margin:
             drawn.append((corridor.radius - margin, ends, LIMIT))
     drawn += [(screw.diameter / 2.0, np.stack((screw.entry, screw.tip)), GIVEN) for screw in screws]

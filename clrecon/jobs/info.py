@@ -32,16 +32,16 @@ def describe_input(
 ) -> InputListing:
     """List the series of an input, a DICOM folder or file or a file of another format, and certify one."""
     settings = settings or InfoSettings()
-    found = list_selected(source, settings, pixels=settings.pixels, progress=progress)
-    entries = [entry.as_dict() for entry in found.series]
-    listing: dict[str, Any] = {"series": entries, "chosen": found.chosen, "certificate": found.certificate}
-    notes, problem, refused = list(found.warnings), found.refusal, None
-    if found.chosen is not None:
-        problem = _judge(next(entry for entry in entries if entry["number"] == found.chosen))
+    selected = list_selected(source, settings, pixels=settings.pixels, progress=progress)
+    entries = [entry.as_dict() for entry in selected.series]
+    listing: dict[str, Any] = {"series": entries, "chosen": selected.chosen, "certificate": selected.certificate}
+    notes, problem, refused = list(selected.warnings), selected.refusal, None
+    if selected.chosen is not None:
+        problem = _judge(next(entry for entry in entries if entry["number"] == selected.chosen))
         if problem is None:
             failed = _judge_gates(listing) if settings.strict else None
             return InputListing(listing, notes, failed)
-        refused, listing["chosen"] = found.chosen, None
+        refused, listing["chosen"] = selected.chosen, None
         notes.append(str(problem))
     if settings.series is None and not settings.strict and any(not entry["problems"] for entry in entries):
         return InputListing(listing, notes, None, refused)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from clrecon.points import PointCloud
 
 
-OTHER_CLOUDS = (".pcd", ".e57", ".laz", ".pts", ".ptx")
+_OTHER_CLOUDS = (".pcd", ".e57", ".laz", ".pts", ".ptx")
 """Extensions of clouds that are not read."""
 
 _OF_BOTH = ("keep_ids", "device", "memory")
@@ -47,7 +47,7 @@ def may_be_mesh(source: str | Path) -> bool:
 def refuse_other_clouds(source: str | Path) -> None:
     """Refuse a file whose extension is that of a cloud of another kind; it would be looked through for a scan."""
     extension = extension_of(source)
-    if extension in OTHER_CLOUDS and os.path.isfile(source):
+    if extension in _OTHER_CLOUDS and os.path.isfile(source):
         raise UsageError(
             f"clouds in files {extension} are not read: convert it to one of {', '.join(CLOUD_INPUTS)} first; text of"
             " X Y Z only needs the extension .xyz"

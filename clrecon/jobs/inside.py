@@ -30,7 +30,7 @@ COLORS = {
     "canal": (0.25, 0.55, 0.90),
 }
 
-FADED = {"solid": ("canal",), "dense": ("canal",), "trabecular": ("solid", "canal"), "canal": ("solid",)}
+_FADED = {"solid": ("canal",), "dense": ("canal",), "trabecular": ("solid", "canal"), "canal": ("solid",)}
 """Parts that are seen faded beside each opaque one: those that it does not hide."""
 
 FADED_OPACITY = 0.15
@@ -62,7 +62,7 @@ def draw_parts(
     for part, mesh in meshes.items():
         shown = [(mesh, MeshLook(COLORS[part]))]
         shown += [
-            (meshes[other], MeshLook(COLORS[other], opacity=FADED_OPACITY)) for other in FADED[part] if other in meshes
+            (meshes[other], MeshLook(COLORS[other], opacity=FADED_OPACITY)) for other in _FADED[part] if other in meshes
         ]
         with ScenePictures(shown, device=device, memory=memory) as scene:
             pictures[part] = scene.take(camera, DEFAULT_SIZE, "white")
@@ -226,7 +226,7 @@ def _write_vertebra(
         assert picture is not None
         (path,) = name_outputs(picture, [name_part(one.suffix, part, several=several)])
         size = run.write_picture(path, drawn).size
-        of_picture = {"part": part, "faded": list(FADED[part]), "size": list(drawn.size)}
+        of_picture = {"part": part, "faded": list(_FADED[part]), "size": list(drawn.size)}
         entry["pictures"].append(of_picture | {"format": extension_of(path)[1:], "bytes": size})
         entry["warnings"] += drawn.report["warnings"]
     return entry

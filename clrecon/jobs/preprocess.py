@@ -236,7 +236,7 @@ def _to_lps(points: Any, space: str) -> Any:
     return np.asarray(points, dtype=np.float64) * np.diag(frame_from_lps(space))
 
 
-MOST_TAKEN = 0.5
+_MOST_TAKEN = 0.5
 """Largest share of the voxels at the level and above that the steps may take unless that is allowed."""
 
 
@@ -360,10 +360,10 @@ class _StepRun:
         share = facts["taken"] / facts["voxels"]
         if share == 1.0:
             raise NoSurfaceError(f"{step} takes all {facts['voxels']:,} voxels: choose a smaller radius")
-        if share > MOST_TAKEN and not self._settings.allow_bone_loss:
+        if share > _MOST_TAKEN and not self._settings.allow_bone_loss:
             raise RefusedInputError(
                 f"{step} takes {facts['taken']:,} of {facts['voxels']:,} voxels ({100.0 * share:.0f} %, over"
-                f" {100.0 * MOST_TAKEN:.0f}): choose a smaller radius, or go on with"
+                f" {100.0 * _MOST_TAKEN:.0f}): choose a smaller radius, or go on with"
                 f" {name_parameter('allow_bone_loss', True)}"
             )
 

@@ -160,7 +160,7 @@ class DistanceSettings(ScanSettings, DeviceSettings):
         super().__post_init__()
 
 
-INSIDE_VIEW = "130,20"
+_INSIDE_VIEW = "130,20"
 """From the left, behind and above: body, arch and canal are seen."""
 
 
@@ -184,9 +184,9 @@ class InsideSettings(ScanSettings, DeviceSettings):
     label: Sequence[str | int] = label_option("label of a vertebra; may be given again", required=True, first=True)
     view: str = option(
         "--view V",
-        f"anterior, posterior, left, right, superior, inferior, or AZ,EL in degrees (default: {INSIDE_VIEW})",
+        f"anterior, posterior, left, right, superior, inferior, or AZ,EL in degrees (default: {_INSIDE_VIEW})",
         group="pictures",
-        default=INSIDE_VIEW,
+        default=_INSIDE_VIEW,
         words=("anterior", "posterior", "left", "right", "superior", "inferior"),
     )
     iso_value: float | None = _parts_option(
@@ -273,7 +273,7 @@ class VertebraeSettings(ScanSettings):
         check_landmark(self.name_at, self.first)
 
 
-LARGEST_MARGIN_MM = 5.0
+_LARGEST_MARGIN_MM = 5.0
 
 
 def _parse_level(text: str) -> float | None:
@@ -311,8 +311,8 @@ class CorridorSettings(ScanSettings, DeviceSettings):
     def __post_init__(self) -> None:
         if not self.label:
             raise UsageError(f"name the vertebrae: {name_parameter('label', 'L3')}, once for each")
-        if not (math.isfinite(self.margin) and 0.0 <= self.margin <= LARGEST_MARGIN_MM):
-            raise UsageError(f"the margin is a length from 0 to {LARGEST_MARGIN_MM:g} mm, not {self.margin:g}")
+        if not (math.isfinite(self.margin) and 0.0 <= self.margin <= _LARGEST_MARGIN_MM):
+            raise UsageError(f"the margin is a length from 0 to {_LARGEST_MARGIN_MM:g} mm, not {self.margin:g}")
         check_surface(self.surface, self.iso_value)
         check_space(self.space)
         super().__post_init__()

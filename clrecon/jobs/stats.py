@@ -102,15 +102,15 @@ def _measure_surfaces(
     return found
 
 
-SURFACE_CELLS = ("area_mm2", "ml", "thickness_p5_mm", "thickness_p50_mm", "thickness_p95_mm", "error_p50_mm", "fitted")
+_SURFACE_CELLS = ("area_mm2", "ml", "thickness_p5_mm", "thickness_p50_mm", "thickness_p95_mm", "error_p50_mm", "fitted")
 """Columns of the table of a surface, before which stands ``surface_``."""
 
 
 def surface_cells(surface: Mapping[str, Any]) -> list[Any]:
-    """Return the figures of a surface by `SURFACE_CELLS`; None for what was not measured."""
+    """Return the figures of a surface by `_SURFACE_CELLS`; None for what was not measured."""
     cortex = surface["cortex"] or {}
     if not cortex.get("vertices"):
-        return [surface["area_mm2"], surface["ml"], *[None] * (len(SURFACE_CELLS) - 2)]
+        return [surface["area_mm2"], surface["ml"], *[None] * (len(_SURFACE_CELLS) - 2)]
     walls = cortex["thickness_mm"]
     error, fitted = cortex["error_mm"]["p50"], cortex["fitted"] / cortex["vertices"]
     return [surface["area_mm2"], surface["ml"], walls["p5"], walls["p50"], walls["p95"], error, fitted]
@@ -123,7 +123,7 @@ def as_csv(report: StatsReport) -> str:
     wanted = [name_percentile(percent) for percent in report.percentiles]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    of_surface = [f"surface_{name}" for name in SURFACE_CELLS] if any(one.surface for one in report.labels) else []
+    of_surface = [f"surface_{name}" for name in _SURFACE_CELLS] if any(one.surface for one in report.labels) else []
     writer.writerow([*own, *(f"p{name}_hu" for name in wanted), *of_surface])
     for one in report.labels:
         cells = [*(one[name] for name in own), *(one["percentiles_hu"][name] for name in wanted)]

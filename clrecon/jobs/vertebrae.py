@@ -104,7 +104,7 @@ def _check_formats(source: str | Path, output: str | Path, picture: str | Path |
     from clrecon.reading import tell_format
 
     kind = map_format(output)
-    if kind in NIFTI:
+    if kind in _NIFTI:
         load_nibabel()
     elif (found := tell_format(source)) is not None:
         raise UsageError(f"DICOM SEG belongs to a scan in DICOM, and this is {found}: write the label map as .nii.gz")
@@ -116,7 +116,7 @@ def _check_formats(source: str | Path, output: str | Path, picture: str | Path |
 
 def _encode_map(labels: LabelMap, output: str | Path, source: str | Path, settings: VertebraeSettings) -> bytes:
     kind = map_format(output)
-    if kind in SEGMENTATION:
+    if kind in _SEGMENTATION:
         from clrecon.labels.write_segmentation import encode_segmentation
         from clrecon.reading.dicom.reader import list_slices
 
@@ -126,12 +126,12 @@ def _encode_map(labels: LabelMap, output: str | Path, source: str | Path, settin
     return encode_nifti(labels, packed=kind.endswith(".gz"))
 
 
-NIFTI, SEGMENTATION = ("nii", "nii.gz"), ("dcm",)
+_NIFTI, _SEGMENTATION = ("nii", "nii.gz"), ("dcm",)
 
 
 def map_format(path: str | Path) -> str:
     name = os.path.basename(os.fspath(path)).lower()
-    for kind in (*NIFTI[::-1], *SEGMENTATION):
+    for kind in (*_NIFTI[::-1], *_SEGMENTATION):
         if name.endswith(f".{kind}") and name != f".{kind}":
             return kind
     raise UsageError(f"a label map is written as .nii.gz, .nii (NIfTI) or .dcm (DICOM SEG), not {name[-40:]!r}")
@@ -143,14 +143,14 @@ def picture_beside(output: str | Path) -> str:
     return text[: -len(map_format(output)) - 1] + ".png"
 
 
-PIXELS_PER_MM = 3
+_PIXELS_PER_MM = 3
 WINDOW_HU = (-150.0, 650.0)
-TINT = 0.35
+_TINT = 0.35
 """Share of a vertebra's colour in its pixels."""
-LOW_COLOR = (255, 40, 40)
-LINE_COLOR = (255, 230, 0)
-TEXT_MM = 6.0
-NAMES_MM = 62
+_LOW_COLOR = (255, 40, 40)
+_LINE_COLOR = (255, 230, 0)
+_TEXT_MM = 6.0
+_NAMES_MM = 62
 
 
 def draw_vertebrae(split: VertebraSplit) -> bytes:
@@ -164,22 +164,22 @@ def draw_vertebrae(split: VertebraSplit) -> bytes:
     doubted = [one.number for one in split.low_confidence]
     left = _tint_slice(plane.sagittal, plane.sagittal_labels, shades, doubted)
     right = _tint_slice(plane.coronal, plane.coronal_labels, shades, doubted)
-    gap = np.zeros((len(left), NAMES_MM * PIXELS_PER_MM, 3), np.uint8)
+    gap = np.zeros((len(left), _NAMES_MM * _PIXELS_PER_MM, 3), np.uint8)
     picture = Image.fromarray(np.concatenate([left, gap, right], axis=1))
     pen = ImageDraw.Draw(picture)
     for front, back in plane.lines:
-        ends = [((column + 0.5) * PIXELS_PER_MM, (row + 0.5) * PIXELS_PER_MM) for row, column in (front, back)]
-        pen.line(ends, fill=LINE_COLOR, width=2)
+        ends = [((column + 0.5) * _PIXELS_PER_MM, (row + 0.5) * _PIXELS_PER_MM) for row, column in (front, back)]
+        pen.line(ends, fill=_LINE_COLOR, width=2)
         row = 0.5 * (front[0] + back[0])
-        at = left.shape[1] + gap.shape[1], (row + 0.5) * PIXELS_PER_MM
-        pen.line([at, (picture.width, at[1])], fill=LINE_COLOR, width=1)
-    font = load_font(TEXT_MM * PIXELS_PER_MM)
+        at = left.shape[1] + gap.shape[1], (row + 0.5) * _PIXELS_PER_MM
+        pen.line([at, (picture.width, at[1])], fill=_LINE_COLOR, width=1)
+    font = load_font(_TEXT_MM * _PIXELS_PER_MM)
     for one, row in zip(split.vertebrae, split.plane.rows, strict=True):
         text = (
             f"{one.name}  {one.confidence:.2f}" + ("" if one.is_confident else "  low") + ("" if one.whole else "  cut")
         )
-        color = tuple(int(value) for value in shades[one.number]) if one.is_confident else LOW_COLOR
-        pen.text((left.shape[1] + 6, (row + 0.5) * PIXELS_PER_MM), text, color, font, "lm")
+        color = tuple(int(value) for value in shades[one.number]) if one.is_confident else _LOW_COLOR
+        pen.text((left.shape[1] + 6, (row + 0.5) * _PIXELS_PER_MM), text, color, font, "lm")
     stream = BytesIO()
     picture.save(stream, "PNG")
     return stream.getvalue()
@@ -191,14 +191,14 @@ def _tint_slice(
     """Return grey values with the colours of the vertebrae over them, enlarged."""
     low, high = WINDOW_HU
     grey = np.clip((np.nan_to_num(values, nan=low) - low) / (high - low), 0.0, 1.0) * 255.0
-    large = np.repeat(np.repeat(grey, PIXELS_PER_MM, axis=0), PIXELS_PER_MM, axis=1)
-    numbers = np.repeat(np.repeat(labels, PIXELS_PER_MM, axis=0), PIXELS_PER_MM, axis=1)
+    large = np.repeat(np.repeat(grey, _PIXELS_PER_MM, axis=0), _PIXELS_PER_MM, axis=1)
+    numbers = np.repeat(np.repeat(labels, _PIXELS_PER_MM, axis=0), _PIXELS_PER_MM, axis=1)
     picture = np.repeat(large[..., None], 3, axis=2)
     rows, columns = np.indices(numbers.shape)
     for number, shade in shades.items():
         own = numbers == number
         if number in doubted:
             own &= (rows + columns) % 12 < 4
-            shade = np.array(LOW_COLOR)
-        picture[own] = (1.0 - TINT) * picture[own] + TINT * shade
+            shade = np.array(_LOW_COLOR)
+        picture[own] = (1.0 - _TINT) * picture[own] + _TINT * shade
     return np.asarray(np.rint(picture), dtype=np.uint8)

@@ -21,7 +21,7 @@ and in tilted or coarse slices no single one shows a closed ring."""
 BEYOND_MM = 6.0
 """What lies so far above and below a hole tells whether it goes on there."""
 
-MOST_BLOCKED = 0.5
+_MOST_BLOCKED = 0.5
 """Share of a hole's outline that bone may cover there.  The wall of a canal that is tilted by 30 degrees covers a
 quarter, the bone below a hollow endplate nearly all."""
 
@@ -181,7 +181,7 @@ def _largest_open(holes: Bits, solid: Bits, places: _Places) -> Bits | None:
         away = places.heights - places.heights[[first, last]][:, None]
         above = (away[1] > 0.0) & (away[1] <= max(BEYOND_MM, away[1, min(last + 1, len(solid) - 1)]))
         below = (away[0] < 0.0) & (away[0] >= min(-BEYOND_MM, away[0, max(first - 1, 0)]))
-        if all(solid[side].any(axis=0)[section].mean() < MOST_BLOCKED for side in (above, below)):
+        if all(solid[side].any(axis=0)[section].mean() < _MOST_BLOCKED for side in (above, below)):
             return np.asarray(hole)
     return None
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from clrecon.system.light_dataclass import dataclass
 
-MOST_OVER_EACH_OTHER = 20_000
+_MOST_OVER_EACH_OTHER = 20_000
 """Most pairs of contours of one ROI that lie over each other on one slice."""
 
 ROUNDED_MM = 0.01
@@ -26,7 +26,7 @@ NOISE_MM = 0.05
 """Contours of which one goes this little beyond the other do not cross: writers round to 0.01 mm."""
 
 
-THIN_PIXELS = 0.25
+_THIN_PIXELS = 0.25
 """Contours with less between them, on average along the outline, are one contour drawn twice and no hole in the other:
 a ring so thin holds hardly a pixel centre."""
 
@@ -89,7 +89,7 @@ class _Patch:
 
     def is_drawn_again(self, other: _Patch) -> bool:
         """Tell whether one of two nested contours leaves next to nothing of the other."""
-        return abs(self.area - other.area) <= THIN_PIXELS * max(self.outline, other.outline)
+        return abs(self.area - other.area) <= _THIN_PIXELS * max(self.outline, other.outline)
 
     def common(self, other: _Patch) -> tuple[slice, slice]:
         """Return the part of the own pixels that lies in the box of another contour, which overlaps."""
@@ -166,8 +166,8 @@ def _find_near(contours: Sequence[NDArray[np.float64]], shape: tuple[int, int]) 
     for a in range(len(contours) - 1):
         size = np.minimum(high[a], high[a + 1 :]) - np.maximum(low[a], low[a + 1 :])
         pairs += [(a, int(b) + a + 1) for b in np.flatnonzero(np.all(size > 0, axis=1))]
-        if len(pairs) > MOST_OVER_EACH_OTHER:
-            raise ValueError(f"more than {MOST_OVER_EACH_OTHER:,} pairs of contours lie over each other")
+        if len(pairs) > _MOST_OVER_EACH_OTHER:
+            raise ValueError(f"more than {_MOST_OVER_EACH_OTHER:,} pairs of contours lie over each other")
     return pairs
 
 

@@ -14,8 +14,8 @@ from clrecon.geometry.blocks import MM3_PER_ML
 from clrecon.labels.label_map import LabelMap
 from clrecon.system.light_dataclass import dataclass
 
-MOST_OFFSETS = 5000
-SAME_DISTANCE = 1e-6
+_MOST_OFFSETS = 5000
+_SAME_DISTANCE = 1e-6
 """Relative difference; offsets whose lengths differ by less, by rounding alone, are equally near."""
 
 
@@ -39,7 +39,7 @@ class Growth:
         limit = _checked(grow_mm, volume)
         reach = np.floor(limit * np.linalg.norm(np.linalg.inv(steps), axis=1) + 1e-9).astype(int)
         offsets = _offsets_within(tuple(reach))
-        near = np.linalg.norm(offsets @ steps.T, axis=1) <= limit * (1.0 + SAME_DISTANCE)
+        near = np.linalg.norm(offsets @ steps.T, axis=1) <= limit * (1.0 + _SAME_DISTANCE)
         return cls(limit, *_sort(offsets[near], steps))
 
     @property
@@ -62,7 +62,7 @@ def _checked(grow_mm: float, volume: Volume) -> float:
     if not (math.isfinite(number) and number >= 0.0):
         raise UsageError(f"labels grow by 0 mm or more, not {number:g}")
     di, dj, dk = volume.spacing
-    if 4 / 3 * math.pi * number * number * number / (di * dj * dk) > MOST_OFFSETS:  # number**3 may overflow
+    if 4 / 3 * math.pi * number * number * number / (di * dj * dk) > _MOST_OFFSETS:  # number**3 may overflow
         raise UsageError(
             f"labels cannot grow by {number:g} mm on voxels of {di:.3g} x {dj:.3g} x {dk:.3g} mm: growth mends the"
             " border of a mask, up to some ten voxels"
@@ -83,7 +83,7 @@ def _sort(offsets: NDArray[np.int32], steps: NDArray[np.float64]) -> tuple[NDArr
     offsets, lengths = offsets[order], lengths[order]
     shells = np.zeros(len(lengths), dtype=np.int32)
     if len(lengths):
-        shells[1:] = np.cumsum(np.diff(lengths) > SAME_DISTANCE * lengths[:-1])
+        shells[1:] = np.cumsum(np.diff(lengths) > _SAME_DISTANCE * lengths[:-1])
     order = np.lexsort((*offsets.T, shells))
     return np.ascontiguousarray(offsets[order], dtype=np.int32), shells
 

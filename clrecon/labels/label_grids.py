@@ -142,7 +142,7 @@ SAME_GRID_MM = 1e-3
 """Largest distance of a voxel from its place in the first mask; a sform is float32."""
 
 
-GRID_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".hdr")
+_GRID_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".hdr")
 """Ends of the names of links that are not opened, by which they may be masks."""
 
 
@@ -163,7 +163,7 @@ def _list_files(folder: Path, follow_links: bool) -> Iterator[Path]:
         (kept, "out of it", f"{name_parameter('follow_links', True)} follows links"),
     ]
     for links, whither, advice in left:
-        masks = [escape_text(path.name) for path in links if path.name.lower().endswith(GRID_SUFFIXES)]
+        masks = [escape_text(path.name) for path in links if path.name.lower().endswith(_GRID_SUFFIXES)]
         if masks and not (follow_links and links is kept):
             what = "mask of {} is a link" if len(masks) == 1 else "masks of {} are links"
             raise RefusedInputError(

@@ -30,8 +30,8 @@ from clrecon.system.packages import ShownAsHtml, public_function
 from clrecon.system.paths import keep_existing
 from clrecon.system.text import escape_text
 
-SUFFIX_LENGTH = 40
-LABELS_LISTED = 60
+_SUFFIX_LENGTH = 40
+_LABELS_LISTED = 60
 
 _LEVEL = re.compile(r"(c|th?|l|s)(0?[1-9]|1[0-9])")
 _VERTEBRA = ("vertebra", "vertebrae", "vert", "level")
@@ -47,7 +47,7 @@ def check_name(name: str) -> str:
 
 def list_labels(names: Mapping[int, str], numbers: Collection[int]) -> str:
     """Return the labels that occur for a message: ``27 vertebrae_L5, 28 vertebrae_L4``."""
-    shown = [f"{number} {names[number]}" for number in sorted(numbers)][:LABELS_LISTED]
+    shown = [f"{number} {names[number]}" for number in sorted(numbers)][:_LABELS_LISTED]
     more = len(numbers) - len(shown)
     return (", ".join(shown) or "none") + (f" and {more} more" if more > 0 else "")
 
@@ -97,7 +97,7 @@ def find_number(label: str | int, names: Mapping[int, str], present: Collection[
 
 def label_suffix(name: str) -> str:
     """Return a name as part of a file name: letters, digits, dot, hyphen and underscore, at most 40; else ``label``."""
-    safe = re.sub(r"[^A-Za-z0-9._-]+", "_", name)[:SUFFIX_LENGTH].strip("._-")
+    safe = re.sub(r"[^A-Za-z0-9._-]+", "_", name)[:_SUFFIX_LENGTH].strip("._-")
     return safe or "label"
 
 
@@ -423,7 +423,7 @@ class LabelMap(Grid, ShownAsHtml):
         return f"LabelMap({ni} x {nj} x {nk}, spacing {di:.4g} x {dj:.4g} x {dk:.4g} mm, {len(self.numbers)} labels)"
 
 
-CARET_CODE = 30
+_CARET_CODE = 30
 """Code of the extension that holds Caret's XML, which has a table of labels."""
 
 
@@ -444,7 +444,7 @@ def encode_nifti(labels: LabelMap, *, packed: bool) -> bytes:
     )
     text = f'<?xml version="1.0" encoding="UTF-8"?><CaretExtension><VolumeInformation Index="0"><LabelTable>{table}'
     text += "</LabelTable></VolumeInformation></CaretExtension>"
-    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(CARET_CODE, text.encode("utf-8")))
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(_CARET_CODE, text.encode("utf-8")))
     content = bytes(image.to_bytes())
     return gzip.compress(content, compresslevel=6, mtime=0) if packed else content
 

@@ -24,7 +24,7 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 
-OTHER_OBJECTS = {
+_OTHER_OBJECTS = {
     "1.2.840.10008.5.1.4.1.1.481.2": "an RT dose",
     "1.2.840.10008.5.1.4.1.1.481.5": "an RT plan",
     "1.2.840.10008.5.1.4.1.1.481.1": "an RT image",
@@ -35,14 +35,14 @@ OTHER_OBJECTS = {
 LARGE_BYTES = 2**29
 """Stored bytes that take a second to unpack.  Zeros pack to a thousandth: a file of 33 MB can hold 34 GB."""
 
-MOST_TIMES = 8
+_MOST_TIMES = 8
 """Most voxels of a large map for each voxel of its scan: twice as fine along each axis."""
 
 
-MASK_NUMBERS = ((1,), (255,))
+_MASK_NUMBERS = ((1,), (255,))
 """The numbers of a mask of one structure."""
 
-WARNINGS_SHOWN = 3
+_WARNINGS_SHOWN = 3
 """Warnings that a refusal quotes."""
 
 
@@ -136,7 +136,7 @@ def _read(path: Path, wanted: Wanted, volume: Grid | None, follow_links: bool, p
     if not labels.numbers and wanted.labels is not None:
         raise UsageError(f"no voxel of {name} has the label '{escape_text(str(wanted.labels[0]), 60)}'")
     if not labels.numbers:
-        why = "".join(f"; {warning}" for warning in labels.warnings[:WARNINGS_SHOWN])
+        why = "".join(f"; {warning}" for warning in labels.warnings[:_WARNINGS_SHOWN])
         raise RefusedInputError(f"{name} is empty: no voxel has a label{why}")
     for label in wanted.labels or ():
         labels.find(label)
@@ -145,8 +145,8 @@ def _read(path: Path, wanted: Wanted, volume: Grid | None, follow_links: bool, p
 
 def _read_dicom(path: Path, wanted: Wanted, volume: Grid | None, progress: Progress) -> LabelMap:
     name, sop_class = escape_text(path.name), _tell_class(path)
-    if sop_class in OTHER_OBJECTS:
-        raise RefusedInputError(f"{name} is {OTHER_OBJECTS[sop_class]}, no label map: give a SEG or an RTSTRUCT")
+    if sop_class in _OTHER_OBJECTS:
+        raise RefusedInputError(f"{name} is {_OTHER_OBJECTS[sop_class]}, no label map: give a SEG or an RTSTRUCT")
     if sop_class == STRUCTURE_SET:
         return read_structures(path, volume if isinstance(volume, Volume) else None, wanted, progress)
     return read_segmentation(path, wanted, progress, partial(_check_proportion, name, volume))
@@ -167,7 +167,7 @@ def _read_folder(follow_links: bool, path: Path, wanted: Wanted, volume: Grid | 
 
 def _name_mask(labels: LabelMap, path: Path) -> LabelMap:
     """Return the map; a mask of one structure that its file does not name has the name of the file."""
-    if labels.numbers not in MASK_NUMBERS or labels.names != {n: f"label_{n}" for n in labels.numbers}:
+    if labels.numbers not in _MASK_NUMBERS or labels.names != {n: f"label_{n}" for n in labels.numbers}:
         return labels
     names = {labels.numbers[0]: name_of_grid(path)}
     return LabelMap(labels.voxels, labels.affine, names, warnings=labels.warnings)
@@ -216,10 +216,10 @@ def _check_proportion(name: str, volume: Grid | None, shape_ijk: tuple[int, int,
     if volume is None:
         return
     times = prod(shape_ijk) / prod(volume.shape_ijk)
-    if stored_bytes <= LARGE_BYTES or times <= MOST_TIMES:
+    if stored_bytes <= LARGE_BYTES or times <= _MOST_TIMES:
         return
     shapes = [" x ".join(map(str, each)) for each in (shape_ijk, volume.shape_ijk)]
     raise RefusedInputError(
         f"{name} has {shapes[0]} voxels, {times:,.0f} times as many as the scan ({shapes[1]}): it is not unpacked,"
-        f" up to {MOST_TIMES} times are; give labels on the grid of the scan"
+        f" up to {_MOST_TIMES} times are; give labels on the grid of the scan"
     )

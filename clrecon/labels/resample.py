@@ -19,7 +19,7 @@ from clrecon.system.text import format_ml
 
 log = get_logger(__name__)
 
-LEAST_SHARE_INSIDE = 0.01
+_LEAST_SHARE_INSIDE = 0.01
 """Least share of the labelled voxels inside the volume: labels of a whole body have more in a scan of one joint, of
 another scan less."""
 
@@ -238,7 +238,7 @@ def _check_overlap(labels: LabelMap, volume: Volume, shares: dict[int, float]) -
     total = sum(labels.counts.values())
     share = sum(shares[number] * count for number, count in labels.counts.items()) / max(total, 1)
     is_crop = any(volume.report.get(part) is not None for part in ("crop", "sliced"))  # which may leave most labels out
-    if share >= LEAST_SHARE_INSIDE or (is_crop and share > 0.0):
+    if share >= _LEAST_SHARE_INSIDE or (is_crop and share > 0.0):
         return
     if is_crop:
         raise RefusedInputError(

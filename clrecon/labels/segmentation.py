@@ -31,7 +31,7 @@ from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text, hash_uid
 
-DIRECTIONS_DIFFER = 1e-4
+_DIRECTIONS_DIFFER = 1e-4
 """Largest difference between direction cosines; the gate of a CT series allows as much between slices."""
 
 SAME_PLACE_MM = 1e-3
@@ -75,7 +75,7 @@ def place_frames(shared: Any, groups: list[Any], name: str) -> FrameStack:
     measures = [_group(shared, g, "PixelMeasuresSequence") for g in groups]
     spacings = np.stack([_numbers(m.PixelSpacing, 2) for m in measures])
     positions = np.stack([_numbers(_group(shared, g, "PlanePositionSequence").ImagePositionPatient, 3) for g in groups])
-    if np.ptp(directions, axis=0).max() > DIRECTIONS_DIFFER or np.ptp(spacings, axis=0).max() > DIRECTIONS_DIFFER:
+    if np.ptp(directions, axis=0).max() > _DIRECTIONS_DIFFER or np.ptp(spacings, axis=0).max() > _DIRECTIONS_DIFFER:
         raise RefusedInputError(f"the frames of {name} differ in direction or pixel spacing: they form no stack")
     row, column = directions[0, :3], directions[0, 3:]
     normal = np.cross(row, column)

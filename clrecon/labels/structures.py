@@ -29,11 +29,11 @@ from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import count_of, escape_text, hash_uid
 
-PARTS_OF_GAP = (4.0, 2.0)
+_PARTS_OF_GAP = (4.0, 2.0)
 """Slices to the smallest gap; the second where the first makes too many."""
 
 MOST_SLICES = 4000
-MOST_ASIDE = 0.4
+_MOST_ASIDE = 0.4
 """Pixels that a slice may lie off the line of all: with less than half a pixel the nearest label is its own."""
 
 
@@ -57,11 +57,11 @@ def label_slices(volume: Volume) -> LabelSlices:
     line = (origins[-1] - origins[0]) / (heights[-1] - heights[0])  # mm per mm of height
     aside = (origins - origins[0] - (heights - heights[0])[:, None] * line) @ np.linalg.pinv(volume.affine[:3, :2]).T
     low, high = heights[0] - gaps[0] / 2.0, heights[-1] + gaps[-1] / 2.0
-    step = next((gaps.min() / n for n in PARTS_OF_GAP if (high - low) * n / gaps.min() <= MOST_SLICES), None)
-    if step is None or np.abs(aside).max() > MOST_ASIDE:
+    step = next((gaps.min() / n for n in _PARTS_OF_GAP if (high - low) * n / gaps.min() <= MOST_SLICES), None)
+    if step is None or np.abs(aside).max() > _MOST_ASIDE:
         raise UsageError(
             f"the slices of the scan are too uneven for contours: {gaps.min():.4g} to {gaps.max():.4g} mm apart, up to"
-            f" {np.abs(aside).max():.2f} pixels off a line (at most {MOST_ASIDE:g})"
+            f" {np.abs(aside).max():.2f} pixels off a line (at most {_MOST_ASIDE:g})"
         )
     places = np.arange(low + step / 2.0, high, step)
     affine = np.array(volume.affine)
@@ -72,16 +72,16 @@ def label_slices(volume: Volume) -> LabelSlices:
 
 STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
 LARGEST_BYTES = 2**30
-MOST_CONTOURS = 1_000_000
+_MOST_CONTOURS = 1_000_000
 
 ON_SLICE_MM, ON_SLICE_STEPS = 0.1, 0.1
 """Largest distance of a contour's points from their slice, in mm and in steps to the next slice; writers round to
 0.01 mm, and some take the places of slices from even steps."""
 
-LEAST_POINTS = 3
+_LEAST_POINTS = 3
 """Points that enclose something; rt_utils and others write contours of one and two as well."""
 
-ON_CENTRE = 0.01
+_ON_CENTRE = 0.01
 """Largest distance of corners from voxel centres, in voxels, at which contours run through voxel centres."""
 
 Corners = NDArray[np.float64]
@@ -144,16 +144,16 @@ def read_structures(
     voxels = empty_labels(name, (len(grid.nearest), nj, ni))
     painter = Painter(name, voxels, names, wanted)
     for done, number in enumerate(painter.order):
-        found = _Raster(name, structures[number], shown[number], volume)
+        raster = _Raster(name, structures[number], shown[number], volume)
         if number in chosen:
-            found.refuse_misplaced()
-        for k, mask in found.fill():
+            raster.refuse_misplaced()
+        for k, mask in raster.fill():
             for place in np.flatnonzero(grid.nearest == k):
                 painter.paint(int(place), number, mask)
         if number in chosen:
-            warnings += found.describe()
+            warnings += raster.describe()
             if wanted.labels is not None:
-                found.refuse_empty()
+                raster.refuse_empty()
         progress("read", done + 1, len(painter.order))
     frame = volume.report.get("frame_of_reference_hash")
     return painter.finish(grid.affine, frame_of_reference_hash=frame, warnings=warnings)
@@ -194,7 +194,7 @@ class _Raster:
         allowed = np.maximum(ON_SLICE_MM, ON_SLICE_STEPS * np.minimum(gaps[1:], gaps[:-1]))
         for contour in self._structure.contours:
             points = _points_of(contour, self._file, self._shown)
-            if len(points) < LEAST_POINTS:
+            if len(points) < _LEAST_POINTS:
                 self._short += 1
                 continue
             ijk = volume.lps_to_ijk(points)
@@ -206,7 +206,7 @@ class _Raster:
             self._off_mm = max(self._off_mm, off)
             self._misplaced += off > allowed[k]
             corners = ijk[:, :2]
-            self._on_centres &= bool(np.abs(corners - np.rint(corners)).max() <= ON_CENTRE)
+            self._on_centres &= bool(np.abs(corners - np.rint(corners)).max() <= _ON_CENTRE)
             slices.setdefault(k, ([], []))[contour.exclusive].append(corners)
         return slices
 
@@ -253,7 +253,7 @@ class _Raster:
             kinds = ", ".join(f"{count} {escape_text(kind, 30)}" for kind, count in self._structure.others.items())
             said.append(f": {kinds} left out, only closed planar contours enclose voxels")
         if self._short:
-            said.append(f": {count_of(self._short, 'contour')} of fewer than {LEAST_POINTS} points left out")
+            said.append(f": {count_of(self._short, 'contour')} of fewer than {_LEAST_POINTS} points left out")
         if self._beyond:
             said.append(f": {count_of(self._beyond, 'contour')} beyond the slices of the scan left out")
         if not self._structure.contours:
@@ -319,7 +319,7 @@ def _parse(path: Path, name: str) -> dict[int, _Structure]:
             _SCHEMA,
             implicit=syntax == IMPLICIT_LITTLE,
             little_endian=True,
-            items_limit=MOST_CONTOURS,
+            items_limit=_MOST_CONTOURS,
         )
         return _collect(top, name)
     except ValueProblem as problem:

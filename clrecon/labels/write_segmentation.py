@@ -23,7 +23,7 @@ from clrecon.version import package_version
 SourceSlice = tuple[Path, int, int]
 """File of a slice of the scan, its frame there from 0, and how many frames the file has."""
 
-SEGMENTATION_CLASS = "1.2.840.10008.5.1.4.1.1.66.4"
+_SEGMENTATION_CLASS = "1.2.840.10008.5.1.4.1.1.66.4"
 ROOT = "2.25."
 _KEPT = ("StudyInstanceUID", "SeriesInstanceUID", "FrameOfReferenceUID", "SOPClassUID", "SOPInstanceUID")
 _DATE, _TIME = "19700101", "000000"
@@ -73,11 +73,11 @@ def _describe(make_uid: Callable[[str], str], first: dict[str, str]) -> Any:
     from pydicom.uid import ExplicitVRLittleEndian
 
     meta = FileMetaDataset()
-    meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID = SEGMENTATION_CLASS, make_uid("instance")
+    meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID = _SEGMENTATION_CLASS, make_uid("instance")
     meta.TransferSyntaxUID = ExplicitVRLittleEndian
     meta.ImplementationClassUID = ROOT + "226127114137317107413166301416404110851"
     seg = FileDataset("", {}, file_meta=meta, preamble=b"\0" * 128)
-    seg.SOPClassUID, seg.SOPInstanceUID = SEGMENTATION_CLASS, meta.MediaStorageSOPInstanceUID
+    seg.SOPClassUID, seg.SOPInstanceUID = _SEGMENTATION_CLASS, meta.MediaStorageSOPInstanceUID
     for empty in ("PatientName", "PatientID", "PatientBirthDate", "PatientSex", "StudyDate", "StudyTime", "StudyID"):
         setattr(seg, empty, "")
     seg.AccessionNumber = seg.ReferringPhysicianName = seg.PositionReferenceIndicator = ""

@@ -247,8 +247,8 @@ def count_duplicate_faces(triangles: NDArray[np.uint32], vertex_count: int, oppo
     """Count triangles with the vertices of an earlier one, neighbours on all sides where given `opposite`."""
     if opposite is not None:
         return len(find_faces_back_to_back(opposite)) // 2
-    found = find_duplicate_faces(triangles, vertex_count)
-    return len(found) - len(np.unique(np.sort(triangles[found], axis=1), axis=0))
+    duplicate_faces = find_duplicate_faces(triangles, vertex_count)
+    return len(duplicate_faces) - len(np.unique(np.sort(triangles[duplicate_faces], axis=1), axis=0))
 
 
 def find_duplicate_faces(triangles: NDArray[np.uint32], vertex_count: int) -> IntArray:

@@ -1,7 +1,7 @@
 """Search for triangles of a surface by place: the nearest to each point, the first on each line.
 
 A tree of boxes (Ericson 2005, chapter 6): triangles in the order of a curve through space (Morton 1966), some to a
-leaf, `FAN` boxes to the next above.  Points and lines go down it together, level by level.
+leaf, `_FAN` boxes to the next above.  Points and lines go down it together, level by level.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 from clrecon.mesh.triangles import cross_product
 from clrecon.system.pieces import find_bounds, in_threads
 
-LEAF, FAN = 4, 8
+_LEAF, _FAN = 4, 8
 """Triangles in a leaf, and boxes in a node."""
 
 PIECE, MOST_PAIRS = 1 << 11, 1 << 18
 """Points that go down together, and pairs of a point and a box beyond which they part: each point far from a surface is
 about as near to many of its boxes."""
 
-CURVE_BITS = 10
+_CURVE_BITS = 10
 """Bits of a place along each axis, by which triangles are put in order."""
 
-REACHES = (1 / 64, 1 / 16, 1 / 4, 1.0)
+_REACHES = (1 / 64, 1 / 16, 1 / 4, 1.0)
 """Shares of a line that are searched in turn: the first triangle is near, most boxes on the line are not."""
 
-LEAST_SINE = 1e-5
+_LEAST_SINE = 1e-5
 """Sine of the angle between two edges below which a triangle is as good as its edges: its plane is not known."""
 
 BESIDE = 1e-9
@@ -56,15 +56,15 @@ class TriangleTree:
         self._curve = _Curve(lows + highs)
         codes = self._curve.codes(lows + highs)
         order = np.argsort(codes, kind="stable")
-        order = np.concatenate([order, np.full(-len(order) % LEAF, order[-1])])
-        self._rows, self._firsts = order.reshape(-1, LEAF), codes[order[::LEAF]]
+        order = np.concatenate([order, np.full(-len(order) % _LEAF, order[-1])])
+        self._rows, self._firsts = order.reshape(-1, _LEAF), codes[order[::_LEAF]]
         lows = np.array([column[self._rows].min(axis=1) for column in lows])
         highs = np.array([column[self._rows].max(axis=1) for column in highs])
         self._levels: list[NDArray[np.float32]] = []
         while not self._levels or len(self._levels[0]) > 1:
-            empty = ((0, 0), (0, -lows.shape[1] % FAN))
-            lows = np.pad(lows, empty, constant_values=np.inf).reshape(3, -1, FAN)
-            highs = np.pad(highs, empty, constant_values=-np.inf).reshape(3, -1, FAN)
+            empty = ((0, 0), (0, -lows.shape[1] % _FAN))
+            lows = np.pad(lows, empty, constant_values=np.inf).reshape(3, -1, _FAN)
+            highs = np.pad(highs, empty, constant_values=-np.inf).reshape(3, -1, _FAN)
             self._levels.insert(0, np.ascontiguousarray(np.concatenate([lows, highs]).swapaxes(0, 1)))
             lows, highs = lows.min(axis=2), highs.max(axis=2)
 
@@ -84,7 +84,7 @@ class TriangleTree:
         shares = np.full(len(starts), np.inf)
 
         def work(where: slice) -> None:
-            for reach in REACHES:
+            for reach in _REACHES:
                 left = np.flatnonzero(np.isinf(shares[where]))
                 lines = starts[where][left], ends[where][left] - starts[where][left]
                 shares[where][left] = self._find_first(*lines, reach)
@@ -124,10 +124,10 @@ class TriangleTree:
         a, b, c = self._corners(rows)
         b -= a
         c -= a
-        away = (columns[:, :, None] - a.reshape(3, -1, LEAF)).reshape(3, -1)
+        away = (columns[:, :, None] - a.reshape(3, -1, _LEAF)).reshape(3, -1)
         u, v, gain = nearest_shares(away, b, c)
         gain += np.einsum("ij,ij->j", away, away)
-        best = LEAF * np.arange(len(leaves)) + gain.reshape(-1, LEAF).argmin(axis=1)
+        best = _LEAF * np.arange(len(leaves)) + gain.reshape(-1, _LEAF).argmin(axis=1)
         places = a[:, best] + u[best] * b[:, best] + v[best] * c[:, best]
         away = columns - places
         return places.T, rows[best], np.einsum("ij,ij->j", away, away)
@@ -145,7 +145,7 @@ class TriangleTree:
         if pairs is None:
             halves = zip(np.array_split(starts, 2), np.array_split(ways, 2), strict=True)
             return np.concatenate([self._find_first(*half, reach) for half in halves])
-        items, rows = pairs[0].repeat(LEAF), self._rows[pairs[1]].reshape(-1)
+        items, rows = pairs[0].repeat(_LEAF), self._rows[pairs[1]].reshape(-1)
         a, b, c = self._corners(rows)
         shares = _shares_of_lines(begin[:, items], ways.T[:, items], a, b - a, c - a)
         shares[~(shares <= reach)] = np.inf
@@ -162,7 +162,7 @@ class TriangleTree:
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]] | None:
         """Return pairs of an item and a leaf, in the order of items, and their bounds; None: too many for one piece.
 
-        lowest: Bounds of items in the boxes (k, 6, `FAN`) of a node, which they go down where these are below limits.
+        lowest: Bounds of items in the boxes (k, 6, `_FAN`) of a node, which they go down where these are below limits.
         highest: Bounds in boxes (k, 6) from which their triangles keep below: no limit needs to be higher.
         """
         items, nodes, bounds = np.arange(len(limits)), np.zeros(len(limits), np.intp), np.zeros(len(limits))
@@ -170,7 +170,7 @@ class TriangleTree:
             boxes = level[nodes]
             every = lowest(items, boxes)
             pair, child = np.nonzero(every <= limits[items, None])
-            items, nodes, bounds = items[pair], FAN * nodes[pair] + child, every[pair, child]
+            items, nodes, bounds = items[pair], _FAN * nodes[pair] + child, every[pair, child]
             if highest is not None and len(items):
                 some, best = _least_of(items, far := highest(items, boxes[pair, :, child]))
                 limits[some] = np.minimum(limits[some], far[best])
@@ -185,22 +185,22 @@ class _Curve:
     def __init__(self, columns: NDArray[np.floating]):
         self._low, high = (end[:, None] for end in find_bounds(columns.T))
         size = np.where(high > self._low, high - self._low, np.inf)
-        self._steps = (2**CURVE_BITS - 1) / size
-        number = np.arange(2**CURVE_BITS, dtype=np.uint32)
-        self._spread = np.bitwise_or.reduce([(number >> bit & 1) << 3 * bit for bit in range(CURVE_BITS)])
+        self._steps = (2**_CURVE_BITS - 1) / size
+        number = np.arange(2**_CURVE_BITS, dtype=np.uint32)
+        self._spread = np.bitwise_or.reduce([(number >> bit & 1) << 3 * bit for bit in range(_CURVE_BITS)])
 
     def codes(self, columns: NDArray[np.floating]) -> NDArray[np.uint32]:
         """Return the place on the curve of each point, (k,); of those beside the box that of its border."""
         codes = np.zeros(columns.shape[1], np.uint32)
         for axis, column in enumerate(columns):
-            cells = np.clip((column - self._low[axis]) * self._steps[axis], 0, 2**CURVE_BITS - 1)
+            cells = np.clip((column - self._low[axis]) * self._steps[axis], 0, 2**_CURVE_BITS - 1)
             codes |= self._spread[cells.astype(np.intp)] << np.uint32(axis)
         return codes
 
 
 def _squares_to_boxes(columns: NDArray[np.floating], boxes: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return squared distances (k, `FAN`) of points (3, k) from boxes (k, 6, `FAN`); infinity for those left empty."""
-    squares = np.zeros((len(boxes), FAN))
+    """Return squared distances (k, `_FAN`) of points (3, k) from boxes (k, 6, `_FAN`); infinity for empty ones."""
+    squares = np.zeros((len(boxes), _FAN))
     for axis, column in enumerate(columns):
         away = np.maximum(boxes[:, axis] - column[:, None], column[:, None] - boxes[:, axis + 3])
         np.maximum(away, 0.0, out=away)
@@ -217,8 +217,8 @@ def _squares_to_corners(columns: Columns, boxes: NDArray[np.float32]) -> NDArray
 
 
 def _enter_boxes(begin: Columns, way: Columns, boxes: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the share of its way at which each line (3, k) enters boxes (k, 6, `FAN`), infinity if it does not."""
-    enter, leave = np.zeros((len(boxes), FAN)), np.full((len(boxes), FAN), np.inf)
+    """Return the share of its way at which each line (3, k) enters boxes (k, 6, `_FAN`), infinity if it does not."""
+    enter, leave = np.zeros((len(boxes), _FAN)), np.full((len(boxes), _FAN), np.inf)
     with np.errstate(over="ignore"):
         for axis in range(3):
             sides = [(boxes[:, side] - begin[axis, :, None]) / way[axis, :, None] for side in (axis, axis + 3)]
@@ -237,7 +237,7 @@ def nearest_shares(
     square = bb * cc - bc * bc
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = (cc * to_b - bc * to_c) / square, (bb * to_c - bc * to_b) / square
-        inside = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (square > LEAST_SINE**2 * bb * cc)
+        inside = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (square > _LEAST_SINE**2 * bb * cc)
         gain = -u * to_b - v * to_c
         rest = np.flatnonzero(~inside)
         bb, bc, cc, to_b, to_c = (each[rest] for each in (bb, bc, cc, to_b, to_c))

@@ -121,10 +121,10 @@ BLOCK_BYTES = 1 << 21
 SMALLEST_BYTES = 1 << 20
 """Smaller results come from numpy: the allocator of the C library keeps those pages itself."""
 
-SPARE_BYTES = 1 << 28
+_SPARE_BYTES = 1 << 28
 """Most bytes of unused pages that are kept for the next result; more go back to the system."""
 
-LARGEST_WASTE = 2
+_LARGEST_WASTE = 2
 """A spare block serves a request only if it is at most this many times as large."""
 
 
@@ -140,7 +140,7 @@ class _Loan(np.ndarray[Any, np.dtype[Any]]):
 class PagePool:
     """Blocks of memory that are lent as numpy arrays and return automatically."""
 
-    def __init__(self, spare_bytes: int = SPARE_BYTES):
+    def __init__(self, spare_bytes: int = _SPARE_BYTES):
         self._spare_bytes = spare_bytes
         self._spare: list[mmap.mmap] = []
         self._lock = threading.RLock()  # a loan can end, by garbage collection, while its own thread holds the lock
@@ -166,7 +166,7 @@ class PagePool:
 
     def _take(self, size: int) -> mmap.mmap:
         with self._lock:
-            fitting = [block for block in self._spare if size <= len(block) <= LARGEST_WASTE * size]
+            fitting = [block for block in self._spare if size <= len(block) <= _LARGEST_WASTE * size]
             if fitting:
                 block = min(fitting, key=len)
                 self._spare.remove(block)

@@ -36,7 +36,7 @@ except ImportError:  # Windows
 ROOM_BYTES = 64 << 20
 """Room that a folder of built kernels must have: all of a device take 12 MB; PoCL ends the process on a full disk."""
 
-LONGEST_FILE_BYTES = 1 << 20
+_LONGEST_FILE_BYTES = 1 << 20
 """Size that files of built kernels must be allowed to have: the longest has 0.2 MB."""
 
 _OWN = "clrecon"
@@ -217,10 +217,10 @@ def refuse_short_files() -> None:
     """Refuse to build with a driver that ends the process when a file cannot be written."""
     if resource is not None:
         limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
-        if limit != resource.RLIM_INFINITY and limit < LONGEST_FILE_BYTES:
+        if limit != resource.RLIM_INFINITY and limit < _LONGEST_FILE_BYTES:
             raise DeviceError(
                 f"kernels cannot be built: files may have {limit / 1e6:.2f} MB here (ulimit -f), and the driver's need"
-                f" up to {LONGEST_FILE_BYTES / 1e6:.0f} MB: raise that limit"
+                f" up to {_LONGEST_FILE_BYTES / 1e6:.0f} MB: raise that limit"
             )
     caches = prepare_caches()
     if caches.refusal:

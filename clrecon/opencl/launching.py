@@ -25,15 +25,15 @@ from clrecon.opencl.quirks import import_pyopencl
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import device_seconds
 
-SHORT_SECONDS = 1e-3
+_SHORT_SECONDS = 1e-3
 """Waits up to this long need no helper thread: the thread looks again and again, and leaves its core to others."""
 
 _leave_core = getattr(os, "sched_yield", lambda: time.sleep(0.0))
 
-LOOK_SECONDS = 0.25
+_LOOK_SECONDS = 0.25
 """Time between two looks at what the device is doing; on Windows, signals wait as long."""
 
-GRACE_SECONDS = 0.5
+_GRACE_SECONDS = 0.5
 """After an interrupt, commands that end within this time are waited for, so that the device stays as it is."""
 
 
@@ -96,7 +96,7 @@ def wait_for(device: Device, last: Command) -> None:
 
 
 def _ends_soon(command: Command) -> bool:
-    event, end = command.event, time.perf_counter() + SHORT_SECONDS
+    event, end = command.event, time.perf_counter() + _SHORT_SECONDS
     while event.command_execution_status > 0:
         _leave_core()
         if time.perf_counter() > end:
@@ -113,7 +113,7 @@ def _wait_long(device: Device, last: Command) -> None:
         is_done = True
     except BaseException as error:
         try:
-            is_done = not isinstance(error, Exception) and helper.is_done(GRACE_SECONDS)
+            is_done = not isinstance(error, Exception) and helper.is_done(_GRACE_SECONDS)
         finally:
             if not is_done:
                 device.give_up()
@@ -130,7 +130,7 @@ def _watch(device: Device, helper: _Helper) -> None:
     since, running = time.monotonic(), None
     while True:
         limit = device_seconds()
-        if helper.is_done(min(LOOK_SECONDS, max(since + limit - time.monotonic(), 0.0))):
+        if helper.is_done(min(_LOOK_SECONDS, max(since + limit - time.monotonic(), 0.0))):
             return
         now, runs_now = time.monotonic(), device.commands.first_running()
         if runs_now is not running:
@@ -151,7 +151,7 @@ def settle(device: Device, error: BaseException) -> None:
     """Wait, after an error, until the device no longer works in memory that the caller frees; not for a hung one."""
     if isinstance(error, DeviceTimeoutError):
         return
-    seconds = device_seconds() if isinstance(error, Exception) else GRACE_SECONDS
+    seconds = device_seconds() if isinstance(error, Exception) else _GRACE_SECONDS
     end, pause = time.monotonic() + seconds, 1e-4
     while (command := device.commands.first_running()) is not None:
         with suppress(import_pyopencl().Error):

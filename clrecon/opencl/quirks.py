@@ -10,7 +10,7 @@ from typing import Any
 from clrecon.errors import DeviceError
 from clrecon.opencl.cache import prepare_caches
 
-SIMULATOR_PLATFORMS = ("oclgrind",)
+_SIMULATOR_PLATFORMS = ("oclgrind",)
 """Platforms of simulators, which claim to be fast devices (Oclgrind: CPU, GPU and accelerator) and are not."""
 
 _THREAD_COUNTS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
@@ -56,7 +56,7 @@ def _check_thread_counts() -> None:
 
 def is_simulator(platform_name: str) -> bool:
     """True for platforms that check or simulate and must never be chosen silently."""
-    return any(name in platform_name.lower() for name in SIMULATOR_PLATFORMS)
+    return any(name in platform_name.lower() for name in _SIMULATOR_PLATFORMS)
 
 
 def is_pocl(platform_name: str) -> bool:

@@ -151,7 +151,7 @@ def _key(device: Device) -> str:
     return binary_key("first use", package_version(), *driver, *device.build_options, *variants)
 
 
-LEAST_ADDRESS_SPACE = 1_000_000_000
+_LEAST_ADDRESS_SPACE = 1_000_000_000
 """Bytes of address space below which no driver is loaded: PoCL shows no device, hangs or ends the process."""
 
 
@@ -187,10 +187,10 @@ def _find_platforms() -> list[Any]:
     except ImportError as error:
         raise DeviceError(f"pyopencl cannot be imported ({error}): reinstall clrecon") from error
     limit = _address_space()
-    if limit is not None and limit < LEAST_ADDRESS_SPACE:
+    if limit is not None and limit < _LEAST_ADDRESS_SPACE:
         raise DeviceError(
             f"no OpenCL driver can be loaded for want of memory: this process may take {limit / 1e9:.2f} GB (ulimit"
-            f" -v), and drivers with their compilers take {LEAST_ADDRESS_SPACE / 1e9:.1f} GB: raise that limit"
+            f" -v), and drivers with their compilers take {_LEAST_ADDRESS_SPACE / 1e9:.1f} GB: raise that limit"
         )
     try:
         return list(cl.get_platforms())

@@ -30,7 +30,7 @@ PIECE_BYTES = 4 << 20
 PIECES = 16
 """Most pieces of a device; they are made as they are needed, at 0.4 ms for a MiB."""
 
-IN_TRANSFER = 3
+_IN_TRANSFER = 3
 """Pieces on the bus; the others are those that threads copy."""
 
 LEAST_BYTES = 1 << 20
@@ -135,7 +135,7 @@ def write_buffer(device: Device, array: NDArray[Any], array_d: Any) -> None:
 
     with pinned.lock:
         for start, end in _ranges(source.nbytes):
-            if len(filling) == PIECES - IN_TRANSFER:
+            if len(filling) == PIECES - _IN_TRANSFER:
                 send()
             piece = pinned.take()
             piece.copying = _threads().submit(np.copyto, piece.memory[: end - start], source[start:end])
@@ -163,7 +163,7 @@ def read_buffers(device: Device, wanted: Sequence[tuple[NDArray[Any], Any, int]]
         for array, array_d, offset in wanted:
             target, what = _bytes_of(array), f"the transfer of {array.nbytes:,} bytes to the computer"
             for start, end in _ranges(array.nbytes):
-                if len(coming) == IN_TRANSFER:
+                if len(coming) == _IN_TRANSFER:
                     take_out()
                 piece = pinned.take()
                 with device.lock:

@@ -24,7 +24,7 @@ CENTRE = (35.2, 35.9, 34.6)
 STEEPNESS = 64.0
 """HU per voxel: the field is the distance to the ball's surface."""
 
-SURFACE_VOXEL = 0.03
+_SURFACE_VOXEL = 0.03
 """Largest distance of a vertex from the ball: rounding of HU, and chords of the linear field; measured 0.012."""
 
 NORMAL = 0.03
@@ -60,8 +60,8 @@ def _compare(mesh: Mesh) -> str:
         )
     outward = vertices - CENTRE
     away = np.abs(np.linalg.norm(outward, axis=1) - RADIUS)
-    if not away.max() <= SURFACE_VOXEL:
-        wrong = int(np.count_nonzero(~(away <= SURFACE_VOXEL)))
+    if not away.max() <= _SURFACE_VOXEL:
+        wrong = int(np.count_nonzero(~(away <= _SURFACE_VOXEL)))
         return f"{wrong:,} of {len(away):,} vertices of a ball lie beside it"
     assert mesh.normals is not None
     turned = np.abs(mesh.normals - outward / np.linalg.norm(outward, axis=1)[:, None]).max(axis=1)

@@ -19,7 +19,7 @@ from clrecon.system.text import escape_text
 
 log = get_logger(__name__)
 
-FEWEST_OF_A_BODY = 100
+_FEWEST_OF_A_BODY = 100
 """Points from which on the size of a cloud is looked at."""
 
 SMALLEST_MM, LARGEST_MM = 3.0, 5000.0
@@ -96,7 +96,7 @@ def _check_points(points: np.ndarray, name: str) -> None:
 def _doubt_unit(points: np.ndarray) -> list[str]:
     """Return a warning where a cloud is as small as a patient in metres, or larger than one in mm."""
     size = points.max(axis=0).astype(np.float64) - points.min(axis=0)
-    if len(points) < FEWEST_OF_A_BODY or SMALLEST_MM <= size.max() <= LARGEST_MM or not size.max() > 0.0:
+    if len(points) < _FEWEST_OF_A_BODY or SMALLEST_MM <= size.max() <= LARGEST_MM or not size.max() > 0.0:
         return []
     box = " x ".join(f"{side:.3g}" for side in size)
     unit = "metres: then multiply them by 1000" if size.max() < SMALLEST_MM else "micrometres: then divide them by 1000"

@@ -13,10 +13,10 @@ from clrecon.points.cloud import PointCloud, PointStep
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 
-GHOST_SHARE = 0.75
+_GHOST_SHARE = 0.75
 """A slice is a ghost where its likeness to both neighbours is below this share of their likeness to each other."""
 
-WITHIN_SHARE = 0.42
+_WITHIN_SHARE = 0.42
 """And where less than this share of its voxels lies within one of them, or of one of them within it, beyond chance: a
 disc between two vertebrae is unlike both, but 89 % of it lies within one, and the base of a skull holds 61 % of one."""
 
@@ -65,8 +65,8 @@ class GhostSlices:
                 }
                 for k in self.slices
             ],
-            "ghost_share": GHOST_SHARE,
-            "within_share": WITHIN_SHARE,
+            "ghost_share": _GHOST_SHARE,
+            "within_share": _WITHIN_SHARE,
             "least_share_of_others": None if np.isnan(others).all() else round(float(np.nanmin(others)), 4),
         }
 
@@ -94,7 +94,7 @@ def judge_slices(
         around[1:-1] = likeness[1]
         within[1:-1] = np.fmax(most[:-1], most[1:])
     # NaN is no ghost.
-    ghosts = (points > 0) & (nearest < GHOST_SHARE * around) & (within < WITHIN_SHARE)
+    ghosts = (points > 0) & (nearest < _GHOST_SHARE * around) & (within < _WITHIN_SHARE)
     return GhostSlices(tuple(np.flatnonzero(ghosts).tolist()), points, nearest, around, within, hu, warnings)
 
 

@@ -15,10 +15,10 @@ from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import chunks
 
-SHEET_POINTS = 500
+_SHEET_POINTS = 500
 """Fewest points of a cluster that may be a sheet: fewer say little about its form."""
 
-SHEET_RATIO = 15.0
+_SHEET_RATIO = 15.0
 """Ratio of the two smaller principal standard deviations above which a cluster is a sheet.  Table tops and headrests of
 five scans have 27 and more, clusters among bone up to 5."""
 
@@ -26,7 +26,7 @@ five scans have 27 and more, clusters among bone up to 5."""
 PIECE = 1 << 16
 """Points that are measured at a time: the caches of a core hold what is made of them."""
 
-LEAST_RUN = 4
+_LEAST_RUN = 4
 """Points of one cluster in a row, on the average, from which they are summed run by run."""
 
 
@@ -44,8 +44,8 @@ class ClusterFigures:
     @property
     def sheets(self) -> NDArray[np.bool_]:
         """True for clusters without thickness: at least 500 points, second deviation over 15 times the first."""
-        thin: NDArray[np.bool_] = self.deviations[:, 1] > SHEET_RATIO * self.deviations[:, 0]
-        return thin & (self.points >= SHEET_POINTS)
+        thin: NDArray[np.bool_] = self.deviations[:, 1] > _SHEET_RATIO * self.deviations[:, 0]
+        return thin & (self.points >= _SHEET_POINTS)
 
     def order(self) -> NDArray[np.int64]:
         """Return the numbers of the clusters, those with most points first, ties by number."""
@@ -75,7 +75,7 @@ class _Runs:
         begins = np.ones(len(labels), bool)
         np.not_equal(labels[1:], labels[:-1], out=begins[1:])
         self._starts: NDArray[np.intp] | None = np.flatnonzero(begins)
-        if LEAST_RUN * len(self._starts) > len(labels):
+        if _LEAST_RUN * len(self._starts) > len(labels):
             self._starts = None  # a run is a point
         else:
             self._lengths = np.diff(self._starts, append=len(labels))
@@ -129,7 +129,7 @@ def measure_clusters(cloud: PointCloud) -> ClusterFigures:
     return ClusterFigures(sizes[1:], centres.T[1:], boxes, np.sqrt(np.maximum(lengths, 0.0)))
 
 
-KEEP_FORMS = "largest, largest:N, min:POINTS, seed:X,Y,Z and no-sheets"
+_KEEP_FORMS = "largest, largest:N, min:POINTS, seed:X,Y,Z and no-sheets"
 """The forms of a keep rule, for messages and help."""
 
 REPORTED = 20
@@ -166,7 +166,7 @@ def _parse_keep_rule(rule: str) -> KeepRule:
         return KeepRule(kind, numbers)
     if kind == "no-sheets" and ":" not in str(rule):
         return KeepRule(kind)
-    raise UsageError(f"the keep rule {str(rule)!r} is not known: the rules are {KEEP_FORMS}, N and POINTS from 1 on")
+    raise UsageError(f"the keep rule {str(rule)!r} is not known: the rules are {_KEEP_FORMS}, N and POINTS from 1 on")
 
 
 @explains_arguments
@@ -304,5 +304,5 @@ def _describe_nothing(labels: NDArray[np.int32], figures: ClusterFigures, fate: 
     return (
         f"no cluster is left of {len(figures.points):,}: {int((labels < 0).sum()):,} of {len(labels):,} points are"
         f" noise, {int((fate == 2).sum()):,} clusters are sheets, {int((fate == 3).sum()):,} are too small, the largest"
-        f" has {largest:,} points; sheets have at least {SHEET_POINTS} points and a ratio over {SHEET_RATIO:g}"
+        f" has {largest:,} points; sheets have at least {_SHEET_POINTS} points and a ratio over {_SHEET_RATIO:g}"
     )

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-POINTS_A_CELL = 4.0
+_POINTS_A_CELL = 4.0
 """Points that a cell should hold: with fewer most cells are empty by chance, with more they hide the shape."""
 
 MOST_CELLS = 1 << 28
@@ -35,12 +35,12 @@ def mean_spacing(points: NDArray[np.floating]) -> float:
         return 0.0
     # As if the points filled the largest face of their box; a surface with folds has smaller cells.
     face = float(np.prod(np.sort(extent)[1:])) or float(extent.max()) ** 2 / len(points)
-    edge, dimension = math.sqrt(POINTS_A_CELL * face / len(points)), 2.0
+    edge, dimension = math.sqrt(_POINTS_A_CELL * face / len(points)), 2.0
     held = len(points) / _count_cells(points, low, extent, edge)
     for _ in range(ROUNDS):
-        if 0.5 < held / POINTS_A_CELL < 2.0:
+        if 0.5 < held / _POINTS_A_CELL < 2.0:
             break
-        other = edge * (POINTS_A_CELL / held) ** (1.0 / dimension)
+        other = edge * (_POINTS_A_CELL / held) ** (1.0 / dimension)
         if float(np.prod(np.floor(extent / other) + 1.0)) > MOST_CELLS:
             break
         before, held = held, len(points) / _count_cells(points, low, extent, other)

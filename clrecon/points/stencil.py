@@ -16,7 +16,7 @@ from clrecon.system.light_dataclass import dataclass
 SLACK = 1e-6
 """Distances up to ``eps * (1 + SLACK)`` are within eps, so that an eps of one slice gap reaches the next slice."""
 
-EPS_STEPS = 1.5
+_EPS_STEPS = 1.5
 """Default eps in units of the largest step between neighbouring voxels."""
 
 PLACES = 9
@@ -54,7 +54,7 @@ class Lattice:
     @property
     def default_eps(self) -> float:
         """1.5 times the largest of the steps in the slices and the largest slice gap, mm."""
-        return EPS_STEPS * max(self.pixel, self.largest_gap)
+        return _EPS_STEPS * max(self.pixel, self.largest_gap)
 
     @property
     def least_step(self) -> float:

@@ -81,7 +81,7 @@ class FlyingEdges:
         return PeerRun(seconds, output.GetNumberOfPoints(), output.GetNumberOfCells())
 
 
-ALL_DEVICES = "all"
+_ALL_DEVICES = "all"
 DEFAULT_RUNS = 7
 MOST_RUNS = 1000
 PHANTOM_SIZE, PHANTOM_SLICES, PHANTOM_SPACING = (512, 512), 149, (0.7, 0.7, 1.0)
@@ -163,7 +163,7 @@ def _choose_devices(name: str | None) -> list[Device]:
     from clrecon.opencl import list_devices
     from clrecon.operators import choose_device
 
-    if (name or "").strip().lower() != ALL_DEVICES:
+    if (name or "").strip().lower() != _ALL_DEVICES:
         return [choose_device(name)]
     usable = [device for device in list_devices() if not device.is_simulator and not device.shortcoming]
     return usable or [choose_device(None)]  # its error says why there is no device
@@ -232,12 +232,12 @@ def _measure_device(device: Device, volume: Volume, hu: float, runs: int) -> dic
     start = perf_counter()
     _ = device.queue
     opened = perf_counter() - start
-    own = _OwnRuns(device, volume, hu)
-    first = own.run()
-    first_parts = own.reports[0]["seconds"]
-    level = float(own.reports[0]["iso_level_hu"])
-    ours, peer = _time_warm(own, volume, level, runs)
-    vertices, triangles = own.counts
+    own_runs = _OwnRuns(device, volume, hu)
+    first = own_runs.run()
+    first_parts = own_runs.reports[0]["seconds"]
+    level = float(own_runs.reports[0]["iso_level_hu"])
+    ours, peer = _time_warm(own_runs, volume, level, runs)
+    vertices, triangles = own_runs.counts
     median = ours["median"]
     return {
         "iso_level_hu": level,
@@ -245,8 +245,8 @@ def _measure_device(device: Device, volume: Volume, hu: float, runs: int) -> dic
         "triangles": triangles,
         "first_seconds": {"open": opened, **first_parts, "total": opened + first},
         "warm_seconds": ours,
-        "part_seconds": own.medians("seconds"),
-        "kernel_seconds": own.medians("kernel_seconds") if device.has_event_times else {},
+        "part_seconds": own_runs.medians("seconds"),
+        "kernel_seconds": own_runs.medians("kernel_seconds") if device.has_event_times else {},
         "resident_seconds": _time_resident(device, volume, hu, runs),
         "mvoxels_per_s": 1e-6 * volume.voxels.size / median,
         "mtriangles_per_s": 1e-6 * triangles / median,

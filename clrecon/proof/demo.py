@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
 
 DEMO_FOLDER = "clrecon-demo"
-DEMO_FILES = ("ct", "bone.stl", "bone.png", "report.json")
+_DEMO_FILES = ("ct", "bone.stl", "bone.png", "report.json")
 
 _TILT_DEG, _OBLIQUE_DEG = 12.0, (10.0, -5.0, 30.0)
 
@@ -93,7 +93,7 @@ def _fill(folder: Path, chosen: Device, progress: Progress | None) -> dict[str, 
     errors = [abs(found - true) for found, true in entries]
     seconds = {**watch.seconds, "total": watch.total()}
     return {
-        "files": list(DEMO_FILES),
+        "files": list(_DEMO_FILES),
         "affine_error_mm": max(errors),
         "check": check,
         "seconds": {part: round(value, 4) for part, value in seconds.items()},
@@ -151,7 +151,7 @@ def _check_replaceable(folder: Path, output: str | Path) -> None:
     except OSError as error:
         raise OutputError(f"cannot make the folder {output}: {error.strerror or error}") from error
     refuse_existing(output, folder)
-    foreign = sorted(names - set(DEMO_FILES))
+    foreign = sorted(names - set(_DEMO_FILES))
     if foreign or (names and not (folder / "ct" / "truth.json").is_file()):
         example = (foreign or sorted(names))[0]
         raise UsageError(f"{output} holds something that is not of a demo ({example}): name a new or empty folder")
@@ -164,6 +164,6 @@ def _put_in_place(made: Path, folder: Path, output: str | Path) -> None:
         made.chmod(final_mode(folder, 0o777))
         place_folder(made, folder, output, keep=keep)
         return
-    for name in DEMO_FILES:
+    for name in _DEMO_FILES:
         place = place_folder if (made / name).is_dir() else place_file
         place(made / name, folder / name, Path(output) / name, keep=keep)

@@ -44,16 +44,16 @@ if TYPE_CHECKING:
     from clrecon.rendering.pictures.picture import Rendering
 
 
-ANIMATIONS = (".mp4", ".gif", ".apng")
+_ANIMATIONS = (".mp4", ".gif", ".apng")
 """Extensions of animations; a name without extension is a folder of PNG files."""
 
 MOST_FRAMES = 10_000
 """Most frames: five minutes at 30 frames per second.  More are a typing error."""
 
-FASTEST = {".mp4": 120.0, ".gif": 50.0, ".apng": 120.0, "": 120.0}
+_FASTEST = {".mp4": 120.0, ".gif": 50.0, ".apng": 120.0, "": 120.0}
 """Most frames per second.  GIF counts hundredths of a second; browsers slow down frames shorter than two."""
 
-SLOWEST = 0.1
+_SLOWEST = 0.1
 
 
 @explains_arguments
@@ -100,14 +100,14 @@ def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
     if not text:
         raise UsageError("the name of the animation is empty")
     extension = animation_kind(text)
-    if extension and extension not in ANIMATIONS:
+    if extension and extension not in _ANIMATIONS:
         raise UsageError(
-            f"an animation is not written as {extension!r}{guess_word(extension, ANIMATIONS)}: use one of"
-            f" {', '.join(ANIMATIONS)}, or a name without extension for a folder of PNG files"
+            f"an animation is not written as {extension!r}{guess_word(extension, _ANIMATIONS)}: use one of"
+            f" {', '.join(_ANIMATIONS)}, or a name without extension for a folder of PNG files"
         )
-    if not isinstance(fps, (int, float)) or not SLOWEST <= fps <= FASTEST[extension]:
+    if not isinstance(fps, (int, float)) or not _SLOWEST <= fps <= _FASTEST[extension]:
         kind = extension[1:].upper() or "a folder of frames"
-        raise UsageError(f"{kind} takes {SLOWEST:g} to {FASTEST[extension]:g} frames a second, not {fps!r}")
+        raise UsageError(f"{kind} takes {_SLOWEST:g} to {_FASTEST[extension]:g} frames a second, not {fps!r}")
     if extension == ".mp4":
         find_encoder()
     if extension:

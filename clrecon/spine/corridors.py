@@ -39,11 +39,11 @@ BODY_SHARE = 0.8
 REACH_MM = 8.0
 """Points of the surface so far before the tip and behind the back plane are no nearer than the pedicle's walls."""
 
-ALONG_MM = 0.75
+_ALONG_MM = 0.75
 """Step along a line."""
 
-MEDIAL_DEG = (-15.0, 45.0)
-SAGITTAL_DEG = (-36.0, 36.0)
+_MEDIAL_DEG = (-15.0, 45.0)
+_SAGITTAL_DEG = (-36.0, 36.0)
 COARSE_DEG = 3.0
 COARSE_MM = 1.0
 
@@ -51,19 +51,19 @@ KEPT = 100
 """Lines of the coarse search that are refined."""
 FINE_STEPS = ((0.5, 1.5), (0.2, 0.6), (0.08, 0.25))
 """Steps of the refinement: of the pass point in mm, of the angles in degrees."""
-MOST_MOVES = 8
+_MOST_MOVES = 8
 """Moves at each step."""
 
 SAME_MM = 0.1
 """Lines whose radius is less than this below the widest are as good: the angles' ranges are theirs."""
 
-EVENNESS = 0.02
+_EVENNESS = 0.02
 """Weight of the mean depth along a line beside its least distance: of lines alike in that the deeper one is taken."""
 
-QUICK_OFF_MM = 1.0
+_QUICK_OFF_MM = 1.0
 """Quick distances are right to this much."""
 
-BESIDE_KNOWN_MM = 2.0
+_BESIDE_KNOWN_MM = 2.0
 """Lines this near to those of the coarse search are judged by the points of the surface beside these."""
 
 THIN_MM = 0.8
@@ -112,7 +112,7 @@ def line_points(lines: Float64Array, span: Span) -> Float64Array:
     medial, sagittal = np.radians(lines[:, 2]), np.radians(lines[:, 3])
     direction = np.stack((-span.side * np.tan(medial), np.full(np.shape(medial), -1.0), np.tan(sagittal)), axis=-1)
     start = np.stack((lines[:, 0], np.full(len(lines), span.pass_y), lines[:, 1]), axis=1)
-    count = int(np.ceil((span.back - span.tip) / ALONG_MM)) + 1
+    count = int(np.ceil((span.back - span.tip) / _ALONG_MM)) + 1
     way = span.pass_y - np.linspace(span.back, span.tip, count)
     return np.asarray(start[:, None] + way[None, :, None] * direction[:, None])
 
@@ -197,8 +197,8 @@ class LineJudge:
         """Return the radius with a little of the mean; below 0 out of the bone; only for lines that may be `above`."""
         least, mean = _least_and_mean(self.depth, lines, self.span)
         score = np.minimum(least, 0.0) - 1.0
-        hopeful = least > (0.0 if above is None else np.maximum(above - QUICK_OFF_MM, 0.0))
-        score[hopeful] = self.radius(lines[hopeful]) + EVENNESS * mean[hopeful]
+        hopeful = least > (0.0 if above is None else np.maximum(above - _QUICK_OFF_MM, 0.0))
+        score[hopeful] = self.radius(lines[hopeful]) + _EVENNESS * mean[hopeful]
         return score
 
 
@@ -237,8 +237,8 @@ def find_line(depth: Depth, surface: Float64Array, frame: VertebraFrame, side: f
     if not len(places):
         return None, span
     near = (surface[:, 1] > tip - REACH_MM) & (surface[:, 1] < back + REACH_MM)
-    medial = np.arange(MEDIAL_DEG[0], MEDIAL_DEG[1] + 0.1, COARSE_DEG)
-    sagittal = np.arange(SAGITTAL_DEG[0], SAGITTAL_DEG[1] + 0.1, COARSE_DEG)
+    medial = np.arange(_MEDIAL_DEG[0], _MEDIAL_DEG[1] + 0.1, COARSE_DEG)
+    sagittal = np.arange(_SAGITTAL_DEG[0], _SAGITTAL_DEG[1] + 0.1, COARSE_DEG)
     turns = np.stack([part.ravel() for part in np.meshgrid(medial, sagittal, indexing="ij")], axis=1)
     lines = np.hstack((np.repeat(places, len(turns), axis=0), np.tile(turns, (len(places), 1))))
     parts = np.array_split(lines, len(lines) // 5000 + 1)
@@ -247,7 +247,7 @@ def find_line(depth: Depth, surface: Float64Array, frame: VertebraFrame, side: f
     chosen = order[:KEPT][score[order[:KEPT]] > 0.0]
     if not len(chosen):
         return None, span
-    reach = float(score[order[0]]) + QUICK_OFF_MM + BESIDE_KNOWN_MM
+    reach = float(score[order[0]]) + _QUICK_OFF_MM + _BESIDE_KNOWN_MM
     judge, last = (
         LineJudge.beside(lines[chosen], reach, depth, points, span) for points in (_thin(surface[near]), surface[near])
     )
@@ -288,7 +288,7 @@ def _refine(
         moves = np.diag((shift, shift, turn, turn))[free]
         moves = np.concatenate((moves, -moves))
         going = np.arange(len(lines))
-        for _ in range(MOST_MOVES):
+        for _ in range(_MOST_MOVES):
             following = (lines[going, None] + moves[None]).reshape(-1, 4)
             scores = judge.score(following, np.repeat(score[going], len(moves))).reshape(len(going), len(moves))
             tried += scores.size
@@ -303,10 +303,10 @@ def _refine(
     return lines, score, tried
 
 
-LEAST_RADIUS_MM, LARGEST_RADIUS_MM = 1.0, 9.0
+_LEAST_RADIUS_MM, _LARGEST_RADIUS_MM = 1.0, 9.0
 """Radii of pedicles: below there is no room for any screw, above there is no pedicle."""
 
-RESOLVED_VOXELS = 2.0
+_RESOLVED_VOXELS = 2.0
 """Least width of a pedicle in voxels, across its nearest wall."""
 
 BESIDE_MM = 1.5
@@ -458,14 +458,14 @@ def _measure(
     way = last - first
     distance, voxels, by_hu = _walls(bone, frame, surface, first, last, line.radius)
     refused = None
-    if line.radius > LARGEST_RADIUS_MM:
+    if line.radius > _LARGEST_RADIUS_MM:
         refused = f"the widest line has a radius of {line.radius:.1f} mm: that is no pedicle of one vertebra"
-    elif voxels < RESOLVED_VOXELS:
+    elif voxels < _RESOLVED_VOXELS:
         refused = (
             f"the pedicle is not resolved: the widest line is {2.0 * line.radius:.1f} mm wide, {voxels:.1f} voxels, and"
-            f" less than {RESOLVED_VOXELS:g} say nothing of its walls"
+            f" less than {_RESOLVED_VOXELS:g} say nothing of its walls"
         )
-    elif line.radius < LEAST_RADIUS_MM:
+    elif line.radius < _LEAST_RADIUS_MM:
         refused = f"the widest line has a radius of {line.radius:.1f} mm: there is no room in this pedicle"
     if refused is not None:
         return Corridor(side, refused, width_voxels=voxels)

@@ -23,7 +23,7 @@ Field = NDArray[np.float32]
 STEP_MM = 1.0
 BEYOND_MM = 40.0
 """The canal is followed this far beyond the ends of its line: the vertebrae at the ends reach further than it."""
-BEND_MM = 30.0
+_BEND_MM = 30.0
 """Length over which directions are averaged; two vertebrae bend against each other over this much."""
 AHEAD_MM = np.arange(0.0, 57.0)
 """Places of a row of the straightened scan in front of the canal, mm."""
@@ -64,7 +64,7 @@ def follow_canal(points: Float64Array, volume: Grid) -> Course:
     line = np.stack([np.interp(at, arcs, axis) for axis in points.T], axis=1)
     if len(points) > 2:
         line = PchipInterpolator(arcs, points, axis=0)(at)
-    sigma = min(BEND_MM, arcs[-1]) / 3.0
+    sigma = min(_BEND_MM, arcs[-1]) / 3.0
     beyond = int(BEYOND_MM / STEP_MM)
     # Beyond its ends the line goes on in the direction of its last centimetres.
     reach = min(len(line) - 1, int(20.0 / STEP_MM))
@@ -116,16 +116,16 @@ def sample_course(
     return found
 
 
-GAPS_MM = (11, 46)
+_GAPS_MM = (11, 46)
 """Least and largest distance of two discs."""
-END_SHARES = (0.6, 1.5)
+_END_SHARES = (0.6, 1.5)
 """Where the bone beyond the last disc may end, in gaps."""
 TILTS_DEG = np.arange(-40.0, 41.0, 5.0)
-TILT_COST = 0.1
+_TILT_COST = 0.1
 """What a tilt of 30 degrees costs, as a share of a usual disc: of planes that look alike the one across is taken."""
-BACK_WALL_MM = 8.0
+_BACK_WALL_MM = 8.0
 """The back wall of a body lies so far in front of the middle of the canal."""
-DEPTH_COST = 1.5
+_DEPTH_COST = 1.5
 """Cost of the square of the logarithm of a gap's ratio to the depth of the body."""
 BODY_BACK_MM = 10.0
 """Planes are looked at from here on in front of the canal: behind it lies the back wall of the body."""
@@ -134,23 +134,23 @@ WALL_SHARE = 0.2
 """Share of the side walls in a plane's brightness; the rest is the median of its middle: spurs bridge a disc's rim."""
 WALL_MARGIN_MM = 3.0
 """The walls of a body are looked for from the core to so far beyond its sides: heads of ribs lie farther out."""
-HALF_THICKNESS_MM = (1, 2, 3, 4, 6)
+_HALF_THICKNESS_MM = (1, 2, 3, 4, 6)
 """Half thicknesses of discs that are tried, from the middle to the end plates."""
-MOST_HALF_THICKNESS = 0.2
+_MOST_HALF_THICKNESS = 0.2
 """Largest half thickness of a disc, as a share of the depth of the body in front of it.  Discs of adults are 3 to 5 mm
 high in neck and upper chest and 9 to 12 in the loin, bodies 15 to 17 and 33 to 35 mm deep (Panjabi et al., Spine 16 and
 17, 1991 and 1992; Gilad and Nissan, Spine 11, 1986); a body between its two plates is three times as high."""
-PLATE_MM = 2
+_PLATE_MM = 2
 """An end plate lies within so many planes beside a disc."""
 BONE_HU, FAT_HU = 100.0, 0.0
 """The planes on both sides of a disc have at least the first, the disc itself at least the second."""
 SOFT_HU = 40.0
 """HU of muscle and vessels beside a body."""
-LEAST_USUAL, REACH_MM = 0.4, 30
+_LEAST_USUAL, REACH_MM = 0.4, 30
 """Where no disc within the second, mm, is as deep as a usual one, shallower ones are; the first is the least share."""
 WORTH = 0.3
 """Depth of a disc that counts neither for nor against it, as a share of a usual one."""
-UNLIKE_COST = 2.0
+_UNLIKE_COST = 2.0
 """Cost of the square of the logarithm of the ratio of neighbouring gaps."""
 
 
@@ -216,14 +216,14 @@ def look_at_bodies(scan: Field) -> Looks:
         walls_hu = _mean(_lines(walls, along, ahead), axis=1, least=0.75)
         brightness[:, place] = (1.0 - WALL_SHARE) * middle_hu + WALL_SHARE * walls_hu
     depth = np.full_like(brightness, np.nan)
-    for half in HALF_THICKNESS_MM:
+    for half in _HALF_THICKNESS_MM:
         centre = _mean(np.stack([_shifted(brightness, shift) for shift in range(1 - half, half)]), axis=0)
         plates = [
-            np.fmax.reduce([_shifted(brightness, sign * (half + n)) for n in range(PLATE_MM)]) for sign in (-1, 1)
+            np.fmax.reduce([_shifted(brightness, sign * (half + n)) for n in range(_PLATE_MM)]) for sign in (-1, 1)
         ]
         found = np.minimum(*plates) - centre
         found[~(np.minimum(*plates) >= BONE_HU) | ~(centre >= FAT_HU)] = np.nan
-        found[half > np.maximum(MOST_HALF_THICKNESS * (front - BACK_WALL_MM), 2.0)] = np.nan
+        found[half > np.maximum(_MOST_HALF_THICKNESS * (front - _BACK_WALL_MM), 2.0)] = np.nan
         depth = np.fmax(depth, found)
     return Looks(brightness, core, depth, middle, front, side)
 
@@ -279,7 +279,7 @@ def choose_discs(looks: Looks) -> tuple[list[Bound], NDArray[np.float64]]:
     if not usual.any():
         return [], usual
     worth, tilt = _worth(depth, usual)
-    row = _best_row(worth - WORTH, looks.front_mm - BACK_WALL_MM)
+    row = _best_row(worth - WORTH, looks.front_mm - _BACK_WALL_MM)
     return [Bound(int(at), int(tilt[at]), float(depth[at, tilt[at]])) for at in row], usual
 
 
@@ -287,19 +287,19 @@ def _usual_depth(best: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the depth of a usual disc at each place: the scan's, or less where all within reach are shallower."""
     from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-    near = GAPS_MM[0] // 2
+    near = _GAPS_MM[0] // 2
     highest = maximum_filter1d(best, 2 * near + 1, mode="nearest")
     peaks = np.where((best > 0) & (best == highest), best, 0.0).astype(np.float64)
     if not peaks.any():
         return np.zeros(len(best))
     usual = float(np.median(np.sort(peaks[peaks > 0])[-max(2, len(best) // 30) :]))
     local = gaussian_filter1d(maximum_filter1d(peaks, 2 * REACH_MM + 1, mode="nearest"), REACH_MM / 2, mode="nearest")
-    return np.clip(local, LEAST_USUAL * usual, usual)
+    return np.clip(local, _LEAST_USUAL * usual, usual)
 
 
 def _worth(depth: Field, usual: NDArray[np.float64]) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
     """Return how much like a disc the best plane of each place is, 1 for a usual one, and its tilt."""
-    worth = np.clip(depth / usual[:, None], -1.0, 1.2) - TILT_COST * (TILTS_DEG / 30.0) ** 2
+    worth = np.clip(depth / usual[:, None], -1.0, 1.2) - _TILT_COST * (TILTS_DEG / 30.0) ** 2
     tilt = worth.argmax(axis=1)
     return np.take_along_axis(worth, tilt[:, None], axis=1)[:, 0], tilt
 
@@ -321,7 +321,7 @@ def discs_between(looks: Looks, seeds: list[int]) -> tuple[list[Bound], NDArray[
 def end_of_bone(looks: Looks, bound: Bound, gap: float, sign: int) -> Bound | None:
     """Return where bone ends beyond the first (`sign` -1) or last disc, None if not in time; `gap` is of discs, mm."""
     flat = looks.brightness[:, len(TILTS_DEG) // 2]
-    first, last = (int(bound.at + sign * share * gap) for share in END_SHARES)
+    first, last = (int(bound.at + sign * share * gap) for share in _END_SHARES)
     best: Bound | None = None
     for at in range(first, last + sign, sign):
         if not 0 < at < len(flat) - 1:
@@ -338,10 +338,10 @@ def end_of_bone(looks: Looks, bound: Bound, gap: float, sign: int) -> Bound | No
 
 
 def _best_row(score: NDArray[np.floating], body_depth_mm: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the row of discs with the highest sum; gaps as `GAPS_MM` allows, and about as long as a body is deep."""
-    least, most = GAPS_MM
+    """Return the row of discs with the highest sum; gaps as `_GAPS_MM` allows, and about as long as a body is deep."""
+    least, most = _GAPS_MM
     gaps = np.arange(least, most + 1)
-    unlike = UNLIKE_COST * np.log(gaps[:, None] / gaps[None, :]) ** 2
+    unlike = _UNLIKE_COST * np.log(gaps[:, None] / gaps[None, :]) ** 2
     n = len(score)
     # sums[s, g]: the best row that ends at place s with a last gap of gaps[g]; first[s]: the row of s alone
     sums = np.full((n, len(gaps)), -np.inf)
@@ -351,7 +351,7 @@ def _best_row(score: NDArray[np.floating], body_depth_mm: NDArray[np.float64]) -
             before = s - gap
             if before < 0:
                 break
-            unlikely = DEPTH_COST * math.log(gap / body_depth_mm[s - gap // 2]) ** 2
+            unlikely = _DEPTH_COST * math.log(gap / body_depth_mm[s - gap // 2]) ** 2
             further = sums[before] - unlike[:, g]
             chosen = int(further.argmax())
             alone = score[before]

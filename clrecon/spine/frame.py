@@ -17,30 +17,30 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.spine.solid_bone import SolidBone
 from clrecon.system.light_dataclass import dataclass
 
-STRIDE = 2
+_STRIDE = 2
 """Points of the lattice in one step of the frame's points: 1 mm."""
 
 PIXELS_MM = (2.0, 1.0)
 """Pixels of the projections, in the first round of the search and in those after it."""
-LEAST_MM3 = 3000.0
-WIDEST_LEAN_DEG, WIDEST_ROLL_DEG = 50.0, 40.0
+_LEAST_MM3 = 3000.0
+_WIDEST_LEAN_DEG, _WIDEST_ROLL_DEG = 50.0, 40.0
 COARSE_DEG = 8.0
 
-LEAST_CANAL_RADIUS_MM = 3.0
+_LEAST_CANAL_RADIUS_MM = 3.0
 """A narrower hole is no canal: real ones are 11 mm wide or more, but a slanted arch narrows what is seen through it."""
-WIDEST_CANAL_RADIUS_MM = 20.0
+_WIDEST_CANAL_RADIUS_MM = 20.0
 
-CORE_SHARE = 0.6
+_CORE_SHARE = 0.6
 """Points with this share of the largest depth and more are the core of the body."""
 
-PLATE_RADIUS_MM = 11.0
+_PLATE_RADIUS_MM = 11.0
 """Radius of the disc about the body's axis in which the endplates are fitted."""
 
-MIRROR_STEPS = ((2.0, 0.75), (0.5, 0.25))
+_MIRROR_STEPS = ((2.0, 0.75), (0.5, 0.25))
 """Steps of the search for the median plane: degrees, mm."""
 
-BODY_HEIGHT_MM = (8.0, 45.0)
-BODY_DEPTH_MM = (10.0, 55.0)
+_BODY_HEIGHT_MM = (8.0, 45.0)
+_BODY_DEPTH_MM = (10.0, 55.0)
 
 
 @dataclass(frozen=True)
@@ -111,8 +111,8 @@ def _hole(points: Float64Array, basis: Float64Array, pixel: float) -> tuple[floa
 def _look_through(points: Float64Array) -> tuple[float, Float64Array, Float64Array]:
     """Return the radius of the canal, its direction (rows as `_basis`) and its centre in that basis."""
     step = COARSE_DEG
-    leans = np.arange(-WIDEST_LEAN_DEG, WIDEST_LEAN_DEG + 0.1, step)
-    rolls = np.arange(-WIDEST_ROLL_DEG, WIDEST_ROLL_DEG + 0.1, step)
+    leans = np.arange(-_WIDEST_LEAN_DEG, _WIDEST_LEAN_DEG + 0.1, step)
+    rolls = np.arange(-_WIDEST_ROLL_DEG, _WIDEST_ROLL_DEG + 0.1, step)
     tried = [(float(lean), float(roll)) for lean, roll in product(leans, rolls)]
     middle = np.zeros(2)
     for number in range(4):
@@ -135,23 +135,23 @@ def _look_through(points: Float64Array) -> tuple[float, Float64Array, Float64Arr
 def find_frame(bone: SolidBone, what: str) -> VertebraFrame:
     from scipy.ndimage import distance_transform_edt
 
-    thin = np.pad(bone.mask[::STRIDE, ::STRIDE, ::STRIDE], 1)
+    thin = np.pad(bone.mask[::_STRIDE, ::_STRIDE, ::_STRIDE], 1)
     index = np.argwhere(thin)
     depth = distance_transform_edt(thin)[tuple(index.T)]
-    points = bone.lattice.points((index - 1) * STRIDE)
-    step = STRIDE * bone.lattice.step
-    if len(points) * step**3 < LEAST_MM3:
+    points = bone.lattice.points((index - 1) * _STRIDE)
+    step = _STRIDE * bone.lattice.step
+    if len(points) * step**3 < _LEAST_MM3:
         raise RefusedInputError(
             f"{what} has a volume of {len(points) * step**3 / 1000:.2g} ml: no vertebra, those have 5 ml or more"
         )
     radius, basis, centre = _look_through(points)
-    if not LEAST_CANAL_RADIUS_MM <= radius <= WIDEST_CANAL_RADIUS_MM:
+    if not _LEAST_CANAL_RADIUS_MM <= radius <= _WIDEST_CANAL_RADIUS_MM:
         seen = f"its widest hole has a radius of {radius:.1f} mm" if radius > 0.0 else "it has no hole"
         raise RefusedInputError(
             f"{what} is not the label of a whole vertebra: no vertebral canal is seen through it ({seen})"
         )
     canal_point = centre @ basis[:2]
-    core = points[depth >= CORE_SHARE * depth.max()]
+    core = points[depth >= _CORE_SHARE * depth.max()]
     middle = core.mean(axis=0)
     up = basis[2]
     axes = _point_front(middle, canal_point, up)
@@ -177,7 +177,7 @@ def _halve(
     """Turn the axes about the cranial one, and shift their origin, so that the label is most like its mirror image."""
     local = ((points - middle) @ axes.T)[::3]
     turn, shift = 0.0, 0.0
-    for step_deg, step_mm in MIRROR_STEPS:
+    for step_deg, step_mm in _MIRROR_STEPS:
         best = (-1, turn, shift)
         for turned in turn + step_deg * np.arange(-4, 5):
             angle = np.radians(turned)
@@ -196,7 +196,7 @@ def _halve(
 
 def _fit_plates(local: Float64Array, axes: Float64Array, what: str) -> tuple[Float64Array, float, float]:
     """Fit planes to both ends of the body's columns; return their mean normal, LPS, middle height and distance, mm."""
-    near = local[np.hypot(local[:, 0], local[:, 1]) <= PLATE_RADIUS_MM]
+    near = local[np.hypot(local[:, 0], local[:, 1]) <= _PLATE_RADIUS_MM]
     place = np.floor(near[:, :2] / 1.5).astype(np.intp) + 20
     key = place[:, 0] * 64 + place[:, 1]
     order = np.lexsort((near[:, 2], key))
@@ -216,10 +216,10 @@ def _fit_plates(local: Float64Array, axes: Float64Array, what: str) -> tuple[Flo
     slope = (planes[0][:2] + planes[1][:2]) / 2.0
     up = axes[2] - slope[0] * axes[0] - slope[1] * axes[1]
     height = float(planes[0][2] - planes[1][2])
-    if not BODY_HEIGHT_MM[0] <= height <= BODY_HEIGHT_MM[1]:
+    if not _BODY_HEIGHT_MM[0] <= height <= _BODY_HEIGHT_MM[1]:
         raise RefusedInputError(
             f"{what} is not the label of a whole vertebra: what lies in front of its canal is {height:.0f} mm high, a"
-            f" body {BODY_HEIGHT_MM[0]:g} to {BODY_HEIGHT_MM[1]:g} mm"
+            f" body {_BODY_HEIGHT_MM[0]:g} to {_BODY_HEIGHT_MM[1]:g} mm"
         )
     return up / np.linalg.norm(up), float((planes[0][2] + planes[1][2]) / 2.0), height
 
@@ -243,10 +243,10 @@ def _measure(
             farthest[key] = max(farthest.get(key, -np.inf), side * value)
         walls.append(side * float(np.median(list(farthest.values()))) if farthest else 0.0)
     depth = walls[1] - walls[0]
-    if not BODY_DEPTH_MM[0] <= depth <= BODY_DEPTH_MM[1] or y <= walls[1]:
+    if not _BODY_DEPTH_MM[0] <= depth <= _BODY_DEPTH_MM[1] or y <= walls[1]:
         raise RefusedInputError(
             f"{what} is not the label of a whole vertebra: what lies in front of its canal is {depth:.0f} mm deep, a"
-            f" body {BODY_DEPTH_MM[0]:g} to {BODY_DEPTH_MM[1]:g} mm"
+            f" body {_BODY_DEPTH_MM[0]:g} to {_BODY_DEPTH_MM[1]:g} mm"
         )
     return VertebraFrame(
         middle, axes, (float(x), float(y)), (float(slope[0]), float(slope[1])), radius, (walls[0], walls[1]), height

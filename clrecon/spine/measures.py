@@ -13,17 +13,17 @@ from clrecon.system.light_dataclass import dataclass
 
 DIRECTIONS = ("medial", "lateral", "cranial", "caudal")
 
-RAY_STEP_MM = 0.1
+_RAY_STEP_MM = 0.1
 RAYS = 24
 STATIONS = 5
 
 WALL_MM = 2.0
 """Reach on both sides of the wall in which its peak and the tissue beside it are looked for."""
-LEAST_CONTRAST_HU = 150.0
+_LEAST_CONTRAST_HU = 150.0
 """Least difference of peak and tissue by which a half maximum is taken."""
 
 CANAL_REACH_MM = 22.0
-CANAL_SAMPLES = 16
+_CANAL_SAMPLES = 16
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def canal_wall(bone: SolidBone, frame: VertebraFrame) -> NDArray[np.bool_]:
     half = 0.75 * frame.body_height
     near = np.flatnonzero((np.linalg.norm(local - axis, axis=1) <= CANAL_REACH_MM) & (np.abs(local[:, 2]) <= half))
     blocked = np.zeros(len(near), dtype=bool)
-    for share in np.linspace(0.0, 1.0, CANAL_SAMPLES, endpoint=False):
+    for share in np.linspace(0.0, 1.0, _CANAL_SAMPLES, endpoint=False):
         at = axis[near] + share * (local[near] - axis[near])
         # within a step of the surface the nearest point of the lattice may be solid
         free = np.linalg.norm(local[near] - at, axis=1) > 2.0 * bone.lattice.step
@@ -104,7 +104,7 @@ def canal_wall(bone: SolidBone, frame: VertebraFrame) -> NDArray[np.bool_]:
 def find_exit(bone: SolidBone, start: Float64Array, direction: Float64Array, reach: float = 80.0) -> Float64Array:
     """Return where a ray from a point inside leaves the bone for the first time, LPS mm."""
     unit = direction / np.linalg.norm(direction)
-    way = np.arange(0.0, reach, RAY_STEP_MM)
+    way = np.arange(0.0, reach, _RAY_STEP_MM)
     outside = ~bone.is_solid(start + way[:, None] * unit)
     return np.asarray(start + (way[int(outside.argmax())] if outside.any() else reach) * unit, dtype=np.float64)
 
@@ -115,12 +115,12 @@ def measure_bias(bone: SolidBone, frame: VertebraFrame, first: Float64Array, las
     turns = np.linspace(0.0, 2.0 * np.pi, RAYS, endpoint=False)
     spokes = np.cos(turns)[:, None] * medial + np.sin(turns)[:, None] * up
     stations = first + np.linspace(0.0, 1.0, STATIONS)[:, None] * (last - first)
-    way = np.arange(0.0, 14.0, RAY_STEP_MM)
+    way = np.arange(0.0, 14.0, _RAY_STEP_MM)
     rays = stations[:, None, None] + way[None, None, :, None] * spokes[None, :, None]
     places = frame.to_lps(rays.reshape(-1, 3))
     solid = bone.is_solid(places).reshape(-1, len(way))
     values = bone.sample_hu(places).reshape(-1, len(way))
-    near = int(WALL_MM / RAY_STEP_MM)
+    near = int(WALL_MM / _RAY_STEP_MM)
     off, halves = [], []
     for inside, hu in zip(solid, values, strict=True):
         wall = int(np.argmin(inside))
@@ -134,9 +134,9 @@ def measure_bias(bone: SolidBone, frame: VertebraFrame, first: Float64Array, las
         half = (float(hu[peak]) + low) / 2.0
         below = np.flatnonzero(hu[peak : wall + near] < half)
         crossed = np.flatnonzero(hu[peak : wall + near] < bone.level)
-        if hu[peak] - low < LEAST_CONTRAST_HU or not len(below) or not len(crossed):
+        if hu[peak] - low < _LEAST_CONTRAST_HU or not len(below) or not len(crossed):
             continue
-        off.append((int(crossed[0]) - int(below[0])) * RAY_STEP_MM)
+        off.append((int(crossed[0]) - int(below[0])) * _RAY_STEP_MM)
         halves.append(half)
     if len(off) < len(solid) // 4:
         return None
@@ -144,19 +144,19 @@ def measure_bias(bone: SolidBone, frame: VertebraFrame, first: Float64Array, las
     return Bias(median_mm, low_mm, high_mm, float(np.median(halves)), len(off))
 
 
-GRADES = (("A", 0.0), ("B", 2.0), ("C", 4.0), ("D", 6.0))
+_GRADES = (("A", 0.0), ("B", 2.0), ("C", 4.0), ("D", 6.0))
 """Grades with the breach, mm, up to which they reach; B to D end below theirs, E is everything else."""
 
 SCALE = "Gertzbein-Robbins in five grades: A no breach, B below 2 mm, C below 4, D below 6, E 6 mm and more"
 
-STATION_MM = 0.5
-LEAST_BREACH_MM = 0.05
+_STATION_MM = 0.5
+_LEAST_BREACH_MM = 0.05
 """Half of what is shown: less is no breach."""
 
 FARTHEST_MM = 15.0
 """A screw whose axis stays farther from the bone than this belongs to another vertebra or another frame."""
 
-LONGEST_MM, WIDEST_MM = 150.0, 15.0
+_LONGEST_MM, _WIDEST_MM = 150.0, 15.0
 
 
 @dataclass(frozen=True)
@@ -174,10 +174,10 @@ class Screw:
         if not np.isfinite(numbers).all():
             raise UsageError(f"{self.name} needs finite numbers: two ends in mm and a diameter, not {numbers.tolist()}")
         length = float(np.linalg.norm(self.tip - self.entry))
-        if not 1.0 <= length <= LONGEST_MM:
-            raise UsageError(f"{self.name} is {length:.4g} mm long: screws have 1 to {LONGEST_MM:g} mm")
-        if not 0.0 < self.diameter <= WIDEST_MM:
-            raise UsageError(f"{self.name} is {self.diameter:.4g} mm thick: screws have up to {WIDEST_MM:g} mm")
+        if not 1.0 <= length <= _LONGEST_MM:
+            raise UsageError(f"{self.name} is {length:.4g} mm long: screws have 1 to {_LONGEST_MM:g} mm")
+        if not 0.0 < self.diameter <= _WIDEST_MM:
+            raise UsageError(f"{self.name} is {self.diameter:.4g} mm thick: screws have up to {_WIDEST_MM:g} mm")
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ class ScrewGrade:
 def grade_breach(breach_mm: float) -> str:
     if breach_mm <= 0.0:
         return "A"
-    return next((grade for grade, below in GRADES[1:] if breach_mm < below), "E")
+    return next((grade for grade, below in _GRADES[1:] if breach_mm < below), "E")
 
 
 def grade_screw(bone: SolidBone, frame: VertebraFrame, screw: Screw, what: str) -> ScrewGrade:
@@ -218,7 +218,7 @@ def grade_screw(bone: SolidBone, frame: VertebraFrame, screw: Screw, what: str) 
         raise UsageError(f"{screw.name} runs from front to back in {what}: give its entry first, then its tip")
     way = last - first
     length = float(np.linalg.norm(way))
-    axis = first + np.linspace(0.0, 1.0, int(np.ceil(length / STATION_MM)) + 1)[:, None] * way
+    axis = first + np.linspace(0.0, 1.0, int(np.ceil(length / _STATION_MM)) + 1)[:, None] * way
     off = bone.depth(frame.to_lps(axis))
     middle = (frame.body_y[0] + frame.body_y[1]) / 2.0
     if off.max() < -FARTHEST_MM:
@@ -238,7 +238,7 @@ def grade_screw(bone: SolidBone, frame: VertebraFrame, screw: Screw, what: str) 
         np.abs(points[:, 2]) < 0.75 * frame.body_height
     )
     graded = ((points[:, 1] <= frame.canal[1]) | in_canal) & (points[:, 1] >= middle)
-    outside = np.where(-depth >= LEAST_BREACH_MM, -depth, 0.0)
+    outside = np.where(-depth >= _LEAST_BREACH_MM, -depth, 0.0)
     sector = sector_names(np.tile(spokes, (len(axis), 1)), way, side)
     breaches = {
         name: float(outside[graded & (sector == number)].max(initial=0.0)) for number, name in enumerate(DIRECTIONS)

@@ -22,39 +22,39 @@ Mask = NDArray[np.bool_]
 Planes = tuple[Float64Array, Float64Array]
 """Centres and normals (m, 3) of planes in LPS mm, from the head downwards; normals point downwards."""
 
-FRONT_MM, BEHIND_MM, BESIDE_MM = 46.0, 58.0, 42.0
+_FRONT_MM, _BEHIND_MM, BESIDE_MM = 46.0, 58.0, 42.0
 """Bone farther than this from the canal belongs to no vertebra."""
-RIB_MM = (55.0, 68.0)
+_RIB_MM = (55.0, 68.0)
 """Bone so far beside the canal is rib, shoulder blade or pelvis, and so is what it joins in `Part.beside`: transverse
 processes reach 35 to 38 mm at T1, 23 to 30 at T12 and 40 to 50 at L3 (Panjabi et al., Spine 16 and 17, 1991, 1992)."""
-PROCESS_MM, NECK_OFF_MM, NECK_AHEAD_MM, NECK_SLOPE = 38.0, 2.0, 6.0, 1.1
+_PROCESS_MM, _NECK_OFF_MM, _NECK_AHEAD_MM, _NECK_SLOPE = 38.0, 2.0, 6.0, 1.1
 """Ribs may lie beyond the first; and beside a body, in front of the transverse process, from the second beyond its wall
 on: there the process lies so far in front of the canal, and farther out it runs back by the last, mm a mm."""
-WAIST_MM = 30
+_WAIST_MM = 30
 """The wall of a body is the widest within so much above and below: its waist is narrower, and so is the sacrum."""
-BODY_MARGIN_MM = 5.0
+_BODY_MARGIN_MM = 5.0
 """In front of the canal bone farther than this from the walls of the bodies is rib, vessel or pelvis."""
-PEDICLE_MM = 8.0
+_PEDICLE_MM = 8.0
 """The bodies' own bounds count from so far in front of the canal."""
-CLOSING_MM = 1.5
-CANAL_MM = 4.0
+_CLOSING_MM = 1.5
+_CANAL_MM = 4.0
 """Holes that come so near to the middle of the canal are the canal and stay open."""
-MARKER_AHEAD_MM, MARKER_OFF_MM = 6.0, 2.0
+_MARKER_AHEAD_MM, _MARKER_OFF_MM = 6.0, 2.0
 """A marker lies so far in front of the canal, within the walls of the body, and off the planes of the discs."""
-PEEL_MM = 1.5
+_PEEL_MM = 1.5
 """Voxels of the rim that are less than half as bright as the bone beside them are peeled off, no deeper than this."""
-BRIGHT_HU = 600.0
-BRIGHT_MM = 0.7
-ARCH_ASIDE_MM, SPINE_ASIDE_MM = 26.0, 12.0
-OVER_MM, UNDER_MM, SPINE_MM = (16.0, 8.0), (20.0, 8.0), (80.0, 1.6, 22.0, 45.0)
+_BRIGHT_HU = 600.0
+_BRIGHT_MM = 0.7
+ARCH_ASIDE_MM, _SPINE_ASIDE_MM = 26.0, 12.0
+_OVER_MM, _UNDER_MM, SPINE_MM = (16.0, 8.0), (20.0, 8.0), (80.0, 1.6, 22.0, 45.0)
 """How far a vertebra reaches over the plane above it and under the one below it: its articular processes, and all else.
 Its spinous process reaches down by 80 mm less 1.6 heights of the vertebra, 22 to 45: those of the chest are steep."""
-RIDGE_WIDTH = 0.12
+_RIDGE_WIDTH = 0.12
 """Arches meet behind a disc over so much height, in gaps of the discs (standard deviation)."""
-RIDGE_AHEAD_MM = (-25.0, 4.0)
-RIDGE_MM, RIDGE_HU = 1.5, 125.0
+_RIDGE_AHEAD_MM = (-25.0, 4.0)
+_RIDGE_MM, _RIDGE_HU = 1.5, 125.0
 """What a ridge between two arches adds to a landscape at its crest."""
-ARCH_DOWN = 0.3
+_ARCH_DOWN = 0.3
 """An arch lies so much lower than its body, in gaps of the discs."""
 
 
@@ -104,7 +104,7 @@ def cut_part(volume: Volume, course: Course, looks: Looks) -> Part:
     """Cut out the box of the volume that can hold the vertebrae."""
     from scipy.ndimage import maximum_filter1d
 
-    sides = list(product((-RIB_MM[1], RIB_MM[1]), (-FRONT_MM, BEHIND_MM)))
+    sides = list(product((-_RIB_MM[1], _RIB_MM[1]), (-_FRONT_MM, _BEHIND_MM)))
     corners = np.concatenate([course.canal + np.array([x, y, 0.0]) for x, y in sides])
     ijk = volume.lps_to_ijk(corners)
     low = np.clip(np.floor(ijk.min(axis=0)).astype(int), 0, np.array(volume.shape_ijk) - 1)
@@ -124,7 +124,7 @@ def cut_part(volume: Volume, course: Course, looks: Looks) -> Part:
         spacing=(dk, dj, di),
     )
     order = np.argsort(course.canal[:, 2], kind="stable")
-    widest = maximum_filter1d(looks.side_mm, 2 * WAIST_MM + 1)
+    widest = maximum_filter1d(looks.side_mm, 2 * _WAIST_MM + 1)
     heights, numbers = course.canal[order, 2], np.arange(len(course))
     for k in range(len(values)):
         places = part.points(volume, k)
@@ -136,20 +136,20 @@ def cut_part(volume: Volume, course: Course, looks: Looks) -> Part:
         ahead, aside = ((off * way[nearest]).sum(axis=-1) for way in (course.ahead, course.aside))
         part.ahead[k], part.aside[k], part.place[k] = ahead, aside, np.clip(at, 0, len(course) - 1)
         front, side = np.interp(at, numbers, looks.front_mm), np.interp(at, numbers, widest)
-        near = (ahead <= FRONT_MM) & (ahead >= -BEHIND_MM) & (np.abs(aside) <= RIB_MM[1])
+        near = (ahead <= _FRONT_MM) & (ahead >= -_BEHIND_MM) & (np.abs(aside) <= _RIB_MM[1])
         near &= (at >= -1.0) & (at <= len(course))
-        walls = (ahead <= front + BODY_MARGIN_MM) & (np.abs(aside) <= side + BODY_MARGIN_MM)
-        part.within[k] = near & (walls | (ahead < PEDICLE_MM))
+        walls = (ahead <= front + _BODY_MARGIN_MM) & (np.abs(aside) <= side + _BODY_MARGIN_MM)
+        part.within[k] = near & (walls | (ahead < _PEDICLE_MM))
         off = np.abs(aside) - side
-        before = (off > NECK_OFF_MM) & (ahead > NECK_AHEAD_MM - NECK_SLOPE * off)
-        part.beside[k] = near & (before | (np.abs(aside) > PROCESS_MM))
-        part.body[k] = near & walls & (ahead >= MARKER_AHEAD_MM)
+        before = (off > _NECK_OFF_MM) & (ahead > _NECK_AHEAD_MM - _NECK_SLOPE * off)
+        part.beside[k] = near & (before | (np.abs(aside) > _PROCESS_MM))
+        part.body[k] = near & walls & (ahead >= _MARKER_AHEAD_MM)
     return part
 
 
 def _ball(spacing: tuple[float, float, float]) -> Mask:
-    """Return the voxels within `CLOSING_MM`, and along each axis the next one at least."""
-    radii = [max(CLOSING_MM, step) for step in spacing]
+    """Return the voxels within `_CLOSING_MM`, and along each axis the next one at least."""
+    radii = [max(_CLOSING_MM, step) for step in spacing]
     reach = [int(radius / step + 1e-6) for radius, step in zip(radii, spacing, strict=True)]
     grid = np.meshgrid(
         *[np.arange(-n, n + 1) * step / r for n, step, r in zip(reach, spacing, radii, strict=True)], indexing="ij"
@@ -167,7 +167,7 @@ def fill_bone(part: Part, level: float) -> Mask:
     margins = [(n // 2, n // 2) for n in ball.shape]
     inner = tuple(slice(n, n + size) for (n, _), size in zip(margins, raw.shape, strict=True))
     bone = np.asarray(binary_closing(np.pad(raw, margins, mode="edge"), ball)[inner]) | raw
-    canal = np.hypot(part.ahead, part.aside) <= CANAL_MM
+    canal = np.hypot(part.ahead, part.aside) <= _CANAL_MM
     for plane, tube in zip(bone, canal, strict=True):
         holes, count = label(binary_fill_holes(plane) & ~plane)
         fills = np.ones(count + 1, bool)
@@ -183,7 +183,7 @@ def _find_ribs(part: Part, bone: Mask) -> Mask:
 
     beside, count = label(bone & part.beside)
     is_rib = np.zeros(count + 1, bool)
-    is_rib[np.unique(beside[np.abs(part.aside) >= RIB_MM[0]])] = True
+    is_rib[np.unique(beside[np.abs(part.aside) >= _RIB_MM[0]])] = True
     is_rib[0] = False
     return np.asarray(is_rib[beside])
 
@@ -209,9 +209,9 @@ def divide(
     markers = _mark(part, bone, planes, volume)
     ridge = _ridges(part, bounds)
     depth = distance_transform_edt(bone, sampling=part.spacing)
-    by_depth = watershed(RIDGE_MM * ridge - depth, markers, mask=bone)
-    bright = gaussian_filter(np.clip(part.values, 0.0, BRIGHT_HU), [BRIGHT_MM / step for step in part.spacing])
-    by_brightness = watershed(RIDGE_HU * ridge - bright, markers, mask=bone)
+    by_depth = watershed(_RIDGE_MM * ridge - depth, markers, mask=bone)
+    bright = gaussian_filter(np.clip(part.values, 0.0, _BRIGHT_HU), [_BRIGHT_MM / step for step in part.spacing])
+    by_brightness = watershed(_RIDGE_HU * ridge - bright, markers, mask=bone)
     pieces = _bound(part, _settle(part, by_depth, by_brightness, bounds), bounds, planes, volume)
     pieces[ribs] = 0
     pieces[~_peel(part, pieces > 0)] = 0
@@ -238,13 +238,13 @@ def _peel(part: Part, bone: Mask) -> Mask:
     """Return bone without the rim that partial volume and closing have added: the edge is where HU fall by half."""
     from scipy.ndimage import binary_erosion, maximum_filter1d, minimum_filter1d
 
-    sizes = [2 * max(1, int(PEEL_MM / step + 1e-6)) + 1 for step in part.spacing]
+    sizes = [2 * max(1, int(_PEEL_MM / step + 1e-6)) + 1 for step in part.spacing]
     brightest, darkest = part.values.copy(), part.values.copy()
     for axis, size in enumerate(sizes):  # along the three axes alone: across the corner lies other bone
         np.maximum(brightest, maximum_filter1d(part.values, size, axis=axis), out=brightest)
         np.minimum(darkest, minimum_filter1d(part.values, size, axis=axis), out=darkest)
     dim = part.values < 0.5 * (brightest + darkest)
-    for _ in range(max(1, round(PEEL_MM / min(part.spacing)))):
+    for _ in range(max(1, round(_PEEL_MM / min(part.spacing)))):
         rim = bone & ~binary_erosion(bone, border_value=1)
         bone = bone & ~(rim & dim)
     return bone
@@ -267,12 +267,12 @@ def _bound(
             continue
         places, own = part.points(volume, k)[chosen], plane[chosen].astype(np.int64)
         aside, ahead = np.abs(part.aside[k][chosen]), part.ahead[k][chosen]
-        near = (aside <= ARCH_ASIDE_MM) & (ahead < MARKER_AHEAD_MM)
+        near = (aside <= ARCH_ASIDE_MM) & (ahead < _MARKER_AHEAD_MM)
         above, below = np.minimum(own - 2, last - 1), np.minimum(own - 1, last - 1)
         over = -((places - centres[above]) * normals[above]).sum(axis=1)
         under = ((places - centres[below]) * normals[below]).sum(axis=1)
-        far = (own > 1) & (over > np.where(near, OVER_MM[0], OVER_MM[1]))
-        reach = np.where(near & (aside <= SPINE_ASIDE_MM), spine[own], np.where(near, UNDER_MM[0], UNDER_MM[1]))
+        far = (own > 1) & (over > np.where(near, _OVER_MM[0], _OVER_MM[1]))
+        reach = np.where(near & (aside <= _SPINE_ASIDE_MM), spine[own], np.where(near, _UNDER_MM[0], _UNDER_MM[1]))
         far |= (own <= last) & (under > reach)
         plane[chosen] = np.where(far, 0, own)
     return pieces
@@ -283,8 +283,8 @@ def _ridges(part: Part, bounds: list[Bound]) -> NDArray[np.float32]:
     at = np.array([bound.at for bound in bounds], np.float64)
     gaps = np.gradient(at) if len(at) > 1 else np.array([30.0])
     place = np.arange(int(part.place.max()) + 2)[:, None]
-    heights = np.exp(-0.5 * ((place - at) / (RIDGE_WIDTH * gaps)) ** 2).max(axis=1)
-    arch = (part.ahead < RIDGE_AHEAD_MM[1]) & (part.ahead > RIDGE_AHEAD_MM[0])
+    heights = np.exp(-0.5 * ((place - at) / (_RIDGE_WIDTH * gaps)) ** 2).max(axis=1)
+    arch = (part.ahead < _RIDGE_AHEAD_MM[1]) & (part.ahead > _RIDGE_AHEAD_MM[0])
     return np.where(arch, heights[np.rint(part.place).astype(int)], 0.0).astype(np.float32)
 
 
@@ -295,7 +295,7 @@ def _mark(part: Part, bone: Mask, planes: Planes, volume: Volume) -> NDArray[np.
         if plane.any():
             places = part.points(volume, k)[plane]
             sides = np.stack([(places - centre) @ normal for centre, normal in zip(*planes, strict=True)], axis=1)
-            off = np.abs(sides).min(axis=1) >= MARKER_OFF_MM
+            off = np.abs(sides).min(axis=1) >= _MARKER_OFF_MM
             markers[k][plane] = np.where(off, 1 + (sides > 0.0).sum(axis=1), 0)
     return markers
 
@@ -320,7 +320,7 @@ def _settle(
     for n, division in enumerate((by_depth, by_brightness)):
         ours[n, groups] = division[differ]
     number = np.maximum(ours - 1, 0)
-    expected = 0.5 * (upper + lower)[number] + np.where(ahead < 0.0, ARCH_DOWN, 0.0) * (lower - upper)[number]
+    expected = 0.5 * (upper + lower)[number] + np.where(ahead < 0.0, _ARCH_DOWN, 0.0) * (lower - upper)[number]
     nearer = np.abs(place - expected).argmin(axis=0)
     result = by_brightness.astype(np.uint8)
     result[differ] = np.take_along_axis(ours, nearer[None], axis=0)[0][groups]
@@ -335,15 +335,15 @@ WEIGHTS = {
 }  # fmt: skip
 """What a trait of 0 takes from the logarithm of the confidence.  Those of rim, discs and border are least squares over
 88 vertebrae of phantoms; phantoms hardly show the others: these take more than least squares gave."""
-LEAST_DEPTH_HU = 30.0
+_LEAST_DEPTH_HU = 30.0
 """Least depth of any disc: noise and partial volume make shallower ones."""
 MARROW_HU = 60.0
 """Least HU of the middle of a body; muscle and a disc beside a thin one have less."""
-VOLUME_ML = (3.0, 80.0)
+_VOLUME_ML = (3.0, 80.0)
 """Least and largest volume of a vertebra; C3 of a small adult has 4 ml."""
-ARCH_SHARE = (0.003, 0.02)
+_ARCH_SHARE = (0.003, 0.02)
 """Share of a vertebra that lies behind its canal in the middle: too little, and enough for a spinous process."""
-WALL_DIRECTIONS = np.radians(np.arange(-130.0, 131.0, 15.0))
+_WALL_DIRECTIONS = np.radians(np.arange(-130.0, 131.0, 15.0))
 """Directions from the middle of a body in which its wall is looked for, 0 is to the front; the pedicles are behind."""
 
 
@@ -398,7 +398,7 @@ def judge(
     traits: Traits = {}
     for name, bound in (("upper", piece.upper), ("lower", piece.lower)):
         if bound is not None:
-            depth = _ramp(bound.depth_hu, 0.0, max(0.8 * float(usual[bound.at]), 2.0 * LEAST_DEPTH_HU))
+            depth = _ramp(bound.depth_hu, 0.0, max(0.8 * float(usual[bound.at]), 2.0 * _LEAST_DEPTH_HU))
             traits[f"{name} disc"] = depth, f"the disc at its {name} end is {bound.depth_hu:.0f} HU darker than bone"
     inner = _further_disc(looks, piece)
     known = [bound.depth_hu for bound in (piece.upper, piece.lower) if bound is not None]
@@ -420,7 +420,7 @@ def judge(
         ratio = max(height / usual_mm, usual_mm / height)
         said = f"its height is {height} mm, and {usual_mm:.0f} mm is usual beside it"
         traits["height"] = _ramp(ratio, 1.6, 1.25), said
-    low, high = VOLUME_ML if piece.whole else (1.0, VOLUME_ML[1])
+    low, high = _VOLUME_ML if piece.whole else (1.0, _VOLUME_ML[1])
     fits = min(_ramp(piece.volume_ml, 0.6 * low, low), _ramp(piece.volume_ml, 1.25 * high, high))
     traits["volume"] = fits, f"its volume is {piece.volume_ml:.3g} ml, not {low:g} to {high:g}"
     torn = piece.doubtful_share
@@ -428,7 +428,7 @@ def judge(
     if piece.whole:
         arch = piece.arch_ml
         share = arch / max(piece.volume_ml, 1e-6)
-        traits["arch"] = _ramp(share, *ARCH_SHARE), f"it has only {arch:.1f} ml of a spinous process"
+        traits["arch"] = _ramp(share, *_ARCH_SHARE), f"it has only {arch:.1f} ml of a spinous process"
     rim = piece.rim_share
     traits["rim"] = 1.0 - rim, f"{100 * rim:.0f} % of its voxels lie in its surface: the slices are thick for its size"
     traits["one part"] = _ramp(piece.largest_share, 0.6, 0.95), f"{100 * piece.largest_share:.0f} % of it hang together"
@@ -456,8 +456,8 @@ def _walls(scan: Field, looks: Looks, piece: Piece) -> float:
     for n in rows:
         middle, deep = looks.middle_mm[n], looks.front_mm[n] - looks.middle_mm[n]
         reach = np.arange(0.6, 1.5, 0.1)[:, None]
-        ahead = middle + reach * deep * np.cos(WALL_DIRECTIONS)
-        aside = reach * looks.side_mm[n] * np.sin(WALL_DIRECTIONS)
+        ahead = middle + reach * deep * np.cos(_WALL_DIRECTIONS)
+        aside = reach * looks.side_mm[n] * np.sin(_WALL_DIRECTIONS)
         j = np.clip(np.rint(ahead - AHEAD_MM[0]).astype(int), 0, len(AHEAD_MM) - 1)
         i = np.clip(np.rint(aside - ASIDE_MM[0]).astype(int), 0, len(ASIDE_MM) - 1)
         found.append(np.nan_to_num(scan[n, j, i], nan=-1000.0))

@@ -21,10 +21,10 @@ from clrecon.system.light_dataclass import dataclass
 
 Box = tuple[slice, slice, slice]
 
-LATTICE_STEP_MM = 0.5
+_LATTICE_STEP_MM = 0.5
 """Step of the lattice: half of a fine voxel, a quarter of a coarse one."""
 
-QUICK_STRIDE = 2
+_QUICK_STRIDE = 2
 """Points of the lattice in one step of the quick distances."""
 
 MARGIN_MM = 3.0
@@ -144,8 +144,8 @@ class SolidBone:
         from scipy.ndimage import distance_transform_edt
 
         # from a point to the nearest one outside; the surface lies half a step before it on average
-        step = QUICK_STRIDE * self.lattice.step
-        thin = self.solid[(slice(None, None, QUICK_STRIDE),) * 3]
+        step = _QUICK_STRIDE * self.lattice.step
+        thin = self.solid[(slice(None, None, _QUICK_STRIDE),) * 3]
         far = distance_transform_edt(np.pad(thin, 1), sampling=step)[1:-1, 1:-1, 1:-1]
         return np.asarray(far - step / 2.0, dtype=np.float32)
 
@@ -153,7 +153,7 @@ class SolidBone:
         """Return the distance from the surface, mm, below 0 outside, of LPS mm (n, 3), right to about half a mm."""
         from scipy.ndimage import map_coordinates
 
-        places = self.lattice.indices(points) / QUICK_STRIDE
+        places = self.lattice.indices(points) / _QUICK_STRIDE
         return np.asarray(map_coordinates(self._quick, places, order=1, mode="nearest"), dtype=np.float64)
 
     def nearest(self, points: Float64Array) -> tuple[Float64Array, NDArray[np.intp]]:
@@ -224,8 +224,8 @@ def fill_vertebra(
         )
     solid_voxels = dense.copy()
     fill_solid(solid_voxels, mask, number, (slice(None),) * 3, True)
-    counts = np.ceil((high - low) / LATTICE_STEP_MM).astype(int) + 1
-    lattice = Lattice(low, LATTICE_STEP_MM, (int(counts[2]), int(counts[1]), int(counts[0])))
+    counts = np.ceil((high - low) / _LATTICE_STEP_MM).astype(int) + 1
+    lattice = Lattice(low, _LATTICE_STEP_MM, (int(counts[2]), int(counts[1]), int(counts[0])))
     filled = (solid_voxels != 0) & (dense == 0)
     parts = (mask == number, own, solid_voxels != 0, filled)
     hu, label, solid = _sample(volume, start, voxels, parts, lattice, level)

@@ -187,16 +187,16 @@ class VertebraSplit(Message):
         return [one for one in self.vertebrae if not one.is_confident]
 
 
-LEVELS_HU = (120.0, 226.0)
+_LEVELS_HU = (120.0, 226.0)
 """The level of bone is taken from between these."""
-LEVEL_SHARE = 0.5
+_LEVEL_SHARE = 0.5
 """The level lies so far between a disc and the marrow of a body."""
-CUT_MM = 8.0
+_CUT_MM = 8.0
 """Least height of a vertebra that the scan cuts."""
-WINGS = 0.25
+_WINGS = 0.25
 """Share of bone beside a body from which on it is the sacrum's."""
-SEED_TO_CANAL_MM = 24.0
-ARCH_BEHIND_MM, ARCH_ASIDE_MM = 13.0, 8.0
+_SEED_TO_CANAL_MM = 24.0
+_ARCH_BEHIND_MM, ARCH_ASIDE_MM = 13.0, 8.0
 """The spinous process lies so far behind the canal, within so much to either side."""
 
 
@@ -255,30 +255,30 @@ def split_vertebrae(
     progress("canal", 0, 1)
     line = _canal_points(volume, points, progress)
     progress("vertebrae", 0, 4)
-    found = _find_discs(volume, line, points)
+    discs = _find_discs(volume, line, points)
     progress("vertebrae", 1, 4)
-    hu = _choose_level(found) if level is None else float(level)
-    part = cut_part(volume, found.course, found.looks)
+    hu = _choose_level(discs) if level is None else float(level)
+    part = cut_part(volume, discs.course, discs.looks)
     bone = fill_bone(part, hu)
     progress("vertebrae", 2, 4)
-    planes = planes_of(found.bounds, found.course, found.looks)
-    pieces, doubtful, rim = divide(part, bone, found.bounds, planes, volume)
+    planes = planes_of(discs.bounds, discs.course, discs.looks)
+    pieces, doubtful, rim = divide(part, bone, discs.bounds, planes, volume)
     progress("vertebrae", 3, 4)
     voxel_ml = float(abs(np.linalg.det(volume.affine[:3, :3])) / 1000.0)
-    behind = pieces[(part.ahead < -ARCH_BEHIND_MM) & (np.abs(part.aside) < ARCH_ASIDE_MM)]
-    arches = np.asarray(voxel_ml * np.bincount(behind, minlength=len(found.bounds) + 2), dtype=np.float64)
-    spans, left_out = _spans(found, pieces, doubtful, rim, arches, voxel_ml, hu)
-    place = 0 if landmark is None else _place_of(landmark, spans, found, volume, part.first, pieces)
+    behind = pieces[(part.ahead < -_ARCH_BEHIND_MM) & (np.abs(part.aside) < ARCH_ASIDE_MM)]
+    arches = np.asarray(voxel_ml * np.bincount(behind, minlength=len(discs.bounds) + 2), dtype=np.float64)
+    spans, left_out = _spans(discs, pieces, doubtful, rim, arches, voxel_ml, hu)
+    place = 0 if landmark is None else _place_of(landmark, spans, discs, volume, part.first, pieces)
     names = name_levels(len(spans), None if level_name is None else (place, level_name))
-    vertebrae = _judge_all(spans, names, found)
+    vertebrae = _judge_all(spans, names, discs)
     kept = {one.number: one.name for one in vertebrae if one.is_confident or keep_unsure}
     if not kept:
         raise RefusedInputError(_describe_refusal(vertebrae, left_out))
-    every = np.zeros(len(found.bounds) + 2, np.uint8)  # number of each piece
+    every = np.zeros(len(discs.bounds) + 2, np.uint8)  # number of each piece
     every[[piece_number for piece_number, _ in spans]] = [one.number for one in vertebrae]
-    plane = _middle_plane(volume, found, spans, _as_map(volume, part.where, every[pieces], {}))
+    plane = _middle_plane(volume, discs, spans, _as_map(volume, part.where, every[pieces], {}))
     labels = _as_map(volume, part.where, np.where(np.isin(every, list(kept)), every, 0)[pieces], kept)
-    centres, normals = planes_of([bound for bound in found.bounds if bound.is_disc], found.course, found.looks)
+    centres, normals = planes_of([bound for bound in discs.bounds if bound.is_disc], discs.course, discs.looks)
     progress("vertebrae", 4, 4)
     return VertebraSplit(labels, vertebrae, centres, normals, hu, left_out, plane)
 
@@ -308,7 +308,7 @@ def _canal_points(volume: Volume, seeds: Float64Array | None, progress: Progress
         return _without_short_ends(line)
     except RefusedInputError as error:
         if seeds is not None:
-            return np.asarray(seeds + np.array([0.0, SEED_TO_CANAL_MM, 0.0]))
+            return np.asarray(seeds + np.array([0.0, _SEED_TO_CANAL_MM, 0.0]))
         what = str(error).partition(": give points")[0].partition("; give points")[0]
         raise RefusedInputError(
             f"{what}; no vertebrae without it: give a point in each of them ({name_parameter('seeds', 'X,Y,Z')})"
@@ -359,7 +359,7 @@ def _choose_level(found: _Found) -> float:
         float(np.nanmedian(np.stack([found.looks.core[rows, column[rows]] for column in columns])))
         for rows in (at, np.clip(middles, 0, len(found.scan) - 1))
     )
-    return float(np.clip(disc + LEVEL_SHARE * (marrow - disc), *LEVELS_HU))
+    return float(np.clip(disc + _LEVEL_SHARE * (marrow - disc), *_LEVELS_HU))
 
 
 def _spans(
@@ -412,7 +412,7 @@ def _no_vertebra(piece: Piece, found: _Found, gaps: list[float], level: float) -
         return ""  # beyond the end of the bone
     if piece.lower is None or not piece.lower.is_disc:
         share = beside_share(found.scan, found.looks, piece, level)
-        if share >= WINGS:
+        if share >= _WINGS:
             return f"the bone has wings ({100 * share:.0f} % beside its body): it looks like the sacrum"
     if piece.whole:
         return None
@@ -420,7 +420,7 @@ def _no_vertebra(piece: Piece, found: _Found, gaps: list[float], level: float) -
     gap = gaps[0] if piece.upper is None else gaps[-1]
     if not reaches or height > 1.3 * gap:
         return f"{height} mm follow without a disc that was found"
-    return None if height >= CUT_MM else f"only {height} mm of a vertebra are in the scan"
+    return None if height >= _CUT_MM else f"only {height} mm of a vertebra are in the scan"
 
 
 def _place_of(

@@ -17,7 +17,7 @@ from clrecon.system.light_dataclass import dataclass
 SECONDS = 30.0
 """Until the child is given up; it takes half a second where nothing else runs."""
 
-SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "swr", "software")
+_SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "swr", "software")
 """Words of drivers that draw with the processor."""
 
 TRIES = 4
@@ -78,7 +78,7 @@ class Display:
     @property
     def is_software(self) -> bool:
         """True where the processor draws: smoothing of edges by many samples would take most of the time."""
-        return any(word in self.driver.lower() for word in SOFTWARE)
+        return any(word in self.driver.lower() for word in _SOFTWARE)
 
 
 class DisplayProbe:

@@ -20,7 +20,7 @@ from numpy.typing import DTypeLike, NDArray
 from clrecon.errors import RefusedInputError
 from clrecon.system.light_dataclass import dataclass
 
-MEMORY_SHARE = 0.9
+_MEMORY_SHARE = 0.9
 """Share of the free memory that voxels may take; the rest is for what is computed beside the volume."""
 
 
@@ -54,7 +54,7 @@ def allocate_voxels(shape: Sequence[int], dtype: DTypeLike, name: str = "") -> N
     available = available_memory_bytes()
     size = " x ".join(map(str, reversed(shape)))
     what = f"{name}{': ' * bool(name)}the volume of {size} voxels needs {needed / 2**30:.2f} GiB of memory"
-    if needed > MEMORY_SHARE * available:
+    if needed > _MEMORY_SHARE * available:
         raise RefusedInputError(f"{what}, {available / 2**30:.2f} GiB are free")
     try:
         return aligned_empty(shape, dtype)

@@ -74,9 +74,9 @@ def numbers_reader(count: int | None, fault: str, *, ends: bool = False) -> Call
     """Return what reads so many numbers, or any count, see `parse_numbers`; refusals say `fault` behind the text."""
 
     def read(text: str) -> tuple[float, ...]:
-        found = parse_numbers(text, ends=ends)
-        if found is None or count not in (None, len(found)):
+        numbers = parse_numbers(text, ends=ends)
+        if numbers is None or count not in (None, len(numbers)):
             raise ValueError(f"{text!r} {fault}")
-        return found
+        return numbers
 
     return read

@@ -7,13 +7,13 @@ import math
 from collections.abc import Iterable
 from functools import lru_cache
 
-TEXT_LIMIT = 64
+_TEXT_LIMIT = 64
 NAMES_SHOWN = 5
-MOST_PLACES = 12
-LARGEST_HU, LARGEST_WRITTEN = 1e6, 1e15
+_MOST_PLACES = 12
+_LARGEST_HU, _LARGEST_WRITTEN = 1e6, 1e15
 
 
-def escape_text(text: str, limit: int = TEXT_LIMIT) -> str:
+def escape_text(text: str, limit: int = _TEXT_LIMIT) -> str:
     r"""Return `text` in one printable line of at most `limit` characters, others as ``\xNN`` or ``\uNNNN``."""
     if text.isprintable() and len(text) <= limit:
         return text
@@ -23,7 +23,7 @@ def escape_text(text: str, limit: int = TEXT_LIMIT) -> str:
 
 def guess_word(word: object, known: Iterable[str]) -> str:
     """Return `` (did you mean X?)`` with the known word that is most like `word` in any case; empty if none is."""
-    if not isinstance(word, str) or len(word) > TEXT_LIMIT:
+    if not isinstance(word, str) or len(word) > _TEXT_LIMIT:
         return ""
     from difflib import get_close_matches  # only where something was misspelt
 
@@ -47,16 +47,16 @@ def format_digits(value: float, digits: int = 3) -> str:
     """Return a number with so many significant digits, never an exponent: ``12,346`` whole, ``0.0039``, ``-312``."""
     if value == 0.0:
         return "0"
-    if not math.isfinite(value) or abs(value) >= LARGEST_WRITTEN:
+    if not math.isfinite(value) or abs(value) >= _LARGEST_WRITTEN:
         return f"{value:g}"
-    places = min(max(0, digits - 1 - math.floor(math.log10(abs(value)))), MOST_PLACES)
+    places = min(max(0, digits - 1 - math.floor(math.log10(abs(value)))), _MOST_PLACES)
     text = f"{value:,.{places}f}"
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
 def format_hu(value: float) -> str:
     """Return HU as far as they mean something: whole numbers as they are, others with three significant digits."""
-    if math.isfinite(value) and value == round(value) and abs(value) < LARGEST_HU:
+    if math.isfinite(value) and value == round(value) and abs(value) < _LARGEST_HU:
         return str(round(value))
     return format_digits(value)
 

@@ -147,8 +147,8 @@ def open_plotter(
 
 def _add_labels(plotter: pyvista.Plotter, shown: ShownLabels, device: Any, memory: int | None) -> None:
     """Add the surface of each label in a colour of its own, translucent around the bone of a scan."""
-    found = extract_label_masks(shown.labels, device=device, memory=memory)
-    for (number, mesh), color in zip(found.items(), distinct_colors(len(found)), strict=True):
+    label_masks = extract_label_masks(shown.labels, device=device, memory=memory)
+    for (number, mesh), color in zip(label_masks.items(), distinct_colors(len(label_masks)), strict=True):
         name = f"{shown.name} {shown.labels.name(number)}"
         opacity = 1.0 if shown.within is None else 0.4
         plotter.add_mesh(mesh.to_pyvista(), color=color, name=name, smooth_shading=True, opacity=opacity)

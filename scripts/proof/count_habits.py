@@ -136,7 +136,7 @@ def _count_package(texts: dict[str, str], places: Places) -> None:
 
 
 def _count_constants(package: dict[str, str], places: Places, others: dict[str, str]) -> None:
-    """Note the constants without an underscore that no other file reads."""
+    """Note the constants without an underscore that no other file, kernel or document names."""
     words = {file: set(re.findall(r"\b[A-Z][A-Z0-9_]+\b", text)) for file, text in (package | others).items()}
     users = Counter(word for names in words.values() for word in names)
     for file, text in package.items():
@@ -189,8 +189,10 @@ def find_habits(root: Path = ROOT) -> Places:
     gc.disable()  # a search among the nodes of all trees takes longer than to parse them
     package, tests = (_read_texts(root, folder, "*.py") for folder in ("clrecon", "tests"))
     _count_package(package, places)
-    _count_constants(package, places, tests | _read_texts(root, "scripts", "*.py"))
-    _count_kernels(_read_texts(root, "cl", "*.cl"), places)
+    kernels = _read_texts(root, "cl", "*.*")
+    documents = _read_texts(root, "docs", "*.md")
+    _count_constants(package, places, tests | kernels | documents | _read_texts(root, "scripts", "*.py"))
+    _count_kernels(kernels, places)
     _count_tests(tests, places)
     gc.enable()
     return places

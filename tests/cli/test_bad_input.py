@@ -126,7 +126,7 @@ def test_a_folder_without_permission(tmp_path: Path, target: Path, capsys: pytes
         folder.chmod(0o700)
 
 
-def test_an_iso_value_above_all_voxels(
+def test_an_iso_value_above_all_voxels_is_refused(
     device: Any, tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = write_series(tmp_path / "ct")
@@ -134,7 +134,9 @@ def test_an_iso_value_above_all_voxels(
     check_refused(arguments, 2, "-1000 to 700 HU", target, capsys)
 
 
-def test_a_constant_volume(device: Any, tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_constant_volume_has_no_surface(
+    device: Any, tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = write_series(tmp_path / "ct", np.full((4, 9, 7), -1000, np.int16))
     check_refused(
         ["mesh", str(folder), "-o", str(target), "--device", str(device.index)], 4, "all 252 voxels are -1000 HU",
@@ -142,7 +144,9 @@ def test_a_constant_volume(device: Any, tmp_path: Path, target: Path, capsys: py
     )  # fmt: skip
 
 
-def test_an_unknown_device(device: Any, tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_device_is_refused(
+    device: Any, tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     arguments = ["mesh", str(tmp_path), "-o", str(target), "--device", "abacus"]
     check_refused(arguments, 5, "'abacus' is not there; found ", target, capsys)
 
@@ -200,7 +204,7 @@ def test_report_and_mesh_are_two_files(tmp_path: Path, target: Path, capsys: pyt
         (["-q", "-v"], "not allowed with"),
     ],
 )
-def test_wrong_usage(
+def test_wrong_options_exit_with_3(
     extra: list[str], words: str, tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     check_refused(["mesh", str(tmp_path), "-o", str(target), *extra], 3, words, target, capsys)

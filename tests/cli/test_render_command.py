@@ -132,7 +132,7 @@ def test_up_turns_the_picture(render: Renders) -> None:
     assert side_of(lit(render("--up", "0,0,-1")[0])) == ("left", "bottom")
 
 
-def test_size_and_perspective(render: Renders) -> None:
+def test_size_and_perspective_set_the_camera(render: Renders) -> None:
     image, report = render("--size", "80x64", "--perspective", "20")
     assert image.shape == (64, 80, 4)
     (picture,) = report["pictures"]
@@ -140,7 +140,7 @@ def test_size_and_perspective(render: Renders) -> None:
     assert render("--perspective")[1]["pictures"][0]["camera"]["view_angle_deg"] == 30.0
 
 
-def test_background(render: Renders) -> None:
+def test_background_colour_fills_the_corner_of_the_picture(render: Renders) -> None:
     assert render()[0][0, 0].tolist() == [0, 0, 0, 255]
     assert render("--background", "#ff8000")[0][0, 0].tolist() == [255, 128, 0, 255]
     transparent = render("--background", "transparent")[0]
@@ -159,7 +159,7 @@ def test_clipping_leaves_out(render: Renders) -> None:
     assert nothing["pictures"][0]["hit_share"] == 0.0 and nothing["pictures"][0]["depth_mm"] is None
 
 
-def test_light(render: Renders) -> None:
+def test_light_option_chooses_the_lighting(render: Renders) -> None:
     flat, report = render("--iso", ISO, "--light", "none", "--view", "30,30")
     assert report["lighting"]["diffuse"] == 0.0
     assert len(np.unique(flat[lit(flat)], axis=0)) == 1

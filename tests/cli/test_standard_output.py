@@ -66,7 +66,7 @@ def test_a_report_goes_to_standard_output_and_the_remarks_to_standard_error(devi
         ("render", "--size", "40x40", "-o", "-"),
     ],
 )
-def test_other_commands_too(device, ct, capfdbinary, arguments):
+def test_results_of_other_commands_go_to_standard_output(device, ct, capfdbinary, arguments):
     command, *rest = arguments
     at = [] if command == "export" else ["--device", device.index]
     assert run(command, ct, *rest, *at) == 0

@@ -69,7 +69,7 @@ def mesh() -> Mesh:
     return Mesh(vertices, triangles, report={"iso_value_hu": 226.0, "certificate": REPORT})
 
 
-def test_the_lines():
+def test_certificate_lines_name_the_frame_only_with_ids():
     assert list(certificate_lines(REPORT)) == LINES
     with_ids = certificate_lines(REPORT, keep_ids=True)
     assert [line for line in with_ids if line not in LINES] == ["frame_of_reference ee740dfa4069b59a"]

@@ -126,7 +126,7 @@ def test_no_patient_data_and_no_path(mesh, extension, tmp_path):
 
 
 @pytest.mark.parametrize(("space", "name"), [("lps", b"LPS"), ("ras", b"RAS")])
-def test_stl_bytes(mesh, space, name, tmp_path):
+def test_stl_has_the_bytes_of_its_definition(mesh, space, name, tmp_path):
     mesh.save(tmp_path / "bone.stl", space)
     content = (tmp_path / "bone.stl").read_bytes()
     assert content[:80] == (b"clrecon SPACE=" + name + b" UNIT=mm").ljust(80)
@@ -275,7 +275,7 @@ def test_unknown_extension_lists_those_that_are_written(mesh, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_unknown_space(mesh, tmp_path):
+def test_an_unknown_space_is_refused(mesh, tmp_path):
     with pytest.raises(UsageError, match="unknown space"):
         mesh.save(tmp_path / "bone.stl", space="xyz")
     assert list(tmp_path.iterdir()) == []

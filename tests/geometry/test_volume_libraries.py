@@ -55,7 +55,7 @@ def numbered(affine: np.ndarray, dtype: str = "int16") -> Volume:
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", AFFINES)
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_there_and_back(way, name, dtype):
+def test_volumes_return_unchanged_from_other_libraries(way, name, dtype):
     volume = numbered(AFFINES[name], dtype)
     there, back = WAYS[way]
     made = back(there(volume))

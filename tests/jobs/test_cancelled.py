@@ -106,7 +106,7 @@ def there(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_reading(scan: Path) -> None:
+def test_reading_can_be_cancelled_at_every_report(scan: Path) -> None:
     found = moments(lambda progress: clrecon.read_volume(scan, progress=progress))
     assert {stage for stage, _, _ in found} == {"scan", "read"}
     for moment in found:
@@ -118,7 +118,7 @@ def test_reading(scan: Path) -> None:
 
 @pytest.mark.release
 @pytest.mark.slow
-def test_a_mesh(scan: Path, device: Any, tmp_path: Path) -> None:
+def test_a_mesh_job_can_be_cancelled_at_every_report(scan: Path, device: Any, tmp_path: Path) -> None:
     settings = MeshSettings(
         iso_value=(100.0, 200.0), smooth=2, decimate=0.5, split=True, field_of_view=14.0, device=str(device.index)
     )
@@ -139,7 +139,7 @@ def test_a_mesh(scan: Path, device: Any, tmp_path: Path) -> None:
         assert there(tmp_path) == before
 
 
-def test_slabs_of_a_surface_and_its_buffers(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cancelled_surface_frees_its_buffers(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     voxels = np.zeros((40, 30, 30), np.int16)
     voxels[5:35, 5:25, 5:25] = 1000
     volume = Volume(voxels, np.eye(4))
@@ -170,7 +170,7 @@ def test_slabs_of_a_surface_and_its_buffers(device: Any, monkeypatch: pytest.Mon
     assert buffers.held == kept
 
 
-def test_slabs_of_a_slice(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slice_made_in_slabs_can_be_cancelled(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     voxels = np.random.default_rng(0).integers(-1000, 1000, (60, 40, 40)).astype(np.int16)
     volume = Volume(voxels, np.eye(4))
     cut = {"size": (64, 64), "memory": 100_000}
@@ -184,7 +184,7 @@ def test_slabs_of_a_slice(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("own", daily(1, [False, True]))
-def test_labels(own: bool, device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_surfaces_of_labels_can_be_cancelled(own: bool, device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     voxels = np.zeros((24, 24, 24), np.int16)
     marks = np.zeros(voxels.shape, np.uint8)
     for number, first in enumerate((2, 9, 16), start=1):
@@ -208,7 +208,9 @@ def test_labels(own: bool, device: Any, monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", daily(1, ["a.apng", "a.gif", "a.mp4", "frames"]))
-def test_a_turntable(name: str, scan: Path, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_turntable_can_be_cancelled_at_every_report(
+    name: str, scan: Path, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     settings = RenderSettings.of(
         "mip", size=(32, 32), turntable=Turntable(frames=4), background="black", device=str(device.index)
     )

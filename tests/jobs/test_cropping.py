@@ -139,7 +139,7 @@ def test_wrong_boxes_are_one_line(
 
 
 @pytest.mark.unit
-def test_boxes() -> None:
+def test_crop_box_is_the_common_part_of_its_limits() -> None:
     assert crop_box(None, None, None) is None
     everywhere = float("inf")
     assert crop_box(None, (1, 2), None) == ((-everywhere, -everywhere, 1), (everywhere, everywhere, 2))

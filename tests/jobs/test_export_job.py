@@ -111,7 +111,7 @@ def test_nothing_is_replaced_where_that_is_asked(tmp_path: Path) -> None:
     assert run("export", scan, "-o", tmp_path / "a.nii") == 0
 
 
-def test_from_python(tmp_path: Path) -> None:
+def test_export_from_python_resamples_and_reports_progress(tmp_path: Path) -> None:
     scan = series(tmp_path)
     seen = []
     settings = ExportSettings(between=(-1e9, 1e9), resample=2.0)

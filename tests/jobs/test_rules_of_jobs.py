@@ -158,7 +158,7 @@ def test_a_corridor_has_a_screw_where_it_has_a_radius(radius: float | None) -> N
     assert found == (None if radius is None else screw_diameter(radius, 1.0))
 
 
-def test_a_file_says_its_frame() -> None:
+def test_a_file_turned_from_ras_gives_a_warning() -> None:
     assert inputs._describe_frame("a", {"space": "LPS", "warnings": []}) == ()
     assert inputs._describe_frame("a", {"space": "RAS", "warnings": ["w"]}) == ("a was turned from RAS to LPS", "w")
 

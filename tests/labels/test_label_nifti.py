@@ -260,7 +260,7 @@ RIGID = np.array([[0.7, 0.0, 0.0, -10.0], [0.0, 0.5, 0.0, 20.0], [0.0, 0.0, -2.5
 
 
 @pytest.mark.parametrize("sform", [True, False])
-def test_pixdim_0_of_0_means_1(tmp_path, sform):
+def test_first_pixdim_of_0_counts_as_1(tmp_path, sform):
     affine = RIGID @ np.diag((1.0, 1.0, -1.0, 1.0))
     path = write_nifti(tmp_path / "a.nii", make_labels(), affine, sform=sform, qform=True)
     before = read_labels(path)

@@ -98,7 +98,7 @@ def test_commands_follow_links_to_masks_on_request(tmp_path, capsys):
     assert "aorta" in capsys.readouterr().out
 
 
-def test_chosen_masks_come_before_others(tmp_path):
+def test_chosen_masks_win_overlaps_and_unknown_ones_are_refused(tmp_path):
     folder = write_folder(tmp_path / "masks")
     alone = read_labels(folder, ["liver", "L3"])
     assert alone.counts == {2: 84, 4: 84} and alone.names == {2: "liver", 4: "vertebrae_L3"} and alone.warnings == ()

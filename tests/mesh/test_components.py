@@ -66,12 +66,12 @@ def test_keep_two():
 
 
 @pytest.mark.parametrize(("least", "volume"), [(0.0079, 0.068), (0.0081, 0.060), (0.0, 0.069)])
-def test_least_volume(least, volume):
+def test_components_below_the_least_volume_are_removed(least, volume):
     kept = select_components(three_boxes(), min_volume_ml=least)
     assert kept.quality()["volume_ml"] == pytest.approx(volume)
 
 
-def test_both_limits():
+def test_number_and_least_volume_apply_together():
     kept = select_components(three_boxes(), keep_largest=2, min_volume_ml=0.01)
     assert kept.report["components_kept"] == 1
     assert kept.quality()["volume_ml"] == pytest.approx(0.060)
@@ -134,7 +134,7 @@ def test_nothing_left():
         {"min_volume_ml": float("inf")},
     ],
 )
-def test_wrong_limits(arguments):
+def test_wrong_limits_are_refused(arguments):
     with pytest.raises(UsageError, match="keep_largest is a whole number|min_volume_ml is a volume"):
         select_components(three_boxes(), **arguments)
 

@@ -104,7 +104,7 @@ def test_good_surfaces_have_none():
     assert count(([], [])) == 0
 
 
-def test_two_triangles():
+def test_triangles_that_touch_count_as_intersecting():
     flat, upright = [[0, 0, 0], [4, 0, 0], [0, 4, 0]], [[1, 1, -1], [1, 1, 3], [2, 1, 3]]
     assert count((np.array(flat + upright, float), [[0, 1, 2], [3, 4, 5]])) == 1
     above = np.array(flat + upright, float)
@@ -125,7 +125,7 @@ def test_spheres_that_cut_each_other(shift):
     assert (count((vertices, triangles)) > 0) == (shift[0] < 20)
 
 
-def test_random_triangles_of_all_sizes():
+def test_random_triangles_intersect_as_solving_says():
     rng = np.random.default_rng(9)
     corners = rng.uniform(0, 10, (60, 1, 3)) + rng.normal(size=(60, 3, 3)) * rng.choice([0.3, 1.0, 4.0], (60, 1, 1))
     vertices = corners.reshape(-1, 3).astype(np.float32).astype(float)

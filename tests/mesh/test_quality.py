@@ -89,7 +89,7 @@ def test_inside_out():
     assert quality["volume_ml"] == pytest.approx(-0.001)
 
 
-def test_hole():
+def test_a_hole_opens_the_mesh_and_changes_its_euler_number():
     vertices, triangles = samples.sphere()
     quality = measure((vertices, np.delete(triangles, 17, axis=0)))
     assert figures(quality, "closed", "manifold", "boundary_edges", "euler_number", "genus") == (
@@ -108,7 +108,7 @@ def test_volume_of_an_open_surface_does_not_depend_on_its_place():
     assert there["volume_ml"] == here["volume_ml"] == pytest.approx(0.008 * 11 / 12)
 
 
-def test_flipped_face():
+def test_a_flipped_face_is_not_oriented_but_closed():
     vertices, triangles = samples.torus()
     triangles[40] = triangles[40, ::-1]
     quality = measure((vertices, triangles))

@@ -47,7 +47,7 @@ def a_cloud() -> PointCloud:
         (["seed:0,0,103", "seed:0,90,0"], {2, 3}, {"noise": 2, "other cluster": 1500}),
     ],
 )
-def test_rules(rules, kept: set[int], counts: dict[str, int]) -> None:
+def test_rules_keep_the_clusters_that_they_name(rules, kept: set[int], counts: dict[str, int]) -> None:
     step = keep_clusters(a_cloud(), rules)
     assert set(step.cloud.labels.tolist()) == kept
     assert {reason: count for reason, count in step.counts.items() if count} == counts

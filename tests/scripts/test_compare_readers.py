@@ -38,7 +38,7 @@ PLACES = TRUTH.lps_mm.tolist()
         ({"refused": "ValueError: no", "verdict": "R"}, "R", False),
     ],
 )
-def test_cells(answer, text, silent_fault):
+def test_cells_say_the_error_and_whether_it_is_silent(answer, text, silent_fault):
     cell = compare_readers.judge(answer, TRUTH)
     assert cell.text() == text and cell.is_silent_fault() is silent_fault
 

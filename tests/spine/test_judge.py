@@ -90,7 +90,9 @@ def test_every_trait_of_a_whole_vertebra() -> None:
         ({"upper": Bound(10, 0, 80.0), "lower": Bound(50, 0, 90.0)}, (), "inside", 1.1),  # 36 of 80 HU
     ],
 )
-def test_single_traits(changes: dict[str, Any], gaps: tuple[float, ...], name: str, value: float) -> None:
+def test_a_changed_vertebra_loses_the_trait_of_the_change(
+    changes: dict[str, Any], gaps: tuple[float, ...], name: str, value: float
+) -> None:
     found = traits_of(replace(WHOLE, **changes), gaps, {20: 36.0})
     assert found[name] == pytest.approx(min(value, 1.0), rel=1e-6)
 

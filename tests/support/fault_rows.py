@@ -6,7 +6,7 @@ the file below tests/.  The guard is guards/test_fault_list.py.
 
 from __future__ import annotations
 
-TRAPS = "reading/dicom/test_trap_matrix.py::test_a_row_of_the_matrix"
+TRAPS = "reading/dicom/test_trap_matrix.py::test_each_trap_gets_its_verdict"
 GEOMETRY = "reading/dicom/test_stack_geometry.py::"
 PIXELS = "reading/dicom/test_pixels.py::"
 SERIES = "reading/dicom/test_series_choice.py::"
@@ -110,7 +110,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     30: (
         "iso value outside of the data: refused with the range, no empty file",
         (
-            BAD_INPUT + "test_an_iso_value_above_all_voxels",
+            BAD_INPUT + "test_an_iso_value_above_all_voxels_is_refused",
             "operators/surface/test_isosurface.py::test_an_iso_value_outside_the_data_is_refused_with_the_range",
         ),
     ),
@@ -121,7 +121,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     32: (
         "constant volume, NaN, infinite voxels: refused",
         (
-            BAD_INPUT + "test_a_constant_volume",
+            BAD_INPUT + "test_a_constant_volume_has_no_surface",
             "geometry/test_iso_rule.py::test_values_that_are_not_finite_are_refused",
         ),
     ),
@@ -241,7 +241,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     68: (
         "STL header: 80 bytes, never begins with solid, no patient data",
         (
-            "exchange/test_mesh_files.py::test_stl_bytes",
+            "exchange/test_mesh_files.py::test_stl_has_the_bytes_of_its_definition",
             "exchange/test_mesh_files.py::test_no_patient_data_and_no_path",
         ),
     ),

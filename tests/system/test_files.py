@@ -52,7 +52,7 @@ def check_untouched(path: Path) -> None:
     assert names(path.parent) == [path.name]
 
 
-def test_new_file(tmp_path):
+def test_new_file_appears_once_it_is_verified(tmp_path):
     seen = []
 
     def verify(temporary: Path) -> None:
@@ -134,7 +134,7 @@ def test_other_errors_pass_through(older, error):
     check_untouched(older)
 
 
-def test_interrupt_while_verifying(older):
+def test_older_file_stays_when_verifying_is_interrupted(older):
     def verify(temporary: Path) -> None:
         raise KeyboardInterrupt
 
@@ -194,7 +194,7 @@ def test_full_disk_is_foreseen(older):
 
 @pytest.mark.parametrize("action", [check_writable, lambda path: replace_file(path, lambda stream: None)])
 class TestRefusedTargets:
-    def test_missing_folder(self, action, tmp_path):
+    def test_a_file_in_a_missing_folder_is_refused(self, action, tmp_path):
         with pytest.raises(OutputError, match="the folder .*no does not exist, make it first"):
             action(tmp_path / "no" / "bone.stl")
         assert names(tmp_path) == []
@@ -204,7 +204,7 @@ class TestRefusedTargets:
             action(older / "bone.stl")
         check_untouched(older)
 
-    def test_folder(self, action, tmp_path):
+    def test_a_folder_in_place_of_the_file_is_refused(self, action, tmp_path):
         with pytest.raises(OutputError, match="it is a folder"):
             action(tmp_path)
         with pytest.raises(OutputError, match="this names a folder"):
@@ -212,18 +212,18 @@ class TestRefusedTargets:
         with pytest.raises(OutputError, match="this names a folder"):
             action("")
 
-    def test_fifo(self, action, tmp_path):
+    def test_a_fifo_in_place_of_the_file_is_refused(self, action, tmp_path):
         os.mkfifo(tmp_path / "x.stl")
         with pytest.raises(OutputError, match="it is a FIFO"):
             action(tmp_path / "x.stl")
         assert stat.S_ISFIFO((tmp_path / "x.stl").stat().st_mode)
 
-    def test_device(self, action):
+    def test_a_character_device_in_place_of_the_file_is_refused(self, action):
         with pytest.raises(OutputError, match="it is a character device"):
             action("/dev/null")
         assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
 
-    def test_socket(self, action, tmp_path, monkeypatch):
+    def test_a_socket_in_place_of_the_file_is_refused(self, action, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)  # the name of a socket must be short
         with socket.socket(socket.AF_UNIX) as server:
             server.bind("s")

@@ -17,7 +17,7 @@ from clrecon.system.options import option, parse_numbers
 
 DENOISERS = ("grid", "bilateral")
 
-GHOSTS = ("keep", "drop")
+_GHOSTS = ("keep", "drop")
 
 
 STEPS = {
@@ -123,10 +123,10 @@ class CloudSettings(InputSettings):
         "--paper", "place and filter voxels as the papers print it, and say by how much that is wrong"
     )
     ghost_slices: str = _steps_option(
-        f"--ghost-slices {'|'.join(GHOSTS)}",
+        f"--ghost-slices {'|'.join(_GHOSTS)}",
         "slices inside the stack that are unlike both neighbours, as screen captures and localizers are: drop takes"
-        f" their points away, keep warns of them (default: {GHOSTS[0]})",
-        default=GHOSTS[0],
+        f" their points away, keep warns of them (default: {_GHOSTS[0]})",
+        default=_GHOSTS[0],
         parse=str.lower,
     )
     clusters: Clustering | None = _steps_option(
@@ -184,7 +184,7 @@ class CloudSettings(InputSettings):
 
         frame_from_lps(self.space)
         _check_choice("points are", self.points, POINT_KINDS)
-        _check_choice("points of ghost slices are kept or dropped:", self.ghost_slices, GHOSTS)
+        _check_choice("points of ghost slices are kept or dropped:", self.ghost_slices, _GHOSTS)
         for name in self.denoise:
             _check_choice("clouds are denoised by", name, DENOISERS)
         if len(set(self.denoise)) < len(self.denoise):

@@ -197,7 +197,7 @@ def warn_of_ghosts(steps: CloudSteps, found: GhostSlices) -> None:
     )
 
 
-LEAST_KEPT = 0.5
+_LEAST_KEPT = 0.5
 """Least share of its points that a step must keep which is there to take noise away."""
 
 _EXTRACTED = (
@@ -261,7 +261,7 @@ class CloudSteps:
         by_reason = ", ".join(f"{count:,} {reason}" for reason, count in counts.items() if count)
         text = f"{name}: {taken:,} of {before:,} points gone ({by_reason})" if taken else f"{name}: no point gone"
         self.gates.append(
-            Gate(f"points_kept_{name.replace(' ', '_')}", share, LEAST_KEPT, None, share >= LEAST_KEPT, text)
+            Gate(f"points_kept_{name.replace(' ', '_')}", share, _LEAST_KEPT, None, share >= _LEAST_KEPT, text)
         )
 
     def check(self, allow_point_loss: bool) -> None:

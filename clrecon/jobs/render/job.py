@@ -204,7 +204,7 @@ def _take_turntable(run: Run, taker: PictureTaker, files: PictureFiles) -> dict[
     }
 
 
-OPAQUE_ONLY = (".jpg", ".jpeg", ".mp4", ".gif")
+_OPAQUE_ONLY = (".jpg", ".jpeg", ".mp4", ".gif")
 
 
 @dataclass(frozen=True)
@@ -261,7 +261,7 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
         picture = "" if files.picture is None else extension_of(files.picture)[1:]
         turntable = "" if files.turntable is None else animation_kind(files.turntable)[1:]
         for kind in (picture, turntable):
-            if f".{kind}" in OPAQUE_ONLY:
+            if f".{kind}" in _OPAQUE_ONLY:
                 raise UsageError(
                     f"{kind.upper()} cannot hold a transparent background:"
                     f" choose PNG, TIFF or APNG, or a colour ({name_parameter('background')})"

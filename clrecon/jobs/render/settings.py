@@ -51,12 +51,12 @@ from clrecon.system.light_dataclass import MISSING, dataclass, fields, replace
 from clrecon.system.options import numbers_reader, option
 from clrecon.system.text import unknown_name
 
-DEFAULT_VIEWS = {"slice": "axial", "cpr": "left", "slices": say_view(SLICES_VIEWS[0])}
+_DEFAULT_VIEWS = {"slice": "axial", "cpr": "left", "slices": say_view(SLICES_VIEWS[0])}
 """Default view of the modes whose default is not the view from the front; that of slices suits the scan."""
 SPINES = (SPINE, "auto")
 """Values of a curve that stand for the spinal canal, which is found in the scan."""
 VIEWS = tuple(DIRECTIONS)
-LIGHTS = ("head", "none")
+_LIGHTS = ("head", "none")
 
 _CALLED = {"light": "lighting", "labels": "labels", "clip_planes": "clip"}
 """Settings that make a field of the style under another name: the name of the setting, and that of the field."""
@@ -348,7 +348,7 @@ class RenderSettings(InputSettings):
 
     @property
     def views_used(self) -> tuple[str, ...]:
-        return tuple(self.views) or (DEFAULT_VIEWS.get(self.mode, ANTERIOR),)
+        return tuple(self.views) or (_DEFAULT_VIEWS.get(self.mode, ANTERIOR),)
 
     @property
     def size_used(self) -> tuple[int, int]:
@@ -395,8 +395,8 @@ def _turn_light(light: str | Sequence[float], lighting: Lighting) -> Lighting:
         return UNSHADED
     direction: Any = light
     if isinstance(light, str):
-        if light not in (*LIGHTS, *DIRECTIONS):
-            known = (*LIGHTS, *DIRECTIONS)
+        if light not in (*_LIGHTS, *DIRECTIONS):
+            known = (*_LIGHTS, *DIRECTIONS)
             raise UsageError(f"{unknown_name('light', light, known)}, or a direction X,Y,Z in LPS")
         direction = DIRECTIONS.get(light)
     return replace(lighting if lighting.shades else Lighting(), direction=direction)

@@ -12,7 +12,7 @@ from clrecon.system.arguments import Space
 from clrecon.system.light_dataclass import dataclass, field, replace
 from clrecon.system.options import option
 
-MOST_NAME = 80
+_MOST_NAME = 80
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ class ViewSettings:
     def __post_init__(self) -> None:
         check_space(self.mesh_space)
         for name in self.names:
-            if not name.strip() or len(name) > MOST_NAME or not name.isprintable():
-                raise UsageError(f"a name has 1 to {MOST_NAME} printable characters, not {name[:MOST_NAME]!r}")
+            if not name.strip() or len(name) > _MOST_NAME or not name.isprintable():
+                raise UsageError(f"a name has 1 to {_MOST_NAME} printable characters, not {name[:_MOST_NAME]!r}")
         if self.scan.labels_pick and not self.scan.one_file:  # each label with a colour of its own
             object.__setattr__(self, "scan", replace(self.scan, one_file=True))

@@ -154,7 +154,7 @@ def compare_meshes(
     )
 
 
-WALL_SAMPLES = 20_000
+_WALL_SAMPLES = 20_000
 """Points on the surface, so that the 5th percentile is based on the 1000 thinnest places."""
 
 _INWARD = 1e-3
@@ -162,7 +162,7 @@ _INWARD = 1e-3
 
 
 def wall_thickness(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], samples: int = WALL_SAMPLES
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], samples: int = _WALL_SAMPLES
 ) -> NDArray[np.float64]:
     """Measure the wall thickness at points that cover a closed surface evenly by area, the same points at every call.
 
@@ -200,7 +200,7 @@ class WallFigures(Record):
 
 
 def measure_walls(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], thin_mm: float, samples: int = WALL_SAMPLES
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], thin_mm: float, samples: int = _WALL_SAMPLES
 ) -> WallFigures:
     """Summarise `wall_thickness`; walls below `thin_mm` are thin."""
     thickness = wall_thickness(vertices, triangles, samples)

@@ -26,21 +26,21 @@ COMPACT_HU = 600.0
 """Compact bone reaches this below its surface; contrast medium in heart and vessels does not."""
 WALL_MM = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 """Depths along the inward normal, to 1.5 voxels if that is deeper; the wall is the highest value at these depths."""
-FLAT_MM, FLAT_HU = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0), 120.0
-"""A wall is flat where values at these depths below it, in voxels of above 1 mm, differ by at most `FLAT_HU`."""
-NEAR_MM, NEAR_STEPS = 15.0, 5.0
+_FLAT_MM, _FLAT_HU = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0), 120.0
+"""A wall is flat where values at these depths below it, in voxels of above 1 mm, differ by at most `_FLAT_HU`."""
+NEAR_MM, _NEAR_STEPS = 15.0, 5.0
 """Bone has a compact wall within this distance, or this number of voxels, of every place; coarse voxels blur most."""
-LEAST_COMPACT = 0.05
-FAINT_HU, FAINT_SPREAD_HU = 500.0, 200.0
+_LEAST_COMPACT = 0.05
+FAINT_HU, _FAINT_SPREAD_HU = 500.0, 200.0
 """Thin bone without walls reaches the first value, and exceeds the median by the second; vessels have one value."""
-LEAST_FLAT = 0.05
+_LEAST_FLAT = 0.05
 MOST_SAMPLES = 8_000
-MOST_COMPONENT_SAMPLES = 500
+_MOST_COMPONENT_SAMPLES = 500
 FEWEST_VERTICES = 150
 """Least number of vertices of a component that is judged; smaller ones are crumbs."""
-RAIL_SECTIONS = 8
+_RAIL_SECTIONS = 8
 """Number of parts of the scan, along its slices, in which the cross section of a rail is compared."""
-RAIL_SHIFT_MM = 1.0
+_RAIL_SHIFT_MM = 1.0
 """Sides of a rail differ by at most this, or half a voxel, from part to part, because of noise and shadows."""
 
 
@@ -74,11 +74,11 @@ def sample_walls(vertices: NDArray[np.floating], normals: NDArray[np.floating], 
         ways = (points + (depth * times)[:, None] * inward for depth in depths_mm)
         return np.stack([trilinear_values(volume, rule, volume.lps_to_ijk(way)) for way in ways])
 
-    wall = look_beneath(WALL_MM, np.maximum(FLAT_MM[0] * longer / WALL_MM[-1], 1.0)).max(axis=0)
-    deep = look_beneath(FLAT_MM, longer)
+    wall = look_beneath(WALL_MM, np.maximum(_FLAT_MM[0] * longer / WALL_MM[-1], 1.0)).max(axis=0)
+    deep = look_beneath(_FLAT_MM, longer)
     low, high = deep.min(axis=0), deep.max(axis=0)
-    flat = (wall < COMPACT_HU) & (low > rule.iso_level) & (high - low < FLAT_HU)
-    return Walls(points, wall, flat, max(NEAR_MM, NEAR_STEPS * max(volume.spacing)))
+    flat = (wall < COMPACT_HU) & (low > rule.iso_level) & (high - low < _FLAT_HU)
+    return Walls(points, wall, flat, max(NEAR_MM, _NEAR_STEPS * max(volume.spacing)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +108,12 @@ def judge_walls(walls: Walls) -> WallLook:
     metal_share = float((walls.wall > METAL_HU).mean())
     if metal_share > 0.5:
         looks_like = "metal"
-    elif compact_share >= LEAST_COMPACT:
+    elif compact_share >= _LEAST_COMPACT:
         looks_like = "bone"
-    elif p99 >= FAINT_HU and p99 - median >= FAINT_SPREAD_HU:
+    elif p99 >= FAINT_HU and p99 - median >= _FAINT_SPREAD_HU:
         looks_like = "faint bone"
     else:
-        looks_like = "contrast medium" if contrast_share >= LEAST_FLAT else "no bone"
+        looks_like = "contrast medium" if contrast_share >= _LEAST_FLAT else "no bone"
     return WallLook(
         looks_like,
         round(compact_share, 4),
@@ -137,7 +137,7 @@ def judge_components(
     ends = np.searchsorted(label_of_vertex[order], np.arange(count + 1))
     sizes = np.diff(ends)
     told = np.flatnonzero(sizes >= fewest)
-    chosen = [order[ends[one] : ends[one + 1] : -(-sizes[one] // MOST_COMPONENT_SAMPLES)] for one in told]
+    chosen = [order[ends[one] : ends[one + 1] : -(-sizes[one] // _MOST_COMPONENT_SAMPLES)] for one in told]
     judged: list[WallLook | None] = [None] * count
     if len(told) == 0:
         return judged
@@ -191,13 +191,13 @@ def _measure_section(
     if k.min() > 1.0 or k.max() < last - 1.0:
         return None
     within = (k >= 1.0) & (k <= last - 1.0)  # without the faces that close the surface at the border of the scan
-    section = ((k[within] - 1.0) * (RAIL_SECTIONS / max(last - 2.0, 1.0))).astype(int).clip(0, RAIL_SECTIONS - 1)
+    section = ((k[within] - 1.0) * (_RAIL_SECTIONS / max(last - 2.0, 1.0))).astype(int).clip(0, _RAIL_SECTIONS - 1)
     across = points[within, :2] * spacing[:2]
-    if np.bincount(section, minlength=RAIL_SECTIONS).min() == 0:
+    if np.bincount(section, minlength=_RAIL_SECTIONS).min() == 0:
         return None
-    sides = np.array([np.percentile(across[section == part], (2, 98), axis=0) for part in range(RAIL_SECTIONS)])
+    sides = np.array([np.percentile(across[section == part], (2, 98), axis=0) for part in range(_RAIL_SECTIONS)])
     moved = np.ptp(sides, axis=0).max(axis=0)
-    if (moved > np.maximum(RAIL_SHIFT_MM, 0.5 * np.array(spacing[:2]))).any():
+    if (moved > np.maximum(_RAIL_SHIFT_MM, 0.5 * np.array(spacing[:2]))).any():
         return None
     return np.asarray(np.diff(np.median(sides, axis=0), axis=0)[0])
 

@@ -16,7 +16,7 @@ from clrecon.mesh.connectivity import (
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.records import Record
 
-LISTED = 20
+_LISTED = 20
 """Most components that are listed one by one."""
 
 
@@ -79,7 +79,7 @@ def compare_topology(before: Topology, after: Topology) -> TopologyChange:
                 "euler_number_before": int(before.euler[number]),
                 "euler_number_after": int(after.euler[number]),
             }
-            for number in differ[:LISTED]
+            for number in differ[:_LISTED]
         ],
     )
 

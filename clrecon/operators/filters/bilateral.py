@@ -32,7 +32,7 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 
-NEAR_GROUP = kernel_constant("filters/near_level.cl", "GROUP")
+_NEAR_GROUP = kernel_constant("filters/near_level.cl", "GROUP")
 """Voxels of a group."""
 
 
@@ -58,13 +58,13 @@ class SlicesThere:
 
 
 def row_words(ni: int) -> int:
-    return -(-ni // (32 * NEAR_GROUP))
+    return -(-ni // (32 * _NEAR_GROUP))
 
 
 def mixed_group_bytes(ni: int, rows: int, core_rows: int) -> int:
     """Return the most bytes on the device that `list_mixed_groups` takes."""
     words = row_words(ni)
-    return 4 * words * (4 * rows + core_rows) + 4 * -(-ni // NEAR_GROUP) * core_rows
+    return 4 * words * (4 * rows + core_rows) + 4 * -(-ni // _NEAR_GROUP) * core_rows
 
 
 def prepare_near_level(device: Device, dtype: DTypeLike = np.int16) -> Program:
@@ -106,10 +106,10 @@ VolumeKind = TypeVar("VolumeKind", Volume, DeviceVolume)
 GROUP = kernel_constant("filters/bilateral.cl", "GROUP")
 """Voxels of a group."""
 
-BILATERAL = "bilateral filter"
+_BILATERAL = "bilateral filter"
 """Purpose by which slabs are planned."""
 
-TAPS_A_LAUNCH = 1 << 32
+_TAPS_A_LAUNCH = 1 << 32
 """Taps of all voxels of a launch: about a second of work, after which progress is told."""
 
 
@@ -236,14 +236,14 @@ def run_bilateral(
     """Filter the voxels of a volume, slab by slab where they do not fit the device as a whole."""
     run = _Run(resident, settings, stopwatch or Stopwatch(), progress)
     nk = resident.volume.shape_ijk[2]
-    planned = resident.plan(BILATERAL, nk, run.needs)
+    planned = resident.plan(_BILATERAL, nk, run.needs)
     if planned == 0:
         limits = resident.limits
         raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
             f"a slice with the {2 * run.halo} slices around it needs {sum(run.needs(1).values()):,} bytes:"
             f" {limits.describe()}; {'use another device' if limits.asked_bytes is None else 'allow more'}"
         )
-    for attempt in resident.attempts(BILATERAL, planned, run.warnings):
+    for attempt in resident.attempts(_BILATERAL, planned, run.warnings):
         with attempt as slices:
             found = run.run(slices)
     return found
@@ -352,8 +352,8 @@ class _Run:
                 copy_buffer(device, there.voxels_d, filtered_d, size, source_offset=offset)
                 level = inside_level(self.dtype, near)
                 box = (self.box[0], self.box[1], self.box[2])
-                found = list_mixed_groups(device, there, self.dtype, level, box)
-                groups, per_row, groups_d = found.count, 32 * row_words(self.ni), found.positions_d
+                mixed_groups = list_mixed_groups(device, there, self.dtype, level, box)
+                groups, per_row, groups_d = mixed_groups.count, 32 * row_words(self.ni), mixed_groups.positions_d
             self._launch(there, filtered_d, ends_d, groups, per_row, groups_d, sides)
         return groups
 
@@ -372,7 +372,7 @@ class _Run:
         range_factor = math.sqrt(0.5 / math.log(2.0)) / self.settings.sigma_hu
         items = 1 if device.kernel_variants["LANES"] == "8" else GROUP
         slice_groups = self.row_groups * there.nj
-        most = max(TAPS_A_LAUNCH // (GROUP * window.taps * slice_groups), 1) * slice_groups
+        most = max(_TAPS_A_LAUNCH // (GROUP * window.taps * slice_groups), 1) * slice_groups
         for first in range(0, groups, most):
             count = min(most, groups - first)
             launch(

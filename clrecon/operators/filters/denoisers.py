@@ -23,7 +23,7 @@ from clrecon.system.progress import Progress, ignore_progress
 
 VolumeKind = TypeVar("VolumeKind", Volume, DeviceVolume)
 
-SHEARED_DEGREES = 0.1
+_SHEARED_DEGREES = 0.1
 """Angle of shear below which distances along the axes are those in the patient, to a part in 500,000."""
 
 _DISTRIBUTIONS = {"skimage": "scikit-image"}
@@ -116,7 +116,7 @@ def _check_volume(volume: Volume, name: str, denoiser: _Denoiser) -> None:
     why = ""
     if volume.uneven:
         why = "the slices are unevenly spaced"
-    elif (angle := shear_degrees(volume.affine)) > SHEARED_DEGREES:
+    elif (angle := shear_degrees(volume.affine)) > _SHEARED_DEGREES:
         why = f"the slices are sheared by {angle:.2g} degrees"
     if why:
         raise UsageError(

@@ -21,10 +21,10 @@ from clrecon.system.light_dataclass import dataclass, replace
 LARGEST_REACH = 14
 """Most voxels from the middle of a window to its end, along each axis: with two rings, a group of 16."""
 
-RADIUS_OF_SIGMA = 2.5
+_RADIUS_OF_SIGMA = 2.5
 """Radius of a window over the sigma, if it is not capped: what lies farther has less than 4 % of the weight."""
 
-SAME_RING = 1e-6
+_SAME_RING = 1e-6
 """Relative difference of squared distances that are one ring: a distance of affines from files."""
 
 
@@ -74,7 +74,7 @@ def choose_window(volume: Volume, sigma_mm: float, dimensions: int, most_taps: i
     rings of equal distance: of square pixels 13 are the disc of five that OpenCV has, and 5, 29 and 49 those of 3, 7
     and 9. Below the number of the first ring the middle stays alone.
     """
-    box = _box(volume, RADIUS_OF_SIGMA * sigma_mm, dimensions)
+    box = _box(volume, _RADIUS_OF_SIGMA * sigma_mm, dimensions)
     k, j, i = np.meshgrid(
         *(np.arange(-n, n + 1) for n in np.minimum(box, 3 * LARGEST_REACH)[::-1].tolist()), indexing="ij"
     )
@@ -144,7 +144,7 @@ def _nearest_rings(
     order = np.flatnonzero(candidates)
     order = order[np.argsort(squares[order], kind="stable")]
     sorted_squares = squares[order]
-    is_next = np.diff(sorted_squares) > SAME_RING * sorted_squares[1:]
+    is_next = np.diff(sorted_squares) > _SAME_RING * sorted_squares[1:]
     ends = np.append(np.flatnonzero(is_next) + 1, len(order))
     kept = np.zeros(len(offsets), np.bool_)
     kept[order[: ends[ends <= most_taps].max(initial=1)]] = True
@@ -154,10 +154,10 @@ def _nearest_rings(
 NOISE_FACTOR = 3.0
 """Sigma of the differences over the noise, where it is not given."""
 
-TAPS = {2: 29, 3: 125}
+_TAPS = {2: 29, 3: 125}
 """Most taps by dimensions, where they are not given."""
 
-MOST_TAPS = 4096
+_MOST_TAPS = 4096
 
 LEAST_SHARE = 0.9
 """Share of the weight of the whole window below which a cut by the number of taps is warned of."""
@@ -251,9 +251,9 @@ def inside_level(dtype: np.dtype[Any], near: float) -> Any:
 
 def _checked_taps(taps: int | None, dimensions: int) -> int:
     if taps is None:
-        return TAPS[dimensions]
-    if isinstance(taps, bool) or not isinstance(taps, (int, np.integer)) or not 2 <= taps <= MOST_TAPS:
-        raise UsageError(f"taps are a whole number from 2 to {MOST_TAPS:,}, not {taps!r}")
+        return _TAPS[dimensions]
+    if isinstance(taps, bool) or not isinstance(taps, (int, np.integer)) or not 2 <= taps <= _MOST_TAPS:
+        raise UsageError(f"taps are a whole number from 2 to {_MOST_TAPS:,}, not {taps!r}")
     return int(taps)
 
 

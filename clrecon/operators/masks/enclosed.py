@@ -119,49 +119,49 @@ def find_spaces(mask: Mask) -> Spaces:
     """
     device, shape, volume = mask.device, mask.shape_ijk, mask.scan
     rest = (~mask).bits
-    found = find_components(device, rest, beside=2 * rest.needs()["mask of the voxels"], memory=mask.memory)
+    components = find_components(device, rest, beside=2 * rest.needs()["mask of the voxels"], memory=mask.memory)
     none = np.empty(0)
-    if not found.count:
+    if not components.count:
         empty = np.empty(0, np.int32)
         runs = RunList(empty, empty, empty, empty, empty)
-        return Spaces(volume, none.astype(np.intp), none, none, none.astype(bool), runs, found, mask)
-    marks_d, _ = mark_with_voxels(device, found, shape, _open_ends(mask))
-    outside = download(device, np.empty(found.count, np.uint8), marks_d) != 0
+        return Spaces(volume, none.astype(np.intp), none, none, none.astype(bool), runs, components, mask)
+    marks_d, _ = mark_with_voxels(device, components, shape, _open_ends(mask))
+    outside = download(device, np.empty(components.count, np.uint8), marks_d) != 0
     numbers = np.flatnonzero(~outside)
-    runs = RunList.read(device, found, shape)
+    runs = RunList.read(device, components, shape)
     runs = runs.where(~outside[runs.numbers])
-    voxels = np.bincount(runs.numbers, runs.lengths, found.count)[numbers]
-    each_ml = runs.sum_ml(volume, found.count)[numbers]
-    hu = _sum_hu(runs, volume, found.count)[numbers] / np.maximum(voxels, 1.0)
+    voxels = np.bincount(runs.numbers, runs.lengths, components.count)[numbers]
+    each_ml = runs.sum_ml(volume, components.count)[numbers]
+    hu = _sum_hu(runs, volume, components.count)[numbers] / np.maximum(voxels, 1.0)
     ni, nj, nk = shape
-    at_end = np.zeros(found.count, bool)
+    at_end = np.zeros(components.count, bool)
     ends = (runs.k == 0) | (runs.k == nk - 1) | (runs.j == 0) | (runs.j == nj - 1)
     at_end[runs.numbers[ends | (runs.first == 0) | (runs.last == ni - 1)]] = True
-    return Spaces(volume, numbers, each_ml.astype(np.float64), hu, at_end[numbers], runs, found, mask)
+    return Spaces(volume, numbers, each_ml.astype(np.float64), hu, at_end[numbers], runs, components, mask)
 
 
 def find_joints(mask: Mask, reach_mm: float, least_ml: float) -> Mask:
     """Choose what lies within a distance of two pieces of a mask that are apart and have some volume each."""
     device, shape, volume = mask.device, mask.shape_ijk, mask.scan
     words = mask_bytes(shape)["mask of the voxels"]
-    found = find_components(device, mask.bits, beside=3 * words, memory=mask.memory)
+    components = find_components(device, mask.bits, beside=3 * words, memory=mask.memory)
     joints = Mask(volume, zero_words(device, words // 4), "joints", device=device, memory=mask.memory)
-    if found.count < 2:
+    if components.count < 2:
         return joints
-    runs = RunList.read(device, found, shape)
-    large = np.flatnonzero(runs.sum_ml(volume, found.count) >= least_ml)
+    runs = RunList.read(device, components, shape)
+    large = np.flatnonzero(runs.sum_ml(volume, components.count) >= least_ml)
     # Two pieces differ in at least one bit of their places in the list.
     for bit in range(max(len(large) - 1, 0).bit_length()):
         sides = []
         for value in (0, 1):
-            marks = np.zeros(4 * -(-found.count // 4), np.uint8)
+            marks = np.zeros(4 * -(-components.count // 4), np.uint8)
             marks[large[(np.arange(len(large)) >> bit & 1) == value]] = 1
             side_d = zero_words(device, words // 4)
             write_runs(
                 device,
-                found.runs.runs_d,
-                found.runs.row_counts_d,
-                found.numbers_d,
+                components.runs.runs_d,
+                components.runs.row_counts_d,
+                components.numbers_d,
                 upload(device, marks),
                 side_d,
                 shape,
@@ -201,10 +201,10 @@ SEAL_MM, LARGEST_SEAL_MM = 2.5, 3.0
 the thin cortex of vertebrae has openings of up to 5 mm.  Between centres of voxels the ball closes every pore up to
 twice its radius less one step."""
 
-SEAL_STEPS = 1.25
+_SEAL_STEPS = 1.25
 """The same radius in largest steps of the voxels: below one it would close nothing along that axis."""
 
-MOST_SEAL_STEPS, SEAL_PARTS = 8.0, 7.0
+_MOST_SEAL_STEPS, _SEAL_PARTS = 8.0, 7.0
 """Without a given radius the ball reaches at most so many largest steps of the voxels, and at most this part of the
 side of a cube as large as the bone: small bones have small pores, and lie close together."""
 
@@ -212,7 +212,7 @@ BONE_ML, BONE_SHARE = 1.0, 0.05
 """Pieces at the level from this volume on, or from this share of all bone, are bones of their own: what lies between
 two of them is a joint."""
 
-MOST_CLOSED = 0.5
+_MOST_CLOSED = 0.5
 """Largest share of a solid bone that the ball alone may close; bone with marrow of thin trabeculae has 0.33."""
 
 LARGEST_MARROW_MM = 35.0
@@ -312,9 +312,9 @@ def fill_enclosed(
 def _default_seal(volume: Volume, bone: Mask) -> float:
     """Return the radius of the ball that fits voxels and bone, mm."""
     step, voxel_mm3 = max(volume.spacing), float(np.prod(volume.spacing))
-    usual = float(np.clip(SEAL_STEPS * step, SEAL_MM, LARGEST_SEAL_MM))
-    bounds = MOST_SEAL_STEPS * step, (bone.count * voxel_mm3) ** (1.0 / 3.0) / SEAL_PARTS
-    return max(min(usual, *bounds), min(SEAL_STEPS * step, usual))
+    usual = float(np.clip(_SEAL_STEPS * step, SEAL_MM, LARGEST_SEAL_MM))
+    bounds = _MOST_SEAL_STEPS * step, (bone.count * voxel_mm3) ** (1.0 / 3.0) / _SEAL_PARTS
+    return max(min(usual, *bounds), min(_SEAL_STEPS * step, usual))
 
 
 def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, steps: Steps) -> Volume:
@@ -376,7 +376,7 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
         report = amend(report, hu_range=made.report["hu_range"])
     share = closed_ml / (filled_ml + bone_ml)
     gate = at_most(
-        "closed_by_seal", share, MOST_CLOSED, None,
+        "closed_by_seal", share, _MOST_CLOSED, None,
         f"share of the solid bone that the ball of {seal_mm:.3g} mm closed, not marrow that bone encloses"
         f" ({name_parameter('seal_mm', 'MM')}: a smaller ball)",
     )  # fmt: skip

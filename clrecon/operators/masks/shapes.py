@@ -45,13 +45,13 @@ PIECE_WORDS = {
 }
 """Words of a row that a work-item holds, by LANES."""
 
-MOST_VISITS = 1e11
+_MOST_VISITS = 1e11
 """Most visits of a row of the ball at a row of the volume: some minutes."""
 
-HALO_BITS = 32
+_HALO_BITS = 32
 """Furthest that bits go along a row that is cut into pieces: a word."""
 
-ANY_NUMBER = 1 << 30
+_ANY_NUMBER = 1 << 30
 """More voxels than any ball reaches."""
 
 
@@ -76,7 +76,7 @@ def whole_ball_of(volume: Volume, radius: float, *, by_slice: bool = False) -> S
     heights = origins @ slice_normal(volume.affine)
     gap = float(min(abs(heights[1] - heights[0]), abs(heights[-1] - heights[-2])))
     beyond = int(radius * (1.0 + SLACK) / gap) + 1
-    shape = ANY_NUMBER, ANY_NUMBER, beyond + 1
+    shape = _ANY_NUMBER, _ANY_NUMBER, beyond + 1
     if volume.uneven:
         lattice = Lattice((*shape[:2], nk + 2 * beyond), volume.affine, volume.slice_origins(beyond))
         ball = make_stencil(lattice, radius)
@@ -94,9 +94,9 @@ def _checked(ball: Stencil, volume: Volume, radius: float, by_slice: bool) -> St
         before = np.concatenate([[0], np.cumsum(own)]).astype(np.int32)
         ball = replace(ball, rows=ball.rows[own], tables=before[ball.tables])
     visits = float((ball.tables[:, 1] - ball.tables[:, 0]).sum(dtype=np.int64)) * volume.shape_ijk[1]
-    if visits > MOST_VISITS:
+    if visits > _MOST_VISITS:
         raise UsageError(
-            f"a ball of {radius:g} mm makes {visits:.1e} visits of rows of the volume, {MOST_VISITS:.0e} are allowed:"
+            f"a ball of {radius:g} mm makes {visits:.1e} visits of rows of the volume, {_MOST_VISITS:.0e} are allowed:"
             " choose a smaller radius"
         )
     return ball
@@ -152,7 +152,7 @@ def spread_bits(device: Device, mask: VoxelMask, ball: Stencil, *, erode: bool =
     halo = 0 if words <= piece and (ball.rows[:, 2] == -ball.rows[:, 3]).all() else 1
     step = piece - 2 * halo
     pieces = -(-words // step)
-    rows, tables = _split_tables(ball, HALO_BITS if halo else None)
+    rows, tables = _split_tables(ball, _HALO_BITS if halo else None)
     spread_d = allocate(device, 4 * words * nj * nk)
     program = load_program(device, "masks/balls.cl", {"LANES": device.kernel_variants["LANES"]})
     launch(

@@ -76,14 +76,14 @@ def mask_bytes(shape_ijk: tuple[int, int, int], pad: int = 0) -> dict[str, int]:
     return {"mask of the voxels": 4 * (-(-ni // 32) + pad) * nj * nk, "row extents": 4 * nj * nk}
 
 
-OPEN_BAND = (-math.inf, math.inf)
+_OPEN_BAND = (-math.inf, math.inf)
 
 
 def checked_band(hu: ArrayLike | Sequence[float | None]) -> tuple[float, float]:
     """Return the two ends of a band of HU, both included; None or infinity leaves an end open."""
     try:
         ends = np.asarray(hu, dtype=object).tolist()
-        low, high = (open_end if end is None else float(end) for end, open_end in zip(ends, OPEN_BAND, strict=True))
+        low, high = (open_end if end is None else float(end) for end, open_end in zip(ends, _OPEN_BAND, strict=True))
     except (TypeError, ValueError, OverflowError):
         low = high = math.nan
     if not low <= high:
@@ -238,7 +238,7 @@ def mark_voxels(
     return VoxelMask(mask_d, extents_d, shape_ijk, words, pad)
 
 
-OPERATIONS = {
+_OPERATIONS = {
     "and": kernel_constant("masks/logic.cl", "OPERATION_AND"),
     "or": kernel_constant("masks/logic.cl", "OPERATION_OR"),
     "xor": kernel_constant("masks/logic.cl", "OPERATION_XOR"),
@@ -252,12 +252,12 @@ def prepare_logic(device: Device, dtype: DTypeLike = np.int16) -> Program:
 
 
 def combine(device: Device, a_d: Any, b_d: Any, shape_ijk: tuple[int, int, int], operation: str) -> Any:
-    """Return the words of two masks of one shape joined; `operation` is one of `OPERATIONS`."""
+    """Return the words of two masks of one shape joined; `operation` is one of `_OPERATIONS`."""
     words, rows = _words(shape_ijk)
     combined_d = allocate(device, 4 * words * rows)
     launch(
         device, prepare_logic(device)["combine_masks"], words * rows, a=a_d, b=b_d,
-        combined=combined_d, n=words * rows, operation=OPERATIONS[operation],
+        combined=combined_d, n=words * rows, operation=_OPERATIONS[operation],
     )  # fmt: skip
     return combined_d
 

@@ -144,15 +144,15 @@ def remove_outliers(
     return step
 
 
-FEATURES: tuple[str, ...] = get_args(Features)
+_FEATURES: tuple[str, ...] = get_args(Features)
 """Ways to tell features: paper B's ratio of distances, and the surface variation."""
 
 PLANE_NUMBERS = kernel_constant("points/bilateral.cl", "PLANE_NUMBERS")
 """Numbers that filter_points leaves for each point."""
 
-MOST_ITERATIONS = 100
+_MOST_ITERATIONS = 100
 
-CELL_OF_SPACING = 2.0
+_CELL_OF_SPACING = 2.0
 """Edge of the cells of paper B over the median distance to the kth neighbour: about 15 points a cell for k = 16."""
 
 
@@ -245,10 +245,10 @@ class _Settings:
             raise UsageError(f"range_factor is a positive number, not {range_factor!r}")
         if not 0.0 < range_factor < math.inf:
             raise UsageError(f"range_factor is a positive number, not {range_factor:g}")
-        if isinstance(iterations, bool) or not isinstance(iterations, int) or not 1 <= iterations <= MOST_ITERATIONS:
-            raise UsageError(f"iterations are a whole number from 1 to {MOST_ITERATIONS}, not {iterations!r}")
-        if features is not None and features not in FEATURES:
-            raise UsageError(f"features are told by one of {', '.join(FEATURES)} or not at all, not {features!r}")
+        if isinstance(iterations, bool) or not isinstance(iterations, int) or not 1 <= iterations <= _MOST_ITERATIONS:
+            raise UsageError(f"iterations are a whole number from 1 to {_MOST_ITERATIONS}, not {iterations!r}")
+        if features is not None and features not in _FEATURES:
+            raise UsageError(f"features are told by one of {', '.join(_FEATURES)} or not at all, not {features!r}")
         if paper:
             return cls(k, 1.0, iterations, "paper")
         return cls(k, float(range_factor), iterations, features)
@@ -305,7 +305,7 @@ class _Run:
         if spacing == 0.0:  # most points coincide: every cell would have one place
             self.feature_points = n
             return
-        self.cell_mm = CELL_OF_SPACING * spacing
+        self.cell_mm = _CELL_OF_SPACING * spacing
         with stopwatch.running(device):
             grid = fill_grid(device, plan_grid(points, self.cell_mm), memory=self.memory)
         if self.settings.features == "paper":

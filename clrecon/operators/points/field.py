@@ -190,7 +190,7 @@ def decide_signs(
 
 BRICK = tuple(kernel_constant("points/field.cl", name) for name in ("BRICK_LONG", "BRICK_WIDE", "BRICK_WIDE"))
 BRICK_ROWS = kernel_constant("points/field.cl", "BRICK_ROWS")
-BRICK_BYTES = 4 * kernel_constant("points/field.cl", "BRICK_NODES")
+_BRICK_BYTES = 4 * kernel_constant("points/field.cl", "BRICK_NODES")
 
 MOST_NODES = 2**31
 """Most nodes of a field."""
@@ -391,7 +391,7 @@ class NodeField:
 
         def shortage(thick: int) -> str:
             most = max(slab.end_brick - slab.first_brick for slab in cut(thick))
-            own = {"nodes": thick * self.nodes.layer_bytes, "bricks": BRICK_BYTES * most}
+            own = {"nodes": thick * self.nodes.layer_bytes, "bricks": _BRICK_BYTES * most}
             kept = {"grid": self.grid.nbytes, "list of bricks": 4 * self.bricks, **self._kept(self.grid.n)}
             return describe_shortage(self.limits, {**kept, **own})
 
@@ -406,7 +406,7 @@ class NodeField:
         values = []
         for slab in self.slabs:
             count = slab.end_brick - slab.first_brick
-            values_d = allocate(device, BRICK_BYTES * count)
+            values_d = allocate(device, _BRICK_BYTES * count)
             if count:
                 self._run(
                     "measure_nodes", count if int(device.kernel_variants["LANES"]) > 1 else BRICK_ROWS * count,
@@ -420,7 +420,7 @@ class NodeField:
                     brick_words=nodes.brick_words, **self._where, **self.settings.squared(),
                 )  # fmt: skip
             if len(self.slabs) > 1:
-                values.append(download(device, np.empty((count, BRICK_BYTES // 4), np.float32), values_d))
+                values.append(download(device, np.empty((count, _BRICK_BYTES // 4), np.float32), values_d))
             else:
                 values.append(values_d)
         return values
@@ -433,7 +433,7 @@ class NodeField:
     @property
     def nbytes(self) -> int:
         """Bytes on the device without points and grid, with all masks."""
-        values = BRICK_BYTES * self.bricks if len(self.slabs) == 1 else 0
+        values = _BRICK_BYTES * self.bricks if len(self.slabs) == 1 else 0
         return values + 4 * self.bricks + Masks.COUNT * self.nodes.mask_bytes
 
     def release_points(self) -> None:

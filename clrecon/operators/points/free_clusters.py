@@ -147,8 +147,8 @@ def cluster_free_points(
                 "device": current.label,
                 "kernel_seconds": dict(stopwatch.by_kernel),
             }
-            made = FreeClusters(labels, cores, count, facts | found, tuple(told))
-    return made
+            free_clusters = FreeClusters(labels, cores, count, facts | found, tuple(told))
+    return free_clusters
 
 
 def find_clusters(

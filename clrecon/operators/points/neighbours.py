@@ -38,24 +38,24 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 
-CANDIDATES = 5.6
+_CANDIDATES = 5.6
 """Points in 27 cells for each neighbour that is searched: fewer send points to farther cells, more are compared in
 vain."""
 
-FEWEST_CANDIDATES = 40
+_FEWEST_CANDIDATES = 40
 """Points in 27 cells for few neighbours."""
 
-ALONE = 0.5
+_ALONE = 0.5
 """Share of the points of a thinned cloud that are alone in their block, at the edge that is searched."""
 
-SAMPLED = 4096
+_SAMPLED = 4096
 """Points that are looked at: the share is then right to 0.01, the edge to 2 %."""
 
 STEPS = 8
 """Halvings of the interval of the edge's logarithm, which is 12 wide at most."""
 
-CELLS_A_POINT = 256
-MANY_CELLS = 2**24
+_CELLS_A_POINT = 256
+_MANY_CELLS = 2**24
 """Most cells of a grid: so many for each point, or this number if that is more."""
 
 
@@ -64,7 +64,7 @@ _MIXERS = np.array([0x1E3779B97F4A7C15, 0x2545F4914F6CDD1D, 0x369DEA0F31A53F85, 
 
 
 def choose_cell_edge(points: NDArray[np.floating], k: int) -> float:
-    """Choose the edge, in mm, so that the 27 cells around a typical point hold some `CANDIDATES` times `k` points.
+    """Choose the edge, in mm, so that the 27 cells around a typical point hold some `_CANDIDATES` times `k` points.
 
     A cloud that is thinned to a share f at random leaves a point with c others in its block alone there with
     probability (1 - f)^c.  So a small sample tells the density of the whole cloud, in points of any dimension, and a
@@ -75,18 +75,18 @@ def choose_cell_edge(points: NDArray[np.floating], k: int) -> float:
     extent = float((high - low).max())
     if extent == 0.0:
         return 1.0
-    wanted = max(FEWEST_CANDIDATES, CANDIDATES * k)
-    share = min(-math.log(ALONE) / wanted, 1.0)
-    groups = max(1, min(round(1.0 / share), round(SAMPLED / max(share * n, 1.0))))
+    wanted = max(_FEWEST_CANDIDATES, _CANDIDATES * k)
+    share = min(-math.log(_ALONE) / wanted, 1.0)
+    groups = max(1, min(round(1.0 / share), round(_SAMPLED / max(share * n, 1.0))))
     rng = np.random.default_rng(0)
     chosen = np.unique(rng.integers(0, n, min(n, round(groups * share * n) + 1)))
     places = np.asarray(points[chosen], dtype=np.float64) - low
     group = rng.integers(0, groups, len(chosen))
-    shortest = max(extent / (0.99 * MOST_CELLS_ALONG), _edge_of_box(high - low, max(MANY_CELLS, CELLS_A_POINT * n)))
+    shortest = max(extent / (0.99 * MOST_CELLS_ALONG), _edge_of_box(high - low, max(_MANY_CELLS, _CELLS_A_POINT * n)))
     small, large = math.log(shortest), math.log(max(extent, shortest))
     for _ in range(STEPS):
         middle = 0.5 * (small + large)
-        if _share_alone(places, group, 3.0 * math.exp(middle)) > ALONE:
+        if _share_alone(places, group, 3.0 * math.exp(middle)) > _ALONE:
             small = middle
         else:
             large = middle
@@ -348,5 +348,5 @@ def find_neighbours(
             for part in search.each_part("neighbours", progress or ignore_progress):
                 search.find(part, indices_d, distances_d)
             indices, distances = download(current, indices, indices_d), download(current, distances, distances_d)
-            found = Neighbours(indices, distances, (*warnings, *told))
-    return found
+            neighbours = Neighbours(indices, distances, (*warnings, *told))
+    return neighbours

@@ -31,10 +31,10 @@ from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_share
 
-GRADIENTS = "gradients"
+_GRADIENTS = "gradients"
 """Purpose by which slabs are planned."""
 
-BELOW, ABOVE = 1, 2
+_BELOW, ABOVE = 1, 2
 """Slices below and above a slab that differences over half a voxel need."""
 
 FARTHEST = 2.0**29
@@ -58,13 +58,13 @@ def find_gradients(
     places = np.clip(volume.lps_to_ijk(points), -FARTHEST, FARTHEST).astype(np.float32)
 
     def needs(slices: int) -> dict[str, int]:
-        held = min(slices + BELOW + ABOVE, nk) * resident.slice_bytes
+        held = min(slices + _BELOW + ABOVE, nk) * resident.slice_bytes
         return {"volume": held, "places": places.nbytes, "gradients": places.nbytes}
 
-    planned = resident.plan(GRADIENTS, nk, needs)
+    planned = resident.plan(_GRADIENTS, nk, needs)
     if planned < 1:
         raise DeviceMemoryError(f"no gradients can be found: {describe_shortage(resident.limits, needs(1))}")
-    for attempt in resident.attempts(GRADIENTS, planned, warnings):
+    for attempt in resident.attempts(_GRADIENTS, planned, warnings):
         with attempt as slices:
             gradients = _all_slabs(resident, places, slices, stopwatch, progress)
     return gradients
@@ -83,7 +83,7 @@ def _all_slabs(
     gradients, gradients_d = empty_output(device, places.shape, np.float32)
     for first in range(0, nk, slices):
         end = min(first + slices, nk)
-        low, high = max(first - BELOW, 0), min(end + ABOVE, nk)
+        low, high = max(first - _BELOW, 0), min(end + ABOVE, nk)
         if slices >= nk:
             voxels_d, low = resident.whole(stopwatch), 0
         else:

@@ -44,10 +44,10 @@ if TYPE_CHECKING:
     from clrecon.labels import LabelMap
 
 
-POINT_BYTES = 20
+_POINT_BYTES = 20
 """Bytes of a point: place, HU, number of the voxel."""
 
-MOST_NUMBERS = 2**32
+_MOST_NUMBERS = 2**32
 """Voxels of a slab have numbers of 32 bits."""
 
 Points = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]
@@ -136,7 +136,7 @@ class VoxelEmission:
             "masks": 4 * read * nj * words * (1 + self.selection.shell),
             "rows": 4 * read * nj + 9 * slices * nj,
             **({} if labels is None else {"labels": read * nj * ni * labels.dtype.itemsize}),
-            **({"points": POINT_BYTES * points} if points else {}),
+            **({"points": _POINT_BYTES * points} if points else {}),
         }
 
     def _plan(self) -> int:
@@ -147,7 +147,7 @@ class VoxelEmission:
             return {**self.needs(slices), **({} if slices == nk else {"points": room})}
 
         ni, nj, _ = self.volume.shape_ijk
-        slices = self.resident.plan(self.kind, nk, needs, most=max(MOST_NUMBERS // (ni * nj), 1))
+        slices = self.resident.plan(self.kind, nk, needs, most=max(_MOST_NUMBERS // (ni * nj), 1))
         if slices == 0:
             raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
                 f"one slice needs {sum(self.needs(1).values()):,} bytes, and room for its points: {limits.describe()};"
@@ -185,7 +185,7 @@ class VoxelEmission:
         positions, positions_d = empty_output(device, (total, 3), np.float32)
         hu, hu_d = empty_output(device, (total,), np.float32)
         numbers, numbers_d = empty_output(device, (total,), np.uint32)
-        is_small = self.volume.voxels.size <= MOST_NUMBERS
+        is_small = self.volume.voxels.size <= _MOST_NUMBERS
         if total:
             program = prepare_voxels(device, self.volume.voxels.dtype)
             words_per_item = words if device.kernel_variants["LANES"] == "8" else 1

@@ -21,10 +21,10 @@ from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_share
 
-CUBE = 32
+_CUBE = 32
 """Nodes along an edge of the cubes in which walls are counted: those of a word."""
 
-OPEN_SHARE = 1.0 / 3.0
+_OPEN_SHARE = 1.0 / 3.0
 """Share of its faces above which a cube is open.  A body that has lost its inside has walls for half of its faces."""
 
 Words = NDArray[np.uint32]
@@ -34,7 +34,7 @@ _BITS = np.array([bin(number).count("1") for number in range(1 << 16)], np.uint8
 
 @dataclass(frozen=True, eq=False)
 class Walls:
-    """Faces between an inner and an outer node, by cube of `CUBE` nodes; arrays of shape (cubes_z, cubes_y, cubes_x).
+    """Faces between an inner and an outer node, by cube of `_CUBE` nodes; arrays of shape (cubes_z, cubes_y, cubes_x).
 
     faces: int64. All faces whose lower node is in the cube.
     walls: int64. Those that no points support: the field itself has one sign on both sides, or a side is far from all
@@ -54,7 +54,7 @@ class Walls:
     @property
     def open(self) -> NDArray[np.bool_]:
         """Cubes in which over a third of the faces are walls."""
-        return self.walls > OPEN_SHARE * self.faces
+        return self.walls > _OPEN_SHARE * self.faces
 
     @property
     def lost(self) -> float:
@@ -75,20 +75,20 @@ def find_walls(near: Words, negative: Words, inside: Words, nx: int) -> Walls:
     bridge of a point, of the sign of the field there, and of the decided sign.
     """
     nz, ny, words = near.shape
-    shape = (-(-nz // CUBE), -(-ny // CUBE), words)
+    shape = (-(-nz // _CUBE), -(-ny // _CUBE), words)
     faces, walls, enclosed = np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(shape)
     bits = np.arange(32 * words).reshape(words, 32) < nx
     valid = np.packbits(bits, axis=1, bitorder="little").view(np.uint32).ravel()
-    for layer, first in enumerate(range(0, nz, CUBE)):
-        parts = [mask[first : first + CUBE + 1] for mask in (near, negative, inside)]
+    for layer, first in enumerate(range(0, nz, _CUBE)):
+        parts = [mask[first : first + _CUBE + 1] for mask in (near, negative, inside)]
         places, normals, cubes = [], [], []
-        for axis, changed, wall, inner in _compare(parts, min(CUBE, nz - first), valid):
+        for axis, changed, wall, inner in _compare(parts, min(_CUBE, nz - first), valid):
             faces[layer] += _count(changed, shape[1])
             found, lower_inside = _list(wall, inner)
             walls[layer] += np.bincount(
-                found[:, 1] // CUBE * words + found[:, 2] // CUBE, minlength=shape[1] * words
+                found[:, 1] // _CUBE * words + found[:, 2] // _CUBE, minlength=shape[1] * words
             ).reshape(shape[1:])
-            cubes.append(found[:, 1] // CUBE * words + found[:, 2] // CUBE)
+            cubes.append(found[:, 1] // _CUBE * words + found[:, 2] // _CUBE)
             doubled = 2 * found
             doubled[:, axis] += 1
             normal = np.zeros_like(found)
@@ -133,7 +133,7 @@ def _count(words: Words, cubes_y: int) -> NDArray[np.int64]:
     k, j, word = np.nonzero(words)  # few of them
     bits = _BITS[words[k, j, word].view(np.uint16)].reshape(-1, 2).sum(axis=1)
     count = words.shape[2]
-    return np.bincount(j // CUBE * count + word, bits, cubes_y * count).astype(np.int64).reshape(cubes_y, count)
+    return np.bincount(j // _CUBE * count + word, bits, cubes_y * count).astype(np.int64).reshape(cubes_y, count)
 
 
 def _list(wall: Words, inside: Words) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -166,20 +166,20 @@ def _enclose(
 FEWEST_POINTS = 4
 """Fewest points that can enclose anything."""
 
-BRIDGE_SHARE = 2.0
+_BRIDGE_SHARE = 2.0
 """Default of B / h: with points at random, mean spacing h, holes are 2 to 2.5 h wide."""
 
 CLEAN = {"reach": 1.0, "smoothing": 0.1}
 NOISY = {"reach": 3.0, "smoothing": 1000.0}
 """Defaults of R / h, which is B / h at least, and of s / h: the nearest planes decide, or all within R count."""
 
-MOST_REACH = 32.0
+_MOST_REACH = 32.0
 """Most R / h: a node adds up all points within R."""
 
-LEAST_SMOOTHING = 1e-3
+_LEAST_SMOOTHING = 1e-3
 """Least s / h: float32 holds the weights."""
 
-LEAK_SHARE = 0.1
+_LEAK_SHARE = 0.1
 """Share of votes against the winner from which on the inside is joined to the outside.  0.02 to 0.05 was seen on bone,
 0.005 on simple shapes, 0.38 to 0.46 with leaks."""
 
@@ -192,19 +192,19 @@ WALL_SHARE = 0.1
 had holes that were bridged, 0.03 to 0.07 on bone, and 0.22 to 0.39 where slices were farther apart than nodes could
 bridge and 8 to 23 % of the volume were lost."""
 
-LOST_SHARE = 0.003
+_LOST_SHARE = 0.003
 """Share of the volume from which on there is a warning that walls enclose it.  0.0001 at most was seen on sound clouds,
 and 0.006 where the smallest of twenty balls had a hole."""
 
-MOST_OPEN_CUBES = 8
+_MOST_OPEN_CUBES = 8
 
-NO_SCAN: dict[str, Any] = {"warnings": [], "outside_air": "distances in mm, no HU: level 0 is no skin"}
+_NO_SCAN: dict[str, Any] = {"warnings": [], "outside_air": "distances in mm, no HU: level 0 is no skin"}
 """Report of the volume of distances."""
 
 WIDER = 1.25
-MOST_WIDENINGS = 3
+_MOST_WIDENINGS = 3
 
-UNIT_ERROR = 1e-3
+_UNIT_ERROR = 1e-3
 """Normals whose length differs more from 1 are made unit vectors."""
 
 
@@ -217,7 +217,7 @@ def reconstruct_surface(
     reach: float | None = None,
     smoothing: float | None = None,
     bridge: float | None = None,
-    widenings: int = MOST_WIDENINGS,
+    widenings: int = _MOST_WIDENINGS,
     device: Device | str | int | None = None,
     memory: int | None = None,
     progress: Progress | None = None,
@@ -291,8 +291,8 @@ def reconstruct_surface(
 
 
 def _check_numbers(widenings: object, lengths: Mapping[str, float | None]) -> None:
-    if isinstance(widenings, bool) or not isinstance(widenings, int) or not 0 <= widenings <= MOST_WIDENINGS:
-        raise UsageError(f"widenings are a whole number from 0 to {MOST_WIDENINGS}, not {widenings!r}")
+    if isinstance(widenings, bool) or not isinstance(widenings, int) or not 0 <= widenings <= _MOST_WIDENINGS:
+        raise UsageError(f"widenings are a whole number from 0 to {_MOST_WIDENINGS}, not {widenings!r}")
     for name, length in lengths.items():
         if length is not None and not (np.isfinite(length) and length > 0.0):
             raise UsageError(f"{name} is a positive number of mm, not {length!r}")
@@ -322,7 +322,7 @@ def _check_cloud(cloud: PointCloud) -> NDArray[np.float32]:
         raise UsageError(
             f"{missing:,} of {len(cloud):,} normals are 0: estimate them anew, or remove these points first"
         )
-    if np.abs(squares - 1.0).max() <= 2.0 * UNIT_ERROR:
+    if np.abs(squares - 1.0).max() <= 2.0 * _UNIT_ERROR:
         return cloud.normals
     return (cloud.normals / np.sqrt(squares)[:, None]).astype(np.float32)
 
@@ -331,20 +331,20 @@ def _choose_lengths(
     spacing: float, noisy: bool, reach: float | None, smoothing: float | None, bridge: float | None
 ) -> FieldSettings:
     shares = NOISY if noisy else CLEAN
-    b = BRIDGE_SHARE * spacing if bridge is None else float(bridge)
+    b = _BRIDGE_SHARE * spacing if bridge is None else float(bridge)
     r = max(shares["reach"] * spacing, b) if reach is None else float(reach)
     s = shares["smoothing"] * spacing if smoothing is None else float(smoothing)
     if not spacing <= b:
         raise UsageError(f"a bridge of {b:g} mm is less than the spacing of {spacing:g} mm: take at least that")
-    if not b <= r <= MOST_REACH * spacing:
+    if not b <= r <= _MOST_REACH * spacing:
         raise UsageError(
             f"a reach of {r:g} mm: with a spacing of {spacing:g} mm it is between the bridge, {b:g} mm, and"
-            f" {MOST_REACH * spacing:g} mm"
+            f" {_MOST_REACH * spacing:g} mm"
         )
-    if not LEAST_SMOOTHING * spacing <= s <= 1e6 * spacing:
+    if not _LEAST_SMOOTHING * spacing <= s <= 1e6 * spacing:
         raise UsageError(
             f"a smoothing of {s:g} mm: with a spacing of {spacing:g} mm it is between"
-            f" {LEAST_SMOOTHING * spacing:g} and {1e6 * spacing:g} mm"
+            f" {_LEAST_SMOOTHING * spacing:g} and {1e6 * spacing:g} mm"
         )
     return FieldSettings(spacing, r, s, b)
 
@@ -369,7 +369,7 @@ class _Reconstruction:
         with self.stopwatch.running(self.device):
             for tries in range(1, widenings + 2):
                 field, signs, negative = self._try()
-                if signs.share_against <= LEAK_SHARE:
+                if signs.share_against <= _LEAK_SHARE:
                     break
                 if tries <= widenings:
                     self._widen(signs)
@@ -412,18 +412,18 @@ class _Reconstruction:
         volume = count_bits(inside) + walls.lost
         lost = walls.lost / volume if volume else 0.0
         cubes = []
-        for z, y, x in walls.worst(MOST_OPEN_CUBES):
-            centre = affine[:3, 3] + h * (CUBE * np.array((x, y, z)) + CUBE / 2)
+        for z, y, x in walls.worst(_MOST_OPEN_CUBES):
+            centre = affine[:3, 3] + h * (_CUBE * np.array((x, y, z)) + _CUBE / 2)
             share = walls.walls[z, y, x] / walls.faces[z, y, x]
             cubes.append(
-                {"centre_mm": centre.round(1).tolist(), "edge_mm": CUBE * h, "wall_share": round(float(share), 4)}
+                {"centre_mm": centre.round(1).tolist(), "edge_mm": _CUBE * h, "wall_share": round(float(share), 4)}
             )
-        if walls.share > WALL_SHARE or lost > LOST_SHARE:
+        if walls.share > WALL_SHARE or lost > _LOST_SHARE:
             place = ", ".join(f"{at:.0f}" for at in cubes[0]["centre_mm"]) if cubes else ""
-            where = f", most of it within {CUBE * h / 2:.3g} mm of ({place}) mm LPS" if place else ""
+            where = f", most of it within {_CUBE * h / 2:.3g} mm of ({place}) mm LPS" if place else ""
             much = (
                 f"at least {format_share(lost, 1)} of the volume are lost"
-                if lost > LOST_SHARE
+                if lost > _LOST_SHARE
                 else "parts of it may be lost"
             )
             self.warnings.append(
@@ -446,7 +446,7 @@ class _Reconstruction:
         h, b = self.settings.spacing, self.settings.bridge
         return RefusedInputError(
             f"inside and outside of the cloud are joined: {format_share(signs.share_against)} of {signs.votes:,} votes"
-            f" are against the winner, at most {format_share(LEAK_SHARE)} may be (bridge {b:.4g} mm, spacing {h:.4g}"
+            f" are against the winner, at most {format_share(_LEAK_SHARE)} may be (bridge {b:.4g} mm, spacing {h:.4g}"
             f" mm, tries {tries}): the cloud has holes wider than twice the bridge, ends open, or its normals do not"
             f" agree; take a larger {name_parameter('spacing')} or a wider bridge, or close it first"
         )
@@ -473,7 +473,7 @@ class _Reconstruction:
 
     def _extract(self, volume: NDArray[np.float32], field: NodeField, facts: dict[str, Any]) -> Mesh:
         far = float(np.float32(self.settings.bridge))
-        nodes = Volume(volume, field.nodes.affine, NO_SCAN, hu_range=(-far, far))
+        nodes = Volume(volume, field.nodes.affine, _NO_SCAN, hu_range=(-far, far))
         field.release()
         try:
             mesh = extract_isosurface(nodes, 0.0, device=self.device, memory=self.memory)

@@ -113,10 +113,10 @@ def thin_points(
 
 REASONS = ("sparse cell", "not reached by growth", "smaller component")
 
-NEIGHBOURS = 16
+_NEIGHBOURS = 16
 """Neighbours of a point, itself among them, the farthest of which gives the default edge."""
 
-EDGE_FACTOR = 2.0
+_EDGE_FACTOR = 2.0
 """Default edge of the cells in distances to the farthest of these neighbours: about 15 points a cell on bone."""
 
 SPARSE = 2**32 - 1
@@ -127,8 +127,8 @@ def choose_edge(cloud: PointCloud, *, device: Device | str | int | None = None, 
     """Return twice the median distance from a point to the 16th of its nearest points, itself counted, in mm."""
     if len(cloud) == 1:
         raise UsageError("the cloud has one point, so that no edge of cells can be chosen: leave it as it is")
-    found = find_neighbours(cloud, NEIGHBOURS, device=device, memory=memory)
-    edge = EDGE_FACTOR * float(np.median(found.distances[:, -1]))
+    found = find_neighbours(cloud, _NEIGHBOURS, device=device, memory=memory)
+    edge = _EDGE_FACTOR * float(np.median(found.distances[:, -1]))
     if edge == 0.0:
         raise UsageError(
             f"over half of the {len(cloud):,} points have {found.distances.shape[1] - 1} others at the same place, so"

@@ -65,7 +65,7 @@ def enqueue_scan(device: Device, counts_d: Any, offsets_d: Any, n: int) -> Any:
     return total_d
 
 
-LARGEST_MASK = 2**27
+_LARGEST_MASK = 2**27
 
 COMPACT_WORDS = kernel_constant("primitives/compact.cl", "COMPACT_WORDS")
 """Words a work-item."""
@@ -90,8 +90,8 @@ def _load_compact(device: Device) -> Program:
 
 def compact(device: Device, mask_d: Any, words: int) -> Compacted:
     """Find the set bits of a mask, (words,) uint32, words 1 to 2^27; bit b of word w is position ``32 * w + b``."""
-    if not 1 <= words <= LARGEST_MASK:
-        raise UsageError(f"{words:,} words: a mask has 1 to {LARGEST_MASK:,}, so that positions fit 32 bits")
+    if not 1 <= words <= _LARGEST_MASK:
+        raise UsageError(f"{words:,} words: a mask has 1 to {_LARGEST_MASK:,}, so that positions fit 32 bits")
     program = _load_compact(device)
     chunks = -(-words // COMPACT_WORDS)
     counts_d = allocate(device, 4 * chunks)
@@ -110,7 +110,7 @@ def compact(device: Device, mask_d: Any, words: int) -> Compacted:
 RADIX_BITS = kernel_constant("primitives/radix_sort.cl", "RADIX_BITS")
 """Bits of a digit, at most."""
 
-KEY_BITS = 32
+_KEY_BITS = 32
 """Bits of a key."""
 
 FEWEST_PER_CHUNK = 4096
@@ -149,18 +149,18 @@ def _plan_digits(bits: int) -> list[tuple[int, int]]:
     return [(low, high - low) for low, high in zip(borders, borders[1:], strict=False)]
 
 
-def sort_bytes(device: Device, n: int, bits: int = KEY_BITS) -> int:
+def sort_bytes(device: Device, n: int, bits: int = _KEY_BITS) -> int:
     """Return the bytes that `radix_sort` takes beside the keys, its result among them."""
     buffers = 4 if len(_plan_digits(max(bits, 1))) > 1 else 2
     return 4 * buffers * n + (4 << min(RADIX_BITS, max(bits, 1))) * _plan_chunks(device, n)[1]
 
 
-def radix_sort(device: Device, keys_d: Any, n: int, *, bits: int = KEY_BITS) -> Sorted:
+def radix_sort(device: Device, keys_d: Any, n: int, *, bits: int = _KEY_BITS) -> Sorted:
     """Sort 1 to 2^31 keys, (n,) uint32, by their lowest `bits`, the only ones that can be set; they stay."""
     if not 1 <= n <= LARGEST_SCAN:
         raise UsageError(f"{n:,} elements: a sort takes 1 to {LARGEST_SCAN:,}")
-    if not 0 <= bits <= KEY_BITS:
-        raise UsageError(f"{bits} bits: keys have 0 to {KEY_BITS}")
+    if not 0 <= bits <= _KEY_BITS:
+        raise UsageError(f"{bits} bits: keys have 0 to {_KEY_BITS}")
     program = prepare_sort(device)
     per_chunk, chunks = _plan_chunks(device, n)
     items = chunks * device.group_size

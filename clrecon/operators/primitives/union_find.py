@@ -22,7 +22,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.primitives.scan import LARGEST_SCAN, Compacted, compact, exclusive_scan, prepare_compact
 
-LARGEST_MESH = 2**32 - 1
+_LARGEST_MESH = 2**32 - 1
 """Most triangles, so that 32 bits can count them."""
 
 MOST_PASSES = 1000
@@ -88,10 +88,10 @@ def hook_in_rounds(
 
 
 def _check_mesh(triangles: NDArray[np.uint32], vertex_count: int) -> None:
-    if not 0 <= vertex_count <= LARGEST_SCAN or len(triangles) > LARGEST_MESH:
+    if not 0 <= vertex_count <= LARGEST_SCAN or len(triangles) > _LARGEST_MESH:
         raise UsageError(
             f"a mesh of {vertex_count:,} vertices and {len(triangles):,} triangles:"
-            f" components are found in up to {LARGEST_SCAN:,} and {LARGEST_MESH:,}"
+            f" components are found in up to {LARGEST_SCAN:,} and {_LARGEST_MESH:,}"
         )
     if triangles.size and int(triangles.max()) >= vertex_count:
         raise UsageError(f"a triangle refers to vertex {int(triangles.max())}, the mesh has {vertex_count} vertices")

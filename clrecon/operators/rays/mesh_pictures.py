@@ -30,7 +30,7 @@ MOST_TRIANGLES = 2**32 - 2
 PIECE = int(kernel_number("rays/triangles.cl", "PIECE"))
 """Pixels along each side of a piece of a large triangle."""
 
-PIECES_A_LAUNCH = 1 << 20
+_PIECES_A_LAUNCH = 1 << 20
 """Pieces of large triangles that a launch draws: a fraction of a second, so that graphics drivers do not take it for a
 hang."""
 
@@ -138,8 +138,8 @@ class Triangles:
             "first": self.first, "finds_numbers": finds_numbers,
         }  # fmt: skip
         launch(device, self._program["draw_triangles"], len(self.part.triangles), **common)
-        for first in range(0, self._pieces, PIECES_A_LAUNCH):
-            end = min(first + PIECES_A_LAUNCH, self._pieces)
+        for first in range(0, self._pieces, _PIECES_A_LAUNCH):
+            end = min(first + _PIECES_A_LAUNCH, self._pieces)
             launch(
                 device, self._program["draw_pieces"], end - first,
                 sums=self._sums_d, first_piece=first, end_piece=end, **common,

@@ -23,7 +23,7 @@ from clrecon.system.progress import Progress, ignore_progress
 TILE = kernel_constant("rays/view.h", "TILE")
 """Pixels along each side of a tile."""
 
-BOX_ROW = kernel_constant("rays/view.h", "VIEW_BOX_LOW")
+_BOX_ROW = kernel_constant("rays/view.h", "VIEW_BOX_LOW")
 """Row of the box in the table; its upper end and both of the focus follow."""
 
 NEAR_ROW = kernel_constant("rays/view.h", "VIEW_NEAR")
@@ -136,8 +136,8 @@ class RayView:
     def widened(self) -> NDArray[np.float32]:
         """Return the table without clip planes, with the focus, enlarged by the spread on all sides, as its box."""
         table = self.table[: len(self.table) - self.planes].copy()
-        table[BOX_ROW, :3] = table[BOX_ROW + 2, :3] - self.spread
-        table[BOX_ROW + 1, :3] = table[BOX_ROW + 3, :3] + self.spread
+        table[_BOX_ROW, :3] = table[_BOX_ROW + 2, :3] - self.spread
+        table[_BOX_ROW + 1, :3] = table[_BOX_ROW + 3, :3] + self.spread
         return table
 
 

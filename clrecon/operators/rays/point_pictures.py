@@ -48,7 +48,7 @@ LARGEST_DISC = kernel_number("rays/splats.cl", "MOST_PIXELS")
 
 SMALLEST_DISC = kernel_number("rays/splats.cl", "LEAST_PIXELS")
 
-PIXELS_A_LAUNCH = 1 << 27
+_PIXELS_A_LAUNCH = 1 << 27
 """Pixels of all discs of a launch: a fraction of a second, so that graphics drivers do not take it for a hang."""
 
 MOST_PIXELS = 1 << 36
@@ -139,7 +139,7 @@ class _Splats:
         picture = {"picture": 16 * width * height}
         room = memory_limits(self.device, memory)
         free = min(room.total_bytes - picture["picture"], 2 * room.buffer_bytes) // self._point_bytes
-        count = max(1, min(points, int(PIXELS_A_LAUNCH / area), max(free, FEWEST_POINTS)))
+        count = max(1, min(points, int(_PIXELS_A_LAUNCH / area), max(free, FEWEST_POINTS)))
         check_budget(self.device, {**picture, "points": self._point_bytes * min(count, FEWEST_POINTS)}, memory)
         return count
 
@@ -241,7 +241,7 @@ def eye_table(camera: Camera, size: tuple[int, int], lighting: Lighting, base: F
 LONE_POINT_MM = 1.0
 """Radius of the discs of clouds that have no spacing; of others it is their mean spacing, which leaves few gaps."""
 
-NOISE_COLOR, KEPT_COLOR, PLAIN_COLOR = "#707070", "#a0a0a0", "bone"
+_NOISE_COLOR, _KEPT_COLOR, _PLAIN_COLOR = "#707070", "#a0a0a0", "bone"
 
 DARKEST_SHARE = 1 / 3
 """Width that is added below the 1st percentile of the HU: that is a quarter of the way from black to white."""
@@ -320,7 +320,7 @@ class PointPictures(Closing):
         stopwatch, shot = Stopwatch(), Shot(camera, size, background, progress or ignore_progress)
         for attempt in with_fallback(self._device):
             with attempt as (device, told):
-                found = draw_splats(
+                splats = draw_splats(
                     device, points, table, normals, shot, radius, base=self._base, lighting=style.light,
                     memory=self.memory, stopwatch=stopwatch,
                 )  # fmt: skip
@@ -334,13 +334,13 @@ class PointPictures(Closing):
             "legend": colors.legend,
             "legend_left_out": colors.left_out,
             "window_hu": colors.window,
-            "shading": found.shading,
-            "slabs": found.parts,
+            "shading": splats.shading,
+            "slabs": splats.parts,
             "seconds": dict(stopwatch.seconds),
             "kernel_seconds": dict(stopwatch.by_kernel),
             "warnings": [*device.warnings, *told, *_warn_of_radius(radius, camera, size)],
         }
-        return Rendering(found.image, found.depth, found.depth, camera, None, "points", report)
+        return Rendering(splats.image, splats.depth, splats.depth, camera, None, "points", report)
 
     def _radius(self, style: PointLook) -> float:
         if style.radius_mm is not None:
@@ -378,7 +378,7 @@ def _color_points(cloud: PointCloud, style: PointLook) -> _Colors:
         share = np.clip((cloud.hu - np.float32(window[0])) * np.float32(255.0 / (window[1] - window[0])), 0, 255)
         grey = np.rint(share).astype(np.uint8)
         return _Colors(_rows(grey, grey, grey), by, [], 0, window)
-    color = np.rint(255.0 * find_color(PLAIN_COLOR if style.color is None else style.color)).astype(np.uint8)
+    color = np.rint(255.0 * find_color(_PLAIN_COLOR if style.color is None else style.color)).astype(np.uint8)
     return _Colors(np.broadcast_to(np.append(color, np.uint8(255)), (len(cloud), 4)), "none", [], 0, None)
 
 
@@ -399,7 +399,7 @@ def _color_by_label(cloud: PointCloud, labels: NDArray[np.int32], removed: bool)
     """Colour points by label; with `removed` by the reason for which each was removed, 0 being those that are kept."""
     numbers, places, counts = _count_labels(labels)
     grey = numbers <= 0 if removed else numbers < 0
-    palette = np.tile(find_color(KEPT_COLOR if removed else NOISE_COLOR), (len(numbers), 1))
+    palette = np.tile(find_color(_KEPT_COLOR if removed else _NOISE_COLOR), (len(numbers), 1))
     palette[~grey] = distinct_colors(int(np.count_nonzero(~grey)))
     levels = np.rint(255.0 * palette).astype(np.uint8)
     names: Mapping[Any, Any] = cloud.report.get("label_names") or {}

@@ -56,10 +56,10 @@ NODES = kernel_constant("rays/steep_segments.h", "NODES")
 GRADIENT_NODES = kernel_constant("rays/composite.cl", "GRADIENT_NODES")
 """Entries of the table of opacity factors by magnitude of the gradient."""
 
-LEAST_DRIFT = 0.02
+_LEAST_DRIFT = 0.02
 """Rays that drift less than this many bricks to the side per brick ahead count as running straight along the row."""
 
-LOWEST_LOG = -1000.0
+_LOWEST_LOG = -1000.0
 """log2 of the transparency of an opaque sample: 0 in float32; infinity times a length of 0 would give NaN."""
 
 
@@ -126,7 +126,7 @@ class TransferTables:
         table = function.table(low, high, NODES)
         with np.errstate(divide="ignore"):
             let_through = np.log2(1.0 - table[:, 3].astype(np.float64)) * (ray_step / function.unit_distance)
-        let_through = np.maximum(let_through, LOWEST_LOG)
+        let_through = np.maximum(let_through, _LOWEST_LOG)
         red, green, blue = np.rint(1023.0 * table[:, :3].T).astype(np.int32)
         colors = red << 20 | green << 10 | blue
         opacities = (-np.expm1(let_through * np.log(2.0))).astype(np.float32)
@@ -167,11 +167,11 @@ class MainWay:
         axis = int(np.argmax(np.abs(forward)))
         ahead = 1 if forward[axis] > 0.0 else -1
         if camera.is_parallel:
-            eye, aside = np.append(forward / np.abs(forward).max(), 0.0), LEAST_DRIFT
+            eye, aside = np.append(forward / np.abs(forward).max(), 0.0), _LEAST_DRIFT
         else:
             place = (frame.places(np.array([camera.position]))[0] - (0.0, 0.0, slab.first_k)) / cells
             nearest = -place[axis] if ahead > 0 else place[axis] - slab.bricks[axis]  # brick on the way
-            eye, aside = np.append(place, 1.0), max(LEAST_DRIFT * nearest, 0.5)
+            eye, aside = np.append(place, 1.0), max(_LEAST_DRIFT * nearest, 0.5)
         return cls(axis, ahead, eye.astype(np.float32), aside)
 
     @property
@@ -363,8 +363,8 @@ class _Job(SlabPicture):
         image = grey_image(values, window)
         if is_water:
             image[values <= 0.0, 3] = 0  # nothing attenuates there, inside the volume or beside it
-        made = Rendering(image, depths, depths.copy(), self.shot.camera, values, style.kind, report)
-        return made if self.shot.background is None else made.with_background(self.shot.background)
+        rendering = Rendering(image, depths, depths.copy(), self.shot.camera, values, style.kind, report)
+        return rendering if self.shot.background is None else rendering.with_background(self.shot.background)
 
     def _view(self, focus: tuple[Float64Array, Float64Array]) -> RayView:
         return RayView.of(

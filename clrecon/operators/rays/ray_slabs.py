@@ -41,7 +41,7 @@ def choose_brick_cells(volume: Volume) -> tuple[int, int, int]:
 GROWN = 2
 """Voxels by which labels grow in volume rendering: a mask ends up to one before the bone, whose flank is one more."""
 
-OVERLAP = 2
+_OVERLAP = 2
 """Slices that a slab holds beyond its own at either side; cells and gradients at its ends read them."""
 
 MOST_VOXELS = (1 << 31) - 1
@@ -146,7 +146,7 @@ def plan_ray_slabs(
     cells, size = choose_brick_cells(resident.volume), resident.dtype.itemsize
 
     def needs(slices: int) -> dict[str, int]:
-        held = nk if slices >= nk else slices + 2 * OVERLAP + 1
+        held = nk if slices >= nk else slices + 2 * _OVERLAP + 1
         shape = max(2, ni), max(2, nj), max(2, held)
         bricks, samples = math.prod(-(-n // c) for n, c in zip(shape, cells, strict=True)), math.prod(shape)
         beside = {} if labels is None else {"labels": 2 * samples * labels.voxels.itemsize}  # they grow
@@ -156,7 +156,7 @@ def plan_ray_slabs(
     most = None
     if int(resident.device.kernel_variants["LANES"]) > 1:
         most = MOST_VOXELS // (max(2, ni) * max(2, nj))
-        most = most if nk <= most else most - 2 * OVERLAP - 1
+        most = most if nk <= most else most - 2 * _OVERLAP - 1
     slices = resident.plan(RAYS, nk, needs, own=(_BRICKS, _LABELS), most=most)
     if slices == 0:
         check_budget(resident.device, needs(1), resident.memory)
@@ -179,7 +179,7 @@ def ray_slabs(resident: DeviceVolume, slices: int, entry_k: float, stopwatch: St
     cells = choose_brick_cells(resident.volume)
     for number, (first, end) in enumerate(parts):
         low, high = (-np.inf if first == 0 else first), (np.inf if end == nk else end)
-        held_first, held_end = max(first - OVERLAP, 0), min(end + OVERLAP + 1, nk)
+        held_first, held_end = max(first - _OVERLAP, 0), min(end + _OVERLAP + 1, nk)
         voxels_d, shape = _upload_part(resident, held_first, held_end, stopwatch)
         stage = (number == 0) + 2 * (number == len(parts) - 1)
         yield RaySlab(voxels_d, shape, held_first, low, high, cells, stage)

@@ -29,10 +29,10 @@ from clrecon.rendering.looks.window import checked_window
 from clrecon.rendering.pictures.styles import SlicesInSpace
 from clrecon.rendering.views.camera import Camera
 
-DEFAULT_COUNT = 12
+_DEFAULT_COUNT = 12
 """Number of slices shown by default: enough to see the body, few enough to see each slice."""
 
-DEFAULT_WINDOW = (-300.0, 400.0)
+_DEFAULT_WINDOW = (-300.0, 400.0)
 """HU of black and white without a window or a transfer function: soft tissue and bone."""
 
 NODES = kernel_constant("rays/slices.cl", "BINS")
@@ -41,7 +41,7 @@ NODES = kernel_constant("rays/slices.cl", "BINS")
 SLICES = "slices in space"
 """Purpose by which parts are planned."""
 
-EDGE_ON = 1e-3
+_EDGE_ON = 1e-3
 """Cosine between a parallel view and the slices' normal below which the slices are invisible."""
 
 
@@ -49,7 +49,7 @@ def choose_slices(volume: Volume, slices: int | Sequence[int] | None = None) -> 
     """Return the numbers k of the slices to show, as `SlicesInSpace.slices`, ascending."""
     nk = volume.shape_ijk[2]
     if slices is None:
-        count = min(nk, DEFAULT_COUNT)
+        count = min(nk, _DEFAULT_COUNT)
         return np.unique(np.rint(np.linspace(0, nk - 1, count)).astype(int)).tolist()
     if isinstance(slices, int):
         return list(range(0, nk, slices))
@@ -107,7 +107,7 @@ class _Colors(NamedTuple):
             low, high = style.transfer_function.range_hu
             colors = style.transfer_function.table(low, high, NODES)
         else:
-            low, high = DEFAULT_WINDOW if style.window is None else checked_window(style.window)
+            low, high = _DEFAULT_WINDOW if style.window is None else checked_window(style.window)
             colors = np.repeat(np.linspace(0.0, 1.0, NODES)[:, None], 4, axis=1).astype(np.float32)
         return cls(colors, low, (NODES - 1) / (high - low))
 
@@ -128,7 +128,7 @@ def _heights(volume: Volume, points: Float64Array) -> Float64Array:
 
 
 def _warn(volume: Volume, camera: Camera) -> list[str]:
-    if not camera.is_parallel or abs(_heights(volume, camera.basis().forward[None])[0]) > EDGE_ON:
+    if not camera.is_parallel or abs(_heights(volume, camera.basis().forward[None])[0]) > _EDGE_ON:
         return []
     return ["the slices are seen edge-on and do not show: look from another side, such as 30,30, or in perspective"]
 

@@ -21,7 +21,7 @@ from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.styles import SurfaceLook
 from clrecon.rendering.views.camera import box_corners
 
-CLOSED_BORDER = 1.0
+_CLOSED_BORDER = 1.0
 """Index steps beyond the outermost voxel centres within which the closed field falls to its outside value."""
 
 
@@ -123,13 +123,13 @@ class _Job(SlabPicture):
     def _view(self, leaps: LeapMap) -> RayView:
         volume = self.resident.volume
         last = np.array(volume.shape_ijk) - 1.0
-        box = enclose(volume, np.full(3, -CLOSED_BORDER), last + CLOSED_BORDER)
+        box = enclose(volume, np.full(3, -_CLOSED_BORDER), last + _CLOSED_BORDER)
         focus = (box[1], box[1])
         if leaps.box is not None:
-            margin = np.full(3, CLOSED_BORDER)
+            margin = np.full(3, _CLOSED_BORDER)
             if volume.uneven:  # one slice more in field coordinates, at any height
                 aside = np.abs(np.diff(self.frame.places(volume.slice_origins(border=1)), axis=0)).max(axis=0)
-                margin = np.array([CLOSED_BORDER, CLOSED_BORDER, 0.0]) + aside
+                margin = np.array([_CLOSED_BORDER, _CLOSED_BORDER, 0.0]) + aside
             focus = leaps.box[0] - margin, leaps.box[1] + margin
         return RayView.of(
             volume, self.shot.camera, self.shot.size, self.ray_step,

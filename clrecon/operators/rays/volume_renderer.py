@@ -46,7 +46,7 @@ from clrecon.system.progress import Progress, ignore_progress
 if TYPE_CHECKING:
     from typing_extensions import Unpack  # of Python 3.11
 
-MASKED_BY = ("field_of_view", "remove_table", "region", LEFT_OUT)
+_MASKED_BY = ("field_of_view", "remove_table", "region", LEFT_OUT)
 """Entries of the report of a volume of which a part was turned into air, or left out."""
 
 AIR_ROOM_HU = 100.0
@@ -66,7 +66,7 @@ def shown_box(shown: Volume | DeviceVolume, style: Style) -> Grid:
     volume = shown.volume if isinstance(shown, DeviceVolume) else shown
     clip = getattr(style, "clip", None)
     labels = _shown_labels(shown, style)
-    if clip is None and labels is None and not any(name in volume.report for name in MASKED_BY):
+    if clip is None and labels is None and not any(name in volume.report for name in _MASKED_BY):
         return volume
     slices = choose_slices(volume, style.slices) if isinstance(style, SlicesInSpace) else None
     box = find_seen_box(volume, _band(style, volume), clip=clip, labels=labels, slices=slices)
@@ -107,10 +107,10 @@ def _band(style: Style, volume: Volume) -> tuple[float, float]:
     return AIR_HU + AIR_ROOM_HU, math.inf
 
 
-SMALLEST_STEP = 0.01
+_SMALLEST_STEP = 0.01
 """Smallest ray step as a share of the smallest spacing; shorter steps only add time."""
 
-MOST_STEPS = 1 << 15
+_MOST_STEPS = 1 << 15
 """Most ray steps through the diagonal of a volume: float32 counts them, and Mesa's llvmpipe ends loops after 65535
 turns."""
 
@@ -273,7 +273,7 @@ class VolumeRenderer(Closing):
     def _checked_step(self, ray_step: float | None) -> float:
         smallest = min(self.volume.spacing)
         diagonal = float(np.linalg.norm(np.ptp(box_corners(self.volume), axis=0)))
-        finest = max(SMALLEST_STEP * smallest, diagonal / MOST_STEPS)
+        finest = max(_SMALLEST_STEP * smallest, diagonal / _MOST_STEPS)
         if ray_step is None:
             return max(0.5 * smallest, finest)
         try:
@@ -284,7 +284,7 @@ class VolumeRenderer(Closing):
             return min(step, 2.0 * diagonal)  # one sample, in the middle of the way through the volume
         raise UsageError(
             f"the ray step is a length in mm, at least {finest:.3g} in this volume (a hundredth of its smallest"
-            f" spacing, and {MOST_STEPS:,} through its diagonal), not {ray_step!r}"
+            f" spacing, and {_MOST_STEPS:,} through its diagonal), not {ray_step!r}"
         )
 
 

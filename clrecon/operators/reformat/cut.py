@@ -366,7 +366,7 @@ PARALLEL = 1.0 - 1e-6
 
 MOST_SLICES = 1000
 
-MOST_TURNED = 30.0
+_MOST_TURNED = 30.0
 """Degrees between a plane that is asked for and planes of voxels that are shown in its place: gantries tilt less."""
 
 
@@ -446,7 +446,7 @@ def take_contact_sheet(
 
 
 def _turn_to_slices(volume: Volume, plane: Camera, warnings: list[str]) -> Camera:
-    """Return a camera across the nearest planes of voxels, or the same one if none lie within `MOST_TURNED` degrees."""
+    """Return a camera across the nearest planes of voxels, or the same if none lie within `_MOST_TURNED` degrees."""
     forward = plane.basis()[2]
     columns = volume.affine[:3, :3]
     normals = [np.cross(columns[:, (axis + 1) % 3], columns[:, (axis + 2) % 3]) for axis in range(3)]
@@ -454,7 +454,7 @@ def _turn_to_slices(volume: Volume, plane: Camera, warnings: list[str]) -> Camer
     cosines = [float(normal @ forward) for normal in normals]
     nearest = int(np.abs(cosines).argmax())
     turned = float(np.degrees(np.arccos(min(1.0, abs(cosines[nearest])))))
-    if abs(cosines[nearest]) > PARALLEL or turned > MOST_TURNED:
+    if abs(cosines[nearest]) > PARALLEL or turned > _MOST_TURNED:
         return plane
     warnings.append(
         f"the slices are tilted by {turned:.1f} degrees from the plane asked for: they are as they were taken"

@@ -46,7 +46,7 @@ COMBINATIONS = {name: kernel_constant("reformat/sample.cl", f"COMBINE_{name.uppe
 SAMPLES_A_LAUNCH = 1 << 23
 """Most samples of a launch, which keeps launches short: systems stop kernels that block a display's GPU for seconds."""
 
-SHEETS = "slices"
+_SHEETS = "slices"
 """Purpose by which slabs are planned."""
 
 FARTHEST = 2.0**30
@@ -136,10 +136,10 @@ class _Run:
     def plan(self) -> int:
         """Return the number of slices on the device at a time; all of the volume if that is worth it."""
         resident, nk = self.resident, self.volume.shape_ijk[2]
-        self.takes_whole = resident.pays_whole(self.slices) and resident.plan(SHEETS, nk, self.needs) == nk
+        self.takes_whole = resident.pays_whole(self.slices) and resident.plan(_SHEETS, nk, self.needs) == nk
         if self.takes_whole:
             return nk
-        slices = resident.plan(SHEETS, self.slices, self.needs)
+        slices = resident.plan(_SHEETS, self.slices, self.needs)
         if slices < min(2, self.slices):
             shortage = describe_shortage(resident.limits, self.needs(min(2, self.slices)))
             kind = DeviceFailedError if resident.limits.asked_bytes is None else DeviceError
@@ -219,7 +219,7 @@ def sample_sheet(
         with attempt as (_, told):
             run = _Run(resident, sheet, samples, combine, stopwatch or Stopwatch())
             planned = run.plan()
-            for slabs in resident.attempts(SHEETS, planned, told, fewest=min(2, planned)):
+            for slabs in resident.attempts(_SHEETS, planned, told, fewest=min(2, planned)):
                 with slabs as slices:
                     made = run.all_slabs(slices, progress)
     if warnings is not None:

@@ -149,11 +149,11 @@ class DeviceVolume(Closing, Volume):
 
         voxels_d: Its voxels there, (nk, nj, ni); None: they are uploaded when they are first needed.
         """
-        made = DeviceVolume(volume, device=self._taken_device, memory=self.memory)
-        made.device = self.device
+        device_volume = DeviceVolume(volume, device=self._taken_device, memory=self.memory)
+        device_volume.device = self.device
         if voxels_d is not None:
-            made._context, made._whole_d = self.device.context, voxels_d
-        return made
+            device_volume._context, device_volume._whole_d = self.device.context, voxels_d
+        return device_volume
 
     @property
     def is_held(self) -> bool:

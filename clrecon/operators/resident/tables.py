@@ -88,7 +88,7 @@ def enclose(volume: Volume, low: Float64Array, high: Float64Array) -> tuple[Floa
     return places.min(axis=0), places.max(axis=0)
 
 
-MOST_LAYERS = 1 << 16
+_MOST_LAYERS = 1 << 16
 """Most entries of the lookup by height; with smaller gaps kernels continue from slice to slice."""
 
 
@@ -113,7 +113,7 @@ class StackTable:
         table[:, 0, 1:3] = places[:, :2]
         table[:-1, 0, 3] = 1.0 / gaps
         table[:, 1:, :3] = slice_normal_matrices(volume, border=0)
-        count = int(min(np.ceil(heights[-1] / gaps.min()) + 1, MOST_LAYERS))
+        count = int(min(np.ceil(heights[-1] / gaps.min()) + 1, _MOST_LAYERS))
         per_mm = count / heights[-1]
         # Half an entry lower, so that rounding in the kernel cannot skip a slice.
         starts = (np.arange(count) - 0.5) / per_mm

@@ -41,16 +41,16 @@ if TYPE_CHECKING:
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
 
-STATES = ("fitted", "not bone", "metal", "badly fitted", "no room")
+_STATES = ("fitted", "not bone", "metal", "badly fitted", "no room")
 """What is across a vertex: a wall; no wall of bone; metal; a profile unlike a wall; another wall or the end of the
 volume just outside of it."""
 
-FITTED, NOT_BONE, METAL, BADLY_FITTED, NO_ROOM = range(len(STATES))
-THINNEST_BLURS, EDGE_SHARE = 0.2, 0.6
+FITTED, NOT_BONE, METAL, _BADLY_FITTED, NO_ROOM = range(len(_STATES))
+_THINNEST_BLURS, EDGE_SHARE = 0.2, 0.6
 """A wall thinner than so many blurs, before something of less than this share of the cortex' HU, is an edge without a
 wall: a vessel, an organ, marrow.  Of true walls 1 to 3 % are as thin."""
 
-MOST_RESIDUAL = 3.0
+_MOST_RESIDUAL = 3.0
 """Residual, in what noise and model explain, from which on a profile is not that of a wall."""
 
 LEAST_ROOM = 2
@@ -58,7 +58,7 @@ LEAST_ROOM = 2
 
 MOST_SHIFT_MM = 2.5
 
-ERROR_FACTOR, LEAST_ERROR = 1.25, 0.06
+_ERROR_FACTOR, _LEAST_ERROR = 1.25, 0.06
 """By what the fit's own error is multiplied, and what is added in squares, in blurs: with both, 94 % of the vertices of
 20 phantoms lie within 1.96 errors, and 74 % within one; without them 88 and 62 %."""
 
@@ -68,7 +68,7 @@ class CortexFit:
     """Where the outer surface of bone lies across the vertices of a mesh, shape (n,) each.
 
     own_cortex_hu: HU of the cortex of components that have constants of their own.
-    states: uint8. Places in `STATES`; all values below are those of the fit, whatever the state.
+    states: uint8. Places in `_STATES`; all values below are those of the fit, whatever the state.
     shift_mm: From the vertex along its normal, outwards positive.
     thickness_mm: Of the wall; at most the length of a profile, which stands for solid bone.
     error_mm, thickness_error_mm: Standard errors.
@@ -86,7 +86,7 @@ class CortexFit:
 
     def counts(self) -> dict[str, int]:
         """Return the number of vertices in each state."""
-        return {name: int(np.count_nonzero(self.states == state)) for state, name in enumerate(STATES)}
+        return {name: int(np.count_nonzero(self.states == state)) for state, name in enumerate(_STATES)}
 
 
 def fit_walls(
@@ -129,9 +129,9 @@ def judge_walls(walls: WallFits, constants: CortexConstants, scale: ProfileScale
     """Return the state of each place."""
     states = np.zeros(len(walls.shift_mm), np.uint8)
     cortex, explained = constants.cortex_hu, unexplained_hu(constants.cortex_hu, constants.known_noise)
-    thin = walls.thickness_mm < THINNEST_BLURS * constants.blur_mm
-    states[walls.residual_hu > MOST_RESIDUAL * explained] = BADLY_FITTED
-    states[np.abs(walls.shift_mm) > MOST_SHIFT_MM] = BADLY_FITTED
+    thin = walls.thickness_mm < _THINNEST_BLURS * constants.blur_mm
+    states[walls.residual_hu > _MOST_RESIDUAL * explained] = _BADLY_FITTED
+    states[np.abs(walls.shift_mm) > MOST_SHIFT_MM] = _BADLY_FITTED
     states[thin & (walls.inner_hu < EDGE_SHARE * cortex)] = NOT_BONE
     states[walls.peak_hu >= METAL_HU] = METAL
     states[~(walls.room_mm > (LEAST_ROOM - 0.5) * scale.step_mm) | np.isnan(walls.peak_hu)] = NO_ROOM
@@ -144,27 +144,27 @@ def standard_errors(
     """Return the standard errors of shift and thickness, mm: noise, what the model leaves, and the constants'."""
     explained = unexplained_hu(constants.cortex_hu, constants.known_noise)
     left = np.maximum(walls.residual_hu, np.float32(explained)) / np.float32(np.sqrt(scale.independent))
-    least = np.float32(LEAST_ERROR * constants.blur_mm)
-    own = np.float32(ERROR_FACTOR) * np.sqrt(walls.shift_variance) * left
-    return np.hypot(own, least), np.float32(ERROR_FACTOR) * np.sqrt(walls.thickness_variance) * left
+    least = np.float32(_LEAST_ERROR * constants.blur_mm)
+    own = np.float32(_ERROR_FACTOR) * np.sqrt(walls.shift_variance) * left
+    return np.hypot(own, least), np.float32(_ERROR_FACTOR) * np.sqrt(walls.thickness_variance) * left
 
 
-MOST_LOOKED_AT = 20_000
+_MOST_LOOKED_AT = 20_000
 """Vertices of a surface at a level whose distance from the bone is measured."""
 
-FEWEST_FITTED = 100
+_FEWEST_FITTED = 100
 """Fitted vertices below which nothing is said about a surface."""
 
 KEPT_MM = 1e-3
 """A vertex farther than this from where its wall is was not moved by all of its shift."""
 
-LEAST_TURN = 0.2
+_LEAST_TURN = 0.2
 """Least cosine between a triangle before and after it was moved."""
 
-CALM_ROUNDS, SHORT_ROUNDS = 12, 8
+_CALM_ROUNDS, _SHORT_ROUNDS = 12, 8
 """Rounds in which corners of triangles that would turn over go to the mean of their neighbours, and then half back."""
 
-BIAS_ROWS = 2000
+_BIAS_ROWS = 2000
 """Vertices by which the effect of the constants on the whole surface is measured."""
 
 
@@ -205,7 +205,7 @@ def choose_shifts(fit: CortexFit, triangles: NDArray[np.uint32], fans: Fans) -> 
     What is badly fitted lies where its neighbours say, with the weights 1 / error^2.  Others are not smoothed: shifts
     undo the waves of the level's surface, and means of them keep these (0.15 mm became 0.17 at a noise of 50 HU).
     """
-    fitted, doubtful = fit.states == FITTED, np.flatnonzero(fit.states == BADLY_FITTED)
+    fitted, doubtful = fit.states == FITTED, np.flatnonzero(fit.states == _BADLY_FITTED)
     shifts = np.where(fitted, fit.shift_mm, 0.0).astype(np.float32)
     weights = np.where(fitted, 1.0 / np.square(np.maximum(fit.error_mm, 1e-3)), 0.0)
     weight, weighted = fans.sums(np.column_stack([weights, weights * shifts]), triangles, doubtful).T
@@ -222,14 +222,14 @@ def calm_vertices(
     """
     places = moved.astype(np.float64)
     rows: IntArray = np.flatnonzero(find_turned(vertices, places, triangles))
-    for turn in range(CALM_ROUNDS + SHORT_ROUNDS + 1):
+    for turn in range(_CALM_ROUNDS + _SHORT_ROUNDS + 1):
         if not len(rows):
             break
         bad = np.unique(triangles[rows])
-        if turn == CALM_ROUNDS + SHORT_ROUNDS:
+        if turn == _CALM_ROUNDS + _SHORT_ROUNDS:
             bad = np.unique(triangles[fans.touching(bad)])
             places[bad] = vertices[bad]
-        elif turn >= CALM_ROUNDS:
+        elif turn >= _CALM_ROUNDS:
             places[bad] = 0.5 * (places[bad] + vertices[bad])
         else:
             count = (fans.begin[bad + 1] - fans.begin[bad])[:, None]
@@ -243,7 +243,7 @@ def calm_vertices(
 def find_turned(
     vertices: NDArray[np.floating], places: Float64Array, triangles: NDArray[np.uint32]
 ) -> NDArray[np.bool_]:
-    """Mark the triangles that turn by more than `LEAST_TURN` lets, where their vertices go to these places."""
+    """Mark the triangles that turn by more than `_LEAST_TURN` lets, where their vertices go to these places."""
     found = np.empty(len(triangles), bool)
 
     def work(where: slice) -> None:
@@ -256,7 +256,7 @@ def find_turned(
         )
         along = np.einsum("an,an->n", after, before)
         squares = np.einsum("an,an->n", after, after) * np.einsum("an,an->n", before, before)
-        found[where] = along <= LEAST_TURN * np.sqrt(squares)
+        found[where] = along <= _LEAST_TURN * np.sqrt(squares)
 
     in_threads(work, len(triangles))
     return found
@@ -343,7 +343,7 @@ def fit_mesh(
     steps.take()
     fitted = fit.states == FITTED
     kept = int(np.count_nonzero(fitted & (np.abs(vertices - wanted).max(axis=1) > KEPT_MM)))
-    known = np.isin(fit.states, (FITTED, BADLY_FITTED))
+    known = np.isin(fit.states, (FITTED, _BADLY_FITTED))
     report = _describe(fit, resident, mesh.vertices, normals, True, kept)
     made = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), {**mesh.report, "cortex": report})
     made.values = {
@@ -391,12 +391,12 @@ def fit_labels(
 
 
 def measure_outside(mesh: Mesh, resident: DeviceVolume, *, constants: CortexConstants | None = None) -> CortexReport:
-    """Measure how far a surface at a level lies outside of the bone, at up to `MOST_LOOKED_AT` of its vertices.
+    """Measure how far a surface at a level lies outside of the bone, at up to `_MOST_LOOKED_AT` of its vertices.
 
     With the constants of the scan alone: those of each component take as long as all else that a mesh does.
     """
     _refuse_few(mesh.vertex_count, mesh.vertex_count)
-    rows = np.unique(np.linspace(0, mesh.vertex_count - 1, min(mesh.vertex_count, MOST_LOOKED_AT)).astype(np.int64))
+    rows = np.unique(np.linspace(0, mesh.vertex_count - 1, min(mesh.vertex_count, _MOST_LOOKED_AT)).astype(np.int64))
     points, normals = mesh.vertices[rows], _normals_of(mesh)[rows]
     fit = fit_walls(resident, points, normals, stopwatch=Stopwatch(), constants=constants)
     _refuse_few(int(np.count_nonzero(fit.states == FITTED)), len(fit.states))
@@ -419,10 +419,10 @@ def _normals_of(mesh: Mesh) -> NDArray[np.float32]:
 
 
 def _refuse_few(count: int, vertices: int) -> None:
-    if count < FEWEST_FITTED:
+    if count < _FEWEST_FITTED:
         raise NoSurfaceError(
             f"the surface has no walls of bone to be fitted: {count} of {vertices:,} vertices, at least"
-            f" {FEWEST_FITTED} are needed"
+            f" {_FEWEST_FITTED} are needed"
         )
 
 
@@ -462,7 +462,7 @@ def _measure_bias(
 ) -> float:
     """Return the root of the squares of what each constant's uncertainty moves the surface by, on average."""
     fitted = np.flatnonzero(fit.states == FITTED)
-    rows = fitted[np.unique(np.linspace(0, len(fitted) - 1, min(len(fitted), BIAS_ROWS)).astype(np.int64))]
+    rows = fitted[np.unique(np.linspace(0, len(fitted) - 1, min(len(fitted), _BIAS_ROWS)).astype(np.int64))]
     sampler = ProfileSampler(resident, Stopwatch())
     walls, known = sampler.take(sampler.values(points[rows], normals[rows])), fit.constants
     changes = []

@@ -93,7 +93,7 @@ def _join(parts: list[Part]) -> Part:
     return joined[0], joined[1], joined[2]
 
 
-MEASURED_FROM = 2
+_MEASURED_FROM = 2
 """Surface of a volume before which a GPU measures its bricks; a CPU gains less from 40 surfaces of a scan."""
 
 
@@ -220,7 +220,7 @@ class Extraction:
         Measuring takes as long as the first pass over the volume, so the first surface of a volume is made without.  So
         are surfaces of ranges and of values below a level: all voxels are read for them.
         """
-        waits = self.resident.surfaces < MEASURED_FROM or self.device.kernel_variants["LANES"] != "1"
+        waits = self.resident.surfaces < _MEASURED_FROM or self.device.kernel_variants["LANES"] != "1"
         if not slab.is_whole or slab.grid.rule.inside != "above" or (waits and not self.resident.kept_bytes(BRICKS)):
             return None
         ranges = keep_bricks(self.resident, voxels_d)

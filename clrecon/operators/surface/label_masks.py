@@ -111,8 +111,8 @@ def _widen(table: NDArray[np.int32], numbers: Sequence[int], shape_ijk: tuple[in
 SPARE_SLICES = 3 + REACH
 """Slices needed beyond a label's box: slices of the mask, gradients, and their occupancy."""
 
-TRIANGLES_PER_SUM = 256
-SAMPLES_PER_FLAGS = 32 * kernel_constant("surface/label_masks.cl", "STRIP")
+_TRIANGLES_PER_SUM = 256
+_SAMPLES_PER_FLAGS = 32 * kernel_constant("surface/label_masks.cl", "STRIP")
 """Samples of a row that one word of flags tells of: 32 strips."""
 
 
@@ -177,7 +177,7 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
     def strip_bytes(self, slices: int) -> int:
         """Return the bytes of two flags for each 16 samples of a row."""
         ni, nj, _ = self.labels.shape_ijk
-        return 8 * -(-ni // SAMPLES_PER_FLAGS) * nj * slices
+        return 8 * -(-ni // _SAMPLES_PER_FLAGS) * nj * slices
 
     def hold(self, boxes: dict[int, Box]) -> HeldMap:
         """Upload the slices that the labels need, and find the occupancy of all labels."""
@@ -190,15 +190,15 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
         rows_d, occupancy_d = allocate(device, 2 * samples), allocate(device, 2 * samples)
         occupied_d = allocate(device, 2 * samples) if self.has_neighbours else occupancy_d
         strips_d = allocate(device, self.strip_bytes(end - first))
-        held = HeldMap(first, end, map_d, rows_d, strips_d, occupancy_d, occupied_d)
+        held_map = HeldMap(first, end, map_d, rows_d, strips_d, occupancy_d, occupied_d)
         if self.has_neighbours:
             around = tuple(
                 slice(min(box[axis].start for box in boxes.values()), max(box[axis].stop for box in boxes.values()))
                 for axis in range(3)
             )
             with self.stopwatch.running(device):
-                self._smooth(held, 0, around, occupied_d)  # type: ignore[arg-type]
-        return held
+                self._smooth(held_map, 0, around, occupied_d)  # type: ignore[arg-type]
+        return held_map
 
     def _smooth(self, held: HeldMap, number: int, box: Box, occupancy_d: Any) -> None:
         """Smooth a label (0: all) to its occupancy in a box and REACH samples around it, which gradients need."""
@@ -313,13 +313,13 @@ class StartedMesh:
         if placement.origin is not None:
             centre[:3] = self.run.labels.ijk_to_lps(middle)[0] - placement.origin
         triangles = self.counted.triangles
-        sums = np.empty(-(-triangles // TRIANGLES_PER_SUM), np.float32)
+        sums = np.empty(-(-triangles // _TRIANGLES_PER_SUM), np.float32)
         sums_d = allocate(device, sums.nbytes)
         with stopwatch.running(device):
             launch(
                 device, self.run.programs()[0]["sum_volumes"], len(sums),
                 positions=self.emission.positions_d, triangles=self.emission.triangles_d, sums=sums_d, centre=centre,
-                triangle_count=triangles, triangles_per_sum=TRIANGLES_PER_SUM,
+                triangle_count=triangles, triangles_per_sum=_TRIANGLES_PER_SUM,
             )  # fmt: skip
         return float(download(device, sums, sums_d).sum(dtype=np.float64)) / 6.0
 

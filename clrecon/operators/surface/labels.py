@@ -208,8 +208,8 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
             dtype = self.resident.dtype
             label_dtype = self.labels.dtype
             variants = {**voxel_variants(dtype), **label_variants(label_dtype)}
-            own = load_program(self.device, "surface/labels.cl", variants)
-            return own, marching_cubes.prepare_marching_cubes(
+            program = load_program(self.device, "surface/labels.cl", variants)
+            return program, marching_cubes.prepare_marching_cubes(
                 self.device, dtype, label_dtype, uneven=self.volume.uneven
             )
 

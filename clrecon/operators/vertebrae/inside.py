@@ -85,7 +85,7 @@ PARTS = ("dense", "trabecular", "canal", "solid")
 NEIGHBOUR_HU = 150.0
 """Voxels of other labels are bone from here on, and no part of a canal; cord and sac lie below 100 HU."""
 
-MISSED_SHARE = 0.1
+_MISSED_SHARE = 0.1
 """Warn where this share of the band around a label lies in the next voxel outside of it."""
 
 LEAST_CANAL_MM = 4.5
@@ -197,8 +197,8 @@ class VertebraInside:
         meshes: dict[str, Mesh] = {}
         for names in (PARTS[:-1], PARTS[-1:]):
             held = {name: mask for name, mask in self.masks.items() if name in names}
-            made = extract_label_masks(self._map(held), device=self.solid.device, memory=memory)
-            meshes |= {PARTS[number - 1]: mesh for number, mesh in made.items()}
+            label_masks = extract_label_masks(self._map(held), device=self.solid.device, memory=memory)
+            meshes |= {PARTS[number - 1]: mesh for number, mesh in label_masks.items()}
         for mesh in meshes.values():
             mesh.report["certificate"] = self.volume.report
         return {name: meshes[name] for name in PARTS if name in meshes}
@@ -371,7 +371,7 @@ def _warn_of_missed(in_band: Mask, dense: Mask, solid: Mask, others: Mask, band:
     """Warn of a label that ends before the dense bone does."""
     beside = in_band & (solid.dilate(min(max(solid.scan.spacing), 3.0)) - solid - others)
     share = beside.count / (beside.count + dense.count)
-    if share < MISSED_SHARE:
+    if share < _MISSED_SHARE:
         return []
     return [
         f"{100 * share:.0f} % of the bone of {name_band(band)} lies in the next voxel outside of the label:"

@@ -23,10 +23,10 @@ from clrecon.system.arguments import SurfaceKind, explains_arguments, name_param
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.text import format_hu
 
-SPARE_VOXELS = 3
+_SPARE_VOXELS = 3
 """Voxels beyond the distances that are asked for, so that nothing round the label touches the end of the crop."""
 
-AXIAL_COSINE = 0.7
+_AXIAL_COSINE = 0.7
 """Slices whose normal has at least this cosine with the patient's long axis are axial: up to 45 degrees off."""
 
 
@@ -82,7 +82,7 @@ def _window(
     if isinstance(grid, Volume) and grid.uneven:
         gaps = np.linalg.norm(np.diff(grid.slice_origins(), axis=0), axis=1)
         steps[2] *= grid.spacing[2] / max(float(gaps.min(initial=grid.spacing[2])), 1e-6)
-    more = margin_mm * steps + SPARE_VOXELS
+    more = margin_mm * steps + _SPARE_VOXELS
     first = np.clip(np.floor(indices.min(axis=0) - more), 0, grid.shape_ijk).astype(np.int64)
     end = np.clip(np.ceil(indices.max(axis=0) + more) + 1, 0, grid.shape_ijk).astype(np.int64)
     return first, end
@@ -111,7 +111,7 @@ def _cut_volume(volume: Volume, first: NDArray[np.int64], end: NDArray[np.int64]
         affine[:3, :3] = affine[:3, order]
         voxels = voxels.transpose([2 - axis for axis in order[::-1]])
     normal = np.cross(affine[:3, 0], affine[:3, 1])
-    axial = bool(abs(normal[2]) >= AXIAL_COSINE * np.linalg.norm(normal))
+    axial = bool(abs(normal[2]) >= _AXIAL_COSINE * np.linalg.norm(normal))
     return Volume(np.ascontiguousarray(voxels), affine, volume.report, origins), axial
 
 

@@ -32,10 +32,10 @@ WINDOW_HU = (-200.0, 800.0)
 BETWEEN = 0.487
 """Place of a plane between two slices: on a slice, vertices lie in the plane."""
 
-PIXELS, DETAIL_MM = 560, 24.0
+PIXELS, _DETAIL_MM = 560, 24.0
 MARGIN_MM = 8.0
-OVERSAMPLING = 2
-WIDEST, THINNEST = {"whole": 3.4, "detail": 7.0}, {"whole": 1.1, "detail": 1.6}
+_OVERSAMPLING = 2
+_WIDEST, THINNEST = {"whole": 3.4, "detail": 7.0}, {"whole": 1.1, "detail": 1.6}
 """Pixels of the first line, which lies below, and of the last one: lines at one place are seen as bands."""
 
 Segments = NDArray[np.float64]
@@ -135,7 +135,7 @@ def draw_plane(
     low, high = np.maximum(low, -0.5), np.minimum(high, shape - 0.5)
     whole = _draw(grey, plane, steps, low, high, "whole", contours, colors)
     middle = _find_detail(contours.get(reference, np.empty((0, 2, 2))), steps, 0.5 * (low + high))
-    half = 0.5 * DETAIL_MM / steps
+    half = 0.5 * _DETAIL_MM / steps
     detail = _draw(grey, plane, steps, middle - half, middle + half, "detail", contours, colors)
     return whole, detail
 
@@ -145,7 +145,7 @@ def _find_detail(segments: Segments, steps: NDArray[np.float64], default: NDArra
     if not len(segments):
         return default
     middles = segments.mean(axis=1)
-    squares = np.floor(middles * steps / (0.5 * DETAIL_MM)).astype(np.int64)
+    squares = np.floor(middles * steps / (0.5 * _DETAIL_MM)).astype(np.int64)
     found, counts = np.unique(squares, axis=0, return_counts=True)
     best = found[int(np.argmax(counts))]
     return np.asarray(middles[(squares == best).all(axis=1)].mean(axis=0))
@@ -167,7 +167,7 @@ def _draw(
     from PIL import Image, ImageDraw
 
     extent = (high - low) * steps
-    scale = OVERSAMPLING * PIXELS / float(extent.max())  # pixels a mm
+    scale = _OVERSAMPLING * PIXELS / float(extent.max())  # pixels a mm
     width, height = (max(1, int(round(scale * side))) for side in extent)
     whole = Image.fromarray(grey)
     # Index coordinates count from the centres of pixels, Pillow's from their corners.
@@ -176,16 +176,16 @@ def _draw(
         (low[0] + 0.5, low[1] + 0.5, high[0] + 0.5, high[1] + 0.5), Image.Resampling.BILINEAR,
     ).convert("RGB")  # fmt: skip
     canvas = ImageDraw.Draw(part)
-    lines = np.linspace(WIDEST[which], THINNEST[which], max(len(contours), 2))
+    lines = np.linspace(_WIDEST[which], THINNEST[which], max(len(contours), 2))
     for (name, segments), line in zip(contours.items(), lines.tolist(), strict=False):
-        thick = max(1, round(OVERSAMPLING * line))
+        thick = max(1, round(_OVERSAMPLING * line))
         ends = (segments - low) * steps * scale
         seen = ((ends > -50) & (ends < [width + 50, height + 50])).all(axis=(1, 2))
         for (x, y), (to_x, to_y) in ends[seen].tolist():
             canvas.line((x, y, to_x, to_y), fill=colors[name], width=thick)
     if plane.flip:
         part = part.transpose(Image.Transpose.FLIP_TOP_BOTTOM)
-    return part.resize((width // OVERSAMPLING or 1, height // OVERSAMPLING or 1), Image.Resampling.LANCZOS)
+    return part.resize((width // _OVERSAMPLING or 1, height // _OVERSAMPLING or 1), Image.Resampling.LANCZOS)
 
 
 MOST_PIXELS = 512

@@ -141,14 +141,14 @@ class CompareReport(RunReport):
 SAME_MM = 1e-3
 """Surfaces whose 95th percentile of distances is below this are the same."""
 
-SAME_CELLS, NEAR_MM = 0.999, 2.0
+_SAME_CELLS, NEAR_MM = 0.999, 2.0
 """Dice of cells from which on methods cut the same ones, and the largest distance then."""
 
-SLOWER, MORE_MEMORY = 1.25, 1.25
+_SLOWER, _MORE_MEMORY = 1.25, 1.25
 """Ratios from which on a method counts as worse than the reference: below, runs of one method differ as much."""
 
-LOWER_DICE, LOWER_SSIM = 5e-4, 5e-3
-WIDER_MM = 5e-3
+_LOWER_DICE, _LOWER_SSIM = 5e-4, 5e-3
+_WIDER_MM = 5e-3
 
 
 def find_findings(methods: Sequence[MethodRecord], reference: str, *, with_truth: bool) -> list[str]:
@@ -195,7 +195,7 @@ def _of_same(done: Rows, reference: str) -> Iterator[str]:
     own = done.get(reference)
     others = [m for m in done.values() if m.name != reference and m.surfaces]
     same = [m for m in others if m.surfaces and m.surfaces["hd95_mm"] < SAME_MM]
-    near = [m for m in others if m not in same and m.cells and m.cells["dice"] >= SAME_CELLS and m.surfaces]
+    near = [m for m in others if m not in same and m.cells and m.cells["dice"] >= _SAME_CELLS and m.surfaces]
     near = [m for m in near if m.surfaces and m.surfaces["max_mm"] < NEAR_MM]
     if own is None:
         return
@@ -215,10 +215,10 @@ def _of_golden(done: Rows) -> Iterator[str]:
     linear, golden = done.get("i-mc"), done.get("i-mc-golden")
     if not (linear and golden and linear.slices and golden.slices and linear.warm_s and golden.warm_s):
         return
-    lower = golden.slices["dice"] < linear.slices["dice"] - LOWER_DICE
+    lower = golden.slices["dice"] < linear.slices["dice"] - _LOWER_DICE
     times = golden.warm_s / linear.warm_s
     spent = "takes as long as with linear ones"
-    if not 1.0 / SLOWER < times < SLOWER:
+    if not 1.0 / _SLOWER < times < _SLOWER:
         spent = f"takes {ratio(times)} times as long" if times > 1.0 else f"takes {100.0 * times:.0f} % of the time"
     yield (
         f"With vertices at the golden section I-MC {spent}, and its sub-voxel Dice {'falls' if lower else 'goes'}"
@@ -316,17 +316,17 @@ def find_worse(method: MethodRecord, reference: MethodRecord | None) -> list[str
     if method.makes != "mesh":
         return ["no surface"]
     worse = []
-    if method.warm_s and reference.warm_s and method.warm_s > SLOWER * reference.warm_s:
+    if method.warm_s and reference.warm_s and method.warm_s > _SLOWER * reference.warm_s:
         worse.append(f"{ratio(method.warm_s / reference.warm_s)} times slower")
-    if method.memory_bytes and reference.memory_bytes and method.memory_bytes > MORE_MEMORY * reference.memory_bytes:
+    if method.memory_bytes and reference.memory_bytes and method.memory_bytes > _MORE_MEMORY * reference.memory_bytes:
         worse.append(f"{megabytes(method.memory_bytes - reference.memory_bytes)} MB more")
     if method.slices and reference.slices:
         lower = reference.slices["dice"] - method.slices["dice"]
-        if lower > LOWER_DICE:
+        if lower > _LOWER_DICE:
             worse.append(f"Dice lower by {lower:.4f}")
     if method.truth and reference.truth:
         wider = method.truth["scatter_mm"] - reference.truth["scatter_mm"]
-        if wider > WIDER_MM:
+        if wider > _WIDER_MM:
             worse.append(f"scatter wider by {wider:.3f} mm")
     if method.quality and reference.quality and reference.quality["closed"] and not method.quality["closed"]:
         worse.append("not closed")

@@ -21,7 +21,7 @@ from clrecon.proof.compare.mesh_slices import measure_slices
 from clrecon.proof.compare.mesh_truth import REACH_MM, measure_truth
 from clrecon.proof.compare.processes import load_array, load_mesh, load_volume
 
-MEASURES = ("quality", "cells", "slices", "surfaces", "truth", "points")
+_MEASURES = ("quality", "cells", "slices", "surfaces", "truth", "points")
 
 
 class Judge:
@@ -53,9 +53,9 @@ class Judge:
         return find_mesh_cells(self.reference, self._volume, name=self._reference or "")
 
     def measure(self, method: str) -> dict[str, Any]:
-        """Measure what a method made: each of `MEASURES`, None where it does not apply, and ``reasons`` of failures."""
+        """Measure the result of a method: each of `_MEASURES`, None where it has none, and ``reasons`` of failures."""
         mesh, points = load_mesh(self._folder, method), load_array(self._folder, method, "points")
-        found: dict[str, Any] = dict.fromkeys(MEASURES)
+        found: dict[str, Any] = dict.fromkeys(_MEASURES)
         reasons: dict[str, str] = {}
         for name, take in self._measures(method, mesh, points).items():
             try:

@@ -95,12 +95,12 @@ PARTS = ("build", "upload", "kernels", "host", "download", "draw")
 """Parts of the time of a method: kernels are built; the volume goes to the device; kernels run; the CPU works (all of
 it, where a method has no kernels); results come back; a picture is drawn."""
 
-DEVICE_PARTS = ("build", "upload", "kernels", "download")
+_DEVICE_PARTS = ("build", "upload", "kernels", "download")
 
 TWIN_SIZE = (128, 128)
 """Pixels of ray casting in numpy, which takes seconds for them, and of the device beside it."""
 
-RAYS_PRESET: Final = "bone"
+_RAYS_PRESET: Final = "bone"
 
 
 @dataclass
@@ -131,7 +131,7 @@ def make(scene: Scene) -> Made:
     seconds = dict.fromkeys(PARTS, 0.0)
     for report in reports:
         own = report.get("seconds", {})
-        for part in DEVICE_PARTS:
+        for part in _DEVICE_PARTS:
             seconds[part] += float(own.get(part, 0.0))
     seconds["host"] = max(0.0, total - sum(seconds.values()))
     kernels: dict[str, float] = {}
@@ -209,7 +209,7 @@ def _cast(scene: Scene, camera: Camera, size: tuple[int, int]) -> Rendering:
     from clrecon.rendering.pictures.styles import VolumeLook
 
     return render(
-        scene.volume, VolumeLook(RAYS_PRESET), camera=camera, size=size, device=scene.device,
+        scene.volume, VolumeLook(_RAYS_PRESET), camera=camera, size=size, device=scene.device,
         memory=scene.request.memory,
     )  # fmt: skip
 
@@ -219,7 +219,7 @@ def _rays_cpu(scene: Scene) -> Product:
     from clrecon.rendering.looks.presets import find_preset
 
     camera, _ = scene.request.views()["view"]
-    preset = find_preset(RAYS_PRESET)
+    preset = find_preset(_RAYS_PRESET)
     found = cast_rays(scene.volume, preset.transfer_function, camera, TWIN_SIZE, lighting=preset.lighting)
     depth = found.depth.astype("float32")
     return Rendering(found.image(), depth, depth, camera), [{}]

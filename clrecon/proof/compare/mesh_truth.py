@@ -17,7 +17,7 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 
-TRUTH_SAMPLES = 20_000
+_TRUTH_SAMPLES = 20_000
 """Points on the mesh; each asks the true surface seven times."""
 
 REACH_MM = 1.5
@@ -54,7 +54,7 @@ class TruthDistance(Record):
 def measure_truth(
     mesh: Mesh,
     truth: SignedSurface,
-    samples: int = TRUTH_SAMPLES,
+    samples: int = _TRUTH_SAMPLES,
     *,
     reach_mm: float | None = None,
     grid: Grid | None = None,

@@ -66,7 +66,7 @@ def choose_methods(names: Sequence[str], reference: str) -> tuple[Compared, ...]
     return tuple(method for name, method in COMPARED.items() if name in wanted)
 
 
-MOST_REPEATS = 100
+_MOST_REPEATS = 100
 
 
 def _parse_names(text: str) -> tuple[str, ...]:
@@ -116,8 +116,8 @@ class CompareSettings(InputSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         choose_methods(self.methods, self.reference)
-        if not 1 <= self.repeat <= MOST_REPEATS:
-            raise UsageError(f"the number of warm runs lies between 1 and {MOST_REPEATS}, not at {self.repeat}")
+        if not 1 <= self.repeat <= _MOST_REPEATS:
+            raise UsageError(f"the number of warm runs lies between 1 and {_MOST_REPEATS}, not at {self.repeat}")
         if isinstance(self.iso_value, Sequence):
             raise UsageError("methods are compared at one iso value: give one number of HU, and no range")
         if len(self.as_mesh().levels) != 1:

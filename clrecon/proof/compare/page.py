@@ -24,7 +24,7 @@ def _read(name: str) -> str:
     return (files(__package__) / name).read_text(encoding="utf-8")
 
 
-PART_COLORS = {
+_PART_COLORS = {
     "read": "#9aa5b1",
     "build": "#f2b134",
     "upload": "#4d9de0",
@@ -34,7 +34,7 @@ PART_COLORS = {
     "draw": "#7768ae",
 }
 
-PART_WORDS = {
+_PART_WORDS = {
     "read": "read the input",
     "build": "open the device, build kernels",
     "upload": "upload",
@@ -44,10 +44,10 @@ PART_WORDS = {
     "draw": "draw the picture",
 }
 
-INK = "#010203"
+_INK = "#010203"
 """Stands for the colour of the page's text, which matplotlib does not know."""
 
-CUT = 2.2
+_CUT = 2.2
 """Bars end at so many times the length that three quarters of them have; longer ones say their number."""
 
 
@@ -57,18 +57,18 @@ def plot_times(report: CompareReport, which: str) -> str:
     parts = {record.name: getattr(record, f"{which}_parts_s") for record in done}
     totals = {name: sum(own.values()) for name, own in parts.items()}
     ranked = sorted(totals.values())
-    end = min(ranked[-1], CUT * ranked[(3 * len(ranked) - 1) // 4])
+    end = min(ranked[-1], _CUT * ranked[(3 * len(ranked) - 1) // 4])
     figure, axes = _start(7.2, 0.9 + 0.34 * len(done))
     for row, record in enumerate(done):
         left = 0.0
         for part in ALL_PARTS:
             width = min(parts[record.name].get(part, 0.0), end - left)
             if width > 0.0:
-                axes.barh(row, width, left=left, height=0.66, color=PART_COLORS[part], linewidth=0)
+                axes.barh(row, width, left=left, height=0.66, color=_PART_COLORS[part], linewidth=0)
             left += max(width, 0.0)
         is_cut = totals[record.name] > end * 1.001
         said = f"{seconds(totals[record.name])}{' (cut)' if is_cut else ''}"
-        axes.text(left + 0.012 * end, row, said, va="center", ha="left", fontsize=9, color=INK)
+        axes.text(left + 0.012 * end, row, said, va="center", ha="left", fontsize=9, color=_INK)
     axes.set_yticks(range(len(done)), [record.title for record in done])
     axes.invert_yaxis()
     axes.set_xlim(0.0, 1.16 * end)
@@ -90,7 +90,7 @@ def plot_accuracy(report: CompareReport, colors: Mapping[str, str]) -> tuple[str
     figure, axes = _start(7.2, 4.6)
     for record, triangles, value in points:
         axes.plot(
-            triangles, value, "o", markersize=9, color=colors[record.name], markeredgecolor=INK, markeredgewidth=0.7
+            triangles, value, "o", markersize=9, color=colors[record.name], markeredgecolor=_INK, markeredgewidth=0.7
         )
     axes.set_xscale("log")
     _set_ranges(axes, [p[1] for p in points], [p[2] for p in points])
@@ -99,7 +99,7 @@ def plot_accuracy(report: CompareReport, colors: Mapping[str, str]) -> tuple[str
     axes.set_ylabel(unit)
     _label(axes, points)
     axes.text(
-        0.015, 0.02, "good corner: few triangles, small error", transform=axes.transAxes, fontsize=9, color=INK,
+        0.015, 0.02, "good corner: few triangles, small error", transform=axes.transAxes, fontsize=9, color=_INK,
         style="italic", alpha=0.75,
     )  # fmt: skip
     return _finish(figure, "accuracy"), measure
@@ -147,9 +147,9 @@ def _label(axes: Any, points: Sequence[tuple[MethodRecord, int, float]]) -> None
         for x, y, across, up, title in sorted(column, key=lambda each: (-each[1], each[0])):
             down = min(y, last - LINE)
             last = down
-            line = {"arrowstyle": "-", "color": INK, "alpha": 0.35, "linewidth": 0.6, "shrinkB": 4.0}
+            line = {"arrowstyle": "-", "color": _INK, "alpha": 0.35, "linewidth": 0.6, "shrinkB": 4.0}
             axes.annotate(
-                title, (across, up), xytext=(beside - x, down - y), textcoords="offset points", fontsize=9, color=INK,
+                title, (across, up), xytext=(beside - x, down - y), textcoords="offset points", fontsize=9, color=_INK,
                 va="center", arrowprops=line if abs(y - down) > 0.5 * LINE or beside - x > 2.0 * ASIDE else None,
             )  # fmt: skip
 
@@ -163,13 +163,13 @@ def _start(width: float, height: float) -> tuple[Any, Any]:
     axes.patch.set_alpha(0.0)
     for name, spine in axes.spines.items():
         spine.set_visible(name in ("left", "bottom"))
-        spine.set_color(INK)
+        spine.set_color(_INK)
         spine.set_alpha(0.5)
-    axes.tick_params(colors=INK, labelsize=9)
-    axes.grid(axis="x", color=INK, alpha=0.12, linewidth=0.6)
+    axes.tick_params(colors=_INK, labelsize=9)
+    axes.grid(axis="x", color=_INK, alpha=0.12, linewidth=0.6)
     axes.set_axisbelow(True)
-    axes.xaxis.label.set_color(INK)
-    axes.yaxis.label.set_color(INK)
+    axes.xaxis.label.set_color(_INK)
+    axes.yaxis.label.set_color(_INK)
     axes.xaxis.label.set_fontsize(10)
     axes.yaxis.label.set_fontsize(10)
     return figure, axes
@@ -192,7 +192,7 @@ def _finish(figure: Any, name: str) -> str:
     text = re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL)
     text = re.sub(r"font: (\S+ )*?([\d.]+)px [^;\"]*", r"font-size: \2px", text)
     text = re.sub(r"font-size: ([\d.]+)px(?= |$)", r"font-size: \1px", text)
-    text = _ID.sub(f"{name}-", text.replace(INK, "currentColor"))
+    text = _ID.sub(f"{name}-", text.replace(_INK, "currentColor"))
     return text.replace("<svg ", f'<svg role="img" aria-label="{name}" ', 1).strip()
 
 
@@ -273,7 +273,7 @@ def _findings(report: CompareReport) -> str:
 
 
 def _times(report: CompareReport) -> str:
-    legend = _legend({words: PART_COLORS[part] for part, words in PART_WORDS.items()})
+    legend = _legend({words: _PART_COLORS[part] for part, words in _PART_WORDS.items()})
     plots = "\n".join(f"<figure>{plot_times(report, which)}</figure>" for which in ("first", "warm"))
     return (
         f'{legend}\n<div class="plots">\n{plots}\n</div>\n<p class="note">Beside each bar: all of its seconds, reading'

@@ -98,7 +98,7 @@ def load_mesh(folder: Path, name: str) -> Mesh | None:
 METHOD = ("-m", "clrecon.proof.compare.child")
 JUDGE = ("-m", "clrecon.proof.compare.judge")
 
-MOST_JUDGES = 4
+_MOST_JUDGES = 4
 
 
 def _start(command: Sequence[str], told: Mapping[str, Any]) -> subprocess.Popen[bytes]:
@@ -151,7 +151,7 @@ def _describe_end(code: int) -> str:
 
 def measure_in_processes(told: Mapping[str, Any], methods: Mapping[str, int]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Measure products, a process a core; yield names with figures, see `Judge`, or ``reasons``."""
-    parts = _share(methods, min(usable_cores(), MOST_JUDGES))
+    parts = _share(methods, min(usable_cores(), _MOST_JUDGES))
     lines: queue.Queue[tuple[int, bytes]] = queue.Queue()
     processes: list[subprocess.Popen[bytes]] = []
     try:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 ALL_PARTS = ("read", *PARTS)
 
-LIBRARIES = {
+_LIBRARIES = {
     "numpy": "numpy",
     "scipy": "scipy",
     "scikit-image": "scikit-image",
@@ -121,7 +121,7 @@ def compose_report(
         said.append(f"only {free:.1f} of {cores} cores are free: times are of a busy computer, their ratios count")
     watch.lap("report")
     versions = {"Python": platform.python_version(), "clrecon": package_version()}
-    for title, name in LIBRARIES.items():
+    for title, name in _LIBRARIES.items():
         try:
             versions[title] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:

@@ -22,7 +22,7 @@ from clrecon.proof.compare.findings import (
 
 NOTHING = "&ndash;"
 
-AGAINST = ("cells", "HD95", "ASSD", "picture")
+_AGAINST = ("cells", "HD95", "ASSD", "picture")
 """Columns of likeness to the reference, which has none to itself."""
 
 GROUPS = {"mesh": "surfaces", "cloud": "clouds", "picture": "pictures of the voxels themselves"}
@@ -153,7 +153,7 @@ def _head(column: Column) -> str:
 
 def _find_best(column: Column, records: Sequence[MethodRecord], reference: str) -> str | None:
     """Return the text of the best number of a column; of measures against the reference, that has none itself."""
-    against = column.head in AGAINST
+    against = column.head in _AGAINST
     values = [
         value
         for record in records
@@ -187,7 +187,7 @@ def _row(
             continue
         text = column.write(value)
         more = _more(column, record)
-        is_own = column.head in AGAINST and reference is not None and record.name == reference.name
+        is_own = column.head in _AGAINST and reference is not None and record.name == reference.name
         is_best = record.makes == "mesh" and best is not None and text == best and not is_own
         mark = ' class="best"' if is_best else ""
         cells.append(f"<td{mark}>{text}{more}</td>")

@@ -104,10 +104,10 @@ def facts_of_series(settings: PhantomSettings, placement: Placement) -> dict[str
 TRUTH_NAME = "truth.json"
 LARGEST_TRUTH = 1 << 28
 """Largest truth.json that is read, in bytes; that of a series of thousands of slices has some MiB."""
-MATERIALS_NAME = "materials.nrrd"
-LEVELS_NAME = "levels.nrrd"
+_MATERIALS_NAME = "materials.nrrd"
+_LEVELS_NAME = "levels.nrrd"
 
-SPINE_ISO_HU = 226.0
+_SPINE_ISO_HU = 226.0
 """Suggested iso value for the spine: above discs, organs and noise, below the blurred thin cortex."""
 
 _GENERATOR = "clrecon phantom"
@@ -187,7 +187,7 @@ def _make(
 def _iso_value(settings: PhantomSettings, half_maximum: float | None) -> float:
     if half_maximum is not None:
         return half_maximum
-    return SPINE_ISO_HU if settings.kind == "spine" else DENSE_HU
+    return _SPINE_ISO_HU if settings.kind == "spine" else DENSE_HU
 
 
 def make_phantom(
@@ -277,11 +277,11 @@ def write_phantom(
             text = json.dumps(truth, indent=2) + "\n"
             (finished / TRUTH_NAME).write_text(text, encoding="utf-8")
             if labels is not None:
-                write_label_map(finished / MATERIALS_NAME, labels, placement.affine)
+                write_label_map(finished / _MATERIALS_NAME, labels, placement.affine)
             if settings.spine_choice is not None:
                 names = {level_number(name): name for name in settings.spine_choice.levels}
                 levels = label_levels(settings, placement.affine)
-                write_label_map(finished / LEVELS_NAME, levels, placement.affine, names)
+                write_label_map(finished / _LEVELS_NAME, levels, placement.affine, names)
             place_folder(finished, folder, folder.name, keep=existing_stay())
     except OSError as error:
         reason = error.strerror or type(error).__name__

@@ -188,11 +188,11 @@ def add_noise(voxels: Float32Array, sigma_hu: float, seed: int) -> Float32Array:
     return voxels
 
 
-ANGLES = 144
+_ANGLES = 144
 """Projections of half a turn."""
-HARDENED_PER_MM = 0.006
+_HARDENED_PER_MM = 0.006
 """Share of a way through metal that beam hardening takes, for each mm of it."""
-STARVED_PER_MM = 0.0004
+_STARVED_PER_MM = 0.0004
 """Noise of a way through metal, as a share of it, for each mm."""
 
 
@@ -231,16 +231,16 @@ def add_streaks(
         rows, columns = np.nonzero(metal[k])
         if not len(rows):
             return
-        noise = np.random.default_rng((seed, 31, k)).standard_normal((ANGLES, bins))
+        noise = np.random.default_rng((seed, 31, k)).standard_normal((_ANGLES, bins))
         error = np.zeros(field.shape[1:], dtype=np.float32)
-        for n, angle in enumerate(np.pi * (np.arange(ANGLES) + 0.5) / ANGLES):
+        for n, angle in enumerate(np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES):
             cos, sin = np.float32(math.cos(angle) / step), np.float32(math.sin(angle) / step)
             hit = np.rint(x[0, columns] * cos + y[rows, 0] * sin).astype(np.intp) + bins // 2
             way = np.bincount(hit, minlength=bins) * (spacing[0] * spacing[1] / step)
             way = np.convolve(way, (0.25, 0.5, 0.25), mode="same")  # a voxel shades more than the bin of its centre
-            wrong = metal_hu * way**2 * (STARVED_PER_MM * noise[n] - HARDENED_PER_MM)
+            wrong = metal_hu * way**2 * (_STARVED_PER_MM * noise[n] - _HARDENED_PER_MM)
             filtered = np.fft.irfft(np.fft.rfft(wrong, 2 * bins) * ramp)[:bins].astype(np.float32)
             error += filtered[(x * cos + y * sin + np.float32(bins // 2 + 0.5)).astype(np.intp)]
-        field[k] += error * np.float32(strength * np.pi / ANGLES)
+        field[k] += error * np.float32(strength * np.pi / _ANGLES)
 
     map_slices(disturb, len(field))

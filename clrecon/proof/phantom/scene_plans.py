@@ -19,30 +19,30 @@ from clrecon.proof.phantom.spine_parts import Vertebra
 from clrecon.proof.phantom.spine_plan import plan_anatomy
 from clrecon.proof.phantom.vertebra import local_bounds, vertebra_distance
 
-SKULL_COMPACT_HU = 1350.0
-DIPLOE_HU = 620.0
-PETROUS_HU = 1900.0
-TOOTH_HU = 2600.0
-VAULT = (71.0, 90.0, 68.0)
+_SKULL_COMPACT_HU = 1350.0
+_DIPLOE_HU = 620.0
+_PETROUS_HU = 1900.0
+_TOOTH_HU = 2600.0
+_VAULT = (71.0, 90.0, 68.0)
 """Half axes of the vault, mm."""
-VAULT_Z = 10.0
-FLOOR_Z = -42.0
+_VAULT_Z = 10.0
+_FLOOR_Z = -42.0
 """z of the base of the skull, mm, relative to the middle of the vault."""
 
 
 def _wall(x: Field, y: Field, z: Field) -> Field:
     """Return the thickness of the vault: 3 mm at the temples, 8 mm at forehead and occiput."""
-    return np.float32(3.0) + np.float32(5.0) * np.clip(np.abs(y) / np.float32(VAULT[1]), 0.0, 1.0)
+    return np.float32(3.0) + np.float32(5.0) * np.clip(np.abs(y) / np.float32(_VAULT[1]), 0.0, 1.0)
 
 
 def _depth_in_vault(x: Field, y: Field, z: Field) -> Field:
     """Return the distance to the inner surface of the vault, positive within it."""
-    return np.asarray(ellipsoid(x, y, z, VAULT) - _wall(x, y, z), dtype=np.float32)
+    return np.asarray(ellipsoid(x, y, z, _VAULT) - _wall(x, y, z), dtype=np.float32)
 
 
 def _depth_in_diploe(x: Field, y: Field, z: Field) -> Field:
     """Return a distance positive in the diploe, which lies between two tables of 1.2 mm where the wall is thick."""
-    outer = ellipsoid(x, y, z, VAULT)
+    outer = ellipsoid(x, y, z, _VAULT)
     wall = _wall(x, y, z)
     between = np.minimum(outer - np.float32(1.2), wall - np.float32(1.2) - outer)
     return np.minimum(between, wall - np.float32(3.5))
@@ -50,23 +50,23 @@ def _depth_in_diploe(x: Field, y: Field, z: Field) -> Field:
 
 def _vault(material: str, hu: float) -> list[Part]:
     """Plan the vault: compact bone, the diploe between its two tables, and the contents."""
-    whole = ball("bone", SKULL_COMPACT_HU, (0.0, 0.0, VAULT_Z), VAULT)
+    whole = ball("bone", _SKULL_COMPACT_HU, (0.0, 0.0, _VAULT_Z), _VAULT)
     layers = (
         whole,
-        dataclasses.replace(cut(whole, _depth_in_diploe), hu=DIPLOE_HU),
+        dataclasses.replace(cut(whole, _depth_in_diploe), hu=_DIPLOE_HU),
         dataclasses.replace(cut(whole, _depth_in_vault), material=material, hu=hu),
     )
-    return [cut(layer, lambda x, y, z: z - np.float32(FLOOR_Z)) for layer in layers]
+    return [cut(layer, lambda x, y, z: z - np.float32(_FLOOR_Z)) for layer in layers]
 
 
 def _base() -> list[Part]:
     """Plan the floor of the skull with the foramen magnum, and the two petrous pyramids."""
-    level = VAULT_Z + FLOOR_Z
-    plate = column("bone", SKULL_COMPACT_HU, (0.0, 4.0), (52.0, 66.0), (level - 5.0, level + 2.0))
-    hole = column("bone", SKULL_COMPACT_HU, (0.0, 36.0), (15.0, 17.0), (level - 9.0, level + 9.0)).distance
+    level = _VAULT_Z + _FLOOR_Z
+    plate = column("bone", _SKULL_COMPACT_HU, (0.0, 4.0), (52.0, 66.0), (level - 5.0, level + 2.0))
+    hole = column("bone", _SKULL_COMPACT_HU, (0.0, 36.0), (15.0, 17.0), (level - 9.0, level + 9.0)).distance
     plate = cut(plate, lambda x, y, z: -hole(x, y - np.float32(32.0), z))
     pyramids = [
-        rod("bone", PETROUS_HU, (side * 12.0, 4.0, level + 1.0), (side * 56.0, 26.0, level + 2.0), 7.0, 10.0)
+        rod("bone", _PETROUS_HU, (side * 12.0, 4.0, level + 1.0), (side * 56.0, 26.0, level + 2.0), 7.0, 10.0)
         for side in (1.0, -1.0)
     ]
     return [plate, *pyramids]
@@ -74,52 +74,52 @@ def _base() -> list[Part]:
 
 def _face(inside_material: str, inside_hu: float) -> list[Part]:
     """Plan orbits, maxilla with its sinuses, cheek bones, teeth and a mandible that touches no other bone."""
-    level = VAULT_Z + FLOOR_Z
+    level = _VAULT_Z + _FLOOR_Z
     parts: list[Part] = []
     for side in (1.0, -1.0):
         orbit = (side * 32.0, -66.0, level + 12.0)
         parts += [
-            ball("bone", SKULL_COMPACT_HU, orbit, (21.0, 24.0, 20.0)),
+            ball("bone", _SKULL_COMPACT_HU, orbit, (21.0, 24.0, 20.0)),
             ball(inside_material, inside_hu, (orbit[0], orbit[1] - 4.0, orbit[2]), (19.0, 24.0, 18.0)),
-            ball("bone", SKULL_COMPACT_HU, (side * 24.0, -60.0, level - 22.0), (19.0, 20.0, 20.0)),
+            ball("bone", _SKULL_COMPACT_HU, (side * 24.0, -60.0, level - 22.0), (19.0, 20.0, 20.0)),
             ball("air", AIR_HU, (side * 24.0, -60.0, level - 22.0), (17.2, 18.2, 18.2)),
             rod(
                 "bone",
-                SKULL_COMPACT_HU,
+                _SKULL_COMPACT_HU,
                 (side * 44.0, -70.0, level - 10.0),
                 (side * 62.0, -38.0, level - 8.0),
                 4.5,
                 2.5,
             ),
             rod(
-                "bone", SKULL_COMPACT_HU, (side * 62.0, -38.0, level - 8.0), (side * 60.0, -2.0, level - 2.0), 2.5, 3.0
+                "bone", _SKULL_COMPACT_HU, (side * 62.0, -38.0, level - 8.0), (side * 60.0, -2.0, level - 2.0), 2.5, 3.0
             ),
         ]
         corner = (side * 46.0, -14.0, level - 60.0)
         parts += [
-            rod("bone", SKULL_COMPACT_HU, (side * 52.0, -6.0, level - 12.0), corner, 4.5, 5.5),
-            rod("bone", SKULL_COMPACT_HU, corner, (side * 10.0, -76.0, level - 66.0), 5.5, 7.0),
+            rod("bone", _SKULL_COMPACT_HU, (side * 52.0, -6.0, level - 12.0), corner, 4.5, 5.5),
+            rod("bone", _SKULL_COMPACT_HU, corner, (side * 10.0, -76.0, level - 66.0), 5.5, 7.0),
         ]
         for angle in np.radians(np.linspace(8.0, 80.0, 6)):
             x, y = side * 26.0 * np.sin(angle), -52.0 - 28.0 * np.cos(angle)
-            parts.append(rod("bone", TOOTH_HU, (x, y, level - 50.0), (x, y, level - 40.0), 2.8))
-    parts.append(rod("bone", SKULL_COMPACT_HU, (-10.0, -76.0, level - 66.0), (10.0, -76.0, level - 66.0), 7.0))
+            parts.append(rod("bone", _TOOTH_HU, (x, y, level - 50.0), (x, y, level - 40.0), 2.8))
+    parts.append(rod("bone", _SKULL_COMPACT_HU, (-10.0, -76.0, level - 66.0), (10.0, -76.0, level - 66.0), 7.0))
     return parts
 
 
 def plan_dry_skull() -> Plan:
     """Plan a macerated skull: a thin dense vault with base and face, air inside and outside, no soft tissue."""
     parts = [*_vault("air", AIR_HU), *_base(), *_face("air", AIR_HU)]
-    return Plan(parts, front=-92.0, back=VAULT[1], rest=(0.0, VAULT_Z))
+    return Plan(parts, front=-92.0, back=_VAULT[1], rest=(0.0, _VAULT_Z))
 
 
 def plan_head() -> Plan:
     """Plan the same skull in soft tissue: scalp, face, brain, eyes, neck, and air in sinuses, nose and throat."""
-    level = VAULT_Z + FLOOR_Z
-    skin = tuple(half + 7.0 for half in VAULT)
+    level = _VAULT_Z + _FLOOR_Z
+    skin = tuple(half + 7.0 for half in _VAULT)
     soft = [
         column("tissue", 45.0, (0.0, 22.0), (56.0, 58.0), (-1e4, level)),
-        ball("tissue", 30.0, (0.0, 0.0, VAULT_Z), (skin[0], skin[1], skin[2])),
+        ball("tissue", 30.0, (0.0, 0.0, _VAULT_Z), (skin[0], skin[1], skin[2])),
         ball("tissue", 10.0, (0.0, -38.0, level - 20.0), (66.0, 62.0, 66.0)),
         rod("tissue", 20.0, (0.0, -96.0, level - 2.0), (0.0, -104.0, level - 18.0), 7.0, 11.0),
     ]
@@ -129,11 +129,11 @@ def plan_head() -> Plan:
         rod("air", AIR_HU, (0.0, -30.0, level - 16.0), (0.0, -16.0, level - 90.0), 8.0),
     ]
     parts = [*soft, *_vault("tissue", 36.0), *_base(), *_face("tissue", -80.0), *eyes, *airway]
-    return Plan(parts, front=-115.0, back=skin[1], rest=(0.0, VAULT_Z))
+    return Plan(parts, front=-115.0, back=skin[1], rest=(0.0, _VAULT_Z))
 
 
 COMPACT_HU = 1400.0
-SPONGY_HU = 260.0
+_SPONGY_HU = 260.0
 MARROW_HU = -60.0
 MUSCLE_HU = 55.0
 FAT_HU = -100.0
@@ -219,7 +219,7 @@ def _bent_plate(center: tuple[float, float, float], half: tuple[float, float, fl
         low = (-half[0], -half[1], -half[2])
         return cut(Part(material, hu, distance, low, half, center), keep)
 
-    return [plate(0.0, "bone", 900.0), plate(1.8, "bone", SPONGY_HU)]
+    return [plate(0.0, "bone", 900.0), plate(1.8, "bone", _SPONGY_HU)]
 
 
 def plan_pelvis() -> Plan:
@@ -230,14 +230,14 @@ def plan_pelvis() -> Plan:
     for side in (1.0, -1.0):
         parts += _bent_plate((side * 22.0, 12.0, 52.0), (104.0, 82.0, 88.0), side)
         parts += [rod("bone", 900.0, (side * 84.0, 4.0, -16.0), (side * 10.0, -66.0, -44.0), 9.0, 8.0)]
-        parts += [rod("bone", SPONGY_HU, (side * 84.0, 4.0, -16.0), (side * 10.0, -66.0, -44.0), 6.8, 6.0)]
+        parts += [rod("bone", _SPONGY_HU, (side * 84.0, 4.0, -16.0), (side * 10.0, -66.0, -44.0), 6.8, 6.0)]
     hip = (-96.0, 0.0, -24.0)
     parts += [ball("bone", 900.0, hip, (23.0, 23.0, 23.0)), ball("bone", 320.0, hip, (21.0, 21.0, 21.0))]
     for side in (1.0, -1.0):
         neck, knee = (side * 96.0, 0.0, -24.0), (side * 136.0, 6.0, -54.0)
         shaft = (side * 128.0, 8.0, -300.0)
         if side < 0.0:
-            parts += [rod("bone", 950.0, neck, knee, 13.0), rod("bone", SPONGY_HU, neck, knee, 10.5)]
+            parts += [rod("bone", 950.0, neck, knee, 13.0), rod("bone", _SPONGY_HU, neck, knee, 10.5)]
         parts += [rod("bone", COMPACT_HU, knee, shaft, 16.0), rod("tissue", MARROW_HU, knee, shaft, 8.5)]
     head, joint = (96.0, 0.0, -24.0), (132.0, 6.0, -52.0)
     parts += [

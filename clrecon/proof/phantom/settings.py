@@ -226,7 +226,7 @@ TABLE_NAMES = ("none", "flat", "curved", "headrest")
 CENTRE_LPS_MM = (-3.5, -142.25, -418.75)
 """Centre of the volume, away from zero as on a real couch, so that an origin lost by a program shows."""
 
-MOST_BEND = 60.0
+_MOST_BEND = 60.0
 """Largest kyphosis and scoliosis that is added, degrees."""
 
 _CHOOSING = ("levels", "facet_gap_mm", "kyphosis_deg", "scoliosis_deg")
@@ -406,8 +406,8 @@ class PhantomSettings:
         self._check_series()
 
     def _check_spine(self) -> None:
-        _check_number("kyphosis", self.kyphosis_deg, -MOST_BEND, MOST_BEND, "degrees")
-        _check_number("scoliosis", self.scoliosis_deg, -MOST_BEND, MOST_BEND, "degrees")
+        _check_number("kyphosis", self.kyphosis_deg, -_MOST_BEND, _MOST_BEND, "degrees")
+        _check_number("scoliosis", self.scoliosis_deg, -_MOST_BEND, _MOST_BEND, "degrees")
         if self.facet_gap_mm is not None:
             _check_number("gap of the facet joints", self.facet_gap_mm, 0.0, LARGEST_GAP_MM, "mm")
         _check_number("unevenness", self.uneven_mm, 0.0, 0.4 * self.spacing[2], "mm (0.4 of the mean gap)")

@@ -267,7 +267,7 @@ class Box:
         }
 
 
-AXIS_LPS = (0.36, -0.48, 0.8)
+_AXIS_LPS = (0.36, -0.48, 0.8)
 """Axis of torus, cylinder and slab: unit length, parallel to no axis of the patient or of usual slices."""
 
 _MARGIN_STEPS = 1.5
@@ -293,14 +293,14 @@ def choose_body(affine: NDArray[np.float64], settings: PhantomSettings) -> Body:
         body, extent, thinnest = Sphere(centre, radius), radius, 2.0 * radius
     elif settings.kind == "torus":
         radius = given if given is not None else 0.6 * reach
-        body, extent, thinnest = Torus(centre, AXIS_LPS, radius, 0.4 * radius), 1.4 * radius, 0.8 * radius
+        body, extent, thinnest = Torus(centre, _AXIS_LPS, radius, 0.4 * radius), 1.4 * radius, 0.8 * radius
     elif settings.kind == "cylinder":
         radius = given if given is not None else 0.4 * reach
-        body = Cylinder(centre, AXIS_LPS, radius, 3.0 * radius)
+        body = Cylinder(centre, _AXIS_LPS, radius, 3.0 * radius)
         extent, thinnest = float(np.hypot(1.0, 1.5)) * radius, 2.0 * radius
     elif settings.kind == "plane":
         radius = given if given is not None else 0.2 * reach
-        body = Box(centre, AXIS_LPS, 2.0 * radius, 0.9 * reach, 0.7 * reach)
+        body = Box(centre, _AXIS_LPS, 2.0 * radius, 0.9 * reach, 0.7 * reach)
         extent, thinnest = float(np.linalg.norm(body.size)) / 2.0, 2.0 * radius
     else:
         raise UsageError(f"a {settings.kind} phantom has no analytic body")

@@ -25,16 +25,16 @@ FAT_HU = -105.0
 MUSCLE_HU = 54.0
 LUNG_HU = -860.0
 LIVER_HU = 62.0
-SPLEEN_HU = 52.0
+_SPLEEN_HU = 52.0
 KIDNEY_HU = 36.0
 BLOOD_HU = 44.0
-CALCIUM_HU = 520.0
-BOWEL_HU = 22.0
-GAS_HU = -850.0
-FLUID_HU = 14.0
-CORD_HU = 38.0
-TABLE_SHELL_HU = 130.0
-TABLE_CORE_HU = -930.0
+_CALCIUM_HU = 520.0
+_BOWEL_HU = 22.0
+_GAS_HU = -850.0
+_FLUID_HU = 14.0
+_CORD_HU = 38.0
+_TABLE_SHELL_HU = 130.0
+_TABLE_CORE_HU = -930.0
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ def _draw_couch(painter: _Painter, anatomy: Anatomy, x: Field, y: Field) -> None
     top = y - np.float32(anatomy.half_depth + 2.0)
     bowed = top + np.float32(0.16 / anatomy.half_width) * x * x
     shell = np.minimum(np.minimum(bowed, 32.0 - top), np.float32(0.95 * anatomy.half_width) - np.abs(x))
-    painter.fill(shell, TABLE_SHELL_HU)
-    painter.fill(shell - np.float32(1.6), TABLE_CORE_HU)
+    painter.fill(shell, _TABLE_SHELL_HU)
+    painter.fill(shell - np.float32(1.6), _TABLE_CORE_HU)
 
 
 def _draw_wall(painter: _Painter, half_width: float | Field, half_depth: float | Field, x: Field, y: Field) -> Field:
@@ -100,12 +100,12 @@ def _draw_organs(painter: _Painter, anatomy: Anatomy, cavity: Field, x: Field, y
     for n in range(9):
         spot = (generator.uniform(-0.6, 0.7) * wide, generator.uniform(-0.75, -0.1) * deep, kidney - 22.0 * n + 25.0)
         size = tuple(generator.uniform(14.0, 26.0, 3))
-        organ(spot, (size[0], size[1], size[2]), BOWEL_HU)
+        organ(spot, (size[0], size[1], size[2]), _BOWEL_HU)
         if n % 3 == 0:
-            organ((spot[0], spot[1] - 0.35 * size[1], spot[2]), (0.6 * size[0], 0.5 * size[1], 0.6 * size[2]), GAS_HU)
+            organ((spot[0], spot[1] - 0.35 * size[1], spot[2]), (0.6 * size[0], 0.5 * size[1], 0.6 * size[2]), _GAS_HU)
     organ((-0.48 * wide, -0.10 * deep, mid - 8.0), (0.62 * wide, 0.80 * deep, 74.0), LIVER_HU)
-    organ((0.20 * wide, -0.45 * deep, mid), (0.34 * wide, 0.36 * deep, 34.0), BOWEL_HU + 8.0)
-    organ((0.70 * wide, 0.22 * deep, mid - 4.0), (0.24 * wide, 0.42 * deep, 44.0), SPLEEN_HU)
+    organ((0.20 * wide, -0.45 * deep, mid), (0.34 * wide, 0.36 * deep, 34.0), _BOWEL_HU + 8.0)
+    organ((0.70 * wide, 0.22 * deep, mid - 4.0), (0.24 * wide, 0.42 * deep, 44.0), _SPLEEN_HU)
     spine_y = anatomy.centres["L2"][1]
     if anatomy.outline is not None:
         spine_y = spine_y - float(anatomy.outline.at(np.array([kidney]))[1][0])
@@ -186,8 +186,8 @@ def _draw_band(painter: _Painter, anatomy: Anatomy, x: Field, y: Field, z: Field
     canal = ellipse(from_x, from_y - np.float32(24.3) + behind, 11.5, 8.3)
     painter.fill(canal, FAT_HU + 40.0)
     sac = ellipse(from_x, from_y - np.float32(24.0) + behind, 8.5, 6.6)
-    painter.fill(sac, FLUID_HU)
-    painter.fill(np.minimum(sac - np.float32(3.0), z - np.float32(anatomy.level_z("L1"))), CORD_HU)
+    painter.fill(sac, _FLUID_HU)
+    painter.fill(np.minimum(sac - np.float32(3.0), z - np.float32(anatomy.level_z("L1"))), _CORD_HU)
 
 
 def _draw_vessels(painter: _Painter, from_x: Field, from_y: Field, z: Field, neck: float | Field) -> None:
@@ -199,7 +199,7 @@ def _draw_vessels(painter: _Painter, from_x: Field, from_y: Field, z: Field, nec
     spots = 0.84 - along * np.cos((from_x - from_y) * np.float32(0.25))
     plaque = 1.1 - np.abs(aorta - np.float32(1.0)) - np.float32(3.0) * np.maximum(spots, 0.0)
     painter.fill(aorta, painter.blood_hu, trunk)
-    painter.fill(np.minimum(plaque, from_x - np.float32(13.0)), CALCIUM_HU, trunk)
+    painter.fill(np.minimum(plaque, from_x - np.float32(13.0)), _CALCIUM_HU, trunk)
     vein = ellipse(from_x + np.float32(16.0), from_y + np.float32(27.0), 12.5, 8.5)
     painter.fill(vein, painter.blood_hu, trunk)
     if not isinstance(neck, float):
@@ -213,12 +213,12 @@ Float32Array = NDArray[np.float32]
 CORTEX_HU = 1050.0
 BODY_CORTEX_HU = 850.0
 TRABECULAR_HU = 190.0
-TRABECULAR_TEXTURE_HU = 45.0
+_TRABECULAR_TEXTURE_HU = 45.0
 ARCH_MARROW_HU = 330.0
 RIB_MARROW_HU = 140.0
-DISC_HU = 92.0
-VEIN_HU = 60.0
-MARKER_HU = 2200.0
+_DISC_HU = 92.0
+_VEIN_HU = 60.0
+_MARKER_HU = 2200.0
 
 
 class _Scene:
@@ -256,7 +256,7 @@ class _Scene:
                 wall = ellipse(at.x, at.y, disc.half_width, disc.half_depth)
                 inside = np.minimum(wall, np.float32(disc.half_length) - np.abs(at.z))
                 # The fibrous ring is a little denser than the nucleus.
-                ring = np.float32(DISC_HU) + np.float32(14.0) * coverage(8.0 - wall, 8.0)
+                ring = np.float32(_DISC_HU) + np.float32(14.0) * coverage(8.0 - wall, 8.0)
                 paint(canvas, placed.region, coverage(inside, self.ramp), ring)
         self._draw_ribs(canvas, scratch, slice_k, k)
         for vertebra, placed in self.vertebrae:
@@ -265,7 +265,7 @@ class _Scene:
         if self.marker.meets(slice_k):
             at = self.marker.window(k)
             ball = np.float32(self.anatomy.marker_radius) - np.sqrt(at.x * at.x + at.y * at.y + at.z * at.z)
-            paint(canvas, at.region, coverage(ball, self.ramp), MARKER_HU)
+            paint(canvas, at.region, coverage(ball, self.ramp), _MARKER_HU)
 
     def _draw_ribs(self, canvas: Field, scratch: Field, slice_k: int, k: float) -> None:
         """Draw all ribs as one union, so that the joints of the rods do not show."""
@@ -293,11 +293,11 @@ class _Scene:
         # 0 in the body, 1 in the arch: thicker cortex and denser marrow behind the body
         arch = coverage(at.y - np.float32(vertebra.depth / 2.0 + 1.0), 6.0)
         cortex = np.float32(0.75) + np.float32(0.65) * arch
-        marrow = waves_at(at.x, at.y, at.z, vertebra.waves) * np.float32(TRABECULAR_TEXTURE_HU)
+        marrow = waves_at(at.x, at.y, at.z, vertebra.waves) * np.float32(_TRABECULAR_TEXTURE_HU)
         marrow += np.float32(TRABECULAR_HU) + np.float32(ARCH_MARROW_HU - TRABECULAR_HU) * arch
         # basivertebral vein, from the middle of the back wall into the body
         vein = capsule((at.x, at.y, at.z), (0.0, vertebra.depth / 2.0, 0.0), (0.0, 2.0, 0.0), 2.4, 1.0, 1.0)
-        marrow += coverage(vein, 1.5) * (np.float32(VEIN_HU) - marrow)
+        marrow += coverage(vein, 1.5) * (np.float32(_VEIN_HU) - marrow)
         shell = np.float32(BODY_CORTEX_HU) + np.float32(CORTEX_HU - BODY_CORTEX_HU) * arch
         paint(canvas, at.region, coverage(bone, self.ramp), shell)
         paint(canvas, at.region, coverage(bone - cortex, self.ramp), marrow)

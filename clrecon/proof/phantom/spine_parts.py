@@ -209,8 +209,8 @@ def _bend(chain: Chain, anchor: int, choice: SpineChoice) -> Chain:
     return dataclasses.replace(chain, frames=frames, centres=centres, moved=moved)
 
 
-NECK_HALF_WIDTH, NECK_HALF_DEPTH = 62.0, 66.0
-NECK_BEHIND_MM = 2.0
+_NECK_HALF_WIDTH, _NECK_HALF_DEPTH = 62.0, 66.0
+_NECK_BEHIND_MM = 2.0
 """The middle of the neck lies this far behind the middle of the vertebral bodies."""
 _NECK_SHARE = {"C7": 0.45, "C6": 0.85}
 """Share of the neck in the outline at the height of a level: 1 above, 0 below."""
@@ -240,12 +240,12 @@ def plan_outline(chain: Chain, half_width: float, half_depth: float) -> Outline 
     rows = np.empty((5, len(chain.names)))
     for n, name in enumerate(chain.names):
         share = _NECK_SHARE.get(name, 1.0 if name[0] == "C" else 0.0)
-        neck_x, neck_y = chain.centres[n, 0], chain.centres[n, 1] + NECK_BEHIND_MM
+        neck_x, neck_y = chain.centres[n, 0], chain.centres[n, 1] + _NECK_BEHIND_MM
         rows[:, n] = (
             chain.moved[n, 0] + share * (neck_x - chain.moved[n, 0]),
             chain.moved[n, 1] + share * (neck_y - chain.moved[n, 1]),
-            half_width + share * (NECK_HALF_WIDTH - half_width),
-            half_depth + share * (NECK_HALF_DEPTH - half_depth),
+            half_width + share * (_NECK_HALF_WIDTH - half_width),
+            half_depth + share * (_NECK_HALF_DEPTH - half_depth),
             share,
         )
     order = np.argsort(chain.centres[:, 2])

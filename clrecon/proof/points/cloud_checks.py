@@ -64,10 +64,10 @@ def _check_neighbours(device: Device) -> str:
     lattice = np.argwhere(np.ones((20, 20, 20))).astype(np.float32)
     many = scattered_points(30_000)  # in some 15,000 cells, of which a work-item takes 16
     for points, k in ((scattered, 16), (scattered, 5), (lattice, 16), (many, 2)):
-        found = find_neighbours(points, k, device=device)
+        neighbours = find_neighbours(points, k, device=device)
         indices, distances = filter_twin.find_neighbours(points, k)
-        require_equal(found.indices, indices, f"{k} nearest of {len(points):,} points")
-        require_equal(found.distances, distances, f"distances of the {k} nearest of {len(points):,} points")
+        require_equal(neighbours.indices, indices, f"{k} nearest of {len(points):,} points")
+        require_equal(neighbours.distances, distances, f"distances of the {k} nearest of {len(points):,} points")
     return "2 to 16 neighbours of up to 30,000 points equal"
 
 
@@ -158,13 +158,13 @@ K = 12
 NORMAL = 1e-3
 """Largest difference of a unit vector's numbers, where the axis is clear."""
 
-MOVED_MM = 2e-5
+_MOVED_MM = 2e-5
 """Largest difference of a filtered point: exp and normals in float32."""
 
-GRADIENT_HU_MM = 0.02
+_GRADIENT_HU_MM = 0.02
 """Largest difference of a gradient of up to 150 HU/mm: weights from float32 coordinates."""
 
-OTHER_SIDE = 0.002
+_OTHER_SIDE = 0.002
 """Share of points that float32 puts on the other side of the bound of features."""
 
 
@@ -212,7 +212,7 @@ def _check_gradients(device: Device, types: tuple[str, ...], uneven: bool) -> st
         resident = DeviceVolume(volume, device=device)
         found = find_gradients(resident, points, stopwatch=Stopwatch())
         expected = gradients_twin.find_gradients(volume, points, resident.values.lowest)
-        worst = max(worst, require_share(found, expected, GRADIENT_HU_MM, OTHER_SIDE, f"gradients of {dtype} voxels"))
+        worst = max(worst, require_share(found, expected, _GRADIENT_HU_MM, _OTHER_SIDE, f"gradients of {dtype} voxels"))
     return f"2,000 gradients in {len(types)} volumes within {worst:.1e} HU/mm"
 
 
@@ -239,11 +239,11 @@ def _filtered(points: NDArray[np.float32], features: str | None, cells_edge: flo
 def _check_filter(device: Device) -> str:
     points = _bumpy_sheet(9_000)
     step = denoise_points(PointCloud(points), K, device=device)
-    away = require_share(step.cloud.points, _filtered(points, None), MOVED_MM, OTHER_SIDE, "filtered points, in mm")
+    away = require_share(step.cloud.points, _filtered(points, None), _MOVED_MM, _OTHER_SIDE, "filtered points, in mm")
     for features in ("paper", "variation"):
         cells = denoise_points(PointCloud(points), K, features=features, device=device)
         expected = _filtered(points, features, cells.facts["cell_mm"])
-        require_share(cells.cloud.points, expected, MOVED_MM, OTHER_SIDE, "points filtered by cells, in mm")
+        require_share(cells.cloud.points, expected, _MOVED_MM, _OTHER_SIDE, "points filtered by cells, in mm")
     return f"9,000 points in three ways within {away:.1e} mm"
 
 
@@ -251,7 +251,7 @@ def _check_outliers(device: Device) -> str:
     points = _bumpy_sheet(9_000)
     _, distances = filter_twin.find_neighbours(points, K)
     step = remove_outliers(PointCloud(points), K, 1.0, device=device)
-    require_share(step.removed, filter_twin.find_outliers(distances, 1.0), 0.0, OTHER_SIDE, "outliers")
+    require_share(step.removed, filter_twin.find_outliers(distances, 1.0), 0.0, _OTHER_SIDE, "outliers")
     require_equal(len(step.cloud), int(np.count_nonzero(step.removed == 0)), "points that are kept")
     return f"{int(step.removed.sum())} outliers of 9,000 points"
 
@@ -270,7 +270,7 @@ FILTER_CHECKS = (
 )
 
 
-FIELD_MM = 5e-5
+_FIELD_MM = 5e-5
 """float32 sums of heights of up to 2 mm, at places up to 150 mm; measured 1e-5."""
 
 ROUNDS = 3
@@ -309,7 +309,7 @@ def _check_field(device: Device) -> str:
     negative = _fetch(masks, masks.negative_d)
     require_equal(_fetch(masks, masks.near_d), near, "near nodes of a field")
     require_equal(_fetch(masks, masks.core_d), core, "core of a field")
-    clear = near & (np.abs(np.where(near, expected.value, 0.0)) > FIELD_MM)
+    clear = near & (np.abs(np.where(near, expected.value, 0.0)) > _FIELD_MM)
     require_equal(negative[clear], expected.value[clear] <= 0.0, "signs of a field")
     require_equal(negative[~near], np.zeros(int((~near).sum()), bool), "signs far from a field")
     signs = decide_signs(masks, field.limits, ROUNDS)
@@ -322,7 +322,7 @@ def _check_field(device: Device) -> str:
     require_equal(_fetch(masks, signs.inside_d), decided.inside, "nodes inside")
     far = float(np.float32(SETTINGS.bridge))
     filled = twin.fill_nodes(expected, near, decided, far, LEAST_SHARE * h)
-    apart = require_close(field.fill(signs), filled, FIELD_MM, "the field on nodes")
+    apart = require_close(field.fill(signs), filled, _FIELD_MM, "the field on nodes")
     return f"{field.bricks} bricks of nodes within {apart:.1g} mm, signs of {nodes.count:,} nodes equal"
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 ROWS_AT_ONCE = 256
 
-SPARE = 16
+_SPARE = 16
 """Further candidates that the tree is asked for: ties of float32 distances may be among them."""
 
 ROUNDING = 1e-5
@@ -50,12 +50,12 @@ def find_neighbours(points: NDArray[np.float32], k: int) -> tuple[NDArray[np.int
     """
     n = len(points)
     points = np.asarray(points, dtype=np.float32)
-    if n <= 2 * (k + SPARE):
+    if n <= 2 * (k + _SPARE):
         return _compare_all(points, np.arange(n), k)
     from scipy.spatial import cKDTree
 
     tree = cKDTree(points.astype(np.float64))
-    far, numbers = tree.query(points.astype(np.float64), k + SPARE)
+    far, numbers = tree.query(points.astype(np.float64), k + _SPARE)
     distances = float32_distances(points[numbers] - points[:, None])
     indices, nearest = _order(distances, numbers, k)
     doubtful = np.flatnonzero(~(nearest[:, -1].astype(np.float64) * (1.0 + ROUNDING) < far[:, -1]))
@@ -130,7 +130,7 @@ def find_outliers(distances: NDArray[np.floating], deviations: float) -> NDArray
     return outliers
 
 
-LEAST_RANGE_MM = 1e-6
+_LEAST_RANGE_MM = 1e-6
 """Where sigma_s is smaller, the neighbours lie in the plane already, and the point stays."""
 
 
@@ -158,7 +158,7 @@ def bilateral_factors(
     """
     away = points[:, None].astype(np.float64) - points.astype(np.float64)[indices]
     heights = np.einsum("nki,ni->nk", away, normals)
-    moves = (sigma_s >= LEAST_RANGE_MM) & (sigma_c > 0.0)
+    moves = (sigma_s >= _LEAST_RANGE_MM) & (sigma_c > 0.0)
     sigma_c, sigma_s = np.where(moves, sigma_c, 1.0), np.where(moves, sigma_s, 1.0)
     squares = np.einsum("nki,nki->nk", away, away)
     weights = np.exp(-squares / (2.0 * sigma_c**2)[:, None] - heights**2 / (2.0 * sigma_s**2)[:, None])
@@ -180,7 +180,7 @@ def cell_factors(
         among = np.broadcast_to(own, (len(own), len(own)))
         away = points[own][:, None].astype(np.float64) - points.astype(np.float64)[among]
         heights = np.einsum("nki,ni->nk", away, normals[own])
-        moves = (sigma_s[own] >= LEAST_RANGE_MM) & (sigma_c[own] > 0.0)
+        moves = (sigma_s[own] >= _LEAST_RANGE_MM) & (sigma_c[own] > 0.0)
         far, high = np.where(moves, sigma_c[own], 1.0)[:, None], np.where(moves, sigma_s[own], 1.0)[:, None]
         weights = np.exp(-np.einsum("nki,nki->nk", away, away) / (2.0 * far**2) - heights**2 / (2.0 * high**2))
         factors[own] = np.where(moves, (weights * heights).sum(axis=1) / weights.sum(axis=1), 0.0)

@@ -36,7 +36,7 @@ from clrecon.proof.points import voxels as twin
 SHAPE = (26, 41, 70)
 """Voxels (k, j, i): more than 1,000 rows, and three words in each."""
 
-MANY_PARTS = 64
+_MANY_PARTS = 64
 """Parts of the rows for each core: more than 500 work-items join runs."""
 
 
@@ -81,7 +81,7 @@ def _check_clusters(device: Device) -> str:
         stencil = make_stencil(Lattice.of(volume), eps)
         with DeviceVolume(volume, device=device) as resident:
             mask = mark_band(resident, (75.0, 110.0), pad=pad_for(stencil))
-            search = ClusterSearch(device, mask, stencil, samples, parts_per_core=MANY_PARTS)
+            search = ClusterSearch(device, mask, stencil, samples, parts_per_core=_MANY_PARTS)
             labels, cores = search.label(), search.flag_cores()
         ijk = np.argwhere((volume.voxels >= 75) & (volume.voxels <= 110))[:, ::-1]
         count, expected, expected_cores = cluster_twin.cluster_points(volume.ijk_to_lps(ijk), eps, samples)

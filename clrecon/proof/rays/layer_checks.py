@@ -39,7 +39,7 @@ from clrecon.rendering.views.clip import Clip
 SIZE = (160, 104)
 """Pixels, of which 32 are a work-item of the kernel that counts them."""
 
-WITH_VOLUME = (96, 60)
+_WITH_VOLUME = (96, 60)
 """Pixels: 720 work-items that take eight rays each."""
 
 TRIANGLES, SPLIT = 660, 90
@@ -47,7 +47,7 @@ TRIANGLES, SPLIT = 660, 90
 
 OPACITY = 0.35
 COLOR_255, DEPTH_MM, EDGE_SHARE = 2.0, 1e-3, 0.01
-BETWEEN_255 = 3.5
+_BETWEEN_255 = 3.5
 """As COLOR_255, and the hundredth behind what is nearly opaque, which rays leave out."""
 
 FIXED = Lighting(0.15, 0.7, 0.4, 20.0, direction=(0.4, -1.0, 0.8))
@@ -186,14 +186,14 @@ def _check_between(device: Device, slices: bool) -> str:
         if slices:
             look = SlicesInSpace([1, 4, 7, 9, 12], opacity=0.4, lowest_hu=-300.0, window=(-500.0, 700.0))
         with ScenePictures([(volume, look), (mesh, screen)], device=device) as pictures:
-            found = pictures.take(camera, WITH_VOLUME)
+            found = pictures.take(camera, _WITH_VOLUME)
         require_whole(found.report)
         sides = []
         for clip in (before, behind):
             if isinstance(look, SlicesInSpace):
-                rgba, _ = overlay_twin(volume, camera, WITH_VOLUME, replace(look, clip=clip))
+                rgba, _ = overlay_twin(volume, camera, _WITH_VOLUME, replace(look, clip=clip))
             else:
-                rgba = cast_rays(volume, function, camera, WITH_VOLUME, step, FIXED, clip).rgba
+                rgba = cast_rays(volume, function, camera, _WITH_VOLUME, step, FIXED, clip).rgba
             sides.append(np.clip(rgba, 0.0, 1.0))
         rest = opacity * np.append(color, 1.0) + (1.0 - opacity) * sides[1]
         expected = sides[0] + (1.0 - sides[0][..., 3:]) * rest
@@ -201,9 +201,9 @@ def _check_between(device: Device, slices: bool) -> str:
         shown = np.concatenate([found.image[..., :3] * (alpha / 255.0), alpha], axis=-1)
         away = np.abs(shown - 255.0 * expected).max(axis=-1)
         worst = max(
-            worst, require_share(away, np.zeros_like(away), BETWEEN_255, EDGE_SHARE, "colours about a screen, of 255")
+            worst, require_share(away, np.zeros_like(away), _BETWEEN_255, EDGE_SHARE, "colours about a screen, of 255")
         )
-    return f"2 pictures of {WITH_VOLUME[0]} x {WITH_VOLUME[1]} pixels within {worst:.1f} of 255"
+    return f"2 pictures of {_WITH_VOLUME[0]} x {_WITH_VOLUME[1]} pixels within {worst:.1f} of 255"
 
 
 RENDERED = ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along", "enter_tiles", "look_ahead")

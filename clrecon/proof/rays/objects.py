@@ -111,7 +111,7 @@ def _eye_dome(depth: NDArray[np.float32], camera: Camera, apart: int) -> Float64
 
 
 NOTHING_MM = np.float32(1e-12)
-FAR_ENOUGH_MM = 0.1
+_FAR_ENOUGH_MM = 0.1
 """Depth of the corners from which on a triangle is looked for between them alone."""
 
 
@@ -142,7 +142,7 @@ def find_meetings(
     for number, corners in enumerate(places[triangles.astype(np.int64)]):
         scale = [np.float32(1.0)] * 3 if camera.is_parallel else list(corners[:, 2])
         across, down = _window(corners[:, 0] / scale, aside, pixel), _window(corners[:, 1] / scale, upwards, pixel)
-        if not camera.is_parallel and corners[:, 2].min() < FAR_ENOUGH_MM:
+        if not camera.is_parallel and corners[:, 2].min() < _FAR_ENOUGH_MM:
             across, down = slice(None), slice(None)
         x = [_drop_nothing(corners[n, 0] - scale[n] * aside[across])[None, :] for n in range(3)]
         y = [_drop_nothing(corners[n, 1] - scale[n] * upwards[down])[:, None] for n in range(3)]

@@ -51,10 +51,10 @@ from clrecon.rendering.pictures.styles import Projection, SlicesInSpace, Surface
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 
-LEAP_SHAPE = (185, 193, 17)
+_LEAP_SHAPE = (185, 193, 17)
 """Voxels (k, j, i) of 46 x 48 x 4 bricks: four rows of bricks a work-item are more than 500."""
 
-BEFORE = 5 * BRICK_CELLS
+_BEFORE = 5 * BRICK_CELLS
 """Slices before the first bright one within which a tile may begin: bricks around it, and rays aside of the middle."""
 
 TYPES = ("int16", "uint8", "float32")
@@ -107,9 +107,9 @@ def _open(device: Device, volume: Volume) -> tuple[DeviceVolume, RaySlab]:
 def _check_leaps(device: Device) -> str:
     rng, stopwatch = np.random.default_rng(24), Stopwatch()
     for dtype in TYPES:
-        voxels = rng.integers(0, 40, LEAP_SHAPE).astype(dtype)
+        voxels = rng.integers(0, 40, _LEAP_SHAPE).astype(dtype)
         for _ in range(60):
-            voxels[tuple(rng.integers(0, LEAP_SHAPE))] = 100
+            voxels[tuple(rng.integers(0, _LEAP_SHAPE))] = 100
         resident, slab = _open(device, stack(voxels, np.eye(4)))
         counts = slab.bricks[::-1]
         with stopwatch.running(device):
@@ -123,12 +123,12 @@ def _check_leaps(device: Device) -> str:
         require_equal(distances, expected, f"distances of bricks of {dtype} voxels")
         for eye, aside in (((0.01, -0.5, 0.7, 0.0), 0.02), ((-3.0, 20.0, 10.0, 1.0), 0.5)):
             for axis in range(3):
-                way = MainWay(axis, 1 if axis else -1, np.array(eye, np.float32), aside)
+                main_way = MainWay(axis, 1 if axis else -1, np.array(eye, np.float32), aside)
                 with stopwatch.running(device):
                     known = LeapMap(upload(device, expected), None)
-                    ways_d = look_ahead(resident, slab, way, known)
+                    ways_d = look_ahead(resident, slab, main_way, known)
                     ways = download(device, np.empty(counts, np.uint8), ways_d)
-                require_equal(ways >> 4, _count_ahead(expected, way), f"free bricks ahead along axis {axis}")
+                require_equal(ways >> 4, _count_ahead(expected, main_way), f"free bricks ahead along axis {axis}")
                 require_equal(ways & FARTHEST, expected, "distances of bricks, copied")
     return f"{np.prod(counts):,} bricks of {len(TYPES)} types of voxels equal"
 
@@ -152,12 +152,12 @@ def _check_tiles(device: Device) -> str:
             entries_d = enter_tiles(resident, slab, view, leaps, output)
             entries = download(device, np.empty((nj, ni), np.float32), entries_d) + view.table[-1, 0]
         heights = volume.slice_origins()[:, 2]
-        first, last = (heights[np.maximum(stair - n, 0)] + distance for n in (BEFORE, 0))
+        first, last = (heights[np.maximum(stair - n, 0)] + distance for n in (_BEFORE, 0))
 
         allowed = 0.5 * (last - first)
         what = f"entries of tiles{' of uneven slices' if uneven else ''}"
         require_close((entries - 0.5 * (first + last)) / allowed, np.zeros_like(entries), 1.0, what)
-    return f"{2 * ni * nj:,} tiles begin up to {BEFORE} slices before the first that shows"
+    return f"{2 * ni * nj:,} tiles begin up to {_BEFORE} slices before the first that shows"
 
 
 LEAP_CHECKS = (
@@ -178,7 +178,7 @@ LEAP_CHECKS = (
 SIZE = (96, 60)
 """Pixels: 720 work-items that take eight rays each."""
 
-PICTURE_SHAPE = (16, 26, 22)
+_PICTURE_SHAPE = (16, 26, 22)
 """Voxels (k, j, i)."""
 
 COLOR_255 = 2.0
@@ -197,7 +197,7 @@ FIXED = Lighting(0.15, 0.7, 0.4, 20.0, direction=(0.4, -1.0, 0.8))
 SOFT = TransferFunction([(-300, 0.9, 0.2, 0.1, 0.0), (200, 1, 0.7, 0.4, 0.15), (900, 1, 1, 0.9, 0.6)])
 STEEP = TransferFunction([(-200, 0.8, 0.1, 0.1, 0), (100, 1, 0.6, 0.3, 0), (130, 1, 0.9, 0.7, 0.9), (800, 1, 1, 1, 1)])
 BY_GRADIENT = TransferFunction(SOFT.points, unit_distance=2.0, gradient_opacity=[(20.0, 0.0), (150.0, 1.0), (600, 0.3)])
-DIM = TransferFunction([(20, 0.9, 0.2, 0.1, 0.0), (90, 1, 0.7, 0.4, 0.2), (130, 1, 1, 0.9, 0.6)])
+_DIM = TransferFunction([(20, 0.9, 0.2, 0.1, 0.0), (90, 1, 0.7, 0.4, 0.2), (130, 1, 1, 0.9, 0.6)])
 """A transfer function for voxels of 8 bits."""
 
 
@@ -224,16 +224,16 @@ def _cut(volume: Volume) -> Clip:
 def _check_composite(device: Device, scenes: tuple[tuple[str, TransferFunction, bool, dict[str, Any]], ...]) -> str:
     worst = 0.0
     for dtype, function, uneven, options in scenes:
-        volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
+        volume = blobs(_PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
         lighting, jitter = options.get("lighting", FIXED), options.get("jitter", False)
         clip = _cut(volume) if options.get("cut") else None
         camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=options.get("perspective", True))
         step = options.get("step", 0.5 * min(volume.spacing))
         style = VolumeLook(function, lighting=lighting, jitter=jitter, clip=clip)
-        found = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
+        picture = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
         twin = cast_rays(volume, function, camera, SIZE, step, lighting, clip, "dvr", jitter=jitter)
         image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
-        worst = max(worst, _compare(found, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}"))
+        worst = max(worst, _compare(picture, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}"))
     return f"{len(scenes)} pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
@@ -260,8 +260,8 @@ def _check_composite_labels(device: Device) -> str:
         style = VolumeLook(
             grey, lighting=UNSHADED, labels=labels, label_colors={3: "red"}, label_opacity={1: 0.25, 3: 0.5}
         )
-        found = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), 0.3)
-        require_whole(found.report)
+        picture = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), 0.3)
+        require_whole(picture.report)
         at = np.arange(SIZE[0])
         grown = [(at >= 32) & (at % 32 < GROWN), (at % 32 >= 8 - GROWN) & (at % 32 < 8)]
         column = np.select(grown, [3, 1], at // 8 % 4)
@@ -270,7 +270,7 @@ def _check_composite_labels(device: Device) -> str:
         tint = np.where((column == 3)[:, None], (0.9, 0.1, 0.1), (0.5, 0.5, 0.5))
         row = 255.0 * np.concatenate([tint * opacity[:, None], opacity[:, None]], axis=1)
         inner = (column == np.roll(column, 1)) & (column == np.roll(column, -1))
-        away = np.abs(_premultiplied(found.image) - row)[:, inner].max(axis=-1)
+        away = np.abs(_premultiplied(picture.image) - row)[:, inner].max(axis=-1)
         require_close(away, np.zeros_like(away), COLOR_255, f"colours of labels of type {dtype}, of 255")
     return f"2 pictures with labels of {SIZE[0]} x {SIZE[1]} pixels as computed"
 
@@ -279,28 +279,28 @@ def _check_projections(device: Device, kinds: tuple[str, ...], uneven: bool) -> 
     worst = 0.0
     for kind in kinds:
         for dtype in ("int16", "float32") if uneven else ("int16", "uint8", "float32"):
-            volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
+            volume = blobs(_PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
             clip = _cut(volume) if dtype == "float32" else None
             camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=dtype != "uint8")
             step = 0.5 * min(volume.spacing)
             style = Projection(kind, clip=clip)  # type: ignore[arg-type]
-            found = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
+            picture = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
             twin = cast_rays(volume, None, camera, SIZE, step, None, clip, kind)
             what = f"{kind} of {dtype} voxels{' of uneven slices' * uneven}"
-            require_whole(found.report)
-            assert found.values is not None
-            worst = max(worst, require_share(found.values, twin.values, VALUE_HU, EDGE_SHARE, what))
+            require_whole(picture.report)
+            assert picture.values is not None
+            worst = max(worst, require_share(picture.values, twin.values, VALUE_HU, EDGE_SHARE, what))
             if kind in ("mip", "minip") and dtype != "uint8":  # 8 bits have several places of one value
-                both = np.isfinite(found.depth) & np.isfinite(twin.depth)
+                both = np.isfinite(picture.depth) & np.isfinite(twin.depth)
                 require_equal(both.any(), True, f"depths of {what}")
-                require_share(found.depth[both], twin.depth[both], DEPTH_MM, 2.0 * EDGE_SHARE, f"depths of {what}")
+                require_share(picture.depth[both], twin.depth[both], DEPTH_MM, 2.0 * EDGE_SHARE, f"depths of {what}")
     return f"values of {', '.join(kinds)} within {worst:.1g}"
 
 
 def _check_surfaces(device: Device, uneven: bool) -> str:
     worst = 0.0
     for dtype, iso_value, shadows in (("int16", 100.0, False), ("uint8", 75.0, False), ("float32", 100.0, True)):
-        volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
+        volume = blobs(_PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
         clip = _cut(volume) if dtype == "float32" else None
         camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=dtype == "float32")
         step = 0.5 * min(volume.spacing)
@@ -334,7 +334,7 @@ def _check_surface_labels(device: Device) -> str:
 def _check_slices(device: Device) -> str:
     worst = 0.0
     for dtype, uneven in (("int16", False), ("uint8", False), ("float32", True)):
-        volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
+        volume = blobs(_PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
         camera = look_at(volume, (0.4, 0.8, -0.7), 7.0, perspective=uneven)
         clip = _cut(volume) if uneven else None
         style = SlicesInSpace([1, 4, 7, 12], opacity=0.4, lowest_hu=-300.0, window=(-500.0, 700.0), clip=clip)
@@ -353,22 +353,22 @@ def _check_points(device: Device) -> str:
     for perspective, own in ((False, None), (True, normals.astype(np.float32))):
         scale = {"view_angle": 9.0} if perspective else {"parallel_scale": 7.0}
         camera = Camera((-30.0, -80.0, 25.0), (0.3, 0.2, 0.1), (0.1, 0.2, 1.0), **scale)
-        found = draw_splats(device, points, colors, own, Shot(camera, SIZE), radius, lighting=FIXED)
-        require_equal(found.parts, 1, "parts of a cloud of 3,000 points")
+        splats = draw_splats(device, points, colors, own, Shot(camera, SIZE), radius, lighting=FIXED)
+        require_equal(splats.parts, 1, "parts of a cloud of 3,000 points")
         depth, numbers = find_splats(points, camera, SIZE, radius)
         apart = round(radius / camera.pixel_mm(SIZE))
         rgba, far = shade_splats(depth, numbers, colors[:, :3] / 255.0, own, camera, FIXED, apart)
-        require_equal(found.image[..., 3] > 0, numbers >= 0, "pixels with a point")
-        require_close(found.depth, far, DEPTH_MM, "depths of points, in mm")
-        away = np.abs(_premultiplied(found.image) - 255.0 * rgba).max(axis=-1)
+        require_equal(splats.image[..., 3] > 0, numbers >= 0, "pixels with a point")
+        require_close(splats.depth, far, DEPTH_MM, "depths of points, in mm")
+        away = np.abs(_premultiplied(splats.image) - 255.0 * rgba).max(axis=-1)
         worst = max(worst, require_close(away, np.zeros_like(away), COLOR_255, "colours of points, of 255"))
     return f"2 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
-PREPARED = ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along")
-RENDERED = (*PREPARED, "enter_tiles", "look_ahead", "composite_rays")
-PROJECTED = ("measure_cells", "project_rays")
-TRACED = (*PREPARED, "trace_surface")
+_PREPARED = ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along")
+RENDERED = (*_PREPARED, "enter_tiles", "look_ahead", "composite_rays")
+_PROJECTED = ("measure_cells", "project_rays")
+_TRACED = (*_PREPARED, "trace_surface")
 
 
 def _check(name: str, kernels: tuple[str, ...], run: Any, *macros: str, **options: Any) -> Check:
@@ -393,7 +393,7 @@ PICTURE_CHECKS = (
         _check_composite,
         scenes=(
             ("int16", SOFT, False, {}),
-            ("uint8", DIM, False, {}),
+            ("uint8", _DIM, False, {}),
             ("float32", SOFT, False, {"cut": True, "jitter": True}),
         ),
     ),
@@ -419,20 +419,20 @@ PICTURE_CHECKS = (
         scenes=(("int16", SOFT, True, {}), ("float32", SOFT, True, {"cut": True})),
     ),
     _check("labels in volume rendering", RENDERED, _check_composite_labels, "LABELS"),
-    _check("projections", PROJECTED, _check_projections, kinds=("mip", "minip", "mean"), uneven=False),
-    _check("radiographs", PROJECTED, _check_projections, "LEAST_VALUE", kinds=("drr",), uneven=False),
+    _check("projections", _PROJECTED, _check_projections, kinds=("mip", "minip", "mean"), uneven=False),
+    _check("radiographs", _PROJECTED, _check_projections, "LEAST_VALUE", kinds=("drr",), uneven=False),
     _check(
         "projections of uneven slices",
-        PROJECTED,
+        _PROJECTED,
         _check_projections,
         "LEAST_VALUE",
         "UNEVEN",
         kinds=("mip", "minip", "mean", "drr"),
         uneven=True,
     ),
-    _check("surfaces without a mesh", TRACED, _check_surfaces, uneven=False),
-    _check("surfaces of uneven slices", TRACED, _check_surfaces, "UNEVEN", uneven=True),
-    _check("labels on surfaces", TRACED, _check_surface_labels, "LABELS"),
+    _check("surfaces without a mesh", _TRACED, _check_surfaces, uneven=False),
+    _check("surfaces of uneven slices", _TRACED, _check_surfaces, "UNEVEN", uneven=True),
+    _check("labels on surfaces", _TRACED, _check_surface_labels, "LABELS"),
     Check("slices in space", ("overlay_slices",), _check_slices),
     Check("points as discs", ("clear_splats", "splat_depths", "splat_numbers", "shade_splats"), _check_points),
 )

@@ -33,16 +33,16 @@ TABLE_NODES = 4096
 OPAQUE = 0.99
 """Opacity at which a ray ends."""
 
-VISIBLE = 1.0 / 255.0
+_VISIBLE = 1.0 / 255.0
 """Opacity of a ray above which its current sample is the first hit."""
 
-FLAT_GRADIENT = 1e-6
+_FLAT_GRADIENT = 1e-6
 """HU per mm; smaller gradients have no direction."""
 
-PART_SLACK = 1e-3
+_PART_SLACK = 1e-3
 """Tolerance as a share of a sample: a step that divides the distance of slice planes up to rounding divides it."""
 
-PLANE_SLACK = 1.0 / 4096.0
+_PLANE_SLACK = 1.0 / 4096.0
 """Tolerance as a share of a sample: a plane just outside the way of a ray, within rounding, counts as inside."""
 
 
@@ -162,7 +162,7 @@ def shade(
     above 1 become 1.
     """
     magnitude = np.linalg.norm(gradients, axis=1)
-    flat = magnitude < FLAT_GRADIENT
+    flat = magnitude < _FLAT_GRADIENT
     normals = gradients / np.where(flat, 1.0, magnitude)[:, None]
     to_camera = -directions
     to_light = to_camera
@@ -177,7 +177,7 @@ def shade(
     diffuse = np.where(flat, 1.0, np.where(faces_light, np.abs(along), 0.0))
     shine = np.abs((normals * half_way).sum(axis=1)) ** lighting.specular_power
     highlight = np.where(flat | ~faces_light, 0.0, shine)
-    certain = magnitude**2 / (magnitude**2 + max(soft_gradient, FLAT_GRADIENT) ** 2)
+    certain = magnitude**2 / (magnitude**2 + max(soft_gradient, _FLAT_GRADIENT) ** 2)
     diffuse, highlight = 1.0 + certain * (diffuse - 1.0), certain * highlight
     share = np.broadcast_to(np.asarray(lit, dtype=np.float64), magnitude.shape)
     light = lighting.ambient + share * lighting.diffuse * diffuse
@@ -213,7 +213,7 @@ def _composite(
         rgba[ray, :3] += weight[:, None] * colour
         rgba[ray, 3] += weight
         weighted[ray] += weight * t
-        first = np.isnan(depth[ray]) & (rgba[ray, 3] > VISIBLE)
+        first = np.isnan(depth[ray]) & (rgba[ray, 3] > _VISIBLE)
         depth[ray[first]] = t[first]
     any_weight = rgba[:, 3] > 0.0
     expected = np.divide(weighted, rgba[:, 3], out=np.full(rays.count, np.nan), where=any_weight)
@@ -342,13 +342,13 @@ def _plane_samples(rays: _Rays, step: float) -> Iterator[tuple[NDArray[np.int64]
     axis = np.abs(rates).argmax(axis=1)[:, None]
     rate = np.take_along_axis(rates, axis, axis=1)[:, 0]
     start = np.take_along_axis(rays.origins @ inverse[:3, :3].T + inverse[:3, 3], axis, axis=1)[:, 0]
-    parts = np.maximum(np.ceil(1.0 / (np.abs(rate) * step) - PART_SLACK), 1.0)
+    parts = np.maximum(np.ceil(1.0 / (np.abs(rate) * step) - _PART_SLACK), 1.0)
     spacing = 1.0 / (np.abs(rate) * parts)
     t_of_plane_0 = -start / rate
     valid = rays.t_out > rays.t_in
     t_in, t_out = np.where(valid, rays.t_in, 0.0), np.where(valid, rays.t_out, -1.0)
-    first = np.ceil((t_in - t_of_plane_0) / spacing - PLANE_SLACK)
-    last = np.floor((t_out - t_of_plane_0) / spacing + PLANE_SLACK)
+    first = np.ceil((t_in - t_of_plane_0) / spacing - _PLANE_SLACK)
+    last = np.floor((t_out - t_of_plane_0) / spacing + _PLANE_SLACK)
     missed = np.flatnonzero(valid & (last < first))
     yield missed, 0.5 * (t_in + t_out)[missed]
     for number in range(int((last - first).max(initial=-1.0)) + 1):

@@ -21,7 +21,7 @@ from clrecon.rendering import Lighting
 from clrecon.rendering.pictures.styles import SlicesInSpace
 from clrecon.rendering.views.camera import Camera
 
-HALVINGS = 10
+_HALVINGS = 10
 """Number of halvings of a step: the hit is then known to 1e-3 of it."""
 
 
@@ -118,7 +118,7 @@ def _first_inside(
         ray, high = ray[inside], t[inside]
         low = high if number == 0 else t_in[ray] + (number - 1) * step
         at_once[ray] = number == 0
-        for _ in range(HALVINGS if number else 0):
+        for _ in range(_HALVINGS if number else 0):
             middle = 0.5 * (low + high)
             inside = field.inside(origins[ray] + middle[:, None] * directions[ray])
             low, high = np.where(inside, low, middle), np.where(inside, middle, high)

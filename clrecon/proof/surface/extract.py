@@ -26,7 +26,7 @@ from clrecon.proof.surface.trilinear_table import CELL_VERTEX
 Surface = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint32]]
 """Vertices (n, 3) and normals (n, 3), LPS mm, and triangles (m, 3)."""
 
-LARGEST_CASE = 8
+_LARGEST_CASE = 8
 """More than the triangles of any case."""
 
 
@@ -89,7 +89,7 @@ def _find_triangles(
         of_case = np.flatnonzero(case_of == case)
         for number, triangle in enumerate(case_table()[case]):
             found.append(np.stack([_edge_vertices(numbers, cells[of_case], edge) for edge in triangle], axis=1))
-            order.append(LARGEST_CASE * of_case + number)
+            order.append(_LARGEST_CASE * of_case + number)
     return np.concatenate(found)[np.argsort(np.concatenate(order))].astype(np.uint32)
 
 

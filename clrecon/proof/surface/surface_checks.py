@@ -49,19 +49,19 @@ from clrecon.proof.surface import labels as twin
 from clrecon.proof.surface.extract import Surface
 from clrecon.proof.surface.extract import extract_isosurface as extract_twin
 
-VERTEX_TOLERANCE_VOXEL = 1e-4
+_VERTEX_TOLERANCE_VOXEL = 1e-4
 """Largest difference of device (float32) and twin (float64), in units of the smallest voxel edge."""
 
-NORMAL_TOLERANCE = 2e-4
+_NORMAL_TOLERANCE = 2e-4
 """Largest difference of unit vectors: near a saddle a gradient is a small difference of float32."""
 
-MARCHING = ("count_rows", "total_counts", "list_words", "emit_vertices", "emit_triangles")
+_MARCHING = ("count_rows", "total_counts", "list_words", "emit_vertices", "emit_triangles")
 """Kernels that every surface launches."""
 
 LONG = (532, 2, 6)
 """Voxels (k, j, i) of more than 500 slices: one of the kernels works slice by slice."""
 
-LONG_THIN = (520, 7, 34)
+_LONG_THIN = (520, 7, 34)
 """Voxels (k, j, i) of an open volume of many thin slices, whose ends are a large part of it."""
 
 
@@ -71,10 +71,10 @@ def compare_mesh(volume: Volume, mesh: Mesh, expected: Surface, what: str) -> fl
     require_whole(mesh.report)
     require_equal(mesh.triangles, triangles, f"triangles of {what}")
     scale = 1.0 / min(volume.spacing)
-    allowed = VERTEX_TOLERANCE_VOXEL
+    allowed = _VERTEX_TOLERANCE_VOXEL
     away = require_close(scale * mesh.vertices, scale * vertices, allowed, f"vertices of {what}, in voxels")
     assert mesh.normals is not None
-    require_close(mesh.normals, normals, NORMAL_TOLERANCE, f"normals of {what}")
+    require_close(mesh.normals, normals, _NORMAL_TOLERANCE, f"normals of {what}")
     return away
 
 
@@ -168,7 +168,7 @@ def _check_growing(device: Device) -> str:
     most.reshape(-1)[np.flatnonzero(most)[::10]] = False
     for voxels, closed, marked, by_point in (
         (noise(WIDE, "int16", 8), True, None, False),
-        (noise(LONG_THIN, "float32", 8), False, noise(LONG_THIN, "uint8", 40) == 38, False),  # whose HU are 7
+        (noise(_LONG_THIN, "float32", 8), False, noise(_LONG_THIN, "uint8", 40) == 38, False),  # whose HU are 7
         (grains, False, None, False),
         (grains, False, at_edge, False),
         (many, False, most, True),
@@ -191,47 +191,47 @@ def _check_growing(device: Device) -> str:
 TRILINEAR = ("count_cells", "make_room", "emit_cell_triangles", "emit_cell_vertices")
 
 SURFACE_CHECKS = (
-    Check("extract_isosurface", ("classify_samples", "classify_bricks", *MARCHING), _check_first_and_second),
-    Check("types of voxels", ("classify_samples", "classify_bricks", *MARCHING), _check_types),
+    Check("extract_isosurface", ("classify_samples", "classify_bricks", *_MARCHING), _check_first_and_second),
+    Check("types of voxels", ("classify_samples", "classify_bricks", *_MARCHING), _check_types),
     Check(
         "uneven slices",
-        ("classify_samples", *MARCHING),
+        ("classify_samples", *_MARCHING),
         partial(_check_variant, make=waves, shape=WIDE, level=30.0, uneven=True),
         {"surface/marching_cubes.cl": ("UNEVEN",)},
     ),
     Check(
         "ranges",
-        ("classify_samples", *MARCHING),
+        ("classify_samples", *_MARCHING),
         partial(_check_variant, make=waves, shape=WIDE, level=(30.0, 60.0)),
         {"masks/classify.cl": ("RANGE",), "surface/marching_cubes.cl": ("RANGE",)},
     ),
     Check(
         "below a level",
-        ("classify_samples", *MARCHING),
+        ("classify_samples", *_MARCHING),
         partial(_check_variant, make=waves, shape=WIDE, level=30.0, below=True),
         {"masks/classify.cl": ("BORDER_INSIDE",)},
     ),
     Check(
         "growing",
-        (*MARCHING, *GROWING, "find_largest", "choose_largest", "choose_cells", "choose_seeded"),
+        (*_MARCHING, *GROWING, "find_largest", "choose_largest", "choose_cells", "choose_seeded"),
         _check_growing,
         {"surface/cells.cl": ("GROWN",), "surface/marching_cubes.cl": ("GROWN",)},
     ),
     Check(
         "golden sections",
-        MARCHING,
+        _MARCHING,
         partial(_check_variant, make=waves, shape=WIDE, level=30.0, types=("int16",), vertex_rule="golden"),
         {"surface/marching_cubes.cl": ("GOLDEN",)},
     ),
     Check(
         "search by golden sections",
-        MARCHING,
+        _MARCHING,
         partial(_check_variant, make=waves, shape=WIDE, level=30.0, types=("int16",), vertex_rule="golden-search"),
         {"surface/marching_cubes.cl": ("GOLDEN_SEARCH",)},
     ),
     Check(
         "trilinear topology",
-        ("classify_samples", *(kernel for kernel in MARCHING if kernel != "emit_triangles"), *TRILINEAR),
+        ("classify_samples", *(kernel for kernel in _MARCHING if kernel != "emit_triangles"), *TRILINEAR),
         partial(_check_variant, make=noise, shape=LONG, level=2.5, topology="trilinear"),
     ),
 )  # fmt: skip
@@ -316,14 +316,14 @@ def _check_volumes(device: Device) -> str:
 LABEL_CHECKS = (
     Check(
         "extract_labels",
-        ("own_samples", "classify_label", *MARCHING),
+        ("own_samples", "classify_label", *_MARCHING),
         _check_labels,
         {"surface/marching_cubes.cl": ("LABELS", "UNEVEN")},
     ),
     Check("survey of labels", ("clear_survey", "find_boxes", "count_faces"), _check_survey),
     Check(
         "extract_label_masks",
-        ("clear_survey", "find_boxes", "count_faces", "smooth_rows", "smooth_across", "classify_mask", *MARCHING),
+        ("clear_survey", "find_boxes", "count_faces", "smooth_rows", "smooth_across", "classify_mask", *_MARCHING),
         _check_masks,
         {"surface/marching_cubes.cl": ("MASKS",)},
     ),
@@ -334,13 +334,13 @@ LABEL_CHECKS = (
 PLACES = 700
 """Profiles that are sampled."""
 
-WALLS = 4200
+_WALLS = 4200
 """Walls that are fitted: more than 500 vectors of eight."""
 
-VALUE_TOLERANCE_HU = 0.25
+_VALUE_TOLERANCE_HU = 0.25
 """Places in float32, 2e-5 of a voxel off, where values change by 1000 HU within a voxel or two."""
 
-TOLERANCES = (
+_TOLERANCES = (
     ("places", 1e-3, 0.01), ("thicknesses", 2e-3, 0.03), ("outer HU", 1.0, 0.01), ("cortex HU", 2.0, 0.03),
     ("inner HU", 2.0, 0.03), ("residuals", 0.3, 0.01), ("variances", 0.01, 0.03), ("variances", 0.01, 0.03),
 )  # fmt: skip
@@ -370,7 +370,7 @@ def _check_profiles(device: Device, dtype: str, uneven: bool) -> str:
         found = sampler.values(points, normals)
     expected = cortex_twin.sample_profiles(volume, points, normals, twin_scale(sampler))
     share = 0.002  # at the border a sample is in the volume or not
-    worst = require_share(found, expected, VALUE_TOLERANCE_HU, share, f"profiles of {dtype} voxels")
+    worst = require_share(found, expected, _VALUE_TOLERANCE_HU, share, f"profiles of {dtype} voxels")
     return f"{PLACES} profiles of {dtype} voxels within {worst:.1e} HU"
 
 
@@ -395,7 +395,7 @@ def make_walls(count: int, seed: int) -> NDArray[np.float32]:
 
 
 def _check_fits(device: Device) -> str:
-    values = make_walls(WALLS, 32)
+    values = make_walls(_WALLS, 32)
     volume = blobs((8, 9, 10), np.eye(4), "int16")
     with DeviceVolume(volume, device=device) as resident:
         sampler = ProfileSampler(resident, Stopwatch())
@@ -406,7 +406,7 @@ def _check_fits(device: Device) -> str:
     )
     known = np.isfinite(expected[8])
     require_close(found[8:], expected[8:], 1e-2, "highest values and room of walls")
-    for row, (what, allowed, share) in enumerate(TOLERANCES):
+    for row, (what, allowed, share) in enumerate(_TOLERANCES):
         one, other = found[row][known], expected[row][known]
         if what == "variances":  # in units of their own
             one, other = one / other, np.ones_like(other)

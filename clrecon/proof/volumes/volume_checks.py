@@ -103,25 +103,25 @@ PRIMITIVE_CHECKS = (
 )  # fmt: skip
 
 
-BRICK_SHAPE = (221, 196, 21)
+_BRICK_SHAPE = (221, 196, 21)
 """Voxels (k, j, i) of 28 x 25 x 3 bricks: 700 rows."""
 
 
 def _check_bricks(device: Device) -> str:
     for dtype in ("int8", "uint8", "int16", "uint16", "int32", "float32"):
-        voxels = noise(BRICK_SHAPE, dtype, 120)
-        rows = np.arange(-(-BRICK_SHAPE[0] // 8) * -(-BRICK_SHAPE[1] // 8)).reshape(-(-BRICK_SHAPE[0] // 8), -1)
+        voxels = noise(_BRICK_SHAPE, dtype, 120)
+        rows = np.arange(-(-_BRICK_SHAPE[0] // 8) * -(-_BRICK_SHAPE[1] // 8)).reshape(-(-_BRICK_SHAPE[0] // 8), -1)
         # Some rows are all outside.
-        shift = (rows % 5).repeat(8, 0).repeat(8, 1)[: BRICK_SHAPE[0], : BRICK_SHAPE[1], None]
+        shift = (rows % 5).repeat(8, 0).repeat(8, 1)[: _BRICK_SHAPE[0], : _BRICK_SHAPE[1], None]
         voxels = np.where(shift == 4, 0, voxels // 4 + 20 * shift).astype(dtype)
-        measured = measure_bricks(device, upload(device, voxels), BRICK_SHAPE[::-1], voxels.dtype)
+        measured = measure_bricks(device, upload(device, voxels), _BRICK_SHAPE[::-1], voxels.dtype)
         shape = (*measured.shape[::-1], 2)
         ranges = download(device, np.empty(shape, voxels.dtype), measured.ranges_d)
         expected = twin.measure_bricks(voxels)
         require_equal(ranges, expected, f"ranges of bricks of {dtype} voxels")
         level = voxels.dtype.type(45)
-        compared = compare_bricks(device, measured, level, BRICK_SHAPE[2], 1)
-        states, extents = twin.compare_bricks(expected, float(level), BRICK_SHAPE[2], 1)
+        compared = compare_bricks(device, measured, level, _BRICK_SHAPE[2], 1)
+        states, extents = twin.compare_bricks(expected, float(level), _BRICK_SHAPE[2], 1)
         found = download(device, np.empty_like(states), compared.states_d)
         require_equal(found, states, f"states of bricks of {dtype} voxels")
         found = download(device, np.empty_like(extents), compared.extents_d)
@@ -132,12 +132,12 @@ def _check_bricks(device: Device) -> str:
 BRICK_CHECKS = (Check("bricks", ("measure_bricks", "compare_bricks"), _check_bricks),)
 
 
-MASK_SHAPE = (26, 41, 70)
+_MASK_SHAPE = (26, 41, 70)
 """Voxels (k, j, i): more than 1,000 rows, and three words in each."""
 
 
 def _check_logic(device: Device) -> str:
-    volume = stack(noise(MASK_SHAPE, "int16", 100), OBLIQUE)
+    volume = stack(noise(_MASK_SHAPE, "int16", 100), OBLIQUE)
     a, b = volume.voxels > 40, volume.voxels % 3 == 0
     with DeviceVolume(volume, device=device) as resident:
         one, other = Mask.from_array(resident, a), Mask.from_array(resident, b)
@@ -156,7 +156,7 @@ def _check_logic(device: Device) -> str:
 def _check_regions(device: Device) -> str:
     said = 0
     for uneven in (False, True):
-        volume = stack(noise(MASK_SHAPE, "int16", 100), OBLIQUE, uneven=uneven)
+        volume = stack(noise(_MASK_SHAPE, "int16", 100), OBLIQUE, uneven=uneven)
         places = twin.find_places(volume)
         low, high = places[2, 3, 4], places[-4, -5, -6]
         sides = np.stack([np.minimum(low, high), np.maximum(low, high)], axis=1)
@@ -172,8 +172,8 @@ def _check_regions(device: Device) -> str:
 def _check_balls(device: Device) -> str:
     said = 0
     for uneven, columns in ((False, 70), (True, 70), (False, 530)):
-        shape = (*MASK_SHAPE[:2], columns) if columns == MASK_SHAPE[2] else (9, 60, columns)
-        affine = OBLIQUE if columns == MASK_SHAPE[2] else np.diag((0.6, 0.6, 1.5, 1.0))
+        shape = (*_MASK_SHAPE[:2], columns) if columns == _MASK_SHAPE[2] else (9, 60, columns)
+        affine = OBLIQUE if columns == _MASK_SHAPE[2] else np.diag((0.6, 0.6, 1.5, 1.0))
         volume = stack(noise(shape, "int16", 100), affine, uneven=uneven)
         few, many = volume.voxels > 97, volume.voxels > 2
         with DeviceVolume(volume, device=device) as resident:
@@ -189,7 +189,7 @@ def _check_balls(device: Device) -> str:
 
 
 def _check_mask_components(device: Device) -> str:
-    volume = stack(noise(MASK_SHAPE, "int16", 100), OBLIQUE)
+    volume = stack(noise(_MASK_SHAPE, "int16", 100), OBLIQUE)
     chosen = volume.voxels > 42
     with DeviceVolume(volume, device=device) as resident:
         mask = Mask.from_array(resident, chosen)
@@ -211,20 +211,20 @@ MASK_CHECKS = (
 )
 
 
-FILTER_SHAPE = (9, 31, 53)
+_FILTER_SHAPE = (9, 31, 53)
 """Rows of four groups: 1,116 of them, and 558 strips for the ends of the rows."""
 
-ROUNDED_HU = 0.501
+_ROUNDED_HU = 0.501
 """Largest difference of a whole number from the mean that it is rounded from."""
 
-FLOAT_HU = 2e-3
+_FLOAT_HU = 2e-3
 """Largest difference of a float: sums of 100 weights in float32, each within 4e-6."""
 
 
 def _check_bilateral(device: Device, types: tuple[str, ...], uneven: bool) -> str:
     worst = 0.0
     for dtype in types:
-        volume = stack(random_integers(FILTER_SHAPE, dtype, 120), OBLIQUE, uneven=uneven)
+        volume = stack(random_integers(_FILTER_SHAPE, dtype, 120), OBLIQUE, uneven=uneven)
         for dimensions, taps in ((3, 120), (2, 13)):
             settings = BilateralSettings.checked(volume, 0.8, 40.0, dimensions, None, False, taps)
             found = run_bilateral(DeviceVolume(volume, device=device), settings)
@@ -234,7 +234,7 @@ def _check_bilateral(device: Device, types: tuple[str, ...], uneven: bool) -> st
             expected = twin.filter_bilateral(
                 volume.voxels, offsets, twin.spatial_weights(volume, offsets, settings.sigma_mm), settings.sigma_hu
             )
-            allowed = FLOAT_HU if volume.voxels.dtype.kind == "f" else ROUNDED_HU
+            allowed = _FLOAT_HU if volume.voxels.dtype.kind == "f" else _ROUNDED_HU
             worst = max(worst, require_close(found.voxels, expected, allowed, f"filtered {dtype} voxels, in HU"))
     return f"{2 * len(types)} volumes within {worst:.2g} HU"
 

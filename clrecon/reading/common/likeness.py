@@ -20,30 +20,30 @@ from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.pieces import count_readers
 from clrecon.system.records import Gate, none_of, unmeasured
 
-LEAST_LIKENESS = 1.25
+_LEAST_LIKENESS = 1.25
 """Ratio of the differences from neighbours to those one period on, from which on slices belong to several volumes.
 Four real scans, whole and with every 2nd, 3rd and 4th slice: at most 0.58, for periods of 3 and 4 at most 0.74 and
 0.82; water with noise: 0.99, 1.06, 1.12."""
-PART_LIKENESS = 2.0
+_PART_LIKENESS = 2.0
 """The same in parts of the picture, with period 2, for `PARTS` of them.  Those scans: at most 1.47 in any part (slices
 17 mm apart), at most 0.89 where slices are nearer; water with noise 1.01."""
 PARTS = 4
 """Number of parts that must reach it; of fewer, all.  One part alone must reach it along more slices
-(`MOST_ALIKE_PART`), in a long stack in more than one window: a vessel with contrast medium in one of two volumes does.
+(`_MOST_ALIKE_PART`), in a long stack in more than one window: a vessel with contrast medium in one of two volumes does.
 A saw cut in bone of a sharp kernel alternates within one volume too: artefacts of a helical scan turn there."""
 PERIODS = (2, 3, 4)
-MOST_ALIKE, LEAST_ALIKE = 12, 4
+_MOST_ALIKE, _LEAST_ALIKE = 12, 4
 """Number of consecutive slices that must all reach it; of fewer slices all, but at least the second number."""
-MOST_ALIKE_PART, LEAST_ALIKE_PART = 20, 6
+_MOST_ALIKE_PART, _LEAST_ALIKE_PART = 20, 6
 HU_RANGE = (-1000, 2000)
 """Values are limited to this range; beyond are padding and metal.  Sums over a cell then fit 16 bits."""
-CELL, FINE_CELL, COARSE_CELLS = 4, 2, 32
-"""Pixels along the side of an averaged cell: `CELL` where that gives `COARSE_CELLS` cells along a side, else fewer."""
+_CELL, _FINE_CELL, _COARSE_CELLS = 4, 2, 32
+"""Pixels along the side of an averaged cell: `_CELL` where that gives `_COARSE_CELLS` along a side, else fewer."""
 FEWEST_CELLS = 64
 """Least number of cells; in smaller pictures differences are due to chance."""
 PART = 8
 """Cells along the side of a part of the picture."""
-NOISE_HU2, PART_NOISE_HU2 = 1.0, 25.0
+_NOISE_HU2, _PART_NOISE_HU2 = 1.0, 25.0
 """Lower limits of squared differences: pictures without noise are alike by chance."""
 READERS = 4
 WINDOW, WINDOWS = 32, 3
@@ -67,7 +67,7 @@ class Likeness:
     @property
     def suspicion(self) -> float:
         """The larger of the two ratios, each divided by its bound: above 1 several volumes are interleaved."""
-        return max(self.whole / LEAST_LIKENESS, (self.part or 0.0) / PART_LIKENESS)
+        return max(self.whole / _LEAST_LIKENESS, (self.part or 0.0) / _PART_LIKENESS)
 
     @property
     def is_mixed(self) -> bool:
@@ -75,7 +75,7 @@ class Likeness:
         return self.suspicion > 1.0
 
     def __str__(self) -> str:
-        if self.whole > LEAST_LIKENESS:
+        if self.whole > _LEAST_LIKENESS:
             where, times = "neighbouring slices", self.whole
         else:
             where, times = "in parts of the picture neighbouring slices", self.part or 0.0
@@ -99,7 +99,7 @@ def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool |
     if not found:
         return None
     second = sorted(one.part or 0.0 for one in found)[-2] if parts and len(found) > 1 else None
-    whole = max(found, key=lambda one: one.whole / LEAST_LIKENESS)
+    whole = max(found, key=lambda one: one.whole / _LEAST_LIKENESS)
     return replace(whole, part=None if whole.part is None else second)
 
 
@@ -109,7 +109,7 @@ def measure_likeness(voxels: NDArray[Any], *, parts: bool = True) -> Likeness | 
     `parts` of the picture are examined too, but not of a tilted gantry: scanners that measure several slices in one
     turn shift them against each other, which shows in objects that do not change along the table (a head holder).
     """
-    if len(voxels) < min(PERIODS) + LEAST_ALIKE:
+    if len(voxels) < min(PERIODS) + _LEAST_ALIKE:
         return None
     cells = _average_cells(voxels)
     if cells.shape[1] * cells.shape[2] < FEWEST_CELLS:
@@ -117,19 +117,19 @@ def measure_likeness(voxels: NDArray[Any], *, parts: bool = True) -> Likeness | 
     differences = [np.square(cells[step:] - cells[:-step]) for step in range(1, max(PERIODS) + 1)]
     found = []
     for period in PERIODS:
-        if len(voxels) < period + LEAST_ALIKE:
+        if len(voxels) < period + _LEAST_ALIKE:
             break
         whole = [one.mean(axis=(1, 2)) for one in differences[:period]]
-        found.append(Likeness(period, float(_steadily(_ratios(whole, NOISE_HU2))), None))
+        found.append(Likeness(period, float(_steadily(_ratios(whole, _NOISE_HU2))), None))
     part = None
-    if parts and len(voxels) >= min(PERIODS) + LEAST_ALIKE_PART:
+    if parts and len(voxels) >= min(PERIODS) + _LEAST_ALIKE_PART:
         tiles = [_average(one, PART) for one in differences[:2]]
         if tiles[0].size:
-            ratios = _ratios(tiles, PART_NOISE_HU2)
+            ratios = _ratios(tiles, _PART_NOISE_HU2)
             reached = np.sort(_steadily(ratios), axis=None)
-            part = max(float(reached[-min(PARTS, len(reached))]), float(_steadily(ratios, MOST_ALIKE_PART).max()))
+            part = max(float(reached[-min(PARTS, len(reached))]), float(_steadily(ratios, _MOST_ALIKE_PART).max()))
     best = max(found, key=lambda one: one.whole)
-    if best.whole <= LEAST_LIKENESS:
+    if best.whole <= _LEAST_LIKENESS:
         best = found[0]
     return Likeness(best.period, best.whole, part)
 
@@ -144,7 +144,7 @@ def _ratios(differences: Sequence[NDArray[np.float32]], noise: float) -> NDArray
     return np.asarray(np.max(nearer, axis=0) / np.maximum(differences[-1], noise))
 
 
-def _steadily(ratios: NDArray[np.float32], most: int = MOST_ALIKE) -> NDArray[np.float32]:
+def _steadily(ratios: NDArray[np.float32], most: int = _MOST_ALIKE) -> NDArray[np.float32]:
     """Return the largest ratio that `most` consecutive stretches reach, or all if there are fewer."""
     count = min(most, len(ratios))
     lowest = [np.min(ratios[first : first + count], axis=0) for first in range(len(ratios) - count + 1)]
@@ -154,7 +154,7 @@ def _steadily(ratios: NDArray[np.float32], most: int = MOST_ALIKE) -> NDArray[np
 def _average_cells(voxels: NDArray[Any]) -> NDArray[np.float32]:
     """Average squares of pixels of each slice, (nk, rows, columns)."""
     least = min(voxels.shape[1:])
-    side = next((side for side in (CELL, FINE_CELL) if least >= side * COARSE_CELLS), 1)
+    side = next((side for side in (_CELL, _FINE_CELL) if least >= side * _COARSE_CELLS), 1)
     rows, columns = voxels.shape[1] // side, voxels.shape[2] // side
     cells = np.zeros((len(voxels), rows, columns), np.float32)
 
@@ -183,14 +183,14 @@ def _average(pictures: NDArray[np.float32], side: int) -> NDArray[np.float32]:
 
 SHOWN_SAID = "pictures that are not where their headers put them: slices in each other's place, rows of a wrong length"
 
-LEAST_EXCHANGE, MOST_EXCHANGES = 1.25, 2
+_LEAST_EXCHANGE, _MOST_EXCHANGES = 1.25, 2
 """How much less alike two slices in each other's place are to their neighbours there, and most pairs of them: more are
 two volumes.  Five scans, whole and with every 2nd, 3rd and 5th slice: at most 1.01; exchanged 1.5 to 3 where slices lie
 up to 4 mm apart."""
-FEWEST_SLICES, FEWEST_SAMPLES, SAMPLES, FEWEST_MOVED = 6, 512, 64, 25
+FEWEST_SLICES, _FEWEST_SAMPLES, SAMPLES, _FEWEST_MOVED = 6, 512, 64, 25
 """Fewest slices and samples of a slice that are compared, most samples along a side, and fewest that must differ:
 square of the sum of their differences by the sum of the squares."""
-WRONG_ROW, NARROWEST, PICTURES = 4.0, 16, 4
+_WRONG_ROW, _NARROWEST, PICTURES = 4.0, 16, 4
 """How much less alike pixels of neighbouring rows are than those of a row, and than those of rows as long as columns
 are; least pixels along a side, and pictures looked at."""
 
@@ -199,7 +199,7 @@ def judge_shown_places(voxels: NDArray[Any]) -> Gate:
     """Judge the gate ``shown_places`` of slices (nk, nj, ni) of HU: order of the slices, and length of the rows."""
     nk, nj, ni = voxels.shape
     samples = _sample_rows(voxels)
-    comparable = nk >= FEWEST_SLICES and samples.shape[1] >= FEWEST_SAMPLES
+    comparable = nk >= FEWEST_SLICES and samples.shape[1] >= _FEWEST_SAMPLES
     found = [f"slices {a + 1} and {b + 1} of {nk}" for a, b in _find_exchanged(samples)] if comparable else []
     texts = [f"{' and '.join(found)} seem to lie in each other's place, by what they show"] if found else []
     if _has_swapped_sides(voxels):
@@ -232,32 +232,32 @@ def _find_exchanged(samples: NDArray[np.int16]) -> list[tuple[int, int]]:
     def differ(a: int, b: int) -> float:
         apart = np.square(np.subtract(samples[a], samples[b], dtype=np.float32))
         total, squares = float(apart.sum()), float(apart @ apart)
-        few = total**2 < FEWEST_MOVED * squares
-        return np.nan if few else max(total / apart.size, NOISE_HU2)
+        few = total**2 < _FEWEST_MOVED * squares
+        return np.nan if few else max(total / apart.size, _NOISE_HU2)
 
     count, found = len(samples), []
     first, second, third = (np.array([differ(k, k + step) for k in range(count - step)]) for step in (1, 2, 3))
-    odd = (np.flatnonzero(np.minimum(first[:-1], first[1:]) > LEAST_EXCHANGE * second) + 1).tolist()
-    for place, a in enumerate(odd if len(odd) <= 2 * MOST_EXCHANGES else ()):
+    odd = (np.flatnonzero(np.minimum(first[:-1], first[1:]) > _LEAST_EXCHANGE * second) + 1).tolist()
+    for place, a in enumerate(odd if len(odd) <= 2 * _MOST_EXCHANGES else ()):
         for b in odd[place + 1 :]:
             there = [differ(a - 1, b) + differ(a + 1, b), differ(b - 1, a) + differ(b + 1, a)]
             here = [first[a - 1] + first[a], first[b - 1] + first[b]]
-            if b - a > 2 and all(one > LEAST_EXCHANGE * other for one, other in zip(here, there, strict=True)):
+            if b - a > 2 and all(one > _LEAST_EXCHANGE * other for one, other in zip(here, there, strict=True)):
                 found.append((a, b))
     for apart, further in () if found else ((1, second), (2, third)):  # a stretch of the stack is turned round
         ratios = np.minimum(first[: -apart - 1] / further[:-1], first[apart + 1 :] / further[1:])
-        found += [(k + 1, k + 1 + apart) for k in np.flatnonzero(ratios > LEAST_EXCHANGE).tolist()]
-    return found if len(found) <= MOST_EXCHANGES else []
+        found += [(k + 1, k + 1 + apart) for k in np.flatnonzero(ratios > _LEAST_EXCHANGE).tolist()]
+    return found if len(found) <= _MOST_EXCHANGES else []
 
 
 def _has_swapped_sides(voxels: NDArray[Any]) -> bool:
     """True where pixels one after the other make a picture only with rows as long as the columns are said to be."""
     nk, nj, ni = voxels.shape
-    if min(nj, ni) < NARROWEST or nj % ni == 0 or ni % nj == 0:
+    if min(nj, ni) < _NARROWEST or nj % ni == 0 or ni % nj == 0:
         return False
     beside, other, below = 0.0, 0.0, 0.0
     for picture in voxels[:: -(-nk // PICTURES)]:
         flat = np.clip(picture, *HU_RANGE).astype(np.float32).ravel()
         apart = [float(np.square(flat[lag:] - flat[:-lag]).mean()) for lag in (1, nj, ni)]
         beside, other, below = beside + apart[0], other + apart[1], below + apart[2]
-    return below > WRONG_ROW * max(beside, other) and other * WRONG_ROW > beside
+    return below > _WRONG_ROW * max(beside, other) and other * _WRONG_ROW > beside

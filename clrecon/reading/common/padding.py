@@ -32,7 +32,7 @@ AIR_RANGE_HU = (-1100, -900)
 SAMPLED_SLICES = 16
 """Number of evenly spread slices that are sampled; they give some thousand voxels beside the padding."""
 
-KEPT_MASKS = 16
+_KEPT_MASKS = 16
 """Masks of this many slices stay unpacked; most scans have the same mask in all slices."""
 
 Map = Callable[[Callable[[int], Any], Iterable[int]], Iterable[Any]]
@@ -56,7 +56,7 @@ class PaddingMasks:
         self._packed: dict[int, bytes] = {}
         self._counts: dict[int, int] = {}
         self._distinct: dict[bytes, bytes] = {}
-        self._mask = lru_cache(KEPT_MASKS)(partial(_unpack_mask, voxels.shape[1:]))
+        self._mask = lru_cache(_KEPT_MASKS)(partial(_unpack_mask, voxels.shape[1:]))
 
     def add(self, k: int, packed: tuple[bytes, int] | None) -> None:
         """Record the padding of slice `k`, as `pack_mask` returns it; None if the slice has none."""
@@ -98,12 +98,12 @@ class PaddingMasks:
         return values[(values >= low) & (values <= high)]
 
 
-SMALLEST = 32
-ROUND = 0.03
+_SMALLEST = 32
+_ROUND = 0.03
 """Largest difference of the four radii along the middle row and column, as a share of the radius."""
-OUTSIDE, RIM = 1.03, (0.9, 0.97)
+_OUTSIDE, _RIM = 1.03, (0.9, 0.97)
 """Where all voxels have the value, and where hardly any has it, in radii."""
-LEAST_PART, LEAST_OUTSIDE, MOST_IN_RIM, FEWEST_VALUES = 0.05, 0.999, 0.05, 16
+_LEAST_PART, _LEAST_OUTSIDE, _MOST_IN_RIM, FEWEST_VALUES = 0.05, 0.999, 0.05, 16
 """Least share of a slice that lies outside, least share of it that has the value, largest share of the rim that has it,
 and fewest values there."""
 
@@ -126,7 +126,7 @@ def fill_disc_padding(voxels: NDArray[Any]) -> Disc | None:
     """Fill outside a round field of view of a value above air; None where there is no disc."""
     nk, nj, ni = voxels.shape
     value = voxels[0, 0, 0]
-    if min(nj, ni) < SMALLEST or value <= AIR_RANGE_HU[1]:
+    if min(nj, ni) < _SMALLEST or value <= AIR_RANGE_HU[1]:
         return None
     distance = _measure_disc(voxels[nk // 2] != value)
     sampled = [picture for picture in voxels[:: -(-nk // SAMPLED_SLICES)] if picture.min() < picture.max()]
@@ -134,7 +134,7 @@ def fill_disc_padding(voxels: NDArray[Any]) -> Disc | None:
         return None
     masks = PaddingMasks(voxels)
     for k, picture in enumerate(voxels):
-        masks.add(k, pack_mask((picture == value) & (distance >= RIM[1])))
+        masks.add(k, pack_mask((picture == value) & (distance >= _RIM[1])))
     filled = masks.fill()
     return Disc(float(value), masks.count, float(value if filled is None else filled))
 
@@ -148,16 +148,16 @@ def _measure_disc(measured: NDArray[np.bool_]) -> NDArray[np.float64] | None:
     radii = ((column[-1] - column[0] + 1) / 2.0, (row[-1] - row[0] + 1) / 2.0)
     j, i = np.ogrid[:nj, :ni]
     distance = np.hypot(j - (column[0] + column[-1]) / 2.0, i - (row[0] + row[-1]) / 2.0) / min(radii)
-    is_round = abs(radii[0] - radii[1]) <= ROUND * min(radii)
-    return distance if is_round and np.mean(distance > OUTSIDE) >= LEAST_PART else None
+    is_round = abs(radii[0] - radii[1]) <= _ROUND * min(radii)
+    return distance if is_round and np.mean(distance > _OUTSIDE) >= _LEAST_PART else None
 
 
 def _is_disc(picture: NDArray[Any], value: Any, distance: NDArray[np.float64]) -> bool:
     """True where a slice has the value everywhere outside, and other ones of many kinds within."""
-    within = picture[(distance > RIM[0]) & (distance < RIM[1])]
+    within = picture[(distance > _RIM[0]) & (distance < _RIM[1])]
     return bool(
-        np.mean(picture[distance > OUTSIDE] == value) >= LEAST_OUTSIDE
-        and np.mean(within == value) <= MOST_IN_RIM
+        np.mean(picture[distance > _OUTSIDE] == value) >= _LEAST_OUTSIDE
+        and np.mean(within == value) <= _MOST_IN_RIM
         and len(np.unique(within)) >= FEWEST_VALUES
     )
 

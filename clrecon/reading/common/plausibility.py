@@ -31,7 +31,7 @@ a wrong PixelPaddingValue probably masks measured voxels."""
 PIXEL_MM = (0.005, 10.0)
 """Range of pixel sizes: from the finest micro-CT in use to attenuation maps of PET and SPECT."""
 GAP_MM = (0.005, 50.0)
-LOWEST_HU, DENSEST_HU = (-10_000.0, 1000.0), (-900.0, 70_000.0)
+LOWEST_HU, _DENSEST_HU = (-10_000.0, 1000.0), (-900.0, 70_000.0)
 """Ranges of the lowest and the densest voxel.  Undeclared padding goes down to -8192; a cut-out of bone has spongy
 parts.  A densest voxel below -900 is air; 16 bits end at 65535."""
 
@@ -50,7 +50,7 @@ def list_odd_values(facts: PixelFacts) -> list[str]:
     """Return the lowest and the densest voxel if they lie outside the range of every CT."""
     return [
         f"{name} voxel {value:g} HU, expected {low:g} to {high:g}"
-        for name, value, (low, high) in (("lowest", facts.hu_min, LOWEST_HU), ("densest", facts.hu_max, DENSEST_HU))
+        for name, value, (low, high) in (("lowest", facts.hu_min, LOWEST_HU), ("densest", facts.hu_max, _DENSEST_HU))
         if not low <= value <= high
     ]
 
@@ -61,13 +61,13 @@ def judge_figures(odd: Sequence[str]) -> Gate:
     return none_of("plausible_hu", len(odd), f"{what} ({'; '.join(odd)})" if odd else what)
 
 
-SIGN_SAID = "neighbouring values that lie nearly the whole range of the stored bits apart: the sign is lost"
+_SIGN_SAID = "neighbouring values that lie nearly the whole range of the stored bits apart: the sign is lost"
 
-FEWEST_BITS = 9
+_FEWEST_BITS = 9
 """An image of 8 bits or fewer has edges from the lowest to the highest value."""
-CLOSE = 0.125
+_CLOSE = 0.125
 """Neighbours this share of the range apart are close."""
-FEWEST_JUMPS, JUMPS, FEWEST_VALUES = 50, 4, 8
+_FEWEST_JUMPS, JUMPS, FEWEST_VALUES = 50, 4, 8
 """Fewest pairs of neighbours that are close only if they are read the other way, how many times those that are close as
 they were read, and fewest different values of theirs: a mask has two."""
 
@@ -75,12 +75,12 @@ they were read, and fewest different values of theirs: a mask has two."""
 def judge_sign(voxels: NDArray[Any], facts: PixelFacts, slices: Sequence[StoredValues]) -> Gate:
     """Judge the gate ``stored_sign`` by the sampled slices of a volume (nk, nj, ni); `slices` in the order of k."""
     if not slices:
-        return unmeasured("stored_sign", 0, None, f"{SIGN_SAID}: the values are no whole numbers")
+        return unmeasured("stored_sign", 0, None, f"{_SIGN_SAID}: the values are no whole numbers")
     close, jumps, pairs, first = 0, 0, [], slices[0]
     for k in sample_slices(len(slices)):
         header = slices[k]
         span = header.slope * 2.0**header.bits_stored
-        if header.bits_stored < FEWEST_BITS or facts.hu_max - facts.hu_min < (1.0 - CLOSE) * span or span <= 0.0:
+        if header.bits_stored < _FEWEST_BITS or facts.hu_max - facts.hu_min < (1.0 - _CLOSE) * span or span <= 0.0:
             continue
         picture = voxels[k]
         half = 0.0 if header.signed else 2.0 ** (header.bits_stored - 1)
@@ -88,12 +88,12 @@ def judge_sign(voxels: NDArray[Any], facts: PixelFacts, slices: Sequence[StoredV
         crossing = above[:, 1:] != above[:, :-1]
         left, right = picture[:, :-1][crossing].astype(np.float64), picture[:, 1:][crossing].astype(np.float64)
         apart = np.abs(left - right)
-        close += int(np.count_nonzero(apart < CLOSE * span))
-        wrapped = apart > (1.0 - CLOSE) * span
+        close += int(np.count_nonzero(apart < _CLOSE * span))
+        wrapped = apart > (1.0 - _CLOSE) * span
         jumps += int(np.count_nonzero(wrapped))
         pairs.append(left[wrapped])
-    if jumps < FEWEST_JUMPS or jumps <= JUMPS * close or len(np.unique(np.concatenate(pairs))) < FEWEST_VALUES:
-        return none_of("stored_sign", 0, SIGN_SAID)
+    if jumps < _FEWEST_JUMPS or jumps <= JUMPS * close or len(np.unique(np.concatenate(pairs))) < FEWEST_VALUES:
+        return none_of("stored_sign", 0, _SIGN_SAID)
     count = 2**first.bits_stored
     if first.signed:
         why = "values of dense bone or metal turn negative: the values seem to be stored without a sign, but"
@@ -109,19 +109,19 @@ def judge_sign(voxels: NDArray[Any], facts: PixelFacts, slices: Sequence[StoredV
     )
 
 
-CEILING_BITS = 12
+_CEILING_BITS = 12
 """Bits of most scanners, even where more bits are stored: 3071 HU with intercept -1024."""
 CEILING_HU = 3071
 """Highest value of 12 bits, however the values are stored now."""
-CEILING_VOXELS = 10
+_CEILING_VOXELS = 10
 """Least number of voxels at the ceiling; fewer may be noise in dense bone."""
 
-CEILING_LEVELS, CEILING_SPIKE = 8, 10.0
+_CEILING_LEVELS, _CEILING_SPIKE = 8, 10.0
 """Values beyond a ceiling: it still counts as one if it has this many times the voxels of the values around it.  Values
 that were cut off there and then interpolated, or put beside slices with more bits, exceed it in a few voxels."""
 
-LEAST_PADDING_SHARE = 0.01
-BLANK_SHOWN = 5
+_LEAST_PADDING_SHARE = 0.01
+_BLANK_SHOWN = 5
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def examine_voxels(
     scale, materials = judge_scale(sample, Layers(voxels), facts, slopes, known=known)
     warnings = [facts.padding_text] if facts.padding_text else []
     if facts.blank:
-        named = ", ".join(str(k + 1) for k in facts.blank[:BLANK_SHOWN]) + ", ..." * (len(facts.blank) > BLANK_SHOWN)
+        named = ", ".join(str(k + 1) for k in facts.blank[:_BLANK_SHOWN]) + ", ..." * (len(facts.blank) > _BLANK_SHOWN)
         warnings.append(
             f"{count_of(len(facts.blank), 'slice')} of {len(voxels):,} between others show one value alone, no picture"
             f" ({named}): what is there is cut in two"
@@ -169,7 +169,7 @@ def leave_unexamined() -> list[Gate]:
     """Return the gates of `examine_voxels` as not measured, for voxels that were not read."""
     return [
         unmeasured(name, 0, None, f"{text}: the pixels were not read")
-        for name, text in (("hu_scale", SCALE_SAID), ("stored_sign", SIGN_SAID), ("shown_places", SHOWN_SAID))
+        for name, text in (("hu_scale", SCALE_SAID), ("stored_sign", _SIGN_SAID), ("shown_places", SHOWN_SAID))
     ]
 
 
@@ -177,10 +177,10 @@ def _warn_of_saturation(voxels: NDArray[Any], facts: PixelFacts, slices: Sequenc
     """Warn of voxels at the highest value that the stored bits, or the 12 bits of the scanner, can express."""
     members: dict[tuple[float, int], set[int]] = {}
     if facts.hu_max >= CEILING_HU:
-        members[float(CEILING_HU), CEILING_BITS] = set(range(len(voxels)))
+        members[float(CEILING_HU), _CEILING_BITS] = set(range(len(voxels)))
     for k, header in enumerate(slices):
         highest = (1 << (header.bits_stored - header.signed)) - 1
-        for bits, stored in {(CEILING_BITS, (1 << CEILING_BITS) - 1), (header.bits_stored, highest)}:
+        for bits, stored in {(_CEILING_BITS, (1 << _CEILING_BITS) - 1), (header.bits_stored, highest)}:
             ceiling = float(np.float32(header.slope * stored + header.intercept))
             if stored <= highest and ceiling <= facts.hu_max:
                 members.setdefault((ceiling, bits), set()).add(k)
@@ -189,7 +189,7 @@ def _warn_of_saturation(voxels: NDArray[Any], facts: PixelFacts, slices: Sequenc
         slope = abs(slices[min(places)].slope) if slices else 1.0
         at, above, beside = np.sum([_count_near(voxels[k], ceiling, slope) for k in places], axis=0).tolist()
         # Values continue beyond: measured with more bits, unless a great many voxels have exactly this value.
-        if at <= CEILING_VOXELS or above and at <= CEILING_SPIKE * beside / (2 * CEILING_LEVELS):
+        if at <= _CEILING_VOXELS or above and at <= _CEILING_SPIKE * beside / (2 * _CEILING_LEVELS):
             continue
         what = "metal is saturated, its surface" if ceiling > METAL_HU else "dense bone is cut off, its surface"
         more = f" and {above} are above it, at most at {facts.hu_max:g} HU" if above else ""
@@ -198,20 +198,20 @@ def _warn_of_saturation(voxels: NDArray[Any], facts: PixelFacts, slices: Sequenc
 
 
 def _count_near(picture: NDArray[Any], ceiling: float, slope: float) -> tuple[int, int, int]:
-    """Count voxels of a slice at the ceiling, above it, and on the `CEILING_LEVELS` next values on either side."""
-    near = picture[picture >= ceiling - (CEILING_LEVELS + 0.5) * slope]
+    """Count voxels of a slice at the ceiling, above it, and on the `_CEILING_LEVELS` next values on either side."""
+    near = picture[picture >= ceiling - (_CEILING_LEVELS + 0.5) * slope]
     at = int(np.count_nonzero(near == ceiling))
     return (
         at,
         int(np.count_nonzero(near > ceiling)),
-        int(np.count_nonzero(near <= ceiling + (CEILING_LEVELS + 0.5) * slope)) - at,
+        int(np.count_nonzero(near <= ceiling + (_CEILING_LEVELS + 0.5) * slope)) - at,
     )
 
 
 def _warn_of_padding(sample: ValueSample, voxels: NDArray[Any]) -> list[str]:
     """Warn of one value far below air that many voxels have, without being declared as padding."""
     found = sample.commonest_below(LOWEST_AIR_HU)
-    if found is None or found[1] < LEAST_PADDING_SHARE:
+    if found is None or found[1] < _LEAST_PADDING_SHARE:
         return []
     value = found[0]
     share = sum(int(np.count_nonzero(picture == value)) for picture in voxels) / voxels.size

@@ -27,16 +27,16 @@ from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
 
-DEFLATE_RATIO = 1032
+_DEFLATE_RATIO = 1032
 """Highest compression ratio of Deflate (zlib's technical note)."""
 
-LARGEST_GRID = 2**32
+_LARGEST_GRID = 2**32
 """Most voxels of a grid: 1000 slices of 2048 x 2048."""
 
-LARGEST_SLICE_BYTES = 2**28
+_LARGEST_SLICE_BYTES = 2**28
 """Most stored bytes of a slice; slices are inflated one at a time."""
 
-LARGEST_SURPLUS = 4096
+_LARGEST_SURPLUS = 4096
 """Most bytes that may follow the last number: some writers fill up a block."""
 
 _CHUNK = 2**18
@@ -103,18 +103,18 @@ class ZlibFile(io.RawIOBase):
 
 def check_size(name: str, shape: tuple[int, ...], item_bytes: int, file_bytes: int, compressed: bool) -> None:
     """Compare the size that a header promises with what the file can hold."""
-    if min(shape) < 1 or prod(shape) > LARGEST_GRID:
+    if min(shape) < 1 or prod(shape) > _LARGEST_GRID:
         raise RefusedInputError(
             f"{name} says that it has {' x '.join(map(str, shape))} voxels: at least 1 an axis and at most"
-            f" {LARGEST_GRID:,} altogether are read"
+            f" {_LARGEST_GRID:,} altogether are read"
         )
-    if prod(shape[:-1]) * item_bytes > LARGEST_SLICE_BYTES:
+    if prod(shape[:-1]) * item_bytes > _LARGEST_SLICE_BYTES:
         raise RefusedInputError(
             f"{name} says that a slice has {' x '.join(map(str, shape[:-1]))} numbers of {item_bytes} bytes: at most"
-            f" {LARGEST_SLICE_BYTES:,} bytes are read"
+            f" {_LARGEST_SLICE_BYTES:,} bytes are read"
         )
     promised = prod(shape) * item_bytes
-    possible = file_bytes * (DEFLATE_RATIO if compressed else 1)
+    possible = file_bytes * (_DEFLATE_RATIO if compressed else 1)
     if promised > possible:
         raise RefusedInputError(
             f"{name} is cut or corrupt: {' x '.join(map(str, shape))} numbers of {item_bytes} bytes cannot come from"
@@ -141,9 +141,9 @@ def check_end(stream: BinaryIO, name: str) -> None:
     """Read to the end of the data, where the checksum of a compressed stream is."""
     found = 0
     try:
-        while part := stream.read(LARGEST_SURPLUS + 1):
+        while part := stream.read(_LARGEST_SURPLUS + 1):
             found += len(part)
-            if found > LARGEST_SURPLUS:
+            if found > _LARGEST_SURPLUS:
                 raise RefusedInputError(f"{name} is corrupt: it holds more numbers than its header says")
     except (EOFError, zlib.error, OSError) as error:
         raise RefusedInputError(f"{name} is cut or corrupt at its end: {escape_text(str(error))}") from error

@@ -32,13 +32,13 @@ from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
 LARGEST_HEADER = 2**20
-LONGEST_KEY, LONGEST_VALUE = 100, 4000
+_LONGEST_KEY, LONGEST_VALUE = 100, 4000
 """Longest accepted key and value in bytes; MetaIO has 255 bytes for keys and 32 KiB for values."""
 
 MM_PER_UNIT = {"": 1.0, "?": 1.0, "mm": 1.0, "cm": 10.0, "um": 0.001}
 """Millimetres of each value of DistanceUnits: missing or unknown (read as mm, as other programs do), mm, cm, micron."""
 
-SAME_FIELD = {
+_SAME_FIELD = {
     "Offset": ("Offset", "Position", "Origin"),
     "TransformMatrix": ("TransformMatrix", "Rotation", "Orientation"),
     "ByteOrderMSB": ("BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
@@ -57,7 +57,7 @@ UNUSED_NUMBERS = {"CenterOfRotation": 0, "ElementSize": 0, "Color": 4, "Compress
 """Fields of numbers that are not used, and how many they have, 0 for one an axis.  MetaIO takes what is missing from
 the lines that follow: those are then not read, or complained of on standard error."""
 
-ELEMENT_TYPES = (
+_ELEMENT_TYPES = (
     *(f"MET_{sign}{size}" for sign in ("", "U") for size in ("CHAR", "SHORT", "INT", "LONG", "LONG_LONG")),
     "MET_FLOAT", "MET_DOUBLE",
 )  # fmt: skip
@@ -101,10 +101,10 @@ def _read_fields(path: Path, name: str) -> tuple[dict[str, str], int]:
     seen = {""}
     at = 0
     while "ElementDataFile" not in fields:
-        line, newline, _ = start[at : at + LONGEST_KEY + LONGEST_VALUE].partition(b"\n")
+        line, newline, _ = start[at : at + _LONGEST_KEY + LONGEST_VALUE].partition(b"\n")
         key, mark, value = (part.strip() for part in line.decode("latin-1").partition("="))
         at += len(line) + len(newline)
-        if not line and not newline or (key and not mark) or len(key) > LONGEST_KEY or len(value) > LONGEST_VALUE:
+        if not line and not newline or (key and not mark) or len(key) > _LONGEST_KEY or len(value) > LONGEST_VALUE:
             raise RefusedInputError(
                 f"{name} has a corrupt MetaImage header: no line 'ElementDataFile = ...' ends it, it stops at"
                 f" '{escape_text(key)}'"
@@ -150,7 +150,7 @@ class _Header:
     def _check_kind(self) -> None:
         if self.text("ObjectType", "Image").lower() != "image":
             raise self.wrong("ObjectType", "Image")
-        if self.text("ElementType").upper() not in ELEMENT_TYPES:
+        if self.text("ElementType").upper() not in _ELEMENT_TYPES:
             raise self.wrong("ElementType", f"a {self.purpose} has one real number a voxel")
         if not self.flag("BinaryData", True):
             raise self.wrong("BinaryData", "True: voxels written as text are not read")
@@ -171,7 +171,7 @@ class _Header:
         return RefusedInputError(f"{self.name} is no usable MetaImage: {used} is '{shown}', expected {expected}")
 
     def _name_of(self, key: str) -> str | None:
-        used = [other for other in SAME_FIELD.get(key, (key,)) if other in self.fields]
+        used = [other for other in _SAME_FIELD.get(key, (key,)) if other in self.fields]
         if len(used) > 1:
             raise RefusedInputError(f"{self.name} has a corrupt MetaImage header: it says {used[0]} and {used[1]}")
         return used[0] if used else None

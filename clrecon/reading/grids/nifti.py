@@ -31,10 +31,10 @@ from clrecon.system.text import escape_text
 LARGEST_HEADER = 2**24
 """Most bytes before the voxels; extensions of label maps have some 10,000."""
 
-AFFINES_DIFFER_MM = 0.1
+_AFFINES_DIFFER_MM = 0.1
 """Distance at a corner from which sform and qform count as different; the quaternions of a qform are only float32."""
 
-SPACINGS_DIFFER = 0.01
+_SPACINGS_DIFFER = 0.01
 """Difference, as a share of the longest step, from which spacings count as different: ITK reads pixdim, others the
 sform."""
 
@@ -190,13 +190,13 @@ def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[F
     except UsageError as error:
         raise RefusedInputError(f"{name} cannot be placed: {error}") from error
     sides, stated = np.linalg.norm(chosen[:3, :3], axis=0), np.abs(header["pixdim"][1:4]).astype(np.float64)
-    if not np.abs(sides - stated).max() <= SPACINGS_DIFFER * sides.max():
+    if not np.abs(sides - stated).max() <= _SPACINGS_DIFFER * sides.max():
         shown = [" x ".join(f"{unit * step:.4g}" for step in steps) for steps in (stated, sides)]
         warnings.append(f"pixdim says a spacing of {shown[0]} mm, the affine {shown[1]} mm: the affine is used")
     if sform is not None and qform is not None:
         corners = np.array(list(product(*((0, length) for length in shape[:3]), (1,))))
         apart = unit * np.linalg.norm(corners @ (sform - qform).T, axis=1).max()
-        if not apart <= AFFINES_DIFFER_MM:
+        if not apart <= _AFFINES_DIFFER_MM:
             warnings.append(f"sform and qform lie {apart:.3g} mm apart: the sform is used")
     return affine, warnings
 
@@ -209,7 +209,7 @@ def _qform(header: Any) -> Any:
     return header.get_qform(coded=True)[0]
 
 
-COMMENT_CODE = 6
+_COMMENT_CODE = 6
 """Code of the extension that holds plain text."""
 
 
@@ -232,7 +232,7 @@ def _write_parts(stream: Any, content: VolumeContent) -> None:
     place_in_header(header, content.affine)
     header["descrip"] = b"HU; certificate of clrecon in the header extension"
     text = "\n".join(("clrecon", *content.lines)).encode("ascii")
-    extension = nibabel.nifti1.Nifti1Extension(COMMENT_CODE, text)
+    extension = nibabel.nifti1.Nifti1Extension(_COMMENT_CODE, text)
     header.extensions.append(extension)
     header["vox_offset"] = header.single_vox_offset + header.extensions.get_sizeondisk()
     header.write_to(stream)

@@ -28,7 +28,7 @@ from clrecon.system.text import escape_text
 
 LARGEST_HEADER = 2**20
 
-LPS_FROM_SPACE = {
+_LPS_FROM_SPACE = {
     "left-posterior-superior": (1.0, 1.0, 1.0), "lps": (1.0, 1.0, 1.0),
     "right-anterior-superior": (-1.0, -1.0, 1.0), "ras": (-1.0, -1.0, 1.0),
     "left-anterior-superior": (1.0, -1.0, 1.0), "las": (1.0, -1.0, 1.0),
@@ -175,12 +175,12 @@ def _dtype(header: dict[str, Any], name: str, purpose: str) -> np.dtype[Any]:
 def nrrd_affine(header: dict[str, Any], name: str) -> Float64Array:
     """Return the affine of the three axes with a direction in a header as pynrrd reads it, from its frame to LPS."""
     space = str(header.get("space", "")).strip().lower()
-    if space not in LPS_FROM_SPACE:
+    if space not in _LPS_FROM_SPACE:
         raise RefusedInputError(
             f"{name} does not say where it lies in the patient (space '{escape_text(space)}'): write it with the space"
             " left-posterior-superior, right-anterior-superior or left-anterior-superior"
         )
-    signs = np.array(LPS_FROM_SPACE[space])
+    signs = np.array(_LPS_FROM_SPACE[space])
     try:
         directions: NDArray[np.float64] = np.asarray(header["space directions"], dtype=np.float64)
         if len(directions) != header["dimension"]:
@@ -207,7 +207,7 @@ def _unit_scale(header: dict[str, Any], name: str) -> NDArray[np.float64]:
     return np.array(scales, dtype=np.float64)
 
 
-CHUNK_BYTES = 2**20
+_CHUNK_BYTES = 2**20
 """Bytes of voxels that pynrrd packs at a time, for the progress."""
 
 
@@ -217,7 +217,7 @@ class _Undated(io.RawIOBase):
     def __init__(self, stream: BinaryIO, content: VolumeContent):
         super().__init__()
         self._stream, self._progress = stream, content.progress
-        self._chunks = -(-content.voxels.nbytes // CHUNK_BYTES)
+        self._chunks = -(-content.voxels.nbytes // _CHUNK_BYTES)
         self._in_header, self._done = True, 0
 
     def writable(self) -> bool:

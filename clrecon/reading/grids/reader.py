@@ -84,15 +84,15 @@ def open_grid(path: Path, kind: str, purpose: str) -> GridFile:
     return opener(path, purpose)
 
 
-LADDER = (np.dtype(np.int16), np.dtype(np.int32), np.dtype(np.float32))
+_LADDER = (np.dtype(np.int16), np.dtype(np.int32), np.dtype(np.float32))
 """Types of a volume, from the narrowest to the widest."""
 
-MOST_LABELS = 256
+_MOST_LABELS = 256
 """Most different whole numbers of what is no CT: label maps have up to about 120, 8-bit images 256, a CT some
 thousand."""
-LARGEST_LABEL = 65_535
+_LARGEST_LABEL = 65_535
 
-LEAST_SPAN = 100.0
+_LEAST_SPAN = 100.0
 """Least range of HU in a CT: air and soft tissue differ by 1000, normalised values span 1, standardised ones about
 10."""
 
@@ -121,8 +121,8 @@ def read_values(grid: GridFile, progress: Progress | None = None) -> GridValues:
 class _Filling:
     def __init__(self, grid: GridFile):
         self._grid = grid
-        self._step = 0  # index into LADDER
-        self._voxels = allocate_voxels(grid.shape_ijk[::-1], LADDER[0], grid.name)
+        self._step = 0  # index into _LADDER
+        self._voxels = allocate_voxels(grid.shape_ijk[::-1], _LADDER[0], grid.name)
         self._holes, self._low, self._high = 0, np.inf, -np.inf
 
     def add(self, k: int, stored: NDArray[Any]) -> None:
@@ -140,7 +140,7 @@ class _Filling:
             step = self._step_for(k, measured, low, high)
             if step > self._step:
                 narrow, self._step = self._voxels, step
-                self._voxels = allocate_voxels(self._grid.shape_ijk[::-1], LADDER[step], self._grid.name)
+                self._voxels = allocate_voxels(self._grid.shape_ijk[::-1], _LADDER[step], self._grid.name)
                 self._voxels[:k] = narrow[:k]
         np.copyto(self._voxels[k], values, casting="unsafe")  # the type holds all these values
 
@@ -155,7 +155,7 @@ class _Filling:
         if not whole and (self._step == 2 or not np.array_equal(measured, np.rint(measured))):
             return 2
         for step in range(self._step, 2):
-            half = 1 << (8 * LADDER[step].itemsize - 1)
+            half = 1 << (8 * _LADDER[step].itemsize - 1)
             if -half <= low and high < half:
                 return step
         if whole:
@@ -211,24 +211,24 @@ def _scale(stored: NDArray[Any], grid: GridFile) -> NDArray[Any]:
 def _doubts(voxels: NDArray[Any], low: float, high: float) -> list[str]:
     """Return reasons why the values may not be HU; `low` and `high` are the extremes of the measured values."""
     span = f"the values run from {low:.5g} to {high:.5g}"
-    if low >= 0 and voxels.dtype.kind == "i" and high <= LARGEST_LABEL:
+    if low >= 0 and voxels.dtype.kind == "i" and high <= _LARGEST_LABEL:
         seen = np.zeros(int(high) + 1, dtype=bool)
         for plane in voxels:
             seen[plane[plane >= 0]] = True
-        if np.count_nonzero(seen) <= MOST_LABELS:
+        if np.count_nonzero(seen) <= _MOST_LABELS:
             return [
                 f"{span} in {np.count_nonzero(seen)} different whole numbers: this looks like a label map (those go"
                 f" with {name_parameter('labels')}) or an 8-bit image, not like HU"
             ]
-    if high - low < LEAST_SPAN:
+    if high - low < _LEAST_SPAN:
         return [f"{span}: normalised, not HU"]
     if low >= 0:
         return [f"{span}, none is below 0: not HU, or HU with an offset (often 1024), which iso values then need too"]
     return []
 
 
-MODALITY = "unknown"
-NOT_DICOM = "not DICOM: position, spacing and the meaning of the values are as the file says and are not verified"
+_MODALITY = "unknown"
+_NOT_DICOM = "not DICOM: position, spacing and the meaning of the values are as the file says and are not verified"
 
 
 def judge_spacing(grid: GridFile) -> Gate:
@@ -247,7 +247,7 @@ def certify_grid(
     ni, nj, nk = grid.shape_ijk
     return Certificate(
         format=grid.kind,
-        series={"number": 1, "uid_hash": None, "modality": MODALITY},
+        series={"number": 1, "uid_hash": None, "modality": _MODALITY},
         slices=nk,
         shape_ijk=[ni, nj, nk],
         spacing_mm=list(spacing),
@@ -325,14 +325,14 @@ def read_grid(path: Path, kind: str, *, rescale: Rescale | None = None, progress
 def _examine(grid: GridFile, values: GridValues) -> VoxelFindings:
     stored: list[StoredRange] = []
     if grid.dtype.kind in "iu":
-        one = StoredRange(8 * grid.dtype.itemsize, grid.dtype.kind == "i", grid.slope, grid.intercept)
-        stored = [one] * len(values.voxels)
+        stored_range = StoredRange(8 * grid.dtype.itemsize, grid.dtype.kind == "i", grid.slope, grid.intercept)
+        stored = [stored_range] * len(values.voxels)
     return examine_voxels(values.voxels, values.facts, (), known=not values.doubts, stored=stored)
 
 
 def _collect_warnings(grid: GridFile, values: GridValues | None, findings: VoxelFindings | None) -> list[str]:
     """Return warnings about the header, then about the values where they were read."""
-    warnings = [NOT_DICOM, *grid.warnings]
+    warnings = [_NOT_DICOM, *grid.warnings]
     spacing = judge_spacing(grid)
     if spacing.ok is False:
         warnings.append(f"{spacing.text}: maybe the file has other units than it says")
@@ -363,7 +363,7 @@ def list_grid(
         number=1,
         uid_hash=None,
         description=f"{grid.kind} file, voxels {grid.dtype.name}",
-        modality=MODALITY,
+        modality=_MODALITY,
         warnings=list(warnings),
         problems=[],
         **{name: certificate[name] for name in copied},

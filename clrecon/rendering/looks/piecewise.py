@@ -116,7 +116,7 @@ STEEP = 0.1
 DENSE = 0.7
 """Opacity of a ray step from which on only its front is visible."""
 
-STEEP_HU = 50.0
+_STEEP_HU = 50.0
 """Widest range of HU for the change `STEEP`: over wider ones parts are no better than samples alone, and cost time."""
 
 
@@ -127,7 +127,7 @@ class Steepness:
     changes: Shape (nodes,). Sum of the changes of opacity, up and down, from the first node to each node.
     narrow: Number of nodes within which the opacity changes by at most `STEEP`.
     has_dense: The opacity is above `DENSE` somewhere.
-    is_steep: The opacity changes by more than `STEEP` within `STEEP_HU` somewhere.
+    is_steep: The opacity changes by more than `STEEP` within `_STEEP_HU` somewhere.
     """
 
     changes: NDArray[np.float64]
@@ -144,4 +144,4 @@ class Steepness:
         apart = (ends - np.arange(len(changes)))[reached]
         # Values this far apart may be rounded to nodes that are one more apart.
         narrow = float(max(apart.min() - 1, 0)) if len(apart) else float(len(changes))
-        return cls(changes, narrow, bool((opacities > DENSE).any()), narrow <= STEEP_HU * nodes_per_hu)
+        return cls(changes, narrow, bool((opacities > DENSE).any()), narrow <= _STEEP_HU * nodes_per_hu)

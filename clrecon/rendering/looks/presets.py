@@ -48,12 +48,12 @@ _CORTEX = (0.96, 0.91, 0.80)
 _DENSE = (1.00, 0.99, 0.95)
 _STEEL = (0.72, 0.80, 0.90)
 
-SOFT_GRADIENT = 25.0
+_SOFT_GRADIENT = 25.0
 """`Lighting.soft_gradient` for bone, HU per mm: its surfaces have 100 to 1000, noise of 10 HU in 0.7 mm 10 to 15."""
 
-_MATT = Lighting(ambient=0.25, diffuse=0.85, specular=0.15, specular_power=12.0, soft_gradient=SOFT_GRADIENT)
-_SOFT = replace(_MATT, soft_gradient=0.3 * SOFT_GRADIENT)  # where muscle meets fat are 30 to 100 HU per mm
-_GLOSSY = Lighting(ambient=0.2, diffuse=0.85, specular=0.25, specular_power=20.0, soft_gradient=SOFT_GRADIENT)
+_MATT = Lighting(ambient=0.25, diffuse=0.85, specular=0.15, specular_power=12.0, soft_gradient=_SOFT_GRADIENT)
+_SOFT = replace(_MATT, soft_gradient=0.3 * _SOFT_GRADIENT)  # where muscle meets fat are 30 to 100 HU per mm
+_GLOSSY = Lighting(ambient=0.2, diffuse=0.85, specular=0.25, specular_power=20.0, soft_gradient=_SOFT_GRADIENT)
 
 _Row = tuple[float, tuple[float, float, float], float]
 

@@ -30,9 +30,9 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.paths import read_regular
 from clrecon.system.text import escape_text
 
-SIZE_LIMIT = 1_000_000
+_SIZE_LIMIT = 1_000_000
 """Bytes: presets.xml of 3D Slicer has 12 kB."""
-NAMES_LISTED = 60
+_NAMES_LISTED = 60
 
 _FIELDS = ("format", "version", "name", "description", "unit_distance_mm", "points", "gradient_opacity", "lighting")
 _LIGHT = ("ambient", "diffuse", "specular", "specular_power", "soft_gradient", "direction")
@@ -97,7 +97,7 @@ def _read_file(path: Path, shown: str) -> bytes:
     if not stat.S_ISREG(status.st_mode):
         raise RefusedInputError("it is no regular file")
     try:
-        return read_regular(path, SIZE_LIMIT)
+        return read_regular(path, _SIZE_LIMIT)
     except OSError as error:
         if error.errno == errno.EFBIG:
             raise RefusedInputError(f"{error.strerror}: no transfer function is") from None
@@ -135,8 +135,8 @@ def _json_entries(value: Any) -> list[Entry]:
 
 def _choose_entry(entries: list[Entry], name: str | None, shown: str) -> Entry:
     names = [entry_name or str(n) for n, (entry_name, _) in enumerate(entries, start=1)]
-    listed = ", ".join(f"{entry!r}"[:66] for entry in names[:NAMES_LISTED])
-    listed += f" and {len(names) - NAMES_LISTED} more" if len(names) > NAMES_LISTED else ""
+    listed = ", ".join(f"{entry!r}"[:66] for entry in names[:_NAMES_LISTED])
+    listed += f" and {len(names) - _NAMES_LISTED} more" if len(names) > _NAMES_LISTED else ""
     if name is None:
         if len(entries) > 1:
             raise _Choice(f"{shown} has {len(entries)} transfer functions, choose one by name: {listed}")
@@ -191,7 +191,7 @@ def _own_point(point: Any, place: str) -> tuple[float, ...]:
 Entry = tuple[str, Callable[[], dict[str, Any]]]
 """A name, empty where the file has none, and the function that makes the parameters."""
 
-GRADIENT_VOXEL_MM = 1.0
+_GRADIENT_VOXEL_MM = 1.0
 """Voxel size for gradients: VTK's are in HU per voxel of a size that no file states; they are taken as HU per mm."""
 
 _LINES = (
@@ -238,7 +238,7 @@ def _slicer_parameters(texts: Mapping[str, str], place: Callable[[str], str]) ->
     if texts.get("gradientOpacity", "").strip():
         what = place("gradientOpacity")
         gradient = gradient_points(
-            curve_from_nodes(what, _parse_nodes(texts["gradientOpacity"], what, 2)), GRADIENT_VOXEL_MM
+            curve_from_nodes(what, _parse_nodes(texts["gradientOpacity"], what, 2)), _GRADIENT_VOXEL_MM
         )
     lighting = UNSHADED
     if number("shade", 0.0) != 0.0:
@@ -311,7 +311,7 @@ def _json_parameters(value: Any, where: str) -> dict[str, Any]:
     if "gradientOpacity" in fields and not fields.get("disableGradientOpacity", False):
         place = f"{where}.gradientOpacity"
         nodes = _json_nodes(fields["gradientOpacity"], place, False)
-        gradient = gradient_points(curve_from_nodes(place, nodes), GRADIENT_VOXEL_MM)
+        gradient = gradient_points(curve_from_nodes(place, nodes), _GRADIENT_VOXEL_MM)
     lighting = UNSHADED
     if fields.get("shade", False):
         light = take_object(fields.get("lighting", {}), f"{where}.lighting")

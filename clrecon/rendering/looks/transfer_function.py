@@ -18,13 +18,13 @@ from clrecon.rendering.looks.piecewise import check_ascending, check_share, eval
 from clrecon.system.arguments import as_numbers, explains_arguments
 from clrecon.system.base_classes import Message
 
-UNIT_LIMIT_MM = 1e9
+_UNIT_LIMIT_MM = 1e9
 """Largest unit distance; its inverse is the smallest.  float32 holds all that a ray step computes from them."""
 
-HU_LIMIT = 1e6
+_HU_LIMIT = 1e6
 """Largest HU, far beyond any scale of CT values; float32 still distinguishes whole HU there."""
 
-END_STEP_HU = 1.0
+_END_STEP_HU = 1.0
 """How far `TransferFunction.range_hu` extends beyond a step at its end, so that both sides of it are included."""
 
 COLUMNS = ("red", "green", "blue", "opacity")
@@ -91,10 +91,10 @@ class TransferFunction(Message):
             self._unit_distance = float(unit_distance)
         except (TypeError, ValueError, OverflowError):
             self._unit_distance = np.nan
-        if not 1.0 / UNIT_LIMIT_MM <= self._unit_distance <= UNIT_LIMIT_MM:
+        if not 1.0 / _UNIT_LIMIT_MM <= self._unit_distance <= _UNIT_LIMIT_MM:
             raise UsageError(
                 "the unit distance of a transfer function is a length in mm, above 0 and at most"
-                f" {UNIT_LIMIT_MM:g}, not {unit_distance!r}"
+                f" {_UNIT_LIMIT_MM:g}, not {unit_distance!r}"
             )
         if not (lighting is None or isinstance(lighting, Lighting)):
             raise UsageError(f"the lighting of a transfer function is a Lighting or None, not {lighting!r}")
@@ -107,7 +107,7 @@ class TransferFunction(Message):
         what = "the transfer function"
         points = _checked_rows(what, "(hu, red, green, blue, opacity)", rows, 5)
         hu = points[:, 0]
-        if np.abs(hu).max() > HU_LIMIT:
+        if np.abs(hu).max() > _HU_LIMIT:
             at = int(np.abs(hu).argmax())
             raise UsageError(f"point {at + 1} of {what} lies at {hu[at]:g} HU, beyond a million")
         check_ascending(what, "HU", hu)
@@ -120,7 +120,7 @@ class TransferFunction(Message):
     def _check_gradient(rows: ArrayLike) -> Float64Array:
         what = "the gradient opacity"
         points = _checked_rows(what, "(HU per mm, factor)", rows, 2)
-        if points[:, 0].min() < 0 or points[:, 0].max() > HU_LIMIT:
+        if points[:, 0].min() < 0 or points[:, 0].max() > _HU_LIMIT:
             raise UsageError(f"{what} goes from 0 to at most a million HU per mm")
         check_ascending(what, "HU per mm", points[:, 0])
         for at in np.flatnonzero((points[:, 1] < 0) | (points[:, 1] > 1))[:1]:
@@ -159,13 +159,13 @@ class TransferFunction(Message):
 
     @property
     def range_hu(self) -> tuple[float, float]:
-        """HU beyond which the function is constant, the lower first: ``END_STEP_HU`` more where it ends in a step."""
+        """HU beyond which the function is constant, the lower first: ``_END_STEP_HU`` more where it ends in a step."""
         hu = self._points[:, 0]
         low, high = float(hu[0]), float(hu[-1])
         alone = hu.size == 1
         return (
-            low - END_STEP_HU if alone or hu[1] == low else low,
-            high + END_STEP_HU if alone or hu[-2] == high else high,
+            low - _END_STEP_HU if alone or hu[1] == low else low,
+            high + _END_STEP_HU if alone or hu[-2] == high else high,
         )
 
     def __call__(self, hu: ArrayLike) -> Float64Array:

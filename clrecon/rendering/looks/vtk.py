@@ -17,7 +17,7 @@ from clrecon.system.arguments import as_numbers
 STEP_HU = 1e-4
 """Nodes nearer than this form a step: programs that cannot keep two nodes at one place move one by a rounding unit."""
 
-COLORS_A_PART = 64
+_COLORS_A_PART = 64
 """Number of straight parts between two nodes that replace a way through a colour space other than RGB."""
 
 
@@ -70,7 +70,7 @@ def _color_curve(function: Any) -> tuple[Float64Array, Float64Array]:
     if function.GetColorSpace() != 0:  # VTK_CTF_RGB
         positions = np.unique([node[0] for node in nodes])
         ways = [
-            np.linspace(*ends, COLORS_A_PART, endpoint=False) for ends in zip(positions, positions[1:], strict=False)
+            np.linspace(*ends, _COLORS_A_PART, endpoint=False) for ends in zip(positions, positions[1:], strict=False)
         ]
         nodes = [[x, *function.GetColor(x), 0.5, 0.0] for x in np.concatenate([*ways, positions[-1:]]).tolist()]
     if function.GetScale() != 0:  # VTK_CTF_LINEAR

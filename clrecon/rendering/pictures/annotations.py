@@ -56,7 +56,7 @@ SMALLEST_SIDE = 64
 LEAST_SHARE = 0.05
 """Smallest component of a unit vector that gets a letter: a turn by 3 degrees."""
 
-TEXT_SHARE, SMALLEST_TEXT = 1 / 28, 9.0
+TEXT_SHARE, _SMALLEST_TEXT = 1 / 28, 9.0
 """Height of the text as a share of the shorter side, and the smallest height in pixels."""
 
 LONGEST_BAR_SHARE = 0.35
@@ -155,7 +155,7 @@ def check_caption(caption: str | None) -> None:
     """Refuse a caption with characters that the font lacks: they would be drawn as boxes."""
     if not caption:
         return
-    font = load_font(4.0 * SMALLEST_TEXT)
+    font = load_font(4.0 * _SMALLEST_TEXT)
     box = bytes(font.getmask("\uffff"))  # not a character: the font draws its box for missing ones
     absent = [
         letter for letter in dict.fromkeys(caption) if letter.isprintable() and bytes(font.getmask(letter)) == box
@@ -177,7 +177,7 @@ class _Page:
         self._pens = [ImageDraw.Draw(mask) for mask in self._masks]
         self._ink = _choose_ink(rendering)
         shorter = min(self._size)
-        text = max(SMALLEST_TEXT, TEXT_SHARE * shorter)
+        text = max(_SMALLEST_TEXT, TEXT_SHARE * shorter)
         self._font = load_font(text)
         self._margin = max(2, round(0.02 * shorter))
         self._stroke = max(1, round(text / 14.0))

@@ -22,7 +22,7 @@ NO_COLOR = (-1.0, -1.0, -1.0)
 NO_LABEL = 0
 """Number of the voxels without a label: they can be made translucent or hidden, as labels can."""
 
-GOLDEN_SHARE = 0.618034
+_GOLDEN_SHARE = 0.618034
 """Step from one hue to the next, as a share of the circle: any number of colours made with it stay distinct."""
 
 
@@ -106,7 +106,7 @@ def _check_opacity(name: str, factor: float) -> float:
 
 def distinct_colors(count: int) -> NDArray[np.float64]:
     """Return colours (count, 3) from 0 to 1 with distinct hues; the first ones are the same for every `count`."""
-    hues = (0.08 + GOLDEN_SHARE * np.arange(count)) % 1.0
+    hues = (0.08 + _GOLDEN_SHARE * np.arange(count)) % 1.0
     bright = (0.95, 0.8)
     colors = [colorsys.hsv_to_rgb(hue, 0.55 + 0.2 * (n % 3 == 1), bright[n % 2]) for n, hue in enumerate(hues)]
     return np.array(colors, dtype=np.float64).reshape(count, 3)
@@ -119,7 +119,7 @@ TIES = 1e-6
 FILL = 0.3
 """Share of its colour within a label for which none is given: the scan stays to be read under it."""
 
-OUTLINE_SHARE = 1 / 400
+_OUTLINE_SHARE = 1 / 400
 """Width of outlines as a share of the shorter side of a picture; a pixel at least."""
 
 
@@ -159,7 +159,7 @@ def draw_labels(
     for label, share in (tints or {}).items():
         shares[find_shown(look.labels, label)] = share
     own = drawn[numbers] & (image[..., 3] > 0)
-    wide = max(1, round(OUTLINE_SHARE * min(numbers.shape))) if width is None else width
+    wide = max(1, round(_OUTLINE_SHARE * min(numbers.shape))) if width is None else width
     # pixels from which another label, or none, is at most `wide` steps away
     edges = np.zeros(numbers.shape, dtype=bool)
     for step in range(1, wide + 1):

@@ -302,7 +302,7 @@ def _finite(depth: NDArray[np.floating]) -> NDArray[np.float32]:
 
 IMAGE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF"}
 
-FLOAT_FORMATS = (".npy", ".tif", ".tiff")
+_FLOAT_FORMATS = (".npy", ".tif", ".tiff")
 
 _MOST_PER_METRE = 2**31 - 1
 """Largest number of pixels per metre in a PNG file."""
@@ -343,16 +343,16 @@ def encode_image(rendering: PictureData, extension: str, quality: int = 95) -> b
 
 
 def write_floats(array: NDArray[np.float32], path: str | os.PathLike[str], pixel_mm: float | None = None) -> int:
-    """Write float32 pixels (h, w), NaN included, to a file with an extension of `FLOAT_FORMATS`; return its bytes."""
+    """Write float32 pixels (h, w), NaN included, to a file with an extension of `_FLOAT_FORMATS`; return its bytes."""
     return _replace_image(path, encode_floats(array, check_float_path(path), pixel_mm))
 
 
 def check_float_path(path: str | os.PathLike[str]) -> str:
-    return find_extension(path, FLOAT_FORMATS, "depth or value")
+    return find_extension(path, _FLOAT_FORMATS, "depth or value")
 
 
 def encode_floats(array: NDArray[np.float32], extension: str, pixel_mm: float | None = None) -> bytes:
-    """Return the bytes of the file that `write_floats` writes; `extension` is one of `FLOAT_FORMATS`."""
+    """Return the bytes of the file that `write_floats` writes; `extension` is one of `_FLOAT_FORMATS`."""
     floats = np.ascontiguousarray(array, dtype=np.float32)
     stream = BytesIO()
     if extension == ".npy":

@@ -20,14 +20,14 @@ from clrecon.system.light_dataclass import dataclass, field, replace
 SHEET_SIZE = (1600, 1200)
 """Default width and height of a contact sheet: twenty slices of about 300 pixels."""
 
-TILE_GAP_PIXELS = 2
+_TILE_GAP_PIXELS = 2
 LEAST_TILE = 64
 """Least pixels along the shorter side of a tile; what is written on smaller ones cannot be read."""
 
-LEAST_LETTERED = 96
+_LEAST_LETTERED = 96
 """Least pixels along the shorter side of a tile with letters."""
 
-TEXT_SHARE, LEAST_TEXT, MOST_TEXT = 1 / 14, 9.0, 18.0
+TEXT_SHARE, _LEAST_TEXT, MOST_TEXT = 1 / 14, 9.0, 18.0
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def lay_out(count: int, mm: tuple[float, float], size: tuple[int, int], zoom: fl
     for columns in range(1, count + 1):
         rows = -(-count // columns)
         room = [
-            (whole - (many - 1) * TILE_GAP_PIXELS) // many for whole, many in zip(size, (columns, rows), strict=True)
+            (whole - (many - 1) * _TILE_GAP_PIXELS) // many for whole, many in zip(size, (columns, rows), strict=True)
         ]
         if min(room) < 1:
             continue
@@ -60,10 +60,10 @@ def lay_out(count: int, mm: tuple[float, float], size: tuple[int, int], zoom: fl
         )
     pixel, columns, (width, height) = best
     rows = -(-count // columns)
-    left = (size[0] - columns * (width + TILE_GAP_PIXELS) + TILE_GAP_PIXELS) // 2
-    top = (size[1] - rows * (height + TILE_GAP_PIXELS) + TILE_GAP_PIXELS) // 2
+    left = (size[0] - columns * (width + _TILE_GAP_PIXELS) + _TILE_GAP_PIXELS) // 2
+    top = (size[1] - rows * (height + _TILE_GAP_PIXELS) + _TILE_GAP_PIXELS) // 2
     corners = tuple(
-        (left + n % columns * (width + TILE_GAP_PIXELS), top + n // columns * (height + TILE_GAP_PIXELS))
+        (left + n % columns * (width + _TILE_GAP_PIXELS), top + n // columns * (height + _TILE_GAP_PIXELS))
         for n in range(count)
     )
     return SheetLayout((width, height), pixel / zoom, corners)
@@ -72,13 +72,13 @@ def lay_out(count: int, mm: tuple[float, float], size: tuple[int, int], zoom: fl
 def write_on_tile(image: NDArray[np.uint8], texts: tuple[str, ...], edges: Mapping[str, str]) -> NDArray[np.uint8]:
     """Write on a copy of a tile (h, w, 4): the first text that fits, else the last, at the top left.
 
-    edges: Sides of the patient at the ``left`` and ``right`` edge, for tiles of `LEAST_LETTERED` pixels and more.
+    edges: Sides of the patient at the ``left`` and ``right`` edge, for tiles of `_LEAST_LETTERED` pixels and more.
     """
     load_pillow()
     from PIL import Image, ImageDraw
 
     height, width = image.shape[:2]
-    font = load_font(float(np.clip(TEXT_SHARE * min(height, width), LEAST_TEXT, MOST_TEXT)))
+    font = load_font(float(np.clip(TEXT_SHARE * min(height, width), _LEAST_TEXT, MOST_TEXT)))
     fitting = [text for text in texts if font.getlength(text) <= width - 6]
     picture: Any = Image.fromarray(np.ascontiguousarray(image))
     pen = ImageDraw.Draw(picture)
@@ -87,14 +87,14 @@ def write_on_tile(image: NDArray[np.uint8], texts: tuple[str, ...], edges: Mappi
         pen.text(at, text, (255, 255, 255, 255), font, anchor, stroke_width=1, stroke_fill=(0, 0, 0, 255))
 
     write((3, 2), fitting[0] if fitting else texts[-1], "la")
-    if min(height, width) >= LEAST_LETTERED:
+    if min(height, width) >= _LEAST_LETTERED:
         for x, anchor, edge in ((3, "lm", "left"), (width - 3, "rm", "right")):
             write((x, height / 2), edges[edge], anchor)
     return np.array(picture)
 
 
 GAP_PIXELS = 6
-TEXT_PIXELS = 15
+_TEXT_PIXELS = 15
 BACKGROUND = 24
 
 
@@ -132,18 +132,18 @@ def draw_sheet(
     columns = max(len(row) for row in rows)
     whole = (
         columns * (width + GAP_PIXELS) + GAP_PIXELS,
-        len(rows) * (height + GAP_PIXELS) + GAP_PIXELS + len(footer) * (TEXT_PIXELS + 5) + (6 if footer else 0),
+        len(rows) * (height + GAP_PIXELS) + GAP_PIXELS + len(footer) * (_TEXT_PIXELS + 5) + (6 if footer else 0),
     )
     page = Image.new("RGB", whole, (BACKGROUND,) * 3)
-    font = load_font(TEXT_PIXELS)
+    font = load_font(_TEXT_PIXELS)
     for y, row in enumerate(rows):
         for x, panel in enumerate(row):
             corner = (GAP_PIXELS + x * (width + GAP_PIXELS), GAP_PIXELS + y * (height + GAP_PIXELS))
             page.paste(_draw_panel(panel, window, font), corner)
     draw = ImageDraw.Draw(page)
-    top = whole[1] - len(footer) * (TEXT_PIXELS + 5) - 4
+    top = whole[1] - len(footer) * (_TEXT_PIXELS + 5) - 4
     for number, text in enumerate(footer):
-        draw.text((GAP_PIXELS + 4, top + number * (TEXT_PIXELS + 5)), text, fill=(230, 230, 230), font=font)
+        draw.text((GAP_PIXELS + 4, top + number * (_TEXT_PIXELS + 5)), text, fill=(230, 230, 230), font=font)
     pixels = np.asarray(page, dtype=np.uint8)
     image = np.dstack((pixels, np.full(pixels.shape[:2], 255, np.uint8)))
     nothing = np.full(pixels.shape[:2], np.nan, np.float32)
@@ -167,7 +167,7 @@ def _draw_panel(panel: Panel, window: tuple[float, float], font: Any) -> Any:
             draw.line([(float(x), float(y)) for x, y in places], fill=stroke.color, width=2)
     outline: dict[str, Any] = {"fill": (255, 255, 255), "stroke_width": 2, "stroke_fill": (0, 0, 0), "font": font}
     for number, text in enumerate(panel.captions):
-        draw.text((6, 4 + number * (TEXT_PIXELS + 4)), text, **outline)
+        draw.text((6, 4 + number * (_TEXT_PIXELS + 4)), text, **outline)
     left, right, top, bottom = panel.edges
     for text, place, anchor in (
         (left, (5, height / 2), "lm"),

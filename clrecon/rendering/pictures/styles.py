@@ -42,12 +42,12 @@ PROJECTIONS, COMBINATIONS, CURVED_KINDS = (get_args(words) for words in (Project
 DEFAULT_ISO_VALUE = 200.0
 """Iso value of surfaces in HU: bone, including the thin cortex of vertebrae."""
 
-DEFAULT_COLOR = "bone"
+_DEFAULT_COLOR = "bone"
 
-DEFAULT_OPACITY = 0.5
+_DEFAULT_OPACITY = 0.5
 """Opacity of a slice in space: the front slices are bright, and the third still gives an eighth of its light."""
 
-LOWEST_SHOWN_HU = -300.0
+_LOWEST_SHOWN_HU = -300.0
 """HU below this are transparent: air, lung and most things around a patient, so that slices behind are visible."""
 
 
@@ -70,7 +70,7 @@ class Lit:
     @property
     def rgb(self) -> Float64Array:
         """The colour: red, green and blue, each from 0 to 1."""
-        return find_color(DEFAULT_COLOR if self.color is None else self.color)
+        return find_color(_DEFAULT_COLOR if self.color is None else self.color)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -294,7 +294,7 @@ class SlicesInSpace(Style):
     slices: int | Sequence[int] | None = style_field(None, checks.slices)
     _: KW_ONLY
     opacity: float = style_field(
-        DEFAULT_OPACITY,
+        _DEFAULT_OPACITY,
         checks.number("the opacity of a slice lies above 0 and up to 1, not at", lambda share: 0.0 < share <= 1.0),
         "slice_opacity",
     )
@@ -303,7 +303,7 @@ class SlicesInSpace(Style):
         None, checks.instance_of("transfer function", TransferFunction)
     )
     lowest_hu: float = style_field(
-        LOWEST_SHOWN_HU, checks.number("the lowest HU that slices show is a number, not", lambda hu: True)
+        _LOWEST_SHOWN_HU, checks.number("the lowest HU that slices show is a number, not", lambda hu: True)
     )
     clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
 

@@ -11,7 +11,7 @@ from clrecon.errors import UsageError
 from clrecon.rendering.pictures.annotations import PictureData
 from clrecon.rendering.views.camera import Camera
 
-FORMS = ("points", "plane")
+_FORMS = ("points", "plane")
 
 
 def rendering_to_pyvista(
@@ -21,8 +21,8 @@ def rendering_to_pyvista(
     camera = rendering.camera
     if camera is None:
         raise UsageError("this picture is no projection (its camera is None): it has no place in a scene")
-    if form not in FORMS:
-        raise UsageError(f"a picture goes into a scene as {' or '.join(FORMS)}, not as {form!r}")
+    if form not in _FORMS:
+        raise UsageError(f"a picture goes into a scene as {' or '.join(_FORMS)}, not as {form!r}")
     if form == "points":
         if distance is not None:
             raise UsageError("the points of a picture lie where its rays hit: a distance is for form='plane'")

@@ -26,13 +26,13 @@ from clrecon.system.light_dataclass import dataclass, replace
 DEFAULT_VIEW_ANGLE = 30.0
 """Degrees from the bottom to the top of a perspective picture, as in VTK."""
 
-FIT_MARGIN = 1.02
+_FIT_MARGIN = 1.02
 """Factor by which a fitted picture is larger than the volume."""
 
-TURN_STEP = 5
+_TURN_STEP = 5
 """Step in degrees between the tested directions of a turning camera."""
 
-RADII_AWAY = 2.0
+_RADII_AWAY = 2.0
 """Distance of a parallel camera from the centre, in radii of the volume: outside, but near, as depths lose digits."""
 
 
@@ -171,9 +171,9 @@ class Camera:
         parallel = view_angle is None
         scale = 1.0 if parallel else None
         near = cls(as_point(middle + towards), as_point(middle), as_point(up_lps), view_angle, scale)
-        turns = range(0, 360, TURN_STEP) if turning else (0,)
+        turns = range(0, 360, _TURN_STEP) if turning else (0,)
         needs = [near.orbit(turn)._room_for(corners - middle, width / height) for turn in turns]
-        position = middle + (RADII_AWAY * radius if parallel else max(needs)) * towards
+        position = middle + (_RADII_AWAY * radius if parallel else max(needs)) * towards
         scale = max(needs) if parallel else None
         if center is not None:
             moved = checked_vector("the centre of a picture", center) - middle
@@ -185,7 +185,7 @@ class Camera:
     def _room_for(self, points: Float64Array, aspect: float) -> float:
         """Return the parallel scale, or the distance of a perspective camera, at which points about the focus fit."""
         right, up, forward = self.basis()
-        across = np.maximum(np.abs(points @ up), np.abs(points @ right) / aspect) * FIT_MARGIN
+        across = np.maximum(np.abs(points @ up), np.abs(points @ right) / aspect) * _FIT_MARGIN
         if self.is_parallel:
             return float(across.max())
         return float((across / self.half_height() - points @ forward).max())

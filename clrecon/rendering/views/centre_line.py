@@ -179,7 +179,7 @@ def _reflect_twice(places: Float64Array, tangents: Float64Array, normal: Float64
 LARGEST_BYTES = 1 << 24
 """Largest file in bytes; a larger one is not a centre line."""
 
-MARKUP_SPACES = {"LPS": "lps", "RAS": "ras", "1": "lps", "0": "ras"}
+_MARKUP_SPACES = {"LPS": "lps", "RAS": "ras", "1": "lps", "0": "ras"}
 """The values by which 3D Slicer names the frame of its points."""
 
 
@@ -300,7 +300,7 @@ def _read_fcsv(name: str, text: str) -> tuple[list[list[float]], str | None]:
 
 
 def _markup_space(name: str, value: Any) -> str:
-    said = MARKUP_SPACES.get(str(value).upper())
+    said = _MARKUP_SPACES.get(str(value).upper())
     if said is None:
         raise RefusedInputError(f"{name}: the coordinate system {value!r} is neither LPS nor RAS")
     return said

@@ -34,7 +34,7 @@ from clrecon.system.text import unknown_name
 MOST_SAMPLES = 65536
 """Most samples through a thick slice; more mean that its thickness is a mistake."""
 
-THIN_LAYER = 0.25
+_THIN_LAYER = 0.25
 """Layers of an uneven stack thinner than this share of a slice's pixel do not make the samples denser."""
 
 
@@ -97,7 +97,7 @@ def finest_step(volume: Volume) -> float:
     area = np.linalg.norm(normal)
     in_plane = area / np.linalg.norm(columns[:, :2], axis=0).max()
     gaps = np.abs(np.diff(volume.slice_origins() @ (normal / area)))
-    return float(min(in_plane, max(gaps.min(), THIN_LAYER * in_plane)))
+    return float(min(in_plane, max(gaps.min(), _THIN_LAYER * in_plane)))
 
 
 def slab_samples(volume: Volume, thickness: float) -> SlabSamples:
@@ -189,7 +189,7 @@ def plane_sheet(camera: Camera, size: Sequence[int], offset_mm: float = 0.0) -> 
     return Sheet(origins, np.tile(pixel * right, (height, 1)), np.tile(forward, (height, 1)), width), own
 
 
-FRAME_STEP_MM = 0.25
+_FRAME_STEP_MM = 0.25
 """Largest distance between places at which frames and projected lengths are computed; less for small pixels."""
 
 
@@ -208,7 +208,7 @@ def _row_places(length: float, height: int, pixel: float) -> Float64Array:
 
 
 def _fine_arcs(length: float, pixel: float) -> Float64Array:
-    count = max(int(np.ceil(length / min(pixel, FRAME_STEP_MM))), 8)
+    count = max(int(np.ceil(length / min(pixel, _FRAME_STEP_MM))), 8)
     return np.linspace(0.0, length, count + 1, dtype=np.float64)
 
 
@@ -287,7 +287,7 @@ def stretched_sheet(curve: Curve, across: Float64Array, size: tuple[int, int], p
 
 def stretched_length(curve: Curve, across: Float64Array) -> float:
     """Return the height in mm of a stretched picture of the whole curve."""
-    arcs = _fine_arcs(curve.length, FRAME_STEP_MM)
+    arcs = _fine_arcs(curve.length, _FRAME_STEP_MM)
     flow = curve.tangents(0.5 * (arcs[1:] + arcs[:-1]))
     direction = _unit_vectors(np.asarray(across, dtype=np.float64))
     return float((np.linalg.norm(flow - (flow @ direction)[:, None] * direction, axis=1) * np.diff(arcs)).sum())

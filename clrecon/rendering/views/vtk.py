@@ -12,7 +12,7 @@ from clrecon.rendering.views.directions import checked_size
 
 Point = Sequence[float]
 
-NEAR_AND_FAR = (0.01, 100.0)
+_NEAR_AND_FAR = (0.01, 100.0)
 """Clipping range of a PyVista camera in distances to its focal point; VTK's default ends in the middle of a patient."""
 
 
@@ -59,6 +59,6 @@ def make_pyvista_camera(
     else:
         made.SetViewAngle(view_angle)
     distance = float(np.linalg.norm(np.subtract(focal_point, position)))
-    near, far = NEAR_AND_FAR
+    near, far = _NEAR_AND_FAR
     made.SetClippingRange(near * distance, far * distance)
     return made

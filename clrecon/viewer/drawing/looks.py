@@ -19,7 +19,7 @@ from clrecon.viewer.model.state import ShownPart, ViewState
 LEAST_OPACITY = 0.01
 """Meshes that are more translucent are not drawn."""
 
-MOST_KEPT, MOST_LABELLED = 64, 6
+_MOST_KEPT, MOST_LABELLED = 64, 6
 """Styles that are kept, and those of them that keep a label map in memory."""
 
 label_level = 0.5
@@ -112,7 +112,7 @@ class Looks:
         labelled = [each for each, kept in self._kept.items() if getattr(kept, "labels", None) is not None]
         for each in labelled[: max(0, len(labelled) - MOST_LABELLED)]:
             del self._kept[each]
-        while len(self._kept) > MOST_KEPT:
+        while len(self._kept) > _MOST_KEPT:
             self._kept.popitem(last=False)
         return style
 

@@ -45,7 +45,7 @@ from clrecon.viewer.model.state import Pick, ShownPart, ViewState
 SMALLEST_SIDE = 64
 """Pixels of the shorter side of a coarse picture."""
 
-COARSE_STEP_VOXELS = 2.0
+_COARSE_STEP_VOXELS = 2.0
 
 MOST_FOUND = 6
 """Sets of parts that are kept, of all views together."""
@@ -239,7 +239,7 @@ class Painter(Stage):
     def _drawn_scan(self, scan: ShownScan, state: ViewState, mode: ViewMode, whole: ShownPart, sharp: bool) -> _Drawn:
         resident = self.resident(scan.number, state)
         labelled = self.labelled(scan.number, state)
-        coarse = None if sharp or mode.kind == "surface" else COARSE_STEP_VOXELS * min(resident.volume.spacing)
+        coarse = None if sharp or mode.kind == "surface" else _COARSE_STEP_VOXELS * min(resident.volume.spacing)
         used = labelled
         if labelled is not None and labelled.is_plain:
             used = None
@@ -254,8 +254,8 @@ class Painter(Stage):
         """Return a label map as the surface of its own voxels."""
         if shown.number not in self._solid:
             volume = Volume(to_voxels(shown.labels), shown.labels.affine.copy(), hu_range=(0, 1))
-            made = DeviceVolume(volume, device=self._device, memory=self.memory)
-            self._solid[shown.number] = made, ResampledLabels(shown.labels.voxels, True, {}, ())
+            device_volume = DeviceVolume(volume, device=self._device, memory=self.memory)
+            self._solid[shown.number] = device_volume, ResampledLabels(shown.labels.voxels, True, {}, ())
         resident, placed = self._solid[shown.number]
         labelled = LabelledLook(shown.labels, placed, tuple(state.parts_of(shown.number)))
         style = self._looks.scan(state, find_modes()["labels"], whole, labelled, None)
@@ -309,8 +309,8 @@ class Painter(Stage):
             if self._scene is not None:
                 self._scene[1].close()
             objects = [(each.subject, each.style) for each in drawn]
-            made = ScenePictures(objects, device=self._device, memory=self.memory, takers=self._takers)
-            self._scene = key, made
+            scene_pictures = ScenePictures(objects, device=self._device, memory=self.memory, takers=self._takers)
+            self._scene = key, scene_pictures
         return self._scene[1].take(camera, size, None, check)
 
     def _empty(self, state: ViewState, size: tuple[int, int], mode: str, camera: Camera) -> Rendering:

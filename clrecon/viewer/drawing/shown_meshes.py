@@ -20,14 +20,14 @@ from clrecon.viewer.drawing.stage import Stage
 from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownScan, find_modes
 from clrecon.viewer.model.state import Color, ShownPart, ViewState
 
-TRIANGLES_A_CELL = 2.0
+_TRIANGLES_A_CELL = 2.0
 """Triangles that a surface leaves in each cell that it passes through."""
 
 
 def coarsen_mesh(mesh: Mesh, triangles: int) -> Mesh:
     """Return a coarse mesh for pictures: vertices that share a cell become one (Rossignac and Borrel 1993)."""
     vertices = mesh.vertices.astype(np.float64)
-    cell = float(np.sqrt(TRIANGLES_A_CELL * mesh.area / triangles))
+    cell = float(np.sqrt(_TRIANGLES_A_CELL * mesh.area / triangles))
     low = vertices.min(axis=0)
     counts = np.floor(np.ptp(vertices, axis=0) / max(cell, 1e-9)).astype(np.int64) + 1
     i, j, k = np.floor((vertices - low) / max(cell, 1e-9)).astype(np.int64).T
@@ -86,7 +86,7 @@ def _cut(mesh: Mesh, plane: NDArray[np.float64]) -> Mesh:
     return keep_triangles(joined, np.ones(len(triangles), np.bool_))
 
 
-CUT_HU_PER_MM = 100.0
+_CUT_HU_PER_MM = 100.0
 """Slope of the values across a cut: steep enough that whole HU place it to 0.005 mm."""
 
 
@@ -156,11 +156,11 @@ def _mesh_labels(stage: Stage, shown: ShownLabels, state: ViewState, progress: P
     parts = {part.number: part for part in state.parts_of(shown.number) if part.visible and part.number}
     if not parts:
         return []
-    found = extract_label_masks(
+    label_masks = extract_label_masks(
         shown.labels, label=sorted(parts), device=stage.device, memory=stage.memory, progress=progress
     )
     made = []
-    for number, mesh in found.items():
+    for number, mesh in label_masks.items():
         cut = mesh if state.clip is None else cut_mesh(mesh, state.clip)
         if cut.triangle_count:
             made.append(_named(cut, parts[number].name, parts[number].color))
@@ -191,7 +191,7 @@ def clip_volume(volume: Volume, clip: Clip, iso_value: float) -> Volume:
             along_i, along_j = np.array(normal) @ columns
             start = float(np.dot(normal, origin)) - offset
             height = np.float32(start) + np.float32(along_j) * j[:, None] + np.float32(along_i) * i
-            most = np.maximum(np.float32(level) + np.float32(CUT_HU_PER_MM) * height, np.float32(low))
+            most = np.maximum(np.float32(level) + np.float32(_CUT_HU_PER_MM) * height, np.float32(low))
             np.minimum(layer, most, out=most)
             layer[...] = np.rint(most) if voxels.dtype.kind in "iu" else most
     made = volume.with_voxels(voxels)

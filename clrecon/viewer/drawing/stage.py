@@ -37,7 +37,7 @@ from clrecon.viewer.model.state import Point, ViewState
 STRIP_PIXELS = 1 << 18
 """Pixels of a strip: some 50 ms of volume rendering on two cores."""
 
-STRIP_ROWS = 16
+_STRIP_ROWS = 16
 """Rows of a strip are a multiple of this, which tiles of rays fill."""
 
 
@@ -46,7 +46,7 @@ def take_strips(
 ) -> Rendering:
     """Take the picture of a parallel camera strip by strip, where it is large; others in one."""
     width, height = size
-    rows = max(STRIP_ROWS, STRIP_PIXELS // width // STRIP_ROWS * STRIP_ROWS)
+    rows = max(_STRIP_ROWS, STRIP_PIXELS // width // _STRIP_ROWS * _STRIP_ROWS)
     if not camera.is_parallel or rows >= height:
         return take(camera, size)
     _, up, _ = camera.basis()

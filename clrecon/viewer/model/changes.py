@@ -26,7 +26,7 @@ from clrecon.viewer.model.objects import ShownObject, ShownScan
 from clrecon.viewer.model.parts import FoundParts, carry_looks
 from clrecon.viewer.model.state import Color, ShownPart, ViewState
 
-FIT_PIXELS = 1000
+_FIT_PIXELS = 1000
 """Height of the picture that a camera is fitted for; only its ratio to the width counts."""
 
 
@@ -34,7 +34,7 @@ def fit_camera(
     points: Float64Array, view: DirectionName | Sequence[float], aspect: float, view_angle: float | None = None
 ) -> Camera:
     """Return a camera from a side of the patient so that points (n, 3) fit; `aspect` is width by height."""
-    size = (max(1, round(aspect * FIT_PIXELS)), FIT_PIXELS)
+    size = (max(1, round(aspect * _FIT_PIXELS)), _FIT_PIXELS)
     return Camera.fit(box_around([points]), view, view_angle=view_angle, size=size)
 
 
@@ -48,17 +48,17 @@ def plane_step(scans: Sequence[ShownScan], plane: str) -> Float64Array:
     return normal * float(along[int(np.argmax(along / np.linalg.norm(columns, axis=0)))])
 
 
-TURN_DEGREES = 180.0
+_TURN_DEGREES = 180.0
 """By which a gesture over the height of the picture turns."""
 
-MOST_MM, LEAST_MM = 1e5, 1e-2
+_MOST_MM, _LEAST_MM = 1e5, 1e-2
 """Half heights between which a camera zooms: from a hundred metres to a hundredth of a millimetre."""
 
 
 def turn_camera(camera: Camera, dx: float, dy: float) -> Camera:
     """Turn about the focal point as if the pointer held what is seen there, as pyvista's trackball does."""
     right, up, _ = camera.basis()
-    turn = rotation_about(up, -dx * TURN_DEGREES) @ rotation_about(right, -dy * TURN_DEGREES)
+    turn = rotation_about(up, -dx * _TURN_DEGREES) @ rotation_about(right, -dy * _TURN_DEGREES)
     away = turn @ np.subtract(camera.position, camera.focal_point)
     return replace(camera, position=as_point(np.add(camera.focal_point, away)), up=as_point(turn @ up))
 
@@ -88,7 +88,7 @@ def zoom_camera(camera: Camera, factor: float, at: tuple[float, float] = (0.0, 0
     if not (math.isfinite(factor) and factor > 0.0):
         raise UsageError(f"the factor of a zoom is a number above 0, not {factor!r}")
     before = _height_mm(camera)
-    height = min(2.0 * MOST_MM, max(2.0 * LEAST_MM, before / factor))
+    height = min(2.0 * _MOST_MM, max(2.0 * _LEAST_MM, before / factor))
     if camera.is_parallel:
         nearer = replace(camera, parallel_scale=0.5 * height)
     else:
@@ -116,9 +116,9 @@ def _height_mm(camera: Camera) -> float:
     return 2.0 * camera.half_height() * (1.0 if camera.is_parallel else camera.distance)
 
 
-MOST_UNDO = 200
+_MOST_UNDO = 200
 
-SAME_GESTURE_S = 1.0
+_SAME_GESTURE_S = 1.0
 """Changes of one kind that follow each other within this time are one step of undo."""
 
 _GESTURES = frozenset(
@@ -293,11 +293,11 @@ class ChangingView:
         goes_on = kind.split(" ")[0] in _GESTURES and (
             last_kind.split(" ")[0] in _GESTURES
             if self._held
-            else kind == last_kind and now - last_time <= SAME_GESTURE_S
+            else kind == last_kind and now - last_time <= _SAME_GESTURE_S
         )
         if not goes_on:
             self._undo.append((self.state, words))
-            del self._undo[:-MOST_UNDO]
+            del self._undo[:-_MOST_UNDO]
         self._last = (kind, now)
         self.state = made
         self.version += 1

@@ -42,7 +42,7 @@ from clrecon.viewer.model.state import (
     measure_points,
 )
 
-BOX_SHARE = 0.5
+_BOX_SHARE = 0.5
 """Of what there is along each axis, in a clip box about the cross."""
 
 
@@ -259,7 +259,7 @@ class ViewModel(ChangingView):
             self.set_clip_box(None, None)
             return
         low, high = self._span(self.objects)
-        half = 0.5 * BOX_SHARE * (high - low)
+        half = 0.5 * _BOX_SHARE * (high - low)
         middle = np.clip(np.array(self.state.cross), low + half, high - half)
         self.set_clip_box((middle - half).tolist(), (middle + half).tolist())
 

@@ -178,7 +178,7 @@ def wrap_inputs(inputs: Sequence[OpenedInput], names: Sequence[str] = ()) -> lis
     return show_objects([each.subject for each in inputs], names, [each.said for each in inputs])
 
 
-ISO_ENDS = (-1000.0, 2000.0)
+_ISO_ENDS = (-1000.0, 2000.0)
 """Ends of the slider, as far as the values of the scan go: air, and dense cortex."""
 
 
@@ -219,7 +219,7 @@ def find_iso_range(scans: Sequence[ShownScan]) -> tuple[float, float]:
     ranges = [each.volume.hu_range for each in scans]
     known = [each for each in ranges if each is not None]
     if not known:
-        return ISO_ENDS
+        return _ISO_ENDS
     low, high = min(each[0] for each in known), max(each[1] for each in known)
-    first, last = max(low, ISO_ENDS[0]), min(high, ISO_ENDS[1])
+    first, last = max(low, _ISO_ENDS[0]), min(high, _ISO_ENDS[1])
     return (float(math.ceil(first)), float(math.floor(last))) if math.ceil(first) < math.floor(last) else (low, high)

@@ -31,10 +31,10 @@ from clrecon.viewer.model.state import Box, Point, ShownPart
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
 
-MOST_CLUSTERS = 20
+_MOST_CLUSTERS = 20
 """Clusters that are parts of their own."""
 
-SMALLER = MOST_CLUSTERS + 1
+SMALLER = _MOST_CLUSTERS + 1
 """Number of all others together."""
 
 STEPS = 5
@@ -106,7 +106,7 @@ def find_clusters(
     sizes = np.bincount(runs.clusters, weights=lengths).astype(np.int64)
     order = np.argsort(-sizes, kind="stable")
     numbers = np.full(len(sizes), SMALLER, np.uint8)
-    numbers[order[:MOST_CLUSTERS]] = np.arange(1, min(MOST_CLUSTERS, len(sizes)) + 1)
+    numbers[order[:_MOST_CLUSTERS]] = np.arange(1, min(_MOST_CLUSTERS, len(sizes)) + 1)
     of_runs = numbers[runs.clusters]
     voxels = _fill_runs(volume, runs, of_runs)
     tell("parts", 2, STEPS)
@@ -129,13 +129,13 @@ def _find_runs(resident: DeviceVolume, iso_value: float) -> _Runs:
         mask = Mask.from_band(resident, (iso_value, np.inf))
     except NoSurfaceError:
         return _Runs(nothing.astype(np.int32), nothing, nothing, nothing)
-    found = find_components(mask.device, mask.bits, memory=resident.memory)
-    count, rows = found.runs.count, mask.bits.rows
+    components = find_components(mask.device, mask.bits, memory=resident.memory)
+    count, rows = components.runs.count, mask.bits.rows
     if not count:
         return _Runs(nothing.astype(np.int32), nothing, nothing, nothing)
-    clusters = download(mask.device, np.empty(count, np.int32), found.numbers_d)
-    columns = download(mask.device, np.empty((count, 2), np.uint16), found.runs.runs_d)
-    counts = download(mask.device, np.empty(rows + 1, np.uint32), found.runs.row_counts_d).astype(np.int64)
+    clusters = download(mask.device, np.empty(count, np.int32), components.numbers_d)
+    columns = download(mask.device, np.empty((count, 2), np.uint16), components.runs.runs_d)
+    counts = download(mask.device, np.empty(rows + 1, np.uint32), components.runs.row_counts_d).astype(np.int64)
     of_rows = np.repeat(np.arange(rows, dtype=np.int64), np.diff(counts))
     return _Runs(clusters, of_rows, columns[:, 0].astype(np.int64), columns[:, 1].astype(np.int64))
 
@@ -176,7 +176,7 @@ def _describe_parts(
         longest = int(np.argmax(lengths[own]))
         middle = (runs.first[own][longest] + lengths[own][longest] // 2, j[longest], k[longest])
         low, high = (runs.first[own].min(), j.min(), k.min()), (runs.last[own].max(), j.max(), k.max())
-        several = len(sizes) - MOST_CLUSTERS
+        several = len(sizes) - _MOST_CLUSTERS
         name = f"part {number}" if number < SMALLER else f"{several:,} smaller part{'s' * (several > 1)}"
         x, y, z = volume.ijk_to_lps([middle])[0].tolist()
         parts.append(

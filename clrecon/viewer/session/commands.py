@@ -173,7 +173,7 @@ def check_command(command: Any) -> tuple[Command, dict[str, Any]]:
     return found, checked
 
 
-ISO_STEP = 5.0
+_ISO_STEP = 5.0
 """HU by which a key moves the iso value."""
 
 
@@ -209,8 +209,8 @@ _SECTIONS: dict[str, dict[str, Key]] = {
         "o": Key("next mode; O: the one before", {"do": "step_mode", "steps": 1}),
         "O": Key("", {"do": "step_mode", "steps": -1}),
         "b": Key("table and blankets away, or shown", {"do": "toggle_table"}),
-        "ArrowLeft": Key(f"{ISO_STEP:g} HU lower; Right: higher", {"do": "step_iso", "by": -ISO_STEP}, name="Left"),
-        "ArrowRight": Key("", {"do": "step_iso", "by": ISO_STEP}),
+        "ArrowLeft": Key(f"{_ISO_STEP:g} HU lower; Right: higher", {"do": "step_iso", "by": -_ISO_STEP}, name="Left"),
+        "ArrowRight": Key("", {"do": "step_iso", "by": _ISO_STEP}),
     },
     "Measure": {
         "m": Key("distance: two clicks", "distance"),
@@ -280,5 +280,5 @@ def page_words() -> dict[str, Any]:
         "help": {**_MOUSE, **rows},
         "hints": _HINTS,
         "windows": {name: WINDOWS[name] for name in _SLICE_WINDOWS},
-        "iso_step": ISO_STEP,
+        "iso_step": _ISO_STEP,
     }

@@ -37,7 +37,7 @@ MOVING_MS = 40.0
 LEAST_SHARE = 0.15
 """Least width of a coarse picture, as a share of the picture's."""
 
-FIRST_SHARE = 0.5
+_FIRST_SHARE = 0.5
 
 MANY_TRIANGLES = 2_000_000
 """Triangles of a mesh above which it is said that pictures take their time."""
@@ -78,7 +78,7 @@ class ViewSession(Closing):
         self.keep_ids, self.no_clobber = keep_ids, no_clobber
         self._lock = threading.RLock()
         self._on_change = on_change
-        self._share = FIRST_SHARE
+        self._share = _FIRST_SHARE
         self._error: str | None = None
         self._said: str | None = None
         self._timing: dict[str, Any] = {}
@@ -215,12 +215,12 @@ class ViewSession(Closing):
         def find(job: Job) -> None:
             with self._lock:
                 state = self.model.state
-            found = self.painter.find_parts(state, job.progress)
+            parts = self.painter.find_parts(state, job.progress)
             with self._lock:
                 if job.cancelled():
                     return
-                if found:
-                    self.model.take_parts(found)
+                if parts:
+                    self.model.take_parts(parts)
                 if then is not None:
                     then()
             self._changed()

@@ -85,7 +85,7 @@ class Pace:
         return Asked(view, self._sizes[view], self.moving)
 
 
-MOVING_QUALITY, SHARP_QUALITY = 70, 92
+_MOVING_QUALITY, _SHARP_QUALITY = 70, 92
 """Of JPEG.  Above 90 the colours are not halved: edges of labels stay where they are."""
 
 
@@ -96,7 +96,7 @@ def encode_picture(picture: Rendering, ground: tuple[int, int, int], sharp: bool
 
     stream = io.BytesIO()
     Image.fromarray(_lay_over(picture.image, ground)).save(
-        stream, "JPEG", quality=SHARP_QUALITY if sharp else MOVING_QUALITY, subsampling=0 if sharp else 2
+        stream, "JPEG", quality=_SHARP_QUALITY if sharp else _MOVING_QUALITY, subsampling=0 if sharp else 2
     )
     width, height = picture.size
     told = {**facts, "sharp": sharp, "size": [width, height], "camera": facts_of_camera(picture.camera)}

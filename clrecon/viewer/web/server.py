@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from aiohttp import web
 
 
-LOOPBACK = "127.0.0.1"
+_LOOPBACK = "127.0.0.1"
 
 _OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 
@@ -102,30 +102,30 @@ def _compose() -> tuple[bytes, str, str]:
     return document.encode(), hash_code(script), hash_code(style)
 
 
-LARGEST_PORT = 65535
+_LARGEST_PORT = 65535
 _WAITING = 64
 
 
 def bind_port(port: int | None = None) -> socket.socket:
     """Return a socket that listens on a port (default: a free one) of 127.0.0.1; it is closed by the caller."""
-    if port is not None and (isinstance(port, bool) or not 1 <= port <= LARGEST_PORT):
-        raise UsageError(f"a port is a whole number from 1 to {LARGEST_PORT}, not {port!r}")
+    if port is not None and (isinstance(port, bool) or not 1 <= port <= _LARGEST_PORT):
+        raise UsageError(f"a port is a whole number from 1 to {_LARGEST_PORT}, not {port!r}")
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         if sys.platform == "win32":  # there the other option would let two programs share a port
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
         else:  # a server that has just ended does not block its port for a minute
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((LOOPBACK, port or 0))
+        listener.bind((_LOOPBACK, port or 0))
         listener.listen(_WAITING)
     except OSError as error:
         listener.close()
         other = f"name another with {name_parameter('port', 'N')}, or leave it out for a free one"
         if error.errno == errno.EADDRINUSE:
-            raise UsageError(f"port {port} of {LOOPBACK} is taken by another program: {other}") from error
+            raise UsageError(f"port {port} of {_LOOPBACK} is taken by another program: {other}") from error
         if error.errno == errno.EACCES:
             raise UsageError(f"port {port} is reserved by the system: {other}") from error
-        raise UsageError(f"port {port or 'any'} of {LOOPBACK} cannot be used ({error.strerror}): {other}") from error
+        raise UsageError(f"port {port or 'any'} of {_LOOPBACK} cannot be used ({error.strerror}): {other}") from error
     return listener
 
 
@@ -185,7 +185,7 @@ class WebServer:
         self._listener = bind_port(port)
         self._secret = make_secret()
         self.port: int = self._listener.getsockname()[1]
-        self.address = f"http://{LOOPBACK}:{self.port}/?secret={self._secret}"
+        self.address = f"http://{_LOOPBACK}:{self.port}/?secret={self._secret}"
         self._connections: dict[Connection, Any] = {}
         self._downloads: Path = Path()
         self._end: Callable[[], object] | None = None

@@ -172,6 +172,7 @@ def test_a_vtp_tells_the_mesh_of_each_triangle(scan: Path, device: Any, tmp_path
         own = found.extract_cells(found.cell_data["PART"] == number).extract_surface()
         alone = pyvista.read(tmp_path / f"one_{name}.vtp")
         assert own.n_cells == alone.n_cells and own.volume == pytest.approx(alone.volume, rel=1e-6)
+        assert own.bounds == pytest.approx(alone.bounds)
         assert ((own.cell_data["COLOR"] == [255, 0, 0]).all()) == (name == "vertebrae_L3")
 
 

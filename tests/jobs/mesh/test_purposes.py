@@ -71,7 +71,7 @@ def test_bone_is_kept_where_the_level_is_that_of_bone_and_nothing_else_is_chosen
     assert MeshSettings(**settings_for("print", given)).keep == keep
 
 
-def test_impossible_purposes() -> None:
+def test_impossible_purposes_are_refused() -> None:
     with pytest.raises(UsageError, match="can be for print, paper-b, not for 'fun'"):
         settings_for("fun", {})
     with pytest.raises(UsageError, match="leave closed=False out"):

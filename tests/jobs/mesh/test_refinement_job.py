@@ -157,7 +157,7 @@ def test_strict_passes_what_is_good(
         ({"max_deviation_mm": 0.2}, "ask for one of them too"),
     ],
 )
-def test_impossible_settings(options: dict[str, Any], complaint: str) -> None:
+def test_impossible_settings_are_refused(options: dict[str, Any], complaint: str) -> None:
     with pytest.raises(UsageError, match=complaint):
         MeshSettings(**options)
 

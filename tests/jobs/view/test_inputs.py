@@ -64,7 +64,7 @@ def test_a_frame_is_said_by_the_caller_where_the_file_names_none(files):
     assert any("taken as LPS" in text for text in assumed.said)
 
 
-def test_a_label_map_of_the_settings_comes_last(files):
+def test_label_map_of_the_settings_comes_last_and_needs_one_scan(files):
     settings = ViewSettings(scan=MeshSettings(labels=LabelChoice(files / "labels.nii.gz")))
     opened = open_inputs([files / "scan.nii.gz"], settings)
     assert [type(each.subject) for each in opened] == [Volume, LabelMap]

@@ -125,7 +125,7 @@ def test_the_mesh_job_writes_pages_too(tmp_path, device):
         (["{a}", "--html", "{page}", "--label", "L1"], "--labels FILE"),
     ],
 )
-def test_wrong_usage(arguments, words, files, tmp_path, capsys):
+def test_views_without_inputs_or_sense_are_refused(arguments, words, files, tmp_path, capsys):
     page = tmp_path / "page.html"
     filled = [word.format(a=files["DOE_JANE.stl"], page=page) for word in arguments]
     check_refused(["view", *filled], 3, words, tmp_path, capsys)

@@ -34,7 +34,7 @@ def test_a_good_mesh_fails_none():
     assert [gate["measured"] for gate in gates if gate["ok"] is None] == [None]  # self-intersections
 
 
-def test_a_hole():
+def test_a_hole_fails_the_gate_closed_alone():
     vertices, triangles = samples.sphere()
     gates = of((vertices, np.delete(triangles, 17, axis=0)))
     assert failed(gates) == {"closed"}
@@ -49,20 +49,20 @@ def test_an_open_surface_has_no_gate_on_what_it_encloses():
     assert not {"closed", "outward"} & {gate["name"] for gate in gates}
 
 
-def test_inside_out():
+def test_an_inside_out_mesh_fails_the_gate_outward_alone():
     vertices, triangles = samples.torus()
     inside_out = Mesh(vertices, triangles[:, ::-1]).quality()
     assert failed(judge_mesh(inside_out)) == {"outward"}
     assert failed(judge_mesh(inside_out, outward=False)) == set()
 
 
-def test_a_flipped_face():
+def test_a_flipped_face_fails_manifold_and_oriented():
     vertices, triangles = samples.torus()
     triangles[40] = triangles[40, ::-1]
     assert failed(of((vertices, triangles))) == {"manifold", "oriented"}
 
 
-def test_a_shared_corner():
+def test_a_shared_corner_fails_the_gate_manifold_alone():
     assert failed(of(samples.weld(samples.join(samples.box(), samples.box((1, 1, 1)))))) == {"manifold"}
 
 
@@ -114,7 +114,7 @@ def test_distances_are_judged_away_from_metal_and_both_figures_are_said():
     assert "(2,500 of 4,000 vertices near metal (above 2000 HU))" in p95["text"]
 
 
-def test_the_volume_of_a_label():
+def test_label_volume_fails_beyond_15_percent():
     assert judge_label_volume(24.0, 63.0, "fill it")["ok"] is False
     assert judge_label_volume(24.0, 63.0, "fill it")["text"] == (
         "the mesh has 24 ml, the label 63 ml (-61.9 %, at most 15 % either way): fill it"

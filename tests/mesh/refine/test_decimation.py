@@ -255,7 +255,7 @@ def test_what_is_left_of_a_cluster_at_a_border_stays_there():
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -0.1, 90.0, float("nan")])
-def test_impossible_shares(fraction):
+def test_impossible_shares_are_refused(fraction):
     with pytest.raises(UsageError, match="between 0 and 1"):
         decimate_mesh(Mesh(*samples.sphere()), fraction, 1.0)
 

@@ -156,7 +156,7 @@ def test_the_step_of_a_sheared_affine_is_the_length_of_a_column():
     assert default_deviation(Mesh(*samples.box(), None, report)) == 0.25 * 0.4  # the rows are 0.3, 0.57 and 2 long
 
 
-def test_steps_are_shortened_along_themselves():
+def test_long_steps_are_shortened_and_keep_their_direction():
     step = np.array([[3.0, 4.0, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -4.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     assert shorten_steps(step, 1.0) == 2
     np.testing.assert_allclose(
@@ -175,7 +175,7 @@ def test_only_vertices_at_a_fault_are_taken_back_at_first():
 
 
 @pytest.mark.parametrize("iterations", [0, -1, 1001, 20.0])
-def test_impossible_iterations(iterations):
+def test_impossible_iterations_are_refused(iterations):
     with pytest.raises(UsageError, match="from 1 to 1000 iterations"):
         smooth_mesh(noisy_sphere(0.1), iterations, 1.0)
 

@@ -105,7 +105,7 @@ def test_equals_opencv(device):
     assert np.abs(found.voxels - theirs).max() <= FILTER_OPENCV_HU
 
 
-def test_a_case_by_hand(device):
+def test_filter_of_one_voxel_equals_the_sum_by_hand(device):
     """One voxel of 10 HU in a row of zeros: exp(-1/2) for the step and exp(-1/2) for the difference, twice."""
     volume = Volume(np.array([[[0, 0, 0, 10, 0, 0, 0]]], np.float32), np.eye(4))
     found, settings = run(device, volume, 10.0, 1.0, 2, taps=5)

@@ -253,7 +253,7 @@ def test_nothing_found_is_an_error(device, choice, words):
         ({"iso_value": 5, "paper": True}, "paper=True places voxels"),
     ],
 )
-def test_wrong_arguments(choice, words):
+def test_wrong_arguments_are_refused(choice, words):
     with pytest.raises(UsageError, match=words):
         extract_points(make_volume((3, 5, 33)), **choice)
 

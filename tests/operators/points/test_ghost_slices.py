@@ -218,7 +218,7 @@ def voxels_of(volume: Volume) -> PointCloud:
 
 
 @pytest.mark.release  # every day: planted slices are found, and each step's own tests
-def test_the_made_case(device, made):
+def test_each_means_against_ghosts_is_needed(device, made):
     """All means together leave bone; each of them switched off leaves its ghost."""
     folder, slices, bone = made
     volume = clrecon.read_volume(folder)

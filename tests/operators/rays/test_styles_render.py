@@ -97,7 +97,7 @@ def test_a_style_and_keywords_make_the_same_picture(device: Any, name: str) -> N
             assert (one is None and two is None) or one.tobytes() == two.tobytes()
 
 
-def test_other_fields_of_cuts_are_used(device: Any) -> None:
+def test_pixel_width_and_angle_of_a_cut_change_its_picture(device: Any) -> None:
     with VolumeRenderer(body(), device=device) as renderer:
         assert renderer.render(PlaneCut(pixel_mm=0.7), size=SIZE).pixel_mm == pytest.approx(0.7)
         assert renderer.render(CurveCut(LINE, width_mm=20.0, pixel_mm=0.5), view="left").size[0] == 40

@@ -42,7 +42,7 @@ def test_profiles_and_walls_are_those_of_the_twin(device, check):
 
 @pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.7, 0.7, 1.5)])
 @pytest.mark.parametrize("thickness", [1.0, 2.0, 4.0])
-def test_a_shell_lies_where_it_is(device, thickness, spacing):
+def test_fitted_shell_is_nearer_to_the_truth(device, thickness, spacing):
     _, of_thick = fit_surface(hollow_ball(thickness=4.0, spacing=spacing), device)
     volume = hollow_ball(thickness=thickness, spacing=spacing)
     mesh, fit = fit_surface(volume, device, constants=of_thick.constants)
@@ -166,7 +166,7 @@ def test_a_scan_without_bone_has_no_cortex(device):
 
 
 @pytest.mark.oclgrind
-def test_a_few_places(device):
+def test_profiles_find_the_wall_at_a_few_points(device):
     volume = hollow_ball()
     points = MIDDLE + 13.5 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
     with DeviceVolume(volume, device=device) as resident:

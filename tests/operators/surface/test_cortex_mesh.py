@@ -56,7 +56,7 @@ def test_the_surface_lies_on_the_bone(level, fitted):
     assert (np.abs(after) < 1.96 * error).mean() > 0.93
 
 
-def test_nothing_breaks(level, fitted):
+def test_fitting_keeps_triangles_and_topology(level, fitted):
     assert np.array_equal(fitted.triangles, level.triangles)
     quality, old = fitted.quality(), level.quality()
     assert all(quality[name] == old[name] for name in ("closed", "manifold", "components", "euler_number"))
@@ -128,7 +128,7 @@ def test_glb_holds_values_without_nan(fitted, tmp_path):
     assert np.allclose(clrecon.read_mesh(glb).vertices, fitted.vertices, atol=1e-4)
 
 
-def test_refusals(shell, level, device):
+def test_fitting_refuses_soft_scans_and_surfaces_below_a_level(shell, level, device):
     soft = shell.with_voxels(np.full(shell.shape, 40, np.int16))
     with pytest.raises(NoSurfaceError, match="no walls of bone"):
         clrecon.fit_cortex(level, soft, device=device)
@@ -143,7 +143,7 @@ def run(*arguments) -> int:
     return main(["mesh", *map(str, arguments)])
 
 
-def test_the_command(shell, tmp_path, capsys):
+def test_surface_cortex_moves_the_vertices_of_the_command(shell, tmp_path, capsys):
     shell.save(tmp_path / "ct.nii.gz")
     given = (tmp_path / "ct.nii.gz", "-o", tmp_path / "a.ply", "--report", tmp_path / "a.json")
     assert run(*given, "--surface", "cortex") == 0

@@ -73,7 +73,7 @@ def test_row_48_an_archive_beside_the_slices_is_counted(tmp_path):
         (bytes(257), ""),
     ],
 )
-def test_kinds(start, kind):
+def test_containers_are_named_by_their_first_bytes(start, kind):
     assert describe_container(start) == kind
 
 

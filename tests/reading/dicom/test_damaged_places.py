@@ -74,7 +74,7 @@ def test_nothing_is_said_of_a_sound_series_with_all_elements(tmp_path):
         {"ReconstructionDiameter": 8},
     ],
 )
-def test_nothing_is_said_where_elements_are_only_odd(tmp_path, values):
+def test_odd_slice_locations_and_diameters_give_no_warning(tmp_path, values):
     """Numbers in place of locations, any order, rounded, missing; pictures cut out, circles about a square."""
     damage(tmp_path, values)
     assert read_volume(tmp_path).report["warnings"] == []

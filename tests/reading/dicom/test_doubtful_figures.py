@@ -29,7 +29,7 @@ def judge(folder):
     ],
     ids=["too small", "too large", "a metre", "every second one lost", "micro-CT", "nearly"],
 )
-def test_spacings(tmp_path, plan, gate, words):
+def test_implausible_spacings_fail_their_gate(tmp_path, plan, gate, words):
     write_series(tmp_path, plan)
     warnings, failed = judge(tmp_path)
     assert (gate in failed) if gate else not {"plausible_spacing", "gap_thickness"} & set(failed)

@@ -237,7 +237,7 @@ def test_one_volume_has_no_second_phase(tmp_path):
         ("AAAABABABAAAA", False),  # the same gaps everywhere: no second volume
     ],
 )
-def test_orders(codes, expected):
+def test_alternating_values_are_told_from_runs(codes, expected):
     assert alternates([ord(code) for code in codes], [1.0] * (len(codes) - 1)) is expected
 
 

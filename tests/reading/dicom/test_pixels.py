@@ -113,7 +113,7 @@ def test_bits_that_do_not_start_at_zero(tmp_path):
 
 
 @pytest.mark.parametrize("bits", [8, 32])
-def test_other_widths(tmp_path, bits):
+def test_pixels_of_8_and_32_bits_are_read(tmp_path, bits):
     def narrow(array, k):
         return (array % 200).astype(f"i{bits // 8}") if bits == 32 else (array % 200).astype("u1")
 
@@ -371,7 +371,7 @@ DATA = [
 
 
 @pytest.mark.parametrize("name, origin, spacing, low, high, mean, bone", DATA, ids=[row[0] for row in DATA])
-def test_real_series(real_data, name, origin, spacing, low, high, mean, bone):
+def test_real_series_have_their_known_affine_and_values(real_data, name, origin, spacing, low, high, mean, bone):
     """Known figures are those without padding masking: padding is put back at its -2000 - 1024 HU for the mean."""
     volume = read_volume(real_data / name)
     expected = np.diag((*spacing, 1.0))

@@ -32,7 +32,7 @@ def test_hu_are_those_of_the_given_rescale(tmp_path, values):
     assert list_series(tmp_path, rescale=(1, -1024), pixels=True).certificate == report
 
 
-def test_a_grid_file(tmp_path):
+def test_given_rescale_makes_hu_of_a_grid_file(tmp_path):
     path = tmp_path / "a.nii.gz"
     Volume((make_body() + 1024).astype(np.int16), np.diag([1.0, 1.0, 2.0, 1.0])).save(path)
     assert "hu_known" in failed(read_volume(path).report)
@@ -48,7 +48,7 @@ def test_without_it_nothing_is_said_of_it(tmp_path):
 @pytest.mark.parametrize(
     "given", [(0, 1), (1,), (1, 2, 3), 5, "ab", (1, float("nan")), (float("inf"), 0), (1e7, 0), None]
 )
-def test_two_numbers(tmp_path, given):
+def test_rescale_that_is_no_slope_and_intercept_is_refused(tmp_path, given):
     folder = write_values(tmp_path, make_body())
     if given is None:
         assert read_volume(folder, rescale=given).hu_range == (make_body().min(), make_body().max())
@@ -57,7 +57,7 @@ def test_two_numbers(tmp_path, given):
         read_volume(folder, rescale=given)
 
 
-def test_the_command_line(tmp_path, capsys):
+def test_info_takes_rescale_as_slope_and_intercept(tmp_path, capsys):
     folder = str(write_values(tmp_path, make_body(), RescaleIntercept=0))
     assert main(["info", folder, "--pixels", "--strict", "--rescale", "1,-1024"]) == 0
     shown = capsys.readouterr()

@@ -277,7 +277,7 @@ def test_a_refusal_names_files_and_not_the_description(tmp_path):
 # --- what else lies in a folder ---
 
 
-def test_nothing_there(tmp_path):
+def test_folders_without_images_are_refused(tmp_path):
     with pytest.raises(NoDicomError, match="does not exist"):
         read_volume(tmp_path / "nowhere")
     with pytest.raises(NoDicomError, match="no DICOM images in .*: 0 files looked at"):

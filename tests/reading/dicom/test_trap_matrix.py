@@ -38,7 +38,7 @@ def check_warnings(volume: Volume, verdict: str, words: tuple[str, ...]) -> None
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_a_row_of_the_matrix(tmp_path: Path, case: Case) -> None:
+def test_each_trap_gets_its_verdict(tmp_path: Path, case: Case) -> None:
     truth = case.write(tmp_path, Size())
     if case.verdict == REFUSED:
         with pytest.raises(ClreconError) as caught:

@@ -108,7 +108,7 @@ def changed(value: Any, place: list[Any], new: Any) -> Any:
     return copy
 
 
-def test_ours_there_and_back_to_the_bit(tmp_path: Path) -> None:
+def test_saved_transfer_functions_load_bit_for_bit(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     points = np.column_stack([np.sort(rng.uniform(-1000, 3000, 50)), rng.uniform(size=(50, 4))])
     points[7, 0] = points[6, 0]
@@ -249,7 +249,7 @@ def test_no_file_a_folder_a_pipe(tmp_path: Path) -> None:
             load_transfer_function(tmp_path / "pipe")
 
 
-def test_slicer_text(tmp_path: Path) -> None:
+def test_slicer_text_is_read_with_any_line_ends(tmp_path: Path) -> None:
     for text in (TEXT, TEXT.replace("\n", "\r\n"), TEXT.rstrip()):
         function = load_transfer_function(put(tmp_path, text, "a.vp"))
         assert function.lighting == Lighting(0.15, 0.8, 0.3, 12)
@@ -355,7 +355,7 @@ def test_wrong_fields_of_slicer_json(tmp_path: Path, place: list[Any], new: Any,
         load_transfer_function(put(tmp_path, value))
 
 
-def test_paraview(tmp_path: Path) -> None:
+def test_paraview_files_are_read_and_wrong_ones_refused(tmp_path: Path) -> None:
     function = load_transfer_function(put(tmp_path, PARAVIEW))
     assert (function.name, function.lighting) == ("Bone CT", None)
     np.testing.assert_allclose(function([300]), [[0.75, 0.5, 0.5, 0.4]], atol=FLOAT64_SHARE)

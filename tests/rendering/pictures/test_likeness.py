@@ -60,7 +60,7 @@ def test_colour_and_alpha():
     assert measure_pictures(white, clear, background=(255, 255, 255)).mse == 0.0
 
 
-def test_controls():
+def test_control_pictures_are_unlike_the_original():
     grey = picture()
     controls = make_control_pictures(grey, picture(top=11))
     assert list(controls) == ["black", "white", "noise", "shifted", "next"]

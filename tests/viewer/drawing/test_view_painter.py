@@ -108,7 +108,7 @@ def test_picks_lie_on_the_mesh(view):
     assert away.max() <= 0.3 and np.median(away) <= 0.02
 
 
-def test_a_pick_takes_the_nearest_object_and_none_beside(view):
+def test_a_pick_finds_the_nearest_object_in_each_projection(view):
     model, painter = view(scenes.make_scan(), scenes.make_mesh())
     spots = {
         number: model.camera.project([point], SIZE)[0][0]

@@ -31,8 +31,8 @@ from clrecon.reading.dicom.parse.values import (
 from clrecon.system.text import escape_text, hash_uid
 
 CT_IMAGE_STORAGE = "1.2.840.10008.5.1.4.1.1.2"
-SECONDARY_CAPTURE = "1.2.840.10008.5.1.4.1.1.7"
-DICOMDIR_CLASS = "1.2.840.10008.1.3.10"
+_SECONDARY_CAPTURE = "1.2.840.10008.5.1.4.1.1.7"
+_DICOMDIR_CLASS = "1.2.840.10008.1.3.10"
 
 DERIVED_WORDS = frozenset("MPR MIP MINIP MAXIP AIP PROJECTION REFORMATTED CPR CURVED VRT SSD".split())
 """Words of ImageType that, together with DERIVED, mark computed images: other planes, projections, renderings."""
@@ -40,11 +40,11 @@ DERIVED_WORDS = frozenset("MPR MIP MINIP MAXIP AIP PROJECTION REFORMATTED CPR CU
 PATIENT_POSITIONS = frozenset("HFP HFS HFDR HFDL FFDR FFDL FFP FFS LFP LFS RFP RFS AFDR AFDL PFDR PFDL".split())
 """Defined terms of PatientPosition (PS3.3 C.7.3.1.1.2); other values are free text and are dropped."""
 
-FLOAT_PIXEL_BITS = {0x7FE00008: 32, 0x7FE00009: 64}
+_FLOAT_PIXEL_BITS = {0x7FE00008: 32, 0x7FE00009: 64}
 """Float and Double Float Pixel Data: BitsAllocated (PS3.3 C.7.6.24, C.7.6.25)."""
 
-PIXEL_SPACING_MM = (1e-3, 50.0)
-POSITION_LIMIT_MM = 1e6
+_PIXEL_SPACING_MM = (1e-3, 50.0)
+_POSITION_LIMIT_MM = 1e6
 _STATED_LENGTHS = (
     ("slice_thickness_mm", "SliceThickness", "(0018,0050)"),
     ("stated_gap_mm", "SpacingBetweenSlices", "(0018,0088)"),
@@ -53,7 +53,7 @@ _STATED_LENGTHS = (
 )
 _LETTERS = re.compile(r"[LRAPHF]{1,3}\\[LRAPHF]{1,3}")
 RESCALE_SLOPE = (1e-6, 1e6)
-RESCALE_INTERCEPT_LIMIT = 1e9
+_RESCALE_INTERCEPT_LIMIT = 1e9
 
 
 # The slices of a series share equal values, so that a tree of 100,000 files needs little memory.
@@ -71,7 +71,7 @@ def read_headers(
     """Read one file as `read_elements` does: a header for each frame, or None for a DICOMDIR, which only lists."""
     elements = read_elements(path, WANTED_TAGS, start, force=force)
     values = Values(elements)
-    if elements.media_class == DICOMDIR_CLASS:
+    if elements.media_class == _DICOMDIR_CLASS:
         if elements.pixel_tag is None and "SOPClassUID" not in values:
             return None
         remark = "the meta header says that it is a DICOMDIR: read as the image that it holds"
@@ -94,7 +94,7 @@ def read_headers(
         return OtherImage(series, path, name, 1, "other", f"modality {modality} is not CT")
     if elements.pixel_tag is None:
         raise CorruptFileError("ends before its pixel data")
-    if (sop_class + ".").startswith(SECONDARY_CAPTURE + "."):
+    if (sop_class + ".").startswith(_SECONDARY_CAPTURE + "."):
         why = "its pixels are a picture, not measured HU"
         if "ImagePositionPatient" not in values:
             why = "without ImagePositionPatient (0020,0032): no geometry"
@@ -163,7 +163,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
     samples, photometric = values.unsigned("SamplesPerPixel", 1), values.word("PhotometricInterpretation")
     rows, columns = values.unsigned("Rows"), values.unsigned("Columns")
     _check_matrix(samples, photometric, rows, columns)
-    float_pixels = elements.pixel_tag in FLOAT_PIXEL_BITS
+    float_pixels = elements.pixel_tag in _FLOAT_PIXEL_BITS
     allocated, stored, high_bit, signed = _validate_float_bits(values) if float_pixels else _validate_bits(values)
     (dj, di), orientation, position = _validate_geometry(values)
     slope, intercept = _validate_rescale(values)
@@ -250,15 +250,15 @@ def _read_stated_lengths(values: Values, warnings: list[str]) -> dict[str, float
 def _validate_geometry(values: Values) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """Check PixelSpacing (row, column), ImageOrientationPatient and ImagePositionPatient against plausible limits."""
     spacing = values.decimals("PixelSpacing", 2)
-    low, high = PIXEL_SPACING_MM
+    low, high = _PIXEL_SPACING_MM
     if not all(low <= length <= high for length in spacing):
         raise values.wrong("PixelSpacing", f"two numbers from {low:g} to {high:g} mm")
     orientation = values.decimals("ImageOrientationPatient", 6)
     if max(abs(v) for v in orientation) > 2.0:
         raise values.wrong("ImageOrientationPatient", "two unit vectors")
     position = values.decimals("ImagePositionPatient", 3)
-    if max(abs(v) for v in position) > POSITION_LIMIT_MM:
-        raise values.wrong("ImagePositionPatient", f"within {POSITION_LIMIT_MM:g} mm")
+    if max(abs(v) for v in position) > _POSITION_LIMIT_MM:
+        raise values.wrong("ImagePositionPatient", f"within {_POSITION_LIMIT_MM:g} mm")
     return spacing, orientation, position
 
 
@@ -268,8 +268,8 @@ def _validate_rescale(values: Values) -> tuple[float, float]:
     intercept = values.decimals("RescaleIntercept", 1)[0] if "RescaleIntercept" in values else 0.0
     if not RESCALE_SLOPE[0] <= abs(slope) <= RESCALE_SLOPE[1]:
         raise values.wrong("RescaleSlope", "a finite number other than 0")
-    if abs(intercept) > RESCALE_INTERCEPT_LIMIT:
-        raise values.wrong("RescaleIntercept", f"within {RESCALE_INTERCEPT_LIMIT:g}")
+    if abs(intercept) > _RESCALE_INTERCEPT_LIMIT:
+        raise values.wrong("RescaleIntercept", f"within {_RESCALE_INTERCEPT_LIMIT:g}")
     return slope, intercept
 
 
@@ -293,7 +293,7 @@ def _validate_bits(values: Values) -> tuple[int, int, int, bool]:
 
 def _validate_float_bits(values: Values) -> tuple[int, int, int, bool]:
     """Check float pixels: all bits are used, they are signed, and the standard defines no rescale (PS3.3 C.7.6.24)."""
-    bits = FLOAT_PIXEL_BITS[values.elements.pixel_tag or 0]
+    bits = _FLOAT_PIXEL_BITS[values.elements.pixel_tag or 0]
     if values.unsigned("BitsAllocated") != bits:
         raise values.wrong("BitsAllocated", f"{bits} for float pixels of this width")
     if is_encapsulated(values.elements.transfer_syntax):

@@ -51,28 +51,28 @@ from clrecon.system.text import escape_text, join_names
 ENHANCED_CT = ("1.2.840.10008.5.1.4.1.1.2.1", "1.2.840.10008.5.1.4.1.1.2.2")
 """SOP classes: Enhanced CT Image Storage, Legacy Converted Enhanced CT Image Storage."""
 
-FRAMES_LIMIT = 65_536
+_FRAMES_LIMIT = 65_536
 HEADER_BYTES_LIMIT = 256 * 1024 * 1024
 ITEMS_PER_FRAME = 64
 
-SHARED_GROUPS, FRAME_GROUPS = 0x52009229, 0x52009230
-PLANE_POSITION, PLANE_ORIENTATION, PIXEL_MEASURES = 0x00209113, 0x00209116, 0x00289110
-PIXEL_VALUE_TRANSFORMATION = 0x00289145
-FRAME_TYPE_GROUP, FRAME_CONTENT = 0x00189329, 0x00209111
-REAL_WORLD_VALUES = 0x00409096
-UNASSIGNED_SHARED, UNASSIGNED_FRAME = 0x00209170, 0x00209171
-DIMENSIONS, DIMENSION_POINTER, DIMENSION_VALUES = 0x00209222, 0x00209165, 0x00209157
+_SHARED_GROUPS, _FRAME_GROUPS = 0x52009229, 0x52009230
+_PLANE_POSITION, _PLANE_ORIENTATION, _PIXEL_MEASURES = 0x00209113, 0x00209116, 0x00289110
+_PIXEL_VALUE_TRANSFORMATION = 0x00289145
+_FRAME_TYPE_GROUP, _FRAME_CONTENT = 0x00189329, 0x00209111
+_REAL_WORLD_VALUES = 0x00409096
+_UNASSIGNED_SHARED, _UNASSIGNED_FRAME = 0x00209170, 0x00209171
+_DIMENSIONS, _DIMENSION_POINTER, _DIMENSION_VALUES = 0x00209222, 0x00209165, 0x00209157
 
-FRAME_ACQUISITION_TIME, FRAME_REFERENCE_TIME = 0x00189074, 0x00189151
-ACQUISITION_DATE_AND_TIME = (0x00080022, 0x00080032)
-IMAGE_TYPE, FRAME_TYPE = 0x00080008, 0x00089007
-PIXEL_PRESENTATION, VOLUMETRIC_PROPERTIES, CALCULATION_TECHNIQUE = 0x00089205, 0x00089206, 0x00089207
-RESCALE_INTERCEPT, RESCALE_SLOPE, RESCALE_TYPE = 0x00281052, 0x00281053, 0x00281054
-RESCALE = (RESCALE_INTERCEPT, RESCALE_SLOPE, RESCALE_TYPE)
-LOSSY = 0x00282110
-REAL_SLOPE, REAL_INTERCEPT, REAL_UNITS, CODE_VALUE = 0x00409225, 0x00409224, 0x004008EA, 0x00080100
-CALIBRATING = (PLANE_POSITION, PLANE_ORIENTATION, PIXEL_MEASURES, PIXEL_VALUE_TRANSFORMATION, REAL_WORLD_VALUES)
-HU_CODES = ("[hnsf'U]", "HU")  # codes of UCUM
+_FRAME_ACQUISITION_TIME, _FRAME_REFERENCE_TIME = 0x00189074, 0x00189151
+_ACQUISITION_DATE_AND_TIME = (0x00080022, 0x00080032)
+_IMAGE_TYPE, _FRAME_TYPE = 0x00080008, 0x00089007
+_PIXEL_PRESENTATION, _VOLUMETRIC_PROPERTIES, _CALCULATION_TECHNIQUE = 0x00089205, 0x00089206, 0x00089207
+RESCALE_INTERCEPT, RESCALE_SLOPE, _RESCALE_TYPE = 0x00281052, 0x00281053, 0x00281054
+_RESCALE = (RESCALE_INTERCEPT, RESCALE_SLOPE, _RESCALE_TYPE)
+_LOSSY = 0x00282110
+_REAL_SLOPE, _REAL_INTERCEPT, _REAL_UNITS, _CODE_VALUE = 0x00409225, 0x00409224, 0x004008EA, 0x00080100
+_CALIBRATING = (_PLANE_POSITION, _PLANE_ORIENTATION, _PIXEL_MEASURES, _PIXEL_VALUE_TRANSFORMATION, _REAL_WORLD_VALUES)
+_HU_CODES = ("[hnsf'U]", "HU")  # codes of UCUM
 GEOMETRY = (0x00200032, 0x00200037, 0x00280030, 0x00180050, 0x00180088)
 """ImagePositionPatient, ImageOrientationPatient, PixelSpacing, SliceThickness, SpacingBetweenSlices: at the top level
 of a multi-frame image they have no meaning."""
@@ -87,13 +87,13 @@ def _wanted(*tags: int) -> Schema:
 
 
 _MACROS: dict[int, Schema] = {
-    PLANE_POSITION: _wanted(0x00200032),
-    PLANE_ORIENTATION: _wanted(0x00200037),
-    PIXEL_MEASURES: _wanted(0x00280030, 0x00180050, 0x00180088),
-    PIXEL_VALUE_TRANSFORMATION: _wanted(*RESCALE),
-    FRAME_TYPE_GROUP: _wanted(FRAME_TYPE, PIXEL_PRESENTATION, VOLUMETRIC_PROPERTIES, CALCULATION_TECHNIQUE),
-    FRAME_CONTENT: _wanted(
-        0x00209056, 0x00209128, 0x00209156, FRAME_ACQUISITION_TIME, FRAME_REFERENCE_TIME, DIMENSION_VALUES
+    _PLANE_POSITION: _wanted(0x00200032),
+    _PLANE_ORIENTATION: _wanted(0x00200037),
+    _PIXEL_MEASURES: _wanted(0x00280030, 0x00180050, 0x00180088),
+    _PIXEL_VALUE_TRANSFORMATION: _wanted(*_RESCALE),
+    _FRAME_TYPE_GROUP: _wanted(_FRAME_TYPE, _PIXEL_PRESENTATION, _VOLUMETRIC_PROPERTIES, _CALCULATION_TECHNIQUE),
+    _FRAME_CONTENT: _wanted(
+        0x00209056, 0x00209128, 0x00209156, _FRAME_ACQUISITION_TIME, _FRAME_REFERENCE_TIME, _DIMENSION_VALUES
     ),
     0x00189118: _wanted(0x00209241, 0x00209153),  # CardiacSynchronizationSequence
     0x00209253: _wanted(0x00209245, 0x00209255),  # RespiratorySynchronizationSequence
@@ -101,24 +101,24 @@ _MACROS: dict[int, Schema] = {
     0x00189314: _wanted(0x00181210),  # CTReconstructionSequence: ConvolutionKernel
     0x00189325: _wanted(0x00180060),  # CTXRayDetailsSequence: KVP
 }
-_MAPPING: Schema = {REAL_SLOPE: None, REAL_INTERCEPT: None, REAL_UNITS: _wanted(CODE_VALUE)}
+_MAPPING: Schema = {_REAL_SLOPE: None, _REAL_INTERCEPT: None, _REAL_UNITS: _wanted(_CODE_VALUE)}
 # Elements of a classic image that no macro holds: time and manner of acquisition, padding, and rescale where a
 # converter did not move it.  The geometry and the form of the pixels are not among them.
 _UNASSIGNED = _wanted(
     0x00080022, 0x00080023, 0x00080032, 0x00080033, 0x00180060, 0x00181060, 0x00181210, 0x00200012, 0x00200100,
-    0x00280120, 0x00280121, *RESCALE, LOSSY,
+    0x00280120, 0x00280121, *_RESCALE, _LOSSY,
 )  # fmt: skip
-_GROUPS: Schema = {**_MACROS, REAL_WORLD_VALUES: _MAPPING}
+_GROUPS: Schema = {**_MACROS, _REAL_WORLD_VALUES: _MAPPING}
 _SCHEMA: Schema = {
-    DIMENSIONS: _wanted(DIMENSION_POINTER),
+    _DIMENSIONS: _wanted(_DIMENSION_POINTER),
     **dict.fromkeys(CONCATENATION_TAGS),
-    SHARED_GROUPS: {**_GROUPS, UNASSIGNED_SHARED: _UNASSIGNED},
-    FRAME_GROUPS: {**_GROUPS, UNASSIGNED_FRAME: _UNASSIGNED},
+    _SHARED_GROUPS: {**_GROUPS, _UNASSIGNED_SHARED: _UNASSIGNED},
+    _FRAME_GROUPS: {**_GROUPS, _UNASSIGNED_FRAME: _UNASSIGNED},
 }
 
 NO_PLANE = ("CURVED_MPR", "VOLUME_RENDER", "SURFACE_RENDER")
-COMPUTED = ("MAX_IP", "MIN_IP", "MPR")
-COMPUTED_CONTRAST = (
+_COMPUTED = ("MAX_IP", "MIN_IP", "MPR")
+_COMPUTED_CONTRAST = (
     "ADDITION DIVISION MASKED MAXIMUM MEAN MEDIAN MINIMUM MULTIPLICATION QUANTITY STD_DEVIATION SUBTRACTION"
 ).split()
 
@@ -150,8 +150,8 @@ def read_groups(path: Path, elements: DicomElements) -> Groups:
         raise ValueProblem("multi-frame image without preamble or meta header: convert it to a DICOM file first")
     values = Values(elements)
     count = values.whole_or_none("NumberOfFrames")
-    if count is None or not 1 <= count <= FRAMES_LIMIT:
-        raise values.wrong("NumberOfFrames", f"a whole number from 1 to {FRAMES_LIMIT}")
+    if count is None or not 1 <= count <= _FRAMES_LIMIT:
+        raise values.wrong("NumberOfFrames", f"a whole number from 1 to {_FRAMES_LIMIT}")
     data, start = _read_header_bytes(path, elements)
     try:
         top = read_sequences(
@@ -164,7 +164,7 @@ def read_groups(path: Path, elements: DicomElements) -> Groups:
         )
     except ValueProblem as problem:
         raise ValueProblem(f"the functional groups cannot be parsed: {problem}") from problem
-    frames = top.sequences.get(FRAME_GROUPS, [])
+    frames = top.sequences.get(_FRAME_GROUPS, [])
     if not frames:
         raise ValueProblem(
             "PerFrameFunctionalGroupsSequence (5200,9230) is missing or empty: the places of the frames are not known"
@@ -174,13 +174,13 @@ def read_groups(path: Path, elements: DicomElements) -> Groups:
             f"NumberOfFrames (0028,0008) is {count}, PerFrameFunctionalGroupsSequence (5200,9230) holds {len(frames)} "
             "items: one a frame expected"
         )
-    shared = top.sequences.get(SHARED_GROUPS, [])
+    shared = top.sequences.get(_SHARED_GROUPS, [])
     if len(shared) > 1:
         raise ValueProblem(f"SharedFunctionalGroupsSequence (5200,9229) holds {len(shared)} items, expected 1")
     return Groups(
         shared[0] if shared else Item(),
         frames,
-        tuple(_name_dimensions(top.sequences.get(DIMENSIONS, []), elements.little_endian)),
+        tuple(_name_dimensions(top.sequences.get(_DIMENSIONS, []), elements.little_endian)),
         read_concatenation(top, count, elements.little_endian),
         tuple(f"{name_tag(tag)} is there twice in one item, with the same value" for tag in sorted(top.repeated)),
     )
@@ -199,17 +199,17 @@ def split_frames(elements: DicomElements, groups: Groups) -> Iterator[Frame]:
         warnings: list[str] = []
         try:
             macros = _merge_macros(groups.shared, item)
-            _lay_over(frame, groups.shared.sequences.get(UNASSIGNED_SHARED, []))
-            _lay_over(frame, item.sequences.get(UNASSIGNED_FRAME, []))
-            if PIXEL_VALUE_TRANSFORMATION in macros:
-                for tag in RESCALE:  # slope and intercept must come from the same place
+            _lay_over(frame, groups.shared.sequences.get(_UNASSIGNED_SHARED, []))
+            _lay_over(frame, item.sequences.get(_UNASSIGNED_FRAME, []))
+            if _PIXEL_VALUE_TRANSFORMATION in macros:
+                for tag in _RESCALE:  # slope and intercept must come from the same place
                     frame.values.pop(tag, None)
-            if elements.values.get(LOSSY):  # a lossy file has lossy frames
-                frame.values[LOSSY] = max(elements.values[LOSSY], frame.values[LOSSY])
-            _lay_over(frame, (items[0] for tag, items in macros.items() if tag != REAL_WORLD_VALUES))
+            if elements.values.get(_LOSSY):  # a lossy file has lossy frames
+                frame.values[_LOSSY] = max(elements.values[_LOSSY], frame.values[_LOSSY])
+            _lay_over(frame, (items[0] for tag, items in macros.items() if tag != _REAL_WORLD_VALUES))
             _take_times(frame)
             _check_frame_type(frame, warnings)
-            _take_real_world_values(frame, macros.get(REAL_WORLD_VALUES, []), warnings)
+            _take_real_world_values(frame, macros.get(_REAL_WORLD_VALUES, []), warnings)
         except ValueProblem as problem:
             yield Frame(elements, (), (), problem)
         else:
@@ -221,11 +221,11 @@ def _merge_macros(shared: Item, frame: Item) -> dict[int, list[Item]]:
     macros: dict[int, list[Item]] = {}
     for source in (shared, frame):
         for tag, items in source.sequences.items():
-            if tag in (UNASSIGNED_SHARED, UNASSIGNED_FRAME) or not items:
+            if tag in (_UNASSIGNED_SHARED, _UNASSIGNED_FRAME) or not items:
                 continue
-            if len(items) > 1 and tag != REAL_WORLD_VALUES:
+            if len(items) > 1 and tag != _REAL_WORLD_VALUES:
                 raise ValueProblem(f"{name_tag(tag)} holds {len(items)} items, expected 1")
-            if tag in macros and tag in CALIBRATING and items != macros[tag]:
+            if tag in macros and tag in _CALIBRATING and items != macros[tag]:
                 raise ValueProblem(f"{name_tag(tag)} is in the shared and in the frame's groups, and they differ")
             macros[tag] = items
     return macros
@@ -239,51 +239,51 @@ def _lay_over(frame: DicomElements, items: Iterable[Item]) -> None:
 
 def _take_times(frame: DicomElements) -> None:
     """Write the time of a frame to the elements that a slice has for it: date and time separately."""
-    for tag in (FRAME_ACQUISITION_TIME, FRAME_REFERENCE_TIME):
+    for tag in (_FRAME_ACQUISITION_TIME, _FRAME_REFERENCE_TIME):
         found = re.match(rb"(\d{8})(\d{2,6}(?:\.\d{1,6})?)", frame.values.get(tag, b""))
         if found is not None:
-            frame.values.update(zip(ACQUISITION_DATE_AND_TIME, found.groups(), strict=True))
-            frame.vrs.update(zip(ACQUISITION_DATE_AND_TIME, ("DA", "TM"), strict=True))
+            frame.values.update(zip(_ACQUISITION_DATE_AND_TIME, found.groups(), strict=True))
+            frame.vrs.update(zip(_ACQUISITION_DATE_AND_TIME, ("DA", "TM"), strict=True))
             return
 
 
 def _check_frame_type(frame: DicomElements, warnings: list[str]) -> None:
     """Use FrameType as ImageType; refuse frames that are not planes; refuse or warn of values not measured as HU."""
     values = frame.values
-    if FRAME_TYPE in values:
-        values[IMAGE_TYPE], frame.vrs[IMAGE_TYPE] = values.pop(FRAME_TYPE), frame.vrs.pop(FRAME_TYPE)
-    elif _words(values.get(IMAGE_TYPE))[0] == "MIXED":
-        raise ValueProblem(f"{name_tag(FRAME_TYPE)} is missing, and ImageType (0008,0008) is MIXED")
-    presentation = _words(values.get(PIXEL_PRESENTATION))[0]
+    if _FRAME_TYPE in values:
+        values[_IMAGE_TYPE], frame.vrs[_IMAGE_TYPE] = values.pop(_FRAME_TYPE), frame.vrs.pop(_FRAME_TYPE)
+    elif _words(values.get(_IMAGE_TYPE))[0] == "MIXED":
+        raise ValueProblem(f"{name_tag(_FRAME_TYPE)} is missing, and ImageType (0008,0008) is MIXED")
+    presentation = _words(values.get(_PIXEL_PRESENTATION))[0]
     if presentation not in ("", "MONOCHROME"):
-        raise ValueProblem(f"{name_tag(PIXEL_PRESENTATION)} is '{presentation}', expected MONOCHROME")
-    if _words(values.get(VOLUMETRIC_PROPERTIES))[0] == "DISTORTED":
-        raise ValueProblem(f"{name_tag(VOLUMETRIC_PROPERTIES)} is 'DISTORTED': the frame is no plane of the patient")
-    technique = _words(values.get(CALCULATION_TECHNIQUE))[0]
+        raise ValueProblem(f"{name_tag(_PIXEL_PRESENTATION)} is '{presentation}', expected MONOCHROME")
+    if _words(values.get(_VOLUMETRIC_PROPERTIES))[0] == "DISTORTED":
+        raise ValueProblem(f"{name_tag(_VOLUMETRIC_PROPERTIES)} is 'DISTORTED': the frame is no plane of the patient")
+    technique = _words(values.get(_CALCULATION_TECHNIQUE))[0]
     if technique in NO_PLANE:
-        raise ValueProblem(f"{name_tag(CALCULATION_TECHNIQUE)} is '{technique}', expected a plane of measured HU")
-    computed = [technique] if technique in COMPUTED else []
-    computed += [word for word in _words(values.get(IMAGE_TYPE))[3:4] if word in COMPUTED_CONTRAST]
+        raise ValueProblem(f"{name_tag(_CALCULATION_TECHNIQUE)} is '{technique}', expected a plane of measured HU")
+    computed = [technique] if technique in _COMPUTED else []
+    computed += [word for word in _words(values.get(_IMAGE_TYPE))[3:4] if word in _COMPUTED_CONTRAST]
     if computed:
         warnings.append(f"computed frames ({', '.join(computed)}): maybe not measured HU")
 
 
 def _take_real_world_values(frame: DicomElements, mappings: list[Item], warnings: list[str]) -> None:
     """Use the real-world mapping to HU as the rescale, if there is no rescale or it gives other values."""
-    kind = _words(frame.values.get(RESCALE_TYPE))[0]
+    kind = _words(frame.values.get(_RESCALE_TYPE))[0]
     if RESCALE_SLOPE in frame.values and kind in ("", "HU"):
         return
     for mapping in mappings:
-        units = [unit.values.get(CODE_VALUE, b"") for unit in mapping.sequences.get(REAL_UNITS, [])]
-        if not any(decode_text(unit) in HU_CODES for unit in units):
+        units = [unit.values.get(_CODE_VALUE, b"") for unit in mapping.sequences.get(_REAL_UNITS, [])]
+        if not any(decode_text(unit) in _HU_CODES for unit in units):
             continue
-        for tag, target in ((REAL_SLOPE, RESCALE_SLOPE), (REAL_INTERCEPT, RESCALE_INTERCEPT)):
+        for tag, target in ((_REAL_SLOPE, RESCALE_SLOPE), (_REAL_INTERCEPT, RESCALE_INTERCEPT)):
             number = decode_number(mapping.values.get(tag, b""), "d", frame.little_endian)
-            if number is None or not math.isfinite(number) or (tag == REAL_SLOPE and number == 0.0):
+            if number is None or not math.isfinite(number) or (tag == _REAL_SLOPE and number == 0.0):
                 found = "missing" if number is None else f"{number:g}"
                 raise ValueProblem(f"{name_tag(tag)} is {found}, expected a finite number")
             frame.values[target], frame.vrs[target] = repr(number).encode(), "DS"
-        frame.values[RESCALE_TYPE], frame.vrs[RESCALE_TYPE] = b"HU", "LO"
+        frame.values[_RESCALE_TYPE], frame.vrs[_RESCALE_TYPE] = b"HU", "LO"
         warnings.append(f"RescaleType is {escape_text(kind, 16)}: " if kind else "no RescaleSlope: ")
         warnings[-1] += "HU by RealWorldValueMappingSequence (0040,9096)"
         return
@@ -301,7 +301,7 @@ def _describe_phase(frame: DicomElements, dimensions: tuple[tuple[int, str], ...
             text = escape_text(decode_text(raw))
         if text:
             yield keyword, text
-    indices = frame.values.get(DIMENSION_VALUES, b"")
+    indices = frame.values.get(_DIMENSION_VALUES, b"")
     for place, name in dimensions:
         number = decode_number(indices[4 * place : 4 * place + 4], "L", frame.little_endian)
         if number is not None:
@@ -310,7 +310,7 @@ def _describe_phase(frame: DicomElements, dimensions: tuple[tuple[int, str], ...
 
 def _name_dimensions(dimensions: list[Item], little: bool) -> Iterator[tuple[int, str]]:
     for place, dimension in enumerate(dimensions):
-        raw = dimension.values.get(DIMENSION_POINTER, b"")
+        raw = dimension.values.get(_DIMENSION_POINTER, b"")
         if len(raw) != 4:
             continue
         group, element = struct.unpack("<HH" if little else ">HH", raw)
@@ -352,7 +352,7 @@ PLACE_POINTERS = frozenset({0x3004000C, 0x00180050, 0x00180088, 0x00200013, 0x00
 SpacingBetweenSlices, InstanceNumber, ImagePositionPatient, SliceLocation, SliceVector.  Others are times or phases."""
 SAME_PLACE_MM = 0.01
 WAYS = (("left", "right"), ("back", "front"), ("head", "feet"))
-EXACT_DIGITS = 15
+_EXACT_DIGITS = 15
 
 
 @dataclass(frozen=True)
@@ -371,9 +371,9 @@ def count_frames(values: Values, sop_class: str) -> int:
     frames = values.whole_or_none("NumberOfFrames")
     if frames is None or frames < 0:
         raise values.wrong("NumberOfFrames", "1, or nothing, in a single slice")
-    if frames > FRAMES_LIMIT:
+    if frames > _FRAMES_LIMIT:
         raise ValueProblem(
-            f"multi-frame image of {frames} frames, SOP class {sop_class}: no more than {FRAMES_LIMIT} are read"
+            f"multi-frame image of {frames} frames, SOP class {sop_class}: no more than {_FRAMES_LIMIT} are read"
         )
     return max(frames, 1)
 
@@ -402,7 +402,7 @@ def find_places(values: Values, sop_class: str, frames: int) -> FramePlaces:
     spacing = values.decimals("SpacingBetweenSlices", 1)[0]
     if spacing == 0.0:
         raise values.wrong("SpacingBetweenSlices", f"the distance of {frames} frames, other than 0")
-    return FramePlaces(spacing * np.arange(frames, dtype=np.float64), EXACT_DIGITS, "SpacingBetweenSlices")
+    return FramePlaces(spacing * np.arange(frames, dtype=np.float64), _EXACT_DIGITS, "SpacingBetweenSlices")
 
 
 def _read_offsets(values: Values, frames: int) -> FramePlaces:

@@ -35,8 +35,8 @@ PHASE_KEYWORDS = (*(keyword for keyword, _, _ in FRAME_PHASES), *SLICE_PHASES)
 """Elements that distinguish the phases of a series, the most specific first: those of frames, then of slices."""
 
 
-UID, PART, PARTS, FIRST_FRAME = 0x00209161, 0x00209162, 0x00209163, 0x00209228
-CONCATENATION_TAGS = (UID, PART, PARTS, FIRST_FRAME)
+UID, PART, PARTS, _FIRST_FRAME = 0x00209161, 0x00209162, 0x00209163, 0x00209228
+CONCATENATION_TAGS = (UID, PART, PARTS, _FIRST_FRAME)
 """The tags of ConcatenationUID, InConcatenationNumber, InConcatenationTotalNumber, ConcatenationFrameOffsetNumber."""
 
 
@@ -60,7 +60,7 @@ def read_concatenation(top: Item, frames: int, little: bool) -> Concatenation | 
     if not part:
         raise ValueProblem(f"{name_tag(PART)} is missing or 0, expected the place of the file in its concatenation")
     parts = decode_number(top.values.get(PARTS, b""), "H", little)
-    first = decode_number(top.values.get(FIRST_FRAME, b""), "L", little)
+    first = decode_number(top.values.get(_FIRST_FRAME, b""), "L", little)
     return Concatenation(
         uid, int(part), None if parts is None else int(parts), None if first is None else int(first), frames
     )

@@ -25,14 +25,14 @@ from clrecon.reading.dicom.parse.values import LONG_VRS, ValueProblem, skip_sequ
 from clrecon.system.arguments import name_parameter
 from clrecon.system.paths import open_regular
 
-PADDING_TAG = 0xFFFCFFFC
+_PADDING_TAG = 0xFFFCFFFC
 INFLATED_LIMIT = 1 << 30
 """Most bytes of one data set that are inflated."""
-LOOKED_AT_BYTES = 16 * 2**20
+_LOOKED_AT_BYTES = 16 * 2**20
 """Most bytes that are examined of a sequence without length, or of a deflated data set after its pixels."""
-MOST_PADDING_BYTES = 64 * 2**20
+_MOST_PADDING_BYTES = 64 * 2**20
 """Longest padding of zeros, and most bytes of pixels that are examined: a sparse file can hold zeros without end."""
-MOST_ELEMENTS = 10_000
+_MOST_ELEMENTS = 10_000
 SHEARED = 0.98
 """Ratio of row differences below which another number of columns explains the pixels better.  Noise gives 1."""
 _CHUNK = 2**20
@@ -95,8 +95,8 @@ def _judge_excess(file: BinaryIO, header: SliceHeader, expected: int, found: int
 
 
 def _is_zero(file: BinaryIO, place: int, count: int) -> bool:
-    """True for bytes of 0; False for more than `MOST_PADDING_BYTES`, which are not examined."""
-    if count > MOST_PADDING_BYTES:
+    """True for bytes of 0; False for more than `_MOST_PADDING_BYTES`, which are not examined."""
+    if count > _MOST_PADDING_BYTES:
         return False
     file.seek(place)
     while count > 0:
@@ -113,7 +113,7 @@ def _find_hidden_columns(file: BinaryIO, header: SliceHeader, found: int) -> int
     columns, rest = divmod(found, header.frames * header.rows * item)
     if rest or columns <= header.columns or header.rows < 2:
         return 0
-    rows = min(header.rows, MOST_PADDING_BYTES // (columns * item))
+    rows = min(header.rows, _MOST_PADDING_BYTES // (columns * item))
     file.seek(header.pixel_offset)
     data = file.read(rows * columns * item)
     if rows < 2 or len(data) < rows * columns * item:
@@ -122,8 +122,8 @@ def _find_hidden_columns(file: BinaryIO, header: SliceHeader, found: int) -> int
     kind = f"{'<' if header.little_endian else '>'}{'f' if header.float_pixels else whole}{item}"
     pixels = np.frombuffer(data, kind).astype(np.float64)
     told = _measure_steps(pixels[: rows * header.columns].reshape(rows, header.columns))
-    other = _measure_steps(pixels.reshape(rows, columns))
-    return columns if other < SHEARED * told else 0
+    steps = _measure_steps(pixels.reshape(rows, columns))
+    return columns if steps < SHEARED * told else 0
 
 
 def _measure_steps(picture: NDArray[np.float64]) -> float:
@@ -153,7 +153,7 @@ def _check_tail(file: BinaryIO, start: int, size: int, *, implicit: bool, little
     """Walk over the bytes after the pixel data, from `start` to the end of the file at `size`."""
     wrong = CorruptFileError(f"{size - start} bytes behind the pixel data are no elements of DICOM")
     place, last = start, PIXEL_TAGS[-1]
-    for _ in range(MOST_ELEMENTS):
+    for _ in range(_MOST_ELEMENTS):
         if place == size:
             return
         file.seek(place)
@@ -166,12 +166,12 @@ def _check_tail(file: BinaryIO, start: int, size: int, *, implicit: bool, little
         if length == UNDEFINED_LENGTH:
             file.seek(place + value)
             try:
-                length = skip_sequence(file.read(LOOKED_AT_BYTES), implicit=implicit, little_endian=little_endian)
+                length = skip_sequence(file.read(_LOOKED_AT_BYTES), implicit=implicit, little_endian=little_endian)
             except ValueProblem as problem:
                 raise wrong from problem
         place += value + length
         last = tag
-        if place > size or tag == PADDING_TAG and place < size:
+        if place > size or tag == _PADDING_TAG and place < size:
             raise wrong
     raise wrong
 
@@ -198,15 +198,15 @@ def _was_sent_as_text(file: BinaryIO, start: int, size: int) -> bool:
 
 
 def _inflate(file: BinaryIO, start: int, needed: int) -> bytes:
-    """Inflate a deflated data set: `needed` bytes of it and at most `LOOKED_AT_BYTES` more."""
+    """Inflate a deflated data set: `needed` bytes of it and at most `_LOOKED_AT_BYTES` more."""
     file.seek(start)
-    limit = needed + LOOKED_AT_BYTES
+    limit = needed + _LOOKED_AT_BYTES
     try:
         inflated, behind = inflate(file.read, limit + 1, _CHUNK)
     except zlib.error as error:
         raise CorruptFileError("the deflated data set is damaged") from error
     if len(inflated) > limit:
-        raise CorruptFileError(f"over {LOOKED_AT_BYTES} bytes follow the pixels of a deflated data set")
+        raise CorruptFileError(f"over {_LOOKED_AT_BYTES} bytes follow the pixels of a deflated data set")
     if behind.strip(b"\0"):
         raise CorruptFileError(f"{len(behind)} bytes behind the deflated data set")
     return inflated

@@ -43,16 +43,16 @@ from clrecon.system.arguments import name_parameter
 from clrecon.system.paths import open_regular
 
 MARK_END = 132  # 128 bytes of preamble, then "DICM"
-PREAMBLE = bytes(128) + b"DICM"
-FIRST_GROUP = 0x0008
-FIRST_LENGTH_LIMIT = 1024
+_PREAMBLE = bytes(128) + b"DICM"
+_FIRST_GROUP = 0x0008
+_FIRST_LENGTH_LIMIT = 1024
 """Longest first element: data sets begin with short ones, such as group length, character set, type or date."""
 ENCODINGS = {
     IMPLICIT_LITTLE: "implicit VR little endian",
     EXPLICIT_LITTLE: "explicit VR little endian",
     EXPLICIT_BIG: "explicit VR big endian",
 }
-PROGRAMS = {
+_PROGRAMS = {
     b"MZ": "Windows",
     b"\x7fELF": "Linux",
     b"\xcf\xfa\xed\xfe": "macOS",
@@ -81,13 +81,13 @@ def restore_start(data: bytes) -> Start | None:
     if marked:
         skip = MARK_END
     if data[skip : skip + 2] == b"\x02\0" and data[skip + 4 : skip + 6].isalpha():
-        return None if marked else Start(PREAMBLE, skip, "no preamble: read on demand")
+        return None if marked else Start(_PREAMBLE, skip, "no preamble: read on demand")
     syntax = _guess_syntax(data[skip : skip + 8])
     if syntax is None:
         return None
     value = syntax.encode() + b"\0" * (len(syntax) % 2)
     meta = struct.pack("<HH2sH", 0x0002, 0x0010, b"UI", len(value)) + value
-    return Start(PREAMBLE + meta, skip, f"no meta header: read on demand, {ENCODINGS[syntax]} taken")
+    return Start(_PREAMBLE + meta, skip, f"no meta header: read on demand, {ENCODINGS[syntax]} taken")
 
 
 def _guess_syntax(head: bytes) -> str | None:
@@ -97,17 +97,17 @@ def _guess_syntax(head: bytes) -> str | None:
     explicit = all(0x41 <= letter <= 0x5A for letter in head[4:6])
     for syntax, order in ((EXPLICIT_LITTLE, "<"), (EXPLICIT_BIG, ">")):
         group, length = struct.unpack(order + "H4xH", head)
-        if group == FIRST_GROUP and explicit and length < FIRST_LENGTH_LIMIT:
+        if group == _FIRST_GROUP and explicit and length < _FIRST_LENGTH_LIMIT:
             return syntax
     group, length = struct.unpack("<H2xL", head)
-    return IMPLICIT_LITTLE if group == FIRST_GROUP and length < FIRST_LENGTH_LIMIT and not explicit else None
+    return IMPLICIT_LITTLE if group == _FIRST_GROUP and length < _FIRST_LENGTH_LIMIT and not explicit else None
 
 
 INFLATE_STEP = 1 << 18
 ITEM = b"\xfe\xff\x00\xe0"
 """Stands for a wanted sequence of undefined length: only whether it is there is asked."""
-META_TAGS = (MEDIA_CLASS, TRANSFER_SYNTAX)
-DESCRIPTIVE_TAGS = (0x00080005, 0x0008103E)
+_META_TAGS = (MEDIA_CLASS, TRANSFER_SYNTAX)
+_DESCRIPTIVE_TAGS = (0x00080005, 0x0008103E)
 """SpecificCharacterSet and SeriesDescription.  They only describe, so two different values in one file do no harm."""
 
 READ_LIMIT = 4 * 1024 * 1024
@@ -219,7 +219,7 @@ def _collect(
             vrs[int(element.tag)] = element.VR
         elif wanted is not None and element.tag in wanted and element.VR == "SQ" and value:
             values[int(element.tag)], vrs[int(element.tag)] = ITEM, "SQ"  # of undefined length: parsed already
-        if last_group is None or element.tag in META_TAGS:
+        if last_group is None or element.tag in _META_TAGS:
             order.add(int(element.tag), value if isinstance(value, bytes) else b"")
     return values, vrs, order.remarks
 
@@ -244,7 +244,7 @@ class _Order:
             self._last = max(tag, self._last)
         elif self._values[tag] == value:
             self.remarks.append(f"{place} is there twice, with the same value")
-        elif tag in DESCRIPTIVE_TAGS:
+        elif tag in _DESCRIPTIVE_TAGS:
             self.remarks.append(f"{place} is there twice, with two values: the last is taken")
         else:
             raise CorruptFileError(f"{place} is there twice, with two values")
@@ -290,9 +290,9 @@ def inflate(read: Callable[[int], bytes], most: int, step: int) -> tuple[bytes, 
 PREFIX_BYTES = 16 * 1024
 LONG_PREFIX_BYTES = 256 * 1024
 """Bytes read at once where the first prefix does not hold the whole header: large private elements, many frames."""
-RESTORED_LIMIT = 16 * 1024 * 1024
+_RESTORED_LIMIT = 16 * 1024 * 1024
 """For a file without its standard start: the header must end within this many bytes."""
-LONGEST_PREFIX_BYTES = (16 * 2**20, 256 * 2**20)
+_LONGEST_PREFIX_BYTES = (16 * 2**20, 256 * 2**20)
 """Bytes read where that is not enough either: contours, segments and other objects that are nearly all header."""
 # A pipe or device in the place of a listed file must not make the reader wait for a writer.
 _OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
@@ -334,7 +334,7 @@ def read_elements(
     if restored is not None:
         raise CorruptFileError(f"no meta header ({describe_way_out()})")
     elements = _read_marked(path, prefix, size, wanted)
-    program = next((name for mark, name in PROGRAMS.items() if prefix.startswith(mark)), "")
+    program = next((name for mark, name in _PROGRAMS.items() if prefix.startswith(mark)), "")
     if program:
         remark = f"the preamble starts a program ({program}): neither run nor copied"
         elements = elements._replace(remarks=(remark, *elements.remarks))
@@ -345,7 +345,7 @@ def _read_restored(path: Path, restored: Start, size: int, wanted: tuple[int, ..
     """Read a file as if it had the standard start that it lacks; all offsets are those of the file itself."""
     with open_regular(path) as file:
         file.seek(restored.skip)
-        data = restored.head + file.read(RESTORED_LIMIT)
+        data = restored.head + file.read(_RESTORED_LIMIT)
     added = len(restored.head) - restored.skip
     elements = parse_carefully(io.BytesIO(data), size + added, wanted)
     deflated = elements.inflate_from >= 0
@@ -373,7 +373,7 @@ def _read_marked(path: Path, prefix: bytes, size: int, wanted: tuple[int, ...] |
         elements = None  # most likely an element that extends beyond the prefix
     if elements is not None and elements.pixel_tag is not None:
         return elements
-    for limit in LONGEST_PREFIX_BYTES:
+    for limit in _LONGEST_PREFIX_BYTES:
         if len(prefix) < size:
             prefix, size = read_start(path, limit)
             elements = parse_plainly(prefix, size, wanted)

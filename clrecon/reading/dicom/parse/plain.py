@@ -24,7 +24,7 @@ TRANSFER_SYNTAX, MEDIA_CLASS = 0x00020010, 0x00020002
 UNDEFINED_LENGTH = 0xFFFFFFFF
 FIRST_PIXEL_TAG = 0x7FE00008
 PIXEL_TAGS = (0x7FE00008, 0x7FE00009, 0x7FE00010)
-PIXEL_VRS = (b"OB", b"OW", b"OF", b"OD", b"OL", b"OV", b"UN")
+_PIXEL_VRS = (b"OB", b"OW", b"OF", b"OD", b"OL", b"OV", b"UN")
 
 
 class NotDicomError(RefusedInputError):
@@ -89,7 +89,7 @@ def read_pixel_head(head: bytes, start: int, implicit: bool, little: bool) -> tu
         return None, -1, 0, ""
     # Implicit VR has the length in these bytes; no even length looks like one of the two-letter names.
     vr = head[4:6]
-    if vr in PIXEL_VRS and len(head) == 12:
+    if vr in _PIXEL_VRS and len(head) == 12:
         length, offset, name = struct.unpack(order + "L", head[8:12])[0], start + 12, vr.decode("ascii")
     elif implicit:
         length, offset, name = struct.unpack(order + "L", head[4:8])[0], start + 8, ""

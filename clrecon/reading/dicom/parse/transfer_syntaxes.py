@@ -21,7 +21,7 @@ from clrecon.reading.dicom.parse.plain import DEFLATED, EXPLICIT_BIG, EXPLICIT_L
 from clrecon.system.packages import install_command
 from clrecon.system.text import escape_text
 
-NATIVE_SYNTAXES = (IMPLICIT_LITTLE, EXPLICIT_LITTLE, DEFLATED, EXPLICIT_BIG)
+_NATIVE_SYNTAXES = (IMPLICIT_LITTLE, EXPLICIT_LITTLE, DEFLATED, EXPLICIT_BIG)
 
 _JPEG = "1.2.840.10008.1.2.4."
 JPEG_LOSSLESS = (_JPEG + "57", _JPEG + "70")
@@ -67,12 +67,12 @@ _OTHER_NAMES = {
 
 def is_encapsulated(transfer_syntax: str) -> bool:
     """True for compressed pixel data."""
-    return transfer_syntax not in NATIVE_SYNTAXES
+    return transfer_syntax not in _NATIVE_SYNTAXES
 
 
 def describe_undecodable(transfer_syntax: str) -> str:
     """Say why pixels of this transfer syntax cannot be read; empty if they can."""
-    if transfer_syntax in NATIVE_SYNTAXES or transfer_syntax in _DECODERS:
+    if transfer_syntax in _NATIVE_SYNTAXES or transfer_syntax in _DECODERS:
         return ""
     from pydicom.config import IGNORE
     from pydicom.uid import UID
@@ -101,7 +101,7 @@ Pieces = list[tuple[int, int]]
 """For each fragment of a frame: offset of its first byte in the file, and number of bytes."""
 
 MAX_FRAGMENTS = 1_000_000
-FRAGMENTS_PER_FRAME = 1000
+_FRAGMENTS_PER_FRAME = 1000
 """Highest mean number of fragments in a frame: writers make one, or pieces of some KiB."""
 _ITEM, _END = (0xFFFE, 0xE000), (0xFFFE, 0xE0DD)
 _STARTS = (b"\xff\xd8\xff", b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP")
@@ -110,7 +110,7 @@ _STARTS = (b"\xff\xd8\xff", b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP")
 
 def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transfer_syntax: str) -> list[Pieces]:
     """Find the fragments of all frames, as many as the header says, in a buffered file from byte `start` on."""
-    table, fragments, _ = _walk_items(file, start, file_bytes, min(MAX_FRAGMENTS, FRAGMENTS_PER_FRAME * (frames + 1)))
+    table, fragments, _ = _walk_items(file, start, file_bytes, min(MAX_FRAGMENTS, _FRAGMENTS_PER_FRAME * (frames + 1)))
     if not fragments:
         raise RefusedInputError("truncated: there are no compressed pixels")
     if len(fragments) == frames:

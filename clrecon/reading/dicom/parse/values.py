@@ -286,12 +286,12 @@ _BINARY = (
 Schema = Mapping[int, Any]
 """Maps a wanted tag to None for a value, or to the schema of its items for a sequence."""
 
-DEPTH_LIMIT = 64
+_DEPTH_LIMIT = 64
 PIXEL_GROUP = 0x7FE00000
 UNDEFINED_LENGTH = 0xFFFFFFFF
 ITEM, ITEM_END, SEQUENCE_END = 0xFFFEE000, 0xFFFEE00D, 0xFFFEE0DD
 LONG_VRS = frozenset((b"OB", b"OD", b"OF", b"OL", b"OV", b"OW", b"SQ", b"SV", b"UC", b"UN", b"UR", b"UT", b"UV"))
-VR_NAMES = {name.encode(): name for name in "AE AS AT CS DA DS DT FD FL IS LO SH SL SS TM UI UL US".split()}
+_VR_NAMES = {name.encode(): name for name in "AE AS AT CS DA DS DT FD FL IS LO SH SL SS TM UI UL US".split()}
 
 
 @dataclass(slots=True)
@@ -399,7 +399,7 @@ class _Walk:
                     value = self.data[place:stop]
                     self.compare(seen, tag, value, where)
                     if value:
-                        item.values[tag], item.vrs[tag] = value, VR_NAMES.get(vr)
+                        item.values[tag], item.vrs[tag] = value, _VR_NAMES.get(vr)
                 place = stop
         return item, place
 
@@ -471,8 +471,8 @@ class _Walk:
                 place += length
             else:
                 open_parts.append((not in_sequence, _UNKNOWN if vr == b"UN" else inside))
-                if len(open_parts) > 2 * DEPTH_LIMIT:
-                    raise ValueProblem(f"sequences are nested too deep (more than {DEPTH_LIMIT} levels)")
+                if len(open_parts) > 2 * _DEPTH_LIMIT:
+                    raise ValueProblem(f"sequences are nested too deep (more than {_DEPTH_LIMIT} levels)")
         return place
 
 

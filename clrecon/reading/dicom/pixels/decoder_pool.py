@@ -33,20 +33,20 @@ log = get_logger(__name__)
 
 SCRIPT = Path(__file__).with_name("decoder_process.py")
 
-START_SECONDS = 120.0
-FRAME_SECONDS = 60.0
-SECONDS_PER_MIB = 1.0
-"""Limit of a frame: `FRAME_SECONDS`, and this much more for each MiB of its pixels, a hundred times the usual time."""
+_START_SECONDS = 120.0
+_FRAME_SECONDS = 60.0
+_SECONDS_PER_MIB = 1.0
+"""Limit of a frame: `_FRAME_SECONDS`, and this much more for each MiB of its pixels, a hundred times the usual time."""
 
-STOPPED_SECONDS = 2.0
+_STOPPED_SECONDS = 2.0
 """When this process stood still longer (Ctrl-Z, a sleeping laptop), the decoders did too, and their time starts
 again."""
 
-FRAME_MEMORY_BYTES = 256 * 2**20
-MEMORY_PER_PIXEL_BYTE = 32
-"""Memory limit of a decoder: `FRAME_MEMORY_BYTES`, and this much more for each byte of pixels; OpenJPEG takes 10."""
+_FRAME_MEMORY_BYTES = 256 * 2**20
+_MEMORY_PER_PIXEL_BYTE = 32
+"""Memory limit of a decoder: `_FRAME_MEMORY_BYTES`, and this much more for each byte of pixels; OpenJPEG takes 10."""
 
-ENVIRONMENT = {
+_ENVIRONMENT = {
     # One thread each: there are as many processes as cores, and each idle thread costs memory and time.
     **dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
     # Memory of one frame is kept for the next (glibc): returning it each time takes longer than decoding RLE.
@@ -74,9 +74,9 @@ class DecoderPool(Closing):
         self, decoders: list[str], frame_bytes: int, *, seconds: float | None = None, memory_bytes: int | None = None
     ):
         mebibytes = frame_bytes / 2**20
-        self.seconds = FRAME_SECONDS + SECONDS_PER_MIB * mebibytes if seconds is None else seconds
+        self.seconds = _FRAME_SECONDS + _SECONDS_PER_MIB * mebibytes if seconds is None else seconds
         self.memory_bytes = (
-            FRAME_MEMORY_BYTES + MEMORY_PER_PIXEL_BYTE * frame_bytes if memory_bytes is None else memory_bytes
+            _FRAME_MEMORY_BYTES + _MEMORY_PER_PIXEL_BYTE * frame_bytes if memory_bytes is None else memory_bytes
         )
         self._decoders = decoders
         self._lock = threading.Lock()
@@ -159,7 +159,7 @@ class DecoderPool(Closing):
             stopped = now - before - interval
             with self._lock:
                 for worker in self._workers:
-                    if stopped > STOPPED_SECONDS:
+                    if stopped > _STOPPED_SECONDS:
                         worker.deadline += stopped
                     elif worker.deadline < now:
                         worker.overdue = True
@@ -199,7 +199,7 @@ class _Worker:
         self.ready = False
         self.overdue = False
         self.why = ""
-        self.deadline = time.monotonic() + START_SECONDS
+        self.deadline = time.monotonic() + _START_SECONDS
         if getattr(sys, "frozen", False) or not sys.executable:
             raise DecoderError("cannot be decoded: that needs a Python interpreter to start, and this program has none")
         with ExitStack() as theirs, ExitStack() as ours:
@@ -216,7 +216,7 @@ class _Worker:
                     stdout=replies,
                     stderr=subprocess.DEVNULL,
                     pass_fds=[number] if number >= 0 else [],
-                    env={**os.environ, **ENVIRONMENT},
+                    env={**os.environ, **_ENVIRONMENT},
                     creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
                 )
             except OSError as error:

@@ -26,7 +26,7 @@ REPLY = "<BQ"
 
 READY, DONE, FAILED, NO_MEMORY, NO_DECODER = range(5)
 
-SIZE_WITHOUT_PROC = 1 << 30
+_SIZE_WITHOUT_PROC = 1 << 30
 """Address space, in bytes, that is assumed to be in use where the system does not tell: more than the imports need."""
 
 Decoder = Callable[[bytes, dict[str, Any]], Any]
@@ -115,7 +115,7 @@ def limit_memory(more_bytes: int) -> None:
         with open("/proc/self/statm", encoding="ascii") as file:
             used = int(file.read().split()[0]) * resource.getpagesize()
     except OSError:
-        used = SIZE_WITHOUT_PROC
+        used = _SIZE_WITHOUT_PROC
     for what, limit in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, used + more_bytes)):
         try:
             resource.setrlimit(what, (limit, limit))

@@ -40,12 +40,12 @@ from clrecon.system.base_classes import Closing
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.paths import open_regular
 
-RLE_HEAD_BYTES = 64
-RLE_BEST_RATIO = 64
+_RLE_HEAD_BYTES = 64
+_RLE_BEST_RATIO = 64
 """Highest compression ratio of RLE: a run of PackBits is two bytes for at most 128."""
 
-LARGE_FRAME_BYTES = 64 * 2**20
-LARGE_FRAME_RATIO = 1000
+_LARGE_FRAME_BYTES = 64 * 2**20
+_LARGE_FRAME_RATIO = 1000
 """Highest accepted ratio of large frames (over 5,792 x 5,792 of 16 bits); beyond it they are taken for attacks.  Small
 frames may be all air."""
 
@@ -91,27 +91,27 @@ def read_codestream(data: bytes, transfer_syntax: str, rows: int, columns: int, 
             f"the compressed frame has {frame.bits} bits a pixel, the header allocates {bits_allocated}"
         )
     pixel_bytes = rows * columns * bits_allocated // 8
-    if pixel_bytes > LARGE_FRAME_BYTES and pixel_bytes > LARGE_FRAME_RATIO * len(data):
+    if pixel_bytes > _LARGE_FRAME_BYTES and pixel_bytes > _LARGE_FRAME_RATIO * len(data):
         raise RefusedInputError(
             f"the compressed frame of {len(data)} bytes would unfold to {pixel_bytes}, more than "
-            f"{LARGE_FRAME_RATIO} times as many"
+            f"{_LARGE_FRAME_RATIO} times as many"
         )
     return frame
 
 
 def _read_rle(data: bytes, rows: int, columns: int, bits_allocated: int) -> Codestream:
     """Check RLE.  Its head gives no size, only whether the segments fit the frame and the image."""
-    if len(data) < RLE_HEAD_BYTES:
+    if len(data) < _RLE_HEAD_BYTES:
         raise RefusedInputError("the compressed frame is shorter than the head of an RLE frame")
-    count, *offsets = struct.unpack("<16L", data[:RLE_HEAD_BYTES])
+    count, *offsets = struct.unpack("<16L", data[:_RLE_HEAD_BYTES])
     segments = bits_allocated // 8
     if count != segments:
         raise RefusedInputError(f"the RLE frame has {count} segments, {segments} expected")
     ends = [*offsets[1:count], len(data)]
-    if offsets[0] != RLE_HEAD_BYTES or not all(a < b for a, b in zip(offsets[:count], ends, strict=True)):
+    if offsets[0] != _RLE_HEAD_BYTES or not all(a < b for a, b in zip(offsets[:count], ends, strict=True)):
         raise RefusedInputError("the RLE frame has a damaged table of segments")
     for start, end in zip(offsets, ends, strict=False):
-        if (end - start) * RLE_BEST_RATIO < rows * columns:
+        if (end - start) * _RLE_BEST_RATIO < rows * columns:
             raise RefusedInputError(f"truncated: an RLE segment of {end - start} bytes for {rows * columns} pixels")
     return Codestream(data, rows, columns, bits_allocated, None)
 
@@ -180,7 +180,7 @@ def _check_end(data: bytes) -> None:
 
 INFLATE_STEP = 1 << 20
 
-COMPRESSED_RATIO, COMPRESSED_EXTRA_BYTES = 4, 1 << 20
+_COMPRESSED_RATIO, _COMPRESSED_EXTRA_BYTES = 4, 1 << 20
 """A compressed frame has at most this many times the bytes of its pixels, plus these bytes."""
 
 Known = TypeVar("Known")
@@ -289,7 +289,7 @@ def _read_into(file: Any, stored: NDArray[Any]) -> None:
 
 def _check_compressed_bytes(found: int, pixel_bytes: int) -> None:
     """Refuse a frame of too many bytes: a failing compression makes an image only a little larger."""
-    most = COMPRESSED_RATIO * pixel_bytes + COMPRESSED_EXTRA_BYTES
+    most = _COMPRESSED_RATIO * pixel_bytes + _COMPRESSED_EXTRA_BYTES
     if found > most:
         raise RefusedInputError(f"the compressed frame has {found} bytes for {pixel_bytes} of pixels, {most} at most")
 

@@ -117,10 +117,10 @@ def describe_stray_bits(found: Iterable[StrayBits | None], headers: Iterable[Sli
 
 
 MAX_READERS = 8
-MAX_DECODERS = 32
+_MAX_DECODERS = 32
 DECODER_WORTH_BYTES = 4 << 20
 """Least bytes of pixels for one more decoder: they take about as long to decode as a process takes to start."""
-FLOAT_LIMIT = 1e9
+_FLOAT_LIMIT = 1e9
 """Larger values are not HU; float32 and every later step can hold this value."""
 
 
@@ -164,7 +164,7 @@ def _fill_volume(
     blank: list[int] = []
     most = MAX_READERS
     if source.compressed:
-        most = min(MAX_DECODERS, 1 + len(slices) * slices[0].pixel_bytes // DECODER_WORTH_BYTES)
+        most = min(_MAX_DECODERS, 1 + len(slices) * slices[0].pixel_bytes // DECODER_WORTH_BYTES)
     with ThreadPoolExecutor(count_readers(len(slices), most)) as pool:
         try:
             jobs = {pool.submit(_fill_slice, source, header, voxels[k]): k for k, header in enumerate(slices)}
@@ -225,7 +225,7 @@ def _fill_slice(source: StoredPixels, header: SliceHeader, out: NDArray[Any]) ->
         # A measured value at this place does not matter: this saves one pass over the slice.
         np.copyto(stored, stored.flat[padding.argmin()], where=padding)
     low, high = stored.min(), stored.max()
-    if header.float_pixels and not (abs(low) <= FLOAT_LIMIT and abs(high) <= FLOAT_LIMIT):
+    if header.float_pixels and not (abs(low) <= _FLOAT_LIMIT and abs(high) <= _FLOAT_LIMIT):
         raise RefusedInputError(f"{header.name}: Float Pixel Data holds {_describe_unfit(stored)}: those are no HU")
     hu_low, hu_high = float(low) * header.slope + header.intercept, float(high) * header.slope + header.intercept
     if hu_low > hu_high:

@@ -30,7 +30,7 @@ make slices that touch or overlap.  With a gap of one thickness, numbers in step
 CLOSEST = 0.25
 """Least distance in thicknesses that the slices between would have: numbers in larger steps are only odd.  Where no
 thickness is stated, the slices between would lie at least a pixel apart, and the steps are at most 1 / `CLOSEST`."""
-PROPORTIONAL = 0.05
+_PROPORTIONAL = 0.05
 """Largest relative difference of the distances for one number where positions follow the numbers."""
 
 
@@ -145,7 +145,7 @@ def _judge_steps(census: Census, stack: Stack, numbers: NDArray[np.int64]) -> tu
         unit = 1
     else:
         each = gaps * unit / steps
-        if float(np.ptp(each)) > PROPORTIONAL * float(each.min()):
+        if float(np.ptp(each)) > _PROPORTIONAL * float(each.min()):
             return 0, ""
         why = "their positions leave room for more"
     low, high = int(numbers.min()), int(numbers.max())

@@ -55,23 +55,23 @@ from clrecon.system.arguments import name_parameter
 from clrecon.system.records import Gate, at_most, none_of, unmeasured
 from clrecon.system.text import count_of, hash_uid
 
-LONG_VOXELS = 10.0
+_LONG_VOXELS = 10.0
 """Gaps of so many pixels want a SliceThickness that says what lies between."""
-GAP_THICKNESSES = 1.95
+_GAP_THICKNESSES = 1.95
 """Largest gap in slice thicknesses: 2 where every second slice of a gapless scan is lost, 10 in a scan of the lung."""
-SLOPES, INTERCEPTS = (1e-3, 100.0), (-40_000.0, 40_000.0)
+_SLOPES, _INTERCEPTS = (1e-3, 100.0), (-40_000.0, 40_000.0)
 """Ranges of slope and intercept.  Scanners write the slope 1, a fraction of 1 or a few; below 0 bone would be dark.
 Stored 16-bit values in the middle of their range need an intercept of 32768."""
-FEWEST_LOCATIONS, FOLLOWS = 3, 0.25
+_FEWEST_LOCATIONS, _FOLLOWS = 3, 0.25
 """Fewest slices whose SliceLocation counts, and how far, in steps, a slice may be from a line through them."""
-LOCATION_PART, LOCATION_MM = 0.05, 1.0
+_LOCATION_PART, _LOCATION_MM = 0.05, 1.0
 """Largest difference of the length of the stack by SliceLocation: some writers round it to whole mm."""
-FIELD_WIDER = 1.5
+_FIELD_WIDER = 1.5
 """Largest width of a picture in ReconstructionDiameters: the circle is in the square, or hardly beyond it."""
-MOST_PIXELS, FINEST_MM = 4096, 0.03
+MOST_PIXELS, _FINEST_MM = 4096, 0.03
 """More pixels along the diameter no scanner has, of those that are not of a micro-CT."""
-CLEAR_DIRECTION = 0.8
-STRAY = "values beyond the stored bits"
+_CLEAR_DIRECTION = 0.8
+_STRAY = "values beyond the stored bits"
 
 
 def judge_series(
@@ -106,9 +106,9 @@ def judge_series(
     share = "share of voxels without a measurement (padding)"
     if facts is None:
         gates.append(unmeasured("padding_share", PADDING_SHARE, None, f"{share}: the pixels were not read"))
-        gates.append(unmeasured("stored_bits", 0, None, f"{STRAY}: the pixels were not read"))
+        gates.append(unmeasured("stored_bits", 0, None, f"{_STRAY}: the pixels were not read"))
     else:
-        gates.append(none_of("stored_bits", facts.stray, facts.stray_text or STRAY))
+        gates.append(none_of("stored_bits", facts.stray, facts.stray_text or _STRAY))
         gates.append(at_most("padding_share", facts.padding_share, PADDING_SHARE, None, share))
     return gates
 
@@ -139,21 +139,21 @@ def _judge_thickness(stack: Stack) -> Gate:
     what = "largest gap between slices as a multiple of SliceThickness; above 1 the tissue between was not measured"
     thickness = np.array([header.slice_thickness_mm or 0.0 for header in stack.slices])
     if (thickness <= 0.0).any():
-        return unmeasured("gap_thickness", GAP_THICKNESSES, None, f"{what}: the thickness is not stated")
+        return unmeasured("gap_thickness", _GAP_THICKNESSES, None, f"{what}: the thickness is not stated")
     gaps = np.diff(stack.distances_mm)
     worst = int(np.argmax(2.0 * gaps / (thickness[1:] + thickness[:-1])))
     ratio = float(2.0 * gaps[worst] / (thickness[worst] + thickness[worst + 1]))
-    if ratio > GAP_THICKNESSES:
+    if ratio > _GAP_THICKNESSES:
         what += f" ({gaps[worst]:g} mm at a thickness of {thickness[worst]:g} mm)"
-    return at_most("gap_thickness", ratio, GAP_THICKNESSES, None, what)
+    return at_most("gap_thickness", ratio, _GAP_THICKNESSES, None, what)
 
 
 def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
     """Judge whether rescale, lowest and densest voxel are those of a CT; without pixels the rescale alone."""
     odd = []
     for name, values, (low, high) in (
-        ("RescaleSlope", [header.slope for header in headers], SLOPES),
-        ("RescaleIntercept", [header.intercept for header in headers], INTERCEPTS),
+        ("RescaleSlope", [header.slope for header in headers], _SLOPES),
+        ("RescaleIntercept", [header.intercept for header in headers], _INTERCEPTS),
     ):
         odd += [f"{name} {value:g}" for value in (min(values), max(values)) if not low <= value <= high][:1]
     if facts is not None and facts.hu_min <= facts.hu_max and not count_unknown(headers):
@@ -188,10 +188,10 @@ def _count_doubled(series: Series) -> int:
 def _judge_stated_gap(stack: Stack) -> Gate:
     """Compare SpacingBetweenSlices with the positions: a sign that every second slice is missing."""
     what, bound = "SpacingBetweenSlices differs from the positions by", 100.0 * STATED_GAP_TOLERANCE
-    found = measure_stated_gap(stack.slices, stack.positions_mm, stack.line.gap_median_mm)
-    if found is None:
+    stated_gap = measure_stated_gap(stack.slices, stack.positions_mm, stack.line.gap_median_mm)
+    if stated_gap is None:
         return unmeasured("stated_gap", bound, "%", f"{what}: it is not stated")
-    return at_most("stated_gap", 100.0 * found[2], bound, "%", what)
+    return at_most("stated_gap", 100.0 * stated_gap[2], bound, "%", what)
 
 
 def _judge_stated_places(stack: Stack) -> Gate:
@@ -210,7 +210,7 @@ def _compare_locations(stack: Stack) -> str | None:
     It is counted from anywhere in any direction, along the normal, the table or an axis of the patient.
     """
     places = [header.stated_location_mm for header in stack.slices]
-    if len(places) < FEWEST_LOCATIONS or any(place is None for place in places):
+    if len(places) < _FEWEST_LOCATIONS or any(place is None for place in places):
         return ""
     along = np.abs(np.array(places, np.float64) - (places[0] or 0.0))
     moved = np.abs(stack.positions_mm - stack.positions_mm[0])
@@ -218,11 +218,11 @@ def _compare_locations(stack: Stack) -> str | None:
     last = len(places) - 1
     if along[-1] <= 0.0 or (np.diff(along) == 1.0).all():  # all at one place, or numbers of the slices
         return ""
-    if np.abs(along / along[-1] - distances / distances[-1]).max() * last > FOLLOWS:
+    if np.abs(along / along[-1] - distances / distances[-1]).max() * last > _FOLLOWS:
         return ""  # it does not follow the slices
     ways = [float(distances[-1]), float(stack.distances_mm[-1] - stack.distances_mm[0]), *moved[-1].tolist()]
     nearest = min(ways, key=lambda length: abs(length - along[-1]))
-    if abs(nearest - along[-1]) <= max(LOCATION_PART * nearest, LOCATION_MM):
+    if abs(nearest - along[-1]) <= max(_LOCATION_PART * nearest, _LOCATION_MM):
         return None
     return (
         f"SliceLocation moves by {along[-1] / last:.4g} mm from slice to slice, ImagePositionPatient by"
@@ -237,9 +237,9 @@ def _compare_field(stack: Stack) -> str | None:
     widest = max(first.columns * first.di_mm, first.rows * first.dj_mm)
     if diameter <= 0.0:
         return ""
-    if widest > FIELD_WIDER * diameter:
+    if widest > _FIELD_WIDER * diameter:
         return f"ReconstructionDiameter says {diameter:g} mm, by PixelSpacing the picture is {widest:.4g} mm wide"
-    if pixel < FINEST_MM or diameter <= MOST_PIXELS * pixel:
+    if pixel < _FINEST_MM or diameter <= MOST_PIXELS * pixel:
         return None
     return f"ReconstructionDiameter says {diameter:g} mm, {diameter / pixel:,.0f} pixels of {pixel:g} mm"
 
@@ -253,7 +253,7 @@ def _compare_letters(stack: Stack) -> str | None:
     for direction, letters in zip((directions.row, directions.column), first.stated_letters.split("\\"), strict=True):
         axis = int(np.argmax(np.abs(direction)))
         letter = ("LR", "PA", "HF")[axis][int(direction[axis] < 0.0)]
-        found.append(letters if letter in letters or abs(direction[axis]) < CLEAR_DIRECTION else letter)
+        found.append(letters if letter in letters or abs(direction[axis]) < _CLEAR_DIRECTION else letter)
     shown = "\\".join(found)
     if shown == first.stated_letters:
         return None
@@ -266,7 +266,7 @@ def count_unknown(headers: Sequence[SliceHeader]) -> int:
     )
 
 
-SAID_BY_GATES = (
+_SAID_BY_GATES = (
     "complete_series",
     "stated_places",
     "shown_places",
@@ -338,7 +338,7 @@ def collect_series_warnings(series: Series) -> list[str]:
 def _describe_long_voxels(stack: Stack) -> list[str]:
     """Describe gaps of many pixels where no thickness says whether the tissue between was measured."""
     gap, pixel = stack.line.gap_median_mm, max(stack.slices[0].di_mm, stack.slices[0].dj_mm)
-    if gap is None or gap < LONG_VOXELS * pixel or median_thickness(stack.slices) is not None:
+    if gap is None or gap < _LONG_VOXELS * pixel or median_thickness(stack.slices) is not None:
         return []
     return [
         f"slices lie {gap:.4g} mm apart, {gap / pixel:.3g} times the width of a pixel, and no SliceThickness says"
@@ -419,7 +419,7 @@ def certify(
     stated = next((h.stated_gap_mm for h in headers if h.stated_gap_mm is not None), None)
     lay = {h.patient_position for h in headers}
     gates = judge_series(series, stack, facts, likeness, None if findings is None else findings.gates)
-    unsaid = [gate.text for gate in gates if gate.name in SAID_BY_GATES and gate.ok is False]
+    unsaid = [gate.text for gate in gates if gate.name in _SAID_BY_GATES and gate.ok is False]
     return Certificate(
         format="DICOM",
         series={"number": series.number, "uid_hash": hash_uid(identity.uid), "modality": identity.modality},

@@ -91,13 +91,13 @@ def advise_on(kinds: Iterable[str]) -> str:
     return "; ".join(advice)
 
 
-DAMAGED_MARK = "DICOM by its header, but without the mark at byte 128"
+_DAMAGED_MARK = "DICOM by its header, but without the mark at byte 128"
 DAMAGED_START = "holds a DICOM header, but not where it should be"
 EMPTY, TEXT, UNKNOWN = "empty", "text", "no DICOM"
-SIZE_BYTES = 256
+_SIZE_BYTES = 256
 """Largest difference in size from a slice: headers of slices differ by a few digits."""
-FEWEST_RANDOM_NAMES = 3
-META_WITHIN = 1024
+_FEWEST_RANDOM_NAMES = 3
+_META_WITHIN = 1024
 """A damaged file may have lost or gained bytes before its meta header; the header begins within this many bytes."""
 
 _META_ELEMENT = re.compile(rb"\x02\0[\0-\x16]\0(UL|UI|OB|SH|AE)")
@@ -129,7 +129,7 @@ class _Slices:
         self.patterns = {_pattern(name) for name in self.names}
         lengths = {len(name) for name in self.names}
         self.random = None
-        if len(self.names) >= FEWEST_RANDOM_NAMES and len(lengths) == 1:
+        if len(self.names) >= _FEWEST_RANDOM_NAMES and len(lengths) == 1:
             self.length = lengths.pop()
             self.random = next((kind for kind in _RANDOM if all(map(kind.fullmatch, self.names))), None)
 
@@ -141,8 +141,8 @@ class _Slices:
         return bool(drawn) and any(map(str.isdigit, name))
 
     def has_size_like(self, size: int) -> bool:
-        place = bisect_left(self.sizes, size - SIZE_BYTES)
-        return place < len(self.sizes) and self.sizes[place] <= size + SIZE_BYTES
+        place = bisect_left(self.sizes, size - _SIZE_BYTES)
+        return place < len(self.sizes) and self.sizes[place] <= size + _SIZE_BYTES
 
 
 def _pattern(name: str) -> str:
@@ -155,13 +155,13 @@ def describe_start(start: bytes) -> str:
     if not start:
         return EMPTY
     if _META_ELEMENT.match(start, META_START):
-        return DAMAGED_MARK
+        return _DAMAGED_MARK
     kind = describe_container(start)
     if kind:
         return kind
     if not 0x20 <= start[0] < 0x7F and not start.strip(start[:1]):
         return f"blank, all bytes {start[0]:02X}"
-    if _SYNTAX_OR_CLASS.search(start, 0, META_WITHIN):
+    if _SYNTAX_OR_CLASS.search(start, 0, _META_WITHIN):
         return DAMAGED_START
     return UNKNOWN if b"\0" in start else TEXT
 
@@ -185,7 +185,7 @@ def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int 
 
 def _judge(stranger: Stranger, folders: dict[str, _Slices], paths: set[str]) -> str:
     folder, _, name = stranger.file.rpartition(os.sep)
-    if stranger.what in (DAMAGED_MARK, DAMAGED_START):
+    if stranger.what in (_DAMAGED_MARK, DAMAGED_START):
         return stranger.what
     known = folders.get(folder)
     stem, point, suffix = name.rpartition(".")

@@ -25,17 +25,17 @@ from clrecon.system.light_dataclass import dataclass, field, replace
 from clrecon.system.text import join_names
 
 PLACES_SHOWN = 4
-PHASES_SHOWN = 12
-SMALLEST_PHASE = 3
+_PHASES_SHOWN = 12
+_SMALLEST_PHASE = 3
 """With more groups than slices at the fullest place, groups are phases only if each has this many slices."""
-TIME_KEYWORDS = ("AcquisitionTime", "ContentTime")
-DATE_KEYWORDS = ("AcquisitionDate", "ContentDate")
-HALF_A_DAY_S = 43_200.0
+_TIME_KEYWORDS = ("AcquisitionTime", "ContentTime")
+_DATE_KEYWORDS = ("AcquisitionDate", "ContentDate")
+_HALF_A_DAY_S = 43_200.0
 SAME_POSITION_MM = 0.01
-SAME_SPACING = 1e-5
-SAME_DIRECTION = 1e-4
+_SAME_SPACING = 1e-5
+_SAME_DIRECTION = 1e-4
 """Tolerances for the geometry of copies, for rounding: those of `clrecon.reading.dicom.stack.fit`."""
-RANK_KEYWORDS = (
+_RANK_KEYWORDS = (
     ("TemporalPositionIdentifier",),
     ("TriggerTime",),
     ("AcquisitionDate", "AcquisitionTime"),
@@ -163,9 +163,9 @@ def lie_alike(one: SliceHeader, other: SliceHeader) -> bool:
     return (
         one.frame_of_reference == other.frame_of_reference
         and _is_near(one.position_mm, other.position_mm, SAME_POSITION_MM)
-        and _is_near((one.di_mm, one.dj_mm), (other.di_mm, other.dj_mm), SAME_SPACING * min(one.di_mm, one.dj_mm))
-        and _is_near(one.row_cosines, other.row_cosines, SAME_DIRECTION)
-        and _is_near(one.column_cosines, other.column_cosines, SAME_DIRECTION)
+        and _is_near((one.di_mm, one.dj_mm), (other.di_mm, other.dj_mm), _SAME_SPACING * min(one.di_mm, one.dj_mm))
+        and _is_near(one.row_cosines, other.row_cosines, _SAME_DIRECTION)
+        and _is_near(one.column_cosines, other.column_cosines, _SAME_DIRECTION)
     )
 
 
@@ -209,7 +209,7 @@ def _find_phases(places: Sequence[Sequence[Sequence[SliceHeader]]]) -> tuple[Pha
             for one in here:
                 for value, header in one.items():
                     groups[value].append(header)
-        if clean and (len(groups) == most or min(map(len, groups.values())) >= SMALLEST_PHASE):
+        if clean and (len(groups) == most or min(map(len, groups.values())) >= _SMALLEST_PHASE):
             return _part((keywords, groups))
     everything = [list(chain(*slices)) for slices in places]
     return _rank_by_time(kept) or _rank_by_time(everything)
@@ -247,7 +247,7 @@ def _rank_by_time(places: Sequence[Sequence[SliceHeader]]) -> tuple[Phase, ...]:
     most = max(map(len, places))
     if any(len(slices) != most for slices in places):
         return ()
-    for keywords in RANK_KEYWORDS:
+    for keywords in _RANK_KEYWORDS:
         ordered = [sorted(slices, key=lambda header: _order(values_of(header, keywords))) for slices in places]
         values = [[values_of(header, keywords) for header in slices] for slices in ordered]
         if any(len(set(visits)) < most or any("" in value for value in visits) for visits in values):
@@ -268,7 +268,7 @@ def _are_passes(values: Sequence[Sequence[tuple[str, ...]]], keywords: tuple[str
     """
     if keywords in (("AcquisitionTime",), ("ContentTime",)):
         seconds = [_seconds(value[0]) or 0.0 for value in chain(*values)]
-        if max(seconds) - min(seconds) > HALF_A_DAY_S:
+        if max(seconds) - min(seconds) > _HALF_A_DAY_S:
             return False
     ranks = {value: rank for rank, value in enumerate(sorted(set(chain(*values)), key=_order))}
     times = np.array([[ranks[value] for value in visits] for visits in values])
@@ -291,11 +291,11 @@ def _show(keywords: Sequence[str], values: Sequence[tuple[str, ...]]) -> list[st
     columns = []
     for place, keyword in enumerate(keywords):
         column = [value[place] for value in values]
-        if keyword in TIME_KEYWORDS:
+        if keyword in _TIME_KEYWORDS:
             seconds = [_seconds(text) for text in column]
             first = min((value for value in seconds if value is not None), default=0.0)
             column = ["(none)" if value is None else f"+{value - first:g} s" for value in seconds]
-        elif keyword in DATE_KEYWORDS:
+        elif keyword in _DATE_KEYWORDS:
             column = [f"date {1 + sorted(set(column)).index(text)}" for text in column]
         columns.append([text or "(none)" for text in column])
     return [", ".join(parts) for parts in zip(*columns, strict=True)]
@@ -315,8 +315,8 @@ def describe_phases(places: Places) -> str:
     if places.problem:
         return places.problem
     phases = places.phases
-    shown = [str(phase) for phase in phases[:PHASES_SHOWN]]
-    more = f" and {len(phases) - PHASES_SHOWN} more" if len(phases) > PHASES_SHOWN else ""
+    shown = [str(phase) for phase in phases[:_PHASES_SHOWN]]
+    more = f" and {len(phases) - _PHASES_SHOWN} more" if len(phases) > _PHASES_SHOWN else ""
     where = "whose slices lie between each other" if places.interleaved else "at the same places"
     spacing = f"; {describe_spacing(phases, phases[0])}" if places.interleaved else ""
     return (

@@ -9,7 +9,7 @@ slice, as an unreadable file may.
 The calls that can hang (listing a folder, opening a file, reading its start) run in daemon threads.  A network drive
 that does not answer cannot be interrupted, not even with Ctrl-C: the caller waits in another thread, reports after
 `NOTICE_S` what it waits for, and gives up after `GIVE_UP_S` with an error that names it.  And where a file takes longer
-than `SLOW_FILE_S`, the delay lies in the connection to the disk: then several threads wait at once.  On a warm cache
+than `_SLOW_FILE_S`, the delay lies in the connection to the disk: then several threads wait at once.  On a warm cache
 one thread is fastest, since the parser beside it needs the interpreter's lock.
 """
 
@@ -49,7 +49,7 @@ T = TypeVar("T")
 
 NOTICE_S = 10.0
 GIVE_UP_S = 300.0  # long enough for a tape library or a sleeping disk
-SLOW_FILE_S = 0.0005
+_SLOW_FILE_S = 0.0005
 CHUNK = 64
 MOST_THREADS = 16
 
@@ -85,7 +85,7 @@ class DiskReader:
             count = len(self._threads)
             start = perf_counter()
             parts = self._run_all([partial(self._read_files, chunk[part::count]) for part in range(count)])
-            if count == 1 and perf_counter() - start > SLOW_FILE_S * len(chunk):
+            if count == 1 and perf_counter() - start > _SLOW_FILE_S * len(chunk):
                 self._start_threads(MOST_THREADS)
             for place in range(len(chunk)):
                 yield parts[place % count][place // count]
@@ -145,16 +145,16 @@ class DiskReader:
                 self._progress(f"no answer yet from {name}", *self._place)
 
 
-DICOM_SUFFIXES = (".dcm", ".dic", ".dicom", ".ima")
+_DICOM_SUFFIXES = (".dcm", ".dic", ".dicom", ".ima")
 PROGRESS_STEPS = 1000
-BLANK_START = bytes(128) + b"DICM"
-LINK_INSIDE, LINK_OUT, LINK_LOST = (
+_BLANK_START = bytes(128) + b"DICM"
+_LINK_INSIDE, LINK_OUT, _LINK_LOST = (
     "link inside the folder",
     "link out of the folder",
     "link to a file that is not there",
 )
 BARE_DATA_SET = "a data set without preamble"
-APPLE_DOUBLE = b"\x00\x05\x16\x07"
+_APPLE_DOUBLE = b"\x00\x05\x16\x07"
 """Start of the "._NAME" files that macOS creates beside files on foreign disks."""
 
 
@@ -241,13 +241,13 @@ def _take_file(file: str, start: FileStart | OSError, scan: Scan, force: bool) -
 def _suspect(file: str, start: bytes) -> str:
     """Say why a file without the mark of DICOM may be the remains of an image; empty without a reason."""
     name = os.path.basename(file)
-    if name.startswith("._") and start.startswith(APPLE_DOUBLE):
+    if name.startswith("._") and start.startswith(_APPLE_DOUBLE):
         return ""
-    if 0 < len(start) < META_START and BLANK_START.startswith(start):
+    if 0 < len(start) < META_START and _BLANK_START.startswith(start):
         return "cut within the preamble"
     if restore_start(start) is not None:
         return f"{BARE_DATA_SET} ({describe_way_out()})"
-    return "named like DICOM but is none" if os.path.splitext(name)[1].lower() in DICOM_SUFFIXES else ""
+    return "named like DICOM but is none" if os.path.splitext(name)[1].lower() in _DICOM_SUFFIXES else ""
 
 
 def _list_files(path: Path, scan: Scan, disk: DiskReader, follow_links: bool) -> list[str]:
@@ -310,14 +310,14 @@ def _sort_link(entry: os.DirEntry[str], found: _Found, scan: Scan) -> None:
     try:
         mode = entry.stat().st_mode
     except OSError:
-        scan.skipped[LINK_LOST] += 1
-        scan.suspects.append(CorruptFile(Path(entry.path), LINK_LOST))
+        scan.skipped[_LINK_LOST] += 1
+        scan.suspects.append(CorruptFile(Path(entry.path), _LINK_LOST))
         return
     target = os.path.realpath(entry.path)
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         scan.skipped["not a regular file"] += 1
     elif target == found.root or target.startswith(found.root.rstrip(os.sep) + os.sep):
-        scan.skipped[LINK_INSIDE] += 1
+        scan.skipped[_LINK_INSIDE] += 1
     elif found.follow_links:
         (found.files if stat.S_ISREG(mode) else found.folders).append(entry.path)
     else:

@@ -96,7 +96,7 @@ def describe_missing_parts(slices: Iterable[SliceHeader]) -> list[str]:
 
 
 PROBLEMS_SHOWN = 3
-SLICE_MODALITIES = ("MR", "NM", "PT")
+_SLICE_MODALITIES = ("MR", "NM", "PT")
 """Other modalities whose files are slices: a corrupt file among them probably is one too."""
 
 
@@ -342,7 +342,7 @@ def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:
     """
     holders: dict[Path, set[str]] = defaultdict(set)  # from folder to the series, by UID, with slices in it
     for series in found:
-        if series.kind == "capture" or series.kind == "other" and series.identity.modality not in SLICE_MODALITIES:
+        if series.kind == "capture" or series.kind == "other" and series.identity.modality not in _SLICE_MODALITIES:
             continue
         images: list[SliceHeader | OtherImage] = [*series.headers, *series.others]
         for image in images:

@@ -82,9 +82,9 @@ def _orthonormalise(row: Float64Array, column: Float64Array) -> tuple[Float64Arr
     return row, column
 
 
-DUPLICATE_MM = 1e-3
+_DUPLICATE_MM = 1e-3
 STATED_GAP_TOLERANCE = 0.01
-PIXEL_SPACING_TOLERANCE = 1e-5
+_PIXEL_SPACING_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,7 @@ def find_mixed_values(headers: Sequence[SliceHeader]) -> list[str]:
         odd = [header for header in headers if header.patient_hash not in (usual, None)]
         found.append(f"PatientID differs within the series: another in {join_names(h.name for h in odd)}")
     di, dj = median([header.di_mm for header in headers]), median([header.dj_mm for header in headers])
-    allowed = PIXEL_SPACING_TOLERANCE * min(di, dj)
+    allowed = _PIXEL_SPACING_TOLERANCE * min(di, dj)
     odd = [header for header in headers if max(abs(header.di_mm - di), abs(header.dj_mm - dj)) > allowed]
     if odd:
         found.append(
@@ -283,7 +283,7 @@ def _mean_directions(
 
 
 def group_places(headers: Sequence[SliceHeader]) -> list[list[SliceHeader]]:
-    """Group slices by place (`DUPLICATE_MM`), in order; where directions are wrong, each slice has its own."""
+    """Group slices by place (`_DUPLICATE_MM`), in order; where directions are wrong, each slice has its own."""
     problems: list[str] = []
     row, column = _mean_directions(headers, problems, [])
     if problems:
@@ -292,7 +292,7 @@ def group_places(headers: Sequence[SliceHeader]) -> list[list[SliceHeader]]:
     places: list[list[SliceHeader]] = []
     last = -np.inf
     for header, distance in zip(slices, distances.tolist(), strict=True):
-        if distance - last >= DUPLICATE_MM:
+        if distance - last >= _DUPLICATE_MM:
             places.append([])
             last = distance
         places[-1].append(header)

@@ -25,7 +25,7 @@ from clrecon.reading.dicom.parse.values import name_element
 from clrecon.reading.dicom.stack.spacing import median
 from clrecon.system.light_dataclass import dataclass
 
-CERTAIN = (
+_CERTAIN = (
     "TemporalPositionIndex",
     "TemporalPositionIdentifier",
     "NominalPercentageOfCardiacPhase",
@@ -35,15 +35,15 @@ CERTAIN = (
     "KVP",
 )
 """Elements that are constant within a volume."""
-POSSIBLE = ("AcquisitionNumber", "FrameAcquisitionNumber", "AcquisitionTime", "ImageType")
+_POSSIBLE = ("AcquisitionNumber", "FrameAcquisitionNumber", "AcquisitionTime", "ImageType")
 """Elements that may change within one volume, from rotation to rotation or from file to file.  They divide a stack only
 if it is uneven as a whole and each part is even."""
-SMALLEST_VOLUME = 3
-EVEN = 0.05
+_SMALLEST_VOLUME = 3
+_EVEN = 0.05
 """Relative difference up to which gaps count as equal here."""
-THICKNESS_TOLERANCE = 0.01
-ALTERNATING = ("AcquisitionNumber", "FrameAcquisitionNumber")
-CODING: dict[str, Callable[[SliceHeader], float]] = {
+_THICKNESS_TOLERANCE = 0.01
+_ALTERNATING = ("AcquisitionNumber", "FrameAcquisitionNumber")
+_CODING: dict[str, Callable[[SliceHeader], float]] = {
     "RescaleSlope": lambda header: header.slope,
     "RescaleIntercept": lambda header: header.intercept,
     "BitsStored": lambda header: header.bits_stored,
@@ -64,9 +64,9 @@ def find_mixture(
     headers: Sequence[SliceHeader],
 ) -> tuple[tuple[str, ...], Mapping[tuple[str, ...], Sequence[SliceHeader]]] | None:
     """Find the keyword that divides a stack into volumes of three slices or more, and the slices of each value."""
-    for keyword, values in _values_along(headers, (*CERTAIN, *POSSIBLE)):
+    for keyword, values in _values_along(headers, (*_CERTAIN, *_POSSIBLE)):
         groups = _find_interleaved(values, headers)
-        if groups and (keyword in CERTAIN or not _is_even(headers) and all(map(_is_even, groups.values()))):
+        if groups and (keyword in _CERTAIN or not _is_even(headers) and all(map(_is_even, groups.values()))):
             return (keyword,), groups
     return None
 
@@ -87,20 +87,20 @@ def _find_interleaved(
     groups: dict[tuple[str, ...], list[SliceHeader]] = defaultdict(list)
     for value, header in zip(values, headers, strict=True):
         groups[(value,)].append(header)
-    if changes < len(groups) or ("",) in groups or min(map(len, groups.values())) < SMALLEST_VOLUME:
+    if changes < len(groups) or ("",) in groups or min(map(len, groups.values())) < _SMALLEST_VOLUME:
         return {}
     return groups
 
 
 def _is_even(headers: Sequence[SliceHeader]) -> bool:
     steps = np.linalg.norm(np.diff(np.array([header.position_mm for header in headers]), axis=0), axis=1)
-    return float(np.ptp(steps)) <= EVEN * float(steps.min())
+    return float(np.ptp(steps)) <= _EVEN * float(steps.min())
 
 
 def describe_differences(headers: Sequence[SliceHeader]) -> Iterator[tuple[str, Callable[[SliceHeader], bool]]]:
     """Yield descriptions of values that differ within a stack but should not, and which slices have another one."""
     first = headers[0]
-    for keyword, values in _values_along(headers, ("KVP", *ALTERNATING)):
+    for keyword, values in _values_along(headers, ("KVP", *_ALTERNATING)):
         if keyword == "KVP":
             text = "KVP differs along the stack: maybe parts of several volumes"
         elif _find_interleaved(values, headers):
@@ -112,11 +112,11 @@ def describe_differences(headers: Sequence[SliceHeader]) -> Iterator[tuple[str, 
     usual = stated[0] if stated else 0.0
 
     def is_other(header: SliceHeader) -> bool:
-        return _thickness(header) > 0.0 and abs(_thickness(header) - usual) > THICKNESS_TOLERANCE * usual
+        return _thickness(header) > 0.0 and abs(_thickness(header) - usual) > _THICKNESS_TOLERANCE * usual
 
     if any(map(is_other, headers)):
         yield "SliceThickness differs along the stack", is_other
-    for keyword, number_of in CODING.items():
+    for keyword, number_of in _CODING.items():
         number, count = Counter(map(number_of, headers)).most_common(1)[0]
         if len(headers) / 2 < count < len(headers):
             text = f"{keyword} is not {number:g} as in the other slices: the HU may be wrong"
@@ -217,29 +217,29 @@ def find_verdict(tag: int, even: bool) -> Verdict:
 
 
 FEWEST_SLICES = 6
-LONGEST_PERIOD = 8
+_LONGEST_PERIOD = 8
 PERIODS = 3
 """The order of values has to repeat this often: by chance, 6 interchangeable slices show it."""
-MOST_TOGETHER = 2
+_MOST_TOGETHER = 2
 """Largest number of neighbouring slices of one volume; more are parts in which one volume may be scanned."""
-MOST_VALUES = 8
+_MOST_VALUES = 8
 """An element with more values is judged by heaps: groups of close numbers, such as the times of two passes."""
-MOST_HEAPS = 4
+_MOST_HEAPS = 4
 LONGEST_VALUE = 64
 DENSER = 1.3
 """Where two volumes overlap in part, slices are this many times closer together than elsewhere."""
 WINDOW, WINDOWS = 32, 3
 """Windows of an evenly spaced stack, and slices in each, that are examined before all slices are: it can only hold
 volumes that overlap from end to end."""
-FEWEST_NUMBERED = 12
+_FEWEST_NUMBERED = 12
 """With fewer slices, InstanceNumber forms two heaps by chance."""
 
-SERIES_UID, SOP_INSTANCE, INSTANCE_NUMBER = 0x0020000E, 0x00080018, 0x00200013
-NEVER = frozenset({SOP_INSTANCE, SERIES_UID, INSTANCE_NUMBER, 0x00200032, 0x00200037, 0x00201041})
+SERIES_UID, _SOP_INSTANCE, INSTANCE_NUMBER = 0x0020000E, 0x00080018, 0x00200013
+NEVER = frozenset({_SOP_INSTANCE, SERIES_UID, INSTANCE_NUMBER, 0x00200032, 0x00200037, 0x00201041})
 """Identifiers and places of single slices, which are examined elsewhere."""
-PIXEL_GROUP, OVERLAY_GROUPS = 0x0028, range(0x5000, 0x6100)
+PIXEL_GROUP, _OVERLAY_GROUPS = 0x0028, range(0x5000, 0x6100)
 """Groups of elements that describe the stored values of single slices: rescale, extremes, padding, overlays."""
-WINDOW_TAGS = frozenset({0x00281050, 0x00281051, 0x00281055})
+_WINDOW_TAGS = frozenset({0x00281050, 0x00281051, 0x00281055})
 
 
 @dataclass(frozen=True)
@@ -300,10 +300,10 @@ def _find_in(headers: Sequence[SliceHeader], even: bool) -> Alternation | None:
             groups = tuple(tuple(k for k, code in enumerate(codes) if code == one) for one in sorted(set(codes)))
             certain = verdict == "phases"
             absent = next((number for number, group in enumerate(groups) if column[group[0]] == b""), None)
-            found = Alternation(tag, groups, certain, heaps, absent)
+            alternation = Alternation(tag, groups, certain, heaps, absent)
             if certain:
-                return found
-            doubtful = doubtful or found
+                return alternation
+            doubtful = doubtful or alternation
             break
     return doubtful
 
@@ -341,9 +341,9 @@ def _shorten(raw: bytes) -> bytes:
 
 def _is_compared(tag: int) -> bool:
     group = tag >> 16
-    if tag == INSTANCE_NUMBER or tag in WINDOW_TAGS:
+    if tag == INSTANCE_NUMBER or tag in _WINDOW_TAGS:
         return True
-    return tag not in NEVER and group != PIXEL_GROUP and group not in OVERLAY_GROUPS and tag & 0xFFFF != 0
+    return tag not in NEVER and group != PIXEL_GROUP and group not in _OVERLAY_GROUPS and tag & 0xFFFF != 0
 
 
 def _code(tag: int, column: Sequence[bytes]) -> Iterator[tuple[list[int], bool]]:
@@ -351,12 +351,12 @@ def _code(tag: int, column: Sequence[bytes]) -> Iterator[tuple[list[int], bool]]
     numbers = [read_number(raw) for raw in column]
     if tag == INSTANCE_NUMBER:
         known = [number for number in numbers if number is not None]
-        if len(known) == len(column) >= FEWEST_NUMBERED:
+        if len(known) == len(column) >= _FEWEST_NUMBERED:
             middle = sorted(known)[len(known) // 2]
             yield [int(number >= middle) for number in known], True
         return
     values = set(column)
-    if len(values) <= MOST_VALUES:
+    if len(values) <= _MOST_VALUES:
         ranks = {raw: rank for rank, raw in enumerate(sorted(values, key=lambda raw: (read_number(raw) or 0.0, raw)))}
         yield [ranks[raw] for raw in column], False
     if len(values) == 2:
@@ -368,7 +368,7 @@ def _code(tag: int, column: Sequence[bytes]) -> Iterator[tuple[list[int], bool]]
     if len(known) == len(column):
         ordered = np.unique(known)
         steps = np.argsort(-np.diff(ordered), kind="stable")
-        for heaps in range(2, min(MOST_HEAPS, len(ordered)) + 1):
+        for heaps in range(2, min(_MOST_HEAPS, len(ordered)) + 1):
             yield np.searchsorted(np.sort(ordered[steps[: heaps - 1]]), known).tolist(), True
 
 
@@ -384,14 +384,14 @@ def read_number(raw: bytes | str) -> float | None:
 def alternates(codes: Sequence[int], gaps: Sequence[float]) -> bool:
     """Tell whether `codes` repeat in a fixed order, in the whole stack or where the `gaps` to the next are shorter."""
     counts = Counter(codes)
-    if len(counts) < 2 or min(counts.values()) < SMALLEST_VOLUME:
+    if len(counts) < 2 or min(counts.values()) < _SMALLEST_VOLUME:
         return False
-    for period in range(2, LONGEST_PERIOD + 1):
+    for period in range(2, _LONGEST_PERIOD + 1):
         for first, last in _runs([one == other for one, other in zip(codes, codes[period:], strict=False)]):
             end = last + period
             if end - first < max(PERIODS * period, FEWEST_SLICES) or len(set(codes[first:end])) < 2:
                 continue
-            slabs = any(len(set(codes[k : k + MOST_TOGETHER + 1])) == 1 for k in range(first, end - MOST_TOGETHER))
+            slabs = any(len(set(codes[k : k + _MOST_TOGETHER + 1])) == 1 for k in range(first, end - _MOST_TOGETHER))
             if not slabs and _spans(codes, gaps, first, end):
                 return True
     return False

@@ -25,9 +25,9 @@ def median(values: Sequence[float] | NDArray[Any]) -> float:
     return float(ordered[middle] if len(ordered) % 2 else (ordered[middle - 1] + ordered[middle]) / 2)
 
 
-MISSING_RATIO = 1.5
+_MISSING_RATIO = 1.5
 RUN_LENGTH = 3
-RUN_TOLERANCE = 0.05
+_RUN_TOLERANCE = 0.05
 """A gap over 1.5 times the usual gap means missing slices, unless it belongs to a run: at least 3 consecutive gaps that
 are equal within 5 %. A run is a change of feed, a hole is not.  The usual gap is the median, with an even count the
 smaller of the two in the middle, so that equally many holes and whole gaps do not make the holes usual.  Beside a run
@@ -37,7 +37,7 @@ PLACES_SHOWN = 4
 
 @dataclass(frozen=True)
 class Holes:
-    """Gaps k, from slice k to k + 1, that are too wide (`MISSING_RATIO`), positions of their ends, usual gap, mm."""
+    """Gaps k, from slice k to k + 1, that are too wide (`_MISSING_RATIO`), positions of their ends, usual gap, mm."""
 
     places: tuple[int, ...] = ()
     gaps_mm: tuple[float, ...] = ()
@@ -71,7 +71,7 @@ def find_holes(distances: Float64Array) -> Holes:
     gaps = np.diff(distances)
     if len(gaps) < 2:
         return Holes()
-    if gaps.max() <= MISSING_RATIO * gaps.min():
+    if gaps.max() <= _MISSING_RATIO * gaps.min():
         return Holes()  # the usual case
     usual = float(np.sort(gaps)[(len(gaps) - 1) // 2])
     if usual <= 0.0:
@@ -82,19 +82,19 @@ def find_holes(distances: Float64Array) -> Holes:
     for k in np.flatnonzero(~in_run).tolist():
         after = int(np.searchsorted(runs, k))
         beside = max(gaps[runs[max(after - 1, 0) : after + 1]].tolist(), default=usual)
-        if gaps[k] > MISSING_RATIO * min(usual, beside):
+        if gaps[k] > _MISSING_RATIO * min(usual, beside):
             wide.append(k)
-            usuals.append(beside if gaps[k] > MISSING_RATIO * beside else usual)
+            usuals.append(beside if gaps[k] > _MISSING_RATIO * beside else usual)
     ends = tuple((float(distances[k]), float(distances[k + 1])) for k in wide)
     return Holes(tuple(wide), tuple(float(gaps[k]) for k in wide), ends, tuple(usuals))
 
 
 def _find_runs(gaps: Float64Array) -> NDArray[np.bool_]:
-    """Mark gaps in runs: at least `RUN_LENGTH` consecutive gaps that are equal within `RUN_TOLERANCE`."""
+    """Mark gaps in runs: at least `RUN_LENGTH` consecutive gaps that are equal within `_RUN_TOLERANCE`."""
     in_run = np.zeros(len(gaps), dtype=bool)
     for place, gap in enumerate(gaps.tolist()):
         low, high = max(place - RUN_LENGTH + 1, 0), min(place + RUN_LENGTH, len(gaps))
-        like = (np.abs(gaps[low:high] - gap) <= RUN_TOLERANCE * gap).tolist()
+        like = (np.abs(gaps[low:high] - gap) <= _RUN_TOLERANCE * gap).tolist()
         first = last = place - low
         while first > 0 and like[first - 1]:
             first -= 1
