@@ -186,6 +186,24 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = sorted(chosen, key=lambda item: item.get_closest_marker("long") is None)
 
 
+def describe_value(value: object) -> str | None:
+    """Return a short text of a value of a table: containers as they are written, functions by their names."""
+    if isinstance(value, dict):
+        parts = [f"{key}={describe_value(part) or type(part).__name__}" for key, part in value.items()]
+    elif isinstance(value, (list, tuple)):
+        parts = [describe_value(part) or type(part).__name__ for part in value]
+    elif value is None or isinstance(value, (str, int, float, bytes)):
+        return str(value)
+    else:
+        return getattr(value, "__name__", None)
+    return ",".join(parts)[:60]
+
+
+def pytest_make_parametrize_id(config: pytest.Config, val: object, argname: str) -> str | None:
+    """Name rows of tables by their lists and dicts too, which pytest only numbers; other values as pytest does."""
+    return describe_value(val) if isinstance(val, (list, tuple, dict)) else None
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "device" in metafunc.fixturenames:
         devices, reason = Devices.get()

@@ -161,12 +161,16 @@ def _patches_private(node: ast.AST) -> bool:
 
 
 def _is_table_without_ids(node: ast.AST) -> bool:
-    """Whether rows that are no plain constants have no names: pytest calls them by their number."""
+    """Whether rows are calls alone: tests/conftest.py names constants, containers and functions, not objects."""
     if not (isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "parametrize" and len(node.args) > 1):
         return False
     rows = getattr(node.args[1], "elts", [])
     named = any(keyword.arg == "ids" for keyword in node.keywords)
-    return len(rows) >= LONG_TABLE and not named and not all(isinstance(row, ast.Constant) for row in rows)
+    return (
+        len(rows) >= LONG_TABLE
+        and not named
+        and any(all(isinstance(value, ast.Call) for value in getattr(row, "elts", [row])) for row in rows)
+    )
 
 
 def _count_tests(texts: dict[str, str], places: Places) -> None:

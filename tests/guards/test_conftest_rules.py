@@ -33,6 +33,13 @@ def test_each_entry_needs_a_device_of_its_own(wanted: str, devices: list[SimpleN
     assert conftest.missing_platforms(wanted, devices) == missing
 
 
+def test_rows_of_tables_are_named_by_their_values() -> None:
+    row = {"up": (0, 1.5), "order": abs, "plan": object()}
+    assert conftest.pytest_make_parametrize_id(None, row, "row") == "up=0,1.5,order=abs,plan=object"
+    assert conftest.pytest_make_parametrize_id(None, ["x" * 99], "row") == "x" * 60
+    assert conftest.pytest_make_parametrize_id(None, "text", "row") is None
+
+
 def run_pytest(tmp_path: Path, test: str, *options: str, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run pytest on one file with a copy of the conftest, away from this project."""
     (tmp_path / "conftest.py").write_text((ROOT / "tests" / "conftest.py").read_text())

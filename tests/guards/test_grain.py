@@ -33,7 +33,7 @@ HABITS = {
     "constants_of_one_file": 73,
     "kernels_with_branches": 18,
     "tests_of_wording": 1_107,
-    "tables_without_ids": 107,
+    "tables_without_ids": 0,
     "patches_of_private_names": 165,
 }
 """Places of each habit that makes code hard to read; see scripts/proof/count_habits.py."""
@@ -51,7 +51,7 @@ LENGTH = 3
     "clrecon/b.py": "def g(other):\n    return compare(other.first, other.second, other.third)\n",
     "cl/a.cl": "__kernel void k()\n{\n#if A\n  a();\n#else\n  b();\n#endif\n}\n",
     "tests/test_a.py": """\
-@pytest.mark.parametrize("row", [(1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 7), (7, 8), (8, 9)])
+@pytest.mark.parametrize("row", [make(1), make(2), make(3), make(4), make(5), make(6), make(7), make(8)])
 def test_words(row, monkeypatch):
     monkeypatch.setattr(module, "LIMIT", 2)
     with pytest.raises(ValueError, match="too large"):
@@ -70,7 +70,7 @@ def test_each_habit_is_found(tmp_path: Path) -> None:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text, encoding="utf-8")
     counts = {habit: len(places) for habit, places in find_habits(tmp_path).items()}
-    assert counts == dict.fromkeys(HABITS, 1) | {"functions_with_pronouns": 1_201}
+    assert counts == dict.fromkeys(HABITS, 1) | {"functions_with_pronouns": 3}
 
 
 @pytest.mark.parametrize("figure", CEILINGS)

@@ -73,6 +73,7 @@ def test_elements_behind_the_pixels(tail):
         element(0x7FE10010, vr=b"@A"),
         long_element(0x7FE10010)[:-1],
     ],
+    ids=["cut", "two", "before", "cut-value", "after-padding", "no-letter", "no-capital", "cut-long"],
 )
 def test_what_are_no_elements_behind_the_pixels(tail):
     with pytest.raises(CorruptFileError, match=f"^{len(tail)} bytes behind the pixel data are no elements of DICOM$"):
