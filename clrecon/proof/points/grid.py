@@ -31,7 +31,7 @@ def make_grid(points: NDArray[np.float32], edge: float) -> GridTwin:
     cell = np.float32(edge)
     corner = (points.min(axis=0).astype(np.float64) - 1e-3 * float(cell)).astype(np.float32)
     x, y, z = find_cells(points, corner, cell).T
-    nx, ny, nz = int(x.max()) + 1, int(y.max()) + 1, int(z.max()) + 1
+    nx, ny, nz = (int(axis.max()) + 1 for axis in (x, y, z))
     words = -(-nx // 32)
     has_points = np.zeros((nz, ny, 32 * words), dtype=bool)
     has_points[z, y, x] = True

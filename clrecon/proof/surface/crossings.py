@@ -24,7 +24,7 @@ def mark_crossings(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 
 def _edges_pass(one: Float64Array, other: Float64Array, common: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """True where an edge of a triangle (k, 3, 3) without a common corner passes through the inside of the other one."""
-    a, b, c = other[:, 0], other[:, 1], other[:, 2]
+    a, b, c = other.swapaxes(0, 1)
     sides = [_volume(a, b, c, one[:, corner]) for corner in range(3)]
     found = np.zeros(len(one), bool)
     for first, second in ((0, 1), (1, 2), (2, 0)):

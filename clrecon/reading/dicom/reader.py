@@ -143,7 +143,7 @@ def list_scan(
     with _quiet_warnings():
         scan, found = _scan_and_group(path, selection, progress)
         warnings = collect_scan_warnings(scan)
-        number, certificate, refusal = None, None, None
+        number = certificate = refusal = None
         try:
             choice = choose_series(found, selection.series)
         except (NoDicomError, RefusedInputError) as error:

@@ -102,7 +102,7 @@ def judge_numbers(census: Census, stack: Stack, copies: int) -> Gate:
 def facts_of_numbers(census: Census, stack: Stack) -> dict[str, Any]:
     """Return the numbers and counts for the certificate, None where the files do not tell."""
     numbers = _ordered_numbers(stack)
-    first, last, step = None, None, None
+    first = last = step = None
     if numbers is not None:
         first, last, step = int(numbers.min()), int(numbers.max()), int(np.abs(np.diff(numbers)).min())
     return {
