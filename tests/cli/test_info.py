@@ -70,7 +70,7 @@ def test_json_is_the_contract(ct: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert set(found) == names_in("clrecon info") == {"series", "chosen", "certificate"}
     assert found["chosen"] == 1
     (one,) = found["series"]
-    assert set(one) == names_in("clrecon info", "Of each series:")
+    assert set(one) == names_in("clrecon info", "For each series:")
     assert (one["slices"], one["shape_ijk"], one["modality"], one["kind"]) == (17, [31, 25, 17], "CT", "stack")
     assert one["spacing_mm"] == pytest.approx(SPACING)
     assert set(found["certificate"]) == names_in("The certificate")
@@ -310,7 +310,7 @@ def test_mesh_strict_counts_the_gates_of_the_volume(
     assert any("lossy compression" in text for text in report["warnings"])
     assert set(report["volume"]) == names_in("The certificate") - {"warnings"}
     assert set(report) == names_in("clrecon mesh") - {"preset_reason"}
-    assert set(report["meshes"][0]) - set(report) <= names_in("clrecon mesh", "Of each mesh in `meshes`")
+    assert set(report["meshes"][0]) - set(report) <= names_in("clrecon mesh", "For each mesh in `meshes`")
     assert b"comment CERTIFICATE gate_failed lossless: slices with lossy" in (tmp_path / "a.ply").read_bytes()
 
 

@@ -103,7 +103,7 @@ def test_a_mesh_that_is_not_of_its_labels_size_is_said(
     report = json.loads((tmp_path / "r.json").read_text())
     assert [gate["ok"] for gate in report["gates"] if gate["name"] == "label_volume"] == [None]
     assert report["meshes"][0]["label_mesh_ml"] is None
-    assert names_in("clrecon mesh INPUT", "Of each mesh in `meshes`") <= set(report["meshes"][0])
+    assert names_in("clrecon mesh INPUT", "For each mesh in `meshes`") <= set(report["meshes"][0])
 
 
 def test_the_labels_own_surface_does_not_depend_on_hu(
@@ -120,7 +120,7 @@ def test_the_labels_own_surface_does_not_depend_on_hu(
     for mesh in report["meshes"]:
         assert mesh["surface"] == "mask" and 0.0 < mesh["mask_level"] < 1.0 and mesh["label_taken_ml"] is None
         assert mesh["volume_ml"] == pytest.approx(mesh["label_ml"], rel=tolerances.MASK_VOLUME)
-        assert names_in("clrecon mesh INPUT", "Of each mesh in `meshes`") <= set(mesh)
+        assert names_in("clrecon mesh INPUT", "For each mesh in `meshes`") <= set(mesh)
 
 
 def test_a_mask_that_leaves_the_ct_goes_on_there(

@@ -96,7 +96,7 @@ PRESETS: dict[str, Preset] = {
         ),
         _preset(
             "spine",
-            "bone with the soft tissue round it faintly visible",
+            "bone with the soft tissue around it faintly visible",
             [
                 (-600.0, _SKIN, 0.0),
                 (-450.0, _SKIN, 0.04),
@@ -129,7 +129,7 @@ PRESETS: dict[str, Preset] = {
         ),
         _preset(
             "lung",
-            "airways, lung and its vessels; the body round it is left out but for the edge of its skin",
+            "airways, lung and its vessels; the body around it is left out except for the edge of its skin",
             [
                 (-970.0, (0.30, 0.55, 0.85), 0.0),
                 (-900.0, (0.35, 0.60, 0.90), 0.004),

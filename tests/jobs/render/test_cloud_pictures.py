@@ -56,7 +56,7 @@ def test_the_command_draws_what_the_function_draws(
     assert np.array_equal(np.load(tmp_path / "d.npy"), own.depth, equal_nan=True)
     report = json.loads((tmp_path / "r.json").read_text())
     assert set(report) == names_in("clrecon render INPUT")
-    of_picture = names_in("clrecon render INPUT", "Of each picture:") - {"values_output"}
+    of_picture = names_in("clrecon render INPUT", "For each picture:") - {"values_output"}
     assert set(report["pictures"][0]) == of_picture
     points = report["pictures"][0]["points"]
     assert points["radius_mm"] == 0.4 and points["color_by"] == "removed" and points["shading"] == "normals"

@@ -77,7 +77,7 @@ def test_the_report_is_what_the_contract_says(device: Any, sphere: tuple[Path, d
     report = make_pictures(sphere[0], files, settings)
     assert set(report) == names_in("clrecon render INPUT")
     optional = {"depth_output", "values_output"}
-    pictures = names_in("clrecon render INPUT", "Of each picture:")
+    pictures = names_in("clrecon render INPUT", "For each picture:")
     assert set(report["pictures"][0]) | optional == pictures
     assert (report["mode"], report["device"], report["memory_allowed_bytes"]) == ("mip", device.label, 10**9)
     assert report["volume"]["tilt_deg"] == pytest.approx(15.0, abs=1e-3)

@@ -33,7 +33,7 @@ def grids():
 
 
 def coordinates(volume):
-    """Of each voxel: distance from the middle of the tube, and way along it, from the upper end down."""
+    """For each voxel: distance from the middle of the tube, and way along it, from the upper end down."""
     nk, nj, ni = volume.voxels.shape
     k, j, i = np.indices((nk, nj, ni)).reshape(3, -1)
     x, y, z = (volume.ijk_to_lps(np.stack([i, j, k], axis=1)) - CENTRE).T

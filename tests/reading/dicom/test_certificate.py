@@ -46,7 +46,7 @@ def test_the_certificate_is_the_contract(tmp_path):
     assert {gate["name"] for gate in report["gates"]} == names_in("The certificate", "measured) and `text`.")
     assert {key for gate in report["gates"] for key in gate} == {"name", "measured", "bound", "unit", "ok", "text"}
     (entry,) = list_series(tmp_path).series
-    assert set(entry.as_dict()) == names_in("clrecon info", "Of each series:")
+    assert set(entry.as_dict()) == names_in("clrecon info", "For each series:")
 
 
 def test_headers_alone_say_nothing_of_pixels(tmp_path, monkeypatch):
