@@ -181,7 +181,7 @@ def _make_header(settings: PhantomSettings, placement: Placement, phase: int) ->
         header.GantryDetectorTilt = placement.tilt
     header.StudyInstanceUID, header.SeriesInstanceUID = UID(study), UID(series)
     header.FrameOfReferenceUID, header.PositionReferenceIndicator = UID(frame), ""
-    header.StudyID, header.SeriesNumber, header.AcquisitionNumber = "1", "1", "1"
+    header.StudyID = header.SeriesNumber = header.AcquisitionNumber = "1"
     if settings.phases > 1:
         header.AcquisitionNumber = header.TemporalPositionIdentifier = str(phase + 1)
         header.NumberOfTemporalPositions = str(settings.phases)
