@@ -71,6 +71,13 @@ def order_by_number(numbers: IntArray, size: int) -> IntArray:
     return csr_array((here[:-1], numbers.astype(kind), here), shape=(count, size)).tocsc().data
 
 
+def find_used(numbers: IntArray, size: int) -> IntArray:
+    """Return the numbers below `size` that occur, ascending, many sooner than `np.unique` does."""
+    used = np.zeros(size, dtype=bool)
+    used[numbers] = True
+    return np.flatnonzero(used)
+
+
 class Fans:
     """The triangles around each vertex: of vertex v `rows` from ``begin[v]`` to ``begin[v + 1]``, in their order."""
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 
-from clrecon.mesh.connectivity import Fans
+from clrecon.mesh.connectivity import Fans, find_used
 
 pytestmark = pytest.mark.unit
 
@@ -30,3 +30,9 @@ def test_fans_equal_a_look_at_all_triangles():
     for vertex in some:
         rows, count = fans.around(np.array([vertex]))
         assert rows.tolist() == np.flatnonzero((triangles == vertex).any(axis=1)).tolist() and count == len(rows)
+
+
+def test_numbers_that_occur_are_each_found_once():
+    triangles = np.array([[5, 0, 3], [3, 0, 1]], np.uint32)
+    assert find_used(triangles, 7).tolist() == [0, 1, 3, 5]
+    assert find_used(triangles[:0], 7).tolist() == []

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import as_stored, find_coincident
-from clrecon.mesh.connectivity import Edges, Fans, find_edges, label_components
+from clrecon.mesh.connectivity import Edges, Fans, find_edges, find_used, label_components
 from clrecon.mesh.intersections import FindCrossings, find_changed_intersections, find_self_intersections
 from clrecon.mesh.refine.collapses import Collapses, Quadrics, last_of_collapses
 from clrecon.mesh.refine.deviation import WITNESSES, Deviation
@@ -86,7 +86,7 @@ class Clusters:
         named = names.astype(np.uint32)[self._triangles]
         is_face = _are_faces(named)
         left = named[is_face]
-        going_on = np.unique(left)
+        going_on = find_used(left, len(names))
         number = np.full(len(names), -1)
         number[going_on] = np.arange(len(going_on))
         if len(going_on) != len(points) or not np.array_equal(number[left], faces):
@@ -125,10 +125,8 @@ class Clusters:
         faces = self.faces()
         if part is not None:
             faces = faces[part[self._components[1].take(faces[:, 0])]]
-        used = np.zeros(len(self.names), dtype=bool)
-        used[faces.reshape(-1)] = True
-        standing = np.flatnonzero(used)
-        number = np.zeros(len(used), dtype=np.uint32)
+        standing = find_used(faces, len(self.names))
+        number = np.zeros(len(self.names), dtype=np.uint32)
         number[standing] = np.arange(len(standing), dtype=np.uint32)
         return standing, number.take(faces, mode="clip")
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.compare.near_distances import NearDistance
-from clrecon.mesh.connectivity import Fans, find_edges
+from clrecon.mesh.connectivity import Fans, find_edges, find_used
 from clrecon.mesh.refine.topology import any_corner
 from clrecon.mesh.triangles import corner_edges
 from clrecon.system.pieces import chunks, in_threads
@@ -205,9 +205,7 @@ class Deviation:
         triangles = self._triangles[rows]
         a, b, c = names[triangles].T
         changed = (a == b) | (b == c) | (c == a)
-        used = np.zeros(len(names), dtype=bool)
-        used[triangles] = True
-        used = np.flatnonzero(used)
+        used = find_used(triangles, len(names))
         step = places[names[used]] - self._vertices[used]
         has_moved = np.zeros(len(names), dtype=bool)
         has_moved[used] = np.einsum("na,na->n", step, step) > self._bound * self._bound
@@ -229,9 +227,7 @@ class Deviation:
             long as these faces stay.  -1 where it is not.
         """
         triangles = self._triangles[rows]
-        used = np.zeros(len(names), dtype=bool)
-        used[triangles] = True
-        used = np.flatnonzero(used)
+        used = find_used(triangles, len(names))
         now = self._make(places, faces)
         length, nearest = now.find_surely_within(self._vertices[used], names[used], self._bound)
         beside = np.full(len(names), -1, dtype=np.int32)
@@ -268,9 +264,7 @@ class Deviation:
         far = np.zeros(len(faces), dtype=bool)
         if len(faces) == 0:
             return far
-        is_used, is_far = np.zeros((2, len(places)), dtype=bool)
-        is_used[faces] = True
-        used = np.flatnonzero(is_used)
+        is_far, used = np.zeros(len(places), dtype=bool), find_used(faces, len(places))
         is_far[used[self._find_far(places[used], used[:, None])]] = True
         far |= any_corner(is_far, faces)
 

@@ -15,7 +15,7 @@ from clrecon.errors import NoSurfaceError
 from clrecon.exchange.coordinates import as_stored
 from clrecon.mesh.compare.distances import SAMPLES, SurfaceDistance, sample_surface
 from clrecon.mesh.compare.near_distances import NearDistance
-from clrecon.mesh.connectivity import find_edges, label_components
+from clrecon.mesh.connectivity import find_edges, find_used, label_components
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.refine.collapses import last_of_collapses
 from clrecon.mesh.refine.decimation import carry_on, check_share, check_triangles
@@ -113,7 +113,7 @@ def _compare_topology(
     # The vertices that are left are those with faces, in their order.
     named = names[mesh.triangles]
     a, b, c = named.T
-    standing = np.unique(named[(a != b) & (b != c) & (c != a)])
+    standing = find_used(named[(a != b) & (b != c) & (c != a)], mesh.vertex_count)
     after = measure_topology(triangles, labels[standing], count)
     gone = np.append((before.faces > 0) & (after.faces == 0), False)  # unused vertices have the label -1
     return compare_topology(before, after), np.flatnonzero(gone[labels])
@@ -143,7 +143,7 @@ def _farthest_point(points: Points, vertices: Points, triangles: NDArray[np.uint
     """Return the distance of the farthest of some points, measured exactly where that to near triangles is large."""
     from scipy.spatial import cKDTree
 
-    used = np.unique(triangles)
+    used = find_used(triangles, len(vertices))
     near = used[cKDTree(vertices[used]).query(points, k=min(_NEAREST, len(used)), workers=-1)[1]]
     at_most = NearDistance(vertices, triangles).find_around(points, near.reshape(len(points), -1))[0]
     order = np.argsort(-at_most)

@@ -11,6 +11,7 @@ from clrecon.mesh.connectivity import (
     find_edges,
     find_faces_back_to_back,
     find_split_vertices,
+    find_used,
     opposite_half_edges,
 )
 from clrecon.system.light_dataclass import dataclass
@@ -120,9 +121,7 @@ def find_faults_beside(faces: NDArray[np.uint32], new: NDArray[np.bool_]) -> Int
     touched[faces[any_corner(new, faces)]] = True
     # With their neighbours: the fans around the touched vertices and the faces along their edges are complete.
     around = faces[any_corner(touched, faces)]
-    used = np.zeros(len(new), dtype=bool)
-    used[around] = True
-    numbers = np.flatnonzero(used)
+    numbers = find_used(around, len(new))
     number = np.empty(len(new), dtype=np.uint32)
     number[numbers] = np.arange(len(numbers), dtype=np.uint32)
     local = number[around]
@@ -147,13 +146,14 @@ def find_torn(triangles: NDArray[np.uint32], names: IntArray) -> IntArray:
     """
     size = len(names)
     edges = find_edges(triangles, size)
-    low, high = np.sort(names[edges.ends], axis=0)
+    one, other = names[edges.ends]
+    low, high = np.minimum(one, other), np.maximum(one, other)
     named = np.sort(names[triangles], axis=1).T
     within, two = named[0] == named[2], (named[0] == named[1]) ^ (named[1] == named[2])
-    used = np.unique(triangles)
+    used = find_used(triangles, size)
     disc = np.bincount(names[used], minlength=size) - np.bincount(low[low == high], minlength=size)
     disc += np.bincount(named[0, within], minlength=size)
-    standing = np.unique(names[used])
+    standing = find_used(names[used], size)
     torn = standing[disc[standing] != 1]
 
     apart = low != high
