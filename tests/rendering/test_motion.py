@@ -103,6 +103,19 @@ def test_gif_shows_the_frames_and_repeats(tmp_path):
     assert sum(durations) == 230  # seven thirtieths of a second, in hundredths
 
 
+def test_a_large_frame_of_a_gif_is_as_near_as_one_whose_every_pixel_chose_the_colours(tmp_path):
+    j, i = np.indices((520, 600)) / 600.0
+    frame = np.stack([255 * i, 200 * j, 128 + 127 * np.sin(9 * i * j)], axis=-1).astype(np.uint8)
+    write_animation(iter([frame, frame]), tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as read:
+        shown = np.asarray(read.convert("RGB"), np.float64)
+    picture = Image.fromarray(frame)
+    best = picture.quantize(256, Image.Quantize.MEDIANCUT)
+    known = np.asarray(picture.quantize(palette=best, dither=Image.Dither.FLOYDSTEINBERG).convert("RGB"), np.float64)
+    off, known_off = (np.sqrt(np.mean(np.square(one - frame))) for one in (shown, known))
+    assert off < 1.05 * known_off, (off, known_off)
+
+
 def test_a_gif_of_two_colours(tmp_path):
     frames = [np.full((5, 4, 3), shade, np.uint8) for shade in (0, 255)]
     frames[1][0, 0] = 0
