@@ -213,7 +213,8 @@ class IsoDistance(Record):
     near_metal: Measured vertices within `METAL_REACH` voxels of a voxel above `METAL_HU`.
     surface_voxel: Of vertices and centres together: decimation leaves vertices outside of what is round, and centres
         inside, so that neither alone is how far the surface lies.
-    away_from_metal_voxel: The same without those near metal; None where these are none, or more than half.
+    away_from_metal_voxel: Without those near metal, of vertices or of both, whichever is nearer; None where these are
+        none, or more than half.
     """
 
     voxel_mm: float
@@ -268,6 +269,10 @@ def _sum_up(
 ) -> IsoDistance:
     count, near = int(np.count_nonzero(near_metal[0])), np.concatenate(near_metal)
     both = np.concatenate([of_vertices, of_centres])
+    away = None
+    if 0 < 2 * count <= len(of_vertices):
+        known = _summarise(of_vertices[~near_metal[0]], voxel), _summarise(both[~near], voxel)
+        away = min(filter(None, known), key=lambda one: one.mean, default=None)
     return IsoDistance(
         voxel,
         {"vertices": len(of_vertices), "centres": len(of_centres)},
@@ -278,7 +283,7 @@ def _sum_up(
         centres_voxel=_summarise(of_centres, voxel),
         surface_voxel=_summarise(both, voxel),
         near_metal=count,
-        away_from_metal_voxel=_summarise(both[~near], voxel) if 0 < 2 * count <= len(of_vertices) else None,
+        away_from_metal_voxel=away,
     )
 
 

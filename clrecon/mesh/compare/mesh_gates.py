@@ -38,6 +38,8 @@ def judge_mesh(
         outside and volume.
     outward: The surface should enclose a volume above zero, unlike the wall of a cavity by itself.
     extracted: Nothing was smoothed or decimated: what flat triangles leave of noise is the voxels', and not judged.
+        Else vertices alone count, or with centres of triangles, whichever lie nearer: few triangles have vertices
+        outside of what is round, and long cells have centres off it.
     deviation: From the surface before smoothing and decimation.
     voxel_mm: Shortest voxel step, the unit of the bounds; needed with `deviation`.
     """
@@ -87,15 +89,15 @@ def _gates_of_quality(quality: Mapping[str, Any], closed: bool, outward: bool) -
 def _gates_of_iso_distance(iso_distance: Mapping[str, Any], extracted: bool) -> Iterator[Gate]:
     what = "vertices and centres of triangles from which no trilinear iso surface was reached"
     yield none_of("iso_distance_found", iso_distance["not_found"], what)
-    points = "the vertices" if extracted else "vertices and centres of triangles"
-    what = f"distance of {points} from the trilinear iso surface"
-    measures = (("p95", DEVIATION_P95_VOXEL, "95 % of them"), ("mean", DEVIATION_MEAN_VOXEL, "mean"))
-    found = iso_distance["vertices_voxel" if extracted else "surface_voxel"]
+    what = "distance of the mesh from the trilinear iso surface"
+    measures = (("p95", DEVIATION_P95_VOXEL, "95 % of it"), ("mean", DEVIATION_MEAN_VOXEL, "mean"))
+    known = [iso_distance.get(name) for name in ("vertices_voxel", *["surface_voxel"] * (not extracted))]
+    found = min(filter(None, known), key=lambda one: float(one["mean"]), default=None)
     near, away = iso_distance.get("near_metal", 0), None if extracted else iso_distance.get("away_from_metal_voxel")
     of = f"of {iso_distance['samples']['vertices']:,} vertices" if near else ""
     metal = f"{near:,} {of} near metal (above {METAL_HU:g} HU)" if near else ""
     for name, bound, which in measures:
-        if away:
+        if found and away:
             aside = f"without {metal}, with them {found[name]:.3g}"
             yield at_most(f"iso_distance_{name}", away[name], bound, "voxel", f"{what}, {which} ({aside})")
         elif found:

@@ -178,12 +178,9 @@ def test_metal_is_named_and_distances_are_judged_without_it(device: Any, tmp_pat
     report = json.loads((tmp_path / "a.json").read_text())
     found, gates = report["iso_distance"], {gate["name"]: gate for gate in report["gates"]}
     assert 0.3 < found["near_metal"] / found["samples"]["vertices"] < 0.5
+    nearer = min((found[of] for of in ("vertices_voxel", "surface_voxel")), key=lambda one: one["mean"])
     for name, bound in (("p95", 0.25), ("mean", 0.1)):
-        whole, away, gate = (
-            found["surface_voxel"][name],
-            found["away_from_metal_voxel"][name],
-            gates[f"iso_distance_{name}"],
-        )
+        whole, away, gate = (nearer[name], found["away_from_metal_voxel"][name], gates[f"iso_distance_{name}"])
         assert whole > bound > 1.5 * away
         assert (gate["measured"], gate["ok"]) == (away, True)
         metal = f"{found['near_metal']:,} of {found['samples']['vertices']:,} vertices near metal (above 2000 HU)"

@@ -99,7 +99,9 @@ def test_vertices_off_the_iso_surface():
     assert (at(0.25, 0.1), at(0.26, 0.1), at(0.25, 0.11)) == (set(), {"iso_distance_p95"}, {"iso_distance_mean"})
     assert failed(judge_mesh(iso_distance={"surface_voxel": None, "not_found": 3})) == {"iso_distance_found"}
     rough = {"vertices_voxel": {"p95": 0.0, "mean": 0.0}, "surface_voxel": {"p95": 0.3, "mean": 0.2}, "not_found": 0}
-    assert failed(judge_mesh(iso_distance=rough, extracted=True)) == set() != failed(judge_mesh(iso_distance=rough))
+    swapped = {"vertices_voxel": rough["surface_voxel"], "surface_voxel": rough["vertices_voxel"], "not_found": 0}
+    assert failed(judge_mesh(iso_distance=rough, extracted=True)) == set() == failed(judge_mesh(iso_distance=rough))
+    assert failed(judge_mesh(iso_distance=swapped)) == set() != failed(judge_mesh(iso_distance=swapped, extracted=True))
 
 
 def test_distances_are_judged_away_from_metal_and_both_figures_are_said():
@@ -108,7 +110,7 @@ def test_distances_are_judged_away_from_metal_and_both_figures_are_said():
     _, p95, mean = judge_mesh(iso_distance=figures)
     assert (p95["measured"], p95["ok"], mean["measured"], mean["ok"]) == (0.2, True, 0.11, False)
     aside = "(without 1,500 of 4,000 vertices near metal (above 2000 HU), with them 0.3)"
-    assert p95["text"].endswith(f", 95 % of them {aside}: 0.2 voxel, at most 0.25")
+    assert p95["text"].endswith(f", 95 % of it {aside}: 0.2 voxel, at most 0.25")
     _, p95, mean = judge_mesh(iso_distance={**figures, "near_metal": 2500, "away_from_metal_voxel": None})
     assert (p95["measured"], p95["ok"], mean["ok"]) == (0.3, False, False)
     assert "(2,500 of 4,000 vertices near metal (above 2000 HU))" in p95["text"]

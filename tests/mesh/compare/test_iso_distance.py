@@ -278,12 +278,12 @@ def test_few_triangles_of_a_ball_are_judged_by_their_surface_not_by_their_corner
     right = (4.0 / 3.0 * np.pi * 4.5**3 / (1000.0 * ball.quality()["volume_ml"])) ** (1.0 / 3.0)
     measured = {
         larger: measure_iso_distance(Mesh(7.0 + larger * right * ball.vertices, ball.triangles), volume, rule)
-        for larger in (1.0, 1.03, 0.95)
+        for larger in (1.0, 1.03, 0.9)
     }
     of_vertices = {larger: one["vertices_voxel"]["mean"] for larger, one in measured.items()}
-    assert of_vertices[1.0] > DEVIATION_MEAN_VOXEL > of_vertices[0.95]
+    assert of_vertices[1.0] > DEVIATION_MEAN_VOXEL
     gates = {larger: judge_mesh(iso_distance=one)[2] for larger, one in measured.items()}
-    assert {larger: gate["ok"] for larger, gate in gates.items()} == {1.0: True, 1.03: False, 0.95: False}
+    assert {larger: gate["ok"] for larger, gate in gates.items()} == {1.0: True, 1.03: False, 0.9: False}
     assert {gate["name"] for gate in gates.values()} == {"iso_distance_mean"}
 
 
