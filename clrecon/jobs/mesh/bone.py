@@ -153,7 +153,7 @@ def _holds_spine(mesh: Mesh, volume: Volume, count: int, labels: NDArray[np.int6
 def judge_surfaces(
     parts: Sequence[Part], volume: Volume, settings: MeshSettings, label: Callable[[Mesh], Labelled]
 ) -> None:
-    """Store in the `facts` of each part ``walls``, the judgement of bone; `label` numbers components judged alone."""
+    """Store in the `facts` of each part ``walls``, judged by HU; `label` numbers components judged alone."""
     import numpy as np
 
     from clrecon.mesh.compare.iso_distance import rule_of_report
@@ -162,7 +162,8 @@ def judge_surfaces(
     for part in parts:
         part.facts["walls"] = None
     lowest = -math.inf if settings.half_way == "auto" else LOWEST_BONE_HU
-    chosen = [part for part in parts if _is_of_bone(part.surface, lowest) and part.mesh.vertex_count]
+    known = [] if list_failed_values(volume) else parts
+    chosen = [part for part in known if _is_of_bone(part.surface, lowest) and part.mesh.vertex_count]
     for surface in dict.fromkeys(part.surface for part in chosen):
         own = [part for part in chosen if part.surface == surface]
         rule = rule_of_report(own[0].mesh.report)

@@ -117,10 +117,15 @@ def check_known_values(volume: Volume, settings: MeshSettings) -> None:
         return
     failed = list_failed_values(volume)
     if failed:
+        auto = (
+            ""
+            if settings.half_way is None
+            else f"; without a print {name_parameter('half_way', 'auto')} says which it finds"
+        )
         raise RefusedInputError(
             f"a print needs a level of bone, and the values of this scan are not known to be HU"
             f" ({failed[-1]['name']}: {failed[-1]['text']}). Give the level in the scan's own values"
-            f" ({name_parameter('iso_value', 'N')}), or say how HU follow from the stored values"
+            f" ({name_parameter('iso_value', 'N')}{auto}), or say how HU follow from the stored values"
             f" ({name_parameter('rescale', 'SLOPE,INTERCEPT')})"
         )
 

@@ -191,9 +191,11 @@ def _warn_of_saturation(voxels: NDArray[Any], facts: PixelFacts, slices: Sequenc
         # Values continue beyond: measured with more bits, unless a great many voxels have exactly this value.
         if at <= _CEILING_VOXELS or above and at <= _CEILING_SPIKE * beside / (2 * _CEILING_LEVELS):
             continue
-        what = "metal is saturated, its surface" if ceiling > METAL_HU else "dense bone is cut off, its surface"
+        what = "metal is saturated" if ceiling > METAL_HU else "metal or dense bone is cut off"
         more = f" and {above} are above it, at most at {facts.hu_max:g} HU" if above else ""
-        warnings.append(f"{at} voxels are at {ceiling:g} HU, the ceiling of {bits} bits{more}: {what} displaced")
+        warnings.append(
+            f"{at} voxels are at {ceiling:g} HU, the ceiling of {bits} bits{more}: {what}, its surface displaced"
+        )
     return warnings
 
 

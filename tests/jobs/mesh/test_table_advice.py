@@ -7,7 +7,7 @@ import pytest
 
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
-from clrecon.jobs.mesh.bone import find_bone, warn_of_walls
+from clrecon.jobs.mesh.bone import find_bone, judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface
 from clrecon.mesh import Mesh
@@ -41,3 +41,20 @@ def test_what_is_even_beneath_may_be_a_table(remove_table):
     (said,) = warn_of_walls([part], MeshSettings(keep="bone", remove_table=remove_table))
     assert "about 10 % is even beneath" in said and "a higher iso value parts them" in said
     assert ("remove_table=True" in said) != remove_table
+
+
+@pytest.mark.parametrize("failed", ["hu_known", "hu_scale", None])
+def test_walls_are_judged_by_hu_where_values_are_hu(failed):
+    """A plate of 380 is even beneath, as contrast medium is in HU; on another scale it may be bone."""
+    voxels = np.zeros((40, 40, 40), np.int16)
+    voxels[10:30, 10:30, 10:30] = 380
+    volume = Volume(voxels, np.eye(4))
+    if failed:
+        volume.report["gates"] = [{"name": failed, "ok": False, "text": "no HU"}]
+    vertices, normals, triangles = extract_isosurface(volume, 190.0)
+    report = {**choose_iso_rule(volume, 190.0).as_report(), "iso_level_hu": 189.5}
+    part = Part(Surface("", 190.0), "", Mesh(vertices, triangles, normals.astype(np.float32), report))
+    settings = MeshSettings(half_way="auto")
+    judge_surfaces([part], volume, settings, lambda mesh: label_components(mesh.triangles, mesh.vertex_count))
+    said = warn_of_walls([part], settings)
+    assert ([], None) == (said, part.facts["walls"]) if failed else "nothing here looks like bone" in said[0]

@@ -167,7 +167,7 @@ def test_the_ceiling_of_12_bits_is_one_however_the_values_are_stored(tmp_path, p
         (16, True, 3071, "ceiling of 12 bits: metal is saturated"),
         (16, True, 31743, "ceiling of 16 bits: metal is saturated"),
         (12, False, 3071, "ceiling of 12 bits: metal is saturated"),
-        (12, True, 1023, "ceiling of 12 bits: dense bone is cut off"),
+        (12, True, 1023, "ceiling of 12 bits: metal or dense bone is cut off"),
         (14, False, 15359, "ceiling of 14 bits: metal is saturated"),
         (16, True, 3000, None),
         (14, False, 3072, None),

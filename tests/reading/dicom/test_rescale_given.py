@@ -87,7 +87,8 @@ def test_a_print_needs_a_level_where_values_are_not_hu(tmp_path, device, capsys,
         assert main([*command, *choice]) == 4
         text = capsys.readouterr().err
         assert "a print needs a level of bone, and the values of this scan are not known to be HU" in text
-        assert "(--hu N)" in text and "(--rescale SLOPE,INTERCEPT)" in text
+        assert "(--hu N" in text and "(--rescale SLOPE,INTERCEPT)" in text
+        assert ("without a print --hu auto says which it finds" in text) == ("auto" in choice)
         assert not out.exists()
     assert main([*command, "--hu", str(level)]) == 0 and out.exists()
     out.unlink()
