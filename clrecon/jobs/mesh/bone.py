@@ -46,6 +46,11 @@ def find_bone(
     count, labels = labelled
     judged, bone, rails = _tell_bone(mesh, volume, rule, labelled)
     if bone.any():
+        if failed := list_failed_values(volume):
+            mesh.report.setdefault("warnings", []).append(
+                f"at {surface.describe()} bone was told by walls of 600 HU, and these values are not known to"
+                f" be HU ({failed[-1]['name']}): look at what was kept"
+            )
         if rails.any():
             away = name_parameter("remove_table", True)
             touching = f"; table that touches bone is one component with it, {away} takes it away first"

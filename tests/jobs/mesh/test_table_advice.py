@@ -58,3 +58,18 @@ def test_walls_are_judged_by_hu_where_values_are_hu(failed):
     judge_surfaces([part], volume, settings, lambda mesh: label_components(mesh.triangles, mesh.vertex_count))
     said = warn_of_walls([part], settings)
     assert ([], None) == (said, part.facts["walls"]) if failed else "nothing here looks like bone" in said[0]
+
+
+@pytest.mark.parametrize("failed", ["hu_known", None])
+def test_bone_that_is_kept_by_values_that_are_no_hu_says_so(failed):
+    hu = np.where(np.linalg.norm(np.indices((24, 24, 24)) - 11.5, axis=0) < 8, 1000, 0)
+    volume = Volume(hu.astype(np.int16), np.eye(4))
+    if failed:
+        volume.report["gates"] = [{"name": failed, "ok": False, "text": "no HU"}]
+    vertices, normals, triangles = extract_isosurface(volume, 500.0)
+    report = {**choose_iso_rule(volume, 500.0).as_report(), "iso_level_hu": 499.5}
+    mesh = Mesh(vertices, triangles, normals.astype(np.float32), report)
+    labelled = label_components(mesh.triangles, mesh.vertex_count)
+    assert find_bone(mesh, volume, Surface("", 500.0), labelled, advice="").tolist() == [True]
+    said = mesh.report.get("warnings", [])
+    assert ["bone was told by walls of 600 HU" in one and "(hu_known)" in one for one in said] == [True] * bool(failed)
