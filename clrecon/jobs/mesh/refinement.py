@@ -14,6 +14,7 @@ from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
 from clrecon.system.arguments import name_parameter
 from clrecon.system.pieces import side_by_side
 from clrecon.system.progress import Progress, Steps, ignore_progress
+from clrecon.system.text import count_of
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -97,10 +98,10 @@ def _may_be_bone(part: Part) -> bool:
 
 
 def warn_of_shift(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
-    """Warn of each closed mesh whose level, not given by the scan, lies too far outside of the bone for its volume."""
+    """Warn of closed meshes whose level, not given by the scan, lies too far outside of the bone for their volume."""
     if settings.half_way == "auto" or not settings.closed:
         return []
-    warnings = []
+    found: dict[str, list[tuple[float, float, str]]] = {}
     for part in parts:
         cortex = part.mesh.report.get("cortex")
         if not cortex or not cortex.get("vertices") or cortex["moved"]:
@@ -111,13 +112,25 @@ def warn_of_shift(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
         area, volume = _measure_size(part)
         excess = shift * told * area
         if volume > 0.0 and (share := excess / max(volume - excess, 0.2 * volume)) >= SHIFT_SHARE:
-            name = f"{part.name}: " if part.name else ""
-            warnings.append(
-                f"{name}the surface {part.surface.phrase} lies {shift:.2g} mm outside of the bone on average, which"
-                f" makes the volume about {100.0 * share:.0f} % too large: {name_parameter('half_way', 'auto')}"
-                " measures the level of this scan"
-            )
-    return warnings
+            found.setdefault(part.surface.phrase, []).append((share, shift, part.name))
+    return [_describe_shifts(phrase, sorted(shifts)) for phrase, shifts in found.items()]
+
+
+def _describe_shifts(phrase: str, shifts: list[tuple[float, float, str]]) -> str:
+    """Describe how far meshes lie outside of the bone in one line; `shifts`: share of volume, mm and name, rising."""
+    (least, _, _), (most, _, name) = shifts[0], shifts[-1]
+    inner, outer = min(shift for _, shift, _ in shifts), max(shift for _, shift, _ in shifts)
+    many, volumes = len(shifts) > 1, "volumes" if len(shifts) > 1 else "volume"
+    whose = f"{count_of(len(shifts), 'mesh', 'meshes')}, most {name}: " if many else f"{name}: " if name else ""
+    return (
+        f"{whose}the surface {phrase} lies {_describe_range(f'{inner:.2g}', f'{outer:.2g}')} mm outside of the bone on"
+        f" average, which makes the {volumes} about {_describe_range(f'{100 * least:.0f}', f'{100 * most:.0f}')} % too"
+        f" large: {name_parameter('half_way', 'auto')} measures the level of this scan"
+    )
+
+
+def _describe_range(low: str, high: str) -> str:
+    return low if low == high else f"{low} to {high}"
 
 
 def _measure_size(part: Part) -> tuple[float, float]:

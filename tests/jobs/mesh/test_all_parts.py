@@ -127,3 +127,10 @@ def test_the_seal_of_a_print_can_be_given(device, bones, tmp_path):
     assert code == 0 and report["volume"]["solid"]["seal_mm"] == 0.3
     with pytest.raises(UsageError, match="seal_mm closes pores for solid=True"):
         MeshSettings(**settings_for("print", {"solid": False, "seal_mm": 0.3}))
+
+
+def test_bones_that_a_level_makes_too_large_share_one_warning(device, bones, tmp_path):
+    _, report = run(bones, tmp_path / "a.3mf", device, "--for", "print", "--all-parts", "--hu", 100)
+    said = [warning for warning in report["warnings"] if "too large" in warning]
+    assert len(said) == 1 and re.match(r"3 meshes, most 003: the surface at 100 HU lies 0\.\d+", said[0]), said
+    assert re.search(r"makes the volumes about \d+ to \d+ % too large: --hu auto", said[0]), said
