@@ -81,9 +81,12 @@ def measure_noise(volume: Volume) -> Noise:
 def _block_deviations(layer: NDArray[Any]) -> NDArray[np.float64]:
     """Return the standard deviations of the blocks of soft tissue of a slice, without their planes."""
     nj, ni = (BLOCK * (n // BLOCK) for n in layer.shape)
-    blocks = layer[:nj, :ni].reshape(nj // BLOCK, BLOCK, ni // BLOCK, BLOCK).swapaxes(1, 2).reshape(-1, BLOCK, BLOCK)
     low, high = SOFT_TISSUE_HU
-    soft = blocks[((blocks >= low) & (blocks <= high)).all(axis=(1, 2))].astype(np.float64)
+    is_soft = (layer >= low) & (layer <= high)
+    is_soft = np.logical_and.reduce([is_soft[j:nj:BLOCK] for j in range(BLOCK)])
+    is_soft = np.logical_and.reduce([is_soft[:, i:ni:BLOCK] for i in range(BLOCK)])
+    tiles = layer[:nj, :ni].reshape(nj // BLOCK, BLOCK, ni // BLOCK, BLOCK).swapaxes(1, 2)
+    soft = tiles[is_soft].astype(np.float64)
     soft -= soft.mean(axis=(1, 2), keepdims=True)
     steps = np.arange(BLOCK) - (BLOCK - 1) / 2.0
     square = BLOCK * float(steps @ steps)

@@ -65,6 +65,11 @@ def side_by_side(one: Callable[[], _One], other: Callable[[], _Other]) -> tuple[
         return first.result(), second
 
 
+def spread_rows(count: int, most: int) -> NDArray[np.int64]:
+    """Return at most `most` of the numbers below `count`, evenly spread and rising, with the first and the last."""
+    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
+
+
 def find_bounds(points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the lowest and highest coordinates of points, (n, 3), column by column, which is ten times faster."""
     return np.array([column.min() for column in points.T]), np.array([column.max() for column in points.T])

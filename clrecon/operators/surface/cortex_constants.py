@@ -24,6 +24,7 @@ from clrecon.operators.surface.cortex import (
     WallFits,
     blurs_of,
 )
+from clrecon.system.pieces import spread_rows
 
 FEWEST_WALLS = 60
 """Profiles across walls below which nothing is known of a scan's cortex."""
@@ -92,7 +93,7 @@ def measure_constants(
     The blur is that which leaves the least of the profiles, the cortex what thick walls show.  Their uncertainties are
     half the spread over four parts of the profiles, and not less than `LEAST_BLUR_ERROR` and `LEAST_CORTEX_ERROR`.
     """
-    rows = np.unique(np.linspace(0, len(points) - 1, min(len(points), LOOKED_AT)).astype(np.int64))
+    rows = spread_rows(len(points), LOOKED_AT)
     values = sampler.values(points[rows], normals[rows])
     walls, peaks = _find_walls(values)
     if len(walls) < FEWEST_WALLS:
@@ -190,7 +191,7 @@ def _find_walls(values: Float32Array) -> tuple[NDArray[np.intp], Float32Array]:
     compact = of_bone[of_bone >= COMPACT_HU]
     least = LEAST_CONTRAST * float(np.percentile(compact if len(compact) >= FEWEST_WALLS else of_bone, 90.0))
     walls = np.flatnonzero(usable & (np.minimum(rise, peaks) > least))
-    return walls[np.unique(np.linspace(0, len(walls) - 1, min(len(walls), MOST_WALLS)).astype(np.intp))], peaks
+    return walls[spread_rows(len(walls), MOST_WALLS)], peaks
 
 
 def _search(fit: _Fit, values: Float32Array, start: _Trial) -> tuple[_Trial, int]:

@@ -31,7 +31,7 @@ from clrecon.operators.surface.cortex import (
 from clrecon.operators.surface.cortex_constants import find_groups, measure_constants
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import in_threads
+from clrecon.system.pieces import in_threads, spread_rows
 from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.records import Record
 
@@ -396,7 +396,7 @@ def measure_outside(mesh: Mesh, resident: DeviceVolume, *, constants: CortexCons
     With the constants of the scan alone: those of each component take as long as all else that a mesh does.
     """
     _refuse_few(mesh.vertex_count, mesh.vertex_count)
-    rows = np.unique(np.linspace(0, mesh.vertex_count - 1, min(mesh.vertex_count, _MOST_LOOKED_AT)).astype(np.int64))
+    rows = spread_rows(mesh.vertex_count, _MOST_LOOKED_AT)
     points, normals = mesh.vertices[rows], _normals_of(mesh)[rows]
     fit = fit_walls(resident, points, normals, stopwatch=Stopwatch(), constants=constants)
     _refuse_few(int(np.count_nonzero(fit.states == FITTED)), len(fit.states))
@@ -462,7 +462,7 @@ def _measure_bias(
 ) -> float:
     """Return the root of the squares of what each constant's uncertainty moves the surface by, on average."""
     fitted = np.flatnonzero(fit.states == FITTED)
-    rows = fitted[np.unique(np.linspace(0, len(fitted) - 1, min(len(fitted), _BIAS_ROWS)).astype(np.int64))]
+    rows = fitted[spread_rows(len(fitted), _BIAS_ROWS)]
     sampler = ProfileSampler(resident, Stopwatch())
     walls, known = sampler.take(sampler.values(points[rows], normals[rows])), fit.constants
     changes = []
