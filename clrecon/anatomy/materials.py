@@ -36,6 +36,8 @@ DENSE = 1240.0
 _MATERIAL_BINS, _MATERIAL_TAILS, _TAIL_SHARE = 400, (0.0005, 0.9995), 0.35
 """Bins of a histogram of any values, the shares left out at its ends, and how far above its last peak what is denser
 reaches, as a share of the range."""
+_LEAST_OF_PEAK = 0.003
+"""Least height of a peak, as a share of the highest: a bone in a wide field of air has marrow of 0.5 % and more."""
 AIR_MODE_HU = -700
 """Modes below this are air."""
 SEED_ABOVE_TISSUE_HU = 100
@@ -99,7 +101,7 @@ def smooth_counts(histogram: Float64Array) -> Float64Array:
 def _find_mode(smooth: Float64Array, low: int, high: int) -> tuple[float, float] | None:
     """Find the highest peak of the smoothed histogram between two HU; return its mode and its width (sigma), HU.
 
-    None where no peak is twice as high as the median of the values 250 to 500 HU below, where another material may have
+    None where no peak is twice as high as the medians of the values 250 to 500 HU below, where another material may have
     its peak, and 200 to 400 HU above it: the ramp of an edge between air and bone has all values alike.  None too where
     the peak is wider than `WIDEST_MODE_HU`.  The width is measured on the upper side, where there is no fat, at 61 % of
     the height (one sigma), less the smoothing.
@@ -110,11 +112,11 @@ def _find_mode(smooth: Float64Array, low: int, high: int) -> tuple[float, float]
         return None
     peak = int(peaks[np.argmax(smooth[peaks])])
     height = smooth[peak]
-    beside = np.concatenate((smooth[max(peak - 500, 0) : max(peak - 250, 0)], smooth[peak + 200 : peak + 400]))
-    if height < 2.0 * np.median(beside):
+    below, above = smooth[max(peak - 500, 0) : max(peak - 250, 0)], smooth[peak + 200 : peak + 400]
+    if height < 2.0 * max(np.median(side) for side in (below, above) if len(side)):
         return None
-    above = smooth[peak:] < math.exp(-0.5) * height
-    width = float(np.argmax(above)) if above.any() else float(len(above))
+    fallen = smooth[peak:] < math.exp(-0.5) * height
+    width = float(np.argmax(fallen)) if fallen.any() else float(len(fallen))
     width = math.sqrt(max(width**2 - SMOOTHING_HU**2, 1.0))
     return (float(peak + LOWEST_HU), width) if width <= WIDEST_MODE_HU else None
 
@@ -237,7 +239,7 @@ def find_two_materials(volume: Volume) -> tuple[float, float] | None:
     counts, ends = np.histogram(values, _MATERIAL_BINS, (float(low), float(high)))
     weights = np.exp(-0.5 * (np.arange(-12, 13) / 4.0) ** 2)
     smooth = np.convolve(np.pad(counts, 12), weights / weights.sum(), mode="valid")
-    peaks = [k for k in _find_peaks(smooth) if smooth[k] >= 0.02 * smooth.max()]
+    peaks = [k for k in _find_peaks(smooth) if smooth[k] >= _LEAST_OF_PEAK * smooth.max()]
     if not peaks:
         return None
     places = [float((ends[k] + ends[k + 1]) / 2.0) for k in peaks]

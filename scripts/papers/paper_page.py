@@ -16,7 +16,7 @@ __all__ = ["make_page"]
 
 Report = Mapping[str, Any]
 
-_OPENING = """# Both papers, made again
+_OPENING = """# Both papers reproduced
 
 clrecon implements two papers on the reconstruction of vertebrae. **Paper A** is "CPU-GPU Rendering of CT Scan Images
 for Vertebra Reconstruction from CT Scan Images with a Calibration Policy". **Paper B** is Liu et al., "Vertebrae CT
@@ -28,7 +28,7 @@ of it, and lists where each of their functions is. It is written by a script, fr
     python3 scripts/papers/papers.py run --work FOLDER --paper-a CT_FOLDER
     python3 scripts/papers/papers.py page
 
-The series of paper B are made-up spines of its sizes, `clrecon phantom --levels`; that of paper A has its size. The
+The series of paper B are synthetic spines of its sizes, `clrecon phantom --levels`; that of paper A has its size. The
 papers' own scans are not public. [compare.md](compare.md) and [measures.md](measures.md) define the measures."""
 
 _SLICES = """## Sub-voxel slices

@@ -63,7 +63,7 @@ Places = dict[str, list[str]]
 
 
 def _read_texts(root: Path, folder: str, pattern: str) -> dict[str, str]:
-    paths = sorted((root / folder).rglob(pattern))
+    paths = [path for path in sorted((root / folder).rglob(pattern)) if "__pycache__" not in path.parts]
     return {path.relative_to(root).as_posix(): path.read_text(encoding="utf-8") for path in paths}
 
 
