@@ -101,10 +101,10 @@ def smooth_counts(histogram: Float64Array) -> Float64Array:
 def _find_mode(smooth: Float64Array, low: int, high: int) -> tuple[float, float] | None:
     """Find the highest peak of the smoothed histogram between two HU; return its mode and its width (sigma), HU.
 
-    None where no peak is twice as high as the medians of the values 250 to 500 HU below, where another material may have
-    its peak, and 200 to 400 HU above it: the ramp of an edge between air and bone has all values alike.  None too where
-    the peak is wider than `WIDEST_MODE_HU`.  The width is measured on the upper side, where there is no fat, at 61 % of
-    the height (one sigma), less the smoothing.
+    None where no peak is twice as high as the medians of the values 250 to 500 HU below, where another material may
+    have its peak, and 200 to 400 HU above it: the ramp of an edge between air and bone has all values alike.  None too
+    where the peak is wider than `WIDEST_MODE_HU`.  The width is measured on the upper side, where there is no fat, at
+    61 % of the height (one sigma), less the smoothing.
     """
     at = np.arange(max(low - LOWEST_HU, 1), min(high - LOWEST_HU, len(smooth) - 2) + 1)
     peaks = at[(smooth[at] > smooth[at - 1]) & (smooth[at] >= smooth[at + 1])]

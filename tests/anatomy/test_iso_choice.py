@@ -298,6 +298,7 @@ def add_cut_air(field: np.ndarray, rows: int = 30, noise: float = 90.0) -> np.nd
 RAW = {
     "noise beside cut air": (add_cut_air(make_ball(1040.0, 0.0, 0.8, 90.0)), 0.0, 1040.0),
     "beside three times as much air": (add_cut_air(make_ball(1040.0, 0.0, 0.8, 30.0), 140, 30.0), 0.0, 1040.0),
+    "beside 23 times as much air": (add_cut_air(make_ball(1040.0, 0.0, 0.8, 30.0), 1000, 30.0), 0.0, 1040.0),
     "CT without its intercept": (make_ball(1040.0, 40.0) + 1024.0, 1064.0, 2064.0),
     "16 bits of micro-CT": (make_ball(30_000.0, 9000.0, 0.8, 400.0), 9000.0, 30_000.0),
     "8 bits": (make_ball(200.0, 30.0, 0.8, 3.0), 30.0, 200.0),

@@ -14,7 +14,6 @@ from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
 from clrecon.system.arguments import name_parameter
 from clrecon.system.pieces import side_by_side
 from clrecon.system.progress import Progress, Steps, ignore_progress
-from clrecon.system.text import count_of
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -120,8 +119,9 @@ def _describe_shifts(phrase: str, shifts: list[tuple[float, float, str]]) -> str
     """Describe how far meshes lie outside of the bone in one line; `shifts`: share of volume, mm and name, rising."""
     (least, _, _), (most, _, name) = shifts[0], shifts[-1]
     inner, outer = min(shift for _, shift, _ in shifts), max(shift for _, shift, _ in shifts)
-    many, volumes = len(shifts) > 1, "volumes" if len(shifts) > 1 else "volume"
-    whose = f"{count_of(len(shifts), 'mesh', 'meshes')}, most {name}: " if many else f"{name}: " if name else ""
+    whose, volumes = f"{name}: " if name else "", "volume"
+    if len(shifts) > 1:
+        whose, volumes = f"{len(shifts):,} meshes, most {name}: ", "volumes"
     return (
         f"{whose}the surface {phrase} lies {_describe_range(f'{inner:.2g}', f'{outer:.2g}')} mm outside of the bone on"
         f" average, which makes the {volumes} about {_describe_range(f'{100 * least:.0f}', f'{100 * most:.0f}')} % too"

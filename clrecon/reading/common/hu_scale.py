@@ -181,7 +181,7 @@ CALMED, RING = 3, 2
 LEAST_CORE, DENSER, ALIKE, NEAR_AIR = 0.01, 0.2, 0.2, 0.3
 """Least share of a body that is denser than soft tissue, by how much, how much soft tissue varies, and how far up from
 air the border of a body reaches: shares of the step from air to soft tissue."""
-WIDER, WIDEST_TISSUE = 1.3, 0.3
+WIDER, WIDEST_TISSUE = 1.3, 0.4
 """Lung is so many times wider than the peak of soft tissue; that of bone is wider than this share of the step."""
 LEAST_AROUND, MOST_AIR_AROUND = 0.5, 0.1
 """Least share of soft tissue and largest share of air in the ring.  Sound scans and phantoms have 0.54 to 1.00 and 0 to
@@ -316,7 +316,7 @@ def _find_body(measured: ValueSample | None, layers: Layers, known: bool) -> _Do
     values that are not known to be HU only a missing intercept is told.
     """
     peaks = find_peaks(measured.values) if measured is not None else []
-    air = next((peak for peak in peaks if peak.share >= LEAST_PEAK_SHARE), None)
+    air = next((peak for peak in peaks if peak.share >= LEAST_PEAK_SHARE / 2.0), None)
     if measured is None or air is None or air.at < OFFSET_AIR_HU[0] or not _is_lowest(measured, air):
         return None
     raw = abs(air.at + 1000.0 - INTERCEPT_HU) <= 100.0 and _may_be_raw(measured)

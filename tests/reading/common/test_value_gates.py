@@ -173,6 +173,13 @@ def test_a_small_body_on_another_scale_is_told_by_the_tissue_around_its_bone(slo
     assert re.sub(r"\d+ HU", "N HU", reason) in re.sub(r"\d+ HU", "N HU", gate.text)
 
 
+@pytest.mark.parametrize(("radius", "noise"), [(30, 150.0), (61.5, 12.0)], ids=["wide peaks", "little air"])
+def test_a_body_of_wide_peaks_or_in_little_air_is_told_on_another_scale(radius, noise):
+    hu = make_layers(-1000.0, (radius, 60.0), (9, 1300.0), noise=noise) * 0.6 + 150.0
+    gate = judge(hu)
+    assert gate.ok is False and "air lies near -4" in gate.text and re.search("soft tissue near 1[789]", gate.text)
+
+
 def test_a_missing_intercept_of_a_small_body_is_told_where_no_header_says_hu():
     assert judge(make_limb() + 1024, known=False).ok is False
 
