@@ -171,9 +171,8 @@ LEAST_RAW_HU = -300
 
 FAINT_HU, FAINT_SHARE, MOST_DENSE = (-800, -200), 0.05, 0.03
 """Range and share of soft tissue where the slope is too small, and the largest share above `TISSUE_HU` begins."""
-STRETCHED_HU, NARROW, DENSE, LEAST_DENSE = 300, 0.08, (1.25, 2.3), 0.02
-"""Soft tissue where the slope is too large: a peak above this value with half of what is not air within this share of
-its step from air, and at least the last share of it at these multiples of the step, as of bone."""
+STRETCHED_HU = 300
+"""Soft tissue where the slope is too large lies above this value."""
 
 
 CALMED, RING = 3, 2
@@ -196,7 +195,15 @@ class Layers:
         self._calm: list[NDArray[np.float32]] = []
 
     def find_enclosing(self, air: Peak, above: Sequence[Peak]) -> Peak | None:
-        """Return the soft tissue that lies around bone, of the peaks above one that may be air; None without any."""
+        """Do what `find_around` does, for a peak in a place where it need not be that of air."""
+        found = self.find_around(air, above)
+        if found is None or (air.at < AS_LUNG_HU and found.at < ABOVE_LUNG_HU):
+            return None
+        among = air.at < AS_LUNG_HU or OFFSET_AIR_HU[1] < air.at <= HIGHEST_AMONG_HU
+        return found if not among or CT_STEP_HU[0] <= found.at - air.at <= CT_STEP_HU[1] else None
+
+    def find_around(self, air: Peak, above: Sequence[Peak]) -> Peak | None:
+        """Return the soft tissue that lies around bone, of the peaks above that of air; None without any."""
         around = []
         for peak in above:
             step = peak.at - air.at
@@ -204,13 +211,7 @@ class Layers:
             off = None if is_lung or is_bone or step < LEAST_STEP_HU else self._measure_around(air.at, peak.at)
             if off is not None:
                 around.append((off, peak))
-        if not around:
-            return None
-        found = min(around)[1]
-        if air.at < AS_LUNG_HU and found.at < ABOVE_LUNG_HU:
-            return None
-        among = air.at < AS_LUNG_HU or OFFSET_AIR_HU[1] < air.at <= HIGHEST_AMONG_HU
-        return found if not among or CT_STEP_HU[0] <= found.at - air.at <= CT_STEP_HU[1] else None
+        return min(around)[1] if around else None
 
     def _measure_around(self, air: float, tissue: float) -> float | None:
         """Return how far what is around dense parts lies from `tissue`; None where it is something else."""
@@ -275,7 +276,7 @@ def judge_scale(
     measured = sample.without_spikes(LOWEST_AIR_HU, HIGHEST_AIR_HU)
     peaks = _find_large_peaks(measured)
     if doubt is None:
-        doubt = _find_doubt(sample, peaks, slopes, facts.disc)
+        doubt = _find_doubt(sample, layers, peaks, slopes, facts.disc)
     if doubt is not None:
         text = (
             f"air lies near {doubt.air:.0f} HU and soft tissue near {doubt.tissue:.0f} HU, where a CT has -1000 and 0"
@@ -355,7 +356,7 @@ def _is_padded_specimen(sample: ValueSample) -> bool:
 
 
 def _find_doubt(
-    sample: ValueSample, peaks: Sequence[Peak], slopes: Sequence[float], disc: float | None
+    sample: ValueSample, layers: Layers, peaks: Sequence[Peak], slopes: Sequence[float], disc: float | None
 ) -> _Doubt | None:
     if len(peaks) < 2:
         return None
@@ -364,7 +365,7 @@ def _find_doubt(
     if lowest.at < LOWEST_AIR_HU:
         return None if air and tissue else _describe_step(lowest, max(above, key=lambda peak: peak.share))
     if air:
-        return None if tissue else _find_wrong_slope(sample, lowest, above, slopes)
+        return None if tissue else _find_wrong_slope(sample, layers, lowest, above, slopes)
     return _find_offset(sample, lowest, above, disc)
 
 
@@ -389,21 +390,17 @@ def _find_offset(sample: ValueSample, air: Peak, above: Sequence[Peak], disc: fl
     return _describe_step(air, tissue) if padded or (tissue.at > TISSUE_HU[1] and empty) else None
 
 
-def _find_wrong_slope(sample: ValueSample, air: Peak, above: Sequence[Peak], slopes: Sequence[float]) -> _Doubt | None:
+def _find_wrong_slope(
+    sample: ValueSample, layers: Layers, air: Peak, above: Sequence[Peak], slopes: Sequence[float]
+) -> _Doubt | None:
     """Look for soft tissue, given air in its place and no peak where soft tissue belongs."""
     tissue = max(above, key=lambda peak: peak.share)
-    step = tissue.at - air.at
     faint = FAINT_HU[0] <= tissue.at <= FAINT_HU[1] and tissue.share >= FAINT_SHARE
     faint = faint and tissue.height >= LEAST_HEIGHT * max(air.height, tissue.height)
     if faint and sample.between(TISSUE_HU[0], np.inf) < MOST_DENSE:
         return _describe_step(air, tissue)
-    if tissue.at <= STRETCHED_HU or set(slopes) == {1.0}:
-        return None
-    solid = sample.between(air.at + step / 2.0, np.inf)
-    narrow = sample.between(tissue.at - NARROW * step, tissue.at + NARROW * step)
-    dense = sample.between(air.at + DENSE[0] * step, air.at + DENSE[1] * step)
-    is_body = narrow >= solid / 2.0 and dense >= LEAST_DENSE * solid
-    return _describe_step(air, tissue) if is_body else None
+    around = None if set(slopes) == {1.0} else layers.find_around(air, above)
+    return None if around is None or around.at <= STRETCHED_HU else _describe_step(air, around)
 
 
 def _describe_step(air: Peak, tissue: Peak) -> _Doubt:

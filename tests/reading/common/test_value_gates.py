@@ -192,9 +192,14 @@ def test_bone_in_water_is_no_body_without_its_intercept():
     assert judge(make_limb() + 1024).ok is False
 
 
-def test_a_stated_slope_tells_a_stretched_body_from_a_specimen(tmp_path):
+@pytest.mark.parametrize(
+    "make",
+    [make_body, lambda: make_layers(-1000.0, (22, 60.0), (16, 1300.0))],
+    ids=["trunk", "limb that is mostly bone"],
+)
+def test_a_stated_slope_tells_a_stretched_body_from_a_specimen(tmp_path, make):
     """The same numbers: with slope 1 they may be a dry bone."""
-    hu = make_body()
+    hu = np.maximum(make(), -1024)
     stretched = read_volume(write_values(tmp_path / "2", hu, RescaleSlope=2)).report
     assert gates_of(stretched)["hu_scale"]["ok"] is False
     plain = write_values(tmp_path / "1", 2 * (hu + 1024) - 1024)
