@@ -77,8 +77,8 @@ TAILS = 0.0005
 """Share of the values that is left out at either end."""
 VALLEY = 0.5
 """Two peaks are two where the histogram between them falls below this share of the lower one."""
-LEAST_PEAK_SHARE, SMALL_PEAK_SHARE = 0.02, 0.004
-"""Least share of a peak, and that of one of soft tissue around bone in a wide field."""
+LEAST_PEAK_SHARE, SMALL_AIR_SHARE, SMALL_PEAK_SHARE = 0.02, 0.01, 0.004
+"""Least share of a peak; of air around a body that fills the field; of soft tissue around bone in a wide field."""
 
 
 class Peak(NamedTuple):
@@ -94,7 +94,7 @@ class Peak(NamedTuple):
 
 
 def find_peaks(values: NDArray[Any]) -> list[Peak]:
-    """Return the peaks of sorted values that hold `SMALL_PEAK_SHARE` of them, from the lowest to the highest."""
+    """Return the peaks of sorted values, from the lowest to the highest."""
     end = int(TAILS * len(values))
     inner = values[end : len(values) - end].astype(np.float64)
     low, high = float(inner[0]), float(inner[-1])
@@ -109,8 +109,7 @@ def find_peaks(values: NDArray[Any]) -> list[Peak]:
         below, above = (np.flatnonzero(half <= smooth[top] / 2.0) for half in (smooth[:top], smooth[top:]))
         first, last = (int(below[-1]) if len(below) else 0), top + (int(above[0]) if len(above) else len(smooth))
         share = float(smooth[first : last + 1].sum()) / len(values)
-        if share >= SMALL_PEAK_SHARE:
-            peaks.append(Peak(low + (top - border + 0.5) * width, (last - first) * width, share))
+        peaks.append(Peak(low + (top - border + 0.5) * width, (last - first) * width, share))
     return peaks
 
 
@@ -149,8 +148,8 @@ LUNG_HU, LUNG_WIDTH = -700, 115
 STEP_HU, CT_STEP_HU = (450, 1200), (850, 1200)
 """Range of the step from air to soft tissue, and that of a CT, from fat to blood."""
 LEAST_STEP_HU, HIGHEST_AMONG_HU = 300, 500
-"""Least step from air to the soft tissue around bone on any scale, and up to where fat, water or spongy bone may be, so
-that it is that of a CT."""
+"""Least step from air to the soft tissue around bone on any scale, and up to where fat, water or trabecular bone may
+be, so that it is that of a CT."""
 AS_LUNG_HU, ABOVE_LUNG_HU = -600, 150
 """Up to where "air" may be lung, around which soft tissue is lower than this."""
 BELOW_AIR_HU, MOST_BEYOND = 150, 0.002
@@ -173,7 +172,6 @@ FAINT_HU, FAINT_SHARE, MOST_DENSE = (-800, -200), 0.05, 0.03
 """Range and share of soft tissue where the slope is too small, and the largest share above `TISSUE_HU` begins."""
 STRETCHED_HU = 300
 """Soft tissue where the slope is too large lies above this value."""
-
 
 CALMED, RING = 3, 2
 """Width of the mean that takes the noise out of a slice, and distance of the ring round what is dense, voxels."""
@@ -268,14 +266,12 @@ def judge_scale(
     """
     if sample is None or len(sample.values) < FEWEST_VALUES:
         return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: too few voxels"), {}
-    doubt = _find_shift(sample, facts)
-    if doubt is None:
-        doubt = _find_body(sample.without_spikes(), layers, known)
+    doubt = _find_shift(sample, facts) or _find_body(sample, layers, known)
     if doubt is None and not known:
         return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: the values are not known to be HU"), {}
-    measured = sample.without_spikes(LOWEST_AIR_HU, HIGHEST_AIR_HU)
-    peaks = _find_large_peaks(measured)
+    peaks: list[Peak] = []
     if doubt is None:
+        peaks = _list_peaks(sample.without_spikes(LOWEST_AIR_HU, HIGHEST_AIR_HU), LEAST_PEAK_SHARE)
         doubt = _find_doubt(sample, layers, peaks, slopes, facts.disc)
     if doubt is not None:
         text = (
@@ -310,14 +306,15 @@ def _find_shift(sample: ValueSample, facts: PixelFacts) -> _Doubt | None:
     return _Doubt(air, tissue, reason)
 
 
-def _find_body(measured: ValueSample | None, layers: Layers, known: bool) -> _Doubt | None:
+def _find_body(sample: ValueSample, layers: Layers, known: bool) -> _Doubt | None:
     """Take the lowest peak for air that lies too high, where the bone above it has soft tissue around it.
 
     Values that many voxels share are left out: outside of a round field of view lies what is no air on this scale. Of
     values that are not known to be HU only a missing intercept is told.
     """
-    peaks = find_peaks(measured.values) if measured is not None else []
-    air = next((peak for peak in peaks if peak.share >= LEAST_PEAK_SHARE / 2.0), None)
+    measured = sample.without_spikes()
+    peaks = _list_peaks(measured, SMALL_PEAK_SHARE)
+    air = next((peak for peak in peaks if peak.share >= SMALL_AIR_SHARE), None)
     if measured is None or air is None or air.at < OFFSET_AIR_HU[0] or not _is_lowest(measured, air):
         return None
     raw = abs(air.at + 1000.0 - INTERCEPT_HU) <= 100.0 and _may_be_raw(measured)
@@ -327,9 +324,9 @@ def _find_body(measured: ValueSample | None, layers: Layers, known: bool) -> _Do
     return _Doubt(air.at, tissue.at, MISSING) if raw else _describe_step(air, tissue)
 
 
-def _find_large_peaks(measured: ValueSample | None) -> list[Peak]:
-    found = find_peaks(measured.values) if measured is not None else []
-    return [peak for peak in found if peak.share >= LEAST_PEAK_SHARE]
+def _list_peaks(measured: ValueSample | None, least: float) -> list[Peak]:
+    """Return the peaks that hold a `least` share of the values; none of too few values."""
+    return [peak for peak in find_peaks(measured.values) if peak.share >= least] if measured is not None else []
 
 
 def _is_lowest(sample: ValueSample, air: Peak) -> bool:

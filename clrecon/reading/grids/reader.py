@@ -171,21 +171,19 @@ class _Filling:
             raise RefusedInputError(f"{self._grid.name} holds no values: all of its voxels are NaN")
         doubts = _doubts(voxels, low, high)
         warnings: list[str] = []
-        disc = None if self._holes else fill_disc_padding(voxels)
-        if disc is not None:
-            facts = PixelFacts(
-                disc.voxels / voxels.size, min(low, disc.filled), high, disc.filled,
-                padding_text=disc.describe(voxels.size), disc=disc.value,
-            )  # fmt: skip
-            return GridValues(voxels, facts, warnings, doubts, _judge_likeness(voxels, self._grid))
-        share = self._holes / voxels.size
+        share, filled, text, disc = self._holes / voxels.size, None, "", None
         if self._holes:
-            warnings = [
+            filled = float(AIR_HU)
+            warnings.append(
                 f"{self._holes:,} voxels ({format_share(share, 2)}) are NaN: {AIR_HU} HU, air, is taken for them"
-            ]
-            low, high = min(low, AIR_HU), max(high, AIR_HU)
-        filled = float(AIR_HU) if self._holes else None
-        facts = PixelFacts(share, float(low), float(high), filled)
+            )
+        elif disc := fill_disc_padding(voxels):
+            share, filled, text = disc.voxels / voxels.size, disc.filled, disc.describe(voxels.size)
+        if filled is not None:
+            low, high = min(low, filled), max(high, filled)
+        facts = PixelFacts(
+            share, float(low), float(high), filled, padding_text=text, disc=None if disc is None else disc.value
+        )
         return GridValues(voxels, facts, warnings, doubts, _judge_likeness(voxels, self._grid))
 
 
