@@ -77,8 +77,9 @@ TAILS = 0.0005
 """Share of the values that is left out at either end."""
 VALLEY = 0.5
 """Two peaks are two where the histogram between them falls below this share of the lower one."""
-LEAST_PEAK_SHARE, SMALL_AIR_SHARE, SMALL_PEAK_SHARE = 0.02, 0.01, 0.004
-"""Least share of a peak; of air around a body that fills the field; of soft tissue around bone in a wide field."""
+LEAST_PEAK_SHARE = 0.02
+_SMALL_AIR_SHARE, _SMALL_PEAK_SHARE = 0.01, 0.004
+"""Least share of air around a body that fills the field, and of soft tissue around bone in a wide field."""
 
 
 class Peak(NamedTuple):
@@ -313,8 +314,8 @@ def _find_body(sample: ValueSample, layers: Layers, known: bool) -> _Doubt | Non
     values that are not known to be HU only a missing intercept is told.
     """
     measured = sample.without_spikes()
-    peaks = _list_peaks(measured, SMALL_PEAK_SHARE)
-    air = next((peak for peak in peaks if peak.share >= SMALL_AIR_SHARE), None)
+    peaks = _list_peaks(measured, _SMALL_PEAK_SHARE)
+    air = next((peak for peak in peaks if peak.share >= _SMALL_AIR_SHARE), None)
     if measured is None or air is None or air.at < OFFSET_AIR_HU[0] or not _is_lowest(measured, air):
         return None
     raw = abs(air.at + 1000.0 - INTERCEPT_HU) <= 100.0 and _may_be_raw(measured)

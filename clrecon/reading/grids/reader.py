@@ -171,19 +171,20 @@ class _Filling:
             raise RefusedInputError(f"{self._grid.name} holds no values: all of its voxels are NaN")
         doubts = _doubts(voxels, low, high)
         warnings: list[str] = []
-        share, filled, text, disc = self._holes / voxels.size, None, "", None
+        share, filled = self._holes / voxels.size, None
+        disc = None if self._holes else fill_disc_padding(voxels)
         if self._holes:
             filled = float(AIR_HU)
             warnings.append(
                 f"{self._holes:,} voxels ({format_share(share, 2)}) are NaN: {AIR_HU} HU, air, is taken for them"
             )
-        elif disc := fill_disc_padding(voxels):
-            share, filled, text = disc.voxels / voxels.size, disc.filled, disc.describe(voxels.size)
+        elif disc is not None:
+            share, filled = disc.voxels / voxels.size, disc.filled
         if filled is not None:
             low, high = min(low, filled), max(high, filled)
-        facts = PixelFacts(
-            share, float(low), float(high), filled, padding_text=text, disc=None if disc is None else disc.value
-        )
+        facts = PixelFacts(share, float(low), float(high), filled)
+        if disc is not None:
+            facts = replace(facts, padding_text=disc.describe(voxels.size), disc=disc.value)
         return GridValues(voxels, facts, warnings, doubts, _judge_likeness(voxels, self._grid))
 
 
