@@ -7,6 +7,7 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
+from clrecon.jobs.options import hu_option, series_option
 from clrecon.system.text import format_digits
 
 PARTLY_DONE = 8
@@ -23,8 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  clrecon bench CT_FOLDER --hu 250 --device all --report bench.json"
     )
     parser.add_argument("input", metavar="INPUT", nargs="?", help="DICOM folder or file (default: a synthetic spine)")
-    parser.add_argument("--hu", type=float, metavar="N", help="iso value in HU (default: the preset bone)", first=True)
-    parser.add_argument("--series", metavar="S", help='number or hash of the series, see "clrecon info"')
+    level = hu_option("iso value in HU (default: the preset bone)", parse=float, first=True)
+    common.add_option(parser, "hu", level)
+    common.add_option(parser, "series", series_option('number or hash of the series, see "clrecon info"'))
     common.add_device(parser, memory=False)
     parser.add_argument(
         "--runs", type=int, default=_RUNS, metavar="N", help=f"timed pairs (default: {_RUNS})", first=True

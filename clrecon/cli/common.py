@@ -15,7 +15,7 @@ from typing import Any, NoReturn, TypeVar, cast
 from clrecon.cli.console import STREAMED, Console, fit_help, printable
 from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.jobs.options import DeviceSettings, InputSettings, ScanSettings
-from clrecon.system.options import options_of
+from clrecon.system.options import option_beside, options_of
 from clrecon.system.progress import DEFAULT_SECONDS, check_time_limit
 from clrecon.system.text import guess_word
 
@@ -250,6 +250,12 @@ def add_fields(container: argparse._ActionsContainer, settings: type, *groups: s
     for group in groups or ("",):
         for own in options_of(settings, group):
             container.add_argument(*own.flags, dest=own.name, **own.how)
+
+
+def add_option(container: argparse._ActionsContainer, name: str, declared: Any) -> None:
+    """Add an option that no settings hold; see `clrecon.system.options.option`."""
+    own = option_beside(name, declared)
+    container.add_argument(*own.flags, dest=own.name, **own.how)
 
 
 def add_output(parser: argparse._ActionsContainer, text: str, metavar: str = "OUT", *, required: bool = True) -> None:

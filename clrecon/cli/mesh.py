@@ -8,9 +8,8 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.jobs.mesh.choices import LabelChoice, is_label_seed
 from clrecon.jobs.mesh.purposes import settings_for
-from clrecon.jobs.mesh.settings import GATE_FAILED, SCAN_GATE_FAILED, MeshSettings
+from clrecon.jobs.mesh.settings import GATE_FAILED, SCAN_GATE_FAILED, LabelChoice, MeshSettings, is_label_seed
 from clrecon.jobs.outputs import MESH_FILES
 from clrecon.jobs.presets import PRESETS
 from clrecon.system.text import count_of, format_digits, format_ml, format_volume

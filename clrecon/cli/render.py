@@ -15,6 +15,7 @@ from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.errors import UsageError
 from clrecon.jobs.inputs import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_only_mesh
+from clrecon.jobs.options import preset_option
 from clrecon.jobs.render.settings import (
     COLORS,
     CURVED_KINDS,
@@ -102,12 +103,8 @@ class Looks:
         first=True,
         words=describe_modes(),
     )
-    preset: str | None = option(
-        "--preset NAME",
-        "colours, opacities, light and mode by tissue (default: bone)",
-        parse=str.lower,
-        first=True,
-        words=describe_presets(),
+    preset: str | None = preset_option(
+        "colours, opacities, light and mode by tissue (default: bone)", first=True, words=describe_presets()
     )
     transfer_function: str | None = option(
         "--transfer-function FILE[:NAME]",

@@ -10,6 +10,7 @@ from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import add_labels, add_levels, describe_volume, mesh_fields
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.options import space_option
 from clrecon.jobs.view import ViewSettings
 from clrecon.system.text import format_volume
 
@@ -60,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         first=True,
     )
     common.add_fields(shown, ViewSettings)
-    shown.add_argument("--space", type=str.lower, metavar="lps|ras", help="frame of picked points (default: lps)")
+    common.add_option(shown, "space", space_option("frame of picked points"))
     common.add_no_clobber(shown)
     common.add_reading(parser)
     common.add_masking(parser, crop=True)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from clrecon.errors import UsageError
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 from clrecon.reading import Selection
+from clrecon.reading.common.selection import series_option as series_option
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass, fields
 from clrecon.system.options import numbers_reader, option, parse_numbers
@@ -163,8 +164,27 @@ def label_map_option(**how: Any) -> Any:
 
 
 def label_option(text: str = "this label only; may be given again", **how: Any) -> Any:
-    """Declare a field for chosen labels of a map."""
-    return option("--label NAME|N", text, action="append", **how)
+    """Declare a field for chosen labels of a map, with ``action=None`` for one."""
+    return option("--label NAME|N", text, **{"action": "append"} | how)
+
+
+def hu_option(text: str, values: str = "N", **how: Any) -> Any:
+    """Declare a field for a level of HU; `values` says what stands for it."""
+    return option(f"--hu {values}", text, **how)
+
+
+def seeds_option(text: str, **how: Any) -> Any:
+    return option("--seed X,Y,Z", text, default=(), parse=parse_point, action="append", **how)
+
+
+def view_option(values: str, text: str, **how: Any) -> Any:
+    """Declare a field for where the camera stands; `values` says what stands for it."""
+    return option(f"--view {values}", text, **how)
+
+
+def strict_option(text: str, **how: Any) -> Any:
+    """Declare a field for an exit code by failed gates."""
+    return option("--strict", f"exit with {text}", **how)
 
 
 def grow_option(when: str = "", **how: Any) -> Any:
@@ -177,14 +197,13 @@ def space_option(text: str, **how: Any) -> Any:
     return option("--space lps|ras", f"{text} (default: lps)", default="lps", parse=str.lower, **how)
 
 
-def preset_option() -> Any:
-    return option(
-        "--preset NAME",
-        f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
-        group="level",
-        parse=str.lower,
-        words=PRESETS,
-    )
+def preset_option(text: str, **how: Any) -> Any:
+    return option("--preset NAME", text, parse=str.lower, **how)
+
+
+def iso_preset_option() -> Any:
+    text = f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})"
+    return preset_option(text, group="level", words=PRESETS)
 
 
 def surface_option(of_hu: str, more: str = "", **how: Any) -> Any:

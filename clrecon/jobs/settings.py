@@ -15,13 +15,17 @@ from clrecon.jobs.options import (
     ScanSettings,
     check_surface,
     grow_option,
+    hu_option,
     label_map_option,
     label_option,
     mesh_space_option,
     parse_levels,
     parse_point,
+    seeds_option,
     space_option,
+    strict_option,
     surface_option,
+    view_option,
 )
 from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset
 from clrecon.reading import Selection
@@ -63,7 +67,7 @@ class InfoSettings(Selection):
         "read the pixels of the series marked * too: share of padding, range of HU, saturated metal",
         first=True,
     )
-    strict: bool = option("--strict", "exit with 4 when it fails a gate, see docs/certificate.md", first=True)
+    strict: bool = strict_option("4 when it fails a gate, see docs/certificate.md", first=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,8 +111,8 @@ class StatsSettings(ScanSettings, DeviceSettings):
     surface: SurfaceKind | None = surface_option(
         "measure the surface of each label at the level too: area and volume", group="surface", first=True
     )
-    iso_value: float | None = option(
-        "--hu N", f"level of the surface (default: that of bone, {FITTED_FROM_HU:g})", group="surface"
+    iso_value: float | None = hu_option(
+        f"level of the surface (default: that of bone, {FITTED_FROM_HU:g})", group="surface"
     )
 
     def __post_init__(self) -> None:
@@ -132,8 +136,8 @@ class DistanceSettings(ScanSettings, DeviceSettings):
     surface: SurfaceKind | None = surface_option(
         "B is a scan, and measured against is the surface of its bone at the level", group="scan", first=True
     )
-    iso_value: float | None = option(
-        "--hu N", f"level of that surface (default: that of bone, {FITTED_FROM_HU:g})", group="scan"
+    iso_value: float | None = hu_option(
+        f"level of that surface (default: that of bone, {FITTED_FROM_HU:g})", group="scan"
     )
     range_mm: float | None = option(
         "--range MM",
@@ -141,8 +145,8 @@ class DistanceSettings(ScanSettings, DeviceSettings):
         group="picture",
         first=True,
     )
-    view: str = option(
-        "--view V", "view of the picture: anterior (default), left, AZ,EL ...", group="picture", default="anterior"
+    view: str = view_option(
+        "V", "view of the picture: anterior (default), left, AZ,EL ...", group="picture", default="anterior"
     )
     space: Space = space_option("patient frame of the coloured mesh", group="picture")
 
@@ -182,17 +186,17 @@ class InsideSettings(ScanSettings, DeviceSettings):
 
     labels: str | Path = label_map_option(required=True)
     label: Sequence[str | int] = label_option("label of a vertebra; may be given again", required=True, first=True)
-    view: str = option(
-        "--view V",
+    view: str = view_option(
+        "V",
         f"anterior, posterior, left, right, superior, inferior, or AZ,EL in degrees (default: {_INSIDE_VIEW})",
         group="pictures",
         default=_INSIDE_VIEW,
         words=("anterior", "posterior", "left", "right", "superior", "inferior"),
     )
-    iso_value: float | None = _parts_option(
-        "--hu N",
+    iso_value: float | None = hu_option(
         "level of the solid bone, within one voxel of the label (default: the label's own voxels; of the cortex"
         f" {FITTED_FROM_HU:g})",
+        group="parts",
         first=True,
     )
     surface: SurfaceKind = surface_option(
@@ -234,15 +238,12 @@ def _parse_name(text: str) -> tuple[tuple[float, ...], str]:
 class VertebraeSettings(ScanSettings):
     """Settings of the search for vertebrae; see `clrecon.split_vertebrae`."""
 
-    level: float | None = _vertebrae_option(
-        "--hu N", "bone is N HU and more (default: half way between discs and marrow, 120 to 226)", first=True
+    level: float | None = hu_option(
+        "bone is N HU and more (default: half way between discs and marrow, 120 to 226)", group="vertebrae", first=True
     )
-    seeds: Sequence[Sequence[float]] = _vertebrae_option(
-        "--seed X,Y,Z",
+    seeds: Sequence[Sequence[float]] = seeds_option(
         "a point in the body of a vertebra, LPS mm; one for each vertebra, in place of the search for discs",
-        default=(),
-        parse=parse_point,
-        action="append",
+        group="vertebrae",
         first=True,
     )
     name_at: tuple[Sequence[float], str] | None = _vertebrae_option(
@@ -291,10 +292,10 @@ class CorridorSettings(ScanSettings, DeviceSettings):
 
     labels: str | Path = label_map_option(required=True)
     label: Sequence[str | int] = label_option("a vertebra of the map; may be given again", default=(), first=True)
-    iso_value: float | None = option(
-        "--hu auto|N",
+    iso_value: float | None = hu_option(
         "HU at which the bone's surface lies (default: auto, half way between bone and the tissue beside it; of the"
         f" cortex {FITTED_FROM_HU:g})",
+        "auto|N",
         parse=_parse_level,
         first=True,
     )

@@ -50,6 +50,12 @@ def option(
     return field(default=default, metadata={_KEY: (flags, group, {"help": help, **how})})
 
 
+def option_beside(name: str, declared: Any) -> Option:
+    """Return an option of a command that no settings hold, of what `option` declares."""
+    flags, _, how = declared.metadata[_KEY]
+    return Option(name, flags, how)
+
+
 def options_of(settings: type, group: str = "") -> Iterator[Option]:
     for own in fields(settings):
         flags, declared, how = own.metadata.get(_KEY, ([], None, {}))

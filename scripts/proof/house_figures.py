@@ -88,7 +88,10 @@ def _docstrings(nodes: list[ast.AST]) -> list[str]:
 
 
 def _option_places(modules: dict[str, tuple[str, list[ast.AST]]]) -> Counter[str]:
-    """Count in how many files each option of the command line is declared, by ``add_argument`` or as a field."""
+    """Count in how many files each option of the command line is declared, by ``add_argument`` or as a field.
+
+    A flag that is something else in another command counts too: ``--window`` of a picture is HU, of a view a face.
+    """
     places: set[tuple[str, str]] = set()
     for name, (_, nodes) in modules.items():
         for node in nodes:

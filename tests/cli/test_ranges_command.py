@@ -12,8 +12,7 @@ import pytest
 
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.choices import LabelChoice
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.options import parse_hu
 
 

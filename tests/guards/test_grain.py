@@ -12,11 +12,11 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 93_069,
-    "modules": 420,
+    "lines": 93_026,
+    "modules": 412,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
-    "options_in_several_files": 15,
+    "options_in_several_files": 8,
     "modules_with_own_all": 0,
 }
 """Who takes something away lowers the figure in the same commit; who needs more says why in the commit."""

@@ -15,8 +15,7 @@ import clrecon
 from clrecon.cli.common import Parser, add_common
 from clrecon.cli.main import _DESTINATIONS, COMMANDS, speaker_of
 from clrecon.jobs.cloud.settings import CloudSettings
-from clrecon.jobs.mesh.choices import LabelChoice
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.options import InputSettings
 from clrecon.jobs.render.job import PictureFiles
 from clrecon.jobs.render.settings import RenderSettings

@@ -57,9 +57,8 @@ def test_row_63_what_exists_is_refused_before_any_work(
 
 
 def test_row_63_labels_are_refused_before_the_scan_is_read(tmp_path: Path, device: object) -> None:
-    from clrecon.jobs.mesh.choices import LabelChoice
     from clrecon.jobs.mesh.job import make_mesh
-    from clrecon.jobs.mesh.settings import MeshSettings
+    from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 
     labels = np.zeros((4, 5, 6), np.uint16)
     labels[1:3, 1:3, 1:3], labels[1:3, 1:3, 4:] = 1, 2

@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.jobs.mesh.choices import LabelChoice
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.make import first_names
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.mesh.surfaces import plan_surfaces
 from clrecon.jobs.outputs import MOST_FILES, check_kept, check_outputs, commit_all, name_outputs
 from clrecon.jobs.render.job import PictureFiles, make_pictures

@@ -15,8 +15,7 @@ from clrecon.anatomy.iso_choice import half_iso_value
 from clrecon.anatomy.noise import Noise
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
-from clrecon.jobs.mesh.choices import LabelChoice
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.labels import LabelMap
 from clrecon.labels.statistics import measure_labels

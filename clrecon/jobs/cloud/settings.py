@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.options import InputSettings, label_map_option, parse_point, space_option
+from clrecon.jobs.options import InputSettings, hu_option, label_map_option, label_option, parse_point, space_option
 from clrecon.points import POINT_KINDS, SURFACE_KINDS
 from clrecon.system.arguments import PointKind, Space, name_parameter
 from clrecon.system.light_dataclass import dataclass, replace
@@ -111,14 +111,15 @@ class CloudSettings(InputSettings):
         parse=str.lower,
         first=True,
     )
-    hu: float | Sequence[float] | None = _points_option(
-        "--hu N|LO,HI",
+    hu: float | Sequence[float] | None = hu_option(
         "iso value, inside is N and above; or a band, both ends included (default: that of bone)",
+        "N|LO,HI",
+        group="points",
         parse=_parse_level,
         first=True,
     )
     labels: str | Path | None = label_map_option(group="points")
-    label: str | None = _points_option("--label NAME|N", "points of this label only (default: of all)")
+    label: str | None = label_option("points of this label only (default: of all)", group="points", action=None)
     paper: bool = _points_option(
         "--paper", "place and filter voxels as the papers print it, and say by how much that is wrong"
     )

@@ -13,8 +13,7 @@ from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
-    from clrecon.jobs.mesh.choices import LabelChoice
-    from clrecon.jobs.mesh.settings import MeshSettings
+    from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
     from clrecon.jobs.mesh.surfaces import Part, Surface
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh

@@ -15,7 +15,7 @@ from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.boxes import CROPS, Box, crop_box
 from clrecon.geometry.grid import Grid
-from clrecon.jobs.options import InputSettings, label_color_option, label_map_option, mesh_space_option
+from clrecon.jobs.options import InputSettings, label_color_option, label_map_option, mesh_space_option, view_option
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import COLORS as COLORS
 from clrecon.rendering.looks.colors import find_color
@@ -189,11 +189,12 @@ class RenderSettings(InputSettings):
     meshes: Sequence[MeshFile] = ()
     mesh_space: Space | None = mesh_space_option("meshes whose files do not name theirs", "meshes")
     light: str | Sequence[float] | None = None
-    views: Sequence[str] = _camera_option(
-        "--view V[,V...]|AZ,EL",
+    views: Sequence[str] = view_option(
+        "V[,V...]|AZ,EL",
         f"where the camera stands: {', '.join(VIEWS)}; or degrees from anterior to the patient's left and to the head;"
         " of slices also axial, coronal, sagittal (default: anterior; of mode slice axial, of slices 30,30, of cpr"
         " left); several make a picture each: out_left.png; may be given again",
+        group="camera",
         default=(),
         parse=_parse_views,
         action="append",

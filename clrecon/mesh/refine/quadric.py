@@ -17,7 +17,7 @@ from clrecon.mesh.compare.distances import SAMPLES, SurfaceDistance, sample_surf
 from clrecon.mesh.compare.near_distances import NearDistance
 from clrecon.mesh.connectivity import find_edges, find_used, label_components
 from clrecon.mesh.mesh import Mesh
-from clrecon.mesh.refine.collapses import last_of_collapses
+from clrecon.mesh.refine.clusters import last_of_collapses
 from clrecon.mesh.refine.decimation import carry_on, check_share, check_triangles
 from clrecon.mesh.refine.topology import TopologyChange, compare_topology, measure_topology
 from clrecon.mesh.triangles import vertex_normals

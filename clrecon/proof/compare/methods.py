@@ -9,7 +9,7 @@ from pathlib import Path
 
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.options import InputSettings, closed_option, parse_hu, preset_option
+from clrecon.jobs.options import InputSettings, closed_option, hu_option, iso_preset_option, parse_hu
 from clrecon.system.arguments import name_parameter
 from clrecon.system.options import option
 
@@ -101,15 +101,15 @@ class CompareSettings(InputSettings):
     repeat: int = _comparison_option(
         "--repeat N", "warm runs of each method; the median counts (default: 3)", default=3, first=True
     )
-    iso_value: float | None = option(
-        "--hu N|auto|half:B,T",
+    iso_value: float | None = hu_option(
         "iso value in HU, inside is N and above; auto: half way between bone and the tissue beside it, measured in the"
         " scan; half:BONE,TISSUE: half way between these two",
+        "N|auto|half:B,T",
         group="level",
         parse=parse_hu,
         first=True,
     )
-    preset: str | None = preset_option()
+    preset: str | None = iso_preset_option()
     half_way: str | Sequence[float] | None = None
     closed: bool = closed_option()
 

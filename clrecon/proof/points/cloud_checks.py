@@ -24,10 +24,10 @@ from clrecon.points import PointCloud
 from clrecon.points.spacing import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
 from clrecon.proof.checking import OBLIQUE, Check, random_integers, require_close, require_equal, require_share, stack
 from clrecon.proof.points import clusters as clusters_twin
+from clrecon.proof.points import clusters as gradients_twin
+from clrecon.proof.points import clusters as grid_twin
 from clrecon.proof.points import field as twin
-from clrecon.proof.points import grid as grid_twin
 from clrecon.proof.points import neighbours as filter_twin
-from clrecon.proof.points import voxels as gradients_twin
 
 
 def scattered_points(n: int) -> NDArray[np.float32]:

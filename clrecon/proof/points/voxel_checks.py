@@ -31,7 +31,7 @@ from clrecon.proof.checking import (
     stack,
 )
 from clrecon.proof.points import clusters as cluster_twin
-from clrecon.proof.points import voxels as twin
+from clrecon.proof.points import clusters as twin
 
 SHAPE = (26, 41, 70)
 """Voxels (k, j, i): more than 1,000 rows, and three words in each."""

@@ -17,14 +17,18 @@ LARGEST = 1e6
 _reading_option = partial(option, group="reading")
 
 
+def series_option(text: str, **how: Any) -> Any:
+    return option("--series S", text, **how)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Selection:
     """The part of an input that is read."""
 
-    series: int | str | None = _reading_option(
-        "--series S",
+    series: int | str | None = series_option(
         'number, hash, UID (or the start of one) or description of the series, see "clrecon info" (default: the CT'
         " series with most slices; of similar ones original before derived, then the thinnest)",
+        group="reading",
         first=True,
     )
     phase: int | None = _reading_option(

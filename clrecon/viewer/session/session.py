@@ -1,4 +1,7 @@
-"""`ViewSession`: what a face of a view holds: model, painter and workers, and nothing of a toolkit."""
+"""`ViewSession`: what a face of a view holds: model, painter and workers, and nothing of a toolkit.
+
+`PictureFacts` tell when a picture is stale; of each kind of work the latest request wins (`Worker`).
+"""
 
 from __future__ import annotations
 
@@ -12,22 +15,192 @@ from typing import Any
 
 import numpy as np
 
-from clrecon.errors import ClreconError, UsageError
+from clrecon.errors import Cancelled, ClreconError, UsageError
+from clrecon.geometry.affine import Float64Array
 from clrecon.opencl import Device
 from clrecon.rendering import Rendering
 from clrecon.rendering.views.directions import checked_size
 from clrecon.system.arguments import Space
 from clrecon.system.base_classes import Closing
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.log import get_logger
 from clrecon.system.text import format_volume
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.drawing.saving import check_target, save_shown
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownMesh, ShownObject
-from clrecon.viewer.model.state import Pick
+from clrecon.viewer.model.state import Pick, ViewState
 from clrecon.viewer.session.commands import check_command
-from clrecon.viewer.session.picture_facts import picture_key, seen_pieces
-from clrecon.viewer.session.worker import CLOSE_S, Job, Worker
+
+CLOSE_S = 1.0
+"""Longest wait for work that is cancelled; threads that still run then end with the process."""
+
+
+@dataclass(eq=False)
+class Job:
+    """Work that was asked for; `cancelled` says whether it is still wanted."""
+
+    kind: str
+    work: Callable[[Job], Any]
+    rank: int
+    gives_way: bool = True
+    _stop: threading.Event = field(default_factory=threading.Event, repr=False)
+
+    def cancelled(self) -> bool:
+        """True where the result is no longer wanted."""
+        return self._stop.is_set()
+
+    def cancel(self) -> None:
+        self._stop.set()
+
+    def progress(self, stage: str, done: int = 0, total: int = 0) -> None:
+        """A progress function that ends the work where it is no longer wanted."""
+        if self.cancelled():
+            raise Cancelled
+
+
+class Worker:
+    """A thread with one place for each kind of work; `on_error` gets kind and words of an error."""
+
+    def __init__(self, name: str, on_error: Callable[[str, str], None], on_change: Callable[[], None] = lambda: None):
+        self._on_error, self._on_change = on_error, on_change
+        self._wake = threading.Condition()
+        self._waiting: dict[str, Job] = {}
+        self._running: Job | None = None
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def ask(self, kind: str, work: Callable[[Job], Any], rank: int = 0, *, gives_way: bool = True) -> Job | None:
+        """Ask for work; one of the same kind that waits is dropped, and one that runs is cancelled if it gives way.
+
+        rank: Lower ones come first.
+        gives_way: False: once it runs it is finished: pictures are seen while requests come faster than pictures.
+        Returns: None after `close`.
+        """
+        job = Job(kind, work, rank, gives_way)
+        with self._wake:
+            if self._closed:
+                return None
+            old = self._waiting.pop(kind, None)
+            if old is not None:
+                old.cancel()
+            running = self._running
+            if running is not None and running.kind == kind and running.gives_way:
+                running.cancel()
+            self._waiting[kind] = job
+            self._wake.notify_all()
+        return job
+
+    def cancel(self, kind: str) -> None:
+        with self._wake:
+            waiting = self._waiting.pop(kind, None)
+            for job in (waiting, self._running):
+                if job is not None and job.kind == kind:
+                    job.cancel()
+            self._wake.notify_all()
+
+    @property
+    def busy(self) -> list[str]:
+        with self._wake:
+            running = [] if self._running is None else [self._running.kind]
+            return [*running, *(kind for kind in self._waiting if kind not in running)]
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until nothing runs or waits; False where time ran out."""
+        with self._wake:
+            return self._wake.wait_for(lambda: not self._waiting and self._running is None, timeout)
+
+    def stop(self) -> None:
+        """Cancel everything, and take nothing more."""
+        with self._wake:
+            self._closed = True
+            for job in (*self._waiting.values(), self._running):
+                if job is not None:
+                    job.cancel()
+            self._waiting.clear()
+            self._wake.notify_all()
+
+    def close(self, timeout: float = CLOSE_S) -> bool:
+        """Cancel everything and wait for the thread to end; False where it still runs after `timeout` seconds."""
+        self.stop()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: self._closed or self._waiting)
+                if self._closed:
+                    return
+                job = min(self._waiting.values(), key=lambda each: each.rank)
+                del self._waiting[job.kind]
+                self._running = job
+            self._on_change()
+            try:
+                if not job.cancelled():
+                    job.work(job)
+            except Cancelled:
+                pass
+            except ClreconError as error:
+                self._on_error(job.kind, str(error))
+            except Exception as error:  # a fault of ours: the view goes on, and says so
+                log.exception("%s failed", job.kind)
+                self._on_error(job.kind, f"{type(error).__name__}: {error} (a fault of clrecon: please report it)")
+            finally:
+                with self._wake:
+                    self._running = None
+                    self._wake.notify_all()
+                self._on_change()
+
+
+SCENE, SLICES = "scene", ("axial", "coronal", "sagittal")
+VIEWS = (SCENE, *SLICES, "curve")
+"""The picture in three dimensions, the three slices, and the reformation along the points of the curve tool."""
+
+REST_SECONDS = 0.2
+"""After the last change until pictures are drawn sharp."""
+
+_STEPS = 64
+"""Places on each line that are compared with the picture's depth."""
+
+_BEFORE_MM, _BEFORE_PIXELS = 0.5, 2.0
+"""By which a place may lie behind what is seen at its pixel: measures begin on the surface."""
+
+
+def picture_key(state: ViewState, view: str) -> Hashable:
+    """Return what the picture of a view depends on: equal keys, equal pictures."""
+    looks = tuple(part for part in state.parts if not part.is_plain)  # the others are drawn as if they were not known
+    parts = (looks, (state.parts_at, state.parts_table) if looks else None)
+    if view == SCENE:
+        cut = (state.clips, state.clip_box)
+        return (state.camera, state.mode, state.iso_value, state.picture_window, state.table, parts, cut)
+    if view in SLICES:
+        return (state.cross, state.window, state.table, parts)
+    return (state.curve, state.window, state.table)
+
+
+def seen_pieces(rendering: Rendering, lines: Sequence[Float64Array], *, expected: bool) -> list[list[list[float]]]:
+    """Return the ends of the pieces of lines (n, 3) that nothing in a picture hides, by its depths or expected ones."""
+    camera, size = rendering.camera, rendering.size
+    assert camera is not None
+    depth = rendering.expected_depth if expected else rendering.depth
+    slack = _BEFORE_MM + _BEFORE_PIXELS * camera.pixel_mm(size)
+    pieces: list[list[list[float]]] = []
+    for line in lines:
+        for start, end in zip(line[:-1], line[1:], strict=True):
+            places = start + np.linspace(0.0, 1.0, _STEPS)[:, None] * (end - start)
+            pixels, depths = camera.project(places, size)
+            known = np.isfinite(pixels).all(axis=1)
+            column, row = np.where(known[:, None], np.floor(pixels), 0).astype(np.int64).T
+            inside = known & (column >= 0) & (row >= 0) & (column < size[0]) & (row < size[1])
+            surface = depth[np.where(inside, row, 0), np.where(inside, column, 0)]
+            seen = ~(inside & (depths > surface + slack))  # beside NaN, where nothing is hit, all is seen
+            ends = np.flatnonzero(np.diff(np.concatenate([[0], seen.astype(np.int8), [0]])))
+            pieces += [np.round(places[[a, b - 1]], 3).tolist() for a, b in ends.reshape(-1, 2) if b - a > 1]
+    return pieces
+
 
 log = get_logger(__name__)
 

@@ -10,10 +10,9 @@ import pytest
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.jobs.mesh.choices import LabelChoice
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.purposes import settings_for
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.system.records import none_of
 
 AFFINE = np.diag((1.0, 1.0, 1.5, 1.0))

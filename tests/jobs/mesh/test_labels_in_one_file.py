@@ -12,7 +12,7 @@ from variants import daily
 
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.choices import LabelChoice
+from clrecon.jobs.mesh.settings import LabelChoice
 from clrecon.labels import LabelMap
 from clrecon.labels.label_map import encode_nifti
 

@@ -13,9 +13,8 @@ from scipy.ndimage import gaussian_filter
 from clrecon import Volume
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.choices import LabelChoice
 from clrecon.jobs.mesh.purposes import settings_for, warn_of_other_pieces, warn_of_print
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 

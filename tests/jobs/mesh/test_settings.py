@@ -7,8 +7,7 @@ import math
 import pytest
 
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.choices import LabelChoice
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS, find_iso_preset
 
 

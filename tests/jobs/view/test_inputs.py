@@ -11,8 +11,7 @@ import view_scenes as scenes
 
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
-from clrecon.jobs.mesh.choices import LabelChoice
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.view import ViewSettings
 from clrecon.jobs.view.inputs import open_inputs
 from clrecon.labels import LabelMap

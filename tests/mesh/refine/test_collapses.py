@@ -7,7 +7,7 @@ import pytest
 import sample_meshes as samples
 
 from clrecon.mesh.connectivity import Fans
-from clrecon.mesh.refine.collapses import Collapses, Quadrics, last_of_collapses
+from clrecon.mesh.refine.clusters import Collapses, Quadrics, last_of_collapses
 
 pytestmark = pytest.mark.unit
 

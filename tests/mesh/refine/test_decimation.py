@@ -16,8 +16,7 @@ from clrecon.geometry import Volume
 from clrecon.mesh import Mesh, split_components
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.intersections import find_self_intersections
-from clrecon.mesh.refine.clusters import Clusters, _find_flat
-from clrecon.mesh.refine.collapses import Quadrics
+from clrecon.mesh.refine.clusters import Clusters, Quadrics, _find_flat
 from clrecon.mesh.refine.decimation import _collapse, _mend, check_refinement, decimate_mesh
 from clrecon.mesh.refine.deviation import Deviation
 from clrecon.mesh.refine.shifts import measure_volumes

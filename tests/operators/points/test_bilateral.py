@@ -13,7 +13,7 @@ from clrecon.operators.points import neighbours
 from clrecon.operators.points.denoising import denoise_points
 from clrecon.points import PointCloud
 from clrecon.points.spacing import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
-from clrecon.proof.points import grid as grid_twin
+from clrecon.proof.points import clusters as grid_twin
 from clrecon.proof.points import neighbours as twin
 from clrecon.proof.points.neighbours import find_neighbours, mean_distances, principal_axes
 

@@ -14,7 +14,7 @@ from clrecon import LabelMap, Volume, extract_isosurface, extract_labels, fit_co
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.operators.points.point_extraction import Selection, VoxelEmission, _join, extract_points
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.proof.points.voxels import extract_voxels, mark_shell
+from clrecon.proof.points.clusters import extract_voxels, mark_shell
 
 pytestmark = pytest.mark.opencl
 

@@ -16,8 +16,8 @@ from clrecon.operators.points.clusters import cluster_points
 from clrecon.operators.points.free_clusters import ClusterSearch, cluster_free_points, find_clusters, plan_cells
 from clrecon.operators.points.grid import fill_grid
 from clrecon.points import PointCloud
+from clrecon.proof.points import clusters as grid_twin
 from clrecon.proof.points import clusters as twin
-from clrecon.proof.points import grid as grid_twin
 
 
 @pytest.fixture(params=["own form", "other form"])

@@ -20,7 +20,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud, drop_ghost_slices, fill_ghost_slices, keep_clusters
 from clrecon.points.ghost_slices import judge_slices
 from clrecon.proof.phantom import PhantomSettings, make_phantom, write_phantom
-from clrecon.proof.points import voxels as twin
+from clrecon.proof.points import clusters as twin
 
 BONE = (200, np.inf)
 

@@ -18,7 +18,7 @@ from clrecon.operators.points.grid import (
     plan_grid,
 )
 from clrecon.points import PointCloud
-from clrecon.proof.points import grid as twin
+from clrecon.proof.points import clusters as twin
 
 
 def check_equal(device, points, edge):

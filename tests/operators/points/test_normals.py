@@ -17,8 +17,8 @@ from clrecon.operators.points import neighbours, normals
 from clrecon.operators.points.normals import estimate_normals
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
+from clrecon.proof.points.clusters import find_gradients as gradients_twin
 from clrecon.proof.points.neighbours import find_neighbours, orient_by_gradients, orient_from, principal_axes
-from clrecon.proof.points.voxels import find_gradients as gradients_twin
 
 
 def degrees_between(a, b):

@@ -12,7 +12,7 @@ from clrecon.operators.points.neighbours import find_neighbours
 from clrecon.operators.points.thinning import REASONS, choose_edge, grow_cells, remove_sparse_cells
 from clrecon.points import PointCloud
 from clrecon.points.spacing import count_cells, find_cell_numbers
-from clrecon.proof.points import grid as twin
+from clrecon.proof.points import clusters as twin
 
 
 @pytest.mark.parametrize("n", [20, 64, 4097])

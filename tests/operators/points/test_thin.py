@@ -10,7 +10,7 @@ from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.operators.points.grid import plan_grid
 from clrecon.operators.points.thinning import choose_points, thin_points
 from clrecon.points import PointCloud
-from clrecon.proof.points import grid as twin
+from clrecon.proof.points import clusters as twin
 
 
 @pytest.mark.parametrize("n", [1, 2, 63, 65, 9001])

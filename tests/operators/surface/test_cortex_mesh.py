@@ -12,9 +12,8 @@ from scipy.special import ndtr
 import clrecon
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.jobs.mesh.choices import LabelChoice
 from clrecon.jobs.mesh.make import _try_steps
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.intersections import find_self_intersections
 from clrecon.opencl.launching import launch

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clrecon.reading.dicom.stack.spacing import median
+from clrecon.reading.dicom.stack.fit import median
 
 
 @settings(deadline=None)

@@ -25,7 +25,16 @@ from clrecon.reading.dicom.series.phases import SAME_POSITION_MM, Phase, _are_pa
 from clrecon.reading.dicom.series.scan import DiskReader
 from clrecon.reading.dicom.series.series import describe_missing_parts
 from clrecon.reading.dicom.stack import mixtures
-from clrecon.reading.dicom.stack.fit import _cross, facts_of_thickness, measure_line, measure_stated_gap, summarise_gaps
+from clrecon.reading.dicom.stack.fit import (
+    RUN_LENGTH,
+    _cross,
+    _find_runs,
+    facts_of_thickness,
+    measure_line,
+    measure_stated_gap,
+    median,
+    summarise_gaps,
+)
 from clrecon.reading.dicom.stack.mixtures import (
     Alternation,
     _is_compared,
@@ -33,7 +42,6 @@ from clrecon.reading.dicom.stack.mixtures import (
     describe_differences,
     find_alternation,
 )
-from clrecon.reading.dicom.stack.spacing import RUN_LENGTH, _find_runs, median
 
 pytestmark = pytest.mark.unit
 

@@ -12,7 +12,7 @@ from clrecon.rendering import Rendering
 from clrecon.rendering.views.camera import Camera
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import show_objects
-from clrecon.viewer.session.picture_facts import VIEWS, picture_key, seen_pieces
+from clrecon.viewer.session.session import VIEWS, picture_key, seen_pieces
 
 pytestmark = pytest.mark.unit
 

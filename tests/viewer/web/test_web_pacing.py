@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clrecon.viewer.session.picture_facts import SCENE
-from clrecon.viewer.web.connection import Connection
-from clrecon.viewer.web.pictures import Asked, Pace, _lay_over
+from clrecon.viewer.session.session import SCENE
+from clrecon.viewer.web.connection import Asked, Connection, Pace, _lay_over
 
 pytestmark = pytest.mark.unit
 

@@ -148,7 +148,7 @@ def test_a_fault_behind_the_page_is_shown_with_its_trace(monkeypatch, capsys: py
         try:
             raise ValueError("a number of another kind")
         except ValueError:
-            logging.getLogger("clrecon.viewer.session.worker").exception("mesh failed")
+            logging.getLogger("clrecon.viewer.session.session").exception("mesh failed")
 
     monkeypatch.setattr("clrecon.viewer.web.server.serve_view", serve)
     assert main(["view", "scan.nii.gz"]) == 0, "the view goes on"

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.reading.dicom.headers.slice_header import OtherImage, SliceHeader
-from clrecon.reading.dicom.stack.fit import Stack, median_thickness
-from clrecon.reading.dicom.stack.spacing import median
+from clrecon.reading.dicom.stack.fit import Stack, median, median_thickness
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.records import Gate, none_of, unmeasured
 

@@ -17,9 +17,8 @@ from clrecon.errors import UsageError
 from clrecon.reading.dicom.headers.slice_header import PHASE_KEYWORDS, SliceHeader
 from clrecon.reading.dicom.pixels.stored import StoredPixels
 from clrecon.reading.dicom.pixels.voxels import read_voxels
-from clrecon.reading.dicom.stack.fit import measure_gap
+from clrecon.reading.dicom.stack.fit import measure_gap, measure_unit
 from clrecon.reading.dicom.stack.mixtures import Alternation, find_mixture, read_number, values_of
-from clrecon.reading.dicom.stack.spacing import measure_unit
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass, field, replace
 from clrecon.system.text import join_names
