@@ -233,6 +233,14 @@ def own_remarks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.fixture
+def printed(capsys: pytest.CaptureFixture[str]) -> Any:
+    """What a command prints, without its sentences."""
+    from printed_text import Printer
+
+    return Printer(capsys)
+
+
+@pytest.fixture
 def users_kernels(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The variant of the kernels that users of this device get: that of the tests is another one on llvmpipe."""
     from clrecon.opencl.quirks import kernel_variants

@@ -13,6 +13,7 @@ import pytest
 import tolerances
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refused
 from scipy.ndimage import gaussian_filter
 
 import clrecon
@@ -325,7 +326,7 @@ def test_two_materials_are_found_on_any_scale(name) -> None:
 def test_values_that_are_known_to_be_hu_keep_their_scale() -> None:
     volume = as_volume(make_ball(2040.0, 1040.0))
     volume.report["gates"] = [{"name": "hu_known", "ok": True}]
-    with pytest.raises(NoSurfaceError, match="no two materials"):
+    with refused(NoSurfaceError, "materials"):
         choose_iso_value(volume)
 
 
@@ -346,7 +347,7 @@ def test_slices_with_metal_are_left_out() -> None:
 def test_nan_is_refused() -> None:
     field = make_ball(1040.0, 40.0).astype(np.float32)
     field[5, 5, 5] = np.nan
-    with pytest.raises(NoSurfaceError, match=r"NaN \(slice 5\)"):
+    with refused(NoSurfaceError, "NaN", 5):
         choose_iso_value(Volume(field, np.eye(4)))
 
 

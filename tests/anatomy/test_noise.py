@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 from tolerances import NOISE_SHARE
 
 from clrecon.anatomy.noise import measure_noise
@@ -39,5 +40,5 @@ def test_noise_of_a_phantom(noise):
 
 
 def test_no_soft_tissue_is_told():
-    with pytest.raises(UsageError, match="0 blocks of 6 x 6 voxels in 3 slices lie from -150 to 250 HU"):
+    with refused(UsageError, 0, 6, 3):
         measure_noise(Volume(np.full((3, 60, 60), -1000, np.int16), np.eye(4)))

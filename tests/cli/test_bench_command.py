@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from ct_files import find_words, write_series
+from printed_text import Printer
 
 from clrecon.cli import bench as command
 from clrecon.cli.main import main
@@ -95,9 +96,10 @@ def test_wrong_arguments_are_one_line(
     assert words in captured.err and len(captured.err.splitlines()) == 1
 
 
-def test_an_input_that_is_not_there(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_input_that_is_not_there(device: Any, tmp_path: Path, printed: Printer) -> None:
     code = main(["bench", str(tmp_path / "gone"), "--device", str(device.index)])
-    assert code in (2, 3, 4) and "gone" in capsys.readouterr().err
+    assert code in (2, 3, 4)
+    printed().assert_error("gone")
 
 
 def test_the_default_of_the_command_is_that_of_the_job() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tolerances
 from ct_files import ORIGIN, RADIUS_MM, SPACING, find_words, write_series
+from printed_text import Printer
 
 from clrecon.cli.main import COMMANDS, main
 
@@ -38,16 +39,14 @@ def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.every_device
 @pytest.mark.parametrize("space", ["lps", "ras"])
 def test_mesh_writes_the_sphere_where_it_is(
-    device: Any, space: str, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    device: Any, space: str, ct: Path, tmp_path: Path, printed: Printer
 ) -> None:
     output, report_path = tmp_path / "Kugel ä.stl", tmp_path / "a report.json"
     arguments = ["mesh", str(ct), "-o", str(output), "--report", str(report_path), "--hu", "-150", "--space", space]
     assert main([*arguments, "--device", str(device.index)]) == 0
-    captured = capsys.readouterr()
-    assert captured.err == ""
-    assert "17 slices of 31 x 25, spacing 0.8 x 1.1 x 1.5 mm" in captured.out
-    assert "-150 HU (as given)" in captured.out
-    assert "Kugel ä.stl" in captured.out
+    captured = printed()
+    assert captured.error_lines == 0
+    captured.assert_output(17, 31, 25, -150, "Kugel")
 
     report = json.loads(report_path.read_text())
     assert CONTRACT <= set(report)
@@ -82,20 +81,20 @@ def test_mesh_says_nothing_of_the_patient(
     assert find_words(written) == []
 
 
-def test_mesh_json_is_the_report(device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mesh_json_is_the_report(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
     output = tmp_path / "a.glb"
     assert main(["mesh", str(ct), "-o", str(output), "--json", "--device", str(device.index)]) == 0
-    captured = capsys.readouterr()
-    report = json.loads(captured.out)
+    captured = printed()
+    report = captured.report()
     assert CONTRACT <= set(report)
     assert (report["preset"], report["iso_value_hu"], report["output"]["format"]) == ("bone", 200.0, "glb")
-    assert captured.err == ""
+    assert captured.error_lines == 0
 
 
-def test_mesh_quiet_prints_nothing(device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mesh_quiet_prints_nothing(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
     output = tmp_path / "a.obj"
     assert main(["mesh", str(ct), "-o", str(output), "-q", "--device", str(device.index)]) == 0
-    assert capsys.readouterr() == ("", "")
+    assert printed().is_silent
     assert output.stat().st_size > 1000
 
 
@@ -156,16 +155,14 @@ def test_several_meshes_are_shown_one_by_one(
 
 
 @pytest.mark.parametrize("spaced", [True, False])
-def test_seeds_may_be_negative(
-    spaced: bool, device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_seeds_may_be_negative(spaced: bool, device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
     centre = np.array(ORIGIN) + np.array(SPACING) * np.array([15, 12, 8])
     seeds = [",".join(f"{value:.3f}" for value in centre + [0, 0, step]) for step in (0, RADIUS_MM)]
     assert seeds[0].startswith("-")
     extra = [word for seed in seeds for word in (["--seed", seed] if spaced else [f"--seed={seed}"])]
     arguments = ["mesh", str(ct), *extra, "-o", str(tmp_path / "a.stl"), "--json", "--device", str(device.index)]
     assert main([*arguments, "--hu", "-150"]) == 0
-    report = json.loads(capsys.readouterr().out)
+    report = printed().report()
     assert report["seeds_mm"] == [[float(value) for value in seed.split(",")] for seed in seeds]
     inside, on = report["meshes"][0]["seed_distances_mm"]
     assert (inside, on) == (
@@ -187,7 +184,7 @@ def test_lists_of_negative_numbers_are_values() -> None:
     assert parser.parse_args(["--seed", "-.5,2"]).seed == ["-.5,2"]
 
 
-def test_open_leaves_the_border_open(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_open_leaves_the_border_open(device: Any, tmp_path: Path, printed: Printer) -> None:
     voxels = np.full((5, 8, 9), -1000, np.int16)
     voxels[:, 2:6, 3:6] = 600
     folder = write_series(tmp_path / "ct", voxels)
@@ -195,15 +192,13 @@ def test_open_leaves_the_border_open(device: Any, tmp_path: Path, capsys: pytest
     closed = []
     for extra in ([], ["--open"]):
         assert main([*arguments, *extra]) == 0
-        report = json.loads(capsys.readouterr().out)
+        report = printed().report()
         closed.append((report["closed"], report["volume_ml"] is None))
     assert closed == [(True, False), (False, True)]
 
 
 @pytest.mark.release
-def test_topology_joins_what_the_trilinear_field_joins(
-    device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_topology_joins_what_the_trilinear_field_joins(device: Any, tmp_path: Path, printed: Printer) -> None:
     voxels = np.full((5, 8, 9), -1000, np.int16)
     voxels[2, 3, 3] = voxels[2, 4, 4] = 600  # the saddle between them is at -200
     folder = write_series(tmp_path / "ct", voxels)
@@ -211,7 +206,7 @@ def test_topology_joins_what_the_trilinear_field_joins(
     found = []
     for extra in ([], ["--topology", "trilinear"]):
         assert main([*arguments, "--device", str(device.index), *extra]) == 0
-        report = json.loads(capsys.readouterr().out)
+        report = printed().report()
         found.append((report["topology"], report["components"], report["closed"], report["manifold"]))
     assert found == [("separated", 2, True, True), ("trilinear", 1, True, True)]
 
@@ -258,13 +253,13 @@ def test_no_driver_says_how_to_get_one(
 
 
 @pytest.mark.slow
-def test_selftest_passes(device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_selftest_passes(device: Any, monkeypatch: pytest.MonkeyPatch, printed: Printer) -> None:
     """With the first checks of the table; all of them run in tests/proof."""
     from clrecon.proof import run as table
 
     monkeypatch.setattr(table, "CHECKS", table.CHECKS[:2])
     assert main(["selftest", "--json", "--device", str(device.index)]) == 0
-    outcome = json.loads(capsys.readouterr().out)
+    outcome = printed().report()
     assert outcome["passed"] is True
     assert [result["operator"] for result in outcome["operators"]] == ["exclusive_scan", "compact"]
     assert all(set(result) == {"operator", "passed", "detail", "seconds"} for result in outcome["operators"])
@@ -283,27 +278,27 @@ def test_selftest_that_fails_exits_5(
     assert captured.err.startswith("clrecon: error: the self-test failed on ")
 
 
-def test_phantom_and_its_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_phantom_and_its_truth(tmp_path: Path, printed: Printer) -> None:
     folder = tmp_path / "ph"
     arguments = ["phantom", str(folder), "--kind", "sphere", "--size", "40x32", "--slices", "24", "--tilt", "-12"]
     arguments += ["--spacing", "0.7", "0.5", "1.0", "--oblique", "10", "-5", "30", "--noise", "0", "--seed", "3"]
     assert main([*arguments, "--json"]) == 0
-    truth = json.loads(capsys.readouterr().out)
+    truth = printed().report()
     assert truth["shape_ijk"] == [40, 32, 24]
     assert truth == json.loads((folder / "truth.json").read_text())
     assert main(["info", str(folder), "--json"]) == 0
-    (entry,) = json.loads(capsys.readouterr().out)["series"]
+    (entry,) = printed().report()["series"]
     np.testing.assert_allclose(entry["affine_ijk_to_lps_mm"], truth["affine_ijk_to_lps_mm"], atol=1e-6)
     assert entry["tilt_deg"] == pytest.approx(-12.0, abs=1e-4) == truth["tilt_deg"]
     assert main([*arguments, "--seed", "4"]) == 0
-    assert "sphere, 24 slices of 40 x 32" in capsys.readouterr().out
+    printed().assert_output(24, 40, 32)
 
 
-def test_phantom_refuses_a_folder_with_other_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_phantom_refuses_a_folder_with_other_files(tmp_path: Path, printed: Printer) -> None:
     (tmp_path / "thesis.txt").write_text("years of work")
     assert main(["phantom", str(tmp_path), "--kind", "sphere"]) == 3
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
-    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert printed().error_lines == 1
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import json
 import sys
 
 import pytest
+from printed_text import Printer
 
 from clrecon.cli.common import guard, megabytes, table
 from clrecon.cli.console import Console, printable
@@ -109,7 +110,7 @@ def test_stdout_holds_one_object_at_most(capsys: pytest.CaptureFixture[str]) -> 
     assert captured.err == "clrecon: error: late\n"
 
 
-def test_a_reader_that_leaves_is_no_error(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_reader_that_leaves_is_no_error(monkeypatch: pytest.MonkeyPatch, printed: Printer) -> None:
     monkeypatch.setattr(sys, "stdout", ClosedPipe())
     console = Console()
 
@@ -119,7 +120,7 @@ def test_a_reader_that_leaves_is_no_error(monkeypatch: pytest.MonkeyPatch, capsy
         return 0
 
     assert guard(action, console, debug=False) == 0
-    assert capsys.readouterr().err == ""
+    assert printed().error_lines == 0
 
 
 def test_a_full_disk_behind_stdout_is_an_error(
@@ -144,11 +145,11 @@ def test_no_stdout_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
     assert guard(lambda: console.say("nobody hears") or 8, console, debug=False) == 8
 
 
-def test_progress_is_silent_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_is_silent_without_a_terminal(printed: Printer) -> None:
     console = Console()
     console.progress("read", 3, 10)
     console.finish()
-    assert capsys.readouterr() == ("", "")
+    assert printed().is_silent
 
 
 def test_progress_moves_on_a_terminal_and_is_removed(monkeypatch: pytest.MonkeyPatch) -> None:

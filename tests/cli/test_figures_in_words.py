@@ -7,6 +7,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from printed_text import Printer
+from refusals import refused
 
 from clrecon.cli import (
     bench,
@@ -124,9 +126,9 @@ def test_two_files_cannot_share_standard_output() -> None:
         with console.filled_streams("cloud", options, Console()):
             pass
 
-    with pytest.raises(UsageError, match="-o and --report cannot share standard output"):
+    with refused(UsageError, "--report", "output"):
         use(output="-", report="-")
-    with pytest.raises(UsageError, match="-o and --json cannot share standard output"):
+    with refused(UsageError, "--json", "output"):
         use(output="-", json=True)
     use(json=True)
 
@@ -305,9 +307,9 @@ def test_meshes_are_made_of_a_part_of_a_scan(capsys: pytest.CaptureFixture[str])
     assert all(option in told for option in ("--clip-box", "--between", "--around", "--fov", "--remove-table"))
 
 
-def test_the_picture_of_distances_is_among_the_first_options(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_picture_of_distances_is_among_the_first_options(printed: Printer) -> None:
     assert main.main(["distance", "--help"]) == 0
-    assert "--picture FILE" in capsys.readouterr().out
+    printed().assert_output("--picture", "FILE")
 
 
 @pytest.mark.parametrize("given", [{}, {"report": "a.json"}, {"json": True}, {"verbose": True}])
@@ -323,7 +325,7 @@ def test_a_mesh_is_measured_for_whoever_sees_the_figures(
     monkeypatch.setattr("clrecon.jobs.mesh.job.make_mesh", make_mesh)
     monkeypatch.setattr(mesh_command, "mesh_fields", lambda options: {})
     options = {"input": "a", "output": "b.stl", "report": None, "json": False, "verbose": False, "no_clobber": False}
-    with pytest.raises(UsageError, match="enough"):
+    with refused(UsageError, "enough"):
         mesh_command.run(argparse.Namespace(**options | given), Console())
     assert told == [bool(given)]
 
@@ -336,6 +338,6 @@ def test_a_moving_line_has_20_characters_at_least(
     assert capsys.readouterr().err == "\rclrecon: " + "x" * 11
 
 
-def test_a_turntable_needs_no_picture(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_turntable_needs_no_picture(printed: Printer) -> None:
     assert main.main(["help", "render"]) == 0
-    assert "[-o OUT]" in capsys.readouterr().out
+    printed().assert_output("OUT")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import ct_files
 import pytest
 import tolerances
+from printed_text import Printer
 
 from clrecon.cli.main import main
 from clrecon.jobs.options import parse_hu
@@ -35,26 +35,22 @@ def test_auto_says_what_it_chose(ct: Path, device: Any, tmp_path: Path, capsys: 
     assert "HU (auto: half way between tissue 0 and bone 700 HU), closed" in line
 
 
-def test_half_takes_the_materials_given(
-    ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_half_takes_the_materials_given(ct: Path, device: Any, tmp_path: Path, printed: Printer) -> None:
     assert run(ct, device, tmp_path, "--hu", "half:700,-100", "--json") == 0
-    report = json.loads(capsys.readouterr().out)
+    report = printed().report()
     assert (report["iso_value_hu"], report["iso_value_choice"]["method"]) == (300.0, "half")
     assert "tissue was given as -100 HU, but the volume runs from 0 to 700 HU" in report["warnings"][0]
     assert run(ct, device, tmp_path, "--hu", "half:700,0") == 0
-    assert "surface  350 HU (half way between tissue 0 and bone 700 HU, as given)" in capsys.readouterr().out
+    printed().assert_output(350, 0, 700)
 
 
-def test_auto_without_bone_ends_with_2_and_the_modes(
-    device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_auto_without_bone_ends_with_2_and_the_modes(device: Any, tmp_path: Path, printed: Printer) -> None:
     voxels = ct_files.sphere_voxels() * 0 + 8
     voxels[0, 0, 0] = 9
     water = ct_files.write_series(tmp_path / "water", voxels)
     assert run(water, device, tmp_path, "--hu", "auto") == 2
-    message = capsys.readouterr().err
-    assert "soft tissue has its mode at 8 HU" in message and "give the iso value (--hu N)" in message
+    message = printed()
+    message.assert_error(8, "--hu")
     assert not (tmp_path / "b.stl").exists()
 
 
@@ -80,6 +76,6 @@ def test_what_hu_understands() -> None:
     assert parse_hu("half:1200,-40") == {"half_way": (1200.0, -40.0)}
 
 
-def test_bone_below_tissue_is_wrong_usage(ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bone_below_tissue_is_wrong_usage(ct: Path, tmp_path: Path, printed: Printer) -> None:
     assert main(["mesh", str(ct), "-o", str(tmp_path / "b.stl"), "--hu", "half:40,1200"]) == 3
-    assert "40 HU is not above 1200 HU" in capsys.readouterr().err
+    printed().assert_error(40, 1200)

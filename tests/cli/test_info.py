@@ -16,6 +16,7 @@ from contract_tables import CONTRACT, names_in
 from ct_files import PATIENT, SPACING, write_series
 from dicom_series import Plan, set_values
 from dicom_series import write_series as write_plan
+from printed_text import Printer
 
 from clrecon.cli.info import describe_certificate, render_listing
 from clrecon.cli.main import main
@@ -78,12 +79,12 @@ def test_json_is_the_contract(ct: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert captured.err == "" and PATIENT.split("^")[0] not in captured.out
 
 
-def test_pixels_are_read_on_request(ct: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pixels_are_read_on_request(ct: Path, printed: Printer) -> None:
     assert main(["info", str(ct), "--json", "--pixels"]) == 0
-    certificate = json.loads(capsys.readouterr().out)["certificate"]
+    certificate = printed().report()["certificate"]
     assert (certificate["padding_share"], certificate["hu_range"]) == (0.0, [-1000, 700])
     assert main(["info", str(ct), "--pixels"]) == 0
-    assert "-1000 to 700 HU" in capsys.readouterr().out
+    printed().assert_output(-1000, 700)
 
 
 def test_what_pixels_tell_is_said_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -117,24 +118,24 @@ def test_the_table_marks_the_choice(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert any(re.fullmatch(r"  slices +17 used, none dropped", row) for row in rows)
 
 
-def test_equal_series_name_the_way_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_equal_series_name_the_way_out(tmp_path: Path, printed: Printer) -> None:
     folder = write_series(tmp_path / "ct", number=1)
     write_series(folder, number=2)
     assert main(["info", str(folder), "--json"]) == 0
-    captured = capsys.readouterr()
-    found = json.loads(captured.out)
+    captured = printed()
+    found = captured.report()
     assert (found["chosen"], found["certificate"]) == (None, None)
-    assert "choose one with --series" in captured.err
+    captured.assert_error("--series")
     assert main(["info", str(folder), "--series", "2", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = printed().report()
     assert found["chosen"] == found["certificate"]["series"]["number"] == 2
     uid_hash = found["series"][1]["uid_hash"]
     assert main(["info", str(folder), "--series", uid_hash, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["chosen"] == 2
+    assert printed().report()["chosen"] == 2
     assert main(["info", str(folder), "--series", "7"]) == 3
-    assert "no series matches --series '7'; there are [1: CT" in capsys.readouterr().err
+    printed().assert_error("--series", "CT", 7, 1)
     assert main(["info", str(folder), "--strict"]) == 4
-    assert "choose one with --series" in capsys.readouterr().err
+    printed().assert_error("--series")
 
 
 def test_strict_holds_a_series_against_its_gates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -171,9 +172,9 @@ def test_a_refused_series_has_its_certificate(tmp_path: Path, capsys: pytest.Cap
     assert "series 1 cannot be used: 1 slice missing" in captured.err
 
 
-def test_quiet_prints_nothing(ct: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet_prints_nothing(ct: Path, printed: Printer) -> None:
     assert main(["info", str(ct), "-q"]) == 0
-    assert capsys.readouterr() == ("", "")
+    assert printed().is_silent
 
 
 def test_a_file_gets_plain_text_of_any_width(ct: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
@@ -314,9 +315,7 @@ def test_mesh_strict_counts_the_gates_of_the_volume(
     assert b"comment CERTIFICATE gate_failed lossless: slices with lossy" in (tmp_path / "a.ply").read_bytes()
 
 
-def test_mesh_strict_takes_slices_that_are_placed_one_by_one(
-    tmp_path: Path, device: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mesh_strict_takes_slices_that_are_placed_one_by_one(tmp_path: Path, device: Any, printed: Printer) -> None:
     import pydicom
 
     folder = write_series(tmp_path / "ct")
@@ -327,7 +326,7 @@ def test_mesh_strict_takes_slices_that_are_placed_one_by_one(
             ds.save_as(path)
     arguments = ["mesh", str(folder), "-o", str(tmp_path / "a.ply"), "--hu", "100", "--device", str(device.index)]
     assert main([*arguments, "--strict", "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+    report = printed().report()
     said = report["volume"]
     assert said["uneven"] and [gate["name"] for gate in said["gates"] if gate["ok"] is False] == ["grid_residual"]
     assert any("unevenly spaced" in text for text in report["warnings"])

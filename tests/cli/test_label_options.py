@@ -12,6 +12,7 @@ import tolerances
 from contract_tables import names_in
 from ct_files import ORIGIN, PATIENT, RADIUS_MM, SPACING, sphere_voxels, write_series
 from label_files import write_nifti
+from printed_text import Printer
 from variants import daily_rows
 
 from clrecon.cli.main import main
@@ -49,14 +50,14 @@ def run(*arguments: object, device: Any = None) -> int:
 
 @pytest.mark.seconds
 def test_each_label_gets_a_file_of_its_name(
-    device: Any, ct: Path, labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    device: Any, ct: Path, labels: Path, tmp_path: Path, printed: Printer
 ) -> None:
     options = ("--labels", labels, "--hu", -150, "--report", tmp_path / "r.json")
     assert run(ct, "-o", tmp_path / "bone.stl", *options, device=device) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bone_RIGHT_half.stl", "bone_left_half.stl", "r.json"]
-    captured = capsys.readouterr()
-    assert "labels   2 labels, grown by one voxel; HU place" in captured.out
-    assert "1 label has no voxel of -150 HU or more in the CT and no mesh: 3 Doe_Jane_x1b_31m" in captured.err
+    captured = printed()
+    captured.assert_output("labels", 2)
+    captured.assert_error("CT", "Doe_Jane_x1b_31m", 1, -150, 3)
     report = json.loads((tmp_path / "r.json").read_text())
     assert [(mesh["name"], mesh["label"], mesh["label_number"]) for mesh in report["meshes"]] == [
         ("left_half", "left_half", 1), ("RIGHT_half", "RIGHT_half", 2),
@@ -123,15 +124,13 @@ def test_the_labels_own_surface_does_not_depend_on_hu(
         assert names_in("clrecon mesh INPUT", "For each mesh in `meshes`") <= set(mesh)
 
 
-def test_a_mask_that_leaves_the_ct_goes_on_there(
-    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mask_that_leaves_the_ct_goes_on_there(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
     shifted = AFFINE.copy()
     shifted[2, 3] += 6 * SPACING[2]
     map_file = write_nifti(tmp_path / "a.nii.gz", (sphere_voxels() >= 0).astype(np.uint8), shifted)
     arguments = ("-o", tmp_path / "b.stl", "--labels", map_file, "--surface", "mask", "--report", tmp_path / "r.json")
     assert run(ct, *arguments, device=device) == 0
-    assert "of label 1 lie outside the CT: its surface goes on there" in capsys.readouterr().err
+    printed().assert_error("CT", 1)
     (mesh,) = json.loads((tmp_path / "r.json").read_text())["meshes"]
     assert mesh["label_inside_share"] < 1.0
     assert mesh["volume_ml"] == pytest.approx(mesh["label_ml"], rel=tolerances.MASK_VOLUME)
@@ -268,11 +267,11 @@ def test_labels_that_miss_their_volume_fail_the_gate(
 
 
 def test_the_memory_that_is_allowed_counts_for_labels_too(
-    device: Any, ct: Path, labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    device: Any, ct: Path, labels: Path, tmp_path: Path, printed: Printer
 ) -> None:
     options = ("--labels", labels, "--hu", -150, "--memory", "20kB")
     assert run(ct, "-o", tmp_path / "bone.stl", *options, device=device) == 5
-    assert "20,000 bytes are allowed on" in capsys.readouterr().err
+    printed().assert_error(20000)
 
 
 def test_labels_and_iso_values_together(device: Any, ct: Path, labels: Path, tmp_path: Path) -> None:
@@ -306,10 +305,10 @@ def test_what_cannot_be_is_said_in_one_line(
 
 @pytest.mark.parametrize("options", [["--label", "1"], ["--grow", "1"]])
 def test_label_options_without_labels_are_refused(
-    options: list[str], ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], ct: Path, tmp_path: Path, printed: Printer
 ) -> None:
     assert run(ct, "-o", tmp_path / "b.stl", *options) == 3
-    assert f"{options[0]} says how labels become meshes" in capsys.readouterr().err
+    printed().assert_error(options[0])
 
 
 @pytest.mark.parametrize(
@@ -328,7 +327,7 @@ def test_a_label_map_that_cannot_be_read_ends_the_job(
 
 
 def test_a_label_none_of_whose_centres_lies_in_the_ct_is_compared_with_what_was_taken(
-    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    device: Any, ct: Path, tmp_path: Path, printed: Printer
 ) -> None:
     """The centre of the large voxel of label 2 lies a millimetre beside the scan, and half of it in the scan."""
     extent = (np.array(sphere_voxels().shape[::-1]) - 1) * SPACING
@@ -341,4 +340,4 @@ def test_a_label_none_of_whose_centres_lies_in_the_ct_is_compared_with_what_was_
     (mesh,) = json.loads((tmp_path / "r.json").read_text())["meshes"]
     assert mesh["label_inside_share"] == 0.0
     assert mesh["label_compared_ml"] == mesh["label_taken_ml"] > 0.0
-    assert f"ml of mesh for {mesh['label_taken_ml']:,.2f} ml of labels" in capsys.readouterr().out
+    printed().assert_output(round(mesh["label_taken_ml"], 2))

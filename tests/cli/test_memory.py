@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 
 from clrecon.cli.main import main
@@ -32,18 +30,18 @@ def ct_folder(tmp_path_factory):
     return folder
 
 
-def test_a_small_budget_gives_the_same_file_in_slabs(ct_folder, tmp_path, capsys):
+def test_a_small_budget_gives_the_same_file_in_slabs(ct_folder, tmp_path, printed):
     assert main(["mesh", str(ct_folder), "-o", str(tmp_path / "whole.stl"), "--json"]) == 0
-    whole = json.loads(capsys.readouterr().out)
+    whole = printed().report()
     arguments = ["mesh", str(ct_folder), "-o", str(tmp_path / "slabs.stl"), "--memory", "200kB"]
     assert main([*arguments, "--json"]) == 0
-    slabs = json.loads(capsys.readouterr().out)
+    slabs = printed().report()
     assert (tmp_path / "whole.stl").read_bytes() == (tmp_path / "slabs.stl").read_bytes()
     assert whole["slabs"] == 1 and whole["memory_allowed_bytes"] is None
     assert slabs["slabs"] > 1 and slabs["memory_allowed_bytes"] == 200_000
     assert sum(slabs["device_bytes"].values()) <= 200_000
     assert main(arguments) == 0
-    assert f"{slabs['slabs']} slabs of at most" in capsys.readouterr().out
+    printed().assert_output(slabs["slabs"])
 
 
 @pytest.mark.parametrize(("memory", "code", "message"), [

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from printed_text import Printer
 from variants import daily
 
 from clrecon.cli.main import main
@@ -42,18 +43,15 @@ def test_the_names_are_those_of_the_table() -> None:
     assert tuple(METHODS) == METHOD_NAMES
 
 
-def test_seeds_choose_and_are_reported(
-    bones: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], device: Any
-) -> None:
+def test_seeds_choose_and_are_reported(bones: Path, tmp_path: Path, printed: Printer, device: Any) -> None:
     code, report = run(bones, tmp_path, "--grow-from", "auto", "-v")
-    said = capsys.readouterr().out
+    said = printed()
     assert code == 0
     assert report["method"] == "i-mc" and report["grow_from"] == ["auto"] and report["vertex_rule"] == "linear"
     assert report["components"] == 2 and report["growing"]["components"] == 3
     cells = report["cells"]
     assert cells["all"] == 41 * 31 * 21 and cells["active"] == cells["grown"] + 8
-    assert f"cells    {cells['visited']:,} visited, {cells['active']:,} active, {cells['all']:,} in all" in said
-    assert "grown    from auto: 2 of 3 parts;" in said and "the largest part of them 8" in said
+    said.assert_output(cells["visited"], cells["active"], cells["all"], 2, 3, 8)
     assert report["meshes"][0]["growing"] == report["growing"]
 
 

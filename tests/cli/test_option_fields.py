@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from importlib import import_module
 
 import pytest
+from refusals import refused
 
 from clrecon.cli.common import Parser, add_fields, make_part, make_settings
 from clrecon.cli.main import COMMANDS
@@ -76,7 +77,7 @@ def test_options_of_a_part_need_the_one_that_it_is_about() -> None:
     ]
     assert made == [None, Part(path="a", grow=2.0)]
     lone = parser.parse_args(["--grow", "0"])
-    with pytest.raises(UsageError, match="--grow is about labels"):
+    with refused(UsageError, "--grow", "labels"):
         make_part(Part, lone, lone.path, "is about labels")
 
 

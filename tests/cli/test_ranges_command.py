@@ -9,6 +9,7 @@ from typing import Any
 import ct_files
 import numpy as np
 import pytest
+from printed_text import Printer
 
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
@@ -48,11 +49,9 @@ def test_below_is_the_lung_without_the_air_outside(
     assert "can show a face" in shown.err
 
 
-def test_a_range_and_an_iso_value_together(
-    ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_range_and_an_iso_value_together(ct: Path, device: Any, tmp_path: Path, printed: Printer) -> None:
     assert run(ct, device, tmp_path, "--hu", "-900:-700,0", "-v") == 0
-    assert "surface  -900:-700, 0 HU (as given)" in capsys.readouterr().out
+    printed().assert_output(-900, -700, 0)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b_-900to-700hu.stl", "b_0hu.stl"]
 
 

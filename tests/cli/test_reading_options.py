@@ -20,12 +20,13 @@ def block(ds, k, hu=1500):
     ds.PixelData = pixels.tobytes()
 
 
-def test_a_gap_is_refused_and_then_allowed(tmp_path, capsys):
+def test_a_gap_is_refused_and_then_allowed(tmp_path, printed):
     write_series(tmp_path / "ct", Plan(shape=SHAPE, leave_out=(4,)), block)
     out = tmp_path / "bone.stl"
     assert main(["mesh", str(tmp_path / "ct"), "-o", str(out)]) == 4
-    said = capsys.readouterr().err
-    assert "1 slice missing between" in said and "--allow-gaps" in said and not out.exists()
+    said = printed()
+    said.assert_error(1, "--allow-gaps")
+    assert not out.exists()
     report = tmp_path / "report.json"
     assert main(["mesh", str(tmp_path / "ct"), "-o", str(out), "--allow-gaps", "--report", str(report)]) == 0
     told = json.loads(report.read_text())
@@ -37,7 +38,7 @@ def test_a_gap_is_refused_and_then_allowed(tmp_path, capsys):
     assert high - low == pytest.approx((3 + 2 * part) * 1.25, abs=1e-3)
 
 
-def test_a_phase_is_chosen(tmp_path, capsys):
+def test_a_phase_is_chosen(tmp_path, printed):
     for number, hu in ((1, 1500), (2, 1300)):
 
         def change(ds, k, number=number, hu=hu):
@@ -47,10 +48,10 @@ def test_a_phase_is_chosen(tmp_path, capsys):
         write_series(tmp_path / "ct", Plan(shape=SHAPE, name=f"{number}-{{}}".format), change)
     out = tmp_path / "bone.stl"
     assert main(["mesh", str(tmp_path / "ct"), "-o", str(out)]) == 4
-    assert "2 phases at the same places, choose one with --phase" in capsys.readouterr().err
+    printed().assert_error("--phase", 2)
     assert main(["mesh", str(tmp_path / "ct"), "-o", str(out), "--phase", "3"]) == 3
-    assert "no phase 3" in capsys.readouterr().err
+    printed().assert_error("phase", 3)
     assert main(["mesh", str(tmp_path / "ct"), "-o", str(out), "--phase", "2", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = printed().report()
     assert told["volume"]["hu_range"] == [-1000, 276]
     assert told["volume"]["phase"]["number"] == 2

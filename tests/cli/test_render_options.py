@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from printed_text import Printer
 
 from clrecon.cli.common import Parser
 from clrecon.cli.main import main
@@ -37,14 +38,14 @@ def test_what_may_be_given_again_makes_a_list(name: str, parser: Parser) -> None
 
 
 def test_no_encoder_is_said_before_anything_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Printer
 ) -> None:
     from clrecon.rendering import movies
 
     movies.find_encoder.cache_clear()
     monkeypatch.setattr(movies, "_find_ffmpeg", lambda: None)
     assert main(["render", str(tmp_path / "no CT"), "--turntable", str(tmp_path / "a.mp4")]) == 3
-    assert "no encoder for MP4" in capsys.readouterr().err
+    printed().assert_error("MP4")
     movies.find_encoder.cache_clear()
     assert list(tmp_path.iterdir()) == []
 

@@ -32,16 +32,16 @@ def run(*arguments: object, device=None) -> int:
     return main(["mesh", *map(str, (*arguments, *given))])
 
 
-def test_solid_fills_and_says_how_much(device, bone, tmp_path, capsys):
+def test_solid_fills_and_says_how_much(device, bone, tmp_path, printed):
     reports = {}
     for option in ("--no-solid", "--solid"):
         path = tmp_path / f"{option}.json"
         assert run(bone, "-o", tmp_path / "a.stl", "--hu", 400, option, "--report", path, device=device) == 0
         reports[option] = json.loads(path.read_text())
-    said = capsys.readouterr().out
+    said = printed()
     assert "solid" not in reports["--no-solid"]["volume"]
     facts = reports["--solid"]["volume"]["solid"]
-    assert f"solid    {facts['filled_ml']:.1f} ml filled, {100 * facts['filled_share']:.0f} % of the solid\n" in said
+    said.assert_output(round(facts["filled_ml"], 1), round(100 * facts["filled_share"], 0))
     true_ml = 1.1 * 4 / 3 * np.pi * 18.0**3 / 1000
     assert reports["--solid"]["volume_ml"] == pytest.approx(true_ml, rel=0.01)
     assert reports["--no-solid"]["volume_ml"] < 0.65 * true_ml
@@ -51,14 +51,14 @@ def test_solid_fills_and_says_how_much(device, bone, tmp_path, capsys):
 
 @pytest.mark.release
 @pytest.mark.seconds
-def test_for_print_is_solid_unless_it_shall_not_be(device, bone, tmp_path, capsys):
+def test_for_print_is_solid_unless_it_shall_not_be(device, bone, tmp_path, printed):
     ml = {}
     for option in ([], ["--no-solid"]):
         path = tmp_path / "r.json"
         code = run(
             bone, "-o", tmp_path / "a.stl", "--for", "print", "--hu", 400, *option, "--report", path, device=device
         )
-        assert code == 0, capsys.readouterr().err
+        assert code == 0, printed()
         ml[bool(option)] = json.loads(path.read_text())["volume_ml"]
     assert ml[False] > 1.5 * ml[True]
 

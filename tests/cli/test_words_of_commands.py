@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from printed_text import Printer
 
 from clrecon.cli.main import COMMANDS, main
 from clrecon.errors import UsageError
@@ -78,9 +79,9 @@ def test_a_word_like_none_is_not_guessed(capsys: pytest.CaptureFixture[str]) -> 
     assert guess_word("BNOE", ["bone", "skin"]) == " (did you mean bone?)"
 
 
-def test_options_after_two_dashes_are_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_after_two_dashes_are_names(tmp_path: Path, printed: Printer) -> None:
     assert main(["info", "--", "--kep"]) == 2
-    assert "--kep does not exist" in capsys.readouterr().err
+    printed().assert_error("--kep")
 
 
 def test_presets_are_found_in_any_case() -> None:

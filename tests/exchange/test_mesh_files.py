@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 import tolerances
+from refusals import refused
 
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
 from clrecon.exchange import formats as writers
@@ -270,26 +271,26 @@ def test_3mf_parts(mesh, tmp_path):
 
 def test_unknown_extension_lists_those_that_are_written(mesh, tmp_path):
     for name in ("bone.step", "bone", "stl"):
-        with pytest.raises(UsageError, match=r"use one of .stl, .ply, .obj, .glb, .vtp, .3mf, .html"):
+        with refused(UsageError, ".3mf"):
             mesh.save(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unknown_space_is_refused(mesh, tmp_path):
-    with pytest.raises(UsageError, match="unknown space"):
+    with refused(UsageError, "space", "xyz"):
         mesh.save(tmp_path / "bone.stl", space="xyz")
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("extension", EVERY)
 def test_empty_mesh_writes_nothing(extension, tmp_path):
-    with pytest.raises(NoSurfaceError, match="surface is empty"):
+    with refused(NoSurfaceError, "surface", "empty"):
         Mesh([[0, 0, 0]], []).save(tmp_path / f"bone{extension}")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_wrong_index_writes_nothing(tmp_path):
-    with pytest.raises(UsageError, match="refers to vertex 9"):
+    with refused(UsageError, 9, "vertex"):
         Mesh(np.eye(3), [[0, 1, 9]]).save(tmp_path / "bone.vtp")
     assert list(tmp_path.iterdir()) == []
 
@@ -314,7 +315,7 @@ class FullDisk(io.RawIOBase):
 @pytest.mark.parametrize("extension", EVERY)
 def test_every_writer_notices_a_full_disk(mesh, extension):
     content = mesh.describe_parts("lps", 1) if extension == ".html" else mesh.describe("lps")
-    with pytest.raises(OSError, match="No space left"):
+    with refused(OSError, 28):
         FORMATS[extension].code.write(FullDisk(700), content)
 
 
@@ -371,7 +372,7 @@ def test_more_vertices_than_a_ply_file_can_count_are_refused():
     content = Mesh(*samples.box()).describe("lps")
     large = dataclasses.replace(content, vertices=samples.LongTable(2**31 + 1))
     stream = io.BytesIO()
-    with pytest.raises(OutputError, match="^2147483649 vertices are too many for a PLY file, at most 2147483648$"):
+    with refused(OutputError, "PLY", 2147483649, 2147483648):
         FORMATS[".ply"].code.write(stream, large)
     assert stream.getvalue() == b""
 
@@ -381,7 +382,7 @@ def test_the_end_of_a_vtp_file_is_quoted_where_it_is_wrong(mesh, tmp_path):
     content = (tmp_path / "bone.vtp").read_bytes().rstrip()
     assert content.endswith(b"</VTKFile>")
     (tmp_path / "bone.vtp").write_bytes(content[:-10] + b"0123456789abcdefghij")
-    with pytest.raises(OutputError, match=r": b'456789abcdefghij' at the end, </VTKFile> expected;"):
+    with refused(OutputError, "VTKFile"):
         FORMATS[".vtp"].code.verify(tmp_path / "bone.vtp", mesh.describe("lps"))
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 from sample_meshes import ball
 from variants import daily
 
@@ -376,5 +377,5 @@ def test_faces_of_four_corners_beside_numbers_are_refused(tmp_path: Path) -> Non
     head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     text = f"{head}element face 1\n{FACE_HEAD}0 0 0\n1 0 0\n1 1 0\n0 1 0\n0.5 4 0 1 2 3 200 -7\n"
     (tmp_path / "a.ply").write_text(text)
-    with pytest.raises(RefusedInputError, match="face 0 of a.ply has 4 corners: only triangles are read"):
+    with refused(RefusedInputError, "a.ply", 0, 4):
         clrecon.read_mesh(tmp_path / "a.ply")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.geometry import (
@@ -81,7 +82,7 @@ def test_ras_negates_x_and_y_and_is_a_rotation():
     rotation = frame_from_lps("ras")
     assert np.array_equal(rotation @ (1.0, 2.0, 3.0), (-1.0, -2.0, 3.0))
     assert np.linalg.det(rotation) == pytest.approx(1.0)
-    with pytest.raises(UsageError, match="mri"):
+    with refused(UsageError, "mri"):
         frame_from_lps("mri")
 
 
@@ -118,7 +119,7 @@ def test_three_steps_span_space_down_to_a_millionth():
 @pytest.mark.parametrize("points", [(1.0, 2.0), [(1.0, 2.0)], [[(1.0, 2.0, 3.0)]], 1.0])
 def test_points_must_come_as_n_by_3(points):
     volume = Volume(np.zeros((2, 3, 4), np.int16), np.eye(4))
-    with pytest.raises(UsageError, match=r"\(n, 3\)"):
+    with refused(UsageError, 3):
         volume.ijk_to_lps(points)
 
 

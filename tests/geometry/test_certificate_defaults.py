@@ -6,6 +6,7 @@ from dataclasses import MISSING, fields
 from typing import Any
 
 import pytest
+from refusals import refused
 
 from clrecon.geometry.certificate import Certificate, without_ids
 
@@ -21,7 +22,7 @@ def test_slices_are_even_and_none_is_missing_unless_said():
 
 def test_a_certificate_is_equal_to_the_dict_of_its_entries():
     assert bare() == {**bare()} and bare() != {**bare(), "slices": 1}
-    with pytest.raises(TypeError, match="unhashable type: 'Certificate'"):  # as a dict
+    with refused(TypeError, "Certificate"):  # as a dict
         hash(bare())
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dicom_series
 import numpy as np
 import pytest
+from refusals import refused
 from uneven_volume import positions, uneven
 
 from clrecon import Volume
@@ -115,9 +116,9 @@ def test_one_slice_of_an_uneven_stack():
 
 
 def test_nothing_left_and_wrong_boxes_are_one_line():
-    with pytest.raises(UsageError, match=r"no voxel lies in the box z 100 to 120 mm \(LPS\); the scan runs"):
+    with refused(UsageError, "LPS", 100, 120):
         crop_volume(numbered(), *between(100, 120))
-    with pytest.raises(UsageError, match="from 9 to 3 mm along y: it holds nothing"):
+    with refused(UsageError, 9, 3):
         crop_volume(numbered(), (0, 9, 0), (1, 3, 1))
     for low, high in (((0, np.nan, 0), (1, 3, 1)), ((0, 0), (1, 1)), ("a", "b")):
         with pytest.raises(UsageError, match="two corners of three numbers"):

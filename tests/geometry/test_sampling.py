@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+from refusals import refused
 from scipy import ndimage
 
 import clrecon
@@ -87,12 +88,12 @@ def test_one_point_is_as_good_as_many():
 
 @pytest.mark.parametrize("points", ["abc", [1, 2], [[1, 2], [3]], 5, None, [[1, 2, 3, 4]]])
 def test_what_is_no_point_is_refused(points):
-    with pytest.raises(UsageError, match="points"):
+    with refused(UsageError, "points"):
         VOLUMES["tilted"].sample(points)
 
 
 def test_another_order_is_refused():
-    with pytest.raises(UsageError, match="one of 0, 1, 3, not 2"):
+    with refused(UsageError, 0, 1, 3):
         VOLUMES["tilted"].sample((0, 0, 0), order=2)
 
 

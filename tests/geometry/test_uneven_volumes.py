@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tolerances
+from refusals import refused
 from uneven_volume import IN_PLANE, positions, uneven
 
 from clrecon.errors import UsageError
@@ -73,7 +74,7 @@ def test_other_voxels_at_the_same_places():
     assert other.uneven and other.voxels.max() == 7.5 and other.report["warnings"] == ["kept"]
     other.report["warnings"].append("its own")
     assert volume.report["warnings"] == ["kept"]
-    with pytest.raises(UsageError, match="shape"):
+    with refused(UsageError, "shape", 6, 5):
         volume.with_voxels(np.zeros((6, 5, 3)))
 
 

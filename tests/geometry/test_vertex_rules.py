@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.geometry.vertices import (
@@ -105,7 +106,7 @@ def test_the_golden_constant_fails_the_bar_that_both_other_rules_pass() -> None:
 
 def test_unknown_rules_and_those_of_the_trilinear_field_are_refused() -> None:
     check_vertex_rule("golden")
-    with pytest.raises(UsageError, match="vertex_rule is one of linear, golden, golden-search, not 'midpoint'"):
+    with refused(UsageError, "vertex_rule", "midpoint"):
         check_vertex_rule("midpoint")
-    with pytest.raises(UsageError, match="exclude each other"):
+    with refused(UsageError, "golden-search", "trilinear"):
         check_vertex_rule("golden-search", "trilinear")

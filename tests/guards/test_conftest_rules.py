@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import conftest
 import pytest
 from house import ROOT
+from refusals import assert_facts, refused
 from variants import daily_rows
 
 POCL = SimpleNamespace(platform="Portable Computing Language", version="OpenCL 3.0 PoCL", driver="3.1")
@@ -38,6 +39,22 @@ def test_rows_of_tables_are_named_by_their_values() -> None:
     assert conftest.pytest_make_parametrize_id(None, row, "row") == "up=0,1.5,order=abs,plan=object"
     assert conftest.pytest_make_parametrize_id(None, ["x" * 99], "row") == "x" * 60
     assert conftest.pytest_make_parametrize_id(None, "text", "row") is None
+
+
+def test_facts_of_a_refusal_are_numbers_and_names_not_sentences() -> None:
+    text = "slice003.dcm: 13,824 voxels at -5.50 mm, --crop x:1:2 (allow_gaps=True), 1.2e+06 mm"
+    assert_facts(text, "slice003.dcm", 13824, -5.5, "--crop", "allow_gaps=True", 1.2e6)
+    for absent in (3, 824, 5.5, 50, "crop-box", "gaps"):
+        with pytest.raises(AssertionError):
+            assert_facts(text, absent)
+    for sentence in ((), ("",), ("13,824 voxels",)):
+        with pytest.raises(ValueError, match="one word each"):
+            assert_facts(text, *sentence)
+    with pytest.raises(KeyError), refused(UserWarning, 3):
+        raise KeyError(3)
+    with refused(KeyError, 3) as caught:
+        raise KeyError(3)
+    assert caught.type is KeyError
 
 
 def run_pytest(tmp_path: Path, test: str, *options: str, **variables: str) -> subprocess.CompletedProcess[str]:

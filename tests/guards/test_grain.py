@@ -32,7 +32,7 @@ HABITS = {
     "equal_functions": 6,
     "constants_of_one_file": 98,
     "kernels_with_branches": 18,
-    "tests_of_wording": 1_107,
+    "tests_of_wording": 579,
     "tables_without_ids": 0,
     "patches_of_private_names": 165,
 }

@@ -36,7 +36,9 @@ def _asserts_value(node: ast.AST) -> bool:
     if isinstance(node, ast.Call):
         function = node.func
         name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
-        expects_error = name == "raises" and any(keyword.arg == "match" for keyword in node.keywords)
+        expects_error = name == "refused" or (
+            name == "raises" and any(keyword.arg == "match" for keyword in node.keywords)
+        )
         return name.startswith(("assert_", "check_")) or expects_error
     return False
 
@@ -89,6 +91,7 @@ def test_a_test_without_assertion_is_found(body: str) -> None:
         "assert run() == 3",
         "np.testing.assert_allclose(a, b)",
         "with pytest.raises(ValueError, match='no'):\n        run()",
+        "with refused(ValueError, 3):\n        run()",
     ],
 )
 def test_a_test_with_assertion_is_accepted(body: str) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_lines import check_refused
+from printed_text import Printer
 from sample_meshes import ball, box
 from surface_volumes import MIDDLE, hollow_ball
 
@@ -62,7 +63,7 @@ def test_a_file_without_a_frame_is_doubted_until_it_is_said(files: dict[str, str
     assert report["a"]["space_from"] == "argument"
 
 
-def test_a_mesh_is_measured_against_the_bone_of_a_scan(tmp_path: Path, capsys: Any, device: Any) -> None:
+def test_a_mesh_is_measured_against_the_bone_of_a_scan(tmp_path: Path, printed: Printer, device: Any) -> None:
     volume = hollow_ball(thickness=3.0)
     volume.save(tmp_path / "ct.nrrd")
     vertices, triangles = ball(13.5, 30)
@@ -76,7 +77,7 @@ def test_a_mesh_is_measured_against_the_bone_of_a_scan(tmp_path: Path, capsys: A
     assert fitted == pytest.approx(0.5, abs=0.08) and level < 0.1
     assert found["cortex"]["b"]["cortex"]["moved"] and found["hu"]["b"]["cortex"] is None
     assert main(["distance", mesh, str(tmp_path / "ct.nrrd"), "--surface", "cortex", "--samples", "500"]) == 0
-    assert "bone fitted from 200 HU, 100 % of it, error 0." in capsys.readouterr().out
+    printed().assert_output(200, 100, 0)
 
 
 def test_an_open_mesh_and_one_in_metres_are_said(files: dict[str, str]) -> None:

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from contract_tables import names_in
+from printed_text import Printer
+from refusals import refused
 
 import clrecon
 from clrecon.cli.inside import _describe_vertebra
@@ -63,26 +65,24 @@ def test_files_report_and_words_agree(inside: Any, tmp_path: Path, capsys: pytes
 
 
 @pytest.mark.release
-def test_several_vertebrae_have_names_of_their_own(
-    inside: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_several_vertebrae_have_names_of_their_own(inside: Any, tmp_path: Path, printed: Printer) -> None:
     assert inside("--label", "L1", "--label", "21", "--hu", "300", "--dense", "350:900", "--json", output="a.ply") == 0
-    report = json.loads(capsys.readouterr().out)
+    report = printed().report()
     assert {path.name for path in tmp_path.iterdir()} == {f"a_{n}_{part}.ply" for n in ("L1", "L2") for part in PARTS}
     assert [vertebra["label"] for vertebra in report["vertebrae"]] == [20, 21]
     assert {vertebra["iso_value_hu"] for vertebra in report["vertebrae"]} == {300.0}
     assert report["vertebrae"][0]["dense_hu"] == [350.0, 900.0]
     assert inside("--label", "L1", "--label", "L2", "--dense", "0", "--json", output="b.ply") == 0
-    warnings = json.loads(capsys.readouterr().out)["warnings"]  # tissue beside the labels is in that band
+    warnings = printed().report()["warnings"]  # tissue beside the labels is in that band
     for name in ("L1", "L2"):
         assert [line for line in warnings if line.startswith(f"{name}: ") and "next voxel outside" in line]
 
 
-def test_solid_bone_ends_at_the_surface_fitted_to_it(inside: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_solid_bone_ends_at_the_surface_fitted_to_it(inside: Any, printed: Printer) -> None:
     found = {}
     for options in ((), ("--hu", "200"), ("--surface", "cortex")):
         assert inside("--label", "L1", *options, "--json", output=f"{len(options)}{options[-1:]}.stl") == 0
-        (found[options],) = json.loads(capsys.readouterr().out)["vertebrae"]
+        (found[options],) = printed().report()["vertebrae"]
     true, level, fitted = (one["volumes_ml"]["solid"] for one in found.values())
     assert level > 1.1 * true and fitted == pytest.approx(true, rel=0.03)
     report = found["--surface", "cortex"]
@@ -90,10 +90,10 @@ def test_solid_bone_ends_at_the_surface_fitted_to_it(inside: Any, capsys: pytest
     assert "200 HU, " in _describe_vertebra(report)[1] and "error 0." in _describe_vertebra(report)[1]
 
 
-def test_what_is_there_stays_with_no_clobber(inside: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_there_stays_with_no_clobber(inside: Any, tmp_path: Path, printed: Printer) -> None:
     (tmp_path / "in_L2_canal.stl").write_text("kept")
     assert inside("--label", "L1", "--label", "L2", "--no-clobber") == 6
-    assert "in_L2_canal.stl exists already" in capsys.readouterr().err
+    printed().assert_error("in_L2_canal.stl")
     assert [path.read_text() for path in tmp_path.iterdir()] == ["kept"]
 
 
@@ -132,7 +132,7 @@ def test_wrong_files_are_one_line_and_leave_nothing(
     assert list(tmp_path.iterdir()) == []
     settings = InsideSettings(labels=spine / "levels.nrrd", label=["L1"])
     assert settings.space == "lps"
-    with pytest.raises(UsageError, match="choose the vertebrae by their labels"):
+    with refused(UsageError, "vertebrae", "labels"):
         InsideSettings(labels="x.nrrd", label=())
     with pytest.raises(UsageError, match="must be above 0 bytes"):
         InsideSettings(labels="x.nrrd", label=["L1"], memory=0)
@@ -140,10 +140,10 @@ def test_wrong_files_are_one_line_and_leave_nothing(
 
 @pytest.mark.release
 @pytest.mark.seconds
-def test_pictures_show_each_part(inside: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pictures_show_each_part(inside: Any, tmp_path: Path, printed: Printer) -> None:
     image = pytest.importorskip("PIL.Image")
     assert inside("--label", "L1", "--picture", str(tmp_path / "p.png"), "--view", "left", "--json") == 0
-    (vertebra,) = json.loads(capsys.readouterr().out)["vertebrae"]
+    (vertebra,) = printed().report()["vertebrae"]
     assert [picture["part"] for picture in vertebra["pictures"]] == list(PARTS)
     assert {path.name for path in tmp_path.glob("*.png")} == {f"p_{part}.png" for part in PARTS}
     shown = {}
@@ -159,11 +159,11 @@ def test_pictures_show_each_part(inside: Any, tmp_path: Path, capsys: pytest.Cap
     assert shown["canal"][1] < 0.01
 
 
-def test_wrong_pictures_are_refused_first(inside: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_pictures_are_refused_first(inside: Any, tmp_path: Path, printed: Printer) -> None:
     assert inside("--label", "L1", "--picture", str(tmp_path / "p.svg")) == 3
     assert inside("--label", "L1", "--picture", str(tmp_path / "p.png"), "--view", "above") == 3
     assert inside("--label", "L1", "--picture", str(tmp_path / "none" / "p.png")) == 6
-    assert capsys.readouterr().err.count("\n") == 3
+    assert printed().error_lines == 3
     (tmp_path / "p_canal.png").write_text("kept")
     assert inside("--label", "L1", "--picture", str(tmp_path / "p.png"), "--no-clobber") == 6
     assert [path.read_text() for path in tmp_path.iterdir()] == ["kept"]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tolerances
 from PIL import Image
+from refusals import refused
 from variants import daily
 
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
@@ -69,9 +70,9 @@ def test_parts_of_the_time_sum_to_the_total(device: Any, sphere: tuple[Path, dic
 def test_outputs_then_device_then_input(sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     nowhere = tmp_path / "nowhere"
     bad_device = MeshSettings(device="abacus")
-    with pytest.raises(OutputError, match="nowhere"):
+    with refused(OutputError, "nowhere"):
         make_mesh(nowhere, nowhere / "a.stl", bad_device)
-    with pytest.raises(DeviceError, match="abacus|no OpenCL device"):
+    with refused(DeviceError, "abacus"):
         make_mesh(nowhere, tmp_path / "a.stl", bad_device)
 
 
@@ -87,7 +88,7 @@ def test_a_failed_write_leaves_both_old_files(
         raise OutputError("the disk is full")
 
     monkeypatch.setattr(fails, fail)
-    with pytest.raises(OutputError, match="full"):
+    with refused(OutputError, "full"):
         make_mesh(sphere[0], mesh, MeshSettings(device=str(device.index)), report_path=report)
     assert (mesh.read_bytes(), report.read_bytes()) == (b"old mesh", b"old report")
     assert sorted(tmp_path.iterdir()) == [report, mesh]
@@ -98,7 +99,7 @@ def test_a_level_with_everything_inside_is_refused(
     level: float, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     settings = MeshSettings(iso_value=level, device=str(device.index))
-    with pytest.raises(NoSurfaceError, match=r"every voxel is inside, the volume runs from -1000 to 1000 HU"):
+    with refused(NoSurfaceError, -1000, 1000):
         make_mesh(sphere[0], tmp_path / "box.stl", settings)
     assert not list(tmp_path.iterdir())
 

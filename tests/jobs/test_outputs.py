@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from refusals import refused
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.jobs.mesh.job import make_mesh
@@ -47,14 +48,14 @@ def test_close_iso_values_keep_all_their_digits() -> None:
 
 def test_two_meshes_are_never_one_file(tmp_path: Path) -> None:
     output = tmp_path / "bone.stl"
-    with pytest.raises(UsageError, match="the mesh T12 and the mesh T12 cannot be the same file"):
+    with refused(UsageError, "T12", "mesh"):
         name_outputs(output, ["T12", "T12"])
-    with pytest.raises(UsageError, match="the mesh t12 and the mesh T12 cannot"):
+    with refused(UsageError, "t12", "T12"):
         name_outputs(output, ["T12", "t12"])
-    with pytest.raises(UsageError, match="the mesh T12 and the report cannot"):
+    with refused(UsageError, "T12", "mesh"):
         name_outputs(output, ["L1", "T12"], tmp_path / "." / "bone_T12.stl")
     (tmp_path / "bone_L1.stl").symlink_to(tmp_path / "bone_T12.stl")
-    with pytest.raises(UsageError, match="the mesh T12 and the mesh L1 cannot"):
+    with refused(UsageError, "T12", "L1"):
         check_outputs(output, None, ["L1", "T12"])
 
 
@@ -67,13 +68,13 @@ def test_a_name_stays_in_the_folder(name: str) -> None:
 def test_too_many_files_are_refused() -> None:
     names = [f"{number}" for number in range(MOST_FILES + 1)]
     assert len(name_outputs("bone.stl", names[1:])) == MOST_FILES
-    with pytest.raises(UsageError, match="1,001 meshes are more than 1,000 files"):
+    with refused(UsageError, 1001, 1000):
         name_outputs("bone.stl", names)
 
 
 def test_each_file_is_looked_at_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "bone_350hu.stl").mkdir()
-    with pytest.raises(OutputError, match="bone_350hu.stl: it is a folder"):
+    with refused(OutputError, "bone_350hu.stl"):
         check_outputs(tmp_path / "bone.stl", None, ["200hu", "350hu"])
     (tmp_path / "bone.stl").mkdir()  # not a file of this job
     check_outputs(tmp_path / "bone.stl", tmp_path / "r.json", ["200hu", "400hu"])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from label_files import write_nrrd
+from printed_text import Printer
 from variants import daily_rows
 
 from clrecon import read_points
@@ -197,13 +198,11 @@ def test_the_range_of_hu_is_that_of_what_stays(report_of: Any) -> None:
     assert report["volume"]["hu_range"][0] == min(-100.0, report["volume"]["preprocess"][0]["outside_hu"])
 
 
-def test_a_cloud_and_a_picture_are_of_the_region(
-    device: Any, scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cloud_and_a_picture_are_of_the_region(device: Any, scan: Path, tmp_path: Path, printed: Printer) -> None:
     box = box_around(SMALL, 6.43)
     given = ["--device", str(device.index), "--region", box, "--json"]
     assert main(["cloud", str(scan), "-o", str(tmp_path / "c.ply"), *given]) == 0
-    assert json.loads(capsys.readouterr().out)["volume"]["region"]["rules"] == [str(parse_region_rules(box)[0])]
+    assert printed().report()["volume"]["region"]["rules"] == [str(parse_region_rules(box)[0])]
     points = np.asarray(read_points(str(tmp_path / "c.ply")).points)
     assert len(points) > 100
     assert np.abs(points - to_lps(SMALL)).max() < 6.43 + 0.8
@@ -212,7 +211,7 @@ def test_a_cloud_and_a_picture_are_of_the_region(
     for more in ([], ["--region", box], ["--region", box, "--preprocess", "erode:1"]):
         arguments = ["render", str(scan), "-o", str(tmp_path / "p.png"), *given[:2], *more, "--json", *picture]
         assert main(arguments) == 0
-        step = json.loads(capsys.readouterr().out)["pictures"][0]["pixel_mm"]  # pictures fit what is left
+        step = printed().report()["pictures"][0]["pixel_mm"]  # pictures fit what is left
         shares.append(np.isfinite(np.load(tmp_path / "d.npy")).sum() * step**2)
     assert shares[0] > 2 * shares[1] > 2.2 * shares[2] > 0
 

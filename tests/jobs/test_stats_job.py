@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from command_lines import check_refused
 from label_files import write_nifti
+from printed_text import Printer
 from scipy.special import ndtr
 
 from clrecon.cli.main import main
@@ -59,15 +60,15 @@ def test_table_json_and_csv_say_the_same(files: dict[str, str], tmp_path: Path, 
     assert "peak_memory_bytes" in report and report["volume"]["series"]["uid_hash"] is None
 
 
-def test_json_on_stdout_and_one_label(files: dict[str, str], capsys: Any) -> None:
+def test_json_on_stdout_and_one_label(files: dict[str, str], printed: Printer) -> None:
     assert main(["stats", files["ct"], "--labels", files["labels"], "--label", "5", "--json"]) == 0
-    (one,) = json.loads(capsys.readouterr().out)["labels"]
+    (one,) = printed().report()["labels"]
     assert one["number"] == 5
 
 
-def test_a_narrow_window_gets_two_tables(files: dict[str, str], capsys: Any) -> None:
+def test_a_narrow_window_gets_two_tables(files: dict[str, str], printed: Printer) -> None:
     assert main(["stats", files["ct"], "--labels", files["labels"], "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+    report = printed().report()
     wide, narrow = _lay_out(report, None), _lay_out(report, 60)
     assert len(wide) == 3 and max(map(len, wide)) > 60
     assert len(narrow) == 7 and max(map(len, narrow)) <= 60
@@ -99,11 +100,12 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
     check_refused(["stats", files["ct"], *given], code, words, tmp_path, capsys)
 
 
-def test_what_exists_stays_with_no_clobber(files: dict[str, str], tmp_path: Path, capsys: Any) -> None:
+def test_what_exists_stays_with_no_clobber(files: dict[str, str], tmp_path: Path, printed: Printer) -> None:
     (tmp_path / "a.csv").write_text("mine")
     given = ["stats", files["ct"], "--labels", files["labels"], "--csv", str(tmp_path / "a.csv")]
     assert main([*given, "--no-clobber"]) == 6
-    assert "a.csv" in capsys.readouterr().err and (tmp_path / "a.csv").read_text() == "mine"
+    printed().assert_error("a.csv")
+    assert (tmp_path / "a.csv").read_text() == "mine"
     assert main(given) == 0
     assert (tmp_path / "a.csv").read_text().startswith("number,name,voxels,ml")
 
@@ -125,14 +127,14 @@ def shells(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 def test_the_surface_of_each_label_has_the_area_volume_and_walls_of_the_bone(
-    shells: dict[str, str], tmp_path: Path, capsys: Any, device: Any
+    shells: dict[str, str], tmp_path: Path, printed: Printer, device: Any
 ) -> None:
     table = tmp_path / "walls.csv"
     given = ["stats", shells["ct"], "--labels", shells["labels"], "--device", str(device.index)]
     assert main([*given, "--surface", "hu", "--json"]) == 0
-    at_level = json.loads(capsys.readouterr().out)["labels"]
+    at_level = printed().report()["labels"]
     assert main([*given, "--surface", "cortex", "--csv", str(table)]) == 0
-    shown = capsys.readouterr().out
+    shown = printed()
     with table.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     for row, level, radius, thickness in zip(rows, at_level, (13.0, 9.0), (2.0, 3.0), strict=False):
@@ -143,4 +145,4 @@ def test_the_surface_of_each_label_has_the_area_volume_and_walls_of_the_bone(
         assert float(row["surface_thickness_p50_mm"]) == pytest.approx(thickness, abs=0.3)
         assert float(row["surface_fitted"]) > 0.9 and 0.0 < float(row["surface_error_p50_mm"]) < 0.2
     assert rows[2]["surface_ml"] == "" and at_level[2]["surface"]["ml"] is None
-    assert "moved onto the bone from 200 HU" in shown and "label_3  none  none" in shown
+    shown.assert_output(200, "label_3")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pydicom
 import pytest
+from printed_text import Printer
 
 from clrecon.cli.main import main
 from clrecon.labels import read_labels, resample_labels
@@ -165,15 +166,13 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_scan_that_is_not_dicom_has_no_segmentation(
-    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_scan_that_is_not_dicom_has_no_segmentation(written: Path, tmp_path: Path, printed: Printer) -> None:
     assert main(["vertebrae", str(written / "a.nii.gz"), "-o", str(tmp_path / "a.dcm")]) == 3
-    assert "NIfTI" in capsys.readouterr().err
+    printed().assert_error("NIfTI")
 
 
-def test_what_exists_stays_with_no_clobber(scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_exists_stays_with_no_clobber(scan: Path, tmp_path: Path, printed: Printer) -> None:
     (tmp_path / "a.png").write_text("mine")
     assert main(["vertebrae", str(scan), "-o", str(tmp_path / "a.nii.gz"), "--no-clobber"]) == 6
-    assert "a.png" in capsys.readouterr().err
+    printed().assert_error("a.png")
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]

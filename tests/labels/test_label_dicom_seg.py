@@ -8,6 +8,7 @@ import pydicom
 import pytest
 from label_files import ct_slices, write_seg
 from pydicom.uid import DeflatedExplicitVRLittleEndian, RLELossless
+from refusals import refused
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume
@@ -72,9 +73,7 @@ def test_a_large_segmentation_is_held_against_its_scan_before_it_is_unpacked(tmp
     monkeypatch.setattr("clrecon.labels.reader.LARGE_BYTES", frames * 54 - 1)
     assert read_labels(path, volume=fits).numbers == (1, 2)  # 270 voxels for 35
     monkeypatch.setattr("clrecon.labels.segmentation._FramePixels", None)
-    with pytest.raises(
-        RefusedInputError, match=r"a.dcm has 9 x 6 x 5 voxels, 9 times as many as the scan \(6 x 5 x 1\)"
-    ):
+    with refused(RefusedInputError, "a.dcm", 9, 6, 5):
         read_labels(path, volume=small)
     (tmp_path / "b.dcm").write_bytes(path.read_bytes()[:400])
     assert not is_large_map(tmp_path / "b.dcm")
@@ -99,13 +98,13 @@ def test_the_frames_of_a_tilted_gantry_form_a_sheared_stack(tmp_path):
 
 def test_overlapping_segments_are_refused_unless_one_is_chosen(tmp_path):
     path = write_seg(tmp_path / "a.dcm", masks(overlap=True), ct_slices(PLAN))
-    with pytest.raises(RefusedInputError, match=r"1 T12 and 2 L1 body share 8 voxels; choose labels .*\(label\)"):
+    with refused(RefusedInputError, "T12", "L1", 1, 2, 8):
         read_labels(path)
     first, second = (int(mask.sum()) for _, mask in masks(overlap=True))
     assert read_labels(path, ["t12"]).counts == {1: first}
     assert read_all_labels(path, ["t12"]).counts == {1: first, 2: second - 8}
     assert read_all_labels(path, [2]).counts == {1: first - 8, 2: second}
-    with pytest.raises(UsageError, match="label 'L9' is not in the label map; there are: 1 T12, 2 L1 body"):
+    with refused(UsageError, "L9", "T12", 1, 2):
         read_labels(path, ["L9"])
 
 
@@ -114,7 +113,7 @@ def test_labels_of_another_frame_of_reference_are_refused(tmp_path):
     volume = ct_volume(tmp_path)
     assert labels.frame_of_reference_hash == volume.report["frame_of_reference_hash"]
     volume.report = amend(volume.report, frame_of_reference_hash="0" * 16)
-    with pytest.raises(RefusedInputError, match="belongs to frame of reference"):
+    with refused(RefusedInputError, "frame", "reference"):
         resample_labels(labels, volume)
 
 
@@ -178,7 +177,7 @@ def test_deflated_files_are_refused_before_they_are_inflated(tmp_path):
     ds = pydicom.dcmread(path)
     ds.file_meta.TransferSyntaxUID = DeflatedExplicitVRLittleEndian
     ds.save_as(path)
-    with pytest.raises(RefusedInputError, match="transfer syntax 1.2.840.10008.1.2.1.99"):
+    with refused(RefusedInputError, "a.dcm", "1.2.840.10008.1.2.1.99"):
         read_labels(path)
 
 
@@ -187,7 +186,7 @@ def test_cut_anywhere_it_is_refused(tmp_path):
     content = write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN)).read_bytes()
     for length in range(0, len(content) - 2, 53):
         (tmp_path / "b.dcm").write_bytes(content[:length])
-        with pytest.raises(RefusedInputError, match="."):
+        with refused(RefusedInputError, "b.dcm"):
             read_labels(tmp_path / "b.dcm")
 
 
@@ -216,7 +215,7 @@ def test_an_element_twice_with_two_values_is_refused(tmp_path, keyword, value):
     head = dicom_series.element_bytes(keyword, b"")[:6]
     end = data.index(head) + 8 + int.from_bytes(data[data.index(head) + 6 : data.index(head) + 8], "little")
     (tmp_path / "a.dcm").write_bytes(data[:end] + dicom_series.element_bytes(keyword, value) + data[end:])
-    with pytest.raises(RefusedInputError, match=rf"a.dcm is a corrupt DICOM file: {keyword} .* is there twice"):
+    with refused(RefusedInputError, "a.dcm", "DICOM", keyword):
         read_labels(tmp_path / "a.dcm")
 
 
@@ -270,7 +269,7 @@ def test_a_background_of_its_own_is_no_label(tmp_path):
     spoil(path, PixelPaddingValue=9)
     assert np.array_equal(read_labels(path).voxels, before.voxels)
     edit_frames(path, lambda frames: [(np.where(px == 1, 0, px).astype(np.uint8), group) for px, group in frames])
-    with pytest.raises(RefusedInputError, match="numbers a segment 0 and its background 9"):
+    with refused(RefusedInputError, "segment", "background", 0, 9):
         read_labels(path)
 
 
@@ -288,5 +287,5 @@ def test_a_binary_segment_twice_at_one_place(tmp_path):
         if equal:
             assert np.array_equal(read_labels(path).voxels, before.voxels)
             continue
-        with pytest.raises(RefusedInputError, match="slice 1 of 5, and give segment 1 different voxels"):
+        with refused(RefusedInputError, "slice", "segment", 1, 5):
             read_labels(path)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import clrecon
 from clrecon import LabelMap
@@ -26,7 +27,7 @@ def test_voxels_of_labels_are_those_of_their_numbers() -> None:
     labels = label_map()
     assert np.argwhere(labels.voxels_of("L3")).tolist() == [[2, 3, 4]]
     assert np.argwhere(labels.voxels_of(["L4", 700])).tolist() == [[0, 1, 2], [2, 3, 4]]
-    with pytest.raises(UsageError, match="label 'L1' is not in the label map"):
+    with refused(UsageError, "L1", "label"):
         labels.voxels_of("L1")
 
 
@@ -48,7 +49,7 @@ def test_a_saved_map_is_read_as_it_was(affine: np.ndarray, name: str, tmp_path: 
     read = clrecon.read_labels(path)
     assert np.array_equal(read.voxels, labels.voxels) and read.names == labels.names
     np.testing.assert_allclose(read.affine, affine, atol=1e-5)  # NIfTI has places as float32
-    with pytest.raises(OutputError, match="exists"):
+    with refused(OutputError, "no_clobber=True"):
         labels.save(path, no_clobber=True)
     before = path.read_bytes()
     label_map(OBLIQUE).only(1).save(path)
@@ -78,7 +79,7 @@ def test_places_in_simpleitk_are_those_of_the_map() -> None:
         image.TransformIndexToPhysicalPoint((4, 3, 2)), (OBLIQUE @ [4.0, 3.0, 2.0, 1.0])[:3], atol=1e-12
     )
     for library in ("to_sitk", "to_pyvista"):
-        with pytest.raises(UsageError, match=r"sheared by \d+\.\d\d degrees: to_nibabel\(\) and save\(\) hold them"):
+        with refused(UsageError, "to_nibabel", "degrees"):
             getattr(label_map(SHEARED), library)()
 
 
@@ -103,9 +104,9 @@ def image_of(values: Any) -> Any:
 def test_whole_numbers_stored_as_real_ones_are_labels_and_others_are_not() -> None:
     assert LabelMap.from_nibabel(image_of(np.array([0.0, 2.0, 65_535.0]))).numbers == (2, 65_535)
     for wrong in ([0.0, 0.5, 1.0], [0.0, np.nan, 1.0], [0.0, 1.0, 1e20]):
-        with pytest.raises(UsageError, match="labels are whole numbers, these are float64"):
+        with refused(UsageError, "float64", "labels"):
             LabelMap.from_nibabel(image_of(np.array(wrong)))
-    with pytest.raises(UsageError, match="labels run from 0 to 65,535, these from -1 to 1"):
+    with refused(UsageError, 0, 65535, -1):
         LabelMap.from_nibabel(image_of(np.array([0.0, -1.0, 1.0])))
 
 
@@ -118,7 +119,7 @@ def test_a_map_on_the_grid_of_a_volume_is_what_resampling_says() -> None:
     assert repr(clrecon.resample_labels(labels, volume)) == "ResampledLabels((6, 4, 5), exact=False, 2 labels)"
     places = [(OBLIQUE @ [0.0, 0.0, k, 1.0])[:3] for k in (0.0, 1.0, 2.5)]
     uneven = clrecon.Volume(np.zeros((3, 4, 5), np.int16), OBLIQUE, slice_positions=places)
-    with pytest.raises(UsageError, match="the slices of the volume are uneven"):
+    with refused(UsageError, "slices", "volume", "clrecon.resample_labels"):
         labels.resample(uneven)
 
 
@@ -131,8 +132,8 @@ def test_an_array_takes_the_places_of_a_volume_or_of_another_map() -> None:
         assert np.array_equal(labels.affine, SHEARED) and labels.frame_of_reference_hash == "f"
     assert made.names == {1: "bone"} and again.names == {1: "label_1"}
     assert LabelMap(array, made, frame_of_reference_hash="g").frame_of_reference_hash == "g"
-    with pytest.raises(UsageError, match=r"the labels have shape \(3, 4, 5\), the grid they are to lie on \(2, 4, 5\)"):
+    with refused(UsageError, 3, 4, 5):
         LabelMap(array, volume[1:])
     uneven = clrecon.Volume(array, np.eye(4), slice_positions=[(0, 0, 0), (0, 0, 1), (0, 0, 3)])
-    with pytest.raises(UsageError, match="the slices of the volume are uneven, no label map has such"):
+    with refused(UsageError, "slices", "volume"):
         LabelMap(array, uneven)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pydicom import Dataset
+from refusals import refused
 
 from clrecon.errors import RefusedInputError
 from clrecon.labels.segmentation import place_frames
@@ -75,7 +76,7 @@ def test_a_frame_says_itself_what_all_say():
     own = frames(0.0, 5.0)  # the step that counts is that of the first frame
     own[1].PixelMeasuresSequence = holder("P", PixelSpacing=(0.75, 0.5), SpacingBetweenSlices=2.5).P
     assert place_frames(shared(), own, "a.dcm").slices == 2
-    with pytest.raises(ValueError, match="no PlaneOrientationSequence"):
+    with refused(ValueError, "PlaneOrientationSequence"):
         place_frames(None, own, "a.dcm")
 
 
@@ -94,13 +95,13 @@ def test_a_frame_may_lie_a_twentieth_of_a_mm_off(aside):
 def test_no_frame_lies_below_the_first_slice():
     """Steps of micrometres: the line through all positions begins a step above the lowest frame."""
     found = frames(0.005, 0.015, 0.019, 0.019, 0.025, 0.043)
-    with pytest.raises(RefusedInputError, match="do not lie evenly"):
+    with refused(RefusedInputError, "a.dcm", "evenly"):
         place_frames(shared(), found, "a.dcm")
 
 
 def test_more_than_a_hundred_thousand_slices_are_too_many():
     assert place_frames(shared(), frames(0.0, 0.5, 50_000.0), "a.dcm").slices == 100_001
-    with pytest.raises(RefusedInputError, match=r"a.dcm lie 0.5 mm apart over 50000.5 mm: too many slices"):
+    with refused(RefusedInputError, "a.dcm", 0.5, 50000.5):
         place_frames(shared(), frames(0.0, 0.5, 50_000.5), "a.dcm")
 
 
@@ -112,7 +113,7 @@ def test_frames_of_two_kinds_form_no_stack(what, values):
     found = frames(0.0, 2.0)
     name = "PixelSpacing" if what == "PixelMeasuresSequence" else "ImageOrientationPatient"
     setattr(found[1], what, holder("P", **{name: values}).P)
-    with pytest.raises(RefusedInputError, match="differ in direction or pixel spacing"):
+    with refused(RefusedInputError, "direction", "pixel", "a.dcm"):
         place_frames(shared(), found, "a.dcm")
     nearly = [1, 0, 0, 0, 1, 0.00005] if len(values) == 6 else [0.75, 0.50005]
     setattr(found[1], what, holder("P", **{name: nearly}).P)
@@ -129,7 +130,7 @@ def test_frames_of_two_kinds_form_no_stack(what, values):
     ],
 )
 def test_directions_have_length_one_and_a_right_angle(directions):
-    with pytest.raises(RefusedInputError, match="cannot be placed: direction"):
+    with refused(RefusedInputError, "direction", "a.dcm"):
         place_frames(shared(directions), frames(0.0, 2.0), "a.dcm")
     nearly = np.array(SQUARE) + 0.3 * (np.array(directions) - SQUARE)
     assert place_frames(shared(nearly), frames(0.0, 2.0), "a.dcm").slices == 2
@@ -137,7 +138,7 @@ def test_directions_have_length_one_and_a_right_angle(directions):
 
 @pytest.mark.parametrize("spacing", [(0.0, 0.5), (0.5, -0.5)])
 def test_spacing_is_above_zero(spacing):
-    with pytest.raises(RefusedInputError, match="cannot be placed: direction"):
+    with refused(RefusedInputError, "direction", "a.dcm"):
         place_frames(shared(spacing=spacing), frames(0.0, 2.0), "a.dcm")
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tolerances
 from label_files import OBLIQUE, RAS, TABLE, make_labels, write_nifti
+from refusals import refused
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.labels import read_labels
@@ -89,7 +90,7 @@ def test_metres_become_millimetres(tmp_path):
 def test_scaled_numbers_are_unscaled(tmp_path):
     path = write_nifti(tmp_path / "a.nii", make_labels())
     assert read_labels(forge(path, "slope", 2.0, 1.0)).numbers == (1, 5, 11)
-    with pytest.raises(RefusedInputError, match="is not a label map: slice 1 of 4 holds 2.5"):
+    with refused(RefusedInputError, 1, 4, 2.5):
         read_labels(forge(path, "slope", 0.5, 0.0))
 
 
@@ -118,11 +119,11 @@ def test_a_fourth_axis_of_one_is_no_axis(tmp_path):
 
 
 def test_without_a_position_it_is_refused(tmp_path):
-    with pytest.raises(RefusedInputError, match="does not say where it lies"):
+    with refused(RefusedInputError, "a.nii", "sform_code"):
         read_labels(write_nifti(tmp_path / "a.nii", make_labels(), sform=False))
-    with pytest.raises(RefusedInputError, match="cannot be placed: the affine is singular"):
+    with refused(RefusedInputError, "affine", "b.nii"):
         read_labels(forge(write_nifti(tmp_path / "b.nii", make_labels()), "sform", *[0] * 12))
-    with pytest.raises(RefusedInputError, match="cannot be placed: the affine holds NaN"):
+    with refused(RefusedInputError, "NaN", "affine"):
         read_labels(forge(write_nifti(tmp_path / "c.nii", make_labels()), "sform", *[np.nan] * 12))
 
 
@@ -199,14 +200,14 @@ def test_header_and_voxels_in_two_files_are_read(tmp_path):
     assert np.array_equal(labels.voxels, voxels)
     assert np.abs(labels.affine - OBLIQUE).max() <= tolerances.NIFTI_AFFINE_MM
     (tmp_path / "a.img").unlink()
-    with pytest.raises(RefusedInputError, match="its voxels are in 'a.img', which is not there"):
+    with refused(RefusedInputError, "a.img", "voxels"):
         read_labels(tmp_path / "a.hdr")
 
 
 def test_without_nibabel_the_command_is_named(tmp_path, monkeypatch):
     path = write_nifti(tmp_path / "a.nii", make_labels())
     monkeypatch.setitem(__import__("sys").modules, "nibabel", None)
-    with pytest.raises(UsageError, match=r"needs the package nibabel: .* install .*nibabel$"):
+    with refused(UsageError, "package"):
         read_labels(path)
 
 
@@ -275,5 +276,5 @@ def test_a_qform_that_is_corrupt_is_said_beside_a_sform(tmp_path):
     assert np.array_equal(labels.affine, before.affine)
     (said,) = labels.warnings
     assert said == "its qform cannot be read (qfac (pixdim[0]) should be 1 or -1): the sform is used"
-    with pytest.raises(RefusedInputError, match=r"corrupt NIfTI header: qfac \(pixdim\[0\]\) should be 1 or -1"):
+    with refused(RefusedInputError, "NIfTI", 0, 1, -1):
         read_labels(forge(path, "sform_code", 0))

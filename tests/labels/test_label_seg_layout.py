@@ -12,6 +12,7 @@ from pydicom.datadict import tag_for_keyword
 from pydicom.dataset import FileMetaDataset
 from pydicom.encaps import encapsulate
 from pydicom.uid import ExplicitVRLittleEndian, RLELossless
+from refusals import refused
 
 from clrecon.errors import RefusedInputError
 from clrecon.labels import segmentation
@@ -43,7 +44,7 @@ def header(kind="LABELMAP", bits=8, syntax=ExplicitVRLittleEndian, **values):
 def test_a_file_holds_at_least_its_pixels(kind, bits, syntax, least):
     data_set = header(kind, bits, syntax, NumberOfFrames=3)
     assert _read_layout(data_set, "a.dcm", least) == _Layout(kind, 10, 10, 3, bits)
-    with pytest.raises(RefusedInputError, match="cannot come from a file of"):
+    with refused(RefusedInputError, "a.dcm", 10):
         _read_layout(data_set, "a.dcm", least - 1)
 
 
@@ -53,13 +54,13 @@ def test_one_frame_unless_it_is_said():
 
 @pytest.mark.parametrize(("kind", "bits"), [("BINARY", 16), ("LABELMAP", 1), ("LABELMAP", 32)])
 def test_bits_are_those_of_the_kind(kind, bits):
-    with pytest.raises(RefusedInputError, match=f"is corrupt: 1 frames of {bits} bits a pixel"):
+    with refused(RefusedInputError, 1, bits):
         _read_layout(header(kind, bits), "a.dcm", 1000)
 
 
 @pytest.mark.parametrize("frames", [0, 1_000_001])
 def test_frames_are_counted_from_one_to_a_million(frames):
-    with pytest.raises(RefusedInputError, match=f"is corrupt: {frames} frames"):
+    with refused(RefusedInputError, frames):
         _read_layout(header(NumberOfFrames=frames), "a.dcm", 1000)
     assert _read_layout(header(NumberOfFrames=1_000_000), "a.dcm", 10**8).frames == 1_000_000
 
@@ -70,7 +71,7 @@ def test_pixels_fill_their_bytes_to_the_last_bit():
     layout = _Layout("BINARY", 3, 3, 3, 1)
     pixels = _FramePixels(header("BINARY", 1, PixelData=data), layout, "a.dcm")
     assert [pixels.read(frame).ravel().tolist() for frame in range(3)] == [[1] * 9, [1] + [0] * 8, [0] * 8 + [1]]
-    with pytest.raises(RefusedInputError, match="is cut: 3 frames of 3 x 3 do not fit 3 bytes"):
+    with refused(RefusedInputError, 3, "frames"):
         _FramePixels(header("BINARY", 1, PixelData=data[:3]), layout, "a.dcm")
 
 
@@ -127,7 +128,7 @@ PLACES = [
 )
 def test_what_places_and_names_segments_occurs_once(keywords):
     _check_elements(nested(*keywords, twice=False), "a.dcm", implicit=False)
-    with pytest.raises(RefusedInputError, match=rf"a.dcm is a corrupt DICOM file: .*{keywords[-1]} .*is there twice"):
+    with refused(RefusedInputError, "a.dcm", "DICOM", keywords[-1]):
         _check_elements(nested(*keywords, twice=True), "a.dcm", implicit=False)
 
 

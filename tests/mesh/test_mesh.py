@@ -7,6 +7,7 @@ import gc
 import numpy as np
 import pytest
 import sample_meshes as samples
+from refusals import refused
 
 from clrecon import PointCloud, Volume, read_mesh, read_points
 from clrecon.errors import UsageError
@@ -51,12 +52,12 @@ def test_wrong_arrays_are_refused(arguments, words):
 
 def test_check_finds_what_the_constructor_does_not_look_at():
     corners = np.eye(3)
-    with pytest.raises(UsageError, match="refers to vertex 7, the mesh has 3 vertices"):
+    with refused(UsageError, "vertex", 7, 3):
         Mesh(corners, [[0, 1, 7]]).check()
     corners[1, 2] = np.nan
-    with pytest.raises(UsageError, match="vertex 1 is not finite"):
+    with refused(UsageError, 1, "vertex"):
         Mesh(corners, [[0, 1, 2]]).check()
-    with pytest.raises(UsageError, match="normal 1 is not finite"):
+    with refused(UsageError, 1, "normal"):
         Mesh(np.eye(3), [[0, 1, 2]], corners).to_pyvista()
 
 
@@ -69,7 +70,7 @@ def test_ras_is_a_half_turn():
     assert not np.signbit(turned[turned == 0]).any()
     assert Mesh(turned, triangles).quality()["volume_ml"] == pytest.approx(mesh.quality()["volume_ml"])
     assert mesh.in_space("lps")[0] is mesh.vertices
-    with pytest.raises(UsageError, match="unknown space 'RAI'"):
+    with refused(UsageError, "RAI", "space"):
         mesh.in_space("RAI")
 
 
@@ -103,7 +104,7 @@ def test_contents_of_a_file_have_name_and_colour_of_a_part():
 
 def test_what_is_empty_still_has_three_columns():
     assert Mesh([], []).vertices.shape == Mesh(np.zeros((0, 3)), []).vertices.shape == (0, 3)
-    with pytest.raises(UsageError, match=r"shape \(n, 3\), these have \(0, 2\)"):
+    with refused(UsageError, 3, 0, 2):
         Mesh(np.zeros((0, 2)), [])
 
 
@@ -189,7 +190,7 @@ def test_merged_meshes_keep_their_arrays_and_numbers_and_the_shortest_voxel():
     assert one.values.keys() == {"HU"} and len(one.split()) == 1 and len(both.split()) == 3
     turned = Mesh(one.vertices, one.triangles, np.tile([0.0, 0.0, 1.0], (8, 1)))
     assert turned.merge(turned).normals.shape == (16, 3) and turned.merge(one).normals is None
-    with pytest.raises(UsageError, match=r"merge takes meshes, not list: of a list mesh.merge\(\*others\)"):
+    with refused(UsageError, "mesh.merge", "meshes"):
         one.merge([other])
 
 
@@ -214,9 +215,9 @@ def test_the_values_of_a_volume_are_sampled_at_vertices_and_points_and_kept_by_f
     again = read_points(tmp_path / "a.npz")
     assert again.hu.tolist() == made.values["HU"].tolist() and again.labels.tolist() == list(range(8))
     for asked in (mesh, cloud):
-        with pytest.raises(UsageError, match="volume must be a Volume"):
+        with refused(UsageError, "Volume", "volume"):
             asked.sample(mesh)
-    with pytest.raises(UsageError, match="values have names of letters, digits and _"):
+    with refused(UsageError, "_", "names"):
         mesh.sample(volume, "mean HU")
 
 
@@ -244,5 +245,5 @@ def test_numbers_at_faces_go_with_the_mesh_and_its_files(tmp_path):
         assert back.values["HU"].tolist() == list(range(16))
         assert back.values.keys() == {"HU"} and back.face_values.keys() == {"stress"}
     mesh.face_values["stress"] = np.zeros(16)
-    with pytest.raises(UsageError, match=r"face_values\['stress'\] are .* one number a triangle is needed, \(24,\)"):
+    with refused(UsageError, "face_values", "stress", 24):
         mesh.save(tmp_path / "b.vtp")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon import Mesh, decimate_mesh
 from clrecon.errors import NoSurfaceError, UsageError
@@ -41,7 +42,7 @@ def test_the_length_of_a_normal_or_direction_is_of_no_matter(length: float) -> N
 def test_an_open_cut_lacks_its_cap_alone() -> None:
     part = box().clip((0, 0, 1), (0, 0, -1), capped=False)
     assert part.area == pytest.approx(2.0 + 6.0) and part.quality().boundary_edges == 8
-    with pytest.raises(UsageError, match="the mesh is open, so that its cut cannot be filled: capped=False leaves it"):
+    with refused(UsageError, "capped=False", "mesh"):
         part.clip((0, 1, 0), (0, 1, 0))
     assert part.clip((0, 1, 0), (0, 1, 0), capped=False).area == pytest.approx(4.0)
 
@@ -61,7 +62,7 @@ def test_numbers_at_faces_follow_a_cut_and_a_cap_has_none() -> None:
 
 def test_planes_beside_a_mesh_leave_it_or_are_refused() -> None:
     assert box().clip((0, 0, -3), (0, 0, 1)).volume == pytest.approx(8.0)
-    with pytest.raises(NoSurfaceError, match="nothing of the mesh lies on that side of the plane: it ends 3 mm off"):
+    with refused(NoSurfaceError, 3, "mesh"):
         box().clip((0, 0, 7), (0, 0, 1))
     assert box().section((0, 0, 7), (0, 0, 1)) == []
 

@@ -6,6 +6,7 @@ import os
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import DeviceError
 from clrecon.opencl import cache, program, quirks
@@ -131,5 +132,5 @@ def test_a_binary_that_the_driver_refuses_is_built_from_source(keeper, monkeypat
 def test_a_program_without_kernels_is_an_error(keeper, monkeypatch):
     monkeypatch.setattr(program.Program, "kernel_names", [])
     monkeypatch.setattr(keeper, "programs", {})
-    with pytest.raises(DeviceError, match="has no kernel"):
+    with refused(DeviceError, "kernel", "compact.cl"):
         load_program(keeper, "primitives/compact.cl")

@@ -1,6 +1,7 @@
 """Options that a user adds to the build of kernels."""
 
 import pytest
+from refusals import refused
 
 from clrecon.errors import DeviceError
 from clrecon.opencl.device import Device
@@ -22,7 +23,5 @@ def test_the_users_options_are_in_every_build(device: Device, monkeypatch: pytes
 def test_an_option_that_the_driver_does_not_know_is_named(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CLRECON_BUILD_OPTIONS", "-no-such-option")
     own = Device(device.index, device.cl_device.platform, device.cl_device)
-    with pytest.raises(
-        DeviceError, match=r"scan\.cl does not build on .* with CLRECON_BUILD_OPTIONS=-no-such-option: "
-    ):
+    with refused(DeviceError, "scan.cl", "CLRECON_BUILD_OPTIONS=-no-such-option"):
         load_program(own, "primitives/scan.cl", own.kernel_variants)

@@ -8,6 +8,7 @@ import warnings
 
 import numpy as np
 import pytest
+from refusals import refused
 from variants import VOXEL_TYPES, daily
 
 from clrecon.opencl import allocate, download, kernel_files, launch, load_program, read_kernel_source, upload
@@ -70,7 +71,7 @@ def test_a_trace_refuses_to_write_what_is_for_reading_alone(device, monkeypatch)
     monkeypatch.setattr(device, "trace", lambda doing: None)
     launch(device, scan_program(device)["sum_blocks"], device.group_size, **buffers)
     buffers["block_sums"] = upload(device, np.zeros(1, np.uint32))
-    with pytest.raises(TypeError, match="sum_blocks writes block_sums, whose buffer is for reading alone"):
+    with refused(TypeError, "sum_blocks", "block_sums"):
         launch(device, scan_program(device)["sum_blocks"], device.group_size, **buffers)
 
 
@@ -84,7 +85,7 @@ def test_numbers_become_what_the_kernel_takes(device):
     assert ordered[3].tolist() == [1, 2.5, 3, 0]
     assert ordered[4:] == (7, 9)
     assert {type(value) for value in ordered[4:]} == {np.uint32}
-    with pytest.raises(TypeError, match="centre is float4, not"):
+    with refused(TypeError, "float4"):
         kernel.order({**buffers, "centre": [1, 2, 3], "triangle_count": 7, "triangles_per_sum": 9})
 
 

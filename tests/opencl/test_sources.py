@@ -6,6 +6,7 @@ import re
 import shutil
 
 import pytest
+from refusals import refused
 
 from clrecon.errors import DeviceError
 from clrecon.opencl import kernel_files, load_program, read_kernel_source, sources
@@ -69,7 +70,7 @@ def test_every_voxel_type_builds(voxel, device):
 def test_a_compiler_error_names_the_true_file_and_line(device, monkeypatch):
     text = '#line 1 "cl/theme/file.cl"\n__kernel void broken(__global int *a)\n{\n    a[0] = missing_name;\n}\n'
     monkeypatch.setattr("clrecon.opencl.program.read_kernel_source", lambda name: text)
-    with pytest.raises(DeviceError, match=r"theme/file.cl does not build on") as caught:
+    with refused(DeviceError, "file.cl") as caught:
         load_program(device, "theme/file.cl")
     log = str(caught.value) + str(caught.value.__cause__)
     assert "missing_name" in log
@@ -83,12 +84,12 @@ def test_row_52_a_missing_kernel_file_is_a_damaged_installation(missing, tmp_pat
     (root / missing).unlink()
     monkeypatch.setattr(sources, "kernel_root", lambda: root)
     name = missing if missing.endswith(".cl") else "surface/marching_cubes.cl"
-    with pytest.raises(DeviceError, match=f"without its kernel file cl/{missing}: its installation is damaged"):
+    with refused(DeviceError, missing):
         sources.read_kernel_source.__wrapped__(name)
 
 
 def test_row_52_an_installation_without_kernels_is_damaged(tmp_path, monkeypatch):
     monkeypatch.setattr(sources.resources, "files", lambda name: tmp_path)
-    with pytest.raises(DeviceError, match=r"without its kernels.*install it again") as caught:
+    with refused(DeviceError, "volume.h", "kernels") as caught:
         sources.kernel_root.__wrapped__()
     assert caught.value.exit_code == 5

@@ -7,6 +7,7 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+from refusals import refused
 
 from clrecon.errors import DeviceError
 from clrecon.opencl import pocl
@@ -85,7 +86,7 @@ def test_the_name_behind_the_target_is_replaced_and_nothing_else():
 )  # fmt: skip
 def test_what_is_not_exactly_so_is_left_alone(texts):
     made = Structure(*texts)
-    with pytest.raises(LookupError, match="names of CPUs were found"):
+    with refused(LookupError, "CPUs", "names"):
         NameOfCpu(made.address)
     assert made.texts == texts
 
@@ -144,7 +145,7 @@ def test_a_device_names_its_cpu_when_it_is_opened_and_not_before(device, monkeyp
     assert found.context is None
     assert [f"-DCPU_NAME={name}" for name in opened] == [option]
     made.strings[1].value = b"znver5"
-    with pytest.raises(DeviceError, match="cannot be opened: the name of the CPU has changed"):
+    with refused(DeviceError, "CPU"):
         _ = found.context
 
 

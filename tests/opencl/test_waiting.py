@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import DeviceFailedError, DeviceLostError, DeviceMemoryError, DeviceTimeoutError
 from clrecon.opencl import Stopwatch, allocate, download, launch, load_program, settle, upload, wait
@@ -116,7 +117,7 @@ def test_row_56_a_device_without_progress_is_an_error_that_names_the_kernel(devi
     ended, hung, after = Event(0), Event(), Event()
     for number, event in enumerate((ended, hung, after)):
         device.commands.add(f"kernel {number}", event, QUEUE)
-    with time_limit(0.2), pytest.raises(DeviceTimeoutError, match="kernel 1 has not ended on .* for 0.2 s") as caught:
+    with time_limit(0.2), refused(DeviceTimeoutError, 1, 0.2) as caught:
         wait(device)
     assert caught.value.exit_code == 5
     assert "(0: none)" in str(caught.value)
@@ -163,7 +164,7 @@ def test_a_driver_that_refuses_to_wait_is_an_error(device, monkeypatch):
     cl, event = import_pyopencl(), Event()
     monkeypatch.setattr(event, "wait", lambda: _refuse(cl))
     device.commands.add("kernel one", event, QUEUE)
-    with pytest.raises(DeviceFailedError, match="kernel one failed on .*refused"):
+    with refused(DeviceFailedError, "one", "refused"):
         wait(device)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 from slab_surfaces import assert_same
 
 import clrecon
@@ -57,7 +58,7 @@ def test_auto_is_the_measured_level_and_the_report_says_why(name: str, volume: c
 
 def test_where_nothing_can_be_measured_auto_says_so_and_no_other_word_is_a_level(device: Any) -> None:
     flat = clrecon.Volume(np.full((8, 8, 8), 40, np.int16), np.eye(4))
-    with pytest.raises(NoSurfaceError, match="no bone found to choose"):
+    with refused(NoSurfaceError, "bone", 40, 8):
         clrecon.extract_isosurface(flat, "auto", device=device)
-    with pytest.raises(UsageError, match="the iso value is 'bone'"):
+    with refused(UsageError, "bone"):
         clrecon.extract_isosurface(flat, "bone", device=device)  # type: ignore[arg-type]

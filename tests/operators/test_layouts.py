@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 from uneven_volume import HEIGHTS, SIDEWAYS, uneven
 
 from clrecon.errors import DeviceMemoryError, UsageError
@@ -278,7 +279,7 @@ def test_voxels_of_a_box_of_more_than_2_to_the_31_are_told_apart():
     order, ordered = _order_voxels(ijk[::-1])
     assert order is not None
     assert (order.tolist(), ordered.tolist()) == ([2, 1, 0], ijk.tolist())
-    with pytest.raises(UsageError, match="1 of 4 points have the voxel of another"):
+    with refused(UsageError, "points", 1, 4):
         _order_voxels(ijk[[0, 1, 2, 1]])
 
 
@@ -325,5 +326,5 @@ def test_slabs_of_a_field_are_as_thick_as_there_is_room(room, ends, monkeypatch)
     assert [(slab.first, slab.end) for slab in slabs] == list(zip([0, *ends[:-1]], ends, strict=True))
     assert [(slab.first_brick, slab.end_brick) for slab in slabs] == [(16 * s.first, 16 * s.end) for s in slabs]
     planned.limits = 0
-    with pytest.raises(DeviceMemoryError, match="no surface can be made of the cloud: much"):
+    with refused(DeviceMemoryError, "surface", "cloud"):
         NodeField._plan_slabs(planned)

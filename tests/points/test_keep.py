@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.points import PointCloud
@@ -121,7 +122,7 @@ def test_any_negative_label_is_noise() -> None:
     ["", "biggest", "largest:0", "largest:1.5", "largest:", "min", "min:-3", "seed:1,2", "seed:a,b,c", "no-sheets:3"],
 )  # fmt: skip
 def test_bad_rules_are_refused(rule: str) -> None:
-    with pytest.raises(UsageError, match="the rules are largest, largest:N, min:POINTS, seed:X,Y,Z and no-sheets"):
+    with refused(UsageError, "POINTS", "rules"):
         keep_clusters(a_cloud(), rule)
 
 

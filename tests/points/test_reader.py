@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 from sample_meshes import LongTable
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
@@ -89,14 +90,14 @@ def test_npz_of_other_programs(tmp_path):
 
 def test_pickled_arrays_are_refused(tmp_path):
     np.savez(tmp_path / "a.npz", points=np.array([{"a": 1}, 2, 3], dtype=object))
-    with pytest.raises(RefusedInputError, match="is no array of its size"):
+    with refused(RefusedInputError, "array", "size", "a.npz"):
         read_points(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("points", [np.zeros((2, 4)), np.zeros(3), np.zeros((2, 3), complex), np.zeros((2, 3), bool)])
 def test_arrays_that_are_no_points_are_refused(points, tmp_path):
     np.savez(tmp_path / "a.npz", points=points)
-    with pytest.raises(RefusedInputError, match=r"^a.npz has points of shape \(.*\) and type .*: \(n, 3\) is needed$"):
+    with refused(RefusedInputError, "a.npz", 3):
         read_points(tmp_path / "a.npz")
 
 
@@ -142,9 +143,9 @@ def test_the_frame_of_a_file(tmp_path):
     assert read_points(bare, space="ras").points.tolist() == [[-1, -2, 3]]
     assert read_points(bare, space="RAS").report["file"]["space_from"] == "argument"
     np.testing.assert_array_equal(read_points(tmp_path / "ras.ply", space="ras").points, POINTS)
-    with pytest.raises(UsageError, match="says that its coordinates are RAS, LPS was asked for: leave the space out"):
+    with refused(UsageError, "RAS", "LPS"):
         read_points(tmp_path / "ras.ply", space="lps")
-    with pytest.raises(UsageError, match="unknown space"):
+    with refused(UsageError, "space", "scanner"):
         read_points(bare, space="scanner")
     odd = read_points(write(tmp_path / "odd.xyz", "# SPACE=MNI\n1 2 3\n"))
     assert odd.report["file"]["warnings"] == ["odd.xyz names the frame 'MNI', which is not known"]
@@ -251,7 +252,7 @@ def test_a_binary_ply_is_read_to_its_last_byte_and_refused_without_it(tmp_path):
     rows = np.arange(9, dtype="<f4")
     content = ply(f"element vertex 3\n{AXES}", "binary_little_endian").encode() + rows.tobytes()
     assert np.array_equal(read_points(write(tmp_path / "a.ply", content)).points, rows.reshape(3, 3))
-    with pytest.raises(RefusedInputError, match="3 vertices of 12 bytes or more cannot come from 35 bytes"):
+    with refused(RefusedInputError, 3, 12, 35):
         read_points(write(tmp_path / "b.ply", content[:-1]))
 
 
@@ -268,7 +269,7 @@ def test_a_byte_order_mark_costs_no_point(tmp_path, line):
 def test_a_first_point_that_holds_words_is_refused(tmp_path, line, wrong):
     file = tmp_path / "a.xyz"
     file.write_text(f"# made by hand\n{line}\n4 5 6\n7 8 9\n")
-    with pytest.raises(RefusedInputError, match=f"a.xyz has '{wrong}' in place of a number in line 2"):
+    with refused(RefusedInputError, "a.xyz", wrong, 2):
         read_points(file)
 
 
@@ -300,7 +301,7 @@ def test_a_unit_is_doubted_by_the_longest_side(side, unit, tmp_path):
 
 
 def test_more_points_than_a_number_of_32_bits_can_tell_are_refused():
-    with pytest.raises(RefusedInputError, match="^a.npz has 2,147,483,648 points: 1 to 2,147,483,647 are read$"):
+    with refused(RefusedInputError, "a.npz", 2147483648, 1, 2147483647):
         _check_points(LongTable(2**31), "a.npz")
 
 

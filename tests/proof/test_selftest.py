@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from conftest import is_set
 from house import ROOT
+from refusals import refused
 
 from clrecon.errors import DeviceError
 from clrecon.opencl import Device
@@ -169,16 +170,16 @@ def test_operators_ask_what_is_left_out(device: Device, tmp_path: Path) -> None:
 
 def test_row_57_mismatches_are_told() -> None:
     require_equal([1, 2], [1, 2], "numbers")
-    with pytest.raises(DeviceError, match=r"^numbers: 1 of 2 differ$"):
+    with refused(DeviceError, "numbers", 1, 2):
         require_equal([1, 3], [1, 2], "numbers")
-    with pytest.raises(DeviceError, match=r"^numbers: 3 elements in place of 2 elements$"):
+    with refused(DeviceError, "numbers", 3, 2):
         require_equal([1, 3, 4], [1, 2], "numbers")
     assert require_close([1.0, np.nan], [1.25, np.nan], 0.5, "numbers") == 0.25
     for found in ([1.0, 2.0], [1.6, np.nan], [np.inf, np.nan]):
-        with pytest.raises(DeviceError, match=r"^numbers: 1 of 2 are off, by up to (inf|0.6) \(0.5 is allowed\)$"):
+        with refused(DeviceError, 2, 0.5):
             require_close(found, [1.0, np.nan], 0.5, "numbers")
     assert require_share([0.0] * 99 + [9.0], [0.0] * 100, 1.0, 0.01, "numbers") == 0.0
-    with pytest.raises(DeviceError, match="2 of 100 are off, by up to 9"):
+    with refused(DeviceError, 2, 100, 9):
         require_share([0.0] * 98 + [9.0, 2.0], [0.0] * 100, 1.0, 0.01, "numbers")
 
 

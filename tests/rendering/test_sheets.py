@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.rendering.pictures.picture import encode_image
@@ -58,5 +59,5 @@ def test_letters_and_captions_are_drawn() -> None:
 
 @pytest.mark.parametrize("rows", [[], [[]], [[panel(), Panel(np.zeros((50, 50), np.float32), 0.5)]]])
 def test_panels_of_different_size_are_refused(rows: list[list[Panel]]) -> None:
-    with pytest.raises(UsageError, match="a sheet needs panels of one size"):
+    with refused(UsageError, "sheet", "size"):
         draw_sheet(rows)

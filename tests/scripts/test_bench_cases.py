@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tolerances
 from bench_harness import FOLDER
+from refusals import refused
 
 from clrecon.errors import UsageError
 
@@ -68,7 +69,7 @@ def test_made_up_inputs_are_made_once(tmp_path: Path) -> None:
     volume = given.volume()
     assert (volume.shape_ijk, volume.voxels.dtype) == ((24, 24, 24), np.int16)
     assert sorted(path.name for path in (tmp_path / "work").iterdir()) == sorted([voxels.name, affine.name])
-    with pytest.raises(UsageError, match="no CT series"):
+    with refused(UsageError, "CT", "series"):
         given.ct_folder()
 
 
@@ -141,9 +142,9 @@ def test_costs_see_pages_and_cores() -> None:
 def test_a_program_that_fails_or_hangs_is_an_error() -> None:
     import sys
 
-    with pytest.raises(RuntimeError, match=r"exited with 3: oh no"):
+    with refused(RuntimeError, 3):
         measure.run_program([sys.executable, "-c", "import sys; sys.stderr.write('oh no'); sys.exit(3)"])
-    with pytest.raises(RuntimeError, match="more than 0.2 s"):
+    with refused(RuntimeError, 0.2):
         measure.run_program([sys.executable, "-c", "import time; time.sleep(60)"], timeout_s=0.2)
 
 
@@ -238,7 +239,7 @@ def test_a_peer_that_dies_is_an_error(tmp_path: Path) -> None:
     from peers.vtk_gpu import GpuPeer
 
     volume = inputs.parse_input("cube8", tmp_path).volume()
-    with pytest.raises(RuntimeError, match="(?s)its process died: .*allow_pickle"):
+    with refused(RuntimeError, "allow_pickle"):
         GpuPeer(np.array([None]), raycast.make_shots(volume)[0].scene(volume))
 
 

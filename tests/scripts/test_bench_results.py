@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from bench_harness import POCL, make_result, make_scaling_result, spread_of
+from printed_text import Printer
 
 import bench  # isort: skip
 import compare  # isort: skip
@@ -122,11 +123,11 @@ def test_seconds_are_short() -> None:
 
 
 @pytest.mark.release
-def test_plots_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plots_are_drawn(tmp_path: Path, printed: Printer) -> None:
     matplotlib_image = pytest.importorskip("matplotlib.image")
     folder = keep(tmp_path / "a", make_result(), make_result(given="b", ratio=0.5), make_scaling_result())
     assert bench.main(["plot", str(folder), "-o", str(tmp_path / "r.png")]) == 0
-    assert "r.png: 3 ratios" in capsys.readouterr().out
+    printed().assert_output("r.png", 3)
     drawn = sorted(path.name for path in tmp_path.glob("*.png"))
     assert drawn == ["r-scaling-spine149-pocl-3.1-debian.png", "r.png"]
     for name in drawn:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import pytest
 from house import ROOT
+from refusals import refused
 
 import make_constants_table  # isort: skip
 import marked_tables  # isort: skip
@@ -49,5 +49,5 @@ def test_what_is_said_to_follow_is_there_in_its_unit_and_shown_by_a_test() -> No
 def test_a_module_that_nothing_is_said_of_is_found(tmp_path: Path) -> None:
     (tmp_path / "anatomy").mkdir()
     (tmp_path / "anatomy" / "new.py").write_text("A_MM = 1\n", encoding="utf-8")
-    with pytest.raises(KeyError, match=r"anatomy/new\.py"):
+    with refused(KeyError, "new.py"):
         make_constants_table.make_table(tmp_path)

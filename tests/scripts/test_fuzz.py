@@ -224,12 +224,12 @@ def test_files_that_are_left(code, name) -> None:
     commands.check_files(0, [Path("out.stl")])
 
 
-def test_a_fault_is_the_exit_status(tmp_path, monkeypatch, capsys) -> None:
+def test_a_fault_is_the_exit_status(tmp_path, monkeypatch, printed) -> None:
     campaign = Campaign()
     campaign.add(Case("values", 3), Outcome("silent", "a value", "slice 1"))
     monkeypatch.setattr(fuzz, "run_campaign", lambda *args, **kwargs: campaign)
     assert fuzz.main(["--seconds", "1", "--json", str(tmp_path / "found.json")]) == 1
-    assert "silent values:3 (a value)" in capsys.readouterr().out
+    printed().assert_output(3)
     assert json.loads((tmp_path / "found.json").read_text())["faults"][0]["case"] == "values:3"
     monkeypatch.setattr(fuzz, "run_campaign", lambda *args, **kwargs: Campaign())
     assert fuzz.main([]) == 0

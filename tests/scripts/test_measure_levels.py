@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.cli.mesh import WHAT_BONE_COSTS
 
@@ -73,5 +74,5 @@ def test_a_mesh_is_met_where_it_crosses_the_true_normals() -> None:
 def test_tables_need_their_markers() -> None:
     text = "a\n<!-- x: made by me -->\nold\n<!-- end of x -->\nb"
     assert marked_tables.find_table(marked_tables.put_table(text, "x", "new"), "x") == "new"
-    with pytest.raises(ValueError, match="0 tables are marked 'y'"):
+    with refused(ValueError, 0, "tables"):
         marked_tables.put_table(text, "y", "new")

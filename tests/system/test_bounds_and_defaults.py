@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import OutputError, RefusedInputError, UsageError
 from clrecon.system import arguments, files, foreign_words, memory, progress
@@ -91,7 +92,7 @@ def test_a_file_may_fill_the_disk_to_its_last_byte(tmp_path: Path, monkeypatch: 
     free = 5 * 10**11
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(total=10**12, free=free))
     files.check_writable(tmp_path / "a.ply", expected_bytes=free)
-    with pytest.raises(OutputError, match=r"it needs about 1000000\.0 MB and 500000\.0 MB are free"):
+    with refused(OutputError, "MB", 500000.0):
         files.check_writable(tmp_path / "a.ply", expected_bytes=2 * free)
 
 
@@ -120,7 +121,7 @@ def test_an_extension_that_is_wrong_is_named(name: str, words: str) -> None:
 def test_a_file_of_the_largest_size_is_read(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"1234")
     assert read_regular(tmp_path / "a", 4) == b"1234"
-    with pytest.raises(OSError, match="larger than 3 bytes"):
+    with refused(OSError, "bytes", 3):
         read_regular(tmp_path / "a", 3)
 
 
@@ -134,7 +135,7 @@ def test_warnings_of_libraries_are_left_out_by_default() -> None:
 
 def test_a_missing_package_is_named_as_it_is_installed() -> None:
     for package, name in ((None, "no_such_module"), ("other-name", "other-name")):
-        with pytest.raises(UsageError, match=f"a table needs the package {name}: .*install.* {name}$"):
+        with refused(UsageError, name):
             import_package("no_such_module", "a table", package)
 
 
@@ -181,7 +182,7 @@ class Few:
 
 def test_fields_are_taken_by_place_and_by_name() -> None:
     assert Few(1) == Few(1, 2, []) == Few(1, second=2) == Few(first=1)
-    with pytest.raises(TypeError, match=r"Few\(\): too many positional arguments"):
+    with refused(TypeError, "Few", "arguments"):
         Few(1, 2, [], 4)  # type: ignore[call-arg]
-    with pytest.raises(TypeError, match=r"Few\(\): multiple values for argument 'first'"):
+    with refused(TypeError, "Few"):
         Few(1, first=1)  # type: ignore[misc]

@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import clrecon
 from clrecon.anatomy.iso_choice import half_iso_value
@@ -225,7 +226,7 @@ def test_a_file_that_went_on_the_way_is_said(file):
 def test_a_file_that_was_changed_on_the_way_is_said(file, values):
     sent = pickle.dumps(Volume(np.load(file, mmap_mode="r"), AFFINE))
     np.save(file, values)
-    with pytest.raises(RefusedInputError, match=r"voxels.npy, which has changed since then"):
+    with refused(RefusedInputError, "voxels.npy"):
         pickle.loads(sent)
 
 

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from contract_tables import names_in
 from label_files import write_nrrd
+from printed_text import Printer
+from refusals import refused
 
 import clrecon
 from clrecon.cli.main import main
@@ -54,11 +56,11 @@ def cloud_command(device: Any, tmp_path: Path) -> Any:
 
 
 def test_points_of_the_surface_are_those_of_the_function(
-    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer
 ) -> None:
     assert cloud_command(scan, "--report", str(tmp_path / "r.json"), "--json") == 0
     report = json.loads((tmp_path / "r.json").read_text())
-    assert json.loads(capsys.readouterr().out) == report
+    assert printed().report() == report
     assert set(report) == names_in("clrecon cloud INPUT")
     level = PRESETS[DEFAULT_PRESET].iso_value
     own = clrecon.extract_points(clrecon.read_volume(scan), level, kind="surface", device=device)
@@ -74,13 +76,13 @@ def test_points_of_the_surface_are_those_of_the_function(
 
 
 def test_clusters_rules_and_what_went(
-    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer
 ) -> None:
     options = ["--keep", "no-sheets", "--hu", BAND, "--cluster", "eps=1.2,min=4", "--keep", "largest:1"]
     removed, told = tmp_path / "went.npz", tmp_path / "r.json"
     assert cloud_command(scan, *options, "--removed", str(removed), "--report", str(told)) == 0
-    said = capsys.readouterr().out
-    assert "3 noise" in said and "labels of that file: 0 kept, 1 noise, 2 sheet, 3 other cluster" in said
+    said = printed()
+    said.assert_output(3, 0, 1, 2)
     volume = clrecon.read_volume(scan)
     first = clrecon.extract_points(volume, hu=(200, 3000), device=device)
     found = clrecon.cluster_points(first, 1.2, 4, volume=volume, device=device)
@@ -172,10 +174,10 @@ def test_labels_choose_points(scan: Path, tmp_path: Path, cloud_command: Any) ->
 
 
 def test_the_placing_of_the_paper_says_how_wrong_it_is(
-    scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+    scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer
 ) -> None:
     assert cloud_command(scan, "--hu", BAND, "--paper", "--json") == 0
-    report = json.loads(capsys.readouterr().out)
+    report = printed().report()
     paper = report["steps"][0]["paper"]
     assert report["paper"] and paper["error_max_mm"] > 30.0
     assert np.ptp(clrecon.read_points(tmp_path / "out.ply").points[:, 2]) < 1e-3
@@ -196,7 +198,7 @@ def test_a_step_that_takes_more_than_noise_is_refused(
     assert cloud_command(tmp_path / "scan.nrrd", *given, "--allow-point-loss") == 0
     assert "and was allowed" in capsys.readouterr().err
     settings = CloudSettings(hu=(200, 3000), clusters=Clustering(1.5, 5), device=str(device.index))
-    with pytest.raises(RefusedInputError, match="allow_point_loss=True"):
+    with refused(RefusedInputError, "allow_point_loss=True"):
         make_cloud(tmp_path / "scan.nrrd", CloudFiles(tmp_path / "b.ply"), settings)
 
 

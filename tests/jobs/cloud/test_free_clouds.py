@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from printed_text import Printer
 
 import clrecon
 from clrecon.cli.main import main
@@ -32,14 +33,12 @@ def write_ball(path: Path, radius: float) -> Path:
     return path
 
 
-def test_a_free_cloud_without_a_viewpoint_gets_no_surface(
-    tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_free_cloud_without_a_viewpoint_gets_no_surface(tmp_path: Path, cloud_command: Any, printed: Printer) -> None:
     source, surface = write_ball(tmp_path / "free.xyz", 10.0), ["--surface", str(tmp_path / "out.stl")]
     assert cloud_command(source, *surface) == 3
-    assert "ask for them (--normals), and name a point inside of the cloud (--viewpoint)" in capsys.readouterr().err
+    printed().assert_error("--normals", "--viewpoint")
     assert cloud_command(source, "--normals", *surface) == 3
-    assert "have either direction: name a point inside of it (--viewpoint)" in capsys.readouterr().err
+    printed().assert_error("--viewpoint")
     assert {path.name for path in tmp_path.iterdir()} == {"free.xyz"}
 
 
@@ -62,12 +61,10 @@ def test_the_filter_as_printed_on_a_cloud_that_was_read(tmp_path: Path, cloud_co
 
 
 @pytest.mark.parametrize("name", ["a.pcd", "a.E57", "a.laz"])
-def test_clouds_that_are_not_read_are_no_scans(
-    name: str, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_clouds_that_are_not_read_are_no_scans(name: str, tmp_path: Path, cloud_command: Any, printed: Printer) -> None:
     (tmp_path / name).write_text("# .PCD")
     assert cloud_command(tmp_path / name) == 3
-    assert f"clouds in files {name[1:].lower()} are not read: convert it to one of .ply," in capsys.readouterr().err
+    printed().assert_error(name[1:].lower())
 
 
 def test_a_cloud_of_numbers_may_be_called_asc(tmp_path: Path, cloud_command: Any) -> None:

@@ -68,9 +68,9 @@ def test_all_bones_are_named_objects_of_a_3mf(device, bones, tmp_path, capsys):
 
 
 @pytest.mark.release
-def test_all_bones_are_one_mesh_of_other_formats(device, bones, tmp_path, capsys):
+def test_all_bones_are_one_mesh_of_other_formats(device, bones, tmp_path, printed):
     code, report = run(bones, tmp_path / "a.stl", device, "--for", "print", "--all-parts")
-    assert code == 0, capsys.readouterr().err
+    assert code == 0, printed()
     assert (report["components"], report["closed"]) == (3, True)
     assert report["volume_ml"] == pytest.approx(sum(TRUE_ML), rel=0.02)
     assert report["print"]["left_out"]["cavities"] == 1
@@ -94,13 +94,13 @@ def test_crumbs_are_counted_with_the_option_that_drops_them(device, bones, tmp_p
     assert report["components"] == 4 and not any("drops them" in text for text in report["warnings"])
 
 
-def test_too_many_objects_are_refused_with_the_number_of_crumbs(device, bones, tmp_path, monkeypatch, capsys):
+def test_too_many_objects_are_refused_with_the_number_of_crumbs(device, bones, tmp_path, monkeypatch, printed):
     monkeypatch.setattr(make, "MOST_FILES", 100)
     code, _ = run(bones, tmp_path / "a.stl", device, "--split")
     assert code == 3
-    error = capsys.readouterr().err
-    assert "154 components, 150 of them below 0.1 ml; at most 100 are written one by one" in error
-    assert "--min-volume 0.1" in error and not list(tmp_path.iterdir())
+    error = printed()
+    error.assert_error(154, 150, 0.1, "--min-volume", 0.1)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
@@ -80,9 +81,7 @@ def test_a_scan_of_contrast_medium_alone_is_said_and_holds_no_bone(read: Any, de
     assert any("too much to be left out of the choice" in text for text in report["warnings"])
     assert any("the surface looks like contrast medium" in text for text in report["warnings"])
     before = (tmp_path / "b.ply").read_bytes()
-    with pytest.raises(
-        NoSurfaceError, match=r"at 200 HU: nothing here looks like bone: of .*looks like contrast medium"
-    ):
+    with refused(NoSurfaceError, 200, "looks"):
         run(tmp_path, device, iso_value=200.0, keep="bone")
     assert (tmp_path / "b.ply").read_bytes() == before
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from printed_text import Printer
+from refusals import refused
 from variants import daily
 
 from clrecon.cli.main import main
@@ -110,19 +112,19 @@ def test_wrong_choices_are_one_line(
 
 
 def test_colours_are_looked_at_when_they_are_chosen() -> None:
-    with pytest.raises(UsageError, match="unknown colour"):
+    with refused(UsageError, "colour"):
         LabelChoice("a.nii", colors=(("L3", "no"),))
 
 
 @pytest.mark.parametrize("option", ["--hide-label=L3", "--label-color=L3=red"])
-def test_they_need_labels(option: str, scan: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_they_need_labels(option: str, scan: Path, printed: Printer) -> None:
     assert main(["mesh", str(scan / "ct.nii"), "-o", "a.glb", option]) == 3
-    assert "--labels FILE" in capsys.readouterr().err
+    printed().assert_error("--labels", "FILE")
 
 
-def test_one_mesh_needs_no_objects(scan: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_mesh_needs_no_objects(scan: Path, printed: Printer) -> None:
     assert main(["mesh", str(scan / "ct.nii"), "-o", "a.glb", "--one-file"]) == 3
-    assert "there is one mesh: --one-file puts labels" in capsys.readouterr().err
+    printed().assert_error("--one-file")
 
 
 def test_an_obj_has_named_coloured_objects(scan: Path, device: Any, tmp_path: Path) -> None:

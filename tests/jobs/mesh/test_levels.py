@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
+from refusals import refused
 
 from clrecon.anatomy.iso_choice import half_iso_value
 from clrecon.errors import NoSurfaceError, UsageError
@@ -69,7 +70,7 @@ def test_given_materials_are_the_mesh_half_way(device: Any, tmp_path: Path) -> N
 
 def test_nothing_is_written_where_auto_finds_no_bone(scan: list[Volume], device: Any, tmp_path: Path) -> None:
     scan[0] = ball(bone=60.0)
-    with pytest.raises(NoSurfaceError, match="no bone found"):
+    with refused(NoSurfaceError, "bone", "half_way"):
         run(tmp_path, device, half_way="auto")
     assert list(tmp_path.iterdir()) == []
 
@@ -124,7 +125,7 @@ def test_impossible_materials_are_refused(settings: dict, words: str) -> None:
 def test_steps_of_the_job_take_volumes_made_from_arrays(report: dict[str, Any] | None) -> None:
     volume = Volume(np.arange(1000, dtype=np.int16).reshape(10, 10, 10), np.eye(4), report)
     check_levels(volume, plan_surfaces([500.0]))
-    with pytest.raises(NoSurfaceError, match="every voxel is inside, the volume runs from 0 to 999 HU"):
+    with refused(NoSurfaceError, 0, 999):
         check_levels(volume, plan_surfaces([0.0]))
     settings = MeshSettings(half_way=(2000.0, 40.0))
     warnings = describe_level(volume, settings, choose_level(volume, settings))[1]

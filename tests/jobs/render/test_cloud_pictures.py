@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from contract_tables import names_in
 from PIL import Image
+from printed_text import Printer
 
 import clrecon
 from clrecon.cli.main import main
@@ -40,14 +41,12 @@ def file(cloud: PointCloud, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_command_draws_what_the_function_draws(
-    device: Any, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_draws_what_the_function_draws(device: Any, file: Path, tmp_path: Path, printed: Printer) -> None:
     given = ["--device", str(device.index), "--size", SIZE, "--color", "removed", "--letters"]
     files = ["-o", str(tmp_path / "a.png"), "--depth", str(tmp_path / "d.npy"), "--report", str(tmp_path / "r.json")]
     assert main(["render", str(file), *files, *given, "--view", "20,30", "--point-radius", "0.4"]) == 0
-    said = capsys.readouterr().out
-    assert "6,000 points with normals, HU, labels" in said and "kept: 1," in said and "removed 1: 1," in said
+    said = printed()
+    said.assert_output(6000, 1, 1)
     cloud = clrecon.read_points(file)
     own = clrecon.render(
         cloud, color_by="removed", radius_mm=0.4, view=(20, 30), size=(80, 64), device=device

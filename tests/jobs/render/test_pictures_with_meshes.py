@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from printed_text import Printer
+from refusals import refused
 from sample_meshes import ball
 
 import clrecon
@@ -57,12 +59,12 @@ def test_a_mesh_is_an_input(device: Any, files: dict[str, Path], tmp_path: Path,
     assert report.cloud is None and report.mode == "mesh"
 
 
-def test_meshes_without_a_scan(device: Any, files: dict[str, Path], tmp_path: Path, capsys: Any) -> None:
+def test_meshes_without_a_scan(device: Any, files: dict[str, Path], tmp_path: Path, printed: Printer) -> None:
     glb = tmp_path / "other.glb"
     clrecon.read_mesh(files["ras.ply"]).save(glb)
     report = tmp_path / "report.json"
     words = ["render", "--mesh", str(glb), "--mesh", f"{files['lps.stl']}=red,0.5", "--size", "64x48"]
-    assert main([*words, "-o", str(tmp_path / "out.png"), "--report", str(report)]) == 0, capsys.readouterr().err
+    assert main([*words, "-o", str(tmp_path / "out.png"), "--report", str(report)]) == 0, printed()
     first, second = json.loads(report.read_text())["meshes"]
     assert (first["file"]["kind"], first["opacity"], second["file"]["kind"], second["opacity"]) == (
         "GLB",
@@ -73,7 +75,7 @@ def test_meshes_without_a_scan(device: Any, files: dict[str, Path], tmp_path: Pa
     assert second["color"] == [1.0, 0.0, 0.0] and first["color"] != second["color"]
     for wrong in (["render", "-o", "a.png"], [*words, "--mode", "mip", "-o", "a.png"]):
         assert main(wrong) == 3
-        assert len(capsys.readouterr().err.splitlines()) == 1
+        assert printed().error_lines == 1
 
 
 @pytest.mark.parametrize("mode", ["dvr", "slices", "surface"])
@@ -119,7 +121,7 @@ def test_a_mesh_is_coloured_by_numbers_at_its_vertices(
     look = clrecon.MeshLook(color_by="distance", lighting=UNSHADED)
     signed = clrecon.render(read, look, size=(200, 200), device=device)
     assert np.abs(signed.image[80, 100, :3].astype(int) - 222).max() < 12
-    with pytest.raises(UsageError, match="no error_mm at its vertices"):
+    with refused(UsageError, "error_mm", "vertices"):
         clrecon.render(read, color_by="error", device=device)
     assert main(["render", str(files["lps.stl"]), "-o", str(out), "--color", "thickness"]) == 3
     assert "a mesh fitted to the cortex has them" in capsys.readouterr().err
@@ -151,5 +153,5 @@ def test_what_has_no_meaning_is_refused(files: dict[str, Path], tmp_path: Path, 
         error = capsys.readouterr().err
         assert text in error and error.strip().count("\n") == 0, error
         assert not Path(out).exists()
-    with pytest.raises(UsageError, match="unknown colour"):
+    with refused(UsageError, "colour", "octarine"):
         MeshFile("a.stl", "octarine")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -34,12 +33,12 @@ def read_page(path: Path):
 
 
 @pytest.mark.unit
-def test_two_meshes_lie_where_they_are_and_the_turned_one_is_said(files, tmp_path, capsys):
+def test_two_meshes_lie_where_they_are_and_the_turned_one_is_said(files, tmp_path, printed):
     page = tmp_path / "both.html"
     inputs = [str(files["DOE_JANE.stl"]), str(files["b.ply"])]
     assert main(["view", *inputs, "--html", str(page), "--name", "bone", "--name", "screw"]) == 0
-    said = capsys.readouterr().out
-    assert "RAS, named by the file, turned to LPS" in said
+    said = printed()
+    said.assert_output("RAS", "LPS")
     facts, vertices, _, triangles = read_page(page)
     assert [part["name"] for part in facts["parts"]] == ["bone", "screw"]
     assert facts["parts"][0]["color"] != facts["parts"][1]["color"]
@@ -50,10 +49,10 @@ def test_two_meshes_lie_where_they_are_and_the_turned_one_is_said(files, tmp_pat
 
 
 @pytest.mark.unit
-def test_names_of_files_are_not_on_the_page(files, tmp_path, capsys):
+def test_names_of_files_are_not_on_the_page(files, tmp_path, printed):
     page = tmp_path / "both.html"
     assert main(["view", str(files["DOE_JANE.stl"]), str(files["b.ply"]), "--html", str(page), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+    report = printed().report()
     content = page.read_bytes()
     assert b"DOE_JANE" not in content and str(tmp_path).encode() not in content
     assert [part["name"] for part in report["parts"]] == ["surface 1", "surface 2"]
@@ -74,7 +73,7 @@ def scan(tmp_path: Path) -> tuple[Path, Path]:
 
 
 @pytest.mark.opencl
-def test_a_scan_is_shown_by_its_components_and_with_labels_by_these(tmp_path, capsys, device):
+def test_a_scan_is_shown_by_its_components_and_with_labels_by_these(tmp_path, printed, device):
     source, labels = scan(tmp_path)
     page = tmp_path / "scan.html"
     assert main(["view", str(source), "--html", str(page), "--hu", "0"]) == 0
@@ -84,7 +83,7 @@ def test_a_scan_is_shown_by_its_components_and_with_labels_by_these(tmp_path, ca
     assert facts["triangles"] == mesh.triangle_count
     assert sum(part["ml"] for part in facts["parts"]) == pytest.approx(mesh.volume / 1000.0, rel=1e-5)
     assert facts["about"][0] == "Surface: iso value 0 HU."
-    assert "surface of 0 HU" in capsys.readouterr().out
+    printed().assert_output(0)
     options = ["--labels", str(labels), "--hu", "0", "--label-color", "2=#ff0000"]
     assert main(["view", str(source), "--html", str(page), *options]) == 0
     parts = read_page(page)[0]["parts"]
@@ -92,12 +91,12 @@ def test_a_scan_is_shown_by_its_components_and_with_labels_by_these(tmp_path, ca
 
 
 @pytest.mark.opencl
-def test_a_scan_and_a_mesh_together(tmp_path, files, capsys, device):
+def test_a_scan_and_a_mesh_together(tmp_path, files, printed, device):
     page = tmp_path / "both.html"
     source = scan(tmp_path)[0]
     assert main(["view", str(source), str(files["b.ply"]), "--html", str(page), "--hu", "0"]) == 0
     assert [part["name"] for part in read_page(page)[0]["parts"]] == ["surface 1", "surface 2"]
-    assert "lie" in capsys.readouterr().err  # the boxes lie apart
+    printed().assert_error("lie")  # the boxes lie apart
 
 
 @pytest.mark.opencl

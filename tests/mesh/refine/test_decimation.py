@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 import tolerances
+from refusals import refused
 from variants import daily
 
 from clrecon.errors import UsageError
@@ -255,7 +256,7 @@ def test_what_is_left_of_a_cluster_at_a_border_stays_there():
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -0.1, 90.0, float("nan")])
 def test_impossible_shares_are_refused(fraction):
-    with pytest.raises(UsageError, match="between 0 and 1"):
+    with refused(UsageError, 0, 1):
         decimate_mesh(Mesh(*samples.sphere()), fraction, 1.0)
 
 
@@ -277,7 +278,7 @@ def test_a_mesh_of_2_to_the_31_corners_is_too_large():
 
     assert check_refinement(of(1, 715_827_882), 1.0) == check_refinement(of(2**31 - 1, 1), 1.0) == 1.0
     for large in (of(1, 715_827_883), of(2**31, 1)):
-        with pytest.raises(UsageError, match="too large to be refined, at most 715,827,882"):
+        with refused(UsageError, 715827882):
             check_refinement(large, 1.0)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
+from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.opencl import upload
@@ -11,9 +11,9 @@ from clrecon.operators.masks.voxel_mask import check_shape, find_extents, mark_v
 
 
 def test_masks_too_large_are_refused():
-    with pytest.raises(UsageError, match="masks hold rows of up to 65,535"):
+    with refused(UsageError, 65535, "masks"):
         check_shape((65_536, 2, 2))
-    with pytest.raises(UsageError, match="up to 2,147,483,647 words"):
+    with refused(UsageError, 2147483647):
         check_shape((65_000, 65_000, 20))
 
 

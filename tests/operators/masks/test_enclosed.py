@@ -5,6 +5,7 @@ from __future__ import annotations
 import enclosed_twin as twin
 import numpy as np
 import pytest
+from refusals import refused
 from surface_volumes import MIRRORED, OBLIQUE
 from uneven_volume import uneven
 
@@ -263,7 +264,7 @@ def test_ways_within_a_room_equal_the_twin(device):
         for mm in (0.1, 0.7, 1.5, 4.0):
             made = one.dilate_within(other, mm).to_numpy()
             np.testing.assert_array_equal(made, twin.dilate_within(volume, start, room, mm))
-    with pytest.raises(UsageError, match="the length of the ways is 0"):
+    with refused(UsageError, "length", 0):
         one.dilate_within(other, 0)
 
 
@@ -302,18 +303,18 @@ def test_values_types_and_a_volume_on_a_device(device):
 
 def test_what_cannot_be_filled_is_refused(device):
     volume = whole(body(distances((21, 21, 21)), 8.0, 5.0))
-    with pytest.raises(NoSurfaceError, match="no voxel has 2000 HU or more: the volume runs from 0 to"):
+    with refused(NoSurfaceError, 2000, 0):
         clrecon.fill_enclosed(volume, 2000, device=device)
-    with pytest.raises(NoSurfaceError, match="every voxel has -10 HU or more"):
+    with refused(NoSurfaceError, -10):
         clrecon.fill_enclosed(volume, -10, device=device)
-    with pytest.raises(UsageError, match="the radius that closes pores is 0"):
+    with refused(UsageError, 0, "radius"):
         clrecon.fill_enclosed(volume, 400, seal_mm=0, device=device)
-    with pytest.raises(UsageError, match="the radius of the thickest marrow is -1"):
+    with refused(UsageError, -1, "radius"):
         clrecon.fill_enclosed(volume, 400, largest_mm=-1, device=device)
-    with pytest.raises(UsageError, match="needs a Volume, not ndarray"):
+    with refused(UsageError, "Volume"):
         clrecon.fill_enclosed(volume.voxels, 400, device=device)
     for options in ({"below": True}, {}):
-        with pytest.raises(UsageError, match="solid=True goes with one iso value"):
+        with refused(UsageError, "solid=True"):
             clrecon.extract_isosurface(volume, 400 if options else (100, 300), solid=True, **options, device=device)
 
 

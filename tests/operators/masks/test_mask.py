@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 from scipy import ndimage
 from surface_volumes import MIRRORED, OBLIQUE, random_volume
 from uneven_volume import uneven
@@ -97,9 +98,9 @@ def test_labels_are_chosen_by_number_and_name(device):
     assert clrecon.Mask.from_labels(volume, labels, device=device).count == np.count_nonzero(numbers)
     again = clrecon.Mask.from_labels(volume, made.to_label_map("two"), ["two"], device=device)
     assert again.count == made.count
-    with pytest.raises(UsageError, match="L9"):
+    with refused(UsageError, "L9"):
         clrecon.Mask.from_labels(volume, labels, ["L9"], device=device)
-    with pytest.raises(UsageError, match="labels must be a LabelMap"):
+    with refused(UsageError, "LabelMap", "labels"):
         clrecon.Mask.from_labels(volume, numbers, device=device)
 
 
@@ -180,11 +181,11 @@ def test_memory_is_summed_before_it_is_taken(device):
     volume = random_volume((40, 50, 600))
     few = clrecon.Mask.from_band(volume, (1, 3), device=device, memory=400_000)  # slab by slab
     assert few.count == ((volume.voxels >= 1) & (volume.voxels <= 3)).sum()
-    with pytest.raises(DeviceError, match="masks of the voxels .* are allowed"):
+    with refused(DeviceError, "masks", "voxels", 3, 400000):
         few & few
-    with pytest.raises(DeviceError, match="are allowed"):
+    with refused(DeviceError, 100000):
         clrecon.Mask.from_band(volume, (1, 3), device=device, memory=100_000)
-    with pytest.raises(DeviceError, match="are allowed"):
+    with refused(DeviceError, 100000):
         clrecon.Mask.from_array(volume, volume.voxels > 1, device=device, memory=100_000)
 
 
@@ -249,7 +250,7 @@ def test_components_are_those_of_scipy_the_largest_first(device, which):
 @pytest.mark.parametrize("wanted", [0, -1, 1.5, True, "2"])
 def test_a_number_of_components_is_a_whole_one(device, wanted):
     mask = clrecon.Mask.from_box(volumes()[0], (0, 3, 0, 3, 0, 3), device=device)
-    with pytest.raises(UsageError, match="number of components is a whole number from 1 on"):
+    with refused(UsageError, 1, "components"):
         mask.keep_largest(wanted)
 
 
@@ -283,10 +284,10 @@ def test_labels_and_masks_of_one_grid_make_label_maps(device: Any) -> None:
 def test_labels_and_masks_of_other_grids_are_refused(device: Any) -> None:
     labels = LabelMap(np.ones((3, 4, 5), np.uint8), np.eye(4))
     away = Volume(np.ones((3, 4, 5), np.int16), np.diag([1.0, 1.0, 2.0, 1.0]))
-    with pytest.raises(UsageError, match="up to 2 mm apart"):
+    with refused(UsageError, "mm", 2):
         labels & Mask.from_band(away, (0, None), device=device)
-    with pytest.raises(UsageError, match=r"the mask has \(5, 4, 2\) voxels, the other volume \(5, 4, 3\)"):
+    with refused(UsageError, 5, 4, 2):
         labels - Mask.from_band(away[:2], (0, None), device=device)
     for other in (3, labels):
-        with pytest.raises(TypeError, match="unsupported operand"):
+        with refused(TypeError, "LabelMap"):
             labels & other  # type: ignore[operator]

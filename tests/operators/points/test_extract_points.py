@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
+from refusals import refused
 from surface_volumes import MIDDLE, hollow_ball
 from variants import VOXEL_TYPES
 
@@ -123,7 +124,7 @@ def test_slabs_give_the_same_points_bit_for_bit(device, kind):
 
 
 def test_too_little_memory_for_one_slice_is_said(device):
-    with pytest.raises(DeviceError, match="one slice needs .* bytes, and room for its points: .* allow more"):
+    with refused(DeviceError, "slice", "points", "bytes"):
         extract_points(make_volume((5, 20, 50)), hu=BAND, device=device, memory=1500)
 
 
@@ -290,5 +291,5 @@ def test_points_of_the_cortex_of_labels_are_those_of_their_meshes(device):
 
 @pytest.mark.parametrize("what", [{}, {"iso_value": "auto"}, {"hu": (200, 900)}])
 def test_the_cortex_needs_a_low_level(device, what):
-    with pytest.raises(UsageError, match="such as 200"):
+    with refused(UsageError, 200):
         extract_points(hollow_ball(), kind="cortex", device=device, **what)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from point_shapes import sphere
+from refusals import refused
 from tolerances import MEAN_DISTANCE_SHARE
 
 from clrecon.errors import UsageError
@@ -53,7 +54,7 @@ def test_a_small_cloud(device):
 
 @pytest.mark.parametrize("deviations", [-1.0, float("nan"), float("inf"), "2", True])
 def test_wrong_deviations_are_refused(device, deviations):
-    with pytest.raises(UsageError, match="a number from 0 on"):
+    with refused(UsageError, 0):
         remove_outliers(PointCloud(np.eye(3)), 2, deviations, device=device)
 
 

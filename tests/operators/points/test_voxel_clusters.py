@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from refusals import refused
 from surface_volumes import OBLIQUE
 from uneven_volume import uneven
 from variants import VOXEL_TYPES, daily, daily_rows
@@ -225,16 +226,16 @@ def test_voxels_by_number_of_another_volume_are_refused(device):
     affine = OBLIQUE.copy()
     affine[0, 3] += 0.02
     moved = Volume(volume.voxels, affine)
-    with pytest.raises(UsageError, match="mm from their voxels: it is another volume"):
+    with refused(UsageError, "voxels", "volume", 0.02):
         cluster_points(cloud, 1.1, 4, volume=moved, device=device)
     smaller = Volume(volume.voxels[:3], OBLIQUE)
-    with pytest.raises(UsageError, match="it is another volume"):
+    with refused(UsageError, "volume", 67, 19):
         cluster_points(cloud, 1.1, 4, volume=smaller, device=device)
 
 
 def test_an_uneven_cloud_needs_its_volume(device):
     volume = uneven(noise((6, 10, 20), 0.4))
-    with pytest.raises(UsageError, match="mm from their voxels, as in uneven stacks: give the volume"):
+    with refused(UsageError, "voxels", "volume"):
         cluster_points(voxel_cloud(volume), 1.1, 4, device=device)
     step = cluster_points(voxel_cloud(volume), 1.1, 4, volume=volume, device=device)
     np.testing.assert_array_equal(
@@ -295,7 +296,7 @@ def test_an_eps_larger_than_the_volume_needs_no_search(device, monkeypatch):
         step = cluster_points(volume, 1e6, samples, hu=(1, 1), device=device)
         assert len(step.cloud) == 27 and (step.cloud.labels == labels).all()
         assert (step.cores == (labels == 0)).all() and step.facts["clusters"] == labels + 1
-    with pytest.raises(UsageError, match="visits of rows of the volume"):
+    with refused(UsageError, "volume"):
         cluster_points(volume, 15.0, 6, hu=(1, 1), device=device)
 
 
@@ -320,15 +321,15 @@ def test_volumes_over_the_memory_give_the_same_labels(device):
     )
     np.testing.assert_array_equal(step.cloud.labels, expected.cloud.labels)
     assert len(heard) > 2 and heard[-1] == ("mask", 40, 40)
-    with pytest.raises(DeviceError, match="the mask of the voxels and one slice need"):
+    with refused(DeviceError, "mask", "voxels", 20000):
         cluster_points(volume, 1.2, 3, hu=(97, 100), device=device, memory=20_000)
-    with pytest.raises(DeviceMemoryError, match="the clusters of the voxels cannot be found: this needs"):
+    with refused(DeviceMemoryError, "clusters", "voxels"):
         cluster_points(volume, 1.2, 3, hu=(0, 100), device=device, memory=memory)
 
 
 def test_memory_is_refused_before_it_is_taken(device, monkeypatch):
     monkeypatch.setattr(voxel_clusters, "allocate", lambda *_: pytest.fail("memory was taken"))
-    with pytest.raises(DeviceMemoryError, match="mask of core voxels"):
+    with refused(DeviceMemoryError, "mask", "core", 2000):
         cluster_points(voxel_cloud(Volume(noise((6, 9, 70), 0.3), FINE)), device=device, memory=2000)
 
 
@@ -367,17 +368,17 @@ def test_bands_that_no_voxel_can_have(device):
 
 def test_bad_clouds_are_refused(device):
     cloud = voxel_cloud(Volume(noise((3, 4, 40), 0.4), FINE))
-    with pytest.raises(UsageError, match="the cloud is empty"):
+    with refused(UsageError, "cloud", "empty"):
         cluster_points(cloud.select([]), device=device)
-    with pytest.raises(UsageError, match="1 of 3 points have the voxel of another point"):
+    with refused(UsageError, 1, 3):
         cluster_points(cloud.select([0, 1, 1]), device=device)
     with pytest.raises(UsageError, match="does not say where its voxels lie"):
         cluster_points(cloud.changed(report={}), device=device)
-    with pytest.raises(UsageError, match="says which voxels of a volume are points"):
+    with refused(UsageError, "voxels", "volume"):
         cluster_points(cloud, hu=(1, 2), device=device)
-    with pytest.raises(UsageError, match="it is another volume"):
+    with refused(UsageError, "volume", 3):
         cluster_points(cloud, volume=Volume(noise((2, 2, 2), 1.0), FINE), device=device)
-    with pytest.raises(UsageError, match=r"points lie up to .* it is another volume"):
+    with refused(UsageError, "points", "voxels"):
         cluster_points(cloud, volume=Volume(noise((3, 4, 40), 1.0), OBLIQUE), device=device)
     one = cluster_points(cloud.select([0]), min_samples=1, eps=0.6, device=device)
     assert one.cloud.labels.tolist() == [0]
@@ -385,7 +386,7 @@ def test_bad_clouds_are_refused(device):
 
 def test_work_of_hours_is_refused(device):
     volume = Volume(np.ones((200, 1000, 33), np.int8), np.diag((1.0, 0.01, 0.01, 1.0)))
-    with pytest.raises(UsageError, match="visits of rows of the volume, 1e\\+11 are allowed: choose a smaller eps"):
+    with refused(UsageError, "volume"):
         cluster_points(volume, 10.0, hu=(1, 1), device=device)
 
 
@@ -421,7 +422,7 @@ def test_a_band_without_an_end_is_one_everywhere(device):
         step = cluster_points(volume, 0.6, 2, hu=hu, device=device)
         assert len(step.cloud) == len(clrecon.extract_points(volume, hu=hu, device=device)) > 0
     for wrong in ((1,), (None, None, None), (2, 1), (None, "x"), (math.nan, None)):
-        with pytest.raises(UsageError, match="a band is two numbers in HU"):
+        with refused(UsageError, "band"):
             cluster_points(volume, 0.6, 2, hu=wrong, device=device)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.opencl import download, upload
@@ -68,11 +69,11 @@ def test_more_blocks_than_a_group_has_items(device, monkeypatch):
 
 
 def test_sizes_that_do_not_fit_are_refused(device):
-    with pytest.raises(UsageError, match="0 elements"):
+    with refused(UsageError, 0, "elements"):
         exclusive_scan(device, None, 0)
-    with pytest.raises(UsageError, match="a scan takes"):
+    with refused(UsageError, "scan"):
         exclusive_scan(device, None, 2**32)
-    with pytest.raises(UsageError, match="positions fit 32 bits"):
+    with refused(UsageError, 32, "positions"):
         compact(device, None, 2**27 + 1)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 from variants import daily
 
 from clrecon.errors import UsageError
@@ -85,9 +86,9 @@ def test_the_forecast_counts_keys_values_and_tables(device):
 
 
 def test_what_cannot_be_sorted_is_refused(device):
-    with pytest.raises(UsageError, match="0 elements: a sort takes 1 to 2,147,483,648"):
+    with refused(UsageError, 0, 1, 2147483648):
         radix_sort(device, None, 0)
-    with pytest.raises(UsageError, match="33 bits: keys have 0 to 32"):
+    with refused(UsageError, 33, 0, 32):
         radix_sort(device, None, 1, bits=33)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tolerances
+from refusals import refused
 from variants import daily
 
 from clrecon import Camera, LabelMap, TransferFunction, UsageError, Volume, render
@@ -69,5 +70,5 @@ def test_a_label_without_opacity_shows_what_is_behind(device):
 
 def test_colours_of_labels_without_labels_are_refused(device):
     volume, _ = block()
-    with pytest.raises(UsageError, match="label_opacity says how labels look: give the labels too"):
+    with refused(UsageError, "label_opacity", "labels"):
         render(volume, device=device, size=(8, 8), label_opacity={1: 0.5})

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 from slab_surfaces import assert_same
 from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
 from tolerances import float32_unit
@@ -116,7 +117,7 @@ def test_a_mask_grows_what_it_touches(device: Any) -> None:
     both = extract_isosurface(volume, 0, device=device, grow_from=seeds)
     assert_same(both, extract_isosurface(volume, 0, device=device))
     other = Mask.from_array(Volume(volume.voxels[1:], volume.affine), chosen[1:], device=device)
-    with pytest.raises(UsageError, match=r"the mask has \(15, 18, 70\) voxels, the volume has \(16, 18, 70\)"):
+    with refused(UsageError, 15, 18, 70):
         extract_isosurface(volume, 0, device=device, grow_from=other)
 
 
@@ -179,7 +180,7 @@ def test_labels_and_masks_grow_what_has_one_of_their_voxels(closed: bool, device
     assert ijk.min(axis=0) == pytest.approx((49.4975, 3.4975, 3.4975), abs=1e-3)
     assert ijk.max(axis=0) == pytest.approx((59.5025, 8.5025, 8.5025), abs=1e-3)
     assert_same(extract_isosurface(volume, 0, device=device, closed=closed, grow_from=[labels]), small)
-    with pytest.raises(UsageError, match=r"touches label hollow: [34] components, none of them has a seed"):
+    with refused(UsageError, "label", "components"):
         extract_isosurface(volume, 0, device=device, closed=closed, grow_from=(labels, 9))
 
 
@@ -226,20 +227,20 @@ def test_a_seed_in_air_is_refused_with_its_distance(device: Any) -> None:
     voxels = np.full((12, 40, 90), -1000, np.int16)
     voxels[4:8, 4:9, 4:9] = 500
     volume = Volume(voxels, np.diag((1.0, 1.0, 1.0, 1.0)))
-    with pytest.raises(UsageError, match=r"seed 30,6,6 has -1000 HU and is 21\.\d mm away from the surface at 0 HU"):
+    with refused(UsageError, 30, -1000, 0):
         extract_isosurface(volume, 0, device=device, grow_from=(30, 6, 6))
-    with pytest.raises(UsageError, match="is more than 50 mm away from the surface at 0 HU: a seed lies within 10 mm"):
+    with refused(UsageError, 50, 0, 10):
         extract_isosurface(volume, 0, device=device, grow_from=(80, 6, 6))
     assert len(extract_isosurface(volume, 0, device=device, grow_from=(16, 6, 6)).triangles) > 0
 
 
 def test_the_trilinear_topology_is_not_grown(device: Any) -> None:
-    with pytest.raises(UsageError, match="a surface of topology trilinear cannot be grown"):
+    with refused(UsageError, "surface", "topology", "grow_from"):
         extract_isosurface(blocks(), 0, device=device, topology="trilinear", grow_from="auto")
 
 
 def test_a_volume_without_surface_is_no_part_of_one(device: Any) -> None:
-    with pytest.raises(NoSurfaceError, match="5000 HU"):
+    with refused(NoSurfaceError, 5000):
         extract_isosurface(blocks(), 5000, device=device, grow_from="auto")
 
 
@@ -247,7 +248,7 @@ def test_memory_for_the_bits_of_the_volume_is_asked_for_first(device: Any) -> No
     volume = smooth_volume((7, 4, 70))
     parts = growing_needs(SampleGrid(volume, choose_iso_rule(volume, 300)))
     assert list(parts.values()) == [4 * 54 * 3, 4 * 54 * 3, 6 * 54 * 3, 4 * 54 * 3, 20 * 54]
-    with pytest.raises(DeviceError, match="a surface cannot be grown|needs"):
+    with refused(DeviceError, 150000, "surface"):
         extract_isosurface(smooth_volume((40, 64, 64)), 300, device=device, grow_from="auto", memory=150_000)
 
 

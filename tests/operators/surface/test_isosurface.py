@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tolerances
+from refusals import refused
 from scipy.spatial import cKDTree
 from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
 from variants import VOXEL_TYPES, daily, daily_rows
@@ -207,7 +208,7 @@ def test_values_that_cannot_be_used_are_refused(device):
 
 
 def test_only_volumes_have_surfaces(device):
-    with pytest.raises(UsageError, match=r"needs a Volume, not ndarray: clrecon.Volume\(voxels, affine\)"):
+    with refused(UsageError, "Volume", "clrecon.Volume"):
         extract_isosurface(np.zeros((3, 4, 5)), 1, device=device)
 
 
@@ -220,7 +221,7 @@ def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
         return marching_cubes.Classified(*(marching_cubes.upload(device, array) for array in (mask, extents)))
 
     monkeypatch.setattr(marching_cubes, "classify", find_nothing)
-    with pytest.raises(DeviceError, match="it computes wrongly"):
+    with refused(DeviceError, "computes", 3, 5):
         extract_isosurface(random_volume((5, 6, 7)), 3, device=device)
     check = next(check for check in CHECKS if check.name == "extract_isosurface")
     outcome = run_check(device, check)

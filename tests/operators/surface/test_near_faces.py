@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 from near_surfaces import FLAT_BOUND, FLAT_CASES, flat_case, sheet
+from refusals import refused
 
 from clrecon.errors import DeviceError
 from clrecon.mesh.compare.near_distances import NearDistance, triangle_distances
@@ -138,5 +139,5 @@ def test_a_small_surface(device):
 def test_a_device_without_room_says_what_it_would_need(device, monkeypatch):
     vertices, triangles = sheet(9)
     monkeypatch.setattr(decimation, "PART", 1 << 40)
-    with pytest.raises(DeviceError, match="points of a launch"):
+    with refused(DeviceError, "points"):
         DeviceBounds(device, vertices, triangles).find_bounds(vertices, np.zeros((81, 1), int), 0.0)

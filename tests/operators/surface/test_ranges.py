@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tolerances
+from refusals import refused
 from slab_surfaces import assert_same, extract_in_slabs
 from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
 from variants import daily, daily_rows
@@ -215,14 +216,14 @@ def test_what_is_no_range_is_refused(device, level, options, said):
 def test_a_range_that_holds_nothing_says_the_range_of_the_data(device):
     volume = random_volume((5, 6, 7))
     for level in [(8, 9), (-9, -8), (3.2, 3.8), (40_000, 50_000)]:
-        with pytest.raises(NoSurfaceError, match="no voxel lies within, the volume runs from 0 to 5 HU"):
+        with refused(NoSurfaceError, 0, 5):
             extract_isosurface(volume, level, device=device)
-    with pytest.raises(NoSurfaceError, match="every voxel lies within"):
+    with refused(NoSurfaceError, "voxel", 5):
         extract_isosurface(volume, (0, 5), device=device, closed=False)
     assert_sound(extract_isosurface(volume, (0, 5), device=device))
-    with pytest.raises(NoSurfaceError, match="no surface of what lies below 0 HU"):
+    with refused(NoSurfaceError, 0, "surface"):
         extract_isosurface(volume, 0, device=device, below=True)
-    with pytest.raises(UsageError, match="are one float32 number"):
+    with refused(UsageError, "float32"):
         extract_isosurface(random_volume((3, 4, 5), "float32"), (1.0, 1.0 + 1e-12), device=device)
 
 
@@ -233,7 +234,7 @@ def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
         return marching_cubes.Classified(*(marching_cubes.upload(device, array) for array in (mask, extents)))
 
     monkeypatch.setattr(marching_cubes, "classify", find_nothing)
-    with pytest.raises(DeviceError, match="it computes wrongly"):
+    with refused(DeviceError, "computes", 2, 3):
         extract_isosurface(random_volume((5, 6, 7)), (2, 3), device=device)
 
 

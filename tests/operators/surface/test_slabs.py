@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 from slab_surfaces import assert_same, extract_in_slabs
 from surface_volumes import MIRRORED, OBLIQUE, random_volume, smooth_volume
 
@@ -141,7 +142,7 @@ def test_the_forecast_is_what_then_happens(device):
 
 def test_a_budget_for_less_than_a_slice_is_refused_before_anything_is_allocated(device, monkeypatch):
     monkeypatch.setattr(device_volume, "upload", lambda *_: pytest.fail("allocated"))
-    with pytest.raises(DeviceError, match=r"one slice with its neighbours needs [0-9,]+ bytes.*10,000 bytes are allow"):
+    with refused(DeviceError, 10000, "room"):
         extract_isosurface(smooth_volume((40, 60, 70)), 100, device=device, memory=10_000)
 
 
@@ -154,9 +155,7 @@ def test_a_refusal_says_the_bytes_of_one_slice_with_its_neighbours(device, slice
     words = 2 * 6
     scratch = 4 * words * classified + 4 * words * counted + 4 * 6 * classified + 12 * 6 * counted + 4 * 6 * counted
     needed = volume.voxels.itemsize * 6 * 33 * read + scratch + 4 * words
-    with pytest.raises(
-        DeviceError, match=f"^one slice with its neighbours needs {needed:,} bytes, and room for its mesh"
-    ):
+    with refused(DeviceError, needed):
         extract_isosurface(volume, 100, device=device, memory=100, closed=False)
 
 
@@ -204,7 +203,7 @@ def test_memory_that_never_suffices_is_an_error_in_the_end(device, monkeypatch):
 
     monkeypatch.setattr(marching_cubes, "allocate", allocate)
     monkeypatch.setattr(cells, "allocate", allocate)
-    with pytest.raises(DeviceError, match="no room for 1 byte"):
+    with refused(DeviceError, 1, "room"):
         extract_isosurface(smooth_volume((9, 10, 11)), 100, device=device)
 
 
@@ -216,7 +215,7 @@ def test_counts_over_32_bits_are_refused(device, monkeypatch):
         return upload(device, download(device, np.empty(1, np.uint64), total_d) + np.uint64(2**32))
 
     monkeypatch.setattr(cells, "enqueue_scan", scan)
-    with pytest.raises(DeviceError, match="more than 32 bits can number"):
+    with refused(DeviceError, 32, "bits"):
         extract_isosurface(random_volume((5, 6, 7)), 3, device=device)
 
 
@@ -235,7 +234,7 @@ def test_vertices_of_all_slabs_together_must_fit_32_bits(device, monkeypatch):
         return tuple(Long(array) for array in true_emit(*arguments))
 
     monkeypatch.setattr(marching_cubes, "emit", emit)
-    with pytest.raises(DeviceError, match="4,294,967,296 vertices"):
+    with refused(DeviceError, 4294967296, "vertices"):
         extract_in_slabs(random_volume((9, 6, 7)), 3, device, 3)
 
 

@@ -7,6 +7,7 @@ import pickle
 
 import numpy as np
 import pytest
+from refusals import refused
 from variants import daily
 
 import clrecon
@@ -95,7 +96,7 @@ def test_parts_fit_together_and_have_surfaces_of_their_volumes(spine, device):
     assert told["dense_hu"] == [450.0, None]
     assert told["solid_of"] == "label"
     assert "solid" in repr(inside)
-    with pytest.raises(TypeError, match="belongs to its process"):
+    with refused(TypeError, "to_label_map", "as_dict"):
         pickle.dumps(inside)
 
 
@@ -139,7 +140,7 @@ def test_uneven_slices_have_masks_and_volumes_but_no_meshes(device):
     uneven = Volume(volume.voxels, volume.affine, slice_positions=positions)
     inside = clrecon.vertebra_inside(uneven, labels, "plate", device=device)
     assert inside.volumes_ml["dense"] == pytest.approx(4 * 24 * 24 * 0.125e-3)
-    with pytest.raises(UsageError, match="slices of the scan are uneven"):
+    with refused(UsageError, "slices", "scan"):
         inside.extract_meshes()
 
 
@@ -173,14 +174,14 @@ def test_bands_are_named_by_their_ends():
 @pytest.mark.parametrize("dense", [(900, 450), (None, None), (450,), "x", (np.nan, 900), 450])
 def test_a_band_that_is_none_is_refused(dense, device):
     volume, labels = slab(4)
-    with pytest.raises(UsageError, match="dense bone is a band of HU"):
+    with refused(UsageError, "dense", "bone"):
         clrecon.vertebra_inside(volume, labels, 1, dense=dense, device=device)
 
 
 @pytest.mark.parametrize("dense", [(2000, None), (1e6, 2e6)])
 def test_a_band_without_bone_is_refused(dense, device):
     volume, labels = slab(4)
-    with pytest.raises(NoSurfaceError, match=r"no voxel of label 1 plate has .* its bone runs from 100 to 900 HU"):
+    with refused(NoSurfaceError, 1, 100, 900):
         clrecon.vertebra_inside(volume, labels, 1, dense=dense, device=device)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import refused
 
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
 from clrecon.opencl import choose_device
@@ -169,13 +170,13 @@ def test_wrong_arguments_are_refused_first(arguments: dict[str, Any], words: str
 
 def test_outputs_then_device_then_input(tmp_path: Path) -> None:
     nowhere = tmp_path / "nowhere"
-    with pytest.raises(OutputError, match="nowhere"):
+    with refused(OutputError, "nowhere"):
         bench.run_bench(nowhere, device="abacus", report_path=nowhere / "b.json")
-    with pytest.raises(DeviceError, match="abacus|no OpenCL device"):
+    with refused(DeviceError, "abacus"):
         bench.run_bench(nowhere, device="abacus")
 
 
 def test_no_surface_leaves_no_report(device: Any, ct: Path, tmp_path: Path) -> None:
-    with pytest.raises(NoSurfaceError, match="5000 HU"):
+    with refused(NoSurfaceError, 5000):
         bench.run_bench(ct, iso_value=5000.0, device=str(device.index), runs=1, report_path=tmp_path / "b.json")
     assert list(tmp_path.iterdir()) == []

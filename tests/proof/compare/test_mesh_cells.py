@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 import pytest
 import sample_meshes as samples
+from refusals import refused
 from uneven_volume import uneven
 
 from clrecon.errors import NoSurfaceError, UsageError
@@ -122,13 +123,13 @@ def test_what_cannot_be_compared_is_refused():
         measure_cells(empty, box, on)
     with pytest.raises(NoSurfaceError, match="the reference passes through no cell"):
         measure_cells(box, empty, on)
-    with pytest.raises(UsageError, match=r"wholly outside .* from \[14, 14, 14\] to \[19, 19, 19\]"):
+    with refused(UsageError, 14, 19):
         measure_cells(far, box, on)
     with pytest.raises(UsageError, match="does not belong to this grid"):
         find_mesh_cells(Mesh([[0, 0, 0], [3e6, 0, 0], [0, 1, 0]], [[0, 1, 2]]), on)
-    with pytest.raises(UsageError, match="more than 1048576 from the first voxel"):
+    with refused(UsageError, 1048576):
         GridCells([[0, 0, 1 << 20]])
-    with pytest.raises(UsageError, match="whole numbers of shape"):
+    with refused(UsageError, "shape", 3):
         GridCells([[0.5, 1, 2]])
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 from variants import daily
 
 from clrecon.errors import RefusedInputError, UsageError
@@ -66,7 +67,7 @@ def test_missing_slices_are_told_and_read_when_allowed(tmp_path: Path) -> None:
     names = sorted(path.name for path in (tmp_path / "ct").glob("*.dcm"))
     assert len(names) == truth["shape_ijk"][2] == 17
     assert {"IM0008.dcm", "IM0009.dcm", "IM0015.dcm"}.isdisjoint(names)
-    with pytest.raises(RefusedInputError, match="missing between"):
+    with refused(RefusedInputError, "allow_gaps=True", 2):
         read_volume(tmp_path / "ct")
     volume = read_volume(tmp_path / "ct", allow_gaps=True)
     assert volume.report["slices_missing"] == 3
@@ -97,7 +98,7 @@ def test_numbers_of_slices_are_read(text: str, numbers: tuple[int, ...]) -> None
 
 @pytest.mark.parametrize("text", ["", "a", "3-", "5-3", "1.5", "-2", "3,,4", "\u0663"])
 def test_other_numbers_of_slices_are_refused(text: str) -> None:
-    with pytest.raises(UsageError, match="like 20-22,40"):
+    with refused(UsageError, 20, 22):
         parse_missing(text)
 
 

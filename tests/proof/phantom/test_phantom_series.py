@@ -9,6 +9,7 @@ import numpy as np
 import pydicom
 import pytest
 import tolerances
+from refusals import refused
 from variants import daily
 
 from clrecon.errors import OutputError, UsageError
@@ -182,6 +183,6 @@ def test_a_file_that_reads_back_differently_is_an_error(tmp_path: Path, monkeypa
         path.write_bytes(bytes(data))
 
     monkeypatch.setattr(pydicom.FileDataset, "save_as", spoil)
-    with pytest.raises(OutputError, match="IM0001.dcm does not read back"):
+    with refused(OutputError, "IM0001.dcm"):
         write_phantom(tmp_path / "ct", PhantomSettings(kind="sphere", **AWKWARD))
     assert list(tmp_path.iterdir()) == []

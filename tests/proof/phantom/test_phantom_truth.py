@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tolerances
+from refusals import refused
 from variants import daily
 
 import clrecon
@@ -156,7 +157,7 @@ def test_points_that_are_none_are_refused(points: list) -> None:
 
 
 def test_scenes_have_no_surface_as_a_function() -> None:
-    with pytest.raises(UsageError, match="see its materials.nrrd"):
+    with refused(UsageError, "materials.nrrd"):
         clrecon.phantom_truth(PhantomSettings(kind="skull"))
 
 

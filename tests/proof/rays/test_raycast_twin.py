@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tolerances
 from raycast_scenes import STEPS, centre_of, even_volume, look, uneven_volume
+from refusals import refused
 from scipy.ndimage import map_coordinates
 
 from clrecon.errors import UsageError
@@ -203,7 +204,7 @@ def test_jitter_lies_within_each_segment_the_last_one_too():
 def test_nothing_is_cast_in_a_mode_that_is_not_there():
     volume = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
     camera = Camera.fit(volume)
-    with pytest.raises(UsageError, match="dvr, mip, minip, mean"):
+    with refused(UsageError, "xray", "minip"):
         cast_rays(volume, None, camera, (4, 4), mode="xray")
-    with pytest.raises(UsageError, match="transfer function"):
+    with refused(UsageError, "function", "transfer"):
         cast_rays(volume, None, camera, (4, 4))

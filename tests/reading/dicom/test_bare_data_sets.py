@@ -8,6 +8,7 @@ from dicom_series import Plan, make_dataset, save_dataset, write_series
 from enhanced_image import make_enhanced
 from hostile_bytes import NATIVE, make_series, save_bytes
 from pydicom.uid import JPEG2000Lossless
+from refusals import refused
 
 from clrecon.cli.main import main
 from clrecon.errors import NoDicomError, RefusedInputError
@@ -53,7 +54,7 @@ def write_cut(folder, files, cut):
 @pytest.mark.parametrize("name", ENCODINGS)
 def test_row_36_a_bare_data_set_is_read_on_demand_alone(tmp_path, name, cut):
     folder = write_cut(tmp_path / "ct", make_series(NATIVE[name]), cut)
-    with pytest.raises((NoDicomError, RefusedInputError), match="force=True") as caught:
+    with refused((NoDicomError, RefusedInputError), "force=True") as caught:
         read_volume(folder)
     assert isinstance(caught.value, NoDicomError if cut is cut_all else RefusedInputError)
     volume = read_volume(folder, force=True)
@@ -68,7 +69,7 @@ def test_row_36_a_meta_header_without_preamble_is_read_on_demand_alone(tmp_path,
     files = make_series(syntax)
     whole = read_volume(write_cut(tmp_path / "whole", files, bytes))
     folder = write_cut(tmp_path / "ct", files, cut)
-    with pytest.raises(NoDicomError, match="3 like a data set without preamble"):
+    with refused(NoDicomError, 3, "data"):
         read_volume(folder)
     volume = read_volume(folder, force=True)
     assert np.array_equal(volume.voxels, whole.voxels)
@@ -78,7 +79,7 @@ def test_row_36_a_meta_header_without_preamble_is_read_on_demand_alone(tmp_path,
 def test_row_36_one_bare_slice_is_not_lost_in_silence(tmp_path):
     folder = write_cut(tmp_path / "ct", make_series(NATIVE["explicit"]), bytes)
     (folder / "2").write_bytes(cut_all((folder / "2").read_bytes()))
-    with pytest.raises(RefusedInputError, match=r"2: a data set without preamble \(force=True"):
+    with refused(RefusedInputError, "force=True", 2):
         read_volume(folder)
     volume = read_volume(folder, force=True)
     assert volume.voxels.shape[0] == 3
@@ -91,22 +92,22 @@ def test_row_36_one_bare_slice_is_not_lost_in_silence(tmp_path):
 )
 def test_row_36_force_makes_nothing_of_other_files(tmp_path, content):
     (tmp_path / "file").write_bytes(content)
-    with pytest.raises(NoDicomError, match="no DICOM images"):
+    with refused(NoDicomError, "DICOM", "images"):
         read_volume(tmp_path, force=True)
 
 
 def test_row_36_a_bare_enhanced_image_is_refused_with_its_reason(tmp_path):
     (tmp_path / "image").write_bytes(cut_all(save_bytes(make_enhanced(PLAN))))
-    with pytest.raises(RefusedInputError, match="image: multi-frame image without preamble or meta header"):
+    with refused(RefusedInputError, "image", "header"):
         read_volume(tmp_path, force=True)
 
 
-def test_row_36_on_the_command_line(tmp_path, capsys):
+def test_row_36_on_the_command_line(tmp_path, printed):
     folder = write_cut(tmp_path / "ct", make_series(NATIVE["implicit"]), cut_all)
     assert main(["info", str(folder)]) == 2
-    assert "--force" in capsys.readouterr().err
+    printed().assert_error("--force")
     assert main(["info", str(folder), "--force"]) == 0
-    assert "implicit VR little endian taken" in capsys.readouterr().out
+    printed().assert_output("VR")
 
 
 def test_long_headers_and_cut_pixels(tmp_path):
@@ -119,7 +120,7 @@ def test_long_headers_and_cut_pixels(tmp_path):
         (tmp_path / f"{k}").write_bytes(cut_all((tmp_path / f"{k}").read_bytes()))
     assert np.array_equal(read_volume(tmp_path, force=True).voxels, plan.hu())
     (tmp_path / "1").write_bytes((tmp_path / "1").read_bytes()[:-1])
-    with pytest.raises(RefusedInputError, match="1: truncated: 24 bytes of pixels expected .*, 23 found"):
+    with refused(RefusedInputError, 1, 24, 23):
         read_volume(tmp_path, force=True)
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.reading.dicom.pixels import decoder_pool, decoder_process
 from clrecon.reading.dicom.pixels.decoder_pool import DecoderError, DecoderPool
@@ -77,7 +78,7 @@ def test_row_40_a_decoder_that_hangs_is_ended():
     with make_pool("hang", seconds=1.5) as pool:
         assert np.array_equal(decode(pool), PIXELS)
         start = time.monotonic()
-        with pytest.raises(DecoderError, match=r"take longer than 1\.5 s to decode"):
+        with refused(DecoderError, 1.5):
             decode(pool, "hang")
         assert time.monotonic() - start < 10
         assert np.array_equal(decode(pool), PIXELS)

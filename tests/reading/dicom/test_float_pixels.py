@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from dicom_series import Plan, set_values, write_series
 from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
+from refusals import refused
 from stored_pixels import set_pixels
 
 from clrecon.errors import RefusedInputError
@@ -77,13 +78,13 @@ def test_row_32_nan_and_infinite_voxels(tmp_path, value, words):
         return array
 
     write_series(tmp_path, change=set_floats(spoil))
-    with pytest.raises(RefusedInputError, match=rf"slice003\.dcm: Float Pixel Data holds {words}: those are no HU"):
+    with refused(RefusedInputError, "slice003", "Float", "Pixel", "Data"):
         read_volume(tmp_path)
 
 
 def test_row_32_all_nan(tmp_path):
     write_series(tmp_path, change=set_floats(lambda array, k: array * np.nan))
-    with pytest.raises(RefusedInputError, match="holds 30 NaN and 0 infinite values of 30"):
+    with refused(RefusedInputError, "NaN", 30, 0):
         read_volume(tmp_path)
 
 

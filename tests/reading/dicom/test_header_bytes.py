@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pydicom.datadict import keyword_for_tag
+from refusals import refused
 
 from clrecon.errors import RefusedInputError
 from clrecon.reading.dicom.headers import multiframe
@@ -76,7 +77,7 @@ def test_elements_behind_the_pixels(tail):
     ids=["cut", "two", "before", "cut-value", "after-padding", "no-letter", "no-capital", "cut-long"],
 )
 def test_what_are_no_elements_behind_the_pixels(tail):
-    with pytest.raises(CorruptFileError, match=f"^{len(tail)} bytes behind the pixel data are no elements of DICOM$"):
+    with refused(CorruptFileError, len(tail), "DICOM"):
         check_tail(tail)
 
 
@@ -89,7 +90,7 @@ def test_two_capital_letters_are_a_value_representation(vr):
 
 @pytest.mark.parametrize("vr", [b"@A", b"A@", b"[A", b"A[", b"aa"])
 def test_other_bytes_are_no_value_representation(vr):
-    with pytest.raises(ValueProblem, match="has no VR within explicit VR"):
+    with refused(ValueProblem, "VR"):
         _Walk(element(0x00100010, vr), 0).read_head(0, 8, EXPLICIT)
     assert _looks_implicit(io.BytesIO(element(0x00080005, vr)), 0) is True
 
@@ -117,7 +118,7 @@ def test_a_thousand_fragments_a_frame_and_a_thousand_more():
     file = fragments(2000)
     assert [len(pieces) for pieces in transfer_syntaxes.find_frames(file, 0, len(file.getvalue()), 1, RLE)] == [1999]
     file = fragments(2001)
-    with pytest.raises(RefusedInputError, match="in more than 2000 fragments"):
+    with refused(RefusedInputError, 2000):
         transfer_syntaxes.find_frames(file, 0, len(file.getvalue()), 1, RLE)
 
 
@@ -150,7 +151,7 @@ def test_an_even_number_of_bytes_has_no_byte_of_padding(tmp_path, more, said):
 @pytest.mark.parametrize(("rows", "columns"), [(0, 5), (5, 0), (0, 0)])
 def test_images_without_rows_or_columns(rows, columns):
     _check_matrix(1, "MONOCHROME2", 1, 1)
-    with pytest.raises(ValueProblem, match=f"is {rows} x {columns}"):
+    with refused(ValueProblem, rows, columns):
         _check_matrix(1, "MONOCHROME2", rows, columns)
 
 
@@ -167,7 +168,7 @@ def test_a_single_slice_may_say_that_it_has_one_frame():
     for text in (b"", b"0 ", b"1 "):
         assert count_frames(values_of(frames=(0x00280008, text, "IS")), "1.2") == 1
     assert count_frames(values_of(frames=(0x00280008, b"2 ", "IS")), "1.2") == 2
-    with pytest.raises(ValueProblem, match="multi-frame image of 65537 frames"):
+    with refused(ValueProblem, 65537, "image"):
         count_frames(values_of(frames=(0x00280008, b"65537", "IS")), "1.2")
 
 
@@ -204,7 +205,7 @@ def test_elements_that_converters_leave_over_and_where_a_data_set_begins():
 
 
 def test_a_header_of_more_than_256_mib_is_not_read():
-    with pytest.raises(ValueProblem, match="a header of 268435457 bytes, no more than 268435456 are read"):
+    with refused(ValueProblem, 268435457, 268435456):
         multiframe._read_header_bytes(Path("none"), SimpleNamespace(pixel_offset=2**28 + 1))  # type: ignore[arg-type]
     with pytest.raises(OSError):
         multiframe._read_header_bytes(Path("none"), SimpleNamespace(pixel_offset=2**28))  # type: ignore[arg-type]
@@ -235,7 +236,7 @@ def test_the_codestream_in_a_jp2_file(form, before):
         b"\xff\x4f\xff\x51 codes"
     )
     for data in (start, start + bytes(7), start + struct.pack(">L4s", 7, b"uuid") + bytes(20)):
-        with pytest.raises(RefusedInputError, match="a JP2 file without a codestream"):
+        with refused(RefusedInputError, "JP2"):
             stored._unwrap_jp2(data)
 
 

@@ -23,6 +23,7 @@ from compressed_frames import (
 )
 from dicom_series import Plan, make_dataset, save_dataset, write_series
 from pydicom.encaps import encapsulate
+from refusals import refused
 from variants import daily
 
 from clrecon.errors import RefusedInputError
@@ -68,7 +69,7 @@ def test_row_38_small_bytes_for_a_large_frame_are_a_bomb(tmp_path):
     """In the head of codestream and header alike: the size is the same lie."""
     data = encode_jpeg_2000(IMAGES[0])
     data = data[:8] + struct.pack(">2L", 65535, 65535) + data[16:]
-    with pytest.raises(RefusedInputError, match=r"bytes would unfold to 8589672450, more than 1000 times as many"):
+    with refused(RefusedInputError, 8589672450, 1000):
         stored.read_codestream(data, JPEG + "90", 65535, 65535, 16)
     air = np.zeros((512, 512), np.uint16)
     (pixels,) = place(tmp_path, encapsulate([encode_jpeg_2000(air)]) + END, rows=512, columns=512)
@@ -113,9 +114,7 @@ def test_row_40_the_file_that_does_not_decode_is_named(tmp_path):
         ds.PixelData = encapsulate([bytes(frame)])
         ds["PixelData"].VR = "OB"
         save_dataset(ds, tmp_path / f"{k}.dcm")
-    with pytest.raises(
-        RefusedInputError, match=rf"^1\.dcm: the compressed pixels \(transfer syntax {RLE}\) do not dec"
-    ):
+    with refused(RefusedInputError, 1, RLE):
         read_volume(tmp_path)
 
 

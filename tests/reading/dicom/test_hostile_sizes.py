@@ -10,6 +10,7 @@ import pytest
 from dicom_series import Plan, make_dataset, save_dataset, write_series
 from pydicom.encaps import encapsulate
 from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEG2000Lossless
+from refusals import refused
 from variants import daily
 
 from clrecon.errors import RefusedInputError
@@ -48,7 +49,7 @@ def test_the_end_of_a_value_is_not_looked_for_in_all_of_a_large_file(tmp_path, m
 
 def test_a_value_of_gigabytes_is_not_read(tmp_path):
     spoil(tmp_path, element(0x28, 0x1053, b"UT", 0xF0000000), size=1 << 33)
-    with pytest.raises(RefusedInputError, match=r"slice003\.dcm: its header takes more than 4194304 bytes to read"):
+    with refused(RefusedInputError, "slice003.dcm", 4194304):
         read_volume(tmp_path)
 
 
@@ -95,7 +96,7 @@ def test_row_38_a_compressed_frame_of_gigabytes_is_not_read(tmp_path):
         file.write(data[: place - 4] + struct.pack("<L", length) + start)
         file.seek(place + length)
         file.write(struct.pack("<HHL", 0xFFFE, 0xE0DD, 0))
-    with pytest.raises(RefusedInputError, match=r"slice003\.dcm: the compressed frame has 4026531840 bytes for 60 of"):
+    with refused(RefusedInputError, "slice003.dcm", 4026531840, 60):
         read_volume(tmp_path)
 
 
@@ -106,9 +107,7 @@ def test_row_38_empty_fragments_are_counted(tmp_path):
     data = write_compressed(path, start + bytes(100))
     place = data.index(start) - 8
     path.write_bytes(data[:place] + 5000 * struct.pack("<HHL", 0xFFFE, 0xE000, 0) + data[place:])
-    with pytest.raises(
-        RefusedInputError, match=r"slice003\.dcm: the compressed pixels are in more than 2000 fragments"
-    ):
+    with refused(RefusedInputError, "slice003.dcm", 2000):
         read_volume(tmp_path)
 
 
@@ -118,5 +117,5 @@ def test_no_memory_is_an_error_of_the_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr(StoredPixels, "_inflate", fail)
     write_series(tmp_path, Plan(syntax=DeflatedExplicitVRLittleEndian))
-    with pytest.raises(RefusedInputError, match=r"slice00\d\.dcm: there is not enough memory to read its pixels"):
+    with refused(RefusedInputError, "memory"):
         read_volume(tmp_path)

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 from dicom_series import Plan, write_series
+from refusals import refused
 
 from clrecon.errors import NoDicomError, RefusedInputError
 from clrecon.reading import Selection, list_series, read_volume
@@ -48,7 +49,7 @@ def test_slices_that_are_links_refuse_the_series_unless_they_are_followed(tmp_pa
 
 def test_a_folder_of_links_alone_says_how_they_are_followed(tmp_path, plan):
     move_out(tmp_path / "ct", map(plan.name, range(9)), tmp_path / "store")
-    with pytest.raises(NoDicomError, match=r"link out of the folder: 9\); follow_links=True follows links"):
+    with refused(NoDicomError, "follow_links=True", 9):
         read_volume(tmp_path / "ct")
     assert np.array_equal(read_volume(tmp_path / "ct", follow_links=True).voxels, plan.hu())
 
@@ -58,7 +59,7 @@ def test_a_link_that_leads_nowhere_may_have_been_a_slice(tmp_path, plan):
     os.symlink("../.git/annex/objects/lost", tmp_path / "ct" / plan.name(8))
     os.symlink("round", tmp_path / "ct" / "round")
     for follow in (False, True):
-        with pytest.raises(RefusedInputError, match="round: link to a file that is not there, slice008.dcm: link to"):
+        with refused(RefusedInputError, "slice008.dcm"):
             read_volume(tmp_path / "ct", follow_links=follow)
     assert list_series(tmp_path / "ct").skipped == {"link to a file that is not there": 2}
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from dicom_series import Plan, make_dataset, save_dataset, set_values, write_series
 from pydicom.uid import MRImageStorage
+from refusals import refused
 
 from clrecon.errors import NoDicomError, RefusedInputError
 from clrecon.reading import list_series, read_volume
@@ -73,7 +74,7 @@ def test_a_folder_that_cannot_be_read(tmp_path, deny):
 def test_unreadable_files_alone_are_no_dicom(tmp_path, deny):
     write_series(tmp_path, Plan(shape=(1, 5, 6)))
     deny(tmp_path / "slice000.dcm")
-    with pytest.raises(NoDicomError, match=r"1 file looked at \(not readable: 1\)"):
+    with refused(NoDicomError, "file", "readable", 1):
         read_volume(tmp_path)
 
 
@@ -142,5 +143,5 @@ def test_what_may_be_left_of_a_slice(tmp_path, name, content, words):
     assert np.array_equal(volume.voxels, plan.hu())
     assert volume.report["files"]["skipped"] == {"not DICOM": 1}
     assert volume.report["warnings"] == ([f"1 skipped: {words.split(': ')[1]}"] if words else [])
-    with pytest.raises(NoDicomError, match=r"1 file looked at \(not DICOM: 1\)"):
+    with refused(NoDicomError, "DICOM", 1):
         read_volume(tmp_path / name)

@@ -14,6 +14,7 @@ from pydicom.uid import (
     ExplicitVRLittleEndian,
     ImplicitVRLittleEndian,
 )
+from refusals import refused
 from stored_pixels import set_pixels
 from tolerances import AFFINE_MM
 from variants import daily
@@ -223,14 +224,14 @@ def test_short_pixel_data_names_both_sizes(tmp_path):
     write_series(tmp_path)
     file = tmp_path / "slice003.dcm"
     file.write_bytes(file.read_bytes()[:-10])
-    with pytest.raises(RefusedInputError, match=r"slice003\.dcm: truncated: 60 bytes of pixels expected .* 50 found"):
+    with refused(RefusedInputError, "slice003.dcm", 60, 6, 5):
         read_volume(tmp_path)
 
 
 def test_row_39_memory_is_asked_for_before_it_is_taken(tmp_path, monkeypatch):
     write_series(tmp_path)
     monkeypatch.setattr(memory, "available_memory_bytes", lambda: 100.0)
-    with pytest.raises(RefusedInputError, match="volume of 6 x 5 x 7 voxels needs"):
+    with refused(RefusedInputError, 6, 5, 7):
         read_volume(tmp_path)
     monkeypatch.undo()
     assert 1e7 < memory.available_memory_bytes() <= memory.physical_memory_bytes()
@@ -245,7 +246,7 @@ def test_row_38_a_deflate_bomb_is_not_inflated(tmp_path, monkeypatch):
         ds.PixelData = bytes(1_000 * 1_000 * 2)
         save_dataset(ds, tmp_path / plan.name(k))
     assert sum(file.stat().st_size for file in tmp_path.iterdir()) < 10_000
-    with pytest.raises(RefusedInputError, match="no more than 1000000 are inflated"):
+    with refused(RefusedInputError, 1000000):
         read_volume(tmp_path)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from dicom_series import Plan
+from refusals import refused
 from value_series import SHAPE, make_body, write_values
 from variants import FOR_RELEASE
 
@@ -53,19 +54,19 @@ def test_rescale_that_is_no_slope_and_intercept_is_refused(tmp_path, given):
     if given is None:
         assert read_volume(folder, rescale=given).hu_range == (make_body().min(), make_body().max())
         return
-    with pytest.raises(UsageError, match="rescale needs a slope other than 0 and an intercept"):
+    with refused(UsageError, 0, "rescale"):
         read_volume(folder, rescale=given)
 
 
-def test_info_takes_rescale_as_slope_and_intercept(tmp_path, capsys):
+def test_info_takes_rescale_as_slope_and_intercept(tmp_path, printed):
     folder = str(write_values(tmp_path, make_body(), RescaleIntercept=0))
     assert main(["info", folder, "--pixels", "--strict", "--rescale", "1,-1024"]) == 0
-    shown = capsys.readouterr()
-    assert "slope 1, intercept -1024, as given" in shown.out
+    shown = printed()
+    shown.assert_output(1, -1024)
     assert main(["info", folder, "--rescale", "1"]) == 3
-    assert "'1' is no slope and intercept: SLOPE,INTERCEPT, such as 1,-1024" in capsys.readouterr().err
+    printed().assert_error("SLOPE", "INTERCEPT", 1, -1024)
     assert main(["info", folder, "--rescale", "0,3"]) == 3
-    assert "--rescale needs a slope other than 0" in capsys.readouterr().err
+    printed().assert_error("--rescale", 0)
 
 
 @pytest.mark.seconds

@@ -14,6 +14,7 @@ import pytest
 from dicom_series import ROOT, Plan, make_dataset, save_dataset, set_raw, set_values, write_series
 from pydicom.data import get_testdata_file
 from pydicom.uid import MRImageStorage, SecondaryCaptureImageStorage
+from refusals import refused
 
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.reading import list_series, read_volume
@@ -95,16 +96,16 @@ def test_a_vague_name_lists_those_that_match(two_series):
 def test_the_start_of_a_hash_or_uid_names_a_series(two_series):
     for wanted in (hash_of(5)[:4], hash_of(5)[:10].upper(), f"{ROOT}.5"[:-1] + "5"):
         assert read_volume(two_series, wanted).report["series"]["number"] == 2
-    with pytest.raises(UsageError, match="no series matches"):
+    with refused(UsageError, "series", 2, 4):
         read_volume(two_series, hash_of(5)[:3])  # three characters are not enough
-    with pytest.raises(UsageError, match="2 series match series '"):
+    with refused(UsageError, 2, "series"):
         read_volume(two_series, ROOT)  # the start of both UIDs
 
 
 def test_two_series_of_equal_size_need_a_choice(tmp_path):
     write_series(tmp_path, Plan(series=1))
     write_series(tmp_path, Plan(series=2, name="x{}".format))
-    with pytest.raises(RefusedInputError, match=r"2 CT series have 7 slices each, choose one with series: \[1: CT"):
+    with refused(RefusedInputError, "CT", 2, 7, 1):
         read_volume(tmp_path)
     listing = list_series(tmp_path)
     assert listing.chosen is None
@@ -117,7 +118,7 @@ def test_a_faulty_largest_series_is_not_passed_over(two_series):
     ds = pydicom.dcmread(file)
     set_raw("PixelSpacing", "0\\0")(ds, 3)
     ds.save_as(file)
-    with pytest.raises(RefusedInputError, match=r"^series 1: b3: PixelSpacing"):
+    with refused(RefusedInputError, "b3", "PixelSpacing", 1):
         read_volume(two_series)
     smaller = read_volume(two_series, 2)
     assert smaller.voxels.shape == (4, 5, 6)
@@ -134,9 +135,7 @@ def test_of_two_equal_series_the_usable_one_is_taken(tmp_path):
         " series 2 is read, the only one of its size that can be used"
     ]
     write_series(tmp_path, Plan(series=3, name="y{}".format))
-    with pytest.raises(
-        RefusedInputError, match=r"2 CT series have 7 slices each, choose one .*: \[2: .*\[3: "
-    ) as caught:
+    with refused(RefusedInputError, "CT", 2, 7, 3) as caught:
         read_volume(tmp_path)
     assert "[1: " not in str(caught.value)
 
@@ -146,9 +145,7 @@ def test_of_equal_series_without_a_usable_one_none_is_taken(tmp_path):
         spoil = set_raw("PixelSpacing", "0\\0", only=3)
         write_series(tmp_path, Plan(series=number, name=f"{number}-{{}}".format), spoil)
     write_series(tmp_path, Plan(series=3, shape=(4, 5, 6), name="3-{}".format))
-    with pytest.raises(
-        RefusedInputError, match=r"7 slices each and none can be used: \[series 1: 1-3: Pix.*\[series 2: 2-3: Pix"
-    ):
+    with refused(RefusedInputError, "PixelSpacing", 7, 1, 3):
         read_volume(tmp_path)
 
 
@@ -164,7 +161,7 @@ def test_old_multi_frame_images_do_not_win_over_a_usable_stack(tmp_path, frames)
     assert volume.report["warnings"] == [
         "1 other CT series not used: [2: CT, 1 slice]; series 1 is read, with the most slices"
     ]
-    with pytest.raises(RefusedInputError, match=f"many: multi-frame image of {frames} frames, SOP class"):
+    with refused(RefusedInputError, frames, "SOP"):
         read_volume(tmp_path, 2)
 
 
@@ -203,23 +200,23 @@ def test_a_secondary_capture_in_the_series_is_parted(tmp_path):
 def test_other_modalities_are_listed_and_never_chosen(tmp_path):
     change = set_values(Modality="MR", SOPClassUID=MRImageStorage)
     write_series(tmp_path, change=change)
-    with pytest.raises(NoDicomError, match="found 1 series of modality MR, no CT series"):
+    with refused(NoDicomError, "MR", "CT", 1):
         read_volume(tmp_path)
     listing = list_series(tmp_path)
     assert (listing.chosen, listing.series[0].modality, listing.series[0].slices) == (None, "MR", 7)
     assert listing.series[0].problems == ["modality MR is not CT"]
     write_series(tmp_path, Plan(series=2, shape=(3, 5, 6), name="ct{}".format))
     assert read_volume(tmp_path).report["series"]["modality"] == "CT"
-    with pytest.raises(NoDicomError, match="series 1 is of modality MR, not CT"):
+    with refused(NoDicomError, "MR", "CT", 1):
         read_volume(tmp_path, 1)
 
 
 def test_single_slices_never_win(tmp_path):
     for number in (1, 2):
         write_series(tmp_path, Plan(series=number, shape=(1, 5, 6), name=f"{number}-{{}}".format))
-    with pytest.raises(RefusedInputError, match="a single slice cannot make a surface: 2 series of one slice each"):
+    with refused(RefusedInputError, 2, "surface"):
         read_volume(tmp_path)
-    with pytest.raises(RefusedInputError, match="a single slice cannot make a surface"):
+    with refused(RefusedInputError, "surface"):
         read_volume(tmp_path / "1-0")
 
 
@@ -270,7 +267,7 @@ def test_no_patient_data_and_no_folder_in_the_report(tmp_path):
 
 def test_a_refusal_names_files_and_not_the_description(tmp_path):
     write_series(tmp_path, Plan(leave_out=(2,)), set_values(SeriesDescription="Doe, spine"))
-    with pytest.raises(RefusedInputError, match=r"^series 1: 1 slice missing .*: slice001\.dcm, slice003\.dcm; find"):
+    with refused(RefusedInputError, "slice001.dcm", "slice003.dcm", 1):
         read_volume(tmp_path)
 
 
@@ -301,7 +298,7 @@ def test_folders_without_images_are_refused(tmp_path):
 
 def test_corrupt_files_alone_are_refused(tmp_path):
     (tmp_path / "bad").write_bytes(bytes(128) + b"DICM" + b"\xff" * 50)
-    with pytest.raises(RefusedInputError, match="no readable DICOM file in .*, corrupt: bad: "):
+    with refused(RefusedInputError, "DICOM"):
         read_volume(tmp_path)
 
 
@@ -320,7 +317,7 @@ def test_links_and_pipes_are_passed_over(tmp_path):
         volume = read_volume(folder, follow_links=follow)
         assert np.array_equal(volume.voxels, plan.hu())
         assert volume.report["files"]["skipped"] == {"link inside the folder": 2, "not a regular file": 3}
-    with pytest.raises(NoDicomError, match="neither a folder nor a regular file"):
+    with refused(NoDicomError, "regular"):
         read_volume(folder / "pipe")
     os.symlink(folder, tmp_path / "named")
     assert read_volume(tmp_path / "named").report["slices"] == 7
@@ -336,12 +333,12 @@ def test_dicomdir_trees_of_pydicom(tmp_path):
     assert listing.skipped["DICOMDIR"] >= 1
     ct = [entry for entry in listing.series if entry.modality == "CT"]
     assert [entry.slices for entry in ct] == [4, 2, 5]  # folders CT2, CT2N and CT5N
-    with pytest.raises(NoDicomError, match="a DICOMDIR only lists files"):
+    with refused(NoDicomError, "DICOMDIR", "lists"):
         read_volume(folder / "DICOMDIR")
 
 
 def test_ct_small_of_pydicom():
-    with pytest.raises(RefusedInputError, match="a single slice cannot make a surface"):
+    with refused(RefusedInputError, "surface"):
         read_volume(get_testdata_file("CT_small.dcm"))
     entry = list_series(get_testdata_file("CT_small.dcm")).series[0]
     assert entry.shape_ijk == [128, 128, 1]

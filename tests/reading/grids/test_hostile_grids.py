@@ -11,6 +11,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from label_files import OBLIQUE, write_nifti, write_nrrd
+from refusals import refused
 from variants import daily
 from volume_files import WRITERS, make_ct, write_metaimage
 
@@ -192,7 +193,7 @@ def test_units_of_length_become_mm(tmp_path):
     volume = clrecon.read_volume(write_nrrd(tmp_path / "a.nrrd", make_ct(), micron, **{"space units": ["um"] * 3}))
     assert np.allclose(volume.affine, OBLIQUE, atol=1e-9)
     path = write_nrrd(tmp_path / "b.nrrd", make_ct(), **{"space units": ["mm", "mm", "parsec"]})
-    with pytest.raises(RefusedInputError, match="unknown units"):
+    with refused(RefusedInputError, "b.nrrd", "unknown"):
         clrecon.read_volume(path)
     for code, scale in ((1, 1000.0), (3, 1e-3), (0, 1.0)):
         path = write_nifti(tmp_path / "a.nii", make_ct(), np.diag((2.0, 3.0, 4.0, 1.0)))
@@ -239,7 +240,7 @@ def test_one_point_in_time_is_a_volume_and_several_are_refused(tmp_path, frames)
         if frames == 1:
             assert np.array_equal(clrecon.read_volume(path).voxels, voxels[0])
         else:
-            with pytest.raises(RefusedInputError, match=r"has 4 axes \(7 x 6 x 4 x 5\): a volume has three.*5"):
+            with refused(RefusedInputError, 4, 7, 6):
                 clrecon.read_volume(path)
 
 
@@ -254,26 +255,26 @@ def write_nrrd_frames(path, voxels, fields):
 def test_colours_are_refused(tmp_path):
     colours = np.zeros((7, 6, 4), dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")])
     nibabel.save(nibabel.Nifti1Image(colours, np.eye(4)), tmp_path / "a.nii")
-    with pytest.raises(RefusedInputError, match="is not a volume: its voxels are colours"):
+    with refused(RefusedInputError, "volume", "voxels", "a.nii"):
         clrecon.read_volume(tmp_path / "a.nii")
     path = write_nrrd(tmp_path / "a.nrrd", np.zeros((4, 6, 7, 3), np.uint8), kinds=["RGB-color"] + ["domain"] * 3)
-    with pytest.raises(RefusedInputError, match="has 4 axes"):
+    with refused(RefusedInputError, 4, "axes"):
         clrecon.read_volume(path)
     path = write_nrrd(tmp_path / "b.nrrd", np.zeros((4, 6, 7, 2), np.uint8))
-    with pytest.raises(RefusedInputError, match="has 4 axes"):
+    with refused(RefusedInputError, 4, "axes"):
         clrecon.read_volume(path)
 
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_single_slice_is_no_volume(tmp_path, name):
     path = WRITERS[name](tmp_path / name, make_ct((1, 6, 7)), OBLIQUE)
-    with pytest.raises(RefusedInputError, match="7 x 6 x 1 voxels: a volume has two at least along each axis"):
+    with refused(RefusedInputError, 7, 6, 1):
         clrecon.read_volume(path)
 
 
 def test_a_field_of_nrrd_without_its_value_is_refused(tmp_path):
     path = edit(write_nrrd(tmp_path / "a.nrrd", make_ct()), b"space origin: ", b"space origin: \n#")
-    with pytest.raises(RefusedInputError, match="corrupt NRRD header"):
+    with refused(RefusedInputError, "NRRD", "header"):
         clrecon.read_volume(path)
 
 
@@ -287,18 +288,18 @@ def test_without_a_position_it_is_refused(tmp_path):
 
 def test_an_analyze_file_is_refused(tmp_path):
     nibabel.save(nibabel.AnalyzeImage(make_ct().transpose(2, 1, 0), np.eye(4)), tmp_path / "a.hdr")
-    with pytest.raises(RefusedInputError, match="Analyze files do not say where they lie"):
+    with refused(RefusedInputError, "Analyze"):
         clrecon.read_volume(tmp_path / "a.hdr")
 
 
 def test_the_voxels_of_a_pair_stay_beside_their_header(tmp_path):
     (tmp_path / "in").mkdir()
     path = WRITERS["a.hdr"](tmp_path / "in" / "a.hdr", make_ct(), OBLIQUE)
-    with pytest.raises(RefusedInputError, match="of a NIfTI pair give the .hdr"):
+    with refused(RefusedInputError, "NIfTI"):
         clrecon.read_volume(tmp_path / "in" / "a.img")
     (tmp_path / "in" / "a.img").rename(tmp_path / "a.img")
     (tmp_path / "in" / "a.img").symlink_to(tmp_path / "a.img")
-    with pytest.raises(RefusedInputError, match="a link to another folder"):
+    with refused(RefusedInputError, "a.img", "a.hdr"):
         clrecon.read_volume(path)
 
 

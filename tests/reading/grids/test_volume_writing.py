@@ -5,6 +5,7 @@ from __future__ import annotations
 import dicom_series
 import numpy as np
 import pytest
+from refusals import refused
 from uneven_volume import uneven
 
 from clrecon import Volume, read_volume, write_volume
@@ -112,9 +113,9 @@ def test_the_certificate_is_in_the_file(tmp_path):
 
 def test_uneven_slices_and_sheared_mha_are_refused(tmp_path):
     for name in NAMES:
-        with pytest.raises(UsageError, match=r"slices of this volume are uneven .*resample"):
+        with refused(UsageError, "slices", "volume"):
             write_volume(uneven(), tmp_path / name)
-    with pytest.raises(UsageError, match=r"sheared by 12.00 degrees.*resample"):
+    with refused(UsageError, ".nii.gz", 12.0):
         write_volume(scan(tmp_path, "tilted"), tmp_path / "a.mha")
     assert not [path for path in tmp_path.iterdir() if path.name != "ct"]
 
@@ -122,7 +123,7 @@ def test_uneven_slices_and_sheared_mha_are_refused(tmp_path):
 def test_other_names_are_refused(tmp_path):
     volume = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
     for name in ("a.stl", "a", ".nii", "a.gz", "a.mhd"):
-        with pytest.raises(UsageError, match=r"one of \.nii\.gz, \.nii, \.nrrd, \.mha"):
+        with refused(UsageError, ".nii.gz"):
             write_volume(volume, tmp_path / name)
     with pytest.raises(UsageError, match="a volume is written"):
         write_volume(volume.voxels, tmp_path / "a.nii")
@@ -158,5 +159,5 @@ def test_uneven_slices_resample_to_their_own_linear_field(tmp_path):
     assert write_volume(volume, tmp_path / "a.mha", resample=0.4) > made.voxels.size
     assert sitk.ReadImage(str(tmp_path / "a.mha")).GetSize() == made.shape_ijk
     for step in (0.0, -1.0, np.nan, 0.001):
-        with pytest.raises(UsageError, match="at least 0.01 mm"):
+        with refused(UsageError, 0.01):
             resample_volume(volume, step)

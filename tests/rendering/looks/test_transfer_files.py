@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 from tolerances import FLOAT64_SHARE, STEP_SIDE
 from variants import daily
 
@@ -154,9 +155,9 @@ def test_the_python_of_the_document_runs() -> None:
 
 def test_an_older_file_stays_when_the_new_one_cannot_be_written(tmp_path: Path) -> None:
     function = TransferFunction([(1, 0, 0, 0, 0), (2, 1, 1, 1, 1)])
-    with pytest.raises(OutputError, match="missing|no folder|not there|does not exist"):
+    with refused(OutputError, "f.json", "folder"):
         function.save(tmp_path / "gone" / "f.json")
-    with pytest.raises(OutputError, match="folder"):
+    with refused(OutputError, "folder"):
         function.save(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
@@ -300,19 +301,19 @@ def test_slicer_presets_by_name_and_number(tmp_path: Path) -> None:
     two = load_transfer_function(path, "2")
     assert (two.name, two.lighting) == ("CT-Two", UNSHADED)
     assert two([0, 25, 50]).tolist() == [[0.2, 0.4, 0.6, 0], [0.2, 0.4, 0.6, 0.5], [0.2, 0.4, 0.6, 1]]
-    with pytest.raises(UsageError, match="3 transfer functions, choose one by name: 'CT-One', 'CT-Two', 'broken'"):
+    with refused(UsageError, "CT-One", "CT-Two", 3):
         load_transfer_function(path)
     for name in ("CT-Three", "4", "0", "\u00b2"):
-        with pytest.raises(UsageError, match=f"no transfer function named '{name}'; there are: 'CT-One'"):
+        with refused(UsageError, name, "CT-One"):
             load_transfer_function(path, name)
-    with pytest.raises(RefusedInputError, match=r"line 7 \('broken'\): scalarOpacity says 5"):
+    with refused(RefusedInputError, "broken", "scalarOpacity", 7, 5):
         load_transfer_function(path, "broken")
     assert (
         load_transfer_function(put(tmp_path, XML.replace("utf-8", "utf-16").encode("utf-16"), "16.xml"), "CT-One")
         == one
     )
     twice = put(tmp_path, XML.replace("CT-Two", "CT-One"), "twice.xml")
-    with pytest.raises(UsageError, match="2 transfer functions named 'CT-One'"):
+    with refused(UsageError, "CT-One", 2):
         load_transfer_function(twice, "CT-One")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.reading import read_volume
@@ -86,7 +87,7 @@ def test_what_cannot_be_compared_is_refused(one, other, said):
 
 
 def test_a_background_that_is_no_colour_is_refused():
-    with pytest.raises(UsageError, match="0 to 255"):
+    with refused(UsageError, 0, 255):
         measure_pictures(picture(), picture(), background=300)
 
 

@@ -10,6 +10,7 @@ import pytest
 import tolerances
 from picture_files import PARALLEL, PERSPECTIVE, make_picture
 from PIL import Image
+from refusals import refused
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.rendering.looks.colors import COLORS, find_color
@@ -93,7 +94,7 @@ def test_jpeg_keeps_an_opaque_picture(tmp_path):
 
 
 def test_jpeg_loses_no_opacity_silently(tmp_path):
-    with pytest.raises(UsageError, match="transparent background: choose PNG"):
+    with refused(UsageError, "PNG", "background"):
         make_picture(background=CLEAR).save(tmp_path / "a.jpg")
     assert not list(tmp_path.iterdir())
     make_picture(background=CLEAR).with_background("white").save(tmp_path / "a.jpg")
@@ -148,7 +149,7 @@ def test_wrong_names_are_refused(tmp_path, save, message):
 
 
 def test_a_missing_folder_is_said(tmp_path):
-    with pytest.raises(OutputError, match="does not exist, make it first"):
+    with refused(OutputError, "a.png", "none", "folder"):
         make_picture().save(tmp_path / "none" / "a.png")
 
 
@@ -160,7 +161,7 @@ def test_a_full_disk_leaves_the_older_picture(tmp_path, monkeypatch):
         total, free = 10**9, 100
 
     monkeypatch.setattr("clrecon.system.files.shutil.disk_usage", lambda folder: Usage)
-    with pytest.raises(OutputError, match="are free in"):
+    with refused(OutputError, "a.png", "MB", "free"):
         make_picture().save(path)
     assert path.read_bytes() == b"older"
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.png"]
@@ -187,7 +188,7 @@ def test_a_missing_pillow_is_said(monkeypatch):
     monkeypatch.setitem(sys.modules, "PIL", None)
     monkeypatch.setattr(sys, "path", [])
     monkeypatch.setattr(sys, "path_importer_cache", {})
-    with pytest.raises(UsageError, match="Pillow cannot be imported"):
+    with refused(UsageError, "Pillow"):
         make_picture().save("a.png")
 
 

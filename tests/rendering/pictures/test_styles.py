@@ -10,6 +10,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.labels import LabelMap
@@ -157,18 +158,18 @@ def test_styles_do_not_change_and_travel(style: type[Style]) -> None:
 
 
 def test_two_that_exclude_each_other_are_refused() -> None:
-    with pytest.raises(UsageError, match="by a window or by a transfer function"):
+    with refused(UsageError, "window", "function"):
         SlicesInSpace(window=(0, 9), transfer_function=GLASS)
-    with pytest.raises(UsageError, match="angle turns straightened pictures"):
+    with refused(UsageError, "angle", "pictures", 5.0):
         CurveCut(LINE, kind="stretched", angle=5.0)
-    with pytest.raises(UsageError, match="one colour or are coloured by hu, not both"):
+    with refused(UsageError, "colour", "coloured"):
         PointLook(color="red", color_by="hu")
     for look in ({"color": "red"}, {"color_by": "label"}):
-        with pytest.raises(UsageError, match="colour the points by them"):
+        with refused(UsageError, "colour", "points", "color_by"):
             PointLook(window=(0, 1), **look)
-    with pytest.raises(UsageError, match="label 2 L2 is named twice"):
+    with refused(UsageError, "L2", 2):
         VolumeLook(labels=LABELS, label_colors={"L2": "red", 2: "blue"})
-    with pytest.raises(UsageError, match="no label 'L9'|L9"):
+    with refused(UsageError, "L9", "L2"):
         SurfaceLook(labels=LABELS, label_opacity={"L9": 0.5})
 
 
@@ -261,9 +262,9 @@ def test_a_style_stands_alone() -> None:
     assert find_style(style, {}) is style
     assert find_style("mip", {"window": (1, 2)}) == Projection(window=(1.0, 2.0))
     assert find_style(None, {"mode": "mip"}) == Projection()
-    with pytest.raises(UsageError, match="leave out color and preset, or the style"):
+    with refused(UsageError, "color", "preset"):
         find_style(style, {"color": "red", "preset": "bone"})
-    with pytest.raises(UsageError, match="the mode is given twice, as 'mip' and as 'dvr'"):
+    with refused(UsageError, "mip", "dvr"):
         find_style("mip", {"mode": "dvr"})
 
 
@@ -272,7 +273,7 @@ def test_keywords_are_fields() -> None:
     for mode, kind in MODES.items():
         assert set(keywords_of(mode).values()) == {own.name for own in fields(kind.style)}
     check_known("mip", "values")
-    with pytest.raises(UsageError, match="clip_box means nothing in mode cpr"):
+    with refused(UsageError, "clip_box", "mode"):
         check_known("cpr", "clip", "clip_box")
 
 

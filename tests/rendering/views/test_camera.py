@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tolerances
+from refusals import refused
 from variants import daily
 
 from clrecon.errors import UsageError
@@ -82,7 +83,7 @@ def test_azimuth_goes_to_the_left_and_elevation_to_the_head():
 def test_an_option_says_angles_with_a_comma_and_is_said_so():
     for text, view in (("left", "left"), ("25,-10.5", (25.0, -10.5))):
         assert read_view(text) == view and say_view(read_view(text)) == text
-    with pytest.raises(UsageError, match="unknown view '1,2,3': .*, or AZIMUTH,ELEVATION in degrees.* such as 30,15"):
+    with refused(UsageError, "AZIMUTH", "ELEVATION", 1, 3, 30):
         read_view("1,2,3")
 
 
@@ -211,9 +212,7 @@ def test_zoom_magnifies():
     "view", ["front", "", "1,2,3", "10", (1,), (0, 91), "25,10", (np.nan, 0), (np.inf, 0), 5, None, ("a", "b")]
 )
 def test_unknown_views_list_the_known_ones(view):
-    with pytest.raises(
-        UsageError, match="anterior, posterior, left, right, superior, inferior, or .azimuth, elevation. in"
-    ):
+    with refused(UsageError, "azimuth", "elevation"):
         Camera.fit(box(), view)
 
 
@@ -252,7 +251,7 @@ def test_impossible_fits_are_refused(arguments, message):
     ],
 )
 def test_impossible_cameras_are_refused(arguments):
-    with pytest.raises(UsageError, match="camera"):
+    with refused(UsageError, "camera"):
         Camera(**{"position": (0, -100, 0), "focal_point": (0, 0, 0), "up": (0, 0, 1), **arguments})
 
 

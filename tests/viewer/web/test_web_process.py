@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 import view_scenes as scenes
+from printed_text import Printer
 from variants import daily
 from web_views import browsing
 
@@ -128,18 +129,16 @@ def test_wrong_arguments_are_said_before_anything_is_read(
     assert said in error and error.count("\n") == 1
 
 
-def test_a_port_that_is_taken_is_said_before_anything_is_read(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_port_that_is_taken_is_said_before_anything_is_read(printed: Printer) -> None:
     with bind_port() as listener:
         port = listener.getsockname()[1]
         assert main(["view", "no_such_folder", "--port", str(port)]) == 3
-    assert (
-        f"port {port} of 127.0.0.1 is taken by another program: name another with --port N" in capsys.readouterr().err
-    )
+    printed().assert_error(port, "--port")
 
 
-def test_an_input_that_is_not_there_ends_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_input_that_is_not_there_ends_the_command(printed: Printer) -> None:
     assert main(["view", "no_such_folder"]) in (2, 3)
-    assert "no_such_folder" in capsys.readouterr().err
+    printed().assert_error("no_such_folder")
 
 
 @pytest.mark.unit
