@@ -119,16 +119,18 @@ def _sample_plane(
 
 Own = TypeVar("Own", bound=BaseVolume)
 
-SMALLEST_STEP_MM = 0.01
+_SMALLEST_STEP_MM = 0.01
 MOST_VOXELS = 2**31
 """Most voxels of a resampled volume: 4 GiB of int16."""
 
 
 def check_step(step_mm: float) -> None:
     number = isinstance(step_mm, int | float | np.integer | np.floating)
-    if not (number and math.isfinite(step_mm) and step_mm >= SMALLEST_STEP_MM):
+    if not (number and math.isfinite(step_mm) and step_mm >= _SMALLEST_STEP_MM):
         shown = f"{step_mm:g}" if number else repr(step_mm)[:40]
-        raise UsageError(f"the step of a resampled volume is a length of at least {SMALLEST_STEP_MM:g} mm, not {shown}")
+        raise UsageError(
+            f"the step of a resampled volume is a length of at least {_SMALLEST_STEP_MM:g} mm, not {shown}"
+        )
 
 
 def check_count(regular: RegularGrid, steps: str) -> None:

@@ -33,7 +33,7 @@ COLORS = {
 _FADED = {"solid": ("canal",), "dense": ("canal",), "trabecular": ("solid", "canal"), "canal": ("solid",)}
 """Parts that are seen faded beside each opaque one: those that it does not hide."""
 
-FADED_OPACITY = 0.15
+_FADED_OPACITY = 0.15
 
 
 def check_pictures(picture: str | Path, view: str) -> None:
@@ -62,7 +62,9 @@ def draw_parts(
     for part, mesh in meshes.items():
         shown = [(mesh, MeshLook(COLORS[part]))]
         shown += [
-            (meshes[other], MeshLook(COLORS[other], opacity=FADED_OPACITY)) for other in _FADED[part] if other in meshes
+            (meshes[other], MeshLook(COLORS[other], opacity=_FADED_OPACITY))
+            for other in _FADED[part]
+            if other in meshes
         ]
         with ScenePictures(shown, device=device, memory=memory) as scene:
             pictures[part] = scene.take(camera, DEFAULT_SIZE, "white")

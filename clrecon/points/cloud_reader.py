@@ -22,7 +22,7 @@ log = get_logger(__name__)
 _FEWEST_OF_A_BODY = 100
 """Points from which on the size of a cloud is looked at."""
 
-SMALLEST_MM, LARGEST_MM = 3.0, 5000.0
+_SMALLEST_MM, LARGEST_MM = 3.0, 5000.0
 """Sides of the box of what a CT shows; 2 m in metres, and 5 mm in micrometres, lie beyond."""
 
 
@@ -96,8 +96,10 @@ def _check_points(points: np.ndarray, name: str) -> None:
 def _doubt_unit(points: np.ndarray) -> list[str]:
     """Return a warning where a cloud is as small as a patient in metres, or larger than one in mm."""
     size = points.max(axis=0).astype(np.float64) - points.min(axis=0)
-    if len(points) < _FEWEST_OF_A_BODY or SMALLEST_MM <= size.max() <= LARGEST_MM or not size.max() > 0.0:
+    if len(points) < _FEWEST_OF_A_BODY or _SMALLEST_MM <= size.max() <= LARGEST_MM or not size.max() > 0.0:
         return []
     box = " x ".join(f"{side:.3g}" for side in size)
-    unit = "metres: then multiply them by 1000" if size.max() < SMALLEST_MM else "micrometres: then divide them by 1000"
+    unit = (
+        "metres: then multiply them by 1000" if size.max() < _SMALLEST_MM else "micrometres: then divide them by 1000"
+    )
     return [f"the points lie in a box of {box}, which is read as mm; perhaps they are in {unit}"]

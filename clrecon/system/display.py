@@ -20,7 +20,7 @@ SECONDS = 30.0
 _SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "swr", "software")
 """Words of drivers that draw with the processor."""
 
-TRIES = 4
+_TRIES = 4
 """Attempts to reach the display, a tenth of a second apart."""
 
 _CHILD = """\
@@ -34,7 +34,7 @@ if sys.platform.startswith("linux"):
         x11 = None
     if x11 is not None:
         x11.XOpenDisplay.restype = ctypes.c_void_p
-        for attempt in range(TRIES):  # a server that has just lost its last client begins anew, and is deaf meanwhile
+        for attempt in range(_TRIES):  # a server that has just lost its last client begins anew, and is deaf meanwhile
             if x11.XOpenDisplay(None):
                 break
             time.sleep(0.1)
@@ -96,7 +96,7 @@ class DisplayProbe:
         else:
             try:
                 self._child = subprocess.Popen(
-                    [sys.executable, "-c", _CHILD.replace("TRIES", str(TRIES))],
+                    [sys.executable, "-c", _CHILD.replace("_TRIES", str(_TRIES))],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.PIPE,
                     stderr=subprocess.DEVNULL,

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from clrecon.mesh.compare.walls import WallLook
     from clrecon.mesh.components import Labelled
 
-CONTRAST_SHARE = 0.04
+_CONTRAST_SHARE = 0.04
 """Share of a bone surface that looks like contrast medium and is reported from here on; spongy bone gives 0.03."""
 OTHER_SHARE = 0.05
 """Share of a surface in one component that is no bone, and is warned of from here on."""
@@ -267,7 +267,7 @@ def _warn_of_whole(part: Part, settings: MeshSettings) -> list[str]:
             return []
         return [f"{where} {_looks(judged)}; {name_parameter('keep', 'bone')} keeps what looks like bone"]
     other = None if part.bones is None or part.bones.other_share < OTHER_SHARE else part.bones.other
-    even = judged["contrast_share"] >= CONTRAST_SHARE
+    even = judged["contrast_share"] >= _CONTRAST_SHARE
     if part.bones is not None and other is not None and not (even and other["looks_like"] == "contrast medium"):
         return [
             f"{where} is in part no bone: one of {count_of(part.bones.components, 'component')},"

@@ -83,11 +83,11 @@ def make_parts(source: str | Path, run: Run, check_map: Callable[[LabelMap], Non
     make_solid = _remember_filled(volume, solid)
     del solid
     run.lap("surface")
-    steps = Steps(run.progress if settings.selects else None, "select", SELECT_STEPS * len(surfaces))
+    steps = Steps(run.progress if settings.selects else None, "select", _SELECT_STEPS * len(surfaces))
     parts: list[Part] = []
     for place, (surface, mesh) in enumerate(zip(surfaces, extracted, strict=True), start=1):
         parts += select_parts(surface, mesh, settings, device.current, volume, steps)
-        steps.take(SELECT_STEPS * place - steps.done)
+        steps.take(_SELECT_STEPS * place - steps.done)
     return MadeParts(volume, make_solid, parts, device, choice, origins)
 
 
@@ -274,10 +274,10 @@ def drop_outside_air(volume: Volume, settings: MeshSettings, progress: Progress)
     return volume
 
 
-CRUMB_ML, CRUMB_SHARE, MANY_COMPONENTS = 0.1, 0.01, 100
+_CRUMB_ML, _CRUMB_SHARE, _MANY_COMPONENTS = 0.1, 0.01, 100
 """A mesh of more components than this below this volume, or this share of all where it is small, gets a warning."""
 
-SELECT_STEPS = 4
+_SELECT_STEPS = 4
 """Steps of the selection from a surface, as progress counts them: pieces, components, bone, and what is kept."""
 
 
@@ -327,7 +327,7 @@ def extract_surfaces(
 def select_parts(
     surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device, volume: Volume, steps: Steps
 ) -> list[Part]:
-    """Keep the components that are asked for, and measure what the purpose needs; `steps` counts `SELECT_STEPS`."""
+    """Keep the components that are asked for, and measure what the purpose needs; `steps` counts `_SELECT_STEPS`."""
     if not settings.is_for_print:
         return _select_parts(surface, mesh, settings, device, volume, steps)
     found = measure_pieces(mesh.vertices, mesh.triangles)
@@ -401,14 +401,14 @@ def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings, device: Device
 
     warnings = []
     for part in parts:
-        if part.quality is None or part.quality.components <= MANY_COMPONENTS or settings.min_volume_ml is not None:
+        if part.quality is None or part.quality.components <= _MANY_COMPONENTS or settings.min_volume_ml is not None:
             continue
         mesh = part.mesh
         labelled = label_parts(mesh, device, settings)
         ml = np.abs(enclosed_mm3(mesh.vertices - local_origin(mesh.vertices), mesh.triangles, *labelled)) / 1000.0
-        crumb_ml = float(f"{min(CRUMB_ML, CRUMB_SHARE * float(ml.sum())):.1g}")
+        crumb_ml = float(f"{min(_CRUMB_ML, _CRUMB_SHARE * float(ml.sum())):.1g}")
         small = ml[ml < crumb_ml]
-        if len(small) > MANY_COMPONENTS:
+        if len(small) > _MANY_COMPONENTS:
             warnings.append(
                 f"{f'{part.name}: ' if part.name else ''}{len(small):,} of {len(ml):,} components enclose less than"
                 f" {format_ml(crumb_ml)} each, {format_ml(float(small.sum()))} together:"

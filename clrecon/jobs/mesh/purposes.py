@@ -82,7 +82,7 @@ LEFT_SHARE = 0.5
 OTHER_SHARE = 0.05
 """Share of ml without walls like bone, beside all parts, from which on there is a warning: ribs in coarse voxels."""
 
-THIN_SHARE = 0.05
+_THIN_SHARE = 0.05
 """Share of the surface with thin walls from which on there is a warning."""
 
 
@@ -122,7 +122,7 @@ def warn_of_print(facts: dict[str, Any]) -> list[str]:
     """Return warnings about the facts of `describe_print`: thin walls, closed cavities, the wrong piece."""
     warnings = []
     wall, left_out = facts["wall"], facts["left_out"]
-    if wall["thin_share"] is not None and wall["thin_share"] > THIN_SHARE:
+    if wall["thin_share"] is not None and wall["thin_share"] > _THIN_SHARE:
         warnings.append(
             f"{100 * wall['thin_share']:.0f} % of the surface has a wall below {wall['thin_mm']:g} mm, which can break"
             f" or be lost in a print: lower {name_parameter('iso_value')}, or print it larger"

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
 
 
-SHIFT_SHARE, FEWEST_TOLD = 0.1, 0.5
+_SHIFT_SHARE, _FEWEST_TOLD = 0.1, 0.5
 """A level that changes the volume by this share is warned of, where so much of the surface has told."""
 
 
@@ -106,11 +106,11 @@ def warn_of_shift(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
         if not cortex or not cortex.get("vertices") or cortex["moved"]:
             continue
         told, shift = cortex["fitted"] / cortex["vertices"], cortex["outside_mm"]["mean"]
-        if told < FEWEST_TOLD:
+        if told < _FEWEST_TOLD:
             continue
         area, volume = _measure_size(part)
         excess = shift * told * area
-        if volume > 0.0 and (share := excess / max(volume - excess, 0.2 * volume)) >= SHIFT_SHARE:
+        if volume > 0.0 and (share := excess / max(volume - excess, 0.2 * volume)) >= _SHIFT_SHARE:
             found.setdefault(part.surface.phrase, []).append((share, shift, part.name))
     return [_describe_shifts(phrase, sorted(shifts)) for phrase, shifts in found.items()]
 

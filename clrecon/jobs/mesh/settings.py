@@ -97,12 +97,12 @@ class LabelChoice:
         return {number: as_point(color) for number, color in zip(numbers, own, strict=True)} | given
 
 
-LABEL_SEED = "label:"
+_LABEL_SEED = "label:"
 """What a seed that is a label begins with."""
 
 
 def is_label_seed(seed: object) -> bool:
-    return isinstance(seed, str) and seed.startswith(LABEL_SEED)
+    return isinstance(seed, str) and seed.startswith(_LABEL_SEED)
 
 
 def check_point(seed: Sequence[float]) -> None:
@@ -124,7 +124,7 @@ def check_growing(
     for seed in grow_from:
         if not isinstance(seed, str):
             check_point(seed)
-        elif seed != "auto" and not (is_label_seed(seed) and seed[len(LABEL_SEED) :].strip()):
+        elif seed != "auto" and not (is_label_seed(seed) and seed[len(_LABEL_SEED) :].strip()):
             raise UsageError(f"{name_parameter('grow_from')} is auto, X,Y,Z in mm or label:NAME, not {seed!r}")
     from clrecon.geometry.vertices import check_vertex_rule
     from clrecon.operators.surface.methods import check_method
@@ -154,7 +154,7 @@ def find_seeds(grow_from: Sequence[str | Sequence[float]], space: str, labels: L
         if not isinstance(seed, str):
             seeds.append((frame_from_lps(space).T @ seed).tolist())
         elif is_label_seed(seed):
-            name = seed[len(LABEL_SEED) :].strip()
+            name = seed[len(_LABEL_SEED) :].strip()
             seeds.append((labels, int(name) if name.isascii() and name.isdigit() else name))
         else:
             seeds.append(seed)
@@ -183,8 +183,8 @@ def _parse_seed(text: str) -> str | tuple[float, ...]:
     """Read ``auto``, ``label:NAME`` or ``X,Y,Z``."""
     if text.lower() == "auto":
         return "auto"
-    if text.lower().startswith(LABEL_SEED):
-        return f"{LABEL_SEED}{text[len(LABEL_SEED) :]}"
+    if text.lower().startswith(_LABEL_SEED):
+        return f"{_LABEL_SEED}{text[len(_LABEL_SEED) :]}"
     try:
         return parse_point(text)
     except ValueError:
@@ -553,7 +553,7 @@ class MeshSettings(InputSettings):
 
     @property
     def seed_labels(self) -> tuple[str, ...]:
-        return tuple(str(seed)[len(LABEL_SEED) :] for seed in self.grow_from if is_label_seed(seed))
+        return tuple(str(seed)[len(_LABEL_SEED) :] for seed in self.grow_from if is_label_seed(seed))
 
     @property
     def method_used(self) -> MethodName:

@@ -91,10 +91,10 @@ def _digits(value: float) -> str:
     return text.removesuffix(".0")
 
 
-HIGHEST_DRY_HU, DRY_HU = -100, -200
+_HIGHEST_DRY_HU, _DRY_HU = -100, -200
 """Thin walls of a dry specimen, in air, stay below the first; the second finds those of the phantoms."""
 
-THICK_SLICES_MM = 2.5
+_THICK_SLICES_MM = 2.5
 """Spacing from which on the half-way level can be too high: at 3 mm it loses blurred thin walls (docs/iso_value.md)."""
 
 
@@ -158,7 +158,7 @@ def describe_level(
                 f"{material} was given as {hu:g} HU, but the volume runs from {format_hu(low)} to {format_hu(high)} HU:"
                 " the level half way may not be that of this scan"
             )
-    if choice.method == "auto" and volume.spacing[2] > THICK_SLICES_MM:
+    if choice.method == "auto" and volume.spacing[2] > _THICK_SLICES_MM:
         warnings.append(
             f"slices are {volume.spacing[2]:.3g} mm apart: walls thinner than that may be lost at"
             f" {choice.iso_value:g} HU; compare with a lower iso value, such as {name_parameter('preset', 'bone')}"
@@ -171,11 +171,11 @@ def _warn_of_specimen(volume: Volume, settings: MeshSettings) -> list[str]:
     from clrecon.anatomy.materials import lies_in_air
 
     level = max((hu for hu in settings.levels if not isinstance(hu, tuple)), default=-math.inf)
-    if settings.surface != "cortex" or level <= HIGHEST_DRY_HU or not lies_in_air(volume):
+    if settings.surface != "cortex" or level <= _HIGHEST_DRY_HU or not lies_in_air(volume):
         return []
     return [
         f"the scan shows no soft tissue but air, as that of a dry specimen does: walls that stay below {level:g} HU are"
-        f" not in the surface and cannot be fitted; {name_parameter('iso_value', DRY_HU)} finds them"
+        f" not in the surface and cannot be fitted; {name_parameter('iso_value', _DRY_HU)} finds them"
     ]
 
 

@@ -21,7 +21,7 @@ from clrecon.system.records import Record
 SAMPLES = 100_000
 """Most points; larger meshes are measured at every n-th vertex and triangle."""
 
-METAL_REACH = 2
+_METAL_REACH = 2
 """Voxels: at metal a level of bone lies in the outermost ones; the surface is a staircase, which smoothing leaves."""
 
 _STEPS = 12
@@ -210,7 +210,7 @@ class IsoDistance(Record):
 
     samples: ``vertices`` and ``centres`` that were measured.
     not_found: Points from which no surface was reached; the figures are of the others.
-    near_metal: Measured vertices within `METAL_REACH` voxels of a voxel above `METAL_HU`.
+    near_metal: Measured vertices within `_METAL_REACH` voxels of a voxel above `METAL_HU`.
     surface_voxel: Of vertices and centres together: decimation leaves vertices outside of what is round, and centres
         inside, so that neither alone is how far the surface lies.
     away_from_metal_voxel: Without those near metal, of vertices or of both, whichever is nearer; None where these are
@@ -296,11 +296,11 @@ def _summarise(distances: Float64Array, unit_mm: float = 1.0) -> DistanceSummary
 
 
 def _find_near_metal(volume: Volume, rule: IsoRule, points: Float64Array) -> NDArray[np.bool_]:
-    """Return which points have a voxel above `METAL_HU` within `METAL_REACH`; none at a level of metal."""
+    """Return which points have a voxel above `METAL_HU` within `_METAL_REACH`; none at a level of metal."""
     near = np.zeros(len(points), np.bool_)
     if max(rule.levels) >= METAL_HU or volume.hu_range is None or volume.hu_range[1] <= METAL_HU:
         return near
-    reach = range(-METAL_REACH, METAL_REACH + 1)
+    reach = range(-_METAL_REACH, _METAL_REACH + 1)
     voxels = _Voxels(volume, rule, np.rint(volume.lps_to_ijk(points)).astype(np.int64), reach)
     for step in product(reach, repeat=3):
         near |= voxels.at(step) > METAL_HU

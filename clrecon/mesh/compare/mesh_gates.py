@@ -8,15 +8,15 @@ from typing import Any
 from clrecon.geometry import METAL_HU
 from clrecon.system.records import Gate, at_most, is_true, none_of, unmeasured
 
-DEVIATION_P95_VOXEL = 0.25
+_DEVIATION_P95_VOXEL = 0.25
 """Bound for 95 % of the surface, in shortest voxel steps."""
 
 DEVIATION_MEAN_VOXEL = 0.1
-VOLUME_CHANGE_PERCENT = 0.5
-MASK_VOLUME_PERCENT = 1.0
+_VOLUME_CHANGE_PERCENT = 0.5
+_MASK_VOLUME_PERCENT = 1.0
 """Bound for the label's own surface, in percent of its volume: extraction takes 0.03 %, the rest is for refinement."""
 
-LABEL_VOLUME_PERCENT = 15.0
+_LABEL_VOLUME_PERCENT = 15.0
 """Bound for a surface placed by HU, in percent of the label's volume.  Solid surfaces of vertebrae differ by -7 to 11 %
 where the iso value fits the bone, and by -14 to -29 % above thin cortex; hollow ones by -32 to -80 %.
 """
@@ -55,7 +55,7 @@ def judge_mesh(
 
 def judge_label_volume(mesh_ml: float | None, label_ml: float, advice: str = "", *, by_hu: bool = True) -> Gate:
     """Compare the volume of a label's mesh, None where it is open, with its voxels'; `by_hu`: HU placed the surface."""
-    name, bound = "label_volume", LABEL_VOLUME_PERCENT if by_hu else MASK_VOLUME_PERCENT
+    name, bound = "label_volume", _LABEL_VOLUME_PERCENT if by_hu else _MASK_VOLUME_PERCENT
     if mesh_ml is None:
         return unmeasured(name, bound, "%", "a surface that is open at the border of the scan encloses no volume")
     change = 100.0 * (mesh_ml / label_ml - 1.0)
@@ -90,7 +90,7 @@ def _gates_of_iso_distance(iso_distance: Mapping[str, Any], extracted: bool) -> 
     what = "vertices and centres of triangles from which no trilinear iso surface was reached"
     yield none_of("iso_distance_found", iso_distance["not_found"], what)
     what = "distance of the mesh from the trilinear iso surface"
-    measures = (("p95", DEVIATION_P95_VOXEL, "95 % of it"), ("mean", DEVIATION_MEAN_VOXEL, "mean"))
+    measures = (("p95", _DEVIATION_P95_VOXEL, "95 % of it"), ("mean", DEVIATION_MEAN_VOXEL, "mean"))
     known = [iso_distance.get(name) for name in ("vertices_voxel", *["surface_voxel"] * (not extracted))]
     found = min(filter(None, known), key=lambda one: float(one["mean"]), default=None)
     near, away = iso_distance.get("near_metal", 0), None if extracted else iso_distance.get("away_from_metal_voxel")
@@ -110,9 +110,9 @@ def _gates_of_iso_distance(iso_distance: Mapping[str, Any], extracted: bool) -> 
 def _gates_of_deviation(deviation: Mapping[str, Any], voxel_mm: float, closed: bool) -> Iterator[Gate]:
     p95, mean = deviation["hd95_mm"] / voxel_mm, deviation["assd_mm"] / voxel_mm
     what = "distance from the surface before smoothing and decimation"
-    yield at_most("deviation_p95", p95, DEVIATION_P95_VOXEL, "voxel", f"{what}, 95 % of it")
+    yield at_most("deviation_p95", p95, _DEVIATION_P95_VOXEL, "voxel", f"{what}, 95 % of it")
     yield at_most("deviation_mean", mean, DEVIATION_MEAN_VOXEL, "voxel", f"{what}, mean")
     change = deviation["volume_change_percent"]
     if closed and change is not None:
         what = "change of volume by smoothing and decimation"
-        yield at_most("volume_change", abs(change), VOLUME_CHANGE_PERCENT, "%", what)
+        yield at_most("volume_change", abs(change), _VOLUME_CHANGE_PERCENT, "%", what)

@@ -26,21 +26,21 @@ from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import find_bounds
 from clrecon.system.progress import Progress, ignore_progress
 
-DEFAULT_MIN_SAMPLES = 6
+_DEFAULT_MIN_SAMPLES = 6
 
-PLANE_PLUS_ONE = "plane+1"
+_PLANE_PLUS_ONE = "plane+1"
 """For min_samples: one more than the members of the stencil in a slice, so that a lone slice is noise."""
 
-WIDE_GAP = 1.5
+_WIDE_GAP = 1.5
 """Slice gap in pixels above which ``plane+1`` takes much bone too."""
 
 LAYER_MM = 0.02
 """Points whose heights differ by less lie in one layer: files round."""
 
-FEWEST_LAYERS = 4
+_FEWEST_LAYERS = 4
 """Layers, and points a layer on average, from which on points without an affine are taken to lie in slices."""
 
-PLACES_CHECKED = 1 << 14
+_PLACES_CHECKED = 1 << 14
 """Points, evenly spread over the cloud, whose places are compared with their voxels: all would take as long as the
 search itself."""
 
@@ -68,7 +68,7 @@ class Clustering(PointStep):
 def cluster_points(
     cloud: PointCloud | Volume | DeviceVolume,
     eps: float | None = None,
-    min_samples: int | str = DEFAULT_MIN_SAMPLES,
+    min_samples: int | str = _DEFAULT_MIN_SAMPLES,
     *,
     hu: ArrayLike | Sequence[float | None] | None = None,
     volume: Volume | DeviceVolume | None = None,
@@ -177,15 +177,15 @@ class _Request:
                 f"eps {used:g} mm is below the largest slice gap of {lattice.largest_gap:.4g} mm: clusters end there,"
                 " and each slice is a sheet"
             )
-        if min_samples == PLANE_PLUS_ONE:
+        if min_samples == _PLANE_PLUS_ONE:
             samples = checked_min_samples(stencil.in_plane + 1)
-            if lattice.largest_gap > WIDE_GAP * lattice.pixel:
+            if lattice.largest_gap > _WIDE_GAP * lattice.pixel:
                 warnings.append(
-                    f"min_samples {PLANE_PLUS_ONE} ({samples}) takes much bone where slices are"
-                    f" {lattice.largest_gap / lattice.pixel:.1f} pixels apart (over {WIDE_GAP:g})"
+                    f"min_samples {_PLANE_PLUS_ONE} ({samples}) takes much bone where slices are"
+                    f" {lattice.largest_gap / lattice.pixel:.1f} pixels apart (over {_WIDE_GAP:g})"
                 )
         elif isinstance(min_samples, str):
-            raise UsageError(f"min_samples is {min_samples!r}: a whole number, or {PLANE_PLUS_ONE}, is needed")
+            raise UsageError(f"min_samples is {min_samples!r}: a whole number, or {_PLANE_PLUS_ONE}, is needed")
         else:
             samples = int(min_samples)
         return cls(lattice, used, samples, stencil, tuple(warnings))
@@ -295,8 +295,8 @@ def _layer_step(along: NDArray[Any]) -> float:
     heights = np.sort(along.astype(np.float64))
     gaps = np.diff(heights)
     between = gaps[gaps > LAYER_MM]
-    in_layers = len(between) >= FEWEST_LAYERS and np.ptp(heights) - between.sum() <= LAYER_MM * len(between)
-    return float(np.median(between)) if in_layers and len(between) * FEWEST_LAYERS <= len(heights) else 0.0
+    in_layers = len(between) >= _FEWEST_LAYERS and np.ptp(heights) - between.sum() <= LAYER_MM * len(between)
+    return float(np.median(between)) if in_layers and len(between) * _FEWEST_LAYERS <= len(heights) else 0.0
 
 
 def _cluster_cloud(
@@ -403,7 +403,7 @@ def _find_lattice(cloud: PointCloud, volume: Volume | None) -> tuple[Lattice, ND
 
 def _stride(cloud: PointCloud) -> int:
     """Return the step from one point whose place is compared to the next."""
-    return max(1, len(cloud) // PLACES_CHECKED)
+    return max(1, len(cloud) // _PLACES_CHECKED)
 
 
 def _check_places(places: NDArray[np.float64], cloud: PointCloud, *, is_given: bool) -> None:

@@ -41,16 +41,16 @@ from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 
-EPS_TOLERANCE = 1e-6
+_EPS_TOLERANCE = 1e-6
 """Distances up to eps times one more than this are within eps."""
 
 LEAST_EPS_MM = 1e-9
 """Smallest eps: squares of smaller ones leave the range of float32."""
 
-UNSURE_SHARE = 1e-6
+_UNSURE_SHARE = 1e-6
 """Part of the limit's square within which kernels decide in sums of two floats; both ends are given to them."""
 
-CELL_SLACK = 1e-3
+_CELL_SLACK = 1e-3
 """Part by which cells are smaller than they could be, besides the rounding of the grid."""
 
 FORWARD_ROWS = kernel_constant("points/cell_links.h", "FORWARD_ROWS")
@@ -62,7 +62,7 @@ CHUNKS_A_CORE = 2
 CELLS_A_CHUNK = 32
 """Cells of a chunk on other devices, and fewest on a CPU."""
 
-CELLS_AN_ITEM = 32
+_CELLS_AN_ITEM = 32
 """Neighbouring cells of a work-item of hook_cells and find_firsts on a CPU."""
 
 
@@ -95,7 +95,7 @@ def plan_cells(points: ArrayLike, eps: float) -> GridPlan:
         return plan_grid(places, 1.01 * float(extent.max()) if extent.any() else 1.0)
     edge = eps / math.sqrt(3.0)
     along = float(extent.max()) / edge
-    return plan_grid(places, edge * (1.0 - CELL_SLACK - min(4e-7 * along, 0.1)))
+    return plan_grid(places, edge * (1.0 - _CELL_SLACK - min(4e-7 * along, 0.1)))
 
 
 def cluster_free_points(
@@ -161,7 +161,7 @@ def find_clusters(
     memory: int | None = None,
     progress: Progress = ignore_progress,
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], int, int]:
-    """Return labels, cores, numbers of clusters and cells of a plan; equal for any `per_chunk` of `CELLS_AN_ITEM`."""
+    """Return labels, cores, numbers of clusters and cells of a plan; equal for any `per_chunk` of `_CELLS_AN_ITEM`."""
     n = len(plan.points)
     needs = {**plan.needs(device), "clusters": 23 * n}
     require_room(memory_limits(device, memory), needs, "the clusters of the points cannot be found")
@@ -196,7 +196,7 @@ class ClusterSearch:
         self._samples = min_samples
         nx, ny, nz = grid.shape
         self._total_words = grid.words * ny * nz
-        limit = min(eps, 2.0 * grid.edge * math.hypot(nx, ny, nz)) * (1.0 + EPS_TOLERANCE)
+        limit = min(eps, 2.0 * grid.edge * math.hypot(nx, ny, nz)) * (1.0 + _EPS_TOLERANCE)
         self._reach_squared = (limit / grid.edge * (1.0 + 1e-5) + 1e-5 + 4e-7 * max(grid.shape)) ** 2
         self._where: dict[str, Any] = {
             "x": grid.x_d, "y": grid.y_d, "z": grid.z_d, "starts": grid.starts_d, "mask": grid.mask_d,
@@ -204,7 +204,7 @@ class ClusterSearch:
             "nz": nz, "words": grid.words, "cells": grid.cells,
         }  # fmt: skip
         self._per_chunk = self._plan_chunk() if per_chunk is None else per_chunk
-        self._per_item = CELLS_AN_ITEM if self._is_cpu else 1
+        self._per_item = _CELLS_AN_ITEM if self._is_cpu else 1
         self.core_x_d = allocate(device, 4 * (grid.n + PADDING))
         self.labels_d, self._other_d, self._firsts_d = (allocate(device, 4 * grid.cells) for _ in range(3))
         self.roots_d = allocate(device, 4 * self._total_words)
@@ -332,6 +332,6 @@ def _bounds(limit: float) -> tuple[float, float, float, float]:
     """Return the float4 of cl/points/pair_distance.h for the largest distance of neighbours in mm."""
     square = limit * limit
     high = np.float32(square)
-    near = np.nextafter(np.float32(square * (1.0 - UNSURE_SHARE)), np.float32(0.0))
-    far = np.nextafter(np.float32(square * (1.0 + UNSURE_SHARE)), np.float32(np.inf))
+    near = np.nextafter(np.float32(square * (1.0 - _UNSURE_SHARE)), np.float32(0.0))
+    far = np.nextafter(np.float32(square * (1.0 + _UNSURE_SHARE)), np.float32(np.inf))
     return float(near), float(far), float(high), float(np.float32(square - float(high)))

@@ -45,7 +45,7 @@ CENTRE = kernel_constant("surface/cortex.cl", "CENTRE")
 ROWS = kernel_constant("surface/cortex.cl", "ROWS")
 RESULTS = kernel_constant("surface/cortex.cl", "RESULTS")
 
-PROFILES = "profiles across walls"
+_PROFILES = "profiles across walls"
 """Purpose by which slabs are planned."""
 
 PIECE, SMALLEST_PIECE = 1 << 18, 1 << 8
@@ -54,7 +54,7 @@ PIECE, SMALLEST_PIECE = 1 << 18, 1 << 8
 STEP_MM = 0.5
 """Step of a profile where voxels have 1 mm3; half of it gave the same places to 0.003 mm."""
 
-SMALLEST_SCALE, LARGEST_SCALE = 0.001, 1.4
+_SMALLEST_SCALE, _LARGEST_SCALE = 0.001, 1.4
 """Bounds of the edge of a voxel's cube, mm, by which profiles are scaled."""
 
 WEIGHT_MM = 2.2
@@ -64,7 +64,7 @@ INNER_SHARE, INNER_SPREAD, CORTEX_SPREAD, OUTER_SPREAD_HU = 0.25, 0.6, 0.15, 100
 """What is expected before the fit: marrow has a quarter of the HU of cortex, within 0.6 of them; the cortex of a place
 lies within 15 % of that of the scan; tissue may be anything from air on."""
 
-MODEL_ERROR = 0.025
+_MODEL_ERROR = 0.025
 """What three plateaus leave of a profile without noise, as a share of the cortex' HU."""
 
 CORRELATED_MM = 1.0
@@ -88,7 +88,7 @@ class ProfileScale:
     @classmethod
     def of(cls, volume: Volume) -> ProfileScale:
         """Return the scale for a volume: by the edge of a cube as large as a voxel."""
-        scale = float(np.clip(np.cbrt(np.prod(volume.spacing)), SMALLEST_SCALE, LARGEST_SCALE))
+        scale = float(np.clip(np.cbrt(np.prod(volume.spacing)), _SMALLEST_SCALE, _LARGEST_SCALE))
         step = STEP_MM * scale
         places = step * (np.arange(SAMPLES) - CENTRE)
         return cls(-step * CENTRE, step, np.exp(-0.5 * (places / (WEIGHT_MM * scale)) ** 2).astype(np.float32))
@@ -218,7 +218,7 @@ def blurs_of(values: Float32Array, blur_mm: float, across_mm: float) -> Float32A
 
 def unexplained_hu(cortex_hu: float, noise_hu: float) -> float:
     """Return the standard deviation of samples around the model: noise, and what three plateaus do not describe."""
-    return float(np.hypot(MODEL_ERROR * cortex_hu, noise_hu))
+    return float(np.hypot(_MODEL_ERROR * cortex_hu, noise_hu))
 
 
 class WallProfiles:
@@ -301,7 +301,7 @@ class ProfileSampler:
             own = (4 * (ROWS + RESULTS) + 32) * stride_of(piece)
             return {"volume": held, "profiles": own, "slices": self.frame.slices.nbytes}
 
-        while (planned := resident.plan(PROFILES, nk, needs)) < 1 and piece > SMALLEST_PIECE:
+        while (planned := resident.plan(_PROFILES, nk, needs)) < 1 and piece > SMALLEST_PIECE:
             piece //= 2
         if planned < 1:
             raise DeviceMemoryError(f"no profiles can be sampled: {describe_shortage(resident.limits, needs(1))}")

@@ -26,7 +26,7 @@ from clrecon.operators.surface.cortex import (
 )
 from clrecon.system.pieces import spread_rows
 
-FEWEST_WALLS = 60
+_FEWEST_WALLS = 60
 """Profiles across walls below which nothing is known of a scan's cortex."""
 
 MOST_WALLS, LOOKED_AT = 500, 4000
@@ -34,9 +34,9 @@ MOST_WALLS, LOOKED_AT = 500, 4000
 
 LEAST_CONTRAST, LEAST_CORTEX_HU = 0.4, 350.0
 """A wall is as high, and rises by as much, as this share of the 90th percentile of those of compact bone, or of those
-that reach the second: the shell of a table rises from air, but is low. Fewer than `FEWEST_WALLS` show no bone."""
+that reach the second: the shell of a table rises from air, but is low. Fewer than `_FEWEST_WALLS` show no bone."""
 
-TRIMMED, NARROW_SPREAD = 0.8, 0.02
+_TRIMMED, _NARROW_SPREAD = 0.8, 0.02
 """Share of the profiles, those fitted best, by which blurs are compared: others touch a second bone or a vessel. Share
 by which the cortex of a place may differ there."""
 
@@ -46,20 +46,20 @@ SEARCH_STEPS = (1.3, 1.12, 1.05)
 FARTHEST = 8.0
 """Factor by which a search leaves its start at most: a blur that nothing shows goes anywhere."""
 
-THICK_SHARE, CORTEX_STEP, CLEARLY_LESS = 0.5, 1.03, 0.97
+_THICK_SHARE, _CORTEX_STEP, _CLEARLY_LESS = 0.5, 1.03, 0.97
 """Where this share of the walls is thick, the cortex is what leaves least of the profiles, in steps of the second from
 what they show on: their percentile holds noise, which the blurs follow, and it them (11 % too much at 40 HU)."""
 
-LEAST_SHARE, DIFFERENT = 0.03, 0.1
+LEAST_SHARE, _DIFFERENT = 0.03, 0.1
 """Components with this share of a surface's vertices are looked at by themselves, and have constants of their own if
 their compact bone differs from that of all by the second share."""
 
-THICK_BLURS, SHARP, WIDE_SPREAD, DENSE_PERCENTILE, FEWEST_THICK = 2.0, 1.25, 0.3, 75.0, 12
+_THICK_BLURS, _SHARP, _WIDE_SPREAD, _DENSE_PERCENTILE, _FEWEST_THICK = 2.0, 1.25, 0.3, 75.0, 12
 """Walls thicker than so many blurs show their HU where the blur is at most the second times that within the slices, if
 the fit leaves the cortex free within the third; of these the percentile, since walls differ and blur only ever lowers
 them."""
 
-LEAST_BLUR_ERROR, LEAST_CORTEX_ERROR, THIN_CORTEX_ERROR = 0.02, 0.05, 0.3
+_LEAST_BLUR_ERROR, _LEAST_CORTEX_ERROR, _THIN_CORTEX_ERROR = 0.02, 0.05, 0.3
 """Shares below which constants are not known: phantoms differ from their own by as much.  The third holds where all
 walls are so thin that blur and density are one."""
 
@@ -91,15 +91,15 @@ def measure_constants(
     """Measure blur and cortex in profiles at some of the points; the noise is that of the scan, if it is known.
 
     The blur is that which leaves the least of the profiles, the cortex what thick walls show.  Their uncertainties are
-    half the spread over four parts of the profiles, and not less than `LEAST_BLUR_ERROR` and `LEAST_CORTEX_ERROR`.
+    half the spread over four parts of the profiles, and not less than `_LEAST_BLUR_ERROR` and `_LEAST_CORTEX_ERROR`.
     """
     rows = spread_rows(len(points), LOOKED_AT)
     values = sampler.values(points[rows], normals[rows])
     walls, peaks = _find_walls(values)
-    if len(walls) < FEWEST_WALLS:
+    if len(walls) < _FEWEST_WALLS:
         raise NoSurfaceError(
             f"the surface has no walls of bone that the cortex could be measured in: {len(walls)} of"
-            f" {len(rows):,} profiles across it, at least {FEWEST_WALLS} are needed"
+            f" {len(rows):,} profiles across it, at least {_FEWEST_WALLS} are needed"
         )
     values, peaks = values[:, walls], peaks[walls]
     try:
@@ -108,7 +108,7 @@ def measure_constants(
         noise = None
     step = volume.spacing
     dense = float(np.percentile(peaks, 95.0))
-    usual = 1.2 * float(np.percentile(peaks, DENSE_PERCENTILE))
+    usual = 1.2 * float(np.percentile(peaks, _DENSE_PERCENTILE))
     start = _Trial(
         _usual_blur(float(np.sqrt(step[0] * step[1]))), max(_usual_blur(step[2]), 0.45 * step[2]),
         min(1.03 * dense, usual),
@@ -125,8 +125,8 @@ def measure_constants(
     for part in (slice(first, None, 4) for first in range(4)):
         one = _search_blurs(fit, part, found, SEARCH_STEPS[1:])
         parts.append((one.blur_mm, one.across_mm, _measure_cortex(fit, values, part, found)[0]))
-    of_cortex = LEAST_CORTEX_ERROR if thick >= FEWEST_THICK else THIN_CORTEX_ERROR
-    least = np.array([LEAST_BLUR_ERROR, LEAST_BLUR_ERROR, of_cortex])
+    of_cortex = _LEAST_CORTEX_ERROR if thick >= _FEWEST_THICK else _THIN_CORTEX_ERROR
+    least = np.array([_LEAST_BLUR_ERROR, _LEAST_BLUR_ERROR, of_cortex])
     spread = np.maximum(np.std(parts, axis=0) / 2.0, least * np.mean(parts, axis=0))
     residual = fit(found, CORTEX_SPREAD).residual_hu
     errors = [float(value) for value in spread]
@@ -165,8 +165,8 @@ def find_groups(
             own = measure_constants(sampler, volume, points[rows], normals[rows], scan)
         except NoSurfaceError:  # a table
             continue
-        is_bone = own.thick >= FEWEST_THICK and own.cortex_hu >= COMPACT_HU
-        if is_bone and abs(own.cortex_hu - scan.cortex_hu) > DIFFERENT * scan.cortex_hu:
+        is_bone = own.thick >= _FEWEST_THICK and own.cortex_hu >= COMPACT_HU
+        if is_bone and abs(own.cortex_hu - scan.cortex_hu) > _DIFFERENT * scan.cortex_hu:
             groups.append((rows, own))
             left[rows] = False
     return [(np.flatnonzero(left), scan), *groups]
@@ -186,10 +186,10 @@ def _find_walls(values: Float32Array) -> tuple[NDArray[np.intp], Float32Array]:
     rise = peaks - values[CENTRE:SAMPLES].min(axis=0, initial=np.inf, where=np.isfinite(values[CENTRE:SAMPLES]))
     usable = whole & (peaks < METAL_HU)
     of_bone = peaks[usable & (peaks >= LEAST_CORTEX_HU)]
-    if len(of_bone) < FEWEST_WALLS:
+    if len(of_bone) < _FEWEST_WALLS:
         return np.zeros(0, np.intp), peaks
     compact = of_bone[of_bone >= COMPACT_HU]
-    least = LEAST_CONTRAST * float(np.percentile(compact if len(compact) >= FEWEST_WALLS else of_bone, 90.0))
+    least = LEAST_CONTRAST * float(np.percentile(compact if len(compact) >= _FEWEST_WALLS else of_bone, 90.0))
     walls = np.flatnonzero(usable & (np.minimum(rise, peaks) > least))
     return walls[spread_rows(len(walls), MOST_WALLS)], peaks
 
@@ -198,7 +198,7 @@ def _search(fit: _Fit, values: Float32Array, start: _Trial) -> tuple[_Trial, int
     """Return the constants that describe the profiles, and how many walls are thick enough to show their HU."""
     found = _search_blurs(fit, slice(None), start, SEARCH_STEPS)
     cortex_hu, thick = _measure_cortex(fit, values, slice(None), found)
-    shown = thick >= THICK_SHARE * values.shape[1]
+    shown = thick >= _THICK_SHARE * values.shape[1]
     for first in range(1, len(SEARCH_STEPS)):
         other = _search_blurs(fit, slice(None), found._replace(cortex_hu=cortex_hu), SEARCH_STEPS[first:])
         if shown and _left(fit, slice(None), other) >= _left(fit, slice(None), found):
@@ -208,17 +208,17 @@ def _search(fit: _Fit, values: Float32Array, start: _Trial) -> tuple[_Trial, int
     if not shown:
         return found._replace(cortex_hu=cortex_hu), thick
     while True:
-        other = found._replace(cortex_hu=found.cortex_hu / CORTEX_STEP)
+        other = found._replace(cortex_hu=found.cortex_hu / _CORTEX_STEP)
         other = _search_blurs(fit, slice(None), other, SEARCH_STEPS[2:])
-        if _left(fit, slice(None), other) >= CLEARLY_LESS * _left(fit, slice(None), found):
+        if _left(fit, slice(None), other) >= _CLEARLY_LESS * _left(fit, slice(None), found):
             return found, thick
         found = other
 
 
 def _left(fit: _Fit, part: slice, trial: _Trial) -> float:
     """Return the mean square of what a trial leaves of a part of the profiles."""
-    squares = np.sort(np.square(fit(trial, NARROW_SPREAD).residual_hu[part], dtype=np.float64))
-    return float(np.mean(squares[: max(1, int(TRIMMED * len(squares)))]))
+    squares = np.sort(np.square(fit(trial, _NARROW_SPREAD).residual_hu[part], dtype=np.float64))
+    return float(np.mean(squares[: max(1, int(_TRIMMED * len(squares)))]))
 
 
 def _search_blurs(fit: _Fit, part: slice, found: _Trial, factors: tuple[float, ...]) -> _Trial:
@@ -236,10 +236,10 @@ def _search_blurs(fit: _Fit, part: slice, found: _Trial, factors: tuple[float, .
 
 def _measure_cortex(fit: _Fit, values: Float32Array, part: slice, found: _Trial) -> tuple[float, int]:
     """Return the HU of compact bone in a part of the profiles, and how many walls are thick enough to show it."""
-    fits = fit(found, WIDE_SPREAD)
+    fits = fit(found, _WIDE_SPREAD)
     blurs = blurs_of(values[:, part], found.blur_mm, found.across_mm)
-    thick = (fits.thickness_mm[part] > THICK_BLURS * blurs) & (blurs < SHARP * found.blur_mm)
-    if np.count_nonzero(thick) < FEWEST_THICK:
+    thick = (fits.thickness_mm[part] > _THICK_BLURS * blurs) & (blurs < _SHARP * found.blur_mm)
+    if np.count_nonzero(thick) < _FEWEST_THICK:
         return found.cortex_hu, int(np.count_nonzero(thick))
-    shown = float(np.percentile(fits.cortex_hu[part][thick], DENSE_PERCENTILE))
+    shown = float(np.percentile(fits.cortex_hu[part][thick], _DENSE_PERCENTILE))
     return float(np.clip(shown, found.cortex_hu / 1.25, found.cortex_hu * 1.25)), int(np.count_nonzero(thick))

@@ -43,15 +43,15 @@ FEWEST = 20_000
 MOST_ROWS = 1 << 22
 """Rows of the finest level; its edge is made longer until there are no more."""
 
-FINEST = 0.97
+_FINEST = 0.97
 """Share of the triangles that belong to the finest level.  With a half, extracted and decimated surfaces took 1.2 to
 1.5 times the time: each level is looked through by itself."""
 
-ROW_BOXES = 2.0
-"""Width of the rows in boxes as long as `FINEST` has them.  With one or three, rows are looked up or looked through
+_ROW_BOXES = 2.0
+"""Width of the rows in boxes as long as `_FINEST` has them.  With one or three, rows are looked up or looked through
 for a tenth longer."""
 
-MOST_LANES = 8
+_MOST_LANES = 8
 """Entries that the kernel looks at together."""
 
 PIECE = 1 << 17
@@ -81,7 +81,7 @@ class CrossingPlan:
 
     @property
     def stride(self) -> int:
-        return len(self.order) + MOST_LANES
+        return len(self.order) + _MOST_LANES
 
     def needs(self) -> dict[str, int]:
         given = self.vertices.nbytes + self.triangles.nbytes + self.order.nbytes
@@ -96,7 +96,7 @@ def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> Cro
     longest = np.maximum(np.maximum(high[0], high[1]), high[2])
     origin, beyond = low.min(axis=1).astype(np.float64), low.max(axis=1).astype(np.float64)
     some = longest[:: max(1, len(longest) // 10_000)].astype(np.float64)
-    edge = max(1.0, ROW_BOXES * float(np.quantile(some, FINEST)))
+    edge = max(1.0, _ROW_BOXES * float(np.quantile(some, _FINEST)))
     while np.prod(np.floor((beyond - origin)[1:] / edge) + 1.0) > MOST_ROWS:
         edge *= 1.25
     level = np.zeros(len(longest), np.int8)

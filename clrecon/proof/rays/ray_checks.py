@@ -196,7 +196,9 @@ EDGE_SHARE = 0.01
 FIXED = Lighting(0.15, 0.7, 0.4, 20.0, direction=(0.4, -1.0, 0.8))
 SOFT = TransferFunction([(-300, 0.9, 0.2, 0.1, 0.0), (200, 1, 0.7, 0.4, 0.15), (900, 1, 1, 0.9, 0.6)])
 STEEP = TransferFunction([(-200, 0.8, 0.1, 0.1, 0), (100, 1, 0.6, 0.3, 0), (130, 1, 0.9, 0.7, 0.9), (800, 1, 1, 1, 1)])
-BY_GRADIENT = TransferFunction(SOFT.points, unit_distance=2.0, gradient_opacity=[(20.0, 0.0), (150.0, 1.0), (600, 0.3)])
+_BY_GRADIENT = TransferFunction(
+    SOFT.points, unit_distance=2.0, gradient_opacity=[(20.0, 0.0), (150.0, 1.0), (600, 0.3)]
+)
 _DIM = TransferFunction([(20, 0.9, 0.2, 0.1, 0.0), (90, 1, 0.7, 0.4, 0.2), (130, 1, 1, 0.9, 0.6)])
 """A transfer function for voxels of 8 bits."""
 
@@ -402,7 +404,7 @@ PICTURE_CHECKS = (
         RENDERED,
         _check_composite,
         "GRADIENT_OPACITY",
-        scenes=(("int16", BY_GRADIENT, False, {}), ("float32", BY_GRADIENT, False, {})),
+        scenes=(("int16", _BY_GRADIENT, False, {}), ("float32", _BY_GRADIENT, False, {})),
     ),
     _check(
         "steep transfer functions",

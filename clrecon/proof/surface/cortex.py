@@ -19,7 +19,7 @@ INNER_SHARE = 0.25
 
 ROUNDS, SLACK = 6, 1.0003
 THINNEST = 0.05
-STARTS = ((-1.1, 0.9), (-0.8, 2.2), (-0.8, 5.0))
+_STARTS = ((-1.1, 0.9), (-0.8, 2.2), (-0.8, 5.0))
 """Places and thicknesses where the search may begin, in blurs."""
 
 _normal_share = np.vectorize(lambda z: 0.5 * math.erfc(-z / math.sqrt(2.0)), otypes=[np.float64])
@@ -159,7 +159,7 @@ def fit_profiles(
     nearest, room = places[first], places[last]
     thickest = scale.step_mm * SAMPLES
     ease = np.array([2.5e-13, 7.5e-12]) * (cortex_hu / scale.step_mm) ** 2
-    begins = [fit(np.clip(x * width, nearest, room), t * width) for x, t in STARTS]
+    begins = [fit(np.clip(x * width, nearest, room), t * width) for x, t in _STARTS]
     now = begins[0].replaced(begins[1]).replaced(begins[2])
     damping = np.full(len(width), 0.01)
     for _ in range(ROUNDS):

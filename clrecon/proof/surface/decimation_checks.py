@@ -45,7 +45,7 @@ SIZE = 40
 ROUNDING_MM = 3e-4
 """Slack of bounds at coordinates up to 40 mm, and the rounding of float32."""
 
-LIMIT_MM = 0.16
+_LIMIT_MM = 0.16
 
 
 def _rough_sheet(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
@@ -90,8 +90,8 @@ def _check_witnesses(device: Device) -> str:
     names = np.arange(len(vertices))
     exact = NearDistance(vertices, triangles)
     length, rows = exact.find_around(places.astype(np.float64), names[:, None])
-    beside = np.where(length <= LIMIT_MM, rows, -1).astype(np.int32)
-    arguments = (places, triangles, names, beside, LIMIT_MM)
+    beside = np.where(length <= _LIMIT_MM, rows, -1).astype(np.int32)
+    arguments = (places, triangles, names, beside, _LIMIT_MM)
     witnesses, left = DeviceBounds(device, vertices, triangles).find_witnesses(*arguments)
     _, of_twin = SurfaceBounds(vertices, triangles).find_witnesses(*arguments)
     require_equal(witnesses[:3], beside[triangles].T, "witnesses of corners")
@@ -101,10 +101,10 @@ def _check_witnesses(device: Device) -> str:
         points = np.einsum("i,kia->ka", weights, places[triangles].astype(np.float64))
         around, _ = exact.find_around(points, triangles.astype(np.int64))
         is_left = (left >> middle & 1).astype(bool)
-        require_equal(around[is_left] > LIMIT_MM - ROUNDING_MM, np.ones(int(is_left.sum()), bool), "middles left")
+        require_equal(around[is_left] > _LIMIT_MM - ROUNDING_MM, np.ones(int(is_left.sum()), bool), "middles left")
         of = np.flatnonzero(known & ~is_left & (witnesses[3 + middle] != witnesses[0]))
         shown = triangle_distances(points[of].T, *vertices[triangles[witnesses[3 + middle, of]]].transpose(1, 2, 0))
-        require_equal(shown <= LIMIT_MM, np.ones(len(of), bool), "witnesses of middles")
+        require_equal(shown <= _LIMIT_MM, np.ones(len(of), bool), "witnesses of middles")
         require_equal(witnesses[3 + middle][~known], witnesses[0][~known], "witnesses of triangles without one")
     return f"{len(triangles):,} triangles, {np.count_nonzero(left)} with middles left"
 

@@ -17,9 +17,9 @@ from clrecon.reading.common.source_facts import PixelFacts
 from clrecon.system.records import Gate, none_of, unmeasured
 
 SAMPLED_SLICES, SAMPLED_VOXELS = 16, 1 << 16
-LEAST_SAMPLE = 1000
+_LEAST_SAMPLE = 1000
 """Least number of sampled voxels for stating a share."""
-SPIKE_SHARE, SPIKE_RATIO = 0.01, 10.0
+_SPIKE_SHARE, _SPIKE_RATIO = 0.01, 10.0
 """A value that so many voxels have, so many times more than has one of the values next to it, was not measured."""
 
 
@@ -42,7 +42,7 @@ class ValueSample:
         values = voxels[:: places.step, ::step, ::step].ravel()
         if facts.padding_hu is not None:
             values = values[values != facts.padding_hu]  # measured air of this value is left out too
-        return cls(np.sort(values)) if len(values) >= LEAST_SAMPLE else None
+        return cls(np.sort(values)) if len(values) >= _LEAST_SAMPLE else None
 
     def between(self, low: float, high: float) -> float:
         first, end = np.searchsorted(self.values, (low, high))
@@ -65,19 +65,19 @@ class ValueSample:
         """Leave out values outside of a range that stand out of those beside them; None where too few are left."""
         found, counts = np.unique(self.values, return_counts=True)
         before, after = np.pad(counts, (1, 0))[:-1], np.pad(counts, (0, 1))[1:]
-        spikes = (counts >= SPIKE_SHARE * len(self.values)) & (counts >= SPIKE_RATIO * np.minimum(before, after))
+        spikes = (counts >= _SPIKE_SHARE * len(self.values)) & (counts >= _SPIKE_RATIO * np.minimum(before, after))
         spikes &= (found < low) | (found > high)
         values = self.values[np.repeat(~spikes, counts)]
-        return ValueSample(values) if len(values) >= LEAST_SAMPLE else None
+        return ValueSample(values) if len(values) >= _LEAST_SAMPLE else None
 
 
-SMOOTHING, FINEST_BIN, MOST_BINS = 20.0, 5.0, 8000
+_SMOOTHING, _FINEST_BIN, _MOST_BINS = 20.0, 5.0, 8000
 """Standard deviation of the smoothing and width of a bin, HU; of wider ranges the bins get wider."""
-TAILS = 0.0005
+_TAILS = 0.0005
 """Share of the values that is left out at either end."""
-VALLEY = 0.5
+_VALLEY = 0.5
 """Two peaks are two where the histogram between them falls below this share of the lower one."""
-LEAST_PEAK_SHARE = 0.02
+_LEAST_PEAK_SHARE = 0.02
 _SMALL_AIR_SHARE, _SMALL_PEAK_SHARE = 0.01, 0.004
 """Least share of air around a body that fills the field, and of soft tissue around bone in a wide field."""
 
@@ -96,11 +96,11 @@ class Peak(NamedTuple):
 
 def find_peaks(values: NDArray[Any]) -> list[Peak]:
     """Return the peaks of sorted values, from the lowest to the highest."""
-    end = int(TAILS * len(values))
+    end = int(_TAILS * len(values))
     inner = values[end : len(values) - end].astype(np.float64)
     low, high = float(inner[0]), float(inner[-1])
-    width = max(FINEST_BIN, (high - low) / MOST_BINS)
-    sigma = max(SMOOTHING / width, 1.0)
+    width = max(_FINEST_BIN, (high - low) / _MOST_BINS)
+    sigma = max(_SMOOTHING / width, 1.0)
     border = int(4 * sigma) + 1
     counts = np.bincount(((inner - low) / width).astype(np.int64) + border)
     weights = np.exp(-0.5 * (np.arange(-border, border + 1) / sigma) ** 2)
@@ -122,7 +122,7 @@ def _find_tops(smooth: NDArray[np.float64]) -> list[int]:
     while len(tops) > 1:
         depths = floors / np.minimum(smooth[tops[:-1]], smooth[tops[1:]])
         shallow = int(np.argmax(depths))
-        if depths[shallow] <= VALLEY:
+        if depths[shallow] <= _VALLEY:
             break
         lower = shallow + int(smooth[tops[shallow]] >= smooth[tops[shallow + 1]])
         beside = floors[max(lower - 1, 0) : lower + 1].min()
@@ -136,52 +136,52 @@ SCALE_SAID = "peaks of air (near -1000 HU) and soft tissue (0 to 80 HU) that lie
 
 FEWEST_VALUES = 4000
 
-LOWEST_AIR_HU, HIGHEST_AIR_HU = -1100, -900
+LOWEST_AIR_HU, _HIGHEST_AIR_HU = -1100, -900
 """Range of the peak of air.  Noise may be lower, but no value that many voxels share."""
 TISSUE_HU = (-150, 200)
 """Range of the peaks of fat, water, muscle, organs and blood with contrast medium."""
 
-OFFSET_AIR_HU = (-880, -160)
+_OFFSET_AIR_HU = (-880, -160)
 """Range in which the air of an offset scan is looked for; from there on it lies among fat and water, up to the end of
 `TISSUE_HU`."""
-LUNG_HU, LUNG_WIDTH = -700, 115
+LUNG_HU, _LUNG_WIDTH = -700, 115
 """Lung may be as low as this; its peak is wider than that."""
-STEP_HU, CT_STEP_HU = (450, 1200), (850, 1200)
+STEP_HU, _CT_STEP_HU = (450, 1200), (850, 1200)
 """Range of the step from air to soft tissue, and that of a CT, from fat to blood."""
-LEAST_STEP_HU, HIGHEST_AMONG_HU = 300, 500
+_LEAST_STEP_HU, _HIGHEST_AMONG_HU = 300, 500
 """Least step from air to the soft tissue around bone on any scale, and up to where fat, water or trabecular bone may
 be, so that it is that of a CT."""
-AS_LUNG_HU, ABOVE_LUNG_HU = -600, 150
+_AS_LUNG_HU, _ABOVE_LUNG_HU = -600, 150
 """Up to where "air" may be lung, around which soft tissue is lower than this."""
-BELOW_AIR_HU, MOST_BEYOND = 150, 0.002
+_BELOW_AIR_HU, _MOST_BEYOND = 150, 0.002
 """So far below the peak of air is at most this share, and so it is in other ranges that a shift leaves empty."""
 
-INTERCEPT_HU, MISSING = 1024, "the rescale intercept seems to be missing"
-LEAST_SHARE, LEAST_TISSUE, TISSUE_PART = 0.02, 0.1, 0.6
-"""Least share of air (within 100 HU) and, for a shift by `INTERCEPT_HU`, of soft tissue (within 150 HU): of all values,
-and of those as dense or denser.  Brain and its skull are no air and soft tissue."""
-LEAST_OFFSET_TISSUE = 0.05
-EMPTY_HU, MOST_IN_EMPTY = (-150, 100), 0.2
+_INTERCEPT_HU, MISSING = 1024, "the rescale intercept seems to be missing"
+LEAST_SHARE, _LEAST_TISSUE, _TISSUE_PART = 0.02, 0.1, 0.6
+"""Least share of air (within 100 HU) and, for a shift by `_INTERCEPT_HU`, of soft tissue (within 150 HU): of all
+values, and of those as dense or denser.  Brain and its skull are no air and soft tissue."""
+_LEAST_OFFSET_TISSUE = 0.05
+_EMPTY_HU, _MOST_IN_EMPTY = (-150, 100), 0.2
 """Range where soft tissue belongs, and the most that lies there in an offset scan, as a share of what lies within 100
 HU of its soft tissue: partial volume.  Contrast medium beside lung has more there, of walls and muscle."""
-LEAST_HEIGHT = 0.1
+_LEAST_HEIGHT = 0.1
 """Least height of the peak of faint soft tissue, as a share of the highest one: lower ones are partial volume."""
-LEAST_RAW_HU = -300
+_LEAST_RAW_HU = -300
 """Stored values without their intercept are not negative; soft tissue and fat alone are not below this."""
 
-FAINT_HU, FAINT_SHARE, MOST_DENSE = (-800, -200), 0.05, 0.03
+FAINT_HU, _FAINT_SHARE, _MOST_DENSE = (-800, -200), 0.05, 0.03
 """Range and share of soft tissue where the slope is too small, and the largest share above `TISSUE_HU` begins."""
-STRETCHED_HU = 300
+_STRETCHED_HU = 300
 """Soft tissue where the slope is too large lies above this value."""
 
-CALMED, RING = 3, 2
+_CALMED, _RING = 3, 2
 """Width of the mean that takes the noise out of a slice, and distance of the ring round what is dense, voxels."""
-LEAST_CORE, DENSER, ALIKE, NEAR_AIR = 0.01, 0.2, 0.2, 0.3
+_LEAST_CORE, DENSER, ALIKE, _NEAR_AIR = 0.01, 0.2, 0.2, 0.3
 """Least share of a body that is denser than soft tissue, by how much, how much soft tissue varies, and how far up from
 air the border of a body reaches: shares of the step from air to soft tissue."""
-WIDER, WIDEST_TISSUE = 1.3, 0.4
+WIDER, _WIDEST_TISSUE = 1.3, 0.4
 """Lung is so many times wider than the peak of soft tissue; that of bone is wider than this share of the step."""
-LEAST_AROUND, MOST_AIR_AROUND = 0.5, 0.1
+_LEAST_AROUND, _MOST_AIR_AROUND = 0.5, 0.1
 """Least share of soft tissue and largest share of air in the ring.  Sound scans and phantoms have 0.54 to 1.00 and 0 to
 0.09, dry bones 0 to 0.08 and 0.49 to 0.87."""
 
@@ -196,18 +196,18 @@ class Layers:
     def find_enclosing(self, air: Peak, above: Sequence[Peak]) -> Peak | None:
         """Do what `find_around` does, for a peak in a place where it need not be that of air."""
         found = self.find_around(air, above)
-        if found is None or (air.at < AS_LUNG_HU and found.at < ABOVE_LUNG_HU):
+        if found is None or (air.at < _AS_LUNG_HU and found.at < _ABOVE_LUNG_HU):
             return None
-        among = air.at < AS_LUNG_HU or OFFSET_AIR_HU[1] < air.at <= HIGHEST_AMONG_HU
-        return found if not among or CT_STEP_HU[0] <= found.at - air.at <= CT_STEP_HU[1] else None
+        among = air.at < _AS_LUNG_HU or _OFFSET_AIR_HU[1] < air.at <= _HIGHEST_AMONG_HU
+        return found if not among or _CT_STEP_HU[0] <= found.at - air.at <= _CT_STEP_HU[1] else None
 
     def find_around(self, air: Peak, above: Sequence[Peak]) -> Peak | None:
         """Return the soft tissue that lies around bone, of the peaks above that of air; None without any."""
         around = []
         for peak in above:
             step = peak.at - air.at
-            is_lung, is_bone = air.width > max(LUNG_WIDTH, WIDER * peak.width), peak.width > WIDEST_TISSUE * step
-            off = None if is_lung or is_bone or step < LEAST_STEP_HU else self._measure_around(air.at, peak.at)
+            is_lung, is_bone = air.width > max(_LUNG_WIDTH, WIDER * peak.width), peak.width > _WIDEST_TISSUE * step
+            off = None if is_lung or is_bone or step < _LEAST_STEP_HU else self._measure_around(air.at, peak.at)
             if off is not None:
                 around.append((off, peak))
         return min(around)[1] if around else None
@@ -221,19 +221,19 @@ class Layers:
             dense = picture > tissue + DENSER * step
             core += int(np.count_nonzero(dense))
             body += int(np.count_nonzero(picture > air + step / 2.0))
-            ring.append(picture[_grow(dense, RING) & ~_grow(dense, RING - 1)])
+            ring.append(picture[_grow(dense, _RING) & ~_grow(dense, _RING - 1)])
         around = np.concatenate(ring)
-        if core < LEAST_CORE * body or not len(around):
+        if core < _LEAST_CORE * body or not len(around):
             return None
         off = np.abs(around - tissue)
-        alike, beside = np.mean(off < ALIKE * step), np.mean(around < air + NEAR_AIR * step)
-        return float(np.median(off)) if alike >= LEAST_AROUND and beside <= MOST_AIR_AROUND else None
+        alike, beside = np.mean(off < ALIKE * step), np.mean(around < air + _NEAR_AIR * step)
+        return float(np.median(off)) if alike >= _LEAST_AROUND and beside <= _MOST_AIR_AROUND else None
 
 
 def _calm(picture: NDArray[Any]) -> NDArray[np.float32]:
     calm = np.asarray(picture, np.float32)
     for axis in (0, 1):
-        calm = _windows(calm, CALMED // 2, axis).mean(axis=-1)
+        calm = _windows(calm, _CALMED // 2, axis).mean(axis=-1)
     return calm
 
 
@@ -272,7 +272,7 @@ def judge_scale(
         return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: the values are not known to be HU"), {}
     peaks: list[Peak] = []
     if doubt is None:
-        peaks = _list_peaks(sample.without_spikes(LOWEST_AIR_HU, HIGHEST_AIR_HU), LEAST_PEAK_SHARE)
+        peaks = _list_peaks(sample.without_spikes(LOWEST_AIR_HU, _HIGHEST_AIR_HU), _LEAST_PEAK_SHARE)
         doubt = _find_doubt(sample, layers, peaks, slopes, facts.disc)
     if doubt is not None:
         text = (
@@ -288,7 +288,7 @@ def judge_scale(
 
 
 def _is_air(peak: Peak) -> bool:
-    return LOWEST_AIR_HU <= peak.at <= HIGHEST_AIR_HU
+    return LOWEST_AIR_HU <= peak.at <= _HIGHEST_AIR_HU
 
 
 def _is_tissue(peak: Peak) -> bool:
@@ -297,10 +297,10 @@ def _is_tissue(peak: Peak) -> bool:
 
 def _find_shift(sample: ValueSample, facts: PixelFacts) -> _Doubt | None:
     """Find an intercept that is missing or was applied twice, for which the values need not be known to be HU."""
-    if facts.hu_min < LOWEST_AIR_HU and _fits(sample, -INTERCEPT_HU) and not _is_padded_specimen(sample):
-        shift, reason = -INTERCEPT_HU, "the rescale intercept seems to have been applied twice"
-    elif _may_be_raw(sample) and _fits(sample, INTERCEPT_HU):
-        shift, reason = INTERCEPT_HU, MISSING
+    if facts.hu_min < LOWEST_AIR_HU and _fits(sample, -_INTERCEPT_HU) and not _is_padded_specimen(sample):
+        shift, reason = -_INTERCEPT_HU, "the rescale intercept seems to have been applied twice"
+    elif _may_be_raw(sample) and _fits(sample, _INTERCEPT_HU):
+        shift, reason = _INTERCEPT_HU, MISSING
     else:
         return None
     air, tissue = sample.median_between(shift - 1100, shift - 900), sample.median_between(shift - 150, shift + 150)
@@ -316,9 +316,9 @@ def _find_body(sample: ValueSample, layers: Layers, known: bool) -> _Doubt | Non
     measured = sample.without_spikes()
     peaks = _list_peaks(measured, _SMALL_PEAK_SHARE)
     air = next((peak for peak in peaks if peak.share >= _SMALL_AIR_SHARE), None)
-    if measured is None or air is None or air.at < OFFSET_AIR_HU[0] or not _is_lowest(measured, air):
+    if measured is None or air is None or air.at < _OFFSET_AIR_HU[0] or not _is_lowest(measured, air):
         return None
-    raw = abs(air.at + 1000.0 - INTERCEPT_HU) <= 100.0 and _may_be_raw(measured)
+    raw = abs(air.at + 1000.0 - _INTERCEPT_HU) <= 100.0 and _may_be_raw(measured)
     tissue = layers.find_enclosing(air, [peak for peak in peaks if peak.at > air.at]) if known or raw else None
     if tissue is None:
         return None
@@ -331,18 +331,18 @@ def _list_peaks(measured: ValueSample | None, least: float) -> list[Peak]:
 
 
 def _is_lowest(sample: ValueSample, air: Peak) -> bool:
-    return sample.between(-np.inf, air.at - max(BELOW_AIR_HU, 1.3 * air.width)) < MOST_BEYOND
+    return sample.between(-np.inf, air.at - max(_BELOW_AIR_HU, 1.3 * air.width)) < _MOST_BEYOND
 
 
 def _may_be_raw(sample: ValueSample) -> bool:
-    return not _fits(sample, 0) and sample.between(-np.inf, LEAST_RAW_HU) < MOST_BEYOND
+    return not _fits(sample, 0) and sample.between(-np.inf, _LEAST_RAW_HU) < _MOST_BEYOND
 
 
 def _fits(sample: ValueSample, shift: int) -> bool:
     """True if air and soft tissue lie where a shift of the HU puts them, with less between them than tissue."""
     air = sample.between(shift - 1100, shift - 900)
     tissue = sample.between(shift - 150, shift + 150)
-    least = max(LEAST_TISSUE, TISSUE_PART * sample.between(shift - 300, np.inf)) if shift else LEAST_SHARE
+    least = max(_LEAST_TISSUE, _TISSUE_PART * sample.between(shift - 300, np.inf)) if shift else LEAST_SHARE
     return air >= LEAST_SHARE and tissue >= least and sample.between(shift - 800, shift - 300) < tissue
 
 
@@ -350,7 +350,7 @@ def _is_padded_specimen(sample: ValueSample) -> bool:
     """True for dense bone in air with padding of one value: it looks like soft tissue and air 1024 HU too low."""
     found = sample.commonest_below(LOWEST_AIR_HU)
     padded = found is not None and found[1] > 0.9 * sample.between(-np.inf, LOWEST_AIR_HU)
-    return padded and sample.between(500, np.inf) >= MOST_BEYOND
+    return padded and sample.between(500, np.inf) >= _MOST_BEYOND
 
 
 def _find_doubt(
@@ -373,18 +373,18 @@ def _find_offset(sample: ValueSample, air: Peak, above: Sequence[Peak], disc: fl
     A round field of view that is filled with a value far above it tells it anywhere.  Among fat and water nothing else
     does, and above these the step of a CT alone.
     """
-    lung = air.at < LUNG_HU and air.width > LUNG_WIDTH
-    padded = disc is not None and disc >= air.at + BELOW_AIR_HU
-    among = OFFSET_AIR_HU[1] < air.at <= TISSUE_HU[1] and not padded
-    if air.at < OFFSET_AIR_HU[0] or among or not _is_lowest(sample, air) or lung:
+    lung = air.at < LUNG_HU and air.width > _LUNG_WIDTH
+    padded = disc is not None and disc >= air.at + _BELOW_AIR_HU
+    among = _OFFSET_AIR_HU[1] < air.at <= TISSUE_HU[1] and not padded
+    if air.at < _OFFSET_AIR_HU[0] or among or not _is_lowest(sample, air) or lung:
         return None
-    low, high = CT_STEP_HU if air.at > TISSUE_HU[1] and not padded else STEP_HU
+    low, high = _CT_STEP_HU if air.at > TISSUE_HU[1] and not padded else STEP_HU
     fitting = [peak for peak in above if low <= peak.at - air.at <= high]
     tissue = max(fitting, key=lambda peak: peak.share, default=None)
-    if tissue is None or tissue.share < LEAST_OFFSET_TISSUE:
+    if tissue is None or tissue.share < _LEAST_OFFSET_TISSUE:
         return None
-    first, last = max(EMPTY_HU[0], air.at + 1.5 * air.width), EMPTY_HU[1]
-    empty = sample.between(first, max(first, last)) < MOST_IN_EMPTY * sample.between(tissue.at - 100, tissue.at + 100)
+    first, last = max(_EMPTY_HU[0], air.at + 1.5 * air.width), _EMPTY_HU[1]
+    empty = sample.between(first, max(first, last)) < _MOST_IN_EMPTY * sample.between(tissue.at - 100, tissue.at + 100)
     return _describe_step(air, tissue) if padded or (tissue.at > TISSUE_HU[1] and empty) else None
 
 
@@ -393,18 +393,18 @@ def _find_wrong_slope(
 ) -> _Doubt | None:
     """Look for soft tissue, given air in its place and no peak where soft tissue belongs."""
     tissue = max(above, key=lambda peak: peak.share)
-    faint = FAINT_HU[0] <= tissue.at <= FAINT_HU[1] and tissue.share >= FAINT_SHARE
-    faint = faint and tissue.height >= LEAST_HEIGHT * max(air.height, tissue.height)
-    if faint and sample.between(TISSUE_HU[0], np.inf) < MOST_DENSE:
+    faint = FAINT_HU[0] <= tissue.at <= FAINT_HU[1] and tissue.share >= _FAINT_SHARE
+    faint = faint and tissue.height >= _LEAST_HEIGHT * max(air.height, tissue.height)
+    if faint and sample.between(TISSUE_HU[0], np.inf) < _MOST_DENSE:
         return _describe_step(air, tissue)
     around = None if set(slopes) == {1.0} else layers.find_around(air, above)
-    return None if around is None or around.at <= STRETCHED_HU else _describe_step(air, around)
+    return None if around is None or around.at <= _STRETCHED_HU else _describe_step(air, around)
 
 
 def _describe_step(air: Peak, tissue: Peak) -> _Doubt:
     """Give the likely reason for the places of air and soft tissue."""
     off = air.at + 1000.0
-    if CT_STEP_HU[0] <= tissue.at - air.at <= CT_STEP_HU[1]:
+    if _CT_STEP_HU[0] <= tissue.at - air.at <= _CT_STEP_HU[1]:
         return _Doubt(
             air.at, tissue.at, f"the rescale intercept seems to be {abs(off):.0f} HU too {'high' if off > 0 else 'low'}"
         )

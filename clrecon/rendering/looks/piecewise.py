@@ -14,7 +14,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.system.light_dataclass import dataclass
 
-STRAIGHT_PARTS = 32
+_STRAIGHT_PARTS = 32
 """Number of straight parts that replace a bent one; the error is at most 0.003 of its rise."""
 
 
@@ -73,7 +73,7 @@ def _bend(sharpness: float) -> tuple[Float64Array, Float64Array]:
     The rise is one half at 0.5. Breaks are evenly spaced in VTK's own parameter s, so they are dense where the way is
     steep, and towards its ends.
     """
-    t = np.arange(1, STRAIGHT_PARTS) / STRAIGHT_PARTS
+    t = np.arange(1, _STRAIGHT_PARTS) / _STRAIGHT_PARTS
     s = np.where(t < 0.5, 2.0 * t * t, 1.0 - 2.0 * (1.0 - t) ** 2)
     root = 1.0 / (1.0 + 10.0 * sharpness)
     way = np.where(s < 0.5, 0.5 * (2.0 * s) ** root, 1.0 - 0.5 * (2.0 - 2.0 * s) ** root)
@@ -86,8 +86,8 @@ def straighten_curve(
 ) -> tuple[Float64Array, Float64Array]:
     """Make a curve from VTK's nodes: `midpoints` and `sharpness` (n,) bend the part from each node to the next one.
 
-    Where sharpness is below 0.01, straight to the midpoint and straight on; else `STRAIGHT_PARTS` straight parts.  With
-    `steps` (VTK's colours, not its opacities) there is a step at the midpoint above 0.99.
+    Where sharpness is below 0.01, straight to the midpoint and straight on; else `_STRAIGHT_PARTS` straight parts.
+    With `steps` (VTK's colours, not its opacities) there is a step at the midpoint above 0.99.
     """
     out_positions, out_values = [positions[:1]], [values[:1]]
     for n in range(positions.size - 1):

@@ -32,7 +32,7 @@ from clrecon.viewer.model.objects import ShownMesh, ShownObject
 from clrecon.viewer.model.state import Pick, ViewState
 from clrecon.viewer.session.commands import check_command
 
-CLOSE_S = 1.0
+_CLOSE_S = 1.0
 """Longest wait for work that is cancelled; threads that still run then end with the process."""
 
 
@@ -121,7 +121,7 @@ class Worker:
             self._waiting.clear()
             self._wake.notify_all()
 
-    def close(self, timeout: float = CLOSE_S) -> bool:
+    def close(self, timeout: float = _CLOSE_S) -> bool:
         """Cancel everything and wait for the thread to end; False where it still runs after `timeout` seconds."""
         self.stop()
         if threading.current_thread() is not self._thread:
@@ -261,7 +261,7 @@ class ViewSession(Closing):
         self._pictures = Worker("view-pictures", self._failed)
         self._work = Worker("view-work", self._failed, self._changed)
 
-    def close(self, timeout: float = CLOSE_S) -> None:
+    def close(self, timeout: float = _CLOSE_S) -> None:
         """Cancel everything, and wait for at most `timeout` seconds: a driver that builds a kernel does not stop."""
         if self._closed:
             return

@@ -52,11 +52,11 @@ def rank_series(series: Series) -> Rank:
     )
 
 
-SHORTEST_START = 4
+_SHORTEST_START = 4
 """Fewest characters of a hash or UID that name a series by its start."""
-SIMILAR = 0.5
+_SIMILAR = 0.5
 """Series with at least this share of the slices of the largest one are compared by more than their number of slices."""
-SAME_PLANE = 0.1
+_SAME_PLANE = 0.1
 """Directions of a localizer that lie no further apart from those of the slices, as unit vectors, are theirs."""
 
 
@@ -70,11 +70,11 @@ class Choice(NamedTuple):
 def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> Choice:
     """Choose the series to read.
 
-    wanted: Number in the listing, SeriesInstanceUID, its hash, the start of one of these (`SHORTEST_START` characters),
-        or the description (whole, or a part that only one series has).  None takes the CT stack with most slices.  Of
-        those with a similar number (`SIMILAR`) original images come before derived ones, then the thinnest slices, then
-        most slices; of equal ones the usable one.  Several patients, or similar stacks in different directions, leave
-        no choice.
+    wanted: Number in the listing, SeriesInstanceUID, its hash, the start of one of these (`_SHORTEST_START`
+        characters), or the description (whole, or a part that only one series has).  None takes the CT stack with most
+        slices.  Of those with a similar number (`_SIMILAR`) original images come before derived ones, then the
+        thinnest slices, then most slices; of equal ones the usable one.  Several patients, or similar stacks in
+        different directions, leave no choice.
     """
     if wanted is None:
         ct = [series for series in found if series.kind != "other"]
@@ -115,14 +115,14 @@ def _match_series(found: Sequence[Series], wanted: int | str) -> list[Series]:
         return by_id
     if text.isascii() and text.isdigit():
         by_number = [series for series in found if series.number == int(text)]
-        if by_number or len(text) < SHORTEST_START:
+        if by_number or len(text) < _SHORTEST_START:
             return by_number
     folded = text.casefold()
     exact = [series for series in found if series.identity.description.casefold() == folded]
     if exact:
         return exact
     begins = [
-        len(text) >= SHORTEST_START and any(own.startswith(folded) for own in _ids_of(series)) for series in found
+        len(text) >= _SHORTEST_START and any(own.startswith(folded) for own in _ids_of(series)) for series in found
     ]
     parts = [folded in series.identity.description.casefold() for series in found]
     return [one for one, begun, part in zip(found, begins, parts, strict=True) if begun or part]
@@ -144,7 +144,7 @@ def _take_best(candidates: Sequence[Series]) -> Choice:
     if len(stacks) == 1:
         return Choice(stacks[0], "")
     most = max(series.count for series in stacks)
-    near = [(series, rank_series(series)) for series in stacks if series.count >= SIMILAR * most and series.count > 1]
+    near = [(series, rank_series(series)) for series in stacks if series.count >= _SIMILAR * most and series.count > 1]
     if not near:
         raise RefusedInputError(f"a single slice cannot make a surface: {len(stacks)} series of one slice each")
     best, why = _sift(near)
@@ -222,7 +222,7 @@ def _may_be_slices(series: Series, chosen: Series) -> bool:
         return False
     if series.kind != "localizer" or not series.headers or not chosen.headers:
         return True
-    return _chord(series.headers[0], chosen.headers[0]) < SAME_PLANE
+    return _chord(series.headers[0], chosen.headers[0]) < _SAME_PLANE
 
 
 def _chord(one: SliceHeader, other: SliceHeader) -> float:
