@@ -11,12 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import map_points
-from clrecon.geometry.blocks import crop_volume, find_extent, slice_volume
-from clrecon.geometry.boxes import CROPS, crop_box
+from clrecon.geometry.blocks import CROPS, crop_box, crop_volume, find_extent, slice_volume
 from clrecon.geometry.grid import BaseVolume
 from clrecon.geometry.images import image_of, make_nibabel, make_sitk, take_nibabel, take_sitk
-from clrecon.geometry.resample import resample_volume
-from clrecon.geometry.sampling import sample_volume
+from clrecon.geometry.resample import resample_volume, sample_volume
 from clrecon.system.arguments import Space, explains_arguments
 from clrecon.system.packages import ShownAsHtml, public_function
 from clrecon.system.paths import keep_existing

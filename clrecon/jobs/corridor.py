@@ -164,9 +164,8 @@ def make_corridors(
         run.lap("corridors")
         outputs = _draw_sheets(run, volume, found, graded, level, files)
         if files.output is not None:
-            outputs += _write_meshes(
-                run, volume, labels, dict(zip(numbers, found, strict=True)), graded, level, files.output, fitted
-            )
+            surfaces = fitted or _fill_vertebrae(run, volume, labels, numbers, level)
+            outputs += _write_meshes(run, dict(zip(numbers, found, strict=True)), graded, surfaces, files.output)
         run.lap("write")
         vertebrae = [
             describe_vertebra(each, number, settings.margin, settings.space, own)
@@ -306,23 +305,26 @@ def _draw_sheets(
     return outputs
 
 
-def _write_meshes(
-    run: Run,
-    volume: Volume,
-    labels: LabelMap,
-    found: dict[int, VertebraCorridors],
-    graded: Sequence[list[tuple[Screw, ScrewGrade]]],
-    level: float,
-    output: str | Path,
-    fitted: Mapping[int, Mesh],
-) -> list[dict[str, Any]]:
-    """Write vertebrae, filled as the mesh job does with solid labels, and cylinders; return their entries."""
+def _fill_vertebrae(
+    run: Run, volume: Volume, labels: LabelMap, numbers: Sequence[int], level: float
+) -> Mapping[int, Mesh]:
+    """Return the surfaces of vertebrae, filled as the mesh job does with solid labels."""
     from clrecon.operators.surface.labels import extract_labels
 
-    vertebrae = fitted or extract_labels(
-        volume, labels, level, device=run.settings.device, label=list(found), solid=True,
-        memory=run.settings.memory, progress=run.progress,
+    return extract_labels(
+        volume, labels, level, device=run.settings.device, label=numbers, solid=True, memory=run.settings.memory,
+        progress=run.progress,
     )  # fmt: skip
+
+
+def _write_meshes(
+    run: Run,
+    found: dict[int, VertebraCorridors],
+    graded: Sequence[list[tuple[Screw, ScrewGrade]]],
+    vertebrae: Mapping[int, Mesh],
+    output: str | Path,
+) -> list[dict[str, Any]]:
+    """Write vertebrae and cylinders; return their entries."""
     meshes: dict[str, Mesh] = {}
     for (number, each), own in zip(found.items(), graded, strict=True):
         meshes[each.name] = vertebrae[number]

@@ -16,7 +16,7 @@ from clrecon.system.paths import extension_of
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
-    from clrecon.geometry.boxes import Box
+    from clrecon.geometry.blocks import Box
     from clrecon.labels import LabelMap
     from clrecon.points import PointCloud
 

@@ -17,7 +17,7 @@ from clrecon.system.light_dataclass import dataclass, fields
 from clrecon.system.options import numbers_reader, option, parse_numbers
 
 if TYPE_CHECKING:
-    from clrecon.geometry.boxes import Box
+    from clrecon.geometry.blocks import Box
 
 
 REGION_FORMS = "box:X0,X1,Y0,Y1,Z0,Z1, hu:LO,HI, label:FILE:NAME, mask:FILE, seed:X,Y,Z, tube:MM and tube:MM:FILE"
@@ -319,7 +319,7 @@ class InputSettings(ScanSettings, DeviceSettings):
 
     @property
     def crop(self) -> Box | None:
-        from clrecon.geometry.boxes import crop_box  # loads numpy, which the help does without
+        from clrecon.geometry.blocks import crop_box  # loads numpy, which the help does without
 
         return crop_box(self.clip_box, self.between, self.around)
 

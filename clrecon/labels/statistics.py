@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, slice_voxel_ml
-from clrecon.labels.label_bodies import label_ml
+from clrecon.labels.label_levels import label_ml
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.resample import ResampledLabels, resample_labels
 from clrecon.system.arguments import explains_arguments

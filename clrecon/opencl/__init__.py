@@ -17,7 +17,7 @@ from clrecon.opencl.arrays import (
 )
 from clrecon.opencl.cache import cache_warnings
 from clrecon.opencl.device import Device, has_hung_commands, keep_for_hung_commands
-from clrecon.opencl.launching import Stopwatch, launch, settle, wait
+from clrecon.opencl.launching import Stopwatch, launch, launcher, settle, wait
 from clrecon.opencl.program import Kernel, Program, load_program
 from clrecon.opencl.select import (
     Attempt,
@@ -57,6 +57,7 @@ __all__ = [
     "kernel_files",
     "kernel_number",
     "launch",
+    "launcher",
     "list_devices",
     "list_platforms",
     "load_program",

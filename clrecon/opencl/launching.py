@@ -12,7 +12,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from queue import SimpleQueue
@@ -20,7 +20,7 @@ from typing import Any
 
 from clrecon.errors import DeviceTimeoutError
 from clrecon.opencl.device import Command, CommandFailedError, Device
-from clrecon.opencl.program import Kernel
+from clrecon.opencl.program import Kernel, Program
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import device_seconds
@@ -263,6 +263,15 @@ def launch(device: Device, kernel: Kernel, items: int, most: int | None = None, 
             wait(device)  # what crashes or hangs is then the kernel that was told last
         if (stopwatch := _running.get()) is not None:
             stopwatch.record(kernel.name, event)
+
+
+def launcher(device: Device, program: Program) -> Callable[..., None]:
+    """Return what launches kernels of a program by name: `launch` with ``(name, items, **arguments)``."""
+
+    def run(kernel: str, items: int, **arguments: Any) -> None:
+        launch(device, program[kernel], items, **arguments)
+
+    return run
 
 
 def _check_written(kernel: Kernel, values: Sequence[Any]) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import AIR_HU, Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.labels.label_bodies import Growth, fill_solid
+from clrecon.labels.label_levels import Growth, fill_solid
 from clrecon.system.light_dataclass import dataclass
 
 Box = tuple[slice, slice, slice]
@@ -198,7 +198,7 @@ def fill_vertebra(
     With `fitted` its surface is the one that was fitted to the bone, from that at the level on.
 
     Inside is what has the level, HU, and is the label's own (or one voxel beyond), and what that encloses, see
-    `clrecon.labels.label_bodies.fill_solid`.  The canal is open above and below, and so stays outside.
+    `clrecon.labels.label_levels.fill_solid`.  The canal is open above and below, and so stays outside.
     """
     spacing = np.array(volume.spacing)
     margin = tuple(int(np.ceil(MARGIN_MM / step)) + 1 for step in spacing[::-1])

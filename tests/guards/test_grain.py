@@ -12,8 +12,8 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 93_026,
-    "modules": 412,
+    "lines": 92_957,
+    "modules": 406,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
     "options_in_several_files": 8,
@@ -22,14 +22,14 @@ CEILINGS = {
 """Who takes something away lowers the figure in the same commit; who needs more says why in the commit."""
 
 HABITS = {
-    "functions_with_pronouns": 1_201,
+    "functions_with_pronouns": 1_200,
     "functions_without_object": 241,
-    "assignments_of_three": 219,
+    "assignments_of_three": 217,
     "nested_conditionals": 0,
     "comprehensions_of_two_loops": 23,
     "positional_flags": 0,
-    "functions_of_many_parameters": 49,
-    "equal_functions": 6,
+    "functions_of_many_parameters": 45,
+    "equal_functions": 1,
     "constants_of_one_file": 0,
     "kernels_with_branches": 18,
     "tests_of_wording": 579,

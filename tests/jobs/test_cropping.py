@@ -13,7 +13,7 @@ from label_files import write_nrrd
 from clrecon import PointLook, read_mesh, read_points
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.geometry.boxes import crop_box
+from clrecon.geometry.blocks import crop_box
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.render.settings import RenderSettings
 

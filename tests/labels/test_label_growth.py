@@ -12,7 +12,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_ed
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, compose_affine
-from clrecon.labels.label_bodies import Growth, _checked
+from clrecon.labels.label_levels import Growth, _checked
 from clrecon.mesh import Mesh
 from clrecon.proof.surface.extract import extract_isosurface
 from clrecon.proof.surface.labels import extract_label, find_solid, own_labels

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from clrecon.labels.label_bodies import _close_ends, _reach_from_faces, fill_solid, find_boxes
+from clrecon.labels.label_levels import _close_ends, _reach_from_faces, fill_solid, find_boxes
 
 
 def slices(*ends):

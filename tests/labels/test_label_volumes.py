@@ -7,7 +7,7 @@ import pytest
 
 from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.labels import LabelMap
-from clrecon.labels.label_bodies import count_ml, label_ml
+from clrecon.labels.label_levels import count_ml, label_ml
 
 pytestmark = pytest.mark.unit
 

@@ -16,7 +16,7 @@ from clrecon.cli.main import main
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import slice_voxel_ml
 from clrecon.labels.contours import fill_contours, unite_contours
-from clrecon.labels.label_bodies import label_ml
+from clrecon.labels.label_levels import label_ml
 from clrecon.labels.reader import read_all_labels
 from clrecon.labels.resample import resample_labels
 from clrecon.labels.structures import label_slices

@@ -1,15 +1,16 @@
-"""The main job: a CT series in, calibrated meshes out, with their report."""
+"""The main job: a CT series in, calibrated meshes out, with the report of the whole job and of each mesh."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
-from clrecon.jobs.mesh.labels import judge_label_volumes, name_label_files
+from clrecon.jobs.mesh.labels import describe_label, judge_label_volumes, name_label_files
 from clrecon.jobs.mesh.make import MadeParts, first_names, label_parts, make_parts, warn_of_crumbs
 from clrecon.jobs.mesh.purposes import describe_purposes
 from clrecon.jobs.mesh.refinement import (
@@ -20,17 +21,228 @@ from clrecon.jobs.mesh.refinement import (
     warn_of_gates,
     warn_of_shift,
 )
-from clrecon.jobs.mesh.report import MeshReport, describe_part, report_of
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.mesh.surfaces import plan_surfaces
+from clrecon.jobs.mesh.surfaces import Part, describe_level, plan_surfaces
 from clrecon.jobs.outputs import check_kept, check_outputs, count_leftovers, name_outputs, refuse_files, refuse_numbered
-from clrecon.jobs.run import Run
+from clrecon.jobs.presets import find_iso_preset
+from clrecon.jobs.run import Run, RunReport
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.system.paths import extension_of
+from clrecon.system.pieces import find_bounds
 from clrecon.system.text import count_of
 
 if TYPE_CHECKING:
+    from clrecon.jobs.mesh.make import MadeParts
+    from clrecon.jobs.run import Run
     from clrecon.labels import LabelMap
+    from clrecon.mesh import Mesh
+    from clrecon.system.files import StagedFile
+
+
+_OF_ONE = ("quality", "walls", "iso_distance", "cortex", "refinement", "print", "cells", "growing")
+"""Entries of a mesh that are also at the top of the report if there is only one mesh."""
+
+_OF_LEVEL = ("iso_value_hu", "iso_level_hu", "inside", "inside_hu", "inside_levels_hu")
+"""Entries of a mesh that are also at the top where all meshes have them in common."""
+
+_SAID_ABOVE = ("vertices", "triangles", "closed", "manifold", "components", "area_mm2", "volume_ml", "bounds_mm")
+
+
+def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], space: str) -> dict[str, Any]:
+    """Return one object of ``meshes``, bounds in the frame `space`; entries that were not measured are None."""
+    quality: dict[str, Any] = part.quality or {}
+    origin = part.mesh.report
+    return {
+        "name": part.name or None,
+        "label": part.surface.label,
+        **{name: origin.get(name) for name in _OF_LEVEL},
+        "vertices": part.mesh.vertex_count,
+        "triangles": part.mesh.triangle_count,
+        **{name: quality.get(name) for name in ("closed", "manifold", "components")},
+        **{name: origin.get(name) for name in ("components_found", "components_kept", "seed_distances_mm")},
+        "area_mm2": quality.get("area_mm2"),
+        "volume_ml": quality.get("volume_ml") if quality.get("closed") else None,
+        "bounds_mm": _bounds(part.mesh, space),
+        "output": {"format": extension_of(output)[1:], "bytes": file.size},
+        "quality": {name: value for name, value in quality.items() if name not in _SAID_ABOVE} or None,
+        "cortex": origin.get("cortex"),
+        "cells": origin.get("cells"),
+        "growing": origin.get("growing"),
+        **({} if part.surface.label is None else describe_label(origin)),
+        **part.facts,
+    }
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeshReport(RunReport):
+    """The report of a mesh job; docs/contract.md explains its entries.
+
+    With one mesh, its entries are here too.  With several, counts and sizes are sums (components of one surface that
+    are written one by one were found together, and count once), `bounds_mm` is the box around all, `closed` and
+    `manifold` are true if they are for each mesh, and entries that differ or cannot be summed are None.
+    """
+
+    _LEFT_OUT = ("preset_reason",)
+    _LAST = (
+        *("device", "driver", "memory_allowed_bytes", "slabs", "device_bytes", "version", "platform", "warnings"),
+        *("volume", *_OF_ONE, "meshes", "output", "preset_reason", "gates", "seconds", "peak_memory_bytes"),
+    )
+    PARTS = (
+        *("device", "read", "upload", "build", "kernels", "download"),
+        *("mask", "choose", "solid", "select", "cortex", "refine", "measure", "write"),
+    )
+
+    iso_value_hu: float | None
+    iso_level_hu: float | None
+    inside: str | None
+    inside_hu: list[float | None] | None
+    inside_levels_hu: list[float | None] | None
+    outside_hu: float | None
+    iso_value_reason: str
+    iso_value_choice: Mapping[str, Any] | None
+    preset: str | None
+    space: str
+    unit: str = "mm"
+    vertices: int
+    triangles: int
+    closed: bool | None
+    manifold: bool | None
+    components: int | None
+    components_found: int | None
+    components_kept: int | None
+    area_mm2: float | None
+    volume_ml: float | None
+    bounds_mm: list[list[float]] | None
+    closed_at_border: bool
+    topology: str
+    method: str
+    grow_from: list[str | list[float]]
+    vertex_rule: str
+    keep: str | None
+    keep_largest: int | None
+    min_volume_ml: float | None
+    seeds_mm: list[list[float]]
+    all_parts: bool
+    split: bool
+    purpose: str | None
+    slabs: int
+    device_bytes: Mapping[str, int]
+    quality: Mapping[str, Any] | None
+    walls: Mapping[str, Any] | None
+    iso_distance: Mapping[str, Any] | None
+    cortex: Mapping[str, Any] | None
+    refinement: Mapping[str, Any] | None
+    print: Mapping[str, Any] | None
+    cells: Mapping[str, int] | None
+    growing: Mapping[str, Any] | None
+    meshes: list[dict[str, Any]]
+    output: Mapping[str, Any]
+    preset_reason: str | None
+    gates: list[dict[str, Any]]
+
+
+_DEVICE_PARTS = ("upload", "build", "kernels", "download")
+"""Parts whose seconds are those of the surfaces as they were extracted."""
+
+
+def report_of(
+    run: Run, made: MadeParts, meshes: Sequence[dict[str, Any]], gates: list[dict[str, Any]], warnings: Sequence[str]
+) -> MeshReport:
+    """Make the report of a job; its `warnings` come after those of the volume and the meshes."""
+    settings: MeshSettings = run.settings
+    parts = made.parts
+    level, level_warnings = describe_level(made.volume, settings, made.choice)
+    preset = settings.preset_used
+    of_one: dict[str, Any] = {name: meshes[0][name] if len(meshes) == 1 else None for name in _OF_ONE}
+    for part in _DEVICE_PARTS:
+        run.seconds[part] = sum(float(origin.get("seconds", {}).get(part, 0.0)) for origin in made.origins)
+    largest: dict[str, int] = {}
+    for own in (part.mesh.report.get("device_bytes", {}) for part in parts):
+        largest.update({what: max(size, largest.get(what, 0)) for what, size in own.items()})
+    report = run.report(
+        MeshReport,
+        [*_warn_of_meshes(parts, meshes), *level_warnings, *warnings],
+        made.volume,
+        on=made.device.current,
+        affine_ijk_to_lps_mm=made.volume.affine.tolist(),
+        **{name: _common(mesh[name] for mesh in meshes) for name in _OF_LEVEL},
+        outside_hu=_common(part.mesh.report.get("outside_hu") for part in parts),
+        **level,
+        preset=preset,
+        space=settings.space,
+        **_describe_all(parts, meshes),
+        closed_at_border=settings.closed,
+        topology=settings.topology,
+        method=settings.method_used,
+        grow_from=[seed if isinstance(seed, str) else [float(value) for value in seed] for seed in settings.grow_from],
+        vertex_rule=settings.vertex_rule,
+        keep=settings.keep,
+        keep_largest=settings.keep_largest,
+        min_volume_ml=settings.min_volume_ml,
+        seeds_mm=[[float(value) for value in seed] for seed in settings.seeds],
+        all_parts=settings.all_parts,
+        split=settings.split,
+        purpose=settings.purpose,
+        slabs=max((part.mesh.report.get("slabs", 1) for part in parts), default=1),
+        device_bytes=largest,
+        **of_one,
+        meshes=list(meshes),
+        output={"format": meshes[0]["output"]["format"], "bytes": sum(file.size for file in run.files)},
+        preset_reason=None if preset is None else find_iso_preset(preset).source,
+        gates=gates,
+    )
+    run.logged = made.volume.report.get("warnings", ())
+    return report
+
+
+def _warn_of_meshes(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> list[str]:
+    from clrecon.exchange.formats import describe_rounding
+
+    warnings = []
+    for part, mesh in zip(parts, meshes, strict=True):
+        warnings += part.mesh.report.get("warnings", [])
+        warnings += describe_rounding(part.mesh, f".{mesh['output']['format']}")
+    return warnings
+
+
+def _describe_all(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return sums over all meshes, and properties that are true for each."""
+    of_surface = {part.surface: mesh for part, mesh in zip(parts, meshes, strict=True)}.values()
+    sums = ("vertices", "triangles", "components", "area_mm2", "volume_ml")
+    return {
+        **{name: _unless_unknown(sum, (mesh[name] for mesh in meshes)) for name in sums},
+        **{name: _unless_unknown(all, (mesh[name] for mesh in meshes)) for name in ("closed", "manifold")},
+        "components_found": _unless_unknown(sum, (mesh["components_found"] for mesh in of_surface)),
+        "components_kept": _unless_unknown(sum, (mesh["components_kept"] for mesh in of_surface)),
+        "bounds_mm": _unless_unknown(_around, (mesh["bounds_mm"] for mesh in meshes)),
+    }
+
+
+def _bounds(mesh: Mesh, space: str) -> list[list[float]] | None:
+    from clrecon.geometry import frame_from_lps
+
+    if mesh.vertex_count == 0:
+        return None
+    frame = frame_from_lps(space)
+    corners = [frame @ corner for corner in find_bounds(mesh.vertices)]
+    return [[float(pick(a, b)) for a, b in zip(*corners, strict=True)] for pick in (min, max)]
+
+
+def _around(boxes: list[list[list[float]]]) -> list[list[float]]:
+    lows, highs = zip(*boxes, strict=True)
+    return [[min(axis) for axis in zip(*lows, strict=True)], [max(axis) for axis in zip(*highs, strict=True)]]
+
+
+def _common(values: Iterable[Any]) -> Any:
+    found = list(values)
+    return found[0] if all(value == found[0] for value in found) else None
+
+
+def _unless_unknown(combine: Callable[[list[Any]], Any], values: Iterable[Any]) -> Any:
+    found = list(values)
+    return None if any(value is None for value in found) else combine(found)
+
 
 log = get_logger(__name__)
 

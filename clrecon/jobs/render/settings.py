@@ -13,7 +13,7 @@ import numpy as np
 from clrecon.errors import UsageError
 from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.boxes import CROPS, Box, crop_box
+from clrecon.geometry.blocks import CROPS, Box, crop_box
 from clrecon.geometry.grid import Grid
 from clrecon.jobs.options import InputSettings, label_color_option, label_map_option, mesh_space_option, view_option
 from clrecon.labels import LabelMap

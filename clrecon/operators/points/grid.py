@@ -16,7 +16,7 @@ from clrecon.opencl import (
     allocate,
     kernel_constant,
     kernel_number,
-    launch,
+    launcher,
     load_program,
     memory_limits,
     require_room,
@@ -207,10 +207,7 @@ def fill_grid(device: Device, plan: GridPlan, *, memory: int | None = None) -> P
     scale = np.float32(1.0) / plan.edge
     where = {"origin": (*map(float, plan.corner), float(scale)), "n": n, "nx": nx, "ny": ny, "nz": nz, "words": words}
     points_d, mask_d, ranks_d = upload(device, plan.points), allocate(device, 4 * total), allocate(device, 4 * total)
-
-    def run(kernel: str, items: int, **arguments: Any) -> None:
-        launch(device, program[kernel], items, **arguments)
-
+    run = launcher(device, program)
     run("clear_cells", total, mask=mask_d, total=total)
     together = MARKED_TOGETHER if int(device.kernel_variants["LANES"]) > 1 else 1
     run("mark_cells", -(-n // together), points=points_d, mask=mask_d, **where)

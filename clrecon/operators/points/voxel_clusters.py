@@ -13,7 +13,7 @@ from clrecon.opencl import (
     allocate,
     download,
     empty_output,
-    launch,
+    launcher,
     load_program,
     memory_limits,
     require_room,
@@ -87,7 +87,8 @@ class ClusterSearch:
         self._needs = search_bytes(mask.needs(), stencil, mask.rows)
         self.device_bytes = 0
         self._check_budget({})
-        self._program = load_program(device, "points/voxel_clusters.cl", {"LANES": device.kernel_variants["LANES"]})
+        program = load_program(device, "points/voxel_clusters.cl", {"LANES": device.kernel_variants["LANES"]})
+        self._run = launcher(device, program)
         self._full, self._forward = StencilTable.of(device, stencil), StencilTable.of(device, stencil.forward())
         self._cores_d = mask.mask_d if self._samples == 1 or self._is_one else self._find_cores()
         self._count()
@@ -119,9 +120,6 @@ class ClusterSearch:
         needs = {**self._needs, **more}
         require_room(self._limits, needs, "the clusters of the voxels cannot be found")
         self.device_bytes = max(self.device_bytes, sum(needs.values()))
-
-    def _run(self, kernel: str, items: int, **arguments: Any) -> None:
-        launch(self._device, self._program[kernel], items, **arguments)
 
     def _find_cores(self) -> Any:
         mask = self._mask

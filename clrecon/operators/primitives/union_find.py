@@ -14,7 +14,7 @@ from clrecon.opencl import (
     Program,
     allocate,
     download,
-    launch,
+    launcher,
     load_program,
     memory_limits,
     require_room,
@@ -102,14 +102,11 @@ class _Rounds:
 
     def __init__(self, device: Device, labels_d: Any, other_d: Any, nodes: int):
         self._device = device
-        self._program = prepare_components(device)
+        self.run = launcher(device, prepare_components(device))
         self._labels_d, self._other_d, self._nodes = labels_d, other_d, nodes
         self._flags_d = allocate(device, 8)
         self._roots: Compacted | None = None
         self._passes = 0
-
-    def run(self, kernel: str, items: int, **arguments: Any) -> None:
-        launch(self._device, self._program[kernel], items, **arguments)
 
     def start(self) -> None:
         self.run("clear_labels", 1, labels=allocate(self._device, 4), flags=self._flags_d, n=1)

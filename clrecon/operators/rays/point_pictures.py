@@ -26,11 +26,11 @@ from clrecon.opencl import (
     load_program,
     memory_limits,
     settle,
-    take_device,
     upload,
     with_fallback,
 )
 from clrecon.operators.rays.picture_buffers import Shot, highlight_table
+from clrecon.operators.resident.device_volume import DeviceWorker
 from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
 from clrecon.rendering import Lighting, Rendering
@@ -40,7 +40,6 @@ from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.pictures.object_looks import PointLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.arguments import name_parameter
-from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
 
 LARGEST_DISC = kernel_number("rays/splats.cl", "MOST_PIXELS")
@@ -270,7 +269,7 @@ class _Colors(NamedTuple):
     window: tuple[float, float] | None
 
 
-class PointPictures(Closing):
+class PointPictures(DeviceWorker):
     """A cloud of points of which pictures are made one after the other: a context manager.
 
     Its arrays must not change as long as this object is open; a cloud over `memory` goes through in parts.
@@ -279,8 +278,8 @@ class PointPictures(Closing):
     def __init__(self, cloud: PointCloud, *, device: Device | str | int | None = None, memory: int | None = None):
         check_memory(memory)
         self.box = cloud_box(cloud)
-        self.cloud, self.memory = cloud, memory
-        self._device = take_device(device)
+        self.cloud = cloud
+        super().__init__(device, memory)
         self._spacing: float | None = None
         self._colors: tuple[PointLook, _Colors] | None = None
         self._base: Float64Array | None = None
@@ -293,11 +292,6 @@ class PointPictures(Closing):
     def close(self) -> None:
         """Free what was made for the pictures."""
         self._colors = None
-
-    @property
-    def device(self) -> Device:
-        """The device that works."""
-        return self._device.current
 
     def take(
         self,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels import ResampledLabels
-from clrecon.labels.label_bodies import Growth
+from clrecon.labels.label_levels import Growth
 from clrecon.opencl import Stopwatch, allocate, check_budget, download, kernel_constant, launch, load_program, upload
 from clrecon.operators.rays.picture_buffers import PictureBuffers, Pixels, Shot
 from clrecon.operators.resident.device_volume import DeviceVolume

@@ -30,7 +30,6 @@ from clrecon.opencl import (
     kernel_constant,
     launch,
     load_program,
-    take_device,
     upload,
     with_fallback,
 )
@@ -47,14 +46,13 @@ from clrecon.operators.rays.mesh_pictures import (
 from clrecon.operators.rays.picture_buffers import Between, DrawnVolume, Shot
 from clrecon.operators.rays.point_pictures import PointPictures, cloud_box, eye_table
 from clrecon.operators.rays.volume_renderer import VolumeRenderer, shown_box
-from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.resident.device_volume import DeviceVolume, DeviceWorker
 from clrecon.points import PointCloud
 from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera, box_corners
-from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
 
 LAYERS = 16
@@ -257,7 +255,7 @@ def check_objects(objects: Sequence[tuple[Any, Style]]) -> None:
         )
 
 
-class ScenePictures(Closing):
+class ScenePictures(DeviceWorker):
     """Objects of which pictures are made together, one after the other: a context manager.
 
     Every pixel has layers from front to back: triangles of meshes (`LayeredPicture`), and one for what is opaque
@@ -281,7 +279,6 @@ class ScenePictures(Closing):
     ):
         check_memory(memory)
         check_objects(objects)
-        self.memory = memory
         if takers is None:
             self.box = _box_of(objects)
         self._parts: list[MeshPart] = []
@@ -293,7 +290,7 @@ class ScenePictures(Closing):
         if self._triangles > MOST_TRIANGLES:
             raise UsageError(f"a picture shows at most {MOST_TRIANGLES:,} triangles, these are {self._triangles:,}")
         self._stack = ExitStack()
-        self._device = take_device(device)
+        super().__init__(device, memory)
         self._is_own = takers is None
         self._takers: dict[int, VolumeRenderer | PointPictures] = {} if takers is None else takers
 
@@ -303,11 +300,6 @@ class ScenePictures(Closing):
         if self._is_own:
             self._takers.clear()
         self._parts = []
-
-    @property
-    def device(self) -> Device:
-        """The device that works."""
-        return self._device.current
 
     def take(
         self,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from clrecon.errors import DeviceError, DeviceFailedError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
-from clrecon.labels.label_bodies import Growth
+from clrecon.labels.label_levels import Growth
 from clrecon.opencl import launch, memory_limits, upload
 from clrecon.operators.rays.picture_buffers import PictureBuffers, RayView, Shot, count_queues, highlight_table
 from clrecon.operators.rays.ray_slabs import LeapMap, RaySlab, SlabPicture, find_leaps, slab_labels

@@ -19,7 +19,7 @@ from clrecon.operators.rays.ray_pictures import take_picture, take_with_layers
 from clrecon.operators.rays.slices import choose_slices, overlay_slices, overlay_with_layers
 from clrecon.operators.rays.surface_pictures import cast_surface
 from clrecon.operators.reformat.cut import take_contact_sheet, take_curve, take_cut
-from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
+from clrecon.operators.resident.device_volume import DeviceVolume, VolumeWorker
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.pictures.label_style import LabelStyle
@@ -40,7 +40,6 @@ from clrecon.rendering.views.clip import ShownLabels, check_center, find_seen_bo
 from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, checked_size, default_view
 from clrecon.rendering.views.reformation import find_plane
 from clrecon.system.arguments import DirectionName, ModeName, ViewName, explains_arguments
-from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
 
 if TYPE_CHECKING:
@@ -115,7 +114,7 @@ _MOST_STEPS = 1 << 15
 turns."""
 
 
-class VolumeRenderer(Closing):
+class VolumeRenderer(VolumeWorker):
     """A volume on a device, of which pictures are made one after the other.
 
     The volume is uploaded once where it fits the device as a whole; a larger one goes through in slabs for each
@@ -142,25 +141,18 @@ class VolumeRenderer(Closing):
     def __init__(
         self, volume: Volume | DeviceVolume, *, device: Device | str | int | None = None, memory: int | None = None
     ):
-        self._resident, self._is_own = take_volume(volume, device, memory, "a picture")
-        self.volume = self._resident.volume
+        super().__init__(volume, device, memory, "a picture")
         self._framed: tuple[tuple[object, ...], Grid] | None = None
         self._inner: VolumeRenderer | None = None
         voxels = self.volume.voxels
         if voxels.dtype.kind == "f" and not np.isfinite(voxels).all():
             raise UsageError("the voxels hold NaN or infinite values: fill them first, for CT with -1024")
 
-    @property
-    def device(self) -> Device:
-        """The device that works."""
-        return self._resident.device
-
     def close(self) -> None:
         """Free the volume on the device; a `DeviceVolume` that was given stays as it is."""
         if self._inner is not None:
             self._inner.close()
-        if self._is_own:
-            self._resident.close()
+        super().close()
 
     @explains_arguments
     def render(

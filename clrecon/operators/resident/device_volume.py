@@ -358,6 +358,36 @@ class DeviceVolume(Closing, Volume):
             del error  # its frames hold buffers
 
 
+class VolumeWorker(Closing):
+    """Base of what works on a volume on a device, for `what`: a `DeviceVolume` that is given, or one of its own."""
+
+    def __init__(self, volume: Volume | DeviceVolume, device: Device | str | int | None, memory: int | None, what: str):
+        self._resident, self._is_own = take_volume(volume, device, memory, what)
+        self.volume = self._resident.volume
+
+    @property
+    def device(self) -> Device:
+        """The device that works."""
+        return self._resident.device
+
+    def close(self) -> None:
+        """Free the volume on the device; a `DeviceVolume` that was given stays as it is."""
+        if self._is_own:
+            self._resident.close()
+
+
+class DeviceWorker(Closing):
+    """Base of what works on a device or its stand-in, with at most `memory` bytes."""
+
+    def __init__(self, device: Device | str | int | None, memory: int | None):
+        self._device, self.memory = take_device(device), memory
+
+    @property
+    def device(self) -> Device:
+        """The device that works."""
+        return self._device.current
+
+
 @contextmanager
 def open_volume(
     volume: Volume | DeviceVolume, device: Device | str | int | None, memory: int | None, what: str

@@ -16,7 +16,7 @@ from clrecon.geometry.iso_rule import IsoRule, Level, check_topology, choose_iso
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device
 from clrecon.operators.masks.enclosed import fill_enclosed
-from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
+from clrecon.operators.resident.device_volume import DeviceVolume, VolumeWorker
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Extraction
 from clrecon.operators.surface.marching_cubes import Placement
@@ -25,11 +25,10 @@ from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 from clrecon.operators.surface.trilinear import check_row
 from clrecon.points import PointCloud
 from clrecon.system.arguments import Topology, VertexRule, explains_arguments, name_parameter
-from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
 
 
-class SurfaceExtractor(Closing):
+class SurfaceExtractor(VolumeWorker):
     """A volume on a device, from which surfaces are extracted at one iso value after the other.
 
     The volume is uploaded once if it fits the device as a whole.  A larger one is processed slab by slab each time,
@@ -56,20 +55,9 @@ class SurfaceExtractor(Closing):
     def __init__(
         self, volume: Volume | DeviceVolume, *, device: Device | str | int | None = None, memory: int | None = None
     ):
-        self._resident, self._is_own = take_volume(volume, device, memory, "a surface")
-        self.volume = self._resident.volume
+        super().__init__(volume, device, memory, "a surface")
         marching_cubes.check_row(self.volume.shape_ijk[0])
         self._placements: dict[int, Placement] = {}
-
-    @property
-    def device(self) -> Device:
-        """The device that works."""
-        return self._resident.device
-
-    def close(self) -> None:
-        """Free the volume on the device; a `DeviceVolume` that was given stays as it is."""
-        if self._is_own:
-            self._resident.close()
 
     @explains_arguments
     def forecast(self, *, closed: bool = True, topology: Topology = "separated") -> dict[str, int]:

@@ -200,9 +200,9 @@ class Extraction:
         if self._vertices_only:
             counted = replace(counted, triangles=0)
         self._check_output(slab, counted)
-        part = marching_cubes.emit(
-            device, slab, program, voxels_d, classified, counted, self.placement, self.vertices, stopwatch
-        )
+        part = marching_cubes.Emission(
+            device, slab, program, voxels_d, classified, counted, self.placement, stopwatch
+        ).run(self.vertices)
         self.grid.volume.release_slices(*slab.voxel_slices)
         self.parts.append(part)
         self.vertices, self.triangles = self.vertices + len(part[0]), self.triangles + len(part[2])

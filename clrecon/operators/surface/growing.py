@@ -23,6 +23,7 @@ from clrecon.opencl import (
     download,
     kernel_constant,
     launch,
+    launcher,
     load_program,
     upload,
 )
@@ -175,10 +176,7 @@ def choose_components(
 ) -> None:  # fmt: skip
     program, (gi, gj, gk) = prepare_choosing(device), grid.shape
     sizes = {"gi": gi, "gj": gj, "gk": gk, "words": grid.words}
-
-    def run(kernel: str, items: int, **arguments: Any) -> None:
-        launch(device, program[kernel], items, **arguments)
-
+    run = launcher(device, program)
     n = runs.total
     if seeds.auto:
         sized = {"roots": components.roots_d, "run_cells": components.cells_d, "sums": components.sums_d}

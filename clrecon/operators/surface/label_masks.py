@@ -13,7 +13,6 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule
 from clrecon.geometry.vertices import warnings_of_far
 from clrecon.labels import LabelMap
-from clrecon.labels.label_bodies import Box, find_boxes, label_ml
 from clrecon.labels.label_levels import (
     FACES_PER_AREA,
     FULL,
@@ -21,9 +20,12 @@ from clrecon.labels.label_levels import (
     REACH,
     STEEPNESS,
     Borders,
+    Box,
     choose_levels,
     count_faces,
+    find_boxes,
     find_enclosed,
+    label_ml,
     level_biases,
     next_level,
 )

@@ -15,7 +15,7 @@ from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.geometry.vertices import warnings_of_far
 from clrecon.labels import LabelMap, ResampledLabels
-from clrecon.labels.label_bodies import Box, Growth, count_ml, fill_solid, find_boxes, label_ml
+from clrecon.labels.label_levels import Box, Growth, count_ml, fill_solid, find_boxes, label_ml
 from clrecon.mesh import Mesh
 from clrecon.opencl import (
     Device,
@@ -281,10 +281,9 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
         if counted.triangles == 0:
             return None
         self.check_output(window, counted)
-        part = marching_cubes.emit(
-            device, window, surface, held.voxels_d, classified, counted, self.placement, 0, stopwatch,
-            {"inside": held.inside_d, "label": number, "half_way_count": half_way_d},
-        )  # fmt: skip
+        part = marching_cubes.Emission(
+            device, window, surface, held.voxels_d, classified, counted, self.placement, stopwatch
+        ).run(inside=held.inside_d, label=number, half_way_count=half_way_d)
         half_way = int(download(device, np.empty(1, np.uint32), half_way_d)[0])
         self.share_by_hu = 1.0 - half_way / counted.vertices
         return part
@@ -375,7 +374,7 @@ def extract_labels(
     closed : bool
         As `extract_isosurface`.
     solid : bool
-        True: fill less dense parts within a label, see ``clrecon.labels.label_bodies``.
+        True: fill less dense parts within a label, see ``clrecon.labels.label_levels``.
     memory : int, optional
         Bytes that may be taken on the device; None is all that it has.  If the slices of all labels do not fit
         together, the labels are processed one by one; the meshes are the same.

@@ -4,7 +4,7 @@ slab.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -301,9 +301,19 @@ class Emission:
             mirrored=slab.grid.winds_backwards, **self._common, **self._classified.own,
         )  # fmt: skip
 
-    @property
-    def output(self) -> dict[str, Any]:
-        return {"positions": self.positions_d, "normals": self.normals_d, "triangles": self.triangles_d}
+    def run(
+        self, first_vertex: int = 0, **label_arguments: Any
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
+        """Run both passes together: positions, normals and triangles of the slab."""
+        with self._stopwatch.running(self._device):
+            self.vertices(self._slab.grid.rule.iso_level, **label_arguments)
+            if self._counted.cells is None:
+                self.triangles(first_vertex)
+            else:
+                output = {"positions": self.positions_d, "normals": self.normals_d, "triangles": self.triangles_d}
+                field = {"voxels": self._voxels_d, "mask": self._classified.mask_d}
+                emit_cells(self._device, self._slab, field, self._counted, self.tables, output, first_vertex)
+        return self.download()
 
     def download(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
         with self._stopwatch.timed("download"):
@@ -314,28 +324,3 @@ class Emission:
         if self._slab.grid.rule.inside == "below":
             np.negative(self._normals, out=self._normals)
         return self._positions, self._normals, self._triangles
-
-
-def emit(
-    device: Device,
-    slab: Slab,
-    program: Program,
-    voxels_d: Any,
-    classified: Classified,
-    counted: Counted,
-    placement: Placement,
-    first_vertex: int,
-    stopwatch: Stopwatch,
-    label_arguments: Mapping[str, Any] | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
-    """Run passes 3 and 4 together: positions, normals and triangles of the slab, see `Emission`."""
-    emission = Emission(device, slab, program, voxels_d, classified, counted, placement, stopwatch)
-    with stopwatch.running(device):
-        emission.vertices(slab.grid.rule.iso_level, **(label_arguments or {}))
-        if counted.cells is not None:
-            emit_cells(
-                device, slab, voxels_d, classified.mask_d, counted, emission.tables, emission.output, first_vertex,
-            )  # fmt: skip
-        else:
-            emission.triangles(first_vertex)
-    return emission.download()

@@ -72,22 +72,18 @@ def count_cells(
 
 
 def emit_cells(
-    device: Device,
-    slab: Slab,
-    voxels_d: Any,
-    mask_d: Any,
-    counted: Any,
-    tables: dict[str, Any],
-    output: dict[str, Any],
+    device: Device, slab: Slab, field: dict[str, Any], counted: Any, tables: dict[str, Any], output: dict[str, Any],
     first_vertex: int,
-) -> None:
-    """Write triangles and vertices inside cells after `first_vertex`; `tables` are those of emit_vertices."""
+) -> None:  # fmt: skip
+    """Write triangles and vertices inside cells after `first_vertex`; `tables` are those of emit_vertices.
+
+    field: Buffers ``voxels`` and ``mask`` of the slab.
+    """
     program = prepare_trilinear(device, slab.grid.volume.voxels.dtype)
     cells: CellVertices = counted.cells
     active = counted.active_words
     common = {
-        "voxels": voxels_d,
-        "mask": mask_d,
+        **field,
         "active_words": counted.active_words_d,
         "row_offsets": counted.row_offsets_d,
         "cell_vertex_offsets": cells.offsets_d,

@@ -14,7 +14,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.labels import LabelMap
 from clrecon.labels.canal import Canal, find_canal
-from clrecon.labels.label_bodies import count_ml
+from clrecon.labels.label_levels import count_ml
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device
 from clrecon.operators.masks.mask import Mask

@@ -10,7 +10,7 @@ from clrecon.geometry import Volume, column_spacing
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.labels import LabelMap
-from clrecon.labels.label_bodies import Growth, find_boxes
+from clrecon.labels.label_levels import Growth, find_boxes
 from clrecon.labels.resample import check_together, warn_of_place
 from clrecon.mesh.scanlines import fill_surface
 from clrecon.opencl import Device, download

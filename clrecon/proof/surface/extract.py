@@ -20,8 +20,7 @@ from clrecon.geometry.iso_rule import (
 )
 from clrecon.geometry.vertices import golden_fraction, search_fraction
 from clrecon.proof.surface.case_table import CORNERS, EDGES, case_table
-from clrecon.proof.surface.trilinear import find_row, place_cell_vertices
-from clrecon.proof.surface.trilinear_table import CELL_VERTEX
+from clrecon.proof.surface.trilinear_table import CELL_VERTEX, find_row, place_cell_vertices
 
 Surface = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint32]]
 """Vertices (n, 3) and normals (n, 3), LPS mm, and triangles (m, 3)."""

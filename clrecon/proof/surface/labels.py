@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
-from clrecon.labels.label_bodies import Growth, fill_solid, find_boxes
-from clrecon.labels.label_levels import FULL, KEEP, REACH, level_biases, next_level
+from clrecon.labels.label_levels import FULL, KEEP, REACH, Growth, fill_solid, find_boxes, level_biases, next_level
 from clrecon.proof.surface.extract import (
     CrossedEdges,
     Surface,

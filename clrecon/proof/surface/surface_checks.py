@@ -16,8 +16,7 @@ from clrecon.errors import DeviceError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import Level
 from clrecon.labels import LabelMap, resample_labels
-from clrecon.labels.label_bodies import find_boxes
-from clrecon.labels.label_levels import FULL, count_faces
+from clrecon.labels.label_levels import FULL, count_faces, find_boxes
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, Stopwatch, allocate, download, launch, upload
 from clrecon.operators.resident.device_volume import DeviceVolume

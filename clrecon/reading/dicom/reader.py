@@ -13,13 +13,14 @@ from typing import Any
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import Volume, column_spacing
 from clrecon.geometry.certificate import Certificate
-from clrecon.reading.common.likeness import Likeness, judge_slices
+from clrecon.reading.common.likeness import judge_slices
 from clrecon.reading.common.plausibility import examine_voxels
 from clrecon.reading.common.selection import Selection, check_rescale
 from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing
 from clrecon.reading.dicom.parse.elements import describe_way_out
 from clrecon.reading.dicom.pixels.voxels import read_voxels
 from clrecon.reading.dicom.series.certificate import (
+    SeriesPixels,
     certify,
     collect_scan_warnings,
     collect_series_warnings,
@@ -29,7 +30,7 @@ from clrecon.reading.dicom.series.choice import choose_series, describe_left
 from clrecon.reading.dicom.series.foreign_files import advise_on, is_text
 from clrecon.reading.dicom.series.scan import BARE_DATA_SET, LINK_OUT, Scan, advise_on_links, scan_path
 from clrecon.reading.dicom.series.series import Series, group_series
-from clrecon.reading.dicom.stack.fit import measure_extent, median_thickness
+from clrecon.reading.dicom.stack.fit import Stack, measure_extent, median_thickness
 from clrecon.system.arguments import name_parameter
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.paths import open_regular
@@ -101,17 +102,12 @@ def read_series(path: str | os.PathLike[str], selection: Selection, progress: Pr
         stack = chosen.stack
         if chosen.problems or stack is None or stack.affine is None:
             raise RefusedInputError(_describe_refusal(chosen))
-        voxels, facts = read_voxels(stack.slices, progress)
-        likeness = judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven)
-        findings = examine_voxels(voxels, facts, stack.slices, known=not count_unknown(stack.slices))
+        pixels = _read_pixels(stack, progress)
+    voxels, facts = pixels.voxels, pixels.facts
     warnings = [
-        *collect_series_warnings(chosen),
-        *_describe_likeness(likeness),
-        *findings.warnings,
-        *collect_scan_warnings(scan),
-        *left,
-    ]
-    report = certify(chosen, stack, facts, scan, stack.affine, warnings, likeness, findings)
+        *collect_series_warnings(chosen), *_warn_of_pixels(pixels), *collect_scan_warnings(scan), *left
+    ]  # fmt: skip
+    report = certify(chosen, stack, pixels, scan, stack.affine, warnings)
     log.info("series %d of %d read: %s voxels %s", chosen.number, len(found), voxels.shape[::-1], voxels.dtype)
     log_warnings(log, report.warnings)
     return Volume(voxels, stack.affine, report, stack.slice_positions, hu_range=(facts.hu_min, facts.hu_max))
@@ -170,18 +166,25 @@ def _certify_chosen(
     stack = series.stack
     if stack is None or series.kind == "other":
         return None
-    facts, likeness, findings, warnings = None, None, None, collect_series_warnings(series)
+    read, warnings = None, collect_series_warnings(series)
     affine = None if series.problems else stack.affine
     if pixels and affine is not None:
-        voxels, facts = read_voxels(stack.slices, progress)
-        likeness = judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven)
-        findings = examine_voxels(voxels, facts, stack.slices, known=not count_unknown(stack.slices))
-        warnings += [*_describe_likeness(likeness), *findings.warnings]
-    return certify(series, stack, facts, scan, affine, [*warnings, *notes], likeness, findings)
+        read = _read_pixels(stack, progress)
+        warnings += _warn_of_pixels(read)
+    return certify(series, stack, read, scan, affine, [*warnings, *notes])
 
 
-def _describe_likeness(likeness: Likeness | None) -> list[str]:
-    return [f"{likeness}, {name_parameter('phase')} takes one"] if likeness is not None and likeness.is_mixed else []
+def _read_pixels(stack: Stack, progress: Progress | None) -> SeriesPixels:
+    voxels, facts = read_voxels(stack.slices, progress)
+    likeness = judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven)
+    findings = examine_voxels(voxels, facts, stack.slices, known=not count_unknown(stack.slices))
+    return SeriesPixels(voxels, facts, likeness, findings)
+
+
+def _warn_of_pixels(pixels: SeriesPixels) -> list[str]:
+    likeness = pixels.likeness
+    mixed = [f"{likeness}, {name_parameter('phase')} takes one"] if likeness is not None and likeness.is_mixed else []
+    return [*mixed, *pixels.findings.warnings]
 
 
 @contextmanager

@@ -16,17 +16,16 @@ from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.labels.resample import ResampledLabels
 from clrecon.mesh import Mesh
-from clrecon.opencl import Device, take_device
+from clrecon.opencl import Device
 from clrecon.operators.rays.point_pictures import PointPictures
 from clrecon.operators.rays.scene import ScenePictures
 from clrecon.operators.rays.volume_renderer import VolumeRenderer
-from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.resident.device_volume import DeviceVolume, DeviceWorker
 from clrecon.operators.surface.extract import SurfaceExtractor
 from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.pictures.styles import PlaneCut, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera
-from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.viewer.drawing.looks import LabelledLook
 from clrecon.viewer.model.changes import shift_camera
@@ -128,16 +127,15 @@ MOST_FOUND, MOST_FOUND_BYTES = 6, 1 << 29
 """Sets of parts kept, of all views together, and bytes of their label maps; two are kept whatever their size."""
 
 
-class Stage(Closing):
+class Stage(DeviceWorker):
     """What is on the device; safe for several threads: `lock` is held while the device works for a view."""
 
     def __init__(
         self, objects: Sequence[ShownObject], *, device: Device | str | int | None = None, memory: int | None = None
     ):
         self.objects = tuple(objects)
-        self.memory = memory
+        super().__init__(device, memory)
         self.lock = threading.RLock()
-        self._device = take_device(device)
         self._bare: dict[int, Volume] = {}
         self._residents: dict[tuple[int, bool], DeviceVolume] = {}
         self._solid: dict[int, tuple[DeviceVolume, ResampledLabels]] = {}
@@ -153,10 +151,6 @@ class Stage(Closing):
                 resident.close()
             for kept in (self._takers, self._residents, self._solid):
                 kept.clear()  # type: ignore[attr-defined]
-
-    @property
-    def device(self) -> Device:
-        return self._device.current
 
     # Parts
 

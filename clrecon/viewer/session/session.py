@@ -1,6 +1,6 @@
 """`ViewSession`: what a face of a view holds: model, painter and workers, and nothing of a toolkit.
 
-`PictureFacts` tell when a picture is stale; of each kind of work the latest request wins (`Worker`).
+`picture_key` tells when a picture is stale; of each kind of work the latest request wins (`Worker`).
 """
 
 from __future__ import annotations
@@ -318,7 +318,7 @@ class ViewSession(Closing):
             self.model.set_aspect(width / height)
 
     def picture_key(self, view: str) -> Hashable:
-        """Return what the picture of a view depends on, see `clrecon.viewer.session.picture_facts`."""
+        """Return what the picture of a view depends on, see the function of this name."""
         return picture_key(self.model.state, view)
 
     def slice(self, plane: str, size: Sequence[int], then: Callable[[Rendering], None]) -> None:

@@ -152,10 +152,6 @@ class Download:
     ticket: str
     path: Path
 
-    @property
-    def size(self) -> int:
-        return self.path.stat().st_size
-
 
 class Downloads:
     """The finished files of one browser; `folder` is one that only the owner of the process can read."""
@@ -376,7 +372,7 @@ class Connection:
 
     def _offer(self, download: Any) -> None:
         self.downloads.offer(download)
-        self._say(saved={"ticket": download.ticket, "name": download.path.name, "bytes": download.size})
+        self._say(saved={"ticket": download.ticket, "name": download.path.name, "bytes": download.path.stat().st_size})
 
     # To the browser
 

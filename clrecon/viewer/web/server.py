@@ -322,7 +322,7 @@ async def _stream(request: web.Request, download: Download) -> web.StreamRespons
 
     response = web.StreamResponse(headers={"Content-Disposition": f'attachment; filename="{download.path.name}"'})
     response.content_type = "application/octet-stream"
-    response.content_length = download.size
+    response.content_length = download.path.stat().st_size
     await response.prepare(request)
     with open(download.path, "rb") as file:
         while piece := await asyncio.to_thread(file.read, _PIECE):

@@ -12,8 +12,7 @@ from variants import daily, daily_rows
 from clrecon.errors import DeviceError, RefusedInputError, UsageError
 from clrecon.geometry import apply_affine
 from clrecon.labels import LabelMap
-from clrecon.labels.label_bodies import find_boxes
-from clrecon.labels.label_levels import FULL, KEEP, Borders, choose_levels, count_faces, find_enclosed
+from clrecon.labels.label_levels import FULL, KEEP, Borders, choose_levels, count_faces, find_boxes, find_enclosed
 from clrecon.mesh.triangles import enclosed_ml
 from clrecon.opencl import Stopwatch
 from clrecon.operators.surface.label_masks import extract_label_masks, survey_labels

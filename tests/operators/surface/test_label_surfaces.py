@@ -12,7 +12,7 @@ from clrecon.errors import DeviceError, NoSurfaceError, RefusedInputError, Usage
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.labels import LabelMap, resample_labels
-from clrecon.labels.label_bodies import Growth
+from clrecon.labels.label_levels import Growth
 from clrecon.opencl import Stopwatch
 from clrecon.operators.resident import device_volume
 from clrecon.operators.resident.device_volume import DeviceVolume

@@ -221,7 +221,7 @@ def test_counts_over_32_bits_are_refused(device, monkeypatch):
 
 def test_vertices_of_all_slabs_together_must_fit_32_bits(device, monkeypatch):
     """Each slab has few; the sum is refused, as soon as it is reached."""
-    true_emit = marching_cubes.emit
+    true_run = marching_cubes.Emission.run
 
     class Long:
         def __init__(self, array):
@@ -230,10 +230,10 @@ def test_vertices_of_all_slabs_together_must_fit_32_bits(device, monkeypatch):
         def __len__(self):
             return 2**31
 
-    def emit(*arguments):
-        return tuple(Long(array) for array in true_emit(*arguments))
+    def run(*arguments):
+        return tuple(Long(array) for array in true_run(*arguments))
 
-    monkeypatch.setattr(marching_cubes, "emit", emit)
+    monkeypatch.setattr(marching_cubes.Emission, "run", run)
     with refused(DeviceError, 4294967296, "vertices"):
         extract_in_slabs(random_volume((9, 6, 7)), 3, device, 3)
 

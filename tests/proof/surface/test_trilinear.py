@@ -17,8 +17,16 @@ from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
 from clrecon.proof.surface.case_table import CORNERS, EDGES, FACES, find_ambiguous_faces
 from clrecon.proof.surface.extract import extract_isosurface
-from clrecon.proof.surface.trilinear import decide_faces, find_row, place_cell_vertices, scale_heights
-from clrecon.proof.surface.trilinear_table import CELL_VERTEX, cell_state, find_regions, find_states
+from clrecon.proof.surface.trilinear_table import (
+    CELL_VERTEX,
+    cell_state,
+    decide_faces,
+    find_regions,
+    find_row,
+    find_states,
+    place_cell_vertices,
+    scale_heights,
+)
 
 MARGIN = np.full(3, 1e-4)
 MOST_DRAWINGS = 2000

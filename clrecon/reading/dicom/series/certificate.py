@@ -32,10 +32,9 @@ from clrecon.reading.common.plausibility import (
 from clrecon.reading.common.source_facts import PixelFacts
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
 from clrecon.reading.dicom.parse.transfer_syntaxes import SYNTAX_NAMES
-from clrecon.reading.dicom.series.census import facts_of_numbers, judge_numbers
 from clrecon.reading.dicom.series.phases import choose_phase, describe_spacing
 from clrecon.reading.dicom.series.scan import Scan
-from clrecon.reading.dicom.series.series import Series
+from clrecon.reading.dicom.series.series import Series, facts_of_numbers, judge_numbers
 from clrecon.reading.dicom.stack.fit import (
     ORIENTATION_EXACT,
     ORIENTATION_LIMIT,
@@ -52,6 +51,7 @@ from clrecon.reading.dicom.stack.fit import (
 )
 from clrecon.reading.dicom.stack.mixtures import describe_differences
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.records import Gate, at_most, none_of, unmeasured
 from clrecon.system.text import count_of, hash_uid
 
@@ -400,21 +400,32 @@ def _facts_of_rescale(headers: Sequence[SliceHeader], scan: Scan, findings: Voxe
     }
 
 
+@dataclass(frozen=True)
+class SeriesPixels:
+    """Voxels of a series, and what they tell beside its headers."""
+
+    voxels: NDArray[Any]
+    facts: PixelFacts
+    likeness: Likeness | None
+    findings: VoxelFindings
+
+
 def certify(
     series: Series,
     stack: Stack,
-    facts: PixelFacts | None,
+    pixels: SeriesPixels | None,
     scan: Scan,
     affine: NDArray[np.float64] | None,
     warnings: Sequence[str],
-    likeness: Likeness | None = None,
-    findings: VoxelFindings | None = None,
 ) -> Certificate:
     """Build the certificate of a series: the report of its volume, and what ``clrecon info`` shows.
 
-    facts, likeness, findings: None: the pixels were not read, and entries that depend on them are None.
+    pixels: None: they were not read, and entries that depend on them are None.
     affine: None: the series is refused.
     """
+    facts = None if pixels is None else pixels.facts
+    likeness = None if pixels is None else pixels.likeness
+    findings = None if pixels is None else pixels.findings
     headers, first, line, identity = stack.slices, stack.slices[0], stack.line, series.identity
     stated = next((h.stated_gap_mm for h in headers if h.stated_gap_mm is not None), None)
     lay = {h.patient_position for h in headers}
