@@ -13,7 +13,7 @@ import argparse
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -62,23 +62,23 @@ CHECKS = {
 }
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, *, checks: Mapping[str, ReleaseCheck] = CHECKS, kept: Path = KEPT) -> int:
     """Run the checks that are named on the command line, or list all."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--list", action="store_true", help="say what each check holds, and run none")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(CHECKS))
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(checks))
     options = parser.parse_args(argv)
-    if unknown := [name for name in options.names if name not in CHECKS]:
-        parser.error(f"no check {unknown[0]!r}: there are {', '.join(CHECKS)}")
+    if unknown := [name for name in options.names if name not in checks]:
+        parser.error(f"no check {unknown[0]!r}: there are {', '.join(checks)}")
     if options.list:
-        for name, check in CHECKS.items():
+        for name, check in checks.items():
             said = [f"{variable}={value}" for variable, value in check.variables.items()]
             print(f"{name}: {check.holds}\n    {' '.join([*said, *check.command])}")
         return 0
-    KEPT.mkdir(parents=True, exist_ok=True)
+    kept.mkdir(parents=True, exist_ok=True)
     failed = []
-    for name in options.names or CHECKS:
-        check = CHECKS[name]
+    for name in options.names or checks:
+        check = checks[name]
         print(f"== {name}: {check.holds}", flush=True)
         environment = {**os.environ, **check.variables}
         python = [sys.executable] if check.command[0].endswith(".py") else []

@@ -173,19 +173,18 @@ def _name_mask(labels: LabelMap, path: Path) -> LabelMap:
     return LabelMap(labels.voxels, labels.affine, names, warnings=labels.warnings)
 
 
-def is_large_map(path: str | Path) -> bool:
+def is_large_map(path: str | Path, *, most_bytes: int = LARGE_BYTES) -> bool:
     """Tell from its header whether a label map is read after its scan: contours of an RTSTRUCT need its slices, and one
-    that takes long to unpack is better held against its grid first.
-    """
+    that takes long to unpack is better held against its grid first."""
     try:
         if Path(path).is_dir():
-            return max(map(_stored_bytes, open_masks(Path(path)).values())) > LARGE_BYTES
+            return max(map(_stored_bytes, open_masks(Path(path)).values())) > most_bytes
         kind = tell_kind(Path(path))
         if kind == "DICOM" and _tell_class(Path(path)) == STRUCTURE_SET:
             return True
         if kind == "DICOM":
-            return tell_pixel_bytes(Path(path)) > LARGE_BYTES
-        return kind is not None and _stored_bytes(open_grid(Path(path), kind, LABEL_MAP)) > LARGE_BYTES
+            return tell_pixel_bytes(Path(path)) > most_bytes
+        return kind is not None and _stored_bytes(open_grid(Path(path), kind, LABEL_MAP)) > most_bytes
     except (ClreconError, OSError):  # told by `read_labels`
         return False
 

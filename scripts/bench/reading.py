@@ -7,7 +7,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -72,13 +72,13 @@ def measure_reading(job: Job) -> dict[str, Any]:
 
 
 @case("scan-tree", "headers of 1,000, 10,000 and 100,000 files; at 1,000 against pydicom without pixels")
-def measure_scan_tree(job: Job) -> dict[str, Any]:
+def measure_scan_tree(job: Job, trees: Sequence[tuple[int, int]] = TREES, runs: int = RUNS) -> dict[str, Any]:
     """Measure seconds and growth of resident memory per file, in fresh processes.  The input is not used."""
     points: list[dict[str, Any]] = []
     ratios, sides = {}, {}
     scan = _load_scan()
     with tempfile.TemporaryDirectory(prefix="clrecon-bench-", dir=_memory_folder()) as scratch:
-        for series, slices in TREES:
+        for series, slices in trees:
             folder = Path(scratch) / f"{series}x{slices}"
             write_tree(folder, series, slices)
             if not points:
@@ -86,7 +86,7 @@ def measure_scan_tree(job: Job) -> dict[str, Any]:
                 summary = summarise(*alternate(own, peer, job.pairs, limit_s=job.limit_s))
                 ratios["pydicom_headers"], sides["pydicom_headers"] = summary["ratio"], summary
             command = [sys.executable, str(READ_SERIES), "scan", str(folder)]
-            points.append(_describe_runs([json.loads(run_program(command)[1]) for _ in range(RUNS)]))
+            points.append(_describe_runs([json.loads(run_program(command)[1]) for _ in range(runs)]))
             shutil.rmtree(folder)
     first, last = points[0], points[-1]
     name = "processor_seconds_a_file"

@@ -23,7 +23,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -68,16 +68,22 @@ class Worker:
     answered: int = 0
     worked: float = 0.0
     waited: float = 0.0
+    start_limit_s: float = START_LIMIT_S
+    stall_limit_s: float = STALL_LIMIT_S
 
     @classmethod
-    def start(cls, case: Case, seed: str) -> Worker:
-        """Start a process with its first case."""
+    def start(cls, case: Case, seed: str, *, program: Path = WORKER, **limits: float) -> Worker:
+        """Start a process with its first case; `limits` are those of the class."""
         environment = {**os.environ, "CLRECON_REQUIRE_TESTS": "", "OPENBLAS_NUM_THREADS": "1"}
         errors = tempfile.TemporaryFile()
         process = subprocess.Popen(
-            [sys.executable, str(WORKER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, env=environment
+            [sys.executable, str(program)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            env=environment,
         )
-        worker = cls(process, errors, case, time.monotonic())
+        worker = cls(process, errors, case, time.monotonic(), **limits)
         worker.give(case, seed)
         return worker
 
@@ -100,14 +106,14 @@ class Worker:
     @property
     def limit_s(self) -> float:
         """Processor time that a case may take: the first one imports, and environments build kernels."""
-        return WORKER_LIMIT_S if self.answered and self.case.family != "environment" else START_LIMIT_S
+        return WORKER_LIMIT_S if self.answered and self.case.family != "environment" else self.start_limit_s
 
     def find_delay(self, look_s: float) -> str:
         """Return in what the case goes beyond what any may take, `look_s` after the last look; empty if it does not."""
         self.waited += min(look_s, LONGEST_LOOK_S)
         if processor_s(self.process.pid) - self.worked > self.limit_s:
             return f"over {self.limit_s:.0f} s of processor time"
-        return f"no answer in {STALL_LIMIT_S:.0f} s" if self.waited > STALL_LIMIT_S else ""
+        return f"no answer in {self.stall_limit_s:.0f} s" if self.waited > self.stall_limit_s else ""
 
     @property
     def answers(self) -> IO[bytes]:
@@ -226,7 +232,14 @@ class NamedCases:
         """Time changes nothing."""
 
 
-def run_campaign(schedule: Schedule | NamedCases, *, seconds: float, seed: str = "1", jobs: int = 1) -> Campaign:
+def run_campaign(
+    schedule: Schedule | NamedCases,
+    *,
+    seconds: float,
+    seed: str = "1",
+    jobs: int = 1,
+    start_worker: Callable[[Case, str], Worker] = Worker.start,
+) -> Campaign:
     """Run cases in `jobs` processes until the time or the cases are over.
 
     Parameters
@@ -237,6 +250,8 @@ def run_campaign(schedule: Schedule | NamedCases, *, seconds: float, seed: str =
     seed : str
         Without spaces.
     jobs : int
+    start_worker : callable
+        Starts a process with a case and the seed.
 
     Returns
     -------
@@ -250,7 +265,7 @@ def run_campaign(schedule: Schedule | NamedCases, *, seconds: float, seed: str =
                 case = schedule.draw()
                 if case is None:
                     break
-                workers.append(Worker.start(case, seed))
+                workers.append(start_worker(case, seed))
             if not workers:
                 break
             looked = time.monotonic()

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -152,17 +152,19 @@ def render_array(kind: str, name: str, words: Iterable[str], columns: int) -> li
 HEADERS = {"mc_tables.h": render_case_table, "trilinear_tables.h": render_trilinear_tables}
 
 
-def main() -> int:
+def main(
+    argv: Sequence[str] | None = None, *, headers: Mapping[str, Callable[[], str]] = HEADERS, folder: Path = KERNELS
+) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing, exit 1 when a header is not up to date")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     stale = 0
-    for name, render in HEADERS.items():
-        header, text = KERNELS / name, render()
+    for name, render in headers.items():
+        header, text = folder / name, render()
         if not arguments.check:
             header.write_text(text)
         elif not header.exists() or header.read_text() != text:
-            print(f"{header.relative_to(ROOT)} is not what the table gives: run scripts/proof/derive_mc_tables.py")
+            print(f"{name} is not what the table gives: run scripts/proof/derive_mc_tables.py")
             stale = 1
     return stale
 

@@ -80,11 +80,18 @@ class Copy:
         Folder and name of the package in it.
     warm : WarmTests, optional
         The process that runs its tests, begun with the first change.
+    first_tests : int
+        Tests that are tried before all others.
+    times_wall, and_wall_s : float
+        Seconds on the clock: so many times those on the processor, and these.
     """
 
     root: Path
     package: str = "clrecon"
     warm: WarmTests | None = None
+    first_tests: int = FIRST_TESTS
+    times_wall: float = TIMES_WALL
+    and_wall_s: float = AND_WALL_SECONDS
 
     @classmethod
     def make(cls, project: Path, folder: Path, package: str = "clrecon") -> Copy:
@@ -171,10 +178,11 @@ class Copy:
         """Run tests in a fork of a process that has imported what they need; returns `Outcome.status`."""
         if self.warm is None:
             self.warm = WarmTests(self.root, self.environment(False), trace.modules)
-        stages = [list(part) for part in (tests[:FIRST_TESTS], tests[FIRST_TESTS:]) if part]
+        stages = [list(part) for part in (tests[: self.first_tests], tests[self.first_tests :]) if part]
         limits_s = [trace.limit_s(part) for part in stages]
         files = str(self.root.parent / "tests"), str(self._said)
-        return self.warm.run(Run(stages, limits_s, TIMES_WALL * sum(limits_s) + AND_WALL_SECONDS, *files)).status
+        wall_s = self.times_wall * sum(limits_s) + self.and_wall_s
+        return self.warm.run(Run(stages, limits_s, wall_s, *files)).status
 
     def close(self) -> None:
         """End the process that runs the tests."""

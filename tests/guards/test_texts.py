@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import re
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -153,25 +152,18 @@ def test_functions_are_short() -> None:
     assert long_functions(inner + "                x = 1\n" * 80) == ["f", "g"]
 
 
-@pytest.fixture
-def rendered(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    """The headers that the tables give, by name; the script takes them from here and is asked to check."""
-    headers = {name: render() for name, render in derive_mc_tables.HEADERS.items()}
-    monkeypatch.setattr(derive_mc_tables, "HEADERS", {name: partial(str, text) for name, text in headers.items()})
-    monkeypatch.setattr(sys, "argv", ["derive_mc_tables.py", "--check"])
-    return headers
-
-
 def test_generated_files_are_up_to_date_and_a_changed_one_is_found(
-    rendered: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert (derive_mc_tables.main(), capsys.readouterr().out) == (0, "")
-    monkeypatch.setattr(derive_mc_tables, "ROOT", tmp_path)
-    monkeypatch.setattr(derive_mc_tables, "KERNELS", tmp_path)
+    rendered = {name: render() for name, render in derive_mc_tables.HEADERS.items()}
+    check = partial(
+        derive_mc_tables.main, ["--check"], headers={name: partial(str, text) for name, text in rendered.items()}
+    )
+    assert (check(), capsys.readouterr().out) == (0, "")
     assert len(rendered) == 2
     for changed in (None, *rendered):
         for name, text in rendered.items():
             (tmp_path / name).write_text(text.replace("0x", "0X", 1) if name == changed else text)
-        assert derive_mc_tables.main() == (changed is not None)
+        assert check(folder=tmp_path) == (changed is not None)
         said = capsys.readouterr().out
         assert said.count("is not what the table gives") == (changed is not None) and (changed or "") in said

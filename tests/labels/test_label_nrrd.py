@@ -227,9 +227,8 @@ def test_progress_counts_slices_from_the_first_to_the_last(tmp_path):
     assert told == [("read", 1, 3), ("read", 2, 3), ("read", 3, 3)] * 2
 
 
-def test_layers_count_where_a_map_is_called_large(tmp_path, monkeypatch):
+def test_layers_count_where_a_map_is_called_large(tmp_path):
     voxels, fields = layered(False)  # 60 voxels in two layers
     path = write_nrrd(tmp_path / "a.seg.nrrd", voxels.astype(np.int16), **fields)
     for most, large in ((239, True), (240, False)):
-        monkeypatch.setattr("clrecon.labels.reader.LARGE_BYTES", most)
-        assert is_large_map(path) == large
+        assert is_large_map(path, most_bytes=most) == large

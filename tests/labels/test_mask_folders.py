@@ -110,11 +110,10 @@ def test_chosen_masks_win_overlaps_and_unknown_ones_are_refused(tmp_path):
         read_labels(folder, ["spleen"])
 
 
-def test_a_folder_says_whether_it_is_large(tmp_path, monkeypatch):
+def test_a_folder_says_whether_it_is_large(tmp_path):
     folder = write_folder(tmp_path / "masks")
     for most, large in ((335, True), (336, False)):  # 168 voxels of 16 bits
-        monkeypatch.setattr("clrecon.labels.reader.LARGE_BYTES", most)
-        assert is_large_map(folder) == large
+        assert is_large_map(folder, most_bytes=most) == large
 
 
 @pytest.mark.parametrize(

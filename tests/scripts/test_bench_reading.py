@@ -59,11 +59,9 @@ def test_reading_is_measured(tmp_path: Path) -> None:
 
 
 @pytest.mark.release
-def test_scans_of_trees_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, "TREES", ((2, 3), (4, 5)))
-    monkeypatch.setattr(reading, "RUNS", 1)
+def test_scans_of_trees_are_measured(tmp_path: Path) -> None:
     write_series(tmp_path / "ct", PLAN)
-    figures = reading.measure_scan_tree(make_job(tmp_path / "ct", tmp_path))
+    figures = reading.measure_scan_tree(make_job(tmp_path / "ct", tmp_path), ((2, 3), (4, 5)), 1)
     assert [(tree["files"], tree["series"]) for tree in figures["trees"]] == [(6, 2), (20, 4)]
     assert set(figures["ratios"]) == {"pydicom_headers"} and figures["processor_seconds_a_file_growth"] > 0
 

@@ -11,6 +11,7 @@ import random
 import tempfile
 import time
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import clouds
@@ -19,7 +20,7 @@ import fuzz
 import numpy as np
 import pytest
 import slices
-from fuzz import Campaign, Case, NamedCases, Schedule, run_campaign
+from fuzz import Campaign, Case, NamedCases, Schedule, Worker, run_campaign
 from trials import FAULTS, MEMORY_LIMIT_BYTES, Answer, Judge, Outcome, Trial, WrongOutcome
 from variants import daily_rows
 
@@ -115,11 +116,11 @@ def test_time_on_a_busy_machine_is_no_fault() -> None:
         ],
     ),
 )
-def test_a_worker_that_dies_or_hangs_is_a_fault(tmp_path, monkeypatch, program, kind, words) -> None:
+def test_a_worker_that_dies_or_hangs_is_a_fault(tmp_path, program, kind, words) -> None:
     (tmp_path / "worker.py").write_text(program)
-    monkeypatch.setattr(fuzz, "WORKER", tmp_path / "worker.py")
-    monkeypatch.setattr(fuzz, "STALL_LIMIT_S" if "sleep" in program else "START_LIMIT_S", 1.0)
-    campaign = run_campaign(NamedCases([Case("values", 7)]), seconds=30)
+    limit = {"stall_limit_s" if "sleep" in program else "start_limit_s": 1.0}
+    start = partial(Worker.start, program=tmp_path / "worker.py", **limit)
+    campaign = run_campaign(NamedCases([Case("values", 7)]), seconds=30, start_worker=start)
     ((case, outcome),) = campaign.faults
     assert str(case) == "values:7" and outcome.kind == kind and words in outcome.text
     assert campaign.as_dict()["counts"] == {"values": {kind: 1}}
@@ -134,8 +135,8 @@ for line in sys.stdin:
     print({answer!r}, flush=True)
 """
     (tmp_path / "worker.py").write_text(program)
-    monkeypatch.setattr(fuzz, "WORKER", tmp_path / "worker.py")
-    campaign = run_campaign(Schedule(["values"], 5), seconds=30)
+    start = partial(Worker.start, program=tmp_path / "worker.py")
+    campaign = run_campaign(Schedule(["values"], 5), seconds=30, start_worker=start)
     assert campaign.counts == {"values": Counter(same=4, crash=1)}
     assert [str(case) for case, _ in campaign.faults] == ["values:2"]
     assert "same" in campaign.table() and all(kind in campaign.table() for kind in FAULTS)

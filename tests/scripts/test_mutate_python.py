@@ -260,8 +260,8 @@ def test_a_change_that_never_ends_is_caught(copy: Copy, trace: Trace, monkeypatc
 
 @pytest.mark.release
 def test_a_change_that_waits_for_ever_is_not_known(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mutate_python, "TIMES_WALL", 0.0)
-    monkeypatch.setattr(mutate_python, "AND_WALL_SECONDS", 1.0)
+    monkeypatch.setattr(copy, "times_wall", 0.0)
+    monkeypatch.setattr(copy, "and_wall_s", 1.0)
     assert copy.try_change(change("n -= 1", "__import__('time').sleep(60.0)"), trace) == ("late", 6)
 
 
@@ -272,7 +272,7 @@ def test_a_change_that_ends_the_process_is_caught(copy: Copy, trace: Trace) -> N
 
 @pytest.mark.release
 def test_later_tests_are_tried_when_the_first_pass(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mutate_python, "FIRST_TESTS", 1)
+    monkeypatch.setattr(copy, "first_tests", 1)
     assert copy.try_change(change("width * height", "width + height"), trace) == ("caught", 6)
     assert copy.try_change(TIMES, trace) == ("survived", 6)
 

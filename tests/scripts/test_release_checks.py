@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -22,20 +23,17 @@ def test_every_check_is_a_program_of_the_project(capsys: pytest.CaptureFixture[s
     assert "CLRECON_RELEASE_TESTS=1 CLRECON_COVERAGE=1 .ci/run" in said
 
 
-def test_a_check_that_fails_is_named_and_the_others_run(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_check_that_fails_is_named_and_the_others_run(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     made = {}
     for name, code in {"bad": 1, "good": 0}.items():
         path = tmp_path / f"{name}.py"
         path.write_text(f"import os, sys\nprint(os.environ['OF_CHECK'])\nsys.exit({code})\n")
         made[name] = ReleaseCheck(f"holds {name}", (str(path),), {"OF_CHECK": name})
-    monkeypatch.setattr(release_checks, "CHECKS", made)
-    monkeypatch.setattr(release_checks, "KEPT", tmp_path / "kept")
-    assert release_checks.main([]) == 1
+    main = partial(release_checks.main, checks=made, kept=tmp_path / "kept")
+    assert main([]) == 1
     said = capfd.readouterr()
     assert sorted(said.out.splitlines()) == sorted(["== bad: holds bad", "bad", "== good: holds good", "good"])
     assert said.err == "failed: bad\n"
-    assert release_checks.main(["good"]) == 0
+    assert main(["good"]) == 0
     with refused(SystemExit, 2):
         release_checks.main(["none"])

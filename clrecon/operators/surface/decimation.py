@@ -37,24 +37,22 @@ from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import chunks
 from clrecon.system.progress import Progress, Steps
 
-FEWEST = 20_000
+_FEWEST = 20_000
 """Meshes with fewer triangles are looked at by the host alone, in less time than the device needs to begin."""
 
-MOST_ROWS = 1 << 22
+_MOST_ROWS = 1 << 22
 """Rows of the finest level; its edge is made longer until there are no more."""
 
 _FINEST = 0.97
-"""Share of the triangles that belong to the finest level.  With a half, extracted and decimated surfaces took 1.2 to
-1.5 times the time: each level is looked through by itself."""
+"""Share of the triangles in the finest level; a half takes 1.2 to 1.5 times as long, as each level is searched."""
 
 _ROW_BOXES = 2.0
-"""Width of the rows in boxes as long as `_FINEST` has them.  With one or three, rows are looked up or looked through
-for a tenth longer."""
+"""Width of the rows in boxes as long as `_FINEST` has them; one or three take a tenth longer."""
 
 _MOST_LANES = 8
 """Entries that the kernel looks at together."""
 
-PIECE = 1 << 17
+_PIECE = 1 << 17
 """Triangles of a launch; progress is reported between launches."""
 
 Float32Array = NDArray[np.float32]
@@ -65,8 +63,7 @@ class CrossingPlan:
     """Triangles in the rows of levels, as the kernel reads them.
 
     vertices: ndarray, shape (v, 3), float32. Scaled by a power of two, which changes no digit.
-    triangles: ndarray, shape (n, 3), uint32
-    order: ndarray, shape (n,), uint32. Triangle of each entry.
+    triangles, order: ndarray, shapes (n, 3) and (n,), uint32. Of the order: the triangle of each entry.
     starts: ndarray, uint32. First entry of each row, and the number of entries.
     levels, edges: ndarray, shape (levels, 4) uint32, (levels,) float32
     """
@@ -88,7 +85,9 @@ class CrossingPlan:
         return {"triangles in rows": given + 52 * self.stride + self.starts.nbytes, "marks": len(self.order) // 8}
 
 
-def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> CrossingPlan:
+def plan_crossings(
+    vertices: Float32Array, triangles: NDArray[np.uint32], *, most_rows: int = _MOST_ROWS
+) -> CrossingPlan:
     """Enter at least one triangle into rows."""
     scaled = np.ldexp(vertices, 11 - int(np.frexp(np.abs(vertices).max())[1]))
     low, high = (np.ascontiguousarray(corner.T) for corner in find_boxes(scaled, triangles))
@@ -97,7 +96,7 @@ def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> Cro
     origin, beyond = low.min(axis=1).astype(np.float64), low.max(axis=1).astype(np.float64)
     some = longest[:: max(1, len(longest) // 10_000)].astype(np.float64)
     edge = max(1.0, _ROW_BOXES * float(np.quantile(some, _FINEST)))
-    while np.prod(np.floor((beyond - origin)[1:] / edge) + 1.0) > MOST_ROWS:
+    while np.prod(np.floor((beyond - origin)[1:] / edge) + 1.0) > most_rows:
         edge *= 1.25
     level = np.zeros(len(longest), np.int8)
     coarse = np.flatnonzero(longest > edge)
@@ -119,7 +118,9 @@ def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> Cro
     return CrossingPlan(scaled, triangles, order.astype(np.uint32), origin.astype(np.float32), starts, levels, table)
 
 
-def mark_crossings(device: Device, plan: CrossingPlan, *, steps: Steps | None = None) -> NDArray[np.bool_]:
+def mark_crossings(
+    device: Device, plan: CrossingPlan, *, piece: int = _PIECE, steps: Steps | None = None
+) -> NDArray[np.bool_]:
     """Mark the triangles that may cut another one, shape (n,), in the order of the mesh."""
     count = len(plan.order)
     program = load_program(device, "surface/crossings.cl", {"LANES": device.kernel_variants["LANES"]})
@@ -131,8 +132,8 @@ def mark_crossings(device: Device, plan: CrossingPlan, *, steps: Steps | None = 
     )  # fmt: skip
     marks_d = zero_words(device, (count + 31) // 32)
     starts_d, levels_d, edges_d = (upload(device, table) for table in (plan.starts, plan.levels, plan.edges))
-    for first in range(0, count, PIECE):
-        items = min(PIECE, count - first)
+    for first in range(0, count, piece):
+        items = min(piece, count - first)
         launch(
             device, program["mark_crossings"], items, places=places_d, names=names_d, starts=starts_d, levels=levels_d,
             edges=edges_d, marks=marks_d, origin_y=plan.origin[1], origin_z=plan.origin[2], first=first, items=items,
@@ -153,16 +154,17 @@ def find_crossings(
     triangles: NDArray[np.uint32],
     changed: NDArray[np.bool_] | None = None,
     *,
+    fewest: int = _FEWEST,
     memory: int | None = None,
     steps: Steps | None = None,
 ) -> NDArray[np.int64]:
     """Find the pairs of triangles that cut each other, (k, 2) int64, see
     `clrecon.mesh.intersections.find_self_intersections`.
 
-    With `changed`, (n,) bool, only pairs with one of these.  Small meshes, vertices in float64 and meshes for which the
-    device has no room are looked at by the host alone, which finds the same pairs.  `steps` counts the triangles.
+    With `changed`, (n,) bool, only pairs with one of these.  Fewer triangles than `fewest`, float64 vertices and meshes
+    without room on the device are left to the host, which finds the same pairs.  `steps` counts the triangles.
     """
-    if len(triangles) < FEWEST or vertices.dtype != np.float32:
+    if len(triangles) < fewest or vertices.dtype != np.float32:
         return find_self_intersections(vertices, triangles, changed, steps=steps)
     plan = plan_crossings(vertices, triangles)
     if describe_shortage(memory_limits(device, memory), plan.needs()):
@@ -171,7 +173,7 @@ def find_crossings(
     return marked[find_self_intersections(vertices, triangles[marked], None if changed is None else changed[marked])]
 
 
-PART = 1 << 20
+_PART = 1 << 20
 """Points or triangles of a launch: each stays short, and its arrays fit beside the surface."""
 
 if kernel_constant("surface/near_faces.cl", "WITNESSES") != WITNESSES:
@@ -192,7 +194,7 @@ class DeviceBounds(SurfaceBounds):
         self, device: Device, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans | None = None
     ):
         super().__init__(vertices, triangles, fans)
-        self._device = device
+        self._device, self.part = device, _PART
 
     def prepare(self) -> None:
         """Bring the surface to the device, before threads use it."""
@@ -214,7 +216,7 @@ class DeviceBounds(SurfaceBounds):
             "begin": self._fans.begin.astype(np.int32),
             "around": self._fans.rows.astype(np.int32, copy=False),
         }
-        part = {"points of a launch": 64 * PART, "vertices": 20 * len(self._vertices)}
+        part = {"points of a launch": 64 * self.part, "vertices": 20 * len(self._vertices)}
         check_budget(self._device, {name: array.nbytes for name, array in arrays.items()} | part)
         return {
             name: upload(self._device, array if len(array) else np.zeros(4, array.dtype))
@@ -231,7 +233,7 @@ class DeviceBounds(SurfaceBounds):
         device, surface = self._device, self._surface
         squares = np.empty(len(points), np.float32)
         rows = np.empty(len(points), np.int32)
-        for where in chunks(len(points), PART):
+        for where in chunks(len(points), self.part):
             count = where.stop - where.start
             here = (upload(device, points[where].astype(np.float32)), upload(device, near[where].astype(np.int32)))
             found = empty_output(device, (count,), np.float32), empty_output(device, (count,), np.int32)
@@ -241,9 +243,8 @@ class DeviceBounds(SurfaceBounds):
                 count=count,
             )  # fmt: skip
             squares[where], rows[where] = download(device, *found[0]), download(device, *found[1])
-        nothing = rows < 0
         length = np.sqrt(squares) + np.float32(self.slack)
-        length[nothing] = np.inf
+        length[rows < 0] = np.inf
         return length, rows
 
     def find_witnesses(
@@ -257,7 +258,7 @@ class DeviceBounds(SurfaceBounds):
             "names": upload(device, names.astype(np.int32)),
             "beside": upload(device, beside),
         }
-        for where in chunks(len(triangles), PART):
+        for where in chunks(len(triangles), self.part):
             count = where.stop - where.start
             faces = upload(device, triangles[where])
             found = empty_output(device, (WITNESSES, count), np.int32), empty_output(device, (count,), np.uint8)

@@ -40,9 +40,8 @@ def test_marks_equal_the_twin(device, count):
     assert count < 700 or 0.05 < found.mean() < 0.95
 
 
-def test_levels_double_their_edge_and_the_finest_has_few_rows(monkeypatch):
-    monkeypatch.setattr(decimation, "MOST_ROWS", 100)
-    plan = plan_crossings(*scattered(700, sizes=(*[0.1] * 60, 6.0)))
+def test_levels_double_their_edge_and_the_finest_has_few_rows():
+    plan = plan_crossings(*scattered(700, sizes=(*[0.1] * 60, 6.0)), most_rows=100)
     edges, longest = plan.edges.T
     np.testing.assert_allclose(edges, edges[0] * 2.0 ** np.arange(len(edges)), rtol=1e-6)
     assert (longest <= edges).all()
@@ -60,36 +59,33 @@ def test_a_few_triangles(device):
 @pytest.mark.parametrize("sizes", [(0.01, 1.0, 40.0), (1.0,), (0.02, 0.021)])
 @pytest.mark.parametrize("extent", [(60.0, 50.0, 40.0), (0.0, 90.0, 5.0), (500.0, 1.0, 1.0)])
 @pytest.mark.parametrize("place", daily(1, [3000.0, 0.0]))
-def test_pairs_are_those_of_the_host(device, sizes, extent, place, monkeypatch):
-    monkeypatch.setattr(decimation, "FEWEST", 1)
+def test_pairs_are_those_of_the_host(device, sizes, extent, place):
     vertices, triangles = scattered(1200, sizes, extent=extent)
     vertices += np.float32(place)
     expected = find_self_intersections(vertices, triangles)
-    assert pairs(find_crossings(device, vertices, triangles)) == pairs(expected)
+    assert pairs(find_crossings(device, vertices, triangles, fewest=1)) == pairs(expected)
 
 
 @pytest.mark.parametrize("fewest", [1, 10_000])
-def test_pairs_with_a_changed_triangle(device, fewest, monkeypatch):
-    monkeypatch.setattr(decimation, "FEWEST", fewest)
+def test_pairs_with_a_changed_triangle(device, fewest):
     vertices, triangles = scattered(900)
     changed = np.arange(900) % 4 == 1
     every = find_self_intersections(vertices, triangles)
     expected = every[changed[every].any(axis=1)]
-    assert pairs(find_crossings(device, vertices, triangles, changed)) == pairs(expected) and 10 < len(expected) < len(
-        every
-    )
+    assert pairs(find_crossings(device, vertices, triangles, changed, fewest=fewest)) == pairs(expected) and 10 < len(
+        expected
+    ) < len(every)
 
 
 @pytest.mark.parametrize("scale", daily(1, [2.0**-60, 2.0**-9, 1.0, 2.0**30]))
-def test_bodies_that_cut_each_other(device, scale, monkeypatch):
+def test_bodies_that_cut_each_other(device, scale):
     """Whatever the unit of length; two spheres whose triangles lie in each other's planes too."""
-    monkeypatch.setattr(decimation, "FEWEST", 1)
     sphere = samples.sphere(rounds=3)
     for shift in ((11.0, 4.0, -3.0), (0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (25.0, 0.0, 0.0)):
         vertices, triangles = samples.join(sphere, samples.sphere(shift, 10.0, 3))
         arrays = (scale * vertices).astype(np.float32), np.asarray(triangles, np.uint32)
         expected = find_self_intersections(*arrays)
-        assert pairs(find_crossings(device, *arrays)) == pairs(expected)
+        assert pairs(find_crossings(device, *arrays, fewest=1)) == pairs(expected)
         assert len(expected) > 0 or shift[0] != 11.0
 
 
@@ -100,35 +96,33 @@ def test_a_closed_surface_leaves_nothing_to_look_at(device):
     assert not found.any()
 
 
-def test_triangles_without_area_are_left_to_the_host(device, monkeypatch):
-    monkeypatch.setattr(decimation, "FEWEST", 1)
+def test_triangles_without_area_are_left_to_the_host(device):
     nothing = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)
-    assert len(find_crossings(device, *nothing)) == 0
+    assert len(find_crossings(device, *nothing, fewest=1)) == 0
     vertices, triangles = scattered(400)
     vertices[::7] = vertices[1::7][: len(vertices[::7])]
-    assert pairs(find_crossings(device, vertices, triangles)) == pairs(find_self_intersections(vertices, triangles))
+    assert pairs(find_crossings(device, vertices, triangles, fewest=1)) == pairs(
+        find_self_intersections(vertices, triangles)
+    )
 
 
 @pytest.mark.parametrize("case", ["small", "float64", "no room"])
 def test_what_the_device_does_not_take_the_host_does(device, case, monkeypatch):
-    if case != "small":
-        monkeypatch.setattr(decimation, "FEWEST", 1)
+    given: dict = {} if case == "small" else {"fewest": 1}
     monkeypatch.setattr(decimation, "mark_crossings", None)
     vertices, triangles = scattered(600)
     own = vertices.astype(np.float64) if case == "float64" else vertices
     told: list[tuple[str, int, int]] = []
     steps = Steps(lambda *step: told.append(step), "crossings", 600)
-    found = find_crossings(device, own, triangles, memory=1 if case == "no room" else None, steps=steps)
+    found = find_crossings(device, own, triangles, memory=1 if case == "no room" else None, steps=steps, **given)
     assert pairs(found) == pairs(find_self_intersections(vertices, triangles)) and len(found) > 10
     assert told[0] == ("crossings", 0, 600) and told[-1] == ("crossings", 600, 600)
 
 
-def test_progress_counts_triangles_and_may_end_the_work(device, monkeypatch):
-    monkeypatch.setattr(decimation, "FEWEST", 1)
-    monkeypatch.setattr(decimation, "PIECE", 256)
-    vertices, triangles = scattered(600)
+def test_progress_counts_triangles_and_may_end_the_work(device):
+    plan = plan_crossings(*scattered(600))
     told: list[int] = []
-    find_crossings(device, vertices, triangles, steps=Steps(lambda *step: told.append(step[1]), "crossings", 600))
+    mark_crossings(device, plan, piece=256, steps=Steps(lambda *step: told.append(step[1]), "crossings", 600))
     assert told == [0, 256, 512, 600]
 
     def cancel(stage: str, done: int, total: int) -> None:
@@ -136,5 +130,7 @@ def test_progress_counts_triangles_and_may_end_the_work(device, monkeypatch):
             raise Cancelled("enough")
 
     with pytest.raises(Cancelled):
-        find_crossings(device, vertices, triangles, steps=Steps(cancel, "crossings", 600))
-    assert find_crossings(device, vertices, triangles).shape[1] == 2
+        mark_crossings(device, plan, piece=256, steps=Steps(cancel, "crossings", 600))
+    told.clear()
+    steps = Steps(lambda *step: told.append(step[1]), "crossings", 600)
+    assert len(find_crossings(device, *scattered(600), fewest=1, steps=steps)) > 10 and told == [0, 600]

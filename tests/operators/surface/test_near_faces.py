@@ -13,7 +13,6 @@ from refusals import refused
 from clrecon.errors import DeviceError
 from clrecon.mesh.compare.near_distances import NearDistance, triangle_distances
 from clrecon.mesh.refine.deviation import MIDDLES, SurfaceBounds
-from clrecon.operators.surface import decimation
 from clrecon.operators.surface.decimation import DeviceBounds
 
 ROUNDING_MM = 2e-4
@@ -111,14 +110,15 @@ def test_faces_without_area_are_passed_over(device):
     assert length[2] == pytest.approx(1.0, abs=ROUNDING_MM)
 
 
-def test_long_requests_are_made_in_parts(device, monkeypatch):
+def test_long_requests_are_made_in_parts(device):
     vertices, triangles, rng = rough(12)
     points, near = rng.uniform(0.0, 11.0, (500, 3)), rng.integers(0, 144, (500, 2))
     names, beside = np.arange(144), np.zeros(144, np.int32)
     arguments = vertices.astype(np.float32) + np.float32(0.3), triangles, names, beside, 0.4
     bounds = DeviceBounds(device, vertices, triangles)
     whole = (*bounds.find_bounds(points, near, 0.5, 2), *bounds.find_witnesses(*arguments))
-    monkeypatch.setattr(decimation, "PART", 64)
+    bounds = DeviceBounds(device, vertices, triangles)
+    bounds.part = 64
     for one, other in zip(
         whole, (*bounds.find_bounds(points, near, 0.5, 2), *bounds.find_witnesses(*arguments)), strict=True
     ):
@@ -136,8 +136,9 @@ def test_a_small_surface(device):
     assert bounds.find_witnesses(places, triangles.astype(np.uint32), np.arange(8), beside, 0.02)[1].any()
 
 
-def test_a_device_without_room_says_what_it_would_need(device, monkeypatch):
+def test_a_device_without_room_says_what_it_would_need(device):
     vertices, triangles = sheet(9)
-    monkeypatch.setattr(decimation, "PART", 1 << 40)
+    bounds = DeviceBounds(device, vertices, triangles)
+    bounds.part = 1 << 40
     with refused(DeviceError, "points"):
-        DeviceBounds(device, vertices, triangles).find_bounds(vertices, np.zeros((81, 1), int), 0.0)
+        bounds.find_bounds(vertices, np.zeros((81, 1), int), 0.0)
