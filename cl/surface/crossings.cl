@@ -13,9 +13,10 @@
  *         |   +---|---+   |
  *         +-------+-------+  y
  *
- * An item looks at the entries behind its own of its level, and at all of the levels with longer triangles: each pair
- * is seen once.  Both of its triangles are marked, by atomic_or(), unless float32 shows that they do not cut each other:
- * signs of volumes and areas that exceed their rounding are those of exact arithmetic.
+ * An item looks at the entries behind its own of its level, at those of the next level with shorter triangles, and at
+ * those of longer ones beyond the next: each pair is seen once, and most triangles look for no longer ones.  Both of
+ * its triangles are marked, by atomic_or(), unless float32 shows that they do not cut each other: signs of volumes
+ * and areas that exceed their rounding are those of exact arithmetic.
  *
  * LANES entries are looked at together: boxes, and sides of both planes, which leave few pairs. */
 #include "include/lanes.h"
@@ -280,7 +281,9 @@ __kernel void mark_crossings(
     uint own_level = 0;
     while (entry >= levels[4 * own_level + 3])
         ++own_level;
-    for (uint level = own_level; level < level_count; ++level) {
+    for (uint level = own_level > 0 ? own_level - 1 : 0; level < level_count; ++level) {
+        if (level == own_level + 1)
+            continue; /* its triangles look here */
         const uint first_row = levels[4 * level];
         const int ny = (int)levels[4 * level + 1], nz = (int)levels[4 * level + 2];
         const float per_edge = 1.0f / edges[2 * level], reach = (1.0f + SLACK) * edges[2 * level + 1];

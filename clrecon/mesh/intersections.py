@@ -154,7 +154,7 @@ def find_boxes_beside(
     start = low.min(axis=1)[:, None]
     length = high.max(axis=1).astype(np.float64) - start[:, 0]
     size = float((some_high - some_low).max(axis=0).mean()) or float(length.max()) or 1.0
-    most = min(max(_CELLS_FOR_ONE * low.shape[1], _FEWEST_CELLS), _MOST_CELLS)
+    most = min(max(_CELLS_FOR_ONE * min(low.shape[1], 8 * some_low.shape[1]), _FEWEST_CELLS), _MOST_CELLS)
     while (length / size + 1.0).prod() > most:
         size *= 1.25
     first, last, some_first, some_last = (

@@ -102,11 +102,10 @@ def _sum_normals(columns: NDArray[np.float64], corners: NDArray[np.uint32], low:
     twice_area = np.sqrt(np.einsum("ij,ij->j", cross, cross))
     with np.errstate(divide="ignore", invalid="ignore"):
         cross = np.where(twice_area > 0.0, cross / twice_area, 0.0)
-    third = q - p
-    dots = (np.einsum("ij,ij->j", p, q), -np.einsum("ij,ij->j", p, third), np.einsum("ij,ij->j", q, third))
+    dots = (np.einsum("ij,ij->j", p, q), np.einsum("ij,ij->j", p, p - q))
     part = np.zeros((3, int(corners.max()) - low + 1))
-    for corner, dot in zip(corners, dots, strict=True):
-        angle = np.arctan2(twice_area, dot)
+    first, second = (np.arctan2(twice_area, dot) for dot in dots)
+    for corner, angle in zip(corners, (first, second, np.pi - first - second), strict=True):
         for axis in range(3):
             part[axis] += np.bincount(corner - low, cross[axis] * angle, part.shape[1])
     return part

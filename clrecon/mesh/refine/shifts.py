@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import as_stored, find_coincident
-from clrecon.mesh.connectivity import Fans, find_edges, label_components
+from clrecon.mesh.connectivity import Fans, find_edges, label_components, order_by_number
 from clrecon.mesh.intersections import (
     FindCrossings,
     find_beside,
@@ -19,6 +19,7 @@ from clrecon.mesh.intersections import (
 )
 from clrecon.mesh.triangles import cross_products
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.pieces import find_bounds
 
 _VOLUME_STEPS = 4
 """Newton steps along the normals; the first leaves about a hundredth of the missing volume."""
@@ -33,8 +34,8 @@ _ROUNDS = 40
 _SMALLEST_SHARE = 0.2
 """Least share of a step after halving; a step that would be shorter is not made at all."""
 
-_IN_A_ROW = 64
-"""Triangles that follow each other, which are near each other mostly, and are sorted out together."""
+_IN_A_BLOCK, _CELL_SHARE = 64, 0.25
+"""Triangles near each other that are sorted out together, and the cells by which they are put in order, for each."""
 
 _ROUNDS_OF_ITS_OWN = 3
 """After this many rounds the vertices around an offending place are taken back too."""
@@ -195,10 +196,16 @@ class _Near:
         self, vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans
     ):
         self._moved, self._triangles, self.fans = moved, triangles, fans
-        starts = np.arange(0, len(triangles), _IN_A_ROW)
-        was, now = (find_boxes(places, triangles) for places in (vertices, moved))
-        self._low = np.minimum.reduceat(np.minimum(was[0], now[0]), starts)
-        self._high = np.maximum.reduceat(np.maximum(was[1], now[1]), starts)
+        low, high = np.minimum(vertices, moved), np.maximum(vertices, moved)
+        start, end = find_bounds(low)
+        size = float(np.cbrt(np.prod(end - start + 1e-3) / (_CELL_SHARE * len(triangles))))
+        x, y, z = ((column / size).astype(np.int32) for column in (low - start).T)
+        cell = (x * (y.max() + 1) + y) * (z.max() + 1) + z
+        self._order = order_by_number(cell.take(triangles[:, 0]), int(cell.max()) + 1)
+        rows = triangles.take(self._order, axis=0)
+        starts = np.arange(0, len(rows), _IN_A_BLOCK)
+        self._low = np.minimum.reduceat(find_boxes(low, rows)[0], starts)
+        self._high = np.maximum.reduceat(find_boxes(high, rows)[1], starts)
 
     def find_spoilt(self, vertices: IntArray, find_crossings: FindCrossings) -> IntArray:
         """Find the vertices of spoilt triangles after these vertices went back."""
@@ -206,7 +213,7 @@ class _Near:
         changed[self.fans.touching(vertices)] = True
         boxes = find_boxes(moved, self._triangles[changed])
         pieces = find_boxes_beside(self._low, self._high, *boxes)
-        rows = np.flatnonzero(np.repeat(pieces, _IN_A_ROW)[: len(changed)])
+        rows = np.sort(self._order[np.repeat(pieces, _IN_A_BLOCK)[: len(changed)]])
         rows = rows[find_beside(moved, self._triangles[rows], changed[rows])]
         used, local = np.unique(self._triangles[rows], return_inverse=True)
         corners = local.reshape(-1, 3).astype(np.uint32)

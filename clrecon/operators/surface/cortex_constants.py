@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -50,9 +51,10 @@ _THICK_SHARE, _CORTEX_STEP, _CLEARLY_LESS = 0.5, 1.03, 0.97
 """Where this share of the walls is thick, the cortex is what leaves least of the profiles, in steps of the second from
 what they show on: their percentile holds noise, which the blurs follow, and it them (11 % too much at 40 HU)."""
 
-LEAST_SHARE, _DIFFERENT = 0.03, 0.1
-"""Components with this share of a surface's vertices are looked at by themselves, and have constants of their own if
-their compact bone differs from that of all by the second share."""
+LEAST_SHARE = 0.03
+_DIFFERENT, _ALIKE = 0.1, 0.02
+"""Components with the first share of a surface's vertices are looked at by themselves, and have constants of their own
+if their compact bone differs from that of all by the second, and if one fit shows it to differ by the third."""
 
 _THICK_BLURS, _SHARP, _WIDE_SPREAD, _DENSE_PERCENTILE, _FEWEST_THICK = 2.0, 1.25, 0.3, 75.0, 12
 """Walls thicker than so many blurs show their HU where the blur is at most the second times that within the slices, if
@@ -82,37 +84,28 @@ _Fit = Callable[[_Trial, float], WallFits]
 
 
 def measure_constants(
-    sampler: ProfileSampler,
-    volume: Volume,
-    points: NDArray[np.floating],
-    normals: NDArray[np.floating],
-    scan: CortexConstants | None = None,
+    sampler: ProfileSampler, volume: Volume, points: NDArray[np.floating], normals: NDArray[np.floating]
 ) -> CortexConstants:
-    """Measure blur and cortex in profiles at some of the points; the noise is that of the scan, if it is known.
+    """Measure blur and cortex in profiles at some of the points, and the noise of the scan.
 
     The blur is that which leaves the least of the profiles, the cortex what thick walls show.  Their uncertainties are
     half the spread over four parts of the profiles, and not less than `_LEAST_BLUR_ERROR` and `_LEAST_CORTEX_ERROR`.
     """
-    rows = spread_rows(len(points), LOOKED_AT)
-    values = sampler.values(points[rows], normals[rows])
-    walls, peaks = _find_walls(values)
-    if len(walls) < _FEWEST_WALLS:
-        raise NoSurfaceError(
-            f"the surface has no walls of bone that the cortex could be measured in: {len(walls)} of"
-            f" {len(rows):,} profiles across it, at least {_FEWEST_WALLS} are needed"
-        )
-    values, peaks = values[:, walls], peaks[walls]
+    values = _sample_walls(sampler, points, normals, np.arange(len(points)))
     try:
-        noise = measure_noise(volume).hu if scan is None else scan.noise_hu
+        noise = measure_noise(volume).hu
     except UsageError:  # a specimen in air
         noise = None
+    return _measure_walls(sampler, volume, values, noise)
+
+
+def _measure_walls(
+    sampler: ProfileSampler, volume: Volume, values: Float32Array, noise: float | None
+) -> CortexConstants:
+    dense, usual = np.percentile(values[: CENTRE + 2].max(axis=0), (95.0, _DENSE_PERCENTILE)).tolist()
     step = volume.spacing
-    dense = float(np.percentile(peaks, 95.0))
-    usual = 1.2 * float(np.percentile(peaks, _DENSE_PERCENTILE))
-    start = _Trial(
-        _usual_blur(float(np.sqrt(step[0] * step[1]))), max(_usual_blur(step[2]), 0.45 * step[2]),
-        min(1.03 * dense, usual),
-    )  # fmt: skip
+    within, across = (min(0.7 * edge**0.5, edge) for edge in (math.sqrt(step[0] * step[1]), step[2]))
+    trial = _Trial(within, max(across, 0.45 * step[2]), min(1.03 * dense, 1.2 * usual))
     known = noise if noise is not None else SILENT_HU
     profiles = sampler.take(values)
 
@@ -120,28 +113,16 @@ def measure_constants(
     def fit(trial: _Trial, cortex_spread: float) -> WallFits:
         return profiles.fit(*trial, known, cortex_spread=cortex_spread)
 
-    found, thick = _search(fit, values, start)
+    trial, thick = _search(fit, values, trial)
     parts = []
     for part in (slice(first, None, 4) for first in range(4)):
-        one = _search_blurs(fit, part, found, SEARCH_STEPS[1:])
-        parts.append((one.blur_mm, one.across_mm, _measure_cortex(fit, values, part, found)[0]))
+        blurs = _search_blurs(fit, part, trial, SEARCH_STEPS[1:])[:2]
+        parts.append((*blurs, _measure_cortex(fit, values, part, trial)[0]))
     of_cortex = _LEAST_CORTEX_ERROR if thick >= _FEWEST_THICK else _THIN_CORTEX_ERROR
     least = np.array([_LEAST_BLUR_ERROR, _LEAST_BLUR_ERROR, of_cortex])
-    spread = np.maximum(np.std(parts, axis=0) / 2.0, least * np.mean(parts, axis=0))
-    residual = fit(found, CORTEX_SPREAD).residual_hu
-    errors = [float(value) for value in spread]
-    return CortexConstants(
-        blur_mm=found.blur_mm,
-        blur_across_mm=found.across_mm,
-        cortex_hu=found.cortex_hu,
-        blur_error_mm=errors[0],
-        blur_across_error_mm=errors[1],
-        cortex_error_hu=errors[2],
-        noise_hu=noise,
-        residual_hu=float(np.sqrt(np.mean(np.square(residual)))),
-        places=values.shape[1],
-        thick=thick,
-    )
+    errors = np.maximum(np.std(parts, axis=0) / 2.0, least * np.mean(parts, axis=0)).tolist()
+    residual = float(np.sqrt(np.mean(np.square(fit(trial, CORTEX_SPREAD).residual_hu))))
+    return CortexConstants(*trial, errors[0], errors[1], errors[2], noise, residual, values.shape[1], thick)
 
 
 def find_groups(
@@ -162,9 +143,12 @@ def find_groups(
     for component in large if len(large) > 1 else []:
         rows = np.flatnonzero(components == component)
         try:
-            own = measure_constants(sampler, volume, points[rows], normals[rows], scan)
+            values = _sample_walls(sampler, points, normals, rows)
         except NoSurfaceError:  # a table
             continue
+        if not _may_differ(sampler, values, scan):
+            continue
+        own = _measure_walls(sampler, volume, values, scan.noise_hu)
         is_bone = own.thick >= _FEWEST_THICK and own.cortex_hu >= COMPACT_HU
         if is_bone and abs(own.cortex_hu - scan.cortex_hu) > _DIFFERENT * scan.cortex_hu:
             groups.append((rows, own))
@@ -172,26 +156,38 @@ def find_groups(
     return [(np.flatnonzero(left), scan), *groups]
 
 
-def _usual_blur(step_mm: float) -> float:
-    """Return the blur from which on that of voxels with this edge is searched, mm."""
-    return min(0.7 * step_mm**0.5, step_mm)
-
-
-def _find_walls(values: Float32Array) -> tuple[NDArray[np.intp], Float32Array]:
-    """Return up to `MOST_WALLS` profiles across walls of bone, and the highest value of each profile."""
+def _sample_walls(
+    sampler: ProfileSampler, points: NDArray[np.floating], normals: NDArray[np.floating], rows: NDArray[np.integer]
+) -> Float32Array:
+    """Return up to `MOST_WALLS` profiles across walls of bone at these rows of the points."""
+    rows = rows[spread_rows(len(rows), LOOKED_AT)]
+    values = sampler.values(points[rows], normals[rows])
     whole = np.isfinite(values[:SAMPLES]).all(axis=0)
-    peaks = np.where(
-        whole, values[: CENTRE + 2].max(axis=0, initial=-np.inf, where=np.isfinite(values[: CENTRE + 2])), 0
-    )
-    rise = peaks - values[CENTRE:SAMPLES].min(axis=0, initial=np.inf, where=np.isfinite(values[CENTRE:SAMPLES]))
+    peaks = np.where(whole, values[: CENTRE + 2].max(axis=0), 0)
+    rise = peaks - values[CENTRE:SAMPLES].min(axis=0)
     usable = whole & (peaks < METAL_HU)
     of_bone = peaks[usable & (peaks >= LEAST_CORTEX_HU)]
-    if len(of_bone) < _FEWEST_WALLS:
-        return np.zeros(0, np.intp), peaks
-    compact = of_bone[of_bone >= COMPACT_HU]
-    least = LEAST_CONTRAST * float(np.percentile(compact if len(compact) >= _FEWEST_WALLS else of_bone, 90.0))
-    walls = np.flatnonzero(usable & (np.minimum(rise, peaks) > least))
-    return walls[spread_rows(len(walls), MOST_WALLS)], peaks
+    walls = np.zeros(0, np.intp)
+    if len(of_bone) >= _FEWEST_WALLS:
+        compact = of_bone[of_bone >= COMPACT_HU]
+        least = LEAST_CONTRAST * float(np.percentile(compact if len(compact) >= _FEWEST_WALLS else of_bone, 90.0))
+        walls = np.flatnonzero(usable & (np.minimum(rise, peaks) > least))
+    if len(walls) < _FEWEST_WALLS:
+        raise NoSurfaceError(
+            f"the surface has no walls of bone that the cortex could be measured in: {len(walls)} of"
+            f" {len(rows):,} profiles across it, at least {_FEWEST_WALLS} are needed"
+        )
+    return values[:, walls[spread_rows(len(walls), MOST_WALLS)]]
+
+
+def _may_differ(sampler: ProfileSampler, values: Float32Array, scan: CortexConstants) -> bool:
+    """Tell whether walls may be of bone with a cortex of its own: with that of the scan they show another one."""
+    if np.count_nonzero(values[: CENTRE + 2].max(axis=0) >= COMPACT_HU) < _FEWEST_THICK:
+        return False
+    trial = _Trial(scan.blur_mm, scan.blur_across_mm, scan.cortex_hu)
+    fits = sampler.take(values).fit(*trial, scan.known_noise, cortex_spread=_WIDE_SPREAD)
+    shown, thick = _measure_cortex(lambda *_: fits, values, slice(None), trial)
+    return thick < _FEWEST_THICK or abs(shown - scan.cortex_hu) > _ALIKE * scan.cortex_hu
 
 
 def _search(fit: _Fit, values: Float32Array, start: _Trial) -> tuple[_Trial, int]:

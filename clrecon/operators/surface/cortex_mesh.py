@@ -247,16 +247,14 @@ def find_turned(
     found = np.empty(len(triangles), bool)
 
     def work(where: slice) -> None:
-        before, after = (
-            cross_product(two - one, three - one)
-            for one, two, three in (
-                (points.take(corners, axis=0).T.astype(np.float64) for corners in triangles[where].T)
-                for points in (vertices, places)
-            )
-        )
-        along = np.einsum("an,an->n", after, before)
-        squares = np.einsum("an,an->n", after, after) * np.einsum("an,an->n", before, before)
-        found[where] = along <= _LEAST_TURN * np.sqrt(squares)
+        normals = []
+        for points in (vertices, places):
+            one, two, three = (points.take(row, axis=0, mode="clip") for row in triangles[where].T.astype(np.intp))
+            p, q = ((corner - one).T.astype(np.float64, order="C") for corner in (two, three))
+            normals.append(cross_product(p, q))
+        before, after = normals
+        along, *squares = (np.einsum("an,an->n", *two) for two in ((after, before), (after, after), (before, before)))
+        found[where] = along <= _LEAST_TURN * np.sqrt(squares[0] * squares[1])
 
     in_threads(work, len(triangles))
     return found

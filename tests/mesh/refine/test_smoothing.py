@@ -252,7 +252,7 @@ def test_steps_are_taken_back_as_if_all_triangles_were_looked_at_after_each_roun
 
 def test_what_is_in_the_way_back_is_found(monkeypatch):
     """A box that would go into a wall finds another half way, of which nothing lies where it was to go."""
-    monkeypatch.setattr(shifts, "_IN_A_ROW", 4)
+    monkeypatch.setattr(shifts, "_IN_A_BLOCK", 4)
     walls = [samples.box((place, -5, -5), (0.2, 10, 10)) for place in (8.4, 4.4)]
     vertices, triangles = samples.join(samples.box(), *walls)
     step = np.zeros((24, 3))
