@@ -114,10 +114,10 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
         nk, nj, ni = volume.voxels.shape
         return np.asarray(~np.repeat(np.repeat(body[k // step[2]], step[1], 0), step[0], 1)[:nj, :ni])
 
-    said = {"body_share": round(float(body.mean()), 4), **bone, "bone_removed": removed}
+    figures = {"body_share": round(float(body.mean()), 4), **bone, "bone_removed": removed}
     boneless = [] if pieces.specimen else find_boneless(cells, body, cells.mean > TISSUE_HU)
-    said["kept_without_bone"] = _place_pieces(volume, cells, boneless)
-    return _turn_into_air(volume, outside, "remove_table", said, steps, gate)
+    figures["kept_without_bone"] = _place_pieces(volume, cells, boneless)
+    return _turn_into_air(volume, outside, "remove_table", figures, steps, gate)
 
 
 def _place_pieces(volume: Volume, cells: Cells, pieces: list[Piece]) -> list[dict[str, Any]]:
@@ -180,13 +180,13 @@ def mask_field_of_view(volume: Volume, radius_mm: float | None = None, *, progre
     _, cj, ci = cells.mean.shape
     middle = np.ix_(np.minimum(np.arange(cj) * sj + sj // 2, nj - 1), np.minimum(np.arange(ci) * si + si // 2, ni - 1))
     bone, gate = judge_circle(cells, ~mask[middle])
-    said = {"radius_mm": round(radius, 3), **bone}
+    figures = {"radius_mm": round(radius, 3), **bone}
     judged = gate if radius_mm is None else None
-    return _turn_into_air(volume, lambda k: mask, "field_of_view", said, steps, judged)
+    return _turn_into_air(volume, lambda k: mask, "field_of_view", figures, steps, judged)
 
 
 def _turn_into_air(
-    volume: Volume, outside: Callable[[int], Mask], name: str, said: dict[str, Any], steps: Steps, gate: Gate | None
+    volume: Volume, outside: Callable[[int], Mask], name: str, figures: dict[str, Any], steps: Steps, gate: Gate | None
 ) -> Volume:
     """Give the voxels outside the value of the air there; `outside` returns the mask of a slice."""
     voxels = np.array(volume.voxels)
@@ -200,7 +200,7 @@ def _turn_into_air(
         volume.release_slices(k, k + 1)
         steps.take()
     share = removed / voxels.size
-    facts = {"voxels_removed": removed, "dense_voxels_removed": dense, "removed_share": round(share, 4), **said}
+    facts = {"voxels_removed": removed, "dense_voxels_removed": dense, "removed_share": round(share, 4), **figures}
     facts["air_hu"] = float(air)
     masked = volume.with_voxels(voxels)
     masked.report = amend(masked.report, **{name: facts})
@@ -212,11 +212,11 @@ def _turn_into_air(
 def _air_level(volume: Volume, outside: Callable[[int], Mask]) -> Any:
     """Return the median of the air outside, so that no surface appears where the mask ends; `AIR_HU` without any."""
     low, high = AIR_RANGE_HU
-    found = []
+    pieces = []
     for k in range(0, volume.voxels.shape[0], -(-volume.voxels.shape[0] // 16)):
         values = volume.voxels[k][outside(k)][::7]
-        found.append(values[(values >= low) & (values <= high)])
-    air = np.sort(np.concatenate(found))
+        pieces.append(values[(values >= low) & (values <= high)])
+    air = np.sort(np.concatenate(pieces))
     if len(air):
         return air[(len(air) - 1) // 2]
     return volume.dtype.type(air_of(volume.dtype))
@@ -270,8 +270,8 @@ def _fill_holes(mask: Mask) -> None:
         return
     box = mask[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
 
-    def fill(where: slice) -> None:
-        for layer in box[where]:
+    def fill(layers: slice) -> None:
+        for layer in box[layers]:
             # All that is outside is one region with its frame, and the first.
             regions, _ = ndimage.label(np.pad(~layer, 1, constant_values=True))
             layer |= regions[1:-1, 1:-1] > 1
@@ -288,11 +288,11 @@ def _thick_parts(tissue: Mask, across: float) -> Mask:
     if count == 0:
         return np.zeros_like(tissue)
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:]
-    kept = np.zeros(count + 1, dtype=bool)
-    kept[pieces[grow(core, -(THICK_MM - OPENING_MM) / across)]] = True
-    kept[1 + int(sizes.argmax())] = True
-    kept[0] = False
-    return grow(kept[pieces], OPENING_MM / across) & tissue
+    is_thick = np.zeros(count + 1, dtype=bool)
+    is_thick[pieces[grow(core, -(THICK_MM - OPENING_MM) / across)]] = True
+    is_thick[1 + int(sizes.argmax())] = True
+    is_thick[0] = False
+    return grow(is_thick[pieces], OPENING_MM / across) & tissue
 
 
 def _find_cavities(cells: NDArray[np.float32], tissue: Mask, thick: Mask, across: float) -> Mask:
@@ -323,20 +323,20 @@ def _find_cavities(cells: NDArray[np.float32], tissue: Mask, thick: Mask, across
     foam[0] = False
     if foam.any():
         foam[regions[grow(foam[regions], -FOAM_MM / across)]] = False
-    kept = np.where(is_lung, thick_wall > _LUNG_WALL, ~is_open & (small | (thick_wall > _AIR_WALL)))
-    kept &= ~foam
-    kept[0] = False
-    return np.asarray(kept[regions])
+    is_cavity = np.where(is_lung, thick_wall > _LUNG_WALL, ~is_open & (small | (thick_wall > _AIR_WALL)))
+    is_cavity &= ~foam
+    is_cavity[0] = False
+    return np.asarray(is_cavity[regions])
 
 
 def find_unmeasured(cells: NDArray[Any]) -> Mask:
     """Mark regions of one value that begin at the corners of a slice: padding, air without noise."""
     from scipy import ndimage
 
-    found = np.zeros(cells.shape, dtype=bool)
+    unmeasured = np.zeros(cells.shape, dtype=bool)
 
-    def mark(where: slice) -> None:
-        for layer, out in zip(cells[where], found[where], strict=True):
+    def mark(layers: slice) -> None:
+        for layer, out in zip(cells[layers], unmeasured[layers], strict=True):
             for corner in set(layer[np.ix_((0, -1), (0, -1))].flat):
                 out |= layer == corner
             if np.count_nonzero(out) < _FEWEST_UNMEASURED:
@@ -351,7 +351,7 @@ def find_unmeasured(cells: NDArray[Any]) -> Mask:
             np.take(outer, pieces, out=out)
 
     in_threads(mark, len(cells), PIECE)
-    return found
+    return unmeasured
 
 
 def _thin_parts(tissue: Mask, body: Mask, cell_mm: tuple[float, float, float]) -> Mask:

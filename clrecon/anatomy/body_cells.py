@@ -76,12 +76,12 @@ def measure_cells(volume: Volume, done: Callable[[slice], None] | None = None) -
     dtype = np.promote_types(np.uint16, np.min_scalar_type(si * sj * sk))
     dense, hard, metal = (np.zeros(shape, dtype=dtype) for _ in range(3))
 
-    def measure(where: slice) -> None:
-        for place in range(where.start, where.stop):
-            first, end = place * sk, min((place + 1) * sk, nk)
+    def measure(layers: slice) -> None:
+        for layer in range(layers.start, layers.stop):
+            first, end = layer * sk, min((layer + 1) * sk, nk)
             slab = volume.voxels[first:end]
-            mean[place] = sum_blocks(slab, sj, si) / (end - first)
-            _count_dense(slab, {DENSE_HU: dense[place], HARD_HU: hard[place], SURE_METAL_HU: metal[place]}, sj, si)
+            mean[layer] = sum_blocks(slab, sj, si) / (end - first)
+            _count_dense(slab, {DENSE_HU: dense[layer], HARD_HU: hard[layer], SURE_METAL_HU: metal[layer]}, sj, si)
             volume.release_slices(first, end)
 
     in_threads(measure, shape[0], PIECE, done)
@@ -113,12 +113,12 @@ def _count_dense(slab: NDArray[Any], counts: dict[float, NDArray[Any]], sj: int,
     """Count the voxels of a slab above each bound in each cell, into zeros; `DENSE_HU` is the lowest bound."""
     # Few voxels are dense: counting them one by one costs less than sums over all voxels.
     _, nj, ni = slab.shape
-    place = np.flatnonzero(slab > DENSE_HU)
-    if not len(place):
+    dense = np.flatnonzero(slab > DENSE_HU)
+    if not len(dense):
         return
     columns = counts[DENSE_HU].shape[1]
-    cell = (place // ni % nj // sj) * columns + place % ni // si
-    values = slab.reshape(-1)[place]
+    cell = (dense // ni % nj // sj) * columns + dense % ni // si
+    values = slab.reshape(-1)[dense]
     for bound, count in counts.items():
         count[...] = np.bincount(cell[values > bound], minlength=count.size).reshape(count.shape)
 
@@ -129,8 +129,8 @@ def grow(mask: Mask, cells: float) -> Mask:
     # The border erodes nothing: an eroded mask is what is left of the grown rest.
     changed = mask.copy() if cells > 0 else ~mask
 
-    def work(where: slice) -> None:
-        for layer in changed[where]:
+    def work(layers: slice) -> None:
+        for layer in changed[layers]:
             _grow_layer(layer, turns)
             if cells <= 0:
                 np.logical_not(layer, out=layer)

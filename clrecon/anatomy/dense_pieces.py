@@ -51,7 +51,7 @@ def find_equipment(cells: Cells, labels: NDArray[np.int32], chosen: Mask, tissue
     """Return which of the chosen pieces (n,), numbered in `labels`, are bars or metal and do not lie in soft tissue."""
     from scipy import ndimage
 
-    found = np.zeros_like(chosen)
+    is_equipment = np.zeros_like(chosen)
     boxes = ndimage.find_objects(labels)
     for number in np.flatnonzero(chosen):
         box = tuple(slice(max(0, part.start - _RING_CELLS), part.stop + _RING_CELLS) for part in boxes[number - 1])
@@ -61,8 +61,8 @@ def find_equipment(cells: Cells, labels: NDArray[np.int32], chosen: Mask, tissue
         bar = piece & ~ndimage.binary_dilation(metal)
         if _is_metal(cells, box, piece) or _is_bar(bar, cells.mean[box], cells.size_mm[::-1]):
             ring = ndimage.binary_dilation(piece, iterations=_RING_CELLS) & ~piece
-            found[number] = not ring.any() or tissue[box][ring].mean() < _SOFT_RING
-    return found
+            is_equipment[number] = not ring.any() or tissue[box][ring].mean() < _SOFT_RING
+    return is_equipment
 
 
 def _is_metal(cells: Cells, box: tuple[slice, ...], piece: Mask) -> bool:
@@ -228,11 +228,11 @@ def _of_specimen(cells: Cells, tissue: Mask) -> DensePieces:
     """Decide for a specimen: pieces are added and count, but for straight plates, rails and long thin ones not hard."""
     table = tissue & _straight_plates(cells, tissue)
     pieces = _label(cells, (cells.dense > 0) & ~table)
-    kept = pieces.is_hard
-    soft = (pieces.dense > 0) & ~kept
+    bones = pieces.is_hard
+    soft = (pieces.dense > 0) & ~bones
     if soft.any():
         soft &= ~((_lengths(cells, pieces) >= LONG_MM) & (_thickness(cells, pieces, soft) <= RAIL_MM))
-    bone = pieces.cells_of(kept | soft)
+    bone = pieces.cells_of(bones | soft)
     return DensePieces(True, _with_edges(cells, bone, tissue & ~table) if bone.any() else bone, bone)
 
 
@@ -287,8 +287,8 @@ def _depth(mask: Mask, size_mm: tuple[float, ...]) -> Float64Array:
     """Estimate the thickness at each cell of a mask, mm: twice the distance to the outside, less one cell."""
     from scipy import ndimage
 
-    way = ndimage.distance_transform_edt(np.pad(mask, 1), sampling=size_mm)
-    return np.asarray(2.0 * way[tuple(slice(1, -1) for _ in mask.shape)] - min(size_mm))
+    depth = ndimage.distance_transform_edt(np.pad(mask, 1), sampling=size_mm)
+    return np.asarray(2.0 * depth[tuple(slice(1, -1) for _ in mask.shape)] - min(size_mm))
 
 
 def _thickness(cells: Cells, pieces: _Pieces, chosen: Mask) -> Float64Array:
@@ -315,11 +315,11 @@ def _room(cells: Cells, pieces: _Pieces, chosen: Mask) -> Float64Array:
     return room * math.prod(cells.size_mm) / 1000.0
 
 
-def judge_bone(cells: Cells, pieces: DensePieces, kept: Mask) -> tuple[dict[str, Any], Gate]:
+def judge_bone(cells: Cells, pieces: DensePieces, chosen: Mask) -> tuple[dict[str, Any], Gate]:
     """Count the dense voxels that stay in the body (`kept`), and judge ``bone_kept`` by `BONE_KEPT`."""
     bone = int(cells.dense[pieces.counted].sum(dtype=np.int64))
-    lost = int(cells.dense[pieces.counted & ~kept].sum(dtype=np.int64))
-    removed = int(cells.dense[~kept].sum(dtype=np.int64))
+    lost = int(cells.dense[pieces.counted & ~chosen].sum(dtype=np.int64))
+    removed = int(cells.dense[~chosen].sum(dtype=np.int64))
     share = 1.0 - lost / bone if bone else None
     facts = {
         "specimen": pieces.specimen,
@@ -328,25 +328,25 @@ def judge_bone(cells: Cells, pieces: DensePieces, kept: Mask) -> tuple[dict[str,
         "bone_kept": None if share is None else round(share, 6),
         "other_voxels_removed": removed - lost,
     }
-    what = f"share of the {bone:,} voxels of bone above {DENSE_HU:g} HU that stay without the table"
-    return facts, _judge_share("bone_kept", share, what)
+    words = f"share of the {bone:,} voxels of bone above {DENSE_HU:g} HU that stay without the table"
+    return facts, _judge_share("bone_kept", share, words)
 
 
-def _judge_share(name: str, share: float | None, what: str) -> Gate:
+def _judge_share(name: str, share: float | None, words: str) -> Gate:
     if share is None:
         return unmeasured(name, BONE_KEPT, None, f"no bone above {DENSE_HU:g} HU")
-    return at_least(name, share, BONE_KEPT, None, what)
+    return at_least(name, share, BONE_KEPT, None, words)
 
 
-def find_removed(cells: Cells, pieces: DensePieces, kept: Mask) -> list[Piece]:
+def find_removed(cells: Cells, pieces: DensePieces, chosen: Mask) -> list[Piece]:
     """Return the largest pieces of bone that are removed; parameters as of `judge_bone`."""
-    lost = _label(cells, pieces.counted & ~kept)
+    lost = _label(cells, pieces.counted & ~chosen)
     return _list_largest(cells, lost.labels, lost.dense, cells.dense)
 
 
-def find_boneless(cells: Cells, kept: Mask, tissue: Mask) -> list[Piece]:
+def find_boneless(cells: Cells, chosen: Mask, tissue: Mask) -> list[Piece]:
     """Return the largest pieces of the body (`kept`) that hold no bone, beside others that do."""
-    parts = _label(cells, kept)
+    parts = _label(cells, chosen)
     has_bone = parts.is_hard & (parts.hard > 0.0)
     if not has_bone.any():
         return []
@@ -359,13 +359,13 @@ def _list_largest(cells: Cells, labels: NDArray[np.int32], voxels: Float64Array,
     """Return the pieces with the most voxels, at most `_MOST_SAID`, with their middles."""
     from scipy import ndimage
 
-    found = []
+    largest = []
     for number in np.argsort(-voxels, kind="stable")[:_MOST_SAID]:
         if voxels[number]:
             middle = ndimage.center_of_mass(weights, labels, int(number))[::-1]
             ijk = tuple((place + 0.5) * step - 0.5 for place, step in zip(middle, cells.step, strict=True))
-            found.append((int(voxels[number]), ijk))
-    return found
+            largest.append((int(voxels[number]), ijk))
+    return largest
 
 
 def judge_circle(cells: Cells, inside: Mask) -> tuple[dict[str, Any], Gate]:
@@ -385,5 +385,5 @@ def judge_circle(cells: Cells, inside: Mask) -> tuple[dict[str, Any], Gate]:
         "bone_voxels_apart": int(pieces.dense[hard & (stays == 0.0)].sum()),
         "bone_kept": None if share is None else round(share, 6),
     }
-    what = f"share of the {bone:,} voxels of bone above {DENSE_HU:g} HU that lie in the circle"
-    return facts, _judge_share("bone_in_circle", share, what)
+    words = f"share of the {bone:,} voxels of bone above {DENSE_HU:g} HU that lie in the circle"
+    return facts, _judge_share("bone_in_circle", share, words)

@@ -65,11 +65,11 @@ _judged: WeakKeyDictionary[Any, bool | None] = WeakKeyDictionary()
 _airs: WeakKeyDictionary[Any, tuple[NDArray[np.bool_], NDArray[Any]]] = WeakKeyDictionary()
 
 
-def warn_of_face(volume: Volume, values: Iterable[float | None], what: str) -> list[str]:
+def warn_of_face(volume: Volume, values: Iterable[float | None], subject: str) -> list[str]:
     """Return the warning about a "surface" or "picture" (`what`) that shows one of some HU, if that can be a face."""
     if not any(value is not None and shows_face(volume, value) for value in values):
         return []
-    return [SAID.format(what)]
+    return [SAID.format(subject)]
 
 
 def warn_of_skin(volume: Volume, vertices: NDArray[Any], triangles: NDArray[Any]) -> list[str]:
@@ -95,10 +95,10 @@ def measure_skin(volume: Volume, vertices: NDArray[Any], triangles: NDArray[Any]
     is_flat = lengths == 0.0
     outwards = crossed / np.where(is_flat, 1.0, lengths)[:, None]
     ijk = volume.lps_to_ijk(corners.mean(axis=1) + BESIDE_MM * outwards)
-    at = np.round(ijk[:, ::-1] / steps).astype(int)
-    inside = np.all((at >= 0) & (at < outer.shape), axis=1) & ~is_flat
-    beside = np.zeros(len(at), bool)
-    beside[inside] = outer[tuple(at[inside].T)]
+    cells = np.round(ijk[:, ::-1] / steps).astype(int)
+    inside = np.all((cells >= 0) & (cells < outer.shape), axis=1) & ~is_flat
+    beside = np.zeros(len(cells), bool)
+    beside[inside] = outer[tuple(cells[inside].T)]
     return float(every * 0.5 * lengths[beside].sum() / 100.0)
 
 
@@ -157,8 +157,8 @@ def _coarse_slices(volume: Volume) -> Iterator[tuple[NDArray[Any], tuple[float, 
     steps = np.delete(spacing, axis)
     every = max(1, int(SLICE_MM / spacing[axis]))
     blocks = [max(1, round(PIXEL_MM / step)) for step in steps]
-    for place in range(0, across.shape[0], every):
-        plane = across[place]
+    for first in range(0, across.shape[0], every):
+        plane = across[first]
         starts = [np.arange(0, extent, block) for extent, block in zip(plane.shape, blocks, strict=True)]
         plane = np.maximum.reduceat(np.maximum.reduceat(plane, starts[0], axis=0), starts[1], axis=1)
         yield plane, (blocks[0] * steps[0], blocks[1] * steps[1]), every * spacing[axis]

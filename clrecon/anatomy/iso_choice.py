@@ -86,12 +86,12 @@ class BoneEdges:
 
 def measure_edges(slices: Slices, background: Background) -> BoneEdges:
     """Measure the plateaus on both sides of the edges of bone in slices, along rows and along columns."""
-    found = []
+    by_axis = []
     for k, values in slices:
         padded = np.pad(values, REACH + _FLAT, mode="edge")
         with np.errstate(invalid="ignore"):  # two infinite neighbours
-            found += [_measure_slice(padded, axis, background, k) for axis in (0, 1)]
-    every = BoneEdges(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+            by_axis += [_measure_slice(padded, axis, background, k) for axis in (0, 1)]
+    every = BoneEdges(*(np.concatenate(parts) for parts in zip(*by_axis, strict=True)))
     edges = every.where((every.tissue >= background.lowest) & (every.tissue <= background.highest))
     bone = edges.where(edges.bone <= METAL_HU)
     # These edges are the blurred rim of metal, not bone.
@@ -117,8 +117,8 @@ def _measure_slice(padded: NDArray[Any], axis: int, background: Background, k: i
     low = (places[:, 1].astype(np.intp) + border) * padded.shape[1] + places[:, 2] + border
     flat_values, flat_inside = padded.ravel(), inside.ravel()
 
-    def values(at: NDArray[np.intp]) -> NDArray[np.float32]:
-        return flat_values[at].astype(np.float32)
+    def values(places: NDArray[np.intp]) -> NDArray[np.float32]:
+        return flat_values[places].astype(np.float32)
 
     falls = flat_inside[low]
     high = np.where(falls, low, low + along)
@@ -128,8 +128,8 @@ def _measure_slice(padded: NDArray[Any], axis: int, background: Background, k: i
     sideways = values(high + across) + values(low + across) - values(high - across) - values(low - across)
     # A lone voxel of noise has no neighbour beside or behind it that is also bone.
     borne_out = flat_inside[high + across] | flat_inside[high - across] | flat_inside[high + uphill]
-    kept = borne_out & (step >= 0.25 * np.abs(sideways))
-    high, low, uphill, step = high[kept], low[kept], uphill[kept], step[kept]
+    is_sure = borne_out & (step >= 0.25 * np.abs(sideways))
+    high, low, uphill, step = high[is_sure], low[is_sure], uphill[is_sure], step[is_sure]
 
     top, steep_up = _walk(flat_values, high, uphill)
     bottom, steep_down = _walk(flat_values, low, -uphill, falling=True)
@@ -137,7 +137,7 @@ def _measure_slice(padded: NDArray[Any], axis: int, background: Background, k: i
     flat = bone < CONTRAST_MEDIUM_HU
     for beyond in range(1, _FLAT + 1):
         flat &= np.abs(values(top + beyond * uphill) - bone) <= _FLAT_SIGMAS * background.noise
-    return bone, values(bottom), np.maximum(step, np.maximum(steep_up, steep_down)), flat, places[kept]
+    return bone, values(bottom), np.maximum(step, np.maximum(steep_up, steep_down)), flat, places[is_sure]
 
 
 def _walk(
@@ -260,28 +260,28 @@ def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> Iso
     progress = progress or ignore_progress
     progress("choose", 0, 3)
     every, scale = sample_slices(volume), OwnScale.of(volume)
-    found = _look(volume, every, scale)
+    look = _look(volume, every, scale)
     progress("choose", 1, 3)
     free = every if scale is not None else _leave_metal(volume.voxels, every)
     if len(free) < len(every):
-        other = _look(volume, free, scale)
-        if other.shows_bone and (not found.shows_bone or other.spread <= STREAKS_SPREAD * found.spread):
-            found = other
+        free_look = _look(volume, free, scale)
+        if free_look.shows_bone and (not look.shows_bone or free_look.spread <= STREAKS_SPREAD * look.spread):
+            look = free_look
     progress("choose", 2, 3)
-    if not found.shows_bone:
-        raise NoSurfaceError(_no_bone(found))
+    if not look.shows_bone:
+        raise NoSurfaceError(_no_bone(look))
     if scale is not None:
-        found = found.on(scale)
-    choice = _describe(found, every.step)
+        look = look.on(scale)
+    choice = _describe(look, every.step)
     reason = choice.reason if scale is None else f"{choice.reason}; {scale.said}"
-    if found.slices < len(every):
-        reason += f"; {count_of(len(every) - found.slices, 'slice')} with metal left out"
-    edges = found.edges
+    if look.slices < len(every):
+        reason += f"; {count_of(len(every) - look.slices, 'slice')} with metal left out"
+    edges = look.edges
     kji = edges.places[np.argmin(np.abs(edges.bone - choice.bone_hu) + np.abs(edges.tissue - choice.tissue_hu))]
-    place = [round(float(mm), 3) for mm in volume.ijk_to_lps(kji[None, ::-1].astype(np.float64))[0]]
-    reason += f"; both are seen at ({', '.join(f'{mm:.4g}' for mm in place)}) mm, in slice {kji[0] + 1}"
+    seen_at = [round(float(mm), 3) for mm in volume.ijk_to_lps(kji[None, ::-1].astype(np.float64))[0]]
+    reason += f"; both are seen at ({', '.join(f'{mm:.4g}' for mm in seen_at)}) mm, in slice {kji[0] + 1}"
     progress("choose", 3, 3)
-    return dataclasses.replace(choice, reason=reason, seen_at_lps_mm=place)
+    return dataclasses.replace(choice, reason=reason, seen_at_lps_mm=seen_at)
 
 
 AutoLevel = Level | Literal["auto"]
@@ -358,13 +358,13 @@ def _leave_metal(voxels: NDArray[Any], sampled: Sequence[int]) -> Sequence[int]:
     return free if len(free) >= FEWEST_SLICES else sampled
 
 
-def _describe(found: _Look, slice_step: int) -> IsoChoice:
-    background, edges, left_out, flat_share, _, slices = found
-    bone, tissue = found.materials
+def _describe(look: _Look, slice_step: int) -> IsoChoice:
+    background, edges, left_out, flat_share, _, slices = look
+    bone, tissue = look.materials
     digits = max(0, 3 - math.floor(math.log10(bone - tissue)))  # of values that are not HU
     digits = digits if digits > 1 else 0
     iso_value = math.floor((bone + tissue) / 2.0 * 10**digits + 0.5) / 10**digits
-    spread, count = found.spread, len(edges.bone)
+    spread, count = look.spread, len(edges.bone)
     steepness = _median(edges.step, edges.contrast)
     below = "air" if background.name == "air" else "tissue"
     reason = (
@@ -396,12 +396,12 @@ def _describe(found: _Look, slice_step: int) -> IsoChoice:
     )
 
 
-def _no_bone(found: _Look) -> str:
-    background = found.background
+def _no_bone(look: _Look) -> str:
+    background = look.background
     return (
         f"no bone found to choose the iso value by: {background.name} has its mode at {background.mode:.0f} HU with a "
-        f"noise of {background.noise:.0f} HU, {format_share(found.dense_share, 2)} of the voxels of {found.slices}"
-        f" slices lie above {background.seed} HU and {len(found.edges.bone)} edges of bone rise from it;"
+        f"noise of {background.noise:.0f} HU, {format_share(look.dense_share, 2)} of the voxels of {look.slices}"
+        f" slices lie above {background.seed} HU and {len(look.edges.bone)} edges of bone rise from it;"
         f" {describe_way_out()}"
     )
 

@@ -86,8 +86,8 @@ def leave_padding(histogram: Float64Array, counted: int, report: dict[str, Any])
     """Remove padding that was filled with air from the histogram: its single value would hide the noise of the air."""
     value, share = report.get("padding_hu"), report.get("padding_share")
     if value is not None and share is not None and LOWEST_HU <= value <= HIGHEST_HU:
-        place = int(np.rint(value)) - LOWEST_HU
-        histogram[place] = max(histogram[place] - share * counted, 0.0)
+        bin_number = int(np.rint(value)) - LOWEST_HU
+        histogram[bin_number] = max(histogram[bin_number] - share * counted, 0.0)
     return histogram
 
 
@@ -106,8 +106,8 @@ def _find_mode(smooth: Float64Array, low: int, high: int) -> tuple[float, float]
     where the peak is wider than `WIDEST_MODE_HU`.  The width is measured on the upper side, where there is no fat, at
     61 % of the height (one sigma), less the smoothing.
     """
-    at = np.arange(max(low - LOWEST_HU, 1), min(high - LOWEST_HU, len(smooth) - 2) + 1)
-    peaks = at[(smooth[at] > smooth[at - 1]) & (smooth[at] >= smooth[at + 1])]
+    bins = np.arange(max(low - LOWEST_HU, 1), min(high - LOWEST_HU, len(smooth) - 2) + 1)
+    peaks = bins[(smooth[bins] > smooth[bins - 1]) & (smooth[bins] >= smooth[bins + 1])]
     if not len(peaks):
         return None
     peak = int(peaks[np.argmax(smooth[peaks])])
@@ -185,16 +185,16 @@ class OwnScale(NamedTuple):
         rescale = volume.report.get("rescale") or {}
         air, tissue = rescale.get("air"), rescale.get("soft_tissue")
         if air is not None and tissue is not None:
-            said = f"on the scan's own scale, with air near {air:.0f} and soft tissue near {tissue:.0f}"
-            return cls(air, tissue, AIR, _SOFT_TISSUE, said)
+            words = f"on the scan's own scale, with air near {air:.0f} and soft tissue near {tissue:.0f}"
+            return cls(air, tissue, AIR, _SOFT_TISSUE, words)
         known = {gate["name"]: gate["ok"] for gate in volume.report.get("gates", ())}.get("hu_known")
         if known or (known is None and _shows_hu(volume)):
             return None
-        found = find_two_materials(volume)
-        if found is None:
+        materials = find_two_materials(volume)
+        if materials is None:
             return None
-        said = f"on the scan's own scale, with two materials near {found[0]:.4g} and {found[1]:.4g}"
-        return cls(*found, _SOFT_TISSUE, DENSE, said)
+        words = f"on the scan's own scale, with two materials near {materials[0]:.4g} and {materials[1]:.4g}"
+        return cls(*materials, _SOFT_TISSUE, DENSE, words)
 
     @property
     def slope(self) -> float:
@@ -251,11 +251,11 @@ def find_two_materials(volume: Volume) -> tuple[float, float] | None:
 
 def _find_peaks(counts: Float64Array) -> list[int]:
     """Return the places of peaks that fall to half on both sides, to the ends or before anything is higher."""
-    found = []
+    peaks = []
     padded = np.concatenate([[0.0], counts, [0.0]])
     for k in np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:])) + 1:
         sides = padded[k::-1], padded[k:]
         ways = (side[: int(np.argmax(side > padded[k]))] if (side > padded[k]).any() else side for side in sides)
         if all(way.min() <= 0.5 * padded[k] for way in ways):
-            found.append(int(k) - 1)
-    return found
+            peaks.append(int(k) - 1)
+    return peaks

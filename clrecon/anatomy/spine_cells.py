@@ -75,8 +75,8 @@ def average_cells(volume: Volume, lattice: Lattice, done: Callable[[slice], None
     aligned = not volume.uneven and not (steps - np.diag(np.diag(steps))).any()
     interpolate = _interpolate_aligned if aligned else _interpolate
 
-    def fill(where: slice) -> None:
-        for k in range(where.start, where.stop):
+    def fill(layers: slice) -> None:
+        for k in range(layers.start, layers.stop):
             values[k] = interpolate(volume, means, lattice.block, x, y, float(z[k]))
 
     in_threads(fill, len(values), 4, done)
@@ -93,8 +93,8 @@ def _average_blocks(volume: Volume, lattice: Lattice, done: Callable[[slice], No
     if volume.voxels.dtype.kind != "f":  # a type that holds the largest sum of a block, which grows with its voxels
         add = np.promote_types(np.int32, np.min_scalar_type(-HU_RANGE[1] * fi * fj * fk))
 
-    def average(where: slice) -> None:
-        for k in range(where.start, where.stop):
+    def average(layers: slice) -> None:
+        for k in range(layers.start, layers.stop):
             part = np.clip(volume.voxels[fk * k : fk * (k + 1), : whole[1], : whole[0]], *HU_RANGE)
             np.divide(sum_blocks(part, fj, fi, add), fi * fj * fk, out=means[k], casting="same_kind")
             volume.release_slices(fk * k, fk * (k + 1))
@@ -113,9 +113,9 @@ def _interpolate(
     plane = np.broadcast_arrays(x, y[:, None], z)
     ijk = volume.lps_to_ijk(np.stack(plane, axis=-1).reshape(-1, 3))
     inside = ((ijk >= -0.5) & (ijk <= size - 0.5)).all(axis=1)
-    at = ((ijk + 0.5) / block - 0.5).T[::-1]
-    found = map_coordinates(means, at, output=np.float32, order=1, mode="nearest")
-    return np.where(inside, np.nan_to_num(found, nan=-1024.0), np.float32(-1024.0)).reshape(len(y), len(x))
+    in_cells = ((ijk + 0.5) / block - 0.5).T[::-1]
+    sampled = map_coordinates(means, in_cells, output=np.float32, order=1, mode="nearest")
+    return np.where(inside, np.nan_to_num(sampled, nan=-1024.0), np.float32(-1024.0)).reshape(len(y), len(x))
 
 
 def _interpolate_aligned(
@@ -130,10 +130,10 @@ def _interpolate_aligned(
         ijk = volume.lps_to_ijk(points)[:, axis]
         outside = (ijk < -0.5) | (ijk > volume.shape_ijk[axis] - 0.5)
         along = 2 - axis
-        at = np.clip((ijk + 0.5) / block[axis] - 0.5, 0.0, means.shape[along] - 1)
-        low = np.minimum(at.astype(np.int64), max(means.shape[along] - 2, 0))
+        in_cells = np.clip((ijk + 0.5) / block[axis] - 0.5, 0.0, means.shape[along] - 1)
+        low = np.minimum(in_cells.astype(np.int64), max(means.shape[along] - 2, 0))
         high = np.minimum(low + 1, means.shape[along] - 1)
-        share = (at - low).astype(np.float32).reshape([-1 if n == along else 1 for n in range(3)])
+        share = (in_cells - low).astype(np.float32).reshape([-1 if n == along else 1 for n in range(3)])
         field = field.take(low, axis=along) * (1.0 - share) + field.take(high, axis=along) * share
         if axis == 2:
             missing = missing | outside[0]
@@ -169,9 +169,9 @@ def disc_mean(field: Field, radius: float) -> Field:
         if half:
             row += padded[:, :, reach - half : reach - half + nx]
             row += padded[:, :, reach + half : reach + half + nx]
-        for place, own in enumerate(halves):
-            if own == half:
-                total += row[:, place : place + ny]
+        for shift, half_width in enumerate(halves):
+            if half_width == half:
+                total += row[:, shift : shift + ny]
                 number += 2 * half + 1
     total /= number
     return total
@@ -247,10 +247,10 @@ def measure_likeness(cells: SpineCells, done: Callable[[slice], None]) -> Likene
     worth = np.empty(box.values.shape, np.float32)
     sure, goes_on = np.empty(box.values.shape, bool), np.empty(box.values.shape, bool)
 
-    def work(where: slice) -> None:
-        worth[where], traits = _look(box, where.start, where.stop)
-        sure[where] = np.logical_and.reduce([traits[name] >= least for name, least in SURE.items()])
-        goes_on[where] = np.logical_and.reduce([traits[name] >= least for name, least in STILL.items()])
+    def work(layers: slice) -> None:
+        worth[layers], traits = _look(box, layers.start, layers.stop)
+        sure[layers] = np.logical_and.reduce([traits[name] >= least for name, least in SURE.items()])
+        goes_on[layers] = np.logical_and.reduce([traits[name] >= least for name, least in STILL.items()])
 
     in_threads(work, len(worth), PIECE, done)
     return Likeness(worth, sure, goes_on, (rows.start, columns.start))
@@ -348,9 +348,9 @@ def _mirrored(cells: SpineCells, first: int, end: int) -> Field:
     for step in aside:
         right, left = slice(reach + step, reach + step + nx), slice(reach - step, reach - step + nx)
         products += padded[:, :, right] * padded[:, :, left]
-        for way in (right, left):
-            squares += square[:, :, way]
-            sums += padded[:, :, way]
+        for shift in (right, left):
+            squares += square[:, :, shift]
+            sums += padded[:, :, shift]
     product, power, total = (
         np.add.reduce([field[:, up + row : up + row + ny] for row in back], axis=0)
         for field in (products, squares, sums)

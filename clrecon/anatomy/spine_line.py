@@ -87,15 +87,15 @@ def _beyond(likeness: Likeness, last: NDArray[np.int64], step: int, *, stop: boo
         k += step
         rows, columns = slice(max(j - REACH, 0), j + REACH + 1), slice(max(i - REACH, 0), i + REACH + 1)
         near = np.where(likeness.goes_on[k, rows, columns], 100.0, 0.0) + likeness.worth[k, rows, columns]
-        at = np.unravel_index(int(near.argmax()), near.shape)
-        j, i = rows.start + int(at[0]), columns.start + int(at[1])
+        peak = np.unravel_index(int(near.argmax()), near.shape)
+        j, i = rows.start + int(peak[0]), columns.start + int(peak[1])
         cells.append((k, j, i))
         if likeness.goes_on[k, j, i]:
             sure = len(cells)
         elif (len(cells) - sure) * CELL_MM[2] > GAP_MM:
             break
-    found = np.array(cells, np.int64).reshape(-1, 3)
-    return found[:sure] if stop else found
+    path = np.array(cells, np.int64).reshape(-1, 3)
+    return path[:sure] if stop else path
 
 
 def look_beyond(cells: SpineCells, likeness: Likeness, last: NDArray[np.int64], step: int) -> SpineEnd:
@@ -104,23 +104,23 @@ def look_beyond(cells: SpineCells, likeness: Likeness, last: NDArray[np.int64], 
     left = len(likeness.worth) - 1 - int(last[0]) if step > 0 else int(last[0])
     if left * CELL_MM[2] <= GAP_MM:
         return SpineEnd(z_mm)
-    found = _beyond(likeness, last, step, stop=False)[0]
-    return SpineEnd(z_mm, float(cells.origin[2] + found[0] * CELL_MM[2]), _lacking(likeness.box_of(cells), found))
+    cell = _beyond(likeness, last, step, stop=False)[0]
+    return SpineEnd(z_mm, float(cells.origin[2] + cell[0] * CELL_MM[2]), _lacking(likeness.box_of(cells), cell))
 
 
-def _lacking(cells: SpineCells, place: NDArray[np.int64]) -> str:
+def _lacking(cells: SpineCells, cell: NDArray[np.int64]) -> str:
     """Say in words what the place that is most like a canal lacks of one."""
-    k, j, i = (int(n) for n in place)
+    k, j, i = (int(n) for n in cell)
     traits = {name: float(field[j, i]) for name, field in traits_of(cells, k).items()}
     parts = []
     if traits["soft"] < STILL["soft"]:
         reach = round(CANAL_RADIUS / CELL_MM[0])
         around = cells.values[k, max(j - reach, 0) : j + reach + 1, max(i - reach, 0) : i + reach + 1]
         hu = float(around.mean())
-        what = "bone" if hu >= SOFT_HU[1] else "bone beside soft tissue"
+        tissue = "bone" if hu >= SOFT_HU[1] else "bone beside soft tissue"
         if hu <= SOFT_HU[0]:
-            what = "air or fat"
-        parts.append(f"{what} in its place ({hu:.0f} HU)")
+            tissue = "air or fat"
+        parts.append(f"{tissue} in its place ({hu:.0f} HU)")
     if traits["wall"] < STILL["wall"]:
         parts.append(
             f"bone in {100.0 * traits['wall']:.0f} % of the directions around it (at least"
@@ -135,9 +135,9 @@ def missing_traits(cells: SpineCells, likeness: Likeness, path: NDArray[np.int64
     """Say in words which traits most slices lack on a path that is no canal; empty where there is no path."""
     box = likeness.box_of(cells)
     chosen = path[np.unique(np.linspace(0, len(path) - 1, LOOKED_AT).astype(int))] if len(path) else path
-    found = [({name: field[j, i] for name, field in traits_of(box, int(k)).items()}) for k, j, i in chosen]
+    seen = [({name: field[j, i] for name, field in traits_of(box, int(k)).items()}) for k, j, i in chosen]
     lacking = [
-        text for name, text in MISSING.items() if 2 * sum(traits[name] < SURE[name] for traits in found) > len(found)
+        text for name, text in MISSING.items() if 2 * sum(traits[name] < SURE[name] for traits in seen) > len(seen)
     ]
     return " and ".join(filter(None, (", ".join(lacking[:-1]), *lacking[-1:])))
 
@@ -216,9 +216,9 @@ def find_spine_line(volume: Volume, *, sure_only: bool = False, progress: Progre
     searched, height = len(cells.values) * CELL_MM[2], (end - begin) * CELL_MM[2]
     if height < SHORTEST_MM:
         missing = missing_traits(cells, likeness, path)
-        what = f"; the place most like a canal lacks {missing}" if missing else ""
+        lack = f"; the place most like a canal lacks {missing}" if missing else ""
         raise RefusedInputError(
-            f"no spine was found that one could be sure of ({_describe_run(cells, path[begin:end], searched)}{what}):"
+            f"no spine was found that one could be sure of ({_describe_run(cells, path[begin:end], searched)}{lack}):"
             " give points of the centre line"
         )
     path = path[begin:end]
@@ -242,8 +242,8 @@ def _faces_forward(cells: SpineCells, likeness: Likeness, path: NDArray[np.int64
     """Return whether the slices of a path look less like a spine where front and back of the scan are exchanged."""
     slices = slice(int(path[0, 0]), int(path[-1, 0]) + 1)
     exchanged = measure_likeness(SpineCells(np.ascontiguousarray(cells.values[:, ::-1]), cells.origin), lambda _: None)
-    own, other = (one.worth[slices].max(axis=(1, 2)) for one in (likeness, exchanged))
-    return bool(np.median(own - other) >= _FORWARD)
+    usual, swapped = (one.worth[slices].max(axis=(1, 2)) for one in (likeness, exchanged))
+    return bool(np.median(usual - swapped) >= _FORWARD)
 
 
 def _describe_run(cells: SpineCells, run: NDArray[np.int64], searched: float) -> str:
@@ -251,9 +251,9 @@ def _describe_run(cells: SpineCells, run: NDArray[np.int64], searched: float) ->
     if not len(run):
         return f"none of its {searched:.0f} mm look like one"
     low, high = (float(cells.origin[2] + k * CELL_MM[2]) for k in (run[0, 0], run[-1, 0]))
-    where = f"z {low:.0f} mm" if len(run) == 1 else f"z {low:.0f} to {high:.0f} mm"
+    range_text = f"z {low:.0f} mm" if len(run) == 1 else f"z {low:.0f} to {high:.0f} mm"
     return (
-        f"{len(run) * CELL_MM[2]:.0f} of {searched:.0f} mm look like one, at {where}, and at least"
+        f"{len(run) * CELL_MM[2]:.0f} of {searched:.0f} mm look like one, at {range_text}, and at least"
         f" {SHORTEST_MM:.0f} mm are needed"
     )
 

@@ -123,13 +123,13 @@ def _find_cavities(air: Mask, within: Mask, deep: Mask) -> Mask:
     return np.asarray(keep[pieces])
 
 
-def _touching_mm2(kept: Mask, outside: Mask, volume: Volume) -> float:
+def _touching_mm2(inside: Mask, outside: Mask, volume: Volume) -> float:
     """Return the area of the faces between the voxels of two masks, mm2."""
     steps = volume.affine[:3, :3].T
     areas = [float(np.linalg.norm(np.cross(steps[(axis + 1) % 3], steps[(axis + 2) % 3]))) for axis in (2, 1, 0)]
     total = 0.0
     for area, (low, high) in zip(areas, _neighbours(), strict=True):
-        faces = np.count_nonzero(kept[low] & outside[high]) + np.count_nonzero(outside[low] & kept[high])
+        faces = np.count_nonzero(inside[low] & outside[high]) + np.count_nonzero(outside[low] & inside[high])
         total += area * int(faces)
     return total
 
@@ -202,7 +202,7 @@ def leave_out_surroundings(volume: Volume, *, progress: Progress | None = None) 
     else:
         dtype = np.dtype(np.float32)
     steps = Steps(progress, "mask", count_cells(volume)[0] + BODY_STEPS + len(voxels))
-    taken = np.array(voxels, dtype=dtype)
+    cleared = np.array(voxels, dtype=dtype)
     try:
         body, (si, sj, sk) = find_body(volume, steps=steps)
     except RefusedInputError:
@@ -210,14 +210,14 @@ def leave_out_surroundings(volume: Volume, *, progress: Progress | None = None) 
     if body is not None:
         across = np.sqrt(si * volume.spacing[0] * sj * volume.spacing[1])
         body = grow(body, -(max(1, round(MARGIN_MM / across)) + np.ceil(LEFT_OUT_SKIN_MM / across)))
-        for k, layer in enumerate(taken):
-            kept = np.repeat(np.repeat(body[k // sk], sj, 0), si, 1)[: layer.shape[0], : layer.shape[1]]
+        for k, layer in enumerate(cleared):
+            is_body = np.repeat(np.repeat(body[k // sk], sj, 0), si, 1)[: layer.shape[0], : layer.shape[1]]
             unmeasured = find_unmeasured(voxels[k : k + 1])[0]
-            np.copyto(layer, value, where=~kept | unmeasured, casting="unsafe")
+            np.copyto(layer, value, where=~is_body | unmeasured, casting="unsafe")
             volume.release_slices(k, k + 1)
             steps.take()
     facts = {"highest_hu": high, "value_hu": value, "body": body is not None}
-    return volume.with_voxels(taken, amend(volume.report, **{LEFT_OUT: facts}))
+    return volume.with_voxels(cleared, amend(volume.report, **{LEFT_OUT: facts}))
 
 
 def count_left_out(volume: Volume) -> dict[str, Any] | None:

@@ -192,9 +192,9 @@ def _options_in(arguments: Sequence[str]) -> list[str]:
 def _join_negative_lists(arguments: Sequence[str]) -> list[str]:
     """Write ``--option -1,2`` as ``--option=-1,2``: argparse takes what begins with a minus for an option."""
     joined: list[str] = []
-    for place, argument in enumerate(arguments):
+    for position, argument in enumerate(arguments):
         if argument == "--":
-            return [*joined, *arguments[place:]]
+            return [*joined, *arguments[position:]]
         previous = joined[-1] if joined else ""
         if previous.startswith("--") and "=" not in previous and _NEGATIVE_LIST.match(argument):
             joined[-1] = f"{previous}={argument}"
@@ -239,17 +239,17 @@ def make_part(part: type[Settings], options: argparse.Namespace, owner: str | No
     """Make settings that mean nothing without the option of `owner`, None where it has no value; `needs` says which."""
     if owner is not None:
         return make_settings(part, options)
-    for own in options_of(part):
-        if getattr(options, own.name) is not None:
-            raise UsageError(f"{own.flags[0]} {needs}")
+    for option in options_of(part):
+        if getattr(options, option.name) is not None:
+            raise UsageError(f"{option.flags[0]} {needs}")
     return None
 
 
 def add_fields(container: argparse._ActionsContainer, settings: type, *groups: str) -> None:
     """Add the options of groups that are fields of settings; without a group those that have none."""
     for group in groups or ("",):
-        for own in options_of(settings, group):
-            container.add_argument(*own.flags, dest=own.name, **own.how)
+        for option in options_of(settings, group):
+            container.add_argument(*option.flags, dest=option.name, **option.how)
 
 
 def add_option(container: argparse._ActionsContainer, name: str, declared: Any) -> None:
@@ -266,9 +266,9 @@ def add_picture(container: argparse._ActionsContainer, text: str, metavar: str =
     container.add_argument("--picture", metavar=metavar, help=text, first=True)
 
 
-def add_report(container: argparse._ActionsContainer, what: str, *, first: bool = True) -> None:
+def add_report(container: argparse._ActionsContainer, content: str, *, first: bool = True) -> None:
     """Add --report, which writes `what` as JSON."""
-    container.add_argument("--report", metavar="FILE", help=f"write {what} as JSON", first=first)
+    container.add_argument("--report", metavar="FILE", help=f"write {content} as JSON", first=first)
 
 
 def add_no_clobber(container: argparse._ActionsContainer, *, with_ids: bool = True) -> None:

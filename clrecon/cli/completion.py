@@ -61,23 +61,23 @@ def write_script(shell: str) -> str:
         raise UsageError(f"no completion for {shell!r:.60}{guess_word(shell, SHELLS)}: use one of {', '.join(SHELLS)}")
     from clrecon.cli.main import COMMANDS, HELP
 
-    found = {}
+    words = {}
     for name, command in COMMANDS.items():
         parser = common.Parser(prog=name)
         import_module(command.module).add_arguments(parser)
         common.add_common(parser)
-        found[name] = _Words(command.help, [_describe(action) for action in parser._actions if action.option_strings])
-    found["completion"].first = list(SHELLS)
-    found[HELP] = _Words("show all options of a command", first=list(COMMANDS))
-    return {"bash": _write_bash, "zsh": _write_zsh, "fish": _write_fish}[shell](found)
+        words[name] = _Words(command.help, [_describe(action) for action in parser._actions if action.option_strings])
+    words["completion"].first = list(SHELLS)
+    words[HELP] = _Words("show all options of a command", first=list(COMMANDS))
+    return {"bash": _write_bash, "zsh": _write_zsh, "fish": _write_fish}[shell](words)
 
 
 def _describe(action: argparse.Action) -> _Option:
-    said = (action.help or "").replace("%%", "%")
+    text = (action.help or "").replace("%%", "%")
     takes_value = action.nargs != 0
     return _Option(
         list(action.option_strings),
-        re.split(r"[;:(]", said)[0].strip(),
+        re.split(r"[;:(]", text)[0].strip(),
         takes_value,
         _find_words(action) if takes_value else [],
     )
@@ -128,8 +128,8 @@ def _write_bash(commands: dict[str, _Words]) -> str:
 
 
 def _write_zsh(commands: dict[str, _Words]) -> str:
-    def entry(word: str, said: str) -> str:
-        return "'" + (f"{word}:{said}" if said else word).replace("'", "'\\''") + "'"
+    def entry(word: str, help_text: str) -> str:
+        return "'" + (f"{word}:{help_text}" if help_text else word).replace("'", "'\\''") + "'"
 
     lines = [
         "#compdef clrecon",
@@ -175,8 +175,8 @@ def _write_fish(commands: dict[str, _Words]) -> str:
             value = " -r" if option.takes_value else ""
             if option.takes_value and option.words:
                 value = f" -x -a '{' '.join(option.words)}'"
-            said = f" -d {_fish_quote(option.help)}" if option.help else ""
-            lines.append(f"{seen} {names}{value}{said}")
+            help_text = f" -d {_fish_quote(option.help)}" if option.help else ""
+            lines.append(f"{seen} {names}{value}{help_text}")
     return "\n".join((*lines, ""))
 
 

@@ -46,16 +46,16 @@ def fit_help(text: str, stream: Any) -> str:
 
 def _find_paragraphs(lines: list[str]) -> list[list[str]]:
     """Put lines together that are one text: broken because they were full, with the rest under the beginning."""
-    found: list[list[str]] = []
+    paragraphs: list[list[str]] = []
     for line in lines:
-        if found and line.strip() and not _COMMAND.match(line) and not _has_label(line):
-            last, indent, hang = found[-1][-1], _indent_of(line), _hang_of(found[-1][0])
+        if paragraphs and line.strip() and not _COMMAND.match(line) and not _has_label(line):
+            last, indent, hang = paragraphs[-1][-1], _indent_of(line), _hang_of(paragraphs[-1][0])
             was_full = len(last) + 1 + len(line.split()[0]) > FULL
-            if indent == hang > _indent_of(found[-1][0]) or was_full and indent in (_indent_of(last), hang):
-                found[-1].append(line)
+            if indent == hang > _indent_of(paragraphs[-1][0]) or was_full and indent in (_indent_of(last), hang):
+                paragraphs[-1].append(line)
                 continue
-        found.append([line])
-    return found
+        paragraphs.append([line])
+    return paragraphs
 
 
 def _fit_paragraph(lines: list[str], width: int) -> str:
@@ -361,9 +361,9 @@ def _streamed_file(
         setattr(options, option, str(path))
         console.stream_file(str(path), _NAME)
         yield
-        made = sorted(os.listdir(folder))
-        if made != [path.name]:
-            raise UsageError(f"{_FILES[option]} {value}: {len(made)} files were made, and one stream holds one")
+        names = sorted(os.listdir(folder))
+        if names != [path.name]:
+            raise UsageError(f"{_FILES[option]} {value}: {len(names)} files were made, and one stream holds one")
         with open(path, "rb") as stream:
             while piece := stream.read(_PIECE):
                 console.send(piece)

@@ -79,11 +79,11 @@ def describe_report(report: dict[str, Any]) -> list[str]:
         f"surface  {'fitted to the bone from ' if report['surface'] == 'cortex' else ''}{report['iso_value_hu']:g} HU,"
         f" {report['iso_value_reason']}",
     ]
-    for each in report["vertebrae"]:
-        for side in each["corridors"]:
-            lines += _describe_side(each["name"], side, report)
-        for screw in each["screws"]:
-            lines += _describe_screw(each["name"], screw)
+    for vertebra in report["vertebrae"]:
+        for side in vertebra["corridors"]:
+            lines += _describe_side(vertebra["name"], side, report)
+        for screw in vertebra["screws"]:
+            lines += _describe_screw(vertebra["name"], screw)
     if report["grade_scale"]:
         lines.append(f"scale    {report['grade_scale']}")
     return [
@@ -99,10 +99,10 @@ def _name_files(report: dict[str, Any], output: str | None, picture: str | None)
 
     files = []
     for kind, path in (("picture", picture), ("mesh", output)):
-        made = [each for each in report["outputs"] if each["kind"] == kind]
-        if path is not None and made:
-            names = [each["name"] for each in made] if kind == "mesh" or len(made) > 1 else [""]
-            files += [(str(own), each["bytes"]) for own, each in zip(name_outputs(path, names), made, strict=True)]
+        outputs = [each for each in report["outputs"] if each["kind"] == kind]
+        if path is not None and outputs:
+            names = [each["name"] for each in outputs] if kind == "mesh" or len(outputs) > 1 else [""]
+            files += [(str(own), each["bytes"]) for own, each in zip(name_outputs(path, names), outputs, strict=True)]
     return files
 
 
@@ -125,16 +125,16 @@ def _describe_side(name: str, side: dict[str, Any], report: dict[str, Any]) -> l
     elif bias is None:
         of_level = "not measured: too few walls beside the line stand out"
     else:
-        way = "outside" if bias["median"] >= 0.0 else "inside"
+        side_word = "outside" if bias["median"] >= 0.0 else "inside"
         of_level = (
-            f"{abs(bias['median']):.2f} mm {way} of this pedicle's own half level ({bias['half_level_hu']:.0f} HU),"
-            f" quartiles {bias['quartiles'][0]:.2f} to {bias['quartiles'][1]:.2f}"
+            f"{abs(bias['median']):.2f} mm {side_word} of this pedicle's own half level ({bias['half_level_hu']:.0f}"
+            f" HU), quartiles {bias['quartiles'][0]:.2f} to {bias['quartiles'][1]:.2f}"
         )
-    own, space = side["medial_angle_range_deg"], report["space"]
+    angles, space = side["medial_angle_range_deg"], report["space"]
     return [
         f"{head}radius {side['radius_mm']:.1f} mm, screw to {side['screw_diameter_mm']:.1f} mm with a margin of"
         f" {report['margin_mm']:g} mm, length {side['length_mm']:.0f} mm",
-        f"         medial {side['medial_angle_deg']:.0f} degrees ({own[0]:.0f} to {own[1]:.0f} within 0.1 mm; LPS"
+        f"         medial {side['medial_angle_deg']:.0f} degrees ({angles[0]:.0f} to {angles[1]:.0f} within 0.1 mm; LPS"
         f" {side['medial_angle_lps_deg']:.0f}), sagittal not determined: {low_high[0]:.0f} to {low_high[1]:.0f} within"
         f" 0.1 mm, line at {side['sagittal_angle_deg']:.0f} (LPS {side['sagittal_angle_lps_deg']:.0f})",
         f"         entry {_point(side['entry_mm'], space)}, tip {_point(side['tip_mm'], space)}",

@@ -37,10 +37,10 @@ def _describe_survey(survey: dict[str, Any]) -> list[str]:
     for device in survey["devices"]:
         mark = "*" if device["chosen"] else " "
         kind = "simulator" if device["simulator"] else device["type"]
-        own = " of its own" if device["has_own_memory"] else ""
+        ownership = " of its own" if device["has_own_memory"] else ""
         memory, largest = (common.megabytes(device[name]) for name in ("memory_bytes", "max_allocation_bytes"))
         lines.append(f"{mark} {device['index']}  {kind:<11}  {printable(device['name'])}")
-        lines.append(f"{'':18}{device['compute_units']} compute units, {memory}{own}, largest buffer {largest}")
+        lines.append(f"{'':18}{device['compute_units']} compute units, {memory}{ownership}, largest buffer {largest}")
         driver = f"{device['platform']}, {device['version']}, driver {device['driver']}"
         lines.append(f"{'':18}{printable(driver)}")
         if device["chosen"]:

@@ -68,10 +68,10 @@ def _describe(report: dict[str, Any]) -> list[str]:
     signed = {words: report[f"{side}_signed_mm"] for words, side in sides.items()}
     if any(signed.values()):
         figures = [["signed mm", "mean", "5 %", "50 %", "95 %", "outside"]]
-        for words, own in signed.items():
-            if own is not None:
-                cells = [_mm(own[name], "+") for name in ("mean", "p5", "median", "p95")]
-                figures.append([words, *cells, f"{100.0 * own['outside_share']:.0f} %"])
+        for words, side_figures in signed.items():
+            if side_figures is not None:
+                cells = [_mm(side_figures[name], "+") for name in ("mean", "p5", "median", "p95")]
+                figures.append([words, *cells, f"{100.0 * side_figures['outside_share']:.0f} %"])
         lines += ["", *common.table(figures, right=range(1, 6))]
     lines.append("")
     if report["colors"] is not None:
@@ -81,24 +81,24 @@ def _describe(report: dict[str, Any]) -> list[str]:
             f"colours  {span} mm, beyond them {100.0 * report['colors']['beyond_share']:.1f} % of A's vertices"
         )
     lines.append(f"time     {report['seconds']['total']:.2f} s")
-    for each in report["outputs"]:
-        lines.append(f"wrote    {each['kind']} {printable(each['name'])}, {common.megabytes(each['bytes'])}")
+    for output in report["outputs"]:
+        lines.append(f"wrote    {output['kind']} {printable(output['name'])}, {common.megabytes(output['bytes'])}")
     return lines
 
 
 def _describe_mesh(letter: str, entry: dict[str, Any]) -> list[str]:
-    made = []
+    lines = []
     if entry["iso_value_hu"] is not None:
-        made = [f"         bone {'fitted from' if entry['cortex'] else 'at'} {entry['iso_value_hu']:g} HU"]
+        lines = [f"         bone {'fitted from' if entry['cortex'] else 'at'} {entry['iso_value_hu']:g} HU"]
     if entry["cortex"]:
-        made[0] += f", {common.describe_fit(entry['cortex'])}"
+        lines[0] += f", {common.describe_fit(entry['cortex'])}"
     size = f"{entry['triangles']:,} triangles, "
     size += "not closed" if entry["volume_ml"] is None else f"closed, {format_volume(entry['volume_ml'])}"
     turned = ", turned to LPS" if entry["space"] != "LPS" else ""
     source = {"file": "named by the file", "argument": "as you say", "assumed": "assumed"}[entry["space_from"]]
     return [
         f"{letter:<9}{printable(entry['name'])}",
-        *made,
+        *lines,
         f"         {size}",
         f"         {entry['space']}, {source}{turned}",
     ]

@@ -56,8 +56,8 @@ def _describe_places(of: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if of["tilt_deg"] is not None:
         edge = "front" if of["tilt_deg"] > 0.0 else "back"
         tilted = abs(of["tilt_deg"]) > _OBLIQUE_DEG
-        said = f"{of['tilt_deg']:+.2f} degrees ({edge} edge towards the head), kept exactly as a shear"
-        yield "tilt", said if tilted else "none"
+        tilt_text = f"{of['tilt_deg']:+.2f} degrees ({edge} edge towards the head), kept exactly as a shear"
+        yield "tilt", tilt_text if tilted else "none"
     reasons = "".join(f", {count} dropped ({reason})" for reason, count in of["dropped"].items())
     missing = f", {of['slices_missing']} missing" if of["slices_missing"] else ""
     yield "slices", f"{of['slices']} used{reasons or ', none dropped'}{missing}"
@@ -90,15 +90,15 @@ def _describe_residual(of: dict[str, Any]) -> str:
 def _describe_gaps(of: dict[str, Any]) -> str:
     low, high, usual = (of["gap_mm"][name] for name in ("min", "max", "median"))
     stated = of["stated_gap_mm"]
-    said = "" if stated is None else f"; SpacingBetweenSlices says {stated:g}"
+    note = "" if stated is None else f"; SpacingBetweenSlices says {stated:g}"
     runs = of["gap_runs"]
     if not high:
-        return f"none, all slices are at one place{said}"
+        return f"none, all slices are at one place{note}"
     if runs and len(runs) <= _RUNS_SHOWN:
-        return ", then ".join(f"{run['count']} of {run['gap_mm']:.4g}" for run in runs) + f" mm{said}"
+        return ", then ".join(f"{run['count']} of {run['gap_mm']:.4g}" for run in runs) + f" mm{note}"
     if high - low > _SAME * usual:
-        return f"{low:.4g} to {high:.4g} mm, usually {usual:.4g}{said}"
-    return f"{usual:.4g} mm{said}"
+        return f"{low:.4g} to {high:.4g} mm, usually {usual:.4g}{note}"
+    return f"{usual:.4g} mm{note}"
 
 
 def _describe_thickness(thickness: dict[str, Any], usual_gap: float) -> str:
@@ -147,10 +147,10 @@ def _describe_values(of: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _describe_gates(gates: list[dict[str, Any]]) -> Iterator[tuple[str, str]]:
-    kept = sum(gate["ok"] is True for gate in gates)
+    passed = sum(gate["ok"] is True for gate in gates)
     failed = [gate for gate in gates if gate["ok"] is False]
     unknown = [gate["name"] for gate in gates if gate["ok"] is None]
-    text = f"{kept} kept, {len(failed)} failed"
+    text = f"{passed} kept, {len(failed)} failed"
     yield "gates", text + (f", not measured: {', '.join(unknown)}" if unknown else "")
     for gate in failed:
         yield "FAILED", f"{gate['name']}: {gate['text']}"
@@ -211,13 +211,13 @@ def render_listing(
     shown = [entry for entry in entries if entry["number"] != refused]
     stacks = [entry for entry in shown if entry["kind"] == "stack"]
     others = [entry for entry in shown if entry["kind"] != "stack"]
-    for group, what, place in (
+    for group, label, field in (
         (others, "not read", "problems"),  # which is no fault of an RT object, a capture or a localizer
         (stacks, "problem", "problems"),
         (entries, "warning", "warnings"),
     ):
-        for numbers, text in _collect_texts(group, place):
-            lines += _wrap(f"series {numbers}: {what}: {printable(text)}", width, "    ")
+        for numbers, text in _collect_texts(group, field):
+            lines += _wrap(f"series {numbers}: {label}: {printable(text)}", width, "    ")
     if certificate:
         judged = "as clrecon mesh would read it" if listing["chosen"] else "refused"
         lines += ["", f"series {listing['certificate']['series']['number']}, {judged}"]
@@ -298,15 +298,15 @@ def _render_table(
 
 def _choose_columns(every: Sequence[_Column], width: int) -> list[_Column] | None:
     """Choose the columns that fit, by importance; None if not even the necessary ones fit."""
-    kept = [column for column in every if not column.left_out]
-    free = width - sum(column.width for column in kept) - _BETWEEN * (len(kept) - 1)
+    shown = [column for column in every if not column.left_out]
+    free = width - sum(column.width for column in shown) - _BETWEEN * (len(shown) - 1)
     if free < 0:
         return None
     for column in sorted(every, key=lambda column: -column.left_out):
         if column.left_out and column.width + _BETWEEN <= free:
-            kept.append(column)
+            shown.append(column)
             free -= column.width + _BETWEEN
-    return [column for column in every if column in kept]
+    return [column for column in every if column in shown]
 
 
 def _make_table(columns: Sequence[_Column], entries: Sequence[dict[str, Any]], chosen: int | None) -> Table:
@@ -348,15 +348,15 @@ def _render_list(columns: Sequence[_Column], width: int) -> list[str]:
     return lines
 
 
-def _collect_texts(entries: Sequence[dict[str, Any]], place: str) -> Iterator[tuple[str, str]]:
+def _collect_texts(entries: Sequence[dict[str, Any]], field: str) -> Iterator[tuple[str, str]]:
     """Collect texts; a text of several series appears once, with their numbers: ``3, 5-9``."""
     numbers: dict[str, list[int]] = {}
     for entry in entries:
-        for text in entry[place]:
+        for text in entry[field]:
             numbers.setdefault(str(text), []).append(entry["number"])
-    for text, found in numbers.items():
+    for text, numbered in numbers.items():
         runs: list[list[int]] = []
-        for number in sorted(found):
+        for number in sorted(numbered):
             if runs and number == runs[-1][-1] + 1:
                 runs[-1].append(number)
             else:
@@ -389,14 +389,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.info import describe_input
 
-    found = describe_input(options.input, common.make_settings(InfoSettings, options), progress=console.progress)
-    console.result(found.listing)
+    facts = describe_input(options.input, common.make_settings(InfoSettings, options), progress=console.progress)
+    console.result(facts.listing)
     if not options.json and not options.quiet:
-        lines = render_listing(found.listing, describe_certificate(found.listing["certificate"]), found.refused)
+        lines = render_listing(facts.listing, describe_certificate(facts.listing["certificate"]), facts.refused)
         for line in lines:
             console.say(line)
-    for note in found.notes:
+    for note in facts.notes:
         console.warn(note, with_json=True)
-    if found.problem is not None:
-        raise found.problem
+    if facts.problem is not None:
+        raise facts.problem
     return 0

@@ -119,12 +119,12 @@ def _describe_vertebra(vertebra: dict[str, Any]) -> list[str]:
     ]
 
 
-def _describe_thickness(found: dict[str, Any]) -> str:
-    limit = f"{found['limit_mm']:.3g} mm (two voxels)"
-    if found["median_mm"] is None:
+def _describe_thickness(thickness: dict[str, Any]) -> str:
+    limit = f"{thickness['limit_mm']:.3g} mm (two voxels)"
+    if thickness["median_mm"] is None:
         return f"thickness of dense bone: not resolved, nothing is thicker than {limit}"
-    share = 100.0 * found["resolved_share"]
+    share = 100.0 * thickness["resolved_share"]
     return (
-        f"thickness of dense bone: {share:.0f} % of it thicker than {limit}, median there {found['median_mm']:.2g} mm;"
-        " the rest is not resolved"
+        f"thickness of dense bone: {share:.0f} % of it thicker than {limit}, median there"
+        f" {thickness['median_mm']:.2g} mm; the rest is not resolved"
     )

@@ -258,10 +258,10 @@ def _describe_quality(report: dict[str, Any]) -> list[str]:
 
 def describe_cortex(meshes: list[dict[str, Any]]) -> list[str]:
     """Describe how far the largest mesh lies or lay from the bone, in a line; no line where it was not measured."""
-    found = [mesh["cortex"] for mesh in meshes if (mesh["cortex"] or {}).get("constants")]
-    if not found:
+    fits = [mesh["cortex"] for mesh in meshes if (mesh["cortex"] or {}).get("constants")]
+    if not fits:
         return []
-    cortex = max(found, key=lambda each: each["vertices"])
+    cortex = max(fits, key=lambda each: each["vertices"])
     outside, error, walls = cortex["outside_mm"], cortex["error_mm"], cortex["thickness_mm"]
     share = 100.0 * cortex["fitted"] / cortex["vertices"]
     ends = f"5 % to 95 %: {outside['p5']:+.2f} to {outside['p95']:+.2f}"
@@ -315,7 +315,7 @@ def describe_cells(report: dict[str, Any]) -> list[str]:
         if not growing:
             continue
         share = cells["all"] / max(cells["visited"], 1)
-        said = [
+        sentences = [
             f"cells    {cells['visited']:,} visited, {cells['active']:,} active, {cells['all']:,} in all (1 in"
             f" {share:,.0f} visited)",
             f"grown    from {', '.join(growing['from'])}: {growing['components_taken']:,} of"
@@ -323,16 +323,16 @@ def describe_cells(report: dict[str, Any]) -> list[str]:
             f" {100 * growing['cells_left_out_share']:.1f} % of the active cells left"
             f" out, the largest part of them {growing['largest_left_out_cells']:,}",
         ]
-        lines += [line for line in said if line not in lines]
+        lines += [line for line in sentences if line not in lines]
     return lines
 
 
 def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
     """Describe the changes by smoothing and decimation: those of one mesh, or the largest of several."""
-    found = [mesh["refinement"] for mesh in meshes if mesh["refinement"]]
-    if not found:
+    refinements = [mesh["refinement"] for mesh in meshes if mesh["refinement"]]
+    if not refinements:
         return []
-    worst = max(found, key=lambda each: each["deviation"]["hd95_mm"] / each["voxel_mm"])
+    worst = max(refinements, key=lambda each: each["deviation"]["hd95_mm"] / each["voxel_mm"])
     parts = []
     if "smooth" in worst:
         parts.append(_describe_smoothing(worst["smooth"]))
@@ -341,7 +341,7 @@ def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
     deviation, voxel = worst["deviation"], worst["voxel_mm"]
     if deviation["volume_change_percent"] is not None:
         parts.append(f"volume {round(deviation['volume_change_percent'], 2) + 0.0:+.2f} %")
-    which = "refined " if len(found) == 1 else "refined (worst mesh)"
+    which = "refined " if len(refinements) == 1 else "refined (worst mesh)"
     lengths = ", ".join(
         f"{name} {deviation[key]:.3f} mm ({deviation[key] / voxel:.2f} voxel)"
         for name, key in (("mean", "assd_mm"), ("95 % within", "hd95_mm"), ("largest", "max_mm"))
@@ -349,42 +349,42 @@ def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
     return [f"{which} {', '.join(parts)}", f"         from the surface before: {lengths}"]
 
 
-def _describe_smoothing(found: dict[str, Any]) -> str:
-    rough, smooth = found["roughness_before_mm"], found["roughness_after_mm"]
-    parts = [count_of(found["iterations"], "iteration"), f"roughness {rough:.3f} to {smooth:.3f} mm"]
-    if found["components_left"]:
-        parts.append(f"{count_of(found['components_left'], 'component')} left unsmoothed to keep the volume")
+def _describe_smoothing(smoothing: dict[str, Any]) -> str:
+    rough, smooth = smoothing["roughness_before_mm"], smoothing["roughness_after_mm"]
+    parts = [count_of(smoothing["iterations"], "iteration"), f"roughness {rough:.3f} to {smooth:.3f} mm"]
+    if smoothing["components_left"]:
+        parts.append(f"{count_of(smoothing['components_left'], 'component')} left unsmoothed to keep the volume")
     return f"smoothed ({'; '.join(parts)})"
 
 
-def _describe_decimation(found: dict[str, Any]) -> str:
+def _describe_decimation(decimation: dict[str, Any]) -> str:
     """Describe how many triangles were removed, how many were asked for, and why decimation ended."""
-    asked, reached = 100 * found["fraction"], 100 * found["reached"]
-    topology = _describe_topology(found["topology"])
-    if found["ended_by"] == "share":
+    asked, reached = 100 * decimation["fraction"], 100 * decimation["reached"]
+    topology = _describe_topology(decimation["topology"])
+    if decimation["ended_by"] == "share":
         return f"{reached:.1f} % of the triangles taken away, as asked, {topology}"
-    bound = f"the bound of {format_digits(found['max_deviation_mm'])} mm"
+    bound = f"the bound of {format_digits(decimation['max_deviation_mm'])} mm"
     return f"{reached:.1f} % of the triangles taken away of {asked:g} % asked for: {bound} ended it, {topology}"
 
 
-def _describe_topology(found: Mapping[str, Any]) -> str:
+def _describe_topology(topology: Mapping[str, Any]) -> str:
     """Describe the Euler number before and after, and in how many components it changed."""
-    before, after = found["euler_number_before"], found["euler_number_after"]
-    if not (found["components_changed"] or found["components_lost"]):
+    before, after = topology["euler_number_before"], topology["euler_number_after"]
+    if not (topology["components_changed"] or topology["components_lost"]):
         return f"Euler number {before} before and after"
-    parts = [f"changed in {found['components_changed']} of {count_of(found['components_before'], 'component')}"]
-    if found["components_lost"]:
-        parts.append(f"{found['components_lost']} lost")
+    parts = [f"changed in {topology['components_changed']} of {count_of(topology['components_before'], 'component')}"]
+    if topology["components_lost"]:
+        parts.append(f"{topology['components_lost']} lost")
     return f"Euler number {before} before, {after} after ({', '.join(parts)})"
 
 
 def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
     """Describe the facts that matter for printing the mesh; of several meshes only the first."""
-    found = [mesh["print"] for mesh in meshes if mesh.get("print")]
-    if not found:
+    prints = [mesh["print"] for mesh in meshes if mesh.get("print")]
+    if not prints:
         return []
-    facts, wall, left_out = found[0], found[0]["wall"], found[0]["left_out"]
-    which = "print    " if len(found) == 1 else "print    (first mesh) "
+    facts, wall, left_out = prints[0], prints[0]["wall"], prints[0]["left_out"]
+    which = "print    " if len(prints) == 1 else "print    (first mesh) "
     lines = [f"{which}size {' x '.join(f'{length:.1f}' for length in facts['size_mm'])} mm"]
     if wall["median_mm"] is not None:
         lines[0] += (

@@ -62,18 +62,18 @@ def _summary(truth: dict[str, Any], output: str) -> list[str]:
     if series := truth.get("series"):
         lines.append(f"series   {_series_words(series)}")
     if truth["ghosts"]:
-        said = [f"slice {one['slice']} shows {one['shows']}" for one in truth["ghosts"]["slices"]]
-        lines.append(f"ghosts   {', '.join(said)}; the last file is a localizer")
+        ghosts = [f"slice {one['slice']} shows {one['shows']}" for one in truth["ghosts"]["slices"]]
+        lines.append(f"ghosts   {', '.join(ghosts)}; the last file is a localizer")
     maps = [name for name, made in (("materials.nrrd", truth["parts"]), ("levels.nrrd", levels)) if made]
     return [*lines, f"wrote    {printable(output)}, with the truth in {' and '.join(['truth.json', *maps])}"]
 
 
 def _series_words(series: dict[str, Any]) -> str:
-    said = []
+    remarks = []
     if series["uneven_mm"]:
-        said.append(f"gaps vary by up to {series['uneven_mm']:g} mm")
+        remarks.append(f"gaps vary by up to {series['uneven_mm']:g} mm")
     if series["missing"]:
-        said.append(f"missing are slices {', '.join(map(str, series['missing']))}")
+        remarks.append(f"missing are slices {', '.join(map(str, series['missing']))}")
     if series["phases"] > 1:
-        said.append(f"{series['phases']} phases at the same places")
-    return "; ".join(said)
+        remarks.append(f"{series['phases']} phases at the same places")
+    return "; ".join(remarks)

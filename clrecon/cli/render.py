@@ -280,11 +280,11 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.render.job import path_of
 
     lines = []
-    for what, path in (("output", files.picture), ("depth_output", files.depth), ("values_output", files.values)):
+    for entry, path in (("output", files.picture), ("depth_output", files.depth), ("values_output", files.values)):
         for picture in report["pictures"]:
-            if path is not None and what in picture:
+            if path is not None and entry in picture:
                 named = path_of(path, picture["name"] or "")
-                lines.append(f"wrote    {printable(named)}, {common.megabytes(picture[what]['bytes'])}")
+                lines.append(f"wrote    {printable(named)}, {common.megabytes(picture[entry]['bytes'])}")
     if report["turntable"]:
         lines.append(
             f"wrote    {printable(files.turntable)}, {common.megabytes(report['turntable']['output']['bytes'])}"
@@ -388,8 +388,8 @@ def _describe_picture(picture: dict[str, Any]) -> str:
         shown = f", {low:.4g} to {high:.4g} mm of water"
     left_out = picture["left_out"]
     if left_out and left_out["voxels"]:
-        where = "the body or the region" if left_out["region"] else "the body"
-        shown += f", without the {100.0 * left_out['share']:.3g} % of the voxels outside of {where}"
+        region = "the body or the region" if left_out["region"] else "the body"
+        shown += f", without the {100.0 * left_out['share']:.3g} % of the voxels outside of {region}"
     if picture["tiles"]:
         many = len(picture["tiles"])
         wide, high = picture["tile_size"]

@@ -19,12 +19,12 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.proof.run import CHECKS, run_device_selftest
 
     width = max(len(check.name) for check in CHECKS)
-    said: list[dict[str, Any]] = []
+    results: list[dict[str, Any]] = []
 
     def tell(device: dict[str, Any], result: dict[str, Any]) -> None:
-        if not said:
+        if not results:
             console.say(f"device  {_name(device)}")
-        said.append(result)
+        results.append(result)
         word, seconds = "pass" if result["passed"] else "FAIL", f"{result['seconds']:.2f} s"
         console.say(f"{word}  {result['operator']:{width}}  {seconds:7}  {printable(result['detail'])}")
 

@@ -97,13 +97,13 @@ def _lay_out_surfaces(labels: Sequence[dict[str, Any]]) -> list[str]:
     fitted = of[0]["kind"] == "cortex"
     head = ["surface", "cm2", "ml", *(["walls 5 %", "50 %", "95 %", "error", "fitted"] if fitted else [])]
     rows = []
-    for one in labels:
-        area, ml, *walls, share = surface_cells(one["surface"])
+    for label in labels:
+        area, ml, *walls, share = surface_cells(label["surface"])
         cells = ["none" if area is None else f"{area / 100.0:,.1f}", "none" if ml is None else _ml(ml)]
         if fitted:
             cells += ["none" if value is None else f"{value:.2f}" for value in walls]
             cells.append("none" if share is None else f"{100.0 * share:.0f} %")
-        rows.append([printable(one["name"]), *cells])
+        rows.append([printable(label["name"]), *cells])
     kind = "moved onto the bone from" if fitted else "at"
     units = "; walls and their error in mm, share of the vertices that lie on the bone" if fitted else ""
     text = f"surface  {kind} {of[0]['iso_value_hu']:g} HU, filled{units}"
@@ -132,8 +132,8 @@ def _mean(value: float | None) -> str:
     return "none" if value is None else f"{round(value, 1) + 0.0:.1f}"
 
 
-def _hu(one: dict[str, Any], *fields: str) -> list[str]:
-    return [_number(one[field]) for field in fields]
+def _hu(entry: dict[str, Any], *fields: str) -> list[str]:
+    return [_number(entry[field]) for field in fields]
 
 
 def _number(value: float | None) -> str:

@@ -67,14 +67,14 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 def _describe(report: dict[str, Any]) -> list[str]:
     rows = [("", "number", "confidence", "height mm", "ml", "")]
-    for one in report["vertebrae"]:
-        remarks = ("" if one["is_confident"] else "low confidence ") + ("" if one["whole"] else "cut by the scan")
-        figures = f"{one['confidence']:.2f}", f"{one['height_mm']:.0f}", f"{one['volume_ml']:.1f}"
-        rows.append((one["name"], str(one["number"]), *figures, remarks.strip()))
-    found = len(report["vertebrae"])
+    for entry in report["vertebrae"]:
+        remarks = ("" if entry["is_confident"] else "low confidence ") + ("" if entry["whole"] else "cut by the scan")
+        figures = f"{entry['confidence']:.2f}", f"{entry['height_mm']:.0f}", f"{entry['volume_ml']:.1f}"
+        rows.append((entry["name"], str(entry["number"]), *figures, remarks.strip()))
+    count = len(report["vertebrae"])
     return [
         f"input    {describe_volume(report['volume'])}",
-        f"found    {found} vertebra{'e' * (found != 1)}, {report['low_confidence']} of low confidence,"
+        f"found    {count} vertebra{'e' * (count != 1)}, {report['low_confidence']} of low confidence,"
         f" {count_of(len(report['discs']), 'disc')};"
         f" bone is {report['level_hu']:.0f} HU and more",
         *(f"         {line}" for line in common.table(rows, right=(1, 2, 3, 4))),

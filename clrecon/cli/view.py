@@ -112,9 +112,9 @@ def _show(options: argparse.Namespace, console: Console) -> int:
 
     warnings: list[str] = []
 
-    def ready(said: list[str]) -> None:
-        warnings.extend(said)
-        for warning in said:
+    def ready(warned: list[str]) -> None:
+        warnings.extend(warned)
+        for warning in warned:
             console.warn(warning)
         console.finish()
 

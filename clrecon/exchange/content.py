@@ -201,8 +201,8 @@ class Assembly:
 def write_lines(stream: IO[bytes], form: str, rows: NDArray[Any]) -> None:
     """Write a line of text for each row of numbers (n, k)."""
     # One % for many lines takes two thirds of the time of one % for each line.
-    for where in chunks(len(rows), _LINES_AT_ONCE):
-        numbers = rows[where]
+    for lines in chunks(len(rows), _LINES_AT_ONCE):
+        numbers = rows[lines]
         stream.write((form * len(numbers) % tuple(numbers.ravel().tolist())).encode("ascii"))
 
 
@@ -252,15 +252,15 @@ class Writable(Protocol):
     def describe_parts(self, space: str, most: int, *, keep_ids: bool = False) -> Content: ...
 
 
-def check_same(words: str, found: object, expected: object) -> None:
+def check_same(words: str, actual: object, expected: object) -> None:
     """Refuse a finished file in which this is not as it was written."""
-    if found != expected:
-        raise refuse_file(words, found, expected)
+    if actual != expected:
+        raise refuse_file(words, actual, expected)
 
 
-def refuse_file(words: str, found: object, expected: object) -> OutputError:
+def refuse_file(words: str, actual: object, expected: object) -> OutputError:
     """Return the error for a file whose contents differ from what was written."""
     return OutputError(
-        f"the file did not arrive on the disk as it was written: {found} {words}, {expected} expected; "
+        f"the file did not arrive on the disk as it was written: {actual} {words}, {expected} expected; "
         "an older file is intact, check the disk and try again"
     )

@@ -76,13 +76,13 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
 def find_places(vertices: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the first vertex at each place, (p,), in the order of vertices, and the place of each vertex, (n,)."""
     mixed = _scramble(vertices)
-    _, first, place = np.unique(mixed, return_index=True, return_inverse=True)
-    if not np.array_equal(vertices[first][place], vertices):  # two places with one sum, or NaN
-        _, first, place = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    _, first, inverse = np.unique(mixed, return_index=True, return_inverse=True)
+    if not np.array_equal(vertices[first][inverse], vertices):  # two places with one sum, or NaN
+        _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first, kind="stable")
     number = np.empty(len(first), np.int64)
     number[order] = np.arange(len(first))
-    return first[order], number[place.reshape(-1)]
+    return first[order], number[inverse.reshape(-1)]
 
 
 def _scramble(vertices: NDArray[np.floating]) -> NDArray[np.uint64]:
@@ -106,7 +106,7 @@ def rounded_apart(vertices: NDArray[np.floating]) -> NDArray[np.float32]:
     rounded = vertices.astype(np.float32)
     if vertices.dtype == np.float32:
         return rounded
-    first, place = find_places(vertices)
+    first, inverse = find_places(vertices)
     apart = rounded[first]
     for turn in range(_MOST_STEPS_APART):
         meeting = find_coincident(apart)
@@ -116,4 +116,4 @@ def rounded_apart(vertices: NDArray[np.floating]) -> NDArray[np.float32]:
             break
         axis = (turn + np.arange(len(going))) % 3
         apart[going, axis] = np.nextafter(apart[going, axis], np.float32(np.inf))
-    return apart[place]
+    return apart[inverse]

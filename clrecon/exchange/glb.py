@@ -204,8 +204,8 @@ class _File:
         entries = self.document.get(kind, [])
         if type(number) is not int or not 0 <= number < len(entries) or not isinstance(entries[number], dict):
             raise ValueError(f"{kind} has no number {number!r:.40}")
-        found: dict[str, Any] = entries[number]
-        return found
+        item: dict[str, Any] = entries[number]
+        return item
 
     def values(self, number: Any, width: int, kinds: str) -> NDArray[Any]:
         """Return the values of an accessor, shape (count, width)."""
@@ -250,11 +250,11 @@ def _split(data: bytes, name: str) -> _File:
     document = json.loads(data[20 : 20 + text_length])
     if not isinstance(document, dict):
         raise ValueError("its JSON is no object")
-    place = 20 + text_length
-    size = int.from_bytes(data[place : place + 4], "little")
-    if len(data) > place and (data[place + 4 : place + 8] != b"BIN\0" or place + 8 + size > len(data)):
+    start = 20 + text_length
+    size = int.from_bytes(data[start : start + 4], "little")
+    if len(data) > start and (data[start + 4 : start + 8] != b"BIN\0" or start + 8 + size > len(data)):
         raise ValueError("its second chunk is no binary data of its length")
-    return _File(document, data[place + 8 : place + 8 + size])
+    return _File(document, data[start + 8 : start + 8 + size])
 
 
 def _collect(file: _File, name: str) -> RawMesh:
@@ -350,11 +350,11 @@ def _joined(shape: Shape) -> Shape:
     if (shape.triangles >= len(shape.vertices)).any():
         raise ValueError(f"a triangle refers to vertex {int(shape.triangles.max()):,} of {len(shape.vertices):,}")
     used = np.unique(shape.triangles)
-    first, place = find_places(shape.vertices[used])
+    first, inverse = find_places(shape.vertices[used])
     number = np.zeros(len(shape.vertices), np.int64)
-    number[used] = place
+    number[used] = inverse
     normals = None if shape.normals is None else shape.normals[used]
-    if normals is not None and np.array_equal(normals[first][place], normals):
+    if normals is not None and np.array_equal(normals[first][inverse], normals):
         return Shape(shape.vertices[used][first], number[shape.triangles], normals[first])
     return Shape(shape.vertices[used][first], number[shape.triangles])
 

@@ -41,14 +41,14 @@ def import_laspy() -> Any:
 
 
 def _extra(content: PointContent) -> dict[str, tuple[str, Any]]:
-    found: dict[str, tuple[str, Any]] = {}
+    columns: dict[str, tuple[str, Any]] = {}
     if content.hu is not None:
-        found["HU"] = ("float32", content.hu)
+        columns["HU"] = ("float32", content.hu)
     if content.labels is not None:
-        found["label"] = ("int32", content.labels)
+        columns["label"] = ("int32", content.labels)
     if content.normals is not None:
-        found |= {name: ("float32", content.normals[:, axis]) for axis, name in enumerate(("nx", "ny", "nz"))}
-    return found
+        columns |= {name: ("float32", content.normals[:, axis]) for axis, name in enumerate(("nx", "ny", "nz"))}
+    return columns
 
 
 def estimate(content: PointContent) -> int:

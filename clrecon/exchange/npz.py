@@ -75,13 +75,13 @@ def verify(path: Path, content: PointContent) -> None:
     try:
         with zipfile.ZipFile(path) as archive:
             broken = archive.testzip()
-            found = {Path(name).stem: _open_array(archive, name) for name in archive.namelist()}
+            arrays = {Path(name).stem: _open_array(archive, name) for name in archive.namelist()}
     except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError) as error:
         raise refuse_file("in the archive", escape_text(str(error)), "a whole archive") from error
     if broken is not None:
         raise refuse_file("in the archive", escape_text(broken), "whole entries")
     forms = {name: (values.shape, values.dtype) for name, values in expected.items()}
-    check_same("in the archive", found, forms)
+    check_same("in the archive", arrays, forms)
 
 
 def _open_array(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -106,15 +106,15 @@ def read_cloud(path: Path) -> RawCloud:
                 raise RefusedInputError(
                     f"{name} is an archive without points: an entry {', '.join(_POINTS)} of shape (n, 3) is needed"
                 )
-            found = {"points": _read_array(archive, entries[points])}
+            arrays = {"points": _read_array(archive, entries[points])}
             for entry in ("normals", "hu", "labels", "ijk", "space", "affine", "iso_value_hu", "certificate"):
                 if entry in entries:
-                    found[entry] = _read_array(archive, entries[entry])
+                    arrays[entry] = _read_array(archive, entries[entry])
     except (
         zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, NotImplementedError, RuntimeError, MemoryError,
     ) as error:  # fmt: skip
         raise say_cut(name, error) from error
-    return _describe(name, found)
+    return _describe(name, arrays)
 
 
 def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
@@ -126,8 +126,8 @@ def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]
         return np.asarray(np.lib.format.read_array(entry, allow_pickle=False))
 
 
-def _describe(name: str, found: dict[str, NDArray[Any]]) -> RawCloud:
-    points = found["points"]
+def _describe(name: str, arrays: dict[str, NDArray[Any]]) -> RawCloud:
+    points = arrays["points"]
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
         raise RefusedInputError(f"{name} has points of shape {points.shape} and type {points.dtype}: (n, 3) is needed")
     n = len(points)
@@ -139,15 +139,15 @@ def _describe(name: str, found: dict[str, NDArray[Any]]) -> RawCloud:
         ("hu", "(n,)", ("hu",)),
         ("labels", "(n,)", ("labels",)),
     ):
-        values = found.get(entry)
+        values = arrays.get(entry)
         if values is None:
             continue
         if values.shape == ((n,) if len(names) == 1 else (n, 3)) and values.dtype.kind in "fiu":
             columns |= columns_of(values.reshape(n, len(names)), names)
         else:
             warnings.append(f"{entry} of shape {values.shape} and type {values.dtype} are left out: {shape} is needed")
-    space, affine, iso_value = found.get("space"), found.get("affine"), found.get("iso_value_hu")
-    certificate = found.get("certificate")
+    space, affine, iso_value = arrays.get("space"), arrays.get("affine"), arrays.get("iso_value_hu")
+    certificate = arrays.get("certificate")
     is_text = certificate is not None and certificate.dtype.kind == "U" and certificate.nbytes <= _SMALL
     return RawCloud(
         "NPZ",

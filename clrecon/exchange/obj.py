@@ -76,8 +76,8 @@ def _write_part(stream: BinaryIO, part: Content, before: int, normals_before: in
     if part.normals is not None:
         face = "f %d//%d %d//%d %d//%d\n"
         write_lines(stream, "vn %.6f %.6f %.6f\n", part.normals)
-    for where in chunks(len(part.triangles), _CHUNK):
-        corners = part.triangles[where].astype(np.int64) + before
+    for piece in chunks(len(part.triangles), _CHUNK):
+        corners = part.triangles[piece].astype(np.int64) + before
         if part.normals is not None:
             corners = np.stack((corners, corners - before + normals_before), axis=2)
         write_lines(stream, face, corners)
@@ -154,8 +154,8 @@ def _collect(lines: Sequence[bytes], name: str) -> RawMesh:
     if table.shape[1] not in (3, 4, 6, 7):
         raise RefusedInputError(f"{name} is corrupt: its vertices have {table.shape[1]} numbers")
     corners, of_normals = _corners(faces, before, len(table), name)
-    said = read_remarks(comments)
-    mesh = RawMesh("OBJ", table[:, :3], corners, **said)
+    remarks = read_remarks(comments)
+    mesh = RawMesh("OBJ", table[:, :3], corners, **remarks)
     mesh.normals = _normals(normals, corners, of_normals, mesh, name)
     colors = table[:, -3:] if table.shape[1] >= 6 else None
     mesh.parts = _parts(begins[b"o"] or begins[b"g"], corners, colors)
@@ -246,8 +246,8 @@ def _one_color(corners: NDArray[np.int64], colors: NDArray[np.float64] | None) -
     """Return the colour that all these corners have."""
     if colors is None or not _are_within(corners, len(colors)):
         return None
-    found = colors[corners.ravel()]
-    if not ((found == found[0]).all() and ((found[0] >= 0.0) & (found[0] <= 1.0)).all()):
+    rows = colors[corners.ravel()]
+    if not ((rows == rows[0]).all() and ((rows[0] >= 0.0) & (rows[0] <= 1.0)).all()):
         return None
-    red, green, blue = found[0].tolist()
+    red, green, blue = rows[0].tolist()
     return red, green, blue

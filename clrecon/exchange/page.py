@@ -154,8 +154,8 @@ _BLOCK = re.compile(r'<script id="(facts|surface)" type="[a-z/]+">([^<]*)</scrip
 
 
 def estimate(content: Content | Assembly) -> int:
-    own = len(read_page_code("page.html")) + len(read_page_code("page.css")) + len(_script())
-    return own + int(_LEAST_BYTES_A_TRIANGLE * sum(len(part.triangles) for part in parts_of(content)))
+    code_bytes = len(read_page_code("page.html")) + len(read_page_code("page.css")) + len(_script())
+    return code_bytes + int(_LEAST_BYTES_A_TRIANGLE * sum(len(part.triangles) for part in parts_of(content)))
 
 
 def write(stream: BinaryIO, content: Content | Assembly) -> None:
@@ -231,9 +231,9 @@ def _join_parts(meshes: Sequence[Content]) -> tuple[CodedSurface, list[dict[str,
         assert mesh.normals is not None
         vertices.append(mesh.vertices @ mesh.to_lps.T)
         normals.append(mesh.normals @ mesh.to_lps.T.astype(np.float32))
-        own = mesh.triangles.astype(np.int64) + before
+        corners = mesh.triangles.astype(np.int64) + before
         pieces = mesh.pieces
-        triangles.append(own if pieces is None else own[np.argsort(pieces.of_triangle, kind="stable")])
+        triangles.append(corners if pieces is None else corners[np.argsort(pieces.of_triangle, kind="stable")])
         before += len(mesh.vertices)
         for name, count, ml in _pieces(mesh):
             named = " ".join(filter(None, (mesh.name or (f"surface {number}" if len(meshes) > 1 else ""), name)))

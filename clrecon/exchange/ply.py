@@ -114,10 +114,10 @@ def write(stream: BinaryIO, content: PointContent) -> None:
 
 def _write_rows(stream: BinaryIO, rows: NDArray[Any], columns: Mapping[str, NDArray[Any]], count: int) -> None:
     """Write `count` rows of columns by way of `rows`, which hold those of a chunk."""
-    for where in chunks(count, _CHUNK):
-        piece = rows[: where.stop - where.start]
+    for lines in chunks(count, _CHUNK):
+        piece = rows[: lines.stop - lines.start]
         for name, values in columns.items():
-            piece[name] = values[where]
+            piece[name] = values[lines]
         stream.write(piece.view(np.uint8).data)
 
 
@@ -173,16 +173,16 @@ def read_cloud(path: Path) -> RawCloud:
             header = read_header(stream, name)
             vertex = skip_to_vertices(stream, header, name)
             if header.order:
-                found = read_binary(stream, header, vertex, name, path.stat().st_size)
+                columns = read_binary(stream, header, vertex, name, path.stat().st_size)
             else:
-                found = read_text(stream, vertex, name, path.stat().st_size)
+                columns = read_text(stream, vertex, name, path.stat().st_size)
     except (OSError, ValueError, OverflowError, MemoryError) as error:
         raise say_cut(name, error) from error
     others = [f"{each.count:,} of '{escape_text(each.name)}'" for each in header.elements if each.name != "vertex"]
     return RawCloud(
         "PLY",
-        np.stack([found.pop(axis) for axis in ("x", "y", "z")], axis=1),
-        found,
+        np.stack([columns.pop(axis) for axis in ("x", "y", "z")], axis=1),
+        columns,
         warnings=[f"elements left out: {', '.join(others)}"] if others else [],
         **read_remarks(header.comments),
     )
@@ -264,8 +264,8 @@ def read_binary(
     columns = {own: np.empty(vertex.count, kind) for own, kind in vertex.types.items()}
     for start in range(0, vertex.count, _PIECE):
         rows = np.frombuffer(stream.read(row.itemsize * min(_PIECE, vertex.count - start)), dtype=row)
-        for own, values in columns.items():
-            values[start : start + len(rows)] = rows[own]
+        for column, values in columns.items():
+            values[start : start + len(rows)] = rows[column]
     return columns
 
 
@@ -298,23 +298,23 @@ def read_mesh(path: Path) -> RawMesh:
             face = _find_faces(header, vertex, name)
             size = path.stat().st_size
             if header.order:
-                found = read_binary(stream, header, vertex, name, size)
+                columns = read_binary(stream, header, vertex, name, size)
                 triangles, at_faces = _read_faces(stream, header, face, name, size)
             else:
                 text = stream.read()
-                found = read_text(io.BytesIO(text), vertex, name, size)
+                columns = read_text(io.BytesIO(text), vertex, name, size)
                 triangles, at_faces = _read_lines(io.BytesIO(text), vertex, face, name)
     except (OSError, ValueError, OverflowError, MemoryError) as error:
         raise say_cut(name, error) from error
-    points = np.stack([found.pop(axis) for axis in ("x", "y", "z")], axis=1)
-    cloud = RawCloud("PLY", points, found)
+    points = np.stack([columns.pop(axis) for axis in ("x", "y", "z")], axis=1)
+    cloud = RawCloud("PLY", points, columns)
     normals = cloud.normals()
     remarks = read_remarks(header.comments)
-    color = _one_color(found)
+    color = _one_color(columns)
     parts = [] if color is None else [Part("", len(triangles), color)]
     values, face_values = (
         numbers_of({own[7:]: column for own, column in each.items() if own.startswith("scalar_")})
-        for each in (found, at_faces)
+        for each in (columns, at_faces)
     )
     others = [own for own in face.types if not own.startswith("scalar_")]
     warnings = [f"numbers at faces left out: {escape_text(', '.join(others))}"] if others else []
@@ -325,17 +325,17 @@ def read_mesh(path: Path) -> RawMesh:
 
 
 def _one_color(columns: Mapping[str, NDArray[Any]]) -> tuple[float, float, float] | None:
-    own = [columns.get(name) for name in ("red", "green", "blue")]
+    rgb = [columns.get(name) for name in ("red", "green", "blue")]
     values = [
-        each[0] / 255.0 for each in own if each is not None and each.dtype == np.uint8 and len(np.unique(each)) == 1
+        each[0] / 255.0 for each in rgb if each is not None and each.dtype == np.uint8 and len(np.unique(each)) == 1
     ]
     return (float(values[0]), float(values[1]), float(values[2])) if len(values) == 3 else None
 
 
 def _find_faces(header: Header, vertex: Element, name: str) -> Element:
     """Return the element of the faces, which has to follow that of the vertices."""
-    place = header.elements.index(vertex) + 1
-    face = header.elements[place] if place < len(header.elements) else None
+    position = header.elements.index(vertex) + 1
+    face = header.elements[position] if position < len(header.elements) else None
     if face is None or face.name != "face":
         raise RefusedInputError(f"{name} has no faces after its vertices: it is no mesh, perhaps a cloud of points")
     if len(face.lists) != 1 or not set(face.lists) <= set(_CORNERS):
@@ -375,9 +375,9 @@ def _read_lines(text: BinaryIO, vertex: Element, face: Element, name: str) -> Fa
 
 
 def _face_row(face: Element, count: str, corner: str, numbers: Mapping[str, str], order: str = "") -> np.dtype[Any]:
-    own = [(f"own {name}", order + kind) for name, kind in numbers.items()]
+    leading = [(f"own {name}", order + kind) for name, kind in numbers.items()]
     corners = [("count", order + count), ("corners", order + corner, (3,))]
-    return np.dtype([*own[: face.leading], *corners, *own[face.leading :]])
+    return np.dtype([*leading[: face.leading], *corners, *leading[face.leading :]])
 
 
 def _take_faces(rows: NDArray[Any], face: Element, name: str) -> Faces:

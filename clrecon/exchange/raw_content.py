@@ -40,19 +40,19 @@ class RawCloud:
 
     def _take(self, names: Iterable[str]) -> list[NDArray[Any]] | None:
         """Return the columns of these names, or None unless all are there."""
-        own = [self._by_name.get(name) for name in names]
-        if None in own:
+        columns = [self._by_name.get(name) for name in names]
+        if None in columns:
             return None
-        self._used |= set(own)  # type: ignore[arg-type]
-        return [self.columns[name] for name in own if name is not None]
+        self._used |= set(columns)  # type: ignore[arg-type]
+        return [self.columns[name] for name in columns if name is not None]
 
     def normals(self) -> NDArray[np.float32] | None:
         """Return unit normals, shape (n, 3), or None where the file has none that can be used."""
-        found = next((columns for names in _NORMAL_NAMES if (columns := self._take(names))), None)
-        if found is None:
+        three_columns = next((columns for names in _NORMAL_NAMES if (columns := self._take(names))), None)
+        if three_columns is None:
             return None
         with np.errstate(all="ignore"):  # harmed bits
-            normals = np.stack(found, axis=1).astype(np.float64)
+            normals = np.stack(three_columns, axis=1).astype(np.float64)
         wrong = int((~np.isfinite(normals).all(axis=1)).sum())
         if wrong:
             self.warnings.append(f"{wrong:,} normals are not finite: the normals are left out")
@@ -68,21 +68,21 @@ class RawCloud:
 
     def hu(self) -> NDArray[np.float32] | None:
         """Return the HU, shape (n,), or None."""
-        for place, name in enumerate(_HU_NAMES):
-            found = self._take([name])
-            if found is not None:
-                if place >= _HU_NAMES.index("scalar"):
+        for rank, name in enumerate(_HU_NAMES):
+            columns = self._take([name])
+            if columns is not None:
+                if rank >= _HU_NAMES.index("scalar"):
                     self.warnings.append(f"HU is taken from the column '{escape_text(self._by_name[name])}'")
                 with np.errstate(all="ignore"):
-                    return found[0].astype(np.float32)
+                    return columns[0].astype(np.float32)
         return None
 
     def labels(self) -> NDArray[np.int32] | None:
         """Return the labels, shape (n,), or None where there are none or they are no whole numbers of 32 bits."""
         for name in _LABEL_NAMES:
-            found = self._take([name])
-            if found is not None:
-                values = found[0]
+            columns = self._take([name])
+            if columns is not None:
+                values = columns[0]
                 whole = np.isfinite(values) & (np.abs(values.astype(np.float64)) < 2**31)
                 if not (whole.all() and (values == np.rint(values)).all()):
                     self.warnings.append(
@@ -94,8 +94,8 @@ class RawCloud:
 
     def ijk(self) -> NDArray[np.int32] | None:
         """Return voxel indices, shape (n, 3), or None; only our own NPZ has them."""
-        found = self._take(("i", "j", "k")) if self.kind == "NPZ" else None
-        return None if found is None else np.stack(found, axis=1).astype(np.int32)
+        columns = self._take(("i", "j", "k")) if self.kind == "NPZ" else None
+        return None if columns is None else np.stack(columns, axis=1).astype(np.int32)
 
     def unused(self) -> list[str]:
         """Return the warning about columns that were not taken, if there are any."""
@@ -121,31 +121,31 @@ def numbers_of(columns: Mapping[str, Any]) -> dict[str, NDArray[np.float32]]:
 
 def read_remarks(lines: Iterable[str]) -> dict[str, Any]:
     """Return what comments say: ``space``, ``iso_value_hu`` and ``certificate``, as entries of a `RawCloud`."""
-    found: dict[str, Any] = {"certificate": []}
+    remarks: dict[str, Any] = {"certificate": []}
     for line in lines:
         text = line.strip()
-        if text.startswith("SPACE=") and "space" not in found:
-            found["space"] = text.removeprefix("SPACE=").strip()
+        if text.startswith("SPACE=") and "space" not in remarks:
+            remarks["space"] = text.removeprefix("SPACE=").strip()
         elif text.startswith("ISO_VALUE_HU="):
             try:
-                found["iso_value_hu"] = float(text.removeprefix("ISO_VALUE_HU="))
+                remarks["iso_value_hu"] = float(text.removeprefix("ISO_VALUE_HU="))
             except ValueError:
                 continue
         elif text.startswith("CERTIFICATE "):
-            found["certificate"].append(text.removeprefix("CERTIFICATE "))
-    return found
+            remarks["certificate"].append(text.removeprefix("CERTIFICATE "))
+    return remarks
 
 
 def say_cut(name: str, error: object) -> RefusedInputError:
     """Return the error for a file that ends early or holds what its format forbids; numpy's of tables in our words."""
-    said = str(error) or type(error).__name__
-    if found := _COLUMNS.match(said):
-        before, now, row = found.groups()
-        said = f"row {row} of its table has {now} numbers, those before have {before}"
-    elif found := _NO_NUMBER.match(said):
-        word, row, column = found.groups()
-        said = f"{word} stands in place of a number in row {int(row) + 1} of its table, column {column}"
-    return RefusedInputError(f"{name} is cut or corrupt: {escape_text(said, 120)}")
+    text = str(error) or type(error).__name__
+    if match := _COLUMNS.match(text):
+        before, now, row = match.groups()
+        text = f"row {row} of its table has {now} numbers, those before have {before}"
+    elif match := _NO_NUMBER.match(text):
+        word, row, column = match.groups()
+        text = f"{word} stands in place of a number in row {int(row) + 1} of its table, column {column}"
+    return RefusedInputError(f"{name} is cut or corrupt: {escape_text(text, 120)}")
 
 
 _COLUMNS = re.compile(r"the number of columns changed from (\d+) to (\d+) at row (\d+)")

@@ -73,8 +73,8 @@ def _pack_facets(coordinates: list[NDArray[np.float32]], triangles: NDArray[np.u
     length[length == 0.0] = 1.0
     zero = np.float32(0)
     packed = bytearray(_FACET_BYTES * len(triangles))
-    for place, column in enumerate([*(part / length + zero for part in normal), *a, *b, *c]):  # + 0 turns -0 into 0
-        np.ndarray(len(triangles), "<f4", packed, 4 * place, (_FACET_BYTES,))[:] = column
+    for position, column in enumerate([*(part / length + zero for part in normal), *a, *b, *c]):  # + 0 turns -0 into 0
+        np.ndarray(len(triangles), "<f4", packed, 4 * position, (_FACET_BYTES,))[:] = column
     return packed
 
 
@@ -110,8 +110,8 @@ def read_mesh(path: Path) -> RawMesh:
                 for start in range(0, count, _PIECE):
                     rows = np.frombuffer(stream.read(_FACET.itemsize * min(_PIECE, count - start)), dtype=_FACET)
                     corners[start : start + len(rows)] = rows["corners"]
-                said = re.search(rb"SPACE=(\w+)", head[:80])
-                return _make(corners, said)
+                space = re.search(rb"SPACE=(\w+)", head[:80])
+                return _make(corners, space)
             if head.removeprefix(MARK).lstrip()[:5].lower() != b"solid":
                 raise RefusedInputError(
                     f"{name} is cut or corrupt: {count:,} triangles take {_HEAD + _FACET.itemsize * count:,} bytes, it"
@@ -120,22 +120,22 @@ def read_mesh(path: Path) -> RawMesh:
             text = plain_lines(head + stream.read())
     except (OSError, ValueError, OverflowError, MemoryError) as error:
         raise say_cut(name, error) from error
-    found = _VERTEX.findall(text)
-    if len(found) % 3 or len(found) != 3 * len(_END.findall(text)):
-        raise RefusedInputError(f"{name} is cut or corrupt: {len(found):,} vertices are not those of whole facets")
+    hits = _VERTEX.findall(text)
+    if len(hits) % 3 or len(hits) != 3 * len(_END.findall(text)):
+        raise RefusedInputError(f"{name} is cut or corrupt: {len(hits):,} vertices are not those of whole facets")
     try:
-        numbers = np.array(found, dtype="S40").astype(np.float64).reshape(-1, 3, 3)
+        numbers = np.array(hits, dtype="S40").astype(np.float64).reshape(-1, 3, 3)
     except ValueError as error:
         raise say_cut(name, error) from error
     return _make(numbers, re.search(rb"SPACE=(\w+)", text[:1024]))
 
 
-def _make(corners: NDArray[np.floating], said: re.Match[bytes] | None) -> RawMesh:
+def _make(corners: NDArray[np.floating], space: re.Match[bytes] | None) -> RawMesh:
     vertices, triangles = join_corners(corners.reshape(-1, 3))
-    return RawMesh("STL", vertices, triangles, space=None if said is None else said[1].decode("ascii", "replace"))
+    return RawMesh("STL", vertices, triangles, space=None if space is None else space[1].decode("ascii", "replace"))
 
 
 def join_corners(corners: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
     """Join corners (3 m, 3) that coincide; vertices stand in the order in which they occur first."""
-    first, place = find_places(corners)
-    return corners[first], place.reshape(-1, 3)
+    first, inverse = find_places(corners)
+    return corners[first], inverse.reshape(-1, 3)

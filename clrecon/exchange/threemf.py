@@ -206,9 +206,9 @@ def read_mesh(path: Path) -> RawMesh:
         raise say_cut(name, error) from error
     mesh = shapes.joined()
     lines = model.description.split("\n")
-    said = read_remarks([*re.findall(r"\b(?:SPACE|ISO_VALUE_HU)=\S+", lines[0]), *lines[1:]])
+    remarks = read_remarks([*re.findall(r"\b(?:SPACE|ISO_VALUE_HU)=\S+", lines[0]), *lines[1:]])
     return RawMesh(
-        "3MF", mesh.vertices, mesh.triangles, unit=_UNITS.get(model.unit, model.unit), parts=shapes.parts, **said
+        "3MF", mesh.vertices, mesh.triangles, unit=_UNITS.get(model.unit, model.unit), parts=shapes.parts, **remarks
     )
 
 
@@ -280,8 +280,8 @@ def _read_model(package: zipfile.ZipFile, entry: str, name: str) -> _Model:
         elif kind in ("component", "item"):
             if any(attribute.endswith(" path") for attribute in attributes):
                 raise RefusedInputError(f"{name} has objects in further files of its package: they are not read")
-            place = int(attributes["objectid"]), _transform(attributes.get("transform"))
-            (own.components if kind == "component" else model.items).append(place)
+            component = int(attributes["objectid"]), _transform(attributes.get("transform"))
+            (own.components if kind == "component" else model.items).append(component)
         elif kind == "basematerials":
             group = model.colors.setdefault(int(attributes["id"]), [])
         elif kind == "base":
@@ -312,9 +312,9 @@ def _begin_object(model: _Model, attributes: dict[str, str]) -> _Object:
         raise ValueError(f"object {number} is there twice")
     colors = model.colors.get(int(attributes.get("pid", -1)), [])
     which = int(attributes.get("pindex", 0))
-    own = _Object(attributes.get("name", ""), colors[which] if 0 <= which < len(colors) else None)
-    model.objects[number] = own
-    return own
+    shape = _Object(attributes.get("name", ""), colors[which] if 0 <= which < len(colors) else None)
+    model.objects[number] = shape
+    return shape
 
 
 def _color(text: str) -> tuple[float, float, float]:
@@ -340,16 +340,16 @@ def _place(model: _Model) -> PlacedShapes:
     scale = np.diag([_MM[model.unit]] * 3 + [1.0])
 
     def add(number: int, matrix: NDArray[np.float64], name: str, level: int) -> None:
-        own = model.objects.get(number)
-        if own is None or level > MOST_LEVELS:
-            raise ValueError(f"object {number} is not there" if own is None else "objects within themselves")
-        name = own.name or name
-        if own.triangles:
-            vertices = np.frombuffer(own.vertices, np.float64).reshape(-1, 3)
-            triangles = np.frombuffer(own.triangles, np.int64).reshape(-1, 3)
-            shapes.add(Shape(vertices, triangles), matrix, Part(name, len(triangles), own.color))
+        shape = model.objects.get(number)
+        if shape is None or level > MOST_LEVELS:
+            raise ValueError(f"object {number} is not there" if shape is None else "objects within themselves")
+        name = shape.name or name
+        if shape.triangles:
+            vertices = np.frombuffer(shape.vertices, np.float64).reshape(-1, 3)
+            triangles = np.frombuffer(shape.triangles, np.int64).reshape(-1, 3)
+            shapes.add(Shape(vertices, triangles), matrix, Part(name, len(triangles), shape.color))
         shapes.count_step()
-        for child, placed in own.components:
+        for child, placed in shape.components:
             add(child, matrix @ placed, name, level + 1)
 
     for number, matrix in model.items:

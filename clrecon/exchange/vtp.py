@@ -113,13 +113,13 @@ def unwrap_cloud(polydata: Any) -> tuple[dict[str, NDArray[Any] | None], str | N
     """Arrays of a ``pyvista.PolyData`` by their names in a cloud, and the frame that it names."""
     import pyvista
 
-    found = pyvista.wrap(polydata) if hasattr(polydata, "GetPolys") else polydata
-    if not isinstance(found, pyvista.PolyData):
+    wrapped = pyvista.wrap(polydata) if hasattr(polydata, "GetPolys") else polydata
+    if not isinstance(wrapped, pyvista.PolyData):
         raise UsageError(f"a {type(polydata).__name__} is no pyvista.PolyData")
-    arrays: dict[str, NDArray[Any] | None] = {"points": np.array(found.points)}
+    arrays: dict[str, NDArray[Any] | None] = {"points": np.array(wrapped.points)}
     for name, theirs in {"normals": "Normals", "hu": "HU", "labels": "label"}.items():
-        arrays[name] = np.array(found.point_data[theirs]) if theirs in found.point_data else None
-    named = found.field_data["SPACE"][0] if "SPACE" in found.field_data else None
+        arrays[name] = np.array(wrapped.point_data[theirs]) if theirs in wrapped.point_data else None
+    named = wrapped.field_data["SPACE"][0] if "SPACE" in wrapped.field_data else None
     return arrays, None if named is None else str(named)
 
 
@@ -173,14 +173,14 @@ def write(stream: BinaryIO, content: PointContent | Assembly) -> None:
     ends = np.arange(corners.shape[1], corners.size + 1, corners.shape[1])
     cells = {"Verts": 0, "Lines": 0, "Strips": 0, "Polys": 0} | {"Verts" if faces is None else "Polys": len(corners)}
     counts = {f"NumberOf{kind}": str(count) for kind, count in {"Points": len(content.vertices), **cells}.items()}
-    own = {"Normals": content.normals, "HU": content.hu, "label": content.labels}
+    point_arrays = {"Normals": content.normals, "HU": content.hu, "label": content.labels}
     active = {"Scalars": "HU", "Normals": "Normals"}
     of_faces = content.face_values if isinstance(content, Content) else {}
     sections: list[tuple[str, dict[str, str], dict[str, Any]]] = [
         (
             "PointData",
-            {kind: name for kind, name in active.items() if own[name] is not None},
-            {**own, **content.values},
+            {kind: name for kind, name in active.items() if point_arrays[name] is not None},
+            {**point_arrays, **content.values},
         ),
         ("CellData", {}, {**of_faces, **_numbers_of_parts(parts)}),
         ("Points", {}, {"Points": content.vertices}),
@@ -214,17 +214,17 @@ def _append(
 ) -> None:
     """Name an array in the XML, with its place after it; `is_row`: its texts or its numbers, those of one row."""
     offset = str(sum(8 + block.nbytes for block in blocks))
-    told = {"Name": name, "format": "appended", "offset": offset}
+    attributes = {"Name": name, "format": "appended", "offset": offset}
     if is_row and isinstance(values[0], str):
         block = np.frombuffer(b"".join(text.encode() + b"\0" for text in values), np.uint8)
-        ElementTree.SubElement(parent, "Array", {"type": "String", "NumberOfTuples": str(len(values)), **told})
+        ElementTree.SubElement(parent, "Array", {"type": "String", "NumberOfTuples": str(len(values)), **attributes})
     else:
         numbers = np.asarray(values)
         block = np.ascontiguousarray(numbers, numbers.dtype.newbyteorder("<"))
         kind = {"i": "Int", "u": "UInt", "f": "Float"}[numbers.dtype.kind] + str(8 * numbers.itemsize)
         width = numbers.size if is_row else math.prod(numbers.shape[1:])
-        told |= {"type": kind, "NumberOfComponents": str(width)} | ({"NumberOfTuples": "1"} if is_row else {})
-        ElementTree.SubElement(parent, "DataArray", told)
+        attributes |= {"type": kind, "NumberOfComponents": str(width)} | ({"NumberOfTuples": "1"} if is_row else {})
+        ElementTree.SubElement(parent, "DataArray", attributes)
     blocks.append(block)
 
 
@@ -375,21 +375,21 @@ def _collect_points(document: Document, name: str) -> RawCloud:
 def _named(pieces: Sequence[dict[str, NDArray[Any]]], normals: str | None) -> dict[str, NDArray[Any]]:
     """Join the arrays that all pieces have; one of several components becomes as many columns."""
     columns: dict[str, NDArray[Any]] = {}
-    for own, values in _common(pieces).items():
+    for name, values in _common(pieces).items():
         width = values.shape[1]
         if width == 1:
-            columns[own] = values[:, 0]
-        elif width == 3 and own == (normals or "Normals"):
+            columns[name] = values[:, 0]
+        elif width == 3 and name == (normals or "Normals"):
             columns |= columns_of(values, ("nx", "ny", "nz"))
         else:
-            columns |= columns_of(values, [f"{own}:{place}" for place in range(width)])
+            columns |= columns_of(values, [f"{name}:{place}" for place in range(width)])
     return columns
 
 
-def _arrays(document: Document, piece: ElementTree.Element, what: str, count: int) -> dict[str, NDArray[Any]]:
+def _arrays(document: Document, piece: ElementTree.Element, kind: str, count: int) -> dict[str, NDArray[Any]]:
     """Return the arrays of numbers at the points or cells of a piece, (count, components) each."""
-    found = [array for array in piece.iterfind(f"{what}/DataArray") if array.get("type") in _TYPES]
-    return {array.get("Name", ""): read_numbers(document, array, count) for array in found}
+    elements = [array for array in piece.iterfind(f"{kind}/DataArray") if array.get("type") in _TYPES]
+    return {array.get("Name", ""): read_numbers(document, array, count) for array in elements}
 
 
 def read_fields(document: Document) -> tuple[dict[str, tuple[str, ...]], dict[str, NDArray[Any]]]:
@@ -397,13 +397,13 @@ def read_fields(document: Document) -> tuple[dict[str, tuple[str, ...]], dict[st
     texts: dict[str, tuple[str, ...]] = {}
     numbers: dict[str, NDArray[Any]] = {}
     for array in document.root.iterfind("PolyData/FieldData/*"):
-        own = array.get("Name", "")
+        name = array.get("Name", "")
         count = read_count(array, "NumberOfTuples")
         if array.get("type") == "String":
             data = _bytes(document, array)[:_LONGEST_TEXT]
-            texts[own] = tuple(text.decode("utf-8", "replace") for text in data.split(b"\0")[:count])
+            texts[name] = tuple(text.decode("utf-8", "replace") for text in data.split(b"\0")[:count])
         elif array.get("type") in _TYPES:
-            numbers[own] = read_numbers(document, array, count).ravel()
+            numbers[name] = read_numbers(document, array, count).ravel()
     return texts, numbers
 
 

@@ -47,10 +47,10 @@ def write(stream: BinaryIO, content: PointContent) -> None:
     """Write the head and the points: nine digits, enough to get back the same float32, and fifteen far away."""
     stream.write(_header(content))
     form = " ".join([content.number] * 3 + ["%.9g"] * (content.hu is not None)) + "\n"
-    for where in chunks(len(content.vertices), _CHUNK):
-        rows = content.vertices[where]
+    for lines in chunks(len(content.vertices), _CHUNK):
+        rows = content.vertices[lines]
         if content.hu is not None:
-            rows = np.column_stack([rows, content.hu[where]])
+            rows = np.column_stack([rows, content.hu[lines]])
         write_lines(stream, form, rows)
 
 

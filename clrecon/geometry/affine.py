@@ -164,15 +164,17 @@ def lps_affine_from_ras(affine: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(np.diag((-1.0, -1.0, 1.0, 1.0)) @ np.asarray(affine, dtype=np.float64), dtype=np.float64)
 
 
-def choose_space(asked: str | None, named: object, what: str) -> str:
+def choose_space(asked: str | None, named: object, title: str) -> str:
     """Return ``LPS`` or ``RAS``, the frame of what another library holds: as `asked`, as `named` there, or LPS."""
     if asked is not None:
         frame_from_lps(asked)
     if named is None:
         return "LPS" if asked is None else asked.upper()
-    told = str(named).upper()
-    if told.lower() not in SPACES:
-        raise UsageError(f"{what} names the frame {str(named)[:40]!r}: {' or '.join(SPACES)} are known")
-    if asked is not None and asked.upper() != told:
-        raise UsageError(f"{what} says that its coordinates are {told}, {asked.upper()} was asked for: leave space out")
-    return told
+    frame = str(named).upper()
+    if frame.lower() not in SPACES:
+        raise UsageError(f"{title} names the frame {str(named)[:40]!r}: {' or '.join(SPACES)} are known")
+    if asked is not None and asked.upper() != frame:
+        raise UsageError(
+            f"{title} says that its coordinates are {frame}, {asked.upper()} was asked for: leave space out"
+        )
+    return frame

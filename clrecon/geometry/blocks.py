@@ -54,12 +54,12 @@ def find_block(grid: Grid, origins: Float64Array, low: ArrayLike, high: ArrayLik
         ends = (low[a] - start) / step, (high[a] - start) / step
         first = np.maximum(first, np.ceil(np.minimum(*ends)))
         last = np.minimum(last, np.floor(np.maximum(*ends)))
-    held = first <= last
-    if not held.any():
+    is_inside = first <= last
+    if not is_inside.any():
         return None
-    slices, rows = np.flatnonzero(held.any(axis=1)), np.flatnonzero(held.any(axis=0))
-    begins = first[held].min(), rows[0], slices[0]
-    ends_at = last[held].max(), rows[-1], slices[-1]
+    slices, rows = np.flatnonzero(is_inside.any(axis=1)), np.flatnonzero(is_inside.any(axis=0))
+    begins = first[is_inside].min(), rows[0], slices[0]
+    ends_at = last[is_inside].max(), rows[-1], slices[-1]
     i0, j0, k0 = (max(0, int(one) - margin) for one in begins)
     i1, j1, k1 = (min(n, int(one) + 1 + margin) for one, n in zip(ends_at, (ni, nj, nk), strict=True))
     return Block((i0, j0, k0), (i1, j1, k1))
@@ -111,10 +111,10 @@ def facts_of_place(report: Mapping[str, Any], volume: Any) -> dict[str, Any]:
     return {name: value for name, value in entries.items() if name in report}
 
 
-def take_report(made: BaseVolume, volume: BaseVolume, said: str, **facts: Any) -> None:
+def take_report(changed: BaseVolume, volume: BaseVolume, warning: str, **facts: Any) -> None:
     """Give a volume the report of the one that it was made of, with its own place, more facts, and a warning."""
-    warnings = [*volume.report.get("warnings", ()), said]
-    made.report = amend(volume.report, warnings=warnings, **facts, **facts_of_place(volume.report, made))
+    warnings = [*volume.report.get("warnings", ()), warning]
+    changed.report = amend(volume.report, warnings=warnings, **facts, **facts_of_place(volume.report, changed))
 
 
 Own = TypeVar("Own", bound=BaseVolume)
@@ -159,7 +159,7 @@ def cut_block(volume: Own, block: Block) -> Own:
 
 
 def _certify(volume: Own, cropped: Own, block: Block, box: np.ndarray, space: str) -> Own:
-    every, kept = math.prod(volume.shape_ijk), math.prod(cropped.shape_ijk)
+    every, stay = math.prod(volume.shape_ijk), math.prod(cropped.shape_ijk)
     size = [n * step for n, step in zip(cropped.shape_ijk, cropped.spacing, strict=True)]
     whole = [n * step for n, step in zip(volume.shape_ijk, volume.spacing, strict=True)]
     facts = {
@@ -167,14 +167,14 @@ def _certify(volume: Own, cropped: Own, block: Block, box: np.ndarray, space: st
         "box_mm": [[float(end) if math.isfinite(end) else None for end in corner] for corner in box],
         "first_ijk": list(block.first),
         "shape_ijk_before": list(volume.shape_ijk),
-        "voxels": kept,
+        "voxels": stay,
         "voxels_all": every,
     }
-    said = (
-        f"cropped to {_describe_box(box)} mm ({space.upper()}): {kept:,} of {every:,} voxels stay"
-        f" ({100.0 * kept / every:.3g} %), {_describe_size(size)} of {_describe_size(whole)} mm"
+    warning = (
+        f"cropped to {_describe_box(box)} mm ({space.upper()}): {stay:,} of {every:,} voxels stay"
+        f" ({100.0 * stay / every:.3g} %), {_describe_size(size)} of {_describe_size(whole)} mm"
     )
-    take_report(cropped, volume, said, crop=facts)
+    take_report(cropped, volume, warning, crop=facts)
     return cropped
 
 
@@ -234,28 +234,30 @@ def slice_volume(volume: Own, key: Any) -> Own:
     """
     slices = _checked_slices(key)
     ranges = [range(*one.indices(size)) for one, size in zip(slices, volume.shape, strict=True)]
-    for axis, kept, one, size in zip(_AXES, ranges, slices, volume.shape, strict=True):
-        if not kept:
-            raise UsageError(f"nothing is left: {_slice_text(one)} holds none of the {size} indices along {axis}")
+    for axis, indices, cut, size in zip(_AXES, ranges, slices, volume.shape, strict=True):
+        if not indices:
+            raise UsageError(f"nothing is left: {_slice_text(cut)} holds none of the {size} indices along {axis}")
     along_ijk = ranges[::-1]
     affine = np.array(volume.affine)
-    for column, kept in enumerate(along_ijk):
+    for column, indices in enumerate(along_ijk):
         # A single voxel has no neighbour to be further away from: it keeps the step of the volume.
-        step = kept.step if len(kept) > 1 else math.copysign(1, kept.step)
+        step = indices.step if len(indices) > 1 else math.copysign(1, indices.step)
         affine[:3, column] = affine[:3, column] * step + 0.0  # which turns -0 into 0
     aside = volume.affine[:3, :2] @ [kept.start for kept in along_ijk[:2]]
     origins = volume.slice_origins()[np.array(along_ijk[2])] + aside
     shape = tuple(len(kept) for kept in along_ijk)
     placed, positions = place_block(affine, origins, volume.uneven, Block((0, 0, 0), shape))  # type: ignore[arg-type]
-    made = volume.alike(volume.voxels[slices], placed, None, positions)
-    said = f"sliced to {', '.join(map(_slice_text, slices))} of k, j, i: {made.voxels.size:,} of {volume.voxels.size:,}"
+    part = volume.alike(volume.voxels[slices], placed, None, positions)
+    words = (
+        f"sliced to {', '.join(map(_slice_text, slices))} of k, j, i: {part.voxels.size:,} of {volume.voxels.size:,}"
+    )
     facts = {
         "first_ijk": [kept.start for kept in along_ijk],
         "step_ijk": [kept.step for kept in along_ijk],
         "shape_ijk_before": list(volume.shape_ijk),
     }
-    take_report(made, volume, f"{said} voxels stay", sliced=facts)
-    return made
+    take_report(part, volume, f"{words} voxels stay", sliced=facts)
+    return part
 
 
 def _checked_slices(key: Any) -> tuple[slice, slice, slice]:
@@ -265,24 +267,24 @@ def _checked_slices(key: Any) -> tuple[slice, slice, slice]:
         given = (*given[: places[0]], *[slice(None)] * max(0, 4 - len(given)), *given[places[0] + 1 :])
     if len(given) > 3:
         raise UsageError(f"a volume has three axes, k, j, i, and is cut by as many slices, not by {len(given)}")
-    for axis, one in zip(_AXES, given, strict=False):
-        _check_slice(axis, one)
+    for axis, cut in zip(_AXES, given, strict=False):
+        _check_slice(axis, cut)
     k, j, i = [*given, slice(None), slice(None), slice(None)][:3]
     return k, j, i
 
 
-def _check_slice(axis: str, one: Any) -> None:
-    if isinstance(one, slice):
+def _check_slice(axis: str, cut: Any) -> None:
+    if isinstance(cut, slice):
         try:
-            one.indices(1)
+            cut.indices(1)
         except (TypeError, ValueError) as error:
-            raise UsageError(f"{_slice_text(one)} along {axis} is no range of indices: {error}") from error
+            raise UsageError(f"{_slice_text(cut)} along {axis} is no range of indices: {error}") from error
         return
     try:
-        number = operator.index(one)
+        number = operator.index(cut)
     except TypeError:
         raise UsageError(
-            f"a volume is cut by slices such as 10:20 along k, j, i, not by {type(one).__name__} along {axis}: for an"
+            f"a volume is cut by slices such as 10:20 along k, j, i, not by {type(cut).__name__} along {axis}: for an"
             " array take volume.voxels[...], for a mask clrecon.Mask"
         ) from None
     end = "" if number == -1 else number + 1
@@ -292,9 +294,9 @@ def _check_slice(axis: str, one: Any) -> None:
     )
 
 
-def _slice_text(one: slice) -> str:
-    ends = ["" if end is None else str(end)[:20] for end in (one.start, one.stop)]
-    return ":".join([*ends, *([] if one.step is None else [str(one.step)[:20]])])
+def _slice_text(cut: slice) -> str:
+    ends = ["" if end is None else str(end)[:20] for end in (cut.start, cut.stop)]
+    return ":".join([*ends, *([] if cut.step is None else [str(cut.step)[:20]])])
 
 
 Box = tuple[tuple[float, ...], tuple[float, ...]]

@@ -94,6 +94,6 @@ def amend(report: dict[str, Any], **changes: Any) -> dict[str, Any]:
     """Return a report with entries changed or added; a certificate stays one, with others in `Certificate.masked`."""
     if not isinstance(report, Certificate):
         return {**report, **changes}
-    own = {field.name for field in fields(report)}
-    masked = {**report.masked, **{name: value for name, value in changes.items() if name not in own}}
-    return report.changed(masked=masked, **{name: value for name, value in changes.items() if name in own})
+    known = {field.name for field in fields(report)}
+    masked = {**report.masked, **{name: value for name, value in changes.items() if name not in known}}
+    return report.changed(masked=masked, **{name: value for name, value in changes.items() if name in known})

@@ -320,11 +320,11 @@ class BaseVolume(Grid):
         positions = None if self._stack is None else self.slice_origins()
         if report is not None:
             return self.alike(array, self._affine, report, positions)
-        report, found = deepcopy(self.report), None
+        report, hu_range = deepcopy(self.report), None
         if report.get("hu_range") is not None:
-            found = _value_range(array)
-            report = amend(report, hu_range=None if found is None else list(found))
-        return self.alike(array, self._affine, report, positions, hu_range=found)
+            hu_range = _value_range(array)
+            report = amend(report, hu_range=None if hu_range is None else list(hu_range))
+        return self.alike(array, self._affine, report, positions, hu_range=hu_range)
 
     def release_slices(self, first: int, end: int) -> None:
         """Let slices ``first`` to ``end - 1`` of a memory-mapped volume leave memory until they are used again."""

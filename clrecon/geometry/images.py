@@ -146,8 +146,8 @@ def take_nibabel(image: Any) -> Taken:
 def _affine_of(image: Any) -> Float64Array:
     header, unit = image.header, 1.0
     coded = all(hasattr(header, name) for name in ("get_sform", "get_qform"))
-    told = not coded or any(int(header[f"{form}_code"]) for form in ("sform", "qform"))
-    if image.affine is None or not told:
+    is_placed = not coded or any(int(header[f"{form}_code"]) for form in ("sform", "qform"))
+    if image.affine is None or not is_placed:
         raise UsageError("the image does not say where it lies: it has no affine, or sform_code and qform_code are 0")
     if coded:
         code = int(header["xyzt_units"]) & 7

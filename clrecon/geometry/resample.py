@@ -35,10 +35,10 @@ def sample_volume(volume: BaseVolume, points: Float64Array, order: int, outside:
     interpolate = {0: _nearest, 1: _trilinear, 3: _spline}[order]
 
     def sample(where: slice) -> None:
-        own = points[where]
-        if not np.isfinite(own).all():
-            own = np.where(np.isfinite(own).all(axis=1, keepdims=True), own, np.nan)
-        places = volume.lps_to_ijk(own)
+        piece = points[where]
+        if not np.isfinite(piece).all():
+            piece = np.where(np.isfinite(piece).all(axis=1, keepdims=True), piece, np.nan)
+        places = volume.lps_to_ijk(piece)
         is_inside = find_inside(places, volume)
         if is_inside.any():
             rows = np.ascontiguousarray((places if is_inside.all() else places[is_inside]).T)
@@ -66,11 +66,11 @@ def _trilinear(voxels: NDArray[Any], places: Float64Array) -> Float64Array:
     def blend(numbers: NDArray[np.intp], axis: int) -> Float64Array:
         if axis < 0:
             return values.take(numbers).astype(np.float64)
-        one, other = blend(numbers, axis - 1), blend(numbers + steps[axis], axis - 1)
-        one *= rests[axis]
-        other *= parts[axis]
-        one += other
-        return one
+        low, high = blend(numbers, axis - 1), blend(numbers + steps[axis], axis - 1)
+        low *= rests[axis]
+        high *= parts[axis]
+        low += high
+        return low
 
     return blend((low[0] + ni * (low[1] + nj * low[2])).astype(np.intp), 2)
 
@@ -81,8 +81,8 @@ def _spline(voxels: NDArray[Any], places: Float64Array) -> Float64Array:
     first = np.maximum(np.floor(places.min(axis=1)).astype(int) - _SPLINE_MARGIN, 0)
     end = np.ceil(places.max(axis=1)).astype(int) + _SPLINE_MARGIN + 1
     block = voxels[tuple(slice(low, high) for low, high in zip(first[::-1], end[::-1], strict=True))]
-    at = (places - first[:, None])[::-1]
-    return np.asarray(ndimage.map_coordinates(block, at, np.float64, order=3, mode="nearest"))
+    in_block = (places - first[:, None])[::-1]
+    return np.asarray(ndimage.map_coordinates(block, in_block, np.float64, order=3, mode="nearest"))
 
 
 def find_inside(places: Float64Array, grid: Grid) -> NDArray[np.bool_]:
@@ -103,10 +103,10 @@ def sample_onto(
     values = np.full(target.shape, air, volume.dtype)
     for k, plane in enumerate(values):
         progress("resample", k, nk)
-        found, is_inside = (_sample_uneven if volume.uneven else _sample_even)(volume, target, k)
+        sampled, is_inside = (_sample_uneven if volume.uneven else _sample_even)(volume, target, k)
         if volume.dtype.kind != "f":
-            np.rint(found, out=found)
-        np.copyto(plane, found, where=is_inside, casting="unsafe")
+            np.rint(sampled, out=sampled)
+        np.copyto(plane, sampled, where=is_inside, casting="unsafe")
     return values
 
 
@@ -119,15 +119,15 @@ def _sample_even(volume: BaseVolume, target: BaseVolume, k: int) -> tuple[NDArra
     right, down = right - first, down - first
     nj, ni = target.shape[1:]
     matrix = np.column_stack([np.zeros(3), down[::-1], right[::-1]])
-    found = ndimage.affine_transform(
+    sampled = ndimage.affine_transform(
         volume.voxels, matrix, first[::-1], (1, nj, ni), np.float32, order=1, mode="nearest"
     )
     row, column = np.ogrid[:nj, :ni]
     is_inside = np.ones((nj, ni), bool)
     for axis, count in enumerate(volume.shape_ijk):
-        place = first[axis] + column * right[axis] + row * down[axis]
-        is_inside &= (place >= -0.5) & (place <= count - 0.5)
-    return found[0], is_inside
+        coordinate = first[axis] + column * right[axis] + row * down[axis]
+        is_inside &= (coordinate >= -0.5) & (coordinate <= count - 0.5)
+    return sampled[0], is_inside
 
 
 def _sample_uneven(volume: BaseVolume, target: BaseVolume, k: int) -> tuple[Float64Array, NDArray[np.bool_]]:
@@ -135,8 +135,8 @@ def _sample_uneven(volume: BaseVolume, target: BaseVolume, k: int) -> tuple[Floa
     nj, ni = target.shape[1:]
     row, column = np.indices((nj, ni))
     pixels = target.ijk_to_lps(np.column_stack([column.ravel(), row.ravel(), np.full(ni * nj, k)]))
-    found = sample_volume(volume, pixels, 1, np.nan).reshape(nj, ni)
-    return found, find_inside(volume.lps_to_ijk(pixels), volume).reshape(nj, ni)
+    sampled = sample_volume(volume, pixels, 1, np.nan).reshape(nj, ni)
+    return sampled, find_inside(volume.lps_to_ijk(pixels), volume).reshape(nj, ni)
 
 
 LARGEST_SHEAR_DEGREES = 0.01
@@ -206,10 +206,10 @@ def resample_grid(grid: Grid, regular: RegularGrid, air: float, progress: Progre
         first, columns, rows = corners[0], corners[1] - corners[0], corners[2] - corners[0]
         if not -0.5 <= first[2] <= grid.voxels.shape[0] - 0.5:
             continue
-        found, inside = _sample_plane(_slice_at(grid, first[2]), first, columns, rows, (nj, ni))
+        sampled, inside = _sample_plane(_slice_at(grid, first[2]), first, columns, rows, (nj, ni))
         if dtype.kind != "f":
-            np.rint(found, out=found)
-        np.copyto(plane, found, where=inside, casting="unsafe")
+            np.rint(sampled, out=sampled)
+        np.copyto(plane, sampled, where=inside, casting="unsafe")
     return values
 
 
@@ -230,13 +230,13 @@ def _sample_plane(
     from scipy import ndimage
 
     matrix = np.array([[rows[1], columns[1]], [rows[0], columns[0]]])
-    found = ndimage.affine_transform(values, matrix, first[1::-1], shape, np.float32, order=1, mode="nearest")
+    sampled = ndimage.affine_transform(values, matrix, first[1::-1], shape, np.float32, order=1, mode="nearest")
     row, column = np.ogrid[: shape[0], : shape[1]]
     inside = np.ones(shape, dtype=bool)
     for axis, count in enumerate(values.shape[::-1]):
-        place = first[axis] + row * rows[axis] + column * columns[axis]
-        inside &= (place >= -0.5) & (place <= count - 0.5)
-    return found, inside
+        coordinate = first[axis] + row * rows[axis] + column * columns[axis]
+        inside &= (coordinate >= -0.5) & (coordinate <= count - 0.5)
+    return sampled, inside
 
 
 Own = TypeVar("Own", bound=BaseVolume)
@@ -281,8 +281,8 @@ def resample_volume(volume: Own, to: float | Sequence[float] | BaseVolume, *, pr
                 f"the two volumes have no place in common: along {'xyz'[axis]} they lie {away[axis]:.1f} mm apart"
             )
         positions = to.slice_origins() if to.uneven else None
-        made = volume.alike(sample_onto(volume, to, air, report), to.affine, None, positions)
-        what = "the voxels of another volume"
+        resampled = volume.alike(sample_onto(volume, to, air, report), to.affine, None, positions)
+        target = "the voxels of another volume"
         figures["step_mm"] = list(to.spacing)
     else:
         steps = np.atleast_1d(np.asarray(to, object)).tolist()
@@ -291,11 +291,11 @@ def resample_volume(volume: Own, to: float | Sequence[float] | BaseVolume, *, pr
         if len(steps) not in (1, 3):
             raise UsageError(f"a resampled volume has one step, or one each along i, j and k, not {len(steps)}")
         figures["step_mm"] = to = float(steps[0]) if len(steps) == 1 else [float(step) for step in steps]
-        what = " x ".join(f"{step:g}" for step in steps) + " mm"
+        target = " x ".join(f"{step:g}" for step in steps) + " mm"
         regular = regular_grid(volume, volume.slice_origins(), to)
-        check_count(regular, f"in steps of {what}")
-        made = volume.alike(resample_grid(volume, regular, air, report), regular.affine)
+        check_count(regular, f"in steps of {target}")
+        resampled = volume.alike(resample_grid(volume, regular, air, report), regular.affine)
     before = " x ".join(f"{step:.4g}" for step in volume.spacing)
-    said = f"resampled (trilinear) from {'uneven slices' if volume.uneven else f'{before} mm'} to {what}"
-    take_report(made, volume, said, resampled=figures)
-    return made
+    warning = f"resampled (trilinear) from {'uneven slices' if volume.uneven else f'{before} mm'} to {target}"
+    take_report(resampled, volume, warning, resampled=figures)
+    return resampled

@@ -228,8 +228,8 @@ class Volume(BaseVolume, ShownAsHtml):
         return make_image_data(image_of(self, resample, "to_pyvista"))
 
     @classmethod
-    def _of(cls: type[Own], *taken: Any) -> Own:
-        return cls(*taken)
+    def _of(cls: type[Own], *parts: Any) -> Own:
+        return cls(*parts)
 
     @classmethod
     @explains_arguments

@@ -25,12 +25,12 @@ _TURNED = "in reverse order: the volume's axes are left-handed"
 """Field array ``SLICES`` of an image whose slices run from the last one of the volume to its first."""
 
 
-def make_image_data(own: Image, name: str = "HU") -> Any:
+def make_image_data(volume: Image, name: str = "HU") -> Any:
     """Make the image of `Volume.to_pyvista`, its numbers as the point data `name`."""
     import pyvista
 
-    notes = {} if own.resampled is None else {"RESAMPLED": f"trilinear, to a regular grid: {own.resampled}"}
-    affine, values = own.affine, own.voxels
+    notes = {} if volume.resampled is None else {"RESAMPLED": f"trilinear, to a regular grid: {volume.resampled}"}
+    affine, values = volume.affine, volume.voxels
     if is_left_handed(affine):
         notes["SLICES"] = _TURNED
         values, affine = _reversed(values, affine)
@@ -48,37 +48,37 @@ def take_image_data(image: Any, name: str | None, space: str | None) -> Taken:
     """Take voxels, a copy, and affine of a ``pyvista.ImageData``; see `Volume.from_pyvista`."""
     import pyvista
 
-    found = pyvista.wrap(image) if hasattr(image, "GetPointData") else image
-    if not isinstance(found, pyvista.ImageData):
+    wrapped = pyvista.wrap(image) if hasattr(image, "GetPointData") else image
+    if not isinstance(wrapped, pyvista.ImageData):
         raise UsageError(f"{type(image).__name__} is no pyvista.ImageData: a volume has even steps along three axes")
-    values = np.array(_numbers_of(found, name)).reshape(found.dimensions[::-1])
+    values = np.array(_numbers_of(wrapped, name)).reshape(wrapped.dimensions[::-1])
     affine = np.eye(4)
-    matrix = found.GetDirectionMatrix()
+    matrix = wrapped.GetDirectionMatrix()
     direction = [[matrix.GetElement(row, column) for column in range(3)] for row in range(3)]
-    affine[:3, :3] = np.array(direction) * found.GetSpacing()
-    affine[:3, 3] = found.GetPoint(0)  # an image that was cut out of another does not begin at its origin
+    affine[:3, :3] = np.array(direction) * wrapped.GetSpacing()
+    affine[:3, 3] = wrapped.GetPoint(0)  # an image that was cut out of another does not begin at its origin
     turn = np.eye(4)
-    turn[:3, :3] = frame_from_lps(choose_space(space, _note(found, "SPACE"), "the ImageData"))
+    turn[:3, :3] = frame_from_lps(choose_space(space, _note(wrapped, "SPACE"), "the ImageData"))
     affine = turn @ affine  # its own inverse: to LPS as from LPS
-    if _note(found, "SLICES") == _TURNED:
+    if _note(wrapped, "SLICES") == _TURNED:
         values, affine = _reversed(values, affine)
     return values, affine
 
 
 def _numbers_of(image: Any, name: str | None) -> Any:
     """Return the point data `name`, or the active scalars, shape (n,)."""
-    held = list(image.point_data.keys())
+    names = list(image.point_data.keys())
     chosen = image.point_data.active_scalars_name if name is None else name
-    if chosen is None and len(held) == 1:
-        chosen = held[0]
-    if chosen not in held:
-        if not held and image.cell_data.keys():
+    if chosen is None and len(names) == 1:
+        chosen = names[0]
+    if chosen not in names:
+        if not names and image.cell_data.keys():
             raise UsageError(
                 "the numbers of the ImageData belong to its cells, those of a volume to its points: take"
                 " image.cells_to_points() first"
             )
         asked = "no active scalars" if chosen is None else f"no point data {str(chosen)[:40]!r}"
-        raise UsageError(f"the ImageData has {asked}; it has {', '.join(map(str, held))[:100] or 'none'}")
+        raise UsageError(f"the ImageData has {asked}; it has {', '.join(map(str, names))[:100] or 'none'}")
     values = image.point_data[chosen]
     if values.ndim != 1:
         raise UsageError(

@@ -151,29 +151,29 @@ def make_corridors(
             _name_files(files, list(names.values()))
         level, choice = _choose_level(volume, settings, run.progress)
         run.lap("choose")
-        taken = resample_labels(labels, volume)
+        placed = resample_labels(labels, volume)
         fitted = _fit_vertebrae(run, volume, labels, numbers, level) if settings.surface == "cortex" else {}
         run.lap("cortex")
-        found = []
+        corridors = []
         for done, number in enumerate(numbers):
             run.progress("corridors", done, len(numbers))
-            _check_inside(taken.inside[number], names[number])
+            _check_inside(placed.inside[number], names[number])
             of_fit = partial(lay_on_lattice, fitted[number]) if fitted else None
-            found.append(measure_corridors(volume, taken.voxels, number, level, names[number], of_fit))
-        graded = _grade_screws(found, labels, numbers, settings.screws)
+            corridors.append(measure_corridors(volume, placed.voxels, number, level, names[number], of_fit))
+        graded = _grade_screws(corridors, labels, numbers, settings.screws)
         run.lap("corridors")
-        outputs = _draw_sheets(run, volume, found, graded, level, files)
+        outputs = _draw_sheets(run, volume, corridors, graded, level, files)
         if files.output is not None:
             surfaces = fitted or _fill_vertebrae(run, volume, labels, numbers, level)
-            outputs += _write_meshes(run, dict(zip(numbers, found, strict=True)), graded, surfaces, files.output)
+            outputs += _write_meshes(run, dict(zip(numbers, corridors, strict=True)), graded, surfaces, files.output)
         run.lap("write")
         vertebrae = [
             describe_vertebra(each, number, settings.margin, settings.space, own)
-            for each, number, own in zip(found, numbers, graded, strict=True)
+            for each, number, own in zip(corridors, numbers, graded, strict=True)
         ]
         report = run.report(
             CorridorReport,
-            [*taken.warnings, *_warn_of_corridors(found)],
+            [*placed.warnings, *_warn_of_corridors(corridors)],
             volume,
             notice=NOT_FOR_PLANNING,
             level_bias=KNOWN_CORTEX_BIAS if fitted else KNOWN_BIAS,
@@ -247,8 +247,8 @@ def lay_on_lattice(mesh: Mesh, lattice: Lattice) -> FittedLattice:
         within = (step >= 0) & (step < shape[2] - 1)
         steps = (*shape[:2], shape[2] - 1)
         share, is_known = np.full(steps, 0.5, np.float32), np.zeros(steps, bool)
-        at = (lines[within] // shape[1], lines[within] % shape[1], step[within])
-        share[at], is_known[at] = (along - step)[within], known[rows[within]]
+        hit = (lines[within] // shape[1], lines[within] % shape[1], step[within])
+        share[hit], is_known[hit] = (along - step)[within], known[rows[within]]
         shares.append(np.moveaxis(share, 2, axis))
         placed.append(np.moveaxis(is_known, 2, axis))
     return FittedLattice(solid, shares, placed)
@@ -263,45 +263,47 @@ def _check_inside(share: float, name: str) -> None:
 
 
 def _grade_screws(
-    found: Sequence[VertebraCorridors], labels: LabelMap, numbers: Sequence[int], screws: Sequence[Screw]
+    corridors: Sequence[VertebraCorridors], labels: LabelMap, numbers: Sequence[int], screws: Sequence[Screw]
 ) -> list[list[tuple[Screw, ScrewGrade]]]:
     """Grade each screw in the vertebra that it names, or else in the one whose bone its axis lies deepest in."""
-    graded: list[list[tuple[Screw, ScrewGrade]]] = [[] for _ in found]
+    graded: list[list[tuple[Screw, ScrewGrade]]] = [[] for _ in corridors]
     for screw in screws:
         if screw.label is not None:
             number = labels.find(screw.label)
             if number not in numbers:
                 raise UsageError(f"{screw.name} belongs to {labels.name(number)}, which is not among the labels named")
-            place = numbers.index(number)
+            position = numbers.index(number)
         else:
             axis = screw.entry + np.linspace(0.0, 1.0, 41)[:, None] * (screw.tip - screw.entry)
-            depths = [float(each.bone.depth(axis).mean()) for each in found]
-            place = int(np.argmax(depths))
-        own = found[place]
-        graded[place].append((screw, grade_screw(own.bone, own.frame, screw, own.name)))
+            depths = [float(each.bone.depth(axis).mean()) for each in corridors]
+            position = int(np.argmax(depths))
+        measured = corridors[position]
+        graded[position].append((screw, grade_screw(measured.bone, measured.frame, screw, measured.name)))
     return graded
 
 
 def _draw_sheets(
     run: Run,
     volume: Volume,
-    found: Sequence[VertebraCorridors],
+    corridors: Sequence[VertebraCorridors],
     graded: Sequence[list[tuple[Screw, ScrewGrade]]],
     level: float,
     files: MeshFiles,
 ) -> list[dict[str, Any]]:
     outputs = []
-    for path, each, own in zip(_picture_paths(files, [each.name for each in found]), found, graded, strict=False):
+    for path, vertebra, grades in zip(
+        _picture_paths(files, [each.name for each in corridors]), corridors, graded, strict=False
+    ):
         footer = [
             f"{screw.name}: {screw.diameter:g} mm, {grade.side}, grade {grade.grade}"
             + (f", {grade.breach_mm:.1f} mm {grade.direction}" if grade.direction else "")
-            for screw, grade in own[:6]
+            for screw, grade in grades[:6]
         ]
         surface = "fitted to the bone from" if run.settings.surface == "cortex" else "at"
         footer += [f"surface {surface} {level:g} HU; green: corridor, yellow: largest screw, red: given screw"]
         footer += [NOT_FOR_PLANNING]
-        picture = draw_corridors(volume, each, [screw for screw, _ in own], run.settings.margin, footer)
-        outputs.append({"kind": "picture", "name": each.name, "bytes": run.write_picture(path, picture).size})
+        picture = draw_corridors(volume, vertebra, [screw for screw, _ in grades], run.settings.margin, footer)
+        outputs.append({"kind": "picture", "name": vertebra.name, "bytes": run.write_picture(path, picture).size})
     return outputs
 
 
@@ -319,31 +321,31 @@ def _fill_vertebrae(
 
 def _write_meshes(
     run: Run,
-    found: dict[int, VertebraCorridors],
+    corridors: dict[int, VertebraCorridors],
     graded: Sequence[list[tuple[Screw, ScrewGrade]]],
     vertebrae: Mapping[int, Mesh],
     output: str | Path,
 ) -> list[dict[str, Any]]:
     """Write vertebrae and cylinders; return their entries."""
     meshes: dict[str, Mesh] = {}
-    for (number, each), own in zip(found.items(), graded, strict=True):
-        meshes[each.name] = vertebrae[number]
-        cylinders = cylinder_meshes(each, [screw for screw, _ in own])
-        meshes |= {f"{each.name}_{name}": mesh for name, mesh in cylinders.items()}
+    for (number, vertebra), grades in zip(corridors.items(), graded, strict=True):
+        meshes[vertebra.name] = vertebrae[number]
+        cylinders = cylinder_meshes(vertebra, [screw for screw, _ in grades])
+        meshes |= {f"{vertebra.name}_{name}": mesh for name, mesh in cylinders.items()}
     written = run.write_meshes(list(meshes.values()), name_outputs(output, list(meshes)))
     return [{"kind": "mesh", "name": name, "bytes": each.size} for name, each in zip(meshes, written, strict=True)]
 
 
-def _warn_of_corridors(found: Sequence[VertebraCorridors]) -> list[str]:
+def _warn_of_corridors(corridors: Sequence[VertebraCorridors]) -> list[str]:
     warnings: list[str] = []
-    for each in found:
-        warnings += each.warnings
-        for corridor in each.corridors:
+    for vertebra in corridors:
+        warnings += vertebra.warnings
+        for corridor in vertebra.corridors:
             if corridor.refused is not None:
-                warnings.append(f"{each.name}, {corridor.side}: {corridor.refused}")
+                warnings.append(f"{vertebra.name}, {corridor.side}: {corridor.refused}")
             elif corridor.by_hu_share is not None and corridor.by_hu_share < _PLACED_BY_LABEL:
                 warnings.append(
-                    f"{each.name}, {corridor.side}: HU place {100.0 * corridor.by_hu_share:.0f} % of the walls beside"
-                    " the line, the label's own border the rest: the radius is that of the label"
+                    f"{vertebra.name}, {corridor.side}: HU place {100.0 * corridor.by_hu_share:.0f} % of the walls"
+                    " beside the line, the label's own border the rest: the radius is that of the label"
                 )
     return warnings

@@ -68,14 +68,14 @@ def _round_numbers(value: Any, digits: int = 3) -> Any:
 
 
 def describe_vertebra(
-    found: VertebraCorridors, label: int, margin: float, space: str, screws: list[tuple[Screw, ScrewGrade]]
+    vertebra: VertebraCorridors, label: int, margin: float, space: str, screws: list[tuple[Screw, ScrewGrade]]
 ) -> dict[str, Any]:
-    place, frame, turn = _point_placer(space), found.frame, frame_from_lps(space)
+    to_space, frame, turn = _point_placer(space), vertebra.frame, frame_from_lps(space)
     return {
-        "name": found.name,
+        "name": vertebra.name,
         "label": label,
         "frame": {
-            "origin_mm": place(frame.origin),
+            "origin_mm": to_space(frame.origin),
             "axes": {
                 name: [round(float(value), 5) for value in turn @ axis]
                 for name, axis in zip(("left", "posterior", "cranial"), frame.axes, strict=True)
@@ -84,14 +84,14 @@ def describe_vertebra(
             "body_depth_mm": round(frame.body_y[1] - frame.body_y[0], 2),
             "canal_radius_mm": round(frame.canal_radius, 2),
         },
-        "corridors": [describe_corridor(corridor, margin, space) for corridor in found.corridors],
+        "corridors": [describe_corridor(corridor, margin, space) for corridor in vertebra.corridors],
         "screws": [describe_grade(screw, grade, space) for screw, grade in screws],
     }
 
 
 def describe_corridor(corridor: Corridor, margin: float, space: str) -> dict[str, Any]:
     """Return the entries of one side; all but `side` and `refused` are None where there is no corridor."""
-    place, radius = _point_placer(space), corridor.radius
+    to_space, radius = _point_placer(space), corridor.radius
     return {
         "side": corridor.side,
         "refused": corridor.refused,
@@ -104,10 +104,10 @@ def describe_corridor(corridor: Corridor, margin: float, space: str) -> dict[str
         "sagittal_angle_range_deg": _round_numbers(corridor.sagittal_range_deg, 1),
         "medial_angle_lps_deg": _round_numbers(corridor.medial_lps_deg, 1),
         "sagittal_angle_lps_deg": _round_numbers(corridor.sagittal_lps_deg, 1),
-        "entry_mm": place(corridor.entry),
-        "tip_mm": place(corridor.tip),
-        "counted_from_mm": place(corridor.back),
-        "pedicle_mm": place(corridor.pass_point),
+        "entry_mm": to_space(corridor.entry),
+        "tip_mm": to_space(corridor.tip),
+        "counted_from_mm": to_space(corridor.back),
+        "pedicle_mm": to_space(corridor.pass_point),
         "margins_mm": _round_numbers(corridor.margins),
         "canal_mm": _round_numbers(corridor.canal),
         "level_bias_mm": _describe_bias(corridor.bias),
@@ -129,12 +129,12 @@ def _describe_bias(bias: Bias | None) -> dict[str, Any] | None:
 
 
 def describe_grade(screw: Screw, grade: ScrewGrade, space: str) -> dict[str, Any]:
-    place = _point_placer(space)
+    to_space = _point_placer(space)
     return {
         "name": screw.name,
         "side": grade.side,
-        "entry_mm": place(screw.entry),
-        "tip_mm": place(screw.tip),
+        "entry_mm": to_space(screw.entry),
+        "tip_mm": to_space(screw.tip),
         "diameter_mm": float(screw.diameter),
         "length_mm": round(float(np.linalg.norm(screw.tip - screw.entry)), 2),
         "grade": grade.grade,
@@ -160,8 +160,8 @@ _LEAST_RISE = 1e-6
 
 def _sample_plane(volume: Volume, centre: Float64Array, right: Float64Array, down: Float64Array) -> NDArray[np.float32]:
     """Return HU (trilinear) of a plane of `_WIDTH_MM`, shape (`PIXELS`, `PIXELS`); air beyond the scan."""
-    way = (np.arange(PIXELS) - (PIXELS - 1) / 2.0) * (_WIDTH_MM / PIXELS)
-    points = centre + way[:, None, None] * down + way[None, :, None] * right
+    steps = (np.arange(PIXELS) - (PIXELS - 1) / 2.0) * (_WIDTH_MM / PIXELS)
+    points = centre + steps[:, None, None] * down + steps[None, :, None] * right
     return sample_volume(volume, points.reshape(-1, 3)).reshape(PIXELS, PIXELS)
 
 
@@ -176,8 +176,8 @@ def _along(
 ) -> list[Stroke]:
     """Return the two sides of a cylinder that lies in the plane, and its axis."""
     flat = _flatten_points(ends, centre, right, down)
-    way = (flat[1] - flat[0]) / max(float(np.linalg.norm(flat[1] - flat[0])), 1e-9)
-    across = radius * np.array((-way[1], way[0]))
+    along = (flat[1] - flat[0]) / max(float(np.linalg.norm(flat[1] - flat[0])), 1e-9)
+    across = radius * np.array((-along[1], along[0]))
     frame = np.stack((flat[0] + across, flat[1] + across, flat[1] - across, flat[0] - across, flat[0] + across))
     return [Stroke(frame, color), Stroke(flat, color)]
 
@@ -187,37 +187,41 @@ def _across(
 ) -> list[Stroke]:
     """Return the circle where a cylinder's axis meets the plane; of one that lies in the plane, its section."""
     normal = np.cross(right, down)
-    height, other = (ends - centre) @ normal
-    if abs(other - height) > _LEAST_RISE * float(np.linalg.norm(ends[1] - ends[0])):
-        crossing = ends[0] + height / (height - other) * (ends[1] - ends[0])
+    height, far_height = (ends - centre) @ normal
+    if abs(far_height - height) > _LEAST_RISE * float(np.linalg.norm(ends[1] - ends[0])):
+        crossing = ends[0] + height / (height - far_height) * (ends[1] - ends[0])
         return [Stroke(_flatten_points(crossing[None], centre, right, down), color, radius)]
     half_width = np.sqrt(max(radius**2 - height**2, 0.0))
     return _along(centre, right, down, ends, float(half_width), color) if half_width > 0.0 else []
 
 
 def draw_corridors(
-    volume: Volume, found: VertebraCorridors, screws: Sequence[Screw], margin: float, footer: Sequence[str]
+    volume: Volume, vertebra: VertebraCorridors, screws: Sequence[Screw], margin: float, footer: Sequence[str]
 ) -> PictureData:
     """Draw a row for each side: two slices through the line, and one square to it at its narrowest section."""
     rows = [
         _draw_row(
-            volume, found, corridor, [screw for screw in screws if _side_of(found, screw) == corridor.side], margin
+            volume,
+            vertebra,
+            corridor,
+            [screw for screw in screws if _side_of(vertebra, screw) == corridor.side],
+            margin,
         )
-        for corridor in found.corridors
+        for corridor in vertebra.corridors
     ]
     return draw_sheet(rows, footer)
 
 
-def _side_of(found: VertebraCorridors, screw: Screw) -> str:
-    first, last = found.frame.to_frame(np.stack((screw.entry, screw.tip)))
-    share = np.clip((found.frame.body_y[1] - first[1]) / min(last[1] - first[1], -1e-9), 0.0, 1.0)
-    return "left" if (first + share * (last - first))[0] > found.frame.canal[0] else "right"
+def _side_of(vertebra: VertebraCorridors, screw: Screw) -> str:
+    first, last = vertebra.frame.to_frame(np.stack((screw.entry, screw.tip)))
+    share = np.clip((vertebra.frame.body_y[1] - first[1]) / min(last[1] - first[1], -1e-9), 0.0, 1.0)
+    return "left" if (first + share * (last - first))[0] > vertebra.frame.canal[0] else "right"
 
 
 def _draw_row(
-    volume: Volume, found: VertebraCorridors, corridor: Corridor, screws: Sequence[Screw], margin: float
+    volume: Volume, vertebra: VertebraCorridors, corridor: Corridor, screws: Sequence[Screw], margin: float
 ) -> list[Panel]:
-    axes, name = found.frame.axes, f"{found.name}, {corridor.side}"
+    axes, name = vertebra.frame.axes, f"{vertebra.name}, {corridor.side}"
     ends: Float64Array
     if corridor.tip is not None and corridor.entry is not None and corridor.pass_point is not None:
         ends, centre = np.stack((corridor.entry, corridor.tip)), corridor.pass_point
@@ -227,7 +231,9 @@ def _draw_row(
         ]
     else:
         side = SIDES[corridor.side]
-        centre = found.frame.to_lps(np.array([[found.frame.canal[0] + 14.0 * side, found.frame.body_y[1], 0.0]]))[0]
+        centre = vertebra.frame.to_lps(
+            np.array([[vertebra.frame.canal[0] + 14.0 * side, vertebra.frame.body_y[1], 0.0]])
+        )[0]
         ends, lines = np.stack((centre + 20.0 * axes[1], centre - 25.0 * axes[1])), [name, "no corridor"]
     back = ends[0] - ends[1]
     back /= np.linalg.norm(back)
@@ -277,8 +283,8 @@ FACES = 48
 
 def cylinder_mesh(first: NDArray[np.float64], last: NDArray[np.float64], radius: float) -> Mesh:
     """Return a closed cylinder between two points, LPS mm, with its normals outwards."""
-    way = np.asarray(last, dtype=np.float64) - first
-    unit = way / np.linalg.norm(way)
+    axis = np.asarray(last, dtype=np.float64) - first
+    unit = axis / np.linalg.norm(axis)
     across = np.cross(unit, np.eye(3)[int(np.abs(unit).argmin())])
     across /= np.linalg.norm(across)
     turns = np.linspace(0.0, 2.0 * np.pi, FACES, endpoint=False)
@@ -301,10 +307,10 @@ def cylinder_mesh(first: NDArray[np.float64], last: NDArray[np.float64], radius:
     return Mesh(vertices, triangles)
 
 
-def cylinder_meshes(found: VertebraCorridors, screws: list[Screw]) -> dict[str, Mesh]:
+def cylinder_meshes(vertebra: VertebraCorridors, screws: list[Screw]) -> dict[str, Mesh]:
     """Return the cylinders of a vertebra by name: ``left``, ``right``, ``screw_1`` and so on."""
     meshes = {}
-    for corridor in found.corridors:
+    for corridor in vertebra.corridors:
         if corridor.radius is not None and corridor.entry is not None and corridor.tip is not None:
             meshes[corridor.side] = cylinder_mesh(corridor.entry, corridor.tip, corridor.radius)
     for number, screw in enumerate(screws, start=1):

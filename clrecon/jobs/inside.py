@@ -112,18 +112,18 @@ def make_inside(
             names = [name_part(suffix, part, several=several) for suffix, part in product(suffixes, PARTS)]
             refuse_files(name_outputs(output, names) + ([] if picture is None else name_outputs(picture, names)))
         run.lap("read")
-        found: list[_FoundVertebra] = []
+        items: list[_FoundVertebra] = []
         for number, suffix in zip(numbers, suffixes, strict=True):
-            run.progress("inside", len(found), len(suffixes) if several else 0)
+            run.progress("inside", len(items), len(suffixes) if several else 0)
             inside = _look_inside(volume, labels, number, settings, device)
-            found.append(_FoundVertebra(suffix, inside, inside.extract_meshes(memory=settings.memory)))
+            items.append(_FoundVertebra(suffix, inside, inside.extract_meshes(memory=settings.memory)))
         run.lap("inside")
         if picture is not None:
-            for place, one in enumerate(found):
-                run.progress("render", place, len(found) if several else 0)
-                one.pictures = draw_parts(one.meshes, settings.view, device, settings.memory)
+            for order, item in enumerate(items):
+                run.progress("render", order, len(items) if several else 0)
+                item.pictures = draw_parts(item.meshes, settings.view, device, settings.memory)
             run.lap("render")
-        vertebrae = [_write_vertebra(run, one, output, picture, report_path, several=several) for one in found]
+        vertebrae = [_write_vertebra(run, one, output, picture, report_path, several=several) for one in items]
         run.lap("write")
         warnings = [
             f"{vertebra['name']}: {warning}" if several else warning
@@ -141,7 +141,7 @@ def make_inside(
             space=settings.space.lower(),
         )
         run.finish(report, report_path)
-    log.info("%d vertebrae looked into, on %s in %.3f s", len(found), report.device, report.seconds["total"])
+    log.info("%d vertebrae looked into, on %s in %.3f s", len(items), report.device, report.seconds["total"])
     return report
 
 
@@ -204,16 +204,18 @@ def _look_inside(
 
 def _write_vertebra(
     run: Run,
-    one: _FoundVertebra,
+    vertebra: _FoundVertebra,
     output: str | Path,
     picture: str | Path | None,
     report_path: str | Path | None,
     *,
     several: bool,
 ) -> dict[str, Any]:
-    entry: dict[str, Any] = {**one.inside.as_dict(), "name": one.suffix, "pictures": []}
-    paths = name_outputs(output, [name_part(one.suffix, part, several=several) for part in one.meshes], report_path)
-    written = run.write_meshes(list(one.meshes.values()), paths)
+    entry: dict[str, Any] = {**vertebra.inside.as_dict(), "name": vertebra.suffix, "pictures": []}
+    paths = name_outputs(
+        output, [name_part(vertebra.suffix, part, several=several) for part in vertebra.meshes], report_path
+    )
+    written = run.write_meshes(list(vertebra.meshes.values()), paths)
     entry["meshes"] = [
         {
             "part": part,
@@ -222,11 +224,11 @@ def _write_vertebra(
             "format": extension_of(path)[1:],
             "bytes": file.size,
         }
-        for (part, mesh), path, file in zip(one.meshes.items(), paths, written, strict=True)
+        for (part, mesh), path, file in zip(vertebra.meshes.items(), paths, written, strict=True)
     ]
-    for part, drawn in one.pictures.items():
+    for part, drawn in vertebra.pictures.items():
         assert picture is not None
-        (path,) = name_outputs(picture, [name_part(one.suffix, part, several=several)])
+        (path,) = name_outputs(picture, [name_part(vertebra.suffix, part, several=several)])
         size = run.write_picture(path, drawn).size
         of_picture = {"part": part, "faded": list(_FADED[part]), "size": list(drawn.size)}
         entry["pictures"].append(of_picture | {"format": extension_of(path)[1:], "bytes": size})

@@ -58,9 +58,9 @@ def _parse_level(part: str, text: str) -> float | tuple[float, float]:
         return parse_levels(part, text)[0]
     ends = part.split(":")
     if len(ends) != 2 or not all(ends):
-        where = f" in {text!r}" if part != text else ""
+        context = f" in {text!r}" if part != text else ""
         raise ValueError(
-            f"{part!r}{where} is no range A:B of two numbers of HU; from A on is {name_parameter('iso_value', 'A')},"
+            f"{part!r}{context} is no range A:B of two numbers of HU; from A on is {name_parameter('iso_value', 'A')},"
             f" below B is {name_parameter('below', 'B')}"
         )
     low, high = (parse_levels(end, text)[0] for end in ends)
@@ -74,8 +74,8 @@ def parse_levels(text: str, whole: str | None = None) -> tuple[float, ...]:
         try:
             levels.append(float(part))
         except ValueError:
-            where = f" in {whole or text!r}" if part != (whole or text) else ""
-            raise ValueError(f"{part!r}{where} is no number of HU") from None
+            context = f" in {whole or text!r}" if part != (whole or text) else ""
+            raise ValueError(f"{part!r}{context} is no number of HU") from None
     return tuple(levels)
 
 

@@ -60,11 +60,11 @@ def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Pa
 def check_distinct(*owned: Sequence[tuple[str, str | Path]]) -> None:
     """Refuse two outputs that are the same file, each given by description and path."""
     owners: dict[str, str] = {}
-    for own, path in chain(*owned):
-        other = owners.get(_identity(path))
-        if other is not None:
-            raise UsageError(f"{own} and {other} cannot be the same file: {path}")
-        owners[_identity(path)] = own
+    for role, path in chain(*owned):
+        owner = owners.get(_identity(path))
+        if owner is not None:
+            raise UsageError(f"{role} and {owner} cannot be the same file: {path}")
+        owners[_identity(path)] = role
 
 
 def check_files(*owned: Sequence[tuple[str, str | Path]]) -> None:
@@ -85,14 +85,14 @@ def check_kept(outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | 
     """
     there = [(what, path) for what, path in outputs if path is not None and os.path.exists(path)]
     read = [path for one in inputs if one and there for path in (one, _find_voxels(one)) if path]
-    for what, path in there:
+    for role, path in there:
         inside = os.path.join(os.path.realpath(path), "")
-        for one in read:
-            same = os.path.exists(one) and (_identity(path) == _identity(one) or os.path.samefile(path, one))
-            if same or os.path.isdir(path) and os.path.realpath(one).startswith(inside):
-                raise UsageError(f"{what} would replace a file that is read: {path}")
+        for source in read:
+            same = os.path.exists(source) and (_identity(path) == _identity(source) or os.path.samefile(path, source))
+            if same or os.path.isdir(path) and os.path.realpath(source).startswith(inside):
+                raise UsageError(f"{role} would replace a file that is read: {path}")
         if os.path.isfile(path) and _is_bare_data_set(path):
-            raise UsageError(f"{what} would replace a DICOM data set: {path}")
+            raise UsageError(f"{role} would replace a DICOM data set: {path}")
 
 
 def _find_voxels(path: str | Path) -> Path | None:
@@ -123,9 +123,9 @@ def count_leftovers(output: str | Path, paths: Sequence[str | Path]) -> int:
     """Count the numbered files of `output` that an earlier run left: not in `paths`, and not ours to remove."""
     stem, extension = os.path.splitext(os.path.basename(output))
     numbered = re.compile(rf"{re.escape(stem)}(?:_.+)?_[0-9]{{3,}}{re.escape(extension)}")
-    own = {_identity(path) for path in paths}
+    written = {_identity(path) for path in paths}
     with os.scandir(os.path.dirname(output) or ".") as entries:
-        return sum(bool(numbered.fullmatch(entry.name)) and _identity(entry.path) not in own for entry in entries)
+        return sum(bool(numbered.fullmatch(entry.name)) and _identity(entry.path) not in written for entry in entries)
 
 
 def refuse_files(paths: Sequence[str | Path]) -> None:
@@ -141,10 +141,10 @@ def refuse_numbered(output: str | Path) -> None:
     """Raise `OutputError` in a block of `keep_existing` if components of an earlier run have names of `output`."""
     from clrecon.system.paths import existing_stay
 
-    if existing_stay() and (found := count_leftovers(output, [])):
+    if existing_stay() and (count := count_leftovers(output, [])):
         raise OutputError(
-            f"{count_of(found, 'numbered file')} of {output} exist{'s' * (found == 1)} already and"
-            f" stay{'s' * (found == 1)} ({name_parameter('no_clobber', True)}):"
+            f"{count_of(count, 'numbered file')} of {output} exist{'s' * (count == 1)} already and"
+            f" stay{'s' * (count == 1)} ({name_parameter('no_clobber', True)}):"
             " name another"
         )
 

@@ -75,11 +75,11 @@ def _describe_bone_left(facts: dict[str, Any]) -> str:
 
     if facts["bone_kept"] is None:
         return " no bone above 300 HU;"
-    what = "the dry bone" if facts["specimen"] else "the bone"
+    bone = "the dry bone" if facts["specimen"] else "the bone"
     removed = f"{facts['bone_voxels_removed']:,} voxels removed"
     if facts["bone_removed"]:
         removed += f": {describe_pieces(facts['bone_removed'])}"
-    return f" of {what} {100.0 * facts['bone_kept']:.4g} % stay ({removed});"
+    return f" of {bone} {100.0 * facts['bone_kept']:.4g} % stay ({removed});"
 
 
 def _describe_bone_cut(facts: dict[str, Any]) -> str:
@@ -119,13 +119,13 @@ def apply_region(
     progress("region", 0, 0)
     volume = resident.volume
     mask, facts, warnings = _find_region(resident, rules, settings.space_of_points, settings.follow_links)
-    kept, cells = mask.count, _count_cells(mask.to_numpy())
+    stay, cells = mask.count, _count_cells(mask.to_numpy())
     every, all_cells = math.prod(volume.shape_ijk), math.prod(n - 1 for n in volume.shape_ijk)
     outside = value_outside(bands, volume.voxels.dtype)
     restricted = mask.apply(resident, outside)
     facts = {
         "rules": [str(rule) for rule in rules],
-        "voxels": kept,
+        "voxels": stay,
         "voxels_all": every,
         "cells": cells,
         "cells_all": all_cells,
@@ -133,12 +133,12 @@ def apply_region(
         **facts,
     }
     now = "is air now" if outside == value_outside((), volume.voxels.dtype) else "is left out"
-    said = (
+    warning = (
         f"outside of the region {' and '.join(facts['rules'])} {now}:"
-        f" {kept:,} of {every:,} voxels stay ({100.0 * kept / every:.3g} %), {cells:,} of {all_cells:,} cells"
+        f" {stay:,} of {every:,} voxels stay ({100.0 * stay / every:.3g} %), {cells:,} of {all_cells:,} cells"
     )
     report = carry_report(volume, restricted.volume)
-    restricted.volume.report = amend(report, region=facts, warnings=[*report.get("warnings", ()), *warnings, said])
+    restricted.volume.report = amend(report, region=facts, warnings=[*report.get("warnings", ()), *warnings, warning])
     return restricted
 
 
@@ -173,10 +173,10 @@ def _find_region(
     for rule in rules:
         if rule.kind == "seed":
             continue
-        own = _mask_of(resident, rule, space, facts, warnings, follow_links)
-        if not own.count:
+        part = _mask_of(resident, rule, space, facts, warnings, follow_links)
+        if not part.count:
             raise UsageError(f"the region {rule} holds no voxel: {describe_extent(resident.volume, space)}")
-        by_kind[rule.kind] = by_kind[rule.kind] | own if rule.kind in by_kind else own
+        by_kind[rule.kind] = by_kind[rule.kind] | part if rule.kind in by_kind else part
     mask = reduce(lambda one, other: one & other, by_kind.values())
     if not mask.count:
         kinds = " and ".join(str(rule) for rule in rules if rule.kind != "seed")
@@ -336,23 +336,23 @@ class _StepRun:
         if not before:
             raise NoSurfaceError(f"{step} finds nothing to work on: no voxel lies from {low:g} to {high:g} HU")
         changed = _apply_morphology(mask, step)
-        taken, added = mask - changed, changed - mask
+        removed, added = mask - changed, changed - mask
         facts = {
             "band_hu": [_finite_or_none(low), _finite_or_none(high)],
             "voxels": before,
-            "taken": taken.count,
+            "taken": removed.count,
             "added": added.count,
         }
         self._check_loss(step, facts)
         inside, outside = _mean_values(resident.volume, mask, band)
         facts |= {"inside_hu": inside, "outside_hu": outside}
         volume = resident.volume
-        for voxels, value in ((taken, outside), (added, inside)):
+        for voxels, value in ((removed, outside), (added, inside)):
             if voxels.count:
                 resident = (~voxels).apply(resident, value)
         resident.volume.report = carry_report(volume, resident.volume)
         self.warnings.append(
-            f"{step} took {taken.count:,} of {before:,} voxels of {_describe_band(band)} and added {added.count:,}"
+            f"{step} took {removed.count:,} of {before:,} voxels of {_describe_band(band)} and added {added.count:,}"
         )
         return resident, facts
 

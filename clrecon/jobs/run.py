@@ -199,9 +199,9 @@ class JobReport(Record):
     peak_memory_bytes: int | None
 
     def _entries(self) -> dict[str, Any]:
-        own = super()._entries()
-        return {name: own[name] for name in own if name not in self._LAST} | {
-            name: own[name] for name in self._LAST if name in own
+        entries = super()._entries()
+        return {name: entries[name] for name in entries if name not in self._LAST} | {
+            name: entries[name] for name in self._LAST if name in entries
         }
 
 
@@ -280,11 +280,11 @@ class Run(Laps):
         """Read the input while the device opens and builds its kernels, see `DeviceOpening`; return both."""
         self.progress("device", 0, 0)
         with DeviceOpening(self.settings.device, trial) as opening:
-            found = read()
+            content = read()
             self.lap("read")
             device = opening.wait()
             self.lap("device")
-        return found, device
+        return content, device
 
     def stage(self, staging: AbstractContextManager[StagedAs]) -> StagedAs:
         """Write a file under a temporary name."""
@@ -337,7 +337,7 @@ class Run(Laps):
         *,
         on: Device | None = None,
         before: Iterable[str] = (),
-        **own: Any,
+        **entries: Any,
     ) -> Report:
         """Compose a report of this kind: a `ScanReport` has the certificate of `volume`, a `RunReport` the device `on`.
 
@@ -347,16 +347,16 @@ class Run(Laps):
         certificate = {} if volume is None else self.certificate(volume)
         self.logged = certificate.pop("warnings", ())
         if issubclass(kind, ScanReport):
-            own["volume"] = certificate
+            entries["volume"] = certificate
         if on is not None:
-            own.update(device=on.label, driver=on.driver, memory_allowed_bytes=self.settings.memory)
+            entries.update(device=on.label, driver=on.driver, memory_allowed_bytes=self.settings.memory)
         return kind(
             version=package_version(),
             platform=platform_name(),
             warnings=list(dict.fromkeys(map(str, (*before, *self.logged, *warnings)))),
             seconds=self.rounded(kind.PARTS),
             peak_memory_bytes=peak_memory_bytes(),
-            **own,
+            **entries,
         )
 
     def finish(self, report: Report, path: str | Path | None) -> Report:

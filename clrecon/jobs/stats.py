@@ -49,9 +49,9 @@ def measure_stats(
         label = tuple(settings.label) or None
         volume, labels = run.read_labelled(source, label)
         run.lap("read")
-        taken = resample_labels(labels, volume)
+        placed = resample_labels(labels, volume)
         percentiles = check_percentiles(PERCENTILES if settings.percentiles is None else settings.percentiles)
-        figures = measure_resampled(volume, labels, taken, label, percentiles=percentiles, progress=run.progress)
+        figures = measure_resampled(volume, labels, placed, label, percentiles=percentiles, progress=run.progress)
         run.lap("measure")
         device = None
         if settings.surface is not None:
@@ -62,11 +62,11 @@ def measure_stats(
             run.lap("surface")
         report = run.report(
             StatsReport,
-            [*taken.warnings, *chain(*(label.warnings for label in figures))],
+            [*placed.warnings, *chain(*(label.warnings for label in figures))],
             volume,
             labels=list(figures),
             percentiles=list(percentiles),
-            resampled=not taken.exact,
+            resampled=not placed.exact,
             affine_ijk_to_lps_mm=volume.affine.tolist(),
             device=None if device is None else device.current.label,
         )
@@ -91,15 +91,15 @@ def _measure_surfaces(
             meshes = fit_labels(resident, labels, level, progress=run.progress)
         else:
             meshes = extract_labels(resident, labels, level, solid=True, progress=run.progress)
-    found = []
-    for one in figures:
+    measured = []
+    for row in figures:
         surface: dict[str, Any] = {"kind": settings.surface, "iso_value_hu": level, "area_mm2": None, "ml": None}
-        mesh = meshes.get(one.number) if one.max_hu is not None and one.max_hu >= level else None  # not filled alone
+        mesh = meshes.get(row.number) if row.max_hu is not None and row.max_hu >= level else None  # not filled alone
         if mesh is not None:
             area, mm3 = measure_triangles(mesh.vertices, mesh.triangles)[:2]
             surface |= {"area_mm2": area, "ml": mm3 / 1000.0}
-        found.append(one.changed(surface=surface | {"cortex": mesh and mesh.report.get("cortex")}))
-    return found
+        measured.append(row.changed(surface=surface | {"cortex": mesh and mesh.report.get("cortex")}))
+    return measured
 
 
 _SURFACE_CELLS = ("area_mm2", "ml", "thickness_p5_mm", "thickness_p50_mm", "thickness_p95_mm", "error_p50_mm", "fitted")
@@ -119,14 +119,14 @@ def surface_cells(surface: Mapping[str, Any]) -> list[Any]:
 def as_csv(report: StatsReport) -> str:
     """Return one line a label, comma-separated, with a line of names above; empty cells where nothing was measured."""
     facts = ("number", "name", "voxels", "ml", "label_ml", "inside_share", "unmeasured")
-    own = (*facts, "mean_hu", "sd_hu", "min_hu", "max_hu")
+    columns = (*facts, "mean_hu", "sd_hu", "min_hu", "max_hu")
     wanted = [name_percentile(percent) for percent in report.percentiles]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     of_surface = [f"surface_{name}" for name in _SURFACE_CELLS] if any(one.surface for one in report.labels) else []
-    writer.writerow([*own, *(f"p{name}_hu" for name in wanted), *of_surface])
-    for one in report.labels:
-        cells = [*(one[name] for name in own), *(one["percentiles_hu"][name] for name in wanted)]
-        cells += surface_cells(one.surface) if one.surface else []
+    writer.writerow([*columns, *(f"p{name}_hu" for name in wanted), *of_surface])
+    for label in report.labels:
+        cells = [*(label[name] for name in columns), *(label["percentiles_hu"][name] for name in wanted)]
+        cells += surface_cells(label.surface) if label.surface else []
         writer.writerow([round(cell, 6) if isinstance(cell, float) else cell for cell in cells])
     return text.getvalue()

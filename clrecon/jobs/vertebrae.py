@@ -106,8 +106,8 @@ def _check_formats(source: str | Path, output: str | Path, picture: str | Path |
     kind = map_format(output)
     if kind in _NIFTI:
         load_nibabel()
-    elif (found := tell_format(source)) is not None:
-        raise UsageError(f"DICOM SEG belongs to a scan in DICOM, and this is {found}: write the label map as .nii.gz")
+    elif (form := tell_format(source)) is not None:
+        raise UsageError(f"DICOM SEG belongs to a scan in DICOM, and this is {form}: write the label map as .nii.gz")
     if picture is not None and not os.fspath(picture).lower().endswith(".png"):
         raise UsageError(f"the picture of the discs is a .png file, not {os.path.basename(os.fspath(picture))[-40:]!r}")
     if picture is not None:
@@ -171,14 +171,16 @@ def draw_vertebrae(split: VertebraSplit) -> bytes:
         ends = [((column + 0.5) * _PIXELS_PER_MM, (row + 0.5) * _PIXELS_PER_MM) for row, column in (front, back)]
         pen.line(ends, fill=_LINE_COLOR, width=2)
         row = 0.5 * (front[0] + back[0])
-        at = left.shape[1] + gap.shape[1], (row + 0.5) * _PIXELS_PER_MM
-        pen.line([at, (picture.width, at[1])], fill=_LINE_COLOR, width=1)
+        start = left.shape[1] + gap.shape[1], (row + 0.5) * _PIXELS_PER_MM
+        pen.line([start, (picture.width, start[1])], fill=_LINE_COLOR, width=1)
     font = load_font(_TEXT_MM * _PIXELS_PER_MM)
-    for one, row in zip(split.vertebrae, split.plane.rows, strict=True):
+    for item, row in zip(split.vertebrae, split.plane.rows, strict=True):
         text = (
-            f"{one.name}  {one.confidence:.2f}" + ("" if one.is_confident else "  low") + ("" if one.whole else "  cut")
+            f"{item.name}  {item.confidence:.2f}"
+            + ("" if item.is_confident else "  low")
+            + ("" if item.whole else "  cut")
         )
-        color = tuple(int(value) for value in shades[one.number]) if one.is_confident else _LOW_COLOR
+        color = tuple(int(value) for value in shades[item.number]) if item.is_confident else _LOW_COLOR
         pen.text((left.shape[1] + 6, (row + 0.5) * _PIXELS_PER_MM), text, color, font, "lm")
     stream = BytesIO()
     picture.save(stream, "PNG")
@@ -196,9 +198,9 @@ def _tint_slice(
     picture = np.repeat(large[..., None], 3, axis=2)
     rows, columns = np.indices(numbers.shape)
     for number, shade in shades.items():
-        own = numbers == number
+        pixels = numbers == number
         if number in doubted:
-            own &= (rows + columns) % 12 < 4
+            pixels &= (rows + columns) % 12 < 4
             shade = np.array(_LOW_COLOR)
-        picture[own] = (1.0 - _TINT) * picture[own] + _TINT * shade
+        picture[pixels] = (1.0 - _TINT) * picture[pixels] + _TINT * shade
     return np.asarray(np.rint(picture), dtype=np.uint8)

@@ -116,9 +116,9 @@ class _Places:
         di, dj = np.rint(np.linalg.solve(self.plane, away)).astype(int)
         j, i = np.nonzero(section)
         nj, ni = section.shape
-        held = (j + dj >= 0) & (j + dj < nj) & (i + di >= 0) & (i + di < ni)
+        is_inside = (j + dj >= 0) & (j + dj < nj) & (i + di >= 0) & (i + di < ni)
         shifted = np.zeros_like(section)
-        shifted[j[held] + dj, i[held] + di] = True
+        shifted[j[is_inside] + dj, i[is_inside] + di] = True
         return shifted
 
 
@@ -150,13 +150,13 @@ def _large_sections(holes: Bits, least: float) -> Bits:
     """Keep the parts of each slice that have at least so many voxels."""
     from scipy.ndimage import label as find_components
 
-    kept = np.zeros_like(holes)
+    large = np.zeros_like(holes)
     for k in np.flatnonzero(holes.any(axis=(1, 2))):
         components, _ = find_components(holes[k])
         sizes = np.bincount(components.ravel())
         sizes[0] = 0
-        kept[k] = (sizes >= least)[components]
-    return kept
+        large[k] = (sizes >= least)[components]
+    return large
 
 
 def _largest_open(holes: Bits, solid: Bits, places: _Places) -> Bits | None:
@@ -202,18 +202,18 @@ def _find_front(solid: Bits, main: Bits, places: _Places) -> tuple[Bits, Float64
         sizes = np.bincount(components[main])
         sizes[0] = 0
         front = components == np.argmax(sizes) if sizes.any() else np.zeros_like(solid)
-        found = np.flatnonzero(front.any(axis=(1, 2)))
-        if len(found) < 3:
+        rows = np.flatnonzero(front.any(axis=(1, 2)))
+        if len(rows) < 3:
             break
-        middles = np.array([_front_of(front[n], places.x(int(n)), places.y(int(n))) for n in found])
-        slope = np.clip(_slopes(places.heights[found], middles), -STEEPEST, STEEPEST)
+        middles = np.array([_front_of(front[n], places.x(int(n)), places.y(int(n))) for n in rows])
+        slope = np.clip(_slopes(places.heights[rows], middles), -STEEPEST, STEEPEST)
     return front, slope, wall
 
 
 def _slopes(heights: Float64Array, middles: Float64Array) -> Float64Array:
     """Return the median of the slopes between all pairs (Theil and Sen): slices with gaps beside the canal are few."""
-    one, other = np.triu_indices(len(heights), 1)
-    return np.asarray(np.median((middles[other] - middles[one]) / (heights[other] - heights[one])[:, None], axis=0))
+    i, j = np.triu_indices(len(heights), 1)
+    return np.asarray(np.median((middles[j] - middles[i]) / (heights[j] - heights[i])[:, None], axis=0))
 
 
 def _front_of(section: Bits, x: Float64Array, y: Float64Array) -> tuple[float, float]:

@@ -87,9 +87,9 @@ class _Patch:
     area: float
     outline: float
 
-    def is_drawn_again(self, other: _Patch) -> bool:
+    def is_drawn_again(self, patch: _Patch) -> bool:
         """Tell whether one of two nested contours leaves next to nothing of the other."""
-        return abs(self.area - other.area) <= _THIN_PIXELS * max(self.outline, other.outline)
+        return abs(self.area - patch.area) <= _THIN_PIXELS * max(self.outline, patch.outline)
 
     def common(self, other: _Patch) -> tuple[slice, slice]:
         """Return the part of the own pixels that lies in the box of another contour, which overlaps."""
@@ -112,15 +112,15 @@ def unite_contours(
     patches = {n: _fill_patch(unique[n], shape, pixel_mm) for n in sorted(set(chain(*near)))}
     crossing, nested, again = [], [], []
     for a, b in near:
-        one, other = patches[a], patches[b]
-        if not (one.inside[one.common(other)] & other.inside[other.common(one)]).any():
+        first, second = patches[a], patches[b]
+        if not (first.inside[first.common(second)] & second.inside[second.common(first)]).any():
             continue
-        if _goes_beyond(one, other) and _goes_beyond(other, one):
+        if _goes_beyond(first, second) and _goes_beyond(second, first):
             crossing.append((a, b))
-        elif one.is_drawn_again(other):
+        elif first.is_drawn_again(second):
             again.append((a, b))
         else:
-            nested.append((a, b) if one.area >= other.area else (b, a))
+            nested.append((a, b) if first.area >= second.area else (b, a))
     if not crossing and not again:
         return United(fill_contours(unique, shape), repeated)
     repeated += len({max(pair) for pair in again})
@@ -150,9 +150,9 @@ def _canonical(corners: NDArray[np.float64], pixel_mm: tuple[float, float]) -> b
     points = np.rint(corners * pixel_mm / ROUNDED_MM).astype(np.int64)
     points = points[np.any(points != np.roll(points, -1, axis=0), axis=1)]
     turns = []
-    for way in (points, points[::-1]):
-        first = int(np.lexsort(way.T)[0]) if len(way) else 0
-        turns.append(np.roll(way, -first, axis=0).tobytes())
+    for direction in (points, points[::-1]):
+        first = int(np.lexsort(direction.T)[0]) if len(direction) else 0
+        turns.append(np.roll(direction, -first, axis=0).tobytes())
     return min(turns)
 
 
@@ -195,10 +195,10 @@ def _fill_patch(corners: NDArray[np.float64], shape: tuple[int, int], pixel_mm: 
     )
 
 
-def _goes_beyond(one: _Patch, other: _Patch) -> bool:
+def _goes_beyond(first: _Patch, second: _Patch) -> bool:
     """True if `one` surely holds a pixel that `other` does not hold."""
-    left = one.surely.copy()
-    left[one.common(other)] &= ~other.maybe[other.common(one)]
+    left = first.surely.copy()
+    left[first.common(second)] &= ~second.maybe[second.common(first)]
     return bool(left.any())
 
 

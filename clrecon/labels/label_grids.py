@@ -44,17 +44,17 @@ class _Segment:
 
 def read_grid_labels(grid: GridFile, wanted: Wanted, progress: Progress = ignore_progress) -> LabelMap:
     """Read a label map or a segmentation; of segments in layers only those that are not wanted may overlap."""
-    segments, said = _read_segments(grid)
+    segments, remarks = _read_segments(grid)
     ni, nj, nk = grid.shape_ijk
     voxels = empty_labels(grid.name, (nk, nj, ni))
     if grid.layers > 1:
-        return _merge_layers(grid, voxels, segments, wanted, said, progress)
+        return _merge_layers(grid, voxels, segments, wanted, remarks, progress)
     for k, plane in enumerate(iterate_labels(grid)):
         if plane.any():
             voxels[k] = plane
         progress("read", k + 1, nk)
     names = {segment.number: segment.name for segment in segments} or _read_names(grid.extension)
-    return LabelMap(voxels, grid.affine, names, warnings=[*grid.warnings, *said])
+    return LabelMap(voxels, grid.affine, names, warnings=[*grid.warnings, *remarks])
 
 
 def _merge_layers(
@@ -62,7 +62,7 @@ def _merge_layers(
     voxels: NDArray[Any],
     segments: Sequence[_Segment],
     wanted: Wanted,
-    said: list[str],
+    remarks: list[str],
     progress: Progress,
 ) -> LabelMap:
     """Merge segments that are stored in layers into one map; numbers that several layers use are renumbered."""
@@ -80,8 +80,8 @@ def _merge_layers(
             painter.paint(k, number, stack[..., by_number[number].layer] == by_number[number].value)
         progress("read", k + 1, len(voxels))
     if unnamed:
-        said.append(f"{unnamed:,} voxels hold values that no segment of their layer has (LabelValue): left out")
-    return painter.finish(grid.affine, warnings=[*grid.warnings, *said])
+        remarks.append(f"{unnamed:,} voxels hold values that no segment of their layer has (LabelValue): left out")
+    return painter.finish(grid.affine, warnings=[*grid.warnings, *remarks])
 
 
 def _read_segments(grid: GridFile) -> tuple[list[_Segment], list[str]]:
@@ -90,10 +90,10 @@ def _read_segments(grid: GridFile) -> tuple[list[_Segment], list[str]]:
     3D Slicer wrote neither layers nor values before version 4.11: segment n was layer n.
     """
     fields = grid.fields
-    found = {int(m[1]) for field in fields if (m := re.fullmatch(r"Segment([0-9]{1,5})_(Name|ID|LabelValue)", field))}
-    if grid.layers > 1 and not found:
+    numbers = {int(m[1]) for field in fields if (m := re.fullmatch(r"Segment([0-9]{1,5})_(Name|ID|LabelValue)", field))}
+    if grid.layers > 1 and not numbers:
         raise RefusedInputError(f"{grid.name} has {grid.layers} layers and does not say which segments they hold")
-    names = {n: str(fields.get(f"Segment{n}_Name", "")) for n in sorted(found)}
+    names = {n: str(fields.get(f"Segment{n}_Name", "")) for n in sorted(numbers)}
     values = _read_numbers(grid, names, "LabelValue")
     layers = _read_numbers(grid, names, "Layer")
     if names and not values and not layers and list(names) == list(range(grid.layers)):
@@ -103,22 +103,22 @@ def _read_segments(grid: GridFile) -> tuple[list[_Segment], list[str]]:
         return [_Segment(n + 1, name, n, 1) for n, name in names.items()], warnings
     lost = {"LabelValue": len(names) - len(values), "Layer": len(names) - len(layers)}
     if grid.layers > 1 and any(lost.values()):
-        what, count = max(lost.items(), key=lambda item: item[1])
+        field_name, count = max(lost.items(), key=lambda item: item[1])
         raise RefusedInputError(
-            f"{grid.name} has {grid.layers} layers, and {count} of its {len(names)} segments have no {what}"
-            f" (SegmentN_{what}): which voxels are theirs is not known"
+            f"{grid.name} has {grid.layers} layers, and {count} of its {len(names)} segments have no {field_name}"
+            f" (SegmentN_{field_name}): which voxels are theirs is not known"
         )
     beyond = [layer for layer in layers.values() if not 0 <= layer < grid.layers]
     if beyond:
         raise RefusedInputError(f"{grid.name} has {grid.layers} layers, and a segment is in layer {beyond[0]}")
-    said = []
+    remarks = []
     if lost["LabelValue"]:
-        said.append(f"{lost['LabelValue']} of {len(names)} segments have no LabelValue: their names are not known")
+        remarks.append(f"{lost['LabelValue']} of {len(names)} segments have no LabelValue: their names are not known")
     empty = [n for n, value in values.items() if value == 0]
     if empty:
-        said.append(f"{len(empty)} of {len(names)} segments have LabelValue 0, which is no label: left out")
+        remarks.append(f"{len(empty)} of {len(names)} segments have LabelValue 0, which is no label: left out")
     segments = [_Segment(v, names[n], layers.get(n, 0), v) for n, v in values.items() if v != 0]
-    return segments, said
+    return segments, remarks
 
 
 def _read_numbers(grid: GridFile, segments: Iterable[int], key: str) -> dict[int, int]:
@@ -148,7 +148,7 @@ _GRID_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".hdr")
 
 def _list_files(folder: Path, follow_links: bool) -> Iterator[Path]:
     """List files as scans are looked for: links inside of the folder lead to what is there anyway, others wait."""
-    root, kept, lost = folder.resolve(), [], []
+    root, paths, lost = folder.resolve(), [], []
     for path in sorted(folder.iterdir(), key=lambda path: path.name):
         if path.name.startswith("."):
             continue
@@ -157,19 +157,19 @@ def _list_files(folder: Path, follow_links: bool) -> Iterator[Path]:
         elif not path.exists():
             lost.append(path)
         elif root not in path.resolve().parents:
-            kept.append(path)
+            paths.append(path)
     left = [
         (lost, "to a file that is not there", "restore it"),
-        (kept, "out of it", f"{name_parameter('follow_links', True)} follows links"),
+        (paths, "out of it", f"{name_parameter('follow_links', True)} follows links"),
     ]
     for links, whither, advice in left:
         masks = [escape_text(path.name) for path in links if path.name.lower().endswith(_GRID_SUFFIXES)]
-        if masks and not (follow_links and links is kept):
-            what = "mask of {} is a link" if len(masks) == 1 else "masks of {} are links"
+        if masks and not (follow_links and links is paths):
+            phrase = "mask of {} is a link" if len(masks) == 1 else "masks of {} are links"
             raise RefusedInputError(
-                f"{len(masks)} {what.format(escape_text(folder.name))} {whither} ({join_names(masks)}); {advice}"
+                f"{len(masks)} {phrase.format(escape_text(folder.name))} {whither} ({join_names(masks)}); {advice}"
             )
-    yield from kept if follow_links else ()
+    yield from paths if follow_links else ()
 
 
 def open_masks(folder: Path, *, follow_links: bool = False) -> dict[str, GridFile]:
@@ -213,9 +213,9 @@ def read_masks(folder: Path, masks: dict[str, GridFile], wanted: Wanted, progres
     for done, number in enumerate(order, start=1):
         grid = masks[names[number]]
         _check_same(first, grid)
-        own, others = _add(voxels, number, grid)
+        voxel_count, others = _add(voxels, number, grid)
         shared += others
-        empty += [] if own else [escape_text(names[number])]
+        empty += [] if voxel_count else [escape_text(names[number])]
         progress("read", done, len(order))
     warnings = [f"{warning} ({grid.name})" for grid in (masks[names[n]] for n in order) for warning in grid.warnings]
     if empty:
@@ -229,14 +229,14 @@ def read_masks(folder: Path, masks: dict[str, GridFile], wanted: Wanted, progres
     return LabelMap(voxels, first.affine, {number: names[number] for number in sorted(order)}, warnings=warnings)
 
 
-def _check_same(first: GridFile, other: GridFile) -> None:
-    shapes = [" x ".join(map(str, grid.shape_ijk)) for grid in (first, other)]
+def _check_same(first: GridFile, second: GridFile) -> None:
+    shapes = [" x ".join(map(str, grid.shape_ijk)) for grid in (first, second)]
     end = np.append(np.array(first.shape_ijk) - 1.0, 1.0)
     corners = np.array(list(product(*((0.0, last) for last in end[:3]), (1.0,))))
-    off = float(np.linalg.norm(corners @ (other.affine - first.affine).T, axis=1).max())
+    off = float(np.linalg.norm(corners @ (second.affine - first.affine).T, axis=1).max())
     if shapes[0] != shapes[1] or off > SAME_GRID_MM:
         raise RefusedInputError(
-            f"the masks {first.name} and {other.name} lie on two grids: {shapes[0]} and {shapes[1]} voxels"
+            f"the masks {first.name} and {second.name} lie on two grids: {shapes[0]} and {shapes[1]} voxels"
             + (f", up to {off:.3g} mm apart" if shapes[0] == shapes[1] else "")
             + "; the masks of one folder belong to one grid"
         )
@@ -244,21 +244,21 @@ def _check_same(first: GridFile, other: GridFile) -> None:
 
 def _add(voxels: NDArray[Any], number: int, grid: GridFile) -> tuple[int, int]:
     """Write a mask into voxels that are free, and return how many it has, and how many of them were not."""
-    value, own, shared = 0, 0, 0
+    value, painted, shared = 0, 0, 0
     for k, plane in enumerate(iterate_labels(grid)):
         mask = plane != 0
         if not mask.any():
             continue
-        found = np.unique(plane[mask])
-        value = value or int(found[0])
-        if len(found) > 1 or found[0] != value:
-            other = next(int(each) for each in found if each != value)
+        values = np.unique(plane[mask])
+        value = value or int(values[0])
+        if len(values) > 1 or values[0] != value:
+            second = next(int(each) for each in values if each != value)
             raise RefusedInputError(
-                f"{grid.name} holds several labels, {value} and {other}: a folder of masks has one file a structure;"
+                f"{grid.name} holds several labels, {value} and {second}: a folder of masks has one file a structure;"
                 " give a label map as a file"
             )
-        taken = voxels[k] != 0
-        own += np.count_nonzero(mask)
-        shared += np.count_nonzero(mask & taken)
-        voxels[k][mask & ~taken] = number
-    return own, shared
+        occupied = voxels[k] != 0
+        painted += np.count_nonzero(mask)
+        shared += np.count_nonzero(mask & occupied)
+        voxels[k][mask & ~occupied] = number
+    return painted, shared

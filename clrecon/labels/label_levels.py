@@ -68,8 +68,8 @@ def next_level(tried: Sequence[tuple[int, float]], wanted: float, rise: float) -
         level = low + round(min(max(share, 0.1), 0.9) * (high - low))  # keeps away from both ends
     else:
         if len(tried) > 1:
-            (one, volume), (other, other_volume) = sorted(tried, key=lambda trial: abs(trial[1] - wanted))[:2]
-            rise = min((other_volume - volume) / (other - one), 0.1 * rise)
+            (first, volume), (second, other_volume) = sorted(tried, key=lambda trial: abs(trial[1] - wanted))[:2]
+            rise = min((other_volume - volume) / (second - first), 0.1 * rise)
         level = best[0] + round((wanted - best[1]) / rise)
     if not low < level < high:
         level = (low + high) // 2
@@ -92,9 +92,11 @@ def count_faces(labels: NDArray[Any]) -> NDArray[np.int64]:
     for axis in range(3):
         size = labels.shape[axis]
         ends = np.take(labels, range(size - 1), axis=axis), np.take(labels, range(1, size), axis=axis)
-        for own, other in (ends, ends[::-1]):
-            for place, found in enumerate(((own != 0) & (other == 0), (own != 0) & (other != 0) & (own != other))):
-                faces[:, place] += np.bincount(own[found], minlength=len(faces))
+        for inner, outer in (ends, ends[::-1]):
+            for column, face in enumerate(
+                ((inner != 0) & (outer == 0), (inner != 0) & (outer != 0) & (inner != outer))
+            ):
+                faces[:, column] += np.bincount(inner[face], minlength=len(faces))
     return faces
 
 
@@ -116,8 +118,8 @@ def _count_between(part: NDArray[Any], number: int) -> NDArray[np.int64]:
     for axis in range(3):
         size = part.shape[axis]
         low, high = (np.take(part, ends, axis=axis) for ends in (range(size - 1), range(1, size)))
-        for own, other in ((low, high), (high, low)):
-            faces += np.bincount(other[(own == number) & (other != number)], minlength=len(faces))
+        for inner, outer in ((low, high), (high, low)):
+            faces += np.bincount(outer[(inner == number) & (outer != number)], minlength=len(faces))
     return faces
 
 
@@ -165,9 +167,9 @@ class Borders:
             outlets.append(faces[0] + faces[1:][table[1 : len(faces)] < 0].sum() > 0)
             shared = faces[1:].sum()  # a lead over another label moves a border as a level twice as large
             entries.append((row, row, (1.0 + DRIFT) * step * (faces[0] + 0.5 * shared)))
-            for other in np.flatnonzero(faces):
-                if other != 0 and table[other] >= 0:
-                    entries.append((row, int(table[other]), -0.5 * step * faces[other]))
+            for neighbour in np.flatnonzero(faces):
+                if neighbour != 0 and table[neighbour] >= 0:
+                    entries.append((row, int(table[neighbour]), -0.5 * step * faces[neighbour]))
         rows, columns, values = zip(*entries, strict=True)
         slopes = coo_array((values, (rows, columns)), shape=(len(numbers),) * 2).tocsc()
         _, parts = connected_components(slopes, directed=False)
@@ -290,10 +292,10 @@ def find_boxes(labels: NDArray[Any], numbers: tuple[int, ...], reach: tuple[int,
     """Find the box (k, j, i) of each number's samples in the grid, `reach` (i, j, k) samples and one more around."""
     from scipy.ndimage import find_objects
 
-    found = find_objects(labels, max_label=max(numbers, default=0))
+    objects = find_objects(labels, max_label=max(numbers, default=0))
     boxes = {}
     for number in numbers:
-        box = found[number - 1]
+        box = objects[number - 1]
         if box is not None:
             boxes[number] = tuple(
                 slice(max(0, part.start - more - 1), min(size, part.stop + more + 1))
@@ -323,13 +325,13 @@ def fill_solid(solid: NDArray[Any], labels: NDArray[Any], number: int, box: Box,
     from scipy.ndimage import binary_dilation, binary_erosion
 
     cube = np.ones((3, 3, 3), dtype=bool)
-    own, mask = solid[box] == number, labels[box] == number
+    body, mask = solid[box] == number, labels[box] == number
     deep = binary_erosion(mask, cube, border_value=1)
-    passable = np.pad(~(own | deep), 1, constant_values=True)
+    passable = np.pad(~(body | deep), 1, constant_values=True)
     if not closed:
         _close_ends(passable, box, solid.shape)
     outside = _reach_from_faces(passable)
-    wide = _reach_from_faces(passable & ~binary_dilation(np.pad(own, 1), cube))
+    wide = _reach_from_faces(passable & ~binary_dilation(np.pad(body, 1), cube))
     wide = binary_dilation(wide, cube) & outside
     inner = (slice(1, -1),) * 3
     filled = (mask & ~wide[inner]) | ((labels[box] == 0) & ~outside[inner])

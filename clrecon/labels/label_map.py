@@ -87,11 +87,11 @@ def find_number(label: str | int, names: Mapping[int, str], present: Collection[
             " give the number or the whole name"
         )
     if not named or named[0] not in present:
-        what = "is not in the label map" if not named or named[0] not in names else "has no voxel in the label map"
+        lack = "is not in the label map" if not named or named[0] not in names else "has no voxel in the label map"
         advice = ""
         if _level(text) is not None and any(re.fullmatch(r"vertebra_[0-9]+", name) for name in names.values()):
             advice = ". These are numbers and no levels: give clrecon vertebrae the level of one of them"
-        raise UsageError(f"label '{escape_text(text)}' {what}; there are: {list_labels(names, present)}{advice}")
+        raise UsageError(f"label '{escape_text(text)}' {lack}; there are: {list_labels(names, present)}{advice}")
     return named[0]
 
 
@@ -104,8 +104,8 @@ def label_suffix(name: str) -> str:
 def file_suffixes(names: Mapping[int, str]) -> dict[int, str]:
     """Return `label_suffix` of each name, with the number added where two files would have one name (ignoring case)."""
     suffixes = {number: label_suffix(name) for number, name in names.items()}
-    found = Counter(suffix.casefold() for suffix in suffixes.values())
-    unique = {n: s if found[s.casefold()] == 1 else f"{s}_{n}" for n, s in suffixes.items()}
+    counts = Counter(suffix.casefold() for suffix in suffixes.values())
+    unique = {n: s if counts[s.casefold()] == 1 else f"{s}_{n}" for n, s in suffixes.items()}
     if len({suffix.casefold() for suffix in unique.values()}) < len(unique):  # a suffix with number is also a name
         return {number: f"label_{number}" for number in names}
     return unique
@@ -272,17 +272,17 @@ class LabelMap(Grid, ShownAsHtml):
         Uneven slices are refused, and else what that refuses.
         """
         _check_even(to)
-        taken = public_function("resample_labels")(self, to)
-        return self.changed(taken.voxels, affine=to.affine, warnings=taken.warnings)
+        placed = public_function("resample_labels")(self, to)
+        return self.changed(placed.voxels, affine=to.affine, warnings=placed.warnings)
 
     def changed(self, voxels: NDArray[Any], names: Mapping[int, str] | None = None, **place: Any) -> LabelMap:
         """Return a map with other voxels and names, and whatever else of `LabelMap` is given."""
-        own = {
+        fields = {
             "affine": self._affine,
             "frame_of_reference_hash": self.frame_of_reference_hash,
             "warnings": self.warnings,
         }
-        return LabelMap(voxels, names=self._names if names is None else names, **{**own, **place})
+        return LabelMap(voxels, names=self._names if names is None else names, **{**fields, **place})
 
     @explains_arguments
     def save(self, path: str | os.PathLike[str], *, no_clobber: bool = False) -> int:
@@ -477,8 +477,8 @@ def _checked_voxels(voxels: ArrayLike) -> NDArray[Any]:
     low, high = int(array.min()), int(array.max())
     if low < 0 or high > LARGEST_NUMBER:
         raise UsageError(f"labels run from 0 to {LARGEST_NUMBER:,}, these from {low:,} to {high:,}")
-    made = np.ascontiguousarray(array, dtype=np.uint8 if array.dtype.itemsize == 1 else np.uint16)
-    if may_change(made):
-        made = made.copy() if np.shares_memory(made, voxels if isinstance(voxels, np.ndarray) else array) else made
-        made.flags.writeable = False
-    return made
+    data = np.ascontiguousarray(array, dtype=np.uint8 if array.dtype.itemsize == 1 else np.uint16)
+    if may_change(data):
+        data = data.copy() if np.shares_memory(data, voxels if isinstance(voxels, np.ndarray) else array) else data
+        data.flags.writeable = False
+    return data

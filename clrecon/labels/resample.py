@@ -183,9 +183,9 @@ def _take_aligned(labels: LabelMap, volume: Volume) -> NDArray[Any] | None:
         target.append(slice(begin, max(begin, end)))
     if view.shape == volume.voxels.shape and not any(part.start for part in (*source, *target)):
         return np.ascontiguousarray(view)
-    taken = np.zeros(volume.voxels.shape, dtype=labels.voxels.dtype)
-    taken[tuple(target)] = view[tuple(source)]
-    return taken
+    sampled = np.zeros(volume.voxels.shape, dtype=labels.voxels.dtype)
+    sampled[tuple(target)] = view[tuple(source)]
+    return sampled
 
 
 def _take_nearest(labels: LabelMap, volume: Volume, progress: Progress) -> tuple[NDArray[Any], bool]:
@@ -197,23 +197,23 @@ def _take_nearest(labels: LabelMap, volume: Volume, progress: Progress) -> tuple
     along = np.arange(ni)[:, None] * i_step, np.arange(nj)[:, None] * j_step
     # A map axis that only i (or only j) moves along needs one index for each column (or row).
     separable = [bool(np.ptp(along[0][:, a]) <= ON_GRID or np.ptp(along[1][:, a]) <= ON_GRID) for a in range(3)]
-    taken = np.zeros((nk, nj, ni), dtype=labels.voxels.dtype)
+    sampled = np.zeros((nk, nj, ni), dtype=labels.voxels.dtype)
     exact = True
     for k in range(nk):
         progress("resample", k, nk)
         index, valid = [], np.ones((1, 1), dtype=bool)
         for a, size in enumerate(labels.shape_ijk):
-            place = starts[k, a] + along[0][None, :, a] + along[1][:, None, a]
+            coordinate = starts[k, a] + along[0][None, :, a] + along[1][:, None, a]
             if separable[a]:
-                place = place[:, :1] if np.ptp(along[0][:, a]) <= ON_GRID else place[:1, :]
-            nearest = np.floor(place + (0.5 - TIES))
+                coordinate = coordinate[:, :1] if np.ptp(along[0][:, a]) <= ON_GRID else coordinate[:1, :]
+            nearest = np.floor(coordinate + (0.5 - TIES))
             inside = (nearest >= 0) & (nearest < size)
-            exact = exact and bool((np.abs(place - nearest)[inside] <= ON_GRID).all())
+            exact = exact and bool((np.abs(coordinate - nearest)[inside] <= ON_GRID).all())
             valid = valid & inside
             index.append(np.clip(nearest, 0, size - 1).astype(np.intp))
         if valid.any():
-            taken[k] = np.where(valid, labels.voxels[index[2], index[1], index[0]], 0)
-    return taken, exact
+            sampled[k] = np.where(valid, labels.voxels[index[2], index[1], index[0]], 0)
+    return sampled, exact
 
 
 def _shares_inside(labels: LabelMap, volume: Volume) -> dict[int, float]:
@@ -229,8 +229,8 @@ def _shares_inside(labels: LabelMap, volume: Volume) -> dict[int, float]:
             continue
         points = apply_affine(labels.affine, np.stack([i, j, np.full(len(i), k)], axis=1))
         places = volume.lps_to_ijk(points)
-        held = ((places >= -0.5) & (places <= upper)).all(axis=1)
-        inside += np.bincount(plane[j[held], i[held]], minlength=len(inside))
+        is_inside = ((places >= -0.5) & (places <= upper)).all(axis=1)
+        inside += np.bincount(plane[j[is_inside], i[is_inside]], minlength=len(inside))
     return {number: float(inside[number]) / count for number, count in labels.counts.items()}
 
 

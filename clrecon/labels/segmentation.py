@@ -272,10 +272,10 @@ def _join_maps(voxels: NDArray[Any], stack: FrameStack, pixels: _FramePixels, pr
         progress("read", frame + 1, len(stack.places))
 
 
-def _contradiction(name: str, stack: FrameStack, k: int, what: str) -> RefusedInputError:
+def _contradiction(name: str, stack: FrameStack, k: int, problem: str) -> RefusedInputError:
     return RefusedInputError(
         f"{name} contradicts itself: two of its frames lie at one place, slice {k + 1} of {stack.slices}, and give"
-        f" {what}"
+        f" {problem}"
     )
 
 
@@ -336,9 +336,9 @@ def _read_layout(dataset: Any, name: str, file_bytes: int) -> _Layout:
     compressed = dataset.file_meta.TransferSyntaxUID == RLE
     # RLE writes two bytes for up to 128, and a header of 64 bytes or more for each frame: it never shrinks more than 64
     # to 1.
-    held = file_bytes * (8 if layout.bits == 1 else 1) * (64 if compressed else 1)
+    most_bytes = file_bytes * (8 if layout.bits == 1 else 1) * (64 if compressed else 1)
     shape = (layout.columns, layout.rows, layout.frames)
-    check_size(name, shape, max(1, layout.bits // 8), held, compressed=False)
+    check_size(name, shape, max(1, layout.bits // 8), most_bytes, compressed=False)
     return layout
 
 

@@ -37,19 +37,19 @@ def iterate_labels(grid: GridFile) -> Iterator[NDArray[np.uint16]]:
         yield _as_labels(numbers, grid.name, grid.place(k))
 
 
-def _as_labels(stored: NDArray[Any], name: str, where: str) -> NDArray[Any]:
+def _as_labels(stored: NDArray[Any], name: str, subject: str) -> NDArray[Any]:
     if stored.dtype.kind == "f":
         with np.errstate(invalid="ignore"):
             broken = ~(stored == np.floor(stored))  # NaN and infinity give warnings; both are refused below
         if broken.any():
             raise RefusedInputError(
-                f"{name} is not a label map: {where} holds {float(stored[broken][0]):g}; labels are whole numbers,"
+                f"{name} is not a label map: {subject} holds {float(stored[broken][0]):g}; labels are whole numbers,"
                 " probabilities and CT images are not"
             )
     low, high = float(stored.min()), float(stored.max())
     if low < 0 or high > LARGEST_NUMBER:
         raise RefusedInputError(
-            f"{name} is not a label map that can be read: {where} holds {low if low < 0 else high:g};"
+            f"{name} is not a label map that can be read: {subject} holds {low if low < 0 else high:g};"
             f" labels run from 0 to {LARGEST_NUMBER:,}"
         )
     return stored.astype(np.uint16)
@@ -91,8 +91,8 @@ class Painter:
         if self._is_wanted[number]:
             before = plane[mask]
             before = before[self._is_wanted[before] & (before != number)]
-            for other, count in zip(*np.unique(before, return_counts=True), strict=True):
-                pair = (int(other), number)
+            for previous, count in zip(*np.unique(before, return_counts=True), strict=True):
+                pair = (int(previous), number)
                 self._shared[pair] = self._shared.get(pair, 0) + int(count)
         plane[mask] = number
 

@@ -62,8 +62,8 @@ class LabelFigures(Record):
     def warnings(self) -> list[str]:
         """What is doubtful about this label."""
         if not self.voxels:
-            where = "outside of the scan" if self.inside_share == 0.0 else "smaller than the voxels of the scan"
-            return [f"{self.name} has no voxel in the scan: its {format_digits(self.label_ml)} ml are {where}"]
+            reason = "outside of the scan" if self.inside_share == 0.0 else "smaller than the voxels of the scan"
+            return [f"{self.name} has no voxel in the scan: its {format_digits(self.label_ml)} ml are {reason}"]
         warnings = []
         if self.inside_share < 1.0:
             warnings.append(
@@ -144,7 +144,7 @@ def measure_labels(
 def measure_resampled(
     volume: Volume,
     labels: LabelMap,
-    taken: ResampledLabels,
+    placed: ResampledLabels,
     label: Sequence[str | int] | str | int | None = None,
     *,
     percentiles: Sequence[float] = PERCENTILES,
@@ -156,13 +156,13 @@ def measure_resampled(
     wanted = check_percentiles(percentiles)
     progress = progress or ignore_progress
     numbers = sorted(labels.choose(label))
-    boxes = find_objects(taken.voxels)
+    boxes = find_objects(placed.voxels)
     voxel_ml = slice_voxel_ml(volume)
     figures = []
-    for place, number in enumerate(numbers):
-        progress("measure labels", place, len(numbers))
+    for row, number in enumerate(numbers):
+        progress("measure labels", row, len(numbers))
         box = boxes[number - 1] if number <= len(boxes) else None
-        values, ml = _take(volume, taken.voxels, number, box, voxel_ml)
+        values, ml = _take(volume, placed.voxels, number, box, voxel_ml)
         figures.append(
             LabelFigures(
                 number=number,
@@ -170,7 +170,7 @@ def measure_resampled(
                 voxels=len(values),
                 ml=float(ml.sum()),
                 label_ml=label_ml(labels, number),
-                inside_share=taken.inside[number],
+                inside_share=placed.inside[number],
                 **_measure(values, ml, wanted),
             )
         )
@@ -204,7 +204,7 @@ def _measure(values: NDArray[Any], ml: NDArray[np.float64], percentiles: Sequenc
     up_to = np.cumsum(shares)
     # The sum of many shares is 1 but for rounding: 100 % is the last level, and a share that is met exactly counts.
     places = [int(np.searchsorted(up_to, percent / 100.0 - 1e-9)) for percent in percentiles]
-    found = {
+    at_percentiles = {
         name_percentile(percent): float(levels[min(place, len(levels) - 1)])
         for percent, place in zip(percentiles, places, strict=True)
     }
@@ -214,7 +214,7 @@ def _measure(values: NDArray[Any], ml: NDArray[np.float64], percentiles: Sequenc
         "sd_hu": deviation,
         "min_hu": float(levels[0]),
         "max_hu": float(levels[-1]),
-        "percentiles_hu": found,
+        "percentiles_hu": at_percentiles,
     }
 
 

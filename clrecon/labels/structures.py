@@ -148,8 +148,8 @@ def read_structures(
         if number in chosen:
             raster.refuse_misplaced()
         for k, mask in raster.fill():
-            for place in np.flatnonzero(grid.nearest == k):
-                painter.paint(int(place), number, mask)
+            for row in np.flatnonzero(grid.nearest == k):
+                painter.paint(int(row), number, mask)
         if number in chosen:
             warnings += raster.describe()
             if wanted.labels is not None:
@@ -219,14 +219,14 @@ class _Raster:
 
     def _unite(self, united: list[Corners], exclusive: list[Corners]) -> NDArray[np.bool_]:
         try:
-            found = unite_contours(united, self._shape, self._pixel_mm)
+            union = unite_contours(united, self._shape, self._pixel_mm)
         except ValueError as error:
             raise RefusedInputError(
                 f"{self._file}: {self._shown} has a slice that cannot be filled: {error}"
             ) from error
-        self._repeated += found.repeated
-        self._crossed += found.crossing > 0
-        return found.inside | fill_contours(exclusive, self._shape)
+        self._repeated += union.repeated
+        self._crossed += union.crossing > 0
+        return union.inside | fill_contours(exclusive, self._shape)
 
     def refuse_misplaced(self) -> None:
         """Refuse an ROI whose contours do not lie on the slices."""
@@ -248,39 +248,39 @@ class _Raster:
         return [f"{self._shown}{said}" for said in (*self._describe_omissions(), *self._describe_rules())]
 
     def _describe_omissions(self) -> list[str]:
-        said = []
+        parts = []
         if self._structure.others:
             kinds = ", ".join(f"{count} {escape_text(kind, 30)}" for kind, count in self._structure.others.items())
-            said.append(f": {kinds} left out, only closed planar contours enclose voxels")
+            parts.append(f": {kinds} left out, only closed planar contours enclose voxels")
         if self._short:
-            said.append(f": {count_of(self._short, 'contour')} of fewer than {_LEAST_POINTS} points left out")
+            parts.append(f": {count_of(self._short, 'contour')} of fewer than {_LEAST_POINTS} points left out")
         if self._beyond:
-            said.append(f": {count_of(self._beyond, 'contour')} beyond the slices of the scan left out")
+            parts.append(f": {count_of(self._beyond, 'contour')} beyond the slices of the scan left out")
         if not self._structure.contours:
-            said.append(" has no closed contour and no voxel")
+            parts.append(" has no closed contour and no voxel")
         elif self._slices:
             span = max(self._slices) - min(self._slices) + 1
             if span > len(self._slices):
-                said.append(
+                parts.append(
                     f": {span - len(self._slices)} of {span} slices from its first to its last have no contour and stay"
                     " empty"
                 )
-        return said
+        return parts
 
     def _describe_rules(self) -> list[str]:
-        said = []
+        parts = []
         if self._repeated:
-            said.append(f": {count_of(self._repeated, 'contour')} written twice, each counts once")
+            parts.append(f": {count_of(self._repeated, 'contour')} written twice, each counts once")
         if self._crossed:
-            said.append(f": contours cross on {count_of(self._crossed, 'slice')} and were united")
+            parts.append(f": contours cross on {count_of(self._crossed, 'slice')} and were united")
         if self._off_mm > ON_SLICE_MM:
-            said.append(f": contours lie up to {self._off_mm:.2f} mm off their slices, a tenth of the step is allowed")
+            parts.append(f": contours lie up to {self._off_mm:.2f} mm off their slices, a tenth of the step is allowed")
         if self._slices and self._on_centres:
-            said.append(
+            parts.append(
                 ": the contours run through voxel centres, as rt_utils writes them: only about half of the voxels on"
                 " the outline belong to the label"
             )
-        return said
+        return parts
 
 
 def _points_of(contour: _Contour, file: str, shown: str) -> NDArray[np.float64]:

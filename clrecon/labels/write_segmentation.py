@@ -45,8 +45,8 @@ def encode_segmentation(labels: LabelMap, slices: Sequence[SourceSlice], *, labe
     frames = [(number, k) for number in numbers for k in range(nk) if (labels.voxels[k] == number).any()]
     digest = hashlib.sha256(labels.voxels.tobytes() + first["SeriesInstanceUID"].encode() + repr(labels.names).encode())
 
-    def make_uid(what: str) -> str:
-        return ROOT + str(int.from_bytes(hashlib.sha256(digest.digest() + what.encode()).digest()[:16], "big"))
+    def make_uid(role: str) -> str:
+        return ROOT + str(int.from_bytes(hashlib.sha256(digest.digest() + role.encode()).digest()[:16], "big"))
 
     seg = _describe(make_uid, first)
     seg.ContentLabel = label

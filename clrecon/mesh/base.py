@@ -38,14 +38,14 @@ def _as_indices(values: ArrayLike) -> NDArray[np.uint32]:
 
 
 def _checked_columns(
-    own: str, columns: Mapping[str, NDArray[np.floating]], what: str, count: int
+    owner: str, columns: Mapping[str, NDArray[np.floating]], unit: str, count: int
 ) -> dict[str, NDArray[np.float32]]:
     checked = {}
     for name, values in columns.items():
         array = np.asarray(values)
         if array.shape != (count,) or array.dtype.kind not in "biuf":
             raise UsageError(
-                f"{own}[{name!r}] are {array.dtype} of shape {array.shape}: one number a {what} is needed, ({count},)"
+                f"{owner}[{name!r}] are {array.dtype} of shape {array.shape}: one number a {unit} is needed, ({count},)"
             )
         if not isinstance(name, str) or not (name.isascii() and name.isidentifier()):
             raise UsageError(f"values have names of letters, digits and _ that begin with a letter, not {name!r}")

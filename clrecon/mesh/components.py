@@ -87,21 +87,21 @@ def select_components(
     if chosen.keep.all():
         mesh.report.update(chosen.facts)
         return mesh
-    kept = keep_triangles(mesh, chosen.keep[chosen.label_of_triangle])
-    kept.report.update(chosen.facts)
-    return kept
+    selected = keep_triangles(mesh, chosen.keep[chosen.label_of_triangle])
+    selected.report.update(chosen.facts)
+    return selected
 
 
-def keep_triangles(mesh: Own, kept: NDArray[np.bool_]) -> Own:
-    triangles = mesh.triangles[kept]
+def keep_triangles(mesh: Own, is_kept: NDArray[np.bool_]) -> Own:
+    triangles = mesh.triangles[is_kept]
     used = np.zeros(mesh.vertex_count, dtype=bool)
     used[triangles] = True
     number = np.cumsum(used, dtype=np.int64) - 1
     normals = None if mesh.normals is None else mesh.normals[used]
-    made = type(mesh)(
+    reduced = type(mesh)(
         mesh.vertices[used], number[triangles].astype(np.uint32), normals, dict(mesh.report), trusted=True
     )  # fmt: skip
-    return give_values(mesh, made, used, kept)
+    return give_values(mesh, reduced, used, is_kept)
 
 
 def split_components(
@@ -136,12 +136,12 @@ def split_components(
     number[vertex_order] = np.arange(mesh.vertex_count)
     parts = []
     for part in range(len(kept)):
-        own = vertex_order[vertex_ends[part] : vertex_ends[part + 1]]
+        used = vertex_order[vertex_ends[part] : vertex_ends[part + 1]]
         faces = triangle_order[triangle_ends[part] : triangle_ends[part + 1]]
         triangles = (number[mesh.triangles[faces]] - vertex_ends[part]).astype(np.uint32)
-        normals = None if mesh.normals is None else mesh.normals[own]
-        made = type(mesh)(mesh.vertices[own], triangles, normals, {**mesh.report, **chosen.facts})
-        parts.append(give_values(mesh, made, own, faces))
+        normals = None if mesh.normals is None else mesh.normals[used]
+        piece = type(mesh)(mesh.vertices[used], triangles, normals, {**mesh.report, **chosen.facts})
+        parts.append(give_values(mesh, piece, used, faces))
     return parts
 
 
@@ -185,9 +185,9 @@ def _choose_components(
     if min_volume_ml is not None:
         # Rounding moves a vertex by at most half a step along each axis, and so changes the volume by at most the area
         # times that distance: a component of exactly the least volume is kept wherever it lies.
-        way = 0.5 * math.sqrt(3.0) * rounding_step(mesh.vertices)
+        rounding_mm = 0.5 * math.sqrt(3.0) * rounding_step(mesh.vertices)
         candidates = keep.copy()
-        keep &= volumes + way * areas / 1000.0 >= min_volume_ml
+        keep &= volumes + rounding_mm * areas / 1000.0 >= min_volume_ml
         if not keep.any():
             raise NoSurfaceError(
                 f"none of {count_of(int(np.count_nonzero(candidates)), 'component')} encloses {min_volume_ml:g} ml: "
@@ -223,7 +223,7 @@ def _find_at_seeds(
     """Find the components of `keep` that are nearest to a seed, and the distance of each seed from its component."""
     rows = np.flatnonzero(keep[label_of_triangle])
     triangles = mesh.triangles if len(rows) == mesh.triangle_count else mesh.triangles[rows]
-    found = np.zeros_like(keep)
+    has_seed = np.zeros_like(keep)
     distances = []
     for seed in seeds if np.ndim(seeds[0]) else [seeds]:
         point = as_numbers("seeds", seed)
@@ -231,11 +231,11 @@ def _find_at_seeds(
             raise UsageError(f"a seed is a point of three numbers in mm, not {seed}")
         row, distance = find_nearest_triangle(mesh.vertices, triangles, point)
         if distance > SEED_REACH_MM:
-            place = ", ".join(f"{value:g}" for value in point)
+            position = ", ".join(f"{value:g}" for value in point)
             raise UsageError(
-                f"the seed at LPS ({place}) mm lies {distance:.1f} mm from the nearest component, at most"
+                f"the seed at LPS ({position}) mm lies {distance:.1f} mm from the nearest component, at most"
                 f" {SEED_REACH_MM:g} mm are allowed: check its coordinates and their frame, LPS or RAS"
             )
-        found[label_of_triangle[rows[row]]] = True
+        has_seed[label_of_triangle[rows[row]]] = True
         distances.append(distance)
-    return found, distances
+    return has_seed, distances

@@ -46,9 +46,9 @@ class Edges:
 
     def border(self, vertex_count: int) -> NDArray[np.bool_]:
         """Mark the vertices at edges with one face, shape (vertex_count,)."""
-        found = np.zeros(vertex_count, dtype=bool)
-        found[self.ends[:, self.uses == 1].reshape(-1)] = True
-        return found
+        is_border = np.zeros(vertex_count, dtype=bool)
+        is_border[self.ends[:, self.uses == 1].reshape(-1)] = True
+        return is_border
 
 
 def _index_type(size: int) -> type[np.integer]:
@@ -96,20 +96,20 @@ class Fans:
 
     def touching(self, vertices: IntArray) -> IntArray:
         """Return the triangles that have one of some vertices, each once, in their order."""
-        found = np.zeros(len(self.rows) // 3, dtype=bool)
-        found[self.around(vertices)[0]] = True
-        return np.flatnonzero(found)
+        is_touching = np.zeros(len(self.rows) // 3, dtype=bool)
+        is_touching[self.around(vertices)[0]] = True
+        return np.flatnonzero(is_touching)
 
     def sums(self, values: NDArray[np.floating], triangles: NDArray[np.uint32], vertices: IntArray) -> NDArray[Any]:
         """Return sums of values (n, k) over all corners of the triangles around vertices: neighbours count twice."""
         rows, count = self.around(vertices)
-        found = np.zeros((len(vertices), values.shape[1]), values.dtype)
+        totals = np.zeros((len(vertices), values.shape[1]), values.dtype)
         used = count > 0
         if used.any():
-            one, two, three = (values[corners] for corners in triangles[rows].T)
-            of_rows = one + two + three
-            found[used] = np.add.reduceat(of_rows, (np.cumsum(count) - count)[used])
-        return found
+            first, two, three = (values[corners] for corners in triangles[rows].T)
+            of_rows = first + two + three
+            totals[used] = np.add.reduceat(of_rows, (np.cumsum(count) - count)[used])
+        return totals
 
 
 def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:
@@ -143,10 +143,10 @@ def opposite_half_edges(triangles: NDArray[np.uint32], edges: Edges) -> IntArray
     clean = edges.oriented and edges.boundary == 0 and edges.nonmanifold == 0
     if not clean or len(edges.half_edges) != triangles.size:
         return None
-    one, other = edges.half_edges[0::2], edges.half_edges[1::2]
+    first, second = edges.half_edges[0::2], edges.half_edges[1::2]
     opposite = np.empty_like(edges.half_edges)
-    opposite[one] = other
-    opposite[other] = one
+    opposite[first] = second
+    opposite[second] = first
     return opposite
 
 
@@ -180,16 +180,16 @@ def _find_split_vertices_of_any_mesh(corners: NDArray[np.uint32], vertex_count: 
     same_edge = np.ones(max(len(edges.half_edges) - 1, 0), dtype=bool)
     same_edge[edges.first[1:] - 1] = False
     pairs = np.flatnonzero(same_edge)
-    one, other = edges.half_edges[pairs], edges.half_edges[pairs + 1]
+    first, second = edges.half_edges[pairs], edges.half_edges[pairs + 1]
 
     def next_corner(half_edge: IntArray) -> IntArray:
         return half_edge + np.where(half_edge % 3 == 2, -2, 1)
 
-    one_end, other_end = next_corner(one), next_corner(other)
-    parallel = corners[one] == corners[other]
+    one_end, other_end = next_corner(first), next_corner(second)
+    parallel = corners[first] == corners[second]
     joined = (
-        np.concatenate([one, one_end]),
-        np.concatenate([np.where(parallel, other, other_end), np.where(parallel, other_end, other)]),
+        np.concatenate([first, one_end]),
+        np.concatenate([np.where(parallel, second, other_end), np.where(parallel, other_end, second)]),
     )
     count, labels = _connect(*joined, corners.size)
     vertex_of_fan = np.empty(count, dtype=np.int64)
@@ -211,9 +211,9 @@ def label_components(
     used = np.zeros(vertex_count, dtype=bool)
     used[triangles.reshape(-1)] = True
     if edges is None:
-        one = np.concatenate([triangles[:, 0], triangles[:, 1]])
-        other = np.concatenate([triangles[:, 1], triangles[:, 2]])
-        groups, labels = _connect(one, other, vertex_count)
+        starts = np.concatenate([triangles[:, 0], triangles[:, 1]])
+        ends = np.concatenate([triangles[:, 1], triangles[:, 2]])
+        groups, labels = _connect(starts, ends, vertex_count)
     else:
         groups, labels = _connect_edges(edges, vertex_count)
     if used.all():
@@ -238,14 +238,14 @@ def _connect_edges(edges: Edges, vertex_count: int) -> tuple[int, NDArray[np.int
     return int(count), labels.astype(np.int64)
 
 
-def _connect(one: NDArray[np.integer], other: NDArray[np.integer], size: int) -> tuple[int, NDArray[np.int64]]:
+def _connect(starts: NDArray[np.integer], ends: NDArray[np.integer], size: int) -> tuple[int, NDArray[np.int64]]:
     """Find the connected components of an undirected graph with `size` nodes, numbered in order of the first node."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     index_type = _index_type(size)
     # bool: duplicate entries are combined by "or"; as numbers their sum could be 0
-    links = (np.ones(len(one), dtype=bool), (one.astype(index_type), other.astype(index_type)))
+    links = (np.ones(len(starts), dtype=bool), (starts.astype(index_type), ends.astype(index_type)))
     count, labels = connected_components(coo_matrix(links, shape=(size, size)).tocsr(), directed=False)
     return int(count), labels.astype(np.int64)
 

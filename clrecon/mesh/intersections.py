@@ -52,11 +52,11 @@ def find_self_intersections(
     """
     sound = np.isfinite(vertices).all(axis=1)
     if not sound.all():
-        kept = np.flatnonzero(sound[triangles].all(axis=1))
+        rows = np.flatnonzero(sound[triangles].all(axis=1))
         cut = find_self_intersections(
-            np.where(sound[:, None], vertices, 0.0), triangles[kept], None if changed is None else changed[kept]
+            np.where(sound[:, None], vertices, 0.0), triangles[rows], None if changed is None else changed[rows]
         )
-        return kept[cut]
+        return rows[cut]
     if len(triangles) == 0:
         return np.zeros((0, 2), dtype=np.int64)
     columns = np.ascontiguousarray((vertices - local_origin(vertices)).T)
@@ -67,14 +67,14 @@ def find_self_intersections(
     pieces = entries.pieces()
     close = [np.zeros((0, 2), dtype=np.int64)] * (len(pieces) - 1)
 
-    def work(where: slice) -> None:
-        one, other = entries.overlapping(slice(pieces[where.start], pieces[where.start + 1]), changed)
-        common = np.zeros(len(one), dtype=np.int8)
+    def work(span: slice) -> None:
+        left, right = entries.overlapping(slice(pieces[span.start], pieces[span.start + 1]), changed)
+        common = np.zeros(len(left), dtype=np.int8)
         for corner in corners:
-            number = corner.take(one)
+            number = corner.take(left)
             for second in corners:
-                common += number == second.take(other)
-        close[where.start] = np.column_stack(planes.not_apart(points, one, other, common))
+                common += number == second.take(right)
+        close[span.start] = np.column_stack(planes.not_apart(points, left, right, common))
 
     def count(piece: slice) -> None:
         if steps is not None:
@@ -90,14 +90,14 @@ def _leave_cut(
 ) -> NDArray[np.int64]:
     cut = np.zeros(len(pairs), dtype=bool)
 
-    def work(where: slice) -> None:
-        corners = triangles[pairs[where].T].transpose(0, 2, 1)  # of which triangle, corner, pair
-        one, other = vertices[corners].astype(np.float64)
-        found = np.flatnonzero(_cut(one, other, corners[0][:, None] == corners[1]))
+    def work(span: slice) -> None:
+        corners = triangles[pairs[span].T].transpose(0, 2, 1)  # of which triangle, corner, pair
+        left, right = vertices[corners].astype(np.float64)
+        rows = np.flatnonzero(_cut(left, right, corners[0][:, None] == corners[1]))
         # Corners at one place count as the same: only pairs that cut each other otherwise can have some.
-        one, other = vertices[corners[:, :, found]].astype(np.float64)
-        found = found[_cut(one, other, (one[:, None] == other).all(axis=3)) & _has_area(one) & _has_area(other)]
-        cut[where.start + found] = True
+        left, right = vertices[corners[:, :, rows]].astype(np.float64)
+        rows = rows[_cut(left, right, (left[:, None] == right).all(axis=3)) & _has_area(left) & _has_area(right)]
+        cut[span.start + rows] = True
 
     in_threads(work, len(pairs), _PIECE)
     return pairs[cut]
@@ -132,10 +132,10 @@ def find_boxes(
     """Return the lowest and the highest coordinates of each triangle, shape (m, 3)."""
     low, high = (np.empty((len(triangles), 3), vertices.dtype) for _ in range(2))
 
-    def work(where: slice) -> None:
-        one, two, three = (vertices.take(corners, axis=0) for corners in triangles[where].T)
-        np.minimum(np.minimum(one, two), three, out=low[where])
-        np.maximum(np.maximum(one, two), three, out=high[where])
+    def work(span: slice) -> None:
+        first, two, three = (vertices.take(corners, axis=0) for corners in triangles[span].T)
+        np.minimum(np.minimum(first, two), three, out=low[span])
+        np.maximum(np.maximum(first, two), three, out=high[span])
 
     in_threads(work, len(triangles))
     return low, high
@@ -201,11 +201,11 @@ class _Entries:
         return np.unique(np.append(begin, len(pairs)))
 
     def overlapping(
-        self, where: slice, changed: NDArray[np.bool_] | None
+        self, span: slice, changed: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Find the pairs of triangles whose boxes overlap and that begin at one of these entries, each once."""
-        count = self.later[where]
-        here = np.repeat(np.arange(where.start, where.stop), count)
+        count = self.later[span]
+        here = np.repeat(np.arange(span.start, span.stop), count)
         there = np.arange(len(here)) - np.repeat(np.cumsum(count) - count, count) + here + 1
         if changed is not None:
             either = changed.take(self.triangle.take(here)) | changed.take(self.triangle.take(there))
@@ -214,12 +214,12 @@ class _Entries:
             overlap = low.take(here) <= high.take(there)
             overlap &= low.take(there) <= high.take(here)
             here, there = here[overlap], there[overlap]
-        one, other = self.triangle.take(here), self.triangle.take(there)
+        left, right = self.triangle.take(here), self.triangle.take(there)
         # Of the cells that both share, exactly one holds the lowest corner of the intersection of their boxes.
-        once = np.ones(len(one), dtype=bool)
+        once = np.ones(len(left), dtype=bool)
         for first, cell in zip(self.first, self.cell, strict=True):
-            once &= np.maximum(first.take(one), first.take(other)) == cell.take(here)
-        return one[once], other[once]
+            once &= np.maximum(first.take(left), first.take(right)) == cell.take(here)
+        return left[once], right[once]
 
 
 @dataclass(frozen=True)
@@ -237,27 +237,31 @@ class _Planes:
         """Return the planes of triangles whose corners, relative to one origin, are `points`, three of shape (3, m)."""
         normal, slack = np.empty((3, len(triangles))), np.empty(len(triangles))
         farthest = max(float(np.abs(corner).max()) for corner in points)
-        for where, _, p, q in corner_edges(vertices, triangles, np.zeros(3)):
-            normal[:, where] = cross_product(p, q)
-            slack[where] = 2.0**-46 * farthest * np.abs(p).sum(axis=0) * np.abs(q).sum(axis=0)
+        for piece, _, p, q in corner_edges(vertices, triangles, np.zeros(3)):
+            normal[:, piece] = cross_product(p, q)
+            slack[piece] = 2.0**-46 * farthest * np.abs(p).sum(axis=0) * np.abs(q).sum(axis=0)
         return cls(normal, np.einsum("am,am->m", normal, points[0]), slack)
 
     def not_apart(
-        self, points: Sequence[Float64Array], one: NDArray[np.int64], other: NDArray[np.int64], common: NDArray[np.int8]
+        self,
+        points: Sequence[Float64Array],
+        left: NDArray[np.int64],
+        right: NDArray[np.int64],
+        common: NDArray[np.int8],
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Leave out pairs of which one, but for its common corners, lies surely on one side of the other's plane."""
         for _ in range(2):
-            normal, offset, slack = self.normal.take(other, axis=1), self.offset.take(other), self.slack.take(other)
+            normal, offset, slack = self.normal.take(right, axis=1), self.offset.take(right), self.slack.take(right)
             above, below = common.copy(), common.copy()
             for corner in points:
                 side = -offset
                 for along, row in zip(normal, corner, strict=True):
-                    side += along * row.take(one)
+                    side += along * row.take(left)
                 above += side > slack
                 below += side < -slack
             near = np.flatnonzero((above != 3) & (below != 3))
-            one, other, common = other.take(near), one.take(near), common.take(near)
-        return one, other
+            left, right, common = right.take(near), left.take(near), common.take(near)
+        return left, right
 
 
 def _enter(low: Float64Array, high: Float64Array) -> _Entries:
@@ -294,59 +298,59 @@ def _enter_into_cells(first: NDArray[np.int32], last: NDArray[np.int32]) -> tupl
     return triangle, cell
 
 
-def _cut(one: Float64Array, other: Float64Array, same: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _cut(left: Float64Array, right: Float64Array, same: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """True where triangles cut each other; corners have shape (3, k, 3), and `same` (3, 3, k) says which are one."""
-    found = np.zeros(one.shape[1], dtype=bool)
+    is_cut = np.zeros(left.shape[1], dtype=bool)
     common = same.sum(axis=(0, 1))
     rows = np.flatnonzero(common == 0)
-    found[rows] = _meet(one[:, rows], other[:, rows])
+    is_cut[rows] = _meet(left[:, rows], right[:, rows])
     for count, meet in ((1, _meet_beside_corner), (2, _fold)):
         rows = np.flatnonzero(common == count)
         # First comes the common corner, or the one that is not common.
         first = [(same[:, :, rows].any(axis=axis) == (count == 1)).argmax(axis=0) for axis in (1, 0)]
         order = [(np.arange(3)[:, None] + start) % 3 for start in first]
-        found[rows] = meet(one[order[0], rows], other[order[1], rows])
-    return found
+        is_cut[rows] = meet(left[order[0], rows], right[order[1], rows])
+    return is_cut
 
 
 def _meet(
-    one: Float64Array, other: Float64Array, edges: tuple[tuple[int, int], ...] = ((0, 1), (1, 2), (2, 0))
+    left: Float64Array, right: Float64Array, edges: tuple[tuple[int, int], ...] = ((0, 1), (1, 2), (2, 0))
 ) -> NDArray[np.bool_]:
     """True where one of these edges of either triangle has a point of the other triangle."""
-    found = np.zeros(one.shape[1], dtype=bool)
-    rows = np.arange(one.shape[1])
+    meets = np.zeros(left.shape[1], dtype=bool)
+    rows = np.arange(left.shape[1])
     ends = sorted(set(chain(*edges)))
     for _ in range(2):
         sides = np.zeros((3, len(rows)), dtype=np.int8)
         for end in ends:
-            sides[end] = _side(other[0], other[1], other[2], one[end])
+            sides[end] = _side(right[0], right[1], right[2], left[end])
         # A triangle wholly on one side of the other's plane cannot meet the other.
         astride = (sides[ends] <= 0).any(axis=0) & (sides[ends] >= 0).any(axis=0)
-        rows, one, other, sides = rows[astride], one[:, astride], other[:, astride], sides[:, astride]
+        rows, left, right, sides = rows[astride], left[:, astride], right[:, astride], sides[:, astride]
         for a, b in edges:
             through = np.flatnonzero((sides[a] * sides[b] <= 0) & (sides[a] != sides[b]))
-            p, q = one[a][through], one[b][through]
-            turns = np.array([_side(p, q, other[c][through], other[(c + 1) % 3][through]) for c in range(3)])
-            found[rows[through]] |= (turns >= 0).all(axis=0) | (turns <= 0).all(axis=0)
+            p, q = left[a][through], left[b][through]
+            turns = np.array([_side(p, q, right[c][through], right[(c + 1) % 3][through]) for c in range(3)])
+            meets[rows[through]] |= (turns >= 0).all(axis=0) | (turns <= 0).all(axis=0)
             within = np.flatnonzero((sides[a] == 0) & (sides[b] == 0))
-            found[rows[within]] |= _meet_in_plane(one[a][within], one[b][within], other[:, within])
-        one, other = other, one
-    return found
+            meets[rows[within]] |= _meet_in_plane(left[a][within], left[b][within], right[:, within])
+        left, right = right, left
+    return meets
 
 
-def _meet_beside_corner(one: Float64Array, other: Float64Array) -> NDArray[np.bool_]:
+def _meet_beside_corner(left: Float64Array, right: Float64Array) -> NDArray[np.bool_]:
     """True where triangles with a common first corner have another point in common."""
-    return _meet(one, other, ((1, 2),))
+    return _meet(left, right, ((1, 2),))
 
 
-def _fold(one: Float64Array, other: Float64Array) -> NDArray[np.bool_]:
+def _fold(left: Float64Array, right: Float64Array) -> NDArray[np.bool_]:
     """True where triangles with a common edge, opposite to their first corners, lie in one plane on one side of it."""
-    found = _side(one[0], one[1], one[2], other[0]) == 0
-    rows = np.flatnonzero(found)
-    axis = _steepest(one[:, rows])
-    u, v, own, its = (_project(corner[rows], axis) for corner in (one[1], one[2], one[0], other[0]))
-    found[rows] = _turn(u, v, own) * _turn(u, v, its) > 0
-    return found
+    folds = _side(left[0], left[1], left[2], right[0]) == 0
+    rows = np.flatnonzero(folds)
+    axis = _steepest(left[:, rows])
+    u, v, third, its = (_project(corner[rows], axis) for corner in (left[1], left[2], left[0], right[0]))
+    folds[rows] = _turn(u, v, third) * _turn(u, v, its) > 0
+    return folds
 
 
 def _meet_in_plane(p: Float64Array, q: Float64Array, triangle: Float64Array) -> NDArray[np.bool_]:

@@ -135,9 +135,9 @@ class Mesh(BaseMesh, ShownAsHtml):
         NoSurfaceError
             The mesh is empty.
         """
-        own = copy.copy(self)
-        own.report = dict(self.report)
-        return select_components(own, count)
+        whole = copy.copy(self)
+        whole.report = dict(self.report)
+        return select_components(whole, count)
 
     def merge(self, *others: Mesh) -> Mesh:
         """Return this mesh and others as one, each as it is: no vertex is joined and nothing is cut.
@@ -156,15 +156,15 @@ class Mesh(BaseMesh, ShownAsHtml):
         facts = {
             name: value for name, value in self.report.items() if all(part.report.get(name) == value for part in parts)
         }
-        made = Mesh(
+        merged = Mesh(
             np.concatenate([part.vertices for part in parts]),
             np.concatenate(triangles),
             np.concatenate(normals) if len(normals) == len(parts) else None,
             facts | ({"voxel_mm": min(steps)} if steps else {}),
         )
-        made.values = _joined([(part.values, part.vertex_count) for part in parts])
-        made.face_values = _joined([(part.face_values, part.triangle_count) for part in parts])
-        return made
+        merged.values = _joined([(part.values, part.vertex_count) for part in parts])
+        merged.face_values = _joined([(part.face_values, part.triangle_count) for part in parts])
+        return merged
 
     @explains_arguments
     def sample(self, volume: Volume, name: str = "HU", order: int = 1, outside: float = float("nan")) -> Mesh:
@@ -182,11 +182,11 @@ class Mesh(BaseMesh, ShownAsHtml):
         outside : float
             Value beyond the voxels.
         """
-        made = give_values(self, copy.copy(self))
-        made.report = dict(self.report)
-        made.values[name] = Volume.sample(volume, self.vertices, order=order, outside=outside).astype(np.float32)
-        made.checked_values()
-        return made
+        sampled = give_values(self, copy.copy(self))
+        sampled.report = dict(self.report)
+        sampled.values[name] = Volume.sample(volume, self.vertices, order=order, outside=outside).astype(np.float32)
+        sampled.checked_values()
+        return sampled
 
     @explains_arguments
     def clip(self, point: ArrayLike, normal: ArrayLike, *, capped: bool = True) -> Mesh:
@@ -207,24 +207,24 @@ class Mesh(BaseMesh, ShownAsHtml):
         """
         from clrecon.mesh.vtk import clip_surface, unwrap_polydata
 
-        surface, at, along, origin = self._cut_by(point, normal)
+        surface, origin_point, along, origin = self._cut_by(point, normal)
         if capped and find_edges(self.triangles, self.vertex_count).boundary:
             raise UsageError("the mesh is open, so that its cut cannot be filled: capped=False leaves it open")
-        part = clip_surface(surface, at, along, capped)
+        part = clip_surface(surface, origin_point, along, capped)
         if not part.GetNumberOfCells():
-            off = float(((at + origin - self.vertices) @ along).min())
+            off = float(((origin_point + origin - self.vertices) @ along).min())
             raise NoSurfaceError(f"nothing of the mesh lies on that side of the plane: it ends {abs(off):.4g} mm off")
         raw, _ = unwrap_polydata(part)
-        made = Mesh(raw.vertices + origin, raw.triangles, report=dict(self.report))
-        made.values = {name: raw.values[name] for name in self.values}
+        clipped = Mesh(raw.vertices + origin, raw.triangles, report=dict(self.report))
+        clipped.values = {name: raw.values[name] for name in self.values}
         if not capped:
-            made.face_values = {name: raw.face_values[name] for name in self.face_values}
+            clipped.face_values = {name: raw.face_values[name] for name in self.face_values}
         elif self.face_values:
             middles = raw.vertices[raw.triangles].mean(axis=1, dtype=np.float64)
             _, rows, _ = TriangleTree(self.vertices - origin, self.triangles).nearest(middles)
             cap = raw.face_values["Labels"] > 0
-            made.face_values = {name: np.where(cap, np.nan, own[rows]) for name, own in self.face_values.items()}
-        return made
+            clipped.face_values = {name: np.where(cap, np.nan, own[rows]) for name, own in self.face_values.items()}
+        return clipped
 
     @explains_arguments
     def section(self, point: ArrayLike, normal: ArrayLike) -> list[NDArray[np.float64]]:
@@ -237,14 +237,14 @@ class Mesh(BaseMesh, ShownAsHtml):
         """
         from clrecon.mesh.vtk import cut_surface
 
-        surface, at, along, origin = self._cut_by(point, normal)
-        return [line + origin for line in cut_surface(surface, at, along)]
+        surface, on_plane, along, origin = self._cut_by(point, normal)
+        return [line + origin for line in cut_surface(surface, on_plane, along)]
 
     def _cut_by(self, point: ArrayLike, normal: ArrayLike) -> tuple[Any, Any, Any, NDArray[np.float64]]:
         """Return the surface near zero for VTK, a plane there, its normal of length 1, and the place of zero."""
         from clrecon.mesh.vtk import wrap_polydata
 
-        at, along = (
+        on_plane, along = (
             _finite_points(vector, name, one=True)[0] for vector, name in ((point, "point"), (normal, "normal"))
         )
         if not along.any():
@@ -254,7 +254,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         surface = wrap_polydata(
             self.vertices - origin, self.triangles, None, self.checked_values(), self.checked_face_values()
         )
-        return surface, at - origin, along / np.linalg.norm(along), origin
+        return surface, on_plane - origin, along / np.linalg.norm(along), origin
 
     def _origin(self) -> NDArray[np.float64]:
         if not self.triangle_count:
@@ -352,7 +352,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         """
         trimesh = import_package("trimesh", "to_trimesh")
         self.check()
-        made = trimesh.Trimesh(
+        converted = trimesh.Trimesh(
             np.array(self.vertices, dtype=np.float64),
             self.triangles.astype(np.int64),
             vertex_normals=None if self.normals is None else self.normals.astype(np.float64),
@@ -361,8 +361,8 @@ class Mesh(BaseMesh, ShownAsHtml):
             face_attributes=self.checked_face_values(),
             process=False,
         )
-        made.units = "mm"
-        return made
+        converted.units = "mm"
+        return converted
 
     @classmethod
     @explains_arguments
@@ -406,9 +406,9 @@ class Mesh(BaseMesh, ShownAsHtml):
     def _of_others(cls, raw: RawMesh, space: str, voxel: Any) -> Mesh:
         """Make a mesh of arrays in ``space``, of a scan whose shortest voxel step is known or None."""
         vertices, normals = turn_to_lps(space, raw.vertices, raw.normals)
-        made = cls(vertices, raw.triangles, normals, None if voxel is None else {"voxel_mm": float(voxel)})
-        made.values, made.face_values = dict(raw.values), dict(raw.face_values)
-        return made
+        mesh = cls(vertices, raw.triangles, normals, None if voxel is None else {"voxel_mm": float(voxel)})
+        mesh.values, mesh.face_values = dict(raw.values), dict(raw.face_values)
+        return mesh
 
     def show(self) -> None:
         """Show the mesh in a window of pyvista, until it is closed; see `clrecon.show`.

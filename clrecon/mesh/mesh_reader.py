@@ -93,8 +93,8 @@ def _report_of_file(raw: RawMesh, space: str, source: str) -> dict[str, Any]:
     }
     report: dict[str, Any] = {"file": facts}
     if len(raw.parts) == 1:
-        own = {"part_name": facts["parts"][0]["name"], "color": facts["parts"][0]["color"]}
-        report |= {name: value for name, value in own.items() if value is not None}
+        part_facts = {"part_name": facts["parts"][0]["name"], "color": facts["parts"][0]["color"]}
+        report |= {name: value for name, value in part_facts.items() if value is not None}
     if raw.iso_value_hu is not None and np.isfinite(raw.iso_value_hu):
         report["iso_value_hu"] = raw.iso_value_hu
     if raw.certificate:

@@ -139,13 +139,13 @@ def measure_triangles(
     columns, origin = np.ascontiguousarray(vertices.T.astype(np.float64)), local_origin(vertices)
     pieces: dict[int, tuple[float, ...]] = {}
 
-    def measure(where: slice) -> None:
-        corner, p, q = take_edges(columns, triangles[where], origin)
+    def measure(piece: slice) -> None:
+        corner, p, q = take_edges(columns, triangles[piece], origin)
         cross = cross_product(p, q)
         squares = np.einsum("ij,ij->j", cross, cross)
         shortest = min(np.einsum("ij,ij->j", edge, edge).min() for edge in (p, q, q - p))
         volume = np.einsum("ij,ij->", corner, cross)
-        pieces[where.start] = np.sqrt(squares).sum(), volume, int(np.count_nonzero(squares == 0.0)), shortest
+        pieces[piece.start] = np.sqrt(squares).sum(), volume, int(np.count_nonzero(squares == 0.0)), shortest
 
     in_threads(measure, len(triangles))
     if not pieces:
@@ -199,8 +199,8 @@ def measure_components(
         return twice_area, six_volumes
     # Every piece adds to all components: with many components, larger pieces save time.
     size = max(CHUNK, count)
-    for where, corner, cross in cross_products(vertices, triangles, local_origin(vertices), size):
-        label = label_of_triangle[where]
+    for piece, corner, cross in cross_products(vertices, triangles, local_origin(vertices), size):
+        label = label_of_triangle[piece]
         if areas:
             twice_area += np.bincount(label, np.sqrt(np.einsum("ij,ij->j", cross, cross)), count)
         if volumes:

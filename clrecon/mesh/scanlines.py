@@ -29,10 +29,10 @@ def cross_lines(
     Returns the line of each crossing, a number below a * b, its place along the line in steps, and its triangle.
     """
     flat = vertices[:, :2] + ASIDE
-    found = [
+    crossings = [
         _cross_some(vertices, flat, triangles[where], shape, where.start) for where in chunks(len(triangles), _PIECE)
     ]
-    lines, places, rows = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    lines, places, rows = (np.concatenate(parts) for parts in zip(*crossings, strict=True))
     return lines, places, rows
 
 
@@ -49,10 +49,10 @@ def _cross_some(
     a, b = low[rows, 0] + inner // size[rows, 1], low[rows, 1] + inner % size[rows, 1]
     names = triangles[rows]
     sides, shares = [], []
-    for one, two in pairwise((*names.T, names[:, 0])):
+    for from_corner, two in pairwise((*names.T, names[:, 0])):
         # from the lower to the higher number: both triangles of an edge find the same side of it
-        turned = one > two
-        start, end = flat[np.where(turned, two, one)], flat[np.where(turned, one, two)]
+        turned = from_corner > two
+        start, end = flat[np.where(turned, two, from_corner)], flat[np.where(turned, from_corner, two)]
         area = (end[:, 0] - start[:, 0]) * (b - start[:, 1]) - (end[:, 1] - start[:, 1]) * (a - start[:, 0])
         sides.append((area >= 0.0) ^ turned)
         shares.append(np.where(turned, -area, area))

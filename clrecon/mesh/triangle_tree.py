@@ -73,8 +73,8 @@ class TriangleTree:
         places, rows = np.empty((len(points), 3)), np.empty(len(points), np.int64)
         squares = np.empty(len(points))
 
-        def work(where: slice) -> None:
-            places[where], rows[where], squares[where] = self._find_nearest(points[where])
+        def work(piece: slice) -> None:
+            places[piece], rows[piece], squares[piece] = self._find_nearest(points[piece])
 
         in_threads(work, len(points), PIECE)
         return places, rows, np.sqrt(squares)
@@ -83,11 +83,11 @@ class TriangleTree:
         """Return where lines from `starts` to `ends`, shape (k, 3), first meet the surface; NaN where they do not."""
         shares = np.full(len(starts), np.inf)
 
-        def work(where: slice) -> None:
+        def work(piece: slice) -> None:
             for reach in _REACHES:
-                left = np.flatnonzero(np.isinf(shares[where]))
-                lines = starts[where][left], ends[where][left] - starts[where][left]
-                shares[where][left] = self._find_first(*lines, reach)
+                left = np.flatnonzero(np.isinf(shares[piece]))
+                lines = starts[piece][left], ends[piece][left] - starts[piece][left]
+                shares[piece][left] = self._find_first(*lines, reach)
 
         in_threads(work, len(starts), PIECE)
         return np.where(np.isinf(shares), np.nan, shares)[:, None] * (ends - starts) + starts
@@ -95,10 +95,10 @@ class TriangleTree:
     def _find_nearest(self, points: Points) -> tuple[Points, NDArray[np.int64], NDArray[np.float64]]:
         columns, every = np.ascontiguousarray(points.T), np.arange(len(points))
         start = np.maximum(np.searchsorted(self._firsts, self._curve.codes(2.0 * columns), side="right") - 1, 0)
-        found = self._measure(columns, every, start)
+        nearest = self._measure(columns, every, start)
         pairs = self._descend(
             lambda items, boxes: _squares_to_boxes(columns[:, items], boxes),
-            found[2].copy(),
+            nearest[2].copy(),
             lambda items, boxes: _squares_to_corners(columns[:, items], boxes),
         )
         if pairs is None:
@@ -107,14 +107,14 @@ class TriangleTree:
             return places, rows, squares
         items, leaves, bounds = pairs
         for some in (_least_of(items, bounds)[1], slice(None)):  # the nearest box of each first: it rules out others
-            near = bounds[some] < found[2][items[some]]
+            near = bounds[some] < nearest[2][items[some]]
             here = items[some][near]
-            other = self._measure(columns[:, here], here, leaves[some][near])
-            here, best = _least_of(here, other[2])
-            nearer = other[2][best] < found[2][here]
-            for values, others in zip(found, other, strict=True):
+            candidates = self._measure(columns[:, here], here, leaves[some][near])
+            here, best = _least_of(here, candidates[2])
+            nearer = candidates[2][best] < nearest[2][here]
+            for values, others in zip(nearest, candidates, strict=True):
                 values[here[nearer]] = others[best[nearer]]
-        return found
+        return nearest
 
     def _measure(
         self, columns: Columns, items: NDArray[np.intp], leaves: NDArray[np.intp]
@@ -137,10 +137,10 @@ class TriangleTree:
 
     def _find_first(self, starts: Points, ways: Points, reach: float) -> NDArray[np.float64]:
         """Return the share of each way at which a line first meets the surface, infinity beyond `reach`."""
-        begin, way = np.ascontiguousarray(starts.T), np.ascontiguousarray(ways.T)
-        way[way == 0.0] = np.finfo(float).tiny
+        begin, direction = np.ascontiguousarray(starts.T), np.ascontiguousarray(ways.T)
+        direction[direction == 0.0] = np.finfo(float).tiny
         pairs = self._descend(
-            lambda items, boxes: _enter_boxes(begin[:, items], way[:, items], boxes), np.full(len(starts), reach)
+            lambda items, boxes: _enter_boxes(begin[:, items], direction[:, items], boxes), np.full(len(starts), reach)
         )
         if pairs is None:
             halves = zip(np.array_split(starts, 2), np.array_split(ways, 2), strict=True)
@@ -149,10 +149,10 @@ class TriangleTree:
         a, b, c = self._corners(rows)
         shares = _shares_of_lines(begin[:, items], ways.T[:, items], a, b - a, c - a)
         shares[~(shares <= reach)] = np.inf
-        found = np.full(len(starts), np.inf)
+        first_shares = np.full(len(starts), np.inf)
         items, best = _least_of(items, shares)
-        found[items] = shares[best]
-        return found
+        first_shares[items] = shares[best]
+        return first_shares
 
     def _descend(
         self,
@@ -216,12 +216,12 @@ def _squares_to_corners(columns: Columns, boxes: NDArray[np.float32]) -> NDArray
     return squares
 
 
-def _enter_boxes(begin: Columns, way: Columns, boxes: NDArray[np.float32]) -> NDArray[np.float64]:
+def _enter_boxes(begin: Columns, direction: Columns, boxes: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the share of its way at which each line (3, k) enters boxes (k, 6, `_FAN`), infinity if it does not."""
     enter, leave = np.zeros((len(boxes), _FAN)), np.full((len(boxes), _FAN), np.inf)
     with np.errstate(over="ignore"):
         for axis in range(3):
-            sides = [(boxes[:, side] - begin[axis, :, None]) / way[axis, :, None] for side in (axis, axis + 3)]
+            sides = [(boxes[:, side] - begin[axis, :, None]) / direction[axis, :, None] for side in (axis, axis + 3)]
             np.maximum(enter, np.minimum(*sides), out=enter)
             np.minimum(leave, np.maximum(*sides), out=leave)
     return np.where((enter <= leave) & (boxes[:, 0] <= boxes[:, 3]), enter, np.inf)
@@ -258,18 +258,18 @@ def nearest_shares(
     return u, v, gain
 
 
-def _shares_of_lines(begin: Columns, way: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
+def _shares_of_lines(begin: Columns, direction: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
     """Return the share of its way at which each line meets its triangle, else infinity (Moeller and Trumbore 1997).
 
     b, c: The edges from the corner a.
     """
-    across = cross_product(way, c)
+    across = cross_product(direction, c)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         inverse = 1.0 / np.einsum("ij,ij->j", b, across)
         there = begin - a
         u = np.einsum("ij,ij->j", there, across) * inverse
         across = cross_product(there, b)
-        v = np.einsum("ij,ij->j", way, across) * inverse
+        v = np.einsum("ij,ij->j", direction, across) * inverse
         share = np.einsum("ij,ij->j", c, across) * inverse
         meets = (u >= -BESIDE) & (v >= -BESIDE) & (u + v <= 1.0 + BESIDE) & (share >= 0.0)
     return np.where(meets, share, np.inf)

@@ -25,8 +25,8 @@ def corner_edges(
         the edge to the second corner, `q` to the third.
     """
     columns = np.ascontiguousarray(vertices.T.astype(np.float64))
-    for where in chunks(len(triangles), size):
-        yield where, *take_edges(columns, triangles[where], origin)
+    for piece in chunks(len(triangles), size):
+        yield piece, *take_edges(columns, triangles[piece], origin)
 
 
 def take_edges(
@@ -59,8 +59,8 @@ def cross_products(
     is six times the signed volume of the tetrahedron over the origin (divergence theorem). With float32 coordinates, c
     is zero exactly for triangles without area.
     """
-    for where, corner, p, q in corner_edges(vertices, triangles, origin, size):
-        yield where, corner, cross_product(p, q)
+    for piece, corner, p, q in corner_edges(vertices, triangles, origin, size):
+        yield piece, corner, cross_product(p, q)
 
 
 def enclosed_ml(
@@ -77,13 +77,13 @@ def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
     total = np.zeros((3, len(vertices)))
     parts: dict[int, tuple[int, NDArray[np.float64]]] = {}
 
-    def work(where: slice) -> None:
-        corners = triangles[where].T
+    def work(piece: slice) -> None:
+        corners = triangles[piece].T
         low = int(corners.min())
-        parts[where.start] = low, _sum_normals(columns, corners, low)
+        parts[piece.start] = low, _sum_normals(columns, corners, low)
 
-    def add(where: slice) -> None:
-        low, part = parts.pop(where.start)
+    def add(piece: slice) -> None:
+        low, part = parts.pop(piece.start)
         total[:, low : low + part.shape[1]] += part
 
     in_threads(work, len(triangles), CHUNK, add)
@@ -127,13 +127,13 @@ def find_nearest_triangle(
     corner_distance = np.einsum("ij,ij->j", columns, columns)
     box_distance = np.empty(len(triangles))
     nearest_corner = np.inf
-    for where in chunks(len(triangles)):
-        a, b, c = triangles[where].T.astype(np.intp)
-        one, two, three = (np.take(columns, index, axis=1, mode="clip") for index in (a, b, c))
-        low = np.minimum(np.minimum(one, two), three)
-        high = np.maximum(np.maximum(one, two), three)
+    for piece in chunks(len(triangles)):
+        a, b, c = triangles[piece].T.astype(np.intp)
+        corner_a, two, three = (np.take(columns, index, axis=1, mode="clip") for index in (a, b, c))
+        low = np.minimum(np.minimum(corner_a, two), three)
+        high = np.maximum(np.maximum(corner_a, two), three)
         gap = np.maximum(np.maximum(low, -high), 0.0)
-        box_distance[where] = np.einsum("ij,ij->j", gap, gap)
+        box_distance[piece] = np.einsum("ij,ij->j", gap, gap)
         nearest_corner = min(nearest_corner, *(float(corner_distance[corner].min()) for corner in (a, b, c)))
     slack = 2.0 * rounding_step(vertices)  # a point and a triangle are each rounded
     near = np.flatnonzero(box_distance <= (math.sqrt(nearest_corner) + slack) ** 2)

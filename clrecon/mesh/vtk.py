@@ -38,18 +38,18 @@ def cut_surface(surface: Any, point: Points, normal: Points) -> list[Points]:
     """Return the lines in which a plane cuts a ``pyvista.PolyData``, (n, 3), the first point again at a closed end."""
     cut = surface.slice(normal=normal, origin=point)
     next_to: list[list[int]] = [[] for _ in range(cut.n_points)]
-    for _, one, other in cut.lines.reshape(-1, 3).tolist():
-        next_to[one].append(other)
-        next_to[other].append(one)
-    found = []
+    for _, begin, end in cut.lines.reshape(-1, 3).tolist():
+        next_to[begin].append(end)
+        next_to[end].append(begin)
+    lines = []
     for start in sorted(range(cut.n_points), key=lambda row: len(next_to[row]) % 2 == 0):  # open ends first
         line = [start]
         while next_to[line[-1]]:  # VTK's own joining of lines breaks them where it begins
             line.append(next_to[line[-1]].pop())
             next_to[line[-1]].remove(line[-2])
         if len(line) > 1:
-            found.append(np.array(cut.points[line], np.float64))
-    return found
+            lines.append(np.array(cut.points[line], np.float64))
+    return lines
 
 
 def wrap_polydata(
@@ -76,23 +76,23 @@ def unwrap_polydata(polydata: Any) -> tuple[RawMesh, float | None]:
     """Return what a ``pyvista.PolyData`` holds, and its voxel step; see `Mesh.from_pyvista`."""
     import pyvista
 
-    found = pyvista.wrap(polydata) if hasattr(polydata, "GetPolys") else polydata
-    if not isinstance(found, pyvista.PolyData):
+    wrapped = pyvista.wrap(polydata) if hasattr(polydata, "GetPolys") else polydata
+    if not isinstance(wrapped, pyvista.PolyData):
         raise UsageError(
             f"a {type(polydata).__name__} is no pyvista.PolyData: of a volume or grid take extract_surface() first"
         )
-    if not found.is_all_triangles:
-        found = found.triangulate()
-    faces = np.asarray(found.faces)
+    if not wrapped.is_all_triangles:
+        wrapped = wrapped.triangulate()
+    faces = np.asarray(wrapped.faces)
     if not len(faces):
-        raise UsageError(f"the PolyData has {found.n_points:,} points and no faces: it is no surface")
+        raise UsageError(f"the PolyData has {wrapped.n_points:,} points and no faces: it is no surface")
     raw = RawMesh(
         "PolyData",
-        np.array(found.points),
+        np.array(wrapped.points),
         faces.reshape(-1, 4)[:, 1:],
-        found.point_data["Normals"] if "Normals" in found.point_data else None,
-        str(found.field_data["SPACE"][0]) if "SPACE" in found.field_data else None,
-        values=numbers_of(found.point_data),
-        face_values=numbers_of(found.cell_data),
+        wrapped.point_data["Normals"] if "Normals" in wrapped.point_data else None,
+        str(wrapped.field_data["SPACE"][0]) if "SPACE" in wrapped.field_data else None,
+        values=numbers_of(wrapped.point_data),
+        face_values=numbers_of(wrapped.cell_data),
     )
-    return raw, float(found.field_data["VOXEL_MM"][0]) if "VOXEL_MM" in found.field_data else None
+    return raw, float(wrapped.field_data["VOXEL_MM"][0]) if "VOXEL_MM" in wrapped.field_data else None

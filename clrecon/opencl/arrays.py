@@ -80,10 +80,10 @@ def memory_limits(device: Device, memory: int | None = None) -> MemoryLimits:
 
 def describe_shortage(limits: MemoryLimits, buffers: Mapping[str, int]) -> str:
     """Return why `buffers` do not fit together, or one of them does not fit alone; empty if they fit."""
-    for what, size in buffers.items():
+    for buffer, size in buffers.items():
         if size > limits.device_buffer_bytes:
             most = _mib(limits.device_buffer_bytes)
-            return f"the {what} needs a buffer of {_mib(size)}, {limits.label} allows {most}"
+            return f"the {buffer} needs a buffer of {_mib(size)}, {limits.label} allows {most}"
     total = sum(buffers.values())
     if total <= limits.total_bytes:
         return ""
@@ -291,7 +291,7 @@ def _fill_all(device: Device, wanted: Sequence[tuple[NDArray[Any], Any, int]]) -
     mapped: list[tuple[NDArray[Any], Any]] = []
     large: list[tuple[NDArray[Any], Any, int]] = []
     for array, array_d, offset in wanted:
-        what, queue = f"the transfer of {array.nbytes:,} bytes to the computer", device.queue
+        action, queue = f"the transfer of {array.nbytes:,} bytes to the computer", device.queue
         host: Any = None
         if array_d.flags & cl.mem_flags.USE_HOST_PTR:
             # Mapping makes the host memory current; on CPU drivers it moves no data.
@@ -304,7 +304,7 @@ def _fill_all(device: Device, wanted: Sequence[tuple[NDArray[Any], Any, int]]) -
             continue
         else:
             event = cl.enqueue_copy(queue, array, raw(array_d), src_offset=offset, is_blocking=False)
-        device.commands.add(what, event, queue, array, array_d, host)
+        device.commands.add(action, event, queue, array, array_d, host)
     if large:
         read_buffers(device, large)
     wait(device)

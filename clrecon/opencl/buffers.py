@@ -47,8 +47,8 @@ class BufferPool:
         step = max(1 << max(size.bit_length() - 4, 0), 256)
         size = -(-size // step) * step
         with self._lock:
-            at = next((n for n, buffer in enumerate(self._spare) if buffer.size == size), None)
-            buffer = None if at is None else self._spare.pop(at)
+            position = next((n for n, buffer in enumerate(self._spare) if buffer.size == size), None)
+            buffer = None if position is None else self._spare.pop(position)
         if buffer is None:
             buffer = self.ask(size)
         lent = LentBuffer(buffer)

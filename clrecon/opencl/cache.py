@@ -162,8 +162,8 @@ def _remove_tree(folder: str) -> None:
 def prepare_caches() -> Caches:
     """Check the folders of built kernels, once in a process, and set the environment of the drivers accordingly."""
     home, home_name = _cache_home()
-    own = home / _OWN
-    faults = _find_faults(home, home_name, own)
+    folder = home / _OWN
+    faults = _find_faults(home, home_name, folder)
     pocl, pocl_name, of_pocl = _pocl_folder(home, home_name)
     if of_pocl and not (home_name in faults and pocl_name.startswith(home_name)):
         faults[pocl_name] = of_pocl
@@ -177,15 +177,15 @@ def prepare_caches() -> Caches:
         pocl, refusal = _temporary_folder(pocl)
     os.environ["POCL_CACHE_DIR"] = str(pocl)
     keeps = home_name not in faults and f"{home_name}/{_OWN}" not in faults
-    return Caches(pocl, not of_pocl, own / "kernels" if keeps else None, warnings if faults else (), refusal)
+    return Caches(pocl, not of_pocl, folder / "kernels" if keeps else None, warnings if faults else (), refusal)
 
 
-def _find_faults(home: Path, home_name: str, own: Path) -> dict[str, str]:
+def _find_faults(home: Path, home_name: str, folder: Path) -> dict[str, str]:
     """Return what is wrong with the folders in the cache home, by their names for messages."""
     fault = _fault_of_room(home)
     if fault:
         return {home_name: fault}
-    faults = {f"{home_name}/{_OWN}": find_fault(own) or find_fault(own / "kernels")}
+    faults = {f"{home_name}/{_OWN}": find_fault(folder) or find_fault(folder / "kernels")}
     faults[f"{home_name}/pytools"] = find_fault(home / "pytools")  # pickles of pyopencl
     mesa = home / "mesa_shader_cache"
     faults[f"{home_name}/mesa_shader_cache"] = find_fault(mesa) if os.path.lexists(mesa) else ""

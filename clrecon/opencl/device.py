@@ -59,8 +59,8 @@ class Commands:
         self._given_up: list[Command] = []
         _all.append(self)
 
-    def add(self, what: str, event: Any, queue: Any, *held: Any) -> Command:
-        command = Command(what, event, queue, held)
+    def add(self, action: str, event: Any, queue: Any, *kept_alive: Any) -> Command:
+        command = Command(action, event, queue, kept_alive)
         self._waiting.append(command)
         return command
 
@@ -92,14 +92,14 @@ class Commands:
         with self._lock:
             self._waiting = [command for command in self._waiting if command.is_running]
 
-    def give_up(self, *kept: Any) -> None:
+    def give_up(self, *buffers: Any) -> None:
         """Nobody will wait for the commands any more; those that still run keep all that they use, and `kept`."""
         with self._lock:
             commands = (*self._given_up, *self._waiting)
             self._given_up = [command for command in commands if command.is_running]
             self._waiting.clear()
             if self._given_up:
-                _kept.append(kept)
+                _kept.append(buffers)
 
     @property
     def has_hung(self) -> bool:
@@ -115,10 +115,10 @@ _kept: list[Any] = []
 
 def has_hung_commands() -> bool:
     """True where a command that was given up still runs on any device: to free its context may take for ever."""
-    found = any(commands.has_hung for commands in _all)
-    if not found:
+    any_hung = any(commands.has_hung for commands in _all)
+    if not any_hung:
         _kept.clear()
-    return found
+    return any_hung
 
 
 def keep_for_hung_commands(*objects: Any) -> None:
@@ -296,8 +296,8 @@ class Device:
     @property
     def usable_bytes(self) -> int:
         """Memory that may be taken: a card keeps a tenth, 512 MiB or else a quarter, for screens and other programs."""
-        kept = max(self.memory_bytes // 10, min(HEADROOM_BYTES, self.memory_bytes // 4))
-        return self.memory_bytes - kept * self.has_own_memory
+        headroom = max(self.memory_bytes // 10, min(HEADROOM_BYTES, self.memory_bytes // 4))
+        return self.memory_bytes - headroom * self.has_own_memory
 
     @property
     def group_size(self) -> int:
@@ -349,8 +349,8 @@ class Device:
         with self.lock:
             if make not in self._opened.kept:
                 self._opened.kept[make] = make(self)
-            kept: Kept = self._opened.kept[make]
-            return kept
+            value: Kept = self._opened.kept[make]
+            return value
 
     def _refuse_fork(self) -> None:
         """Refuse to work in a forked process: the driver's threads do not exist there, so it would wait for ever."""
@@ -384,14 +384,14 @@ class Device:
             self._opened.kept = {}
             self.programs.clear()
 
-    def fail(self, what: str, error: Exception, *, is_late: bool = False) -> DeviceError:
+    def fail(self, action: str, error: Exception, *, is_late: bool = False) -> DeviceError:
         """Return the error for a failed call, and give the context up: a lost device needs a new one.
 
         is_late: The driver had accepted the command before.
         """
         self.give_up()
-        log.info("%s on %s: %s; its context is given up", what, self.label, describe_error(error))
-        return kind_of_error(error, is_late=is_late)(f"{what} on {self.label}: {describe_error(error)}")
+        log.info("%s on %s: %s; its context is given up", action, self.label, describe_error(error))
+        return kind_of_error(error, is_late=is_late)(f"{action} on {self.label}: {describe_error(error)}")
 
     def describe(self) -> dict[str, Any]:
         """Properties for listings and reports."""
@@ -399,8 +399,8 @@ class Device:
             *("index", "name", "platform", "type", "version", "driver", "platform_version"),
             *("memory_bytes", "max_allocation_bytes", "compute_units", "has_own_memory"),
         )
-        own = {name: getattr(self, name) for name in names}
-        return own | {"simulator": self.is_simulator, "shortcoming": self.shortcoming}
+        facts = {name: getattr(self, name) for name in names}
+        return facts | {"simulator": self.is_simulator, "shortcoming": self.shortcoming}
 
     def __repr__(self) -> str:
         return f"Device({self.index}: {self.label}, {self.type})"

@@ -139,9 +139,9 @@ def _watch(device: Device, helper: _Helper) -> None:
             raise DeviceTimeoutError(_describe_hang(device, "a command" if running is None else running.what, limit))
 
 
-def _describe_hang(device: Device, what: str, limit: float) -> str:
+def _describe_hang(device: Device, action: str, limit: float) -> str:
     return (
-        f"{what} has not ended on {device.label} for {limit:g} s, so it counts as hung: choose another"
+        f"{action} has not ended on {device.label} for {limit:g} s, so it counts as hung: choose another"
         f" {name_parameter('device')}, take a smaller volume or picture, or give a longer"
         f" {name_parameter('timeout')} in seconds (0: none)"
     )
@@ -257,8 +257,8 @@ def launch(device: Device, kernel: Kernel, items: int, most: int | None = None, 
                 if part < rounded:
                     queue.flush()  # what a driver sends together counts as one for watchdogs
         except cl.Error as error:
-            what = f"kernel {kernel.name} ({rounded:,} items in groups of {group}) failed"
-            raise device.fail(what, error) from error
+            action = f"kernel {kernel.name} ({rounded:,} items in groups of {group}) failed"
+            raise device.fail(action, error) from error
         if device.trace is not None:
             wait(device)  # what crashes or hangs is then the kernel that was told last
         if (stopwatch := _running.get()) is not None:

@@ -318,8 +318,8 @@ def has_unknown_cpu(platform_name: str, device_version: str) -> bool:
 
 def choose_name(cpuinfo: str) -> str:
     """Return the best of `CPU_NAMES` whose flags are all in the text of /proc/cpuinfo."""
-    found = re.search(r"^flags\s*:(.*)$", cpuinfo, re.MULTILINE)
-    flags = set(found.group(1).split()) if found else set()
+    match = re.search(r"^flags\s*:(.*)$", cpuinfo, re.MULTILINE)
+    flags = set(match.group(1).split()) if match else set()
     return next(name for name, needs in CPU_NAMES if needs <= flags)
 
 

@@ -158,8 +158,8 @@ def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
     try:
         with warnings.catch_warnings(), device.checked_cache(_key(device, source, options)):
             warnings.simplefilter("ignore")  # a compiler's remarks about code that builds
-            kept = _build_from_binary(device, source, options) if device.keeps_binaries else None
-            built = _build_from_source(device, source, options) if kept is None else kept
+            from_binary = _build_from_binary(device, source, options) if device.keeps_binaries else None
+            built = _build_from_source(device, source, options) if from_binary is None else from_binary
             program = Program(name, built, find_signatures(source, definitions_of(options)))
     except (import_pyopencl().Error, RuntimeError, OSError) as error:  # OSError: from a cache
         on = device.label + (f" with CLRECON_BUILD_OPTIONS={device.own_options}" if device.own_options else "")
@@ -168,7 +168,7 @@ def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
         if device.known_good is not None:
             device.known_good.forget(_key(device, source, options))
         raise DeviceError(f"cl/{name} has no kernel on {device.label}: its cache was damaged, run again")
-    origin = "source" if kept is None else "a kept binary"
+    origin = "source" if from_binary is None else "a kept binary"
     log.debug("cl/%s %s built from %s in %.3f s", name, options, origin, time.perf_counter() - start)
     return program
 

@@ -36,20 +36,20 @@ def import_pyopencl() -> Any:
     try:
         import pyopencl
     except ValueError as error:
-        told = os.environ.get("PYOPENCL_NO_CACHE", "")
-        raise DeviceError(f"PYOPENCL_NO_CACHE is {told!r}: unset it, or write 1 or 0 ({error})") from error
+        setting = os.environ.get("PYOPENCL_NO_CACHE", "")
+        raise DeviceError(f"PYOPENCL_NO_CACHE is {setting!r}: unset it, or write 1 or 0 ({error})") from error
     return pyopencl
 
 
 def _check_thread_counts() -> None:
     """Refuse what PoCL makes nothing good of: -1 ends the process when the platform is loaded, words are one thread."""
     for name in _THREAD_COUNTS:
-        told = os.environ.get(name, "").strip()
-        if not told:
+        setting = os.environ.get(name, "").strip()
+        if not setting:
             os.environ.pop(name, None)
-        elif not re.fullmatch(r"\+?[0-9]{1,9}", told) or int(told) > _MOST_THREADS:
+        elif not re.fullmatch(r"\+?[0-9]{1,9}", setting) or int(setting) > _MOST_THREADS:
             raise DeviceError(
-                f"{name} is {told!r:.60}, and PoCL needs a number of threads: unset it, or write a whole number, at"
+                f"{name} is {setting!r:.60}, and PoCL needs a number of threads: unset it, or write a whole number, at"
                 f" most {_MOST_THREADS}"
             )
 

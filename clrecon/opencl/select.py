@@ -87,8 +87,8 @@ def remembered_fault(device: Device) -> str:
     known = read_binary(_key(device)) or b""
     if known == _BEGUN:
         return _DIED
-    said = next((known[len(start) :] for start in (_WRONG, _CRASHED) if known.startswith(start)), b"")
-    return said.decode(errors="replace")
+    fault = next((known[len(start) :] for start in (_WRONG, _CRASHED) if known.startswith(start)), b"")
+    return fault.decode(errors="replace")
 
 
 def _is_off() -> bool:
@@ -104,7 +104,7 @@ def _find_fault(device: Device) -> str:
     if known == _PASSED:
         return ""
     if known == _BEGUN or known.startswith(_CRASHED):
-        fault, found = _check_apart(device)
+        fault, verdict = _check_apart(device)
     else:
         store_binary(key, _BEGUN)
         try:
@@ -112,9 +112,9 @@ def _find_fault(device: Device) -> str:
         except BaseException:  # an interrupt or a time limit says nothing
             store_binary(key, b"")
             raise
-        found = _WRONG + fault.encode() if fault else _PASSED
+        verdict = _WRONG + fault.encode() if fault else _PASSED
     log.info("%s checked at its first use: %s", device.label, fault or "it computes rightly")
-    store_binary(key, found)
+    store_binary(key, verdict)
     return fault
 
 
@@ -134,8 +134,8 @@ def _check_apart(device: Device) -> tuple[str, bytes]:
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        told = f"its check does not end within {seconds:g} s" if isinstance(error, subprocess.TimeoutExpired) else _DIED
-        return told, _CRASHED + told.encode()
+        why = f"its check does not end within {seconds:g} s" if isinstance(error, subprocess.TimeoutExpired) else _DIED
+        return why, _CRASHED + why.encode()
     if ended.returncode == 0:
         fault = str(json.loads(ended.stdout.splitlines()[-1]))
         return fault, _WRONG + fault.encode() if fault else _PASSED
@@ -207,17 +207,17 @@ def _discover() -> tuple[tuple[tuple[str, str, str], ...], tuple[Device, ...]]:
         cl = quirks.import_pyopencl()
         note = ""
         try:
-            found = cl_platform.get_devices()
+            cl_devices = cl_platform.get_devices()
         except cl.Error as error:  # DEVICE_NOT_FOUND is the normal answer of a driver without its hardware
-            found = []
+            cl_devices = []
             if "DEVICE_NOT_FOUND" not in str(error):
                 note = describe_error(error)
-        for cl_device in found:
+        for cl_device in cl_devices:
             try:
                 devices.append(Device(len(devices), cl_platform, cl_device))
             except cl.Error as error:  # one broken driver must not hide the others
                 note = f"a device does not answer: {describe_error(error)}"
-        count = f"{len(found)} device{'s' * (len(found) != 1)}"
+        count = f"{len(cl_devices)} device{'s' * (len(cl_devices) != 1)}"
         platforms.append((cl_platform.name.strip(), cl_platform.version.strip(), note or count))
     return tuple(platforms), tuple(devices)
 
@@ -327,9 +327,9 @@ def explain_choice(name: str | int | None = None) -> str:
     others = [device for device in devices if device is not chosen and not (is_automatic and remembered_fault(device))]
     if not others:
         return f"{named}no other one"
-    other = max(others, key=lambda device: device.score)
-    each = zip(_REASONS, chosen.score, other.score, strict=True)
-    return f"{named}before {other.index}: {next(why for why, one, two in each if one != two)}"
+    runner_up = max(others, key=lambda device: device.score)
+    reasons = zip(_REASONS, chosen.score, runner_up.score, strict=True)
+    return f"{named}before {runner_up.index}: {next(why for why, one, two in reasons if one != two)}"
 
 
 def choose_unchecked(name: str | int | None = None) -> Device:

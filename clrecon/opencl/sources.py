@@ -92,10 +92,10 @@ def read_kernel_source(name: str) -> str:
 @cache
 def _numbers(name: str) -> dict[str, set[str]]:
     """Every number that a kernel file defines; variants may define one differently."""
-    found: dict[str, set[str]] = {}
+    numbers: dict[str, set[str]] = {}
     for macro, number in _NUMBER.findall(_read_file(name)):
-        found.setdefault(macro, set()).add(number)
-    return found
+        numbers.setdefault(macro, set()).add(number)
+    return numbers
 
 
 def kernel_number(name: str, macro: str) -> float:
@@ -161,18 +161,18 @@ def find_signatures(source: str, definitions: Mapping[str, str]) -> dict[str, tu
     """Return the arguments of all kernels of a source with its includes; `definitions` are those of the build."""
     macros, text = _preprocess(source, definitions)
     signatures = {}
-    at = text.find("__kernel")
-    while at >= 0:  # comments are long, so they are removed only here
-        match = _KERNEL.match(_strip_comments(text[at : at + _LONGEST_HEAD]))
+    start = text.find("__kernel")
+    while start >= 0:  # comments are long, so they are removed only here
+        match = _KERNEL.match(_strip_comments(text[start : start + _LONGEST_HEAD]))
         if match is not None:
             signatures[match[1]] = _arguments(_expand(match[2], macros))
-        at = text.find("__kernel", at + 1)
+        start = text.find("__kernel", start + 1)
     return signatures
 
 
 def _preprocess(source: str, definitions: Mapping[str, str]) -> tuple[dict[str, str], str]:
     """Return the macros without parameters at the end of a source, and the text that its conditions keep."""
-    macros, kept = dict(definitions), []
+    macros, lines = dict(definitions), []
     states: list[tuple[bool, bool]] = []  # for each open condition: is its branch kept, and was one kept before
     for name, rest, text in _split_source(source):
         if name in ("if", "ifdef", "ifndef"):
@@ -190,8 +190,8 @@ def _preprocess(source: str, definitions: Mapping[str, str]) -> tuple[dict[str, 
         elif name not in ("", "define", "undef", "line", "pragma", "error"):
             raise ValueError(f"#{name} {rest}")
         if not states or states[-1][0]:
-            kept.append(text)
-    return macros, "".join(kept)
+            lines.append(text)
+    return macros, "".join(lines)
 
 
 def _define(directive: str, rest: str, macros: dict[str, str]) -> None:

@@ -110,12 +110,12 @@ def _ranges(size: int) -> Iterator[tuple[int, int]]:
 def write_buffer(device: Device, array: NDArray[Any], array_d: Any) -> None:
     """Copy a C-contiguous array into a buffer, for all later commands; the array may change afterwards."""
     cl = import_pyopencl()
-    source, what = _bytes_of(array), f"the transfer of {array.nbytes:,} bytes to the device"
+    source, action = _bytes_of(array), f"the transfer of {array.nbytes:,} bytes to the device"
     if array.nbytes < LEAST_BYTES:
         source = source.copy()
         with device.lock:
             event = cl.enqueue_copy(device.queue, raw(array_d), source, is_blocking=False)
-            device.commands.add(what, event, device.queue, array_d, source)
+            device.commands.add(action, event, device.queue, array_d, source)
         return
     pinned = device.of_context(PinnedPieces)
     filling: deque[tuple[_Piece, int, int]] = deque()
@@ -129,7 +129,7 @@ def write_buffer(device: Device, array: NDArray[Any], array_d: Any) -> None:
             event = cl.enqueue_copy(
                 queue, raw(array_d), piece.memory[: end - start], dst_offset=start, is_blocking=False
             )
-            piece.command = device.commands.add(what, event, queue, array_d, piece)
+            piece.command = device.commands.add(action, event, queue, array_d, piece)
         piece.is_taken = False
         queue.flush()
 
@@ -161,7 +161,7 @@ def read_buffers(device: Device, wanted: Sequence[tuple[NDArray[Any], Any, int]]
 
     with pinned.lock:
         for array, array_d, offset in wanted:
-            target, what = _bytes_of(array), f"the transfer of {array.nbytes:,} bytes to the computer"
+            target, action = _bytes_of(array), f"the transfer of {array.nbytes:,} bytes to the computer"
             for start, end in _ranges(array.nbytes):
                 if len(coming) == _IN_TRANSFER:
                     take_out()
@@ -171,7 +171,7 @@ def read_buffers(device: Device, wanted: Sequence[tuple[NDArray[Any], Any, int]]
                     event = cl.enqueue_copy(
                         queue, piece.memory[: end - start], raw(array_d), src_offset=offset + start, is_blocking=False
                     )
-                    piece.command = device.commands.add(what, event, queue, array_d, piece)
+                    piece.command = device.commands.add(action, event, queue, array_d, piece)
                 queue.flush()
                 coming.append((piece, target[start:end]))
         while coming:

@@ -109,10 +109,10 @@ class PointCloud(Message, ShownAsHtml):
         Nothing is checked or copied, which would take longer than making them.  Of ``VoxelNumbers`` the indices are
         made when they are first asked for.
         """
-        made = cls.__new__(cls)
-        made._points, made._normals, made._hu, made._labels, made._ijk = points, normals, hu, labels, ijk
-        made.report = {} if report is None else report
-        return made
+        cloud = cls.__new__(cls)
+        cloud._points, cloud._normals, cloud._hu, cloud._labels, cloud._ijk = points, normals, hu, labels, ijk
+        cloud.report = {} if report is None else report
+        return cloud
 
     def _checked(self, name: str, values: ArrayLike | None) -> NDArray[Any] | None:
         """Return what is known of the points as it is kept, for example their `labels`."""
@@ -212,13 +212,13 @@ class PointCloud(Message, ShownAsHtml):
         if unknown:
             raise UsageError(f"a cloud has no {sorted(unknown)[0]}: it has {', '.join(known)}")
         if "points" in arrays or "report" in arrays:
-            own = {name: getattr(self, name) for name in known}
-            return PointCloud(**{**own, "report": dict(self.report), **arrays})
+            known_arrays = {name: getattr(self, name) for name in known}
+            return PointCloud(**{**known_arrays, "report": dict(self.report), **arrays})
         # What stays was checked before.
-        made = PointCloud.of_known(self._points, self._normals, self._hu, self._labels, self._ijk, dict(self.report))
+        cloud = PointCloud.of_known(self._points, self._normals, self._hu, self._labels, self._ijk, dict(self.report))
         for name, values in arrays.items():
-            setattr(made, f"_{name}", made._checked(name, values))
-        return made
+            setattr(cloud, f"_{name}", cloud._checked(name, values))
+        return cloud
 
     def select(self, mask: ArrayLike) -> PointCloud:
         """Return the cloud of some of the points.
@@ -248,8 +248,8 @@ class PointCloud(Message, ShownAsHtml):
         numbers = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
         points = as_stored(self._points.take(numbers, axis=0))  # those far from the origin may be gone
         of_points = {"normals": self._normals, "hu": self._hu, "labels": self._labels, "ijk": self._ijk}
-        taken = {name: _take_values(values, numbers) for name, values in of_points.items() if values is not None}
-        return PointCloud.of_known(points, **taken, report=dict(self.report))
+        arrays = {name: _take_values(values, numbers) for name, values in of_points.items() if values is not None}
+        return PointCloud.of_known(points, **arrays, report=dict(self.report))
 
     @explains_arguments
     def sample(self, volume: Volume, order: int = 1, outside: float = float("nan")) -> PointCloud:
@@ -382,9 +382,9 @@ class PointCloud(Message, ShownAsHtml):
     @classmethod
     def _of_others(cls, arrays: Mapping[str, NDArray[Any] | None], space: str) -> PointCloud:
         """Make a cloud of the arrays of another library, in `space`; a column counts as a list."""
-        if (found := arrays.get("points")) is None:
+        if (points_found := arrays.get("points")) is None:
             raise UsageError("there are no points")
-        points, normals = turn_to_lps(space, found, arrays.get("normals"))
+        points, normals = turn_to_lps(space, points_found, arrays.get("normals"))
         hu, labels = (None if (each := arrays.get(name)) is None else np.ravel(each) for name in ("hu", "labels"))
         return cls(points, normals, hu, labels)
 
@@ -440,13 +440,13 @@ class VoxelNumbers:
     def indices(self) -> NDArray[np.int32]:
         """Return the voxel indices (i, j, k), shape (n, 3)."""
         ni, nj, _ = self.shape_ijk
-        found = np.empty((len(self.numbers), 3), np.int32)
+        ijk = np.empty((len(self.numbers), 3), np.int32)
         rows = self.numbers // self.numbers.dtype.type(ni)
         slices = rows // self.numbers.dtype.type(nj)
-        found[:, 0] = self.numbers - rows * self.numbers.dtype.type(ni)
-        found[:, 1] = rows - slices * self.numbers.dtype.type(nj)
-        found[:, 2] = slices
-        return found
+        ijk[:, 0] = self.numbers - rows * self.numbers.dtype.type(ni)
+        ijk[:, 1] = rows - slices * self.numbers.dtype.type(nj)
+        ijk[:, 2] = slices
+        return ijk
 
 
 def count_numbers(numbers: NDArray[np.uint8], reasons: Sequence[str]) -> dict[str, int]:

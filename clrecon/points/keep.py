@@ -110,19 +110,19 @@ def measure_clusters(cloud: PointCloud) -> ClusterFigures:
     entries = max((runs.clusters for _, runs in pieces), default=0) + 1
     sizes, sums, squares = np.zeros(entries, np.int64), np.zeros((3, entries)), np.zeros((3, 3, entries))
     low, high = np.full((3, entries), np.inf, points.dtype), np.full((3, entries), -np.inf, points.dtype)
-    for where, runs in pieces:
+    for piece, runs in pieces:
         runs.count(sizes)
         for axis in range(3):
-            own = np.ascontiguousarray(points[where, axis])
-            runs.widen(low[axis], high[axis], own)
-            runs.add(sums[axis], own.astype(np.float64))
+            column = np.ascontiguousarray(points[piece, axis])
+            runs.widen(low[axis], high[axis], column)
+            runs.add(sums[axis], column.astype(np.float64))
     shares = 1.0 / np.maximum(sizes, 1)
     centres = sums * shares
-    for where, runs in pieces:
-        around = [points[where, axis] - runs.spread(centres[axis]) for axis in range(3)]
+    for piece, runs in pieces:
+        around = [points[piece, axis] - runs.spread(centres[axis]) for axis in range(3)]
         for axis in range(3):
-            for other in range(axis + 1):
-                runs.add(squares[axis, other], around[axis] * around[other])
+            for second_axis in range(axis + 1):
+                runs.add(squares[axis, second_axis], around[axis] * around[second_axis])
     spread = np.moveaxis(squares * shares, 2, 0)[1:]  # eigvalsh reads the lower triangles
     lengths = np.linalg.eigvalsh(spread) if len(spread) else np.zeros((0, 3))
     boxes = np.stack([low.T, high.T], axis=1)[1:].astype(np.float64)
@@ -216,8 +216,8 @@ def keep_clusters(
         raise UsageError(f"the figures are of {len(figures.points):,} clusters, the cloud has others: leave them out")
     fate, facts = _judge_clusters(cloud, figures, wanted, cores)
     removed = np.append(np.uint8(1), fate).take(np.maximum(labels, -1) + 1)  # the first one is that of noise
-    kept = removed == 0
-    if not kept.any():
+    is_kept = removed == 0
+    if not is_kept.any():
         raise NoSurfaceError(_describe_nothing(labels, figures, fate))
     facts = {
         "keep": [_as_text(rule) for rule in wanted],
@@ -228,7 +228,7 @@ def keep_clusters(
         **facts,
     }
     warnings = _warn_of_seeds(cloud, wanted, facts)
-    return PointStep(cloud if kept.all() else cloud.select(kept), removed, REASONS, facts, warnings)
+    return PointStep(cloud if is_kept.all() else cloud.select(is_kept), removed, REASONS, facts, warnings)
 
 
 def _warn_of_seeds(cloud: PointCloud, rules: tuple[KeepRule, ...], facts: Mapping[str, object]) -> tuple[str, ...]:
@@ -270,11 +270,11 @@ def _judge_clusters(
     seeds = [rule.numbers for rule in rules if rule.kind == "seed"]
     if not seeds:
         return fate, {}
-    found = [_find_cluster(cloud, seed, cores) for seed in seeds]
+    seeded = [_find_cluster(cloud, seed, cores) for seed in seeds]
     others = np.ones(len(fate), dtype=bool)
-    others[[cluster for cluster, _ in found]] = False
+    others[[cluster for cluster, _ in seeded]] = False
     fate[others & (fate == 0)] = 4
-    return fate, {"seed_distances_mm": [round(distance, 3) for _, distance in found]}
+    return fate, {"seed_distances_mm": [round(distance, 3) for _, distance in seeded]}
 
 
 def _find_cluster(cloud: PointCloud, seed: tuple[float, ...], cores: ArrayLike | None) -> tuple[int, float]:

@@ -36,17 +36,17 @@ def mean_spacing(points: NDArray[np.floating]) -> float:
     # As if the points filled the largest face of their box; a surface with folds has smaller cells.
     face = float(np.prod(np.sort(extent)[1:])) or float(extent.max()) ** 2 / len(points)
     edge, dimension = math.sqrt(_POINTS_A_CELL * face / len(points)), 2.0
-    held = len(points) / _count_cells(points, low, extent, edge)
+    fill = len(points) / _count_cells(points, low, extent, edge)
     for _ in range(ROUNDS):
-        if 0.5 < held / _POINTS_A_CELL < 2.0:
+        if 0.5 < fill / _POINTS_A_CELL < 2.0:
             break
-        other = edge * (_POINTS_A_CELL / held) ** (1.0 / dimension)
-        if float(np.prod(np.floor(extent / other) + 1.0)) > MOST_CELLS:
+        next_edge = edge * (_POINTS_A_CELL / fill) ** (1.0 / dimension)
+        if float(np.prod(np.floor(extent / next_edge) + 1.0)) > MOST_CELLS:
             break
-        before, held = held, len(points) / _count_cells(points, low, extent, other)
-        dimension = min(max(math.log(held / before) / math.log(other / edge), 1.0), 3.0)
-        edge = other
-    return min(edge / math.sqrt(held), float(extent.max()) / len(points) ** (1.0 / 3.0))
+        before, fill = fill, len(points) / _count_cells(points, low, extent, next_edge)
+        dimension = min(max(math.log(fill / before) / math.log(next_edge / edge), 1.0), 3.0)
+        edge = next_edge
+    return min(edge / math.sqrt(fill), float(extent.max()) / len(points) ** (1.0 / 3.0))
 
 
 def _count_cells(
@@ -56,14 +56,14 @@ def _count_cells(
     if float(np.prod(counts.astype(np.float64))) > MOST_CELLS:  # a few points far apart
         return len(points)
     scale = points.dtype.type(1.0 / edge)
-    place = np.zeros(len(points), np.int32)
+    cell = np.zeros(len(points), np.int32)
     for axis in (2, 1, 0):
         along = ((points[:, axis] - low[axis]) * scale).astype(np.int32)
         np.minimum(along, np.int32(counts[axis] - 1), out=along)
-        place *= np.int32(counts[axis])
-        place += along
+        cell *= np.int32(counts[axis])
+        cell += along
     occupied = np.zeros(int(np.prod(counts)), np.bool_)
-    occupied[place] = True
+    occupied[cell] = True
     return int(np.count_nonzero(occupied))
 
 
@@ -105,9 +105,9 @@ def distance_ratios(
     """
     counts = np.bincount(cells)
     spacing = np.bincount(cells, nearest) / np.maximum(counts, 1)
-    own = spacing[cells]
+    expected = spacing[cells]
     apart = np.asarray(means, dtype=np.float64)
-    return np.divide(apart, own, out=np.where(apart > 0.0, np.inf, 0.0), where=own > 0.0)
+    return np.divide(apart, expected, out=np.where(apart > 0.0, np.inf, 0.0), where=expected > 0.0)
 
 
 def ratio_threshold(ratios: NDArray[np.floating]) -> float:

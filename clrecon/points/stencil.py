@@ -93,8 +93,8 @@ class Stencil:
     @property
     def joins_columns(self) -> bool:
         """True where neighbouring voxels of a row are within eps."""
-        own = (self.rows[:, 0] == 0) & (self.rows[:, 1] == 0)
-        return bool((self.rows[own, 3] > 0).any())
+        in_column = (self.rows[:, 0] == 0) & (self.rows[:, 1] == 0)
+        return bool((self.rows[in_column, 3] > 0).any())
 
     def holds(self, shape_ijk: tuple[int, int, int]) -> bool:
         """Tell whether all voxels of a volume of this shape are within eps of each other."""
@@ -111,9 +111,9 @@ class Stencil:
         tables, done = np.empty_like(self.tables), {}
         for k, (begin, end) in enumerate(self.tables.tolist()):
             if (begin, end) not in done:
-                own = self.rows[begin:end]
-                dj, dk = own[:, 0], own[:, 1]
-                after = own[(dk > 0) | ((dk == 0) & (dj >= 0))].copy()
+                own_rows = self.rows[begin:end]
+                dj, dk = own_rows[:, 0], own_rows[:, 1]
+                after = own_rows[(dk > 0) | ((dk == 0) & (dj >= 0))].copy()
                 same = (after[:, 0] == 0) & (after[:, 1] == 0)
                 after[same, 2] = 1
                 first = sum(map(len, rows))
@@ -201,7 +201,7 @@ def _order(plane: _Plane, rows: NDArray[np.int32], offsets: Float64Array) -> NDA
 
 def _uneven_tables(origins: Float64Array, plane: _Plane) -> tuple[list[NDArray[np.int32]], NDArray[np.int32]]:
     nk, heights = len(origins), origins @ plane.normal
-    found: dict[bytes, NDArray[np.int32]] = {}
+    cache: dict[bytes, NDArray[np.int32]] = {}
     stored: dict[bytes, tuple[int, int]] = {}
     parts: list[NDArray[np.int32]] = []
     tables = np.empty((nk, 2), np.int32)
@@ -212,7 +212,7 @@ def _uneven_tables(origins: Float64Array, plane: _Plane) -> tuple[list[NDArray[n
         key = offsets.tobytes() + (near - k).tobytes()
         if key not in stored:
             rows = [
-                _rows_between(plane, offset, int(other - k), found) for other, offset in zip(near, offsets, strict=True)
+                _rows_between(plane, offset, int(other - k), cache) for other, offset in zip(near, offsets, strict=True)
             ]
             whole = np.concatenate(rows)
             places = np.repeat(offsets, [len(part) for part in rows], axis=0)
@@ -224,15 +224,15 @@ def _uneven_tables(origins: Float64Array, plane: _Plane) -> tuple[list[NDArray[n
 
 
 def _rows_between(
-    plane: _Plane, offset: Float64Array, dk: int, found: dict[bytes, NDArray[np.int32]]
+    plane: _Plane, offset: Float64Array, dk: int, cache: dict[bytes, NDArray[np.int32]]
 ) -> NDArray[np.int32]:
     """Return the rows of another slice; those behind mirror those ahead, so that each of two sees the other."""
     if dk < 0:
-        return _mirror(_rows_between(plane, -offset + 0.0, -dk, found))
+        return _mirror(_rows_between(plane, -offset + 0.0, -dk, cache))
     key = offset.tobytes() + dk.to_bytes(8, "little")
-    if key not in found:
-        found[key] = plane.rows_at(offset, dk)
-    return found[key]
+    if key not in cache:
+        cache[key] = plane.rows_at(offset, dk)
+    return cache[key]
 
 
 def _finish(nk: int, parts: Sequence[ArrayLike], tables: NDArray[np.int32]) -> Stencil:

@@ -255,14 +255,16 @@ def _measure_device(device: Device, volume: Volume, hu: float, runs: int) -> dic
     }
 
 
-def _time_warm(own: _OwnRuns, volume: Volume, level: float, runs: int) -> tuple[dict[str, Any], dict[str, Any] | None]:
+def _time_warm(
+    runner: _OwnRuns, volume: Volume, level: float, runs: int
+) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """Spreads of the warm runs and of flying edges, run in turn; the second is None if VTK is not installed."""
 
     try:
         flying_edges = FlyingEdges(volume, usable_cores())
     except ImportError:
-        own.run()
-        return spread([own.run() for _ in range(runs)]), None
+        runner.run()
+        return spread([runner.run() for _ in range(runs)]), None
     counts: list[tuple[int, int]] = []
 
     def run_peer() -> float:
@@ -270,7 +272,7 @@ def _time_warm(own: _OwnRuns, volume: Volume, level: float, runs: int) -> tuple[
         counts.append((done.vertices, done.triangles))
         return done.seconds
 
-    summary = summarise(*alternate(own.run, run_peer, runs))
+    summary = summarise(*alternate(runner.run, run_peer, runs))
     vertices, triangles = counts[-1]
     peer = {
         "name": "vtkFlyingEdges3D",

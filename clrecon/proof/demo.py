@@ -58,13 +58,13 @@ def make_demo(
         chosen = choose_device(device)
         with ExitStack() as stack:
             with system_errors(output):
-                made = stack.enter_context(temporary_folder(folder if folder.exists() else folder.parent))
+                staged = stack.enter_context(temporary_folder(folder if folder.exists() else folder.parent))
             try:
-                outcome = _fill(made, chosen, progress)
+                outcome = _fill(staged, chosen, progress)
             except OutputError as error:
-                raise OutputError(str(error).replace(str(made), str(output))) from error
+                raise OutputError(str(error).replace(str(staged), str(output))) from error
             with hold_interrupts():
-                _put_in_place(made, folder, output)
+                _put_in_place(staged, folder, output)
     return {"folder": str(output), **outcome}
 
 
@@ -157,13 +157,13 @@ def _check_replaceable(folder: Path, output: str | Path) -> None:
         raise UsageError(f"{output} holds something that is not of a demo ({example}): name a new or empty folder")
 
 
-def _put_in_place(made: Path, folder: Path, output: str | Path) -> None:
+def _put_in_place(staged: Path, folder: Path, output: str | Path) -> None:
     """Move a finished demonstration to its place: as a folder, or file by file into a folder that is there."""
     keep = existing_stay()
     if not folder.exists():
-        made.chmod(final_mode(folder, 0o777))
-        place_folder(made, folder, output, keep=keep)
+        staged.chmod(final_mode(folder, 0o777))
+        place_folder(staged, folder, output, keep=keep)
         return
     for name in _DEMO_FILES:
-        place = place_folder if (made / name).is_dir() else place_file
-        place(made / name, folder / name, Path(output) / name, keep=keep)
+        move = place_folder if (staged / name).is_dir() else place_file
+        move(staged / name, folder / name, Path(output) / name, keep=keep)

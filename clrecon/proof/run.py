@@ -72,17 +72,17 @@ def run_selftest(
     if many <= 1:
         yield from _run_part(device, checks, silent_seconds, [], threading.Event())
         return
-    told: queue.Queue[dict[str, Any] | BaseException | None] = queue.Queue()
+    messages: queue.Queue[dict[str, Any] | BaseException | None] = queue.Queue()
     children: list[_Child] = []
     is_over = threading.Event()
 
     def run(part: Sequence[Check]) -> None:
         try:
             for result in _run_part(device, part, silent_seconds, children, is_over):
-                told.put(result)
+                messages.put(result)
         except BaseException as error:  # raised again by the thread that waits
-            told.put(error)
-        told.put(None)
+            messages.put(error)
+        messages.put(None)
 
     threads = [threading.Thread(target=run, args=(checks[n::many],), daemon=True) for n in range(many)]
     try:
@@ -90,7 +90,7 @@ def run_selftest(
             thread.start()
         running = many
         while running:
-            line = told.get()
+            line = messages.get()
             if isinstance(line, BaseException):
                 raise line
             if line is None:
@@ -187,17 +187,17 @@ class _Child:
             if not line:
                 self._process.wait()
                 return
-            told = json.loads(line)
-            if "operator" in told:
-                yield told
-            elif "warnings" in told:
-                for text in told["warnings"]:
+            message = json.loads(line)
+            if "operator" in message:
+                yield message
+            elif "warnings" in message:
+                for text in message["warnings"]:
                     if text not in self._device.warnings:
                         self._device.remark(text)
-            elif "check" in told:
+            elif "check" in message:
                 self._doing, self._since = "the preparation of its data", time.perf_counter()
             else:
-                self._doing = told["doing"]
+                self._doing = message["doing"]
 
     @property
     def seconds(self) -> float:
@@ -275,8 +275,8 @@ def run_device_selftest(
         if tell is not None:
             tell(device.describe(), result)
         progress("selftest", len(results), len(CHECKS))
-    place = {check.name: n for n, check in enumerate(CHECKS)}
-    results.sort(key=lambda result: place.get(result["operator"], len(place)))  # processes run side by side
+    rank = {check.name: n for n, check in enumerate(CHECKS)}
+    results.sort(key=lambda result: rank.get(result["operator"], len(rank)))  # processes run side by side
     passed = bool(results) and all(result["passed"] for result in results)
     return {"device": device.describe(), "passed": passed, "operators": results, "warnings": device.warnings}
 

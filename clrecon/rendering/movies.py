@@ -240,15 +240,15 @@ def stage_frame_folder(frames: Iterator[NDArray[np.uint8]], path: str | os.PathL
     size = 0
     with contextlib.ExitStack() as stack:
         with system_errors(path):
-            made = stack.enter_context(temporary_folder(folder.parent))
+            staged = stack.enter_context(temporary_folder(folder.parent))
             for number, frame in enumerate(frames):
-                with open(made / f"frame_{number:04d}.png", "xb") as stream:
+                with open(staged / f"frame_{number:04d}.png", "xb") as stream:
                     Image.fromarray(frame).save(stream, "PNG")
                     stream.flush()
                     os.fsync(stream.fileno())
                     size += stream.tell()
-            made.chmod(final_mode(folder, 0o777))
-        yield StagedFolder(path, made, folder, size)
+            staged.chmod(final_mode(folder, 0o777))
+        yield StagedFolder(path, staged, folder, size)
 
 
 _REPEAT_FOR_EVER = b"\x21\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00"
@@ -292,23 +292,23 @@ def _gif_picture(frame: NDArray[np.uint8]) -> tuple[bytes, bytes]:
     dithered.save(data, "GIF", optimize=False, interlace=False)
     content = data.getvalue()
     flags = content[10]
-    at = 13
+    position = 13
     palette = b""
     if flags & 0x80:
-        palette = content[at : at + (3 << ((flags & 7) + 1))]
-        at += len(palette)
-    while content[at] == 0x21:  # extensions: a label, then blocks with their length, up to an empty block
-        at += 2
-        while content[at]:
-            at += content[at] + 1
-        at += 1
-    assert content[at] == 0x2C and content[-1] == 0x3B
-    local = content[at + 9]
-    at += 10
+        palette = content[position : position + (3 << ((flags & 7) + 1))]
+        position += len(palette)
+    while content[position] == 0x21:  # extensions: a label, then blocks with their length, up to an empty block
+        position += 2
+        while content[position]:
+            position += content[position] + 1
+        position += 1
+    assert content[position] == 0x2C and content[-1] == 0x3B
+    local = content[position + 9]
+    position += 10
     if local & 0x80:
-        palette = content[at : at + (3 << ((local & 7) + 1))]
-        at += len(palette)
-    return palette, content[at:-1]
+        palette = content[position : position + (3 << ((local & 7) + 1))]
+        position += len(palette)
+    return palette, content[position:-1]
 
 
 def write_apng(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
@@ -353,11 +353,11 @@ def _png_chunks(frame: NDArray[np.uint8]) -> Iterator[tuple[bytes, bytes]]:
     data = BytesIO()
     Image.fromarray(frame).save(data, "PNG")
     content = data.getvalue()
-    at = 8
-    while at < len(content):
-        length, kind = struct.unpack_from(">I4s", content, at)
-        yield kind, content[at + 8 : at + 8 + length]
-        at += 12 + length
+    position = 8
+    while position < len(content):
+        length, kind = struct.unpack_from(">I4s", content, position)
+        yield kind, content[position + 8 : position + 8 + length]
+        position += 12 + length
 
 
 def _write_chunk(stream: BinaryIO, kind: bytes, body: bytes) -> None:
@@ -401,9 +401,9 @@ def write_video(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: floa
     first = next(frames)
     height, width = first.shape[:2]
     with tempfile.TemporaryDirectory(prefix="clrecon-") as folder:
-        made = Path(folder) / "video.mp4"
+        video = Path(folder) / "video.mp4"
         errors = Path(folder) / "errors.txt"
-        command = _encoder_command(find_encoder(), (width + width % 2, height + height % 2), fps, made)
+        command = _encoder_command(find_encoder(), (width + width % 2, height + height % 2), fps, video)
         with open(errors, "wb") as log, _start_encoder(command, log) as encoder:
             assert encoder.stdin is not None
             try:
@@ -420,11 +420,11 @@ def write_video(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: floa
                 with contextlib.suppress(OSError):
                     encoder.stdin.close()
                 raise
-        if code != 0 or not made.exists():
+        if code != 0 or not video.exists():
             lines = errors.read_text(errors="replace").split("\n")
-            said = next((line.strip() for line in reversed(lines) if line.strip()), f"exit code {code}")
-            raise OutputError(f"the encoder of MP4 failed: {said}")
-        with open(made, "rb") as finished:
+            last_line = next((line.strip() for line in reversed(lines) if line.strip()), f"exit code {code}")
+            raise OutputError(f"the encoder of MP4 failed: {last_line}")
+        with open(video, "rb") as finished:
             shutil.copyfileobj(finished, stream, 1 << 20)
 
 

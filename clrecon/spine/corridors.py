@@ -113,14 +113,14 @@ def line_points(lines: Float64Array, span: Span) -> Float64Array:
     direction = np.stack((-span.side * np.tan(medial), np.full(np.shape(medial), -1.0), np.tan(sagittal)), axis=-1)
     start = np.stack((lines[:, 0], np.full(len(lines), span.pass_y), lines[:, 1]), axis=1)
     count = int(np.ceil((span.back - span.tip) / _ALONG_MM)) + 1
-    way = span.pass_y - np.linspace(span.back, span.tip, count)
-    return np.asarray(start[:, None] + way[None, :, None] * direction[:, None])
+    steps = span.pass_y - np.linspace(span.back, span.tip, count)
+    return np.asarray(start[:, None] + steps[None, :, None] * direction[:, None])
 
 
 def _least_and_mean(depth: Depth, lines: Float64Array, span: Span) -> tuple[Float64Array, Float64Array]:
     points = line_points(lines, span)
-    found = depth(points.reshape(-1, 3)).reshape(points.shape[:2])
-    return found.min(axis=1), found.mean(axis=1)
+    depths = depth(points.reshape(-1, 3)).reshape(points.shape[:2])
+    return depths.min(axis=1), depths.mean(axis=1)
 
 
 def segment_distances(first: Float64Array, last: Float64Array, points: Float64Array) -> Float64Array:
@@ -140,20 +140,21 @@ def _pair_squares(first: Float64Array, last: Float64Array, points: Float64Array)
     table = np.stack((*rows.T, ones, np.einsum("ij,ij->i", rows, rows))).astype(np.float32)
     step = max(1, AT_ONCE // len(points))
     for start in range(0, max(len(first), 1), step):
-        one, other = first[start : start + step] - middle, last[start : start + step] - middle
-        length = np.linalg.norm(other - one, axis=1)
-        unit = (other - one) / np.maximum(length, 1e-9)[:, None]
-        start_along = np.einsum("ij,ij->i", unit, one)
-        nothing = np.zeros(len(one))
+        starts, ends = first[start : start + step] - middle, last[start : start + step] - middle
+        length = np.linalg.norm(ends - starts, axis=1)
+        unit = (ends - starts) / np.maximum(length, 1e-9)[:, None]
+        start_along = np.einsum("ij,ij->i", unit, starts)
+        nothing = np.zeros(len(starts))
         along = np.column_stack((unit, -start_along, nothing)).astype(np.float32) @ table
         square = (
-            np.column_stack((-2.0 * one, np.einsum("ij,ij->i", one, one), nothing + 1.0)).astype(np.float32) @ table
+            np.column_stack((-2.0 * starts, np.einsum("ij,ij->i", starts, starts), nothing + 1.0)).astype(np.float32)
+            @ table
         )
         # square of the distance from the first end; less what lies along the segment, plus what lies beyond its ends
-        held = np.clip(along, np.float32(0.0), length.astype(np.float32)[:, None])
+        clipped = np.clip(along, np.float32(0.0), length.astype(np.float32)[:, None])
         along *= np.float32(2.0)
-        along -= held
-        along *= held
+        along -= clipped
+        along *= clipped
         square -= along
         yield square
 
@@ -210,10 +211,10 @@ def _pass_points(coarse: Depth, frame: VertebraFrame, side: float, back: float) 
     grid = np.stack([part.ravel() for part in np.meshgrid(x, z, indexing="ij")], axis=1)
     best: tuple[float, float, Float64Array] = (np.inf, back, np.zeros((0, 2)))
     for y in np.arange(frame.body_y[1] - 1.0, back + 0.1, COARSE_MM):
-        found = coarse(np.stack((grid[:, 0], np.full(len(grid), y), grid[:, 1]), axis=1))
-        deepest = float(found.max())
+        depths = coarse(np.stack((grid[:, 0], np.full(len(grid), y), grid[:, 1]), axis=1))
+        deepest = float(depths.max())
         if deepest < best[0]:
-            best = (deepest, float(y), grid[found >= max(0.6 * deepest, 0.3)])
+            best = (deepest, float(y), grid[depths >= max(0.6 * deepest, 0.3)])
     return best[1], best[2]
 
 
@@ -261,9 +262,9 @@ def find_line(depth: Depth, surface: Float64Array, frame: VertebraFrame, side: f
             turned = winner.copy()
             turned[column] = angle
             starts += [lines[rows[int(score[rows].argmax())]], turned]
-        held = free.copy()
-        held[column] = False
-        refined, scores, more = _refine(judge, np.array(starts), held, FINE_STEPS[:2])
+        free_columns = free.copy()
+        free_columns[column] = False
+        refined, scores, more = _refine(judge, np.array(starts), free_columns, FINE_STEPS[:2])
         best, top, tried = np.concatenate((best, refined)), np.concatenate((top, scores)), tried + more
     best = best[top > 0.0]
     refined, scores, more = _refine(last, best[np.argsort(top[top > 0.0])[::-1][:LAST]], free, FINE_STEPS[1:])
@@ -404,8 +405,8 @@ def find_corridors(
         The label is not that of a whole vertebra, or it is cut off at the end of the scan.
     """
     number = labels.find(label)
-    taken, (level, _) = resample_labels(labels, volume), settle_level(volume, iso_value)
-    return measure_corridors(volume, taken.voxels, number, checked_iso_value(level), labels.name(number))
+    placed, (level, _) = resample_labels(labels, volume), settle_level(volume, iso_value)
+    return measure_corridors(volume, placed.voxels, number, checked_iso_value(level), labels.name(number))
 
 
 def measure_corridors(
@@ -422,11 +423,11 @@ def measure_corridors(
     warnings = _judge_cut(bone, frame, name)
     surface = frame.to_frame(bone.surface)
     wall = surface[canal_wall(bone, frame)]
-    found = []
+    corridors = []
     for side, sign in SIDES.items():
         line, span = find_line(lambda points: bone.quick_depth(frame.to_lps(points)), surface, frame, sign)
-        found.append(_measure(bone, frame, surface, wall, side, line, span))
-    return VertebraCorridors(name, bone, frame, tuple(found), tuple(warnings))
+        corridors.append(_measure(bone, frame, surface, wall, side, line, span))
+    return VertebraCorridors(name, bone, frame, tuple(corridors), tuple(warnings))
 
 
 def _judge_cut(bone: SolidBone, frame: VertebraFrame, name: str) -> list[str]:
@@ -455,7 +456,7 @@ def _measure(
         )
     ends = line_points(np.array([[line.x, line.z, line.medial_deg, line.sagittal_deg]]), span)[0]
     first, last = ends[0], ends[-1]
-    way = last - first
+    axis = last - first
     distance, voxels, by_hu = _walls(bone, frame, surface, first, last, line.radius)
     refused = None
     if line.radius > _LARGEST_RADIUS_MM:
@@ -469,12 +470,12 @@ def _measure(
         refused = f"the widest line has a radius of {line.radius:.1f} mm: there is no room in this pedicle"
     if refused is not None:
         return Corridor(side, refused, width_voxels=voxels)
-    middle = first + (span.back - frame.body_y[1]) / (span.back - span.tip) * way
+    middle = first + (span.back - frame.body_y[1]) / (span.back - span.tip) * axis
     start, *_, tip = frame.to_lps(np.stack((first, last)))
     exit_point = find_exit(bone, start, start - tip)
     lps = tip - start
-    pass_point = first + (span.back - span.pass_y) / (span.back - span.tip) * way
-    medial, sagittal = line_angles(way, span.side)
+    pass_point = first + (span.back - span.pass_y) / (span.back - span.tip) * axis
+    medial, sagittal = line_angles(axis, span.side)
     medial_lps, sagittal_lps = line_angles(lps, span.side)
     canal = float(np.linalg.norm(segment_offsets(wall, first, last)[0], axis=1).min()) if len(wall) else None
     return Corridor(

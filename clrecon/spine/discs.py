@@ -60,10 +60,10 @@ def follow_canal(points: Float64Array, volume: Grid) -> Course:
     from scipy.ndimage import gaussian_filter1d
 
     arcs = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    at = np.arange(0.0, arcs[-1] + 1e-6, STEP_MM)
-    line = np.stack([np.interp(at, arcs, axis) for axis in points.T], axis=1)
+    stations = np.arange(0.0, arcs[-1] + 1e-6, STEP_MM)
+    line = np.stack([np.interp(stations, arcs, axis) for axis in points.T], axis=1)
     if len(points) > 2:
-        line = PchipInterpolator(arcs, points, axis=0)(at)
+        line = PchipInterpolator(arcs, points, axis=0)(stations)
     sigma = min(_BEND_MM, arcs[-1]) / 3.0
     beyond = int(BEYOND_MM / STEP_MM)
     # Beyond its ends the line goes on in the direction of its last centimetres.
@@ -93,7 +93,7 @@ def sample_course(
     from scipy.ndimage import map_coordinates
 
     offsets = ahead_mm[:, None, None], aside_mm[None, :, None]
-    found = np.empty((len(course), len(ahead_mm), len(aside_mm)), np.float32)
+    sampled = np.empty((len(course), len(ahead_mm), len(aside_mm)), np.float32)
     size = np.array(grid.shape_ijk)
 
     def sample(n: int) -> None:
@@ -102,18 +102,18 @@ def sample_course(
         inside = ((ijk >= -0.5) & (ijk <= size - 0.5)).all(axis=1)
         low, high = np.maximum(np.floor(ijk.min(axis=0)).astype(int) - 1, 0), np.ceil(ijk.max(axis=0)).astype(int) + 2
         if not inside.any():
-            found[n] = np.nan
+            sampled[n] = np.nan
             return
         part = grid.voxels[low[2] : high[2], low[1] : high[1], low[0] : high[0]].astype(np.float32)
         values = map_coordinates(part, (ijk - low).T[::-1], order=order, mode="nearest")
-        found[n] = np.where(inside, values, np.nan).reshape(found[n].shape)
+        sampled[n] = np.where(inside, values, np.nan).reshape(sampled[n].shape)
 
-    def sample_places(where: slice) -> None:
-        for n in range(where.start, where.stop):
+    def sample_places(piece: slice) -> None:
+        for n in range(piece.start, piece.stop):
             sample(n)
 
     in_threads(sample_places, len(course), 16)
-    return found
+    return sampled
 
 
 _GAPS_MM = (11, 46)
@@ -210,21 +210,21 @@ def look_at_bodies(scan: Field) -> Looks:
     brightness = np.full((n, len(TILTS_DEG)), np.nan, np.float32)
     shares = np.linspace(0.1, 0.9, 13)
     ahead = BODY_BACK_MM + shares * (front - BODY_BACK_MM)[:, None]
-    for place, tilt in enumerate(np.radians(TILTS_DEG)):
+    for tilt_number, tilt in enumerate(np.radians(TILTS_DEG)):
         along = np.arange(n)[:, None] + np.tan(tilt) * (ahead - middle[:, None])
         middle_hu = _median(_lines(core, along, ahead), least=0.75)
         walls_hu = _mean(_lines(walls, along, ahead), axis=1, least=0.75)
-        brightness[:, place] = (1.0 - WALL_SHARE) * middle_hu + WALL_SHARE * walls_hu
+        brightness[:, tilt_number] = (1.0 - WALL_SHARE) * middle_hu + WALL_SHARE * walls_hu
     depth = np.full_like(brightness, np.nan)
     for half in _HALF_THICKNESS_MM:
         centre = _mean(np.stack([_shifted(brightness, shift) for shift in range(1 - half, half)]), axis=0)
         plates = [
             np.fmax.reduce([_shifted(brightness, sign * (half + n)) for n in range(_PLATE_MM)]) for sign in (-1, 1)
         ]
-        found = np.minimum(*plates) - centre
-        found[~(np.minimum(*plates) >= BONE_HU) | ~(centre >= FAT_HU)] = np.nan
-        found[half > np.maximum(_MOST_HALF_THICKNESS * (front - _BACK_WALL_MM), 2.0)] = np.nan
-        depth = np.fmax(depth, found)
+        disc_hu = np.minimum(*plates) - centre
+        disc_hu[~(np.minimum(*plates) >= BONE_HU) | ~(centre >= FAT_HU)] = np.nan
+        disc_hu[half > np.maximum(_MOST_HALF_THICKNESS * (front - _BACK_WALL_MM), 2.0)] = np.nan
+        depth = np.fmax(depth, disc_hu)
     return Looks(brightness, core, depth, middle, front, side)
 
 
@@ -268,8 +268,8 @@ def _lines(image: Field, along: NDArray[np.float64], ahead: NDArray[np.float64])
 
     inside = (along >= 0) & (along <= len(image) - 1)
     filled = np.where(np.isfinite(image), image, -200.0)
-    found = map_coordinates(filled, [along, ahead / (AHEAD_MM[1] - AHEAD_MM[0])], order=1, mode="nearest")
-    return np.asarray(np.where(inside, found, np.nan), dtype=np.float32)
+    sampled = map_coordinates(filled, [along, ahead / (AHEAD_MM[1] - AHEAD_MM[0])], order=1, mode="nearest")
+    return np.asarray(np.where(inside, sampled, np.nan), dtype=np.float32)
 
 
 def choose_discs(looks: Looks) -> tuple[list[Bound], NDArray[np.float64]]:
@@ -307,15 +307,15 @@ def _worth(depth: Field, usual: NDArray[np.float64]) -> tuple[NDArray[np.floatin
 def discs_between(looks: Looks, seeds: list[int]) -> tuple[list[Bound], NDArray[np.float64]]:
     """Return the best disc between each two neighbouring seeds, places in bodies; as `choose_discs`."""
     depth = np.nan_to_num(looks.depth, nan=-1e3)
-    found = []
+    bounds = []
     for upper, lower in itertools.pairwise(sorted(seeds)):
         margin = max(2, (lower - upper) // 5)
         part = depth[upper + margin : lower - margin]
         worth, tilt = _worth(part, np.full(len(part), max(float(part.max()), 1.0)))
-        at = int(worth.argmax())
-        found.append(Bound(upper + margin + at, int(tilt[at]), float(part[at, tilt[at]])))
-    usual = float(np.median([bound.depth_hu for bound in found])) if found else 0.0
-    return found, np.full(len(depth), usual)
+        best = int(worth.argmax())
+        bounds.append(Bound(upper + margin + best, int(tilt[best]), float(part[best, tilt[best]])))
+    usual = float(np.median([bound.depth_hu for bound in bounds])) if bounds else 0.0
+    return bounds, np.full(len(depth), usual)
 
 
 def end_of_bone(looks: Looks, bound: Bound, gap: float, sign: int) -> Bound | None:
@@ -323,17 +323,17 @@ def end_of_bone(looks: Looks, bound: Bound, gap: float, sign: int) -> Bound | No
     flat = looks.brightness[:, len(TILTS_DEG) // 2]
     first, last = (int(bound.at + sign * share * gap) for share in _END_SHARES)
     best: Bound | None = None
-    for at in range(first, last + sign, sign):
-        if not 0 < at < len(flat) - 1:
+    for station in range(first, last + sign, sign):
+        if not 0 < station < len(flat) - 1:
             break
-        inner = flat[max(0, min(at - 6 * sign, at - sign)) : max(at - 6 * sign, at - sign) + 1]
-        outer = flat[max(0, min(at + sign, at + 6 * sign)) : max(at + sign, at + 6 * sign) + 1]
+        inner = flat[max(0, min(station - 6 * sign, station - sign)) : max(station - 6 * sign, station - sign) + 1]
+        outer = flat[max(0, min(station + sign, station + 6 * sign)) : max(station + sign, station + 6 * sign) + 1]
         if not (np.isfinite(inner).sum() >= 4 and np.isfinite(outer).sum() >= 4):
             continue
         bone = float(np.nanmean(inner))
         drop = bone - float(np.nanmean(outer))
         if bone >= BONE_HU and drop >= 0.5 * (bone - SOFT_HU) and (best is None or drop > best.depth_hu):
-            best = Bound(at, len(TILTS_DEG) // 2, drop, is_disc=False)
+            best = Bound(station, len(TILTS_DEG) // 2, drop, is_disc=False)
     return best
 
 

@@ -92,9 +92,9 @@ def _hole(points: Float64Array, basis: Float64Array, pixel: float) -> tuple[floa
 
     flat = points @ basis[:2].T
     low = flat.min(axis=0) - 2.0 * pixel
-    place = ((flat - low) / pixel).astype(np.intp)
-    size = place.max(axis=0) + 3
-    seen = (np.bincount(place[:, 0] * size[1] + place[:, 1], minlength=size[0] * size[1]) > 0).reshape(size)
+    pixels = ((flat - low) / pixel).astype(np.intp)
+    size = pixels.max(axis=0) + 3
+    seen = (np.bincount(pixels[:, 0] * size[1] + pixels[:, 1], minlength=size[0] * size[1]) > 0).reshape(size)
     seen = binary_closing(seen)
     holes = binary_fill_holes(seen) & ~seen
     if not holes.any():
@@ -102,10 +102,10 @@ def _hole(points: Float64Array, basis: Float64Array, pixel: float) -> tuple[floa
     wide = distance_transform_edt(holes)
     radius = float(wide.max())
     # the centre of the circles that are nearly as wide: a single pixel would jump
-    at = np.argwhere(wide >= 0.8 * radius)
+    candidates = np.argwhere(wide >= 0.8 * radius)
     first = np.unravel_index(int(wide.argmax()), wide.shape)
-    at = at[np.linalg.norm(at - np.array(first), axis=1) <= radius]
-    return (radius - 0.5) * pixel, low + (at.mean(axis=0) + 0.5) * pixel
+    candidates = candidates[np.linalg.norm(candidates - np.array(first), axis=1) <= radius]
+    return (radius - 0.5) * pixel, low + (candidates.mean(axis=0) + 0.5) * pixel
 
 
 def _look_through(points: Float64Array) -> tuple[float, Float64Array, Float64Array]:
@@ -132,7 +132,7 @@ def _look_through(points: Float64Array) -> tuple[float, Float64Array, Float64Arr
     return radius, basis, centre
 
 
-def find_frame(bone: SolidBone, what: str) -> VertebraFrame:
+def find_frame(bone: SolidBone, subject: str) -> VertebraFrame:
     from scipy.ndimage import distance_transform_edt
 
     thin = np.pad(bone.mask[::_STRIDE, ::_STRIDE, ::_STRIDE], 1)
@@ -142,13 +142,13 @@ def find_frame(bone: SolidBone, what: str) -> VertebraFrame:
     step = _STRIDE * bone.lattice.step
     if len(points) * step**3 < _LEAST_MM3:
         raise RefusedInputError(
-            f"{what} has a volume of {len(points) * step**3 / 1000:.2g} ml: no vertebra, those have 5 ml or more"
+            f"{subject} has a volume of {len(points) * step**3 / 1000:.2g} ml: no vertebra, those have 5 ml or more"
         )
     radius, basis, centre = _look_through(points)
     if not _LEAST_CANAL_RADIUS_MM <= radius <= _WIDEST_CANAL_RADIUS_MM:
         seen = f"its widest hole has a radius of {radius:.1f} mm" if radius > 0.0 else "it has no hole"
         raise RefusedInputError(
-            f"{what} is not the label of a whole vertebra: no vertebral canal is seen through it ({seen})"
+            f"{subject} is not the label of a whole vertebra: no vertebral canal is seen through it ({seen})"
         )
     canal_point = centre @ basis[:2]
     core = points[depth >= _CORE_SHARE * depth.max()]
@@ -157,11 +157,11 @@ def find_frame(bone: SolidBone, what: str) -> VertebraFrame:
     axes = _point_front(middle, canal_point, up)
     for _ in range(4):
         local = (points - middle) @ axes.T
-        up, shift, height = _fit_plates(local, axes, what)
+        up, shift, height = _fit_plates(local, axes, subject)
         middle = middle + shift * axes[2]
         axes = _point_front(middle, canal_point + ((middle - canal_point) @ basis[2]) * basis[2], up)
     middle, axes = _halve(bone, points, middle, axes)
-    return _measure(points, middle, axes, (canal_point, basis[2], radius), height, what)
+    return _measure(points, middle, axes, (canal_point, basis[2], radius), height, subject)
 
 
 def _point_front(middle: Float64Array, canal: Float64Array, up: Float64Array) -> Float64Array:
@@ -185,8 +185,8 @@ def _halve(
             height = local @ across
             for shifted in shift + step_mm * np.arange(-3, 4):
                 mirrored = local - 2.0 * (height - shifted)[:, None] * across
-                held = int(np.count_nonzero(bone.is_labelled(middle + mirrored @ axes)))
-                best = max(best, (held, float(turned), float(shifted)))
+                labelled = int(np.count_nonzero(bone.is_labelled(middle + mirrored @ axes)))
+                best = max(best, (labelled, float(turned), float(shifted)))
         _, turn, shift = best
     angle = np.radians(turn)
     rotation = np.array(((np.cos(angle), np.sin(angle), 0.0), (-np.sin(angle), np.cos(angle), 0.0), (0.0, 0.0, 1.0)))
@@ -194,17 +194,17 @@ def _halve(
     return middle + shift * turned_axes[0], turned_axes
 
 
-def _fit_plates(local: Float64Array, axes: Float64Array, what: str) -> tuple[Float64Array, float, float]:
+def _fit_plates(local: Float64Array, axes: Float64Array, subject: str) -> tuple[Float64Array, float, float]:
     """Fit planes to both ends of the body's columns; return their mean normal, LPS, middle height and distance, mm."""
     near = local[np.hypot(local[:, 0], local[:, 1]) <= _PLATE_RADIUS_MM]
-    place = np.floor(near[:, :2] / 1.5).astype(np.intp) + 20
-    key = place[:, 0] * 64 + place[:, 1]
+    column = np.floor(near[:, :2] / 1.5).astype(np.intp) + 20
+    key = column[:, 0] * 64 + column[:, 1]
     order = np.lexsort((near[:, 2], key))
     key, near = key[order], near[order]
     starts = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
     ends = np.r_[starts[1:], len(key)] - 1
     if len(starts) < 20:
-        raise RefusedInputError(f"{what} is not the label of a whole vertebra: no body lies in front of its canal")
+        raise RefusedInputError(f"{subject} is not the label of a whole vertebra: no body lies in front of its canal")
     planes = []
     for rows in (near[ends], near[starts]):
         design = np.column_stack((rows[:, :2], np.ones(len(rows))))
@@ -218,15 +218,15 @@ def _fit_plates(local: Float64Array, axes: Float64Array, what: str) -> tuple[Flo
     height = float(planes[0][2] - planes[1][2])
     if not _BODY_HEIGHT_MM[0] <= height <= _BODY_HEIGHT_MM[1]:
         raise RefusedInputError(
-            f"{what} is not the label of a whole vertebra: what lies in front of its canal is {height:.0f} mm high, a"
-            f" body {_BODY_HEIGHT_MM[0]:g} to {_BODY_HEIGHT_MM[1]:g} mm"
+            f"{subject} is not the label of a whole vertebra: what lies in front of its canal is {height:.0f} mm"
+            f" high, a body {_BODY_HEIGHT_MM[0]:g} to {_BODY_HEIGHT_MM[1]:g} mm"
         )
     return up / np.linalg.norm(up), float((planes[0][2] + planes[1][2]) / 2.0), height
 
 
 def _measure(
     points: Float64Array, middle: Float64Array, axes: Float64Array, canal: tuple[Float64Array, Float64Array, float],
-    height: float, what: str,
+    height: float, subject: str,
 ) -> VertebraFrame:  # fmt: skip
     """Measure the walls of the body and place the canal's axis in the frame."""
     canal_point, along, radius = canal
@@ -245,7 +245,7 @@ def _measure(
     depth = walls[1] - walls[0]
     if not _BODY_DEPTH_MM[0] <= depth <= _BODY_DEPTH_MM[1] or y <= walls[1]:
         raise RefusedInputError(
-            f"{what} is not the label of a whole vertebra: what lies in front of its canal is {depth:.0f} mm deep, a"
+            f"{subject} is not the label of a whole vertebra: what lies in front of its canal is {depth:.0f} mm deep, a"
             f" body {_BODY_DEPTH_MM[0]:g} to {_BODY_DEPTH_MM[1]:g} mm"
         )
     return VertebraFrame(

@@ -67,9 +67,9 @@ def sector_names(offsets: Float64Array, direction: Float64Array, side: float) ->
 
 def segment_offsets(points: Float64Array, first: Float64Array, last: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return offsets of points (n, 3) from the nearest ones of a segment, and where on it, 0 to 1, these lie (n,)."""
-    way = last - first
-    share = np.clip((points - first) @ way / (way @ way), 0.0, 1.0)
-    return points - first - share[:, None] * way, share
+    axis = last - first
+    share = np.clip((points - first) @ axis / (axis @ axis), 0.0, 1.0)
+    return points - first - share[:, None] * axis, share
 
 
 def margins(surface: Float64Array, first: Float64Array, last: Float64Array, side: float) -> dict[str, float | None]:
@@ -77,36 +77,36 @@ def margins(surface: Float64Array, first: Float64Array, last: Float64Array, side
     offsets, share = segment_offsets(surface, first, last)
     offsets = offsets[(share > 0.0) & (share < 1.0)]
     distance, sector = np.linalg.norm(offsets, axis=1), sector_names(offsets, last - first, side)
-    found: dict[str, float | None] = {}
+    margin_by_side: dict[str, float | None] = {}
     for number, name in enumerate(DIRECTIONS):
-        own = distance[sector == number]
-        found[name] = float(own.min()) if len(own) else None
-    return found
+        in_sector = distance[sector == number]
+        margin_by_side[name] = float(in_sector.min()) if len(in_sector) else None
+    return margin_by_side
 
 
 def canal_wall(bone: SolidBone, frame: VertebraFrame) -> NDArray[np.bool_]:
     """Mark the points of the surface that can be seen from the canal's axis at their own height: the canal's wall."""
     local = frame.to_frame(bone.surface)
     axis = frame.canal_at(local[:, 2])
-    found = np.zeros(len(local), dtype=bool)
+    is_wall = np.zeros(len(local), dtype=bool)
     half = 0.75 * frame.body_height
     near = np.flatnonzero((np.linalg.norm(local - axis, axis=1) <= CANAL_REACH_MM) & (np.abs(local[:, 2]) <= half))
     blocked = np.zeros(len(near), dtype=bool)
     for share in np.linspace(0.0, 1.0, _CANAL_SAMPLES, endpoint=False):
-        at = axis[near] + share * (local[near] - axis[near])
+        on_way = axis[near] + share * (local[near] - axis[near])
         # within a step of the surface the nearest point of the lattice may be solid
-        free = np.linalg.norm(local[near] - at, axis=1) > 2.0 * bone.lattice.step
-        blocked |= free & bone.is_solid(frame.to_lps(at))
-    found[near[~blocked]] = True
-    return found
+        free = np.linalg.norm(local[near] - on_way, axis=1) > 2.0 * bone.lattice.step
+        blocked |= free & bone.is_solid(frame.to_lps(on_way))
+    is_wall[near[~blocked]] = True
+    return is_wall
 
 
 def find_exit(bone: SolidBone, start: Float64Array, direction: Float64Array, reach: float = 80.0) -> Float64Array:
     """Return where a ray from a point inside leaves the bone for the first time, LPS mm."""
     unit = direction / np.linalg.norm(direction)
-    way = np.arange(0.0, reach, _RAY_STEP_MM)
-    outside = ~bone.is_solid(start + way[:, None] * unit)
-    return np.asarray(start + (way[int(outside.argmax())] if outside.any() else reach) * unit, dtype=np.float64)
+    steps = np.arange(0.0, reach, _RAY_STEP_MM)
+    outside = ~bone.is_solid(start + steps[:, None] * unit)
+    return np.asarray(start + (steps[int(outside.argmax())] if outside.any() else reach) * unit, dtype=np.float64)
 
 
 def measure_bias(bone: SolidBone, frame: VertebraFrame, first: Float64Array, last: Float64Array) -> Bias | None:
@@ -115,16 +115,16 @@ def measure_bias(bone: SolidBone, frame: VertebraFrame, first: Float64Array, las
     turns = np.linspace(0.0, 2.0 * np.pi, RAYS, endpoint=False)
     spokes = np.cos(turns)[:, None] * medial + np.sin(turns)[:, None] * up
     stations = first + np.linspace(0.0, 1.0, STATIONS)[:, None] * (last - first)
-    way = np.arange(0.0, 14.0, _RAY_STEP_MM)
-    rays = stations[:, None, None] + way[None, None, :, None] * spokes[None, :, None]
+    steps = np.arange(0.0, 14.0, _RAY_STEP_MM)
+    rays = stations[:, None, None] + steps[None, None, :, None] * spokes[None, :, None]
     places = frame.to_lps(rays.reshape(-1, 3))
-    solid = bone.is_solid(places).reshape(-1, len(way))
-    values = bone.sample_hu(places).reshape(-1, len(way))
+    solid = bone.is_solid(places).reshape(-1, len(steps))
+    values = bone.sample_hu(places).reshape(-1, len(steps))
     near = int(WALL_MM / _RAY_STEP_MM)
     off, halves = [], []
     for inside, hu in zip(solid, values, strict=True):
         wall = int(np.argmin(inside))
-        if inside.all() or wall < 2 or wall + near >= len(way):
+        if inside.all() or wall < 2 or wall + near >= len(steps):
             continue
         begin = max(0, wall - near)
         peak = begin + int(hu[begin : wall + 1].argmax())
@@ -207,7 +207,7 @@ def grade_breach(breach_mm: float) -> str:
     return next((grade for grade, below in _GRADES[1:] if breach_mm < below), "E")
 
 
-def grade_screw(bone: SolidBone, frame: VertebraFrame, screw: Screw, what: str) -> ScrewGrade:
+def grade_screw(bone: SolidBone, frame: VertebraFrame, screw: Screw, subject: str) -> ScrewGrade:
     """Grade a screw in a vertebra, named `what` in messages.
 
     Graded is the part from the coronal plane through the canal's axis to the body's middle, and behind it what lies in
@@ -215,22 +215,22 @@ def grade_screw(bone: SolidBone, frame: VertebraFrame, screw: Screw, what: str) 
     """
     first, last = frame.to_frame(np.stack((screw.entry, screw.tip)))
     if first[1] < last[1]:
-        raise UsageError(f"{screw.name} runs from front to back in {what}: give its entry first, then its tip")
-    way = last - first
-    length = float(np.linalg.norm(way))
-    axis = first + np.linspace(0.0, 1.0, int(np.ceil(length / _STATION_MM)) + 1)[:, None] * way
+        raise UsageError(f"{screw.name} runs from front to back in {subject}: give its entry first, then its tip")
+    axis_vector = last - first
+    length = float(np.linalg.norm(axis_vector))
+    axis = first + np.linspace(0.0, 1.0, int(np.ceil(length / _STATION_MM)) + 1)[:, None] * axis_vector
     off = bone.depth(frame.to_lps(axis))
     middle = (frame.body_y[0] + frame.body_y[1]) / 2.0
     if off.max() < -FARTHEST_MM:
         raise UsageError(
-            f"{screw.name} lies {-off.max():.0f} mm or more from {what}: it belongs to another vertebra, or its numbers"
-            " are of another frame (LPS or RAS)"
+            f"{screw.name} lies {-off.max():.0f} mm or more from {subject}: it belongs to another vertebra, or its"
+            " numbers are of another frame (LPS or RAS)"
         )
     if last[1] > frame.body_y[1]:
-        raise UsageError(f"the tip of {screw.name} lies behind the body of {what}: it does not pass the pedicle")
-    share = (frame.body_y[1] - first[1]) / way[1]
-    side = 1.0 if (first + share * way)[0] > frame.canal[0] else -1.0
-    spokes = _spokes(way)
+        raise UsageError(f"the tip of {screw.name} lies behind the body of {subject}: it does not pass the pedicle")
+    share = (frame.body_y[1] - first[1]) / axis_vector[1]
+    side = 1.0 if (first + share * axis_vector)[0] > frame.canal[0] else -1.0
+    spokes = _spokes(axis_vector)
     points = (axis[:, None] + screw.diameter / 2.0 * spokes[None]).reshape(-1, 3)
     depth = bone.depth(frame.to_lps(points))
     canal_axis = frame.canal_at(points[:, 2])
@@ -239,14 +239,14 @@ def grade_screw(bone: SolidBone, frame: VertebraFrame, screw: Screw, what: str) 
     )
     graded = ((points[:, 1] <= frame.canal[1]) | in_canal) & (points[:, 1] >= middle)
     outside = np.where(-depth >= _LEAST_BREACH_MM, -depth, 0.0)
-    sector = sector_names(np.tile(spokes, (len(axis), 1)), way, side)
+    sector = sector_names(np.tile(spokes, (len(axis), 1)), axis_vector, side)
     breaches = {
         name: float(outside[graded & (sector == number)].max(initial=0.0)) for number, name in enumerate(DIRECTIONS)
     }
     breach = max(breaches.values())
     surface = frame.to_frame(bone.surface)
-    begin = first + max(0.0, (frame.canal[1] - first[1]) / way[1]) * way
-    end = first + min(1.0, (middle - first[1]) / way[1]) * way
+    begin = first + max(0.0, (frame.canal[1] - first[1]) / axis_vector[1]) * axis_vector
+    end = first + min(1.0, (middle - first[1]) / axis_vector[1]) * axis_vector
     room: dict[str, float | None] = {}
     for name, value in margins(surface, begin, end, side).items():
         room[name] = None if value is None else value - screw.diameter / 2.0
@@ -263,9 +263,9 @@ def grade_screw(bone: SolidBone, frame: VertebraFrame, screw: Screw, what: str) 
     )
 
 
-def _spokes(way: Float64Array) -> Float64Array:
+def _spokes(axis: Float64Array) -> Float64Array:
     """Return unit vectors (n, 3) square to a direction, all around."""
-    unit = way / np.linalg.norm(way)
+    unit = axis / np.linalg.norm(axis)
     first = np.cross(unit, np.eye(3)[int(np.abs(unit).argmin())])
     first /= np.linalg.norm(first)
     turns = np.linspace(0.0, 2.0 * np.pi, 2 * RAYS, endpoint=False)

@@ -94,10 +94,10 @@ class Part:
 
 
 def planes_of(bounds: list[Bound], course: Course, looks: Looks) -> Planes:
-    at = np.array([bound.at for bound in bounds])
+    stations = np.array([bound.at for bound in bounds])
     tilt = np.radians(TILTS_DEG[[bound.tilt for bound in bounds]])[:, None]
-    centres = course.canal[at] + looks.middle_mm[at, None] * course.ahead[at]
-    return centres, np.cos(tilt) * course.down[at] - np.sin(tilt) * course.ahead[at]
+    centres = course.canal[stations] + looks.middle_mm[stations, None] * course.ahead[stations]
+    return centres, np.cos(tilt) * course.down[stations] - np.sin(tilt) * course.ahead[stations]
 
 
 def cut_part(volume: Volume, course: Course, looks: Looks) -> Part:
@@ -128,16 +128,16 @@ def cut_part(volume: Volume, course: Course, looks: Looks) -> Part:
     heights, numbers = course.canal[order, 2], np.arange(len(course))
     for k in range(len(values)):
         places = part.points(volume, k)
-        at = np.interp(places[..., 2], heights, order.astype(np.float64))
+        stations = np.interp(places[..., 2], heights, order.astype(np.float64))
         for _ in range(2):  # from the canal at the same height to the plane across the canal, where it is bent
-            nearest = np.clip(np.rint(at), 0, len(course) - 1).astype(int)
+            nearest = np.clip(np.rint(stations), 0, len(course) - 1).astype(int)
             off = places - course.canal[nearest]
-            at = nearest + (off * course.down[nearest]).sum(axis=-1)
+            stations = nearest + (off * course.down[nearest]).sum(axis=-1)
         ahead, aside = ((off * way[nearest]).sum(axis=-1) for way in (course.ahead, course.aside))
-        part.ahead[k], part.aside[k], part.place[k] = ahead, aside, np.clip(at, 0, len(course) - 1)
-        front, side = np.interp(at, numbers, looks.front_mm), np.interp(at, numbers, widest)
+        part.ahead[k], part.aside[k], part.place[k] = ahead, aside, np.clip(stations, 0, len(course) - 1)
+        front, side = np.interp(stations, numbers, looks.front_mm), np.interp(stations, numbers, widest)
         near = (ahead <= _FRONT_MM) & (ahead >= -_BEHIND_MM) & (np.abs(aside) <= _RIB_MM[1])
-        near &= (at >= -1.0) & (at <= len(course))
+        near &= (stations >= -1.0) & (stations <= len(course))
         walls = (ahead <= front + _BODY_MARGIN_MM) & (np.abs(aside) <= side + _BODY_MARGIN_MM)
         part.within[k] = near & (walls | (ahead < _PEDICLE_MM))
         off = np.abs(aside) - side
@@ -256,8 +256,8 @@ def _bound(
     """Take from each piece what lies too far beyond its planes: sacrum, pelvis, ribs of other levels."""
     centres, normals = planes
     last = len(centres)
-    at = np.array([bound.at for bound in bounds], np.float64)
-    gaps = np.diff(at) if last > 1 else np.array([30.0])
+    cuts = np.array([bound.at for bound in bounds], np.float64)
+    gaps = np.diff(cuts) if last > 1 else np.array([30.0])
     heights = np.r_[gaps[0], gaps[0], gaps, gaps[-1]]  # of piece n, the first is no piece
     first, less, low, high = SPINE_MM
     spine = np.clip(first - less * heights, low, high)
@@ -265,25 +265,25 @@ def _bound(
         chosen = plane > 0
         if not chosen.any():
             continue
-        places, own = part.points(volume, k)[chosen], plane[chosen].astype(np.int64)
+        places, station = part.points(volume, k)[chosen], plane[chosen].astype(np.int64)
         aside, ahead = np.abs(part.aside[k][chosen]), part.ahead[k][chosen]
         near = (aside <= ARCH_ASIDE_MM) & (ahead < _MARKER_AHEAD_MM)
-        above, below = np.minimum(own - 2, last - 1), np.minimum(own - 1, last - 1)
+        above, below = np.minimum(station - 2, last - 1), np.minimum(station - 1, last - 1)
         over = -((places - centres[above]) * normals[above]).sum(axis=1)
         under = ((places - centres[below]) * normals[below]).sum(axis=1)
-        far = (own > 1) & (over > np.where(near, _OVER_MM[0], _OVER_MM[1]))
-        reach = np.where(near & (aside <= _SPINE_ASIDE_MM), spine[own], np.where(near, _UNDER_MM[0], _UNDER_MM[1]))
-        far |= (own <= last) & (under > reach)
-        plane[chosen] = np.where(far, 0, own)
+        far = (station > 1) & (over > np.where(near, _OVER_MM[0], _OVER_MM[1]))
+        reach = np.where(near & (aside <= _SPINE_ASIDE_MM), spine[station], np.where(near, _UNDER_MM[0], _UNDER_MM[1]))
+        far |= (station <= last) & (under > reach)
+        plane[chosen] = np.where(far, 0, station)
     return pieces
 
 
 def _ridges(part: Part, bounds: list[Bound]) -> NDArray[np.float32]:
     """Return ridges, 0 to 1, at the heights at which one arch ends and the next begins: those of the discs."""
-    at = np.array([bound.at for bound in bounds], np.float64)
-    gaps = np.gradient(at) if len(at) > 1 else np.array([30.0])
-    place = np.arange(int(part.place.max()) + 2)[:, None]
-    heights = np.exp(-0.5 * ((place - at) / (_RIDGE_WIDTH * gaps)) ** 2).max(axis=1)
+    cuts = np.array([bound.at for bound in bounds], np.float64)
+    gaps = np.gradient(cuts) if len(cuts) > 1 else np.array([30.0])
+    stations = np.arange(int(part.place.max()) + 2)[:, None]
+    heights = np.exp(-0.5 * ((stations - cuts) / (_RIDGE_WIDTH * gaps)) ** 2).max(axis=1)
     arch = (part.ahead < _RIDGE_AHEAD_MM[1]) & (part.ahead > _RIDGE_AHEAD_MM[0])
     return np.where(arch, heights[np.rint(part.place).astype(int)], 0.0).astype(np.float32)
 
@@ -306,22 +306,22 @@ def _settle(
     """Choose one of two divisions for each group of voxels in which they differ."""
     from skimage.measure import label
 
-    at = np.array([bound.at for bound in bounds], np.float64)
-    gaps = np.diff(at) if len(at) > 1 else np.array([30.0])
-    upper, lower = np.r_[at[0] - gaps[0], at], np.r_[at, at[-1] + gaps[-1]]
+    cuts = np.array([bound.at for bound in bounds], np.float64)
+    gaps = np.diff(cuts) if len(cuts) > 1 else np.array([30.0])
+    upper, lower = np.r_[cuts[0] - gaps[0], cuts], np.r_[cuts, cuts[-1] + gaps[-1]]
     differ = by_depth != by_brightness
     pairs = np.where(differ, by_depth * (len(bounds) + 2) + by_brightness, 0)
     groups = label(pairs, connectivity=1)[differ]
     if not len(groups):
         return by_brightness.astype(np.uint8)
     count = np.maximum(np.bincount(groups), 1)
-    place, ahead = (np.bincount(groups, field[differ]) / count for field in (part.place, part.ahead))
+    station, ahead = (np.bincount(groups, field[differ]) / count for field in (part.place, part.ahead))
     ours = np.zeros((2, len(count)), np.int64)
     for n, division in enumerate((by_depth, by_brightness)):
         ours[n, groups] = division[differ]
     number = np.maximum(ours - 1, 0)
     expected = 0.5 * (upper + lower)[number] + np.where(ahead < 0.0, _ARCH_DOWN, 0.0) * (lower - upper)[number]
-    nearer = np.abs(place - expected).argmin(axis=0)
+    nearer = np.abs(station - expected).argmin(axis=0)
     result = by_brightness.astype(np.uint8)
     result[differ] = np.take_along_axis(ours, nearer[None], axis=0)[0][groups]
     return result
@@ -418,8 +418,8 @@ def judge(
     if piece.whole and gaps:
         usual_mm = float(np.median(gaps))
         ratio = max(height / usual_mm, usual_mm / height)
-        said = f"its height is {height} mm, and {usual_mm:.0f} mm is usual beside it"
-        traits["height"] = _ramp(ratio, 1.6, 1.25), said
+        remark = f"its height is {height} mm, and {usual_mm:.0f} mm is usual beside it"
+        traits["height"] = _ramp(ratio, 1.6, 1.25), remark
     low, high = _VOLUME_ML if piece.whole else (1.0, _VOLUME_ML[1])
     fits = min(_ramp(piece.volume_ml, 0.6 * low, low), _ramp(piece.volume_ml, 1.25 * high, high))
     traits["volume"] = fits, f"its volume is {piece.volume_ml:.3g} ml, not {low:g} to {high:g}"
@@ -452,7 +452,7 @@ def _middle_rows(piece: Piece) -> slice:
 def _walls(scan: Field, looks: Looks, piece: Piece) -> float:
     """Return the share of directions in which cortex brighter than the marrow stands round the middle of the body."""
     rows = range(*_middle_rows(piece).indices(len(scan)))
-    found = []
+    rings_hu = []
     for n in rows:
         middle, deep = looks.middle_mm[n], looks.front_mm[n] - looks.middle_mm[n]
         reach = np.arange(0.6, 1.5, 0.1)[:, None]
@@ -460,8 +460,8 @@ def _walls(scan: Field, looks: Looks, piece: Piece) -> float:
         aside = reach * looks.side_mm[n] * np.sin(_WALL_DIRECTIONS)
         j = np.clip(np.rint(ahead - AHEAD_MM[0]).astype(int), 0, len(AHEAD_MM) - 1)
         i = np.clip(np.rint(aside - ASIDE_MM[0]).astype(int), 0, len(ASIDE_MM) - 1)
-        found.append(np.nan_to_num(scan[n, j, i], nan=-1000.0))
-    rings = np.stack(found)
+        rings_hu.append(np.nan_to_num(scan[n, j, i], nan=-1000.0))
+    rings = np.stack(rings_hu)
     highest, outside = rings.max(axis=1), rings[:, -3:].min(axis=1)
     # a wall: as dense as bone, and softer beyond it
     return float(((highest >= 130.0) & (outside <= highest - 60.0)).mean())
@@ -481,11 +481,11 @@ def beside_share(scan: Field, looks: Looks, piece: Piece, level: float) -> float
     """Return the share of bone right beside a body: muscle stands there, but at the sacrum its wings."""
     rows = range(*_middle_rows(piece).indices(len(scan)))
     side = looks.side_mm[max(piece.begin - 20, 0)]  # of the body above: the wings have no side wall
-    found = []
+    beside = []
     for n in rows:
         ahead = (AHEAD_MM >= BODY_BACK_MM - 4.0) & (AHEAD_MM <= BODY_BACK_MM + 10.0)
         aside = np.abs(np.abs(ASIDE_MM) - side - 7.0) <= 4.0
-        found.append(scan[n][ahead][:, aside])
-    known = np.concatenate([part.ravel() for part in found])
+        beside.append(scan[n][ahead][:, aside])
+    known = np.concatenate([part.ravel() for part in beside])
     known = known[np.isfinite(known)]
     return float((known >= level).mean()) if known.size else 0.0

@@ -79,20 +79,20 @@ def sample_volume(volume: Volume, points: Float64Array) -> NDArray[np.float32]:
         return np.full(len(points), AIR_HU, np.float32)
     box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     part = np.asarray(volume.voxels[box], dtype=np.float32)
-    found = map_coordinates(part, places - low[:, None], order=1, mode="constant", cval=AIR_HU)
-    return np.asarray(found, dtype=np.float32)
+    sampled = map_coordinates(part, places - low[:, None], order=1, mode="constant", cval=AIR_HU)
+    return np.asarray(sampled, dtype=np.float32)
 
 
 def label_box(labels: NDArray[Any], number: int, margin: tuple[int, int, int]) -> Box | None:
     """Return the box (k, j, i) of a label in an array, `margin` (k, j, i) larger and within it; None without one."""
     from scipy.ndimage import find_objects
 
-    found = find_objects((labels == number).view(np.uint8))
-    if not found:
+    objects = find_objects((labels == number).view(np.uint8))
+    if not objects:
         return None
     return tuple(  # type: ignore[return-value]
         slice(max(0, part.start - more), min(size, part.stop + more))
-        for part, more, size in zip(found[0], margin, labels.shape, strict=True)
+        for part, more, size in zip(objects[0], margin, labels.shape, strict=True)
     )
 
 
@@ -158,8 +158,8 @@ class SolidBone:
 
     def nearest(self, points: Float64Array) -> tuple[Float64Array, NDArray[np.intp]]:
         """Return distances (n,) to the nearest points of the surface, and their places in `surface`."""
-        distance, place = self._tree.query(points)
-        return np.asarray(distance, dtype=np.float64), np.asarray(place, dtype=np.intp)
+        distance, index = self._tree.query(points)
+        return np.asarray(distance, dtype=np.float64), np.asarray(index, dtype=np.intp)
 
     def is_solid(self, points: Float64Array) -> NDArray[np.bool_]:
         """Tell of LPS mm (n, 3) whether the nearest point of the lattice is solid; False beyond the lattice."""
@@ -173,9 +173,9 @@ class SolidBone:
         index = np.rint(self.lattice.indices(points)).astype(np.intp)
         limits = np.array(self.lattice.shape)[:, None]
         within = ((index >= 0) & (index < limits)).all(axis=0)
-        found = np.zeros(len(points), dtype=bool)
-        found[within] = marked[tuple(index[:, within])]
-        return found
+        is_marked = np.zeros(len(points), dtype=bool)
+        is_marked[within] = marked[tuple(index[:, within])]
+        return is_marked
 
     def depth(self, points: Float64Array) -> Float64Array:
         """Return the distance from the surface, mm, positive inside, of LPS mm (n, 3)."""
@@ -186,12 +186,12 @@ class SolidBone:
         """Return HU (trilinear) at LPS mm (n, 3); beyond the lattice those of its end."""
         from scipy.ndimage import map_coordinates
 
-        found = map_coordinates(self.hu, self.lattice.indices(points), order=1, mode="nearest")
-        return np.asarray(found, dtype=np.float64)
+        sampled = map_coordinates(self.hu, self.lattice.indices(points), order=1, mode="nearest")
+        return np.asarray(sampled, dtype=np.float64)
 
 
 def fill_vertebra(
-    volume: Volume, labels: NDArray[Any], number: int, level: float, what: str, fitted: Fitted | None = None
+    volume: Volume, labels: NDArray[Any], number: int, level: float, subject: str, fitted: Fitted | None = None
 ) -> SolidBone:
     """Make the solid bone of one label on the volume's own grid; `what` names it in messages.
 
@@ -204,36 +204,36 @@ def fill_vertebra(
     margin = tuple(int(np.ceil(MARGIN_MM / step)) + 1 for step in spacing[::-1])
     box = label_box(labels, number, margin)  # type: ignore[arg-type]
     if box is None:
-        raise RefusedInputError(f"no voxel of {what} lies in the scan")
+        raise RefusedInputError(f"no voxel of {subject} lies in the scan")
     mask = labels[box]
     start = np.array([part.start for part in box])
-    own = _own(mask, number, volume)
+    vertebra_mask = _own(mask, number, volume)
     voxels = np.asarray(volume.voxels[box], dtype=np.float32)
-    dense = np.where(own & (voxels >= level), mask.dtype.type(number), mask.dtype.type(0))
+    dense = np.where(vertebra_mask & (voxels >= level), mask.dtype.type(number), mask.dtype.type(0))
     if not dense.any():
         raise RefusedInputError(
-            f"no voxel of {what} has {level:g} HU or more: they run to {float(voxels[mask == number].max()):g} HU"
+            f"no voxel of {subject} has {level:g} HU or more: they run to {float(voxels[mask == number].max()):g} HU"
         )
-    found = np.argwhere(mask == number)
-    ends = ((found + start == 0) | (found + start == np.array(volume.voxels.shape) - 1)).any(axis=1)
-    places = volume.ijk_to_lps((found + start)[:, ::-1].astype(np.float64))
+    voxels_found = np.argwhere(mask == number)
+    ends = ((voxels_found + start == 0) | (voxels_found + start == np.array(volume.voxels.shape) - 1)).any(axis=1)
+    places = volume.ijk_to_lps((voxels_found + start)[:, ::-1].astype(np.float64))
     low, high = places.min(axis=0) - MARGIN_MM, places.max(axis=0) + MARGIN_MM
     if (high - low).max() > LARGEST_MM:
         raise RefusedInputError(
-            f"{what} is {(high - low).max() - 2 * MARGIN_MM:.0f} mm long: that is no vertebra, give the label of one"
+            f"{subject} is {(high - low).max() - 2 * MARGIN_MM:.0f} mm long: that is no vertebra, give the label of one"
         )
     solid_voxels = dense.copy()
     fill_solid(solid_voxels, mask, number, (slice(None),) * 3, True)
     counts = np.ceil((high - low) / _LATTICE_STEP_MM).astype(int) + 1
     lattice = Lattice(low, _LATTICE_STEP_MM, (int(counts[2]), int(counts[1]), int(counts[0])))
     filled = (solid_voxels != 0) & (dense == 0)
-    parts = (mask == number, own, solid_voxels != 0, filled)
+    parts = (mask == number, vertebra_mask, solid_voxels != 0, filled)
     hu, label, solid = _sample(volume, start, voxels, parts, lattice, level)
     laid = None if fitted is None else fitted(lattice)
     solid = _largest(solid if laid is None else laid.solid)
     surface, by_hu = _cross(lattice, hu, solid, level, laid)
     if not len(surface):
-        raise RefusedInputError(f"nothing of {what} is left at {level:g} HU")
+        raise RefusedInputError(f"nothing of {subject} is left at {level:g} HU")
     return SolidBone(
         lattice, hu, solid, label, surface, by_hu, level, np.array(volume.affine[:3, :3]), places[ends],
         laid is not None,
@@ -268,11 +268,11 @@ def _sample(
         within[within] = near[tuple(np.floor(places[:, within] + 0.5).astype(np.intp))]
         places = places[:, within]
         sampled = [map_coordinates(part, places, order=1, mode="nearest") for part in (voxels, *shares)]
-        values, label, own, whole, filled = sampled
+        values, label, own_share, whole, filled = sampled
         # a cell whose corners are all solid is so throughout; in others HU decide, and half a filled voxel
-        inside = ((values >= level) & (own >= 0.5)) | (filled >= 0.5) | (whole >= 1.0 - 1e-4)
-        at = within.reshape(ny, nx)
-        hu[z][at], mask[z][at], solid[z][at] = values, label >= 0.5, inside
+        inside = ((values >= level) & (own_share >= 0.5)) | (filled >= 0.5) | (whole >= 1.0 - 1e-4)
+        in_plane = within.reshape(ny, nx)
+        hu[z][in_plane], mask[z][in_plane], solid[z][in_plane] = values, label >= 0.5, inside
     return hu, mask, solid
 
 
@@ -297,19 +297,19 @@ def _cross(
         size = solid.shape[axis]
         first = np.take(solid, range(size - 1), axis=axis)
         second = np.take(solid, range(1, size), axis=axis)
-        at = np.argwhere(first != second)
-        ends = at.copy()
+        near_index = np.argwhere(first != second)
+        ends = near_index.copy()
         ends[:, axis] += 1
-        one, other = hu[tuple(at.T)].astype(np.float64), hu[tuple(ends.T)].astype(np.float64)
-        outward = first[tuple(at.T)]
-        inner, outer = np.where(outward, one, other), np.where(outward, other, one)
+        near_hu, far_hu = hu[tuple(near_index.T)].astype(np.float64), hu[tuple(ends.T)].astype(np.float64)
+        outward = first[tuple(near_index.T)]
+        inner, outer = np.where(outward, near_hu, far_hu), np.where(outward, far_hu, near_hu)
         if fitted is None:
             by_hu = (inner >= level) & (outer < level)
-            share = np.where(by_hu, (one - level) / np.where(one == other, 1.0, one - other), 0.5)
+            share = np.where(by_hu, (near_hu - level) / np.where(near_hu == far_hu, 1.0, near_hu - far_hu), 0.5)
         else:
-            by_hu, share = fitted.placed[axis][tuple(at.T)], fitted.shares[axis][tuple(at.T)]
-        where = at.astype(np.float64)
-        where[:, axis] += share
-        points.append(lattice.points(where))
+            by_hu, share = fitted.placed[axis][tuple(near_index.T)], fitted.shares[axis][tuple(near_index.T)]
+        crossing = near_index.astype(np.float64)
+        crossing[:, axis] += share
+        points.append(lattice.points(crossing))
         placed.append(by_hu)
     return np.concatenate(points), np.concatenate(placed)

@@ -69,18 +69,18 @@ def name_levels(count: int, given: tuple[int, str] | None) -> dict[int, str]:
     """Return numbers and names of `count` vertebrae from the head down, ``vertebra_1`` on if no place is `given`."""
     if given is None:
         return {n: f"vertebra_{n}" for n in range(1, count + 1)}
-    place, level = given
-    first = LEVELS.index(level) - place
+    position, level = given
+    first = LEVELS.index(level) - position
     if first < 0:
         raise UsageError(
-            f"{place} vertebrae were found above {level}, and there are only {place + first} levels above {level}:"
-            " look at the picture and name another level"
+            f"{position} vertebrae were found above {level}, and there are only {position + first} levels above"
+            f" {level}: look at the picture and name another level"
         )
     if first + count > len(LEVELS):
         raise UsageError(
-            f"{count - place} vertebrae were found from {level} downwards, and there are only"
-            f" {len(LEVELS) - first - place} levels from {level} to {LEVELS[-1]}: look at the picture and name another"
-            " level"
+            f"{count - position} vertebrae were found from {level} downwards, and there are only"
+            f" {len(LEVELS) - first - position} levels from {level} to {LEVELS[-1]}: look at the picture and name"
+            " another level"
         )
     return {first + n + 1: LEVELS[first + n] for n in range(count)}
 
@@ -268,16 +268,16 @@ def split_vertebrae(
     behind = pieces[(part.ahead < -_ARCH_BEHIND_MM) & (np.abs(part.aside) < ARCH_ASIDE_MM)]
     arches = np.asarray(voxel_ml * np.bincount(behind, minlength=len(discs.bounds) + 2), dtype=np.float64)
     spans, left_out = _spans(discs, pieces, doubtful, rim, arches, voxel_ml, hu)
-    place = 0 if landmark is None else _place_of(landmark, spans, discs, volume, part.first, pieces)
-    names = name_levels(len(spans), None if level_name is None else (place, level_name))
+    position = 0 if landmark is None else _place_of(landmark, spans, discs, volume, part.first, pieces)
+    names = name_levels(len(spans), None if level_name is None else (position, level_name))
     vertebrae = _judge_all(spans, names, discs)
-    kept = {one.number: one.name for one in vertebrae if one.is_confident or keep_unsure}
-    if not kept:
+    named = {one.number: one.name for one in vertebrae if one.is_confident or keep_unsure}
+    if not named:
         raise RefusedInputError(_describe_refusal(vertebrae, left_out))
     every = np.zeros(len(discs.bounds) + 2, np.uint8)  # number of each piece
     every[[piece_number for piece_number, _ in spans]] = [one.number for one in vertebrae]
     plane = _middle_plane(volume, discs, spans, _as_map(volume, part.where, every[pieces], {}))
-    labels = _as_map(volume, part.where, np.where(np.isin(every, list(kept)), every, 0)[pieces], kept)
+    labels = _as_map(volume, part.where, np.where(np.isin(every, list(named)), every, 0)[pieces], named)
     centres, normals = planes_of([bound for bound in discs.bounds if bound.is_disc], discs.course, discs.looks)
     progress("vertebrae", 4, 4)
     return VertebraSplit(labels, vertebrae, centres, normals, hu, left_out, plane)
@@ -309,9 +309,9 @@ def _canal_points(volume: Volume, seeds: Float64Array | None, progress: Progress
     except RefusedInputError as error:
         if seeds is not None:
             return np.asarray(seeds + np.array([0.0, _SEED_TO_CANAL_MM, 0.0]))
-        what = str(error).partition(": give points")[0].partition("; give points")[0]
+        reason = str(error).partition(": give points")[0].partition("; give points")[0]
         raise RefusedInputError(
-            f"{what}; no vertebrae without it: give a point in each of them ({name_parameter('seeds', 'X,Y,Z')})"
+            f"{reason}; no vertebrae without it: give a point in each of them ({name_parameter('seeds', 'X,Y,Z')})"
         ) from error
 
 
@@ -322,8 +322,8 @@ def _without_short_ends(line: SpineLine) -> Float64Array:
     first = upper if heights[-1] - upper < BEYOND_MM else heights[-1]
     last = lower if lower - heights[0] < BEYOND_MM else heights[0]
     inner = heights[(heights > last + 1.0) & (heights < first - 1.0)]
-    kept = np.array([last, *inner, first])[::-1]
-    return np.stack([np.interp(kept, heights, axis) for axis in line.points[::-1].T], axis=1)
+    heights_kept = np.array([last, *inner, first])[::-1]
+    return np.stack([np.interp(heights_kept, heights, axis) for axis in line.points[::-1].T], axis=1)
 
 
 def _find_discs(volume: Volume, line: Float64Array, seeds: Float64Array | None) -> _Found:
@@ -333,14 +333,14 @@ def _find_discs(volume: Volume, line: Float64Array, seeds: Float64Array | None) 
     if seeds is None:
         bounds, usual = choose_discs(looks)
     else:
-        at = [course.nearest(seed) for seed in seeds]
-        if min(np.diff(sorted(at))) < 8:
+        seed_stations = [course.nearest(seed) for seed in seeds]
+        if min(np.diff(sorted(seed_stations))) < 8:
             raise UsageError("two seeds lie at the same height of the spine: one is needed in each vertebra")
-        bounds, usual = discs_between(looks, at)
+        bounds, usual = discs_between(looks, seed_stations)
     if len(bounds) < 2 and seeds is None:
-        found = "one disc was" if bounds else "no disc was"
+        disc_count = "one disc was" if bounds else "no disc was"
         raise RefusedInputError(
-            f"{found} found along {len(course)} mm of the spine, and a vertebra is what lies between two:"
+            f"{disc_count} found along {len(course)} mm of the spine, and a vertebra is what lies between two:"
             f" give a point in each vertebra ({name_parameter('seeds', 'X,Y,Z')})"
         )
     gaps = [float(b.at - a.at) for a, b in itertools.pairwise(bounds)] or [30.0]
@@ -350,26 +350,26 @@ def _find_discs(volume: Volume, line: Float64Array, seeds: Float64Array | None) 
     return _Found(course, scan, looks, bounds, usual)
 
 
-def _choose_level(found: _Found) -> float:
+def _choose_level(discs: _Found) -> float:
     """Return the level half way between the discs and the marrow of the bodies, HU."""
-    at = np.array([bound.at for bound in found.bounds if bound.is_disc])
-    middles = (at[:-1] + at[1:]) // 2 if len(at) > 1 else at + 15
-    columns = [found.looks.middle_mm.astype(int) + shift for shift in (-5, 0, 5)]
+    disc_stations = np.array([bound.at for bound in discs.bounds if bound.is_disc])
+    middles = (disc_stations[:-1] + disc_stations[1:]) // 2 if len(disc_stations) > 1 else disc_stations + 15
+    columns = [discs.looks.middle_mm.astype(int) + shift for shift in (-5, 0, 5)]
     disc, marrow = (
-        float(np.nanmedian(np.stack([found.looks.core[rows, column[rows]] for column in columns])))
-        for rows in (at, np.clip(middles, 0, len(found.scan) - 1))
+        float(np.nanmedian(np.stack([discs.looks.core[rows, column[rows]] for column in columns])))
+        for rows in (disc_stations, np.clip(middles, 0, len(discs.scan) - 1))
     )
     return float(np.clip(disc + _LEVEL_SHARE * (marrow - disc), *_LEVELS_HU))
 
 
 def _spans(
-    found: _Found, pieces: NDArray[np.uint8], doubtful: Float64Array, rim: Float64Array, arches: Float64Array,
+    discs: _Found, pieces: NDArray[np.uint8], doubtful: Float64Array, rim: Float64Array, arches: Float64Array,
     voxel_ml: float, level: float,
 ) -> tuple[list[tuple[int, Piece]], list[str]]:  # fmt: skip
     """Return the number and span of each piece that is a vertebra, and what else was seen."""
     from scipy.ndimage import find_objects, label
 
-    bounds, course = found.bounds, found.course
+    bounds, course = discs.bounds, discs.course
     volumes = np.bincount(pieces.ravel(), minlength=len(bounds) + 2) * voxel_ml
     boxes = find_objects(pieces, max_label=len(bounds) + 1)
     spans, left_out = [], []
@@ -395,28 +395,28 @@ def _spans(
             rim_share=float(rim[n + 1]),
             arch_ml=float(arches[n + 1]),
         )
-        reason = _no_vertebra(piece, found, gaps, level)
+        reason = _no_vertebra(piece, discs, gaps, level)
         if reason is None:
             spans.append((n + 1, piece))
         elif reason:
-            where = "above the first vertebra" if n == 0 else "below the last vertebra"
-            left_out.append(f"{where} {reason}")
+            side_text = "above the first vertebra" if n == 0 else "below the last vertebra"
+            left_out.append(f"{side_text} {reason}")
     return spans, left_out
 
 
-def _no_vertebra(piece: Piece, found: _Found, gaps: list[float], level: float) -> str | None:
+def _no_vertebra(piece: Piece, discs: _Found, gaps: list[float], level: float) -> str | None:
     """Return why a piece is no vertebra, None where it may be one, "" where there is nothing to tell."""
     height = piece.end - piece.begin
     known = piece.upper or piece.lower
     if known is None or (known is not None and not known.is_disc and not piece.whole):
         return ""  # beyond the end of the bone
     if piece.lower is None or not piece.lower.is_disc:
-        share = beside_share(found.scan, found.looks, piece, level)
+        share = beside_share(discs.scan, discs.looks, piece, level)
         if share >= _WINGS:
             return f"the bone has wings ({100 * share:.0f} % beside its body): it looks like the sacrum"
     if piece.whole:
         return None
-    reaches = found.course.reaches[0 if piece.upper is None else 1]
+    reaches = discs.course.reaches[0 if piece.upper is None else 1]
     gap = gaps[0] if piece.upper is None else gaps[-1]
     if not reaches or height > 1.3 * gap:
         return f"{height} mm follow without a disc that was found"
@@ -424,7 +424,7 @@ def _no_vertebra(piece: Piece, found: _Found, gaps: list[float], level: float) -
 
 
 def _place_of(
-    point: Float64Array, spans: list[tuple[int, Piece]], found: _Found, volume: Volume, first: tuple[int, int, int],
+    point: Float64Array, spans: list[tuple[int, Piece]], discs: _Found, volume: Volume, first: tuple[int, int, int],
     pieces: NDArray[np.uint8],
 ) -> int:  # fmt: skip
     """Return the place of the vertebra at a point: by its bone, else by the height of the point along the spine."""
@@ -432,24 +432,24 @@ def _place_of(
     number = 0
     if all(0 <= n < size for n, size in zip((k, j, i), pieces.shape, strict=True)):
         number = int(pieces[k, j, i])
-    at = found.course.nearest(point)
-    far = float(np.linalg.norm(found.course.canal[at] - point)) > 80.0
-    for place, (own, piece) in enumerate(spans):
-        if own == number or (not number and not far and piece.begin <= at < piece.end):
-            return place
+    station = discs.course.nearest(point)
+    far = float(np.linalg.norm(discs.course.canal[station] - point)) > 80.0
+    for index, (number_there, piece) in enumerate(spans):
+        if number_there == number or (not number and not far and piece.begin <= station < piece.end):
+            return index
     shown = ", ".join(f"{value:g}" for value in point)
     raise UsageError(f"there is no vertebra at {shown} mm: give a point in the body of one that was found")
 
 
-def _judge_all(spans: list[tuple[int, Piece]], names: dict[int, str], found: _Found) -> list[Vertebra]:
+def _judge_all(spans: list[tuple[int, Piece]], names: dict[int, str], discs: _Found) -> list[Vertebra]:
     vertebrae = []
     for n, ((_, piece), (number, name)) in enumerate(zip(spans, names.items(), strict=True)):
         beside = [spans[m][1] for m in (n - 2, n - 1, n + 1, n + 2) if 0 <= m < len(spans)]
         gaps = [float(one.end - one.begin) for one in beside if one.whole and _between_discs(one)]
-        traits = judge(piece, gaps if _between_discs(piece) else [], found.scan, found.looks, found.course, found.usual)
+        traits = judge(piece, gaps if _between_discs(piece) else [], discs.scan, discs.looks, discs.course, discs.usual)
         confidence, doubts = weigh(traits)
         middle = (piece.begin + piece.end) // 2
-        centre = found.course.canal[middle] + found.looks.middle_mm[middle] * found.course.ahead[middle]
+        centre = discs.course.canal[middle] + discs.looks.middle_mm[middle] * discs.course.ahead[middle]
         vertebrae.append(
             Vertebra(
                 number=number,
@@ -482,26 +482,24 @@ def _describe_refusal(vertebrae: list[Vertebra], left_out: list[str]) -> str:
     )
 
 
-def _as_map(
-    volume: Volume, where: tuple[slice, slice, slice], numbers: NDArray[Any], names: dict[int, str]
-) -> LabelMap:
+def _as_map(volume: Volume, box: tuple[slice, slice, slice], numbers: NDArray[Any], names: dict[int, str]) -> LabelMap:
     voxels = np.zeros(volume.voxels.shape, np.uint8)
-    voxels[where] = numbers
+    voxels[box] = numbers
     return LabelMap(voxels, volume.affine, names)
 
 
-def _middle_plane(volume: Volume, found: _Found, spans: list[tuple[int, Piece]], labels: LabelMap) -> MiddlePlane:
+def _middle_plane(volume: Volume, discs: _Found, spans: list[tuple[int, Piece]], labels: LabelMap) -> MiddlePlane:
     """Sample the scan and all labels in the straightened middle plane and through the bodies."""
-    course, looks = found.course, found.looks
+    course, looks = discs.course, discs.looks
     ahead = np.arange(-58.0, AHEAD_MM[-1])
     sagittal = sample_course(volume, course, ahead, np.zeros(1))[:, ::-1, 0]
     numbers = sample_course(labels, course, ahead, np.zeros(1), order=0)[:, ::-1, 0]
     rows, columns = np.arange(len(course)), np.rint(looks.middle_mm).astype(int)
-    coronal = found.scan[rows, columns]
+    coronal = discs.scan[rows, columns]
     beside = sample_course(labels, course, AHEAD_MM, ASIDE_MM, order=0)[rows, columns]
     canal = len(ahead) - 1 - int(-ahead[0])
     lines = []
-    for bound in found.bounds:
+    for bound in discs.bounds:
         slope, middle = math.tan(math.radians(TILTS_DEG[bound.tilt])), looks.middle_mm[bound.at]
         ends = (looks.front_mm[bound.at], BODY_BACK_MM)
         front, back = ((float(bound.at + slope * (end - middle)), float(canal - end)) for end in ends)

@@ -75,8 +75,8 @@ class MappedArray(_Packed):
         self.mapping = mapping
 
     def __reduce__(self) -> tuple[Callable[..., NDArray[Any]], tuple[object, ...]]:
-        place = self.mapping.place(self.array)
-        return super().__reduce__() if place is None else (FilePlace.open, (place,))
+        file_place = self.mapping.place(self.array)
+        return super().__reduce__() if file_place is None else (FilePlace.open, (file_place,))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> _Packed:
         return super().__deepcopy__(memo) if self.mapping.writeable else self

@@ -124,7 +124,7 @@ class DisplayProbe:
             return Display(self._fault)
         child, self._child = self._child, None
         try:
-            told, _ = child.communicate(timeout=seconds)
+            output, _ = child.communicate(timeout=seconds)
         except subprocess.TimeoutExpired:
             child.kill()
             child.communicate()
@@ -133,13 +133,13 @@ class DisplayProbe:
             if child.poll() is None:
                 child.kill()
                 child.wait()
-        return read_words(told, child.returncode)
+        return read_words(output, child.returncode)
 
 
-def read_words(told: bytes, code: int) -> Display:
+def read_words(output: bytes, code: int) -> Display:
     """Return what the words of a child (lines of JSON, each with more than the one before) and its exit status mean."""
     try:
-        facts = json.loads(told.decode().splitlines()[-1])
+        facts = json.loads(output.decode().splitlines()[-1])
     except (ValueError, IndexError):
         facts = {}
     if not facts.get("display", True):

@@ -125,9 +125,11 @@ def stage_file(
             stream.flush()
             size = stream.tell()
             os.fsync(stream.fileno())
-            found = os.fstat(stream.fileno()).st_size
-            if found != size:
-                raise OutputError(f"cannot write {shown_path(path)}: {size} bytes written, {found} arrived on the disk")
+            arrived = os.fstat(stream.fileno()).st_size
+            if arrived != size:
+                raise OutputError(
+                    f"cannot write {shown_path(path)}: {size} bytes written, {arrived} arrived on the disk"
+                )
             if verify is not None:
                 verify(temporary)
             if sys.platform != "win32":
@@ -220,20 +222,20 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
     _sweep(parent)
     with contextlib.ExitStack() as stack:
         while True:
-            made = parent / f".clrecon-{secrets.token_hex(8)}.folder"
-            stack.callback(_own_folders.pop, made.name, None)
-            _own_folders[made.name] = parent
-            stack.callback(shutil.rmtree, made, ignore_errors=True)
-            made.mkdir(mode=0o700)
-            if sys.platform == "win32" or _lock_folder(stack, made):
+            folder = parent / f".clrecon-{secrets.token_hex(8)}.folder"
+            stack.callback(_own_folders.pop, folder.name, None)
+            _own_folders[folder.name] = parent
+            stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            folder.mkdir(mode=0o700)
+            if sys.platform == "win32" or _lock_folder(stack, folder):
                 break
-        yield made
+        yield folder
 
 
-def _lock_folder(stack: contextlib.ExitStack, made: Path) -> bool:
+def _lock_folder(stack: contextlib.ExitStack, folder: Path) -> bool:
     """Lock a new folder until `stack` closes; False when another process was about to remove it in `_sweep`."""
     try:
-        descriptor = os.open(made, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+        descriptor = os.open(folder, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
     except FileNotFoundError:
         return False
     stack.callback(os.close, descriptor)
@@ -243,7 +245,7 @@ def _lock_folder(stack: contextlib.ExitStack, made: Path) -> bool:
         return False
     except OSError:
         return True
-    return made.exists()
+    return folder.exists()
 
 
 def _lock_new(stream: BinaryIO) -> bool:
@@ -299,12 +301,12 @@ def _sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def check_folder(path: str | os.PathLike[str], own: re.Pattern[str], what: str) -> Path:
+def check_folder(path: str | os.PathLike[str], pattern: re.Pattern[str], noun: str) -> Path:
     """Return the folder to make or replace; `own` are files of earlier runs, `what` names what will be in it."""
     folder = resolve_target(path)
     with system_errors(path):
         if folder.exists():
-            _check_existing(path, folder, own, what)
+            _check_existing(path, folder, pattern, noun)
         elif folder.is_symlink():
             raise OutputError(f"cannot write {path}: it is a symbolic link that leads back to itself")
         if not folder.parent.is_dir():
@@ -314,22 +316,22 @@ def check_folder(path: str | os.PathLike[str], own: re.Pattern[str], what: str) 
     return folder
 
 
-def _check_existing(path: str | os.PathLike[str], folder: Path, own: re.Pattern[str], what: str) -> None:
+def _check_existing(path: str | os.PathLike[str], folder: Path, pattern: re.Pattern[str], noun: str) -> None:
     if not folder.is_dir():
         raise OutputError(f"cannot write {path}: it is a file, name a folder or use an extension")
     refuse_existing(path, folder)
-    others = [entry.name for entry in os.scandir(folder) if not own.fullmatch(entry.name)]
+    others = [entry.name for entry in os.scandir(folder) if not pattern.fullmatch(entry.name)]
     if others:
         raise UsageError(
             f"the folder {path} holds other things ({len(others)}, such as {sorted(others)[0]!r}):"
-            f" name a new or empty one for the {what}"
+            f" name a new or empty one for the {noun}"
         )
     if any(is_dicom(entry.path) for entry in os.scandir(folder)):
         raise OutputError(f"cannot write {path}: DICOM files are there, which are never replaced")
     if os.path.samefile(folder, os.curdir):  # a process in this folder would then be in a removed one
-        raise UsageError(f"the {what} replace the folder {path}, which is the current one: name one in it")
+        raise UsageError(f"the {noun} replace the folder {path}, which is the current one: name one in it")
     if os.path.ismount(folder):
-        raise OutputError(f"cannot write {path}: a disk is mounted there, name a folder in it for the {what}")
+        raise OutputError(f"cannot write {path}: a disk is mounted there, name a folder in it for the {noun}")
     if not os.access(folder, os.W_OK):
         raise OutputError(f"cannot write {path}: the folder is there and write-protected")
 
@@ -337,8 +339,8 @@ def _check_existing(path: str | os.PathLike[str], folder: Path, own: re.Pattern[
 class StagedFolder:
     """A finished folder, with files of `size` bytes, under a temporary name beside its place."""
 
-    def __init__(self, path: str | os.PathLike[str], made: Path, folder: Path, size: int):
-        self._path, self._made, self._folder = path, made, folder
+    def __init__(self, path: str | os.PathLike[str], staged: Path, folder: Path, size: int):
+        self._path, self._made, self._folder = path, staged, folder
         self._keep = existing_stay()
         self.size = size
 

@@ -64,13 +64,13 @@ def _move_stdout(stack: contextlib.ExitStack) -> None:
         if stream is None or stream.fileno() != 1:
             return
         stream.flush()
-        own, errors = os.dup(1), os.dup(2)
+        stdout_copy, errors = os.dup(1), os.dup(2)
     except (OSError, ValueError, AttributeError):  # a stream that is closed, or is no file: nothing to keep clean
         return
     os.dup2(errors, 1)
     os.close(errors)
     encoding, handling = stream.encoding, stream.errors
-    sys.stdout = open(own, "w", encoding=encoding, errors=handling, buffering=1 if stream.isatty() else -1)
+    sys.stdout = open(stdout_copy, "w", encoding=encoding, errors=handling, buffering=1 if stream.isatty() else -1)
 
     def restore(moved: TextIO = sys.stdout) -> None:
         os.dup2(moved.fileno(), 1)

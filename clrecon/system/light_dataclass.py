@@ -111,8 +111,8 @@ class _Signature:
     def __get__(self, _: object, cls: Any) -> inspect.Signature:
         kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
         shown = []
-        for own in sorted((own for own in fields(cls) if own.init), key=lambda own: bool(own.kw_only)):
-            default = own.default if own.default_factory is MISSING else own.default_factory
+        for item in sorted((own for own in fields(cls) if own.init), key=lambda own: bool(own.kw_only)):
+            default = item.default if item.default_factory is MISSING else item.default_factory
             default = inspect.Parameter.empty if default is MISSING else default
-            shown.append(inspect.Parameter(own.name, kinds[bool(own.kw_only)], default=default, annotation=own.type))
+            shown.append(inspect.Parameter(item.name, kinds[bool(item.kw_only)], default=default, annotation=item.type))
         return inspect.Signature(shown)

@@ -20,7 +20,7 @@ def get_logger(name: str) -> logging.Logger:
 
 def log_warnings(log: logging.Logger, warnings: Iterable[str], known: Iterable[str] = ()) -> None:
     """Log the warnings of a report, except those that are `known`, which are already logged."""
-    said = set(known)
+    logged = set(known)
     for text in warnings:
-        if text not in said:
+        if text not in logged:
             log.warning("%s", text)

@@ -53,13 +53,13 @@ def allocate_voxels(shape: Sequence[int], dtype: DTypeLike, name: str = "") -> N
     needed = math.prod(shape) * np.dtype(dtype).itemsize
     available = available_memory_bytes()
     size = " x ".join(map(str, reversed(shape)))
-    what = f"{name}{': ' * bool(name)}the volume of {size} voxels needs {needed / 2**30:.2f} GiB of memory"
+    need = f"{name}{': ' * bool(name)}the volume of {size} voxels needs {needed / 2**30:.2f} GiB of memory"
     if needed > _MEMORY_SHARE * available:
-        raise RefusedInputError(f"{what}, {available / 2**30:.2f} GiB are free")
+        raise RefusedInputError(f"{need}, {available / 2**30:.2f} GiB are free")
     try:
         return aligned_empty(shape, dtype)
     except MemoryError as error:
-        raise RefusedInputError(f"{what}, which cannot be had") from error
+        raise RefusedInputError(f"{need}, which cannot be had") from error
 
 
 _FILES = {  # Of a version of control groups: the files of limit and use, and the reclaimable field of memory.stat.
@@ -83,8 +83,8 @@ def _group_bytes(proc: Path, groups: Path) -> Iterator[int]:
             version, root = 1, groups / "memory"
         else:
             continue
-        own = root / path.lstrip("/")
-        for folder in (own, *own.parents):  # A container may see its own group as the root.
+        group_folder = root / path.lstrip("/")
+        for folder in (group_folder, *group_folder.parents):  # A container may see its own group as the root.
             free = _free_in(folder, *_FILES[version])
             if free is not None:
                 yield free
@@ -123,18 +123,18 @@ class FilePlace:
 
     def open(self) -> NDArray[Any]:
         """Map the array into memory, read-only."""
-        what = f"voxels were sent as a place in the file {self.path}"
+        problem = f"voxels were sent as a place in the file {self.path}"
         try:
-            found = os.stat(self.path)
-            if not stat.S_ISREG(found.st_mode) or (found.st_size, found.st_mtime_ns) != (
+            status = os.stat(self.path)
+            if not stat.S_ISREG(status.st_mode) or (status.st_size, status.st_mtime_ns) != (
                 self.file_bytes,
                 self.changed_ns,
             ):
-                raise RefusedInputError(f"{what}, which has changed since then: send the volume again")
+                raise RefusedInputError(f"{problem}, which has changed since then: send the volume again")
             return np.memmap(self.path, np.dtype(self.dtype), "r", self.offset, self.shape)
         except OSError as error:
             raise RefusedInputError(
-                f"{what}, which cannot be read here ({error.strerror or error}): keep it until all have read it, or"
+                f"{problem}, which cannot be read here ({error.strerror or error}): keep it until all have read it, or"
                 " send a volume that is not memory-mapped"
             ) from error
 
@@ -165,13 +165,13 @@ class Mapping:
         if self.writeable:
             self.file.flush()
         try:
-            found = os.stat(self.path)
+            status = os.stat(self.path)
         except OSError:
             return None
-        if (found.st_dev, found.st_ino) != self.identity:
+        if (status.st_dev, status.st_ino) != self.identity:
             return None
         offset = self.start + part.ctypes.data - self.address
-        return FilePlace(self.path, offset, part.dtype.str, part.shape, found.st_size, found.st_mtime_ns)
+        return FilePlace(self.path, offset, part.dtype.str, part.shape, status.st_size, status.st_mtime_ns)
 
 
 def find_mapping(array: NDArray[Any]) -> Mapping | None:
@@ -190,8 +190,8 @@ def _describe(owner: np.memmap[Any, Any], file: mmap.mmap) -> Mapping:
     identity = None
     if path is not None:
         try:
-            found = os.stat(path)
-            identity = found.st_dev, found.st_ino
+            status = os.stat(path)
+            identity = status.st_dev, status.st_ino
         except OSError:  # removed since it was mapped
             path = None
     start = owner.offset - owner.offset % mmap.ALLOCATIONGRANULARITY  # numpy maps from a multiple of this

@@ -57,11 +57,11 @@ def option_beside(name: str, declared: Any) -> Option:
 
 
 def options_of(settings: type, group: str = "") -> Iterator[Option]:
-    for own in fields(settings):
-        flags, declared, how = own.metadata.get(_KEY, ([], None, {}))
+    for item in fields(settings):
+        flags, declared, how = item.metadata.get(_KEY, ([], None, {}))
         if declared == group:
-            read = _READERS.get(str(own.type))
-            yield Option(own.name, flags, how if read is None else {"type": read, **how})
+            read = _READERS.get(str(item.type))
+            yield Option(item.name, flags, how if read is None else {"type": read, **how})
 
 
 def parse_numbers(text: str, *, ends: bool = False) -> tuple[float, ...] | None:

@@ -38,8 +38,8 @@ def find_extension(path: str | os.PathLike[str], known: Iterable[str], noun: str
     except TypeError as error:
         raise UsageError(f"a {noun} file is named by a string or a path, not {type(path).__name__}") from error
     if extension not in known:
-        found = f"the extension {extension!r}{hint or guess_word(extension, known)}" if extension else "no extension"
-        raise UsageError(f"the name of the {noun} file has {found}: use one of {', '.join(known)}")
+        ending = f"the extension {extension!r}{hint or guess_word(extension, known)}" if extension else "no extension"
+        raise UsageError(f"the name of the {noun} file has {ending}: use one of {', '.join(known)}")
     return extension
 
 
@@ -266,24 +266,24 @@ def _link_new(temporary: Path, target: Path) -> None:
         os.unlink(temporary)
 
 
-def place_folder(made: Path, folder: Path, path: str | os.PathLike[str], *, keep: bool) -> None:
+def place_folder(staged: Path, folder: Path, path: str | os.PathLike[str], *, keep: bool) -> None:
     """Rename a finished folder to its place; an older one gets the temporary name for its owner to remove."""
     with system_errors(path):
         if keep:
             with contextlib.suppress(OSError):
                 folder.rmdir()  # only an empty one
             try:
-                made.rename(folder)
+                staged.rename(folder)
             except OSError as error:
                 if error.errno in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
                     raise _there_already(path) from None
                 raise
             return
-        older = made.with_suffix(".older")
+        older = staged.with_suffix(".older")
         try:
             if folder.exists():
                 folder.rename(older)
-            made.rename(folder)
+            staged.rename(folder)
         finally:
             if older.exists():
-                older.rename(made if folder.exists() else folder)
+                older.rename(staged if folder.exists() else folder)

@@ -57,11 +57,11 @@ _One = TypeVar("_One")
 _Other = TypeVar("_Other")
 
 
-def side_by_side(one: Callable[[], _One], other: Callable[[], _Other]) -> tuple[_One, _Other]:
+def side_by_side(in_pool: Callable[[], _One], on_this_thread: Callable[[], _Other]) -> tuple[_One, _Other]:
     """Call two functions at once, the first in a thread; what one of them raises is raised after both have ended."""
     with ThreadPoolExecutor(1) as pool:
-        first = pool.submit(one)
-        second = other()
+        first = pool.submit(in_pool)
+        second = on_this_thread()
         return first.result(), second
 
 

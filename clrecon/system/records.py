@@ -25,8 +25,8 @@ class Record(dict[str, Any]):
         dict.update(self, self._entries())
 
     def _entries(self) -> dict[str, Any]:
-        own = _fields_of(self)
-        return {name: value for name, value in own.items() if value is not None or name not in self._LEFT_OUT}
+        own_entries = _fields_of(self)
+        return {name: value for name, value in own_entries.items() if value is not None or name not in self._LEFT_OUT}
 
     def as_dict(self) -> dict[str, Any]:
         """Return the entries as a new dict, with records inside as dicts too: the form of reports."""
@@ -72,24 +72,24 @@ class Gate(Record):
     text: str
 
 
-def none_of(name: str, count: int, what: str, ok: bool | None = None) -> Gate:
+def none_of(name: str, count: int, subject: str, ok: bool | None = None) -> Gate:
     """Gate: a count must be 0.  Where `ok` is given, it decides instead of the count."""
     ok = count == 0 if ok is None else ok
-    return Gate(name, count, 0, None, bool(ok), f"{what}: {count}, none allowed")
+    return Gate(name, count, 0, None, bool(ok), f"{subject}: {count}, none allowed")
 
 
-def is_true(name: str, flag: bool, what: str) -> Gate:
-    says = what if flag else f"this does not hold: {what}"
+def is_true(name: str, flag: bool, subject: str) -> Gate:
+    says = subject if flag else f"this does not hold: {subject}"
     return Gate(name, bool(flag), True, None, bool(flag), says)
 
 
-def at_most(name: str, measured: float, bound: float, unit: str | None, what: str) -> Gate:
-    text = f"{what}: {_say(measured, bound, 3)}{' ' * bool(unit)}{unit or ''}, at most {bound:.3g}"
+def at_most(name: str, measured: float, bound: float, unit: str | None, subject: str) -> Gate:
+    text = f"{subject}: {_say(measured, bound, 3)}{' ' * bool(unit)}{unit or ''}, at most {bound:.3g}"
     return Gate(name, measured, bound, unit, measured <= bound, text)
 
 
-def at_least(name: str, measured: float, bound: float, unit: str | None, what: str) -> Gate:
-    text = f"{what}: {_say(measured, bound, 4)}{' ' * bool(unit)}{unit or ''}, at least {bound:g}"
+def at_least(name: str, measured: float, bound: float, unit: str | None, subject: str) -> Gate:
+    text = f"{subject}: {_say(measured, bound, 4)}{' ' * bool(unit)}{unit or ''}, at least {bound:g}"
     return Gate(name, measured, bound, unit, measured >= bound, text)
 
 

@@ -131,8 +131,8 @@ def _show_listing(listing: SeriesListing) -> str:
         size = " x ".join(map(str, entry.shape_ijk or ()))
         spacing = " x ".join(f"{value:.4g}" for value in entry.spacing_mm or ())
         chosen = "read by default" if entry.number == listing.chosen else ""
-        said = "; ".join((*entry.problems, *entry.warnings))
-        rows.append((entry.number, entry.description, entry.modality, entry.slices, size, spacing, chosen, said))
+        remarks = "; ".join((*entry.problems, *entry.warnings))
+        rows.append((entry.number, entry.description, entry.modality, entry.slices, size, spacing, chosen, remarks))
     heads = ("series", "description", "modality", "slices", "voxels", "spacing mm", "", "remarks")
     return _table(heads, rows) + "".join(f"<p>{escape(text)}</p>" for text in listing.warnings)
 
@@ -148,8 +148,8 @@ def _image(picture: Rendering) -> str:
 def _table(heads: Sequence[str], rows: Sequence[Iterable[object]], colors: Sequence[str] = ()) -> str:
     """Return rows as a table, of many the first, each with a mark in its colour."""
     lines = ["<tr>" + "".join(f"<th>{escape(head)}</th>" for head in heads) + "</tr>"]
-    for place, row in enumerate(rows[:_MOST_ROWS]):
-        mark = f'<span style="color: {colors[place]}">&#9632;</span> ' if colors else ""
+    for index, row in enumerate(rows[:_MOST_ROWS]):
+        mark = f'<span style="color: {colors[index]}">&#9632;</span> ' if colors else ""
         cells = [escape(str(cell)) for cell in row]
         lines.append("<tr>" + "".join(f"<td>{mark * (n == 0)}{cell}</td>" for n, cell in enumerate(cells)) + "</tr>")
     more = f"<p>and {len(rows) - _MOST_ROWS:,} more</p>" if len(rows) > _MOST_ROWS else ""

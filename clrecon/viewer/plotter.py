@@ -125,16 +125,16 @@ def open_plotter(
         opened.callback(plotter.close)
         plotter.set_background((0.055, 0.06, 0.07))
         extractors, scans = [], [each for each in objects if isinstance(each, ShownScan)]
-        for each in objects:
-            if isinstance(each, ShownMesh):
-                plotter.add_mesh(each.mesh.to_pyvista(), color=BONE, name=each.name, smooth_shading=True)
-            elif isinstance(each, ShownCloud):
-                plotter.add_points(each.cloud.to_pyvista(), color=BONE, name=each.name, point_size=3)
-            elif isinstance(each, ShownLabels):
-                _add_labels(plotter, each, device, memory)
-            elif isinstance(each, ShownScan):
-                extractor = opened.enter_context(SurfaceExtractor(each.volume, device=device, memory=memory))
-                extractors.append((each.name, extractor))
+        for shown in objects:
+            if isinstance(shown, ShownMesh):
+                plotter.add_mesh(shown.mesh.to_pyvista(), color=BONE, name=shown.name, smooth_shading=True)
+            elif isinstance(shown, ShownCloud):
+                plotter.add_points(shown.cloud.to_pyvista(), color=BONE, name=shown.name, point_size=3)
+            elif isinstance(shown, ShownLabels):
+                _add_labels(plotter, shown, device, memory)
+            elif isinstance(shown, ShownScan):
+                extractor = opened.enter_context(SurfaceExtractor(shown.volume, device=device, memory=memory))
+                extractors.append((shown.name, extractor))
         if extractors:
             _add_iso_slider(plotter, extractors, find_iso_range(scans), iso_value)
         plotter.add_axes(xlabel="L", ylabel="P", zlabel="S", color="white")
@@ -224,10 +224,10 @@ def _add_keys(plotter: pyvista.Plotter) -> None:
 
 def _wait_for_display(probe: DisplayProbe) -> Display:
     """Refuse where VTK would end the process with a segmentation fault, or show nothing."""
-    found = probe.wait()
-    if found.fault is not None:
-        raise NoDisplayError(f"no window can be opened: {found.fault}")
-    return found
+    display = probe.wait()
+    if display.fault is not None:
+        raise NoDisplayError(f"no window can be opened: {display.fault}")
+    return display
 
 
 def _run(plotter: pyvista.Plotter, display: Display) -> None:

@@ -12,7 +12,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 92_957,
+    "lines": 93_004,
     "modules": 406,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
@@ -22,7 +22,7 @@ CEILINGS = {
 """Who takes something away lowers the figure in the same commit; who needs more says why in the commit."""
 
 HABITS = {
-    "functions_with_pronouns": 1_200,
+    "functions_with_pronouns": 28,
     "functions_without_object": 241,
     "assignments_of_three": 217,
     "nested_conditionals": 0,

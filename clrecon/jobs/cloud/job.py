@@ -144,10 +144,10 @@ def _write_files(
     run.progress("write", 0, 0)
     allow_open_files(4)
     outputs: list[dict[str, Any]] = []
-    for what, path in (("cloud", files.output), ("removed", files.removed)):
+    for role, path in (("cloud", files.output), ("removed", files.removed)):
         if path is not None:
-            chosen = steps.cloud if what == "cloud" else steps.removed_cloud()
-            outputs.append(describe_file(what, path, run.stage(stage_cloud(chosen, path, space, keep_ids=keep_ids))))
+            chosen = steps.cloud if role == "cloud" else steps.removed_cloud()
+            outputs.append(describe_file(role, path, run.stage(stage_cloud(chosen, path, space, keep_ids=keep_ids))))
     if surface is not None and files.surface is not None:
         from clrecon.exchange.formats import stage_mesh
 
@@ -214,8 +214,8 @@ class CloudReport(RunReport):
     outputs: list[dict[str, Any]]
 
 
-def describe_file(what: str, path: str | Path, file: Staged) -> dict[str, Any]:
-    return {"what": what, "format": extension_of(path)[1:], "bytes": file.size}
+def describe_file(role: str, path: str | Path, file: Staged) -> dict[str, Any]:
+    return {"what": role, "format": extension_of(path)[1:], "bytes": file.size}
 
 
 def report_of(

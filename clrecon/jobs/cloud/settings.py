@@ -70,18 +70,18 @@ def _parse_level(text: str) -> float | tuple[float, ...]:
 def _parse_clusters(text: str) -> dict[str, Any]:
     """Read ``eps=MM,min=N`` (either may be missing) as fields of `Clustering`, which is checked with the others."""
     known = {"eps": "eps", "min": "min_samples"}
-    found: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for part in text.split(","):
         name, equals, value = (word.strip() for word in part.partition("="))
-        if not equals or name not in known or known[name] in found:
+        if not equals or name not in known or known[name] in options:
             raise ValueError(f"{text!r} is not eps=MM,min=N, such as eps=1.2,min=6")
         try:
-            found[known[name]] = (
+            options[known[name]] = (
                 value if value == "plane+1" and name == "min" else (float if name == "eps" else int)(value)
             )
         except ValueError:
             raise ValueError(f"{text!r}: {name} is no number: {value!r}") from None
-    return found
+    return options
 
 
 def _parse_denoisers(text: str) -> tuple[str, ...]:
@@ -260,11 +260,11 @@ class CloudSettings(InputSettings):
         return self.clusters or (Clustering() if self.keep else None)
 
 
-def _check_choice(what: str, value: str | None, known: Sequence[str]) -> None:
+def _check_choice(subject: str, value: str | None, known: Sequence[str]) -> None:
     if value is not None and value not in known:
-        raise UsageError(f"{what} one of {', '.join(known)}, not {value!r:.60}")
+        raise UsageError(f"{subject} one of {', '.join(known)}, not {value!r:.60}")
 
 
-def _check_mm(what: str, value: float) -> None:
+def _check_mm(subject: str, value: float) -> None:
     if not 0.0 < value <= LARGEST_MM:
-        raise UsageError(f"{what} is a length in mm above 0 and up to {LARGEST_MM:g}, not {value:g}")
+        raise UsageError(f"{subject} is a length in mm above 0 and up to {LARGEST_MM:g}, not {value:g}")

@@ -69,9 +69,9 @@ def _extract_cloud(
     from clrecon.operators.points.point_extraction import extract_points
 
     began = time.perf_counter()
-    what: dict[str, Any] = {"hu": settings.hu} if settings.is_band else {"iso_value": iso_value_of(settings)}
+    level: dict[str, Any] = {"hu": settings.hu} if settings.is_band else {"iso_value": iso_value_of(settings)}
     cloud = extract_points(
-        resident, **what, kind=settings.kind, labels=labels, label=settings.label, paper=settings.paper,
+        resident, **level, kind=settings.kind, labels=labels, label=settings.label, paper=settings.paper,
         progress=progress,
     )  # fmt: skip
     return CloudSteps(cloud, began)
@@ -141,10 +141,10 @@ def _cluster_points(
         from clrecon.points.stencil import Lattice
 
         eps, volume = Lattice.of(resident.volume).default_eps if eps is None else eps, None
-    found = cluster_points(steps.cloud, eps, chosen.min_samples, **_with_volume(volume, shared))
-    steps.add("clusters", found)
+    groups = cluster_points(steps.cloud, eps, chosen.min_samples, **_with_volume(volume, shared))
+    steps.add("clusters", groups)
     rules = rules_in_lps(settings)
-    steps.add("keep", keep_clusters(found.cloud, rules, cores=found.cores, figures=found.figures), takes_noise=True)
+    steps.add("keep", keep_clusters(groups.cloud, rules, cores=groups.cores, figures=groups.figures), takes_noise=True)
 
 
 def _with_volume(resident: DeviceVolume | None, shared: dict[str, Any]) -> dict[str, Any]:
@@ -183,16 +183,16 @@ def find_ghosts(resident: DeviceVolume, level: float, settings: CloudSettings, p
     return find_ghost_slices(resident, band, progress=progress)
 
 
-def warn_of_ghosts(steps: CloudSteps, found: GhostSlices) -> None:
-    if not found.slices:
+def warn_of_ghosts(steps: CloudSteps, ghosts: GhostSlices) -> None:
+    if not ghosts.slices:
         return
-    names = ", ".join(map(str, found.slices[:MOST_NAMED]))
-    more = f" and {len(found.slices) - MOST_NAMED} more" if len(found.slices) > MOST_NAMED else ""
-    one = len(found.slices) == 1
+    names = ", ".join(map(str, ghosts.slices[:MOST_NAMED]))
+    more = f" and {len(ghosts.slices) - MOST_NAMED} more" if len(ghosts.slices) > MOST_NAMED else ""
+    single = len(ghosts.slices) == 1
     steps.warnings.append(
-        f"{'slice' if one else 'slices'} {names}{more} of {len(found.points)}, counted from 0,"
-        f" {'is' if one else 'are'} unlike both neighbours, as foreign images are; the points stay: look at"
-        f" {'it' if one else 'them'}, or drop {'its' if one else 'their'} points"
+        f"{'slice' if single else 'slices'} {names}{more} of {len(ghosts.points)}, counted from 0,"
+        f" {'is' if single else 'are'} unlike both neighbours, as foreign images are; the points stay: look at"
+        f" {'it' if single else 'them'}, or drop {'its' if single else 'their'} points"
         f" ({name_parameter('ghost_slices', 'drop')})"
     )
 
@@ -256,10 +256,10 @@ class CloudSteps:
             self._judge(name, len(step.removed), step.counts)
 
     def _judge(self, name: str, before: int, counts: Mapping[str, int]) -> None:
-        taken = sum(count for reason, count in counts.items() if reason not in _TAKEN_BY_RULE)
-        share = 1.0 - taken / before if before else 1.0
+        lost = sum(count for reason, count in counts.items() if reason not in _TAKEN_BY_RULE)
+        share = 1.0 - lost / before if before else 1.0
         by_reason = ", ".join(f"{count:,} {reason}" for reason, count in counts.items() if count)
-        text = f"{name}: {taken:,} of {before:,} points gone ({by_reason})" if taken else f"{name}: no point gone"
+        text = f"{name}: {lost:,} of {before:,} points gone ({by_reason})" if lost else f"{name}: no point gone"
         self.gates.append(
             Gate(f"points_kept_{name.replace(' ', '_')}", share, _LEAST_KEPT, None, share >= _LEAST_KEPT, text)
         )

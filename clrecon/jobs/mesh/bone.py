@@ -142,17 +142,17 @@ def _holds_spine(mesh: Mesh, volume: Volume, count: int, labels: NDArray[np.int6
     from clrecon.anatomy.spine_line import find_spine_line
     from clrecon.mesh.compare.walls import lie_near_line
 
-    found = np.zeros(count, dtype=bool)
+    is_spine = np.zeros(count, dtype=bool)
     try:
         line = find_spine_line(volume, sure_only=True).points
     except RefusedInputError:
-        return found
+        return is_spine
     used = np.flatnonzero(labels >= 0)
     used = used[:: -(-len(used) // 100_000) or 1]
     near = lie_near_line(mesh.vertices[used], line, SPINE_MM)
     if near.any():
-        found[np.bincount(labels[used][near], minlength=count).argmax()] = True
-    return found
+        is_spine[np.bincount(labels[used][near], minlength=count).argmax()] = True
+    return is_spine
 
 
 def judge_surfaces(
@@ -170,16 +170,16 @@ def judge_surfaces(
     known = [] if list_failed_values(volume) else parts
     chosen = [part for part in known if _is_of_bone(part.surface, lowest) and part.mesh.vertex_count]
     for surface in dict.fromkeys(part.surface for part in chosen):
-        own = [part for part in chosen if part.surface == surface]
-        rule = rule_of_report(own[0].mesh.report)
+        members = [part for part in chosen if part.surface == surface]
+        rule = rule_of_report(members[0].mesh.report)
         if rule is None:
             continue
-        step = -(-sum(part.mesh.vertex_count for part in own) // MOST_SAMPLES)
-        vertices = [part.mesh.vertices[::step] for part in own]
-        normals = [normals_of(part.mesh)[::step] for part in own]
+        step = -(-sum(part.mesh.vertex_count for part in members) // MOST_SAMPLES)
+        vertices = [part.mesh.vertices[::step] for part in members]
+        normals = [normals_of(part.mesh)[::step] for part in members]
         walls = sample_walls(np.concatenate(vertices), np.concatenate(normals), volume, rule)
         ends = np.cumsum([0, *map(len, vertices)])
-        for part, first, end in zip(own, ends[:-1], ends[1:], strict=True):
+        for part, first, end in zip(members, ends[:-1], ends[1:], strict=True):
             own_walls = walls.where(slice(first, end))
             judged = part.facts["walls"] = judge_walls(own_walls)
             if not _means_bone(settings) or settings.selects:
@@ -199,9 +199,9 @@ def _count_bones(mesh: Mesh, volume: Volume, rule: IsoRule, labelled: Labelled) 
             break
     sizes = np.bincount(labelled[1][labelled[1] >= 0], minlength=labelled[0])
     sizes[bone | rails | np.array([one is None for one in judged])] = 0
-    other = int(sizes.argmax())
-    share = float(sizes[other] / mesh.vertex_count)
-    return Bones(labelled[0], int(bone.sum()), int(rails.sum()), judged[other] if share else None, share)
+    largest = int(sizes.argmax())
+    share = float(sizes[largest] / mesh.vertex_count)
+    return Bones(labelled[0], int(bone.sum()), int(rails.sum()), judged[largest] if share else None, share)
 
 
 def _is_of_bone(surface: Surface, lowest: float) -> bool:
@@ -216,14 +216,14 @@ def warn_of_walls(parts: Sequence[Part], settings: MeshSettings, choice: IsoChoi
     contrast = [] if choice is None else warn_of_contrast(choice)
     warnings = []
     for surface in dict.fromkeys(part.surface for part in parts):
-        own = [part for part in parts if part.surface == surface and part.facts.get("walls")]
+        members = [part for part in parts if part.surface == surface and part.facts.get("walls")]
         if settings.split:
-            warnings += _warn_of_pieces(own)
-        elif own:
-            boneless = _warn_of_no_bone(own[0], settings)
+            warnings += _warn_of_pieces(members)
+        elif members:
+            boneless = _warn_of_no_bone(members[0], settings)
             if boneless and choice is not None and choice.contrast_medium_share:
                 contrast = []  # the same figures, with advice that helps only if there is bone
-            warnings += boneless or _warn_of_whole(own[0], settings)
+            warnings += boneless or _warn_of_whole(members[0], settings)
     return contrast + warnings
 
 
@@ -261,17 +261,17 @@ def _warn_of_whole(part: Part, settings: MeshSettings) -> list[str]:
     from clrecon.mesh.compare.walls import looks_like_bone
 
     judged = part.facts["walls"]
-    where = f"at {part.surface.describe()} {'what is kept' if settings.selects else 'the surface'}"
+    subject = f"at {part.surface.describe()} {'what is kept' if settings.selects else 'the surface'}"
     if not looks_like_bone(judged):
         if settings.seeds or not (settings.keep_largest is not None or _means_bone(settings)):
             return []
-        return [f"{where} {_looks(judged)}; {name_parameter('keep', 'bone')} keeps what looks like bone"]
-    other = None if part.bones is None or part.bones.other_share < OTHER_SHARE else part.bones.other
+        return [f"{subject} {_looks(judged)}; {name_parameter('keep', 'bone')} keeps what looks like bone"]
+    rival = None if part.bones is None or part.bones.other_share < OTHER_SHARE else part.bones.other
     even = judged["contrast_share"] >= _CONTRAST_SHARE
-    if part.bones is not None and other is not None and not (even and other["looks_like"] == "contrast medium"):
+    if part.bones is not None and rival is not None and not (even and rival["looks_like"] == "contrast medium"):
         return [
-            f"{where} is in part no bone: one of {count_of(part.bones.components, 'component')},"
-            f" {100.0 * part.bones.other_share:.0f} % of the surface, {_looks(other)}."
+            f"{subject} is in part no bone: one of {count_of(part.bones.components, 'component')},"
+            f" {100.0 * part.bones.other_share:.0f} % of the surface, {_looks(rival)}."
             f" {name_parameter('remove_table', True)} takes a table away, {name_parameter('keep', 'bone')} leaves out"
             " what touches no bone"
         ]
@@ -284,6 +284,6 @@ def _warn_of_whole(part: Part, settings: MeshSettings) -> list[str]:
         )
     advice = apart if settings.keep == "bone" else f"{name_parameter('keep', 'bone')} leaves out what touches no bone"
     return [
-        f"{where} is in part like heart, vessels or organs with contrast medium (about"
+        f"{subject} is in part like heart, vessels or organs with contrast medium (about"
         f" {100.0 * judged['contrast_share']:.0f} % is even beneath and far from compact bone): {advice}"
     ]

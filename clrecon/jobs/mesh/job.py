@@ -147,25 +147,25 @@ _DEVICE_PARTS = ("upload", "build", "kernels", "download")
 
 
 def report_of(
-    run: Run, made: MadeParts, meshes: Sequence[dict[str, Any]], gates: list[dict[str, Any]], warnings: Sequence[str]
+    run: Run, result: MadeParts, meshes: Sequence[dict[str, Any]], gates: list[dict[str, Any]], warnings: Sequence[str]
 ) -> MeshReport:
     """Make the report of a job; its `warnings` come after those of the volume and the meshes."""
     settings: MeshSettings = run.settings
-    parts = made.parts
-    level, level_warnings = describe_level(made.volume, settings, made.choice)
+    parts = result.parts
+    level, level_warnings = describe_level(result.volume, settings, result.choice)
     preset = settings.preset_used
     of_one: dict[str, Any] = {name: meshes[0][name] if len(meshes) == 1 else None for name in _OF_ONE}
     for part in _DEVICE_PARTS:
-        run.seconds[part] = sum(float(origin.get("seconds", {}).get(part, 0.0)) for origin in made.origins)
+        run.seconds[part] = sum(float(origin.get("seconds", {}).get(part, 0.0)) for origin in result.origins)
     largest: dict[str, int] = {}
-    for own in (part.mesh.report.get("device_bytes", {}) for part in parts):
-        largest.update({what: max(size, largest.get(what, 0)) for what, size in own.items()})
+    for sizes in (part.mesh.report.get("device_bytes", {}) for part in parts):
+        largest.update({what: max(size, largest.get(what, 0)) for what, size in sizes.items()})
     report = run.report(
         MeshReport,
         [*_warn_of_meshes(parts, meshes), *level_warnings, *warnings],
-        made.volume,
-        on=made.device.current,
-        affine_ijk_to_lps_mm=made.volume.affine.tolist(),
+        result.volume,
+        on=result.device.current,
+        affine_ijk_to_lps_mm=result.volume.affine.tolist(),
         **{name: _common(mesh[name] for mesh in meshes) for name in _OF_LEVEL},
         outside_hu=_common(part.mesh.report.get("outside_hu") for part in parts),
         **level,
@@ -192,7 +192,7 @@ def report_of(
         preset_reason=None if preset is None else find_iso_preset(preset).source,
         gates=gates,
     )
-    run.logged = made.volume.report.get("warnings", ())
+    run.logged = result.volume.report.get("warnings", ())
     return report
 
 
@@ -235,13 +235,13 @@ def _around(boxes: list[list[list[float]]]) -> list[list[float]]:
 
 
 def _common(values: Iterable[Any]) -> Any:
-    found = list(values)
-    return found[0] if all(value == found[0] for value in found) else None
+    collected = list(values)
+    return collected[0] if all(value == collected[0] for value in collected) else None
 
 
 def _unless_unknown(combine: Callable[[list[Any]], Any], values: Iterable[Any]) -> Any:
-    found = list(values)
-    return None if any(value is None for value in found) else combine(found)
+    collected = list(values)
+    return None if any(value is None for value in collected) else combine(collected)
 
 
 log = get_logger(__name__)
@@ -284,17 +284,17 @@ def make_mesh(
             if settings.labels is not None and run.no_clobber and not settings.one_file:
                 refuse_files(name_outputs(output, name_label_files(labels, settings.labels, surfaces)))
 
-        made = make_parts(source, run, check_map)
-        parts = made.parts
+        result = make_parts(source, run, check_map)
+        parts = result.parts
         paths = [output] * len(parts)
         if not settings.one_file:
             paths = name_outputs(output, [part.name for part in parts], report_path)
         is_measured = settings.strict or (report_path is not None if measure is None else measure)
-        judge_surfaces(parts, made.volume, settings, partial(label_parts, device=made.device, settings=settings))
+        judge_surfaces(parts, result.volume, settings, partial(label_parts, device=result.device, settings=settings))
         run.lap("select")
-        gates = _refine_and_measure(run, made, is_measured)
+        gates = _refine_and_measure(run, result, is_measured)
         warnings = [
-            *warn_of_crumbs(parts, settings, made.device),
+            *warn_of_crumbs(parts, settings, result.device),
             *warn_of_shift(parts, settings),
             *describe_purposes(parts, settings),
             *warn_of_gates(gates),
@@ -312,10 +312,10 @@ def make_mesh(
         else:
             files = run.write_meshes(meshes, paths)
         run.lap("write")
-        walls = warn_of_walls(parts, settings, made.choice)
+        walls = warn_of_walls(parts, settings, result.choice)
         left = _warn_of_leftovers(output, paths) if settings.split else []
         entries = [describe_part(*each, settings.space) for each in zip(parts, files, paths, strict=True)]
-        report = report_of(run, made, entries, gates, [*left, *walls, *warnings])
+        report = report_of(run, result, entries, gates, [*left, *walls, *warnings])
         run.finish(report, report_path)
     log.info(
         "%d meshes made, %d triangles, %d slabs, on %s in %.3f s",
@@ -329,18 +329,20 @@ def makes_objects(output: str | Path) -> bool:
     return extension_of(output) == ".3mf"
 
 
-def _refine_and_measure(run: Run, made: MadeParts, measure: bool) -> list[dict[str, Any]]:
+def _refine_and_measure(run: Run, result: MadeParts, measure: bool) -> list[dict[str, Any]]:
     settings: MeshSettings = run.settings
-    place_on_cortex(made, settings, measure, run.progress)
+    place_on_cortex(result, settings, measure, run.progress)
     run.lap("cortex")
     if settings.refines:
-        for part in made.parts:
-            part.mesh = refine_surface(part.mesh, settings, made.device, run.progress)
+        for part in result.parts:
+            part.mesh = refine_surface(part.mesh, settings, result.device, run.progress)
         run.lap("refine")
     if measure:
-        measure_parts(made.parts, made.solid([part.mesh for part in made.parts]), settings, made.device, run.progress)
-    gates = judge_parts(made.parts, settings)
-    return gates + (judge_label_volumes(made.parts, settings.closed) if settings.labels_pick else [])
+        measure_parts(
+            result.parts, result.solid([part.mesh for part in result.parts]), settings, result.device, run.progress
+        )
+    gates = judge_parts(result.parts, settings)
+    return gates + (judge_label_volumes(result.parts, settings.closed) if settings.labels_pick else [])
 
 
 def _warn_of_leftovers(output: str | Path, paths: Sequence[str | Path]) -> list[str]:

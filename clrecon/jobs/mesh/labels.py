@@ -61,7 +61,7 @@ def extract_label_surfaces(
     from clrecon.labels import file_suffixes
     from clrecon.operators.surface.labels import extract_labels
 
-    found: list[tuple[Surface, int, Mesh]] = []
+    label_surfaces: list[tuple[Surface, int, Mesh]] = []
     numbers = choice.numbers_of(labels)
     colors = choice.colors_of(labels, numbers, settings.one_file)
     asked = numbers if choice.label or choice.hidden else None
@@ -69,7 +69,7 @@ def extract_label_surfaces(
     for surface in surfaces:
         if surface.iso_value is None:
             masks = _extract_masks(volume, labels, asked, device, settings, progress)
-            found += [(surface, number, mesh) for number, mesh in masks.items()]
+            label_surfaces += [(surface, number, mesh) for number, mesh in masks.items()]
             continue
         if isinstance(surface.iso_value, tuple):  # refused with the settings
             raise UsageError(f"labels take one iso value, not {surface.describe()}")
@@ -77,7 +77,7 @@ def extract_label_surfaces(
             volume, labels, surface.iso_value, device=device, label=asked, grow_mm=choice.grow_mm,
             closed=settings.closed, solid=choice.solid, memory=settings.memory, progress=progress,
         )  # fmt: skip
-        found += [(surface, number, mesh) for number, mesh in meshes.items()]
+        label_surfaces += [(surface, number, mesh) for number, mesh in meshes.items()]
         left_out = [f"{number} {suffixes[number]}" for number in numbers if number not in meshes]
         if left_out:
             more = f" and {len(left_out) - NAMES_SHOWN} more" if len(left_out) > NAMES_SHOWN else ""
@@ -86,12 +86,12 @@ def extract_label_surfaces(
                 f" or more in the CT and no mesh: {', '.join(left_out[:NAMES_SHOWN])}{more}"
             )
     named = []
-    for surface, number, mesh in found:
+    for surface, number, mesh in label_surfaces:
         if number in colors:
             mesh.report |= {"part_name": suffixes[number], "color": colors[number]}
-        name = "_".join(part for part in (suffixes[number], surface.name) if part) if len(found) > 1 else ""
+        name = "_".join(part for part in (suffixes[number], surface.name) if part) if len(label_surfaces) > 1 else ""
         named.append(replace(surface, name=name, label=suffixes[number]))
-    return named, [mesh for _, _, mesh in found]
+    return named, [mesh for _, _, mesh in label_surfaces]
 
 
 def _extract_masks(
@@ -147,15 +147,15 @@ def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, A
         if part.surface.label is not None:
             by_surface.setdefault(part.surface, []).append(part)
     gates = []
-    for surface, own in by_surface.items():
-        origin = own[0].mesh.report
+    for surface, members in by_surface.items():
+        origin = members[0].mesh.report
         by_hu = origin["surface"] == "hu"
         label_ml = _ml_in_ct(origin) if by_hu else origin["label_ml"]
-        mesh_ml = sum(enclosed_ml(part.mesh.vertices, part.mesh.triangles) for part in own) if closed else None
+        mesh_ml = sum(enclosed_ml(part.mesh.vertices, part.mesh.triangles) for part in members) if closed else None
         advice = "" if mesh_ml is None else _advise(mesh_ml < label_ml, origin)
         gate = judge_label_volume(mesh_ml, label_ml, advice, by_hu=by_hu)
         gates.append({"mesh": surface.name or None, **gate})
-        for part in own:
+        for part in members:
             part.facts |= {"label_mesh_ml": mesh_ml, "label_compared_ml": label_ml}
     return gates
 
@@ -167,9 +167,9 @@ def _ml_in_ct(origin: dict[str, Any]) -> float:
 
 def _advise(too_small: bool, origin: dict[str, Any]) -> str:
     """Return advice about a mesh that is much smaller, or larger, than its label."""
-    kept, found = origin.get("components_kept"), origin.get("components_found")
-    if too_small and kept is not None and kept < found:
-        return f"{kept} of its {found} components were kept"
+    left, total = origin.get("components_kept"), origin.get("components_found")
+    if too_small and left is not None and left < total:
+        return f"{left} of its {total} components were kept"
     if origin["surface"] == "mask":
         return "no level makes up for borders with other labels or what was done after it; the mask itself is kept"
     level, mask = name_parameter("iso_value"), name_parameter("surface", "mask")

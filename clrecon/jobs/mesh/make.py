@@ -85,9 +85,9 @@ def make_parts(source: str | Path, run: Run, check_map: Callable[[LabelMap], Non
     run.lap("surface")
     steps = Steps(run.progress if settings.selects else None, "select", _SELECT_STEPS * len(surfaces))
     parts: list[Part] = []
-    for place, (surface, mesh) in enumerate(zip(surfaces, extracted, strict=True), start=1):
+    for number, (surface, mesh) in enumerate(zip(surfaces, extracted, strict=True), start=1):
         parts += select_parts(surface, mesh, settings, device.current, volume, steps)
-        steps.take(_SELECT_STEPS * place - steps.done)
+        steps.take(_SELECT_STEPS * number - steps.done)
     return MadeParts(volume, make_solid, parts, device, choice, origins)
 
 
@@ -330,12 +330,12 @@ def select_parts(
     """Keep the components that are asked for, and measure what the purpose needs; `steps` counts `_SELECT_STEPS`."""
     if not settings.is_for_print:
         return _select_parts(surface, mesh, settings, device, volume, steps)
-    found = measure_pieces(mesh.vertices, mesh.triangles)
+    total = measure_pieces(mesh.vertices, mesh.triangles)
     steps.take()
     parts = _select_parts(surface, mesh, settings, device, volume, steps)
-    each = [measure_pieces(part.mesh.vertices, part.mesh.triangles) for part in parts]
+    sizes = [measure_pieces(part.mesh.vertices, part.mesh.triangles) for part in parts]
     for part in parts:
-        part.pieces = found, {name: sum(kept[name] for kept in each) for name in found}
+        part.pieces = total, {name: sum(kept[name] for kept in sizes) for name in total}
     return parts
 
 
@@ -358,8 +358,8 @@ def _select_parts(
             must=not settings.is_for_print,
         )  # fmt: skip
         if settings.is_for_print and among is not None:
-            other = mesh.triangles[~among[labelled[1][mesh.triangles[:, 0]]]]
-            no_bone = measure_pieces(mesh.vertices, other)
+            rejected = mesh.triangles[~among[labelled[1][mesh.triangles[:, 0]]]]
+            no_bone = measure_pieces(mesh.vertices, rejected)
             mesh.report.update(not_bone=no_bone["pieces"], not_bone_ml=no_bone["pieces_ml"])
     if settings.all_parts:
         # walls of cavities are no bodies: what they enclose is filled
@@ -371,8 +371,8 @@ def _select_parts(
     steps.take()
     try:
         if not settings.split:
-            kept = select_components(mesh, *limits, seeds=seeds, labelled=labelled, among=among)
-            return [Part(surface, surface.name, kept)]
+            selected = select_components(mesh, *limits, seeds=seeds, labelled=labelled, among=among)
+            return [Part(surface, surface.name, selected)]
         pieces = split_components(mesh, *limits, seeds=seeds, labelled=labelled, among=among, most=MOST_FILES)
     except (NoSurfaceError, UsageError) as error:
         label = "" if surface.label is None else f"{surface.label} "  # one of several is too small, or too far
@@ -429,8 +429,8 @@ def first_names(surfaces: Sequence[Surface], split: bool) -> list[str]:
     return [_name_piece(surface, 1) if split else surface.name for surface in surfaces]
 
 
-def _name_piece(surface: Surface, place: int) -> str:
-    return f"{surface.name}_{place:03d}" if surface.name else f"{place:03d}"
+def _name_piece(surface: Surface, number: int) -> str:
+    return f"{surface.name}_{number:03d}" if surface.name else f"{number:03d}"
 
 
 def extract_one(

@@ -48,8 +48,8 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
             given = {**given, "labels": replace(given["labels"], solid=True)}
     elif given.get("region"):
         fields["preprocess"] += ",region"  # the paper's order
-    taken = {field: value for field, value in fields.items() if not given.get(field)}
-    return {**given, **taken, "purpose": name}
+    defaults = {field: value for field, value in fields.items() if not given.get(field)}
+    return {**given, **defaults, "purpose": name}
 
 
 def _without_parts(given: dict[str, Any]) -> MeshSettings:
@@ -93,16 +93,16 @@ def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
     from clrecon.system.pieces import local_origin
 
     labelled = label_components(triangles, len(vertices))
-    found = enclosed_mm3(vertices - local_origin(vertices), triangles, *labelled) / 1000.0
+    volumes = enclosed_mm3(vertices - local_origin(vertices), triangles, *labelled) / 1000.0
     return {
-        "pieces": int((found > 0.0).sum()),
-        "pieces_ml": float(found[found > 0.0].sum()),
-        "cavities": int((found < 0.0).sum()),
-        "cavities_ml": float(-found[found < 0.0].sum()),
+        "pieces": int((volumes > 0.0).sum()),
+        "pieces_ml": float(volumes[volumes > 0.0].sum()),
+        "cavities": int((volumes < 0.0).sum()),
+        "cavities_ml": float(-volumes[volumes < 0.0].sum()),
     }
 
 
-def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) -> dict[str, Any]:
+def describe_print(mesh: Mesh, all_pieces: dict[str, float], pieces: dict[str, float]) -> dict[str, Any]:
     """Return ``print`` of the report for a mesh as it is written, from `measure_pieces` before and after the choice."""
     from clrecon.mesh.compare.distances import measure_walls
 
@@ -111,10 +111,10 @@ def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) 
         "size_mm": size.tolist(),
         "wall": measure_walls(mesh.vertices, mesh.triangles, THIN_MM),
         "left_out": {
-            **{name: max(found[name] - kept[name], 0) for name in found},
+            **{name: max(all_pieces[name] - pieces[name], 0) for name in all_pieces},
             **{name: mesh.report.get(name) for name in ("not_bone", "not_bone_ml")},
         },
-        **kept,
+        **pieces,
     }
 
 

@@ -37,14 +37,14 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress:
     from clrecon.operators.surface.decimation import decimate_mesh
     from clrecon.operators.surface.smoothing import smooth_mesh
 
-    raw, where = mesh, device if settings.memory is None else None
+    raw, mesh_device = mesh, device if settings.memory is None else None
     if settings.smooth is not None:
-        mesh = smooth_mesh(mesh, settings.smooth, settings.max_deviation_mm, device=where, progress=progress)
+        mesh = smooth_mesh(mesh, settings.smooth, settings.max_deviation_mm, device=mesh_device, progress=progress)
     share = settings.decimate_used
     if share is not None and settings.method == "g-mc":
         mesh = collapse_quadric(mesh, share, progress=progress)
     elif share is not None:
-        mesh = decimate_mesh(mesh, share, settings.max_deviation_mm, device=where, progress=progress)
+        mesh = decimate_mesh(mesh, share, settings.max_deviation_mm, device=mesh_device, progress=progress)
     mesh.report["refinement"] |= {
         "deviation": compare_meshes(mesh, raw, progress=progress),
         "voxel_mm": default_deviation(raw) / BOUND_VOXEL,
@@ -53,7 +53,7 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress:
 
 
 def place_on_cortex(
-    made: MadeParts, settings: MeshSettings, measure: bool, progress: Progress = ignore_progress
+    result: MadeParts, settings: MeshSettings, measure: bool, progress: Progress = ignore_progress
 ) -> None:
     """Move the meshes onto the bone, if the settings ask for it, or say how far they lie from it: without `measure` the
     largest alone, and only where the scan has not given its level.
@@ -61,7 +61,7 @@ def place_on_cortex(
     Constants of the scan are measured once, in its largest mesh.  One that shows no bone gets ``{"reason": words}``
     in place of figures; that none shows any is an error where they were to be moved.
     """
-    moves, parts = settings.surface == "cortex", made.parts
+    moves, parts = settings.surface == "cortex", result.parts
     if not moves:
         parts = sorted(filter(_may_be_bone, parts), key=lambda part: -part.mesh.vertex_count)
         if not measure:
@@ -71,7 +71,7 @@ def place_on_cortex(
     from clrecon.operators.resident.device_volume import DeviceVolume
     from clrecon.operators.surface.cortex_mesh import fit_meshes, measure_outside
 
-    with DeviceVolume(made.volume, device=made.device, memory=settings.memory) as resident:
+    with DeviceVolume(result.volume, device=result.device, memory=settings.memory) as resident:
         if moves:
             fitted = fit_meshes([part.mesh for part in parts], resident, progress=progress)
             for part, mesh in zip(parts, fitted, strict=True):
@@ -80,8 +80,8 @@ def place_on_cortex(
         constants = None
         for part in parts:
             try:
-                found = measure_outside(part.mesh, resident, constants=constants)
-                part.mesh.report["cortex"], constants = found, found.constants
+                cortex = measure_outside(part.mesh, resident, constants=constants)
+                part.mesh.report["cortex"], constants = cortex, cortex.constants
             except (NoSurfaceError, DeviceError) as error:
                 part.mesh.report["cortex"] = {"reason": str(error)}
                 if constants is None:
@@ -100,19 +100,19 @@ def warn_of_shift(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
     """Warn of closed meshes whose level, not given by the scan, lies too far outside of the bone for their volume."""
     if settings.half_way == "auto" or not settings.closed:
         return []
-    found: dict[str, list[tuple[float, float, str]]] = {}
+    by_phrase: dict[str, list[tuple[float, float, str]]] = {}
     for part in parts:
         cortex = part.mesh.report.get("cortex")
         if not cortex or not cortex.get("vertices") or cortex["moved"]:
             continue
-        told, shift = cortex["fitted"] / cortex["vertices"], cortex["outside_mm"]["mean"]
-        if told < _FEWEST_TOLD:
+        fitted_share, shift = cortex["fitted"] / cortex["vertices"], cortex["outside_mm"]["mean"]
+        if fitted_share < _FEWEST_TOLD:
             continue
         area, volume = _measure_size(part)
-        excess = shift * told * area
+        excess = shift * fitted_share * area
         if volume > 0.0 and (share := excess / max(volume - excess, 0.2 * volume)) >= _SHIFT_SHARE:
-            found.setdefault(part.surface.phrase, []).append((share, shift, part.name))
-    return [_describe_shifts(phrase, sorted(shifts)) for phrase, shifts in found.items()]
+            by_phrase.setdefault(part.surface.phrase, []).append((share, shift, part.name))
+    return [_describe_shifts(phrase, sorted(shifts)) for phrase, shifts in by_phrase.items()]
 
 
 def _describe_shifts(phrase: str, shifts: list[tuple[float, float, str]]) -> str:
@@ -185,9 +185,9 @@ def _measure_distances(parts: Sequence[Part], volume: Volume) -> None:
         rule = None if moved or part.surface.label is not None else rule_of_report(part.mesh.report)
         if rule is not None:
             placed.setdefault(rule, []).append(part)
-    for rule, own in placed.items():
-        for part, found in zip(own, measure_iso_distances([part.mesh for part in own], volume, rule), strict=True):
-            part.facts["iso_distance"] = found
+    for rule, group in placed.items():
+        for part, gap in zip(group, measure_iso_distances([part.mesh for part in group], volume, rule), strict=True):
+            part.facts["iso_distance"] = gap
 
 
 def judge_parts(parts: Sequence[Part], settings: MeshSettings) -> list[dict[str, Any]]:
@@ -202,7 +202,7 @@ def judge_parts(parts: Sequence[Part], settings: MeshSettings) -> list[dict[str,
     for part in parts:
         refinement = part.mesh.report.get("refinement")
         iso_distance = part.facts.get("iso_distance")
-        found = judge_mesh(
+        gates_of_part = judge_mesh(
             part.quality,
             closed=settings.closed,
             outward=not settings.split,
@@ -212,7 +212,7 @@ def judge_parts(parts: Sequence[Part], settings: MeshSettings) -> list[dict[str,
             voxel_mm=refinement and refinement["voxel_mm"],
         )
         part.facts |= {"iso_distance": iso_distance, "refinement": refinement}
-        gates += [{"mesh": part.name or None, **gate} for gate in found]
+        gates += [{"mesh": part.name or None, **gate} for gate in gates_of_part]
     return gates
 
 

@@ -93,8 +93,8 @@ class LabelChoice:
             given[number] = as_point(find_color(color))
         if not distinct:
             return given
-        own = distinct_colors(len(numbers))
-        return {number: as_point(color) for number, color in zip(numbers, own, strict=True)} | given
+        palette = distinct_colors(len(numbers))
+        return {number: as_point(color) for number, color in zip(numbers, palette, strict=True)} | given
 
 
 _LABEL_SEED = "label:"
@@ -460,11 +460,11 @@ class MeshSettings(InputSettings):
             return
         if not self.levels:
             raise UsageError("give at least one iso value in HU")
-        for place, level in enumerate(self.levels):
+        for number, level in enumerate(self.levels):
             for value in level if isinstance(level, tuple) else (level,):
                 if not math.isfinite(value):
                     raise UsageError(f"the iso value must be a finite number of HU, not {value}")
-            if level in self.levels[:place]:
+            if level in self.levels[:number]:
                 raise UsageError(f"the iso value {name_level(level)} HU is given twice")
             self._check_range(level)
 

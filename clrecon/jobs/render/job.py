@@ -159,8 +159,8 @@ def _take_views(run: Run, taker: PictureTaker, files: PictureFiles) -> list[dict
     """Take the picture of each view and write it under a temporary name; return the report's entries of them."""
     pictures: list[dict[str, Any]] = []
     views = taker.views
-    for place, view in enumerate(views):
-        run.progress("render", place, len(views) if len(views) > 1 else 0)
+    for number, view in enumerate(views):
+        run.progress("render", number, len(views) if len(views) > 1 else 0)
         picture = taker.take_view(view)
         run.lap("render")
         name = name_view(view, views)
@@ -268,11 +268,11 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
                 )
     of_views = {"the picture": files.picture, "the depths": files.depth, "the values": files.values}
     owned: list[tuple[str, str | Path]] = [] if files.report is None else [("the report", files.report)]
-    for what, path in of_views.items():
+    for role, path in of_views.items():
         if path is not None:
-            (check_image_path if what == "the picture" else check_float_path)(path)
+            (check_image_path if role == "the picture" else check_float_path)(path)
             names = [name_view(view, settings.views_used) for view in settings.views_used]
-            owned += [(f"{what} {name}".rstrip(), path_of(path, name)) for name in names]
+            owned += [(f"{role} {name}".rstrip(), path_of(path, name)) for name in names]
     moving = [] if files.turntable is None else [("the turntable", files.turntable)]
     check_distinct(owned, moving)
     check_files(owned)
@@ -285,9 +285,9 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
 def _check_outside_frames(folder: str | Path, owned: Sequence[tuple[str, str | Path]]) -> None:
     """Refuse files in the folder of frames, because that folder is replaced as a whole."""
     frames = Path(os.path.realpath(folder))
-    for what, path in owned:
+    for role, path in owned:
         if frames in Path(os.path.realpath(path)).parents:
-            raise UsageError(f"{what} cannot lie in {folder}, which holds frames and nothing else: name another folder")
+            raise UsageError(f"{role} cannot lie in {folder}, which holds frames and nothing else: name another folder")
 
 
 def _write_picture(run: Run, picture: Rendering, files: PictureFiles, name: str) -> dict[str, dict[str, Any]]:
@@ -300,9 +300,9 @@ def _write_picture(run: Run, picture: Rendering, files: PictureFiles, name: str)
     assert files.picture is not None
     path = path_of(files.picture, name)
     outputs = {"output": entry(path, run.write_picture(path, picture))}
-    for what, named, floats in (("depth", files.depth, picture.depth), ("values", files.values, picture.values)):
+    for kind, named, floats in (("depth", files.depth, picture.depth), ("values", files.values, picture.values)):
         if named is not None and floats is not None:
             path = path_of(named, name)
             content = encode_floats(floats, extension_of(path), picture.pixel_mm)
-            outputs[f"{what}_output"] = entry(path, run.write(path, content))
+            outputs[f"{kind}_output"] = entry(path, run.write(path, content))
     return outputs

@@ -135,14 +135,14 @@ class PictureTaker(Closing):
     def take(self, camera: Camera) -> Rendering:
         return self._render(camera=camera, size=self._settings.size_used)
 
-    def _render(self, **place: Any) -> Rendering:
+    def _render(self, **view: Any) -> Rendering:
         settings = self._settings
         if self._is_scene:
-            picture = self._open_scene().take(place["camera"], place["size"], self._ground)
+            picture = self._open_scene().take(view["camera"], view["size"], self._ground)
         elif isinstance(self.style, PointLook):
-            picture = self._take_points(self.style, place["camera"], place["size"])
+            picture = self._take_points(self.style, view["camera"], view["size"])
         else:
-            picture = self._open_volume().render(self.style, background=settings.background, **place)
+            picture = self._open_volume().render(self.style, background=settings.background, **view)
         letters = settings.letters and not settings.is_sheet  # each slice of a sheet has its own
         picture = picture.annotated(letters=letters, scale_bar=settings.scale_bar, caption=settings.caption)
         if not isinstance(self.style, MeshLook) or self.style.color_by is None:

@@ -45,7 +45,7 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
     """Make one entry of ``pictures``, without the files; ranges are None for a picture without values or hits."""
     import numpy as np
 
-    made = picture.report
+    report = picture.report
     values = None if picture.values is None else _range(picture.values[np.isfinite(picture.values)])
     is_water = picture.mode == "drr"
     hit = np.isfinite(picture.depth)
@@ -58,23 +58,23 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
         "hit_share": float(hit.mean()) if picture.camera is not None else None,
         "depth_mm": _range(picture.depth[hit]),
         "values_hu": None if is_water else values,
-        "window_hu": made.get("window_hu"),
+        "window_hu": report.get("window_hu"),
         "values_mm_water": values if is_water else None,
-        "window_mm_water": made.get("window_mm_water"),
-        **{name: made.get(name) for name in ("ray_step_mm", "slices", "plane", "curve")},
-        "edges": made.get("edges") if picture.camera is None else edge_letters(picture.camera),
-        "points": _describe_points(made),
-        **{name: made.get(name) for name in ("left_out", "labels", "tiles", "tile_size")},
-        "slabs": made.get("slabs", 1),
-        "seconds": made.get("seconds"),
+        "window_mm_water": report.get("window_mm_water"),
+        **{name: report.get(name) for name in ("ray_step_mm", "slices", "plane", "curve")},
+        "edges": report.get("edges") if picture.camera is None else edge_letters(picture.camera),
+        "points": _describe_points(report),
+        **{name: report.get(name) for name in ("left_out", "labels", "tiles", "tile_size")},
+        "slabs": report.get("slabs", 1),
+        "seconds": report.get("seconds"),
     }
 
 
-def _describe_points(made: Mapping[str, Any]) -> dict[str, Any] | None:
+def _describe_points(report: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return how the points of a cloud are shown; None in other modes."""
-    if made.get("mode") != "points":
+    if report.get("mode") != "points":
         return None
-    return {name: made[name] for name in ("points", "radius_mm", "color_by", "shading", "legend", "legend_left_out")}
+    return {name: report[name] for name in ("points", "radius_mm", "color_by", "shading", "legend", "legend_left_out")}
 
 
 _NOUNS = {"points": "cloud", "mesh": "mesh"}
@@ -97,20 +97,20 @@ def find_emptiness(picture: Rendering) -> str | None:
         return None
     shade = "black" if values.max() <= low else "white"
     shown, unit = f"{values.min():g} to {values.max():g}", "mm of water" if is_water else "HU"
-    kept = picture.mode == "minip" and "left_out" not in picture.report
-    air = f": the air round the body is the lowest, do not keep it ({name_parameter('keep_air')})" if kept else ""
+    is_kept = picture.mode == "minip" and "left_out" not in picture.report
+    air = f": the air round the body is the lowest, do not keep it ({name_parameter('keep_air')})" if is_kept else ""
     return f"all of the picture is {shade}: its {shown} {unit} lie beyond the window from {low:g} to {high:g}{air}"
 
 
 def warn_of_picture(picture: Rendering, known: Collection[str] = ()) -> list[str]:
     """Return warnings about a picture; those that are `known` are about its device."""
-    made = picture.report
-    warnings = [str(text) for text in made.get("warnings", []) if text not in known]
+    report = picture.report
+    warnings = [str(text) for text in report.get("warnings", []) if text not in known]
     empty = find_emptiness(picture)
     if empty is not None and not warnings:  # slices seen edge-on have a warning of their own
         warnings.append(empty)
-    found = (made.get("curve") or {}).get("found")
-    if found is not None:
+    taken_curve = (report.get("curve") or {}).get("found")
+    if taken_curve is not None:
         warnings.append("the centre line is the spinal canal as it was found: look whether it is the canal")
     return warnings
 
@@ -234,9 +234,9 @@ def _describe_labels(look: LabelLook | None, labels: LabelMap | None) -> list[di
     from clrecon.labels import file_suffixes
 
     looks: dict[int, dict[str, Any]] = {}
-    for what, chosen in (("color", look.colors), ("opacity", look.opacities)):
+    for look_name, chosen in (("color", look.colors), ("opacity", look.opacities)):
         for label, value in chosen.items():
-            looks.setdefault(find_shown(labels, label), {})[what] = value
+            looks.setdefault(find_shown(labels, label), {})[look_name] = value
     names = file_suffixes({number: labels.name(number) for number in looks if number != NO_LABEL})
     names[NO_LABEL] = "none"
     return [

@@ -244,25 +244,25 @@ class RenderSettings(InputSettings):
             crops a scan, and where the style can be clipped it ends exactly at the box; clouds and meshes are clipped
             alone.
         """
-        own = {name: given.pop(name) for name in [*given] if name in {each.name for each in fields(cls)}}
-        curve = None if own.get("curve") is None else SPINE  # files are read later: placeholders until then
-        function = None if own.get("transfer_function") is None else find_preset(DEFAULT_PRESET).transfer_function
+        picks = {name: given.pop(name) for name in [*given] if name in {each.name for each in fields(cls)}}
+        curve = None if picks.get("curve") is None else SPINE  # files are read later: placeholders until then
+        function = None if picks.get("transfer_function") is None else find_preset(DEFAULT_PRESET).transfer_function
         mode = choose_mode(mode, preset, curve=curve, **given)
-        box = crop_box(*(own.get(name) for name in CROPS))
+        box = crop_box(*(picks.get(name) for name in CROPS))
         if mode in ("points", "mesh"):
-            own = {name: value for name, value in own.items() if name not in CROPS}
-        said = own | {"clip_planes": tuple(clip_planes) or None}
+            picks = {name: value for name, value in picks.items() if name not in CROPS}
+        values = picks | {"clip_planes": tuple(clip_planes) or None}
         for called, keyword in _CALLED.items():
-            if said.get(called) is not None:
+            if values.get(called) is not None:
                 check_known(mode, keyword, called)
-        light = own.get("light")
+        light = picks.get("light")
         look = {
             "lighting": None if light is None else _turn_light(light, Lighting()),
             "clip": _find_clip(box if "clip" in keywords_of(mode) else None, clip_planes),
             "transfer_function": function,
             "curve": curve,
         }
-        return cls(make_style(mode, preset, **given, **look), preset, **own)
+        return cls(make_style(mode, preset, **given, **look), preset, **picks)
 
     @classmethod
     def keywords(cls) -> set[str]:

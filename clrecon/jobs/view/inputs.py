@@ -82,18 +82,18 @@ def open_inputs(
         "cloud": partial(_open_cloud, space=settings.mesh_space),
         "scan": partial(_open_scan, settings=settings, progress=tell),
     }
-    found: dict[int, OpenedInput] = {}
-    for place in sorted(range(len(inputs)), key=lambda place: kinds[place] == "scan"):
-        tell("read", len(found), len(inputs))
-        found[place] = readers[kinds[place]](inputs[place])
+    by_position: dict[int, OpenedInput] = {}
+    for position in sorted(range(len(inputs)), key=lambda place: kinds[place] == "scan"):
+        tell("read", len(by_position), len(inputs))
+        by_position[position] = readers[kinds[position]](inputs[position])
         if ready is not None:
-            ready(found[place])
-    made = [found[place] for place in range(len(inputs))]
+            ready(by_position[position])
+    opened = [by_position[place] for place in range(len(inputs))]
     if labels is not None:
-        made.append(_open_labels(settings, next((each.subject for each in made if _is_scan(each)), None)))
+        opened.append(_open_labels(settings, next((each.subject for each in opened if _is_scan(each)), None)))
         if ready is not None:
-            ready(made[-1])
-    return made
+            ready(opened[-1])
+    return opened
 
 
 def _is_scan(opened: OpenedInput) -> bool:
@@ -145,8 +145,8 @@ def _open_cloud(path: str | Path, space: Space | None) -> OpenedInput:
         cloud = read_points(path, space=space)
     file, name = cloud.report["file"], escape_text(Path(path).name)
     assumed = file["space_from"] == "assumed"
-    said = (f"{name} names no patient frame: its coordinates are taken as LPS",) if assumed else ()
-    return OpenedInput(cloud, (*_describe_frame(name, file), *said), dict(file))
+    notes = (f"{name} names no patient frame: its coordinates are taken as LPS",) if assumed else ()
+    return OpenedInput(cloud, (*_describe_frame(name, file), *notes), dict(file))
 
 
 def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress) -> OpenedInput:
@@ -160,8 +160,8 @@ def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress) -> 
     volume = read_selected(path, scan, progress=progress)
     if tell_format(path) is not None and _holds_labels(volume):
         labels = _read_labels(path)
-        said = f"{name} is taken for a label map: its values are whole numbers from 0"
-        return OpenedInput(labels, (said, *labels.warnings))
+        note = f"{name} is taken for a label map: its values are whole numbers from 0"
+        return OpenedInput(labels, (note, *labels.warnings))
     volume = mask_volume(volume, scan, progress)
     if scan.crop is not None or scan.region or scan.preprocess is not None:
         from clrecon.jobs.preprocess import preprocess_volume, restrict_volume

@@ -56,8 +56,8 @@ def write_view(
         run.check([("the page", output)], *inputs, None if labels is None else labels.path)
         # Mesh files first: they are read in a moment, and a wrong one is said before the device works on a scan.
         order = sorted(range(len(inputs)), key=lambda place: not may_be_mesh(inputs[place]))
-        found = {place: _read_input(inputs[place], settings, run) for place in order}
-        shown = [found[place] for place in range(len(inputs))]
+        by_position = {place: _read_input(inputs[place], settings, run) for place in order}
+        shown = [by_position[place] for place in range(len(inputs))]
         meshes = _name_and_color(shown, settings)
         placed = [
             (mesh, {"name": one.entry["name"], "space_from": one.entry["space_from"], "bounds_mm": mesh.bounds})
@@ -120,23 +120,23 @@ def _read_input(path: str | Path, settings: ViewSettings, run: Run) -> _ShownInp
         shown = _read_mesh(path, settings)
         run.lap("read")
         return shown
-    made = make_parts(path, run)
-    label = partial(label_parts, device=made.device, settings=settings.scan)
-    judge_surfaces(made.parts, made.volume, settings.scan, label)
+    result = make_parts(path, run)
+    label = partial(label_parts, device=result.device, settings=settings.scan)
+    judge_surfaces(result.parts, result.volume, settings.scan, label)
     run.lap("select")
     meshes = []
-    for part in made.parts:
-        if len(made.parts) > 1 and "part_name" not in part.mesh.report:
+    for part in result.parts:
+        if len(result.parts) > 1 and "part_name" not in part.mesh.report:
             part.mesh.report["part_name"] = part.name.replace("_", " ")
         meshes.append(part.mesh)
     return _ShownInput(
         meshes,
         {
-            **_describe_scan(path, made.volume, meshes, run),
-            "surface": ", ".join(dict.fromkeys(part.surface.describe() for part in made.parts)),
+            **_describe_scan(path, result.volume, meshes, run),
+            "surface": ", ".join(dict.fromkeys(part.surface.describe() for part in result.parts)),
         },
-        [*made.volume.report.get("warnings", ()), *chain(*(mesh.report.get("warnings", ()) for mesh in meshes))],
-        made.device.current.label,
+        [*result.volume.report.get("warnings", ()), *chain(*(mesh.report.get("warnings", ()) for mesh in meshes))],
+        result.device.current.label,
     )
 
 
@@ -173,10 +173,10 @@ def _describe_scan(path: str | Path, volume: Volume, meshes: Sequence[Mesh], run
 
 def _name_and_color(shown: Sequence[_ShownInput], settings: ViewSettings) -> list[Mesh]:
     colors = distinct_colors(len(shown))
-    for number, one in enumerate(shown, start=1):
+    for number, item in enumerate(shown, start=1):
         given = settings.names[number - 1] if number <= len(settings.names) else ""
         name = given or (f"surface {number}" if len(shown) > 1 else "")
-        for mesh in one.meshes:
+        for mesh in item.meshes:
             words = " ".join(filter(None, (name, mesh.report.get("part_name"))))
             if words:
                 mesh.report["part_name"] = words

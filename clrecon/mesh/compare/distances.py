@@ -34,8 +34,8 @@ def sample_surface_points(
 ) -> tuple[Points, NDArray[np.int64]]:
     """As `sample_surface`, with the row of the triangle of each point, shape (count,)."""
     area = np.zeros(len(triangles))
-    for where, _, cross in cross_products(vertices, triangles, np.zeros(3)):
-        area[where] = np.sqrt(np.einsum("ij,ij->j", cross, cross))
+    for piece, _, cross in cross_products(vertices, triangles, np.zeros(3)):
+        area[piece] = np.sqrt(np.einsum("ij,ij->j", cross, cross))
     up_to = np.cumsum(area)
     if len(up_to) == 0 or up_to[-1] <= 0.0:
         raise NoSurfaceError("a surface without area has no points to measure from")
@@ -137,9 +137,9 @@ def compare_meshes(
     sides = []
     progress = progress or ignore_progress
     points = [sample_surface(each.vertices, each.triangles, samples) for each in (mesh, reference)]
-    for side, other in enumerate((reference, mesh)):
+    for side, second in enumerate((reference, mesh)):
         progress("compare", side, 2)
-        sides.append(summarise_distances(SurfaceDistance(other.vertices, other.triangles)(points[side])))
+        sides.append(summarise_distances(SurfaceDistance(second.vertices, second.triangles)(points[side])))
     progress("compare", 2, 2)
     origin = local_origin(reference.vertices)
     volume, wanted = (enclosed_ml(each.vertices, each.triangles, origin) for each in (mesh, reference))
@@ -178,8 +178,8 @@ def wall_thickness(
     normals = np.cross(b - a, c - a)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     farthest = float(np.linalg.norm(near.max(axis=0) - near.min(axis=0))) + 1.0
-    found = TriangleTree(near, triangles).first_hits(points - _INWARD * normals, points - farthest * normals)
-    return np.asarray(np.linalg.norm(found - points, axis=1))
+    hits = TriangleTree(near, triangles).first_hits(points - _INWARD * normals, points - farthest * normals)
+    return np.asarray(np.linalg.norm(hits - points, axis=1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,8 +75,8 @@ class _Voxels:
         """Return the voxels so many steps along i, j and k from the places, shape (n,)."""
         i, j, k = (own[at - self._first] for own, at in zip(self._offsets, step, strict=True))
         values = self._values.take(i + j + k).astype(np.float64)
-        for own, at in zip(self._beyond, step, strict=True):
-            marks = own[at - self._first]
+        for tables, index in zip(self._beyond, step, strict=True):
+            marks = tables[index - self._first]
             if marks is not None:
                 values[marks] = self._outside
         return values
@@ -146,8 +146,8 @@ def _distances_to_level(volume: Volume, rule: IsoRule, level: float, points: Flo
     matrices = np.asarray(layer_normal_matrices(volume, rule.border))
     longest = 0.5 * smallest_voxel_mm(volume)
     distances = np.full(len(points), np.nan)
-    for where in chunks(len(points), _PIECE):
-        here = points[where].copy()
+    for piece in chunks(len(points), _PIECE):
+        here = points[piece].copy()
         going = np.arange(len(here))
         for _ in range(_STEPS):
             # Beyond the border the field does not change: a step from there would begin at the border all the same.
@@ -164,8 +164,8 @@ def _distances_to_level(volume: Volume, rule: IsoRule, level: float, points: Flo
             step *= np.minimum(1.0, longest / np.maximum(length, longest))[:, None]
             here[going] += step
             there = length <= _ON_THE_SURFACE
-            found = going[there]
-            distances[where][found] = np.linalg.norm(here[found] - points[where][found], axis=1)
+            reached = going[there]
+            distances[piece][reached] = np.linalg.norm(here[reached] - points[piece][reached], axis=1)
             going = going[~there]
             if len(going) == 0:
                 break
@@ -180,8 +180,8 @@ def _distances_along_lines(volume: Volume, rule: IsoRule, level: float, points: 
     """
     corners = np.array(list(product(range(-1, 3), repeat=3)), float)
     distances = np.full(len(points), np.nan)
-    for where in chunks(len(points), 1024):
-        start = volume.lps_to_ijk(points[where])
+    for piece in chunks(len(points), 1024):
+        start = volume.lps_to_ijk(points[piece])
         nearest = np.full(len(start), np.inf)
 
         def above(ijk: Float64Array) -> Float64Array:
@@ -193,14 +193,14 @@ def _distances_along_lines(volume: Volume, rule: IsoRule, level: float, points: 
         row, corner = np.nonzero((above(ends) >= 0.0) != (here >= 0.0)[:, None])
         line = ends[row, corner] - start[row]
         before, way_before = here[row], 0.0
-        for way in np.arange(1, _LINE_STEPS + 1) / _LINE_STEPS:
-            after = above(start[row] + way * line)
+        for fraction in np.arange(1, _LINE_STEPS + 1) / _LINE_STEPS:
+            after = above(start[row] + fraction * line)
             met = np.flatnonzero((before >= 0.0) != (after >= 0.0))
             share = before[met] / (before[met] - after[met])
-            ijk = start[row[met]] + (way_before + share * (way - way_before))[:, None] * line[met]
-            np.minimum.at(nearest, row[met], np.linalg.norm(volume.ijk_to_lps(ijk) - points[where][row[met]], axis=1))
-            before, way_before = after, way
-        distances[where] = np.where(np.isfinite(nearest), nearest, np.nan)
+            ijk = start[row[met]] + (way_before + share * (fraction - way_before))[:, None] * line[met]
+            np.minimum.at(nearest, row[met], np.linalg.norm(volume.ijk_to_lps(ijk) - points[piece][row[met]], axis=1))
+            before, way_before = after, fraction
+        distances[piece] = np.where(np.isfinite(nearest), nearest, np.nan)
     return distances
 
 
@@ -244,19 +244,19 @@ def measure_iso_distances(
     meshes: Sequence[Mesh], volume: Volume, rule: IsoRule, samples: int = SAMPLES
 ) -> list[IsoDistance]:
     """Do it for several meshes, small ones together: a call costs as much for ten points as for a thousand."""
-    found: list[IsoDistance] = []
+    result: list[IsoDistance] = []
     waiting: list[Float64Array] = []
-    for place, mesh in enumerate(meshes, start=1):
+    for number, mesh in enumerate(meshes, start=1):
         triangles = mesh.triangles[:: -(-mesh.triangle_count // samples) or 1]
         waiting.append(mesh.vertices[:: -(-mesh.vertex_count // samples) or 1].astype(np.float64))
         waiting.append(mesh.vertices[triangles].mean(axis=1, dtype=np.float64))
-        if place == len(meshes) or sum(map(len, waiting)) >= samples:
+        if number == len(meshes) or sum(map(len, waiting)) >= samples:
             distances = distances_to_iso_surface(volume, rule, np.concatenate(waiting))
             near = _find_near_metal(volume, rule, np.concatenate(waiting))
             parts, marks = _split_as(waiting, distances), _split_as(waiting, near)
-            found += map(partial(_sum_up, smallest_voxel_mm(volume)), parts[::2], parts[1::2], marks[::2], marks[1::2])
+            result += map(partial(_sum_up, smallest_voxel_mm(volume)), parts[::2], parts[1::2], marks[::2], marks[1::2])
             waiting.clear()
-    return found
+    return result
 
 
 def _split_as(points: Sequence[Float64Array], values: NDArray[Any]) -> list[NDArray[Any]]:
@@ -289,10 +289,10 @@ def _sum_up(
 
 def _summarise(distances: Float64Array, unit_mm: float = 1.0) -> DistanceSummary | None:
     """Sum up the finite distances, None without one."""
-    found = distances[np.isfinite(distances)]
-    if len(found) == 0:
+    known = distances[np.isfinite(distances)]
+    if len(known) == 0:
         return None
-    return DistanceSummary(*(value / unit_mm for value in summarise_distances(found).values()))
+    return DistanceSummary(*(value / unit_mm for value in summarise_distances(known).values()))
 
 
 def _find_near_metal(volume: Volume, rule: IsoRule, points: Float64Array) -> NDArray[np.bool_]:

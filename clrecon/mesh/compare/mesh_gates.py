@@ -71,8 +71,8 @@ def _gates_of_quality(quality: Mapping[str, Any], closed: bool, outward: bool) -
         if quality["boundary_edges"] or not quality["open_edges_by_place"]:
             yield none_of("closed", quality["boundary_edges"], "edges with one triangle only", quality["closed"])
         else:
-            what = "edges that are not in two triangles once vertices at one place are joined, as in STL"
-            yield none_of("closed", quality["open_edges_by_place"], what, quality["closed"])
+            words = "edges that are not in two triangles once vertices at one place are joined, as in STL"
+            yield none_of("closed", quality["open_edges_by_place"], words, quality["closed"])
     yield none_of("manifold", sheets, "edges and vertices with several sheets", quality["manifold"])
     yield is_true("oriented", quality["oriented"], "all triangles face the same side of the surface")
     if closed and outward:
@@ -87,32 +87,32 @@ def _gates_of_quality(quality: Mapping[str, Any], closed: bool, outward: bool) -
 
 
 def _gates_of_iso_distance(iso_distance: Mapping[str, Any], extracted: bool) -> Iterator[Gate]:
-    what = "vertices and centres of triangles from which no trilinear iso surface was reached"
-    yield none_of("iso_distance_found", iso_distance["not_found"], what)
-    what = "distance of the mesh from the trilinear iso surface"
+    words = "vertices and centres of triangles from which no trilinear iso surface was reached"
+    yield none_of("iso_distance_found", iso_distance["not_found"], words)
+    words = "distance of the mesh from the trilinear iso surface"
     measures = (("p95", _DEVIATION_P95_VOXEL, "95 % of it"), ("mean", DEVIATION_MEAN_VOXEL, "mean"))
     known = [iso_distance.get(name) for name in ("vertices_voxel", *["surface_voxel"] * (not extracted))]
-    found = min(filter(None, known), key=lambda one: float(one["mean"]), default=None)
+    clear = min(filter(None, known), key=lambda one: float(one["mean"]), default=None)
     near, away = iso_distance.get("near_metal", 0), None if extracted else iso_distance.get("away_from_metal_voxel")
     of = f"of {iso_distance['samples']['vertices']:,} vertices" if near else ""
     metal = f"{near:,} {of} near metal (above {METAL_HU:g} HU)" if near else ""
     for name, bound, which in measures:
-        if found and away:
-            aside = f"without {metal}, with them {found[name]:.3g}"
-            yield at_most(f"iso_distance_{name}", away[name], bound, "voxel", f"{what}, {which} ({aside})")
-        elif found:
+        if clear and away:
+            aside = f"without {metal}, with them {clear[name]:.3g}"
+            yield at_most(f"iso_distance_{name}", away[name], bound, "voxel", f"{words}, {which} ({aside})")
+        elif clear:
             aside = f" ({metal})" if metal else ""
-            yield at_most(f"iso_distance_{name}", found[name], bound, "voxel", f"{what}, {which}{aside}")
+            yield at_most(f"iso_distance_{name}", clear[name], bound, "voxel", f"{words}, {which}{aside}")
         else:
-            yield unmeasured(f"iso_distance_{name}", bound, "voxel", f"{what}: none was reached")
+            yield unmeasured(f"iso_distance_{name}", bound, "voxel", f"{words}: none was reached")
 
 
 def _gates_of_deviation(deviation: Mapping[str, Any], voxel_mm: float, closed: bool) -> Iterator[Gate]:
     p95, mean = deviation["hd95_mm"] / voxel_mm, deviation["assd_mm"] / voxel_mm
-    what = "distance from the surface before smoothing and decimation"
-    yield at_most("deviation_p95", p95, _DEVIATION_P95_VOXEL, "voxel", f"{what}, 95 % of it")
-    yield at_most("deviation_mean", mean, DEVIATION_MEAN_VOXEL, "voxel", f"{what}, mean")
+    words = "distance from the surface before smoothing and decimation"
+    yield at_most("deviation_p95", p95, _DEVIATION_P95_VOXEL, "voxel", f"{words}, 95 % of it")
+    yield at_most("deviation_mean", mean, DEVIATION_MEAN_VOXEL, "voxel", f"{words}, mean")
     change = deviation["volume_change_percent"]
     if closed and change is not None:
-        what = "change of volume by smoothing and decimation"
-        yield at_most("volume_change", abs(change), _VOLUME_CHANGE_PERCENT, "%", what)
+        words = "change of volume by smoothing and decimation"
+        yield at_most("volume_change", abs(change), _VOLUME_CHANGE_PERCENT, "%", words)

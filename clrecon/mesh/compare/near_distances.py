@@ -43,45 +43,45 @@ class NearDistance:
 
         Up to `limit` mm they may be too large, as only nearby triangles are examined.
         """
-        found, _ = self.find_within(points, near, limit)
-        rest = np.flatnonzero(~(found <= limit))
+        lengths, _ = self.find_within(points, near, limit)
+        rest = np.flatnonzero(~(lengths <= limit))
         if len(rest):
             self._exact = self._exact or SurfaceDistance(self._vertices, self._triangles)
-            found[rest] = self._exact(points[rest])
-        return found
+            lengths[rest] = self._exact(points[rest])
+        return lengths
 
     def find_within(
         self, points: Points, near: NDArray[np.integer], limit: float
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return distances to the triangles around one vertex only, and their rows; up to `limit` as `__call__`."""
-        found, rows = self._around(points, near, _perpendicular)
-        rest = np.flatnonzero(~(found <= limit))
+        lengths, rows = self._around(points, near, _perpendicular)
+        rest = np.flatnonzero(~(lengths <= limit))
         if len(rest):
-            found[rest], rows[rest] = self._around(points[rest], near[rest], triangle_distances)
-        return found, rows
+            lengths[rest], rows[rest] = self._around(points[rest], near[rest], triangle_distances)
+        return lengths, rows
 
     def find_surely_within(
         self, points: Points, near: NDArray[np.integer], limit: float
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """As `find_within`, but by upper bounds first: up to `limit` distances may be too large and rows others."""
-        found, rows = self.find_upper_bounds(points, near)
-        rest = np.flatnonzero(~(found <= limit))
+        lengths, rows = self.find_upper_bounds(points, near)
+        rest = np.flatnonzero(~(lengths <= limit))
         if len(rest):
-            found[rest], rows[rest] = self._around(points[rest], near[rest], triangle_distances)
-        return found, rows
+            lengths[rest], rows[rest] = self._around(points[rest], near[rest], triangle_distances)
+        return lengths, rows
 
     def find_upper_bounds(
         self, points: Points, near: NDArray[np.integer]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return upper bounds of the distances to the triangles around one vertex, and the rows of these."""
-        found, rows = np.full(len(points), np.inf), np.full(len(points), -1)
+        lengths, rows = np.full(len(points), np.inf), np.full(len(points), -1)
         self.prepare()
 
-        def work(where: slice) -> None:
-            found[where], rows[where] = self.upper_bounds(points[where].T.astype(np.float32), near[where])
+        def work(piece: slice) -> None:
+            lengths[piece], rows[piece] = self.upper_bounds(points[piece].T.astype(np.float32), near[piece])
 
         in_threads(work, len(points), _PIECE_OF_BOUNDS)
-        return found, rows
+        return lengths, rows
 
     def upper_bounds(
         self, columns: NDArray[np.float32], near: NDArray[np.integer]
@@ -117,12 +117,12 @@ class NearDistance:
 
     def find_around(self, points: Points, near: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return distances to the triangles around several vertices of each point, (k, v), and their rows."""
-        found, rows = self._around(points, near[:, 0], triangle_distances)
+        lengths, rows = self._around(points, near[:, 0], triangle_distances)
         for others in near.T[1:]:
             length, row = self._around(points, others, triangle_distances)
-            rows = np.where(length < found, row, rows)
-            found = np.minimum(found, length)
-        return found, rows
+            rows = np.where(length < lengths, row, rows)
+            lengths = np.minimum(lengths, length)
+        return lengths, rows
 
     @property
     def _columns(self) -> Columns:
@@ -134,27 +134,27 @@ class NearDistance:
     def _corners(self, rows: NDArray[np.integer]) -> tuple[Columns, Columns, Columns]:
         a, b, c = self._triangles[rows].T.astype(np.intp)
         # "clip" avoids checking each index, which takes longer than the look-up; the triangles have been checked.
-        one, two, three = (self._columns.take(corner, axis=1, mode="clip") for corner in (a, b, c))
-        return one, two, three
+        first, two, three = (self._columns.take(corner, axis=1, mode="clip") for corner in (a, b, c))
+        return first, two, three
 
     def _around(
         self, points: Points, near: NDArray[np.integer], measure: Callable[..., NDArray[np.float64]]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the smallest value of a measure among the triangles around the vertices, and the rows of these."""
-        found, rows = np.full(len(points), np.inf), np.full(len(points), -1)
+        lengths, rows = np.full(len(points), np.inf), np.full(len(points), -1)
         assert len(self._columns) == 3  # before threads use them
 
-        def work(where: slice) -> None:
-            pair, row, start, some = self._pairs(near[where])
-            columns = np.ascontiguousarray(points[where].T)
+        def work(piece: slice) -> None:
+            pair, row, start, some = self._pairs(near[piece])
+            columns = np.ascontiguousarray(points[piece].T)
             length = measure(columns.take(pair, axis=1, mode="clip"), *self._corners(row))
             if some.any():
-                found[where][some] = np.minimum.reduceat(length, start[some])
-                shortest = np.flatnonzero(length == found[where][pair])[::-1]  # backwards: the first of equals wins
-                rows[where][pair[shortest]] = row[shortest]
+                lengths[piece][some] = np.minimum.reduceat(length, start[some])
+                shortest = np.flatnonzero(length == lengths[piece][pair])[::-1]  # backwards: the first of equals wins
+                rows[piece][pair[shortest]] = row[shortest]
 
         in_threads(work, len(points), _PIECE)
-        return found, rows
+        return lengths, rows
 
     def _pairs(self, near: NDArray[np.integer]) -> tuple[IntArray, IntArray, IntArray, NDArray[np.bool_]]:
         """List pairs of a place in `near` and a triangle around it; where each vertex's pairs begin, if it has any."""
@@ -205,17 +205,17 @@ class FaceFrames:
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
         columns = np.ascontiguousarray(vertices.T, dtype=np.float64)
-        corner, one, two = (columns.take(index, axis=1) for index in triangles.T.astype(np.intp))
-        one -= corner
+        corner, to_b, two = (columns.take(index, axis=1) for index in triangles.T.astype(np.intp))
+        to_b -= corner
         two -= corner
-        cross = cross_product(one, two)
+        cross = cross_product(to_b, two)
         square = np.einsum("ij,ij->j", cross, cross)
         inverse = np.divide(1.0, square, out=np.zeros_like(square), where=square > 0.0)
-        along = (cross_product(two, cross) * inverse, cross_product(cross, one) * inverse)
+        along = (cross_product(two, cross) * inverse, cross_product(cross, to_b) * inverse)
         # One row a triangle, 16 numbers: they lie side by side, and a look-up costs one access to memory.
         self._rows = np.zeros((len(triangles), 16), dtype=np.float32)
-        for place, part in enumerate((corner, *along, one, two)):
-            self._rows[:, 3 * place : 3 * place + 3] = part.T
+        for column, part in enumerate((corner, *along, to_b, two)):
+            self._rows[:, 3 * column : 3 * column + 3] = part.T
         self.slack = rounding_of_bounds(float(np.abs(columns).max(initial=0.0)))
 
     def squares(self, points: NDArray[np.float32], rows: NDArray[np.integer]) -> NDArray[np.float32]:
@@ -237,6 +237,6 @@ class FaceFrames:
         away -= u * frames[9:12]
         away -= v * frames[12:15]
         away *= away
-        found: NDArray[np.float32] = away[0] + away[1]
-        found += away[2]
-        return found
+        squared: NDArray[np.float32] = away[0] + away[1]
+        squared += away[2]
+        return squared

@@ -57,9 +57,9 @@ class SignedDistance:
         self._tree = TriangleTree(vertices - self._origin, triangles)
         self._sign = 1.0 if outward else -1.0
         faces = np.zeros((len(triangles), 3))
-        for where, _, cross in cross_products(vertices, triangles, np.zeros(3)):
+        for piece, _, cross in cross_products(vertices, triangles, np.zeros(3)):
             length = np.sqrt(np.einsum("ij,ij->j", cross, cross))
-            faces[where] = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0.0).T
+            faces[piece] = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0.0).T
         self._faces = faces
         self._edges = faces[np.arange(len(opposite)) // 3] + faces[opposite // 3]
         self._corners = vertex_normals(vertices, triangles).astype(np.float64)
@@ -186,20 +186,20 @@ def measure_distance(
     """
     if samples < 1:
         raise UsageError(f"distances need at least 1 sample, not {samples}")
-    told, done = progress or ignore_progress, 0
+    report, done = progress or ignore_progress, 0
     sides, signed, warnings = [], [], []
-    for one, other, name in ((mesh, reference, names[1]), (reference, mesh, names[0])):
-        points = sample_surface(one.vertices, one.triangles, samples)
-        measure, has_sign, remark = _measurer_of(other, name)
+    for source, target, name in ((mesh, reference, names[1]), (reference, mesh, names[0])):
+        points = sample_surface(source.vertices, source.triangles, samples)
+        measure, has_sign, remark = _measurer_of(target, name)
         distances = np.empty(samples)
-        for where in chunks(samples, _PIECE):
-            told("compare", done + where.start, 2 * samples)
-            distances[where] = measure(points[where])
+        for piece in chunks(samples, _PIECE):
+            report("compare", done + piece.start, 2 * samples)
+            distances[piece] = measure(points[piece])
         done += samples
         sides.append(summarise_distances(np.abs(distances)))
         signed.append(_summarise_sides(distances) if has_sign else None)
         warnings += remark
-    told("compare", done, 2 * samples)
+    report("compare", done, 2 * samples)
     return MeshDeviation(
         hausdorff_mm=max(side.max for side in sides),
         hd95_mm=max(side.p95 for side in sides),
@@ -237,13 +237,13 @@ def measure_vertex_distances(
     NoSurfaceError
         The reference is empty.
     """
-    told = progress or ignore_progress
+    report = progress or ignore_progress
     measure, has_sign, _ = _measurer_of(reference, "the reference")
     distances = np.empty(mesh.vertex_count)
-    for where in chunks(mesh.vertex_count, _PIECE):
-        told("compare", where.start, mesh.vertex_count)
-        distances[where] = measure(mesh.vertices[where].astype(np.float64))
-    told("compare", mesh.vertex_count, mesh.vertex_count)
+    for piece in chunks(mesh.vertex_count, _PIECE):
+        report("compare", piece.start, mesh.vertex_count)
+        distances[piece] = measure(mesh.vertices[piece].astype(np.float64))
+    report("compare", mesh.vertex_count, mesh.vertex_count)
     return distances, has_sign
 
 

@@ -136,17 +136,17 @@ def judge_components(
     order = np.argsort(label_of_vertex, kind="stable")
     ends = np.searchsorted(label_of_vertex[order], np.arange(count + 1))
     sizes = np.diff(ends)
-    told = np.flatnonzero(sizes >= fewest)
-    chosen = [order[ends[one] : ends[one + 1] : -(-sizes[one] // _MOST_COMPONENT_SAMPLES)] for one in told]
+    large = np.flatnonzero(sizes >= fewest)
+    chosen = [order[ends[one] : ends[one + 1] : -(-sizes[one] // _MOST_COMPONENT_SAMPLES)] for one in large]
     judged: list[WallLook | None] = [None] * count
-    if len(told) == 0:
+    if len(large) == 0:
         return judged
     rows = np.concatenate(chosen)
     walls = sample_walls(mesh.vertices[rows], normals_of(mesh)[rows], volume, rule)
     first = 0
-    for component, own in zip(told, chosen, strict=True):
-        judged[component] = judge_walls(walls.where(slice(first, first + len(own))))
-        first += len(own)
+    for component, samples in zip(large, chosen, strict=True):
+        judged[component] = judge_walls(walls.where(slice(first, first + len(samples))))
+        first += len(samples)
     return judged
 
 
@@ -167,11 +167,11 @@ def find_rails(
         return rails
     order = np.argsort(label_of_vertex, kind="stable")
     ends = np.searchsorted(label_of_vertex[order], np.arange(len(chosen) + 1))
-    for one in np.flatnonzero(chosen):
-        rows = order[ends[one] : ends[one + 1]]
+    for number in np.flatnonzero(chosen):
+        rows = order[ends[number] : ends[number + 1]]
         # it is blurred by about a voxel
         width = _measure_section(volume.lps_to_ijk(mesh.vertices[rows].astype(np.float64)), volume.spacing, last)
-        rails[one] = width is not None and bool((width - volume.spacing[:2]).min() <= RAIL_MM)
+        rails[number] = width is not None and bool((width - volume.spacing[:2]).min() <= RAIL_MM)
     return rails
 
 
@@ -223,7 +223,7 @@ def lie_near_line(points: NDArray[np.floating], line: NDArray[np.float64], dista
     """Mark the points nearer than `distance` to a line through points (n, 3), all in mm."""
     near = np.zeros(len(points), dtype=bool)
     for start, end in zip(line[:-1], line[1:], strict=True):
-        way = end - start
-        along = np.clip((points - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
-        near |= np.linalg.norm(points - start - along[:, None] * way, axis=1) < distance
+        line_vector = end - start
+        along = np.clip((points - start) @ line_vector / max(float(line_vector @ line_vector), 1e-12), 0.0, 1.0)
+        near |= np.linalg.norm(points - start - along[:, None] * line_vector, axis=1) < distance
     return near

@@ -56,9 +56,9 @@ class Collapses:
 
     def latest(self, names: IntArray) -> IntArray:
         """Return for each cluster the number of its last collapse, -1 where there is none, from names of vertices."""
-        found = np.full(len(names), -1)
-        found[names[self._into]] = np.arange(len(self._into))  # the last of equals stays
-        return found
+        latest_rows = np.full(len(names), -1)
+        latest_rows[names[self._into]] = np.arange(len(self._into))  # the last of equals stays
+        return latest_rows
 
     def undo(self, marked: NDArray[np.bool_], names: IntArray) -> tuple[NDArray[np.bool_], IntArray]:
         """Undo the last collapses of marked clusters: one of each, and more where one is undone often in this round.
@@ -85,8 +85,8 @@ class Collapses:
         turns = np.minimum(self._turns[heads] + 1, _MOST_TURNS)
         self._turns[heads] = turns
         self._turns[self._gone[rows[gone]]] = np.repeat(turns, count)[gone]
-        kept = np.sort(rows[~gone])
-        left = np.stack([self._into[kept], self._gone[kept]], axis=1)
+        standing = np.sort(rows[~gone])
+        left = np.stack([self._into[standing], self._gone[standing]], axis=1)
         stays = np.ones(len(self._into), dtype=bool)
         stays[rows[gone]] = False
         self._into, self._gone = self._into[stays], self._gone[stays]
@@ -98,19 +98,19 @@ class Quadrics:
 
     def __init__(self, vertices: Float64Array, triangles: NDArray[np.uint32], fans: Fans):
         planes = np.empty((len(triangles), 4))
-        for where, corner, normal in cross_products(vertices, triangles, np.zeros(3)):
+        for piece, corner, normal in cross_products(vertices, triangles, np.zeros(3)):
             length = np.sqrt(np.einsum("ij,ij->j", normal, normal))
             normal /= np.where(length > 0.0, length, 1.0)
-            planes[where, :3], planes[where, 3] = normal.T, np.einsum("ij,ij->j", normal, corner)
+            planes[piece, :3], planes[piece, 3] = normal.T, np.einsum("ij,ij->j", normal, corner)
         self._vertices, self._sums = vertices, np.zeros((len(vertices), 9))
 
-        def work(where: slice) -> None:
-            begin = fans.begin[where.start : where.stop + 1]
+        def work(piece: slice) -> None:
+            begin = fans.begin[piece.start : piece.stop + 1]
             around = planes.take(fans.rows[begin[0] : begin[-1]], axis=0)
             products = around[:, [0, 0, 0, 1, 1, 2, 0, 1, 2]] * around[:, [0, 1, 2, 1, 2, 2, 3, 3, 3]]
             used = np.diff(begin) > 0
             if used.any():
-                self._sums[where][used] = np.add.reduceat(products, (begin[:-1] - begin[0])[used])
+                self._sums[piece][used] = np.add.reduceat(products, (begin[:-1] - begin[0])[used])
 
         in_threads(work, len(vertices))
 
@@ -244,9 +244,9 @@ class Clusters:
 
     def _changed_components(self, new: NDArray[np.bool_]) -> NDArray[np.bool_]:
         count, labels = self._components
-        found = np.zeros(count + 1, dtype=bool)
-        found[labels[new]] = True  # -1, the last, is that of vertices without triangles
-        return found[:-1]
+        is_changed = np.zeros(count + 1, dtype=bool)
+        is_changed[labels[new]] = True  # -1, the last, is that of vertices without triangles
+        return is_changed[:-1]
 
     def take_changed(self) -> tuple[IntArray, NDArray[np.uint32]]:
         """Return what is `numbered` of the components that changed since the last call."""
@@ -331,17 +331,17 @@ class Clusters:
         everywhere: Examine all of the surface.  If not, only the surroundings of what was undone are examined once all
             of it has been, until they are sound, and then all of it until it is so once in this round.
         """
-        found: IntArray = np.zeros(0, dtype=np.int64)
+        faults: IntArray = np.zeros(0, dtype=np.int64)
         new = self._take_new("faults")
         if self._examined and new.any():
             touched = np.zeros(len(self.names), dtype=bool)
             touched[self._named[self._face_rows(new)]] = True
-            found = find_faults_beside(self._named[self._face_rows(touched)], new)
-        if len(found) or (self._sound and not everywhere):
-            return found
-        found = self._find_faults_everywhere()
-        self._examined, self._sound = True, len(found) == 0
-        return found
+            faults = find_faults_beside(self._named[self._face_rows(touched)], new)
+        if len(faults) or (self._sound and not everywhere):
+            return faults
+        faults = self._find_faults_everywhere()
+        self._examined, self._sound = True, len(faults) == 0
+        return faults
 
     def _find_faults_everywhere(self) -> IntArray:
         """Find the faults of components that changed since the last call that looked for all of them."""
@@ -389,8 +389,8 @@ class Clusters:
         whole[parts] = labels[standing]
         order = np.lexsort((-part_size, whole))
         largest = np.full(count, -1)
-        found, first = np.unique(whole[order], return_index=True)
-        largest[found] = order[first]
+        components, first = np.unique(whole[order], return_index=True)
+        largest[components] = order[first]
         of_name = np.full(len(self.names), -1)
         of_name[standing] = parts
         part = of_name[self.names]
@@ -473,7 +473,7 @@ def _find_flat(places: NDArray[np.floating], faces: NDArray[np.uint32]) -> list[
 
 def _any_witness(flags: NDArray[np.bool_], witnesses: IntArray) -> NDArray[np.bool_]:
     """Mark triangles with a witness, shape (7, m), whose flag is set, or without witness."""
-    found = witnesses[0] < 0
+    is_near = witnesses[0] < 0
     for rows in witnesses:
-        found |= flags.take(rows, mode="clip")
-    return found
+        is_near |= flags.take(rows, mode="clip")
+    return is_near

@@ -92,9 +92,9 @@ def check_triangles(mesh: Mesh) -> None:
         raise UsageError(f"a mesh of {mesh.triangle_count} triangles is too large to be refined, at most 715,827,882")
 
 
-def carry_on(mesh: Mesh, name: str, said: dict[str, Any]) -> dict[str, Any]:
+def carry_on(mesh: Mesh, name: str, facts: dict[str, Any]) -> dict[str, Any]:
     """Return the report of a mesh with one more entry in ``refinement``."""
-    return {**mesh.report, "refinement": {**mesh.report.get("refinement", {}), name: said}}
+    return {**mesh.report, "refinement": {**mesh.report.get("refinement", {}), name: facts}}
 
 
 def decimate_mesh(
@@ -127,7 +127,7 @@ def decimate_mesh(
 
     rounds, taken_back = _collapse_in_rounds(clusters, deviation, wanted, bound, tell)
     vertices, triangles, undone = _with_volumes(clusters, deviation, mesh, origin, longest, find_crossings)
-    said = {
+    facts = {
         "fraction": fraction,
         "reached": 1.0 - len(triangles) / mesh.triangle_count,
         "ended_by": "share" if len(triangles) <= _nearly(wanted) else "bound",
@@ -137,7 +137,7 @@ def decimate_mesh(
         "vertices_taken_back": taken_back + undone,
         "topology": clusters.compare_topology(),
     }
-    return Mesh(vertices, triangles, vertex_normals(vertices, triangles), carry_on(mesh, "decimate", said))
+    return Mesh(vertices, triangles, vertex_normals(vertices, triangles), carry_on(mesh, "decimate", facts))
 
 
 def _nearly(wanted: float) -> float:
@@ -198,10 +198,10 @@ def _with_volumes(
         steps[standing] = step
         now = measure_volumes(places + step, triangles, count, labels[standing], border[standing])
         if not clusters.undo(standing[wanted.differ(now)[labels[standing]]]):
-            vertices, triangles, held, spoilt = _move(clusters, wanted, origin, longest, steps, fresh, find_crossings)
+            vertices, triangles, stuck, spoilt = _move(clusters, wanted, origin, longest, steps, fresh, find_crossings)
             fresh[:] = False
             fresh[labels[spoilt]] = True
-            if not clusters.undo(held) and not clusters.undo(spoilt):
+            if not clusters.undo(stuck) and not clusters.undo(spoilt):
                 break
         _mend(clusters, deviation)
     return vertices, triangles, collapsed - clusters.collapsed_count
@@ -225,20 +225,20 @@ def _move(
     standing, triangles = clusters.numbered()
     count, labels, border = clusters.components()
     labels, places, step = labels[standing], clusters.places[standing], steps[standing]
-    held, look_at = np.zeros(len(standing), dtype=bool), fresh[labels[triangles[:, 0]]]
+    stuck, look_at = np.zeros(len(standing), dtype=bool), fresh[labels[triangles[:, 0]]]
     for _ in range(_MOVES):
         vertices = move_vertices(as_stored(places + origin), triangles, step, find_crossings, look_at=look_at)[0]
         moved = vertices - origin - places
-        held |= np.abs(moved - step).max(axis=1) > rounding_step(vertices)
+        stuck |= np.abs(moved - step).max(axis=1) > rounding_step(vertices)
         now = measure_volumes(places + moved, triangles, count, labels, border[standing])
-        spoilt = wanted.differ(now) & (np.bincount(labels[held], minlength=count) > 0)
+        spoilt = wanted.differ(now) & (np.bincount(labels[stuck], minlength=count) > 0)
         if not spoilt.any():
             break
         step, look_at = moved, spoilt[labels[triangles[:, 0]]]
-        restore_volumes(places, step, triangles[look_at], labels, wanted, longest, held | ~spoilt[labels])
-    kept = ~spoilt[labels]
-    steps[standing[kept]] = moved[kept]
-    return vertices, triangles, standing[~kept & held], standing[~kept]
+        restore_volumes(places, step, triangles[look_at], labels, wanted, longest, stuck | ~spoilt[labels])
+    is_sound = ~spoilt[labels]
+    steps[standing[is_sound]] = moved[is_sound]
+    return vertices, triangles, standing[~is_sound & stuck], standing[~is_sound]
 
 
 def _mend(clusters: Clusters, deviation: Deviation, tell: Callable[[], None] = lambda: None) -> None:

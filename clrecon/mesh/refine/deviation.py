@@ -45,17 +45,17 @@ class SurfaceBounds(NearDistance):
         those around the nearest corner of the nearest triangle.  Nothing nearer than `limit` mm is looked for.  Where
         no triangle was measured the bound is infinite and the row -1.
         """
-        found: tuple[Float32Array, IntArray] = (np.full(len(points), np.inf, np.float32), np.full(len(points), -1))
+        bounds: tuple[Float32Array, IntArray] = (np.full(len(points), np.inf, np.float32), np.full(len(points), -1))
         self.prepare()
 
-        def work(where: slice) -> None:
-            length, rows = found[0][where], found[1][where]
-            columns = points[where].T.astype(np.float32)
+        def work(piece: slice) -> None:
+            length, rows = bounds[0][piece], bounds[1][piece]
+            columns = points[piece].T.astype(np.float32)
             rest = np.arange(columns.shape[1])
             for turn in range(near.shape[1] + walks):
                 here = columns[:, rest]
                 if turn < near.shape[1]:
-                    vertex = near[where][rest, turn]
+                    vertex = near[piece][rest, turn]
                 else:
                     vertex = self._nearest_corner(here, rows[rest])
                 bound, row = self.upper_bounds(here, vertex)
@@ -66,7 +66,7 @@ class SurfaceBounds(NearDistance):
                     rest = rest[rows[rest] >= 0]
 
         in_threads(work, len(points), _PIECE)
-        return found
+        return bounds
 
     def find_witnesses(
         self, places: Float32Array, triangles: IntArray, names: IntArray, beside: IntArray, limit: float
@@ -90,12 +90,12 @@ class SurfaceBounds(NearDistance):
         far = any_corner(beside < 0, triangles)
         self.prepare()
 
-        def work(where: slice) -> None:
-            near = witnesses[:3, where]
-            corners = [columns.take(corner, axis=1, mode="clip") for corner in triangles[where].T]
-            rest = np.flatnonzero(~far[where])
+        def work(piece: slice) -> None:
+            near = witnesses[:3, piece]
+            corners = [columns.take(corner, axis=1, mode="clip") for corner in triangles[piece].T]
+            rest = np.flatnonzero(~far[piece])
             rest = rest[~self._are_within([corner[:, rest] for corner in corners], near[:, rest], limit)]
-            self._leave_middles(corners, near, rest, names[triangles[where]], limit, witnesses[:, where], left[where])
+            self._leave_middles(corners, near, rest, names[triangles[piece]], limit, witnesses[:, piece], left[piece])
 
         in_threads(work, len(triangles), _PIECE)
         return witnesses, left
@@ -108,13 +108,13 @@ class SurfaceBounds(NearDistance):
         """True where one of the faces nearest to the corners, shape (3, k), is surely within the limit of all three."""
         most = self._most(limit)
         within = (near[0] == near[1]) & (near[1] == near[2])
-        for one, others in ((0, (1, 2)), (1, (2, 0)), (2, (0, 1))):
+        for corner, others in ((0, (1, 2)), (1, (2, 0)), (2, (0, 1))):
             rest = np.flatnonzero(~within)
-            for other in others:
-                apart = near[other, rest] != near[one, rest]
+            for neighbour in others:
+                apart = near[neighbour, rest] != near[corner, rest]
                 some = rest[apart]
                 beyond = np.zeros(len(rest), dtype=bool)
-                beyond[apart] = ~(self.frames.squares(corners[other][:, some], near[one, some]) < most)
+                beyond[apart] = ~(self.frames.squares(corners[neighbour][:, some], near[corner, some]) < most)
                 rest = rest[~beyond]
             within[rest] = True
         return within
@@ -130,11 +130,9 @@ class SurfaceBounds(NearDistance):
         left: NDArray[np.uint8],
     ) -> None:
         """Look at middles, see `find_witnesses`, of the triangles `rest`; `witnesses` and `left` change in place."""
-        one, two, three = (corner[:, rest] for corner in corners)
+        a, b, c = (corner[:, rest] for corner in corners)
         half = np.float32(0.5)
-        points = np.concatenate(
-            [(one + two + three) * np.float32(1 / 3), (one + two) * half, (two + three) * half, (three + one) * half], 1
-        )
+        points = np.concatenate([(a + b + c) * np.float32(1 / 3), (a + b) * half, (b + c) * half, (c + a) * half], 1)
         point = np.arange(len(MIDDLES) * len(rest))
         most = self._most(limit)
         for corner in range(3):
@@ -285,17 +283,17 @@ class Deviation:
     ) -> NDArray[np.bool_]:
         """Mark edges (n, 2) or triangles (n, 3) with a point inside too far from the original near vertices `near`."""
         steps: NDArray[np.int8] = np.empty(len(corners), dtype=np.int8)
-        for where in chunks(len(corners)):
-            sides = places[corners[where]]
+        for piece in chunks(len(corners)):
+            sides = places[corners[piece]]
             sides -= np.roll(sides, 1, axis=1)
             longest = np.sqrt(np.einsum("nca,nca->nc", sides, sides).max(axis=1))
-            steps[where] = np.clip(2 * np.ceil(longest / (4.0 * self._step)), 2, _MOST_STEPS)
+            steps[piece] = np.clip(2 * np.ceil(longest / (4.0 * self._step)), 2, _MOST_STEPS)
         far = np.zeros(len(corners), dtype=bool)
         for count in np.unique(steps[look_at]):
             rows = np.flatnonzero((steps == count) & look_at)
             weights = _inner_weights(int(count), corners.shape[1])
-            for where in chunks(len(rows), max(_POINTS // len(weights), 1)):
-                these = rows[where]
+            for piece in chunks(len(rows), max(_POINTS // len(weights), 1)):
+                these = rows[piece]
                 ends = places[corners[these].T].reshape(corners.shape[1], -1)
                 points = (weights @ ends).reshape(-1, 3)
                 hints = np.tile(near[these], (len(weights), 1))

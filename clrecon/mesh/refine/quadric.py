@@ -86,7 +86,7 @@ def collapse_quadric(mesh: Mesh, fraction: float, *, progress: Progress | None =
     topology, lost = _compare_topology(mesh, triangles, last_of_collapses(collapses, mesh.vertex_count))
     progress("decimate", 2, 3)
     gates = _gates_of_topology(topology)
-    said: dict[str, Any] = {
+    facts: dict[str, Any] = {
         "fraction": fraction,
         "reached": 1.0 - len(triangles) / mesh.triangle_count,
         "triangles_before": mesh.triangle_count,
@@ -96,7 +96,7 @@ def collapse_quadric(mesh: Mesh, fraction: float, *, progress: Progress | None =
         "gates": gates,
     }
     progress("decimate", 3, 3)
-    report = carry_on(mesh, "quadric", said)
+    report = carry_on(mesh, "quadric", facts)
     failed = [gate.text for gate in gates if not gate.ok]
     if failed:
         report["warnings"] = [*report.get("warnings", []), *failed]
@@ -119,11 +119,11 @@ def _compare_topology(
     return compare_topology(before, after), np.flatnonzero(gone[labels])
 
 
-def _gates_of_topology(found: TopologyChange) -> list[Gate]:
-    lost = f"components of {found.components_before:,} that collapsing edges by their quadric error has lost"
-    opened = max(found.loose_edges_after - found.loose_edges_before, 0)
+def _gates_of_topology(change: TopologyChange) -> list[Gate]:
+    lost = f"components of {change.components_before:,} that collapsing edges by their quadric error has lost"
+    opened = max(change.loose_edges_after - change.loose_edges_before, 0)
     return [
-        none_of("components_lost", found.components_lost, lost),
+        none_of("components_lost", change.components_lost, lost),
         none_of("edges_opened", opened, "edges that collapsing has made, in one triangle or in more than two"),
     ]
 
@@ -147,10 +147,10 @@ def _farthest_point(points: Points, vertices: Points, triangles: NDArray[np.uint
     near = used[cKDTree(vertices[used]).query(points, k=min(_NEAREST, len(used)), workers=-1)[1]]
     at_most = NearDistance(vertices, triangles).find_around(points, near.reshape(len(points), -1))[0]
     order = np.argsort(-at_most)
-    exact, found = SurfaceDistance(vertices, triangles), 0.0
+    exact, farthest = SurfaceDistance(vertices, triangles), 0.0
     for first in range(0, len(order), _EXACT):
         some = order[first : first + _EXACT]
-        if at_most[some[0]] <= found:
+        if at_most[some[0]] <= farthest:
             break
-        found = max(found, float(exact(points[some]).max()))
-    return found
+        farthest = max(farthest, float(exact(points[some]).max()))
+    return farthest

@@ -88,10 +88,10 @@ def enclosed_mm3(
 ) -> Float64Array:  # fmt: skip
     """Return the volume of each component, vertices in mm near 0; `cross_of` (3, m) gets the cross products."""
     six_volumes = np.zeros(count)
-    for where, corner, cross in cross_products(vertices, triangles, np.zeros(3), max(count, 1 << 14)):
-        six_volumes += np.bincount(labels[triangles[where, 0]], np.einsum("ij,ij->j", corner, cross), count)
+    for piece, corner, cross in cross_products(vertices, triangles, np.zeros(3), max(count, 1 << 14)):
+        six_volumes += np.bincount(labels[triangles[piece, 0]], np.einsum("ij,ij->j", corner, cross), count)
         if cross_of is not None:
-            cross_of[:, where] = cross
+            cross_of[:, piece] = cross
     return six_volumes / 6.0
 
 
@@ -102,7 +102,7 @@ def restore_volumes(
     labels: NDArray[np.int64],
     wanted: Volumes,
     longest: float,
-    held: NDArray[np.bool_] | None = None,
+    stuck: NDArray[np.bool_] | None = None,
 ) -> None:
     """Change steps so that each closed component gets the volume it had, by a shift along the normals.
 
@@ -112,7 +112,7 @@ def restore_volumes(
     step: ndarray, shape (n, 3), mm. Changed in place; no step becomes longer than `longest`, and those `held` stay.
     """
     count = len(wanted.mm3)
-    moving = np.flatnonzero(~np.append(wanted.is_open, True)[labels] & ~(np.zeros(1, bool) if held is None else held))
+    moving = np.flatnonzero(~np.append(wanted.is_open, True)[labels] & ~(np.zeros(1, bool) if stuck is None else stuck))
     for _ in range(_VOLUME_STEPS):
         volumes, gradient = _volumes(vertices + step, triangles, labels, count)
         length = np.sqrt(np.einsum("an,an->n", gradient, gradient))
@@ -232,5 +232,5 @@ def _find_spoilt(
         for where, _, cross in cross_products(vertices, triangles, np.zeros(3))
     ]
     cut = triangles[find_changed_intersections(vertices, triangles, look_at, find_crossings)]
-    found = [triangles[np.concatenate(flat)].reshape(-1), cut.reshape(-1), find_coincident(vertices)]
-    return np.unique(np.concatenate(found).astype(np.int64))
+    suspects = [triangles[np.concatenate(flat)].reshape(-1), cut.reshape(-1), find_coincident(vertices)]
+    return np.unique(np.concatenate(suspects).astype(np.int64))

@@ -111,9 +111,9 @@ class Filter:
     def measure_bends(self, places: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Return how far each vertex lies from the mean of its neighbours, (n, 3) mm, and its normal, of length mm2."""
         rings = self._rings
-        own = np.repeat(places, np.diff(rings.begin), axis=0)
-        after, before = places.take(rings.after, axis=0) - own, places.take(rings.before, axis=0) - own
-        entries = self._matrix(np.arange(len(own), dtype=np.int32), len(own))
+        centres = np.repeat(places, np.diff(rings.begin), axis=0)
+        after, before = places.take(rings.after, axis=0) - centres, places.take(rings.before, axis=0) - centres
+        entries = self._matrix(np.arange(len(centres), dtype=np.int32), len(centres))
         normals = entries @ np.ascontiguousarray(cross_product(after.T, before.T).T)
         return rings.weights[:, None] * (entries @ after), normals
 
@@ -216,14 +216,14 @@ class _Components:
         """
         wanted = np.ascontiguousarray(steps.T, dtype=np.float64)
         length = np.sqrt(_dot(wanted, wanted))
-        made = _shorten(wanted, length, longest)
+        moves = _shorten(wanted, length, longest)
         area = np.bincount(self._labels, self._areas, self._count + 1)
         for _ in range(_ESTIMATES):  # the gradient of the volume at a vertex is a third of the area around it
-            lost = self._volumes - self._measure(self._columns + made, self._triangles, self._of_triangle)
+            lost = self._volumes - self._measure(self._columns + moves, self._triangles, self._of_triangle)
             shift = np.divide(lost, area, out=np.zeros_like(lost), where=self._is_closed & (area > 0.0))
             shift = shift.clip(-0.5 * longest, 0.5 * longest)
-            made += self._normals * shift[self._labels]
-            made = _shorten(made, np.sqrt(_dot(made, made)), longest)
+            moves += self._normals * shift[self._labels]
+            moves = _shorten(moves, np.sqrt(_dot(moves, moves)), longest)
         room = (_ROOM * np.abs(shift) + _LEAST_ROOM * longest).clip(0.0, 0.5 * longest)
         pending = self._is_closed.copy()
         for less in _LESS:
@@ -231,14 +231,14 @@ class _Components:
                 break
             vertices = np.flatnonzero(pending[self._labels])
             room = np.maximum(room, (1.0 - less) * longest)
-            trial = made.take(vertices, axis=1) if less == 1.0 else less * wanted.take(vertices, axis=1)
+            trial = moves.take(vertices, axis=1) if less == 1.0 else less * wanted.take(vertices, axis=1)
             trial = _shorten(trial, np.sqrt(_dot(trial, trial)), (longest - room)[self._labels[vertices]])
             done = self._shift(vertices, trial, pending, room)
-            kept = done[self._labels[vertices]]
-            made[:, vertices[kept]] = trial[:, kept]
+            done_vertices = done[self._labels[vertices]]
+            moves[:, vertices[done_vertices]] = trial[:, done_vertices]
             pending &= ~done
-        made[:, pending[self._labels]] = 0.0
-        return np.ascontiguousarray(made.T), int(np.count_nonzero(length > longest)), int(np.count_nonzero(pending))
+        moves[:, pending[self._labels]] = 0.0
+        return np.ascontiguousarray(moves.T), int(np.count_nonzero(length > longest)), int(np.count_nonzero(pending))
 
     def _shift(
         self, vertices: IntArray, steps: Float64Array, pending: NDArray[np.bool_], room: Float64Array
@@ -261,16 +261,16 @@ class _Components:
         parts = _determinants(columns, normals, triangles)
         sums = np.array([np.bincount(of_triangle, part, self._count + 1) for part in parts], dtype=np.float64)
         sums[0] -= self._volumes
-        zero, one, two, three = sums
+        zero, linear, two, three = sums
         shift = np.zeros(self._count + 1)
         for _ in range(_NEWTON_STEPS):
             value, slope = (
-                ((three * shift + two) * shift + one) * shift + zero,
-                (3.0 * three * shift + 2.0 * two) * shift + one,
+                ((three * shift + two) * shift + linear) * shift + zero,
+                (3.0 * three * shift + 2.0 * two) * shift + linear,
             )
             shift -= np.divide(value, slope, out=np.zeros_like(shift), where=np.abs(slope) > 1e-9 * np.abs(value))
             shift = shift.clip(-room, room)
-        value = ((three * shift + two) * shift + one) * shift + zero
+        value = ((three * shift + two) * shift + linear) * shift + zero
         steps += normals * shift[self._labels[vertices]]
         return np.asarray(pending & (np.abs(value) <= _VOLUME_SLACK * np.abs(self._volumes)))
 
@@ -291,25 +291,25 @@ def _determinants(
     """Return of each triangle its part of the volume in mm3, or with normals its parts of the cubic of a shift."""
     parts = [np.empty(len(triangles)) for _ in range(1 if normals is None else 4)]
 
-    def work(where: slice) -> None:
-        corners = triangles[where].T.astype(np.intp)
+    def work(piece: slice) -> None:
+        corners = triangles[piece].T.astype(np.intp)
         a, b, c = (columns.take(corner, axis=1, mode="clip") for corner in corners)
         across = cross_product(b, c)
-        parts[0][where] = _dot(a, across) / 6.0
+        parts[0][piece] = _dot(a, across) / 6.0
         if normals is None:
             return
         u, v, w = (normals.take(corner, axis=1, mode="clip") for corner in corners)
         beside = cross_product(v, w)
-        parts[1][where] = (_dot(u, across) + _dot(v, cross_product(c, a)) + _dot(w, cross_product(a, b))) / 6.0
-        parts[2][where] = (_dot(a, beside) + _dot(b, cross_product(w, u)) + _dot(c, cross_product(u, v))) / 6.0
-        parts[3][where] = _dot(u, beside) / 6.0
+        parts[1][piece] = (_dot(u, across) + _dot(v, cross_product(c, a)) + _dot(w, cross_product(a, b))) / 6.0
+        parts[2][piece] = (_dot(a, beside) + _dot(b, cross_product(w, u)) + _dot(c, cross_product(u, v))) / 6.0
+        parts[3][piece] = _dot(u, beside) / 6.0
 
     in_threads(work, len(triangles))
     return parts
 
 
-def _dot(one: Float64Array, other: Float64Array) -> Float64Array:
-    return np.asarray(one[0] * other[0] + one[1] * other[1] + one[2] * other[2])
+def _dot(first: Float64Array, second: Float64Array) -> Float64Array:
+    return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
 
 
 def _shorten(steps: Float64Array, length: Float64Array, longest: float | Float64Array) -> Float64Array:
@@ -356,20 +356,20 @@ def smooth_mesh(
     progress("smooth", 1, 3)
     still = np.flatnonzero(rings.weights == 0.0)
     components = _Components(mesh.vertices - origin, mesh.triangles, normals, low_pass.label(mesh.triangles), still)
-    steps, held, left = components.keep_volumes(wanted, longest)
+    steps, held_back, left = components.keep_volumes(wanted, longest)
     progress("smooth", 2, 3)
     vertices, taken_back = move_vertices(
         mesh.vertices, mesh.triangles, steps, find_crossings,
         lambda now, made: components.find_changed(now - origin, made),
     )  # fmt: skip
     progress("smooth", 3, 3)
-    said = {
+    facts = {
         "iterations": iterations,
         "max_deviation_mm": bound,
         "roughness_before_mm": _roughness(bends),
         "roughness_after_mm": _roughness(measure(vertices)[0]),
-        "vertices_held_back": held,
+        "vertices_held_back": held_back,
         "vertices_taken_back": taken_back,
         "components_left": left,
     }
-    return Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), carry_on(mesh, "smooth", said))
+    return Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), carry_on(mesh, "smooth", facts))

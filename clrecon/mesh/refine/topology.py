@@ -91,8 +91,8 @@ IntArray = NDArray[np.integer]
 def any_corner(flags: NDArray[np.bool_], triangles: IntArray) -> NDArray[np.bool_]:
     """Mark triangles, shape (m, 3), that have a corner whose flag is set."""
     # "clip" avoids checking each index, which takes longer than the look-up.
-    one, two, three = flags.take(triangles, mode="clip").T
-    return np.asarray(one | two | three)
+    first, two, three = flags.take(triangles, mode="clip").T
+    return np.asarray(first | two | three)
 
 
 def find_sheets(faces: NDArray[np.uint32], size: int, edges: Edges) -> list[IntArray]:
@@ -146,8 +146,8 @@ def find_torn(triangles: NDArray[np.uint32], names: IntArray) -> IntArray:
     """
     size = len(names)
     edges = find_edges(triangles, size)
-    one, other = names[edges.ends]
-    low, high = np.minimum(one, other), np.maximum(one, other)
+    first, second = names[edges.ends]
+    low, high = np.minimum(first, second), np.maximum(first, second)
     named = np.sort(names[triangles], axis=1).T
     within, two = named[0] == named[2], (named[0] == named[1]) ^ (named[1] == named[2])
     used = find_used(triangles, size)

@@ -188,26 +188,26 @@ def filter_bilateral(
     try:
         settings = BilateralSettings.checked(resident.volume, sigma_mm, sigma_hu, dimensions, near, normals, taps)
         for attempt in resident.with_fallback():
-            with attempt as (_, told):
-                made: Any = _filter(resident, settings, told, progress or ignore_progress, keep=not is_new)
-        return made  # type: ignore[no-any-return]
+            with attempt as (_, notes):
+                filtered: Any = _filter(resident, settings, notes, progress or ignore_progress, keep=not is_new)
+        return filtered  # type: ignore[no-any-return]
     finally:
         if is_new:
             resident.close()
 
 
 def _filter(
-    resident: DeviceVolume, settings: BilateralSettings, told: list[str], progress: Progress, *, keep: bool
+    resident: DeviceVolume, settings: BilateralSettings, notes: list[str], progress: Progress, *, keep: bool
 ) -> Volume | DeviceVolume:
-    found = run_bilateral(resident, settings, progress=progress)
+    bilateral = run_bilateral(resident, settings, progress=progress)
     facts = {
         **settings.as_report(),
-        "exact_at_ends": None if settings.near is None else not _reach_ends(found.voxels, settings.near),
-        "filtered_share": round(found.share, 6),
-        "slabs": found.slabs,
+        "exact_at_ends": None if settings.near is None else not _reach_ends(bilateral.voxels, settings.near),
+        "filtered_share": round(bilateral.share, 6),
+        "slabs": bilateral.slabs,
     }
-    warnings = [*told, *settings.warnings, *found.warnings]
-    return finish_result(resident, found.voxels, found.voxels_d, facts, warnings, keep=keep)
+    warnings = [*notes, *settings.warnings, *bilateral.warnings]
+    return finish_result(resident, bilateral.voxels, bilateral.voxels_d, facts, warnings, keep=keep)
 
 
 def _reach_ends(voxels: NDArray[Any], level: float) -> bool:
@@ -245,8 +245,8 @@ def run_bilateral(
         )
     for attempt in resident.attempts(_BILATERAL, planned, run.warnings):
         with attempt as slices:
-            found = run.run(slices)
-    return found
+            result = run.run(slices)
+    return result
 
 
 class _Run:

@@ -98,12 +98,12 @@ def filter_volume(
     tell = progress or ignore_progress
     nk = source.shape_ijk[2]
     tell("filter", 0, nk)
-    found, used = denoiser.run(package, source, {**denoiser.defaults, **parameters}, tell)
+    voxels, used = denoiser.run(package, source, {**denoiser.defaults, **parameters}, tell)
     tell("filter", nk, nk)
     top = denoiser.package.split(".")[0]
     facts = {"filter": name, **used, "package": f"{top} {metadata.version(_DISTRIBUTIONS.get(top, top))}"}
-    made = report_filter(source, _as_voxels(found, source), facts, [])
-    return made if resident is None else resident.follow(made)  # type: ignore[return-value]
+    filtered = report_filter(source, _as_voxels(voxels, source), facts, [])
+    return filtered if resident is None else resident.follow(filtered)  # type: ignore[return-value]
 
 
 def _check_volume(volume: Volume, name: str, denoiser: _Denoiser) -> None:
@@ -133,13 +133,13 @@ def _import_package(name: str, denoiser: _Denoiser) -> Any:
         raise UsageError(f"the filter {name} needs the package {package}: {command}") from error
 
 
-def _as_voxels(found: NDArray[Any], volume: Volume) -> NDArray[Any]:
+def _as_voxels(result: NDArray[Any], volume: Volume) -> NDArray[Any]:
     """Return values in the type of the voxels, whole numbers rounded."""
     dtype = volume.voxels.dtype
-    if dtype.kind == "f" or found.dtype == dtype:
-        return np.ascontiguousarray(found, dtype)
+    if dtype.kind == "f" or result.dtype == dtype:
+        return np.ascontiguousarray(result, dtype)
     limits = np.iinfo(dtype)
-    return np.clip(np.rint(found), limits.min, limits.max).astype(dtype)
+    return np.clip(np.rint(result), limits.min, limits.max).astype(dtype)
 
 
 def _whole(name: str, value: Any, least: int, most: int) -> int:
@@ -171,8 +171,8 @@ def _run_median(
         radius, used = [math.floor(length / step + 0.5) for step in volume.spacing], {"radius_mm": length}
         if not any(radius):
             raise UsageError(f"radius_mm={length:g} is less than half a voxel along each axis: nothing would change")
-    found = sitk.GetArrayFromImage(sitk.Median(_image(sitk, volume), radius))
-    return found, {**used, "window": [2 * n + 1 for n in radius]}
+    result = sitk.GetArrayFromImage(sitk.Median(_image(sitk, volume), radius))
+    return result, {**used, "window": [2 * n + 1 for n in radius]}
 
 
 def _run_gaussian(
@@ -180,8 +180,8 @@ def _run_gaussian(
 ) -> tuple[NDArray[Any], dict[str, Any]]:
     sigma = checked_length("sigma_mm", asked["sigma_mm"], volume)
     steps = [sigma / step for step in reversed(volume.spacing)]
-    found = filters.gaussian(volume.voxels.astype(np.float32), steps, mode="nearest", preserve_range=True)
-    return found, {"sigma_mm": sigma}
+    result = filters.gaussian(volume.voxels.astype(np.float32), steps, mode="nearest", preserve_range=True)
+    return result, {"sigma_mm": sigma}
 
 
 def _run_curvature_flow(
@@ -191,8 +191,8 @@ def _run_curvature_flow(
     stable = ITK_TIME_STEP * min(1.0, min(volume.spacing)) ** 2
     step = stable if asked["time_step"] is None else _number("time_step", asked["time_step"], 1.0)
     image = sitk.Cast(_image(sitk, volume), sitk.sitkFloat32)
-    found = sitk.GetArrayFromImage(sitk.CurvatureFlow(image, step, iterations))
-    return found, {"iterations": iterations, "time_step": step}
+    result = sitk.GetArrayFromImage(sitk.CurvatureFlow(image, step, iterations))
+    return result, {"iterations": iterations, "time_step": step}
 
 
 def _run_non_local_means(
@@ -200,14 +200,14 @@ def _run_non_local_means(
 ) -> tuple[NDArray[Any], dict[str, Any]]:
     patch, reach = _whole("patch", asked["patch"], 3, 31), _whole("reach", asked["reach"], 1, 31)
     noise = measure_noise(volume).hu if asked["sigma_hu"] is None else _number("sigma_hu", asked["sigma_hu"], 1e6)
-    found = np.empty(volume.voxels.shape, np.float32)
+    result = np.empty(volume.voxels.shape, np.float32)
     for k, layer in enumerate(volume.voxels):
-        made = restoration.denoise_nl_means(
+        plane = restoration.denoise_nl_means(
             layer.astype(np.float32), patch, reach, 0.8 * noise, fast_mode=True, sigma=noise, preserve_range=True
         )
-        found[k] = np.reshape(made, layer.shape)  # it drops the axis of a single column
-        tell("filter", k + 1, len(found))
-    return found, {"sigma_hu": noise, "patch": patch, "reach": reach, "dimensions": 2}
+        result[k] = np.reshape(plane, layer.shape)  # it drops the axis of a single column
+        tell("filter", k + 1, len(result))
+    return result, {"sigma_hu": noise, "patch": patch, "reach": reach, "dimensions": 2}
 
 
 DENOISERS = {

@@ -89,8 +89,8 @@ def choose_window(volume: Volume, sigma_mm: float, dimensions: int, most_taps: i
         steps = _nominal_steps(volume)[:, :dimensions]
         total = (math.tau * sigma_mm**2) ** (dimensions / 2) / math.sqrt(np.linalg.det(steps.T @ steps))
     share = float(weights[is_kept].sum()) / total
-    kept = whole[is_kept]
-    return Window(kept, _exponents(volume, kept, sigma_mm), share, math.prod((2 * box + 1).tolist()))
+    offsets_kept = whole[is_kept]
+    return Window(offsets_kept, _exponents(volume, offsets_kept, sigma_mm), share, math.prod((2 * box + 1).tolist()))
 
 
 def _nominal_steps(volume: Volume) -> Float64Array:
@@ -146,9 +146,9 @@ def _nearest_rings(
     sorted_squares = squares[order]
     is_next = np.diff(sorted_squares) > _SAME_RING * sorted_squares[1:]
     ends = np.append(np.flatnonzero(is_next) + 1, len(order))
-    kept = np.zeros(len(offsets), np.bool_)
-    kept[order[: ends[ends <= most_taps].max(initial=1)]] = True
-    return kept
+    is_nearest = np.zeros(len(offsets), np.bool_)
+    is_nearest[order[: ends[ends <= most_taps].max(initial=1)]] = True
+    return is_nearest
 
 
 NOISE_FACTOR = 3.0
@@ -268,10 +268,10 @@ def _check_whole_numbers(volume: Volume) -> None:
         )
 
 
-def _positive(name: str, value: float, what: str) -> float:
+def _positive(name: str, value: float, requirement: str) -> float:
     is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
     if not is_number or not 0.0 < value < math.inf:
-        raise UsageError(f"{name} is {what}, not {value!r}")
+        raise UsageError(f"{name} is {requirement}, not {value!r}")
     return float(value)
 
 
@@ -279,8 +279,8 @@ def checked_length(name: str, value: float, volume: Volume) -> float:
     length = _positive(name, value, "a length in mm above 0")
     sides = [n * step for n, step in zip(volume.shape_ijk, volume.spacing, strict=True)]
     if length > max(sides):
-        told = " x ".join(f"{side:.4g}" for side in sides)
-        raise UsageError(f"{name} is {length:g} mm, larger than the volume ({told} mm)")
+        sides_text = " x ".join(f"{side:.4g}" for side in sides)
+        raise UsageError(f"{name} is {length:g} mm, larger than the volume ({sides_text} mm)")
     return length
 
 
@@ -296,11 +296,11 @@ def _measured_noise(volume: Volume) -> Noise:
 
 def report_filter(volume: Volume, voxels: NDArray[Any], facts: dict[str, Any], warnings: Sequence[str]) -> Volume:
     """Return a volume with filtered voxels, and one step more, in plain JSON types, in ``report["filtered"]``."""
-    made = volume.with_voxels(voxels)
-    steps = (made.report.get("filtered") or {}).get("steps", [])
-    told = list(made.report.get("warnings", []))
-    made.report = amend(made.report, filtered={"steps": [*steps, facts]}, warnings=[*told, *warnings])
-    return made
+    filtered = volume.with_voxels(voxels)
+    steps = (filtered.report.get("filtered") or {}).get("steps", [])
+    known = list(filtered.report.get("warnings", []))
+    filtered.report = amend(filtered.report, filtered={"steps": [*steps, facts]}, warnings=[*known, *warnings])
+    return filtered
 
 
 def finish_result(
@@ -313,5 +313,5 @@ def finish_result(
     keep: bool,
 ) -> Volume | DeviceVolume:
     """Return the filtered volume, see `report_filter`; with `keep` on the device, where `voxels_d` may be it."""
-    made = report_filter(resident.volume, voxels, facts, warnings)
-    return resident.follow(made, voxels_d) if keep else made
+    filtered = report_filter(resident.volume, voxels, facts, warnings)
+    return resident.follow(filtered, voxels_d) if keep else filtered

@@ -49,22 +49,22 @@ class Spaces:
 
     def choose(self, wanted: NDArray[np.bool_]) -> Mask:
         """Return the voxels of some of the spaces; `wanted` has shape (n,)."""
-        mask, found = self._mask, self._found
+        mask, components = self._mask, self._found
         words_d = zero_words(mask.device, mask_bytes(mask.shape_ijk)["mask of the voxels"] // 4)
         if wanted.any():
-            marks = np.zeros(4 * -(-found.count // 4), np.uint8)
+            marks = np.zeros(4 * -(-components.count // 4), np.uint8)
             marks[self.numbers[wanted]] = 1
             write_runs(
-                mask.device, found.runs.runs_d, found.runs.row_counts_d, found.numbers_d, upload(mask.device, marks),
-                words_d, mask.shape_ijk,
+                mask.device, components.runs.runs_d, components.runs.row_counts_d, components.numbers_d,
+                upload(mask.device, marks), words_d, mask.shape_ijk,
             )  # fmt: skip
         return Mask(mask.scan, words_d, f"spaces in ({mask.name})", device=mask.device, memory=mask.memory)
 
     def are_wide(self, radius_mm: float) -> NDArray[np.bool_]:
         """Tell of each space whether a ball of this radius fits into it and what lies beyond ends that cut it."""
         wide = np.zeros(self.count, bool)
-        for place in np.flatnonzero(self.ml >= WIDE_ML) if np.isfinite(radius_mm) else ():
-            wide[place] = _hold_ball(self._runs.of(self.numbers[place]), self.volume, radius_mm)
+        for hole in np.flatnonzero(self.ml >= WIDE_ML) if np.isfinite(radius_mm) else ():
+            wide[hole] = _hold_ball(self._runs.of(self.numbers[hole]), self.volume, radius_mm)
         return wide
 
     def describe(self, which: NDArray[np.bool_]) -> dict[str, Any]:
@@ -74,8 +74,8 @@ class Spaces:
             return {**facts, "largest_ml": 0.0, "at_mm": None}
         largest = int(np.argmax(np.where(which, self.ml, -1.0)))
         middle = _find_middle(self._runs.of(self.numbers[largest]))
-        at = self.volume.ijk_to_lps(np.array([middle], np.float64))[0]
-        return {**facts, "largest_ml": float(self.ml[largest]), "at_mm": [round(float(x), 1) for x in at]}
+        position = self.volume.ijk_to_lps(np.array([middle], np.float64))[0]
+        return {**facts, "largest_ml": float(self.ml[largest]), "at_mm": [round(float(x), 1) for x in position]}
 
 
 def _sum_hu(runs: RunList, volume: Volume, count: int) -> NDArray[np.float64]:
@@ -83,19 +83,19 @@ def _sum_hu(runs: RunList, volume: Volume, count: int) -> NDArray[np.float64]:
     nj, ni = volume.voxels.shape[1:]
     bounds = np.searchsorted(runs.k, np.arange(len(volume.voxels) + 1))
     for k in np.flatnonzero(np.diff(bounds)):
-        own = slice(int(bounds[k]), int(bounds[k + 1]))
+        rows = slice(int(bounds[k]), int(bounds[k + 1]))
         totals = np.zeros(nj * ni + 1)
         np.cumsum(volume.voxels[k].ravel(), dtype=np.float64, out=totals[1:])
-        row = runs.j[own] * ni
-        hu = totals[row + runs.last[own] + 1] - totals[row + runs.first[own]]
-        sums += np.bincount(runs.numbers[own], hu, count)
+        row = runs.j[rows] * ni
+        hu = totals[row + runs.last[rows] + 1] - totals[row + runs.first[rows]]
+        sums += np.bincount(runs.numbers[rows], hu, count)
     return sums
 
 
 def _find_middle(runs: RunList) -> tuple[int, int, int]:
-    at = np.flatnonzero(runs.k == runs.k[len(runs.k) // 2])
-    one = at[len(at) // 2]
-    return int(runs.first[one] + runs.last[one]) // 2, int(runs.j[one]), int(runs.k[one])
+    runs_in_slice = np.flatnonzero(runs.k == runs.k[len(runs.k) // 2])
+    middle = runs_in_slice[len(runs_in_slice) // 2]
+    return int(runs.first[middle] + runs.last[middle]) // 2, int(runs.j[middle]), int(runs.k[middle])
 
 
 def _hold_ball(runs: RunList, volume: Volume, radius_mm: float) -> bool:
@@ -176,21 +176,21 @@ def _open_ends(mask: Mask) -> NDArray[np.int32]:
     """Return i, j, k of the voxels of the six ends of the volume that the mask does not enclose there, shape (n, 3)."""
     ni, nj, nk = mask.shape_ijk
     words = download(mask.device, np.empty((nk, nj, -(-ni // 32)), "<u4"), mask._mask_d)
-    found = []
-    for place in (0, nk - 1):
-        face = np.unpackbits(words[place].view(np.uint8), axis=1, count=ni, bitorder="little")
+    ends = []
+    for edge in (0, nk - 1):
+        face = np.unpackbits(words[edge].view(np.uint8), axis=1, count=ni, bitorder="little")
         j, i = np.nonzero(find_open_places(face))
-        found.append((i, j, np.full_like(i, place)))
-    for place in (0, nj - 1):
-        rows = np.ascontiguousarray(words[:, place])
+        ends.append((i, j, np.full_like(i, edge)))
+    for edge in (0, nj - 1):
+        rows = np.ascontiguousarray(words[:, edge])
         face = np.unpackbits(rows.view(np.uint8), axis=1, count=ni, bitorder="little")
         k, i = np.nonzero(find_open_places(face))
-        found.append((i, np.full_like(i, place), k))
-    for place in (0, ni - 1):
-        face = (words[:, :, place // 32] >> np.uint32(place % 32)) & 1
+        ends.append((i, np.full_like(i, edge), k))
+    for edge in (0, ni - 1):
+        face = (words[:, :, edge // 32] >> np.uint32(edge % 32)) & 1
         k, j = np.nonzero(find_open_places(face))
-        found.append((np.full_like(j, place), j, k))
-    return np.concatenate([np.stack(axes, axis=1) for axes in found]).astype(np.int32)
+        ends.append((np.full_like(j, edge), j, k))
+    return np.concatenate([np.stack(axes, axis=1) for axes in ends]).astype(np.int32)
 
 
 LEAST_SAID_ML = 0.1
@@ -293,20 +293,20 @@ def fill_enclosed(
     largest = np.inf if largest_mm is None else checked_mm(largest_mm, "the radius of the thickest marrow")
     steps = Steps(progress, "solid", 5)
     with open_volume(volume, device, memory, "a solid body") as resident:
-        own = resident.volume
-        level, chosen = settle_level(own, iso_value)
-        rule = choose_iso_rule(own, level, values=resident.values)
+        scan = resident.volume
+        level, chosen = settle_level(scan, iso_value)
+        rule = choose_iso_rule(scan, level, values=resident.values)
         bone = Mask.from_band(resident, (float(rule.lowest_inside), np.inf))
-        if not bone.count or bone.count == own.voxels.size:
-            what = "no voxel has" if not bone.count else "every voxel has"
-            low, high = own.hu_range or (float(own.voxels.min()), float(own.voxels.max()))
+        if not bone.count or bone.count == scan.voxels.size:
+            lack = "no voxel has" if not bone.count else "every voxel has"
+            low, high = scan.hu_range or (float(scan.voxels.min()), float(scan.voxels.max()))
             ends = f"the volume runs from {format_hu(low)} to {format_hu(high)} HU"
-            raise NoSurfaceError(f"{what} {level:g} HU or more: {ends}")
-        seal = seal or _default_seal(own, bone)
+            raise NoSurfaceError(f"{lack} {level:g} HU or more: {ends}")
+        seal = seal or _default_seal(scan, bone)
         steps.take()
-        made = _fill(bone, (seal, largest, keep_air), float(rule.lowest_inside), steps)
-        made.report = amend(made.report, solid=made.report["solid"] | chosen)
-        return resident.follow(made) if isinstance(volume, DeviceVolume) else made
+        filled = _fill(bone, (seal, largest, keep_air), float(rule.lowest_inside), steps)
+        filled.report = amend(filled.report, solid=filled.report["solid"] | chosen)
+        return resident.follow(filled) if isinstance(volume, DeviceVolume) else filled
 
 
 def _default_seal(volume: Volume, bone: Mask) -> float:
@@ -334,7 +334,7 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
     left = kinds["wide"] | kinds["air"]
     body = sealed | spaces.choose(~left)
     room = body - bone
-    found = {
+    solid_facts = {
         "spaces": int(np.count_nonzero(~left)),
         "at_ends": int(np.count_nonzero(spaces.at_ends & ~left)),
         "largest_ml": float(spaces.ml[~left].max(initial=0.0)),
@@ -352,9 +352,9 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
     del room, body, joints
     result_pages.clear()  # of the masks that are gone: the new voxels take as much memory as the volume
     voxels, airy_count = np.empty_like(volume.voxels), np.zeros(len(volume.voxels), np.int64)
-    for k, (layer, own) in enumerate(zip(volume.voxels, filled.layers(), strict=True)):
-        voxels[k] = np.where(own, value, layer)
-        airy_count[k] = np.count_nonzero(own & (layer < AIR_LIMIT_HU))
+    for k, (layer, layer_mask) in enumerate(zip(volume.voxels, filled.layers(), strict=True)):
+        voxels[k] = np.where(layer_mask, value, layer)
+        airy_count[k] = np.count_nonzero(layer_mask & (layer < AIR_LIMIT_HU))
     steps.take()
     filled_ml, closed_ml = _measure_ml(filled, ml), _measure_ml(filled & sealed, ml)
     lattice = Lattice.of(volume)
@@ -368,12 +368,12 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
         "metal_ml": _filled_at_metal(bone, filled, METAL_STEPS * seal_mm, ml),
         "filled_air_ml": float(airy_count @ ml),
         "filled_hu": float(value),
-        **found,
+        **solid_facts,
     }
-    made = volume.with_voxels(voxels)
+    filled_volume = volume.with_voxels(voxels)
     report = volume.report
     if report.get("hu_range") is not None:
-        report = amend(report, hu_range=made.report["hu_range"])
+        report = amend(report, hu_range=filled_volume.report["hu_range"])
     share = closed_ml / (filled_ml + bone_ml)
     gate = at_most(
         "closed_by_seal", share, _MOST_CLOSED, None,
@@ -381,8 +381,8 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
         f" ({name_parameter('seal_mm', 'MM')}: a smaller ball)",
     )  # fmt: skip
     warnings = [*report.get("warnings", ()), *_warn(facts)]
-    made.report = amend(report, solid=facts, warnings=warnings, gates=[*report.get("gates", ()), gate])
-    return made
+    filled_volume.report = amend(report, solid=facts, warnings=warnings, gates=[*report.get("gates", ()), gate])
+    return filled_volume
 
 
 def _filled_at_metal(bone: Mask, filled: Mask, reach_mm: float, ml: NDArray[np.float64]) -> float:
@@ -422,14 +422,14 @@ def _mean_inside(volume: Volume, bone: Mask, lowest_inside: float) -> Any:
 def _warn(facts: dict[str, Any]) -> list[str]:
     """Return what stays open, and whether more was filled than there is bone."""
     warnings = []
-    for kind, what in (("wide", "too wide for marrow"), ("air", "air, as in sinuses and airways")):
+    for kind, phrase in (("wide", "too wide for marrow"), ("air", "air, as in sinuses and airways")):
         left = facts["open"][kind]
         if left["ml"] >= LEAST_SAID_ML:
-            at = ", ".join(f"{x:.0f}" for x in left["at_mm"])
+            position = ", ".join(f"{x:.0f}" for x in left["at_mm"])
             several = f", the largest {format_ml(left['largest_ml'])}" if left["spaces"] > 1 else ""
             warnings.append(
                 f"solid: {format_ml(left['ml'])} stay open in {count_of(left['spaces'], 'enclosed space')}"
-                f" ({what}{several}, round {at} mm LPS)"
+                f" ({phrase}{several}, round {position} mm LPS)"
             )
     if not facts["filled_ml"]:
         warnings.append("solid: nothing is enclosed at this level, and nothing was filled")

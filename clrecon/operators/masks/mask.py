@@ -87,9 +87,9 @@ class Mask(MaskComponents):
             for attempt in resident.with_fallback():
                 with attempt as (current, _):
                     marked = mark_band(resident, band, progress=progress or ignore_progress)
-            made = cls(resident.volume, marked.mask_d, name, device=current, memory=resident.memory)
-        made._extents = marked
-        return made
+            mask = cls(resident.volume, marked.mask_d, name, device=current, memory=resident.memory)
+        mask._extents = marked
+        return mask
 
     @classmethod
     @explains_arguments
@@ -266,16 +266,16 @@ class Mask(MaskComponents):
         extract: Callable[..., dict[int, Mesh]] = public_function("extract_label_masks")
         return extract(self.to_label_map(), device=self.device, memory=self.memory)[1]
 
-    def __rand__(self, other: LabelMap) -> LabelMap:
-        return self._relabelled(other, lambda voxels, chosen: np.where(chosen, voxels, 0))
+    def __rand__(self, label_map: LabelMap) -> LabelMap:
+        return self._relabelled(label_map, lambda voxels, chosen: np.where(chosen, voxels, 0))
 
-    def __rsub__(self, other: LabelMap) -> LabelMap:
-        return self._relabelled(other, lambda voxels, chosen: np.where(chosen, 0, voxels))
+    def __rsub__(self, label_map: LabelMap) -> LabelMap:
+        return self._relabelled(label_map, lambda voxels, chosen: np.where(chosen, 0, voxels))
 
-    def __ror__(self, other: LabelMap) -> LabelMap:
-        number = max({0, *getattr(other, "names", ())}) + 1
+    def __ror__(self, label_map: LabelMap) -> LabelMap:
+        number = max({0, *getattr(label_map, "names", ())}) + 1
         return self._relabelled(
-            other,
+            label_map,
             lambda voxels, chosen: np.where(chosen & (voxels == 0), np.int32(number), voxels),
             {number: self.name},
         )
@@ -312,20 +312,20 @@ class Mask(MaskComponents):
         DeviceError
             The device has no room, or it fails.
         """
-        own = volume.volume if isinstance(volume, DeviceVolume) else volume
-        if not isinstance(own, Volume):
+        scan = volume.volume if isinstance(volume, DeviceVolume) else volume
+        if not isinstance(scan, Volume):
             raise UsageError(f"a mask is applied to a Volume, not to {type(volume).__name__}")
-        self._check_frame(own)
-        value = _checked_value(outside, own.voxels.dtype)
+        self._check_frame(scan)
+        value = _checked_value(outside, scan.voxels.dtype)
         voxels_d = None
         if isinstance(volume, DeviceVolume) and volume.device is self.device:
             voxels, voxels_d = self._replace(volume, value)
         else:
-            voxels = np.where(self.to_numpy(), own.voxels, value)
-        made = own.with_voxels(voxels)
-        chosen = {"chosen": self.name, "voxels": self.count, "all_voxels": own.voxels.size, "outside_hu": float(value)}
-        made.report = amend(made.report, region=chosen)
-        return volume.follow(made, voxels_d) if isinstance(volume, DeviceVolume) else made
+            voxels = np.where(self.to_numpy(), scan.voxels, value)
+        masked = scan.with_voxels(voxels)
+        chosen = {"chosen": self.name, "voxels": self.count, "all_voxels": scan.voxels.size, "outside_hu": float(value)}
+        masked.report = amend(masked.report, region=chosen)
+        return volume.follow(masked, voxels_d) if isinstance(volume, DeviceVolume) else masked
 
     def _replace(self, resident: DeviceVolume, value: Any) -> tuple[NDArray[Any], Any]:
         """Return the voxels with `value` where none is chosen, and those on the device if it has room, else None."""
@@ -378,9 +378,9 @@ def _checked_value(value: float, dtype: np.dtype[Any]) -> Any:
     try:
         number = float(value)
         with np.errstate(invalid="ignore", over="ignore"):
-            made = dtype.type(number)
+            converted = dtype.type(number)
     except (TypeError, ValueError, OverflowError):
-        number, made = np.nan, None
-    if made is None or not np.isfinite(number) or (dtype.kind != "f" and float(made) != number):
+        number, converted = np.nan, None
+    if converted is None or not np.isfinite(number) or (dtype.kind != "f" and float(converted) != number):
         raise UsageError(f"the value outside is {value!r}: voxels of {dtype} hold no such HU")
-    return made
+    return converted

@@ -41,9 +41,9 @@ class RowSpans:
         return cls(np.stack([low[some], high[some]], axis=1).astype(np.uint16), starts)
 
 
-def checked_mm(mm: float, what: str) -> float:
+def checked_mm(mm: float, subject: str) -> float:
     if isinstance(mm, bool) or not isinstance(mm, (int, float, np.number)) or not 0.0 < float(mm) < np.inf:
-        raise UsageError(f"{what} is {mm!r}: a number of mm above 0 is needed")
+        raise UsageError(f"{subject} is {mm!r}: a number of mm above 0 is needed")
     return float(mm)
 
 
@@ -95,8 +95,8 @@ def _between(start: Float64Array, step: float, low: float, high: float) -> Ends:
     if abs(step) < 1e-12:
         never = (start < low) | (start > high)
         return np.where(never, np.inf, -np.inf), np.where(never, -np.inf, np.inf)
-    one, other = (low - start) / step, (high - start) / step
-    return np.minimum(one, other), np.maximum(one, other)
+    to_low, to_high = (low - start) / step, (high - start) / step
+    return np.minimum(to_low, to_high), np.maximum(to_low, to_high)
 
 
 def _rows(
@@ -135,9 +135,9 @@ def _capsule(
         side = _within(away - height[:, None] * along, step - climb * along, radius)
         between = _between(height, climb, 0.0, length)
         spans.append((np.maximum(side[0], between[0]), np.minimum(side[1], between[1])))
-    kept = [(np.where(a <= b, a, np.inf), np.where(a <= b, b, -np.inf)) for a, b in spans]
-    first = np.minimum.reduce([a for a, _ in kept])
-    last = np.maximum.reduce([b for _, b in kept])
+    ends = [(np.where(a <= b, a, np.inf), np.where(a <= b, b, -np.inf)) for a, b in spans]
+    first = np.minimum.reduce([a for a, _ in ends])
+    last = np.maximum.reduce([b for _, b in ends])
     return k * nj + j, first, last
 
 

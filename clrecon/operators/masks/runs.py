@@ -161,11 +161,11 @@ class RunList:
     numbers: NDArray[np.int32]
 
     @classmethod
-    def read(cls, device: Device, found: Components, shape_ijk: tuple[int, int, int]) -> RunList:
-        count, (_, nj, nk) = found.runs.count, shape_ijk
-        ends = download(device, np.empty((count, 2), np.uint16), found.runs.runs_d)
-        starts = download(device, np.empty(nj * nk + 1, np.uint32), found.runs.row_counts_d)
-        numbers = download(device, np.empty(count, np.int32), found.numbers_d)
+    def read(cls, device: Device, components: Components, shape_ijk: tuple[int, int, int]) -> RunList:
+        count, (_, nj, nk) = components.runs.count, shape_ijk
+        ends = download(device, np.empty((count, 2), np.uint16), components.runs.runs_d)
+        starts = download(device, np.empty(nj * nk + 1, np.uint32), components.runs.row_counts_d)
+        numbers = download(device, np.empty(count, np.int32), components.numbers_d)
         rows = np.repeat(np.arange(nj * nk, dtype=np.int32), np.diff(starts))
         first, last = (ends[:, side].astype(np.int32) for side in (0, 1))
         return cls(rows % nj, rows // nj, first, last, numbers)
@@ -211,29 +211,30 @@ def find_components(
 
 
 def mark_at_border(
-    device: Device, found: Components, shape_ijk: tuple[int, int, int], *, by_slice: bool = False
+    device: Device, components: Components, shape_ijk: tuple[int, int, int], *, by_slice: bool = False
 ) -> Any:
     """Return a buffer with a mark, 0 or 1, for each component: 1 where it reaches the border of the volume or slice."""
     ni, nj, nk = shape_ijk
-    marks_d = zero_words(device, -(-found.count // 4))
+    marks_d = zero_words(device, -(-components.count // 4))
     launch(
-        device, prepare_runs(device)["mark_border_runs"], nj * nk, runs=found.runs.runs_d,
-        row_counts=found.runs.row_counts_d, numbers=found.numbers_d, marks=marks_d, ni=ni, nj=nj, nk=nk,
+        device, prepare_runs(device)["mark_border_runs"], nj * nk, runs=components.runs.runs_d,
+        row_counts=components.runs.row_counts_d, numbers=components.numbers_d, marks=marks_d, ni=ni, nj=nj, nk=nk,
         by_slice=int(by_slice),
     )  # fmt: skip
     return marks_d
 
 
 def mark_with_voxels(
-    device: Device, found: Components, shape_ijk: tuple[int, int, int], voxels: NDArray[np.int32]
+    device: Device, components: Components, shape_ijk: tuple[int, int, int], voxels: NDArray[np.int32]
 ) -> tuple[Any, NDArray[np.int32]]:
     """Mark the components, (components,) uint8, that hold one of `voxels`, i, j, k, and find that of each, or -1."""
     n = len(voxels)
-    marks_d = zero_words(device, -(-found.count // 4))
+    marks_d = zero_words(device, -(-components.count // 4))
     which, which_d = np.empty(n, np.int32), allocate(device, 4 * n)
     launch(
         device, prepare_runs(device)["mark_voxel_runs"], n,
-        voxels=upload(device, np.ascontiguousarray(voxels, np.int32)), runs=found.runs.runs_d,
-        row_counts=found.runs.row_counts_d, numbers=found.numbers_d, marks=marks_d, found=which_d, n=n, nj=shape_ijk[1],
+        voxels=upload(device, np.ascontiguousarray(voxels, np.int32)), runs=components.runs.runs_d,
+        row_counts=components.runs.row_counts_d, numbers=components.numbers_d, marks=marks_d, found=which_d,
+        n=n, nj=shape_ijk[1],
     )  # fmt: skip
     return marks_d, download(device, which, which_d)

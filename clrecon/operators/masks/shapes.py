@@ -90,9 +90,9 @@ def whole_ball_of(volume: Volume, radius: float, *, by_slice: bool = False) -> S
 def _checked(ball: Stencil, volume: Volume, radius: float, by_slice: bool) -> Stencil:
     if by_slice:
         # the rows of each voxel's own slice
-        own = ball.rows[:, 1] == 0
-        before = np.concatenate([[0], np.cumsum(own)]).astype(np.int32)
-        ball = replace(ball, rows=ball.rows[own], tables=before[ball.tables])
+        in_slice = ball.rows[:, 1] == 0
+        before = np.concatenate([[0], np.cumsum(in_slice)]).astype(np.int32)
+        ball = replace(ball, rows=ball.rows[in_slice], tables=before[ball.tables])
     visits = float((ball.tables[:, 1] - ball.tables[:, 0]).sum(dtype=np.int64)) * volume.shape_ijk[1]
     if visits > _MOST_VISITS:
         raise UsageError(
@@ -111,11 +111,11 @@ def _split(rows: NDArray[np.int32], most: int | None) -> NDArray[np.int32]:
     # As many rows of one width as it takes, evenly: two where the number of voxels is even.
     count = -(-(high - low + 1) // (2 * half + 1))
     which = np.repeat(np.arange(len(rows)), count)
-    place = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
+    rank = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
     room = (high - low - 2 * half)[which]
-    centre = low[which] + half[which] + np.where(place == 0, 0, room * place // np.maximum(count[which] - 1, 1))
-    made = np.stack([rows[which, 0], rows[which, 1], centre, half[which]], axis=1)
-    return made[np.lexsort((made[:, 2], made[:, 0], made[:, 1], -made[:, 3]))].astype(np.int32)
+    centre = low[which] + half[which] + np.where(rank == 0, 0, room * rank // np.maximum(count[which] - 1, 1))
+    balls = np.stack([rows[which, 0], rows[which, 1], centre, half[which]], axis=1)
+    return balls[np.lexsort((balls[:, 2], balls[:, 0], balls[:, 1], -balls[:, 3]))].astype(np.int32)
 
 
 def _split_tables(ball: Stencil, most: int | None) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -208,10 +208,10 @@ class MaskBits:
     @property
     def ml(self) -> float:
         """Volume of the chosen voxels, ml; each slice reaches half way to its neighbours."""
-        each = slice_voxel_ml(self.scan)
+        slice_ml = slice_voxel_ml(self.scan)
         if not self.scan.uneven:
-            return self.count * float(each[0])
-        return float(np.count_nonzero(self.to_numpy(), axis=(1, 2)) @ each)
+            return self.count * float(slice_ml[0])
+        return float(np.count_nonzero(self.to_numpy(), axis=(1, 2)) @ slice_ml)
 
     @property
     def bounds(self) -> Float64Array:
@@ -241,10 +241,10 @@ class MaskBits:
 
     def to_numpy(self) -> NDArray[np.bool_]:
         """Return the chosen voxels, shape (nk, nj, ni), bool."""
-        made = np.empty(self.shape_ijk[::-1], np.bool_)
-        for whole, layer in zip(made, self.layers(), strict=True):
+        array = np.empty(self.shape_ijk[::-1], np.bool_)
+        for whole, layer in zip(array, self.layers(), strict=True):
             whole[...] = layer
-        return made
+        return array
 
     __array_ufunc__ = None  # an array and a mask have no common operators
 
@@ -297,14 +297,14 @@ class MaskBits:
 
     def _check_frame(self, volume: Volume) -> None:
         """Refuse a volume whose voxels lie elsewhere."""
-        own = self.scan
-        if volume is own:
+        scan = self.scan
+        if volume is scan:
             return
-        if volume.shape_ijk != own.shape_ijk:
-            raise UsageError(f"the mask has {own.shape_ijk} voxels, the other volume {volume.shape_ijk}")
-        ni, nj, _ = own.shape_ijk
-        turned = np.abs((volume.affine - own.affine)[:3, :2] * (ni, nj)).max()
-        away = max(float(turned), float(np.abs(volume.slice_origins() - own.slice_origins()).max()))
+        if volume.shape_ijk != scan.shape_ijk:
+            raise UsageError(f"the mask has {scan.shape_ijk} voxels, the other volume {volume.shape_ijk}")
+        ni, nj, _ = scan.shape_ijk
+        turned = np.abs((volume.affine - scan.affine)[:3, :2] * (ni, nj)).max()
+        away = max(float(turned), float(np.abs(volume.slice_origins() - scan.slice_origins()).max()))
         if away > PLACE_TOLERANCE_MM:
             raise UsageError(f"the voxels of the mask and of the other volume lie up to {format_digits(away)} mm apart")
 
@@ -425,12 +425,12 @@ class MaskComponents(MaskShapes):
         self._check_budget(3)
         device, shape, size = self.device, self.shape_ijk, mask_bytes(self.shape_ijk)["mask of the voxels"]
         rest = voxel_mask.find_extents(device, voxel_mask.invert(device, self._mask_d, shape), shape)
-        found = find_components(device, rest, by_slice=by_slice, beside=2 * size, memory=self.memory)
+        holes = find_components(device, rest, by_slice=by_slice, beside=2 * size, memory=self.memory)
         filled_d = allocate(device, size)
         copy_buffer(device, self._mask_d, filled_d, size)
-        if found.count:
-            marks_d = mark_at_border(device, found, shape, by_slice=by_slice)
-            self._write(found, marks_d, filled_d, wanted=0)
+        if holes.count:
+            marks_d = mark_at_border(device, holes, shape, by_slice=by_slice)
+            self._write(holes, marks_d, filled_d, wanted=0)
         return self._made(filled_d, f"({self.name}) with holes filled" + " slice by slice" * by_slice)
 
     def grow(self: ComponentMask, points_mm: ArrayLike) -> ComponentMask:
@@ -444,14 +444,14 @@ class MaskComponents(MaskShapes):
             raise UsageError(f"to grow needs points that are numbers, these are {len(points)} points")
         device, shape, size = self.device, self.shape_ijk, mask_bytes(self.shape_ijk)["mask of the voxels"]
         voxels = self._find_voxels(points)
-        found = find_components(device, self.bits, beside=size, memory=self.memory)
-        if not found.count:
+        parts = find_components(device, self.bits, beside=size, memory=self.memory)
+        if not parts.count:
             raise UsageError(f"no voxel is chosen ({self.name}): nothing can grow")
-        marks_d, components = mark_with_voxels(device, found, shape, voxels)
+        marks_d, components = mark_with_voxels(device, parts, shape, voxels)
         if (components < 0).any():
             raise UsageError(self._describe_miss(points[components < 0][0], "lies in a voxel that is not chosen"))
         grown_d = zero_words(device, size // 4)
-        self._write(found, marks_d, grown_d, wanted=1)
+        self._write(parts, marks_d, grown_d, wanted=1)
         return self._made(grown_d, f"({self.name}) grown from {len(points)} point{'s' * (len(points) != 1)}")
 
     @explains_arguments
@@ -463,33 +463,33 @@ class MaskComponents(MaskShapes):
         most : int
             Smaller ones than so many are left out.
         """
-        found, sizes = self._measure_components(most)
+        parts, sizes = self._measure_components(most)
         largest = np.argsort(-sizes, kind="stable")[:most]
-        return [self._choose(found, largest[n : n + 1], f"component {n + 1}") for n in range(len(largest))]
+        return [self._choose(parts, largest[n : n + 1], f"component {n + 1}") for n in range(len(largest))]
 
     @explains_arguments
     def keep_largest(self: ComponentMask, count: int = 1) -> ComponentMask:
         """Return the `count` largest components in one mask; joined as in `components`."""
-        found, sizes = self._measure_components(count)
-        what = "the largest component" if count == 1 else f"the {count} largest components"
-        return self._choose(found, np.argsort(-sizes, kind="stable")[:count], what)
+        parts, sizes = self._measure_components(count)
+        label = "the largest component" if count == 1 else f"the {count} largest components"
+        return self._choose(parts, np.argsort(-sizes, kind="stable")[:count], label)
 
     def _measure_components(self, wanted: int) -> tuple[Components, Float64Array]:
         if isinstance(wanted, bool) or not isinstance(wanted, int | np.integer) or wanted < 1:
             raise UsageError(f"a number of components is a whole number from 1 on, not {wanted!r}")
         size = mask_bytes(self.shape_ijk)["mask of the voxels"]
-        found = find_components(self.device, self.bits, beside=2 * size, memory=self.memory)
-        if not found.count:
-            return found, np.empty(0)
-        return found, RunList.read(self.device, found, self.shape_ijk).sum_ml(self.scan, found.count)
+        parts = find_components(self.device, self.bits, beside=2 * size, memory=self.memory)
+        if not parts.count:
+            return parts, np.empty(0)
+        return parts, RunList.read(self.device, parts, self.shape_ijk).sum_ml(self.scan, parts.count)
 
-    def _choose(self: ComponentMask, found: Components, numbers: NDArray[np.integer], what: str) -> ComponentMask:
+    def _choose(self: ComponentMask, parts: Components, numbers: NDArray[np.integer], label: str) -> ComponentMask:
         chosen_d = zero_words(self.device, mask_bytes(self.shape_ijk)["mask of the voxels"] // 4)
         if len(numbers):
-            marks = np.zeros(4 * -(-found.count // 4), np.uint8)
+            marks = np.zeros(4 * -(-parts.count // 4), np.uint8)
             marks[numbers] = 1
-            self._write(found, upload(self.device, marks), chosen_d, wanted=1)
-        return self._made(chosen_d, f"{what} of ({self.name})")
+            self._write(parts, upload(self.device, marks), chosen_d, wanted=1)
+        return self._made(chosen_d, f"{label} of ({self.name})")
 
     def _find_voxels(self, points: Float64Array) -> NDArray[np.int32]:
         ijk = np.floor(self.scan.lps_to_ijk(points) + 0.5)
@@ -498,9 +498,9 @@ class MaskComponents(MaskShapes):
             raise UsageError(self._describe_miss(points[outside][0], "lies outside of the volume"))
         return ijk.astype(np.int32)
 
-    def _describe_miss(self, point: Float64Array, what: str) -> str:
+    def _describe_miss(self, point: Float64Array, problem: str) -> str:
         """Return the message for a point that nothing can grow from."""
-        where = ", ".join(f"{x:.1f}" for x in point)
+        position = ", ".join(f"{x:.1f}" for x in point)
         least = np.inf
         for chosen, origin in zip(self.to_numpy(), self.scan.slice_origins(), strict=True):
             rows = np.argwhere(chosen)
@@ -510,11 +510,11 @@ class MaskComponents(MaskShapes):
         near = f"no voxel is chosen ({self.name})"
         if np.isfinite(least):
             near = f"the nearest voxel that is chosen ({self.name}) is {least:.1f} mm away"
-        return f"the point ({where}) mm {what}: {near}"
+        return f"the point ({position}) mm {problem}: {near}"
 
-    def _write(self, found: Components, marks_d: object, mask_d: object, wanted: int) -> None:
-        runs = found.runs
+    def _write(self, parts: Components, marks_d: object, mask_d: object, wanted: int) -> None:
+        runs = parts.runs
         write_runs(
-            self.device, runs.runs_d, runs.row_counts_d, found.numbers_d, marks_d, mask_d, self.shape_ijk,
+            self.device, runs.runs_d, runs.row_counts_d, parts.numbers_d, marks_d, mask_d, self.shape_ijk,
             wanted=wanted,
         )  # fmt: skip

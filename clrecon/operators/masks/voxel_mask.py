@@ -35,8 +35,8 @@ from clrecon.system.text import format_band
 
 def prepare_classify(device: Device, dtype: DTypeLike = np.int16, inside: str = "above") -> Program:
     """Build the kernels for volumes of `dtype`; `inside` as in `IsoRule.inside`."""
-    own = {"above": {}, "below": {"BORDER_INSIDE": "1"}, "between": {"RANGE": "1"}}[inside]
-    return load_program(device, "masks/classify.cl", {**voxel_variants(dtype), **device.kernel_variants, **own})
+    variants = {"above": {}, "below": {"BORDER_INSIDE": "1"}, "between": {"RANGE": "1"}}[inside]
+    return load_program(device, "masks/classify.cl", {**voxel_variants(dtype), **device.kernel_variants, **variants})
 
 
 LONGEST_ROW = 65_535

@@ -148,9 +148,9 @@ def _cluster_volume(
     resident: DeviceVolume, band: tuple[float, float], eps: float | None, min_samples: int | str, tell: Progress
 ) -> Clustering:
     for attempt in resident.with_fallback():
-        with attempt as (_, told):
-            made = _cluster_band(resident, band, eps, min_samples, told, tell)
-    return made
+        with attempt as (_, notes):
+            clusters = _cluster_band(resident, band, eps, min_samples, notes, tell)
+    return clusters
 
 
 @dataclass(frozen=True)
@@ -202,11 +202,11 @@ class _Request:
 
     def finish(
         self, cloud: PointCloud, labels: NDArray[np.int32], cores: NDArray[np.bool_], search: ClusterSearch,
-        stopwatch: Stopwatch, device: Device, told: list[str],
+        stopwatch: Stopwatch, device: Device, notes: list[str],
     ) -> Clustering:  # fmt: skip
         labelled = cloud.changed(labels=labels)
         figures = measure_clusters(labelled)
-        warnings = [*told, *self.warnings]
+        warnings = [*notes, *self.warnings]
         if self.samples > len(cloud):
             warnings.append(f"{len(cloud):,} points are fewer than min_samples {self.samples}: all are noise")
         facts = {
@@ -227,15 +227,15 @@ def _cluster_band(
     band: tuple[float, float],
     eps: float | None,
     min_samples: int | str,
-    told: list[str],
+    notes: list[str],
     progress: Progress,
 ) -> Clustering:
     volume, device, stopwatch = resident.volume, resident.device, Stopwatch()
     request = _Request.of(Lattice.of(volume), eps, min_samples)
     pad = pad_for(request.stencil)
     masks = mask_bytes(volume.shape_ijk, pad)
-    own = search_bytes(masks, request.stencil, volume.shape_ijk[1] * volume.shape_ijk[2])
-    beside = {what: size for what, size in own.items() if what not in masks}
+    needs = search_bytes(masks, request.stencil, volume.shape_ijk[1] * volume.shape_ijk[2])
+    beside = {what: size for what, size in needs.items() if what not in masks}
     mask = mark_band(resident, band, pad=pad, beside=beside, stopwatch=stopwatch, progress=progress)
     with stopwatch.running(device):
         search = ClusterSearch(device, mask, request.stencil, request.samples, memory=resident.memory)
@@ -243,7 +243,7 @@ def _cluster_band(
     if not len(labels):
         raise UsageError(f"no voxel lies from {band[0]:g} to {band[1]:g} HU: there is nothing to cluster")
     cloud = extract_points(resident, kind="voxels", hu=band)
-    return request.finish(cloud, labels, cores, search, stopwatch, device, told)
+    return request.finish(cloud, labels, cores, search, stopwatch, device, notes)
 
 
 def _cluster_free(
@@ -267,12 +267,12 @@ def _cluster_free(
             f"the points are no voxels (they have no ijk) and lie in no planes: give a whole number in place of"
             f" {min_samples!r} ({name_parameter('min_samples')})"
         )
-    found = cluster_free_points(cloud, eps, min_samples, device=device, memory=memory, progress=progress)
-    labelled = cloud.changed(labels=found.labels)
+    free = cluster_free_points(cloud, eps, min_samples, device=device, memory=memory, progress=progress)
+    labelled = cloud.changed(labels=free.labels)
     figures = measure_clusters(labelled)
-    facts = {**found.facts, "sheets": int(figures.sheets.sum()), "largest_clusters": figures.as_dicts(REPORTED)}
-    warnings = (*found.warnings, *_warn_of_layers(cloud, eps))
-    return Clustering(labelled, np.zeros(len(cloud), np.uint8), (), facts, warnings, found.cores, figures)
+    facts = {**free.facts, "sheets": int(figures.sheets.sum()), "largest_clusters": figures.as_dicts(REPORTED)}
+    warnings = (*free.warnings, *_warn_of_layers(cloud, eps))
+    return Clustering(labelled, np.zeros(len(cloud), np.uint8), (), facts, warnings, free.cores, figures)
 
 
 def _warn_of_layers(cloud: PointCloud, eps: float) -> list[str]:
@@ -307,13 +307,13 @@ def _cluster_cloud(
     device: Device | str | int | None,
     memory: int | None,
 ) -> Clustering:
-    own = volume.volume if isinstance(volume, DeviceVolume) else volume
-    order, lattice, voxels = _find_numbered(cloud, own) or _find_listed(cloud, own)
+    scan = volume.volume if isinstance(volume, DeviceVolume) else volume
+    order, lattice, voxels = _find_numbered(cloud, scan) or _find_listed(cloud, scan)
     request = _Request.of(lattice, eps, min_samples)
-    taken = take_device(device) if not isinstance(volume, DeviceVolume) else volume.device
+    chosen_device = take_device(device) if not isinstance(volume, DeviceVolume) else volume.device
 
-    for attempt in with_fallback(taken):
-        with attempt as (current, told):
+    for attempt in with_fallback(chosen_device):
+        with attempt as (current, notes):
             stopwatch = Stopwatch()
             with stopwatch.running(current):
                 mask = mark_voxels(current, voxels, lattice.shape_ijk, pad=pad_for(request.stencil))
@@ -321,8 +321,8 @@ def _cluster_cloud(
                 labels, cores = search.label(), search.flag_cores()
                 if order is not None:
                     labels, cores = _restore_order(search, labels, cores, order)
-            made = request.finish(cloud, labels, cores, search, stopwatch, current, told)
-    return made
+            clusters = request.finish(cloud, labels, cores, search, stopwatch, current, notes)
+    return clusters
 
 
 Order = NDArray[np.int64] | None
@@ -369,14 +369,14 @@ def _restore_order(
     search: ClusterSearch, labels: NDArray[np.int32], cores: NDArray[np.bool_], order: NDArray[np.int64]
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     """Return labels and core points in the order of the cloud, numbered by the first core point in that order."""
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    mine, mine_cores = labels[place], cores[place]
+    position = np.empty_like(order)
+    position[order] = np.arange(len(order))
+    mine, mine_cores = labels[position], cores[position]
     clusters, firsts = np.unique(mine[mine_cores], return_index=True)
     number = np.zeros(max(search.count, 1), np.int32)
     number[clusters[np.argsort(firsts)]] = np.arange(len(clusters), dtype=np.int32)
     if len(clusters):
-        mine = search.label(number[search.run_numbers()])[place]
+        mine = search.label(number[search.run_numbers()])[position]
     return mine, mine_cores
 
 

@@ -118,7 +118,7 @@ def remove_outliers(
         raise UsageError(f"deviations are a number from 0 on, usually 1 to 3, not {deviations!r}")
 
     for attempt in with_fallback(take_device(device)):
-        with attempt as (current, told):
+        with attempt as (current, notes):
             stopwatch = Stopwatch()
             search = NeighbourSearch(current, points, k, DistanceMeasure.needs(len(points)), memory, stopwatch)
             distances = DistanceMeasure(search, stopwatch)
@@ -140,7 +140,7 @@ def remove_outliers(
                 "seconds": dict(stopwatch.seconds),
                 "device": current.label,
             }
-            step = PointStep(cloud.select(removed == 0), removed, ("outlier",), facts, (*warnings, *told))
+            step = PointStep(cloud.select(removed == 0), removed, ("outlier",), facts, (*warnings, *notes))
     return step
 
 
@@ -223,12 +223,12 @@ def denoise_points(
     settings = _Settings.checked(k, range_factor, iterations, features, paper)
 
     for attempt in with_fallback(take_device(device)):
-        with attempt as (current, told):
+        with attempt as (current, notes):
             run = _Run(settings, current, memory, progress or ignore_progress)
             moved = points
             for _ in range(settings.iterations):
                 moved = moved + run.moves(moved)
-            step = run.describe(cloud, moved, (*warnings, *told))
+            step = run.describe(cloud, moved, (*warnings, *notes))
     return step
 
 

@@ -96,17 +96,17 @@ class _Runs:
 class _Decision:
     """The passes of cl/points/field_signs.cl."""
 
-    def __init__(self, masks: Masks, limits: MemoryLimits, memory: int | None, taken: int):
+    def __init__(self, masks: Masks, limits: MemoryLimits, memory: int | None, used: int):
         self.masks, self.device, self.memory = masks, masks.device, memory
-        self._limits, self._taken = limits, taken
+        self._limits, self._taken = limits, used
         self._program = load_program(masks.device, "points/field_signs.cl")
         self._lines = {"words": masks.words, "rows": masks.rows}
 
     def run(self, kernel: str, items: int, **arguments: Any) -> None:
         launch(self.device, self._program[kernel], items, **arguments)
 
-    def _check(self, what: str, size: int) -> None:
-        require_room(self._limits, {"field": self._taken, what: size}, "the inside of the cloud cannot be found")
+    def _check(self, buffer: str, size: int) -> None:
+        require_room(self._limits, {"field": self._taken, buffer: size}, "the inside of the cloud cannot be found")
 
     def find_runs(self) -> _Runs:
         masks, rows = self.masks, self.masks.rows
@@ -372,9 +372,9 @@ class NodeField:
             merged=merged_d, bricks=bricks_d, nx=grid.shape[0], words=grid.words, bricks_x=bricks_x,
             brick_words=words, rows=rows, **self._where,
         )  # fmt: skip
-        found = compact(self.device, bricks_d, rows * words)
-        listed = download(self.device, np.empty(found.count, np.uint32), found.positions_d)
-        return found.positions_d, listed
+        compacted = compact(self.device, bricks_d, rows * words)
+        listed = download(self.device, np.empty(compacted.count, np.uint32), compacted.positions_d)
+        return compacted.positions_d, listed
 
     def _plan_slabs(self) -> tuple[_Slab, ...]:
         """Cut the layers of bricks into slabs that the device has room for."""
@@ -391,9 +391,9 @@ class NodeField:
 
         def shortage(thick: int) -> str:
             most = max(slab.end_brick - slab.first_brick for slab in cut(thick))
-            own = {"nodes": thick * self.nodes.layer_bytes, "bricks": _BRICK_BYTES * most}
-            kept = {"grid": self.grid.nbytes, "list of bricks": 4 * self.bricks, **self._kept(self.grid.n)}
-            return describe_shortage(self.limits, {**kept, **own})
+            slab_needs = {"nodes": thick * self.nodes.layer_bytes, "bricks": _BRICK_BYTES * most}
+            resident = {"grid": self.grid.nbytes, "list of bricks": 4 * self.bricks, **self._kept(self.grid.n)}
+            return describe_shortage(self.limits, {**resident, **slab_needs})
 
         thick = _largest(layers, lambda count: not shortage(count))
         if thick == 0:

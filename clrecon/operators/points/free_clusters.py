@@ -133,12 +133,12 @@ def cluster_free_points(
     plan = plan_cells(places, eps)
 
     for attempt in with_fallback(take_device(device)):
-        with attempt as (current, told):
+        with attempt as (current, notes):
             stopwatch = Stopwatch()
             with stopwatch.running(current):
                 search = find_clusters(current, plan, eps, min_samples, memory=memory, progress=progress)
             labels, cores, count, cells = search
-            found = {
+            free_facts = {
                 "clusters": count,
                 "core_points": int(cores.sum()),
                 "noise_points": int((labels < 0).sum()),
@@ -147,7 +147,7 @@ def cluster_free_points(
                 "device": current.label,
                 "kernel_seconds": dict(stopwatch.by_kernel),
             }
-            free_clusters = FreeClusters(labels, cores, count, facts | found, tuple(told))
+            free_clusters = FreeClusters(labels, cores, count, facts | free_facts, tuple(notes))
     return free_clusters
 
 

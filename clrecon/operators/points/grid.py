@@ -205,18 +205,18 @@ def fill_grid(device: Device, plan: GridPlan, *, memory: int | None = None) -> P
         )
     (nx, ny, nz), words = plan.shape, plan.words
     scale = np.float32(1.0) / plan.edge
-    where = {"origin": (*map(float, plan.corner), float(scale)), "n": n, "nx": nx, "ny": ny, "nz": nz, "words": words}
+    grid = {"origin": (*map(float, plan.corner), float(scale)), "n": n, "nx": nx, "ny": ny, "nz": nz, "words": words}
     points_d, mask_d, ranks_d = upload(device, plan.points), allocate(device, 4 * total), allocate(device, 4 * total)
     run = launcher(device, program)
     run("clear_cells", total, mask=mask_d, total=total)
     together = MARKED_TOGETHER if int(device.kernel_variants["LANES"]) > 1 else 1
-    run("mark_cells", -(-n // together), points=points_d, mask=mask_d, **where)
+    run("mark_cells", -(-n // together), points=points_d, mask=mask_d, **grid)
     run("count_marked", total, mask=mask_d, counts=ranks_d, total=total)
     cells = exclusive_scan(device, ranks_d, total, in_place=True).total
     if not 1 <= cells <= n:
         raise DeviceError(f"{device.label} computes wrongly: {n:,} points in {cells:,} cells")
     keys_d = allocate(device, 4 * n)
-    run("number_points", n, points=points_d, mask=mask_d, ranks=ranks_d, keys=keys_d, **where)
+    run("number_points", n, points=points_d, mask=mask_d, ranks=ranks_d, keys=keys_d, **grid)
     by_cell = radix_sort(device, keys_d, n, bits=_bits(cells))
     wait(device)  # what the sort used is free then
     del keys_d

@@ -277,8 +277,8 @@ def _check_pairs(grid: PointGrid, starts: NDArray[np.uint32]) -> None:
         return
     axes = [download(grid.device, np.empty(grid.n, np.float32), axis_d) for axis_d in (grid.x_d, grid.y_d, grid.z_d)]
     for cell in crowded:
-        own = slice(int(starts[cell]), int(starts[cell + 1]))
-        if all(np.ptp(axis[own]) == 0.0 for axis in axes):
+        rows = slice(int(starts[cell]), int(starts[cell + 1]))
+        if all(np.ptp(axis[rows]) == 0.0 for axis in axes):
             pairs -= int(counts[cell]) ** 2
     if pairs > MOST_PAIRS:
         raise UsageError(
@@ -340,7 +340,7 @@ def find_neighbours(
     k, warnings = check_neighbours(k, len(places))
 
     for attempt in with_fallback(take_device(device)):
-        with attempt as (current, told):
+        with attempt as (current, notes):
             results = {"neighbours": 4 * k * len(places), "distances": 4 * k * len(places)}
             search = NeighbourSearch(current, places, k, results, memory, Stopwatch())
             indices, indices_d = empty_output(current, (len(places), k), np.int32)
@@ -348,5 +348,5 @@ def find_neighbours(
             for part in search.each_part("neighbours", progress or ignore_progress):
                 search.find(part, indices_d, distances_d)
             indices, distances = download(current, indices, indices_d), download(current, distances, distances_d)
-            neighbours = Neighbours(indices, distances, (*warnings, *told))
+            neighbours = Neighbours(indices, distances, (*warnings, *notes))
     return neighbours

@@ -58,8 +58,8 @@ def find_gradients(
     places = np.clip(volume.lps_to_ijk(points), -FARTHEST, FARTHEST).astype(np.float32)
 
     def needs(slices: int) -> dict[str, int]:
-        held = min(slices + _BELOW + ABOVE, nk) * resident.slice_bytes
-        return {"volume": held, "places": places.nbytes, "gradients": places.nbytes}
+        slab_bytes = min(slices + _BELOW + ABOVE, nk) * resident.slice_bytes
+        return {"volume": slab_bytes, "places": places.nbytes, "gradients": places.nbytes}
 
     planned = resident.plan(_GRADIENTS, nk, needs)
     if planned < 1:
@@ -199,17 +199,17 @@ def estimate_normals(
     k, warnings = check_neighbours(k, len(points), FEWEST_NEIGHBOURS)
     if volume is not None and viewpoint is not None:
         raise UsageError("normals are oriented by a volume or away from a viewpoint, not both: leave out one")
-    place = None if viewpoint is None else _check_viewpoint(viewpoint)
+    origin = None if viewpoint is None else _check_viewpoint(viewpoint)
     tell = progress or ignore_progress
     if volume is None:
         for attempt in with_fallback(take_device(device)):
-            with attempt as (current, told):
-                step = _Run(cloud, k, current, memory, [*warnings, *told], tell).step(place)
+            with attempt as (current, notes):
+                step = _Run(cloud, k, current, memory, [*warnings, *notes], tell).step(origin)
         return step
     with open_volume(volume, device, memory, "the orientation of normals") as resident:
         for attempt in resident.with_fallback():
-            with attempt as (current, told):
-                run = _Run(cloud, k, current, resident.memory, [*warnings, *told], tell)
+            with attempt as (current, notes):
+                run = _Run(cloud, k, current, resident.memory, [*warnings, *notes], tell)
                 gradients = find_gradients(
                     resident, points, stopwatch=run.stopwatch, progress=tell, warnings=run.warnings
                 )
@@ -218,10 +218,10 @@ def estimate_normals(
 
 
 def _check_viewpoint(viewpoint: ArrayLike) -> NDArray[np.float64]:
-    place = as_numbers("viewpoint", viewpoint)
-    if place.shape != (3,) or not np.isfinite(place).all():
+    point = as_numbers("viewpoint", viewpoint)
+    if point.shape != (3,) or not np.isfinite(point).all():
         raise UsageError(f"a viewpoint is three numbers in LPS mm, not {viewpoint!r}")
-    return place
+    return point
 
 
 @dataclass

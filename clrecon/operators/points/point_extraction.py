@@ -75,8 +75,8 @@ class Selection:
 def prepare_voxels(device: Device, dtype: DTypeLike, labels: DTypeLike | None = None) -> Program:
     prepare_scan(device)
     prepare_classify(device, dtype, "between")
-    own = {} if labels is None else label_variants(labels)
-    return load_program(device, "points/emit.cl", {**voxel_variants(dtype), **device.kernel_variants, **own})
+    variants = {} if labels is None else label_variants(labels)
+    return load_program(device, "points/emit.cl", {**voxel_variants(dtype), **device.kernel_variants, **variants})
 
 
 @dataclass
@@ -178,9 +178,9 @@ class VoxelEmission:
         voxels_d = self.resident.whole(stopwatch) if is_whole else self.resident.part(begin, stop, stopwatch)
         words, rows = -(-ni // 32), (end - first) * nj
         with stopwatch.running(device):
-            where = {"words": words, "first_row": (first - begin) * nj, "rows": rows}
-            mask_d, extents_d, marked = self._mark(voxels_d, begin, stop, where)
-            counts_d, total = self._count(mask_d, extents_d, where)
+            layout = {"words": words, "first_row": (first - begin) * nj, "rows": rows}
+            mask_d, extents_d, marked = self._mark(voxels_d, begin, stop, layout)
+            counts_d, total = self._count(mask_d, extents_d, layout)
         self._check_output(end - first, total)
         positions, positions_d = empty_output(device, (total, 3), np.float32)
         hu, hu_d = empty_output(device, (total,), np.float32)
@@ -195,17 +195,17 @@ class VoxelEmission:
                     row_extents=extents_d, offsets=counts_d, voxels=voxels_d,
                     origins=upload(device, self._origins[first:end]), steps=upload(device, self._steps),
                     positions=positions_d, hu=hu_d, numbers=numbers_d, first_number=first * nj * ni if is_small else 0,
-                    ni=ni, nj=nj, words_per_item=words_per_item, **where,
+                    ni=ni, nj=nj, words_per_item=words_per_item, **layout,
                 )  # fmt: skip
             with stopwatch.timed("download"):
                 download_all(device, (positions, positions_d, 0), (hu, hu_d, 0), (numbers, numbers_d, 0))
         self.volume.release_slices(begin, stop)
         return (positions, hu, numbers if is_small else numbers + np.int64(first * nj * ni)), marked or total
 
-    def _mark(self, voxels_d: Any, begin: int, stop: int, own: dict[str, int]) -> tuple[Any, Any, int | None]:
+    def _mark(self, voxels_d: Any, begin: int, stop: int, layout: dict[str, int]) -> tuple[Any, Any, int | None]:
         """Mark the voxels of the band, of the label; with a label or a shell also count those of the band."""
         device, _stopwatch, (ni, nj, nk) = self.resident.device, self.stopwatch, self.volume.shape_ijk
-        chosen, words = self.selection, own["words"]
+        chosen, words = self.selection, layout["words"]
         rows = (stop - begin) * nj
         mask_d, extents_d = allocate(device, 4 * rows * words), allocate(device, 4 * rows)
         launch(
@@ -215,7 +215,7 @@ class VoxelEmission:
         )  # fmt: skip
         if chosen.labels is None and not chosen.shell:
             return mask_d, extents_d, None
-        _, marked = self._count(mask_d, extents_d, own)
+        _, marked = self._count(mask_d, extents_d, layout)
         program = prepare_voxels(
             device, self.volume.voxels.dtype, None if chosen.labels is None else chosen.labels.dtype
         )
@@ -233,13 +233,14 @@ class VoxelEmission:
             mask_d = shell_d
         return mask_d, extents_d, marked
 
-    def _count(self, mask_d: Any, extents_d: Any, own: dict[str, int]) -> tuple[Any, int]:
+    def _count(self, mask_d: Any, extents_d: Any, layout: dict[str, int]) -> tuple[Any, int]:
         """Count the voxels of a mask in the slab's own rows; return the number before each row, and all."""
         device, _stopwatch = self.resident.device, self.stopwatch
         program = prepare_voxels(device, self.volume.voxels.dtype)
-        counts_d = allocate(device, 4 * own["rows"])
-        launch(device, program["count_points"], own["rows"], mask=mask_d, row_extents=extents_d, counts=counts_d, **own)
-        scanned = exclusive_scan(device, counts_d, own["rows"], in_place=True)
+        rows = layout["rows"]
+        counts_d = allocate(device, 4 * rows)
+        launch(device, program["count_points"], rows, mask=mask_d, row_extents=extents_d, counts=counts_d, **layout)
+        scanned = exclusive_scan(device, counts_d, rows, in_place=True)
         if scanned.total > MOST_POINTS:
             raise DeviceMemoryError(f"a slab has {scanned.total:,} points: more than {MOST_POINTS:,}")
         return scanned.offsets_d, scanned.total
@@ -251,8 +252,8 @@ class VoxelEmission:
         if shortage:
             raise DeviceMemoryError(shortage)
         volume, output = needs["volume"], needs.get("points", 0)
-        for what, size in (("volume", volume), ("output", output), ("scratch", sum(needs.values()) - volume - output)):
-            self.largest[what] = max(self.largest[what], size)
+        for kind, size in (("volume", volume), ("output", output), ("scratch", sum(needs.values()) - volume - output)):
+            self.largest[kind] = max(self.largest[kind], size)
 
     def describe(self) -> dict[str, Any]:
         device = self.resident.device
@@ -388,10 +389,10 @@ def _describe(band: Band) -> str:
     return f"{high:g} HU or less" if math.isinf(low) else f"{low:g} to {high:g} HU"
 
 
-def _refuse_band(volume: Volume, band: Band, where: str) -> NoSurfaceError:
+def _refuse_band(volume: Volume, band: Band, region: str) -> NoSurfaceError:
     low, high = data_range(volume)
     return NoSurfaceError(
-        f"no voxel {where}of {_describe(band)}: the volume runs from {format_hu(low)} to {format_hu(high)} HU"
+        f"no voxel {region}of {_describe(band)}: the volume runs from {format_hu(low)} to {format_hu(high)} HU"
     )
 
 
@@ -401,9 +402,9 @@ def _voxels(
 ) -> PointCloud:  # fmt: skip
     volume = resident.volume
     ends = band_bounds(volume, band)
-    taken = None if labels is None else resident.bring(labels)
+    placed = None if labels is None else resident.bring(labels)
     number = 0 if labels is None or label is None else labels.find(label)
-    chosen = Selection(*ends, shell, None if taken is None else taken.voxels, number, paper)
+    chosen = Selection(*ends, shell, None if placed is None else placed.voxels, number, paper)
 
     for attempt in resident.with_fallback():
         with attempt as (current, warnings):
@@ -430,7 +431,7 @@ def _voxels(
                     *current.warnings,
                     *warnings_of_far(volume),
                     *warn_of_face(volume, band[:1] if math.isfinite(band[0]) else (), "cloud"),
-                    *(() if taken is None else taken.warnings),
+                    *(() if placed is None else placed.warnings),
                     *run.warnings,
                 ],
             }

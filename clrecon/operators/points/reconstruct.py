@@ -84,14 +84,14 @@ def find_walls(near: Words, negative: Words, inside: Words, nx: int) -> Walls:
         places, normals, cubes = [], [], []
         for axis, changed, wall, inner in _compare(parts, min(_CUBE, nz - first), valid):
             faces[layer] += _count(changed, shape[1])
-            found, lower_inside = _list(wall, inner)
+            wall_rows, lower_inside = _list(wall, inner)
             walls[layer] += np.bincount(
-                found[:, 1] // _CUBE * words + found[:, 2] // _CUBE, minlength=shape[1] * words
+                wall_rows[:, 1] // _CUBE * words + wall_rows[:, 2] // _CUBE, minlength=shape[1] * words
             ).reshape(shape[1:])
-            cubes.append(found[:, 1] // _CUBE * words + found[:, 2] // _CUBE)
-            doubled = 2 * found
+            cubes.append(wall_rows[:, 1] // _CUBE * words + wall_rows[:, 2] // _CUBE)
+            doubled = 2 * wall_rows
             doubled[:, axis] += 1
-            normal = np.zeros_like(found)
+            normal = np.zeros_like(wall_rows)
             normal[:, axis] = np.where(lower_inside, -1, 1)
             places.append(doubled)
             normals.append(normal)
@@ -278,8 +278,8 @@ def reconstruct_surface(
     check_memory(memory)
     normals = _check_cloud(cloud)
     _check_numbers(widenings, {"spacing": spacing, "reach": reach, "smoothing": smoothing, "bridge": bridge})
-    own = _own_spacing(cloud) if spacing is None else float(spacing)
-    settings = _choose_lengths(own, noisy, reach, smoothing, bridge)
+    mean_mm = _own_spacing(cloud) if spacing is None else float(spacing)
+    settings = _choose_lengths(mean_mm, noisy, reach, smoothing, bridge)
 
     for attempt in with_fallback(take_device(device)):
         with attempt as (current, warnings):
@@ -299,13 +299,13 @@ def _check_numbers(widenings: object, lengths: Mapping[str, float | None]) -> No
 
 
 def _own_spacing(cloud: PointCloud) -> float:
-    own = mean_spacing(cloud.points)
-    if own == 0.0:
+    mean_mm = mean_spacing(cloud.points)
+    if mean_mm == 0.0:
         raise UsageError(
             "the points coincide, so that their spacing is not known: name it in mm"
             f" ({name_parameter('spacing', 1)}), or thin the cloud"
         )
-    return own
+    return mean_mm
 
 
 def _check_cloud(cloud: PointCloud) -> NDArray[np.float32]:
@@ -419,15 +419,15 @@ class _Reconstruction:
                 {"centre_mm": centre.round(1).tolist(), "edge_mm": _CUBE * h, "wall_share": round(float(share), 4)}
             )
         if walls.share > WALL_SHARE or lost > _LOST_SHARE:
-            place = ", ".join(f"{at:.0f}" for at in cubes[0]["centre_mm"]) if cubes else ""
-            where = f", most of it within {_CUBE * h / 2:.3g} mm of ({place}) mm LPS" if place else ""
+            middle = ", ".join(f"{at:.0f}" for at in cubes[0]["centre_mm"]) if cubes else ""
+            spot = f", most of it within {_CUBE * h / 2:.3g} mm of ({middle}) mm LPS" if middle else ""
             much = (
                 f"at least {format_share(lost, 1)} of the volume are lost"
                 if lost > _LOST_SHARE
                 else "parts of it may be lost"
             )
             self.warnings.append(
-                f"{format_share(walls.share, 1)} of the surface are walls that no points support{where}: the cloud is"
+                f"{format_share(walls.share, 1)} of the surface are walls that no points support{spot}: the cloud is"
                 f" open there, or its points are farther apart than nodes of {h:.4g} mm bridge, and {much}; take a"
                 f" larger {name_parameter('spacing')} and compare the volumes"
             )
@@ -481,12 +481,12 @@ class _Reconstruction:
             raise NoSurfaceError(
                 f"the cloud encloses nothing at a spacing of {self.settings.spacing:.4g} mm: take a smaller one"
             ) from None
-        made = mesh.report
+        notes = mesh.report
         facts |= {
-            "device": made["device"],
-            "driver": made["driver"],
-            "seconds": {part: made["seconds"][part] + self.stopwatch.seconds[part] for part in made["seconds"]},
-            "kernel_seconds": {**self.stopwatch.by_kernel, **made["kernel_seconds"]},
-            "warnings": [*self.warnings, *made["warnings"]],
+            "device": notes["device"],
+            "driver": notes["driver"],
+            "seconds": {part: notes["seconds"][part] + self.stopwatch.seconds[part] for part in notes["seconds"]},
+            "kernel_seconds": {**self.stopwatch.by_kernel, **notes["kernel_seconds"]},
+            "warnings": [*self.warnings, *notes["warnings"]],
         }
         return Mesh(mesh.vertices, mesh.triangles, mesh.normals, facts)

@@ -90,24 +90,24 @@ def thin_points(
         No device, no room for the points, or the device fails.
     """
     check_memory(memory)
-    made = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
-    if not len(made):
+    source = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
+    if not len(source):
         raise UsageError("the cloud is empty: there is nothing to thin")
     if not (isinstance(spacing, (int, float, np.number)) and math.isfinite(spacing) and spacing > 0.0):
         raise UsageError(f"{name_parameter('spacing', spacing)}: a positive length in mm is needed")
-    plan, tell = plan_grid(made.points, float(spacing)), progress or ignore_progress
+    plan, tell = plan_grid(source.points, float(spacing)), progress or ignore_progress
 
     for attempt in with_fallback(take_device(device)):
-        with attempt as (current, told):
+        with attempt as (current, notes):
             stopwatch = Stopwatch()
             tell("thin", 0, 1)
             with stopwatch.running(current):
                 chosen = np.sort(choose_points(current, plan, memory=memory))
-            removed = np.ones(len(made), np.uint8)
+            removed = np.ones(len(source), np.uint8)
             removed[chosen] = 0
             facts = {"spacing_mm": float(spacing), "device": current.label, "kernel_seconds": dict(stopwatch.by_kernel)}
             tell("thin", 1, 1)
-            step = PointStep(made.select(chosen), removed, (REASON,), facts, tuple(told))
+            step = PointStep(source.select(chosen), removed, (REASON,), facts, tuple(notes))
     return step
 
 
@@ -127,11 +127,12 @@ def choose_edge(cloud: PointCloud, *, device: Device | str | int | None = None, 
     """Return twice the median distance from a point to the 16th of its nearest points, itself counted, in mm."""
     if len(cloud) == 1:
         raise UsageError("the cloud has one point, so that no edge of cells can be chosen: leave it as it is")
-    found = find_neighbours(cloud, _NEIGHBOURS, device=device, memory=memory)
-    edge = _EDGE_FACTOR * float(np.median(found.distances[:, -1]))
+    neighbours = find_neighbours(cloud, _NEIGHBOURS, device=device, memory=memory)
+    edge = _EDGE_FACTOR * float(np.median(neighbours.distances[:, -1]))
     if edge == 0.0:
         raise UsageError(
-            f"over half of the {len(cloud):,} points have {found.distances.shape[1] - 1} others at the same place, so"
+            f"over half of the {len(cloud):,} points have {neighbours.distances.shape[1] - 1} others at the same"
+            " place, so"
             " that no edge of cells can be chosen: remove double points first (clrecon.thin_points with a small"
             " spacing), or give an edge in mm"
         )
@@ -186,20 +187,20 @@ def _judge_cells(
 ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
     """Return the number of the reason for which each cell goes, 0 for those that stay, and figures."""
     crowded = labels != SPARSE
-    own = labels[crowded]
-    cells_of = np.bincount(own, minlength=len(labels))
-    points_of = np.bincount(own, weights=counts[crowded], minlength=len(labels))
+    cells = labels[crowded]
+    cells_of = np.bincount(cells, minlength=len(labels))
+    points_of = np.bincount(cells, weights=counts[crowded], minlength=len(labels))
     reached = np.zeros(len(labels), bool)
     reached[labels[crowded & (counts >= threshold)]] = True
     roots = np.flatnonzero(reached)
     facts: dict[str, Any] = {"cells": len(labels), "sparse_cells": int((~crowded).sum()), "components": len(roots)}
     kinds = np.ones(len(labels), np.uint8)
-    kinds[crowded] = np.where(reached[own], 0, 2)
+    kinds[crowded] = np.where(reached[cells], 0, 2)
     if len(roots):
         best = roots[np.lexsort((roots, -points_of[roots], -cells_of[roots]))[0]]
         facts["largest_component"] = {"cells": int(cells_of[best]), "points": int(points_of[best])}
         if largest:
-            kinds[crowded] = np.where((own != best) & (kinds[crowded] == 0), 3, kinds[crowded])
+            kinds[crowded] = np.where((cells != best) & (kinds[crowded] == 0), 3, kinds[crowded])
     return kinds, facts
 
 
@@ -256,22 +257,22 @@ def remove_sparse_cells(
     Liu et al. 2019, section 2.2.
     """
     check_memory(memory)
-    made = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
-    _check(made, edge, fewest, threshold)
-    tell, taken = progress or ignore_progress, take_device(device)
-    length = choose_edge(made, device=taken, memory=memory) if edge is None else float(edge)
+    source = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
+    _check(source, edge, fewest, threshold)
+    tell, chosen_device = progress or ignore_progress, take_device(device)
+    length = choose_edge(source, device=chosen_device, memory=memory) if edge is None else float(edge)
     tell("cells", 1, 2)
-    plan = plan_grid(made.points, length)
+    plan = plan_grid(source.points, length)
 
-    for attempt in with_fallback(taken):
-        with attempt as (current, told):
+    for attempt in with_fallback(chosen_device):
+        with attempt as (current, notes):
             stopwatch = Stopwatch()
             with stopwatch.running(current):
                 grown = grow_cells(current, plan, int(fewest), int(threshold), keep_largest, memory=memory)
             asked = {"edge_is_default": edge is None, "fewest": int(fewest), "threshold": int(threshold)}
             made_on = {"device": current.label, "kernel_seconds": dict(stopwatch.by_kernel)}
             facts = {"edge_mm": float(plan.edge), **asked, **grown.facts, **made_on}
-            step = _finish(made, grown, facts, keep_largest, told)
+            step = _finish(source, grown, facts, keep_largest, notes)
     tell("cells", 2, 2)
     return step
 
@@ -286,7 +287,7 @@ def _check(cloud: PointCloud, edge: float | None, fewest: int, threshold: int) -
         raise UsageError(f"an edge of {edge!r}: a positive length in mm is needed")
 
 
-def _finish(cloud: PointCloud, grown: _Grown, facts: dict[str, Any], keep_largest: bool, told: list[str]) -> PointStep:
+def _finish(cloud: PointCloud, grown: _Grown, facts: dict[str, Any], keep_largest: bool, notes: list[str]) -> PointStep:
     """Put the step together, and refuse one that leaves nothing."""
     removed = grown.removed
     if removed.all():
@@ -295,7 +296,7 @@ def _finish(cloud: PointCloud, grown: _Grown, facts: dict[str, Any], keep_larges
             f" {facts['edge_mm']:.4g} mm have fewer than {facts['fewest']} points, and no other has"
             f" {facts['threshold']}.  Take larger cells, or none for the default"
         )
-    warnings = list(told)
+    warnings = list(notes)
     smaller = int((removed == 3).sum())
     if keep_largest and smaller:
         components, points = grown.facts["components"], int((removed == 0).sum())

@@ -164,19 +164,19 @@ def radix_sort(device: Device, keys_d: Any, n: int, *, bits: int = _KEY_BITS) ->
     program = prepare_sort(device)
     per_chunk, chunks = _plan_chunks(device, n)
     items = chunks * device.group_size
-    taken, free = (keys_d, keys_d), [(allocate(device, 4 * n), allocate(device, 4 * n))]
+    current, free = (keys_d, keys_d), [(allocate(device, 4 * n), allocate(device, 4 * n))]
     digits = _plan_digits(max(bits, 1))
     for number, (shift, width) in enumerate(digits):
         sizes = {"n": n, "shift": shift, "bins": 1 << width, "per_chunk": per_chunk, "chunks": chunks}
         counts_d = allocate(device, (4 << width) * chunks)
-        launch(device, program["count_digits"], items, keys=taken[0], counts=counts_d, **sizes)
+        launch(device, program["count_digits"], items, keys=current[0], counts=counts_d, **sizes)
         offsets_d = exclusive_scan(device, counts_d, chunks << width, in_place=True).offsets_d
-        made = free.pop() if free else (allocate(device, 4 * n), allocate(device, 4 * n))
+        pair = free.pop() if free else (allocate(device, 4 * n), allocate(device, 4 * n))
         launch(
-            device, program["scatter_by_digit"], items, keys=taken[0], values=taken[1], offsets=offsets_d,
-            sorted_keys=made[0], sorted_values=made[1], numbered=int(number == 0), **sizes,
+            device, program["scatter_by_digit"], items, keys=current[0], values=current[1], offsets=offsets_d,
+            sorted_keys=pair[0], sorted_values=pair[1], numbered=int(number == 0), **sizes,
         )  # fmt: skip
         if number > 0:
-            free.append(taken)
-        taken = made
-    return Sorted(*taken)
+            free.append(current)
+        current = pair
+    return Sorted(*current)

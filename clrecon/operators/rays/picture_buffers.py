@@ -229,9 +229,9 @@ class PictureBuffers:
     @classmethod
     def of_states(cls, device: Device, size: tuple[int, int], states_d: Any) -> PictureBuffers:
         """Return the buffers of a picture that others finish: kernels write states alone."""
-        made = cls(device, (1, 1), None, False)
-        made.size, made.states_d = size, states_d
-        return made
+        buffers = cls(device, (1, 1), None, False)
+        buffers.size, buffers.states_d = size, states_d
+        return buffers
 
     @property
     def arguments(self) -> dict[str, Any]:

@@ -179,31 +179,31 @@ class _Splats:
             launch(device, program["clear_splats"], pixels, keys=keys_d, numbers=numbers_d, pixels=pixels)
         for number, kernel in enumerate(("splat_depths", "splat_numbers")):
             for first in starts:
-                held, points_d = min(count, n - first), hold(first)
+                piece, points_d = min(count, n - first), hold(first)
                 more = {"numbers": numbers_d, "first": first} if number else {}
                 with stopwatch.running(device):  # wait: CPU devices read the host's arrays
                     launch(
-                        device, program[kernel], max(held, 1),
-                        points=points_d, keys=keys_d, radius=self.radius, count=held, **more, **picture,
+                        device, program[kernel], max(piece, 1),
+                        points=points_d, keys=keys_d, radius=self.radius, count=piece, **more, **picture,
                     )  # fmt: skip
                 del points_d
-                tell(number * n + first + held)
+                tell(number * n + first + piece)
         whole_d = None
         for first in starts:
-            held = min(count, n - first)
-            own = np.zeros(3, np.float32) if self.shading != "normals" else normals[first : first + held]  # type: ignore[index]
+            piece = min(count, n - first)
+            shown = np.zeros(3, np.float32) if self.shading != "normals" else normals[first : first + piece]  # type: ignore[index]
             normals_d, colors_d = (
-                _upload(device, own, stopwatch),
-                _upload(device, colors[first : first + held], stopwatch),
+                _upload(device, shown, stopwatch),
+                _upload(device, colors[first : first + piece], stopwatch),
             )
             with stopwatch.running(device):
                 launch(
                     device, program["shade_splats"], pixels, keys=keys_d, numbers=numbers_d, normals=normals_d,
                     colors=colors_d, highlights=lights_d, image=image_d, depths=depths_d, background=self.background,
-                    shading=_SHADINGS[self.shading], apart=self.apart, first=first, count=held, **picture,
+                    shading=_SHADINGS[self.shading], apart=self.apart, first=first, count=piece, **picture,
                 )  # fmt: skip
             del normals_d, colors_d
-            tell(2 * n + first + held)
+            tell(2 * n + first + piece)
         with stopwatch.timed("download"):
             download_all(device, (image, image_d, 0), (depth, depths_d, 0))
         return SplatPicture(image, depth, self.shading, len(starts))
@@ -308,12 +308,12 @@ class PointPictures(DeviceWorker):
         cloud, points = self.cloud, self._points
         table, normals = colors.table, cloud.normals
         if style.clip is not None:
-            kept = style.clip.contains(cloud.points)
-            points, table = points[kept], table[kept]
-            normals = None if normals is None else normals[kept]
+            is_inside = style.clip.contains(cloud.points)
+            points, table = points[is_inside], table[is_inside]
+            normals = None if normals is None else normals[is_inside]
         stopwatch, shot = Stopwatch(), Shot(camera, size, background, progress or ignore_progress)
         for attempt in with_fallback(self._device):
-            with attempt as (device, told):
+            with attempt as (device, notes):
                 splats = draw_splats(
                     device, points, table, normals, shot, radius, base=self._base, lighting=style.light,
                     memory=self.memory, stopwatch=stopwatch,
@@ -332,7 +332,7 @@ class PointPictures(DeviceWorker):
             "slabs": splats.parts,
             "seconds": dict(stopwatch.seconds),
             "kernel_seconds": dict(stopwatch.by_kernel),
-            "warnings": [*device.warnings, *told, *_warn_of_radius(radius, camera, size)],
+            "warnings": [*device.warnings, *notes, *_warn_of_radius(radius, camera, size)],
         }
         return Rendering(splats.image, splats.depth, splats.depth, camera, None, "points", report)
 
@@ -397,12 +397,12 @@ def _color_by_label(cloud: PointCloud, labels: NDArray[np.int32], removed: bool)
     palette[~grey] = distinct_colors(int(np.count_nonzero(~grey)))
     levels = np.rint(255.0 * palette).astype(np.uint8)
     names: Mapping[Any, Any] = cloud.report.get("label_names") or {}
-    said = {-1: "noise"} if not removed else {0: "kept"}
+    spare = {-1: "noise"} if not removed else {0: "kept"}
     order = sorted(np.argsort(-counts, kind="stable")[:MOST_NAMED].tolist())
     legend = [
         {
             "label": int(numbers[place]),
-            "name": names.get(int(numbers[place])) or names.get(str(numbers[place])) or said.get(int(numbers[place])),
+            "name": names.get(int(numbers[place])) or names.get(str(numbers[place])) or spare.get(int(numbers[place])),
             "color": "#" + bytes(levels[place]).hex(),
             "points": int(counts[place]),
         }

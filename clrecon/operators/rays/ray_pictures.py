@@ -169,9 +169,9 @@ class MainWay:
         if camera.is_parallel:
             eye, aside = np.append(forward / np.abs(forward).max(), 0.0), _LEAST_DRIFT
         else:
-            place = (frame.places(np.array([camera.position]))[0] - (0.0, 0.0, slab.first_k)) / cells
-            nearest = -place[axis] if ahead > 0 else place[axis] - slab.bricks[axis]  # brick on the way
-            eye, aside = np.append(place, 1.0), max(_LEAST_DRIFT * nearest, 0.5)
+            eye_cell = (frame.places(np.array([camera.position]))[0] - (0.0, 0.0, slab.first_k)) / cells
+            nearest = -eye_cell[axis] if ahead > 0 else eye_cell[axis] - slab.bricks[axis]  # brick on the way
+            eye, aside = np.append(eye_cell, 1.0), max(_LEAST_DRIFT * nearest, 0.5)
         return cls(axis, ahead, eye.astype(np.float32), aside)
 
     @property
@@ -196,14 +196,14 @@ def enter_tiles(resident: DeviceVolume, slab: RaySlab, view: RayView, leaps: Lea
     return entries_d
 
 
-def look_ahead(resident: DeviceVolume, slab: RaySlab, way: MainWay, leaps: LeapMap) -> Any:
+def look_ahead(resident: DeviceVolume, slab: RaySlab, ray: MainWay, leaps: LeapMap) -> Any:
     """Return for each brick the empty distance around it, and ahead of it along the main way, on the device."""
     bi, bj, bk = bricks = slab.bricks
     count = math.prod(bricks)
     ways_d = allocate(resident.device, count)
     launch(
-        resident.device, resident.program("rays/leaps.cl")["look_ahead"], count // bricks[way.axis],
-        distances=leaps.distances_d, ways=ways_d, bi=bi, bj=bj, bk=bk, **way.arguments,
+        resident.device, resident.program("rays/leaps.cl")["look_ahead"], count // bricks[ray.axis],
+        distances=leaps.distances_d, ways=ways_d, bi=bi, bj=bj, bk=bk, **ray.arguments,
     )  # fmt: skip
     return ways_d
 
@@ -239,8 +239,8 @@ _NO_BODY = "no body was found in the scan: the lowest values are those of all of
 def take_picture(resident: DeviceVolume, style: VolumeLook | Projection, shot: Shot, ray_step: float) -> Rendering:
     for attempt in resident.with_fallback():
         with attempt as (_, warnings):
-            made = _Job(resident, style, shot, ray_step, warnings).run()
-    return made
+            picture = _Job(resident, style, shot, ray_step, warnings).run()
+    return picture
 
 
 def take_with_layers(
@@ -260,8 +260,8 @@ def take_with_layers(
             for slabs in resident.attempts(RAYS, planned, job.warnings):
                 with slabs as slices:
                     sample = partial(job.sample_between, slices)
-                    made = draw(DrawnVolume(device, sample, job.near_mm, job.stopwatch, job.warnings))
-    return made
+                    picture = draw(DrawnVolume(device, sample, job.near_mm, job.stopwatch, job.warnings))
+    return picture
 
 
 class _Job(SlabPicture):
@@ -333,15 +333,15 @@ class _Job(SlabPicture):
         last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
         with stopwatch.running(device):  # wait: CPU devices read host arrays that are freed here
             entries_d = enter_tiles(resident, slab, view, leaps, output)
-            way = MainWay.of(resident, slab, view.camera)
-            ways_d = look_ahead(resident, slab, way, leaps)
+            ray = MainWay.of(resident, slab, view.camera)
+            ways_d = look_ahead(resident, slab, ray, leaps)
             launch(
                 device, program["composite_rays"], output.items(queues, int(device.kernel_variants["LANES"])),
                 view.rays_a_launch(device),
                 ways=ways_d, entries=entries_d, highlights=upload(device, highlight_table(self.lighting)),
                 view=upload(device, view.table), last_place=last, slope=resident.stack.slope,
                 shaded=self.lighting.shades, jitter=style.jitter, queues=queues, **more, **tables.arguments,
-                **output.arguments, **view.arguments, **way.arguments, **resident.stack.arguments,
+                **output.arguments, **view.arguments, **ray.arguments, **resident.stack.arguments,
             )  # fmt: skip
 
     def _finish_projection(

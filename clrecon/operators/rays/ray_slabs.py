@@ -146,8 +146,8 @@ def plan_ray_slabs(
     cells, size = choose_brick_cells(resident.volume), resident.dtype.itemsize
 
     def needs(slices: int) -> dict[str, int]:
-        held = nk if slices >= nk else slices + 2 * _OVERLAP + 1
-        shape = max(2, ni), max(2, nj), max(2, held)
+        held_slices = nk if slices >= nk else slices + 2 * _OVERLAP + 1
+        shape = max(2, ni), max(2, nj), max(2, held_slices)
         bricks, samples = math.prod(-(-n // c) for n, c in zip(shape, cells, strict=True)), math.prod(shape)
         beside = {} if labels is None else {"labels": 2 * samples * labels.voxels.itemsize}  # they grow
         rest = {} if slices >= nk else extra
@@ -157,7 +157,7 @@ def plan_ray_slabs(
     if int(resident.device.kernel_variants["LANES"]) > 1:
         most = MOST_VOXELS // (max(2, ni) * max(2, nj))
         most = most if nk <= most else most - 2 * _OVERLAP - 1
-    slices = resident.plan(RAYS, nk, needs, own=(_BRICKS, _LABELS), most=most)
+    slices = resident.plan(RAYS, nk, needs, counted=(_BRICKS, _LABELS), most=most)
     if slices == 0:
         check_budget(resident.device, needs(1), resident.memory)
     return max(slices, 1)
@@ -209,10 +209,10 @@ def _grow(resident: DeviceVolume, slab: RaySlab, labels_d: Any, dtype: np.dtype[
     device, (ni, nj, nk) = resident.device, slab.shape_ijk
     near = Growth.of(resident.volume, None).table
     made_d = allocate(device, ni * nj * nk * dtype.itemsize)
-    own = load_program(device, "surface/labels.cl", {**voxel_variants(resident.dtype), **label_variants(dtype)})
+    program = load_program(device, "surface/labels.cl", {**voxel_variants(resident.dtype), **label_variants(dtype)})
     lowest = -np.inf if resident.dtype.kind == "f" else np.iinfo(resident.dtype).min
     launch(
-        device, own["own_samples"], ni * nj * nk, voxels=slab.voxels_d, labels=labels_d,
+        device, program["own_samples"], ni * nj * nk, voxels=slab.voxels_d, labels=labels_d,
         near=upload(device, near), inside=made_d, level=lowest, ni=ni, nj=nj, nk=nk, offsets=len(near),
     )  # fmt: skip
     return made_d
@@ -297,19 +297,19 @@ def find_leaps(
     from_d = to_d
     slab.maps.clear()  # one map for a slab: making it takes some milliseconds
     marked = download(device, np.empty((bk, bj, bi), np.uint8), from_d) == 0
-    made = slab.maps[key] = LeapMap(from_d, _find_box(resident.volume, marked, slab))
-    return made
+    leaps = slab.maps[key] = LeapMap(from_d, _find_box(resident.volume, marked, slab))
+    return leaps
 
 
 def _find_box(volume: Volume, marked: NDArray[np.bool_], slab: RaySlab) -> tuple[Float64Array, Float64Array] | None:
     ends = []
     across = np.any(marked, axis=0)
-    each = np.any(across, axis=0), np.any(across, axis=1), np.any(marked, axis=(1, 2))
-    for along, cells in zip(each, slab.brick_cells, strict=True):
-        where = np.flatnonzero(along)
-        if not len(where):
+    occupied = np.any(across, axis=0), np.any(across, axis=1), np.any(marked, axis=(1, 2))
+    for along, cells in zip(occupied, slab.brick_cells, strict=True):
+        marked_cells = np.flatnonzero(along)
+        if not len(marked_cells):
             return None
-        ends.append((where[0] * cells, (where[-1] + 1) * cells))
+        ends.append((marked_cells[0] * cells, (marked_cells[-1] + 1) * cells))
     low, high = np.array(ends, dtype=np.float64).T
     low[2] += slab.first_k
     high[2] += slab.first_k
@@ -343,8 +343,8 @@ class SlabPicture(ABC):
         planned = plan_ray_slabs(self.resident, *PictureBuffers.needs(self.shot.size), self.labels)
         for attempt in self.resident.attempts(RAYS, planned, self.warnings):
             with attempt as slices:
-                made = self.take(slices)
-        return made
+                picture = self.take(slices)
+        return picture
 
     def slabs(self, slices: int) -> Iterator[RaySlab]:
         entry_k = entry_slice(self.resident.volume, self.shot.camera)
@@ -362,13 +362,13 @@ class SlabPicture(ABC):
         with self.stopwatch.timed("download"):
             return output.download(has_image=self.makes_image), number
 
-    def describe(self, mode: str, slabs: int, **own: Any) -> dict[str, Any]:
+    def describe(self, mode: str, slabs: int, **facts: Any) -> dict[str, Any]:
         device = self.resident.device
         return {
             "mode": mode,
             "device": device.label,
             "driver": device.driver,
-            **own,
+            **facts,
             "ray_step_mm": self.ray_step,
             "slabs": slabs,
             "seconds": dict(self.stopwatch.seconds),

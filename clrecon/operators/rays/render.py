@@ -100,14 +100,14 @@ def render(
         with VolumeRenderer(shown, device=device, memory=memory) as renderer:
             return renderer.render(style, size=size, background=background, progress=progress, **{**placing, **look})
     objects = _name_objects(shown, style, look)
-    place = Place.checked(objects[0][1], **_with_view(placing, objects))
+    placement = Place.checked(objects[0][1], **_with_view(placing, objects))
     size = checked_size(DEFAULT_SIZE if size is None else size)
     ground = None if is_transparent(background) else background
     if isinstance(shown, PointCloud) and isinstance(chosen := objects[0][1], PointLook):
         with PointPictures(shown, device=device, memory=memory) as points:
-            return points.take(chosen, place.camera_for(points.box, size), size, ground, progress)
+            return points.take(chosen, placement.camera_for(points.box, size), size, ground, progress)
     with ScenePictures(objects, device=device, memory=memory) as pictures:
-        return pictures.take(place.camera_for(pictures.box, size), size, ground, progress)
+        return pictures.take(placement.camera_for(pictures.box, size), size, ground, progress)
 
 
 def _name_objects(

@@ -184,14 +184,14 @@ class _Layers:
         with stopwatch.running(self.device):
             self._launch("begin_layer", **still, **self.keys.arguments, **self._place)
             for finds_numbers in (False, True):
-                for own in self.triangles:
-                    own.draw(self.keys, finds_numbers)
+                for triangles in self.triangles:
+                    triangles.draw(self.keys, finds_numbers)
             self._launch(
                 "show_still", still=self.still_d, numbers=self.keys.numbers_d, keys=self.keys.keys_d,
                 pixels=self.pixels, **still, **self._layer,
             )  # fmt: skip
-            for own in self.triangles:
-                own.shade(self.keys, self.layer_d, self.depths_d)
+            for triangles in self.triangles:
+                triangles.shade(self.keys, self.layer_d, self.depths_d)
 
     def _sample(self, volume: Callable[[Between], None], is_first: bool) -> None:
         if is_first:
@@ -313,12 +313,12 @@ class ScenePictures(DeviceWorker):
         tell("render", 0, len(self._objects))
         drawn: list[Rendering] = []
         translucent: tuple[VolumeRenderer, VolumeLook | SlicesInSpace] | None = None
-        for place, (_, style) in enumerate(self._objects):
+        for number, (_, style) in enumerate(self._objects):
             if isinstance(style, PointLook | SurfaceLook):
-                drawn.append(self._draw_alone(place, style, camera, size))
+                drawn.append(self._draw_alone(number, style, camera, size))
                 tell("render", len(drawn), len(self._objects))
             elif isinstance(style, VolumeLook | SlicesInSpace):
-                renderer = self._taker(place)
+                renderer = self._taker(number)
                 assert isinstance(renderer, VolumeRenderer)
                 translucent = renderer, style
         shot = Shot(camera, size, background, tell)
@@ -326,38 +326,38 @@ class ScenePictures(DeviceWorker):
         if translucent is None:
             for attempt in with_fallback(self._device):
                 with attempt as (device, warnings):
-                    made = finish(DrawnVolume(device, None, 0.0, Stopwatch(), warnings))
+                    picture = finish(DrawnVolume(device, None, 0.0, Stopwatch(), warnings))
         else:
             renderer, look = translucent
             beside = {
                 "picture": PIXEL_BYTES * size[0] * size[1],
                 "triangles": sum(part.device_bytes for part in self._parts),
             }
-            made = renderer.render_with_layers(look, shot, beside, finish)
+            picture = renderer.render_with_layers(look, shot, beside, finish)
         tell("render", len(self._objects), len(self._objects))
-        return made
+        return picture
 
-    def _taker(self, place: int) -> VolumeRenderer | PointPictures:
+    def _taker(self, number: int) -> VolumeRenderer | PointPictures:
         """Return what takes pictures of an object alone; it stays open."""
-        subject = self._objects[place][0]
+        subject = self._objects[number][0]
         if id(subject) not in self._takers:
             opened: VolumeRenderer | PointPictures
             if isinstance(subject, PointCloud):
                 opened = PointPictures(subject, device=self._device.current, memory=self.memory)
             else:
                 assert isinstance(subject, Volume | DeviceVolume)
-                own = None if isinstance(subject, DeviceVolume) else self._device.current
+                device = None if isinstance(subject, DeviceVolume) else self._device.current
                 memory = None if isinstance(subject, DeviceVolume) else self.memory
-                opened = VolumeRenderer(subject, device=own, memory=memory)
+                opened = VolumeRenderer(subject, device=device, memory=memory)
             if self._is_own:
                 self._stack.enter_context(opened)
             self._takers[id(subject)] = opened
         return self._takers[id(subject)]
 
     def _draw_alone(
-        self, place: int, style: PointLook | SurfaceLook, camera: Camera, size: tuple[int, int]
+        self, number: int, style: PointLook | SurfaceLook, camera: Camera, size: tuple[int, int]
     ) -> Rendering:
-        taker = self._taker(place)
+        taker = self._taker(number)
         if isinstance(taker, PointPictures):
             assert isinstance(style, PointLook)
             return taker.take(style, camera, size, None)
@@ -365,16 +365,16 @@ class ScenePictures(DeviceWorker):
 
     def _finish(self, drawn: list[Rendering], shot: Shot, volume: DrawnVolume) -> Rendering:
         device, stopwatch = volume.device, volume.stopwatch
-        found = draw_layers(
+        layers = draw_layers(
             device, self._parts, shot, still=_join_stills(drawn), volume=volume.sample, near_mm=volume.near_mm,
             memory=self.memory, stopwatch=stopwatch,
         )  # fmt: skip
         warnings = [*device.warnings, *volume.warnings]
-        for each in drawn:
-            warnings += [text for text in each.report["warnings"] if text not in warnings]
-        if found.open_pixels:
+        for rendering in drawn:
+            warnings += [text for text in rendering.report["warnings"] if text not in warnings]
+        if layers.open_pixels:
             warnings.append(
-                f"{found.open_pixels:,} pixels have more than {found.layers} translucent surfaces behind each other:"
+                f"{layers.open_pixels:,} pixels have more than {layers.layers} translucent surfaces behind each other:"
                 " the rest is left out"
             )
         modes = [style.mode for _, style in self._objects]
@@ -384,12 +384,12 @@ class ScenePictures(DeviceWorker):
             "device": device.label,
             "driver": device.driver,
             "triangles": self._triangles,
-            "layers": found.layers,
+            "layers": layers.layers,
             "seconds": dict(stopwatch.seconds),
             "kernel_seconds": dict(stopwatch.by_kernel),
             "warnings": warnings,
         }
-        return Rendering(found.image, found.depth, found.expected_depth, shot.camera, None, modes[0], report)
+        return Rendering(layers.image, layers.depth, layers.expected_depth, shot.camera, None, modes[0], report)
 
 
 def _box_of(objects: Sequence[tuple[Subject, Style]]) -> Grid:
@@ -405,8 +405,8 @@ def _box_of(objects: Sequence[tuple[Subject, Style]]) -> Grid:
         grids.append(grid if isinstance(grid, Volume) else None)
         corners.append(mesh_corners(subject) if isinstance(subject, Mesh) else box_corners(grid))  # type: ignore[arg-type]
     every = box_around(corners)
-    for volume, own in zip(grids, corners, strict=True):
-        if volume is not None and np.allclose(box_around([own]).affine, every.affine):
+    for volume, object_corners in zip(grids, corners, strict=True):
+        if volume is not None and np.allclose(box_around([object_corners]).affine, every.affine):
             return volume
     return every
 

@@ -71,8 +71,8 @@ def overlay_slices(resident: DeviceVolume, style: SlicesInSpace, shot: Shot) -> 
             planned = overlay.plan(*PictureBuffers.needs(shot.size))
             for slabs in resident.attempts(SLICES, planned, overlay.warnings):
                 with slabs as slices:
-                    made = overlay.take(slices)
-    return made
+                    picture = overlay.take(slices)
+    return picture
 
 
 def overlay_with_layers(
@@ -90,8 +90,8 @@ def overlay_with_layers(
             for slabs in resident.attempts(SLICES, overlay.plan(beside, {}), overlay.warnings):
                 with slabs as slices:
                     sample = partial(overlay.sample_between, slices)
-                    made = draw(DrawnVolume(device, sample, near_mm, overlay.stopwatch, overlay.warnings))
-    return made
+                    picture = draw(DrawnVolume(device, sample, near_mm, overlay.stopwatch, overlay.warnings))
+    return picture
 
 
 class _Colors(NamedTuple):
@@ -152,8 +152,8 @@ class _Overlay:
         resident, count = self.resident, len(self.chosen)
 
         def needs(slices: int) -> dict[str, int]:
-            own = {"slices": slices * resident.slice_bytes, **picture}
-            return own if slices == count else {**own, **states}
+            buffers = {"slices": slices * resident.slice_bytes, **picture}
+            return buffers if slices == count else {**buffers, **states}
 
         if resident.is_held and resident.shortage({"volume": resident.volume.voxels.nbytes, **picture}):
             resident.make_way()

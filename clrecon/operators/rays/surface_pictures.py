@@ -43,8 +43,8 @@ def cast_surface(resident: DeviceVolume, style: SurfaceLook, shot: Shot, ray_ste
     rule = choose_iso_rule(resident.volume, style.iso_value, values=resident.values)
     for attempt in resident.with_fallback():
         with attempt as (_, warnings):
-            made = _Job(resident, rule, style, shot, float(ray_step), warnings).run()
-    return made
+            picture = _Job(resident, rule, style, shot, float(ray_step), warnings).run()
+    return picture
 
 
 class _Job(SlabPicture):

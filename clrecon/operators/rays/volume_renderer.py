@@ -83,8 +83,8 @@ def _shown_labels(volume: Volume | DeviceVolume, style: Style) -> ShownLabels | 
     look = _hiding_look(style)
     if look is None:
         return None
-    taken = volume.bring(look.labels) if isinstance(volume, DeviceVolume) else resample_labels(look.labels, volume)
-    return ShownLabels(taken.voxels, look.table[:, 3] > 0.0)
+    placed = volume.bring(look.labels) if isinstance(volume, DeviceVolume) else resample_labels(look.labels, volume)
+    return ShownLabels(placed.voxels, look.table[:, 3] > 0.0)
 
 
 def _band(style: Style, volume: Volume) -> tuple[float, float]:
@@ -177,10 +177,10 @@ class VolumeRenderer(VolumeWorker):
         if isinstance(style, MeshLook):
             raise UsageError("mode mesh shows a mesh, and this is a volume: extract a surface first")
         seen_from = default_view(style.mode, self.volume) if view is None and camera is None else view
-        place = Place.checked(style, camera, seen_from, up, zoom, view_angle, center)
+        placement = Place.checked(style, camera, seen_from, up, zoom, view_angle, center)
         progress = progress or ignore_progress
         if isinstance(style, CurveCut):
-            return take_curve(self._resident, style, place.view, place.up, size, background, progress)
+            return take_curve(self._resident, style, placement.view, placement.up, size, background, progress)
         is_sheet = isinstance(style, PlaneCut) and style.sheet is not None
         own_size = SHEET_SIZE if is_sheet else DEFAULT_SIZE
         size = checked_size(own_size if size is None else size)
@@ -190,8 +190,8 @@ class VolumeRenderer(VolumeWorker):
                 size=size, background=background, progress=progress,
             )  # fmt: skip
         if isinstance(style, PlaneCut):
-            return self._cut(style, place, size, background, progress)
-        camera = place.camera or place.camera_for(self.frame(style), size)
+            return self._cut(style, placement, size, background, progress)
+        camera = placement.camera or placement.camera_for(self.frame(style), size)
         shot = Shot(camera, size, None if is_transparent(background) else background, progress)
         if isinstance(style, SlicesInSpace):
             return overlay_slices(self._resident, style, shot)
@@ -245,16 +245,16 @@ class VolumeRenderer(VolumeWorker):
     def _cut(
         self,
         style: PlaneCut,
-        place: Place,
+        placement: Place,
         size: tuple[int, int],
         background: str | Sequence[float],
         progress: Progress,
     ) -> Rendering:
-        plane = place.camera
+        plane = placement.camera
         if plane is None:
             plane = find_plane(
-                place.checked_box(self.frame(style)), place.view, size,
-                zoom=place.zoom, up=place.up, pixel_mm=style.pixel_mm, center=place.center,
+                placement.checked_box(self.frame(style)), placement.view, size,
+                zoom=placement.zoom, up=placement.up, pixel_mm=style.pixel_mm, center=placement.center,
             )  # fmt: skip
         elif style.pixel_mm is not None:
             raise UsageError("the size of pixels is that of the camera: leave it out, or the camera")

@@ -137,13 +137,13 @@ def take_cut(
     """Cut the slice of a camera, as `cut_slice` does, with the labels of the style."""
     job = CutJob(resident, style, progress)
     sheet, camera = plane_sheet(plane, size, style.offset_mm)
-    made = job.sample(sheet)
-    if np.isnan(made.values).all():
+    reformation = job.sample(sheet)
+    if np.isnan(reformation.values).all():
         raise UsageError(_describe_miss(resident.volume, camera))
-    image, numbers = job.draw(made.values, sheet)
-    depth = np.where(np.isnan(made.values), np.float32(np.nan), np.float32(camera.distance))
-    report = job.describe(made, camera.pixel_mm(size)) | _describe_plane(camera)
-    return job.finish(image, made.values, depth, camera, numbers, report, background)
+    image, numbers = job.draw(reformation.values, sheet)
+    depth = np.where(np.isnan(reformation.values), np.float32(np.nan), np.float32(camera.distance))
+    report = job.describe(reformation, camera.pixel_mm(size)) | _describe_plane(camera)
+    return job.finish(image, reformation.values, depth, camera, numbers, report, background)
 
 
 def _describe_plane(camera: Camera) -> dict[str, Any]:
@@ -252,19 +252,19 @@ def take_curve(
 ) -> Rendering:
     """Make the picture along the curve of a style, as `reformat_curve` does, with its labels."""
     job = CutJob(resident, style, progress)
-    line, found = _find_line(resident.volume, style.curve, progress)
+    line, spine = _find_line(resident.volume, style.curve, progress)
     across, top = _find_directions(view, up)
     turned = bool((line.points[-1] - line.points[0]) @ top > 0.0)
     line = line.reversed() if turned else line
     curved, pixel = _lay_sheet(resident.volume, style, line, across, size)
-    made = job.sample(curved.sheet)
-    made.values[np.isnan(curved.arc)] = np.nan
-    image, numbers = job.draw(made.values, curved.sheet)
-    said = _describe_curve(line, curved, style.kind, across, turned) | {"angle_deg": style.angle, "found": found}
+    reformation = job.sample(curved.sheet)
+    reformation.values[np.isnan(curved.arc)] = np.nan
+    image, numbers = job.draw(reformation.values, curved.sheet)
+    curve_facts = _describe_curve(line, curved, style.kind, across, turned) | {"angle_deg": style.angle, "found": spine}
     edges = sheet_letters(curved.sheet, ~np.isnan(curved.arc))
-    report = job.describe(made, pixel) | {"curve": said, "edges": edges}
-    report["warnings"] += _warn_of_part(found)
-    return job.finish(image, made.values, None, None, numbers, report, background)
+    report = job.describe(reformation, pixel) | {"curve": curve_facts, "edges": edges}
+    report["warnings"] += _warn_of_part(spine)
+    return job.finish(image, reformation.values, None, None, numbers, report, background)
 
 
 def _lay_sheet(
@@ -280,11 +280,11 @@ def _lay_sheet(
     return stretched_sheet(line, across, fitted, pixel), pixel
 
 
-def _warn_of_part(found: dict[str, Any] | None) -> list[str]:
+def _warn_of_part(spine: dict[str, Any] | None) -> list[str]:
     """Return the warning for a spine that was lost before the scan ends: where, and what was found instead."""
-    if found is None:
+    if spine is None:
         return []
-    ends = [(name, found[f"{name}_end"]) for name in ("upper", "lower")]
+    ends = [(name, spine[f"{name}_end"]) for name in ("upper", "lower")]
     lost = [
         f"{'above' if name == 'upper' else 'below'} it was lost at z {end['lost_mm']:.1f} mm: {end['because']}"
         for name, end in ends
@@ -295,7 +295,7 @@ def _warn_of_part(found: dict[str, Any] | None) -> list[str]:
     (_, upper), (_, lower) = ends
     return [
         f"the spinal canal was followed from z {upper['z_mm']:.1f} to {lower['z_mm']:.1f} mm,"
-        f" {found['height_mm']:.0f} of the {found['searched_mm']:.0f} mm of the scan; {'; '.join(lost)}"
+        f" {spine['height_mm']:.0f} of the {spine['searched_mm']:.0f} mm of the scan; {'; '.join(lost)}"
     ]
 
 
@@ -415,33 +415,33 @@ def take_contact_sheet(
     numbers = None if job.look is None else np.zeros(size[::-1], job.look.labels.voxels.dtype)
     edges = edge_letters(plane)
     tiles: list[dict[str, Any]] = []
-    made = None
-    for n, (place, (left, top)) in enumerate(zip(places, layout.corners, strict=True)):
+    reformation = None
+    for n, (spot, (left, top)) in enumerate(zip(places, layout.corners, strict=True)):
         progress("render", n, len(places))
-        middle = np.asarray(plane.focal_point) + place.offset_mm * forward
-        own = replace(
-            plane, focal_point=tuple(middle), position=tuple(np.asarray(plane.position) + place.offset_mm * forward),
+        middle = np.asarray(plane.focal_point) + spot.offset_mm * forward
+        tile_plane = replace(
+            plane, focal_point=tuple(middle), position=tuple(np.asarray(plane.position) + spot.offset_mm * forward),
             parallel_scale=0.5 * height * layout.pixel_mm,
         )  # fmt: skip
-        sheet, _ = plane_sheet(own, layout.tile)
-        made = job.sample(sheet)
+        sheet, _ = plane_sheet(tile_plane, layout.tile)
+        reformation = job.sample(sheet)
         part = slice(top, top + height), slice(left, left + width)
-        values[part] = made.values
-        drawn, labels = job.draw(made.values, sheet)
+        values[part] = reformation.values
+        drawn, labels = job.draw(reformation.values, sheet)
         if numbers is not None and labels is not None:
             numbers[part] = labels
         axis = int(np.abs(forward).argmax())
         if abs(forward[axis]) > PARALLEL:
             texts = [f"{'xyz'[axis]} {middle[axis]:.1f} mm", f"{middle[axis]:.1f}"]
         else:
-            texts = [f"{place.offset_mm:+.1f} mm", f"{place.offset_mm:+.1f}"]
-        if place.number is not None:
-            texts.insert(0, f"{place.number}: {texts[0]}")
+            texts = [f"{spot.offset_mm:+.1f} mm", f"{spot.offset_mm:+.1f}"]
+        if spot.number is not None:
+            texts.insert(0, f"{spot.number}: {texts[0]}")
         image[part] = write_on_tile(drawn, tuple(texts), edges)
-        tiles.append({"slice": place.number, "middle_lps_mm": middle.round(3).tolist(), "left": left, "top": top})
+        tiles.append({"slice": spot.number, "middle_lps_mm": middle.round(3).tolist(), "left": left, "top": top})
     progress("render", len(places), len(places))
-    assert made is not None
-    report = job.describe(made, layout.pixel_mm) | {"edges": edges, "tiles": tiles, "tile_size": [width, height]}
+    assert reformation is not None
+    report = job.describe(reformation, layout.pixel_mm) | {"edges": edges, "tiles": tiles, "tile_size": [width, height]}
     return job.finish(image, values, None, None, numbers, report, background)
 
 
@@ -468,16 +468,18 @@ def _choose(volume: Volume, style: PlaneCut, plane: Camera, depths: Float64Array
     """Return the slices of a sheet in their order; `depths` are those of the corners of what is shown."""
     forward = plane.basis()[2]
     low, high = float(depths.min()), float(depths.max())
-    own = _voxel_planes(volume, plane)
+    planes = _voxel_planes(volume, plane)
     axis = int(np.abs(forward).argmax())
     if style.slices is not None:
-        if own is None:
+        if planes is None:
             raise UsageError("planes of voxels do not lie in this view: choose slices by their number or distance")
-        numbers = range(0, len(own), style.slices) if isinstance(style.slices, int) else style.slices
-        missing = [k for k in numbers if not 0 <= k < len(own)]
+        numbers = range(0, len(planes), style.slices) if isinstance(style.slices, int) else style.slices
+        missing = [k for k in numbers if not 0 <= k < len(planes)]
         if missing:
-            raise UsageError(f"slice {missing[0]} is not there: in this direction the volume has 0 to {len(own) - 1}")
-        found = [_Place(float(own[k]), int(k)) for k in numbers]
+            raise UsageError(
+                f"slice {missing[0]} is not there: in this direction the volume has 0 to {len(planes) - 1}"
+            )
+        spots = [_Place(float(planes[k]), int(k)) for k in numbers]
     elif isinstance(style.sheet, str):
         step = float(style.sheet.removesuffix("mm"))
         first = np.ceil((low + float(plane.focal_point @ forward)) / step) * step - float(plane.focal_point @ forward)
@@ -487,15 +489,15 @@ def _choose(volume: Volume, style: PlaneCut, plane: Camera, depths: Float64Array
                 f"slices {style.sheet} apart are {max(count, 0):,} in the {high - low:.0f} mm of this view: 1 to"
                 f" {MOST_SLICES:,} can be shown"
             )
-        found = [_Place(float(first + n * step), None) for n in range(count)]
+        spots = [_Place(float(first + n * step), None) for n in range(count)]
     else:
         count = int(style.sheet or 1)
-        found = [_Place(low + (n + 0.5) * (high - low) / count, None) for n in range(count)]
-        if own is not None:  # slices as they were taken, where they are
-            nearest = [int(np.abs(own - place.offset_mm).round(6).argmin()) for place in found]
-            found = [_Place(float(own[k]), k) for k in dict.fromkeys(nearest)]
+        spots = [_Place(low + (n + 0.5) * (high - low) / count, None) for n in range(count)]
+        if planes is not None:  # slices as they were taken, where they are
+            nearest = [int(np.abs(planes - place.offset_mm).round(6).argmin()) for place in spots]
+            spots = [_Place(float(planes[k]), k) for k in dict.fromkeys(nearest)]
     head_first = axis == 2
-    return sorted(found, key=lambda place: place.offset_mm * (forward[axis] if not head_first else -forward[axis]))
+    return sorted(spots, key=lambda place: place.offset_mm * (forward[axis] if not head_first else -forward[axis]))
 
 
 def _voxel_planes(volume: Volume, plane: Camera) -> Float64Array | None:

@@ -180,8 +180,8 @@ class _Run:
         if self.combine == "mean":
             values = values / np.where(empty, np.float32(1.0), weights)
         values[empty] = np.nan
-        held = slices if takes_whole else min(slices, self.slices)
-        return Reformation(values, self.slices, count, sum(self.needs(held).values()))
+        most_slices = slices if takes_whole else min(slices, self.slices)
+        return Reformation(values, self.slices, count, sum(self.needs(most_slices).values()))
 
     def _launch_rows(self, program: Program, **part: Any) -> None:
         """Launch the kernel for all rows; `part` has its arguments other than rows and sizes."""
@@ -216,15 +216,15 @@ def sample_sheet(
         raise UsageError(f"the samples of a slab are combined by one of {', '.join(COMBINATIONS)}, not {combine!r}")
 
     for attempt in resident.with_fallback():
-        with attempt as (_, told):
+        with attempt as (_, notes):
             run = _Run(resident, sheet, samples, combine, stopwatch or Stopwatch())
             planned = run.plan()
-            for slabs in resident.attempts(_SHEETS, planned, told, fewest=min(2, planned)):
+            for slabs in resident.attempts(_SHEETS, planned, notes, fewest=min(2, planned)):
                 with slabs as slices:
-                    made = run.all_slabs(slices, progress)
+                    reformation = run.all_slabs(slices, progress)
     if warnings is not None:
-        warnings.extend(told)
-    return made
+        warnings.extend(notes)
+    return reformation
 
 
 class CutJob:
@@ -273,7 +273,7 @@ class CutJob:
         seen = Rendering(image, depth, depth.copy(), camera, values, mode=self.style.mode, report=report)
         return seen if is_transparent(background) else seen.with_background(background)
 
-    def describe(self, made: Reformation, pixel_mm: float) -> dict[str, Any]:
+    def describe(self, reformation: Reformation, pixel_mm: float) -> dict[str, Any]:
         return {
             "pixel_mm": pixel_mm,
             "thickness_mm": self.style.thickness,
@@ -283,8 +283,8 @@ class CutJob:
             "window_hu": list(self.window),
             "device": self.resident.device.label,
             "driver": self.resident.device.driver,
-            "slabs": made.slabs,
-            "device_bytes": made.device_bytes,
+            "slabs": reformation.slabs,
+            "device_bytes": reformation.device_bytes,
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
             "warnings": [*self.resident.device.warnings, *self.warnings],

@@ -199,28 +199,28 @@ class DeviceVolume(Closing, Volume):
         self.uploaded_bytes += voxels.nbytes
         return voxels_d
 
-    def keep(self, what: str, of: Hashable, nbytes: int, make: Callable[[], Made]) -> Made:
+    def keep(self, name: str, of: Hashable, nbytes: int, make: Callable[[], Made]) -> Made:
         """Return what an operator made of the volume and `of`, and will need again; one object of each kind is kept.
 
         It is dropped when one of its kind for other inputs is asked for, when the voxels are dropped, or when another
         operator needs the room.
 
-        what: Kind of the object, for messages about memory.
+        name: Kind of the object, for messages about memory.
         nbytes: Its bytes on the device; 0 for small tables, which stay when the voxels are dropped.
         """
         with self._lock:
             self._check_context()
-            kept = self._kept.get(what)
-            if kept is None or kept.of != of:
-                self._kept.pop(what, None)
-                kept = self._kept[what] = _Kept(of, make(), nbytes)
-            made: Made = kept.value
-            return made
+            entry = self._kept.get(name)
+            if entry is None or entry.of != of:
+                self._kept.pop(name, None)
+                entry = self._kept[name] = _Kept(of, make(), nbytes)
+            value: Made = entry.value
+            return value
 
-    def kept_bytes(self, what: str) -> int:
+    def kept_bytes(self, name: str) -> int:
         """Bytes on the device of the kept object of a kind; 0 without one."""
-        kept = self._kept.get(what)
-        return 0 if kept is None else kept.nbytes
+        entry = self._kept.get(name)
+        return 0 if entry is None else entry.nbytes
 
     @property
     def stack(self) -> StackTable:
@@ -228,13 +228,13 @@ class DeviceVolume(Closing, Volume):
         return self.keep("places of the slices", None, 0, lambda: StackTable.of(self.volume, self.device))
 
     @classmethod
-    def _of(cls, *taken: Any) -> DeviceVolume:
-        return cls(Volume(*taken))
+    def _of(cls, *parts: Any) -> DeviceVolume:
+        return cls(Volume(*parts))
 
     def program(self, name: str, **variants: str) -> Program:
         """Build a kernel file that samples this volume along rays."""
-        own = {"UNEVEN": "1"} if self.volume.uneven else {}
-        return load_program(self.device, name, {**ray_variants(self.device, self.dtype), **own, **variants})
+        extra = {"UNEVEN": "1"} if self.volume.uneven else {}
+        return load_program(self.device, name, {**ray_variants(self.device, self.dtype), **extra, **variants})
 
     def release(self) -> None:
         """Free everything on the device."""
@@ -273,14 +273,14 @@ class DeviceVolume(Closing, Volume):
         """Limits of the memory on the device."""
         return memory_limits(self.device, self.memory)
 
-    def shortage(self, needs: Mapping[str, int], own: tuple[str, ...] = ()) -> str:
+    def shortage(self, needs: Mapping[str, int], counted: tuple[str, ...] = ()) -> str:
         """Return why the device has no room for ``needs``; empty if it has.
 
         needs: Bytes of all buffers that an operator uses at a time, the voxels among them, by description.
-        own: Kinds of kept objects that ``needs`` already counts; others are added, and dropped if they are in the way.
+        counted: Kinds of kept objects that ``needs`` counts already; others are added, and dropped if in the way.
         """
         with self._lock:
-            others = {what: kept.nbytes for what, kept in self._kept.items() if what not in own and kept.nbytes}
+            others = {what: kept.nbytes for what, kept in self._kept.items() if what not in counted and kept.nbytes}
             shortage = describe_shortage(self.limits, {**needs, **others})
             if shortage and others:
                 self._kept = {what: kept for what, kept in self._kept.items() if what not in others}
@@ -289,22 +289,22 @@ class DeviceVolume(Closing, Volume):
 
     def plan(
         self,
-        what: str,
+        name: str,
         total: int,
         needs: Callable[[int], Mapping[str, int]],
         *,
-        own: tuple[str, ...] = (),
+        counted: tuple[str, ...] = (),
         most: int | None = None,
     ) -> int:
         """Return the number of slices in a slab: ``total`` if all fit, else as many as fit, or 0.
 
-        what: Purpose of the slabs.  Thinner ones that were necessary for it before, see `attempts`, are planned again.
-        needs: Function from a number of slices to the bytes of every buffer, by description; `own` as in `shortage`.
+        name: Purpose of the slabs.  Thinner ones that were necessary for it before, see `attempts`, are planned again.
+        needs: Function from a number of slices to bytes of every buffer, by description; `counted` as in `shortage`.
         most: Most slices that kernels can process together.
         """
         limits = self.limits
-        most = min(total if most is None else most, self.most_slices.get(what, total))
-        if total <= most and not self.shortage(needs(total), own):
+        most = min(total if most is None else most, self.most_slices.get(name, total))
+        if total <= most and not self.shortage(needs(total), counted):
             return total
         low, high = 0, total  # of parts nothing is kept: others are dropped when the first one comes
         while high - low > 1:
@@ -325,7 +325,7 @@ class DeviceVolume(Closing, Volume):
             yield attempt
 
     def attempts(
-        self, what: str, slices: int, warnings: list[str] | None = None, *, fewest: int = 1
+        self, name: str, slices: int, warnings: list[str] | None = None, *, fewest: int = 1
     ) -> Iterator[Attempt[int]]:
         """Yield attempts with ``slices`` in a slab, then with half as many as long as the device has no room.
 
@@ -335,7 +335,7 @@ class DeviceVolume(Closing, Volume):
 
         The block makes all its buffers in functions that it calls: earlier ones are gone, and its own would stay.
 
-        what: As in `plan`, whose result ``slices`` are.
+        name: As in `plan`, whose result ``slices`` are.
         warnings: Gets a line for each halving.
         fewest: Fewest slices that are tried.
         """
@@ -351,8 +351,8 @@ class DeviceVolume(Closing, Volume):
             if is_last:
                 raise error
             is_last = slices <= fewest  # once more, with nothing else on the device
-            slices = self.most_slices[what] = max(fewest, -(-slices // 2))
-            log.info("%s: no room on %s, continued with slabs of %d slices", what, self.device.label, slices)
+            slices = self.most_slices[name] = max(fewest, -(-slices // 2))
+            log.info("%s: no room on %s, continued with slabs of %d slices", name, self.device.label, slices)
             if warnings is not None:
                 warnings.append(f"{error}: continued with slabs of {count_of(slices, 'slice')}")
             del error  # its frames hold buffers
@@ -390,19 +390,19 @@ class DeviceWorker(Closing):
 
 @contextmanager
 def open_volume(
-    volume: Volume | DeviceVolume, device: Device | str | int | None, memory: int | None, what: str
+    volume: Volume | DeviceVolume, device: Device | str | int | None, memory: int | None, action: str
 ) -> Iterator[DeviceVolume]:
     """Yield a volume on its device, for `what`: a given open one, or a new one that is closed at the end."""
-    made, is_new = take_volume(volume, device, memory, what)
+    resident, is_new = take_volume(volume, device, memory, action)
     try:
-        yield made
+        yield resident
     finally:
         if is_new:
-            made.close()
+            resident.close()
 
 
 def take_volume(
-    volume: Volume | DeviceVolume, device: Device | str | int | None, memory: int | None, what: str
+    volume: Volume | DeviceVolume, device: Device | str | int | None, memory: int | None, action: str
 ) -> tuple[DeviceVolume, bool]:
     """Return the same volume, which the caller closes, and whether it is new."""
     if isinstance(volume, DeviceVolume):
@@ -410,5 +410,5 @@ def take_volume(
             raise UsageError("a DeviceVolume has its device and its memory already: leave out device and memory")
         return volume, False
     if not isinstance(volume, Volume):
-        raise UsageError(f"{what} needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
+        raise UsageError(f"{action} needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
     return DeviceVolume(volume, device=device, memory=memory), True

@@ -122,21 +122,21 @@ class StackFrame:
 
     def places(self, points: NDArray[np.floating]) -> Float32Array:
         """Return the kernel's places (n, 4) of points (n, 3) in LPS mm; the last column is the slice at or below."""
-        found = self._turn(points, self._origin)
-        layers = np.searchsorted(self._heights, found[:, 2], side="right") - 1
-        found[:, 3] = np.clip(layers, 0, max(len(self._heights) - 2, 0))
-        return found
+        in_stack = self._turn(points, self._origin)
+        layers = np.searchsorted(self._heights, in_stack[:, 2], side="right") - 1
+        in_stack[:, 3] = np.clip(layers, 0, max(len(self._heights) - 2, 0))
+        return in_stack
 
     def directions(self, normals: NDArray[np.floating]) -> Float32Array:
         """Return the kernel's directions (n, 4) of unit vectors (n, 3) in LPS."""
         return self._turn(normals, np.zeros(3))
 
     def _turn(self, vectors: NDArray[np.floating], origin: Float64Array) -> Float32Array:
-        found = np.zeros((len(vectors), 4), np.float32)
+        turned = np.zeros((len(vectors), 4), np.float32)
         x, y, z = np.ascontiguousarray(vectors.T) - origin[:, None]
         for n, (a, b, c) in enumerate(self._matrix):  # a product of matrices takes eight times as long
-            found[:, n] = a * x + b * y + c * z
-        return found
+            turned[:, n] = a * x + b * y + c * z
+        return turned
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,9 +297,9 @@ class ProfileSampler:
         piece = min(PIECE, len(points))
 
         def needs(slices: int) -> dict[str, int]:
-            held = min(slices + 2 * reach + 1, nk) * resident.slice_bytes
-            own = (4 * (ROWS + RESULTS) + 32) * stride_of(piece)
-            return {"volume": held, "profiles": own, "slices": self.frame.slices.nbytes}
+            held_bytes = min(slices + 2 * reach + 1, nk) * resident.slice_bytes
+            profile_bytes = (4 * (ROWS + RESULTS) + 32) * stride_of(piece)
+            return {"volume": held_bytes, "profiles": profile_bytes, "slices": self.frame.slices.nbytes}
 
         while (planned := resident.plan(_PROFILES, nk, needs)) < 1 and piece > SMALLEST_PIECE:
             piece //= 2
@@ -337,12 +337,12 @@ class ProfileSampler:
 
     def values(self, points: NDArray[np.floating], normals: NDArray[np.floating]) -> Float32Array:
         """Return the profiles, shape (ROWS, n): HU, NaN beyond the volume, and what blurs them."""
-        found = np.empty((ROWS, len(points)), np.float32)
+        profile_values = np.empty((ROWS, len(points)), np.float32)
         for rows, values_d in self.pieces(points, normals):
             stride = stride_of(len(rows))
             piece = download(self.device, np.empty((ROWS, stride), np.float32), values_d)
-            found[:, rows] = piece[:, : len(rows)]
-        return found
+            profile_values[:, rows] = piece[:, : len(rows)]
+        return profile_values
 
     def take(self, values: Float32Array) -> WallProfiles:
         """Return profiles (ROWS, n) as they are fitted on the device."""

@@ -73,9 +73,9 @@ class _Trial(NamedTuple):
     across_mm: float
     cortex_hu: float
 
-    def changed(self, place: int, factor: float) -> _Trial:
+    def changed(self, axis: int, factor: float) -> _Trial:
         blurs = [self.blur_mm, self.across_mm]
-        blurs[place] *= factor
+        blurs[axis] *= factor
         return _Trial(blurs[0], blurs[1], self.cortex_hu)
 
 
@@ -148,10 +148,10 @@ def find_groups(
             continue
         if not _may_differ(sampler, values, scan):
             continue
-        own = _measure_walls(sampler, volume, values, scan.noise_hu)
-        is_bone = own.thick >= _FEWEST_THICK and own.cortex_hu >= COMPACT_HU
-        if is_bone and abs(own.cortex_hu - scan.cortex_hu) > _DIFFERENT * scan.cortex_hu:
-            groups.append((rows, own))
+        part_constants = _measure_walls(sampler, volume, values, scan.noise_hu)
+        is_bone = part_constants.thick >= _FEWEST_THICK and part_constants.cortex_hu >= COMPACT_HU
+        if is_bone and abs(part_constants.cortex_hu - scan.cortex_hu) > _DIFFERENT * scan.cortex_hu:
+            groups.append((rows, part_constants))
             left[rows] = False
     return [(np.flatnonzero(left), scan), *groups]
 
@@ -192,23 +192,23 @@ def _may_differ(sampler: ProfileSampler, values: Float32Array, scan: CortexConst
 
 def _search(fit: _Fit, values: Float32Array, start: _Trial) -> tuple[_Trial, int]:
     """Return the constants that describe the profiles, and how many walls are thick enough to show their HU."""
-    found = _search_blurs(fit, slice(None), start, SEARCH_STEPS)
-    cortex_hu, thick = _measure_cortex(fit, values, slice(None), found)
+    best = _search_blurs(fit, slice(None), start, SEARCH_STEPS)
+    cortex_hu, thick = _measure_cortex(fit, values, slice(None), best)
     shown = thick >= _THICK_SHARE * values.shape[1]
     for first in range(1, len(SEARCH_STEPS)):
-        other = _search_blurs(fit, slice(None), found._replace(cortex_hu=cortex_hu), SEARCH_STEPS[first:])
-        if shown and _left(fit, slice(None), other) >= _left(fit, slice(None), found):
+        candidate = _search_blurs(fit, slice(None), best._replace(cortex_hu=cortex_hu), SEARCH_STEPS[first:])
+        if shown and _left(fit, slice(None), candidate) >= _left(fit, slice(None), best):
             break
-        found = other
-        cortex_hu, thick = _measure_cortex(fit, values, slice(None), found)
+        best = candidate
+        cortex_hu, thick = _measure_cortex(fit, values, slice(None), best)
     if not shown:
-        return found._replace(cortex_hu=cortex_hu), thick
+        return best._replace(cortex_hu=cortex_hu), thick
     while True:
-        other = found._replace(cortex_hu=found.cortex_hu / _CORTEX_STEP)
-        other = _search_blurs(fit, slice(None), other, SEARCH_STEPS[2:])
-        if _left(fit, slice(None), other) >= _CLEARLY_LESS * _left(fit, slice(None), found):
-            return found, thick
-        found = other
+        candidate = best._replace(cortex_hu=best.cortex_hu / _CORTEX_STEP)
+        candidate = _search_blurs(fit, slice(None), candidate, SEARCH_STEPS[2:])
+        if _left(fit, slice(None), candidate) >= _CLEARLY_LESS * _left(fit, slice(None), best):
+            return best, thick
+        best = candidate
 
 
 def _left(fit: _Fit, part: slice, trial: _Trial) -> float:
@@ -217,25 +217,25 @@ def _left(fit: _Fit, part: slice, trial: _Trial) -> float:
     return float(np.mean(squares[: max(1, int(_TRIMMED * len(squares)))]))
 
 
-def _search_blurs(fit: _Fit, part: slice, found: _Trial, factors: tuple[float, ...]) -> _Trial:
+def _search_blurs(fit: _Fit, part: slice, best: _Trial, factors: tuple[float, ...]) -> _Trial:
     """Return the blurs that leave least of a part of the profiles, from those of a trial on."""
-    first, least = found, _left(fit, part, found)
+    first, least = best, _left(fit, part, best)
     for factor in factors:
-        for place in (0, 1):
+        for axis in (0, 1):
             for change in (factor, 1.0 / factor):
-                while (value := _left(fit, part, trial := found.changed(place, change))) < 0.9999 * least:
-                    found, least = trial, value
+                while (value := _left(fit, part, trial := best.changed(axis, change))) < 0.9999 * least:
+                    best, least = trial, value
                     if not all(1.0 / FARTHEST < new / old < FARTHEST for new, old in zip(trial, first, strict=True)):
-                        return found
-    return found
+                        return best
+    return best
 
 
-def _measure_cortex(fit: _Fit, values: Float32Array, part: slice, found: _Trial) -> tuple[float, int]:
+def _measure_cortex(fit: _Fit, values: Float32Array, part: slice, trial: _Trial) -> tuple[float, int]:
     """Return the HU of compact bone in a part of the profiles, and how many walls are thick enough to show it."""
-    fits = fit(found, _WIDE_SPREAD)
-    blurs = blurs_of(values[:, part], found.blur_mm, found.across_mm)
-    thick = (fits.thickness_mm[part] > _THICK_BLURS * blurs) & (blurs < _SHARP * found.blur_mm)
+    fits = fit(trial, _WIDE_SPREAD)
+    blurs = blurs_of(values[:, part], trial.blur_mm, trial.across_mm)
+    thick = (fits.thickness_mm[part] > _THICK_BLURS * blurs) & (blurs < _SHARP * trial.blur_mm)
     if np.count_nonzero(thick) < _FEWEST_THICK:
-        return found.cortex_hu, int(np.count_nonzero(thick))
+        return trial.cortex_hu, int(np.count_nonzero(thick))
     shown = float(np.percentile(fits.cortex_hu[part][thick], _DENSE_PERCENTILE))
-    return float(np.clip(shown, found.cortex_hu / 1.25, found.cortex_hu * 1.25)), int(np.count_nonzero(thick))
+    return float(np.clip(shown, trial.cortex_hu / 1.25, trial.cortex_hu * 1.25)), int(np.count_nonzero(thick))

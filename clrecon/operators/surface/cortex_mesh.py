@@ -111,8 +111,8 @@ def fit_walls(
     groups = [(np.arange(count), constants)]
     if components is not None:
         groups = find_groups(sampler, resident.volume, points, normals, components, constants)
-    own = tuple(known.cortex_hu for _, known in groups[1:])
-    fit = CortexFit(constants, own, np.empty(count, np.uint8), *(np.empty(count, np.float32) for _ in range(5)))
+    levels = tuple(known.cortex_hu for _, known in groups[1:])
+    fit = CortexFit(constants, levels, np.empty(count, np.uint8), *(np.empty(count, np.float32) for _ in range(5)))
     for members, known in groups:
         for piece, values_d in sampler.pieces(points[members], normals[members]):
             rows = members[piece]
@@ -145,8 +145,8 @@ def standard_errors(
     explained = unexplained_hu(constants.cortex_hu, constants.known_noise)
     left = np.maximum(walls.residual_hu, np.float32(explained)) / np.float32(np.sqrt(scale.independent))
     least = np.float32(_LEAST_ERROR * constants.blur_mm)
-    own = np.float32(_ERROR_FACTOR) * np.sqrt(walls.shift_variance) * left
-    return np.hypot(own, least), np.float32(_ERROR_FACTOR) * np.sqrt(walls.thickness_variance) * left
+    fit_errors = np.float32(_ERROR_FACTOR) * np.sqrt(walls.shift_variance) * left
+    return np.hypot(fit_errors, least), np.float32(_ERROR_FACTOR) * np.sqrt(walls.thickness_variance) * left
 
 
 _MOST_LOOKED_AT = 20_000
@@ -244,20 +244,20 @@ def find_turned(
     vertices: NDArray[np.floating], places: Float64Array, triangles: NDArray[np.uint32]
 ) -> NDArray[np.bool_]:
     """Mark the triangles that turn by more than `_LEAST_TURN` lets, where their vertices go to these places."""
-    found = np.empty(len(triangles), bool)
+    is_turned = np.empty(len(triangles), bool)
 
-    def work(where: slice) -> None:
+    def work(piece: slice) -> None:
         normals = []
         for points in (vertices, places):
-            one, two, three = (points.take(row, axis=0, mode="clip") for row in triangles[where].T.astype(np.intp))
+            one, two, three = (points.take(row, axis=0, mode="clip") for row in triangles[piece].T.astype(np.intp))
             p, q = ((corner - one).T.astype(np.float64, order="C") for corner in (two, three))
             normals.append(cross_product(p, q))
         before, after = normals
         along, *squares = (np.einsum("an,an->n", *two) for two in ((after, before), (after, after), (before, before)))
-        found[where] = along <= _LEAST_TURN * np.sqrt(squares[0] * squares[1])
+        is_turned[piece] = along <= _LEAST_TURN * np.sqrt(squares[0] * squares[1])
 
     in_threads(work, len(triangles))
-    return found
+    return is_turned
 
 
 @explains_arguments
@@ -340,16 +340,16 @@ def fit_mesh(
     )
     steps.take()
     fitted = fit.states == FITTED
-    kept = int(np.count_nonzero(fitted & (np.abs(vertices - wanted).max(axis=1) > KEPT_MM)))
+    unmoved = int(np.count_nonzero(fitted & (np.abs(vertices - wanted).max(axis=1) > KEPT_MM)))
     known = np.isin(fit.states, (FITTED, _BADLY_FITTED))
-    report = _describe(fit, resident, mesh.vertices, normals, True, kept)
-    made = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), {**mesh.report, "cortex": report})
-    made.values = {
+    report = _describe(fit, resident, mesh.vertices, normals, True, unmoved)
+    moved = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), {**mesh.report, "cortex": report})
+    moved.values = {
         "thickness_mm": np.where(known, fit.thickness_mm, np.float32(np.nan)),
         "error_mm": np.where(fitted, fit.error_mm, np.float32(np.nan)),
     }
     steps.take()
-    return made
+    return moved
 
 
 def fit_meshes(meshes: Sequence[Mesh], resident: DeviceVolume, *, progress: Progress = ignore_progress) -> list[Mesh]:
@@ -430,7 +430,7 @@ def _describe(
     points: NDArray[np.floating],
     normals: NDArray[np.floating],
     moved: bool,
-    kept: int,
+    unmoved: int,
 ) -> CortexReport:
     fitted = fit.states == FITTED
     shift, thickness = fit.shift_mm[fitted].astype(np.float64), fit.thickness_mm[fitted]
@@ -440,7 +440,7 @@ def _describe(
         own_cortex_hu=list(fit.own_cortex_hu),
         vertices=len(fit.states),
         **{name.replace(" ", "_"): count for name, count in fit.counts().items()},
-        kept=kept,
+        kept=unmoved,
         outside_mm={"mean": float(-shift.mean()), **_percentiles(-shift, 5, 50, 95)},
         error_mm=_percentiles(fit.error_mm[fitted], 50, 95),
         bias_mm=_measure_bias(fit, resident, points, normals),
@@ -468,7 +468,7 @@ def _measure_bias(
         error = getattr(known, f"{name.removesuffix('_mm').removesuffix('_hu')}_error_{name[-2:]}")
         ends = []
         for sign in (-1.0, 1.0):
-            other = known.changed(**{name: getattr(known, name) + sign * error})
-            ends.append(walls.fit_with(other).shift_mm.astype(np.float64).mean())
+            shifted = known.changed(**{name: getattr(known, name) + sign * error})
+            ends.append(walls.fit_with(shifted).shift_mm.astype(np.float64).mean())
         changes.append(0.5 * (ends[1] - ends[0]))
     return float(np.linalg.norm(changes))

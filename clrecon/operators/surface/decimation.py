@@ -105,11 +105,11 @@ def plan_crossings(
     size = (np.floor((beyond - origin)[1:] / edges[:, None].astype(np.float64)) + 1.0).astype(np.int64)  # y, z
     first_row = np.concatenate([[0], np.cumsum(size.prod(axis=1))])
     row, longest_of = np.empty(len(longest), np.int64), np.zeros(len(edges))
-    for each, width in enumerate(edges.astype(np.float64)):
-        own = np.flatnonzero(level == each) if each else slice(None)  # coarse ones are entered anew
-        y, z = (((low[axis, own] - origin[axis]) / width).astype(np.int64) for axis in (1, 2))
-        row[own] = first_row[each] + y + size[each, 0] * z
-        longest_of[each] = longest[level == each].max(initial=0.0)
+    for step, width in enumerate(edges.astype(np.float64)):
+        rows = np.flatnonzero(level == step) if step else slice(None)  # coarse ones are entered anew
+        y, z = (((low[axis, rows] - origin[axis]) / width).astype(np.int64) for axis in (1, 2))
+        row[rows] = first_row[step] + y + size[step, 0] * z
+        longest_of[step] = longest[level == step].max(initial=0.0)
     bits = low[0].view(np.int32)
     order = np.argsort(row << 32 | np.where(bits < 0, ~bits, bits ^ np.int32(-(2**31))).view(np.uint32))
     starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=first_row[-1]))]).astype(np.uint32)
@@ -233,16 +233,16 @@ class DeviceBounds(SurfaceBounds):
         device, surface = self._device, self._surface
         squares = np.empty(len(points), np.float32)
         rows = np.empty(len(points), np.int32)
-        for where in chunks(len(points), self.part):
-            count = where.stop - where.start
-            here = (upload(device, points[where].astype(np.float32)), upload(device, near[where].astype(np.int32)))
-            found = empty_output(device, (count,), np.float32), empty_output(device, (count,), np.int32)
+        for piece in chunks(len(points), self.part):
+            count = piece.stop - piece.start
+            here = (upload(device, points[piece].astype(np.float32)), upload(device, near[piece].astype(np.int32)))
+            buffers = empty_output(device, (count,), np.float32), empty_output(device, (count,), np.int32)
             launch(
                 device, self._program["find_near_faces"], count, points=here[0], near=here[1], **surface,
-                squares=found[0][1], rows=found[1][1], hints=near.shape[1], walks=walks, enough=self._most(limit),
+                squares=buffers[0][1], rows=buffers[1][1], hints=near.shape[1], walks=walks, enough=self._most(limit),
                 count=count,
             )  # fmt: skip
-            squares[where], rows[where] = download(device, *found[0]), download(device, *found[1])
+            squares[piece], rows[piece] = download(device, *buffers[0]), download(device, *buffers[1])
         length = np.sqrt(squares) + np.float32(self.slack)
         length[rows < 0] = np.inf
         return length, rows
@@ -258,15 +258,15 @@ class DeviceBounds(SurfaceBounds):
             "names": upload(device, names.astype(np.int32)),
             "beside": upload(device, beside),
         }
-        for where in chunks(len(triangles), self.part):
-            count = where.stop - where.start
-            faces = upload(device, triangles[where])
-            found = empty_output(device, (WITNESSES, count), np.int32), empty_output(device, (count,), np.uint8)
+        for piece in chunks(len(triangles), self.part):
+            count = piece.stop - piece.start
+            faces = upload(device, triangles[piece])
+            buffers = empty_output(device, (WITNESSES, count), np.int32), empty_output(device, (count,), np.uint8)
             launch(
                 device, self._program["find_witnesses"], count, triangles=faces, **of_vertices, **self._surface,
-                witnesses=found[0][1], left=found[1][1], enough=self._most(limit), count=count,
+                witnesses=buffers[0][1], left=buffers[1][1], enough=self._most(limit), count=count,
             )  # fmt: skip
-            witnesses[:, where], left[where] = download(device, *found[0]), download(device, *found[1])
+            witnesses[:, piece], left[piece] = download(device, *buffers[0]), download(device, *buffers[1])
         return witnesses, left
 
 

@@ -259,17 +259,17 @@ def _open(
     below: bool,
     *,
     progress: Progress | None,
-    **where: Any,
+    **options: Any,
 ) -> Iterator[SurfaceExtractor]:
     """Yield an extractor for a volume, or with `solid` for one in which what the level encloses is filled."""
     with ExitStack() as opened:
         if solid:
             if below or np.ndim(iso_value):  # type: ignore[arg-type]
                 raise UsageError(f"{name_parameter('solid', True)} goes with one iso value, not with below or a range")
-            volume = fill_enclosed(volume, iso_value, progress=progress, **where)  # type: ignore[arg-type]
+            volume = fill_enclosed(volume, iso_value, progress=progress, **options)  # type: ignore[arg-type]
             if isinstance(volume, DeviceVolume):
                 opened.enter_context(volume)
-        yield opened.enter_context(SurfaceExtractor(volume, **where))
+        yield opened.enter_context(SurfaceExtractor(volume, **options))
 
 
 @explains_arguments

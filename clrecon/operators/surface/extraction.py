@@ -42,8 +42,8 @@ def _refuse_level(device: Device, volume: Volume, rule: IsoRule) -> ClreconError
         return NoSurfaceError(f"no surface of {rule.describe()}: {how_many} voxel lies within, {runs}")
     if low < rule.lowest_inside <= high:
         return _refuse_device(device, rule, runs)
-    where = "above" if rule.lowest_inside > high else "at or below the lowest of"
-    return NoSurfaceError(f"no surface {rule.phrase()}: {runs}, the iso value lies {where} that range")
+    relation = "above" if rule.lowest_inside > high else "at or below the lowest of"
+    return NoSurfaceError(f"no surface {rule.phrase()}: {runs}, the iso value lies {relation} that range")
 
 
 def _refuse_device(device: Device, rule: IsoRule, runs: str) -> DeviceError:
@@ -230,15 +230,15 @@ class Extraction:
         """Refuse a slab whose mesh does not fit beside the other buffers; record the memory of the slab."""
         needs = slab.needs(counted.output())
         needs["active words"] = 4 * counted.active_words
-        kept = self.resident.kept_bytes(BRICKS)
-        if slab.is_whole and kept:
-            needs[BRICKS] = kept
+        bricks_size = self.resident.kept_bytes(BRICKS)
+        if slab.is_whole and bricks_size:
+            needs[BRICKS] = bricks_size
         shortage = self.resident.shortage(needs, (BRICKS,))
         if shortage:
             raise DeviceMemoryError(shortage)
         output, volume = sum(counted.output().values()), needs["volume"]
-        for what, size in (("volume", volume), ("output", output), ("scratch", sum(needs.values()) - volume - output)):
-            self.largest[what] = max(self.largest[what], size)
+        for kind, size in (("volume", volume), ("output", output), ("scratch", sum(needs.values()) - volume - output)):
+            self.largest[kind] = max(self.largest[kind], size)
 
     def _describe_cells(self) -> tuple[dict[str, int], dict[str, Any] | None]:
         """Cells that are visited, of all; of a surface that is grown also the active and the grown ones, and what was
@@ -252,10 +252,10 @@ class Extraction:
     def describe(self, vertices: int, triangles: int) -> dict[str, Any]:
         """Return the report of a mesh: how it was made, without patient data."""
         rule = self.grid.rule
-        said = rule.as_report()
+        rule_facts = rule.as_report()
         cells, growing = self._describe_cells()
         return {
-            **said,
+            **rule_facts,
             "closed_at_border": rule.closed,
             "topology": rule.topology,
             "outside_hu": rule.outside if rule.closed else None,
@@ -272,7 +272,7 @@ class Extraction:
             "warnings": [
                 *self.device.warnings,
                 *warnings_of_far(self.grid.volume),
-                *warn_of_face(self.grid.volume, said["inside_hu"], "surface"),
+                *warn_of_face(self.grid.volume, rule_facts["inside_hu"], "surface"),
                 *warnings_of_rule(rule.vertex_rule),
                 *self.warnings,
             ],

@@ -46,9 +46,9 @@ def find_cell_near(
 ) -> tuple[int, int, int]:
     """Return the active cell (k, j, i), by the mask of the whole grid, whose centre is nearest to a point, LPS mm."""
     for reach in (_NEAR_MM, SEED_REACH_MM):
-        found = _look(device, grid, classified, point, reach)
-        if found is not None and found[1] <= reach:
-            return found[0]
+        nearest = _look(device, grid, classified, point, reach)
+        if nearest is not None and nearest[1] <= reach:
+            return nearest[0]
     farther = _look(device, grid, classified, point, FARTHEST_TOLD_MM)
     raise UsageError(_describe_lone(grid, point, None if farther is None else farther[1]))
 

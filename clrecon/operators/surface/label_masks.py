@@ -120,10 +120,10 @@ _SAMPLES_PER_FLAGS = 32 * kernel_constant("surface/label_masks.cl", "STRIP")
 
 def prepare_label_masks(device: Device, label_dtype: DTypeLike = np.uint8) -> tuple[Program, Program]:
     """Build the kernels for labels of this type: those of the occupancy and those of the surface."""
-    own = load_program(
+    mask_program = load_program(
         device, "surface/label_masks.cl", {"VOXEL": "short", "VALUE": "int", **label_variants(label_dtype)}
     )
-    return own, marching_cubes.prepare_marching_cubes(device, np.int16, label_dtype, masks=True)
+    return mask_program, marching_cubes.prepare_marching_cubes(device, np.int16, label_dtype, masks=True)
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
                 self._smooth(held_map, 0, around, occupied_d)  # type: ignore[arg-type]
         return held_map
 
-    def _smooth(self, held: HeldMap, number: int, box: Box, occupancy_d: Any) -> None:
+    def _smooth(self, slab: HeldMap, number: int, box: Box, occupancy_d: Any) -> None:
         """Smooth a label (0: all) to its occupancy in a box and REACH samples around it, which gradients need."""
         ni, nj, nk = self.labels.shape_ijk
         inner = [
@@ -210,69 +210,69 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
         ]
         (begin_k, end_k), (begin_j, end_j), (begin_i, end_i) = inner
         row_j = max(0, begin_j - REACH), min(nj, end_j + REACH)
-        row_k = max(held.first, begin_k - REACH), min(held.end, end_k + REACH)
+        row_k = max(slab.first, begin_k - REACH), min(slab.end, end_k + REACH)
         slices = row_k[1] - row_k[0]
         launch(
-            self.device, self.programs()[0]["smooth_rows"], slices * (row_j[1] - row_j[0]), map=held.map_d,
-            rows=held.rows_d, strips=held.strips_d, label=number, ni=ni, nj=nj, begin_i=begin_i, end_i=end_i,
-            begin_j=row_j[0], end_j=row_j[1], begin_slice=row_k[0] - held.first, slices=slices,
+            self.device, self.programs()[0]["smooth_rows"], slices * (row_j[1] - row_j[0]), map=slab.map_d,
+            rows=slab.rows_d, strips=slab.strips_d, label=number, ni=ni, nj=nj, begin_i=begin_i, end_i=end_i,
+            begin_j=row_j[0], end_j=row_j[1], begin_slice=row_k[0] - slab.first, slices=slices,
         )  # fmt: skip
         launch(
-            self.device, self.programs()[0]["smooth_across"], (end_k - begin_k) * (end_j - begin_j), rows=held.rows_d,
-            strips=held.strips_d, occupancy=occupancy_d, ni=ni, nj=nj, nk=nk, begin_i=begin_i, end_i=end_i,
-            begin_j=begin_j, end_j=end_j, first_row_slice=held.first, first_slice=begin_k, slices=end_k - begin_k,
+            self.device, self.programs()[0]["smooth_across"], (end_k - begin_k) * (end_j - begin_j), rows=slab.rows_d,
+            strips=slab.strips_d, occupancy=occupancy_d, ni=ni, nj=nj, nk=nk, begin_i=begin_i, end_i=end_i,
+            begin_j=begin_j, end_j=end_j, first_row_slice=slab.first, first_slice=begin_k, slices=end_k - begin_k,
         )  # fmt: skip
 
     def keep_enclosed(self, numbers: Sequence[int], boxes: dict[int, Box]) -> None:
         """Find the levels of enclosed labels, which do not depend on the labels that are asked for."""
-        own = {number: boxes[number] for number in numbers}
+        chosen_boxes = {number: boxes[number] for number in numbers}
         try:
-            self._measure_enclosed(self.group(own), own)
+            self._measure_enclosed(self.group(chosen_boxes), chosen_boxes)
         except DeviceMemoryError as error:
             self.warnings.append(f"{error}: continued with one label at a time")
-            self._measure_enclosed([{number: box} for number, box in own.items()], own)
+            self._measure_enclosed([{number: box} for number, box in chosen_boxes.items()], chosen_boxes)
 
     def _measure_enclosed(self, groups: list[dict[int, Box]], boxes: dict[int, Box]) -> None:
-        held = [self.hold(groups[0])] if len(groups) == 1 else []
+        slab = [self.hold(groups[0])] if len(groups) == 1 else []
         voxel_mm3 = abs(np.linalg.det(self.labels.affine[:3, :3]))
 
         def measure(levels: dict[int, int]) -> dict[int, float]:
             self.levels = levels
-            found = {}
+            volumes = {}
             for group in groups:
-                there = held[0] if held else self.hold(group)
+                there = slab[0] if slab else self.hold(group)
                 for number, box in group.items():
                     started = self._start_one(there, number, box)
-                    found[number] = started.enclosed_mm3(levels[number]) / voxel_mm3
-            return found
+                    volumes[number] = started.enclosed_mm3(levels[number]) / voxel_mm3
+            return volumes
 
         self.levels = choose_levels(Borders.of(self.labels.voxels, list(boxes), boxes), measure)
 
-    def _start_one(self, held: HeldMap, number: int, box: Box) -> StartedMesh:
+    def _start_one(self, slab: HeldMap, number: int, box: Box) -> StartedMesh:
         """Make all of a label's mesh except its vertices, which depend on levels."""
         device, stopwatch = self.device, self.stopwatch
-        own, surface = self.programs()
-        window = self.window(box, (held.first, held.end))
+        mask_program, surface = self.programs()
+        window = self.window(box, (slab.first, slab.end))
         classified = self.empty_mask(window)
         with stopwatch.running(device):
-            self._smooth(held, number, box, held.occupancy_d)
+            self._smooth(slab, number, box, slab.occupancy_d)
             launch(
-                device, own["classify_mask"], window.mask_rows,
-                map=held.map_d, mask=classified.mask_d, row_extents=classified.row_extents_d, label=number,
+                device, mask_program["classify_mask"], window.mask_rows,
+                map=slab.map_d, mask=classified.mask_d, row_extents=classified.row_extents_d, label=number,
                 begin_j=box[1].start, end_j=box[1].stop, **window.arguments,
             )  # fmt: skip
             counted = count(device, window, classified)
         self.check_output(window, counted)
         emission = marching_cubes.Emission(
-            device, window, surface, held.occupancy_d, classified, counted, self.placement, stopwatch
+            device, window, surface, slab.occupancy_d, classified, counted, self.placement, stopwatch
         )
         with stopwatch.running(device):
             emission.triangles()
-        return StartedMesh(self, held, number, box, counted, emission)
+        return StartedMesh(self, slab, number, box, counted, emission)
 
-    def extract_one(self, held: HeldMap, number: int, box: Box) -> tuple[Part, int]:
+    def extract_one(self, slab: HeldMap, number: int, box: Box) -> tuple[Part, int]:
         """Return positions, normals and triangles of one label, and the level that places them."""
-        started = self._start_one(held, number, box)
+        started = self._start_one(slab, number, box)
         level = self.levels.get(number)
         if level is None:
             return started.keep_volume(1000.0 * label_ml(self.labels, number), self.grid.rule.closed)
@@ -300,10 +300,10 @@ class StartedMesh:
     emission: marching_cubes.Emission
 
     def place(self, level: int) -> None:
-        held = self.held
+        slab = self.held
         biases_d = upload(self.run.device, level_biases(self.run.levels, self.run.labels.numbers[-1] + 1))
         with self.run.stopwatch.running(self.run.device):
-            self.emission.vertices(level, map=held.map_d, label=self.number, occupied=held.occupied_d, biases=biases_d)
+            self.emission.vertices(level, map=slab.map_d, label=self.number, occupied=slab.occupied_d, biases=biases_d)
 
     def enclosed_mm3(self, level: int) -> float:
         """Return the volume that the mesh encloses at a level: the device sums pieces, the host the rest."""
@@ -430,8 +430,8 @@ def _make_meshes(run: MaskExtraction, chosen: Sequence[int], progress: Progress)
     boxes = {number: everywhere[number] for number in chosen}
     meshes: dict[int, Mesh] = {}
     for number, ((positions, normals, triangles), level) in run.extract_each(boxes, progress):
-        own = {"label": number, "label_name": labels.name(number), "label_ml": label_ml(labels, number)}
-        mesh = Mesh(run.placement.to_lps(positions), triangles, normals, {**run.describe(), **own}, trusted=True)
+        of_label = {"label": number, "label_name": labels.name(number), "label_ml": label_ml(labels, number)}
+        mesh = Mesh(run.placement.to_lps(positions), triangles, normals, {**run.describe(), **of_label}, trusted=True)
         mesh_ml = enclosed_ml(mesh.vertices, triangles) if run.grid.rule.closed else None
         mesh.report |= {"mask_level": level / FULL, "label_mesh_ml": mesh_ml}
         mesh.report["warnings"] += warn_of_volume(mesh.report)

@@ -67,11 +67,11 @@ def each_label(
     while waiting:
         left = dict(waiting.pop(0))
         try:
-            held = hold(left)
+            slab = hold(left)
             for number, box in list(left.items()):
-                made = extract(held, number, box)
+                surface = extract(slab, number, box)
                 del left[number]
-                yield number, made
+                yield number, surface
         except DeviceMemoryError as error:
             if len(left) == 1:
                 if not retried.isdisjoint(left):
@@ -109,7 +109,7 @@ class ExtractionByLabel(Generic[Held, Made]):
         """Upload the slices that the labels need, and compute what they share."""
         raise NotImplementedError
 
-    def extract_one(self, held: Held, number: int, box: Box) -> Made:
+    def extract_one(self, slab: Held, number: int, box: Box) -> Made:
         raise NotImplementedError
 
     def group(self, boxes: dict[int, Box]) -> list[dict[int, Box]]:
@@ -120,9 +120,9 @@ class ExtractionByLabel(Generic[Held, Made]):
             return [boxes]
         return [{number: box} for number, box in boxes.items()]
 
-    def window(self, box: Box, held: tuple[int, int]) -> Window:
+    def window(self, box: Box, ends: tuple[int, int]) -> Window:
         """Return the slices of the sample grid around a label's box."""
-        return Window(self.grid, box[0].start, box[0].stop + 2 * self.grid.rule.border, held)
+        return Window(self.grid, box[0].start, box[0].stop + 2 * self.grid.rule.border, ends)
 
     def extract_each(self, boxes: dict[int, Box], progress: Progress) -> Iterator[tuple[int, Made]]:
         """Yield labels with their surfaces, as many at once as fit the device."""
@@ -130,13 +130,13 @@ class ExtractionByLabel(Generic[Held, Made]):
         self.groups = len(groups)
         done = 0
 
-        def extract(held: Held, number: int, box: Box) -> Made:
+        def extract(slab: Held, number: int, box: Box) -> Made:
             progress("labels", done, len(boxes))
-            return self.extract_one(held, number, box)
+            return self.extract_one(slab, number, box)
 
-        for number, made in each_label(groups, self.hold, extract, self.warnings):
-            done += made is not None
-            yield number, made
+        for number, surface in each_label(groups, self.hold, extract, self.warnings):
+            done += surface is not None
+            yield number, surface
 
     def empty_mask(self, window: Window) -> Classified:
         """Make the mask of a label on the device, if it has room for what finds the surface."""
@@ -185,7 +185,7 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
     def __init__(
         self,
         resident: DeviceVolume,
-        taken: ResampledLabels,
+        placed: ResampledLabels,
         rule: IsoRule,
         growth: Growth,
         solid: bool,
@@ -197,7 +197,7 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
         super().__init__(device, resident.memory, SampleGrid(volume, rule), placement, warnings)
         self.resident = resident
         self.volume = volume
-        self.labels = taken.voxels
+        self.labels = placed.voxels
         self.rule = rule
         self.growth = growth
         self.solid = solid
@@ -236,7 +236,7 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
         device, stopwatch, resident = self.device, self.stopwatch, self.resident
         first, end = self.slices_for(boxes)
         check_budget(device, self.needs(first, end), resident.memory)
-        own, _ = self.programs()
+        label_program, _ = self.programs()
         is_whole = end - first == self.volume.shape_ijk[2] and resident.is_held
         voxels_d = resident.whole(stopwatch) if is_whole else resident.part(first, end, stopwatch)
         labels = self.labels[first:end]
@@ -247,8 +247,9 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
         inside_d = allocate(device, labels.nbytes)
         with stopwatch.running(device):
             launch(
-                device, own["own_samples"], labels.size, voxels=voxels_d, labels=labels_d, near=near_d, inside=inside_d,
-                level=self.level, nk=labels.shape[0], nj=labels.shape[1], ni=labels.shape[2], offsets=len(near),
+                device, label_program["own_samples"], labels.size, voxels=voxels_d, labels=labels_d, near=near_d,
+                inside=inside_d, level=self.level, nk=labels.shape[0], nj=labels.shape[1], ni=labels.shape[2],
+                offsets=len(near),
             )  # fmt: skip
         if self.solid:
             inside_d = self._fill(boxes, first, end, inside_d)
@@ -265,16 +266,16 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
         with self.stopwatch.timed("upload"):
             return upload(self.device, part)
 
-    def extract_one(self, held: HeldSlices, number: int, box: Box) -> Part | None:
+    def extract_one(self, slab: HeldSlices, number: int, box: Box) -> Part | None:
         """Return positions, normals and triangles of one label, None if no sample is inside of it."""
         device, stopwatch = self.device, self.stopwatch
-        own, surface = self.programs()
-        window = self.window(box, (held.first, held.end))
+        label_program, surface = self.programs()
+        window = self.window(box, (slab.first, slab.end))
         classified = self.empty_mask(window)
         half_way_d = allocate(device, 4)
         with stopwatch.running(device):
             launch(
-                device, own["classify_label"], window.mask_rows, inside=held.inside_d, mask=classified.mask_d,
+                device, label_program["classify_label"], window.mask_rows, inside=slab.inside_d, mask=classified.mask_d,
                 row_extents=classified.row_extents_d, half_way_count=half_way_d, label=number, **window.arguments,
             )  # fmt: skip
             counted = count(device, window, classified)
@@ -282,8 +283,8 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
             return None
         self.check_output(window, counted)
         part = marching_cubes.Emission(
-            device, window, surface, held.voxels_d, classified, counted, self.placement, stopwatch
-        ).run(inside=held.inside_d, label=number, half_way_count=half_way_d)
+            device, window, surface, slab.voxels_d, classified, counted, self.placement, stopwatch
+        ).run(inside=slab.inside_d, label=number, half_way_count=half_way_d)
         half_way = int(download(device, np.empty(1, np.uint32), half_way_d)[0])
         self.share_by_hu = 1.0 - half_way / counted.vertices
         return part
@@ -320,10 +321,10 @@ _FILLS = "the whole CT is inside of it, and a surface that ends open has nowhere
 
 
 def _refuse_label(
-    volume: Volume, taken: ResampledLabels, labels: LabelMap, rule: IsoRule, number: int
+    volume: Volume, placed: ResampledLabels, labels: LabelMap, rule: IsoRule, number: int
 ) -> NoSurfaceError:
     label = f"{number} {labels.name(number)}"
-    mask = taken.voxels == number
+    mask = placed.voxels == number
     if not mask.any():
         return NoSurfaceError(f"label {label} has no voxel in the CT: it lies outside")
     hu = volume.voxels[mask]
@@ -401,7 +402,7 @@ def extract_labels(
         As `extract_isosurface`.
     """
     with open_volume(volume, device, memory, "a surface of a label") as resident:
-        taken = resident.bring(labels)
+        placed = resident.bring(labels)
         level, chosen = settle_level(resident.volume, iso_value)
         rule = choose_iso_rule(resident.volume, level, closed=closed, values=resident.values)
         marching_cubes.check_row(resident.volume.shape_ijk[0])
@@ -409,34 +410,34 @@ def extract_labels(
 
         for attempt in resident.with_fallback():
             with attempt as (_, warnings):
-                run = LabelExtraction(resident, taken, rule, growth, solid, warnings)
-                meshes = _make_meshes(run, labels, taken, label, progress or ignore_progress)
+                run = LabelExtraction(resident, placed, rule, growth, solid, warnings)
+                meshes = _make_meshes(run, labels, placed, label, progress or ignore_progress)
     if not meshes:
-        raise _refuse_all(resident.volume, taken, labels, rule)
+        raise _refuse_all(resident.volume, placed, labels, rule)
     for mesh in meshes.values():
         mesh.report.update(chosen)
     return meshes
 
 
-def _refuse_all(volume: Volume, taken: ResampledLabels, labels: LabelMap, rule: IsoRule) -> NoSurfaceError:
+def _refuse_all(volume: Volume, placed: ResampledLabels, labels: LabelMap, rule: IsoRule) -> NoSurfaceError:
     """The error where no label has a surface: none has a dense voxel, or one is all of an open volume."""
-    for values, numbers in zip(volume.voxels, taken.voxels, strict=True):
+    for values, numbers in zip(volume.voxels, placed.voxels, strict=True):
         dense = numbers[(numbers > 0) & rule.mark_inside(values)]
         if dense.size:
-            return _refuse_label(volume, taken, labels, rule, int(dense[0]))
+            return _refuse_label(volume, placed, labels, rule, int(dense[0]))
     return NoSurfaceError(f"no label has a voxel of {rule.iso_value:g} HU or more in the CT")
 
 
 def _make_meshes(
     run: LabelExtraction,
     labels: LabelMap,
-    taken: ResampledLabels,
+    placed: ResampledLabels,
     label: Sequence[int | str] | int | str | None,
     progress: Progress,
 ) -> dict[int, Mesh]:
     chosen = labels.choose(label)
-    boxes = find_boxes(taken.voxels, chosen, run.growth.reach)
-    refuse = None if label is None else partial(_refuse_label, run.volume, taken, labels, run.rule)
+    boxes = find_boxes(placed.voxels, chosen, run.growth.reach)
+    refuse = None if label is None else partial(_refuse_label, run.volume, placed, labels, run.rule)
     missing = [number for number in chosen if number not in boxes]
     if missing and refuse is not None:
         raise refuse(missing[0])
@@ -446,14 +447,14 @@ def _make_meshes(
             if refuse is not None:
                 raise refuse(number)
             continue
-        report = {**run.describe(), **_describe_label(run.volume, labels, taken, number, boxes[number])}
-        meshes[number] = _as_mesh(run, taken, report, part)
+        report = {**run.describe(), **_describe_label(run.volume, labels, placed, number, boxes[number])}
+        meshes[number] = _as_mesh(run, placed, report, part)
     return meshes
 
 
-def _as_mesh(run: LabelExtraction, taken: ResampledLabels, report: dict[str, Any], part: Part) -> Mesh:
+def _as_mesh(run: LabelExtraction, placed: ResampledLabels, report: dict[str, Any], part: Part) -> Mesh:
     report["vertices_by_hu_share"] = run.share_by_hu
-    warnings = list(taken.warnings)
+    warnings = list(placed.warnings)
     if report["label_inside_share"] < 1.0:
         share = 100.0 * (1.0 - report["label_inside_share"])
         warnings.append(
@@ -468,11 +469,11 @@ def _as_mesh(run: LabelExtraction, taken: ResampledLabels, report: dict[str, Any
     return mesh
 
 
-def _describe_label(volume: Volume, labels: LabelMap, taken: ResampledLabels, number: int, box: Box) -> dict[str, Any]:
+def _describe_label(volume: Volume, labels: LabelMap, placed: ResampledLabels, number: int, box: Box) -> dict[str, Any]:
     return {
         "label": number,
         "label_name": labels.name(number),
-        "label_inside_share": taken.inside[number],
+        "label_inside_share": placed.inside[number],
         "label_ml": label_ml(labels, number),
-        "label_taken_ml": count_ml(taken.voxels, number, box, slice_voxel_ml(volume)),
+        "label_taken_ml": count_ml(placed.voxels, number, box, slice_voxel_ml(volume)),
     }

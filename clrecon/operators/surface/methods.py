@@ -104,11 +104,11 @@ def extract_soup(volume: Volume, rule: IsoRule) -> NDArray[np.float64]:
 def weld(soup: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
     """Join corners at the same place: vertices (n, 3) in the order of their first triangle, and triangles (m, 3)."""
     corners = np.ascontiguousarray(soup.reshape(-1, 3)) + 0.0  # + 0.0: no two zeros
-    _, first, found = np.unique(corners.view("V24"), return_index=True, return_inverse=True)
+    _, first, inverse = np.unique(corners.view("V24"), return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    return corners[first[order]], rank[found.reshape(-1)].reshape(-1, 3).astype(np.uint32)
+    return corners[first[order]], rank[inverse.reshape(-1)].reshape(-1, 3).astype(np.uint32)
 
 
 DECIMATED_SHARE = 0.9
@@ -145,10 +145,10 @@ def check_method(
     """Return a method of the table; `plain`: the surface of what lies above one iso value."""
     if method not in METHODS:
         raise UsageError(f"there is no {name_parameter('method', method)}: it is one of {', '.join(METHODS)}")
-    chosen, said = METHODS[method], name_parameter("method", method)
+    chosen, method_name = METHODS[method], name_parameter("method", method)
     if grows and not chosen.grows:
         raise UsageError(
-            f"{said} makes the whole surface: leave {name_parameter('grow_from')} out, or take"
+            f"{method_name} makes the whole surface: leave {name_parameter('grow_from')} out, or take"
             f" {name_parameter('method', 'i-mc')}"
         )
     if (grows or chosen.grows) and topology != "separated":
@@ -159,10 +159,10 @@ def check_method(
         return chosen
     for name, value, usual in (("vertex_rule", vertex_rule, "linear"), ("topology", topology, "separated")):
         if value != usual:
-            raise UsageError(f"{said} has its own rules: leave {name_parameter(name, value)} out")
+            raise UsageError(f"{method_name} has its own rules: leave {name_parameter(name, value)} out")
     if not plain:
         raise UsageError(
-            f"{said} takes one iso value, what lies above it is inside: neither ranges nor what lies below"
+            f"{method_name} takes one iso value, what lies above it is inside: neither ranges nor what lies below"
         )
     return chosen
 
@@ -279,10 +279,10 @@ def _extract_by_skimage(volume: Volume, rule: IsoRule) -> tuple[np.ndarray[Any, 
     if rule.closed:
         values = np.pad(values, 1, constant_values=np.float32(rule.outside))
     try:
-        found, faces, _, _ = marching_cubes(values, rule.iso_level, allow_degenerate=False)
+        points, faces, _, _ = marching_cubes(values, rule.iso_level, allow_degenerate=False)
     except (ValueError, RuntimeError) as error:
         raise NoSurfaceError(f"no surface {rule.phrase()}: {error}") from error
-    vertices = volume.ijk_to_lps(found[:, ::-1].astype(np.float64) - rule.border)
+    vertices = volume.ijk_to_lps(points[:, ::-1].astype(np.float64) - rule.border)
     # In (k, j, i) its triangles are counter-clockwise as seen from higher values; reversing the axes mirrors them.
     triangles = faces[:, ::-1] if is_left_handed(volume.affine) else faces
     return vertices, np.ascontiguousarray(triangles, np.uint32)

@@ -163,7 +163,7 @@ def plan_slabs(grid: SampleGrid, resident: DeviceVolume) -> int:
     # A slab classifies two more slices than it owns.
     most_mask_slices = (MOST_WORDS - 1) // (grid.shape[1] << grid.row_shift)
     most = None if gk <= most_mask_slices else most_mask_slices - 2
-    slices = resident.plan(grid.kind, gk, needs, own=(BRICKS,), most=most)
+    slices = resident.plan(grid.kind, gk, needs, counted=(BRICKS,), most=most)
     if slices == 0:
         first = min(2, gk - 1)
         shortest = Slab(grid, first, first + 1).needs()

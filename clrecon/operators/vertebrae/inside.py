@@ -69,9 +69,9 @@ def measure_thickness(mask: Mask) -> ShellThickness:
     if not total or not counts[0]:
         return ShellThickness(limit, 0.0, None, None)
     left = np.maximum.accumulate(np.array([*counts, 0])[::-1])[::-1]  # openings by lattice balls may grow again
-    own = -np.diff(left)  # voxels whose largest ball is that of each radius
-    thickness = 2.0 * radii[: len(own)]
-    share = np.cumsum(own) / own.sum()
+    volumes = -np.diff(left)  # voxels whose largest ball is that of each radius
+    thickness = 2.0 * radii[: len(volumes)]
+    share = np.cumsum(volumes) / volumes.sum()
     median, p95 = (float(thickness[np.searchsorted(share, part)]) for part in (0.5, 0.95))
     return ShellThickness(limit, counts[0] / total, median, p95)
 
@@ -153,8 +153,8 @@ class VertebraInside:
     @property
     def masks(self) -> dict[str, Mask]:
         """The masks by the names of ``PARTS``, without those that are absent or empty."""
-        found = {name: getattr(self, name) for name in PARTS}
-        return {name: mask for name, mask in found.items() if mask is not None and mask.count}
+        by_name = {name: getattr(self, name) for name in PARTS}
+        return {name: mask for name, mask in by_name.items() if mask is not None and mask.count}
 
     @cached_property
     def volumes_ml(self) -> dict[str, float]:
@@ -196,8 +196,8 @@ class VertebraInside:
         """
         meshes: dict[str, Mesh] = {}
         for names in (PARTS[:-1], PARTS[-1:]):
-            held = {name: mask for name, mask in self.masks.items() if name in names}
-            label_masks = extract_label_masks(self._map(held), device=self.solid.device, memory=memory)
+            masks = {name: mask for name, mask in self.masks.items() if name in names}
+            label_masks = extract_label_masks(self._map(masks), device=self.solid.device, memory=memory)
             meshes |= {PARTS[number - 1]: mesh for number, mesh in label_masks.items()}
         for mesh in meshes.values():
             mesh.report["certificate"] = self.volume.report
@@ -292,20 +292,20 @@ def vertebra_inside(
         if not dense_bone.count:
             raise _refuse_band(crop, solid, band)
         bone = solid.to_numpy()
-        found = find_canal(bone, crop.volume) if crop.axial else None
+        canal_found = find_canal(bone, crop.volume) if crop.axial else None
         canal = None
-        if found is not None:  # other labels that are bone are neighbours; the cord and the sac have labels too
-            canal = Mask.from_array(resident, found.voxels) - (others & _mark_bone(resident))
+        if canal_found is not None:  # other labels that are bone are neighbours; the cord and the sac have labels too
+            canal = Mask.from_array(resident, canal_found.voxels) - (others & _mark_bone(resident))
     trabecular = solid - dense_bone
     dense_bone.name, trabecular.name = name_band(band), f"solid bone without {name_band(band)}"
     if canal is not None:
         canal.name = f"canal of {crop.name}"
-    warnings = [*crop.warnings, *_warn_of_canal(crop, found)]
+    warnings = [*crop.warnings, *_warn_of_canal(crop, canal_found)]
     if iso_value is None:
         warnings += _warn_of_missed(in_band, dense_bone, solid, others, band)
     return VertebraInside(
         crop.number, crop.name, crop.volume, solid, dense_bone, trabecular, canal, band, iso_value,
-        crop.inside_share, measure_thickness(dense_bone), found, cortex, warnings,
+        crop.inside_share, measure_thickness(dense_bone), canal_found, cortex, warnings,
     )  # fmt: skip
 
 
@@ -353,15 +353,15 @@ def _refuse_band(crop: LabelCrop, solid: Mask, band: tuple[float, float]) -> NoS
     )
 
 
-def _warn_of_canal(crop: LabelCrop, found: Canal | None) -> list[str]:
+def _warn_of_canal(crop: LabelCrop, canal: Canal | None) -> list[str]:
     called = f"label {crop.number} {crop.name}"
     if not crop.axial:
         return [f"no canal of {called}: the slices are not axial, and uneven ones are not turned"]
-    if found is None:
+    if canal is None:
         return [f"no canal of {called}: its arch is closed in no slice, nor in some neighbouring slices together"]
-    if found.height_mm < LEAST_CANAL_MM:
+    if canal.height_mm < LEAST_CANAL_MM:
         return [
-            f"the canal of {called} is {found.height_mm:.3g} mm high: pedicles are higher; the label has gaps, is cut"
+            f"the canal of {called} is {canal.height_mm:.3g} mm high: pedicles are higher; the label has gaps, is cut"
             " or tilted sideways"
         ]
     return []

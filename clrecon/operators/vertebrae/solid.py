@@ -52,8 +52,8 @@ def crop_label(volume: Volume, labels: LabelMap, label: int | str, margin_mm: fl
     shares = check_together(labels, volume)
     number = labels.find(label)
     share, called = shares[number], f"label {number} {labels.name(number)}"
-    own = find_boxes(labels.voxels, (number,), (0, 0, 0))[number]
-    low, high = (np.array([getattr(part, end) for part in own[::-1]]) for end in ("start", "stop"))
+    box = find_boxes(labels.voxels, (number,), (0, 0, 0))[number]
+    low, high = (np.array([getattr(part, end) for part in box[::-1]]) for end in ("start", "stop"))
     corners = np.stack(np.meshgrid(*zip(low - 0.5, high - 0.5, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
     places = labels.ijk_to_lps(corners)
     first, end = _window(volume, places, margin_mm)
@@ -209,28 +209,28 @@ def make_solid(
         raise UsageError("the label's own voxels do not grow: leave the growth out, or give an iso value")
     numbers = resident.bring(crop.labels).voxels
     others = Mask.from_array(resident, (numbers != 0) & (numbers != crop.number))
-    cortex, own = None, numbers == crop.number
+    cortex, is_label = None, numbers == crop.number
     if iso_value is not None:
-        own = _inside(resident, crop, iso_value, grow_mm)
-    if iso_value is not None and surface == "cortex" and own.any():
+        is_label = _inside(resident, crop, iso_value, grow_mm)
+    if iso_value is not None and surface == "cortex" and is_label.any():
         mesh = fit_labels(resident, crop.labels, iso_value, crop.number, grow_mm=grow_mm)[crop.number]
         places = crop.volume.lps_to_ijk(mesh.vertices)[:, ::-1]
-        cortex, own = mesh.report["cortex"], fill_surface(places, mesh.triangles, own.shape)
-    if not own.any():
+        cortex, is_label = mesh.report["cortex"], fill_surface(places, mesh.triangles, is_label.shape)
+    if not is_label.any():
         raise _refuse_empty(crop, numbers == crop.number, iso_value)
-    bone = Mask.from_array(resident, own)
+    bone = Mask.from_array(resident, is_label)
     # not close(): near the end of the scan it takes what lies between bone and the end, as bone may go on beyond it
     closed = bone.dilate(close_mm).erode(close_mm) | bone
     solid = (closed - others).fill_holes() - others
-    what = "label" if iso_value is None else f"{iso_value:g} HU in label"
-    what = f"the cortex from {what}" if cortex else what
-    solid.name = f"solid bone of {what} {crop.name}, closed by {close_mm:g} mm"
+    phrase = "label" if iso_value is None else f"{iso_value:g} HU in label"
+    phrase = f"the cortex from {phrase}" if cortex else phrase
+    solid.name = f"solid bone of {phrase} {crop.name}, closed by {close_mm:g} mm"
     return solid, others, cortex
 
 
-def _refuse_empty(crop: LabelCrop, own: NDArray[np.bool_], iso_value: float | None) -> NoSurfaceError:
+def _refuse_empty(crop: LabelCrop, is_label: NDArray[np.bool_], iso_value: float | None) -> NoSurfaceError:
     """Return the error for a label without voxels at an iso value, or without any on the grid of the volume."""
-    called, hu = f"label {crop.number} {crop.name}", crop.volume.voxels[own]
+    called, hu = f"label {crop.number} {crop.name}", crop.volume.voxels[is_label]
     if iso_value is None or not hu.size:
         return NoSurfaceError(f"{called} holds the centre of no voxel of the CT: it is smaller than they are")
     low, high = float(hu.min()), float(hu.max())
@@ -242,21 +242,21 @@ def _refuse_empty(crop: LabelCrop, own: NDArray[np.bool_], iso_value: float | No
 def _inside(resident: DeviceVolume, crop: LabelCrop, iso_value: float, grow_mm: float | None) -> NDArray[np.bool_]:
     """Mark the voxels that are inside of the label at an iso value, as surfaces of solid labels have them."""
     volume = crop.volume
-    taken = resident.bring(crop.labels)
+    placed = resident.bring(crop.labels)
     rule = choose_iso_rule(volume, iso_value, closed=True, values=resident.values)
     growth = Growth.of(volume, grow_mm)
-    boxes = find_boxes(taken.voxels, (crop.number,), growth.reach)
-    inside = np.zeros(taken.voxels.shape, taken.voxels.dtype)
+    boxes = find_boxes(placed.voxels, (crop.number,), growth.reach)
+    inside = np.zeros(placed.voxels.shape, placed.voxels.dtype)
     if rule.mark_inside(volume.voxels).all():
         raise NoSurfaceError(
             f"every voxel around label {crop.number} {crop.name} has {iso_value:g} HU and more, from"
             f" {float(volume.voxels.min()):g} HU on: a level lies between bone and what is beside it"
         )
-    if not boxes or not ((taken.voxels == crop.number) & rule.mark_inside(volume.voxels)).any():
+    if not boxes or not ((placed.voxels == crop.number) & rule.mark_inside(volume.voxels)).any():
         return inside != 0
 
     for attempt in resident.with_fallback():
         with attempt:
-            held = LabelExtraction(resident, taken, rule, growth, True, []).hold(boxes)
-            download(resident.device, inside[held.first : held.end], held.inside_d)
+            slab = LabelExtraction(resident, placed, rule, growth, True, []).hold(boxes)
+            download(resident.device, inside[slab.first : slab.end], slab.inside_d)
     return inside == crop.number

@@ -32,34 +32,34 @@ class Check:
     variants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
-def require_equal(found: ArrayLike, expected: ArrayLike, what: str) -> None:
+def require_equal(found: ArrayLike, expected: ArrayLike, subject: str) -> None:
     """Refuse arrays that are not equal element by element."""
-    one, other = np.asarray(found), np.asarray(expected)
-    if one.shape != other.shape:
-        raise DeviceError(f"{what}: {_describe_shape(one)} in place of {_describe_shape(other)}")
-    wrong = int(np.count_nonzero(one != other))
+    actual, wanted = np.asarray(found), np.asarray(expected)
+    if actual.shape != wanted.shape:
+        raise DeviceError(f"{subject}: {_describe_shape(actual)} in place of {_describe_shape(wanted)}")
+    wrong = int(np.count_nonzero(actual != wanted))
     if wrong:
-        raise DeviceError(f"{what}: {wrong:,} of {one.size:,} differ")
+        raise DeviceError(f"{subject}: {wrong:,} of {actual.size:,} differ")
 
 
-def require_close(found: ArrayLike, expected: ArrayLike, allowed: float, what: str) -> float:
+def require_close(found: ArrayLike, expected: ArrayLike, allowed: float, subject: str) -> float:
     """Refuse numbers more than `allowed` apart, or with NaN at other places; return the largest distance."""
-    return require_share(found, expected, allowed, 0.0, what)
+    return require_share(found, expected, allowed, 0.0, subject)
 
 
-def require_share(found: ArrayLike, expected: ArrayLike, allowed: float, share: float, what: str) -> float:
+def require_share(found: ArrayLike, expected: ArrayLike, allowed: float, share: float, subject: str) -> float:
     """Refuse where more than a share is more than `allowed` apart; return the largest distance of the others."""
-    one, other = np.asarray(found, dtype=np.float64), np.asarray(expected, dtype=np.float64)
-    if one.shape != other.shape:
-        raise DeviceError(f"{what}: {_describe_shape(one)} in place of {_describe_shape(other)}")
+    actual, wanted = np.asarray(found, dtype=np.float64), np.asarray(expected, dtype=np.float64)
+    if actual.shape != wanted.shape:
+        raise DeviceError(f"{subject}: {_describe_shape(actual)} in place of {_describe_shape(wanted)}")
     with np.errstate(invalid="ignore"):
-        away = np.abs(one - other)
-    away = np.where(np.isnan(one) & np.isnan(other), 0.0, away)
+        away = np.abs(actual - wanted)
+    away = np.where(np.isnan(actual) & np.isnan(wanted), 0.0, away)
     wrong = ~(away <= allowed)
     if wrong.mean() > share:
         worst = np.max(np.where(np.isnan(away), np.inf, away))
         raise DeviceError(
-            f"{what}: {int(wrong.sum()):,} of {one.size:,} are off, by up to {worst:.3g} ({allowed:g} is allowed)"
+            f"{subject}: {int(wrong.sum()):,} of {actual.size:,} are off, by up to {worst:.3g} ({allowed:g} is allowed)"
         )
     return float(away[~wrong].max(initial=0.0))
 

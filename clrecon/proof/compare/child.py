@@ -48,18 +48,18 @@ def _measure(request: Request) -> dict[str, Any]:
     scene = Scene(load_volume(folder), request, None)
     before = peak_memory_bytes()
     opened = _open_device(scene) if COMPARED[name].on_device else 0.0
-    made = make(scene)
-    first = made.seconds
+    result = make(scene)
+    first = result.seconds
     first["build"] += opened
     runs: list[dict[str, float]] = []
     while len(runs) < request.repeat and sum(map(_total, runs)) < LONG_SECONDS:
-        del made  # two results at once would count as the memory of one
-        made = make(scene)
-        runs.append(made.seconds)
+        del result  # two results at once would count as the memory of one
+        result = make(scene)
+        runs.append(result.seconds)
     peak = peak_memory_bytes()
     if scene.device is None:  # which draws the pictures
         _open_device(scene)
-    product = made.product
+    product = result.product
     pictures: dict[str, Any] = {}
     for view in request.views():
         if name == "rays-cpu" and view == "along":
@@ -75,7 +75,7 @@ def _measure(request: Request) -> dict[str, Any]:
     if name == "rays-cpu":
         small = [_total(first), min(map(_total, runs))]
     save_arrays(folder, name, **pictures)
-    report = made.report
+    report = result.report
     return {
         "first": first,
         "warm": runs,
@@ -120,8 +120,8 @@ def main() -> None:
     """Run the method that the JSON object on stdin names, and write what comes of it to stdout as JSON."""
     lines = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # a driver may print
-    told = json.load(sys.stdin)
-    request = Request(**{**told, "size": tuple(told["size"])})
+    data = json.load(sys.stdin)
+    request = Request(**{**data, "size": tuple(data["size"])})
     lines.write(to_json(run_method(request), indent=None) + "\n")
     lines.flush()
     os._exit(0)  # the driver of a device that hangs would wait

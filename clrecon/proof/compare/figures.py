@@ -89,12 +89,12 @@ def cut_mesh(mesh: Mesh, volume: Volume, plane: Plane) -> Segments:
     # The lone corner of each triangle is the one whose two edges are cut.
     lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
     rows = np.arange(len(corners))
-    own = corners[rows, lone]
+    lone_corner = corners[rows, lone]
     ends = []
     for step in (1, 2):
-        other = corners[rows, (lone + step) % 3]
-        share = (height[own] / (height[own] - height[other]))[:, None]
-        ends.append((ijk[own] + share * (ijk[other] - ijk[own]))[:, [plane.across, plane.down]])
+        next_corner = corners[rows, (lone + step) % 3]
+        share = (height[lone_corner] / (height[lone_corner] - height[next_corner]))[:, None]
+        ends.append((ijk[lone_corner] + share * (ijk[next_corner] - ijk[lone_corner]))[:, [plane.across, plane.down]])
     return np.stack(ends, axis=1)
 
 
@@ -146,8 +146,8 @@ def _find_detail(segments: Segments, steps: NDArray[np.float64], default: NDArra
         return default
     middles = segments.mean(axis=1)
     squares = np.floor(middles * steps / (0.5 * _DETAIL_MM)).astype(np.int64)
-    found, counts = np.unique(squares, axis=0, return_counts=True)
-    best = found[int(np.argmax(counts))]
+    distinct, counts = np.unique(squares, axis=0, return_counts=True)
+    best = distinct[int(np.argmax(counts))]
     return np.asarray(middles[(squares == best).all(axis=1)].mean(axis=0))
 
 
@@ -249,8 +249,8 @@ def measure_against_slice(
 
     def like(picture: NDArray[np.uint8]) -> dict[str, float]:
         grey = np.rint(picture.mean(axis=2)).astype(np.uint8) if picture.ndim == 3 else picture
-        found = measure_pictures(grey, wanted, whole=True)
-        return {"ssim": found.ssim, "mse": found.mse}
+        figures = measure_pictures(grey, wanted, whole=True)
+        return {"ssim": figures.ssim, "mse": figures.mse}
 
     return {
         "window_hu": [-200.0, 800.0],
@@ -286,14 +286,14 @@ def compare_pictures(pictures: Mapping[str, Image], reference: str) -> dict[str,
     """Return ``mse`` and ``ssim`` of each picture to that of the reference; without one, nothing."""
     if reference not in pictures:
         return {}
-    found = {}
+    likeness = {}
     for name, picture in pictures.items():
         try:
             like = measure_pictures(picture, pictures[reference])
         except ClreconError:  # nothing is drawn in either
             continue
-        found[name] = {"mse": like.mse, "ssim": like.ssim}
-    return found
+        likeness[name] = {"mse": like.mse, "ssim": like.ssim}
+    return likeness
 
 
 def difference_of(picture: Image, reference: Image) -> Image:
@@ -381,8 +381,8 @@ class Figures:
 
     def compare_with_slice(self) -> None:
         """Compare the pictures that look along the slices with the middle one."""
-        found = {name: load_array(self.work, name, "along") for name in self.views}
-        pictures = {name: picture for name, picture in found.items() if picture is not None}
+        arrays = {name: load_array(self.work, name, "along") for name in self.views}
+        pictures = {name: picture for name, picture in arrays.items() if picture is not None}
         width, height = along_slices(self.volume)["size"]
         self.paper = measure_against_slice(self.volume, pictures, (width, height))
 
@@ -402,15 +402,15 @@ def collect_figures(figures: Figures, records: Sequence[MethodRecord]) -> None:
             figures.views[name] = figures.images[name] = view
         mesh = load_mesh(figures.work, name)
         if mesh is not None:
-            for plane, own in zip(figures.planes, figures.contours, strict=True):
-                own[name] = cut_mesh(mesh, figures.volume, plane)
+            for plane, contours in zip(figures.planes, figures.contours, strict=True):
+                contours[name] = cut_mesh(mesh, figures.volume, plane)
     reference = figures.views.get(figures.reference)
     for name, view in figures.views.items():
         if reference is not None and name != figures.reference and view.shape == reference.shape:
             figures.images[f"{name}-difference"] = difference_of(view, reference)
-    for plane, own in zip(figures.planes, figures.contours, strict=True):
-        order = sorted(own, key=lambda name: name != figures.reference)  # which lies below all others
-        lines = {name: own[name] for name in order if name not in figures.same}
+    for plane, contours in zip(figures.planes, figures.contours, strict=True):
+        order = sorted(contours, key=lambda name: name != figures.reference)  # which lies below all others
+        lines = {name: contours[name] for name in order if name not in figures.same}
         whole, detail = draw_plane(figures.volume, plane, figures.box, lines, COLORS, figures.reference)
         figures.images[f"slice-{'ijk'[plane.axis]}"] = whole
         figures.images[f"slice-{'ijk'[plane.axis]}-detail"] = detail

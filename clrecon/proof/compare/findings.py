@@ -154,13 +154,13 @@ _WIDER_MM = 5e-3
 def find_findings(methods: Sequence[MethodRecord], reference: str, *, with_truth: bool) -> list[str]:
     """Return the findings, each a sentence; `reference` is the name of the method that others are compared with."""
     done = {method.name: method for method in methods if method.is_done}
-    found = [*_of_time(done, reference), *_of_same(done, reference), *_of_golden(done), *_of_growing(done, reference)]
-    found += [*_of_decimation(done, reference), *_of_clouds(done, with_truth), *_of_rays(done)]
-    found += _of_truth(done) if with_truth else ()
+    lines = [*_of_time(done, reference), *_of_same(done, reference), *_of_golden(done), *_of_growing(done, reference)]
+    lines += [*_of_decimation(done, reference), *_of_clouds(done, with_truth), *_of_rays(done)]
+    lines += _of_truth(done) if with_truth else ()
     missing = [method.title for method in methods if not method.is_done]
     if missing:
-        found.append(f"{join(missing)} did not run: the table says why.")
-    return found
+        lines.append(f"{join(missing)} did not run: the table says why.")
+    return lines
 
 
 Rows = Mapping[str, MethodRecord]
@@ -177,37 +177,37 @@ def _of_time(done: Rows, reference: str) -> Iterator[str]:
         f" warm, {seconds(fastest.first_s)} s the first time; {slowest.title} is the slowest with"
         f" {seconds(slowest.warm_s)} s, {ratio(slowest.warm_s / fastest.warm_s)} times as long."
     )
-    own, peers = done.get(reference), [m for m in timed if m.peer]
-    if own is None or own.peer or not own.warm_s or not peers:
+    reference_row, peers = done.get(reference), [m for m in timed if m.peer]
+    if reference_row is None or reference_row.peer or not reference_row.warm_s or not peers:
         return
     best = min(peers, key=lambda m: m.warm_s or 0.0)
     assert best.warm_s
-    times = best.warm_s / own.warm_s
-    said = (
-        f"{own.title} is {ratio(times)} times as fast"
+    times = best.warm_s / reference_row.warm_s
+    sentence = (
+        f"{reference_row.title} is {ratio(times)} times as fast"
         if times >= 1.0
-        else f"{own.title} takes {ratio(1.0 / times)} times as long"
+        else f"{reference_row.title} takes {ratio(1.0 / times)} times as long"
     )
-    yield f"{said} as the fastest peer, {best.title} ({milliseconds(1e3 * best.warm_s)} ms), when both are warm."
+    yield f"{sentence} as the fastest peer, {best.title} ({milliseconds(1e3 * best.warm_s)} ms), when both are warm."
 
 
 def _of_same(done: Rows, reference: str) -> Iterator[str]:
-    own = done.get(reference)
+    reference_row = done.get(reference)
     others = [m for m in done.values() if m.name != reference and m.surfaces]
     same = [m for m in others if m.surfaces and m.surfaces["hd95_mm"] < SAME_MM]
     near = [m for m in others if m not in same and m.cells and m.cells["dice"] >= _SAME_CELLS and m.surfaces]
     near = [m for m in near if m.surfaces and m.surfaces["max_mm"] < NEAR_MM]
-    if own is None:
+    if reference_row is None:
         return
     if same:
         give = "gives" if len(same) == 1 else "give"
-        yield f"{join([m.title for m in same])} {give} the surface of {own.title}, to 0.001 mm."
+        yield f"{join([m.title for m in same])} {give} the surface of {reference_row.title}, to 0.001 mm."
     if near:
         far = max(m.surfaces["hd95_mm"] for m in near if m.surfaces)
         yield (
             f"{join([m.title for m in near])} pass{'es' if len(near) == 1 else ''} through the same cells as"
-            f" {own.title} and divide{'s' if len(near) == 1 else ''} them into other triangles: HD95 up to {far:.3f}"
-            " mm."
+            f" {reference_row.title} and divide{'s' if len(near) == 1 else ''} them into other triangles: HD95 up to"
+            f" {far:.3f} mm."
         )
 
 
@@ -233,7 +233,7 @@ def _of_growing(done: Rows, reference: str) -> Iterator[str]:
     if not (grown and grown.cells_visited and grown.cells_all and grown.growing):
         return
     left = grown.growing["cells_left_out_share"]
-    said = (
+    clause = (
         f" and leaves out {100.0 * left:.1f} % of those that the surface passes through: the parts that are too small"
         " to be grown from."
         if left > 0.0
@@ -241,7 +241,7 @@ def _of_growing(done: Rows, reference: str) -> Iterator[str]:
     )
     yield (
         f"I-MC visits {count(grown.cells_visited)} of {count(grown.cells_all)} cells, 1 in"
-        f" {ratio(grown.cells_all / grown.cells_visited)},{said}"
+        f" {ratio(grown.cells_all / grown.cells_visited)},{clause}"
     )
     if whole and whole.name == "t-mc" and whole.warm_s and grown.warm_s:
         times = grown.warm_s / whole.warm_s
@@ -255,15 +255,15 @@ def _of_growing(done: Rows, reference: str) -> Iterator[str]:
 def _of_decimation(done: Rows, reference: str) -> Iterator[str]:
     whole = done.get(reference)
     for name in ("g-mc", "s-mc"):
-        made = done.get(name)
-        if not (made and whole and made.triangles and whole.triangles and made.surfaces and made.slices):
+        row = done.get(name)
+        if not (row and whole and row.triangles and whole.triangles and row.surfaces and row.slices):
             continue
-        quality = made.quality or {}
+        quality = row.quality or {}
         closed = "closed" if quality.get("closed") else "no longer closed"
         yield (
-            f"{made.title} keeps {100.0 * made.triangles / whole.triangles:.0f} % of the triangles at a sub-voxel"
-            f" Dice of {share(made.slices['dice'])}, HD95 {made.surfaces['hd95_mm']:.3f} mm and at most"
-            f" {made.surfaces['max_mm']:.2f} mm, {closed}, in {seconds(made.warm_s or 0.0)} s."
+            f"{row.title} keeps {100.0 * row.triangles / whole.triangles:.0f} % of the triangles at a sub-voxel"
+            f" Dice of {share(row.slices['dice'])}, HD95 {row.surfaces['hd95_mm']:.3f} mm and at most"
+            f" {row.surfaces['max_mm']:.2f} mm, {closed}, in {seconds(row.warm_s or 0.0)} s."
         )
 
 
@@ -271,12 +271,14 @@ def _of_clouds(done: Rows, with_truth: bool) -> Iterator[str]:
     cloud = done.get("cloud")
     if not (cloud and cloud.points and cloud.points_mm):
         return
-    told = cloud.points_mm
-    far = told["to_reference_mm"]
-    said = f", {far['mean']:.2f} mm from the reference surface on average" if far else ""
-    scatter = f" and scattered by {told['scatter_mm']:.2f} mm about the truth" if told["scatter_mm"] is not None else ""
+    points = cloud.points_mm
+    far = points["to_reference_mm"]
+    clause = f", {far['mean']:.2f} mm from the reference surface on average" if far else ""
+    scatter = (
+        f" and scattered by {points['scatter_mm']:.2f} mm about the truth" if points["scatter_mm"] is not None else ""
+    )
     yield (
-        f"The cloud has {count(cloud.points)} points{said}{scatter}: they are centres of voxels, not places of the"
+        f"The cloud has {count(cloud.points)} points{clause}{scatter}: they are centres of voxels, not places of the"
         " surface."
     )
     around = done.get("cloud-surface")

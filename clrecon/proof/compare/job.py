@@ -66,9 +66,9 @@ def check_report_folder(path: str | os.PathLike[str]) -> Path:
 class MadeFolder(StagedFolder):
     """The folder while it is filled, at its temporary `path`."""
 
-    def __init__(self, path: str | os.PathLike[str], made: Path, folder: Path):
-        super().__init__(path, made, folder, 0)
-        self._shown, self.path = path, made
+    def __init__(self, path: str | os.PathLike[str], staged: Path, folder: Path):
+        super().__init__(path, staged, folder, 0)
+        self._shown, self.path = path, staged
 
     def write(self, name: str, text: str) -> None:
         with system_errors(self._shown), open(self.path / name, "x", encoding="utf-8", newline="\n") as stream:
@@ -93,9 +93,9 @@ def stage_report_folder(path: str | os.PathLike[str]) -> Iterator[MadeFolder]:
     folder = check_report_folder(path)
     with contextlib.ExitStack() as stack:
         with system_errors(path):
-            made = stack.enter_context(temporary_folder(folder.parent))
-            made.chmod(final_mode(folder, 0o777))
-        yield MadeFolder(path, made, folder)
+            staged = stack.enter_context(temporary_folder(folder.parent))
+            staged.chmod(final_mode(folder, 0o777))
+        yield MadeFolder(path, staged, folder)
 
 
 log = get_logger(__name__)
@@ -134,12 +134,12 @@ def make_comparison(
             save_volume(work, volume)
         figures = Figures(work, volume, level, settings.reference)
         figures.planes, figures.box = find_planes(volume, level)
-        told = _run_methods(figures, settings, device, progress)
+        rows = _run_methods(figures, settings, device, progress)
         watch.lap("methods")
-        measured = _measure(told, figures, settings, truth, progress)
+        measured = _measure(rows, figures, settings, truth, progress)
         watch.lap("measure")
         progress("report", 0, 0)
-        records = [make_record(COMPARED[name], each, measured.get(name, {}), read_s) for name, each in told.items()]
+        records = [make_record(COMPARED[name], each, measured.get(name, {}), read_s) for name, each in rows.items()]
         collect_figures(figures, records)
         records = figures.complete(records)
         if settings.paper:
@@ -149,12 +149,12 @@ def make_comparison(
             warnings=[*warnings, *device.warnings], watch=watch,
         )  # fmt: skip
         with keep_existing(keep=no_clobber):
-            made = stack.enter_context(stage_report_folder(output))
+            staged = stack.enter_context(stage_report_folder(output))
             with system_errors(output):
-                draw_figures(figures, made.path)
-                made.write("index.html", make_page(report, figures))
-            made.write_report(report)
-            made.commit()
+                draw_figures(figures, staged.path)
+                staged.write("index.html", make_page(report, figures))
+            staged.write_report(report)
+            staged.commit()
     log_warnings(log, report.warnings, volume.report.get("warnings", ()))
     log.info("%d methods compared on %s in %.3f s", len(records), report.device, watch.total())
     return report
@@ -217,30 +217,30 @@ def _run_methods(
     volume, chosen = figures.volume, settings.chosen
     camera = choose_camera(volume, figures.box)
     along = along_slices(volume) if settings.paper else None
-    told: dict[str, dict[str, Any]] = {}
+    rows: dict[str, dict[str, Any]] = {}
     hung = False
     for done, method in enumerate(chosen):
         progress("compare methods", done, len(chosen))
         if hung and method.on_device:
-            told[method.name] = {"state": "failed", "kind": "DeviceError", "error": "not run: the device hangs"}
+            rows[method.name] = {"state": "failed", "kind": "DeviceError", "error": "not run: the device hangs"}
             continue
         request = Request(
             method=method.name, folder=str(figures.work), iso_value=figures.level, closed=settings.closed,
             device=device.index, memory=settings.memory, repeat=settings.repeat, timeout=device_seconds(),
             camera=camera, size=SIZE, along=along,
         )  # fmt: skip
-        told[method.name] = run_in_process(request)
-        hung = hung or bool(told[method.name].get("hung"))
+        rows[method.name] = run_in_process(request)
+        hung = hung or bool(rows[method.name].get("hung"))
     progress("compare methods", len(chosen), len(chosen))
-    _refuse_nothing(told)
-    return told
+    _refuse_nothing(rows)
+    return rows
 
 
-def _refuse_nothing(told: dict[str, dict[str, Any]]) -> None:
+def _refuse_nothing(rows: dict[str, dict[str, Any]]) -> None:
     """Raise the first error where no method works: NoSurfaceError where they found none, else that of a device."""
-    if any(each["state"] == "done" for each in told.values()):
+    if any(each["state"] == "done" for each in rows.values()):
         return
-    errors: Sequence[dict[str, Any]] = list(told.values())
+    errors: Sequence[dict[str, Any]] = list(rows.values())
     empty = [each for each in errors if each["kind"] == "NoSurfaceError"]
     kind: type[ClreconError] = NoSurfaceError if empty else DeviceError
     first = (empty or errors)[0]["error"]
@@ -248,10 +248,10 @@ def _refuse_nothing(told: dict[str, dict[str, Any]]) -> None:
 
 
 def _measure(
-    told: dict[str, dict[str, Any]], figures: Figures, settings: CompareSettings, truth: str | None, progress: Progress
+    rows: dict[str, dict[str, Any]], figures: Figures, settings: CompareSettings, truth: str | None, progress: Progress
 ) -> dict[str, dict[str, Any]]:
     sizes = {
-        name: int(each["triangles"] or each["points"] or 0) for name, each in told.items() if each["state"] == "done"
+        name: int(each["triangles"] or each["points"] or 0) for name, each in rows.items() if each["state"] == "done"
     }
     sizes = {name: size for name, size in sizes.items() if size}
     asked = {
@@ -261,9 +261,9 @@ def _measure(
         "closed": settings.closed,
         "truth": truth,
     }
-    found: dict[str, dict[str, Any]] = {}
+    measured: dict[str, dict[str, Any]] = {}
     progress("measure methods", 0, len(sizes))
     for name, measures in measure_in_processes(asked, sizes):
-        found[name] = measures
-        progress("measure methods", len(found), len(sizes))
-    return found
+        measured[name] = measures
+        progress("measure methods", len(measured), len(sizes))
+    return measured

@@ -31,10 +31,10 @@ class Judge:
     ``iso_value``; ``closed``; ``truth``, the folder of a phantom, or None.
     """
 
-    def __init__(self, told: Mapping[str, Any]):
-        self._folder = Path(told["folder"])
-        self._reference: str | None = told["reference"]
-        self._level, self._closed, self._truth = float(told["iso_value"]), bool(told["closed"]), told["truth"]
+    def __init__(self, message: Mapping[str, Any]):
+        self._folder = Path(message["folder"])
+        self._reference: str | None = message["reference"]
+        self._level, self._closed, self._truth = float(message["iso_value"]), bool(message["closed"]), message["truth"]
         self._volume = load_volume(self._folder)
 
     @cached_property
@@ -55,14 +55,14 @@ class Judge:
     def measure(self, method: str) -> dict[str, Any]:
         """Measure the result of a method: each of `_MEASURES`, None where it has none, and ``reasons`` of failures."""
         mesh, points = load_mesh(self._folder, method), load_array(self._folder, method, "points")
-        found: dict[str, Any] = dict.fromkeys(_MEASURES)
+        measures: dict[str, Any] = dict.fromkeys(_MEASURES)
         reasons: dict[str, str] = {}
         for name, take in self._measures(method, mesh, points).items():
             try:
-                found[name] = take()
+                measures[name] = take()
             except (ClreconError, MemoryError) as error:
                 reasons[name] = str(error) or "out of memory"
-        return {**found, "reasons": reasons}
+        return {**measures, "reasons": reasons}
 
     def _measures(self, method: str, mesh: Mesh | None, points: Any) -> dict[str, Callable[[], Any]]:
         if points is not None:
@@ -85,16 +85,16 @@ class Judge:
         """Measure points of a cloud: distances from the reference, and signed ones from the true surface."""
         step = max(1, len(points) // SAMPLES)
         sample = np.asarray(points[::step], dtype=np.float64)
-        found: dict[str, Any] = {"samples": len(sample), "to_reference_mm": None, "bias_mm": None, "scatter_mm": None}
+        figures: dict[str, Any] = {"samples": len(sample), "to_reference_mm": None, "bias_mm": None, "scatter_mm": None}
         if self.reference is not None:
             distance = SurfaceDistance(self.reference.vertices, self.reference.triangles)
-            found["to_reference_mm"] = summarise_distances(distance(sample))
+            figures["to_reference_mm"] = summarise_distances(distance(sample))
         if self._truth is not None:
             signed = self.truth.signed_distance(sample)
             signed = signed[np.abs(signed) <= REACH_MM]
             if len(signed):
-                found["bias_mm"], found["scatter_mm"] = float(signed.mean()), float(signed.std())
-        return found
+                figures["bias_mm"], figures["scatter_mm"] = float(signed.mean()), float(signed.std())
+        return figures
 
 
 def _facts_of_quality(mesh: Mesh) -> dict[str, Any]:
@@ -107,9 +107,9 @@ def main() -> None:
     """Measure the methods that the JSON object on stdin names, and write a line of JSON for each."""
     lines = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
     os.dup2(2, 1)
-    told = json.load(sys.stdin)
-    judge = Judge(told)
-    for method in told["methods"]:
+    data = json.load(sys.stdin)
+    judge = Judge(data)
+    for method in data["methods"]:
         lines.write(to_json({"method": method, **judge.measure(method)}, indent=None) + "\n")
 
 

@@ -72,13 +72,13 @@ def extract_by_vtk(volume: Volume, iso_value: float, name: str, closed: bool) ->
     contour.ComputeScalarsOff()
     contour.ComputeGradientsOff()
     contour.Update()
-    made = contour.GetOutput()
-    if not made.GetNumberOfPolys():
+    polydata = contour.GetOutput()
+    if not polydata.GetNumberOfPolys():
         raise NoSurfaceError(f"no surface {rule.phrase()}")
     extracted = perf_counter()
-    found: NDArray[np.float64] = vtk_to_numpy(made.GetPoints().GetData()).astype(np.float64)
-    faces = vtk_to_numpy(made.GetPolys().GetConnectivityArray()).reshape(-1, 3)
-    places = volume.ijk_to_lps(found - rule.border).astype(np.float32)
+    vertices_ijk: NDArray[np.float64] = vtk_to_numpy(polydata.GetPoints().GetData()).astype(np.float64)
+    faces = vtk_to_numpy(polydata.GetPolys().GetConnectivityArray()).reshape(-1, 3)
+    places = volume.ijk_to_lps(vertices_ijk - rule.border).astype(np.float32)
     # In (i, j, k) its triangles are counter-clockwise as seen from lower values.
     triangles = faces[:, ::-1] if is_left_handed(volume.affine) else faces
     triangles = np.ascontiguousarray(triangles, np.uint32)
@@ -130,9 +130,9 @@ def make(scene: Scene) -> Made:
     total = perf_counter() - start
     seconds = dict.fromkeys(PARTS, 0.0)
     for report in reports:
-        own = report.get("seconds", {})
+        part_seconds = report.get("seconds", {})
         for part in _DEVICE_PARTS:
-            seconds[part] += float(own.get(part, 0.0))
+            seconds[part] += float(part_seconds.get(part, 0.0))
     seconds["host"] = max(0.0, total - sum(seconds.values()))
     kernels: dict[str, float] = {}
     for report in reports:
@@ -220,9 +220,9 @@ def _rays_cpu(scene: Scene) -> Product:
 
     camera, _ = scene.request.views()["view"]
     preset = find_preset(_RAYS_PRESET)
-    found = cast_rays(scene.volume, preset.transfer_function, camera, TWIN_SIZE, lighting=preset.lighting)
-    depth = found.depth.astype("float32")
-    return Rendering(found.image(), depth, depth, camera), [{}]
+    cast = cast_rays(scene.volume, preset.transfer_function, camera, TWIN_SIZE, lighting=preset.lighting)
+    depth = cast.depth.astype("float32")
+    return Rendering(cast.image(), depth, depth, camera), [{}]
 
 
 def _plain(scene: Scene) -> Product:

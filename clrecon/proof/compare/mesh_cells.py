@@ -46,10 +46,10 @@ def meets_box(corners: NDArray[np.float64], half: float) -> NDArray[np.bool_]:
             u, v = (axis + 1) % 3, (axis + 2) % 3
             # The shadow of both ends of the edge is one point.
             eu, ev = edges[edge, u], edges[edge, v]
-            one = eu * x[edge, v] - ev * x[edge, u]
-            other = eu * third[v] - ev * third[u]
+            first = eu * x[edge, v] - ev * x[edge, u]
+            second = eu * third[v] - ev * third[u]
             reach = half * (np.abs(eu) + np.abs(ev))
-            meets &= (np.minimum(one, other) <= reach) & (np.maximum(one, other) >= -reach)
+            meets &= (np.minimum(first, second) <= reach) & (np.maximum(first, second) >= -reach)
     return np.asarray(meets)
 
 
@@ -191,13 +191,13 @@ def find_mesh_cells(mesh: Mesh, grid: Grid, *, name: str = "", progress: Progres
     margin = _ROUNDINGS * rounding_step(mesh.vertices) * _steps_per_mm(grid)
     ijk = grid.lps_to_ijk(mesh.vertices)
     _check_place(ijk, grid)
-    told = progress or ignore_progress
-    found = []
-    for where in chunks(mesh.triangle_count, _PIECE):
-        told("cells", where.start, mesh.triangle_count)
-        found += [np.unique(_pack(cells)) for cells in _cells_of(ijk[mesh.triangles[where]], min(margin, 0.25))]
-    told("cells", mesh.triangle_count, mesh.triangle_count)
-    return GridCells(_unpack(np.unique(np.concatenate(found))), name)
+    report = progress or ignore_progress
+    packed = []
+    for piece in chunks(mesh.triangle_count, _PIECE):
+        report("cells", piece.start, mesh.triangle_count)
+        packed += [np.unique(_pack(cells)) for cells in _cells_of(ijk[mesh.triangles[piece]], min(margin, 0.25))]
+    report("cells", mesh.triangle_count, mesh.triangle_count)
+    return GridCells(_unpack(np.unique(np.concatenate(packed))), name)
 
 
 def _steps_per_mm(grid: Grid) -> float:
@@ -232,9 +232,9 @@ def _cells_of(triangles: Triangles, margin: float) -> Iterator[IntArray]:
         low = np.ceil(corners.min(axis=1) - 1.0 + margin).astype(np.int64)
         size = np.maximum(np.floor(corners.max(axis=1) - margin).astype(np.int64) - low + 1, 0)
         count = size.prod(axis=1)
-        one = count == 1
-        reached[owner[one]] = True
-        yield low[one]
+        is_single = count == 1
+        reached[owner[is_single]] = True
+        yield low[is_single]
         several = np.flatnonzero((count > 1) & (count <= _MOST_CANDIDATES))
         for cells, row in _tested(corners, low, size, several, margin):
             reached[owner[row]] = True
@@ -259,9 +259,9 @@ def _tested(
         extent = size[part]
         count = extent.prod(axis=1)
         pair = np.repeat(np.arange(len(part)), count)
-        place = np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
+        rank = np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
         ni, nj = extent[pair, 0], extent[pair, 1]
-        offset = np.stack([place % ni, place // ni % nj, place // (ni * nj)], axis=1)
+        offset = np.stack([rank % ni, rank // ni % nj, rank // (ni * nj)], axis=1)
         cells = low[part][pair] + offset
         meets = meets_box(corners[part[pair]] - (cells + 0.5)[:, None], 0.5 - margin)
         yield cells[meets], part[pair[meets]]
@@ -300,28 +300,28 @@ def measure_cells(
     UsageError
         As `find_mesh_cells`; or the mesh lies wholly outside of the grid.
     """
-    own = mesh if isinstance(mesh, GridCells) else find_mesh_cells(mesh, grid, progress=progress)
+    mesh_cells = mesh if isinstance(mesh, GridCells) else find_mesh_cells(mesh, grid, progress=progress)
     wanted = reference if isinstance(reference, GridCells) else find_mesh_cells(reference, grid, progress=progress)
-    for what, cells in (("surface", own), ("reference", wanted)):
+    for role, cells in (("surface", mesh_cells), ("reference", wanted)):
         if len(cells) == 0:
-            raise NoSurfaceError(f"the {what} passes through no cell: there is nothing to compare")
-    corners = own.ijk
+            raise NoSurfaceError(f"the {role} passes through no cell: there is nothing to compare")
+    corners = mesh_cells.ijk
     outside = int(((corners < -1) | (corners >= np.array(grid.shape_ijk))).any(axis=1).sum())
-    if outside == len(own):
+    if outside == len(mesh_cells):
         raise UsageError(
             f"the mesh lies wholly outside of the grid: its cells run from {corners.min(axis=0).tolist()} to"
             f" {corners.max(axis=0).tolist()}, those of the grid from -1 to {[n - 1 for n in grid.shape_ijk]}; see"
             " whether both are in the same patient frame"
         )
-    common = len(np.intersect1d(own.keys, wanted.keys, assume_unique=True))
+    common = len(np.intersect1d(mesh_cells.keys, wanted.keys, assume_unique=True))
     return CellOverlap(
         reference=reference_name or wanted.name or "reference",
-        cells=len(own),
+        cells=len(mesh_cells),
         reference_cells=len(wanted),
         common_cells=common,
         cells_outside=outside,
         recall=common / len(wanted),
-        precision=common / len(own),
-        dice=2.0 * common / (len(own) + len(wanted)),
-        jaccard=common / (len(own) + len(wanted) - common),
+        precision=common / len(mesh_cells),
+        dice=2.0 * common / (len(mesh_cells) + len(wanted)),
+        jaccard=common / (len(mesh_cells) + len(wanted) - common),
     )

@@ -113,21 +113,21 @@ def measure_slices(
     rule = choose_iso_rule(volume, iso_value, closed=closed)
     ijk = volume.lps_to_ijk(mesh.vertices)
     _check_place(ijk, volume, rule)
-    told = progress or ignore_progress
+    report = progress or ignore_progress
     lattices = (Lattice.over(volume, rule, int(finer), shifts), Lattice.over(volume, rule, 1, (0.0, 0.0, 0.0)))
     layers = lattices[0].cells_ijk[2]
-    found = []
+    overlaps = []
     for n, lattice in enumerate(lattices):
 
         def tell(done: int, before: int = n * layers) -> None:
-            told("slices", before + done, 2 * layers)
+            report("slices", before + done, 2 * layers)
 
-        found.append(_count_overlap(ijk, mesh.triangles, volume, rule, lattice, tell))
-    fine, own = found
-    told("slices", 2 * layers, 2 * layers)
+        overlaps.append(_count_overlap(ijk, mesh.triangles, volume, rule, lattice, tell))
+    fine, overlap = overlaps
+    report("slices", 2 * layers, 2 * layers)
     return SliceOverlap(
         dice=fine.dice,
-        voxel_dice=own.dice,
+        voxel_dice=overlap.dice,
         finer=int(finer),
         points_mesh=fine.mesh,
         points_hu=fine.hu,
@@ -172,10 +172,10 @@ def _count_overlap(
     volume: Volume,
     rule: IsoRule,
     lattice: Lattice,
-    told: Callable[[int], None],
+    report: Callable[[int], None],
 ) -> _Counts:
     """Count the points of a lattice that are in the mesh, in the HU, and in both."""
-    mesh, hu = find_piercings(ijk, triangles, lattice), find_level_runs(volume, rule, lattice, told)
+    mesh, hu = find_piercings(ijk, triangles, lattice), find_level_runs(volume, rule, lattice, report)
     rows, ends = np.unique(lattice.row_of(mesh), return_counts=True)
     odd = rows[ends % 2 == 1]
     if len(odd) > _MOST_ODD * len(rows):
@@ -185,8 +185,8 @@ def _count_overlap(
         )
     if len(odd):
         mesh, hu = (keys[~np.isin(lattice.row_of(keys), odd)] for keys in (mesh, hu))
-    own, wanted, apart = count_points(mesh), count_points(hu), count_points(exclusive_or(mesh, hu))
-    return _Counts(own, wanted, (own + wanted - apart) // 2, len(odd))
+    inside, wanted, apart = count_points(mesh), count_points(hu), count_points(exclusive_or(mesh, hu))
+    return _Counts(inside, wanted, (inside + wanted - apart) // 2, len(odd))
 
 
 _PIECE = 1 << 16
@@ -210,9 +210,9 @@ def find_piercings(ijk: Float64Array, triangles: NDArray[np.uint32], lattice: La
         those that would be there an even number of times are not.
     """
     points = lattice.number(ijk)
-    found = [np.zeros(0, dtype=np.int64)]
-    found += [_pierce(points[triangles[where]], lattice.shape_ijk) for where in chunks(len(triangles), _PIECE)]
-    keys = np.sort(np.concatenate(found))
+    piercings = [np.zeros(0, dtype=np.int64)]
+    piercings += [_pierce(points[triangles[where]], lattice.shape_ijk) for where in chunks(len(triangles), _PIECE)]
+    keys = np.sort(np.concatenate(piercings))
     fresh = np.flatnonzero(np.diff(keys, prepend=-1))
     odd = np.diff(fresh, append=len(keys)) % 2 == 1
     return keys[fresh[odd]]
@@ -233,13 +233,13 @@ def _pierce(corners: Float64Array, shape_ijk: tuple[int, int, int]) -> IntArray:
     row, plane = _spread_rows(*(_first_from(end[:, 2], nk) for end in (a, c)))
     a, b, c = a[row], b[row], c[row]
     upper = (plane >= b[:, 2])[:, None]
-    one = _points_at(a, c, plane, 2)
-    other = _points_at(np.where(upper, b, a), np.where(upper, c, b), plane, 2)
-    swapped = (one[:, 1] > other[:, 1])[:, None]
-    one, other = np.where(swapped, other, one), np.where(swapped, one, other)
-    line, at_row = _spread_rows(*(_first_from(end[:, 1], nj) for end in (one, other)))
-    place = _points_at(one[line], other[line], at_row, 1)[:, 0]
-    i = _first_from(place, ni)
+    first = _points_at(a, c, plane, 2)
+    second = _points_at(np.where(upper, b, a), np.where(upper, c, b), plane, 2)
+    swapped = (first[:, 1] > second[:, 1])[:, None]
+    first, second = np.where(swapped, second, first), np.where(swapped, first, second)
+    line, at_row = _spread_rows(*(_first_from(end[:, 1], nj) for end in (first, second)))
+    crossing = _points_at(first[line], second[line], at_row, 1)[:, 0]
+    i = _first_from(crossing, ni)
     return np.asarray((plane[line] * nj + at_row) * (ni + 1) + i)
 
 
@@ -248,9 +248,9 @@ def _first_from(values: Float64Array, size: int) -> IntArray:
     return np.clip(np.ceil(values), 0, size).astype(np.int64)
 
 
-def _points_at(low: Float64Array, high: Float64Array, place: IntArray, axis: int) -> Float64Array:
+def _points_at(low: Float64Array, high: Float64Array, at_row: IntArray, axis: int) -> Float64Array:
     """Return the points of lines from `low` to `high` at a coordinate along an axis; its two other coordinates."""
-    share = (place - low[:, axis]) / (high[:, axis] - low[:, axis])
+    share = (at_row - low[:, axis]) / (high[:, axis] - low[:, axis])
     return low[:, :axis] + share[:, None] * (high[:, :axis] - low[:, :axis])
 
 
@@ -296,9 +296,9 @@ def count_points(keys: Keys) -> int:
     return int((keys[1::2] - keys[::2]).sum())
 
 
-def exclusive_or(one: Keys, other: Keys) -> Keys:
+def exclusive_or(first: Keys, second: Keys) -> Keys:
     """Return the ends of the runs of points that are in one but not in the other."""
-    keys = np.sort(np.concatenate([one, other]), kind="stable")  # merges two ascending parts
+    keys = np.sort(np.concatenate([first, second]), kind="stable")  # merges two ascending parts
     alone = np.ones(len(keys), dtype=bool)
     equal = keys[1:] == keys[:-1]
     alone[1:] &= ~equal
@@ -306,7 +306,7 @@ def exclusive_or(one: Keys, other: Keys) -> Keys:
     return np.asarray(keys[alone])
 
 
-def find_level_runs(volume: Volume, rule: IsoRule, lattice: Lattice, told: Callable[[int], None]) -> Keys:
+def find_level_runs(volume: Volume, rule: IsoRule, lattice: Lattice, report: Callable[[int], None]) -> Keys:
     """Find the ends of runs of points, (n,) int64, ascending, where the trilinear HU reach the one level of a rule.
 
     A trilinear field has its extremes at the corners of a cell: only cells with corners on both sides have points on
@@ -315,12 +315,12 @@ def find_level_runs(volume: Volume, rule: IsoRule, lattice: Lattice, told: Calla
     layers = lattice.cells_ijk[2]
     ni, nj, _ = volume.shape_ijk
     step = max(1, _SLAB_VOXELS // (ni * nj))
-    found = [np.zeros(0, dtype=np.int64)]
+    runs = [np.zeros(0, dtype=np.int64)]
     for first in range(0, layers, step):
-        told(first)
+        report(first)
         samples = _slices_with_border(volume, rule, first, min(first + step, layers) + 1)
-        found.append(np.sort(_runs_in(samples, rule, lattice, first)))
-    return np.concatenate(found)
+        runs.append(np.sort(_runs_in(samples, rule, lattice, first)))
+    return np.concatenate(runs)
 
 
 def _slices_with_border(volume: Volume, rule: IsoRule, first: int, end: int) -> NDArray[Any]:
@@ -361,7 +361,7 @@ def _runs_in(samples: NDArray[Any], rule: IsoRule, lattice: Lattice, first: int)
     follows = np.concatenate([[False], (np.diff(i) == 1) & (np.diff(j) == 0) & (np.diff(k) == 0)])
     shared = inside[k, j, i] & (i > 0)
     last = np.flatnonzero(i == lattice.cells_ijk[0] - 1)
-    found = []
+    ends = []
     for (row_k, tk), (row_j, tj) in itertools.product(enumerate(lattice.shares(2)), enumerate(lattice.shares(1))):
         if row_j == 0:
             edges = {
@@ -373,10 +373,10 @@ def _runs_in(samples: NDArray[Any], rule: IsoRule, lattice: Lattice, first: int)
         before[follows] = states[-1][np.flatnonzero(follows) - 1]
         row = base + (row_k * nj + row_j) * (ni + 1)
         for point, state in enumerate(states):
-            found.append(row[state != before] + point)
+            ends.append(row[state != before] + point)
             before = state
-        found.append(row[last[before[last]]] + finer)
-    return np.concatenate(found)
+        ends.append(row[last[before[last]]] + finer)
+    return np.concatenate(ends)
 
 
 def _blend(low: NDArray[np.float32], high: NDArray[np.float32], share: float) -> NDArray[np.float32]:

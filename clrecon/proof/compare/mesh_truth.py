@@ -100,18 +100,18 @@ def measure_truth(
     if not 0.0 < reach_mm < np.inf:
         raise UsageError(f"the reach is a number of mm above 0, not {reach_mm}")
     mesh.check()
-    told = progress or ignore_progress
+    report = progress or ignore_progress
     points, rows = sample_surface_points(mesh.vertices, mesh.triangles, samples)
-    told("truth", 0, 2)
+    report("truth", 0, 2)
     distance = truth.signed_distance(points)
-    told("truth", 1, 2)
+    report("truth", 1, 2)
     near = np.abs(distance) <= reach_mm
     if grid is not None:
         ijk = grid.lps_to_ijk(points)
         near &= ((ijk >= 1.0) & (ijk <= np.array(grid.shape_ijk) - 2.0)).all(axis=1)
     points, rows, distance = points[near], rows[near], distance[near]
     cosine = np.einsum("ij,ij->i", _face_normals(mesh, rows), _directions(truth, points))
-    told("truth", 2, 2)
+    report("truth", 2, 2)
     outer = cosine > 0.0
     if not outer.any():
         raise NoSurfaceError(
@@ -195,9 +195,9 @@ def find_cut_cells(
     cells = np.array(grid.shape_ijk) + 1  # with the border: from -1 on
     counts = -(-cells // _BLOCK)
     low = np.stack(np.meshgrid(*(np.arange(n) * _BLOCK for n in counts), indexing="ij"), axis=-1).reshape(-1, 3) - 1
-    edge, asked, told = _BLOCK, 0, progress or ignore_progress
+    edge, asked, report = _BLOCK, 0, progress or ignore_progress
     while True:
-        told("truth", asked, 0)
+        report("truth", asked, 0)
         low = low[(low < cells - 1).all(axis=1)]
         reach = _half_diagonals(grid, low, edge)
         distance = np.abs(truth.signed_distance(grid.ijk_to_lps(low + 0.5 * edge)))
@@ -207,7 +207,7 @@ def find_cut_cells(
             break
         edge //= 2
         low = (low[:, None] + _cell_corners(2) * edge).reshape(-1, 3)
-    told("truth", asked, 0)
+    report("truth", asked, 0)
     return GridCells(low[_is_cut(truth, grid, low)], name)
 
 

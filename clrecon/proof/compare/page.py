@@ -67,8 +67,8 @@ def plot_times(report: CompareReport, which: str) -> str:
                 axes.barh(row, width, left=left, height=0.66, color=_PART_COLORS[part], linewidth=0)
             left += max(width, 0.0)
         is_cut = totals[record.name] > end * 1.001
-        said = f"{seconds(totals[record.name])}{' (cut)' if is_cut else ''}"
-        axes.text(left + 0.012 * end, row, said, va="center", ha="left", fontsize=9, color=_INK)
+        label = f"{seconds(totals[record.name])}{' (cut)' if is_cut else ''}"
+        axes.text(left + 0.012 * end, row, label, va="center", ha="left", fontsize=9, color=_INK)
     axes.set_yticks(range(len(done)), [record.title for record in done])
     axes.invert_yaxis()
     axes.set_xlim(0.0, 1.16 * end)
@@ -137,11 +137,11 @@ def _label(axes: Any, points: Sequence[tuple[MethodRecord, int, float]]) -> None
         x, y = axes.transData.transform((across, up)) * scale
         placed.append((x, y, across, up, record.title))
     columns: list[list[tuple[float, float, int, float, str]]] = []
-    for each in sorted(placed):
-        if columns and each[0] - columns[-1][-1][0] < WIDE:
-            columns[-1].append(each)
+    for entry in sorted(placed):
+        if columns and entry[0] - columns[-1][-1][0] < WIDE:
+            columns[-1].append(entry)
         else:
-            columns.append([each])
+            columns.append([entry])
     for column in columns:
         beside, last = column[-1][0] + ASIDE, float("inf")
         for x, y, across, up, title in sorted(column, key=lambda each: (-each[1], each[0])):
@@ -268,8 +268,8 @@ def _facts(report: CompareReport) -> list[tuple[str, str]]:
 def _findings(report: CompareReport) -> str:
     items = "\n".join(f"<li>{escape(text)}</li>" for text in report.findings)
     warnings = "\n".join(f"<li>{escape(text)}</li>" for text in report.warnings)
-    said = f"<h3>Warnings</h3>\n<ul>\n{warnings}\n</ul>" if warnings else ""
-    return f'<ul class="findings">\n{items}\n</ul>\n{said}'
+    warning_list = f"<h3>Warnings</h3>\n<ul>\n{warnings}\n</ul>" if warnings else ""
+    return f'<ul class="findings">\n{items}\n</ul>\n{warning_list}'
 
 
 def _times(report: CompareReport) -> str:
@@ -285,12 +285,12 @@ def _accuracy(report: CompareReport) -> str:
     plot, measure = plot_accuracy(report, COLORS)
     if not plot:
         return ""
-    said = (
+    caption = (
         "Scatter about the true surface: what the method adds to the error of the level."
         if measure == "scatter"
         else "1 minus the sub-voxel Dice of slices: 0 is a mesh that encloses exactly what is at the level and above."
     )
-    return f"<figure>{plot}<figcaption>{escape(said)} One point a method.</figcaption></figure>"
+    return f"<figure>{plot}<figcaption>{escape(caption)} One point a method.</figcaption></figure>"
 
 
 def _legend(colors: Mapping[str, str]) -> str:
@@ -310,16 +310,16 @@ def _views(report: CompareReport, figures: Figures) -> str:
         alt = f"{record.title}, {report.view} view"
         images = _image(figures.images[record.name], alt)
         difference = figures.images.get(f"{record.name}-difference")
-        said = "the reference" if record.name == report.reference else ""
+        caption = "the reference" if record.name == report.reference else ""
         if difference is not None:
             images += _image(difference, f"difference of {record.title} to {reference}")
             like = record.pictures
-            said = "" if like is None else f"SSIM {share(like['ssim'])}, MSE {like['mse']:,.1f}"
-        elif not said:
+            caption = "" if like is None else f"SSIM {share(like['ssim'])}, MSE {like['mse']:,.1f}"
+        elif not caption:
             width, height = (record.small or {"size": report.size})["size"]
-            said = f"{width} x {height} pixels: not compared"
+            caption = f"{width} x {height} pixels: not compared"
         tiles.append(
-            f"<figure>{images}<figcaption><strong>{escape(record.title)}</strong> {said}</figcaption></figure>"
+            f"<figure>{images}<figcaption><strong>{escape(record.title)}</strong> {caption}</figcaption></figure>"
         )
     note = (
         f'<p class="note">One camera ({escape(report.view)}), one light, {report.size[0]} x {report.size[1]} pixels,'
@@ -339,19 +339,19 @@ def _slices(report: CompareReport, figures: Figures) -> str:
         return ""
     titles = {record.name: record.title for record in report.methods}
     drawn = set(chain(*(entry["lines"] for entry in report.slices)))
-    own = {titles[name]: COLORS[name] for name in titles if name in drawn and name not in figures.same}
+    colors = {titles[name]: COLORS[name] for name in titles if name in drawn and name not in figures.same}
     reference = titles[report.reference]
-    if figures.same and reference in own:
+    if figures.same and reference in colors:
         also = join([titles[name] for name in titles if name in figures.same])
-        own = {f"{title} (and {also})" if title == reference else title: color for title, color in own.items()}
+        colors = {f"{title} (and {also})" if title == reference else title: color for title, color in colors.items()}
     tiles = []
     for entry in report.slices:
-        for which, said in (("file", "the whole"), ("detail", "a detail of 24 mm")):
+        for which, extent in (("file", "the whole"), ("detail", "a detail of 24 mm")):
             image = figures.images[entry[which].removesuffix(".png")]
             first = int(entry["index"])
-            words = f"{entry['name']}, between slices {first} and {first + 1} along {entry['axis']}: {said}"
+            words = f"{entry['name']}, between slices {first} and {first + 1} along {entry['axis']}: {extent}"
             tiles.append(f"<figure>{_image(image, words)}<figcaption>{escape(words)}</figcaption></figure>")
-    return f'{_legend(own)}\n<div class="planes">\n' + "\n".join(tiles) + "\n</div>"
+    return f'{_legend(colors)}\n<div class="planes">\n' + "\n".join(tiles) + "\n</div>"
 
 
 def _paper(report: CompareReport) -> str:
@@ -359,19 +359,19 @@ def _paper(report: CompareReport) -> str:
         return ""
     low, high = report.paper["window_hu"]
     black = report.paper["controls"].get("black")
-    said = (
+    caption = (
         f"Each method looks along the slices, pixel for pixel with slice {report.paper['slice']} at a window of"
         f" {low:g} to {high:g} HU, and is compared with it as a paper on rendering of CT compares a view with an"
         " image. The controls show what this is worth"
     )
-    said += (
+    caption += (
         f": an all-black picture has an SSIM of {black['ssim']:.2f} here; the paper prints 0.38 to 0.56 for its"
         " methods."
         if black
         else "."
     )
     printed = "Seconds in the last column are those of the paper, on its own machine and scan." if PAPER else ""
-    return f'<p>{escape(said)}</p>\n{paper_table(report)}\n<p class="note">{printed}</p>'
+    return f'<p>{escape(caption)}</p>\n{paper_table(report)}\n<p class="note">{printed}</p>'
 
 
 def _definitions(report: CompareReport) -> str:

@@ -58,29 +58,29 @@ class Request:
 def save_volume(folder: Path, volume: Volume) -> None:
     """Write voxels and place of a volume, and nothing of its report."""
     np.save(folder / _VOXELS, volume.voxels, allow_pickle=False)
-    place = {"affine": volume.affine}
+    geometry = {"affine": volume.affine}
     if volume.uneven:
-        place["positions"] = volume.slice_origins()
-    np.savez(folder / _PLACE, **place)  # type: ignore[arg-type]
+        geometry["positions"] = volume.slice_origins()
+    np.savez(folder / _PLACE, **geometry)  # type: ignore[arg-type]
 
 
 def load_volume(folder: Path) -> Volume:
     """Read what `save_volume` wrote, into memory."""
     voxels = np.load(folder / _VOXELS, allow_pickle=False)
-    with np.load(folder / _PLACE, allow_pickle=False) as place:
-        return Volume(voxels, place["affine"], None, place["positions"] if "positions" in place else None)
+    with np.load(folder / _PLACE, allow_pickle=False) as geometry:
+        return Volume(voxels, geometry["affine"], None, geometry["positions"] if "positions" in geometry else None)
 
 
 def save_arrays(folder: Path, name: str, **arrays: NDArray[Any] | None) -> None:
     """Write the arrays of a method; those that are None are left out."""
-    for what, array in arrays.items():
+    for role, array in arrays.items():
         if array is not None:
-            np.save(folder / f"{name}-{what}.npy", array, allow_pickle=False)
+            np.save(folder / f"{name}-{role}.npy", array, allow_pickle=False)
 
 
-def load_array(folder: Path, name: str, what: str) -> NDArray[Any] | None:
+def load_array(folder: Path, name: str, role: str) -> NDArray[Any] | None:
     """Read one of them; None if it was left out."""
-    path = folder / f"{name}-{what}.npy"
+    path = folder / f"{name}-{role}.npy"
     return np.load(path, allow_pickle=False) if path.exists() else None
 
 
@@ -101,7 +101,7 @@ JUDGE = ("-m", "clrecon.proof.compare.judge")
 _MOST_JUDGES = 4
 
 
-def _start(command: Sequence[str], told: Mapping[str, Any]) -> subprocess.Popen[bytes]:
+def _start(command: Sequence[str], data: Mapping[str, Any]) -> subprocess.Popen[bytes]:
     if getattr(sys, "frozen", False) or not sys.executable:
         raise DeviceError("methods are compared in processes of a Python interpreter, and this program has none")
     try:
@@ -116,7 +116,7 @@ def _start(command: Sequence[str], told: Mapping[str, Any]) -> subprocess.Popen[
         raise DeviceError(f"no process can be started to compare methods: {error.strerror or error}") from error
     assert process.stdin is not None
     try:
-        process.stdin.write(json.dumps(told).encode())
+        process.stdin.write(json.dumps(data).encode())
         process.stdin.close()
     except OSError:  # it has ended already: its answer is missing
         pass
@@ -135,10 +135,10 @@ def run_in_process(request: Request) -> dict[str, Any]:
         process.wait()
         process.stdout.close()
     try:
-        told: dict[str, Any] = json.loads(answer)
+        answer_record: dict[str, Any] = json.loads(answer)
     except ValueError:
         return {"state": "failed", "kind": "Crash", "error": _describe_end(process.returncode), "hung": False}
-    return told
+    return answer_record
 
 
 def _describe_end(code: int) -> str:
@@ -149,14 +149,14 @@ def _describe_end(code: int) -> str:
     return f"its process crashed with {name}{more}"
 
 
-def measure_in_processes(told: Mapping[str, Any], methods: Mapping[str, int]) -> Iterator[tuple[str, dict[str, Any]]]:
+def measure_in_processes(data: Mapping[str, Any], methods: Mapping[str, int]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Measure products, a process a core; yield names with figures, see `Judge`, or ``reasons``."""
     parts = _share(methods, min(usable_cores(), _MOST_JUDGES))
     lines: queue.Queue[tuple[int, bytes]] = queue.Queue()
     processes: list[subprocess.Popen[bytes]] = []
     try:
         for number, part in enumerate(parts):
-            process = _start(JUDGE, {**told, "methods": part})
+            process = _start(JUDGE, {**data, "methods": part})
             processes.append(process)
             threading.Thread(target=_forward, args=(number, process.stdout, lines), daemon=True).start()
         running = len(processes)

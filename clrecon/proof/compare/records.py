@@ -40,26 +40,26 @@ BUSY_SHARE = 0.5
 
 
 def make_record(
-    method: Compared, told: Mapping[str, Any], measured: Mapping[str, Any], read_s: Mapping[str, float]
+    method: Compared, result: Mapping[str, Any], measured: Mapping[str, Any], read_s: Mapping[str, float]
 ) -> MethodRecord:
     """Compose the row of a method from `run_method`, `Judge.measure`, and both seconds of reading."""
-    done = told["state"] == "done"
-    first, runs = (told["first"], told["warm"]) if done else ({}, [])
+    done = result["state"] == "done"
+    first, runs = (result["first"], result["warm"]) if done else ({}, [])
     warm = {part: statistics.median(run[part] for run in runs) for part in PARTS} if done else {}
-    cells = told.get("cells") or {}
-    peak, before = told.get("memory_bytes"), told.get("memory_before_bytes")
-    kernels = told.get("kernel_seconds") or {}
+    cells = result.get("cells") or {}
+    peak, before = result.get("memory_bytes"), result.get("memory_before_bytes")
+    kernels = result.get("kernel_seconds") or {}
     return MethodRecord(
         name=method.name,
         title=method.title,
         what=method.what,
         makes=method.makes,
         peer=method.peer,
-        state=told["state"],
-        error=told["error"],
-        triangles=told.get("triangles"),
-        vertices=told.get("vertices"),
-        points=told.get("points"),
+        state=result["state"],
+        error=result["error"],
+        triangles=result.get("triangles"),
+        vertices=result.get("vertices"),
+        points=result.get("points"),
         first_s=_work(first) if done else None,
         warm_s=statistics.median(map(_work, runs)) if done else None,
         warm_runs=len(runs),
@@ -70,7 +70,7 @@ def make_record(
         memory_own_bytes=None if peak is None or before is None else max(0, peak - before),
         cells_visited=cells.get("visited"),
         cells_all=cells.get("all"),
-        growing=told.get("growing"),
+        growing=result.get("growing"),
         quality=measured.get("quality"),
         cells=measured.get("cells"),
         slices=measured.get("slices"),
@@ -78,7 +78,7 @@ def make_record(
         truth=measured.get("truth"),
         points_mm=measured.get("points"),
         reasons=measured.get("reasons", {}),
-        small=_facts_of_small(method, told),
+        small=_facts_of_small(method, result),
     )
 
 
@@ -86,9 +86,9 @@ def _work(parts: Mapping[str, float]) -> float:
     return sum(parts.values()) - parts.get("draw", 0.0)
 
 
-def _facts_of_small(method: Compared, told: Mapping[str, Any]) -> dict[str, Any] | None:
+def _facts_of_small(method: Compared, result: Mapping[str, Any]) -> dict[str, Any] | None:
     """Describe ray casting at the size of the twin; its time at the full size is reckoned from the pixels."""
-    small = told.get("small")
+    small = result.get("small")
     if not small:
         return None
     pixels = SIZE[0] * SIZE[1] / (TWIN_SIZE[0] * TWIN_SIZE[1])
@@ -115,10 +115,10 @@ def compose_report(
 ) -> CompareReport:
     """Compose the report of what the methods got: a level in HU, why that one, and warnings."""
     certificate = dict(volume.report) if settings.keep_ids else dict(without_ids(volume.report))
-    said = [str(text) for text in certificate.pop("warnings", [])]
+    notes = [str(text) for text in certificate.pop("warnings", [])]
     cores, free = usable_cores(), free_cores()
     if free < BUSY_SHARE * cores:
-        said.append(f"only {free:.1f} of {cores} cores are free: times are of a busy computer, their ratios count")
+        notes.append(f"only {free:.1f} of {cores} cores are free: times are of a busy computer, their ratios count")
     watch.lap("report")
     versions = {"Python": platform.python_version(), "clrecon": package_version()}
     for title, name in _LIBRARIES.items():
@@ -154,7 +154,7 @@ def compose_report(
         memory_allowed_bytes=settings.memory,
         version=package_version(),
         platform=platform_name(),
-        warnings=list(dict.fromkeys([*said, *warnings])),
+        warnings=list(dict.fromkeys([*notes, *warnings])),
         volume=certificate,
         seconds={part: round(spent, 4) for part, spent in {**watch.seconds, "total": watch.total()}.items()},
         peak_memory_bytes=peak_memory_bytes(),

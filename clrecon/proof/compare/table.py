@@ -176,8 +176,8 @@ def _row(
     swatch = f'<span class="swatch" style="background:{colors[record.name]}"></span>'
     name = f'<th scope="row">{swatch}{escape(record.title)}<small>{escape(record.what)}</small></th>'
     if not record.is_done:
-        said = "not installed" if record.state == "missing" else record.state
-        words = f"{said}: {escape(record.error or '')}"
+        state = "not installed" if record.state == "missing" else record.state
+        words = f"{state}: {escape(record.error or '')}"
         return f'<tr class="failed">{name}<td colspan="{len(columns) + 1}">{words}</td></tr>'
     cells = []
     for column, best in zip(columns, bests, strict=True):
@@ -191,8 +191,8 @@ def _row(
         is_best = record.makes == "mesh" and best is not None and text == best and not is_own
         mark = ' class="best"' if is_best else ""
         cells.append(f"<td{mark}>{text}{more}</td>")
-    own = reference is not None and record.name == reference.name
-    words = "the reference" if own else "; ".join(find_worse(record, reference))
+    is_reference = reference is not None and record.name == reference.name
+    words = "the reference" if is_reference else "; ".join(find_worse(record, reference))
     if not record.is_done or reference is None:
         words = ""
     missing = "; ".join(f"{name}: {reason}" for name, reason in record.reasons.items())
@@ -241,13 +241,13 @@ def paper_table(report: CompareReport) -> str:
         if not record.is_done:
             continue
         printed = PAPER.get(record.name)
-        told = "" if printed is None else f"{printed['method']}: {printed['seconds']:g}"
-        told += f", later {printed['later_s']:g}" if printed and "later_s" in printed else ""
+        printed_text = "" if printed is None else f"{printed['method']}: {printed['seconds']:g}"
+        printed_text += f", later {printed['later_s']:g}" if printed and "later_s" in printed else ""
         first = report.read_s["first"] + (record.first_s or 0.0)
         later = report.read_s["warm"] + (record.warm_s or 0.0)
         rows.append(
             f'<tr><th scope="row">{escape(record.title)}</th><td>{seconds(first)}</td><td>{seconds(later)}</td>'
-            f'{_likeness(like)}<td class="words">{escape(told)}</td></tr>'
+            f'{_likeness(like)}<td class="words">{escape(printed_text)}</td></tr>'
         )
     rows.append('<tr class="group"><th colspan="6" scope="colgroup">controls: pictures of nothing</th></tr>')
     for name, like in report.paper["controls"].items():

@@ -73,9 +73,9 @@ def facts_of_spine(anatomy: Anatomy, affine: Float64Array, settings: PhantomSett
     }
     choice = settings.spine_choice
     if choice is not None:
-        for vertebra, said in zip(anatomy.vertebrae, described["vertebrae"], strict=True):
-            said["label"] = level_number(vertebra.name)
-            said["whole"] = inside(bone_points(vertebra) + centre)
+        for vertebra, facts in zip(anatomy.vertebrae, described["vertebrae"], strict=True):
+            facts["label"] = level_number(vertebra.name)
+            facts["whole"] = inside(bone_points(vertebra) + centre)
         first, last = anatomy.vertebrae[0].axes[2], anatomy.vertebrae[-1].axes[2]
         # the angles between the first and the last level, as they are measured on a lateral and an anterior picture
         described["sagittal_angle_deg"] = _angle(last[1], last[2]) - _angle(first[1], first[2])

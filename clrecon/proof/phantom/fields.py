@@ -52,10 +52,10 @@ def ellipsoid(x: Field, y: Field, z: Field, half: Point) -> Field:
 
 
 def capsule(
-    at: tuple[Field, Field, Field], a: Point, b: Point, radius_a: float, radius_b: float, flatten: float = 1.0
+    points: tuple[Field, Field, Field], a: Point, b: Point, radius_a: float, radius_b: float, flatten: float = 1.0
 ) -> Field:
     """Distance to a rod from `a` to `b`, its radii `radius_a` and `radius_b`, its height its width / `flatten`."""
-    x, y, z = at
+    x, y, z = points
     ax, ay, az = a[0], a[1], a[2] * flatten
     dx, dy, dz = b[0] - ax, b[1] - ay, b[2] * flatten - az
     length2 = dx * dx + dy * dy + dz * dz
@@ -114,15 +114,15 @@ def nearest_on_surface(
     damping: Share of the way along the tangent plane that a round goes.
     """
     best = np.full(len(points), np.inf)
-    at = starts
+    foot = starts
     for _ in range(rounds):
-        value, gradient = gradient_of(function, at)
+        value, gradient = gradient_of(function, foot)
         square = np.maximum(np.einsum("ij,ij->i", gradient, gradient), 1e-6)
         off = np.abs(value) / np.sqrt(square)
         reached = off < 1e-3
-        np.minimum(best, np.where(reached, np.linalg.norm(points - at, axis=1) + off, np.inf), out=best)
-        way = points - at
-        along = np.einsum("ij,ij->i", way, gradient) / square
-        tangent = way - along[:, None] * gradient
-        at = at + damping * tangent - (value / square)[:, None] * gradient
+        np.minimum(best, np.where(reached, np.linalg.norm(points - foot, axis=1) + off, np.inf), out=best)
+        offset = points - foot
+        along = np.einsum("ij,ij->i", offset, gradient) / square
+        tangent = offset - along[:, None] * gradient
+        foot = foot + damping * tangent - (value / square)[:, None] * gradient
     return best

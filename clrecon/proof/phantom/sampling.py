@@ -236,9 +236,10 @@ def add_streaks(
         for n, angle in enumerate(np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES):
             cos, sin = np.float32(math.cos(angle) / step), np.float32(math.sin(angle) / step)
             hit = np.rint(x[0, columns] * cos + y[rows, 0] * sin).astype(np.intp) + bins // 2
-            way = np.bincount(hit, minlength=bins) * (spacing[0] * spacing[1] / step)
-            way = np.convolve(way, (0.25, 0.5, 0.25), mode="same")  # a voxel shades more than the bin of its centre
-            wrong = metal_hu * way**2 * (_STARVED_PER_MM * noise[n] - _HARDENED_PER_MM)
+            metal_mm = np.bincount(hit, minlength=bins) * (spacing[0] * spacing[1] / step)
+            # A voxel shades more than the bin of its centre.
+            metal_mm = np.convolve(metal_mm, (0.25, 0.5, 0.25), mode="same")
+            wrong = metal_hu * metal_mm**2 * (_STARVED_PER_MM * noise[n] - _HARDENED_PER_MM)
             filtered = np.fft.irfft(np.fft.rfft(wrong, 2 * bins) * ramp)[:bins].astype(np.float32)
             error += filtered[(x * cos + y * sin + np.float32(bins // 2 + 0.5)).astype(np.intp)]
         field[k] += error * np.float32(strength * np.pi / _ANGLES)

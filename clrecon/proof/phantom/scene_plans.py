@@ -169,7 +169,7 @@ def plan_pair() -> Plan:
 def _vertebra(vertebra: Vertebra, center: np.ndarray, axes: np.ndarray, marrow_hu: float) -> list[Part]:
     """Plan cortex and marrow of a vertebra at any place and angle."""
     low, high = local_bounds(vertebra)
-    at = (float(center[0]), float(center[1]), float(center[2]))
+    spot = (float(center[0]), float(center[1]), float(center[2]))
 
     def bone(x: Field, y: Field, z: Field) -> Field:
         return vertebra_distance(vertebra, x, y, z)
@@ -179,7 +179,7 @@ def _vertebra(vertebra: Vertebra, center: np.ndarray, axes: np.ndarray, marrow_h
         arch = coverage(y - np.float32(vertebra.depth / 2.0 + 1.0), 6.0)
         return np.asarray(bone(x, y, z) - np.float32(1.0) - np.float32(0.6) * arch, dtype=np.float32)
 
-    return [Part("bone", 950.0, bone, low, high, at, axes), Part("bone", marrow_hu, marrow, low, high, at, axes)]
+    return [Part("bone", 950.0, bone, low, high, spot, axes), Part("bone", marrow_hu, marrow, low, high, spot, axes)]
 
 
 def plan_bones() -> Plan:
@@ -348,8 +348,8 @@ def plan_long_bone() -> Plan:
         return np.asarray(np.float32(1.35) - np.sqrt(x * x + y * y), dtype=np.float32)
 
     jitter = np.random.default_rng(20)
-    for axis, one, other in itertools.product(range(3), np.arange(-0.9, 1.0, 0.6), np.arange(-0.9, 1.0, 0.6)):
-        ends = np.insert(np.add((one, other), jitter.uniform(-0.05, 0.05, (2, 2))), axis, (-1.5, 1.5), axis=1)
+    for axis, first, second in itertools.product(range(3), np.arange(-0.9, 1.0, 0.6), np.arange(-0.9, 1.0, 0.6)):
+        ends = np.insert(np.add((first, second), jitter.uniform(-0.05, 0.05, (2, 2))), axis, (-1.5, 1.5), axis=1)
         a, b = ((float(end[0]), float(end[1]), float(end[2])) for end in ends)
         parts.append(cut(rod("bone", 2600.0, a, b, 0.08), within))
     return Plan(parts, front=-1.96, back=1.96)
@@ -367,13 +367,13 @@ def plan_hand() -> Plan:
         ((-13.0, 0.0, -42.0), -0.1, 0.96, 0),
         ((-28.0, 1.0, -43.0), -0.2, 0.82, 0),
     ):
-        way = np.array((math.sin(lean), 0.0, math.cos(lean)))
-        at = np.array(base)
+        direction = np.array((math.sin(lean), 0.0, math.cos(lean)))
+        joint = np.array(base)
         for length, radius in list(zip(lengths, radii, strict=True))[first:]:
-            start, at = at + radius * way, at + scale * length * way
-            bones.append(([_point(start), _point(at - radius * way)], radius))
-            at = at + 2.8 * way
-        flesh.append(rod("tissue", 60.0, base, _point(at), 10.0, 8.0))
+            start, joint = joint + radius * direction, joint + scale * length * direction
+            bones.append(([_point(start), _point(joint - radius * direction)], radius))
+            joint = joint + 2.8 * direction
+        flesh.append(rod("tissue", 60.0, base, _point(joint), 10.0, 8.0))
     places = [(x, y, z) for (z, y), x in itertools.product(((-51.0, 0.0), (-63.5, 1.0)), (-22.0, -8.0, 6.0, 20.0))]
     wrist = [([(x - 0.7, y, z), (x + 0.7, y, z)], 5.0) for x, y, z in places]
     palm = ball("tissue", 60.0, (-4.0, 0.0, -30.0), (40.0, 13.0, 34.0))

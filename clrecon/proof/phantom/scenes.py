@@ -159,37 +159,37 @@ def draw_scene(
         for offset in offsets:
             canvas = np.full(shape[1:], AIR_HU, dtype=np.float32)
             for part, piece in met:
-                at = piece.window(k + offset)
-                paint(canvas, at.region, coverage(_distance(part, at), ramp), part.hu)
+                view = piece.window(k + offset)
+                paint(canvas, view.region, coverage(_distance(part, view), ramp), part.hu)
             voxels[k] += canvas
         voxels[k] /= np.float32(subslices)
         for part, piece in met:
-            at = piece.window(float(k))
-            labels[k][at.region][_distance(part, at) >= 0.0] = MATERIALS.index(part.material)
+            view = piece.window(float(k))
+            labels[k][view.region][_distance(part, view) >= 0.0] = MATERIALS.index(part.material)
         if progress is not None:
             progress("draw", k + 1, shape[0])
     return voxels, labels
 
 
-def _distance(part: Part, at: Window) -> Field:
-    return np.asarray(part.distance(at.x, at.y, at.z), dtype=np.float32)
+def _distance(part: Part, view: Window) -> Field:
+    return np.asarray(part.distance(view.x, view.y, view.z), dtype=np.float32)
 
 
 def facts_of_parts(voxels: NDArray[np.int16], labels: LabelArray, affine: Float64Array) -> dict[str, dict[str, float]]:
     """Describe each material that is present: its label, voxels, volume and number of dense voxels."""
     voxel_ml = abs(float(np.linalg.det(affine[:3, :3]))) / 1000.0
-    found = {}
+    facts = {}
     for label, material in enumerate(MATERIALS):
         mask = labels == label
         if count := int(np.count_nonzero(mask)):
-            found[material] = {
+            facts[material] = {
                 "label": label,
                 "voxels": count,
                 "volume_ml": round(count * voxel_ml, 3),
                 "volume_mm3": round(1000.0 * count * voxel_ml, 4),
                 "voxels_above_300_hu": int(np.count_nonzero(voxels[mask] > DENSE_HU)),
             }
-    return found
+    return facts
 
 
 def bone_depth(parts: Sequence[Part], points_mm: Float64Array, *materials: str) -> Float32Array:
@@ -197,8 +197,8 @@ def bone_depth(parts: Sequence[Part], points_mm: Float64Array, *materials: str) 
     x, y, z = np.ascontiguousarray((points_mm - CENTRE_LPS_MM).T, dtype=np.float32)
     depth = np.full(len(points_mm), -np.inf, dtype=np.float32)
     for part in parts:
-        own = part.distance_at(x, y, z)
-        depth = np.maximum(depth, own) if part.material in materials else np.minimum(depth, -own)
+        part_depth = part.distance_at(x, y, z)
+        depth = np.maximum(depth, part_depth) if part.material in materials else np.minimum(depth, -part_depth)
     return depth
 
 

@@ -133,11 +133,11 @@ def slice_file_name(index: int) -> str:
     return f"IM{index + 1:04d}.dcm"
 
 
-def _make_uid(settings: PhantomSettings, *what: str) -> str:
+def _make_uid(settings: PhantomSettings, *words: str) -> str:
     from pydicom.uid import generate_uid
 
     described = json.dumps(settings.as_dict(), sort_keys=True)
-    return str(generate_uid(entropy_srcs=["clrecon phantom", described, *what]))
+    return str(generate_uid(entropy_srcs=["clrecon phantom", described, *words]))
 
 
 def _make_headers(settings: PhantomSettings, placement: Placement, phase: int) -> Iterator[FileDataset]:

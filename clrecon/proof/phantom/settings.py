@@ -149,8 +149,8 @@ class Kind:
     """HU of both sides of most of the surface of bone; None where there are several bones or tissues."""
 
 
-def _scene(said: str, spacing: tuple[float, float, float], table: str = "none", **more: Any) -> Kind:
-    return Kind(said, spacing, **{"noise": 12.0, "point_spread_mm": 0.5, "table": table, "is_scene": True, **more})
+def _scene(words: str, spacing: tuple[float, float, float], table: str = "none", **more: Any) -> Kind:
+    return Kind(words, spacing, **{"noise": 12.0, "point_spread_mm": 0.5, "table": table, "is_scene": True, **more})
 
 
 KINDS = {
@@ -255,10 +255,10 @@ def parse_missing(text: str) -> tuple[int, ...]:
     """Read numbers of slices such as ``"20-22,40"``."""
     numbers: list[int] = []
     for part in text.split(","):
-        found = re.fullmatch(r" *([0-9]{1,4})(?: *- *([0-9]{1,4}))? *", part, re.ASCII)
-        if found is None or int(found[2] or found[1]) < int(found[1]):
+        match = re.fullmatch(r" *([0-9]{1,4})(?: *- *([0-9]{1,4}))? *", part, re.ASCII)
+        if match is None or int(match[2] or match[1]) < int(match[1]):
             raise UsageError(f"missing slices {text[:40]!r} are not understood: use numbers from 1, like 20-22,40")
-        numbers += range(int(found[1]), int(found[2] or found[1]) + 1)
+        numbers += range(int(match[1]), int(match[2] or match[1]) + 1)
     return tuple(numbers)
 
 
@@ -417,8 +417,8 @@ class PhantomSettings:
         if self.kind != "spine":
             for name, default in (*_SPINE_ONLY.items(), ("ghosts", False)):
                 if getattr(self, name) != default:
-                    said = _SAID.get(name) or name.removesuffix("_deg").removesuffix("_mm").replace("_", " ")
-                    raise UsageError(f"a {self.kind} has no {said}: {_SAID_PLURAL.get(name, 'it is')} for the spine")
+                    noun = _SAID.get(name) or name.removesuffix("_deg").removesuffix("_mm").replace("_", " ")
+                    raise UsageError(f"a {self.kind} has no {noun}: {_SAID_PLURAL.get(name, 'it is')} for the spine")
         if self.slices is None or self.levels is not None:
             choice, slices = self.spine_choice, self.slices
             if choice is not None and self.levels is not None:

@@ -252,9 +252,9 @@ class _Scene:
         """Draw all bone of (sub-)slice `k`, which belongs to slice `slice_k`, onto `canvas`."""
         for disc, placed in self.discs:
             if placed.meets(slice_k):
-                at = placed.window(k)
-                wall = ellipse(at.x, at.y, disc.half_width, disc.half_depth)
-                inside = np.minimum(wall, np.float32(disc.half_length) - np.abs(at.z))
+                view = placed.window(k)
+                wall = ellipse(view.x, view.y, disc.half_width, disc.half_depth)
+                inside = np.minimum(wall, np.float32(disc.half_length) - np.abs(view.z))
                 # The fibrous ring is a little denser than the nucleus.
                 ring = np.float32(_DISC_HU) + np.float32(14.0) * coverage(8.0 - wall, 8.0)
                 paint(canvas, placed.region, coverage(inside, self.ramp), ring)
@@ -263,9 +263,9 @@ class _Scene:
             if placed.meets(slice_k):
                 self._draw_vertebra(canvas, vertebra, placed.window(k))
         if self.marker.meets(slice_k):
-            at = self.marker.window(k)
-            ball = np.float32(self.anatomy.marker_radius) - np.sqrt(at.x * at.x + at.y * at.y + at.z * at.z)
-            paint(canvas, at.region, coverage(ball, self.ramp), _MARKER_HU)
+            view = self.marker.window(k)
+            ball = np.float32(self.anatomy.marker_radius) - np.sqrt(view.x * view.x + view.y * view.y + view.z * view.z)
+            paint(canvas, view.region, coverage(ball, self.ramp), _MARKER_HU)
 
     def _draw_ribs(self, canvas: Field, scratch: Field, slice_k: int, k: float) -> None:
         """Draw all ribs as one union, so that the joints of the rods do not show."""
@@ -275,8 +275,8 @@ class _Scene:
         for _, _, placed in active:
             scratch[placed.region] = -1e3
         for a, b, placed in active:
-            at = placed.window(k)
-            rod = capsule((at.x, at.y, at.z), tuple(a), tuple(b), 3.5, 3.5, 0.55)
+            grid = placed.window(k)
+            rod = capsule((grid.x, grid.y, grid.z), tuple(a), tuple(b), 3.5, 3.5, 0.55)
             view = scratch[placed.region]
             np.maximum(view, rod, out=view)
         rows = slice(min(p.region[0].start for *_, p in active), max(p.region[0].stop for *_, p in active))
@@ -286,21 +286,21 @@ class _Scene:
         paint(canvas, (rows, columns), coverage(rib - np.float32(1.0), self.ramp), RIB_MARROW_HU)
         rib[...] = -1e3
 
-    def _draw_vertebra(self, canvas: Field, vertebra: Vertebra, at: Window) -> None:
-        bone = vertebra_distance(vertebra, at.x, at.y, at.z)
+    def _draw_vertebra(self, canvas: Field, vertebra: Vertebra, view: Window) -> None:
+        bone = vertebra_distance(vertebra, view.x, view.y, view.z)
         if bone.max() <= -self.ramp:
             return
         # 0 in the body, 1 in the arch: thicker cortex and denser marrow behind the body
-        arch = coverage(at.y - np.float32(vertebra.depth / 2.0 + 1.0), 6.0)
+        arch = coverage(view.y - np.float32(vertebra.depth / 2.0 + 1.0), 6.0)
         cortex = np.float32(0.75) + np.float32(0.65) * arch
-        marrow = waves_at(at.x, at.y, at.z, vertebra.waves) * np.float32(_TRABECULAR_TEXTURE_HU)
+        marrow = waves_at(view.x, view.y, view.z, vertebra.waves) * np.float32(_TRABECULAR_TEXTURE_HU)
         marrow += np.float32(TRABECULAR_HU) + np.float32(ARCH_MARROW_HU - TRABECULAR_HU) * arch
         # basivertebral vein, from the middle of the back wall into the body
-        vein = capsule((at.x, at.y, at.z), (0.0, vertebra.depth / 2.0, 0.0), (0.0, 2.0, 0.0), 2.4, 1.0, 1.0)
+        vein = capsule((view.x, view.y, view.z), (0.0, vertebra.depth / 2.0, 0.0), (0.0, 2.0, 0.0), 2.4, 1.0, 1.0)
         marrow += coverage(vein, 1.5) * (np.float32(_VEIN_HU) - marrow)
         shell = np.float32(BODY_CORTEX_HU) + np.float32(CORTEX_HU - BODY_CORTEX_HU) * arch
-        paint(canvas, at.region, coverage(bone, self.ramp), shell)
-        paint(canvas, at.region, coverage(bone - cortex, self.ramp), marrow)
+        paint(canvas, view.region, coverage(bone, self.ramp), shell)
+        paint(canvas, view.region, coverage(bone - cortex, self.ramp), marrow)
 
 
 def plan_spine(settings: PhantomSettings, affine: Float64Array) -> tuple[Anatomy, Float64Array]:
@@ -322,8 +322,10 @@ def label_levels(settings: PhantomSettings, affine: Float64Array) -> NDArray[np.
         placed = PlacedPiece(Piece(vertebra.center, vertebra.axes, low, high), grid, settings.shape_kji)
         for k in range(settings.slices):
             if placed.meets(k):
-                at = placed.window(float(k))
-                labels[k][at.region][vertebra_distance(vertebra, at.x, at.y, at.z) >= 0.0] = level_number(vertebra.name)
+                view = placed.window(float(k))
+                labels[k][view.region][vertebra_distance(vertebra, view.x, view.y, view.z) >= 0.0] = level_number(
+                    vertebra.name
+                )
     return labels
 
 
@@ -343,13 +345,13 @@ def draw_spine(
     anatomy, grid = plan_spine(settings, affine)
     scene = _Scene(anatomy, grid, shape, ramp)
     body = Plan([], front=-anatomy.half_depth, back=anatomy.half_depth)
-    own = settings.table_used == "own"
-    table = None if own else lay_under(body, settings.table_used, settings.table_gap_mm, settings.prone)
+    is_own = settings.table_used == "own"
+    table = None if is_own else lay_under(body, settings.table_used, settings.table_gap_mm, settings.prone)
     voxels = np.empty(shape, dtype=np.float32)
     offsets = (np.arange(subslices) + 0.5) / subslices - 0.5
 
-    def draw(k: int, place: float) -> None:
-        full = Window((slice(0, shape[1]), slice(0, shape[2])), grid, place)
+    def draw(k: int, slice_place: float) -> None:
+        full = Window((slice(0, shape[1]), slice(0, shape[2])), grid, slice_place)
         tissue = np.full(shape[1:], AIR_HU, dtype=np.float32)
         painter = _Painter(tissue, ramp, settings.seed, blood_hu)
         _draw_tissue(painter, anatomy, full.x, full.y, full.z, table, settings.prone)
@@ -357,7 +359,7 @@ def draw_spine(
         voxels[k] = 0.0
         for offset in offsets:
             canvas = tissue.copy() if subslices > 1 else tissue
-            scene.draw(canvas, scratch, k, place + offset)
+            scene.draw(canvas, scratch, k, slice_place + offset)
             voxels[k] += canvas
         if subslices > 1:
             voxels[k] /= np.float32(subslices)

@@ -231,11 +231,11 @@ def fit_slices(
     whole = math.ceil(_reach(bone_extent(shown, choice.normal)) / dk)
     bodies = math.ceil(_reach(body_extent(shown, choice.normal)) / dk)
     row, column, _ = slice_directions(*directions)
-    for what, direction, available in (("columns", row, extent[0]), ("rows", column, extent[1])):
+    for noun, direction, available in (("columns", row, extent[0]), ("rows", column, extent[1])):
         needed = _reach(body_extent(shown, direction))
         if needed > available:
             raise UsageError(
-                f"{named} do not fit: their bodies need {needed:.0f} mm of {what}, there are {available:.0f} mm;"
+                f"{named} do not fit: their bodies need {needed:.0f} mm of {noun}, there are {available:.0f} mm;"
                 " take more pixels, larger ones or fewer levels"
             )
     if slices is not None:

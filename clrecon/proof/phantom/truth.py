@@ -86,35 +86,35 @@ class _Shape:
         rims = [self._rim(n, fine[(np.abs(value) < _STEP_MM) & (np.abs(cut) < _STEP_MM)]) for n, cut in enumerate(cuts)]
         for cut in cuts:
             np.minimum(value, cut, out=value)
-        at = fine[np.abs(value) < reach * _STEP_MM / 1.5]
+        points = fine[np.abs(value) < reach * _STEP_MM / 1.5]
         for _ in range(3):
-            value, gradient = gradient_of(self, at)
+            value, gradient = gradient_of(self, points)
             square = np.maximum(np.einsum("ij,ij->i", gradient, gradient), 1e-4)
-            at = at - np.clip(value / square, -_STEP_MM, _STEP_MM)[:, None] * gradient
-        at = at[np.abs(self(at)) < 1e-4]
-        return np.concatenate((at, *rims))
+            points = points - np.clip(value / square, -_STEP_MM, _STEP_MM)[:, None] * gradient
+        points = points[np.abs(self(points)) < 1e-4]
+        return np.concatenate((points, *rims))
 
     def _rim(self, cut: int, near: Float64Array) -> Float64Array:
         """Return points where the bone and a cut are both zero and nothing else is cut away."""
 
-        def move(at: Float64Array, rounds: int) -> tuple[Float64Array, Float64Array]:
+        def move(points: Float64Array, rounds: int) -> tuple[Float64Array, Float64Array]:
             """Return points moved onto the rim, and its directions there."""
-            along = np.zeros_like(at)
+            along = np.zeros_like(points)
             for _ in range(rounds):
-                bone, first = gradient_of(functools.partial(self.part, 0), at)
-                hole, second = gradient_of(functools.partial(self.part, cut + 1), at)
+                bone, first = gradient_of(functools.partial(self.part, 0), points)
+                hole, second = gradient_of(functools.partial(self.part, cut + 1), points)
                 a, b, c = ((u * v).sum(axis=1) for u, v in ((first, first), (first, second), (second, second)))
                 det = np.maximum(a * c - b * b, 1e-3)
                 step = ((c * bone - b * hole) / det)[:, None] * first + ((a * hole - b * bone) / det)[:, None] * second
-                at = at - np.clip(step, -_STEP_MM, _STEP_MM)
+                points = points - np.clip(step, -_STEP_MM, _STEP_MM)
                 along = np.cross(first, second) / np.sqrt(det)[:, None]
-            return at, along
+            return points, along
 
-        at, along = move(near, 5)
+        points, along = move(near, 5)
         offsets = (np.arange(_RIM_PARTS) - (_RIM_PARTS - 1) / 2.0) * _STEP_MM / _RIM_PARTS
-        at = move((at[:, None] + along[:, None] * offsets[:, None]).reshape(-1, 3), 3)[0]
-        bone, hole = self.part(0, at), self.part(cut + 1, at)
-        return at[(np.abs(bone) < 1e-4) & (np.abs(hole) < 1e-4) & (np.abs(self(at)) < 1e-4)]
+        points = move((points[:, None] + along[:, None] * offsets[:, None]).reshape(-1, 3), 3)[0]
+        bone, hole = self.part(0, points), self.part(cut + 1, points)
+        return points[(np.abs(bone) < 1e-4) & (np.abs(hole) < 1e-4) & (np.abs(self(points)) < 1e-4)]
 
 
 class BoneSurface:
@@ -134,15 +134,15 @@ class BoneSurface:
 
     def holder(self, points: Float64Array) -> NDArray[np.intp]:
         """Return the place in `vertebrae` of the one that holds each point (n, 3), -1 where none does."""
-        found = np.full(len(points), -1, dtype=np.intp)
+        holders = np.full(len(points), -1, dtype=np.intp)
         for n, vertebra in enumerate(self.vertebrae):
             local = (points - vertebra.center) @ vertebra.axes.T
             low, high = local_bounds(vertebra)
             boxed = np.flatnonzero(((local > low) & (local < high)).all(axis=1))
             for start in range(0, len(boxed), _CHUNK):
                 part = boxed[start : start + _CHUNK]
-                found[part[self._shapes[n](local[part]) >= 0.0]] = n
-        return found
+                holders[part[self._shapes[n](local[part]) >= 0.0]] = n
+        return holders
 
     def distance(self, points: Float64Array) -> Float64Array:
         """Return the distance of points (n, 3) to the nearest point of the surface, mm, without a sign."""
@@ -169,44 +169,44 @@ class BoneSurface:
     def _foot(self, n: int, points: Float64Array, starts: Float64Array) -> Float64Array:
         """Return distances to the feet of perpendiculars on the parts nearest at `starts`; infinite where cut away."""
         shape = self._shapes[n]
-        found = np.full(len(points), np.inf)
+        distances = np.full(len(points), np.inf)
         values = np.abs(shape.parts(starts))
         # the functions are steeper than a distance by different factors: parts that may be the nearest one are tried
         near = values <= 2.0 * values.min(axis=0) + 0.2
         for part, tried in enumerate(near):
             chosen = np.flatnonzero(tried)
             if len(chosen):
-                at, slope = _walk(functools.partial(shape.part, part), points[chosen], starts[chosen])
-                off = np.abs(shape(at)) / slope
-                reached = np.where(off < 1e-3, np.linalg.norm(points[chosen] - at, axis=1) + off, np.inf)
-                found[chosen] = np.minimum(found[chosen], reached)
-        return found
+                feet, slope = _walk(functools.partial(shape.part, part), points[chosen], starts[chosen])
+                off = np.abs(shape(feet)) / slope
+                reached = np.where(off < 1e-3, np.linalg.norm(points[chosen] - feet, axis=1) + off, np.inf)
+                distances[chosen] = np.minimum(distances[chosen], reached)
+        return distances
 
 
-def _walk(function: Function, points: Float64Array, at: Float64Array) -> tuple[Float64Array, Float64Array]:
+def _walk(function: Function, points: Float64Array, foot: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return the feet of the perpendiculars of points on a smooth surface, and the slopes of the function there.
 
     A step goes along the touching plane by the part of the way that the curvature of the surface in this direction
     leaves: way / (1 + curvature * height), with the height over the surface.
     """
     for _ in range(2):
-        value, gradient = gradient_of(function, at)
+        value, gradient = gradient_of(function, foot)
         slope = np.sqrt(np.maximum(np.einsum("ij,ij->i", gradient, gradient), 1e-6))
         normal = -gradient / slope[:, None]  # outwards
-        at = at + (value / slope)[:, None] * normal
-        way = points - at
-        height = np.einsum("ij,ij->i", way, normal)
-        tangent = way - height[:, None] * normal
+        foot = foot + (value / slope)[:, None] * normal
+        offset = points - foot
+        height = np.einsum("ij,ij->i", offset, normal)
+        tangent = offset - height[:, None] * normal
         length = np.sqrt(np.maximum(np.einsum("ij,ij->i", tangent, tangent), 1e-12))
         probe = np.minimum(length, _PROBE_MM)
         # how far the surface falls back from the plane a little on the way
-        drop = -function(at + (probe / length)[:, None] * tangent) / slope
+        drop = -function(foot + (probe / length)[:, None] * tangent) / slope
         share = 1.0 / np.clip(1.0 + 2.0 * drop / probe**2 * height, 0.5, 100.0)
-        at = at + share[:, None] * tangent
-    value, gradient = gradient_of(function, at)
+        foot = foot + share[:, None] * tangent
+    value, gradient = gradient_of(function, foot)
     square = np.maximum(np.einsum("ij,ij->i", gradient, gradient), 1e-6)
-    at = at - (value / square)[:, None] * gradient
-    return at, np.sqrt(square)
+    foot = foot - (value / square)[:, None] * gradient
+    return foot, np.sqrt(square)
 
 
 _SAME_MM = 1e-6

@@ -59,9 +59,9 @@ def _unite(parts: list[Field], blend_mm: float) -> Field:
     return reduce(lambda a, b: smooth_union(a, b, blend_mm), parts)
 
 
-def _foramen(side: Field, y: Field, at: tuple[float, float], half: tuple[float, float]) -> Field:
+def _foramen(side: Field, y: Field, middle: tuple[float, float], half: tuple[float, float]) -> Field:
     """Return the distance to a canal along z through a transverse process."""
-    return ellipse(side - np.float32(at[0]), y - np.float32(at[1]), *half)
+    return ellipse(side - np.float32(middle[0]), y - np.float32(middle[1]), *half)
 
 
 def _canal(vertebra: Vertebra, x: Field, y: Field) -> Field:
@@ -366,8 +366,8 @@ def _distance_to(vertebra: Vertebra, points: Float64Array) -> Float64Array:
     # starts at three distances in all directions: the processes of the vertebra may lie on any side
     starts = np.concatenate([local[:, None] + reach * ways for reach in (2.0, 4.0, 7.0)], axis=1)
     targets = np.repeat(local, starts.shape[1], axis=0)
-    found = nearest_on_surface(surface, targets, starts.reshape(-1, 3), _ROUNDS)
-    return found.reshape(len(points), -1).min(axis=1)
+    nearest = nearest_on_surface(surface, targets, starts.reshape(-1, 3), _ROUNDS)
+    return nearest.reshape(len(points), -1).min(axis=1)
 
 
 def close_facets(vertebrae: Sequence[Vertebra], gap_mm: float) -> list[Vertebra]:

@@ -40,18 +40,18 @@ def scattered_points(n: int) -> NDArray[np.float32]:
 def _check_grid(device: Device) -> str:
     points = scattered_points(20_000)
     for edge in (0.5, 2.3):
-        made, twin = make_grid(device, points, edge), grid_twin.make_grid(points, edge)
-        what = f"of a grid of {edge} mm"
-        require_equal(made.cells, len(twin.starts) - 1, f"the number of cells {what}")
+        device_grid, twin = make_grid(device, points, edge), grid_twin.make_grid(points, edge)
+        subject = f"of a grid of {edge} mm"
+        require_equal(device_grid.cells, len(twin.starts) - 1, f"the number of cells {subject}")
         for name, buffer, expected in (
-            ("mask", made.mask_d, twin.mask),
-            ("ranks", made.ranks_d, twin.ranks),
-            ("starts", made.starts_d, twin.starts),
-            ("order", made.order_d, twin.order),
-            *zip("xyz", (made.x_d, made.y_d, made.z_d), twin.points.T, strict=True),
+            ("mask", device_grid.mask_d, twin.mask),
+            ("ranks", device_grid.ranks_d, twin.ranks),
+            ("starts", device_grid.starts_d, twin.starts),
+            ("order", device_grid.order_d, twin.order),
+            *zip("xyz", (device_grid.x_d, device_grid.y_d, device_grid.z_d), twin.points.T, strict=True),
         ):
-            found = download(device, np.empty(expected.shape, expected.dtype), buffer)
-            require_equal(found, expected, f"{name} {what}")
+            content = download(device, np.empty(expected.shape, expected.dtype), buffer)
+            require_equal(content, expected, f"{name} {subject}")
     return "2 grids over 20,000 points equal"
 
 
@@ -86,12 +86,12 @@ EPS = 0.97
 def _check_clusters(device: Device) -> str:
     points = scattered_points(20_000)
     for samples in (1, 3):
-        found = cluster_free_points(points, EPS, samples, device=device)
+        clusters = cluster_free_points(points, EPS, samples, device=device)
         count, labels, cores = clusters_twin.cluster_points(points, EPS, samples)
-        what = f"with {samples} samples"
-        require_equal(found.count, count, f"the number of clusters {what}")
-        require_equal(found.cores, cores, f"core points {what}")
-        require_equal(found.labels, labels, f"labels {what}")
+        subject = f"with {samples} samples"
+        require_equal(clusters.count, count, f"the number of clusters {subject}")
+        require_equal(clusters.cores, cores, f"core points {subject}")
+        require_equal(clusters.labels, labels, f"labels {subject}")
     return f"clusters of 20,000 points equal, {count:,} of them"
 
 
@@ -99,22 +99,22 @@ def _check_passes(device: Device) -> str:
     """Compare links within chunks, the roots of words, and the forecast of pairs; chunks are small here."""
     points, samples, per_chunk = scattered_points(20_000), 3, 32
     plan = plan_cells(points, EPS)
-    made, grid = fill_grid(device, plan), grid_twin.make_grid(points, float(plan.edge))
-    search = ClusterSearch(device, made, EPS, samples, per_chunk)
+    device_grid, grid = fill_grid(device, plan), grid_twin.make_grid(points, float(plan.edge))
+    search = ClusterSearch(device, device_grid, EPS, samples, per_chunk)
     pairs = clusters_twin.count_pairs(grid, float(plan.edge), samples)
     require_close(search.count_pairs(), pairs, 1e-3, "pairs of points")
     search.find_cores()
     search.join_within()
     _, labels, cores = clusters_twin.cluster_points(points, EPS, samples)
     expected = clusters_twin.join_chunks(grid, cores[grid.order], EPS * (1.0 + 1e-6), per_chunk)
-    found = download(device, np.empty(made.cells, np.uint32), search.labels_d)
-    require_equal(found, expected, "labels within chunks")
+    downloaded = download(device, np.empty(device_grid.cells, np.uint32), search.labels_d)
+    require_equal(downloaded, expected, "labels within chunks")
     search.note_words()
     roots = clusters_twin.note_words(grid, expected)
     require_equal(download(device, np.empty(roots.shape, np.uint32), search.roots_d), roots, "roots of words")
     search.hook_chunks()
     require_equal(search.label()[0], labels, "labels of clusters that were found in small chunks")
-    return f"links of {made.cells:,} cells equal"
+    return f"links of {device_grid.cells:,} cells equal"
 
 
 def _check_thin(device: Device) -> str:
@@ -127,9 +127,9 @@ def _check_thin(device: Device) -> str:
 def _check_sparse_cells(device: Device) -> str:
     points = scattered_points(20_000)
     for edge, fewest, threshold, largest in ((1.1, 2, 3, False), (1.6, 2, 4, True)):
-        found = grow_cells(device, plan_grid(points, edge), fewest, threshold, largest).removed
+        removed = grow_cells(device, plan_grid(points, edge), fewest, threshold, largest).removed
         expected = grid_twin.grow_cells(points, edge, fewest, threshold, largest)
-        require_equal(found, expected, f"what becomes of points in cells of {edge} mm")
+        require_equal(removed, expected, f"what becomes of points in cells of {edge} mm")
     return "growth over 2 grids equal"
 
 
@@ -182,9 +182,9 @@ def _check_normals(device: Device) -> str:
     clear = (eigenvalues[:, 1] - eigenvalues[:, 0]) / eigenvalues[:, 2] > 0.03
     viewpoint = np.array([30.0, 30.0, -90.0])
     expected = filter_twin.orient_from(axes, points, viewpoint)
-    found = estimate_normals(PointCloud(points), K, viewpoint=viewpoint, device=device).cloud.normals
-    assert found is not None
-    return f"9,000 normals within {require_close(found[clear], expected[clear], NORMAL, 'normals'):.1e}"
+    normals = estimate_normals(PointCloud(points), K, viewpoint=viewpoint, device=device).cloud.normals
+    assert normals is not None
+    return f"9,000 normals within {require_close(normals[clear], expected[clear], NORMAL, 'normals'):.1e}"
 
 
 def _check_oriented(device: Device) -> str:
@@ -210,9 +210,11 @@ def _check_gradients(device: Device, types: tuple[str, ...], uneven: bool) -> st
         last = np.array(volume.shape_ijk) - 1.0
         points = volume.ijk_to_lps(np.random.default_rng(5).uniform(-1.0, last + 1.0, (2_000, 3)))
         resident = DeviceVolume(volume, device=device)
-        found = find_gradients(resident, points, stopwatch=Stopwatch())
+        slopes = find_gradients(resident, points, stopwatch=Stopwatch())
         expected = gradients_twin.find_gradients(volume, points, resident.values.lowest)
-        worst = max(worst, require_share(found, expected, _GRADIENT_HU_MM, _OTHER_SIDE, f"gradients of {dtype} voxels"))
+        worst = max(
+            worst, require_share(slopes, expected, _GRADIENT_HU_MM, _OTHER_SIDE, f"gradients of {dtype} voxels")
+        )
     return f"2,000 gradients in {len(types)} volumes within {worst:.1e} HU/mm"
 
 
@@ -228,10 +230,10 @@ def _filtered(points: NDArray[np.float32], features: str | None, cells_edge: flo
         cells = np.unique(steps, axis=0, return_inverse=True)[1].ravel()
         if features == "paper":
             ratios = distance_ratios(filter_twin.mean_distances(distances), distances[:, 1], cells)
-            kept = find_features(ratios, ratio_threshold(ratios))
+            is_feature = find_features(ratios, ratio_threshold(ratios))
         else:
-            kept = eigenvalues[:, 0] / eigenvalues.sum(axis=1) > VARIATION_OF_FEATURES
-        factors = np.where(kept, factors, filter_twin.cell_factors(points, axes, cells, *scales))
+            is_feature = eigenvalues[:, 0] / eigenvalues.sum(axis=1) > VARIATION_OF_FEATURES
+        factors = np.where(is_feature, factors, filter_twin.cell_factors(points, axes, cells, *scales))
     moved: NDArray[np.float64] = points - factors[:, None] * axes
     return moved
 
@@ -293,8 +295,8 @@ def _two_balls() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 def _fetch(masks: Masks, mask_d: Any) -> NDArray[np.bool_]:
     """Return a mask of nodes, shape (nz, ny, nx)."""
     nx, ny, nz = masks.shape
-    found = download(masks.device, np.empty((nz, ny, 4 * masks.words), np.uint8), mask_d)
-    return np.unpackbits(found, axis=2, bitorder="little")[:, :, :nx].astype(bool)
+    mask_bytes = download(masks.device, np.empty((nz, ny, 4 * masks.words), np.uint8), mask_d)
+    return np.unpackbits(mask_bytes, axis=2, bitorder="little")[:, :, :nx].astype(bool)
 
 
 def _check_field(device: Device) -> str:

@@ -80,8 +80,8 @@ def grow_cells(
     kinds[0] = 1
     if largest and (kinds == 0).any():
         cells = np.bincount(parts.reshape(-1), minlength=number + 1)
-        held = np.bincount(parts.reshape(-1), weights=counts.reshape(-1), minlength=number + 1)
-        best = max(np.flatnonzero(kinds == 0), key=lambda part: (cells[part], held[part], -part))
+        point_counts = np.bincount(parts.reshape(-1), weights=counts.reshape(-1), minlength=number + 1)
+        best = max(np.flatnonzero(kinds == 0), key=lambda part: (cells[part], point_counts[part], -part))
         kinds[(kinds == 0) & (np.arange(number + 1) != best)] = 3
     return kinds[parts[z, y, x]]
 
@@ -116,9 +116,9 @@ def cluster_points(points: ArrayLike, eps: float, min_samples: int) -> tuple[int
     number[kinds[np.argsort(places)]] = np.arange(len(kinds))
     labels[members] = number[parts[members]]
     lowest = np.full(n, n, dtype=np.int64)
-    for core, other in (pairs.T, pairs.T[::-1]):
-        borders = cores[core] & ~cores[other]
-        np.minimum.at(lowest, other[borders], labels[core[borders]])
+    for core, neighbour in (pairs.T, pairs.T[::-1]):
+        borders = cores[core] & ~cores[neighbour]
+        np.minimum.at(lowest, neighbour[borders], labels[core[borders]])
     labels[lowest < n] = lowest[lowest < n]
     return len(kinds), labels, cores
 
@@ -210,8 +210,8 @@ def extract_voxels(
         marked = mark_shell(marked)
     k, j, i = np.nonzero(marked)
     origins = volume.slice_origins()
-    place = origins[np.zeros_like(k) if paper else k]
-    points = place + i[:, None] * volume.affine[:3, 0] + j[:, None] * volume.affine[:3, 1]
+    slice_origin = origins[np.zeros_like(k) if paper else k]
+    points = slice_origin + i[:, None] * volume.affine[:3, 0] + j[:, None] * volume.affine[:3, 1]
     return points, volume.voxels[marked].astype(np.float32), np.stack([i, j, k], axis=1)
 
 

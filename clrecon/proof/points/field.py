@@ -63,27 +63,27 @@ def measure_field(
                 node = nearest + (di, dj, dk)
                 on_grid = ((node >= 0) & (node < shape)).all(axis=1)
                 i, j, k = node[on_grid].T
-                place = corner + node[on_grid].astype(np.float32) * h
-                away = place - points[on_grid]
+                node_points = corner + node[on_grid].astype(np.float32) * h
+                away = node_points - points[on_grid]
                 x, y, z = away.T
-                own = x * x + (y * y + z * z)
-                used = own < reach32 * reach32
-                at = k[used], j[used], i[used]
-                exact = own[used].astype(np.float64)
+                squares = x * x + (y * y + z * z)
+                used = squares < reach32 * reach32
+                nodes = k[used], j[used], i[used]
+                exact = squares[used].astype(np.float64)
                 weight = (1.0 - exact / float(reach32) ** 2) ** 2 / (exact + float(np.float32(smoothing)) ** 2)
                 height = (away[used].astype(np.float64) * normals[on_grid][used]).sum(axis=1)
-                np.add.at(summed, at, weight * height)
-                np.add.at(weights, at, weight)
-                np.minimum.at(squared, at, own[used])
+                np.add.at(summed, nodes, weight * height)
+                np.add.at(weights, nodes, weight)
+                np.minimum.at(squared, nodes, squares[used])
     with np.errstate(invalid="ignore"):
         return FieldTwin(summed / weights, squared)
 
 
-def _shifted(mask: NDArray[np.bool_], axis: int, way: int) -> NDArray[np.bool_]:
+def _shifted(mask: NDArray[np.bool_], axis: int, step: int) -> NDArray[np.bool_]:
     """Return for each node the bit of its neighbour; False beyond the nodes."""
     result = np.zeros_like(mask)
     to, source = [slice(None)] * 3, [slice(None)] * 3
-    to[axis], source[axis] = (slice(None, -1), slice(1, None)) if way > 0 else (slice(1, None), slice(None, -1))
+    to[axis], source[axis] = (slice(None, -1), slice(1, None)) if step > 0 else (slice(1, None), slice(None, -1))
     result[tuple(to)] = mask[tuple(source)]
     return result
 
@@ -103,8 +103,8 @@ def decide_signs(
 
     regions, count = ndimage.label(~near)
     votes = np.zeros((2, count + 1), dtype=np.int64)
-    for axis, way in _SIDES:
-        voter, sign = _shifted(near, axis, way), _shifted(negative, axis, way)
+    for axis, step in _SIDES:
+        voter, sign = _shifted(near, axis, step), _shifted(negative, axis, step)
         for which in (0, 1):
             votes[which] += np.bincount(regions[voter & (sign == bool(which))], minlength=count + 1)
     votes[:, 0] = 0
@@ -112,8 +112,8 @@ def decide_signs(
     reached = ~near
     for _ in range(rounds):
         signs = np.zeros((2, *near.shape), dtype=bool)
-        for axis, way in _SIDES:
-            there, sign = _shifted(reached, axis, way), _shifted(inside, axis, way)
+        for axis, step in _SIDES:
+            there, sign = _shifted(reached, axis, step), _shifted(inside, axis, step)
             signs[0] |= there & ~sign
             signs[1] |= there & sign
         new = (signs[0] | signs[1]) & ~reached & ~core
@@ -155,8 +155,8 @@ def find_walls(
                 towards = -step if inside[tuple(lower)] else step
                 walls.setdefault((z, y, x), []).append((lower + 0.5 * step, towards.astype(float)))
     result = {}
-    for place, count in faces.items():
-        found = walls.get(place, [])
-        middle = np.mean([at for at, _ in found], axis=0) if found else np.zeros(3)
-        result[place] = (count, len(found), sum(float((at - middle) @ normal) for at, normal in found) / 3.0)
+    for key, count in faces.items():
+        seen = walls.get(key, [])
+        middle = np.mean([at for at, _ in seen], axis=0) if seen else np.zeros(3)
+        result[key] = (count, len(seen), sum(float((at - middle) @ normal) for at, normal in seen) / 3.0)
     return result

@@ -176,14 +176,14 @@ def cell_factors(
     """Return beta with sums over all points of a point's cell in place of its neighbours."""
     factors = np.zeros(len(points))
     order = np.argsort(cells, kind="stable")
-    for own in np.split(order, np.flatnonzero(np.diff(cells[order])) + 1):
-        among = np.broadcast_to(own, (len(own), len(own)))
-        away = points[own][:, None].astype(np.float64) - points.astype(np.float64)[among]
-        heights = np.einsum("nki,ni->nk", away, normals[own])
-        moves = (sigma_s[own] >= _LEAST_RANGE_MM) & (sigma_c[own] > 0.0)
-        far, high = np.where(moves, sigma_c[own], 1.0)[:, None], np.where(moves, sigma_s[own], 1.0)[:, None]
+    for in_cell in np.split(order, np.flatnonzero(np.diff(cells[order])) + 1):
+        among = np.broadcast_to(in_cell, (len(in_cell), len(in_cell)))
+        away = points[in_cell][:, None].astype(np.float64) - points.astype(np.float64)[among]
+        heights = np.einsum("nki,ni->nk", away, normals[in_cell])
+        moves = (sigma_s[in_cell] >= _LEAST_RANGE_MM) & (sigma_c[in_cell] > 0.0)
+        far, high = np.where(moves, sigma_c[in_cell], 1.0)[:, None], np.where(moves, sigma_s[in_cell], 1.0)[:, None]
         weights = np.exp(-np.einsum("nki,nki->nk", away, away) / (2.0 * far**2) - heights**2 / (2.0 * high**2))
-        factors[own] = np.where(moves, (weights * heights).sum(axis=1) / weights.sum(axis=1), 0.0)
+        factors[in_cell] = np.where(moves, (weights * heights).sum(axis=1) / weights.sum(axis=1), 0.0)
     return factors
 
 

@@ -75,7 +75,7 @@ def _check_masks(device: Device) -> str:
 
 
 def _check_clusters(device: Device) -> str:
-    said = []
+    counts = []
     for uneven, eps, samples in ((False, 1.2, 6), (True, 1.1, 4), (False, 0.75, 1), (True, 0.45, 2)):
         volume = _volume(uneven)
         stencil = make_stencil(Lattice.of(volume), eps)
@@ -85,12 +85,12 @@ def _check_clusters(device: Device) -> str:
             labels, cores = search.label(), search.flag_cores()
         ijk = np.argwhere((volume.voxels >= 75) & (volume.voxels <= 110))[:, ::-1]
         count, expected, expected_cores = cluster_twin.cluster_points(volume.ijk_to_lps(ijk), eps, samples)
-        what = f"at eps {eps} mm and min_samples {samples}"
-        require_equal(search.count, count, f"the number of clusters {what}")
-        require_equal(cores, expected_cores, f"core points {what}")
-        require_equal(labels, expected, f"labels {what}")
-        said.append(count)
-    return f"{', '.join(map(str, said))} clusters equal"
+        subject = f"at eps {eps} mm and min_samples {samples}"
+        require_equal(search.count, count, f"the number of clusters {subject}")
+        require_equal(cores, expected_cores, f"core points {subject}")
+        require_equal(labels, expected, f"labels {subject}")
+        counts.append(count)
+    return f"{', '.join(map(str, counts))} clusters equal"
 
 
 def _check_overlaps(device: Device) -> str:
@@ -132,11 +132,11 @@ def _compare(device: Device, dtype: str, uneven: bool, kind: Any, labels: str | 
         volume, kind=kind, hu=BAND, labels=label_map, label=number or None, device=device
     )  # fmt: skip
     points, hu, ijk = twin.extract_voxels(volume, *BAND, shell=kind == "shell", labels=chosen, label=number)
-    what = f"{kind} of {dtype} voxels{'' if labels is None else f' with labels of {labels}'}"
+    subject = f"{kind} of {dtype} voxels{'' if labels is None else f' with labels of {labels}'}"
     require_whole(cloud.report)
-    require_equal(cloud.ijk if cloud.ijk is not None else (), ijk, f"indices of {what}")
-    require_equal(cloud.hu if cloud.hu is not None else (), hu, f"HU of {what}")
-    return require_close(cloud.points, points, PLACE_TOLERANCE_MM, f"places of {what}, mm")
+    require_equal(cloud.ijk if cloud.ijk is not None else (), ijk, f"indices of {subject}")
+    require_equal(cloud.hu if cloud.hu is not None else (), hu, f"HU of {subject}")
+    return require_close(cloud.points, points, PLACE_TOLERANCE_MM, f"places of {subject}, mm")
 
 
 def _check_voxels(device: Device) -> str:

@@ -92,24 +92,24 @@ def _blend(
     every = Meetings(pixels[order], numbers[order], depths[order], shares[order])
     triangles = np.concatenate([mesh.triangles, [[0, 1, 2]]])
     color, opacity = np.zeros((height, width, 3)), np.zeros((height, width))
-    first, way, layers = np.full((height, width), np.nan), np.zeros((height, width)), []
+    first, depth_sum, layers = np.full((height, width), np.nan), np.zeros((height, width)), []
     for layer in range(int(np.bincount(pixels).max())):
         places = np.where(opacity < 1.0, nth_layer(every, layer, SIZE), -1)
         assert mesh.normals is not None
         rgb, depth = shade_layer(
             every, places, mesh.vertices, triangles, mesh.normals, colors / 255.0, camera, FIXED
         )  # fmt: skip
-        own = np.where(places >= 0, every.triangles[places], 0)
-        is_sheet = own == count
+        triangle_numbers = np.where(places >= 0, every.triangles[places], 0)
+        is_sheet = triangle_numbers == count
         rgb[is_sheet] = still.image[is_sheet][:, :3] / 255.0
-        share = np.where(is_sheet, still.image[..., 3] / 255.0, np.where(own >= SPLIT, 1.0, OPACITY))
+        share = np.where(is_sheet, still.image[..., 3] / 255.0, np.where(triangle_numbers >= SPLIT, 1.0, OPACITY))
         weight = np.where(places >= 0, (1.0 - opacity) * share, 0.0)
         color, opacity = color + weight[..., None] * rgb, opacity + weight
-        way += weight * np.nan_to_num(depth)
+        depth_sum += weight * np.nan_to_num(depth)
         first = np.where(np.isnan(first), depth, first)
         layers.append(np.where(np.isnan(depth), np.inf, depth))
     with np.errstate(invalid="ignore"):
-        return layers, np.concatenate([color, opacity[..., None]], axis=-1), first, way / opacity
+        return layers, np.concatenate([color, opacity[..., None]], axis=-1), first, depth_sum / opacity
 
 
 def _check_layers(device: Device) -> str:
@@ -130,35 +130,36 @@ def _check_layers(device: Device) -> str:
         ways: list[Any] = []
 
         def note(between: Between, ways: list[Any] = ways) -> None:
-            held = (between.nearest_d, between.farthest_d)
-            ways.append([download(device, np.empty(SIZE[::-1], np.float32), each) for each in held])
+            depths = (between.nearest_d, between.farthest_d)
+            ways.append([download(device, np.empty(SIZE[::-1], np.float32), each) for each in depths])
 
-        found = draw_layers(device, parts, Shot(camera, SIZE), still=still, volume=note)
+        layered = draw_layers(device, parts, Shot(camera, SIZE), still=still, volume=note)
         layers, rgba, depth, mean = _blend(mesh, colors, camera, still)
-        _compare_ways(ways, layers, found)
+        _compare_ways(ways, layers, layered)
         first = draw_layers(device, parts, Shot(camera, SIZE), still=still, most=1)
         more = np.isfinite(layers[0]) & (first.image[..., 3] < 255)
         require_equal(first.open_pixels, np.count_nonzero(more), "pixels that may have a second layer")
-        require_close(found.depth, depth, DEPTH_MM, "depths of triangles, in mm")
-        require_close(found.expected_depth, mean, DEPTH_MM, "expected depths of triangles, in mm")
-        opacity = found.image[..., 3:].astype(np.float64)
-        shown = np.concatenate([found.image[..., :3] * (opacity / 255.0), opacity], axis=-1)
+        require_close(layered.depth, depth, DEPTH_MM, "depths of triangles, in mm")
+        require_close(layered.expected_depth, mean, DEPTH_MM, "expected depths of triangles, in mm")
+        opacity = layered.image[..., 3:].astype(np.float64)
+        shown = np.concatenate([layered.image[..., :3] * (opacity / 255.0), opacity], axis=-1)
         away = np.abs(shown - 255.0 * rgba).max(axis=-1)
         worst = max(worst, require_close(away, np.zeros_like(away), COLOR_255, "colours of triangles, of 255"))
     return f"2 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
-def _compare_ways(ways: list[Any], layers: list[Float64Array], found: LayeredPicture) -> None:
+def _compare_ways(ways: list[Any], layers: list[Float64Array], image: LayeredPicture) -> None:
     """Compare where rays begin and end between layers; beyond the last one with something there may be an empty one."""
-    require_equal(found.open_pixels, 0, "pixels with further layers")
+    require_equal(image.open_pixels, 0, "pixels with further layers")
     ends = [*layers, np.full(SIZE[::-1], np.inf), np.full(SIZE[::-1], np.inf)]
     nearest = np.full(SIZE[::-1], -np.inf)
     for number, ((begin, end), farthest) in enumerate(zip(ways, ends, strict=False)):
-        for what, own, expected in (("begin", begin, nearest), ("end", end, farthest)):
-            one, other = (np.sign(depths) * np.isinf(depths) for depths in (own, expected))  # before or behind all
-            require_equal(one, other, f"pixels without a {what} of the way before layer {number}")
-            finite, wanted = (np.where(np.isinf(depths), 0.0, depths) for depths in (own, expected))
-            require_close(finite, wanted, DEPTH_MM, f"{what}s of the way before layer {number}, in mm")
+        for part, drawn, expected in (("begin", begin, nearest), ("end", end, farthest)):
+            # Before or behind all.
+            side, wanted_side = (np.sign(depths) * np.isinf(depths) for depths in (drawn, expected))
+            require_equal(side, wanted_side, f"pixels without a {part} of the way before layer {number}")
+            finite, wanted = (np.where(np.isinf(depths), 0.0, depths) for depths in (drawn, expected))
+            require_close(finite, wanted, DEPTH_MM, f"{part}s of the way before layer {number}, in mm")
         nearest = farthest
 
 
@@ -166,9 +167,9 @@ def _screen(volume: Volume, camera: Camera) -> tuple[Mesh, Clip, Clip]:
     """Return two triangles across a volume, aslant, and the half-spaces before and behind them."""
     centre, toward = centre_of(volume), -camera.basis().forward + (0.2, 0.3, -0.25)
     normal = toward / np.linalg.norm(toward)
-    one = np.cross(normal, (0.0, 0.0, 1.0))
-    one, other = 200.0 * one, 200.0 * np.cross(normal, one)
-    corners = [centre - one - other, centre + one - other, centre + one + other, centre - one + other]
+    across = np.cross(normal, (0.0, 0.0, 1.0))
+    across, down = 200.0 * across, 200.0 * np.cross(normal, across)
+    corners = [centre - across - down, centre + across - down, centre + across + down, centre - across + down]
     return Mesh(corners, [(0, 1, 2), (0, 2, 3)]), Clip.plane(centre, normal), Clip.plane(centre, -normal)
 
 
@@ -186,8 +187,8 @@ def _check_between(device: Device, slices: bool) -> str:
         if slices:
             look = SlicesInSpace([1, 4, 7, 9, 12], opacity=0.4, lowest_hu=-300.0, window=(-500.0, 700.0))
         with ScenePictures([(volume, look), (mesh, screen)], device=device) as pictures:
-            found = pictures.take(camera, _WITH_VOLUME)
-        require_whole(found.report)
+            picture = pictures.take(camera, _WITH_VOLUME)
+        require_whole(picture.report)
         sides = []
         for clip in (before, behind):
             if isinstance(look, SlicesInSpace):
@@ -197,8 +198,8 @@ def _check_between(device: Device, slices: bool) -> str:
             sides.append(np.clip(rgba, 0.0, 1.0))
         rest = opacity * np.append(color, 1.0) + (1.0 - opacity) * sides[1]
         expected = sides[0] + (1.0 - sides[0][..., 3:]) * rest
-        alpha = found.image[..., 3:].astype(np.float64)
-        shown = np.concatenate([found.image[..., :3] * (alpha / 255.0), alpha], axis=-1)
+        alpha = picture.image[..., 3:].astype(np.float64)
+        shown = np.concatenate([picture.image[..., :3] * (alpha / 255.0), alpha], axis=-1)
         away = np.abs(shown - 255.0 * expected).max(axis=-1)
         worst = max(
             worst, require_share(away, np.zeros_like(away), _BETWEEN_255, EDGE_SHARE, "colours about a screen, of 255")

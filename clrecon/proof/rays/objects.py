@@ -85,13 +85,13 @@ def shade_splats(
     there = numbers >= 0
     rgba = np.zeros((height, width, 4))
     rgba[there, 3] = 1.0
-    found = colors[numbers[there]]
+    rgb = colors[numbers[there]]
     if lighting.shades:
         if normals is not None:
-            found = shade(found, normals[numbers[there]].astype(np.float64), directions[there], lighting)
+            rgb = shade(rgb, normals[numbers[there]].astype(np.float64), directions[there], lighting)
         else:
-            found = found * _eye_dome(depth, camera, apart)[there][:, None]
-    rgba[there, :3] = found
+            rgb = rgb * _eye_dome(depth, camera, apart)[there][:, None]
+    rgba[there, :3] = rgb
     along = 1.0 if camera.is_parallel else directions @ camera.basis().forward
     return rgba, np.asarray(depth / along, dtype=np.float64)
 
@@ -100,12 +100,12 @@ def _eye_dome(depth: NDArray[np.float32], camera: Camera, apart: int) -> Float64
     height, width = depth.shape
     around = np.pad(depth.astype(np.float64), apart, constant_values=np.nan)
     pixel = 2.0 * camera.half_height() / height
-    way = apart * pixel * (1.0 if camera.is_parallel else depth)
+    reach = apart * pixel * (1.0 if camera.is_parallel else depth)
     total = np.zeros(depth.shape)
     for down in (-1, 0, 1):
         for aside in (-1, 0, 1):
             top, left = apart + down * apart, apart + aside * apart
-            slope = (depth - around[top : top + height, left : left + width]) / way
+            slope = (depth - around[top : top + height, left : left + width]) / reach
             total += np.clip(np.nan_to_num(slope, nan=0.0), 0.0, STEEPEST)
     return np.asarray(np.exp(-DARKENING * total / 8.0))
 
@@ -137,7 +137,7 @@ def find_meetings(
     aside = ((np.arange(width, dtype=np.float32) + np.float32(0.5)) - half_x) * pixel
     upwards = (half_y - (np.arange(height, dtype=np.float32) + np.float32(0.5))) * pixel
     places = np.stack([_coordinate(vertices, axis, camera.position) for axis in camera.basis()], axis=1)
-    found: list[tuple[NDArray[np.int64], int, NDArray[np.float32], Float64Array]] = []
+    meetings: list[tuple[NDArray[np.int64], int, NDArray[np.float32], Float64Array]] = []
     all_pixels = np.arange(width * height).reshape(height, width)
     for number, corners in enumerate(places[triangles.astype(np.int64)]):
         scale = [np.float32(1.0)] * 3 if camera.is_parallel else list(corners[:, 2])
@@ -156,12 +156,12 @@ def find_meetings(
         depth = np.clip(((u * a + v * b) + w * c) / total, corners[:, 2].min(), corners[:, 2].max())
         seen = np.full(len(depth), True) if camera.is_parallel else depth >= NEAREST_MM
         shares = (np.stack([u, v, w], axis=1).astype(np.float64) / total[:, None])[seen]
-        found.append((all_pixels[down, across][met][seen], number, depth[seen], shares))
-    if not found:
+        meetings.append((all_pixels[down, across][met][seen], number, depth[seen], shares))
+    if not meetings:
         return Meetings(np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32), np.zeros((0, 3)))
-    pixels = np.concatenate([each[0] for each in found])
-    numbers = np.concatenate([np.full(len(each[0]), each[1]) for each in found])
-    depths, shares = np.concatenate([each[2] for each in found]), np.concatenate([each[3] for each in found])
+    pixels = np.concatenate([each[0] for each in meetings])
+    numbers = np.concatenate([np.full(len(each[0]), each[1]) for each in meetings])
+    depths, shares = np.concatenate([each[2] for each in meetings]), np.concatenate([each[3] for each in meetings])
     order = np.lexsort((numbers, depths, pixels))
     return Meetings(pixels[order], numbers[order], depths[order], shares[order])
 
@@ -206,16 +206,16 @@ def shade_layer(
     wrong = away * np.einsum("ni,ni->n", face, directions) < 0.0
     normal = normal - np.where(wrong, 1.001 * away, 0.0)[:, None] * directions
     rgb, depth = np.zeros((height, width, 3)), np.full((height, width), np.nan)
-    own = np.einsum("nk,nki->ni", shares, colors[corners])
-    rgb[there] = shade(own, normal, directions, lighting) if lighting.shades else own
+    colors_here = np.einsum("nk,nki->ni", shares, colors[corners])
+    rgb[there] = shade(colors_here, normal, directions, lighting) if lighting.shades else colors_here
     along = 1.0 if camera.is_parallel else directions @ camera.basis().forward
     depth[there] = meetings.depths[places[there]] / along
     return rgb, depth
 
 
-def _window(at: NDArray[np.float32], centres: NDArray[np.float32], pixel: np.float32) -> slice:
+def _window(place_range: NDArray[np.float32], centres: NDArray[np.float32], pixel: np.float32) -> slice:
     """Return the pixels between corners along one axis, with two more on either side."""
-    near = np.flatnonzero((centres >= at.min() - 2.0 * pixel) & (centres <= at.max() + 2.0 * pixel))
+    near = np.flatnonzero((centres >= place_range.min() - 2.0 * pixel) & (centres <= place_range.max() + 2.0 * pixel))
     return slice(near[0], near[-1] + 1) if len(near) else slice(0, 0)
 
 
@@ -227,10 +227,10 @@ def _find_side(
     ax: NDArray[np.float32], ay: NDArray[np.float32], bx: NDArray[np.float32], by: NDArray[np.float32]
 ) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
     """Return the sign of ax by - ay bx, or that a little beside it, and the difference."""
-    one, other = ax.astype(np.float64) * by, ay.astype(np.float64) * bx
-    exact = np.sign(one - other)
+    first, second = ax.astype(np.float64) * by, ay.astype(np.float64) * bx
+    exact = np.sign(first - second)
     beside = np.where(ay != by, np.sign(ay - by), np.sign(bx - ax))
     short_one, short_other = ax * by, ay * bx
-    rest = (one - short_one).astype(np.float32) - (other - short_other).astype(np.float32)
+    rest = (first - short_one).astype(np.float32) - (second - short_other).astype(np.float32)
     area = np.where(short_one != short_other, short_one - short_other, rest)
     return np.where(exact != 0.0, exact, beside).astype(np.int8), area

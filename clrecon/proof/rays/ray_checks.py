@@ -75,28 +75,28 @@ def _spread(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
     for axis in range(3):
         lines = np.moveaxis(distances, axis, 0)
         best = lines.copy()
-        for way in range(1, FARTHEST):
-            for one, other in ((np.s_[way:], np.s_[:-way]), (np.s_[:-way], np.s_[way:])):
-                best[one] = np.minimum(best[one], np.maximum(lines[other], way))
+        for step in range(1, FARTHEST):
+            for target, source in ((np.s_[step:], np.s_[:-step]), (np.s_[:-step], np.s_[step:])):
+                best[target] = np.minimum(best[target], np.maximum(lines[source], step))
         distances = np.moveaxis(best, 0, axis)
     return distances
 
 
-def _count_ahead(distances: NDArray[np.uint8], way: MainWay) -> NDArray[np.uint8]:
+def _count_ahead(distances: NDArray[np.uint8], ray: MainWay) -> NDArray[np.uint8]:
     """Return what is free ahead of each brick along the main way, with the bricks beside it that rays drift to."""
     free = distances.T > 0
-    own = free
-    for axis in {0, 1, 2} - {way.axis}:
+    clear = free
+    for axis in {0, 1, 2} - {ray.axis}:
         numbers = np.arange(free.shape[axis])
-        offset = np.float32(0.5) + numbers - way.eye[axis] if way.eye[3] else np.full(len(numbers), way.eye[axis])
-        drift = np.where(np.abs(offset) <= way.aside, 0, np.sign(offset)).astype(int)
-        own = own & np.take(own, np.clip(numbers + drift, 0, len(numbers) - 1), axis=axis)
-    lines = np.moveaxis(own, way.axis, 0)
+        offset = np.float32(0.5) + numbers - ray.eye[axis] if ray.eye[3] else np.full(len(numbers), ray.eye[axis])
+        drift = np.where(np.abs(offset) <= ray.aside, 0, np.sign(offset)).astype(int)
+        clear = clear & np.take(clear, np.clip(numbers + drift, 0, len(numbers) - 1), axis=axis)
+    lines = np.moveaxis(clear, ray.axis, 0)
     counts, count = np.zeros(lines.shape, np.uint8), np.full(lines.shape[1:], FARTHEST)
-    for n in range(len(lines))[:: -way.ahead]:
+    for n in range(len(lines))[:: -ray.ahead]:
         count = np.where(lines[n], np.minimum(count + 1, FARTHEST), 0)
         counts[n] = count
-    return np.moveaxis(counts, 0, way.axis).T
+    return np.moveaxis(counts, 0, ray.axis).T
 
 
 def _open(device: Device, volume: Volume) -> tuple[DeviceVolume, RaySlab]:
@@ -155,8 +155,8 @@ def _check_tiles(device: Device) -> str:
         first, last = (heights[np.maximum(stair - n, 0)] + distance for n in (_BEFORE, 0))
 
         allowed = 0.5 * (last - first)
-        what = f"entries of tiles{' of uneven slices' if uneven else ''}"
-        require_close((entries - 0.5 * (first + last)) / allowed, np.zeros_like(entries), 1.0, what)
+        subject = f"entries of tiles{' of uneven slices' if uneven else ''}"
+        require_close((entries - 0.5 * (first + last)) / allowed, np.zeros_like(entries), 1.0, subject)
     return f"{2 * ni * nj:,} tiles begin up to {_BEFORE} slices before the first that shows"
 
 
@@ -208,14 +208,14 @@ def _premultiplied(image: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.concatenate([image[..., :3] * (opacity / 255.0), opacity], axis=-1)
 
 
-def _compare(found: Rendering, image: NDArray[Any], depth: NDArray[Any], what: str) -> float:
+def _compare(picture: Rendering, image: NDArray[Any], depth: NDArray[Any], subject: str) -> float:
     """Compare colours over black and depths, pixel by pixel."""
-    require_whole(found.report)
-    both = np.isfinite(found.depth) & np.isfinite(depth)
-    require_share(np.isfinite(found.depth), np.isfinite(depth), 0.0, EDGE_SHARE, f"hits of {what}")
-    require_share(found.depth[both], depth[both], DEPTH_MM, 2.0 * EDGE_SHARE, f"depths of {what}, in mm")
-    away = np.abs(_premultiplied(found.image) - image).max(axis=-1)
-    return require_share(away, np.zeros_like(away), COLOR_255, EDGE_SHARE, f"colours of {what}, of 255")
+    require_whole(picture.report)
+    both = np.isfinite(picture.depth) & np.isfinite(depth)
+    require_share(np.isfinite(picture.depth), np.isfinite(depth), 0.0, EDGE_SHARE, f"hits of {subject}")
+    require_share(picture.depth[both], depth[both], DEPTH_MM, 2.0 * EDGE_SHARE, f"depths of {subject}, in mm")
+    away = np.abs(_premultiplied(picture.image) - image).max(axis=-1)
+    return require_share(away, np.zeros_like(away), COLOR_255, EDGE_SHARE, f"colours of {subject}, of 255")
 
 
 def _cut(volume: Volume) -> Clip:
@@ -264,9 +264,9 @@ def _check_composite_labels(device: Device) -> str:
         )
         picture = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), 0.3)
         require_whole(picture.report)
-        at = np.arange(SIZE[0])
-        grown = [(at >= 32) & (at % 32 < GROWN), (at % 32 >= 8 - GROWN) & (at % 32 < 8)]
-        column = np.select(grown, [3, 1], at // 8 % 4)
+        pixels = np.arange(SIZE[0])
+        grown = [(pixels >= 32) & (pixels % 32 < GROWN), (pixels % 32 >= 8 - GROWN) & (pixels % 32 < 8)]
+        column = np.select(grown, [3, 1], pixels // 8 % 4)
         factor = np.choose(column, (1.0, 0.25, 1.0, 0.5))
         opacity = 1.0 - (1.0 - 0.1 * factor) ** (10 * 0.5 / grey.unit_distance)
         tint = np.where((column == 3)[:, None], (0.9, 0.1, 0.1), (0.5, 0.5, 0.5))
@@ -288,14 +288,14 @@ def _check_projections(device: Device, kinds: tuple[str, ...], uneven: bool) -> 
             style = Projection(kind, clip=clip)  # type: ignore[arg-type]
             picture = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
             twin = cast_rays(volume, None, camera, SIZE, step, None, clip, kind)
-            what = f"{kind} of {dtype} voxels{' of uneven slices' * uneven}"
+            subject = f"{kind} of {dtype} voxels{' of uneven slices' * uneven}"
             require_whole(picture.report)
             assert picture.values is not None
-            worst = max(worst, require_share(picture.values, twin.values, VALUE_HU, EDGE_SHARE, what))
+            worst = max(worst, require_share(picture.values, twin.values, VALUE_HU, EDGE_SHARE, subject))
             if kind in ("mip", "minip") and dtype != "uint8":  # 8 bits have several places of one value
                 both = np.isfinite(picture.depth) & np.isfinite(twin.depth)
-                require_equal(both.any(), True, f"depths of {what}")
-                require_share(picture.depth[both], twin.depth[both], DEPTH_MM, 2.0 * EDGE_SHARE, f"depths of {what}")
+                require_equal(both.any(), True, f"depths of {subject}")
+                require_share(picture.depth[both], twin.depth[both], DEPTH_MM, 2.0 * EDGE_SHARE, f"depths of {subject}")
     return f"values of {', '.join(kinds)} within {worst:.1g}"
 
 
@@ -307,10 +307,10 @@ def _check_surfaces(device: Device, uneven: bool) -> str:
         camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=dtype == "float32")
         step = 0.5 * min(volume.spacing)
         style = SurfaceLook(iso_value, color="white", shadows=shadows, lighting=FIXED, clip=clip)
-        found = cast_surface(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
+        picture = cast_surface(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
         twin = surface_twin(volume, iso_value, camera, SIZE, step, FIXED, clip, shadows=shadows)
         image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
-        worst = max(worst, _compare(found, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}"))
+        worst = max(worst, _compare(picture, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}"))
     return f"3 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
@@ -322,13 +322,13 @@ def _check_surface_labels(device: Device) -> str:
             50.0, color="white", lighting=Lighting(1.0, 0.0, 0.0), labels=labels,
             label_colors={1: "red", 2: "blue"}, label_opacity={3: 0.4},
         )  # fmt: skip
-        found = cast_surface(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), 0.2)
-        require_whole(found.report)
+        picture = cast_surface(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), 0.2)
+        require_whole(picture.report)
         column = np.arange(SIZE[0]) // 8 % 4
         colors = 255.0 * np.array([(1, 1, 1, 1), (1, 0, 0, 1), (0, 0, 1, 1), (0.4, 0.4, 0.4, 0.4)])
         inner = (np.arange(SIZE[0]) % 8 > 1) & (np.arange(SIZE[0]) % 8 < 6)
         rows = slice(3, SIZE[1] - 3)
-        away = np.abs(_premultiplied(found.image) - colors[column])[rows, inner].max(axis=-1)
+        away = np.abs(_premultiplied(picture.image) - colors[column])[rows, inner].max(axis=-1)
         require_close(away, np.zeros_like(away), COLOR_255, f"colours of labels of type {dtype}, of 255")
     return f"2 pictures with labels of {SIZE[0]} x {SIZE[1]} pixels as computed"
 
@@ -340,9 +340,9 @@ def _check_slices(device: Device) -> str:
         camera = look_at(volume, (0.4, 0.8, -0.7), 7.0, perspective=uneven)
         clip = _cut(volume) if uneven else None
         style = SlicesInSpace([1, 4, 7, 12], opacity=0.4, lowest_hu=-300.0, window=(-500.0, 700.0), clip=clip)
-        found = overlay_slices(DeviceVolume(volume, device=device), style, Shot(camera, SIZE))
+        picture = overlay_slices(DeviceVolume(volume, device=device), style, Shot(camera, SIZE))
         rgba, depth = overlay_twin(volume, camera, SIZE, style)
-        worst = max(worst, _compare(found, 255.0 * rgba, depth, f"slices of {dtype} voxels"))
+        worst = max(worst, _compare(picture, 255.0 * rgba, depth, f"slices of {dtype} voxels"))
     return f"3 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
@@ -352,14 +352,14 @@ def _check_points(device: Device) -> str:
     normals = rng.normal(size=(3000, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     points, colors = (6.0 * normals).astype(np.float32), rng.integers(0, 256, (3000, 4)).astype(np.uint8)
-    for perspective, own in ((False, None), (True, normals.astype(np.float32))):
+    for perspective, point_normals in ((False, None), (True, normals.astype(np.float32))):
         scale = {"view_angle": 9.0} if perspective else {"parallel_scale": 7.0}
         camera = Camera((-30.0, -80.0, 25.0), (0.3, 0.2, 0.1), (0.1, 0.2, 1.0), **scale)
-        splats = draw_splats(device, points, colors, own, Shot(camera, SIZE), radius, lighting=FIXED)
+        splats = draw_splats(device, points, colors, point_normals, Shot(camera, SIZE), radius, lighting=FIXED)
         require_equal(splats.parts, 1, "parts of a cloud of 3,000 points")
         depth, numbers = find_splats(points, camera, SIZE, radius)
         apart = round(radius / camera.pixel_mm(SIZE))
-        rgba, far = shade_splats(depth, numbers, colors[:, :3] / 255.0, own, camera, FIXED, apart)
+        rgba, far = shade_splats(depth, numbers, colors[:, :3] / 255.0, point_normals, camera, FIXED, apart)
         require_equal(splats.image[..., 3] > 0, numbers >= 0, "pixels with a point")
         require_close(splats.depth, far, DEPTH_MM, "depths of points, in mm")
         away = np.abs(_premultiplied(splats.image) - 255.0 * rgba).max(axis=-1)

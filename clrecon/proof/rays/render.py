@@ -122,13 +122,13 @@ def cast_rays(
     if mode == "dvr":
         if transfer_function is None:
             raise UsageError("dvr needs a transfer function")
-        found = _composite(rays, transfer_function, lighting, step, part)
+        result = _composite(rays, transfer_function, lighting, step, part)
     elif mode in ("mean", "drr"):
-        found = _integrate(rays, step, as_water=mode == "drr")
+        result = _integrate(rays, step, as_water=mode == "drr")
     else:
-        found = _find_extreme(rays, step, 1.0 if mode == "mip" else -1.0)
+        result = _find_extreme(rays, step, 1.0 if mode == "mip" else -1.0)
     shape = (height, width)
-    rgba, depth, expected_depth, values = found
+    rgba, depth, expected_depth, values = result
     return RayPicture(
         rgba.reshape(*shape, 4), depth.reshape(shape), expected_depth.reshape(shape), values.reshape(shape)
     )
@@ -243,9 +243,9 @@ class _SteepSegments:
     def sample(self, number: float | Float64Array, ray: NDArray[np.int64]) -> Float64Array:
         """Return values of samples of rays, in nodes; after the last sample its own value."""
         rays, part = self.rays, self.part[ray]
-        way = rays.t_out[ray] - rays.t_in[ray]
-        last = np.ceil(way / self.step) - 1.0
-        t_last = rays.t_in[ray] + last * self.step + part * (way - last * self.step)
+        length = rays.t_out[ray] - rays.t_in[ray]
+        last = np.ceil(length / self.step) - 1.0
+        t_last = rays.t_in[ray] + last * self.step + part * (length - last * self.step)
         t = np.minimum(rays.t_in[ray] + (number + part) * self.step, t_last)
         ijk, _ = rays.places(ray, t)
         return (sample_field(rays.volume.voxels, ijk) - self.low) * self.scale + 0.5
@@ -269,11 +269,11 @@ class _SteepSegments:
         steep = (here + most >= self.first) & (here + least < self.last)
         steep &= ((most - least > self.steepness.narrow) & (change > STEEP)) | dense
         clear, seen_at, seen_value = np.ones(len(ray)), np.zeros(len(ray)), np.zeros(len(ray))
-        for at in (np.arange(PARTS) + 0.5) / PARTS - 0.5:
-            end = (2.0 if number else 1.0) * front if at < 0.0 else 2.0 * back
-            rise = np.clip(at * (back - front + at * (back + front)), np.minimum(end, 0.0), np.maximum(end, 0.0))
+        for share in (np.arange(PARTS) + 0.5) / PARTS - 0.5:
+            end = (2.0 if number else 1.0) * front if share < 0.0 else 2.0 * back
+            rise = np.clip(share * (back - front + share * (back + front)), np.minimum(end, 0.0), np.maximum(end, 0.0))
             behind = clear * self.clear[self.nodes(here + rise)] ** (1.0 / PARTS)
-            seen_at += (clear - behind) * at
+            seen_at += (clear - behind) * share
             seen_value += (clear - behind) * (here + rise)
             clear = behind
         whole = np.maximum(1.0 - clear, 1e-6)
@@ -290,8 +290,8 @@ def _segments(
     rays: _Rays, step: float, part: Float64Array, opacity: Float64Array
 ) -> Iterator[tuple[NDArray[np.int64], Float64Array, Float64Array]]:
     """Yield segment by segment (ray numbers, t of the sample, length) of the rays that are not opaque yet."""
-    way = rays.t_out - rays.t_in
-    segments = np.where(way > 0.0, np.ceil(way / step), 0.0)
+    depth_range = rays.t_out - rays.t_in
+    segments = np.where(depth_range > 0.0, np.ceil(depth_range / step), 0.0)
     for number in range(int(segments.max(initial=0.0))):
         ray = np.flatnonzero((number < segments) & (opacity < OPAQUE))
         if len(ray) == 0:
@@ -305,12 +305,12 @@ def _integrate(rays: _Rays, step: float, as_water: bool) -> Found:
     voxels = rays.volume.voxels
     if as_water:
         voxels = np.maximum(voxels.astype(np.float64), AIR_HU) / -AIR_HU + 1.0
-    total, way = np.zeros(rays.count), np.zeros(rays.count)
+    total, path = np.zeros(rays.count), np.zeros(rays.count)
     for ray, t, length in _segments(rays, step, np.full(rays.count, 0.5), np.zeros(rays.count)):
         ijk, there = rays.places(ray, t)
         total[ray] += np.where(there, length * sample_field(voxels, ijk), 0.0)
-        way[ray] += np.where(there, length, 0.0)
-    mean = np.divide(total, way, out=np.full(rays.count, np.nan), where=way > 0.0)
+        path[ray] += np.where(there, length, 0.0)
+    mean = np.divide(total, path, out=np.full(rays.count, np.nan), where=path > 0.0)
     nowhere = np.full(rays.count, np.nan)
     return np.zeros((rays.count, 4)), nowhere, nowhere.copy(), total if as_water else mean
 

@@ -76,24 +76,24 @@ def cast_surface(
     nearest = -np.inf if camera.is_parallel else 0.0
     t_in, t_out, entered_by = find_interval(origins, directions, box, clip, nearest)
     hit, at_once = _first_inside(field, origins, directions, t_in, t_out, step)
-    found = np.flatnonzero(~np.isnan(hit))
-    points = origins[found] + hit[found, None] * directions[found]
+    rays_hit = np.flatnonzero(~np.isnan(hit))
+    points = origins[rays_hit] + hit[rays_hit, None] * directions[rays_hit]
     normals = field.gradient(points)
-    for n in np.flatnonzero(at_once[found]):
-        plane = entered_by[found[n]]
-        normals[n] = directions[found[n]] if plane < 0 else clip.planes[plane, :3]  # type: ignore[union-attr]
+    for n in np.flatnonzero(at_once[rays_hit]):
+        plane = entered_by[rays_hit[n]]
+        normals[n] = directions[rays_hit[n]] if plane < 0 else clip.planes[plane, :3]  # type: ignore[union-attr]
     colours = np.broadcast_to(np.array(colour, dtype=np.float64), points.shape)
     if lighting is not None:
-        lit = np.ones(len(found))
+        lit = np.ones(len(rays_hit))
         if shadows and lighting.direction is not None:
             light = np.array(lighting.direction, dtype=np.float64)
             towards = np.broadcast_to(light / np.linalg.norm(light), points.shape)
             _, far, _ = find_interval(points, towards, box, clip)
-            blocked, _ = _first_inside(field, points, towards, np.full(len(found), step), far, step)
+            blocked, _ = _first_inside(field, points, towards, np.full(len(rays_hit), step), far, step)
             lit = np.where(np.isnan(blocked), 1.0, 0.0)
-        colours = shade(colours, normals, directions[found], lighting, lit)
+        colours = shade(colours, normals, directions[rays_hit], lighting, lit)
     rgba = np.zeros((len(origins), 4))
-    rgba[found] = np.column_stack([colours, np.ones(len(found))])
+    rgba[rays_hit] = np.column_stack([colours, np.ones(len(rays_hit))])
     width, height = size
     depth = hit.reshape(height, width)
     return RayPicture(rgba.reshape(height, width, 4), depth, depth.copy(), np.full((height, width), np.nan))

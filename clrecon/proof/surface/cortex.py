@@ -132,7 +132,7 @@ def fit_profiles(
     weights = np.where(counts, scale.weights.astype(np.float64), 0.0)
     values = np.where(counts, profiles[:SAMPLES].T / 1000.0 - cortex_hu / 1000.0, 0.0)
     expected = np.array([0.0, 0.0, (INNER_SHARE - 1.0) * cortex_hu / 1000.0])
-    kept = np.array(precisions)
+    precision = np.array(precisions)
 
     def fit(x0: Float64Array, t: Float64Array) -> _Fit:
         z, behind = (places - x0[:, None]) / width[:, None], (places - x0[:, None] + t[:, None]) / width[:, None]
@@ -140,9 +140,9 @@ def fit_profiles(
         shares = np.stack([outer, 1.0 - outer - inner, inner], axis=2)
         rise_x = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi) / width[:, None]
         fall_x = np.exp(-0.5 * behind**2) / np.sqrt(2.0 * np.pi) / width[:, None]
-        square = np.einsum("ns,nsa,nsb->nab", weights, shares, shares) + np.diag(kept)
+        square = np.einsum("ns,nsa,nsb->nab", weights, shares, shares) + np.diag(precision)
         plateaus = np.linalg.solve(
-            square, (np.einsum("ns,nsa,ns->na", weights, shares, values) + kept * expected)[..., None]
+            square, (np.einsum("ns,nsa,ns->na", weights, shares, values) + precision * expected)[..., None]
         )
         plateaus = plateaus[..., 0]
         left = values - np.einsum("nsa,na->ns", shares, plateaus)
@@ -150,11 +150,11 @@ def fit_profiles(
         by_x = (ctx - out) * rise_x - (ctx - mar) * fall_x
         changes = np.stack([by_x, (ctx - mar) * fall_x], axis=2)
         mixed = np.einsum("ns,nsa,nsb->nab", weights, changes, shares)
-        own = np.einsum("ns,nsa,nsb->nab", weights, changes, changes)
-        own -= mixed @ np.linalg.solve(square, mixed.transpose(0, 2, 1))
+        curvature = np.einsum("ns,nsa,nsb->nab", weights, changes, changes)
+        curvature -= mixed @ np.linalg.solve(square, mixed.transpose(0, 2, 1))
         samples = np.einsum("ns,ns->n", weights, left**2)
-        cost = samples + (kept * (plateaus - expected) ** 2).sum(axis=1)
-        return _Fit(x0, t, plateaus, cost, samples, own, np.einsum("ns,nsa,ns->na", weights, changes, left))
+        cost = samples + (precision * (plateaus - expected) ** 2).sum(axis=1)
+        return _Fit(x0, t, plateaus, cost, samples, curvature, np.einsum("ns,nsa,ns->na", weights, changes, left))
 
     nearest, room = places[first], places[last]
     thickest = scale.step_mm * SAMPLES

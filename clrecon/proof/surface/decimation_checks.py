@@ -29,9 +29,9 @@ def _scatter(count: int, seed: int) -> tuple[NDArray[np.float32], NDArray[np.uin
 def _check_crossings(device: Device) -> str:
     """Compare the marks of triangles that cut each other; none of these is so flat that float32 cannot tell."""
     vertices, triangles = _scatter(1600, 3)
-    found = mark_crossings(device, plan_crossings(vertices, triangles))
-    require_equal(found, twin.mark_crossings(vertices, triangles), "triangles that cut each other")
-    return f"{int(found.sum()):,} of {len(found):,} triangles that cut another one"
+    is_cut = mark_crossings(device, plan_crossings(vertices, triangles))
+    require_equal(is_cut, twin.mark_crossings(vertices, triangles), "triangles that cut each other")
+    return f"{int(is_cut.sum()):,} of {len(is_cut):,} triangles that cut another one"
 
 
 CROSSING_CHECKS = (
@@ -71,8 +71,8 @@ def _check_distances(device: Device) -> str:
     for walks in (0, 40):
         length, rows = bounds.find_bounds(points, near, 0.0, walks)
         require_equal((rows >= 0) & (rows < len(triangles)), np.ones(count, dtype=bool), "rows of nearest triangles")
-        own = triangle_distances(points.T, *vertices[triangles[rows]].transpose(1, 2, 0))
-        worst = max(worst, require_close(length, own, ROUNDING_MM, "distances to the nearest triangles, in mm"))
+        exact = triangle_distances(points.T, *vertices[triangles[rows]].transpose(1, 2, 0))
+        worst = max(worst, require_close(length, exact, ROUNDING_MM, "distances to the nearest triangles, in mm"))
         if walks == 0:
             require_close(length, expected, ROUNDING_MM, "distances to triangles around vertices, in mm")
         else:
@@ -119,15 +119,15 @@ def _check_smoothing(device: Device) -> str:
     """Compare bends, normals and the steps of the filter with those of the host, bit for bit."""
     vertices, triangles = _rough_sheet(np.random.default_rng(14))
     places, rings = vertices.astype(np.float32), Rings.of(triangles, len(vertices))
-    own, twin_filter = DeviceFilter(device, rings), Filter(rings)
-    bends, normals = own.measure_bends(places)
-    for found, expected, what in zip(
+    tested, twin_filter = DeviceFilter(device, rings), Filter(rings)
+    bends, normals = tested.measure_bends(places)
+    for actual, expected, subject in zip(
         (bends, normals), twin_filter.measure_bends(places), ("bends", "normals"), strict=True
     ):
-        require_equal(found, expected, what)
+        require_equal(actual, expected, subject)
     for iterations in (1, 20):
         terms = sinc_terms(iterations)
-        require_equal(own.find_steps(bends, terms), twin_filter.find_steps(bends, terms), "steps of the filter")
+        require_equal(tested.find_steps(bends, terms), twin_filter.find_steps(bends, terms), "steps of the filter")
     return f"{len(places):,} vertices"
 
 

@@ -83,13 +83,13 @@ def _find_triangles(
     cases = _find_cases(inside)
     cells = np.argwhere((cases != 0) & (cases != 255) & (True if wanted is None else wanted))
     case_of = cases[tuple(cells.T)]
-    found, order = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
+    triangle_rows, order = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
     for case in np.unique(case_of):
         of_case = np.flatnonzero(case_of == case)
         for number, triangle in enumerate(case_table()[case]):
-            found.append(np.stack([_edge_vertices(numbers, cells[of_case], edge) for edge in triangle], axis=1))
+            triangle_rows.append(np.stack([_edge_vertices(numbers, cells[of_case], edge) for edge in triangle], axis=1))
             order.append(_LARGEST_CASE * of_case + number)
-    return np.concatenate(found)[np.argsort(np.concatenate(order))].astype(np.uint32)
+    return np.concatenate(triangle_rows)[np.argsort(np.concatenate(order))].astype(np.uint32)
 
 
 CellVertices = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
@@ -122,8 +122,8 @@ def _find_trilinear_triangles(
             placed = place_cell_vertices(row, case, corners, margins[k])
             points.append(placed[0])
             gradients.append(placed[1])
-    found = (np.array(cells, dtype=np.int64).reshape(-1, 3), np.concatenate(points), np.concatenate(gradients))
-    return np.array(triangles, dtype=np.uint32).reshape(-1, 3), found
+    inner_points = (np.array(cells, dtype=np.int64).reshape(-1, 3), np.concatenate(points), np.concatenate(gradients))
+    return np.array(triangles, dtype=np.uint32).reshape(-1, 3), inner_points
 
 
 def extract_isosurface(

@@ -71,14 +71,14 @@ def grow_cells(inside: NDArray[np.bool_], seeds: Iterable[tuple[int, int, int]])
         cell = queue.popleft()
         for axis in range(3):
             for step in (-1, 1):
-                other = tuple(n + step * (at == axis) for at, n in enumerate(cell))
-                if not 0 <= other[axis] < active.shape[axis]:
+                next_cell = tuple(n + step * (at == axis) for at, n in enumerate(cell))
+                if not 0 <= next_cell[axis] < active.shape[axis]:
                     continue
-                looked_at[other] = True
-                face = min(cell, other)
-                if mixed[axis][face] and not entered[other]:
-                    entered[other] = True
-                    queue.append(other)
+                looked_at[next_cell] = True
+                face = min(cell, next_cell)
+                if mixed[axis][face] and not entered[next_cell]:
+                    entered[next_cell] = True
+                    queue.append(next_cell)
     return Frontier(entered, int(looked_at.sum()))
 
 

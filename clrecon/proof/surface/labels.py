@@ -127,12 +127,12 @@ def extract_label_mask(
     leads_out = ~(within[edges.near] & within[edges.far])
     grown = np.pad(labels.astype(np.int64), border, mode="edge")
 
-    own = (FULL // 4096) * find_occupancy(labels == number)
+    occupancy = (FULL // 4096) * find_occupancy(labels == number)
     everyone = (FULL // 4096) * find_occupancy(labels != 0)
-    values = [np.pad(field, border, mode="edge") for field in (own, everyone)]
+    values = [np.pad(field, border, mode="edge") for field in (occupancy, everyone)]
     slopes = [
         np.pad(gradients(np.pad(field.astype(np.float64), 1, mode="edge"), False), [(border, border)] * 3 + [(0, 0)])
-        for field in (own, everyone)
+        for field in (occupancy, everyone)
     ]
     starts = inside[edges.near]
     others, next_others = ((values[1] - values[0])[ends] for ends in (edges.near, edges.far))
@@ -145,7 +145,7 @@ def extract_label_mask(
     between = ~leads_out & (grown[edges.near] != 0) & (grown[edges.far] != 0)
     biases = level_biases(dict(enclosed or {}), int(labels.max()) + 1)[grown]
     before = biases[edges.near] - biases[edges.far]
-    lead, next_lead = (np.maximum(lead, 1) for lead in _find_leads(labels, own, edges, inside, grown, border))
+    lead, next_lead = (np.maximum(lead, 1) for lead in _find_leads(labels, occupancy, edges, inside, grown, border))
     value, next_value = np.maximum(lead + before, 1), np.maximum(next_lead - before, 1)
     t[between] = (value / (value + next_value))[between]
     t[leads_out] = 0.5
@@ -161,7 +161,7 @@ def extract_label_mask(
 
 def _find_leads(
     labels: NDArray[Any],
-    own: NDArray[np.int64],
+    occupancy: NDArray[np.int64],
     edges: CrossedEdges,
     inside: NDArray[np.bool_],
     grown: NDArray[np.int64],
@@ -171,14 +171,14 @@ def _find_leads(
     the label whose samples are `inside`, `grown` the number of each sample of the grid.
     """
     starts = inside[edges.near]
-    other = np.where(starts, grown[edges.far], grown[edges.near])
-    leads = np.zeros((2, len(other)), np.int64)
-    values = np.pad(own, border, mode="edge")
-    for number in np.unique(other):
-        among = other == number
+    rival_number = np.where(starts, grown[edges.far], grown[edges.near])
+    leads = np.zeros((2, len(rival_number)), np.int64)
+    values = np.pad(occupancy, border, mode="edge")
+    for number in np.unique(rival_number):
+        among = rival_number == number
         rival = np.pad((FULL // 4096) * find_occupancy(labels == number), border, mode="edge")
-        for place, ends in enumerate((edges.near, edges.far)):
-            leads[place][among] = (values - rival)[ends][among]
+        for end_number, ends in enumerate((edges.near, edges.far)):
+            leads[end_number][among] = (values - rival)[ends][among]
     return np.where(starts, leads[0], -leads[0]), np.where(starts, -leads[1], leads[1])
 
 

@@ -64,20 +64,20 @@ _LONG_THIN = (520, 7, 34)
 """Voxels (k, j, i) of an open volume of many thin slices, whose ends are a large part of it."""
 
 
-def compare_mesh(volume: Volume, mesh: Mesh, expected: Surface, what: str) -> float:
+def compare_mesh(volume: Volume, mesh: Mesh, expected: Surface, subject: str) -> float:
     """Refuse a mesh that is not its twin; return the largest distance of a vertex, in voxel edges."""
     vertices, normals, triangles = expected
     require_whole(mesh.report)
-    require_equal(mesh.triangles, triangles, f"triangles of {what}")
+    require_equal(mesh.triangles, triangles, f"triangles of {subject}")
     scale = 1.0 / min(volume.spacing)
     allowed = _VERTEX_TOLERANCE_VOXEL
-    away = require_close(scale * mesh.vertices, scale * vertices, allowed, f"vertices of {what}, in voxels")
+    away = require_close(scale * mesh.vertices, scale * vertices, allowed, f"vertices of {subject}, in voxels")
     assert mesh.normals is not None
-    require_close(mesh.normals, normals, _NORMAL_TOLERANCE, f"normals of {what}")
+    require_close(mesh.normals, normals, _NORMAL_TOLERANCE, f"normals of {subject}")
     return away
 
 
-def _compare(device: Device, volume: Volume, levels: tuple[Level, ...], what: str, **options: Any) -> float:
+def _compare(device: Device, volume: Volume, levels: tuple[Level, ...], subject: str, **options: Any) -> float:
     """Compare surfaces of a volume one after the other: from the second on, bricks of the volume are known."""
     worst = 0.0
     with DeviceVolume(volume, device=device) as resident:
@@ -85,7 +85,7 @@ def _compare(device: Device, volume: Volume, levels: tuple[Level, ...], what: st
             if number == 1:
                 keep_bricks(resident, resident.whole(Stopwatch()))
             mesh = extract_isosurface(resident, level, **options)
-            words = f"{what}, surface {number + 1}" if len(levels) > 1 else what
+            words = f"{subject}, surface {number + 1}" if len(levels) > 1 else subject
             worst = max(worst, compare_mesh(volume, mesh, extract_twin(volume, level, **options), words))
     return worst
 
@@ -149,8 +149,8 @@ def _grains() -> tuple[NDArray[Any], NDArray[Any]]:
     """Return grains of a voxel and a large one, run 521 on, and a mark in the one at an edge of the volume."""
     voxels, marked = np.zeros((24, 12, 40), np.int16), np.zeros((24, 12, 40), bool)
     places = list(product((2, 5, 8, 11), (2, 5, 8), range(2, 38, 3)))
-    for place in places[:130]:
-        voxels[place] = 100
+    for index in places[:130]:
+        voxels[index] = 100
     voxels[14:20, 3:9, 10:16] = 100
     voxels[0, 11, 5] = 100
     marked[0, 11, 5] = True
@@ -258,13 +258,13 @@ def _check_labels(device: Device) -> str:
         big = 2 if label_dtype == "uint8" else 300
         numbers = _blocks(label_dtype, (big, big, big, big, big, big, 0))
         label_map = LabelMap(numbers, volume.affine)
-        taken = resample_labels(label_map, volume).voxels
-        inside = twin.find_solid(volume, taken, 30.0, closed=closed, solid=(big,) if solid else ())
-        made = extract_labels(volume, label_map, 30.0, device=device, closed=closed, solid=solid)
-        if list(made) != [big]:
-            raise DeviceError(f"labels {list(made)} have a surface in place of [{big}]")
+        placed = resample_labels(label_map, volume).voxels
+        inside = twin.find_solid(volume, placed, 30.0, closed=closed, solid=(big,) if solid else ())
+        meshes = extract_labels(volume, label_map, 30.0, device=device, closed=closed, solid=solid)
+        if list(meshes) != [big]:
+            raise DeviceError(f"labels {list(meshes)} have a surface in place of [{big}]")
         expected = twin.extract_label(volume, inside, big, 30.0, closed=closed)
-        worst = max(worst, compare_mesh(volume, made[big], expected, f"label {big} in {dtype} voxels"))
+        worst = max(worst, compare_mesh(volume, meshes[big], expected, f"label {big} in {dtype} voxels"))
     return f"2 labels: triangles equal, vertices within {worst:.1e} voxel"
 
 
@@ -305,10 +305,10 @@ def _check_volumes(device: Device) -> str:
         triangle_count=len(triangles), triangles_per_sum=16,
     )  # fmt: skip
     corners = (positions.astype(np.float64) - centre[:3])[triangles]
-    each = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-    expected = np.add.reduceat(each, np.arange(0, len(each), 16))
-    found = download(device, np.empty(SUMS, np.float32), sums_d)
-    away = require_close(found, expected, 0.1, "volumes below triangles, in mm3")
+    six_volumes = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    expected = np.add.reduceat(six_volumes, np.arange(0, len(six_volumes), 16))
+    sums = download(device, np.empty(SUMS, np.float32), sums_d)
+    away = require_close(sums, expected, 0.1, "volumes below triangles, in mm3")
     return f"{SUMS} sums within {away:.1g} of {np.abs(expected).max():,.0f} mm3"
 
 
@@ -366,10 +366,10 @@ def _check_profiles(device: Device, dtype: str, uneven: bool) -> str:
     points, normals = scatter_profiles(volume, 31)
     with DeviceVolume(volume, device=device) as resident:
         sampler = ProfileSampler(resident, Stopwatch())
-        found = sampler.values(points, normals)
+        profiles = sampler.values(points, normals)
     expected = cortex_twin.sample_profiles(volume, points, normals, twin_scale(sampler))
     share = 0.002  # at the border a sample is in the volume or not
-    worst = require_share(found, expected, _VALUE_TOLERANCE_HU, share, f"profiles of {dtype} voxels")
+    worst = require_share(profiles, expected, _VALUE_TOLERANCE_HU, share, f"profiles of {dtype} voxels")
     return f"{PLACES} profiles of {dtype} voxels within {worst:.1e} HU"
 
 
@@ -377,17 +377,17 @@ def make_walls(count: int, seed: int) -> NDArray[np.float32]:
     """Return profiles (SAMPLES + 2, count) of walls of all kinds with noise, some of them cut off or beside another."""
     random = np.random.default_rng(seed)
     x = 0.5 * (np.arange(SAMPLES) - 7.0)
-    place, thickness = random.uniform(-1.6, 0.2, count), random.uniform(0.2, 4.0, count)
+    wall_place, thickness = random.uniform(-1.6, 0.2, count), random.uniform(0.2, 4.0, count)
     blur = random.uniform(0.5, 0.9, count)
     outer, cortex = random.choice([-1000.0, 50.0], count), random.uniform(600.0, 1400.0, count)
     inner = random.uniform(-100.0, 400.0, count)
     share = cortex_twin._normal_share
-    o = share((x[:, None] - place) / blur)
-    i = share(-(x[:, None] - place + thickness) / blur)
+    o = share((x[:, None] - wall_place) / blur)
+    i = share(-(x[:, None] - wall_place + thickness) / blur)
     values = outer * o + inner * i + cortex * (1.0 - o - i) + random.normal(0.0, 15.0, o.shape)
-    other = random.random(count) < 0.2
-    values[-2:, other] += 600.0
-    values[:2, other] += 500.0
+    is_joint = random.random(count) < 0.2
+    values[-2:, is_joint] += 600.0
+    values[:2, is_joint] += 500.0
     values[11:, ::17] = np.nan
     values[:, 5::31] = np.nan
     return np.vstack([values, random.random(count), random.choice([1.0, 2.3], count)]).astype(np.float32)
@@ -398,19 +398,19 @@ def _check_fits(device: Device) -> str:
     volume = blobs((8, 9, 10), np.eye(4), "int16")
     with DeviceVolume(volume, device=device) as resident:
         sampler = ProfileSampler(resident, Stopwatch())
-        found = np.stack(sampler.take(values).fit(0.66, 0.81, 980.0, 20.0).rows())
+        rows = np.stack(sampler.take(values).fit(0.66, 0.81, 980.0, 20.0).rows())
     precisions = expected_precisions(980.0, 20.0, CORTEX_SPREAD, sampler.scale.independent)
     expected = cortex_twin.fit_profiles(
         values.astype(np.float64), twin_scale(sampler), 0.66, 0.81, 980.0, precisions, 100.0
     )
     known = np.isfinite(expected[8])
-    require_close(found[8:], expected[8:], 1e-2, "highest values and room of walls")
-    for row, (what, allowed, share) in enumerate(_TOLERANCES):
-        one, other = found[row][known], expected[row][known]
-        if what == "variances":  # in units of their own
-            one, other = one / other, np.ones_like(other)
-        require_share(one, other, allowed, share, f"{what} of walls")
-    apart = np.abs(found[0] - expected[0])[known]
+    require_close(rows[8:], expected[8:], 1e-2, "highest values and room of walls")
+    for row, (subject, allowed, share) in enumerate(_TOLERANCES):
+        actual, wanted = rows[row][known], expected[row][known]
+        if subject == "variances":  # in units of their own
+            actual, wanted = actual / wanted, np.ones_like(wanted)
+        require_share(actual, wanted, allowed, share, f"{subject} of walls")
+    apart = np.abs(rows[0] - expected[0])[known]
     return f"{int(known.sum())} walls, 99 % of the places within {np.percentile(apart, 99.0):.1e} mm"
 
 

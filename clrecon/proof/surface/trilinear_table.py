@@ -163,8 +163,8 @@ def _find_tunnels(case: int, joined: int) -> list[Tunnel]:
 
 
 def _loop_between(loops: list[Loop], region: list[int], a: int, b: int) -> Loop:
-    found = [loop for loop in loops if {region[corner] for corner in EDGES[loop[0]][1:]} == {a, b}]
-    (loop,) = found
+    candidates = [loop for loop in loops if {region[corner] for corner in EDGES[loop[0]][1:]} == {a, b}]
+    (loop,) = candidates
     return loop
 
 

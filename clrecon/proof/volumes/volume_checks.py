@@ -59,11 +59,11 @@ def _check_compaction(device: Device) -> str:
 def _check_sort(device: Device) -> str:
     for n, bits in ((1, 32), (4097, 11), (70_001, 9), (70_001, 32)):
         keys = random_integers((n,), "uint32", 2**bits)
-        found = radix_sort(device, upload(device, keys), n, bits=bits)
+        sorted_on_device = radix_sort(device, upload(device, keys), n, bits=bits)
         expected, order = twin.radix_sort(keys)
-        values = download(device, np.empty(n, np.uint32), found.values_d)
+        values = download(device, np.empty(n, np.uint32), sorted_on_device.values_d)
         require_equal(values, order, f"order of {n:,} keys of {bits} bits")
-        sorted_keys = download(device, np.empty(n, np.uint32), found.keys_d)
+        sorted_keys = download(device, np.empty(n, np.uint32), sorted_on_device.keys_d)
         require_equal(sorted_keys, expected, f"{n:,} sorted keys of {bits} bits")
     return "4 arrays from 1 to 70,001 keys equal"
 
@@ -82,9 +82,9 @@ def _check_components(device: Device) -> str:
 def _require_components(
     device: Device, mesh: NDArray[np.uint32], vertices: int, count: int, labels: NDArray[np.int64]
 ) -> None:
-    found, numbers = label_components(device, mesh, vertices)
-    if found != count:
-        raise DeviceError(f"{found:,} components of {len(mesh):,} triangles in place of {count:,}")
+    component_count, numbers = label_components(device, mesh, vertices)
+    if component_count != count:
+        raise DeviceError(f"{component_count:,} components of {len(mesh):,} triangles in place of {count:,}")
     require_equal(numbers, labels, f"components of {len(mesh):,} triangles")
 
 
@@ -122,10 +122,10 @@ def _check_bricks(device: Device) -> str:
         level = voxels.dtype.type(45)
         compared = compare_bricks(device, measured, level, _BRICK_SHAPE[2], 1)
         states, extents = twin.compare_bricks(expected, float(level), _BRICK_SHAPE[2], 1)
-        found = download(device, np.empty_like(states), compared.states_d)
-        require_equal(found, states, f"states of bricks of {dtype} voxels")
-        found = download(device, np.empty_like(extents), compared.extents_d)
-        require_equal(found, extents, f"extents of bricks of {dtype} voxels")
+        downloaded = download(device, np.empty_like(states), compared.states_d)
+        require_equal(downloaded, states, f"states of bricks of {dtype} voxels")
+        downloaded = download(device, np.empty_like(extents), compared.extents_d)
+        require_equal(downloaded, extents, f"extents of bricks of {dtype} voxels")
     return "2,100 bricks of 6 types of voxels equal"
 
 
@@ -140,21 +140,21 @@ def _check_logic(device: Device) -> str:
     volume = stack(noise(_MASK_SHAPE, "int16", 100), OBLIQUE)
     a, b = volume.voxels > 40, volume.voxels % 3 == 0
     with DeviceVolume(volume, device=device) as resident:
-        one, other = Mask.from_array(resident, a), Mask.from_array(resident, b)
-        for made, expected, what in (
-            (one & other, a & b, "and"), (one | other, a | b, "or"), (one ^ other, a ^ b, "exclusive or"),
-            (one - other, a & ~b, "and not"), (~one, ~a, "not"),
+        first, second = Mask.from_array(resident, a), Mask.from_array(resident, b)
+        for mask, expected, name in (
+            (first & second, a & b, "and"), (first | second, a | b, "or"), (first ^ second, a ^ b, "exclusive or"),
+            (first - second, a & ~b, "and not"), (~first, ~a, "not"),
         ):  # fmt: skip
-            require_equal(made.to_numpy(), expected, f"{what} of masks")
-            if made.count != expected.sum():
-                raise DeviceError(f"{what} of masks: {made.count:,} voxels are counted in place of {expected.sum():,}")
-        kept = one.apply(resident).volume.voxels
-    require_equal(kept, np.where(a, volume.voxels, -1024), "a volume of what a mask chooses")
+            require_equal(mask.to_numpy(), expected, f"{name} of masks")
+            if mask.count != expected.sum():
+                raise DeviceError(f"{name} of masks: {mask.count:,} voxels are counted in place of {expected.sum():,}")
+        applied = first.apply(resident).volume.voxels
+    require_equal(applied, np.where(a, volume.voxels, -1024), "a volume of what a mask chooses")
     return f"{a.size:,} voxels equal"
 
 
 def _check_regions(device: Device) -> str:
-    said = 0
+    voxel_count = 0
     for uneven in (False, True):
         volume = stack(noise(_MASK_SHAPE, "int16", 100), OBLIQUE, uneven=uneven)
         places = twin.find_places(volume)
@@ -165,27 +165,27 @@ def _check_regions(device: Device) -> str:
             box, tube = Mask.from_box(resident, sides.ravel().tolist()), Mask.from_tube(resident, line, 6.0)
         require_equal(box.to_numpy(), twin.find_in_box(volume, sides), "the voxels in a box")
         require_equal(tube.to_numpy(), twin.find_in_tube(volume, line, 6.0), "the voxels in a tube")
-        said += box.count + tube.count
-    return f"{said:,} voxels equal"
+        voxel_count += box.count + tube.count
+    return f"{voxel_count:,} voxels equal"
 
 
 def _check_balls(device: Device) -> str:
-    said = 0
+    voxel_count = 0
     for uneven, columns in ((False, 70), (True, 70), (False, 530)):
         shape = (*_MASK_SHAPE[:2], columns) if columns == _MASK_SHAPE[2] else (9, 60, columns)
         affine = OBLIQUE if columns == _MASK_SHAPE[2] else np.diag((0.6, 0.6, 1.5, 1.0))
         volume = stack(noise(shape, "int16", 100), affine, uneven=uneven)
         few, many = volume.voxels > 97, volume.voxels > 2
         with DeviceVolume(volume, device=device) as resident:
-            one, other = Mask.from_array(resident, few), Mask.from_array(resident, many)
-            for made, expected, what in (
-                (one.dilate(1.3), twin.dilate(volume, few, 1.3), "dilation"),
-                (other.erode(1.3), twin.erode(volume, many, 1.3), "erosion"),
-                (one.close(1.3), twin.close(volume, few, 1.3), "closing"),
+            first, second = Mask.from_array(resident, few), Mask.from_array(resident, many)
+            for mask, expected, operation in (
+                (first.dilate(1.3), twin.dilate(volume, few, 1.3), "dilation"),
+                (second.erode(1.3), twin.erode(volume, many, 1.3), "erosion"),
+                (first.close(1.3), twin.close(volume, few, 1.3), "closing"),
             ):
-                require_equal(made.to_numpy(), expected, f"{what} by a ball, rows of {columns} voxels")
-        said += 3 * few.size
-    return f"{said:,} voxels equal"
+                require_equal(mask.to_numpy(), expected, f"{operation} by a ball, rows of {columns} voxels")
+        voxel_count += 3 * few.size
+    return f"{voxel_count:,} voxels equal"
 
 
 def _check_mask_components(device: Device) -> str:
@@ -195,12 +195,12 @@ def _check_mask_components(device: Device) -> str:
         mask = Mask.from_array(resident, chosen)
         filled, flat = mask.fill_holes(), mask.fill_holes(by_slice=True)
         lone = Mask.from_array(resident, volume.voxels > 70)
-        at = np.argwhere(volume.voxels > 70)[::9]
-        grown = lone.grow(volume.ijk_to_lps(at[:, ::-1]))
+        seeds = np.argwhere(volume.voxels > 70)[::9]
+        grown = lone.grow(volume.ijk_to_lps(seeds[:, ::-1]))
     require_equal(filled.to_numpy(), twin.fill_holes(chosen), "filled holes")
     require_equal(flat.to_numpy(), twin.fill_holes(chosen, by_slice=True), "filled holes of slices")
-    require_equal(grown.to_numpy(), twin.grow(volume.voxels > 70, at), "components grown from points")
-    return f"{len(at):,} points, {filled.count - mask.count:,} voxels of holes equal"
+    require_equal(grown.to_numpy(), twin.grow(volume.voxels > 70, seeds), "components grown from points")
+    return f"{len(seeds):,} points, {filled.count - mask.count:,} voxels of holes equal"
 
 
 MASK_CHECKS = (
@@ -227,15 +227,15 @@ def _check_bilateral(device: Device, types: tuple[str, ...], uneven: bool) -> st
         volume = stack(random_integers(_FILTER_SHAPE, dtype, 120), OBLIQUE, uneven=uneven)
         for dimensions, taps in ((3, 120), (2, 13)):
             settings = BilateralSettings.checked(volume, 0.8, 40.0, dimensions, None, False, taps)
-            found = run_bilateral(DeviceVolume(volume, device=device), settings)
-            if found.slabs != 1:
+            filtered = run_bilateral(DeviceVolume(volume, device=device), settings)
+            if filtered.slabs != 1:
                 raise DeviceError("filtered in parts: the device has too little memory")
             offsets = settings.window.offsets
             expected = twin.filter_bilateral(
                 volume.voxels, offsets, twin.spatial_weights(volume, offsets, settings.sigma_mm), settings.sigma_hu
             )
             allowed = _FLOAT_HU if volume.voxels.dtype.kind == "f" else _ROUNDED_HU
-            worst = max(worst, require_close(found.voxels, expected, allowed, f"filtered {dtype} voxels, in HU"))
+            worst = max(worst, require_close(filtered.voxels, expected, allowed, f"filtered {dtype} voxels, in HU"))
     return f"{2 * len(types)} volumes within {worst:.2g} HU"
 
 
@@ -298,10 +298,10 @@ def _check_sheets(device: Device, types: tuple[str, ...], uneven: bool) -> str:
         for view, thickness, combine in PLANES:
             sheet, _ = plane_sheet(find_plane(volume, view, SIZE), SIZE, 0.1)
             samples = slab_samples(volume, thickness)
-            made = sample_sheet(DeviceVolume(volume, device=device), sheet, samples, combine)
-            require_whole({"slabs": made.slabs, "warnings": ()})
+            cut = sample_sheet(DeviceVolume(volume, device=device), sheet, samples, combine)
+            require_whole({"slabs": cut.slabs, "warnings": ()})
             expected = reformat_sheet(volume, sheet, samples, combine)
-            worst = max(worst, require_close(made.values, expected, VALUE_HU, f"slices of {dtype} voxels, in HU"))
+            worst = max(worst, require_close(cut.values, expected, VALUE_HU, f"slices of {dtype} voxels, in HU"))
     return f"{len(types) * len(PLANES)} slices of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1e} HU"
 
 

@@ -54,9 +54,9 @@ def measure_bricks(voxels: NDArray[Any], brick: int = 8) -> NDArray[Any]:
     """Return the lowest and highest value of each brick, (bk, bj, bi, 2)."""
     shape = [-(-n // brick) for n in voxels.shape]
     ranges = np.empty((*shape, 2), voxels.dtype)
-    for at in np.ndindex(*shape):
-        part = voxels[tuple(slice(brick * n, brick * (n + 1)) for n in at)]
-        ranges[at] = part.min(), part.max()
+    for brick_index in np.ndindex(*shape):
+        part = voxels[tuple(slice(brick * n, brick * (n + 1)) for n in brick_index)]
+        ranges[brick_index] = part.min(), part.max()
     return ranges
 
 
@@ -90,11 +90,11 @@ def fill_holes(chosen: ArrayLike, *, by_slice: bool = False) -> NDArray[np.bool_
 
 def grow(chosen: ArrayLike, voxels: ArrayLike) -> NDArray[np.bool_]:
     bits = np.asarray(chosen, dtype=bool)
-    found = np.zeros_like(bits)
+    grown = np.zeros_like(bits)
     for voxel in np.asarray(voxels).tolist():
-        if not found[tuple(voxel)]:
-            found |= _flood(bits, tuple(voxel))
-    return found
+        if not grown[tuple(voxel)]:
+            grown |= _flood(bits, tuple(voxel))
+    return grown
 
 
 def _flood(bits: NDArray[np.bool_], start: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -103,10 +103,10 @@ def _flood(bits: NDArray[np.bool_], start: tuple[int, ...]) -> NDArray[np.bool_]
     met[start] = bits[start]
     open_ends = [start] if bits[start] else []
     while open_ends:
-        place = open_ends.pop()
+        voxel = open_ends.pop()
         for axis, size in enumerate(bits.shape):
             for step in (-1, 1):
-                near = (*place[:axis], place[axis] + step, *place[axis + 1 :])
+                near = (*voxel[:axis], voxel[axis] + step, *voxel[axis + 1 :])
                 if 0 <= near[axis] < size and bits[near] and not met[near]:
                     met[near] = True
                     open_ends.append(near)
@@ -124,8 +124,8 @@ def find_in_box(volume: Volume, sides: ArrayLike) -> NDArray[np.bool_]:
     """Return the voxels in a box of sides (3, 2), LPS mm, and up to 1e-6 mm beyond; infinity leaves a side open."""
     low, high = np.asarray(sides, dtype=np.float64).T
     places = find_places(volume)
-    found: NDArray[np.bool_] = ((places >= low - 1e-6) & (places <= high + 1e-6)).all(axis=-1)
-    return found
+    in_box: NDArray[np.bool_] = ((places >= low - 1e-6) & (places <= high + 1e-6)).all(axis=-1)
+    return in_box
 
 
 def find_in_tube(volume: Volume, points: ArrayLike, radius_mm: float) -> NDArray[np.bool_]:
@@ -138,8 +138,8 @@ def find_in_tube(volume: Volume, points: ArrayLike, radius_mm: float) -> NDArray
         square = float(along @ along)
         part = np.clip(((places - begin) @ along) / square, 0.0, 1.0) if square else np.zeros(places.shape[:-1])
         nearest = np.minimum(nearest, np.linalg.norm(places - begin - part[..., None] * along, axis=-1))
-    found: NDArray[np.bool_] = nearest <= radius_mm * (1.0 + 1e-6)
-    return found
+    in_tube: NDArray[np.bool_] = nearest <= radius_mm * (1.0 + 1e-6)
+    return in_tube
 
 
 Bits = NDArray[np.bool_]
@@ -181,14 +181,14 @@ def _spread(
     from scipy.spatial import cKDTree
 
     wanted, k = places[inner], np.arange(len(places))[inner[0]]
-    found = np.zeros(wanted.shape[:-1], bool)
+    is_near = np.zeros(wanted.shape[:-1], bool)
     layers = [(slice(n, n + 1), slice(at, at + 1)) for n, at in enumerate(k)] if by_slice else [(slice(None),) * 2]
-    for own, layer in layers:
+    for layers_there, layer in layers:
         if chosen[layer].any():
             tree = cKDTree(places[layer][chosen[layer]])
-            distances = tree.query(wanted[own].reshape(-1, 3), distance_upper_bound=2.0 * mm)[0]
-            found[own] = (distances <= mm * (1.0 + 1e-6)).reshape(found[own].shape)
-    return found
+            distances = tree.query(wanted[layers_there].reshape(-1, 3), distance_upper_bound=2.0 * mm)[0]
+            is_near[layers_there] = (distances <= mm * (1.0 + 1e-6)).reshape(is_near[layers_there].shape)
+    return is_near
 
 
 GROUP = 16
@@ -268,11 +268,11 @@ def is_inside(volume: Volume, points: Float64Array) -> NDArray[np.bool_]:
 def sample_field(volume: Volume, points: Float64Array) -> Float64Array:
     """Interpolate HU trilinearly in the box of the volume; beyond the outer centres the nearest value holds."""
     last = np.array(volume.shape_ijk) - 1
-    at = np.clip(volume.lps_to_ijk(points), 0.0, last)
-    low = np.floor(at).astype(np.intp)
-    part = at - low
+    ijk = np.clip(volume.lps_to_ijk(points), 0.0, last)
+    low = np.floor(ijk).astype(np.intp)
+    part = ijk - low
     high = np.minimum(low + (part > 0.0), last)
-    values = np.zeros(len(at))
+    values = np.zeros(len(ijk))
     for corner in np.ndindex(2, 2, 2):
         i, j, k = (np.where(upper, high[:, axis], low[:, axis]) for axis, upper in enumerate(corner))
         weight = np.prod(np.where(corner, part, 1.0 - part), axis=1)

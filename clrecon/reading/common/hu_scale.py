@@ -58,15 +58,15 @@ class ValueSample:
         low = self.values[: np.searchsorted(self.values, limit)]
         if not len(low):
             return None
-        found, counts = np.unique(low, return_counts=True)
-        return float(found[counts.argmax()]), float(counts.max()) / len(self.values)
+        values, counts = np.unique(low, return_counts=True)
+        return float(values[counts.argmax()]), float(counts.max()) / len(self.values)
 
     def without_spikes(self, low: float = np.inf, high: float = -np.inf) -> ValueSample | None:
         """Leave out values outside of a range that stand out of those beside them; None where too few are left."""
-        found, counts = np.unique(self.values, return_counts=True)
+        distinct, counts = np.unique(self.values, return_counts=True)
         before, after = np.pad(counts, (1, 0))[:-1], np.pad(counts, (0, 1))[1:]
         spikes = (counts >= _SPIKE_SHARE * len(self.values)) & (counts >= _SPIKE_RATIO * np.minimum(before, after))
-        spikes &= (found < low) | (found > high)
+        spikes &= (distinct < low) | (distinct > high)
         values = self.values[np.repeat(~spikes, counts)]
         return ValueSample(values) if len(values) >= _LEAST_SAMPLE else None
 
@@ -195,11 +195,11 @@ class Layers:
 
     def find_enclosing(self, air: Peak, above: Sequence[Peak]) -> Peak | None:
         """Do what `find_around` does, for a peak in a place where it need not be that of air."""
-        found = self.find_around(air, above)
-        if found is None or (air.at < _AS_LUNG_HU and found.at < _ABOVE_LUNG_HU):
+        around = self.find_around(air, above)
+        if around is None or (air.at < _AS_LUNG_HU and around.at < _ABOVE_LUNG_HU):
             return None
         among = air.at < _AS_LUNG_HU or _OFFSET_AIR_HU[1] < air.at <= _HIGHEST_AMONG_HU
-        return found if not among or _CT_STEP_HU[0] <= found.at - air.at <= _CT_STEP_HU[1] else None
+        return around if not among or _CT_STEP_HU[0] <= around.at - air.at <= _CT_STEP_HU[1] else None
 
     def find_around(self, air: Peak, above: Sequence[Peak]) -> Peak | None:
         """Return the soft tissue that lies around bone, of the peaks above that of air; None without any."""
@@ -279,8 +279,8 @@ def judge_scale(
             f"air lies near {doubt.air:.0f} HU and soft tissue near {doubt.tissue:.0f} HU, where a CT has -1000 and 0"
             f" to 80: {doubt.reason}; thresholds in HU do not fit these values"
         )
-        found = {"air": round(doubt.air, 1), "soft_tissue": round(doubt.tissue, 1)}
-        return Gate("hu_scale", 2, 0, None, False, text), found
+        levels = {"air": round(doubt.air, 1), "soft_tissue": round(doubt.tissue, 1)}
+        return Gate("hu_scale", 2, 0, None, False, text), levels
     places = [f"{peak.at:.0f}" for peak in peaks if _is_air(peak) or _is_tissue(peak)]
     if not places:
         return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: neither was found"), {}
@@ -348,8 +348,8 @@ def _fits(sample: ValueSample, shift: int) -> bool:
 
 def _is_padded_specimen(sample: ValueSample) -> bool:
     """True for dense bone in air with padding of one value: it looks like soft tissue and air 1024 HU too low."""
-    found = sample.commonest_below(LOWEST_AIR_HU)
-    padded = found is not None and found[1] > 0.9 * sample.between(-np.inf, LOWEST_AIR_HU)
+    padding = sample.commonest_below(LOWEST_AIR_HU)
+    padded = padding is not None and padding[1] > 0.9 * sample.between(-np.inf, LOWEST_AIR_HU)
     return padded and sample.between(500, np.inf) >= _MOST_BEYOND
 
 

@@ -76,12 +76,12 @@ class Likeness:
 
     def __str__(self) -> str:
         if self.whole > _LEAST_LIKENESS:
-            where, times = "neighbouring slices", self.whole
+            subject, times = "neighbouring slices", self.whole
         else:
-            where, times = "in parts of the picture neighbouring slices", self.part or 0.0
-        other = "the next but one" if self.period == 2 else f"those {self.period} further on"
+            subject, times = "in parts of the picture neighbouring slices", self.part or 0.0
+        further = "the next but one" if self.period == 2 else f"those {self.period} further on"
         return (
-            f"{where} are less alike than each is to {other} (differences {times:.3g} times as large): maybe "
+            f"{subject} are less alike than each is to {further} (differences {times:.3g} times as large): maybe "
             f"{'two' if self.period != 3 else 'three'} volumes between each other"
         )
 
@@ -93,13 +93,13 @@ def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool |
     if uneven or count <= WINDOW * WINDOWS:
         return measure_likeness(voxels, parts=parts)
     starts = [(count - WINDOW) * place // (WINDOWS - 1) for place in range(WINDOWS)]
-    found = [
+    likenesses = [
         one for first in starts if (one := measure_likeness(voxels[first : first + WINDOW], parts=parts)) is not None
     ]
-    if not found:
+    if not likenesses:
         return None
-    second = sorted(one.part or 0.0 for one in found)[-2] if parts and len(found) > 1 else None
-    whole = max(found, key=lambda one: one.whole / _LEAST_LIKENESS)
+    second = sorted(one.part or 0.0 for one in likenesses)[-2] if parts and len(likenesses) > 1 else None
+    whole = max(likenesses, key=lambda one: one.whole / _LEAST_LIKENESS)
     return replace(whole, part=None if whole.part is None else second)
 
 
@@ -115,12 +115,12 @@ def measure_likeness(voxels: NDArray[Any], *, parts: bool = True) -> Likeness | 
     if cells.shape[1] * cells.shape[2] < FEWEST_CELLS:
         return None
     differences = [np.square(cells[step:] - cells[:-step]) for step in range(1, max(PERIODS) + 1)]
-    found = []
+    likenesses = []
     for period in PERIODS:
         if len(voxels) < period + _LEAST_ALIKE:
             break
         whole = [one.mean(axis=(1, 2)) for one in differences[:period]]
-        found.append(Likeness(period, float(_steadily(_ratios(whole, _NOISE_HU2))), None))
+        likenesses.append(Likeness(period, float(_steadily(_ratios(whole, _NOISE_HU2))), None))
     part = None
     if parts and len(voxels) >= min(PERIODS) + _LEAST_ALIKE_PART:
         tiles = [_average(one, PART) for one in differences[:2]]
@@ -128,9 +128,9 @@ def measure_likeness(voxels: NDArray[Any], *, parts: bool = True) -> Likeness | 
             ratios = _ratios(tiles, _PART_NOISE_HU2)
             reached = np.sort(_steadily(ratios), axis=None)
             part = max(float(reached[-min(PARTS, len(reached))]), float(_steadily(ratios, _MOST_ALIKE_PART).max()))
-    best = max(found, key=lambda one: one.whole)
+    best = max(likenesses, key=lambda one: one.whole)
     if best.whole <= _LEAST_LIKENESS:
-        best = found[0]
+        best = likenesses[0]
     return Likeness(best.period, best.whole, part)
 
 
@@ -139,8 +139,8 @@ def _ratios(differences: Sequence[NDArray[np.float32]], noise: float) -> NDArray
     period = len(differences)
     count = len(differences[-1])
     nearer = []
-    for step, one in enumerate(differences[:-1], start=1):
-        nearer.append(np.mean([one[first : first + count] for first in range(period - step + 1)], axis=0))
+    for step, of_step in enumerate(differences[:-1], start=1):
+        nearer.append(np.mean([of_step[first : first + count] for first in range(period - step + 1)], axis=0))
     return np.asarray(np.max(nearer, axis=0) / np.maximum(differences[-1], noise))
 
 
@@ -200,8 +200,8 @@ def judge_shown_places(voxels: NDArray[Any]) -> Gate:
     nk, nj, ni = voxels.shape
     samples = _sample_rows(voxels)
     comparable = nk >= FEWEST_SLICES and samples.shape[1] >= _FEWEST_SAMPLES
-    found = [f"slices {a + 1} and {b + 1} of {nk}" for a, b in _find_exchanged(samples)] if comparable else []
-    texts = [f"{' and '.join(found)} seem to lie in each other's place, by what they show"] if found else []
+    pairs = [f"slices {a + 1} and {b + 1} of {nk}" for a, b in _find_exchanged(samples)] if comparable else []
+    texts = [f"{' and '.join(pairs)} seem to lie in each other's place, by what they show"] if pairs else []
     if _has_swapped_sides(voxels):
         texts.append(f"rows of {nj} pixels fit better than those of {ni}: Rows and Columns seem to be swapped")
     if not texts and not comparable:
@@ -235,19 +235,19 @@ def _find_exchanged(samples: NDArray[np.int16]) -> list[tuple[int, int]]:
         few = total**2 < _FEWEST_MOVED * squares
         return np.nan if few else max(total / apart.size, _NOISE_HU2)
 
-    count, found = len(samples), []
+    count, exchanged = len(samples), []
     first, second, third = (np.array([differ(k, k + step) for k in range(count - step)]) for step in (1, 2, 3))
     odd = (np.flatnonzero(np.minimum(first[:-1], first[1:]) > _LEAST_EXCHANGE * second) + 1).tolist()
-    for place, a in enumerate(odd if len(odd) <= 2 * _MOST_EXCHANGES else ()):
-        for b in odd[place + 1 :]:
+    for position, a in enumerate(odd if len(odd) <= 2 * _MOST_EXCHANGES else ()):
+        for b in odd[position + 1 :]:
             there = [differ(a - 1, b) + differ(a + 1, b), differ(b - 1, a) + differ(b + 1, a)]
             here = [first[a - 1] + first[a], first[b - 1] + first[b]]
             if b - a > 2 and all(one > _LEAST_EXCHANGE * other for one, other in zip(here, there, strict=True)):
-                found.append((a, b))
-    for apart, further in () if found else ((1, second), (2, third)):  # a stretch of the stack is turned round
+                exchanged.append((a, b))
+    for apart, further in () if exchanged else ((1, second), (2, third)):  # a stretch of the stack is turned round
         ratios = np.minimum(first[: -apart - 1] / further[:-1], first[apart + 1 :] / further[1:])
-        found += [(k + 1, k + 1 + apart) for k in np.flatnonzero(ratios > _LEAST_EXCHANGE).tolist()]
-    return found if len(found) <= _MOST_EXCHANGES else []
+        exchanged += [(k + 1, k + 1 + apart) for k in np.flatnonzero(ratios > _LEAST_EXCHANGE).tolist()]
+    return exchanged if len(exchanged) <= _MOST_EXCHANGES else []
 
 
 def _has_swapped_sides(voxels: NDArray[Any]) -> bool:
@@ -255,9 +255,9 @@ def _has_swapped_sides(voxels: NDArray[Any]) -> bool:
     nk, nj, ni = voxels.shape
     if min(nj, ni) < _NARROWEST or nj % ni == 0 or ni % nj == 0:
         return False
-    beside, other, below = 0.0, 0.0, 0.0
+    beside, across, below = 0.0, 0.0, 0.0
     for picture in voxels[:: -(-nk // PICTURES)]:
         flat = np.clip(picture, *HU_RANGE).astype(np.float32).ravel()
         apart = [float(np.square(flat[lag:] - flat[:-lag]).mean()) for lag in (1, nj, ni)]
-        beside, other, below = beside + apart[0], other + apart[1], below + apart[2]
-    return below > _WRONG_ROW * max(beside, other) and other * _WRONG_ROW > beside
+        beside, across, below = beside + apart[0], across + apart[1], below + apart[2]
+    return below > _WRONG_ROW * max(beside, across) and across * _WRONG_ROW > beside

@@ -42,8 +42,8 @@ def judge_steps(pixels_mm: Sequence[float], gap_mm: float | None) -> Gate:
     odd = [f"pixels of {mm:g} mm" for mm in sorted(set(pixels_mm)) if not low <= mm <= high]
     if gap_mm is not None and not gap_low <= gap_mm <= gap_high:
         odd.append(f"gaps of {gap_mm:g} mm")
-    what = f"spacings that no scanner has, outside of {low:g} to {high:g} mm, gaps up to {gap_high:g} mm"
-    return none_of("plausible_spacing", len(odd), f"{what} ({', '.join(odd)})" if odd else what)
+    words = f"spacings that no scanner has, outside of {low:g} to {high:g} mm, gaps up to {gap_high:g} mm"
+    return none_of("plausible_spacing", len(odd), f"{words} ({', '.join(odd)})" if odd else words)
 
 
 def list_odd_values(facts: PixelFacts) -> list[str]:
@@ -57,8 +57,8 @@ def list_odd_values(facts: PixelFacts) -> list[str]:
 
 def judge_figures(odd: Sequence[str]) -> Gate:
     """Judge the gate ``plausible_hu``, given the unusual figures."""
-    what = "figures of HU that no CT has"
-    return none_of("plausible_hu", len(odd), f"{what} ({'; '.join(odd)})" if odd else what)
+    words = "figures of HU that no CT has"
+    return none_of("plausible_hu", len(odd), f"{words} ({'; '.join(odd)})" if odd else words)
 
 
 _SIGN_SAID = "neighbouring values that lie nearly the whole range of the stored bits apart: the sign is lost"
@@ -143,8 +143,8 @@ def examine_voxels(
 ) -> VoxelFindings:
     """Examine values, of DICOM with its slices by k, else as `stored`; `known`: nothing says that they are no HU."""
     if facts.hu_min == facts.hu_max:
-        what = "padding" if facts.padding_share == 1.0 else f"{facts.hu_min:g} HU"
-        raise RefusedInputError(f"all {voxels.size:,} voxels are {what}: the volume is constant and holds no image")
+        content = "padding" if facts.padding_share == 1.0 else f"{facts.hu_min:g} HU"
+        raise RefusedInputError(f"all {voxels.size:,} voxels are {content}: the volume is constant and holds no image")
     sign, shown = judge_sign(voxels, facts, slices or stored), judge_shown_places(voxels)
     if sign.ok is False:
         unknown = unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: the sign of the values is lost")
@@ -187,14 +187,14 @@ def _warn_of_saturation(voxels: NDArray[Any], facts: PixelFacts, slices: Sequenc
     warnings = []
     for (ceiling, bits), places in sorted(members.items()):
         slope = abs(slices[min(places)].slope) if slices else 1.0
-        at, above, beside = np.sum([_count_near(voxels[k], ceiling, slope) for k in places], axis=0).tolist()
+        count, above, beside = np.sum([_count_near(voxels[k], ceiling, slope) for k in places], axis=0).tolist()
         # Values continue beyond: measured with more bits, unless a great many voxels have exactly this value.
-        if at <= _CEILING_VOXELS or above and at <= _CEILING_SPIKE * beside / (2 * _CEILING_LEVELS):
+        if count <= _CEILING_VOXELS or above and count <= _CEILING_SPIKE * beside / (2 * _CEILING_LEVELS):
             continue
-        what = "metal is saturated" if ceiling > METAL_HU else "metal or dense bone is cut off"
+        cause = "metal is saturated" if ceiling > METAL_HU else "metal or dense bone is cut off"
         more = f" and {above} are above it, at most at {facts.hu_max:g} HU" if above else ""
         warnings.append(
-            f"{at} voxels are at {ceiling:g} HU, the ceiling of {bits} bits{more}: {what}, its surface displaced"
+            f"{count} voxels are at {ceiling:g} HU, the ceiling of {bits} bits{more}: {cause}, its surface displaced"
         )
     return warnings
 
@@ -202,20 +202,20 @@ def _warn_of_saturation(voxels: NDArray[Any], facts: PixelFacts, slices: Sequenc
 def _count_near(picture: NDArray[Any], ceiling: float, slope: float) -> tuple[int, int, int]:
     """Count voxels of a slice at the ceiling, above it, and on the `_CEILING_LEVELS` next values on either side."""
     near = picture[picture >= ceiling - (_CEILING_LEVELS + 0.5) * slope]
-    at = int(np.count_nonzero(near == ceiling))
+    equal = int(np.count_nonzero(near == ceiling))
     return (
-        at,
+        equal,
         int(np.count_nonzero(near > ceiling)),
-        int(np.count_nonzero(near <= ceiling + (_CEILING_LEVELS + 0.5) * slope)) - at,
+        int(np.count_nonzero(near <= ceiling + (_CEILING_LEVELS + 0.5) * slope)) - equal,
     )
 
 
 def _warn_of_padding(sample: ValueSample, voxels: NDArray[Any]) -> list[str]:
     """Warn of one value far below air that many voxels have, without being declared as padding."""
-    found = sample.commonest_below(LOWEST_AIR_HU)
-    if found is None or found[1] < _LEAST_PADDING_SHARE:
+    padding = sample.commonest_below(LOWEST_AIR_HU)
+    if padding is None or padding[1] < _LEAST_PADDING_SHARE:
         return []
-    value = found[0]
+    value = padding[0]
     share = sum(int(np.count_nonzero(picture == value)) for picture in voxels) / voxels.size
     return [
         f"{100.0 * share:.3g} % of the voxels are at {value:g} HU, below air: padding that the files do not declare; it"

@@ -42,14 +42,14 @@ def make_entry(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry:
     stack = series.stack
     affine = stack.affine if stack is not None and not series.problems else None
     first = stack.slices[0] if stack is not None else None
-    found = series.headers if stack is None or series.problems else stack.slices  # of a refused series all
+    headers = series.headers if stack is None or series.problems else stack.slices  # of a refused series all
     return SeriesEntry(
         number=series.number,
         uid_hash=hash_uid(series.identity.uid),
         description=series.identity.description,
         modality=series.identity.modality,
         slices=series.count,
-        shape_ijk=None if first is None else [first.columns, first.rows, len(found)],
+        shape_ijk=None if first is None else [first.columns, first.rows, len(headers)],
         spacing_mm=None if affine is None else list(column_spacing(affine)),
         affine_ijk_to_lps_mm=None if affine is None else affine.tolist(),
         tilt_deg=None if stack is None or affine is None else stack.tilt_deg,
@@ -95,9 +95,9 @@ def read_series(path: str | os.PathLike[str], selection: Selection, progress: Pr
     Source: DICOM PS3.3 C.7.6.2 (Image Plane), C.7.5.1 (padding), C.8.2.1 (CT image, rescale).
     """
     with _quiet_warnings():
-        scan, found = _scan_and_group(path, selection, progress)
-        choice = choose_series(found, selection.series)
-        left = describe_left(found, choice, selection.series)
+        scan, listed = _scan_and_group(path, selection, progress)
+        choice = choose_series(listed, selection.series)
+        left = describe_left(listed, choice, selection.series)
         chosen = choice.series.choose(_checked_phase(selection), allow_gaps=selection.allow_gaps)
         stack = chosen.stack
         if chosen.problems or stack is None or stack.affine is None:
@@ -108,7 +108,7 @@ def read_series(path: str | os.PathLike[str], selection: Selection, progress: Pr
         *collect_series_warnings(chosen), *_warn_of_pixels(pixels), *collect_scan_warnings(scan), *left
     ]  # fmt: skip
     report = certify(chosen, stack, pixels, scan, stack.affine, warnings)
-    log.info("series %d of %d read: %s voxels %s", chosen.number, len(found), voxels.shape[::-1], voxels.dtype)
+    log.info("series %d of %d read: %s voxels %s", chosen.number, len(listed), voxels.shape[::-1], voxels.dtype)
     log_warnings(log, report.warnings)
     return Volume(voxels, stack.affine, report, stack.slice_positions, hu_range=(facts.hu_min, facts.hu_max))
 
@@ -116,8 +116,8 @@ def read_series(path: str | os.PathLike[str], selection: Selection, progress: Pr
 def list_slices(path: str | os.PathLike[str], selection: Selection) -> list[tuple[Path, int, int]]:
     """List the slices of the volume of `read_series`: file, frame there from 0, and number of frames of the file."""
     with _quiet_warnings():
-        _, found = _scan_and_group(path, selection, None)
-        choice = choose_series(found, selection.series)
+        _, listed = _scan_and_group(path, selection, None)
+        choice = choose_series(listed, selection.series)
         chosen = choice.series.choose(_checked_phase(selection), allow_gaps=selection.allow_gaps)
         if chosen.problems or chosen.stack is None:
             raise RefusedInputError(_describe_refusal(chosen))
@@ -137,25 +137,25 @@ def list_scan(
     """List the series at a path with their problems, and the certificate of the chosen one, for `pixels` read too."""
     phase = _checked_phase(selection)
     with _quiet_warnings():
-        scan, found = _scan_and_group(path, selection, progress)
+        scan, listed = _scan_and_group(path, selection, progress)
         warnings = collect_scan_warnings(scan)
         number = certificate = refusal = None
         try:
-            choice = choose_series(found, selection.series)
+            choice = choose_series(listed, selection.series)
         except (NoDicomError, RefusedInputError) as error:
             refusal = error
             warnings.append(str(error))
         else:
             chosen = choice.series
             number = chosen.number
-            warnings += describe_left(found, choice, selection.series)
+            warnings += describe_left(listed, choice, selection.series)
             judged = chosen.choose(phase, allow_gaps=selection.allow_gaps)
-            found = [judged if one is chosen else one for one in found]
+            listed = [judged if one is chosen else one for one in listed]
             certificate = _certify_chosen(judged, scan, warnings, pixels, progress)
-        entries = [make_entry(one, collect_series_warnings(one)) for one in found]
+        entries = [make_entry(one, collect_series_warnings(one)) for one in listed]
         if certificate is not None:  # its pixels may show more than its headers
-            own = [text for text in certificate.warnings if text not in warnings]
-            entries = [replace(entry, warnings=own) if entry.number == number else entry for entry in entries]
+            new_warnings = [text for text in certificate.warnings if text not in warnings]
+            entries = [replace(entry, warnings=new_warnings) if entry.number == number else entry for entry in entries]
     return SeriesListing(entries, number, dict(scan.skipped), warnings, certificate, refusal)
 
 
@@ -243,9 +243,9 @@ def _scan_and_group(
         hint += f"; {advise_on_links()}" if scan.skipped[LINK_OUT] else ""
         hint += f"; {_describe_single(folder)}" if folder.is_file() and _UNKNOWN & set(scan.skipped) else ""
         raise NoDicomError(f"no DICOM images in {shown}: {looked}{hint}")
-    found = group_series(scan)
-    log.debug("%d files: %d slices in %d series, skipped %s", scan.files, len(scan.slices), len(found), scan.skipped)
-    return scan, found
+    listed = group_series(scan)
+    log.debug("%d files: %d slices in %d series, skipped %s", scan.files, len(scan.slices), len(listed), scan.skipped)
+    return scan, listed
 
 
 def _describe_refusal(series: Series) -> str:

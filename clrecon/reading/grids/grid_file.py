@@ -122,28 +122,28 @@ def check_size(name: str, shape: tuple[int, ...], item_bytes: int, file_bytes: i
         )
 
 
-def read_bytes(stream: BinaryIO, count: int, name: str, where: str) -> bytes:
+def read_bytes(stream: BinaryIO, count: int, name: str, section: str) -> bytes:
     """Read exactly `count` bytes of a stream, which may be compressed."""
     parts, missing = [], count
     try:
         while missing > 0:
             part = stream.read(missing)
             if not part:
-                raise RefusedInputError(f"{name} is cut: it ends in {where}, {missing:,} bytes before its end")
+                raise RefusedInputError(f"{name} is cut: it ends in {section}, {missing:,} bytes before its end")
             parts.append(part)
             missing -= len(part)
     except (EOFError, zlib.error, OSError) as error:
-        raise RefusedInputError(f"{name} is cut or corrupt in {where}: {escape_text(str(error))}") from error
+        raise RefusedInputError(f"{name} is cut or corrupt in {section}: {escape_text(str(error))}") from error
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
 def check_end(stream: BinaryIO, name: str) -> None:
     """Read to the end of the data, where the checksum of a compressed stream is."""
-    found = 0
+    surplus = 0
     try:
         while part := stream.read(_LARGEST_SURPLUS + 1):
-            found += len(part)
-            if found > _LARGEST_SURPLUS:
+            surplus += len(part)
+            if surplus > _LARGEST_SURPLUS:
                 raise RefusedInputError(f"{name} is corrupt: it holds more numbers than its header says")
     except (EOFError, zlib.error, OSError) as error:
         raise RefusedInputError(f"{name} is cut or corrupt at its end: {escape_text(str(error))}") from error
@@ -157,14 +157,14 @@ def file_beside(header: Path, named: str) -> Path:
         raise RefusedInputError(f"{name} says that its voxels are in '{shown}': only files beside it are read")
     folder = header.parent.resolve()
     try:
-        found = (folder / named).resolve(strict=True)
+        target = (folder / named).resolve(strict=True)
     except (OSError, RuntimeError) as error:
         raise RefusedInputError(f"{name} says that its voxels are in '{shown}', which is not there") from error
-    if not found.is_relative_to(folder):
+    if not target.is_relative_to(folder):
         raise RefusedInputError(f"{name} says that its voxels are in '{shown}', a link to another folder: not read")
-    if not found.is_file():
+    if not target.is_file():
         raise RefusedInputError(f"{name} says that its voxels are in '{shown}', which is no regular file")
-    return found
+    return target
 
 
 LABEL_MAP = "label map"

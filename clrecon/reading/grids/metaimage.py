@@ -99,11 +99,11 @@ def _read_fields(path: Path, name: str) -> tuple[dict[str, str], int]:
         start = file.read(LARGEST_HEADER)
     fields: dict[str, str] = {}
     seen = {""}
-    at = 0
+    position = 0
     while "ElementDataFile" not in fields:
-        line, newline, _ = start[at : at + _LONGEST_KEY + LONGEST_VALUE].partition(b"\n")
+        line, newline, _ = start[position : position + _LONGEST_KEY + LONGEST_VALUE].partition(b"\n")
         key, mark, value = (part.strip() for part in line.decode("latin-1").partition("="))
-        at += len(line) + len(newline)
+        position += len(line) + len(newline)
         if not line and not newline or (key and not mark) or len(key) > _LONGEST_KEY or len(value) > LONGEST_VALUE:
             raise RefusedInputError(
                 f"{name} has a corrupt MetaImage header: no line 'ElementDataFile = ...' ends it, it stops at"
@@ -114,7 +114,7 @@ def _read_fields(path: Path, name: str) -> tuple[dict[str, str], int]:
         seen.add(key.casefold())
         if key:
             fields[key] = value
-    return fields, at
+    return fields, position
 
 
 class _Header:
@@ -224,8 +224,8 @@ def _ask_library(path: Path, header: _Header) -> tuple[tuple[int, int, int], np.
     size, axes = tuple(int(n) for n in reader.GetSize()), reader.GetDimension()
     directions = np.array(reader.GetDirection()).reshape(axes, axes)
     placed = (reader.GetSpacing(), reader.GetOrigin(), directions.T.ravel())
-    said = (header.numbers("ElementSpacing", axes), header.numbers("Offset", axes))
-    same = all(map(np.allclose, placed, (*said, header.numbers("TransformMatrix", axes * axes))))
+    stated = (header.numbers("ElementSpacing", axes), header.numbers("Offset", axes))
+    same = all(map(np.allclose, placed, (*stated, header.numbers("TransformMatrix", axes * axes))))
     same = same and list(size) == header.numbers("DimSize", axes)
     if dtype is None or not same or reader.GetNumberOfComponents() != 1:
         raise RefusedInputError(f"{header.name} has a corrupt MetaImage header: it can be read in two ways")

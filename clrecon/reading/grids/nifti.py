@@ -107,12 +107,12 @@ def _read_header(stream: BinaryIO, name: str, purpose: str) -> _Header:
     start = read_bytes(stream, 4, name, "its header")
     kind, size, magic = (nibabel.Nifti2Header, 540, b"2") if start in _SECOND else (nibabel.Nifti1Header, 348, b"1")
     parsed = kind(start + read_bytes(stream, size - 4, name, "its header"), check=False)
-    found = parsed["magic"].item()
-    paired = found[:3] == b"ni" + magic
-    if not paired and found[:3] != b"n+" + magic:
+    magic_found = parsed["magic"].item()
+    paired = magic_found[:3] == b"ni" + magic
+    if not paired and magic_found[:3] != b"n+" + magic:
         raise RefusedInputError(
-            f"{name} is no NIfTI file (its mark is {escape_text(repr(found))}): Analyze files do not say where they lie"
-            " and are not read, convert it to .nii.gz"
+            f"{name} is no NIfTI file (its mark is {escape_text(repr(magic_found))}): Analyze files do not say where"
+            " they lie and are not read, convert it to .nii.gz"
         )
     offset = float(parsed["vox_offset"])
     first = 0 if paired else size + 4

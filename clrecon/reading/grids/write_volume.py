@@ -178,7 +178,7 @@ def _verify(path: Path, kind: str, content: VolumeContent) -> None:
         raise OutputError("the volume file was not written rightly: its header reads back otherwise")
 
 
-def _measure_apart(affine: NDArray[Any], other: NDArray[np.float64], shape: tuple[int, ...]) -> float:
+def _measure_apart(affine: NDArray[Any], second: NDArray[np.float64], shape: tuple[int, ...]) -> float:
     """Return how far, along an axis, the first or last voxel of a shape (nk, nj, ni) lies from its place in another."""
     last = np.array([*shape[::-1], 1.0]) - (1.0, 1.0, 1.0, 0.0)
-    return max(float(np.abs((affine - other) @ end).max()) for end in (np.array([0.0, 0.0, 0.0, 1.0]), last))
+    return max(float(np.abs((affine - second) @ end).max()) for end in (np.array([0.0, 0.0, 0.0, 1.0]), last))

@@ -104,5 +104,5 @@ class ColorScale:
         table = _ABOUT_ZERO if self.signed else _FROM_ZERO
         places = (np.asarray(values, dtype=np.float64) - self.low) / (self.limit - self.low) * (len(table) - 1)
         known, unknown = np.arange(len(table)), np.isnan(places)[..., None]
-        found = np.stack([np.interp(places, known, column) for column in table.T], axis=-1)
-        return np.rint(np.where(unknown, _UNKNOWN, found)).astype(np.uint8)
+        rgb = np.stack([np.interp(places, known, column) for column in table.T], axis=-1)
+        return np.rint(np.where(unknown, _UNKNOWN, rgb)).astype(np.uint8)

@@ -18,37 +18,37 @@ _STRAIGHT_PARTS = 32
 """Number of straight parts that replace a bent one; the error is at most 0.003 of its rise."""
 
 
-def check_ascending(what: str, unit: str, positions: Float64Array) -> None:
+def check_ascending(title: str, unit: str, positions: Float64Array) -> None:
     """Refuse positions (n,) that descend, and more than two at one place."""
     back = np.flatnonzero(np.diff(positions) < 0)
     if back.size:
-        at = int(back[0])
+        n = int(back[0])
         raise UsageError(
-            f"{what} goes back from {positions[at]:g} {unit} at point {at + 1} to {positions[at + 1]:g} {unit} at point"
-            f" {at + 2}: order its points by {unit}"
+            f"{title} goes back from {positions[n]:g} {unit} at point {n + 1} to {positions[n + 1]:g} {unit} at point"
+            f" {n + 2}: order its points by {unit}"
         )
     thrice = np.flatnonzero(positions[2:] == positions[:-2])
     if thrice.size:
-        at = int(thrice[0])
+        n = int(thrice[0])
         raise UsageError(
-            f"{what} has more than two points at {positions[at]:g} {unit}, from point {at + 1} on: a step has two"
+            f"{title} has more than two points at {positions[n]:g} {unit}, from point {n + 1} on: a step has two"
         )
 
 
-def check_share(what: str, value: float, at: int, advice: str = "") -> None:
+def check_share(title: str, value: float, n: int, advice: str = "") -> None:
     """Refuse a value of point `at` (from 0) that is not in 0..1."""
     if not 0.0 <= value <= 1.0:
-        raise UsageError(f"{what} of point {at + 1} is {value:g}, and must lie between 0 and 1{advice}")
+        raise UsageError(f"{title} of point {n + 1} is {value:g}, and must lie between 0 and 1{advice}")
 
 
 def evaluate_curve(
-    positions: Float64Array, values: Float64Array, at: Float64Array, *, left: bool = False
+    positions: Float64Array, values: Float64Array, places: Float64Array, *, left: bool = False
 ) -> Float64Array:
     """Return values (..., k) of a curve at positions (...,); with `left`, a step has the value of its first point."""
     if left:  # mirrored, it is the second point
-        positions, values, at = -positions[::-1], values[::-1], -at
+        positions, values, places = -positions[::-1], values[::-1], -places
     # np.interp uses the last of equal positions: it searches the place with positions[n] <= at < positions[n + 1].
-    return np.stack([np.interp(at, positions, column) for column in values.T], axis=-1)
+    return np.stack([np.interp(places, positions, column) for column in values.T], axis=-1)
 
 
 def merge_curves(first: tuple[Float64Array, Float64Array], second: tuple[Float64Array, Float64Array]) -> Float64Array:
@@ -56,12 +56,12 @@ def merge_curves(first: tuple[Float64Array, Float64Array], second: tuple[Float64
     steps = {at for positions, _ in (first, second) for at in positions[1:][positions[1:] == positions[:-1]].tolist()}
     rows = []
     for position in np.unique(np.concatenate([first[0], second[0]])):
-        at = np.array([position])
+        here = np.array([position])
         # Elsewhere both sides are equal except for rounding.
         for left in (True, False) if float(position) in steps else (False,):
             rows.append(
                 np.concatenate(
-                    [at, evaluate_curve(*first, at, left=left)[0], evaluate_curve(*second, at, left=left)[0]]
+                    [here, evaluate_curve(*first, here, left=left)[0], evaluate_curve(*second, here, left=left)[0]]
                 )
             )
     return np.array(rows)
@@ -76,9 +76,9 @@ def _bend(sharpness: float) -> tuple[Float64Array, Float64Array]:
     t = np.arange(1, _STRAIGHT_PARTS) / _STRAIGHT_PARTS
     s = np.where(t < 0.5, 2.0 * t * t, 1.0 - 2.0 * (1.0 - t) ** 2)
     root = 1.0 / (1.0 + 10.0 * sharpness)
-    way = np.where(s < 0.5, 0.5 * (2.0 * s) ** root, 1.0 - 0.5 * (2.0 - 2.0 * s) ** root)
+    run = np.where(s < 0.5, 0.5 * (2.0 * s) ** root, 1.0 - 0.5 * (2.0 - 2.0 * s) ** root)
     rise = s * s * (3.0 - 2.0 * s) + (1.0 - sharpness) * s * (2.0 * s * s - 3.0 * s + 1.0)
-    return way, np.clip(rise, 0.0, 1.0)
+    return run, np.clip(rise, 0.0, 1.0)
 
 
 def straighten_curve(
@@ -93,15 +93,15 @@ def straighten_curve(
     for n in range(positions.size - 1):
         middle, sharp = float(np.clip(midpoints[n], 1e-5, 1.0 - 1e-5)), float(sharpness[n])
         if positions[n + 1] == positions[n] or (sharp < 0.01 and middle == 0.5):
-            way, rise = np.empty(0), np.empty(0)
+            run, rise = np.empty(0), np.empty(0)
         elif sharp > 0.99 and steps:
-            way, rise = np.array([0.5, 0.5]), np.array([0.0, 1.0])
+            run, rise = np.array([0.5, 0.5]), np.array([0.0, 1.0])
         elif sharp < 0.01:
-            way, rise = np.array([0.5]), np.array([0.5])
+            run, rise = np.array([0.5]), np.array([0.5])
         else:
-            way, rise = _bend(sharp)
-        way = np.where(way < 0.5, 2.0 * way * middle, middle + (2.0 * way - 1.0) * (1.0 - middle))
-        out_positions += [positions[n] + way * (positions[n + 1] - positions[n]), positions[n + 1 : n + 2]]
+            run, rise = _bend(sharp)
+        run = np.where(run < 0.5, 2.0 * run * middle, middle + (2.0 * run - 1.0) * (1.0 - middle))
+        out_positions += [positions[n] + run * (positions[n + 1] - positions[n]), positions[n + 1 : n + 2]]
         out_values += [values[n] + rise[:, np.newaxis] * (values[n + 1] - values[n]), values[n + 1 : n + 2]]
     return np.concatenate(out_positions), np.concatenate(out_values)
 

@@ -142,23 +142,23 @@ def _choose_entry(entries: list[Entry], name: str | None, shown: str) -> Entry:
             raise _Choice(f"{shown} has {len(entries)} transfer functions, choose one by name: {listed}")
         return entries[0]
     wanted = name.strip().casefold()
-    found = [n for n, entry in enumerate(names) if entry.casefold() == wanted]
-    if not found and wanted.isascii() and wanted.isdigit() and 1 <= int(wanted[:9]) <= len(entries):
-        found = [int(wanted[:9]) - 1]
-    if len(found) != 1:
-        what = f"has {len(found)} transfer functions" if found else "has no transfer function"
-        raise _Choice(f"{shown} {what} named {name[:64]!r}; there are: {listed}")
-    return entries[found[0]]
+    matches = [n for n, entry in enumerate(names) if entry.casefold() == wanted]
+    if not matches and wanted.isascii() and wanted.isdigit() and 1 <= int(wanted[:9]) <= len(entries):
+        matches = [int(wanted[:9]) - 1]
+    if len(matches) != 1:
+        state = f"has {len(matches)} transfer functions" if matches else "has no transfer function"
+        raise _Choice(f"{shown} {state} named {name[:64]!r}; there are: {listed}")
+    return entries[matches[0]]
 
 
 def _own_parameters(value: dict[str, Any]) -> dict[str, Any]:
-    what = "the file"
-    take_object(value, what, needed=("format", "version"))
+    source = "the file"
+    take_object(value, source, needed=("format", "version"))
     if value["format"] != FORMAT:
         raise RefusedInputError(f'its format is {value["format"]!r:.64}, not "{FORMAT}"')
     if value["version"] != VERSION or isinstance(value["version"], bool):
         raise RefusedInputError(f"its version is {value['version']!r:.64}: this clrecon reads version {VERSION}")
-    take_object(value, what, known=_FIELDS, needed=("points",))
+    take_object(value, source, known=_FIELDS, needed=("points",))
     parameters: dict[str, Any] = {
         "points": [_own_point(point, f"points[{n}]") for n, point in enumerate(take_list(value["points"], "points"))],
         "unit_distance": take_number(value.get("unit_distance_mm", 1.0), "unit_distance_mm"),
@@ -168,9 +168,9 @@ def _own_parameters(value: dict[str, Any]) -> dict[str, Any]:
     if value.get("gradient_opacity") is not None:
         rows = []
         for n, point in enumerate(take_list(value["gradient_opacity"], "gradient_opacity")):
-            place, names = f"gradient_opacity[{n}]", ("hu_per_mm", "factor")
-            fields = take_object(point, place, known=names, needed=names)
-            rows.append([take_number(fields[name], f"{place}.{name}") for name in names])
+            path, names = f"gradient_opacity[{n}]", ("hu_per_mm", "factor")
+            fields = take_object(point, path, known=names, needed=names)
+            rows.append([take_number(fields[name], f"{path}.{name}") for name in names])
         parameters["gradient_opacity"] = rows
     if value.get("lighting") is not None:
         light = dict(take_object(value["lighting"], "lighting", known=_LIGHT))
@@ -181,11 +181,11 @@ def _own_parameters(value: dict[str, Any]) -> dict[str, Any]:
     return parameters
 
 
-def _own_point(point: Any, place: str) -> tuple[float, ...]:
+def _own_point(point: Any, path: str) -> tuple[float, ...]:
     names = ("hu", "color", "opacity")
-    fields = take_object(point, place, known=names, needed=names)
-    hu, opacity = (take_number(fields[name], f"{place}.{name}") for name in ("hu", "opacity"))
-    return hu, *take_color(fields["color"], f"{place}.color"), opacity
+    fields = take_object(point, path, known=names, needed=names)
+    hu, opacity = (take_number(fields[name], f"{path}.{name}") for name in ("hu", "opacity"))
+    return hu, *take_color(fields["color"], f"{path}.color"), opacity
 
 
 Entry = tuple[str, Callable[[], dict[str, Any]]]
@@ -200,45 +200,45 @@ _LINES = (
 )  # fmt: skip
 
 
-def _parse_number(text: str, what: str) -> float:
+def _parse_number(text: str, subject: str) -> float:
     try:
         number = float(text)
     except ValueError:
         number = np.nan
     if not np.isfinite(number):
-        raise RefusedInputError(f"{what} is {text[:64]!r}, not a finite number")
+        raise RefusedInputError(f"{subject} is {text[:64]!r}, not a finite number")
     return number
 
 
-def _parse_nodes(text: str, what: str, width: int) -> Float64Array:
+def _parse_nodes(text: str, subject: str, width: int) -> Float64Array:
     """Return nodes (n, width + 2) of ``COUNT X VALUES ...``, with VTK's midpoint and sharpness of a straight part."""
     words = text.split()
-    numbers = np.array([_parse_number(word, f"number {n + 1} of {what}") for n, word in enumerate(words)])
+    numbers = np.array([_parse_number(word, f"number {n + 1} of {subject}") for n, word in enumerate(words)])
     if not numbers.size or numbers[0] != numbers.size - 1 or (numbers.size - 1) % width or numbers.size == 1:
-        found = max(numbers.size - 1, 0)
-        said = f"{numbers[0]:g}" if numbers.size else "nothing"
-        raise RefusedInputError(f"{what} says {said} and has {found} numbers after it, of {width} to a point")
+        count = max(numbers.size - 1, 0)
+        stated = f"{numbers[0]:g}" if numbers.size else "nothing"
+        raise RefusedInputError(f"{subject} says {stated} and has {count} numbers after it, of {width} to a point")
     rows = numbers[1:].reshape(-1, width)
     return np.column_stack([rows, np.full(len(rows), 0.5), np.zeros(len(rows))])
 
 
-def _slicer_parameters(texts: Mapping[str, str], place: Callable[[str], str]) -> dict[str, Any]:
+def _slicer_parameters(texts: Mapping[str, str], path: Callable[[str], str]) -> dict[str, Any]:
     """Make the parameters from the words that .vp lines and XML attributes share; `place` says where a field is."""
 
     def number(name: str, default: float) -> float:
         text = texts.get(name, "").strip()
-        return _parse_number(text.split()[0], place(name)) if text else default
+        return _parse_number(text.split()[0], path(name)) if text else default
 
     for name in ("scalarOpacity", "colorTransfer"):
         if not texts.get(name, "").strip():
-            raise RefusedInputError(f"{place(name)} is missing")
-    opacity = curve_from_nodes(place("scalarOpacity"), _parse_nodes(texts["scalarOpacity"], place("scalarOpacity"), 2))
-    colors = curve_from_nodes(place("colorTransfer"), _parse_nodes(texts["colorTransfer"], place("colorTransfer"), 4))
+            raise RefusedInputError(f"{path(name)} is missing")
+    opacity = curve_from_nodes(path("scalarOpacity"), _parse_nodes(texts["scalarOpacity"], path("scalarOpacity"), 2))
+    colors = curve_from_nodes(path("colorTransfer"), _parse_nodes(texts["colorTransfer"], path("colorTransfer"), 4))
     gradient = None
     if texts.get("gradientOpacity", "").strip():
-        what = place("gradientOpacity")
+        field = path("gradientOpacity")
         gradient = gradient_points(
-            curve_from_nodes(what, _parse_nodes(texts["gradientOpacity"], what, 2)), _GRADIENT_VOXEL_MM
+            curve_from_nodes(field, _parse_nodes(texts["gradientOpacity"], field, 2)), _GRADIENT_VOXEL_MM
         )
     lighting = UNSHADED
     if number("shade", 0.0) != 0.0:
@@ -260,9 +260,9 @@ def read_slicer_xml(data: bytes) -> list[Entry]:
     def start(tag: str, attributes: dict[str, str]) -> None:
         if tag in ("VolumeProperty", "VolumePropertyNode"):
             line = parser.CurrentLineNumber
-            place = f"line {line} ({attributes.get('name', tag)[:64]!r})"
+            path = f"line {line} ({attributes.get('name', tag)[:64]!r})"
             entries.append(
-                (attributes.get("name", ""), lambda: _slicer_parameters(attributes, lambda name: f"{place}: {name}"))
+                (attributes.get("name", ""), lambda: _slicer_parameters(attributes, lambda name: f"{path}: {name}"))
             )
 
     parser.StartDoctypeDeclHandler = refuse
@@ -278,49 +278,49 @@ def read_slicer_xml(data: bytes) -> list[Entry]:
     return entries
 
 
-def _json_nodes(value: Any, where: str, is_color: bool) -> list[list[float]]:
+def _json_nodes(value: Any, path: str, is_color: bool) -> list[list[float]]:
     rows = []
-    points = take_list(take_object(value, where, needed=["points"])["points"], f"{where}.points")
+    points = take_list(take_object(value, path, needed=["points"])["points"], f"{path}.points")
     for n, point in enumerate(points):
-        place = f"{where}.points[{n}]"
-        fields = take_object(point, place, needed=["x", "color" if is_color else "y"])
-        row = [take_number(fields["x"], f"{place}.x")]
-        row += take_color(fields["color"], f"{place}.color") if is_color else [take_number(fields["y"], f"{place}.y")]
+        entry = f"{path}.points[{n}]"
+        fields = take_object(point, entry, needed=["x", "color" if is_color else "y"])
+        row = [take_number(fields["x"], f"{entry}.x")]
+        row += take_color(fields["color"], f"{entry}.color") if is_color else [take_number(fields["y"], f"{entry}.y")]
         for name, default in (("midpoint", 0.5), ("sharpness", 0.0)):
-            row.append(take_number(fields.get(name, default), f"{place}.{name}"))
+            row.append(take_number(fields.get(name, default), f"{entry}.{name}"))
         rows.append(row)
     return rows
 
 
-def _json_parameters(value: Any, where: str) -> dict[str, Any]:
-    components = take_object(value, where, needed=["components"])["components"]
-    where = f"{where}.components[0]"
+def _json_parameters(value: Any, path: str) -> dict[str, Any]:
+    components = take_object(value, path, needed=["components"])["components"]
+    path = f"{path}.components[0]"
     # Voxels of CT have one component.
-    fields = take_object(take_list(components, where.removesuffix("[0]"))[0], where, needed=["scalarOpacity"])
-    place = f"{where}.scalarOpacity"
-    opacity = curve_from_nodes(place, _json_nodes(fields["scalarOpacity"], place, False))
+    fields = take_object(take_list(components, path.removesuffix("[0]"))[0], path, needed=["scalarOpacity"])
+    entry = f"{path}.scalarOpacity"
+    opacity = curve_from_nodes(entry, _json_nodes(fields["scalarOpacity"], entry, False))
     if "rgbTransferFunction" in fields:
-        place = f"{where}.rgbTransferFunction"
-        colors = curve_from_nodes(place, _json_nodes(fields["rgbTransferFunction"], place, True), steps=True)
+        entry = f"{path}.rgbTransferFunction"
+        colors = curve_from_nodes(entry, _json_nodes(fields["rgbTransferFunction"], entry, True), steps=True)
     else:
-        place = f"{where}.grayTransferFunction"
-        take_object(fields, where, needed=["grayTransferFunction"])
-        positions, grey = curve_from_nodes(place, _json_nodes(fields["grayTransferFunction"], place, False))
+        entry = f"{path}.grayTransferFunction"
+        take_object(fields, path, needed=["grayTransferFunction"])
+        positions, grey = curve_from_nodes(entry, _json_nodes(fields["grayTransferFunction"], entry, False))
         colors = positions, np.repeat(grey, 3, axis=1)
     gradient = None
     if "gradientOpacity" in fields and not fields.get("disableGradientOpacity", False):
-        place = f"{where}.gradientOpacity"
-        nodes = _json_nodes(fields["gradientOpacity"], place, False)
-        gradient = gradient_points(curve_from_nodes(place, nodes), _GRADIENT_VOXEL_MM)
+        entry = f"{path}.gradientOpacity"
+        nodes = _json_nodes(fields["gradientOpacity"], entry, False)
+        gradient = gradient_points(curve_from_nodes(entry, nodes), _GRADIENT_VOXEL_MM)
     lighting = UNSHADED
     if fields.get("shade", False):
-        light = take_object(fields.get("lighting", {}), f"{where}.lighting")
+        light = take_object(fields.get("lighting", {}), f"{path}.lighting")
         defaults = {"ambient": 0.1, "diffuse": 0.7, "specular": 0.2, "specularPower": 10.0}
         ambient, diffuse, specular, power = (
-            take_number(light.get(key, default), f"{where}.lighting.{key}") for key, default in defaults.items()
+            take_number(light.get(key, default), f"{path}.lighting.{key}") for key, default in defaults.items()
         )
         lighting = Lighting(ambient, diffuse, specular, power)
-    unit = take_number(fields.get("scalarOpacityUnitDistance", 1.0), f"{where}.scalarOpacityUnitDistance")
+    unit = take_number(fields.get("scalarOpacityUnitDistance", 1.0), f"{path}.scalarOpacityUnitDistance")
     return {
         "points": merge_curves(colors, opacity),
         "gradient_opacity": gradient,
@@ -344,25 +344,25 @@ def read_slicer_json(value: Any) -> list[Entry]:
     return [entry(n) for n in range(len(properties))]
 
 
-def _paraview_parameters(value: Any, where: str) -> dict[str, Any]:
-    fields = take_object(value, where, needed=["RGBPoints"])
+def _paraview_parameters(value: Any, path: str) -> dict[str, Any]:
+    fields = take_object(value, path, needed=["RGBPoints"])
     if "Points" not in fields:
         raise RefusedInputError(
-            f"{where} has colours (RGBPoints) but no opacities (Points): save them with the preset in ParaView"
+            f"{path} has colours (RGBPoints) but no opacities (Points): save them with the preset in ParaView"
         )
-    space = take_text(fields.get("ColorSpace", "RGB"), f"{where}.ColorSpace")
+    space = take_text(fields.get("ColorSpace", "RGB"), f"{path}.ColorSpace")
     if space != "RGB":
-        raise RefusedInputError(f"{where} goes through colours in {space[:64]!r}: only RGB is read")
+        raise RefusedInputError(f"{path} goes through colours in {space[:64]!r}: only RGB is read")
     curves = []
     for name, width in (("RGBPoints", 4), ("Points", 4)):
-        place = f"{where}.{name}"
-        numbers = [take_number(x, f"{place}[{n}]") for n, x in enumerate(take_list(fields[name], place))]
+        entry = f"{path}.{name}"
+        numbers = [take_number(x, f"{entry}[{n}]") for n, x in enumerate(take_list(fields[name], entry))]
         if len(numbers) % width:
-            raise RefusedInputError(f"{place} has {len(numbers)} numbers, of {width} to a point")
+            raise RefusedInputError(f"{entry} has {len(numbers)} numbers, of {width} to a point")
         rows = np.reshape(numbers, (-1, width))
         if name == "RGBPoints":
             rows = np.column_stack([rows, np.full(len(rows), 0.5), np.zeros(len(rows))])
-        curves.append(curve_from_nodes(place, rows))
+        curves.append(curve_from_nodes(entry, rows))
     return {"points": merge_curves(curves[0], curves[1])}
 
 
@@ -380,12 +380,12 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    unique: dict[str, Any] = {}
     for key, value in pairs:
-        if key in found:
+        if key in unique:
             raise ValueError(f"the field {key[:64]!r} is there twice")
-        found[key] = value
-    return found
+        unique[key] = value
+    return unique
 
 
 def parse_json(text: str) -> Any:
@@ -409,47 +409,47 @@ def _show_value(value: Any) -> str:
 
 
 def take_object(
-    value: Any, where: str, known: Collection[str] | None = None, needed: Collection[str] = ()
+    value: Any, path: str, known: Collection[str] | None = None, needed: Collection[str] = ()
 ) -> dict[str, Any]:
     """Return an object; if `known` is given, refuse other fields."""
     if not isinstance(value, dict):
-        raise RefusedInputError(f"{where} is {_show_value(value)}, not an object")
+        raise RefusedInputError(f"{path} is {_show_value(value)}, not an object")
     unknown = [key for key in value if known is not None and key not in known]
     if unknown:
         raise RefusedInputError(
-            f"{where} has a field {unknown[0][:64]!r} that is not known: {', '.join(known or ())} are"
+            f"{path} has a field {unknown[0][:64]!r} that is not known: {', '.join(known or ())} are"
         )
     missing = [key for key in needed if key not in value]
     if missing:
-        raise RefusedInputError(f"{where} has no field {missing[0]!r}")
+        raise RefusedInputError(f"{path} has no field {missing[0]!r}")
     return value
 
 
-def take_list(value: Any, where: str) -> list[Any]:
+def take_list(value: Any, path: str) -> list[Any]:
     if not isinstance(value, list) or not value:
         raise RefusedInputError(
-            f"{where} is {'empty' if value == [] else _show_value(value)}, not a list with something in it"
+            f"{path} is {'empty' if value == [] else _show_value(value)}, not a list with something in it"
         )
     return value
 
 
-def take_number(value: Any, where: str) -> float:
+def take_number(value: Any, path: str) -> float:
     try:
         number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
     except OverflowError:
         number = math.nan
     if not math.isfinite(number):
-        raise RefusedInputError(f"{where} is {_show_value(value)}, not a finite number")
+        raise RefusedInputError(f"{path} is {_show_value(value)}, not a finite number")
     return number
 
 
-def take_text(value: Any, where: str) -> str:
+def take_text(value: Any, path: str) -> str:
     if not isinstance(value, str):
-        raise RefusedInputError(f"{where} is {_show_value(value)}, not a text")
+        raise RefusedInputError(f"{path} is {_show_value(value)}, not a text")
     return value
 
 
-def take_color(value: Any, where: str) -> tuple[float, float, float]:
+def take_color(value: Any, path: str) -> tuple[float, float, float]:
     """Return red, green, blue from three numbers or from a text ``#rrggbb``."""
     if isinstance(value, str) and len(value) == 7 and value[0] == "#":
         try:
@@ -458,6 +458,6 @@ def take_color(value: Any, where: str) -> tuple[float, float, float]:
         except (ValueError, IndexError):
             pass
     if not isinstance(value, list) or len(value) != 3:
-        raise RefusedInputError(f"{where} is {_show_value(value)}, not [red, green, blue] or '#rrggbb'")
-    red, green, blue = (take_number(part, f"{where}[{n}]") for n, part in enumerate(value))
+        raise RefusedInputError(f"{path} is {_show_value(value)}, not [red, green, blue] or '#rrggbb'")
+    red, green, blue = (take_number(part, f"{path}[{n}]") for n, part in enumerate(value))
     return red, green, blue

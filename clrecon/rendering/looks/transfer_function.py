@@ -30,18 +30,18 @@ _END_STEP_HU = 1.0
 COLUMNS = ("red", "green", "blue", "opacity")
 
 
-def _checked_rows(what: str, form: str, rows: ArrayLike, width: int) -> Float64Array:
+def _checked_rows(title: str, form: str, rows: ArrayLike, width: int) -> Float64Array:
     try:
         array = np.array(rows, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise UsageError(f"{what} is made of points {form}, each of {width} numbers: these are not") from None
+        raise UsageError(f"{title} is made of points {form}, each of {width} numbers: these are not") from None
     if array.ndim != 2 or array.shape[0] < 1 or array.shape[1] != width:
-        raise UsageError(f"{what} is made of points {form}, not of an array of shape {array.shape}")
+        raise UsageError(f"{title} is made of points {form}, not of an array of shape {array.shape}")
     bad = np.argwhere(~np.isfinite(array))
     if bad.size:
         row, column = bad[0]
         names = form.strip("()").split(", ")
-        raise UsageError(f"point {row + 1} of {what}: {names[column]} is {array[row, column]}, not a finite number")
+        raise UsageError(f"point {row + 1} of {title}: {names[column]} is {array[row, column]}, not a finite number")
     array.setflags(write=False)
     return array
 
@@ -104,27 +104,27 @@ class TransferFunction(Message):
 
     @staticmethod
     def _check_points(rows: ArrayLike) -> Float64Array:
-        what = "the transfer function"
-        points = _checked_rows(what, "(hu, red, green, blue, opacity)", rows, 5)
+        title = "the transfer function"
+        points = _checked_rows(title, "(hu, red, green, blue, opacity)", rows, 5)
         hu = points[:, 0]
         if np.abs(hu).max() > _HU_LIMIT:
-            at = int(np.abs(hu).argmax())
-            raise UsageError(f"point {at + 1} of {what} lies at {hu[at]:g} HU, beyond a million")
-        check_ascending(what, "HU", hu)
-        for at, column in np.argwhere((points[:, 1:] < 0) | (points[:, 1:] > 1))[:1]:
+            n = int(np.abs(hu).argmax())
+            raise UsageError(f"point {n + 1} of {title} lies at {hu[n]:g} HU, beyond a million")
+        check_ascending(title, "HU", hu)
+        for n, column in np.argwhere((points[:, 1:] < 0) | (points[:, 1:] > 1))[:1]:
             advice = ": divide numbers up to 255 by 255" if points[:, 1:].max() > 1 else ""
-            check_share(f"{COLUMNS[column]}", points[at, column + 1], at, advice)
+            check_share(f"{COLUMNS[column]}", points[n, column + 1], n, advice)
         return points
 
     @staticmethod
     def _check_gradient(rows: ArrayLike) -> Float64Array:
-        what = "the gradient opacity"
-        points = _checked_rows(what, "(HU per mm, factor)", rows, 2)
+        title = "the gradient opacity"
+        points = _checked_rows(title, "(HU per mm, factor)", rows, 2)
         if points[:, 0].min() < 0 or points[:, 0].max() > _HU_LIMIT:
-            raise UsageError(f"{what} goes from 0 to at most a million HU per mm")
-        check_ascending(what, "HU per mm", points[:, 0])
-        for at in np.flatnonzero((points[:, 1] < 0) | (points[:, 1] > 1))[:1]:
-            check_share(f"the factor of {what}", points[at, 1], int(at))
+            raise UsageError(f"{title} goes from 0 to at most a million HU per mm")
+        check_ascending(title, "HU per mm", points[:, 0])
+        for n in np.flatnonzero((points[:, 1] < 0) | (points[:, 1] > 1))[:1]:
+            check_share(f"the factor of {title}", points[n, 1], int(n))
         return points
 
     @property
@@ -190,10 +190,10 @@ class TransferFunction(Message):
         """Return the factor on the opacity (...,), float64, at magnitudes of the gradient (...,) in HU per mm; 1
         without one.
         """
-        at = as_numbers("magnitude", magnitude)
+        magnitudes = as_numbers("magnitude", magnitude)
         if self._gradient_opacity is None:
-            return np.ones(at.shape)
-        return evaluate_curve(self._gradient_opacity[:, 0], self._gradient_opacity[:, 1:], at)[..., 0]
+            return np.ones(magnitudes.shape)
+        return evaluate_curve(self._gradient_opacity[:, 0], self._gradient_opacity[:, 1:], magnitudes)[..., 0]
 
     @explains_arguments
     def gradient_table(self, high: float, nodes: int) -> NDArray[np.float32]:
@@ -208,8 +208,8 @@ class TransferFunction(Message):
 
     def changed(self, **changes: Any) -> TransferFunction:
         """Return a copy with other parameters, named as in the constructor."""
-        own = {name: getattr(self, name) for name in ("points", "unit_distance", "gradient_opacity", "lighting")}
-        return TransferFunction(**{**own, "name": self._name, "description": self._description, **changes})
+        arguments = {name: getattr(self, name) for name in ("points", "unit_distance", "gradient_opacity", "lighting")}
+        return TransferFunction(**{**arguments, "name": self._name, "description": self._description, **changes})
 
     @explains_arguments
     def scaled(self, opacity: float) -> TransferFunction:

@@ -22,7 +22,7 @@ _COLORS_A_PART = 64
 
 
 def curve_from_nodes(
-    what: str, nodes: Iterable[ArrayLike], *, clamped: bool = True, steps: bool = False
+    title: str, nodes: Iterable[ArrayLike], *, clamped: bool = True, steps: bool = False
 ) -> tuple[Float64Array, Float64Array]:
     """Make a curve from VTK's nodes, each (position, values..., midpoint, sharpness).
 
@@ -31,17 +31,17 @@ def curve_from_nodes(
     """
     rows = np.array(list(nodes), dtype=np.float64)
     if rows.size == 0:
-        raise UsageError(f"{what} has no points")
+        raise UsageError(f"{title} has no points")
     positions = rows[:, 0].copy()
     back = np.flatnonzero(np.diff(positions) < 0)
     if back.size:
-        at = int(back[0])
-        raise UsageError(f"{what} goes back from {positions[at]:g} at point {at + 1} to {positions[at + 1]:g}")
-    for at in np.flatnonzero(np.diff(positions) < STEP_HU)[::-1]:
-        positions[at] = positions[at + 1]
+        n = int(back[0])
+        raise UsageError(f"{title} goes back from {positions[n]:g} at point {n + 1} to {positions[n + 1]:g}")
+    for n in np.flatnonzero(np.diff(positions) < STEP_HU)[::-1]:
+        positions[n] = positions[n + 1]
     same_as_before = np.concatenate([[False], positions[1:] == positions[:-1]])
-    kept = ~(same_as_before & np.concatenate([same_as_before[1:], [False]]))
-    rows, positions = rows[kept], positions[kept]
+    is_kept = ~(same_as_before & np.concatenate([same_as_before[1:], [False]]))
+    rows, positions = rows[is_kept], positions[is_kept]
     positions, values = straighten_curve(positions, rows[:, 1:-2], rows[:, -2], rows[:, -1], steps)
     if not clamped:
         zero = np.zeros((1, values.shape[1]))
@@ -60,13 +60,13 @@ def _nodes(function: Any, width: int) -> list[list[float]]:
     return rows
 
 
-def _opacity_curve(what: str, function: Any) -> tuple[Float64Array, Float64Array]:
-    return curve_from_nodes(what, _nodes(function, 4), clamped=bool(function.GetClamping()))
+def _opacity_curve(title: str, function: Any) -> tuple[Float64Array, Float64Array]:
+    return curve_from_nodes(title, _nodes(function, 4), clamped=bool(function.GetClamping()))
 
 
 def _color_curve(function: Any) -> tuple[Float64Array, Float64Array]:
     """Return the colours of a vtkColorTransferFunction; ways through HSV, Lab etc. become straight parts in RGB."""
-    what, nodes = "its colour function", _nodes(function, 6)
+    title, nodes = "its colour function", _nodes(function, 6)
     if function.GetColorSpace() != 0:  # VTK_CTF_RGB
         positions = np.unique([node[0] for node in nodes])
         ways = [
@@ -75,7 +75,7 @@ def _color_curve(function: Any) -> tuple[Float64Array, Float64Array]:
         nodes = [[x, *function.GetColor(x), 0.5, 0.0] for x in np.concatenate([*ways, positions[-1:]]).tolist()]
     if function.GetScale() != 0:  # VTK_CTF_LINEAR
         raise UsageError("its colour function is logarithmic: HU have no logarithm")
-    return curve_from_nodes(what, nodes, clamped=bool(function.GetClamping()), steps=True)
+    return curve_from_nodes(title, nodes, clamped=bool(function.GetClamping()), steps=True)
 
 
 def _check_voxel(voxel_mm: float) -> None:
@@ -145,26 +145,26 @@ def property_to_vtk(function: Any, voxel_mm: float) -> Any:
     ):
         colors.AddRGBPoint(hu, red, green, blue)
         opacity.AddPoint(hu, alpha)
-    made = vtkVolumeProperty()
-    made.SetColor(colors)
-    made.SetScalarOpacity(opacity)
-    made.SetScalarOpacityUnitDistance(function.unit_distance)
-    made.SetInterpolationTypeToLinear()
+    vtk_property = vtkVolumeProperty()
+    vtk_property.SetColor(colors)
+    vtk_property.SetScalarOpacity(opacity)
+    vtk_property.SetScalarOpacityUnitDistance(function.unit_distance)
+    vtk_property.SetInterpolationTypeToLinear()
     if function.gradient_opacity is None:
-        made.DisableGradientOpacityOn()
+        vtk_property.DisableGradientOpacityOn()
     else:
         gradient = vtkPiecewiseFunction()
         places = _separate_steps(function.gradient_opacity[:, 0])
-        for place, factor in zip(places, function.gradient_opacity[:, 1].tolist(), strict=True):
-            gradient.AddPoint(place * voxel_mm, factor)
-        made.SetGradientOpacity(gradient)
+        for gradient_hu, factor in zip(places, function.gradient_opacity[:, 1].tolist(), strict=True):
+            gradient.AddPoint(gradient_hu * voxel_mm, factor)
+        vtk_property.SetGradientOpacity(gradient)
     lighting = Lighting() if function.lighting is None else function.lighting
-    made.SetShade(lighting.shades)
-    made.SetAmbient(lighting.ambient)
-    made.SetDiffuse(lighting.diffuse)
-    made.SetSpecular(lighting.specular)
-    made.SetSpecularPower(lighting.specular_power)
-    return made
+    vtk_property.SetShade(lighting.shades)
+    vtk_property.SetAmbient(lighting.ambient)
+    vtk_property.SetDiffuse(lighting.diffuse)
+    vtk_property.SetSpecular(lighting.specular)
+    vtk_property.SetSpecularPower(lighting.specular_power)
+    return vtk_property
 
 
 def points_from_pyvista(cmap: Any, opacity: Any, clim: tuple[float, float]) -> Float64Array:

@@ -41,8 +41,8 @@ class PictureData(Message):
         """Side of a pixel in mm; None if it varies within the picture (perspective)."""
         if self.camera is not None:
             return self.camera.pixel_mm(self.size) if self.camera.is_parallel else None
-        told = self.report.get("pixel_mm")
-        return None if told is None else float(told)
+        stated = self.report.get("pixel_mm")
+        return None if stated is None else float(stated)
 
     @property
     def is_opaque(self) -> bool:
@@ -139,13 +139,13 @@ def annotate(
             if text:
                 page.draw_edge(edge, text)
     if scale_bar:
-        camera, pixel_mm, where = rendering.camera, rendering.pixel_mm, ""
+        camera, pixel_mm, plane_note = rendering.camera, rendering.pixel_mm, ""
         if camera is not None and not camera.is_parallel:
-            pixel_mm, where = camera.pixel_mm(rendering.size), " (focal plane)"
+            pixel_mm, plane_note = camera.pixel_mm(rendering.size), " (focal plane)"
         if pixel_mm is None:
             raise UsageError("the size of this picture's pixels is not known: leave the scale bar out")
         length = bar_length(pixel_mm * rendering.size[0])
-        page.draw_bar(*(length / pixel_mm, f"{length:g} mm{where}"))
+        page.draw_bar(*(length / pixel_mm, f"{length:g} mm{plane_note}"))
     if caption:
         page.draw_caption(caption)
     return page.finish()
@@ -211,14 +211,14 @@ class _Page:
     def draw_caption(self, text: str) -> None:
         """Draw one line at the top left, cut before the letters of the top edge."""
         line = "".join(character if character.isprintable() else " " for character in text)
-        at = (self._margin + self._stroke, self._margin + self._stroke)
-        ends = [left for left, top, _, _ in self._boxes if top < at[1] + self._font.size]
-        room = min([self._size[0] - self._margin, *ends]) - at[0] - 3 * self._stroke
+        corner = (self._margin + self._stroke, self._margin + self._stroke)
+        ends = [left for left, top, _, _ in self._boxes if top < corner[1] + self._font.size]
+        room = min([self._size[0] - self._margin, *ends]) - corner[0] - 3 * self._stroke
         if self._font.getlength(line) > room:
             while line and self._font.getlength(line + "...") > room:
                 line = line[:-1].rstrip()
             line += "..."
-        self._write(at, line, "lt")
+        self._write(corner, line, "lt")
 
     def finish(self) -> np.ndarray:
         from PIL import Image
@@ -230,8 +230,8 @@ class _Page:
             picture = Image.alpha_composite(picture, layer)
         return np.array(picture)
 
-    def _write(self, at: tuple[float, float], text: str, anchor: str) -> None:
-        box = self._box(at, text, anchor)
+    def _write(self, corner: tuple[float, float], text: str, anchor: str) -> None:
+        box = self._box(corner, text, anchor)
         left, top, right, bottom = box
         if left < 0 or top < 0 or right > self._size[0] or bottom > self._size[1] or self._overlaps(box):
             width, height = self._size
@@ -240,10 +240,10 @@ class _Page:
             )
         self._boxes.append(box)
         for pen, stroke in zip(self._pens, (self._stroke, 0), strict=True):
-            pen.text(at, text, 255, self._font, anchor, stroke_width=stroke)
+            pen.text(corner, text, 255, self._font, anchor, stroke_width=stroke)
 
-    def _box(self, at: tuple[float, float], text: str, anchor: str) -> tuple[float, float, float, float]:
-        return self._pens[0].textbbox(at, text, self._font, anchor, stroke_width=self._stroke)
+    def _box(self, corner: tuple[float, float], text: str, anchor: str) -> tuple[float, float, float, float]:
+        return self._pens[0].textbbox(corner, text, self._font, anchor, stroke_width=self._stroke)
 
     def _overlaps(self, box: tuple[float, float, float, float]) -> bool:
         left, top, right, bottom = box

@@ -77,21 +77,21 @@ def find_shown(labels: LabelMap, label: int | str) -> int:
     return NO_LABEL if str(label).strip() == "0" else labels.find(label)
 
 
-def _by_number(labels: LabelMap, what: str, mapping: Mapping | None) -> dict:
+def _by_number(labels: LabelMap, subject: str, mapping: Mapping | None) -> dict:
     if mapping is None:
         return {}
     if not isinstance(mapping, Mapping):
-        raise UsageError(f"{what} of labels are a mapping such as {{'L2': ...}}, not {type(mapping).__name__}")
-    found: dict = {}
+        raise UsageError(f"{subject} of labels are a mapping such as {{'L2': ...}}, not {type(mapping).__name__}")
+    by_number: dict = {}
     for label, value in mapping.items():
         number = find_shown(labels, label)
-        if number == NO_LABEL and what == _COLORS:
+        if number == NO_LABEL and subject == _COLORS:
             raise UsageError("what has no label (0) keeps the colours of the picture: it gets an opacity alone")
-        if number in found:
+        if number in by_number:
             shown = "0" if number == NO_LABEL else f"{number} {labels.name(number)}"
-            raise UsageError(f"{what} of labels: label {shown} is named twice")
-        found[number] = value
-    return found
+            raise UsageError(f"{subject} of labels: label {shown} is named twice")
+        by_number[number] = value
+    return by_number
 
 
 def _check_opacity(name: str, factor: float) -> float:
@@ -126,15 +126,15 @@ _OUTLINE_SHARE = 1 / 400
 def labels_on_sheet(labels: LabelMap, sheet: Sheet) -> NDArray[Any]:
     """Return the label at the centre of each pixel of a sheet, (h, w), looked up in the map in mm; 0: none."""
     size = np.array(labels.shape_ijk)
-    found = np.zeros((sheet.height, sheet.width), labels.voxels.dtype)
+    numbers = np.zeros((sheet.height, sheet.width), labels.voxels.dtype)
     for first in range(0, sheet.height, ROWS_AT_ONCE):
         points = sheet.points(slice(first, first + ROWS_AT_ONCE))
-        at = np.floor(labels.lps_to_ijk(points.reshape(-1, 3)) + (0.5 - TIES)).astype(np.int64)
-        inside = ((at >= 0) & (at < size)).all(axis=1)
-        i, j, k = at[inside].T
-        part = found[first : first + ROWS_AT_ONCE].reshape(-1)
+        ijk = np.floor(labels.lps_to_ijk(points.reshape(-1, 3)) + (0.5 - TIES)).astype(np.int64)
+        inside = ((ijk >= 0) & (ijk < size)).all(axis=1)
+        i, j, k = ijk[inside].T
+        part = numbers[first : first + ROWS_AT_ONCE].reshape(-1)
         part[inside] = labels.voxels[k, j, i]
-    return found
+    return numbers
 
 
 def draw_labels(
@@ -158,7 +158,7 @@ def draw_labels(
     shares = np.full(len(table), FILL, np.float32)
     for label, share in (tints or {}).items():
         shares[find_shown(look.labels, label)] = share
-    own = drawn[numbers] & (image[..., 3] > 0)
+    is_labelled = drawn[numbers] & (image[..., 3] > 0)
     wide = max(1, round(_OUTLINE_SHARE * min(numbers.shape))) if width is None else width
     # pixels from which another label, or none, is at most `wide` steps away
     edges = np.zeros(numbers.shape, dtype=bool)
@@ -172,10 +172,10 @@ def draw_labels(
                 edges[tuple(there)] |= differ
     amount = np.where(edges, np.float32(1.0), shares[numbers])[..., None]
     colors = 255.0 * table[numbers][..., :3]
-    made = image.copy()
+    drawn_image = image.copy()
     mixed = amount * colors + (1.0 - amount) * image[..., :3]
-    made[..., :3] = np.where(own[..., None], np.rint(mixed).astype(np.uint8), image[..., :3])
-    return made
+    drawn_image[..., :3] = np.where(is_labelled[..., None], np.rint(mixed).astype(np.uint8), image[..., :3])
+    return drawn_image
 
 
 def facts_of_overlay(numbers: NDArray[Any], look: LabelStyle) -> list[dict[str, Any]]:

@@ -66,23 +66,23 @@ def measure_pictures(
         Shapes or types differ or are not those of pictures, a picture is smaller than the window of SSIM, or nothing
         is drawn in either.
     """
-    one, other = (_as_picture(pixels, background) for pixels in (picture, reference))
-    if one.shape != other.shape:
-        raise UsageError(f"pictures of one camera have one shape: these have {one.shape} and {other.shape}")
-    rows, columns = one.shape[:2]
+    given, wanted = (_as_picture(pixels, background) for pixels in (picture, reference))
+    if given.shape != wanted.shape:
+        raise UsageError(f"pictures of one camera have one shape: these have {given.shape} and {wanted.shape}")
+    rows, columns = given.shape[:2]
     if min(rows, columns) < WINDOW:
         raise UsageError(f"a picture of {columns} x {rows} pixels is smaller than the window of SSIM, {WINDOW} pixels")
-    empty = _colour(background, one.shape[2])
-    drawn = ((one != empty) | (other != empty)).any(axis=2)
+    empty = _colour(background, given.shape[2])
+    drawn = ((given != empty) | (wanted != empty)).any(axis=2)
     if not whole and not drawn.any():
         raise UsageError("nothing is drawn in either picture: there is nothing to compare")
     (top, bottom), (left, right) = (
         (0, size) if whole else _span(drawn.any(axis=1 - axis)) for axis, size in enumerate((rows, columns))
     )
-    one, other = one[top:bottom, left:right], other[top:bottom, left:right]
-    difference = one.astype(np.float64) - other
+    given, wanted = given[top:bottom, left:right], wanted[top:bottom, left:right]
+    difference = given.astype(np.float64) - wanted
     return PictureLikeness(
-        float(np.mean(difference * difference)), _structural_similarity(one, other), (top, left, bottom, right)
+        float(np.mean(difference * difference)), _structural_similarity(given, wanted), (top, left, bottom, right)
     )
 
 
@@ -118,10 +118,10 @@ def _span(drawn: NDArray[np.bool_]) -> tuple[int, int]:
     return first, max(end, first + WINDOW)
 
 
-def _structural_similarity(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
+def _structural_similarity(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
     from skimage.metrics import structural_similarity
 
-    return float(structural_similarity(one, other, win_size=WINDOW, data_range=RANGE, channel_axis=2))
+    return float(structural_similarity(first, second, win_size=WINDOW, data_range=RANGE, channel_axis=2))
 
 
 def make_control_pictures(picture: ArrayLike, next_picture: ArrayLike | None = None) -> Mapping[str, NDArray[Any]]:

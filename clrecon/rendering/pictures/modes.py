@@ -181,8 +181,8 @@ def make_style(mode: str | None = None, preset: str | None = None, **look: objec
         elif mode != "drr":  # its window is in mm of water
             given.setdefault("window", chosen.window)
     names = keywords_of(mode)
-    own = {names[keyword]: value for keyword, value in {**given, "mode": mode}.items() if keyword in names}
-    return style(**own)
+    arguments = {names[keyword]: value for keyword, value in {**given, "mode": mode}.items() if keyword in names}
+    return style(**arguments)
 
 
 def find_style(style: Style | str | None, look: Mapping[str, object]) -> Style:

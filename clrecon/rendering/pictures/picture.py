@@ -85,13 +85,13 @@ class Rendering(PictureData):
         """
         if self.camera is None or self.pixel_mm is None:
             raise UsageError("this picture has no axes in mm: its camera is None or not parallel")
-        found: list[float] = []
-        for way, pixels in zip(self.camera.basis(), self.size, strict=False):
-            axis = int(np.argmax(np.abs(way)))
-            along = abs(abs(way[axis]) - 1.0) < 1e-9
-            middle, sign = (self.camera.focal_point[axis], float(np.sign(way[axis]))) if along else (0.0, 1.0)
-            found += [middle - sign * 0.5 * pixels * self.pixel_mm, middle + sign * 0.5 * pixels * self.pixel_mm]
-        left, right, lower, upper = found
+        ends: list[float] = []
+        for direction, pixels in zip(self.camera.basis(), self.size, strict=False):
+            axis = int(np.argmax(np.abs(direction)))
+            along = abs(abs(direction[axis]) - 1.0) < 1e-9
+            middle, sign = (self.camera.focal_point[axis], float(np.sign(direction[axis]))) if along else (0.0, 1.0)
+            ends += [middle - sign * 0.5 * pixels * self.pixel_mm, middle + sign * 0.5 * pixels * self.pixel_mm]
+        left, right, lower, upper = ends
         return left, right, lower, upper
 
     def show(self) -> None:

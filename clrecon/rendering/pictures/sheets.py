@@ -83,8 +83,8 @@ def write_on_tile(image: NDArray[np.uint8], texts: tuple[str, ...], edges: Mappi
     picture: Any = Image.fromarray(np.ascontiguousarray(image))
     pen = ImageDraw.Draw(picture)
 
-    def write(at: tuple[float, float], text: str, anchor: str) -> None:
-        pen.text(at, text, (255, 255, 255, 255), font, anchor, stroke_width=1, stroke_fill=(0, 0, 0, 255))
+    def write(corner: tuple[float, float], text: str, anchor: str) -> None:
+        pen.text(corner, text, (255, 255, 255, 255), font, anchor, stroke_width=1, stroke_fill=(0, 0, 0, 255))
 
     write((3, 2), fitting[0] if fitting else texts[-1], "la")
     if min(height, width) >= _LEAST_LETTERED:
@@ -169,14 +169,14 @@ def _draw_panel(panel: Panel, window: tuple[float, float], font: Any) -> Any:
     for number, text in enumerate(panel.captions):
         draw.text((6, 4 + number * (_TEXT_PIXELS + 4)), text, **outline)
     left, right, top, bottom = panel.edges
-    for text, place, anchor in (
+    for text, corner, anchor in (
         (left, (5, height / 2), "lm"),
         (right, (width - 5, height / 2), "rm"),
         (top, (width / 2, 5), "mt"),
         (bottom, (width / 2, height - 5), "mb"),
     ):
         if text:
-            draw.text(place, text, anchor=anchor, **outline)
+            draw.text(corner, text, anchor=anchor, **outline)
     return picture
 
 
@@ -207,6 +207,6 @@ def add_scale(picture: Rendering, scale: ColorScale, title: str) -> Rendering:
     for row, line in enumerate(lines):
         pen.text((gap, gap + round(1.3 * text * row)), line, "black", font, "lt")
     for tick, name in zip(scale.ticks, names, strict=True):
-        place = top + (scale.limit - tick) / (scale.limit - scale.low) * (bottom - 1 - top)
-        pen.text((gap + bar + gap // 2, place), name, "black", font, "lm")
+        tick_y = top + (scale.limit - tick) / (scale.limit - scale.low) * (bottom - 1 - top)
+        pen.text((gap + bar + gap // 2, tick_y), name, "black", font, "lm")
     return replace(picture, image=np.concatenate([picture.image, np.array(strip)], axis=1))

@@ -18,12 +18,12 @@ SPINE = "spine"
 """Value of a curve that stands for the spinal canal, which is found in the volume."""
 
 
-def instance_of(what: str, kind: type) -> Callable[[Any], Any]:
+def instance_of(noun: str, kind: type) -> Callable[[Any], Any]:
 
     def check(value: Any) -> Any:
         if isinstance(value, kind):
             return value
-        raise UsageError(f"the {what} of a picture is a {kind.__name__} or None, not {type(value).__name__}")
+        raise UsageError(f"the {noun} of a picture is a {kind.__name__} or None, not {type(value).__name__}")
 
     return check
 
@@ -44,11 +44,11 @@ def number(text: str, is_fine: Callable[[float], bool]) -> Callable[[Any], float
 
     def check(value: Any) -> float:
         try:
-            found = float(value)
+            checked = float(value)
         except (TypeError, ValueError, OverflowError):
-            found = math.nan
-        if not math.isnan(found) and is_fine(found):
-            return found
+            checked = math.nan
+        if not math.isnan(checked) and is_fine(checked):
+            return checked
         shown = f"{value:g}" if isinstance(value, float) else f"{value!r:.60}"
         raise UsageError(f"{text} {shown}")
 
@@ -124,13 +124,13 @@ def sheet(value: Any) -> int | str:
     raise UsageError(f"a contact sheet has a number of slices, or their distance such as '5mm', not {value!r:.60}")
 
 
-def mapping(what: str) -> Callable[[Any], Any]:
+def mapping(subject: str) -> Callable[[Any], Any]:
     """Make a check for a mapping with labels as keys; `what` names the values in the message."""
 
     def check(value: Any) -> Any:
         if isinstance(value, Mapping):
             return dict(value)
-        raise UsageError(f"{what} of labels are a mapping such as {{'L2': ...}}, not {type(value).__name__}")
+        raise UsageError(f"{subject} of labels are a mapping such as {{'L2': ...}}, not {type(value).__name__}")
 
     return check
 

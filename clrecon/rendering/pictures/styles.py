@@ -86,10 +86,10 @@ class Style:
     _mode: ClassVar[str]
 
     def __post_init__(self) -> None:
-        for own in fields(self):
-            value = getattr(self, own.name)
-            if value is not None or own.default is not None:
-                object.__setattr__(self, own.name, own.metadata["check"](value))
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if value is not None or item.default is not None:
+                object.__setattr__(self, item.name, item.metadata["check"](value))
 
     @property
     def mode(self) -> str:
@@ -365,8 +365,8 @@ class PlaneCut(_Cut):
         if self.slices is not None and self.sheet is None:
             object.__setattr__(self, "sheet", checks.SHEET_SLICES)
         if self.sheet is not None and (self.offset_mm or self.pixel_mm is not None):
-            what = name_parameter("offset_mm" if self.offset_mm else "pixel_mm")
-            raise UsageError(f"a contact sheet shows slices through all of the scan, at one scale: leave {what} out")
+            option = name_parameter("offset_mm" if self.offset_mm else "pixel_mm")
+            raise UsageError(f"a contact sheet shows slices through all of the scan, at one scale: leave {option} out")
 
 
 @dataclass(frozen=True)

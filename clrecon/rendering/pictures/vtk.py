@@ -26,12 +26,12 @@ def rendering_to_pyvista(
     if form == "points":
         if distance is not None:
             raise UsageError("the points of a picture lie where its rays hit: a distance is for form='plane'")
-        made = _make_points(rendering, camera, rendering.expected_depth if expected else rendering.depth)
+        dataset = _make_points(rendering, camera, rendering.expected_depth if expected else rendering.depth)
     else:
-        made = _make_plane(rendering, camera, camera.distance if distance is None else distance)
+        dataset = _make_plane(rendering, camera, camera.distance if distance is None else distance)
     for name, text in {"SPACE": "LPS", "UNIT": "mm"}.items():
-        made.field_data[name] = [text]
-    return made
+        dataset.field_data[name] = [text]
+    return dataset
 
 
 def _make_points(rendering: PictureData, camera: Camera, depth: NDArray[np.float32]) -> Any:

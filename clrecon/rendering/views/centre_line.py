@@ -54,8 +54,8 @@ class Curve(Message):
             raise UsageError(f"a centre line is an array of points (n, 3) in LPS mm, not of shape {given.shape}")
         wrong = np.flatnonzero(~(np.abs(given) <= FARTHEST_MM).all(axis=1))
         if len(wrong):
-            at = int(wrong[0])
-            raise UsageError(f"point {at} of the centre line is no place in mm: {_as_text(given[at])}")
+            index = int(wrong[0])
+            raise UsageError(f"point {index} of the centre line is no place in mm: {_as_text(given[index])}")
         apart = np.ones(len(given), bool)
         apart[1:] = np.linalg.norm(np.diff(given, axis=0), axis=1) > SAME_PLACE_MM
         self.points: Float64Array = given[apart]
@@ -91,14 +91,14 @@ class Curve(Message):
         ends, lengths, speeds = self._lengths
         wanted = np.clip(np.asarray(arc, dtype=np.float64), 0.0, lengths[-1])
         part = np.clip(np.searchsorted(lengths, wanted, side="right") - 1, 0, len(ends) - 2)
-        found = ends[part] + (wanted - lengths[part]) / speeds[part]
+        parameter = ends[part] + (wanted - lengths[part]) / speeds[part]
         nodes, weights = _gauss_nodes()
         for _ in range(3):  # Newton's method on the integral from the start of the part
-            way = found - ends[part]
-            passed = np.linalg.norm(self._spline(ends[part][:, None] + way[:, None] * nodes, 1), axis=-1) @ weights
-            speed = np.linalg.norm(self._spline(found, 1), axis=-1)
-            found = found - (lengths[part] + way * passed - wanted) / speed
-        return np.asarray(np.clip(found, ends[0], ends[-1]))
+            run = parameter - ends[part]
+            passed = np.linalg.norm(self._spline(ends[part][:, None] + run[:, None] * nodes, 1), axis=-1) @ weights
+            speed = np.linalg.norm(self._spline(parameter, 1), axis=-1)
+            parameter = parameter - (lengths[part] + run * passed - wanted) / speed
+        return np.asarray(np.clip(parameter, ends[0], ends[-1]))
 
     def at(self, arc: ArrayLike) -> Float64Array:
         """Return places (n, 3) in LPS mm at arc lengths (n,) in mm."""
@@ -129,11 +129,11 @@ class Curve(Message):
             return
         corners = volume.ijk_to_lps([tuple(n - 0.5 if b else -0.5 for n, b in zip(volume.shape_ijk, bits, strict=True))
                                      for bits in np.ndindex(2, 2, 2)])  # fmt: skip
-        at = int(outside[0])
+        index = int(outside[0])
         raise UsageError(
             f"{len(outside)} of {len(self.points)} points of the centre line lie outside of the volume, the first is"
-            f" point {at} at {_as_text(self.points[at])} LPS mm: the volume runs from {_as_text(corners.min(axis=0))}"
-            f" to {_as_text(corners.max(axis=0))} (are the points RAS?)"
+            f" point {index} at {_as_text(self.points[index])} LPS mm: the volume runs from"
+            f" {_as_text(corners.min(axis=0))} to {_as_text(corners.max(axis=0))} (are the points RAS?)"
         )
 
 
@@ -216,20 +216,20 @@ def read_curve_points(path: str | Path, space: Space | None = None) -> Float64Ar
     text = _read_text(file, shown)
     name = file.name.lower()
     if name.endswith(".fcsv"):
-        rows, said = _read_fcsv(shown, text)
+        rows, stated = _read_fcsv(shown, text)
     elif name.endswith(".json"):
-        rows, said = _read_json(shown, text)
+        rows, stated = _read_json(shown, text)
     else:
-        rows, said = _read_lines(shown, text.splitlines()), None
-    if said is not None and space is not None and said != space:
-        raise UsageError(f"{shown} says that its points are {said.upper()}, not {space.upper()}")
+        rows, stated = _read_lines(shown, text.splitlines()), None
+    if stated is not None and space is not None and stated != space:
+        raise UsageError(f"{shown} says that its points are {stated.upper()}, not {space.upper()}")
     points = np.array(rows, dtype=np.float64).reshape(-1, 3)
     wrong = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(wrong):
         raise RefusedInputError(f"{shown}: point {int(wrong[0])} has a coordinate that is no finite number")
     if len(points) < 2:
         raise RefusedInputError(f"{shown} holds {len(points)} point{'s' * (len(points) != 1)}, a line needs two")
-    if (said or space) == "ras":
+    if (stated or space) == "ras":
         points[:, :2] *= -1.0
     return points
 
@@ -245,13 +245,13 @@ def _read_text(file: Path, shown: str) -> str:
         raise RefusedInputError(f"{shown} is no text: byte {error.start} is not UTF-8") from error
 
 
-def _parse_triple(where: str, parts: list[str]) -> list[float]:
+def _parse_triple(context: str, parts: list[str]) -> list[float]:
     try:
         values = [float(part) for part in parts]
     except ValueError:
         values = []
     if len(values) != 3:
-        raise RefusedInputError(f"{where} is not three numbers: {' '.join(parts)[:60]!r}")
+        raise RefusedInputError(f"{context} is not three numbers: {' '.join(parts)[:60]!r}")
     return values
 
 
@@ -278,32 +278,32 @@ def _read_lines(name: str, lines: list[str]) -> list[list[float]]:
     return rows
 
 
-def _find_columns(where: str, names: list[str]) -> list[int]:
-    found = [name.strip("\"'").lower() for name in names]
-    if any(found.count(axis) != 1 for axis in "xyz"):
-        raise RefusedInputError(f"{where} names columns, but not x, y and z once each: {' '.join(names)[:60]!r}")
-    return [found.index(axis) for axis in "xyz"]
+def _find_columns(context: str, names: list[str]) -> list[int]:
+    lowered = [name.strip("\"'").lower() for name in names]
+    if any(lowered.count(axis) != 1 for axis in "xyz"):
+        raise RefusedInputError(f"{context} names columns, but not x, y and z once each: {' '.join(names)[:60]!r}")
+    return [lowered.index(axis) for axis in "xyz"]
 
 
 def _read_fcsv(name: str, text: str) -> tuple[list[list[float]], str | None]:
     """Read comments, which name the frame, and then lines of ``id,x,y,z,...``."""
-    said: str | None = None
+    stated: str | None = None
     rows: list[list[float]] = []
     for number, line in enumerate(text.splitlines(), start=1):
         if line.startswith("#"):
             key, _, value = line[1:].partition("=")
             if key.strip().lower() == "coordinatesystem":
-                said = _markup_space(name, value.strip())
+                stated = _markup_space(name, value.strip())
         elif line.strip():
             rows.append(_parse_triple(f"{name}, line {number}", line.split(",")[1:4]))
-    return rows, said
+    return rows, stated
 
 
 def _markup_space(name: str, value: Any) -> str:
-    said = _MARKUP_SPACES.get(str(value).upper())
-    if said is None:
+    stated = _MARKUP_SPACES.get(str(value).upper())
+    if stated is None:
         raise RefusedInputError(f"{name}: the coordinate system {value!r} is neither LPS nor RAS")
-    return said
+    return stated
 
 
 def _read_json(name: str, text: str) -> tuple[list[list[float]], str | None]:
@@ -313,23 +313,23 @@ def _read_json(name: str, text: str) -> tuple[list[list[float]], str | None]:
         raise RefusedInputError(f"{name} is no JSON: {str(error)[:80]}") from error
     if isinstance(content, dict) and "markups" in content:
         return _read_markups(name, content["markups"])
-    said = None
+    stated = None
     if isinstance(content, dict):
-        said = _markup_space(name, content["space"]) if "space" in content else None
+        stated = _markup_space(name, content["space"]) if "space" in content else None
         content = content.get("points")
     if not isinstance(content, list):
         raise RefusedInputError(f'{name} holds no points: a list of [x, y, z], or {{"points": [...], "space": "LPS"}}')
-    return [_json_point(name, at, point) for at, point in enumerate(content)], said
+    return [_json_point(name, at, point) for at, point in enumerate(content)], stated
 
 
-def _json_point(name: str, at: int, point: Any) -> list[float]:
+def _json_point(name: str, index: int, point: Any) -> list[float]:
     numeric = isinstance(point, list) and all(type(value) in (int, float) for value in point)
     if not numeric or len(point) != 3:
-        raise RefusedInputError(f"{name}: point {at} is not three numbers: {str(point)[:60]}")
+        raise RefusedInputError(f"{name}: point {index} is not three numbers: {str(point)[:60]}")
     try:
         return [float(value) for value in point]
     except OverflowError as error:
-        raise RefusedInputError(f"{name}: point {at} has a number that is too large") from error
+        raise RefusedInputError(f"{name}: point {index} has a number that is too large") from error
 
 
 def _read_markups(name: str, markups: Any) -> tuple[list[list[float]], str]:
@@ -340,11 +340,11 @@ def _read_markups(name: str, markups: Any) -> tuple[list[list[float]], str]:
     units = markup.get("coordinateUnits", "mm")
     if units not in ("mm", ["mm", "UCUM", "length"], ["mm", "UCUM", "millimeter"]):
         raise RefusedInputError(f"{name}: the unit of its coordinates is {str(units)[:40]!r}, not mm")
-    said = _markup_space(name, markup.get("coordinateSystem", "LPS"))
+    stated = _markup_space(name, markup.get("coordinateSystem", "LPS"))
     points = markup.get("controlPoints")
     if not isinstance(points, list) or not all(isinstance(point, dict) for point in points):
         raise RefusedInputError(f"{name} holds a markup without controlPoints")
     placed = [
         (at, point) for at, point in enumerate(points) if point.get("positionStatus", "defined") == "defined"
     ]  # points without position have not been placed yet
-    return [_json_point(name, at, point.get("position")) for at, point in placed], said
+    return [_json_point(name, at, point.get("position")) for at, point in placed], stated

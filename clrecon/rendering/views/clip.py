@@ -197,10 +197,10 @@ def check_center(center: object, shown: Grid) -> tuple[float, float, float]:
     low, high = corners.min(axis=0), corners.max(axis=0)
     if (np.array(point) < low - 1e-6).any() or (np.array(point) > high + 1e-6).any():
         box = ", ".join(f"{axis} {a:.1f} to {b:.1f}" for axis, a, b in zip("xyz", low, high, strict=True))
-        place = ", ".join(f"{value:g}" for value in point)
+        center_text = ", ".join(f"{value:g}" for value in point)
         raise UsageError(
-            f"the centre of the picture ({place}) lies outside of what is shown, which runs from {box} LPS mm (are the"
-            " numbers RAS?)"
+            f"the centre of the picture ({center_text}) lies outside of what is shown, which runs from {box} LPS mm"
+            " (are the numbers RAS?)"
         )
     return point
 
@@ -211,12 +211,12 @@ def _voxels_kept(volume: Volume, origin: Float64Array, clip: Clip | None) -> NDA
         return None
     ni, nj, _ = volume.shape_ijk
     columns = volume.affine[:3, :3]
-    kept = np.ones((nj, ni), dtype=bool)
+    is_kept = np.ones((nj, ni), dtype=bool)
     for plane in clip.planes:
         along_i, along_j, along_k = plane[:3] @ columns
         reach = abs(along_i) + abs(along_j) + abs(along_k)  # a voxel shows as far as to its neighbours
-        kept &= (np.arange(nj) * along_j)[:, None] + np.arange(ni) * along_i >= plane[3] - plane[:3] @ origin - reach
-    return kept
+        is_kept &= (np.arange(nj) * along_j)[:, None] + np.arange(ni) * along_i >= plane[3] - plane[:3] @ origin - reach
+    return is_kept
 
 
 def _extent_of_marked(seen: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
@@ -228,10 +228,10 @@ def _extent_of_marked(seen: NDArray[np.bool_]) -> tuple[int, int, int, int] | No
     return int(columns[0]), int(columns[-1]), int(rows[0]), int(rows[-1])
 
 
-def _corners_of_extents(volume: Volume, found: Float64Array, reach: float) -> Float64Array:
+def _corners_of_extents(volume: Volume, extents: Float64Array, reach: float) -> Float64Array:
     """Return the corners of the extents (k, i0, i1, j0, j1) of slices, LPS mm, larger by a voxel within the volume."""
     most = np.array(volume.shape_ijk) - 0.5
-    k, low_i, high_i, low_j, high_j = found.T
+    k, low_i, high_i, low_j, high_j = extents.T
     ends = [
         (np.maximum(low_i - 1.0, -0.5), np.minimum(high_i + 1.0, most[0])),
         (np.maximum(low_j - 1.0, -0.5), np.minimum(high_j + 1.0, most[1])),

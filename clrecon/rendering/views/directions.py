@@ -44,14 +44,14 @@ def as_point(vector: Any) -> tuple[float, float, float]:
     return x, y, z
 
 
-def checked_vector(what: str, value: ArrayLike) -> tuple[float, float, float]:
+def checked_vector(subject: str, value: ArrayLike) -> tuple[float, float, float]:
     """Return three finite numbers as floats."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         array = np.empty(0)
     if array.shape != (3,) or not np.isfinite(array).all():
-        raise UsageError(f"{what} is three finite numbers in LPS mm, not {value!r}")
+        raise UsageError(f"{subject} is three finite numbers in LPS mm, not {value!r}")
     return float(array[0]), float(array[1]), float(array[2])
 
 
@@ -118,15 +118,15 @@ def say_view(view: str | tuple[float, float]) -> str:
     return view if isinstance(view, str) else f"{view[0]:g},{view[1]:g}"
 
 
-def _find_angles(view: str | Sequence[str | float], said: str | None = None) -> tuple[float, float]:
+def _find_angles(view: str | Sequence[str | float], typed: str | None = None) -> tuple[float, float]:
     try:
         azimuth, elevation = (float(part) for part in (() if isinstance(view, str) else view))
     except (TypeError, ValueError, OverflowError):
         azimuth = elevation = float("nan")
     if not (np.isfinite(azimuth) and abs(elevation) <= 90.0):
-        form, example = ("(azimuth, elevation)", "(30, 15)") if said is None else ("AZIMUTH,ELEVATION", "30,15")
+        form, example = ("(azimuth, elevation)", "(30, 15)") if typed is None else ("AZIMUTH,ELEVATION", "30,15")
         raise UsageError(
-            f"{unknown_name('view', said or view, DIRECTIONS)}, or {form} in degrees,"
+            f"{unknown_name('view', typed or view, DIRECTIONS)}, or {form} in degrees,"
             f" elevation from -90 to 90, such as {example}{hint_at_sheet(view)}"
         )
     return azimuth, elevation

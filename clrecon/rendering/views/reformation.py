@@ -167,10 +167,10 @@ def checked_offset(offset_mm: float) -> float:
     return offset
 
 
-def positive_mm(what: str, value: float) -> float:
+def positive_mm(subject: str, value: float) -> float:
     number = number_or_nan(value)
     if not 0.0 < number < np.inf:
-        raise UsageError(f"{what} is a length in mm, not {value!r}")
+        raise UsageError(f"{subject} is a length in mm, not {value!r}")
     return number
 
 
@@ -182,11 +182,11 @@ def plane_sheet(camera: Camera, size: Sequence[int], offset_mm: float = 0.0) -> 
     shift = checked_offset(offset_mm) * forward
     centre = np.add(camera.focal_point, shift)
     position = np.add(camera.position, shift)
-    own = Camera(as_point(position), as_point(centre), camera.up, parallel_scale=0.5 * height * pixel)
+    plane_camera = Camera(as_point(position), as_point(centre), camera.up, parallel_scale=0.5 * height * pixel)
     above = 0.5 * height - 0.5 - np.arange(height)
     first = centre + (0.5 - 0.5 * width) * pixel * right
     origins = first + (pixel * above)[:, None] * up
-    return Sheet(origins, np.tile(pixel * right, (height, 1)), np.tile(forward, (height, 1)), width), own
+    return Sheet(origins, np.tile(pixel * right, (height, 1)), np.tile(forward, (height, 1)), width), plane_camera
 
 
 _FRAME_STEP_MM = 0.25
@@ -262,18 +262,18 @@ def stretched_sheet(curve: Curve, across: Float64Array, size: tuple[int, int], p
     flat = flow - (flow @ direction)[:, None] * direction
     speed = np.linalg.norm(flat, axis=1)
     if speed.min() < 0.05:
-        at = float(arcs[int(speed.argmin())])
+        arc_mm = float(arcs[int(speed.argmin())])
         raise UsageError(
-            f"the centre line runs along the rows of the stretched picture {at:.1f} mm after its begin: take another"
-            " view, or straighten it"
+            f"the centre line runs along the rows of the stretched picture {arc_mm:.1f} mm after its begin: take"
+            " another view, or straighten it"
         )
     # Simpson's rule on each step, with the speed in the middle of the step too.
     between = curve.tangents(0.5 * (arcs[1:] + arcs[:-1]))
     middle_speed = np.linalg.norm(between - (between @ direction)[:, None] * direction, axis=1)
-    way = np.concatenate([[0.0], np.cumsum(np.diff(arcs) * (speed[:-1] + 4.0 * middle_speed + speed[1:]) / 6.0)])
-    rows = _row_places(float(way[-1]), height, pixel)
-    within = (rows >= 0.0) & (rows <= way[-1])
-    arc = np.interp(rows, way, arcs)
+    length = np.concatenate([[0.0], np.cumsum(np.diff(arcs) * (speed[:-1] + 4.0 * middle_speed + speed[1:]) / 6.0)])
+    rows = _row_places(float(length[-1]), height, pixel)
+    within = (rows >= 0.0) & (rows <= length[-1])
+    arc = np.interp(rows, length, arcs)
     places, tangent = curve.at(arc), curve.tangents(arc)
     aside = places @ direction
     extent = curve.at(arcs) @ direction

@@ -48,17 +48,17 @@ def make_pyvista_camera(
 ) -> Any:
     import pyvista
 
-    made = pyvista.Camera()
-    made.SetUseHorizontalViewAngle(False)
-    made.SetPosition(*position)
-    made.SetFocalPoint(*focal_point)
-    made.SetViewUp(*up)
-    made.parallel_projection = parallel_scale is not None  # PyVista has its own flag in addition to VTK's
+    view_camera = pyvista.Camera()
+    view_camera.SetUseHorizontalViewAngle(False)
+    view_camera.SetPosition(*position)
+    view_camera.SetFocalPoint(*focal_point)
+    view_camera.SetViewUp(*up)
+    view_camera.parallel_projection = parallel_scale is not None  # PyVista has its own flag in addition to VTK's
     if parallel_scale is not None:
-        made.SetParallelScale(parallel_scale)
+        view_camera.SetParallelScale(parallel_scale)
     else:
-        made.SetViewAngle(view_angle)
+        view_camera.SetViewAngle(view_angle)
     distance = float(np.linalg.norm(np.subtract(focal_point, position)))
     near, far = _NEAR_AND_FAR
-    made.SetClippingRange(near * distance, far * distance)
-    return made
+    view_camera.SetClippingRange(near * distance, far * distance)
+    return view_camera

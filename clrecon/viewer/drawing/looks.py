@@ -73,15 +73,15 @@ class Looks:
     def mesh(self, state: ViewState, part: ShownPart, opaque: bool) -> MeshLook:
         key = ("mesh", part, state.clip, opaque)
         opacity = 1.0 if opaque else max(part.opacity, LEAST_OPACITY)
-        made = self._known(key) or self._keep(key, MeshLook(part.color, opacity=opacity, clip=state.clip))
-        assert isinstance(made, MeshLook)
-        return made
+        look = self._known(key) or self._keep(key, MeshLook(part.color, opacity=opacity, clip=state.clip))
+        assert isinstance(look, MeshLook)
+        return look
 
     def cloud(self, state: ViewState, part: ShownPart) -> PointLook:
         key = ("cloud", part.color, state.clip)
-        made = self._known(key) or self._keep(key, PointLook(color=part.color, clip=state.clip))
-        assert isinstance(made, PointLook)
-        return made
+        look = self._known(key) or self._keep(key, PointLook(color=part.color, clip=state.clip))
+        assert isinstance(look, PointLook)
+        return look
 
     def plane(self, state: ViewState, labelled: LabelledLook | None, offset_mm: float) -> PlaneCut:
         """Return the style of a slice; labels are drawn over it where they have a colour."""
@@ -102,16 +102,16 @@ class Looks:
         return replace(known, offset_mm=offset_mm)
 
     def _known(self, key: Hashable) -> Style | None:
-        made = self._kept.get(key)
-        if made is not None:
+        style = self._kept.get(key)
+        if style is not None:
             self._kept.move_to_end(key)
-        return made
+        return style
 
     def _keep(self, key: Hashable, style: Style) -> Style:
         self._kept[key] = style
         labelled = [each for each, kept in self._kept.items() if getattr(kept, "labels", None) is not None]
-        for each in labelled[: max(0, len(labelled) - MOST_LABELLED)]:
-            del self._kept[each]
+        for old_key in labelled[: max(0, len(labelled) - MOST_LABELLED)]:
+            del self._kept[old_key]
         while len(self._kept) > _MOST_KEPT:
             self._kept.popitem(last=False)
         return style

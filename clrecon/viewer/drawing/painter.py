@@ -108,19 +108,19 @@ class Painter(Stage):
         with self.lock:
             _stop(cancelled)
             begun = perf_counter()
-            made = self._take(self._drawn(state, sharp), state, (width, height), cancelled)
-            made.report["ms"] = 1000.0 * (perf_counter() - begun)
-            made.report["sharp"] = sharp
-            return made
+            rendering = self._take(self._drawn(state, sharp), state, (width, height), cancelled)
+            rendering.report["ms"] = 1000.0 * (perf_counter() - begun)
+            rendering.report["sharp"] = sharp
+            return rendering
 
     def slice(self, state: ViewState, plane: str, size: Sequence[int]) -> Rendering:
         """Cut a slice ("axial", "coronal" or "sagittal") through the cross; empty where there is no scan."""
         width, height = checked_size(size)
         with self.lock:
-            found = self._sliced(state)
-            if found is None:
+            sliced = self._sliced(state)
+            if sliced is None:
                 return self._empty(state, (width, height), "slice", self.slice_camera(state, plane, (width, height)))
-            resident, labelled = found
+            resident, labelled = sliced
             camera = self.slice_camera(state, plane, (width, height))
             style = self._looks.plane(state, labelled, 0.0)
             self.place(resident, labelled)
@@ -133,8 +133,8 @@ class Painter(Stage):
         """Return the camera of a slice: its focal point lies in the slice, so that places can be told from pixels."""
         if plane not in PLANES:
             raise UsageError(unknown_name("plane", plane, PLANES))
-        found = self._sliced(state)
-        grid = found[0].volume if found is not None else box_around([each.corners for each in self.objects])
+        sliced = self._sliced(state)
+        grid = sliced[0].volume if sliced is not None else box_around([each.corners for each in self.objects])
         camera = find_plane(grid, plane, size)
         forward = camera.basis().forward
         shift = float(forward @ np.subtract(state.cross, camera.focal_point)) * forward
@@ -148,9 +148,9 @@ class Painter(Stage):
         nearest: tuple[float, _Drawn] | None = None
         with self.lock:
             for drawn in self._drawn(state, sharp=True, opaque=True):
-                made = self._take([drawn], state, (1, 1), never, camera)
+                picture = self._take([drawn], state, (1, 1), never, camera)
                 hazy = isinstance(drawn.style, VolumeLook | SlicesInSpace)
-                depth = float((made.expected_depth if hazy else made.depth)[0, 0])
+                depth = float((picture.expected_depth if hazy else picture.depth)[0, 0])
                 if np.isfinite(depth) and (nearest is None or depth < nearest[0]):
                     nearest = depth, drawn
             if nearest is None:
@@ -167,9 +167,9 @@ class Painter(Stage):
         point = spot.focal_point
         with self.lock:
             key, number = None, None
-            found = self._sliced(state)
-            if found is not None and found[1] is not None:
-                key = _key_of(found[1], self._number_at(found[0], found[1], point))
+            sliced = self._sliced(state)
+            if sliced is not None and sliced[1] is not None:
+                key = _key_of(sliced[1], self._number_at(sliced[0], sliced[1], point))
                 part = state.part(key) if key else None
                 number = None if part is None else part.object
             return Pick(point=point, object=number, part=key, hu=self.hu_at(point))
@@ -205,36 +205,36 @@ class Painter(Stage):
 
     def make_coarse(self, cancelled: Callable[[], bool] = never) -> None:
         """Make the coarse meshes that are drawn while anything moves, once."""
-        for each in self.objects:
-            if isinstance(each, ShownMesh) and each.mesh.triangle_count > COARSE_TRIANGLES:
-                if each.number not in self._coarse:
+        for shown in self.objects:
+            if isinstance(shown, ShownMesh) and shown.mesh.triangle_count > COARSE_TRIANGLES:
+                if shown.number not in self._coarse:
                     _stop(cancelled)
-                    self._coarse[each.number] = coarsen_mesh(each.mesh, COARSE_TRIANGLES)
+                    self._coarse[shown.number] = coarsen_mesh(shown.mesh, COARSE_TRIANGLES)
 
     def _drawn(self, state: ViewState, sharp: bool, *, opaque: bool = False) -> list[_Drawn]:
         """Return what a state shows, with looks, in the order of the objects; meshes opaque where that is enough."""
         mode = find_modes()[state.mode]
-        made: list[_Drawn] = []
-        for each in self.objects:
-            whole = state.whole(each.number)
+        drawn: list[_Drawn] = []
+        for shown in self.objects:
+            whole = state.whole(shown.number)
             if whole is None or not whole.visible:
                 continue
-            if isinstance(each, ShownScan):
-                if mode.kind == "labels" or (made and not mode.joins):
+            if isinstance(shown, ShownScan):
+                if mode.kind == "labels" or (drawn and not mode.joins):
                     continue
-                used = mode if not any(isinstance(one.subject, DeviceVolume) for one in made) else _SURFACE
-                made.append(self._drawn_scan(each, state, used, whole, sharp))
+                used = mode if not any(isinstance(one.subject, DeviceVolume) for one in drawn) else _SURFACE
+                drawn.append(self._drawn_scan(shown, state, used, whole, sharp))
             elif not mode.joins:
                 continue
-            elif isinstance(each, ShownMesh):
+            elif isinstance(shown, ShownMesh):
                 if whole.opacity >= LEAST_OPACITY:
-                    mesh = each.mesh if sharp else self._coarse.get(each.number, each.mesh)
-                    made.append(_Drawn(each.number, mesh, self._looks.mesh(state, whole, opaque or not sharp)))
-            elif isinstance(each, ShownCloud):
-                made.append(_Drawn(each.number, each.cloud, self._looks.cloud(state, whole)))
-            elif isinstance(each, ShownLabels) and (mode.kind == "labels" or each.within is None):
-                made.append(self._drawn_labels(each, state, whole, sharp))
-        return made
+                    mesh = shown.mesh if sharp else self._coarse.get(shown.number, shown.mesh)
+                    drawn.append(_Drawn(shown.number, mesh, self._looks.mesh(state, whole, opaque or not sharp)))
+            elif isinstance(shown, ShownCloud):
+                drawn.append(_Drawn(shown.number, shown.cloud, self._looks.cloud(state, whole)))
+            elif isinstance(shown, ShownLabels) and (mode.kind == "labels" or shown.within is None):
+                drawn.append(self._drawn_labels(shown, state, whole, sharp))
+        return drawn
 
     def _drawn_scan(self, scan: ShownScan, state: ViewState, mode: ViewMode, whole: ShownPart, sharp: bool) -> _Drawn:
         resident = self.resident(scan.number, state)
@@ -267,11 +267,11 @@ class Painter(Stage):
         shown = [each for each in scans if (whole := state.whole(each.number)) is not None and whole.visible]
         for scan in shown or scans:
             return self.resident(scan.number, state), self.labelled(scan.number, state)
-        for each in self.objects:
-            if isinstance(each, ShownLabels):
-                whole = state.whole(each.number)
+        for shown_object in self.objects:
+            if isinstance(shown_object, ShownLabels):
+                whole = state.whole(shown_object.number)
                 assert whole is not None
-                drawn = self._drawn_labels(each, state, whole, sharp=True)
+                drawn = self._drawn_labels(shown_object, state, whole, sharp=True)
                 assert isinstance(drawn.subject, DeviceVolume)
                 return drawn.subject, drawn.labelled
         return None
@@ -291,9 +291,9 @@ class Painter(Stage):
         def check(stage: str, done: int, total: int) -> None:
             _stop(cancelled)
 
-        for each in drawn:
-            if isinstance(each.subject, DeviceVolume):
-                self.place(each.subject, each.labelled)
+        for item in drawn:
+            if isinstance(item.subject, DeviceVolume):
+                self.place(item.subject, item.labelled)
         first = drawn[0]
         if len(drawn) == 1 and isinstance(first.subject, DeviceVolume):
             renderer, style = self.renderer(first.subject), first.style

@@ -39,13 +39,13 @@ KINDS: dict[str, tuple[str, ...]] = {
 def check_target(path: str | os.PathLike[str], painter: Painter, state: ViewState) -> str:
     """Return as what a file is written, a key of `KINDS`."""
     name = Path(path).name.lower()
-    found = [kind for kind, endings in KINDS.items() if any(name.endswith(ending) for ending in endings)]
-    if not found:
+    kinds = [kind for kind, endings in KINDS.items() if any(name.endswith(ending) for ending in endings)]
+    if not kinds:
         known = "; ".join(f"{kind}: {', '.join(endings)}" for kind, endings in KINDS.items())
         raise UsageError(f"{escape_text(Path(path).name)}: the extension says as what it is written ({known})")
     shown = [each for each in painter.objects if (whole := state.whole(each.number)) is not None and whole.visible]
-    kind = found[0]
-    if kind == "mesh" and "cloud" in found and shown and all(isinstance(each, ShownCloud) for each in shown):
+    kind = kinds[0]
+    if kind == "mesh" and "cloud" in kinds and shown and all(isinstance(each, ShownCloud) for each in shown):
         kind = "cloud"
     if kind == "volume" and not any(isinstance(each, ShownScan) for each in painter.objects):
         raise UsageError("there is no scan: a file of a volume needs one")
@@ -95,10 +95,10 @@ def save_shown(
     kind = check_target(path, painter, state)
     name = escape_text(Path(path).name)
     if kind == "picture":
-        made = painter.picture(state, size, sharp=True)
-        made = made.with_background("black").annotated(letters=True, scale_bar=True)
-        written = made.save(path, no_clobber=no_clobber)
-        return [f"{name}: picture of {made.size[0]} x {made.size[1]} pixels, {_megabytes(written)}"]
+        picture = painter.picture(state, size, sharp=True)
+        picture = picture.with_background("black").annotated(letters=True, scale_bar=True)
+        written = picture.save(path, no_clobber=no_clobber)
+        return [f"{name}: picture of {picture.size[0]} x {picture.size[1]} pixels, {_megabytes(written)}"]
     if kind == "volume":
         volume = shown_volume(painter, state, progress)
         ni, nj, nk = volume.shape_ijk
@@ -126,7 +126,7 @@ def shown_volume(painter: Painter, state: ViewState, progress: Progress | None =
     scan = (shown or scans)[0]
     resident = painter.resident(scan.number, state)
     volume = resident.volume
-    kept = None
+    is_kept = None
     labelled = painter.labelled(scan.number, state)
     if labelled is not None and not all(part.visible for part in labelled.parts):
         with painter.lock:
@@ -135,7 +135,7 @@ def shown_volume(painter: Painter, state: ViewState, progress: Progress | None =
         wanted[[part.number for part in labelled.parts if not part.visible and part.number <= int(voxels.max())]] = (
             False
         )
-        kept = wanted[voxels]
+        is_kept = wanted[voxels]
     if state.clips:
         within = np.empty(volume.voxels.shape, np.bool_)
         planes = np.array([each.row for each in state.clips])
@@ -146,9 +146,9 @@ def shown_volume(painter: Painter, state: ViewState, progress: Progress | None =
                 along_i, along_j = np.array(normal) @ volume.affine[:3, :2]
                 start = float(np.dot(normal, origin)) - offset
                 layer &= start + along_j * np.arange(nj)[:, None] + along_i * np.arange(ni) >= 0.0
-        kept = within if kept is None else kept & within
-    if kept is not None:
-        chosen = Mask.from_array(volume, kept, device=painter.device, memory=painter.memory)
+        is_kept = within if is_kept is None else is_kept & within
+    if is_kept is not None:
+        chosen = Mask.from_array(volume, is_kept, device=painter.device, memory=painter.memory)
         volume = chosen.apply(volume)
     if state.clip_box is not None:
         (x0, y0, z0), (x1, y1, z1) = state.clip_box
@@ -159,11 +159,11 @@ def shown_volume(painter: Painter, state: ViewState, progress: Progress | None =
 def shown_cloud(painter: Painter, state: ViewState, progress: Progress | None = None) -> PointCloud:
     """Return the points of the clouds that are shown; without one the vertices of what has a surface."""
     clouds = []
-    for each in painter.objects:
-        whole = state.whole(each.number)
-        if isinstance(each, ShownCloud) and whole is not None and whole.visible:
+    for shown in painter.objects:
+        whole = state.whole(shown.number)
+        if isinstance(shown, ShownCloud) and whole is not None and whole.visible:
             clip = state.clip
-            clouds.append(each.cloud if clip is None else each.cloud.select(clip.contains(each.cloud.points)))
+            clouds.append(shown.cloud if clip is None else shown.cloud.select(clip.contains(shown.cloud.points)))
     if not clouds:
         meshes = painter.mesh_of_shown(state, progress)
         clouds = [PointCloud(mesh.vertices, mesh.normals, report=dict(mesh.report)) for mesh in meshes]

@@ -37,9 +37,9 @@ def coarsen_mesh(mesh: Mesh, triangles: int) -> Mesh:
     places = np.stack([np.bincount(group, vertices[:, axis]) / sizes for axis in range(3)], axis=1)
     joined = group[mesh.triangles]
     a, b, c = joined.T
-    kept = joined[(a != b) & (b != c) & (c != a)]
+    triangles_left = joined[(a != b) & (b != c) & (c != a)]
     points = places.astype(mesh.vertices.dtype)
-    used = kept.astype(np.uint32)
+    used = triangles_left.astype(np.uint32)
     return Mesh(points, used, vertex_normals(points, used), dict(mesh.report), trusted=True)
 
 
@@ -59,8 +59,8 @@ def _cut(mesh: Mesh, plane: NDArray[np.float64]) -> Mesh:
     if (count == 3).all():
         return mesh
     across = mesh.triangles[(count == 1) | (count == 2)].astype(np.int64)
-    kept = corners[(count == 1) | (count == 2)]
-    alone = np.argmax(np.where((kept.sum(axis=1) == 1)[:, None], kept, ~kept), axis=1)
+    is_kept = corners[(count == 1) | (count == 2)]
+    alone = np.argmax(np.where((is_kept.sum(axis=1) == 1)[:, None], is_kept, ~is_kept), axis=1)
     turned = np.take_along_axis(across, (alone[:, None] + np.arange(3)) % 3, axis=1)
     edges = np.sort(turned[:, [0, 1, 0, 2]].reshape(-1, 2), axis=1)
     keys, which = np.unique(edges[:, 0] * mesh.vertex_count + edges[:, 1], return_inverse=True)
@@ -71,16 +71,16 @@ def _cut(mesh: Mesh, plane: NDArray[np.float64]) -> Mesh:
         return np.concatenate([values, (values[first] + share * (values[second] - values[first])).astype(values.dtype)])
 
     cuts = which.reshape(-1, 2) + mesh.vertex_count
-    is_corner = kept.sum(axis=1) == 1
+    is_corner = is_kept.sum(axis=1) == 1
     a, b, c = turned.T
     p, q = cuts.T
-    made = [
+    pieces = [
         mesh.triangles[count == 3],
         np.stack([a, p, q], axis=1)[is_corner],
         np.stack([p, b, c], axis=1)[~is_corner],
         np.stack([p, c, q], axis=1)[~is_corner],
     ]
-    triangles = np.concatenate(made).astype(np.uint32)
+    triangles = np.concatenate(pieces).astype(np.uint32)
     normals = None if mesh.normals is None else between(mesh.normals)
     joined = Mesh(between(mesh.vertices), triangles, normals, dict(mesh.report), trusted=True)
     return keep_triangles(joined, np.ones(len(triangles), np.bool_))
@@ -98,23 +98,23 @@ def make_meshes(stage: Stage, state: ViewState, progress: Progress | None = None
     """
     tell = progress or ignore_progress
     only_labels = find_modes()[state.mode].kind == "labels"
-    made: list[Mesh] = []
-    for each in stage.objects:
-        tell("surface", len(made), 0)
-        whole = state.whole(each.number)
+    meshes: list[Mesh] = []
+    for shown in stage.objects:
+        tell("surface", len(meshes), 0)
+        whole = state.whole(shown.number)
         if whole is None or not whole.visible:
             continue
-        if isinstance(each, ShownScan) and not only_labels:
-            made += _mesh_scan(stage, each, whole, state, progress)
-        elif isinstance(each, ShownMesh):
-            cut = each.mesh if state.clip is None else cut_mesh(each.mesh, state.clip)
+        if isinstance(shown, ShownScan) and not only_labels:
+            meshes += _mesh_scan(stage, shown, whole, state, progress)
+        elif isinstance(shown, ShownMesh):
+            cut = shown.mesh if state.clip is None else cut_mesh(shown.mesh, state.clip)
             if cut.triangle_count:
-                made.append(_named(cut, whole.name, whole.color))
-        elif isinstance(each, ShownLabels) and (only_labels or each.within is None):
-            made += _mesh_labels(stage, each, state, progress)
-    if not made:
+                meshes.append(_named(cut, whole.name, whole.color))
+        elif isinstance(shown, ShownLabels) and (only_labels or shown.within is None):
+            meshes += _mesh_labels(stage, shown, state, progress)
+    if not meshes:
         raise NoSurfaceError("nothing that has a surface is shown: show a part first")
-    return made
+    return meshes
 
 
 def _mesh_scan(
@@ -141,15 +141,15 @@ def _mesh_scan(
     numbers = number_vertices(mesh, volume, state.iso_value, voxels)[mesh.triangles[:, 0]]
     hidden = [part.number for part in labelled.parts if not part.visible]
     colored = {part.number: part for part in labelled.parts if part.visible and part.number and part.color}
-    made = []
+    meshes = []
     rest = ~np.isin(numbers, [*hidden, *colored])
-    for kept, name, color in (
+    for is_kept, name, color in (
         *((numbers == number, part.name, part.color) for number, part in colored.items()),
         (rest, whole.name, whole.color),
     ):
-        if kept.any():
-            made.append(_named(keep_triangles(mesh, kept), name, color))
-    return made
+        if is_kept.any():
+            meshes.append(_named(keep_triangles(mesh, is_kept), name, color))
+    return meshes
 
 
 def _mesh_labels(stage: Stage, shown: ShownLabels, state: ViewState, progress: Progress | None) -> list[Mesh]:
@@ -159,12 +159,12 @@ def _mesh_labels(stage: Stage, shown: ShownLabels, state: ViewState, progress: P
     label_masks = extract_label_masks(
         shown.labels, label=sorted(parts), device=stage.device, memory=stage.memory, progress=progress
     )
-    made = []
+    meshes = []
     for number, mesh in label_masks.items():
         cut = mesh if state.clip is None else cut_mesh(mesh, state.clip)
         if cut.triangle_count:
-            made.append(_named(cut, parts[number].name, parts[number].color))
-    return made
+            meshes.append(_named(cut, parts[number].name, parts[number].color))
+    return meshes
 
 
 def _named(mesh: Mesh, name: str, color: Color | None) -> Mesh:
@@ -194,9 +194,9 @@ def clip_volume(volume: Volume, clip: Clip, iso_value: float) -> Volume:
             most = np.maximum(np.float32(level) + np.float32(_CUT_HU_PER_MM) * height, np.float32(low))
             np.minimum(layer, most, out=most)
             layer[...] = np.rint(most) if voxels.dtype.kind in "iu" else most
-    made = volume.with_voxels(voxels)
-    made.report = amend(made.report, clipped=clip.planes.tolist())
-    return made
+    clipped = volume.with_voxels(voxels)
+    clipped.report = amend(clipped.report, clipped=clip.planes.tolist())
+    return clipped
 
 
 def number_vertices(mesh: Mesh, volume: Volume, iso_value: float, voxels: NDArray) -> NDArray:
@@ -210,10 +210,10 @@ def number_vertices(mesh: Mesh, volume: Volume, iso_value: float, voxels: NDArra
     ends[0, rows, axis] = np.floor(ijk[rows, axis])
     ends[1, rows, axis] = ends[0, rows, axis] + 1
     last = np.array(volume.shape_ijk) - 1
-    found = np.zeros(len(ijk), voxels.dtype)
+    numbers = np.zeros(len(ijk), voxels.dtype)
     for end in ends:
         within = ((end >= 0) & (end <= last)).all(axis=1)
         i, j, k = np.clip(end, 0, last).T
         inside = within & (volume.voxels[k, j, i] > level)
-        found[inside] = voxels[k, j, i][inside]
-    return found
+        numbers[inside] = voxels[k, j, i][inside]
+    return numbers

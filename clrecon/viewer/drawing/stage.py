@@ -54,8 +54,8 @@ def take_strips(
     for first in range(0, height, rows):
         end = min(first + rows, height)
         shift = (0.5 * height - 0.5 * (first + end)) * pixel * up
-        own = shift_camera(camera, shift, parallel_scale=0.5 * (end - first) * pixel)
-        strips.append(take(own, (width, end - first)))
+        strip_camera = shift_camera(camera, shift, parallel_scale=0.5 * (end - first) * pixel)
+        strips.append(take(strip_camera, (width, end - first)))
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(strip, name) for strip in strips])
         for name in ("image", "depth", "expected_depth", "values")
@@ -75,9 +75,9 @@ def warm_kernels(objects: Sequence[ShownObject], device: Device, progress: Progr
     """Build what the first pictures, the slider and the parts need, on a small volume of each type of voxels."""
     tell = progress or ignore_progress
     done = set()
-    for each in objects:
-        if isinstance(each, ShownScan):
-            kind = each.volume.voxels.dtype, each.volume.uneven
+    for shown in objects:
+        if isinstance(shown, ShownScan):
+            kind = shown.volume.voxels.dtype, shown.volume.uneven
             if kind not in done:
                 done.add(kind)
                 _warm_scan(_ball(*kind), device, tell)
@@ -149,14 +149,14 @@ class Stage(DeviceWorker):
                 taker.close()
             for resident in (*self._residents.values(), *(each for each, _ in self._solid.values())):
                 resident.close()
-            for kept in (self._takers, self._residents, self._solid):
-                kept.clear()  # type: ignore[attr-defined]
+            for cache in (self._takers, self._residents, self._solid):
+                cache.clear()  # type: ignore[attr-defined]
 
     # Parts
 
     def find_parts(self, state: ViewState, progress: Progress | None = None) -> list[FoundParts]:
         """Find the parts of all scans without a label map at the iso value, or take those that were found before."""
-        made = []
+        found_parts = []
         for scan in self._clustered():
             key = (scan.number, state.iso_value, state.table)
             with self.lock:
@@ -169,15 +169,15 @@ class Stage(DeviceWorker):
                 self._found[key] = known
                 self._found.move_to_end(key)
                 self._drop_found()
-            made.append(known)
-        return made
+            found_parts.append(known)
+        return found_parts
 
     def _drop_found(self) -> None:
         """Drop the parts that were asked for longest ago, where there are many."""
 
         def too_many() -> bool:
-            taken = sum(each.labels.voxels.nbytes for each in self._found.values())
-            return len(self._found) > MOST_FOUND or taken > MOST_FOUND_BYTES
+            byte_count = sum(each.labels.voxels.nbytes for each in self._found.values())
+            return len(self._found) > MOST_FOUND or byte_count > MOST_FOUND_BYTES
 
         while len(self._found) > 2 and too_many():
             self._found.popitem(last=False)
@@ -190,7 +190,7 @@ class Stage(DeviceWorker):
         """Make the scans without table and blankets, once; returns what was taken from each, by number."""
         from clrecon.anatomy.body import remove_table
 
-        said = {}
+        facts = {}
         for scan in self.objects:
             if not isinstance(scan, ShownScan):
                 continue
@@ -198,8 +198,8 @@ class Stage(DeviceWorker):
                 bare = remove_table(scan.volume, progress=progress)
                 with self.lock:
                     self._bare[scan.number] = bare
-            said[scan.number] = dict(self._bare[scan.number].report["remove_table"])
-        return said
+            facts[scan.number] = dict(self._bare[scan.number].report["remove_table"])
+        return facts
 
     @property
     def knows_table(self) -> bool:
@@ -217,13 +217,13 @@ class Stage(DeviceWorker):
         """Return the label map by which a scan is divided, None where its parts are not known."""
         scan = next(each for each in self.objects if each.number == number and isinstance(each, ShownScan))
         with self.lock:
-            own = self._map_of(scan.number)
-            if own is not None:
-                return LabelledLook(own.labels, None, tuple(state.parts_of(own.number)))
-            found = self._found_for(scan, state)
-            if found is None:
+            shown_map = self._map_of(scan.number)
+            if shown_map is not None:
+                return LabelledLook(shown_map.labels, None, tuple(state.parts_of(shown_map.number)))
+            found_parts = self._found_for(scan, state)
+            if found_parts is None:
                 return None
-            return LabelledLook(found.labels, found.placed, tuple(state.parts_of(scan.number)))
+            return LabelledLook(found_parts.labels, found_parts.placed, tuple(state.parts_of(scan.number)))
 
     def labels_on(self, resident: DeviceVolume, labelled: LabelledLook) -> NDArray[Any]:
         """Return the numbers of a label map on the grid of a scan; hold `lock`."""
@@ -263,13 +263,13 @@ class Stage(DeviceWorker):
         if scan is None:
             return None
         volume = scan.volume
-        at = volume.lps_to_ijk([point])[0]
+        ijk = volume.lps_to_ijk([point])[0]
         last = np.array(volume.shape_ijk) - 1
-        if (at < -0.5).any() or (at > last + 0.5).any():
+        if (ijk < -0.5).any() or (ijk > last + 0.5).any():
             return None
-        at = np.clip(at, 0, last)
-        low = np.minimum(at.astype(np.int64), np.maximum(last - 1, 0))
-        share = at - low
+        ijk = np.clip(ijk, 0, last)
+        low = np.minimum(ijk.astype(np.int64), np.maximum(last - 1, 0))
+        share = ijk - low
         i, j, k = low
         block = volume.voxels[k : k + 2, j : j + 2, i : i + 2].astype(np.float64)
         for part in share[::-1]:

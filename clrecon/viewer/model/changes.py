@@ -83,7 +83,7 @@ def pan_camera(camera: Camera, dx: float, dy: float) -> Camera:
     return shift_camera(camera, shift)
 
 
-def zoom_camera(camera: Camera, factor: float, at: tuple[float, float] = (0.0, 0.0)) -> Camera:
+def zoom_camera(camera: Camera, factor: float, point: tuple[float, float] = (0.0, 0.0)) -> Camera:
     """Show everything `factor` times as large; what is seen at a place, in heights from the middle, stays there."""
     if not (math.isfinite(factor) and factor > 0.0):
         raise UsageError(f"the factor of a zoom is a number above 0, not {factor!r}")
@@ -95,7 +95,7 @@ def zoom_camera(camera: Camera, factor: float, at: tuple[float, float] = (0.0, 0
         offset = np.subtract(camera.position, camera.focal_point) * (height / before)
         nearer = replace(camera, position=as_point(np.add(camera.focal_point, offset)))
     lost = 1.0 - before / height
-    return pan_camera(nearer, at[0] * lost, at[1] * lost)
+    return pan_camera(nearer, point[0] * lost, point[1] * lost)
 
 
 def pixel_camera(camera: Camera, size: tuple[int, int], x: float, y: float) -> Camera:
@@ -163,10 +163,10 @@ class ChangingView:
         """Shift what is seen by shares of the picture's height, to the right and down."""
         self._change("pan", "the shift", camera=pan_camera(self.camera, *checked_numbers("a shift", dx, dy)))
 
-    def zoom(self, factor: float, at: tuple[float, float] = (0.0, 0.0)) -> None:
+    def zoom(self, factor: float, point: tuple[float, float] = (0.0, 0.0)) -> None:
         """Show everything larger by a factor; what is seen at `at` stays there, see `zoom_camera`."""
         (factor,) = checked_numbers("the factor of a zoom", factor)
-        x, y = checked_numbers("the place of a zoom", *at)
+        x, y = checked_numbers("the place of a zoom", *point)
         self._change("zoom", "the zoom", camera=zoom_camera(self.camera, factor, (x, y)))
 
     def roll(self, degrees: float) -> None:
@@ -187,11 +187,11 @@ class ChangingView:
         if on:
             angle = 30.0
             away = float(camera.parallel_scale or 1.0) / math.tan(math.radians(0.5 * angle))
-            place = np.array(camera.focal_point) - away * camera.basis().forward
-            made = replace(camera, position=as_point(place), parallel_scale=None, view_angle=angle)
+            position = np.array(camera.focal_point) - away * camera.basis().forward
+            changed = replace(camera, position=as_point(position), parallel_scale=None, view_angle=angle)
         else:
-            made = replace(camera, parallel_scale=camera.half_height() * camera.distance, view_angle=None)
-        self._change("perspective", "the perspective", camera=made)
+            changed = replace(camera, parallel_scale=camera.half_height() * camera.distance, view_angle=None)
+        self._change("perspective", "the perspective", camera=changed)
 
     def toggle_perspective(self) -> None:
         self.set_perspective(self.camera.is_parallel)
@@ -206,9 +206,9 @@ class ChangingView:
         """Show one part and hide all others; an object as a whole with all of its parts."""
         chosen = self._part(key)
         parts = []
-        for each in self.state.parts:
-            with_it = each.key == key or (each.object == chosen.object and (each.is_whole or chosen.is_whole))
-            parts.append(replace(each, visible=with_it))
+        for part in self.state.parts:
+            with_it = part.key == key or (part.object == chosen.object and (part.is_whole or chosen.is_whole))
+            parts.append(replace(part, visible=with_it))
         self._change("only", f"the choice of {chosen.name}", parts=tuple(parts))
 
     def show_all(self) -> None:
@@ -251,16 +251,18 @@ class ChangingView:
             raise UsageError(f"an opacity is a number from 0 to 1, not {opacity:g}")
         self._change_part(part, f"the opacity of {part.name}", f"opacity {key}", opacity=opacity)
 
-    def take_parts(self, found: Sequence[FoundParts]) -> None:
+    def take_parts(self, batches: Sequence[FoundParts]) -> None:
         """Take the parts that were found, with the looks of those that were there; not a step of undo."""
-        numbers = {each.scan for each in found}
-        kept = [each for each in self.state.parts if each.is_whole or each.object not in numbers]
-        for one in found:
-            old = [each for each in self.state.parts if each.object == one.scan and not each.is_whole]
-            fresh = carry_looks(old, one)
-            at = next(place for place, each in enumerate(kept) if each.object == one.scan and each.is_whole)
-            kept[at + 1 : at + 1] = fresh
-        self.state = replace(self.state, parts=tuple(kept), parts_at=found[0].iso_value, parts_table=found[0].table)
+        numbers = {each.scan for each in batches}
+        parts = [each for each in self.state.parts if each.is_whole or each.object not in numbers]
+        for batch in batches:
+            old = [each for each in self.state.parts if each.object == batch.scan and not each.is_whole]
+            fresh = carry_looks(old, batch)
+            index = next(place for place, each in enumerate(parts) if each.object == batch.scan and each.is_whole)
+            parts[index + 1 : index + 1] = fresh
+        self.state = replace(
+            self.state, parts=tuple(parts), parts_at=batches[0].iso_value, parts_table=batches[0].table
+        )
         self.version += 1
 
     # Undo
@@ -285,8 +287,8 @@ class ChangingView:
 
     def _change(self, kind: str, words: str, **changes: Any) -> None:
         """Make a change that can be undone; those of one gesture are one step."""
-        made = replace(self.state, **changes)
-        if made == self.state:
+        changed = replace(self.state, **changes)
+        if changed == self.state:
             return
         now = self._clock()
         last_kind, last_time = self._last
@@ -299,12 +301,12 @@ class ChangingView:
             self._undo.append((self.state, words))
             del self._undo[:-_MOST_UNDO]
         self._last = (kind, now)
-        self.state = made
+        self.state = changed
         self.version += 1
 
     def _change_part(self, part: ShownPart, words: str, kind: str = "part", **changes: Any) -> None:
-        made = replace(part, **changes)
-        parts = tuple(made if each.key == part.key else each for each in self.state.parts)
+        changed = replace(part, **changes)
+        parts = tuple(changed if each.key == part.key else each for each in self.state.parts)
         self._change(kind, words, parts=parts)
 
     def _part(self, key: str) -> ShownPart:
@@ -315,14 +317,14 @@ class ChangingView:
 
     def _shown_corners(self) -> Float64Array:
         state, corners = self.state, []
-        for each in self.objects:
-            whole = state.whole(each.number)
+        for shown in self.objects:
+            whole = state.whole(shown.number)
             if whole is not None and not whole.visible:
                 continue
-            own = [part for part in state.parts_of(each.number) if part.box is not None]
-            boxes = [part.box for part in own if part.visible and part.box is not None]
-            some = boxes and len(boxes) < len(own) and state.mode == "surface"
-            corners.append(np.array(boxes, dtype=np.float64).reshape(-1, 3) if some else each.corners)
+            boxed = [part for part in state.parts_of(shown.number) if part.box is not None]
+            boxes = [part.box for part in boxed if part.visible and part.box is not None]
+            some = boxes and len(boxes) < len(boxed) and state.mode == "surface"
+            corners.append(np.array(boxes, dtype=np.float64).reshape(-1, 3) if some else shown.corners)
         if not corners:
             corners = [each.corners for each in self.objects]
         points = np.concatenate(corners)
@@ -331,12 +333,12 @@ class ChangingView:
         return points
 
 
-def checked_numbers(what: str, *values: Any) -> list[float]:
-    found = []
+def checked_numbers(subject: str, *values: Any) -> list[float]:
+    numbers = []
     for value in values:
         is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
         number = float(value) if is_number else math.nan
         if not math.isfinite(number):
-            raise UsageError(f"{what} is a finite number, not {value!r:.40}")
-        found.append(number)
-    return found
+            raise UsageError(f"{subject} is a finite number, not {value!r:.40}")
+        numbers.append(number)
+    return numbers

@@ -173,8 +173,8 @@ class ViewModel(ChangingView):
     def set_cross(self, point: Sequence[float]) -> None:
         """Move the cross to a place, LPS mm; outside of everything it goes to the nearest place within."""
         low, high = self._span()
-        place = np.clip(np.array(checked_vector("the cross", point)), low, high)
-        self._change("cross", "the place of the slices", cross=as_point(place))
+        point_in_box = np.clip(np.array(checked_vector("the cross", point)), low, high)
+        self._change("cross", "the place of the slices", cross=as_point(point_in_box))
 
     # Tools
 
@@ -193,24 +193,24 @@ class ViewModel(ChangingView):
         if len(points) != POINTS_OF[tool]:
             self._change("point", "the point", points=points)
             return None
-        made = measure_points(tool, [each.point for each in points])
-        self._change("point", f"the {tool}", points=(), measures=(*self.state.measures, made))
-        return made
+        measure = measure_points(tool, [each.point for each in points])
+        self._change("point", f"the {tool}", points=(), measures=(*self.state.measures, measure))
+        return measure
 
     def add_seed(self, pick: Pick) -> None:
         """Keep a place as a seed, whatever tool is used."""
-        made = measure_points("seed", [pick.point])
-        self._change("point", "the seed", measures=(*self.state.measures, made))
+        measure = measure_points("seed", [pick.point])
+        self._change("point", "the seed", measures=(*self.state.measures, measure))
 
     def end_tool(self) -> Measure | None:
         """Put the tool away; the points of a curve become a measure, other unfinished points are dropped."""
         tool, points = self.state.tool, [each.point for each in self.state.points]
         if tool is None:
             return None
-        made = measure_points(tool, points) if tool == "curve" and len(points) > 1 else None
-        measures = self.state.measures if made is None else (*self.state.measures, made)
+        measure = measure_points(tool, points) if tool == "curve" and len(points) > 1 else None
+        measures = self.state.measures if measure is None else (*self.state.measures, measure)
         self._change("end tool", f"the end of the {tool}", tool=None, points=(), measures=measures)
-        return made
+        return measure
 
     def clear_measures(self) -> None:
         self._change("clear measures", "the measures", measures=(), points=())
@@ -328,8 +328,8 @@ class ViewModel(ChangingView):
 
     def say_place(self, point: Sequence[float]) -> str:
         """Return a place, LPS mm, as words in `space`."""
-        place = self.signs * np.array(point) + 0.0
-        return f"{', '.join(f'{value:.1f}' for value in place)} mm {self.space.upper()}"
+        values_shown = self.signs * np.array(point) + 0.0
+        return f"{', '.join(f'{value:.1f}' for value in values_shown)} mm {self.space.upper()}"
 
     def _set_clip(self, n: int, plane: ClipPlane, kind: str) -> None:
         clips = (*self.state.clips[:n], plane, *self.state.clips[n + 1 :])

@@ -139,27 +139,27 @@ def show_objects(
     if not subjects:
         raise UsageError("there is nothing to show")
     scan = next((number for number, each in enumerate(subjects, start=1) if isinstance(each, Volume)), None)
-    made: list[ShownObject] = []
+    shown: list[ShownObject] = []
     for number, subject in enumerate(subjects, start=1):
         given = names[number - 1] if number <= len(names) else ""
-        told = tuple(said[number - 1]) if number <= len(said) else ()
+        notes = tuple(said[number - 1]) if number <= len(said) else ()
 
-        def own(kind: str, given: str = given, number: int = number, told: tuple[str, ...] = told) -> dict[str, Any]:
-            return {"number": number, "name": given or f"{kind} {number}", "said": told}
+        def own(kind: str, given: str = given, number: int = number, lines: tuple[str, ...] = notes) -> dict[str, Any]:
+            return {"number": number, "name": given or f"{kind} {number}", "said": lines}
 
         if isinstance(subject, Volume):
-            made.append(ShownScan(**own("scan"), volume=subject))
+            shown.append(ShownScan(**own("scan"), volume=subject))
         elif isinstance(subject, Mesh):
-            made.append(ShownMesh(**own("mesh"), mesh=_with_normals(subject)))
+            shown.append(ShownMesh(**own("mesh"), mesh=_with_normals(subject)))
         elif isinstance(subject, PointCloud):
             if not len(subject):
                 raise UsageError(f"{own('cloud')['name']} has no points: there is nothing to show")
-            made.append(ShownCloud(**own("cloud"), cloud=subject))
+            shown.append(ShownCloud(**own("cloud"), cloud=subject))
         elif isinstance(subject, LabelMap):
-            made.append(ShownLabels(**own("labels"), labels=subject, within=scan))
+            shown.append(ShownLabels(**own("labels"), labels=subject, within=scan))
         else:
             raise UsageError(f"a view shows a Volume, Mesh, PointCloud or LabelMap, not {type(subject).__name__}")
-    return made
+    return shown
 
 
 def _with_normals(mesh: Mesh) -> Mesh:
@@ -185,15 +185,15 @@ _ISO_ENDS = (-1000.0, 2000.0)
 def first_parts(objects: Sequence[ShownObject]) -> list[ShownPart]:
     """Return the objects as wholes, and the labels of label maps."""
     parts = []
-    for each in objects:
+    for item in objects:
         count: int | None = None
-        if isinstance(each, ShownMesh):
-            count = each.mesh.triangle_count
-        elif isinstance(each, ShownCloud):
-            count = len(each.cloud)
-        parts.append(ShownPart(key=str(each.number), name=each.name, kind=each.kind, object=each.number, count=count))
-        if isinstance(each, ShownLabels):
-            parts += _label_parts(each)
+        if isinstance(item, ShownMesh):
+            count = item.mesh.triangle_count
+        elif isinstance(item, ShownCloud):
+            count = len(item.cloud)
+        parts.append(ShownPart(key=str(item.number), name=item.name, kind=item.kind, object=item.number, count=count))
+        if isinstance(item, ShownLabels):
+            parts += _label_parts(item)
     return parts
 
 

@@ -68,9 +68,9 @@ class FoundParts:
     parts: tuple[ShownPart, ...]
 
 
-def number_at(volume: Volume, numbers: NDArray[Any], place: Point) -> int:
+def number_at(volume: Volume, numbers: NDArray[Any], point: Point) -> int:
     """Return the number of the voxel that is nearest to a place in LPS mm; 0 outside of the volume."""
-    ijk = np.rint(volume.lps_to_ijk([place])[0]).astype(np.int64)
+    ijk = np.rint(volume.lps_to_ijk([point])[0]).astype(np.int64)
     if (ijk < 0).any() or (ijk >= volume.shape_ijk).any():
         return 0
     i, j, k = ijk
@@ -168,14 +168,14 @@ def _describe_parts(
     order = np.argsort(numbers, kind="stable")
     ends = np.searchsorted(numbers[order], np.arange(SMALLER + 2))
     for number in range(1, SMALLER + 1):
-        own = order[ends[number] : ends[number + 1]]
-        if not len(own):
+        own_runs = order[ends[number] : ends[number + 1]]
+        if not len(own_runs):
             continue
-        count = int((lengths[own] + 1).sum())
-        k, j = np.divmod(runs.rows[own], nj)
-        longest = int(np.argmax(lengths[own]))
-        middle = (runs.first[own][longest] + lengths[own][longest] // 2, j[longest], k[longest])
-        low, high = (runs.first[own].min(), j.min(), k.min()), (runs.last[own].max(), j.max(), k.max())
+        count = int((lengths[own_runs] + 1).sum())
+        k, j = np.divmod(runs.rows[own_runs], nj)
+        longest = int(np.argmax(lengths[own_runs]))
+        middle = (runs.first[own_runs][longest] + lengths[own_runs][longest] // 2, j[longest], k[longest])
+        low, high = (runs.first[own_runs].min(), j.min(), k.min()), (runs.last[own_runs].max(), j.max(), k.max())
         several = len(sizes) - _MOST_CLUSTERS
         name = f"part {number}" if number < SMALLER else f"{several:,} smaller part{'s' * (several > 1)}"
         x, y, z = volume.ijk_to_lps([middle])[0].tolist()
@@ -205,9 +205,9 @@ def _box_of(volume: Volume, low: Sequence[int], high: Sequence[int]) -> Box:
     return (x0, y0, z0), (x1, y1, z1)
 
 
-def carry_looks(old: Sequence[ShownPart], found: FoundParts) -> list[ShownPart]:
+def carry_looks(old: Sequence[ShownPart], found_parts: FoundParts) -> list[ShownPart]:
     """Return found parts with the looks that parts had at another iso value, known again by a place within."""
-    fresh = {part.number: part for part in found.parts}
+    fresh = {part.number: part for part in found_parts.parts}
     for part in sorted(old, key=lambda each: -(each.count or 0)):
         if part.is_plain:
             continue
@@ -216,7 +216,7 @@ def carry_looks(old: Sequence[ShownPart], found: FoundParts) -> list[ShownPart]:
             if part.number == SMALLER:
                 number = SMALLER
             elif part.inside is not None:
-                number = number_at(found.volume, found.labels.voxels, part.inside)
+                number = number_at(found_parts.volume, found_parts.labels.voxels, part.inside)
         known = fresh.get(number)
         if known is not None and known.is_plain and (number == 0) == (part.kind == "rest"):
             fresh[number] = replace(known, color=part.color, opacity=part.opacity, visible=part.visible)

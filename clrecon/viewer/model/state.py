@@ -114,13 +114,13 @@ class ClipPlane:
         return x, y, z, sign * height
 
     def describe(self) -> dict[str, Any]:
-        at = self.low + self.share * (self.high - self.low)
+        at_mm = self.low + self.share * (self.high - self.low)
         return {
             "name": self.name,
             "words": f"{self.name if self.name.isalpha() else orientation_letters(np.array(self.direction))} side",
             "direction": [round(value, 5) for value in self.direction],
             "share": round(self.share, 5),
-            "at_mm": round(at, 2),
+            "at_mm": round(at_mm, 2),
             "flipped": self.flipped,
         }
 

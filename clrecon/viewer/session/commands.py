@@ -152,15 +152,15 @@ def check_command(command: Any) -> tuple[Command, dict[str, Any]]:
     name = command.get("do")
     if not isinstance(name, str) or name not in COMMANDS:
         raise UsageError(unknown_name("command", name, COMMANDS))
-    found = COMMANDS[name]
+    known_command = COMMANDS[name]
     given = {key: value for key, value in command.items() if key != "do"}
-    known = {**found.needs, **found.takes}
+    known = {**known_command.needs, **known_command.takes}
     for key in given:
         if key not in known:
             raise UsageError(
                 f"the command {name} has no argument {str(key)!r:.60}: {', '.join(known) or 'it takes none'}"
             )
-    missing = [key for key in found.needs if key not in given]
+    missing = [key for key in known_command.needs if key not in given]
     if missing:
         raise UsageError(f"the command {name} needs {', '.join(missing)}")
     checked = {}
@@ -170,7 +170,7 @@ def check_command(command: Any) -> tuple[Command, dict[str, Any]]:
         except (TypeError, ValueError, OverflowError) as error:
             wanted = str(error) if isinstance(error, TypeError) else "a number"
             raise UsageError(f"{key} of the command {name} is {wanted}, not {value!r:.60}") from None
-    return found, checked
+    return known_command, checked
 
 
 _ISO_STEP = 5.0

@@ -290,24 +290,24 @@ class ViewSession(Closing):
         def take(job: Job) -> None:
             with self._lock:
                 now, share = self.model.state if moving else state, self._share
-            made = self.painter.picture(now, (width, height), sharp=not moving, share=share, cancelled=job.cancelled)
+            picture = self.painter.picture(now, (width, height), sharp=not moving, share=share, cancelled=job.cancelled)
             if moving:
-                took = max(1.0, made.report["ms"])
-                share = made.size[0] / width * math.sqrt(MOVING_MS / took)
+                took = max(1.0, picture.report["ms"])
+                share = picture.size[0] / width * math.sqrt(MOVING_MS / took)
                 with self._lock:
                     self._share = min(1.0, max(LEAST_SHARE, share))
             with self._lock:
                 self._timing = {
-                    "ms": round(made.report["ms"], 1),
-                    "size": list(made.size),
+                    "ms": round(picture.report["ms"], 1),
+                    "size": list(picture.size),
                     "sharp": not moving,
                     "device": self.painter.device.label,
-                    "slabs": made.report.get("slabs", 1),
-                    "warnings": list(made.report["warnings"]),
+                    "slabs": picture.report.get("slabs", 1),
+                    "warnings": list(picture.report["warnings"]),
                 }
-                self._shown = made
+                self._shown = picture
             if not job.cancelled():
-                then(made)
+                then(picture)
 
         self._pictures.ask("picture", take, rank=0, gives_way=not moving)
 
@@ -328,9 +328,9 @@ class ViewSession(Closing):
         def take(job: Job) -> None:
             with self._lock:
                 state = self.model.state
-            made = self.painter.slice(state, plane, checked)
+            picture = self.painter.slice(state, plane, checked)
             if not job.cancelled():
-                then(made)
+                then(picture)
 
         self._pictures.ask(f"slice {plane}", take, rank=1, gives_way=False)
 
@@ -351,12 +351,12 @@ class ViewSession(Closing):
 
     def do(self, command: Mapping[str, Any]) -> dict[str, Any]:
         """Do a command of `COMMANDS`; return `facts`, and its own ``"pick"``, ``"undone"`` or ``"measure"``."""
-        found, arguments = check_command(command)
+        known_command, arguments = check_command(command)
         with self._lock:
-            said = found.call(self, **arguments)
+            answer = known_command.call(self, **arguments)
             if self.model.parts_known and self.painter.has_parts(self.model.state):
                 self._work.cancel("parts")
-            return {**self.facts(), **(said if isinstance(said, dict) else {})}
+            return {**self.facts(), **(answer if isinstance(answer, dict) else {})}
 
     def facts(self) -> dict[str, Any]:
         """Return all that panels show, for JSON."""
@@ -424,40 +424,40 @@ class ViewSession(Closing):
     def _apply_table(self, shown: bool) -> None:
         self.model.set_table(shown)
         if not shown:
-            taken = self.painter.remove_table()
+            by_scan = self.painter.remove_table()
             self._said = "; ".join(
                 f"{100.0 * facts['removed_share']:.3g} % of the voxels are air now, {facts['dense_voxels_removed']:,}"
                 " of them dense: look whether the body is whole"
-                for facts in taken.values()
+                for facts in by_scan.values()
             )
         self.rest()
 
     def pick(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Return what is seen at a pixel of the picture, or of a slice."""
-        found = self._pick(x, y, size, plane)
-        return {"pick": self._facts_of_pick(found)}
+        picked = self._pick(x, y, size, plane)
+        return {"pick": self._facts_of_pick(picked)}
 
     def cross_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Move the slices to what is seen at a pixel."""
-        found = self._pick(x, y, size, plane)
-        if found is not None:
-            self.model.set_cross(found.point)
-        return {"pick": self._facts_of_pick(found)}
+        picked = self._pick(x, y, size, plane)
+        if picked is not None:
+            self.model.set_cross(picked.point)
+        return {"pick": self._facts_of_pick(picked)}
 
     def add_point(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Add what is seen at a pixel to the tool that is used."""
-        found = self._pick(x, y, size, plane)
-        if found is None:
+        picked = self._pick(x, y, size, plane)
+        if picked is None:
             return {"pick": None, "measure": None}
-        made = self.model.add_point(found)
-        return {"pick": self._facts_of_pick(found), "measure": None if made is None else made.describe()}
+        measure = self.model.add_point(picked)
+        return {"pick": self._facts_of_pick(picked), "measure": None if measure is None else measure.describe()}
 
     def mark_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Keep what is seen at a pixel as a seed, without a tool."""
-        found = self._pick(x, y, size, plane)
-        if found is not None:
-            self.model.add_seed(found)
-        return {"pick": self._facts_of_pick(found)}
+        picked = self._pick(x, y, size, plane)
+        if picked is not None:
+            self.model.add_seed(picked)
+        return {"pick": self._facts_of_pick(picked)}
 
     def hide_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Hide the part at a pixel; parts that are not known yet are found first, in the background."""
@@ -527,36 +527,36 @@ class ViewSession(Closing):
     def _with_part(
         self, x: float, y: float, size: tuple[int, int], plane: str | None, apply: Callable[[str], None]
     ) -> dict[str, Any]:
-        found = self._pick(x, y, size, plane)
-        if found is None:
+        picked = self._pick(x, y, size, plane)
+        if picked is None:
             return {"pick": None}
-        state, described = self.model.state, self._facts_of_pick(found)
-        part = None if found.part is None else state.part(found.part)
+        state, described = self.model.state, self._facts_of_pick(picked)
+        part = None if picked.part is None else state.part(picked.part)
         divided = self.model.parts_known and self.painter.has_parts(state)
         if divided or (part is not None and part.kind in ("mesh", "cloud", "label")):
-            if found.part is not None:
-                apply(found.part)
+            if picked.part is not None:
+                apply(picked.part)
             return {"pick": described}
 
         def again() -> None:
-            at = self._pick(x, y, size, plane)
-            if at is not None and at.part is not None:
-                apply(at.part)
+            picked = self._pick(x, y, size, plane)
+            if picked is not None and picked.part is not None:
+                apply(picked.part)
 
         self.find_parts(again)
         return {"pick": described}
 
-    def _facts_of_pick(self, found: Pick | None) -> dict[str, Any] | None:
+    def _facts_of_pick(self, picked: Pick | None) -> dict[str, Any] | None:
         """Return a pick for JSON, with words that say what it is and where."""
-        if found is None:
+        if picked is None:
             return None
-        part = None if found.part is None else self.model.state.part(found.part)
+        part = None if picked.part is None else self.model.state.part(picked.part)
         words = [] if part is None else [part.name]
         if part is not None and part.ml is not None:
             words.append(format_volume(part.ml))
-        if found.hu is not None:
-            words.append(f"{found.hu:.0f} HU")
-        return {**found.describe(), "words": ", ".join([*words, self.model.say_place(found.point)])}
+        if picked.hu is not None:
+            words.append(f"{picked.hu:.0f} HU")
+        return {**picked.describe(), "words": ", ".join([*words, self.model.say_place(picked.point)])}
 
     def _seen_lines(self) -> list[list[list[float]]]:
         """Return the pieces of measured lines that are not hidden in the picture that was taken last."""
@@ -569,17 +569,17 @@ class ViewSession(Closing):
         return seen_pieces(self._shown, [np.array(line) for line in lines if len(line) > 1], expected=expected)
 
     def _warnings(self) -> list[str]:
-        said = list(chain(*(each.said for each in self.model.objects)))
+        notes = list(chain(*(each.said for each in self.model.objects)))
         if self._timing.get("slabs", 1) > 1:
-            said.append("the scan does not fit the device: every picture takes it through in slabs, which is slow")
-        for each in self.model.objects:
-            if isinstance(each, ShownMesh) and each.mesh.triangle_count > MANY_TRIANGLES:
-                said.append(
-                    f"{each.name} has {each.mesh.triangle_count:,} triangles: a sharp picture takes a while, and a"
+            notes.append("the scan does not fit the device: every picture takes it through in slabs, which is slow")
+        for shown in self.model.objects:
+            if isinstance(shown, ShownMesh) and shown.mesh.triangle_count > MANY_TRIANGLES:
+                notes.append(
+                    f"{shown.name} has {shown.mesh.triangle_count:,} triangles: a sharp picture takes a while, and a"
                     " coarse mesh is shown while anything moves"
                 )
-        said += self._timing.get("warnings", [])
-        return list(dict.fromkeys(said))
+        notes += self._timing.get("warnings", [])
+        return list(dict.fromkeys(notes))
 
     def _failed(self, kind: str, words: str) -> None:
         log.warning("%s: %s", kind, words)

@@ -118,8 +118,8 @@ def encode_picture(picture: Rendering, ground: tuple[int, int, int], sharp: bool
         stream, "JPEG", quality=_SHARP_QUALITY if sharp else _MOVING_QUALITY, subsampling=0 if sharp else 2
     )
     width, height = picture.size
-    told = {**facts, "sharp": sharp, "size": [width, height], "camera": facts_of_camera(picture.camera)}
-    head = json.dumps(told, separators=(",", ":"), allow_nan=False).encode()
+    head_facts = {**facts, "sharp": sharp, "size": [width, height], "camera": facts_of_camera(picture.camera)}
+    head = json.dumps(head_facts, separators=(",", ":"), allow_nan=False).encode()
     return len(head).to_bytes(4, "little") + head + stream.getvalue()
 
 
@@ -163,9 +163,9 @@ class Downloads:
     def reserve(self, name: str) -> Download:
         """Return a place for a file of this name; it can be fetched after `offer`."""
         ticket = secrets.token_urlsafe(24)
-        own = self._folder / ticket
-        own.mkdir(mode=0o700)
-        return Download(ticket, own / name)
+        own_folder = self._folder / ticket
+        own_folder.mkdir(mode=0o700)
+        return Download(ticket, own_folder / name)
 
     def offer(self, download: Download) -> None:
         """Let a finished file be fetched, and remove those that were not."""
@@ -324,14 +324,14 @@ class Connection:
                     continue
                 if message.get("do") in _NOT_FOR_BROWSERS:
                     raise UsageError(f"the command {message['do']} is not for browsers")
-                said = await self._loop.run_in_executor(self._thread, self._session.do, message)
+                answer = await self._loop.run_in_executor(self._thread, self._session.do, message)
             except ClreconError as error:
                 self._say(error=str(error))
             except Exception as error:  # a fault of ours: the other browsers, and this one, go on
                 log.exception("a command failed")
                 self._say(error=f"{type(error).__name__}: a fault of clrecon, please report it")
             else:
-                once = {name: said.pop(name) for name in _SAID_ONCE if name in said}
+                once = {name: answer.pop(name) for name in _SAID_ONCE if name in answer}
                 if once:
                     self._say(**once)
             self._look_again()
@@ -422,8 +422,8 @@ class Connection:
         def then(picture: Rendering) -> None:
             self._number += 1
             facts = {"view": asked.view, "number": self._number, "ms": float(picture.report.get("ms", 0.0))}
-            made = encode_picture(picture, self._ground, not asked.moving, facts)
-            self._later(self._deliver, asked, made)
+            message = encode_picture(picture, self._ground, not asked.moving, facts)
+            self._later(self._deliver, asked, message)
 
         try:
             if asked.view == SCENE:
@@ -436,10 +436,10 @@ class Connection:
             self._drawing = None
             self._say(error=str(error))
 
-    def _deliver(self, asked: Asked, made: bytes) -> None:
+    def _deliver(self, asked: Asked, message: bytes) -> None:
         if self._drawing is asked:
             self._drawing = None
-        self._ready = made
+        self._ready = message
         self._wake.set()
 
     async def _write(self) -> None:
@@ -448,15 +448,15 @@ class Connection:
             while True:
                 await self._wake.wait()
                 self._wake.clear()
-                told = json.dumps(self._facts(), separators=(",", ":"))
-                if told != self._told:
-                    self._told = told
-                    await self._socket.send_str(f'{{"facts":{told}}}')
+                facts_text = json.dumps(self._facts(), separators=(",", ":"))
+                if facts_text != self._told:
+                    self._told = facts_text
+                    await self._socket.send_str(f'{{"facts":{facts_text}}}')
                 while self._notes:
                     await self._socket.send_str(json.dumps(self._notes.pop(0)))
                 if self._ready is not None and not self._under_way:
-                    made, self._ready, self._under_way = self._ready, None, True
-                    await self._socket.send_bytes(made)
+                    message, self._ready, self._under_way = self._ready, None, True
+                    await self._socket.send_bytes(message)
                     self._draw()
         except (ConnectionError, RuntimeError):  # the browser has left
             await self._socket.close()

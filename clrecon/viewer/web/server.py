@@ -120,12 +120,12 @@ def bind_port(port: int | None = None) -> socket.socket:
         listener.listen(_WAITING)
     except OSError as error:
         listener.close()
-        other = f"name another with {name_parameter('port', 'N')}, or leave it out for a free one"
+        advice = f"name another with {name_parameter('port', 'N')}, or leave it out for a free one"
         if error.errno == errno.EADDRINUSE:
-            raise UsageError(f"port {port} of {_LOOPBACK} is taken by another program: {other}") from error
+            raise UsageError(f"port {port} of {_LOOPBACK} is taken by another program: {advice}") from error
         if error.errno == errno.EACCES:
-            raise UsageError(f"port {port} is reserved by the system: {other}") from error
-        raise UsageError(f"port {port or 'any'} of {_LOOPBACK} cannot be used ({error.strerror}): {other}") from error
+            raise UsageError(f"port {port} is reserved by the system: {advice}") from error
+        raise UsageError(f"port {port or 'any'} of {_LOOPBACK} cannot be used ({error.strerror}): {advice}") from error
     return listener
 
 

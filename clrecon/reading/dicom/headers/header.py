@@ -105,8 +105,8 @@ def read_headers(
         frames = count_frames(values, sop_class)
         places = find_places(values, sop_class, frames) if frames > 1 else None
         header = _validate(values, series, path, name, frames=frames)
-        said = check_surplus(elements, header, force=force)
-        header = replace(header, warnings=(*header.warnings, *said)) if said else header
+        remarks = check_surplus(elements, header, force=force)
+        header = replace(header, warnings=(*header.warnings, *remarks)) if remarks else header
         return [header] if places is None else list(spread_frames(header, places))
     except ValueProblem as problem:
         return OtherImage(series, path, name, 1, "broken", f"{name}: {problem}")
@@ -116,39 +116,39 @@ def _read_frames(
     elements: DicomElements, series: SeriesIdentity, path: Path, name: str, force: bool
 ) -> list[SliceHeader] | OtherImage:
     """Read one header for each frame of an enhanced image, or return the first problem."""
-    frames, place = 1, name
+    frames, frame_name = 1, name
     headers: list[SliceHeader] = []
-    said: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     try:
         groups = read_groups(path, elements)
         frames = len(groups.frames)
         for number, frame in enumerate(split_frames(elements, groups)):
-            place = f"{name} frame {number + 1}" if frames > 1 else name
+            frame_name = f"{name} frame {number + 1}" if frames > 1 else name
             if frame.problem is not None:
                 raise frame.problem
-            header = _validate(Values(frame.elements), series, path, place, frames=frames)
+            header = _validate(Values(frame.elements), series, path, frame_name, frames=frames)
             if number == 0:
-                said = check_surplus(elements, header, force=force)
+                remarks = check_surplus(elements, header, force=force)
             headers.append(
                 replace(
                     header,
                     frame=number,
                     concatenation=groups.concatenation,
                     phase=(*frame.phase, *header.phase),
-                    warnings=(*header.warnings, *said, *groups.warnings, *frame.warnings),
+                    warnings=(*header.warnings, *remarks, *groups.warnings, *frame.warnings),
                 )
             )
     except ValueProblem as problem:
-        return OtherImage(series, path, name, frames, "broken", f"{place}: {problem}")
+        return OtherImage(series, path, name, frames, "broken", f"{frame_name}: {problem}")
     return headers
 
 
 def _check_matrix(samples: int, photometric: str, rows: int, columns: int) -> None:
     """Refuse colour images, and images without pixels."""
     if samples != 1 or photometric not in ("MONOCHROME1", "MONOCHROME2"):
-        found = photometric or "nothing"
+        interpretation = photometric or "nothing"
         raise ValueProblem(
-            f"PhotometricInterpretation (0028,0004) is {escape_text(found)} with {samples} samples: "
+            f"PhotometricInterpretation (0028,0004) is {escape_text(interpretation)} with {samples} samples: "
             "a CT slice is MONOCHROME2"
         )
     if rows == 0 or columns == 0:
@@ -176,8 +176,8 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
     if elements.encoding_differs:
         warnings.append("implicit and explicit VR are mixed up: parsed as found, not as the transfer syntax says")
     image_type = [word.strip() for word in values.text("ImageType").upper().split("\\")]
-    found = sorted(DERIVED_WORDS.intersection(re.split("[^A-Z]+", " ".join(image_type))))
-    derived = found if "DERIVED" in image_type else []
+    words_found = sorted(DERIVED_WORDS.intersection(re.split("[^A-Z]+", " ".join(image_type))))
+    derived = words_found if "DERIVED" in image_type else []
     if derived:
         warnings.append(f"derived images (ImageType has DERIVED and {' '.join(derived)}): maybe not measured HU")
 
@@ -316,12 +316,12 @@ def _check_pixel_room(header: SliceHeader, pixel_vr: str) -> None:
         raise ValueProblem("Pixel Data (7FE0,0010) has no length, but the transfer syntax is uncompressed")
     if not header.little_endian and header.bits_allocated == 8 and pixel_vr == "OW":
         raise ValueProblem("8-bit pixels as big-endian words: not supported")
-    found = header.pixel_length
+    size = header.pixel_length
     if header.inflate_from < 0:
-        found = min(found, max(header.file_bytes - header.pixel_offset, 0))
-    if found < header.frames * header.pixel_bytes:
+        size = min(size, max(header.file_bytes - header.pixel_offset, 0))
+    if size < header.frames * header.pixel_bytes:
         frames = f"{header.frames} x " if header.frames > 1 else ""
         raise ValueProblem(
             f"truncated: {header.frames * header.pixel_bytes} bytes of pixels expected "
-            f"({frames}{header.columns} x {header.rows} x {header.bits_allocated} bit), {found} found"
+            f"({frames}{header.columns} x {header.rows} x {header.bits_allocated} bit), {size} found"
         )

@@ -240,9 +240,9 @@ def _lay_over(frame: DicomElements, items: Iterable[Item]) -> None:
 def _take_times(frame: DicomElements) -> None:
     """Write the time of a frame to the elements that a slice has for it: date and time separately."""
     for tag in (_FRAME_ACQUISITION_TIME, _FRAME_REFERENCE_TIME):
-        found = re.match(rb"(\d{8})(\d{2,6}(?:\.\d{1,6})?)", frame.values.get(tag, b""))
-        if found is not None:
-            frame.values.update(zip(_ACQUISITION_DATE_AND_TIME, found.groups(), strict=True))
+        match = re.match(rb"(\d{8})(\d{2,6}(?:\.\d{1,6})?)", frame.values.get(tag, b""))
+        if match is not None:
+            frame.values.update(zip(_ACQUISITION_DATE_AND_TIME, match.groups(), strict=True))
             frame.vrs.update(zip(_ACQUISITION_DATE_AND_TIME, ("DA", "TM"), strict=True))
             return
 
@@ -280,8 +280,8 @@ def _take_real_world_values(frame: DicomElements, mappings: list[Item], warnings
         for tag, target in ((_REAL_SLOPE, RESCALE_SLOPE), (_REAL_INTERCEPT, RESCALE_INTERCEPT)):
             number = decode_number(mapping.values.get(tag, b""), "d", frame.little_endian)
             if number is None or not math.isfinite(number) or (tag == _REAL_SLOPE and number == 0.0):
-                found = "missing" if number is None else f"{number:g}"
-                raise ValueProblem(f"{name_tag(tag)} is {found}, expected a finite number")
+                value_text = "missing" if number is None else f"{number:g}"
+                raise ValueProblem(f"{name_tag(tag)} is {value_text}, expected a finite number")
             frame.values[target], frame.vrs[target] = repr(number).encode(), "DS"
         frame.values[_RESCALE_TYPE], frame.vrs[_RESCALE_TYPE] = b"HU", "LO"
         warnings.append(f"RescaleType is {escape_text(kind, 16)}: " if kind else "no RescaleSlope: ")
@@ -302,21 +302,21 @@ def _describe_phase(frame: DicomElements, dimensions: tuple[tuple[int, str], ...
         if text:
             yield keyword, text
     indices = frame.values.get(_DIMENSION_VALUES, b"")
-    for place, name in dimensions:
-        number = decode_number(indices[4 * place : 4 * place + 4], "L", frame.little_endian)
+    for dimension_number, name in dimensions:
+        number = decode_number(indices[4 * dimension_number : 4 * dimension_number + 4], "L", frame.little_endian)
         if number is not None:
             yield f"DimensionIndexValues {name}", f"{number:g}"
 
 
 def _name_dimensions(dimensions: list[Item], little: bool) -> Iterator[tuple[int, str]]:
-    for place, dimension in enumerate(dimensions):
+    for number, dimension in enumerate(dimensions):
         raw = dimension.values.get(_DIMENSION_POINTER, b"")
         if len(raw) != 4:
             continue
         group, element = struct.unpack("<HH" if little else ">HH", raw)
         pointer = group << 16 | element
         if pointer not in DIMENSIONS_OF_PLACE:
-            yield place, name_element(pointer)
+            yield number, name_element(pointer)
 
 
 def _read_header_bytes(path: Path, elements: DicomElements) -> tuple[bytes, int]:
@@ -431,7 +431,7 @@ def spread_frames(header: SliceHeader, places: FramePlaces) -> Iterator[SliceHea
     """Return one header for each frame, given that of the first one."""
     normal = _cross(header.row_cosines, header.column_cosines)
     first = np.array(header.position_mm)
-    said = f"{header.frames} frames in one classic CT image: {_describe_way(places, normal)}"
+    remark = f"{header.frames} frames in one classic CT image: {_describe_way(places, normal)}"
     for number, offset in enumerate(places.offsets_mm.tolist()):
         yield replace(
             header,
@@ -440,7 +440,7 @@ def spread_frames(header: SliceHeader, places: FramePlaces) -> Iterator[SliceHea
             position_mm=tuple((first + offset * normal).tolist()),
             position_digits=(places.digits,) * 3,
             stated_gap_mm=None if header.stated_gap_mm is None else abs(header.stated_gap_mm),
-            warnings=(*header.warnings, said),
+            warnings=(*header.warnings, remark),
         )
 
 
@@ -448,13 +448,14 @@ def _describe_way(places: FramePlaces, normal: NDArray[np.float64]) -> str:
     """Say from which end of the patient the frames run, and how this is known."""
     axis = int(np.argmax(np.abs(normal)))
     towards, away = WAYS[axis] if (normal[axis] > 0.0) == (places.offsets_mm[-1] > 0.0) else WAYS[axis][::-1]
-    way = f"they run from {away} to {towards}"
+    direction = f"they run from {away} to {towards}"
     if places.element == "GridFrameOffsetVector":
         steps = np.diff(places.offsets_mm)
         ordered = bool((steps > 0.0).all() or (steps < 0.0).all())
-        return f"{way if ordered else 'they are in no order'}, as GridFrameOffsetVector says"
+        return f"{direction if ordered else 'they are in no order'}, as GridFrameOffsetVector says"
     return (
-        f"{way}, along the normal of rows and columns in steps of SpacingBetweenSlices, {places.offsets_mm[1]:g} mm; "
+        f"{direction}, along the normal of rows and columns in steps of SpacingBetweenSlices,"
+        f" {places.offsets_mm[1]:g} mm; "
         "no element says that they do not run the other way, and then the volume is mirrored: compare left and "
         "right with the scanner's pictures"
     )

@@ -74,16 +74,16 @@ def _check_encapsulated(elements: DicomElements, header: SliceHeader, force: boo
         return tuple(_judge_tail(file, elements, end, header.file_bytes, force)) if end < header.file_bytes else ()
 
 
-def _judge_excess(file: BinaryIO, header: SliceHeader, expected: int, found: int, force: bool) -> str:
+def _judge_excess(file: BinaryIO, header: SliceHeader, expected: int, size: int, force: bool) -> str:
     frames = f"{header.frames} x " if header.frames > 1 else ""
     counts = (
         f"Pixel Data has {header.pixel_length} bytes, {frames}{header.columns} x {header.rows} x "
         f"{header.bits_allocated} bit take {expected}"
     )
-    if found < header.pixel_length:
-        counts += f", {found} are there: the file is cut"
-    elif _is_zero(file, header.pixel_offset + expected, found - expected):
-        columns = _find_hidden_columns(file, header, found)
+    if size < header.pixel_length:
+        counts += f", {size} are there: the file is cut"
+    elif _is_zero(file, header.pixel_offset + expected, size - expected):
+        columns = _find_hidden_columns(file, header, size)
         if not columns:
             return f"{counts}: the rest is zeros, taken as padding"
         counts += f": rows are more alike with {columns} columns"
@@ -94,11 +94,11 @@ def _judge_excess(file: BinaryIO, header: SliceHeader, expected: int, found: int
     raise ValueProblem(f"{counts} ({name_parameter('force', True)} leaves the rest out)")
 
 
-def _is_zero(file: BinaryIO, place: int, count: int) -> bool:
+def _is_zero(file: BinaryIO, start: int, count: int) -> bool:
     """True for bytes of 0; False for more than `_MOST_PADDING_BYTES`, which are not examined."""
     if count > _MOST_PADDING_BYTES:
         return False
-    file.seek(place)
+    file.seek(start)
     while count > 0:
         part = file.read(min(count, _CHUNK))
         if not part or part.strip(b"\0"):
@@ -107,10 +107,10 @@ def _is_zero(file: BinaryIO, place: int, count: int) -> bool:
     return True
 
 
-def _find_hidden_columns(file: BinaryIO, header: SliceHeader, found: int) -> int:
+def _find_hidden_columns(file: BinaryIO, header: SliceHeader, byte_count: int) -> int:
     """Return the number of columns that the first frame's pixels suggest, if the bytes suffice for more; else 0."""
     item = header.bits_allocated // 8
-    columns, rest = divmod(found, header.frames * header.rows * item)
+    columns, rest = divmod(byte_count, header.frames * header.rows * item)
     if rest or columns <= header.columns or header.rows < 2:
         return 0
     rows = min(header.rows, _MOST_PADDING_BYTES // (columns * item))
@@ -121,9 +121,9 @@ def _find_hidden_columns(file: BinaryIO, header: SliceHeader, found: int) -> int
     whole = "i" if header.signed else "u"
     kind = f"{'<' if header.little_endian else '>'}{'f' if header.float_pixels else whole}{item}"
     pixels = np.frombuffer(data, kind).astype(np.float64)
-    told = _measure_steps(pixels[: rows * header.columns].reshape(rows, header.columns))
+    steps_as_told = _measure_steps(pixels[: rows * header.columns].reshape(rows, header.columns))
     steps = _measure_steps(pixels.reshape(rows, columns))
-    return columns if steps < SHEARED * told else 0
+    return columns if steps < SHEARED * steps_as_told else 0
 
 
 def _measure_steps(picture: NDArray[np.float64]) -> float:
@@ -152,11 +152,11 @@ def _judge_tail(file: BinaryIO, elements: DicomElements, end: int, size: int, fo
 def _check_tail(file: BinaryIO, start: int, size: int, *, implicit: bool, little_endian: bool) -> None:
     """Walk over the bytes after the pixel data, from `start` to the end of the file at `size`."""
     wrong = CorruptFileError(f"{size - start} bytes behind the pixel data are no elements of DICOM")
-    place, last = start, PIXEL_TAGS[-1]
+    position, last = start, PIXEL_TAGS[-1]
     for _ in range(_MOST_ELEMENTS):
-        if place == size:
+        if position == size:
             return
-        file.seek(place)
+        file.seek(position)
         head = file.read(12)
         if len(head) < 8:
             raise wrong
@@ -164,14 +164,14 @@ def _check_tail(file: BinaryIO, start: int, size: int, *, implicit: bool, little
         if tag <= last:
             raise wrong
         if length == UNDEFINED_LENGTH:
-            file.seek(place + value)
+            file.seek(position + value)
             try:
                 length = skip_sequence(file.read(_LOOKED_AT_BYTES), implicit=implicit, little_endian=little_endian)
             except ValueProblem as problem:
                 raise wrong from problem
-        place += value + length
+        position += value + length
         last = tag
-        if place > size or tag == _PADDING_TAG and place < size:
+        if position > size or tag == _PADDING_TAG and position < size:
             raise wrong
     raise wrong
 

@@ -169,12 +169,12 @@ def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> Di
         file = cast(BinaryIO, _MeteredFile(io.BytesIO(_inflate_header(file))))
     little = transfer_syntax != EXPLICIT_BIG
     implicit = transfer_syntax == IMPLICIT_LITTLE
-    found = _looks_implicit(file, start)
-    differs = found is not None and found != implicit
-    implicit = implicit if found is None else found
+    seen_implicit = _looks_implicit(file, start)
+    differs = seen_implicit is not None and seen_implicit != implicit
+    implicit = implicit if seen_implicit is None else seen_implicit
     values, vrs, remarks = _collect(file, implicit=implicit, little=little, last_group=None, wanted=wanted)
-    place = file.tell()
-    tag, offset, length, vr = read_pixel_head(file.read(12), place, implicit, little)
+    position = file.tell()
+    tag, offset, length, vr = read_pixel_head(file.read(12), position, implicit, little)
     return DicomElements(
         transfer_syntax,
         media_class,
@@ -236,18 +236,18 @@ class _Order:
         self._last = 0
 
     def add(self, tag: int, value: bytes) -> None:
-        place = name_tag(tag)
+        tag_name = name_tag(tag)
         value = value.rstrip(b" \0")
         if tag not in self._values:
             if tag < self._last:
-                self.remarks.append(f"{place} is not in the order of tags: taken all the same")
+                self.remarks.append(f"{tag_name} is not in the order of tags: taken all the same")
             self._last = max(tag, self._last)
         elif self._values[tag] == value:
-            self.remarks.append(f"{place} is there twice, with the same value")
+            self.remarks.append(f"{tag_name} is there twice, with the same value")
         elif tag in _DESCRIPTIVE_TAGS:
-            self.remarks.append(f"{place} is there twice, with two values: the last is taken")
+            self.remarks.append(f"{tag_name} is there twice, with two values: the last is taken")
         else:
-            raise CorruptFileError(f"{place} is there twice, with two values")
+            raise CorruptFileError(f"{tag_name} is there twice, with two values")
         self._values[tag] = value
 
 

@@ -169,11 +169,11 @@ def _parse(data: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomEleme
         return None
     vrs: dict[int, str | None]
     if implicit:
-        values, place = _walk_implicit(data, start, _keys(wanted))
+        values, position = _walk_implicit(data, start, _keys(wanted))
         vrs = dict.fromkeys(values)
     else:
-        values, vrs, place = _walk_explicit(data, start, _keys(wanted))
-    tag, offset, length, vr = read_pixel_head(data[place : place + 12], place, implicit, True)
+        values, vrs, position = _walk_explicit(data, start, _keys(wanted))
+    tag, offset, length, vr = read_pixel_head(data[position : position + 12], position, implicit, True)
     if tag is None or not _known_character_sets(values.get(CHARACTER_SET, b"")):
         return None
     return DicomElements(
@@ -200,33 +200,33 @@ def _keys(tags: tuple[int, ...] | None) -> dict[int, int]:
 
 
 def _walk_explicit(
-    data: bytes, place: int, wanted: dict[int, int], *, meta: bool = False
+    data: bytes, position: int, wanted: dict[int, int], *, meta: bool = False
 ) -> tuple[dict[int, bytes], dict[int, str | None], int]:
     """Walk to the pixel data, or the meta header's end; return values, VRs and the offset, perhaps beyond `data`."""
     values: dict[int, bytes] = {}
     vrs: dict[int, str | None] = {}
     last = 0
     while True:
-        key, name, length = _explicit_head(data, place)
+        key, name, length = _explicit_head(data, position)
         group = key & 0xFFFF
         if meta:
             if group != 2:
                 if group == _DELIMITER_GROUP:
                     raise _NotPlainError
-                return values, vrs, place
+                return values, vrs, position
         elif group >= _PIXEL_GROUP and (group << 16 | key >> 16) >= FIRST_PIXEL_TAG:
-            return values, vrs, place
+            return values, vrs, position
         if name in SHORT_VRS:
             vr = SHORT_VRS[name]
-            place += 8
+            position += 8
         elif name in LONG_VRS:
             vr = LONG_VRS[name]
-            (length,) = _long_length(data, place + 8)
-            place += 12
+            (length,) = _long_length(data, position + 8)
+            position += 12
             if length == UNDEFINED_LENGTH:
                 if vr != "SQ" or meta or wanted.get(key):
                     raise _NotPlainError
-                place = _skip_items(data, place, False, DEEPEST)
+                position = _skip_items(data, position, False, DEEPEST)
                 continue
         else:
             raise _NotPlainError
@@ -236,25 +236,25 @@ def _walk_explicit(
                 raise _NotPlainError
             last = tag
             if length:
-                values[tag] = data[place : place + length]
+                values[tag] = data[position : position + length]
                 vrs[tag] = vr
-        place += length
+        position += length
 
 
-def _walk_implicit(data: bytes, place: int, wanted: dict[int, int]) -> tuple[dict[int, bytes], int]:
+def _walk_implicit(data: bytes, position: int, wanted: dict[int, int]) -> tuple[dict[int, bytes], int]:
     """Do the same as `_walk_explicit` for a data set in implicit VR."""
     values: dict[int, bytes] = {}
     last = 0
     while True:
-        key, length = _implicit_head(data, place)
+        key, length = _implicit_head(data, position)
         group = key & 0xFFFF
         if group >= _PIXEL_GROUP and (group << 16 | key >> 16) >= FIRST_PIXEL_TAG:
-            return values, place
-        place += 8
+            return values, position
+        position += 8
         if length == UNDEFINED_LENGTH:
-            if wanted.get(key) or not _is_sequence(data, place, key):
+            if wanted.get(key) or not _is_sequence(data, position, key):
                 raise _NotPlainError
-            place = _skip_items(data, place, True, DEEPEST)
+            position = _skip_items(data, position, True, DEEPEST)
             continue
         if key in wanted:
             tag = wanted[key]
@@ -262,55 +262,55 @@ def _walk_implicit(data: bytes, place: int, wanted: dict[int, int]) -> tuple[dic
                 raise _NotPlainError
             last = tag
             if length:
-                values[tag] = data[place : place + length]
-        place += length
+                values[tag] = data[position : position + length]
+        position += length
 
 
-def _is_sequence(data: bytes, place: int, key: int) -> bool:
+def _is_sequence(data: bytes, position: int, key: int) -> bool:
     """True where an element of undefined length in implicit VR is certainly a sequence."""
     private = key & 1  # private: the group is odd
-    return key in _SEQUENCE_KEYS or bool(private) and _long_length(data, place)[0] == _ITEM
+    return key in _SEQUENCE_KEYS or bool(private) and _long_length(data, position)[0] == _ITEM
 
 
-def _skip_items(data: bytes, place: int, implicit: bool, levels: int) -> int:
+def _skip_items(data: bytes, position: int, implicit: bool, levels: int) -> int:
     """Walk over the items of a sequence of undefined length; return the offset after its delimiter."""
     if not levels:
         raise _NotPlainError
     while True:
-        key, length = _implicit_head(data, place)
-        place += 8
+        key, length = _implicit_head(data, position)
+        position += 8
         if key == _SEQUENCE_END and length == 0:
-            return place
+            return position
         if key != _ITEM:
             raise _NotPlainError
-        end = None if length == UNDEFINED_LENGTH else place + length
-        place = _skip_elements(data, place, end, implicit, levels - 1)
+        end = None if length == UNDEFINED_LENGTH else position + length
+        position = _skip_elements(data, position, end, implicit, levels - 1)
 
 
-def _skip_elements(data: bytes, place: int, end: int | None, implicit: bool, levels: int) -> int:
+def _skip_elements(data: bytes, position: int, end: int | None, implicit: bool, levels: int) -> int:
     """Walk over the elements of an item, to `end` or to its delimiter; return the offset after it."""
-    while end is None or place < end:
-        key, length = _implicit_head(data, place)
+    while end is None or position < end:
+        key, length = _implicit_head(data, position)
         if key == _ITEM_END and length == 0 and end is None:
-            return place + 8
+            return position + 8
         if key & 0xFFFF == _DELIMITER_GROUP or key == _CHARACTER_SET:
             raise _NotPlainError
-        name = data[place + 4 : place + 6]
-        place += 8
+        name = data[position + 4 : position + 6]
+        position += 8
         if not implicit:
             if name in SHORT_VRS:
                 length >>= 16
             elif name in LONG_VRS:
-                (length,) = _long_length(data, place)
-                place += 4
+                (length,) = _long_length(data, position)
+                position += 4
             else:
                 raise _NotPlainError
         if length != UNDEFINED_LENGTH:
-            place += length
-        elif name == b"SQ" if not implicit else _is_sequence(data, place, key):
-            place = _skip_items(data, place, implicit, levels)
+            position += length
+        elif name == b"SQ" if not implicit else _is_sequence(data, position, key):
+            position = _skip_items(data, position, implicit, levels)
         else:
             raise _NotPlainError
-    if place != end:
+    if position != end:
         raise _NotPlainError
-    return place
+    return position

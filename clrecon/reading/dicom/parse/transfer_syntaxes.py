@@ -143,43 +143,43 @@ def read_pieces(file: BinaryIO, pieces: Pieces) -> bytes:
 def _walk_items(file: BinaryIO, start: int, file_bytes: int, most: int) -> tuple[tuple[int, int], Pieces, int]:
     """Return the offset table, the fragments, and the offset of the byte after them; a cut stream would decode too."""
     items: Pieces = []
-    place = start
+    position = start
     file.seek(start)
-    while place + 8 <= file_bytes:
-        group, element, length = struct.unpack("<HHL", _read(file, place, 8))
-        place += 8
+    while position + 8 <= file_bytes:
+        group, element, length = struct.unpack("<HHL", _read(file, position, 8))
+        position += 8
         if (group, element) == _END:
-            return (items[0] if items else (place, 0)), items[1:], place
+            return (items[0] if items else (position, 0)), items[1:], position
         if (group, element) != _ITEM:
             raise RefusedInputError(
                 f"truncated: no item of compressed pixels where one is expected ({group:04X},{element:04X})"
             )
-        if length > file_bytes - place:
+        if length > file_bytes - position:
             raise RefusedInputError(
-                f"truncated: {length} bytes of compressed pixels expected, {file_bytes - place} found"
+                f"truncated: {length} bytes of compressed pixels expected, {file_bytes - position} found"
             )
-        items.append((place, length))
+        items.append((position, length))
         if len(items) > most:
             raise RefusedInputError(f"the compressed pixels are in more than {most} fragments")
-        place += length
+        position += length
     raise RefusedInputError("truncated: the compressed pixels have no end mark")
 
 
 def _firsts_by_table(file: BinaryIO, table: tuple[int, int], fragments: Pieces, frames: int) -> list[int]:
     """Return the index of the first fragment of each frame by the basic offset table; empty if that does not fit."""
-    place, length = table
+    position, length = table
     if length != 4 * frames:
         return []
-    offsets = struct.unpack(f"<{frames}L", _read(file, place, length))
+    offsets = struct.unpack(f"<{frames}L", _read(file, position, length))
     number = {fragment[0] - fragments[0][0]: n for n, fragment in enumerate(fragments)}
     firsts = [number.get(offset, -1) for offset in offsets]
     rising = all(a < b for a, b in zip(firsts, firsts[1:], strict=False))
     return firsts if rising and firsts[0] == 0 else []
 
 
-def _read(file: BinaryIO, place: int, count: int) -> bytes:
-    if file.tell() != place:
-        file.seek(place)
+def _read(file: BinaryIO, position: int, count: int) -> bytes:
+    if file.tell() != position:
+        file.seek(position)
     data = file.read(count)
     if len(data) < count:
         raise RefusedInputError(f"truncated: {count} bytes of compressed pixels expected, {len(data)} found")

@@ -176,15 +176,15 @@ class Values:
 
     def wrong(self, keyword: str, expected: str) -> ValueProblem:
         tag = _TAGS[keyword]
-        place = _name_field(keyword)
+        field_name = _name_field(keyword)
         if keyword not in self and not self.elements.values.get(tag):
-            return ValueProblem(f"{place} is missing or empty, expected {expected}")
+            return ValueProblem(f"{field_name} is missing or empty, expected {expected}")
         raw = self.elements.values[tag]
         vr = self.elements.vrs.get(tag)
         binary = vr in ("US", "SS", "UL") or (vr is None and keyword in _BINARY)
         number = int.from_bytes(raw, self.byte_order)
         shown = str(number) if binary else f"'{escape_text(decode_text(raw))}'"
-        return ValueProblem(f"{place} is {shown}, expected {expected}")
+        return ValueProblem(f"{field_name} is {shown}, expected {expected}")
 
     def text(self, keyword: str) -> str:
         raw = self.elements.values.get(_TAGS[keyword], b"")
@@ -349,131 +349,131 @@ class _Walk:
         self.items_limit = items_limit
         self.repeated: set[int] = set()
 
-    def read_head(self, place: int, end: int, encoding: _Encoding) -> tuple[int, bytes, int, int]:
+    def read_head(self, position: int, end: int, encoding: _Encoding) -> tuple[int, bytes, int, int]:
         """Return tag, VR (empty in implicit VR), length, and the offset of the value."""
-        if place + 8 > end:
+        if position + 8 > end:
             raise ValueProblem("a sequence ends within the head of an element")
         if encoding.implicit:
-            group, element, length = encoding.implicit_head.unpack_from(self.data, place)
-            return group << 16 | element, b"", length, place + 8
-        group, element, vr, length = encoding.explicit_head.unpack_from(self.data, place)
+            group, element, length = encoding.implicit_head.unpack_from(self.data, position)
+            return group << 16 | element, b"", length, position + 8
+        group, element, vr, length = encoding.explicit_head.unpack_from(self.data, position)
         tag = group << 16 | element
         if group == 0xFFFE:
-            return tag, b"", encoding.length.unpack_from(self.data, place + 4)[0], place + 8
+            return tag, b"", encoding.length.unpack_from(self.data, position + 4)[0], position + 8
         if vr in LONG_VRS:
-            if place + 12 > end:
+            if position + 12 > end:
                 raise ValueProblem("a sequence ends within the head of an element")
-            return tag, vr, encoding.length.unpack_from(self.data, place + 8)[0], place + 12
+            return tag, vr, encoding.length.unpack_from(self.data, position + 8)[0], position + 12
         if not (0x41 <= vr[0] <= 0x5A and 0x41 <= vr[1] <= 0x5A):
             raise ValueProblem(f"the element ({group:04X},{element:04X}) has no VR within explicit VR")
-        return tag, vr, length, place + 8
+        return tag, vr, length, position + 8
 
     def read_data_set(
-        self, place: int, end: int, schema: Schema, encoding: _Encoding, where: str, *, top: bool = False
+        self, position: int, end: int, schema: Schema, encoding: _Encoding, context: str, *, top: bool = False
     ) -> tuple[Item, int]:
         """Read the elements up to `end`, or to the delimiter of an item; also return the offset after them."""
         item = Item()
         seen: dict[int, bytes] = {}
-        while place < end:
-            if top and end - place < 8:
+        while position < end:
+            if top and end - position < 8:
                 break
-            tag, vr, length, place = self.read_head(place, end, encoding)
+            tag, vr, length, position = self.read_head(position, end, encoding)
             if tag == ITEM_END or top and tag >= PIXEL_GROUP:
                 break
             inner = schema.get(tag)
             if tag in item.sequences:
-                raise ValueProblem(f"{name_tag(tag)} is there twice" + (f" in an item of {where}" if where else ""))
+                raise ValueProblem(f"{name_tag(tag)} is there twice" + (f" in an item of {context}" if context else ""))
             if inner is not None and (length == UNDEFINED_LENGTH or vr in (b"SQ", b"UN", b"")):
                 inside = _UNKNOWN if vr == b"UN" else encoding
-                item.sequences[tag], place = self.read_items(place, end, length, inner, inside, _name_number(tag))
+                item.sequences[tag], position = self.read_items(position, end, length, inner, inside, _name_number(tag))
             elif length == UNDEFINED_LENGTH:
-                place = self.skip(place, end, _UNKNOWN if vr == b"UN" else encoding)
+                position = self.skip(position, end, _UNKNOWN if vr == b"UN" else encoding)
             else:
-                stop = place + length
+                stop = position + length
                 if stop > end:
                     raise ValueProblem(
-                        f"the element {_name_number(tag)} needs {length} bytes, {end - place} are left"
-                        + (f" in {where}" if where else "")
+                        f"the element {_name_number(tag)} needs {length} bytes, {end - position} are left"
+                        + (f" in {context}" if context else "")
                     )
                 if inner is None and tag in schema:
-                    value = self.data[place:stop]
-                    self.compare(seen, tag, value, where)
+                    value = self.data[position:stop]
+                    self.compare(seen, tag, value, context)
                     if value:
                         item.values[tag], item.vrs[tag] = value, _VR_NAMES.get(vr)
-                place = stop
-        return item, place
+                position = stop
+        return item, position
 
-    def compare(self, seen: dict[int, bytes], tag: int, value: bytes, where: str) -> None:
+    def compare(self, seen: dict[int, bytes], tag: int, value: bytes, context: str) -> None:
         """Refuse a second, different value of a tag in one item: nobody can tell which was meant."""
         if tag not in seen:
             seen[tag] = value
         elif seen[tag] == value:
             self.repeated.add(tag)
         else:
-            inside = f" in an item of {where}" if where else ""
+            inside = f" in an item of {context}" if context else ""
             raise ValueProblem(f"{name_tag(tag)} is there twice{inside}, with two values")
 
     def read_items(
-        self, place: int, end: int, length: int, schema: Schema, encoding: _Encoding, where: str
+        self, position: int, end: int, length: int, schema: Schema, encoding: _Encoding, context: str
     ) -> tuple[list[Item], int]:
         """Read the items of a sequence; also return the offset after it."""
         delimited = length == UNDEFINED_LENGTH
-        stop = end if delimited else place + length
+        stop = end if delimited else position + length
         if stop > end:
-            raise ValueProblem(f"the sequence {where} needs {length} bytes, {end - place} are left")
+            raise ValueProblem(f"the sequence {context} needs {length} bytes, {end - position} are left")
         items: list[Item] = []
-        while place < stop:
-            tag, _, item_length, place = self.read_item_head(place, stop, encoding, where)
+        while position < stop:
+            tag, _, item_length, position = self.read_item_head(position, stop, encoding, context)
             if tag == SEQUENCE_END and delimited:
-                return items, place
+                return items, position
             if tag != ITEM:
-                raise ValueProblem(f"the sequence {where} holds {_name_number(tag)} in place of an item")
+                raise ValueProblem(f"the sequence {context} holds {_name_number(tag)} in place of an item")
             if self.items_left == 0:
                 raise ValueProblem(f"the sequences hold more than {self.items_limit} items")
             self.items_left -= 1
-            item_stop = stop if item_length == UNDEFINED_LENGTH else place + item_length
+            item_stop = stop if item_length == UNDEFINED_LENGTH else position + item_length
             if item_stop > stop:
                 raise ValueProblem(
-                    f"item {len(items) + 1} of {where} needs {item_length} bytes, {stop - place} are left"
+                    f"item {len(items) + 1} of {context} needs {item_length} bytes, {stop - position} are left"
                 )
-            item, place = self.read_data_set(place, item_stop, schema, encoding, where)
+            item, position = self.read_data_set(position, item_stop, schema, encoding, context)
             items.append(item)
             if item_length != UNDEFINED_LENGTH:
-                place = item_stop
+                position = item_stop
         if delimited:
-            raise ValueProblem(f"the sequence {where} has no end")
-        return items, place
+            raise ValueProblem(f"the sequence {context} has no end")
+        return items, position
 
-    def read_item_head(self, place: int, end: int, encoding: _Encoding, where: str) -> tuple[int, bytes, int, int]:
-        if place + 8 > end:
-            raise ValueProblem(f"the sequence {where} ends within an item")
-        group, element, length = encoding.implicit_head.unpack_from(self.data, place)
-        return group << 16 | element, b"", length, place + 8
+    def read_item_head(self, position: int, end: int, encoding: _Encoding, context: str) -> tuple[int, bytes, int, int]:
+        if position + 8 > end:
+            raise ValueProblem(f"the sequence {context} ends within an item")
+        group, element, length = encoding.implicit_head.unpack_from(self.data, position)
+        return group << 16 | element, b"", length, position + 8
 
-    def skip(self, place: int, end: int, encoding: _Encoding) -> int:
+    def skip(self, position: int, end: int, encoding: _Encoding) -> int:
         """Skip a sequence of undefined length; return the offset after it."""
         open_parts: list[tuple[bool, _Encoding]] = [(True, encoding)]  # is it a sequence (or an item of one), encoding
         while open_parts:
             in_sequence, inside = open_parts[-1]
             if in_sequence:
-                tag, vr, length, place = self.read_item_head(place, end, inside, "of undefined length")
+                tag, vr, length, position = self.read_item_head(position, end, inside, "of undefined length")
                 if tag == SEQUENCE_END:
                     open_parts.pop()
                     continue
                 if tag != ITEM:
                     raise ValueProblem(f"a sequence of undefined length holds {_name_number(tag)} in place of an item")
             else:
-                tag, vr, length, place = self.read_head(place, end, inside)
+                tag, vr, length, position = self.read_head(position, end, inside)
                 if tag == ITEM_END:
                     open_parts.pop()
                     continue
             if length != UNDEFINED_LENGTH:
-                place += length
+                position += length
             else:
                 open_parts.append((not in_sequence, _UNKNOWN if vr == b"UN" else inside))
                 if len(open_parts) > 2 * _DEPTH_LIMIT:
                     raise ValueProblem(f"sequences are nested too deep (more than {_DEPTH_LIMIT} levels)")
-        return place
+        return position
 
 
 def decode_number(raw: bytes, form: str, little_endian: bool) -> float | int | None:

@@ -116,9 +116,9 @@ def limit_memory(more_bytes: int) -> None:
             used = int(file.read().split()[0]) * resource.getpagesize()
     except OSError:
         used = _SIZE_WITHOUT_PROC
-    for what, limit in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, used + more_bytes)):
+    for resource_kind, limit in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, used + more_bytes)):
         try:
-            resource.setrlimit(what, (limit, limit))
+            resource.setrlimit(resource_kind, (limit, limit))
         except (OSError, ValueError):
             pass  # a stricter limit is set, or the system (macOS) does not know this one
 

@@ -133,37 +133,37 @@ def _read_jpeg_2000(data: bytes) -> Codestream:
 
 def _unwrap_jp2(data: bytes) -> bytes:
     """Return the codestream in a JP2 file, which some writers put into DICOM against its rules."""
-    place = 0
-    while place + 8 <= len(data):
-        length, kind = struct.unpack(">L4s", data[place : place + 8])
+    position = 0
+    while position + 8 <= len(data):
+        length, kind = struct.unpack(">L4s", data[position : position + 8])
         head = 8
-        if length == 1 and place + 16 <= len(data):
-            length, head = struct.unpack(">Q", data[place + 8 : place + 16])[0], 16
+        if length == 1 and position + 16 <= len(data):
+            length, head = struct.unpack(">Q", data[position + 8 : position + 16])[0], 16
         if kind == b"jp2c":
-            return data[place + head : place + length if length else len(data)]
+            return data[position + head : position + length if length else len(data)]
         if length < head:
             break
-        place += length
+        position += length
     raise RefusedInputError("the compressed frame is a JP2 file without a codestream")
 
 
 def _read_jpeg(data: bytes, transfer_syntax: str) -> Codestream:
     wanted, name = (_LS_FRAME, "JPEG-LS") if transfer_syntax in JPEG_LS else (_LOSSLESS_FRAME, "JPEG lossless")
     assert transfer_syntax in (*JPEG_LS, *JPEG_LOSSLESS)
-    place = 2 if data.startswith(b"\xff\xd8") else len(data)
-    while place + 10 <= len(data) and data[place] == 0xFF:
-        marker = data[place + 1]
+    position = 2 if data.startswith(b"\xff\xd8") else len(data)
+    while position + 10 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
         if marker == 0xFF:  # fill byte
-            place += 1
+            position += 1
             continue
         if marker == _LS_FRAME or (0xC0 <= marker <= 0xCF and marker not in _NO_FRAMES):
             if marker != wanted:
                 break
-            bits, rows, columns, components = struct.unpack(">B2HB", data[place + 4 : place + 10])
+            bits, rows, columns, components = struct.unpack(">B2HB", data[position + 4 : position + 10])
             _check_components(components)
             _check_end(data)
             return Codestream(data, rows, columns, bits, None)
-        place += 2 + struct.unpack(">H", data[place + 2 : place + 4])[0]
+        position += 2 + struct.unpack(">H", data[position + 2 : position + 4])[0]
     raise RefusedInputError(f"the compressed frame is no {name} codestream")
 
 
@@ -255,9 +255,9 @@ class StoredPixels(Closing):
         needed = header.pixel_offset + header.frames * stored.nbytes
         inflated = self._know(self._inflated, header, lambda: _inflate_data_set(header, needed))
         first = header.pixel_offset + header.frame * stored.nbytes
-        found = max(len(inflated) - first, 0)
-        if found < stored.nbytes:
-            raise RefusedInputError(f"truncated: {stored.nbytes} bytes of pixels expected, {found} found")
+        size = max(len(inflated) - first, 0)
+        if size < stored.nbytes:
+            raise RefusedInputError(f"truncated: {stored.nbytes} bytes of pixels expected, {size} found")
         stored[...] = np.frombuffer(inflated, stored.dtype, stored.size, first).reshape(stored.shape)
 
     def _know(self, known: dict[Path, Known], header: SliceHeader, find: Callable[[], Known]) -> Known:
@@ -287,11 +287,11 @@ def _read_into(file: Any, stored: NDArray[Any]) -> None:
         done += count
 
 
-def _check_compressed_bytes(found: int, pixel_bytes: int) -> None:
+def _check_compressed_bytes(size: int, pixel_bytes: int) -> None:
     """Refuse a frame of too many bytes: a failing compression makes an image only a little larger."""
     most = _COMPRESSED_RATIO * pixel_bytes + _COMPRESSED_EXTRA_BYTES
-    if found > most:
-        raise RefusedInputError(f"the compressed frame has {found} bytes for {pixel_bytes} of pixels, {most} at most")
+    if size > most:
+        raise RefusedInputError(f"the compressed frame has {size} bytes for {pixel_bytes} of pixels, {most} at most")
 
 
 def _inflate_data_set(header: SliceHeader, needed: int) -> bytes:

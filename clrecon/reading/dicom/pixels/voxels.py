@@ -99,20 +99,20 @@ def _read_overlay_bits(header: SliceHeader) -> list[int]:
     return [bit for raw in values.values() if (bit := int.from_bytes(raw[:2], order)) > 0]
 
 
-def describe_stray_bits(found: Iterable[StrayBits | None], headers: Iterable[SliceHeader]) -> tuple[int, str]:
+def describe_stray_bits(stray_bits: Iterable[StrayBits | None], headers: Iterable[SliceHeader]) -> tuple[int, str]:
     """Return how many values of a stack lost bits of their own, and one line about it; 0 and "" if there are none."""
-    pairs = [(one, header) for one, header in zip(found, headers, strict=True) if one is not None]
+    pairs = [(one, header) for one, header in zip(stray_bits, headers, strict=True) if one is not None]
     signs = any(one.signs for one, _ in pairs)
     counts = [one.odd + (one.plain if signs else 0) for one, _ in pairs]
     count = sum(counts)
     if not count:
         return 0, ""
-    one, header = next(pair for pair, own in zip(pairs, counts, strict=True) if own)
-    assert one.example is not None
+    stray, header = next(pair for pair, own in zip(pairs, counts, strict=True) if own)
+    assert stray.example is not None
     return count, (
         f"values beyond the {header.bits_stored} stored bits (bits above HighBit {header.high_bit}, neither sign nor "
         f"overlay) in {sum(own > 0 for own in counts)} of the slices, cut off, so that their HU wrap around (stored "
-        f"{one.example[0]} is read as {one.example[1]})"
+        f"{stray.example[0]} is read as {stray.example[1]})"
     )
 
 
@@ -186,15 +186,15 @@ def _fill_volume(
             pool.shutdown(cancel_futures=True)
             raise
         padding_hu = padding.fill(pool.map)
-    padded, said = padding.count, describe_masked_tissue(tissue)
+    padded, notes = padding.count, describe_masked_tissue(tissue)
     disc = fill_disc_padding(voxels) if padding_hu is None else None
     if disc is not None:
-        padded, padding_hu, said = disc.voxels, disc.filled, disc.describe(voxels.size)
+        padded, padding_hu, notes = disc.voxels, disc.filled, disc.describe(voxels.size)
     if padding_hu is not None:
         low, high = min(low, padding_hu), max(high, padding_hu)
     count, text = describe_stray_bits(stray, slices)
     return PixelFacts(
-        padded / voxels.size, float(low), float(high), padding_hu, count, text, said, disc and disc.value,
+        padded / voxels.size, float(low), float(high), padding_hu, count, text, notes, disc and disc.value,
         tuple(find_between(sorted(blank), len(slices))),
     )  # fmt: skip
 

@@ -92,9 +92,9 @@ def judge_series(
     first = stack.slices[0]
     gates.append(judge_steps((first.di_mm, first.dj_mm), stack.line.gap_median_mm))
     gates += _gates_of_places(stack)
-    what = "slices at the place of another that differ from it and are no phases"
+    words = "slices at the place of another that differ from it and are no phases"
     gates.append(judge_numbers(series.census, stack, _count_copies(series)))
-    gates.append(none_of("duplicate_slices", _count_doubled(series), what))
+    gates.append(none_of("duplicate_slices", _count_doubled(series), words))
     gates.append(_judge_one_volume(series, likeness))
     gates += [
         none_of("hu_known", count_unknown(stack.slices), "slices whose values are not known to be HU"),
@@ -115,19 +115,19 @@ def judge_series(
 
 def _gates_of_places(stack: Stack) -> Iterator[Gate]:
     directions = measure_directions(stack.slices)
-    what = "ImageOrientationPatient is off unit length or right angle by"
-    yield at_most("orientation_exact", directions.deviation, ORIENTATION_EXACT, None, what)
-    what = "ImageOrientationPatient of a slice differs from the mean by"
+    words = "ImageOrientationPatient is off unit length or right angle by"
+    yield at_most("orientation_exact", directions.deviation, ORIENTATION_EXACT, None, words)
+    words = "ImageOrientationPatient of a slice differs from the mean by"
     if directions.deviation > ORIENTATION_LIMIT:
-        yield unmeasured("orientation_same", ORIENTATION_SPREAD_RAD, "rad", f"{what}: there is no mean")
+        yield unmeasured("orientation_same", ORIENTATION_SPREAD_RAD, "rad", f"{words}: there is no mean")
     else:
-        yield at_most("orientation_same", directions.spread_rad, directions.spread_allowed_rad, "rad", what)
+        yield at_most("orientation_same", directions.spread_rad, directions.spread_allowed_rad, "rad", words)
     line = stack.line
-    what = "largest distance of a slice from even positions"
+    words = "largest distance of a slice from even positions"
     if line.residual_max_mm is None or line.tolerance_mm is None:
-        yield unmeasured("grid_residual", 0.01, "mm", f"{what}: there is one slice")
+        yield unmeasured("grid_residual", 0.01, "mm", f"{words}: there is one slice")
         return
-    yield at_most("grid_residual", line.residual_max_mm, line.tolerance_mm, "mm", what)
+    yield at_most("grid_residual", line.residual_max_mm, line.tolerance_mm, "mm", words)
     yield none_of("missing_slices", stack.missing, "slices missing in between")
     yield _judge_thickness(stack)
     yield _judge_stated_gap(stack)
@@ -136,16 +136,16 @@ def _gates_of_places(stack: Stack) -> Iterator[Gate]:
 
 def _judge_thickness(stack: Stack) -> Gate:
     """Compare gaps with SliceThickness: how much of the tissue was measured."""
-    what = "largest gap between slices as a multiple of SliceThickness; above 1 the tissue between was not measured"
+    words = "largest gap between slices as a multiple of SliceThickness; above 1 the tissue between was not measured"
     thickness = np.array([header.slice_thickness_mm or 0.0 for header in stack.slices])
     if (thickness <= 0.0).any():
-        return unmeasured("gap_thickness", _GAP_THICKNESSES, None, f"{what}: the thickness is not stated")
+        return unmeasured("gap_thickness", _GAP_THICKNESSES, None, f"{words}: the thickness is not stated")
     gaps = np.diff(stack.distances_mm)
     worst = int(np.argmax(2.0 * gaps / (thickness[1:] + thickness[:-1])))
     ratio = float(2.0 * gaps[worst] / (thickness[worst] + thickness[worst + 1]))
     if ratio > _GAP_THICKNESSES:
-        what += f" ({gaps[worst]:g} mm at a thickness of {thickness[worst]:g} mm)"
-    return at_most("gap_thickness", ratio, _GAP_THICKNESSES, None, what)
+        words += f" ({gaps[worst]:g} mm at a thickness of {thickness[worst]:g} mm)"
+    return at_most("gap_thickness", ratio, _GAP_THICKNESSES, None, words)
 
 
 def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
@@ -164,10 +164,10 @@ def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
 def _judge_one_volume(series: Series, likeness: Likeness | None) -> Gate:
     """Judge whether slices differ more from neighbours than from others, and whether an element alternates."""
     doubts = 0 if series.stack is None or series.find_doubt() == "" else 1
-    what = "signs of several volumes between each other: a header that alternates, neighbours less alike than others"
+    words = "signs of several volumes between each other: a header that alternates, neighbours less alike than others"
     if likeness is None and not doubts:
-        return unmeasured("one_volume", 0, None, f"{what}: the pixels were not read, or too few")
-    return none_of("one_volume", doubts + (likeness is not None and likeness.is_mixed), what)
+        return unmeasured("one_volume", 0, None, f"{words}: the pixels were not read, or too few")
+    return none_of("one_volume", doubts + (likeness is not None and likeness.is_mixed), words)
 
 
 def _count_copies(series: Series) -> int:
@@ -187,21 +187,23 @@ def _count_doubled(series: Series) -> int:
 
 def _judge_stated_gap(stack: Stack) -> Gate:
     """Compare SpacingBetweenSlices with the positions: a sign that every second slice is missing."""
-    what, bound = "SpacingBetweenSlices differs from the positions by", 100.0 * STATED_GAP_TOLERANCE
+    words, bound = "SpacingBetweenSlices differs from the positions by", 100.0 * STATED_GAP_TOLERANCE
     stated_gap = measure_stated_gap(stack.slices, stack.positions_mm, stack.line.gap_median_mm)
     if stated_gap is None:
-        return unmeasured("stated_gap", bound, "%", f"{what}: it is not stated")
-    return at_most("stated_gap", 100.0 * stated_gap[2], bound, "%", what)
+        return unmeasured("stated_gap", bound, "%", f"{words}: it is not stated")
+    return at_most("stated_gap", 100.0 * stated_gap[2], bound, "%", words)
 
 
 def _judge_stated_places(stack: Stack) -> Gate:
     """Compare position, orientation and pixel spacing with other elements that say the same."""
-    what = "elements that contradict the places of the voxels"
-    said = [text for text in (_compare_locations(stack), _compare_field(stack), _compare_letters(stack)) if text != ""]
-    wrong = [text for text in said if text is not None]
-    if not any(text is None for text in said) and not wrong:
-        return unmeasured("stated_places", 0, None, f"{what}: there are none")
-    return none_of("stated_places", len(wrong), f"{what} ({'; '.join(wrong)})" if wrong else what)
+    words = "elements that contradict the places of the voxels"
+    clashes = [
+        text for text in (_compare_locations(stack), _compare_field(stack), _compare_letters(stack)) if text != ""
+    ]
+    wrong = [text for text in clashes if text is not None]
+    if not any(text is None for text in clashes) and not wrong:
+        return unmeasured("stated_places", 0, None, f"{words}: there are none")
+    return none_of("stated_places", len(wrong), f"{words} ({'; '.join(wrong)})" if wrong else words)
 
 
 def _compare_locations(stack: Stack) -> str | None:
@@ -249,12 +251,12 @@ def _compare_letters(stack: Stack) -> str | None:
     first, directions = stack.slices[0], measure_directions(stack.slices)
     if not first.stated_letters or first.quadruped or directions.deviation > ORIENTATION_LIMIT:
         return ""
-    found = []
+    letters_found = []
     for direction, letters in zip((directions.row, directions.column), first.stated_letters.split("\\"), strict=True):
         axis = int(np.argmax(np.abs(direction)))
         letter = ("LR", "PA", "HF")[axis][int(direction[axis] < 0.0)]
-        found.append(letters if letter in letters or abs(direction[axis]) < _CLEAR_DIRECTION else letter)
-    shown = "\\".join(found)
+        letters_found.append(letters if letter in letters or abs(direction[axis]) < _CLEAR_DIRECTION else letter)
+    shown = "\\".join(letters_found)
     if shown == first.stated_letters:
         return None
     return f"PatientOrientation says {first.stated_letters}, by ImageOrientationPatient it is {shown}"

@@ -67,7 +67,7 @@ class Choice(NamedTuple):
     why: str
 
 
-def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> Choice:
+def choose_series(listed: Sequence[Series], wanted: int | str | None = None) -> Choice:
     """Choose the series to read.
 
     wanted: Number in the listing, SeriesInstanceUID, its hash, the start of one of these (`_SHORTEST_START`
@@ -77,16 +77,16 @@ def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> C
         different directions, leave no choice.
     """
     if wanted is None:
-        ct = [series for series in found if series.kind != "other"]
+        ct = [series for series in listed if series.kind != "other"]
         if not ct:
-            counts = Counter(series.identity.modality for series in found)
-            what = ", ".join(f"{count} series of modality {modality}" for modality, count in sorted(counts.items()))
-            raise NoDicomError(f"found {what}, no CT series")
+            counts = Counter(series.identity.modality for series in listed)
+            kinds = ", ".join(f"{count} series of modality {modality}" for modality, count in sorted(counts.items()))
+            raise NoDicomError(f"found {kinds}, no CT series")
         _check_one_patient(ct)
         return _take_best(ct)
-    matches = _match_series(found, wanted)
+    matches = _match_series(listed, wanted)
     if not matches:
-        raise UsageError(f"no series matches {name_parameter('series')} {wanted!r}; there are {_list_lines(found)}")
+        raise UsageError(f"no series matches {name_parameter('series')} {wanted!r}; there are {_list_lines(listed)}")
     if len({series.identity for series in matches}) != 1:
         raise UsageError(f"{len(matches)} series match {name_parameter('series')} {wanted!r}: {_list_lines(matches)}")
     chosen, why = Choice(matches[0], "") if len(matches) == 1 else _take_best(matches)
@@ -106,26 +106,26 @@ def _check_one_patient(ct: Sequence[Series]) -> None:
         )
 
 
-def _match_series(found: Sequence[Series], wanted: int | str) -> list[Series]:
+def _match_series(listed: Sequence[Series], wanted: int | str) -> list[Series]:
     text = str(wanted).strip()
     if not text:
         return []
-    by_id = [series for series in found if text in _ids_of(series)]
+    by_id = [series for series in listed if text in _ids_of(series)]
     if by_id:
         return by_id
     if text.isascii() and text.isdigit():
-        by_number = [series for series in found if series.number == int(text)]
+        by_number = [series for series in listed if series.number == int(text)]
         if by_number or len(text) < _SHORTEST_START:
             return by_number
     folded = text.casefold()
-    exact = [series for series in found if series.identity.description.casefold() == folded]
+    exact = [series for series in listed if series.identity.description.casefold() == folded]
     if exact:
         return exact
     begins = [
-        len(text) >= _SHORTEST_START and any(own.startswith(folded) for own in _ids_of(series)) for series in found
+        len(text) >= _SHORTEST_START and any(own.startswith(folded) for own in _ids_of(series)) for series in listed
     ]
-    parts = [folded in series.identity.description.casefold() for series in found]
-    return [one for one, begun, part in zip(found, begins, parts, strict=True) if begun or part]
+    parts = [folded in series.identity.description.casefold() for series in listed]
+    return [one for one, begun, part in zip(listed, begins, parts, strict=True) if begun or part]
 
 
 def _ids_of(series: Series) -> list[str]:
@@ -167,42 +167,42 @@ def _take_best(candidates: Sequence[Series]) -> Choice:
 def _sift(near: Sequence[tuple[Series, Rank]]) -> tuple[list[Series], str]:
     """Keep the best of similar series, step by step; returns those that are equally good and the last reason."""
     why = "with the most slices"
-    kept = [each for each in near if each[1].original]
-    if kept and len(kept) < len(near):
+    candidates = [each for each in near if each[1].original]
+    if candidates and len(candidates) < len(near):
         why = "original images before derived ones"
-        kept_axes = {rank.direction for _, rank in kept}
+        kept_axes = {rank.direction for _, rank in candidates}
         if kept_axes == {"axial"} and any(rank.direction != "axial" for _, rank in near):
             why = "original axial images before derived ones in other directions"
-    kept = kept or list(near)
-    if len({rank.direction for _, rank in kept}) > 1:
-        lines = join_names(f"[{series.describe()}, {rank.direction}]" for series, rank in kept)
+    candidates = candidates or list(near)
+    if len({rank.direction for _, rank in candidates}) > 1:
+        lines = join_names(f"[{series.describe()}, {rank.direction}]" for series, rank in candidates)
         raise RefusedInputError(
-            f"{len(kept)} CT series of similar size run in different directions, choose one with"
+            f"{len(candidates)} CT series of similar size run in different directions, choose one with"
             f" {name_parameter('series')}: {lines}"
         )
-    known = [rank.thickness_mm for _, rank in kept if rank.thickness_mm is not None]
-    if len(known) == len(kept) and max(known) > min(known):
-        kept = [each for each in kept if each[1].thickness_mm == min(known)]
+    known = [rank.thickness_mm for _, rank in candidates if rank.thickness_mm is not None]
+    if len(known) == len(candidates) and max(known) > min(known):
+        candidates = [each for each in candidates if each[1].thickness_mm == min(known)]
         why = f"with the thinnest slices, {min(known):g} mm"
-    most = max(series.count for series, _ in kept)
-    return [series for series, _ in kept if series.count == most], why
+    most = max(series.count for series, _ in candidates)
+    return [series for series, _ in candidates if series.count == most], why
 
 
-def describe_left(found: Sequence[Series], choice: Choice, wanted: int | str | None = None) -> list[str]:
+def describe_left(listed: Sequence[Series], choice: Choice, wanted: int | str | None = None) -> list[str]:
     """Say which CT series are not used and why, where the choice was not the caller's; warn of what may be slices."""
     chosen = choice.series
-    left = [series for series in found if series is not chosen]
+    left = [series for series in listed if series is not chosen]
     stacks = [series for series in left if series.kind == "stack"] if wanted is None else []
     lines = []
     for series in stacks:
         unusable = series.count >= chosen.count and series.problems
         lines.append(f"[{series.describe()}{', cannot be used' if unusable else ''}]")
-    told = []
+    sentences = []
     if lines:
         read = f"; series {chosen.number} is read, {choice.why}" if choice.why else ""
         noun = "other CT series"
-        told = [f"{count_of(len(lines), noun, noun)} not used: {join_names(lines)}{read}"]
-    return [*told, *_describe_doubtful(left, chosen), *_describe_other_planes(left, chosen)]
+        sentences = [f"{count_of(len(lines), noun, noun)} not used: {join_names(lines)}{read}"]
+    return [*sentences, *_describe_doubtful(left, chosen), *_describe_other_planes(left, chosen)]
 
 
 def _describe_doubtful(left: Sequence[Series], chosen: Series) -> list[str]:
@@ -225,9 +225,9 @@ def _may_be_slices(series: Series, chosen: Series) -> bool:
     return _chord(series.headers[0], chosen.headers[0]) < _SAME_PLANE
 
 
-def _chord(one: SliceHeader, other: SliceHeader) -> float:
+def _chord(first: SliceHeader, second: SliceHeader) -> float:
     """Return how far the directions of two slices lie apart, as unit vectors."""
-    return max(math.dist(one.row_cosines, other.row_cosines), math.dist(one.column_cosines, other.column_cosines))
+    return max(math.dist(first.row_cosines, second.row_cosines), math.dist(first.column_cosines, second.column_cosines))
 
 
 def _describe_other_planes(left: Sequence[Series], chosen: Series) -> list[str]:
@@ -242,6 +242,6 @@ def _describe_other_planes(left: Sequence[Series], chosen: Series) -> list[str]:
     return [f"{count} slice{'s' * (count > 1)} of the series that is read left: in another plane, {angles} degrees off"]
 
 
-def _list_lines(found: Sequence[Series]) -> str:
+def _list_lines(listed: Sequence[Series]) -> str:
     """List series for an error; what people typed into their headers is left to the listing."""
-    return join_names(f"[{series.describe()}]" for series in found) + ' ("clrecon info" describes them)'
+    return join_names(f"[{series.describe()}]" for series in listed) + ' ("clrecon info" describes them)'

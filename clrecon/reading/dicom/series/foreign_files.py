@@ -66,8 +66,8 @@ def describe_container(start: bytes) -> str:
     for mark, kind in _STARTS:
         if start.startswith(mark):
             return kind
-    where, mark = _TAR_MARK
-    return "tar archive" if start[where] == mark else ""
+    offset, mark = _TAR_MARK
+    return "tar archive" if start[offset] == mark else ""
 
 
 def is_text(start: bytes) -> bool:
@@ -82,8 +82,8 @@ def advise_on(kinds: Iterable[str]) -> str:
     packed, grids = sorted(_ARCHIVES & kinds), sorted(_GRIDS & kinds)
     advice = [f"unpack each {' and '.join(packed)} and name the folder"] if packed else []
     if grids or "gzip file" in kinds:
-        what = " or ".join(grids) or "NIfTI volume (.nii.gz)"
-        advice.append(f"a {what} is read when the file itself is named")
+        formats = " or ".join(grids) or "NIfTI volume (.nii.gz)"
+        advice.append(f"a {formats} is read when the file itself is named")
     if any("mesh" in kind for kind in kinds):
         advice.append("a mesh is shown with clrecon render and measured with clrecon distance")
     if "NumPy array" in kinds:
@@ -141,8 +141,8 @@ class _Slices:
         return bool(drawn) and any(map(str.isdigit, name))
 
     def has_size_like(self, size: int) -> bool:
-        place = bisect_left(self.sizes, size - _SIZE_BYTES)
-        return place < len(self.sizes) and self.sizes[place] <= size + _SIZE_BYTES
+        index = bisect_left(self.sizes, size - _SIZE_BYTES)
+        return index < len(self.sizes) and self.sizes[index] <= size + _SIZE_BYTES
 
 
 def _pattern(name: str) -> str:
@@ -206,5 +206,5 @@ def _judge(stranger: Stranger, folders: dict[str, _Slices], paths: set[str]) -> 
     return ""
 
 
-def _say(what: str) -> str:
-    return what if what in (EMPTY, UNKNOWN, TEXT) or what.startswith("blank") else f"of the kind {what}"
+def _say(kind: str) -> str:
+    return kind if kind in (EMPTY, UNKNOWN, TEXT) or kind.startswith("blank") else f"of the kind {kind}"

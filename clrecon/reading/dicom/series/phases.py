@@ -79,14 +79,14 @@ class Places:
 def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHeader, SliceHeader], bool]) -> Places:
     """Leave out copies and find phases of the slices at each place; `same` tells whether two have the same pixels."""
     sorted_out = [_sort_copies(slices, same) for slices in places]
-    kept = [[copies[0] for copies in found] for found in sorted_out]
+    distinct = [[copies[0] for copies in found] for found in sorted_out]
     count = sum(map(len, places))
-    headers = tuple(chain(*kept))
+    headers = tuple(chain(*distinct))
     if len(places) == 1 and count > 1:
         phases = _find_phases(sorted_out)
         problem = _describe_one_place(count, headers, phases)
         return Places(headers, count - len(headers), phases, problem=problem)
-    if max(map(len, kept), default=0) <= 1:
+    if max(map(len, distinct), default=0) <= 1:
         phases = _part(find_mixture(headers))
         return Places(headers, count - len(headers), phases, interleaved=bool(phases))
     phases = _find_phases(sorted_out)
@@ -94,7 +94,7 @@ def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHe
         # A slice that is equal in two phases (air, at the ends) is a copy, but belongs to both.
         headers = tuple(chain(*(phase.headers for phase in phases)))
         return Places(headers, count - len(headers), phases)
-    crowded = [slices for slices in kept if len(slices) > 1]
+    crowded = [slices for slices in distinct if len(slices) > 1]
     shown = "; ".join(join_names(header.name for header in slices) for slices in crowded[:PLACES_SHOWN])
     more = f"; and {len(crowded) - PLACES_SHOWN} more" if len(crowded) > PLACES_SHOWN else ""
     alike = all(lie_alike(slices[0], header) for slices in crowded for header in slices[1:])
@@ -122,34 +122,35 @@ def _describe_digits(headers: Sequence[SliceHeader]) -> str:
 
 def _describe_one_place(count: int, headers: Sequence[SliceHeader], phases: Sequence[Phase]) -> str:
     """Describe the problem of a series whose images all lie at one place."""
-    what = "copies of each other"
+    kind = "copies of each other"
     if phases:
-        what = f"{len(phases)} phases of one slice each, which differ in {phases[0].keyword}"
+        kind = f"{len(phases)} phases of one slice each, which differ in {phases[0].keyword}"
     elif len(headers) > 1:
-        what = f"{len(headers)} of them with different pixels, and no element of their headers parts them into phases"
-    at = ", ".join(f"{value:g}" for value in headers[0].position_mm)
+        kind = f"{len(headers)} of them with different pixels, and no element of their headers parts them into phases"
+    position = ", ".join(f"{value:g}" for value in headers[0].position_mm)
     return (
-        f"all {count} images lie in one plane, at ImagePositionPatient ({at}) mm ({what}): a single slice cannot make"
+        f"all {count} images lie in one plane, at ImagePositionPatient ({position}) mm ({kind}): a single slice"
+        " cannot make"
         f" a volume{', and choosing a phase does not help' if phases else ''}. If one slice was scanned repeatedly"
         " (cine, perfusion, bolus tracking), use another series; if these are different slices, their positions were"
         " lost or overwritten: export the series again"
     )
 
 
-def part_alternating(places: Places, found: Alternation) -> Places:
+def part_alternating(places: Places, alternation: Alternation) -> Places:
     """Divide slices, one at each place, into phases by an alternation along them; the phases share no place."""
-    members = [tuple(places.headers[k] for k in group) for group in found.groups]
-    if not found.tag:
+    members = [tuple(places.headers[k] for k in group) for group in alternation.groups]
+    if not alternation.tag:
         shown = [f"{number} of {len(members)}" for number in range(1, len(members) + 1)]
         keyword = "place"
-    elif found.heaps:
-        shown, keyword = [str(number) for number in range(1, len(members) + 1)], f"order of {found.name}"
-    elif found.name in PHASE_KEYWORDS:
-        keyword = found.name
+    elif alternation.heaps:
+        shown, keyword = [str(number) for number in range(1, len(members) + 1)], f"order of {alternation.name}"
+    elif alternation.name in PHASE_KEYWORDS:
+        keyword = alternation.name
         shown = _show((keyword,), [values_of(headers[0], (keyword,)) for headers in members])
     else:  # free text may contain anything
-        shown = ["(none)" if number == found.absent else f"value {number + 1}" for number in range(len(members))]
-        keyword = found.name
+        shown = ["(none)" if number == alternation.absent else f"value {number + 1}" for number in range(len(members))]
+        keyword = alternation.name
     phases = tuple(
         Phase(number, keyword, text, headers)
         for number, (text, headers) in enumerate(zip(shown, members, strict=True), start=1)
@@ -157,26 +158,28 @@ def part_alternating(places: Places, found: Alternation) -> Places:
     return replace(places, phases=phases, interleaved=True, doubt="")
 
 
-def lie_alike(one: SliceHeader, other: SliceHeader) -> bool:
+def lie_alike(first: SliceHeader, second: SliceHeader) -> bool:
     """True when two slices at one place have the same geometry: empty slices have equal pixels at every place."""
     return (
-        one.frame_of_reference == other.frame_of_reference
-        and _is_near(one.position_mm, other.position_mm, SAME_POSITION_MM)
-        and _is_near((one.di_mm, one.dj_mm), (other.di_mm, other.dj_mm), _SAME_SPACING * min(one.di_mm, one.dj_mm))
-        and _is_near(one.row_cosines, other.row_cosines, _SAME_DIRECTION)
-        and _is_near(one.column_cosines, other.column_cosines, _SAME_DIRECTION)
+        first.frame_of_reference == second.frame_of_reference
+        and _is_near(first.position_mm, second.position_mm, SAME_POSITION_MM)
+        and _is_near(
+            (first.di_mm, first.dj_mm), (second.di_mm, second.dj_mm), _SAME_SPACING * min(first.di_mm, first.dj_mm)
+        )
+        and _is_near(first.row_cosines, second.row_cosines, _SAME_DIRECTION)
+        and _is_near(first.column_cosines, second.column_cosines, _SAME_DIRECTION)
     )
 
 
-def _is_near(one: Sequence[float], other: Sequence[float], tolerance: float) -> bool:
-    return all(abs(a - b) <= tolerance for a, b in zip(one, other, strict=True))
+def _is_near(first: Sequence[float], second: Sequence[float], tolerance: float) -> bool:
+    return all(abs(a - b) <= tolerance for a, b in zip(first, second, strict=True))
 
 
-def have_same_pixels(one: SliceHeader, other: SliceHeader, source: StoredPixels | None = None) -> bool:
+def have_same_pixels(first: SliceHeader, second: SliceHeader, source: StoredPixels | None = None) -> bool:
     """True when two slices hold the same HU; reads both, from `source` where many are compared."""
-    if (one.rows, one.columns) != (other.rows, other.columns):
+    if (first.rows, first.columns) != (second.rows, second.columns):
         return False
-    voxels, _ = read_voxels([one, other], source=source)
+    voxels, _ = read_voxels([first, second], source=source)
     return np.array_equal(voxels[0], voxels[1])
 
 
@@ -184,41 +187,41 @@ def _sort_copies(
     slices: Sequence[SliceHeader], same: Callable[[SliceHeader, SliceHeader], bool]
 ) -> list[list[SliceHeader]]:
     """Sort the slices at one place so that copies are together."""
-    found: list[list[SliceHeader]] = []
+    copy_groups: list[list[SliceHeader]] = []
     for header in slices:
-        for copies in found:
+        for copies in copy_groups:
             if lie_alike(copies[0], header) and same(copies[0], header):
                 copies.append(header)
                 break
         else:
-            found.append([header])
-    return found
+            copy_groups.append([header])
+    return copy_groups
 
 
 def _find_phases(places: Sequence[Sequence[Sequence[SliceHeader]]]) -> tuple[Phase, ...]:
     """Find phases among slices that are grouped by place, and at each place by copies."""
-    kept = [[copies[0] for copies in found] for found in places]
-    for keywords in _keyword_choices(kept):
+    distinct = [[copies[0] for copies in found] for found in places]
+    for keywords in _keyword_choices(distinct):
         groups: dict[tuple[str, ...], list[SliceHeader]] = defaultdict(list)
         clean, most = True, 0
-        for found in places:
-            here = [{values_of(header, keywords): header for header in reversed(copies)} for copies in found]
+        for copy_groups in places:
+            here = [{values_of(header, keywords): header for header in reversed(copies)} for copies in copy_groups]
             values = list(chain(*here))
             clean, most = clean and len(set(values)) == len(values), max(most, len(values))
-            for one in here:
-                for value, header in one.items():
+            for headers_at in here:
+                for value, header in headers_at.items():
                     groups[value].append(header)
         if clean and (len(groups) == most or min(map(len, groups.values())) >= _SMALLEST_PHASE):
             return _part((keywords, groups))
     everything = [list(chain(*slices)) for slices in places]
-    return _rank_by_time(kept) or _rank_by_time(everything)
+    return _rank_by_time(distinct) or _rank_by_time(everything)
 
 
-def _part(found: tuple[tuple[str, ...], Mapping[tuple[str, ...], Sequence[SliceHeader]]] | None) -> tuple[Phase, ...]:
+def _part(choice: tuple[tuple[str, ...], Mapping[tuple[str, ...], Sequence[SliceHeader]]] | None) -> tuple[Phase, ...]:
     """Make phases of groups of slices, by the values of keywords."""
-    if found is None:
+    if choice is None:
         return ()
-    keywords, groups = found
+    keywords, groups = choice
     ordered = sorted(groups, key=_order)
     shown = _show(keywords, ordered)
     return tuple(
@@ -288,8 +291,8 @@ def _order(value: tuple[str, ...]) -> list[tuple[int, float, str]]:
 def _show(keywords: Sequence[str], values: Sequence[tuple[str, ...]]) -> list[str]:
     """Return values for a listing; dates and times, which may identify the patient, only since the first one."""
     columns = []
-    for place, keyword in enumerate(keywords):
-        column = [value[place] for value in values]
+    for index, keyword in enumerate(keywords):
+        column = [value[index] for value in values]
         if keyword in _TIME_KEYWORDS:
             seconds = [_seconds(text) for text in column]
             first = min((value for value in seconds if value is not None), default=0.0)
@@ -316,10 +319,10 @@ def describe_phases(places: Places) -> str:
     phases = places.phases
     shown = [str(phase) for phase in phases[:_PHASES_SHOWN]]
     more = f" and {len(phases) - _PHASES_SHOWN} more" if len(phases) > _PHASES_SHOWN else ""
-    where = "whose slices lie between each other" if places.interleaved else "at the same places"
+    arrangement = "whose slices lie between each other" if places.interleaved else "at the same places"
     spacing = f"; {describe_spacing(phases, phases[0])}" if places.interleaved else ""
     return (
-        f"{len(phases)} phases {where}, choose one with {name_parameter('phase')}: [{'], ['.join(shown)}]{more}"
+        f"{len(phases)} phases {arrangement}, choose one with {name_parameter('phase')}: [{'], ['.join(shown)}]{more}"
         f"{spacing}"
     )
 

@@ -87,18 +87,18 @@ class DiskReader:
             parts = self._run_all([partial(self._read_files, chunk[part::count]) for part in range(count)])
             if count == 1 and perf_counter() - start > _SLOW_FILE_S * len(chunk):
                 self._start_threads(MOST_THREADS)
-            for place in range(len(chunk)):
-                yield parts[place % count][place // count]
+            for index in range(len(chunk)):
+                yield parts[index % count][index // count]
 
     def _read_files(self, files: Sequence[str]) -> list[FileStart | OSError]:
-        found: list[FileStart | OSError] = []
+        starts: list[FileStart | OSError] = []
         for file in files:
             self.touched = file
             try:
-                found.append(read_start(file))
+                starts.append(read_start(file))
             except OSError as error:
-                found.append(error)
-        return found
+                starts.append(error)
+        return starts
 
     def _start_threads(self, count: int) -> None:
         while len(self._threads) < count:
@@ -258,31 +258,31 @@ def _list_files(path: Path, scan: Scan, disk: DiskReader, follow_links: bool) ->
             scan.is_file = True
             return [str(path)]
         if not path.is_dir():
-            what = "is neither a folder nor a regular file" if os.path.lexists(path) else "does not exist"
-            raise NoDicomError(f"{escape_text(str(path), 256)} {what}")
+            problem = "is neither a folder nor a regular file" if os.path.lexists(path) else "does not exist"
+            raise NoDicomError(f"{escape_text(str(path), 256)} {problem}")
         with os.scandir(path):
             pass
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise NoDicomError(f"{escape_text(str(path), 256)} cannot be read: {reason}") from error
 
-    found = _Found(os.path.realpath(path), follow_links, [str(path)])
+    listing = _Found(os.path.realpath(path), follow_links, [str(path)])
     visited: set[str] = set()
-    while found.folders:
-        disk.touched = folder = found.folders.pop()
-        place = os.path.realpath(folder) if follow_links else folder
-        if place in visited:
+    while listing.folders:
+        disk.touched = folder = listing.folders.pop()
+        real_path = os.path.realpath(folder) if follow_links else folder
+        if real_path in visited:
             continue
-        visited.add(place)
+        visited.add(real_path)
         try:
             with os.scandir(folder) as entries:
                 for entry in entries:
                     if entry.is_symlink():
-                        _sort_link(entry, found, scan)
+                        _sort_link(entry, listing, scan)
                     elif entry.is_file(follow_symlinks=False):
-                        found.files.append(entry.path)
+                        listing.files.append(entry.path)
                     elif entry.is_dir(follow_symlinks=False):
-                        found.folders.append(entry.path)
+                        listing.folders.append(entry.path)
                     else:
                         scan.skipped["not a regular file"] += 1
         except OSError:
@@ -290,7 +290,7 @@ def _list_files(path: Path, scan: Scan, disk: DiskReader, follow_links: bool) ->
             scan.corrupt.append(CorruptFile(Path(folder), "folder not readable"))
     for left in (scan.corrupt, scan.suspects):
         left.sort(key=lambda entry: entry.file)  # a folder is listed in any order
-    files = sorted(found.files)
+    files = sorted(listing.files)
     if follow_links:  # a file may be reached at its own place and through links
         files = sorted({os.path.realpath(file): file for file in reversed(files)}.values())
     return files
@@ -306,7 +306,7 @@ class _Found:
     files: list[str] = field(default_factory=list)
 
 
-def _sort_link(entry: os.DirEntry[str], found: _Found, scan: Scan) -> None:
+def _sort_link(entry: os.DirEntry[str], listing: _Found, scan: Scan) -> None:
     try:
         mode = entry.stat().st_mode
     except OSError:
@@ -316,10 +316,10 @@ def _sort_link(entry: os.DirEntry[str], found: _Found, scan: Scan) -> None:
     target = os.path.realpath(entry.path)
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         scan.skipped["not a regular file"] += 1
-    elif target == found.root or target.startswith(found.root.rstrip(os.sep) + os.sep):
+    elif target == listing.root or target.startswith(listing.root.rstrip(os.sep) + os.sep):
         scan.skipped[_LINK_INSIDE] += 1
-    elif found.follow_links:
-        (found.files if stat.S_ISREG(mode) else found.folders).append(entry.path)
+    elif listing.follow_links:
+        (listing.files if stat.S_ISREG(mode) else listing.folders).append(entry.path)
     else:
         scan.skipped[LINK_OUT] += 1
         scan.suspects.append(CorruptFile(Path(entry.path), LINK_OUT))

@@ -73,38 +73,38 @@ class Census:
 def take_census(
     slices: Mapping[str, Sequence[SliceHeader]], others: Mapping[str, Sequence[OtherImage]]
 ) -> dict[str, Census]:
-    found: dict[str, Census] = {}
+    censuses: dict[str, Census] = {}
     studies: dict[str, list[str]] = defaultdict(list)
     for key in {**slices, **others}:
-        own, beside = slices.get(key, ()), others.get(key, ())
-        studies[(own or beside)[0].series.study].append(key)
-        found[key] = Census(
-            frozenset(header.instance_number for header in own if header.instance_number is not None),
-            len(own) + sum(image.frames for image in beside),
-            len({header.file for header in own}) + len(beside),
-            max((header.stated_images for header in own if header.stated_images is not None), default=None),
-            max((header.stated_files for header in own if header.stated_files is not None), default=None),
+        own_slices, beside = slices.get(key, ()), others.get(key, ())
+        studies[(own_slices or beside)[0].series.study].append(key)
+        censuses[key] = Census(
+            frozenset(header.instance_number for header in own_slices if header.instance_number is not None),
+            len(own_slices) + sum(image.frames for image in beside),
+            len({header.file for header in own_slices}) + len(beside),
+            max((header.stated_images for header in own_slices if header.stated_images is not None), default=None),
+            max((header.stated_files for header in own_slices if header.stated_files is not None), default=None),
         )
     for keys in studies.values():
-        ends = {key: max(found[key].numbers, default=0) for key in keys}
+        ends = {key: max(censuses[key].numbers, default=0) for key in keys}
         shared: dict[int | None, int] = defaultdict(int)
         for key in keys:
-            shared[found[key].stated_images] += found[key].images
+            shared[censuses[key].stated_images] += censuses[key].images
         for key in keys:
             before = frozenset(end for other, end in ends.items() if other != key)
-            stated = found[key].stated_images
+            stated = censuses[key].stated_images
             accounted = stated is not None and shared[stated] == stated  # an acquisition reconstructed several times
-            found[key] = replace(found[key], ends_before=before, stated_images=None if accounted else stated)
-    return found
+            censuses[key] = replace(censuses[key], ends_before=before, stated_images=None if accounted else stated)
+    return censuses
 
 
 def judge_numbers(census: Census, stack: Stack, copies: int) -> Gate:
     """Judge the gate ``complete_series`` of the slices that are or would be read; `copies` of its images are copies."""
-    what = "slices missing according to the numbers and counts in the headers"
+    words = "slices missing according to the numbers and counts in the headers"
     numbers = _ordered_numbers(stack)
     if numbers is None and census.stated_images is None and census.stated_files is None:
-        return unmeasured("complete_series", 0, None, f"{what}: no count, and no numbers in the order of the slices")
-    found = [] if numbers is None else [_judge_steps(census, stack, numbers), _judge_start(census, numbers)]
+        return unmeasured("complete_series", 0, None, f"{words}: no count, and no numbers in the order of the slices")
+    absences = [] if numbers is None else [_judge_steps(census, stack, numbers), _judge_start(census, numbers)]
     for keyword, stated, there in (
         ("ImagesInAcquisition", census.stated_images, census.images),
         ("NumberOfSeriesRelatedInstances", census.stated_files, census.files),
@@ -112,10 +112,10 @@ def judge_numbers(census: Census, stack: Stack, copies: int) -> Gate:
         if stated is not None:
             there -= copies if there > stated else 0  # else the copies may be among those that were counted
             absent = max(stated - there, 0)
-            found.append((absent, f"{keyword} says {stated}, there {'is' if there == 1 else 'are'} {there}"))
-    reasons = [(count, text) for count, text in found if count]
+            absences.append((absent, f"{keyword} says {stated}, there {'is' if there == 1 else 'are'} {there}"))
+    reasons = [(count, text) for count, text in absences if count]
     shown = f" ({'; '.join(text for _, text in reasons)})" if reasons else ""
-    return none_of("complete_series", max((count for count, _ in reasons), default=0), what + shown)
+    return none_of("complete_series", max((count for count, _ in reasons), default=0), words + shown)
 
 
 def facts_of_numbers(census: Census, stack: Stack) -> dict[str, Any]:
@@ -163,8 +163,8 @@ def _judge_steps(census: Census, stack: Stack, numbers: NDArray[np.int64]) -> tu
             return 0, ""
         unit = 1
     else:
-        each = gaps * unit / steps
-        if float(np.ptp(each)) > _PROPORTIONAL * float(each.min()):
+        slice_steps = gaps * unit / steps
+        if float(np.ptp(slice_steps)) > _PROPORTIONAL * float(slice_steps.min()):
             return 0, ""
         why = "their positions leave room for more"
     low, high = int(numbers.min()), int(numbers.max())
@@ -214,18 +214,18 @@ class Planes:
         return len(self._planes) - 1
 
 
-def _are_near(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
-    return math.dist(one[:3], other[:3]) < SPLIT_ANGLE_RAD and math.dist(one[3:], other[3:]) < SPLIT_ANGLE_RAD
+def _are_near(first: tuple[float, ...], second: tuple[float, ...]) -> bool:
+    return math.dist(first[:3], second[:3]) < SPLIT_ANGLE_RAD and math.dist(first[3:], second[3:]) < SPLIT_ANGLE_RAD
 
 
 def describe_missing_parts(slices: Iterable[SliceHeader]) -> list[str]:
     """Describe missing files of concatenations of a series: at an end of the stack they would leave no hole."""
-    found: dict[str, set[Concatenation]] = defaultdict(set)
+    parts_of: dict[str, set[Concatenation]] = defaultdict(set)
     for header in slices:
         if header.concatenation is not None:
-            found[header.concatenation.uid].add(header.concatenation)
+            parts_of[header.concatenation.uid].add(header.concatenation)
     problems = []
-    for parts in found.values():
+    for parts in parts_of.values():
         there = {part.part for part in parts}
         last = max(max(part.parts or 0, part.part) for part in parts)
         missing = [str(number) for number in range(1, last + 1) if number not in there]
@@ -363,17 +363,17 @@ class Series:
         if stack.problems:
             return places
         places = replace(places, headers=stack.slices)
-        found = find_alternation(stack.slices, not stack.line.uneven)
-        if found is not None and found.certain:
-            return part_alternating(places, found)
-        if found is None and phase is None:
+        alternation = find_alternation(stack.slices, not stack.line.uneven)
+        if alternation is not None and alternation.certain:
+            return part_alternating(places, alternation)
+        if alternation is None and phase is None:
             return places
         likeness = judge_slices(read_voxels(stack.slices)[0], stack.tilt_deg, uneven=stack.line.uneven)
         if likeness is not None and likeness.is_mixed:
-            return part_alternating(places, found or alternate_places(len(stack.slices), likeness.period))
-        if found is None:
+            return part_alternating(places, alternation or alternate_places(len(stack.slices), likeness.period))
+        if alternation is None:
             return places
-        doubt = f"{found.name} alternates along the stack: maybe several volumes between each other"
+        doubt = f"{alternation.name} alternates along the stack: maybe several volumes between each other"
         return replace(places, doubt=doubt)
 
     @cached_property
@@ -434,7 +434,7 @@ def group_series(scan: Scan) -> list[Series]:
     for image in scan.others:
         others[_group_key(image)].append(image)
     censuses = take_census(slices, others)
-    found = []
+    listed = []
     for uid, census in censuses.items():
         parts = _split_slices(slices[uid])
         lost = describe_missing_parts(slices[uid])
@@ -452,22 +452,22 @@ def group_series(scan: Scan) -> list[Series]:
         for part in parts:
             part.census = census
         parts.sort(key=lambda part: (part.kind != "stack", -part.count))
-        found += parts
-    found.sort(key=lambda one: (one.identity.number is None, one.identity.number or 0, one.identity.uid))
-    _number_patients_and_studies(found)
-    found.sort(key=_owner_key(found))
-    for number, series in enumerate(found, start=1):
+        listed += parts
+    listed.sort(key=lambda one: (one.identity.number is None, one.identity.number or 0, one.identity.uid))
+    _number_patients_and_studies(listed)
+    listed.sort(key=_owner_key(listed))
+    for number, series in enumerate(listed, start=1):
         series.number, series.is_file = number, scan.is_file
     if scan.corrupt or scan.suspects:
-        _blame_corrupt_files(found, scan)
-    return found
+        _blame_corrupt_files(listed, scan)
+    return listed
 
 
-def _number_patients_and_studies(found: Sequence[Series]) -> None:
+def _number_patients_and_studies(listed: Sequence[Series]) -> None:
     """Number patients and studies in the order of the listing: a hash of a short ID could be reversed."""
     patients: dict[str, int] = {}
     studies: dict[str, int] = {}
-    for series in found:
+    for series in listed:
         patient = next((header.patient_hash for header in series.headers if header.patient_hash), None)
         if patient is not None:
             series.patient = patients.setdefault(patient, len(patients) + 1)
@@ -475,27 +475,27 @@ def _number_patients_and_studies(found: Sequence[Series]) -> None:
             series.study = studies.setdefault(series.identity.study, len(studies) + 1)
 
 
-def _owner_key(found: Sequence[Series]) -> Callable[[Series], tuple[float, float]]:
+def _owner_key(listed: Sequence[Series]) -> Callable[[Series], tuple[float, float]]:
     """Return a sort key by patient and by study, where there are several; unknown ones come last."""
-    owners = {series.study: series.patient for series in found if series.study and series.patient}
-    for series in found:
+    owners = {series.study: series.patient for series in listed if series.study and series.patient}
+    for series in listed:
         series.patient = series.patient or owners.get(series.study, 0)
-    patients = len({series.patient for series in found} - {0}) > 1
-    studies = len({series.study for series in found} - {0}) > 1
+    patients = len({series.patient for series in listed} - {0}) > 1
+    studies = len({series.study for series in listed} - {0}) > 1
     return lambda series: (
         (series.patient or math.inf) if patients else 0,
         (series.study or math.inf) if studies else 0,
     )
 
 
-def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:
+def _blame_corrupt_files(listed: Sequence[Series], scan: Scan) -> None:
     """Give every stack the unreadable files that may belong to it: a lost slice at its end would leave no hole.
 
     A corrupt file may belong to any stack, unless its folder holds slices of other series only; a suspect to a stack
     with slices in its folder, or in several folders where its own holds none.
     """
     holders: dict[Path, set[str]] = defaultdict(set)  # from folder to the series, by UID, with slices in it
-    for series in found:
+    for series in listed:
         if series.kind == "capture" or series.kind == "other" and series.identity.modality not in _SLICE_MODALITIES:
             continue
         images: list[SliceHeader | OtherImage] = [*series.headers, *series.others]
@@ -508,11 +508,11 @@ def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:
     # Every file is handled once and lists are shared, because 10,000 series may come with as many bad files.
     corrupt, loose_corrupt = _sort_by_holder(scan.corrupt, holders)
     suspects, loose_suspects = _sort_by_holder(scan.suspects, holders)
-    for series in found:
+    for series in listed:
         if series.kind == "stack":
-            own = folders[series.key]
-            spread = len(own) > 1
-            near = [files[folder] for files, folder in itertools.product((corrupt, suspects), own) if folder in files]
+            paths = folders[series.key]
+            spread = len(paths) > 1
+            near = [files[folder] for files, folder in itertools.product((corrupt, suspects), paths) if folder in files]
             blamed = [part for part in (*near, loose_corrupt, loose_suspects if spread else []) if part]
             series.corrupt = blamed[0] if len(blamed) == 1 else list(itertools.chain(*blamed))
 
@@ -521,12 +521,12 @@ def _sort_by_holder(
     files: Sequence[CorruptFile], holders: Mapping[Path, object]
 ) -> tuple[dict[Path, list[CorruptFile]], list[CorruptFile]]:
     """Divide files by whether their folder holds slices; the second list is of files in other folders."""
-    held: dict[Path, list[CorruptFile]] = defaultdict(list)
+    held_by: dict[Path, list[CorruptFile]] = defaultdict(list)
     loose: list[CorruptFile] = []
     for file in files:
         folder = file.file.parent
-        (held[folder] if folder in holders else loose).append(file)
-    return held, loose
+        (held_by[folder] if folder in holders else loose).append(file)
+    return held_by, loose
 
 
 def _group_key(image: SliceHeader | OtherImage) -> str:

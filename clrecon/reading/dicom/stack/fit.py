@@ -105,15 +105,15 @@ def find_holes(distances: Float64Array) -> Holes:
 def _find_runs(gaps: Float64Array) -> NDArray[np.bool_]:
     """Mark gaps in runs: at least `RUN_LENGTH` consecutive gaps that are equal within `_RUN_TOLERANCE`."""
     in_run = np.zeros(len(gaps), dtype=bool)
-    for place, gap in enumerate(gaps.tolist()):
-        low, high = max(place - RUN_LENGTH + 1, 0), min(place + RUN_LENGTH, len(gaps))
+    for index, gap in enumerate(gaps.tolist()):
+        low, high = max(index - RUN_LENGTH + 1, 0), min(index + RUN_LENGTH, len(gaps))
         like = (np.abs(gaps[low:high] - gap) <= _RUN_TOLERANCE * gap).tolist()
-        first = last = place - low
+        first = last = index - low
         while first > 0 and like[first - 1]:
             first -= 1
         while last < len(like) - 1 and like[last + 1]:
             last += 1
-        in_run[place] = last - first + 1 >= RUN_LENGTH
+        in_run[index] = last - first + 1 >= RUN_LENGTH
     return in_run
 
 
@@ -316,8 +316,8 @@ def measure_stack(headers: Sequence[SliceHeader], *, allow_gaps: bool = False) -
         if holes.places and allow_gaps:
             warnings.append(f"{holes.describe()}: what is there is placed exactly, surfaces bridge the gap")
         elif holes.places:
-            where = holes.describe([header.name for header in slices])
-            problems.append(f"{where}; find them, or take what is there with {name_parameter('allow_gaps', True)}")
+            gaps = holes.describe([header.name for header in slices])
+            problems.append(f"{gaps}; find them, or take what is there with {name_parameter('allow_gaps', True)}")
         if line.uneven and not problems:
             warnings.append(_describe_unevenness(distances, line))
         if not problems:
@@ -393,27 +393,27 @@ def find_mixed_values(headers: Sequence[SliceHeader]) -> list[str]:
         ("FrameOfReferenceUID", lambda h: h.frame_of_reference, lambda h: "another" if h.frame_of_reference else "no"),
         ("StudyInstanceUID", lambda h: h.series.study, lambda h: "another" if h.series.study else "no"),
     )
-    found = []
+    differences = []
     for title, key, show in checks:
         counts = Counter(key(header) for header in headers)
         if len(counts) > 1:
             usual = counts.most_common(1)[0][0]
             odd = [header for header in headers if key(header) != usual]
-            found.append(f"{title} differ within the series: {show(odd[0])} in {join_names(h.name for h in odd)}")
+            differences.append(f"{title} differ within the series: {show(odd[0])} in {join_names(h.name for h in odd)}")
     patients = Counter(header.patient_hash for header in headers if header.patient_hash is not None)
     if len(patients) > 1:
         usual = patients.most_common(1)[0][0]
         odd = [header for header in headers if header.patient_hash not in (usual, None)]
-        found.append(f"PatientID differs within the series: another in {join_names(h.name for h in odd)}")
+        differences.append(f"PatientID differs within the series: another in {join_names(h.name for h in odd)}")
     di, dj = median([header.di_mm for header in headers]), median([header.dj_mm for header in headers])
     allowed = _PIXEL_SPACING_TOLERANCE * min(di, dj)
     odd = [header for header in headers if max(abs(header.di_mm - di), abs(header.dj_mm - dj)) > allowed]
     if odd:
-        found.append(
+        differences.append(
             f"PixelSpacing differs within the series: {odd[0].dj_mm:g}\\{odd[0].di_mm:g} mm against "
             f"{dj:g}\\{di:g} mm in {join_names(h.name for h in odd)}"
         )
-    return found
+    return differences
 
 
 def _mean_directions(

@@ -56,8 +56,8 @@ doubtful."""
 
 def values_of(header: SliceHeader, keywords: Sequence[str]) -> tuple[str, ...]:
     """Return the values that distinguish phases; empty if there are none."""
-    own = dict(header.phase)
-    return tuple(own.get(keyword, "") for keyword in keywords)
+    phase_values = dict(header.phase)
+    return tuple(phase_values.get(keyword, "") for keyword in keywords)
 
 
 def find_mixture(
@@ -72,9 +72,9 @@ def find_mixture(
 
 
 def _values_along(headers: Sequence[SliceHeader], keywords: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
-    own = [dict(header.phase) for header in headers]
+    phase_values = [dict(header.phase) for header in headers]
     for keyword in keywords:
-        values = [one.get(keyword, "") for one in own]
+        values = [one.get(keyword, "") for one in phase_values]
         if len(set(values)) > 1:
             yield keyword, values
 
@@ -410,8 +410,8 @@ def _spans(codes: Sequence[int], gaps: Sequence[float], first: int, end: int) ->
 def _runs(flags: Sequence[bool]) -> Iterator[tuple[int, int]]:
     """Return first index and end of each run of true flags."""
     start = 0
-    for place, flag in enumerate([*flags, False]):
+    for index, flag in enumerate([*flags, False]):
         if not flag:
-            if place > start:
-                yield start, place
-            start = place + 1
+            if index > start:
+                yield start, index
+            start = index + 1
