@@ -270,13 +270,13 @@ def _fill_holes(mask: Mask) -> None:
         return
     box = mask[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
 
-    def fill(layers: slice) -> None:
+    def fill_layers(layers: slice) -> None:
         for layer in box[layers]:
             # All that is outside is one region with its frame, and the first.
             regions, _ = ndimage.label(np.pad(~layer, 1, constant_values=True))
             layer |= regions[1:-1, 1:-1] > 1
 
-    in_threads(fill, len(box), PIECE)
+    in_threads(fill_layers, len(box), PIECE)
 
 
 def _thick_parts(tissue: Mask, across: float) -> Mask:
@@ -335,7 +335,7 @@ def find_unmeasured(cells: NDArray[Any]) -> Mask:
 
     unmeasured = np.zeros(cells.shape, dtype=bool)
 
-    def mark(layers: slice) -> None:
+    def mark_layers(layers: slice) -> None:
         for layer, out in zip(cells[layers], unmeasured[layers], strict=True):
             for corner in set(layer[np.ix_((0, -1), (0, -1))].flat):
                 out |= layer == corner
@@ -350,7 +350,7 @@ def find_unmeasured(cells: NDArray[Any]) -> Mask:
             outer[0] = False
             np.take(outer, pieces, out=out)
 
-    in_threads(mark, len(cells), PIECE)
+    in_threads(mark_layers, len(cells), PIECE)
     return unmeasured
 
 

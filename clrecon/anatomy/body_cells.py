@@ -76,7 +76,7 @@ def measure_cells(volume: Volume, done: Callable[[slice], None] | None = None) -
     dtype = np.promote_types(np.uint16, np.min_scalar_type(si * sj * sk))
     dense, hard, metal = (np.zeros(shape, dtype=dtype) for _ in range(3))
 
-    def measure(layers: slice) -> None:
+    def measure_layers(layers: slice) -> None:
         for layer in range(layers.start, layers.stop):
             first, end = layer * sk, min((layer + 1) * sk, nk)
             slab = volume.voxels[first:end]
@@ -84,7 +84,7 @@ def measure_cells(volume: Volume, done: Callable[[slice], None] | None = None) -
             _count_dense(slab, {DENSE_HU: dense[layer], HARD_HU: hard[layer], SURE_METAL_HU: metal[layer]}, sj, si)
             volume.release_slices(first, end)
 
-    in_threads(measure, shape[0], PIECE, done)
+    in_threads(measure_layers, shape[0], PIECE, done)
     for axis, (size, step) in enumerate(((nj, sj), (ni, si)), start=1):
         widths = np.diff(np.append(np.arange(0, size, step), size)).astype(np.float32)
         mean /= widths.reshape([-1 if place == axis else 1 for place in range(3)])
@@ -129,13 +129,13 @@ def grow(mask: Mask, cells: float) -> Mask:
     # The border erodes nothing: an eroded mask is what is left of the grown rest.
     changed = mask.copy() if cells > 0 else ~mask
 
-    def work(layers: slice) -> None:
+    def change_layers(layers: slice) -> None:
         for layer in changed[layers]:
             _grow_layer(layer, turns)
             if cells <= 0:
                 np.logical_not(layer, out=layer)
 
-    in_threads(work, len(changed), PIECE)
+    in_threads(change_layers, len(changed), PIECE)
     return changed
 
 

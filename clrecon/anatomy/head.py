@@ -131,11 +131,11 @@ def shows_face(volume: Volume, hu: float) -> bool:
 def find_head(volume: Volume) -> bool | None:
     """Tell whether slices show the vault of a skull; False where a trunk fills every slice; None for all else."""
     if volume not in _judged:
-        _judged[volume] = _judge(volume)
+        _judged[volume] = _judge_head(volume)
     return _judged[volume]
 
 
-def _judge(volume: Volume) -> bool | None:
+def _judge_head(volume: Volume) -> bool | None:
     vault, trunk, bodies = 0.0, 0, 0
     for plane, pixels_mm, step in _coarse_slices(volume):
         vault += step * _has_vault(plane, pixels_mm)

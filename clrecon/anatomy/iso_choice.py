@@ -260,11 +260,11 @@ def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> Iso
     progress = progress or ignore_progress
     progress("choose", 0, 3)
     every, scale = sample_slices(volume), OwnScale.of(volume)
-    look = _look(volume, every, scale)
+    look = _measure_look(volume, every, scale)
     progress("choose", 1, 3)
     free = every if scale is not None else _leave_metal(volume.voxels, every)
     if len(free) < len(every):
-        free_look = _look(volume, free, scale)
+        free_look = _measure_look(volume, free, scale)
         if free_look.shows_bone and (not look.shows_bone or free_look.spread <= STREAKS_SPREAD * look.spread):
             look = free_look
     progress("choose", 2, 3)
@@ -272,7 +272,7 @@ def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> Iso
         raise NoSurfaceError(_no_bone(look))
     if scale is not None:
         look = look.on(scale)
-    choice = _describe(look, every.step)
+    choice = _describe_look(look, every.step)
     reason = choice.reason if scale is None else f"{choice.reason}; {scale.said}"
     if look.slices < len(every):
         reason += f"; {count_of(len(every) - look.slices, 'slice')} with metal left out"
@@ -338,7 +338,7 @@ class _Look(NamedTuple):
         )
 
 
-def _look(volume: Volume, sampled: Sequence[int], scale: OwnScale | None) -> _Look:
+def _measure_look(volume: Volume, sampled: Sequence[int], scale: OwnScale | None) -> _Look:
     """Measure the edges of bone in some slices, in HU."""
 
     def slices() -> Slices:
@@ -358,7 +358,7 @@ def _leave_metal(voxels: NDArray[Any], sampled: Sequence[int]) -> Sequence[int]:
     return free if len(free) >= FEWEST_SLICES else sampled
 
 
-def _describe(look: _Look, slice_step: int) -> IsoChoice:
+def _describe_look(look: _Look, slice_step: int) -> IsoChoice:
     background, edges, left_out, flat_share, _, slices = look
     bone, tissue = look.materials
     digits = max(0, 3 - math.floor(math.log10(bone - tissue)))  # of values that are not HU

@@ -75,11 +75,11 @@ def average_cells(volume: Volume, lattice: Lattice, done: Callable[[slice], None
     aligned = not volume.uneven and not (steps - np.diag(np.diag(steps))).any()
     interpolate = _interpolate_aligned if aligned else _interpolate
 
-    def fill(layers: slice) -> None:
+    def fill_layers(layers: slice) -> None:
         for k in range(layers.start, layers.stop):
             values[k] = interpolate(volume, means, lattice.block, x, y, float(z[k]))
 
-    in_threads(fill, len(values), 4, done)
+    in_threads(fill_layers, len(values), 4, done)
     return SpineCells(values, lattice.origin)
 
 
@@ -247,18 +247,18 @@ def measure_likeness(cells: SpineCells, done: Callable[[slice], None]) -> Likene
     worth = np.empty(box.values.shape, np.float32)
     sure, goes_on = np.empty(box.values.shape, bool), np.empty(box.values.shape, bool)
 
-    def work(layers: slice) -> None:
-        worth[layers], traits = _look(box, layers.start, layers.stop)
+    def measure_layers(layers: slice) -> None:
+        worth[layers], traits = _measure_traits(box, layers.start, layers.stop)
         sure[layers] = np.logical_and.reduce([traits[name] >= least for name, least in SURE.items()])
         goes_on[layers] = np.logical_and.reduce([traits[name] >= least for name, least in STILL.items()])
 
-    in_threads(work, len(worth), PIECE, done)
+    in_threads(measure_layers, len(worth), PIECE, done)
     return Likeness(worth, sure, goes_on, (rows.start, columns.start))
 
 
 def traits_of(cells: SpineCells, k: int) -> dict[str, Field]:
     """Return the traits of the cells of one slice, (ny, nx) each, by their names in `SURE`."""
-    return {name: field[0] for name, field in _look(cells, k, k + 1)[1].items()}
+    return {name: field[0] for name, field in _measure_traits(cells, k, k + 1)[1].items()}
 
 
 def _extent(values: Field, axis: int) -> slice:
@@ -271,7 +271,7 @@ def _extent(values: Field, axis: int) -> slice:
     return slice(max(first - _BORDER, 0), min(last + 1 + _BORDER, count))
 
 
-def _look(cells: SpineCells, first: int, end: int) -> tuple[Field, dict[str, Field]]:
+def _measure_traits(cells: SpineCells, first: int, end: int) -> tuple[Field, dict[str, Field]]:
     """Return what the cells of some slices are worth, and their traits by name."""
     bone_reach = heights(16.0) // 2
     bone = np.clip((cells.around(first, end, bone_reach) - 110.0) / 130.0, 0.0, 1.0)

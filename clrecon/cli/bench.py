@@ -49,7 +49,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         progress=console.progress,
     )
     console.result(result)
-    for line in _describe(result):
+    for line in _describe_bench(result):
         console.say(line)
     if options.report:
         console.say(f"\nreport   {printable(options.report)}")
@@ -58,7 +58,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     return PARTLY_DONE if any(entry["error"] for entry in result["devices"]) else 0
 
 
-def _describe(result: dict[str, Any]) -> list[str]:
+def _describe_bench(result: dict[str, Any]) -> list[str]:
     given = result["input"]
     ni, nj, nk = given["shape_ijk"]
     spacing = " x ".join(f"{step:.4g}" for step in given["spacing_mm"])

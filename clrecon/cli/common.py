@@ -143,12 +143,12 @@ class Parser(argparse.ArgumentParser):
 def _make_markable(kind: Any) -> Callable[..., argparse.Action]:
     """Return the maker of a kind of action that takes `first` too: an option that most people need, and its `words`."""
 
-    def make(*given: Any, first: bool = False, words: Iterable[str] = (), **how: Any) -> argparse.Action:
+    def make_action(*given: Any, first: bool = False, words: Iterable[str] = (), **how: Any) -> argparse.Action:
         action: Any = kind(*given, **how)
         action.is_first, action.words = first, words
         return cast("argparse.Action", action)
 
-    return make
+    return make_action
 
 
 def _name_value(action: argparse.Action, formatter: argparse.HelpFormatter) -> str:

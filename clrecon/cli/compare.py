@@ -67,7 +67,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     named = [method[which] for method, which in product(report["methods"], ("picture", "difference"))]
     pictures = sum(name is not None for name in named) + 2 * len(report["slices"])
     written = f"wrote    {printable(options.output)}: index.html, report.json and {pictures} pictures"
-    common.show_report(report, [*_describe(report), written], options, console)
+    common.show_report(report, [*_describe_comparison(report), written], options, console)
     return PARTLY_DONE if any(_is_missed(method, settings.methods) for method in report["methods"]) else 0
 
 
@@ -76,7 +76,7 @@ def _is_missed(method: dict[str, Any], asked: Sequence[str]) -> bool:
     return method["state"] == "failed" or (method["state"] != "done" and method["name"] in asked)
 
 
-def _describe(report: dict[str, Any]) -> list[str]:
+def _describe_comparison(report: dict[str, Any]) -> list[str]:
     """Describe a comparison for people: the input, the table in short, what the numbers say."""
     rows = [("method", "triangles", "first s", "warm s", "memory MB", "slices Dice", "HD95 mm", "scatter mm")]
     for method in report["methods"]:
@@ -86,13 +86,13 @@ def _describe(report: dict[str, Any]) -> list[str]:
         rows.append(
             (
                 method["name"],
-                _say(method["triangles"], ",.0f"),
-                _say(method["first_s"], ".3f"),
-                _say(method["warm_s"], ".3f"),
-                _say(method["memory_bytes"] and 1e-6 * method["memory_bytes"], ",.0f"),
-                _say(method["slices"] and method["slices"]["dice"], ".4f"),
-                _say(method["surfaces"] and method["surfaces"]["hd95_mm"], ".3f"),
-                _say(method["truth"] and method["truth"]["scatter_mm"], ".3f"),
+                _format_number(method["triangles"], ",.0f"),
+                _format_number(method["first_s"], ".3f"),
+                _format_number(method["warm_s"], ".3f"),
+                _format_number(method["memory_bytes"] and 1e-6 * method["memory_bytes"], ",.0f"),
+                _format_number(method["slices"] and method["slices"]["dice"], ".4f"),
+                _format_number(method["surfaces"] and method["surfaces"]["hd95_mm"], ".3f"),
+                _format_number(method["truth"] and method["truth"]["scatter_mm"], ".3f"),
             )
         )
     return [
@@ -107,5 +107,5 @@ def _describe(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def _say(value: float | None, form: str) -> str:
+def _format_number(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)

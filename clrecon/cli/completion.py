@@ -66,13 +66,15 @@ def write_script(shell: str) -> str:
         parser = common.Parser(prog=name)
         import_module(command.module).add_arguments(parser)
         common.add_common(parser)
-        words[name] = _Words(command.help, [_describe(action) for action in parser._actions if action.option_strings])
+        words[name] = _Words(
+            command.help, [_find_option(action) for action in parser._actions if action.option_strings]
+        )
     words["completion"].first = list(SHELLS)
     words[HELP] = _Words("show all options of a command", first=list(COMMANDS))
     return {"bash": _write_bash, "zsh": _write_zsh, "fish": _write_fish}[shell](words)
 
 
-def _describe(action: argparse.Action) -> _Option:
+def _find_option(action: argparse.Action) -> _Option:
     text = (action.help or "").replace("%%", "%")
     takes_value = action.nargs != 0
     return _Option(

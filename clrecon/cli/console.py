@@ -224,7 +224,7 @@ class Console:
 
     def clear(self) -> None:
         if self._drawn and sys.stderr is not None:
-            _write(sys.stderr, "\r" + " " * self._drawn + "\r")
+            _write_text(sys.stderr, "\r" + " " * self._drawn + "\r")
             self._drawn = 0
 
     def finish(self) -> None:
@@ -245,7 +245,7 @@ class Console:
             line = line[: room - len(count)].rstrip() + count
         line = line[:room]
         if sys.stderr is not None:
-            _write(sys.stderr, "\r" + line + " " * max(0, self._drawn - len(line)))
+            _write_text(sys.stderr, "\r" + line + " " * max(0, self._drawn - len(line)))
             self._drawn = len(line)
 
     def _to_stderr(self, line: str) -> None:
@@ -254,7 +254,7 @@ class Console:
             for hidden in (self._hidden_name, os.path.splitext(self._hidden_name)[0]):  # one of several files too
                 line = line.replace(hidden, self._shown_name)
         if sys.stderr is not None:
-            _write(sys.stderr, fit(line, sys.stderr) + "\n")
+            _write_text(sys.stderr, fit(line, sys.stderr) + "\n")
 
     def _to_stdout(self, text: str) -> None:
         self.clear()
@@ -275,7 +275,7 @@ class Console:
             raise OutputError(f"cannot write to standard output: {error.strerror or error}") from error
 
 
-def _write(stream: Any, text: str) -> None:
+def _write_text(stream: Any, text: str) -> None:
     try:
         stream.write(text)
         stream.flush()

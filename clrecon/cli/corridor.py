@@ -110,7 +110,7 @@ def _point(values: list[float], space: str) -> str:
     return f"({values[0]:.1f}, {values[1]:.1f}, {values[2]:.1f}) {space.upper()}"
 
 
-def _number(value: float | None) -> str:
+def _format_number(value: float | None) -> str:
     return "none" if value is None else f"{value:.1f}"
 
 
@@ -119,7 +119,7 @@ def _describe_side(name: str, side: dict[str, Any], report: dict[str, Any]) -> l
     if side["refused"]:
         return [f"{head}no corridor, {side['refused']}"]
     bias, low_high = side["level_bias_mm"], side["sagittal_angle_range_deg"]
-    margins = ", ".join(f"{place} {_number(value)}" for place, value in side["margins_mm"].items())
+    margins = ", ".join(f"{place} {_format_number(value)}" for place, value in side["margins_mm"].items())
     if report["surface"] == "cortex":
         of_level = "none: the surface is fitted"
     elif bias is None:
@@ -138,7 +138,7 @@ def _describe_side(name: str, side: dict[str, Any], report: dict[str, Any]) -> l
         f" {side['medial_angle_lps_deg']:.0f}), sagittal not determined: {low_high[0]:.0f} to {low_high[1]:.0f} within"
         f" 0.1 mm, line at {side['sagittal_angle_deg']:.0f} (LPS {side['sagittal_angle_lps_deg']:.0f})",
         f"         entry {_point(side['entry_mm'], space)}, tip {_point(side['tip_mm'], space)}",
-        f"         distance to {margins}; to the canal {_number(side['canal_mm'])} mm",
+        f"         distance to {margins}; to the canal {_format_number(side['canal_mm'])} mm",
         f"         level {of_level}",
     ]
 
@@ -146,7 +146,7 @@ def _describe_side(name: str, side: dict[str, Any], report: dict[str, Any]) -> l
 def _describe_screw(name: str, screw: dict[str, Any]) -> list[str]:
     breach = "no breach" if not screw["direction"] else f"breach {screw['breach_mm']:.1f} mm, {screw['direction']}"
     front = f"; {screw['front_mm']:.1f} mm outside in the body's front half" if screw["front_mm"] else ""
-    margins = ", ".join(f"{place} {_number(value)}" for place, value in screw["margins_mm"].items())
+    margins = ", ".join(f"{place} {_format_number(value)}" for place, value in screw["margins_mm"].items())
     return [
         f"{printable(name):<8} {printable(screw['name'])}, {screw['side']}, {screw['diameter_mm']:g} x"
         f" {screw['length_mm']:.0f} mm: grade {screw['grade']}, {breach}{front}",

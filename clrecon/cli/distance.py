@@ -51,11 +51,11 @@ def run(options: argparse.Namespace, console: Console) -> int:
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
-    common.show_report(report, _describe(report), options, console)
+    common.show_report(report, _describe_distance(report), options, console)
     return 0
 
 
-def _describe(report: dict[str, Any]) -> list[str]:
+def _describe_distance(report: dict[str, Any]) -> list[str]:
     lines = []
     for name in ("a", "b"):
         lines += _describe_mesh(name.upper(), report[name])

@@ -54,11 +54,11 @@ def run(options: argparse.Namespace, console: Console) -> int:
     output = report["output"]
     size, space = common.megabytes(output["bytes"]), output["space"].upper()
     written = f"wrote    {printable(options.output)}, {size}, HU as {output['type']}, {space} mm"
-    common.show_report(report, [*_describe(report), written], options, console)
+    common.show_report(report, [*_describe_export(report), written], options, console)
     return 0
 
 
-def _describe(report: dict[str, Any]) -> list[str]:
+def _describe_export(report: dict[str, Any]) -> list[str]:
     output = report["output"]
     low, high = output["corners_lps_mm"]
     box = ", ".join(f"{name} {a:.1f} to {b:.1f}" for name, a, b in zip("xyz", low, high, strict=True))

@@ -77,14 +77,14 @@ def _lay_out(report: dict[str, Any], width: int | None) -> list[str]:
     spread = [
         ["min", *(f"{name} %" for name in percents), "max"],
         *(
-            [*_hu(one, "min_hu"), *(_number(one["percentiles_hu"][name]) for name in percents), *_hu(one, "max_hu")]
+            [*_hu(one, "min_hu"), *(_format_hu(one["percentiles_hu"][name]) for name in percents), *_hu(one, "max_hu")]
             for one in report["labels"]
         ),
     ]
     whole = _name_rows(names, [a + b for a, b in zip(volumes, spread, strict=True)])
     if width is None or max(map(len, whole)) <= width:
         return whole
-    return [*_fit(names, volumes, width), "", *_fit(names, spread, width)]
+    return [*_fit_names(names, volumes, width), "", *_fit_names(names, spread, width)]
 
 
 def _lay_out_surfaces(labels: Sequence[dict[str, Any]]) -> list[str]:
@@ -110,7 +110,7 @@ def _lay_out_surfaces(labels: Sequence[dict[str, Any]]) -> list[str]:
     return ["", text, *common.table([head, *rows], range(1, 8))]
 
 
-def _fit(names: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[str]:
+def _fit_names(names: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[str]:
     """Shorten the names until the table fits into the width, or few characters of them are left."""
     beside = max(len(line) for line in _name_rows([""] * len(names), rows))
     most = max(_LEAST_NAME, width - beside)
@@ -133,10 +133,10 @@ def _mean(value: float | None) -> str:
 
 
 def _hu(entry: dict[str, Any], *fields: str) -> list[str]:
-    return [_number(entry[field]) for field in fields]
+    return [_format_hu(entry[field]) for field in fields]
 
 
-def _number(value: float | None) -> str:
+def _format_hu(value: float | None) -> str:
     """Return HU with a decimal only where there is one, and zero without a sign."""
     if value is None:
         return "none"

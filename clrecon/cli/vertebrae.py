@@ -55,7 +55,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
-    lines = _describe(report)
+    lines = _describe_split(report)
     if settings.name_at is None and settings.first is None:
         lines.append(f"names    {_NAMING}")
     lines.append(f"wrote    {printable(options.output)}, {common.megabytes(report['output']['bytes'])}")
@@ -65,7 +65,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     return _PARTLY if report["low_confidence"] else 0
 
 
-def _describe(report: dict[str, Any]) -> list[str]:
+def _describe_split(report: dict[str, Any]) -> list[str]:
     rows = [("", "number", "confidence", "height mm", "ml", "")]
     for entry in report["vertebrae"]:
         remarks = ("" if entry["is_confident"] else "low confidence ") + ("" if entry["whole"] else "cut by the scan")

@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> int:
     _check_faces(options)
     if options.window:
-        return _show(options, console)
+        return _show_window(options, console)
     if options.html is None:
         return _serve(options, _settings(options), console)
     from clrecon.jobs.view.job import write_view
@@ -83,7 +83,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     report = write_view(
         options.inputs, options.html, settings, no_clobber=options.no_clobber, progress=console.progress
     )
-    common.show_report(report, _describe(report, options.html), options, console)
+    common.show_report(report, _describe_view(report, options.html), options, console)
     return 0
 
 
@@ -107,7 +107,7 @@ def _check_faces(options: argparse.Namespace) -> None:
         raise UsageError("a view replaces no file: leave --no-clobber out")
 
 
-def _show(options: argparse.Namespace, console: Console) -> int:
+def _show_window(options: argparse.Namespace, console: Console) -> int:
     from clrecon.system.display import DisplayProbe, NoDisplayError
 
     warnings: list[str] = []
@@ -172,7 +172,7 @@ def _serve(options: argparse.Namespace, settings: ViewSettings, console: Console
     return 0
 
 
-def _describe(report: dict[str, Any], output: str) -> list[str]:
+def _describe_view(report: dict[str, Any], output: str) -> list[str]:
     lines = [f"input    {_describe_input(entry)}" for entry in report["inputs"]]
     lines.append(f"mesh     {report['vertices']:,} vertices, {report['triangles']:,} triangles")
     rows = [

@@ -125,7 +125,7 @@ def stage_assembly(
         mesh.check()
     extension = check_format(path)
     content = Assembly(
-        tuple(_describe(mesh, extension, space, 1, keep_ids=keep_ids) for mesh in meshes if mesh.triangle_count)
+        tuple(_describe_content(mesh, extension, space, 1, keep_ids=keep_ids) for mesh in meshes if mesh.triangle_count)
     )
     if not content.parts:
         raise NoSurfaceError("the surfaces are empty: no file is written")
@@ -165,13 +165,13 @@ def stage_mesh(
     extension = check_format(path)
     chosen = FORMATS[extension]
     mesh.check()
-    content = _describe(mesh, extension, space, MOST_PARTS, keep_ids=keep_ids)
+    content = _describe_content(mesh, extension, space, MOST_PARTS, keep_ids=keep_ids)
     if mesh.triangle_count == 0:
         raise NoSurfaceError(f"the surface is empty: no {extension[1:].upper()} file is written")
     return stage_content(content, path, chosen, f"{mesh.triangle_count} triangles", "PLY or VTP")
 
 
-def _describe(mesh: Writable, extension: str, space: str, parts: int, *, keep_ids: bool) -> Content:
+def _describe_content(mesh: Writable, extension: str, space: str, parts: int, *, keep_ids: bool) -> Content:
     """Return the contents of a file, with normals and parts where its format shows them."""
     if extension == ".html":
         return mesh.describe_parts(space, parts, keep_ids=keep_ids)

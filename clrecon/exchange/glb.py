@@ -217,10 +217,10 @@ class _File:
         if view.get("buffer") != 0 or "uri" in self.entry("buffers", 0):
             raise ValueError("its data are in another file")
         item = np.dtype(form).itemsize
-        count, stride = _count(accessor, "count"), _count(view, "byteStride") or width * item
-        start, inside = _count(view, "byteOffset"), _count(accessor, "byteOffset")
+        count, stride = _read_count(accessor, "count"), _read_count(view, "byteStride") or width * item
+        start, inside = _read_count(view, "byteOffset"), _read_count(accessor, "byteOffset")
         last = inside + stride * (count - 1) + width * item
-        if count and (last > _count(view, "byteLength") or start + last > len(self.binary)):
+        if count and (last > _read_count(view, "byteLength") or start + last > len(self.binary)):
             raise ValueError(f"accessor {number} goes on behind the end of its data")
         shape, strides = (count, width), (stride, item)
         return np.ndarray(shape, form, self.binary, start + inside, strides) if count else np.zeros(shape, form)
@@ -231,15 +231,15 @@ def read_mesh(path: Path) -> RawMesh:
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:
-            file = _split(stream.read(), name)
-        return _collect(file, name)
+            file = _split_chunks(stream.read(), name)
+        return _collect_mesh(file, name)
     except (
         OSError, ValueError, TypeError, AttributeError, KeyError, OverflowError, MemoryError, RecursionError,
     ) as error:  # fmt: skip
         raise say_cut(name, error) from error
 
 
-def _split(data: bytes, name: str) -> _File:
+def _split_chunks(data: bytes, name: str) -> _File:
     if data[:4] != b"glTF" or len(data) < 20:
         raise RefusedInputError(f"{name} is no GLB file: it does not begin with the mark of one")
     version, length, text_length = (int.from_bytes(data[at : at + 4], "little") for at in (4, 8, 12))
@@ -257,7 +257,7 @@ def _split(data: bytes, name: str) -> _File:
     return _File(document, data[start + 8 : start + 8 + size])
 
 
-def _collect(file: _File, name: str) -> RawMesh:
+def _collect_mesh(file: _File, name: str) -> RawMesh:
     document = file.document
     needed = [text for text in document.get("extensionsRequired", ()) if not str(text).startswith(_FOR_LOOKS)]
     if needed:
@@ -394,7 +394,7 @@ def _matrix(numbers: Any) -> NDArray[np.float64]:
     return np.array(numbers, dtype=np.float64).reshape(4, 4).T
 
 
-def _count(entry: dict[str, Any], name: str) -> int:
+def _read_count(entry: dict[str, Any], name: str) -> int:
     value = entry.get(name, 0)
     if type(value) is not int or not 0 <= value < 1 << 40:
         raise ValueError(f"{name} is {value!r:.40}")

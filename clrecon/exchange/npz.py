@@ -114,7 +114,7 @@ def read_cloud(path: Path) -> RawCloud:
         zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, NotImplementedError, RuntimeError, MemoryError,
     ) as error:  # fmt: skip
         raise say_cut(name, error) from error
-    return _describe(name, arrays)
+    return _describe_cloud(name, arrays)
 
 
 def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
@@ -126,7 +126,7 @@ def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]
         return np.asarray(np.lib.format.read_array(entry, allow_pickle=False))
 
 
-def _describe(name: str, arrays: dict[str, NDArray[Any]]) -> RawCloud:
+def _describe_cloud(name: str, arrays: dict[str, NDArray[Any]]) -> RawCloud:
     points = arrays["points"]
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
         raise RefusedInputError(f"{name} has points of shape {points.shape} and type {points.dtype}: (n, 3) is needed")

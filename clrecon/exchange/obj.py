@@ -56,13 +56,13 @@ def write(stream: BinaryIO, content: Content | Assembly) -> None:
     before = normals_before = 1
     for number, part in enumerate(parts_of(content), start=1):
         if isinstance(content, Assembly):
-            stream.write(f"o {_name(part, number)}\n".encode("ascii"))
+            stream.write(f"o {_name_object(part, number)}\n".encode("ascii"))
         _write_part(stream, part, before, normals_before)
         before += len(part.vertices)
         normals_before += 0 if part.normals is None else len(part.normals)
 
 
-def _name(part: Content, number: int) -> str:
+def _name_object(part: Content, number: int) -> str:
     """Return the name of an object: one word of ASCII, as some readers take no more."""
     words = (part.name or f"object {number}").encode("ascii", "replace").decode("ascii").split()
     return "_".join(words) or f"object_{number}"
@@ -120,12 +120,12 @@ def read_mesh(path: Path) -> RawMesh:
     try:
         with open_regular(path) as stream:
             text = plain_lines(stream.read()).replace(b"\\\n", b" ")
-        return _collect(text.split(b"\n"), name)
+        return _collect_mesh(text.split(b"\n"), name)
     except (OSError, ValueError, OverflowError, MemoryError) as error:
         raise say_cut(name, error) from error
 
 
-def _collect(lines: Sequence[bytes], name: str) -> RawMesh:
+def _collect_mesh(lines: Sequence[bytes], name: str) -> RawMesh:
     vertices: list[bytes] = []
     normals: list[bytes] = []
     faces: list[bytes] = []
@@ -194,11 +194,11 @@ def _corners(
     if text.count(b"/") == 6 * len(faces) and faces:
         named = re.sub(rb"(?:^|(?<= ))[^/ ]*/[^/ ]*/", b"", text).split()
         if len(named) == 3 * len(faces):
-            of_normals = _numbers(named, before, 1)
-    return _numbers(re.sub(rb"/\S*", b"", text).split(), before, 0), of_normals
+            of_normals = _parse_indices(named, before, 1)
+    return _parse_indices(re.sub(rb"/\S*", b"", text).split(), before, 0), of_normals
 
 
-def _numbers(words: Sequence[bytes], before: Sequence[tuple[int, int]], which: int) -> NDArray[np.int64]:
+def _parse_indices(words: Sequence[bytes], before: Sequence[tuple[int, int]], which: int) -> NDArray[np.int64]:
     """Return indices from 0; negative ones count back from what stood before their face."""
     numbers = np.array(words, dtype=np.int64).reshape(-1, 3)
     counts = np.zeros((len(numbers), 1), np.int64)

@@ -95,9 +95,9 @@ def decode_surface(coded: CodedSurface) -> tuple[NDArray[np.float64], NDArray[np
     n, corners = coded.vertices, 3 * coded.triangles
     if len(data) != 9 * n + 4 * corners:
         raise ValueError(f"the surface has {len(data):,} bytes, {9 * n + 4 * corners:,} expected")
-    positions = _unfold(_join(data[: 6 * n], 3, np.uint16), np.uint16)
-    turned = _unfold(_join(data[6 * n : 9 * n], 3, np.uint8), np.uint8).view(np.int8)
-    codes = _join(data[9 * n :], 1, np.uint32)[:, 0].astype(np.int64)
+    positions = _unfold(_join_planes(data[: 6 * n], 3, np.uint16), np.uint16)
+    turned = _unfold(_join_planes(data[6 * n : 9 * n], 3, np.uint8), np.uint8).view(np.int8)
+    codes = _join_planes(data[9 * n :], 1, np.uint32)[:, 0].astype(np.int64)
     # A code of 0 is a vertex that was not there before: the highest so far is the number of these, less one.
     new = np.cumsum(codes == 0)
     indices = np.concatenate(([0], new[:-1])) - codes
@@ -139,7 +139,7 @@ def _planes(values: NDArray[Any], count: int) -> list[bytes]:
     return [((values >> (8 * byte)) & 0xFF).astype(np.uint8).T.tobytes() for byte in range(count)]
 
 
-def _join(planes: NDArray[np.uint8], columns: int, kind: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
+def _join_planes(planes: NDArray[np.uint8], columns: int, kind: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
     stacked = planes.reshape(np.dtype(kind).itemsize, columns, -1)
     return sum((plane.astype(kind) << kind(8 * byte) for byte, plane in enumerate(stacked)), np.zeros((), kind)).T
 
@@ -179,7 +179,7 @@ def compose_page(content: Content | Assembly) -> bytes:
         "half_step_mm": coded.half_step_mm,
         "space": meshes[0].space,
         "parts": parts,
-        "about": _describe(meshes, coded),
+        "about": _describe_meshes(meshes, coded),
     }
     # "<" would end the block: in JSON it can stand as an escape.
     text = json.dumps(facts, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
@@ -256,7 +256,7 @@ def _pieces(mesh: Content) -> list[tuple[str, int, float | None]]:
     ]
 
 
-def _describe(meshes: Sequence[Content], coded: CodedSurface) -> list[str]:
+def _describe_meshes(meshes: Sequence[Content], coded: CodedSurface) -> list[str]:
     """Return the lines below the parts: what is shown, how exactly, and where it comes from."""
     insides = list(dict.fromkeys(inside for mesh in meshes if (inside := _inside(mesh))))
     certificates = list(dict.fromkeys(mesh.certificate for mesh in meshes if mesh.certificate))

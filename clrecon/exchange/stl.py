@@ -111,7 +111,7 @@ def read_mesh(path: Path) -> RawMesh:
                     rows = np.frombuffer(stream.read(_FACET.itemsize * min(_PIECE, count - start)), dtype=_FACET)
                     corners[start : start + len(rows)] = rows["corners"]
                 space = re.search(rb"SPACE=(\w+)", head[:80])
-                return _make(corners, space)
+                return _make_mesh(corners, space)
             if head.removeprefix(MARK).lstrip()[:5].lower() != b"solid":
                 raise RefusedInputError(
                     f"{name} is cut or corrupt: {count:,} triangles take {_HEAD + _FACET.itemsize * count:,} bytes, it"
@@ -127,10 +127,10 @@ def read_mesh(path: Path) -> RawMesh:
         numbers = np.array(hits, dtype="S40").astype(np.float64).reshape(-1, 3, 3)
     except ValueError as error:
         raise say_cut(name, error) from error
-    return _make(numbers, re.search(rb"SPACE=(\w+)", text[:1024]))
+    return _make_mesh(numbers, re.search(rb"SPACE=(\w+)", text[:1024]))
 
 
-def _make(corners: NDArray[np.floating], space: re.Match[bytes] | None) -> RawMesh:
+def _make_mesh(corners: NDArray[np.floating], space: re.Match[bytes] | None) -> RawMesh:
     vertices, triangles = join_corners(corners.reshape(-1, 3))
     return RawMesh("STL", vertices, triangles, space=None if space is None else space[1].decode("ascii", "replace"))
 

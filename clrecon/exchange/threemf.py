@@ -198,7 +198,7 @@ def read_mesh(path: Path) -> RawMesh:
     try:
         with open_regular(path) as stream, zipfile.ZipFile(stream) as package:
             model = _read_model(package, _find_model(package, name), name)
-        shapes = _place(model)
+        shapes = _place_shapes(model)
     except (
         OSError, EOFError, ValueError, KeyError, OverflowError, MemoryError, NotImplementedError, RuntimeError,
         zipfile.BadZipFile, zlib.error, expat.ExpatError,
@@ -216,19 +216,19 @@ def _find_model(package: zipfile.ZipFile, name: str) -> str:
     entries = set(package.namelist())
     targets: list[str] = []
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
+    def start_element(tag: str, attributes: dict[str, str]) -> None:
         if tag.endswith(" Relationship") and attributes.get("Type") == _MODEL_TYPE:
             targets.append(attributes.get("Target", "").lstrip("/"))
 
     if _RELATIONS in entries:
-        _parse(package, _RELATIONS, start)
+        _parse_entry(package, _RELATIONS, start_element)
     model = targets[0] if targets else _MODEL
     if model not in entries:
         raise RefusedInputError(f"{name} is a zip archive without a 3D model: it is no 3MF file")
     return model
 
 
-def _parse(
+def _parse_entry(
     package: zipfile.ZipFile,
     entry: str,
     start: Callable[[str, dict[str, str]], None],
@@ -261,7 +261,7 @@ def _read_model(package: zipfile.ZipFile, entry: str, name: str) -> _Model:
     texts: list[str] | None = None
     group = model.colors.setdefault(-1, [])
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
+    def start_element(tag: str, attributes: dict[str, str]) -> None:
         nonlocal own, texts, group
         space, _, kind = tag.rpartition(" ")
         if space == _MATERIAL:
@@ -302,7 +302,7 @@ def _read_model(package: zipfile.ZipFile, entry: str, name: str) -> _Model:
         if texts is not None:
             model.description, texts = "".join(texts), None
 
-    _parse(package, entry, start, text, end)
+    _parse_entry(package, entry, start_element, text, end)
     return model
 
 
@@ -335,7 +335,7 @@ def _transform(text: str | None) -> NDArray[np.float64]:
     return matrix
 
 
-def _place(model: _Model) -> PlacedShapes:
+def _place_shapes(model: _Model) -> PlacedShapes:
     shapes = PlacedShapes()
     scale = np.diag([_MM[model.unit]] * 3 + [1.0])
 

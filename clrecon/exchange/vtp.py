@@ -123,7 +123,7 @@ def unwrap_cloud(polydata: Any) -> tuple[dict[str, NDArray[Any] | None], str | N
     return arrays, None if named is None else str(named)
 
 
-def _join(content: PointContent | Assembly) -> PointContent:
+def _join_meshes(content: PointContent | Assembly) -> PointContent:
     """Return the meshes of a file as one, with the facts of the first; a cloud or a single mesh stays as it is."""
     if not isinstance(content, Assembly):
         return content
@@ -166,7 +166,7 @@ def write(stream: BinaryIO, content: PointContent | Assembly) -> None:
     ``COLOR``; the field array ``PART_NAMES`` has the names in this order.
     """
     parts = content.parts if isinstance(content, Assembly) else []
-    content = _join(content)
+    content = _join_meshes(content)
     faces = content.triangles if isinstance(content, Content) else None
     corners = np.arange(len(content.vertices))[:, None] if faces is None else faces
     whole = np.int32 if max(len(content.vertices), corners.size) < 2**31 else np.int64
@@ -254,7 +254,7 @@ def _facts(content: PointContent, parts: Sequence[Content]) -> dict[str, Any]:
 
 def verify(path: Path, content: PointContent | Assembly) -> None:
     """Check the counts in the XML and the end of a finished file."""
-    least, content = estimate(content), _join(content)
+    least, content = estimate(content), _join_meshes(content)
     with path.open("rb") as stream:
         head = stream.read(8192).decode("latin-1")
         stream.seek(max(path.stat().st_size - 64, 0))
@@ -296,15 +296,15 @@ class Document:
 
 def read_cloud(path: Path) -> RawCloud:
     """Read the points, the point arrays and the field arrays ``SPACE``, ``ISO_VALUE_HU`` and so on."""
-    return _read(path, _collect_points)
+    return _read_document(path, _collect_points)
 
 
 def read_mesh(path: Path) -> RawMesh:
     """Read the triangles of a VTP file; those of one number in the cell array ``PART`` are a part."""
-    return _read(path, _collect_triangles)
+    return _read_document(path, _collect_triangles)
 
 
-def _read(path: Path, collect: Callable[[Document, str], Raw]) -> Raw:
+def _read_document(path: Path, collect: Callable[[Document, str], Raw]) -> Raw:
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:

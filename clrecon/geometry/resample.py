@@ -63,16 +63,16 @@ def _trilinear(voxels: NDArray[Any], places: Float64Array) -> Float64Array:
     rests = 1.0 - parts
     steps = [np.where(low[axis] < last[axis], strides[axis], 0) for axis in range(3)]
 
-    def blend(numbers: NDArray[np.intp], axis: int) -> Float64Array:
+    def blend_values(numbers: NDArray[np.intp], axis: int) -> Float64Array:
         if axis < 0:
             return values.take(numbers).astype(np.float64)
-        low, high = blend(numbers, axis - 1), blend(numbers + steps[axis], axis - 1)
+        low, high = blend_values(numbers, axis - 1), blend_values(numbers + steps[axis], axis - 1)
         low *= rests[axis]
         high *= parts[axis]
         low += high
         return low
 
-    return blend((low[0] + ni * (low[1] + nj * low[2])).astype(np.intp), 2)
+    return blend_values((low[0] + ni * (low[1] + nj * low[2])).astype(np.intp), 2)
 
 
 def _spline(voxels: NDArray[Any], places: Float64Array) -> Float64Array:

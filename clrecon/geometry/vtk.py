@@ -58,9 +58,9 @@ def take_image_data(image: Any, name: str | None, space: str | None) -> Taken:
     affine[:3, :3] = np.array(direction) * wrapped.GetSpacing()
     affine[:3, 3] = wrapped.GetPoint(0)  # an image that was cut out of another does not begin at its origin
     turn = np.eye(4)
-    turn[:3, :3] = frame_from_lps(choose_space(space, _note(wrapped, "SPACE"), "the ImageData"))
+    turn[:3, :3] = frame_from_lps(choose_space(space, _read_note(wrapped, "SPACE"), "the ImageData"))
     affine = turn @ affine  # its own inverse: to LPS as from LPS
-    if _note(wrapped, "SLICES") == _TURNED:
+    if _read_note(wrapped, "SLICES") == _TURNED:
         values, affine = _reversed(values, affine)
     return values, affine
 
@@ -88,7 +88,7 @@ def _numbers_of(image: Any, name: str | None) -> Any:
     return values
 
 
-def _note(image: Any, name: str) -> str | None:
+def _read_note(image: Any, name: str) -> str | None:
     return str(image.field_data[name][0]) if name in image.field_data else None
 
 

@@ -53,10 +53,10 @@ class CorridorReport(ScanReport):
 def _point_placer(space: str) -> Callable[[NDArray[Any] | None], list[float] | None]:
     turn = frame_from_lps(space)
 
-    def place(point: NDArray[Any] | None) -> list[float] | None:
+    def place_point(point: NDArray[Any] | None) -> list[float] | None:
         return None if point is None else [round(float(value), 3) for value in turn @ point]
 
-    return place
+    return place_point
 
 
 def _round_numbers(value: Any, digits: int = 3) -> Any:

@@ -37,7 +37,7 @@ def describe_input(
     listing: dict[str, Any] = {"series": entries, "chosen": selected.chosen, "certificate": selected.certificate}
     notes, problem, refused = list(selected.warnings), selected.refusal, None
     if selected.chosen is not None:
-        problem = _judge(next(entry for entry in entries if entry["number"] == selected.chosen))
+        problem = _judge_entry(next(entry for entry in entries if entry["number"] == selected.chosen))
         if problem is None:
             failed = _judge_gates(listing) if settings.strict else None
             return InputListing(listing, notes, failed)
@@ -49,7 +49,7 @@ def describe_input(
     return InputListing(listing, notes, problem, refused)
 
 
-def _judge(entry: dict[str, Any]) -> ClreconError | None:
+def _judge_entry(entry: dict[str, Any]) -> ClreconError | None:
     if not entry["problems"]:
         return None
     kind = RefusedInputError if entry["modality"] == "CT" else NoDicomError

@@ -134,7 +134,7 @@ def _paint(
     shape: tuple[int, int],
 ) -> NDArray[np.bool_]:
     """Fill contours from the outer to the inner ones: one within an odd number of regions, or crossing, is a hole."""
-    region = _join(len(contours), crossing)
+    region = _join_regions(len(contours), crossing)
     around: list[set[int]] = [set() for _ in contours]
     for outer, inner in nested:
         around[inner].add(region[outer])
@@ -202,7 +202,7 @@ def _goes_beyond(first: _Patch, second: _Patch) -> bool:
     return bool(left.any())
 
 
-def _join(count: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
+def _join_regions(count: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
     """Return for each of `count` members the number of its region; pairs are of one region."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -91,7 +91,7 @@ def read_labels(
         not say where it lies in space, or has segments that overlap.
     """
     wanted = check_wanted(label)
-    labels = _read(Path(path), Wanted(wanted, others=False), volume, follow_links, progress)
+    labels = _read_map(Path(path), Wanted(wanted, others=False), volume, follow_links, progress)
     return labels if wanted is None else _keep(labels, [labels.find(label) for label in wanted])
 
 
@@ -104,7 +104,7 @@ def read_all_labels(
     progress: Progress | None = None,
 ) -> LabelMap:
     """Read a label map with all labels, which tell a surface where its own ends; `first` get voxels of several."""
-    return _read(Path(path), Wanted(check_wanted(first)), volume, follow_links, progress)
+    return _read_map(Path(path), Wanted(check_wanted(first)), volume, follow_links, progress)
 
 
 def _keep(labels: LabelMap, numbers: Sequence[int]) -> LabelMap:
@@ -116,7 +116,9 @@ def _keep(labels: LabelMap, numbers: Sequence[int]) -> LabelMap:
     return labels.changed(np.stack([table[plane] for plane in labels.voxels]), names)
 
 
-def _read(path: Path, wanted: Wanted, volume: Grid | None, follow_links: bool, progress: Progress | None) -> LabelMap:
+def _read_map(
+    path: Path, wanted: Wanted, volume: Grid | None, follow_links: bool, progress: Progress | None
+) -> LabelMap:
     try:
         if not path.exists():
             raise UsageError(f"there is no label map {escape_text(str(path), 200)}")

@@ -80,7 +80,7 @@ def resample_labels(labels: LabelMap, volume: Volume, *, progress: Progress | No
         The arguments are not a LabelMap and a Volume.
     """
     shares = check_together(labels, volume)
-    voxels, exact = _take(labels, volume, progress or ignore_progress)
+    voxels, exact = _take_labels(labels, volume, progress or ignore_progress)
     misplaced = warn_of_place(labels, volume, voxels)
     log_warnings(log, misplaced)
     return ResampledLabels(voxels, exact, shares, (*labels.warnings, *misplaced))
@@ -100,7 +100,7 @@ def warn_of_place(labels: LabelMap, volume: Volume, voxels: NDArray[Any] | None 
     places = apply_affine(np.linalg.inv(volume.affine) @ labels.affine, corners)  # in steps of the scan
     if np.abs(places - corners).max() <= ON_GRID:
         return []
-    placed = _take(labels, volume, ignore_progress)[0] if voxels is None else voxels
+    placed = _take_labels(labels, volume, ignore_progress)[0] if voxels is None else voxels
     by_affine, by_index = _shares_of_bone(volume, placed, labels.voxels)
     box, scan = (np.stack((each.min(axis=0), each.max(axis=0))) for each in (places, corners))
     if by_affine >= by_index and np.abs(box - scan).max() <= ON_GRID:
@@ -135,7 +135,7 @@ def _shares_of_bone(volume: Volume, *maps: NDArray[Any]) -> list[float]:
     return [float(dense) / max(int(labelled), 1) for dense, labelled in counts]
 
 
-def _take(labels: LabelMap, volume: Volume, progress: Progress) -> tuple[NDArray[Any], bool]:
+def _take_labels(labels: LabelMap, volume: Volume, progress: Progress) -> tuple[NDArray[Any], bool]:
     """Return the labels on the grid of the volume, and whether each voxel coincides with one of the map."""
     aligned = _take_aligned(labels, volume)
     return (aligned, True) if aligned is not None else _take_nearest(labels, volume, progress)

@@ -53,7 +53,7 @@ class FrameStack:
     warnings: tuple[str, ...] = ()
 
 
-def _numbers(value: Any, count: int) -> NDArray[np.float64]:
+def _floats(value: Any, count: int) -> NDArray[np.float64]:
     numbers = np.array([float(number) for number in value], dtype=np.float64)
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
         raise ValueError(f"{count} numbers are needed, there are {numbers.tolist()}")
@@ -70,11 +70,11 @@ def _group(shared: Any, group: Any, sequence: str) -> Any:
 def place_frames(shared: Any, groups: list[Any], name: str) -> FrameStack:
     """Place the frames of a SEG by their own positions, from its shared and its per-frame functional groups."""
     directions = np.stack(
-        [_numbers(_group(shared, g, "PlaneOrientationSequence").ImageOrientationPatient, 6) for g in groups]
+        [_floats(_group(shared, g, "PlaneOrientationSequence").ImageOrientationPatient, 6) for g in groups]
     )
     measures = [_group(shared, g, "PixelMeasuresSequence") for g in groups]
-    spacings = np.stack([_numbers(m.PixelSpacing, 2) for m in measures])
-    positions = np.stack([_numbers(_group(shared, g, "PlanePositionSequence").ImagePositionPatient, 3) for g in groups])
+    spacings = np.stack([_floats(m.PixelSpacing, 2) for m in measures])
+    positions = np.stack([_floats(_group(shared, g, "PlanePositionSequence").ImagePositionPatient, 3) for g in groups])
     if np.ptp(directions, axis=0).max() > _DIRECTIONS_DIFFER or np.ptp(spacings, axis=0).max() > _DIRECTIONS_DIFFER:
         raise RefusedInputError(f"the frames of {name} differ in direction or pixel spacing: they form no stack")
     row, column = directions[0, :3], directions[0, 3:]
@@ -201,7 +201,7 @@ def read_segmentation(
     """Read a DICOM SEG of a label map or of binary segments; only those that are not wanted may overlap."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pydicom's messages quote the file unescaped
-        return _read(path, escape_text(path.name), wanted, progress, check)
+        return _read_frames(path, escape_text(path.name), wanted, progress, check)
 
 
 def tell_pixel_bytes(path: Path) -> int:
@@ -220,8 +220,8 @@ def tell_pixel_bytes(path: Path) -> int:
     return layout.pixel_bytes
 
 
-def _read(path: Path, name: str, wanted: Wanted, progress: Progress, check: Check | None) -> LabelMap:
-    dataset = _parse(path, name)
+def _read_frames(path: Path, name: str, wanted: Wanted, progress: Progress, check: Check | None) -> LabelMap:
+    dataset = _parse_dataset(path, name)
     try:
         layout = _read_layout(dataset, name, path.stat().st_size)
         segments = {int(s.SegmentNumber): str(s.get("SegmentLabel", "")) for s in dataset.SegmentSequence}
@@ -283,7 +283,7 @@ def _first_line(error: Exception) -> str:
     return escape_text((str(error).splitlines() or [""])[0] or type(error).__name__, 200)
 
 
-def _parse(path: Path, name: str) -> Any:
+def _parse_dataset(path: Path, name: str) -> Any:
     from pydicom import dcmread
     from pydicom.filereader import read_file_meta_info
 

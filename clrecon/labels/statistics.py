@@ -162,7 +162,7 @@ def measure_resampled(
     for row, number in enumerate(numbers):
         progress("measure labels", row, len(numbers))
         box = boxes[number - 1] if number <= len(boxes) else None
-        values, ml = _take(volume, placed.voxels, number, box, voxel_ml)
+        values, ml = _take_values(volume, placed.voxels, number, box, voxel_ml)
         figures.append(
             LabelFigures(
                 number=number,
@@ -171,14 +171,14 @@ def measure_resampled(
                 ml=float(ml.sum()),
                 label_ml=label_ml(labels, number),
                 inside_share=placed.inside[number],
-                **_measure(values, ml, wanted),
+                **_measure_values(values, ml, wanted),
             )
         )
     progress("measure labels", len(numbers), len(numbers))
     return figures
 
 
-def _take(
+def _take_values(
     volume: Volume, labels: NDArray[Any], number: int, box: tuple[slice, ...] | None, voxel_ml: NDArray[np.float64]
 ) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """Return the values of a label's voxels and the volume of each in ml, both of shape (n,)."""
@@ -189,7 +189,7 @@ def _take(
     return volume.voxels[box][mask], np.repeat(voxel_ml[box[0]], counts)
 
 
-def _measure(values: NDArray[Any], ml: NDArray[np.float64], percentiles: Sequence[float]) -> dict[str, Any]:
+def _measure_values(values: NDArray[Any], ml: NDArray[np.float64], percentiles: Sequence[float]) -> dict[str, Any]:
     finite = np.isfinite(values) if values.dtype.kind == "f" else np.ones(len(values), dtype=bool)
     unmeasured = len(values) - int(np.count_nonzero(finite))
     if unmeasured:

@@ -132,7 +132,7 @@ def read_structures(
     if volume is None:
         raise UsageError(f"{name} is an RTSTRUCT: its contours need the scan they were drawn on, give its volume too")
     grid = label_slices(volume)
-    structures = _parse(path, name)
+    structures = _parse_file(path, name)
     names = {number: one.name for number, one in structures.items()}
     shown = {number: text or f"label_{number}" for number, text in names.items()}
     chosen = set(structures)
@@ -299,7 +299,7 @@ def _points_of(contour: _Contour, file: str, shown: str) -> NDArray[np.float64]:
     return numbers.reshape(-1, 3)
 
 
-def _parse(path: Path, name: str) -> dict[int, _Structure]:
+def _parse_file(path: Path, name: str) -> dict[int, _Structure]:
     from pydicom.filereader import read_file_meta_info
 
     try:
@@ -321,7 +321,7 @@ def _parse(path: Path, name: str) -> dict[int, _Structure]:
             little_endian=True,
             items_limit=_MOST_CONTOURS,
         )
-        return _collect(top, name)
+        return _collect_structures(top, name)
     except ValueProblem as problem:
         raise RefusedInputError(f"{name} is a corrupt DICOM file: {problem}") from problem
     except ClreconError:
@@ -330,7 +330,7 @@ def _parse(path: Path, name: str) -> dict[int, _Structure]:
         raise RefusedInputError(f"{name} is no usable RTSTRUCT: {type(error).__name__}") from error
 
 
-def _collect(top: Item, name: str) -> dict[int, _Structure]:
+def _collect_structures(top: Item, name: str) -> dict[int, _Structure]:
     decode = _decoder(top.values.get(_CHARACTERS, b""))
     structures: dict[int, _Structure] = {}
     for item in top.sequences.get(_ROIS, ()):
@@ -345,13 +345,13 @@ def _collect(top: Item, name: str) -> dict[int, _Structure]:
         number = _whole(item.values.get(_OWNER), name)
         if number not in structures:
             raise RefusedInputError(f"{name} is corrupt: contours belong to ROI {number}, which it does not list")
-        _take(structures[number], item.sequences.get(_CONTOURS, ()), name)
+        _take_contours(structures[number], item.sequences.get(_CONTOURS, ()), name)
     if 0 not in structures:
         return structures
     return dict(enumerate(structures.values(), start=1))  # no label has the number 0
 
 
-def _take(structure: _Structure, contours: Iterable[Item], name: str) -> None:
+def _take_contours(structure: _Structure, contours: Iterable[Item], name: str) -> None:
     for item in contours:
         kind = item.values.get(_TYPE, b"").decode("ascii", "replace").strip(" \0").upper() or "contours of no type"
         if kind in _CLOSED:

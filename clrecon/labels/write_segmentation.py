@@ -48,7 +48,7 @@ def encode_segmentation(labels: LabelMap, slices: Sequence[SourceSlice], *, labe
     def make_uid(role: str) -> str:
         return ROOT + str(int.from_bytes(hashlib.sha256(digest.digest() + role.encode()).digest()[:16], "big"))
 
-    seg = _describe(make_uid, first)
+    seg = _describe_series(make_uid, first)
     seg.ContentLabel = label
     seg.Rows, seg.Columns, seg.NumberOfFrames = rows, columns, len(frames)
     seg.SegmentSequence = Items([_segment(number, labels.name(number)) for number in numbers])
@@ -67,7 +67,7 @@ def encode_segmentation(labels: LabelMap, slices: Sequence[SourceSlice], *, labe
     return stream.getvalue()
 
 
-def _describe(make_uid: Callable[[str], str], first: dict[str, str]) -> Any:
+def _describe_series(make_uid: Callable[[str], str], first: dict[str, str]) -> Any:
     """Return the elements that do not depend on the labels; `first` has the UIDs of a slice of the scan."""
     from pydicom.dataset import FileDataset, FileMetaDataset
     from pydicom.uid import ExplicitVRLittleEndian

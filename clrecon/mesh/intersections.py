@@ -67,7 +67,7 @@ def find_self_intersections(
     pieces = entries.pieces()
     close = [np.zeros((0, 2), dtype=np.int64)] * (len(pieces) - 1)
 
-    def work(span: slice) -> None:
+    def pair_entries(span: slice) -> None:
         left, right = entries.overlapping(slice(pieces[span.start], pieces[span.start + 1]), changed)
         common = np.zeros(len(left), dtype=np.int8)
         for corner in corners:
@@ -76,12 +76,12 @@ def find_self_intersections(
                 common += number == second.take(right)
         close[span.start] = np.column_stack(planes.not_apart(points, left, right, common))
 
-    def count(piece: slice) -> None:
+    def count_piece(piece: slice) -> None:
         if steps is not None:
             first, end = (len(triangles) * n // len(close) for n in (piece.start, piece.stop))
             steps.take(end - first)
 
-    in_threads(work, len(close), 1, count)
+    in_threads(pair_entries, len(close), 1, count_piece)
     return _leave_cut(vertices, triangles, np.concatenate(close)) if close else np.zeros((0, 2), dtype=np.int64)
 
 
@@ -90,16 +90,16 @@ def _leave_cut(
 ) -> NDArray[np.int64]:
     cut = np.zeros(len(pairs), dtype=bool)
 
-    def work(span: slice) -> None:
+    def test_pairs(span: slice) -> None:
         corners = triangles[pairs[span].T].transpose(0, 2, 1)  # of which triangle, corner, pair
         left, right = vertices[corners].astype(np.float64)
-        rows = np.flatnonzero(_cut(left, right, corners[0][:, None] == corners[1]))
+        rows = np.flatnonzero(_cut_pairs(left, right, corners[0][:, None] == corners[1]))
         # Corners at one place count as the same: only pairs that cut each other otherwise can have some.
         left, right = vertices[corners[:, :, rows]].astype(np.float64)
-        rows = rows[_cut(left, right, (left[:, None] == right).all(axis=3)) & _has_area(left) & _has_area(right)]
+        rows = rows[_cut_pairs(left, right, (left[:, None] == right).all(axis=3)) & _has_area(left) & _has_area(right)]
         cut[span.start + rows] = True
 
-    in_threads(work, len(pairs), _PIECE)
+    in_threads(test_pairs, len(pairs), _PIECE)
     return pairs[cut]
 
 
@@ -132,12 +132,12 @@ def find_boxes(
     """Return the lowest and the highest coordinates of each triangle, shape (m, 3)."""
     low, high = (np.empty((len(triangles), 3), vertices.dtype) for _ in range(2))
 
-    def work(span: slice) -> None:
+    def bound_triangles(span: slice) -> None:
         first, two, three = (vertices.take(corners, axis=0) for corners in triangles[span].T)
         np.minimum(np.minimum(first, two), three, out=low[span])
         np.maximum(np.maximum(first, two), three, out=high[span])
 
-    in_threads(work, len(triangles))
+    in_threads(bound_triangles, len(triangles))
     return low, high
 
 
@@ -298,7 +298,7 @@ def _enter_into_cells(first: NDArray[np.int32], last: NDArray[np.int32]) -> tupl
     return triangle, cell
 
 
-def _cut(left: Float64Array, right: Float64Array, same: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _cut_pairs(left: Float64Array, right: Float64Array, same: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """True where triangles cut each other; corners have shape (3, k, 3), and `same` (3, 3, k) says which are one."""
     is_cut = np.zeros(left.shape[1], dtype=bool)
     common = same.sum(axis=(0, 1))

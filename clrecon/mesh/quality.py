@@ -139,7 +139,7 @@ def measure_triangles(
     columns, origin = np.ascontiguousarray(vertices.T.astype(np.float64)), local_origin(vertices)
     pieces: dict[int, tuple[float, ...]] = {}
 
-    def measure(piece: slice) -> None:
+    def measure_piece(piece: slice) -> None:
         corner, p, q = take_edges(columns, triangles[piece], origin)
         cross = cross_product(p, q)
         squares = np.einsum("ij,ij->j", cross, cross)
@@ -147,7 +147,7 @@ def measure_triangles(
         volume = np.einsum("ij,ij->", corner, cross)
         pieces[piece.start] = np.sqrt(squares).sum(), volume, int(np.count_nonzero(squares == 0.0)), shortest
 
-    in_threads(measure, len(triangles))
+    in_threads(measure_piece, len(triangles))
     if not pieces:
         return 0.0, 0.0, 0, None
     rows = np.array([pieces[start] for start in sorted(pieces)])

@@ -73,23 +73,23 @@ class TriangleTree:
         places, rows = np.empty((len(points), 3)), np.empty(len(points), np.int64)
         squares = np.empty(len(points))
 
-        def work(piece: slice) -> None:
+        def search_piece(piece: slice) -> None:
             places[piece], rows[piece], squares[piece] = self._find_nearest(points[piece])
 
-        in_threads(work, len(points), PIECE)
+        in_threads(search_piece, len(points), PIECE)
         return places, rows, np.sqrt(squares)
 
     def first_hits(self, starts: Points, ends: Points) -> Points:
         """Return where lines from `starts` to `ends`, shape (k, 3), first meet the surface; NaN where they do not."""
         shares = np.full(len(starts), np.inf)
 
-        def work(piece: slice) -> None:
+        def follow_piece(piece: slice) -> None:
             for reach in _REACHES:
                 left = np.flatnonzero(np.isinf(shares[piece]))
                 lines = starts[piece][left], ends[piece][left] - starts[piece][left]
                 shares[piece][left] = self._find_first(*lines, reach)
 
-        in_threads(work, len(starts), PIECE)
+        in_threads(follow_piece, len(starts), PIECE)
         return np.where(np.isinf(shares), np.nan, shares)[:, None] * (ends - starts) + starts
 
     def _find_nearest(self, points: Points) -> tuple[Points, NDArray[np.int64], NDArray[np.float64]]:

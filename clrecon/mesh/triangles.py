@@ -77,7 +77,7 @@ def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
     total = np.zeros((3, len(vertices)))
     parts: dict[int, tuple[int, NDArray[np.float64]]] = {}
 
-    def work(piece: slice) -> None:
+    def sum_piece(piece: slice) -> None:
         corners = triangles[piece].T
         low = int(corners.min())
         parts[piece.start] = low, _sum_normals(columns, corners, low)
@@ -86,7 +86,7 @@ def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
         low, part = parts.pop(piece.start)
         total[:, low : low + part.shape[1]] += part
 
-    in_threads(work, len(triangles), CHUNK, add)
+    in_threads(sum_piece, len(triangles), CHUNK, add)
     length = np.sqrt(np.einsum("ij,ij->j", total, total))
     flat = length == 0.0
     total[:, flat] = np.array([[0.0], [0.0], [1.0]])

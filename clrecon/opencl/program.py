@@ -41,14 +41,14 @@ def _take_buffer(value: Any) -> Any:
 def _take_whole(kind: Any) -> Callable[[Any], Any]:
     low, high = int(np.iinfo(kind).min), int(np.iinfo(kind).max)
 
-    def take(value: Any) -> Any:
+    def take_value(value: Any) -> Any:
         if low <= value <= high:
             number = kind(value)
             if value.__class__ is int or number == value:  # comparing takes as long as converting
                 return number
         raise ValueError(f"{value!r} is no {kind.__name__}")
 
-    return take
+    return take_value
 
 
 def _take_float4(numbers: Any) -> Any:

@@ -90,7 +90,7 @@ def read_kernel_source(name: str) -> str:
 
 
 @cache
-def _numbers(name: str) -> dict[str, set[str]]:
+def _list_numbers(name: str) -> dict[str, set[str]]:
     """Every number that a kernel file defines; variants may define one differently."""
     numbers: dict[str, set[str]] = {}
     for macro, number in _NUMBER.findall(_read_file(name)):
@@ -100,7 +100,7 @@ def _numbers(name: str) -> dict[str, set[str]]:
 
 def kernel_number(name: str, macro: str) -> float:
     """Return the number that a kernel file or header defines as `macro`, as in ``#define AIR_HU (-1000.0f)``."""
-    numbers = _numbers(name).get(macro, set())
+    numbers = _list_numbers(name).get(macro, set())
     if len(numbers) != 1:
         there = f"several numbers {macro}: {', '.join(sorted(numbers))}" if numbers else f"no number {macro}"
         raise KeyError(f"cl/{name} defines {there}")
@@ -213,7 +213,7 @@ def _holds(directive: str, condition: str, macros: Mapping[str, str]) -> bool:
         raise ValueError(f"#if {condition}")
     text = text.replace("&&", " and ").replace("||", " or ")
     try:
-        return bool(_number(ast.parse(re.sub(r"!(?!=)", " not ", text).strip(), mode="eval").body))
+        return bool(_read_number(ast.parse(re.sub(r"!(?!=)", " not ", text).strip(), mode="eval").body))
     except (SyntaxError, KeyError) as error:
         raise ValueError(f"#if {condition}") from error
 
@@ -233,19 +233,19 @@ _OPERATIONS: dict[type, Callable[[int, int], int]] = {
 }
 
 
-def _number(node: ast.expr) -> int:
+def _read_number(node: ast.expr) -> int:
     if isinstance(node, ast.Constant) and isinstance(node.value, int):
         return node.value
     if isinstance(node, ast.BoolOp):
-        holds = [_number(part) != 0 for part in node.values]
+        holds = [_read_number(part) != 0 for part in node.values]
         return int(all(holds) if isinstance(node.op, ast.And) else any(holds))
     if isinstance(node, ast.UnaryOp):
-        value = _number(node.operand)
+        value = _read_number(node.operand)
         return int(not value) if isinstance(node.op, ast.Not) else -value
     if isinstance(node, ast.BinOp):
-        return int(_OPERATIONS[type(node.op)](_number(node.left), _number(node.right)))
+        return int(_OPERATIONS[type(node.op)](_read_number(node.left), _read_number(node.right)))
     if isinstance(node, ast.Compare) and len(node.ops) == 1:
-        return int(_OPERATIONS[type(node.ops[0])](_number(node.left), _number(node.comparators[0])))
+        return int(_OPERATIONS[type(node.ops[0])](_read_number(node.left), _read_number(node.comparators[0])))
     raise SyntaxError(ast.dump(node))
 
 

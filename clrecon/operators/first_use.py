@@ -49,10 +49,10 @@ def check_ball(device: Device) -> str:
         return ""  # a device that is full is no wrong one: what follows meets the same
     except (ClreconError, ArithmeticError, LookupError, ValueError) as error:
         return str(error)
-    return _compare(mesh)
+    return _compare_mesh(mesh)
 
 
-def _compare(mesh: Mesh) -> str:
+def _compare_mesh(mesh: Mesh) -> str:
     vertices, triangles = mesh.vertices.astype(np.float64), mesh.triangles.astype(np.int64)
     if not len(triangles) or triangles.max(initial=0) >= len(vertices):
         return (

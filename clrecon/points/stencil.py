@@ -140,8 +140,8 @@ def make_stencil(lattice: Lattice, eps: float) -> Stencil:
         whole = np.concatenate([*ahead, *map(_mirror, ahead[1:])])
         whole = whole[_order(plane, whole, whole[:, 1:2] * step)]
         tables = np.tile(np.array([[0, len(whole)]], np.int32), (nk, 1))
-        return _finish(nk, [whole], tables)
-    return _finish(nk, *_uneven_tables(lattice.origins, plane))
+        return _finish_stencil(nk, [whole], tables)
+    return _finish_stencil(nk, *_uneven_tables(lattice.origins, plane))
 
 
 class _Plane:
@@ -235,7 +235,7 @@ def _rows_between(
     return cache[key]
 
 
-def _finish(nk: int, parts: Sequence[ArrayLike], tables: NDArray[np.int32]) -> Stencil:
+def _finish_stencil(nk: int, parts: Sequence[ArrayLike], tables: NDArray[np.int32]) -> Stencil:
     rows = np.concatenate(parts).astype(np.int32)
     lengths = rows[:, 3] - rows[:, 2] + 1
     members: dict[int, tuple[bool, int]] = {}

@@ -60,7 +60,7 @@ def make_demo(
             with system_errors(output):
                 staged = stack.enter_context(temporary_folder(folder if folder.exists() else folder.parent))
             try:
-                outcome = _fill(staged, chosen, progress)
+                outcome = _fill_folder(staged, chosen, progress)
             except OutputError as error:
                 raise OutputError(str(error).replace(str(staged), str(output))) from error
             with hold_interrupts():
@@ -68,7 +68,7 @@ def make_demo(
     return {"folder": str(output), **outcome}
 
 
-def _fill(folder: Path, chosen: Device, progress: Progress | None) -> dict[str, Any]:
+def _fill_folder(folder: Path, chosen: Device, progress: Progress | None) -> dict[str, Any]:
     from clrecon.proof.phantom import PhantomSettings, write_phantom
 
     watch = Laps()
@@ -76,7 +76,7 @@ def _fill(folder: Path, chosen: Device, progress: Progress | None) -> dict[str, 
     truth = write_phantom(folder / "ct", settings, progress=progress)
     watch.lap("phantom")
     picture = make_pictures(
-        folder / "ct", PictureFiles(folder / "bone.png"), _look(str(chosen.index)), progress=progress
+        folder / "ct", PictureFiles(folder / "bone.png"), _choose_look(str(chosen.index)), progress=progress
     )
     watch.lap("picture")
     report = make_mesh(
@@ -102,7 +102,7 @@ def _fill(folder: Path, chosen: Device, progress: Progress | None) -> dict[str, 
     }
 
 
-def _look(device: str) -> RenderSettings:
+def _choose_look(device: str) -> RenderSettings:
     return RenderSettings.of(preset="bone", views=["25,10"], ray_step=0.25, letters=True, scale_bar=True, device=device)
 
 

@@ -235,20 +235,20 @@ def main() -> None:
     lines = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
     os.dup2(2, 1)  # a driver may print
 
-    def tell(**line: Any) -> None:
+    def tell_line(**line: Any) -> None:
         lines.write(json.dumps(line) + "\n")
 
     request = json.load(sys.stdin)
     device = list_devices()[request["device"]]
-    device.trace = lambda doing: tell(doing=doing)
+    device.trace = lambda doing: tell_line(doing=doing)
     for check in CHECKS:
         if check.name in request["checks"]:
-            tell(check=check.name)
+            tell_line(check=check.name)
             result = run_check(device, check)
             if device.known_good is not None:  # after its last result the process may be ended
                 device.known_good.record()
-            tell(warnings=device.warnings)
-            tell(**result)
+            tell_line(warnings=device.warnings)
+            tell_line(**result)
 
 
 def run_device_selftest(

@@ -37,7 +37,7 @@ def free_cores(seconds: float = 0.2) -> float:
     """Number of cores that are free now: the work of all threads together, divided by that of one thread alone."""
     block = bytes(1 << 20)
 
-    def work(done: list[int]) -> None:
+    def count_loops(done: list[int]) -> None:
         end, count = time.perf_counter() + seconds, 0
         while time.perf_counter() < end:
             zlib.crc32(block)  # lets other threads run
@@ -46,8 +46,8 @@ def free_cores(seconds: float = 0.2) -> float:
 
     alone: list[int] = []
     together: list[int] = []
-    work(alone)
-    threads = [threading.Thread(target=work, args=(together,)) for _ in range(usable_cores())]
+    count_loops(alone)
+    threads = [threading.Thread(target=count_loops, args=(together,)) for _ in range(usable_cores())]
     for thread in threads:
         thread.start()
     for thread in threads:

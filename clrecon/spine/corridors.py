@@ -426,7 +426,7 @@ def measure_corridors(
     corridors = []
     for side, sign in SIDES.items():
         line, span = find_line(lambda points: bone.quick_depth(frame.to_lps(points)), surface, frame, sign)
-        corridors.append(_measure(bone, frame, surface, wall, side, line, span))
+        corridors.append(_measure_corridor(bone, frame, surface, wall, side, line, span))
     return VertebraCorridors(name, bone, frame, tuple(corridors), tuple(warnings))
 
 
@@ -444,7 +444,7 @@ def _judge_cut(bone: SolidBone, frame: VertebraFrame, name: str) -> list[str]:
     return [f"{name} touches the end of the scan with its processes; body and pedicles are whole"]
 
 
-def _measure(
+def _measure_corridor(
     bone: SolidBone, frame: VertebraFrame, surface: Float64Array, wall: Float64Array, side: str, line: Line | None,
     span: Span,
 ) -> Corridor:  # fmt: skip

@@ -161,7 +161,7 @@ def find_frame(bone: SolidBone, subject: str) -> VertebraFrame:
         middle = middle + shift * axes[2]
         axes = _point_front(middle, canal_point + ((middle - canal_point) @ basis[2]) * basis[2], up)
     middle, axes = _halve(bone, points, middle, axes)
-    return _measure(points, middle, axes, (canal_point, basis[2], radius), height, subject)
+    return _measure_body(points, middle, axes, (canal_point, basis[2], radius), height, subject)
 
 
 def _point_front(middle: Float64Array, canal: Float64Array, up: Float64Array) -> Float64Array:
@@ -224,7 +224,7 @@ def _fit_plates(local: Float64Array, axes: Float64Array, subject: str) -> tuple[
     return up / np.linalg.norm(up), float((planes[0][2] + planes[1][2]) / 2.0), height
 
 
-def _measure(
+def _measure_body(
     points: Float64Array, middle: Float64Array, axes: Float64Array, canal: tuple[Float64Array, Float64Array, float],
     height: float, subject: str,
 ) -> VertebraFrame:  # fmt: skip

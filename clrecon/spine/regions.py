@@ -206,7 +206,7 @@ def divide(
 
     ribs = _find_ribs(part, bone)
     bone = bone & (np.abs(part.aside) <= BESIDE_MM)
-    markers = _mark(part, bone, planes, volume)
+    markers = _mark_bodies(part, bone, planes, volume)
     ridge = _ridges(part, bounds)
     depth = distance_transform_edt(bone, sampling=part.spacing)
     by_depth = watershed(_RIDGE_MM * ridge - depth, markers, mask=bone)
@@ -288,7 +288,7 @@ def _ridges(part: Part, bounds: list[Bound]) -> NDArray[np.float32]:
     return np.where(arch, heights[np.rint(part.place).astype(int)], 0.0).astype(np.float32)
 
 
-def _mark(part: Part, bone: Mask, planes: Planes, volume: Volume) -> NDArray[np.int32]:
+def _mark_bodies(part: Part, bone: Mask, planes: Planes, volume: Volume) -> NDArray[np.int32]:
     """Return the bone of the bodies with its piece's number, but for what is near to a plane."""
     markers = np.zeros(bone.shape, np.int32)
     for k, plane in enumerate(bone & part.body):

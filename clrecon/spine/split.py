@@ -248,7 +248,7 @@ def split_vertebrae(
         No spine, fewer than two discs, or all vertebrae are of low confidence.
     """
     progress = progress or ignore_progress
-    _check(volume, level)
+    _check_input(volume, level)
     points = None if seeds is None else _checked_seeds(seeds)
     level_name = check_landmark(name_at, first)
     landmark = None if name_at is None else checked_points([name_at[0]])[0]
@@ -283,7 +283,7 @@ def split_vertebrae(
     return VertebraSplit(labels, vertebrae, centres, normals, hu, left_out, plane)
 
 
-def _check(volume: Volume, level: float | None) -> None:
+def _check_input(volume: Volume, level: float | None) -> None:
     if level is not None and not math.isfinite(level):
         raise UsageError(f"the level of bone is a number of HU, not {level!r}")
     if volume.uneven:

@@ -155,18 +155,18 @@ def _read_kinds(annotation: Any) -> list[tuple[str, Accepts]] | None:
     """Return the kinds that an annotation allows; None where one of them is not known here."""
     if not isinstance(annotation, str):
         return None
-    kinds = [_read_kind(*word.partition("[")[::2]) for word in _split(annotation, "|")]
+    kinds = [_read_kind(*word.partition("[")[::2]) for word in _split_text(annotation, "|")]
     return None if None in kinds else cast("list[tuple[str, Accepts]]", kinds)
 
 
 def _read_kind(name: str, inner: str) -> tuple[str, Accepts] | None:
     if name != "tuple":
         return _KINDS.get(name)
-    count = 0 if "..." in inner else len(_split(inner[:-1], ","))
+    count = 0 if "..." in inner else len(_split_text(inner[:-1], ","))
     return f"{count or 'some'} values", lambda value: _is_sequence(value) and count in (0, len(value))
 
 
-def _split(text: str, separator: str) -> list[str]:
+def _split_text(text: str, separator: str) -> list[str]:
     """Split at the separators that stand in no brackets."""
     parts, depth = [""], 0
     for letter in text:
@@ -178,7 +178,7 @@ def _split(text: str, separator: str) -> list[str]:
     return [part.strip() for part in parts]
 
 
-def _describe(kinds: list[tuple[str, Accepts]]) -> str:
+def _describe_kinds(kinds: list[tuple[str, Accepts]]) -> str:
     words = list(dict.fromkeys(word for word, _ in kinds))
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
 
@@ -215,7 +215,7 @@ def explains_arguments(function: Callable[Given, Made]) -> Callable[Given, Made]
             for name, value in given.items():
                 kinds = checked.get(name)
                 if kinds is not None and not any(accepts(value) for _, accepts in kinds):
-                    wanted = f"{name} must be {_describe(kinds)}, not {_name_value(value)}{_advise(kinds)}"
+                    wanted = f"{name} must be {_describe_kinds(kinds)}, not {_name_value(value)}{_advise(kinds)}"
                     raise UsageError(wanted) from error
             raise
 

@@ -180,12 +180,12 @@ def find_mapping(array: NDArray[Any]) -> Mapping | None:
     while isinstance(owner, np.ndarray):
         base: Any = owner.base
         if isinstance(owner, np.memmap) and isinstance(base, mmap.mmap):
-            return None if owner.mode == "c" else _describe(owner, base)
+            return None if owner.mode == "c" else _describe_mapping(owner, base)
         owner = base
     return None
 
 
-def _describe(owner: np.memmap[Any, Any], file: mmap.mmap) -> Mapping:
+def _describe_mapping(owner: np.memmap[Any, Any], file: mmap.mmap) -> Mapping:
     path = None if owner.filename is None else os.path.abspath(owner.filename)
     identity = None
     if path is not None:

@@ -79,10 +79,10 @@ def parse_numbers(text: str, *, ends: bool = False) -> tuple[float, ...] | None:
 def numbers_reader(count: int | None, fault: str, *, ends: bool = False) -> Callable[[str], tuple[float, ...]]:
     """Return what reads so many numbers, or any count, see `parse_numbers`; refusals say `fault` behind the text."""
 
-    def read(text: str) -> tuple[float, ...]:
+    def read_numbers(text: str) -> tuple[float, ...]:
         numbers = parse_numbers(text, ends=ends)
         if numbers is None or count not in (None, len(numbers)):
             raise ValueError(f"{text!r} {fault}")
         return numbers
 
-    return read
+    return read_numbers

@@ -84,16 +84,16 @@ def is_true(name: str, flag: bool, subject: str) -> Gate:
 
 
 def at_most(name: str, measured: float, bound: float, unit: str | None, subject: str) -> Gate:
-    text = f"{subject}: {_say(measured, bound, 3)}{' ' * bool(unit)}{unit or ''}, at most {bound:.3g}"
+    text = f"{subject}: {_say_figure(measured, bound, 3)}{' ' * bool(unit)}{unit or ''}, at most {bound:.3g}"
     return Gate(name, measured, bound, unit, measured <= bound, text)
 
 
 def at_least(name: str, measured: float, bound: float, unit: str | None, subject: str) -> Gate:
-    text = f"{subject}: {_say(measured, bound, 4)}{' ' * bool(unit)}{unit or ''}, at least {bound:g}"
+    text = f"{subject}: {_say_figure(measured, bound, 4)}{' ' * bool(unit)}{unit or ''}, at least {bound:g}"
     return Gate(name, measured, bound, unit, measured >= bound, text)
 
 
-def _say(measured: float, bound: float, digits: int) -> str:
+def _say_figure(measured: float, bound: float, digits: int) -> str:
     """Return a figure with as many digits as tell it from its bound, `digits` at least."""
     while measured != bound and digits < 17 and f"{measured:.{digits}g}" == f"{bound:.{digits}g}":
         digits += 1

@@ -81,15 +81,15 @@ def _show_mesh(mesh: Mesh) -> str:
             )
     if not mesh.triangle_count:
         return f"<p>{escape(repr(mesh))}</p>"
-    return f"{_draw(mesh)}<p>{escape(repr(mesh))}; a page of it is a file: mesh.save('page.html')</p>"
+    return f"{_draw_object(mesh)}<p>{escape(repr(mesh))}; a page of it is a file: mesh.save('page.html')</p>"
 
 
 def _show_cloud(cloud: PointCloud) -> str:
     text = f"<p>{escape(repr(cloud))}</p>"
-    return _draw(cloud) + text if len(cloud.points) else text
+    return _draw_object(cloud) + text if len(cloud.points) else text
 
 
-def _draw(shown: Mesh | PointCloud) -> str:
+def _draw_object(shown: Mesh | PointCloud) -> str:
     from clrecon.operators.rays.render import render
 
     return _image(render(shown, size=_PICTURE_SIZE, background="white").annotated(letters=True, scale_bar=True))

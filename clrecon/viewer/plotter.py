@@ -165,7 +165,7 @@ def _add_iso_slider(
 
     surfaces = {name: pyvista.PolyData() for name, _ in extractors}
 
-    def extract(hu: float) -> None:
+    def extract_surfaces(hu: float) -> None:
         for name, extractor in extractors:
             try:
                 mesh = extractor.extract(round(hu)).to_pyvista()
@@ -174,12 +174,12 @@ def _add_iso_slider(
             surfaces[name].copy_from(mesh, deep=False)
 
     start = min(max(DEFAULT_ISO_VALUE if iso_value is None else iso_value, limits[0]), limits[1])
-    extract(start)
+    extract_surfaces(start)
     for name, surface in surfaces.items():
         plotter.add_mesh(surface, color=BONE, name=name).prop.interpolation = "Phong"  # by our normals, without a copy
     plotter.add_slider_widget(
-        extract, limits, value=start, title="iso value, HU", pointa=(0.25, 0.08), pointb=(0.75, 0.08), fmt="%.0f",
-        color="white",
+        extract_surfaces, limits, value=start, title="iso value, HU", pointa=(0.25, 0.08), pointb=(0.75, 0.08),
+        fmt="%.0f", color="white",
     )  # fmt: skip
 
 
@@ -189,14 +189,14 @@ def _add_keys(plotter: pyvista.Plotter) -> None:
 
     plane, on = vtkPlane(), {"clip": False, "measure": False}
 
-    def cut(normal: Sequence[float], origin: Sequence[float]) -> None:
+    def cut_meshes(normal: Sequence[float], origin: Sequence[float]) -> None:
         plane.SetNormal(*(-value for value in normal))  # what the arrow points to is taken away
         plane.SetOrigin(*origin)
 
     def toggle_clip() -> None:
         on["clip"] = not on["clip"]
         if on["clip"]:
-            plotter.add_plane_widget(cut, normal=(0, -1, 0), interaction_event="always", color="white")
+            plotter.add_plane_widget(cut_meshes, normal=(0, -1, 0), interaction_event="always", color="white")
         else:
             plotter.clear_plane_widgets()
         for actor in plotter.renderer.actors.values():

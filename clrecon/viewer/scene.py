@@ -65,7 +65,7 @@ def merge_scene(plotter: Any, rendering: Rendering) -> Rendering:
             f" {rendering.size[0]} x {rendering.size[1]}: make them equal (plotter.window_size = rendering.size)"
         )
     _place_camera(plotter, rendering.camera)
-    colors, depth = _draw(plotter, rendering.camera)
+    colors, depth = _draw_scene(plotter, rendering.camera)
     return merge_layers(rendering, colors, depth)
 
 
@@ -74,7 +74,7 @@ def _place_camera(plotter: Any, camera: Camera) -> None:
     plotter.renderer.ResetCameraClippingRange()
 
 
-def _draw(plotter: Any, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+def _draw_scene(plotter: Any, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """Return colours with opacity, and depths along the rays in mm, NaN where there is nothing."""
     renderer, window = plotter.renderer, plotter.render_window
     background, gradient = renderer.GetBackground(), renderer.GetGradientBackground()

@@ -26,7 +26,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -72,7 +72,7 @@ class Worker:
     stall_limit_s: float = STALL_LIMIT_S
 
     @classmethod
-    def start(cls, case: Case, seed: str, *, program: Path = WORKER, **limits: float) -> Worker:
+    def start(cls, case: Case, seed: str, *, program: Path = WORKER, **limits: Any) -> Worker:
         """Start a process with its first case; `limits` are those of the class."""
         environment = {**os.environ, "CLRECON_REQUIRE_TESTS": "", "OPENBLAS_NUM_THREADS": "1"}
         errors = tempfile.TemporaryFile()

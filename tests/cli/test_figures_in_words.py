@@ -74,7 +74,7 @@ def test_colours_of_distances_say_what_lies_beyond() -> None:
         "a_to_b_signed_mm": None, "b_to_a_signed_mm": None, "seconds": {"total": 1.0}, "outputs": [],
         "colors": {"range_mm": 2.0, "signed": True, "beyond_share": 0.25},
     }  # fmt: skip
-    assert "colours  -2 to +2 mm, beyond them 25.0 % of A's vertices" in distance._describe(report)
+    assert "colours  -2 to +2 mm, beyond them 25.0 % of A's vertices" in distance._describe_distance(report)
 
 
 def test_the_ranges_of_a_corridor_are_both_ends() -> None:
@@ -285,7 +285,7 @@ def test_labels_over_slices_are_listed_up_to_a_number(count: int) -> None:
     ("value", "words"), [(None, "none"), (1.26, "1.3"), (-0.04, "0"), (2.0, "2"), (99999.94, "99999.9"), (1e5, "1e+05")]
 )
 def test_hu_have_a_decimal_where_there_is_one(value: float | None, words: str) -> None:
-    assert stats._number(value) == words
+    assert stats._format_hu(value) == words
 
 
 @pytest.mark.parametrize("resident", [None, {"median": 0.5, "q1": 0.4, "q3": 0.6, "min": 0.3, "max": 0.7}])

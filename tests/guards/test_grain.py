@@ -12,7 +12,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 93_004,
+    "lines": 93_015,
     "modules": 406,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
@@ -22,8 +22,8 @@ CEILINGS = {
 """Who takes something away lowers the figure in the same commit; who needs more says why in the commit."""
 
 HABITS = {
-    "functions_with_pronouns": 28,
-    "functions_without_object": 241,
+    "functions_with_pronouns": 29,
+    "functions_without_object": 46,
     "assignments_of_three": 217,
     "nested_conditionals": 0,
     "comprehensions_of_two_loops": 23,

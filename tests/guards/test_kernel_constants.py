@@ -87,7 +87,7 @@ def test_importing_clrecon_reads_no_kernel_file() -> None:
     code = (
         "import sys, clrecon, clrecon.cli.main;"
         "sources = sys.modules.get('clrecon.opencl.sources');"
-        "print(sources._numbers.cache_info().misses if sources else 0)"
+        "print(sources._list_numbers.cache_info().misses if sources else 0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "0"

@@ -117,7 +117,9 @@ def test_demo_writes_and_replaces(device: Any, tmp_path: Path, monkeypatch: pyte
     first = make_demo(folder, str(device.index))
     kept = copytree(folder, tmp_path / "kept")
     (folder / "report.json").write_text("{}")
-    monkeypatch.setattr("clrecon.proof.demo._fill", lambda made, *_: copytree(kept, made, dirs_exist_ok=True) and first)
+    monkeypatch.setattr(
+        "clrecon.proof.demo._fill_folder", lambda made, *_: copytree(kept, made, dirs_exist_ok=True) and first
+    )
     second = make_demo(folder, str(device.index))
     assert sorted(path.name for path in folder.iterdir()) == ["bone.png", "bone.stl", "ct", "report.json"]
     report = json.loads((folder / "report.json").read_text())
@@ -147,7 +149,7 @@ def test_demo_without_a_device_or_room_leaves_nothing(
         folder.mkdir()
     with pytest.raises(DeviceError):
         make_demo(folder, "no such device")
-    monkeypatch.setattr("clrecon.proof.demo._fill", fill_the_disk)
+    monkeypatch.setattr("clrecon.proof.demo._fill_folder", fill_the_disk)
     with pytest.raises(OutputError) as caught:
         make_demo(folder, str(device.index))
     assert str(caught.value) == f"cannot write {folder / 'bone.stl'}: the disk is full"

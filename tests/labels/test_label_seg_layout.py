@@ -150,4 +150,4 @@ def test_files_beyond_four_gigabytes_are_not_read(tmp_path: Path, monkeypatch: p
     for most, words in ((size, "is DICOM but no segmentation"), (size - 1, f"is larger than {size - 1:,} bytes")):
         monkeypatch.setattr(segmentation, "LARGEST_BYTES", most)
         with pytest.raises(RefusedInputError, match=words):
-            segmentation._parse(tmp_path / "a.dcm", "a.dcm")
+            segmentation._parse_dataset(tmp_path / "a.dcm", "a.dcm")

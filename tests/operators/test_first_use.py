@@ -21,7 +21,7 @@ from clrecon.errors import DeviceError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, program, select
-from clrecon.operators.first_use import CENTRE, RADIUS, _compare, check_ball
+from clrecon.operators.first_use import CENTRE, RADIUS, _compare_mesh, check_ball
 from clrecon.operators.surface.extract import extract_isosurface
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts" / "proof"))
@@ -59,9 +59,9 @@ def test_row_57_a_device_that_computes_wrongly_does_not(
 def test_row_57_a_vertex_without_triangles_is_none_of_a_ball() -> None:
     vertices, triangles = sphere(CENTRE, RADIUS, 5)
     normals = (vertices - CENTRE) / RADIUS
-    assert _compare(Mesh(vertices, triangles, normals)) == ""
+    assert _compare_mesh(Mesh(vertices, triangles, normals)) == ""
     more = Mesh(np.concatenate([vertices, vertices[:1]]), triangles, np.concatenate([normals, normals[:1]]))
-    assert _compare(more) == f"the surface of a ball has 0 open edges and {len(triangles):,} triangles"
+    assert _compare_mesh(more) == f"the surface of a ball has 0 open edges and {len(triangles):,} triangles"
 
 
 class FakeDevice(SimpleNamespace):

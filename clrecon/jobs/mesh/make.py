@@ -107,7 +107,7 @@ def _remember_filled(volume: Volume, solid: Volume) -> Callable[[Sequence[Mesh]]
     volume.report, filled_hu = solid.report, solid.report["solid"]["filled_hu"]
     result_pages.clear()  # of the solid volume's mesh
 
-    def make(meshes: Sequence[Mesh]) -> Volume:
+    def make_solid(meshes: Sequence[Mesh]) -> Volume:
         corners = np.concatenate([list(product(*np.transpose(mesh.bounds))) for mesh in meshes])
         heights = volume.lps_to_ijk(corners)[:, 2]
         first = max(int(heights.min()) - BESIDE_SLICES, 0)
@@ -117,7 +117,7 @@ def _remember_filled(volume: Volume, solid: Volume) -> Callable[[Sequence[Mesh]]
             layer[np.unpackbits(bits, count=layer.size).view(bool).reshape(layer.shape)] = filled_hu
         return part.with_voxels(voxels)
 
-    return make
+    return make_solid
 
 
 def _read_inputs(

@@ -77,10 +77,10 @@ class NearDistance:
         lengths, rows = np.full(len(points), np.inf), np.full(len(points), -1)
         self.prepare()
 
-        def work(piece: slice) -> None:
+        def bound_piece(piece: slice) -> None:
             lengths[piece], rows[piece] = self.upper_bounds(points[piece].T.astype(np.float32), near[piece])
 
-        in_threads(work, len(points), _PIECE_OF_BOUNDS)
+        in_threads(bound_piece, len(points), _PIECE_OF_BOUNDS)
         return lengths, rows
 
     def upper_bounds(
@@ -144,7 +144,7 @@ class NearDistance:
         lengths, rows = np.full(len(points), np.inf), np.full(len(points), -1)
         assert len(self._columns) == 3  # before threads use them
 
-        def work(piece: slice) -> None:
+        def measure_piece(piece: slice) -> None:
             pair, row, start, some = self._pairs(near[piece])
             columns = np.ascontiguousarray(points[piece].T)
             length = measure(columns.take(pair, axis=1, mode="clip"), *self._corners(row))
@@ -153,7 +153,7 @@ class NearDistance:
                 shortest = np.flatnonzero(length == lengths[piece][pair])[::-1]  # backwards: the first of equals wins
                 rows[piece][pair[shortest]] = row[shortest]
 
-        in_threads(work, len(points), _PIECE)
+        in_threads(measure_piece, len(points), _PIECE)
         return lengths, rows
 
     def _pairs(self, near: NDArray[np.integer]) -> tuple[IntArray, IntArray, IntArray, NDArray[np.bool_]]:

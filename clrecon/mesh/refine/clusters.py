@@ -104,7 +104,7 @@ class Quadrics:
             planes[piece, :3], planes[piece, 3] = normal.T, np.einsum("ij,ij->j", normal, corner)
         self._vertices, self._sums = vertices, np.zeros((len(vertices), 9))
 
-        def work(piece: slice) -> None:
+        def sum_fans(piece: slice) -> None:
             begin = fans.begin[piece.start : piece.stop + 1]
             around = planes.take(fans.rows[begin[0] : begin[-1]], axis=0)
             products = around[:, [0, 0, 0, 1, 1, 2, 0, 1, 2]] * around[:, [0, 1, 2, 1, 2, 2, 3, 3, 3]]
@@ -112,7 +112,7 @@ class Quadrics:
             if used.any():
                 self._sums[piece][used] = np.add.reduceat(products, (begin[:-1] - begin[0])[used])
 
-        in_threads(work, len(vertices))
+        in_threads(sum_fans, len(vertices))
 
     def best_places(self, clusters: IntArray, members: IntArray, count: int) -> Float64Array:
         """Return places (count, 3), mm, of the least sum of squares of `clusters` (k,), from 0 on, of `members`."""

@@ -120,12 +120,12 @@ def decimate_mesh(
     deviation = Deviation(mesh.vertices - origin, mesh.triangles, deviation_bound, make_bounds, clusters.fans)
     wanted = (1.0 - fraction) * mesh.triangle_count
 
-    def tell(left: int) -> None:
+    def tell_left(left: int) -> None:
         if progress is not None:
             to_go = math.ceil(mesh.triangle_count - wanted)
             progress("decimate", min(mesh.triangle_count - left, to_go), to_go)
 
-    rounds, taken_back = _collapse_in_rounds(clusters, deviation, wanted, bound, tell)
+    rounds, taken_back = _collapse_in_rounds(clusters, deviation, wanted, bound, tell_left)
     vertices, triangles, undone = _with_volumes(clusters, deviation, mesh, origin, longest, find_crossings)
     facts = {
         "fraction": fraction,

@@ -48,7 +48,7 @@ class SurfaceBounds(NearDistance):
         bounds: tuple[Float32Array, IntArray] = (np.full(len(points), np.inf, np.float32), np.full(len(points), -1))
         self.prepare()
 
-        def work(piece: slice) -> None:
+        def bound_piece(piece: slice) -> None:
             length, rows = bounds[0][piece], bounds[1][piece]
             columns = points[piece].T.astype(np.float32)
             rest = np.arange(columns.shape[1])
@@ -65,7 +65,7 @@ class SurfaceBounds(NearDistance):
                 if turn >= near.shape[1] - 1:  # no triangle leads further
                     rest = rest[rows[rest] >= 0]
 
-        in_threads(work, len(points), _PIECE)
+        in_threads(bound_piece, len(points), _PIECE)
         return bounds
 
     def find_witnesses(
@@ -90,14 +90,14 @@ class SurfaceBounds(NearDistance):
         far = any_corner(beside < 0, triangles)
         self.prepare()
 
-        def work(piece: slice) -> None:
+        def judge_piece(piece: slice) -> None:
             near = witnesses[:3, piece]
             corners = [columns.take(corner, axis=1, mode="clip") for corner in triangles[piece].T]
             rest = np.flatnonzero(~far[piece])
             rest = rest[~self._are_within([corner[:, rest] for corner in corners], near[:, rest], limit)]
             self._leave_middles(corners, near, rest, names[triangles[piece]], limit, witnesses[:, piece], left[piece])
 
-        in_threads(work, len(triangles), _PIECE)
+        in_threads(judge_piece, len(triangles), _PIECE)
         return witnesses, left
 
     def _most(self, limit: float) -> float:

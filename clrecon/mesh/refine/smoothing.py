@@ -291,7 +291,7 @@ def _determinants(
     """Return of each triangle its part of the volume in mm3, or with normals its parts of the cubic of a shift."""
     parts = [np.empty(len(triangles)) for _ in range(1 if normals is None else 4)]
 
-    def work(piece: slice) -> None:
+    def measure_piece(piece: slice) -> None:
         corners = triangles[piece].T.astype(np.intp)
         a, b, c = (columns.take(corner, axis=1, mode="clip") for corner in corners)
         across = cross_product(b, c)
@@ -304,7 +304,7 @@ def _determinants(
         parts[2][piece] = (_dot(a, beside) + _dot(b, cross_product(w, u)) + _dot(c, cross_product(u, v))) / 6.0
         parts[3][piece] = _dot(u, beside) / 6.0
 
-    in_threads(work, len(triangles))
+    in_threads(measure_piece, len(triangles))
     return parts
 
 
@@ -346,12 +346,12 @@ def smooth_mesh(
     rings = Rings.of(mesh.triangles, mesh.vertex_count)
     low_pass = make_filter(rings)
 
-    def measure(vertices: NDArray[np.floating]) -> tuple[Float32Array, Float32Array]:
+    def measure_bends(vertices: NDArray[np.floating]) -> tuple[Float32Array, Float32Array]:
         # Differences of float32 are exact in float32; float64 is far from zero.
         near = vertices if vertices.dtype == np.float32 else (vertices - origin).astype(np.float32)
         return low_pass.measure_bends(near)
 
-    bends, normals = measure(mesh.vertices)
+    bends, normals = measure_bends(mesh.vertices)
     wanted = low_pass.find_steps(bends, sinc_terms(iterations))
     progress("smooth", 1, 3)
     still = np.flatnonzero(rings.weights == 0.0)
@@ -367,7 +367,7 @@ def smooth_mesh(
         "iterations": iterations,
         "max_deviation_mm": bound,
         "roughness_before_mm": _roughness(bends),
-        "roughness_after_mm": _roughness(measure(vertices)[0]),
+        "roughness_after_mm": _roughness(measure_bends(vertices)[0]),
         "vertices_held_back": held_back,
         "vertices_taken_back": taken_back,
         "components_left": left,

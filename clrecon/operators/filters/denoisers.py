@@ -148,7 +148,7 @@ def _whole(name: str, value: Any, least: int, most: int) -> int:
     return int(value)
 
 
-def _number(name: str, value: Any, most: float) -> float:
+def _check_number(name: str, value: Any, most: float) -> float:
     is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
     if not is_number or not 0.0 < value <= most:
         raise UsageError(f"{name} is a number above 0, at most {most:g}, not {value!r}")
@@ -189,7 +189,7 @@ def _run_curvature_flow(
 ) -> tuple[NDArray[Any], dict[str, Any]]:
     iterations = _whole("iterations", asked["iterations"], 1, 1000)
     stable = ITK_TIME_STEP * min(1.0, min(volume.spacing)) ** 2
-    step = stable if asked["time_step"] is None else _number("time_step", asked["time_step"], 1.0)
+    step = stable if asked["time_step"] is None else _check_number("time_step", asked["time_step"], 1.0)
     image = sitk.Cast(_image(sitk, volume), sitk.sitkFloat32)
     result = sitk.GetArrayFromImage(sitk.CurvatureFlow(image, step, iterations))
     return result, {"iterations": iterations, "time_step": step}
@@ -199,7 +199,7 @@ def _run_non_local_means(
     restoration: Any, volume: Volume, asked: dict[str, Any], tell: Progress
 ) -> tuple[NDArray[Any], dict[str, Any]]:
     patch, reach = _whole("patch", asked["patch"], 3, 31), _whole("reach", asked["reach"], 1, 31)
-    noise = measure_noise(volume).hu if asked["sigma_hu"] is None else _number("sigma_hu", asked["sigma_hu"], 1e6)
+    noise = measure_noise(volume).hu if asked["sigma_hu"] is None else _check_number("sigma_hu", asked["sigma_hu"], 1e6)
     result = np.empty(volume.voxels.shape, np.float32)
     for k, layer in enumerate(volume.voxels):
         plane = restoration.denoise_nl_means(

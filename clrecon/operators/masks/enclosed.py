@@ -304,7 +304,7 @@ def fill_enclosed(
             raise NoSurfaceError(f"{lack} {level:g} HU or more: {ends}")
         seal = seal or _default_seal(scan, bone)
         steps.take()
-        filled = _fill(bone, (seal, largest, keep_air), float(rule.lowest_inside), steps)
+        filled = _fill_spaces(bone, (seal, largest, keep_air), float(rule.lowest_inside), steps)
         filled.report = amend(filled.report, solid=filled.report["solid"] | chosen)
         return resident.follow(filled) if isinstance(volume, DeviceVolume) else filled
 
@@ -317,7 +317,7 @@ def _default_seal(volume: Volume, bone: Mask) -> float:
     return max(min(usual, *bounds), min(_SEAL_STEPS * step, usual))
 
 
-def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, steps: Steps) -> Volume:
+def _fill_spaces(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, steps: Steps) -> Volume:
     """Fill what a mask encloses; `how`: radius of the seal, that of wide spaces, whether air stays."""
     volume = bone.scan
     seal_mm, largest_mm, keep_air = how
@@ -380,7 +380,7 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
         f"share of the solid bone that the ball of {seal_mm:.3g} mm closed, not marrow that bone encloses"
         f" ({name_parameter('seal_mm', 'MM')}: a smaller ball)",
     )  # fmt: skip
-    warnings = [*report.get("warnings", ()), *_warn(facts)]
+    warnings = [*report.get("warnings", ()), *_warn_of_spaces(facts)]
     filled_volume.report = amend(report, solid=facts, warnings=warnings, gates=[*report.get("gates", ()), gate])
     return filled_volume
 
@@ -419,7 +419,7 @@ def _mean_inside(volume: Volume, bone: Mask, lowest_inside: float) -> Any:
     return dtype.type(min(round(mean), int(np.iinfo(dtype).max)))
 
 
-def _warn(facts: dict[str, Any]) -> list[str]:
+def _warn_of_spaces(facts: dict[str, Any]) -> list[str]:
     """Return what stays open, and whether more was filled than there is bone."""
     warnings = []
     for kind, phrase in (("wide", "too wide for marrow"), ("air", "air, as in sinuses and airways")):

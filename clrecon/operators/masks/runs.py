@@ -203,10 +203,10 @@ def find_components(
         upload(device, np.tile(np.array([[0, len(faces)]], np.int32), (nk, 1))),
     )
 
-    def check(links: int) -> None:
+    def check_links(links: int) -> None:
         check_budget(device, {**needs, "pairs of runs": 12 * links, "roots": 5 * counted.count}, memory)
 
-    count, numbers_d = join_runs(device, listed, mask.shape_ijk, table, check=check)
+    count, numbers_d = join_runs(device, listed, mask.shape_ijk, table, check=check_links)
     return Components(listed, count, numbers_d)
 
 

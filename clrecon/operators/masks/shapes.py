@@ -102,7 +102,7 @@ def _checked(ball: Stencil, volume: Volume, radius: float, by_slice: bool) -> St
     return ball
 
 
-def _split(rows: NDArray[np.int32], most: int | None) -> NDArray[np.int32]:
+def _split_rows(rows: NDArray[np.int32], most: int | None) -> NDArray[np.int32]:
     """Return rows (dj, dk, centre, half), the widest first, for rows (dj, dk, lowest di, highest di)."""
     low, high = rows[:, 2].astype(np.int64), rows[:, 3].astype(np.int64)
     half = (high - low) // 2
@@ -119,13 +119,13 @@ def _split(rows: NDArray[np.int32], most: int | None) -> NDArray[np.int32]:
 
 
 def _split_tables(ball: Stencil, most: int | None) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the rows of `_split` of all tables, and where each table begins and ends."""
+    """Return the rows of `_split_rows` of all tables, and where each table begins and ends."""
     parts: list[NDArray[np.int32]] = []
     done: dict[tuple[int, int], tuple[int, int]] = {}
     tables, count = np.empty_like(ball.tables), 0
     for k, (begin, end) in enumerate(ball.tables.tolist()):
         if (begin, end) not in done:
-            parts.append(_split(ball.rows[begin:end], most))
+            parts.append(_split_rows(ball.rows[begin:end], most))
             done[begin, end] = count, count + len(parts[-1])
             count += len(parts[-1])
         tables[k] = done[begin, end]

@@ -382,7 +382,7 @@ class NodeField:
         per_layer = 32 * self.nodes.brick_words * self.nodes.bricks[1]
         before = np.searchsorted(self._list, per_layer * np.arange(layers + 1, dtype=np.int64))
 
-        def cut(thick: int) -> tuple[_Slab, ...]:
+        def cut_slabs(thick: int) -> tuple[_Slab, ...]:
             ends = [min(first + thick, layers) for first in range(0, layers, thick)]
             return tuple(
                 _Slab(first, end, int(before[first]), int(before[end]))
@@ -390,7 +390,7 @@ class NodeField:
             )
 
         def shortage(thick: int) -> str:
-            most = max(slab.end_brick - slab.first_brick for slab in cut(thick))
+            most = max(slab.end_brick - slab.first_brick for slab in cut_slabs(thick))
             slab_needs = {"nodes": thick * self.nodes.layer_bytes, "bricks": _BRICK_BYTES * most}
             resident = {"grid": self.grid.nbytes, "list of bricks": 4 * self.bricks, **self._kept(self.grid.n)}
             return describe_shortage(self.limits, {**resident, **slab_needs})
@@ -398,7 +398,7 @@ class NodeField:
         thick = _largest(layers, lambda count: not shortage(count))
         if thick == 0:
             raise DeviceMemoryError(f"no surface can be made of the cloud: {shortage(1)}")
-        return cut(thick)
+        return cut_slabs(thick)
 
     def _measure(self) -> list[Any]:
         """Measure the field in all bricks; return the values of each slab, on the device where there is one slab."""

@@ -77,7 +77,7 @@ class FreeClusters:
     warnings: tuple[str, ...] = ()
 
 
-def _check(eps: float, min_samples: int) -> None:
+def _check_numbers(eps: float, min_samples: int) -> None:
     if not (isinstance(eps, (int, float, np.floating, np.integer)) and math.isfinite(eps) and eps >= LEAST_EPS_MM):
         raise UsageError(f"{name_parameter('eps', eps)}: a distance in mm is needed, at least {LEAST_EPS_MM:g}")
     if isinstance(min_samples, bool) or not isinstance(min_samples, (int, np.integer)) or min_samples < 1:
@@ -119,7 +119,7 @@ def cluster_free_points(
     eps: mm.  Distances up to ``eps * (1 + 1e-6)`` are within.
     min_samples: From 1 on; 1 gives connected components.
     """
-    _check(eps, min_samples)
+    _check_numbers(eps, min_samples)
     check_memory(memory)
     places = np.asarray(points)
     if places.ndim != 2 or places.shape[1] != 3:

@@ -218,7 +218,7 @@ class NeighbourSearch:
         self._margin = ROUNDING * float(extent)
         starts = download(device, np.empty(self.grid.cells + 1, np.uint32), self.grid.starts_d)
         _check_pairs(self.grid, starts)
-        self.parts = _split(starts, self._part_points)
+        self.parts = _split_cells(starts, self._part_points)
 
     @property
     def _part_points(self) -> int:
@@ -257,7 +257,7 @@ class NeighbourSearch:
             progress(stage, done, self.grid.n)
 
 
-def _split(starts: NDArray[np.uint32], points: int) -> list[Part]:
+def _split_cells(starts: NDArray[np.uint32], points: int) -> list[Part]:
     """Split cells in parts of about `points` points; a single cell is never split."""
     cells, total = len(starts) - 1, int(starts[-1])
     wanted = np.arange(points, total, points)

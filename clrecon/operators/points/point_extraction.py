@@ -122,7 +122,7 @@ class VoxelEmission:
             with attempt as slices:
                 self._go_on(slices, progress)
         try:
-            return _join(self._parts)
+            return _join_points(self._parts)
         except MemoryError as error:
             raise DeviceError(f"the cloud does not fit the memory of this computer: {error}") from error
 
@@ -267,7 +267,7 @@ class VoxelEmission:
         }
 
 
-def _join(parts: list[Points]) -> Points:
+def _join_points(parts: list[Points]) -> Points:
     """Join the points of all slabs; those of a slab are freed as soon as they are copied."""
     if len(parts) == 1:
         return parts[0]
@@ -353,7 +353,7 @@ def extract_points(
         As `extract_isosurface`.
     """
     progress = progress or ignore_progress
-    kind = _check(iso_value, kind, hu, labels, label, paper)
+    kind = _check_choices(iso_value, kind, hu, labels, label, paper)
     with open_volume(volume, device, memory, "a cloud of points") as resident:
         level, chosen = settle_level(resident.volume, "auto" if iso_value is None and hu is None else iso_value)
         if kind in SURFACE_KINDS:
@@ -365,7 +365,7 @@ def extract_points(
     return cloud
 
 
-def _check(
+def _check_choices(
     iso_value: object, kind: PointKind | None, hu: object, labels: object, label: object, paper: bool
 ) -> PointKind:
     if iso_value is not None and hu is not None:
@@ -382,7 +382,7 @@ def _check(
     return kind
 
 
-def _describe(band: Band) -> str:
+def _describe_band(band: Band) -> str:
     low, high = band
     if math.isinf(high):
         return f"{low:g} HU or more"
@@ -392,7 +392,7 @@ def _describe(band: Band) -> str:
 def _refuse_band(volume: Volume, band: Band, region: str) -> NoSurfaceError:
     low, high = data_range(volume)
     return NoSurfaceError(
-        f"no voxel {region}of {_describe(band)}: the volume runs from {format_hu(low)} to {format_hu(high)} HU"
+        f"no voxel {region}of {_describe_band(band)}: the volume runs from {format_hu(low)} to {format_hu(high)} HU"
     )
 
 

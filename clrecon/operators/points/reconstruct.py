@@ -82,8 +82,8 @@ def find_walls(near: Words, negative: Words, inside: Words, nx: int) -> Walls:
     for layer, first in enumerate(range(0, nz, _CUBE)):
         parts = [mask[first : first + _CUBE + 1] for mask in (near, negative, inside)]
         places, normals, cubes = [], [], []
-        for axis, changed, wall, inner in _compare(parts, min(_CUBE, nz - first), valid):
-            faces[layer] += _count(changed, shape[1])
+        for axis, changed, wall, inner in _compare_nodes(parts, min(_CUBE, nz - first), valid):
+            faces[layer] += _count_bits(changed, shape[1])
             wall_rows, lower_inside = _list(wall, inner)
             walls[layer] += np.bincount(
                 wall_rows[:, 1] // _CUBE * words + wall_rows[:, 2] // _CUBE, minlength=shape[1] * words
@@ -104,7 +104,7 @@ def count_bits(words: Words) -> int:
     return sum(int(_BITS[layer.view(np.uint16)].sum(dtype=np.int64)) for layer in words)
 
 
-def _compare(parts: list[Words], layers: int, valid: Words) -> Iterator[tuple[int, Words, Words, Words]]:
+def _compare_nodes(parts: list[Words], layers: int, valid: Words) -> Iterator[tuple[int, Words, Words, Words]]:
     """Yield for each axis (z, y, x) the faces towards the next node, those without support, and inner lower nodes."""
     for axis in range(3):
         (near, near_next), (negative, negative_next), (inside, inside_next) = (
@@ -128,7 +128,7 @@ def _neighbours(mask: Words, axis: int, layers: int) -> tuple[Words, Words]:
     return mask, after
 
 
-def _count(words: Words, cubes_y: int) -> NDArray[np.int64]:
+def _count_bits(words: Words, cubes_y: int) -> NDArray[np.int64]:
     """Return the number of set bits by cube, shape (cubes_y, words)."""
     k, j, word = np.nonzero(words)  # few of them
     bits = _BITS[words[k, j, word].view(np.uint16)].reshape(-1, 2).sum(axis=1)

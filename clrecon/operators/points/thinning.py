@@ -258,7 +258,7 @@ def remove_sparse_cells(
     """
     check_memory(memory)
     source = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
-    _check(source, edge, fewest, threshold)
+    _check_input(source, edge, fewest, threshold)
     tell, chosen_device = progress or ignore_progress, take_device(device)
     length = choose_edge(source, device=chosen_device, memory=memory) if edge is None else float(edge)
     tell("cells", 1, 2)
@@ -272,12 +272,12 @@ def remove_sparse_cells(
             asked = {"edge_is_default": edge is None, "fewest": int(fewest), "threshold": int(threshold)}
             made_on = {"device": current.label, "kernel_seconds": dict(stopwatch.by_kernel)}
             facts = {"edge_mm": float(plan.edge), **asked, **grown.facts, **made_on}
-            step = _finish(source, grown, facts, keep_largest, notes)
+            step = _finish_step(source, grown, facts, keep_largest, notes)
     tell("cells", 2, 2)
     return step
 
 
-def _check(cloud: PointCloud, edge: float | None, fewest: int, threshold: int) -> None:
+def _check_input(cloud: PointCloud, edge: float | None, fewest: int, threshold: int) -> None:
     if not len(cloud):
         raise UsageError("the cloud is empty: it has no cells")
     for name, value in (("fewest", fewest), ("threshold", threshold)):
@@ -287,7 +287,9 @@ def _check(cloud: PointCloud, edge: float | None, fewest: int, threshold: int) -
         raise UsageError(f"an edge of {edge!r}: a positive length in mm is needed")
 
 
-def _finish(cloud: PointCloud, grown: _Grown, facts: dict[str, Any], keep_largest: bool, notes: list[str]) -> PointStep:
+def _finish_step(
+    cloud: PointCloud, grown: _Grown, facts: dict[str, Any], keep_largest: bool, notes: list[str]
+) -> PointStep:
     """Put the step together, and refuse one that leaves nothing."""
     removed = grown.removed
     if removed.all():

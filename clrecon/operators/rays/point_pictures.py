@@ -164,7 +164,7 @@ class _Splats:
         starts, whole_d = range(0, max(n, 1), max(count, 1)), None
         picture: dict[str, Any] = {"view": view_d, "width": width, "height": height}
 
-        def tell(done: int) -> None:
+        def tell_done(done: int) -> None:
             self.progress("points", done, 3 * n)
 
         def hold(first: int) -> Any:
@@ -174,7 +174,7 @@ class _Splats:
             whole_d = _upload(device, points, stopwatch) if whole_d is None else whole_d
             return whole_d
 
-        tell(0)
+        tell_done(0)
         with stopwatch.running(device):
             launch(device, program["clear_splats"], pixels, keys=keys_d, numbers=numbers_d, pixels=pixels)
         for number, kernel in enumerate(("splat_depths", "splat_numbers")):
@@ -187,7 +187,7 @@ class _Splats:
                         points=points_d, keys=keys_d, radius=self.radius, count=piece, **more, **picture,
                     )  # fmt: skip
                 del points_d
-                tell(number * n + first + piece)
+                tell_done(number * n + first + piece)
         whole_d = None
         for first in starts:
             piece = min(count, n - first)
@@ -203,7 +203,7 @@ class _Splats:
                     shading=_SHADINGS[self.shading], apart=self.apart, first=first, count=piece, **picture,
                 )  # fmt: skip
             del normals_d, colors_d
-            tell(2 * n + first + piece)
+            tell_done(2 * n + first + piece)
         with stopwatch.timed("download"):
             download_all(device, (image, image_d, 0), (depth, depths_d, 0))
         return SplatPicture(image, depth, self.shading, len(starts))

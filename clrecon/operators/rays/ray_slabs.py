@@ -191,20 +191,20 @@ def slab_labels(
 ) -> Any:
     """Return the labels of a slab's voxels on the device, grown by `GROWN` voxels or not; those of a whole one stay."""
 
-    def make() -> Any:
+    def make_labels() -> Any:
         with stopwatch.timed("upload"):
             made_d = upload(resident.device, pad_slices(labels.voxels[slab.first_k : slab.end_k]))
         for _ in range(GROWN if grown else 0):
-            made_d = _grow(resident, slab, made_d, labels.voxels.dtype)
+            made_d = _grow_labels(resident, slab, made_d, labels.voxels.dtype)
         return made_d
 
     if not slab.is_whole:
-        return make()
+        return make_labels()
     # The labels are kept too, so that no other array can get their address in the meantime.
-    return resident.keep(_LABELS, (id(labels), grown), labels.voxels.nbytes, lambda: (labels, make()))[1]
+    return resident.keep(_LABELS, (id(labels), grown), labels.voxels.nbytes, lambda: (labels, make_labels()))[1]
 
 
-def _grow(resident: DeviceVolume, slab: RaySlab, labels_d: Any, dtype: np.dtype[Any]) -> Any:
+def _grow_labels(resident: DeviceVolume, slab: RaySlab, labels_d: Any, dtype: np.dtype[Any]) -> Any:
     """Return labels of a slab in which voxels without one have that of the nearest of the voxels around them."""
     device, (ni, nj, nk) = resident.device, slab.shape_ijk
     near = Growth.of(resident.volume, None).table
@@ -221,7 +221,7 @@ def _grow(resident: DeviceVolume, slab: RaySlab, labels_d: Any, dtype: np.dtype[
 def _whole_slab(resident: DeviceVolume, stopwatch: Stopwatch) -> RaySlab:
     """Return the only slab of a volume that fits; its bricks and their ranges stay on the device with the voxels."""
 
-    def make() -> RaySlab:
+    def make_slab() -> RaySlab:
         voxels = resident.volume.voxels
         padded = pad_slices(voxels)
         voxels_d = resident.whole(stopwatch) if padded is voxels else resident.upload(padded, stopwatch)
@@ -231,7 +231,7 @@ def _whole_slab(resident: DeviceVolume, stopwatch: Stopwatch) -> RaySlab:
     ni, nj, nk = (max(2, n) for n in resident.volume.shape_ijk)
     cells = choose_brick_cells(resident.volume)
     bricks = math.prod(-(-n // c) for n, c in zip((ni, nj, nk), cells, strict=True))
-    return resident.keep(_BRICKS, None, bricks * (2 * resident.dtype.itemsize + 4), make)
+    return resident.keep(_BRICKS, None, bricks * (2 * resident.dtype.itemsize + 4), make_slab)
 
 
 def _upload_part(

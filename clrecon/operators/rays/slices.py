@@ -127,7 +127,7 @@ def _heights(volume: Volume, points: Float64Array) -> Float64Array:
     return np.asarray(points @ (normal / np.linalg.norm(normal)), dtype=np.float64)
 
 
-def _warn(volume: Volume, camera: Camera) -> list[str]:
+def _warn_of_edge(volume: Volume, camera: Camera) -> list[str]:
     if not camera.is_parallel or abs(_heights(volume, camera.basis().forward[None])[0]) > _EDGE_ON:
         return []
     return ["the slices are seen edge-on and do not show: look from another side, such as 30,30, or in perspective"]
@@ -145,7 +145,7 @@ class _Overlay:
         planes = None if style.clip is None else style.clip.planes
         self.view = RayView.of(resident.volume, camera, shot.size, 1.0, planes=planes, box=box, focus=box)
         self.stopwatch = Stopwatch()
-        self.warnings = [*warnings, *_warn(resident.volume, camera)]
+        self.warnings = [*warnings, *_warn_of_edge(resident.volume, camera)]
 
     def plan(self, picture: Mapping[str, int], states: Mapping[str, int]) -> int:
         """Return how many slices fit beside a picture at once."""

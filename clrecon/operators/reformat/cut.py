@@ -404,7 +404,7 @@ def take_contact_sheet(
         plane = _turn_to_slices(resident.volume, plane, job.warnings)
     right, up, forward = plane.basis()
     seen = box_corners(shown) - plane.focal_point
-    places = _choose(resident.volume, style, plane, seen @ forward)
+    places = _choose_slices(resident.volume, style, plane, seen @ forward)
     extent = np.ptp(seen @ right), np.ptp(seen @ up)
     whole = max(extent[0] / size[0], extent[1] / size[1])
     zoom = whole / plane.pixel_mm(size)  # the plane's own scale, beside that at which the box just fits
@@ -464,7 +464,7 @@ def _turn_to_slices(volume: Volume, plane: Camera, warnings: list[str]) -> Camer
     return replace(plane, position=tuple(position.tolist()))
 
 
-def _choose(volume: Volume, style: PlaneCut, plane: Camera, depths: Float64Array) -> list[_Place]:
+def _choose_slices(volume: Volume, style: PlaneCut, plane: Camera, depths: Float64Array) -> list[_Place]:
     """Return the slices of a sheet in their order; `depths` are those of the corners of what is shown."""
     forward = plane.basis()[2]
     low, high = float(depths.min()), float(depths.max())

@@ -246,7 +246,7 @@ def find_turned(
     """Mark the triangles that turn by more than `_LEAST_TURN` lets, where their vertices go to these places."""
     is_turned = np.empty(len(triangles), bool)
 
-    def work(piece: slice) -> None:
+    def compare_normals(piece: slice) -> None:
         normals = []
         for points in (vertices, places):
             one, two, three = (points.take(row, axis=0, mode="clip") for row in triangles[piece].T.astype(np.intp))
@@ -256,7 +256,7 @@ def find_turned(
         along, *squares = (np.einsum("an,an->n", *two) for two in ((after, before), (after, after), (before, before)))
         is_turned[piece] = along <= _LEAST_TURN * np.sqrt(squares[0] * squares[1])
 
-    in_threads(work, len(triangles))
+    in_threads(compare_normals, len(triangles))
     return is_turned
 
 
@@ -342,7 +342,7 @@ def fit_mesh(
     fitted = fit.states == FITTED
     unmoved = int(np.count_nonzero(fitted & (np.abs(vertices - wanted).max(axis=1) > KEPT_MM)))
     known = np.isin(fit.states, (FITTED, _BADLY_FITTED))
-    report = _describe(fit, resident, mesh.vertices, normals, True, unmoved)
+    report = _describe_fit(fit, resident, mesh.vertices, normals, True, unmoved)
     moved = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), {**mesh.report, "cortex": report})
     moved.values = {
         "thickness_mm": np.where(known, fit.thickness_mm, np.float32(np.nan)),
@@ -398,7 +398,7 @@ def measure_outside(mesh: Mesh, resident: DeviceVolume, *, constants: CortexCons
     points, normals = mesh.vertices[rows], _normals_of(mesh)[rows]
     fit = fit_walls(resident, points, normals, stopwatch=Stopwatch(), constants=constants)
     _refuse_few(int(np.count_nonzero(fit.states == FITTED)), len(fit.states))
-    return _describe(fit, resident, points, normals, False, 0)
+    return _describe_fit(fit, resident, points, normals, False, 0)
 
 
 def _label(mesh: Mesh, resident: DeviceVolume) -> NDArray[np.int64]:
@@ -424,7 +424,7 @@ def _refuse_few(count: int, vertices: int) -> None:
         )
 
 
-def _describe(
+def _describe_fit(
     fit: CortexFit,
     resident: DeviceVolume,
     points: NDArray[np.floating],

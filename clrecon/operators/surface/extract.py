@@ -242,7 +242,7 @@ def extract_isosurface(
     Lorensen and Cline 1987; Schroeder et al. 2015; "trilinear": Nielson and Hamann 1991, Chernyaev 1995, Grosso 2016.
     """
     level, chosen = settle_level(volume, iso_value, progress)  # before anything is filled
-    with _open(volume, level, solid, below, device=device, memory=memory, progress=progress) as extractor:
+    with _open_extractor(volume, level, solid, below, device=device, memory=memory, progress=progress) as extractor:
         mesh = extractor.extract(
             level, closed=closed, topology=topology, below=below, grow_from=grow_from, vertex_rule=vertex_rule,
             progress=progress,
@@ -252,7 +252,7 @@ def extract_isosurface(
 
 
 @contextmanager
-def _open(
+def _open_extractor(
     volume: Volume | DeviceVolume,
     iso_value: Level,
     solid: bool,

@@ -77,7 +77,7 @@ def _voxel_levels(device: Device, volume: Volume, rule: IsoRule) -> tuple[Any, .
     return level, dtype.type(min(highest, limits.max))
 
 
-def _join(parts: list[Part]) -> Part:
+def _join_parts(parts: list[Part]) -> Part:
     """Join the parts of all slabs; each part is freed as soon as it is copied."""
     if len(parts) == 1:
         return parts[0]
@@ -156,7 +156,7 @@ class Extraction:
         if self.vertices == 0:
             raise _refuse_level(self.device, self.grid.volume, self.grid.rule)
         try:
-            return _join(self.parts)
+            return _join_parts(self.parts)
         except MemoryError as error:
             raise DeviceError(f"the mesh does not fit the memory of this computer: {error}") from error
 

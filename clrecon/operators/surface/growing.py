@@ -46,14 +46,14 @@ def find_cell_near(
 ) -> tuple[int, int, int]:
     """Return the active cell (k, j, i), by the mask of the whole grid, whose centre is nearest to a point, LPS mm."""
     for reach in (_NEAR_MM, SEED_REACH_MM):
-        nearest = _look(device, grid, classified, point, reach)
+        nearest = _look_for_cell(device, grid, classified, point, reach)
         if nearest is not None and nearest[1] <= reach:
             return nearest[0]
-    farther = _look(device, grid, classified, point, FARTHEST_TOLD_MM)
+    farther = _look_for_cell(device, grid, classified, point, FARTHEST_TOLD_MM)
     raise UsageError(_describe_lone(grid, point, None if farther is None else farther[1]))
 
 
-def _look(
+def _look_for_cell(
     device: Device, grid: SampleGrid, classified: Classified, point: NDArray[np.float64], reach: float
 ) -> tuple[tuple[int, int, int], float] | None:
     """Return the cell and how far it is; cells farther than `reach` may be missed."""

@@ -236,7 +236,7 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
         slab = [self.hold(groups[0])] if len(groups) == 1 else []
         voxel_mm3 = abs(np.linalg.det(self.labels.affine[:3, :3]))
 
-        def measure(levels: dict[int, int]) -> dict[int, float]:
+        def measure_levels(levels: dict[int, int]) -> dict[int, float]:
             self.levels = levels
             volumes = {}
             for group in groups:
@@ -246,7 +246,7 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
                     volumes[number] = started.enclosed_mm3(levels[number]) / voxel_mm3
             return volumes
 
-        self.levels = choose_levels(Borders.of(self.labels.voxels, list(boxes), boxes), measure)
+        self.levels = choose_levels(Borders.of(self.labels.voxels, list(boxes), boxes), measure_levels)
 
     def _start_one(self, slab: HeldMap, number: int, box: Box) -> StartedMesh:
         """Make all of a label's mesh except its vertices, which depend on levels."""

@@ -130,11 +130,11 @@ class ExtractionByLabel(Generic[Held, Made]):
         self.groups = len(groups)
         done = 0
 
-        def extract(slab: Held, number: int, box: Box) -> Made:
+        def extract_label(slab: Held, number: int, box: Box) -> Made:
             progress("labels", done, len(boxes))
             return self.extract_one(slab, number, box)
 
-        for number, surface in each_label(groups, self.hold, extract, self.warnings):
+        for number, surface in each_label(groups, self.hold, extract_label, self.warnings):
             done += surface is not None
             yield number, surface
 

@@ -46,7 +46,7 @@ class Seeds:
         of its voxels at their inner side.  "auto" takes the parts with at least `AUTO_SHARE` of the cells of the
         largest.
         """
-        items = _split(grow_from)
+        items = _split_seeds(grow_from)
         points: list[NDArray[np.float64]] = []
         marked: NDArray[np.bool_] | None = None
         names: list[str] = []
@@ -69,7 +69,7 @@ class Seeds:
         return cls(AUTO in names, placed, None if marked is None else pack_seeds(marked), tuple(names))
 
 
-def _split(grow_from: Any) -> list[Any]:
+def _split_seeds(grow_from: Any) -> list[Any]:
     if isinstance(grow_from, str) or hasattr(grow_from, "to_numpy") or hasattr(grow_from, "numbers"):
         return [grow_from]
     if isinstance(grow_from, np.ndarray):

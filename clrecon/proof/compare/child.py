@@ -11,7 +11,7 @@ from typing import Any
 
 from clrecon.errors import ClreconError, DeviceError
 from clrecon.jobs.run import peak_memory_bytes, to_json
-from clrecon.proof.compare.makers import Scene, draw, make, time_small
+from clrecon.proof.compare.makers import Scene, draw, make_timed, time_small
 from clrecon.proof.compare.methods import COMPARED
 from clrecon.proof.compare.processes import Request, load_volume, save_arrays, save_mesh
 from clrecon.system.progress import time_limit
@@ -23,14 +23,14 @@ LONG_SECONDS = 2.0
 def run_method(request: Request) -> dict[str, Any]:
     """Run a method: first, warm, its picture; its arrays are files of the request's folder afterwards.
 
-    Return its ``state`` ("done", "failed", "declined" or "missing"), and with "done" the figures, see `_measure`; else
-    ``error``, what kind it is of, and why.
+    Return its ``state`` ("done", "failed", "declined" or "missing"), and with "done" the figures, see
+    `_measure_method`; else ``error``, what kind it is of, and why.
     """
     from clrecon.opencl import has_hung_commands
 
     try:
         with time_limit(request.timeout):
-            return {"state": "done", "error": None, "kind": None, **_measure(request)}
+            return {"state": "done", "error": None, "kind": None, **_measure_method(request)}
     except ImportError as error:
         name = error.name or COMPARED[request.method].peer or "a library"
         return {"state": "missing", "kind": "ImportError", "error": f"{name.partition('.')[0]} is not installed"}
@@ -43,18 +43,18 @@ def run_method(request: Request) -> dict[str, Any]:
         return {"state": "failed", "kind": type(error).__name__, "error": f"{type(error).__name__}: {error}"}
 
 
-def _measure(request: Request) -> dict[str, Any]:
+def _measure_method(request: Request) -> dict[str, Any]:
     folder, name = Path(request.folder), request.method
     scene = Scene(load_volume(folder), request, None)
     before = peak_memory_bytes()
     opened = _open_device(scene) if COMPARED[name].on_device else 0.0
-    result = make(scene)
+    result = make_timed(scene)
     first = result.seconds
     first["build"] += opened
     runs: list[dict[str, float]] = []
     while len(runs) < request.repeat and sum(map(_total, runs)) < LONG_SECONDS:
         del result  # two results at once would count as the memory of one
-        result = make(scene)
+        result = make_timed(scene)
         runs.append(result.seconds)
     peak = peak_memory_bytes()
     if scene.device is None:  # which draws the pictures

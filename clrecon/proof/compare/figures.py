@@ -133,10 +133,10 @@ def draw_plane(
     low, high = box[0, axes] - MARGIN_MM / steps, box[1, axes] + MARGIN_MM / steps
     shape = np.array([grey.shape[1], grey.shape[0]])
     low, high = np.maximum(low, -0.5), np.minimum(high, shape - 0.5)
-    whole = _draw(grey, plane, steps, low, high, "whole", contours, colors)
+    whole = _draw_slice(grey, plane, steps, low, high, "whole", contours, colors)
     middle = _find_detail(contours.get(reference, np.empty((0, 2, 2))), steps, 0.5 * (low + high))
     half = 0.5 * _DETAIL_MM / steps
-    detail = _draw(grey, plane, steps, middle - half, middle + half, "detail", contours, colors)
+    detail = _draw_slice(grey, plane, steps, middle - half, middle + half, "detail", contours, colors)
     return whole, detail
 
 
@@ -151,7 +151,7 @@ def _find_detail(segments: Segments, steps: NDArray[np.float64], default: NDArra
     return np.asarray(middles[(squares == best).all(axis=1)].mean(axis=0))
 
 
-def _draw(
+def _draw_slice(
     grey: NDArray[np.uint8],
     plane: Plane,
     steps: NDArray[np.float64],

@@ -125,8 +125,8 @@ def make_comparison(
     with keep_existing(keep=no_clobber):
         folder = check_report_folder(output)
     check_kept([("the report", output)], source, settings.truth)
-    volume, device, read_s = _open(source, settings, progress, watch)
-    volume, level, reason, warnings = _prepare(volume, settings, device, progress)
+    volume, device, read_s = _open_input(source, settings, progress, watch)
+    volume, level, reason, warnings = _prepare_volume(volume, settings, device, progress)
     watch.lap("mask")
     with ExitStack() as stack:
         with system_errors(output):
@@ -136,7 +136,7 @@ def make_comparison(
         figures.planes, figures.box = find_planes(volume, level)
         rows = _run_methods(figures, settings, device, progress)
         watch.lap("methods")
-        measured = _measure(rows, figures, settings, truth, progress)
+        measured = _measure_methods(rows, figures, settings, truth, progress)
         watch.lap("measure")
         progress("report", 0, 0)
         records = [make_record(COMPARED[name], each, measured.get(name, {}), read_s) for name, each in rows.items()]
@@ -169,7 +169,7 @@ def _check_truth(path: Path) -> str:
     return str(folder.resolve())
 
 
-def _open(
+def _open_input(
     source: str | Path, settings: CompareSettings, progress: Progress, watch: Laps
 ) -> tuple[Volume, Device, dict[str, float]]:
     """Read the input twice, while the device opens; also return the seconds of both times."""
@@ -187,7 +187,7 @@ def _open(
     return volume, device, read_s
 
 
-def _prepare(
+def _prepare_volume(
     volume: Volume, settings: CompareSettings, device: Device, progress: Progress
 ) -> tuple[Volume, float, str, list[str]]:
     """Return the volume that all methods get, the level, why it is that, and warnings."""
@@ -247,7 +247,7 @@ def _refuse_nothing(rows: dict[str, dict[str, Any]]) -> None:
     raise kind(str(first) if empty else f"none of {len(errors)} methods works; the first says: {first}")
 
 
-def _measure(
+def _measure_methods(
     rows: dict[str, dict[str, Any]], figures: Figures, settings: CompareSettings, truth: str | None, progress: Progress
 ) -> dict[str, dict[str, Any]]:
     sizes = {

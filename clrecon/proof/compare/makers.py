@@ -122,7 +122,7 @@ class Made:
     extra: dict[str, float] = field(default_factory=dict)
 
 
-def make(scene: Scene) -> Made:
+def make_timed(scene: Scene) -> Made:
     """Run the method once, and time it."""
     maker = _MAKERS[scene.request.method]
     start = perf_counter()

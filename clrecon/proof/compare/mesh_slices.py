@@ -119,10 +119,10 @@ def measure_slices(
     overlaps = []
     for n, lattice in enumerate(lattices):
 
-        def tell(done: int, before: int = n * layers) -> None:
+        def tell_done(done: int, before: int = n * layers) -> None:
             report("slices", before + done, 2 * layers)
 
-        overlaps.append(_count_overlap(ijk, mesh.triangles, volume, rule, lattice, tell))
+        overlaps.append(_count_overlap(ijk, mesh.triangles, volume, rule, lattice, tell_done))
     fine, overlap = overlaps
     report("slices", 2 * layers, 2 * layers)
     return SliceOverlap(
@@ -365,10 +365,11 @@ def _runs_in(samples: NDArray[Any], rule: IsoRule, lattice: Lattice, first: int)
     for (row_k, tk), (row_j, tj) in itertools.product(enumerate(lattice.shares(2)), enumerate(lattice.shares(1))):
         if row_j == 0:
             edges = {
-                (b, a): _blend(corners[0, b, a], corners[1, b, a], tk) for b, a in itertools.product((0, 1), repeat=2)
+                (b, a): _blend_two(corners[0, b, a], corners[1, b, a], tk)
+                for b, a in itertools.product((0, 1), repeat=2)
             }
-        low, high = (_blend(edges[0, a], edges[1, a], tj) for a in (0, 1))
-        states = [_blend(low, high, ti) >= np.float32(rule.iso_level) for ti in lattice.shares(0)]
+        low, high = (_blend_two(edges[0, a], edges[1, a], tj) for a in (0, 1))
+        states = [_blend_two(low, high, ti) >= np.float32(rule.iso_level) for ti in lattice.shares(0)]
         before = shared.copy()
         before[follows] = states[-1][np.flatnonzero(follows) - 1]
         row = base + (row_k * nj + row_j) * (ni + 1)
@@ -379,5 +380,5 @@ def _runs_in(samples: NDArray[Any], rule: IsoRule, lattice: Lattice, first: int)
     return np.concatenate(ends)
 
 
-def _blend(low: NDArray[np.float32], high: NDArray[np.float32], share: float) -> NDArray[np.float32]:
+def _blend_two(low: NDArray[np.float32], high: NDArray[np.float32], share: float) -> NDArray[np.float32]:
     return np.asarray(low + np.float32(share) * (high - low))

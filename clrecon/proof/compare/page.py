@@ -20,7 +20,7 @@ from clrecon.proof.compare.records import ALL_PARTS
 from clrecon.proof.compare.table import main_table, paper_table, shown_columns, small_table
 
 
-def _read(name: str) -> str:
+def _read_text(name: str) -> str:
     return (files(__package__) / name).read_text(encoding="utf-8")
 
 
@@ -58,7 +58,7 @@ def plot_times(report: CompareReport, which: str) -> str:
     totals = {name: sum(own.values()) for name, own in parts.items()}
     ranked = sorted(totals.values())
     end = min(ranked[-1], _CUT * ranked[(3 * len(ranked) - 1) // 4])
-    figure, axes = _start(7.2, 0.9 + 0.34 * len(done))
+    figure, axes = _start_figure(7.2, 0.9 + 0.34 * len(done))
     for row, record in enumerate(done):
         left = 0.0
         for part in ALL_PARTS:
@@ -74,7 +74,7 @@ def plot_times(report: CompareReport, which: str) -> str:
     axes.set_xlim(0.0, 1.16 * end)
     axes.set_xlabel(f"seconds, {'first run' if which == 'first' else 'warm (median)'}")
     axes.tick_params(axis="y", length=0)
-    return _finish(figure, f"times-{which}")
+    return _finish_figure(figure, f"times-{which}")
 
 
 def plot_accuracy(report: CompareReport, colors: Mapping[str, str]) -> tuple[str, str]:
@@ -87,7 +87,7 @@ def plot_accuracy(report: CompareReport, colors: Mapping[str, str]) -> tuple[str
             points.append((record, record.triangles, value))
     if not points:
         return "", measure
-    figure, axes = _start(7.2, 4.6)
+    figure, axes = _start_figure(7.2, 4.6)
     for record, triangles, value in points:
         axes.plot(
             triangles, value, "o", markersize=9, color=colors[record.name], markeredgecolor=_INK, markeredgewidth=0.7
@@ -102,7 +102,7 @@ def plot_accuracy(report: CompareReport, colors: Mapping[str, str]) -> tuple[str
         0.015, 0.02, "good corner: few triangles, small error", transform=axes.transAxes, fontsize=9, color=_INK,
         style="italic", alpha=0.75,
     )  # fmt: skip
-    return _finish(figure, "accuracy"), measure
+    return _finish_figure(figure, "accuracy"), measure
 
 
 def _error_of(record: MethodRecord, measure: str) -> float | None:
@@ -154,7 +154,7 @@ def _label(axes: Any, points: Sequence[tuple[MethodRecord, int, float]]) -> None
             )  # fmt: skip
 
 
-def _start(width: float, height: float) -> tuple[Any, Any]:
+def _start_figure(width: float, height: float) -> tuple[Any, Any]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
@@ -178,7 +178,7 @@ def _start(width: float, height: float) -> tuple[Any, Any]:
 _ID = re.compile(r'(?<= id=")|(?<=url\(#)|(?<=href="#)')
 
 
-def _finish(figure: Any, name: str) -> str:
+def _finish_figure(figure: Any, name: str) -> str:
     """Return a figure as SVG for a page: no metadata, no addresses, identities of its own, colours of the page."""
     import matplotlib
 
@@ -228,10 +228,10 @@ def make_page(report: CompareReport, figures: Figures) -> str:
     done = sum(record.is_done for record in report.methods)
     ni, nj, nk = report.shape_ijk
     of = f"{done} of {len(report.methods)}" if done < len(report.methods) else f"{done}"
-    return Template(_read("page.html")).substitute(
+    return Template(_read_text("page.html")).substitute(
         version=escape(report.version),
         title="Surfaces and clouds of one scan, compared",
-        style=_read("page.css").strip(),
+        style=_read_text("page.css").strip(),
         lead=escape(
             f"{of} methods on one scan of {ni} x {nj} x {nk} voxels at {report.iso_value_hu:g} HU, each in a process of"
             f" its own, compared with {_title_of(report, report.reference)}."

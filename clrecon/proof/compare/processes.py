@@ -101,7 +101,7 @@ JUDGE = ("-m", "clrecon.proof.compare.judge")
 _MOST_JUDGES = 4
 
 
-def _start(command: Sequence[str], data: Mapping[str, Any]) -> subprocess.Popen[bytes]:
+def _start_process(command: Sequence[str], data: Mapping[str, Any]) -> subprocess.Popen[bytes]:
     if getattr(sys, "frozen", False) or not sys.executable:
         raise DeviceError("methods are compared in processes of a Python interpreter, and this program has none")
     try:
@@ -125,7 +125,7 @@ def _start(command: Sequence[str], data: Mapping[str, Any]) -> subprocess.Popen[
 
 def run_in_process(request: Request) -> dict[str, Any]:
     """Run a method in a process of its own, and return what `clrecon.proof.compare.child.run_method` tells."""
-    process = _start(METHOD, request.as_dict())
+    process = _start_process(METHOD, request.as_dict())
     assert process.stdout is not None
     try:
         answer = process.stdout.read()
@@ -156,7 +156,7 @@ def measure_in_processes(data: Mapping[str, Any], methods: Mapping[str, int]) ->
     processes: list[subprocess.Popen[bytes]] = []
     try:
         for number, part in enumerate(parts):
-            process = _start(JUDGE, {**data, "methods": part})
+            process = _start_process(JUDGE, {**data, "methods": part})
             processes.append(process)
             threading.Thread(target=_forward, args=(number, process.stdout, lines), daemon=True).start()
         running = len(processes)

@@ -60,8 +60,8 @@ def make_record(
         triangles=result.get("triangles"),
         vertices=result.get("vertices"),
         points=result.get("points"),
-        first_s=_work(first) if done else None,
-        warm_s=statistics.median(map(_work, runs)) if done else None,
+        first_s=_sum_work(first) if done else None,
+        warm_s=statistics.median(map(_sum_work, runs)) if done else None,
         warm_runs=len(runs),
         first_parts_s={"read": read_s["first"], **first} if done else {},
         warm_parts_s={"read": read_s["warm"], **warm} if done else {},
@@ -82,7 +82,7 @@ def make_record(
     )
 
 
-def _work(parts: Mapping[str, float]) -> float:
+def _sum_work(parts: Mapping[str, float]) -> float:
     return sum(parts.values()) - parts.get("draw", 0.0)
 
 

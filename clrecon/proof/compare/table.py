@@ -46,31 +46,31 @@ class Column:
 
 
 def _in(name: str, entry: str) -> Callable[[MethodRecord], Any]:
-    def take(record: MethodRecord) -> Any:
+    def take_measure(record: MethodRecord) -> Any:
         measures = getattr(record, name)
         return None if measures is None else measures.get(entry)
 
-    return take
+    return take_measure
 
 
 def _distance(entry: str, of_points: str) -> Callable[[MethodRecord], Any]:
     """Take a distance of surfaces, or of points where the method made a cloud."""
 
-    def take(record: MethodRecord) -> Any:
+    def take_distance(record: MethodRecord) -> Any:
         if record.points_mm is not None and record.points_mm["to_reference_mm"]:
             return record.points_mm["to_reference_mm"][of_points]
         return None if record.surfaces is None else record.surfaces[entry]
 
-    return take
+    return take_distance
 
 
 def _truth(entry: str) -> Callable[[MethodRecord], Any]:
-    def take(record: MethodRecord) -> Any:
+    def take_scatter(record: MethodRecord) -> Any:
         if record.points_mm is not None:
             return record.points_mm.get(entry)
         return None if record.truth is None else record.truth[entry]
 
-    return take
+    return take_scatter
 
 
 def _millimetres(value: float) -> str:

@@ -117,7 +117,7 @@ _PHASE_HU = 90.0
 """What the contrast medium adds to the vessels from phase to phase."""
 
 
-def _make(
+def _make_voxels(
     settings: PhantomSettings, placement: Placement, progress: Progress | None, phase: int = 0
 ) -> tuple[NDArray[np.int16], dict[str, Any], LabelArray | None]:
     """Make voxels of all slices, truth and, of a scene, materials."""
@@ -207,7 +207,7 @@ def make_phantom(
         or phased.
     """
     placement = place_slices(settings)
-    voxels, truth, _ = _make(settings, placement, progress)
+    voxels, truth, _ = _make_voxels(settings, placement, progress)
     if settings.missing:
         voxels = voxels[[k for k in range(len(voxels)) if k + 1 not in settings.missing]]
     return voxels, placement.affine, truth
@@ -266,13 +266,13 @@ def write_phantom(
         _check_replaceable(folder)
         refuse_existing(folder.name, folder)
         placement = place_slices(settings)
-        voxels, truth, labels = _make(settings, placement, progress)
+        voxels, truth, labels = _make_voxels(settings, placement, progress)
         with temporary_folder(folder.parent) as temporary:
             finished = temporary / "series"
             finished.mkdir()
             write_series(finished, voxels, settings, placement, progress)
             for phase in range(1, settings.phases):
-                voxels, _, _ = _make(settings, placement, progress, phase)
+                voxels, _, _ = _make_voxels(settings, placement, progress, phase)
                 write_series(finished, voxels, settings, placement, progress, phase)
             text = json.dumps(truth, indent=2) + "\n"
             (finished / TRUTH_NAME).write_text(text, encoding="utf-8")

@@ -228,25 +228,25 @@ class _Scene:
         self.anatomy, self.ramp = anatomy, ramp_mm
         margin = np.full(3, 2.0 * ramp_mm + float(np.linalg.norm(affine[:3, :3], axis=0).max()))
 
-        def place(center: Float64Array, axes: Float64Array, low: Float64Array, high: Float64Array) -> PlacedPiece:
+        def place_piece(center: Float64Array, axes: Float64Array, low: Float64Array, high: Float64Array) -> PlacedPiece:
             return PlacedPiece(Piece(center, axes, low - margin, high + margin), affine, shape_kji)
 
         self.discs = []
         for disc in anatomy.discs:
             half = np.array((disc.half_width, disc.half_depth, disc.half_length))
-            self.discs.append((disc, place(disc.center, disc.axes, -half, half)))
+            self.discs.append((disc, place_piece(disc.center, disc.axes, -half, half)))
         self.vertebrae = []
         for vertebra in anatomy.vertebrae:
             low, high = (np.array(corner) for corner in local_bounds(vertebra))
-            self.vertebrae.append((vertebra, place(vertebra.center, vertebra.axes, low, high)))
+            self.vertebrae.append((vertebra, place_piece(vertebra.center, vertebra.axes, low, high)))
         self.rib_rods = []
         for rib in anatomy.ribs:
             for a, b in itertools.pairwise(rib.points):
                 reach = np.array((4.5, 4.5, 8.0))
                 low, high = np.minimum(a, b) - reach, np.maximum(a, b) + reach
-                self.rib_rods.append((a, b, place(np.zeros(3), np.eye(3), low, high)))
+                self.rib_rods.append((a, b, place_piece(np.zeros(3), np.eye(3), low, high)))
         reach = np.full(3, anatomy.marker_radius)
-        self.marker = place(anatomy.marker, np.eye(3), -reach, reach)
+        self.marker = place_piece(anatomy.marker, np.eye(3), -reach, reach)
 
     def draw(self, canvas: Field, scratch: Field, slice_k: int, k: float) -> None:
         """Draw all bone of (sub-)slice `k`, which belongs to slice `slice_k`, onto `canvas`."""
@@ -350,7 +350,7 @@ def draw_spine(
     voxels = np.empty(shape, dtype=np.float32)
     offsets = (np.arange(subslices) + 0.5) / subslices - 0.5
 
-    def draw(k: int, slice_place: float) -> None:
+    def draw_slice(k: int, slice_place: float) -> None:
         full = Window((slice(0, shape[1]), slice(0, shape[2])), grid, slice_place)
         tissue = np.full(shape[1:], AIR_HU, dtype=np.float32)
         painter = _Painter(tissue, ramp, settings.seed, blood_hu)
@@ -366,7 +366,7 @@ def draw_spine(
 
     # One thread: the pieces are small, and threads lose more time to the interpreter lock than they gain.
     for k in range(shape[0]):
-        draw(k, float(k if places is None else places[k]))
+        draw_slice(k, float(k if places is None else places[k]))
         if progress is not None:
             progress("draw", k + 1, shape[0])
     return voxels, anatomy

@@ -123,7 +123,7 @@ PLACE_TOLERANCE_MM = 1.6e-5
 BAND = (20.0, 70.0)
 
 
-def _compare(device: Device, dtype: str, uneven: bool, kind: Any, labels: str | None) -> float:
+def _compare_points(device: Device, dtype: str, uneven: bool, kind: Any, labels: str | None) -> float:
     volume = stack(noise(WIDE, dtype, 100), OBLIQUE, uneven=uneven)
     chosen = None if labels is None else random_integers(WIDE, labels, 3)
     label_map = None if chosen is None else LabelMap(chosen, OBLIQUE)
@@ -141,7 +141,7 @@ def _compare(device: Device, dtype: str, uneven: bool, kind: Any, labels: str | 
 
 def _check_voxels(device: Device) -> str:
     worst = max(
-        _compare(device, dtype, uneven, kind, labels)
+        _compare_points(device, dtype, uneven, kind, labels)
         for dtype, uneven, kind, labels in (
             ("int16", False, "voxels", None),
             ("float32", True, "voxels", None),

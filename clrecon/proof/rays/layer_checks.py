@@ -76,7 +76,7 @@ def _still(camera: Camera) -> Still:
     return Still(image, depth)
 
 
-def _blend(
+def _blend_layers(
     mesh: Mesh, colors: NDArray[np.uint8], camera: Camera, still: Still
 ) -> tuple[list[Float64Array], Float64Array, Float64Array, Float64Array]:
     """Return the depths of all layers, premultiplied colours, first and expected depths; see `SPLIT`."""
@@ -129,12 +129,12 @@ def _check_layers(device: Device) -> str:
         still = _still(camera)
         ways: list[Any] = []
 
-        def note(between: Between, ways: list[Any] = ways) -> None:
+        def note_ends(between: Between, ways: list[Any] = ways) -> None:
             depths = (between.nearest_d, between.farthest_d)
             ways.append([download(device, np.empty(SIZE[::-1], np.float32), each) for each in depths])
 
-        layered = draw_layers(device, parts, Shot(camera, SIZE), still=still, volume=note)
-        layers, rgba, depth, mean = _blend(mesh, colors, camera, still)
+        layered = draw_layers(device, parts, Shot(camera, SIZE), still=still, volume=note_ends)
+        layers, rgba, depth, mean = _blend_layers(mesh, colors, camera, still)
         _compare_ways(ways, layers, layered)
         first = draw_layers(device, parts, Shot(camera, SIZE), still=still, most=1)
         more = np.isfinite(layers[0]) & (first.image[..., 3] < 255)

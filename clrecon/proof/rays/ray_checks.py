@@ -69,7 +69,7 @@ def _count_cells(voxels: NDArray[Any], take: np.ufunc) -> NDArray[Any]:
     return voxels
 
 
-def _spread(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def _spread_bricks(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Return the Chebyshev distance of each brick to the nearest that shows, at most `FARTHEST`."""
     distances = np.where(shown, 0, FARTHEST).astype(np.uint8)
     for axis in range(3):
@@ -99,7 +99,7 @@ def _count_ahead(distances: NDArray[np.uint8], ray: MainWay) -> NDArray[np.uint8
     return np.moveaxis(counts, 0, ray.axis).T
 
 
-def _open(device: Device, volume: Volume) -> tuple[DeviceVolume, RaySlab]:
+def _open_slab(device: Device, volume: Volume) -> tuple[DeviceVolume, RaySlab]:
     resident = DeviceVolume(volume, device=device)
     return resident, next(ray_slabs(resident, volume.shape_ijk[2], np.inf, Stopwatch()))
 
@@ -110,7 +110,7 @@ def _check_leaps(device: Device) -> str:
         voxels = rng.integers(0, 40, _LEAP_SHAPE).astype(dtype)
         for _ in range(60):
             voxels[tuple(rng.integers(0, _LEAP_SHAPE))] = 100
-        resident, slab = _open(device, stack(voxels, np.eye(4)))
+        resident, slab = _open_slab(device, stack(voxels, np.eye(4)))
         counts = slab.bricks[::-1]
         with stopwatch.running(device):
             ranges = np.empty((*counts, 2), dtype)
@@ -119,7 +119,7 @@ def _check_leaps(device: Device) -> str:
             distances = download(device, np.empty(counts, np.uint8), leaps.distances_d)
         low, high = _count_cells(voxels, np.minimum), _count_cells(voxels, np.maximum)
         require_equal(ranges, np.stack([low, high], axis=-1), f"ranges of bricks of {dtype} voxels")
-        expected = _spread(high > 50)
+        expected = _spread_bricks(high > 50)
         require_equal(distances, expected, f"distances of bricks of {dtype} voxels")
         for eye, aside in (((0.01, -0.5, 0.7, 0.0), 0.02), ((-3.0, 20.0, 10.0, 1.0), 0.5)):
             for axis in range(3):
@@ -141,7 +141,7 @@ def _check_tiles(device: Device) -> str:
     size, distance, stopwatch = (ni * TILE, nj * TILE), 50.0, Stopwatch()
     for uneven in (False, True):
         volume = stack(voxels, np.eye(4), uneven=uneven)
-        resident, slab = _open(device, volume)
+        resident, slab = _open_slab(device, volume)
         middle = np.array([(ni - 1) / 2, (nj - 1) / 2, 0.0])
         camera = Camera(tuple(middle - (0.0, 0.0, distance)), tuple(middle), (0.0, -1.0, 0.0), parallel_scale=nj / 2)
         box = volume_box(volume)
@@ -208,7 +208,7 @@ def _premultiplied(image: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.concatenate([image[..., :3] * (opacity / 255.0), opacity], axis=-1)
 
 
-def _compare(picture: Rendering, image: NDArray[Any], depth: NDArray[Any], subject: str) -> float:
+def _compare_picture(picture: Rendering, image: NDArray[Any], depth: NDArray[Any], subject: str) -> float:
     """Compare colours over black and depths, pixel by pixel."""
     require_whole(picture.report)
     both = np.isfinite(picture.depth) & np.isfinite(depth)
@@ -218,7 +218,7 @@ def _compare(picture: Rendering, image: NDArray[Any], depth: NDArray[Any], subje
     return require_share(away, np.zeros_like(away), COLOR_255, EDGE_SHARE, f"colours of {subject}, of 255")
 
 
-def _cut(volume: Volume) -> Clip:
+def _cut_middle(volume: Volume) -> Clip:
     centre = centre_of(volume)
     return Clip.box(centre - 5.0, centre + (6.0, 7.0, 4.0)) & Clip.plane(centre, (0.5, 0.4, 1.0))
 
@@ -228,14 +228,16 @@ def _check_composite(device: Device, scenes: tuple[tuple[str, TransferFunction, 
     for dtype, function, uneven, options in scenes:
         volume = blobs(_PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
         lighting, jitter = options.get("lighting", FIXED), options.get("jitter", False)
-        clip = _cut(volume) if options.get("cut") else None
+        clip = _cut_middle(volume) if options.get("cut") else None
         camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=options.get("perspective", True))
         step = options.get("step", 0.5 * min(volume.spacing))
         style = VolumeLook(function, lighting=lighting, jitter=jitter, clip=clip)
         picture = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
         twin = cast_rays(volume, function, camera, SIZE, step, lighting, clip, "dvr", jitter=jitter)
         image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
-        worst = max(worst, _compare(picture, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}"))
+        worst = max(
+            worst, _compare_picture(picture, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}")
+        )
     return f"{len(scenes)} pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
@@ -282,7 +284,7 @@ def _check_projections(device: Device, kinds: tuple[str, ...], uneven: bool) -> 
     for kind in kinds:
         for dtype in ("int16", "float32") if uneven else ("int16", "uint8", "float32"):
             volume = blobs(_PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
-            clip = _cut(volume) if dtype == "float32" else None
+            clip = _cut_middle(volume) if dtype == "float32" else None
             camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=dtype != "uint8")
             step = 0.5 * min(volume.spacing)
             style = Projection(kind, clip=clip)  # type: ignore[arg-type]
@@ -303,14 +305,16 @@ def _check_surfaces(device: Device, uneven: bool) -> str:
     worst = 0.0
     for dtype, iso_value, shadows in (("int16", 100.0, False), ("uint8", 75.0, False), ("float32", 100.0, True)):
         volume = blobs(_PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
-        clip = _cut(volume) if dtype == "float32" else None
+        clip = _cut_middle(volume) if dtype == "float32" else None
         camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=dtype == "float32")
         step = 0.5 * min(volume.spacing)
         style = SurfaceLook(iso_value, color="white", shadows=shadows, lighting=FIXED, clip=clip)
         picture = cast_surface(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
         twin = surface_twin(volume, iso_value, camera, SIZE, step, FIXED, clip, shadows=shadows)
         image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
-        worst = max(worst, _compare(picture, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}"))
+        worst = max(
+            worst, _compare_picture(picture, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}")
+        )
     return f"3 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
@@ -338,11 +342,11 @@ def _check_slices(device: Device) -> str:
     for dtype, uneven in (("int16", False), ("uint8", False), ("float32", True)):
         volume = blobs(_PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
         camera = look_at(volume, (0.4, 0.8, -0.7), 7.0, perspective=uneven)
-        clip = _cut(volume) if uneven else None
+        clip = _cut_middle(volume) if uneven else None
         style = SlicesInSpace([1, 4, 7, 12], opacity=0.4, lowest_hu=-300.0, window=(-500.0, 700.0), clip=clip)
         picture = overlay_slices(DeviceVolume(volume, device=device), style, Shot(camera, SIZE))
         rgba, depth = overlay_twin(volume, camera, SIZE, style)
-        worst = max(worst, _compare(picture, 255.0 * rgba, depth, f"slices of {dtype} voxels"))
+        worst = max(worst, _compare_picture(picture, 255.0 * rgba, depth, f"slices of {dtype} voxels"))
     return f"3 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
@@ -373,7 +377,7 @@ _PROJECTED = ("measure_cells", "project_rays")
 _TRACED = (*_PREPARED, "trace_surface")
 
 
-def _check(name: str, kernels: tuple[str, ...], run: Any, *macros: str, **options: Any) -> Check:
+def _check_last(name: str, kernels: tuple[str, ...], run: Any, *macros: str, **options: Any) -> Check:
     """Return a check whose last kernel is built with macros; the kernels before it know only uneven slices."""
     file = {
         "composite_rays": "rays/composite.cl",
@@ -389,7 +393,7 @@ def _check(name: str, kernels: tuple[str, ...], run: Any, *macros: str, **option
 
 
 PICTURE_CHECKS = (
-    _check(
+    _check_last(
         "volume rendering",
         RENDERED,
         _check_composite,
@@ -399,31 +403,31 @@ PICTURE_CHECKS = (
             ("float32", SOFT, False, {"cut": True, "jitter": True}),
         ),
     ),
-    _check(
+    _check_last(
         "gradient opacity",
         RENDERED,
         _check_composite,
         "GRADIENT_OPACITY",
         scenes=(("int16", _BY_GRADIENT, False, {}), ("float32", _BY_GRADIENT, False, {})),
     ),
-    _check(
+    _check_last(
         "steep transfer functions",
         RENDERED,
         _check_composite,
         "TAKES_PARTS",
         scenes=(("int16", STEEP, False, {"step": 0.17}), ("float32", STEEP, False, {"step": 0.17})),
     ),
-    _check(
+    _check_last(
         "volume rendering of uneven slices",
         RENDERED,
         _check_composite,
         "UNEVEN",
         scenes=(("int16", SOFT, True, {}), ("float32", SOFT, True, {"cut": True})),
     ),
-    _check("labels in volume rendering", RENDERED, _check_composite_labels, "LABELS"),
-    _check("projections", _PROJECTED, _check_projections, kinds=("mip", "minip", "mean"), uneven=False),
-    _check("radiographs", _PROJECTED, _check_projections, "LEAST_VALUE", kinds=("drr",), uneven=False),
-    _check(
+    _check_last("labels in volume rendering", RENDERED, _check_composite_labels, "LABELS"),
+    _check_last("projections", _PROJECTED, _check_projections, kinds=("mip", "minip", "mean"), uneven=False),
+    _check_last("radiographs", _PROJECTED, _check_projections, "LEAST_VALUE", kinds=("drr",), uneven=False),
+    _check_last(
         "projections of uneven slices",
         _PROJECTED,
         _check_projections,
@@ -432,9 +436,9 @@ PICTURE_CHECKS = (
         kinds=("mip", "minip", "mean", "drr"),
         uneven=True,
     ),
-    _check("surfaces without a mesh", _TRACED, _check_surfaces, uneven=False),
-    _check("surfaces of uneven slices", _TRACED, _check_surfaces, "UNEVEN", uneven=True),
-    _check("labels on surfaces", _TRACED, _check_surface_labels, "LABELS"),
+    _check_last("surfaces without a mesh", _TRACED, _check_surfaces, uneven=False),
+    _check_last("surfaces of uneven slices", _TRACED, _check_surfaces, "UNEVEN", uneven=True),
+    _check_last("labels on surfaces", _TRACED, _check_surface_labels, "LABELS"),
     Check("slices in space", ("overlay_slices",), _check_slices),
     Check("points as discs", ("clear_splats", "splat_depths", "splat_numbers", "shade_splats"), _check_points),
 )

@@ -134,7 +134,7 @@ def fit_profiles(
     expected = np.array([0.0, 0.0, (INNER_SHARE - 1.0) * cortex_hu / 1000.0])
     precision = np.array(precisions)
 
-    def fit(x0: Float64Array, t: Float64Array) -> _Fit:
+    def fit_walls(x0: Float64Array, t: Float64Array) -> _Fit:
         z, behind = (places - x0[:, None]) / width[:, None], (places - x0[:, None] + t[:, None]) / width[:, None]
         outer, inner = _normal_share(z), _normal_share(-behind)
         shares = np.stack([outer, 1.0 - outer - inner, inner], axis=2)
@@ -159,7 +159,7 @@ def fit_profiles(
     nearest, room = places[first], places[last]
     thickest = scale.step_mm * SAMPLES
     ease = np.array([2.5e-13, 7.5e-12]) * (cortex_hu / scale.step_mm) ** 2
-    begins = [fit(np.clip(x * width, nearest, room), t * width) for x, t in _STARTS]
+    begins = [fit_walls(np.clip(x * width, nearest, room), t * width) for x, t in _STARTS]
     now = begins[0].replaced(begins[1]).replaced(begins[2])
     damping = np.full(len(width), 0.01)
     for _ in range(ROUNDS):
@@ -169,7 +169,7 @@ def fit_profiles(
         step = np.linalg.solve(system, now.slope[..., None])[..., 0]
         x0 = np.clip(now.x0 + np.clip(step[:, 0], -width, width), nearest, room)
         t = np.maximum(now.t + np.clip(step[:, 1], -1.5 * width, 1.5 * width), 0.5 * now.t)
-        following = fit(x0, np.clip(t, THINNEST * width, thickest))
+        following = fit_walls(x0, np.clip(t, THINNEST * width, thickest))
         damping = damping * np.where(following.cost < SLACK * now.cost, 0.2, 5.0)
         now = now.replaced(following, SLACK)
     now.square[:, (0, 1), (0, 1)] += ease

@@ -77,7 +77,7 @@ def compare_mesh(volume: Volume, mesh: Mesh, expected: Surface, subject: str) ->
     return away
 
 
-def _compare(device: Device, volume: Volume, levels: tuple[Level, ...], subject: str, **options: Any) -> float:
+def _compare_surfaces(device: Device, volume: Volume, levels: tuple[Level, ...], subject: str, **options: Any) -> float:
     """Compare surfaces of a volume one after the other: from the second on, bricks of the volume are known."""
     worst = 0.0
     with DeviceVolume(volume, device=device) as resident:
@@ -94,7 +94,7 @@ def _check_first_and_second(device: Device) -> str:
     worst = 0.0
     for dtype, affine, closed in (("int16", OBLIQUE, True), ("float32", MIRRORED, False)):
         volume = stack(waves(WIDE, dtype, -500.0, 500.0), affine)
-        worst = max(worst, _compare(device, volume, (30.5, -80.0), f"{dtype} voxels", closed=closed))
+        worst = max(worst, _compare_surfaces(device, volume, (30.5, -80.0), f"{dtype} voxels", closed=closed))
     return f"4 surfaces: triangles equal, vertices within {worst:.1e} voxel"
 
 
@@ -102,7 +102,7 @@ def _check_types(device: Device) -> str:
     worst = 0.0
     for dtype in ("int8", "uint8", "uint16", "int32"):
         volume = stack(waves((130, 44, 7), dtype), OBLIQUE)
-        worst = max(worst, _compare(device, volume, (40.5, 61.0), f"{dtype} voxels"))
+        worst = max(worst, _compare_surfaces(device, volume, (40.5, 61.0), f"{dtype} voxels"))
     return f"8 surfaces of 4 types: triangles equal, vertices within {worst:.1e} voxel"
 
 
@@ -113,7 +113,7 @@ def _check_variant(
     worst = 0.0
     for dtype in types:
         volume = stack(make(shape, dtype), OBLIQUE, uneven=uneven)
-        worst = max(worst, _compare(device, volume, (level,), f"{dtype} voxels", **options))
+        worst = max(worst, _compare_surfaces(device, volume, (level,), f"{dtype} voxels", **options))
     return f"{len(types)} surfaces: triangles equal, vertices within {worst:.1e} voxel"
 
 

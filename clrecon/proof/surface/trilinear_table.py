@@ -123,17 +123,17 @@ def find_regions(case: int, joined: int) -> list[int]:
     """Return for each corner the lowest corner that it is joined to on the cell's boundary."""
     region = list(range(8))
 
-    def join(a: int, b: int) -> None:
+    def join_corners(a: int, b: int) -> None:
         low, high = sorted((region[a], region[b]))
         region[:] = [low if r == high else r for r in region]
 
     for _, low, high in EDGES:
         if case >> low & 1 == case >> high & 1:
-            join(low, high)
+            join_corners(low, high)
     for face in find_ambiguous_faces(case):
         a, b, c, d = FACES[face]
         first_joined = (joined >> face & 1) == (case >> a & 1)
-        join(*((a, c) if first_joined else (b, d)))
+        join_corners(*((a, c) if first_joined else (b, d)))
     return region
 
 
@@ -187,7 +187,7 @@ def _cut_disc(loop: Loop) -> tuple[tuple[Triangle, ...], ...]:
     return tuple(ways)
 
 
-def _place(vertex: int, diagonal: int = 0) -> tuple[int, int, int]:
+def _place_vertex(vertex: int, diagonal: int = 0) -> tuple[int, int, int]:
     """Return the place of a vertex in a model cell of 20 units: edges at their middles, a tunnel's box 6 units wide."""
     if vertex >= CELL_VERTEX:
         x, y, z = CORNERS[ring_corners(diagonal)[vertex - CELL_VERTEX]]
@@ -198,7 +198,7 @@ def _place(vertex: int, diagonal: int = 0) -> tuple[int, int, int]:
 
 
 def _squared_length(a: int, b: int, diagonal: int = 0) -> int:
-    return sum((p - q) ** 2 for p, q in zip(_place(a, diagonal), _place(b, diagonal), strict=True))
+    return sum((p - q) ** 2 for p, q in zip(_place_vertex(a, diagonal), _place_vertex(b, diagonal), strict=True))
 
 
 def _squared_chords(triangles: Iterable[Triangle]) -> int:

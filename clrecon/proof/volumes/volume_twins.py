@@ -147,14 +147,14 @@ Bits = NDArray[np.bool_]
 
 def dilate(volume: Volume, chosen: ArrayLike, mm: float, *, by_slice: bool = False) -> Bits:
     """Return the voxels within ``mm * (1 + 1e-6)`` of a chosen one, shape (nk, nj, ni)."""
-    return _spread(find_places(volume), np.asarray(chosen, dtype=bool), mm, by_slice)
+    return _spread_mask(find_places(volume), np.asarray(chosen, dtype=bool), mm, by_slice)
 
 
 def erode(volume: Volume, chosen: ArrayLike, mm: float, *, by_slice: bool = False, beyond: bool = False) -> Bits:
     """Return the voxels without one within ``mm * (1 + 1e-6)`` that is not chosen; `beyond`: those beyond are."""
     bits = np.asarray(chosen, dtype=bool)
     if beyond:
-        return ~_spread(find_places(volume), ~bits, mm, by_slice)
+        return ~_spread_mask(find_places(volume), ~bits, mm, by_slice)
     # enough voxels that those beyond them are farther than `mm` from the volume
     steps = volume.affine[:3, :3].copy()
     ends = np.diff(volume.slice_origins(1), axis=0)[[0, -1]]
@@ -166,7 +166,7 @@ def erode(volume: Volume, chosen: ArrayLike, mm: float, *, by_slice: bool = Fals
     border = i, j, k
     padded = np.pad(~bits, [(n, n) for n in border[::-1]], constant_values=True)
     inner = tuple(slice(n, n + size) for n, size in zip(border[::-1], bits.shape, strict=True))
-    return ~_spread(find_places(volume, border), padded, mm, by_slice, inner)
+    return ~_spread_mask(find_places(volume, border), padded, mm, by_slice, inner)
 
 
 def close(volume: Volume, chosen: ArrayLike, mm: float, *, by_slice: bool = False) -> Bits:
@@ -174,7 +174,7 @@ def close(volume: Volume, chosen: ArrayLike, mm: float, *, by_slice: bool = Fals
     return erode(volume, dilate(volume, chosen, mm, by_slice=by_slice), mm, by_slice=by_slice, beyond=True)
 
 
-def _spread(
+def _spread_mask(
     places: NDArray[np.float64], chosen: Bits, mm: float, by_slice: bool, inner: tuple[slice, ...] = (slice(None),) * 3
 ) -> Bits:
     """Return the voxels of the part `inner` that are near chosen ones."""

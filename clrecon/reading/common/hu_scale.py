@@ -221,7 +221,7 @@ class Layers:
             dense = picture > tissue + DENSER * step
             core += int(np.count_nonzero(dense))
             body += int(np.count_nonzero(picture > air + step / 2.0))
-            ring.append(picture[_grow(dense, _RING) & ~_grow(dense, _RING - 1)])
+            ring.append(picture[_grow_mask(dense, _RING) & ~_grow_mask(dense, _RING - 1)])
         around = np.concatenate(ring)
         if core < _LEAST_CORE * body or not len(around):
             return None
@@ -237,7 +237,7 @@ def _calm(picture: NDArray[Any]) -> NDArray[np.float32]:
     return calm
 
 
-def _grow(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+def _grow_mask(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
     for axis in (0, 1):
         mask = np.any(_windows(mask, reach, axis), axis=-1)
     return mask

@@ -75,7 +75,7 @@ def open_nrrd(path: Path, purpose: str) -> GridFile:
     if end is None and (detached is None or len(start) == LARGEST_HEADER):
         raise RefusedInputError(f"{name} has no voxels: its NRRD header does not end within {LARGEST_HEADER:,} bytes")
     beside = None if detached is None else _voxel_file(path, detached[1].decode("utf-8", "replace"))
-    header = _parse(text, name, purpose)
+    header = _parse_header(text, name, purpose)
     encoding = str(header.get("encoding", "")).lower()
     if encoding not in ("raw", "gzip", "gz"):
         raise RefusedInputError(f"{name} is stored as '{escape_text(encoding)}': raw and gzip are read, write it so")
@@ -97,7 +97,7 @@ def open_nrrd(path: Path, purpose: str) -> GridFile:
     )
 
 
-def _parse(text: bytes, name: str, purpose: str) -> dict[str, Any]:
+def _parse_header(text: bytes, name: str, purpose: str) -> dict[str, Any]:
     nrrd = import_extra("nrrd", purpose)
     lines = [line + "\n" for line in text.decode("utf-8", "replace").splitlines()]
     try:

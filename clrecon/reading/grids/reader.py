@@ -312,7 +312,7 @@ log = get_logger(__name__)
 
 def read_grid(path: Path, kind: str, *, rescale: Rescale | None = None, progress: Progress | None = None) -> Volume:
     """Read a volume of one of the kinds of `tell_kind`; a given rescale replaces that of the header."""
-    grid = _open(path, kind, rescale)
+    grid = _open_by_kind(path, kind, rescale)
     values = read_values(grid, progress)
     findings = _examine(grid, values)
     report = certify_grid(grid, values, _collect_warnings(grid, values, findings), findings)
@@ -351,7 +351,7 @@ def list_grid(
     path: Path, kind: str, *, rescale: Rescale | None = None, pixels: bool = False, progress: Progress | None = None
 ) -> SeriesListing:
     """List the one volume of a file, with its certificate, for `pixels` also by its voxels; see `read_grid`."""
-    grid = _open(path, kind, rescale)
+    grid = _open_by_kind(path, kind, rescale)
     values = read_values(grid, progress) if pixels else None
     findings = None if values is None else _examine(grid, values)
     warnings = _collect_warnings(grid, values, findings)
@@ -370,7 +370,7 @@ def list_grid(
     return SeriesListing([entry], 1, {}, [], certificate)
 
 
-def _open(path: Path, kind: str, rescale: Rescale | None) -> GridFile:
+def _open_by_kind(path: Path, kind: str, rescale: Rescale | None) -> GridFile:
     try:
         grid = open_grid(path, kind, VOLUME)
     except OSError as error:

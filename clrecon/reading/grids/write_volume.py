@@ -125,7 +125,7 @@ def stage_volume(
     return stage_file(
         path,
         lambda stream: chosen.write(stream, content),
-        lambda temporary: _verify(temporary, chosen.kind, content),
+        lambda temporary: _verify_file(temporary, chosen.kind, content),
         expected_bytes=0 if packed else content.voxels.nbytes,
     )
 
@@ -171,7 +171,7 @@ def check_holds(volume: Volume, extension: str) -> None:
     raise UsageError(f"{fault}; resample it to a regular grid ({name_parameter('resample', 'MM')})")
 
 
-def _verify(path: Path, kind: str, content: VolumeContent) -> None:
+def _verify_file(path: Path, kind: str, content: VolumeContent) -> None:
     grid = open_grid(path, kind, VOLUME)
     off = _measure_apart(grid.affine, content.affine, content.voxels.shape)
     if grid.shape_ijk != content.voxels.shape[::-1] or off > SAME_PLACE_MM or grid.scaled:

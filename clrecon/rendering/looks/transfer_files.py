@@ -257,7 +257,7 @@ def read_slicer_xml(data: bytes) -> list[Entry]:
     def refuse(*_: Any) -> None:
         raise RefusedInputError(f"line {parser.CurrentLineNumber}: it has a DOCTYPE, which files of Slicer do not have")
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
+    def start_element(tag: str, attributes: dict[str, str]) -> None:
         if tag in ("VolumeProperty", "VolumePropertyNode"):
             line = parser.CurrentLineNumber
             path = f"line {line} ({attributes.get('name', tag)[:64]!r})"
@@ -266,7 +266,7 @@ def read_slicer_xml(data: bytes) -> list[Entry]:
             )
 
     parser.StartDoctypeDeclHandler = refuse
-    parser.StartElementHandler = start
+    parser.StartElementHandler = start_element
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:

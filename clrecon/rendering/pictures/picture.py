@@ -260,7 +260,7 @@ def merge_layers(rendering: Rendering, colors: NDArray[np.uint8], depth: NDArray
     of_picture = np.where(nothing, np.inf, rendering.expected_depth)
     of_scene = np.where(colors[..., 3] > 0, np.nan_to_num(depth, nan=np.inf), np.inf)
     scene_first = of_scene < of_picture
-    image, shares = _blend(
+    image, shares = _blend_pictures(
         np.where(scene_first[..., None], colors, rendering.image),
         np.where(scene_first[..., None], rendering.image, colors),
     )
@@ -275,7 +275,7 @@ def merge_layers(rendering: Rendering, colors: NDArray[np.uint8], depth: NDArray
     )
 
 
-def _blend(front: NDArray[np.uint8], back: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+def _blend_pictures(front: NDArray[np.uint8], back: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """Blend one picture over another, both not premultiplied; also return their weights (2, h, w), 0 to 1."""
     opacity = front[..., 3] / 255.0
     shares = np.stack([opacity, (1.0 - opacity) * back[..., 3] / 255.0])

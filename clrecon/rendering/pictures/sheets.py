@@ -83,13 +83,13 @@ def write_on_tile(image: NDArray[np.uint8], texts: tuple[str, ...], edges: Mappi
     picture: Any = Image.fromarray(np.ascontiguousarray(image))
     pen = ImageDraw.Draw(picture)
 
-    def write(corner: tuple[float, float], text: str, anchor: str) -> None:
+    def write_text(corner: tuple[float, float], text: str, anchor: str) -> None:
         pen.text(corner, text, (255, 255, 255, 255), font, anchor, stroke_width=1, stroke_fill=(0, 0, 0, 255))
 
-    write((3, 2), fitting[0] if fitting else texts[-1], "la")
+    write_text((3, 2), fitting[0] if fitting else texts[-1], "la")
     if min(height, width) >= _LEAST_LETTERED:
         for x, anchor, edge in ((3, "lm", "left"), (width - 3, "rm", "right")):
-            write((x, height / 2), edges[edge], anchor)
+            write_text((x, height / 2), edges[edge], anchor)
     return np.array(picture)
 
 

@@ -20,29 +20,29 @@ SPINE = "spine"
 
 def instance_of(noun: str, kind: type) -> Callable[[Any], Any]:
 
-    def check(value: Any) -> Any:
+    def check_instance(value: Any) -> Any:
         if isinstance(value, kind):
             return value
         raise UsageError(f"the {noun} of a picture is a {kind.__name__} or None, not {type(value).__name__}")
 
-    return check
+    return check_instance
 
 
 def one_of(names: Sequence[str], text: str) -> Callable[[Any], Any]:
     """Make a check of a name; the message is `text`, which lists the names, and the given value."""
 
-    def check(value: Any) -> Any:
+    def check_name(value: Any) -> Any:
         if isinstance(value, str) and value in names:
             return value
         raise UsageError(f"{text}, not {value!r:.60}")
 
-    return check
+    return check_name
 
 
 def number(text: str, is_fine: Callable[[float], bool]) -> Callable[[Any], float]:
     """Make a check of one number; the message is `text`, which describes it, and the given value."""
 
-    def check(value: Any) -> float:
+    def check_number(value: Any) -> float:
         try:
             checked = float(value)
         except (TypeError, ValueError, OverflowError):
@@ -52,7 +52,7 @@ def number(text: str, is_fine: Callable[[float], bool]) -> Callable[[Any], float
         shown = f"{value:g}" if isinstance(value, float) else f"{value!r:.60}"
         raise UsageError(f"{text} {shown}")
 
-    return check
+    return check_number
 
 
 def flag(name: str, value: Any) -> bool:
@@ -127,12 +127,12 @@ def sheet(value: Any) -> int | str:
 def mapping(subject: str) -> Callable[[Any], Any]:
     """Make a check for a mapping with labels as keys; `what` names the values in the message."""
 
-    def check(value: Any) -> Any:
+    def check_mapping(value: Any) -> Any:
         if isinstance(value, Mapping):
             return dict(value)
         raise UsageError(f"{subject} of labels are a mapping such as {{'L2': ...}}, not {type(value).__name__}")
 
-    return check
+    return check_mapping
 
 
 ray_step = number("the ray step is a length in mm above 0, not", lambda mm: 0.0 < mm < math.inf)

@@ -288,7 +288,7 @@ class Painter(Stage):
         if not drawn:
             return self._empty(state, size, state.mode, camera)
 
-        def check(stage: str, done: int, total: int) -> None:
+        def check_on(stage: str, done: int, total: int) -> None:
             _stop(cancelled)
 
         for item in drawn:
@@ -298,12 +298,12 @@ class Painter(Stage):
         if len(drawn) == 1 and isinstance(first.subject, DeviceVolume):
             renderer, style = self.renderer(first.subject), first.style
 
-            def take(camera: Camera, size: tuple[int, int]) -> Rendering:
-                return renderer.render(style, camera=camera, size=size, background="transparent", progress=check)
+            def take_strip(camera: Camera, size: tuple[int, int]) -> Rendering:
+                return renderer.render(style, camera=camera, size=size, background="transparent", progress=check_on)
 
             # The window of a projection without one is chosen from all of the picture.
             whole = isinstance(style, Projection) and style.window is None
-            return take(camera, size) if whole else take_strips(take, camera, size)
+            return take_strip(camera, size) if whole else take_strips(take_strip, camera, size)
         key = tuple((id(each.subject), id(each.style)) for each in drawn)
         if self._scene is None or self._scene[0] != key:
             if self._scene is not None:
@@ -311,7 +311,7 @@ class Painter(Stage):
             objects = [(each.subject, each.style) for each in drawn]
             scene_pictures = ScenePictures(objects, device=self._device, memory=self.memory, takers=self._takers)
             self._scene = key, scene_pictures
-        return self._scene[1].take(camera, size, None, check)
+        return self._scene[1].take(camera, size, None, check_on)
 
     def _empty(self, state: ViewState, size: tuple[int, int], mode: str, camera: Camera) -> Rendering:
         width, height = size

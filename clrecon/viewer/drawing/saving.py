@@ -115,7 +115,7 @@ def save_shown(
             staged.commit()
         written = staged.size
     else:
-        written = _join(meshes).save(path, space, keep_ids=keep_ids, no_clobber=no_clobber)
+        written = _join_meshes(meshes).save(path, space, keep_ids=keep_ids, no_clobber=no_clobber)
     return [f"{name}: {count_of(len(meshes), 'mesh', 'meshes')}, {triangles:,} triangles, {_megabytes(written)}"]
 
 
@@ -179,7 +179,7 @@ def shown_cloud(painter: Painter, state: ViewState, progress: Progress | None = 
     return PointCloud(np.concatenate([cloud.points for cloud in clouds]), **arrays)
 
 
-def _join(meshes: Sequence[Mesh]) -> Mesh:
+def _join_meshes(meshes: Sequence[Mesh]) -> Mesh:
     if len(meshes) == 1:
         return meshes[0]
     starts = np.cumsum([0, *(mesh.vertex_count for mesh in meshes[:-1])])

@@ -46,11 +46,11 @@ def coarsen_mesh(mesh: Mesh, triangles: int) -> Mesh:
 def cut_mesh(mesh: Mesh, clip: Clip) -> Mesh:
     """Return the part of a mesh within a clip; triangles across a plane are cut at it."""
     for plane in clip.planes:
-        mesh = _cut(mesh, plane)
+        mesh = _cut_mesh(mesh, plane)
     return mesh
 
 
-def _cut(mesh: Mesh, plane: NDArray[np.float64]) -> Mesh:
+def _cut_mesh(mesh: Mesh, plane: NDArray[np.float64]) -> Mesh:
     """Cut by a plane; a triangle is turned so that the corner that is alone on its side comes first."""
     heights = mesh.vertices @ plane[:3] - plane[3]
     inside = heights >= 0.0

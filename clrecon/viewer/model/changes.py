@@ -163,10 +163,10 @@ class ChangingView:
         """Shift what is seen by shares of the picture's height, to the right and down."""
         self._change("pan", "the shift", camera=pan_camera(self.camera, *checked_numbers("a shift", dx, dy)))
 
-    def zoom(self, factor: float, point: tuple[float, float] = (0.0, 0.0)) -> None:
+    def zoom(self, factor: float, at: tuple[float, float] = (0.0, 0.0)) -> None:
         """Show everything larger by a factor; what is seen at `at` stays there, see `zoom_camera`."""
         (factor,) = checked_numbers("the factor of a zoom", factor)
-        x, y = checked_numbers("the place of a zoom", *point)
+        x, y = checked_numbers("the place of a zoom", *at)
         self._change("zoom", "the zoom", camera=zoom_camera(self.camera, factor, (x, y)))
 
     def roll(self, degrees: float) -> None:

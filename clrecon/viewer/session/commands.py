@@ -14,7 +14,7 @@ MOST_TEXT = 200
 """Characters of a name in a command."""
 
 
-def _number(value: Any) -> float:
+def _check_number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError("a number")
     return float(value)
@@ -38,11 +38,11 @@ def _flag(value: Any) -> bool:
     return value
 
 
-def _numbers(count: int) -> Callable[[Any], tuple[float, ...]]:
+def _check_numbers(count: int) -> Callable[[Any], tuple[float, ...]]:
     def check(value: Any) -> tuple[float, ...]:
         if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != count:
             raise TypeError(f"{count} numbers")
-        return tuple(_number(each) for each in value)
+        return tuple(_check_number(each) for each in value)
 
     return check
 
@@ -55,11 +55,11 @@ def _size(value: Any) -> tuple[int, int]:
 
 
 def _direction(value: Any) -> str | tuple[float, ...]:
-    return _text(value) if isinstance(value, str) else _numbers(3)(value)
+    return _text(value) if isinstance(value, str) else _check_numbers(3)(value)
 
 
 def _view(value: Any) -> str | tuple[float, ...]:
-    return _text(value) if isinstance(value, str) else _numbers(2)(value)
+    return _text(value) if isinstance(value, str) else _check_numbers(2)(value)
 
 
 def _or_none(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -95,33 +95,33 @@ def _session(command: str, words: str, method: str, /, *, takes: Mapping[str, An
     COMMANDS[command] = Command(words, needs, takes or {}, call)
 
 
-_model("turn", "turn about the middle, in shares of the height", "turn", dx=_number, dy=_number)
-_model("pan", "shift what is seen, in shares of the height", "pan", dx=_number, dy=_number)
+_model("turn", "turn about the middle, in shares of the height", "turn", dx=_check_number, dy=_check_number)
+_model("pan", "shift what is seen, in shares of the height", "pan", dx=_check_number, dy=_check_number)
 _model("zoom", "show larger; at: from the middle, in shares of the height", "zoom",
-       factor=_number, takes={"at": _numbers(2)})  # fmt: skip
-_model("roll", "turn the picture clockwise, degrees", "roll", degrees=_number)
+       factor=_check_number, takes={"at": _check_numbers(2)})  # fmt: skip
+_model("roll", "turn the picture clockwise, degrees", "roll", degrees=_check_number)
 _model("look", "look from a side of the patient, or azimuth and elevation", "look", view=_view)
 _model("set_perspective", "a perspective or a parallel camera", "set_perspective", on=_flag)
 _model("toggle_perspective", "a perspective camera for a parallel one, or back", "toggle_perspective")
-_model("set_iso", "iso value of the surfaces, HU", "set_iso", hu=_number)
-_model("step_iso", "move the iso value by HU, as far as the slider goes", "step_iso", by=_number)
+_model("set_iso", "iso value of the surfaces, HU", "set_iso", hu=_check_number)
+_model("step_iso", "move the iso value by HU, as far as the slider goes", "step_iso", by=_check_number)
 _model("set_mode", "what scans are shown as", "set_mode", name=_text)
 _model("step_mode", "go so many modes further down the list", "step_mode", steps=_whole)
 _model("set_window", "HU of black and white; of: slices or picture", "set_window",
-       low=_number, high=_number, takes={"of": _text})  # fmt: skip
+       low=_check_number, high=_check_number, takes={"of": _text})  # fmt: skip
 _session("set_table", "show or take away table and blankets", "set_table", shown=_flag)
 _session("toggle_table", "take table and blankets away, or show them", "toggle_table")
-_model("scroll", "move a slice by steps of its voxels", "scroll", plane=_text, steps=_number)
-_model("set_cross", "move the slices to a place, LPS mm", "set_cross", point=_numbers(3))
+_model("scroll", "move a slice by steps of its voxels", "scroll", plane=_text, steps=_check_number)
+_model("set_cross", "move the slices to a place, LPS mm", "set_cross", point=_check_numbers(3))
 _session("find_parts", "find the parts of the scans at the iso value", "find_parts")
 _model("show", "show or hide a part", "show", key=_text, visible=_flag)
 _model("only", "show one part alone", "only", key=_text)
 _model("show_all", "show all parts", "show_all")
-_model("set_color", "colour of a part, 0 to 1; null: its own", "set_color", key=_text, rgb=_or_none(_numbers(3)))
+_model("set_color", "colour of a part, 0 to 1; null: its own", "set_color", key=_text, rgb=_or_none(_check_numbers(3)))
 _model("color_parts", "a colour for each part of scans", "color_parts", takes={"distinct": _flag})
 _model("toggle_colors", "a colour for each part of scans, or none", "toggle_colors")
-_model("set_opacity", "opacity of a part, 0 to 1", "set_opacity", key=_text, value=_number)
-_AT = {"x": _number, "y": _number, "size": _size}
+_model("set_opacity", "opacity of a part, 0 to 1", "set_opacity", key=_text, value=_check_number)
+_AT = {"x": _check_number, "y": _check_number, "size": _size}
 _session("pick", "what is seen at a pixel; plane: of a slice", "pick", takes={"plane": _or_none(_text)}, **_AT)
 _session("hide_at", "hide the part at a pixel", "hide_at", takes={"plane": _or_none(_text)}, **_AT)
 _session("only_at", "show the part at a pixel alone", "only_at", takes={"plane": _or_none(_text)}, **_AT)
@@ -132,11 +132,11 @@ _model("start_tool", "take points for: distance, angle, curve, seed", "start_too
 _model("end_tool", "put the tool away; a curve is made", "end_tool")
 _model("clear_measures", "drop all measures", "clear_measures")
 _model("add_clip", "cut with a plane towards a side", "add_clip", direction=_direction)
-_model("move_clip", "move a plane, 0 to 1", "move_clip", n=_whole, share=_number)
+_model("move_clip", "move a plane, 0 to 1", "move_clip", n=_whole, share=_check_number)
 _model("flip_clip", "take the other side of a plane away", "flip_clip", n=_whole)
 _model("remove_clip", "drop a plane", "remove_clip", n=_whole)
 _model("set_clip_box", "show a box, LPS mm; null: all", "set_clip_box",
-       low=_or_none(_numbers(3)), high=_or_none(_numbers(3)))  # fmt: skip
+       low=_or_none(_check_numbers(3)), high=_or_none(_check_numbers(3)))  # fmt: skip
 _model("toggle_clip_box", "show a box about the cross, or all", "toggle_clip_box")
 _session("undo", "take the last change back", "undo")
 _model("hold", "the pointer is pressed: until it is released one step of undo", "hold", on=_flag)
@@ -191,18 +191,18 @@ class Key:
     name: str = ""
 
 
-def _look(side: str) -> Key:
+def _look_from(side: str) -> Key:
     return Key(f"look from {side}", {"do": "look", "view": side})
 
 
 _SECTIONS: dict[str, dict[str, Key]] = {
     "Views": {
-        "1": _look("anterior"),
-        "2": _look("posterior"),
-        "3": _look("left"),
-        "4": _look("right"),
-        "5": _look("superior"),
-        "6": _look("inferior"),
+        "1": _look_from("anterior"),
+        "2": _look_from("posterior"),
+        "3": _look_from("left"),
+        "4": _look_from("right"),
+        "5": _look_from("superior"),
+        "6": _look_from("inferior"),
         "f": Key("parallel or perspective", {"do": "toggle_perspective"}),
     },
     "Scan": {

@@ -287,7 +287,7 @@ class ViewSession(Closing):
         with self._lock:
             state = self.model.state
 
-        def take(job: Job) -> None:
+        def take_picture(job: Job) -> None:
             with self._lock:
                 now, share = self.model.state if moving else state, self._share
             picture = self.painter.picture(now, (width, height), sharp=not moving, share=share, cancelled=job.cancelled)
@@ -309,7 +309,7 @@ class ViewSession(Closing):
             if not job.cancelled():
                 then(picture)
 
-        self._pictures.ask("picture", take, rank=0, gives_way=not moving)
+        self._pictures.ask("picture", take_picture, rank=0, gives_way=not moving)
 
     def fit(self, size: Sequence[int]) -> None:
         """Tell the (width, height) of the picture: the view of the start fits it."""
@@ -325,14 +325,14 @@ class ViewSession(Closing):
         """Ask for a slice through the cross: "axial", "coronal" or "sagittal"; the latest of each plane wins."""
         checked = checked_size(size)
 
-        def take(job: Job) -> None:
+        def take_slice(job: Job) -> None:
             with self._lock:
                 state = self.model.state
             picture = self.painter.slice(state, plane, checked)
             if not job.cancelled():
                 then(picture)
 
-        self._pictures.ask(f"slice {plane}", take, rank=1, gives_way=False)
+        self._pictures.ask(f"slice {plane}", take_slice, rank=1, gives_way=False)
 
     def curve_picture(self, size: Sequence[int], then: Callable[[Rendering], None]) -> None:
         checked = checked_size(size)
@@ -385,7 +385,7 @@ class ViewSession(Closing):
     def find_parts(self, then: Callable[[], None] | None = None) -> None:
         """Find the parts of the scans in the background; `then` is called in its thread with the lock held."""
 
-        def find(job: Job) -> None:
+        def find_parts_now(job: Job) -> None:
             with self._lock:
                 state = self.model.state
             parts = self.painter.find_parts(state, job.progress)
@@ -398,7 +398,7 @@ class ViewSession(Closing):
                     then()
             self._changed()
 
-        self._work.ask("parts", find, rank=2)
+        self._work.ask("parts", find_parts_now, rank=2)
 
     def set_table(self, shown: bool) -> None:
         """Show the table, or take it away, which takes a moment the first time."""
@@ -485,7 +485,7 @@ class ViewSession(Closing):
             state = self.model.state
         check_target(path, self.painter, state)
 
-        def write(job: Job) -> None:
+        def write_shown(job: Job) -> None:
             lines = save_shown(
                 path, self.painter, state, size=checked, space=self.model.space, keep_ids=self.keep_ids,
                 no_clobber=self.no_clobber, progress=job.progress,
@@ -495,7 +495,7 @@ class ViewSession(Closing):
             if then is not None:
                 then(lines)
 
-        self._work.ask("save", write, rank=1, gives_way=False)
+        self._work.ask("save", write_shown, rank=1, gives_way=False)
 
     def save_to(self, path: str, size: tuple[int, int] = (1024, 1024)) -> None:
         """Write what is shown, see `save`; the facts say when it is written."""

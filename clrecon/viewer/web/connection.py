@@ -305,7 +305,7 @@ class Connection:
             if (red, green, blue) != self._ground:
                 self._ground = (red, green, blue)
                 self._keys.clear()
-            sizes = {view: _fit(size) for view, size in message["sizes"].items() if view in VIEWS}
+            sizes = {view: _fit_size(size) for view, size in message["sizes"].items() if view in VIEWS}
             if SCENE in sizes:
                 self._session.fit(sizes[SCENE])
             self._pace.resize(sizes)
@@ -320,7 +320,7 @@ class Connection:
             message = await self._waiting.get()
             try:
                 if "save" in message:
-                    self._save(message["save"], _fit(message.get("size") or (1024, 1024)))
+                    self._save(message["save"], _fit_size(message.get("size") or (1024, 1024)))
                     continue
                 if message.get("do") in _NOT_FOR_BROWSERS:
                     raise UsageError(f"the command {message['do']} is not for browsers")
@@ -345,11 +345,11 @@ class Connection:
             raise UsageError("a format is an extension such as .stl")
         download = self.downloads.reserve(f"view{format}")
 
-        def finish(lines: list[str]) -> None:
+        def finish_file(lines: list[str]) -> None:
             self._later(self._offer, download)
 
         try:
-            self._session.save(download.path, finish, size)
+            self._session.save(download.path, finish_file, size)
         except ClreconError:
             self.downloads.drop(download)
             raise
@@ -477,7 +477,7 @@ class Connection:
             function(*arguments)
 
 
-def _fit(size: Any) -> tuple[int, int]:
+def _fit_size(size: Any) -> tuple[int, int]:
     """Return a size that a picture may have, of the same shape."""
     try:
         width, height = (min(max(1.0, float(value)), 1e6) for value in size)

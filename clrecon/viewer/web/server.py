@@ -150,11 +150,11 @@ def open_browser(address: str, folder: Path) -> None:
             f'<!DOCTYPE html><meta http-equiv="refresh" content="0; url={shown}"><a href="{shown}">clrecon</a>\n'
         )
 
-    def start() -> None:
+    def start_browser() -> None:
         with contextlib.suppress(Exception):  # the address was printed
             webbrowser.open(Path(file.name).as_uri())
 
-    threading.Thread(target=start, name="clrecon-open-browser", daemon=True).start()
+    threading.Thread(target=start_browser, name="clrecon-open-browser", daemon=True).start()
 
 
 log = get_logger(__name__)

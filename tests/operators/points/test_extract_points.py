@@ -13,7 +13,7 @@ from variants import VOXEL_TYPES
 
 from clrecon import LabelMap, Volume, extract_isosurface, extract_labels, fit_cortex
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
-from clrecon.operators.points.point_extraction import Selection, VoxelEmission, _join, extract_points
+from clrecon.operators.points.point_extraction import Selection, VoxelEmission, _join_points, extract_points
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.proof.points.clusters import extract_voxels, mark_shell
 
@@ -54,7 +54,7 @@ def test_slabs_are_joined_in_their_order(lengths):
     places, numbers = np.arange(3.0 * sum(lengths), dtype=np.float32).reshape(-1, 3), np.arange(sum(lengths))
     ends = np.cumsum((0, *lengths))
     parts = [(places[a:b], places[a:b, 0], numbers[a:b]) for a, b in zip(ends, ends[1:], strict=False)]
-    found = _join(parts)
+    found = _join_points(parts)
     for array, expected in zip(found, (places, places[:, 0], numbers), strict=True):
         assert array.dtype == expected.dtype
         np.testing.assert_array_equal(array, expected)

@@ -223,7 +223,7 @@ def test_a_refusal_is_no_failure(error: Exception, state: str, monkeypatch: pyte
     def refuse(request: Any) -> dict[str, Any]:
         raise error
 
-    monkeypatch.setattr(child, "_measure", refuse)
+    monkeypatch.setattr(child, "_measure_method", refuse)
     assert child.run_method(SimpleNamespace(timeout=10.0, method="t-mc"))["state"] == state  # type: ignore[arg-type]
 
 

@@ -156,7 +156,7 @@ class _MeteredFile:
 
 def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
     file.seek(META_START)
-    meta, _, meta_remarks = _collect(file, implicit=False, little=True, last_group=2, wanted=())
+    meta, _, meta_remarks = _collect_values(file, implicit=False, little=True, last_group=2, wanted=())
     transfer_syntax = decode_uid(meta.get(TRANSFER_SYNTAX))
     media_class = decode_uid(meta.get(MEDIA_CLASS))
     if not transfer_syntax:
@@ -172,7 +172,7 @@ def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> Di
     seen_implicit = _looks_implicit(file, start)
     differs = seen_implicit is not None and seen_implicit != implicit
     implicit = implicit if seen_implicit is None else seen_implicit
-    values, vrs, remarks = _collect(file, implicit=implicit, little=little, last_group=None, wanted=wanted)
+    values, vrs, remarks = _collect_values(file, implicit=implicit, little=little, last_group=None, wanted=wanted)
     position = file.tell()
     tag, offset, length, vr = read_pixel_head(file.read(12), position, implicit, little)
     return DicomElements(
@@ -192,7 +192,7 @@ def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> Di
     )
 
 
-def _collect(
+def _collect_values(
     file: BinaryIO, *, implicit: bool, little: bool, last_group: int | None, wanted: tuple[int, ...] | None
 ) -> tuple[dict[int, bytes], dict[int, str | None], list[str]]:
     """Read values up to the end of `last_group` or the pixel data, VRs, and remarks on order, which pydicom hides."""
@@ -263,13 +263,13 @@ def _looks_implicit(file: BinaryIO, start: int) -> bool | None:
 def _inflate_header(file: BinaryIO) -> bytes:
     """Inflate the start of a deflated data set: enough for its header, and never more than a fixed limit."""
 
-    def read(count: int) -> bytes:
+    def read_bytes(count: int) -> bytes:
         try:
             return file.read(count)
         except CorruptFileError:
             return b""  # the limit is that of other files; data up to it are used
 
-    inflated, _ = inflate(read, READ_LIMIT, INFLATE_STEP)
+    inflated, _ = inflate(read_bytes, READ_LIMIT, INFLATE_STEP)
     if not inflated:
         raise CorruptFileError("nothing in the deflated data set")
     return inflated

@@ -153,12 +153,12 @@ class _Everything(dict[int, int]):
 def parse_plainly(data: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomElements | None:
     """Parse the start of a file of `size` bytes, `wanted` tags or all; None for another form or an end beyond it."""
     try:
-        return _parse(data, size, wanted)
+        return _parse_data(data, size, wanted)
     except (_NotPlainError, CorruptFileError, struct.error):
         return None
 
 
-def _parse(data: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomElements | None:
+def _parse_data(data: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomElements | None:
     meta, _, start = _walk_explicit(data, META_START, _keys((TRANSFER_SYNTAX, MEDIA_CLASS)), meta=True)
     transfer_syntax = decode_uid(meta.get(TRANSFER_SYNTAX))
     if not transfer_syntax or transfer_syntax in (DEFLATED, EXPLICIT_BIG):

@@ -122,7 +122,7 @@ def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transf
             return [fragments]
         raise RefusedInputError(f"{len(fragments)} fragments for {frames} RLE frames, which have one each")
     firsts = _firsts_by_table(file, table, fragments, frames) or [
-        n for n, (place, length) in enumerate(fragments) if _read(file, place, min(length, 6)).startswith(_STARTS)
+        n for n, (place, length) in enumerate(fragments) if _read_bytes(file, place, min(length, 6)).startswith(_STARTS)
     ]
     if len(firsts) != frames or firsts[0] != 0:
         raise RefusedInputError(
@@ -137,7 +137,7 @@ def find_end(file: BinaryIO, start: int, file_bytes: int) -> int:
 
 
 def read_pieces(file: BinaryIO, pieces: Pieces) -> bytes:
-    return b"".join([_read(file, place, length) for place, length in pieces])
+    return b"".join([_read_bytes(file, place, length) for place, length in pieces])
 
 
 def _walk_items(file: BinaryIO, start: int, file_bytes: int, most: int) -> tuple[tuple[int, int], Pieces, int]:
@@ -146,7 +146,7 @@ def _walk_items(file: BinaryIO, start: int, file_bytes: int, most: int) -> tuple
     position = start
     file.seek(start)
     while position + 8 <= file_bytes:
-        group, element, length = struct.unpack("<HHL", _read(file, position, 8))
+        group, element, length = struct.unpack("<HHL", _read_bytes(file, position, 8))
         position += 8
         if (group, element) == _END:
             return (items[0] if items else (position, 0)), items[1:], position
@@ -170,14 +170,14 @@ def _firsts_by_table(file: BinaryIO, table: tuple[int, int], fragments: Pieces, 
     position, length = table
     if length != 4 * frames:
         return []
-    offsets = struct.unpack(f"<{frames}L", _read(file, position, length))
+    offsets = struct.unpack(f"<{frames}L", _read_bytes(file, position, length))
     number = {fragment[0] - fragments[0][0]: n for n, fragment in enumerate(fragments)}
     firsts = [number.get(offset, -1) for offset in offsets]
     rising = all(a < b for a, b in zip(firsts, firsts[1:], strict=False))
     return firsts if rising and firsts[0] == 0 else []
 
 
-def _read(file: BinaryIO, position: int, count: int) -> bytes:
+def _read_bytes(file: BinaryIO, position: int, count: int) -> bytes:
     if file.tell() != position:
         file.seek(position)
     data = file.read(count)

@@ -236,10 +236,10 @@ class StoredPixels(Closing):
     def _decode(self, header: SliceHeader, stored: NDArray[Any]) -> NDArray[Any]:
         with open_regular(header.file) as file:
 
-            def find() -> list[Pieces]:
+            def find_pieces() -> list[Pieces]:
                 return find_frames(file, header.pixel_offset, header.file_bytes, header.frames, header.transfer_syntax)
 
-            pieces = self._know(self._frames, header, find)[header.frame]
+            pieces = self._know(self._frames, header, find_pieces)[header.frame]
             _check_compressed_bytes(sum(length for _, length in pieces), header.pixel_bytes)
             data = read_pieces(file, pieces)
         frame = read_codestream(data, header.transfer_syntax, header.rows, header.columns, header.bits_allocated)

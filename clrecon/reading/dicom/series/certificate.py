@@ -302,7 +302,7 @@ def collect_series_warnings(series: Series) -> list[str]:
     headers = series.stack.slices
     warnings = [*_describe_what_was_left(series), *series.stack.warnings]
     for text in dict.fromkeys(chain(*(header.warnings for header in headers))):
-        warnings.append(f"{text} ({_place(series.stack, lambda h, text=text: text in h.warnings)})")  # type: ignore[misc]
+        warnings.append(f"{text} ({_place_slices(series.stack, lambda h, text=text: text in h.warnings)})")  # type: ignore[misc]
     checks: tuple[tuple[Callable[[SliceHeader], bool], str], ...] = (
         (lambda h: not h.has_slope, "no RescaleSlope: slope 1, intercept {intercept} taken: maybe not HU"),
         (
@@ -328,8 +328,8 @@ def collect_series_warnings(series: Series) -> list[str]:
         odd = next((header for header in headers if is_so(header)), None)
         if odd is not None:
             text = text.format(type=odd.rescale_type, intercept=f"{odd.intercept:g}", slope=f"{odd.slope:g}")
-            warnings.append(f"{text} ({_place(series.stack, is_so)})")
-    warnings += [f"{text} ({_place(series.stack, is_so)})" for text, is_so in describe_differences(headers)]
+            warnings.append(f"{text} ({_place_slices(series.stack, is_so)})")
+    warnings += [f"{text} ({_place_slices(series.stack, is_so)})" for text, is_so in describe_differences(headers)]
     warnings += _describe_long_voxels(series.stack)
     doubt = series.find_doubt()
     if doubt and not any(doubt in text for text in warnings):
@@ -382,7 +382,7 @@ def _facts_of_phase(series: Series) -> dict[str, Any] | None:
     return {"number": chosen.number, "of": len(series.places.phases), "keyword": chosen.keyword, "value": chosen.value}
 
 
-def _place(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:
+def _place_slices(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:
     """Describe slices by count and position along the normal; their file names may contain the patient's name."""
     positions = [place for header, place in zip(stack.slices, stack.distances_mm, strict=True) if is_so(header)]
     if len(positions) == len(stack.slices):

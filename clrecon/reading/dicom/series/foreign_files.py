@@ -179,11 +179,11 @@ def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int 
     for folder, known in folders.items():
         known.finish()
         paths.update(f"{_pattern(os.path.basename(folder))}/{pattern}" for pattern in known.patterns)
-    judged = ((Path(stranger.file), _judge(stranger, folders, paths)) for stranger in strangers)
+    judged = ((Path(stranger.file), _judge_stranger(stranger, folders, paths)) for stranger in strangers)
     return [(path, reason) for path, reason in judged if reason]
 
 
-def _judge(stranger: Stranger, folders: dict[str, _Slices], paths: set[str]) -> str:
+def _judge_stranger(stranger: Stranger, folders: dict[str, _Slices], paths: set[str]) -> str:
     folder, _, name = stranger.file.rpartition(os.sep)
     if stranger.what in (_DAMAGED_MARK, DAMAGED_START):
         return stranger.what
@@ -198,13 +198,13 @@ def _judge(stranger: Stranger, folders: dict[str, _Slices], paths: set[str]) -> 
     else:
         alike = known.has_name_like(whole)
     if alike and (not added or stranger.what in (EMPTY, UNKNOWN, *_PACKED_SLICES) or stranger.what.startswith("blank")):
-        return f"named like slices, but {_say(stranger.what)}"
+        return f"named like slices, but {_say_kind(stranger.what)}"
     if known is None or name.startswith(".") or name.lower() in _OF_THE_SYSTEM:
         return ""
     if (stranger.what == UNKNOWN or stranger.what.startswith("blank")) and known.has_size_like(stranger.size):
-        return f"as large as the slices beside it, but {_say(stranger.what)}"
+        return f"as large as the slices beside it, but {_say_kind(stranger.what)}"
     return ""
 
 
-def _say(kind: str) -> str:
+def _say_kind(kind: str) -> str:
     return kind if kind in (EMPTY, UNKNOWN, TEXT) or kind.startswith("blank") else f"of the kind {kind}"

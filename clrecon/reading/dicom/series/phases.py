@@ -147,7 +147,7 @@ def part_alternating(places: Places, alternation: Alternation) -> Places:
         shown, keyword = [str(number) for number in range(1, len(members) + 1)], f"order of {alternation.name}"
     elif alternation.name in PHASE_KEYWORDS:
         keyword = alternation.name
-        shown = _show((keyword,), [values_of(headers[0], (keyword,)) for headers in members])
+        shown = _show_values((keyword,), [values_of(headers[0], (keyword,)) for headers in members])
     else:  # free text may contain anything
         shown = ["(none)" if number == alternation.absent else f"value {number + 1}" for number in range(len(members))]
         keyword = alternation.name
@@ -223,7 +223,7 @@ def _part(choice: tuple[tuple[str, ...], Mapping[tuple[str, ...], Sequence[Slice
         return ()
     keywords, groups = choice
     ordered = sorted(groups, key=_order)
-    shown = _show(keywords, ordered)
+    shown = _show_values(keywords, ordered)
     return tuple(
         Phase(number, " and ".join(keywords), text, tuple(groups[value]))
         for number, (value, text) in enumerate(zip(ordered, shown, strict=True), start=1)
@@ -288,7 +288,7 @@ def _order(value: tuple[str, ...]) -> list[tuple[int, float, str]]:
     return [(0, number, "") if (number := read_number(part)) is not None else (1, 0.0, part) for part in value]
 
 
-def _show(keywords: Sequence[str], values: Sequence[tuple[str, ...]]) -> list[str]:
+def _show_values(keywords: Sequence[str], values: Sequence[tuple[str, ...]]) -> list[str]:
     """Return values for a listing; dates and times, which may identify the patient, only since the first one."""
     columns = []
     for index, keyword in enumerate(keywords):
