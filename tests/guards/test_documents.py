@@ -11,7 +11,7 @@ from command_lines import parse_command
 from house import ROOT
 
 DOCUMENTS = [
-    *("README.md", "CONTRIBUTING.md", "CHANGELOG.md"),
+    *("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md"),
     *(path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs").rglob("*.md"))),
 ]
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
@@ -52,6 +52,23 @@ def test_a_phrase_that_readers_stumble_over_is_found() -> None:
 def test_every_named_file_is_there(name: str) -> None:
     path = ROOT / name
     assert find_missing_files(path.read_text(encoding="utf-8"), path.parent) == []
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / ".github").rglob("*.yml")), ids=lambda path: path.stem)
+def test_what_a_form_or_workflow_asks_for_is_there(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    for arguments in re.findall(r"`clrecon ([^`]+)`", text):
+        parse_command(shlex.split(arguments))
+    programs = re.findall(r"(?:python3? |run: )(\S*(?:scripts/\w+\.py|\.ci/run))", text)
+    assert [name for name in programs if not (ROOT / name).is_file()] == []
+
+
+def test_the_workflow_runs_every_check_and_the_oldest_and_newest_python() -> None:
+    text = (ROOT / ".github/workflows/tests.yml").read_text(encoding="utf-8")
+    setup = (ROOT / "setup.cfg").read_text(encoding="utf-8")
+    oldest = re.search(r"python_requires = >= ([\d.]+)", setup)
+    assert "- run: .ci/run" in text and "scripts/test.py --fast" in text
+    assert oldest is not None and f'python: ["{oldest[1]}", "3.14"]' in text
 
 
 def test_a_missing_file_is_found() -> None:
