@@ -11,8 +11,6 @@ from unittest import mock
 import numpy as np
 import pytest
 import tolerances
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from refusals import refused
 from scipy.ndimage import gaussian_filter
 
@@ -136,8 +134,8 @@ def test_faint_bone_is_counted() -> None:
 
 # --- what must not move it ---
 @pytest.mark.release
-@settings(max_examples=15, deadline=None)
-@given(shift=st.integers(-40, 60), scale=st.floats(0.8, 1.25))
+@pytest.mark.parametrize("shift", [-40, -13, 0, 27, 60])
+@pytest.mark.parametrize("scale", [0.8, 1.0, 1.25])
 def test_shift_and_scale_carry_over(shift: int, scale: float) -> None:
     field = make_ball(1040.0, 40.0, 0.8, 20.0)
     expected = choose_iso_value(as_volume(field)).iso_value * scale + shift
