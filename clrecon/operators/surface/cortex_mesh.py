@@ -50,6 +50,13 @@ _THINNEST_BLURS, EDGE_SHARE = 0.2, 0.6
 """A wall thinner than so many blurs, before something of less than this share of the cortex' HU, is an edge without a
 wall: a vessel, an organ, marrow.  Of true walls 1 to 3 % are as thin."""
 
+_ACROSS, _HIDDEN_BLURS = 1.25, 0.3
+"""Where a profile is blurred by more than so often what slices are within themselves, a wall thinner than so many of
+these blurs is badly fitted: thick slices hide where within them it lies."""
+
+_RINGS, _CORNERS = 3, 12.0
+"""Rounds in which hidden walls ask their neighbours, and about how many corners of them there are."""
+
 _MOST_RESIDUAL = 3.0
 """Residual, in what noise and model explain, from which on a profile is not that of a wall."""
 
@@ -69,6 +76,7 @@ class CortexFit:
 
     own_cortex_hu: HU of the cortex of components that have constants of their own.
     states: uint8. Places in `_STATES`; all values below are those of the fit, whatever the state.
+    hidden: bool. Badly fitted because thick slices hide the wall.
     shift_mm: From the vertex along its normal, outwards positive.
     thickness_mm: Of the wall; at most the length of a profile, which stands for solid bone.
     error_mm, thickness_error_mm: Standard errors.
@@ -78,6 +86,7 @@ class CortexFit:
     constants: CortexConstants
     own_cortex_hu: tuple[float, ...]
     states: NDArray[np.uint8]
+    hidden: NDArray[np.bool_]
     shift_mm: Float32Array
     thickness_mm: Float32Array
     error_mm: Float32Array
@@ -112,20 +121,28 @@ def fit_walls(
     if components is not None:
         groups = find_groups(sampler, resident.volume, points, normals, components, constants)
     levels = tuple(known.cortex_hu for _, known in groups[1:])
-    fit = CortexFit(constants, levels, np.empty(count, np.uint8), *(np.empty(count, np.float32) for _ in range(5)))
+    marks = np.empty(count, np.uint8), np.empty(count, bool)
+    fit = CortexFit(constants, levels, *marks, *(np.empty(count, np.float32) for _ in range(5)))
+    steep = np.square(normals @ sampler.frame.normal)
     for members, known in groups:
         for piece, values_d in sampler.pieces(points[members], normals[members]):
             rows = members[piece]
             with stopwatch.running(resident.device):
                 walls = WallProfiles(sampler, values_d, len(rows)).fit_with(known)
-            fit.states[rows] = judge_walls(walls, known, sampler.scale)
+            within, across = known.blur_mm**2, known.blur_across_mm**2
+            blurs = np.sqrt(within + (across - within) * steep[rows])
+            hidden = (blurs > _ACROSS * known.blur_mm) & (walls.thickness_mm < _HIDDEN_BLURS * blurs)
+            fit.states[rows] = judge_walls(walls, known, sampler.scale, hidden)
+            fit.hidden[rows] = hidden & (fit.states[rows] == _BADLY_FITTED)
             fit.shift_mm[rows], fit.thickness_mm[rows] = walls.shift_mm, walls.thickness_mm
             fit.room_mm[rows] = walls.room_mm
             fit.error_mm[rows], fit.thickness_error_mm[rows] = standard_errors(walls, known, sampler.scale)
     return fit
 
 
-def judge_walls(walls: WallFits, constants: CortexConstants, scale: ProfileScale) -> NDArray[np.uint8]:
+def judge_walls(
+    walls: WallFits, constants: CortexConstants, scale: ProfileScale, hidden: NDArray[np.bool_]
+) -> NDArray[np.uint8]:
     """Return the state of each place."""
     states = np.zeros(len(walls.shift_mm), np.uint8)
     cortex, explained = constants.cortex_hu, unexplained_hu(constants.cortex_hu, constants.known_noise)
@@ -133,6 +150,7 @@ def judge_walls(walls: WallFits, constants: CortexConstants, scale: ProfileScale
     states[walls.residual_hu > _MOST_RESIDUAL * explained] = _BADLY_FITTED
     states[np.abs(walls.shift_mm) > MOST_SHIFT_MM] = _BADLY_FITTED
     states[thin & (walls.inner_hu < EDGE_SHARE * cortex)] = NOT_BONE
+    states[hidden] = _BADLY_FITTED
     states[walls.peak_hu >= METAL_HU] = METAL
     states[~(walls.room_mm > (LEAST_ROOM - 0.5) * scale.step_mm) | np.isnan(walls.peak_hu)] = NO_ROOM
     return states
@@ -202,15 +220,20 @@ class CortexReport(Record):
 def choose_shifts(fit: CortexFit, triangles: NDArray[np.uint32], fans: Fans) -> NDArray[np.float32]:
     """Return the shift of each vertex, mm: that of the fit; 0 where there is no wall.
 
-    What is badly fitted lies where its neighbours say, with the weights 1 / error^2.  Others are not smoothed: shifts
-    undo the waves of the level's surface, and means of them keep these (0.15 mm became 0.17 at a noise of 50 HU).
+    What is badly fitted lies where its neighbours say, with the weights 1 / error^2; hidden walls ask neighbours
+    that did so, too.  Others are not smoothed: shifts undo the waves of the level's surface, and means keep these (0.15
+    mm became 0.17 at a noise of 50 HU).
     """
     fitted, doubtful = fit.states == FITTED, np.flatnonzero(fit.states == _BADLY_FITTED)
     shifts = np.where(fitted, fit.shift_mm, 0.0).astype(np.float32)
     weights = np.where(fitted, 1.0 / np.square(np.maximum(fit.error_mm, 1e-3)), 0.0)
-    weight, weighted = fans.sums(np.column_stack([weights, weights * shifts]), triangles, doubtful).T
-    known = weight > 0.0
-    shifts[doubtful[known]] = weighted[known] / weight[known]
+    for _ in range(_RINGS):
+        weight, weighted = fans.sums(np.column_stack([weights, weights * shifts]), triangles, doubtful).T
+        is_known = weight > 0.0
+        rows, weight = doubtful[is_known], weight[is_known]
+        shifts[rows] = weighted[is_known] / weight
+        weights[rows] = weight / _CORNERS
+        doubtful = doubtful[fit.hidden[doubtful]]
     return np.clip(shifts, -MOST_SHIFT_MM, MOST_SHIFT_MM)
 
 

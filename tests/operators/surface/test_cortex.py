@@ -13,9 +13,9 @@ from clrecon.geometry import Volume
 from clrecon.opencl import Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import cortex
-from clrecon.operators.surface.cortex import ProfileSampler
+from clrecon.operators.surface.cortex import CortexConstants, ProfileSampler
 from clrecon.operators.surface.cortex_constants import MOST_WALLS
-from clrecon.operators.surface.cortex_mesh import FITTED, METAL, NO_ROOM, NOT_BONE, fit_walls
+from clrecon.operators.surface.cortex_mesh import _STATES, FITTED, METAL, NO_ROOM, NOT_BONE, fit_walls
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.proof.checking import OBLIQUE, stack
 from clrecon.proof.surface.surface_checks import CORTEX_CHECKS
@@ -118,6 +118,16 @@ def test_what_is_no_wall_is_told(device):
     assert (fit.states[beside] == NOT_BONE).mean() > 0.95
     assert set(fit.states[near_metal].tolist()) == {METAL}
     assert sum(fit.counts().values()) == mesh.vertex_count
+
+
+def test_thick_slices_hide_thin_walls_across_them_alone(device):
+    volume = hollow_ball(thickness=1.0, spacing=(1.0, 1.0, 4.0))
+    constants = CortexConstants(0.7, 2.0, 1000.0, 0.02, 0.05, 50.0, 10.0, 20.0, 500, 100)
+    mesh, fit = fit_surface(volume, device, constants=constants)
+    assert fit.hidden.sum() > 20 and np.abs(mesh.normals[fit.hidden, 2]).min() > 0.2
+    assert set(fit.states[fit.hidden].tolist()) == {_STATES.index("badly fitted")}
+    same = fit_surface(volume, device, constants=constants.changed(blur_across_mm=0.8))[1]
+    assert not same.hidden.any()
 
 
 def test_thin_walls_alone_do_not_show_their_density(device):

@@ -19,7 +19,7 @@ from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.intersections import find_self_intersections
 from clrecon.opencl.launching import launch
 from clrecon.operators.surface import cortex, decimation
-from clrecon.operators.surface.cortex_mesh import calm_vertices, find_turned
+from clrecon.operators.surface.cortex_mesh import CortexFit, calm_vertices, choose_shifts, find_turned
 from clrecon.operators.surface.extract import extract_isosurface
 
 MIDDLE = np.array([19.5, 19.0, 18.0])
@@ -84,6 +84,20 @@ def test_triangles_that_would_turn_over_are_calmed(level):
     assert not find_turned(level.vertices, calm, level.triangles).any()
     same = calm_vertices(level.vertices, level.vertices, level.triangles, fans)
     assert np.array_equal(same, level.vertices)
+
+
+def test_walls_that_thick_slices_hide_follow_their_neighbours():
+    """A sheet of 9 x 9 vertices, three columns of them fitted: three more if they are hidden, else one."""
+    rows, columns = np.indices((9, 9))
+    corner = (9 * rows + columns)[:8, :8].ravel()
+    triangles = np.concatenate([corner[:, None] + [0, 1, 10], corner[:, None] + [0, 10, 9]]).astype(np.uint32)
+    states = np.where(columns < 3, 0, 3).astype(np.uint8).ravel()
+    shift, error = np.where(states == 0, -0.5, 9.0).astype(np.float32), np.full(81, 0.1, np.float32)
+    hidden = (states == 3) & (rows < 5).ravel()
+    fit = CortexFit(None, (), states, hidden, shift, error, error, error, error)
+    shifts = choose_shifts(fit, triangles, Fans(triangles, 81)).reshape(9, 9)
+    np.testing.assert_allclose(shifts[:4], np.where(columns < 6, -0.5, 0.0)[:4], rtol=1e-6)
+    np.testing.assert_allclose(shifts[6:], np.where(columns < 4, -0.5, 0.0)[6:], rtol=1e-6)
 
 
 def test_sums_over_triangles_are_twice_those_over_neighbours(level):
