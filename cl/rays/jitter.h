@@ -1,7 +1,7 @@
 /* Jitter: the place of a pixel's samples in their segments, for rays whose samples must not line up.
  *
  * The mixer is lowbias32 (C. Wellons 2018, "Prospecting for hash functions"), applied to y, then to x with the result;
- * clrecon/proof/rays/rays.py gives the same bits. */
+ * clrecon/proof/rays/render.py gives the same bits. */
 #ifndef CLRECON_JITTER_H
 #define CLRECON_JITTER_H
 

@@ -135,10 +135,6 @@ _BAR_WIDTH, _LEAST_BAR = 24, 6
 _REDRAW_SECONDS = 0.1
 
 
-def describe_stage(stage: str) -> str:
-    return _STAGES.get(stage, stage)
-
-
 def printable(text: object) -> str:
     """Return `text` on one line, with control and direction characters as escapes: files can hold terminal codes."""
     return "".join(
@@ -214,7 +210,7 @@ class Console:
         """Show the progress of a job, see `clrecon.system.progress`."""
         if self.verbose and stage != self._stage:
             elapsed = time.perf_counter() - self._start
-            self._to_stderr(f"clrecon: {elapsed:6.2f} s  {describe_stage(stage)}")
+            self._to_stderr(f"clrecon: {elapsed:6.2f} s  {_STAGES.get(stage, stage)}")
         elif self._moving:
             now = time.perf_counter()
             if stage != self._stage or done == total or now - self._last_draw >= _REDRAW_SECONDS:

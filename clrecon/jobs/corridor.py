@@ -157,7 +157,11 @@ def make_corridors(
         corridors = []
         for done, number in enumerate(numbers):
             run.progress("corridors", done, len(numbers))
-            _check_inside(placed.inside[number], names[number])
+            if placed.inside[number] < 1.0:
+                raise RefusedInputError(
+                    f"{names[number]} is cut off: {100.0 * (1.0 - placed.inside[number]):.3g} % of its label lie"
+                    " outside of the scan; corridors need the whole vertebra"
+                )
             of_fit = partial(lay_on_lattice, fitted[number]) if fitted else None
             corridors.append(measure_corridors(volume, placed.voxels, number, level, names[number], of_fit))
         graded = _grade_screws(corridors, labels, numbers, settings.screws)
@@ -252,14 +256,6 @@ def lay_on_lattice(mesh: Mesh, lattice: Lattice) -> FittedLattice:
         shares.append(np.moveaxis(share, 2, axis))
         placed.append(np.moveaxis(is_known, 2, axis))
     return FittedLattice(solid, shares, placed)
-
-
-def _check_inside(share: float, name: str) -> None:
-    if share < 1.0:
-        raise RefusedInputError(
-            f"{name} is cut off: {100.0 * (1.0 - share):.3g} % of its label lie outside of the scan; corridors need the"
-            " whole vertebra"
-        )
 
 
 def _grade_screws(

@@ -19,7 +19,6 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -279,9 +278,5 @@ def store_binary(key: str, binary: bytes) -> None:
         except OSError:
             os.unlink(name)
             raise
-        _prune(sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime))
-
-
-def _prune(files: Sequence[Path]) -> None:
-    for path in files[:-_MOST_FILES]:
-        path.unlink(missing_ok=True)
+        for path in sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)[:-_MOST_FILES]:
+            path.unlink(missing_ok=True)

@@ -12,8 +12,8 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 93_038,
-    "modules": 406,
+    "lines": 92_965,
+    "modules": 402,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
     "options_in_several_files": 8,
@@ -24,11 +24,11 @@ CEILINGS = {
 HABITS = {
     "functions_with_pronouns": 29,
     "functions_without_object": 46,
-    "assignments_of_three": 217,
+    "assignments_of_three": 216,
     "nested_conditionals": 0,
     "comprehensions_of_two_loops": 23,
     "positional_flags": 0,
-    "functions_of_many_parameters": 45,
+    "functions_of_many_parameters": 38,
     "equal_functions": 1,
     "constants_of_one_file": 0,
     "kernels_with_branches": 18,

@@ -18,8 +18,7 @@ from clrecon.jobs.mesh.purposes import settings_for
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings, check_growing
 from clrecon.jobs.mesh.surfaces import Surface, check_known_values, choose_level
 from clrecon.jobs.options import parse_bytes, parse_hu, parse_preprocess
-from clrecon.jobs.render.job import PictureFiles, check_pictures, make_pictures
-from clrecon.jobs.render.report import find_emptiness
+from clrecon.jobs.render.job import PictureFiles, check_pictures, find_emptiness, make_pictures
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.vertebrae import picture_beside
 from clrecon.jobs.view import inputs

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clrecon.mesh import triangle_tree
-from clrecon.mesh.compare.near_distances import triangle_distances
+from clrecon.mesh.compare.distances import triangle_distances
 from clrecon.mesh.triangle_tree import TriangleTree
 
 RANDOM = np.random.default_rng(5)

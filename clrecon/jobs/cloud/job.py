@@ -56,10 +56,7 @@ def make_cloud(source: str | Path, files: CloudFiles, settings: CloudSettings | 
         surface = None if files.surface is None else _reconstruct_surface(steps, settings, device.current, run.progress)
         run.lap("surface")
         outputs, losses = _write_files(run, steps, surface, files)
-        report = report_of(
-            run, subject, steps, device.current, surface=surface, has_removed=files.removed is not None,
-            outputs=outputs, losses=losses,
-        )  # fmt: skip
+        report = report_of(run, subject, steps, device.current, surface=surface, outputs=outputs, losses=losses)
         run.finish(report, files.report)
     log.info("%d points of %d on %s in %.3f s", report.points, report.points_first, report.device, run.total())
     return report
@@ -225,7 +222,6 @@ def report_of(
     device: Device,
     *,
     surface: Mesh | None,
-    has_removed: bool,
     outputs: list[dict[str, Any]],
     losses: Sequence[str],
 ) -> CloudReport:
@@ -262,7 +258,7 @@ def report_of(
         paper=settings.paper,
         steps=steps.entries,
         gates=[gate.as_dict() for gate in steps.gates],
-        removed_labels=name_reasons(steps.reasons) if has_removed else None,
+        removed_labels=name_reasons(steps.reasons) if any(file["what"] == "removed" for file in outputs) else None,
         surface=None if surface is None else _describe_surface(surface),
         outputs=outputs,
     )

@@ -33,8 +33,6 @@ from clrecon.system.pieces import find_bounds
 from clrecon.system.text import count_of
 
 if TYPE_CHECKING:
-    from clrecon.jobs.mesh.make import MadeParts
-    from clrecon.jobs.run import Run
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.system.files import StagedFile

@@ -16,6 +16,7 @@ from clrecon.rendering.pictures.styles import SPINE, CurveCut, SlicesInSpace, St
 from clrecon.rendering.views.clip import check_center
 from clrecon.rendering.views.directions import default_view, read_view, say_view
 from clrecon.system.base_classes import Closing
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
@@ -65,26 +66,33 @@ def read_look(look: LabelLook | None, volume: Volume | None = None, *, follow_li
     return labels
 
 
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What is read beside the input; None: `function` of the preset, `curve` of the style."""
+
+    function: TransferFunction | None = None
+    curve: Float64Array | None = None
+    labels: LabelMap | None = None
+    meshes: Sequence[Mesh] = ()
+
+
 class PictureTaker(Closing):
-    """Takes the pictures of settings, and frees the device; None: `function` of the preset, `curve` of the style."""
+    """Takes the pictures of settings, and frees the device."""
 
     def __init__(
         self,
         subject: Volume | PointCloud | Mesh,
         device: Device,
         settings: RenderSettings,
-        *,
-        function: TransferFunction | None = None,
-        curve: Float64Array | None = None,
-        labels: LabelMap | None = None,
-        meshes: Sequence[Mesh] = (),
         progress: Progress,
+        beside: Beside | None = None,
     ):
-        self.meshes = list(meshes)
+        beside = beside or Beside()
+        self.meshes = list(beside.meshes)
         self._subject, self.device, self._settings = subject, device, settings
-        self.labels, self._progress = labels, progress
-        self.style = settings.style_with(function, curve, labels)
-        self.function = _shown_function(settings, self.style) if function is None else function
+        self.labels, self._progress = beside.labels, progress
+        self.style = settings.style_with(beside.function, beside.curve, beside.labels)
+        self.function = beside.function or _shown_function(settings, self.style)
         self.warnings: list[str] = []
         self._stack = ExitStack()
         self._renderer: Any = None

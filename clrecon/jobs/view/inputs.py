@@ -90,16 +90,13 @@ def open_inputs(
             ready(by_position[position])
     opened = [by_position[place] for place in range(len(inputs))]
     if labels is not None:
-        opened.append(_open_labels(settings, next((each.subject for each in opened if _is_scan(each)), None)))
+        from clrecon.geometry import Volume
+
+        scans = (each.subject for each in opened if isinstance(each.subject, Volume))
+        opened.append(_open_labels(settings, next(scans, None)))
         if ready is not None:
             ready(opened[-1])
     return opened
-
-
-def _is_scan(opened: OpenedInput) -> bool:
-    from clrecon.geometry import Volume
-
-    return isinstance(opened.subject, Volume)
 
 
 def _tell_kind(path: str | Path) -> str:

@@ -8,8 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.mesh.compare.distances import SurfaceDistance
-from clrecon.mesh.compare.near_distances import NearDistance
+from clrecon.mesh.compare.distances import NearDistance, SurfaceDistance
 from clrecon.mesh.connectivity import Fans, find_edges, find_used
 from clrecon.mesh.refine.topology import any_corner
 from clrecon.mesh.triangles import corner_edges

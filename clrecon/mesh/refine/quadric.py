@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError
 from clrecon.exchange.coordinates import as_stored
-from clrecon.mesh.compare.distances import SAMPLES, SurfaceDistance, sample_surface
-from clrecon.mesh.compare.near_distances import NearDistance
+from clrecon.mesh.compare.distances import SAMPLES, NearDistance, SurfaceDistance, sample_surface
 from clrecon.mesh.connectivity import find_edges, find_used, label_components
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.refine.clusters import last_of_collapses

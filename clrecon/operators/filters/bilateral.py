@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -249,6 +249,14 @@ def run_bilateral(
     return result
 
 
+class _Groups(NamedTuple):
+    """Groups of voxels that are filtered: how many, those of a row, and the list of those near the level, if any."""
+
+    total: int
+    per_row: int
+    listed_d: Any
+
+
 class _Run:
     """One filtering, whatever the number of slices in a slab."""
 
@@ -345,7 +353,7 @@ class _Run:
                 )  # fmt: skip
             near = self.settings.near
             if near is None:
-                groups, per_row, groups_d = self.row_groups * there.core_rows, self.row_groups, None
+                groups = _Groups(self.row_groups * there.core_rows, self.row_groups, None)
             else:
                 size = there.core_count * self.resident.slice_bytes
                 offset = (there.core_first - there.first) * self.resident.slice_bytes
@@ -353,39 +361,31 @@ class _Run:
                 level = inside_level(self.dtype, near)
                 box = (self.box[0], self.box[1], self.box[2])
                 mixed_groups = list_mixed_groups(device, there, self.dtype, level, box)
-                groups, per_row, groups_d = mixed_groups.count, 32 * row_words(self.ni), mixed_groups.positions_d
-            self._launch(there, filtered_d, ends_d, groups, per_row, groups_d, sides)
-        return groups
+                groups = _Groups(mixed_groups.count, 32 * row_words(self.ni), mixed_groups.positions_d)
+            self._launch(there, filtered_d, ends_d, groups, sides)
+        return groups.total
 
-    def _launch(
-        self,
-        there: SlicesThere,
-        filtered_d: Any,
-        ends_d: Any,
-        groups: int,
-        per_row: int,
-        groups_d: Any,
-        sides: dict[str, int],
-    ) -> None:
+    def _launch(self, there: SlicesThere, filtered_d: Any, ends_d: Any, groups: _Groups, sides: dict[str, int]) -> None:
         """Filter all groups, or those of a list, in launches of about a second."""
         device, window = self.resident.device, self.window
         range_factor = math.sqrt(0.5 / math.log(2.0)) / self.settings.sigma_hu
         items = 1 if device.kernel_variants["LANES"] == "8" else GROUP
         slice_groups = self.row_groups * there.nj
         most = max(_TAPS_A_LAUNCH // (GROUP * window.taps * slice_groups), 1) * slice_groups
-        for first in range(0, groups, most):
-            count = min(most, groups - first)
+        for first in range(0, groups.total, most):
+            count = min(most, groups.total - first)
             launch(
                 device, self.program["filter_bilateral"], count * items,
                 voxels=there.voxels_d, ends=ends_d, tap_rows=self.tap_rows_d, spatial=self.spatial_d,
-                groups=self.tap_rows_d if groups_d is None else groups_d, filtered=filtered_d, range=range_factor,
-                is_listed=groups_d is not None, first_entry=first, group_count=first + count, row_groups=per_row,
-                ni=self.ni, nj=there.nj, nk=self.nk, first_k=there.first, core_k=there.core_first,
-                tap_steps=self.tap_steps_d, row_count=len(self.tap_rows), steps=window.taps, inner_j=self.inner_jk[0],
-                inner_k=self.inner_jk[1], table_taps=window.taps if len(window.exponents) > 1 else 0, **sides,
+                groups=self.tap_rows_d if groups.listed_d is None else groups.listed_d, filtered=filtered_d,
+                range=range_factor, is_listed=groups.listed_d is not None, first_entry=first,
+                group_count=first + count, row_groups=groups.per_row, ni=self.ni, nj=there.nj, nk=self.nk,
+                first_k=there.first, core_k=there.core_first, tap_steps=self.tap_steps_d,
+                row_count=len(self.tap_rows), steps=window.taps, inner_j=self.inner_jk[0], inner_k=self.inner_jk[1],
+                table_taps=window.taps if len(window.exponents) > 1 else 0, **sides,
             )  # fmt: skip
-            if groups_d is None:
+            if groups.listed_d is None:
                 wait(device)
                 self.progress("filter", there.core_first + (first + count) // slice_groups, self.nk)
-        if groups_d is not None:
+        if groups.listed_d is not None:
             self.progress("filter", there.core_first + there.core_count, self.nk)

@@ -132,11 +132,6 @@ def _split_tables(ball: Stencil, most: int | None) -> tuple[NDArray[np.int32], N
     return np.concatenate(parts), tables
 
 
-def table_bytes(ball: Stencil) -> int:
-    """Return about how many bytes the rows of a ball take on the device."""
-    return 2 * ball.rows.nbytes + ball.tables.nbytes
-
-
 def spread_bits(device: Device, mask: VoxelMask, ball: Stencil, *, erode: bool = False, beyond: bool = False) -> Any:
     """Return the words of a mask that is dilated or eroded, (nk, nj, words) uint32.
 
@@ -392,7 +387,8 @@ class MaskShapes(MaskBits):
         radius = checked_mm(mm, "the radius of the ball")
         ball = (whole_ball_of if whole else ball_of)(self.scan, radius, by_slice=by_slice)
         size, extents = mask_bytes(self.shape_ijk).values()
-        needs = {"2 masks of the voxels": 2 * size, "row extents": extents, "rows of the ball": table_bytes(ball)}
+        rows = 2 * ball.rows.nbytes + ball.tables.nbytes
+        needs = {"2 masks of the voxels": 2 * size, "row extents": extents, "rows of the ball": rows}
         check_budget(self.device, needs, self.memory)
         return spread_bits(self.device, self.bits, ball, erode=erode, beyond=beyond)
 

@@ -202,7 +202,7 @@ class _Request:
 
     def finish(
         self, cloud: PointCloud, labels: NDArray[np.int32], cores: NDArray[np.bool_], search: ClusterSearch,
-        stopwatch: Stopwatch, device: Device, notes: list[str],
+        stopwatch: Stopwatch, notes: list[str],
     ) -> Clustering:  # fmt: skip
         labelled = cloud.changed(labels=labels)
         figures = measure_clusters(labelled)
@@ -215,7 +215,7 @@ class _Request:
             "noise_points": int(np.count_nonzero(labels < 0)),
             "sheets": int(figures.sheets.sum()),
             "largest_clusters": figures.as_dicts(REPORTED),
-            "device": device.label,
+            "device": search.device.label,
             "kernel_seconds": dict(stopwatch.by_kernel),
         }
         removed = np.zeros(len(cloud), dtype=np.uint8)
@@ -243,7 +243,7 @@ def _cluster_band(
     if not len(labels):
         raise UsageError(f"no voxel lies from {band[0]:g} to {band[1]:g} HU: there is nothing to cluster")
     cloud = extract_points(resident, kind="voxels", hu=band)
-    return request.finish(cloud, labels, cores, search, stopwatch, device, notes)
+    return request.finish(cloud, labels, cores, search, stopwatch, notes)
 
 
 def _cluster_free(
@@ -321,7 +321,7 @@ def _cluster_cloud(
                 labels, cores = search.label(), search.flag_cores()
                 if order is not None:
                     labels, cores = _restore_order(search, labels, cores, order)
-            clusters = request.finish(cloud, labels, cores, search, stopwatch, current, notes)
+            clusters = request.finish(cloud, labels, cores, search, stopwatch, notes)
     return clusters
 
 

@@ -389,13 +389,6 @@ def _describe_band(band: Band) -> str:
     return f"{high:g} HU or less" if math.isinf(low) else f"{low:g} to {high:g} HU"
 
 
-def _refuse_band(volume: Volume, band: Band, region: str) -> NoSurfaceError:
-    low, high = data_range(volume)
-    return NoSurfaceError(
-        f"no voxel {region}of {_describe_band(band)}: the volume runs from {format_hu(low)} to {format_hu(high)} HU"
-    )
-
-
 def _voxels(
     resident: DeviceVolume, band: Band, shell: bool, labels: LabelMap | None, label: int | str | None, paper: bool,
     progress: Progress,
@@ -414,7 +407,11 @@ def _voxels(
                 which = "" if labels is None else "of a label "
                 if labels is not None and number:
                     which = f"of label {number} {labels.name(number)} "
-                raise _refuse_band(volume, band, which)
+                low, high = data_range(volume)
+                raise NoSurfaceError(
+                    f"no voxel {which}of {_describe_band(band)}: the volume runs from {format_hu(low)} to"
+                    f" {format_hu(high)} HU"
+                )
             points = positions if run.origin is None else positions + run.origin
             of_label = None if chosen.labels is None else chosen.labels.reshape(-1)[numbers].astype(np.int32)
             report = {

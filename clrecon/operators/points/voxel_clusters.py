@@ -75,7 +75,7 @@ class ClusterSearch:
         memory: int | None = None,
         parts_per_core: int = PARTS_PER_CORE,
     ):
-        self._device, self._mask = device, mask
+        self.device, self._mask = device, mask
         self._limits = memory_limits(device, memory)
         self._parts = parts_per_core
         self._samples = checked_min_samples(min_samples)
@@ -97,7 +97,7 @@ class ClusterSearch:
     @property
     def _is_cpu(self) -> bool:
         """True where a work-item is to do as much as a core can, not as little as a lane."""
-        return self._device.has_long_items
+        return self.device.has_long_items
 
     @property
     def _rows(self) -> dict[str, int]:
@@ -125,7 +125,7 @@ class ClusterSearch:
         mask = self._mask
         item_words = mask.words if self._is_cpu else 1
         planes = (self._samples - 1).bit_length()
-        cores_d = allocate(self._device, 4 * mask.words * mask.rows)
+        cores_d = allocate(self.device, 4 * mask.words * mask.rows)
         self._run(
             "find_cores", mask.rows * -(-mask.words // item_words), mask=mask.mask_d, row_extents=mask.row_extents_d,
             cores=cores_d, words=mask.words, item_words=item_words, planes=planes,
@@ -135,17 +135,17 @@ class ClusterSearch:
 
     def _count(self) -> None:
         """Count runs and points, row by row."""
-        counted = count_runs(self._device, self._mask, self._cores_d, lone=not self._stencil.joins_columns)
+        counted = count_runs(self.device, self._mask, self._cores_d, lone=not self._stencil.joins_columns)
         self._counted, self._row_counts_d = counted, counted.row_counts_d
         self.runs, self.points = counted.count, counted.voxels
         if self._is_one and self.points < self._samples:
             nothing = np.zeros(self._mask.rows * self._mask.words, np.uint32)
-            self._cores_d, self.runs = upload(self._device, nothing), 0
+            self._cores_d, self.runs = upload(self.device, nothing), 0
         self._needs |= {"runs of core voxels": 16 * self.runs, "labels": 4 * self.points}
         self._check_budget({})
 
     def _join(self) -> tuple[int, Any]:
-        device, runs = self._device, self.runs
+        device, runs = self.device, self.runs
         listed = list_runs(device, self._mask, self._cores_d, self._counted)
         self._runs_d = listed.runs_d
         if self._is_one:
@@ -158,30 +158,30 @@ class ClusterSearch:
 
     def label(self, numbers: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
         """Return the cluster of each point, or its `numbers` (runs,), order k, j, i, -1 for noise: (points,) int32."""
-        labels, labels_d = empty_output(self._device, (self.points,), np.int32)
+        labels, labels_d = empty_output(self.device, (self.points,), np.int32)
         if not self.runs:
             labels.fill(-1)
             return labels
-        numbers_d = self.numbers_d if numbers is None else upload(self._device, numbers)
+        numbers_d = self.numbers_d if numbers is None else upload(self.device, numbers)
         self._run(
             "label_points", self._mask.rows, mask=self._mask.mask_d, cores=self._cores_d,
             row_extents=self._mask.row_extents_d, runs=self._runs_d, row_counts=self._row_counts_d,
             numbers=numbers_d, labels=labels_d, words=self._mask.words,
             **self._full.arguments, **self._slices,
         )  # fmt: skip
-        return download(self._device, labels, labels_d)
+        return download(self.device, labels, labels_d)
 
     def run_numbers(self) -> NDArray[np.int32]:
         """Return the cluster of each run, shape (runs,), int32."""
-        return download(self._device, np.empty(self.runs, np.int32), self.numbers_d)
+        return download(self.device, np.empty(self.runs, np.int32), self.numbers_d)
 
     def flag_cores(self) -> NDArray[np.bool_]:
         """Return whether each point is a core point, in the order k, j, i, shape (points,), bool."""
-        flags, flags_d = empty_output(self._device, (self.points,), np.uint8)
+        flags, flags_d = empty_output(self.device, (self.points,), np.uint8)
         if self.points:
             self._run(
                 "flag_cores", self._mask.rows, mask=self._mask.mask_d, cores=self._cores_d,
                 row_extents=self._mask.row_extents_d, row_counts=self._row_counts_d, flags=flags_d, **self._rows,
             )  # fmt: skip
-            download(self._device, flags, flags_d)
+            download(self.device, flags, flags_d)
         return flags.view(np.bool_)

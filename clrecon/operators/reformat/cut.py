@@ -135,7 +135,7 @@ def take_cut(
     progress: Progress = ignore_progress,
 ) -> Rendering:
     """Cut the slice of a camera, as `cut_slice` does, with the labels of the style."""
-    job = CutJob(resident, style, progress)
+    job = CutJob(resident, style, progress, background)
     sheet, camera = plane_sheet(plane, size, style.offset_mm)
     reformation = job.sample(sheet)
     if np.isnan(reformation.values).all():
@@ -143,7 +143,7 @@ def take_cut(
     image, numbers = job.draw(reformation.values, sheet)
     depth = np.where(np.isnan(reformation.values), np.float32(np.nan), np.float32(camera.distance))
     report = job.describe(reformation, camera.pixel_mm(size)) | _describe_plane(camera)
-    return job.finish(image, reformation.values, depth, camera, numbers, report, background)
+    return job.finish(image, reformation.values, depth, camera, numbers, report)
 
 
 def _describe_plane(camera: Camera) -> dict[str, Any]:
@@ -251,7 +251,7 @@ def take_curve(
     progress: Progress = ignore_progress,
 ) -> Rendering:
     """Make the picture along the curve of a style, as `reformat_curve` does, with its labels."""
-    job = CutJob(resident, style, progress)
+    job = CutJob(resident, style, progress, background)
     line, spine = _find_line(resident.volume, style.curve, progress)
     across, top = _find_directions(view, up)
     turned = bool((line.points[-1] - line.points[0]) @ top > 0.0)
@@ -264,7 +264,7 @@ def take_curve(
     edges = sheet_letters(curved.sheet, ~np.isnan(curved.arc))
     report = job.describe(reformation, pixel) | {"curve": curve_facts, "edges": edges}
     report["warnings"] += _warn_of_part(spine)
-    return job.finish(image, reformation.values, None, None, numbers, report, background)
+    return job.finish(image, reformation.values, None, None, numbers, report)
 
 
 def _lay_sheet(
@@ -398,7 +398,7 @@ def take_contact_sheet(
         ``report["tiles"]`` has ``middle_lps_mm``, ``slice`` (number of its plane of voxels, or None), ``left`` and
         ``top`` (pixels) of each.
     """
-    job = CutJob(resident, style, ignore_progress)
+    job = CutJob(resident, style, ignore_progress, background)
     _, plane = plane_sheet(plane, size)
     if style.slices is not None:
         plane = _turn_to_slices(resident.volume, plane, job.warnings)
@@ -442,7 +442,7 @@ def take_contact_sheet(
     progress("render", len(places), len(places))
     assert reformation is not None
     report = job.describe(reformation, layout.pixel_mm) | {"edges": edges, "tiles": tiles, "tile_size": [width, height]}
-    return job.finish(image, values, None, None, numbers, report, background)
+    return job.finish(image, values, None, None, numbers, report)
 
 
 def _turn_to_slices(volume: Volume, plane: Camera, warnings: list[str]) -> Camera:

@@ -230,8 +230,10 @@ def sample_sheet(
 class CutJob:
     """One picture of sheets through a volume: the device, how samples are combined, labels, and the report."""
 
-    def __init__(self, resident: DeviceVolume, style: PlaneCut | CurveCut, progress: Progress):
-        self.resident, self.style, self.progress = resident, style, progress
+    def __init__(
+        self, resident: DeviceVolume, style: PlaneCut | CurveCut, progress: Progress, background: str | Sequence[float]
+    ):
+        self.resident, self.style, self.progress, self.background = resident, style, progress, background
         self.samples = slab_samples(resident.volume, style.thickness)
         self.window = BONE_WINDOW if style.window is None else checked_window(style.window)
         self.stopwatch = Stopwatch()
@@ -264,14 +266,13 @@ class CutJob:
         camera: Camera | None,
         numbers: NDArray[Any] | None,
         report: dict[str, Any],
-        background: str | Sequence[float],
     ) -> Rendering:
         if depth is None:
             depth = np.full(values.shape, np.nan, np.float32)
         if numbers is not None and self.look is not None:
             report["labels"] = facts_of_overlay(numbers, self.look)
         seen = Rendering(image, depth, depth.copy(), camera, values, mode=self.style.mode, report=report)
-        return seen if is_transparent(background) else seen.with_background(background)
+        return seen if is_transparent(self.background) else seen.with_background(self.background)
 
     def describe(self, reformation: Reformation, pixel_mm: float) -> dict[str, Any]:
         return {

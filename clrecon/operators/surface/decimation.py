@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare.near_distances import rounding_of_bounds
+from clrecon.mesh.compare.distances import rounding_of_bounds
 from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.intersections import find_boxes, find_self_intersections
 from clrecon.mesh.refine import decimation

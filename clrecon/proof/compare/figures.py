@@ -133,10 +133,11 @@ def draw_plane(
     low, high = box[0, axes] - MARGIN_MM / steps, box[1, axes] + MARGIN_MM / steps
     shape = np.array([grey.shape[1], grey.shape[0]])
     low, high = np.maximum(low, -0.5), np.minimum(high, shape - 0.5)
-    whole = _draw_slice(grey, plane, steps, low, high, "whole", contours, colors)
+    drawn = [(segments, colors[name]) for name, segments in contours.items()]
+    whole = _draw_slice(grey, plane, steps, low, high, "whole", drawn)
     middle = _find_detail(contours.get(reference, np.empty((0, 2, 2))), steps, 0.5 * (low + high))
     half = 0.5 * _DETAIL_MM / steps
-    detail = _draw_slice(grey, plane, steps, middle - half, middle + half, "detail", contours, colors)
+    detail = _draw_slice(grey, plane, steps, middle - half, middle + half, "detail", drawn)
     return whole, detail
 
 
@@ -158,9 +159,9 @@ def _draw_slice(
     low: NDArray[np.float64],
     high: NDArray[np.float64],
     which: str,
-    contours: Mapping[str, Segments],
-    colors: Mapping[str, str],
+    contours: Sequence[tuple[Segments, str]],
 ) -> Any:
+    """Draw a part of a plane with contours, each in its colour."""
     from clrecon.rendering.pictures.pillow import load_pillow
 
     load_pillow()
@@ -177,12 +178,12 @@ def _draw_slice(
     ).convert("RGB")  # fmt: skip
     canvas = ImageDraw.Draw(part)
     lines = np.linspace(_WIDEST[which], THINNEST[which], max(len(contours), 2))
-    for (name, segments), line in zip(contours.items(), lines.tolist(), strict=False):
+    for (segments, color), line in zip(contours, lines.tolist(), strict=False):
         thick = max(1, round(_OVERSAMPLING * line))
         ends = (segments - low) * steps * scale
         seen = ((ends > -50) & (ends < [width + 50, height + 50])).all(axis=(1, 2))
         for (x, y), (to_x, to_y) in ends[seen].tolist():
-            canvas.line((x, y, to_x, to_y), fill=colors[name], width=thick)
+            canvas.line((x, y, to_x, to_y), fill=color, width=thick)
     if plane.flip:
         part = part.transpose(Image.Transpose.FLIP_TOP_BOTTOM)
     return part.resize((width // _OVERSAMPLING or 1, height // _OVERSAMPLING or 1), Image.Resampling.LANCZOS)

@@ -8,7 +8,7 @@ import contextlib
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -73,9 +73,6 @@ class MadeFolder(StagedFolder):
     def write(self, name: str, text: str) -> None:
         with system_errors(self._shown), open(self.path / name, "x", encoding="utf-8", newline="\n") as stream:
             stream.write(text)
-
-    def write_report(self, report: Mapping[str, Any]) -> None:
-        self.write(REPORT, to_json(report) + "\n")
 
     def commit(self) -> None:
         """Bring all files to the disk, and the folder to its place."""
@@ -153,7 +150,7 @@ def make_comparison(
             with system_errors(output):
                 draw_figures(figures, staged.path)
                 staged.write("index.html", make_page(report, figures))
-            staged.write_report(report)
+            staged.write(REPORT, to_json(report) + "\n")
             staged.commit()
     log_warnings(log, report.warnings, volume.report.get("warnings", ()))
     log.info("%d methods compared on %s in %.3f s", len(records), report.device, watch.total())

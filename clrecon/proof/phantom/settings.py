@@ -427,7 +427,9 @@ class PhantomSettings:
 
     def _check_series(self) -> None:
         missing = tuple(self.missing)
-        object.__setattr__(self, "missing", tuple(sorted(missing, key=int)) if _are_integers(missing) else missing)
+        if all(isinstance(number, (int, np.integer)) for number in missing):
+            missing = tuple(sorted(missing, key=int))
+        object.__setattr__(self, "missing", missing)
         for number in missing:
             _check_integer("the number of a missing slice", number, 2, self.slices - 1)
         if len(set(missing)) < len(missing):
@@ -487,10 +489,6 @@ class PhantomSettings:
             if plain[name] == default:
                 del plain[name]
         return plain
-
-
-def _are_integers(values: tuple[Any, ...]) -> bool:
-    return all(isinstance(value, (int, np.integer)) for value in values)
 
 
 def _check_integer(name: str, value: Any, low: int, high: int) -> None:

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import choose_iso_rule, slice_normal_matrices
-from clrecon.proof.rays.rays import Planes, box_of, find_interval, sample_field, voxel_gradients
-from clrecon.proof.rays.render import RayPicture, shade
+from clrecon.proof.rays.render import Planes, RayPicture, box_of, find_interval, sample_field, shade, voxel_gradients
 from clrecon.rendering import Lighting
 from clrecon.rendering.pictures.styles import SlicesInSpace
 from clrecon.rendering.views.camera import Camera

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.mesh.compare.near_distances import NearDistance, triangle_distances
+from clrecon.mesh.compare.distances import NearDistance, triangle_distances
 from clrecon.mesh.refine.deviation import MIDDLES, SurfaceBounds
 from clrecon.mesh.refine.smoothing import Filter, Rings, sinc_terms
 from clrecon.opencl import Device

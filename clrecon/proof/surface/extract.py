@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,7 +200,7 @@ def extract_inside(
         slopes = gradients(around, rule.closed)
         slope[half_way], next_slope[half_way] = slopes[edges.near][half_way], slopes[edges.far][half_way]
     slope[above], next_slope[above] = -slope[above], -next_slope[above]  # gradients point inwards from here on
-    return build_surface(volume, rule, inside, edges, t, slope, next_slope, cells)
+    return build_surface(volume, rule, inside, edges, EdgePlaces(t, slope, next_slope), cells)
 
 
 @dataclass(frozen=True)
@@ -215,6 +216,19 @@ class CrossedEdges:
     near: tuple[NDArray[np.int64], ...]
     far: tuple[NDArray[np.int64], ...]
     axis: NDArray[np.int64]
+
+
+class EdgePlaces(NamedTuple):
+    """Where vertices lie on their edges.
+
+    t: ndarray, shape (n,). Part of the edge, from the near end.
+    slope, next_slope: ndarray, shape (n, 3). Parts of the two ends in the gradient at the vertex, per step along i, j,
+        k; where their sum vanishes, the direction of the edge is used.
+    """
+
+    t: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    next_slope: NDArray[np.float64]
 
 
 def find_crossed_edges(inside: NDArray[np.bool_]) -> CrossedEdges:
@@ -239,20 +253,16 @@ def build_surface(
     rule: IsoRule,
     inside: NDArray[np.bool_],
     edges: CrossedEdges,
-    t: NDArray[np.float64],
-    slope: NDArray[np.float64],
-    next_slope: NDArray[np.float64],
+    places: EdgePlaces,
     cells_wanted: NDArray[np.bool_] | None = None,
 ) -> Surface:
-    """Place the vertices at the parts `t` of their edges, from the near end, and write the triangles.
+    """Place the vertices on their edges, and write the triangles.
 
-    slope, next_slope: ndarray, shape (n, 3). Parts of the two ends in the gradient at the vertex, per step along i, j,
-        k; where their sum vanishes, the direction of the edge is used.
     cells_wanted: ndarray, shape (gk - 1, gj - 1, gi - 1), bool. Cells whose triangles are wanted, of the topology
         "separated"; vertices of no triangle are left out then.
     """
     (k, j, i), (k1, j1, i1), axis, numbers = edges.near, edges.far, edges.axis, edges.numbers
-    slope, next_slope = slope.copy(), next_slope.copy()
+    t, slope, next_slope = places.t, places.slope.copy(), places.next_slope.copy()
     field = sample_grid(volume, rule, rule.border)
     margins, layers = vertex_margin(volume, rule.border), layer_margins(volume, rule.border)
     step = np.eye(3, dtype=np.int64)[axis]

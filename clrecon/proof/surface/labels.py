@@ -15,6 +15,7 @@ from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.labels.label_levels import FULL, KEEP, REACH, Growth, fill_solid, find_boxes, level_biases, next_level
 from clrecon.proof.surface.extract import (
     CrossedEdges,
+    EdgePlaces,
     Surface,
     build_surface,
     edge_margins,
@@ -156,7 +157,7 @@ def extract_label_mask(
     slope, next_slope = (np.where(takes, slopes[1][e], slopes[0][e]) for e in (edges.near, edges.far))
     slope, next_slope = (1.0 - t[:, None]) * slope, t[:, None] * next_slope
     slope[leads_out] = next_slope[leads_out] = 0.0
-    return build_surface(volume, rule, inside, edges, t, slope, next_slope)
+    return build_surface(volume, rule, inside, edges, EdgePlaces(t, slope, next_slope))
 
 
 def _find_leads(

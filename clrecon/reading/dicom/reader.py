@@ -27,8 +27,15 @@ from clrecon.reading.dicom.series.certificate import (
     count_unknown,
 )
 from clrecon.reading.dicom.series.choice import choose_series, describe_left
-from clrecon.reading.dicom.series.foreign_files import advise_on, is_text
-from clrecon.reading.dicom.series.scan import BARE_DATA_SET, LINK_OUT, Scan, advise_on_links, scan_path
+from clrecon.reading.dicom.series.scan import (
+    BARE_DATA_SET,
+    LINK_OUT,
+    Scan,
+    advise_on,
+    advise_on_links,
+    is_text,
+    scan_path,
+)
 from clrecon.reading.dicom.series.series import Series, group_series
 from clrecon.reading.dicom.stack.fit import Stack, measure_extent, median_thickness
 from clrecon.system.arguments import name_parameter

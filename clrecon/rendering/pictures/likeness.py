@@ -81,9 +81,10 @@ def measure_pictures(
     )
     given, wanted = given[top:bottom, left:right], wanted[top:bottom, left:right]
     difference = given.astype(np.float64) - wanted
-    return PictureLikeness(
-        float(np.mean(difference * difference)), _structural_similarity(given, wanted), (top, left, bottom, right)
-    )
+    from skimage.metrics import structural_similarity
+
+    similarity = float(structural_similarity(given, wanted, win_size=WINDOW, data_range=RANGE, channel_axis=2))
+    return PictureLikeness(float(np.mean(difference * difference)), similarity, (top, left, bottom, right))
 
 
 def _as_picture(pixels: ArrayLike, background: Sequence[int] | int) -> NDArray[np.uint8]:
@@ -116,12 +117,6 @@ def _span(drawn: NDArray[np.bool_]) -> tuple[int, int]:
     first, end = int(places[0]), int(places[-1]) + 1
     first = max(min(first, end - WINDOW, len(drawn) - WINDOW), 0)
     return first, max(end, first + WINDOW)
-
-
-def _structural_similarity(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
-    from skimage.metrics import structural_similarity
-
-    return float(structural_similarity(first, second, win_size=WINDOW, data_range=RANGE, channel_axis=2))
 
 
 def make_control_pictures(picture: ArrayLike, next_picture: ArrayLike | None = None) -> Mapping[str, NDArray[Any]]:

@@ -35,7 +35,6 @@ from clrecon.viewer.session.session import REST_SECONDS, SCENE, SLICES, VIEWS
 if TYPE_CHECKING:
     from aiohttp import web
 
-    from clrecon.rendering import Rendering
     from clrecon.viewer.session.session import ViewSession
 
 

@@ -12,7 +12,7 @@ from variants import but_seldom, daily
 
 from clrecon.anatomy.body import remove_table
 from clrecon.geometry import Volume
-from clrecon.jobs.render.report import find_emptiness
+from clrecon.jobs.render.job import find_emptiness
 from clrecon.operators.rays.render import VolumeRenderer
 from clrecon.rendering import PRESETS, Rendering
 from clrecon.rendering.views.camera import Camera

@@ -10,8 +10,14 @@ from refusals import refused
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare.distances import SurfaceDistance, compare_meshes, sample_surface, sample_surface_points
-from clrecon.mesh.compare.near_distances import NearDistance, triangle_distances
+from clrecon.mesh.compare.distances import (
+    NearDistance,
+    SurfaceDistance,
+    compare_meshes,
+    sample_surface,
+    sample_surface_points,
+    triangle_distances,
+)
 
 pytestmark = pytest.mark.unit
 

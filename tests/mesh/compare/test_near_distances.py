@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 
-from clrecon.mesh.compare.near_distances import FaceFrames, NearDistance, triangle_distances
+from clrecon.mesh.compare.distances import FaceFrames, NearDistance, triangle_distances
 from clrecon.system import pieces
 
 pytestmark = pytest.mark.unit

@@ -25,7 +25,7 @@ from variants import daily
 
 from clrecon.geometry import Volume
 from clrecon.opencl.sources import read_kernel_source
-from clrecon.proof.rays.rays import hash_pixels, jitter_pixels
+from clrecon.proof.rays.render import hash_pixels, jitter_pixels
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip

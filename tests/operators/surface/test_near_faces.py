@@ -11,7 +11,7 @@ from near_surfaces import FLAT_BOUND, FLAT_CASES, flat_case, sheet
 from refusals import refused
 
 from clrecon.errors import DeviceError
-from clrecon.mesh.compare.near_distances import NearDistance, triangle_distances
+from clrecon.mesh.compare.distances import NearDistance, triangle_distances
 from clrecon.mesh.refine.deviation import MIDDLES, SurfaceBounds
 from clrecon.operators.surface.decimation import DeviceBounds
 

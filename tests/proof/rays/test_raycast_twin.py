@@ -12,8 +12,18 @@ from scipy.ndimage import map_coordinates
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import slice_normal_matrices
-from clrecon.proof.rays.rays import box_of, find_interval, hash_pixels, jitter_pixels, sample_field, voxel_gradients
-from clrecon.proof.rays.render import TABLE_NODES, cast_rays, look_up, shade
+from clrecon.proof.rays.render import (
+    TABLE_NODES,
+    box_of,
+    cast_rays,
+    find_interval,
+    hash_pixels,
+    jitter_pixels,
+    look_up,
+    sample_field,
+    shade,
+    voxel_gradients,
+)
 from clrecon.rendering import Lighting, TransferFunction
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip

@@ -15,7 +15,7 @@ from dicom_series import Plan, write_series
 from clrecon.errors import NoDicomError
 from clrecon.mesh import Mesh
 from clrecon.reading import read_volume
-from clrecon.reading.dicom.series.foreign_files import advise_on, describe_container
+from clrecon.reading.dicom.series.scan import advise_on, describe_container
 
 
 def make_zip(data):

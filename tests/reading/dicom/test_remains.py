@@ -12,8 +12,7 @@ from refusals import refused
 
 from clrecon.errors import RefusedInputError
 from clrecon.reading import list_series, read_volume
-from clrecon.reading.dicom.series.foreign_files import UNKNOWN, Stranger, describe_start, find_remains
-from clrecon.reading.dicom.series.scan import scan_path
+from clrecon.reading.dicom.series.scan import UNKNOWN, Stranger, describe_start, find_remains, scan_path
 
 COUNT = 12
 UID = "1.2.826.0.1.3680043.10.1.77.{}"

@@ -21,9 +21,8 @@ from clrecon.reading.dicom.pixels.decoder_pool import _find_modules
 from clrecon.reading.dicom.pixels.voxels import _describe_unfit, _fill_slice, _fits_stored_bits
 from clrecon.reading.dicom.series import certificate
 from clrecon.reading.dicom.series.certificate import _judge_thickness
-from clrecon.reading.dicom.series.foreign_files import DAMAGED_START, _Slices, describe_start
 from clrecon.reading.dicom.series.phases import SAME_POSITION_MM, Phase, _are_passes, _sort_copies
-from clrecon.reading.dicom.series.scan import DiskReader
+from clrecon.reading.dicom.series.scan import DAMAGED_START, DiskReader, _Slices, describe_start
 from clrecon.reading.dicom.series.series import describe_missing_parts
 from clrecon.reading.dicom.stack import mixtures
 from clrecon.reading.dicom.stack.fit import (
