@@ -239,9 +239,9 @@ def test_without_open3d_the_message_says_so(monkeypatch):
 def test_without_laspy_the_message_says_how_to_install_it(tmp_path, monkeypatch):
     make_cloud(2).save(tmp_path / "bone.las")
     monkeypatch.setitem(__import__("sys").modules, "laspy", None)
-    with pytest.raises(UsageError, match=r"laspy: .* install .*laspy;"):
+    with refused(UsageError, "laspy"):
         make_cloud(2).save(tmp_path / "new.las")
-    with pytest.raises(UsageError, match=r"laspy: .* install .*laspy;"):
+    with refused(UsageError, "laspy"):
         read_points(tmp_path / "bone.las")
     assert [entry.name for entry in tmp_path.iterdir()] == ["bone.las"]
 

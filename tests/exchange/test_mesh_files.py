@@ -329,11 +329,11 @@ def test_a_file_that_was_cut_or_belongs_to_another_mesh_is_found(mesh, extension
     whole = path.read_bytes()
     for length in (len(whole) - 2, len(whole) // 2, 90):
         path.write_bytes(whole[:length])
-        with pytest.raises(OutputError, match="did not arrive on the disk"):
+        with refused(OutputError, "disk"):
             FORMATS[extension].code.verify(path, content)
     path.write_bytes(whole)
     fewer = Mesh(mesh.vertices, mesh.triangles[1:], mesh.normals, mesh.report)
-    with pytest.raises(OutputError, match="did not arrive on the disk"):
+    with refused(OutputError, "disk"):
         FORMATS[extension].code.verify(path, fewer.describe("lps"))
 
 
@@ -343,7 +343,7 @@ def test_an_older_file_survives_a_failed_check(mesh, extension, tmp_path, monkey
     path = tmp_path / f"bone{extension}"
     path.write_bytes(b"older")
     monkeypatch.setattr(FORMATS[extension].code, "write", lambda stream, content: stream.write(b"x" * 200))
-    with pytest.raises(OutputError, match="did not arrive on the disk"):
+    with refused(OutputError, "disk"):
         mesh.save(path)
     assert path.read_bytes() == b"older"
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
@@ -389,7 +389,7 @@ def test_the_end_of_a_vtp_file_is_quoted_where_it_is_wrong(mesh, tmp_path):
 def test_too_large_for_the_format(mesh, tmp_path, monkeypatch):
     small = FORMATS[".stl"]
     monkeypatch.setitem(FORMATS, ".stl", dataclasses.replace(small, most_bytes=5000))
-    with pytest.raises(OutputError, match=r"at most 4 GiB can be read: write PLY or VTP"):
+    with refused(OutputError, "PLY", "VTP", 4):
         mesh.save(tmp_path / "bone.stl")
     assert list(tmp_path.iterdir()) == []
     assert FORMATS[".glb"].most_bytes == small.most_bytes == 2**32 - 1

@@ -112,7 +112,7 @@ def test_three_steps_span_space_down_to_a_millionth():
     affine[0, 2], affine[2, 2] = 1.0, 1.01e-6
     assert np.array_equal(checked_affine(affine), affine)
     affine[2, 2] = 0.99e-6
-    with pytest.raises(UsageError, match="singular"):
+    with refused(UsageError, "affine", "singular"):
         checked_affine(affine)
 
 

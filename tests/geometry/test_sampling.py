@@ -120,7 +120,7 @@ def test_three_steps_are_those_of_the_axes():
 def test_volumes_that_lie_apart_and_other_numbers_of_steps_are_refused():
     volume = VOLUMES["tilted"]
     away = clrecon.Volume(volume.voxels, TILTED + [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 900.0], [0, 0, 0, 0]])
-    with pytest.raises(UsageError, match=r"no place in common: along z they lie 88\d\.\d mm apart"):
+    with refused(UsageError, "z", "mm"):
         volume.resample(away)
-    with pytest.raises(UsageError, match="one each along i, j and k, not 2"):
+    with refused(UsageError, "i", "j", "k", 2):
         volume.resample((1.0, 1.0))

@@ -91,7 +91,7 @@ def test_random_ranges_are_those_of_nibabel():
         stops = random.choice([None, -3, -1, 0, 1, 3, 9], 3)
         key = tuple(map(slice, starts, stops, random.choice([None, 1, 2, -1, -2], 3)))
         if 0 in volume.voxels[key].shape:
-            with pytest.raises(UsageError, match="nothing is left"):
+            with refused(UsageError, "indices"):
                 volume[key]
             continue
         if any(n == 1 and own.step is not None for n, own in zip(volume.voxels[key].shape, key, strict=True)):
@@ -159,7 +159,7 @@ def test_what_is_no_part_is_refused_in_one_line(key, words):
 
 
 def test_a_volume_is_no_sequence_of_parts():
-    with pytest.raises(TypeError, match="not iterable"):
+    with refused(TypeError, "Volume"):
         iter(VOLUMES["oblique"])
     with pytest.raises(TypeError):
         3 in VOLUMES["oblique"]  # type: ignore[operator]  # noqa: B015

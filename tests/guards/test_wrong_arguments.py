@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import clrecon
 from clrecon.errors import ClreconError, UsageError
@@ -192,7 +193,7 @@ def test_the_message_says_what_is_wanted_and_what_came(arguments: dict[str, Any]
 def test_sound_arguments_and_errors_of_another_cause_stay_as_they_are() -> None:
     volume = things()["Volume"]
     assert sample(volume, np.uint8(3), np.float32(0.5), ["a", "b"]) == (13, 0, 1)  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="missing 1 required positional argument: 'volume'"):
+    with refused(TypeError, "volume"):
         sample()  # type: ignore[call-arg]
     with pytest.raises(IndexError):
         sample(volume, 100)

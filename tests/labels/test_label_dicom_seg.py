@@ -224,7 +224,7 @@ def test_real_segmentation_and_nrrd_agree(real_data):
     seg, nrrd = (resample_labels(read_labels(folder / name), volume) for name in ("liver.dcm", "liver_seg.nrrd"))
     assert seg.exact and nrrd.exact and seg.voxels.any()
     assert np.array_equal(seg.voxels, nrrd.voxels)
-    with pytest.raises(RefusedInputError, match="1 GREEN and 2 ORANGE share 3,017 voxels, and 2 more pairs"):
+    with refused(RefusedInputError, "GREEN", "ORANGE", 3017):
         read_labels(folder / "partial_overlaps.dcm")
     assert read_labels(folder / "partial_overlaps.dcm", ["green"]).find("GREEN") == 1
 

@@ -51,9 +51,9 @@ def test_parts_are_meshes_largest_first() -> None:
     assert [part.triangle_count for part in mesh.split(min_volume_ml=0.005)] == [240, 12]
     (near,) = mesh.split(seeds=[(0.0, 0.0, -1.0)])
     assert near.volume == pytest.approx(8.0, rel=1e-6)
-    with pytest.raises(UsageError, match="from 1"):
+    with refused(UsageError, "keep_largest", 1):
         mesh.keep_largest(0)
-    with pytest.raises(NoSurfaceError, match="empty"):
+    with refused(NoSurfaceError, "empty"):
         Mesh([], []).components()
 
 
@@ -134,7 +134,7 @@ def test_what_is_no_mesh_is_refused() -> None:
         Mesh.from_trimesh(trimesh.Scene())
     metres = trimesh.creation.box()
     metres.units = "meters"
-    with pytest.raises(UsageError, match=r"in meters.*convert_units"):
+    with refused(UsageError, "convert_units", "mm"):
         Mesh.from_trimesh(metres)
     with refused(UsageError, "xyz"):
         Mesh.from_trimesh(trimesh.creation.box(), "xyz")

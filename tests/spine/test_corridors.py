@@ -203,7 +203,7 @@ def test_a_label_map_by_name_gives_the_same() -> None:
     wanted = measure_corridors(volume, labels, 3, HALF_HU, "L3")
     assert [each.radius for each in found.corridors] == [each.radius for each in wanted.corridors]
     assert found.name == "L3"
-    with pytest.raises(UsageError, match="L4"):
+    with refused(UsageError, "L4"):
         find_corridors(volume, LabelMap(labels, volume.affine, {3: "L3"}), "L4", HALF_HU)
 
 

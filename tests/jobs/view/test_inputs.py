@@ -78,7 +78,7 @@ def test_dicom_labels_are_an_input_too(real_data):
     assert isinstance(opened.subject, LabelMap)
     (scan,) = open_inputs([real_data / "seg_and_labels" / "enhanced_24x38x3"])
     assert isinstance(scan.subject, Volume)
-    with pytest.raises(RefusedInputError, match="overlap"):
+    with refused(RefusedInputError, "overlap"):
         open_inputs([real_data / "seg_and_labels" / "partial_overlaps.dcm"])
 
 

@@ -150,7 +150,7 @@ def test_radii_that_are_none_are_refused(device, mm):
 def test_work_of_hours_and_more_memory_than_allowed_are_refused(device):
     tall = Volume(np.zeros((200, 1000, 33), np.int8), np.diag((1.0, 0.01, 0.01, 1.0)))
     mask = clrecon.Mask.from_band(tall, (0, 1), device=device, memory=20_000_000)
-    with pytest.raises(UsageError, match="visits of rows of the volume, 1e\\+11 are allowed: choose a smaller radius"):
+    with refused(UsageError, "radius", 100000000000.0):
         mask.dilate(10.0)
-    with pytest.raises(DeviceError, match="2 masks of the voxels .* are allowed"):
+    with refused(DeviceError, "masks", 2):
         clrecon.Mask(tall, mask.bits.mask_d, "", device=mask.device, memory=3_000_000).dilate(0.02)

@@ -85,9 +85,9 @@ def test_a_centre_is_in_the_middle_and_zoom_goes_with_it(two_blocks, device):
     assert np.allclose(hit.mean(axis=0), 31.5, atol=1.0) and len(hit) > 900
     with refused(UsageError, 900, "outside"):
         clrecon.render(volume, "surface", center=(0, 0, 900), device=device)
-    with pytest.raises(UsageError, match="leave out center"):
+    with refused(UsageError, "center"):
         clrecon.render(volume, "surface", center=at, camera=plain, device=device)
-    with pytest.raises(UsageError, match="means nothing in mode cpr"):
+    with refused(UsageError, "center", "cpr"):
         clrecon.render(volume, "cpr", center=at, device=device)
 
 

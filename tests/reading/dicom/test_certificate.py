@@ -9,6 +9,7 @@ import pytest
 import tolerances
 from contract_tables import names_in
 from dicom_series import Plan, set_raw, set_values, write_series
+from refusals import refused
 
 from clrecon import list_series, read_volume
 from clrecon.cli.main import main
@@ -68,7 +69,7 @@ def test_headers_alone_say_nothing_of_pixels(tmp_path, monkeypatch):
         "hu_scale",
         "stored_sign",
     }
-    with pytest.raises(AssertionError, match="pixels were read"):
+    with refused(AssertionError, "pixels"):
         certify(tmp_path, pixels=True)
 
 

@@ -107,7 +107,7 @@ def test_time_in_which_the_whole_program_stood_still_counts_for_nothing(monkeypa
 
 def test_row_38_a_decoder_that_takes_all_memory_is_stopped():
     with make_pool("allocate", memory_bytes=100 * 2**20) as pool:
-        with pytest.raises(DecoderError, match="need more than 100 MiB of memory to decode"):
+        with refused(DecoderError, 100, "MiB"):
             decode(pool, "allocate")
         assert np.array_equal(decode(pool), PIXELS)
 
@@ -127,7 +127,7 @@ def test_what_a_decoder_prints_disturbs_nothing(capfd):
 def test_a_decoder_that_cannot_be_imported_is_said():
     with (
         DecoderPool(["no_such_module:decode"], 8) as pool,
-        pytest.raises(DecoderError, match=r"does not start \(ModuleNotFoundError: No module named 'no_such_module'\)"),
+        refused(DecoderError, "ModuleNotFoundError", "no_such_module"),
     ):
         pool.decode(b"", "no_such_module:decode", np.zeros((1, 1), np.int16))
 
@@ -192,7 +192,7 @@ def test_stopping_ends_a_decoder_in_another_thread():
         pool.kill()
         thread.join(10)
         assert caught == ["are not decoded: reading was stopped"]
-        with pytest.raises(DecoderError, match="reading was stopped"):
+        with refused(DecoderError, "stopped"):
             decode(pool)
 
 
@@ -243,7 +243,7 @@ def test_no_module_comes_from_the_current_folder(tmp_path, monkeypatch):
         monkeypatch.setattr(sys, "path", [entry, *sys.path])
     with make_pool() as pool:
         assert np.array_equal(decode(pool), PIXELS)
-    with DecoderPool(["own_decoder:decode"], 8) as pool, pytest.raises(DecoderError, match="No module named"):
+    with DecoderPool(["own_decoder:decode"], 8) as pool, refused(DecoderError, "module"):
         pool.decode(b"", "own_decoder:decode", np.zeros((1, 1), np.int16))
     assert not (tmp_path / "ran").exists()
 

@@ -62,5 +62,5 @@ def test_unknown_transfer_syntax_is_named(tmp_path):
         save_dataset(ds, tmp_path / f"{k}")
         data = (tmp_path / f"{k}").read_bytes()
         (tmp_path / f"{k}").write_bytes(data.replace(b"1.2.840.10008.1.2.1\0", b"1.2.840.113619.5.9\0\0"))
-    with pytest.raises(RefusedInputError, match=r"transfer syntax 1\.2\.840\.113619\.5\.9 \(private or unknown\)"):
+    with refused(RefusedInputError, "1.2.840.113619.5.9"):
         read_volume(tmp_path)

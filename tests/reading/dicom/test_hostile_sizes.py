@@ -73,7 +73,7 @@ def test_long_sequences_are_stepped_over_without_objects(tmp_path, monkeypatch):
     monkeypatch.setattr(careful, "READ_LIMIT", elements.LONG_PREFIX_BYTES + 1000)
     assert read_volume(tmp_path).voxels.shape == (7, 5, 6)
     monkeypatch.setattr(plain, "DEEPEST", 0)  # left to the careful parser, of which too much is asked
-    with pytest.raises(RefusedInputError, match=r"slice003\.dcm: its header takes more than"):
+    with refused(RefusedInputError, "slice003.dcm", "header"):
         read_volume(tmp_path)
 
 

@@ -158,7 +158,7 @@ def test_row_46_a_folder_that_hangs_is_named(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr(os, "scandir", hang)
     try:
-        with pytest.raises(RefusedInputError, match="gone: no answer from the disk or network drive"):
+        with refused(RefusedInputError, "gone", "disk"):
             list_series(tmp_path)
     finally:
         answer.set()
@@ -200,7 +200,7 @@ def test_row_46_a_file_that_vanishes_is_named(tmp_path: Path, monkeypatch: pytes
         return read_start(file, limit)
 
     monkeypatch.setattr(disk, "read_start", vanish)
-    with pytest.raises(RefusedInputError, match=r"slice006\.dcm: not readable: No such file"):
+    with refused(RefusedInputError, "slice006.dcm"):
         read_volume(tmp_path)
 
 

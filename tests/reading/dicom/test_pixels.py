@@ -317,7 +317,7 @@ def test_a_compressed_frame_of_another_size_is_refused_before_decoding(tmp_path,
             ds = pydicom.dcmread(file)
             ds.Rows = 500
             ds.save_as(file)
-        with pytest.raises(RefusedInputError, match="compressed frame is 512 x 512, the header says 512 x 500"):
+        with refused(RefusedInputError, "frame", 512, 500):
             read_volume(folder)
     assert len(list(tmp_path.iterdir())) == 3
 
@@ -412,5 +412,5 @@ def test_real_uneven_tilted_series_lies_where_its_slices_say(real_data):
 
 
 def test_real_segmentation_is_named_as_such(real_data):
-    with pytest.raises(NoDicomError, match="found 1 series of modality SEG, no CT series"):
+    with refused(NoDicomError, "SEG", "CT", 1):
         read_volume(real_data / "seg_and_labels" / "liver.dcm")

@@ -60,7 +60,7 @@ def test_rounded_even_steps_are_one_even_stack(tmp_path, step, digits, keyword):
 @pytest.mark.parametrize("lost", daily(3, [1, 2, 20, 30, 57, 58]))
 def test_a_missing_slice_is_no_rounding(tmp_path, lost):
     write_rounded(tmp_path, 0.0105, 2, leave_out=(lost,))
-    with pytest.raises(RefusedInputError, match="slice missing between"):
+    with refused(RefusedInputError, "slice", "missing"):
         read_volume(tmp_path)
 
 
@@ -75,7 +75,7 @@ def test_whole_millimetres_hide_no_missing_slice(tmp_path, lost):
 @pytest.mark.parametrize(("stated", "digits"), daily_rows(1, [(5, 2), (0.02, 2), (0.0105, 3)]))
 def test_another_thickness_or_more_digits_explain_nothing(tmp_path, stated, digits):
     write_rounded(tmp_path, 0.0105, digits, stated=stated, leave_out=() if digits == 2 else (30,))
-    with pytest.raises(RefusedInputError, match="slice missing between"):
+    with refused(RefusedInputError, "slice", "missing"):
         read_volume(tmp_path)
 
 

@@ -319,7 +319,7 @@ def test_more_numbers_than_the_header_says_are_refused(tmp_path):
     for name, old, new in (("raw.nrrd", b"sizes: 40 40 6", b"sizes: 40 40 3"), ("a.mha", b"40 40 6", b"40 40 3"),
                            ("packed.mha", b"40 40 6", b"40 40 3")):  # fmt: skip
         path = edit(WRITERS[name](tmp_path / name, voxels, OBLIQUE), old, new)
-        with pytest.raises(RefusedInputError, match="holds more numbers than its header says"):
+        with refused(RefusedInputError, "header", "numbers"):
             clrecon.read_volume(path)
 
 
@@ -338,9 +338,7 @@ def test_a_small_file_that_would_fill_the_memory_is_refused(tmp_path, monkeypatc
     assert path.stat().st_size < 100_000
     monkeypatch.setattr(memory, "available_memory_bytes", lambda: 2**20)
     tracemalloc.start()
-    with pytest.raises(
-        RefusedInputError, match="a.nii.gz: the volume of 400 x 400 x 60 voxels needs 0.02 GiB of memory, 0.00 GiB are"
-    ):
+    with refused(RefusedInputError, "a.nii.gz", 400, 60, "GiB"):
         clrecon.read_volume(path)
     assert tracemalloc.get_traced_memory()[1] < 8e6
     tracemalloc.stop()

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import clrecon
 from clrecon.errors import UsageError
@@ -46,7 +47,7 @@ def test_edges_of_a_plane_are_mm_of_the_axes_that_it_runs_along(device, plane, m
 
 
 def test_a_perspective_picture_has_no_edges_in_mm(shot):
-    with pytest.raises(UsageError, match="no axes in mm"):
+    with refused(UsageError, "axes", "mm"):
         _ = replace(shot, camera=replace(shot.camera, parallel_scale=None, view_angle=30.0)).extent
 
 
@@ -54,5 +55,5 @@ def test_a_cut_has_no_places_of_depth(device):
     volume = clrecon.Volume(np.zeros((8, 8, 8), np.int16), np.eye(4))
     line = [(1.0, 3.0, 1.0), (3.0, 4.0, 4.0), (5.0, 3.0, 6.5)]
     made = clrecon.reformat_curve(volume, line, device=device)
-    with pytest.raises(UsageError, match="its camera is None"):
+    with refused(UsageError, "camera", "None"):
         made.world_points()

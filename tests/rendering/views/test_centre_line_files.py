@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.rendering.views.centre_line import read_curve_points
@@ -51,9 +52,9 @@ def test_the_frame_of_a_text_is_what_one_says(tmp_path):
     (tmp_path / "ras.txt").write_text(rows(RAS, " "))
     assert np.array_equal(read_curve_points(tmp_path / "ras.txt", "ras"), POINTS)
     (tmp_path / "said.mrk.json").write_text(json.dumps(markups(POINTS)))
-    with pytest.raises(UsageError, match="says that its points are LPS, not RAS"):
+    with refused(UsageError, "LPS", "RAS"):
         read_curve_points(tmp_path / "said.mrk.json", "ras")
-    with pytest.raises(UsageError, match="lps or ras"):
+    with refused(UsageError, "lps", "ras"):
         read_curve_points(tmp_path / "ras.txt", "world")
 
 

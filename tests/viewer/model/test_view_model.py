@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import view_scenes as scenes
+from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.labels.resample import ResampledLabels
@@ -222,7 +223,7 @@ def test_an_angle_of_points_in_one_place_is_refused():
     model.start_tool("angle")
     model.add_point(Pick(point=(0.0, 0.0, 0.0)))
     model.add_point(Pick(point=(0.0, 0.0, 0.0)))
-    with pytest.raises(UsageError, match="one place"):
+    with refused(UsageError, "angle", "points"):
         model.add_point(Pick(point=(1.0, 0.0, 0.0)))
 
 
