@@ -7,7 +7,7 @@ import json
 import dicom_series
 import numpy as np
 import pytest
-from refusals import refused
+from refusals import assert_one_line, refused
 from structure_sets import write_structures
 from uneven_volume import uneven
 
@@ -328,7 +328,7 @@ def test_corrupt_files_are_one_line(volume, tmp_path, harm):
         write_structures(path, {"x": rois["x"], "y": rois["x"]}, numbers=[4, 4])
     with pytest.raises(RefusedInputError) as found:
         read_labels(path, volume=volume)
-    assert "rt.dcm" in str(found.value) and "\n" not in str(found.value)
+    assert_one_line(found.value, "rt.dcm")
 
 
 @pytest.mark.release

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from made_once import make_once
-from refusals import refused
+from refusals import assert_one_line, refused
 from variants import FOR_RELEASE, daily, daily_rows
 
 from clrecon.errors import DeviceError
@@ -301,7 +301,7 @@ def test_a_number_of_threads_that_ends_the_process_is_refused(name, told, monkey
     monkeypatch.setenv(name, told)
     with refused(DeviceError, name, 4096) as caught:
         quirks.import_pyopencl.__wrapped__()
-    assert str(caught.value).isprintable() and len(str(caught.value)) < 250
+    assert_one_line(caught.value, letters=250)
 
 
 @pytest.mark.parametrize("told", ["", " ", "0", " 2 ", "+3", "4096"])

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import pytest
 
-__all__ = ["assert_facts", "refused"]
+__all__ = ["assert_facts", "assert_one_line", "refused"]
 
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[-+]?\d+)?(?![\w]|\.\d)")
 
@@ -32,6 +32,14 @@ def assert_facts(text: str, *facts: str | float) -> None:
             assert re.search(rf"(?<!\w){re.escape(fact)}(?!\w)", text), f"{fact} is not in: {text}"
         else:
             assert float(fact) in _numbers_in(text), f"the number {fact} is not in: {text}"
+
+
+def assert_one_line(error: BaseException, *facts: str | float, letters: int = 1000) -> None:
+    """Assert that the message of an error is one line of printable letters, fewer than `letters`, and has `facts`."""
+    text = str(error)
+    assert text.isprintable() and 0 < len(text) < letters, text
+    if facts:
+        assert_facts(text, *facts)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from house import ROOT
-from refusals import refused
+from refusals import assert_one_line, refused
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.labels import read_labels
@@ -51,7 +51,7 @@ def no_file(request, tmp_path):
 def test_no_reader_waits(no_file, reader):
     with pytest.raises(ClreconError) as caught:
         READERS[reader](no_file)
-    assert "\n" not in str(caught.value)
+    assert_one_line(caught.value)
 
 
 def test_what_is_no_regular_file_is_not_opened(no_file):

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from refusals import refused
+from refusals import assert_one_line, refused
 from tolerances import FLOAT64_SHARE, STEP_SIDE
 from variants import daily
 
@@ -392,5 +392,5 @@ def test_mutated_files_are_read_or_refused_in_one_line(tmp_path: Path, sample: A
             assert np.isfinite(function.table(*function.range_hu, 16)).all()
             read += 1
         except (RefusedInputError, UsageError) as error:
-            assert "\n" not in str(error) and len(str(error)) < 1000
+            assert_one_line(error)
     assert 0 < read < 400
