@@ -33,9 +33,10 @@ papers' own scans are not public. [compare.md](compare.md) and [measures.md](mea
 
 _SLICES = """## Sub-voxel slices
 
-Two surfaces can pass through the same cells and be far apart. The mesh is cut again on a lattice three times finer than
-the voxels and off their planes, and compared with the scan there; on the lattice of the voxels themselves every surface
-with one vertex on each crossed edge looks perfect. The golden constant of paper B shows on the finer lattice alone."""
+Two surfaces can pass through the same cells and be far apart. clrecon therefore also compares mesh and scan on a
+lattice that is three times finer than the voxels and does not coincide with their planes. On the lattice of the
+voxels every surface with one vertex on each crossed edge looks perfect; the error of paper B's golden constant is
+visible only on the finer lattice."""
 
 _TIMES = """## Paper B, time
 
@@ -70,7 +71,10 @@ def make_page(reports: Mapping[str, Report], growing: Mapping[str, Any] | None, 
     parts = [_OPENING, *_machine(reports), _SLICES, *_slices(reports), *_table_1(reports), _SSIM, *_ssim(reports["a"])]
     parts += [_ACCURACY, *_accuracy(reports["b149"]), _TIMES, *_times(reports, growing)]
     parts += ["## Claims", *judge_claims(reports, growing)]
-    parts += ["## Functions", "Every function that the papers contain. Figures stand on the pages named last."]
+    parts += [
+        "## Functions",
+        "The table lists every function in the papers. The last column names the pages with figures.",
+    ]
     parts += ["\n".join(table_of_functions(rows))]
     return "\n\n".join(part if part.startswith(("|", "#")) else _wrap(part) for part in parts) + "\n"
 
