@@ -316,7 +316,7 @@ def _room(cells: Cells, pieces: _Pieces, chosen: Mask) -> Float64Array:
 
 
 def judge_bone(cells: Cells, pieces: DensePieces, chosen: Mask) -> tuple[dict[str, Any], Gate]:
-    """Count the dense voxels that stay in the body (`kept`), and judge ``bone_kept`` by `BONE_KEPT`."""
+    """Count the dense voxels that stay in the body (`chosen`), and judge ``bone_kept`` by `BONE_KEPT`."""
     bone = int(cells.dense[pieces.counted].sum(dtype=np.int64))
     lost = int(cells.dense[pieces.counted & ~chosen].sum(dtype=np.int64))
     removed = int(cells.dense[~chosen].sum(dtype=np.int64))
@@ -345,7 +345,7 @@ def find_removed(cells: Cells, pieces: DensePieces, chosen: Mask) -> list[Piece]
 
 
 def find_boneless(cells: Cells, chosen: Mask, tissue: Mask) -> list[Piece]:
-    """Return the largest pieces of the body (`kept`) that hold no bone, beside others that do."""
+    """Return the largest pieces of the body (`chosen`) that hold no bone, beside others that do."""
     parts = _label(cells, chosen)
     has_bone = parts.is_hard & (parts.hard > 0.0)
     if not has_bone.any():

@@ -66,7 +66,7 @@ _airs: WeakKeyDictionary[Any, tuple[NDArray[np.bool_], NDArray[Any]]] = WeakKeyD
 
 
 def warn_of_face(volume: Volume, values: Iterable[float | None], subject: str) -> list[str]:
-    """Return the warning about a "surface" or "picture" (`what`) that shows one of some HU, if that can be a face."""
+    """Return the warning about a "surface" or "picture" (`subject`) that shows one of some HU, if it can be a face."""
     if not any(value is not None and shows_face(volume, value) for value in values):
         return []
     return [SAID.format(subject)]

@@ -300,7 +300,7 @@ def _steps(right: float, back: float) -> tuple[int, int]:
 
 
 def _moved(field: Field, ways: list[tuple[float, float]]) -> list[Field]:
-    """Return, for each way, the values `right` and `back` mm further in the slices; 0 beyond the ends."""
+    """Return, for each way, the values so many mm further right and back in the slices; 0 beyond the ends."""
     steps = [_steps(*way) for way in ways]
     reach = int(np.abs(steps).max())
     padded = with_border(field, reach)
@@ -348,9 +348,9 @@ def _mirrored(cells: SpineCells, first: int, end: int) -> Field:
     for step in aside:
         right, left = slice(reach + step, reach + step + nx), slice(reach - step, reach - step + nx)
         products += padded[:, :, right] * padded[:, :, left]
-        for shift in (right, left):
-            squares += square[:, :, shift]
-            sums += padded[:, :, shift]
+        for side in (right, left):
+            squares += square[:, :, side]
+            sums += padded[:, :, side]
     product, power, total = (
         np.add.reduce([field[:, up + row : up + row + ny] for row in back], axis=0)
         for field in (products, squares, sums)

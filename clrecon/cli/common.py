@@ -267,7 +267,7 @@ def add_picture(container: argparse._ActionsContainer, text: str, metavar: str =
 
 
 def add_report(container: argparse._ActionsContainer, content: str, *, first: bool = True) -> None:
-    """Add --report, which writes `what` as JSON."""
+    """Add --report, which writes `content` as JSON."""
     container.add_argument("--report", metavar="FILE", help=f"write {content} as JSON", first=first)
 
 

@@ -89,13 +89,13 @@ def measure_meshes(
                 raise NoSurfaceError(f"{entry['name']} has no triangle with an area: there is nothing to measure")
         run.lap("read")
         names = (entries[0]["name"], entries[1]["name"])
-        gaps = measure_distance(meshes[0], meshes[1], settings.samples or SAMPLES, names=names, progress=run.progress)
+        apart = measure_distance(meshes[0], meshes[1], settings.samples or SAMPLES, names=names, progress=run.progress)
         colored = None
         if files.output is not None or files.picture is not None:
             from clrecon.rendering.looks.colors import ColorScale, round_up
 
             distances, signed = measure_vertex_distances(meshes[0], meshes[1], progress=run.progress)
-            limit = settings.range_mm or round_up(max(gaps.to_reference_mm.p95, _LEAST_RANGE_MM))
+            limit = settings.range_mm or round_up(max(apart.to_reference_mm.p95, _LEAST_RANGE_MM))
             colored = _Colored(distances, ColorScale(limit, signed))
         run.lap("measure")
         drawn = None
@@ -108,17 +108,17 @@ def measure_meshes(
         warnings = list(chain(*(mesh.report["file"]["warnings"] for mesh in meshes)))
         report = run.report(
             DistanceReport,
-            [*warnings, *doubt_frames(meshes, entries), *gaps.warnings],
+            [*warnings, *doubt_frames(meshes, entries), *apart.warnings],
             a=entries[0],
             b=entries[1],
-            hausdorff_mm=gaps.hausdorff_mm,
-            hd95_mm=gaps.hd95_mm,
-            assd_mm=gaps.assd_mm,
-            a_to_b_mm=gaps.to_reference_mm,
-            b_to_a_mm=gaps.from_reference_mm,
-            a_to_b_signed_mm=gaps.to_reference_signed_mm,
-            b_to_a_signed_mm=gaps.from_reference_signed_mm,
-            samples=gaps.samples,
+            hausdorff_mm=apart.hausdorff_mm,
+            hd95_mm=apart.hd95_mm,
+            assd_mm=apart.assd_mm,
+            a_to_b_mm=apart.to_reference_mm,
+            b_to_a_mm=apart.from_reference_mm,
+            a_to_b_signed_mm=apart.to_reference_signed_mm,
+            b_to_a_signed_mm=apart.from_reference_signed_mm,
+            samples=apart.samples,
             colors=None if colored is None else colored.describe(),
             outputs=outputs,
             device=None if device is None else device.current.label,

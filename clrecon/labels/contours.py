@@ -196,7 +196,7 @@ def _fill_patch(corners: NDArray[np.float64], shape: tuple[int, int], pixel_mm: 
 
 
 def _goes_beyond(first: _Patch, second: _Patch) -> bool:
-    """True if `one` surely holds a pixel that `other` does not hold."""
+    """True if `first` surely holds a pixel that `second` does not hold."""
     left = first.surely.copy()
     left[first.common(second)] &= ~second.maybe[second.common(first)]
     return bool(left.any())

@@ -106,8 +106,8 @@ class Fans:
         totals = np.zeros((len(vertices), values.shape[1]), values.dtype)
         used = count > 0
         if used.any():
-            first, two, three = (values[corners] for corners in triangles[rows].T)
-            of_rows = first + two + three
+            first, second, third = (values[corners] for corners in triangles[rows].T)
+            of_rows = first + second + third
             totals[used] = np.add.reduceat(of_rows, (np.cumsum(count) - count)[used])
         return totals
 

@@ -207,12 +207,12 @@ class Mesh(BaseMesh, ShownAsHtml):
         """
         from clrecon.mesh.vtk import clip_surface, unwrap_polydata
 
-        surface, origin_point, along, origin = self._cut_by(point, normal)
+        surface, on_plane, along, origin = self._cut_by(point, normal)
         if capped and find_edges(self.triangles, self.vertex_count).boundary:
             raise UsageError("the mesh is open, so that its cut cannot be filled: capped=False leaves it open")
-        part = clip_surface(surface, origin_point, along, capped)
+        part = clip_surface(surface, on_plane, along, capped)
         if not part.GetNumberOfCells():
-            off = float(((origin_point + origin - self.vertices) @ along).min())
+            off = float(((on_plane + origin - self.vertices) @ along).min())
             raise NoSurfaceError(f"nothing of the mesh lies on that side of the plane: it ends {abs(off):.4g} mm off")
         raw, _ = unwrap_polydata(part)
         clipped = Mesh(raw.vertices + origin, raw.triangles, report=dict(self.report))

@@ -49,10 +49,10 @@ def _cross_some(
     a, b = low[rows, 0] + inner // size[rows, 1], low[rows, 1] + inner % size[rows, 1]
     names = triangles[rows]
     sides, shares = [], []
-    for from_corner, two in pairwise((*names.T, names[:, 0])):
+    for from_corner, to_corner in pairwise((*names.T, names[:, 0])):
         # from the lower to the higher number: both triangles of an edge find the same side of it
-        turned = from_corner > two
-        start, end = flat[np.where(turned, two, from_corner)], flat[np.where(turned, from_corner, two)]
+        turned = from_corner > to_corner
+        start, end = flat[np.where(turned, to_corner, from_corner)], flat[np.where(turned, from_corner, to_corner)]
         area = (end[:, 0] - start[:, 0]) * (b - start[:, 1]) - (end[:, 1] - start[:, 1]) * (a - start[:, 0])
         sides.append((area >= 0.0) ^ turned)
         shares.append(np.where(turned, -area, area))

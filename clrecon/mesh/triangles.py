@@ -20,9 +20,9 @@ def corner_edges(
     Differences of float32 coordinates and their products are exact in float64.
 
     Yields:
-    where: The triangles of this piece.
-    corner, p, q: ndarray, shape (3, k), float64. One row each for x, y, z, mm; `corner` is relative to `origin`, `p` is
-        the edge to the second corner, `q` to the third.
+    piece: Of the triangles.
+    corner, p, q: ndarray, shape (3, k), float64. One row each for x, y, z, mm; the corner is relative to `origin`, p is
+        the edge to the second corner, q to the third.
     """
     columns = np.ascontiguousarray(vertices.T.astype(np.float64))
     for piece in chunks(len(triangles), size):
@@ -129,9 +129,9 @@ def find_nearest_triangle(
     nearest_corner = np.inf
     for piece in chunks(len(triangles)):
         a, b, c = triangles[piece].T.astype(np.intp)
-        corner_a, two, three = (np.take(columns, index, axis=1, mode="clip") for index in (a, b, c))
-        low = np.minimum(np.minimum(corner_a, two), three)
-        high = np.maximum(np.maximum(corner_a, two), three)
+        corner_a, corner_b, corner_c = (np.take(columns, index, axis=1, mode="clip") for index in (a, b, c))
+        low = np.minimum(np.minimum(corner_a, corner_b), corner_c)
+        high = np.maximum(np.maximum(corner_a, corner_b), corner_c)
         gap = np.maximum(np.maximum(low, -high), 0.0)
         box_distance[piece] = np.einsum("ij,ij->j", gap, gap)
         nearest_corner = min(nearest_corner, *(float(corner_distance[corner].min()) for corner in (a, b, c)))

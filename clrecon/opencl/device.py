@@ -93,7 +93,7 @@ class Commands:
             self._waiting = [command for command in self._waiting if command.is_running]
 
     def give_up(self, *buffers: Any) -> None:
-        """Nobody will wait for the commands any more; those that still run keep all that they use, and `kept`."""
+        """Nobody will wait for the commands any more; those that still run keep all that they use, and `buffers`."""
         with self._lock:
             commands = (*self._given_up, *self._waiting)
             self._given_up = [command for command in commands if command.is_running]

@@ -93,10 +93,10 @@ def canal_wall(bone: SolidBone, frame: VertebraFrame) -> NDArray[np.bool_]:
     near = np.flatnonzero((np.linalg.norm(local - axis, axis=1) <= CANAL_REACH_MM) & (np.abs(local[:, 2]) <= half))
     blocked = np.zeros(len(near), dtype=bool)
     for share in np.linspace(0.0, 1.0, _CANAL_SAMPLES, endpoint=False):
-        on_way = axis[near] + share * (local[near] - axis[near])
+        on_axis = axis[near] + share * (local[near] - axis[near])
         # within a step of the surface the nearest point of the lattice may be solid
-        free = np.linalg.norm(local[near] - on_way, axis=1) > 2.0 * bone.lattice.step
-        blocked |= free & bone.is_solid(frame.to_lps(on_way))
+        free = np.linalg.norm(local[near] - on_axis, axis=1) > 2.0 * bone.lattice.step
+        blocked |= free & bone.is_solid(frame.to_lps(on_axis))
     is_wall[near[~blocked]] = True
     return is_wall
 
@@ -208,7 +208,7 @@ def grade_breach(breach_mm: float) -> str:
 
 
 def grade_screw(bone: SolidBone, frame: VertebraFrame, screw: Screw, subject: str) -> ScrewGrade:
-    """Grade a screw in a vertebra, named `what` in messages.
+    """Grade a screw in a vertebra, named `subject` in messages.
 
     Graded is the part from the coronal plane through the canal's axis to the body's middle, and behind it what lies in
     the canal.  Farther back it has to leave the bone, and farther in front the original scale does not look.

@@ -193,7 +193,7 @@ class SolidBone:
 def fill_vertebra(
     volume: Volume, labels: NDArray[Any], number: int, level: float, subject: str, fitted: Fitted | None = None
 ) -> SolidBone:
-    """Make the solid bone of one label on the volume's own grid; `what` names it in messages.
+    """Make the solid bone of one label on the volume's own grid; `subject` names it in messages.
 
     With `fitted` its surface is the one that was fitted to the bone, from that at the level on.
 

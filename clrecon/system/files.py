@@ -302,7 +302,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def check_folder(path: str | os.PathLike[str], pattern: re.Pattern[str], noun: str) -> Path:
-    """Return the folder to make or replace; `own` are files of earlier runs, `what` names what will be in it."""
+    """Return the folder to make or replace; `pattern` are files of earlier runs, `noun` names what will be in it."""
     folder = resolve_target(path)
     with system_errors(path):
         if folder.exists():

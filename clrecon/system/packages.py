@@ -18,13 +18,13 @@ from typing import Any
 from clrecon.errors import UsageError
 
 
-def import_package(module: str, user: str, package: str | None = None) -> Any:
-    """Import a module; `what` needs it, for the message, and `package` is its name when it is installed."""
+def import_package(module: str, subject: str, package: str | None = None) -> Any:
+    """Import a module; `subject` needs it, for the message, and `package` is its name when it is installed."""
     try:
         return import_module(module)
     except ImportError as error:
         named = package or module
-        raise UsageError(f"{user} needs the package {named}: {install_command(named)}") from error
+        raise UsageError(f"{subject} needs the package {named}: {install_command(named)}") from error
 
 
 def install_command(*packages: str) -> str:

@@ -30,7 +30,7 @@ def add_rendering(
     form: {"points", "plane"}. See `Rendering.to_pyvista`.  Points are as large as the pixels of a picture that is as
         high as the window.
     move_camera: Give the plotter the camera of the picture.
-    options: Options of `Rendering.to_pyvista`: `expected`, `distance`.
+    options: Options of `Rendering.to_pyvista`: ``expected``, ``distance``.
     """
     data = rendering_to_pyvista(rendering, form, **options)
     style = {}

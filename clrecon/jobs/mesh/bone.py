@@ -266,12 +266,12 @@ def _warn_of_whole(part: Part, settings: MeshSettings) -> list[str]:
         if settings.seeds or not (settings.keep_largest is not None or _means_bone(settings)):
             return []
         return [f"{subject} {_looks(judged)}; {name_parameter('keep', 'bone')} keeps what looks like bone"]
-    rival = None if part.bones is None or part.bones.other_share < OTHER_SHARE else part.bones.other
+    second = None if part.bones is None or part.bones.other_share < OTHER_SHARE else part.bones.other
     even = judged["contrast_share"] >= _CONTRAST_SHARE
-    if part.bones is not None and rival is not None and not (even and rival["looks_like"] == "contrast medium"):
+    if part.bones is not None and second is not None and not (even and second["looks_like"] == "contrast medium"):
         return [
             f"{subject} is in part no bone: one of {count_of(part.bones.components, 'component')},"
-            f" {100.0 * part.bones.other_share:.0f} % of the surface, {_looks(rival)}."
+            f" {100.0 * part.bones.other_share:.0f} % of the surface, {_looks(second)}."
             f" {name_parameter('remove_table', True)} takes a table away, {name_parameter('keep', 'bone')} leaves out"
             " what touches no bone"
         ]

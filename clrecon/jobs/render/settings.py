@@ -240,9 +240,9 @@ class RenderSettings(InputSettings):
         """Make settings from the keywords of `clrecon.rendering.pictures.modes.make_style`.
 
         clip_planes: Planes by point and normal, six numbers each; the side to which the normal points is kept.
-        **given: Fields of `RenderSettings`, and of the mode's style.  The box of `clip_box`, `between` and `around`
-            crops a scan, and where the style can be clipped it ends exactly at the box; clouds and meshes are clipped
-            alone.
+        **given: Fields of `RenderSettings`, and of the mode's style.  The box of ``clip_box``, ``between`` and
+            ``around`` crops a scan, and where the style can be clipped it ends exactly at the box; clouds and meshes
+            are clipped alone.
         """
         picks = {name: given.pop(name) for name in [*given] if name in {each.name for each in fields(cls)}}
         curve = None if picks.get("curve") is None else SPINE  # files are read later: placeholders until then

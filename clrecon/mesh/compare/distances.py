@@ -142,9 +142,9 @@ def compare_meshes(
     sides = []
     progress = progress or ignore_progress
     points = [sample_surface(each.vertices, each.triangles, samples) for each in (mesh, reference)]
-    for side, second in enumerate((reference, mesh)):
+    for side, target in enumerate((reference, mesh)):
         progress("compare", side, 2)
-        sides.append(summarise_distances(SurfaceDistance(second.vertices, second.triangles)(points[side])))
+        sides.append(summarise_distances(SurfaceDistance(target.vertices, target.triangles)(points[side])))
     progress("compare", 2, 2)
     origin = local_origin(reference.vertices)
     volume, wanted = (enclosed_ml(each.vertices, each.triangles, origin) for each in (mesh, reference))
@@ -339,8 +339,8 @@ class NearDistance:
     def _corners(self, rows: NDArray[np.integer]) -> tuple[Columns, Columns, Columns]:
         a, b, c = self._triangles[rows].T.astype(np.intp)
         # "clip" avoids checking each index, which takes longer than the look-up; the triangles have been checked.
-        first, two, three = (self._columns.take(corner, axis=1, mode="clip") for corner in (a, b, c))
-        return first, two, three
+        first, second, third = (self._columns.take(corner, axis=1, mode="clip") for corner in (a, b, c))
+        return first, second, third
 
     def _around(
         self, points: Points, near: NDArray[np.integer], measure: Callable[..., NDArray[np.float64]]
@@ -410,16 +410,16 @@ class FaceFrames:
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
         columns = np.ascontiguousarray(vertices.T, dtype=np.float64)
-        corner, to_b, two = (columns.take(index, axis=1) for index in triangles.T.astype(np.intp))
+        corner, to_b, to_c = (columns.take(index, axis=1) for index in triangles.T.astype(np.intp))
         to_b -= corner
-        two -= corner
-        cross = cross_product(to_b, two)
+        to_c -= corner
+        cross = cross_product(to_b, to_c)
         square = np.einsum("ij,ij->j", cross, cross)
         inverse = np.divide(1.0, square, out=np.zeros_like(square), where=square > 0.0)
-        along = (cross_product(two, cross) * inverse, cross_product(cross, to_b) * inverse)
+        along = (cross_product(to_c, cross) * inverse, cross_product(cross, to_b) * inverse)
         # One row a triangle, 16 numbers: they lie side by side, and a look-up costs one access to memory.
         self._rows = np.zeros((len(triangles), 16), dtype=np.float32)
-        for column, part in enumerate((corner, *along, to_b, two)):
+        for column, part in enumerate((corner, *along, to_b, to_c)):
             self._rows[:, 3 * column : 3 * column + 3] = part.T
         self.slack = rounding_of_bounds(float(np.abs(columns).max(initial=0.0)))
 

@@ -473,7 +473,7 @@ def _find_flat(places: NDArray[np.floating], faces: NDArray[np.uint32]) -> list[
 
 def _any_witness(flags: NDArray[np.bool_], witnesses: IntArray) -> NDArray[np.bool_]:
     """Mark triangles with a witness, shape (7, m), whose flag is set, or without witness."""
-    is_near = witnesses[0] < 0
+    is_flagged = witnesses[0] < 0
     for rows in witnesses:
-        is_near |= flags.take(rows, mode="clip")
-    return is_near
+        is_flagged |= flags.take(rows, mode="clip")
+    return is_flagged

@@ -109,7 +109,7 @@ def restore_volumes(
     A small shift is a large share of the volume of a thin sheet: in a thin-walled bone at voxels of 3 mm, 6 % of the
     volume were 0.03 voxel.
 
-    step: ndarray, shape (n, 3), mm. Changed in place; no step becomes longer than `longest`, and those `held` stay.
+    step: ndarray, shape (n, 3), mm. Changed in place; no step becomes longer than `longest`, and those `stuck` stay.
     """
     count = len(wanted.mm3)
     moving = np.flatnonzero(~np.append(wanted.is_open, True)[labels] & ~(np.zeros(1, bool) if stuck is None else stuck))

@@ -261,16 +261,16 @@ class _Components:
         parts = _determinants(columns, normals, triangles)
         sums = np.array([np.bincount(of_triangle, part, self._count + 1) for part in parts], dtype=np.float64)
         sums[0] -= self._volumes
-        zero, linear, two, three = sums
+        constant, linear, quadratic, cubic = sums
         shift = np.zeros(self._count + 1)
         for _ in range(_NEWTON_STEPS):
             value, slope = (
-                ((three * shift + two) * shift + linear) * shift + zero,
-                (3.0 * three * shift + 2.0 * two) * shift + linear,
+                ((cubic * shift + quadratic) * shift + linear) * shift + constant,
+                (3.0 * cubic * shift + 2.0 * quadratic) * shift + linear,
             )
             shift -= np.divide(value, slope, out=np.zeros_like(shift), where=np.abs(slope) > 1e-9 * np.abs(value))
             shift = shift.clip(-room, room)
-        value = ((three * shift + two) * shift + linear) * shift + zero
+        value = ((cubic * shift + quadratic) * shift + linear) * shift + constant
         steps += normals * shift[self._labels[vertices]]
         return np.asarray(pending & (np.abs(value) <= _VOLUME_SLACK * np.abs(self._volumes)))
 

@@ -91,8 +91,8 @@ IntArray = NDArray[np.integer]
 def any_corner(flags: NDArray[np.bool_], triangles: IntArray) -> NDArray[np.bool_]:
     """Mark triangles, shape (m, 3), that have a corner whose flag is set."""
     # "clip" avoids checking each index, which takes longer than the look-up.
-    first, two, three = flags.take(triangles, mode="clip").T
-    return np.asarray(first | two | three)
+    first, second, third = flags.take(triangles, mode="clip").T
+    return np.asarray(first | second | third)
 
 
 def find_sheets(faces: NDArray[np.uint32], size: int, edges: Edges) -> list[IntArray]:

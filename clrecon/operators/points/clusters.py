@@ -369,14 +369,14 @@ def _restore_order(
     search: ClusterSearch, labels: NDArray[np.int32], cores: NDArray[np.bool_], order: NDArray[np.int64]
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     """Return labels and core points in the order of the cloud, numbered by the first core point in that order."""
-    position = np.empty_like(order)
-    position[order] = np.arange(len(order))
-    mine, mine_cores = labels[position], cores[position]
+    inverse = np.empty_like(order)
+    inverse[order] = np.arange(len(order))
+    mine, mine_cores = labels[inverse], cores[inverse]
     clusters, firsts = np.unique(mine[mine_cores], return_index=True)
     number = np.zeros(max(search.count, 1), np.int32)
     number[clusters[np.argsort(firsts)]] = np.arange(len(clusters), dtype=np.int32)
     if len(clusters):
-        mine = search.label(number[search.run_numbers()])[position]
+        mine = search.label(number[search.run_numbers()])[inverse]
     return mine, mine_cores
 
 

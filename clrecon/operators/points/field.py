@@ -176,7 +176,7 @@ class _Decision:
 def decide_signs(
     masks: Masks, limits: MemoryLimits, rounds: int, *, memory: int | None = None, taken: int = 0
 ) -> Signs:
-    """Decide which nodes are inside, signs flooding `rounds` nodes; `negative_d` is used up; `taken` bytes are gone."""
+    """Decide which nodes are inside, signs flooding `rounds` nodes; negative ones are used up, `taken` bytes gone."""
     decision = _Decision(masks, limits, memory, taken)
     runs = decision.find_runs()
     count, regions = decision.number_regions(runs)

@@ -199,12 +199,12 @@ def estimate_normals(
     k, warnings = check_neighbours(k, len(points), FEWEST_NEIGHBOURS)
     if volume is not None and viewpoint is not None:
         raise UsageError("normals are oriented by a volume or away from a viewpoint, not both: leave out one")
-    origin = None if viewpoint is None else _check_viewpoint(viewpoint)
+    eye = None if viewpoint is None else _check_viewpoint(viewpoint)
     tell = progress or ignore_progress
     if volume is None:
         for attempt in with_fallback(take_device(device)):
             with attempt as (current, notes):
-                step = _Run(cloud, k, current, memory, [*warnings, *notes], tell).step(origin)
+                step = _Run(cloud, k, current, memory, [*warnings, *notes], tell).step(eye)
         return step
     with open_volume(volume, device, memory, "the orientation of normals") as resident:
         for attempt in resident.with_fallback():

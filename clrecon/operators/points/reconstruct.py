@@ -481,12 +481,12 @@ class _Reconstruction:
             raise NoSurfaceError(
                 f"the cloud encloses nothing at a spacing of {self.settings.spacing:.4g} mm: take a smaller one"
             ) from None
-        notes = mesh.report
+        figures = mesh.report
         facts |= {
-            "device": notes["device"],
-            "driver": notes["driver"],
-            "seconds": {part: notes["seconds"][part] + self.stopwatch.seconds[part] for part in notes["seconds"]},
-            "kernel_seconds": {**self.stopwatch.by_kernel, **notes["kernel_seconds"]},
-            "warnings": [*self.warnings, *notes["warnings"]],
+            "device": figures["device"],
+            "driver": figures["driver"],
+            "seconds": {part: figures["seconds"][part] + self.stopwatch.seconds[part] for part in figures["seconds"]},
+            "kernel_seconds": {**self.stopwatch.by_kernel, **figures["kernel_seconds"]},
+            "warnings": [*self.warnings, *figures["warnings"]],
         }
         return Mesh(mesh.vertices, mesh.triangles, mesh.normals, facts)

@@ -397,12 +397,12 @@ def _color_by_label(cloud: PointCloud, labels: NDArray[np.int32], removed: bool)
     palette[~grey] = distinct_colors(int(np.count_nonzero(~grey)))
     levels = np.rint(255.0 * palette).astype(np.uint8)
     names: Mapping[Any, Any] = cloud.report.get("label_names") or {}
-    spare = {-1: "noise"} if not removed else {0: "kept"}
+    usual = {-1: "noise"} if not removed else {0: "kept"}
     order = sorted(np.argsort(-counts, kind="stable")[:MOST_NAMED].tolist())
     legend = [
         {
             "label": int(numbers[place]),
-            "name": names.get(int(numbers[place])) or names.get(str(numbers[place])) or spare.get(int(numbers[place])),
+            "name": names.get(int(numbers[place])) or names.get(str(numbers[place])) or usual.get(int(numbers[place])),
             "color": "#" + bytes(levels[place]).hex(),
             "points": int(counts[place]),
         }

@@ -33,7 +33,7 @@ def cast_surface(resident: DeviceVolume, style: SurfaceLook, shot: Shot, ray_ste
     inside and the one before, the surface is found to 1e-3 of a step.  A ray that begins inside has its hit at once: on
     a clip plane with the plane's normal, so that cut bone is flat; at a camera inside, with the ray's direction.
 
-    style: With `shadows`, a hit has only ambient light if the way from it to the fixed light meets something inside,
+    style: With its shadows, a hit has only ambient light if the way from it to the fixed light meets something inside,
         one ray step away or farther; translucent labels let their share through.  A hit in a label with opacity below 1
         is blended, and the ray continues: out of the inside to the next entry, or into the next label. The label of a
         hit is that of the nearest inside voxel of its cell; as in meshes of labels, a voxel without one has that of the

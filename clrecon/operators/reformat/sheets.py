@@ -180,8 +180,8 @@ class _Run:
         if self.combine == "mean":
             values = values / np.where(empty, np.float32(1.0), weights)
         values[empty] = np.nan
-        most_slices = slices if takes_whole else min(slices, self.slices)
-        return Reformation(values, self.slices, count, sum(self.needs(most_slices).values()))
+        together = slices if takes_whole else min(slices, self.slices)
+        return Reformation(values, self.slices, count, sum(self.needs(together).values()))
 
     def _launch_rows(self, program: Program, **part: Any) -> None:
         """Launch the kernel for all rows; `part` has its arguments other than rows and sizes."""

@@ -392,7 +392,7 @@ class DeviceWorker(Closing):
 def open_volume(
     volume: Volume | DeviceVolume, device: Device | str | int | None, memory: int | None, action: str
 ) -> Iterator[DeviceVolume]:
-    """Yield a volume on its device, for `what`: a given open one, or a new one that is closed at the end."""
+    """Yield a volume on its device, for `action`: a given open one, or a new one that is closed at the end."""
     resident, is_new = take_volume(volume, device, memory, action)
     try:
         yield resident

@@ -105,11 +105,11 @@ def plan_crossings(
     size = (np.floor((beyond - origin)[1:] / edges[:, None].astype(np.float64)) + 1.0).astype(np.int64)  # y, z
     first_row = np.concatenate([[0], np.cumsum(size.prod(axis=1))])
     row, longest_of = np.empty(len(longest), np.int64), np.zeros(len(edges))
-    for step, width in enumerate(edges.astype(np.float64)):
-        rows = np.flatnonzero(level == step) if step else slice(None)  # coarse ones are entered anew
+    for number, width in enumerate(edges.astype(np.float64)):
+        rows = np.flatnonzero(level == number) if number else slice(None)  # coarse ones are entered anew
         y, z = (((low[axis, rows] - origin[axis]) / width).astype(np.int64) for axis in (1, 2))
-        row[rows] = first_row[step] + y + size[step, 0] * z
-        longest_of[step] = longest[level == step].max(initial=0.0)
+        row[rows] = first_row[number] + y + size[number, 0] * z
+        longest_of[number] = longest[level == number].max(initial=0.0)
     bits = low[0].view(np.int32)
     order = np.argsort(row << 32 | np.where(bits < 0, ~bits, bits ^ np.int32(-(2**31))).view(np.uint32))
     starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=first_row[-1]))]).astype(np.uint32)

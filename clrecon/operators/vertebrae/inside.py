@@ -69,9 +69,9 @@ def measure_thickness(mask: Mask) -> ShellThickness:
     if not total or not counts[0]:
         return ShellThickness(limit, 0.0, None, None)
     left = np.maximum.accumulate(np.array([*counts, 0])[::-1])[::-1]  # openings by lattice balls may grow again
-    volumes = -np.diff(left)  # voxels whose largest ball is that of each radius
-    thickness = 2.0 * radii[: len(volumes)]
-    share = np.cumsum(volumes) / volumes.sum()
+    voxel_counts = -np.diff(left)  # voxels whose largest ball is that of each radius
+    thickness = 2.0 * radii[: len(voxel_counts)]
+    share = np.cumsum(voxel_counts) / voxel_counts.sum()
     median, p95 = (float(thickness[np.searchsorted(share, part)]) for part in (0.5, 0.95))
     return ShellThickness(limit, counts[0] / total, median, p95)
 

@@ -271,11 +271,11 @@ def _of_clouds(done: Rows, with_truth: bool) -> Iterator[str]:
     cloud = done.get("cloud")
     if not (cloud and cloud.points and cloud.points_mm):
         return
-    points = cloud.points_mm
-    far = points["to_reference_mm"]
+    figures = cloud.points_mm
+    far = figures["to_reference_mm"]
     clause = f", {far['mean']:.2f} mm from the reference surface on average" if far else ""
     scatter = (
-        f" and scattered by {points['scatter_mm']:.2f} mm about the truth" if points["scatter_mm"] is not None else ""
+        f" and scattered by {figures['scatter_mm']:.2f} mm about the truth" if figures["scatter_mm"] is not None else ""
     )
     yield (
         f"The cloud has {count(cloud.points)} points{clause}{scatter}: they are centres of voxels, not places of the"

@@ -27,7 +27,7 @@ _MEASURES = ("quality", "cells", "slices", "surfaces", "truth", "points")
 class Judge:
     """Measures of one scan, one level and one reference.
 
-    They are `told` the ``folder`` with the arrays; ``reference``, name of a method, None where it failed;
+    The message has the ``folder`` with the arrays; ``reference``, name of a method, None where it failed;
     ``iso_value``; ``closed``; ``truth``, the folder of a phantom, or None.
     """
 

@@ -248,9 +248,9 @@ def _first_from(values: Float64Array, size: int) -> IntArray:
     return np.clip(np.ceil(values), 0, size).astype(np.int64)
 
 
-def _points_at(low: Float64Array, high: Float64Array, at_row: IntArray, axis: int) -> Float64Array:
+def _points_at(low: Float64Array, high: Float64Array, coordinate: IntArray, axis: int) -> Float64Array:
     """Return the points of lines from `low` to `high` at a coordinate along an axis; its two other coordinates."""
-    share = (at_row - low[:, axis]) / (high[:, axis] - low[:, axis])
+    share = (coordinate - low[:, axis]) / (high[:, axis] - low[:, axis])
     return low[:, :axis] + share[:, None] * (high[:, :axis] - low[:, :axis])
 
 
@@ -310,7 +310,7 @@ def find_level_runs(volume: Volume, rule: IsoRule, lattice: Lattice, report: Cal
     """Find the ends of runs of points, (n,) int64, ascending, where the trilinear HU reach the one level of a rule.
 
     A trilinear field has its extremes at the corners of a cell: only cells with corners on both sides have points on
-    both sides.  `told` is called with the number of layers of cells that are done.
+    both sides.  `report` is called with the number of layers of cells that are done.
     """
     layers = lattice.cells_ijk[2]
     ni, nj, _ = volume.shape_ijk

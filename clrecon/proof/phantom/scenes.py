@@ -159,20 +159,20 @@ def draw_scene(
         for offset in offsets:
             canvas = np.full(shape[1:], AIR_HU, dtype=np.float32)
             for part, piece in met:
-                view = piece.window(k + offset)
-                paint(canvas, view.region, coverage(_distance(part, view), ramp), part.hu)
+                window = piece.window(k + offset)
+                paint(canvas, window.region, coverage(_distance(part, window), ramp), part.hu)
             voxels[k] += canvas
         voxels[k] /= np.float32(subslices)
         for part, piece in met:
-            view = piece.window(float(k))
-            labels[k][view.region][_distance(part, view) >= 0.0] = MATERIALS.index(part.material)
+            window = piece.window(float(k))
+            labels[k][window.region][_distance(part, window) >= 0.0] = MATERIALS.index(part.material)
         if progress is not None:
             progress("draw", k + 1, shape[0])
     return voxels, labels
 
 
-def _distance(part: Part, view: Window) -> Field:
-    return np.asarray(part.distance(view.x, view.y, view.z), dtype=np.float32)
+def _distance(part: Part, window: Window) -> Field:
+    return np.asarray(part.distance(window.x, window.y, window.z), dtype=np.float32)
 
 
 def facts_of_parts(voxels: NDArray[np.int16], labels: LabelArray, affine: Float64Array) -> dict[str, dict[str, float]]:

@@ -252,9 +252,9 @@ class _Scene:
         """Draw all bone of (sub-)slice `k`, which belongs to slice `slice_k`, onto `canvas`."""
         for disc, placed in self.discs:
             if placed.meets(slice_k):
-                view = placed.window(k)
-                wall = ellipse(view.x, view.y, disc.half_width, disc.half_depth)
-                inside = np.minimum(wall, np.float32(disc.half_length) - np.abs(view.z))
+                window = placed.window(k)
+                wall = ellipse(window.x, window.y, disc.half_width, disc.half_depth)
+                inside = np.minimum(wall, np.float32(disc.half_length) - np.abs(window.z))
                 # The fibrous ring is a little denser than the nucleus.
                 ring = np.float32(_DISC_HU) + np.float32(14.0) * coverage(8.0 - wall, 8.0)
                 paint(canvas, placed.region, coverage(inside, self.ramp), ring)
@@ -263,9 +263,9 @@ class _Scene:
             if placed.meets(slice_k):
                 self._draw_vertebra(canvas, vertebra, placed.window(k))
         if self.marker.meets(slice_k):
-            view = self.marker.window(k)
-            ball = np.float32(self.anatomy.marker_radius) - np.sqrt(view.x * view.x + view.y * view.y + view.z * view.z)
-            paint(canvas, view.region, coverage(ball, self.ramp), _MARKER_HU)
+            window = self.marker.window(k)
+            ball = np.float32(self.anatomy.marker_radius) - np.sqrt(window.x**2 + window.y**2 + window.z**2)
+            paint(canvas, window.region, coverage(ball, self.ramp), _MARKER_HU)
 
     def _draw_ribs(self, canvas: Field, scratch: Field, slice_k: int, k: float) -> None:
         """Draw all ribs as one union, so that the joints of the rods do not show."""
@@ -275,8 +275,8 @@ class _Scene:
         for _, _, placed in active:
             scratch[placed.region] = -1e3
         for a, b, placed in active:
-            grid = placed.window(k)
-            rod = capsule((grid.x, grid.y, grid.z), tuple(a), tuple(b), 3.5, 3.5, 0.55)
+            window = placed.window(k)
+            rod = capsule((window.x, window.y, window.z), tuple(a), tuple(b), 3.5, 3.5, 0.55)
             view = scratch[placed.region]
             np.maximum(view, rod, out=view)
         rows = slice(min(p.region[0].start for *_, p in active), max(p.region[0].stop for *_, p in active))
@@ -286,21 +286,21 @@ class _Scene:
         paint(canvas, (rows, columns), coverage(rib - np.float32(1.0), self.ramp), RIB_MARROW_HU)
         rib[...] = -1e3
 
-    def _draw_vertebra(self, canvas: Field, vertebra: Vertebra, view: Window) -> None:
-        bone = vertebra_distance(vertebra, view.x, view.y, view.z)
+    def _draw_vertebra(self, canvas: Field, vertebra: Vertebra, window: Window) -> None:
+        bone = vertebra_distance(vertebra, window.x, window.y, window.z)
         if bone.max() <= -self.ramp:
             return
         # 0 in the body, 1 in the arch: thicker cortex and denser marrow behind the body
-        arch = coverage(view.y - np.float32(vertebra.depth / 2.0 + 1.0), 6.0)
+        arch = coverage(window.y - np.float32(vertebra.depth / 2.0 + 1.0), 6.0)
         cortex = np.float32(0.75) + np.float32(0.65) * arch
-        marrow = waves_at(view.x, view.y, view.z, vertebra.waves) * np.float32(_TRABECULAR_TEXTURE_HU)
+        marrow = waves_at(window.x, window.y, window.z, vertebra.waves) * np.float32(_TRABECULAR_TEXTURE_HU)
         marrow += np.float32(TRABECULAR_HU) + np.float32(ARCH_MARROW_HU - TRABECULAR_HU) * arch
         # basivertebral vein, from the middle of the back wall into the body
-        vein = capsule((view.x, view.y, view.z), (0.0, vertebra.depth / 2.0, 0.0), (0.0, 2.0, 0.0), 2.4, 1.0, 1.0)
+        vein = capsule((window.x, window.y, window.z), (0.0, vertebra.depth / 2.0, 0.0), (0.0, 2.0, 0.0), 2.4, 1.0, 1.0)
         marrow += coverage(vein, 1.5) * (np.float32(_VEIN_HU) - marrow)
         shell = np.float32(BODY_CORTEX_HU) + np.float32(CORTEX_HU - BODY_CORTEX_HU) * arch
-        paint(canvas, view.region, coverage(bone, self.ramp), shell)
-        paint(canvas, view.region, coverage(bone - cortex, self.ramp), marrow)
+        paint(canvas, window.region, coverage(bone, self.ramp), shell)
+        paint(canvas, window.region, coverage(bone - cortex, self.ramp), marrow)
 
 
 def plan_spine(settings: PhantomSettings, affine: Float64Array) -> tuple[Anatomy, Float64Array]:
@@ -322,9 +322,9 @@ def label_levels(settings: PhantomSettings, affine: Float64Array) -> NDArray[np.
         placed = PlacedPiece(Piece(vertebra.center, vertebra.axes, low, high), grid, settings.shape_kji)
         for k in range(settings.slices):
             if placed.meets(k):
-                view = placed.window(float(k))
-                labels[k][view.region][vertebra_distance(vertebra, view.x, view.y, view.z) >= 0.0] = level_number(
-                    vertebra.name
+                window = placed.window(float(k))
+                labels[k][window.region][vertebra_distance(vertebra, window.x, window.y, window.z) >= 0.0] = (
+                    level_number(vertebra.name)
                 )
     return labels
 

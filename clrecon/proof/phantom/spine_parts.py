@@ -151,13 +151,13 @@ def lean_and_roll(lean: float, roll: float) -> Float64Array:
     return np.array((left, np.cross(superior, left), superior))
 
 
-def _stack(sizes: dict[str, Float64Array], frames: list[Float64Array], anchor: int, foot: Float64Array) -> Float64Array:
-    """Return the centres of bodies with their discs between them, that of level `anchor` at `at`."""
+def _stack(sizes: dict[str, Float64Array], frames: list[Float64Array], anchor: int, spot: Float64Array) -> Float64Array:
+    """Return the centres of bodies with their discs between them, that of level `anchor` at `spot`."""
     centres = np.zeros((len(frames), 3))
     for n in range(1, len(frames)):
         centres[n] = centres[n - 1] - frames[n - 1][2] * (sizes["height"][n - 1] / 2.0 + sizes["disc"][n - 1] / 2.0)
         centres[n] -= frames[n][2] * (sizes["height"][n] / 2.0 + sizes["disc"][n - 1] / 2.0)
-    centres += foot - centres[anchor]
+    centres += spot - centres[anchor]
     return centres
 
 
@@ -177,9 +177,9 @@ def lay_chain(generator: np.random.Generator, seed: int, half_depth: float, choi
         rolls = np.concatenate((np.radians(neck.normal(0.0, 0.5, more)), rolls))
         leans[0], rolls[0] = leans[1], rolls[1]  # the ring lies square to the dens
     anchor = names.index(_ANCHOR_LEVEL)
-    sacrum = np.array((1.7, half_depth - 21.0 - 67.0, -4.0))
+    centre = np.array((1.7, half_depth - 21.0 - 67.0, -4.0))
     frames = [lean_and_roll(lean, roll) for lean, roll in zip(leans, rolls, strict=True)]
-    centres = _stack(sizes, frames, anchor, sacrum)
+    centres = _stack(sizes, frames, anchor, centre)
     chain = Chain(names, sizes, frames, centres, np.zeros_like(centres))
     if choice is not None and choice.is_bent:
         chain = _bend(chain, anchor, choice)

@@ -213,9 +213,9 @@ def shade_layer(
     return rgb, depth
 
 
-def _window(place_range: NDArray[np.float32], centres: NDArray[np.float32], pixel: np.float32) -> slice:
+def _window(places: NDArray[np.float32], centres: NDArray[np.float32], pixel: np.float32) -> slice:
     """Return the pixels between corners along one axis, with two more on either side."""
-    near = np.flatnonzero((centres >= place_range.min() - 2.0 * pixel) & (centres <= place_range.max() + 2.0 * pixel))
+    near = np.flatnonzero((centres >= places.min() - 2.0 * pixel) & (centres <= places.max() + 2.0 * pixel))
     return slice(near[0], near[-1] + 1) if len(near) else slice(0, 0)
 
 

@@ -114,7 +114,7 @@ def extract_label_mask(
       level counts as one step on its own side.  Where the occupancy of the other labels is not lower at the label's end
       than at the far end (they lie alongside, not across a gap), that of all labels replaces the label's;
     - with another label, it lies where the leads of both are equal.  The lead at an end is the occupancy of its own
-      number less that of the other end's number, at least 1. The lead of an enclosed label, see `choose_enclosed`, is
+      number less that of the other end's number, at least 1. The lead of an enclosed label, see `find_enclosed`, is
       larger by the amount by which its level is lower than the other's (`START` if that has none);
     - beyond the map, which is closed at its border or not, it lies half way.
 
@@ -168,7 +168,7 @@ def _find_leads(
     grown: NDArray[np.int64],
     border: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return for each end of each edge the lead of its number over that of the other end, `own` being the occupancy of
+    """Return for each end of each edge the lead of its number over that of the other end, `occupancy` being that of
     the label whose samples are `inside`, `grown` the number of each sample of the grid.
     """
     starts = inside[edges.near]

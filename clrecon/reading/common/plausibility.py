@@ -57,7 +57,7 @@ def list_odd_values(facts: PixelFacts) -> list[str]:
 
 def judge_figures(odd: Sequence[str]) -> Gate:
     """Judge the gate ``plausible_hu``, given the unusual figures."""
-    words = "figures of HU that no CT has"
+    words = "implausible HU values"
     return none_of("plausible_hu", len(odd), f"{words} ({'; '.join(odd)})" if odd else words)
 
 

@@ -296,7 +296,7 @@ def judge_grid(grid: GridFile, values: GridValues | None, value_gates: Sequence[
     else:
         gates.append(unmeasured("hu_known", 0, None, f"{doubtful}: the file does not say what they are"))
     if values is None or values.doubts:
-        gates.append(unmeasured("plausible_hu", 0, None, "figures of HU that no CT has: not read, or hardly HU"))
+        gates.append(unmeasured("plausible_hu", 0, None, "implausible HU values: not read, or hardly HU"))
     else:
         gates.append(judge_figures(list_odd_values(values.facts)))
     gates += leave_unexamined() if value_gates is None else value_gates

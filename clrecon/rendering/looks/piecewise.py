@@ -36,7 +36,7 @@ def check_ascending(title: str, unit: str, positions: Float64Array) -> None:
 
 
 def check_share(title: str, value: float, n: int, advice: str = "") -> None:
-    """Refuse a value of point `at` (from 0) that is not in 0..1."""
+    """Refuse a value of point `n` (from 0) that is not in 0..1."""
     if not 0.0 <= value <= 1.0:
         raise UsageError(f"{title} of point {n + 1} is {value:g}, and must lie between 0 and 1{advice}")
 

@@ -223,7 +223,7 @@ def _parse_nodes(text: str, subject: str, width: int) -> Float64Array:
 
 
 def _slicer_parameters(texts: Mapping[str, str], path: Callable[[str], str]) -> dict[str, Any]:
-    """Make the parameters from the words that .vp lines and XML attributes share; `place` says where a field is."""
+    """Make the parameters from the words that .vp lines and XML attributes share; `path` says where a field is."""
 
     def number(name: str, default: float) -> float:
         text = texts.get(name, "").strip()

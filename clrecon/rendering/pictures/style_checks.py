@@ -125,7 +125,7 @@ def sheet(value: Any) -> int | str:
 
 
 def mapping(subject: str) -> Callable[[Any], Any]:
-    """Make a check for a mapping with labels as keys; `what` names the values in the message."""
+    """Make a check for a mapping with labels as keys; `subject` names the values in the message."""
 
     def check_mapping(value: Any) -> Any:
         if isinstance(value, Mapping):

@@ -138,7 +138,7 @@ def facts_of_camera(camera: Camera | None) -> dict[str, Any] | None:
 
 
 def _lay_over(image: NDArray[np.uint8], ground: tuple[int, int, int]) -> NDArray[np.uint8]:
-    """Return (h, w, 3) of an image with opacity over a colour, in whole numbers: this runs for each moving picture."""
+    """Return (h, w, 3) of an image with opacity over a colour, in whole numbers: it runs while a view moves."""
     opacity = image[..., 3:].astype(np.uint16)
     behind = np.array(ground, dtype=np.uint16) * (255 - opacity)
     return ((image[..., :3] * opacity + behind + 127) // 255).astype(np.uint8)

@@ -316,8 +316,8 @@ def measure_stack(headers: Sequence[SliceHeader], *, allow_gaps: bool = False) -
         if holes.places and allow_gaps:
             warnings.append(f"{holes.describe()}: what is there is placed exactly, surfaces bridge the gap")
         elif holes.places:
-            gaps = holes.describe([header.name for header in slices])
-            problems.append(f"{gaps}; find them, or take what is there with {name_parameter('allow_gaps', True)}")
+            missing = holes.describe([header.name for header in slices])
+            problems.append(f"{missing}; find them, or take what is there with {name_parameter('allow_gaps', True)}")
         if line.uneven and not problems:
             warnings.append(_describe_unevenness(distances, line))
         if not problems:
