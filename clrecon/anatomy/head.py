@@ -136,7 +136,8 @@ def find_head(volume: Volume) -> bool | None:
 
 
 def _judge_head(volume: Volume) -> bool | None:
-    vault, trunk, bodies = 0.0, 0, 0
+    vault = 0.0
+    trunk, bodies = 0, 0
     for plane, pixels_mm, step in _coarse_slices(volume):
         vault += step * _has_vault(plane, pixels_mm)
         area = float((plane > AIR_HU).sum()) * pixels_mm[0] * pixels_mm[1] / 100.0

@@ -129,7 +129,8 @@ def _measure_slice(padded: NDArray[Any], axis: int, background: Background, k: i
     # A lone voxel of noise has no neighbour beside or behind it that is also bone.
     borne_out = flat_inside[high + across] | flat_inside[high - across] | flat_inside[high + uphill]
     is_sure = borne_out & (step >= 0.25 * np.abs(sideways))
-    high, low, uphill, step = high[is_sure], low[is_sure], uphill[is_sure], step[is_sure]
+    high, low = high[is_sure], low[is_sure]
+    uphill, step = uphill[is_sure], step[is_sure]
 
     top, steep_up = _walk(flat_values, high, uphill)
     bottom, steep_down = _walk(flat_values, low, -uphill, falling=True)
@@ -168,7 +169,10 @@ def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float, float]:
     return edges.where(~edges.flat), share, share
 
 
-STREAKS_HU, FEWEST_METAL, METAL_SLICES, STREAKS_SPREAD = 3000, 20, 3, 0.7
+STREAKS_HU = 3000
+FEWEST_METAL = 20
+METAL_SLICES = 3
+STREAKS_SPREAD = 0.7
 """A slice with so many voxels above this shows metal, whose streaks, and whose rim so many slices away, have the values
 of bone.  Streaks spread the levels of single edges: without metal slices these lie at most this part as far apart."""
 

@@ -33,7 +33,9 @@ AIR, _SOFT_TISSUE = -1000.0, 40.0
 """HU of the two materials by which a scan with a scale of its own is read."""
 DENSE = 1240.0
 """HU that the denser of two materials is read as, where nothing is known of the values."""
-_MATERIAL_BINS, _MATERIAL_TAILS, _TAIL_SHARE = 400, (0.0005, 0.9995), 0.35
+_MATERIAL_BINS = 400
+_MATERIAL_TAILS = (0.0005, 0.9995)
+_TAIL_SHARE = 0.35
 """Bins of a histogram of any values, the shares left out at its ends, and how far above its last peak what is denser
 reaches, as a share of the range."""
 _LEAST_OF_PEAK = 0.003

@@ -273,7 +273,9 @@ def _depths(cells: SpineCells, path: NDArray[np.int64]) -> tuple[float, float | 
 
 def _longest_run(sure: NDArray[np.bool_]) -> tuple[int, int]:
     """Return the first and the end of the longest run of sure slices; gaps up to `GAP_MM` do not divide a run."""
-    best, begin, last = (0, 0), None, 0
+    best = (0, 0)
+    begin = None
+    last = 0
     for k in np.flatnonzero(sure):
         if begin is None or (k - last - 1) * CELL_MM[2] > GAP_MM:
             begin = int(k)
@@ -312,7 +314,8 @@ def _best_path(gain: Field) -> NDArray[np.int64]:
         if came[k, j, i] < 0:
             break
         dy, dx = steps[came[k, j, i]]
-        k, j, i = k - 1, j + dy, i + dx
+        k, j = k - 1, j + dy
+        i = i + dx
     return np.array(path[::-1], np.int64).reshape(-1, 3)
 
 

@@ -82,7 +82,8 @@ def _describe_device(entry: dict[str, Any]) -> list[str]:
     head = f"device {device['index']} {name}"
     if entry["error"]:
         return [head, f"  failed: {printable(entry['error'])}"]
-    first, warm, peer = entry["first_seconds"], entry["warm_seconds"], entry["peer"]
+    first, warm = entry["first_seconds"], entry["warm_seconds"]
+    peer = entry["peer"]
     opening = ", ".join(
         f"{part} {_seconds(first.get(part, 0.0))}" for part in ("open", "build", "upload", "kernels", "download")
     )

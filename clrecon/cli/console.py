@@ -49,7 +49,8 @@ def _find_paragraphs(lines: list[str]) -> list[list[str]]:
     paragraphs: list[list[str]] = []
     for line in lines:
         if paragraphs and line.strip() and not _COMMAND.match(line) and not _has_label(line):
-            last, indent, hang = paragraphs[-1][-1], _indent_of(line), _hang_of(paragraphs[-1][0])
+            last = paragraphs[-1][-1]
+            indent, hang = _indent_of(line), _hang_of(paragraphs[-1][0])
             was_full = len(last) + 1 + len(line.split()[0]) > FULL
             if indent == hang > _indent_of(paragraphs[-1][0]) or was_full and indent in (_indent_of(last), hang):
                 paragraphs[-1].append(line)
@@ -147,7 +148,8 @@ class Console:
     """The output streams of one command: stdout has the result, or with `as_json` one JSON object; stderr all else."""
 
     def __init__(self, *, as_json: bool = False):
-        self.as_json, self.quiet, self.verbose = as_json, False, False
+        self.as_json = as_json
+        self.quiet, self.verbose = False, False
         self.has_result = False
         self._streams_result, self._said_on_stderr = False, False
         self._hidden_name, self._shown_name = "", ""
@@ -169,7 +171,8 @@ class Console:
 
     def stream_file(self, path: str, name: str) -> None:
         """Leave stdout to a file, see `send`, and call the temporary `path` of it by a `name`: ``-o -``."""
-        self._said_on_stderr, self._hidden_name, self._shown_name = True, path, name
+        self._said_on_stderr = True
+        self._hidden_name, self._shown_name = path, name
 
     def send(self, piece: bytes) -> None:
         self.clear()

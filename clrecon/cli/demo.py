@@ -36,7 +36,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def _summary(outcome: dict[str, Any]) -> list[str]:
-    folder, check, seconds = printable(outcome["folder"]), outcome["check"], outcome["seconds"]
+    folder = printable(outcome["folder"])
+    check, seconds = outcome["check"], outcome["seconds"]
     width, height = outcome["picture"]["pictures"][0]["size"]
     error = 100.0 * (check["volume_ml"] / check["true_volume_ml"] - 1.0)
     spacing = " x ".join(f"{step:.3g}" for step in check["spacing_mm"])

@@ -262,7 +262,8 @@ def describe_cortex(meshes: list[dict[str, Any]]) -> list[str]:
     if not fits:
         return []
     cortex = max(fits, key=lambda each: each["vertices"])
-    outside, error, walls = cortex["outside_mm"], cortex["error_mm"], cortex["thickness_mm"]
+    outside, error = cortex["outside_mm"], cortex["error_mm"]
+    walls = cortex["thickness_mm"]
     share = 100.0 * cortex["fitted"] / cortex["vertices"]
     ends = f"5 % to 95 %: {outside['p5']:+.2f} to {outside['p95']:+.2f}"
     if not cortex["moved"]:
@@ -383,7 +384,8 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
     prints = [mesh["print"] for mesh in meshes if mesh.get("print")]
     if not prints:
         return []
-    facts, wall, left_out = prints[0], prints[0]["wall"], prints[0]["left_out"]
+    facts, wall = prints[0], prints[0]["wall"]
+    left_out = prints[0]["left_out"]
     which = "print    " if len(prints) == 1 else "print    (first mesh) "
     lines = [f"{which}size {' x '.join(f'{length:.1f}' for length in facts['size_mm'])} mm"]
     if wall["median_mm"] is not None:

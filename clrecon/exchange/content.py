@@ -55,7 +55,8 @@ def plain_lines(lines: Iterable[object]) -> tuple[str, ...]:
 def _facts(report: Mapping[str, Any], keep_ids: bool) -> Iterator[str]:
     for name in _NUMBERS:
         yield from _line(name, [("", report.get(name))])
-    gaps, dropped, runs = _mapping(report.get("gap_mm")), _mapping(report.get("dropped")), report.get("gap_runs")
+    gaps, dropped = _mapping(report.get("gap_mm")), _mapping(report.get("dropped"))
+    runs = report.get("gap_runs")
     yield from _line("gap_mm", [(end, gaps.get(end)) for end in ("min", "max", "median")])
     if isinstance(runs, list) and 0 < len(runs) <= _RUNS_WRITTEN:
         pairs = [(word, _mapping(run).get(key)) for run in runs for word, key in (("", "count"), ("x", "gap_mm"))]

@@ -70,7 +70,8 @@ def _document(content: Content | Assembly) -> dict[str, Any]:
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
     start = 0
-    nodes, meshes, materials = [], [], []
+    nodes, meshes = [], []
+    materials = []
     for number, part in enumerate(parts):
         primitive, start = _describe_part(part, number, start, views, accessors)
         rotation = _SCENE_FROM_LPS @ part.to_lps

@@ -146,7 +146,8 @@ def _describe_cloud(name: str, arrays: dict[str, NDArray[Any]]) -> RawCloud:
             columns |= columns_of(values.reshape(n, len(names)), names)
         else:
             warnings.append(f"{entry} of shape {values.shape} and type {values.dtype} are left out: {shape} is needed")
-    space, affine, iso_value = arrays.get("space"), arrays.get("affine"), arrays.get("iso_value_hu")
+    space, affine = arrays.get("space"), arrays.get("affine")
+    iso_value = arrays.get("iso_value_hu")
     certificate = arrays.get("certificate")
     is_text = certificate is not None and certificate.dtype.kind == "U" and certificate.nbytes <= _SMALL
     return RawCloud(

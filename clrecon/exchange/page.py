@@ -225,7 +225,8 @@ def verify(path: Path, content: Content | Assembly) -> None:
 
 def _join_parts(meshes: Sequence[Content]) -> tuple[CodedSurface, list[dict[str, Any]]]:
     """Code all meshes as one surface whose triangles are sorted by part, and list the parts."""
-    vertices, normals, triangles, parts = [], [], [], []
+    vertices, normals = [], []
+    triangles, parts = [], []
     before, first = 0, 0
     for number, mesh in enumerate(meshes, start=1):
         assert mesh.normals is not None

@@ -345,7 +345,9 @@ def parse_document(data: bytes, name: str) -> Document:
 
 
 def _collect_points(document: Document, name: str) -> RawCloud:
-    points, columns, left_out, normals = [], [], 0, None
+    points, columns = [], []
+    left_out = 0
+    normals = None
     for piece in document.root.iterfind("PolyData/Piece"):
         count = read_count(piece, "NumberOfPoints")
         array = piece.find("Points/DataArray")

@@ -203,7 +203,8 @@ def resample_grid(grid: Grid, regular: RegularGrid, air: float, progress: Progre
         progress("resample", k, nk)
         # The plane is parallel to the slices: one k for all of it, and i and j run linearly along its rows and columns.
         corners = grid.lps_to_ijk(apply_affine(regular.affine, [[0.0, 0.0, k], [1.0, 0.0, k], [0.0, 1.0, k]]))
-        first, columns, rows = corners[0], corners[1] - corners[0], corners[2] - corners[0]
+        first = corners[0]
+        columns, rows = corners[1] - corners[0], corners[2] - corners[0]
         if not -0.5 <= first[2] <= grid.voxels.shape[0] - 0.5:
             continue
         sampled, inside = _sample_plane(_slice_at(grid, first[2]), first, columns, rows, (nj, ni))

@@ -83,7 +83,8 @@ def cubic_value(
     before: ArrayLike, value: ArrayLike, next_value: ArrayLike, after: ArrayLike, fraction: ArrayLike
 ) -> NDArray[np.float64]:
     """Return the cubic of Catmull and Rom through four values one step apart, at a fraction between the middle two."""
-    f0, f1, t = np.asarray(value, np.float64), np.asarray(next_value, np.float64), np.asarray(fraction)
+    f0, f1 = np.asarray(value, np.float64), np.asarray(next_value, np.float64)
+    t = np.asarray(fraction)
     rise, next_rise = (f1 - np.asarray(before)) / 2.0, (np.asarray(after) - f0) / 2.0
     second, third = 3.0 * (f1 - f0) - 2.0 * rise - next_rise, 2.0 * (f0 - f1) + rise + next_rise
     return np.asarray(f0 + t * (rise + t * (second + t * third)))

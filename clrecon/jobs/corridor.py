@@ -240,7 +240,8 @@ def lay_on_lattice(mesh: Mesh, lattice: Lattice) -> FittedLattice:
 
     known = np.isfinite(mesh.values["thickness_mm"])[mesh.triangles].all(axis=1)
     places = lattice.indices(mesh.vertices.astype(np.float64)).T
-    solid, shares, placed = np.zeros(lattice.shape, bool), [], []
+    solid = np.zeros(lattice.shape, bool)
+    shares, placed = [], []
     for axis in range(3):
         order = [other for other in range(3) if other != axis] + [axis]
         shape = [lattice.shape[each] for each in order]

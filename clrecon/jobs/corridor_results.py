@@ -70,7 +70,9 @@ def _round_numbers(value: Any, digits: int = 3) -> Any:
 def describe_vertebra(
     vertebra: VertebraCorridors, label: int, margin: float, space: str, screws: list[tuple[Screw, ScrewGrade]]
 ) -> dict[str, Any]:
-    to_space, frame, turn = _point_placer(space), vertebra.frame, frame_from_lps(space)
+    to_space = _point_placer(space)
+    frame = vertebra.frame
+    turn = frame_from_lps(space)
     return {
         "name": vertebra.name,
         "label": label,
@@ -151,7 +153,9 @@ Float64Array = NDArray[np.float64]
 
 _WIDTH_MM = 96.0
 PIXELS = 400
-_CORRIDOR, LIMIT, GIVEN = (90, 230, 120), (255, 190, 60), (255, 90, 90)
+_CORRIDOR = (90, 230, 120)
+LIMIT = (255, 190, 60)
+GIVEN = (255, 90, 90)
 """Colours of corridor, largest screw and given screws."""
 
 _LEAST_RISE = 1e-6

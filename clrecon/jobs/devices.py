@@ -20,7 +20,9 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
     warnings: Sequence[str] = cache_warnings()
     try:
         device = choose_remembered(name)
-        chosen, reason, warnings = device.index, explain_choice(name), device.warnings
+        chosen = device.index
+        reason = explain_choice(name)
+        warnings = device.warnings
     except DeviceError as error:
         problem = error
     survey = {

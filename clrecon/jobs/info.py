@@ -35,7 +35,9 @@ def describe_input(
     selected = list_selected(source, settings, pixels=settings.pixels, progress=progress)
     entries = [entry.as_dict() for entry in selected.series]
     listing: dict[str, Any] = {"series": entries, "chosen": selected.chosen, "certificate": selected.certificate}
-    notes, problem, refused = list(selected.warnings), selected.refusal, None
+    notes = list(selected.warnings)
+    problem = selected.refusal
+    refused = None
     if selected.chosen is not None:
         problem = _judge_entry(next(entry for entry in entries if entry["number"] == selected.chosen))
         if problem is None:

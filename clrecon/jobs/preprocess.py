@@ -274,7 +274,8 @@ def preprocess_volume(
 
 class _StepRun:
     def __init__(self, settings: InputSettings, bands: Sequence[Band], progress: Progress):
-        self._settings, self._bands, self._progress = settings, bands, progress
+        self._settings, self._bands = settings, bands
+        self._progress = progress
         self._level: float | None = None
         self.said: list[dict[str, Any]] = []
         self.warnings: list[str] = []

@@ -236,7 +236,8 @@ class Run(Laps):
 
     def __init__(self, settings: Any, *, no_clobber: bool = False, progress: Progress | None = None):
         super().__init__()
-        self.settings, self.no_clobber, self.progress = settings, no_clobber, progress or ignore_progress
+        self.settings, self.no_clobber = settings, no_clobber
+        self.progress = progress or ignore_progress
         self.files: list[Staged] = []
         self.logged: Iterable[str] = ()
         self._keep_ids: bool = getattr(settings, "keep_ids", False)

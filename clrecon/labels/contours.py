@@ -110,7 +110,8 @@ def unite_contours(
     repeated = len(contours) - len(unique)
     near = _find_near(unique, shape)
     patches = {n: _fill_patch(unique[n], shape, pixel_mm) for n in sorted(set(chain(*near)))}
-    crossing, nested, again = [], [], []
+    crossing, nested = [], []
+    again = []
     for a, b in near:
         first, second = patches[a], patches[b]
         if not (first.inside[first.common(second)] & second.inside[second.common(first)]).any():

@@ -148,7 +148,8 @@ _GRID_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".hdr")
 
 def _list_files(folder: Path, follow_links: bool) -> Iterator[Path]:
     """List files as scans are looked for: links inside of the folder lead to what is there anyway, others wait."""
-    root, paths, lost = folder.resolve(), [], []
+    root = folder.resolve()
+    paths, lost = [], []
     for path in sorted(folder.iterdir(), key=lambda path: path.name):
         if path.name.startswith("."):
             continue
@@ -244,7 +245,8 @@ def _check_same(first: GridFile, second: GridFile) -> None:
 
 def _add(voxels: NDArray[Any], number: int, grid: GridFile) -> tuple[int, int]:
     """Write a mask into voxels that are free, and return how many it has, and how many of them were not."""
-    value, painted, shared = 0, 0, 0
+    value, painted = 0, 0
+    shared = 0
     for k, plane in enumerate(iterate_labels(grid)):
         mask = plane != 0
         if not mask.any():

@@ -174,7 +174,9 @@ def _take_aligned(labels: LabelMap, volume: Volume) -> NDArray[Any] | None:
     view = labels.voxels.transpose([2 - axes[b] for b in (2, 1, 0)])
     source, target = [], []
     for b in (2, 1, 0):
-        sign, first, length = whole[axes[b], b], int(origin[axes[b]]), labels.shape_ijk[axes[b]]
+        sign = whole[axes[b], b]
+        first = int(origin[axes[b]])
+        length = labels.shape_ijk[axes[b]]
         if sign < 0:
             view = np.flip(view, 2 - b)
             first = length - 1 - first

@@ -248,7 +248,8 @@ def _read_frames(path: Path, name: str, wanted: Wanted, progress: Progress, chec
     painted: set[tuple[int, int]] = set()
     frames = _frames_in_order(numbers, painter.order, segments, name)
     for done, frame in enumerate(frames, start=1):
-        k, number, mask = stack.places[frame], numbers[frame], pixels.read(frame).astype(bool)
+        k, number = stack.places[frame], numbers[frame]
+        mask = pixels.read(frame).astype(bool)
         if (k, number) in painted and not np.array_equal(voxels[k] == number, mask):
             raise _contradiction(name, stack, k, f"segment {number} different voxels")
         painter.paint(k, number, mask)

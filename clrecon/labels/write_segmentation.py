@@ -50,7 +50,8 @@ def encode_segmentation(labels: LabelMap, slices: Sequence[SourceSlice], *, labe
 
     seg = _describe_series(make_uid, first)
     seg.ContentLabel = label
-    seg.Rows, seg.Columns, seg.NumberOfFrames = rows, columns, len(frames)
+    seg.Rows, seg.Columns = rows, columns
+    seg.NumberOfFrames = len(frames)
     seg.SegmentSequence = Items([_segment(number, labels.name(number)) for number in numbers])
     seg.ReferencedSeriesSequence = Items([_references(sources)])
     organization = make_uid("dimensions")
@@ -82,7 +83,8 @@ def _describe_series(make_uid: Callable[[str], str], first: dict[str, str]) -> A
         setattr(seg, empty, "")
     seg.AccessionNumber = seg.ReferringPhysicianName = seg.PositionReferenceIndicator = ""
     seg.StudyInstanceUID, seg.FrameOfReferenceUID = first["StudyInstanceUID"], first["FrameOfReferenceUID"]
-    seg.SeriesInstanceUID, seg.SeriesNumber, seg.InstanceNumber = make_uid("series"), "300", "1"
+    seg.SeriesInstanceUID = make_uid("series")
+    seg.SeriesNumber, seg.InstanceNumber = "300", "1"
     seg.SeriesDescription, seg.Modality = "vertebrae, first guess", "SEG"
     seg.Manufacturer, seg.ManufacturerModelName = "clrecon", "clrecon"
     seg.DeviceSerialNumber, seg.SoftwareVersions = "0", package_version()
@@ -90,9 +92,12 @@ def _describe_series(make_uid: Callable[[str], str], first: dict[str, str]) -> A
     seg.ContentTime = seg.SeriesTime = _TIME
     seg.ContentDescription = seg.ContentCreatorName = ""
     seg.ImageType = ["DERIVED", "PRIMARY"]
-    seg.SamplesPerPixel, seg.PhotometricInterpretation, seg.PixelRepresentation = 1, "MONOCHROME2", 0
+    seg.SamplesPerPixel = 1
+    seg.PhotometricInterpretation = "MONOCHROME2"
+    seg.PixelRepresentation = 0
     seg.BitsAllocated = seg.BitsStored = 1
-    seg.HighBit, seg.LossyImageCompression, seg.SegmentationType = 0, "00", "BINARY"
+    seg.HighBit = 0
+    seg.LossyImageCompression, seg.SegmentationType = "00", "BINARY"
     seg.SegmentsOverlap = "NO"
     return seg
 
@@ -172,7 +177,8 @@ def _decimals(values: Any) -> list[Any]:
 
 def _shared(labels: LabelMap) -> Any:
     di, dj, _ = labels.spacing
-    row, column, step = labels.affine[:3, 0] / di, labels.affine[:3, 1] / dj, labels.affine[:3, 2]
+    row, column = labels.affine[:3, 0] / di, labels.affine[:3, 1] / dj
+    step = labels.affine[:3, 2]
     gap = _decimals([abs(float(np.cross(row, column) @ step))])[0]
     measures = _item(PixelSpacing=_decimals((dj, di)), SliceThickness=gap, SpacingBetweenSlices=gap)
     return _item(

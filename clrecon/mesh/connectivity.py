@@ -121,7 +121,8 @@ def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:
     low, high = np.minimum(start, end), np.maximum(start, end)
     for ends in (high, low):  # Least significant number first: each sort keeps the order of the earlier ones.
         half_edges = half_edges[order_by_number(ends[half_edges], vertex_count)]
-    low, high, upward = low[half_edges], high[half_edges], upward[half_edges]
+    low, high = low[half_edges], high[half_edges]
+    upward = upward[half_edges]
     same = low[1:] == low[:-1]
     same &= high[1:] == high[:-1]
     oriented = not bool((same & (upward[1:] == upward[:-1])).any())
@@ -171,7 +172,8 @@ def find_split_vertices(
         back = current == start
         if back.any():
             steps[going[back]] = step
-            going, current, start = going[~back], current[~back], start[~back]
+            going, current = going[~back], current[~back]
+            start = start[~back]
     return np.flatnonzero(steps != degree)
 
 

@@ -23,7 +23,9 @@ _PIECE = 1 << 16
 _FEW = 0.05
 """Share of changed triangles up to which it is faster to search only around them."""
 
-_FEWEST_CELLS, _MOST_CELLS, _CELLS_FOR_ONE = 1 << 12, 1 << 22, 64
+_FEWEST_CELLS = 1 << 12
+_MOST_CELLS = 1 << 22
+_CELLS_FOR_ONE = 64
 """Coarse cells of a surface: so many for a triangle within these bounds, and none smaller than changed ones are."""
 
 _ROUNDING = 2.0**-50
@@ -251,7 +253,8 @@ class _Planes:
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Leave out pairs of which one, but for its common corners, lies surely on one side of the other's plane."""
         for _ in range(2):
-            normal, offset, slack = self.normal.take(right, axis=1), self.offset.take(right), self.slack.take(right)
+            normal, offset = self.normal.take(right, axis=1), self.offset.take(right)
+            slack = self.slack.take(right)
             above, below = common.copy(), common.copy()
             for corner in points:
                 side = -offset
@@ -260,7 +263,8 @@ class _Planes:
                 above += side > slack
                 below += side < -slack
             near = np.flatnonzero((above != 3) & (below != 3))
-            left, right, common = right.take(near), left.take(near), common.take(near)
+            left, right = right.take(near), left.take(near)
+            common = common.take(near)
         return left, right
 
 
@@ -277,7 +281,8 @@ def _enter(low: Float64Array, high: Float64Array) -> _Entries:
     shape = cell.max(axis=1).astype(np.int64) + 1
     key = (cell[2] * shape[1] + cell[1]) * shape[0] + cell[0]
     order = np.argsort(key, kind="stable")
-    key, triangle, cell = key.take(order), triangle.take(order), cell.take(order, axis=1)  # rows side by side
+    key, triangle = key.take(order), triangle.take(order)
+    cell = cell.take(order, axis=1)  # rows side by side
     ends = np.append(np.flatnonzero(key[1:] != key[:-1]) + 1, len(key))
     later = np.repeat(ends, np.diff(ends, prepend=0)) - 1 - np.arange(len(key))
     below, above = np.nextafter(low.astype(np.float32), -np.inf), np.nextafter(high.astype(np.float32), np.inf)
@@ -326,7 +331,8 @@ def _meet(
             sides[end] = _side(right[0], right[1], right[2], left[end])
         # A triangle wholly on one side of the other's plane cannot meet the other.
         astride = (sides[ends] <= 0).any(axis=0) & (sides[ends] >= 0).any(axis=0)
-        rows, left, right, sides = rows[astride], left[:, astride], right[:, astride], sides[:, astride]
+        rows, left = rows[astride], left[:, astride]
+        right, sides = right[:, astride], sides[:, astride]
         for a, b in edges:
             through = np.flatnonzero((sides[a] * sides[b] <= 0) & (sides[a] != sides[b]))
             p, q = left[a][through], left[b][through]
@@ -412,7 +418,9 @@ def _area(a: Any, b: Any, c: Any) -> tuple[Any, Any]:
 
 def _volume(a: Any, b: Any, c: Any, d: Any) -> tuple[Any, Any]:
     """Return six times the signed volume of a tetrahedron, and the sum of its absolute terms."""
-    (px, py, pz), (qx, qy, qz), (rx, ry, rz) = b - a, c - a, d - a
-    x, y, z = (qy * rz, qz * ry), (qz * rx, qx * rz), (qx * ry, qy * rx)
+    (px, py, pz), (qx, qy, qz) = b - a, c - a
+    rx, ry, rz = d - a
+    x, y = (qy * rz, qz * ry), (qz * rx, qx * rz)
+    z = (qx * ry, qy * rx)
     value = px * (x[0] - x[1]) + py * (y[0] - y[1]) + pz * (z[0] - z[1])
     return value, sum(abs(p) * (abs(one) + abs(other)) for p, (one, other) in zip((px, py, pz), (x, y, z), strict=True))

@@ -165,12 +165,15 @@ class TriangleTree:
         lowest: Bounds of items in the boxes (k, 6, `_FAN`) of a node, which they go down where these are below limits.
         highest: Bounds in boxes (k, 6) from which their triangles keep below: no limit needs to be higher.
         """
-        items, nodes, bounds = np.arange(len(limits)), np.zeros(len(limits), np.intp), np.zeros(len(limits))
+        items = np.arange(len(limits))
+        nodes, bounds = np.zeros(len(limits), np.intp), np.zeros(len(limits))
         for level in self._levels:
             boxes = level[nodes]
             every = lowest(items, boxes)
             pair, child = np.nonzero(every <= limits[items, None])
-            items, nodes, bounds = items[pair], _FAN * nodes[pair] + child, every[pair, child]
+            items = items[pair]
+            nodes = _FAN * nodes[pair] + child
+            bounds = every[pair, child]
             if highest is not None and len(items):
                 some, best = _least_of(items, far := highest(items, boxes[pair, :, child]))
                 limits[some] = np.minimum(limits[some], far[best])

@@ -110,7 +110,9 @@ class PointCloud(Message, ShownAsHtml):
         made when they are first asked for.
         """
         cloud = cls.__new__(cls)
-        cloud._points, cloud._normals, cloud._hu, cloud._labels, cloud._ijk = points, normals, hu, labels, ijk
+        cloud._points, cloud._normals = points, normals
+        cloud._hu, cloud._labels = hu, labels
+        cloud._ijk = ijk
         cloud.report = {} if report is None else report
         return cloud
 

@@ -108,7 +108,8 @@ def measure_clusters(cloud: PointCloud) -> ClusterFigures:
     points = cloud.points
     pieces = [(where, _Runs(cloud.labels[where])) for where in chunks(len(cloud), PIECE)]
     entries = max((runs.clusters for _, runs in pieces), default=0) + 1
-    sizes, sums, squares = np.zeros(entries, np.int64), np.zeros((3, entries)), np.zeros((3, 3, entries))
+    sizes, sums = np.zeros(entries, np.int64), np.zeros((3, entries))
+    squares = np.zeros((3, 3, entries))
     low, high = np.full((3, entries), np.inf, points.dtype), np.full((3, entries), -np.inf, points.dtype)
     for piece, runs in pieces:
         runs.count(sizes)

@@ -84,7 +84,9 @@ class FlyingEdges:
 _ALL_DEVICES = "all"
 DEFAULT_RUNS = 7
 MOST_RUNS = 1000
-PHANTOM_SIZE, PHANTOM_SLICES, PHANTOM_SPACING = (512, 512), 149, (0.7, 0.7, 1.0)
+PHANTOM_SIZE = (512, 512)
+PHANTOM_SLICES = 149
+PHANTOM_SPACING = (0.7, 0.7, 1.0)
 BUSY_SHARE = 0.5
 """Smallest share of free cores without a warning: with fewer, other programs distort the times."""
 

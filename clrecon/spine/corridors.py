@@ -265,7 +265,8 @@ def find_line(depth: Depth, surface: Float64Array, frame: VertebraFrame, side: f
         free_columns = free.copy()
         free_columns[column] = False
         refined, scores, more = _refine(judge, np.array(starts), free_columns, FINE_STEPS[:2])
-        best, top, tried = np.concatenate((best, refined)), np.concatenate((top, scores)), tried + more
+        best, top = np.concatenate((best, refined)), np.concatenate((top, scores))
+        tried = tried + more
     best = best[top > 0.0]
     refined, scores, more = _refine(last, best[np.argsort(top[top > 0.0])[::-1][:LAST]], free, FINE_STEPS[1:])
     winner, tried = refined[int(scores.argmax())], tried + more

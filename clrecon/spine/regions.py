@@ -22,12 +22,17 @@ Mask = NDArray[np.bool_]
 Planes = tuple[Float64Array, Float64Array]
 """Centres and normals (m, 3) of planes in LPS mm, from the head downwards; normals point downwards."""
 
-_FRONT_MM, _BEHIND_MM, BESIDE_MM = 46.0, 58.0, 42.0
+_FRONT_MM = 46.0
+_BEHIND_MM = 58.0
+BESIDE_MM = 42.0
 """Bone farther than this from the canal belongs to no vertebra."""
 _RIB_MM = (55.0, 68.0)
 """Bone so far beside the canal is rib, shoulder blade or pelvis, and so is what it joins in `Part.beside`: transverse
 processes reach 35 to 38 mm at T1, 23 to 30 at T12 and 40 to 50 at L3 (Panjabi et al., Spine 16 and 17, 1991, 1992)."""
-_PROCESS_MM, _NECK_OFF_MM, _NECK_AHEAD_MM, _NECK_SLOPE = 38.0, 2.0, 6.0, 1.1
+_PROCESS_MM = 38.0
+_NECK_OFF_MM = 2.0
+_NECK_AHEAD_MM = 6.0
+_NECK_SLOPE = 1.1
 """Ribs may lie beyond the first; and beside a body, in front of the transverse process, from the second beyond its wall
 on: there the process lies so far in front of the canal, and farther out it runs back by the last, mm a mm."""
 _WAIST_MM = 30
@@ -46,7 +51,9 @@ _PEEL_MM = 1.5
 _BRIGHT_HU = 600.0
 _BRIGHT_MM = 0.7
 ARCH_ASIDE_MM, _SPINE_ASIDE_MM = 26.0, 12.0
-_OVER_MM, _UNDER_MM, SPINE_MM = (16.0, 8.0), (20.0, 8.0), (80.0, 1.6, 22.0, 45.0)
+_OVER_MM = (16.0, 8.0)
+_UNDER_MM = (20.0, 8.0)
+SPINE_MM = (80.0, 1.6, 22.0, 45.0)
 """How far a vertebra reaches over the plane above it and under the one below it: its articular processes, and all else.
 Its spinous process reaches down by 80 mm less 1.6 heights of the vertebra, 22 to 45: those of the chest are steep."""
 _RIDGE_WIDTH = 0.12
@@ -134,7 +141,8 @@ def cut_part(volume: Volume, course: Course, looks: Looks) -> Part:
             off = places - course.canal[nearest]
             stations = nearest + (off * course.down[nearest]).sum(axis=-1)
         ahead, aside = ((off * way[nearest]).sum(axis=-1) for way in (course.ahead, course.aside))
-        part.ahead[k], part.aside[k], part.place[k] = ahead, aside, np.clip(stations, 0, len(course) - 1)
+        part.ahead[k], part.aside[k] = ahead, aside
+        part.place[k] = np.clip(stations, 0, len(course) - 1)
         front, side = np.interp(stations, numbers, looks.front_mm), np.interp(stations, numbers, widest)
         near = (ahead <= _FRONT_MM) & (ahead >= -_BEHIND_MM) & (np.abs(aside) <= _RIB_MM[1])
         near &= (stations >= -1.0) & (stations <= len(course))

@@ -272,7 +272,9 @@ def _sample(
         # a cell whose corners are all solid is so throughout; in others HU decide, and half a filled voxel
         inside = ((values >= level) & (own_share >= 0.5)) | (filled >= 0.5) | (whole >= 1.0 - 1e-4)
         in_plane = within.reshape(ny, nx)
-        hu[z][in_plane], mask[z][in_plane], solid[z][in_plane] = values, label >= 0.5, inside
+        hu[z][in_plane] = values
+        mask[z][in_plane] = label >= 0.5
+        solid[z][in_plane] = inside
     return hu, mask, solid
 
 

@@ -92,7 +92,8 @@ class StagedFile:
     """A finished file of `size` bytes under a temporary name beside its target."""
 
     def __init__(self, path: str | os.PathLike[str], temporary: Path, target: Path, stream: BinaryIO, size: int):
-        self._path, self._temporary, self._target, self._stream = path, temporary, target, stream
+        self._path, self._temporary = path, temporary
+        self._target, self._stream = target, stream
         self._keep = existing_stay()
         self.size = size
 
@@ -340,7 +341,8 @@ class StagedFolder:
     """A finished folder, with files of `size` bytes, under a temporary name beside its place."""
 
     def __init__(self, path: str | os.PathLike[str], staged: Path, folder: Path, size: int):
-        self._path, self._made, self._folder = path, staged, folder
+        self._path, self._made = path, staged
+        self._folder = folder
         self._keep = existing_stay()
         self.size = size
 

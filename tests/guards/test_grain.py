@@ -12,7 +12,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 92_965,
+    "lines": 93_233,
     "modules": 402,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
@@ -24,7 +24,7 @@ CEILINGS = {
 HABITS = {
     "functions_with_pronouns": 29,
     "functions_without_object": 46,
-    "assignments_of_three": 216,
+    "assignments_of_three": 15,
     "nested_conditionals": 0,
     "comprehensions_of_two_loops": 23,
     "positional_flags": 0,

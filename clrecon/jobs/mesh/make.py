@@ -274,7 +274,9 @@ def drop_outside_air(volume: Volume, settings: MeshSettings, progress: Progress)
     return volume
 
 
-_CRUMB_ML, _CRUMB_SHARE, _MANY_COMPONENTS = 0.1, 0.01, 100
+_CRUMB_ML = 0.1
+_CRUMB_SHARE = 0.01
+_MANY_COMPONENTS = 100
 """A mesh of more components than this below this volume, or this share of all where it is small, gets a warning."""
 
 _SELECT_STEPS = 4

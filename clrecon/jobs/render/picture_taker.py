@@ -89,7 +89,8 @@ class PictureTaker(Closing):
     ):
         beside = beside or Beside()
         self.meshes = list(beside.meshes)
-        self._subject, self.device, self._settings = subject, device, settings
+        self._subject, self.device = subject, device
+        self._settings = settings
         self.labels, self._progress = beside.labels, progress
         self.style = settings.style_with(beside.function, beside.curve, beside.labels)
         self.function = beside.function or _shown_function(settings, self.style)

@@ -369,7 +369,8 @@ class NearDistance:
 
 def _perpendicular(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
     """Return the length of the perpendicular from each point to its triangle, infinity where its foot lies outside."""
-    b, c, points = b - a, c - a, points - a
+    b, c = b - a, c - a
+    points = points - a
     cross = cross_product(b, c)
     square = np.einsum("ij,ij->j", cross, cross)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -158,7 +158,8 @@ def _distances_to_level(volume: Volume, rule: IsoRule, level: float, points: Flo
             gradient = np.einsum("nab,nb->na", matrices[slices], per_step)
             square = np.einsum("na,na->n", gradient, gradient)
             uphill = square > 0.0
-            going, value, gradient, square = going[uphill], value[uphill], gradient[uphill], square[uphill]
+            going, value = going[uphill], value[uphill]
+            gradient, square = gradient[uphill], square[uphill]
             step = ((level - value) / square)[:, None] * gradient
             length = np.linalg.norm(step, axis=1)
             step *= np.minimum(1.0, longest / np.maximum(length, longest))[:, None]

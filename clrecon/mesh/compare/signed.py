@@ -76,7 +76,8 @@ class SignedDistance:
     def _normals_at(self, places: Points, rows: NDArray[np.int64]) -> Points:
         """Return pseudonormals at places on triangles, shape (k, 3)."""
         a, b, c = (self._vertices[corner] for corner in self._triangles[rows].T)
-        p, q, there = b - a, c - a, places - a
+        p, q = b - a, c - a
+        there = places - a
         cross = np.cross(p, q)
         square = np.einsum("ij,ij->i", cross, cross)
         safe = np.where(square > 0.0, square, 1.0)
@@ -187,7 +188,8 @@ def measure_distance(
     if samples < 1:
         raise UsageError(f"distances need at least 1 sample, not {samples}")
     report, done = progress or ignore_progress, 0
-    sides, signed, warnings = [], [], []
+    sides, signed = [], []
+    warnings = []
     for source, target, name in ((mesh, reference, names[1]), (reference, mesh, names[0])):
         points = sample_surface(source.vertices, source.triangles, samples)
         measure, has_sign, remark = _measurer_of(target, name)

@@ -155,7 +155,8 @@ class Clusters:
         origin: Float64Array,
         find_crossings: FindCrossings = find_self_intersections,
     ):
-        self._triangles, self._origin, self._find_crossings = triangles, origin, find_crossings
+        self._triangles, self._origin = triangles, origin
+        self._find_crossings = find_crossings
         self._original = self._rounded(vertices)
         self.names: IntArray = np.arange(len(vertices))
         """For each vertex the one that represents its cluster, shape (n,)."""
@@ -204,7 +205,8 @@ class Clusters:
         places[moved] = self._rounded(points[gained])
         self._collapses.add(standing[collapses])
         self.names, self.places = names, places
-        self._named, self._is_face, self._faces = named, is_face, left
+        self._named, self._is_face = named, is_face
+        self._faces = left
         for check, new in self._new.items():
             new[moved] |= check != "faults"
         self._new["components"][rename != np.arange(len(rename))] = True  # of a component that is gone none has moved

@@ -148,7 +148,9 @@ def _collapse_in_rounds(
     clusters: Clusters, deviation: Deviation, wanted: float, bound: float, tell: Callable[[int], None]
 ) -> tuple[int, int]:
     """Collapse and repair until few triangles are left, or hardly any more go; return rounds and undone collapses."""
-    left, rounds, taken_back, is_last = len(clusters.faces()), 0, 0, False
+    left = len(clusters.faces())
+    rounds, taken_back = 0, 0
+    is_last = False
     while left > _nearly(wanted) and rounds < _ROUNDS:
         tell(left)
         if rounds == 0:
@@ -224,7 +226,8 @@ def _move(
     """
     standing, triangles = clusters.numbered()
     count, labels, border = clusters.components()
-    labels, places, step = labels[standing], clusters.places[standing], steps[standing]
+    labels, places = labels[standing], clusters.places[standing]
+    step = steps[standing]
     stuck, look_at = np.zeros(len(standing), dtype=bool), fresh[labels[triangles[:, 0]]]
     for _ in range(_MOVES):
         vertices = move_vertices(as_stored(places + origin), triangles, step, find_crossings, look_at=look_at)[0]

@@ -184,7 +184,8 @@ class Deviation:
     ):
         from scipy.spatial import cKDTree
 
-        self._vertices, self._triangles, self._bound, self._make = vertices, triangles, bound, make_bounds
+        self._vertices, self._triangles = vertices, triangles
+        self._bound, self._make = bound, make_bounds
         # scipy builds the tree without Python's lock: this goes on while the first edges are collapsed.
         pool = ThreadPoolExecutor(1)
         self._tree = pool.submit(cKDTree, vertices, balanced_tree=False, compact_nodes=False)

@@ -195,7 +195,8 @@ class _Near:
     def __init__(
         self, vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans
     ):
-        self._moved, self._triangles, self.fans = moved, triangles, fans
+        self._moved, self._triangles = moved, triangles
+        self.fans = fans
         low, high = np.minimum(vertices, moved), np.maximum(vertices, moved)
         start, end = find_bounds(low)
         size = float(np.cbrt(np.prod(end - start + 1e-3) / (_CELL_SHARE * len(triangles))))

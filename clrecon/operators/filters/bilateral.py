@@ -261,7 +261,8 @@ class _Run:
     """One filtering, whatever the number of slices in a slab."""
 
     def __init__(self, resident: DeviceVolume, settings: BilateralSettings, stopwatch: Stopwatch, progress: Progress):
-        self.resident, self.settings, self.stopwatch, self.progress = resident, settings, stopwatch, progress
+        self.resident, self.settings = resident, settings
+        self.stopwatch, self.progress = stopwatch, progress
         self.warnings: list[str] = []
         ni, self.nj, self.nk = resident.volume.shape_ijk
         self.ni, self.dtype = ni, resident.dtype

@@ -117,7 +117,8 @@ def find_spaces(mask: Mask) -> Spaces:
     border of the volume, or reaches it only within what the mask encloses in that end slice alone: there an end of the
     volume cuts it, as that of a scan cuts the canal of a long bone.
     """
-    device, shape, volume = mask.device, mask.shape_ijk, mask.scan
+    device, shape = mask.device, mask.shape_ijk
+    volume = mask.scan
     rest = (~mask).bits
     components = find_components(device, rest, beside=2 * rest.needs()["mask of the voxels"], memory=mask.memory)
     none = np.empty(0)
@@ -142,7 +143,8 @@ def find_spaces(mask: Mask) -> Spaces:
 
 def find_joints(mask: Mask, reach_mm: float, least_ml: float) -> Mask:
     """Choose what lies within a distance of two pieces of a mask that are apart and have some volume each."""
-    device, shape, volume = mask.device, mask.shape_ijk, mask.scan
+    device, shape = mask.device, mask.shape_ijk
+    volume = mask.scan
     words = mask_bytes(shape)["mask of the voxels"]
     components = find_components(device, mask.bits, beside=3 * words, memory=mask.memory)
     joints = Mask(volume, zero_words(device, words // 4), "joints", device=device, memory=mask.memory)
@@ -219,7 +221,9 @@ LARGEST_MARROW_MM = 35.0
 """Radius of the smallest ball that fits into no marrow: the head of a femur is 20 to 29 mm in radius, the skull of a
 newborn more than 45."""
 
-SATURATED_HU, METAL_STEPS, METAL_SHARE = 3000.0, 2.0, 0.05
+SATURATED_HU = 3000.0
+METAL_STEPS = 2.0
+METAL_SHARE = 0.05
 """What is filled within so many radii of the ball of values above the first is beside metal, in joints of it and in
 canals round it, and warned of from this share of the solid body on."""
 

@@ -170,7 +170,8 @@ class MaskBits:
     """One bit for each voxel of a volume, on a device; what `clrecon.Mask` is made of."""
 
     def __init__(self, volume: Volume, mask_d: Any, name: str, *, device: Device, memory: int | None = None):
-        self.scan, self.device, self.memory, self.name = volume, device, memory, name
+        self.scan, self.device = volume, device
+        self.memory, self.name = memory, name
         self._mask_d = mask_d
         self._extents: VoxelMask | None = None
         self._count: int | None = None
@@ -419,7 +420,8 @@ class MaskComponents(MaskShapes):
         by_slice: In each slice alone: what its chosen voxels enclose in the slice.
         """
         self._check_budget(3)
-        device, shape, size = self.device, self.shape_ijk, mask_bytes(self.shape_ijk)["mask of the voxels"]
+        device, shape = self.device, self.shape_ijk
+        size = mask_bytes(self.shape_ijk)["mask of the voxels"]
         rest = voxel_mask.find_extents(device, voxel_mask.invert(device, self._mask_d, shape), shape)
         holes = find_components(device, rest, by_slice=by_slice, beside=2 * size, memory=self.memory)
         filled_d = allocate(device, size)
@@ -438,7 +440,8 @@ class MaskComponents(MaskShapes):
         points = checked_points(points_mm)
         if not len(points) or not np.isfinite(points).all():
             raise UsageError(f"to grow needs points that are numbers, these are {len(points)} points")
-        device, shape, size = self.device, self.shape_ijk, mask_bytes(self.shape_ijk)["mask of the voxels"]
+        device, shape = self.device, self.shape_ijk
+        size = mask_bytes(self.shape_ijk)["mask of the voxels"]
         voxels = self._find_voxels(points)
         parts = find_components(device, self.bits, beside=size, memory=self.memory)
         if not parts.count:

@@ -168,7 +168,8 @@ class _Marking:
         stopwatch: Stopwatch,
         progress: Progress,
     ):
-        self.resident, self.bounds, self.words, self.pad = resident, bounds, words, pad
+        self.resident, self.bounds = resident, bounds
+        self.words, self.pad = words, pad
         self.stopwatch, self.progress = stopwatch, progress
 
     def mark(self, slices: int) -> VoxelMask:

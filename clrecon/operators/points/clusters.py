@@ -230,7 +230,8 @@ def _cluster_band(
     notes: list[str],
     progress: Progress,
 ) -> Clustering:
-    volume, device, stopwatch = resident.volume, resident.device, Stopwatch()
+    volume, device = resident.volume, resident.device
+    stopwatch = Stopwatch()
     request = _Request.of(Lattice.of(volume), eps, min_samples)
     pad = pad_for(request.stencil)
     masks = mask_bytes(volume.shape_ijk, pad)

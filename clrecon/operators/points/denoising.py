@@ -256,14 +256,17 @@ class _Settings:
 
 class _Run:
     def __init__(self, settings: _Settings, device: Device, memory: int | None, progress: Progress):
-        self.settings, self.device, self.memory, self.progress = settings, device, memory, progress
+        self.settings, self.device = settings, device
+        self.memory, self.progress = memory, progress
         self.stopwatch = Stopwatch()
         self.feature_points: int | None = None
         self.cell_mm: float | None = None
 
     def moves(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the moves of one iteration, (n, 3) mm."""
-        device, stopwatch, settings, n = self.device, self.stopwatch, self.settings, len(points)
+        device, stopwatch = self.device, self.stopwatch
+        settings = self.settings
+        n = len(points)
         split = settings.features is not None
         results = {"moves": 12 * n, **PlaneFits.needs(n), **(DistanceMeasure.needs(n) if split else {})}
         if split:
@@ -300,7 +303,8 @@ class _Run:
         program: Program,
     ) -> None:
         """Let points that are no features take the mean over their whole cell."""
-        device, stopwatch, n = self.device, self.stopwatch, len(points)
+        device, stopwatch = self.device, self.stopwatch
+        n = len(points)
         spacing = float(np.median(planes[:, 3]))
         if spacing == 0.0:  # most points coincide: every cell would have one place
             self.feature_points = n

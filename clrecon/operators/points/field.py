@@ -97,7 +97,9 @@ class _Decision:
     """The passes of cl/points/field_signs.cl."""
 
     def __init__(self, masks: Masks, limits: MemoryLimits, memory: int | None, used: int):
-        self.masks, self.device, self.memory = masks, masks.device, memory
+        self.masks = masks
+        self.device = masks.device
+        self.memory = memory
         self._limits, self._taken = limits, used
         self._program = load_program(masks.device, "points/field_signs.cl")
         self._lines = {"words": masks.words, "rows": masks.rows}
@@ -402,7 +404,8 @@ class NodeField:
 
     def _measure(self) -> list[Any]:
         """Measure the field in all bricks; return the values of each slab, on the device where there is one slab."""
-        grid, nodes, device = self.grid, self.nodes, self.device
+        grid, nodes = self.grid, self.nodes
+        device = self.device
         values = []
         for slab in self.slabs:
             count = slab.end_brick - slab.first_brick

@@ -197,7 +197,8 @@ def make_grid(device: Device, points: ArrayLike, edge: float, *, memory: int | N
 def fill_grid(device: Device, plan: GridPlan, *, memory: int | None = None) -> PointGrid:
     """Sort the points of a plan by cells; see `make_grid`."""
     require_room(memory_limits(device, memory), plan.needs(device), "the points cannot be sorted by cells")
-    program, n, total = prepare_grid(device), len(plan.points), plan.total_words
+    program, n = prepare_grid(device), len(plan.points)
+    total = plan.total_words
     if device.most_steps is not None and n > device.most_steps // STEPS_A_POINT:
         device.remark(
             f"{device.label} ends the loops of a work-item after {device.most_steps:,} steps and tells nobody: what is"
@@ -206,7 +207,8 @@ def fill_grid(device: Device, plan: GridPlan, *, memory: int | None = None) -> P
     (nx, ny, nz), words = plan.shape, plan.words
     scale = np.float32(1.0) / plan.edge
     grid = {"origin": (*map(float, plan.corner), float(scale)), "n": n, "nx": nx, "ny": ny, "nz": nz, "words": words}
-    points_d, mask_d, ranks_d = upload(device, plan.points), allocate(device, 4 * total), allocate(device, 4 * total)
+    points_d = upload(device, plan.points)
+    mask_d, ranks_d = allocate(device, 4 * total), allocate(device, 4 * total)
     run = launcher(device, program)
     run("clear_cells", total, mask=mask_d, total=total)
     together = MARKED_TOGETHER if int(device.kernel_variants["LANES"]) > 1 else 1

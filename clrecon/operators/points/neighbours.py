@@ -195,7 +195,8 @@ class NeighbourSearch:
         memory: int | None,
         stopwatch: Stopwatch,
     ):
-        self.device, self.k, self._stopwatch = device, k, stopwatch
+        self.device, self.k = device, k
+        self._stopwatch = stopwatch
         plan = plan_grid(points, choose_cell_edge(points, k))
         self.forecast = {
             **plan.needs(device),
@@ -236,7 +237,9 @@ class NeighbourSearch:
         """Write the neighbours of the points of a part, (place_count, k), as places in the sorted order; with their
         distances as numbers, both to the rows of these points in (n, k).
         """
-        grid, one_lane, by_place = self.grid, _has_one_lane(self.device), distances_d is None
+        grid = self.grid
+        one_lane = _has_one_lane(self.device)
+        by_place = distances_d is None
         distances_d = neighbours_d if by_place else distances_d
         (nx, ny, nz), (x, y, z) = grid.shape, (float(value) for value in grid.origin - grid.base)
         launch(

@@ -118,7 +118,8 @@ class PlaneFits:
     """Planes of parts: neighbours_d (places, k) int32, normals_d (3, places), variations_d (places,) float32."""
 
     def __init__(self, search: NeighbourSearch, stopwatch: Stopwatch):
-        self._search, self._stopwatch, device = search, stopwatch, search.device
+        self._search, self._stopwatch = search, stopwatch
+        device = search.device
         with stopwatch.timed("build"):
             self.program = load_program(device, "points/normals.cl", {"LANES": device.kernel_variants["LANES"]})
         most = search.most_places
@@ -239,7 +240,8 @@ class _Run:
     def step(
         self, viewpoint: NDArray[np.float64] | None = None, gradients: NDArray[np.float32] | None = None
     ) -> PointStep:
-        device, stopwatch, points = self.device, self.stopwatch, self.cloud.points
+        device, stopwatch = self.device, self.stopwatch
+        points = self.cloud.points
         n = len(points)
         results = {"normals": 13 * n, "gradients": 0 if gradients is None else 12 * n}
         search = NeighbourSearch(device, points, self.k, {**PlaneFits.needs(n), **results}, self.memory, stopwatch)

@@ -170,7 +170,8 @@ class VoxelEmission:
                 progress("slabs", end, nk)
 
     def _one_slab(self, first: int, end: int) -> tuple[Points, int]:
-        device, stopwatch, (ni, nj, nk) = self.resident.device, self.stopwatch, self.volume.shape_ijk
+        device, stopwatch = self.resident.device, self.stopwatch
+        ni, nj, nk = self.volume.shape_ijk
         # slices of a shell need their neighbours
         border = int(self.selection.shell)
         begin, stop = max(first - border, 0), min(end + border, self.volume.shape_ijk[2])
@@ -204,7 +205,8 @@ class VoxelEmission:
 
     def _mark(self, voxels_d: Any, begin: int, stop: int, layout: dict[str, int]) -> tuple[Any, Any, int | None]:
         """Mark the voxels of the band, of the label; with a label or a shell also count those of the band."""
-        device, _stopwatch, (ni, nj, nk) = self.resident.device, self.stopwatch, self.volume.shape_ijk
+        device, _stopwatch = self.resident.device, self.stopwatch
+        ni, nj, nk = self.volume.shape_ijk
         chosen, words = self.selection, layout["words"]
         rows = (stop - begin) * nj
         mask_d, extents_d = allocate(device, 4 * rows * words), allocate(device, 4 * rows)

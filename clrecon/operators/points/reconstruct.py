@@ -76,12 +76,14 @@ def find_walls(near: Words, negative: Words, inside: Words, nx: int) -> Walls:
     """
     nz, ny, words = near.shape
     shape = (-(-nz // _CUBE), -(-ny // _CUBE), words)
-    faces, walls, enclosed = np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(shape)
+    faces, walls = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+    enclosed = np.zeros(shape)
     bits = np.arange(32 * words).reshape(words, 32) < nx
     valid = np.packbits(bits, axis=1, bitorder="little").view(np.uint32).ravel()
     for layer, first in enumerate(range(0, nz, _CUBE)):
         parts = [mask[first : first + _CUBE + 1] for mask in (near, negative, inside)]
-        places, normals, cubes = [], [], []
+        places, normals = [], []
+        cubes = []
         for axis, changed, wall, inner in _compare_nodes(parts, min(_CUBE, nz - first), valid):
             faces[layer] += _count_bits(changed, shape[1])
             wall_rows, lower_inside = _list(wall, inner)
@@ -359,8 +361,10 @@ class _Reconstruction:
         memory: int | None,
         progress: Progress,
     ):
-        self.cloud, self.normals, self.settings = cloud, normals, settings
-        self.device, self.memory, self.progress = device, memory, progress
+        self.cloud, self.normals = cloud, normals
+        self.settings = settings
+        self.device, self.memory = device, memory
+        self.progress = progress
         self.stopwatch = Stopwatch()
         self.warnings: list[str] = []
 

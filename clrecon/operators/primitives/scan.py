@@ -54,7 +54,8 @@ def enqueue_scan(device: Device, counts_d: Any, offsets_d: Any, n: int) -> Any:
     _check_size(n)
     scan = _load_scan(device)
     blocks = -(-n // (SCAN_PER_ITEM * device.group_size))
-    sums_d, block_offsets_d, total_d = (allocate(device, 4 * blocks), allocate(device, 4 * blocks), allocate(device, 8))
+    sums_d, block_offsets_d = allocate(device, 4 * blocks), allocate(device, 4 * blocks)
+    total_d = allocate(device, 8)
     items = blocks * device.group_size
     launch(device, scan["sum_blocks"], items, counts=counts_d, block_sums=sums_d, n=n)
     launch(

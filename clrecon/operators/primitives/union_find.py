@@ -103,7 +103,8 @@ class _Rounds:
     def __init__(self, device: Device, labels_d: Any, other_d: Any, nodes: int):
         self._device = device
         self.run = launcher(device, prepare_components(device))
-        self._labels_d, self._other_d, self._nodes = labels_d, other_d, nodes
+        self._labels_d, self._other_d = labels_d, other_d
+        self._nodes = nodes
         self._flags_d = allocate(device, 8)
         self._roots: Compacted | None = None
         self._passes = 0

@@ -99,7 +99,8 @@ class Triangles:
     def __init__(
         self, device: Device, part: MeshPart, first: int, camera: Camera, size: tuple[int, int], stopwatch: Stopwatch
     ):
-        self.device, self.part, self.first, self.stopwatch = device, part, first, stopwatch
+        self.device, self.part = device, part
+        self.first, self.stopwatch = first, stopwatch
         self._program = load_program(device, "rays/triangles.cl")
         width, height = size
         with stopwatch.timed("upload"):

@@ -117,7 +117,9 @@ class _Splats:
         has_normals: bool,
     ):
         camera, self.size, background, self.progress = shot
-        self.device, self.radius, self.lighting = device, np.float32(radius_mm), lighting
+        self.device = device
+        self.radius = np.float32(radius_mm)
+        self.lighting = lighting
         shading = "normals" if has_normals else "depths"
         self.shading = shading if lighting.shades else "none"
         self.table = eye_table(camera, self.size, lighting, np.zeros(3) if base is None else base)
@@ -240,7 +242,9 @@ def eye_table(camera: Camera, size: tuple[int, int], lighting: Lighting, base: F
 LONE_POINT_MM = 1.0
 """Radius of the discs of clouds that have no spacing; of others it is their mean spacing, which leaves few gaps."""
 
-_NOISE_COLOR, _KEPT_COLOR, _PLAIN_COLOR = "#707070", "#a0a0a0", "bone"
+_NOISE_COLOR = "#707070"
+_KEPT_COLOR = "#a0a0a0"
+_PLAIN_COLOR = "bone"
 
 DARKEST_SHARE = 1 / 3
 """Width that is added below the 1st percentile of the HU: that is a quarter of the way from black to white."""

@@ -309,7 +309,8 @@ class _Job(SlabPicture):
         self, slab: RaySlab, style: VolumeLook, output: PictureBuffers, between: Between | None = None
     ) -> None:
         """Blend a slab into the picture, and wait; of a part of the rays, `between`, write only the states."""
-        resident, device, stopwatch = self.resident, self.resident.device, self.stopwatch
+        resident, device = self.resident, self.resident.device
+        stopwatch = self.stopwatch
         key = (style.function, self.ray_step)
         tables = resident.keep("transfer function", key, 0, lambda: TransferTables.of(device, *key))
         with stopwatch.running(device):

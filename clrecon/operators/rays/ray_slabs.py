@@ -325,7 +325,8 @@ class SlabPicture(ABC):
     def __init__(
         self, resident: DeviceVolume, shot: Shot, ray_step: float, style: LabelStyle | None, warnings: list[str]
     ):
-        self.resident, self.shot, self.ray_step = resident, shot, ray_step
+        self.resident, self.shot = resident, shot
+        self.ray_step = ray_step
         self.labels = None if style is None else resident.bring(style.labels)
         self.warnings = [*warnings, *([] if self.labels is None else self.labels.warnings)]
         self.stopwatch = Stopwatch()
@@ -352,7 +353,9 @@ class SlabPicture(ABC):
 
     def draw_slabs(self, slices: int) -> tuple[Pixels, int]:
         """Return image, depths and means, and the number of slabs."""
-        nk, tell, number = self.resident.volume.shape_ijk[2], self.shot.progress, 0
+        nk = self.resident.volume.shape_ijk[2]
+        tell = self.shot.progress
+        number = 0
         output = PictureBuffers(self.resident.device, self.shot.size, self.shot.background, slices < nk)
         tell("slabs", 0, nk)
         for slab in self.slabs(slices):

@@ -120,7 +120,8 @@ class _Layers:
         stopwatch: Stopwatch,
     ):
         camera, size, *_ = self.shot = shot
-        self.device, self.size, self.stopwatch, self.near_mm = device, size, stopwatch, near_mm
+        self.device, self.size = device, size
+        self.stopwatch, self.near_mm = stopwatch, near_mm
         self.has_still = still is not None
         self.pixels = size[0] * size[1]
         self.program = load_program(device, "rays/layers.cl")
@@ -143,7 +144,8 @@ class _Layers:
         self.states_d, self.marks_d = allocate(device, 32 * self.pixels), allocate(device, 16 * self.pixels)
 
     def run(self, volume: Callable[[Between], None] | None, most: int) -> LayeredPicture:
-        device, (width, height), background = self.device, self.size, self.shot.background
+        device, (width, height) = self.device, self.size
+        background = self.shot.background
         with self.stopwatch.running(device):
             floors = {"floor_keys": self.keys.floor_keys_d, "floor_numbers": self.keys.floor_numbers_d}
             self._launch("clear_rays", pixels=self.pixels, **self._rays, **floors)

@@ -137,7 +137,9 @@ class _Overlay:
     """One picture: part after part of the slices, in the order in which rays cross them."""
 
     def __init__(self, resident: DeviceVolume, style: SlicesInSpace, shot: Shot, warnings: list[str]):
-        self.resident, self.style, self.shot, camera = resident, style, shot, shot.camera
+        self.resident, self.style = resident, style
+        self.shot = shot
+        camera = shot.camera
         self.chosen = choose_slices(resident.volume, style.slices)
         self.colors = _Colors.of(style)
         self.order = _sort_slices(resident.volume, camera, self.chosen)
@@ -195,7 +197,9 @@ class _Overlay:
 
     def _draw(self, part: Sequence[int], stage: int, output: PictureBuffers, between: Between | None = None) -> None:
         """Draw slices in the given order, and wait."""
-        resident, style, colors, view, stopwatch = self.resident, self.style, self.colors, self.view, self.stopwatch
+        resident, style = self.resident, self.style
+        colors, view = self.colors, self.view
+        stopwatch = self.stopwatch
         device, volume = resident.device, resident.volume
         places = np.zeros((len(part), 4), np.float32)
         places[:, :3] = FieldFrame.of(volume).places(volume.slice_origins()[list(part)])

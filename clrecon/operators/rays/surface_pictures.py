@@ -54,7 +54,8 @@ class _Job(SlabPicture):
         self, resident: DeviceVolume, rule: IsoRule, look: SurfaceLook, shot: Shot, ray_step: float, warnings: list[str]
     ):
         super().__init__(resident, shot, ray_step, look.label_style, warnings)
-        self.rule, self.look, self.style = rule, look, look.label_style
+        self.rule, self.look = rule, look
+        self.style = look.label_style
         self.planes = np.empty((0, 4)) if look.clip is None else look.clip.planes
         self.frame = FieldFrame.of(resident.volume)
 
@@ -82,7 +83,8 @@ class _Job(SlabPicture):
             self.ray_step = longest
 
     def draw(self, slab: RaySlab, output: PictureBuffers) -> None:
-        resident, rule, look = self.resident, self.rule, self.look
+        resident, rule = self.resident, self.rule
+        look = self.look
         device, volume = resident.device, resident.volume
         lanes, queues = int(device.kernel_variants["LANES"]), count_queues(device)
         variants, tables = self._tables(slab)

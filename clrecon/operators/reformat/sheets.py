@@ -116,7 +116,8 @@ class _Run:
     """One reformation: all rows through one part of the volume after another."""
 
     def __init__(self, resident: DeviceVolume, sheet: Sheet, samples: SlabSamples, combine: str, stopwatch: Stopwatch):
-        self.resident, self.sheet, self.samples = resident, sheet, samples
+        self.resident, self.sheet = resident, sheet
+        self.samples = samples
         self.device, self.volume = resident.device, resident.volume
         self.combine, self.stopwatch = combine, stopwatch
         self.places = _place_rows(self.volume, sheet, samples)
@@ -233,7 +234,8 @@ class CutJob:
     def __init__(
         self, resident: DeviceVolume, style: PlaneCut | CurveCut, progress: Progress, background: str | Sequence[float]
     ):
-        self.resident, self.style, self.progress, self.background = resident, style, progress, background
+        self.resident, self.style = resident, style
+        self.progress, self.background = progress, background
         self.samples = slab_samples(resident.volume, style.thickness)
         self.window = BONE_WINDOW if style.window is None else checked_window(style.window)
         self.stopwatch = Stopwatch()

@@ -60,7 +60,10 @@ _SMALLEST_SCALE, _LARGEST_SCALE = 0.001, 1.4
 WEIGHT_MM = 2.2
 """Width of the Gaussian of the samples' weights, at a scale of 1 mm."""
 
-INNER_SHARE, INNER_SPREAD, CORTEX_SPREAD, OUTER_SPREAD_HU = 0.25, 0.6, 0.15, 1000.0
+INNER_SHARE = 0.25
+INNER_SPREAD = 0.6
+CORTEX_SPREAD = 0.15
+OUTER_SPREAD_HU = 1000.0
 """What is expected before the fit: marrow has a quarter of the HU of cortex, within 0.6 of them; the cortex of a place
 lies within 15 % of that of the scan; tissue may be anything from air on."""
 
@@ -228,8 +231,10 @@ class WallProfiles:
     """
 
     def __init__(self, sampler: ProfileSampler, values_d: Any, count: int):
-        self._device, self._program, self._scale = sampler.device, sampler.program, sampler.scale
-        self._values_d, self._count, self._stride = values_d, count, stride_of(count)
+        self._device, self._program = sampler.device, sampler.program
+        self._scale = sampler.scale
+        self._values_d, self._count = values_d, count
+        self._stride = stride_of(count)
         self._weights_d = upload(self._device, self._scale.weights)
 
     def fit(
@@ -281,7 +286,8 @@ class ProfileSampler:
     """Samples profiles of a volume on a device, slab by slab where it does not fit as a whole; the same bits then."""
 
     def __init__(self, resident: DeviceVolume, stopwatch: Stopwatch):
-        self._resident, self._stopwatch, self.device = resident, stopwatch, resident.device
+        self._resident, self._stopwatch = resident, stopwatch
+        self.device = resident.device
         self.scale, self.frame = ProfileScale.of(resident.volume), StackFrame(resident.volume)
         with stopwatch.timed("build"):
             self.program = prepare_cortex(resident.device, resident.dtype)

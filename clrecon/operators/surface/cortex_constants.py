@@ -47,7 +47,9 @@ SEARCH_STEPS = (1.3, 1.12, 1.05)
 FARTHEST = 8.0
 """Factor by which a search leaves its start at most: a blur that nothing shows goes anywhere."""
 
-_THICK_SHARE, _CORTEX_STEP, _CLEARLY_LESS = 0.5, 1.03, 0.97
+_THICK_SHARE = 0.5
+_CORTEX_STEP = 1.03
+_CLEARLY_LESS = 0.97
 """Where this share of the walls is thick, the cortex is what leaves least of the profiles, in steps of the second from
 what they show on: their percentile holds noise, which the blurs follow, and it them (11 % too much at 40 HU)."""
 
@@ -56,12 +58,18 @@ _DIFFERENT, _ALIKE = 0.1, 0.02
 """Components with the first share of a surface's vertices are looked at by themselves, and have constants of their own
 if their compact bone differs from that of all by the second, and if one fit shows it to differ by the third."""
 
-_THICK_BLURS, _SHARP, _WIDE_SPREAD, _DENSE_PERCENTILE, _FEWEST_THICK = 2.0, 1.25, 0.3, 75.0, 12
+_THICK_BLURS = 2.0
+_SHARP = 1.25
+_WIDE_SPREAD = 0.3
+_DENSE_PERCENTILE = 75.0
+_FEWEST_THICK = 12
 """Walls thicker than so many blurs show their HU where the blur is at most the second times that within the slices, if
 the fit leaves the cortex free within the third; of these the percentile, since walls differ and blur only ever lowers
 them."""
 
-_LEAST_BLUR_ERROR, _LEAST_CORTEX_ERROR, _THIN_CORTEX_ERROR = 0.02, 0.05, 0.3
+_LEAST_BLUR_ERROR = 0.02
+_LEAST_CORTEX_ERROR = 0.05
+_THIN_CORTEX_ERROR = 0.3
 """Shares below which constants are not known: phantoms differ from their own by as much.  The third holds where all
 walls are so thin that blur and density are one."""
 

@@ -380,7 +380,9 @@ def fit_meshes(meshes: Sequence[Mesh], resident: DeviceVolume, *, progress: Prog
 
     Those that show none stay as they are, with ``{"reason": words}`` in place of figures; that none does is an error.
     """
-    constants, fitted, refused = None, list(meshes), []
+    constants = None
+    fitted = list(meshes)
+    refused = []
     for row in sorted(range(len(meshes)), key=lambda row: -meshes[row].vertex_count):
         try:
             for attempt in resident.with_fallback():

@@ -66,7 +66,8 @@ def voxel_level(device: Device, volume: Volume, rule: IsoRule) -> Any:
 
 def _voxel_levels(device: Device, volume: Volume, rule: IsoRule) -> tuple[Any, ...]:
     """Return the same and, for a range, the highest inside value."""
-    level, highest, dtype = voxel_level(device, volume, rule), rule.highest_inside, volume.voxels.dtype
+    level = voxel_level(device, volume, rule)
+    highest, dtype = rule.highest_inside, volume.voxels.dtype
     if highest is None:
         return (level,)
     if dtype.kind == "f":
@@ -134,7 +135,8 @@ class Extraction:
 
     def run(self, progress: Progress) -> Part:
         """Build the kernels, and process the grid, as many slices at a time as fit the device."""
-        rule, volume, gk = self.grid.rule, self.grid.volume, self.grid.shape[2]
+        rule, volume = self.grid.rule, self.grid.volume
+        gk = self.grid.shape[2]
         progress("build", 0, 1)
         with self.stopwatch.timed("build"):
             prepare_isosurface(

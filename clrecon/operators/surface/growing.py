@@ -57,7 +57,8 @@ def _look_for_cell(
     device: Device, grid: SampleGrid, classified: Classified, point: NDArray[np.float64], reach: float
 ) -> tuple[tuple[int, int, int], float] | None:
     """Return the cell and how far it is; cells farther than `reach` may be missed."""
-    volume, (gi, gj, gk), border = grid.volume, grid.shape, grid.rule.border
+    volume, (gi, gj, gk) = grid.volume, grid.shape
+    border = grid.rule.border
     normal = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
     heights = np.abs((volume.slice_origins(border) - point) @ (normal / np.linalg.norm(normal)))
     near = np.flatnonzero(heights <= reach)
@@ -268,7 +269,8 @@ class _Search:
     """Components of the active cells of one grid."""
 
     def __init__(self, resident: DeviceVolume, grid: SampleGrid, classified: Classified):
-        self.resident, self.grid, self.classified = resident, grid, classified
+        self.resident, self.grid = resident, grid
+        self.classified = classified
         self.device = resident.device
         self.program = prepare_growing(self.device)
         gi, gj, gk = grid.shape

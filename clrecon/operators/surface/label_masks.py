@@ -308,7 +308,8 @@ class StartedMesh:
     def enclosed_mm3(self, level: int) -> float:
         """Return the volume that the mesh encloses at a level: the device sums pieces, the host the rest."""
         self.place(level)
-        device, stopwatch, placement = self.run.device, self.run.stopwatch, self.run.placement
+        device, stopwatch = self.run.device, self.run.stopwatch
+        placement = self.run.placement
         middle = [[(part.start + part.stop - 1) / 2 for part in self.box[::-1]]]
         centre = np.zeros(4, np.float32)
         centre[:3] = self.run.labels.ijk_to_lps(middle)[0]

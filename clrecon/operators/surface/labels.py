@@ -146,7 +146,8 @@ class ExtractionByLabel(Generic[Held, Made]):
 
     def check_output(self, window: Window, counted: Counted) -> None:
         """Refuse a mesh that does not fit beside the other buffers; record the memory of the label."""
-        needs, scratch, output = self._needs(window), window.scratch(), counted.output()
+        needs, scratch = self._needs(window), window.scratch()
+        output = counted.output()
         check_budget(self.device, {**needs, **output}, self.memory, less_may_fit=True)
         self.device_bytes = {
             "volume": sum(needs.values()) - sum(scratch.values()),
@@ -233,7 +234,8 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
 
     def hold(self, boxes: dict[int, Box]) -> HeldSlices:
         """Upload the slices that the labels need, and find which samples are inside of which label."""
-        device, stopwatch, resident = self.device, self.stopwatch, self.resident
+        device, stopwatch = self.device, self.stopwatch
+        resident = self.resident
         first, end = self.slices_for(boxes)
         check_budget(device, self.needs(first, end), resident.memory)
         label_program, _ = self.programs()

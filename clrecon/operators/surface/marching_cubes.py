@@ -252,8 +252,10 @@ class Emission:
         self, device: Device, slab: Slab, program: Program, voxels_d: Any, classified: Classified, counted: Counted,
         placement: Placement, stopwatch: Stopwatch,
     ):  # fmt: skip
-        self._device, self._slab, self._program, self._stopwatch = device, slab, program, stopwatch
-        self._voxels_d, self._classified, self._counted, self._placement = voxels_d, classified, counted, placement
+        self._device, self._slab = device, slab
+        self._program, self._stopwatch = program, stopwatch
+        self._voxels_d, self._classified = voxels_d, classified
+        self._counted, self._placement = counted, placement
         self.frames_d = upload(device, placement.slice_frames[slab.first : slab.first + slab.mask_slices])
         self.steps_d = upload(device, placement.steps)
         self._positions, self.positions_d = empty_output(device, (counted.vertices, 3), np.float32)

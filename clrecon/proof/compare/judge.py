@@ -34,7 +34,8 @@ class Judge:
     def __init__(self, message: Mapping[str, Any]):
         self._folder = Path(message["folder"])
         self._reference: str | None = message["reference"]
-        self._level, self._closed, self._truth = float(message["iso_value"]), bool(message["closed"]), message["truth"]
+        self._level, self._closed = float(message["iso_value"]), bool(message["closed"])
+        self._truth = message["truth"]
         self._volume = load_volume(self._folder)
 
     @cached_property

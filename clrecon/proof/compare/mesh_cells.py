@@ -211,7 +211,8 @@ def _steps_per_mm(grid: Grid) -> float:
 
 def _check_place(ijk: NDArray[np.float64], grid: Grid) -> None:
     """Refuse a mesh that reaches farther beyond the grid than the grid is large: its cells could be any number."""
-    low, high, size = ijk.min(axis=0), ijk.max(axis=0), np.array(grid.shape_ijk) + 1
+    low, high = ijk.min(axis=0), ijk.max(axis=0)
+    size = np.array(grid.shape_ijk) + 1
     if (low < -size).any() or (high > 2 * size).any():
         raise UsageError(
             f"the mesh does not belong to this grid: it runs from {low.round(1).tolist()} to"
@@ -242,7 +243,8 @@ def _cells_of(triangles: Triangles, margin: float) -> Iterator[IntArray]:
         many = count > _MOST_CANDIDATES
         # four triangles between corners and middles of edges of each
         a, b, c = (corners[many][:, corner] for corner in range(3))
-        ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+        ab, bc = 0.5 * (a + b), 0.5 * (b + c)
+        ca = 0.5 * (c + a)
         parts = [np.stack(part, axis=1) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
         corners, owner = np.stack(parts, axis=1).reshape(-1, 3, 3), np.repeat(owner[many], 4)
     # Slivers along an edge between cells reach farther into none of them than coordinates are rounded.

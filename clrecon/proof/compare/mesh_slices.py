@@ -185,7 +185,8 @@ def _count_overlap(
         )
     if len(odd):
         mesh, hu = (keys[~np.isin(lattice.row_of(keys), odd)] for keys in (mesh, hu))
-    inside, wanted, apart = count_points(mesh), count_points(hu), count_points(exclusive_or(mesh, hu))
+    inside, wanted = count_points(mesh), count_points(hu)
+    apart = count_points(exclusive_or(mesh, hu))
     return _Counts(inside, wanted, (inside + wanted - apart) // 2, len(odd))
 
 
@@ -231,7 +232,8 @@ def _pierce(corners: Float64Array, shape_ijk: tuple[int, int, int]) -> IntArray:
     order = np.argsort(corners[:, :, 2], axis=1, kind="stable")
     a, b, c = (corners[np.arange(len(corners)), order[:, n]] for n in range(3))
     row, plane = _spread_rows(*(_first_from(end[:, 2], nk) for end in (a, c)))
-    a, b, c = a[row], b[row], c[row]
+    a, b = a[row], b[row]
+    c = c[row]
     upper = (plane >= b[:, 2])[:, None]
     first = _points_at(a, c, plane, 2)
     second = _points_at(np.where(upper, b, a), np.where(upper, c, b), plane, 2)

@@ -195,7 +195,9 @@ def find_cut_cells(
     cells = np.array(grid.shape_ijk) + 1  # with the border: from -1 on
     counts = -(-cells // _BLOCK)
     low = np.stack(np.meshgrid(*(np.arange(n) * _BLOCK for n in counts), indexing="ij"), axis=-1).reshape(-1, 3) - 1
-    edge, asked, report = _BLOCK, 0, progress or ignore_progress
+    edge = _BLOCK
+    asked = 0
+    report = progress or ignore_progress
     while True:
         report("truth", asked, 0)
         low = low[(low < cells - 1).all(axis=1)]

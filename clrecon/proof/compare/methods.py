@@ -13,7 +13,9 @@ from clrecon.jobs.options import InputSettings, closed_option, hu_option, iso_pr
 from clrecon.system.arguments import name_parameter
 from clrecon.system.options import option
 
-MESH, CLOUD, PICTURE = "mesh", "cloud", "picture"
+MESH = "mesh"
+CLOUD = "cloud"
+PICTURE = "picture"
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,9 @@ def _set_ranges(axes: Any, across: Sequence[float], up: Sequence[float]) -> None
     axes.set_xticks([], minor=True)
 
 
-LINE, WIDE, ASIDE = 11.5, 60.0, 12.0
+LINE = 11.5
+WIDE = 60.0
+ASIDE = 12.0
 """Points between lines of names; how far apart points share no column of names; and how far names are beside them."""
 
 

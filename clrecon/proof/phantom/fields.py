@@ -45,7 +45,8 @@ def ellipse(x: Field, y: Field, half_x: float | Field, half_y: float | Field) ->
 
 
 def ellipsoid(x: Field, y: Field, z: Field, half: Point) -> Field:
-    u, v, w = x / half[0], y / half[1], z / half[2]
+    u, v = x / half[0], y / half[1]
+    w = z / half[2]
     radius = np.sqrt(u * u + v * v + w * w)
     slope = np.sqrt((u / half[0]) ** 2 + (v / half[1]) ** 2 + (w / half[2]) ** 2)
     return np.asarray((1.0 - radius) * (radius + 1e-3) / (slope + 1e-3 / min(half)), dtype=x.dtype)
@@ -56,10 +57,13 @@ def capsule(
 ) -> Field:
     """Distance to a rod from `a` to `b`, its radii `radius_a` and `radius_b`, its height its width / `flatten`."""
     x, y, z = points
-    ax, ay, az = a[0], a[1], a[2] * flatten
-    dx, dy, dz = b[0] - ax, b[1] - ay, b[2] * flatten - az
+    ax, ay = a[0], a[1]
+    az = a[2] * flatten
+    dx, dy = b[0] - ax, b[1] - ay
+    dz = b[2] * flatten - az
     length2 = dx * dx + dy * dy + dz * dz
-    px, py, pz = x - np.float32(ax), y - np.float32(ay), z * np.float32(flatten) - np.float32(az)
+    px, py = x - np.float32(ax), y - np.float32(ay)
+    pz = z * np.float32(flatten) - np.float32(az)
     along = px * np.float32(dx / length2)
     along += py * np.float32(dy / length2)
     along += pz * np.float32(dz / length2)

@@ -383,7 +383,8 @@ def plan_hand() -> Plan:
 
 def plan_hip() -> Plan:
     """Plan the left hip of a slim person: a stem in the femur and a head of metal in a socket of bone."""
-    head, neck, tip = (-16.0, 0.0, 22.0), (16.0, 4.0, -4.0), (14.0, 6.0, -38.0)
+    head, neck = (-16.0, 0.0, 22.0), (16.0, 4.0, -4.0)
+    tip = (14.0, 6.0, -38.0)
     ilium = [(-18.0, 8.0, 44.0), (-26.0, 16.0, 140.0)]
     parts = [
         column("tissue", FAT_HU, (0.0, 2.0), (74.0, 64.0)),

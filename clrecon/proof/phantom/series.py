@@ -190,9 +190,12 @@ def _make_header(settings: PhantomSettings, placement: Placement, phase: int) ->
     header.SamplesPerPixel, header.PhotometricInterpretation = 1, "MONOCHROME2"
     header.Rows, header.Columns = rows, columns
     header.PixelSpacing = placement.pixel_spacing
-    header.BitsAllocated, header.BitsStored, header.HighBit, header.PixelRepresentation = 16, 16, 15, 1
+    header.BitsAllocated, header.BitsStored = 16, 16
+    header.HighBit, header.PixelRepresentation = 15, 1
     header.WindowCenter, header.WindowWidth = "300", "1500"
-    header.RescaleIntercept, header.RescaleSlope, header.RescaleType = str(RESCALE_INTERCEPT), "1", scanner.unit
+    header.RescaleIntercept = str(RESCALE_INTERCEPT)
+    header.RescaleSlope = "1"
+    header.RescaleType = scanner.unit
     return header
 
 

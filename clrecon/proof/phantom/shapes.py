@@ -290,10 +290,13 @@ def choose_body(affine: NDArray[np.float64], settings: PhantomSettings) -> Body:
     body: Body
     if settings.kind == "sphere":
         radius = given if given is not None else 0.7 * reach
-        body, extent, thinnest = Sphere(centre, radius), radius, 2.0 * radius
+        body = Sphere(centre, radius)
+        extent = radius
+        thinnest = 2.0 * radius
     elif settings.kind == "torus":
         radius = given if given is not None else 0.6 * reach
-        body, extent, thinnest = Torus(centre, _AXIS_LPS, radius, 0.4 * radius), 1.4 * radius, 0.8 * radius
+        body = Torus(centre, _AXIS_LPS, radius, 0.4 * radius)
+        extent, thinnest = 1.4 * radius, 0.8 * radius
     elif settings.kind == "cylinder":
         radius = given if given is not None else 0.4 * reach
         body = Cylinder(centre, _AXIS_LPS, radius, 3.0 * radius)

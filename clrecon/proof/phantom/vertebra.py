@@ -120,7 +120,8 @@ def _axis(vertebra: Vertebra, side: Field, y: Field, z: Field) -> tuple[Field, l
 
 def _typical(vertebra: Vertebra, side: Field, y: Field, z: Field) -> tuple[Field, list[Field]]:
     """C3 to C7: uncinate processes, pillars, forked transverse processes; C7 alone has one long spinous tip."""
-    half_x, half_y, half_z = vertebra.width / 2.0, vertebra.depth / 2.0, vertebra.height / 2.0
+    half_x, half_y = vertebra.width / 2.0, vertebra.depth / 2.0
+    half_z = vertebra.height / 2.0
     wide, middle = vertebra.canal_half_width, half_y + vertebra.canal_half_depth
     rear = middle + vertebra.canal_half_depth
     last = vertebra.name == "C7"
@@ -184,7 +185,8 @@ def canal_distance(vertebra: Vertebra, x: Field, y: Field) -> Field:
 
 def _body_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
     """Return the distance to a waisted elliptic cylinder with slightly hollow endplates and a flattened back."""
-    half_x, half_y, half_z = vertebra.width / 2.0, vertebra.depth / 2.0, vertebra.height / 2.0
+    half_x, half_y = vertebra.width / 2.0, vertebra.depth / 2.0
+    half_z = vertebra.height / 2.0
     level = np.minimum(np.abs(z) / np.float32(half_z), 1.2)
     # 9 % waist at mid height, a small lip at the rims
     girth = np.float32(0.91) + np.float32(0.09) * level * level
@@ -203,7 +205,8 @@ def _mix(thoracic: tuple[float, ...], lumbar: tuple[float, ...], share: float) -
 def _arch_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
     """Return the distance to pedicles, laminae and all processes; |x| serves both sides."""
     side = np.abs(x)
-    wide, deep, high = vertebra.canal_half_width, vertebra.canal_half_depth, vertebra.height
+    wide, deep = vertebra.canal_half_width, vertebra.canal_half_depth
+    high = vertebra.height
     middle = vertebra.depth / 2.0 + deep
     rear = middle + deep
     lumbar = vertebra.lumbar

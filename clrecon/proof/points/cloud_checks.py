@@ -97,7 +97,8 @@ def _check_clusters(device: Device) -> str:
 
 def _check_passes(device: Device) -> str:
     """Compare links within chunks, the roots of words, and the forecast of pairs; chunks are small here."""
-    points, samples, per_chunk = scattered_points(20_000), 3, 32
+    points = scattered_points(20_000)
+    samples, per_chunk = 3, 32
     plan = plan_cells(points, EPS)
     device_grid, grid = fill_grid(device, plan), grid_twin.make_grid(points, float(plan.edge))
     search = ClusterSearch(device, device_grid, EPS, samples, per_chunk)
@@ -302,7 +303,8 @@ def _fetch(masks: Masks, mask_d: Any) -> NDArray[np.bool_]:
 def _check_field(device: Device) -> str:
     points, normals = _two_balls()
     field = NodeField(device, points, normals, SETTINGS)
-    nodes, masks, h = field.nodes, field.masks, SETTINGS.spacing
+    nodes, masks = field.nodes, field.masks
+    h = SETTINGS.spacing
     expected = twin.measure_field(
         points, normals, nodes.corner, h, nodes.shape, reach=SETTINGS.reach, smoothing=SETTINGS.smoothing
     )

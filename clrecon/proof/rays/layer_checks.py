@@ -46,7 +46,9 @@ TRIANGLES, SPLIT = 660, 90
 """All triangles, every seventh of which fills a quarter of the picture; from `SPLIT` on they are opaque."""
 
 OPACITY = 0.35
-COLOR_255, DEPTH_MM, EDGE_SHARE = 2.0, 1e-3, 0.01
+COLOR_255 = 2.0
+DEPTH_MM = 1e-3
+EDGE_SHARE = 0.01
 _BETWEEN_255 = 3.5
 """As COLOR_255, and the hundredth behind what is nearly opaque, which rays leave out."""
 
@@ -92,7 +94,8 @@ def _blend_layers(
     every = Meetings(pixels[order], numbers[order], depths[order], shares[order])
     triangles = np.concatenate([mesh.triangles, [[0, 1, 2]]])
     color, opacity = np.zeros((height, width, 3)), np.zeros((height, width))
-    first, depth_sum, layers = np.full((height, width), np.nan), np.zeros((height, width)), []
+    first, depth_sum = np.full((height, width), np.nan), np.zeros((height, width))
+    layers = []
     for layer in range(int(np.bincount(pixels).max())):
         places = np.where(opacity < 1.0, nth_layer(every, layer, SIZE), -1)
         assert mesh.normals is not None
@@ -175,7 +178,8 @@ def _screen(volume: Volume, camera: Camera) -> tuple[Mesh, Clip, Clip]:
 
 def _check_between(device: Device, slices: bool) -> str:
     """Show a volume with a translucent screen across it: the twin's part before it, the screen, and the part behind."""
-    worst, opacity, color = 0.0, 0.4, np.array([0.2, 0.9, 0.4])
+    worst, opacity = 0.0, 0.4
+    color = np.array([0.2, 0.9, 0.4])
     function = TransferFunction([(-300, 0.9, 0.2, 0.1, 0.0), (200, 1, 0.7, 0.4, 0.15), (900, 1, 1, 0.9, 0.6)])
     screen = MeshLook(tuple(color.tolist()), opacity=opacity, lighting=UNSHADED)
     for perspective in (False, True):

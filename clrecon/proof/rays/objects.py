@@ -50,7 +50,8 @@ def find_splats(
             j, i = at_y[on].astype(int), at_x[on].astype(int)
             # Sorted with the best point of each pixel last: numpy keeps the last value that is assigned.
             order = np.lexsort((-number, -z[number]))
-            j, i, number = j[order], i[order], number[order]
+            j, i = j[order], i[order]
+            number = number[order]
             nearer = (z[number] < best[j, i]) | ((z[number] == best[j, i]) & (number < first[j, i]))
             best[j[nearer], i[nearer]] = z[number[nearer]]
             first[j[nearer], i[nearer]] = number[nearer]

@@ -135,10 +135,13 @@ def _check_leaps(device: Device) -> str:
 
 def _check_tiles(device: Device) -> str:
     """Look at a stair of bright voxels, straight on: each tile begins before it, at most a few bricks."""
-    nk, nj, ni = 90, 64, 80
+    nk, nj = 90, 64
+    ni = 80
     stair = 30 + np.arange(ni) // 2
     voxels = np.where(np.arange(nk)[:, None, None] >= stair, 1000, np.zeros((nk, nj, ni))).astype(np.int16)
-    size, distance, stopwatch = (ni * TILE, nj * TILE), 50.0, Stopwatch()
+    size = (ni * TILE, nj * TILE)
+    distance = 50.0
+    stopwatch = Stopwatch()
     for uneven in (False, True):
         volume = stack(voxels, np.eye(4), uneven=uneven)
         resident, slab = _open_slab(device, volume)
@@ -352,7 +355,8 @@ def _check_slices(device: Device) -> str:
 
 def _check_points(device: Device) -> str:
     """Draw a ball of points, with normals and without: each pixel shows the point that the twin finds."""
-    rng, radius, worst = np.random.default_rng(25), 0.6, 0.0
+    rng = np.random.default_rng(25)
+    radius, worst = 0.6, 0.0
     normals = rng.normal(size=(3000, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     points, colors = (6.0 * normals).astype(np.float32), rng.integers(0, 256, (3000, 4)).astype(np.uint8)

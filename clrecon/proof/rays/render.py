@@ -42,7 +42,8 @@ class Box:
     """
 
     def __init__(self, normals: Float64Array, offsets: Float64Array, low: Float64Array, high: Float64Array):
-        self.normals, self.offsets, self.low, self.high = normals, offsets, low, high
+        self.normals, self.offsets = normals, offsets
+        self.low, self.high = low, high
 
 
 def box_of(volume: Volume, border: float = 0.5) -> Box:
@@ -335,7 +336,8 @@ def _composite(
             t, values, opacity = steep.take_parts(number, ray, t, length, values, opacity)
         opacity = np.where(there, opacity, 0.0)
         seen = opacity > 0.0
-        ray, t, length, opacity = ray[seen], t[seen], length[seen], opacity[seen]
+        ray, t = ray[seen], t[seen]
+        length, opacity = length[seen], opacity[seen]
         colour = look_up(transfer_function, values[seen])[:, :3]
         ijk, _ = rays.places(ray, t)
         slope = sample_field(gradients, ijk)
@@ -359,7 +361,8 @@ class _SteepSegments:
     """Divides segments where the transfer function is steep, by a parabola through three samples, and blends them."""
 
     def __init__(self, rays: _Rays, function: TransferFunction, step: float, part: Float64Array):
-        self.rays, self.function, self.step, self.part = rays, function, step, part
+        self.rays, self.function = rays, function
+        self.step, self.part = step, part
         low, high = function.range_hu
         self.low, self.scale = low, (TABLE_NODES - 1) / (high - low)
         table = function.table(low, high, TABLE_NODES)[:, 3].astype(np.float64)
@@ -403,7 +406,8 @@ class _SteepSegments:
         dense = 1.0 - self.clear[self.nodes(here)] > DENSE
         steep = (here + most >= self.first) & (here + least < self.last)
         steep &= ((most - least > self.steepness.narrow) & (change > STEEP)) | dense
-        clear, seen_at, seen_value = np.ones(len(ray)), np.zeros(len(ray)), np.zeros(len(ray))
+        clear = np.ones(len(ray))
+        seen_at, seen_value = np.zeros(len(ray)), np.zeros(len(ray))
         for share in (np.arange(PARTS) + 0.5) / PARTS - 0.5:
             end = (2.0 if number else 1.0) * front if share < 0.0 else 2.0 * back
             rise = np.clip(share * (back - front + share * (back + front)), np.minimum(end, 0.0), np.maximum(end, 0.0))

@@ -30,7 +30,8 @@ class _ClosedField:
     def __init__(self, volume: Volume, iso_value: float):
         rule = choose_iso_rule(volume, iso_value)
         voxels = volume.voxels.astype(np.float64)
-        self.volume, self.level, self.outside = volume, rule.iso_level, rule.outside
+        self.volume = volume
+        self.level, self.outside = rule.iso_level, rule.outside
         self.closed = np.pad(voxels, 1, constant_values=rule.outside)
         wider = np.pad(voxels, 2, constant_values=rule.outside)
         matrices = slice_normal_matrices(volume, 2)

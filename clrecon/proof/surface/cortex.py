@@ -65,7 +65,8 @@ def sample_profiles(
 def find_wall(profiles: Float64Array, rise: float) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64Array]:
     """Return the first and the last sample that belong to the wall of each profile, and its highest value."""
     count = profiles.shape[1]
-    first, last, peak = np.full(count, CENTRE), np.full(count, CENTRE), np.full(count, np.nan)
+    first, last = np.full(count, CENTRE), np.full(count, CENTRE)
+    peak = np.full(count, np.nan)
     for row in range(count):
         y = profiles[:SAMPLES, row]
         if np.isnan(y[CENTRE]):

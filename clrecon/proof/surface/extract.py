@@ -261,8 +261,10 @@ def build_surface(
     cells_wanted: ndarray, shape (gk - 1, gj - 1, gi - 1), bool. Cells whose triangles are wanted, of the topology
         "separated"; vertices of no triangle are left out then.
     """
-    (k, j, i), (k1, j1, i1), axis, numbers = edges.near, edges.far, edges.axis, edges.numbers
-    t, slope, next_slope = places.t, places.slope.copy(), places.next_slope.copy()
+    (k, j, i), (k1, j1, i1) = edges.near, edges.far
+    axis, numbers = edges.axis, edges.numbers
+    t = places.t
+    slope, next_slope = places.slope.copy(), places.next_slope.copy()
     field = sample_grid(volume, rule, rule.border)
     margins, layers = vertex_margin(volume, rule.border), layer_margins(volume, rule.border)
     step = np.eye(3, dtype=np.int64)[axis]
@@ -292,7 +294,8 @@ def build_surface(
     normals = -up / np.linalg.norm(up, axis=1, keepdims=True)
     if cells_wanted is not None:
         used, left = np.unique(triangles, return_inverse=True)
-        positions, normals, triangles = positions[used], normals[used], left.reshape(-1, 3).astype(np.uint32)
+        positions, normals = positions[used], normals[used]
+        triangles = left.reshape(-1, 3).astype(np.uint32)
     if is_left_handed(volume.affine):
         triangles = triangles[:, ::-1].copy()
     return positions, normals, triangles

@@ -31,7 +31,8 @@ def own_labels(labels: NDArray[Any], volume: Volume, grow_mm: float | None) -> N
     lowest of equally near ones; None: the nearest, in mm, among its 26 neighbours.
     """
     growth = Growth.of(volume, grow_mm)
-    offsets, shells, reach = growth.offsets, growth.shells, growth.reach
+    offsets, shells = growth.offsets, growth.shells
+    reach = growth.reach
     owner = labels.astype(np.uint16)
     none = 65_536
     padded = np.pad(labels.astype(np.int64), [(n, n) for n in reach[::-1]])

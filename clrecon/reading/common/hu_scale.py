@@ -71,7 +71,9 @@ class ValueSample:
         return ValueSample(values) if len(values) >= _LEAST_SAMPLE else None
 
 
-_SMOOTHING, _FINEST_BIN, _MOST_BINS = 20.0, 5.0, 8000
+_SMOOTHING = 20.0
+_FINEST_BIN = 5.0
+_MOST_BINS = 8000
 """Standard deviation of the smoothing and width of a bin, HU; of wider ranges the bins get wider."""
 _TAILS = 0.0005
 """Share of the values that is left out at either end."""
@@ -157,7 +159,9 @@ _BELOW_AIR_HU, _MOST_BEYOND = 150, 0.002
 """So far below the peak of air is at most this share, and so it is in other ranges that a shift leaves empty."""
 
 _INTERCEPT_HU, MISSING = 1024, "the rescale intercept seems to be missing"
-LEAST_SHARE, _LEAST_TISSUE, _TISSUE_PART = 0.02, 0.1, 0.6
+LEAST_SHARE = 0.02
+_LEAST_TISSUE = 0.1
+_TISSUE_PART = 0.6
 """Least share of air (within 100 HU) and, for a shift by `_INTERCEPT_HU`, of soft tissue (within 150 HU): of all
 values, and of those as dense or denser.  Brain and its skull are no air and soft tissue."""
 _LEAST_OFFSET_TISSUE = 0.05
@@ -169,14 +173,19 @@ _LEAST_HEIGHT = 0.1
 _LEAST_RAW_HU = -300
 """Stored values without their intercept are not negative; soft tissue and fat alone are not below this."""
 
-FAINT_HU, _FAINT_SHARE, _MOST_DENSE = (-800, -200), 0.05, 0.03
+FAINT_HU = (-800, -200)
+_FAINT_SHARE = 0.05
+_MOST_DENSE = 0.03
 """Range and share of soft tissue where the slope is too small, and the largest share above `TISSUE_HU` begins."""
 _STRETCHED_HU = 300
 """Soft tissue where the slope is too large lies above this value."""
 
 _CALMED, _RING = 3, 2
 """Width of the mean that takes the noise out of a slice, and distance of the ring round what is dense, voxels."""
-_LEAST_CORE, DENSER, ALIKE, _NEAR_AIR = 0.01, 0.2, 0.2, 0.3
+_LEAST_CORE = 0.01
+DENSER = 0.2
+ALIKE = 0.2
+_NEAR_AIR = 0.3
 """Least share of a body that is denser than soft tissue, by how much, how much soft tissue varies, and how far up from
 air the border of a body reaches: shares of the step from air to soft tissue."""
 WIDER, _WIDEST_TISSUE = 1.3, 0.4
@@ -216,7 +225,8 @@ class Layers:
         """Return how far what is around dense parts lies from `tissue`; None where it is something else."""
         self._calm = self._calm or [_calm(self.voxels[k]) for k in sample_slices(len(self.voxels))]
         step = tissue - air
-        core, body, ring = 0, 0, []
+        core, body = 0, 0
+        ring = []
         for picture in self._calm:
             dense = picture > tissue + DENSER * step
             core += int(np.count_nonzero(dense))

@@ -37,7 +37,9 @@ _MOST_ALIKE, _LEAST_ALIKE = 12, 4
 _MOST_ALIKE_PART, _LEAST_ALIKE_PART = 20, 6
 HU_RANGE = (-1000, 2000)
 """Values are limited to this range; beyond are padding and metal.  Sums over a cell then fit 16 bits."""
-_CELL, _FINE_CELL, _COARSE_CELLS = 4, 2, 32
+_CELL = 4
+_FINE_CELL = 2
+_COARSE_CELLS = 32
 """Pixels along the side of an averaged cell: `_CELL` where that gives `_COARSE_CELLS` along a side, else fewer."""
 FEWEST_CELLS = 64
 """Least number of cells; in smaller pictures differences are due to chance."""
@@ -187,10 +189,15 @@ _LEAST_EXCHANGE, _MOST_EXCHANGES = 1.25, 2
 """How much less alike two slices in each other's place are to their neighbours there, and most pairs of them: more are
 two volumes.  Five scans, whole and with every 2nd, 3rd and 5th slice: at most 1.01; exchanged 1.5 to 3 where slices lie
 up to 4 mm apart."""
-FEWEST_SLICES, _FEWEST_SAMPLES, SAMPLES, _FEWEST_MOVED = 6, 512, 64, 25
+FEWEST_SLICES = 6
+_FEWEST_SAMPLES = 512
+SAMPLES = 64
+_FEWEST_MOVED = 25
 """Fewest slices and samples of a slice that are compared, most samples along a side, and fewest that must differ:
 square of the sum of their differences by the sum of the squares."""
-_WRONG_ROW, _NARROWEST, PICTURES = 4.0, 16, 4
+_WRONG_ROW = 4.0
+_NARROWEST = 16
+PICTURES = 4
 """How much less alike pixels of neighbouring rows are than those of a row, and than those of rows as long as columns
 are; least pixels along a side, and pictures looked at."""
 
@@ -255,9 +262,11 @@ def _has_swapped_sides(voxels: NDArray[Any]) -> bool:
     nk, nj, ni = voxels.shape
     if min(nj, ni) < _NARROWEST or nj % ni == 0 or ni % nj == 0:
         return False
-    beside, across, below = 0.0, 0.0, 0.0
+    beside, across = 0.0, 0.0
+    below = 0.0
     for picture in voxels[:: -(-nk // PICTURES)]:
         flat = np.clip(picture, *HU_RANGE).astype(np.float32).ravel()
         apart = [float(np.square(flat[lag:] - flat[:-lag]).mean()) for lag in (1, nj, ni)]
-        beside, across, below = beside + apart[0], across + apart[1], below + apart[2]
+        beside, across = beside + apart[0], across + apart[1]
+        below = below + apart[2]
     return below > _WRONG_ROW * max(beside, across) and across * _WRONG_ROW > beside

@@ -103,7 +103,10 @@ _ROUND = 0.03
 """Largest difference of the four radii along the middle row and column, as a share of the radius."""
 _OUTSIDE, _RIM = 1.03, (0.9, 0.97)
 """Where all voxels have the value, and where hardly any has it, in radii."""
-_LEAST_PART, _LEAST_OUTSIDE, _MOST_IN_RIM, FEWEST_VALUES = 0.05, 0.999, 0.05, 16
+_LEAST_PART = 0.05
+_LEAST_OUTSIDE = 0.999
+_MOST_IN_RIM = 0.05
+FEWEST_VALUES = 16
 """Least share of a slice that lies outside, least share of it that has the value, largest share of the rim that has it,
 and fewest values there."""
 

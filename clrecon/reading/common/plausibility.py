@@ -67,7 +67,9 @@ _FEWEST_BITS = 9
 """An image of 8 bits or fewer has edges from the lowest to the highest value."""
 _CLOSE = 0.125
 """Neighbours this share of the range apart are close."""
-_FEWEST_JUMPS, JUMPS, FEWEST_VALUES = 50, 4, 8
+_FEWEST_JUMPS = 50
+JUMPS = 4
+FEWEST_VALUES = 8
 """Fewest pairs of neighbours that are close only if they are read the other way, how many times those that are close as
 they were read, and fewest different values of theirs: a mask has two."""
 
@@ -76,7 +78,9 @@ def judge_sign(voxels: NDArray[Any], facts: PixelFacts, slices: Sequence[StoredV
     """Judge the gate ``stored_sign`` by the sampled slices of a volume (nk, nj, ni); `slices` in the order of k."""
     if not slices:
         return unmeasured("stored_sign", 0, None, f"{_SIGN_SAID}: the values are no whole numbers")
-    close, jumps, pairs, first = 0, 0, [], slices[0]
+    close, jumps = 0, 0
+    pairs = []
+    first = slices[0]
     for k in sample_slices(len(slices)):
         header = slices[k]
         span = header.slope * 2.0**header.bits_stored

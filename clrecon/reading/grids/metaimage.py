@@ -121,7 +121,8 @@ class _Header:
     """The fields of a header, checked before any library sees them."""
 
     def __init__(self, fields: dict[str, str], name: str, purpose: str):
-        self.fields, self.name, self.purpose = fields, name, purpose
+        self.fields, self.name = fields, name
+        self.purpose = purpose
         self.warnings: list[str] = []
 
     def check(self) -> None:

@@ -123,7 +123,9 @@ class _Filling:
         self._grid = grid
         self._step = 0  # index into _LADDER
         self._voxels = allocate_voxels(grid.shape_ijk[::-1], _LADDER[0], grid.name)
-        self._holes, self._low, self._high = 0, np.inf, -np.inf
+        self._holes = 0
+        self._low = np.inf
+        self._high = -np.inf
 
     def add(self, k: int, stored: NDArray[Any]) -> None:
         values = _scale(stored, self._grid)
@@ -166,7 +168,8 @@ class _Filling:
         return 2
 
     def finish(self) -> GridValues:
-        voxels, low, high = self._voxels, self._low, self._high
+        voxels, low = self._voxels, self._low
+        high = self._high
         if self._holes == voxels.size:
             raise RefusedInputError(f"{self._grid.name} holds no values: all of its voxels are NaN")
         doubts = _doubts(voxels, low, high)

@@ -46,7 +46,9 @@ def evaluate_curve(
 ) -> Float64Array:
     """Return values (..., k) of a curve at positions (...,); with `left`, a step has the value of its first point."""
     if left:  # mirrored, it is the second point
-        positions, values, places = -positions[::-1], values[::-1], -places
+        positions = -positions[::-1]
+        values = values[::-1]
+        places = -places
     # np.interp uses the last of equal positions: it searches the place with positions[n] <= at < positions[n + 1].
     return np.stack([np.interp(places, positions, column) for column in values.T], axis=-1)
 

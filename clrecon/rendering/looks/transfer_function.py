@@ -100,7 +100,8 @@ class TransferFunction(Message):
             raise UsageError(f"the lighting of a transfer function is a Lighting or None, not {lighting!r}")
         if not (isinstance(name, str) and isinstance(description, str)):
             raise UsageError("name and description of a transfer function are text")
-        self._lighting, self._name, self._description = lighting, name, description
+        self._lighting, self._name = lighting, name
+        self._description = description
 
     @staticmethod
     def _check_points(rows: ArrayLike) -> Float64Array:

@@ -139,7 +139,8 @@ def annotate(
             if text:
                 page.draw_edge(edge, text)
     if scale_bar:
-        camera, pixel_mm, plane_note = rendering.camera, rendering.pixel_mm, ""
+        camera, pixel_mm = rendering.camera, rendering.pixel_mm
+        plane_note = ""
         if camera is not None and not camera.is_parallel:
             pixel_mm, plane_note = camera.pixel_mm(rendering.size), " (focal plane)"
         if pixel_mm is None:

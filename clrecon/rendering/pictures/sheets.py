@@ -27,7 +27,9 @@ LEAST_TILE = 64
 _LEAST_LETTERED = 96
 """Least pixels along the shorter side of a tile with letters."""
 
-TEXT_SHARE, _LEAST_TEXT, MOST_TEXT = 1 / 14, 9.0, 18.0
+TEXT_SHARE = 1 / 14
+_LEAST_TEXT = 9.0
+MOST_TEXT = 18.0
 
 
 @dataclass(frozen=True)

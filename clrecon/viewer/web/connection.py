@@ -226,7 +226,8 @@ class Connection:
         self._socket = socket
         self._session = open_session(lambda: self._later(self._hear))
         self.downloads = Downloads(folder)
-        self._save_as, self._wrote, self._quit = tuple(save_as), wrote, quit
+        self._save_as = tuple(save_as)
+        self._wrote, self._quit = wrote, quit
         self._pace = Pace()
         self._keys: dict[str, Any] = {}
         self._ground = (0, 0, 0)
@@ -454,7 +455,9 @@ class Connection:
                 while self._notes:
                     await self._socket.send_str(json.dumps(self._notes.pop(0)))
                 if self._ready is not None and not self._under_way:
-                    message, self._ready, self._under_way = self._ready, None, True
+                    message = self._ready
+                    self._ready = None
+                    self._under_way = True
                     await self._socket.send_bytes(message)
                     self._draw()
         except (ConnectionError, RuntimeError):  # the browser has left

@@ -90,9 +90,13 @@ def read_pixel_head(head: bytes, start: int, implicit: bool, little: bool) -> tu
     # Implicit VR has the length in these bytes; no even length looks like one of the two-letter names.
     vr = head[4:6]
     if vr in _PIXEL_VRS and len(head) == 12:
-        length, offset, name = struct.unpack(order + "L", head[8:12])[0], start + 12, vr.decode("ascii")
+        length = struct.unpack(order + "L", head[8:12])[0]
+        offset = start + 12
+        name = vr.decode("ascii")
     elif implicit:
-        length, offset, name = struct.unpack(order + "L", head[4:8])[0], start + 8, ""
+        length = struct.unpack(order + "L", head[4:8])[0]
+        offset = start + 8
+        name = ""
     else:
         raise CorruptFileError("the head of the pixel data element is damaged")
     return tag, offset, -1 if length == UNDEFINED_LENGTH else length, name

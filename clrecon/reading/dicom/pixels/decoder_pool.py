@@ -123,7 +123,8 @@ class DecoderPool(Closing):
     def close(self) -> None:
         self._stopping.set()
         with self._lock:
-            workers, self._workers, self._idle = self._workers, [], []
+            workers = self._workers
+            self._workers, self._idle = [], []
         for worker in workers:
             # It has no state to lose, and a process that was forked meanwhile may keep its input open.
             worker.process.kill()

@@ -159,7 +159,10 @@ def read_voxels(
 def _fill_volume(
     source: StoredPixels, slices: Sequence[SliceHeader], voxels: NDArray[Any], progress: Progress | None
 ) -> PixelFacts:
-    padding, low, high, tissue = PaddingMasks(voxels), np.inf, -np.inf, 0
+    padding = PaddingMasks(voxels)
+    low = np.inf
+    high = -np.inf
+    tissue = 0
     stray: list[StrayBits | None] = [None] * len(slices)
     blank: list[int] = []
     most = MAX_READERS
@@ -189,7 +192,8 @@ def _fill_volume(
     padded, notes = padding.count, describe_masked_tissue(tissue)
     disc = fill_disc_padding(voxels) if padding_hu is None else None
     if disc is not None:
-        padded, padding_hu, notes = disc.voxels, disc.filled, disc.describe(voxels.size)
+        padded, padding_hu = disc.voxels, disc.filled
+        notes = disc.describe(voxels.size)
     if padding_hu is not None:
         low, high = min(low, padding_hu), max(high, padding_hu)
     count, text = describe_stray_bits(stray, slices)

@@ -428,7 +428,9 @@ def certify(
     facts = None if pixels is None else pixels.facts
     likeness = None if pixels is None else pixels.likeness
     findings = None if pixels is None else pixels.findings
-    headers, first, line, identity = stack.slices, stack.slices[0], stack.line, series.identity
+    headers = stack.slices
+    first = stack.slices[0]
+    line, identity = stack.line, series.identity
     stated = next((h.stated_gap_mm for h in headers if h.stated_gap_mm is not None), None)
     lay = {h.patient_position for h in headers}
     gates = judge_series(series, stack, facts, likeness, None if findings is None else findings.gates)

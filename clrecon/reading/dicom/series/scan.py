@@ -125,7 +125,9 @@ def advise_on(kinds: Iterable[str]) -> str:
 
 _DAMAGED_MARK = "DICOM by its header, but without the mark at byte 128"
 DAMAGED_START = "holds a DICOM header, but not where it should be"
-EMPTY, TEXT, UNKNOWN = "empty", "text", "no DICOM"
+EMPTY = "empty"
+TEXT = "text"
+UNKNOWN = "no DICOM"
 _SIZE_BYTES = 256
 """Largest difference in size from a slice: headers of slices differ by a few digits."""
 _FEWEST_RANDOM_NAMES = 3
@@ -345,11 +347,9 @@ class DiskReader:
 _DICOM_SUFFIXES = (".dcm", ".dic", ".dicom", ".ima")
 PROGRESS_STEPS = 1000
 _BLANK_START = bytes(128) + b"DICM"
-_LINK_INSIDE, LINK_OUT, _LINK_LOST = (
-    "link inside the folder",
-    "link out of the folder",
-    "link to a file that is not there",
-)
+_LINK_INSIDE = "link inside the folder"
+LINK_OUT = "link out of the folder"
+_LINK_LOST = "link to a file that is not there"
 BARE_DATA_SET = "a data set without preamble"
 _APPLE_DOUBLE = b"\x00\x05\x16\x07"
 """Start of the "._NAME" files that macOS creates beside files on foreign disks."""

@@ -123,7 +123,8 @@ def facts_of_numbers(census: Census, stack: Stack) -> dict[str, Any]:
     numbers = _ordered_numbers(stack)
     first = last = step = None
     if numbers is not None:
-        first, last, step = int(numbers.min()), int(numbers.max()), int(np.abs(np.diff(numbers)).min())
+        first, last = int(numbers.min()), int(numbers.max())
+        step = int(np.abs(np.diff(numbers)).min())
     return {
         "first": first,
         "last": last,
