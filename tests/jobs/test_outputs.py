@@ -140,6 +140,15 @@ def test_a_report_replaces_no_file_that_is_read(tmp_path: Path, monkeypatch: pyt
     check_kept([("the report", None)], "ct.nrrd")
 
 
+def test_a_folder_of_frames_replaces_no_folder_of_an_input(tmp_path: Path) -> None:
+    scan = tmp_path / "frames" / "scan" / "ct.nrrd"
+    scan.parent.mkdir(parents=True)
+    scan.write_bytes(b"mine")
+    with refused(UsageError, "frames"):
+        check_kept([("the frames", tmp_path / "frames")], scan)
+    check_kept([("the frames", tmp_path / "frames" / "other")], scan)
+
+
 class Disturbed:
     """A staged file during whose commit the user presses Ctrl-C."""
 

@@ -188,6 +188,16 @@ def test_the_radius_of_a_line_is_its_distance_from_all_points_of_the_surface() -
     assert (beside - radii > 0.1).any() and (np.abs(beside - radii)[:60] < 1e-3).all()
 
 
+def test_of_two_lines_as_far_from_the_surface_the_deeper_scores_higher() -> None:
+    span = Span(1.0, 20.0, -20.0, 0.0)
+    lines = np.array([[-3.0, 0.0, 0.0, 0.0], [3.0, 0.0, 0.0, 0.0]])
+    surface = np.array([[0.0, 0.0, 0.0]])
+    judge = LineJudge.beside(lines, 5.0, lambda points: 10.0 + points[:, 0], surface, span)
+    np.testing.assert_allclose(judge.radius(lines), 3.0, atol=1e-3)
+    shallow, deep = judge.score(lines)
+    assert 3.0 < shallow < deep < 3.5
+
+
 @pytest.mark.parametrize(
     ("radius", "margin", "diameter"), [(3.5, 1.0, 5.0), (3.56, 1.0, 5.1), (0.9, 1.0, 0.0), (3.0, 0.0, 6.0)]
 )

@@ -218,6 +218,16 @@ def test_measures_are_made_of_points_in_mm():
     assert model.state.measures == () and model.undo() == "the measures" and len(model.state.measures) == 3
 
 
+def test_the_curve_of_a_view_is_the_one_that_was_made_last():
+    model = make_model()
+    for length in (3.0, 5.0):
+        model.start_tool("curve")
+        for x in (0.0, length):
+            model.add_point(Pick(point=(x, 0.0, 0.0)))
+        model.end_tool()
+    assert model.state.curve == ((0.0, 0.0, 0.0), (5.0, 0.0, 0.0))
+
+
 def test_an_angle_of_points_in_one_place_is_refused():
     model = make_model()
     model.start_tool("angle")
