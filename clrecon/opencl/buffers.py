@@ -14,7 +14,7 @@ from clrecon.opencl.quirks import import_pyopencl
 POOLED_BYTES = 1 << 26
 """Larger buffers are given back to the driver at once."""
 
-SPARE_BUFFER_BYTES = 1 << 28
+_SPARE_BUFFER_BYTES = 1 << 28
 """Most bytes of a device that are kept in unused buffers."""
 
 
@@ -68,7 +68,7 @@ class BufferPool:
     def _give_back(self, buffer: Any) -> None:
         with self._lock:
             self._spare.append(buffer)
-            while self.spare_bytes > SPARE_BUFFER_BYTES:
+            while self.spare_bytes > _SPARE_BUFFER_BYTES:
                 self._spare.pop(0)
 
 

@@ -130,7 +130,7 @@ _DEPTH_COST = 1.5
 BODY_BACK_MM = 10.0
 """Planes are looked at from here on in front of the canal: behind it lies the back wall of the body."""
 CORE_ASIDE_MM = 7.0
-WALL_SHARE = 0.2
+_WALL_SHARE = 0.2
 """Share of the side walls in a plane's brightness; the rest is the median of its middle: spurs bridge a disc's rim."""
 WALL_MARGIN_MM = 3.0
 """The walls of a body are looked for from the core to so far beyond its sides: heads of ribs lie farther out."""
@@ -214,7 +214,7 @@ def look_at_bodies(scan: Field) -> Looks:
         along = np.arange(n)[:, None] + np.tan(tilt) * (ahead - middle[:, None])
         middle_hu = _median(_lines(core, along, ahead), least=0.75)
         walls_hu = _mean(_lines(walls, along, ahead), axis=1, least=0.75)
-        brightness[:, tilt_number] = (1.0 - WALL_SHARE) * middle_hu + WALL_SHARE * walls_hu
+        brightness[:, tilt_number] = (1.0 - _WALL_SHARE) * middle_hu + _WALL_SHARE * walls_hu
     depth = np.full_like(brightness, np.nan)
     for half in _HALF_THICKNESS_MM:
         centre = _mean(np.stack([_shifted(brightness, shift) for shift in range(1 - half, half)]), axis=0)

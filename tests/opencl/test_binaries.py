@@ -85,31 +85,25 @@ def test_row_72_files_are_private_whatever_the_umask(own_cache):
     assert (own_cache / KEY).stat().st_mode & 0o777 == 0o600
 
 
-def test_the_oldest_go(own_cache, monkeypatch):
-    monkeypatch.setattr(cache, "_MOST_FILES", 3)
-    for number in range(5):
+def test_the_oldest_go(own_cache):
+    for number in range(512):
+        (own_cache / f"{number:03}").touch()
+        os.utime(own_cache / f"{number:03}", (number, number))
+    for number in range(2):
         store_binary(binary_key(str(number)), b"program")
-        os.utime(own_cache / binary_key(str(number)), (number, number))
-    store_binary(binary_key("5"), b"program")
-    assert [read_binary(binary_key(str(number))) is None for number in range(6)] == [
-        True,
-        True,
-        True,
-        False,
-        False,
-        False,
-    ]
+    assert len(list(own_cache.iterdir())) == 512
+    assert [(own_cache / f"{number:03}").exists() for number in range(4)] == [False, False, True, True]
+    assert all(read_binary(binary_key(str(number))) == b"program" for number in range(2))
 
 
 def test_the_next_process_takes_the_binary(keeper, monkeypatch):
-    """Building from source once; then, with no program in memory, from the binary."""
-    sources = []
-    true_way = program._build_from_source
-    monkeypatch.setattr(program, "_build_from_source", lambda *a: sources.append(1) or true_way(*a))
+    """What is built from source is stored: once; then, with no program in memory, the binary is taken."""
+    stored = []
+    monkeypatch.setattr(program, "store_binary", lambda *kept: stored.append(kept) or store_binary(*kept))
     for _ in range(3):
         monkeypatch.setattr(keeper, "programs", {})
         assert load_program(keeper, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
-    assert len(sources) == 1
+    assert len(stored) == 1
 
 
 def test_binaries_compute_what_sources_do(keeper, monkeypatch):

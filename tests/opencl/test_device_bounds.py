@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,8 +14,9 @@ from house import ROOT
 from refusals import refused
 
 from clrecon.errors import DeviceError, UsageError
-from clrecon.opencl import arrays, cache, launching, pocl, program, quirks, select, sources
+from clrecon.opencl import arrays, buffers, cache, launching, pocl, program, quirks, select, sources
 from clrecon.opencl.device import HEADROOM_BYTES, Device, _find_shortcoming
+from clrecon.opencl.program import load_program
 from clrecon.opencl.sources import find_signatures
 from clrecon.opencl.transfers import LEAST_BYTES
 
@@ -78,7 +78,7 @@ def test_memory_is_a_whole_number_from_1(memory: Any) -> None:
 )
 def test_large_buffers_are_pages_of_the_host(size: int, shared: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arrays, "empty_output", lambda *given: (None, "pages"))
-    monkeypatch.setattr(arrays, "_make_buffer", lambda *given: "buffer")
+    monkeypatch.setattr(buffers, "ask_driver", lambda *given: "buffer")
     device: Any = SimpleNamespace(shares_host_memory=True)
     assert arrays.allocate(device, size) == ("pages" if shared else "buffer")
 
@@ -191,16 +191,12 @@ def test_large_arrays_come_back_in_pieces(
     assert ways == [way]
 
 
-def test_the_log_says_how_long_a_build_took(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_log_says_how_long_a_build_took(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[tuple[Any, ...]] = []
     seconds = iter((5.0, 7.5))
     monkeypatch.setattr(program, "log", SimpleNamespace(debug=lambda *words: told.append(words)))
-    monkeypatch.setattr(program.time, "perf_counter", lambda: next(seconds))
-    monkeypatch.setattr(program, "_build_from_source", lambda *given: None)
-    monkeypatch.setattr(program, "_key", lambda *given: "key")
-    monkeypatch.setattr(program, "Program", lambda *given: SimpleNamespace(kernel_names=["a"]))
-    device: Any = SimpleNamespace(
-        first_header="", trace=None, known_good=None, keeps_binaries=False, checked_cache=lambda key: nullcontext()
-    )
-    program._build(device, "primitives/scan.cl", ())
-    assert told == [("cl/%s %s built from %s in %.3f s", "primitives/scan.cl", (), "source", 2.5)]
+    monkeypatch.setattr(program, "time", SimpleNamespace(perf_counter=lambda: next(seconds)))
+    monkeypatch.setattr(device, "programs", {})
+    monkeypatch.setattr(device, "keeps_binaries", False)
+    load_program(device, "primitives/compact.cl")
+    assert told == [("cl/%s %s built from %s in %.3f s", "primitives/compact.cl", device.build_options, "source", 2.5)]

@@ -115,8 +115,7 @@ def test_row_51_a_device_of_the_other_byte_order_is_refused_in_a_line(device, tm
 
 
 def test_row_51_a_kernel_whose_groups_the_driver_refuses_is_an_error_in_a_line(device, volume, monkeypatch):
-    monkeypatch.setattr("clrecon.opencl.device.GROUP_SIZE", 1 << 20)
-    monkeypatch.setattr(device, "max_work_group_size", 1 << 20)
+    monkeypatch.setattr(Device, "group_size", 1 << 20)
     with refused(Exception, "INVALID_WORK_GROUP_SIZE"):
         WORK["mip"](DeviceVolume(volume, device=choose_device(device)), None)
 

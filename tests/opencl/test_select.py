@@ -12,6 +12,7 @@ from refusals import refused
 from clrecon.errors import DeviceError
 from clrecon.opencl import check_budget, choose_device, list_devices, list_platforms, select
 from clrecon.opencl.device import _find_shortcoming
+from clrecon.opencl.quirks import import_pyopencl
 
 
 class FakeDevice:
@@ -19,7 +20,7 @@ class FakeDevice:
 
     def __init__(self, index, name, platform, kind, memory=2**30, simulator=False, software=False):
         self.index, self.name, self.platform, self.type = index, name, platform, kind
-        self.usable_bytes, self.is_simulator = memory, simulator
+        self.usable_bytes, self.is_simulator, self.cl_device = memory, simulator, name
         self.max_allocation_bytes = memory // 4
         self.label = f"{name} ({platform})"
         self.shortcoming = self.fault = ""
@@ -99,7 +100,8 @@ def test_a_simulator_is_never_chosen_silently(machine, monkeypatch):
 def test_row_50_a_simulator_that_nobody_named_is_told(machine, wanted, variables, is_told, monkeypatch):
     for name, text in variables.items():
         monkeypatch.setenv(name, text)
-    monkeypatch.setattr(select, "_named_by_pyopencl", lambda cl, devices: devices[:1])
+    context = SimpleNamespace(devices=["Oclgrind Simulator"])
+    monkeypatch.setattr(import_pyopencl(), "create_some_context", lambda interactive: context)
     chosen = choose_device(wanted)
     assert chosen.is_simulator
     assert ["is a simulator" in text for text in chosen.warnings] == [True] * is_told
@@ -184,8 +186,9 @@ def test_no_device_says_how_to_get_a_driver(monkeypatch):
 
 def test_no_device_under_a_limit_of_memory_names_it(monkeypatch):
     monkeypatch.setattr(select, "list_devices", list)
-    monkeypatch.setattr(select, "_address_space", lambda: 2_500_000_000)
-    with refused(DeviceError, "GB", "memory"):
+    resource = pytest.importorskip("resource")
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (2_500_000_000, resource.RLIM_INFINITY))
+    with refused(DeviceError, 2.5, "memory"):
         choose_device()
 
 

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import gc
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from counted_calls import counting_calls
 
 import clrecon
-from clrecon.opencl import allocate, buffers, copy_buffer, download, download_all, transfers, upload
+from clrecon.opencl import allocate, buffers, copy_buffer, download, download_all, upload
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.transfers import LEAST_BYTES, PIECE_BYTES, PIECES, PinnedPieces
 from clrecon.rendering.pictures.styles import Projection, VolumeLook
@@ -106,14 +107,11 @@ def test_a_piece_that_is_filled_stays_until_it_is_sent(apart, monkeypatch):
         def result(self):
             return None
 
-    class Now:
-        """Copies at once."""
+    def copy_at_once(pool, copy, *arguments):
+        copy(*arguments)
+        return Hidden()
 
-        def submit(self, copy, *arguments):
-            copy(*arguments)
-            return Hidden()
-
-    monkeypatch.setattr(transfers, "_threads", Now)
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", copy_at_once)
     apart.of_context(PinnedPieces)._pieces.clear()
     array = numbers(9 * PIECE_BYTES + 5)
     array_d = upload(apart, array)
@@ -152,13 +150,12 @@ def test_the_pool_lends_a_buffer_again(apart):
     assert pool.take(4990).buffer.int_ptr == number
 
 
-def test_the_pool_keeps_no_more_than_its_limit(apart, monkeypatch):
-    monkeypatch.setattr(buffers, "SPARE_BUFFER_BYTES", 3 << 20)
+def test_the_pool_keeps_no_more_than_its_limit(apart):
     pool = buffers.BufferPool(apart)
-    lent = [pool.take(1 << 20) for _ in range(5)]
+    lent = [pool.take(1 << 26) for _ in range(6)]
     lent.clear()
     gc.collect()
-    assert pool.spare_bytes == 3 << 20
+    assert pool.spare_bytes == 1 << 28
 
 
 def test_spare_buffers_make_way_where_the_driver_has_no_room(apart, monkeypatch):

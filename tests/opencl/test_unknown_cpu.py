@@ -151,12 +151,10 @@ def test_a_device_names_its_cpu_when_it_is_opened_and_not_before(device, monkeyp
 
 @pytest.mark.every_device
 def test_programs_get_what_tells_caches_apart(device, monkeypatch):
-    from clrecon.opencl import load_program, program
+    from clrecon.opencl import load_program
 
-    seen = []
-    monkeypatch.setattr(program, "_build", lambda device, name, options: seen.append(options))
-    fresh = SimpleNamespace(build_options=("-DCPU_NAME=haswell",), lock=device.lock, programs={})
-    load_program(fresh, "primitives/compact.cl", {"B": "2", "A": "1"})
-    assert seen == [("-DCPU_NAME=haswell", "-DA=1", "-DB=2")]
+    monkeypatch.setattr(device, "programs", {})
+    load_program(device, "primitives/compact.cl", {"B": "2", "A": "1"})
+    assert list(device.programs) == [("primitives/compact.cl", (*device.build_options, "-DA=1", "-DB=2"))]
     names_cpu = any("CPU_NAME" in option for option in device.build_options)
     assert names_cpu == has_unknown_cpu(device.platform, device.version)

@@ -58,11 +58,13 @@ class Failing:
         cl = import_pyopencl()
         self.kind, self.first, self.last = kind, first, first if last is None else last
         self.counts = {"buffer": 0, "launch": 0}
+        self.sizes: list[int] = []
         true_buffer, true_enqueue = arrays._make_buffer, cl.Kernel.__call__
         contexts: dict[Any, str] = {}
 
         def make_buffer(device: Device, flags: Any, size: int, host: Any = None) -> Any:
             contexts[device.context] = device.label
+            self.sizes.append(size)
             if label in (None, device.label) and self._is_due("buffer"):
                 raise DeviceMemoryError(f"{size:,} bytes cannot be had on {device.label}: injected")
             return true_buffer(device, flags, size, host)

@@ -115,13 +115,13 @@ BATCH_CELLS = kernel_constant("points/neighbours.cl", "BATCH_CELLS")
 MOST_NEIGHBOURS = kernel_constant("points/near_rows.h", "MOST_NEIGHBOURS")
 """Most neighbours of a point: three times as many candidates have room in the kernel."""
 
-PART_POINTS = 1 << 16
+_PART_POINTS = 1 << 16
 """Points of a launch on a CPU: their neighbours stay in its caches until the next kernel reads them."""
 
-PART_POINTS_OF_GPU = 1 << 20
+_PART_POINTS_OF_GPU = 1 << 20
 """Points of a launch on a GPU, which needs many work-items and keeps each launch short."""
 
-CROWDED = 4096
+_CROWDED = 4096
 """Points in a cell from which on pairs are counted before the search."""
 
 ROUNDING = 1e-6
@@ -184,7 +184,7 @@ def check_neighbours(k: int, points: int, fewest: int = 1) -> tuple[int, tuple[s
 
 
 class NeighbourSearch:
-    """A grid over at least `k` points, and the kernel that lists neighbours in parts of some `PART_POINTS` points."""
+    """A grid over at least `k` points, and the kernel that lists neighbours in parts of some `_PART_POINTS` points."""
 
     def __init__(
         self,
@@ -218,12 +218,12 @@ class NeighbourSearch:
         extent = np.abs(plan.corner).max() + float(plan.edge) * max(plan.shape)
         self._margin = ROUNDING * float(extent)
         starts = download(device, np.empty(self.grid.cells + 1, np.uint32), self.grid.starts_d)
-        _check_pairs(self.grid, starts)
+        check_pairs(self.grid, starts)
         self.parts = _split_cells(starts, self._part_points)
 
     @property
     def _part_points(self) -> int:
-        return PART_POINTS_OF_GPU if _has_one_lane(self.device) else PART_POINTS
+        return _PART_POINTS_OF_GPU if _has_one_lane(self.device) else _PART_POINTS
 
     @property
     def most_places(self) -> int:
@@ -271,22 +271,22 @@ def _split_cells(starts: NDArray[np.uint32], points: int) -> list[Part]:
     ]
 
 
-def _check_pairs(grid: PointGrid, starts: NDArray[np.uint32]) -> None:
-    """Refuse clouds of which too many points lie in one cell, but not at one place."""
+def check_pairs(grid: PointGrid, starts: NDArray[np.uint32], crowded: int = _CROWDED, most: int = MOST_PAIRS) -> None:
+    """Refuse clouds of which too many points lie in one cell of more than `crowded`, but not at one place."""
     counts = np.diff(starts).astype(np.int64)
-    crowded = np.flatnonzero(counts > CROWDED)
-    pairs = int((counts[crowded] ** 2).sum())
-    if pairs <= MOST_PAIRS:
+    cells = np.flatnonzero(counts > crowded)
+    pairs = int((counts[cells] ** 2).sum())
+    if pairs <= most:
         return
     axes = [download(grid.device, np.empty(grid.n, np.float32), axis_d) for axis_d in (grid.x_d, grid.y_d, grid.z_d)]
-    for cell in crowded:
+    for cell in cells:
         rows = slice(int(starts[cell]), int(starts[cell + 1]))
         if all(np.ptp(axis[rows]) == 0.0 for axis in axes):
             pairs -= int(counts[cell]) ** 2
-    if pairs > MOST_PAIRS:
+    if pairs > most:
         raise UsageError(
             f"{int(counts.max()):,} of {grid.n:,} points lie in one cell of {grid.edge:.3g} mm: {pairs:.1e} pairs would"
-            f" be compared, possible are {MOST_PAIRS:.0e}; remove points far from all others, or thin the cloud"
+            f" be compared, possible are {most:.0e}; remove points far from all others, or thin the cloud"
         )
 
 

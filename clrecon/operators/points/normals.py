@@ -103,7 +103,7 @@ def _all_slabs(
 FEWEST_NEIGHBOURS = 3
 """Three points lie in a plane."""
 
-DOUBTFUL_SHARE = 0.1
+_DOUBTFUL_SHARE = 0.1
 """Share of doubtful normals above which there is a warning.  Shells of bone have 0.04 where voxels are nearly cubes,
 and 0.22 and 0.38 with gaps between slices of 4.25 and 7 mm."""
 
@@ -274,7 +274,7 @@ class _Run:
             )
         if how == "NOT":
             warnings.append("normals have either direction: give a volume or a viewpoint to orient them")
-        if doubtful > DOUBTFUL_SHARE * n:
+        if doubtful > _DOUBTFUL_SHARE * n:
             warnings.append(
                 f"{doubtful:,} of {n:,} normals ({format_share(doubtful / n)}) are doubtful and follow the HU alone:"
                 f" the {self.k} nearest points of theirs lie in one slice, or on both sides of something thin; take the"

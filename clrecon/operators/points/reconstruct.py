@@ -185,11 +185,11 @@ _LEAK_SHARE = 0.1
 """Share of votes against the winner from which on the inside is joined to the outside.  0.02 to 0.05 was seen on bone,
 0.005 on simple shapes, 0.38 to 0.46 with leaks."""
 
-DOUBTFUL_SHARE = 0.05
+_DOUBTFUL_SHARE = 0.05
 """Share from which on there is a warning: of several bones one may leak, and the others outvote it.  0.057 was seen
 where slices 4.25 mm apart were meshed with nodes 1 mm apart, and 17 % of the volume were lost."""
 
-WALL_SHARE = 0.1
+_WALL_SHARE = 0.1
 """Share of the surface without points from which on there is a warning.  Up to 0.01 was seen on shapes, 0.07 where they
 had holes that were bridged, 0.03 to 0.07 on bone, and 0.22 to 0.39 where slices were farther apart than nodes could
 bridge and 8 to 23 % of the volume were lost."""
@@ -384,7 +384,7 @@ class _Reconstruction:
                     f"the normals of the cloud point inward: {format_share(1.0 - signs.share_against)} of"
                     f" {signs.votes:,} votes put the surroundings of the cloud inside; turn the normals"
                 )
-            if signs.share_against > DOUBTFUL_SHARE:
+            if signs.share_against > _DOUBTFUL_SHARE:
                 self.warnings.append(
                     f"{format_share(signs.share_against, 1)} of {signs.votes:,} votes are against the winner: parts of"
                     " the cloud may be open, and the volume too small; compare with a larger spacing or bridge"
@@ -422,7 +422,7 @@ class _Reconstruction:
             cubes.append(
                 {"centre_mm": centre.round(1).tolist(), "edge_mm": _CUBE * h, "wall_share": round(float(share), 4)}
             )
-        if walls.share > WALL_SHARE or lost > _LOST_SHARE:
+        if walls.share > _WALL_SHARE or lost > _LOST_SHARE:
             middle = ", ".join(f"{at:.0f}" for at in cubes[0]["centre_mm"]) if cubes else ""
             spot = f", most of it within {_CUBE * h / 2:.3g} mm of ({middle}) mm LPS" if middle else ""
             much = (

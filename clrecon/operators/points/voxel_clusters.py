@@ -26,7 +26,7 @@ from clrecon.points.stencil import Stencil
 MOST_SAMPLES = 255
 """Largest min_samples: counters have 8 bits."""
 
-LARGEST_WORK = 1e11
+_LARGEST_WORK = 1e11
 """Most visits of a row of the stencil at a row of the volume: some minutes."""
 
 
@@ -110,10 +110,10 @@ class ClusterSearch:
     def _check_work(self, stencil: Stencil) -> None:
         nj = self._mask.shape_ijk[1]
         work = float((stencil.tables[:, 1] - stencil.tables[:, 0]).sum(dtype=np.int64)) * nj
-        if work > LARGEST_WORK:
+        if work > _LARGEST_WORK:
             raise UsageError(
                 f"each voxel has up to {stencil.members[1]:,} voxels within eps, which makes {work:.1e} visits of rows"
-                f" of the volume, {LARGEST_WORK:.0e} are allowed: choose a smaller eps"
+                f" of the volume, {_LARGEST_WORK:.0e} are allowed: choose a smaller eps"
             )
 
     def _check_budget(self, more: dict[str, int]) -> None:

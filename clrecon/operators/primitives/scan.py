@@ -135,11 +135,11 @@ def prepare_sort(device: Device) -> Program:
     return load_program(device, "primitives/radix_sort.cl", variants)
 
 
-def _plan_chunks(device: Device, n: int) -> tuple[int, int]:
+def _plan_chunks(device: Device, n: int, fewest: int = FEWEST_PER_CHUNK) -> tuple[int, int]:
     wanted = MOST_CHUNKS
     if device.has_long_items:  # a chunk is the work of a core: some for each, for equal shares
         wanted = min(max(16, 8 * device.compute_units), MOST_CHUNKS)
-    per_chunk = max(FEWEST_PER_CHUNK, -(-n // wanted))
+    per_chunk = max(fewest, -(-n // wanted))
     return per_chunk, -(-n // per_chunk)
 
 
@@ -156,14 +156,14 @@ def sort_bytes(device: Device, n: int, bits: int = _KEY_BITS) -> int:
     return 4 * buffers * n + (4 << min(RADIX_BITS, max(bits, 1))) * _plan_chunks(device, n)[1]
 
 
-def radix_sort(device: Device, keys_d: Any, n: int, *, bits: int = _KEY_BITS) -> Sorted:
+def radix_sort(device: Device, keys_d: Any, n: int, *, bits: int = _KEY_BITS, fewest: int = FEWEST_PER_CHUNK) -> Sorted:
     """Sort 1 to 2^31 keys, (n,) uint32, by their lowest `bits`, the only ones that can be set; they stay."""
     if not 1 <= n <= LARGEST_SCAN:
         raise UsageError(f"{n:,} elements: a sort takes 1 to {LARGEST_SCAN:,}")
     if not 0 <= bits <= _KEY_BITS:
         raise UsageError(f"{bits} bits: keys have 0 to {_KEY_BITS}")
     program = prepare_sort(device)
-    per_chunk, chunks = _plan_chunks(device, n)
+    per_chunk, chunks = _plan_chunks(device, n, fewest)
     items = chunks * device.group_size
     current, free = (keys_d, keys_d), [(allocate(device, 4 * n), allocate(device, 4 * n))]
     digits = _plan_digits(max(bits, 1))

@@ -25,7 +25,7 @@ from clrecon.operators.primitives.scan import LARGEST_SCAN, Compacted, compact, 
 _LARGEST_MESH = 2**32 - 1
 """Most triangles, so that 32 bits can count them."""
 
-MOST_PASSES = 1000
+_MOST_PASSES = 1000
 """Limit of passes, far above the need of 2^31 vertices: 62 rounds of at most 11 passes each."""
 
 
@@ -171,9 +171,9 @@ class _Rounds:
 
     def _next_pass(self) -> int:
         self._passes += 1
-        if self._passes > MOST_PASSES:
+        if self._passes > _MOST_PASSES:
             raise DeviceError(
-                f"{self._device.label} has not found the components after {MOST_PASSES} passes: it computes wrongly,"
+                f"{self._device.label} has not found the components after {_MOST_PASSES} passes: it computes wrongly,"
                 " see `clrecon selftest` and try another device"
             )
         return self._passes

@@ -13,7 +13,7 @@ from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.opencl import download
 from clrecon.operators.points import neighbours
 from clrecon.operators.points.grid import fill_grid, plan_grid
-from clrecon.operators.points.neighbours import choose_cell_edge, find_neighbours
+from clrecon.operators.points.neighbours import check_pairs, choose_cell_edge, find_neighbours
 from clrecon.points import PointCloud
 from clrecon.proof.points import neighbours as twin
 
@@ -63,17 +63,12 @@ def test_cells_of_any_size_give_the_same(device, edge, monkeypatch):
     check_equal(device, scattered_points(3000), 16)
 
 
-def test_parts_give_the_same(device, monkeypatch):
-    points = scattered_points(5000)
-    whole = find_neighbours(points, 8, device=device)
-    monkeypatch.setattr(neighbours, "PART_POINTS", 300)
-    monkeypatch.setattr(neighbours, "PART_POINTS_OF_GPU", 300)
+def test_a_cloud_of_several_parts_has_the_neighbours_of_its_twin_and_tells_each_part(device):
+    count = 70_000 if device.has_long_items else 1_100_000
     told = []
-    parts = find_neighbours(points, 8, device=device, progress=lambda *step: told.append(step))
-    assert np.array_equal(parts.indices, whole.indices)
-    assert np.array_equal(parts.distances, whole.distances)
-    assert len(told) > 10
-    assert told[-1] == ("neighbours", 5000, 5000)
+    find_neighbours(scattered_points(count), 8, device=device, progress=lambda *step: told.append(step))
+    assert len(told) == 2 and told[-1] == ("neighbours", count, count)
+    check_equal(device, scattered_points(count), 8)
 
 
 @pytest.mark.oclgrind
@@ -128,19 +123,16 @@ def test_a_million_equal_points_do_not_take_the_square(device):
     assert not found.distances.any()
 
 
-def test_equal_points_in_a_crowded_cell_are_no_pairs(device, monkeypatch):
+def test_equal_points_in_a_crowded_cell_are_no_pairs(device):
     """Five points at one place, four others in one cell, three in a third, which is not crowded: 16 pairs."""
-    monkeypatch.setattr(neighbours, "CROWDED", 3)
     apart = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
     points = np.concatenate([np.zeros((5, 3)), apart + (10.0, 0.0, 0.0), apart[:3] + (20.0, 0.0, 0.0)])
     grid = fill_grid(device, plan_grid(points, 1.0))
     starts = download(device, np.empty(grid.cells + 1, np.uint32), grid.starts_d)
     assert sorted(np.diff(starts).tolist()) == [3, 4, 5]
-    monkeypatch.setattr(neighbours, "MOST_PAIRS", 16)
-    neighbours._check_pairs(grid, starts)
-    monkeypatch.setattr(neighbours, "MOST_PAIRS", 15)
+    check_pairs(grid, starts, crowded=3, most=16)
     with refused(UsageError, 5, 12, 1):
-        neighbours._check_pairs(grid, starts)
+        check_pairs(grid, starts, crowded=3, most=15)
 
 
 @pytest.mark.parametrize("k", [0, -1, 129, 2.0, True, None])
@@ -149,14 +141,13 @@ def test_wrong_numbers_of_neighbours_are_refused(device, k):
         find_neighbours(np.zeros((3, 3)), k, device=device)
 
 
-def test_clouds_that_cannot_be_searched_are_refused(device, monkeypatch):
+def test_clouds_that_cannot_be_searched_are_refused(device):
     with refused(UsageError, "cloud"):
         find_neighbours(np.zeros((0, 3)), device=device)
     with refused(UsageError, 2, 4, 1):
         find_neighbours([[0, 0, 0], [0, np.nan, 0], [1, 1, 1], [np.inf, 0, 0]], device=device)
-    monkeypatch.setattr(neighbours, "MOST_PAIRS", 10**7)
-    crowded = np.r_[RNG.normal(0, 1e-3, (5000, 3)), RNG.uniform(-1e5, 1e5, (5000, 3))]
-    with refused(UsageError, "points", "pairs", 5000):
+    crowded = np.r_[RNG.normal(0, 1e-3, (1_010_000, 3)), RNG.uniform(-1e5, 1e5, (50, 3))]
+    with refused(UsageError, "points", "pairs", 1_010_000):
         find_neighbours(crowded, device=device)
 
 

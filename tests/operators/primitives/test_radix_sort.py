@@ -9,17 +9,23 @@ from variants import daily
 
 from clrecon.errors import UsageError
 from clrecon.opencl import download, upload
-from clrecon.operators.primitives import scan as module
-from clrecon.operators.primitives.scan import FEWEST_PER_CHUNK, RADIX_BITS, exclusive_scan, radix_sort, sort_bytes
+from clrecon.operators.primitives.scan import (
+    FEWEST_PER_CHUNK,
+    RADIX_BITS,
+    _plan_digits,
+    exclusive_scan,
+    radix_sort,
+    sort_bytes,
+)
 from clrecon.proof.volumes import volume_twins as twin
 
 CHUNK = FEWEST_PER_CHUNK
 SIZES = sorted({1, 2, *(border + step for border in (64, 1024, CHUNK, 2 * CHUNK) for step in (-1, 0, 1)), 90_001})
 
 
-def check_sorted(device, keys, bits=32):
+def check_sorted(device, keys, bits=32, **chunks):
     keys_d = upload(device, keys)
-    made = radix_sort(device, keys_d, len(keys), bits=bits)
+    made = radix_sort(device, keys_d, len(keys), bits=bits, **chunks)
     sorted_keys, values = twin.radix_sort(keys)
     assert np.array_equal(download(device, np.empty(len(keys), np.uint32), made.keys_d), sorted_keys)
     assert np.array_equal(download(device, np.empty(len(keys), np.uint32), made.values_d), values)
@@ -58,12 +64,10 @@ def test_keys_in_order(device, form, order):
 
 
 @pytest.mark.oclgrind
-def test_several_small_chunks(device, form, monkeypatch):
+def test_several_small_chunks(device, form):
     """Chunks of 100 elements: a simulator can check many of them."""
-    monkeypatch.setattr(module, "FEWEST_PER_CHUNK", 100)
-    monkeypatch.setattr(module, "MOST_CHUNKS", 7)
-    check_sorted(device, np.random.default_rng(5).integers(0, 40, 1234, dtype=np.uint32), 6)
-    check_sorted(device, np.random.default_rng(6).integers(0, 2**13, 633, dtype=np.uint32), 13)
+    check_sorted(device, np.random.default_rng(5).integers(0, 40, 1234, dtype=np.uint32), 6, fewest=100)
+    check_sorted(device, np.random.default_rng(6).integers(0, 2**13, 633, dtype=np.uint32), 13, fewest=100)
 
 
 @pytest.mark.parametrize("group", daily(1, [1, 16]))
@@ -73,10 +77,10 @@ def test_devices_with_small_work_groups(device, form, group, monkeypatch):
 
 
 def test_fewer_bits_take_fewer_passes():
-    assert module._plan_digits(11) == [(0, 11)]
-    assert module._plan_digits(12) == [(0, 6), (6, 6)]
-    assert module._plan_digits(32) == [(0, 10), (10, 11), (21, 11)]
-    assert [sum(width for _, width in module._plan_digits(bits)) for bits in range(1, 33)] == list(range(1, 33))
+    assert _plan_digits(11) == [(0, 11)]
+    assert _plan_digits(12) == [(0, 6), (6, 6)]
+    assert _plan_digits(32) == [(0, 10), (10, 11), (21, 11)]
+    assert [sum(width for _, width in _plan_digits(bits)) for bits in range(1, 33)] == list(range(1, 33))
 
 
 def test_the_forecast_counts_keys_values_and_tables(device):

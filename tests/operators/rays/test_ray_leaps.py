@@ -16,7 +16,6 @@ from clrecon.opencl import upload
 from clrecon.operators.rays import ray_pictures, ray_slabs
 from clrecon.operators.rays import ray_pictures as composite
 from clrecon.operators.rays.render import VolumeRenderer, render
-from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import volume_box
 from clrecon.rendering import UNSHADED, Rendering, TransferFunction
 from clrecon.rendering.views.camera import Camera
@@ -200,16 +199,6 @@ def test_labels_of_a_single_slice_stay_until_the_picture_is_made(device):
             )  # fmt: skip
             middle = picture.image[10:-10, 10:-10].reshape(-1, 4)
             assert (middle == middle[0]).all() and middle[0, 2] > 200
-
-
-def test_volumes_of_more_voxels_than_an_int_counts_go_through_in_slabs(device, monkeypatch):
-    """Of samples that are taken at once places are ints from the first of them on."""
-    volume = scattered(np.random.default_rng(3), uneven=False)
-    ni, nj, nk = volume.shape_ijk
-    monkeypatch.setattr(ray_slabs, "MOST_VOXELS", ni * nj * (nk // 2 + 6))
-    found = ray_slabs.plan_ray_slabs(DeviceVolume(volume, device=device), {}, {})
-    held = nk if int(device.kernel_variants["LANES"]) == 1 else nk // 2 + 1
-    assert found == held
 
 
 def test_more_samples_than_float32_counts_are_refused(device):

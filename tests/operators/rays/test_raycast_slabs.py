@@ -11,9 +11,7 @@ import tolerances
 from raycast_scenes import DeviceCaster, blobs, even_volume, look, premultiplied, uneven_volume
 from soft_function import SOFT
 
-from clrecon.geometry import Volume
-from clrecon.operators.rays import ray_slabs
-from clrecon.operators.rays.ray_slabs import BRICK_CELLS, plan_ray_slabs
+from clrecon.operators.rays.ray_slabs import BRICK_CELLS, MOST_VOXELS, plan_ray_slabs
 from clrecon.proof.rays.render import MODES
 from clrecon.rendering import Lighting
 
@@ -36,13 +34,12 @@ def test_slabs_give_the_picture_of_the_whole(device, mode, towards, even):
 
 @pytest.mark.parametrize("lanes", ["1", "8"])
 @pytest.mark.parametrize(("most_slices", "most"), [(19, 19 - 5), (20, 20), (21, 21)])
-def test_a_slab_needs_its_slices_with_two_before_and_three_behind(monkeypatch, lanes, most_slices, most):
-    """The forecast and the bound of kernels with several lanes, by hand: 9 x 7 x 20 voxels of two bytes."""
-    ni, nj, nk = 9, 7, 20
-    monkeypatch.setattr(ray_slabs, "MOST_VOXELS", ni * nj * most_slices + 1)
+def test_a_slab_needs_its_slices_with_two_before_and_three_behind(lanes, most_slices, most):
+    """The forecast and the bound of kernels with several lanes, by hand: 20 large slices with voxels of two bytes."""
+    ni, nj, nk = 10_000, MOST_VOXELS // (10_000 * most_slices), 20
     asked: dict[str, Any] = {}
     resident = SimpleNamespace(
-        volume=Volume(np.zeros((nk, nj, ni), np.int16), np.eye(4)),
+        volume=SimpleNamespace(shape_ijk=(ni, nj, nk), spacing=(1.0, 1.0, 1.0)),
         dtype=np.dtype(np.int16),
         device=SimpleNamespace(kernel_variants={"LANES": lanes}),
         plan=lambda purpose, slices, needs, **more: asked.update(more, slices=slices, needs=needs) or 3,

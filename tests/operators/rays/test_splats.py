@@ -12,7 +12,6 @@ from variants import each_value
 
 import clrecon
 from clrecon.errors import DeviceError, UsageError
-from clrecon.operators.rays import point_pictures
 from clrecon.operators.rays.picture_buffers import Shot
 from clrecon.operators.rays.point_pictures import MOST_NAMED, PointPictures, cloud_box, draw_splats
 from clrecon.points import PointCloud
@@ -117,14 +116,13 @@ def test_points_smaller_than_a_pixel_are_seen(device: Any) -> None:
 
 
 @pytest.mark.parametrize("name", ["parallel", "perspective"])
-def test_parts_and_permutations_give_the_same_picture(device: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    points, normals = ball(2000)
-    colors = np.full((2000, 4), 255, np.uint8)
-    colors[:, 0] = np.arange(2000) % 256
+def test_parts_and_permutations_give_the_same_picture(device: Any, name: str) -> None:
+    points, normals = ball(250_000)
+    colors = np.full((250_000, 4), 255, np.uint8)
+    colors[:, 0] = np.arange(250_000) % 256
     camera, calls = CAMERAS[name], []
     whole = draw_splats(device, points, colors, normals, Shot(camera, SIZE), 0.5)
-    monkeypatch.setattr(point_pictures, "FEWEST_POINTS", 300)
-    memory = 16 * SIZE[0] * SIZE[1] + 28 * 650
+    memory = 16 * SIZE[0] * SIZE[1] + 28 * 80_000
     parts = draw_splats(
         device,
         points,
@@ -136,8 +134,8 @@ def test_parts_and_permutations_give_the_same_picture(device: Any, name: str, mo
     )
     assert (whole.parts, parts.parts) == (1, 4)
     assert parts.image.tobytes() == whole.image.tobytes() and parts.depth.tobytes() == whole.depth.tobytes()
-    assert calls[0] == ("points", 0, 6000) and calls[-1] == ("points", 6000, 6000)
-    order = np.random.default_rng(5).permutation(2000)
+    assert calls[0] == ("points", 0, 750_000) and calls[-1] == ("points", 750_000, 750_000)
+    order = np.random.default_rng(5).permutation(250_000)
     other = draw_splats(device, points[order], colors[order], normals[order], Shot(camera, SIZE), 0.5)
     assert other.image.tobytes() == whole.image.tobytes()
     with refused(DeviceError, "points"):
@@ -212,7 +210,7 @@ def test_the_camera_sees_the_whole_cloud(device: Any) -> None:
     assert np.isfinite(lone.depth).any()
 
 
-def test_what_cannot_be_shown_is_refused(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_shown_is_refused(device: Any) -> None:
     cloud = PointCloud(ball(50)[0])
     with pytest.raises(UsageError, match="no points: there is nothing to show"):
         clrecon.render(PointCloud(np.empty((0, 3))), device=device)
@@ -229,6 +227,6 @@ def test_what_cannot_be_shown_is_refused(device: Any, monkeypatch: pytest.Monkey
         PointPictures(cloud, device=device, memory=0)
     near = clrecon.render(cloud, camera=FRONT, size=(64, 64), radius_mm=80.0, device=device)
     assert "are drawn with 128" in near.report["warnings"][-1]
-    monkeypatch.setattr(point_pictures, "MOST_PIXELS", 1000)
-    with refused(UsageError, "radius", "zoom", 50):
-        clrecon.render(cloud, camera=FRONT, size=(64, 64), radius_mm=8.0, device=device)
+    large = PointCloud(ball(1_400_000)[0])
+    with refused(UsageError, "radius", "zoom", 1_400_000):
+        clrecon.render(large, camera=FRONT, size=(64, 64), radius_mm=80.0, device=device)

@@ -14,7 +14,7 @@ from surface_volumes import OBLIQUE, smooth_volume
 from variants import daily_rows, each_value
 
 import clrecon
-from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
+from clrecon.errors import DeviceError, UsageError
 from clrecon.labels import LabelMap, resample
 from clrecon.opencl import Stopwatch
 from clrecon.operators.rays.ray_pictures import TransferTables
@@ -75,15 +75,10 @@ def test_a_failure_is_said_in_the_report(device, volume, monkeypatch):
 
 
 def test_a_device_without_any_room_is_an_error_in_the_end(device, volume, labels, monkeypatch):
-    from clrecon.opencl import arrays
-
-    def no_room(device, flags, size, host=None):
-        raise DeviceMemoryError("no room for 1 byte")
-
     for work, do in WORK.items():
         with DeviceVolume(volume, device=device) as resident, monkeypatch.context() as patch:
-            patch.setattr(arrays, "_make_buffer", no_room)
-            with refused(DeviceError, 1, "room"):
+            Failing(patch, "buffer", 1, 10**6)
+            with refused(DeviceError, "bytes", "injected"):
                 do(resident, labels)
             assert resident.uploaded_bytes == 0, work
 

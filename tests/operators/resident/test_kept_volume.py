@@ -7,10 +7,10 @@ from collections import Counter
 import numpy as np
 import pytest
 from device_work import label_boxes
+from failing_devices import Failing
 from surface_volumes import smooth_volume
 
 import clrecon
-from clrecon.opencl import arrays
 from clrecon.opencl.program import Kernel
 from clrecon.operators.resident.device_volume import DeviceVolume
 
@@ -78,21 +78,16 @@ def test_parts_of_a_kept_volume_are_kept_on_its_device(volume, labels, device, t
 def test_ten_surfaces_of_a_kept_volume_take_no_more_than_ten_of_new_ones(volume, device, monkeypatch):
     """Kernels and buffers, counted: of a CPU all but the voxels are the same, a GPU has bricks from the second on."""
     kernels: list[str] = []
-    buffers: list[int] = []
-    order, make = Kernel.order, arrays._make_buffer
+    order = Kernel.order
 
     def count_order(self, given):
         kernels.append(self.name)
         return order(self, given)
 
-    def count_buffer(device, flags, size, host=None):
-        buffers.append(size)
-        return make(device, flags, size, host)
-
     levels = range(-200, 300, 50)
     clrecon.extract_isosurface(volume, 0, device=device)  # whose device may be checked at first use
     monkeypatch.setattr(Kernel, "order", count_order)
-    monkeypatch.setattr(arrays, "_make_buffer", count_buffer)
+    buffers = Failing(monkeypatch, "buffer", 0).sizes
     new = [clrecon.extract_isosurface(volume, level, device=device) for level in levels]
     taken = Counter(kernels), Counter(buffers)
     kernels.clear()
