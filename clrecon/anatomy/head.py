@@ -8,16 +8,14 @@ soft tissue.  No other part of the body has one: the ring of a vertebra is small
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.geometry import Volume
 from clrecon.geometry.affine import column_spacing
-
-if TYPE_CHECKING:
-    from clrecon.geometry import Volume
 
 SKIN_HU = (-950.0, 150.0)
 """Levels between air and bone: the outermost surface is the skin."""

@@ -9,7 +9,7 @@ from typing import Any
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.jobs.outputs import MESH_FILES
+from clrecon.jobs.outputs import MESH_FILES, MeshFiles, name_outputs
 from clrecon.jobs.settings import CorridorSettings
 
 PARTLY_DONE = 8
@@ -53,7 +53,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.corridor import make_corridors, parse_screw, read_screws
-    from clrecon.jobs.outputs import MeshFiles
 
     space = options.space or "lps"
     screws = tuple(parse_screw(text, space, number) for number, text in enumerate(options.screw, start=1))
@@ -95,8 +94,6 @@ def describe_report(report: dict[str, Any]) -> list[str]:
 
 
 def _name_files(report: dict[str, Any], output: str | None, picture: str | None) -> list[tuple[str, int]]:
-    from clrecon.jobs.outputs import name_outputs
-
     files = []
     for kind, path in (("picture", picture), ("mesh", output)):
         outputs = [each for each in report["outputs"] if each["kind"] == kind]

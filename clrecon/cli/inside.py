@@ -9,7 +9,7 @@ from typing import Any
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.jobs.outputs import MESH_FILES
+from clrecon.jobs.outputs import MESH_FILES, name_outputs
 from clrecon.jobs.settings import InsideSettings
 from clrecon.system.text import format_volume
 
@@ -86,7 +86,6 @@ def describe_inside(report: dict[str, Any]) -> list[str]:
 def _name_files(path: str, report: dict[str, Any], kind: str) -> str:
     """Name the files of a kind, ``meshes`` or ``pictures``: all of one vertebra, the first and the last of several."""
     from clrecon.jobs.inside import name_part
-    from clrecon.jobs.outputs import name_outputs
 
     several = len(report["vertebrae"]) > 1
     names = [

@@ -15,6 +15,7 @@ from importlib import import_module
 from types import FrameType
 from typing import NamedTuple
 
+from clrecon.cli import common
 from clrecon.cli.common import EXIT_CODES, Parser, guard, has_hung_device
 from clrecon.cli.console import Console, filled_streams
 from clrecon.errors import UsageError
@@ -142,8 +143,6 @@ def run() -> None:
 
 
 def _dispatch(arguments: list[str], console: Console) -> int:
-    from clrecon.cli import common
-
     arguments = _as_help_option(arguments)
     parser = Parser(prog="clrecon", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("-V", "--version", action="store_true", help="print the version and stop")

@@ -10,7 +10,8 @@ from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.jobs.mesh.purposes import settings_for
 from clrecon.jobs.mesh.settings import GATE_FAILED, SCAN_GATE_FAILED, LabelChoice, MeshSettings, is_label_seed
-from clrecon.jobs.outputs import MESH_FILES
+from clrecon.jobs.mesh.surfaces import VALUE_GATES, names_level
+from clrecon.jobs.outputs import MESH_FILES, name_outputs
 from clrecon.jobs.presets import PRESETS
 from clrecon.system.text import count_of, format_digits, format_ml, format_volume
 
@@ -105,7 +106,6 @@ def mesh_fields(options: argparse.Namespace) -> dict[str, Any]:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.mesh.job import make_mesh, makes_objects
-    from clrecon.jobs.mesh.surfaces import names_level
 
     given = mesh_fields(options)
     settings = MeshSettings(**settings_for(given.pop("purpose", None), given))
@@ -200,8 +200,6 @@ def _describe_choice(report: dict[str, Any]) -> str:
 
 def _describe_costs(volume: dict[str, Any]) -> str:
     """Say what the default level costs: in mm where it was measured, voxels of half a mm and more, else in voxels."""
-    from clrecon.jobs.mesh.surfaces import VALUE_GATES
-
     if any(gate["name"] in VALUE_GATES and gate["ok"] is False for gate in volume.get("gates") or ()):
         return "a level in HU, which these values are not; --hu auto measures the level of bone"
     fine = min(volume.get("spacing_mm") or (1.0,)) < FINE_MM
@@ -238,8 +236,6 @@ def _describe_parts(meshes: list[dict[str, Any]]) -> list[str]:
 
 
 def _describe_files(output: str, report: dict[str, Any], *, together: bool) -> str:
-    from clrecon.jobs.outputs import name_outputs
-
     paths = [output] if together else name_outputs(output, [mesh["name"] or "" for mesh in report["meshes"]])
     names = [printable(str(path)) for path in (paths[0], paths[-1])]
     files = {1: names[0], 2: " and ".join(names)}.get(len(paths), f"{names[0]} to {names[1]}, {len(paths):,} files")
@@ -420,7 +416,6 @@ def finish_with_gates(report: dict[str, Any], console: Console, strict: bool, *,
     and so does one that the values are HU, where a print has a level in the values' `own_units`.
     """
     from clrecon.jobs.mesh.refinement import warn_of_gates
-    from clrecon.jobs.mesh.surfaces import VALUE_GATES
 
     settled = _GATES_OF_AFFINE + VALUE_GATES * own_units
     gates = [gate for gate in report["volume"].get("gates", ()) if gate["name"] not in settled]

@@ -13,18 +13,15 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import VertexRule, name_parameter
-
-if TYPE_CHECKING:
-    from clrecon.geometry.volume import Volume
-
 
 _VERTEX_RULES: tuple[str, ...] = get_args(VertexRule)
 

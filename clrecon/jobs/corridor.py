@@ -9,12 +9,14 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from clrecon.anatomy.iso_choice import IsoChoice, choose_iso_value
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
-from clrecon.geometry import frame_from_lps
+from clrecon.exchange.formats import check_format
+from clrecon.geometry import Volume, frame_from_lps
 from clrecon.jobs.corridor_results import (
     KNOWN_BIAS,
     KNOWN_CORTEX_BIAS,
@@ -27,21 +29,18 @@ from clrecon.jobs.corridor_results import (
 from clrecon.jobs.outputs import MeshFiles, check_files, name_outputs
 from clrecon.jobs.run import Run
 from clrecon.jobs.settings import FITTED_FROM_HU, CorridorSettings
+from clrecon.labels import LabelMap
 from clrecon.labels.label_map import file_suffixes
 from clrecon.labels.resample import resample_labels
+from clrecon.mesh import Mesh
+from clrecon.mesh.scanlines import cross_lines, fill_lines
+from clrecon.rendering.pictures.picture import check_image_path
 from clrecon.spine.corridors import VertebraCorridors, measure_corridors
 from clrecon.spine.measures import SCALE, Screw, ScrewGrade, grade_screw
 from clrecon.spine.solid_bone import FittedLattice, Lattice
 from clrecon.system.paths import read_regular
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
-
-if TYPE_CHECKING:
-    from clrecon.anatomy.iso_choice import IsoChoice
-    from clrecon.geometry import Volume
-    from clrecon.labels import LabelMap
-    from clrecon.mesh import Mesh
-
 
 _CSV_COLUMNS = ("entry_x", "entry_y", "entry_z", "tip_x", "tip_y", "tip_z", "diameter")
 """Columns of a CSV file, beside ``name`` and ``label``, which may be left out."""
@@ -135,9 +134,6 @@ def make_corridors(
     """Find the corridors through the pedicles of labelled vertebrae, and grade given screws."""
     files = files or MeshFiles()
     with Run(settings, **how) as run:
-        from clrecon.exchange.formats import check_format
-        from clrecon.rendering.pictures.picture import check_image_path
-
         if files.output is not None:
             check_format(files.output)
         if files.picture is not None:
@@ -215,8 +211,6 @@ def _name_files(files: MeshFiles, names: Sequence[str]) -> None:
 def _choose_level(volume: Volume, settings: CorridorSettings, progress: Progress) -> tuple[float, IsoChoice | None]:
     if settings.iso_value is not None or settings.surface == "cortex":
         return float(FITTED_FROM_HU if settings.iso_value is None else settings.iso_value), None
-    from clrecon.anatomy.iso_choice import choose_iso_value
-
     choice = choose_iso_value(volume, progress=progress)
     return choice.iso_value, choice
 
@@ -236,8 +230,6 @@ def _fit_vertebrae(run: Run, volume: Volume, labels: LabelMap, numbers: Sequence
 
 def lay_on_lattice(mesh: Mesh, lattice: Lattice) -> FittedLattice:
     """Return what lies within a fitted surface, and where it crosses the steps of a lattice along each axis."""
-    from clrecon.mesh.scanlines import cross_lines, fill_lines
-
     known = np.isfinite(mesh.values["thickness_mm"])[mesh.triangles].all(axis=1)
     places = lattice.indices(mesh.vertices.astype(np.float64)).T
     solid = np.zeros(lattice.shape, bool)

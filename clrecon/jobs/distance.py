@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.exchange.content import certificate_lines
+from clrecon.exchange.formats import FORMATS, stage_content
 from clrecon.jobs.outputs import MeshFiles
 from clrecon.jobs.run import JobReport, Run
 from clrecon.jobs.settings import FITTED_FROM_HU, DistanceSettings
@@ -164,8 +166,6 @@ def _write_files(
     files: MeshFiles,
     settings: DistanceSettings,
 ) -> list[dict[str, Any]]:
-    from clrecon.exchange.formats import FORMATS, stage_content
-
     written: list[tuple[str, str | Path, StagedFile]] = []
     if files.output is not None and colored is not None:
         content = replace(
@@ -197,7 +197,6 @@ def read_side(path: str | Path, space: Space | None) -> Mesh:
 
 def _make_side(run: Run, source: str | Path, device: Device) -> Mesh:
     """Return the surface of the bone of a scan: at its level, or moved onto the bone."""
-    from clrecon.exchange.content import certificate_lines
     from clrecon.operators.resident.device_volume import DeviceVolume
     from clrecon.operators.surface.cortex_mesh import fit_meshes
     from clrecon.operators.surface.extract import SurfaceExtractor

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from clrecon.geometry import Volume
 from clrecon.geometry.blocks import find_extent
 from clrecon.geometry.resample import resample_volume
 from clrecon.jobs.inputs import crop_scan
@@ -22,9 +23,6 @@ from clrecon.reading.grids.write_volume import (
 )
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress
-
-if TYPE_CHECKING:
-    from clrecon.geometry import Volume
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

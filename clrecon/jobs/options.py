@@ -15,6 +15,7 @@ from clrecon.reading.common.selection import series_option as series_option
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass, fields
 from clrecon.system.options import numbers_reader, option, parse_numbers
+from clrecon.system.text import escape_text
 
 if TYPE_CHECKING:
     from clrecon.geometry.blocks import Box
@@ -360,8 +361,6 @@ class RegionRule:
     name: str | None = None
 
     def __str__(self) -> str:
-        from clrecon.system.text import escape_text
-
         numbers = ",".join("" if math.isinf(number) else f"{number:g}" for number in self.numbers)
         file = None if self.path is None else escape_text(self.path.replace("\\", "/").rsplit("/", 1)[-1])
         return ":".join(part for part in (self.kind, numbers, file, self.name) if part)

@@ -7,18 +7,14 @@ import re
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.exchange.formats import ASSEMBLIES, FORMATS, check_format, list_extensions
 from clrecon.system.arguments import name_parameter
-from clrecon.system.files import check_writable
+from clrecon.system.files import Staged, check_writable, hold_interrupts
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.paths import existing_stay, keep_existing, open_regular, refuse_existing, resolve_target
 from clrecon.system.text import count_of
-
-if TYPE_CHECKING:
-    from clrecon.system.files import Staged
-
 
 MESH_FILES, OBJECT_FILES = list_extensions(tuple(FORMATS)), list_extensions(ASSEMBLIES)
 """Extensions of mesh files, and of those that hold several objects, for help texts."""
@@ -110,7 +106,6 @@ def _find_voxels(path: str | Path) -> Path | None:
 
 def _is_bare_data_set(path: str | Path) -> bool:
     from clrecon.reading.dicom.parse.elements import restore_start
-    from clrecon.system.paths import open_regular
 
     try:
         with open_regular(path) as stream:
@@ -130,8 +125,6 @@ def count_leftovers(output: str | Path, paths: Sequence[str | Path]) -> int:
 
 def refuse_files(paths: Sequence[str | Path]) -> None:
     """Raise `OutputError` if one of the files exists."""
-    from clrecon.system.paths import keep_existing, refuse_existing, resolve_target
-
     with keep_existing():
         for path in paths:
             refuse_existing(path, resolve_target(path))
@@ -139,8 +132,6 @@ def refuse_files(paths: Sequence[str | Path]) -> None:
 
 def refuse_numbered(output: str | Path) -> None:
     """Raise `OutputError` in a block of `keep_existing` if components of an earlier run have names of `output`."""
-    from clrecon.system.paths import existing_stay
-
     if existing_stay() and (count := count_leftovers(output, [])):
         raise OutputError(
             f"{count_of(count, 'numbered file')} of {output} exist{'s' * (count == 1)} already and"
@@ -151,8 +142,6 @@ def refuse_numbered(output: str | Path) -> None:
 
 def _identity(path: str | Path) -> str:
     """Return a key that is equal for two names of one file, also with links and on systems that ignore case."""
-    from clrecon.system.paths import resolve_target
-
     return str(resolve_target(path)).casefold()
 
 
@@ -171,8 +160,6 @@ def check_outputs(
 
 def commit_all(files: Sequence[Staged]) -> None:
     """Move staged files to their places, one after the other; Ctrl-C waits until all are there."""
-    from clrecon.system.files import hold_interrupts
-
     with hold_interrupts():
         for done, file in enumerate(files):
             try:

@@ -12,7 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy.body import describe_pieces, mask_field_of_view, remove_table
+from clrecon.anatomy.spine_line import find_spine_line
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
+from clrecon.geometry import frame_from_lps
 from clrecon.geometry.blocks import describe_extent
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.grid import AIR_HU
@@ -41,8 +44,6 @@ def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> 
     """Return the volume with air outside the field of view and the body, as the settings ask for it."""
     if settings.field_of_view is None and not settings.remove_table:
         return volume
-    from clrecon.anatomy.body import describe_pieces, mask_field_of_view, remove_table
-
     warnings = list(volume.report.get("warnings", ()))
     if settings.field_of_view is not None:
         radius = settings.field_of_view
@@ -71,8 +72,6 @@ def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> 
 
 
 def _describe_bone_left(facts: dict[str, Any]) -> str:
-    from clrecon.anatomy.body import describe_pieces
-
     if facts["bone_kept"] is None:
         return " no bone above 300 HU;"
     bone = "the dry bone" if facts["specimen"] else "the bone"
@@ -220,8 +219,6 @@ def _line_of(volume: Volume, rule: RegionRule, facts: dict[str, Any]) -> Any:
         from clrecon.rendering.views.centre_line import read_curve_points
 
         return read_curve_points(rule.path)
-    from clrecon.anatomy.spine_line import find_spine_line
-
     try:
         line = find_spine_line(volume)
     except RefusedInputError as error:
@@ -231,8 +228,6 @@ def _line_of(volume: Volume, rule: RegionRule, facts: dict[str, Any]) -> Any:
 
 
 def _to_lps(points: Any, space: str) -> Any:
-    from clrecon.geometry import frame_from_lps
-
     return np.asarray(points, dtype=np.float64) * np.diag(frame_from_lps(space))
 
 

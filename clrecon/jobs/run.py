@@ -14,7 +14,9 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from clrecon.errors import Cancelled, ClreconError, DeviceError
+from clrecon.exchange.formats import stage_assembly, stage_mesh
 from clrecon.jobs.outputs import check_files, check_kept, commit_all
+from clrecon.system.files import allow_open_files, stage_file
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.paths import extension_of, keep_existing
@@ -145,8 +147,6 @@ def _as_plain(value: Any) -> Any:
 
 def stage_report(path: str | Path, report: Mapping[str, Any]) -> AbstractContextManager[StagedFile]:
     """Write `report` as JSON under a temporary name, to be committed after the files that it describes."""
-    from clrecon.system.files import stage_file
-
     content = (to_json(report) + "\n").encode("ascii")
     return stage_file(path, lambda stream: stream.write(content))
 
@@ -296,8 +296,6 @@ class Run(Laps):
 
     def write(self, path: str | Path, content: bytes) -> StagedFile:
         """Write bytes under a temporary name."""
-        from clrecon.system.files import stage_file
-
         return self.stage(stage_file(path, lambda stream: stream.write(content), expected_bytes=len(content)))
 
     def write_picture(self, path: str | Path, picture: PictureData) -> StagedFile:
@@ -306,9 +304,6 @@ class Run(Laps):
         return self.write(path, encode_image(picture, extension_of(path)))
 
     def write_meshes(self, meshes: Sequence[Mesh], paths: Sequence[str | Path]) -> list[StagedFile]:
-        from clrecon.exchange.formats import stage_mesh
-        from clrecon.system.files import allow_open_files
-
         allow_open_files(len(meshes))
         staged: list[StagedFile] = []
         for mesh, path in zip(meshes, paths, strict=True):
@@ -318,8 +313,6 @@ class Run(Laps):
 
     def write_together(self, meshes: Sequence[Mesh], path: str | Path) -> StagedFile:
         """Write all meshes as named objects of one file under a temporary name."""
-        from clrecon.exchange.formats import stage_assembly
-
         self.progress("write", 0, 0)
         return self.stage(stage_assembly(meshes, path, self.settings.space, keep_ids=self._keep_ids))
 

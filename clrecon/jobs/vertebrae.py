@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.jobs.run import Run, ScanReport
 from clrecon.jobs.settings import VertebraeSettings
+from clrecon.labels.label_map import encode_nifti, load_nibabel
+from clrecon.labels.write_segmentation import encode_segmentation
+from clrecon.reading import tell_format
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
 from clrecon.system.light_dataclass import dataclass
@@ -100,9 +103,6 @@ def make_vertebrae(
 
 def _check_formats(source: str | Path, output: str | Path, picture: str | Path | None) -> None:
     """Refuse names of files that say another format."""
-    from clrecon.labels.label_map import load_nibabel
-    from clrecon.reading import tell_format
-
     kind = map_format(output)
     if kind in _NIFTI:
         load_nibabel()
@@ -117,12 +117,9 @@ def _check_formats(source: str | Path, output: str | Path, picture: str | Path |
 def _encode_map(labels: LabelMap, output: str | Path, source: str | Path, settings: VertebraeSettings) -> bytes:
     kind = map_format(output)
     if kind in _SEGMENTATION:
-        from clrecon.labels.write_segmentation import encode_segmentation
         from clrecon.reading.dicom.reader import list_slices
 
         return encode_segmentation(labels, list_slices(source, settings))
-    from clrecon.labels.label_map import encode_nifti
-
     return encode_nifti(labels, packed=kind.endswith(".gz"))
 
 

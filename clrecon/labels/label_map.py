@@ -24,6 +24,8 @@ from clrecon.geometry.affine import checked_affine
 from clrecon.geometry.grid import may_change
 from clrecon.geometry.images import Image, make_nibabel, make_sitk, place_in_header, take_nibabel, take_sitk
 from clrecon.geometry.resample import LARGEST_SHEAR_DEGREES, shear_degrees
+from clrecon.geometry.vtk import make_image_data, take_image_data
+from clrecon.reading.grids.grid_file import LABEL_MAP, import_extra
 from clrecon.system.arguments import Space, explains_arguments
 from clrecon.system.files import replace_file
 from clrecon.system.packages import ShownAsHtml, public_function
@@ -348,8 +350,6 @@ class LabelMap(Grid, ShownAsHtml):
 
         Memory and axes are as of `Volume.to_pyvista`: sheared ones are refused.
         """
-        from clrecon.geometry.vtk import make_image_data
-
         image = make_image_data(self._at_right_angles(), "label")
         image.field_data["LABELS"] = [f"{number} {name}" for number, name in self.names.items()] or [""]
         return image
@@ -368,8 +368,6 @@ class LabelMap(Grid, ShownAsHtml):
         names : mapping of int to str, optional
             As of a `LabelMap`; None: those of the field array ``LABELS``, which `to_pyvista` writes.
         """
-        from clrecon.geometry.vtk import take_image_data
-
         voxels, affine = take_image_data(image, name, space)
         if names is None and "LABELS" in image.field_data:
             rows = [str(text).partition(" ")[::2] for text in image.field_data["LABELS"]]
@@ -428,8 +426,6 @@ _CARET_CODE = 30
 
 
 def load_nibabel() -> Any:
-    from clrecon.reading.grids.grid_file import LABEL_MAP, import_extra
-
     return import_extra("nibabel", LABEL_MAP)
 
 

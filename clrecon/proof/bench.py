@@ -16,6 +16,7 @@ from clrecon.jobs.outputs import check_kept
 from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset
 from clrecon.jobs.run import Laps, platform_name, stage_report
 from clrecon.proof.timing import alternate, free_cores, processor_name, spread, summarise, usable_cores
+from clrecon.system.files import check_writable
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.version import package_version
@@ -113,8 +114,6 @@ def run_bench(
     progress = progress or ignore_progress
     _check_arguments(source, iso_value, runs, series)
     if report_path is not None:
-        from clrecon.system.files import check_writable
-
         with keep_existing(keep=no_clobber):
             check_writable(report_path)
         check_kept([("the report", report_path)], source)

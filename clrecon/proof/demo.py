@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import OutputError, UsageError
+from clrecon.geometry import Volume
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.render.job import PictureFiles, make_pictures
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.run import Laps
+from clrecon.proof.phantom import PhantomSettings, make_phantom, write_phantom
 from clrecon.system.files import hold_interrupts, temporary_folder
 from clrecon.system.paths import (
     existing_stay,
@@ -69,8 +71,6 @@ def make_demo(
 
 
 def _fill_folder(folder: Path, chosen: Device, progress: Progress | None) -> dict[str, Any]:
-    from clrecon.proof.phantom import PhantomSettings, write_phantom
-
     watch = Laps()
     settings = PhantomSettings(kind="spine", size=(256, 192), slices=110, spacing=(1.0, 1.0, 1.25))
     truth = write_phantom(folder / "ct", settings, progress=progress)
@@ -110,9 +110,7 @@ def check_sphere(device: Device) -> dict[str, Any]:
     """Mesh a sphere in an anisotropic, tilted, oblique volume; return its largest ``radius_error_max_mm`` too."""
     import numpy as np
 
-    from clrecon.geometry import Volume
     from clrecon.operators.surface.extract import extract_isosurface
-    from clrecon.proof.phantom import PhantomSettings, make_phantom
 
     settings = PhantomSettings(
         kind="sphere",

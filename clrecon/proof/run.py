@@ -20,7 +20,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import IO, Any
 
 from clrecon.errors import ClreconError, DeviceError
-from clrecon.opencl import Device, list_devices
+from clrecon.opencl import Device, choose_unchecked, list_devices
 from clrecon.proof.checking import Check
 from clrecon.proof.points import cloud_checks, voxel_checks
 from clrecon.proof.rays import layer_checks, ray_checks
@@ -264,8 +264,6 @@ def run_device_selftest(
     Return ``{"device": {...}, "passed": bool, "operators": [{"operator", "passed", "detail", "seconds"}], "warnings":
     [text]}``.
     """
-    from clrecon.opencl import choose_unchecked
-
     progress = progress or ignore_progress
     device = choose_unchecked(name)
     results: list[dict[str, Any]] = []

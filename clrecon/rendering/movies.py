@@ -26,12 +26,14 @@ from functools import lru_cache
 from io import BytesIO
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
+from clrecon.rendering.pictures.picture import Rendering
+from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.files import Staged, StagedFolder, check_folder, check_writable, stage_file, temporary_folder
@@ -39,10 +41,6 @@ from clrecon.system.packages import install_command
 from clrecon.system.paths import final_mode, keep_existing, system_errors
 from clrecon.system.progress import Progress
 from clrecon.system.text import guess_word
-
-if TYPE_CHECKING:
-    from clrecon.rendering.pictures.picture import Rendering
-
 
 _ANIMATIONS = (".mp4", ".gif", ".apng")
 """Extensions of animations; a name without extension is a folder of PNG files."""
@@ -231,8 +229,6 @@ def check_frame_folder(path: str | os.PathLike[str]) -> Path:
 @contextlib.contextmanager
 def stage_frame_folder(frames: Iterator[NDArray[np.uint8]], path: str | os.PathLike[str]) -> Iterator[StagedFolder]:
     """Write frames (h, w, 3 or 4) as frame_0000.png, ... into a folder under a temporary name."""
-    from clrecon.rendering.pictures.pillow import load_pillow
-
     load_pillow()
     from PIL import Image
 
@@ -261,8 +257,6 @@ dithered frame is as near to it: root of the mean square 0.90 for 0.91, 1.79 for
 
 def write_gif(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
     """Write frames (h, w, 3), each with 256 colours of its own."""
-    from clrecon.rendering.pictures.pillow import load_pillow
-
     load_pillow()
     first = next(frames)
     height, width = first.shape[:2]
@@ -313,8 +307,6 @@ def _gif_picture(frame: NDArray[np.uint8]) -> tuple[bytes, bytes]:
 
 def write_apng(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
     """Write frames (h, w, 3 or 4) without loss; `stream` must be seekable, as the number of frames comes first."""
-    from clrecon.rendering.pictures.pillow import load_pillow
-
     load_pillow()
     first = next(frames)
     height, width = first.shape[:2]

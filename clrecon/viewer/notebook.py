@@ -10,6 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clrecon.errors import ClreconError
+from clrecon.exchange.content import certificate_lines
+from clrecon.exchange.formats import MOST_PARTS
+from clrecon.geometry import Volume
+from clrecon.points import PointCloud
+from clrecon.reading.common.source_facts import SeriesListing
 from clrecon.system.arguments import ViewName
 from clrecon.system.log import get_logger
 
@@ -48,11 +53,8 @@ def to_html(shown: Mesh | Volume | PointCloud | LabelMap | SeriesListing) -> str
     str or None
         None where it cannot be shown, as without an OpenCL device: notebooks then show the text.  Nothing is raised.
     """
-    from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
-    from clrecon.points import PointCloud
-    from clrecon.reading.common.source_facts import SeriesListing
 
     kinds: list[tuple[type, Any]] = [
         (Mesh, _show_mesh), (Volume, _show_volume), (PointCloud, _show_cloud), (LabelMap, _show_labels),
@@ -69,7 +71,6 @@ def to_html(shown: Mesh | Volume | PointCloud | LabelMap | SeriesListing) -> str
 
 
 def _show_mesh(mesh: Mesh) -> str:
-    from clrecon.exchange.formats import MOST_PARTS
     from clrecon.exchange.page import compose_page
 
     if _LEAST_BYTES_OF_SCANS * mesh.triangle_count <= MOST_PAGE_BYTES and mesh.triangle_count:
@@ -96,7 +97,6 @@ def _draw_object(shown: Mesh | PointCloud) -> str:
 
 
 def _show_volume(volume: Volume) -> str:
-    from clrecon.exchange.content import certificate_lines
     from clrecon.operators.reformat.cut import cut_slice
 
     try:

@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,7 @@ from clrecon.errors import UsageError
 from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.picture import merge_layers
 from clrecon.rendering.pictures.vtk import rendering_to_pyvista
-
-if TYPE_CHECKING:
-    from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.camera import Camera
 
 
 def add_rendering(

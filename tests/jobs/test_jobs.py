@@ -76,7 +76,7 @@ def test_outputs_then_device_then_input(sphere: tuple[Path, dict[str, Any]], tmp
         make_mesh(nowhere, tmp_path / "a.stl", bad_device)
 
 
-@pytest.mark.parametrize("fails", daily(1, ["clrecon.exchange.formats.stage_mesh", "clrecon.jobs.run.stage_report"]))
+@pytest.mark.parametrize("fails", daily(1, ["clrecon.jobs.run.stage_mesh", "clrecon.jobs.run.stage_report"]))
 def test_a_failed_write_leaves_both_old_files(
     fails: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,13 +9,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
+from clrecon.exchange.formats import check_cloud_format, check_format, describe_cloud_losses, stage_cloud, stage_mesh
 from clrecon.jobs.cloud.settings import OF_SCANS, CloudSettings
 from clrecon.jobs.cloud.steps import CloudSteps, find_ghosts, iso_value_of, name_reasons, take_points, try_steps
 from clrecon.jobs.inputs import describe_cloud, is_cloud_file, refuse_other_clouds, refuse_scan_settings
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.run import Run, RunReport
-from clrecon.points import SURFACE_KINDS
+from clrecon.points import SURFACE_KINDS, PointCloud
+from clrecon.points.cloud_reader import read_points
+from clrecon.points.ghost_slices import fill_ghost_slices
 from clrecon.system.arguments import name_parameter
+from clrecon.system.files import allow_open_files
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.system.paths import extension_of
@@ -84,8 +88,6 @@ def _check_kind(settings: CloudSettings, is_cloud: bool) -> None:
 def _read_input(source: str | Path, is_cloud: bool, run: Run) -> tuple[Volume | PointCloud, LabelMap | None]:
     settings: CloudSettings = run.settings
     if is_cloud:
-        from clrecon.points.cloud_reader import read_points
-
         run.progress("read", 0, 0)
         return read_points(source, space=settings.input_space), None
     if settings.labels is None:
@@ -98,7 +100,6 @@ def _mask_scan(
 ) -> tuple[Volume, GhostSlices]:
     """Turn what the settings name into air; ghost slices are found before, and do not tie the body to its table."""
     from clrecon.operators.resident.device_volume import DeviceVolume
-    from clrecon.points.ghost_slices import fill_ghost_slices
 
     with DeviceVolume(volume, device=device.current, memory=settings.memory) as resident:
         ghosts = find_ghosts(resident, iso_value_of(settings), settings, progress)
@@ -134,9 +135,6 @@ def _write_files(
     run: Run, steps: CloudSteps, surface: Mesh | None, files: CloudFiles
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Write the files but the report; return their entries, and warnings of what the cloud's format cannot hold."""
-    from clrecon.exchange.formats import describe_cloud_losses, stage_cloud
-    from clrecon.system.files import allow_open_files
-
     space, keep_ids = run.settings.space, run.settings.keep_ids
     run.progress("write", 0, 0)
     allow_open_files(4)
@@ -146,8 +144,6 @@ def _write_files(
             chosen = steps.cloud if role == "cloud" else steps.removed_cloud()
             outputs.append(describe_file(role, path, run.stage(stage_cloud(chosen, path, space, keep_ids=keep_ids))))
     if surface is not None and files.surface is not None:
-        from clrecon.exchange.formats import stage_mesh
-
         file = run.stage(stage_mesh(surface, files.surface, space, keep_ids=keep_ids))
         outputs.append(describe_file("surface", files.surface, file))
     losses = describe_cloud_losses(steps.cloud.describe(space, with_ijk=False), f".{outputs[0]['format']}")
@@ -174,8 +170,6 @@ class CloudFiles:
         ]
 
     def check_formats(self) -> None:
-        from clrecon.exchange.formats import check_cloud_format, check_format
-
         check_cloud_format(self.output)
         if self.removed is not None:
             check_cloud_format(self.removed)
@@ -226,8 +220,6 @@ def report_of(
     losses: Sequence[str],
 ) -> CloudReport:
     """Compose the report of a job on what was read, the `subject`; `losses` are warnings of the cloud's format."""
-    from clrecon.points import PointCloud
-
     settings: CloudSettings = run.settings
     cloud, first = steps.cloud, steps.first.report
     volume = None if isinstance(subject, PointCloud) else subject

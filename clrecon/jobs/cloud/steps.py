@@ -10,10 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clrecon.errors import RefusedInputError
+from clrecon.geometry import Volume
 from clrecon.jobs.cloud.settings import CloudSettings, Clustering
 from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset
 from clrecon.jobs.run import trial_cube
+from clrecon.points import PointCloud
 from clrecon.points.cloud import count_numbers
+from clrecon.points.ghost_slices import drop_ghost_slices
+from clrecon.points.keep import keep_clusters
+from clrecon.points.stencil import Lattice
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Gate
@@ -41,7 +46,6 @@ def take_points(
 
     ghosts: Of the scan before it was masked; None: they are looked for in the volume.
     """
-    from clrecon.geometry import Volume
     from clrecon.operators.resident.device_volume import DeviceVolume
 
     if not isinstance(subject, Volume):
@@ -53,8 +57,6 @@ def take_points(
             ghosts = find_ghosts(resident, iso_value_of(settings), settings, progress)
         steps = _extract_cloud(resident, labels, settings, progress)
         if settings.ghost_slices == "drop":
-            from clrecon.points.ghost_slices import drop_ghost_slices
-
             step = drop_ghost_slices(steps.cloud, ghosts, volume=subject)
             steps.add("ghost slices", step, takes_noise=True)
         else:
@@ -87,8 +89,6 @@ def iso_value_of(settings: CloudSettings) -> float:
 
 def try_steps(device: Device, settings: CloudSettings, is_cloud: bool) -> None:
     """Build the kernels by running all steps on a small cube."""
-    from clrecon.points import PointCloud
-
     cube = trial_cube()
     subject: Volume | PointCloud = PointCloud(np.argwhere(cube.voxels >= 0).astype(np.float32)) if is_cloud else cube
     take_points(subject, None, device, settings.for_trial(), ignore_progress)
@@ -134,12 +134,9 @@ def _cluster_points(
 ) -> None:
     """Cluster the points; drop noise and the clusters that no keep rule names."""
     from clrecon.operators.points.clusters import cluster_points
-    from clrecon.points.keep import keep_clusters
 
     eps, volume = chosen.eps, resident
     if resident is not None and not steps.cloud.has_ijk:  # points of a surface: free, but of that scan
-        from clrecon.points.stencil import Lattice
-
         eps, volume = Lattice.of(resident.volume).default_eps if eps is None else eps, None
     groups = cluster_points(steps.cloud, eps, chosen.min_samples, **_with_volume(volume, shared))
     steps.add("clusters", groups)

@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clrecon.exchange.formats import check_assembly, describe_rounding
+from clrecon.geometry import frame_from_lps
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import describe_label, judge_label_volumes, name_label_files
 from clrecon.jobs.mesh.make import MadeParts, first_names, label_parts, make_parts, warn_of_crumbs
@@ -195,8 +197,6 @@ def report_of(
 
 
 def _warn_of_meshes(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> list[str]:
-    from clrecon.exchange.formats import describe_rounding
-
     warnings = []
     for part, mesh in zip(parts, meshes, strict=True):
         warnings += part.mesh.report.get("warnings", [])
@@ -218,8 +218,6 @@ def _describe_all(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> di
 
 
 def _bounds(mesh: Mesh, space: str) -> list[list[float]] | None:
-    from clrecon.geometry import frame_from_lps
-
     if mesh.vertex_count == 0:
         return None
     frame = frame_from_lps(space)
@@ -268,8 +266,6 @@ def make_mesh(
         surfaces = plan_surfaces(settings.levels, below=settings.below is not None)
         with run.keeping():
             if settings.one_file:
-                from clrecon.exchange.formats import check_assembly
-
                 check_assembly(output)
             outputs = check_outputs(
                 output, report_path, [""] if settings.one_file else first_names(surfaces, settings.split)

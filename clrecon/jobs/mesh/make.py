@@ -10,7 +10,10 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clrecon.anatomy.surroundings import leave_outside_air
 from clrecon.errors import DeviceFailedError, NoSurfaceError, UsageError
+from clrecon.geometry import frame_from_lps
+from clrecon.geometry.certificate import amend
 from clrecon.jobs.inputs import read_with_labels
 from clrecon.jobs.mesh.bone import find_bone
 from clrecon.jobs.mesh.labels import extract_label_surfaces, open_labels
@@ -23,6 +26,7 @@ from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
 from clrecon.jobs.run import Run, trial_cube
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.text import format_hu, format_ml
 
@@ -254,9 +258,6 @@ def drop_outside_air(volume: Volume, settings: MeshSettings, progress: Progress)
     """Return the volume without the air around the patient, if the settings ask for the values below an iso value."""
     if settings.below is None or settings.keep_outside:
         return volume
-    from clrecon.anatomy.surroundings import leave_outside_air
-    from clrecon.geometry.certificate import amend
-
     warnings = list(volume.report.get("warnings", ()))
     levels = [level for level in settings.levels if not isinstance(level, tuple)]
     volume = leave_outside_air(volume, levels, progress=progress)
@@ -346,7 +347,6 @@ def _select_parts(
 ) -> list[Part]:
     if not settings.selects:
         return [Part(surface, surface.name, mesh)]
-    from clrecon.geometry import frame_from_lps
     from clrecon.mesh import select_components, split_components
 
     limits = (settings.keep_largest, settings.min_volume_ml)
@@ -366,7 +366,6 @@ def _select_parts(
     if settings.all_parts:
         # walls of cavities are no bodies: what they enclose is filled
         from clrecon.mesh.refine.shifts import enclosed_mm3
-        from clrecon.system.pieces import local_origin
 
         is_body = enclosed_mm3(mesh.vertices - local_origin(mesh.vertices), mesh.triangles, *labelled) >= 0.0
         among = is_body if among is None else among & is_body
@@ -399,7 +398,6 @@ def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings, device: Device
     import numpy as np
 
     from clrecon.mesh.refine.shifts import enclosed_mm3
-    from clrecon.system.pieces import local_origin
 
     warnings = []
     for part in parts:

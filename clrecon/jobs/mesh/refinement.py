@@ -14,6 +14,7 @@ from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
 from clrecon.system.arguments import name_parameter
 from clrecon.system.pieces import side_by_side
 from clrecon.system.progress import Progress, Steps, ignore_progress
+from clrecon.system.records import failed_gates
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -231,6 +232,4 @@ def _count_crossings(mesh: Mesh, device: Device | None, steps: Steps) -> int:
 
 def warn_of_gates(gates: Sequence[dict[str, Any]]) -> list[str]:
     """Return one line for each failed gate, with the name of its mesh if there are several."""
-    from clrecon.system.records import failed_gates
-
     return [f"{gate['mesh']}: {line}" if gate["mesh"] else line for gate in gates for line in failed_gates([gate])]

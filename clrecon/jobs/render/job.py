@@ -11,19 +11,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.anatomy.head import SKIN_SEEN_HU, warn_of_face
+from clrecon.anatomy.surroundings import LEFT_OUT, leave_out_surroundings
 from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.certificate import amend
 from clrecon.jobs.inputs import describe_cloud, is_cloud_file, is_only_mesh, read_with_labels, refuse_scan_settings
 from clrecon.jobs.outputs import check_distinct, check_files, check_kept
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.render.picture_taker import Beside, PictureTaker, read_curve, read_function, read_look
 from clrecon.jobs.render.settings import LabelLook, RenderSettings
 from clrecon.jobs.run import Run, RunReport
+from clrecon.labels import file_suffixes
 from clrecon.mesh import Mesh
 from clrecon.mesh.mesh_reader import read_mesh
-from clrecon.rendering.pictures.annotations import edge_letters
+from clrecon.points import PointCloud
+from clrecon.points.cloud_reader import read_points
+from clrecon.rendering.movies import animation_kind, check_animation, stage_animation, turntable_cameras
+from clrecon.rendering.pictures.annotations import check_caption, edge_letters
 from clrecon.rendering.pictures.label_style import NO_LABEL, find_shown
 from clrecon.rendering.pictures.modes import check_known
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
+from clrecon.rendering.pictures.picture import check_float_path, check_image_path, encode_floats
+from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Projection, Style, SurfaceLook, VolumeLook
 from clrecon.system.arguments import name_parameter
 from clrecon.system.files import allow_open_files
@@ -165,9 +174,6 @@ def report_of(
     turntable: dict[str, Any] | None,
 ) -> PictureReport:
     """Compose the report of a job; the `taker` knows transfer function, light and warnings."""
-    from clrecon.geometry import Volume
-    from clrecon.points import PointCloud
-
     settings: RenderSettings = run.settings
     volume = subject if isinstance(subject, Volume) else None
     cloud = describe_cloud(subject) if isinstance(subject, PointCloud) else None
@@ -243,8 +249,6 @@ def _describe_labels(look: LabelLook | None, labels: LabelMap | None) -> list[di
     """Describe the labels with a look of their own, by names that files can have: the map's own can be anything."""
     if look is None or labels is None:
         return None
-    from clrecon.labels import file_suffixes
-
     looks: dict[int, dict[str, Any]] = {}
     for look_name, chosen in (("color", look.colors), ("opacity", look.opacities)):
         for label, value in chosen.items():
@@ -337,8 +341,6 @@ def _read_input(source: str | Path, run: Run) -> tuple[Volume | PointCloud | Mes
         run.progress("read", 0, 0)
         if settings.mode == "mesh":
             return read_mesh(source, space=settings.mesh_space), None
-        from clrecon.points.cloud_reader import read_points
-
         return read_points(source), None
     path = None if settings.labels is None else settings.labels.path
     read_map = partial(read_look, settings.labels, follow_links=settings.follow_links)
@@ -358,9 +360,6 @@ def _mask_scan(volume: Volume, settings: RenderSettings, device: Device, progres
 
 def _leave_out_surroundings(volume: Volume, settings: RenderSettings, device: Device, progress: Progress) -> Volume:
     """Leave out what lies outside of the body and of the region, whose voxels get a value above those that count."""
-    from clrecon.anatomy.surroundings import LEFT_OUT, leave_out_surroundings
-    from clrecon.geometry.certificate import amend
-
     measured = volume.report.get("hu_range")
     volume = leave_out_surroundings(volume, progress=progress)
     bands: list[Band] = [(-math.inf, volume.report[LEFT_OUT]["value_hu"] - 1.0)]
@@ -373,9 +372,6 @@ def _leave_out_surroundings(volume: Volume, settings: RenderSettings, device: De
 def _try_picture(device: Device, settings: RenderSettings) -> None:
     """Build the kernels, of volumes those for int16, by taking a small picture of an empty volume or of one point."""
     import numpy as np
-
-    from clrecon.geometry import Volume
-    from clrecon.points import PointCloud
 
     mode = "slice" if settings.mode == "cpr" else settings.mode  # the same kernel, and no curve is needed
     subject: Volume | PointCloud | Mesh
@@ -411,8 +407,6 @@ def _take_turntable(run: Run, taker: PictureTaker, files: PictureFiles) -> dict[
     turn = settings.turntable
     if files.turntable is None or turn is None:
         return None
-    from clrecon.rendering.movies import animation_kind, stage_animation, turntable_cameras
-
     first = settings.camera(taker.box, taker.views[0], turning=True)
     cameras = turntable_cameras(first, turn.frames, turn.degrees)
 
@@ -480,11 +474,6 @@ def path_of(path: str | Path, name: str) -> str | Path:
 
 def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[str, str | Path]]:
     """Refuse outputs that cannot be written, before any work is done; return description and path of each."""
-    from clrecon.rendering.movies import animation_kind, check_animation
-    from clrecon.rendering.pictures.annotations import check_caption
-    from clrecon.rendering.pictures.picture import check_float_path, check_image_path
-    from clrecon.rendering.pictures.pillow import load_pillow
-
     load_pillow()
     check_caption(settings.caption)
     for name in ("depth", "values"):
@@ -527,7 +516,6 @@ def _check_outside_frames(folder: str | Path, owned: Sequence[tuple[str, str | P
 
 def _write_picture(run: Run, picture: Rendering, files: PictureFiles, name: str) -> dict[str, dict[str, Any]]:
     """Write a picture, and its depths and values if asked for; return their entries in the report."""
-    from clrecon.rendering.pictures.picture import encode_floats
 
     def entry(path: str | Path, file: StagedFile) -> dict[str, Any]:
         return {"format": extension_of(path)[1:], "bytes": file.size}

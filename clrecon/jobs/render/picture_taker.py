@@ -7,12 +7,17 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, cast
 
+from clrecon.geometry.grid import Grid
 from clrecon.jobs.render.settings import SPINES, LabelLook, RenderSettings
+from clrecon.labels.reader import read_all_labels
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.looks.presets import find_preset
+from clrecon.rendering.looks.transfer_files import load_transfer_function
 from clrecon.rendering.pictures.label_style import NO_LABEL
 from clrecon.rendering.pictures.object_looks import MESH_COLORS, MeshLook, PointLook
+from clrecon.rendering.pictures.sheets import add_scale
 from clrecon.rendering.pictures.styles import SPINE, CurveCut, SlicesInSpace, Style, SurfaceLook, VolumeLook
+from clrecon.rendering.views.centre_line import read_curve_points
 from clrecon.rendering.views.clip import check_center
 from clrecon.rendering.views.directions import default_view, read_view, say_view
 from clrecon.system.base_classes import Closing
@@ -35,8 +40,6 @@ def read_function(named: str | None) -> TransferFunction | None:
     """Read the transfer function ``FILE`` or ``FILE:NAME``; None if no file is given."""
     if named is None:
         return None
-    from clrecon.rendering.looks.transfer_files import load_transfer_function
-
     path, colon, name = named.rpartition(":")
     if colon and not os.path.exists(named) and os.path.exists(path):
         return load_transfer_function(path, name)
@@ -47,8 +50,6 @@ def read_curve(named: str | None) -> Float64Array | None:
     """Read the points (n, 3) in LPS mm of a centre line; None if no file is given or the spinal canal is meant."""
     if named is None or named in SPINES:
         return None
-    from clrecon.rendering.views.centre_line import read_curve_points
-
     return read_curve_points(named)
 
 
@@ -56,8 +57,6 @@ def read_look(look: LabelLook | None, volume: Volume | None = None, *, follow_li
     """Read the label map; None if no file is given.  With the scan, a large one is held against its grid first."""
     if look is None:
         return None
-    from clrecon.labels.reader import read_all_labels
-
     opacities = [label for label in look.opacities if label.strip() != str(NO_LABEL)]
     named = [*look.colors, *opacities]  # they get the voxels that they share with others
     labels = read_all_labels(look.path, named or None, volume=volume, follow_links=follow_links)
@@ -119,7 +118,6 @@ class PictureTaker(Closing):
         return self._box
 
     def _find_box(self) -> Grid:
-        from clrecon.geometry.grid import Grid
         from clrecon.operators.rays.point_pictures import cloud_box
 
         if self._is_scene:
@@ -156,8 +154,6 @@ class PictureTaker(Closing):
         picture = picture.annotated(letters=letters, scale_bar=settings.scale_bar, caption=settings.caption)
         if not isinstance(self.style, MeshLook) or self.style.color_by is None:
             return picture
-        from clrecon.rendering.pictures.sheets import add_scale
-
         scale, _ = self.style.find_scale(cast("Mesh", self._subject).values)
         return add_scale(picture, scale, MESH_COLORS[self.style.color_by])
 

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.exchange.formats import MESH_INPUTS
+from clrecon.geometry import Volume
 from clrecon.jobs.distance import read_side
 from clrecon.jobs.inputs import crop_labels, is_cloud_file, refuse_other_clouds
 from clrecon.jobs.mesh.labels import open_labels
 from clrecon.jobs.options import InputSettings, changed_fields
-from clrecon.jobs.preprocess import mask_volume
+from clrecon.jobs.preprocess import mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.view import ViewSettings
 from clrecon.mesh import Mesh
+from clrecon.points.cloud_reader import read_points
 from clrecon.reading import read_selected, tell_format
 from clrecon.system.arguments import Space, name_parameter
 from clrecon.system.light_dataclass import dataclass, field, fields
@@ -90,8 +92,6 @@ def open_inputs(
             ready(by_position[position])
     opened = [by_position[place] for place in range(len(inputs))]
     if labels is not None:
-        from clrecon.geometry import Volume
-
         scans = (each.subject for each in opened if isinstance(each.subject, Volume))
         opened.append(_open_labels(settings, next(scans, None)))
         if ready is not None:
@@ -135,8 +135,6 @@ def _open_mesh(path: str | Path, space: Space | None) -> OpenedInput:
 
 
 def _open_cloud(path: str | Path, space: Space | None) -> OpenedInput:
-    from clrecon.points.cloud_reader import read_points
-
     cloud = read_points(path)
     if space is not None and cloud.report["file"]["space_from"] == "assumed":
         cloud = read_points(path, space=space)
@@ -161,7 +159,6 @@ def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress) -> 
         return OpenedInput(labels, (note, *labels.warnings))
     volume = mask_volume(volume, scan, progress)
     if scan.crop is not None or scan.region or scan.preprocess is not None:
-        from clrecon.jobs.preprocess import preprocess_volume, restrict_volume
         from clrecon.operators import take_device
 
         device = take_device(scan.device)

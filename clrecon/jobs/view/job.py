@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.exchange.page import read_facts
+from clrecon.geometry import Volume
 from clrecon.jobs.distance import doubt_frames, read_side
 from clrecon.jobs.inputs import may_be_mesh
 from clrecon.jobs.mesh.bone import judge_surfaces
@@ -24,10 +25,6 @@ from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.text import escape_text
-
-if TYPE_CHECKING:
-    from clrecon.geometry import Volume
-
 
 log = get_logger(__name__)
 

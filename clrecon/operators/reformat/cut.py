@@ -159,8 +159,6 @@ def _describe_plane(camera: Camera) -> dict[str, Any]:
 
 
 def _describe_miss(volume: Volume, camera: Camera) -> str:
-    from clrecon.rendering.views.camera import box_corners
-
     along = (box_corners(volume) - camera.focal_point) @ camera.basis().forward
     if along.min() > 0.0 or along.max() < 0.0:
         return (

@@ -11,6 +11,8 @@ from typing import Any
 
 from clrecon.errors import ClreconError, DeviceError
 from clrecon.jobs.run import peak_memory_bytes, to_json
+from clrecon.opencl import has_hung_commands
+from clrecon.operators import choose_device
 from clrecon.proof.compare.makers import Scene, draw, make_timed, time_small
 from clrecon.proof.compare.methods import COMPARED
 from clrecon.proof.compare.processes import Request, load_volume, save_arrays, save_mesh
@@ -26,8 +28,6 @@ def run_method(request: Request) -> dict[str, Any]:
     Return its ``state`` ("done", "failed", "declined" or "missing"), and with "done" the figures, see
     `_measure_method`; else ``error``, what kind it is of, and why.
     """
-    from clrecon.opencl import has_hung_commands
-
     try:
         with time_limit(request.timeout):
             return {"state": "done", "error": None, "kind": None, **_measure_method(request)}
@@ -108,8 +108,6 @@ def _save(folder: Path, name: str, product: Any) -> dict[str, Any]:
 
 
 def _open_device(scene: Scene) -> float:
-    from clrecon.operators import choose_device
-
     start = perf_counter()
     scene.device = choose_device(scene.request.device)
     _ = scene.device.queue

@@ -25,6 +25,7 @@ from clrecon.proof.compare.findings import SAME_MM, MethodRecord
 from clrecon.proof.compare.methods import COMPARED
 from clrecon.proof.compare.processes import load_array, load_mesh
 from clrecon.rendering.pictures.likeness import make_control_pictures, measure_pictures
+from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.arguments import DirectionName
 
@@ -162,8 +163,6 @@ def _draw_slice(
     contours: Sequence[tuple[Segments, str]],
 ) -> Any:
     """Draw a part of a plane with contours, each in its colour."""
-    from clrecon.rendering.pictures.pillow import load_pillow
-
     load_pillow()
     from PIL import Image, ImageDraw
 
@@ -231,8 +230,6 @@ def along_slices(volume: Volume) -> dict[str, Any]:
 
 def middle_slice(volume: Volume, size: tuple[int, int], offset: int = 0) -> NDArray[np.uint8]:
     """Return the middle slice, or one beside it, as grey values of the size of the pictures."""
-    from clrecon.rendering.pictures.pillow import load_pillow
-
     load_pillow()
     from PIL import Image
 
@@ -311,8 +308,6 @@ def embed(image: Any) -> str:
 
 
 def _as_pillow(image: Any) -> Any:
-    from clrecon.rendering.pictures.pillow import load_pillow
-
     load_pillow()
     from PIL import Image as Pillow
 

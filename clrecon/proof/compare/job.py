@@ -13,13 +13,15 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from clrecon.errors import ClreconError, DeviceError, NoSurfaceError, UsageError
+from clrecon.geometry import Volume
 from clrecon.jobs.mesh.make import check_levels, mask_and_preprocess, mask_parts
 from clrecon.jobs.mesh.surfaces import choose_level, describe_level, plan_surfaces
 from clrecon.jobs.outputs import check_kept
 from clrecon.jobs.run import DeviceOpening, Laps, to_json
+from clrecon.opencl import Device
 from clrecon.proof.compare.figures import (
     SIZE,
     Figures,
@@ -34,17 +36,13 @@ from clrecon.proof.compare.methods import COMPARED, CompareSettings
 from clrecon.proof.compare.page import make_page
 from clrecon.proof.compare.processes import Request, measure_in_processes, run_in_process, save_volume
 from clrecon.proof.compare.records import compose_report, make_record
+from clrecon.proof.phantom import phantom_truth
 from clrecon.reading import read_selected
 from clrecon.system.files import StagedFolder, check_folder, temporary_folder
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.paths import final_mode, keep_existing, system_errors
 from clrecon.system.progress import Progress, device_seconds, ignore_progress
 from clrecon.system.text import format_hu
-
-if TYPE_CHECKING:
-    from clrecon.geometry import Volume
-    from clrecon.opencl import Device
-
 
 PAGE, REPORT = "index.html", "report.json"
 
@@ -159,8 +157,6 @@ def make_comparison(
 
 def _check_truth(path: Path) -> str:
     """Return the folder of a phantom's truth, which can be read."""
-    from clrecon.proof.phantom import phantom_truth
-
     folder = path.parent if path.name == "truth.json" and not path.is_dir() else path
     phantom_truth(folder)
     return str(folder.resolve())

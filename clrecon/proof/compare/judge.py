@@ -20,6 +20,7 @@ from clrecon.proof.compare.mesh_cells import GridCells, find_mesh_cells, measure
 from clrecon.proof.compare.mesh_slices import measure_slices
 from clrecon.proof.compare.mesh_truth import REACH_MM, measure_truth
 from clrecon.proof.compare.processes import load_array, load_mesh, load_volume
+from clrecon.proof.phantom import phantom_truth
 
 _MEASURES = ("quality", "cells", "slices", "surfaces", "truth", "points")
 
@@ -40,8 +41,6 @@ class Judge:
 
     @cached_property
     def truth(self) -> Any:
-        from clrecon.proof.phantom import phantom_truth
-
         return phantom_truth(self._truth)
 
     @cached_property

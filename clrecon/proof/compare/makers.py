@@ -17,9 +17,12 @@ from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
 from clrecon.mesh.triangles import vertex_normals
 from clrecon.opencl import Device
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.proof.compare.processes import Request
+from clrecon.proof.rays.render import cast_rays
 from clrecon.rendering import Rendering
+from clrecon.rendering.looks.presets import find_preset
 from clrecon.rendering.views.camera import Camera
 
 Image = NDArray[np.uint8]
@@ -157,7 +160,6 @@ def _surface(scene: Scene, method: Any, **more: Any) -> Product:
 
 def _fitted(scene: Scene) -> Product:
     """Marching cubes, and the surface moved onto the bone; the volume goes to the device once."""
-    from clrecon.operators.resident.device_volume import DeviceVolume
     from clrecon.operators.surface.cortex_mesh import fit_cortex
     from clrecon.operators.surface.extract import extract_isosurface
 
@@ -188,7 +190,6 @@ def _cloud_surface(scene: Scene) -> Product:
     from clrecon.operators.points.normals import estimate_normals
     from clrecon.operators.points.point_extraction import extract_points
     from clrecon.operators.points.reconstruct import reconstruct_surface
-    from clrecon.operators.resident.device_volume import DeviceVolume
 
     request = scene.request
     with DeviceVolume(scene.volume, device=scene.device, memory=request.memory) as resident:
@@ -215,9 +216,6 @@ def _cast(scene: Scene, camera: Camera, size: tuple[int, int]) -> Rendering:
 
 
 def _rays_cpu(scene: Scene) -> Product:
-    from clrecon.proof.rays.render import cast_rays
-    from clrecon.rendering.looks.presets import find_preset
-
     camera, _ = scene.request.views()["view"]
     preset = find_preset(_RAYS_PRESET)
     cast = cast_rays(scene.volume, preset.transfer_function, camera, TWIN_SIZE, lighting=preset.lighting)

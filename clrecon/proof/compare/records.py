@@ -7,22 +7,19 @@ import importlib.metadata
 import platform
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from clrecon.geometry import Volume
 from clrecon.geometry.certificate import without_ids
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name
-from clrecon.proof.compare.figures import SIZE, VIEW
+from clrecon.opencl import Device
+from clrecon.proof.compare.figures import SIZE, VIEW, Figures
 from clrecon.proof.compare.findings import CompareReport, MethodRecord, find_findings
 from clrecon.proof.compare.makers import PARTS, TWIN_SIZE
 from clrecon.proof.compare.methods import Compared, CompareSettings
 from clrecon.proof.timing import free_cores, processor_name, usable_cores
 from clrecon.version import package_version
-
-if TYPE_CHECKING:
-    from clrecon.geometry import Volume
-    from clrecon.opencl import Device
-    from clrecon.proof.compare.figures import Figures
 
 ALL_PARTS = ("read", *PARTS)
 

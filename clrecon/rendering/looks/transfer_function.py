@@ -17,6 +17,8 @@ from clrecon.rendering.looks.lighting import Lighting
 from clrecon.rendering.looks.piecewise import check_ascending, check_share, evaluate_curve
 from clrecon.system.arguments import as_numbers, explains_arguments
 from clrecon.system.base_classes import Message
+from clrecon.system.files import replace_file
+from clrecon.system.paths import keep_existing
 
 _UNIT_LIMIT_MM = 1e9
 """Largest unit distance; its inverse is the smallest.  float32 holds all that a ray step computes from them."""
@@ -335,9 +337,6 @@ class TransferFunction(Message):
         OutputError
             The file cannot be written; an older file of that name is intact.
         """
-        from clrecon.system.files import replace_file
-        from clrecon.system.paths import keep_existing
-
         names = {"name": self.name, "description": self.description}
         head: dict[str, Any] = {key: text for key, text in names.items() if text}
         head["unit_distance_mm"] = self.unit_distance

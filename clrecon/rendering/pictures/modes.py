@@ -5,12 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from itertools import chain
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypedDict
+from typing import Literal, NamedTuple, TypedDict
+
+from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
+from clrecon.labels import LabelMap
+from clrecon.rendering.looks.lighting import Lighting
 from clrecon.rendering.looks.presets import find_preset
+from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.pictures.object_looks import MESH_COLORS, MeshLook, PointLook
 from clrecon.rendering.pictures.styles import (
+    ByLabel,
+    Color,
     CurveCut,
     PlaneCut,
     Projection,
@@ -19,19 +26,11 @@ from clrecon.rendering.pictures.styles import (
     SurfaceLook,
     VolumeLook,
 )
+from clrecon.rendering.views.centre_line import Curve
+from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import hint_at_sheet
 from clrecon.system.arguments import Combination, CurvedKind, ModeName, PresetName, WindowName, name_parameter
 from clrecon.system.text import unknown_name
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from clrecon.labels import LabelMap
-    from clrecon.rendering.looks.lighting import Lighting
-    from clrecon.rendering.looks.transfer_function import TransferFunction
-    from clrecon.rendering.pictures.styles import ByLabel, Color
-    from clrecon.rendering.views.centre_line import Curve
-    from clrecon.rendering.views.clip import Clip
 
 
 class Mode(NamedTuple):

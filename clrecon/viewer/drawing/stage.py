@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy.body import remove_table
 from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
@@ -188,8 +189,6 @@ class Stage(DeviceWorker):
 
     def remove_table(self, progress: Progress | None = None) -> dict[int, dict[str, Any]]:
         """Make the scans without table and blankets, once; returns what was taken from each, by number."""
-        from clrecon.anatomy.body import remove_table
-
         facts = {}
         for scan in self.objects:
             if not isinstance(scan, ShownScan):

@@ -14,6 +14,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
+from clrecon.mesh.triangles import vertex_normals
 from clrecon.points import PointCloud
 from clrecon.rendering.looks.presets import PRESETS
 from clrecon.rendering.pictures.label_style import distinct_colors
@@ -167,8 +168,6 @@ def _with_normals(mesh: Mesh) -> Mesh:
         raise UsageError("a mesh has no triangle: there is nothing to show")
     if mesh.normals is not None:
         return mesh
-    from clrecon.mesh.triangles import vertex_normals
-
     normals = vertex_normals(mesh.vertices, mesh.triangles)
     return Mesh(mesh.vertices, mesh.triangles, normals, dict(mesh.report), trusted=True)
 

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import NoSurfaceError
+from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels import LabelMap
 from clrecon.labels.resample import ResampledLabels
@@ -27,9 +28,6 @@ from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_hu
 from clrecon.viewer.model.state import Box, Point, ShownPart
-
-if TYPE_CHECKING:
-    from clrecon.geometry import Volume
 
 _MOST_CLUSTERS = 20
 """Clusters that are parts of their own."""

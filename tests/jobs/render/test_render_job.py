@@ -137,9 +137,9 @@ def test_a_step_that_fails_leaves_the_old_files(
         )
     else:
         home = {
-            "encode_floats": "clrecon.rendering.pictures.picture.encode_floats",
+            "encode_floats": "clrecon.jobs.render.job.encode_floats",
             "stage_report": "clrecon.jobs.run.stage_report",
-            "stage_animation": "clrecon.rendering.movies.stage_animation",
+            "stage_animation": "clrecon.jobs.render.job.stage_animation",
             "commit": "clrecon.system.files.StagedFile.commit",
         }[fails]
         monkeypatch.setattr(home, fail)

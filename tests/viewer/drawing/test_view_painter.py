@@ -222,7 +222,7 @@ def test_a_curve_straightens_the_scan(view):
 
 
 def test_without_the_table_another_volume_is_shown(view, monkeypatch):
-    from clrecon.anatomy import body
+    from clrecon.viewer.drawing import stage
 
     model, painter = view()
     bare = scenes.make_scan().voxels.copy()
@@ -233,7 +233,7 @@ def test_without_the_table_another_volume_is_shown(view, monkeypatch):
         made.report = {**made.report, "remove_table": {"removed_share": 0.5, "dense_voxels_removed": 7}}
         return made
 
-    monkeypatch.setattr(body, "remove_table", remove)
+    monkeypatch.setattr(stage, "remove_table", remove)
     before = shown_pixels(painter.picture(model.state, SIZE))
     assert not painter.knows_table
     assert painter.remove_table()[1]["dense_voxels_removed"] == 7 and painter.knows_table

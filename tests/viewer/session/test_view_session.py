@@ -237,14 +237,14 @@ def test_points_of_a_tool_are_picks_in_picture_and_slices(session):
 
 @pytest.mark.opencl
 def test_the_table_goes_in_the_background_and_it_is_said_how_much(session, monkeypatch):
-    from clrecon.anatomy import body
+    from clrecon.viewer.drawing import stage
 
     def remove(volume, progress=None):
         made = volume.with_voxels(volume.voxels.copy())
         made.report = {**made.report, "remove_table": {"removed_share": 0.25, "dense_voxels_removed": 1200}}
         return made
 
-    monkeypatch.setattr(body, "remove_table", remove)
+    monkeypatch.setattr(stage, "remove_table", remove)
     view = session(scenes.make_scan())
     view.do({"do": "set_table", "shown": False})
     assert view.wait(PATIENCE)
@@ -256,7 +256,7 @@ def test_the_table_goes_in_the_background_and_it_is_said_how_much(session, monke
     def refuse(volume, progress=None):
         raise RefusedInputError("no body found")
 
-    monkeypatch.setattr(body, "remove_table", refuse)
+    monkeypatch.setattr(stage, "remove_table", refuse)
     other = session(scenes.make_scan())
     other.do({"do": "set_table", "shown": False})
     assert other.wait(PATIENCE)
