@@ -29,7 +29,7 @@ HABITS = {
     "comprehensions_of_two_loops": 23,
     "positional_flags": 0,
     "functions_of_many_parameters": 38,
-    "equal_functions": 1,
+    "equal_functions": 0,
     "constants_of_one_file": 0,
     "kernels_with_branches": 18,
     "tests_of_wording": 489,

@@ -29,35 +29,30 @@ from clrecon.opencl import (
     upload,
 )
 from clrecon.operators.points.grid import CELL_ROUNDING, GridPlan, fill_grid, plan_grid
-from clrecon.operators.primitives.scan import compact, exclusive_scan
+from clrecon.operators.primitives.scan import BitRows, compact, exclusive_scan
 from clrecon.operators.primitives.union_find import label_components
 from clrecon.system.light_dataclass import dataclass
 
 
-class Masks:
+class Masks(BitRows):
     """Masks of nodes on a device, cleared: a bit for each node, (nz, ny, words) uint32, rows along x of whole words.
 
     They are of nodes within B of a point, of those within one spacing, and of near ones whose field is not positive.
     """
 
+    shape: tuple[int, int, int]
     COUNT: ClassVar[int] = 6
     """Masks that exist together at most, those of `decide_signs` among them."""
 
     def __init__(self, device: Device, shape: tuple[int, int, int]):
         self.device, self.shape = device, shape
-        self.words = -(-shape[0] // 32)
-        self.rows = shape[1] * shape[2]
         self.near_d, self.core_d, self.negative_d = (self.make() for _ in range(3))
         program = load_program(device, "points/grid.cl", {"LANES": device.kernel_variants["LANES"]})
         for mask_d in (self.near_d, self.core_d, self.negative_d):
-            launch(device, program["clear_cells"], self.total, mask=mask_d, total=self.total)
-
-    @property
-    def total(self) -> int:
-        return self.words * self.rows
+            launch(device, program["clear_cells"], self.total_words, mask=mask_d, total=self.total_words)
 
     def make(self) -> Any:
-        return allocate(self.device, 4 * self.total)
+        return allocate(self.device, 4 * self.total_words)
 
     def fetch(self, mask_d: Any) -> NDArray[np.uint32]:
         """Return a mask, shape (nz, ny, words)."""
@@ -166,7 +161,7 @@ class _Decision:
         )  # fmt: skip
         for _ in range(rounds):
             self.run(
-                "flood_signs", masks.total,
+                "flood_signs", masks.total_words,
                 near=masks.near_d, core=masks.core_d, inside=inside_d, reached=reached_d, next_inside=next_inside_d,
                 next_reached=next_reached_d, ny=masks.shape[1], **self._lines,
             )  # fmt: skip
@@ -222,7 +217,7 @@ class FieldSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Nodes:
+class Nodes(BitRows):
     """Nodes of a field: bricks (x, y, z) around the points; `corner`, float32 mm, is relative to `base`, LPS mm."""
 
     corner: NDArray[np.float32]
@@ -241,16 +236,8 @@ class Nodes:
         return math.prod(self.shape)
 
     @property
-    def words(self) -> int:
-        return -(-self.shape[0] // 32)
-
-    @property
-    def rows(self) -> int:
-        return self.shape[1] * self.shape[2]
-
-    @property
     def mask_bytes(self) -> int:
-        return 4 * self.words * self.rows
+        return 4 * self.total_words
 
     @property
     def brick_words(self) -> int:

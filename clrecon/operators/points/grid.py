@@ -23,7 +23,7 @@ from clrecon.opencl import (
     upload,
     wait,
 )
-from clrecon.operators.primitives.scan import exclusive_scan, prepare_sort, radix_sort, sort_bytes
+from clrecon.operators.primitives.scan import BitRows, exclusive_scan, prepare_sort, radix_sort, sort_bytes
 from clrecon.points.spacing import MARGIN
 from clrecon.system.light_dataclass import dataclass
 
@@ -53,7 +53,7 @@ _CHUNK = 256
 
 
 @dataclass(frozen=True, eq=False)
-class GridPlan:
+class GridPlan(BitRows):
     """A grid before its points are sorted: all that is known without a device.
 
     points: ndarray, shape (n, 3), float32. mm relative to `base`.
@@ -70,14 +70,6 @@ class GridPlan:
     corner: NDArray[np.float32]
     edge: np.float32
     shape: tuple[int, int, int]
-
-    @property
-    def words(self) -> int:
-        return -(-self.shape[0] // 32)
-
-    @property
-    def total_words(self) -> int:
-        return self.words * self.shape[1] * self.shape[2]
 
     def needs(self, device: Device) -> dict[str, int]:
         """Return the bytes that `fill_grid` takes at most, by description; the grid itself is what it keeps of them."""

@@ -4,7 +4,7 @@ number of their element.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,28 @@ SCAN_PER_ITEM = kernel_constant("primitives/scan.cl", "SCAN_PER_ITEM")
 """Elements a work-item."""
 
 LARGEST_SCAN = 2**31
+
+
+class BitRows:
+    """A grid with a bit for each of (nx, ny, nz) places, rows along x of whole words of 32 bits."""
+
+    if TYPE_CHECKING:  # a field of some grids, a property of others
+
+        @property
+        def shape(self) -> tuple[int, int, int]:
+            raise NotImplementedError
+
+    @property
+    def words(self) -> int:
+        return -(-self.shape[0] // 32)
+
+    @property
+    def rows(self) -> int:
+        return self.shape[1] * self.shape[2]
+
+    @property
+    def total_words(self) -> int:
+        return self.words * self.rows
 
 
 @dataclass(frozen=True)

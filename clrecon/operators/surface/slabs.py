@@ -8,6 +8,7 @@ from functools import cached_property
 from clrecon.errors import DeviceError, DeviceFailedError
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.iso_rule import IsoRule
+from clrecon.operators.primitives.scan import BitRows
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.system.light_dataclass import dataclass
 
@@ -16,7 +17,7 @@ BRICKS = "brick ranges"
 
 
 @dataclass(frozen=True)
-class SampleGrid:
+class SampleGrid(BitRows):
     """The samples of a volume with its border, packed in the inside mask; kept for the whole grid where it `grows`."""
 
     volume: Volume
@@ -34,11 +35,6 @@ class SampleGrid:
         """Key of the grid: grids with the same key need the same memory."""
         grown = "grown " * self.grows
         return f"{grown}{self.rule.topology} surface with a border of {self.rule.border}"
-
-    @property
-    def words(self) -> int:
-        """32-bit words of the mask in a row."""
-        return -(-self.shape[0] // 32)
 
     @property
     def row_shift(self) -> int:
