@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -240,7 +240,7 @@ class Likeness:
         return SpineCells(cells.values[:, row : row + ny, column : column + nx], cells.origin)
 
 
-def measure_likeness(cells: SpineCells, done: Callable[[slice], None]) -> Likeness:
+def measure_likeness(cells: SpineCells, done: Callable[[slice], None], bounds: Mapping[str, float] = SURE) -> Likeness:
     """Measure how much each cell is like the canal's middle; `done` is called in this thread with finished slices."""
     rows, columns = (_extent(cells.values, axis) for axis in (1, 2))
     box = SpineCells(np.ascontiguousarray(cells.values[:, rows, columns]), cells.origin)
@@ -249,7 +249,7 @@ def measure_likeness(cells: SpineCells, done: Callable[[slice], None]) -> Likene
 
     def measure_layers(layers: slice) -> None:
         worth[layers], traits = _measure_traits(box, layers.start, layers.stop)
-        sure[layers] = np.logical_and.reduce([traits[name] >= least for name, least in SURE.items()])
+        sure[layers] = np.logical_and.reduce([traits[name] >= least for name, least in bounds.items()])
         goes_on[layers] = np.logical_and.reduce([traits[name] >= least for name, least in STILL.items()])
 
     in_threads(measure_layers, len(worth), PIECE, done)

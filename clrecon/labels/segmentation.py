@@ -284,7 +284,7 @@ def _first_line(error: Exception) -> str:
     return escape_text((str(error).splitlines() or [""])[0] or type(error).__name__, 200)
 
 
-def _parse_dataset(path: Path, name: str) -> Any:
+def _parse_dataset(path: Path, name: str, most: int = LARGEST_BYTES) -> Any:
     from pydicom import dcmread
     from pydicom.filereader import read_file_meta_info
 
@@ -297,7 +297,7 @@ def _parse_dataset(path: Path, name: str) -> Any:
                 " and RLE are read, convert it"
             )
         with open_regular(path) as file:
-            _check_elements(file.read(LARGEST_BYTES + 1), name, syntax == IMPLICIT_LITTLE)
+            _check_elements(file.read(most + 1), name, syntax == IMPLICIT_LITTLE, most)
             file.seek(0)
             dataset = dcmread(file)
         sop_class = str(dataset.get("SOPClassUID", ""))
@@ -312,10 +312,10 @@ def _parse_dataset(path: Path, name: str) -> Any:
     return dataset
 
 
-def _check_elements(data: bytes, name: str, implicit: bool) -> None:
+def _check_elements(data: bytes, name: str, implicit: bool, most: int = LARGEST_BYTES) -> None:
     """Refuse elements that occur twice with two values: pydicom silently keeps the last one."""
-    if len(data) > LARGEST_BYTES:
-        raise RefusedInputError(f"{name} is larger than {LARGEST_BYTES:,} bytes: no segmentation is read from it")
+    if len(data) > most:
+        raise RefusedInputError(f"{name} is larger than {most:,} bytes: no segmentation is read from it")
     try:
         read_sequences(
             data, find_data_set(data), _ONCE, implicit=implicit, little_endian=True, items_limit=4 * MOST_FRAMES

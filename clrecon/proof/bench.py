@@ -85,9 +85,6 @@ class FlyingEdges:
 _ALL_DEVICES = "all"
 DEFAULT_RUNS = 7
 MOST_RUNS = 1000
-PHANTOM_SIZE = (512, 512)
-PHANTOM_SLICES = 149
-PHANTOM_SPACING = (0.7, 0.7, 1.0)
 BUSY_SHARE = 0.5
 """Smallest share of free cores without a warning: with fewer, other programs distort the times."""
 
@@ -179,7 +176,7 @@ def _get_volume(source: str | Path | None, series: str | None, progress: Progres
     from clrecon.geometry import Volume
     from clrecon.proof.phantom import PhantomSettings, make_phantom
 
-    settings = PhantomSettings(kind="spine", size=PHANTOM_SIZE, slices=PHANTOM_SLICES, spacing=PHANTOM_SPACING)
+    settings = PhantomSettings(kind="spine", size=(512, 512), slices=149, spacing=(0.7, 0.7, 1.0))
     voxels, affine, truth = make_phantom(settings, progress)
     return Volume(voxels, affine), float(truth["iso_value_hu"])
 

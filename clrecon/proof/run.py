@@ -53,8 +53,6 @@ CHECKS: tuple[Check, ...] = (
 )
 
 
-COMMAND = ("-m", "clrecon.proof.run")
-
 MOST_PROCESSES = 4
 """Each of them takes a second to begin, and has the twins on a core of its own."""
 
@@ -144,7 +142,7 @@ class _Child:
             raise DeviceError("the self-test needs a Python interpreter to start, and this program has none")
         try:
             self._process = subprocess.Popen(
-                [sys.executable, *COMMAND],
+                [sys.executable, "-m", "clrecon.proof.run"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -254,6 +252,7 @@ def main() -> None:
 def run_device_selftest(
     name: str | None = None,
     *,
+    checks: Sequence[Check] = CHECKS,
     progress: Progress | None = None,
     tell: Callable[[dict[str, Any], dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
@@ -267,13 +266,13 @@ def run_device_selftest(
     progress = progress or ignore_progress
     device = choose_unchecked(name)
     results: list[dict[str, Any]] = []
-    progress("selftest", 0, len(CHECKS))
-    for result in run_selftest(device, CHECKS, silent_seconds=min(device_seconds(), threading.TIMEOUT_MAX)):
+    progress("selftest", 0, len(checks))
+    for result in run_selftest(device, checks, silent_seconds=min(device_seconds(), threading.TIMEOUT_MAX)):
         results.append(result)
         if tell is not None:
             tell(device.describe(), result)
-        progress("selftest", len(results), len(CHECKS))
-    rank = {check.name: n for n, check in enumerate(CHECKS)}
+        progress("selftest", len(results), len(checks))
+    rank = {check.name: n for n, check in enumerate(checks)}
     results.sort(key=lambda result: rank.get(result["operator"], len(rank)))  # processes run side by side
     passed = bool(results) and all(result["passed"] for result in results)
     return {"device": device.describe(), "passed": passed, "operators": results, "warnings": device.warnings}

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from variants import daily
 
-from clrecon.anatomy import spine_cells
 from clrecon.anatomy.spine_cells import (
     CELL_MM,
     SURE,
@@ -124,10 +123,9 @@ def test_the_worth_of_every_cell(border):
     assert np.array_equal(found.sure[clear], sure[clear]) and clear.mean() > 0.6
 
 
-def test_some_of_these_cells_are_sure(monkeypatch):
-    """The test before compares something: with lower bounds some cells are sure and others are not."""
-    monkeypatch.setattr(spine_cells, "SURE", {"wall": 0.2, "mirror": 0.01, "body": 0.2, "soft": 0.2})
-    sure = measure_likeness(some_cells(), lambda _: None).sure
+def test_some_of_these_cells_are_sure_by_lower_bounds():
+    lower = {"wall": 0.2, "mirror": 0.01, "body": 0.2, "soft": 0.2}
+    sure = measure_likeness(some_cells(), lambda _: None, lower).sure
     assert 0.001 < sure.mean() < 0.9
 
 

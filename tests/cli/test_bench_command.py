@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from ct_files import find_words, write_series
+from failing_devices import BurntDevice
 from printed_text import Printer
 
 from clrecon.cli import bench as command
@@ -56,20 +57,7 @@ def test_json_and_report_are_the_contract(
 def test_a_failed_device_is_partly_done(
     device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from clrecon.errors import DeviceError
-    from clrecon.proof import bench
-
-    real = bench._measure_device
-    seen: list[Any] = []
-
-    def fail_first(*arguments: Any) -> dict[str, Any]:
-        seen.append(arguments)
-        if len(seen) == 1:
-            raise DeviceError("it caught fire")
-        return real(*arguments)
-
-    monkeypatch.setattr(bench, "_measure_device", fail_first)
-    monkeypatch.setattr(bench, "_choose_devices", lambda name: [device, device])
+    monkeypatch.setattr("clrecon.opencl.list_devices", lambda: [BurntDevice(device), device])
     assert main(["bench", str(ct), "--runs", "1", "--device", "all"]) == command.PARTLY_DONE
     captured = capsys.readouterr()
     assert "failed: it caught fire" in captured.out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import sys
 
 import pytest
@@ -178,7 +179,7 @@ def test_the_count_stays_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch, c
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr("clrecon.cli.console._columns", lambda: columns)
+    monkeypatch.setattr(os, "get_terminal_size", lambda _: os.terminal_size((columns, 24)))
     Console().progress("scan", 25, 95)
     assert terminal.getvalue().strip() == expected and len(expected) < columns
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from types import SimpleNamespace
 from typing import Any
 
@@ -333,7 +334,7 @@ def test_a_mesh_is_measured_for_whoever_sees_the_figures(
 def test_a_moving_line_has_20_characters_at_least(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(console, "_columns", lambda: 5)
+    monkeypatch.setattr(os, "get_terminal_size", lambda _: os.terminal_size((5, 24)))
     Console()._draw("x" * 50, 0, 0)
     assert capsys.readouterr().err == "\rclrecon: " + "x" * 11
 

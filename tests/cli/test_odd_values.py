@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gettext
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -63,8 +64,8 @@ def ways_to_say(action: argparse.Action, value: str) -> list[list[str]]:
 @pytest.fixture
 def untranslated(monkeypatch: pytest.MonkeyPatch) -> None:
     """Argparse looks for a translation of each of its words: a third of the time of a call."""
-    monkeypatch.setattr(argparse, "_", str)
-    monkeypatch.setattr(argparse, "ngettext", lambda one, many, count: one if count == 1 else many)
+    monkeypatch.setattr(gettext, "dgettext", lambda domain, text: text)
+    monkeypatch.setattr(gettext, "dngettext", lambda domain, one, many, count: one if count == 1 else many)
 
 
 @pytest.mark.usefixtures("untranslated")

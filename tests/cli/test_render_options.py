@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -43,7 +44,8 @@ def test_no_encoder_is_said_before_anything_is_read(
     from clrecon.rendering import movies
 
     movies.find_encoder.cache_clear()
-    monkeypatch.setattr(movies, "_find_ffmpeg", lambda: None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setenv("PATH", "")
     assert main(["render", str(tmp_path / "no CT"), "--turntable", str(tmp_path / "a.mp4")]) == 3
     printed().assert_error("MP4")
     movies.find_encoder.cache_clear()

@@ -16,7 +16,7 @@ from refusals import refused
 
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
 from clrecon.exchange import formats as writers
-from clrecon.exchange.coordinates import find_places, rounded_apart
+from clrecon.exchange.coordinates import _scramble, find_places, rounded_apart
 from clrecon.exchange.formats import FORMATS
 from clrecon.mesh import Mesh
 
@@ -432,10 +432,12 @@ def test_rounding_brings_no_vertex_to_a_place_of_others():
     assert len(np.unique(rounded, axis=0)) == len(np.unique(points, axis=0)) == 9_500
 
 
-def test_places_of_one_sum_are_told_apart(monkeypatch):
-    vertices = np.float32([[1, 2, 3], [0, 0, 0], [1, 2, 3], [-0.0, 0, 0], [3, 2, 1]])
-    for is_scrambled in (True, False):
-        if not is_scrambled:
-            monkeypatch.setattr("clrecon.exchange.coordinates._scramble", lambda own: np.zeros(len(own), np.uint64))
-        first, place = find_places(vertices)
-        assert (first.tolist(), place.tolist()) == ([0, 1, 4], [0, 1, 0, 1, 2])
+def test_places_of_one_sum_are_told_apart():
+    vertices = np.array([[1, 2, 3], [0, 0, 0], [1, 2, 3], [-0.0, 0, 0], [3, 2, 1]])
+    first, place = find_places(vertices)
+    assert (first.tolist(), place.tolist()) == ([0, 1, 4], [0, 1, 0, 1, 2])
+    of_one, of_three = _scramble(vertices[[0, 4], :1])
+    vertices[4, 1:] = (of_one ^ of_three ^ vertices[0, 1].view(np.uint64)).view(np.float64), 3.0
+    assert np.isfinite(vertices).all() and len(np.unique(_scramble(vertices))) == 2
+    first, place = find_places(vertices)
+    assert (first.tolist(), place.tolist()) == ([0, 1, 4], [0, 1, 0, 1, 2])

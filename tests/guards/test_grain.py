@@ -12,7 +12,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 93_093,
+    "lines": 93_089,
     "modules": 402,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
@@ -32,9 +32,9 @@ HABITS = {
     "equal_functions": 0,
     "constants_of_one_file": 0,
     "kernels_with_branches": 18,
-    "tests_of_wording": 489,
+    "tests_of_wording": 487,
     "tables_without_ids": 0,
-    "patches_of_private_names": 103,
+    "patches_of_private_names": 44,
 }
 """Places of each habit that makes code hard to read; see scripts/proof/count_habits.py."""
 

@@ -132,7 +132,7 @@ def test_what_places_and_names_segments_occurs_once(keywords):
         _check_elements(nested(*keywords, twice=True), "a.dcm", implicit=False)
 
 
-def test_files_beyond_four_gigabytes_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_files_beyond_four_gigabytes_are_not_read(tmp_path: Path):
     class Long(bytes):
         def __len__(self) -> int:
             return 2**32 + 1
@@ -140,14 +140,12 @@ def test_files_beyond_four_gigabytes_are_not_read(tmp_path: Path, monkeypatch: p
     with pytest.raises(RefusedInputError, match="a.dcm is larger than 4,294,967,296 bytes"):
         _check_elements(Long(META), "a.dcm", implicit=False)
     content = META + element_bytes("Rows", b"\1\0")
-    monkeypatch.setattr(segmentation, "LARGEST_BYTES", len(content))
-    _check_elements(content, "a.dcm", implicit=False)
+    _check_elements(content, "a.dcm", implicit=False, most=len(content))
     data_set = Dataset()
     data_set.preamble, data_set.file_meta = bytes(128), FileMetaDataset()
     data_set.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
     data_set.save_as(tmp_path / "a.dcm", enforce_file_format=False)
     size = (tmp_path / "a.dcm").stat().st_size
     for most, words in ((size, "is DICOM but no segmentation"), (size - 1, f"is larger than {size - 1:,} bytes")):
-        monkeypatch.setattr(segmentation, "LARGEST_BYTES", most)
         with pytest.raises(RefusedInputError, match=words):
-            segmentation._parse_dataset(tmp_path / "a.dcm", "a.dcm")
+            segmentation._parse_dataset(tmp_path / "a.dcm", "a.dcm", most)

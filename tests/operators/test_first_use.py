@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,7 @@ from refusals import refused
 from sample_meshes import sphere
 from variants import daily_rows
 
+from clrecon import operators
 from clrecon.errors import DeviceError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
@@ -78,7 +80,7 @@ class FakeDevice(SimpleNamespace):
 
 
 @pytest.fixture
-def checked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+def checked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
     """The devices that were checked; those named "wrong" fail.  Files of the cache are a dict."""
     seen: list[Any] = []
     files: dict[str, bytes] = {}
@@ -88,10 +90,11 @@ def checked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         assert select.find_fault(device) == ""  # what the check itself asks of the device
         return "wrong sums" if device.name == "wrong" else ""
 
-    monkeypatch.setattr(select, "_check", [check])
+    select.register(check)
     monkeypatch.setattr(select, "read_binary", files.get)
     monkeypatch.setattr(select, "store_binary", files.__setitem__)
-    return seen
+    yield seen
+    select.register(operators._check_device, "-m", "clrecon.operators.first_use")
 
 
 def test_row_57_the_check_runs_once_for_a_driver_a_device_and_a_version(
@@ -141,7 +144,7 @@ def test_row_57_an_interrupted_check_says_nothing(
         assert list(kept.values()) == [select._BEGUN]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(select, "_check", [interrupt])
+    select.register(interrupt)
     with pytest.raises(KeyboardInterrupt):
         select.find_fault(FakeDevice())  # type: ignore[arg-type]
     assert list(kept.values()) == [b""] and select.remembered_fault(FakeDevice()) == ""  # type: ignore[arg-type]
@@ -164,7 +167,7 @@ def test_row_57_where_a_process_died_in_the_check_a_child_makes_it(
     fault: str,
     remembered: bytes,
 ) -> None:
-    monkeypatch.setattr(select, "_command", ["-c", code])
+    select.register(check_ball, "-c", code)
     key = select._key(FakeDevice())  # type: ignore[arg-type]
     for before in (select._BEGUN, select._CRASHED + b"earlier"):
         kept[key] = before

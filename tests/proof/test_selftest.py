@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from child_code import run_instead
 from conftest import is_set
 from house import ROOT
 from refusals import refused
@@ -24,7 +25,6 @@ from refusals import refused
 from clrecon.errors import DeviceError
 from clrecon.opencl import Device
 from clrecon.opencl.sources import definitions_of
-from clrecon.proof import run
 from clrecon.proof.checking import LEAST_ITEMS, Check, require_close, require_equal, require_share
 from clrecon.proof.rays import ray_checks
 from clrecon.proof.run import CHECKS, run_check, run_selftest
@@ -207,10 +207,7 @@ for check in checks:
 @pytest.fixture
 def storied(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Device:
     """The device, whose self-test runs `STORY` in the place of checks."""
-    story = tmp_path / "story.py"
-    story.write_text(STORY)
-    monkeypatch.setattr(run, "COMMAND", (str(story),))
-    monkeypatch.setattr(device, "_remarks", [])
+    run_instead(monkeypatch, tmp_path / "code", "clrecon.proof.run", STORY)
     return device
 
 

@@ -37,17 +37,18 @@ def test_every_case_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(name in out for name in EXPECTED)
 
 
-def test_a_case_joins_in_one_line_and_its_name_is_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "CASES", {})
-
+def test_a_case_joins_in_one_line_and_its_name_is_its_own() -> None:
     @registry.case("own", "what it is")
     def measure_own(job: registry.Job) -> dict[str, Any]:
         return {"ratios": {}}
 
-    assert registry.CASES["own"].measure is measure_own
-    measure_own.__module__ = "other"
-    with refused(ValueError, "own"):
-        registry.case("own", "again")(lambda job: {})
+    try:
+        assert registry.CASES["own"].measure is measure_own
+        measure_own.__module__ = "other"
+        with refused(ValueError, "own"):
+            registry.case("own", "again")(lambda job: {})
+    finally:
+        del registry.CASES["own"]
 
 
 def test_wrong_arguments_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -88,8 +88,9 @@ def test_a_missing_tool_and_a_kernel_that_does_not_build_are_named(
     def miss(text: Text) -> check_gpu.Figures:
         raise NoToolError("ptxas")
 
-    monkeypatch.setattr(check_gpu, "TARGETS", {"syntax": ("", refuse), "spirv": ("", miss)})
-    assert check_gpu.main(["--only", "primitives/scan.cl"]) == 1
+    for target, compile_text in {"syntax": refuse, "spirv": miss}.items():
+        monkeypatch.setitem(check_gpu.TARGETS, target, ("", compile_text))
+    assert check_gpu.main(["--only", "primitives/scan.cl", "--targets", "syntax,spirv"]) == 1
     said = capsys.readouterr()
     assert "syntax: primitives/scan.cl: no such word" in said.err
     assert "spirv: ptxas is not installed" in said.err and said.out.endswith("2 faults\n")

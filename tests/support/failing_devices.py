@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from clrecon.errors import DeviceMemoryError
+from clrecon.errors import DeviceError, DeviceMemoryError
 from clrecon.opencl import Device, arrays
 from clrecon.opencl.quirks import import_pyopencl
 
-__all__ = ["Failing", "lost_error", "pretended_gpu"]
+__all__ = ["BurntDevice", "Failing", "lost_error", "pretended_gpu"]
 
 
 def pretended_gpu(device: Device) -> Device:
@@ -80,3 +80,17 @@ class Failing:
     def _is_due(self, kind: str) -> bool:
         self.counts[kind] += 1
         return self.kind == kind and 0 < self.first <= self.counts[kind] <= self.last
+
+
+class BurntDevice:
+    """A device whose queue cannot be opened."""
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._device, name)
+
+    @property
+    def queue(self) -> Any:
+        raise DeviceError("it caught fire")

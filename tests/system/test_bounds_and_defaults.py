@@ -51,14 +51,13 @@ def test_a_volume_that_does_not_fit_is_named_with_its_gib(monkeypatch: pytest.Mo
     assert memory.allocate_voxels((2, 3, 4), np.int16).nbytes == 48
 
 
-def test_interrupts_are_held_and_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupts_are_held_and_given_back() -> None:
     before = signal.getsignal(signal.SIGINT)
-    with monkeypatch.context() as patch:
-        patch.setattr(signal, "SIGTERM", signal.SIGUSR1)  # one that this process does not handle
-        default = signal.getsignal(signal.SIGUSR1)
-        with files.hold_interrupts():
-            assert signal.getsignal(signal.SIGINT) is not before
-            assert not callable(default) and signal.getsignal(signal.SIGUSR1) is default
+    handled = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    with files.hold_interrupts():
+        assert signal.getsignal(signal.SIGINT) is not before
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL  # which this process does not handle
+    signal.signal(signal.SIGTERM, handled)
     assert signal.getsignal(signal.SIGINT) is before
     seen: list[Any] = []
 
@@ -81,8 +80,9 @@ def test_the_limit_of_open_files_is_raised_as_far_as_it_goes(
 ) -> None:
     resource = pytest.importorskip("resource")
     told: list[tuple[int, int]] = []
-    monkeypatch.setattr(resource, "RLIM_INFINITY", -1)
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (soft, hard))
+    no_limit = {-1: resource.RLIM_INFINITY}
+    limits = no_limit.get(soft, soft), no_limit.get(hard, hard)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: limits)
     monkeypatch.setattr(resource, "setrlimit", lambda _, both: told.append(both))
     files.allow_open_files(1000)
     assert told == asked

@@ -19,7 +19,6 @@ import pytest
 from refusals import refused
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.system import files
 from clrecon.system.files import check_writable, replace_file, stage_file
 
 pytestmark = [
@@ -345,16 +344,17 @@ def test_many_writers_of_one_name(tmp_path):
 
 
 def test_a_file_swept_before_it_was_locked_is_made_again(tmp_path, monkeypatch):
-    real, calls = files._lock_new, []
+    fcntl = pytest.importorskip("fcntl")
+    flock, calls = fcntl.flock, []
 
-    def lock(stream):
-        calls.append(stream)
+    def lock(descriptor, operation):
+        calls.append(descriptor)
         if len(calls) == 1:
             for entry in tmp_path.iterdir():
                 entry.unlink()
-        return real(stream)
+        flock(descriptor, operation)
 
-    monkeypatch.setattr(files, "_lock_new", lock)
+    monkeypatch.setattr(fcntl, "flock", lock)
     assert replace_file(tmp_path / "x", lambda stream: stream.write(b"abc")) == 3
     assert len(calls) == 2
     assert (tmp_path / "x").read_bytes() == b"abc"

@@ -308,7 +308,9 @@ def exclusive_or(first: Keys, second: Keys) -> Keys:
     return np.asarray(keys[alone])
 
 
-def find_level_runs(volume: Volume, rule: IsoRule, lattice: Lattice, report: Callable[[int], None]) -> Keys:
+def find_level_runs(
+    volume: Volume, rule: IsoRule, lattice: Lattice, report: Callable[[int], None], most: int = _SLAB_VOXELS
+) -> Keys:
     """Find the ends of runs of points, (n,) int64, ascending, where the trilinear HU reach the one level of a rule.
 
     A trilinear field has its extremes at the corners of a cell: only cells with corners on both sides have points on
@@ -316,7 +318,7 @@ def find_level_runs(volume: Volume, rule: IsoRule, lattice: Lattice, report: Cal
     """
     layers = lattice.cells_ijk[2]
     ni, nj, _ = volume.shape_ijk
-    step = max(1, _SLAB_VOXELS // (ni * nj))
+    step = max(1, most // (ni * nj))
     runs = [np.zeros(0, dtype=np.int64)]
     for first in range(0, layers, step):
         report(first)

@@ -95,8 +95,8 @@ def load_mesh(folder: Path, name: str) -> Mesh | None:
     return Mesh(vertices, triangles, load_array(folder, name, "normals"))
 
 
-METHOD = ("-m", "clrecon.proof.compare.child")
-JUDGE = ("-m", "clrecon.proof.compare.judge")
+_METHOD = ("-m", "clrecon.proof.compare.child")
+_JUDGE = ("-m", "clrecon.proof.compare.judge")
 
 _MOST_JUDGES = 4
 
@@ -125,7 +125,7 @@ def _start_process(command: Sequence[str], data: Mapping[str, Any]) -> subproces
 
 def run_in_process(request: Request) -> dict[str, Any]:
     """Run a method in a process of its own, and return what `clrecon.proof.compare.child.run_method` tells."""
-    process = _start_process(METHOD, request.as_dict())
+    process = _start_process(_METHOD, request.as_dict())
     assert process.stdout is not None
     try:
         answer = process.stdout.read()
@@ -156,7 +156,7 @@ def measure_in_processes(data: Mapping[str, Any], methods: Mapping[str, int]) ->
     processes: list[subprocess.Popen[bytes]] = []
     try:
         for number, part in enumerate(parts):
-            process = _start_process(JUDGE, {**data, "methods": part})
+            process = _start_process(_JUDGE, {**data, "methods": part})
             processes.append(process)
             threading.Thread(target=_forward, args=(number, process.stdout, lines), daemon=True).start()
         running = len(processes)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from failing_devices import BurntDevice
 from refusals import refused
 
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
 from clrecon.opencl import choose_device
 from clrecon.proof import bench
-from clrecon.proof import bench as peer
-from clrecon.proof.phantom import PhantomSettings, write_phantom
+from clrecon.proof.phantom import PhantomSettings, make_phantom, write_phantom
 
 
 @pytest.fixture(scope="module")
@@ -51,10 +52,15 @@ def test_every_stage_of_a_series_is_timed(device: Any, ct: Path, tmp_path: Path)
 
 
 def test_without_an_input_a_spine_is_made(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "PHANTOM_SIZE", (64, 64))
-    monkeypatch.setattr(bench, "PHANTOM_SLICES", 24)
-    monkeypatch.setattr(bench, "PHANTOM_SPACING", (3.0, 3.0, 5.0))
+    asked = []
+
+    def make_small(settings: PhantomSettings, progress: Any) -> Any:
+        asked.append((settings.size, settings.slices, settings.spacing))
+        return make_phantom(replace(settings, size=(64, 64), slices=24, spacing=(3.0, 3.0, 5.0)), progress)
+
+    monkeypatch.setattr("clrecon.proof.phantom.make_phantom", make_small)
     result = bench.run_bench(device=str(device.index), runs=1)
+    assert asked == [((512, 512), 149, (0.7, 0.7, 1.0))]
     assert result["input"]["kind"] == "phantom"
     assert (result["iso_value_hu"], result["iso_level_hu"]) == (226.0, 225.5)
     assert result["devices"][0]["triangles"] > 500
@@ -65,7 +71,7 @@ def test_without_vtk_there_is_no_ratio(device: Any, ct: Path, monkeypatch: pytes
     def refuse(*_: Any) -> None:
         raise ImportError("no VTK")
 
-    monkeypatch.setattr(peer.FlyingEdges, "__init__", refuse)
+    monkeypatch.setattr(bench, "FlyingEdges", refuse)
     result = bench.run_bench(ct, device=str(device.index), runs=2)
     (entry,) = result["devices"]
     assert (entry["peer"], entry["ratio"]) == (None, None)
@@ -76,29 +82,23 @@ def test_without_vtk_there_is_no_ratio(device: Any, ct: Path, monkeypatch: pytes
 def test_a_device_that_fails_is_told_and_the_others_go_on(
     device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = bench._measure_device
-    calls: list[int] = []
-
-    def fail_first(*arguments: Any) -> dict[str, Any]:
-        calls.append(1)
-        if len(calls) == 1:
-            raise DeviceError("it caught fire")
-        return real(*arguments)
-
-    monkeypatch.setattr(bench, "_measure_device", fail_first)
-    monkeypatch.setattr(bench, "_choose_devices", lambda name: [device, device])
+    monkeypatch.setattr("clrecon.opencl.list_devices", lambda: [BurntDevice(device), device])
     result = bench.run_bench(ct, device="all", runs=1)
     assert [entry["error"] for entry in result["devices"]] == ["it caught fire", None]
     assert f"{device.name} failed: it caught fire" in result["warnings"]
-    monkeypatch.setattr(bench, "_choose_devices", lambda name: [device])
-    calls.clear()
-    with pytest.raises(DeviceError, match="caught fire"):
-        bench.run_bench(ct, runs=1)
+
+
+def test_where_all_devices_fail_the_first_error_is_raised(
+    device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clrecon.opencl.list_devices", lambda: [BurntDevice(device)])
+    with refused(DeviceError, "fire"):
+        bench.run_bench(ct, device="all", runs=1)
 
 
 def test_unequal_surfaces_are_told(device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = peer.FlyingEdges.run
-    monkeypatch.setattr(peer.FlyingEdges, "run", lambda self, level: real(self, level)._replace(triangles=7))
+    real = bench.FlyingEdges.run
+    monkeypatch.setattr(bench.FlyingEdges, "run", lambda self, level: real(self, level)._replace(triangles=7))
     result = bench.run_bench(ct, device=str(device.index), runs=1)
     assert any("flying edges 7: the times are not of the same work" in text for text in result["warnings"])
 

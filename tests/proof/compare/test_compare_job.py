@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from child_code import run_instead
 from conftest import is_set
 from html_check import PageCheck, find_faults
 from made_once import make_once
@@ -21,7 +22,7 @@ from clrecon.cli.compare import _is_missed
 from clrecon.cli.main import main
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
 from clrecon.jobs.run import to_json
-from clrecon.proof.compare import child, job, processes
+from clrecon.proof.compare import child, job
 from clrecon.proof.compare.findings import CompareReport, MethodRecord
 from clrecon.proof.compare.job import make_comparison
 from clrecon.proof.compare.judge import Judge
@@ -220,18 +221,19 @@ def test_a_method_that_nobody_named_may_decline(state: str, asked: tuple[str, ..
 
 @pytest.mark.parametrize(("error", "state"), [(UsageError("no"), "declined"), (DeviceError("no"), "failed")])
 def test_a_refusal_is_no_failure(error: Exception, state: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(request: Any) -> dict[str, Any]:
+    def refuse(folder: Path) -> Any:
         raise error
 
-    monkeypatch.setattr(child, "_measure_method", refuse)
-    assert child.run_method(SimpleNamespace(timeout=10.0, method="t-mc"))["state"] == state  # type: ignore[arg-type]
+    monkeypatch.setattr(child, "load_volume", refuse)
+    request: Any = SimpleNamespace(timeout=10.0, method="t-mc", folder="scan")
+    assert child.run_method(request)["state"] == state
 
 
 @pytest.mark.seconds
 def test_a_crash_and_a_missing_library_are_rows(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Printer
 ) -> None:
-    monkeypatch.setattr(processes, "METHOD", ("-c", ONE_CRASHES))
+    run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.child", ONE_CRASHES)
     arguments = ["compare", str(ball), "-o", str(tmp_path / "r"), "--device", str(device.index), "--repeat", "1"]
     assert main([*arguments, "--methods", "skimage,vtk-mc,t-mc"]) == 8
     rows = {m["name"]: m for m in read_report(tmp_path / "r")["methods"]}
@@ -248,7 +250,7 @@ def test_a_crash_and_a_missing_library_are_rows(
 def test_without_its_reference_the_page_says_what_is_left(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(processes, "METHOD", ("-c", ONE_CRASHES))
+    run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.child", ONE_CRASHES)
     settings = CompareSettings(methods=("t-mc",), reference="skimage", repeat=1, device=str(device.index))
     report = make_comparison(ball, tmp_path / "r", settings)
     rows = {m.name: m for m in report.methods}
@@ -259,7 +261,7 @@ def test_without_its_reference_the_page_says_what_is_left(
 def test_where_no_method_works_there_is_no_folder(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(processes, "METHOD", ("-c", NOBODY_TELLS))
+    run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.child", NOBODY_TELLS)
     settings = CompareSettings(methods=("t-mc",), device=str(device.index))
     with refused(DeviceError, "SIGABRT", 1):
         make_comparison(ball, tmp_path / "r", settings)
@@ -270,7 +272,7 @@ def test_where_no_method_works_there_is_no_folder(
 def test_measures_of_a_crashed_process_are_missing_with_a_reason(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(processes, "JUDGE", ("-c", NOBODY_TELLS))
+    run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.judge", NOBODY_TELLS)
     settings = CompareSettings(methods=("t-mc",), repeat=1, device=str(device.index))
     (record,) = make_comparison(ball, tmp_path / "r", settings).methods
     assert record.is_done and record.slices is None and "SIGABRT" in record.reasons["all"]
@@ -283,7 +285,7 @@ def test_measures_of_a_crashed_process_are_missing_with_a_reason(
 def test_no_surface_is_said_before_any_method_runs(
     hu: float, words: str, device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(processes, "METHOD", ("-c", NOBODY_TELLS))
+    run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.child", NOBODY_TELLS)
     settings = CompareSettings(iso_value=hu, device=str(device.index))
     with pytest.raises(NoSurfaceError, match=words):
         make_comparison(ball, tmp_path / "r", settings)

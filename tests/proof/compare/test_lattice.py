@@ -13,7 +13,6 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.iso_distance import trilinear_values
-from clrecon.proof.compare import mesh_slices as lattices
 from clrecon.proof.compare.mesh_slices import Lattice, count_points, exclusive_or, find_level_runs, find_piercings
 
 pytestmark = pytest.mark.unit
@@ -44,16 +43,15 @@ def points_of(lattice: Lattice) -> np.ndarray:
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize(("finer", "offsets"), [(1, (0.0, 0.0, 0.0)), (3, (0.137, 0.271, 0.389)), (2, (0.0, 0.5, 0.9))])
 @pytest.mark.parametrize("made", [smooth_volume, noise, uneven_noise])
-def test_runs_are_those_of_the_trilinear_field(monkeypatch, made, finer, offsets, closed):
+def test_runs_are_those_of_the_trilinear_field(made, finer, offsets, closed):
     volume = made()
     level = float(np.median(volume.voxels)) + 0.37  # which no point has: float32 and float64 agree
     rule = choose_iso_rule(volume, level, closed=closed)
     lattice = Lattice.over(volume, rule, finer, offsets)
     wanted = trilinear_values(volume, rule, points_of(lattice)) >= rule.iso_level
     ni, nj, _ = volume.shape_ijk
-    monkeypatch.setattr(lattices, "_SLAB_VOXELS", 4 * ni * nj)
     told: list[int] = []
-    keys = find_level_runs(volume, rule, lattice, told.append)
+    keys = find_level_runs(volume, rule, lattice, told.append, most=4 * ni * nj)
     assert (np.diff(keys) > 0).all()
     assert told == list(range(0, lattice.cells_ijk[2], 4))
     found = filled(keys, lattice)

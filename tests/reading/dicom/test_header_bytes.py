@@ -332,11 +332,10 @@ def test_all_elements_are_kept_where_none_are_named():
         ("other", 9, ["bad"], []),
     ],
 )
-def test_larger_stacks_that_cannot_be_used_are_told(kind, count, problems, said, monkeypatch):
-    monkeypatch.setattr(choice, "_describe_other_planes", lambda left, chosen: [])
+def test_larger_stacks_that_cannot_be_used_are_told(kind, count, problems, said):
     identity = SimpleNamespace(modality="SR")
     other: Any = SimpleNamespace(
-        kind=kind, count=count, problems=problems, describe=lambda: "2: CT", key="b", identity=identity
+        kind=kind, count=count, problems=problems, describe=lambda: "2: CT", key="b", identity=identity, headers=()
     )
     chosen: Any = SimpleNamespace(count=5, number=1, key="a")
     taken = choice.Choice(chosen, "by lot")

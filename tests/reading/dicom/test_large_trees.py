@@ -8,6 +8,7 @@ import stat
 import threading
 import time
 import tracemalloc
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -87,15 +88,19 @@ def test_slices_share_what_they_have_in_common(tmp_path: Path) -> None:
     assert not hasattr(first, "__dict__")
 
 
-def test_bad_files_beside_many_series_are_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_files_beside_many_series_are_looked_at_once(tmp_path: Path) -> None:
     """Work grows with files and series, not with their product."""
     (tmp_path / "tree").mkdir()
     copy_series(tmp_path / "tree", 50, 1)
     found = scan_path(tmp_path / "tree")
-    found.corrupt = [CorruptFile(tmp_path / "bad" / f"{k}", "cut") for k in range(100)]
     shown: list[CorruptFile] = []
-    plain_text = CorruptFile.__str__
-    monkeypatch.setattr(CorruptFile, "__str__", lambda self: shown.append(self) or plain_text(self))
+
+    class Watched(CorruptFile):
+        def __str__(self) -> str:
+            shown.append(self)
+            return super().__str__()
+
+    found.corrupt = [Watched(tmp_path / "bad" / f"{k}", "cut") for k in range(100)]
     series = group_series(found)
     assert all(part.corrupt is series[0].corrupt for part in series)
     assert series[0].corrupt == found.corrupt
@@ -122,8 +127,7 @@ def test_of_other_files_only_the_start_is_read(tmp_path: Path, monkeypatch: pyte
 
 @pytest.fixture
 def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(disk, "NOTICE_S", 0.02)
-    monkeypatch.setattr(disk, "GIVE_UP_S", 0.1)
+    monkeypatch.setattr(disk, "DiskReader", partial(disk.DiskReader, notice_s=0.02, give_up_s=0.1))
 
 
 def test_row_46_a_file_that_hangs_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurried: None) -> None:

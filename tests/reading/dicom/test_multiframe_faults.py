@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from dicom_series import Plan, make_dataset, save_dataset, set_raw, set_values, write_series
@@ -23,6 +25,7 @@ from tolerances import THOUSAND_FRAMES_S
 from clrecon.errors import NoDicomError, RefusedInputError
 from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.headers import multiframe
+from clrecon.reading.dicom.parse.values import ValueProblem
 
 
 def per_frame(change, only=None):
@@ -271,7 +274,7 @@ def test_items_without_end_are_not_all_taken(tmp_path):
     assert f"the sequences hold more than {multiframe.ITEMS_PER_FRAME * 8} items" in refusal(tmp_path)
 
 
-def test_long_headers_are_not_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(multiframe, "HEADER_BYTES_LIMIT", 1000)
-    write_enhanced(tmp_path / "mf")
-    assert "bytes, no more than 1000 are read" in refusal(tmp_path)
+def test_long_headers_are_not_read(tmp_path):
+    long: Any = SimpleNamespace(pixel_offset=2**28 + 1)
+    with refused(ValueProblem, 2**28 + 1, 2**28):
+        multiframe._read_header_bytes(tmp_path / "no file", long)

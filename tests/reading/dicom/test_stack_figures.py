@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from queue import Empty
 from types import SimpleNamespace
@@ -137,14 +138,19 @@ def test_thin_slices_may_differ_in_thickness_too():
 
 def test_a_long_even_stack_is_looked_at_in_three_windows_first(monkeypatch):
     seen = []
-    monkeypatch.setattr(mixtures, "_find_in", lambda headers, even: seen.append([header.at for header in headers]))
-    stack = slices(at=list(range(100)), frames=[1] * 100)
+
+    def read_nothing(file, wanted, *, force):
+        seen.append(file)
+        return SimpleNamespace(values={})
+
+    monkeypatch.setattr(mixtures, "read_elements", read_nothing)
+    stack = slices(file=list(range(100)), frames=[1] * 100, position_mm=[(0.0, 0.0, k) for k in range(100)])
     assert find_alternation(stack, even=True) is None
-    assert [(part[0], part[-1]) for part in seen] == [(0, 31), (34, 65), (68, 99)]
+    assert seen == [*range(32), *range(34, 66), *range(68, 100)]
     seen.clear()
     find_alternation(stack, even=False)
     find_alternation(stack[:96], even=True)
-    assert [(part[0], part[-1]) for part in seen] == [(0, 99), (0, 95)]
+    assert seen == [*range(100), *range(96)]
 
 
 def test_elements_that_are_compared():
@@ -300,8 +306,11 @@ def test_decoders_find_numpy_but_nothing_of_the_current_folder(tmp_path, monkeyp
 )
 def test_bits_above_the_stored_ones_are_sign_or_overlay(overlays, expected, monkeypatch):
     """Twelve stored bits of 16: -1 with its sign extended, and 5 with the lowest bit above set."""
-    monkeypatch.setattr(stray_bits, "_read_overlay_bits", lambda header: overlays)
-    header: Any = SimpleNamespace(bits_allocated=16, bits_stored=12, high_bit=11, signed=True, float_pixels=False)
+    values = {0x60000102 + 0x20000 * number: struct.pack("<H", bit) for number, bit in enumerate(overlays)}
+    monkeypatch.setattr(stray_bits, "read_elements", lambda file, wanted, force: SimpleNamespace(values=values))
+    header: Any = SimpleNamespace(
+        bits_allocated=16, bits_stored=12, high_bit=11, signed=True, float_pixels=False, file="a", little_endian=True
+    )
     assert stray_bits.find_stray_bits(header, np.array([[-1, 4101]], np.int16), None) == expected
 
 
@@ -320,17 +329,18 @@ def test_copies_lie_where_the_first_of_them_does():
     assert _sort_copies(copies, lambda one, other: False) == [[one] for one in copies]
 
 
-def test_a_doubt_about_the_order_is_said_once(monkeypatch):
+def test_a_doubt_about_the_order_is_said_once():
     own = headers(1.0, 1.0)
     for header in own:
         header.has_slope = header.has_intercept = True
         header.lossy = header.modality_lut = header.quadruped = False
         header.warnings = ()
-    monkeypatch.setattr(certificate, "_describe_what_was_left", lambda series: [])
-    monkeypatch.setattr(certificate, "_describe_long_voxels", lambda stack: [])
+        header.di_mm = header.dj_mm = 1.0
+    places = SimpleNamespace(copies=0, phases=())
+    line = SimpleNamespace(gap_median_mm=None)
     for said, doubt, expected in (([], "A doubt", ["A doubt"]), (["A doubt."], "A doubt", ["A doubt."]), ([], "", [])):
-        stack = SimpleNamespace(slices=own, warnings=said)
-        series: Any = SimpleNamespace(kind="stack", stack=stack, find_doubt=lambda doubt=doubt: doubt)
+        stack = SimpleNamespace(slices=own, warnings=said, line=line)
+        series: Any = SimpleNamespace(kind="stack", stack=stack, places=places, find_doubt=lambda doubt=doubt: doubt)
         assert certificate.collect_series_warnings(series) == expected
 
 

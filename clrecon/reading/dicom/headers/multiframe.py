@@ -52,7 +52,7 @@ ENHANCED_CT = ("1.2.840.10008.5.1.4.1.1.2.1", "1.2.840.10008.5.1.4.1.1.2.2")
 """SOP classes: Enhanced CT Image Storage, Legacy Converted Enhanced CT Image Storage."""
 
 _FRAMES_LIMIT = 65_536
-HEADER_BYTES_LIMIT = 256 * 1024 * 1024
+_HEADER_BYTES_LIMIT = 256 * 1024 * 1024
 ITEMS_PER_FRAME = 64
 
 _SHARED_GROUPS, _FRAME_GROUPS = 0x52009229, 0x52009230
@@ -321,8 +321,8 @@ def _name_dimensions(dimensions: list[Item], little: bool) -> Iterator[tuple[int
 
 def _read_header_bytes(path: Path, elements: DicomElements) -> tuple[bytes, int]:
     """Return the data set up to its pixel data, and the offset in these bytes where it starts."""
-    if elements.pixel_offset > HEADER_BYTES_LIMIT:
-        raise ValueProblem(f"a header of {elements.pixel_offset} bytes, no more than {HEADER_BYTES_LIMIT} are read")
+    if elements.pixel_offset > _HEADER_BYTES_LIMIT:
+        raise ValueProblem(f"a header of {elements.pixel_offset} bytes, no more than {_HEADER_BYTES_LIMIT} are read")
     with open_regular(path) as file:
         if elements.inflate_from >= 0:
             file.seek(elements.inflate_from)

@@ -288,7 +288,7 @@ def inflate(read: Callable[[int], bytes], most: int, step: int) -> tuple[bytes, 
 
 
 PREFIX_BYTES = 16 * 1024
-LONG_PREFIX_BYTES = 256 * 1024
+_LONG_PREFIX_BYTES = 256 * 1024
 """Bytes read at once where the first prefix does not hold the whole header: large private elements, many frames."""
 _RESTORED_LIMIT = 16 * 1024 * 1024
 """For a file without its standard start: the header must end within this many bytes."""
@@ -361,7 +361,7 @@ def _read_restored(path: Path, restored: Start, size: int, wanted: tuple[int, ..
 def _read_marked(path: Path, prefix: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
     elements = parse_plainly(prefix, size, wanted)
     if elements is None and len(prefix) < size:
-        prefix, size = read_start(path, LONG_PREFIX_BYTES)
+        prefix, size = read_start(path, _LONG_PREFIX_BYTES)
         elements = parse_plainly(prefix, size, wanted)
     if elements is not None:
         return elements

@@ -100,7 +100,7 @@ def choose_decoder(transfer_syntax: str) -> str:
 Pieces = list[tuple[int, int]]
 """For each fragment of a frame: offset of its first byte in the file, and number of bytes."""
 
-MAX_FRAGMENTS = 1_000_000
+_MAX_FRAGMENTS = 1_000_000
 _FRAGMENTS_PER_FRAME = 1000
 """Highest mean number of fragments in a frame: writers make one, or pieces of some KiB."""
 _ITEM, _END = (0xFFFE, 0xE000), (0xFFFE, 0xE0DD)
@@ -110,7 +110,7 @@ _STARTS = (b"\xff\xd8\xff", b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP")
 
 def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transfer_syntax: str) -> list[Pieces]:
     """Find the fragments of all frames, as many as the header says, in a buffered file from byte `start` on."""
-    table, fragments, _ = _walk_items(file, start, file_bytes, min(MAX_FRAGMENTS, _FRAGMENTS_PER_FRAME * (frames + 1)))
+    table, fragments, _ = _walk_items(file, start, file_bytes, min(_MAX_FRAGMENTS, _FRAGMENTS_PER_FRAME * (frames + 1)))
     if not fragments:
         raise RefusedInputError("truncated: there are no compressed pixels")
     if len(fragments) == frames:
@@ -133,7 +133,7 @@ def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transf
 
 def find_end(file: BinaryIO, start: int, file_bytes: int) -> int:
     """Return the offset of the byte after the compressed pixel data; parameters and errors as for `find_frames`."""
-    return _walk_items(file, start, file_bytes, MAX_FRAGMENTS)[2]
+    return _walk_items(file, start, file_bytes, _MAX_FRAGMENTS)[2]
 
 
 def read_pieces(file: BinaryIO, pieces: Pieces) -> bytes:

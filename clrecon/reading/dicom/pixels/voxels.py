@@ -118,7 +118,7 @@ def describe_stray_bits(stray_bits: Iterable[StrayBits | None], headers: Iterabl
 
 MAX_READERS = 8
 _MAX_DECODERS = 32
-DECODER_WORTH_BYTES = 4 << 20
+_DECODER_WORTH_BYTES = 4 << 20
 """Least bytes of pixels for one more decoder: they take about as long to decode as a process takes to start."""
 _FLOAT_LIMIT = 1e9
 """Larger values are not HU; float32 and every later step can hold this value."""
@@ -167,7 +167,7 @@ def _fill_volume(
     blank: list[int] = []
     most = MAX_READERS
     if source.compressed:
-        most = min(_MAX_DECODERS, 1 + len(slices) * slices[0].pixel_bytes // DECODER_WORTH_BYTES)
+        most = min(_MAX_DECODERS, 1 + len(slices) * slices[0].pixel_bytes // _DECODER_WORTH_BYTES)
     with ThreadPoolExecutor(count_readers(len(slices), most)) as pool:
         try:
             jobs = {pool.submit(_fill_slice, source, header, voxels[k]): k for k, header in enumerate(slices)}

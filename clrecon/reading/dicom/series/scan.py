@@ -8,9 +8,9 @@ slice, as an unreadable file may.
 
 The calls that can hang (listing a folder, opening a file, reading its start) run in daemon threads.  A network drive
 that does not answer cannot be interrupted, not even with Ctrl-C: the caller waits in another thread, reports after
-`NOTICE_S` what it waits for, and gives up after `GIVE_UP_S` with an error that names it.  And where a file takes longer
-than `_SLOW_FILE_S`, the delay lies in the connection to the disk: then several threads wait at once.  On a warm cache
-one thread is fastest, since the parser beside it needs the interpreter's lock.
+`_NOTICE_S` what it waits for, and gives up after `_GIVE_UP_S` with an error that names it.  And where a file takes
+longer than `_SLOW_FILE_S`, the delay lies in the connection to the disk: then several threads wait at once.  On a warm
+cache one thread is fastest, since the parser beside it needs the interpreter's lock.
 
 A slice lost at an end of a stack leaves no hole.  Its file often remains: empty, blank, packed, or with a damaged
 start, under a name without suffix as usual on CDs.  So other files beside slices are compared with them by names that
@@ -246,8 +246,8 @@ def _say_kind(kind: str) -> str:
 
 T = TypeVar("T")
 
-NOTICE_S = 10.0
-GIVE_UP_S = 300.0  # long enough for a tape library or a sleeping disk
+_NOTICE_S = 10.0
+_GIVE_UP_S = 300.0  # long enough for a tape library or a sleeping disk
 _SLOW_FILE_S = 0.0005
 CHUNK = 64
 MOST_THREADS = 16
@@ -256,8 +256,9 @@ MOST_THREADS = 16
 class DiskReader:
     """Reads in separate threads while the caller waits and reports; `touched` is the path that was read last."""
 
-    def __init__(self, progress: Progress | None = None):
+    def __init__(self, progress: Progress | None = None, notice_s: float = _NOTICE_S, give_up_s: float = _GIVE_UP_S):
         self._progress = progress
+        self._notice_s, self._give_up_s = notice_s, give_up_s
         self._jobs: SimpleQueue[tuple[int, Callable[[], Any]] | None] = SimpleQueue()
         self._done: SimpleQueue[tuple[int, Any, BaseException | None]] = SimpleQueue()
         self._threads: list[threading.Thread] = []
@@ -328,15 +329,15 @@ class DiskReader:
         waited, seen = 0.0, self.touched
         while True:
             try:
-                return self._done.get(timeout=NOTICE_S)
+                return self._done.get(timeout=self._notice_s)
             except Empty:
                 pass
             if self.touched != seen:
                 waited, seen = 0.0, self.touched
                 continue
-            waited += NOTICE_S
+            waited += self._notice_s
             name = escape_text(os.path.basename(self.touched) or self.touched)
-            if waited >= GIVE_UP_S:
+            if waited >= self._give_up_s:
                 raise RefusedInputError(
                     f"{name}: no answer from the disk or network drive for {waited:.0f} s; is it still connected?"
                 )
