@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 log = get_logger(__name__)
 
-MOST_PAGE_BYTES = 2_000_000
+_MOST_PAGE_BYTES = 2_000_000
 """Of a page within a notebook, which keeps all that it shows."""
 
 _PAGE_HEIGHT = 480
@@ -73,9 +73,9 @@ def to_html(shown: Mesh | Volume | PointCloud | LabelMap | SeriesListing) -> str
 def _show_mesh(mesh: Mesh) -> str:
     from clrecon.exchange.page import compose_page
 
-    if _LEAST_BYTES_OF_SCANS * mesh.triangle_count <= MOST_PAGE_BYTES and mesh.triangle_count:
+    if _LEAST_BYTES_OF_SCANS * mesh.triangle_count <= _MOST_PAGE_BYTES and mesh.triangle_count:
         page = compose_page(mesh.describe_parts("lps", MOST_PARTS))
-        if len(page) <= MOST_PAGE_BYTES:
+        if len(page) <= _MOST_PAGE_BYTES:
             return (
                 f'<iframe sandbox="allow-scripts" title="{escape(repr(mesh))}" width="100%" height="{_PAGE_HEIGHT}"'
                 f' style="border: 0" srcdoc="{escape(page.decode())}"></iframe>'

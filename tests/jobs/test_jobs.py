@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from shutil import copytree
 from typing import Any
 
 import numpy as np
@@ -112,25 +111,23 @@ def test_survey_says_why_no_device_is_used(device: Any) -> None:
 
 
 @pytest.mark.slow
-def test_demo_writes_and_replaces(device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_demo_replaces_an_earlier_one(device: Any, tmp_path: Path) -> None:
     folder = tmp_path / "demo"
-    first = make_demo(folder, str(device.index))
-    kept = copytree(folder, tmp_path / "kept")
-    (folder / "report.json").write_text("{}")
-    monkeypatch.setattr(
-        "clrecon.proof.demo._fill_folder", lambda made, *_: copytree(kept, made, dirs_exist_ok=True) and first
-    )
-    second = make_demo(folder, str(device.index))
+    (folder / "ct").mkdir(parents=True)
+    for name in ("bone.stl", "bone.png", "report.json", "ct/truth.json", "ct/of an earlier one"):
+        (folder / name).write_text("of an earlier demonstration")
+    made = make_demo(folder, str(device.index))
     assert sorted(path.name for path in folder.iterdir()) == ["bone.png", "bone.stl", "ct", "report.json"]
+    assert not (folder / "ct" / "of an earlier one").exists()
     report = json.loads((folder / "report.json").read_text())
-    assert report["triangles"] == first["mesh"]["triangles"] == second["mesh"]["triangles"] > 100_000
+    assert report["triangles"] == made["mesh"]["triangles"] > 100_000
     assert (report["closed"], report["manifold"]) == (True, True)
-    assert first["affine_error_mm"] < 1e-6
+    assert made["affine_error_mm"] < 1e-6
     with Image.open(folder / "bone.png") as picture:
         pixels = np.asarray(picture)
     assert pixels.shape == (1024, 1024, 4) and 0.05 < (pixels[..., :3].max(axis=-1) > 60).mean() < 0.5
-    assert second["picture"]["pictures"][0]["output"]["bytes"] == (folder / "bone.png").stat().st_size
-    check = first["check"]
+    assert made["picture"]["pictures"][0]["output"]["bytes"] == (folder / "bone.png").stat().st_size
+    check = made["check"]
     assert check["volume_ml"] == pytest.approx(check["true_volume_ml"], rel=tolerances.PHANTOM_SPHERE_VOLUME_SHARE)
     assert check["radius_error_max_mm"] < 0.15 * max(check["spacing_mm"])
 
@@ -139,20 +136,20 @@ def test_demo_writes_and_replaces(device: Any, tmp_path: Path, monkeypatch: pyte
 def test_demo_without_a_device_or_room_leaves_nothing(
     there: bool, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fill_the_disk(folder: Path, *_: Any) -> None:
-        (folder / "ct").mkdir()
-        (folder / "bone.stl").write_bytes(b"half")
-        raise OutputError(f"cannot write {folder / 'bone.stl'}: the disk is full")
+    def fill_the_disk(folder: Path, *_: Any, **__: Any) -> None:
+        folder.mkdir()
+        (folder / "slice").write_bytes(b"half")
+        raise OutputError(f"cannot write {folder / 'slice'}: the disk is full")
 
     folder = tmp_path / "demo"
     if there:
         folder.mkdir()
     with pytest.raises(DeviceError):
         make_demo(folder, "no such device")
-    monkeypatch.setattr("clrecon.proof.demo._fill_folder", fill_the_disk)
+    monkeypatch.setattr("clrecon.proof.demo.write_phantom", fill_the_disk)
     with pytest.raises(OutputError) as caught:
         make_demo(folder, str(device.index))
-    assert str(caught.value) == f"cannot write {folder / 'bone.stl'}: the disk is full"
+    assert str(caught.value) == f"cannot write {folder / 'ct' / 'slice'}: the disk is full"
     assert list(tmp_path.rglob("*")) == ([folder] if there else [])
 
 

@@ -16,7 +16,7 @@ from clrecon.jobs import corridor_results
 from clrecon.jobs.mesh import bone, make, purposes
 from clrecon.jobs.mesh.purposes import settings_for
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings, check_growing
-from clrecon.jobs.mesh.surfaces import Surface, check_known_values, choose_level
+from clrecon.jobs.mesh.surfaces import Surface, check_known_values, choose_level, plan_surfaces
 from clrecon.jobs.options import parse_bytes, parse_hu, parse_preprocess
 from clrecon.jobs.render.job import PictureFiles, check_pictures, find_emptiness, make_pictures
 from clrecon.jobs.render.settings import RenderSettings
@@ -24,6 +24,7 @@ from clrecon.jobs.vertebrae import picture_beside
 from clrecon.jobs.view import inputs
 from clrecon.jobs.view import job as view_job
 from clrecon.mesh import Mesh
+from clrecon.mesh.compare.walls import WallLook
 from clrecon.spine.corridors import screw_diameter
 
 pytestmark = pytest.mark.unit
@@ -177,17 +178,20 @@ def test_inputs_of_a_page_have_names_and_colours() -> None:
 
 
 def test_a_surface_without_bone_has_no_advice_on_contrast_medium(monkeypatch: pytest.MonkeyPatch) -> None:
-    boneless: list[str] = []
+    def warnings_of(looks_like: str, bones: Any, contrast_share: float) -> list[str]:
+        look = WallLook(looks_like, 0.0, 0.0, 0.0, {"median": 300.0, "p99": 400.0}, 1000)
+        part: Any = SimpleNamespace(surface=surface, bones=bones, facts={"walls": look})
+        choice: Any = SimpleNamespace(contrast_medium_share=contrast_share)
+        return bone.warn_of_walls([part], MeshSettings(), choice)
+
     monkeypatch.setattr(bone, "warn_of_contrast", lambda choice: ["contrast"])
-    monkeypatch.setattr(bone, "_warn_of_no_bone", lambda part, settings: boneless)
-    monkeypatch.setattr(bone, "_warn_of_whole", lambda part, settings: ["whole"])
-    part: Any = SimpleNamespace(surface="a", facts={"walls": {"looks_like": "bone"}})
-    choice: Any = SimpleNamespace(contrast_medium_share=0.3)
-    assert bone.warn_of_walls([part], MeshSettings(), choice) == ["contrast", "whole"]
-    boneless.append("none")
-    assert bone.warn_of_walls([part], MeshSettings(), choice) == ["none"]
-    choice.contrast_medium_share = 0.0
-    assert bone.warn_of_walls([part], MeshSettings(), choice) == ["contrast", "none"]
+    (surface,) = plan_surfaces([200.0])
+    boneless = SimpleNamespace(bone=0, components=3, rails=0)
+    contrast, whole = warnings_of("contrast medium", None, 0.3)
+    assert contrast == "contrast" and "keeps what looks like bone" in whole
+    (none,) = warnings_of("no bone", boneless, 0.3)
+    assert "nothing here looks like bone, none of 3 components" in none
+    assert warnings_of("no bone", boneless, 0.0) == ["contrast", none]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.points import PointCloud
 from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing
-from clrecon.viewer import notebook
 from clrecon.viewer.notebook import _MOST_ROWS, _table
 
 VOLUME = Volume(np.arange(6 * 8 * 10, dtype=np.int16).reshape(6, 8, 10) * 4 - 900, np.diag([1.0, 1.0, 2.0, 1.0]))
@@ -43,9 +42,10 @@ def test_a_mesh_is_its_page_in_a_frame_that_may_do_nothing_but_its_script():
 
 
 @pytest.mark.opencl
-def test_a_mesh_whose_page_is_too_large_is_a_picture(device, monkeypatch):
-    monkeypatch.setattr(notebook, "MOST_PAGE_BYTES", 20_000)
-    shown = Mesh(*samples.torus())._repr_html_()
+def test_a_mesh_whose_page_is_too_large_is_a_picture(device):
+    vertices, triangles = samples.torus(1000, 240)
+    vertices = vertices + np.random.default_rng(1).normal(0.0, 0.3, vertices.shape)  # which packs to 5 bytes a triangle
+    shown = Mesh(vertices, triangles)._repr_html_()
     check = PageCheck(shown)
     assert check.faults == [] and len(check.pictures) == 1
     assert "mesh.save(" in shown
@@ -86,8 +86,7 @@ def test_without_a_device_nothing_is_raised(monkeypatch):
 
     monkeypatch.setattr("clrecon.operators.reformat.cut.cut_slice", refuse)
     monkeypatch.setattr("clrecon.operators.rays.render.render", refuse)
-    monkeypatch.setattr(notebook, "MOST_PAGE_BYTES", 1000)
-    assert Mesh(*samples.torus())._repr_html_() is None
+    assert Mesh(*samples.torus(1000, 300))._repr_html_() is None
     assert PointCloud([[0, 0, 0], [1, 2, 3]])._repr_html_() is None
     assert "No slices: no device here" in VOLUME._repr_html_()
 

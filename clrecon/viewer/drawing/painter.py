@@ -50,7 +50,7 @@ _COARSE_STEP_VOXELS = 2.0
 MOST_FOUND = 6
 """Sets of parts that are kept, of all views together."""
 
-COARSE_TRIANGLES = 200_000
+_COARSE_TRIANGLES = 200_000
 """Meshes with more triangles are drawn by a coarse one while anything moves."""
 
 
@@ -206,10 +206,10 @@ class Painter(Stage):
     def make_coarse(self, cancelled: Callable[[], bool] = never) -> None:
         """Make the coarse meshes that are drawn while anything moves, once."""
         for shown in self.objects:
-            if isinstance(shown, ShownMesh) and shown.mesh.triangle_count > COARSE_TRIANGLES:
+            if isinstance(shown, ShownMesh) and shown.mesh.triangle_count > _COARSE_TRIANGLES:
                 if shown.number not in self._coarse:
                     _stop(cancelled)
-                    self._coarse[shown.number] = coarsen_mesh(shown.mesh, COARSE_TRIANGLES)
+                    self._coarse[shown.number] = coarsen_mesh(shown.mesh, _COARSE_TRIANGLES)
 
     def _drawn(self, state: ViewState, sharp: bool, *, opaque: bool = False) -> list[_Drawn]:
         """Return what a state shows, with looks, in the order of the objects; meshes opaque where that is enough."""

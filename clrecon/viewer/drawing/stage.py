@@ -34,7 +34,7 @@ from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownObject, Sh
 from clrecon.viewer.model.parts import FoundParts, find_clusters
 from clrecon.viewer.model.state import Point, ViewState
 
-STRIP_PIXELS = 1 << 18
+_STRIP_PIXELS = 1 << 18
 """Pixels of a strip: some 50 ms of volume rendering on two cores."""
 
 _STRIP_ROWS = 16
@@ -46,7 +46,7 @@ def take_strips(
 ) -> Rendering:
     """Take the picture of a parallel camera strip by strip, where it is large; others in one."""
     width, height = size
-    rows = max(_STRIP_ROWS, STRIP_PIXELS // width // _STRIP_ROWS * _STRIP_ROWS)
+    rows = max(_STRIP_ROWS, _STRIP_PIXELS // width // _STRIP_ROWS * _STRIP_ROWS)
     if not camera.is_parallel or rows >= height:
         return take(camera, size)
     _, up, _ = camera.basis()
@@ -124,7 +124,7 @@ def _warm_scan(volume: Volume, device: Device, tell: Progress) -> None:
             renderer.render(style, camera=camera, size=PICTURE, background="transparent")
 
 
-MOST_FOUND, MOST_FOUND_BYTES = 6, 1 << 29
+MOST_FOUND, _MOST_FOUND_BYTES = 6, 1 << 29
 """Sets of parts kept, of all views together, and bytes of their label maps; two are kept whatever their size."""
 
 
@@ -178,7 +178,7 @@ class Stage(DeviceWorker):
 
         def too_many() -> bool:
             byte_count = sum(each.labels.voxels.nbytes for each in self._found.values())
-            return len(self._found) > MOST_FOUND or byte_count > MOST_FOUND_BYTES
+            return len(self._found) > MOST_FOUND or byte_count > _MOST_FOUND_BYTES
 
         while len(self._found) > 2 and too_many():
             self._found.popitem(last=False)

@@ -204,7 +204,7 @@ def seen_pieces(rendering: Rendering, lines: Sequence[Float64Array], *, expected
 
 log = get_logger(__name__)
 
-MOVING_MS = 40.0
+_MOVING_MS = 40.0
 """Time of a coarse picture that its size is steered to."""
 
 LEAST_SHARE = 0.15
@@ -212,7 +212,7 @@ LEAST_SHARE = 0.15
 
 _FIRST_SHARE = 0.5
 
-MANY_TRIANGLES = 2_000_000
+_MANY_TRIANGLES = 2_000_000
 """Triangles of a mesh above which it is said that pictures take their time."""
 
 _WORDS = {
@@ -293,7 +293,7 @@ class ViewSession(Closing):
             picture = self.painter.picture(now, (width, height), sharp=not moving, share=share, cancelled=job.cancelled)
             if moving:
                 took = max(1.0, picture.report["ms"])
-                share = picture.size[0] / width * math.sqrt(MOVING_MS / took)
+                share = picture.size[0] / width * math.sqrt(_MOVING_MS / took)
                 with self._lock:
                     self._share = min(1.0, max(LEAST_SHARE, share))
             with self._lock:
@@ -573,7 +573,7 @@ class ViewSession(Closing):
         if self._timing.get("slabs", 1) > 1:
             notes.append("the scan does not fit the device: every picture takes it through in slabs, which is slow")
         for shown in self.model.objects:
-            if isinstance(shown, ShownMesh) and shown.mesh.triangle_count > MANY_TRIANGLES:
+            if isinstance(shown, ShownMesh) and shown.mesh.triangle_count > _MANY_TRIANGLES:
                 notes.append(
                     f"{shown.name} has {shown.mesh.triangle_count:,} triangles: a sharp picture takes a while, and a"
                     " coarse mesh is shown while anything moves"

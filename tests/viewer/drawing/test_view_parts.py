@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import view_scenes as scenes
@@ -73,24 +76,27 @@ def test_many_parts_are_twenty_and_the_rest_together(view):
     assert mesh.bounds[1] - mesh.bounds[0] == pytest.approx([2.0, 1.0, 1.0], abs=0.4)
 
 
-def test_parts_and_looks_of_long_ago_are_dropped(view, monkeypatch):
-    from clrecon.viewer.drawing import looks, stage
-
-    monkeypatch.setattr(stage, "MOST_FOUND", 3)
-    monkeypatch.setattr(looks, "MOST_LABELLED", 2)
+def test_parts_and_looks_of_long_ago_are_dropped(view):
     model, painter = view()
-    for hu in range(200, 800, 100):
+    for hu in range(200, 1000, 100):
         model.set_iso(float(hu))
         find(model, painter)
         model.set_color("1/1", (1.0, 0.1 * hu / 100.0, 0.0))
         painter.picture(model.state, SIZE)
-    assert [key[1] for key in painter._found] == [500.0, 600.0, 700.0]
+    assert [key[1] for key in painter._found] == [400.0, 500.0, 600.0, 700.0, 800.0, 900.0]
     kept = [style for style in painter._looks._kept.values() if getattr(style, "labels", None) is not None]
-    assert [style.iso_value for style in kept] == [600.0, 700.0]
-    monkeypatch.setattr(stage, "MOST_FOUND_BYTES", 1)
-    model.set_iso(310.0)
-    find(model, painter)
-    assert [key[1] for key in painter._found] == [700.0, 310.0]
+    assert [style.iso_value for style in kept] == [400.0, 500.0, 600.0, 700.0, 800.0, 900.0]
+
+
+def test_two_sets_of_parts_are_kept_whatever_their_size(view):
+    model, painter = view()
+    for hu in (200.0, 300.0, 400.0):
+        model.set_iso(hu)
+        find(model, painter)
+        key, found = painter._found.popitem()
+        half_a_gigabyte = SimpleNamespace(voxels=np.broadcast_to(np.uint8(0), 2**29))
+        painter._found[key] = replace(found, labels=half_a_gigabyte)
+    assert [key[1] for key in painter._found] == [300.0, 400.0]
 
 
 def test_no_voxel_at_the_iso_value_is_no_part(view):

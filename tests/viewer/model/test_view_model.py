@@ -11,7 +11,7 @@ import pytest
 import view_scenes as scenes
 from refusals import refused
 
-from clrecon.errors import UsageError
+from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.labels.resample import ResampledLabels
 from clrecon.points import PointCloud
 from clrecon.viewer.drawing.painter import Painter
@@ -373,9 +373,10 @@ def test_clouds_that_are_shown_are_one_with_what_all_of_them_have():
 
 
 def test_the_search_for_parts_tells_every_step(monkeypatch):
-    nothing = np.empty(0, np.int64)
-    runs = parts._Runs(nothing.astype(np.int32), nothing, nothing, nothing)
-    monkeypatch.setattr(parts, "_find_runs", lambda resident, iso_value: runs)
+    def find_nothing(resident, band):
+        raise NoSurfaceError("no voxel is so dense")
+
+    monkeypatch.setattr(parts.Mask, "from_band", find_nothing)
     told = []
     parts.find_clusters(SimpleNamespace(volume=scenes.make_scan()), 1, 300.0, True, lambda *step: told.append(step))
     assert told == [("parts", done, parts.STEPS) for done in range(parts.STEPS + 1)]

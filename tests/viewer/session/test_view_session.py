@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from open_views import open_sessions, search_for_ever
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.viewer.drawing.painter import Painter
-from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.model.objects import ShownMesh, show_objects
 from clrecon.viewer.session.commands import COMMANDS
 from clrecon.viewer.session.session import ViewSession
 
@@ -173,13 +174,18 @@ def test_pictures_and_slices_come_from_its_threads(session):
 
 @pytest.mark.opencl
 def test_a_coarse_picture_is_steered_and_the_latest_state_is_drawn(session, monkeypatch):
-    from clrecon.viewer.session import session as module
-
     view = session(scenes.make_scan())
-    monkeypatch.setattr(module, "MOVING_MS", 1e9)
+    paint, took_ms = view.painter.picture, 1.0
+
+    def paint_for(*given, **how):
+        painted = paint(*given, **how)
+        painted.report["ms"] = took_ms
+        return painted
+
+    monkeypatch.setattr(view.painter, "picture", paint_for)
     picture(view, moving=True)
     assert picture(view, moving=True).size == SIZE
-    monkeypatch.setattr(module, "MOVING_MS", 1e-9)
+    took_ms = 1e9
     picture(view, moving=True)
     assert picture(view, moving=True).size == (77, 64)
     view.do({"do": "look", "view": "left"})
@@ -315,13 +321,20 @@ def test_several_sessions_share_a_painter_and_do_not_disturb_each_other(device):
                 view.close()
 
 
-@pytest.mark.opencl
-def test_what_makes_pictures_slow_is_said(session, monkeypatch):
-    from clrecon.viewer.session import session as module
+def test_a_mesh_of_many_triangles_is_said_to_be_slow():
+    def warnings_of(triangles):
+        mesh: Any = SimpleNamespace(triangle_count=triangles)
+        shown = ShownMesh(number=1, name="mesh 1", mesh=mesh)
+        own: Any = SimpleNamespace(model=SimpleNamespace(objects=[shown]), _timing={})
+        return ViewSession._warnings(own)
 
-    monkeypatch.setattr(module, "MANY_TRIANGLES", 100)
-    view = session(scenes.make_mesh())
-    assert "mesh 1 has" in view.facts()["warnings"][0] and "coarse" in view.facts()["warnings"][0]
+    assert warnings_of(2_000_000) == []
+    (warning,) = warnings_of(2_000_001)
+    assert "mesh 1 has 2,000,001 triangles" in warning and "coarse" in warning
+
+
+@pytest.mark.opencl
+def test_a_scan_that_goes_through_in_slabs_is_said_to_be_slow(session):
     view = session(scenes.make_scan(), memory=80_000)
     found: list[Any] = []
     view.picture((24, 20), False, found.append)

@@ -10,6 +10,7 @@ import http.client
 import json
 import logging
 import re
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
@@ -391,12 +392,12 @@ def test_a_browser_can_end_the_server(views: Views) -> None:
         asyncio.run(look(running))
 
 
-def test_too_many_browsers_are_told_so(views: Views, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "MOST_BROWSERS", 1)
-
+def test_too_many_browsers_are_told_so(views: Views) -> None:
     async def look(running: WebServer) -> None:
-        async with browsing(running) as one:
-            await one.until(lambda: one.facts)
+        async with AsyncExitStack() as stack:
+            browsers = [await stack.enter_async_context(browsing(running)) for _ in range(server.MOST_BROWSERS)]
+            for one in browsers:
+                await one.until(lambda one=one: one.facts)
             async with browsing(running) as other:
                 await other.until(lambda: other.close_code is not None)
                 assert other.close_code == 1013
