@@ -312,7 +312,9 @@ def test_the_table_of_an_uneven_stack(monkeypatch):
 def test_slabs_of_a_field_are_as_thick_as_there_is_room(room, ends, monkeypatch):
     nodes = Nodes(NOWHERE.astype(np.float32), NOWHERE, np.float32(1.0), (3, 2, 5))
     monkeypatch.setattr(
-        field, "describe_shortage", lambda limits, needs: "" if needs["nodes"] <= limits * nodes.layer_bytes else "much"
+        field.ocl,
+        "describe_shortage",
+        lambda limits, needs: "" if needs["nodes"] <= limits * nodes.layer_bytes else "much",
     )
     planned: Any = SimpleNamespace(
         nodes=nodes,

@@ -8,22 +8,10 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import DeviceError, DeviceFailedError
 from clrecon.geometry import Volume
-from clrecon.opencl import (
-    Device,
-    Program,
-    Stopwatch,
-    allocate,
-    copy_buffer,
-    download,
-    empty_output,
-    kernel_constant,
-    launch,
-    load_program,
-    upload,
-    wait,
-)
+from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.filters.settings import BilateralSettings, finish_result, inside_level
 from clrecon.operators.primitives.scan import Compacted, compact, prepare_compact
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
@@ -32,7 +20,7 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 
-_NEAR_GROUP = kernel_constant("filters/near_level.cl", "GROUP")
+_NEAR_GROUP = ocl.kernel_constant("filters/near_level.cl", "GROUP")
 """Voxels of a group."""
 
 
@@ -69,7 +57,7 @@ def mixed_group_bytes(ni: int, rows: int, core_rows: int) -> int:
 
 def prepare_near_level(device: Device, dtype: DTypeLike = np.int16) -> Program:
     prepare_compact(device)
-    return load_program(device, "filters/near_level.cl", voxel_variants(dtype))
+    return ocl.load_program(device, "filters/near_level.cl", voxel_variants(dtype))
 
 
 def list_mixed_groups(
@@ -83,17 +71,17 @@ def list_mixed_groups(
     """
     program, words = prepare_near_level(device, dtype), row_words(there.ni)
     count, core_count = words * there.rows, words * there.core_rows
-    some_d, all_d, some_near_d, all_near_d = (allocate(device, 4 * count) for _ in range(4))
-    mask_d = allocate(device, 4 * core_count)
-    launch(
+    some_d, all_d, some_near_d, all_near_d = (ocl.allocate(device, 4 * count) for _ in range(4))
+    mask_d = ocl.allocate(device, 4 * core_count)
+    ocl.launch(
         device, program["classify_groups"], there.rows, voxels=there.voxels_d, some=some_d,
         every=all_d, level=level, ni=there.ni, rows=there.rows, words=words, reach=reach[0],
     )  # fmt: skip
-    launch(
+    ocl.launch(
         device, program["spread_groups"], count, some=some_d, every=all_d, some_near=some_near_d,
         all_near=all_near_d, count=count, words=words, nj=there.nj, reach=reach[1],
     )  # fmt: skip
-    launch(
+    ocl.launch(
         device, program["mark_mixed_groups"], core_count, some_near=some_near_d,
         all_near=all_near_d, mask=mask_d, count=core_count, slice_words=words * there.nj, slices=there.count,
         core_first=there.core_first - there.first, reach=reach[2],
@@ -103,7 +91,7 @@ def list_mixed_groups(
 
 VolumeKind = TypeVar("VolumeKind", Volume, DeviceVolume)
 
-GROUP = kernel_constant("filters/bilateral.cl", "GROUP")
+GROUP = ocl.kernel_constant("filters/bilateral.cl", "GROUP")
 """Voxels of a group."""
 
 _BILATERAL = "bilateral filter"
@@ -296,36 +284,36 @@ class _Run:
         device, stopwatch = self.resident.device, self.stopwatch
         with stopwatch.timed("build"):
             variants = {**voxel_variants(self.dtype), "LANES": device.kernel_variants["LANES"]}
-            self.program = load_program(device, "filters/bilateral.cl", variants)
+            self.program = ocl.load_program(device, "filters/bilateral.cl", variants)
             if self.settings.near is not None:
                 prepare_near_level(device, self.dtype)
         window = self.window
         self.tap_rows = window.rows()
-        self.tap_rows_d = upload(device, self.tap_rows)
+        self.tap_rows_d = ocl.upload(device, self.tap_rows)
         steps, self.inner_jk = self._tap_steps()
-        self.tap_steps_d = upload(device, steps)
-        self.spatial_d = upload(device, np.maximum(window.exponents, -1000.0).astype(np.float32))
+        self.tap_steps_d = ocl.upload(device, steps)
+        self.spatial_d = ocl.upload(device, np.maximum(window.exponents, -1000.0).astype(np.float32))
         self.progress("filter", 0, self.nk)
         shape = (self.nk, self.nj, self.ni)
         if slices == self.nk:
             voxels_d = self.resident.whole(stopwatch)
-            filtered, filtered_d = empty_output(device, shape, self.dtype)
+            filtered, filtered_d = ocl.empty_output(device, shape, self.dtype)
             groups = self._filter(SlicesThere(voxels_d, self.ni, self.nj, 0, self.nk, 0, self.nk), filtered_d)
             with stopwatch.timed("download"):
-                filtered = download(device, filtered, filtered_d)
+                filtered = ocl.download(device, filtered, filtered_d)
             return Filtered(filtered, filtered_d, self._share(groups), 1, tuple(self.warnings))
         filtered, groups = np.empty(shape, self.dtype), 0
         for first in range(0, self.nk, slices):
             end = min(first + slices, self.nk)
             there_first, there_end = max(0, first - self.halo), min(end + self.halo, self.nk)
             voxels_d = self.resident.part(there_first, there_end, stopwatch)
-            part, part_d = empty_output(device, (end - first, self.nj, self.ni), self.dtype)
+            part, part_d = ocl.empty_output(device, (end - first, self.nj, self.ni), self.dtype)
             there = SlicesThere(
                 voxels_d, self.ni, self.nj, there_first, there_end - there_first, first, end - first
             )  # fmt: skip
             groups += self._filter(there, part_d)
             with stopwatch.timed("download"):
-                filtered[first:end] = download(device, part, part_d)
+                filtered[first:end] = ocl.download(device, part, part_d)
             self.resident.volume.release_slices(there_first, end)
         return Filtered(filtered, None, self._share(groups), -(-self.nk // slices), tuple(self.warnings))
 
@@ -344,11 +332,11 @@ class _Run:
         """Filter the slices that are worked on; return the number of groups that were filtered."""
         device, stopwatch = self.resident.device, self.stopwatch
         width = GROUP + 2 * self.reach
-        ends_d = allocate(device, there.rows * self.strips * width * self.dtype.itemsize)
+        ends_d = ocl.allocate(device, there.rows * self.strips * width * self.dtype.itemsize)
         sides = {"strips": max(self.strips, 1), "inner": self.inner, "inner_end": self.inner_end, "reach": self.reach}
         with stopwatch.running(device):
             if self.strips:
-                launch(
+                ocl.launch(
                     device, self.program["copy_row_ends"], there.rows * self.strips,
                     voxels=there.voxels_d, ends=ends_d, ni=self.ni, rows=there.rows, **sides,
                 )  # fmt: skip
@@ -358,7 +346,7 @@ class _Run:
             else:
                 size = there.core_count * self.resident.slice_bytes
                 offset = (there.core_first - there.first) * self.resident.slice_bytes
-                copy_buffer(device, there.voxels_d, filtered_d, size, source_offset=offset)
+                ocl.copy_buffer(device, there.voxels_d, filtered_d, size, source_offset=offset)
                 level = inside_level(self.dtype, near)
                 box = (self.box[0], self.box[1], self.box[2])
                 mixed_groups = list_mixed_groups(device, there, self.dtype, level, box)
@@ -375,7 +363,7 @@ class _Run:
         most = max(_TAPS_A_LAUNCH // (GROUP * window.taps * slice_groups), 1) * slice_groups
         for first in range(0, groups.total, most):
             count = min(most, groups.total - first)
-            launch(
+            ocl.launch(
                 device, self.program["filter_bilateral"], count * items,
                 voxels=there.voxels_d, ends=ends_d, tap_rows=self.tap_rows_d, spatial=self.spatial_d,
                 groups=self.tap_rows_d if groups.listed_d is None else groups.listed_d, filtered=filtered_d,
@@ -386,7 +374,7 @@ class _Run:
                 table_taps=window.taps if len(window.exponents) > 1 else 0, **sides,
             )  # fmt: skip
             if groups.listed_d is None:
-                wait(device)
+                ocl.wait(device)
                 self.progress("filter", there.core_first + (first + count) // slice_groups, self.nk)
         if groups.listed_d is not None:
             self.progress("filter", there.core_first + there.core_count, self.nk)

@@ -9,21 +9,11 @@ from typing import Any, NoReturn, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, slice_normal, slice_voxel_ml
 from clrecon.geometry.affine import Float64Array, checked_points
-from clrecon.opencl import (
-    Device,
-    allocate,
-    check_budget,
-    copy_buffer,
-    download,
-    kernel_constant,
-    launch,
-    load_program,
-    upload,
-    wait,
-)
+from clrecon.opencl import Device
 from clrecon.operators.masks import voxel_mask
 from clrecon.operators.masks.regions import checked_mm
 from clrecon.operators.masks.runs import (
@@ -40,8 +30,8 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.text import format_digits
 
 PIECE_WORDS = {
-    "8": kernel_constant("masks/row_pieces.h", "CPU_PIECE_WORDS"),
-    "1": kernel_constant("masks/row_pieces.h", "GPU_PIECE_WORDS"),
+    "8": ocl.kernel_constant("masks/row_pieces.h", "CPU_PIECE_WORDS"),
+    "1": ocl.kernel_constant("masks/row_pieces.h", "GPU_PIECE_WORDS"),
 }
 """Words of a row that a work-item holds, by LANES."""
 
@@ -148,12 +138,12 @@ def spread_bits(device: Device, mask: VoxelMask, ball: Stencil, *, erode: bool =
     step = piece - 2 * halo
     pieces = -(-words // step)
     rows, tables = _split_tables(ball, _HALO_BITS if halo else None)
-    spread_d = allocate(device, 4 * words * nj * nk)
-    program = load_program(device, "masks/balls.cl", {"LANES": device.kernel_variants["LANES"]})
-    launch(
+    spread_d = ocl.allocate(device, 4 * words * nj * nk)
+    program = ocl.load_program(device, "masks/balls.cl", {"LANES": device.kernel_variants["LANES"]})
+    ocl.launch(
         device, program["spread_ball"], nj * nk * pieces, mask=mask.mask_d,
         row_extents=mask.row_extents_d, reach_j=int(np.abs(rows[:, 0]).max()), reach_k=int(np.abs(rows[:, 1]).max()),
-        stencil=upload(device, rows), tables=upload(device, tables), spread=spread_d, ni=ni, nj=nj,
+        stencil=ocl.upload(device, rows), tables=ocl.upload(device, tables), spread=spread_d, ni=ni, nj=nj,
         nk=nk, words=words, pieces=pieces, piece=step, halo=halo, shifted=int(rows[:, 2].any()),
         flip=0xFFFFFFFF if erode else 0, beyond=0xFFFFFFFF if erode != beyond else 0,
     )  # fmt: skip
@@ -231,7 +221,7 @@ class MaskBits:
     def layers(self) -> Iterator[NDArray[np.bool_]]:
         """Yield the chosen voxels of each slice, shape (nj, ni), bool: an eighth of the memory of `to_numpy`."""
         ni, nj, nk = self.shape_ijk
-        words = download(self.device, np.empty((nk, nj, -(-ni // 32)), "<u4"), self._mask_d)
+        words = ocl.download(self.device, np.empty((nk, nj, -(-ni // 32)), "<u4"), self._mask_d)
         for layer in words.view(np.uint8):
             yield np.unpackbits(layer, axis=1, count=ni, bitorder="little").view(np.bool_)
 
@@ -277,8 +267,8 @@ class MaskBits:
         other_d = other._mask_d
         if other.device is not self.device:  # a device failed, and another took over
             ni, nj, nk = self.shape_ijk
-            words = download(other.device, np.empty(-(-ni // 32) * nj * nk, np.uint32), other_d)
-            other_d = upload(self.device, words)
+            words = ocl.download(other.device, np.empty(-(-ni // 32) * nj * nk, np.uint32), other_d)
+            other_d = ocl.upload(self.device, words)
         made_d = voxel_mask.combine(self.device, self._mask_d, other_d, self.shape_ijk, operation)
         return self._made(made_d, f"({self.name}) {operation} ({other.name})")
 
@@ -289,7 +279,7 @@ class MaskBits:
 
     def _check_budget(self, masks: int, **more: int) -> None:
         size = mask_bytes(self.shape_ijk)["mask of the voxels"]
-        check_budget(self.device, {f"{masks} masks of the voxels": masks * size, **more}, self.memory)
+        ocl.check_budget(self.device, {f"{masks} masks of the voxels": masks * size, **more}, self.memory)
 
     def _check_frame(self, volume: Volume) -> None:
         """Refuse a volume whose voxels lie elsewhere."""
@@ -372,7 +362,7 @@ class MaskShapes(MaskBits):
             cross = _cross_of(self.scan, most > done)
             spread = self._made(spread_bits(self.device, reached.bits, cross), self.name)
             reached = reached | (spread & room)
-            wait(self.device)  # the masks of commands that wait in the queue are all in memory
+            ocl.wait(self.device)  # the masks of commands that wait in the queue are all in memory
         return self._made(reached._mask_d, f"({self.name}) dilated by {mm:g} mm within ({room.name})")
 
     def _erode(self, mm: float, by_slice: bool) -> Any:
@@ -390,7 +380,7 @@ class MaskShapes(MaskBits):
         size, extents = mask_bytes(self.shape_ijk).values()
         rows = 2 * ball.rows.nbytes + ball.tables.nbytes
         needs = {"2 masks of the voxels": 2 * size, "row extents": extents, "rows of the ball": rows}
-        check_budget(self.device, needs, self.memory)
+        ocl.check_budget(self.device, needs, self.memory)
         return spread_bits(self.device, self.bits, ball, erode=erode, beyond=beyond)
 
 
@@ -424,8 +414,8 @@ class MaskComponents(MaskShapes):
         size = mask_bytes(self.shape_ijk)["mask of the voxels"]
         rest = voxel_mask.find_extents(device, voxel_mask.invert(device, self._mask_d, shape), shape)
         holes = find_components(device, rest, by_slice=by_slice, beside=2 * size, memory=self.memory)
-        filled_d = allocate(device, size)
-        copy_buffer(device, self._mask_d, filled_d, size)
+        filled_d = ocl.allocate(device, size)
+        ocl.copy_buffer(device, self._mask_d, filled_d, size)
         if holes.count:
             marks_d = mark_at_border(device, holes, shape, by_slice=by_slice)
             self._write(holes, marks_d, filled_d, wanted=0)
@@ -487,7 +477,7 @@ class MaskComponents(MaskShapes):
         if len(numbers):
             marks = np.zeros(4 * -(-parts.count // 4), np.uint8)
             marks[numbers] = 1
-            self._write(parts, upload(self.device, marks), chosen_d, wanted=1)
+            self._write(parts, ocl.upload(self.device, marks), chosen_d, wanted=1)
         return self._made(chosen_d, f"{label} of ({self.name})")
 
     def _find_voxels(self, points: Float64Array) -> NDArray[np.int32]:

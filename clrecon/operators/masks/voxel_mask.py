@@ -9,21 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import DeviceError, DeviceFailedError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.opencl import (
-    Device,
-    Program,
-    Stopwatch,
-    allocate,
-    copy_buffer,
-    download,
-    empty_output,
-    kernel_constant,
-    launch,
-    load_program,
-    upload,
-)
+from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import voxel_variants
 from clrecon.points.cloud import VoxelNumbers
@@ -36,7 +25,9 @@ from clrecon.system.text import format_band
 def prepare_classify(device: Device, dtype: DTypeLike = np.int16, inside: str = "above") -> Program:
     """Build the kernels for volumes of `dtype`; `inside` as in `IsoRule.inside`."""
     variants = {"above": {}, "below": {"BORDER_INSIDE": "1"}, "between": {"RANGE": "1"}}[inside]
-    return load_program(device, "masks/classify.cl", {**voxel_variants(dtype), **device.kernel_variants, **variants})
+    return ocl.load_program(
+        device, "masks/classify.cl", {**voxel_variants(dtype), **device.kernel_variants, **variants}
+    )
 
 
 LONGEST_ROW = 65_535
@@ -175,14 +166,14 @@ class _Marking:
     def mark(self, slices: int) -> VoxelMask:
         resident, device = self.resident, self.resident.device
         ni, nj, nk = resident.volume.shape_ijk
-        mask_d, extents_d = allocate(device, 4 * self.words * nj * nk), allocate(device, 4 * nj * nk)
+        mask_d, extents_d = ocl.allocate(device, 4 * self.words * nj * nk), ocl.allocate(device, 4 * nj * nk)
         if slices == nk:
             voxels_d = resident.whole(self.stopwatch)
             with self.stopwatch.running(device):
                 self._classify(voxels_d, mask_d, extents_d, nk)
             return VoxelMask(mask_d, extents_d, (ni, nj, nk), self.words, self.pad)
         resident.make_way()
-        part_d, part_extents_d = (allocate(device, size * nj * slices) for size in (4 * self.words, 4))
+        part_d, part_extents_d = (ocl.allocate(device, size * nj * slices) for size in (4 * self.words, 4))
         for first in range(0, nk, slices):
             end = min(first + slices, nk)
             voxels_d = resident.part(first, end, self.stopwatch)
@@ -192,7 +183,7 @@ class _Marking:
                     (part_d, mask_d, 4 * self.words * nj),
                     (part_extents_d, extents_d, 4 * nj),
                 ):
-                    copy_buffer(device, source_d, target_d, size * (end - first), size * first)
+                    ocl.copy_buffer(device, source_d, target_d, size * (end - first), size * first)
             resident.volume.release_slices(first, end)
             self.progress("mask", end, nk)
         return VoxelMask(mask_d, extents_d, (ni, nj, nk), self.words, self.pad)
@@ -200,7 +191,7 @@ class _Marking:
     def _classify(self, voxels_d: Any, mask_d: Any, extents_d: Any, slices: int) -> None:
         volume = self.resident.volume
         ni, nj, _ = volume.shape_ijk
-        launch(
+        ocl.launch(
             self.resident.device,
             prepare_classify(self.resident.device, volume.voxels.dtype, "between")["classify_samples"], nj * slices,
             voxels=voxels_d, mask=mask_d, row_extents=extents_d, level=self.bounds[0], highest=self.bounds[1], ni=ni,
@@ -210,9 +201,9 @@ class _Marking:
 
 def zero_words(device: Device, words: int) -> Any:
     """Return a buffer of words of 32 zero bits that kernels may write: uploaded buffers are for reading alone."""
-    words_d = allocate(device, 4 * words)
-    clear = load_program(device, "masks/band_mask.cl")["clear_words"]
-    launch(device, clear, words, mask=words_d, n=words)
+    words_d = ocl.allocate(device, 4 * words)
+    clear = ocl.load_program(device, "masks/band_mask.cl")["clear_words"]
+    ocl.launch(device, clear, words, mask=words_d, n=words)
     return words_d
 
 
@@ -223,8 +214,8 @@ def mark_voxels(
     check_shape(shape_ijk, pad)
     ni, nj, nk = shape_ijk
     words, rows = -(-ni // 32) + pad, nj * nk
-    program = load_program(device, "masks/band_mask.cl")
-    mask_d, extents_d = zero_words(device, words * rows), allocate(device, 4 * rows)
+    program = ocl.load_program(device, "masks/band_mask.cl")
+    mask_d, extents_d = zero_words(device, words * rows), ocl.allocate(device, 4 * rows)
     if isinstance(voxels, VoxelNumbers):
         n, kernel = len(voxels.numbers), "set_numbered_bits"
         given = {"numbers": np.ascontiguousarray(voxels.numbers, np.uint32)}
@@ -233,30 +224,30 @@ def mark_voxels(
         n, kernel = len(voxels), "set_bits"
         given, sizes = {"ijk": np.ascontiguousarray(voxels, np.int32)}, {"nj": nj}
     if n:
-        given_d = {name: upload(device, values) for name, values in given.items()}
-        launch(device, program[kernel], n, mask=mask_d, n=n, words=words, **given_d, **sizes)
-    launch(device, program["find_extents"], rows, mask=mask_d, row_extents=extents_d, rows=rows, words=words)
+        given_d = {name: ocl.upload(device, values) for name, values in given.items()}
+        ocl.launch(device, program[kernel], n, mask=mask_d, n=n, words=words, **given_d, **sizes)
+    ocl.launch(device, program["find_extents"], rows, mask=mask_d, row_extents=extents_d, rows=rows, words=words)
     return VoxelMask(mask_d, extents_d, shape_ijk, words, pad)
 
 
 _OPERATIONS = {
-    "and": kernel_constant("masks/logic.cl", "OPERATION_AND"),
-    "or": kernel_constant("masks/logic.cl", "OPERATION_OR"),
-    "xor": kernel_constant("masks/logic.cl", "OPERATION_XOR"),
-    "and not": kernel_constant("masks/logic.cl", "OPERATION_AND_NOT"),
+    "and": ocl.kernel_constant("masks/logic.cl", "OPERATION_AND"),
+    "or": ocl.kernel_constant("masks/logic.cl", "OPERATION_OR"),
+    "xor": ocl.kernel_constant("masks/logic.cl", "OPERATION_XOR"),
+    "and not": ocl.kernel_constant("masks/logic.cl", "OPERATION_AND_NOT"),
 }
 """Words of an operation, and its number in the kernel."""
 
 
 def prepare_logic(device: Device, dtype: DTypeLike = np.int16) -> Program:
-    return load_program(device, "masks/logic.cl", voxel_variants(dtype))
+    return ocl.load_program(device, "masks/logic.cl", voxel_variants(dtype))
 
 
 def combine(device: Device, a_d: Any, b_d: Any, shape_ijk: tuple[int, int, int], operation: str) -> Any:
     """Return the words of two masks of one shape joined; `operation` is one of `_OPERATIONS`."""
     words, rows = _words(shape_ijk)
-    combined_d = allocate(device, 4 * words * rows)
-    launch(
+    combined_d = ocl.allocate(device, 4 * words * rows)
+    ocl.launch(
         device, prepare_logic(device)["combine_masks"], words * rows, a=a_d, b=b_d,
         combined=combined_d, n=words * rows, operation=_OPERATIONS[operation],
     )  # fmt: skip
@@ -265,8 +256,8 @@ def combine(device: Device, a_d: Any, b_d: Any, shape_ijk: tuple[int, int, int],
 
 def invert(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int]) -> Any:
     words, rows = _words(shape_ijk)
-    inverted_d = allocate(device, 4 * words * rows)
-    launch(
+    inverted_d = ocl.allocate(device, 4 * words * rows)
+    ocl.launch(
         device, prepare_logic(device)["invert_mask"], words * rows, mask=mask_d,
         inverted=inverted_d, n=words * rows, ni=shape_ijk[0], words=words,
     )  # fmt: skip
@@ -275,16 +266,18 @@ def invert(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int]) -> Any:
 
 def count_bits(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int]) -> int:
     words, rows = _words(shape_ijk)
-    counts, counts_d = empty_output(device, (rows,), np.uint32)
-    launch(device, prepare_logic(device)["count_row_bits"], rows, mask=mask_d, counts=counts_d, rows=rows, words=words)
-    return int(download(device, counts, counts_d).sum(dtype=np.int64))
+    counts, counts_d = ocl.empty_output(device, (rows,), np.uint32)
+    ocl.launch(
+        device, prepare_logic(device)["count_row_bits"], rows, mask=mask_d, counts=counts_d, rows=rows, words=words
+    )
+    return int(ocl.download(device, counts, counts_d).sum(dtype=np.int64))
 
 
 def find_extents(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int]) -> VoxelMask:
     words, rows = _words(shape_ijk)
-    extents_d = allocate(device, 4 * rows)
-    launch(
-        device, load_program(device, "masks/band_mask.cl")["find_extents"], rows, mask=mask_d,
+    extents_d = ocl.allocate(device, 4 * rows)
+    ocl.launch(
+        device, ocl.load_program(device, "masks/band_mask.cl")["find_extents"], rows, mask=mask_d,
         row_extents=extents_d, rows=rows, words=words,
     )  # fmt: skip
     return VoxelMask(mask_d, extents_d, shape_ijk, words, 0)
@@ -296,12 +289,12 @@ def replace_outside(
     """Return voxels with `outside` where the mask is not set: a host array, (nk, nj, ni), and a buffer."""
     ni, nj, nk = shape_ijk
     words, rows = _words(shape_ijk)
-    replaced, replaced_d = empty_output(device, (nk, nj, ni), dtype)
-    launch(
+    replaced, replaced_d = ocl.empty_output(device, (nk, nj, ni), dtype)
+    ocl.launch(
         device, prepare_logic(device, dtype)["replace_outside"], rows, voxels=voxels_d,
         mask=mask_d, replaced=replaced_d, outside=dtype.type(outside), rows=rows, words=words, ni=ni,
     )  # fmt: skip
-    return download(device, replaced, replaced_d), replaced_d
+    return ocl.download(device, replaced, replaced_d), replaced_d
 
 
 def _words(shape_ijk: tuple[int, int, int]) -> tuple[int, int]:

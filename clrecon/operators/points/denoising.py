@@ -8,22 +8,9 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import UsageError
-from clrecon.opencl import (
-    Device,
-    Program,
-    Stopwatch,
-    allocate,
-    check_memory,
-    download,
-    empty_output,
-    kernel_constant,
-    launch,
-    load_program,
-    take_device,
-    upload,
-    with_fallback,
-)
+from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.points.grid import fill_grid, plan_grid
 from clrecon.operators.points.neighbours import NeighbourSearch, Part, check_neighbours, take_points
 from clrecon.operators.points.normals import FEWEST_NEIGHBOURS, PlaneFits
@@ -41,11 +28,11 @@ class DistanceMeasure:
         self._search, self._stopwatch = search, stopwatch
         with stopwatch.timed("build"):
             lanes = search.device.kernel_variants["LANES"]
-            program = load_program(search.device, "points/outliers.cl", {"LANES": lanes})
+            program = ocl.load_program(search.device, "points/outliers.cl", {"LANES": lanes})
         self._kernel = program["measure_distances"]
         n = search.grid.n
-        self._means, self._means_d = empty_output(search.device, (n,), np.float32)
-        self._nearest, self._nearest_d = empty_output(search.device, (n,), np.float32)
+        self._means, self._means_d = ocl.empty_output(search.device, (n,), np.float32)
+        self._nearest, self._nearest_d = ocl.empty_output(search.device, (n,), np.float32)
 
     @staticmethod
     def needs(points: int) -> dict[str, int]:
@@ -54,7 +41,7 @@ class DistanceMeasure:
     def measure(self, part: Part, neighbours_d: Any) -> None:
         """Measure a part, whose neighbours are listed by place."""
         search = self._search
-        launch(
+        ocl.launch(
             search.device, self._kernel, -(-part.place_count // int(search.device.kernel_variants["LANES"])),
             **search.coordinates, order=search.grid.order_d, neighbours=neighbours_d, means=self._means_d,
             nearest=self._nearest_d, k=search.k, first_place=part.first_place, place_count=part.place_count,
@@ -63,7 +50,7 @@ class DistanceMeasure:
     def read(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return mean and nearest distances, (n,) mm each, by the points' numbers."""
         device = self._search.device
-        return download(device, self._means, self._means_d), download(device, self._nearest, self._nearest_d)
+        return ocl.download(device, self._means, self._means_d), ocl.download(device, self._nearest, self._nearest_d)
 
 
 @explains_arguments
@@ -111,18 +98,18 @@ def remove_outliers(
     DeviceError
         The device fails.
     """
-    check_memory(memory)
+    ocl.check_memory(memory)
     points = take_points(cloud)
     k, warnings = check_neighbours(k, len(points), 2)
     if isinstance(deviations, bool) or not isinstance(deviations, (int, float)) or not 0.0 <= deviations < math.inf:
         raise UsageError(f"deviations are a number from 0 on, usually 1 to 3, not {deviations!r}")
 
-    for attempt in with_fallback(take_device(device)):
+    for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, notes):
             stopwatch = Stopwatch()
             search = NeighbourSearch(current, points, k, DistanceMeasure.needs(len(points)), memory, stopwatch)
             distances = DistanceMeasure(search, stopwatch)
-            neighbours_d = allocate(current, 4 * k * search.most_places)
+            neighbours_d = ocl.allocate(current, 4 * k * search.most_places)
             for part in search.each_part("outliers", progress or ignore_progress):
                 search.find(part, neighbours_d)
                 distances.measure(part, neighbours_d)
@@ -147,7 +134,7 @@ def remove_outliers(
 _FEATURES: tuple[str, ...] = get_args(Features)
 """Ways to tell features: paper B's ratio of distances, and the surface variation."""
 
-PLANE_NUMBERS = kernel_constant("points/bilateral.cl", "PLANE_NUMBERS")
+PLANE_NUMBERS = ocl.kernel_constant("points/bilateral.cl", "PLANE_NUMBERS")
 """Numbers that filter_points leaves for each point."""
 
 _MOST_ITERATIONS = 100
@@ -217,12 +204,12 @@ def denoise_points(
     DeviceError
         The device fails.
     """
-    check_memory(memory)
+    ocl.check_memory(memory)
     points = take_points(cloud)
     k, warnings = check_neighbours(k, len(points), FEWEST_NEIGHBOURS)
     settings = _Settings.checked(k, range_factor, iterations, features, paper)
 
-    for attempt in with_fallback(take_device(device)):
+    for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, notes):
             run = _Run(settings, current, memory, progress or ignore_progress)
             moved = points
@@ -274,14 +261,14 @@ class _Run:
         search = NeighbourSearch(device, points, settings.k, results, self.memory, stopwatch)
         fits = PlaneFits(search, stopwatch)
         with stopwatch.timed("build"):
-            program = load_program(device, "points/bilateral.cl", {"LANES": device.kernel_variants["LANES"]})
+            program = ocl.load_program(device, "points/bilateral.cl", {"LANES": device.kernel_variants["LANES"]})
         distances = DistanceMeasure(search, stopwatch) if split else None
-        moves, moves_d = empty_output(device, (n, 3), np.float32)
-        planes, planes_d = empty_output(device, (n if split else 1, PLANE_NUMBERS), np.float32)
+        moves, moves_d = ocl.empty_output(device, (n, 3), np.float32)
+        planes, planes_d = ocl.empty_output(device, (n if split else 1, PLANE_NUMBERS), np.float32)
         lanes = int(device.kernel_variants["LANES"])
         for part in search.each_part("denoise", self.progress):
             fits.fit(part)
-            launch(
+            ocl.launch(
                 device, program["filter_points"], -(-part.place_count // lanes),
                 **search.coordinates, order=search.grid.order_d, neighbours=fits.neighbours_d, normals=fits.normals_d,
                 variations=fits.variations_d, moves=moves_d, planes=planes_d, range_factor=settings.range_factor,
@@ -290,8 +277,8 @@ class _Run:
             if distances is not None:
                 distances.measure(part, fits.neighbours_d)
         if distances is not None:
-            self._filter_cells(points, distances, download(device, planes, planes_d), planes_d, moves_d, program)
-        return download(device, moves, moves_d)
+            self._filter_cells(points, distances, ocl.download(device, planes, planes_d), planes_d, moves_d, program)
+        return ocl.download(device, moves, moves_d)
 
     def _filter_cells(
         self,
@@ -314,8 +301,8 @@ class _Run:
             grid = fill_grid(device, plan_grid(points, self.cell_mm), memory=self.memory)
         if self.settings.features == "paper":
             means, nearest = distances.read()
-            starts = download(device, np.empty(grid.cells + 1, np.uint32), grid.starts_d)
-            order = download(device, np.empty(n, np.uint32), grid.order_d)
+            starts = ocl.download(device, np.empty(grid.cells + 1, np.uint32), grid.starts_d)
+            order = ocl.download(device, np.empty(n, np.uint32), grid.order_d)
             cells = np.empty(n, np.int64)
             cells[order] = np.searchsorted(starts, np.arange(n), side="right") - 1
             ratios = distance_ratios(means, nearest, cells)
@@ -324,10 +311,10 @@ class _Run:
             features = planes[:, 5] > VARIATION_OF_FEATURES
         self.feature_points = int(np.count_nonzero(features))
         with stopwatch.running(device):
-            launch(
+            ocl.launch(
                 device, program["filter_cells"], n, x=grid.x_d, y=grid.y_d, z=grid.z_d,
                 order=grid.order_d, starts=grid.starts_d, planes=planes_d,
-                features=upload(device, features.astype(np.uint8)), moves=moves_d, cells=grid.cells, points=n,
+                features=ocl.upload(device, features.astype(np.uint8)), moves=moves_d, cells=grid.cells, points=n,
             )  # fmt: skip
 
     def describe(self, cloud: PointCloud, moved: NDArray[np.floating], warnings: tuple[str, ...]) -> PointStep:

@@ -12,22 +12,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import DeviceMemoryError, UsageError
-from clrecon.opencl import (
-    Device,
-    MemoryLimits,
-    allocate,
-    describe_shortage,
-    download,
-    empty_output,
-    kernel_constant,
-    launch,
-    load_program,
-    memory_limits,
-    require_room,
-    result_pages,
-    upload,
-)
+from clrecon.opencl import Device, MemoryLimits
 from clrecon.operators.points.grid import CELL_ROUNDING, GridPlan, fill_grid, plan_grid
 from clrecon.operators.primitives.scan import BitRows, compact, exclusive_scan
 from clrecon.operators.primitives.union_find import label_components
@@ -47,16 +34,16 @@ class Masks(BitRows):
     def __init__(self, device: Device, shape: tuple[int, int, int]):
         self.device, self.shape = device, shape
         self.near_d, self.core_d, self.negative_d = (self.make() for _ in range(3))
-        program = load_program(device, "points/grid.cl", {"LANES": device.kernel_variants["LANES"]})
+        program = ocl.load_program(device, "points/grid.cl", {"LANES": device.kernel_variants["LANES"]})
         for mask_d in (self.near_d, self.core_d, self.negative_d):
-            launch(device, program["clear_cells"], self.total_words, mask=mask_d, total=self.total_words)
+            ocl.launch(device, program["clear_cells"], self.total_words, mask=mask_d, total=self.total_words)
 
     def make(self) -> Any:
-        return allocate(self.device, 4 * self.total_words)
+        return ocl.allocate(self.device, 4 * self.total_words)
 
     def fetch(self, mask_d: Any) -> NDArray[np.uint32]:
         """Return a mask, shape (nz, ny, words)."""
-        return download(self.device, np.empty((self.shape[2], self.shape[1], self.words), np.uint32), mask_d)
+        return ocl.download(self.device, np.empty((self.shape[2], self.shape[1], self.words), np.uint32), mask_d)
 
 
 @dataclass(frozen=True)
@@ -96,23 +83,23 @@ class _Decision:
         self.device = masks.device
         self.memory = memory
         self._limits, self._taken = limits, used
-        self._program = load_program(masks.device, "points/field_signs.cl")
+        self._program = ocl.load_program(masks.device, "points/field_signs.cl")
         self._lines = {"words": masks.words, "rows": masks.rows}
 
     def run(self, kernel: str, items: int, **arguments: Any) -> None:
-        launch(self.device, self._program[kernel], items, **arguments)
+        ocl.launch(self.device, self._program[kernel], items, **arguments)
 
     def _check(self, buffer: str, size: int) -> None:
-        require_room(self._limits, {"field": self._taken, buffer: size}, "the inside of the cloud cannot be found")
+        ocl.require_room(self._limits, {"field": self._taken, buffer: size}, "the inside of the cloud cannot be found")
 
     def find_runs(self) -> _Runs:
         masks, rows = self.masks, self.masks.rows
         along = {"nx": masks.shape[0], **self._lines}
-        counts_d = allocate(self.device, 4 * rows)
+        counts_d = ocl.allocate(self.device, 4 * rows)
         self.run("count_runs", rows, near=masks.near_d, counts=counts_d, **along)
         offsets = exclusive_scan(self.device, counts_d, rows, in_place=True)
         self._check("runs of far nodes", 25 * offsets.total + 8 * rows)
-        firsts_d, lasts_d = (allocate(self.device, 4 * offsets.total) for _ in range(2))
+        firsts_d, lasts_d = (ocl.allocate(self.device, 4 * offsets.total) for _ in range(2))
         self.run(
             "list_runs", rows, near=masks.near_d, offsets=offsets.offsets_d, firsts=firsts_d, lasts=lasts_d, **along
         )
@@ -122,15 +109,15 @@ class _Decision:
         masks, rows = self.masks, self.masks.rows
         of = {"offsets": runs.offsets_d, "firsts": runs.firsts_d, "lasts": runs.lasts_d}
         sizes = {"ny": masks.shape[1], "rows": rows, "runs": runs.count}
-        counts_d = allocate(self.device, 4 * rows)
+        counts_d = ocl.allocate(self.device, 4 * rows)
         self.run("count_joins", rows, counts=counts_d, **of, **sizes)
         places = exclusive_scan(self.device, counts_d, rows, in_place=True)
         self._check("pairs of runs", 25 * runs.count + 12 * places.total)
         pairs = np.empty((places.total, 3), np.uint32)
         if places.total:
-            pairs_d = allocate(self.device, 12 * places.total)
+            pairs_d = ocl.allocate(self.device, 12 * places.total)
             self.run("list_joins", rows, places=places.offsets_d, pairs=pairs_d, **of, **sizes)
-            download(self.device, pairs, pairs_d)
+            ocl.download(self.device, pairs, pairs_d)
             del pairs_d
         count, labels = label_components(self.device, pairs, runs.count, memory=self.memory)
         lone = np.flatnonzero(labels < 0)
@@ -140,13 +127,13 @@ class _Decision:
     def count_votes(self, runs: _Runs) -> NDArray[np.uint32]:
         """Return the votes for outside and for inside of each run, shape (runs, 2)."""
         masks = self.masks
-        votes_d = allocate(self.device, 8 * runs.count)
+        votes_d = ocl.allocate(self.device, 8 * runs.count)
         self.run(
             "count_votes", masks.rows,
             near=masks.near_d, negative=masks.negative_d, offsets=runs.offsets_d, firsts=runs.firsts_d,
             lasts=runs.lasts_d, votes=votes_d, nx=masks.shape[0], ny=masks.shape[1], runs=runs.count, **self._lines,
         )  # fmt: skip
-        return download(self.device, np.empty((runs.count, 2), np.uint32), votes_d)
+        return ocl.download(self.device, np.empty((runs.count, 2), np.uint32), votes_d)
 
     def paint(self, runs: _Runs, signs: NDArray[np.uint8], rounds: int) -> Any:
         """Return the mask of nodes inside; `negative_d` is used up."""
@@ -156,7 +143,7 @@ class _Decision:
         self.run(
             "paint_regions", masks.rows,
             near=masks.near_d, negative=next_inside_d, offsets=runs.offsets_d, firsts=runs.firsts_d,
-            lasts=runs.lasts_d, signs=upload(self.device, signs), inside=inside_d, reached=reached_d,
+            lasts=runs.lasts_d, signs=ocl.upload(self.device, signs), inside=inside_d, reached=reached_d,
             also_reached=next_reached_d, nx=masks.shape[0], runs=runs.count, **self._lines,
         )  # fmt: skip
         for _ in range(rounds):
@@ -185,9 +172,9 @@ def decide_signs(
     return Signs(inside_d, int(sums.sum()), against, count, bool(is_inside[regions[0]]))
 
 
-BRICK = tuple(kernel_constant("points/field.cl", name) for name in ("BRICK_LONG", "BRICK_WIDE", "BRICK_WIDE"))
-BRICK_ROWS = kernel_constant("points/field.cl", "BRICK_ROWS")
-_BRICK_BYTES = 4 * kernel_constant("points/field.cl", "BRICK_NODES")
+BRICK = tuple(ocl.kernel_constant("points/field.cl", name) for name in ("BRICK_LONG", "BRICK_WIDE", "BRICK_WIDE"))
+BRICK_ROWS = ocl.kernel_constant("points/field.cl", "BRICK_ROWS")
+_BRICK_BYTES = 4 * ocl.kernel_constant("points/field.cl", "BRICK_NODES")
 
 MOST_NODES = 2**31
 """Most nodes of a field."""
@@ -302,7 +289,7 @@ class NodeField:
         memory: int | None = None,
     ):
         self.device, self.settings = device, settings
-        self.limits = memory_limits(device, memory)
+        self.limits = ocl.memory_limits(device, memory)
         plan = plan_grid(points, 2.0 * settings.spacing)
         self.nodes = plan_nodes(plan, settings)
         # Cells are found by coordinates in float32.
@@ -310,8 +297,8 @@ class NodeField:
         self._within = settings.reach + 1e-3 * settings.spacing + 4.0 * CELL_ROUNDING * extent
         n = len(plan.points)
         needs = {**plan.needs(device), **self._kept(n), "normals as given": 12 * n, "nodes": self.nodes.layer_bytes}
-        require_room(self.limits, needs, "no surface can be made of the cloud")
-        self._program = load_program(device, "points/field.cl", {"LANES": device.kernel_variants["LANES"]})
+        ocl.require_room(self.limits, needs, "no surface can be made of the cloud")
+        self._program = ocl.load_program(device, "points/field.cl", {"LANES": device.kernel_variants["LANES"]})
         self.grid = fill_grid(device, plan, memory=memory)
         self._normals_d = self._sort_normals(normals)
         self._list_d, self._list = self._find_bricks()
@@ -320,7 +307,7 @@ class NodeField:
         self._values = self._measure()
 
     def _run(self, kernel: str, items: int, **arguments: Any) -> None:
-        launch(self.device, self._program[kernel], items, **arguments)
+        ocl.launch(self.device, self._program[kernel], items, **arguments)
 
     @property
     def bricks(self) -> int:
@@ -332,10 +319,10 @@ class NodeField:
 
     def _sort_normals(self, normals: NDArray[np.float32]) -> tuple[Any, Any, Any]:
         n = self.grid.n
-        sorted_d = [allocate(self.device, 4 * n) for _ in range(3)]
+        sorted_d = [ocl.allocate(self.device, 4 * n) for _ in range(3)]
         self._run(
             "sort_normals", n,
-            normals=upload(self.device, normals), order=self.grid.order_d, n=n,
+            normals=ocl.upload(self.device, normals), order=self.grid.order_d, n=n,
             nx=sorted_d[0], ny=sorted_d[1], nz=sorted_d[2],
         )  # fmt: skip
         return sorted_d[0], sorted_d[1], sorted_d[2]
@@ -350,7 +337,10 @@ class NodeField:
         grid, nodes = self.grid, self.nodes
         bricks_x, bricks_y, bricks_z = nodes.bricks
         rows, words = bricks_y * bricks_z, nodes.brick_words
-        merged_d, bricks_d = allocate(self.device, 4 * rows * grid.words), allocate(self.device, 4 * rows * words)
+        merged_d, bricks_d = (
+            ocl.allocate(self.device, 4 * rows * grid.words),
+            ocl.allocate(self.device, 4 * rows * words),
+        )
         self._run(
             "merge_rows", rows * grid.words,
             mask=grid.mask_d, merged=merged_d, ny=grid.shape[1], nz=grid.shape[2], words=grid.words,
@@ -362,7 +352,7 @@ class NodeField:
             brick_words=words, rows=rows, **self._where,
         )  # fmt: skip
         compacted = compact(self.device, bricks_d, rows * words)
-        listed = download(self.device, np.empty(compacted.count, np.uint32), compacted.positions_d)
+        listed = ocl.download(self.device, np.empty(compacted.count, np.uint32), compacted.positions_d)
         return compacted.positions_d, listed
 
     def _plan_slabs(self) -> tuple[_Slab, ...]:
@@ -382,7 +372,7 @@ class NodeField:
             most = max(slab.end_brick - slab.first_brick for slab in cut_slabs(thick))
             slab_needs = {"nodes": thick * self.nodes.layer_bytes, "bricks": _BRICK_BYTES * most}
             resident = {"grid": self.grid.nbytes, "list of bricks": 4 * self.bricks, **self._kept(self.grid.n)}
-            return describe_shortage(self.limits, {**resident, **slab_needs})
+            return ocl.describe_shortage(self.limits, {**resident, **slab_needs})
 
         thick = _largest(layers, lambda count: not shortage(count))
         if thick == 0:
@@ -396,7 +386,7 @@ class NodeField:
         values = []
         for slab in self.slabs:
             count = slab.end_brick - slab.first_brick
-            values_d = allocate(device, _BRICK_BYTES * count)
+            values_d = ocl.allocate(device, _BRICK_BYTES * count)
             if count:
                 self._run(
                     "measure_nodes", count if int(device.kernel_variants["LANES"]) > 1 else BRICK_ROWS * count,
@@ -410,7 +400,7 @@ class NodeField:
                     brick_words=nodes.brick_words, **self._where, **self.settings.squared(),
                 )  # fmt: skip
             if len(self.slabs) > 1:
-                values.append(download(device, np.empty((count, _BRICK_BYTES // 4), np.float32), values_d))
+                values.append(ocl.download(device, np.empty((count, _BRICK_BYTES // 4), np.float32), values_d))
             else:
                 values.append(values_d)
         return values
@@ -418,7 +408,7 @@ class NodeField:
     def _listed(self, slab: _Slab) -> Any:
         if len(self.slabs) == 1:
             return self._list_d
-        return upload(self.device, self._list[slab.first_brick : slab.end_brick])
+        return ocl.upload(self.device, self._list[slab.first_brick : slab.end_brick])
 
     @property
     def nbytes(self) -> int:
@@ -437,14 +427,14 @@ class NodeField:
         """Return the field as a volume, positive inside, with the decided signs; shape (nz, ny, nx), mm."""
         nx, ny, nz = self.nodes.shape
         device, whole = self.device, len(self.slabs) == 1
-        volume, volume_d = empty_output(device, (nz, ny, nx), np.float32) if whole else (
-            result_pages.empty((nz, ny, nx), np.float32), None,
+        volume, volume_d = ocl.empty_output(device, (nz, ny, nx), np.float32) if whole else (
+            ocl.result_pages.empty((nz, ny, nx), np.float32), None,
         )  # fmt: skip
         for number, slab in enumerate(self.slabs):
             first, end = BRICK[2] * slab.first, BRICK[2] * slab.end
-            slab_d = volume_d if whole else allocate(device, 4 * nx * ny * (end - first))
+            slab_d = volume_d if whole else ocl.allocate(device, 4 * nx * ny * (end - first))
             self._fill_slab(slab, signs, self._values[number], slab_d)
-            download(device, volume[first:end], slab_d)
+            ocl.download(device, volume[first:end], slab_d)
             if progress is not None:
                 progress(number + 1, len(self.slabs))
         return volume
@@ -460,7 +450,7 @@ class NodeField:
         if count:
             self._run(
                 "place_bricks", BRICK_ROWS * count,
-                list=self._listed(slab), values=values if len(self.slabs) == 1 else upload(self.device, values),
+                list=self._listed(slab), values=values if len(self.slabs) == 1 else ocl.upload(self.device, values),
                 near=self.masks.near_d, inside=signs.inside_d, volume=slab_d,
                 nodes_y=nodes.shape[1], bricks_y=bricks_y, brick_words=nodes.brick_words,
                 least=LEAST_SHARE * float(nodes.spacing), count=count, **sizes,

@@ -8,23 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import UsageError
-from clrecon.opencl import (
-    Device,
-    Program,
-    Stopwatch,
-    allocate,
-    check_memory,
-    download,
-    empty_output,
-    kernel_constant,
-    launch,
-    load_program,
-    memory_limits,
-    require_room,
-    take_device,
-    with_fallback,
-)
+from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.points.grid import (
     MOST_PAIRS,
     PADDING,
@@ -53,8 +39,8 @@ _UNSURE_SHARE = 1e-6
 _CELL_SLACK = 1e-3
 """Part by which cells are smaller than they could be, besides the rounding of the grid."""
 
-FORWARD_ROWS = kernel_constant("points/cell_links.h", "FORWARD_ROWS")
-NEAR_ROWS = kernel_constant("points/cell_links.h", "NEAR_ROWS")
+FORWARD_ROWS = ocl.kernel_constant("points/cell_links.h", "FORWARD_ROWS")
+NEAR_ROWS = ocl.kernel_constant("points/cell_links.h", "NEAR_ROWS")
 
 CHUNKS_A_CORE = 2
 """Chunks for each core of a CPU: few, since links between chunks take more time than those within."""
@@ -120,7 +106,7 @@ def cluster_free_points(
     min_samples: From 1 on; 1 gives connected components.
     """
     _check_numbers(eps, min_samples)
-    check_memory(memory)
+    ocl.check_memory(memory)
     places = np.asarray(points)
     if places.ndim != 2 or places.shape[1] != 3:
         raise UsageError(f"points have shape (n, 3), these have {places.shape}")
@@ -132,7 +118,7 @@ def cluster_free_points(
         return FreeClusters(np.full(n, -1, np.int32), np.zeros(n, bool), 0, facts, (warning,))
     plan = plan_cells(places, eps)
 
-    for attempt in with_fallback(take_device(device)):
+    for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, notes):
             stopwatch = Stopwatch()
             with stopwatch.running(current):
@@ -164,7 +150,7 @@ def find_clusters(
     """Return labels, cores, numbers of clusters and cells of a plan; equal for any `per_chunk` of `_CELLS_AN_ITEM`."""
     n = len(plan.points)
     needs = {**plan.needs(device), "clusters": 23 * n}
-    require_room(memory_limits(device, memory), needs, "the clusters of the points cannot be found")
+    ocl.require_room(ocl.memory_limits(device, memory), needs, "the clusters of the points cannot be found")
     grid = fill_grid(device, plan, memory=memory)
     progress("clusters", 1, 4)
     search = ClusterSearch(device, grid, eps, min_samples, per_chunk)
@@ -191,7 +177,7 @@ class ClusterSearch:
         self._device, self._grid = device, grid
         self._is_cpu = device.has_long_items
         lanes = device.kernel_variants["LANES"] if self._is_cpu else "1"
-        self._program = load_program(device, "points/free_clusters.cl", {"LANES": lanes})
+        self._program = ocl.load_program(device, "points/free_clusters.cl", {"LANES": lanes})
         self._of_grid = prepare_grid(device)
         self._samples = min_samples
         nx, ny, nz = grid.shape
@@ -205,9 +191,9 @@ class ClusterSearch:
         }  # fmt: skip
         self._per_chunk = self._plan_chunk() if per_chunk is None else per_chunk
         self._per_item = _CELLS_AN_ITEM if self._is_cpu else 1
-        self.core_x_d = allocate(device, 4 * (grid.n + PADDING))
-        self.labels_d, self._other_d, self._firsts_d = (allocate(device, 4 * grid.cells) for _ in range(3))
-        self.roots_d = allocate(device, 4 * self._total_words)
+        self.core_x_d = ocl.allocate(device, 4 * (grid.n + PADDING))
+        self.labels_d, self._other_d, self._firsts_d = (ocl.allocate(device, 4 * grid.cells) for _ in range(3))
+        self.roots_d = ocl.allocate(device, 4 * self._total_words)
         self.count = 0
 
     def _plan_chunk(self) -> int:
@@ -217,14 +203,16 @@ class ClusterSearch:
         return max(-(-share // CELLS_A_CHUNK), 1) * CELLS_A_CHUNK
 
     def _run(self, kernel: str, items: int, program: Program | None = None, **arguments: Any) -> None:
-        launch(self._device, (program or self._program)[kernel], items, **arguments)
+        ocl.launch(self._device, (program or self._program)[kernel], items, **arguments)
 
     def check_pairs(self) -> None:
         """Refuse clouds that are so dense that comparing their points would take many minutes."""
         n, cells = self._grid.n, self._grid.cells
         if float(n) * n <= MOST_PAIRS:
             return
-        counts = np.diff(download(self._device, np.empty(cells + 1, np.uint32), self._grid.starts_d)).astype(np.float64)
+        counts = np.diff(ocl.download(self._device, np.empty(cells + 1, np.uint32), self._grid.starts_d)).astype(
+            np.float64
+        )
         if float(counts @ counts) * 187 <= MOST_PAIRS:  # 125 cells around, 62 after each
             return
         pairs = float(self.count_pairs().sum(dtype=np.float64))
@@ -238,9 +226,9 @@ class ClusterSearch:
     def count_pairs(self) -> NDArray[np.float32]:
         """Return the most pairs that may have to be compared for each cell with points."""
         cells = self._grid.cells
-        pairs, pairs_d = empty_output(self._device, (cells,), np.float32)
+        pairs, pairs_d = ocl.empty_output(self._device, (cells,), np.float32)
         self._run("count_pairs", cells, pairs=pairs_d, min_samples=self._samples, **self._where)
-        return download(self._device, pairs, pairs_d)
+        return ocl.download(self._device, pairs, pairs_d)
 
     def find_cores(self) -> None:
         """Find the core points, and label each core cell with itself."""
@@ -304,7 +292,7 @@ class ClusterSearch:
             core_x=self.core_x_d, starts=grid.starts_d, order=grid.order_d, labels=self.labels_d,
             firsts=self._firsts_d, cells=grid.cells, per_item=self._per_item,
         )  # fmt: skip
-        marks_d, before_d = allocate(self._device, 4 * words), allocate(self._device, 4 * words)
+        marks_d, before_d = ocl.allocate(self._device, 4 * words), ocl.allocate(self._device, 4 * words)
         self._run("clear_cells", words, self._of_grid, mask=marks_d, total=words)
         self._run(
             "mark_firsts", grid.cells, labels=self.labels_d, firsts=self._firsts_d, marks=marks_d, cells=grid.cells
@@ -317,15 +305,15 @@ class ClusterSearch:
             labels=self.labels_d, firsts=self._firsts_d, marks=marks_d, before=before_d, numbers=numbers_d,
             cells=grid.cells,
         )  # fmt: skip
-        labels, labels_d = empty_output(self._device, (grid.n,), np.int32)
-        cores, cores_d = empty_output(self._device, (grid.n,), np.uint8)
+        labels, labels_d = ocl.empty_output(self._device, (grid.n,), np.int32)
+        cores, cores_d = ocl.empty_output(self._device, (grid.n,), np.uint8)
         self._run(
             "label_free_points", grid.cells,
             core_x=self.core_x_d, order=grid.order_d, numbers=numbers_d, clusters=labels_d, cores=cores_d,
             reach_squared=self._reach_squared, **self._where,
         )  # fmt: skip
-        download(self._device, labels, labels_d)
-        return labels, download(self._device, cores, cores_d).view(np.bool_)
+        ocl.download(self._device, labels, labels_d)
+        return labels, ocl.download(self._device, cores, cores_d).view(np.bool_)
 
 
 def _bounds(limit: float) -> tuple[float, float, float, float]:

@@ -8,21 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry.vertices import is_far
-from clrecon.opencl import (
-    Device,
-    Program,
-    allocate,
-    kernel_constant,
-    kernel_number,
-    launcher,
-    load_program,
-    memory_limits,
-    require_room,
-    upload,
-    wait,
-)
+from clrecon.opencl import Device, Program
 from clrecon.operators.primitives.scan import BitRows, exclusive_scan, prepare_sort, radix_sort, sort_bytes
 from clrecon.points.spacing import MARGIN
 from clrecon.system.light_dataclass import dataclass
@@ -30,7 +19,7 @@ from clrecon.system.light_dataclass import dataclass
 STEPS_A_POINT = 16
 """Steps with each point of a cloud that a work-item may make where all others are candidates: four passes at least."""
 
-MARKED_TOGETHER = kernel_constant("points/grid.cl", "MARKED_TOGETHER")
+MARKED_TOGETHER = ocl.kernel_constant("points/grid.cl", "MARKED_TOGETHER")
 """Points a work-item of mark_cells on a CPU."""
 
 MOST_CELLS = 2**31
@@ -42,7 +31,7 @@ MOST_CELLS_ALONG = 2**17
 MOST_PAIRS = 10**12
 """Most pairs of points that may have to be compared because they lie in near cells: minutes to hours."""
 
-CELL_ROUNDING = kernel_number("points/grid.h", "GRID_ROUNDING")
+CELL_ROUNDING = ocl.kernel_number("points/grid.h", "GRID_ROUNDING")
 """A point may lie outside of its cell by this share of its distance from the grid's origin: float32 chose the cell."""
 
 PADDING = 8
@@ -178,7 +167,7 @@ def _count_cells(box: NDArray[np.float32], corner: NDArray[np.float32], edge: np
 
 def prepare_grid(device: Device) -> Program:
     prepare_sort(device)
-    return load_program(device, "points/grid.cl", {"LANES": device.kernel_variants["LANES"]})
+    return ocl.load_program(device, "points/grid.cl", {"LANES": device.kernel_variants["LANES"]})
 
 
 def make_grid(device: Device, points: ArrayLike, edge: float, *, memory: int | None = None) -> PointGrid:
@@ -188,7 +177,7 @@ def make_grid(device: Device, points: ArrayLike, edge: float, *, memory: int | N
 
 def fill_grid(device: Device, plan: GridPlan, *, memory: int | None = None) -> PointGrid:
     """Sort the points of a plan by cells; see `make_grid`."""
-    require_room(memory_limits(device, memory), plan.needs(device), "the points cannot be sorted by cells")
+    ocl.require_room(ocl.memory_limits(device, memory), plan.needs(device), "the points cannot be sorted by cells")
     program, n = prepare_grid(device), len(plan.points)
     total = plan.total_words
     if device.most_steps is not None and n > device.most_steps // STEPS_A_POINT:
@@ -199,9 +188,9 @@ def fill_grid(device: Device, plan: GridPlan, *, memory: int | None = None) -> P
     (nx, ny, nz), words = plan.shape, plan.words
     scale = np.float32(1.0) / plan.edge
     grid = {"origin": (*map(float, plan.corner), float(scale)), "n": n, "nx": nx, "ny": ny, "nz": nz, "words": words}
-    points_d = upload(device, plan.points)
-    mask_d, ranks_d = allocate(device, 4 * total), allocate(device, 4 * total)
-    run = launcher(device, program)
+    points_d = ocl.upload(device, plan.points)
+    mask_d, ranks_d = ocl.allocate(device, 4 * total), ocl.allocate(device, 4 * total)
+    run = ocl.launcher(device, program)
     run("clear_cells", total, mask=mask_d, total=total)
     together = MARKED_TOGETHER if int(device.kernel_variants["LANES"]) > 1 else 1
     run("mark_cells", -(-n // together), points=points_d, mask=mask_d, **grid)
@@ -209,13 +198,13 @@ def fill_grid(device: Device, plan: GridPlan, *, memory: int | None = None) -> P
     cells = exclusive_scan(device, ranks_d, total, in_place=True).total
     if not 1 <= cells <= n:
         raise DeviceError(f"{device.label} computes wrongly: {n:,} points in {cells:,} cells")
-    keys_d = allocate(device, 4 * n)
+    keys_d = ocl.allocate(device, 4 * n)
     run("number_points", n, points=points_d, mask=mask_d, ranks=ranks_d, keys=keys_d, **grid)
     by_cell = radix_sort(device, keys_d, n, bits=_bits(cells))
-    wait(device)  # what the sort used is free then
+    ocl.wait(device)  # what the sort used is free then
     del keys_d
-    x_d, y_d, z_d = (allocate(device, 4 * (n + PADDING)) for _ in range(3))
-    starts_d = allocate(device, 4 * (cells + 1))
+    x_d, y_d, z_d = (ocl.allocate(device, 4 * (n + PADDING)) for _ in range(3))
+    starts_d = ocl.allocate(device, 4 * (cells + 1))
     run(
         "gather_points", n,
         points=points_d, keys=by_cell.keys_d, order=by_cell.values_d, x=x_d, y=y_d, z=z_d, starts=starts_d, n=n,

@@ -9,21 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import DeviceMemoryError, UsageError
-from clrecon.opencl import (
-    Device,
-    Stopwatch,
-    check_memory,
-    describe_shortage,
-    download,
-    empty_output,
-    kernel_constant,
-    launch,
-    load_program,
-    memory_limits,
-    take_device,
-    with_fallback,
-)
+from clrecon.opencl import Device, Stopwatch
 from clrecon.operators.points.grid import (
     MOST_CELLS_ALONG,
     MOST_PAIRS,
@@ -109,10 +97,10 @@ def _share_alone(places: NDArray[np.float64], group: NDArray[np.int64], block: f
     return float(np.count_nonzero(np.diff(new) == 1)) / len(keys)
 
 
-BATCH_CELLS = kernel_constant("points/neighbours.cl", "BATCH_CELLS")
+BATCH_CELLS = ocl.kernel_constant("points/neighbours.cl", "BATCH_CELLS")
 """Cells a work-item on a CPU."""
 
-MOST_NEIGHBOURS = kernel_constant("points/near_rows.h", "MOST_NEIGHBOURS")
+MOST_NEIGHBOURS = ocl.kernel_constant("points/near_rows.h", "MOST_NEIGHBOURS")
 """Most neighbours of a point: three times as many candidates have room in the kernel."""
 
 _PART_POINTS = 1 << 16
@@ -203,7 +191,7 @@ class NeighbourSearch:
             "neighbours of a part": 4 * k * min(self._part_points, len(points)),
             **needs,
         }
-        shortage = describe_shortage(memory_limits(device, memory), self.forecast)
+        shortage = ocl.describe_shortage(ocl.memory_limits(device, memory), self.forecast)
         if shortage:
             raise DeviceMemoryError(
                 f"the neighbours of {len(points):,} points cannot be found: {shortage}; fewer points need less"
@@ -211,13 +199,13 @@ class NeighbourSearch:
         with stopwatch.timed("build"):
             prepare_grid(device)
             lanes = "1" if _has_one_lane(device) else "8"
-            self._program = load_program(device, "points/neighbours.cl", {"LANES": lanes})
+            self._program = ocl.load_program(device, "points/neighbours.cl", {"LANES": lanes})
         with stopwatch.running(device):
             self.grid = fill_grid(device, plan, memory=memory)
         # beyond the rounding of a cell's faces and of distances to them
         extent = np.abs(plan.corner).max() + float(plan.edge) * max(plan.shape)
         self._margin = ROUNDING * float(extent)
-        starts = download(device, np.empty(self.grid.cells + 1, np.uint32), self.grid.starts_d)
+        starts = ocl.download(device, np.empty(self.grid.cells + 1, np.uint32), self.grid.starts_d)
         check_pairs(self.grid, starts)
         self.parts = _split_cells(starts, self._part_points)
 
@@ -242,7 +230,7 @@ class NeighbourSearch:
         by_place = distances_d is None
         distances_d = neighbours_d if by_place else distances_d
         (nx, ny, nz), (x, y, z) = grid.shape, (float(value) for value in grid.origin - grid.base)
-        launch(
+        ocl.launch(
             self.device, self._program["list_neighbours"],
             part.place_count if one_lane else -(-part.cell_count // BATCH_CELLS), mask=grid.mask_d, ranks=grid.ranks_d,
             starts=grid.starts_d, order=grid.order_d, **self.coordinates, neighbours=neighbours_d,
@@ -278,7 +266,9 @@ def check_pairs(grid: PointGrid, starts: NDArray[np.uint32], crowded: int = _CRO
     pairs = int((counts[cells] ** 2).sum())
     if pairs <= most:
         return
-    axes = [download(grid.device, np.empty(grid.n, np.float32), axis_d) for axis_d in (grid.x_d, grid.y_d, grid.z_d)]
+    axes = [
+        ocl.download(grid.device, np.empty(grid.n, np.float32), axis_d) for axis_d in (grid.x_d, grid.y_d, grid.z_d)
+    ]
     for cell in cells:
         rows = slice(int(starts[cell]), int(starts[cell + 1]))
         if all(np.ptp(axis[rows]) == 0.0 for axis in axes):
@@ -338,18 +328,21 @@ def find_neighbours(
     >>> near = clrecon.find_neighbours(cloud, k=8)  # doctest: +SKIP
     >>> spacing = np.median(near.distances[:, 1])  # doctest: +SKIP
     """
-    check_memory(memory)
+    ocl.check_memory(memory)
     places = take_points(points)
     k, warnings = check_neighbours(k, len(places))
 
-    for attempt in with_fallback(take_device(device)):
+    for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, notes):
             results = {"neighbours": 4 * k * len(places), "distances": 4 * k * len(places)}
             search = NeighbourSearch(current, places, k, results, memory, Stopwatch())
-            indices, indices_d = empty_output(current, (len(places), k), np.int32)
-            distances, distances_d = empty_output(current, (len(places), k), np.float32)
+            indices, indices_d = ocl.empty_output(current, (len(places), k), np.int32)
+            distances, distances_d = ocl.empty_output(current, (len(places), k), np.float32)
             for part in search.each_part("neighbours", progress or ignore_progress):
                 search.find(part, indices_d, distances_d)
-            indices, distances = download(current, indices, indices_d), download(current, distances, distances_d)
+            indices, distances = (
+                ocl.download(current, indices, indices_d),
+                ocl.download(current, distances, distances_d),
+            )
             neighbours = Neighbours(indices, distances, (*warnings, *notes))
     return neighbours

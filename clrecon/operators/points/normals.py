@@ -5,23 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
-from clrecon.opencl import (
-    Device,
-    Stopwatch,
-    allocate,
-    check_memory,
-    describe_shortage,
-    download,
-    empty_output,
-    kernel_number,
-    launch,
-    load_program,
-    take_device,
-    upload,
-    with_fallback,
-)
+from clrecon.opencl import Device, Stopwatch
 from clrecon.operators.points.neighbours import NeighbourSearch, Part, check_neighbours, take_points
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.resident.tables import voxel_variants
@@ -63,7 +50,7 @@ def find_gradients(
 
     planned = resident.plan(_GRADIENTS, nk, needs)
     if planned < 1:
-        raise DeviceMemoryError(f"no gradients can be found: {describe_shortage(resident.limits, needs(1))}")
+        raise DeviceMemoryError(f"no gradients can be found: {ocl.describe_shortage(resident.limits, needs(1))}")
     for attempt in resident.attempts(_GRADIENTS, planned, warnings):
         with attempt as slices:
             gradients = _all_slabs(resident, places, slices, stopwatch, progress)
@@ -76,11 +63,11 @@ def _all_slabs(
     device, volume = resident.device, resident.volume
     ni, nj, nk = volume.shape_ijk
     with stopwatch.timed("build"):
-        program = load_program(device, "points/gradients.cl", voxel_variants(resident.dtype))
+        program = ocl.load_program(device, "points/gradients.cl", voxel_variants(resident.dtype))
     origins = volume.slice_origins(1)
-    origins_d = upload(device, (origins - origins[0]).astype(np.float32))
-    places_d = upload(device, places)
-    gradients, gradients_d = empty_output(device, places.shape, np.float32)
+    origins_d = ocl.upload(device, (origins - origins[0]).astype(np.float32))
+    places_d = ocl.upload(device, places)
+    gradients, gradients_d = ocl.empty_output(device, places.shape, np.float32)
     for first in range(0, nk, slices):
         end = min(first + slices, nk)
         low, high = max(first - _BELOW, 0), min(end + ABOVE, nk)
@@ -89,7 +76,7 @@ def _all_slabs(
         else:
             voxels_d = resident.part(low, high, stopwatch)
         with stopwatch.running(device):
-            launch(
+            ocl.launch(
                 device, program["find_gradients"], len(places),
                 voxels=voxels_d, places=places_d, origins=origins_d, gradients=gradients_d, ni=ni, nj=nj, nk=nk,
                 first_k=low, own_first=first, own_end=end, step_i=(*volume.affine[:3, 0], 0.0),
@@ -97,7 +84,7 @@ def _all_slabs(
             )  # fmt: skip
         volume.release_slices(low, high)
         progress("gradients", end, nk)
-    return download(device, gradients, gradients_d)
+    return ocl.download(device, gradients, gradients_d)
 
 
 FEWEST_NEIGHBOURS = 3
@@ -107,9 +94,9 @@ _DOUBTFUL_SHARE = 0.1
 """Share of doubtful normals above which there is a warning.  Shells of bone have 0.04 where voxels are nearly cubes,
 and 0.22 and 0.38 with gaps between slices of 4.25 and 7 mm."""
 
-_HOW = {how: int(kernel_number("points/normals.cl", f"ORIENT_{how}")) for how in ("NOT", "DOWN", "AWAY")}
+_HOW = {how: int(ocl.kernel_number("points/normals.cl", f"ORIENT_{how}")) for how in ("NOT", "DOWN", "AWAY")}
 _STATES = {
-    state: int(kernel_number("points/normals.cl", f"STATE_{state}"))
+    state: int(ocl.kernel_number("points/normals.cl", f"STATE_{state}"))
     for state in ("SURE", "DOUBTFUL", "UNORIENTED", "NO_PLANE")
 }
 
@@ -121,10 +108,10 @@ class PlaneFits:
         self._search, self._stopwatch = search, stopwatch
         device = search.device
         with stopwatch.timed("build"):
-            self.program = load_program(device, "points/normals.cl", {"LANES": device.kernel_variants["LANES"]})
+            self.program = ocl.load_program(device, "points/normals.cl", {"LANES": device.kernel_variants["LANES"]})
         most = search.most_places
-        self.neighbours_d = allocate(device, 4 * search.k * most)
-        self.normals_d, self.variations_d = allocate(device, 12 * most), allocate(device, 4 * most)
+        self.neighbours_d = ocl.allocate(device, 4 * search.k * most)
+        self.normals_d, self.variations_d = ocl.allocate(device, 12 * most), ocl.allocate(device, 4 * most)
 
     @staticmethod
     def needs(points: int) -> dict[str, int]:
@@ -135,7 +122,7 @@ class PlaneFits:
         search = self._search
         search.find(part, self.neighbours_d)
         lanes = int(search.device.kernel_variants["LANES"])
-        launch(
+        ocl.launch(
             search.device, self.program["fit_planes"], -(-part.place_count // lanes),
             **search.coordinates, neighbours=self.neighbours_d, normals=self.normals_d, variations=self.variations_d,
             first_place=part.first_place, place_count=part.place_count, k=search.k,
@@ -195,7 +182,7 @@ def estimate_normals(
     DeviceError
         The device fails.
     """
-    check_memory(memory)
+    ocl.check_memory(memory)
     points = take_points(cloud)
     k, warnings = check_neighbours(k, len(points), FEWEST_NEIGHBOURS)
     if volume is not None and viewpoint is not None:
@@ -203,7 +190,7 @@ def estimate_normals(
     eye = None if viewpoint is None else _check_viewpoint(viewpoint)
     tell = progress or ignore_progress
     if volume is None:
-        for attempt in with_fallback(take_device(device)):
+        for attempt in ocl.with_fallback(ocl.take_device(device)):
             with attempt as (current, notes):
                 step = _Run(cloud, k, current, memory, [*warnings, *notes], tell).step(eye)
         return step
@@ -246,22 +233,22 @@ class _Run:
         results = {"normals": 13 * n, "gradients": 0 if gradients is None else 12 * n}
         search = NeighbourSearch(device, points, self.k, {**PlaneFits.needs(n), **results}, self.memory, stopwatch)
         fits = PlaneFits(search, stopwatch)
-        normals, normals_d = empty_output(device, (n, 3), np.float32)
-        states, states_d = empty_output(device, (n,), np.uint8)
+        normals, normals_d = ocl.empty_output(device, (n, 3), np.float32)
+        states, states_d = ocl.empty_output(device, (n,), np.uint8)
         how, seen_from = ("AWAY", viewpoint - search.grid.base) if viewpoint is not None else ("NOT", np.zeros(3))
         gradients_d = normals_d
         if gradients is not None:
-            how, gradients_d = "DOWN", upload(device, gradients)
+            how, gradients_d = "DOWN", ocl.upload(device, gradients)
         for part in search.each_part("normals", self.progress):
             fits.fit(part)
-            launch(
+            ocl.launch(
                 device, fits.program["orient_normals"], part.place_count, **search.coordinates,
                 order=search.grid.order_d, normals=fits.normals_d, gradients=gradients_d, oriented=normals_d,
                 states=states_d, viewpoint=(*seen_from, 0.0), how=_HOW[how], first_place=part.first_place,
                 place_count=part.place_count,
             )  # fmt: skip
         with stopwatch.timed("download"):
-            normals, states = download(device, normals, normals_d), download(device, states, states_d)
+            normals, states = ocl.download(device, normals, normals_d), ocl.download(device, states, states_d)
         return self._describe(normals, states, how)
 
     def _describe(self, normals: NDArray[np.float32], states: NDArray[np.uint8], how: str) -> PointStep:

@@ -9,24 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.anatomy.head import warn_of_face
 from clrecon.anatomy.iso_choice import settle_level
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import data_range
 from clrecon.geometry.vertices import find_vertex_origin, warnings_of_far
-from clrecon.opencl import (
-    Device,
-    Program,
-    Stopwatch,
-    allocate,
-    download_all,
-    empty_output,
-    launch,
-    load_program,
-    result_pages,
-    upload,
-)
+from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.masks.voxel_mask import band_bounds, checked_band, prepare_classify
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
@@ -76,7 +66,7 @@ def prepare_voxels(device: Device, dtype: DTypeLike, labels: DTypeLike | None = 
     prepare_scan(device)
     prepare_classify(device, dtype, "between")
     variants = {} if labels is None else label_variants(labels)
-    return load_program(device, "points/emit.cl", {**voxel_variants(dtype), **device.kernel_variants, **variants})
+    return ocl.load_program(device, "points/emit.cl", {**voxel_variants(dtype), **device.kernel_variants, **variants})
 
 
 @dataclass
@@ -183,23 +173,23 @@ class VoxelEmission:
             mask_d, extents_d, marked = self._mark(voxels_d, begin, stop, layout)
             counts_d, total = self._count(mask_d, extents_d, layout)
         self._check_output(end - first, total)
-        positions, positions_d = empty_output(device, (total, 3), np.float32)
-        hu, hu_d = empty_output(device, (total,), np.float32)
-        numbers, numbers_d = empty_output(device, (total,), np.uint32)
+        positions, positions_d = ocl.empty_output(device, (total, 3), np.float32)
+        hu, hu_d = ocl.empty_output(device, (total,), np.float32)
+        numbers, numbers_d = ocl.empty_output(device, (total,), np.uint32)
         is_small = self.volume.voxels.size <= _MOST_NUMBERS
         if total:
             program = prepare_voxels(device, self.volume.voxels.dtype)
             words_per_item = words if device.kernel_variants["LANES"] == "8" else 1
             with stopwatch.running(device):
-                launch(
+                ocl.launch(
                     device, program["emit_points"], rows * -(-words // words_per_item), mask=mask_d,
                     row_extents=extents_d, offsets=counts_d, voxels=voxels_d,
-                    origins=upload(device, self._origins[first:end]), steps=upload(device, self._steps),
+                    origins=ocl.upload(device, self._origins[first:end]), steps=ocl.upload(device, self._steps),
                     positions=positions_d, hu=hu_d, numbers=numbers_d, first_number=first * nj * ni if is_small else 0,
                     ni=ni, nj=nj, words_per_item=words_per_item, **layout,
                 )  # fmt: skip
             with stopwatch.timed("download"):
-                download_all(device, (positions, positions_d, 0), (hu, hu_d, 0), (numbers, numbers_d, 0))
+                ocl.download_all(device, (positions, positions_d, 0), (hu, hu_d, 0), (numbers, numbers_d, 0))
         self.volume.release_slices(begin, stop)
         return (positions, hu, numbers if is_small else numbers + np.int64(first * nj * ni)), marked or total
 
@@ -209,8 +199,8 @@ class VoxelEmission:
         ni, nj, nk = self.volume.shape_ijk
         chosen, words = self.selection, layout["words"]
         rows = (stop - begin) * nj
-        mask_d, extents_d = allocate(device, 4 * rows * words), allocate(device, 4 * rows)
-        launch(
+        mask_d, extents_d = ocl.allocate(device, 4 * rows * words), ocl.allocate(device, 4 * rows)
+        ocl.launch(
             device, prepare_classify(device, self.volume.voxels.dtype, "between")["classify_samples"], rows,
             voxels=voxels_d, mask=mask_d, row_extents=extents_d, level=chosen.low, highest=chosen.high, ni=ni, nj=nj,
             nk=nk, border=0, first_slice=begin, first_sample_slice=begin, gk=stop - begin, words=words,
@@ -222,13 +212,13 @@ class VoxelEmission:
             device, self.volume.voxels.dtype, None if chosen.labels is None else chosen.labels.dtype
         )
         if chosen.labels is not None:
-            launch(
+            ocl.launch(
                 device, program["restrict_mask"], rows, mask=mask_d, row_extents=extents_d,
-                labels=upload(device, chosen.labels[begin:stop]), label=chosen.label, ni=ni, words=words, rows=rows,
+                labels=ocl.upload(device, chosen.labels[begin:stop]), label=chosen.label, ni=ni, words=words, rows=rows,
             )  # fmt: skip
         if chosen.shell:
-            shell_d = allocate(device, 4 * rows * words)
-            launch(
+            shell_d = ocl.allocate(device, 4 * rows * words)
+            ocl.launch(
                 device, program["find_shell"], rows,
                 mask=mask_d, row_extents=extents_d, shell=shell_d, nj=nj, words=words, slices=stop - begin,
             )  # fmt: skip
@@ -240,8 +230,8 @@ class VoxelEmission:
         device, _stopwatch = self.resident.device, self.stopwatch
         program = prepare_voxels(device, self.volume.voxels.dtype)
         rows = layout["rows"]
-        counts_d = allocate(device, 4 * rows)
-        launch(device, program["count_points"], rows, mask=mask_d, row_extents=extents_d, counts=counts_d, **layout)
+        counts_d = ocl.allocate(device, 4 * rows)
+        ocl.launch(device, program["count_points"], rows, mask=mask_d, row_extents=extents_d, counts=counts_d, **layout)
         scanned = exclusive_scan(device, counts_d, rows, in_place=True)
         if scanned.total > MOST_POINTS:
             raise DeviceMemoryError(f"a slab has {scanned.total:,} points: more than {MOST_POINTS:,}")
@@ -274,7 +264,7 @@ def _join_points(parts: list[Points]) -> Points:
     if len(parts) == 1:
         return parts[0]
     rows = sum(len(part[1]) for part in parts)
-    joined = tuple(result_pages.empty((rows, *array.shape[1:]), array.dtype) for array in parts[0])
+    joined = tuple(ocl.result_pages.empty((rows, *array.shape[1:]), array.dtype) for array in parts[0])
     filled = 0
     while parts:
         part = parts.pop(0)

@@ -10,23 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import UsageError
-from clrecon.opencl import (
-    Device,
-    Program,
-    Stopwatch,
-    allocate,
-    check_memory,
-    download,
-    empty_output,
-    launch,
-    load_program,
-    memory_limits,
-    require_room,
-    take_device,
-    upload,
-    with_fallback,
-)
+from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.points.grid import GridPlan, PointGrid, fill_grid, plan_grid
 from clrecon.operators.points.neighbours import find_neighbours
 from clrecon.operators.primitives.union_find import hook_in_rounds
@@ -42,15 +28,15 @@ REASON = "thinned"
 def choose_points(device: Device, plan: GridPlan, *, memory: int | None = None) -> NDArray[np.uint32]:
     """Return the number of the point nearest to the mean of each cell with points, in the order of the cells."""
     needs = {**plan.needs(device), "chosen points": 4 * len(plan.points)}
-    require_room(memory_limits(device, memory), needs, "the cloud cannot be thinned")
+    ocl.require_room(ocl.memory_limits(device, memory), needs, "the cloud cannot be thinned")
     grid = fill_grid(device, plan, memory=memory)
-    chosen, chosen_d = empty_output(device, (grid.cells,), np.uint32)
-    program = load_program(device, "points/thin.cl")
-    launch(
+    chosen, chosen_d = ocl.empty_output(device, (grid.cells,), np.uint32)
+    program = ocl.load_program(device, "points/thin.cl")
+    ocl.launch(
         device, program["choose_points"], grid.cells, x=grid.x_d, y=grid.y_d, z=grid.z_d, starts=grid.starts_d,
         order=grid.order_d, chosen=chosen_d, cells=grid.cells,
     )  # fmt: skip
-    return download(device, chosen, chosen_d)
+    return ocl.download(device, chosen, chosen_d)
 
 
 @explains_arguments
@@ -89,7 +75,7 @@ def thin_points(
     DeviceError
         No device, no room for the points, or the device fails.
     """
-    check_memory(memory)
+    ocl.check_memory(memory)
     source = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
     if not len(source):
         raise UsageError("the cloud is empty: there is nothing to thin")
@@ -97,7 +83,7 @@ def thin_points(
         raise UsageError(f"{name_parameter('spacing', spacing)}: a positive length in mm is needed")
     plan, tell = plan_grid(source.points, float(spacing)), progress or ignore_progress
 
-    for attempt in with_fallback(take_device(device)):
+    for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, notes):
             stopwatch = Stopwatch()
             tell("thin", 0, 1)
@@ -150,36 +136,38 @@ def grow_cells(
 ) -> _Grown:
     """Find the cells that stay; parameters are those of `remove_sparse_cells`."""
     needs = {**plan.needs(device), "labels of cells": 9 * len(plan.points), "marks of points": len(plan.points)}
-    require_room(memory_limits(device, memory), needs, "sparse cells cannot be found")
-    program = load_program(device, "points/sparse_cells.cl")
+    ocl.require_room(ocl.memory_limits(device, memory), needs, "sparse cells cannot be found")
+    program = ocl.load_program(device, "points/sparse_cells.cl")
     grid = fill_grid(device, plan, memory=memory)
     labels = _label_cells(device, program, grid, fewest)
-    starts = download(device, np.empty(grid.cells + 1, np.uint32), grid.starts_d).astype(np.int64)
+    starts = ocl.download(device, np.empty(grid.cells + 1, np.uint32), grid.starts_d).astype(np.int64)
     counts = starts[1:] - starts[:-1]
     kinds, facts = _judge_cells(labels, counts, threshold, largest)
-    removed, removed_d = empty_output(device, (grid.n,), np.uint8)
-    launch(
+    removed, removed_d = ocl.empty_output(device, (grid.n,), np.uint8)
+    ocl.launch(
         device, program["mark_places"], grid.cells,
-        starts=grid.starts_d, order=grid.order_d, kinds=upload(device, kinds), marks=removed_d, cells=grid.cells,
+        starts=grid.starts_d, order=grid.order_d, kinds=ocl.upload(device, kinds), marks=removed_d, cells=grid.cells,
     )  # fmt: skip
-    return _Grown(download(device, removed, removed_d), facts)
+    return _Grown(ocl.download(device, removed, removed_d), facts)
 
 
 def _label_cells(device: Device, program: Program, grid: PointGrid, fewest: int) -> NDArray[np.uint32]:
     """Return the first cell of the component of each cell, `SPARSE` for sparse ones."""
     cells, (nx, ny, nz) = grid.cells, grid.shape
-    labels_d, other_d = allocate(device, 4 * cells), allocate(device, 4 * cells)
-    launch(device, program["label_crowded"], cells, starts=grid.starts_d, labels=labels_d, cells=cells, fewest=fewest)
+    labels_d, other_d = ocl.allocate(device, 4 * cells), ocl.allocate(device, 4 * cells)
+    ocl.launch(
+        device, program["label_crowded"], cells, starts=grid.starts_d, labels=labels_d, cells=cells, fewest=fewest
+    )
 
     def hook(roots_d: Any, hooked_d: Any, flags_d: Any, number: int) -> None:
-        launch(
+        ocl.launch(
             device, program["hook_touching"], cells, x=grid.x_d, y=grid.y_d, z=grid.z_d, starts=grid.starts_d,
             mask=grid.mask_d, ranks=grid.ranks_d, labels=roots_d, hooked=hooked_d, flags=flags_d,
             origin=grid.origin_and_scale, nx=nx, ny=ny, nz=nz, words=grid.words, cells=cells, pass_number=number,
         )  # fmt: skip
 
     roots_d = hook_in_rounds(device, labels_d, other_d, cells, hook)[0]
-    return download(device, np.empty(cells, np.uint32), roots_d)
+    return ocl.download(device, np.empty(cells, np.uint32), roots_d)
 
 
 def _judge_cells(
@@ -256,15 +244,15 @@ def remove_sparse_cells(
     ----------
     Liu et al. 2019, section 2.2.
     """
-    check_memory(memory)
+    ocl.check_memory(memory)
     source = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
     _check_input(source, edge, fewest, threshold)
-    tell, chosen_device = progress or ignore_progress, take_device(device)
+    tell, chosen_device = progress or ignore_progress, ocl.take_device(device)
     length = choose_edge(source, device=chosen_device, memory=memory) if edge is None else float(edge)
     tell("cells", 1, 2)
     plan = plan_grid(source.points, length)
 
-    for attempt in with_fallback(chosen_device):
+    for attempt in ocl.with_fallback(chosen_device):
         with attempt as (current, notes):
             stopwatch = Stopwatch()
             with stopwatch.running(current):

@@ -7,18 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import UsageError
-from clrecon.opencl import (
-    Device,
-    allocate,
-    download,
-    empty_output,
-    launcher,
-    load_program,
-    memory_limits,
-    require_room,
-    upload,
-)
+from clrecon.opencl import Device
 from clrecon.operators.masks.runs import PARTS_PER_CORE, StencilTable, count_runs, join_runs, list_runs
 from clrecon.operators.masks.voxel_mask import VoxelMask
 from clrecon.points.stencil import Stencil
@@ -76,7 +67,7 @@ class ClusterSearch:
         parts_per_core: int = PARTS_PER_CORE,
     ):
         self.device, self._mask = device, mask
-        self._limits = memory_limits(device, memory)
+        self._limits = ocl.memory_limits(device, memory)
         self._parts = parts_per_core
         self._samples = checked_min_samples(min_samples)
         self._stencil = stencil
@@ -87,12 +78,12 @@ class ClusterSearch:
         self._needs = search_bytes(mask.needs(), stencil, mask.rows)
         self.device_bytes = 0
         self._check_budget({})
-        program = load_program(device, "points/voxel_clusters.cl", {"LANES": device.kernel_variants["LANES"]})
-        self._run = launcher(device, program)
+        program = ocl.load_program(device, "points/voxel_clusters.cl", {"LANES": device.kernel_variants["LANES"]})
+        self._run = ocl.launcher(device, program)
         self._full, self._forward = StencilTable.of(device, stencil), StencilTable.of(device, stencil.forward())
         self._cores_d = mask.mask_d if self._samples == 1 or self._is_one else self._find_cores()
         self._count()
-        self.count, self.numbers_d = self._join() if self.runs else (0, allocate(device, 4))
+        self.count, self.numbers_d = self._join() if self.runs else (0, ocl.allocate(device, 4))
 
     @property
     def _is_cpu(self) -> bool:
@@ -118,14 +109,14 @@ class ClusterSearch:
 
     def _check_budget(self, more: dict[str, int]) -> None:
         needs = {**self._needs, **more}
-        require_room(self._limits, needs, "the clusters of the voxels cannot be found")
+        ocl.require_room(self._limits, needs, "the clusters of the voxels cannot be found")
         self.device_bytes = max(self.device_bytes, sum(needs.values()))
 
     def _find_cores(self) -> Any:
         mask = self._mask
         item_words = mask.words if self._is_cpu else 1
         planes = (self._samples - 1).bit_length()
-        cores_d = allocate(self.device, 4 * mask.words * mask.rows)
+        cores_d = ocl.allocate(self.device, 4 * mask.words * mask.rows)
         self._run(
             "find_cores", mask.rows * -(-mask.words // item_words), mask=mask.mask_d, row_extents=mask.row_extents_d,
             cores=cores_d, words=mask.words, item_words=item_words, planes=planes,
@@ -140,7 +131,7 @@ class ClusterSearch:
         self.runs, self.points = counted.count, counted.voxels
         if self._is_one and self.points < self._samples:
             nothing = np.zeros(self._mask.rows * self._mask.words, np.uint32)
-            self._cores_d, self.runs = upload(self.device, nothing), 0
+            self._cores_d, self.runs = ocl.upload(self.device, nothing), 0
         self._needs |= {"runs of core voxels": 16 * self.runs, "labels": 4 * self.points}
         self._check_budget({})
 
@@ -149,7 +140,7 @@ class ClusterSearch:
         listed = list_runs(device, self._mask, self._cores_d, self._counted)
         self._runs_d = listed.runs_d
         if self._is_one:
-            return 1, upload(device, np.zeros(runs, np.int32))
+            return 1, ocl.upload(device, np.zeros(runs, np.int32))
         return join_runs(
             device, listed, self._mask.shape_ijk, self._forward,
             check=lambda links: self._check_budget({"pairs of runs": 12 * links, "roots": 5 * runs}),
@@ -158,30 +149,30 @@ class ClusterSearch:
 
     def label(self, numbers: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
         """Return the cluster of each point, or its `numbers` (runs,), order k, j, i, -1 for noise: (points,) int32."""
-        labels, labels_d = empty_output(self.device, (self.points,), np.int32)
+        labels, labels_d = ocl.empty_output(self.device, (self.points,), np.int32)
         if not self.runs:
             labels.fill(-1)
             return labels
-        numbers_d = self.numbers_d if numbers is None else upload(self.device, numbers)
+        numbers_d = self.numbers_d if numbers is None else ocl.upload(self.device, numbers)
         self._run(
             "label_points", self._mask.rows, mask=self._mask.mask_d, cores=self._cores_d,
             row_extents=self._mask.row_extents_d, runs=self._runs_d, row_counts=self._row_counts_d,
             numbers=numbers_d, labels=labels_d, words=self._mask.words,
             **self._full.arguments, **self._slices,
         )  # fmt: skip
-        return download(self.device, labels, labels_d)
+        return ocl.download(self.device, labels, labels_d)
 
     def run_numbers(self) -> NDArray[np.int32]:
         """Return the cluster of each run, shape (runs,), int32."""
-        return download(self.device, np.empty(self.runs, np.int32), self.numbers_d)
+        return ocl.download(self.device, np.empty(self.runs, np.int32), self.numbers_d)
 
     def flag_cores(self) -> NDArray[np.bool_]:
         """Return whether each point is a core point, in the order k, j, i, shape (points,), bool."""
-        flags, flags_d = empty_output(self.device, (self.points,), np.uint8)
+        flags, flags_d = ocl.empty_output(self.device, (self.points,), np.uint8)
         if self.points:
             self._run(
                 "flag_cores", self._mask.rows, mask=self._mask.mask_d, cores=self._cores_d,
                 row_extents=self._mask.row_extents_d, row_counts=self._row_counts_d, flags=flags_d, **self._rows,
             )  # fmt: skip
-            download(self.device, flags, flags_d)
+            ocl.download(self.device, flags, flags_d)
         return flags.view(np.bool_)

@@ -8,18 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import DeviceError, UsageError
-from clrecon.opencl import (
-    Device,
-    Program,
-    allocate,
-    download,
-    launcher,
-    load_program,
-    memory_limits,
-    require_room,
-    upload,
-)
+from clrecon.opencl import Device, Program
 from clrecon.operators.primitives.scan import LARGEST_SCAN, Compacted, compact, exclusive_scan, prepare_compact
 
 _LARGEST_MESH = 2**32 - 1
@@ -32,7 +23,7 @@ _MOST_PASSES = 1000
 def prepare_components(device: Device) -> Program:
     """Build the kernels now, so that a later `label_components` does not wait for them."""
     prepare_compact(device)
-    return load_program(device, "primitives/union_find.cl")
+    return ocl.load_program(device, "primitives/union_find.cl")
 
 
 def label_components(
@@ -49,7 +40,7 @@ def label_components(
         return 0, np.full(vertex_count, -1, dtype=np.int64)
     search = _Search(device, faces, vertex_count, memory)
     count, numbers_d = search.number(*search.find_roots(), vertex_count)
-    numbers = download(device, np.empty(vertex_count, dtype=np.int32), numbers_d)
+    numbers = ocl.download(device, np.empty(vertex_count, dtype=np.int32), numbers_d)
     return count, numbers.astype(np.int64)
 
 
@@ -102,21 +93,21 @@ class _Rounds:
 
     def __init__(self, device: Device, labels_d: Any, other_d: Any, nodes: int):
         self._device = device
-        self.run = launcher(device, prepare_components(device))
+        self.run = ocl.launcher(device, prepare_components(device))
         self._labels_d, self._other_d = labels_d, other_d
         self._nodes = nodes
-        self._flags_d = allocate(device, 8)
+        self._flags_d = ocl.allocate(device, 8)
         self._roots: Compacted | None = None
         self._passes = 0
 
     def start(self) -> None:
-        self.run("clear_labels", 1, labels=allocate(self._device, 4), flags=self._flags_d, n=1)
+        self.run("clear_labels", 1, labels=ocl.allocate(self._device, 4), flags=self._flags_d, n=1)
 
     def number(self, labels_d: Any, spare_d: Any, n: int) -> tuple[int, Any]:
         """Number the components by their roots: their count, and a buffer, (n,) int32."""
         self.run("flag_roots", n, labels=labels_d, roots=spare_d, n=n)
         roots = exclusive_scan(self._device, spare_d, n)
-        numbers_d = allocate(self._device, 4 * n)
+        numbers_d = ocl.allocate(self._device, 4 * n)
         self.run("number_components", n, labels=labels_d, offsets=roots.offsets_d, numbers=numbers_d, n=n)
         return roots.total, numbers_d
 
@@ -179,30 +170,30 @@ class _Rounds:
         return self._passes
 
     def _read_flags(self) -> NDArray[np.uint32]:
-        return download(self._device, np.empty(2, dtype=np.uint32), self._flags_d)
+        return ocl.download(self._device, np.empty(2, dtype=np.uint32), self._flags_d)
 
     def list_marked(self, kernel: str, size: int, **inputs: Any) -> Compacted:
         """List the elements that a kernel marks in a bit mask of `size` bits."""
         words = -(-size // 32)
-        mask_d = allocate(self._device, 4 * words)
+        mask_d = ocl.allocate(self._device, 4 * words)
         self.run(kernel, words, mask=mask_d, **inputs)
         return compact(self._device, mask_d, words)
 
 
 class _Search(_Rounds):
     def __init__(self, device: Device, triangles: NDArray[np.uint32], vertex_count: int, memory: int | None):
-        self._limits = memory_limits(device, memory)
+        self._limits = ocl.memory_limits(device, memory)
         self._faces, self._vertices = len(triangles), vertex_count
         labels = 4 * vertex_count
         self._buffers = {"triangles": triangles.nbytes, "labels": labels, "labels of the round before": labels}
         self._check_budget({"mixed triangles": 4 * self._faces, "roots of the first round": labels})
         self._check_budget({"component offsets": labels, "component numbers": labels})
         prepare_components(device)
-        self._faces_d = upload(device, triangles)
-        super().__init__(device, allocate(device, labels), allocate(device, labels), vertex_count)
+        self._faces_d = ocl.upload(device, triangles)
+        super().__init__(device, ocl.allocate(device, labels), ocl.allocate(device, labels), vertex_count)
 
     def _check_budget(self, more: dict[str, int]) -> None:
-        require_room(self._limits, {**self._buffers, **more}, "the components of the mesh cannot be found")
+        ocl.require_room(self._limits, {**self._buffers, **more}, "the components of the mesh cannot be found")
 
     def find_roots(self) -> tuple[Any, Any]:
         """Run all rounds; return labels whose labels are all roots, and a free buffer, both (n,) uint32."""
@@ -213,7 +204,7 @@ class _Search(_Rounds):
         mixed = self.list_marked("mark_mixed", self._faces, triangles=self._faces_d, labels=labels_d, m=self._faces)
         if mixed.count:
             self._check_budget({"roots of mixed triangles": 16 * mixed.count})
-            corners_d = allocate(self._device, 12 * mixed.count)
+            corners_d = ocl.allocate(self._device, 12 * mixed.count)
             self.run(
                 "gather_roots", mixed.count,
                 triangles=self._faces_d, mixed=mixed.positions_d, labels=labels_d, corners=corners_d,

@@ -9,26 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
-from clrecon.opencl import (
-    Device,
-    Stopwatch,
-    allocate,
-    check_budget,
-    check_memory,
-    download_all,
-    empty_output,
-    kernel_constant,
-    kernel_number,
-    launch,
-    load_program,
-    memory_limits,
-    settle,
-    upload,
-    with_fallback,
-)
+from clrecon.opencl import Device, Stopwatch
 from clrecon.operators.rays.picture_buffers import Shot, highlight_table
 from clrecon.operators.resident.device_volume import DeviceWorker
 from clrecon.points import PointCloud
@@ -42,10 +27,10 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 
-LARGEST_DISC = kernel_number("rays/splats.cl", "MOST_PIXELS")
+LARGEST_DISC = ocl.kernel_number("rays/splats.cl", "MOST_PIXELS")
 """Largest radius of a disc in pixels."""
 
-SMALLEST_DISC = kernel_number("rays/splats.cl", "LEAST_PIXELS")
+SMALLEST_DISC = ocl.kernel_number("rays/splats.cl", "LEAST_PIXELS")
 
 _PIXELS_A_LAUNCH = 1 << 27
 """Pixels of all discs of a launch: a fraction of a second, so that graphics drivers do not take it for a hang."""
@@ -57,7 +42,7 @@ FEWEST_POINTS = 1 << 16
 """Points that a part is not made smaller than for want of memory."""
 
 _SHADINGS = {
-    name: kernel_constant("rays/splats.cl", macro)
+    name: ocl.kernel_constant("rays/splats.cl", macro)
     for name, macro in {"none": "UNSHADED_POINTS", "normals": "SHADED_BY_NORMALS", "depths": "SHADED_BY_DEPTHS"}.items()
 }
 
@@ -98,7 +83,7 @@ def draw_splats(
         try:
             return job.draw(points, colors, normals, count, stopwatch)
         except DeviceMemoryError as error:
-            settle(device, error)
+            ocl.settle(device, error)
             if count <= FEWEST_POINTS:
                 raise
             count = max(FEWEST_POINTS, count // 2)
@@ -138,10 +123,10 @@ class _Splats:
                 f" pixels, at most {MOST_PIXELS:.1e} are drawn: take a smaller radius, or zoom less"
             )
         picture = {"picture": 16 * width * height}
-        room = memory_limits(self.device, memory)
+        room = ocl.memory_limits(self.device, memory)
         free = min(room.total_bytes - picture["picture"], 2 * room.buffer_bytes) // self._point_bytes
         count = max(1, min(points, int(_PIXELS_A_LAUNCH / area), max(free, FEWEST_POINTS)))
-        check_budget(self.device, {**picture, "points": self._point_bytes * min(count, FEWEST_POINTS)}, memory)
+        ocl.check_budget(self.device, {**picture, "points": self._point_bytes * min(count, FEWEST_POINTS)}, memory)
         return count
 
     @property
@@ -157,12 +142,12 @@ class _Splats:
         stopwatch: Stopwatch,
     ) -> SplatPicture:
         device, (width, height) = self.device, self.size
-        program = load_program(device, "rays/splats.cl")
+        program = ocl.load_program(device, "rays/splats.cl")
         pixels, n = width * height, len(points)
-        image, image_d = empty_output(device, (height, width, 4), np.uint8)
-        depth, depths_d = empty_output(device, (height, width), np.float32)
-        keys_d, numbers_d = allocate(device, 4 * pixels), allocate(device, 4 * pixels)
-        view_d, lights_d = upload(device, self.table), upload(device, highlight_table(self.lighting))
+        image, image_d = ocl.empty_output(device, (height, width, 4), np.uint8)
+        depth, depths_d = ocl.empty_output(device, (height, width), np.float32)
+        keys_d, numbers_d = ocl.allocate(device, 4 * pixels), ocl.allocate(device, 4 * pixels)
+        view_d, lights_d = ocl.upload(device, self.table), ocl.upload(device, highlight_table(self.lighting))
         starts, whole_d = range(0, max(n, 1), max(count, 1)), None
         picture: dict[str, Any] = {"view": view_d, "width": width, "height": height}
 
@@ -178,13 +163,13 @@ class _Splats:
 
         tell_done(0)
         with stopwatch.running(device):
-            launch(device, program["clear_splats"], pixels, keys=keys_d, numbers=numbers_d, pixels=pixels)
+            ocl.launch(device, program["clear_splats"], pixels, keys=keys_d, numbers=numbers_d, pixels=pixels)
         for number, kernel in enumerate(("splat_depths", "splat_numbers")):
             for first in starts:
                 piece, points_d = min(count, n - first), hold(first)
                 more = {"numbers": numbers_d, "first": first} if number else {}
                 with stopwatch.running(device):  # wait: CPU devices read the host's arrays
-                    launch(
+                    ocl.launch(
                         device, program[kernel], max(piece, 1),
                         points=points_d, keys=keys_d, radius=self.radius, count=piece, **more, **picture,
                     )  # fmt: skip
@@ -199,7 +184,7 @@ class _Splats:
                 _upload(device, colors[first : first + piece], stopwatch),
             )
             with stopwatch.running(device):
-                launch(
+                ocl.launch(
                     device, program["shade_splats"], pixels, keys=keys_d, numbers=numbers_d, normals=normals_d,
                     colors=colors_d, highlights=lights_d, image=image_d, depths=depths_d, background=self.background,
                     shading=_SHADINGS[self.shading], apart=self.apart, first=first, count=piece, **picture,
@@ -207,7 +192,7 @@ class _Splats:
             del normals_d, colors_d
             tell_done(2 * n + first + piece)
         with stopwatch.timed("download"):
-            download_all(device, (image, image_d, 0), (depth, depths_d, 0))
+            ocl.download_all(device, (image, image_d, 0), (depth, depths_d, 0))
         return SplatPicture(image, depth, self.shading, len(starts))
 
     @property
@@ -218,7 +203,7 @@ class _Splats:
 
 def _upload(device: Device, array: NDArray[Any], stopwatch: Stopwatch) -> Any:
     with stopwatch.timed("upload"):
-        return upload(device, array if array.size else np.zeros(4, array.dtype))  # OpenCL has no empty buffers
+        return ocl.upload(device, array if array.size else np.zeros(4, array.dtype))  # OpenCL has no empty buffers
 
 
 def eye_table(camera: Camera, size: tuple[int, int], lighting: Lighting, base: Float64Array) -> NDArray[np.float32]:
@@ -280,7 +265,7 @@ class PointPictures(DeviceWorker):
     """
 
     def __init__(self, cloud: PointCloud, *, device: Device | str | int | None = None, memory: int | None = None):
-        check_memory(memory)
+        ocl.check_memory(memory)
         self.box = cloud_box(cloud)
         self.cloud = cloud
         super().__init__(device, memory)
@@ -316,7 +301,7 @@ class PointPictures(DeviceWorker):
             points, table = points[is_inside], table[is_inside]
             normals = None if normals is None else normals[is_inside]
         stopwatch, shot = Stopwatch(), Shot(camera, size, background, progress or ignore_progress)
-        for attempt in with_fallback(self._device):
+        for attempt in ocl.with_fallback(self._device):
             with attempt as (device, notes):
                 splats = draw_splats(
                     device, points, table, normals, shot, radius, base=self._base, lighting=style.light,

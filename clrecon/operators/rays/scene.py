@@ -13,26 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
 from clrecon.mesh import Mesh
-from clrecon.opencl import (
-    Device,
-    Stopwatch,
-    allocate,
-    check_budget,
-    check_memory,
-    download,
-    download_all,
-    empty_output,
-    kernel_constant,
-    launch,
-    load_program,
-    upload,
-    with_fallback,
-)
+from clrecon.opencl import Device, Stopwatch
 from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.operators.rays.mesh_pictures import (
     MOST_TRIANGLES,
@@ -58,7 +45,7 @@ from clrecon.system.progress import Progress, ignore_progress
 LAYERS = 16
 """Most layers of a picture."""
 
-COUNTED = kernel_constant("rays/layers.cl", "COUNTED")
+COUNTED = ocl.kernel_constant("rays/layers.cl", "COUNTED")
 
 PIXEL_BYTES = 16 + 20 + 48 + 12 + 8 + 4
 """Bytes a pixel: keys, a layer, states and marks, the picture, the still, the depth of the layer before."""
@@ -103,7 +90,7 @@ def draw_layers(
     """
     pixels = math.prod(shot.size)
     needs = {"picture": PIXEL_BYTES * pixels, "triangles": sum(part.device_bytes for part in parts)}
-    check_budget(device, needs, memory)
+    ocl.check_budget(device, needs, memory)
     return _Layers(device, parts, shot, still, near_mm, stopwatch or Stopwatch()).run(volume, most)
 
 
@@ -124,12 +111,12 @@ class _Layers:
         self.stopwatch, self.near_mm = stopwatch, near_mm
         self.has_still = still is not None
         self.pixels = size[0] * size[1]
-        self.program = load_program(device, "rays/layers.cl")
-        self.view_d = upload(device, eye_table(camera, size, Lighting(), np.zeros(3)))
+        self.program = ocl.load_program(device, "rays/layers.cl")
+        self.view_d = ocl.upload(device, eye_table(camera, size, Lighting(), np.zeros(3)))
         shown = Still(np.zeros((1, 1, 4), np.uint8), np.zeros((1, 1), np.float32)) if still is None else still
         with stopwatch.timed("upload"):
-            self.still_d = upload(device, np.ascontiguousarray(shown.image))
-            self.still_depths_d = upload(device, np.ascontiguousarray(shown.depth, np.float32))
+            self.still_d = ocl.upload(device, np.ascontiguousarray(shown.image))
+            self.still_depths_d = ocl.upload(device, np.ascontiguousarray(shown.depth, np.float32))
         self.triangles: list[Triangles] = []
         first = 0
         for part in parts:
@@ -139,9 +126,9 @@ class _Layers:
         is_opaque = all(part.opacity >= 1.0 for part in parts)
         self.is_single = is_opaque and (still is None or bool((shown.image[..., 3] % 255 == 0).all()))
         self.keys = LayerKeys.of(device, self.pixels)
-        self.layer_d = allocate(device, 16 * self.pixels)
-        self.depths_d, self.nearest_d = allocate(device, 4 * self.pixels), allocate(device, 4 * self.pixels)
-        self.states_d, self.marks_d = allocate(device, 32 * self.pixels), allocate(device, 16 * self.pixels)
+        self.layer_d = ocl.allocate(device, 16 * self.pixels)
+        self.depths_d, self.nearest_d = ocl.allocate(device, 4 * self.pixels), ocl.allocate(device, 4 * self.pixels)
+        self.states_d, self.marks_d = ocl.allocate(device, 32 * self.pixels), ocl.allocate(device, 16 * self.pixels)
 
     def run(self, volume: Callable[[Between], None] | None, most: int) -> LayeredPicture:
         device, (width, height) = self.device, self.size
@@ -165,9 +152,9 @@ class _Layers:
         if volume is not None and (is_first or open_pixels):  # else all rays have gone to their ends already
             self._fill(self.depths_d, np.inf)
             self._sample(volume, is_first)
-        image, image_d = empty_output(device, (height, width, 4), np.uint8)
-        depths, first_d = empty_output(device, (height, width), np.float32)
-        means, means_d = empty_output(device, (height, width), np.float32)
+        image, image_d = ocl.empty_output(device, (height, width, 4), np.uint8)
+        depths, first_d = ocl.empty_output(device, (height, width), np.float32)
+        means, means_d = ocl.empty_output(device, (height, width), np.float32)
         ground = np.zeros(4, np.float32)
         if background is not None:
             ground[:] = *find_color(background), 1.0
@@ -177,7 +164,7 @@ class _Layers:
                 **self._rays, **self._place,
             )  # fmt: skip
         with self.stopwatch.timed("download"):
-            download_all(device, (image, image_d, 0), (depths, first_d, 0), (means, means_d, 0))
+            ocl.download_all(device, (image, image_d, 0), (depths, first_d, 0), (means, means_d, 0))
         return LayeredPicture(image, depths, means, drawn, open_pixels)
 
     def _draw_layer(self) -> None:
@@ -205,14 +192,14 @@ class _Layers:
             open_d = zero_words(self.device, 1)
             items = -(-self.pixels // COUNTED)
             self._launch("count_open", items, keys=self.keys.keys_d, open=open_d, pixels=self.pixels)
-        return int(download(self.device, np.zeros(1, np.uint32), open_d)[0])
+        return int(ocl.download(self.device, np.zeros(1, np.uint32), open_d)[0])
 
     def _fill(self, depths_d: Any, depth: float) -> None:
         with self.stopwatch.running(self.device):
             self._launch("fill_depths", depths=depths_d, depth=depth, pixels=self.pixels)
 
     def _launch(self, kernel: str, items: int | None = None, **arguments: Any) -> None:
-        launch(self.device, self.program[kernel], self.pixels if items is None else items, **arguments)
+        ocl.launch(self.device, self.program[kernel], self.pixels if items is None else items, **arguments)
 
     @property
     def _rays(self) -> dict[str, Any]:
@@ -279,7 +266,7 @@ class ScenePictures(DeviceWorker):
         memory: int | None = None,
         takers: dict[int, VolumeRenderer | PointPictures] | None = None,
     ):
-        check_memory(memory)
+        ocl.check_memory(memory)
         check_objects(objects)
         if takers is None:
             self.box = _box_of(objects)
@@ -326,7 +313,7 @@ class ScenePictures(DeviceWorker):
         shot = Shot(camera, size, background, tell)
         finish = partial(self._finish, drawn, shot)
         if translucent is None:
-            for attempt in with_fallback(self._device):
+            for attempt in ocl.with_fallback(self._device):
                 with attempt as (device, warnings):
                     picture = finish(DrawnVolume(device, None, 0.0, Stopwatch(), warnings))
         else:

@@ -11,22 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import DeviceError, DeviceFailedError, UsageError
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels.resample import check_together, warn_of_place
-from clrecon.opencl import (
-    Device,
-    Program,
-    Stopwatch,
-    allocate,
-    describe_shortage,
-    download,
-    kernel_constant,
-    launch,
-    load_program,
-    upload,
-)
+from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import voxel_variants
 from clrecon.rendering import Rendering
@@ -40,7 +30,9 @@ from clrecon.rendering.views.reformation import Sheet, SlabSamples, slab_samples
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 
-COMBINATIONS = {name: kernel_constant("reformat/sample.cl", f"COMBINE_{name.upper()}") for name in styles.COMBINATIONS}
+COMBINATIONS = {
+    name: ocl.kernel_constant("reformat/sample.cl", f"COMBINE_{name.upper()}") for name in styles.COMBINATIONS
+}
 """How the samples of a slab are combined: the kernel's numbers."""
 
 SAMPLES_A_LAUNCH = 1 << 23
@@ -65,7 +57,7 @@ class Reformation:
 
 def prepare_reformat(device: Device, dtype: DTypeLike = np.int16, *, uneven: bool = False) -> Program:
     """Build the kernel for volumes of `dtype`, with `uneven` for those whose slices no affine places."""
-    return load_program(device, "reformat/sample.cl", {**voxel_variants(dtype), "UNEVEN": str(int(uneven))})
+    return ocl.load_program(device, "reformat/sample.cl", {**voxel_variants(dtype), "UNEVEN": str(int(uneven))})
 
 
 @dataclass(frozen=True)
@@ -142,7 +134,7 @@ class _Run:
             return nk
         slices = resident.plan(_SHEETS, self.slices, self.needs)
         if slices < min(2, self.slices):
-            shortage = describe_shortage(resident.limits, self.needs(min(2, self.slices)))
+            shortage = ocl.describe_shortage(resident.limits, self.needs(min(2, self.slices)))
             kind = DeviceFailedError if resident.limits.asked_bytes is None else DeviceError
             raise kind(f"two slices at a time are too much: {shortage}; give more memory or a smaller picture")
         return slices
@@ -153,10 +145,10 @@ class _Run:
         takes_whole = self.takes_whole and slices == self.volume.shape_ijk[2]
         with self.stopwatch.timed("build"):
             program = prepare_reformat(self.device, self.resident.dtype, uneven=self.volume.uneven)
-        rows_d, slices_d = upload(self.device, places.rows), upload(self.device, places.slices)
+        rows_d, slices_d = ocl.upload(self.device, places.rows), ocl.upload(self.device, places.slices)
         values_d, weights_d = (
-            allocate(self.device, 4 * shape[0] * shape[1]),
-            allocate(self.device, 4 * shape[0] * shape[1]),
+            ocl.allocate(self.device, 4 * shape[0] * shape[1]),
+            ocl.allocate(self.device, 4 * shape[0] * shape[1]),
         )
         count, own_first = 0, places.first
         while count == 0 or own_first < places.end:
@@ -175,8 +167,8 @@ class _Run:
             count, own_first = count + 1, own_end
             progress("slabs", own_end - places.first, self.slices)
         with self.stopwatch.timed("download"):
-            values = download(self.device, np.empty(shape, np.float32), values_d)
-            weights = download(self.device, np.empty(shape, np.float32), weights_d)
+            values = ocl.download(self.device, np.empty(shape, np.float32), values_d)
+            weights = ocl.download(self.device, np.empty(shape, np.float32), weights_d)
         empty = weights == 0.0
         if self.combine == "mean":
             values = values / np.where(empty, np.float32(1.0), weights)
@@ -191,7 +183,7 @@ class _Run:
         rows = max(1, SAMPLES_A_LAUNCH // (width * (self.samples.intervals + 1)))
         for first in range(0, height, rows):
             count = min(rows, height - first)
-            launch(
+            ocl.launch(
                 self.device, program["reformat_rows"], count * width, first_row=first, row_count=count, width=width,
                 ni=ni, nj=nj, nk=nk, intervals=self.samples.intervals, combine=COMBINATIONS[self.combine], **part,
             )  # fmt: skip

@@ -9,25 +9,11 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from numpy.typing import ArrayLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import ValueRange
-from clrecon.opencl import (
-    Attempt,
-    Device,
-    MemoryLimits,
-    Program,
-    Stopwatch,
-    check_memory,
-    describe_shortage,
-    keep_for_hung_commands,
-    load_program,
-    memory_limits,
-    settle,
-    take_device,
-    upload,
-    with_fallback,
-)
+from clrecon.opencl import Attempt, Device, MemoryLimits, Program, Stopwatch
 from clrecon.operators.resident.tables import StackTable, ray_variants
 from clrecon.system.base_classes import Closing
 from clrecon.system.light_dataclass import dataclass
@@ -97,10 +83,10 @@ class DeviceVolume(Closing, Volume):
     def __init__(self, volume: Volume, *, device: Device | str | int | None = None, memory: int | None = None):
         if not isinstance(volume, Volume):
             raise UsageError(f"a DeviceVolume is made of a Volume, not {type(volume).__name__}")
-        check_memory(memory)
+        ocl.check_memory(memory)
         vars(self).update(vars(volume))  # the same voxels, places and report
         self.volume: Volume = volume.volume if isinstance(volume, DeviceVolume) else volume
-        self._taken_device = take_device(device)
+        self._taken_device = ocl.take_device(device)
         self.device = self._taken_device.current
         self.memory = memory
         self.uploaded_bytes = 0
@@ -195,7 +181,7 @@ class DeviceVolume(Closing, Volume):
     def upload(self, voxels: NDArray[Any], stopwatch: Stopwatch) -> Any:
         """Upload voxels of this volume, in any order and number."""
         with stopwatch.timed("upload"):
-            voxels_d = upload(self.device, voxels)
+            voxels_d = ocl.upload(self.device, voxels)
         self.uploaded_bytes += voxels.nbytes
         return voxels_d
 
@@ -234,12 +220,12 @@ class DeviceVolume(Closing, Volume):
     def program(self, name: str, **variants: str) -> Program:
         """Build a kernel file that samples this volume along rays."""
         extra = {"UNEVEN": "1"} if self.volume.uneven else {}
-        return load_program(self.device, name, {**ray_variants(self.device, self.dtype), **extra, **variants})
+        return ocl.load_program(self.device, name, {**ray_variants(self.device, self.dtype), **extra, **variants})
 
     def release(self) -> None:
         """Free everything on the device."""
         with self._lock:
-            keep_for_hung_commands(self._whole_d, self._kept)
+            ocl.keep_for_hung_commands(self._whole_d, self._kept)
             self._whole_d = None
             self._kept = {}
 
@@ -271,7 +257,7 @@ class DeviceVolume(Closing, Volume):
     @property
     def limits(self) -> MemoryLimits:
         """Limits of the memory on the device."""
-        return memory_limits(self.device, self.memory)
+        return ocl.memory_limits(self.device, self.memory)
 
     def shortage(self, needs: Mapping[str, int], counted: tuple[str, ...] = ()) -> str:
         """Return why the device has no room for ``needs``; empty if it has.
@@ -281,10 +267,10 @@ class DeviceVolume(Closing, Volume):
         """
         with self._lock:
             others = {what: kept.nbytes for what, kept in self._kept.items() if what not in counted and kept.nbytes}
-            shortage = describe_shortage(self.limits, {**needs, **others})
+            shortage = ocl.describe_shortage(self.limits, {**needs, **others})
             if shortage and others:
                 self._kept = {what: kept for what, kept in self._kept.items() if what not in others}
-                shortage = describe_shortage(self.limits, needs)
+                shortage = ocl.describe_shortage(self.limits, needs)
             return shortage
 
     def plan(
@@ -309,13 +295,13 @@ class DeviceVolume(Closing, Volume):
         low, high = 0, total  # of parts nothing is kept: others are dropped when the first one comes
         while high - low > 1:
             middle = (low + high) // 2
-            fits = middle <= most and not describe_shortage(limits, needs(middle))
+            fits = middle <= most and not ocl.describe_shortage(limits, needs(middle))
             low, high = (middle, high) if fits else (low, middle)
         return low
 
     def with_fallback(self) -> Iterator[Attempt[tuple[Device, list[str]]]]:
         """Yield attempts at the work of an operator, each anew on `device`."""
-        for attempt in with_fallback(self._taken_device):
+        for attempt in ocl.with_fallback(self._taken_device):
             current, _ = attempt.given
             with self._lock:
                 if current is not self.device:
@@ -346,7 +332,7 @@ class DeviceVolume(Closing, Volume):
             error = attempt.take_error()
             if error is None:
                 return
-            settle(self.device, error)
+            ocl.settle(self.device, error)
             self.release()
             if is_last:
                 raise error
@@ -380,7 +366,7 @@ class DeviceWorker(Closing):
     """Base of what works on a device or its stand-in, with at most `memory` bytes."""
 
     def __init__(self, device: Device | str | int | None, memory: int | None):
-        self._device, self.memory = take_device(device), memory
+        self._device, self.memory = ocl.take_device(device), memory
 
     @property
     def device(self) -> Device:

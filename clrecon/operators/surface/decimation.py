@@ -8,29 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon import opencl as ocl
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import rounding_of_bounds
 from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.intersections import find_boxes, find_self_intersections
 from clrecon.mesh.refine import decimation
 from clrecon.mesh.refine.deviation import WITNESSES, SurfaceBounds
-from clrecon.opencl import (
-    Device,
-    Program,
-    allocate,
-    check_budget,
-    describe_shortage,
-    download,
-    empty_output,
-    kernel_constant,
-    launch,
-    load_program,
-    memory_limits,
-    take_device,
-    upload,
-    wait,
-    with_fallback,
-)
+from clrecon.opencl import Device, Program
 from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
@@ -123,26 +108,26 @@ def mark_crossings(
 ) -> NDArray[np.bool_]:
     """Mark the triangles that may cut another one, shape (n,), in the order of the mesh."""
     count = len(plan.order)
-    program = load_program(device, "surface/crossings.cl", {"LANES": device.kernel_variants["LANES"]})
-    places_d, names_d = (allocate(device, 4 * rows * plan.stride) for rows in (10, 3))
-    launch(
-        device, program["enter_triangles"], plan.stride, vertices=upload(device, plan.vertices),
-        triangles=upload(device, plan.triangles), order=upload(device, plan.order), places=places_d, names=names_d,
-        count=count, stride=plan.stride,
+    program = ocl.load_program(device, "surface/crossings.cl", {"LANES": device.kernel_variants["LANES"]})
+    places_d, names_d = (ocl.allocate(device, 4 * rows * plan.stride) for rows in (10, 3))
+    ocl.launch(
+        device, program["enter_triangles"], plan.stride, vertices=ocl.upload(device, plan.vertices),
+        triangles=ocl.upload(device, plan.triangles), order=ocl.upload(device, plan.order), places=places_d,
+        names=names_d, count=count, stride=plan.stride,
     )  # fmt: skip
     marks_d = zero_words(device, (count + 31) // 32)
-    starts_d, levels_d, edges_d = (upload(device, table) for table in (plan.starts, plan.levels, plan.edges))
+    starts_d, levels_d, edges_d = (ocl.upload(device, table) for table in (plan.starts, plan.levels, plan.edges))
     for first in range(0, count, piece):
         items = min(piece, count - first)
-        launch(
+        ocl.launch(
             device, program["mark_crossings"], items, places=places_d, names=names_d, starts=starts_d, levels=levels_d,
             edges=edges_d, marks=marks_d, origin_y=plan.origin[1], origin_z=plan.origin[2], first=first, items=items,
             level_count=len(plan.edges), stride=plan.stride,
         )  # fmt: skip
         if steps is not None:
-            wait(device)
+            ocl.wait(device)
             steps.take(items)
-    words = download(device, np.empty((count + 31) // 32, np.uint32), marks_d)
+    words = ocl.download(device, np.empty((count + 31) // 32, np.uint32), marks_d)
     marked = np.zeros(count, bool)
     marked[plan.order] = np.unpackbits(words.view(np.uint8), bitorder="little")[:count].view(bool)
     return marked
@@ -167,7 +152,7 @@ def find_crossings(
     if len(triangles) < fewest or vertices.dtype != np.float32:
         return find_self_intersections(vertices, triangles, changed, steps=steps)
     plan = plan_crossings(vertices, triangles)
-    if describe_shortage(memory_limits(device, memory), plan.needs()):
+    if ocl.describe_shortage(ocl.memory_limits(device, memory), plan.needs()):
         return find_self_intersections(vertices, triangles, changed, steps=steps)
     marked = np.flatnonzero(mark_crossings(device, plan, steps=steps))
     return marked[find_self_intersections(vertices, triangles[marked], None if changed is None else changed[marked])]
@@ -176,7 +161,7 @@ def find_crossings(
 _PART = 1 << 20
 """Points or triangles of a launch: each stays short, and its arrays fit beside the surface."""
 
-if kernel_constant("surface/near_faces.cl", "WITNESSES") != WITNESSES:
+if ocl.kernel_constant("surface/near_faces.cl", "WITNESSES") != WITNESSES:
     raise ImportError("cl/surface/near_faces.cl and clrecon.mesh.refine.deviation differ in the number of witnesses")
 
 Float64Array = NDArray[np.float64]
@@ -206,7 +191,7 @@ class DeviceBounds(SurfaceBounds):
 
     @cached_property
     def _program(self) -> Program:
-        return load_program(self._device, "surface/near_faces.cl")
+        return ocl.load_program(self._device, "surface/near_faces.cl")
 
     @cached_property
     def _surface(self) -> dict[str, Any]:
@@ -217,9 +202,9 @@ class DeviceBounds(SurfaceBounds):
             "around": self._fans.rows.astype(np.int32, copy=False),
         }
         part = {"points of a launch": 64 * self.part, "vertices": 20 * len(self._vertices)}
-        check_budget(self._device, {name: array.nbytes for name, array in arrays.items()} | part)
+        ocl.check_budget(self._device, {name: array.nbytes for name, array in arrays.items()} | part)
         return {
-            name: upload(self._device, array if len(array) else np.zeros(4, array.dtype))
+            name: ocl.upload(self._device, array if len(array) else np.zeros(4, array.dtype))
             for name, array in arrays.items()
         }
 
@@ -235,14 +220,17 @@ class DeviceBounds(SurfaceBounds):
         rows = np.empty(len(points), np.int32)
         for piece in chunks(len(points), self.part):
             count = piece.stop - piece.start
-            here = (upload(device, points[piece].astype(np.float32)), upload(device, near[piece].astype(np.int32)))
-            buffers = empty_output(device, (count,), np.float32), empty_output(device, (count,), np.int32)
-            launch(
+            here = (
+                ocl.upload(device, points[piece].astype(np.float32)),
+                ocl.upload(device, near[piece].astype(np.int32)),
+            )
+            buffers = ocl.empty_output(device, (count,), np.float32), ocl.empty_output(device, (count,), np.int32)
+            ocl.launch(
                 device, self._program["find_near_faces"], count, points=here[0], near=here[1], **surface,
                 squares=buffers[0][1], rows=buffers[1][1], hints=near.shape[1], walks=walks, enough=self._most(limit),
                 count=count,
             )  # fmt: skip
-            squares[piece], rows[piece] = download(device, *buffers[0]), download(device, *buffers[1])
+            squares[piece], rows[piece] = ocl.download(device, *buffers[0]), ocl.download(device, *buffers[1])
         length = np.sqrt(squares) + np.float32(self.slack)
         length[rows < 0] = np.inf
         return length, rows
@@ -254,19 +242,22 @@ class DeviceBounds(SurfaceBounds):
         witnesses: NDArray[np.int32] = np.empty((WITNESSES, len(triangles)), np.int32)
         left = np.empty(len(triangles), np.uint8)
         of_vertices = {
-            "vertices": upload(device, places),
-            "names": upload(device, names.astype(np.int32)),
-            "beside": upload(device, beside),
+            "vertices": ocl.upload(device, places),
+            "names": ocl.upload(device, names.astype(np.int32)),
+            "beside": ocl.upload(device, beside),
         }
         for piece in chunks(len(triangles), self.part):
             count = piece.stop - piece.start
-            faces = upload(device, triangles[piece])
-            buffers = empty_output(device, (WITNESSES, count), np.int32), empty_output(device, (count,), np.uint8)
-            launch(
+            faces = ocl.upload(device, triangles[piece])
+            buffers = (
+                ocl.empty_output(device, (WITNESSES, count), np.int32),
+                ocl.empty_output(device, (count,), np.uint8),
+            )
+            ocl.launch(
                 device, self._program["find_witnesses"], count, triangles=faces, **of_vertices, **self._surface,
                 witnesses=buffers[0][1], left=buffers[1][1], enough=self._most(limit), count=count,
             )  # fmt: skip
-            witnesses[:, piece], left[piece] = download(device, *buffers[0]), download(device, *buffers[1])
+            witnesses[:, piece], left[piece] = ocl.download(device, *buffers[0]), ocl.download(device, *buffers[1])
         return witnesses, left
 
 
@@ -321,7 +312,7 @@ def decimate_mesh(
     decimation.check_refinement(mesh, max_deviation_mm)
     if device is None:
         return decimation.decimate_mesh(mesh, fraction, max_deviation_mm, progress=progress)
-    for attempt in with_fallback(take_device(device)):
+    for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, _):
             decimated = decimation.decimate_mesh(
                 mesh, fraction, max_deviation_mm, progress=progress, make_bounds=partial(DeviceBounds, current),

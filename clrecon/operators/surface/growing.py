@@ -13,20 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
-from clrecon.opencl import (
-    Device,
-    Program,
-    Stopwatch,
-    allocate,
-    copy_buffer,
-    download,
-    kernel_constant,
-    launch,
-    launcher,
-    load_program,
-    upload,
-)
+from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.primitives.scan import enqueue_scan, exclusive_scan, prepare_scan
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.marching_cubes import Classified, load_cells
@@ -66,7 +55,7 @@ def _look_for_cell(
         return None
     first, end = max(int(near[0]) - 1, 0), min(int(near[-1]) + 2, gk)
     (begin_j, end_j), (begin_word, end_word) = _rows_near(grid, point, reach, first, end)
-    mask = download(
+    mask = ocl.download(
         device, np.empty((end - first, gj, grid.words), np.uint32), classified.mask_d, 4 * first * gj * grid.words
     )[:, begin_j:end_j, begin_word:end_word]
     bits = np.unpackbits(np.ascontiguousarray(mask).view(np.uint8), axis=2, bitorder="little")
@@ -107,14 +96,14 @@ def _describe_lone(grid: SampleGrid, point: NDArray[np.float64], away: float | N
 
 
 SUMS = {
-    name: kernel_constant("surface/component_sums.h", name)
+    name: ocl.kernel_constant("surface/component_sums.h", name)
     for name in ("COMPONENTS", "CHOSEN", "ACTIVE_CELLS", "CHOSEN_CELLS", "LARGEST_LEFT_OUT", "SUMS")
 }
 """Places of what is summed up over components, and their number."""
 
 
 def prepare_choosing(device: Device) -> Program:
-    return load_program(device, "surface/choosing.cl")
+    return ocl.load_program(device, "surface/choosing.cl")
 
 
 @dataclass(frozen=True)
@@ -129,7 +118,7 @@ class Sums:
 
     @classmethod
     def read(cls, device: Device, sums_d: Any) -> Sums:
-        sums = download(device, np.empty(SUMS["SUMS"], np.uint32), sums_d)
+        sums = ocl.download(device, np.empty(SUMS["SUMS"], np.uint32), sums_d)
 
         def cells(which: str) -> int:
             return int(sums[SUMS[which]]) + (int(sums[SUMS[which] + 1]) << 32)
@@ -177,7 +166,7 @@ def choose_components(
 ) -> None:  # fmt: skip
     program, (gi, gj, gk) = prepare_choosing(device), grid.shape
     sizes = {"gi": gi, "gj": gj, "gk": gk, "words": grid.words}
-    run = launcher(device, program)
+    run = ocl.launcher(device, program)
     n = runs.total
     if seeds.auto:
         sized = {"roots": components.roots_d, "run_cells": components.cells_d, "sums": components.sums_d}
@@ -188,12 +177,12 @@ def choose_components(
         cells = np.array([(i, j, k, 0) for k, j, i in near], np.uint32)
         run(
             "choose_cells", len(cells), run_starts=runs.starts_d, word_runs=runs.words_d, row_offsets=runs.offsets_d,
-            cells=upload(device, cells), n=len(cells), gj=gj, words=grid.words, **components.places,
+            cells=ocl.upload(device, cells), n=len(cells), gj=gj, words=grid.words, **components.places,
         )  # fmt: skip
     if seeds.voxels is not None:
         run(
             "choose_seeded", gj * gk, mask=classified.mask_d, word_runs=runs.words_d, border=grid.rule.border,
-            seeds=upload(device, seeds.voxels), enclosed_set=grid.rule.inside != "below",
+            seeds=ocl.upload(device, seeds.voxels), enclosed_set=grid.rule.inside != "below",
             voxel_words=seeds.voxels.shape[2], **runs.places, **components.places, **sizes,
         )  # fmt: skip
     sum_components(device, runs, components)
@@ -208,7 +197,7 @@ def choose_components(
 
 
 def sum_components(device: Device, runs: Runs, components: Components) -> None:
-    launch(
+    ocl.launch(
         device, prepare_choosing(device)["sum_components"], runs.total,
         run_cells=components.cells_d, sums=components.sums_d, runs=runs.total, **components.places,
     )  # fmt: skip
@@ -221,7 +210,7 @@ def prepare_growing(device: Device) -> Program:
     prepare_scan(device)
     load_cells(device, grown=True)
     prepare_choosing(device)
-    return load_program(device, "surface/growing.cl", {"ATOMIC_LOADS": "1"} if device.is_simulator else {})
+    return ocl.load_program(device, "surface/growing.cl", {"ATOMIC_LOADS": "1"} if device.is_simulator else {})
 
 
 @dataclass(frozen=True)
@@ -250,7 +239,7 @@ class Grown:
     def report(self, device: Device, grid: SampleGrid) -> tuple[dict[str, int], dict[str, Any]]:
         """Return the numbers of cells, and what was grown and left out; the device may have to be waited for."""
         sums = Sums.read(device, self.sums_d)
-        visited = int(download(device, np.empty(1, np.uint64), self.visited_d)[0])
+        visited = int(ocl.download(device, np.empty(1, np.uint64), self.visited_d)[0])
         cells = {
             "visited": visited, "grown": sums.chosen_cells, "active": sums.active_cells,
             "all": math.prod(n - 1 for n in grid.shape),
@@ -279,12 +268,12 @@ class _Search:
         self.sizes = {"gi": gi, **self.row_sizes}
 
     def run(self, kernel: str, items: int, **arguments: Any) -> None:
-        launch(self.device, self.program[kernel], items, **arguments)
+        ocl.launch(self.device, self.program[kernel], items, **arguments)
 
     def find_runs(self) -> Runs:
         bits = 4 * self.rows * self.grid.words
-        active_d, starts_d, words_d = (allocate(self.device, size) for size in (bits, bits, bits // 2))
-        counts_d, extents_d = allocate(self.device, 4 * self.rows), allocate(self.device, 4 * self.rows)
+        active_d, starts_d, words_d = (ocl.allocate(self.device, size) for size in (bits, bits, bits // 2))
+        counts_d, extents_d = ocl.allocate(self.device, 4 * self.rows), ocl.allocate(self.device, 4 * self.rows)
         self.run(
             "find_cell_runs", self.rows, mask=self.classified.mask_d,
             row_extents=self.classified.row_extents_d, active_cells=active_d, run_starts=starts_d,
@@ -298,8 +287,8 @@ class _Search:
 
     def join(self, runs: Runs) -> Components:
         device, n = self.device, runs.total
-        parents_d, cells_d, chosen_d, roots_d = (allocate(device, 4 * n) for _ in range(4))
-        sums_d = allocate(device, 4 * SUMS["SUMS"])
+        parents_d, cells_d, chosen_d, roots_d = (ocl.allocate(device, 4 * n) for _ in range(4))
+        sums_d = ocl.allocate(device, 4 * SUMS["SUMS"])
         self.run(
             "begin_cell_runs", n, parents=parents_d, run_cells=cells_d, chosen=chosen_d, sums=sums_d,
             runs=n,
@@ -317,8 +306,8 @@ class _Search:
     def mark(self, runs: Runs, components: Components) -> tuple[Any, Any, Any]:
         """Return the grown samples of chosen components, their extents, and how many cells growing visits."""
         device = self.device
-        grown_d = allocate(device, 4 * self.rows * self.grid.words)
-        extents_d, counts_d = allocate(device, 4 * self.rows), allocate(device, 4 * self.rows)
+        grown_d = ocl.allocate(device, 4 * self.rows * self.grid.words)
+        extents_d, counts_d = ocl.allocate(device, 4 * self.rows), ocl.allocate(device, 4 * self.rows)
         self.run(
             "mark_grown", self.rows, active_cells=runs.active_d, grown=grown_d, grown_extents=extents_d,
             **runs.places, **components.places, **self.sizes,
@@ -348,10 +337,10 @@ def join_slabs(
 ) -> Classified:  # fmt: skip
     """Return the inside mask of the whole grid, from those of slabs that follow each other."""
     device, (_, gj, gk) = resident.device, grid.shape
-    mask_d, extents_d = allocate(device, 4 * gj * gk * grid.words), allocate(device, 4 * gj * gk)
+    mask_d, extents_d = ocl.allocate(device, 4 * gj * gk * grid.words), ocl.allocate(device, 4 * gj * gk)
     for slab, classified in slabs:
-        copy_buffer(device, classified.mask_d, mask_d, 4 * slab.rows * grid.words, 4 * slab.first * gj * grid.words)
-        copy_buffer(device, classified.row_extents_d, extents_d, 4 * slab.rows, 4 * slab.first * gj)
+        ocl.copy_buffer(device, classified.mask_d, mask_d, 4 * slab.rows * grid.words, 4 * slab.first * gj * grid.words)
+        ocl.copy_buffer(device, classified.row_extents_d, extents_d, 4 * slab.rows, 4 * slab.first * gj)
     return Classified(mask_d, extents_d)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import DeviceMemoryError, RefusedInputError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule
@@ -32,22 +33,7 @@ from clrecon.labels.label_levels import (
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.mesh_gates import judge_label_volume
 from clrecon.mesh.triangles import enclosed_ml
-from clrecon.opencl import (
-    Device,
-    Program,
-    Stopwatch,
-    allocate,
-    check_budget,
-    describe_shortage,
-    download,
-    kernel_constant,
-    launch,
-    load_program,
-    memory_limits,
-    take_device,
-    upload,
-    with_fallback,
-)
+from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.resident.tables import label_variants
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Part
@@ -83,21 +69,23 @@ def _survey(
     boxes, faces = np.empty((size, 6), np.int32), np.zeros((size, 2), np.uint32)
     touch = len(labels.numbers) > 1
     needs = {"labels": voxels.nbytes, "boxes": boxes.nbytes, "faces": faces.nbytes}
-    if describe_shortage(memory_limits(device, memory), needs):
+    if ocl.describe_shortage(ocl.memory_limits(device, memory), needs):
         return None
     with stopwatch.timed("build"):
-        program = load_program(device, "surface/label_survey.cl", label_variants(voxels.dtype))
+        program = ocl.load_program(device, "surface/label_survey.cl", label_variants(voxels.dtype))
     with stopwatch.timed("upload"):
-        map_d = upload(device, voxels)
-    boxes_d, faces_d = allocate(device, boxes.nbytes), allocate(device, faces.nbytes)
+        map_d = ocl.upload(device, voxels)
+    boxes_d, faces_d = ocl.allocate(device, boxes.nbytes), ocl.allocate(device, faces.nbytes)
     ni, nj, nk = labels.shape_ijk
     grid: dict[str, Any] = {"map": map_d, "ni": ni, "nj": nj, "nk": nk}
     with stopwatch.running(device):
-        launch(device, program["clear_survey"], size, boxes=boxes_d, faces=faces_d, labels=size)
-        launch(device, program["find_boxes"], nj * nk, boxes=boxes_d, **grid)
+        ocl.launch(device, program["clear_survey"], size, boxes=boxes_d, faces=faces_d, labels=size)
+        ocl.launch(device, program["find_boxes"], nj * nk, boxes=boxes_d, **grid)
         if touch:
-            launch(device, program["count_faces"], nj * nk, faces=faces_d, **grid)
-    return _widen(download(device, boxes, boxes_d), labels.numbers, (ni, nj, nk)), download(device, faces, faces_d)
+            ocl.launch(device, program["count_faces"], nj * nk, faces=faces_d, **grid)
+    return _widen(ocl.download(device, boxes, boxes_d), labels.numbers, (ni, nj, nk)), ocl.download(
+        device, faces, faces_d
+    )
 
 
 def _widen(table: NDArray[np.int32], numbers: Sequence[int], shape_ijk: tuple[int, int, int]) -> dict[int, Box]:
@@ -114,13 +102,13 @@ SPARE_SLICES = 3 + REACH
 """Slices needed beyond a label's box: slices of the mask, gradients, and their occupancy."""
 
 _TRIANGLES_PER_SUM = 256
-_SAMPLES_PER_FLAGS = 32 * kernel_constant("surface/label_masks.cl", "STRIP")
+_SAMPLES_PER_FLAGS = 32 * ocl.kernel_constant("surface/label_masks.cl", "STRIP")
 """Samples of a row that one word of flags tells of: 32 strips."""
 
 
 def prepare_label_masks(device: Device, label_dtype: DTypeLike = np.uint8) -> tuple[Program, Program]:
     """Build the kernels for labels of this type: those of the occupancy and those of the surface."""
-    mask_program = load_program(
+    mask_program = ocl.load_program(
         device, "surface/label_masks.cl", {"VOXEL": "short", "VALUE": "int", **label_variants(label_dtype)}
     )
     return mask_program, marching_cubes.prepare_marching_cubes(device, np.int16, label_dtype, masks=True)
@@ -185,13 +173,13 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
         """Upload the slices that the labels need, and find the occupancy of all labels."""
         device = self.device
         first, end = self.slices_for(boxes)
-        check_budget(device, self.needs(first, end), self.memory)
+        ocl.check_budget(device, self.needs(first, end), self.memory)
         with self.stopwatch.timed("upload"):
-            map_d = upload(device, self.labels.voxels[first:end])
+            map_d = ocl.upload(device, self.labels.voxels[first:end])
         samples = self.labels.voxels[first:end].size
-        rows_d, occupancy_d = allocate(device, 2 * samples), allocate(device, 2 * samples)
-        occupied_d = allocate(device, 2 * samples) if self.has_neighbours else occupancy_d
-        strips_d = allocate(device, self.strip_bytes(end - first))
+        rows_d, occupancy_d = ocl.allocate(device, 2 * samples), ocl.allocate(device, 2 * samples)
+        occupied_d = ocl.allocate(device, 2 * samples) if self.has_neighbours else occupancy_d
+        strips_d = ocl.allocate(device, self.strip_bytes(end - first))
         held_map = HeldMap(first, end, map_d, rows_d, strips_d, occupancy_d, occupied_d)
         if self.has_neighbours:
             around = tuple(
@@ -212,12 +200,12 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
         row_j = max(0, begin_j - REACH), min(nj, end_j + REACH)
         row_k = max(slab.first, begin_k - REACH), min(slab.end, end_k + REACH)
         slices = row_k[1] - row_k[0]
-        launch(
+        ocl.launch(
             self.device, self.programs()[0]["smooth_rows"], slices * (row_j[1] - row_j[0]), map=slab.map_d,
             rows=slab.rows_d, strips=slab.strips_d, label=number, ni=ni, nj=nj, begin_i=begin_i, end_i=end_i,
             begin_j=row_j[0], end_j=row_j[1], begin_slice=row_k[0] - slab.first, slices=slices,
         )  # fmt: skip
-        launch(
+        ocl.launch(
             self.device, self.programs()[0]["smooth_across"], (end_k - begin_k) * (end_j - begin_j), rows=slab.rows_d,
             strips=slab.strips_d, occupancy=occupancy_d, ni=ni, nj=nj, nk=nk, begin_i=begin_i, end_i=end_i,
             begin_j=begin_j, end_j=end_j, first_row_slice=slab.first, first_slice=begin_k, slices=end_k - begin_k,
@@ -256,7 +244,7 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
         classified = self.empty_mask(window)
         with stopwatch.running(device):
             self._smooth(slab, number, box, slab.occupancy_d)
-            launch(
+            ocl.launch(
                 device, mask_program["classify_mask"], window.mask_rows,
                 map=slab.map_d, mask=classified.mask_d, row_extents=classified.row_extents_d, label=number,
                 begin_j=box[1].start, end_j=box[1].stop, **window.arguments,
@@ -301,7 +289,7 @@ class StartedMesh:
 
     def place(self, level: int) -> None:
         slab = self.held
-        biases_d = upload(self.run.device, level_biases(self.run.levels, self.run.labels.numbers[-1] + 1))
+        biases_d = ocl.upload(self.run.device, level_biases(self.run.levels, self.run.labels.numbers[-1] + 1))
         with self.run.stopwatch.running(self.run.device):
             self.emission.vertices(level, map=slab.map_d, label=self.number, occupied=slab.occupied_d, biases=biases_d)
 
@@ -317,14 +305,14 @@ class StartedMesh:
             centre[:3] = self.run.labels.ijk_to_lps(middle)[0] - placement.origin
         triangles = self.counted.triangles
         sums = np.empty(-(-triangles // _TRIANGLES_PER_SUM), np.float32)
-        sums_d = allocate(device, sums.nbytes)
+        sums_d = ocl.allocate(device, sums.nbytes)
         with stopwatch.running(device):
-            launch(
+            ocl.launch(
                 device, self.run.programs()[0]["sum_volumes"], len(sums),
                 positions=self.emission.positions_d, triangles=self.emission.triangles_d, sums=sums_d, centre=centre,
                 triangle_count=triangles, triangles_per_sum=_TRIANGLES_PER_SUM,
             )  # fmt: skip
-        return float(download(device, sums, sums_d).sum(dtype=np.float64)) / 6.0
+        return float(ocl.download(device, sums, sums_d).sum(dtype=np.float64)) / 6.0
 
     def keep_volume(self, wanted: float, closed: bool) -> tuple[Part, int]:
         """Try levels until the mesh has, as nearly as possible, the volume of the label's voxels, mm3."""
@@ -408,7 +396,7 @@ def extract_label_masks(
     marching_cubes.check_row(labels.shape_ijk[0])
     chosen = labels.choose(label)
 
-    for attempt in with_fallback(take_device(device)):
+    for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, warnings):
             run = MaskExtraction(labels, current, memory, closed, warnings)
             meshes = _make_meshes(run, chosen, progress or ignore_progress)

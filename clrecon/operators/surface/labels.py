@@ -8,6 +8,7 @@ from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
+from clrecon import opencl as ocl
 from clrecon.anatomy.head import SKIN_HU, warn_of_skin
 from clrecon.anatomy.iso_choice import settle_level
 from clrecon.errors import DeviceMemoryError, NoSurfaceError
@@ -17,19 +18,7 @@ from clrecon.geometry.vertices import warnings_of_far
 from clrecon.labels import LabelMap, ResampledLabels
 from clrecon.labels.label_levels import Box, Growth, count_ml, fill_solid, find_boxes, label_ml
 from clrecon.mesh import Mesh
-from clrecon.opencl import (
-    Device,
-    Program,
-    Stopwatch,
-    allocate,
-    check_budget,
-    describe_shortage,
-    download,
-    launch,
-    load_program,
-    memory_limits,
-    upload,
-)
+from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.resident.tables import label_variants, voxel_variants
 from clrecon.operators.surface import marching_cubes
@@ -115,8 +104,8 @@ class ExtractionByLabel(Generic[Held, Made]):
     def group(self, boxes: dict[int, Box]) -> list[dict[int, Box]]:
         """Group all labels together if their slices fit the device, else one by one: the meshes are the same."""
         scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
-        room, needs = memory_limits(self.device, self.memory), self.needs(*self.slices_for(boxes))
-        if not describe_shortage(room, {**needs, "scratch": min(scratch, room.buffer_bytes)}):
+        room, needs = ocl.memory_limits(self.device, self.memory), self.needs(*self.slices_for(boxes))
+        if not ocl.describe_shortage(room, {**needs, "scratch": min(scratch, room.buffer_bytes)}):
             return [boxes]
         return [{number: box} for number, box in boxes.items()]
 
@@ -140,15 +129,15 @@ class ExtractionByLabel(Generic[Held, Made]):
 
     def empty_mask(self, window: Window) -> Classified:
         """Make the mask of a label on the device, if it has room for what finds the surface."""
-        check_budget(self.device, self._needs(window), self.memory, less_may_fit=True)
-        mask_d = allocate(self.device, 4 * window.mask_rows * self.grid.words)
-        return Classified(mask_d, allocate(self.device, 4 * window.mask_rows))
+        ocl.check_budget(self.device, self._needs(window), self.memory, less_may_fit=True)
+        mask_d = ocl.allocate(self.device, 4 * window.mask_rows * self.grid.words)
+        return Classified(mask_d, ocl.allocate(self.device, 4 * window.mask_rows))
 
     def check_output(self, window: Window, counted: Counted) -> None:
         """Refuse a mesh that does not fit beside the other buffers; record the memory of the label."""
         needs, scratch = self._needs(window), window.scratch()
         output = counted.output()
-        check_budget(self.device, {**needs, **output}, self.memory, less_may_fit=True)
+        ocl.check_budget(self.device, {**needs, **output}, self.memory, less_may_fit=True)
         self.device_bytes = {
             "volume": sum(needs.values()) - sum(scratch.values()),
             "scratch": sum(scratch.values()),
@@ -209,7 +198,7 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
             dtype = self.resident.dtype
             label_dtype = self.labels.dtype
             variants = {**voxel_variants(dtype), **label_variants(label_dtype)}
-            program = load_program(self.device, "surface/labels.cl", variants)
+            program = ocl.load_program(self.device, "surface/labels.cl", variants)
             return program, marching_cubes.prepare_marching_cubes(
                 self.device, dtype, label_dtype, uneven=self.volume.uneven
             )
@@ -230,25 +219,25 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
 
     def _fits_whole(self) -> bool:
         needs = self.needs(0, self.volume.shape_ijk[2])
-        return not describe_shortage(self.resident.limits, needs | {"mesh": sum(needs.values()) // 2})
+        return not ocl.describe_shortage(self.resident.limits, needs | {"mesh": sum(needs.values()) // 2})
 
     def hold(self, boxes: dict[int, Box]) -> HeldSlices:
         """Upload the slices that the labels need, and find which samples are inside of which label."""
         device, stopwatch = self.device, self.stopwatch
         resident = self.resident
         first, end = self.slices_for(boxes)
-        check_budget(device, self.needs(first, end), resident.memory)
+        ocl.check_budget(device, self.needs(first, end), resident.memory)
         label_program, _ = self.programs()
         is_whole = end - first == self.volume.shape_ijk[2] and resident.is_held
         voxels_d = resident.whole(stopwatch) if is_whole else resident.part(first, end, stopwatch)
         labels = self.labels[first:end]
         near = self.growth.table
         with stopwatch.timed("upload"):
-            labels_d = upload(device, labels)
-            near_d = upload(device, near if len(near) else np.zeros((1, 4), np.int32))
-        inside_d = allocate(device, labels.nbytes)
+            labels_d = ocl.upload(device, labels)
+            near_d = ocl.upload(device, near if len(near) else np.zeros((1, 4), np.int32))
+        inside_d = ocl.allocate(device, labels.nbytes)
         with stopwatch.running(device):
-            launch(
+            ocl.launch(
                 device, label_program["own_samples"], labels.size, voxels=voxels_d, labels=labels_d, near=near_d,
                 inside=inside_d, level=self.level, nk=labels.shape[0], nj=labels.shape[1], ni=labels.shape[2],
                 offsets=len(near),
@@ -262,11 +251,11 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
         inside = np.zeros(self.labels.shape, dtype=self.labels.dtype)
         part = inside[first:end]
         with self.stopwatch.timed("download"):
-            download(self.device, part, inside_d)
+            ocl.download(self.device, part, inside_d)
         for number, box in boxes.items():
             fill_solid(inside, self.labels, number, box, self.rule.closed)
         with self.stopwatch.timed("upload"):
-            return upload(self.device, part)
+            return ocl.upload(self.device, part)
 
     def extract_one(self, slab: HeldSlices, number: int, box: Box) -> Part | None:
         """Return positions, normals and triangles of one label, None if no sample is inside of it."""
@@ -274,9 +263,9 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
         label_program, surface = self.programs()
         window = self.window(box, (slab.first, slab.end))
         classified = self.empty_mask(window)
-        half_way_d = allocate(device, 4)
+        half_way_d = ocl.allocate(device, 4)
         with stopwatch.running(device):
-            launch(
+            ocl.launch(
                 device, label_program["classify_label"], window.mask_rows, inside=slab.inside_d, mask=classified.mask_d,
                 row_extents=classified.row_extents_d, half_way_count=half_way_d, label=number, **window.arguments,
             )  # fmt: skip
@@ -287,7 +276,7 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
         part = marching_cubes.Emission(
             device, window, surface, slab.voxels_d, classified, counted, self.placement, stopwatch
         ).run(inside=slab.inside_d, label=number, half_way_count=half_way_d)
-        half_way = int(download(device, np.empty(1, np.uint32), half_way_d)[0])
+        half_way = int(ocl.download(device, np.empty(1, np.uint32), half_way_d)[0])
         self.share_by_hu = 1.0 - half_way / counted.vertices
         return part
 

@@ -10,21 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from clrecon import opencl as ocl
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import layer_margins, layer_normal_matrices, slice_normal_matrices, vertex_margin
 from clrecon.geometry.vertices import find_vertex_origin
-from clrecon.opencl import (
-    Device,
-    Program,
-    Stopwatch,
-    allocate,
-    download_all,
-    empty_output,
-    launch,
-    load_program,
-    upload,
-)
+from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.masks.voxel_mask import prepare_classify
 from clrecon.operators.primitives.scan import enqueue_scan, prepare_scan
 from clrecon.operators.resident.tables import BrickStates, label_variants, voxel_variants
@@ -36,7 +27,7 @@ from clrecon.system.light_dataclass import dataclass
 def load_cells(device: Device, *, grown: bool = False) -> Program:
     """Build the kernels, which are the same for every type of voxels; with `grown`, those for parts of a surface."""
     variants = {**device.kernel_variants, "GROWN": "1"} if grown else device.kernel_variants
-    return load_program(device, "surface/cells.cl", variants)
+    return ocl.load_program(device, "surface/cells.cl", variants)
 
 
 @dataclass(frozen=True)
@@ -91,10 +82,10 @@ def count(device: Device, slab: Slab, classified: Classified, voxels_d: Any = No
     grid, rows = slab.grid, slab.counted_rows
     program = load_cells(device, grown=classified.is_part)
     gi, gj, _ = grid.shape
-    row_counts_d = allocate(device, 12 * rows)
-    word_vertices_d, word_triangles_d = (allocate(device, 2 * rows * grid.words) for _ in range(2))
-    flags_d = allocate(device, 4 * rows * grid.flag_words)
-    launch(
+    row_counts_d = ocl.allocate(device, 12 * rows)
+    word_vertices_d, word_triangles_d = (ocl.allocate(device, 2 * rows * grid.words) for _ in range(2))
+    flags_d = ocl.allocate(device, 4 * rows * grid.flag_words)
+    ocl.launch(
         device, program["count_rows"], rows,
         mask=classified.mask_d, row_extents=classified.row_extents_d, row_counts=row_counts_d,
         words_with_work=flags_d, word_vertices=word_vertices_d, word_triangles=word_triangles_d,
@@ -105,20 +96,20 @@ def count(device: Device, slab: Slab, classified: Classified, voxels_d: Any = No
     if grid.rule.topology == "trilinear":
         cells = count_cells(device, slab, voxels_d, classified.mask_d, flags_d, row_counts_d, word_triangles_d)
     total_d = enqueue_scan(device, row_counts_d, row_counts_d, 3 * rows)
-    totals_d = allocate(device, 12)
-    launch(
+    totals_d = ocl.allocate(device, 12)
+    ocl.launch(
         device, program["total_counts"], 1,
         row_offsets=row_counts_d, total=total_d, totals=totals_d, rows=slab.rows, rows_to_count=rows,
     )  # fmt: skip
     totals, total = np.empty(3, np.uint32), np.empty(1, np.uint64)
-    download_all(device, (totals, totals_d, 0), (total, total_d, 0))
+    ocl.download_all(device, (totals, totals_d, 0), (total, total_d, 0))
     if total[0] >= 2**32:
         raise DeviceMemoryError(
             f"a slab of {slab.slices} slices has {total[0]:,} vertices and triangles: more than 32 bits can number"
         )
     vertices, triangles, active = (int(n) for n in totals)
-    active_words_d = allocate(device, 4 * active)
-    launch(
+    active_words_d = ocl.allocate(device, 4 * active)
+    ocl.launch(
         device, program["list_words"], slab.rows,
         words_with_work=flags_d, row_offsets=row_counts_d, active_words=active_words_d, rows=slab.rows,
         rows_to_count=rows, flag_words=grid.flag_words, row_shift=grid.row_shift,
@@ -163,7 +154,7 @@ def prepare_marching_cubes(
         variants["UNEVEN"] = "1"
     if vertex_rule != "linear":
         variants[vertex_rule.upper().replace("-", "_")] = "1"
-    return load_program(device, "surface/marching_cubes.cl", variants)
+    return ocl.load_program(device, "surface/marching_cubes.cl", variants)
 
 
 def pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -220,18 +211,18 @@ def classify(
     bricks: The comparison of the volume's bricks with the only level, if the slab is the whole volume.
     """
     program = prepare_classify(device, slab.grid.volume.voxels.dtype, slab.grid.rule.inside)
-    mask_d = allocate(device, 4 * slab.mask_rows * slab.grid.words)
-    row_extents_d = allocate(device, 4 * slab.mask_rows)
+    mask_d = ocl.allocate(device, 4 * slab.mask_rows * slab.grid.words)
+    row_extents_d = ocl.allocate(device, 4 * slab.mask_rows)
     if bricks is not None:
         (ni, nj, nk), border = slab.grid.volume.shape_ijk, slab.grid.rule.border
-        launch(
+        ocl.launch(
             device, program["classify_bricks"], slab.mask_rows,
             word_states=bricks.states_d, word_extents=bricks.extents_d, voxels=voxels_d, mask=mask_d,
             row_extents=row_extents_d, level=levels[0], ni=ni, nj=nj, nk=nk, border=border, words=slab.grid.words,
         )  # fmt: skip
         return Classified(mask_d, row_extents_d)
     bounds = {"level": levels[0]} if len(levels) == 1 else {"level": levels[0], "highest": levels[1]}
-    launch(
+    ocl.launch(
         device, program["classify_samples"], slab.mask_rows,
         voxels=voxels_d, mask=mask_d, row_extents=row_extents_d, **bounds, **slab.arguments,
     )  # fmt: skip
@@ -256,11 +247,11 @@ class Emission:
         self._program, self._stopwatch = program, stopwatch
         self._voxels_d, self._classified = voxels_d, classified
         self._counted, self._placement = counted, placement
-        self.frames_d = upload(device, placement.slice_frames[slab.first : slab.first + slab.mask_slices])
-        self.steps_d = upload(device, placement.steps)
-        self._positions, self.positions_d = empty_output(device, (counted.vertices, 3), np.float32)
-        self._normals, self.normals_d = empty_output(device, (counted.vertices, 3), np.float32)
-        self._triangles, self.triangles_d = empty_output(device, (counted.triangles, 3), np.uint32)
+        self.frames_d = ocl.upload(device, placement.slice_frames[slab.first : slab.first + slab.mask_slices])
+        self.steps_d = ocl.upload(device, placement.steps)
+        self._positions, self.positions_d = ocl.empty_output(device, (counted.vertices, 3), np.float32)
+        self._normals, self.normals_d = ocl.empty_output(device, (counted.vertices, 3), np.float32)
+        self._triangles, self.triangles_d = ocl.empty_output(device, (counted.triangles, 3), np.uint32)
         self._common = {
             "mask": classified.mask_d,
             "active_words": counted.active_words_d,
@@ -277,7 +268,7 @@ class Emission:
             return
         rule = self._slab.grid.rule
         upper = {} if rule.upper_level is None else {"upper_level": rule.upper_level, "highest": rule.highest_inside}
-        launch(
+        ocl.launch(
             self._device, self._program["emit_vertices"], self._items,
             voxels=self._voxels_d, **self.tables, positions=self.positions_d, normals=self.normals_d,
             iso_level=iso_level, outside=rule.outside, value_scale=rule.value_scale,
@@ -296,7 +287,7 @@ class Emission:
         slab, counted = self._slab, self._counted
         gi, gj, _ = slab.grid.shape
         program = load_cells(self._device, grown=self._classified.is_part)
-        launch(
+        ocl.launch(
             self._device, program["emit_triangles"], self._items,
             word_triangles=counted.word_triangles_d, triangles=self.triangles_d, first_vertex=first_vertex,
             rows_to_count=slab.counted_rows, gi=gi, gj=gj, gk=slab.mask_slices, words=slab.grid.words,
@@ -319,7 +310,7 @@ class Emission:
 
     def download(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
         with self._stopwatch.timed("download"):
-            download_all(
+            ocl.download_all(
                 self._device, (self._positions, self.positions_d, 0), (self._normals, self.normals_d, 0),
                 (self._triangles, self.triangles_d, 0),
             )  # fmt: skip

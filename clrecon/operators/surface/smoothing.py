@@ -9,23 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon import opencl as ocl
 from clrecon.mesh import Mesh
 from clrecon.mesh.refine import smoothing
 from clrecon.mesh.refine.smoothing import Filter, Rings, Term
-from clrecon.opencl import (
-    Device,
-    Program,
-    describe_shortage,
-    download,
-    download_all,
-    empty_output,
-    launch,
-    load_program,
-    memory_limits,
-    take_device,
-    upload,
-    with_fallback,
-)
+from clrecon.opencl import Device, Program
 from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.operators.primitives.union_find import label_components
 from clrecon.operators.surface.decimation import find_crossings
@@ -36,7 +24,7 @@ Float32Array = NDArray[np.float32]
 
 
 def prepare_smoothing(device: Device) -> Program:
-    return load_program(device, "surface/smoothing.cl")
+    return ocl.load_program(device, "surface/smoothing.cl")
 
 
 class DeviceFilter(Filter):
@@ -46,13 +34,13 @@ class DeviceFilter(Filter):
         super().__init__(rings)
         self._device, self._count = device, len(rings.weights)
         needs = {"vertices and their steps": 4 * 16 * self._count, "corners": 8 * len(rings.after) + 8 * self._count}
-        self._fits = self._count > 0 and not describe_shortage(memory_limits(device), needs)
+        self._fits = self._count > 0 and not ocl.describe_shortage(ocl.memory_limits(device), needs)
 
     @cached_property
     def _corners(self) -> dict[str, Any]:
         rings = self._rings
         arrays = {"begin": rings.begin, "after": rings.after, "before": rings.before, "weights": rings.weights}
-        return {name: upload(self._device, array) for name, array in arrays.items()}
+        return {name: ocl.upload(self._device, array) for name, array in arrays.items()}
 
     def label(self, triangles: NDArray[np.uint32]) -> tuple[int, NDArray[np.int64]]:
         return label_components(self._device, triangles, self._count) if self._fits else super().label(triangles)
@@ -61,28 +49,28 @@ class DeviceFilter(Filter):
         if not self._fits:
             return super().measure_bends(places)
         device, count = self._device, self._count
-        (bends, bends_d), (normals, normals_d) = (empty_output(device, (count, 4), np.float32) for _ in range(2))
-        launch(
+        (bends, bends_d), (normals, normals_d) = (ocl.empty_output(device, (count, 4), np.float32) for _ in range(2))
+        ocl.launch(
             device, prepare_smoothing(device)["measure_bends"], count,
-            places=upload(device, _padded(places)), **self._corners, bends=bends_d, normals=normals_d, count=count,
+            places=ocl.upload(device, _padded(places)), **self._corners, bends=bends_d, normals=normals_d, count=count,
         )  # fmt: skip
-        download_all(device, (bends, bends_d, 0), (normals, normals_d, 0))
+        ocl.download_all(device, (bends, bends_d, 0), (normals, normals_d, 0))
         return bends[:, :3], normals[:, :3]
 
     def find_steps(self, bends: Float32Array, terms: Sequence[Term]) -> Float32Array:
         if not self._fits:
             return super().find_steps(bends, terms)
         device, count = self._device, self._count
-        kernel, bends_d = prepare_smoothing(device)["filter_bends"], upload(device, _padded(bends))
+        kernel, bends_d = prepare_smoothing(device)["filter_bends"], ocl.upload(device, _padded(bends))
         later_d, sums_d = (zero_words(device, 4 * count) for _ in range(2))
         corners = {name: self._corners[name] for name in ("begin", "after", "weights")}
         for factor, share in terms:
-            launch(
+            ocl.launch(
                 device, kernel, count, bends=bends_d, later=later_d, **corners, sums=sums_d,
                 factor=factor, share=share, count=count,
             )  # fmt: skip
             later_d, sums_d = sums_d, later_d
-        return download(device, np.empty((count, 4), np.float32), later_d)[:, :3]
+        return ocl.download(device, np.empty((count, 4), np.float32), later_d)[:, :3]
 
 
 def _padded(vectors: Float32Array) -> Float32Array:
@@ -143,7 +131,7 @@ def smooth_mesh(
     """
     if device is None:
         return smoothing.smooth_mesh(mesh, iterations, max_deviation_mm, progress=progress)
-    for attempt in with_fallback(take_device(device)):
+    for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, _):
             smooth = smoothing.smooth_mesh(
                 mesh, iterations, max_deviation_mm, progress=progress, make_filter=partial(DeviceFilter, current),

@@ -96,10 +96,10 @@ def test_the_passes_equal_their_twins(device, form):
     search.note_words()
     cores = twin.cluster_points(points, 0.9, 3)[2][grid.order]
     labels = twin.join_chunks(grid, cores, 0.9 * (1 + 1e-6), 64)
-    found = module.download(device, np.empty(len(labels), np.uint32), search.labels_d)
+    found = module.ocl.download(device, np.empty(len(labels), np.uint32), search.labels_d)
     assert np.array_equal(found, labels)
     roots = twin.note_words(grid, labels)
-    assert np.array_equal(module.download(device, np.empty(len(roots), np.uint32), search.roots_d), roots)
+    assert np.array_equal(module.ocl.download(device, np.empty(len(roots), np.uint32), search.roots_d), roots)
     assert (roots == twin.SEVERAL_ROOTS).any()
 
 

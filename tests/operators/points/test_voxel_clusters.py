@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from uneven_volume import uneven
 from variants import VOXEL_TYPES, daily, daily_rows
 
 import clrecon
+from clrecon import opencl
 from clrecon.errors import DeviceError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.operators.masks.voxel_mask import checked_band, mark_band
@@ -327,7 +329,8 @@ def test_volumes_over_the_memory_give_the_same_labels(device):
 
 
 def test_memory_is_refused_before_it_is_taken(device, monkeypatch):
-    monkeypatch.setattr(voxel_clusters, "allocate", lambda *_: pytest.fail("memory was taken"))
+    no_memory = {**vars(opencl), "allocate": lambda *_: pytest.fail("memory was taken")}
+    monkeypatch.setattr(voxel_clusters, "ocl", SimpleNamespace(**no_memory))
     with refused(DeviceMemoryError, "mask", "core", 2000):
         cluster_points(voxel_cloud(Volume(noise((6, 9, 70), 0.3), FINE)), device=device, memory=2000)
 

@@ -153,7 +153,7 @@ def test_vertices_that_are_not_there_are_refused(device):
 
 def test_too_little_memory_is_said_before_it_is_taken(device, monkeypatch):
     monkeypatch.setattr(device, "memory_bytes", 16_000)
-    monkeypatch.setattr(components, "allocate", lambda *_: pytest.fail("memory was taken"))
+    monkeypatch.setattr(components.ocl, "allocate", lambda *_: pytest.fail("memory was taken"))
     with refused(DeviceMemoryError, "component", "offsets", 16000):
         label_components(device, soup(1000, 10), 1000)
     monkeypatch.setattr(device, "memory_bytes", 17_000)

@@ -261,7 +261,7 @@ def test_bytes_a_pixel_are_those_of_the_buffers(device: Any, monkeypatch: pytest
 
         return call
 
-    for module, names in ((scene, ("allocate", "upload", "empty_output")), (mesh_pictures, ("allocate",))):
+    for module, names in ((scene.ocl, ("allocate", "upload", "empty_output")), (mesh_pictures, ("allocate",))):
         for name in names:
             monkeypatch.setattr(module, name, counted(getattr(module, name), name))
 

@@ -178,11 +178,11 @@ def test_the_trial_run_launches_the_kernels_of_the_cortex(labels, device, monkey
         launched.add(kernel.name)
         launch(opened, kernel, *more, **arguments)
 
-    for module in (cortex, decimation):
+    for module in (cortex, decimation.ocl):
         monkeypatch.setattr(module, "launch", note)
     choice = LabelChoice("labels.nii.gz") if labels else None
     _try_steps(device, MeshSettings(surface="cortex", labels=choice))
-    assert launched == {"sample_profiles", "fit_profiles", "enter_triangles", "mark_crossings"}
+    assert {"sample_profiles", "fit_profiles", "enter_triangles", "mark_crossings"} <= launched
 
 
 def test_a_print_lies_on_the_bone(shell, tmp_path, printed):

@@ -71,6 +71,6 @@ def test_a_device_without_room_leaves_it_to_the_host(device, monkeypatch):
     vertices, triangles = samples.sphere((0, 0, 0), 20.0, 3)
     mesh = Mesh(rough(vertices), triangles)
     expected = clrecon.smooth_mesh(mesh, 5, 0.25, device=device)
-    monkeypatch.setattr(smoothing, "describe_shortage", lambda *_: "no room")
-    monkeypatch.setattr(smoothing, "launch", None)
+    monkeypatch.setattr(smoothing.ocl, "describe_shortage", lambda *_: "no room")
+    monkeypatch.setattr(smoothing.ocl, "launch", None)
     np.testing.assert_array_equal(clrecon.smooth_mesh(mesh, 5, 0.25, device=device).vertices, expected.vertices)

@@ -112,7 +112,7 @@ def test_growth_is_that_of_the_twin_to_the_last_sample(device, grow_mm):
             taken = resample_labels(LabelMap(labels, affine), volume)
             run = operator.LabelExtraction(DeviceVolume(volume, device=device), taken, rule, growth, False, [])
             held = run.hold({1: (slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2]))})
-            inside = operator.download(device, np.empty_like(taken.voxels), held.inside_d)
+            inside = operator.ocl.download(device, np.empty_like(taken.voxels), held.inside_d)
             assert np.array_equal(inside, twin.find_solid(volume, labels, 3, grow_mm=grow_mm))
 
 
@@ -166,9 +166,8 @@ def test_labels_that_do_not_fit_together_go_through_one_by_one(device, monkeypat
     volume, labels = random_volume(shape), np.zeros(shape, np.uint16)
     labels[:6], labels[28:31], labels[55:] = 3, 7, 9
     expected = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, solid=True)
-    uploads, true_upload = [], operator.upload
-    for module in (operator, device_volume):
-        monkeypatch.setattr(module, "upload", lambda d, a: uploads.append(a.shape) or true_upload(d, a))
+    uploads, true_upload = [], device_volume.ocl.upload
+    monkeypatch.setattr(device_volume.ocl, "upload", lambda d, a: uploads.append(a.shape) or true_upload(d, a))
     meshes = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, solid=True, memory=500_000)
     assert sum(len(shape) == 3 and shape[1:] == (40, 40) for shape in uploads) == 9  # three for each label
     for number, mesh in meshes.items():

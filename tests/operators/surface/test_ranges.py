@@ -231,7 +231,7 @@ def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
     def find_nothing(device, slab, *_):
         mask = np.zeros(slab.mask_rows * slab.grid.words, np.uint32)
         extents = np.zeros(2 * slab.mask_rows, np.uint16)
-        return marching_cubes.Classified(*(marching_cubes.upload(device, array) for array in (mask, extents)))
+        return marching_cubes.Classified(*(marching_cubes.ocl.upload(device, array) for array in (mask, extents)))
 
     monkeypatch.setattr(marching_cubes, "classify", find_nothing)
     with refused(DeviceError, "computes", 2, 3):

@@ -141,7 +141,7 @@ def test_the_forecast_is_what_then_happens(device):
 
 
 def test_a_budget_for_less_than_a_slice_is_refused_before_anything_is_allocated(device, monkeypatch):
-    monkeypatch.setattr(device_volume, "upload", lambda *_: pytest.fail("allocated"))
+    monkeypatch.setattr(device_volume.ocl, "upload", lambda *_: pytest.fail("allocated"))
     with refused(DeviceError, 10000, "room"):
         extract_isosurface(smooth_volume((40, 60, 70)), 100, device=device, memory=10_000)
 
@@ -181,7 +181,7 @@ def test_memory_that_runs_out_late_halves_the_slab(device, monkeypatch, fails):
     """The driver says at the n-th allocation that there is no more: smaller slabs, a warning, the same mesh."""
     volume = smooth_volume((24, 30, 40))
     expected = extract_isosurface(volume, 100, device=device)
-    true_allocate, calls = cells.allocate, []
+    true_allocate, calls = marching_cubes.ocl.allocate, []
 
     def allocate(*arguments):
         calls.append(1)
@@ -189,8 +189,7 @@ def test_memory_that_runs_out_late_halves_the_slab(device, monkeypatch, fails):
             raise DeviceMemoryError("no room for 1 byte")
         return true_allocate(*arguments)
 
-    monkeypatch.setattr(marching_cubes, "allocate", allocate)
-    monkeypatch.setattr(cells, "allocate", allocate)
+    monkeypatch.setattr(marching_cubes.ocl, "allocate", allocate)
     mesh = extract_isosurface(volume, 100, device=device)
     assert mesh.report["slabs"] == 2
     assert mesh.report["warnings"][-1] == "no room for 1 byte: continued with slabs of 13 slices"
@@ -201,8 +200,7 @@ def test_memory_that_never_suffices_is_an_error_in_the_end(device, monkeypatch):
     def allocate(*_):
         raise DeviceMemoryError("no room for 1 byte")
 
-    monkeypatch.setattr(marching_cubes, "allocate", allocate)
-    monkeypatch.setattr(cells, "allocate", allocate)
+    monkeypatch.setattr(marching_cubes.ocl, "allocate", allocate)
     with refused(DeviceError, 1, "room"):
         extract_isosurface(smooth_volume((9, 10, 11)), 100, device=device)
 
