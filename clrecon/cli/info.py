@@ -111,7 +111,8 @@ def _describe_thickness(thickness: dict[str, Any], usual_gap: float) -> str:
         return f"{text}: neighbouring slices touch"
     percent = thickness["overlap_percent"]
     share = "" if percent is None else f" ({abs(percent):.0f} % of the gap)"
-    return f"{text}: {_overlap(overlap, usual_gap)} between neighbouring slices{share}"
+    between = f"{overlap:.3g} mm overlap" if overlap > 0.0 else f"{-overlap:.3g} mm not measured"
+    return f"{text}: {between} between neighbouring slices{share}"
 
 
 def _overlaps(least: float, most: float, nothing: float) -> str:
@@ -122,12 +123,6 @@ def _overlaps(least: float, most: float, nothing: float) -> str:
     if most <= 0.0:
         return f"{abs(most):.3g} to {-least:.3g} mm between neighbouring slices are not measured"
     return f"neighbouring slices overlap by up to {most:.3g} mm, or up to {-least:.3g} mm between them are not measured"
-
-
-def _overlap(length: float, usual_gap: float) -> str:
-    if abs(length) <= _SAME * usual_gap:
-        return "nothing"
-    return f"{length:.3g} mm overlap" if length > 0.0 else f"{-length:.3g} mm not measured"
 
 
 def _describe_values(of: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -154,10 +149,6 @@ def _describe_gates(gates: list[dict[str, Any]]) -> Iterator[tuple[str, str]]:
     yield "gates", text + (f", not measured: {', '.join(unknown)}" if unknown else "")
     for gate in failed:
         yield "FAILED", f"{gate['name']}: {gate['text']}"
-
-
-def _format_lengths(lengths: list[float], form: str) -> str:
-    return " x ".join(f"{length:{form}}" for length in lengths)
 
 
 def _span(ends: list[float]) -> str:
@@ -244,10 +235,10 @@ def _columns(entries: Sequence[dict[str, Any]], chosen: int | None) -> Iterator[
     yield _Column("slices", [str(entry["slices"]) for entry in entries], right=True)
     if any(entry["phases"] for entry in entries):
         yield _Column("phases", [str(len(entry["phases"]) or "-") for entry in entries], right=True)
-    matrix = [_format_known_lengths(entry["shape_ijk"] and entry["shape_ijk"][:2], "d") for entry in entries]
+    matrix = [_format_lengths(entry["shape_ijk"] and entry["shape_ijk"][:2], "d") for entry in entries]
     yield _Column("matrix", matrix, left_out=5)
-    yield _Column("spacing mm", [_format_known_lengths(entry["spacing_mm"], ".4g") for entry in entries])
-    yield _Column("extent mm", [_format_known_lengths(entry["extent_mm"], ".0f") for entry in entries], left_out=1)
+    yield _Column("spacing mm", [_format_lengths(entry["spacing_mm"], ".4g") for entry in entries])
+    yield _Column("extent mm", [_format_lengths(entry["extent_mm"], ".0f") for entry in entries], left_out=1)
     thickness = [entry["slice_thickness_mm"] for entry in entries]
     yield _Column("thick", ["-" if t is None else f"{t:.4g}" for t in thickness], left_out=2, right=True)
     tilts = ["-" if entry["tilt_deg"] is None else _format_tilt(entry["tilt_deg"]) for entry in entries]
@@ -265,7 +256,7 @@ def _format_tilt(degrees: float) -> str:
     return f"{degrees:+.2f}" if round(degrees, 2) else "0"
 
 
-def _format_known_lengths(lengths: Sequence[float] | None, form: str) -> str:
+def _format_lengths(lengths: Sequence[float] | None, form: str) -> str:
     return " x ".join(f"{length:{form}}" for length in lengths) if lengths else "-"
 
 

@@ -7,6 +7,8 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from clrecon.errors import OutputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.jobs.mesh.job import make_mesh
@@ -108,8 +110,6 @@ def _choose_look(device: str) -> RenderSettings:
 
 def check_sphere(device: Device) -> dict[str, Any]:
     """Mesh a sphere in an anisotropic, tilted, oblique volume; return its largest ``radius_error_max_mm`` too."""
-    import numpy as np
-
     from clrecon.operators.surface.extract import extract_isosurface
 
     settings = PhantomSettings(

@@ -10,6 +10,8 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from clrecon.anatomy.surroundings import leave_outside_air
 from clrecon.errors import DeviceFailedError, NoSurfaceError, UsageError
 from clrecon.geometry import frame_from_lps
@@ -103,8 +105,6 @@ def _remember_filled(volume: Volume, solid: Volume) -> Callable[[Sequence[Mesh]]
     """Return what makes slices of a solid volume again: one bit a voxel, while meshes need the memory of a volume."""
     if solid is volume:
         return lambda meshes: volume
-    import numpy as np
-
     from clrecon.opencl import result_pages
 
     places = [np.packbits(own != layer) for own, layer in zip(solid.voxels, volume.voxels, strict=True)]
@@ -395,8 +395,6 @@ def label_parts(mesh: Mesh, device: Device, settings: MeshSettings) -> Labelled:
 
 def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings, device: Device) -> list[str]:
     """Return a warning for each measured mesh of many small components, which names the option that drops them."""
-    import numpy as np
-
     from clrecon.mesh.refine.shifts import enclosed_mm3
 
     warnings = []

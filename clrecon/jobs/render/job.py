@@ -10,6 +10,8 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from clrecon.anatomy.head import SKIN_SEEN_HU, warn_of_face
 from clrecon.anatomy.surroundings import LEFT_OUT, leave_out_surroundings
 from clrecon.errors import UsageError
@@ -66,8 +68,6 @@ def describe_camera(camera: Camera | None) -> dict[str, Any] | None:
 
 def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]:
     """Make one entry of ``pictures``, without the files; ranges are None for a picture without values or hits."""
-    import numpy as np
-
     report = picture.report
     values = None if picture.values is None else _range(picture.values[np.isfinite(picture.values)])
     is_water = picture.mode == "drr"
@@ -104,8 +104,6 @@ _NOUNS = {"points": "cloud", "mesh": "mesh"}
 
 
 def find_emptiness(picture: Rendering) -> str | None:
-    import numpy as np
-
     values = None if picture.values is None else picture.values[np.isfinite(picture.values)]
     if values is None or not values.size:
         if np.isfinite(picture.depth).any():
@@ -263,8 +261,6 @@ def _describe_labels(look: LabelLook | None, labels: LabelMap | None) -> list[di
 
 def _skin_shown(style: Style) -> list[float]:
     """Return the HU of the skin that a picture shows: the level of a surface, or where a volume is not transparent."""
-    import numpy as np
-
     if isinstance(style, SurfaceLook):
         return [style.iso_value]
     if not isinstance(style, VolumeLook):
@@ -371,8 +367,6 @@ def _leave_out_surroundings(volume: Volume, settings: RenderSettings, device: De
 
 def _try_picture(device: Device, settings: RenderSettings) -> None:
     """Build the kernels, of volumes those for int16, by taking a small picture of an empty volume or of one point."""
-    import numpy as np
-
     mode = "slice" if settings.mode == "cpr" else settings.mode  # the same kernel, and no curve is needed
     subject: Volume | PointCloud | Mesh
     if mode == "mesh":

@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -271,13 +271,7 @@ def choose_camera(volume: Volume, box: NDArray[np.float64]) -> dict[str, Any]:
     low, high = box
     ends = np.stack([low - 1.0, high + 1.0])
     places = volume.ijk_to_lps([[ends[bit >> axis & 1, axis] for axis in range(3)] for bit in range(8)])
-    camera = Camera.fit(box_around([places]), VIEW, size=SIZE)
-    return {
-        "position": list(camera.position),
-        "focal_point": list(camera.focal_point),
-        "up": list(camera.up),
-        "parallel_scale": camera.parallel_scale,
-    }
+    return asdict(Camera.fit(box_around([places]), VIEW, size=SIZE))
 
 
 def compare_pictures(pictures: Mapping[str, Image], reference: str) -> dict[str, dict[str, float]]:

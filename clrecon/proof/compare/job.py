@@ -243,10 +243,8 @@ def _refuse_nothing(rows: dict[str, dict[str, Any]]) -> None:
 def _measure_methods(
     rows: dict[str, dict[str, Any]], figures: Figures, settings: CompareSettings, truth: str | None, progress: Progress
 ) -> dict[str, dict[str, Any]]:
-    sizes = {
-        name: int(each["triangles"] or each["points"] or 0) for name, each in rows.items() if each["state"] == "done"
-    }
-    sizes = {name: size for name, size in sizes.items() if size}
+    done = {name: each for name, each in rows.items() if each["state"] == "done"}
+    sizes = {name: size for name, each in done.items() if (size := int(each["triangles"] or each["points"] or 0))}
     asked = {
         "folder": str(figures.work),
         "reference": settings.reference if settings.reference in sizes else None,

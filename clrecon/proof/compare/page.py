@@ -14,7 +14,7 @@ from string import Template
 from typing import Any
 
 from clrecon.proof.compare.child import LONG_SECONDS
-from clrecon.proof.compare.figures import COLORS, PAPER, Figures, embed
+from clrecon.proof.compare.figures import COLORS, Figures, embed
 from clrecon.proof.compare.findings import CompareReport, MethodRecord, join, seconds, share
 from clrecon.proof.compare.records import ALL_PARTS
 from clrecon.proof.compare.table import main_table, paper_table, shown_columns, small_table
@@ -255,7 +255,7 @@ def _facts(report: CompareReport) -> list[tuple[str, str]]:
     region = (report.volume.get("region") or {}).get("rules")
     spacing = " x ".join(f"{step:.4g}" for step in report.spacing_mm)
     versions = ", ".join(f"{name} {version}" for name, version in report.versions.items())
-    facts = [
+    return [
         ("Voxels", f"{' x '.join(map(str, report.shape_ijk))}, spacing {spacing} mm"),
         ("Level", f"{report.iso_value_hu:g} HU: {report.iso_value_reason}"),
         ("Region", " and ".join(region) if region else "the whole scan"),
@@ -264,7 +264,6 @@ def _facts(report: CompareReport) -> list[tuple[str, str]]:
         ("Versions", versions),
         ("Date", report.date),
     ]
-    return facts
 
 
 def _findings(report: CompareReport) -> str:
@@ -372,7 +371,7 @@ def _paper(report: CompareReport) -> str:
         if black
         else "."
     )
-    printed = "Seconds in the last column are those of the paper, on its own machine and scan." if PAPER else ""
+    printed = "Seconds in the last column are those of the paper, on its own machine and scan."
     return f'<p>{escape(caption)}</p>\n{paper_table(report)}\n<p class="note">{printed}</p>'
 
 
@@ -385,8 +384,7 @@ def _definitions(report: CompareReport) -> str:
         (
             "read, draw",
             "Seconds of reading the input, which is the same for all, and of drawing the picture on the device; both"
-            " are"
-            " in the bars alone.",
+            " are in the bars alone.",
         )
     )
     if any(record.small and record.small["scaled_s"] for record in report.methods):

@@ -179,6 +179,7 @@ def _row(
         state = "not installed" if record.state == "missing" else record.state
         words = f"{state}: {escape(record.error or '')}"
         return f'<tr class="failed">{name}<td colspan="{len(columns) + 1}">{words}</td></tr>'
+    is_reference = reference is not None and record.name == reference.name
     cells = []
     for column, best in zip(columns, bests, strict=True):
         value = column.take(record)
@@ -187,14 +188,11 @@ def _row(
             continue
         text = column.write(value)
         more = _more(column, record)
-        is_own = column.head in _AGAINST and reference is not None and record.name == reference.name
+        is_own = column.head in _AGAINST and is_reference
         is_best = record.makes == "mesh" and best is not None and text == best and not is_own
         mark = ' class="best"' if is_best else ""
         cells.append(f"<td{mark}>{text}{more}</td>")
-    is_reference = reference is not None and record.name == reference.name
     words = "the reference" if is_reference else "; ".join(find_worse(record, reference))
-    if not record.is_done or reference is None:
-        words = ""
     missing = "; ".join(f"{name}: {reason}" for name, reason in record.reasons.items())
     words += f"<small>{escape(missing)}</small>" if missing else ""
     return f'<tr{kind}>{name}{"".join(cells)}<td class="words">{words or "nothing"}</td></tr>'

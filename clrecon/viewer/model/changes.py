@@ -78,16 +78,14 @@ def shift_camera(camera: Camera, shift: Float64Array, **changes: Any) -> Camera:
 def pan_camera(camera: Camera, dx: float, dy: float) -> Camera:
     """Shift what is seen by shares of the picture's height, at the focal point."""
     right, up, _ = camera.basis()
-    height = _height_mm(camera)
-    shift = height * (dy * up - dx * right)
-    return shift_camera(camera, shift)
+    return shift_camera(camera, height_mm(camera) * (dy * up - dx * right))
 
 
 def zoom_camera(camera: Camera, factor: float, point: tuple[float, float] = (0.0, 0.0)) -> Camera:
     """Show everything `factor` times as large; what is seen at a place, in heights from the middle, stays there."""
     if not (math.isfinite(factor) and factor > 0.0):
         raise UsageError(f"the factor of a zoom is a number above 0, not {factor!r}")
-    before = _height_mm(camera)
+    before = height_mm(camera)
     height = min(2.0 * _MOST_MM, max(2.0 * _LEAST_MM, before / factor))
     if camera.is_parallel:
         nearer = replace(camera, parallel_scale=0.5 * height)
@@ -112,7 +110,7 @@ def pixel_camera(camera: Camera, size: tuple[int, int], x: float, y: float) -> C
     return replace(camera, focal_point=as_point(camera.position + camera.distance * along), view_angle=angle)
 
 
-def _height_mm(camera: Camera) -> float:
+def height_mm(camera: Camera) -> float:
     return 2.0 * camera.half_height() * (1.0 if camera.is_parallel else camera.distance)
 
 

@@ -20,7 +20,7 @@ from clrecon.rendering.views.directions import as_point, checked_vector, default
 from clrecon.rendering.views.reformation import PLANES
 from clrecon.system.arguments import Space
 from clrecon.system.text import format_hu, unknown_name
-from clrecon.viewer.model.changes import ChangingView, checked_numbers, fit_camera, plane_step
+from clrecon.viewer.model.changes import ChangingView, checked_numbers, fit_camera, height_mm, plane_step
 from clrecon.viewer.model.objects import (
     ShownLabels,
     ShownObject,
@@ -310,9 +310,7 @@ class ViewModel(ChangingView):
                 "focal_point": list(state.camera.focal_point),
                 "up": list(state.camera.up),
                 "parallel": state.camera.is_parallel,
-                "height_mm": 2.0
-                * state.camera.half_height()
-                * (1.0 if state.camera.is_parallel else state.camera.distance),
+                "height_mm": height_mm(state.camera),
             },
             "undo": self._undo[-1][1] if self._undo else None,
             "notes": notes,

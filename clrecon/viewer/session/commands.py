@@ -68,12 +68,12 @@ def _or_none(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 @dataclass(frozen=True)
 class Command:
-    """A command, with the checks of its arguments; `call` gets the session and these, and may return further facts."""
+    """A command: the checks of its arguments, and the method of a session that gets these ("undo", "model.turn")."""
 
     words: str
     needs: Mapping[str, Callable[[Any], Any]]
     takes: Mapping[str, Callable[[Any], Any]]
-    call: Callable[..., Any]
+    method: str
 
 
 COMMANDS: dict[str, Command] = {}
@@ -82,17 +82,11 @@ COMMANDS: dict[str, Command] = {}
 def _model(command: str, words: str, method: str, /, *, takes: Mapping[str, Any] | None = None, **needs: Any) -> None:
     """Add a command that is a method of the model, with arguments of the same names."""
 
-    def call(session: Any, **given: Any) -> None:
-        getattr(session.model, method)(**given)
-
-    COMMANDS[command] = Command(words, needs, takes or {}, call)
+    COMMANDS[command] = Command(words, needs, takes or {}, f"model.{method}")
 
 
 def _session(command: str, words: str, method: str, /, *, takes: Mapping[str, Any] | None = None, **needs: Any) -> None:
-    def call(session: Any, **given: Any) -> Any:
-        return getattr(session, method)(**given)
-
-    COMMANDS[command] = Command(words, needs, takes or {}, call)
+    COMMANDS[command] = Command(words, needs, takes or {}, method)
 
 
 _model("turn", "turn about the middle, in shares of the height", "turn", dx=_check_number, dy=_check_number)
@@ -140,7 +134,7 @@ _model("set_clip_box", "show a box, LPS mm; null: all", "set_clip_box",
 _model("toggle_clip_box", "show a box about the cross, or all", "toggle_clip_box")
 _session("undo", "take the last change back", "undo")
 _model("hold", "the pointer is pressed: until it is released one step of undo", "hold", on=_flag)
-_session("save", "write what is shown; the extension says as what", "save_to", path=_text, takes={"size": _size})
+_session("save", "write what is shown; the extension says as what", "save", path=_text, takes={"size": _size})
 _session("cancel", "stop the work in the background", "cancel")
 _session("dismiss", "drop the words of the last error", "dismiss")
 

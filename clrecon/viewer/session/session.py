@@ -10,6 +10,7 @@ import os
 import threading
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from itertools import chain
+from operator import attrgetter
 from time import monotonic
 from typing import Any
 
@@ -353,7 +354,7 @@ class ViewSession(Closing):
         """Do a command of `COMMANDS`; return `facts`, and its own ``"pick"``, ``"undone"`` or ``"measure"``."""
         known_command, arguments = check_command(command)
         with self._lock:
-            answer = known_command.call(self, **arguments)
+            answer = attrgetter(known_command.method)(self)(**arguments)
             if self.model.parts_known and self.painter.has_parts(self.model.state):
                 self._work.cancel("parts")
             return {**self.facts(), **(answer if isinstance(answer, dict) else {})}
@@ -496,10 +497,6 @@ class ViewSession(Closing):
                 then(lines)
 
         self._work.ask("save", write_shown, rank=1, gives_way=False)
-
-    def save_to(self, path: str, size: tuple[int, int] = (1024, 1024)) -> None:
-        """Write what is shown, see `save`; the facts say when it is written."""
-        self.save(path, size=size)
 
     def cancel(self) -> None:
         for kind in _WORDS:
