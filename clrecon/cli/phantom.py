@@ -7,7 +7,6 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.proof.phantom import write_phantom
 from clrecon.proof.phantom.settings import KINDS, PhantomSettings
 from clrecon.system.paths import keep_existing
 from clrecon.system.text import format_ml
@@ -32,6 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
+    from clrecon.proof.phantom import write_phantom
+
     settings = common.make_settings(PhantomSettings, options)
     with keep_existing(keep=options.no_clobber):
         truth = write_phantom(options.output, settings, progress=console.progress)

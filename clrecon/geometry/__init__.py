@@ -16,22 +16,3 @@ from clrecon.geometry.affine import (
 from clrecon.geometry.blocks import slice_voxel_ml
 from clrecon.geometry.grid import AIR_HU, METAL_HU, Grid
 from clrecon.geometry.volume import Volume
-
-__all__ = [
-    "AIR_HU",
-    "Grid",
-    "METAL_HU",
-    "SPACES",
-    "Volume",
-    "apply_affine",
-    "column_spacing",
-    "compose_affine",
-    "frame_from_lps",
-    "is_left_handed",
-    "lps_affine_from_ras",
-    "normal_matrix",
-    "slice_normal",
-    "signed_tilt",
-    "slice_voxel_ml",
-    "tilt_degrees",
-]

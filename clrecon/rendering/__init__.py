@@ -5,15 +5,3 @@ from clrecon.rendering.looks.presets import DEFAULT_PRESET, PRESETS, Preset, fin
 from clrecon.rendering.looks.transfer_files import load_transfer_function
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.pictures.picture import Rendering
-
-__all__ = [
-    "DEFAULT_PRESET",
-    "PRESETS",
-    "UNSHADED",
-    "Lighting",
-    "Preset",
-    "Rendering",
-    "TransferFunction",
-    "find_preset",
-    "load_transfer_function",
-]

@@ -13,27 +13,6 @@ if TYPE_CHECKING:
     from clrecon.proof.phantom.shapes import Body, Box, Cylinder, Sphere, Torus
     from clrecon.proof.phantom.truth import PhantomTruth, phantom_truth
 
-__all__ = [
-    "KINDS",
-    "MATERIALS",
-    "Body",
-    "Box",
-    "Cylinder",
-    "PhantomSettings",
-    "PhantomTruth",
-    "Sphere",
-    "Torus",
-    "add_noise",
-    "apply_point_spread",
-    "label_materials",
-    "make_phantom",
-    "parse_missing",
-    "parse_size",
-    "phantom_truth",
-    "sample_occupancy",
-    "write_phantom",
-]
-
 _MODULES = {
     "build": ("label_materials", "make_phantom", "write_phantom"),
     "sampling": ("add_noise", "apply_point_spread", "sample_occupancy"),
