@@ -8,13 +8,14 @@ import re
 import sys
 import textwrap
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NoReturn, TypeVar, cast
 
 from clrecon.cli.console import STREAMED, Console, fit_help, printable
 from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.jobs.options import DeviceSettings, InputSettings, ScanSettings
+from clrecon.system.arguments import OptionSpeaker
 from clrecon.system.options import option_beside, options_of
 from clrecon.system.progress import DEFAULT_SECONDS, check_time_limit
 from clrecon.system.text import guess_word
@@ -29,6 +30,11 @@ _STREAM = re.compile(r"-\.[A-Za-z0-9.]+")
 """``-.ply`` behind ``-o``: standard output, and the format."""
 
 _NEGATIVE_LIST = re.compile(r"-[0-9.]+(?:[eE][+-]?[0-9]+)?[,:]")
+
+
+def speaker_of(parser: argparse.ArgumentParser) -> OptionSpeaker:
+    return OptionSpeaker({action.dest: action.option_strings[0] for action in parser._actions if action.option_strings})
+
 
 EXIT_CODES = """\
 exit codes: 0 done; 1 unexpected error; 2 no usable DICOM or no surface; 3 wrong usage;
@@ -245,11 +251,14 @@ def make_part(part: type[Settings], options: argparse.Namespace, owner: str | No
     return None
 
 
-def add_fields(container: argparse._ActionsContainer, settings: type, *groups: str) -> None:
+def add_fields(
+    container: argparse._ActionsContainer, settings: type, *groups: str, without: Container[str] = ()
+) -> None:
     """Add the options of groups that are fields of settings; without a group those that have none."""
     for group in groups or ("",):
         for option in options_of(settings, group):
-            container.add_argument(*option.flags, dest=option.name, **option.how)
+            if option.name not in without:
+                container.add_argument(*option.flags, dest=option.name, **option.how)
 
 
 def add_option(container: argparse._ActionsContainer, name: str, declared: Any) -> None:

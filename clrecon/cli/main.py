@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import atexit
 import contextlib
 import os
@@ -16,51 +15,13 @@ from types import FrameType
 from typing import NamedTuple
 
 from clrecon.cli import common
-from clrecon.cli.common import EXIT_CODES, Parser, guard, has_hung_device
+from clrecon.cli.common import EXIT_CODES, Parser, guard, has_hung_device, speaker_of
 from clrecon.cli.console import Console, filled_streams
 from clrecon.errors import UsageError
-from clrecon.system.arguments import Speaker, in_python, spoken_by
+from clrecon.system.arguments import in_python, spoken_by
 from clrecon.system.foreign_words import own_streams
+from clrecon.system.packages import hide_unused
 from clrecon.system.progress import DEFAULT_SECONDS, time_limit
-
-_DESTINATIONS = {
-    "color_by": "color",
-    "direction": "light",
-    "eps": "clusters",
-    "half_way": "iso_value",
-    "labels": "path",
-    "iso_value": "hu",
-    "kind": "points",
-    "min_samples": "clusters",
-    "picture": "output",
-}
-"""Other names of parameters, which count where a command has no option of the parameter's own name."""
-
-_PARTS = {"eps": "eps=", "min_samples": "min="}
-"""Parameters that are a part of an option's value."""
-
-
-def speaker_of(parser: argparse.ArgumentParser) -> Speaker:
-    """Make a function that names parameters as options of a command; others keep their names in Python."""
-    options = {action.dest: action.option_strings[0] for action in parser._actions if action.option_strings}
-
-    def speak(parameter: str, value: object = None) -> str:
-        name = parameter
-        while name not in options:
-            if name not in _DESTINATIONS:
-                return in_python(parameter, value)
-            name = _DESTINATIONS[name]
-        option = options[name]
-        part = _PARTS.get(parameter, "")
-        if part:
-            unit = "MM" if parameter == "eps" else "N"
-            return f"{option} {part}{unit if value is None else value}"
-        if value is None or value is True or (parameter == "closed" and value is False):
-            return option
-        words = str(value).strip("()").replace(", ", ",")
-        return f"{option} {'half:' if parameter == 'half_way' and value != 'auto' else ''}{words}"
-
-    return speak
 
 
 class _Command(NamedTuple):
@@ -79,6 +40,7 @@ COMMANDS = {
     "corridor": _Command("clrecon.cli.corridor", "find the widest straight line through each pedicle of a vertebra"),
     "stats": _Command("clrecon.cli.stats", "measure each label of a label map: ml, and HU with percentiles"),
     "distance": _Command("clrecon.cli.distance", "measure how far two meshes lie apart, in mm and in colours"),
+    "batch": _Command("clrecon.cli.batch", "make the meshes of many scans, with a table and a page of all"),
     "info": _Command("clrecon.cli.info", "show which series a folder holds and whether they can be used"),
     "devices": _Command("clrecon.cli.devices", "show the OpenCL devices and which one would be used"),
     "phantom": _Command("clrecon.cli.phantom", "write a synthetic CT series with a known surface"),
@@ -90,11 +52,6 @@ COMMANDS = {
 }
 
 HELP = "help"
-
-_UNUSED_MODULES = ("requests", "PIL")
-"""Hidden from pydicom by ``None`` in `sys.modules`: reading does not need them, and their import takes as long as it.
-`clrecon.rendering.pictures.pillow` makes Pillow available again.
-"""
 
 _MOST_SECONDS_TO_END = 1.0
 """Time for the removal of temporary folders after a kernel has hung."""
@@ -124,8 +81,7 @@ def run() -> None:
     signal.signal(signal.SIGTERM, _interrupt)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # not under nohup
         signal.signal(signal.SIGHUP, _interrupt)
-    for name in _UNUSED_MODULES:
-        sys.modules.setdefault(name, None)  # type: ignore[arg-type]
+    hide_unused()
     code = main()
     for stream in (sys.stdout, sys.stderr):
         # The stream is None (never opened) or its reader closed it; `main` has already printed everything.

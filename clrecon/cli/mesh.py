@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 from clrecon.cli import common
@@ -60,6 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _epilog()
     common.add_input(parser, f"{common.SCAN_FOLDER}; or {common.GRID_FILE}")
     common.add_output(parser, f"mesh file: {MESH_FILES}")
+    checks = add_mesh_options(parser)
+    common.add_report(checks, "affine, counts, quality, device and times")
+
+
+def add_mesh_options(parser: argparse.ArgumentParser, without: Container[str] = ()) -> argparse._ArgumentGroup:
+    """Add the options of a mesh but for those of labels named in `without`; return the group of the checks."""
     common.add_fields(parser, MeshSettings, "purpose")
     common.add_reading(parser)
     common.add_masking(parser, crop=True)
@@ -67,13 +73,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     method = parser.add_argument_group("method", "marching cubes as papers compare them: see docs/methods.md")
     common.add_fields(method, MeshSettings, "method")
     common.add_fields(parser.add_argument_group("components"), MeshSettings, "selection", "files")
-    add_labels(parser)
+    add_labels(parser, without)
     common.add_fields(parser.add_argument_group("refinement"), MeshSettings, "refinement")
     common.add_device(parser.add_argument_group("device"))
     checks = parser.add_argument_group("checks")
     common.add_fields(checks, MeshSettings, "strict")
     common.add_no_clobber(checks)
-    common.add_report(checks, "affine, counts, quality, device and times")
+    return checks
 
 
 def add_levels(parser: argparse.ArgumentParser, title: str) -> argparse._ArgumentGroup:
@@ -84,16 +90,16 @@ def add_levels(parser: argparse.ArgumentParser, title: str) -> argparse._Argumen
     return group
 
 
-def add_labels(parser: argparse.ArgumentParser) -> None:
+def add_labels(parser: argparse.ArgumentParser, without: Container[str] = ()) -> None:
     about = "one mesh a label: the label picks the cells, HU place the vertices"
-    common.add_fields(parser.add_argument_group("labels", about), LabelChoice)
+    common.add_fields(parser.add_argument_group("labels", about), LabelChoice, without=without)
 
 
-def mesh_fields(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the fields of `MeshSettings` that the options give."""
+def mesh_fields(options: argparse.Namespace, labels_by: str = "with --labels FILE") -> dict[str, Any]:
+    """Return the fields of `MeshSettings` that the options give; a message says `labels_by` what a label map comes."""
     given = common.pick(options, MeshSettings)
     given |= given.pop("iso_value", {})  # one of two fields
-    needs = "says how labels become meshes: give their file with --labels FILE"
+    needs = f"says how labels become meshes: give their file {labels_by}"
     if given.get("surface") == "cortex":  # labels pick the cells, as with hu
         options = argparse.Namespace(**{**vars(options), "surface": "hu"})
     labels = common.make_part(LabelChoice, options, options.path, needs)
@@ -404,24 +410,15 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-_GATES_OF_AFFINE = ("grid_residual",)
-"""Gates for the fit of the affine to the slices.  Meshes do not need it: they use the position of each slice."""
-
-
 def finish_with_gates(report: dict[str, Any], console: Console, strict: bool, *, own_units: bool = False) -> int:
     """Print the warnings of a report; returns the exit code.
 
     With `strict` a failed gate of the volume or of a mesh is an error, which is printed even with ``--quiet`` and
-    ``--json``; that of a mesh decides the code.  A failed gate of `_GATES_OF_AFFINE` (uneven slices) stays a warning,
-    and so does one that the values are HU, where a print has a level in the values' `own_units`.
+    ``--json``; that of a mesh decides the code; see `find_failed`.
     """
-    from clrecon.jobs.mesh.refinement import warn_of_gates
+    from clrecon.jobs.mesh.refinement import find_failed
 
-    settled = _GATES_OF_AFFINE + VALUE_GATES * own_units
-    gates = [gate for gate in report["volume"].get("gates", ()) if gate["name"] not in settled]
-    of_volume = [{"mesh": "volume", **gate} for gate in gates]
-    failed_scan = warn_of_gates(of_volume) if strict else []
-    failed_mesh = warn_of_gates(report["gates"]) if strict else []
+    failed_scan, failed_mesh = find_failed(report, own_units=own_units) if strict else ([], [])
     failed = failed_scan + failed_mesh
     for warning in report["warnings"]:
         if warning not in failed:

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack
+from copy import copy
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -224,6 +225,21 @@ class RunReport(ScanReport):
     memory_allowed_bytes: int | None
 
 
+class SharedScan:
+    """A scan that several jobs read one after another, from the disk once."""
+
+    def __init__(self) -> None:
+        self._volume: Volume | None = None
+
+    def read(self, source: str | Path, settings: Any, *, progress: Progress) -> Volume:
+        """Return a volume whose report is its own: a job puts another in its place."""
+        from clrecon.reading import read_selected
+
+        if self._volume is None:
+            self._volume = read_selected(source, settings, progress=progress)
+        return copy(self._volume)
+
+
 class Run(Laps):
     """One run of a job: checks and stages its files, times it, composes the shared part of its report, and commits.
 
@@ -231,13 +247,22 @@ class Run(Laps):
     those that are not committed at the end of the ``with`` block are removed.
 
     no_clobber: Files that exist stay and are an `OutputError`, before any work.
+    shared: The scan, of a caller whose other jobs read the same part of it.
     logged: Warnings that are in the log already: those of the volume of the report.
     """
 
-    def __init__(self, settings: Any, *, no_clobber: bool = False, progress: Progress | None = None):
+    def __init__(
+        self,
+        settings: Any,
+        *,
+        no_clobber: bool = False,
+        progress: Progress | None = None,
+        shared: SharedScan | None = None,
+    ):
         super().__init__()
         self.settings, self.no_clobber = settings, no_clobber
         self.progress = progress or ignore_progress
+        self._shared = shared
         self.files: list[Staged] = []
         self.logged: Iterable[str] = ()
         self._keep_ids: bool = getattr(settings, "keep_ids", False)
@@ -263,7 +288,8 @@ class Run(Laps):
     def read(self, source: str | Path) -> Volume:
         from clrecon.reading import read_selected
 
-        return read_selected(source, self.settings, progress=self.progress)
+        read = read_selected if self._shared is None else self._shared.read
+        return read(source, self.settings, progress=self.progress)
 
     def read_labelled(self, source: str | Path, label: Sequence[str | int] | None = None) -> tuple[Volume, LabelMap]:
         """Read the scan and the label map of the settings; with `label` these labels of it."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import statistics
 import threading
@@ -13,14 +12,13 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+from clrecon.system.processes import list_cores
+
 _CPUINFO = Path("/proc/cpuinfo")
 
 
 def usable_cores() -> int:
-    """Number of cores that this process may use; the computer can have more."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(list_cores())
 
 
 def processor_name(cpuinfo: Path = _CPUINFO) -> str:

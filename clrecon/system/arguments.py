@@ -38,12 +38,56 @@ def in_python(parameter: str, value: object = None) -> str:
     return f"{parameter}={value if placeholder else repr(value)}"
 
 
+_DESTINATIONS = {
+    "color_by": "color",
+    "direction": "light",
+    "eps": "clusters",
+    "half_way": "iso_value",
+    "labels": "path",
+    "iso_value": "hu",
+    "kind": "points",
+    "min_samples": "clusters",
+    "picture": "output",
+}
+"""Other names of parameters, which count where a command has no option of the parameter's own name."""
+
+_PARTS = {"eps": "eps=", "min_samples": "min="}
+"""Parameters that are a part of an option's value."""
+
+
+class OptionSpeaker:
+    """Names parameters as options of a command, by `options` with their first flags; others as in Python."""
+
+    def __init__(self, options: Mapping[str, str]):
+        self.options = options
+
+    def __call__(self, parameter: str, value: object = None) -> str:
+        name = parameter
+        while name not in self.options:
+            if name not in _DESTINATIONS:
+                return in_python(parameter, value)
+            name = _DESTINATIONS[name]
+        option = self.options[name]
+        part = _PARTS.get(parameter, "")
+        if part:
+            unit = "MM" if parameter == "eps" else "N"
+            return f"{option} {part}{unit if value is None else value}"
+        if value is None or value is True or (parameter == "closed" and value is False):
+            return option
+        words = str(value).strip("()").replace(", ", ",")
+        return f"{option} {'half:' if parameter == 'half_way' and value != 'auto' else ''}{words}"
+
+
 _speaker: Speaker = in_python
 
 
 def name_parameter(parameter: str, value: object = None) -> str:
     """Name a parameter in words of Python or the command line, with a value, or capitals such as ``"N"`` for one."""
     return _speaker(parameter, value)
+
+
+def current_speaker() -> Speaker:
+    return _speaker
 
 
 @contextmanager

@@ -17,6 +17,18 @@ from typing import Any
 
 from clrecon.errors import UsageError
 
+_UNUSED = ("requests", "PIL")
+"""What pydicom imports and reading does not need; it takes as long as pydicom itself."""
+
+
+def hide_unused() -> None:
+    """Hide modules from pydicom by None in `sys.modules`, in a process of our own.
+
+    `clrecon.rendering.pictures.pillow` makes Pillow available again.
+    """
+    for name in _UNUSED:
+        sys.modules.setdefault(name, None)  # type: ignore[arg-type]
+
 
 def import_package(module: str, subject: str, package: str | None = None) -> Any:
     """Import a module; `subject` needs it, for the message, and `package` is its name when it is installed."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from clrecon.system.processes import list_cores
 
 CHUNK = 1 << 14
 """Triangles in a piece.  These take about 2 MB in float64; pieces 32 times as long took 1.5 times the time."""
@@ -85,5 +86,4 @@ def local_origin(vertices: NDArray[np.floating]) -> NDArray[np.float64]:
 
 def count_readers(slices: int, most: int) -> int:
     """Return the number of reading threads: the number of cores that this process may use."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(most, cores, slices))
+    return max(1, min(most, len(list_cores()), slices))

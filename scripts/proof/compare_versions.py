@@ -49,8 +49,8 @@ LABEL_MAPS = ("levels.nrrd", "materials.nrrd")
 """Label maps that phantoms have beside them."""
 
 COMMANDS = (
-    *("mesh", "cloud", "inside", "render", "view", "export", "vertebrae", "corridor", "stats", "distance", "info"),
-    *("devices", "phantom", "selftest", "bench", "compare", "demo", "completion", "help"),
+    *("mesh", "cloud", "inside", "render", "view", "export", "vertebrae", "corridor", "stats", "distance", "batch"),
+    *("info", "devices", "phantom", "selftest", "bench", "compare", "demo", "completion", "help"),
 )
 
 MESHES = {

@@ -12,14 +12,15 @@ import pytest
 from house import PACKAGE, ROOT
 
 import clrecon
-from clrecon.cli.common import Parser, add_common
-from clrecon.cli.main import _DESTINATIONS, COMMANDS, speaker_of
+from clrecon.cli.common import Parser, add_common, speaker_of
+from clrecon.cli.main import COMMANDS
+from clrecon.jobs.batch.plan import BatchSettings
 from clrecon.jobs.cloud.settings import CloudSettings
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.options import InputSettings
 from clrecon.jobs.render.job import PictureFiles
 from clrecon.jobs.render.settings import RenderSettings
-from clrecon.system.arguments import in_python, name_parameter, spoken_by
+from clrecon.system.arguments import _DESTINATIONS, in_python, name_parameter, spoken_by
 from clrecon.viewer.web.server import serve_view
 
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
@@ -117,6 +118,7 @@ def test_every_parameter_that_the_library_names_is_one_of_its_own() -> None:
     is_error = [isinstance(each, type) and issubclass(each, Exception) for each in public]
     functions = [each for each, error in zip(public, is_error, strict=True) if callable(each) and not error]
     settings = (
+        BatchSettings,
         InputSettings,
         CloudSettings,
         MeshSettings,

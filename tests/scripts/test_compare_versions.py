@@ -62,7 +62,13 @@ def test_every_command_is_compared_or_left_out_by_name(tmp_path: Path) -> None:
     commands.append(_distance_of(folders, commands))
     assert set(COMMANDS) == {*OF_CLRECON, "help"}
     alone = {"phantom", "completion", "devices", "help"}
-    assert {command[0] for command in commands} == {*OF_CLRECON} - alone - {"selftest", "bench", "compare", "demo"}
+    assert {command[0] for command in commands} == {*OF_CLRECON} - alone - {
+        "batch",
+        "selftest",
+        "bench",
+        "compare",
+        "demo",
+    }
     assert [Path(path).name for path in commands[-1][1:3]] == ["bone.stl", "auto.ply"]
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import DeviceError, NoSurfaceError
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.mesh.surfaces import Part
+from clrecon.jobs.mesh.surfaces import VALUE_GATES, Part
 from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
 from clrecon.system.arguments import name_parameter
 from clrecon.system.pieces import side_by_side
@@ -233,3 +233,18 @@ def _count_crossings(mesh: Mesh, device: Device | None, steps: Steps) -> int:
 def warn_of_gates(gates: Sequence[dict[str, Any]]) -> list[str]:
     """Return one line for each failed gate, with the name of its mesh if there are several."""
     return [f"{gate['mesh']}: {line}" if gate["mesh"] else line for gate in gates for line in failed_gates([gate])]
+
+
+_GATES_OF_AFFINE = ("grid_residual",)
+"""Gates for the fit of the affine to the slices.  Meshes do not need it: they use the position of each slice."""
+
+
+def find_failed(report: Mapping[str, Any], *, own_units: bool = False) -> tuple[list[str], list[str]]:
+    """Return a line for each failed gate of the scan, and of the meshes of a report.
+
+    Gates of `_GATES_OF_AFFINE` (uneven slices) are left out, and so is that the values are HU, where a print has a
+    level in the values' `own_units`.
+    """
+    left_out = _GATES_OF_AFFINE + VALUE_GATES * own_units
+    of_scan = [{"mesh": "volume", **gate} for gate in report["volume"].get("gates", ()) if gate["name"] not in left_out]
+    return warn_of_gates(of_scan), warn_of_gates(report["gates"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from time import perf_counter
@@ -21,6 +20,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.proof.compare.processes import Request
 from clrecon.proof.rays.render import cast_rays
+from clrecon.proof.timing import usable_cores
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.presets import find_preset
 from clrecon.rendering.views.camera import Camera
@@ -65,7 +65,7 @@ def extract_by_vtk(volume: Volume, iso_value: float, name: str, closed: bool) ->
     grid: Any = vtkImageData()
     grid.SetDimensions(ni, nj, nk)
     grid.GetPointData().SetScalars(numpy_to_vtk(np.ascontiguousarray(voxels).reshape(-1)))
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     vtkSMPTools.SetBackend("STDThread" if cores > 1 else "Sequential")
     vtkSMPTools.Initialize(cores)
     contour: Any = getattr(vtkFiltersCore, FILTERS[name])()

@@ -6,9 +6,7 @@ from __future__ import annotations
 
 import json
 import queue
-import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -18,11 +16,11 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import DeviceError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.proof.timing import usable_cores
 from clrecon.rendering.views.camera import Camera
+from clrecon.system.processes import describe_end, start_python
 
 _VOXELS, _PLACE = "voxels.npy", "place.npz"
 
@@ -102,18 +100,7 @@ _MOST_JUDGES = 4
 
 
 def _start_process(command: Sequence[str], data: Mapping[str, Any]) -> subprocess.Popen[bytes]:
-    if getattr(sys, "frozen", False) or not sys.executable:
-        raise DeviceError("methods are compared in processes of a Python interpreter, and this program has none")
-    try:
-        process = subprocess.Popen(
-            [sys.executable, *command],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
-        )
-    except OSError as error:
-        raise DeviceError(f"no process can be started to compare methods: {error.strerror or error}") from error
+    process = start_python(command, "methods are compared")
     assert process.stdin is not None
     try:
         process.stdin.write(json.dumps(data).encode())
@@ -137,16 +124,8 @@ def run_in_process(request: Request) -> dict[str, Any]:
     try:
         answer_record: dict[str, Any] = json.loads(answer)
     except ValueError:
-        return {"state": "failed", "kind": "Crash", "error": _describe_end(process.returncode), "hung": False}
+        return {"state": "failed", "kind": "Crash", "error": describe_end(process.returncode), "hung": False}
     return answer_record
-
-
-def _describe_end(code: int) -> str:
-    if code >= 0:
-        return f"its process ended with exit code {code}"
-    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-    more = ": out of memory, or ended by somebody" if name == "SIGKILL" else ""
-    return f"its process crashed with {name}{more}"
 
 
 def measure_in_processes(data: Mapping[str, Any], methods: Mapping[str, int]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -170,7 +149,7 @@ def measure_in_processes(data: Mapping[str, Any], methods: Mapping[str, int]) ->
             running -= 1
             processes[number].wait()
             for name in parts[number]:
-                yield name, {"reasons": {"all": _describe_end(processes[number].returncode)}}
+                yield name, {"reasons": {"all": describe_end(processes[number].returncode)}}
     finally:
         for process in processes:
             process.kill()

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import warnings as python_warnings
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import Volume, column_spacing
@@ -129,6 +130,32 @@ def list_slices(path: str | os.PathLike[str], selection: Selection) -> list[tupl
         if chosen.problems or chosen.stack is None:
             raise RefusedInputError(_describe_refusal(chosen))
         return [(header.file, header.frame, header.frames) for header in chosen.stack.slices]
+
+
+class StackPlace(NamedTuple):
+    """A stack of CT slices: its number, the nearest folder that holds it, and the words that name its series there."""
+
+    number: int
+    folder: Path
+    series: str
+
+
+def list_stacks(path: str | os.PathLike[str], selection: Selection) -> list[StackPlace]:
+    """List the CT stacks at a path, refused ones too, by the smallest folders from which they can be read alone."""
+    with _quiet_warnings():
+        _, listed = _scan_and_group(path, selection, None)
+    counts = Counter(hash_uid(series.identity.uid) for series in listed)
+    stacks = []
+    for series in listed:
+        uid_hash = hash_uid(series.identity.uid)
+        if series.kind != "stack":
+            continue
+        if uid_hash is None or counts[uid_hash] > 1 or not series.headers:
+            stacks.append(StackPlace(series.number, Path(path), str(series.number)))
+        else:
+            folder = os.path.commonpath({header.file.parent for header in series.headers})
+            stacks.append(StackPlace(series.number, Path(folder), uid_hash))
+    return stacks
 
 
 def _checked_phase(selection: Selection) -> int | None:

@@ -1,0 +1,96 @@
+"""``clrecon batch``: the meshes of many scans, each read once, with a table and a page of all."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from typing import TYPE_CHECKING
+
+from clrecon.cli import common
+from clrecon.cli.console import Console, printable
+from clrecon.cli.mesh import add_mesh_options, mesh_fields
+from clrecon.jobs.batch.plan import COLUMNS, PAGE, TABLE, BatchSettings, Plan, read_cases
+from clrecon.jobs.mesh.purposes import settings_for
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.options import ScanSettings
+from clrecon.system.arguments import current_speaker
+from clrecon.system.progress import DEFAULT_SECONDS
+
+if TYPE_CHECKING:
+    from clrecon.jobs.batch.job import BatchReport
+    from clrecon.jobs.batch.scheduler import Outcome
+
+_EPILOG = f"""\
+A manifest is a table in UTF-8 with commas, whose first line names the columns {", ".join(COLUMNS)}; series and labels
+may be left out. Paths start at its folder. Of a folder each series of CT slices is a case, named by its number.
+
+OUT/CASE holds the mesh, a picture, with labels a table of them, and case.json, all or nothing. OUT/cohort.csv and
+OUT/cohort.html show all cases, and name no file and no patient. See docs/batch.md.
+
+examples:
+  clrecon batch cohort.csv -o OUT --hu 300
+  clrecon batch CT_FOLDER -o OUT --format ply --workers 2
+  clrecon batch cohort.csv -o OUT --hu 300 --resume
+  clrecon batch cohort.csv -o OUT --hu 300 --part 3/40
+  clrecon batch cohort.csv -o OUT --collect"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = _EPILOG
+    parser.add_argument("input", metavar="MANIFEST", help="table of the cases, or a folder whose series are the cases")
+    common.add_output(parser, "folder that gets a folder for each case, the table and the page")
+    common.add_fields(parser.add_argument_group("what is made of each case"), BatchSettings, "make")
+    common.add_fields(parser.add_argument_group("how it runs"), BatchSettings, "run")
+    common.add_fields(parser.add_argument_group("cases that are there"), BatchSettings, "again")
+    add_mesh_options(parser, without=("path",))
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    from clrecon.jobs.batch.job import run_batch
+
+    batch = common.make_settings(BatchSettings, options)
+    cases = read_cases(options.input, common.make_settings(ScanSettings, options))
+    is_labelled = {case.labels is not None for case in cases}
+    plan = Plan(
+        output=options.output,
+        batch=batch,
+        plain=_make_settings(options, None) if False in is_labelled else None,
+        labelled=_make_settings(options, "") if True in is_labelled else None,
+        options=getattr(current_speaker(), "options", None),
+        timeout=DEFAULT_SECONDS if options.timeout is None else options.timeout,
+        no_clobber=options.no_clobber,
+    )
+
+    def tell_outcome(outcome: Outcome) -> None:
+        answer = outcome.answer
+        if answer.status != "done":
+            before, reason = " before" * answer.kept, outcome.death or answer.error or "see its report"
+            console.warn(f"{outcome.case.name}: {answer.status}{before}, {reason}", with_json=True)
+
+    report = run_batch(cases, plan, tell=tell_outcome, progress=console.progress)
+    console.result(report)
+    for line in _describe_batch(report, options.output, is_part=batch.part is not None):
+        console.say(line)
+    return report.exit_code
+
+
+def _make_settings(options: argparse.Namespace, labels: str | None) -> MeshSettings:
+    """Make the settings of meshes without labels, or with a label map that each case names."""
+    options.path = labels
+    given = mesh_fields(options, f"in the column {COLUMNS[3]} of each row")
+    return MeshSettings(**settings_for(given.pop("purpose", None), given))
+
+
+def _describe_batch(report: BatchReport, output: str, *, is_part: bool) -> list[str]:
+    counts = ", ".join(f"{count:,} {status}" for status, count in report.statuses.items()) or "none was left to make"
+    earlier = f"; {report.kept:,} kept as an earlier run made them" if report.kept else ""
+    paths = [os.path.join(output, name) for name in (PAGE, TABLE)]
+    if is_part:
+        wrote = f"cases in {printable(output)}; --collect writes the table and the page of all parts"
+    else:
+        wrote = " and ".join(map(printable, paths))
+    return [
+        f"cases    {report.cases:,}: {counts}{earlier}",
+        f"time     {common.describe_times(report.seconds)}",
+        f"wrote    {wrote}",
+    ]

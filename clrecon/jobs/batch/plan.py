@@ -1,0 +1,301 @@
+"""What a batch makes: the settings, the cases of a table or a folder, and the key by which a case is known again."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from clrecon.errors import NoDicomError, UsageError
+from clrecon.exchange.formats import MESH_INPUTS
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
+from clrecon.jobs.options import DeviceSettings, ScanSettings
+from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import asdict, dataclass, fields, replace
+from clrecon.system.options import option
+from clrecon.system.paths import find_extension, shown_path
+from clrecon.system.text import escape_text, guess_word
+from clrecon.version import package_version
+
+_MOST_WORKERS = 256
+
+
+def _parse_part(text: str) -> tuple[int, int]:
+    number, _, count = text.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise ValueError(f"{text!r:.40} is no part I/N of the cases: 1/4 is the first of four, 4/4 the last")
+    return int(number), int(count)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchSettings:
+    """What is made of each case beside the settings of its mesh, and how the cases are dealt out."""
+
+    format: str = option(
+        "--format EXT",
+        f"format of the meshes, one of: {', '.join(MESH_INPUTS)} (default: .stl)",
+        group="make",
+        default=".stl",
+        first=True,
+        parse=lambda text: text.lower() if text.startswith(".") else f".{text.lower()}",
+        words=tuple(extension[1:] for extension in MESH_INPUTS),
+    )
+    measure: bool = option(
+        "--no-measure", "leave out area, volume, components and gates of the meshes", group="make", default=True
+    )
+    picture: bool = option("--no-picture", "leave out the picture of each case", group="make", default=True)
+    workers: int | None = option(
+        "--workers N", "processes that make cases side by side (default: one for each device)", group="run", first=True
+    )
+    devices: str | None = option(
+        "--devices D,D",
+        "OpenCL devices by their indexes, to which the workers are dealt in turn (default: that of --device)",
+        group="run",
+    )
+    part: tuple[int, int] | None = option(
+        "--part I/N",
+        "make each N-th case alone, from the I-th on, 1/N to N/N; the table and the page are for --collect then",
+        group="run",
+        parse=_parse_part,
+    )
+    resume: bool = option(
+        "--resume", "leave out cases that are there, made of the same files with the same settings", group="again",
+        first=True,
+    )  # fmt: skip
+    retry: bool = option("--retry", "make again those cases alone that are not done", group="again", first=True)
+    collect: bool = option(
+        "--collect", "make nothing: write the table and the page of the cases that are there", group="again", first=True
+    )
+
+    def __post_init__(self) -> None:
+        find_extension(f"mesh{self.format}", MESH_INPUTS, "mesh")
+        if self.workers is not None and not 1 <= self.workers <= _MOST_WORKERS:
+            raise UsageError(f"a batch takes 1 to {_MOST_WORKERS} workers, not {self.workers}")
+        if self.devices is not None and not all(word.strip().isdecimal() for word in self.devices.split(",")):
+            raise UsageError(f"{self.devices!r:.60} are no devices: their indexes with commas, such as 0,1")
+
+    def deal_devices(self) -> list[str | None]:
+        """Return a device for each worker, None for the one that each job would choose."""
+        devices: list[str | None] = [None] if self.devices is None else [*map(str.strip, self.devices.split(","))]
+        return [devices[number % len(devices)] for number in range(self.workers or len(devices))]
+
+
+class Case(NamedTuple):
+    """A row of a manifest; `line` is its place in the file, from 1, of a folder the number of the series."""
+
+    name: str
+    source: str
+    series: str | None
+    labels: str | None
+    line: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What a worker needs to know of the whole batch, and what the key of a case counts.
+
+    plain, labelled: Settings of the meshes of cases without and with a label map, whose path each case has itself.
+    options: Names of parameters in the messages of a worker, see `OptionSpeaker`; None: as in Python.
+    """
+
+    output: str
+    batch: BatchSettings
+    plain: MeshSettings | None = None
+    labelled: MeshSettings | None = None
+    options: Mapping[str, str] | None = None
+    timeout: float
+    no_clobber: bool = False
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self), default=os.fspath)
+
+    @classmethod
+    def from_json(cls, text: str) -> Plan:
+        values = _with_tuples(json.loads(text))
+        for kind in ("plain", "labelled"):
+            if values[kind] is not None:
+                labels = values[kind]["labels"]
+                values[kind]["labels"] = None if labels is None else LabelChoice(**labels)
+                values[kind] = MeshSettings(**values[kind])
+        return cls(**values | {"batch": BatchSettings(**values["batch"])})
+
+    @property
+    def device(self) -> str | None:
+        return (self.plain or self.labelled or DeviceSettings()).device
+
+    def settings_of(self, case: Case) -> MeshSettings:
+        settings = self.plain if case.labels is None else self.labelled
+        assert settings is not None  # made for each kind of row that there is
+        if case.labels is not None:
+            assert settings.labels is not None
+            settings = replace(settings, labels=replace(settings.labels, path=case.labels))
+        return settings if case.series is None else replace(settings, series=case.series)
+
+    def folder_of(self, case: Case) -> Path:
+        return Path(self.output, case.name)
+
+
+def _with_tuples(value: Any) -> Any:
+    """Return what was read from JSON with a tuple for each list, as settings have them."""
+    if isinstance(value, dict):
+        return {name: _with_tuples(entry) for name, entry in value.items()}
+    return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
+
+
+_FORMAT = 1
+"""Rises when files of a case change their names or their meaning."""
+
+_ANY_MACHINE = ("device", "memory", "labels")
+"""Settings that change nothing of what is made; the label map counts by its files, and by the choice of labels."""
+
+
+def make_key(case: Case, plan: Plan) -> str:
+    """Return a hash of the version, of all settings that matter, and of names, sizes and times of the files read."""
+    settings = plan.settings_of(case)
+    values = {own.name: getattr(settings, own.name) for own in fields(settings) if own.name not in _ANY_MACHINE}
+    labels = None if settings.labels is None else replace(settings.labels, path="")
+    asked = (_FORMAT, package_version(), values, labels, plan.batch.format, plan.batch.measure, plan.batch.picture)
+    digest = hashlib.sha256(repr(asked).encode("utf-8", "replace"))
+    for path in filter(None, (case.source, case.labels)):
+        for name, size, time_ns in _list_files(path, follow_links=settings.follow_links):
+            digest.update(f"{name}\0{size}\0{time_ns}\n".encode("utf-8", "surrogateescape"))
+    return digest.hexdigest()
+
+
+def _list_files(path: str, *, follow_links: bool) -> Iterator[tuple[str, int, int]]:
+    """Yield name, size and time of a file, or of all files of a folder in order."""
+    if not os.path.isdir(path):
+        status = os.stat(path)
+        yield "", status.st_size, status.st_mtime_ns
+        return
+    for folder, folders, names in os.walk(path, followlinks=follow_links):
+        folders.sort()
+        for name in sorted(names):
+            file = os.path.join(folder, name)
+            status = os.stat(file, follow_symlinks=follow_links and os.path.exists(file))
+            yield os.path.relpath(file, path), status.st_size, status.st_mtime_ns
+
+
+COLUMNS = ("case", "input", "series", "labels")
+TABLE, PAGE = "cohort.csv", "cohort.html"
+REPORT = "case.json"
+
+_NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,98}[A-Za-z0-9_-])?")
+
+
+def read_cases(manifest: str | Path, selection: ScanSettings) -> list[Case]:
+    """Read the rows of a CSV file, or find the series of a folder, in order."""
+    return _find_series(manifest, selection) if os.path.isdir(manifest) else _read_table(manifest)
+
+
+def _read_table(path: str | Path) -> list[Case]:
+    name = escape_text(os.path.basename(path))
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as stream:
+            rows = csv.reader(stream, strict=True)
+            places = _find_columns(name, next(rows, []))
+            cases = _read_rows(name, rows, places, os.path.dirname(os.path.abspath(path)))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UsageError(f"the manifest {name} is no table in UTF-8 with commas: {error}") from None
+    except OSError as error:
+        raise UsageError(f"the manifest {name} cannot be read: {error.strerror or error}") from None
+    if not cases:
+        raise UsageError(f"the manifest {name} has no case below its line of columns")
+    return cases
+
+
+def _find_columns(name: str, header: Sequence[str]) -> dict[str, int]:
+    """Return the place of each column, by the first line of a table."""
+    words = [word.strip() for word in header]
+    unknown = [word for word in words if word not in COLUMNS]
+    if unknown:
+        shown = ", ".join(f"{word!r:.60}{guess_word(word, COLUMNS)}" for word in unknown[:5])
+        raise UsageError(f"the manifest {name} has unknown columns: {shown}; there are {', '.join(COLUMNS)}")
+    missing = [word for word in COLUMNS[:2] if word not in words]
+    if missing or len(set(words)) < len(words):
+        wrong = f"no column {' and no column '.join(missing)}" if missing else "a column twice"
+        raise UsageError(
+            f"the manifest {name} has {wrong}: its first line is {','.join(COLUMNS)}, the last two optional"
+        )
+    return {word: place for place, word in enumerate(words)}
+
+
+def _read_rows(name: str, rows: Any, places: dict[str, int], folder: str) -> list[Case]:
+    lines: dict[str, int] = {}
+    cases: list[Case] = []
+    for row in rows:
+        if not any(cell.strip() for cell in row):
+            continue
+        line = rows.line_num
+        if len(row) != len(places):
+            raise UsageError(f"line {line} of the manifest {name} has {len(row)} cells, its first line {len(places)}")
+        cells = {column: row[place].strip() for column, place in places.items()}
+        case = cells["case"]
+        if not _NAME.fullmatch(case) or case.lower() in (TABLE, PAGE):
+            raise UsageError(
+                f"line {line} of the manifest {name}: the case {case!r:.60} cannot be the name of a folder: up to 100"
+                " letters, digits, dots, dashes and underscores, a letter or digit first"
+            )
+        first = lines.setdefault(case.lower(), line)
+        if first != line:
+            raise UsageError(f"lines {first} and {line} of the manifest {name} are both the case {case}: name one else")
+        if not cells["input"]:
+            raise UsageError(f"line {line} of the manifest {name}: the case {case} has no input")
+        source, labels = (
+            os.path.join(folder, path) if (path := cells.get(column, "")) else None for column in ("input", "labels")
+        )
+        cases.append(Case(case, source or "", cells.get("series") or None, labels, line))
+    return cases
+
+
+def _find_series(folder: str | Path, selection: ScanSettings) -> list[Case]:
+    """Return a case for each stack of CT slices below a folder, by its number: names of folders can be patients'."""
+    from clrecon.reading.dicom.reader import list_stacks
+
+    if selection.series is not None:
+        raise UsageError(
+            f"each series of a folder is a case: leave {name_parameter('series')} out, or write a manifest"
+        )
+    stacks = list_stacks(folder, selection)
+    if not stacks:
+        raise NoDicomError(
+            "no series of CT slices in this folder; files of other formats are named by a manifest, a table of"
+            f" {', '.join(COLUMNS)}"
+        )
+    width = max(3, len(str(stacks[-1].number)))
+    return [
+        Case(f"series-{stack.number:0{width}d}", str(stack.folder), stack.series, None, stack.number)
+        for stack in stacks
+    ]
+
+
+def check_places(cases: Sequence[Case], output: str | Path) -> None:
+    """Refuse an output folder that holds an input or lies in one, or whose folders of these names are no cases."""
+    root = os.path.join(os.path.realpath(output), "")
+    parents: dict[str, str] = {}
+    for case in cases:
+        for path in filter(None, (case.source, case.labels)):
+            parent, name = os.path.split(os.path.normpath(path))
+            if parent not in parents:
+                parents[parent] = os.path.realpath(parent)
+            read = os.path.join(parents[parent], name, "")
+            if root.startswith(read) or read.startswith(root):
+                raise UsageError(
+                    f"the output folder {shown_path(output)} and what the case {case.name} reads lie one in the other:"
+                    " name another output"
+                )
+    if not os.path.isdir(output):
+        return
+    names = {case.name.lower() for case in cases}
+    with os.scandir(output) as entries:
+        for entry in entries:
+            if entry.name.lower() in names and not os.path.isfile(os.path.join(entry.path, REPORT)):
+                raise UsageError(
+                    f"{shown_path(entry.path)} is no case of a batch, and one of that name would replace it: name"
+                    " another output folder"
+                )

@@ -1,0 +1,50 @@
+"""The cores of this process, and processes of the same Python beside it: their start, and how they end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+
+from clrecon.errors import DeviceError
+
+
+def list_cores() -> list[int]:
+    """Numbers of the cores that this process may use; the computer can have more."""
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
+
+
+def start_python(
+    command: Sequence[str], subject: str, environment: Mapping[str, str] | None = None
+) -> subprocess.Popen[bytes]:
+    """Start this Python with pipes to its input and output; its errors are dropped, since drivers print there.
+
+    subject: What the process is for, for the message where there is no interpreter, or no process can be started.
+    environment: Variables beside those of this process.
+    """
+    if getattr(sys, "frozen", False) or not sys.executable:
+        raise DeviceError(f"{subject} in processes of a Python interpreter, and this program has none")
+    try:
+        return subprocess.Popen(
+            [sys.executable, *command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, **(environment or {})},
+            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+        )
+    except OSError as error:
+        raise DeviceError(f"{subject} in processes, and none can be started: {error.strerror or error}") from error
+
+
+def describe_end(code: int) -> str:
+    """Say how a process has ended, by its exit code, or the negative number of a signal."""
+    if code >= 0:
+        return f"its process ended with exit code {code}"
+    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+    more = ": out of memory, or ended by somebody" if name == "SIGKILL" else ""
+    return f"its process crashed with {name}{more}"
