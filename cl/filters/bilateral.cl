@@ -24,7 +24,6 @@
 #include "include/volume.h"
 
 #define GROUP 16 /* voxels of a group */
-#define VECTORS 2 /* of LANES = 8 in a group */
 #define IS_FLOAT ((VALUE)0.5f > (VALUE)0)
 #define LARGEST_FLOAT 3.40282347e38f
 #define LEAST_EXPONENT -120.0f /* weights below are 0 but for rounding, and those of floats are 0 */
@@ -87,6 +86,98 @@ static inline floats finish_value(const tap_sums *sums, const floats centre, con
     return to_floats(to_ints(change + choose(change < 0.0f, (floats)(-0.5f), (floats)(0.5f)))) + centre;
 }
 
+/* LANES voxels that are filtered. */
+typedef struct {
+    floats centre, scaled; /* their values, and those in units of 1 / range HU */
+    tap_sums sums;
+} lanes_of_voxels;
+
+static inline void start_lanes(lanes_of_voxels *lanes, __global const VOXEL *own, const float range)
+{
+    const floats centre = to_floats(load_lanes(own));
+    const tap_sums sums = {1.0f, 0.0f, centre, centre}; /* the voxel itself, which is no tap */
+    lanes->centre = centre;
+    lanes->scaled = centre * range;
+    lanes->sums = sums;
+}
+
+/* Add taps by their steps from the voxels at `own`. */
+static inline void add_steps_to_lanes(
+    lanes_of_voxels *lanes, __global const VOXEL *own, __global const int *steps, __global const float *spatial,
+    const int count, const float range)
+{
+    for (int t = 0; t < count; ++t)
+        add_tap(&lanes->sums, to_floats(load_lanes(own + steps[t])), lanes->centre, lanes->scaled, spatial[t], range);
+}
+
+/* Add a row of taps, the first of which is at `near`. */
+static inline void add_row_to_lanes(
+    lanes_of_voxels *lanes, __global const VOXEL *near, __global const float *spatial, const int count,
+    const float range)
+{
+    for (int t = 0; t < count; ++t)
+        add_tap(&lanes->sums, to_floats(load_lanes(near + t)), lanes->centre, lanes->scaled, spatial[t], range);
+}
+
+/* The voxels of an item: a group, or one. */
+#if LANES == 8
+#define VOXELS_OF_ITEM GROUP
+typedef struct {
+    lanes_of_voxels first, second;
+} item_voxels;
+
+static inline void start_voxels(item_voxels *voxels, __global const VOXEL *own, const float range)
+{
+    start_lanes(&voxels->first, own, range);
+    start_lanes(&voxels->second, own + LANES, range);
+}
+
+static inline void add_steps(
+    item_voxels *voxels, __global const VOXEL *own, __global const int *steps, __global const float *spatial,
+    const int count, const float range)
+{
+    add_steps_to_lanes(&voxels->first, own, steps, spatial, count, range);
+    add_steps_to_lanes(&voxels->second, own + LANES, steps, spatial, count, range);
+}
+
+static inline void add_row(
+    item_voxels *voxels, __global const VOXEL *near, __global const float *spatial, const int count, const float range)
+{
+    add_row_to_lanes(&voxels->first, near, spatial, count, range);
+    add_row_to_lanes(&voxels->second, near + LANES, spatial, count, range);
+}
+
+/* Store the first `count` voxels. */
+static inline void store_voxels(const item_voxels *voxels, __global VOXEL *to, const int count, const float range)
+{
+    const VOXEL8 first
+        = CLRECON_VECTOR(convert_, VOXEL8)(finish_value(&voxels->first.sums, voxels->first.centre, range));
+    const VOXEL8 second
+        = CLRECON_VECTOR(convert_, VOXEL8)(finish_value(&voxels->second.sums, voxels->second.centre, range));
+    if (count == GROUP) {
+        vstore8(first, 0, to);
+        vstore8(second, 1, to);
+        return;
+    }
+    VOXEL lanes[GROUP];
+    vstore8(first, 0, lanes);
+    vstore8(second, 1, lanes);
+    for (int n = 0; n < count; ++n)
+        to[n] = lanes[n];
+}
+#else
+#define VOXELS_OF_ITEM 1
+typedef lanes_of_voxels item_voxels;
+#define start_voxels start_lanes
+#define add_steps add_steps_to_lanes
+#define add_row add_row_to_lanes
+
+static inline void store_voxels(const item_voxels *voxels, __global VOXEL *to, const int count, const float range)
+{
+    *to = (VOXEL)finish_value(&voxels->sums, voxels->centre, range);
+}
+#endif
+
 /* Parameters  voxels    in   slices of the volume
  *             ends      out  (rows, strips, GROUP + 2 reach) strips for the groups 0 to inner - 1 and from inner_end on
  *             ni        voxels a row;  rows  of the slices
@@ -142,14 +233,9 @@ __kernel void filter_bilateral(
     const int inner_j, const int inner_k, const int table_taps, const uint strips,
     const uint inner, const uint inner_end, const int reach)
 {
-    const uint item = get_global_id(0);
-#if LANES == 8
-    const uint entry = first_entry + item;
-    const int lane = 0;
-#else
-    const uint entry = first_entry + item / GROUP;
-    const int lane = item % GROUP;
-#endif
+    const uint item = get_global_id(0), items = GROUP / VOXELS_OF_ITEM; /* of a group */
+    const uint entry = first_entry + item / items;
+    const int lane = item % items;
     if (entry >= group_count)
         return;
     const uint number = is_listed ? groups[entry] : entry;
@@ -167,48 +253,16 @@ __kernel void filter_bilateral(
     __global const VOXEL *own = base + ((size_t)(k - first_k) * nj + j) * row_step;
     __global const float *taps = spatial + (size_t)table_taps * k;
 
-    const floats centre = to_floats(load_lanes(own));
-    const floats scaled = centre * range;
-    tap_sums sums = {1.0f, 0.0f, centre, centre}; /* the voxel itself, which is no tap */
-#if LANES == 8
-    const floats next_centre = to_floats(load_lanes(own + LANES));
-    const floats next_scaled = next_centre * range;
-    tap_sums next = {1.0f, 0.0f, next_centre, next_centre};
-#endif
+    item_voxels filtering;
+    start_voxels(&filtering, own, range);
     const int tap_count = in_row && j >= inner_j && j + inner_j < nj && k >= inner_k && k + inner_k < nk ? steps : 0;
-    for (int t = 0; t < tap_count; ++t)
-        add_tap(&sums, to_floats(load_lanes(own + tap_steps[t])), centre, scaled, taps[t], range);
-#if LANES == 8
-    for (int t = 0; t < tap_count; ++t)
-        add_tap(&next, to_floats(load_lanes(own + LANES + tap_steps[t])), next_centre, next_scaled, taps[t], range);
-#endif
+    add_steps(&filtering, own, tap_steps, taps, tap_count, range);
     for (int r = tap_count ? row_count : 0; r < row_count; ++r) {
-        const int4 tap_row = tap_rows[r];
-        const int near_j = clamp(j + tap_row.x, 0, nj - 1), near_k = clamp(k + tap_row.y, 0, nk - 1) - first_k;
-        __global const VOXEL *near = base + ((size_t)near_k * nj + near_j) * row_step + tap_row.z;
-        for (int t = 0; t < tap_row.w; ++t)
-            add_tap(&sums, to_floats(load_lanes(near + t)), centre, scaled, taps[t], range);
-#if LANES == 8
-        for (int t = 0; t < tap_row.w; ++t)
-            add_tap(&next, to_floats(load_lanes(near + t + LANES)), next_centre, next_scaled, taps[t], range);
-#endif
-        taps += tap_row.w;
+        const int step_j = tap_rows[r].x, step_k = tap_rows[r].y, step_i = tap_rows[r].z, count_i = tap_rows[r].w;
+        const int near_j = clamp(j + step_j, 0, nj - 1), near_k = clamp(k + step_k, 0, nk - 1) - first_k;
+        __global const VOXEL *near = base + ((size_t)near_k * nj + near_j) * row_step + step_i;
+        add_row(&filtering, near, taps, count_i, range);
+        taps += count_i;
     }
-    __global VOXEL *to = filtered + voxel_index(i, j, core_slice, ni, nj);
-#if LANES == 8
-    const VOXEL8 values = CLRECON_VECTOR(convert_, VOXEL8)(finish_value(&sums, centre, range));
-    const VOXEL8 next_values = CLRECON_VECTOR(convert_, VOXEL8)(finish_value(&next, next_centre, range));
-    if (count == GROUP) {
-        vstore8(values, 0, to);
-        vstore8(next_values, 1, to);
-    } else {
-        VOXEL lanes[GROUP];
-        vstore8(values, 0, lanes);
-        vstore8(next_values, 1, lanes);
-        for (int n = 0; n < count; ++n)
-            to[n] = lanes[n];
-    }
-#else
-    *to = (VOXEL)finish_value(&sums, centre, range);
-#endif
+    store_voxels(&filtering, filtered + voxel_index(i, j, core_slice, ni, nj), count, range);
 }

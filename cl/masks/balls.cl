@@ -19,21 +19,6 @@
  * empty rows alone dilate to, is known from the extents of the rows. */
 #include "masks/row_pieces.h"
 
-/* Words of a row from `at` on, their bits `shift` voxels further along i, `beyond` beyond the row. */
-static inline words_of_piece load_row_shifted(
-    __global const uint *mask, const int at, const int first, const int shift, const int ni, const int total,
-    const uint flip, const uint beyond)
-{
-    const int word = shift >> 5, bits = shift & 31;
-    const words_of_piece own = bits_of_row(first + word, ni);
-    const words_of_piece low = ((load_vector(mask, at + word, total) ^ flip) & own) | (beyond & ~own);
-    if (bits == 0)
-        return low;
-    const words_of_piece next = bits_of_row(first + word + 1, ni);
-    const words_of_piece high = ((load_vector(mask, at + word + 1, total) ^ flip) & next) | (beyond & ~next);
-    return low >> (uint)bits | high << (uint)(32 - bits);
-}
-
 /* True if no row that the ball of row (j, k) may look at has a bit set: extents of rows without any are 0. */
 static inline int is_empty_near(
     __global const uint *row_extents, const int j, const int k, const int reach_j, const int reach_k, const int nj,
@@ -53,7 +38,7 @@ static inline int is_empty_near(
 
 /* Parameters  mask     in   (nk, nj, words)
  *             row_extents  in   (nk, nj) of the mask: 0 for rows without a bit set
- *             stencil  in   (m) rows of balls
+ *             stencil  in   (m) rows of balls: dj, dk, centre, half
  *             tables   in   (nk) begin and end of the ball of each slice
  *             spread   out  (nk, nj, words)
  *             reach_j, reach_k   largest |dj| and |dk| of the balls
@@ -88,72 +73,25 @@ __kernel void spread_ball(
         return;
     }
     const int2 table = tables[k];
-    row_piece own, met;
-    own.a = bits_of_row(first, ni);
-    met.a = (words_of_piece)(0u);
-#if LANES == 8
-    own.b = bits_of_row(first + VECTOR_WORDS, ni);
-    met.b = (words_of_piece)(0u);
-#endif
+    const row_piece own = bits_of_piece(first, ni);
+    row_piece met = {(words_of_piece)(0u)};
     int half_width = stencil[table.x].w;
     for (int which = table.x; which < table.y; ++which) {
-        const int4 near = stencil[which];
-        for (; half_width > near.w; --half_width)
+        const int near_j = j + stencil[which].x, near_k = k + stencil[which].y;
+        const int centre = stencil[which].z, near_width = stencil[which].w;
+        for (; half_width > near_width; --half_width)
             met = widen(shifted ? met : within_row(met, own, beyond), beyond);
-        if (j + near.x < 0 || j + near.x >= nj || k + near.y < 0 || k + near.y >= nk) {
-            met.a |= beyond;
-#if LANES == 8
-            met.b |= beyond;
-#endif
+        if (near_j < 0 || near_j >= nj || near_k < 0 || near_k >= nk) {
+            join_word(&met, beyond);
             continue;
         }
-        const int at = (row + near.y * nj + near.x) * words + first;
-        if (!shifted) {
-            met.a |= load_vector(mask, at, total) ^ flip;
-#if LANES == 8
-            met.b |= load_vector(mask, at + VECTOR_WORDS, total) ^ flip;
-#endif
-        } else {
-            met.a |= load_row_shifted(mask, at, first, near.z, ni, total, flip, beyond);
-#if LANES == 8
-            met.b |= load_row_shifted(
-                mask, at + VECTOR_WORDS, first + VECTOR_WORDS, near.z, ni, total, flip, beyond);
-#endif
-        }
+        const int at = (near_k * nj + near_j) * words + first;
+        if (shifted)
+            join_shifted(&met, mask, at, first, centre, ni, total, flip, beyond);
+        else
+            join_piece(&met, mask, at, total, flip);
     }
     for (; half_width > 0; --half_width)
         met = widen(shifted ? met : within_row(met, own, beyond), beyond);
-    met.a = (met.a ^ flip) & own.a;
-#define STORE(n, word) \
-    if (first + n >= begin && first + n < end) \
-        to[first + n] = word;
-#if LANES == 8
-    met.b = (met.b ^ flip) & own.b;
-    if (halo == 0 && end == PIECE_WORDS) {
-        vstore8(met.a, 0, to);
-        vstore8(met.b, 1, to);
-        return;
-    }
-    STORE(0, met.a.s0)
-    STORE(1, met.a.s1)
-    STORE(2, met.a.s2)
-    STORE(3, met.a.s3)
-    STORE(4, met.a.s4)
-    STORE(5, met.a.s5)
-    STORE(6, met.a.s6)
-    STORE(7, met.a.s7)
-    STORE(8, met.b.s0)
-    STORE(9, met.b.s1)
-    STORE(10, met.b.s2)
-    STORE(11, met.b.s3)
-    STORE(12, met.b.s4)
-    STORE(13, met.b.s5)
-    STORE(14, met.b.s6)
-    STORE(15, met.b.s7)
-#else
-    STORE(0, met.a.x)
-    STORE(1, met.a.y)
-    STORE(2, met.a.z)
-    STORE(3, met.a.w)
-#endif
+    store_piece(met, own, to, first, begin, end, flip);
 }

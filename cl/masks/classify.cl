@@ -26,9 +26,14 @@ typedef struct {
 #endif
 } inside_bounds;
 
+/* The parameters of a kernel for the upper end of a range, and what it compares with. */
 #ifdef RANGE
+#define RANGE_PARAMETERS , const VOXEL highest
+#define RANGE_BOUNDS { level, highest }
 #define IS_INSIDE(values, bounds) ((values) >= (bounds).level & (values) <= (bounds).highest)
 #else
+#define RANGE_PARAMETERS
+#define RANGE_BOUNDS { level }
 #define IS_INSIDE(values, bounds) ((values) >= (bounds).level)
 #endif
 
@@ -60,16 +65,18 @@ static inline uint classify_word(__global const VOXEL *row, int first, int ni, i
 }
 
 /* Bits of word w of a row of ni voxels that belong to its border; all of the row's where it lies in the border. */
+#ifdef BORDER_INSIDE
+#define BORDER_IS_INSIDE 1
 static inline uint border_bits(int w, int ni, int border, int row_in_volume)
 {
-#ifdef BORDER_INSIDE
     const ulong row = low_bits(clamp(ni + 2 * border - 32 * w, 0, 32));
     const ulong voxels = low_bits(clamp(ni + border - 32 * w, 0, 32)) & ~low_bits(clamp(border - 32 * w, 0, 32));
     return (uint)(row_in_volume ? row & ~voxels : row);
-#else
-    return 0;
-#endif
 }
+#else
+#define BORDER_IS_INSIDE 0
+static inline uint border_bits(int w, int ni, int border, int row_in_volume) { return 0; }
+#endif
 
 /* Parameters  voxels     in   slices of the volume from first_slice on
  *             mask       out  (gk, gj, words) bit set where voxel >= level
@@ -89,11 +96,8 @@ static inline uint border_bits(int w, int ni, int border, int row_in_volume)
 __kernel void classify_samples(
     __global const VOXEL *restrict voxels, __global uint *restrict mask, __global ushort2 *restrict row_extents,
     const VOXEL level,
-#ifdef RANGE
-    const VOXEL highest,
-#endif
     const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
-    const uint gk, const int words)
+    const uint gk, const int words RANGE_PARAMETERS)
 {
     const uint gj = nj + 2 * border;
     const uint row = get_global_id(0);
@@ -105,18 +109,10 @@ __kernel void classify_samples(
     if (j < 0 || j >= nj || k < 0 || k >= nk) {
         for (int w = 0; w < words; ++w)
             row_mask[w] = border_bits(w, ni, border, 0);
-#ifdef BORDER_INSIDE
-        row_extents[row] = (ushort2)(0, (ushort)words);
-#else
-        row_extents[row] = (ushort2)(0, 0);
-#endif
+        row_extents[row] = (ushort2)(0, BORDER_IS_INSIDE ? (ushort)words : 0);
         return;
     }
-#ifdef RANGE
-    const inside_bounds bounds = {level, highest};
-#else
-    const inside_bounds bounds = {level};
-#endif
+    const inside_bounds bounds = RANGE_BOUNDS;
     __global const VOXEL *row_voxels = voxels + voxel_index(0, j, k - first_slice, ni, nj);
     int begin = words, end = 0;
     for (int w = 0; w < words; ++w) {

@@ -69,31 +69,141 @@ static inline words_of_piece bits_of_row(const int first, const int ni)
     return word >= 0 ? within : (words_of_piece)(0u);
 }
 
-/* The same words with `beyond` in place of what is not in the row. */
-static inline row_piece within_row(row_piece piece, const row_piece row, const uint beyond)
+/* Words of a row from `at` on, their bits `shift` voxels further along i, `beyond` beyond the row. */
+static inline words_of_piece load_row_shifted(
+    __global const uint *mask, const int at, const int first, const int shift, const int ni, const int total,
+    const uint flip, const uint beyond)
 {
-    piece.a = (piece.a & row.a) | (beyond & ~row.a);
+    const int word = shift >> 5, bits = shift & 31;
+    const words_of_piece own = bits_of_row(first + word, ni);
+    const words_of_piece low = ((load_vector(mask, at + word, total) ^ flip) & own) | (beyond & ~own);
+    if (bits == 0)
+        return low;
+    const words_of_piece next = bits_of_row(first + word + 1, ni);
+    const words_of_piece high = ((load_vector(mask, at + word + 1, total) ^ flip) & next) | (beyond & ~next);
+    return low >> (uint)bits | high << (uint)(32 - bits);
+}
+
+/* Store four words of a piece, from its word n on, where they are some of those to be stored. */
+#define STORE_WORD(n, word) \
+    if (first + (n) >= begin && first + (n) < end) \
+        to[first + (n)] = word;
+#define STORE_WORDS(words, n) \
+    STORE_WORD(n, (words).x) STORE_WORD(n + 1, (words).y) STORE_WORD(n + 2, (words).z) STORE_WORD(n + 3, (words).w)
+
+/* For pieces of each kind:
+ *
+ *      bits_of_piece    the bits that belong to a row of ni voxels, from its word `first` on
+ *      within_row       the same words with `beyond` in place of what is not in the row
+ *      join_word        set the bits of a word in all words
+ *      join_piece       set those of the words of a mask from `at` on, or with `flip` ~0 the others
+ *      join_shifted     set those that load_row_shifted has
+ *      widen            set bits and their neighbours on both sides; before the first and behind the last word lies
+ *                       `beyond`
+ *      store_piece      what is in the row, or with `flip` ~0 the complement, as words begin to end - 1 of the row */
 #if LANES == 8
-    piece.b = (piece.b & row.b) | (beyond & ~row.b);
-#endif
+static inline row_piece bits_of_piece(const int first, const int ni)
+{
+    const row_piece piece = {bits_of_row(first, ni), bits_of_row(first + VECTOR_WORDS, ni)};
     return piece;
 }
 
-/* Set bits and their neighbours on both sides; before the first and behind the last word are words of `beyond`. */
+static inline row_piece within_row(row_piece piece, const row_piece row, const uint beyond)
+{
+    piece.a = (piece.a & row.a) | (beyond & ~row.a);
+    piece.b = (piece.b & row.b) | (beyond & ~row.b);
+    return piece;
+}
+
+static inline void join_word(row_piece *piece, const uint word)
+{
+    piece->a |= word;
+    piece->b |= word;
+}
+
+static inline void join_piece(
+    row_piece *piece, __global const uint *mask, const int at, const int total, const uint flip)
+{
+    piece->a |= load_vector(mask, at, total) ^ flip;
+    piece->b |= load_vector(mask, at + VECTOR_WORDS, total) ^ flip;
+}
+
+static inline void join_shifted(
+    row_piece *piece, __global const uint *mask, const int at, const int first, const int shift, const int ni,
+    const int total, const uint flip, const uint beyond)
+{
+    const int next = VECTOR_WORDS;
+    piece->a |= load_row_shifted(mask, at, first, shift, ni, total, flip, beyond);
+    piece->b |= load_row_shifted(mask, at + next, first + next, shift, ni, total, flip, beyond);
+}
+
 static inline row_piece widen(row_piece piece, const uint beyond)
 {
-    const words_of_piece a = piece.a;
-#if LANES == 8
-    const words_of_piece b = piece.b;
+    const words_of_piece a = piece.a, b = piece.b;
     const uint8 before_a = (uint8)(beyond, a.s0123, a.s456), after_a = (uint8)(a.s1234, a.s567, b.s0);
     const uint8 before_b = (uint8)(a.s7, b.s0123, b.s456), after_b = (uint8)(b.s1234, b.s567, beyond);
     piece.a = a | a << 1 | before_a >> 31 | a >> 1 | after_a << 31;
     piece.b = b | b << 1 | before_b >> 31 | b >> 1 | after_b << 31;
-#else
-    const uint4 before = (uint4)(beyond, a.xyz), after = (uint4)(a.yzw, beyond);
-    piece.a = a | a << 1 | before >> 31 | a >> 1 | after << 31;
-#endif
     return piece;
 }
+
+static inline void store_piece(
+    const row_piece piece, const row_piece row, __global uint *to, const int first, const int begin, const int end,
+    const uint flip)
+{
+    const words_of_piece a = (piece.a ^ flip) & row.a, b = (piece.b ^ flip) & row.b;
+    if (first == begin && end == PIECE_WORDS) {
+        vstore8(a, 0, to);
+        vstore8(b, 1, to);
+        return;
+    }
+    STORE_WORDS(a.lo, 0)
+    STORE_WORDS(a.hi, 4)
+    STORE_WORDS(b.lo, 8)
+    STORE_WORDS(b.hi, 12)
+}
+#else
+static inline row_piece bits_of_piece(const int first, const int ni)
+{
+    const row_piece piece = {bits_of_row(first, ni)};
+    return piece;
+}
+
+static inline row_piece within_row(row_piece piece, const row_piece row, const uint beyond)
+{
+    piece.a = (piece.a & row.a) | (beyond & ~row.a);
+    return piece;
+}
+
+static inline void join_word(row_piece *piece, const uint word) { piece->a |= word; }
+
+static inline void join_piece(
+    row_piece *piece, __global const uint *mask, const int at, const int total, const uint flip)
+{
+    piece->a |= load_vector(mask, at, total) ^ flip;
+}
+
+static inline void join_shifted(
+    row_piece *piece, __global const uint *mask, const int at, const int first, const int shift, const int ni,
+    const int total, const uint flip, const uint beyond)
+{
+    piece->a |= load_row_shifted(mask, at, first, shift, ni, total, flip, beyond);
+}
+
+static inline row_piece widen(row_piece piece, const uint beyond)
+{
+    const words_of_piece a = piece.a, before = (uint4)(beyond, a.xyz), after = (uint4)(a.yzw, beyond);
+    piece.a = a | a << 1 | before >> 31 | a >> 1 | after << 31;
+    return piece;
+}
+
+static inline void store_piece(
+    const row_piece piece, const row_piece row, __global uint *to, const int first, const int begin, const int end,
+    const uint flip)
+{
+    const words_of_piece a = (piece.a ^ flip) & row.a;
+    STORE_WORDS(a, 0)
+}
+#endif
 
 #endif

@@ -22,6 +22,38 @@
 /* Numbers that filter_points leaves for each point: normal, sigma_c, sigma_s, variation. */
 #define PLANE_NUMBERS 6
 
+/* Heights and squares of distances are needed twice: CPUs keep them, GPUs find them again, which takes no memory. */
+#if LANES == 8
+#define KEPT_NEIGHBOURS MOST_NEIGHBOURS
+static inline void keep_height(floats *heights, floats *squares, const int t, const floats height, const floats square)
+{
+    heights[t] = height;
+    squares[t] = square;
+}
+
+static inline void height_again(
+    __global const float *x, __global const float *y, __global const float *z, __global const int *neighbours,
+    const near_rows rows, const int t, const floats nx, const floats ny, const floats nz, const floats *heights,
+    const floats *squares, floats *height, floats *square)
+{
+    *height = heights[t];
+    *square = squares[t];
+}
+#else
+#define KEPT_NEIGHBOURS 1
+static inline void keep_height(floats *heights, floats *squares, const int t, const floats height, const floats square)
+{
+}
+
+static inline void height_again(
+    __global const float *x, __global const float *y, __global const float *z, __global const int *neighbours,
+    const near_rows rows, const int t, const floats nx, const floats ny, const floats nz, const floats *heights,
+    const floats *squares, floats *height, floats *square)
+{
+    height_of_row(x, y, z, neighbours, rows, t, nx, ny, nz, height, square);
+}
+#endif
+
 /* Parameters  x y z      in   (points) mm, sorted by cell
  *             order      in   (points) number of each point in the cloud
  *             neighbours in   (place_count, k) places of the neighbours, ascending by distance
@@ -50,19 +82,12 @@ __kernel void filter_points(
     const floats nx = (floats)(GATHER(float, normals, own));
     const floats ny = (floats)(GATHER(float, normals + place_count, own));
     const floats nz = (floats)(GATHER(float, normals + 2 * (size_t)place_count, own));
-#if LANES == 8
-    floats heights[MOST_NEIGHBOURS], squares[MOST_NEIGHBOURS];
-#define KEEP(t)          \
-    heights[t] = height; \
-    squares[t] = square;
-#else
-#define KEEP(t)
-#endif
+    floats heights[KEPT_NEIGHBOURS], squares[KEPT_NEIGHBOURS];
     floats sum = 0.0f, sum_of_squares = 0.0f, farthest = 0.0f;
     for (int t = 0; t < k; ++t) {
         floats height, square;
         height_of_row(x, y, z, neighbours, rows, t, nx, ny, nz, &height, &square);
-        KEEP(t)
+        keep_height(heights, squares, t, height, square);
         sum += height;
         sum_of_squares += height * height;
         farthest = square;
@@ -76,12 +101,8 @@ __kernel void filter_points(
     const floats high = choose(moving, -0.5f / (sigma_s * sigma_s), (floats)(0.0f));
     floats above = 0.0f, below = 1.0f; /* the first neighbour is at the point itself: height 0, weight 1 */
     for (int t = 1; t < k; ++t) {
-#if LANES == 8
-        const floats height = heights[t], square = squares[t];
-#else
         floats height, square;
-        height_of_row(x, y, z, neighbours, rows, t, nx, ny, nz, &height, &square);
-#endif
+        height_again(x, y, z, neighbours, rows, t, nx, ny, nz, heights, squares, &height, &square);
         const floats weight = exp(square * far + height * height * high);
         above += weight * height;
         below += weight;

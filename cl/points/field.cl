@@ -130,6 +130,54 @@ __kernel void sort_normals(
     nz[place] = normal.z;
 }
 
+/* The points with their normals in the order of their grid, the nodes, and what a point counts; see measure_nodes. */
+typedef struct {
+    __global const uint *mask, *ranks, *starts;
+    __global const float *px, *py, *pz, *nx, *ny, *nz;
+    float4 nodes, origin;
+    int cells_x, cells_y, cells_z, words;
+    float within, squared_reach, per_squared_reach, squared_smoothing;
+} field_grid;
+
+/* What is written of a row of nodes, and by what it is decided. */
+typedef struct {
+    __global float *values;
+    __global uchar *near, *core, *negative;
+    uint nodes_y, node_words;
+    float squared_bridge, squared_spacing;
+} field_rows;
+
+/* Rows of nodes with all cells whose points may reach them. */
+typedef struct {
+    float8 x;
+    float3 low, high; /* of the nodes */
+    int2 over_x, over_y, over_z; /* cells, the last one included */
+} node_block;
+
+/* The block that begins with node `first`, `rows` rows wide along y and z. */
+static inline node_block find_block(const field_grid *g, const int4 first, const int rows)
+{
+    const float spacing = g->nodes.w;
+    const float8 x = g->nodes.x + (convert_float8((int8)(0, 1, 2, 3, 4, 5, 6, 7) + first.x) * spacing);
+    const float3 low = (float3)(x.s0, g->nodes.y + (float)first.y * spacing, g->nodes.z + (float)first.z * spacing);
+    const float3 high = (float3)(
+        x.s7, g->nodes.y + (float)(first.y + rows - 1) * spacing, g->nodes.z + (float)(first.z + rows - 1) * spacing);
+    const float4 origin = g->origin;
+    const int2 over_x = cells_between(low.x - g->within, high.x + g->within, origin.x, origin.w, g->cells_x);
+    const int2 over_y = cells_between(low.y - g->within, high.y + g->within, origin.y, origin.w, g->cells_y);
+    const int2 over_z = cells_between(low.z - g->within, high.z + g->within, origin.z, origin.w, g->cells_z);
+    const node_block block = {x, low, high, over_x, over_y, over_x.x > over_x.y ? (int2)(0, -1) : over_z};
+    return block;
+}
+
+/* First point of the cells (over_x, cell_y, cell_z), and the one after the last. */
+static inline uint2 points_over(const field_grid *g, const int2 over_x, const int cell_y, const int cell_z)
+{
+    const uint row = grid_row(cell_y, cell_z, g->cells_y, g->words);
+    const uint2 cells = grid_window(g->mask, g->ranks, row, over_x.x, over_x.y);
+    return (uint2)(g->starts[cells.x], g->starts[cells.y]);
+}
+
 /* What the nodes of a row have so far: sums of weighted heights and of weights, squared distance of the nearest point. */
 typedef struct {
     float8 heights, weights, nearest;
@@ -138,14 +186,14 @@ typedef struct {
 /* Add a point at x = `place` to a row of nodes at `x`.  `square` is its squared distance in y and z, `height` that part of
  * <x - p, n>. */
 static inline RowSums add_point(
-    RowSums sums, const float8 x, const float place, const float square, const float nx, const float height,
-    const float per_squared_reach, const float squared_smoothing)
+    RowSums sums, const field_grid *g, const float8 x, const float place, const float square, const float nx,
+    const float height)
 {
     const float8 along = x - place;
     const float8 squared = along * along + square;
-    const float8 rest = 1.0f - squared * per_squared_reach;
+    const float8 rest = 1.0f - squared * g->per_squared_reach;
     const float8 inner = rest > 0.0f ? rest : 0.0f;
-    const float8 weight = inner * inner / (squared + squared_smoothing);
+    const float8 weight = inner * inner / (squared + g->squared_smoothing);
     sums.heights += weight * (along * nx + height);
     sums.weights += weight;
     sums.nearest = squared < sums.nearest ? squared : sums.nearest;
@@ -161,17 +209,19 @@ static inline uchar row_bits(const int8 condition)
     return (uchar)(pairs.x | pairs.y);
 }
 
-/* Write f of a row and its bits. */
+/* Write f of row `row` of a brick, which is number `place` of the list, and its bits. */
 static inline void write_row(
-    const RowSums sums, __global float *values, __global uchar *near, __global uchar *core, __global uchar *negative,
-    const size_t value, const size_t byte, const float squared_bridge, const float squared_spacing)
+    const field_rows *out, const RowSums sums, const uint place, const int4 brick, const uint row)
 {
-    const int8 is_near = (sums.weights > 0.0f) & (sums.nearest <= squared_bridge);
+    const int8 is_near = (sums.weights > 0.0f) & (sums.nearest <= out->squared_bridge);
     const float8 mean = sums.weights > 0.0f ? sums.heights / sums.weights : 0.0f;
-    vstore8(mean, value, values);
-    near[byte] = row_bits(is_near);
-    core[byte] = row_bits(is_near & (sums.nearest <= squared_spacing));
-    negative[byte] = row_bits(is_near & (mean <= 0.0f));
+    const size_t node_row = (size_t)(brick.z * BRICK_WIDE + (int)(row / BRICK_WIDE)) * out->nodes_y
+                            + (size_t)(brick.y * BRICK_WIDE + (int)(row % BRICK_WIDE));
+    const size_t byte = node_row * (4 * out->node_words) + (size_t)brick.x;
+    vstore8(mean, (size_t)place * BRICK_ROWS + row, out->values);
+    out->near[byte] = row_bits(is_near);
+    out->core[byte] = row_bits(is_near & (sums.nearest <= out->squared_spacing));
+    out->negative[byte] = row_bits(is_near & (mean <= 0.0f));
 }
 
 #if LANES == 8
@@ -180,35 +230,94 @@ typedef struct {
     float x[GATHERED], y[GATHERED], z[GATHERED], nx[GATHERED], ny[GATHERED], nz[GATHERED];
 } Gathered;
 
-/* Add gathered points to all rows of a brick whose first node is `corner`; corner.w is the spacing. */
+/* Add gathered points to all rows of a brick whose first node is `first`. */
 static inline void add_gathered(
-    const Gathered *points, const uint count, RowSums *rows, const float8 x, const int4 first, const float4 nodes,
-    const float squared_reach, const float per_squared_reach, const float squared_smoothing)
+    const field_grid *g, const Gathered *points, const uint count, RowSums *rows, const float8 x, const int4 first)
 {
     ushort chosen[GATHERED];
     float squares[GATHERED];
     for (int row = 0; row < BRICK_ROWS; ++row) {
-        const float y = nodes.y + (float)(first.y + row % BRICK_WIDE) * nodes.w;
-        const float z = nodes.z + (float)(first.z + row / BRICK_WIDE) * nodes.w;
+        const float y = g->nodes.y + (float)(first.y + row % BRICK_WIDE) * g->nodes.w;
+        const float z = g->nodes.z + (float)(first.z + row / BRICK_WIDE) * g->nodes.w;
         uint used = 0;
         for (uint point = 0; point < count; ++point) {
             const float dy = y - points->y[point], dz = z - points->z[point];
             const float square = dy * dy + dz * dz;
             chosen[used] = (ushort)point;
             squares[used] = square;
-            used += square < squared_reach;
+            used += square < g->squared_reach;
         }
         RowSums sums = rows[row];
         for (uint place = 0; place < used; ++place) {
             const uint point = chosen[place];
             const float height =
                 (y - points->y[point]) * points->ny[point] + (z - points->z[point]) * points->nz[point];
-            sums = add_point(
-                sums, x, points->x[point], squares[place], points->nx[point], height, per_squared_reach,
-                squared_smoothing);
+            sums = add_point(sums, g, x, points->x[point], squares[place], points->nx[point], height);
         }
         rows[row] = sums;
     }
+}
+
+/* Measure all rows of a brick. */
+#define ITEMS_OF_BRICK 1
+static inline void measure_item(
+    const field_grid *g, const field_rows *out, const uint place, const int4 brick, const uint item)
+{
+    const int4 first = brick * (int4)(BRICK_LONG, BRICK_WIDE, BRICK_WIDE, 0);
+    const node_block block = find_block(g, first, BRICK_WIDE);
+    const float3 low = block.low, high = block.high;
+    const RowSums nothing = {(float8)(0.0f), (float8)(0.0f), (float8)(INFINITY)};
+    RowSums sums[BRICK_ROWS];
+    for (int row = 0; row < BRICK_ROWS; ++row)
+        sums[row] = nothing;
+    Gathered points;
+    uint gathered = 0;
+    for (int cell_z = block.over_z.x; cell_z <= block.over_z.y; ++cell_z)
+        for (int cell_y = block.over_y.x; cell_y <= block.over_y.y; ++cell_y) {
+            const uint2 range = points_over(g, block.over_x, cell_y, cell_z);
+            for (uint point = range.x; point < range.y; ++point) {
+                const float from_x = fmax(fmax(low.x - g->px[point], g->px[point] - high.x), 0.0f);
+                const float from_y = fmax(fmax(low.y - g->py[point], g->py[point] - high.y), 0.0f);
+                const float from_z = fmax(fmax(low.z - g->pz[point], g->pz[point] - high.z), 0.0f);
+                points.x[gathered] = g->px[point];
+                points.y[gathered] = g->py[point];
+                points.z[gathered] = g->pz[point];
+                points.nx[gathered] = g->nx[point];
+                points.ny[gathered] = g->ny[point];
+                points.nz[gathered] = g->nz[point];
+                gathered += from_x * from_x + (from_y * from_y + from_z * from_z) < g->squared_reach;
+                if (gathered == GATHERED) {
+                    add_gathered(g, &points, gathered, sums, block.x, first);
+                    gathered = 0;
+                }
+            }
+        }
+    add_gathered(g, &points, gathered, sums, block.x, first);
+    for (uint row = 0; row < BRICK_ROWS; ++row)
+        write_row(out, sums[row], place, brick, row);
+}
+#else
+/* Measure row number `item` of a brick. */
+#define ITEMS_OF_BRICK BRICK_ROWS
+static inline void measure_item(
+    const field_grid *g, const field_rows *out, const uint place, const int4 brick, const uint item)
+{
+    const int4 first = brick * (int4)(BRICK_LONG, BRICK_WIDE, BRICK_WIDE, 0)
+                       + (int4)(0, (int)(item % BRICK_WIDE), (int)(item / BRICK_WIDE), 0);
+    const node_block block = find_block(g, first, 1);
+    RowSums sums = {(float8)(0.0f), (float8)(0.0f), (float8)(INFINITY)};
+    for (int cell_z = block.over_z.x; cell_z <= block.over_z.y; ++cell_z)
+        for (int cell_y = block.over_y.x; cell_y <= block.over_y.y; ++cell_y) {
+            const uint2 range = points_over(g, block.over_x, cell_y, cell_z);
+            for (uint point = range.x; point < range.y; ++point) {
+                const float y = block.low.y - g->py[point], z = block.low.z - g->pz[point];
+                const float square = y * y + z * z;
+                if (square < g->squared_reach)
+                    sums = add_point(
+                        sums, g, block.x, g->px[point], square, g->nx[point], y * g->ny[point] + z * g->nz[point]);
+            }
+        }
+    write_row(out, sums, place, brick, item);
 }
 #endif
 
@@ -221,7 +330,7 @@ static inline void add_gathered(
  *             nodes_y        nodes along y;  node_words: words of a row of the masks;  bricks_y brick_words: of the bricks
  *             squared_reach squared_smoothing squared_bridge squared_spacing    R^2, s^2, B^2, h^2
  *             count          bricks
- * Launch      global = count with LANES 8, else 16 * count, rounded up by the host, any local
+ * Launch      global = ITEMS_OF_BRICK * count rounded up by the host, any local
  * Guarantees  every value and every byte of the bricks is written */
 __kernel void measure_nodes(
     __global const uint *restrict mask, __global const uint *restrict ranks, __global const uint *restrict starts,
@@ -233,86 +342,12 @@ __kernel void measure_nodes(
     const uint node_words, const uint bricks_y, const uint brick_words, const float squared_reach,
     const float squared_smoothing, const float squared_bridge, const float squared_spacing, const uint count)
 {
-#if LANES == 8
-    const uint place = get_global_id(0), rows = BRICK_WIDE;
-    if (place >= count)
-        return;
-    const int4 brick = brick_at(list[place], bricks_y, brick_words);
-    const int4 first = brick * (int4)(BRICK_LONG, BRICK_WIDE, BRICK_WIDE, 0);
-#else
-    const uint place = (uint)get_global_id(0) / BRICK_ROWS, row = (uint)get_global_id(0) % BRICK_ROWS, rows = 1;
-    if (place >= count)
-        return;
-    const int4 brick = brick_at(list[place], bricks_y, brick_words);
-    const int4 first = brick * (int4)(BRICK_LONG, BRICK_WIDE, BRICK_WIDE, 0)
-                       + (int4)(0, (int)(row % BRICK_WIDE), (int)(row / BRICK_WIDE), 0);
-#endif
-    const float per_squared_reach = 1.0f / squared_reach, spacing = nodes.w;
-    const float8 x = nodes.x + (convert_float8((int8)(0, 1, 2, 3, 4, 5, 6, 7) + first.x) * spacing);
-    const float3 low = (float3)(x.s0, nodes.y + (float)first.y * spacing, nodes.z + (float)first.z * spacing);
-    const float3 high = (float3)(
-        x.s7, nodes.y + (float)(first.y + (int)rows - 1) * spacing, nodes.z + (float)(first.z + (int)rows - 1) * spacing);
-    const int2 over_x = cells_between(low.x - within, high.x + within, origin.x, origin.w, cells_x);
-    const int2 over_y = cells_between(low.y - within, high.y + within, origin.y, origin.w, cells_y);
-    const int2 over_z = cells_between(low.z - within, high.z + within, origin.z, origin.w, cells_z);
-    const RowSums nothing = {(float8)(0.0f), (float8)(0.0f), (float8)(INFINITY)};
-#if LANES == 8
-    RowSums sums[BRICK_ROWS];
-    Gathered points;
-    for (int row = 0; row < BRICK_ROWS; ++row)
-        sums[row] = nothing;
-    uint gathered = 0;
-#else
-    RowSums sums = nothing;
-#endif
-    for (int cell_z = over_z.x; cell_z <= over_z.y; ++cell_z)
-        for (int cell_y = over_y.x; cell_y <= over_y.y; ++cell_y) {
-            if (over_x.x > over_x.y)
-                continue;
-            const uint2 cells =
-                grid_window(mask, ranks, grid_row(cell_y, cell_z, cells_y, words), over_x.x, over_x.y);
-            const uint end = starts[cells.y];
-            for (uint point = starts[cells.x]; point < end; ++point) {
-#if LANES == 8
-                const float from_x = fmax(fmax(low.x - px[point], px[point] - high.x), 0.0f);
-                const float from_y = fmax(fmax(low.y - py[point], py[point] - high.y), 0.0f);
-                const float from_z = fmax(fmax(low.z - pz[point], pz[point] - high.z), 0.0f);
-                points.x[gathered] = px[point];
-                points.y[gathered] = py[point];
-                points.z[gathered] = pz[point];
-                points.nx[gathered] = nx[point];
-                points.ny[gathered] = ny[point];
-                points.nz[gathered] = nz[point];
-                gathered += from_x * from_x + (from_y * from_y + from_z * from_z) < squared_reach;
-                if (gathered == GATHERED) {
-                    add_gathered(
-                        &points, gathered, sums, x, first, nodes, squared_reach, per_squared_reach, squared_smoothing);
-                    gathered = 0;
-                }
-#else
-                const float2 away = (float2)(low.y - py[point], low.z - pz[point]);
-                const float square = away.x * away.x + away.y * away.y;
-                if (square < squared_reach)
-                    sums = add_point(
-                        sums, x, px[point], square, nx[point], away.x * ny[point] + away.y * nz[point],
-                        per_squared_reach, squared_smoothing);
-#endif
-            }
-        }
-#if LANES == 8
-    add_gathered(&points, gathered, sums, x, first, nodes, squared_reach, per_squared_reach, squared_smoothing);
-    for (int row = 0; row < BRICK_ROWS; ++row) {
-        const size_t node_row = (size_t)(first.z + row / BRICK_WIDE) * nodes_y + (size_t)(first.y + row % BRICK_WIDE);
-        write_row(
-            sums[row], values, near, core, negative, (size_t)place * BRICK_ROWS + (size_t)row,
-            node_row * (4 * node_words) + (size_t)brick.x, squared_bridge, squared_spacing);
-    }
-#else
-    const size_t node_row = (size_t)first.z * nodes_y + (size_t)first.y;
-    write_row(
-        sums, values, near, core, negative, (size_t)place * BRICK_ROWS + row, node_row * (4 * node_words) + (size_t)brick.x,
-        squared_bridge, squared_spacing);
-#endif
+    const field_grid grid = {mask, ranks, starts, px, py, pz, nx, ny, nz, nodes, origin, cells_x, cells_y, cells_z,
+        words, within, squared_reach, 1.0f / squared_reach, squared_smoothing};
+    const field_rows out = {values, near, core, negative, nodes_y, node_words, squared_bridge, squared_spacing};
+    const uint place = (uint)get_global_id(0) / ITEMS_OF_BRICK, item = (uint)get_global_id(0) % ITEMS_OF_BRICK;
+    if (place < count)
+        measure_item(&grid, &out, place, brick_at(list[place], bricks_y, brick_words), item);
 }
 
 /* Parameters  inside  in   (rows, 4 * node_words) bytes: the node is inside; those of the slab

@@ -71,6 +71,13 @@ __kernel void find_core_points(
     labels[cell] = label;
 }
 
+/* Chunk of an item; on a CPU it is that of the work-group, and items but the first have none: NO_CELL. */
+#if LANES == 8
+static inline uint find_chunk(void) { return get_local_id(0) == 0 ? (uint)get_group_id(0) : NO_CELL; }
+#else
+static inline uint find_chunk(void) { return get_global_id(0); }
+#endif
+
 /* Root of a cell; the way there is halved. */
 static inline uint find_root(__global uint *labels, uint cell)
 {
@@ -111,13 +118,7 @@ __kernel void join_chunks(
     GRID_PARAMETERS, __global const float *restrict core_x, __global const uint *restrict roots,
     __global uint *labels, const uint per_chunk, const int first_row, const int end_row)
 {
-#if LANES == 8
-    if (get_local_id(0) != 0)
-        return;
-    const uint chunk = get_group_id(0);
-#else
-    const uint chunk = get_global_id(0);
-#endif
+    const uint chunk = find_chunk();
     if (chunk > (cells - 1) / per_chunk)
         return;
     const point_grid grid = { x, y, z, starts, mask, ranks, origin, bounds, nx, ny, nz, words };

@@ -19,6 +19,11 @@
 
 /* Neighbouring points of an item of mark_cells on a CPU: those of one word of the mask need one atomic. */
 #define MARKED_TOGETHER 16
+#if LANES == 8
+#define MARKED_BY_ITEM MARKED_TOGETHER
+#else
+#define MARKED_BY_ITEM 1
+#endif
 
 /* Parameters  mask   out  (total,) zeros
  *             total  words
@@ -34,17 +39,16 @@ __kernel void clear_cells(__global uint *restrict mask, const uint total)
  *             mask    in/out  (nz, ny, words), cleared; then the bits of cells with points
  *             origin  corner of cell (0, 0, 0) relative to the base, 1 / edge
  *             n       points;  nx ny nz: cells;  words: of a row
- * Launch      global = n, or n / MARKED_TOGETHER with LANES 8, rounded up by the host, any local
+ * Launch      global = n / MARKED_BY_ITEM rounded up by the host, any local
  * Assumes     no point lies before the origin */
 __kernel void mark_cells(
     __global const float *restrict points, __global uint *mask, const float4 origin, const uint n, const int nx,
     const int ny, const int nz, const int words)
 {
-#if LANES == 8
-    const uint first = (uint)get_global_id(0) * MARKED_TOGETHER;
+    const uint first = (uint)get_global_id(0) * MARKED_BY_ITEM;
     if (first >= n)
         return;
-    const uint end = first + min((uint)MARKED_TOGETHER, n - first);
+    const uint end = first + min((uint)MARKED_BY_ITEM, n - first);
     uint word = 0xffffffffu, bits = 0;
     for (uint point = first; point < end; ++point) {
         const float3 place = vload3(point, points);
@@ -58,14 +62,6 @@ __kernel void mark_cells(
         bits |= 1u << (cell.x & 31);
     }
     atomic_or(mask + word, bits);
-#else
-    const uint point = get_global_id(0);
-    if (point >= n)
-        return;
-    const float3 place = vload3(point, points);
-    const int4 cell = grid_cell(place.x, place.y, place.z, origin, nx, ny, nz);
-    atomic_or(mask + grid_row(cell.y, cell.z, ny, words) + ((uint)cell.x >> 5), 1u << (cell.x & 31));
-#endif
 }
 
 /* Parameters  mask    in   (total,)

@@ -22,6 +22,11 @@
 
 #define BATCH_CELLS 16
 
+/* What a launch works on: cells, and the points in them. */
+typedef struct {
+    uint first_cell, cell_count, first_place, place_count;
+} launch_part;
+
 #if LANES == 8
 #include "points/nearest_listed.h"
 
@@ -67,8 +72,45 @@ static inline void list_cell(
         write_sorted(c, by_place ? place - first_place : g->order[place], k, by_place, neighbours, distances);
     }
 }
+
+/* Find the neighbours of the points of BATCH_CELLS cells. */
+static inline void list_item(
+    const cloud_grid *g, const size_t item, const int k, const float4 origin, const float margin, const int by_place,
+    const launch_part part, __global int *neighbours, __global float *distances)
+{
+    if (item >= (part.cell_count + BATCH_CELLS - 1) / BATCH_CELLS)
+        return;
+    candidates c;
+    const uint first = part.first_cell + (uint)item * BATCH_CELLS;
+    const uint end = min(first + BATCH_CELLS, part.first_cell + part.cell_count);
+    uint word = word_of_cell(g, first);
+    uint bits = g->mask[word];
+    for (uint before = g->ranks[word]; before < first; ++before)
+        bits &= bits - 1u;
+    float bound = origin.w * origin.w;
+    for (uint number = first; number < end; ++number) {
+        while (bits == 0u)
+            bits = g->mask[++word];
+        const int3 cell = place_of_bit(g, word, popcount((bits & -bits) - 1u));
+        bits &= bits - 1u;
+        list_cell(
+            &c, g, number, cell, k, origin.xyz, origin.w, margin, &bound, by_place, part.first_place, neighbours,
+            distances);
+    }
+}
 #else
 #include "points/nearest_passes.h"
+
+/* Find the neighbours of one point. */
+static inline void list_item(
+    const cloud_grid *g, const size_t item, const int k, const float4 origin, const float margin, const int by_place,
+    const launch_part part, __global int *neighbours, __global float *distances)
+{
+    if (item < part.place_count)
+        list_point(
+            g, part.first_place + (uint)item, k, origin.xyz, origin.w, margin, by_place, part.first_place, neighbours,
+            distances);
+}
 #endif
 
 /* Parameters  mask      in   (nz, ny, words) occupied cells, a bit each
@@ -96,32 +138,6 @@ __kernel void list_neighbours(
     const uint cell_count, const uint first_place, const uint place_count)
 {
     const cloud_grid g = {mask, ranks, starts, order, x, y, z, nx, ny, nz, words, cells, points};
-#if LANES == 8
-    const uint item = get_global_id(0);
-    if (item >= (cell_count + BATCH_CELLS - 1) / BATCH_CELLS)
-        return;
-    candidates c;
-    const uint first = first_cell + item * BATCH_CELLS;
-    const uint end = min(first + BATCH_CELLS, first_cell + cell_count);
-    uint word = word_of_cell(&g, first);
-    uint bits = mask[word];
-    for (uint before = ranks[word]; before < first; ++before)
-        bits &= bits - 1u;
-    float bound = origin.w * origin.w;
-    for (uint number = first; number < end; ++number) {
-        while (bits == 0u)
-            bits = mask[++word];
-        const int3 cell = place_of_bit(&g, word, popcount((bits & -bits) - 1u));
-        bits &= bits - 1u;
-        list_cell(
-            &c, &g, number, cell, k, origin.xyz, origin.w, margin, &bound, by_place, first_place, neighbours,
-            distances);
-    }
-#else
-    const size_t item = get_global_id(0);
-    if (item >= place_count)
-        return;
-    list_point(
-        &g, first_place + (uint)item, k, origin.xyz, origin.w, margin, by_place, first_place, neighbours, distances);
-#endif
+    const launch_part part = {first_cell, cell_count, first_place, place_count};
+    list_item(&g, get_global_id(0), k, origin, margin, by_place, part, neighbours, distances);
 }

@@ -23,6 +23,41 @@
 #define COMBINE_MAX 1
 #define COMBINE_MIN 2
 
+/* Find the slice at or below a height and the share of the way to the one above, and make i and j indices of it.
+ * Returns whether the height lies in the stack. */
+#if UNEVEN
+static inline int find_slice(
+    __global const long *slices, const int nk, const long height, long *i, long *j, int *k, float *share)
+{
+    int low = 0, high = nk - 1; /* the layer: slices[low] <= height < slices[low + 1], or one at an end */
+    while (high - low > 1) {
+        const int middle = (low + high) / 2;
+        if (slices[3 * middle + 2] <= height)
+            low = middle;
+        else
+            high = middle;
+    }
+    __global const long *below = slices + 3 * low;
+    const float gap = (float)(below[5] - below[2]), part = (float)(height - below[2]) / gap;
+    if (!(part >= -0.5f - 1e-6f && part <= 1.5f + 1e-6f)) /* only in the first and the last layer */
+        return 0;
+    *i -= below[0] + (long)(part * (float)(below[3] - below[0]));
+    *j -= below[1] + (long)(part * (float)(below[4] - below[1]));
+    *k = part < 1.0f ? low : low + 1;
+    *share = part < 1.0f ? fmax(part, 0.0f) : 0.0f;
+    return 1;
+}
+#else
+static inline int find_slice(
+    __global const long *slices, const int nk, const long height, long *i, long *j, int *k, float *share)
+{
+    const long place = clamp_place(height, nk);
+    *k = (int)(place >> 32);
+    *share = (float)(uint)place * (1.0f / 4294967296.0f);
+    return is_within(height, nk);
+}
+#endif
+
 /* Parameters  voxels    in   the slices first_k and following of a volume of (nk, nj, ni)
  *             rows      in   (h, 9) 2^-32 units: the place of each row's first pixel on the sheet, the steps from pixel
  *                            to pixel, and from sample to sample along the slab.  Places are index coordinates (i, j, k);
@@ -63,34 +98,11 @@ __kernel void reformat_rows(
         long i = geometry[0] + (long)x * geometry[3] + (long)(m - middle_sample) * geometry[6];
         long j = geometry[1] + (long)x * geometry[4] + (long)(m - middle_sample) * geometry[7];
         const long height = geometry[2] + (long)x * geometry[5] + (long)(m - middle_sample) * geometry[8];
-#if UNEVEN
-        int low = 0, high = nk - 1; /* the layer: slices[low] <= height < slices[low + 1], or one at an end */
-        while (high - low > 1) {
-            const int middle = (low + high) / 2;
-            if (slices[3 * middle + 2] <= height)
-                low = middle;
-            else
-                high = middle;
-        }
-        __global const long *below = slices + 3 * low;
-        const float gap = (float)(below[5] - below[2]), part = (float)(height - below[2]) / gap;
-        if (!(part >= -0.5f - 1e-6f && part <= 1.5f + 1e-6f)) /* only in the first and the last layer */
+        int k;
+        float fk;
+        if (!find_slice(slices, nk, height, &i, &j, &k, &fk) || !is_within(i, ni) || !is_within(j, nj) || k < own_first
+            || k >= own_end)
             continue;
-        i -= below[0] + (long)(part * (float)(below[3] - below[0]));
-        j -= below[1] + (long)(part * (float)(below[4] - below[1]));
-        const int k = part < 1.0f ? low : low + 1;
-        const float fk = part < 1.0f ? fmax(part, 0.0f) : 0.0f;
-        if (!is_within(i, ni) || !is_within(j, nj) || k < own_first || k >= own_end)
-            continue;
-#else
-        if (!is_within(i, ni) || !is_within(j, nj) || !is_within(height, nk))
-            continue;
-        const long place = clamp_place(height, nk);
-        const int k = (int)(place >> 32);
-        const float fk = (float)(uint)place * (1.0f / 4294967296.0f);
-        if (k < own_first || k >= own_end)
-            continue;
-#endif
         __global const VOXEL *lower = voxels + slice_voxels * (size_t)(k - first_k);
         __global const VOXEL *upper = fk > 0.0f ? lower + slice_voxels : lower;
         const float sample = sample_trilinear(lower, upper, clamp_place(i, ni), clamp_place(j, nj), fk, ni);

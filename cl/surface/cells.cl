@@ -7,6 +7,7 @@
  * References: as in cl/surface/marching_cubes.cl. */
 #include "include/mask_rows.h"
 #include "surface/cell_numbers.h"
+#include "surface/grown.h"
 #include "surface/mc_tables.h"
 
 #ifndef LANES
@@ -14,6 +15,37 @@
 #endif
 #ifndef WORDS_PER_ITEM
 #define WORDS_PER_ITEM 1
+#endif
+
+/* Words of a row that may own a vertex or have an active cell: from .x to below .y, which is 0 where there are none. */
+#ifdef GROWN
+#define EXTENT_PARAMETERS , __global const ushort2 *restrict grown_extents
+#define EXTENTS grown_extents
+static inline uint2 find_words(
+    __global const ushort2 *extents, const grown_samples *grown, const uint row, const uint gj, const int has_y,
+    const int has_z)
+{
+    return convert_uint2(extents[grown->first_row + row]);
+}
+#else
+#define EXTENT_PARAMETERS
+#define EXTENTS row_extents
+/* Beyond the extents of the four rows everything is outside; the sample before may own an edge into them. */
+static inline uint2 find_words(
+    __global const ushort2 *extents, const grown_samples *grown, const uint row, const uint gj, const int has_y,
+    const int has_z)
+{
+    const ushort2 around[4] = {extents[row], extents[has_y ? row + 1 : row], extents[has_z ? row + gj : row],
+        extents[has_y && has_z ? row + gj + 1 : row]};
+    uint begin = 0xffff, end = 0;
+    for (uint n = 0; n < 4; ++n) {
+        if (around[n].x < around[n].y) {
+            begin = min(begin, (uint)around[n].x);
+            end = max(end, (uint)around[n].y);
+        }
+    }
+    return (uint2)(begin, end);
+}
 #endif
 
 /* Parameters  mask             in   (gk, gj, words)
@@ -37,10 +69,7 @@ __kernel void count_rows(
     __global uint *restrict row_counts, __global uint *restrict words_with_work,
     __global ushort *restrict word_vertices, __global ushort *restrict word_triangles,
     const uint gi, const uint gj, const uint gk, const uint words, const uint flag_words, const uint rows_to_count
-#ifdef GROWN
-    , __global const uint *restrict grown, __global const ushort2 *restrict grown_extents, const uint first_grown
-#endif
-    )
+    GROWN_PARAMETERS EXTENT_PARAMETERS)
 {
     const uint row = get_global_id(0);
     if (row >= rows_to_count)
@@ -53,23 +82,9 @@ __kernel void count_rows(
     __global const uint *y1z0 = has_y ? y0z0 + words : y0z0;
     __global const uint *y0z1 = has_z ? y0z0 + (size_t)gj * words : y0z0;
     __global const uint *y1z1 = has_y && has_z ? y0z1 + words : y0z0;
-#ifdef GROWN
-    const size_t grown_row = (size_t)first_grown * gj + row;
-    __global const uint *row_grown = grown + grown_row * words;
-    uint begin = grown_extents[grown_row].x, end = grown_extents[grown_row].y;
-#else
-    /* Beyond the extents of the four rows everything is outside; the sample before may own an edge into them. */
-    const ushort2 extents[4] = {row_extents[row], row_extents[has_y ? row + 1 : row],
-        row_extents[has_z ? row + gj : row], row_extents[has_y && has_z ? row + gj + 1 : row]};
-    uint begin = words, end = 0;
-    for (uint around = 0; around < 4; ++around) {
-        if (extents[around].x < extents[around].y) {
-            begin = min(begin, (uint)extents[around].x);
-            end = max(end, (uint)extents[around].y);
-        }
-    }
-#endif
-    begin -= begin != 0;
+    const grown_samples grown_here = GROWN_SAMPLES;
+    const uint2 row_words = find_words(EXTENTS, &grown_here, row, gj, has_y, has_z);
+    const uint begin = row_words.x - (row_words.x != 0), end = row_words.y;
     for (uint f = 0; f < flag_words; ++f)
         words_with_work[(size_t)row * flag_words + f] = 0;
     if (end == 0) {
@@ -87,11 +102,7 @@ __kernel void count_rows(
         rows.y1z0 |= next_rows.y1z0 << 32;
         rows.y0z1 |= next_rows.y0z1 << 32;
         rows.y1z1 |= next_rows.y1z1 << 32;
-#ifdef GROWN
-        const uint kept = row_grown[w];
-#else
-        const uint kept = ~0u;
-#endif
+        const uint kept = load_grown(&grown_here, row, w);
         const uint active = find_active_cells(rows, w, gi) & kept;
         const uint y = (uint)(rows.y0z0 ^ rows.y1z0) & kept, z = (uint)(rows.y0z0 ^ rows.y0z1) & kept;
         if ((active | y | z) != 0) {
@@ -155,10 +166,12 @@ __kernel void list_words(
     }
 }
 
+/* Write the triangles of a cell from number *triangle on; `packed` is its row of MC_TRIANGLES, and the shifts say where
+ * in a packed triangle its first and its last corner stand.  On CPUs *waits triangles wait in private memory for their
+ * turn, and the last ones for flush_triangles. */
 #if LANES > 1
 #define TRIANGLES_WAITING 64
 
-/* Write triangles that wait in private memory. */
 static inline void flush_triangles(const uint *waiting, uint count, __global uint *out)
 {
     uint n = 0;
@@ -166,6 +179,48 @@ static inline void flush_triangles(const uint *waiting, uint count, __global uin
         vstore8(vload8(0, waiting + n), 0, out + n);
     for (; n < 3 * count; ++n)
         out[n] = waiting[n];
+}
+
+static inline void write_triangles(
+    const cell_numbers *edge_numbers, const ulong packed, const uint first_shift, const uint last_shift,
+    uint *waiting, uint *waits, size_t *triangle, __global uint *triangles)
+{
+    /* Two triangles whether they count or not, the rest where there are more: wrong guesses cost more. */
+    __private uint *out = waiting + 3 * *waits;
+    const uint count = (uint)packed & 15;
+    uint numbers[16];
+    vstore8(edge_numbers->along_xy, 0, numbers);
+    vstore4(edge_numbers->along_z, 2, numbers);
+#define PUT(n) \
+    out[3 * n] = numbers[packed >> (4 + 12 * n + first_shift) & 15]; \
+    out[3 * n + 1] = numbers[packed >> (8 + 12 * n) & 15]; \
+    out[3 * n + 2] = numbers[packed >> (4 + 12 * n + last_shift) & 15];
+    PUT(0) PUT(1)
+    if (count > 2) {
+        PUT(2) PUT(3) PUT(4)
+    }
+#undef PUT
+    *waits += count;
+    if (*waits > TRIANGLES_WAITING - 5) {
+        flush_triangles(waiting, *waits, triangles + 3 * *triangle);
+        *triangle += *waits;
+        *waits = 0;
+    }
+}
+#else
+#define TRIANGLES_WAITING 1 /* none */
+static inline void flush_triangles(const uint *waiting, uint count, __global uint *out) {}
+
+static inline void write_triangles(
+    const cell_numbers *edge_numbers, const ulong packed, const uint first_shift, const uint last_shift,
+    uint *waiting, uint *waits, size_t *triangle, __global uint *triangles)
+{
+    for (uint n = 0; n < ((uint)packed & 15); ++n) {
+        const uint corners = (uint)(packed >> (4 + 12 * n));
+        vstore3((uint3)(pick_number(*edge_numbers, corners >> first_shift & 15),
+            pick_number(*edge_numbers, corners >> 4 & 15),
+            pick_number(*edge_numbers, corners >> last_shift & 15)), (*triangle)++, triangles);
+    }
 }
 #endif
 
@@ -189,22 +244,16 @@ __kernel void emit_triangles(
     __global const ushort *restrict word_triangles,
     __global uint *restrict triangles, const uint first_vertex, const uint rows_to_count,
     const uint gi, const uint gj, const uint gk, const uint words, const uint row_shift, const uint active,
-    const int mirrored
-#ifdef GROWN
-    , __global const uint *restrict grown, const uint first_grown
-#endif
-    )
+    const int mirrored GROWN_PARAMETERS)
 {
     const uint begin = get_global_id(0) * WORDS_PER_ITEM;
     if (begin >= active)
         return;
     const uint end = min(begin + WORDS_PER_ITEM, active);
-    /* Where in a packed triangle its first and its last corner stand. */
     const uint first_shift = mirrored ? 8 : 0, last_shift = mirrored ? 0 : 8;
-#if LANES > 1
+    const grown_samples grown_here = GROWN_SAMPLES;
     uint waiting[3 * TRIANGLES_WAITING];
     uint waits = 0;
-#endif
     const uint first_row = active_words[begin] >> row_shift;
     __global const uint *triangle_offsets = row_offsets + rows_to_count;
     size_t triangle = (size_t)(triangle_offsets[first_row] - triangle_offsets[0])
@@ -220,14 +269,9 @@ __kernel void emit_triangles(
         const uint j = row - slice_begin;
         if (j + 1 >= gj || k + 1 >= gk)
             continue;
-        cell_rows rows;
+        cell_rows rows, kept;
         load_cell_rows(&rows, mask, j, k, w, gj, words);
-#ifdef GROWN
-        cell_rows kept;
-        load_cell_rows(&kept, grown, j, k + first_grown, w, gj, words);
-#else
-        const cell_rows kept = EVERY_EDGE;
-#endif
+        load_grown_rows(&kept, &grown_here, j, k, w, gj);
         uint rest = find_active_cells(rows, w, gi) & (uint)kept.y0z0;
         numbered_rows edges;
         number_rows(&edges, &rows, &kept, mask, row_offsets, word_vertices, first_vertex, j, k, w, gi, gj, gk, words);
@@ -235,40 +279,10 @@ __kernel void emit_triangles(
             const uint b = lowest_bit(rest);
             cell_numbers edge_numbers;
             number_cell(&edge_numbers, &edges, b);
-            const ulong packed = MC_TRIANGLES[cell_case(rows, b)];
-            const uint count = (uint)packed & 15;
-#if LANES > 1
-            /* Two triangles whether they count or not, the rest where there are more: wrong guesses cost more. */
-            __private uint *out = waiting + 3 * waits;
-            uint numbers[16];
-            vstore8(edge_numbers.along_xy, 0, numbers);
-            vstore4(edge_numbers.along_z, 2, numbers);
-#define PUT(n) \
-            out[3 * n] = numbers[packed >> (4 + 12 * n + first_shift) & 15]; \
-            out[3 * n + 1] = numbers[packed >> (8 + 12 * n) & 15]; \
-            out[3 * n + 2] = numbers[packed >> (4 + 12 * n + last_shift) & 15];
-            PUT(0) PUT(1)
-            if (count > 2) {
-                PUT(2) PUT(3) PUT(4)
-            }
-#undef PUT
-            waits += count;
-            if (waits > TRIANGLES_WAITING - 5) {
-                flush_triangles(waiting, waits, triangles + 3 * triangle);
-                triangle += waits;
-                waits = 0;
-            }
-#else
-            for (uint n = 0; n < count; ++n) {
-                const uint corners = (uint)(packed >> (4 + 12 * n));
-                vstore3((uint3)(pick_number(edge_numbers, corners >> first_shift & 15),
-                    pick_number(edge_numbers, corners >> 4 & 15),
-                    pick_number(edge_numbers, corners >> last_shift & 15)), triangle++, triangles);
-            }
-#endif
+            write_triangles(
+                &edge_numbers, MC_TRIANGLES[cell_case(rows, b)], first_shift, last_shift, waiting, &waits, &triangle,
+                triangles);
         }
     }
-#if LANES > 1
     flush_triangles(waiting, waits, triangles + 3 * triangle);
-#endif
 }

@@ -13,10 +13,18 @@
 typedef struct {
     __global const LABEL *inside;
     uint label;
-} label_part;
+    float iso_level;
+    __global uint *half_way_count;
+} surface_border;
+
+/* The parameters of a kernel for the border, the border itself, and whether it goes on beyond that of the volume. */
+#define BORDER_PARAMETERS \
+    , __global const LABEL *restrict inside, const uint label, __global uint *restrict half_way_count
+#define SURFACE_BORDER { inside, label, iso_level, half_way_count }
+#define BORDER_GOES_ON 0
 
 /* The label that sample (i, j, k) is inside of; beyond the border of a closed volume none, of an open one the nearest. */
-static inline uint sample_label(const label_part *labels, const volume_part *volume, int i, int j, int k)
+static inline uint sample_label(const surface_border *labels, const volume_part *volume, int i, int j, int k)
 {
     const int ni = volume->ni, nj = volume->nj, nk = volume->nk;
     const int beyond = (i < 0) | (i >= ni) | (j < 0) | (j >= nj) | (k < 0) | (k >= nk);
@@ -28,12 +36,13 @@ static inline uint sample_label(const label_part *labels, const volume_part *vol
 
 /* Turn lane n of a gathered group into a vertex half way, where HU do not place it; returns 1 then, else 0. */
 static inline uint gather_border(
-    vertex_group *group, uint n, const volume_part *volume, const label_part *labels, float iso_level,
-    int i, int j, int k, int axis)
+    vertex_group *group, uint n, const volume_part *volume, const surface_border *labels, int i, int j, int k, int axis,
+    int inner)
 {
     const int i1 = i + (axis == 0), j1 = j + (axis == 1), k1 = k + (axis == 2);
     const uint own = sample_label(labels, volume, i, j, k), other = sample_label(labels, volume, i1, j1, k1);
-    const int own_dense = (float)group->value[n] >= iso_level, other_dense = (float)group->next_value[n] >= iso_level;
+    const int own_dense = (float)group->value[n] >= labels->iso_level;
+    const int other_dense = (float)group->next_value[n] >= labels->iso_level;
     const int placed = own == labels->label ? own_dense && !other_dense && other == 0
                                             : other_dense && !own_dense && own == 0;
     group->half_way[n] = !placed;
@@ -51,6 +60,12 @@ static inline uint gather_border(
     group->next_gradient_k[n] = double_gradient(INSIDE(i1, j1, k1 - 1), INSIDE(i1, j1, k1 + 1), k1, nk, closed);
 #undef INSIDE
     return 1;
+}
+
+static inline void count_half_way(const surface_border *labels, const uint half_way)
+{
+    if (half_way != 0)
+        atomic_add(labels->half_way_count, half_way);
 }
 
 #endif

@@ -37,12 +37,14 @@
  * and shared without a hash, an atomic or an index array, and the order never depends on the device. */
 #include "include/volume.h"
 #include "include/mask_rows.h"
+#include "surface/grown.h"
 #include "surface/vertex_group.h"
-#ifdef LABELS
+#if defined(LABELS)
 #include "surface/label_border.h"
-#endif
-#ifdef MASKS
+#elif defined(MASKS)
 #include "surface/mask_border.h"
+#else
+#include "surface/no_border.h"
 #endif
 
 #ifndef WORDS_PER_ITEM
@@ -157,38 +159,17 @@ void emit_vertices(
     const float iso_level, const VALUE outside, const float value_scale, const float4 margin,
     const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
     const uint gk, const uint words, const uint row_shift, const uint active
-#ifdef LABELS
-    , __global const LABEL *restrict inside, const uint label, __global uint *restrict half_way_count
-#endif
-#ifdef RANGE
-    , const float upper_level, const float highest
-#endif
-#ifdef MASKS
-    , __global const LABEL *restrict map, const uint label, __global const VOXEL *restrict occupied,
-    __global const int *restrict biases
-#endif
-#ifdef GROWN
-    , __global const uint *restrict grown, const uint first_grown
-#endif
-    )
+    BORDER_PARAMETERS RANGE_PARAMETERS GROWN_PARAMETERS)
 {
     const uint begin = get_global_id(0) * WORDS_PER_ITEM;
     if (begin >= active)
         return;
     const uint end = min(begin + WORDS_PER_ITEM, active);
-#ifdef MASKS
-    /* Beyond the map its border goes on: edges that lead out are placed apart from all others. */
-    const volume_part volume = {voxels, ni, nj, nk, first_slice, 0, outside};
-    const mask_part masks = {map, {occupied, ni, nj, nk, first_slice, 0, outside}, label, (int)iso_level,
-        biases};
-#else
-    const volume_part volume = {voxels, ni, nj, nk, first_slice, border, outside};
-#endif
-#ifdef LABELS
-    const label_part labels = {inside, label};
-    uint half_way = 0;
-#endif
+    const volume_part volume = {voxels, ni, nj, nk, first_slice, BORDER_GOES_ON ? 0 : border, outside};
     const uint gi = ni + 2 * border, gj = nj + 2 * border;
+    const surface_border surface = SURFACE_BORDER;
+    const grown_samples grown_here = GROWN_SAMPLES;
+    uint half_way = 0;
     slice_frame frame;
     frame.i_step = steps[0].xyz;
     frame.i_rest = steps[1].xyz;
@@ -197,10 +178,7 @@ void emit_vertices(
     frame.margin = margin.xyz;
     frame.iso_level = iso_level;
     frame.value_scale = value_scale;
-#ifdef RANGE
-    frame.upper_level = upper_level;
-    frame.highest = highest;
-#endif
+    set_upper_end(&frame RANGE_ARGUMENTS);
 
     /* First touches of the volume wait for memory: ask for all that the item will need before it needs any of it. */
     for (uint n = begin; n < end; ++n) {
@@ -229,11 +207,7 @@ void emit_vertices(
         const uint j = row - slice_begin;
         crossed_edges edges;
         find_crossed_edges(&edges, mask, j, k, w, gi, gj, gk, words);
-#ifdef GROWN
-        const uint kept = grown[((size_t)first_grown * gj + row) * words + w];
-#else
-        const uint kept = ~0u;
-#endif
+        const uint kept = load_grown(&grown_here, row, w);
         const uint x = (uint)edges.x & kept, y = (uint)edges.y & kept, z = (uint)edges.z & kept;
         word_vertex_list list;
         list_vertices(&list, x, y, z);
@@ -244,12 +218,7 @@ void emit_vertices(
             const int i = vi + (int)(vertex >> 2), axis = vertex & 3;
             const int inner = row_is_inner && i >= 1 && i < ni - 2;
             gather_vertex(&group, gathered, &volume, i, vj, vk, axis, inner);
-#ifdef LABELS
-            half_way += gather_border(&group, gathered, &volume, &labels, iso_level, i, vj, vk, axis);
-#endif
-#ifdef MASKS
-            gather_mask_border(&group, gathered, &masks, i, vj, vk, axis, inner);
-#endif
+            half_way += gather_border(&group, gathered, &volume, &surface, i, vj, vk, axis, inner);
             ++gathered;
             if (gathered == LANES) {
                 write_vertices(&group, &frame, LANES, positions + 3 * written, normals + 3 * written);
@@ -260,8 +229,5 @@ void emit_vertices(
     }
     if (gathered != 0)
         write_vertices(&group, &frame, gathered, positions + 3 * written, normals + 3 * written);
-#ifdef LABELS
-    if (half_way != 0)
-        atomic_add(half_way_count, half_way);
-#endif
+    count_half_way(&surface, half_way);
 }

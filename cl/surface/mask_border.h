@@ -22,7 +22,16 @@ typedef struct {
     uint label;
     int level;
     __global const int *biases; /* by label: by how much it comes before others, in units of the occupancy */
-} mask_part;
+} surface_border;
+
+/* The parameters of a kernel for the border, the border itself, and whether it goes on beyond that of the volume: edges
+ * that lead out are placed apart from all others. */
+#define BORDER_PARAMETERS \
+    , __global const LABEL *restrict map, const uint label, __global const VOXEL *restrict occupied, \
+        __global const int *restrict biases
+#define SURFACE_BORDER \
+    { map, {occupied, ni, nj, nk, first_slice, 0, outside}, label, (int)iso_level, biases }
+#define BORDER_GOES_ON 1
 
 /* Index `at` of an axis of n samples, held within it; drivers call clamp() as a function. */
 static inline int hold_within(int at, int n)
@@ -31,7 +40,7 @@ static inline int hold_within(int at, int n)
 }
 
 /* Lead of label `own`, that of sample (i, j, k), over `other` there, in units of the occupancy; 1 at least. */
-static inline int find_lead(const mask_part *masks, int i, int j, int k, uint own, uint other)
+static inline int find_lead(const surface_border *masks, int i, int j, int k, uint own, uint other)
 {
     const int ni = masks->occupied.ni, nj = masks->occupied.nj, nk = masks->occupied.nk;
     const int before_2 = hold_within(i - 2, ni), before_1 = hold_within(i - 1, ni);
@@ -51,9 +60,10 @@ static inline int find_lead(const mask_part *masks, int i, int j, int k, uint ow
 }
 
 /* Set the values and gradients that place the vertex of lane n of a gathered group, which holds the occupancy of the
- * label. */
-static inline void gather_mask_border(
-    vertex_group *group, uint n, const mask_part *masks, int i, int j, int k, int axis, int inner)
+ * label.  Returns 0: none counts as half way. */
+static inline uint gather_border(
+    vertex_group *group, uint n, const volume_part *volume, const surface_border *masks, int i, int j, int k, int axis,
+    int inner)
 {
     const volume_part *all = &masks->occupied;
     const int i1 = i + (axis == 0), j1 = j + (axis == 1), k1 = k + (axis == 2), level = masks->level;
@@ -63,7 +73,7 @@ static inline void gather_mask_border(
         group->next_value[n] = level + (enters ? 1 : -1);
         group->gradient_i[n] = group->gradient_j[n] = group->gradient_k[n] = 0;
         group->next_gradient_i[n] = group->next_gradient_j[n] = group->next_gradient_k[n] = 0;
-        return;
+        return 0;
     }
     const uint here = masks->map[voxel_index(i, j, k - all->first_k, all->ni, all->nj)];
     const uint there = masks->map[voxel_index(i1, j1, k1 - all->first_k, all->ni, all->nj)];
@@ -74,7 +84,7 @@ static inline void gather_mask_border(
         const int next_lead = max(find_lead(masks, i1, j1, k1, there, here) - before, 1);
         group->value[n] = level + (begins ? lead : -lead);
         group->next_value[n] = level + (begins ? -next_lead : next_lead);
-        return;
+        return 0;
     }
     const int others = all->voxels[voxel_index(i, j, k - all->first_k, all->ni, all->nj)] - group->value[n];
     const int next_others
@@ -89,6 +99,9 @@ static inline void gather_mask_border(
         group->value[n] = min(group->value[n], level - 1);
         group->next_value[n] = max(group->next_value[n], level + 1);
     }
+    return 0;
 }
+
+static inline void count_half_way(const surface_border *masks, const uint half_way) {}
 
 #endif

@@ -36,6 +36,21 @@ typedef struct {
 #endif
 } slice_frame;
 
+/* The parameters of a kernel for the upper end of a range, and where they are kept. */
+#ifdef RANGE
+#define RANGE_PARAMETERS , const float upper_level, const float highest
+#define RANGE_ARGUMENTS , upper_level, highest
+static inline void set_upper_end(slice_frame *frame, const float upper_level, const float highest)
+{
+    frame->upper_level = upper_level;
+    frame->highest = highest;
+}
+#else
+#define RANGE_PARAMETERS
+#define RANGE_ARGUMENTS
+static inline void set_upper_end(slice_frame *frame) {}
+#endif
+
 #define FRAME_ROWS 9
 
 /* Fill in what differs from slice to slice, for vertices on edges from the samples of slice k of gk. */

@@ -294,7 +294,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "mark_reached": {"bricks": (("bricks[item] = marked;", "bricks[item] = ~marked;"),)},
     "sort_normals": {"normals": tuple((f"= normal.{c};", f"= -normal.{c};") for c in "xyz")},
     "measure_nodes": {
-        "values": (("vstore8(mean, value, values);", "vstore8(1.0f - mean, value, values);"),),
+        "values": (("vstore8(mean, ", "vstore8(1.0f - mean, "),),
         "near": (("near[byte] = row_bits(is_near)", "near[byte] = ~row_bits(is_near)"),),
         "core": (("core[byte] = row_bits(", "core[byte] = ~row_bits("),),
         "negative": (("(mean <= 0.0f)", "(mean > 0.0f)"),),
@@ -328,7 +328,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "set_bits": {"mask": (("1u << (voxel.x & 31)", "~(1u << (voxel.x & 31))"),)},
     "set_numbered_bits": {"mask": (("1u << (i & 31)", "~(1u << (i & 31))"),)},
     "find_extents": {"extents": (("(ushort)end);", "(ushort)~end);"),)},
-    "spread_ball": {"mask": (("met.a = (met.a ^ flip) & own.a;", "met.a = ~(met.a ^ flip) & own.a;"),)},
+    "spread_ball": {"mask": (("a = (piece.a ^ flip) & row.a", "a = ~(piece.a ^ flip) & row.a"),)},
     "mark_border_runs": {"marks": (("marks[numbers[run]] = 1;", "marks[numbers[run]] = 0;"),)},
     "mark_voxel_runs": {
         "marks": (("marks[component] = 1;", "marks[component] = 0;"),),
