@@ -19,6 +19,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.system.arguments import FilterName, explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.packages import install_command
+from clrecon.system.pieces import in_threads
 from clrecon.system.progress import Progress, ignore_progress
 
 VolumeKind = TypeVar("VolumeKind", Volume, DeviceVolume)
@@ -201,12 +202,15 @@ def _run_non_local_means(
     patch, reach = _whole("patch", asked["patch"], 3, 31), _whole("reach", asked["reach"], 1, 31)
     noise = measure_noise(volume).hu if asked["sigma_hu"] is None else _check_number("sigma_hu", asked["sigma_hu"], 1e6)
     result = np.empty(volume.voxels.shape, np.float32)
-    for k, layer in enumerate(volume.voxels):
+
+    def filter_slice(piece: slice) -> None:
+        layer = volume.voxels[piece.start]
         plane = restoration.denoise_nl_means(
             layer.astype(np.float32), patch, reach, 0.8 * noise, fast_mode=True, sigma=noise, preserve_range=True
         )
-        result[k] = np.reshape(plane, layer.shape)  # it drops the axis of a single column
-        tell("filter", k + 1, len(result))
+        result[piece.start] = np.reshape(plane, layer.shape)  # it drops the axis of a single column
+
+    in_threads(filter_slice, len(result), 1, lambda piece: tell("filter", piece.stop, len(result)))
     return result, {"sigma_hu": noise, "patch": patch, "reach": reach, "dimensions": 2}
 
 
