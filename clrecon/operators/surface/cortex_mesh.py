@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import METAL_HU, Volume
 from clrecon.mesh import Mesh
-from clrecon.mesh.connectivity import Fans
+from clrecon.mesh.connectivity import Fans, find_used
 from clrecon.mesh.connectivity import label_components as label_on_host
 from clrecon.mesh.refine.shifts import move_vertices
 from clrecon.mesh.triangles import cross_product, vertex_normals
@@ -179,8 +179,9 @@ KEPT_MM = 1e-3
 _LEAST_TURN = 0.2
 """Least cosine between a triangle before and after it was moved."""
 
-_CALM_ROUNDS, _SHORT_ROUNDS = 12, 8
-"""Rounds in which corners of triangles that would turn over go to the mean of their neighbours, and then half back."""
+_LEAST_CALMED, _SHORT_ROUNDS = 0.95, 8
+"""Corners of triangles that would turn over go to the mean of their neighbours as long as less than this share stays
+turned, and then, in so many rounds, half back: a speck of eight triangles is turned whatever its neighbours say."""
 
 _BIAS_ROWS = 2000
 """Vertices by which the effect of the constants on the whole surface is measured."""
@@ -245,16 +246,18 @@ def calm_vertices(
     """
     places = moved.astype(np.float64)
     rows: IntArray = np.flatnonzero(find_turned(vertices, places, triangles))
-    for turn in range(_CALM_ROUNDS + _SHORT_ROUNDS + 1):
-        if not len(rows):
-            break
-        bad = np.unique(triangles[rows])
-        if turn == _CALM_ROUNDS + _SHORT_ROUNDS:
-            bad = np.unique(triangles[fans.touching(bad)])
+    before, halved = len(triangles), 0
+    while len(rows):
+        bad = find_used(triangles[rows], len(places))
+        if halved == _SHORT_ROUNDS:
+            bad = find_used(triangles[fans.touching(bad)], len(places))
             places[bad] = vertices[bad]
-        elif turn >= _CALM_ROUNDS:
+            break
+        if halved or len(rows) > _LEAST_CALMED * before:
+            halved += 1
             places[bad] = 0.5 * (places[bad] + vertices[bad])
         else:
+            before = len(rows)
             count = (fans.begin[bad + 1] - fans.begin[bad])[:, None]
             beside = 0.5 * (fans.sums(places, triangles, bad) - count * places[bad])
             places[bad] = (places[bad] + beside) / (1.0 + count)
