@@ -352,7 +352,7 @@ class Clusters:
         edges = find_edges(faces, len(standing))
         faults = find_sheets(faces, len(standing), edges)
         if any(map(len, faults)):  # the other faults can only be found, or cost less, after these are repaired
-            return np.asarray(standing[np.unique(np.concatenate(faults).astype(np.int64))])
+            return np.asarray(standing[find_used(np.concatenate(faults).astype(np.int64), len(standing))])
         self._take_new("components")
         stored, everywhere = self._stored(), self.standing()
         faults = [
@@ -361,7 +361,7 @@ class Clusters:
             self._find_lost(standing, faces, edges, part),
             self._find_torn(standing, faces, edges),
         ]
-        return np.unique(np.concatenate(faults).astype(np.int64))
+        return find_used(np.concatenate(faults).astype(np.int64), len(self.names))
 
     def _find_torn(self, standing: IntArray, faces: NDArray[np.uint32], edges: Edges) -> IntArray:
         """Find names where components that are still there have got another Euler number."""
@@ -400,7 +400,7 @@ class Clusters:
         if not lost.any():
             return np.zeros(0, dtype=np.int64)
         # With their surroundings: a part that has come apart can consist of vertices without clusters.
-        return np.unique(self.names[self._triangles[lost[self._triangles].any(axis=1)]])
+        return find_used(self.names[self._triangles[lost[self._triangles].any(axis=1)]], len(self.names))
 
     def _stored(self) -> NDArray[np.floating]:
         return as_stored(self.places + self._origin)
@@ -413,7 +413,8 @@ class Clusters:
         """
         faces = self.faces()
         changed = any_corner(self._take_new("cuts"), faces)
-        return np.unique(faces[find_changed_intersections(self._stored(), faces, changed, self._find_crossings)])
+        cut = faces[find_changed_intersections(self._stored(), faces, changed, self._find_crossings)]
+        return find_used(cut, len(self.names))
 
     def find_far(self, deviation: Deviation) -> IntArray:
         """Find names of clusters where either surface is too far from the other.
@@ -450,7 +451,7 @@ class Clusters:
         if len(named) == 0:
             return np.zeros(0, dtype=np.int64)
         last = self._collapses.latest(self.names)[named].argmax(axis=1)
-        return np.unique(named[np.arange(len(named)), last])
+        return find_used(named[np.arange(len(named)), last], len(self.names))
 
     def find_left_behind(self, deviation: Deviation) -> IntArray:
         """Find names of clusters with vertices too far from the changed faces around them; `find_far` is exact."""
@@ -459,7 +460,8 @@ class Clusters:
         rows = np.flatnonzero(beside[self.names] & self._has_moved())
         near[self.names[rows]] = True
         faces = self._named[self._face_rows(near)]
-        return np.unique(self.names[rows[deviation.are_left_behind(rows, self.names, self.places, faces)]])
+        left = rows[deviation.are_left_behind(rows, self.names, self.places, faces)]
+        return find_used(self.names[left], len(self.names))
 
 
 def _are_faces(named: IntArray) -> NDArray[np.bool_]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import as_stored, find_coincident
-from clrecon.mesh.connectivity import Fans, find_edges, label_components, order_by_number
+from clrecon.mesh.connectivity import Fans, find_edges, find_used, label_components, order_by_number
 from clrecon.mesh.intersections import (
     FindCrossings,
     find_beside,
@@ -172,7 +172,7 @@ def move_vertices(
     near: _Near | None = None
     for turn in range(_ROUNDS):
         if turn >= _ROUNDS_OF_ITS_OWN and near is not None:
-            spoilt = np.unique(triangles[near.fans.touching(spoilt)])
+            spoilt = find_used(triangles[near.fans.touching(spoilt)], len(vertices))
         spoilt = spoilt[share[spoilt] > 0.0]
         if len(spoilt):
             share[spoilt] *= 0.5
@@ -234,4 +234,4 @@ def _find_spoilt(
     ]
     cut = triangles[find_changed_intersections(vertices, triangles, look_at, find_crossings)]
     suspects = [triangles[np.concatenate(flat)].reshape(-1), cut.reshape(-1), find_coincident(vertices)]
-    return np.unique(np.concatenate(suspects).astype(np.int64))
+    return find_used(np.concatenate(suspects).astype(np.int64), len(vertices))

@@ -133,7 +133,7 @@ def find_faults_beside(faces: NDArray[np.uint32], new: NDArray[np.bool_]) -> Int
     split = find_split_vertices(local, len(numbers), edges)
     split = split[touched[numbers[split]]]
     faults += [split, local[np.isin(local, split).any(axis=1)].reshape(-1) if len(split) else split]
-    return numbers[np.unique(np.concatenate(faults).astype(np.int64))]
+    return numbers[find_used(np.concatenate(faults).astype(np.int64), len(numbers))]
 
 
 def find_torn(triangles: NDArray[np.uint32], names: IntArray) -> IntArray:
@@ -161,4 +161,4 @@ def find_torn(triangles: NDArray[np.uint32], names: IntArray) -> IntArray:
     weight = np.concatenate([np.ones(np.count_nonzero(apart), int), np.full(np.count_nonzero(two), -1)])
     key, number = np.unique(strips, return_inverse=True)
     key = key[np.bincount(number, weight, minlength=len(key)) != 1]
-    return np.unique(np.concatenate([torn, key // size, key % size]))
+    return find_used(np.concatenate([torn, key // size, key % size]), size)
