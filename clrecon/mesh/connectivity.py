@@ -107,7 +107,6 @@ class Fans:
         used = count > 0
         if used.any():
             # "clip" avoids checking each index, which takes longer than the look-up.
-            # "clip" avoids checking each index, which takes longer than the look-up.
             first, second, third = (values.take(corners, axis=0, mode="clip") for corners in triangles[rows].T)
             of_rows = first + second + third
             totals[used] = np.add.reduceat(of_rows, (np.cumsum(count) - count)[used])

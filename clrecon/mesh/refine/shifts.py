@@ -226,7 +226,7 @@ def _find_spoilt(
     triangles: NDArray[np.uint32],
     look_at: NDArray[np.bool_],
     find_crossings: FindCrossings,
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Find vertices of triangles without area, of triangles that cut each other, and vertices that coincide."""
     flat = [
         where.start + np.flatnonzero(~cross.any(axis=0))

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from clrecon.errors import DeviceMemoryError
 from clrecon.geometry import Volume, slice_normal
 from clrecon.opencl import (
-    Device,
-    Program,
     Stopwatch,
     allocate,
     describe_shortage,
@@ -205,13 +203,6 @@ class WallFits:
         return tuple(vars(self).values())
 
 
-def prepare_cortex(device: Device, dtype: np.dtype[Any]) -> Program:
-    """Build the kernels for volumes of `dtype`."""
-    return load_program(
-        device, "surface/cortex.cl", {**voxel_variants(dtype), "LANES": device.kernel_variants["LANES"]}
-    )
-
-
 def blurs_of(values: Float32Array, blur_mm: float, across_mm: float) -> Float32Array:
     """Return the width of the blur along each of the profiles (ROWS, n), mm: it grows with the gap between slices."""
     steep, gap = values[SAMPLES], values[SAMPLES + 1]
@@ -290,7 +281,8 @@ class ProfileSampler:
         self.device = resident.device
         self.scale, self.frame = ProfileScale.of(resident.volume), StackFrame(resident.volume)
         with stopwatch.timed("build"):
-            self.program = prepare_cortex(resident.device, resident.dtype)
+            variants = {**voxel_variants(resident.dtype), "LANES": self.device.kernel_variants["LANES"]}
+            self.program = load_program(self.device, "surface/cortex.cl", variants)
 
     def pieces(
         self, points: NDArray[np.floating], normals: NDArray[np.floating]

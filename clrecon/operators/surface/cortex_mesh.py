@@ -241,9 +241,7 @@ def choose_shifts(fit: CortexFit, triangles: NDArray[np.uint32], fans: Fans) -> 
 def calm_vertices(
     vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans
 ) -> NDArray[np.float64]:
-    """Return moved vertices with no triangle turned over: the corners of such go to the mean of their neighbours, and
-    after some rounds back half the way, and at last all of it.
-    """
+    """Return moved vertices with no triangle turned over: its corners go to the mean of their neighbours, or back."""
     places = moved.astype(np.float64)
     rows: IntArray = np.flatnonzero(find_turned(vertices, places, triangles))
     before, halved = len(triangles), 0
