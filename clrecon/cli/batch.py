@@ -67,7 +67,11 @@ def run(options: argparse.Namespace, console: Console) -> int:
             before, reason = " before" * answer.kept, outcome.death or answer.error or "see its report"
             console.warn(f"{outcome.case.name}: {answer.status}{before}, {reason}", with_json=True)
 
-    report = run_batch(cases, plan, tell=tell_outcome, progress=console.progress)
+    try:
+        report = run_batch(cases, plan, tell=tell_outcome, progress=console.progress)
+    except KeyboardInterrupt:
+        console.warn("cases that are whole stay, and --resume goes on", with_json=True)
+        raise
     console.result(report)
     for line in _describe_batch(report, options.output, is_part=batch.part is not None):
         console.say(line)

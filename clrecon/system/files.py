@@ -11,6 +11,7 @@ Of a symbolic link the file that it points to is replaced.  A folder is made und
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import secrets
@@ -190,7 +191,7 @@ def _check_space(path: str | os.PathLike[str], folder: Path, expected_bytes: int
         raise OutputError(
             f"cannot write {shown_path(path)}: it needs about {expected_bytes / 1e6:.1f} MB and "
             f"{usage.free / 1e6:.1f} MB are free in {shown_path(folder)}"
-        )
+        ) from OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @contextlib.contextmanager

@@ -186,6 +186,9 @@ def test_full_disk_is_foreseen(older):
         replace_file(older, calls.append, expected_bytes=10**15)
     with refused(OutputError, "MB", "free", 1e9):
         check_writable(older, expected_bytes=10**15)
+    with pytest.raises(OutputError) as caught:
+        check_writable(older, expected_bytes=10**15)
+    assert caught.value.__cause__.errno == errno.ENOSPC  # as where the disk fills while it is written
     assert calls == []
     check_untouched(older)
 

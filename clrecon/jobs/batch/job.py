@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
 
@@ -71,7 +71,8 @@ def run_batch(
             kept_count = len(chosen) - len(waiting)
         start = perf_counter()
         progress(_count_cases(0, len(waiting), None), 0, 0)
-        for number, outcome in enumerate((scheduler or LocalScheduler(plan)).run(waiting) if waiting else (), start=1):
+        outcomes = (scheduler or LocalScheduler(plan)).run(waiting) if waiting else ()
+        for number, outcome in enumerate(_with_advice(outcomes), start=1):
             if outcome.death:
                 error = {"kind": "WorkerDied", "exit_code": None, "message": outcome.death}
                 fail_case(outcome.case, plan, LOST, error)
@@ -87,6 +88,15 @@ def run_batch(
             run.lap("table")
         statuses = dict(counts.most_common())
         return run.report(BatchReport, (), cases=len(chosen), made=made_count, kept=kept_count, statuses=statuses)
+
+
+def _with_advice(outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
+    """Yield the outcomes; an output that takes no more is an error that says how to go on."""
+    try:
+        yield from outcomes
+    except OutputError as error:
+        more = f"; cases that are whole stay, and {name_parameter('resume', True)} goes on"
+        raise OutputError(f"{error}{more}") from error
 
 
 def _check_choice(plan: Plan) -> None:

@@ -75,6 +75,7 @@ def test_figures_of_the_table_are_those_of_the_reports(cohort: Path) -> None:
     assert float(row["volume_ml"]) == pytest.approx(report["mesh"]["volume_ml"], abs=1e-6)
 
 
+@pytest.mark.seconds
 def test_resume_makes_what_is_missing_or_changed_and_ends_with_the_same_bytes(
     cohort: Path, tmp_path: Path, printed: Any
 ) -> None:
@@ -96,6 +97,7 @@ def test_resume_makes_what_is_missing_or_changed_and_ends_with_the_same_bytes(
     assert printed().report()["kept"] == 0
 
 
+@pytest.mark.seconds
 def test_retry_makes_failed_cases_alone(cohort: Path, tmp_path: Path, printed: Any) -> None:
     folder = write_cohort(tmp_path)
     command = ["batch", str(folder / "m.csv"), "-o", str(folder / "out"), "--no-picture", "--no-measure"]
@@ -126,6 +128,7 @@ def test_existing_cases_stay_with_no_clobber(cohort: Path, printed: Any) -> None
     assert files_of(cohort / "out") == before
 
 
+@pytest.mark.seconds
 def test_labels_of_a_row_give_meshes_and_statistics(tmp_path: Path) -> None:
     affine = np.diag([2.0, 2.0, 2.0, 1.0])
     voxels = np.zeros((12, 12, 12), np.int16)

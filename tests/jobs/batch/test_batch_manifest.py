@@ -67,6 +67,7 @@ def test_what_is_no_table_is_refused(content: bytes | None, tmp_path: Path) -> N
         read_cases(path, ScanSettings())
 
 
+@pytest.mark.seconds
 def test_hundred_thousand_rows_take_seconds_and_little_memory(tmp_path: Path) -> None:
     text = "case,input\n" + "".join(f"case-{number},/data/ct/{number}\n" for number in range(100_000))
     tracemalloc.start()

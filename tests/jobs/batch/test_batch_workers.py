@@ -16,7 +16,10 @@ import pytest
 
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are looked up in /proc")
+pytestmark = [
+    pytest.mark.seconds,
+    pytest.mark.skipif(sys.platform != "linux", reason="processes are looked up in /proc"),
+]
 
 COMMAND = [sys.executable, "-m", "clrecon", "batch"]
 
@@ -50,8 +53,8 @@ def children_of(process: subprocess.Popen[str]) -> list[int]:
     return [int(word) for task in tasks.iterdir() for word in (task / "children").read_text().split()]
 
 
-def wait_for_work(folder: Path, process: subprocess.Popen[str], done: str = "") -> None:
-    """Wait until a case is being made, that behind `done` if it is given."""
+def wait_for_work(folder: Path, process: subprocess.Popen[str], done: str) -> None:
+    """Wait until a case is being made behind `done`: kernels are built then, and no file of a driver is left cut."""
     output = folder / "out"
     end = time.monotonic() + 120.0
     while not (os.path.exists(output / done) and list(output.glob(".clrecon-*.folder"))):
@@ -78,7 +81,7 @@ def test_killed_worker_takes_its_own_case_along_and_is_named(cohort: Path) -> No
 
 def test_case_of_a_killed_worker_among_several_is_made_again_alone(cohort: Path) -> None:
     process = start(cohort, "--workers", "2")
-    wait_for_work(cohort, process)
+    wait_for_work(cohort, process, "first")
     for worker in children_of(process):
         os.kill(worker, signal.SIGKILL)
     process.communicate(timeout=240)
