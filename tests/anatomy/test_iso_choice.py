@@ -366,15 +366,10 @@ def test_half_way_between_given_materials(bone, tissue, level) -> None:
 
 @pytest.mark.parametrize(
     ("bone", "tissue", "words"),
-    [
-        (40, 1200, "40 HU is not above 1200 HU"),
-        (40, 40, "not above"),
-        (math.nan, 1, "finite"),
-        (1, -math.inf, "finite"),
-    ],
+    [(40, 1200, (40, 1200, "HU")), (40, 40, ("above",)), (math.nan, 1, ("finite",)), (1, -math.inf, ("finite",))],
 )
 def test_impossible_materials_are_refused(bone, tissue, words) -> None:
-    with pytest.raises(UsageError, match=words):
+    with refused(UsageError, *words):
         half_iso_value(bone, tissue)
 
 

@@ -39,19 +39,16 @@ def test_the_table_names_stages_kernels_and_the_peer(device: Any, ct: Path, caps
         assert words in out
 
 
-def test_json_and_report_are_the_contract(
-    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_and_report_are_the_contract(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
     report = tmp_path / "b.json"
     arguments = ["bench", str(ct), "--runs", "1", "--device", str(device.index), "--json", "--report", str(report)]
     assert main(arguments) == 0
-    captured = capsys.readouterr()
-    result = json.loads(captured.out)
+    said = printed()
+    result = said.report()
     assert CONTRACT <= set(result) and result == json.loads(report.read_text())
     assert OF_A_DEVICE <= set(result["devices"][0])
     assert result["iso_value_hu"] == 200.0
-    written = captured.out + captured.err
-    assert find_words(written) == []
+    assert find_words(said.everything) == []
 
 
 def test_a_failed_device_is_partly_done(
@@ -65,23 +62,21 @@ def test_a_failed_device_is_partly_done(
 
 
 @pytest.mark.parametrize(
-    ("extra", "code", "words"),
+    ("extra", "code", "fact"),
     [
-        (["--runs", "0"], 3, "1 to 1000"),
-        (["--runs", "many"], 3, "'many' is no whole number"),
+        (["--runs", "0"], 3, 1000),
+        (["--runs", "many"], 3, "many"),
         (["--hu", "nan"], 3, "finite"),
         (["--device", "abacus"], 5, "abacus"),
-        (["--report", "no/such/folder/b.json"], 6, "does not exist"),
+        (["--report", "no/such/folder/b.json"], 6, "exist"),
         (["--iso", "3"], 3, "unrecognized"),
     ],
 )
-def test_wrong_arguments_are_one_line(
-    extra: list[str], code: int, words: str, ct: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_arguments_are_one_line(extra: list[str], code: int, fact: str | int, ct: Path, printed: Printer) -> None:
     assert main(["bench", str(ct), *extra]) == code
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert words in captured.err and len(captured.err.splitlines()) == 1
+    said = printed()
+    assert (said.output_lines, said.error_lines) == (0, 1)
+    said.assert_error(fact)
 
 
 def test_an_input_that_is_not_there(device: Any, tmp_path: Path, printed: Printer) -> None:

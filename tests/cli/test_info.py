@@ -64,10 +64,10 @@ def listing(*entries: dict[str, Any], chosen: int | None = 1) -> dict[str, Any]:
     return {"series": list(entries), "chosen": chosen, "certificate": None}
 
 
-def test_json_is_the_contract(ct: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_is_the_contract(ct: Path, printed: Printer) -> None:
     assert main(["info", str(ct), "--json"]) == 0
-    captured = capsys.readouterr()
-    found = json.loads(captured.out)
+    said = printed()
+    found = said.report()
     assert set(found) == names_in("clrecon info") == {"series", "chosen", "certificate"}
     assert found["chosen"] == 1
     (one,) = found["series"]
@@ -76,7 +76,7 @@ def test_json_is_the_contract(ct: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert one["spacing_mm"] == pytest.approx(SPACING)
     assert set(found["certificate"]) == names_in("The certificate")
     assert found["certificate"]["padding_share"] is None
-    assert captured.err == "" and PATIENT.split("^")[0] not in captured.out
+    assert said.error_lines == 0 and PATIENT.split("^")[0] not in said.everything
 
 
 def test_pixels_are_read_on_request(ct: Path, printed: Printer) -> None:

@@ -311,18 +311,14 @@ def test_label_options_without_labels_are_refused(
     printed().assert_error(options[0])
 
 
-@pytest.mark.parametrize(
-    ("content", "code", "words"),
-    [(None, 3, "there is no label map"), (b"", 4, "is no label map"), (b"\x1f\x8b\x08\0", 4, "is no label map")],
-)
+@pytest.mark.parametrize(("content", "code"), [(None, 3), (b"", 4), (b"\x1f\x8b\x08\0", 4)])
 def test_a_label_map_that_cannot_be_read_ends_the_job(
-    content: bytes | None, code: int, words: str, device: Any, ct: Path, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    content: bytes | None, code: int, device: Any, ct: Path, tmp_path: Path, printed: Printer,
 ) -> None:  # fmt: skip
     if content is not None:
         (tmp_path / "a.nii.gz").write_bytes(content)
     assert run(ct, "-o", tmp_path / "b.stl", "--labels", tmp_path / "a.nii.gz", device=device) == code
-    assert words in capsys.readouterr().err
+    printed().assert_error("a.nii.gz")
     assert not (tmp_path / "b.stl").exists()
 
 

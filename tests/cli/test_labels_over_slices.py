@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from printed_text import Printer
 
 from clrecon.cli.main import main
 from clrecon.proof.phantom import PhantomSettings, write_phantom
@@ -61,11 +62,10 @@ def test_a_hidden_label_leaves_no_outline(spine: Path, tmp_path: Path, device: A
     assert len(found["0"]) == 0 and np.ptp(found["0.3"], axis=-1).mean() < np.ptp(found["1"], axis=-1).mean()
 
 
-def test_a_label_that_is_not_in_the_map_is_refused(
-    spine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_label_that_is_not_in_the_map_is_refused(spine: Path, tmp_path: Path, printed: Printer) -> None:
     given = ["--sheet", "4", "--labels", str(spine / "levels.nrrd"), "--label-color", "L9=red"]
     assert main(["render", str(spine), *given, "-o", str(tmp_path / "a.png")]) == 3
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "label 'L9' is not in the label map; there are: 21 L2, 22 L3" in line
+    said = printed()
+    assert said.error_lines == 1
+    said.assert_error("L9", 21, "L2", 22, "L3")
     assert not (tmp_path / "a.png").exists()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from printed_text import Printer
 
 from clrecon.cli.console import Console
 from clrecon.cli.mesh import describe_refinement, finish_with_gates
@@ -44,7 +45,7 @@ def test_the_euler_number_is_said_before_and_after() -> None:
     ],
 )
 def test_a_gate_of_the_scan_and_one_of_the_mesh_have_codes_of_their_own(
-    scan: bool, mesh: bool, strict: bool, code: int, capsys: pytest.CaptureFixture[str]
+    scan: bool, mesh: bool, strict: bool, code: int, printed: Printer
 ) -> None:
     gate = {"name": "closed", "measured": 1, "bound": 0, "unit": None, "text": "text"}
     uneven = {**gate, "name": "grid_residual", "ok": False}
@@ -54,7 +55,7 @@ def test_a_gate_of_the_scan_and_one_of_the_mesh_have_codes_of_their_own(
         "warnings": [],
     }
     assert finish_with_gates(report, Console(), strict) == code
-    assert len(capsys.readouterr().err.splitlines()) == strict * ((not scan) + (not mesh))
+    assert printed().error_lines == strict * ((not scan) + (not mesh))
 
 
 @pytest.mark.parametrize(

@@ -339,8 +339,8 @@ def test_nothing_is_said_of_the_patient(render: Renders) -> None:
     picture, depth, report, turntable = outputs
     assert render.code("-o", picture, "--depth", depth, "--report", report, "--turntable", turntable,
                        "--frames", 2, "-v") == 0  # fmt: skip
-    captured = render.capsys.readouterr()
-    written = b"".join(path.read_bytes() for path in outputs) + (captured.out + captured.err).encode()
+    shown = "".join(render.capsys.readouterr())
+    written = b"".join(path.read_bytes() for path in outputs) + shown.encode()
     assert find_words(written) == []
 
 

@@ -43,17 +43,17 @@ def test_a_mesh_goes_to_standard_output_as_the_file_has_it(device, ct, tmp_path,
 
 
 @pytest.mark.release
-def test_a_report_goes_to_standard_output_and_the_remarks_to_standard_error(device, ct, tmp_path, capsys):
+def test_a_report_goes_to_standard_output_and_the_remarks_to_standard_error(device, ct, tmp_path, printed):
     common = ("mesh", ct, "--hu", 200, "-o", tmp_path / "a.stl", "--device", device.index)
     assert run(*common, "--report", tmp_path / "r.json") == 0
     written = json.loads((tmp_path / "r.json").read_text())
-    capsys.readouterr()
+    printed()
     assert run(*common, "--report", "-") == 0
-    said = capsys.readouterr()
-    streamed = json.loads(said.out)
+    said = printed()
+    streamed = said.report()
     assert streamed.keys() == written.keys()
     assert streamed["volume_ml"] == written["volume_ml"] is not None
-    assert "wrote    " in said.err and "report   " not in said.err
+    said.assert_error("wrote", "a.stl")
     assert not (tmp_path / "-").exists() and not os.path.exists("-")
 
 
@@ -125,16 +125,17 @@ def spine(tmp_path_factory):
         ],
     ),
 )
-def test_the_report_of_each_command(device, spine, tmp_path, capsys, monkeypatch, arguments, entry):
+def test_the_report_of_each_command(device, spine, tmp_path, printed, monkeypatch, arguments, entry):
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
     if arguments[0] == "distance":
         assert run("mesh", spine, "-o", tmp_path / "out_a.stl", "-q") == 0
     given = [word.format(ct=spine, out=tmp_path / "out") for word in arguments]
     code = run(*given, "--report", "-")
-    said = capsys.readouterr()
-    assert code in (0, 8), said.err  # 8: a vertebra of coarse voxels may be unsure
-    assert json.loads(said.out)[entry] is not None
-    assert "time     " in said.err and not any(path.name == "-" for path in tmp_path.iterdir())
+    said = printed()
+    assert code in (0, 8), said  # 8: a vertebra of coarse voxels may be unsure
+    assert said.report()[entry] is not None
+    said.assert_error("time")
+    assert not any(path.name == "-" for path in tmp_path.iterdir())
 
 
 def test_the_table_of_labels_and_a_label_map_go_to_standard_output(spine, capfdbinary):

@@ -331,7 +331,7 @@ def test_harmed_packed_bytes_are_refused(tmp_path: Path) -> None:
         place = data.index(b".model" if name == "a.3mf" else b"points.npy", 100 if name == "a.3mf" else 0) + 40
         data[place : place + 40] = b"\xff" * 40
         (tmp_path / name).write_bytes(bytes(data))
-        with pytest.raises(RefusedInputError, match="cut or corrupt"):
+        with refused(RefusedInputError, "corrupt"):
             read(tmp_path / name)
 
 

@@ -128,7 +128,7 @@ def test_values_beyond_float32_interpolation_are_refused(low, high, dtype, iso_v
 
 @pytest.mark.parametrize("bad", ["abc", None, {}])
 def test_an_iso_value_is_a_number(bad):
-    with pytest.raises(UsageError, match="give a number"):
+    with refused(UsageError, "number"):
         choose_iso_rule(make_volume(0, 1), bad)
 
 
@@ -181,14 +181,14 @@ def test_a_number_of_any_kind_is_one_level(level):
 @pytest.mark.parametrize(
     ("level", "below", "words"),
     [
-        ((200, 300, 400), False, "two ends, not .200, 300, 400."),
-        ((300, 200), False, "the range 300 to 200 HU holds nothing"),
-        ((200, 200), False, "the range 200 to 200 HU holds nothing"),
-        ((200, 300), True, "one iso value, not the range 200 to 300"),
+        ((200, 300, 400), False, (300, 400)),
+        ((300, 200), False, (300, 200, "HU")),
+        ((200, 200), False, (200, "HU")),
+        ((200, 300), True, (200, 300)),
     ],
 )
 def test_ranges_that_are_none_are_refused(level, below, words):
-    with pytest.raises(UsageError, match=words):
+    with refused(UsageError, *words):
         choose_iso_rule(make_volume(-1000, 900), level, below=below)
 
 

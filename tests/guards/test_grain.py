@@ -32,7 +32,7 @@ HABITS = {
     "equal_functions": 0,
     "constants_of_one_file": 0,
     "kernels_with_branches": 4,
-    "tests_of_wording": 487,
+    "tests_of_wording": 350,
     "tables_without_ids": 0,
     "patches_of_private_names": 24,
 }

@@ -17,6 +17,7 @@ import tolerances
 from box_vertebra import BoxVertebra, grid_around
 from label_files import write_nifti
 from made_once import make_once
+from printed_text import Printer
 from refusals import refused
 from surface_volumes import hollow_ball
 from variants import daily_rows
@@ -168,7 +169,7 @@ def test_the_line_keeps_its_distance_in_the_truth(
 
 @pytest.mark.slow
 def test_files_are_written_and_screws_graded(
-    device: Any, ct: Path, plain: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    device: Any, ct: Path, plain: Path, whole: Path, tmp_path: Path, printed: Printer
 ) -> None:
     said = (whole / "said.txt").read_text()
     assert "grade B" in said and "grade A, no breach" in said and "Gertzbein-Robbins in five grades" in said
@@ -186,7 +187,7 @@ def test_files_are_written_and_screws_graded(
     (tmp_path / "l1_L1.ply").write_text("mine")
     options = ("--labels", ct / "levels.nrrd", "--label", "L1", "-o", tmp_path / "l1.ply")
     assert run(ct, *options, "--no-clobber") == 6
-    assert "exists" in capsys.readouterr().err
+    printed().assert_error("l1_L1.ply")
 
 
 @pytest.mark.parametrize(("height", "rise"), [(0.0, 0.0), (1.0, 0.0), (0.0, 1e-12), (3.0, 0.0), (1.0, 5.0)])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from label_files import write_nrrd
+from refusals import refused
 
 from clrecon import PointLook, read_mesh, read_points
 from clrecon.cli.main import main
@@ -144,9 +145,9 @@ def test_crop_box_is_the_common_part_of_its_limits() -> None:
     everywhere = float("inf")
     assert crop_box(None, (1, 2), None) == ((-everywhere, -everywhere, 1), (everywhere, everywhere, 2))
     assert crop_box((0, 9, 0, 9, 0, 9), (3, 20), (1, 5, 5, 4)) == ((0, 1, 3), (5, 9, 9))
-    with pytest.raises(UsageError, match=f"^clip_box takes six .*, not {'x' * 60}$"):
+    with refused(UsageError, "clip_box", "x" * 60):
         crop_box("x" * 99, None, None)
-    with pytest.raises(UsageError, match="clip_box takes six numbers"):
+    with refused(UsageError, "clip_box", 2):
         MeshSettings(clip_box=(1, 2))
     assert RenderSettings.of(clip_box=(0, 1, 0, 1, 0, 1)).crop_margin == 1
     assert RenderSettings.of("slice", clip_box=(0, 1, 0, 1, 0, 1)).crop_margin == 0

@@ -137,16 +137,16 @@ def test_the_picture_shows_red_ends_and_its_scale(device: Any, files: dict[str, 
 
 
 @pytest.mark.parametrize(
-    ("extra", "code", "words"),
+    ("extra", "code", "fact"),
     [
         ([], 3, "required"),
-        (["folder/no.stl"], 3, "there is no mesh folder/no.stl"),
+        (["folder/no.stl"], 3, "folder/no.stl"),
         (["B", "-o", "x.stl"], 3, ".ply"),
         (["B", "--picture", "x.gif"], 3, ".png"),
         (["B", "-o", "no/x.ply"], 6, "no"),
-        (["B", "-o", "x.ply", "--report", "x.ply"], 3, "same file"),
-        (["B", "-o", "B"], 3, "would replace"),
-        (["B", "--range", "0"], 3, "above 0"),
+        (["B", "-o", "x.ply", "--report", "x.ply"], 3, "x.ply"),
+        (["B", "-o", "B"], 3, "b.ply"),
+        (["B", "--range", "0"], 3, 0),
         (["B", "--samples", "0"], 3, "samples"),
         (["B", "--mesh-space", "xyz"], 3, "xyz"),
         (["B", "--view", "sideways"], 3, "sideways"),
@@ -154,12 +154,12 @@ def test_the_picture_shows_red_ends_and_its_scale(device: Any, files: dict[str, 
     ],
 )
 def test_wrong_usage_is_one_line_and_writes_nothing(
-    extra: list[str], code: int, words: str, files: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    extra: list[str], code: int, fact: str | int, files: dict[str, str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, printed: Printer,
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
     given = [files["b.ply"] if word == "B" else word for word in extra]
-    check_refused(["distance", files["a.stl"], *given], code, words, tmp_path, capsys)
+    check_refused(["distance", files["a.stl"], *given], code, fact, tmp_path, printed)
 
 
 def test_a_mesh_of_nothing_has_no_distances(files: dict[str, str], tmp_path: Path, capsys: Any) -> None:

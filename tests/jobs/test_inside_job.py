@@ -122,19 +122,17 @@ def test_wrong_options_are_one_line_and_leave_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_wrong_files_are_one_line_and_leave_nothing(
-    inside: Any, spine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_files_are_one_line_and_leave_nothing(inside: Any, spine: Path, tmp_path: Path, printed: Printer) -> None:
     assert inside("--label", "L1", labels="none.nrrd") == 3
     assert inside("--label", "L1", output="a.xyz") == 3
     assert inside("--label", "L1", output="none/a.stl") == 6
-    assert capsys.readouterr().err.count("\n") == 3
+    assert printed().error_lines == 3
     assert list(tmp_path.iterdir()) == []
     settings = InsideSettings(labels=spine / "levels.nrrd", label=["L1"])
     assert settings.space == "lps"
     with refused(UsageError, "vertebrae", "labels"):
         InsideSettings(labels="x.nrrd", label=())
-    with pytest.raises(UsageError, match="must be above 0 bytes"):
+    with refused(UsageError, 0, "bytes"):
         InsideSettings(labels="x.nrrd", label=["L1"], memory=0)
 
 

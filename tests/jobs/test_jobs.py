@@ -147,9 +147,8 @@ def test_demo_without_a_device_or_room_leaves_nothing(
     with pytest.raises(DeviceError):
         make_demo(folder, "no such device")
     monkeypatch.setattr("clrecon.proof.demo.write_phantom", fill_the_disk)
-    with pytest.raises(OutputError) as caught:
+    with refused(OutputError, f"{folder / 'ct' / 'slice'}", "full"):
         make_demo(folder, str(device.index))
-    assert str(caught.value) == f"cannot write {folder / 'ct' / 'slice'}: the disk is full"
     assert list(tmp_path.rglob("*")) == ([folder] if there else [])
 
 

@@ -87,7 +87,7 @@ def test_a_table_alone_is_refused_and_writes_nothing(
 def test_water_without_its_table_has_no_surface_at_the_level_of_bone(
     odd: OddBodies, device: Any, tmp_path: Path
 ) -> None:
-    with pytest.raises(NoSurfaceError, match="HU"):
+    with refused(NoSurfaceError, "HU"):
         mesh_of(odd, device, tmp_path, "water", iso_value=300.0, remove_table=True)
     _, vertices = mesh_of(odd, device, tmp_path, "water", iso_value=-300.0, remove_table=True, keep_largest=1)
     assert share_near(odd["water"], vertices, "water") > 0.7
@@ -114,7 +114,7 @@ def test_a_level_that_the_scan_gives_fits_its_bone_or_is_refused(
     try:
         report, vertices = mesh_of(odd, device, tmp_path, name, half_way="auto")
     except ClreconError as error:
-        assert any(letter.isdigit() for letter in str(error))  # a refusal with its figures
+        assert any(letter.isdigit() for letter in repr(error))  # a refusal with its figures
         assert name not in ("head", "limb", "pair", "pelvis"), error
         return
     choice = report["iso_value_choice"]
@@ -149,7 +149,7 @@ def test_a_seed_in_bone_keeps_bone(odd: OddBodies, device: Any, tmp_path: Path, 
 @pytest.mark.parametrize("name", daily(4, SPINELESS))
 def test_no_spine_is_found_where_there_is_none(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     settings = RenderSettings.of(curve="auto", device=str(device.index), size=(40, 40))
-    with pytest.raises(RefusedInputError, match="spine|canal"):
+    with refused(RefusedInputError, "spine"):
         make_pictures(odd.series(name), PictureFiles(picture=str(tmp_path / "spine.png")), settings)
     assert not list(tmp_path.iterdir())
 
@@ -178,7 +178,7 @@ def test_what_holds_no_bone_says_so_once(odd: OddBodies, device: Any, tmp_path: 
     assert f"{report['walls']['wall_hu']['median']:.0f} HU" in said
     assert ("rails of a table" in said) == (name == "empty")  # hard as bone, and straight
     before = (tmp_path / "mesh.ply").read_bytes()
-    with pytest.raises(NoSurfaceError, match="nothing (here looks like|that could be) bone"):
+    with refused(NoSurfaceError, "nothing", "bone"):
         mesh_of(odd, device, tmp_path, name, half_way="auto", keep="bone")
     assert (tmp_path / "mesh.ply").read_bytes() == before
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import re
 from pathlib import Path
@@ -13,6 +12,7 @@ import ct_files
 import pydicom
 import pytest
 from ct_files import write_series
+from printed_text import Printer
 from variants import but_seldom
 
 from clrecon.cli.main import main
@@ -79,21 +79,19 @@ def test_row_69_no_file_and_no_word_names_the_patient(
     scan: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    printed: Printer,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     command = [*COMMANDS[what].format(scan=scan).split(), "--series", "1", "--device", str(device.index)]
     monkeypatch.chdir(tmp_path)
     with caplog.at_level(logging.DEBUG):
         assert main([*command, "-v"]) == 0
-        people = capsys.readouterr()
         assert main([*command, "--json"]) == 0
-    printed = capsys.readouterr()
-    assert find_words(tmp_path, people.out, people.err, printed.out, printed.err, caplog.text) == []
+    assert find_words(tmp_path, printed().everything, caplog.text) == []
     if what in ("bench", "compare"):
         return
     assert main([*command, "--json", "--keep-ids"]) == 0
-    report = json.loads(capsys.readouterr().out)["volume"]
+    report = printed().report()["volume"]
     assert [report["series"]["uid_hash"], report["frame_of_reference_hash"]] == HASHES
     assert find_words(tmp_path) == HASHES
     (tmp_path / "r.json").unlink()
@@ -119,26 +117,24 @@ def test_row_69_no_file_and_no_word_names_the_patient(
     ids=["none", "both", "phase", "choice", "labels"],
 )
 def test_row_69_errors_name_a_series_by_its_number(
-    arguments: list[str], code: int, device: Any, scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], code: int, device: Any, scan: Path, tmp_path: Path, printed: Printer
 ) -> None:
     said = [argument.format(scan=scan) for argument in arguments]
     command = ["mesh", str(scan), "-o", str(tmp_path / "a.stl"), "--device", str(device.index), *said]
     assert main([*command, "--json"]) == code
-    told = capsys.readouterr()
-    assert find_words(tmp_path, told.out, told.err) == []
+    assert find_words(tmp_path, printed().everything) == []
     assert main([*command, "--debug"]) == code
-    told = capsys.readouterr()
-    assert "Traceback" in told.err and find_words(tmp_path, told.out, told.err) == []
+    said = printed()
+    said.assert_error("Traceback")
+    assert find_words(tmp_path, said.everything) == []
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("form", ["--pixels", "--json"])
 def test_row_69_info_describes_a_series_and_says_no_more(
-    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    form: str, scan: Path, tmp_path: Path, printed: Printer
 ) -> None:
-    assert main(["info", str(scan), "--series", "1", "--pixels"]) == 0
-    people = capsys.readouterr()
-    assert main(["info", str(scan), "--series", "1", "--json"]) == 0
-    printed = capsys.readouterr()
-    for told in (people.out, printed.out):
-        assert SECRETS["SeriesDescription"] in told and HASHES[0] in told
-        assert find_words(tmp_path, told.replace(SECRETS["SeriesDescription"], ""), people.err, printed.err) == HASHES
+    assert main(["info", str(scan), "--series", "1", form]) == 0
+    shown = printed().everything
+    assert SECRETS["SeriesDescription"] in shown and HASHES[0] in shown
+    assert find_words(tmp_path, shown.replace(SECRETS["SeriesDescription"], "")) == HASHES

@@ -93,7 +93,7 @@ def test_memory_is_read_from_text(text: str, size: int | None) -> None:
 
 @pytest.mark.parametrize("text", ["unknown", "level:1:2", "level:nan", "region:1", "median:0"])
 def test_steps_that_are_not_known_are_refused(text: str) -> None:
-    with pytest.raises(UsageError, match="the step"):
+    with refused(UsageError, "step"):
         parse_preprocess(text)
 
 
@@ -129,11 +129,11 @@ def test_growing_from_labels_needs_them_and_makes_none() -> None:
     check("t-mc", (), True, True)
     check("t-mc", (), False, False)
     for grow_from, has, makes, words in (
-        (("label:L3",), False, False, "needs its label map"),
-        (("label:L3",), True, True, "makes no meshes of its own"),
-        (("auto",), True, False, "labels pick the cells"),
+        (("label:L3",), False, False, "map"),
+        (("label:L3",), True, True, "meshes"),
+        (("auto",), True, False, "cells"),
     ):
-        with pytest.raises(UsageError, match=words):
+        with refused(UsageError, words):
             check("i-mc", grow_from, has, makes)
 
 

@@ -99,9 +99,9 @@ def test_a_dicom_file_that_is_none_of_the_scan(scan, tmp_path):
     """Nor does anything else that writes with `replace_file`."""
     other = tmp_path / "other.json"
     other.write_bytes((scan / "IM0001").read_bytes())
-    with pytest.raises(OutputError, match=DICOM_THERE):
+    with refused(OutputError, "other.json", "DICOM"):
         make_mesh("ct", "a.stl", report_path=other)
-    with pytest.raises(OutputError, match=DICOM_THERE):
+    with refused(OutputError, "other.json", "DICOM"):
         replace_file(other, lambda stream: stream.write(b"new"))
     assert other.read_bytes() == (scan / "IM0001").read_bytes()
 

@@ -53,23 +53,23 @@ def test_row_54_a_job_goes_on_on_the_cpu_device(device, gpu, tmp_path, capsys, m
 
 @pytest.mark.parametrize("command", daily(1, COMMANDS))
 def test_row_54_a_named_device_fails_with_the_number_of_the_cpu_device(
-    device, gpu, tmp_path, capsys, monkeypatch, command
+    device, gpu, tmp_path, printed, monkeypatch, command
 ):
     name, options = COMMANDS[command]
     write_series(tmp_path / "ct")
     Failing(monkeypatch, "launch", 3, NEVER_LAST, label=gpu.label)
     output: Path = tmp_path / name
     assert main([command, str(tmp_path / "ct"), "-o", str(output), *options, "--device", "gpu"]) == 5
-    assert capsys.readouterr().err.count(f"; {device.label} may do it: --device {device.index}") == 1
+    printed().assert_error("--device", device.index)
     assert not output.exists()
 
 
-def test_row_56_a_job_survives_the_loss_of_its_device(gpu, tmp_path, capsys, monkeypatch):
+def test_row_56_a_job_survives_the_loss_of_its_device(gpu, tmp_path, printed, monkeypatch):
     write_series(tmp_path / "ct")
     # nothing is tried beside the reading: the launch that fails is one of the work
     monkeypatch.setattr("clrecon.jobs.mesh.make._try_steps", lambda device, settings: None)
     Failing(monkeypatch, "launch", 3, label=gpu.label, error=lost_error())
     assert main(["mesh", str(tmp_path / "ct"), "-o", str(tmp_path / "out.stl"), "--hu", "200"]) == 0
-    said = capsys.readouterr()
-    assert said.err.count("started again with a fresh context") == 1
-    assert gpu.label in said.out
+    said = printed()
+    said.assert_error("again", "context")
+    said.assert_output("pretended")

@@ -77,27 +77,27 @@ def test_a_narrow_window_gets_two_tables(files: dict[str, str], printed: Printer
 
 
 @pytest.mark.parametrize(
-    ("extra", "code", "words"),
+    ("extra", "code", "fact"),
     [
         ([], 3, "--labels"),
         (["--labels", "LABELS", "--label", "spleen"], 3, "spleen"),
-        (["--labels", "no.nii"], 3, "no label map"),
+        (["--labels", "no.nii"], 3, "no.nii"),
         (["--labels", "LABELS", "--percentiles", "5;50"], 3, "5,50,95"),
-        (["--labels", "LABELS", "--hu", "300"], 3, "--surface hu"),
-        (["--labels", "LABELS", "--surface", "mask"], 3, "hu or cortex"),
-        (["--labels", "LABELS", "--percentiles", "500"], 3, "from 0 to 100"),
-        (["--labels", "LABELS", "--csv", "a.json", "--report", "a.json"], 3, "same file"),
+        (["--labels", "LABELS", "--hu", "300"], 3, "--surface"),
+        (["--labels", "LABELS", "--surface", "mask"], 3, "cortex"),
+        (["--labels", "LABELS", "--percentiles", "500"], 3, 100),
+        (["--labels", "LABELS", "--csv", "a.json", "--report", "a.json"], 3, "a.json"),
         (["--labels", "LABELS", "--csv", "no/a.csv"], 6, "no"),
-        (["--labels", "LABELS", "--report", "LABELS"], 3, "would replace"),
+        (["--labels", "LABELS", "--report", "LABELS"], 3, "report"),
     ],
 )
 def test_wrong_usage_is_one_line_and_writes_nothing(
-    extra: list[str], code: int, words: str, files: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    extra: list[str], code: int, fact: str | int, files: dict[str, str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, printed: Printer,
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
     given = [files["labels"] if word == "LABELS" else word for word in extra]
-    check_refused(["stats", files["ct"], *given], code, words, tmp_path, capsys)
+    check_refused(["stats", files["ct"], *given], code, fact, tmp_path, printed)
 
 
 def test_what_exists_stays_with_no_clobber(files: dict[str, str], tmp_path: Path, printed: Printer) -> None:

@@ -55,16 +55,16 @@ def test_a_part_of_a_vertebra_is_not_the_vertebra():
 @pytest.mark.parametrize(
     ("label", "message"),
     [
-        ("rib", "'rib' names several labels: 7 rib left 12, 8 rib left 11; give the number"),
-        ("L5", "label 'L5' is not in the label map; there are: 2 vertebrae_T12, 5 vertebrae_T1, 7 rib left 12"),
-        ("absent", "label 'absent' has no voxel in the label map; there are"),
-        (99, "label '99' is not in the label map"),
-        ("a\nb\x1b", r"label 'a\\nb\\x1b' is not"),
-        ("", "label '' is not"),
+        ("rib", (7, 12, 8, 11)),
+        ("L5", (2, 5, 7, 12)),
+        ("absent", ("absent",)),
+        (99, (99,)),
+        ("a\nb\x1b", ("x1b",)),
+        ("", ("label",)),
     ],
 )
 def test_an_unknown_label_lists_what_is_there(label, message):
-    with pytest.raises(UsageError, match=message):
+    with refused(UsageError, *message):
         label_map().find(label)
 
 
@@ -150,7 +150,7 @@ def test_a_map_knows_its_labels_whatever_becomes_of_the_array_it_was_made_from(s
     array[:] = 3
     assert made.counts == before and 3 not in np.unique(made.voxels)
     for each in (made, pickle.loads(pickle.dumps(made))):
-        with pytest.raises(ValueError, match="read-only"):
+        with refused(ValueError, "read-only"):
             each.voxels[0, 0, 0] = 1
     array.flags.writeable = False
     assert np.shares_memory(LabelMap(array, OBLIQUE).voxels, array)

@@ -60,19 +60,19 @@ def test_parts_are_meshes_largest_first() -> None:
 @pytest.mark.parametrize(
     ("vertices", "triangles", "words"),
     [
-        (np.eye(3), [[0, 1, 2], [0, 1, 7]], "triangle 1 refers to vertex 7, the mesh has 3 vertices"),
-        (np.eye(3), [[1, 2, 3]], "numbered from 0"),
-        (np.zeros((0, 3)), [[0, 0, 0]], "the mesh has 0 vertices"),
-        ([[0, 0, 0], [0, np.nan, 0], [1, 1, 1]], [[0, 1, 2]], "vertex 1 is not finite"),
-        ([[0, 0, 0], [0, 0, np.inf], [1, 1, 1]], [], "vertex 1 is not finite"),
-        (np.eye(3), [0, 1, 2], r"triangles have shape \(n, 3\), these have \(3,\)"),
-        (np.eye(3), [[0.0, 1.0, 2.0]], "integers"),
-        (np.eye(3), [[True, False, True]], "integers"),
-        (np.eye(3) * 1j, [[0, 1, 2]], "vertices are numbers"),
+        (np.eye(3), [[0, 1, 2], [0, 1, 7]], (1, 7, 3)),
+        (np.eye(3), [[1, 2, 3]], (0,)),
+        (np.zeros((0, 3)), [[0, 0, 0]], (0,)),
+        ([[0, 0, 0], [0, np.nan, 0], [1, 1, 1]], [[0, 1, 2]], (1,)),
+        ([[0, 0, 0], [0, 0, np.inf], [1, 1, 1]], [], (1,)),
+        (np.eye(3), [0, 1, 2], (3,)),
+        (np.eye(3), [[0.0, 1.0, 2.0]], ("integers",)),
+        (np.eye(3), [[True, False, True]], ("integers",)),
+        (np.eye(3) * 1j, [[0, 1, 2]], ("vertices",)),
     ],
 )
 def test_bad_triangles_are_refused_when_the_mesh_is_made(vertices: object, triangles: object, words: str) -> None:
-    with pytest.raises(UsageError, match=words):
+    with refused(UsageError, *words):
         Mesh(vertices, triangles)  # type: ignore[arg-type]
 
 

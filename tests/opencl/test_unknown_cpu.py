@@ -93,9 +93,8 @@ def test_what_is_not_exactly_so_is_left_alone(texts):
 
 @linux_only
 def test_memory_that_is_not_there_is_an_error_and_no_crash():
-    with pytest.raises(LookupError) as caught:
+    with refused(LookupError, "Input/output"):
         NameOfCpu(4096)
-    assert "Input/output error" in str(caught.value)
 
 
 @linux_only
@@ -103,7 +102,7 @@ def test_a_name_that_has_changed_meanwhile_is_left_alone():
     made = Structure(b"x86_64-unknown-linux-gnu", UNKNOWN)
     cpu = NameOfCpu(made.address)
     made.strings[1].value = b"znver5"
-    with pytest.raises(LookupError, match="has changed"):
+    with refused(LookupError, "changed"):
         cpu.write()
     assert made.texts[1] == b"znver5"
 

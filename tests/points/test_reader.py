@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 import struct
 from pathlib import Path
 
@@ -306,19 +307,16 @@ def test_more_points_than_a_number_of_32_bits_can_tell_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("1 2 3\n4 5 6\n7 8\n", "row 3 of its table has 2 numbers, those before have 3"),
-        ("1 2 3\n4 x 6\n", "'x' stands in place of a number in row 2 of its table, column 2"),
-        ("1,5 2,5 3,5\n2,5 3,5 4,5\n", "in place of a number in row 1 of its table"),
-    ],
+    ("text", "facts"),
+    [("1 2 3\n4 5 6\n7 8\n", (3, 2)), ("1 2 3\n4 x 6\n", ("x", 2)), ("1,5 2,5 3,5\n2,5 3,5 4,5\n", (1,))],
 )
-def test_tables_with_faults_are_named_by_row_without_words_of_numpy(tmp_path: Path, text: str, words: str) -> None:
+def test_tables_with_faults_are_named_by_row_without_words_of_numpy(
+    tmp_path: Path, text: str, facts: tuple[str | int, ...]
+) -> None:
     (tmp_path / "a.xyz").write_text(text)
-    with pytest.raises(RefusedInputError) as caught:
+    with refused(RefusedInputError, "row", *facts) as caught:
         read_points(tmp_path / "a.xyz")
-    assert words in str(caught.value)
-    assert not any(word in str(caught.value) for word in ("usecols", "float64", "convert"))
+    assert not re.search("usecols|float64|convert", repr(caught.value))
 
 
 @pytest.mark.parametrize("name", ["a.asc", "A.ASC", "a.pts"])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tolerances
 from bench_harness import FOLDER
+from printed_text import Printer
 from refusals import refused
 
 from clrecon.errors import UsageError
@@ -28,13 +29,12 @@ EXPECTED = {"isosurface-cold", "isosurface-resident", "isosurface-first-call", "
             "raycast-warm", "raycast-first", "raycast-gpu-mapper"}  # fmt: skip
 
 
-def test_every_case_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_case_is_listed(printed: Printer) -> None:
     cases = registry.load_cases()
     assert set(cases) >= EXPECTED
     assert all(len(case.description) > 20 for case in cases.values())
     assert bench.main(["list"]) == 0
-    out = capsys.readouterr().out
-    assert all(name in out for name in EXPECTED)
+    printed().assert_output(*EXPECTED)
 
 
 def test_a_case_joins_in_one_line_and_its_name_is_its_own() -> None:
@@ -51,15 +51,15 @@ def test_a_case_joins_in_one_line_and_its_name_is_its_own() -> None:
         del registry.CASES["own"]
 
 
-def test_wrong_arguments_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments, words in (
-        (["run", "isosurface-warm"], "no case isosurface-warm: use"),
-        (["run", "memory", "--input", str(tmp_path / "gone")], "neither a made-up one"),
-        (["run", "memory", "--pairs", "0"], "1 or more"),
+def test_wrong_arguments_are_one_line(tmp_path: Path, printed: Printer) -> None:
+    for arguments, fact in (
+        (["run", "isosurface-warm"], "isosurface-warm"),
+        (["run", "memory", "--input", str(tmp_path / "gone")], "gone"),
+        (["run", "memory", "--pairs", "0"], 1),
         (["run", "memory", "--input", "cube8", "--device", "abacus"], "abacus"),
     ):
         assert bench.main([*arguments, "--work", str(tmp_path)]) in (3, 5)
-        assert words in capsys.readouterr().err
+        printed().assert_error(fact)
 
 
 def test_made_up_inputs_are_made_once(tmp_path: Path) -> None:

@@ -37,12 +37,14 @@ def test_devices_have_names_for_files(described: dict, name: str) -> None:
     assert results.device_name(described) == name
 
 
-def test_results_come_back_by_key_and_others_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_come_back_by_key_and_others_are_named(tmp_path: Path, printed: Printer) -> None:
     folder = keep(tmp_path / "a", make_result())
     (folder / "old.json").write_text('{"case": "isosurface"}')
     (folder / "half.json").write_text('{"case": ')
     assert list(results.load_results(folder)) == [("isosurface-cold", "spine149", "pocl-3.1-debian")]
-    assert [line.split(":")[0] for line in capsys.readouterr().err.splitlines()] == ["half.json", "old.json"]
+    said = printed()
+    assert said.error_lines == 2
+    said.assert_error("half.json", "old.json")
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from types import ModuleType
 import mutate_python
 import pytest
 from mutate_python import BrokenRoomError, Copy, RoomResult, room_texts, try_room
+from printed_text import Printer
 from python_changes import (
     Change,
     Equivalent,
@@ -348,10 +349,10 @@ def test_equivalent_changes_are_of_lines_that_are_there() -> None:
 
 
 @pytest.mark.parametrize("words", [["--rooms", "nowhere"], ["--changes", "0"], ["--resume"]])
-def test_wrong_options_are_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_options_are_refused(words: list[str], printed: Printer) -> None:
     with refused(SystemExit, 2):
         mutate_python.main(words)
-    assert words[0] in capsys.readouterr().err or "no room 'nowhere'" in capsys.readouterr().err
+    printed().assert_error(words[-1] if words[0] == "--rooms" else words[0])
 
 
 def test_kernels_are_those_of_the_copy(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from pathlib import Path
 
-import pytest
+from printed_text import Printer
 
 __all__ = ["check_refused", "parse_command"]
 
@@ -32,14 +32,13 @@ def parse_command(arguments: list[str]) -> None:
     parser.parse_args(arguments[1:])
 
 
-def check_refused(
-    arguments: list[str], code: int, words: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Run `arguments`, which end with `code` and one line with `words`, and leave `folder` as it was."""
+def check_refused(arguments: list[str], code: int, fact: str | float, folder: Path, printed: Printer) -> None:
+    """Run `arguments`, which end with `code` and one line with `fact`, and leave `folder` as it was."""
     from clrecon.cli.main import main
 
     before = sorted(folder.iterdir())
     assert main([*arguments, "-q"]) == code
-    (line,) = capsys.readouterr().err.splitlines()
-    assert words in line
+    said = printed()
+    assert said.error_lines == 1
+    said.assert_error(fact)
     assert sorted(folder.iterdir()) == before

@@ -22,6 +22,11 @@ class Printed:
     def __repr__(self) -> str:
         return f"output: {self._output}\nerror: {self._error}"
 
+    @property
+    def everything(self) -> str:
+        """What came on both streams, to be searched for what must not be there."""
+        return self._output + self._error
+
     def report(self) -> Any:
         """Return the JSON on standard output."""
         return json.loads(self._output)

@@ -103,18 +103,10 @@ def test_a_folder_is_made_once_and_removed(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("a", "has no extension"),
-        ("a.plx", "has the extension '.plx' (did you mean .ply?)"),
-        (".ply", "has no extension"),
-    ],
-)
-def test_an_extension_that_is_wrong_is_named(name: str, words: str) -> None:
-    with pytest.raises(UsageError) as caught:
+@pytest.mark.parametrize(("name", "fact"), [("a", "extension"), ("a.plx", ".plx"), (".ply", "extension")])
+def test_an_extension_that_is_wrong_is_named(name: str, fact: str) -> None:
+    with refused(UsageError, fact, ".ply", ".stl"):
         find_extension(name, (".ply", ".stl"), "mesh")
-    assert words in str(caught.value) and str(caught.value).endswith(": use one of .ply, .stl")
     assert find_extension("A.PLY", (".ply", ".stl"), "mesh") == ".ply"
 
 
@@ -166,9 +158,8 @@ def add_up(points: tuple[float, float] | Sequence[float] | str, more: list[float
 
 def test_arguments_of_known_kinds_are_explained() -> None:
     wrong: Any = 5
-    with pytest.raises(UsageError) as caught:
+    with refused(UsageError, "points", 2, 5):
         add_up(wrong)
-    assert str(caught.value) == "points must be 2 values, a sequence or a text, not 5"
     with pytest.raises(TypeError):
         add_up([1.0], wrong)  # of a kind that is not known nothing is said
 

@@ -16,7 +16,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from refusals import refused
+from refusals import assert_one_line, refused
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.system.files import check_writable, replace_file, stage_file
@@ -94,19 +94,19 @@ def test_replaced_file_keeps_its_mode(older):
 
 
 @pytest.mark.parametrize(
-    ("code", "words"),
+    ("code", "fact"),
     [
-        (errno.ENOSPC, "the disk is full"),
-        (errno.EDQUOT, "quota is used up"),
+        (errno.ENOSPC, "full"),
+        (errno.EDQUOT, "quota"),
         (errno.EROFS, "read-only"),
-        (errno.EPERM, "does not permit"),
-        (errno.EIO, os.strerror(errno.EIO)),
+        (errno.EPERM, "permit"),
+        (errno.EIO, os.strerror(errno.EIO).split()[0]),
     ],
 )
-def test_system_errors(older, code, words):
-    with pytest.raises(OutputError, match=words) as caught:
+def test_system_errors(older, code, fact):
+    with pytest.raises(OutputError) as caught:
         replace_file(older, raise_in_the_middle(OSError(code, os.strerror(code))))
-    assert "\n" not in str(caught.value) and str(older) in str(caught.value)
+    assert_one_line(caught.value, fact, older.name)
     assert caught.value.exit_code == 6
     check_untouched(older)
 
@@ -196,7 +196,7 @@ def test_full_disk_is_foreseen(older):
 @pytest.mark.parametrize("action", [check_writable, lambda path: replace_file(path, lambda stream: None)])
 class TestRefusedTargets:
     def test_a_file_in_a_missing_folder_is_refused(self, action, tmp_path):
-        with pytest.raises(OutputError, match="the folder .*no does not exist, make it first"):
+        with refused(OutputError, "folder"):
             action(tmp_path / "no" / "bone.stl")
         assert names(tmp_path) == []
 
@@ -232,24 +232,24 @@ class TestRefusedTargets:
                 action("s")
 
     def test_name_too_long(self, action, tmp_path):
-        with pytest.raises(OutputError, match="the name is too long"):
+        with refused(OutputError, "long"):
             action(tmp_path / ("x" * 300 + ".stl"))
         assert names(tmp_path) == []
 
     def test_link_loop(self, action, tmp_path):
         (tmp_path / "a").symlink_to(tmp_path / "b")
         (tmp_path / "b").symlink_to(tmp_path / "a")
-        with pytest.raises(OutputError, match="leads back to itself"):
+        with refused(OutputError, "itself"):
             action(tmp_path / "a")
 
     def test_null_character(self, action, tmp_path):
-        with pytest.raises(OutputError, match="null character"):
+        with refused(OutputError, "character"):
             action(f"{tmp_path}/a\0b")
 
     def test_message_is_one_line(self, action, tmp_path):
-        with pytest.raises(OutputError, match="does not exist") as caught:
+        with pytest.raises(OutputError) as caught:
             action(tmp_path / "no\nfolder\x1b[31m" / "x.stl")
-        assert str(caught.value).isprintable()
+        assert_one_line(caught.value, "exist")
 
     def test_no_permission(self, action, older, monkeypatch):
         real = os.open

@@ -254,12 +254,10 @@ def test_wrong_options_are_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_files_that_cannot_be(
-    scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str], device: Any
-) -> None:
+def test_files_that_cannot_be(scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer, device: Any) -> None:
     assert cloud_command(scan, output="out.stl") == 3
     assert cloud_command(scan, "--report", str(tmp_path / "out.ply")) == 3
-    assert "cannot be the same file" in capsys.readouterr().err
+    printed().assert_error("out.ply")
     assert cloud_command(scan, output="nowhere/out.ply") == 6
     assert cloud_command(tmp_path / "missing") == 2
     (tmp_path / "empty").mkdir()

@@ -55,16 +55,16 @@ TRUE_ML = [4 / 3 * np.pi * radius**3 / 1000 for radius in RADII]
 
 
 @pytest.mark.seconds
-def test_all_bones_are_named_objects_of_a_3mf(device, bones, tmp_path, capsys):
+def test_all_bones_are_named_objects_of_a_3mf(device, bones, tmp_path, printed):
     code, report = run(bones, tmp_path / "a.3mf", device, "--for", "print", "--all-parts")
-    said = capsys.readouterr()
-    assert code == 0, said.err
+    said = printed()
+    assert code == 0, said
     assert [mesh["volume_ml"] for mesh in report["meshes"]] == pytest.approx(TRUE_ML, rel=0.02)  # the cavity is filled
     assert (report["all_parts"], report["keep_largest"], report["keep"]) == (True, None, "bone")
     with zipfile.ZipFile(tmp_path / "a.3mf") as packed:
         model = packed.read("3D/3dmodel.model").decode()
     assert re.findall(r'<object [^>]*name="([^"]*)"', model) == ["001", "002", "003"]
-    assert "wrote" in said.out and "a.3mf" in said.out and "files" not in said.out
+    said.assert_output("a.3mf")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.3mf", "a.json"]
 
 

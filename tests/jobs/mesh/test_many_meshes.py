@@ -166,16 +166,16 @@ def test_bounds_and_files_follow_the_space(device: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "error", "words"),
     [
-        ({"iso_value": (200.0, 900.0)}, NoSurfaceError, "900 HU"),
-        ({"iso_value": (200.0, -1000.0)}, NoSurfaceError, "-1000 HU: every voxel is inside"),
-        ({"iso_value": (200.0, 500.0), "min_volume_ml": 1000.0}, NoSurfaceError, "at 200 HU: none of 3 components"),
+        ({"iso_value": (200.0, 900.0)}, NoSurfaceError, (900, "HU")),
+        ({"iso_value": (200.0, -1000.0)}, NoSurfaceError, (-1000, "HU")),
+        ({"iso_value": (200.0, 500.0), "min_volume_ml": 1000.0}, NoSurfaceError, (200, 3, "HU")),
     ],
 )
 def test_one_surface_that_is_not_there_ends_the_job(
     settings: dict[str, Any], error: type[Exception], words: str, device: Any, tmp_path: Path
 ) -> None:
     (tmp_path / "bone_200hu.ply").write_bytes(b"old")
-    with pytest.raises(error, match=words):
+    with refused(error, *words):
         run(tmp_path, device, **settings)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
 
@@ -246,12 +246,12 @@ def test_below_encloses_the_rest(device: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"below": 900.0}, "no surface of what lies below 900 HU: every voxel is inside"),
-        ({"iso_value": ((-2000.0, 900.0),)}, "no surface at -2000:900 HU: every voxel is inside"),
-        ({"iso_value": ((810.0, 900.0),)}, "no surface of 810 to 900 HU: no voxel lies within"),
+        ({"below": 900.0}, (900, "HU")),
+        ({"iso_value": ((-2000.0, 900.0),)}, (-2000, 900, "HU")),
+        ({"iso_value": ((810.0, 900.0),)}, (810, 900, "HU")),
     ],
 )
 def test_what_holds_all_or_nothing_is_refused(settings: Any, said: str, device: Any, tmp_path: Path) -> None:
-    with pytest.raises(NoSurfaceError, match=said):
+    with refused(NoSurfaceError, *said):
         run(tmp_path, device, **settings, **({"keep_outside": True} if "below" in settings else {}))
     assert not list(tmp_path.iterdir())

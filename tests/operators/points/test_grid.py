@@ -99,19 +99,15 @@ def test_far_clouds_are_sorted_relative_to_their_base(device):
 
 def test_grids_that_are_too_large_are_refused_with_their_numbers():
     points = np.array([(0, 0, 0), (3000, 2000, 1000)], np.float32)
-    words = (
-        r"cells of 0\.5 mm: the box of the points, 3000 x 2000 x 1000 mm, has 6,001 x 4,001 x 2,001 of them, possible"
-        " are 2,147,483,648 in all and 131,072 along an axis: take larger cells"
-    )
-    with pytest.raises(UsageError, match=words):
+    with refused(UsageError, 0.5, 3000, 2000, 1000, 6001, 4001, 2001, 2**31, 2**17):
         plan_grid(points, 0.5)
     line = np.array([(0, 0, 0), (MOST_CELLS_ALONG, 0, 0)], np.float32)
-    with pytest.raises(UsageError, match="131,073 x 1 x 1 of them"):
+    with refused(UsageError, 131_073):
         plan_grid(line, 1.0)
     assert plan_grid(line[:, [1, 0, 2]], 1.00001).shape == (1, MOST_CELLS_ALONG - 1, 1)
     plan = plan_grid(points * np.float32(0.25), 0.72)
     assert np.prod(plan.shape) <= MOST_CELLS
-    with pytest.raises(UsageError, match="has 4,611,686,018,427,387,905 x "):
+    with refused(UsageError, 1e-36):
         plan_grid(points, 1e-36)
 
 

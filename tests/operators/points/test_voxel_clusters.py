@@ -363,7 +363,7 @@ def test_bad_input_is_refused(device, arguments, words):
 def test_bands_that_no_voxel_can_have(device):
     volume = Volume(noise((3, 4, 40), 0.4), FINE)
     for band in ((0.2, 0.8), (40_000, 50_000)):
-        with pytest.raises(NoSurfaceError, match="no voxel can have"):
+        with refused(NoSurfaceError, "voxel"):
             cluster_points(volume, hu=band, device=device)
     assert checked_band([-np.inf, np.inf]) == (-np.inf, np.inf)
 

@@ -43,7 +43,7 @@ def test_rays_of_a_thousand_million_steps_end(device, mode):
     volume = body((24, 16, 20), (1e-4, 1.0, 1000.0))
     picture = clrecon.render(volume, mode, camera=along_k(volume, 1e-3), size=(4, 4), device=device)
     assert picture.image[..., :3].any()
-    with pytest.raises(UsageError, match="ray step"):
+    with refused(UsageError, "step"):
         clrecon.render(volume, mode, ray_step=5e-5, size=(4, 4), device=device)
 
 
@@ -139,7 +139,7 @@ def test_after_a_failure_the_next_picture_is_made_on_a_fresh_device(device, monk
         lost = renderer.device.context
 
         monkeypatch.setattr(launching, "wait", lambda device: _fail(device, cl))
-        with pytest.raises(DeviceError, match="gone"):
+        with refused(DeviceError, "gone"):
             renderer.render(mode, size=SIZE, view=(20, 30))
         monkeypatch.undo()
         assert renderer.device.context is not lost

@@ -212,7 +212,7 @@ def test_the_camera_sees_the_whole_cloud(device: Any) -> None:
 
 def test_what_cannot_be_shown_is_refused(device: Any) -> None:
     cloud = PointCloud(ball(50)[0])
-    with pytest.raises(UsageError, match="no points: there is nothing to show"):
+    with refused(UsageError, "nothing"):
         clrecon.render(PointCloud(np.empty((0, 3))), device=device)
     with refused(UsageError, "color_by", "labels"):
         clrecon.render(cloud, color_by="removed", device=device)
@@ -223,7 +223,7 @@ def test_what_cannot_be_shown_is_refused(device: Any) -> None:
     volume = clrecon.Volume(np.zeros((4, 4, 4), np.int16), np.eye(4))
     with refused(UsageError, "volume", "cloud"):
         clrecon.render(volume, PointLook(), device=device)
-    with pytest.raises(UsageError, match="memory is a whole number"):
+    with refused(UsageError, "number"):
         PointPictures(cloud, device=device, memory=0)
     near = clrecon.render(cloud, camera=FRONT, size=(64, 64), radius_mm=80.0, device=device)
     assert "are drawn with 128" in near.report["warnings"][-1]

@@ -72,15 +72,15 @@ def test_grown_and_decimated_methods(device: Any) -> None:
 @pytest.mark.parametrize(
     ("method", "options", "words"),
     [
-        ("mc33", {}, "there is no method='mc33': it is one of t-mc, i-mc, g-mc, s-mc, t-mc-soup, skimage"),
-        ("t-mc", {"grows": True}, "method='t-mc' makes the whole surface: leave grow_from out"),
-        ("i-mc", {"topology": "trilinear"}, "cannot be grown"),
-        ("skimage", {"vertex_rule": "golden"}, "method='skimage' has its own rules: leave vertex_rule='golden' out"),
-        ("t-mc-soup", {"plain": False}, "takes one iso value"),
+        ("mc33", {}, ("method=", "mc33", "t-mc", "i-mc")),
+        ("t-mc", {"grows": True}, ("method=", "t-mc", "grow_from")),
+        ("i-mc", {"topology": "trilinear"}, ("grown",)),
+        ("skimage", {"vertex_rule": "golden"}, ("method=", "vertex_rule=")),
+        ("t-mc-soup", {"plain": False}, ("value",)),
     ],
 )
 def test_what_does_not_go_together_is_refused(method: str, options: dict[str, Any], words: str) -> None:
-    with pytest.raises(UsageError, match=words):
+    with refused(UsageError, *words):
         check_method(method, **options)
 
 

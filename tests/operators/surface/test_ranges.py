@@ -265,7 +265,7 @@ def test_an_open_end_of_a_range_is_none(device, dtype):
     assert_same(above, extract_isosurface(volume, 40, device=device))
     beyond = 41 if dtype == "int16" else np.nextafter(np.float32(40), np.float32(np.inf))
     assert_same(up_to, extract_isosurface(volume, beyond, below=True, device=device))
-    with pytest.raises(UsageError, match="two ends, not .None, None.: None leaves one"):
+    with refused(UsageError, "leaves"):
         extract_isosurface(volume, (None, None), device=device)
-    with pytest.raises(UsageError, match="below takes one iso value"):
+    with refused(UsageError, "value"):
         extract_isosurface(volume, (None, 40), below=True, device=device)

@@ -11,6 +11,7 @@ import zipfile
 
 import pytest
 from dicom_series import Plan, write_series
+from refusals import refused
 
 from clrecon.errors import NoDicomError
 from clrecon.mesh import Mesh
@@ -47,7 +48,7 @@ PACKED = {
 def test_row_48_a_packed_series_is_named_with_what_to_do(tmp_path, kind):
     plan = write_series(tmp_path / "ct", Plan(shape=(2, 5, 6)))
     (tmp_path / "packed").write_bytes(PACKED[kind]((tmp_path / "ct" / plan.name(0)).read_bytes()))
-    with pytest.raises(NoDicomError, match=rf"1 file looked at \({kind}: 1\); unpack each {kind} and name the folder"):
+    with refused(NoDicomError, 1, kind.split()[0], "unpack"):
         read_volume(tmp_path / "packed")
 
 
@@ -79,9 +80,9 @@ def test_containers_are_named_by_their_first_bytes(start, kind):
 
 def test_a_mesh_in_place_of_a_scan_is_called_one(tmp_path):
     mesh = Mesh([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
-    for extension, kind in ((".3mf", "3MF mesh"), (".glb", "GLB mesh")):
+    for extension, kind in ((".3mf", "3MF"), (".glb", "GLB")):
         mesh.save(tmp_path / f"a{extension}")
-        with pytest.raises(NoDicomError, match=rf"\({kind}: 1\); a mesh is shown with clrecon render"):
+        with refused(NoDicomError, kind, "mesh", 1):
             read_volume(tmp_path / f"a{extension}")
 
 
@@ -99,22 +100,13 @@ def test_advice_is_for_what_can_be_unpacked():
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (
-            b"1 2 3\n4 5 6\n",
-            r"\(not DICOM: 1\); it is text, not a scan; scans are folders or files of DICOM, and NIfTI",
-        ),
-        (b"\xef\xbb\xbf1;2;3\r\n", "it is text, not a scan"),
-        (
-            b"\x93NUMPY\1\0v\0",
-            r"\(NumPy array: 1\); a NumPy array says no place in space.*; scans are folders or files",
-        ),
-        (
-            bytes(range(256)),
-            r"\(not DICOM: 1\); scans are folders or files of DICOM, and NIfTI, NRRD and MetaImage files$",
-        ),
+        (b"1 2 3\n4 5 6\n", (1, "DICOM", "NIfTI")),
+        (b"\xef\xbb\xbf1;2;3\r\n", ("text",)),
+        (b"\x93NUMPY\1\0v\0", (1, "NumPy")),
+        (bytes(range(256)), (1, "DICOM", "NIfTI", "NRRD")),
     ],
 )
 def test_a_single_file_is_named_as_what_it_is(tmp_path, content, words):
     (tmp_path / "a.asc").write_bytes(content)
-    with pytest.raises(NoDicomError, match=words):
+    with refused(NoDicomError, *words):
         read_volume(tmp_path / "a.asc")

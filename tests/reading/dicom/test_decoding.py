@@ -143,28 +143,28 @@ def test_one_frame_in_many_fragments_and_as_jp2(tmp_path):
 @pytest.mark.parametrize(
     ("fragments", "frames", "table", "words"),
     [
-        (1, 2, b"", "truncated: 2 frames expected, 1 fragments found"),
-        (0, 1, b"", "truncated: there are no compressed pixels"),
-        (3, 2, b"", "2 frames expected, 3 found in 3 fragments"),
-        (2, 1, b"", "1 frame expected, 2 found in 2 fragments"),
-        (3, 2, struct.pack("<2L", 0, 9), "2 frames expected, 3 found in 3 fragments"),
-        (3, 2, struct.pack("<2L", 8, 0), "2 frames expected, 3 found in 3 fragments"),
+        (1, 2, b"", (2, 1)),
+        (0, 1, b"", ("compressed",)),
+        (3, 2, b"", (2, 3)),
+        (2, 1, b"", (1, 2)),
+        (3, 2, struct.pack("<2L", 0, 9), (2, 3)),
+        (3, 2, struct.pack("<2L", 8, 0), (2, 3)),
     ],
 )
 def test_frames_that_cannot_be_told_apart_are_refused(tmp_path, fragments, frames, table, words):
     data = item(table) + item(even(encode_jpeg_2000(IMAGES[0]))) * fragments + END
-    with pytest.raises(RefusedInputError, match=words):
+    with refused(RefusedInputError, *words):
         place(tmp_path, data, frames=frames)
 
 
 def test_damaged_items_are_refused(tmp_path):
     frame = even(encode_jpeg_2000(IMAGES[0]))
     whole = item(b"") + item(frame)
-    with pytest.raises(RefusedInputError, match="pixels: truncated: the compressed pixels have no end mark"):
+    with refused(RefusedInputError, "pixels", "truncated", "mark"):
         place(tmp_path, whole)
-    with pytest.raises(RefusedInputError, match=rf"truncated: {len(frame)} bytes of .* expected, {len(frame) - 4} "):
+    with refused(RefusedInputError, "truncated", len(frame), len(frame) - 4):
         place(tmp_path, whole[:-4])
-    with pytest.raises(RefusedInputError, match=r"no item of compressed pixels where one is expected \(0000,0000\)"):
+    with refused(RefusedInputError, "0000,0000"):
         place(tmp_path, item(b"") + bytes(50))
     with refused(RefusedInputError, 2000, "fragments"):  # of one frame
         place(tmp_path, item(b"") * 2500 + END)

@@ -71,10 +71,9 @@ def test_slices_that_each_have_their_own_rescale_are_not_doubtful(tmp_path):
 def test_a_secondary_capture_with_a_position_is_refused(tmp_path, ending):
     sop_class = SecondaryCaptureImageStorage + ending
     write_series(tmp_path, change=set_values(SOPClassUID=sop_class))
-    with pytest.raises(RefusedInputError) as caught:
+    with refused(RefusedInputError, "slice000.dcm", sop_class):
         read_volume(tmp_path)
     reason = f"slice000.dcm: secondary capture (SOP class {sop_class}): its pixels are a picture, not measured HU"
-    assert reason in str(caught.value)
     assert list_series(tmp_path).series[0].problems[0] == reason
     plan = write_series(tmp_path, Plan(series=2, shape=(3, 5, 6), name="ct{}".format))
     assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
@@ -148,7 +147,7 @@ def test_free_text_where_terms_belong_is_not_repeated(tmp_path):
     assert thickness == (
         "SliceThickness (0018,0050) is no finite number; ignored, it plays no part in the geometry (all slices)"
     )
-    assert "other" in str(list_series(tmp_path).series[1].modality)
+    assert "other" in (list_series(tmp_path).series[1].modality or "")
     for number in (1, 3):
         assert "DOE" not in json.dumps(read_volume(tmp_path, series=number).report)
     assert "DOE" not in json.dumps([entry.as_dict() for entry in list_series(tmp_path).series])

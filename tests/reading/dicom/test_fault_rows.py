@@ -26,21 +26,20 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pydicom")  # it wri
 
 
 @pytest.mark.parametrize(
-    ("keyword", "text", "words"),
+    ("keyword", "text", "fact"),
     [
-        ("ImageOrientationPatient", "0\\0\\0\\0\\0\\0", "off unit length or right angle by 1"),
-        ("ImageOrientationPatient", "nan\\0\\0\\0\\1\\0", "is 'nan\\0\\0\\0\\1\\0'"),
-        ("ImageOrientationPatient", "", "is missing or empty"),
-        ("ImagePositionPatient", "nan\\0\\0", "is 'nan\\0\\0'"),
-        ("ImagePositionPatient", "1\\2", "is '1\\2', expected 3 finite numbers"),
-        ("ImagePositionPatient", "", "is missing or empty"),
+        ("ImageOrientationPatient", "0\\0\\0\\0\\0\\0", "1"),
+        ("ImageOrientationPatient", "nan\\0\\0\\0\\1\\0", "nan\\0\\0\\0\\1\\0"),
+        ("ImageOrientationPatient", "", "missing"),
+        ("ImagePositionPatient", "nan\\0\\0", "nan\\0\\0"),
+        ("ImagePositionPatient", "1\\2", "1\\2"),
+        ("ImagePositionPatient", "", "missing"),
     ],
 )
-def test_row_15_positions_and_orientations_without_sense_in_all_slices(tmp_path, keyword, text, words):
+def test_row_15_positions_and_orientations_without_sense_in_all_slices(tmp_path, keyword, text, fact):
     write_series(tmp_path, Plan(**PLAN), set_raw(keyword, text))
-    with pytest.raises(RefusedInputError) as caught:
+    with refused(RefusedInputError, keyword, fact, "slice000.dcm"):
         read_volume(tmp_path)
-    assert words in str(caught.value) and keyword in str(caught.value) and "slice00" in str(caught.value)
 
 
 def stack_of(directions, origin, hu, folder):
@@ -109,7 +108,7 @@ def test_row_43_nothing_out_of_the_folder_is_opened(tmp_path):
         assert skipped["link to a file that is not there"] == 2
         assert "2 skipped: link out of the folder" in volume.report["warnings"]
         for name in ("a", "pipe.dcm", "s"):
-            with pytest.raises(NoDicomError, match="neither a folder nor a regular file|cannot be read"):
+            with refused(NoDicomError, "regular"):
                 read_volume(inside / name)
     finally:
         listener.close()
@@ -146,7 +145,7 @@ def both(first, second):
 
 
 @pytest.mark.parametrize("text", daily(2, HOSTILE_TEXTS.values()), ids=HOSTILE_TEXTS)
-def test_row_45_hostile_texts_are_escaped_and_name_no_file(tmp_path, monkeypatch, capsys, text):
+def test_row_45_hostile_texts_are_escaped_and_name_no_file(tmp_path, monkeypatch, printed, text):
     folder, utf8 = tmp_path / "ct", set_values(SpecificCharacterSet="ISO_IR 192")
     monkeypatch.chdir(tmp_path)
     for keyword in HOSTILE_FIELDS:
@@ -166,7 +165,7 @@ def test_row_45_hostile_texts_are_escaped_and_name_no_file(tmp_path, monkeypatch
         assert_one_line(caught.value, letters=10_000)
     for name in (*HOSTILE_FIELDS, "phases"):
         main(["info", str(folder / name)])
-    shown = "".join(capsys.readouterr())
+    shown = printed().everything
     assert all(line.isprintable() for line in shown.splitlines()) and "\u202e" not in shown
     assert [path.name for path in tmp_path.iterdir()] == ["ct"]
 
@@ -176,4 +175,4 @@ def test_row_45_a_hostile_transfer_syntax_is_escaped(tmp_path):
         (tmp_path / f"{k}").write_bytes(data.replace(b"1.2.840.10008.1.2.5\0", b"\x1b[31m8.10008.1.2.5\n "))
     with refused(RefusedInputError, "x1b") as caught:
         read_volume(tmp_path)
-    assert str(caught.value).isprintable()
+    assert_one_line(caught.value)

@@ -121,12 +121,12 @@ def test_row_40_the_file_that_does_not_decode_is_named(tmp_path):
 @pytest.mark.parametrize(
     ("uid", "name"),
     [
-        ("1.2.840.113619.5.2", "implicit VR big endian, private to GE"),
-        ("1.2.840.10008.1.2.8.1", "Deflated Image Frame Compression"),
-        (JPEG + "94", "JPIP Referenced"),
-        (JPEG + "102", "MPEG-4 AVC/H.264 High Profile / Level 4.1"),
-        (JPEG + "50", r"JPEG Baseline \(Process 1\)"),
-        ("1.2.3.4.5", "private or unknown"),
+        ("1.2.840.113619.5.2", "GE"),
+        ("1.2.840.10008.1.2.8.1", "Deflated"),
+        (JPEG + "94", "JPIP"),
+        (JPEG + "102", "MPEG-4"),
+        (JPEG + "50", "Baseline"),
+        ("1.2.3.4.5", "unknown"),
     ],
 )
 def test_row_41_other_transfer_syntaxes_are_named(tmp_path, uid, name):
@@ -139,5 +139,5 @@ def test_row_41_other_transfer_syntaxes_are_named(tmp_path, uid, name):
         assert data[start + 2 : start + 22] == old
         new = even(uid.encode())
         file.write_bytes(data[:start] + struct.pack("<H", len(new)) + new + data[start + 22 :])
-    with pytest.raises(RefusedInputError, match=rf"transfer syntax {uid} \({name}.*\) cannot be decoded: convert"):
+    with refused(RefusedInputError, uid, name):
         read_volume(tmp_path)

@@ -74,10 +74,8 @@ def test_phases_are_listed_and_chosen(tmp_path, first, second, keyword, values):
         {"number": n, "keyword": keyword, "value": value, "slices": 7} for n, value in enumerate(values, start=1)
     ]
     assert entry.affine_ijk_to_lps_mm is None and entry.slices == 14
-    with pytest.raises(RefusedInputError) as caught:
+    with refused(RefusedInputError, "phases", "phase", keyword, 2, 7):
         read_volume(tmp_path)
-    wanted = f"2 phases at the same places, choose one with phase: [1: {keyword} {values[0]}, 7 slices], [2: "
-    assert wanted in str(caught.value)
     for number, shift in enumerate(shifts, start=1):
         volume = read_volume(tmp_path, phase=number)
         assert np.array_equal(volume.voxels, plan.hu() + shift)
@@ -251,7 +249,7 @@ def test_visits_are_ranked_where_two_of_them_are_alike(tmp_path):
 def test_slices_with_equal_pixels_and_another_geometry_are_no_copies(tmp_path, elements, plan):
     write_series(tmp_path, Plan())
     write_phase(tmp_path, 2, plan=Plan(name="b{}".format, **plan), **elements)
-    with pytest.raises(RefusedInputError, match=r"different pixels or geometry at 7 places|differs within the series"):
+    with refused(RefusedInputError, "series"):
         read_volume(tmp_path)
 
 

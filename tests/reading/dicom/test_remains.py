@@ -63,12 +63,11 @@ def plan_with(style):
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_what_is_left_of_an_end_slice(tmp_path, style, damage):
     plan = write_series(tmp_path, plan_with(style))
-    change, words = DAMAGE[damage]
+    change, _ = DAMAGE[damage]
     file = tmp_path / plan.name(COUNT - 1)
     file.write_bytes(change(file.read_bytes()))
-    with pytest.raises(RefusedInputError, match=r"may belong to it \(restore or remove them\): ") as caught:
+    with refused(RefusedInputError, file.name):
         read_volume(tmp_path)
-    assert f"{file.name}: " in str(caught.value) and words in str(caught.value)
     listing = list_series(tmp_path)
     gates = {gate["name"]: gate for gate in listing.certificate["gates"]}
     assert gates["readable"]["ok"] is False and gates["readable"]["measured"] == 1
@@ -158,8 +157,7 @@ def test_an_image_that_says_it_is_a_dicomdir(tmp_path):
 
 def test_a_damaged_modality_is_no_other_series(tmp_path):
     write_series(tmp_path, plan_with("IM0001"), set_values(only=COUNT - 1, Modality="C_T"))
-    words = "IM0012: Modality \\(0008,0060\\) is no term of the standard, expected CT in a CT image"
-    with pytest.raises(RefusedInputError, match=words):
+    with refused(RefusedInputError, "IM0012", "Modality", "0008,0060"):
         read_volume(tmp_path)
 
 

@@ -74,12 +74,8 @@ def test_a_series_is_named_in_many_ways(two_series, wanted):
 
 @pytest.mark.parametrize("wanted", [3, "neck", "", "9", "1.2.4"])
 def test_an_unknown_name_lists_what_is_there(two_series, wanted):
-    with pytest.raises(UsageError) as caught:
+    with refused(UsageError, repr(wanted), "CT", 1, 7, 2, 4):
         read_volume(two_series, wanted)
-    assert str(caught.value) == (
-        f"no series matches series {wanted!r}; there are [1: CT, 7 slices], [2: CT, 4 slices]"
-        ' ("clrecon info" describes them)'
-    )
 
 
 def test_a_vague_name_lists_those_that_match(two_series):
@@ -137,7 +133,7 @@ def test_of_two_equal_series_the_usable_one_is_taken(tmp_path):
     write_series(tmp_path, Plan(series=3, name="y{}".format))
     with refused(RefusedInputError, "CT", 2, 7, 3) as caught:
         read_volume(tmp_path)
-    assert "[1: " not in str(caught.value)
+    assert "[1: " not in repr(caught.value)
 
 
 def test_of_equal_series_without_a_usable_one_none_is_taken(tmp_path):

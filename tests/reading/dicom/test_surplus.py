@@ -16,6 +16,7 @@ from pydicom.uid import (
     ExplicitVRLittleEndian,
     ImplicitVRLittleEndian,
 )
+from refusals import refused
 from variants import daily
 
 from clrecon.errors import RefusedInputError
@@ -222,11 +223,9 @@ def test_line_ends_that_were_changed_on_the_way(tmp_path, syntax, old, new, whol
         data = file.read_bytes()
         start = 132 if whole else len(data) - 2 * 6400
         file.write_bytes(data[:start] + data[start:].replace(old, new))
-    with pytest.raises(RefusedInputError) as caught:
+    facts = {b"\n": ("text",), b"\r\n": ("truncated", 12800), b"\r": ("elements", "DICOM")}
+    with refused(RefusedInputError, *("IM0000",) if whole else facts[old]):
         read_volume(tmp_path)
-    if not whole:
-        words = {b"\n": TEXT, b"\r\n": "truncated: 12800 bytes of pixels expected", b"\r": "are no elements of DICOM"}
-        assert words[old] in str(caught.value)
 
 
 @pytest.mark.parametrize("tail", [b"", element(0xFFFCFFFC, b"OB", bytes(5000), ExplicitVRLittleEndian)])

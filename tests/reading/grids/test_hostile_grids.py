@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 import tracemalloc
@@ -11,7 +10,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from label_files import OBLIQUE, write_nifti, write_nrrd
-from refusals import refused
+from refusals import assert_one_line, refused
 from variants import daily
 from volume_files import WRITERS, make_ct, write_metaimage
 
@@ -59,7 +58,7 @@ def test_damaged_compressed_voxels_are_refused(tmp_path, name):
         damaged = bytearray(content)
         damaged[at] ^= 0x5A
         part.write_bytes(damaged)
-        with pytest.raises(RefusedInputError, match="is cut|is cut or corrupt|holds more numbers"):
+        with refused(RefusedInputError, "corrupt"):
             clrecon.read_volume(path)
 
 
@@ -347,7 +346,7 @@ def test_a_small_file_that_would_fill_the_memory_is_refused(tmp_path, monkeypatc
 def test_texts_of_a_file_are_escaped_and_never_in_the_report(tmp_path):
     path = write_metaimage(tmp_path / "Jane\x1b[31mDoe.mha", make_ct(), Comment="Doe^Jane\x1b]0;x")
     volume = clrecon.read_volume(path)
-    assert "Doe" not in str(volume.report) and "Doe" not in str(clrecon.list_series(path))
+    assert "Doe" not in repr(volume.report) + repr(clrecon.list_series(path))
     with pytest.raises(RefusedInputError) as caught:
         clrecon.read_volume(write_metaimage(path, make_ct(), ElementSpacing="\x1b[31m"))
-    assert re.search(r"[\x00-\x1f]", str(caught.value)) is None
+    assert_one_line(caught.value)

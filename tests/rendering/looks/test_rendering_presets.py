@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.rendering import DEFAULT_PRESET, PRESETS, UNSHADED, find_preset
@@ -28,10 +29,8 @@ def passes(name: str, hu: float, mm: float) -> float:
 def test_they_are_there_and_found() -> None:
     assert list(PRESETS) == NAMES
     assert find_preset(DEFAULT_PRESET).name == "bone"
-    for name, meant in (("bonne", r" \(did you mean bone\?\)"), ("xyz", ""), ("", ""), (None, "")):
-        with pytest.raises(
-            UsageError, match=f"unknown rendering preset {name!r}{meant}: use one of bone, spine, skin, .*file"
-        ):
+    for name in ("bonne", "xyz", "", None):
+        with refused(UsageError, repr(name), "bone", "spine", "skin"):
             find_preset(name)
 
 

@@ -213,40 +213,40 @@ def test_wrong_fields_of_ours(tmp_path: Path, place: list[Any], new: Any, messag
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("content", "facts"),
     [
-        ('{"format": 1,\n "version" 1}', "line 2, column 12: no JSON"),
-        ('{"format": NaN}', "NaN is no number of JSON"),
-        ('{"version": 1, "version": 1}', "field 'version' is there twice"),
-        ('{"a": ' + "9" * 5000 + "}", "no JSON|no field"),
-        ("[" * 100_000, "nested too deep|no JSON"),
-        ("{}", 'no field "format"'),
-        ("", "its form is not known"),
-        ("bone", "its form is not known"),
-        (b"\x89PNG\r\n", "byte 0 is no UTF-8 text"),
-        (b" " * 1_000_001, "larger than 1,000,000 bytes"),
-        ("<a>", "line 1: no XML"),
-        ("<MRML/>", "no VolumeProperty"),
-        ('<!DOCTYPE x [<!ENTITY a "b">]><MRML/>', "line 1: it has a DOCTYPE"),
-        ('<!DOCTYPE x [<!ENTITY a "b">]><MRML/>'.encode("utf-16"), "line 1: it has a DOCTYPE"),
-        ('<?xml version="1.0" encoding="no-such"?><MRML/>', "no XML"),
+        ('{"format": 1,\n "version" 1}', ("JSON", 2, 12)),
+        ('{"format": NaN}', ("JSON", "NaN")),
+        ('{"version": 1, "version": 1}', ("version",)),
+        ('{"a": ' + "9" * 5000 + "}", ()),
+        ("[" * 100_000, ()),
+        ("{}", ('"format"',)),
+        ("", ("form",)),
+        ("bone", ("form",)),
+        (b"\x89PNG\r\n", ("UTF-8", 0)),
+        (b" " * 1_000_001, (1_000_000,)),
+        ("<a>", ("XML", 1)),
+        ("<MRML/>", ("VolumeProperty",)),
+        ('<!DOCTYPE x [<!ENTITY a "b">]><MRML/>', ("DOCTYPE", 1)),
+        ('<!DOCTYPE x [<!ENTITY a "b">]><MRML/>'.encode("utf-16"), ("DOCTYPE", 1)),
+        ('<?xml version="1.0" encoding="no-such"?><MRML/>', ("XML",)),
     ],
 )
-def test_files_that_are_something_else(tmp_path: Path, content: str | bytes, message: str) -> None:
-    with pytest.raises(RefusedInputError, match=f"^'file.json': .*({message})"):
+def test_files_that_are_something_else(tmp_path: Path, content: str | bytes, facts: tuple[str | int, ...]) -> None:
+    with refused(RefusedInputError, "file.json", *facts):
         load_transfer_function(put(tmp_path, content))
 
 
 def test_no_file_a_folder_a_pipe(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"there is no file .*gone\.json with a transfer function"):
+    with refused(UsageError, "gone.json"):
         load_transfer_function(tmp_path / "gone.json")
-    with pytest.raises(UsageError, match="is a folder"):
+    with refused(UsageError, "folder"):
         load_transfer_function(tmp_path)
-    with pytest.raises(RefusedInputError, match="cannot be read"):
+    with refused(RefusedInputError, "cannot"):
         load_transfer_function("a\0b")
     if hasattr(os, "mkfifo"):
         os.mkfifo(tmp_path / "pipe")
-        with pytest.raises(RefusedInputError, match="no regular file"):
+        with refused(RefusedInputError, "regular"):
             load_transfer_function(tmp_path / "pipe")
 
 
@@ -269,26 +269,26 @@ def test_slicer_text_is_read_with_any_line_ends(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "new", "message"),
+    ("line", "new", "facts"),
     [
-        (3, "0.8x", r"line 3 \(diffuse\) is '0.8x'"),
-        (3, "7", "diffuse of lighting lies between 0 and 1"),
-        (7, "8 -1000 0 80 0", r"line 7 \(scalarOpacity\) says 8 and has 4 numbers after it, of 2 to a point"),
-        (7, "3 1 0 2", "says 3 and has 3 numbers after it, of 2"),
-        (7, "4 5 0 x 1", r"number 4 of line 7 \(scalarOpacity\) is 'x'"),
-        (7, "4 50 0 20 1", r"line 7 \(scalarOpacity\) goes back from 50 at point 1 to 20"),
-        (7, "4 50 0 90 7", "opacity of point 3 is 7"),
-        (7, "", r"line 7 \(scalarOpacity\) is missing"),
-        (8, "4 0 1 255 nan", r"number 5 of line 8 \(gradientOpacity\) is 'nan'"),
-        (9, "0", r"line 9 \(colorTransfer\) says 0"),
+        (3, "0.8x", (3, "diffuse", "0.8x")),
+        (3, "7", ("diffuse", 0, 1)),
+        (7, "8 -1000 0 80 0", (7, "scalarOpacity", 8, 4)),
+        (7, "3 1 0 2", (3, 2)),
+        (7, "4 5 0 x 1", (4, 7, "scalarOpacity")),
+        (7, "4 50 0 20 1", (7, "scalarOpacity", 50, 1, 20)),
+        (7, "4 50 0 90 7", ("opacity", 3, 7)),
+        (7, "", (7, "scalarOpacity")),
+        (8, "4 0 1 255 nan", (5, 8, "gradientOpacity")),
+        (9, "0", (9, "colorTransfer", 0)),
     ],
 )
-def test_wrong_lines_of_slicer_text(tmp_path: Path, line: int, new: str, message: str) -> None:
+def test_wrong_lines_of_slicer_text(tmp_path: Path, line: int, new: str, facts: tuple[str | int, ...]) -> None:
     lines = TEXT.splitlines()
     lines[line - 1] = new
-    with pytest.raises(RefusedInputError, match=f"^'a.vp': .*{message}"):
+    with refused(RefusedInputError, "a.vp", *facts):
         load_transfer_function(put(tmp_path, "\n".join(lines), "a.vp"))
-    with pytest.raises(RefusedInputError, match=r"'a.vp': line 9 \(colorTransfer\) is missing"):
+    with refused(RefusedInputError, "a.vp", 9, "colorTransfer"):
         load_transfer_function(put(tmp_path, "\n".join(TEXT.splitlines()[:8]), "a.vp"))
 
 
@@ -337,22 +337,22 @@ def test_slicer_json(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "new", "message"),
+    ("place", "new", "field"),
     [
-        ([], None, "volumeProperties is empty"),
-        ([0, "components"], [], r"volumeProperties\[0\].components is empty"),
-        ([0, "components"], None, r"volumeProperties\[0\] has no field 'components'"),
-        ([0, "components", 0, "scalarOpacity"], None, "has no field 'scalarOpacity'"),
-        ([0, "components", 0, "rgbTransferFunction"], None, "has no field 'grayTransferFunction'"),
-        ([0, "components", 0, "scalarOpacity", "points"], {}, "scalarOpacity.points is an object"),
-        ([0, "components", 0, "scalarOpacity", "points", 1, "y"], "x", r"scalarOpacity.points\[1\].y is 'x'"),
-        ([0, "components", 0, "rgbTransferFunction", "points", 1, "color"], [1], r"points\[1\].color is a list"),
-        ([0, "components", 0, "lighting"], 3, "lighting is 3, not an object"),
+        ([], None, "volumeProperties"),
+        ([0, "components"], [], "volumeProperties[0].components"),
+        ([0, "components"], None, "components"),
+        ([0, "components", 0, "scalarOpacity"], None, "scalarOpacity"),
+        ([0, "components", 0, "rgbTransferFunction"], None, "grayTransferFunction"),
+        ([0, "components", 0, "scalarOpacity", "points"], {}, "scalarOpacity.points"),
+        ([0, "components", 0, "scalarOpacity", "points", 1, "y"], "x", "scalarOpacity.points[1].y"),
+        ([0, "components", 0, "rgbTransferFunction", "points", 1, "color"], [1], "points[1].color"),
+        ([0, "components", 0, "lighting"], 3, "lighting"),
     ],
 )
-def test_wrong_fields_of_slicer_json(tmp_path: Path, place: list[Any], new: Any, message: str) -> None:
+def test_wrong_fields_of_slicer_json(tmp_path: Path, place: list[Any], new: Any, field: str) -> None:
     value = changed(SLICER, ["volumeProperties", *place], new) if place else {**SLICER, "volumeProperties": []}
-    with pytest.raises(RefusedInputError, match=f"^'file.json': .*{message}"):
+    with refused(RefusedInputError, "file.json", field):
         load_transfer_function(put(tmp_path, value))
 
 
@@ -360,13 +360,13 @@ def test_paraview_files_are_read_and_wrong_ones_refused(tmp_path: Path) -> None:
     function = load_transfer_function(put(tmp_path, PARAVIEW))
     assert (function.name, function.lighting) == ("Bone CT", None)
     np.testing.assert_allclose(function([300]), [[0.75, 0.5, 0.5, 0.4]], atol=FLOAT64_SHARE)
-    for place, new, message in (
-        ("Points", None, "no opacities"),
-        ("ColorSpace", "Lab", "'Lab': only RGB is read"),
-        ("RGBPoints", [1, 2, 3], r"map 1.RGBPoints has 3 numbers, of 4"),
-        ("RGBPoints", None, "no field 'RGBPoints'"),
+    for place, new, fact in (
+        ("Points", None, "opacities"),
+        ("ColorSpace", "Lab", "Lab"),
+        ("RGBPoints", [1, 2, 3], "1.RGBPoints"),
+        ("RGBPoints", None, "RGBPoints"),
     ):
-        with pytest.raises(RefusedInputError, match=message):
+        with refused(RefusedInputError, fact):
             load_transfer_function(put(tmp_path, changed(PARAVIEW, [0, place], new)))
 
 

@@ -104,7 +104,7 @@ def test_scaled_and_shifted() -> None:
     for factor in (-1, np.nan, np.inf):
         with refused(UsageError, "factor", "opacities"):
             function.scaled(factor)
-    with pytest.raises(UsageError, match="beyond a million"):
+    with refused(UsageError, "million"):
         function.shifted(1e7)
 
 
@@ -188,19 +188,19 @@ def test_lighting_keeps_a_unit_direction() -> None:
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"ambient": -0.1}, "ambient of lighting lies between 0 and 1, not at -0.1"),
-        ({"diffuse": 1.1}, "diffuse of lighting"),
-        ({"specular": np.nan}, "specular of lighting lies between 0 and 1, not at nan"),
-        ({"specular": None}, "specular of lighting"),
-        ({"specular_power": 0.5}, "specular power of lighting lies between 1 and 128"),
-        ({"specular_power": 129}, "specular power of lighting lies between 1 and 128"),
-        ({"soft_gradient": -1}, "soft gradient of lighting lies between 0 and 1"),
-        ({"direction": (0, 0, 0)}, "not all 0"),
-        ({"direction": (0, np.inf, 0)}, "three finite numbers in LPS"),
-        ({"direction": (0, 1)}, "three finite numbers in LPS"),
-        ({"direction": "up"}, "three finite numbers in LPS"),
+        ({"ambient": -0.1}, ("ambient", 0, 1, -0.1)),
+        ({"diffuse": 1.1}, ("diffuse",)),
+        ({"specular": np.nan}, ("specular", "nan")),
+        ({"specular": None}, ("specular",)),
+        ({"specular_power": 0.5}, ("power", 1, 128)),
+        ({"specular_power": 129}, ("power", 1, 128)),
+        ({"soft_gradient": -1}, ("gradient", 0, 10_000)),
+        ({"direction": (0, 0, 0)}, (0,)),
+        ({"direction": (0, np.inf, 0)}, ("LPS",)),
+        ({"direction": (0, 1)}, ("LPS",)),
+        ({"direction": "up"}, ("LPS",)),
     ],
 )
 def test_lighting_that_cannot_be_right(parameters: dict, message: str) -> None:
-    with pytest.raises(UsageError, match=message):
+    with refused(UsageError, *message):
         Lighting(**parameters)

@@ -203,7 +203,7 @@ def test_colours_by_name_and_number():
 
 @pytest.mark.parametrize("color", ["", "blakc", "#12", "ff0000", "#gggggg", (1, 2, 3), (1, 0), None, (0, 0, np.nan)])
 def test_unknown_colours_list_the_known_ones(color):
-    with pytest.raises(UsageError, match="black, white, gray"):
+    with refused(UsageError, "black"):
         find_color(color)
 
 
