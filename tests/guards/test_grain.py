@@ -28,7 +28,7 @@ HABITS = {
     "nested_conditionals": 0,
     "comprehensions_of_two_loops": 23,
     "positional_flags": 0,
-    "functions_of_many_parameters": 38,
+    "functions_of_many_parameters": 36,
     "equal_functions": 0,
     "constants_of_one_file": 0,
     "kernels_with_branches": 4,

@@ -94,7 +94,7 @@ class SurfaceBounds(NearDistance):
             corners = [columns.take(corner, axis=1, mode="clip") for corner in triangles[piece].T]
             rest = np.flatnonzero(~far[piece])
             rest = rest[~self._are_within([corner[:, rest] for corner in corners], near[:, rest], limit)]
-            self._leave_middles(corners, near, rest, names[triangles[piece]], limit, witnesses[:, piece], left[piece])
+            self._leave_middles(corners, rest, names[triangles[piece]], limit, witnesses[:, piece], left[piece])
 
         in_threads(judge_piece, len(triangles), _PIECE)
         return witnesses, left
@@ -121,7 +121,6 @@ class SurfaceBounds(NearDistance):
     def _leave_middles(
         self,
         corners: Corners,
-        near: IntArray,
         rest: IntArray,
         names: IntArray,
         limit: float,
@@ -135,7 +134,7 @@ class SurfaceBounds(NearDistance):
         point = np.arange(len(MIDDLES) * len(rest))
         most = self._most(limit)
         for corner in range(3):
-            beside = near[corner, rest[point % max(len(rest), 1)]]
+            beside = witnesses[corner, rest[point % max(len(rest), 1)]]
             point = point[~(self.frames.squares(points[:, point], beside) < most)]
         for corner in range(3):
             of = rest[point % max(len(rest), 1)]

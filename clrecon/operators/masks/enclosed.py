@@ -54,10 +54,7 @@ class Spaces:
         if wanted.any():
             marks = np.zeros(4 * -(-components.count // 4), np.uint8)
             marks[self.numbers[wanted]] = 1
-            write_runs(
-                mask.device, components.runs.runs_d, components.runs.row_counts_d, components.numbers_d,
-                upload(mask.device, marks), words_d, mask.shape_ijk,
-            )  # fmt: skip
+            write_runs(mask.device, components, upload(mask.device, marks), words_d, mask.shape_ijk)
         return Mask(mask.scan, words_d, f"spaces in ({mask.name})", device=mask.device, memory=mask.memory)
 
     def are_wide(self, radius_mm: float) -> NDArray[np.bool_]:
@@ -159,15 +156,7 @@ def find_joints(mask: Mask, reach_mm: float, least_ml: float) -> Mask:
             marks = np.zeros(4 * -(-components.count // 4), np.uint8)
             marks[large[(np.arange(len(large)) >> bit & 1) == value]] = 1
             side_d = zero_words(device, words // 4)
-            write_runs(
-                device,
-                components.runs.runs_d,
-                components.runs.row_counts_d,
-                components.numbers_d,
-                upload(device, marks),
-                side_d,
-                shape,
-            )
+            write_runs(device, components, upload(device, marks), side_d, shape)
             sides.append(Mask(volume, side_d, "bones", device=device, memory=mask.memory).dilate(reach_mm))
         joints = joints | (sides[0] & sides[1])
         wait(device)  # the masks of commands that wait in the queue are all in memory

@@ -14,7 +14,7 @@ from clrecon.geometry.certificate import amend
 from clrecon.opencl import Device, Stopwatch, check_budget, upload
 from clrecon.operators.masks import voxel_mask
 from clrecon.operators.masks.regions import RowSpans, box_spans, checked_box, tube_spans
-from clrecon.operators.masks.runs import write_runs
+from clrecon.operators.masks.runs import Components, RowRuns, write_runs
 from clrecon.operators.masks.shapes import MaskComponents
 from clrecon.operators.masks.voxel_mask import check_shape, checked_band, mark_band, mask_bytes, zero_words
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
@@ -366,11 +366,9 @@ class Mask(MaskComponents):
             with attempt as (device, _):
                 check_budget(device, {**sizes, "spans of rows": 8 * n}, resident.memory)
                 mask_d = zero_words(device, sizes["mask of the voxels"] // 4)
-                write_runs(
-                    device, upload(device, spans.columns), upload(device, spans.row_counts),
-                    upload(device, np.zeros(n, np.int32)), upload(device, np.ones(1, np.uint8)), mask_d,
-                    volume.shape_ijk,
-                )  # fmt: skip
+                runs = RowRuns(upload(device, spans.columns), upload(device, spans.row_counts), n, 0, False)
+                parts = Components(runs, 1, upload(device, np.zeros(n, np.int32)))
+                write_runs(device, parts, upload(device, np.ones(1, np.uint8)), mask_d, volume.shape_ijk)
         return cls(volume, mask_d, name, device=device, memory=resident.memory)
 
 

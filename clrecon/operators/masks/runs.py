@@ -120,25 +120,6 @@ def join_runs(
     return join_parts(device, labels_d, roots_d, runs, links_d, links)
 
 
-def write_runs(
-    device: Device,
-    runs_d: Any,
-    row_counts_d: Any,
-    numbers_d: Any,
-    marks_d: Any,
-    mask_d: Any,
-    shape_ijk: tuple[int, int, int],
-    *,
-    wanted: int = 1,
-) -> None:
-    """Set the bits of runs whose component has the mark `wanted`, 0 or 1; the other bits stay as they are."""
-    ni, nj, nk = shape_ijk
-    launch(
-        device, prepare_runs(device)["write_runs"], nj * nk, runs=runs_d, row_counts=row_counts_d, numbers=numbers_d,
-        marks=marks_d, mask=mask_d, wanted=wanted, rows=nj * nk, words=-(-ni // 32),
-    )  # fmt: skip
-
-
 @dataclass(frozen=True)
 class Components:
     """Components of the set voxels of a mask by the faces of voxels, on a device: the number of each run, (runs.count,)
@@ -148,6 +129,17 @@ class Components:
     runs: RowRuns
     count: int
     numbers_d: Any
+
+
+def write_runs(
+    device: Device, parts: Components, marks_d: Any, mask_d: Any, shape_ijk: tuple[int, int, int], *, wanted: int = 1
+) -> None:
+    """Set the bits of runs whose component has the mark `wanted`, 0 or 1; the other bits stay as they are."""
+    ni, nj, nk = shape_ijk
+    launch(
+        device, prepare_runs(device)["write_runs"], nj * nk, runs=parts.runs.runs_d, row_counts=parts.runs.row_counts_d,
+        numbers=parts.numbers_d, marks=marks_d, mask=mask_d, wanted=wanted, rows=nj * nk, words=-(-ni // 32),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -418,7 +418,7 @@ class MaskComponents(MaskShapes):
         ocl.copy_buffer(device, self._mask_d, filled_d, size)
         if holes.count:
             marks_d = mark_at_border(device, holes, shape, by_slice=by_slice)
-            self._write(holes, marks_d, filled_d, wanted=0)
+            write_runs(self.device, holes, marks_d, filled_d, self.shape_ijk, wanted=0)
         return self._made(filled_d, f"({self.name}) with holes filled" + " slice by slice" * by_slice)
 
     def grow(self: ComponentMask, points_mm: ArrayLike) -> ComponentMask:
@@ -440,7 +440,7 @@ class MaskComponents(MaskShapes):
         if (components < 0).any():
             raise UsageError(self._describe_miss(points[components < 0][0], "lies in a voxel that is not chosen"))
         grown_d = zero_words(device, size // 4)
-        self._write(parts, marks_d, grown_d, wanted=1)
+        write_runs(self.device, parts, marks_d, grown_d, self.shape_ijk)
         return self._made(grown_d, f"({self.name}) grown from {len(points)} point{'s' * (len(points) != 1)}")
 
     @explains_arguments
@@ -477,7 +477,7 @@ class MaskComponents(MaskShapes):
         if len(numbers):
             marks = np.zeros(4 * -(-parts.count // 4), np.uint8)
             marks[numbers] = 1
-            self._write(parts, ocl.upload(self.device, marks), chosen_d, wanted=1)
+            write_runs(self.device, parts, ocl.upload(self.device, marks), chosen_d, self.shape_ijk)
         return self._made(chosen_d, f"{label} of ({self.name})")
 
     def _find_voxels(self, points: Float64Array) -> NDArray[np.int32]:
@@ -500,10 +500,3 @@ class MaskComponents(MaskShapes):
         if np.isfinite(least):
             near = f"the nearest voxel that is chosen ({self.name}) is {least:.1f} mm away"
         return f"the point ({position}) mm {problem}: {near}"
-
-    def _write(self, parts: Components, marks_d: object, mask_d: object, wanted: int) -> None:
-        runs = parts.runs
-        write_runs(
-            self.device, runs.runs_d, runs.row_counts_d, parts.numbers_d, marks_d, mask_d, self.shape_ijk,
-            wanted=wanted,
-        )  # fmt: skip
