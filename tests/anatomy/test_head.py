@@ -45,11 +45,16 @@ def test_row_70_heads_in_any_position(settings: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("axes", [(0, 1, 2), (1, 0, 2), (2, 1, 0)], ids=["axial", "coronal", "sagittal"])
-def test_row_70_heads_in_slices_along_any_axis(axes: tuple[int, int, int]) -> None:
-    volume = phantom("head")
+@pytest.mark.parametrize(
+    ("kind", "spacing", "is_head"), [("head", (2.4, 2.4, 3.5), True), ("pelvis", (4.0, 4.0, 4.0), False)]
+)
+def test_row_70_heads_and_trunks_in_slices_along_any_axis(
+    kind: str, spacing: tuple[float, ...], is_head: bool, axes: tuple[int, int, int]
+) -> None:
+    volume = phantom(kind, spacing=spacing)
     affine = volume.affine.copy()
     affine[:3, :3] = volume.affine[:3, 2::-1][:, list(axes)][:, ::-1]
-    assert find_head(Volume(np.transpose(volume.voxels, axes), affine)) is True
+    assert find_head(Volume(np.transpose(volume.voxels, axes), affine)) is is_head
 
 
 def test_row_70_every_level_below_bone_is_warned_of() -> None:
