@@ -25,33 +25,30 @@
 #include "rays/look_ahead.h"
 #include "rays/phong.h"
 #include "rays/ray_packet.h"
+#include "rays/ray_state.h"
+#include "rays/sample_run.h"
 #include "rays/stack.h"
 #include "rays/steep_segments.h"
 #include "rays/view.h"
 
 #define GRADIENT_NODES 256 /* of the table of factors by magnitude */
 #define OPAQUE 0.99f /* nothing behind can be seen */
-#define FIRST_SEEN (1.0f / 255.0f) /* opacity that makes a first hit */
 #define SAMPLES_A_LOOK 8 /* samples until a packet looks for empty space again */
-#define AT_ONCE 4 /* of them taken before any is blended */
 #define SAMPLES_AHEAD 6.0f /* that their voxels are asked for */
 
-/* State of the rays: premultiplied colour, t of the first hit (negative while there is none), weighted sum of t. */
+/* State of the rays, see ray_state: t of the first hit is negative while there is none. */
 typedef struct {
     floats red, green, blue, opacity, first_hit, sum;
 } sights;
 
-#ifdef LABELS
-#define LABEL_PARAMETERS , __global const LABEL *restrict labels, __global const float4 *restrict label_colors
-#else
-#define LABEL_PARAMETERS
-#endif
-
-#ifdef GRADIENT_OPACITY
-#define IS_WEIGHED 1
-#else
-#define IS_WEIGHED 0
-#endif
+/* Its numbers lane by lane, as rows of an array. */
+#define RED 0
+#define GREEN 1
+#define BLUE 2
+#define OPACITY 3
+#define FIRST_HIT 4
+#define SUM 5
+#define STATE_NUMBERS 6
 
 /* Opacity over `times` as many steps.  Called only where it is needed: logarithms are slow on CPUs.  Opacity 1 stays 1,
  * however short the way. */
@@ -68,6 +65,73 @@ static inline floats weigh_opacity(const looks *look, const floats opacity, cons
     return stretch_opacity(factor * whole, (floats)(1.0f / look->steps_per_unit));
 }
 
+/* In each variant:
+ *
+ *      weigh_by_label      opacity with that of the labels at sample `number`
+ *      tint_by_label       colour with a share of that of the labels at a place
+ *      weigh_by_gradient   opacity with the factor of the gradient (x, y, z) */
+#ifdef LABELS
+#define LABEL_PARAMETERS , __global const LABEL *restrict labels, __global const float4 *restrict label_colors
+#define LABEL_TABLES labels, label_colors
+static inline floats weigh_by_label(const field *f, const slice_stack *stack, const looks *look,
+    const ray_lanes *course, const packet *rays, const floats number, const floats opacity)
+{
+    if (!ANY_LANE(opacity > 0.0f))
+        return opacity;
+    floats i, j, k;
+    find_places(stack, course, rays, number, 1, &i, &j, &k);
+    const floats factor = LABEL_CHANNEL(look->label_colors, find_labels(look->labels, f, i, j, k), 3);
+    if (!ANY_LANE((factor < 1.0f) & (opacity > 0.0f)))
+        return opacity;
+    return choose(factor < 1.0f, weigh_opacity(look, opacity, factor), opacity);
+}
+
+static inline void tint_by_label(const field *f, const looks *look, const floats i, const floats j, const floats k,
+    floats *red, floats *green, floats *blue)
+{
+    const ints label = find_labels(look->labels, f, i, j, k);
+    const floats label_red = LABEL_CHANNEL(look->label_colors, label, 0);
+    const floats tinted = choose(label_red < 0.0f, (floats)(0.0f), (floats)(LABEL_TINT));
+    *red += tinted * (label_red - *red);
+    *green += tinted * (LABEL_CHANNEL(look->label_colors, label, 1) - *green);
+    *blue += tinted * (LABEL_CHANNEL(look->label_colors, label, 2) - *blue);
+}
+#else
+#define LABEL_PARAMETERS
+#define LABEL_TABLES 0, 0
+static inline floats weigh_by_label(const field *f, const slice_stack *stack, const looks *look,
+    const ray_lanes *course, const packet *rays, const floats number, const floats opacity)
+{
+    return opacity;
+}
+
+static inline void tint_by_label(const field *f, const looks *look, const floats i, const floats j, const floats k,
+    floats *red, floats *green, floats *blue)
+{
+}
+#endif
+
+#ifdef GRADIENT_OPACITY
+#define IS_WEIGHED 1
+static inline floats weigh_by_gradient(
+    const looks *look, const floats opacity, const floats x, const floats y, const floats z)
+{
+    const floats entry = lesser(sqrt(x * x + y * y + z * z) * look->factor_scale, (floats)(GRADIENT_NODES - 1));
+    const ints at = lesser_int(to_ints(entry), (ints)(GRADIENT_NODES - 2));
+    const floats low = (floats)(GATHER(float, look->factors, at));
+    const floats high = (floats)(GATHER(float, look->factors + 1, at));
+    const floats factor = low + (entry - to_floats(at)) * (high - low);
+    return choose(opacity > 0.0f, weigh_opacity(look, opacity, factor), opacity);
+}
+#else
+#define IS_WEIGHED 0
+static inline floats weigh_by_gradient(
+    const looks *look, const floats opacity, const floats x, const floats y, const floats z)
+{
+    return opacity;
+}
+#endif
+
 /* Opacity over one ray step of segment n of each ray, whose light and colour are taken at `number`; 0 for lanes whose
  * segment does not count.  With `inner` the segments of all lanes count, lie within the volume with all voxels that
  * they need, and are not the last of their rays. */
@@ -75,37 +139,17 @@ static inline floats find_opacity(const field *f, const slice_stack *stack, cons
     const packet *rays, const float n, const int inner, const ints counts, const segment_values *v, floats *number,
     floats *value)
 {
-    floats i, j, k;
-    floats opacity = (floats)(GATHER(float, look->opacities, find_node(v->here)));
-    *number = n;
-    *value = v->here;
-#if TAKES_PARTS
     floats shift;
+    floats opacity = (floats)(GATHER(float, look->opacities, find_node(v->here)));
     opacity = find_steep_opacity(look, v, counts, opacity, &shift, value);
-    *number = n + shift;
-#endif
+    *number = find_number(rays, look, n, inner, shift);
     if (!inner) {
+        floats i, j, k;
         find_places(stack, course, rays, (floats)(n), 0, &i, &j, &k);
-#if TAKES_PARTS
-        *number = choose(rays->last == n, rays->last_number + shift * (rays->rest / look->ray_step), *number);
-#else
-        *number = lesser((floats)(n), rays->last_number);
-#endif
-        ints within = (k >= look->slab_low) & (k < look->slab_high) & (n >= rays->begin);
-#ifdef UNEVEN
-        within &= (i >= -0.5f) & (i <= f->last.x + 0.5f) & (j >= -0.5f) & (j <= f->last.y + 0.5f);
-#endif
+        const ints within = (k >= look->slab_low) & (k < look->slab_high) & (n >= rays->begin) & lie_in_slice(f, i, j);
         opacity = choose(within, opacity, (floats)(0.0f));
     }
-#ifdef LABELS
-    if (ANY_LANE(opacity > 0.0f)) {
-        find_places(stack, course, rays, *number, 1, &i, &j, &k);
-        const floats factor = LABEL_CHANNEL(look->label_colors, find_labels(look->labels, f, i, j, k), 3);
-        if (ANY_LANE((factor < 1.0f) & (opacity > 0.0f)))
-            opacity = choose(factor < 1.0f, weigh_opacity(look, opacity, factor), opacity);
-    }
-#endif
-    return opacity;
+    return weigh_by_label(f, stack, look, course, rays, *number, opacity);
 }
 
 /* Blend segment n of each ray where it has opacity; `value` and `opacity` are those at `number`. */
@@ -121,14 +165,7 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
         find_slopes(f, i, j, k, inner, &s);
         floats x, y, z;
         find_gradients(look->view, stack, &s, k, &x, &y, &z);
-#if IS_WEIGHED
-        const floats entry = lesser(sqrt(x * x + y * y + z * z) * look->factor_scale, (floats)(GRADIENT_NODES - 1));
-        const ints at = lesser_int(to_ints(entry), (ints)(GRADIENT_NODES - 2));
-        const floats low = (floats)(GATHER(float, look->factors, at));
-        const floats high = (floats)(GATHER(float, look->factors + 1, at));
-        const floats factor = low + (entry - to_floats(at)) * (high - low);
-        opacity = choose(opacity > 0.0f, weigh_opacity(look, opacity, factor), opacity);
-#endif
+        opacity = weigh_by_gradient(look, opacity, x, y, z);
         if (look->shaded)
             find_light(look->view, look->highlights, x, y, z, rays->toward_x, rays->toward_y, rays->toward_z, &share,
                 &highlight);
@@ -141,14 +178,7 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
     const floats unit = 1.0f / 1023.0f;
     floats red = to_floats(color >> 20) * unit, green = to_floats((color >> 10) & 1023) * unit;
     floats blue = to_floats(color & 1023) * unit;
-#ifdef LABELS
-    const ints label = find_labels(look->labels, f, i, j, k);
-    const floats label_red = LABEL_CHANNEL(look->label_colors, label, 0);
-    const floats tinted = choose(label_red < 0.0f, (floats)(0.0f), (floats)(LABEL_TINT));
-    red += tinted * (label_red - red);
-    green += tinted * (LABEL_CHANNEL(look->label_colors, label, 1) - green);
-    blue += tinted * (LABEL_CHANNEL(look->label_colors, label, 2) - blue);
-#endif
+    tint_by_label(f, look, i, j, k, &red, &green, &blue);
     const floats weight = (1.0f - seen->opacity) * opacity;
     seen->red += weight * lesser(red * share + highlight, (floats)(1.0f));
     seen->green += weight * lesser(green * share + highlight, (floats)(1.0f));
@@ -157,6 +187,26 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
     seen->sum += weight * t;
     seen->first_hit = choose((seen->first_hit < 0.0f) & (seen->opacity > FIRST_SEEN), t, seen->first_hit);
 }
+
+/* Shorten the ways of rays to what lies between two depths.  The ends of a way stay finite. */
+#ifdef BETWEEN
+static inline void shorten_ways(const int2 first_pixel, const int2 size, ray_packet *way,
+    __global const float *nearest, __global const float *farthest)
+{
+    float begin_of[LANES], end_of[LANES];
+    for (int lane = 0; lane < LANES; ++lane) {
+        const int inside = first_pixel.x + lane < size.x && first_pixel.y < size.y;
+        const size_t place = (size_t)first_pixel.y * (size_t)size.x + (size_t)(first_pixel.x + lane);
+        begin_of[lane] = inside ? nearest[place] : 0.0f;
+        end_of[lane] = inside ? farthest[place] : 0.0f;
+    }
+    const floats begin = load_lanes(begin_of) - way->offset, end = load_lanes(end_of) - way->offset;
+    way->t_in = lesser(greater(way->t_in, begin), way->t_out);
+    way->t_out = greater(lesser(way->t_out, end), way->t_in);
+}
+#else
+static inline void shorten_ways(const int2 first_pixel, const int2 size, ray_packet *way) {}
+#endif
 
 /* Set up the rays of LANES pixels that are neighbours in a row; nothing shows before `entry`. */
 static inline void start_rays(const field *f, const looks *look, const int2 first_pixel, const int2 size,
@@ -167,9 +217,7 @@ static inline void start_rays(const field *f, const looks *look, const int2 firs
     const floats x = (float)first_pixel.x + LANE_NUMBERS, y = (float)first_pixel.y;
     ray_packet way;
     start_packet(look->view, x, y, planes, perspective, &way);
-#ifdef BETWEEN
-    shorten_ways(nearest, farthest, first_pixel, size, &way);
-#endif
+    shorten_ways(first_pixel, size, &way BETWEEN_ARGUMENTS);
     rays->phase = 0.5f;
     if (jitter) {
         float phase_of[LANES];
@@ -205,25 +253,25 @@ static inline void start_rays(const field *f, const looks *look, const int2 firs
 /* The state that earlier slabs left. */
 static inline void load_sights(__global const float4 *states, const int2 first_pixel, const int2 size, sights *seen)
 {
-    float lane_of[6][LANES];
+    float lane_of[STATE_NUMBERS][LANES];
     for (int lane = 0; lane < LANES; ++lane) {
         const int inside = first_pixel.x + lane < size.x && first_pixel.y < size.y;
         const size_t place = (size_t)first_pixel.y * (size_t)size.x + (size_t)(first_pixel.x + lane);
         const float4 color = inside ? states[2 * place] : (float4)(0.0f);
         const float4 rest = inside ? states[2 * place + 1] : (float4)(0.0f);
-        lane_of[0][lane] = color.x;
-        lane_of[1][lane] = color.y;
-        lane_of[2][lane] = color.z;
-        lane_of[3][lane] = color.w;
-        lane_of[4][lane] = rest.x;
-        lane_of[5][lane] = rest.y;
+        lane_of[RED][lane] = color.x;
+        lane_of[GREEN][lane] = color.y;
+        lane_of[BLUE][lane] = color.z;
+        lane_of[OPACITY][lane] = color.w;
+        lane_of[FIRST_HIT][lane] = rest.x;
+        lane_of[SUM][lane] = rest.y;
     }
-    seen->red = load_lanes(lane_of[0]);
-    seen->green = load_lanes(lane_of[1]);
-    seen->blue = load_lanes(lane_of[2]);
-    seen->opacity = load_lanes(lane_of[3]);
-    seen->first_hit = load_lanes(lane_of[4]);
-    seen->sum = load_lanes(lane_of[5]);
+    seen->red = load_lanes(lane_of[RED]);
+    seen->green = load_lanes(lane_of[GREEN]);
+    seen->blue = load_lanes(lane_of[BLUE]);
+    seen->opacity = load_lanes(lane_of[OPACITY]);
+    seen->first_hit = load_lanes(lane_of[FIRST_HIT]);
+    seen->sum = load_lanes(lane_of[SUM]);
 }
 
 /* Parameters  voxels   in   (slices, nj, ni)
@@ -232,7 +280,7 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
  *             highlights in (HIGHLIGHTS) see rays/shade.h
  *             entries  in   (tile rows, tile columns) t before which nothing is visible, MAXFLOAT where nothing is
  *             view     in   see rays/view.h
- *             states   in/out  (height, width, 2) float4: premultiplied rgba; t of the first hit, sum of w t, -, -
+ *             states   in/out  (height, width, 2) float4: see rays/ray_state.h
  *             image    out  (height, width) rgba
  *             depths means  out  (height, width) first hit and expected depth, mm; NaN where nothing is hit
  *             background    rgb, and 1 where it fills what the rays leave
@@ -279,10 +327,7 @@ __kernel void composite_rays(
     const float last_value = last_shown < NODES - 1 ? (float)last_shown + 1.0f : MAXFLOAT;
     const looks look = { colors, opacities, clears, changes, narrow, highlights, factors, view, low, scale,
         factor_scale, steps_per_unit, ray_step, slab_low, slab_high, first_value, last_value, shaded,
-#ifdef LABELS
-        labels, label_colors
-#endif
-    };
+        LABEL_TABLES };
 
     const uint tile = find_tile(first_pixel, width, height, queues);
     const uint tiles = (width + TILE - 1) / TILE * ((height + TILE - 1) / TILE);
@@ -311,10 +356,8 @@ __kernel void composite_rays(
     float n = LEAST_LANE(rays.begin);
     floats end = choose(seen.opacity < OPAQUE, rays.end, (floats)(0.0f));
     int shows = 0; /* the samples before: then the next ones probably do too */
-#if TAKES_PARTS
-    floats before = 0.0f, here = 0.0f; /* values of samples n - 1 and n, where `goes_on` */
-    int goes_on = 0;
-#endif
+    sample_run run;
+    forget_samples(&run);
     while (ANY_LANE(n < end)) {
         if (!shows) {
             /* The last sample of a ray lies before its place in the row. */
@@ -330,69 +373,18 @@ __kernel void composite_rays(
                 const float least = LEAST_LANE(choose(n < end, leap, (floats)(MAXFLOAT)));
                 const int whole = (int)least;
                 n += (float)max(whole + ((float)whole < least), 1);
-#if TAKES_PARTS
-                goes_on = 0;
-#endif
+                forget_samples(&run);
                 continue;
             }
         }
-#if TAKES_PARTS
-        if (!goes_on) {
-            int inner = HAS_INNER && n >= rays.inner_begin && n + 1.0f <= rays.inner_end;
-            here = find_value(&f, &stack, &look, &course, &rays, (floats)(n), inner);
-            /* The segment of the sample before reaches half way to this one.  Where one side of the values shows, and
-             * this one does not, that segment shows nothing either. */
-            if (!one_sided || ANY_LANE((here >= look.first_value) & (here < look.last_value))) {
-                n = max(n - 1.0f, 0.0f);
-                inner = HAS_INNER && n - 1.0f >= rays.inner_begin && n + 1.0f <= rays.inner_end;
-                const floats place = n > 0.0f ? (floats)(n - 1.0f) : -lesser(rays.phase, (floats)(0.5f));
-                here = find_value(&f, &stack, &look, &course, &rays, (floats)(n), inner);
-                before = find_value(&f, &stack, &look, &course, &rays, place, inner);
-                before = n > 0.0f ? before : before + (before - here);
-            } else {
-                before = here;
-            }
-            goes_on = 1;
-        }
-#endif
+        begin_samples(&f, &stack, &look, &course, &rays, one_sided, &n, &run);
         for (int part = 0; part < SAMPLES_A_LOOK && ANY_LANE(n < end); part += AT_ONCE) {
             floats value[AT_ONCE + 2 * BESIDE];
             const int inner = HAS_INNER && n - (float)BESIDE >= rays.inner_begin
                 && n + (float)(AT_ONCE + BESIDE) <= rays.inner_end;
-#if HAS_INNER
-            const float early = n + SAMPLES_AHEAD;
-            if (inner && early < rays.inner_end)
-                fetch_cell_early(&f, course.start_i.s0 + early * course.stride_i.s0,
-                    course.start_j.s0 + early * course.stride_j.s0, course.start_k.s0 + early * course.stride_k.s0);
-#endif
-            /* Whether one of some samples may show is decided once: their loads need not wait for each other. */
-#if TAKES_PARTS
-            value[0] = before;
-            value[1] = here;
-            floats least = lesser(before, here), most = greater(before, here), widest = fabs(here - before);
-#else
-            ints may_show = 0;
-#endif
-#if LANES == 1
-#pragma unroll
-#endif
-            for (int sample = 2 * BESIDE; sample < AT_ONCE + 2 * BESIDE; ++sample) {
-                value[sample] = find_value(
-                    &f, &stack, &look, &course, &rays, (floats)(n + (float)(sample - BESIDE)), inner);
-#if TAKES_PARTS
-                least = lesser(least, value[sample]);
-                most = greater(most, value[sample]);
-                widest = greater(widest, fabs(value[sample] - value[sample - 1]));
-#else
-                may_show |= (value[sample] >= look.first_value) & (value[sample] < look.last_value);
-#endif
-            }
-#if TAKES_PARTS
-            before = value[AT_ONCE];
-            here = value[AT_ONCE + 1];
-            const ints may_show = (most >= look.first_value) & (least < look.last_value);
-            const int may_be_steep = has_dense || ANY_LANE(widest > narrow);
-#endif
+            if (inner)
+                fetch_sample_early(&f, &course, n + SAMPLES_AHEAD, rays.inner_end);
+            const ints may_show = take_samples(&f, &stack, &look, &course, &rays, n, inner, has_dense, value, &run);
             shows = ANY_LANE(may_show & (n < end));
             if (shows) {
                 for (int sample = 0; sample < AT_ONCE; ++sample) {
@@ -402,12 +394,7 @@ __kernel void composite_rays(
                     const ints counts = segment < end;
                     if (!ANY_LANE(counts))
                         break;
-#if TAKES_PARTS
-                    const segment_values v = { value[at], value[at + 1], value[at + 2],
-                        segment > 0.0f ? 2.0f : 1.0f, may_be_steep };
-#else
-                    const segment_values v = { value[at] };
-#endif
+                    const segment_values v = find_segment(&run, value, at, segment);
                     floats number, seen_value;
                     const floats opacity = find_opacity(
                         &f, &stack, &look, &course, &rays, segment, inner, counts, &v, &number, &seen_value);
@@ -424,21 +411,22 @@ __kernel void composite_rays(
             n += (float)AT_ONCE;
         }
     }
-    float out_of[6][LANES], offset_of[LANES];
-    store_lanes(seen.red, out_of[0]);
-    store_lanes(seen.green, out_of[1]);
-    store_lanes(seen.blue, out_of[2]);
-    store_lanes(seen.opacity, out_of[3]);
-    store_lanes(seen.first_hit, out_of[4]);
-    store_lanes(seen.sum, out_of[5]);
+    float out_of[STATE_NUMBERS][LANES], offset_of[LANES];
+    store_lanes(seen.red, out_of[RED]);
+    store_lanes(seen.green, out_of[GREEN]);
+    store_lanes(seen.blue, out_of[BLUE]);
+    store_lanes(seen.opacity, out_of[OPACITY]);
+    store_lanes(seen.first_hit, out_of[FIRST_HIT]);
+    store_lanes(seen.sum, out_of[SUM]);
     store_lanes(rays.offset, offset_of);
     for (int lane = 0; lane < LANES; ++lane) {
         const int2 pixel = find_pixel(first_pixel + lane, width, height, queues);
         if (pixel.x >= (int)width || pixel.y >= (int)height)
             continue;
         const size_t place = (size_t)pixel.y * width + (size_t)pixel.x;
-        const float4 color = (float4)(out_of[0][lane], out_of[1][lane], out_of[2][lane], out_of[3][lane]);
-        const float first_hit = out_of[4][lane], sum = out_of[5][lane];
+        const float4 color
+            = (float4)(out_of[RED][lane], out_of[GREEN][lane], out_of[BLUE][lane], out_of[OPACITY][lane]);
+        const float first_hit = out_of[FIRST_HIT][lane], sum = out_of[SUM][lane];
         if (!(stage & LAST_SLAB)) {
             states[2 * place] = color;
             states[2 * place + 1] = (float4)(first_hit, sum, 0.0f, 0.0f);

@@ -47,6 +47,16 @@ typedef int pair_of_shorts __attribute__((aligned(2)));
     }
 #endif
 
+/* Whether LANES places lie beside no voxel: rays run through the box of slices that lie over each other. */
+#ifdef UNEVEN
+static inline ints lie_in_slice(const field *f, const floats i, const floats j)
+{
+    return (i >= -0.5f) & (i <= f->last.x + 0.5f) & (j >= -0.5f) & (j <= f->last.y + 0.5f);
+}
+#else
+static inline ints lie_in_slice(const field *f, const floats i, const floats j) { return (ints)(-1); }
+#endif
+
 /* Cells that LANES places near each other lie in, and their parts of the way through them. */
 typedef struct {
     ints i, j, k;

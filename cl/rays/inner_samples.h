@@ -12,6 +12,18 @@
 #define HAS_INNER 0
 #endif
 
+/* Ask for the voxels that the first lane needs at sample n of a packet, if that is before `end`. */
+#if HAS_INNER
+static inline void fetch_sample_early(const field *f, const ray_lanes *course, const float n, const float end)
+{
+    if (n < end)
+        fetch_cell_early(f, course->start_i.s0 + n * course->stride_i.s0, course->start_j.s0 + n * course->stride_j.s0,
+            course->start_k.s0 + n * course->stride_k.s0);
+}
+#else
+static inline void fetch_sample_early(const field *f, const ray_lanes *course, const float n, const float end) {}
+#endif
+
 /* Voxels along one axis that rounding may move samples by: places are sums of terms as large as the rays' origins. */
 static inline float find_slack(const floats origin, const float last)
 {

@@ -15,6 +15,14 @@
 #include "rays/stack.h"
 #include "rays/view.h"
 
+#ifdef UNEVEN
+#define MEETS_PLANES 0 /* no step meets planes at any distance */
+#define MAY_LEAP 0 /* rays are no lines among the bricks */
+#else
+#define MEETS_PLANES 1
+#define MAY_LEAP 1
+#endif
+
 #define HIGHEST 0
 #define LOWEST 1
 #define MEAN 2
@@ -133,17 +141,9 @@ __kernel void project_rays(
     start_packet(view, x, y, planes, perspective, &way);
     ray_lanes course;
     row_of_samples row;
-#ifdef UNEVEN
-    const int on_planes = 0; /* no step meets planes at any distance */
-#else
-    const int on_planes = which == HIGHEST || which == LOWEST;
-#endif
+    const int on_planes = MEETS_PLANES && (which == HIGHEST || which == LOWEST);
     const int sums = which == MEAN || which == RADIOGRAPH;
-#ifdef UNEVEN
-    const int leaps = 0; /* rays are no lines among the bricks */
-#else
-    const int leaps = which != MEAN;
-#endif
+    const int leaps = MAY_LEAP && which != MEAN;
     if (on_planes)
         plan_crossings(&way, ray_step, &course, &row);
     else
@@ -156,19 +156,19 @@ __kernel void project_rays(
     const float sign = which == LOWEST ? -1.0f : 1.0f;
     __global const VOXEL *limits = ranges + (which != LOWEST);
     floats best = sums ? 0.0f : -MAXFLOAT, best_t = 0.0f, length_mm = 0.0f;
-    float lane_of[3][LANES], offset_of[LANES];
+    float value_of[LANES], t_of[LANES], mm_of[LANES], offset_of[LANES]; /* states: these three, lane by lane */
     if (!(stage & FIRST_SLAB)) {
         for (int lane = 0; lane < LANES; ++lane) {
             const int inside = first.x + lane < (int)width && first.y < (int)height;
             const size_t place = (size_t)first.y * width + (size_t)(first.x + lane);
             const float4 state = inside ? states[2 * place] : (float4)(0.0f);
-            lane_of[0][lane] = state.x;
-            lane_of[1][lane] = state.y;
-            lane_of[2][lane] = state.z;
+            value_of[lane] = state.x;
+            t_of[lane] = state.y;
+            mm_of[lane] = state.z;
         }
-        best = load_lanes(lane_of[0]);
-        best_t = load_lanes(lane_of[1]);
-        length_mm = load_lanes(lane_of[2]);
+        best = load_lanes(value_of);
+        best_t = load_lanes(t_of);
+        length_mm = load_lanes(mm_of);
     }
     float n = 0.0f;
     while (ANY_LANE(n < end)) {
@@ -196,10 +196,8 @@ __kernel void project_rays(
                     j = snap(j);
                     k = snap(k);
                 }
-                ints counts = (number < end) & (k >= slab_low) & (k < slab_high);
-#ifdef UNEVEN
-                counts &= (i >= -0.5f) & (i <= f.last.x + 0.5f) & (j >= -0.5f) & (j <= f.last.y + 0.5f);
-#endif
+                const ints counts
+                    = (number < end) & (k >= slab_low) & (k < slab_high) & lie_in_slice(&f, i, j);
                 const floats value = sign * sample_lanes(&f, i, j, k, inner);
                 if (sums) {
                     const floats mm = choose(number < row.count - 1.0f, (floats)(ray_step), row.rest);
@@ -217,22 +215,22 @@ __kernel void project_rays(
             n += (float)AT_ONCE;
         }
     }
-    store_lanes(best, lane_of[0]);
-    store_lanes(best_t, lane_of[1]);
-    store_lanes(length_mm, lane_of[2]);
+    store_lanes(best, value_of);
+    store_lanes(best_t, t_of);
+    store_lanes(length_mm, mm_of);
     store_lanes(way.offset, offset_of);
     for (int lane = 0; lane < LANES; ++lane) {
         if (first.x + lane >= (int)width || first.y >= (int)height)
             continue;
         const size_t place = (size_t)first.y * width + (size_t)(first.x + lane);
         if (!(stage & LAST_SLAB)) {
-            states[2 * place] = (float4)(lane_of[0][lane], lane_of[1][lane], lane_of[2][lane], 0.0f);
+            states[2 * place] = (float4)(value_of[lane], t_of[lane], mm_of[lane], 0.0f);
             continue;
         }
-        const int missed = !(lane_of[2][lane] > 0.0f);
-        const float mean = lane_of[0][lane] / lane_of[2][lane];
+        const int missed = !(mm_of[lane] > 0.0f);
+        const float mean = value_of[lane] / mm_of[lane];
         const float missing = which == RADIOGRAPH ? 0.0f : NAN; /* what is not scanned is air */
-        values[place] = missed ? missing : which == MEAN ? mean : sign * lane_of[0][lane];
-        depths[place] = missed || sums ? NAN : lane_of[1][lane] + offset_of[lane];
+        values[place] = missed ? missing : which == MEAN ? mean : sign * value_of[lane];
+        depths[place] = missed || sums ? NAN : t_of[lane] + offset_of[lane];
     }
 }

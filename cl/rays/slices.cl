@@ -6,11 +6,23 @@
  *
  * -D BETWEEN   only what lies between two depths of each pixel, see cl/rays/layers.cl */
 #include "include/volume.h"
+#include "rays/between.h"
+#include "rays/ray_state.h"
 #include "rays/view.h"
 
 #define BINS 4096 /* of the table of colours */
-#define FIRST_SEEN (1.0f / 255.0f) /* opacity that makes a first hit */
-#define NO_HIT (-MAXFLOAT)
+
+/* Shorten a ray to what lies between two depths of its pixel.  Returns t from which on slices are left out. */
+#ifdef BETWEEN
+static inline float shorten_ray(
+    ray *r, const size_t at_pixel, __global const float *nearest, __global const float *farthest)
+{
+    r->t_in = max(r->t_in, nearest[at_pixel] - r->offset);
+    return farthest[at_pixel] - r->offset;
+}
+#else
+static inline float shorten_ray(ray *r, const size_t at_pixel) { return INFINITY; }
+#endif
 
 /* Parameters  slices   in   (slices, nj, ni) all slices of the volume, or those that are shown
  *             places   in   (count) for each slice that is shown, in the order in which rays cross them: x, y: what i and
@@ -18,7 +30,7 @@
  *                           `slices`
  *             colors   in   (BINS) rgb by value
  *             view     in   see rays/view.h
- *             states   in/out  (height, width, 2) float4: premultiplied rgba; t of the first hit, sum of w t, -, -
+ *             states   in/out  (height, width, 2) float4: see rays/ray_state.h
  *             image    out  (height, width) rgba
  *             depths means  out  (height, width) first hit and expected depth, mm; NaN where nothing is hit
  *             background    rgb, and 1 where it fills what the rays leave
@@ -32,13 +44,11 @@
 __kernel void overlay_slices(
     __global const VOXEL *restrict slices, __global const float4 *restrict places,
     __global const float4 *restrict colors, __global const float4 *restrict view,
-#ifdef BETWEEN
-    __global const float *restrict nearest, __global const float *restrict farthest,
-#endif
     __global float4 *restrict states, __global uchar4 *restrict image, __global float *restrict depths, __global float *restrict means,
     const float4 background, const int ni, const int nj, const int count,
     const float bins_low, const float bins_scale, const float opacity, const float lowest, const uint width,
-    const uint height, const uint planes, const int perspective, const int stage, const uint queues)
+    const uint height, const uint planes, const int perspective, const int stage, const uint queues
+    BETWEEN_PARAMETERS)
 {
     const int2 pixel = find_pixel((uint)get_global_id(0), width, height, queues);
     if (pixel.x >= (int)width || pixel.y >= (int)height)
@@ -46,19 +56,11 @@ __kernel void overlay_slices(
     const size_t at_pixel = (size_t)pixel.y * width + (size_t)pixel.x;
     ray r;
     start_ray(view, convert_float2(pixel), planes, perspective, &r);
-    float beyond = INFINITY;
-#ifdef BETWEEN
-    r.t_in = max(r.t_in, nearest[at_pixel] - r.offset);
-    beyond = farthest[at_pixel] - r.offset;
-#endif
+    const float beyond = shorten_ray(&r, at_pixel BETWEEN_ARGUMENTS);
 
-    float4 seen = (float4)(0.0f);
-    float first_hit = NO_HIT, sum = 0.0f;
-    if (!(stage & FIRST_SLAB)) {
-        seen = states[2 * at_pixel];
-        first_hit = states[2 * at_pixel + 1].x;
-        sum = states[2 * at_pixel + 1].y;
-    }
+    ray_state seen = { (float4)(0.0f), NO_HIT, 0.0f, 0.0f };
+    if (!(stage & FIRST_SLAB))
+        load_state(states, at_pixel, &seen);
     const int crossed = r.t_out > r.t_in && fabs(r.step.z) > 1e-12f ? count : 0;
     for (int n = 0; n < crossed; ++n) {
         const float4 place = places[n];
@@ -81,19 +83,12 @@ __kernel void overlay_slices(
         if (!(value >= lowest))
             continue;
         const int bin = (int)clamp((value - bins_low) * bins_scale + 0.5f, 0.0f, (float)(BINS - 1));
-        const float weight = (1.0f - seen.w) * opacity;
-        seen.xyz += weight * colors[bin].xyz;
-        seen.w += weight;
-        sum += weight * t;
-        if (first_hit == NO_HIT && seen.w > FIRST_SEEN)
-            first_hit = t;
+        const float weight = (1.0f - seen.color.w) * opacity;
+        seen.color.xyz += weight * colors[bin].xyz;
+        seen.color.w += weight;
+        seen.sum += weight * t;
+        if (seen.first_hit == NO_HIT && seen.color.w > FIRST_SEEN)
+            seen.first_hit = t;
     }
-    if (!(stage & LAST_SLAB)) {
-        states[2 * at_pixel] = seen;
-        states[2 * at_pixel + 1] = (float4)(first_hit, sum, 0.0f, 0.0f);
-        return;
-    }
-    image[at_pixel] = finish_color(seen, background);
-    depths[at_pixel] = first_hit == NO_HIT ? NAN : first_hit + r.offset;
-    means[at_pixel] = first_hit == NO_HIT ? NAN : sum / seen.w + r.offset;
+    store_state(&seen, r.offset, stage, at_pixel, states, image, depths, means, background);
 }

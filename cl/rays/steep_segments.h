@@ -49,10 +49,8 @@ typedef struct {
     float slab_low, slab_high; /* samples with slab_low <= k < slab_high are this slab's */
     float first_value, last_value; /* in nodes: what shows anything is at least the first and below the last */
     int shaded;
-#ifdef LABELS
-    __global const LABEL *labels;
+    __global const LABEL *labels; /* with -D LABELS, as the next */
     __global const float4 *label_colors;
-#endif
 } looks;
 
 /* Indices of sample n of each ray; unless `inner`, no farther than the last. */
@@ -81,17 +79,13 @@ static inline ints find_node(const floats value)
 }
 
 /* Values of the samples before a segment, in its middle, and after it; without parts that in its middle alone. */
-typedef struct {
 #if TAKES_PARTS
+typedef struct {
     floats before, here, after;
     float reach; /* twice the share of the way to `before` that values may go: half of it lies before the ray */
     int may_be_steep;
-#else
-    floats here;
-#endif
 } segment_values;
 
-#if TAKES_PARTS
 /* Opacity over one ray step of a segment whose values run through its sample and the neighbours, where that is steep;
  * `shift` is the place where it is seen, in samples from its own, 0 where it is not steep, and `value` is that of this
  * place. */
@@ -135,6 +129,18 @@ static inline floats find_steep_opacity(
     *shift = choose(steep, seen_at * share, *shift);
     *value = choose(steep, seen_value * share, *value);
     return choose(steep, whole, opacity);
+}
+#else
+typedef struct {
+    floats here;
+} segment_values;
+
+static inline floats find_steep_opacity(
+    const looks *look, const segment_values *v, const ints counts, const floats opacity, floats *shift, floats *value)
+{
+    *shift = 0.0f;
+    *value = v->here;
+    return opacity;
 }
 #endif
 

@@ -10,6 +10,7 @@
  * -D UNEVEN   uneven slices
  * -D LABELS   labels with colours and opacities: a ray continues through translucent labels */
 #include "rays/hit.h"
+#include "rays/ray_state.h"
 #include "rays/surface_lines.h"
 #include "rays/view.h"
 #ifdef LABELS
@@ -17,9 +18,7 @@
 #endif
 
 #define OPAQUE 0.99f /* nothing behind can be seen */
-#define FIRST_SEEN (1.0f / 255.0f) /* opacity that makes a first hit */
 #define OUT (-1.0f) /* in place of the label that a ray passes through */
-#define NO_HIT (-MAXFLOAT)
 
 /* LPS gradient of differences per index step in slice k.  Layers beyond the ends are as thick as those at the ends. */
 static inline float3 to_lps(const scene *s, __global const float4 *view, const float4 step, const int k)
@@ -112,13 +111,6 @@ typedef struct {
     int exists;
 } hit;
 
-/* The state of a ray, kept in `states` between slabs. */
-typedef struct {
-    float4 color; /* premultiplied */
-    float first_hit, sum; /* t of the first hit; sum of t, weighted */
-    float label; /* that the ray passes through, or OUT */
-} sight;
-
 /* Sources of light and colours. */
 typedef struct {
     __global const float4 *view, *normals;
@@ -128,32 +120,6 @@ typedef struct {
     float4 color, light_step, cue;
     float ray_step;
 } looks;
-
-static inline void load_sight(__global const float4 *states, const size_t at_pixel, sight *seen)
-{
-    const float4 state = states[2 * at_pixel + 1];
-    seen->color = states[2 * at_pixel];
-    seen->first_hit = state.x;
-    seen->sum = state.y;
-    seen->label = state.z;
-}
-
-/* Keep the state of a ray for the next slab; after the last slab, write its pixel. */
-static inline void store_sight(
-    const sight *seen, const float offset, const int stage, const size_t at_pixel, __global float4 *states,
-    __global uchar4 *image, __global float *depths, __global float *means,
-    const float4 background)
-{
-    const float4 color = seen->color;
-    if (!(stage & LAST_SLAB)) {
-        states[2 * at_pixel] = color;
-        states[2 * at_pixel + 1] = (float4)(seen->first_hit, seen->sum, seen->label, 0.0f);
-        return;
-    }
-    image[at_pixel] = finish_color(color, background);
-    depths[at_pixel] = seen->first_hit == NO_HIT ? NAN : seen->first_hit + offset;
-    means[at_pixel] = seen->first_hit == NO_HIT ? NAN : seen->sum / color.w + offset;
-}
 
 /* Samples of a ray through the volume; *n is the first one to be looked at, the return value the end of them. */
 static inline int start_line(
@@ -203,7 +169,7 @@ static inline void follow_light(const scene *s, const looks *look, const hit *hi
 /* Blend a hit of colour rgb, of which `light` of the fixed light is lit, over what the ray has seen. */
 static inline void add_hit(
     const looks *look, const hit *h, const ray *r, const line *along, float3 rgb, const float opacity,
-    const float light, sight *seen)
+    const float light, ray_state *seen)
 {
     const float t = r->t_in + min(h->number, along->last) * look->ray_step;
     const float3 dark = rgb * look->view[VIEW_PHONG].x;
@@ -217,15 +183,40 @@ static inline void add_hit(
         seen->first_hit = t;
 }
 
+/* Of what colour and how opaque a surface is, and which part of the fixed light falls on it. */
+typedef struct {
+    float3 rgb;
+    float opacity, light;
+} hit_look;
+
+/* In each variant:
+ *
+ *      pass_label    continue a ray through the label that it is in, if it is in one.  Entering another label is a hit.
+ *                    Returns whether the ray has more samples
+ *      find_look     what a hit looks like, or with `on_surface` one where the ray comes in from outside; the light is
+ *                    blocked at sample `blocked` of the line to it, or with `blocked` = `end` nowhere.  The ray goes on
+ *                    in the label that was hit */
 #ifdef LABELS
-/* Continue a ray through the label that it is in.  Entering another label is a hit.  Returns whether the ray has more
- * samples. */
+typedef struct {
+    __global const LABEL *labels;
+    __global const int4 *near;
+    int offsets;
+    __global const float4 *colors;
+} label_source;
+
+#define LABEL_PARAMETERS \
+    , __global const LABEL *restrict labels, __global const int4 *restrict near, const int offsets, \
+        __global const float4 *restrict label_colors
+#define LABEL_SOURCE { labels, near, offsets, label_colors }
+
 static inline int pass_label(
-    const scene *s, __global const LABEL *labels, const looks *look, const line *along, float *number,
-    const float end, sight *seen, hit *h)
+    const scene *s, const label_source *source, const looks *look, const line *along, float *number, const float end,
+    ray_state *seen, hit *h)
 {
+    if (seen->label == OUT)
+        return 1;
     uint label = 0;
-    const int n = leave_label(s, labels, along, (int)*number, (int)end, (uint)seen->label, &label);
+    const int n = leave_label(s, source->labels, along, (int)*number, (int)end, (uint)seen->label, &label);
     *number = (float)n;
     if (n >= (int)end)
         return 0;
@@ -237,9 +228,48 @@ static inline int pass_label(
     if (h->exists) {
         const float3 at = index_of(s, h->place);
         const int k = clamp((int)floor(at.z + 0.5f), 0, (int)s->field.inner.last.z);
-        h->gradient = to_lps(s, look->view, find_label_differences(labels, &s->field.inner, at, label), k);
+        const float4 differences = find_label_differences(source->labels, &s->field.inner, at, label);
+        h->gradient = to_lps(s, look->view, differences, k);
     }
     return 1;
+}
+
+static inline hit_look find_look(
+    const scene *s, const label_source *source, const looks *look, const int on_surface, const line *to_light,
+    const float blocked, const float end, hit *h, ray_state *seen)
+{
+    if (on_surface)
+        h->label = find_surface_label(s, source->labels, source->near, source->offsets, h->place);
+    float light = 1.0f;
+    if (blocked < end)
+        light = let_light_through(
+            s, source->labels, source->near, source->offsets, source->colors, to_light, (int)blocked, (int)end);
+    seen->label = (float)h->label;
+    const float4 color = source->colors[h->label];
+    const hit_look seen_here = { tint(look->color.xyz, color, 1.0f), color.w, light };
+    return seen_here;
+}
+#else
+typedef struct {
+    int unused;
+} label_source;
+
+#define LABEL_PARAMETERS
+#define LABEL_SOURCE { 0 }
+
+static inline int pass_label(
+    const scene *s, const label_source *source, const looks *look, const line *along, float *number, const float end,
+    ray_state *seen, hit *h)
+{
+    return 1;
+}
+
+static inline hit_look find_look(
+    const scene *s, const label_source *source, const looks *look, const int on_surface, const line *to_light,
+    const float blocked, const float end, hit *h, ray_state *seen)
+{
+    const hit_look seen_here = { look->color.xyz, 1.0f, blocked < end ? 0.0f : 1.0f };
+    return seen_here;
 }
 #endif
 
@@ -251,8 +281,7 @@ static inline int pass_label(
  *             labels   in   (slices, nj, ni), label_colors (numbers) in: only with LABELS, see rays/label_color.h
  *             near     in   (offsets) only with LABELS: see include/label_owner.h
  *             highlights in (HIGHLIGHTS) see rays/shade.h
- *             states   in/out  (height, width, 2) float4: premultiplied rgba; t of the first hit, sum of w t, label
- *                           that the ray passes through or OUT, -
+ *             states   in/out  (height, width, 2) float4: see rays/ray_state.h; the label may be OUT
  *             image    out  (height, width) rgba
  *             depths means  out  (height, width) first hit and expected depth, mm; NaN where nothing is hit
  *             background    rgb, and 1 where it fills what the rays leave
@@ -273,10 +302,6 @@ static inline int pass_label(
 __kernel void trace_surface(
     __global const VOXEL *restrict voxels, __global const uchar *restrict leaps, __global const float4 *restrict view,
     __global const float4 *restrict normals,
-#ifdef LABELS
-    __global const LABEL *restrict labels, __global const int4 *restrict near, const int offsets,
-    __global const float4 *restrict label_colors,
-#endif
     __global const float *restrict highlights, __global float4 *restrict states, __global uchar4 *restrict image,
     __global float *restrict depths, __global float *restrict means, const float4 background,
     const float4 last_place, const float4 slope, const int ni, const int nj, const int first_k,
@@ -284,7 +309,7 @@ __kernel void trace_surface(
     const int cells_k,
     const float level, const float outside, const float4 color, const float4 light_step, const float4 cue,
     const uint width, const uint height, const uint planes, const int perspective, const int stage,
-    const uint queues STACK_PARAMETERS)
+    const uint queues LABEL_PARAMETERS STACK_PARAMETERS)
 {
     const uint first_pixel = (uint)get_global_id(0) * LANES;
     const field inner = { voxels, ni, nj, first_k, end_k, last_place };
@@ -292,11 +317,12 @@ __kernel void trace_surface(
     const leap_map map = { leaps, bi, bj, bk, cells_k };
     const slice_stack stack = STACK_TABLE;
     const scene s = { f, map, stack, slope };
+    const label_source source = LABEL_SOURCE;
     const looks look = { view, normals, highlights, planes, perspective, color, light_step, cue, view[VIEW_NEAR].y };
     ray rays[LANES];
     bundle all, to_light;
     hit hits[LANES];
-    sight sights[LANES];
+    ray_state sights[LANES];
     float ends[LANES];
     all.last_counts = planes > 0;
     for (int lane = 0; lane < LANES; ++lane) {
@@ -311,7 +337,7 @@ __kernel void trace_surface(
         if (pixel.x >= (int)width || pixel.y >= (int)height)
             end = 0;
         else if (!(stage & FIRST_SLAB))
-            load_sight(states, (size_t)pixel.y * width + (size_t)pixel.x, sights + lane);
+            load_state(states, (size_t)pixel.y * width + (size_t)pixel.x, sights + lane);
         all.numbers[lane] = (float)n;
         ends[lane] = (float)end;
     }
@@ -320,11 +346,9 @@ __kernel void trace_surface(
         for (int lane = 0; lane < LANES; ++lane) {
             int open = all.numbers[lane] < ends[lane] && sights[lane].color.w < OPAQUE;
             hits[lane].exists = 0;
-#ifdef LABELS
-            if (open && sights[lane].label != OUT)
-                open = pass_label(&s, labels, &look, all.lines + lane, all.numbers + lane, ends[lane], sights + lane,
+            if (open)
+                open = pass_label(&s, &source, &look, all.lines + lane, all.numbers + lane, ends[lane], sights + lane,
                     hits + lane);
-#endif
             all.ends[lane] = open && !hits[lane].exists ? ends[lane] : -1.0f;
             active |= open;
         }
@@ -338,21 +362,12 @@ __kernel void trace_surface(
             follow_light(&s, &look, hits, &to_light);
         for (int lane = 0; lane < LANES; ++lane)
             if (hits[lane].exists) {
-                const int in_shadow = light_step.w > 0.0f && to_light.numbers[lane] < to_light.ends[lane];
-                float light = in_shadow ? 0.0f : 1.0f, opacity = 1.0f;
-                float3 rgb = color.xyz;
-#ifdef LABELS
-                hit *h = hits + lane;
-                if (all.ends[lane] >= 0.0f)
-                    h->label = find_surface_label(&s, labels, near, offsets, h->place);
-                if (in_shadow)
-                    light = let_light_through(&s, labels, near, offsets, label_colors, to_light.lines + lane,
-                        (int)to_light.numbers[lane], (int)to_light.ends[lane]);
-                sights[lane].label = (float)h->label;
-                opacity = label_colors[h->label].w;
-                rgb = tint(rgb, label_colors[h->label], 1.0f);
-#endif
-                add_hit(&look, hits + lane, rays + lane, all.lines + lane, rgb, opacity, light, sights + lane);
+                const float end = light_step.w > 0.0f ? to_light.ends[lane] : 0.0f;
+                const float blocked = light_step.w > 0.0f ? to_light.numbers[lane] : 0.0f;
+                const hit_look seen = find_look(&s, &source, &look, all.ends[lane] >= 0.0f, to_light.lines + lane,
+                    blocked, end, hits + lane, sights + lane);
+                add_hit(&look, hits + lane, rays + lane, all.lines + lane, seen.rgb, seen.opacity, seen.light,
+                    sights + lane);
                 all.numbers[lane] += 1.0f;
             }
     }
@@ -360,6 +375,6 @@ __kernel void trace_surface(
         const int2 pixel = find_pixel(first_pixel + lane, width, height, queues);
         const size_t at_pixel = (size_t)pixel.y * width + (size_t)pixel.x;
         if (pixel.x < (int)width && pixel.y < (int)height)
-            store_sight(sights + lane, rays[lane].offset, stage, at_pixel, states, image, depths, means, background);
+            store_state(sights + lane, rays[lane].offset, stage, at_pixel, states, image, depths, means, background);
     }
 }

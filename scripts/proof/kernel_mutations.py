@@ -30,6 +30,8 @@ EQUIVALENT = {
 BITS = (("row_mask[w] = bits;", "row_mask[w] = ~bits;"),)
 MARK = (("mask[word] = bits;", "mask[word] = ~bits;"),)
 IMAGE = ("= finish_color(", "= (uchar4)(255) - finish_color(")
+RAY_IMAGE = (("image[pixel] = finish_color(", "image[pixel] = (uchar4)(255) - finish_color("),)
+RAY_DEPTHS = (("NAN : seen->first_hit + offset", "NAN : -seen->first_hit - offset"),)
 
 INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "count_set_bits": {"counts": (("= count;", "= 32u * COMPACT_WORDS - count;"),)},
@@ -127,18 +129,12 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "project_rays": {
         "values": (
             ("missed ? missing : which", "missed ? missing : -1.0f * (which"),
-            ("sign * lane_of[0][lane];", "sign * lane_of[0][lane]);"),
+            ("sign * value_of[lane];", "sign * value_of[lane]);"),
         ),
-        "depths": (("NAN : lane_of[1][lane] + offset_of", "NAN : -lane_of[1][lane] - offset_of"),),
+        "depths": (("NAN : t_of[lane] + offset_of", "NAN : -t_of[lane] - offset_of"),),
     },
-    "trace_surface": {
-        "image": (("image[at_pixel] = finish_color(", "image[at_pixel] = (uchar4)(255) - finish_color("),),
-        "depths": (("NAN : seen->first_hit + offset", "NAN : -seen->first_hit - offset"),),
-    },
-    "overlay_slices": {
-        "image": (("= finish_color(", "= (uchar4)(255) - finish_color("),),
-        "depths": (("NAN : first_hit + r.offset", "NAN : -first_hit - r.offset"),),
-    },
+    "trace_surface": {"image": RAY_IMAGE, "depths": RAY_DEPTHS},
+    "overlay_slices": {"image": RAY_IMAGE, "depths": RAY_DEPTHS},
     "clear_splats": {
         "keys": (("keys[pixel] = EMPTY;", "keys[pixel] = 0u;"),),
         "numbers": (("numbers[pixel] = EMPTY;", "numbers[pixel] = 0u;"),),
