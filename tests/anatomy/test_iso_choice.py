@@ -91,7 +91,7 @@ def test_a_specimen_in_air_is_cut_half_way_to_air() -> None:
         (-1000, 60.0, ("air", 150, -np.inf, -880.0)),
     ],
 )
-def test_the_range_of_what_bone_lies_in(mode, noise, around) -> None:
+def test_background_has_the_mode_and_noise_of_its_peak_and_a_range_around_it(mode, noise, around) -> None:
     hu = np.arange(materials.LOWEST_HU, materials.HIGHEST_HU + 1)
     found = materials.find_background(1e5 * np.exp(-0.5 * ((hu - mode) / noise) ** 2))
     assert found.mode == pytest.approx(mode, abs=1.0) and found.noise == pytest.approx(noise, abs=1.0)

@@ -252,7 +252,7 @@ def test_help_alone_and_of_a_command() -> None:
 
 
 @pytest.mark.parametrize(("ml", "words"), [(None, "0 ml"), (2.0, "2.00 ml")])
-def test_volumes_of_a_vertebra(ml: float | None, words: str) -> None:
+def test_a_trabecular_volume_that_is_not_there_is_0_ml(ml: float | None, words: str) -> None:
     vertebra = {
         "volumes_ml": {"canal": None, "solid": 9.0, "dense": 3.0, "trabecular": ml}, "dense_hu": (300.0, None),
         "iso_value_hu": 200.0, "canal_height_mm": None, "cortex": None, "name": "L3",

@@ -54,7 +54,7 @@ def test_a_surface_comes_back_within_half_a_step(seed):
     assert (flat <= np.concatenate(([0], np.maximum.accumulate(flat)[:-1] + 1))).all()
 
 
-def test_a_flat_surface_and_one_triangle():
+def test_a_flat_surface_of_one_triangle_comes_back_exactly():
     vertices = np.array([[0.0, 0.0, 7.0], [30.0, 0.0, 7.0], [0.0, 40.0, 7.0]])
     coded = encode_surface(vertices, np.tile(np.float32([0, 0, -1]), (3, 1)), np.array([[2, 0, 1]], np.uint32))
     found, turned, corners = decode_surface(coded)

@@ -33,7 +33,7 @@ def figures(quality: dict, *names: str) -> tuple:
     return tuple(quality[name] for name in names)
 
 
-def test_box_far_from_the_origin():
+def test_a_box_far_from_the_origin_has_its_area_and_volume():
     quality = measure(samples.box(FAR, (2.0, 3.0, 5.5)))
     assert quality == {
         "vertices": 8,

@@ -88,7 +88,7 @@ def test_a_cut_slice_in_a_folder_of_its_own(tmp_path, name, length):
 
 
 @pytest.mark.parametrize("plan", [Plan(name="ct/{}".format), APART], ids=["one folder", "folders"])
-def test_a_corrupt_file_apart_from_all_slices(tmp_path, plan):
+def test_a_corrupt_file_apart_from_all_slices_refuses_the_series(tmp_path, plan):
     write_series(tmp_path, plan)
     (tmp_path / "bad").write_bytes(CORRUPT)
     check_refused(tmp_path, "bad: ")

@@ -129,7 +129,7 @@ def test_pixel_data_longer_than_the_file_is_cut(tmp_path):
 
 
 @pytest.mark.parametrize("syntax", SYNTAXES[:2])
-def test_frames_with_more_than_their_pixels(tmp_path, syntax):
+def test_zeros_behind_frames_are_padding_and_frames_too_many_are_refused(tmp_path, syntax):
     ds = make_enhanced(Plan(**{**vars(PLAN), "syntax": syntax}))
     ds.PixelData += bytes(64)
     save_dataset(ds, tmp_path / "one")
@@ -167,7 +167,7 @@ def test_elements_behind_the_pixels(tmp_path, syntax):
 
 
 @pytest.mark.parametrize("syntax", SYNTAXES[:2])
-def test_a_sequence_without_length_behind_the_pixels(tmp_path, syntax):
+def test_a_sequence_behind_the_pixels_is_left_out_and_a_cut_one_refused(tmp_path, syntax):
     plan = write(tmp_path, None, syntax)
     head = element(0xFFFAFFFA, b"SQ", b"", syntax)[:-4] + b"\xff" * 4
     item = struct.pack("<HHL", 0xFFFE, 0xE000, 0xFFFFFFFF) + element(0x04000005, b"OB", b"ab", syntax)

@@ -162,7 +162,7 @@ def test_an_older_file_stays_when_the_new_one_cannot_be_written(tmp_path: Path) 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_fields_that_may_be_left_out(tmp_path: Path) -> None:
+def test_fields_that_are_left_out_have_their_defaults(tmp_path: Path) -> None:
     function = load_transfer_function(put(tmp_path, OWN))
     assert function == TransferFunction([(100, 1, 0.5, 0, 0), (300, 1, 1, 1, 0.5)])
     nothing = {**OWN, "lighting": None, "gradient_opacity": None}
