@@ -65,7 +65,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         answer = outcome.answer
         if answer.status != "done":
             before, reason = " before" * answer.kept, outcome.death or answer.error or "see its report"
-            console.warn(f"{outcome.case.name}: {answer.status}{before}, {reason}", with_json=True)
+            console.warn(f"{outcome.case.name}: {answer.status}{before}, {printable(reason)}", with_json=True)
 
     try:
         report = run_batch(cases, plan, tell=tell_outcome, progress=console.progress)

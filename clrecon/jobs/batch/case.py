@@ -62,7 +62,7 @@ _SHARED = {"device", "driver", "memory_allowed_bytes", *JobReport._LAST}
 
 
 class Answer(NamedTuple):
-    """What came of a case: `is_last` of a process whose device hangs, `kept` of an earlier run, `error` is its kind."""
+    """What came of a case: `is_last` of a process whose device hangs, `kept` of an earlier run, `error` its words."""
 
     status: str
     is_last: bool = False
@@ -81,12 +81,12 @@ def make_case(case: Case, plan: Plan) -> Answer:
     if plan.batch.resume and key is not None:
         earlier = read_report(plan.folder_of(case))
         if earlier and earlier["key"] == key and earlier["status"] in (DONE, GATE, REFUSED):
-            return Answer(earlier["status"], kept=True, error=(earlier["error"] or {}).get("kind", ""))
+            return Answer(earlier["status"], kept=True, error=(earlier["error"] or {}).get("message", ""))
     with _folder_in_place(case, plan) as folder:
         _forget_peak_memory()
         with Run(plan) as run:
             report = _make_or_fail(case, plan, run, folder, key)
-        return Answer(report.status, error=(report.error or {}).get("kind", ""))
+        return Answer(report.status, error=(report.error or {}).get("message", ""))
 
 
 def read_report(folder: Path) -> dict[str, Any] | None:
