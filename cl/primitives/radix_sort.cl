@@ -109,6 +109,7 @@ static inline void scatter_chunk(
         digits[item] = digit;
         barrier(CLK_LOCAL_MEM_FENCE);
         uint rank = 0, after = 0;
+#pragma unroll 16 /* AMD's compiler takes 99 registers for all 64 at once, 25 for these */
         for (uint other = 0; other < RADIX_GROUP; ++other) {
             const uint same = digits[other] == digit;
             rank += same & (other < item);
