@@ -51,11 +51,10 @@ def test_one_bad_case_stops_no_other(cohort: Path) -> None:
     assert sorted(path.name for path in (cohort / "out" / "gone").iterdir()) == ["case.json"]
 
 
-def test_refused_case_is_told_with_what_its_input_lacks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refused_case_is_told_with_what_its_input_lacks(tmp_path: Path, printed: Any) -> None:
     (tmp_path / "m.csv").write_text("case,input\ngone,nowhere-4711\n")
     assert main(["batch", str(tmp_path / "m.csv"), "-o", str(tmp_path / "out")]) == 8
-    case, *reason = capsys.readouterr().err.partition("gone:")[1:]
-    assert case and any("nowhere-4711" in words for words in reason)
+    printed().assert_error("gone", "nowhere-4711")
 
 
 def test_mesh_of_a_case_is_that_of_the_mesh_command(cohort: Path, tmp_path: Path) -> None:
