@@ -16,17 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy import dense_pieces
 from clrecon.anatomy.body_cells import DENSE_HU, PIECE, Cells, Mask, count_cells, grow, measure_cells
-from clrecon.anatomy.dense_pieces import (
-    BONE_KEPT,
-    DensePieces,
-    Piece,
-    find_boneless,
-    find_dense_pieces,
-    find_removed,
-    judge_bone,
-    judge_circle,
-)
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.resample import air_of
@@ -101,14 +92,14 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
     steps = Steps(progress, "mask", slices + BODY_STEPS + len(volume.voxels))
     cells = measure_cells(volume, steps.take_slice)
     body, pieces = _find_body(cells, steps)
-    bone, gate = judge_bone(cells, pieces, body)
-    removed = _place_pieces(volume, cells, find_removed(cells, pieces, body))
+    bone, gate = dense_pieces.judge_bone(cells, pieces, body)
+    removed = _place_pieces(volume, cells, dense_pieces.find_removed(cells, pieces, body))
     if gate["ok"] is False and not allow_bone_loss:
         raise RefusedInputError(
             f"the table cannot be told from the body: of {bone['bone_voxels']:,} voxels of bone above 300 HU"
             f" {bone['bone_voxels_removed']:,} would be removed with it (bone_kept {bone['bone_kept']:.3f}, at least"
-            f" {BONE_KEPT:g} is needed): {describe_pieces(removed)}; leave the table in, or, where this is no bone,"
-            f" use {name_parameter('allow_bone_loss', True)}"
+            f" {dense_pieces.BONE_KEPT:g} is needed): {describe_pieces(removed)}; leave the table in, or, where this is"
+            f" no bone, use {name_parameter('allow_bone_loss', True)}"
         )
     step = cells.step
 
@@ -117,12 +108,12 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
         return np.asarray(~np.repeat(np.repeat(body[k // step[2]], step[1], 0), step[0], 1)[:nj, :ni])
 
     figures = {"body_share": round(float(body.mean()), 4), **bone, "bone_removed": removed}
-    boneless = [] if pieces.specimen else find_boneless(cells, body, cells.mean > TISSUE_HU)
+    boneless = [] if pieces.specimen else dense_pieces.find_boneless(cells, body, cells.mean > TISSUE_HU)
     figures["kept_without_bone"] = _place_pieces(volume, cells, boneless)
     return _turn_into_air(volume, outside, "remove_table", figures, steps, gate)
 
 
-def _place_pieces(volume: Volume, cells: Cells, pieces: list[Piece]) -> list[dict[str, Any]]:
+def _place_pieces(volume: Volume, cells: Cells, pieces: list[dense_pieces.Piece]) -> list[dict[str, Any]]:
     return [
         {
             "voxels": voxels,
@@ -181,7 +172,7 @@ def mask_field_of_view(volume: Volume, radius_mm: float | None = None, *, progre
     si, sj, _ = cells.step
     _, cj, ci = cells.mean.shape
     middle = np.ix_(np.minimum(np.arange(cj) * sj + sj // 2, nj - 1), np.minimum(np.arange(ci) * si + si // 2, ni - 1))
-    bone, gate = judge_circle(cells, ~mask[middle])
+    bone, gate = dense_pieces.judge_circle(cells, ~mask[middle])
     figures = {"radius_mm": round(radius, 3), **bone}
     judged = gate if radius_mm is None else None
     return _turn_into_air(volume, lambda k: mask, "field_of_view", figures, steps, judged)
@@ -231,7 +222,7 @@ def find_body(volume: Volume, *, steps: Steps | None = None) -> tuple[Mask, tupl
     return _find_body(cells, steps)[0], cells.step
 
 
-def _find_body(cells: Cells, steps: Steps) -> tuple[Mask, DensePieces]:
+def _find_body(cells: Cells, steps: Steps) -> tuple[Mask, dense_pieces.DensePieces]:
     """Find the body with its margin, in `BODY_STEPS` steps, and decide on all pieces as dense as bone."""
     across = cells.across
     dense_enough = cells.mean > TISSUE_HU
@@ -241,7 +232,7 @@ def _find_body(cells: Cells, steps: Steps) -> tuple[Mask, DensePieces]:
     steps.take()
     body = _thick_parts(tissue, across)
     steps.take()
-    pieces = find_dense_pieces(cells, dense_enough, thick, body)
+    pieces = dense_pieces.find_dense_pieces(cells, dense_enough, thick, body)
     if not (body.any() or pieces.added.any()):
         raise RefusedInputError(
             f"no body found: nothing above {TISSUE_HU:g} HU is {2 * OPENING_MM:g} mm thick, and there is no bone"

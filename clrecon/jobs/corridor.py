@@ -17,15 +17,7 @@ from clrecon.anatomy.iso_choice import IsoChoice, choose_iso_value
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
 from clrecon.exchange.formats import check_format
 from clrecon.geometry import Volume, frame_from_lps
-from clrecon.jobs.corridor_results import (
-    KNOWN_BIAS,
-    KNOWN_CORTEX_BIAS,
-    NOT_FOR_PLANNING,
-    CorridorReport,
-    cylinder_meshes,
-    describe_vertebra,
-    draw_corridors,
-)
+from clrecon.jobs import corridor_results
 from clrecon.jobs.outputs import MeshFiles, check_files, name_outputs
 from clrecon.jobs.run import Run
 from clrecon.jobs.settings import FITTED_FROM_HU, CorridorSettings
@@ -130,7 +122,7 @@ _PLACED_BY_LABEL = 0.5
 
 def make_corridors(
     source: str | Path, settings: CorridorSettings, files: MeshFiles | None = None, **how: Any
-) -> CorridorReport:
+) -> corridor_results.CorridorReport:
     """Find the corridors through the pedicles of labelled vertebrae, and grade given screws."""
     files = files or MeshFiles()
     with Run(settings, **how) as run:
@@ -168,15 +160,15 @@ def make_corridors(
             outputs += _write_meshes(run, dict(zip(numbers, corridors, strict=True)), graded, surfaces, files.output)
         run.lap("write")
         vertebrae = [
-            describe_vertebra(each, number, settings.margin, settings.space, own)
+            corridor_results.describe_vertebra(each, number, settings.margin, settings.space, own)
             for each, number, own in zip(corridors, numbers, graded, strict=True)
         ]
         report = run.report(
-            CorridorReport,
+            corridor_results.CorridorReport,
             [*placed.warnings, *_warn_of_corridors(corridors)],
             volume,
-            notice=NOT_FOR_PLANNING,
-            level_bias=KNOWN_CORTEX_BIAS if fitted else KNOWN_BIAS,
+            notice=corridor_results.NOT_FOR_PLANNING,
+            level_bias=corridor_results.KNOWN_CORTEX_BIAS if fitted else corridor_results.KNOWN_BIAS,
             iso_value_hu=level,
             iso_value_reason="as given" if choice is None else choice.reason,
             iso_value_choice=None if choice is None else choice.measurements(),
@@ -290,8 +282,10 @@ def _draw_sheets(
         ]
         surface = "fitted to the bone from" if run.settings.surface == "cortex" else "at"
         footer += [f"surface {surface} {level:g} HU; green: corridor, yellow: largest screw, red: given screw"]
-        footer += [NOT_FOR_PLANNING]
-        picture = draw_corridors(volume, vertebra, [screw for screw, _ in grades], run.settings.margin, footer)
+        footer += [corridor_results.NOT_FOR_PLANNING]
+        picture = corridor_results.draw_corridors(
+            volume, vertebra, [screw for screw, _ in grades], run.settings.margin, footer
+        )
         outputs.append({"kind": "picture", "name": vertebra.name, "bytes": run.write_picture(path, picture).size})
     return outputs
 
@@ -319,7 +313,7 @@ def _write_meshes(
     meshes: dict[str, Mesh] = {}
     for (number, vertebra), grades in zip(corridors.items(), graded, strict=True):
         meshes[vertebra.name] = vertebrae[number]
-        cylinders = cylinder_meshes(vertebra, [screw for screw, _ in grades])
+        cylinders = corridor_results.cylinder_meshes(vertebra, [screw for screw, _ in grades])
         meshes |= {f"{vertebra.name}_{name}": mesh for name, mesh in cylinders.items()}
     written = run.write_meshes(list(meshes.values()), name_outputs(output, list(meshes)))
     return [{"kind": "mesh", "name": name, "bytes": each.size} for name, each in zip(meshes, written, strict=True)]

@@ -13,14 +13,7 @@ from clrecon.jobs.inputs import crop_scan
 from clrecon.jobs.preprocess import mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.run import Run, ScanReport
 from clrecon.jobs.settings import ExportSettings
-from clrecon.reading.grids.write_volume import (
-    FORMATS,
-    check_holds,
-    check_volume_format,
-    describe_shear,
-    stage_volume,
-    stored_values,
-)
+from clrecon.reading.grids import write_volume
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress
 
@@ -44,29 +37,29 @@ def export_volume(
     """Read a CT series and write its volume: masked, cropped, preprocessed and resampled as the settings ask."""
     settings = settings or ExportSettings()
     with Run(settings, **how) as run:
-        extension = check_volume_format(output)
+        extension = write_volume.check_volume_format(output)
         run.check([("the volume", output), ("the report", report_path)], source)
         volume = run.read(source)
         run.lap("read")
         if settings.resample is None:  # no device works for what cannot be written
-            check_holds(crop_scan(volume, settings.crop, settings.space), extension)
+            write_volume.check_holds(crop_scan(volume, settings.crop, settings.space), extension)
         volume, device = _mask_volume(volume, settings, run.progress)
         run.lap("mask")
         if settings.resample is not None:
             run.progress("resample", 0, 0)
             volume = resample_volume(volume, settings.resample, progress=run.progress)
             run.lap("resample")
-        shear = describe_shear(volume)
-        file = run.stage(stage_volume(volume, output, keep_ids=settings.keep_ids, progress=run.progress))
+        shear = write_volume.describe_shear(volume)
+        file = run.stage(write_volume.stage_volume(volume, output, keep_ids=settings.keep_ids, progress=run.progress))
         run.lap("write")
         region = volume.report.get("region")
         facts = {
             "format": extension[1:],
             "bytes": file.size,
-            "type": stored_values(volume.voxels[:1], volume.hu_range).dtype.name,
+            "type": write_volume.stored_values(volume.voxels[:1], volume.hu_range).dtype.name,
             "shape_ijk": list(volume.shape_ijk),
             "affine_ijk_to_lps_mm": volume.affine.tolist(),
-            "space": "ras" if FORMATS[extension].kind == "NIfTI" else "lps",
+            "space": "ras" if write_volume.FORMATS[extension].kind == "NIfTI" else "lps",
             "corners_lps_mm": [corner.tolist() for corner in find_extent(volume)],
             "outside_hu": None if region is None else region["outside_hu"],
         }

@@ -19,16 +19,8 @@ from clrecon.geometry import frame_from_lps
 from clrecon.geometry.blocks import describe_extent
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.grid import AIR_HU
+from clrecon.jobs import options
 from clrecon.jobs.inputs import crop_scan
-from clrecon.jobs.options import (
-    FILTERS,
-    MORPHOLOGY,
-    InputSettings,
-    PreprocessStep,
-    RegionRule,
-    parse_preprocess,
-    parse_region_rules,
-)
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress
 from clrecon.system.text import format_digits
@@ -40,7 +32,7 @@ if TYPE_CHECKING:
     from clrecon.operators.resident.device_volume import DeviceVolume
 
 
-def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> Volume:
+def mask_volume(volume: Volume, settings: options.InputSettings, progress: Progress) -> Volume:
     """Return the volume with air outside the field of view and the body, as the settings ask for it."""
     if settings.field_of_view is None and not settings.remove_table:
         return volume
@@ -96,7 +88,7 @@ Band = tuple[float, float]
 
 
 def restrict_volume(
-    volume: Volume, settings: InputSettings, device: Device, bands: Sequence[Band], progress: Progress
+    volume: Volume, settings: options.InputSettings, device: Device, bands: Sequence[Band], progress: Progress
 ) -> Volume:
     """Crop the volume and, if asked here, make what is outside of the region air that is in none of the `bands`."""
     volume = crop_scan(volume, settings.crop, settings.space_of_points, margin=settings.crop_margin)
@@ -111,10 +103,10 @@ def restrict_volume(
 
 
 def apply_region(
-    resident: DeviceVolume, settings: InputSettings, bands: Sequence[Band], progress: Progress
+    resident: DeviceVolume, settings: options.InputSettings, bands: Sequence[Band], progress: Progress
 ) -> DeviceVolume:
     """Return the volume with air outside of the region of interest; ``report["region"]`` has its figures."""
-    rules = parse_region_rules(settings.region or ())
+    rules = options.parse_region_rules(settings.region or ())
     progress("region", 0, 0)
     volume = resident.volume
     mask, facts, warnings = _find_region(resident, rules, settings.space_of_points, settings.follow_links)
@@ -163,7 +155,7 @@ def value_outside(bands: Sequence[Band], dtype: np.dtype[Any]) -> float:
 
 
 def _find_region(
-    resident: DeviceVolume, rules: Sequence[RegionRule], space: str, follow_links: bool
+    resident: DeviceVolume, rules: Sequence[options.RegionRule], space: str, follow_links: bool
 ) -> tuple[Mask, dict[str, Any], list[str]]:
     """Return the region's voxels, facts and warnings: rules of one kind are united, different kinds intersected."""
     facts: dict[str, Any] = {}
@@ -192,7 +184,12 @@ def _count_cells(marked: NDArray[np.bool_]) -> int:
 
 
 def _mask_of(
-    resident: DeviceVolume, rule: RegionRule, space: str, facts: dict[str, Any], warnings: list[str], follow_links: bool
+    resident: DeviceVolume,
+    rule: options.RegionRule,
+    space: str,
+    facts: dict[str, Any],
+    warnings: list[str],
+    follow_links: bool,
 ) -> Mask:
     from clrecon.operators.masks.mask import Mask
 
@@ -213,7 +210,7 @@ def _mask_of(
     return Mask.from_labels(resident, labels, names)
 
 
-def _line_of(volume: Volume, rule: RegionRule, facts: dict[str, Any]) -> Any:
+def _line_of(volume: Volume, rule: options.RegionRule, facts: dict[str, Any]) -> Any:
     """Return the centre line of a tube, LPS mm."""
     if rule.path is not None:
         from clrecon.rendering.views.centre_line import read_curve_points
@@ -236,7 +233,7 @@ _MOST_TAKEN = 0.5
 
 
 def preprocess_volume(
-    volume: Volume, settings: InputSettings, device: Device, bands: Sequence[Band], progress: Progress
+    volume: Volume, settings: options.InputSettings, device: Device, bands: Sequence[Band], progress: Progress
 ) -> Volume:
     """Run the steps of preprocessing in their order, one after the other on the device.
 
@@ -249,7 +246,7 @@ def preprocess_volume(
         return volume
     from clrecon.operators.resident.device_volume import DeviceVolume
 
-    steps = parse_preprocess(settings.preprocess)
+    steps = options.parse_preprocess(settings.preprocess)
     with ExitStack() as stack:
         resident = stack.enter_context(DeviceVolume(volume, device=device, memory=settings.memory))
         run = _StepRun(settings, bands, progress)
@@ -268,14 +265,14 @@ def preprocess_volume(
 
 
 class _StepRun:
-    def __init__(self, settings: InputSettings, bands: Sequence[Band], progress: Progress):
+    def __init__(self, settings: options.InputSettings, bands: Sequence[Band], progress: Progress):
         self._settings, self._bands = settings, bands
         self._progress = progress
         self._level: float | None = None
         self.said: list[dict[str, Any]] = []
         self.warnings: list[str] = []
 
-    def take(self, resident: DeviceVolume, step: PreprocessStep) -> DeviceVolume:
+    def take(self, resident: DeviceVolume, step: options.PreprocessStep) -> DeviceVolume:
         """Run a step; the volume is the same object where the step changes nothing."""
         began = perf_counter()
         facts: dict[str, Any] = {}
@@ -283,7 +280,7 @@ class _StepRun:
             self._level = step.numbers[0]
         elif step.name == "region":
             resident = apply_region(resident, self._settings, self._bands, self._progress)
-        elif step.name in MORPHOLOGY:
+        elif step.name in options.MORPHOLOGY:
             resident, facts = self._change_shape(resident, step)
         else:
             resident, facts = self._filter(resident, step)
@@ -303,11 +300,11 @@ class _StepRun:
             )
         return self._bands[0]
 
-    def _filter(self, resident: DeviceVolume, step: PreprocessStep) -> tuple[DeviceVolume, dict[str, Any]]:
+    def _filter(self, resident: DeviceVolume, step: options.PreprocessStep) -> tuple[DeviceVolume, dict[str, Any]]:
         from clrecon.operators.filters.bilateral import filter_bilateral
         from clrecon.operators.filters.denoisers import filter_volume
 
-        given: dict[str, Any] = dict(zip(FILTERS[step.name], step.numbers, strict=False))
+        given: dict[str, Any] = dict(zip(options.FILTERS[step.name], step.numbers, strict=False))
         if step.name.startswith("bilateral"):
             near = None
             if step.name == "bilateral-near":
@@ -323,7 +320,9 @@ class _StepRun:
             done = filter_volume(resident, step.name, progress=self._progress, **given)  # type: ignore[arg-type]
         return done, dict(done.volume.report["filtered"]["steps"][-1])
 
-    def _change_shape(self, resident: DeviceVolume, step: PreprocessStep) -> tuple[DeviceVolume, dict[str, Any]]:
+    def _change_shape(
+        self, resident: DeviceVolume, step: options.PreprocessStep
+    ) -> tuple[DeviceVolume, dict[str, Any]]:
         from clrecon.operators.masks.mask import Mask
 
         low, high = band = self._band
@@ -352,7 +351,7 @@ class _StepRun:
         )
         return resident, facts
 
-    def _check_loss(self, step: PreprocessStep, facts: dict[str, Any]) -> None:
+    def _check_loss(self, step: options.PreprocessStep, facts: dict[str, Any]) -> None:
         share = facts["taken"] / facts["voxels"]
         if share == 1.0:
             raise NoSurfaceError(f"{step} takes all {facts['voxels']:,} voxels: choose a smaller radius")
@@ -364,7 +363,7 @@ class _StepRun:
             )
 
 
-def _apply_morphology(mask: Mask, step: PreprocessStep) -> Mask:
+def _apply_morphology(mask: Mask, step: options.PreprocessStep) -> Mask:
     if step.name.startswith("fill"):
         return mask.fill_holes(by_slice=step.name == "fill-slices")
     change = {"erode": mask.erode, "dilate": mask.dilate, "open": mask.open, "close": mask.close}[step.name]

@@ -9,24 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.options import (
-    DeviceSettings,
-    InputSettings,
-    ScanSettings,
-    check_surface,
-    grow_option,
-    hu_option,
-    label_map_option,
-    label_option,
-    mesh_space_option,
-    parse_levels,
-    parse_point,
-    seeds_option,
-    space_option,
-    strict_option,
-    surface_option,
-    view_option,
-)
+from clrecon.jobs import options
 from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset
 from clrecon.reading import Selection
 from clrecon.system.arguments import Space, SurfaceKind, name_parameter
@@ -46,7 +29,7 @@ def check_space(space: str | None) -> None:
 
 
 def _check_surface_level(settings: StatsSettings | DistanceSettings) -> None:
-    check_surface(settings.surface, settings.iso_value)
+    options.check_surface(settings.surface, settings.iso_value)
     if settings.iso_value is not None and settings.surface is None:
         raise UsageError(
             f"a level is that of a surface: ask for one ({name_parameter('surface', 'hu')}), or leave"
@@ -67,11 +50,11 @@ class InfoSettings(Selection):
         "read the pixels of the series marked * too: share of padding, range of HU, saturated metal",
         first=True,
     )
-    strict: bool = strict_option("4 when it fails a gate, see docs/certificate.md", first=True)
+    strict: bool = options.strict_option("4 when it fails a gate, see docs/certificate.md", first=True)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportSettings(InputSettings):
+class ExportSettings(options.InputSettings):
     """Settings of the export job; see `clrecon.geometry.resample.resample_volume`."""
 
     resample: float | None = option(
@@ -79,7 +62,7 @@ class ExportSettings(InputSettings):
         "resample (trilinear) to a regular grid with this step along all axes; without it voxels stay as they are",
         first=True,
     )
-    space: Space = space_option("patient frame of the numbers of crop and region; the file's is its format's")
+    space: Space = options.space_option("patient frame of the numbers of crop and region; the file's is its format's")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -96,11 +79,11 @@ class ExportSettings(InputSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StatsSettings(ScanSettings, DeviceSettings):
+class StatsSettings(options.ScanSettings, options.DeviceSettings):
     """Settings of the job of statistics; without `label` all labels are measured, without `surface` their voxels."""
 
-    labels: str | Path = label_map_option(required=True)
-    label: Sequence[str | int] = label_option(default=(), first=True)
+    labels: str | Path = options.label_map_option(required=True)
+    label: Sequence[str | int] = options.label_option(default=(), first=True)
     percentiles: Sequence[float] | None = option(
         "--percentiles P,P",
         "percentiles of HU, from 0 to 100 (default: 5,25,50,75,95)",
@@ -108,10 +91,10 @@ class StatsSettings(ScanSettings, DeviceSettings):
         first=True,
     )
 
-    surface: SurfaceKind | None = surface_option(
+    surface: SurfaceKind | None = options.surface_option(
         "measure the surface of each label at the level too: area and volume", group="surface", first=True
     )
-    iso_value: float | None = hu_option(
+    iso_value: float | None = options.hu_option(
         f"level of the surface (default: that of bone, {FITTED_FROM_HU:g})", group="surface"
     )
 
@@ -128,15 +111,15 @@ MOST_SAMPLES = 10_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistanceSettings(ScanSettings, DeviceSettings):
+class DistanceSettings(options.ScanSettings, options.DeviceSettings):
     """Settings of the job of distances; with `surface` the reference is a scan, of whose bone that surface is made."""
 
-    mesh_space: Space | None = mesh_space_option("files that do not name theirs")
+    mesh_space: Space | None = options.mesh_space_option("files that do not name theirs")
     samples: int | None = option("--samples N", "points on each mesh, evenly by area (default: 50000)")
-    surface: SurfaceKind | None = surface_option(
+    surface: SurfaceKind | None = options.surface_option(
         "B is a scan, and measured against is the surface of its bone at the level", group="scan", first=True
     )
-    iso_value: float | None = hu_option(
+    iso_value: float | None = options.hu_option(
         f"level of that surface (default: that of bone, {FITTED_FROM_HU:g})", group="scan"
     )
     range_mm: float | None = option(
@@ -145,10 +128,10 @@ class DistanceSettings(ScanSettings, DeviceSettings):
         group="picture",
         first=True,
     )
-    view: str = view_option(
+    view: str = options.view_option(
         "V", "view of the picture: anterior (default), left, AZ,EL ...", group="picture", default="anterior"
     )
-    space: Space = space_option("patient frame of the coloured mesh", group="picture")
+    space: Space = options.space_option("patient frame of the coloured mesh", group="picture")
 
     def __post_init__(self) -> None:
         from clrecon.rendering.views.directions import find_view, read_view
@@ -181,40 +164,42 @@ def _parse_band(text: str) -> tuple[float | None, float | None]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class InsideSettings(ScanSettings, DeviceSettings):
+class InsideSettings(options.ScanSettings, options.DeviceSettings):
     """Settings of the job that looks into vertebrae; None in `dense`, (low, high), leaves an end open."""
 
-    labels: str | Path = label_map_option(required=True)
-    label: Sequence[str | int] = label_option("label of a vertebra; may be given again", required=True, first=True)
-    view: str = view_option(
+    labels: str | Path = options.label_map_option(required=True)
+    label: Sequence[str | int] = options.label_option(
+        "label of a vertebra; may be given again", required=True, first=True
+    )
+    view: str = options.view_option(
         "V",
         f"anterior, posterior, left, right, superior, inferior, or AZ,EL in degrees (default: {_INSIDE_VIEW})",
         group="pictures",
         default=_INSIDE_VIEW,
         words=("anterior", "posterior", "left", "right", "superior", "inferior"),
     )
-    iso_value: float | None = hu_option(
+    iso_value: float | None = options.hu_option(
         "level of the solid bone, within one voxel of the label (default: the label's own voxels; of the cortex"
         f" {FITTED_FROM_HU:g})",
         group="parts",
         first=True,
     )
-    surface: SurfaceKind = surface_option(
+    surface: SurfaceKind = options.surface_option(
         "the solid bone ends at the label or the level (default)", group="parts", default="hu", first=True
     )
     dense: Sequence[float | None] | None = _parts_option(
         "--dense A[:B]", "HU of dense bone, from A on or from A to B (default: 450)", parse=_parse_band
     )
     close_mm: float | None = _parts_option("--close MM", "pores that close by balls (default: 1.5)")
-    grow_mm: float | None = grow_option("with --hu: ", group="parts")
-    space: Space = space_option("patient frame of the meshes", group="parts")
+    grow_mm: float | None = options.grow_option("with --hu: ", group="parts")
+    space: Space = options.space_option("patient frame of the meshes", group="parts")
 
     def __post_init__(self) -> None:
         check_space(self.space)
         if not self.label:
             raise UsageError(f"choose the vertebrae by their labels: {name_parameter('label', 'L3')}")
         super().__post_init__()
-        check_surface(self.surface)
+        options.check_surface(self.surface)
         if self.grow_mm is not None and self.solid_from is None:
             raise UsageError(
                 f"the labels' own voxels do not grow: leave {name_parameter('grow_mm')} out, or give an iso value"
@@ -231,17 +216,17 @@ def _parse_name(text: str) -> tuple[tuple[float, ...], str]:
     point, equals, level = text.rpartition("=")
     if not equals or not level.strip():
         raise ValueError(f"{text!r} is no named point: write it as X,Y,Z=L3")
-    return parse_point(point), level.strip()
+    return options.parse_point(point), level.strip()
 
 
 @dataclass(frozen=True, kw_only=True)
-class VertebraeSettings(ScanSettings):
+class VertebraeSettings(options.ScanSettings):
     """Settings of the search for vertebrae; see `clrecon.split_vertebrae`."""
 
-    level: float | None = hu_option(
+    level: float | None = options.hu_option(
         "bone is N HU and more (default: half way between discs and marrow, 120 to 226)", group="vertebrae", first=True
     )
-    seeds: Sequence[Sequence[float]] = seeds_option(
+    seeds: Sequence[Sequence[float]] = options.seeds_option(
         "a point in the body of a vertebra, LPS mm; one for each vertebra, in place of the search for discs",
         group="vertebrae",
         first=True,
@@ -280,26 +265,28 @@ _LARGEST_MARGIN_MM = 5.0
 def _parse_level(text: str) -> float | None:
     if text == "auto":
         return None
-    levels = parse_levels(text)
+    levels = options.parse_levels(text)
     if len(levels) != 1:
         raise ValueError(f"it is one level or auto, not {text!r:.80}")
     return levels[0]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorridorSettings(ScanSettings, DeviceSettings):
+class CorridorSettings(options.ScanSettings, options.DeviceSettings):
     """Settings of the corridor job; without `iso_value` it is half way, measured in the scan."""
 
-    labels: str | Path = label_map_option(required=True)
-    label: Sequence[str | int] = label_option("a vertebra of the map; may be given again", default=(), first=True)
-    iso_value: float | None = hu_option(
+    labels: str | Path = options.label_map_option(required=True)
+    label: Sequence[str | int] = options.label_option(
+        "a vertebra of the map; may be given again", default=(), first=True
+    )
+    iso_value: float | None = options.hu_option(
         "HU at which the bone's surface lies (default: auto, half way between bone and the tissue beside it; of the"
         f" cortex {FITTED_FROM_HU:g})",
         "auto|N",
         parse=_parse_level,
         first=True,
     )
-    surface: SurfaceKind = surface_option("the surface lies at the level (default)", default="hu", first=True)
+    surface: SurfaceKind = options.surface_option("the surface lies at the level (default)", default="hu", first=True)
     margin: float = option(
         "--margin MM",
         "distance that a screw of the largest diameter keeps from the surface (default: 1)",
@@ -307,13 +294,13 @@ class CorridorSettings(ScanSettings, DeviceSettings):
         first=True,
     )
     screws: tuple[Any, ...] = ()
-    space: Space = space_option("patient frame of points and meshes", group="space")
+    space: Space = options.space_option("patient frame of points and meshes", group="space")
 
     def __post_init__(self) -> None:
         if not self.label:
             raise UsageError(f"name the vertebrae: {name_parameter('label', 'L3')}, once for each")
         if not (math.isfinite(self.margin) and 0.0 <= self.margin <= _LARGEST_MARGIN_MM):
             raise UsageError(f"the margin is a length from 0 to {_LARGEST_MARGIN_MM:g} mm, not {self.margin:g}")
-        check_surface(self.surface, self.iso_value)
+        options.check_surface(self.surface, self.iso_value)
         check_space(self.space)
         super().__post_init__()

@@ -10,14 +10,7 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.exchange.content import Pieces
 from clrecon.exchange.coordinates import find_coincident
-from clrecon.mesh.connectivity import (
-    Edges,
-    count_duplicate_faces,
-    find_edges,
-    find_split_vertices,
-    label_components,
-    opposite_half_edges,
-)
+from clrecon.mesh import connectivity
 from clrecon.mesh.triangles import cross_product, cross_products, take_edges
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import CHUNK, find_bounds, in_threads, local_origin
@@ -79,10 +72,10 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
     if triangle_count and int(triangles.max()) >= vertex_count:
         raise UsageError(f"a triangle refers to vertex {int(triangles.max())}, the mesh has {vertex_count} vertices")
 
-    edges = find_edges(triangles, vertex_count)
-    opposite = opposite_half_edges(triangles, edges)
-    split_vertices = len(find_split_vertices(triangles, vertex_count, edges, opposite))
-    components, labels = label_components(triangles, vertex_count, edges)
+    edges = connectivity.find_edges(triangles, vertex_count)
+    opposite = connectivity.opposite_half_edges(triangles, edges)
+    split_vertices = len(connectivity.find_split_vertices(triangles, vertex_count, edges, opposite))
+    components, labels = connectivity.label_components(triangles, vertex_count, edges)
     unused = int(np.count_nonzero(labels < 0))
     loops = triangles.size - len(edges.half_edges)
     euler_number = vertex_count - unused - edges.count + triangle_count
@@ -105,7 +98,7 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
         euler_number=euler_number,
         genus=components - euler_number // 2 if closed and manifold else None,
         zero_area_faces=zero_area,
-        duplicate_faces=count_duplicate_faces(triangles, vertex_count, opposite),
+        duplicate_faces=connectivity.count_duplicate_faces(triangles, vertex_count, opposite),
         unused_vertices=unused,
         shortest_edge_mm=shortest,
         area_mm2=area,
@@ -116,7 +109,7 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
 
 
 def _count_by_place(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], used: NDArray[np.bool_], edges: Edges
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], used: NDArray[np.bool_], edges: connectivity.Edges
 ) -> tuple[int, int]:
     """Count used vertices that coincide with another, and edges that are not in two faces after these are joined."""
     coincident = find_coincident(vertices)
@@ -128,7 +121,7 @@ def _count_by_place(
     joined[coincident] = coincident[first][number.reshape(-1)]
     faces = joined[triangles]
     a, b, c = faces.T
-    by_place = find_edges(faces[(a != b) & (b != c) & (c != a)], len(vertices))
+    by_place = connectivity.find_edges(faces[(a != b) & (b != c) & (c != a)], len(vertices))
     return len(coincident), by_place.boundary + by_place.nonmanifold
 
 
@@ -167,7 +160,7 @@ def find_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], m
         whole = np.zeros(len(triangles), dtype=np.int64)
         _, volumes = measure_components(vertices, triangles, whole, 1, areas=False, volumes=True)
         return Pieces(whole, ("",), (float(volumes[0]),))
-    count, labels = label_components(triangles, len(vertices))
+    count, labels = connectivity.label_components(triangles, len(vertices))
     of_triangle = labels[triangles[:, 0]]
     areas, volumes = measure_components(vertices, triangles, of_triangle, count, areas=True, volumes=True)
     ranked = np.argsort(-areas, kind="stable")

@@ -17,17 +17,8 @@ from clrecon.jobs.render.job import PictureFiles, make_pictures
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.run import Laps
 from clrecon.proof.phantom import PhantomSettings, make_phantom, write_phantom
+from clrecon.system import paths
 from clrecon.system.files import hold_interrupts, temporary_folder
-from clrecon.system.paths import (
-    existing_stay,
-    final_mode,
-    keep_existing,
-    place_file,
-    place_folder,
-    refuse_existing,
-    resolve_target,
-    system_errors,
-)
 from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
@@ -56,12 +47,12 @@ def make_demo(
     """
     from clrecon.operators import choose_device
 
-    folder = resolve_target(output)
-    with keep_existing(keep=no_clobber):
+    folder = paths.resolve_target(output)
+    with paths.keep_existing(keep=no_clobber):
         _check_replaceable(folder, output)
         chosen = choose_device(device)
         with ExitStack() as stack:
-            with system_errors(output):
+            with paths.system_errors(output):
                 staged = stack.enter_context(temporary_folder(folder if folder.exists() else folder.parent))
             try:
                 outcome = _fill_folder(staged, chosen, progress)
@@ -148,7 +139,7 @@ def _check_replaceable(folder: Path, output: str | Path) -> None:
         return
     except OSError as error:
         raise OutputError(f"cannot make the folder {output}: {error.strerror or error}") from error
-    refuse_existing(output, folder)
+    paths.refuse_existing(output, folder)
     foreign = sorted(names - set(_DEMO_FILES))
     if foreign or (names and not (folder / "ct" / "truth.json").is_file()):
         example = (foreign or sorted(names))[0]
@@ -157,11 +148,11 @@ def _check_replaceable(folder: Path, output: str | Path) -> None:
 
 def _put_in_place(staged: Path, folder: Path, output: str | Path) -> None:
     """Move a finished demonstration to its place: as a folder, or file by file into a folder that is there."""
-    keep = existing_stay()
+    keep = paths.existing_stay()
     if not folder.exists():
-        staged.chmod(final_mode(folder, 0o777))
-        place_folder(staged, folder, output, keep=keep)
+        staged.chmod(paths.final_mode(folder, 0o777))
+        paths.place_folder(staged, folder, output, keep=keep)
         return
     for name in _DEMO_FILES:
-        move = place_folder if (staged / name).is_dir() else place_file
+        move = paths.place_folder if (staged / name).is_dir() else paths.place_file
         move(staged / name, folder / name, Path(output) / name, keep=keep)

@@ -25,18 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.system.paths import (
-    checked_target,
-    existing_stay,
-    final_mode,
-    is_dicom,
-    place_file,
-    place_folder,
-    refuse_existing,
-    resolve_target,
-    shown_path,
-    system_errors,
-)
+from clrecon.system import paths
 
 if TYPE_CHECKING:
     import logging
@@ -95,14 +84,14 @@ class StagedFile:
     def __init__(self, path: str | os.PathLike[str], temporary: Path, target: Path, stream: BinaryIO, size: int):
         self._path, self._temporary = path, temporary
         self._target, self._stream = target, stream
-        self._keep = existing_stay()
+        self._keep = paths.existing_stay()
         self.size = size
 
     def commit(self) -> None:
         if sys.platform == "win32":
-            with system_errors(self._path):
+            with paths.system_errors(self._path):
                 self._stream.close()  # Windows cannot rename an open file.
-        place_file(self._temporary, self._target, self._path, keep=self._keep)
+        paths.place_file(self._temporary, self._target, self._path, keep=self._keep)
         _sync_folder(self._target.parent)
         _log().info("file written: %d bytes", self.size)
 
@@ -116,12 +105,12 @@ def stage_file(
     expected_bytes: int = 0,
 ) -> Iterator[StagedFile]:
     """Write a file under a temporary name; `StagedFile.commit` in the block puts it in place, one after the other."""
-    target = checked_target(path)
+    target = paths.checked_target(path)
     with contextlib.ExitStack() as stack:
-        with system_errors(path):
+        with paths.system_errors(path):
             _check_space(path, target.parent, expected_bytes)
             _sweep(target.parent)
-            mode = final_mode(target)
+            mode = paths.final_mode(target)
             temporary, stream = stack.enter_context(_temporary_file(target.parent))
             write(stream)
             stream.flush()
@@ -130,7 +119,7 @@ def stage_file(
             arrived = os.fstat(stream.fileno()).st_size
             if arrived != size:
                 raise OutputError(
-                    f"cannot write {shown_path(path)}: {size} bytes written, {arrived} arrived on the disk"
+                    f"cannot write {paths.shown_path(path)}: {size} bytes written, {arrived} arrived on the disk"
                 )
             if verify is not None:
                 verify(temporary)
@@ -177,8 +166,8 @@ def allow_open_files(count: int) -> None:
 
 def check_writable(path: str | os.PathLike[str], *, expected_bytes: int = 0) -> None:
     """Raise `OutputError` if `replace_file` will surely fail: an empty temporary file is made there and removed."""
-    target = checked_target(path)
-    with system_errors(path):
+    target = paths.checked_target(path)
+    with paths.system_errors(path):
         _check_space(path, target.parent, expected_bytes)
         with _temporary_file(target.parent):
             pass
@@ -189,8 +178,8 @@ def _check_space(path: str | os.PathLike[str], folder: Path, expected_bytes: int
     # Some network file systems do not tell their free space and report 0 bytes.
     if usage.total and expected_bytes > usage.free:
         raise OutputError(
-            f"cannot write {shown_path(path)}: it needs about {expected_bytes / 1e6:.1f} MB and "
-            f"{usage.free / 1e6:.1f} MB are free in {shown_path(folder)}"
+            f"cannot write {paths.shown_path(path)}: it needs about {expected_bytes / 1e6:.1f} MB and "
+            f"{usage.free / 1e6:.1f} MB are free in {paths.shown_path(folder)}"
         ) from OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
@@ -305,8 +294,8 @@ def _sync_folder(folder: Path) -> None:
 
 def check_folder(path: str | os.PathLike[str], pattern: re.Pattern[str], noun: str) -> Path:
     """Return the folder to make or replace; `pattern` are files of earlier runs, `noun` names what will be in it."""
-    folder = resolve_target(path)
-    with system_errors(path):
+    folder = paths.resolve_target(path)
+    with paths.system_errors(path):
         if folder.exists():
             _check_existing(path, folder, pattern, noun)
         elif folder.is_symlink():
@@ -321,14 +310,14 @@ def check_folder(path: str | os.PathLike[str], pattern: re.Pattern[str], noun: s
 def _check_existing(path: str | os.PathLike[str], folder: Path, pattern: re.Pattern[str], noun: str) -> None:
     if not folder.is_dir():
         raise OutputError(f"cannot write {path}: it is a file, name a folder or use an extension")
-    refuse_existing(path, folder)
+    paths.refuse_existing(path, folder)
     others = [entry.name for entry in os.scandir(folder) if not pattern.fullmatch(entry.name)]
     if others:
         raise UsageError(
             f"the folder {path} holds other things ({len(others)}, such as {sorted(others)[0]!r}):"
             f" name a new or empty one for the {noun}"
         )
-    if any(is_dicom(entry.path) for entry in os.scandir(folder)):
+    if any(paths.is_dicom(entry.path) for entry in os.scandir(folder)):
         raise OutputError(f"cannot write {path}: DICOM files are there, which are never replaced")
     if os.path.samefile(folder, os.curdir):  # a process in this folder would then be in a removed one
         raise UsageError(f"the {noun} replace the folder {path}, which is the current one: name one in it")
@@ -344,11 +333,11 @@ class StagedFolder:
     def __init__(self, path: str | os.PathLike[str], staged: Path, folder: Path, size: int):
         self._path, self._made = path, staged
         self._folder = folder
-        self._keep = existing_stay()
+        self._keep = paths.existing_stay()
         self.size = size
 
     def commit(self) -> None:
         """Move the folder to its place; that of an earlier run is removed at the end of the ``with`` block."""
         with hold_interrupts():
-            place_folder(self._made, self._folder, self._path, keep=self._keep)
+            paths.place_folder(self._made, self._folder, self._path, keep=self._keep)
         _log().info("folder written: %d bytes", self.size)

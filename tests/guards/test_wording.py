@@ -41,7 +41,7 @@ def find_options(source: str) -> list[str]:
     declared = [
         str(ast.get_source_segment(source, node))
         for node in ast.walk(ast.parse(source))
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "").endswith("option")
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("option")
     ]
     for text in declared:
         source = source.replace(text, "")

@@ -11,25 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.options import (
-    LEVELS_HELP,
-    InputSettings,
-    check_surface,
-    closed_option,
-    grow_option,
-    hu_option,
-    iso_preset_option,
-    label_color_option,
-    label_map_option,
-    label_option,
-    parse_hu,
-    parse_levels,
-    parse_point,
-    seeds_option,
-    space_option,
-    strict_option,
-    surface_option,
-)
+from clrecon.jobs import options
 from clrecon.jobs.outputs import OBJECT_FILES
 from clrecon.jobs.presets import DEFAULT_PRESET, PURPOSES, Purpose, find_iso_preset, find_purpose
 from clrecon.system.arguments import MethodName, Space, Topology, VertexRule, name_parameter
@@ -44,16 +26,16 @@ if TYPE_CHECKING:
 class LabelChoice:
     """The labels of a map, by numbers or names, that become meshes; without `label` all that have a surface."""
 
-    path: str | Path = label_map_option(default=MISSING)
-    label: tuple[str | int, ...] = label_option(default=())
+    path: str | Path = options.label_map_option(default=MISSING)
+    label: tuple[str | int, ...] = options.label_option(default=())
     hidden: tuple[str | int, ...] = option(
         "--hide-label NAME|N", "not this label; may be given again", default=(), action="append"
     )
-    colors: tuple[tuple[str | int, str], ...] = label_color_option(
+    colors: tuple[tuple[str | int, str], ...] = options.label_color_option(
         " in .ply and in the formats of several objects, such as L3=orange"
     )
     surface: str = "hu"
-    grow_mm: float | None = grow_option()
+    grow_mm: float | None = options.grow_option()
     solid: bool = False
 
     def __post_init__(self) -> None:
@@ -186,7 +168,7 @@ def _parse_seed(text: str) -> str | tuple[float, ...]:
     if text.lower().startswith(_LABEL_SEED):
         return f"{_LABEL_SEED}{text[len(_LABEL_SEED) :]}"
     try:
-        return parse_point(text)
+        return options.parse_point(text)
     except ValueError:
         raise ValueError(f"{text!r} is neither auto nor X,Y,Z in mm nor label:NAME") from None
 
@@ -204,7 +186,7 @@ _refinement_option = partial(option, group="refinement")
 
 
 @dataclass(frozen=True)
-class MeshSettings(InputSettings):
+class MeshSettings(options.InputSettings):
     """Settings of the mesh job; options say in their help what they do.
 
     iso_value: float or sequence of float or (low, high). A pair in the sequence is a range: ``((100, 300),)``.
@@ -226,17 +208,17 @@ class MeshSettings(InputSettings):
         first=True,
         words=PURPOSES,
     )
-    iso_value: float | Sequence[float | Sequence[float]] | None = hu_option(
-        LEVELS_HELP, "N[,N...]|A:B|auto|half:B,T", group="level", parse=parse_hu, first=True
+    iso_value: float | Sequence[float | Sequence[float]] | None = options.hu_option(
+        options.LEVELS_HELP, "N[,N...]|A:B|auto|half:B,T", group="level", parse=options.parse_hu, first=True
     )
     below: float | Sequence[float] | None = option(
         "--below N[,N...]",
         "in place of an iso value: inside is what lies below N HU, such as lungs, airways and sinuses (-400); the air"
         " round the patient is left out",
         group="level",
-        parse=parse_levels,
+        parse=options.parse_levels,
     )
-    preset: str | None = iso_preset_option()
+    preset: str | None = options.iso_preset_option()
     half_way: str | Sequence[float] | None = None
     keep_outside: bool = _inside_option("--keep-outside", "with --below: leave the air round the patient in")
     solid: bool = _inside_option(
@@ -249,13 +231,13 @@ class MeshSettings(InputSettings):
     seal_mm: float | None = _inside_option(
         "--seal MM", "with --solid: close pores up to twice as wide, less one voxel (default: 2.5 to 3, by the voxels)"
     )
-    surface: str = surface_option(
+    surface: str = options.surface_option(
         "vertices lie at the level (default)",
         "mask: with --labels the label's own surface, whatever the HU: organs, lungs, what HU do not show",
         group="kind",
         default="hu",
     )
-    space: Space = space_option("patient frame of the mesh", group="surface")
+    space: Space = options.space_option("patient frame of the mesh", group="surface")
     topology: Topology = option(
         "--topology T",
         "what is done where the voxels leave open which of them are joined: separated keeps them apart (default),"
@@ -265,7 +247,7 @@ class MeshSettings(InputSettings):
         parse=str.lower,
         words=("separated", "trilinear"),
     )
-    closed: bool = closed_option()
+    closed: bool = options.closed_option()
     method: MethodName | None = _method_option(
         f"--method {'|'.join(METHOD_NAMES)}",
         "t-mc: every cell (default); i-mc: only what hangs together with seeds; g-mc: t-mc, then quadric collapse"
@@ -296,7 +278,7 @@ class MeshSettings(InputSettings):
     min_volume_ml: float | None = _selection_option(
         "--min-volume ML", "keep components of at least ML millilitres only", first=True
     )
-    seeds: Sequence[Sequence[float]] = seeds_option(
+    seeds: Sequence[Sequence[float]] = options.seeds_option(
         "keep the component whose surface lies nearest to this point, in mm of the frame of --space; repeat it for"
         " several",
         group="selection",
@@ -327,7 +309,7 @@ class MeshSettings(InputSettings):
         "--max-deviation MM",
         "smoothing and decimation each move nothing further (default: a quarter of the shortest voxel step)",
     )
-    strict: bool = strict_option(
+    strict: bool = options.strict_option(
         f"{GATE_FAILED} when a gate of a mesh fails (closed, manifold, no cuts, close to the scan ...), with"
         f' {SCAN_GATE_FAILED} when only gates of the scan do (see "clrecon info")',
         group="strict",
@@ -378,7 +360,7 @@ class MeshSettings(InputSettings):
 
     def _check_surface(self) -> None:
         """Refuse an unknown kind of surface, and `cortex` where HU do not place the outer surface of bone."""
-        check_surface(self.surface, None, "mask")
+        options.check_surface(self.surface, None, "mask")
         if self.surface == "hu":
             return
         name = name_parameter("surface", self.surface)

@@ -34,28 +34,20 @@ from clrecon.rendering.pictures.sheets import SHEET_SIZE
 from clrecon.rendering.pictures.style_checks import SHEET_SLICES as SHEET_SLICES
 from clrecon.rendering.pictures.styles import CURVED_KINDS as CURVED_KINDS
 from clrecon.rendering.pictures.styles import SPINE, CurveCut, PlaneCut, SlicesInSpace, Style, SurfaceLook, VolumeLook
+from clrecon.rendering.views import directions
 from clrecon.rendering.views.camera import DEFAULT_VIEW_ANGLE, Camera
 from clrecon.rendering.views.clip import Clip
-from clrecon.rendering.views.directions import (
-    ANTERIOR,
-    DEFAULT_SIZE,
-    DIRECTIONS,
-    SLICES_VIEWS,
-    checked_size,
-    read_view,
-    say_view,
-)
 from clrecon.rendering.views.reformation import PLANES, find_plane
 from clrecon.system.arguments import Space, name_parameter
 from clrecon.system.light_dataclass import MISSING, dataclass, fields, replace
 from clrecon.system.options import numbers_reader, option
 from clrecon.system.text import unknown_name
 
-_DEFAULT_VIEWS = {"slice": "axial", "cpr": "left", "slices": say_view(SLICES_VIEWS[0])}
+_DEFAULT_VIEWS = {"slice": "axial", "cpr": "left", "slices": directions.say_view(directions.SLICES_VIEWS[0])}
 """Default view of the modes whose default is not the view from the front; that of slices suits the scan."""
 SPINES = (SPINE, "auto")
 """Values of a curve that stand for the spinal canal, which is found in the scan."""
-VIEWS = tuple(DIRECTIONS)
+VIEWS = tuple(directions.DIRECTIONS)
 _LIGHTS = ("head", "none")
 
 _CALLED = {"light": "lighting", "labels": "labels", "clip_planes": "clip"}
@@ -199,7 +191,7 @@ class RenderSettings(InputSettings):
         parse=_parse_views,
         action="append",
         first=True,
-        words=(*DIRECTIONS, *PLANES),
+        words=(*directions.DIRECTIONS, *PLANES),
     )
     up: str | Sequence[float] | None = _camera_option(
         "--up SIDE|X,Y,Z", "what is at the top (default: superior, else anterior)", parse=parse_direction
@@ -288,7 +280,7 @@ class RenderSettings(InputSettings):
 
     def _check_place(self) -> None:
         """Check views, sizes and angles by placing cameras before a volume of one voxel."""
-        checked_size(self.size_used)
+        directions.checked_size(self.size_used)
         if (self.letters or self.scale_bar or self.caption) and min(self.size_used) < SMALLEST_SIDE:
             raise UsageError(
                 f"a picture of {self.size_used[0]} x {self.size_used[1]} pixels is too small for letters, a scale"
@@ -349,14 +341,14 @@ class RenderSettings(InputSettings):
 
     @property
     def views_used(self) -> tuple[str, ...]:
-        return tuple(self.views) or (_DEFAULT_VIEWS.get(self.mode, ANTERIOR),)
+        return tuple(self.views) or (_DEFAULT_VIEWS.get(self.mode, directions.ANTERIOR),)
 
     @property
     def size_used(self) -> tuple[int, int]:
         """Width and height in pixels; for a curved reformation without `size` they depend on the curve."""
         if self.size is not None:
             return self.size
-        return SHEET_SIZE if self.is_sheet else DEFAULT_SIZE
+        return SHEET_SIZE if self.is_sheet else directions.DEFAULT_SIZE
 
     @property
     def is_sheet(self) -> bool:
@@ -381,9 +373,11 @@ class RenderSettings(InputSettings):
     def camera(self, volume: Grid, view: str, *, turning: bool = False) -> Camera:
         """Place the camera of one view; with `turning` the whole volume stays in it while the camera orbits."""
         if isinstance(self.style, PlaneCut):
-            return find_plane(volume, read_view(view), self.size_used, zoom=self.zoom, up=self.up, center=self.center)
+            return find_plane(
+                volume, directions.read_view(view), self.size_used, zoom=self.zoom, up=self.up, center=self.center
+            )
         return Camera.fit(
-            volume, read_view(view), self.zoom,
+            volume, directions.read_view(view), self.zoom,
             up=self.up, view_angle=self.view_angle, size=self.size_used, turning=turning, center=self.center,
         )  # fmt: skip
 
@@ -396,10 +390,10 @@ def _turn_light(light: str | Sequence[float], lighting: Lighting) -> Lighting:
         return UNSHADED
     direction: Any = light
     if isinstance(light, str):
-        if light not in (*_LIGHTS, *DIRECTIONS):
-            known = (*_LIGHTS, *DIRECTIONS)
+        if light not in (*_LIGHTS, *directions.DIRECTIONS):
+            known = (*_LIGHTS, *directions.DIRECTIONS)
             raise UsageError(f"{unknown_name('light', light, known)}, or a direction X,Y,Z in LPS")
-        direction = DIRECTIONS.get(light)
+        direction = directions.DIRECTIONS.get(light)
     return replace(lighting if lighting.shades else Lighting(), direction=direction)
 
 

@@ -14,6 +14,7 @@ from clrecon.anatomy.surroundings import LEFT_OUT, count_left_out
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import takes_parts
 from clrecon.opencl import Device, allocate, kernel_constant, kernel_number, launch, upload
+from clrecon.operators.rays import ray_slabs
 from clrecon.operators.rays.picture_buffers import (
     NEAR_ROW,
     Between,
@@ -23,17 +24,6 @@ from clrecon.operators.rays.picture_buffers import (
     Shot,
     count_queues,
     highlight_table,
-)
-from clrecon.operators.rays.ray_slabs import (
-    FARTHEST,
-    RAYS,
-    LeapMap,
-    RaySlab,
-    SlabPicture,
-    find_leaps,
-    measure_cells,
-    plan_ray_slabs,
-    slab_labels,
 )
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import FieldFrame, label_variants, volume_box
@@ -160,7 +150,7 @@ class MainWay:
     aside: float
 
     @classmethod
-    def of(cls, resident: DeviceVolume, slab: RaySlab, camera: Camera) -> MainWay:
+    def of(cls, resident: DeviceVolume, slab: ray_slabs.RaySlab, camera: Camera) -> MainWay:
         """Find the main way from the ray in the middle."""
         frame, cells = FieldFrame.of(resident.volume), np.array(slab.brick_cells, np.float64)
         forward = frame.matrix @ camera.basis().forward / cells
@@ -179,13 +169,15 @@ class MainWay:
         return {"main_axis": self.axis, "ahead": self.ahead, "eye": self.eye, "aside": self.aside}
 
 
-def enter_tiles(resident: DeviceVolume, slab: RaySlab, view: RayView, leaps: LeapMap, output: PictureBuffers) -> Any:
+def enter_tiles(
+    resident: DeviceVolume, slab: ray_slabs.RaySlab, view: RayView, leaps: ray_slabs.LeapMap, output: PictureBuffers
+) -> Any:
     """Return for each tile the distance in mm before which its rays meet nothing visible, on the device."""
     device = resident.device
     lanes = int(device.kernel_variants["LANES"])
     width, height = view.size
     camera = view.camera
-    margin = math.ceil(min((resident.stack.index_steps(view.spread) / slab.brick_cells).max(), FARTHEST))
+    margin = math.ceil(min((resident.stack.index_steps(view.spread) / slab.brick_cells).max(), ray_slabs.FARTHEST))
     entries_d = allocate(device, 4 * output.tiles)
     launch(
         device, resident.program("rays/tiles.cl")["enter_tiles"], -(-output.tiles // lanes),
@@ -196,7 +188,7 @@ def enter_tiles(resident: DeviceVolume, slab: RaySlab, view: RayView, leaps: Lea
     return entries_d
 
 
-def look_ahead(resident: DeviceVolume, slab: RaySlab, ray: MainWay, leaps: LeapMap) -> Any:
+def look_ahead(resident: DeviceVolume, slab: ray_slabs.RaySlab, ray: MainWay, leaps: ray_slabs.LeapMap) -> Any:
     """Return for each brick the empty distance around it, and ahead of it along the main way, on the device."""
     bi, bj, bk = bricks = slab.bricks
     count = math.prod(bricks)
@@ -218,7 +210,9 @@ PROJECTIONS = {
 """Numbers of the modes in the kernel."""
 
 
-def project_slab(resident: DeviceVolume, slab: RaySlab, view: RayView, mode: str, output: PictureBuffers) -> None:
+def project_slab(
+    resident: DeviceVolume, slab: ray_slabs.RaySlab, view: RayView, mode: str, output: PictureBuffers
+) -> None:
     """Add one slab to a projection, "mip", "minip", "mean" or "drr"; `output.means_d` receives the values."""
     variants = {"LEAST_VALUE": f"({AIR_HU:g})"} if mode == "drr" else {}
     device = resident.device
@@ -227,7 +221,7 @@ def project_slab(resident: DeviceVolume, slab: RaySlab, view: RayView, mode: str
     launch(
         device, resident.program("rays/project.cl", **variants)["project_rays"], output.items(queues, lanes),
         view.rays_a_launch(device),
-        ranges=measure_cells(resident, slab), view=upload(device, view.table),
+        ranges=ray_slabs.measure_cells(resident, slab), view=upload(device, view.table),
         states=output.states_d, depths=output.depths_d, values=output.means_d, last_place=last,
         which=PROJECTIONS[mode], queues=queues, **slab.arguments, **view.arguments, **resident.stack.arguments,
     )  # fmt: skip
@@ -256,15 +250,15 @@ def take_with_layers(
     for attempt in resident.with_fallback():
         with attempt as (device, warnings):
             job = _Job(resident, style, shot, ray_step, warnings)
-            planned = plan_ray_slabs(resident, beside, {}, job.labels)
-            for slabs in resident.attempts(RAYS, planned, job.warnings):
+            planned = ray_slabs.plan_ray_slabs(resident, beside, {}, job.labels)
+            for slabs in resident.attempts(ray_slabs.RAYS, planned, job.warnings):
                 with slabs as slices:
                     sample = partial(job.sample_between, slices)
                     picture = draw(DrawnVolume(device, sample, job.near_mm, job.stopwatch, job.warnings))
     return picture
 
 
-class _Job(SlabPicture):
+class _Job(ray_slabs.SlabPicture):
     def __init__(
         self, resident: DeviceVolume, style: VolumeLook | Projection, shot: Shot, ray_step: float, warnings: list[str]
     ):
@@ -285,7 +279,7 @@ class _Job(SlabPicture):
         report["unit_distance_mm"] = style.function.unit_distance
         return Rendering(image, depths, means, self.shot.camera, None, style.mode, report)
 
-    def draw(self, slab: RaySlab, output: PictureBuffers) -> None:
+    def draw(self, slab: ray_slabs.RaySlab, output: PictureBuffers) -> None:
         if isinstance(self.style, VolumeLook):
             self._composite(slab, self.style, output)
             return
@@ -306,7 +300,7 @@ class _Job(SlabPicture):
             self._composite(slab, style, output, between)
 
     def _composite(
-        self, slab: RaySlab, style: VolumeLook, output: PictureBuffers, between: Between | None = None
+        self, slab: ray_slabs.RaySlab, style: VolumeLook, output: PictureBuffers, between: Between | None = None
     ) -> None:
         """Blend a slab into the picture, and wait; of a part of the rays, `between`, write only the states."""
         resident, device = self.resident, self.resident.device
@@ -314,7 +308,7 @@ class _Job(SlabPicture):
         key = (style.function, self.ray_step)
         tables = resident.keep("transfer function", key, 0, lambda: TransferTables.of(device, *key))
         with stopwatch.running(device):
-            leaps = find_leaps(resident, slab, key, tables.shown, tables.low, tables.scale)
+            leaps = ray_slabs.find_leaps(resident, slab, key, tables.shown, tables.low, tables.scale)
         nothing = (self.box[1], self.box[1])
         view = self._view(nothing if leaps.box is None else leaps.box)
         variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
@@ -324,7 +318,7 @@ class _Job(SlabPicture):
         look = style.label_style
         if self.labels is not None and look is not None:
             variants |= {"LABELS": "1", **label_variants(self.labels.voxels.dtype)}
-            more["labels"] = slab_labels(resident, slab, self.labels, stopwatch, grown=True)
+            more["labels"] = ray_slabs.slab_labels(resident, slab, self.labels, stopwatch, grown=True)
             more["label_colors"] = upload(device, look.table)
         if between is not None:
             variants |= {"BETWEEN": "1"}

@@ -21,15 +21,7 @@ from clrecon.geometry.grid import Grid
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, Stopwatch
 from clrecon.operators.masks.voxel_mask import zero_words
-from clrecon.operators.rays.mesh_pictures import (
-    MOST_TRIANGLES,
-    LayerKeys,
-    MeshPart,
-    Triangles,
-    box_around,
-    make_part,
-    mesh_corners,
-)
+from clrecon.operators.rays import mesh_pictures
 from clrecon.operators.rays.picture_buffers import Between, DrawnVolume, Shot
 from clrecon.operators.rays.point_pictures import PointPictures, cloud_box, eye_table
 from clrecon.operators.rays.volume_renderer import VolumeRenderer, shown_box
@@ -70,7 +62,7 @@ class LayeredPicture(NamedTuple):
 
 def draw_layers(
     device: Device,
-    parts: Sequence[MeshPart],
+    parts: Sequence[mesh_pictures.MeshPart],
     shot: Shot,
     *,
     still: Still | None = None,
@@ -100,7 +92,7 @@ class _Layers:
     def __init__(
         self,
         device: Device,
-        parts: Sequence[MeshPart],
+        parts: Sequence[mesh_pictures.MeshPart],
         shot: Shot,
         still: Still | None,
         near_mm: float,
@@ -117,15 +109,15 @@ class _Layers:
         with stopwatch.timed("upload"):
             self.still_d = ocl.upload(device, np.ascontiguousarray(shown.image))
             self.still_depths_d = ocl.upload(device, np.ascontiguousarray(shown.depth, np.float32))
-        self.triangles: list[Triangles] = []
+        self.triangles: list[mesh_pictures.Triangles] = []
         first = 0
         for part in parts:
             if len(part.triangles) and len(part.vertices):
-                self.triangles.append(Triangles(device, part, first, camera, size, stopwatch))
+                self.triangles.append(mesh_pictures.Triangles(device, part, first, camera, size, stopwatch))
                 first += len(part.triangles)
         is_opaque = all(part.opacity >= 1.0 for part in parts)
         self.is_single = is_opaque and (still is None or bool((shown.image[..., 3] % 255 == 0).all()))
-        self.keys = LayerKeys.of(device, self.pixels)
+        self.keys = mesh_pictures.LayerKeys.of(device, self.pixels)
         self.layer_d = ocl.allocate(device, 16 * self.pixels)
         self.depths_d, self.nearest_d = ocl.allocate(device, 4 * self.pixels), ocl.allocate(device, 4 * self.pixels)
         self.states_d, self.marks_d = ocl.allocate(device, 32 * self.pixels), ocl.allocate(device, 16 * self.pixels)
@@ -270,14 +262,16 @@ class ScenePictures(DeviceWorker):
         check_objects(objects)
         if takers is None:
             self.box = _box_of(objects)
-        self._parts: list[MeshPart] = []
+        self._parts: list[mesh_pictures.MeshPart] = []
         self._objects = list(objects)
         for subject, style in objects:
             if isinstance(subject, Mesh) and isinstance(style, MeshLook):
-                self._parts.append(make_part(subject, style))
+                self._parts.append(mesh_pictures.make_part(subject, style))
         self._triangles = sum(len(part.triangles) for part in self._parts)
-        if self._triangles > MOST_TRIANGLES:
-            raise UsageError(f"a picture shows at most {MOST_TRIANGLES:,} triangles, these are {self._triangles:,}")
+        if self._triangles > mesh_pictures.MOST_TRIANGLES:
+            raise UsageError(
+                f"a picture shows at most {mesh_pictures.MOST_TRIANGLES:,} triangles, these are {self._triangles:,}"
+            )
         self._stack = ExitStack()
         super().__init__(device, memory)
         self._is_own = takers is None
@@ -392,10 +386,10 @@ def _box_of(objects: Sequence[tuple[Subject, Style]]) -> Grid:
         elif not isinstance(subject, Mesh):
             grid = shown_box(subject, style)
         grids.append(grid if isinstance(grid, Volume) else None)
-        corners.append(mesh_corners(subject) if isinstance(subject, Mesh) else box_corners(grid))  # type: ignore[arg-type]
-    every = box_around(corners)
+        corners.append(mesh_pictures.mesh_corners(subject) if isinstance(subject, Mesh) else box_corners(grid))  # type: ignore[arg-type]
+    every = mesh_pictures.box_around(corners)
     for volume, object_corners in zip(grids, corners, strict=True):
-        if volume is not None and np.allclose(box_around([object_corners]).affine, every.affine):
+        if volume is not None and np.allclose(mesh_pictures.box_around([object_corners]).affine, every.affine):
             return volume
     return every
 

@@ -15,24 +15,8 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.geometry import column_spacing, signed_tilt
-from clrecon.proof.phantom.sampling import (
-    add_cupping,
-    add_noise,
-    add_streaks,
-    apply_point_spread,
-    outside_disc,
-    sample_occupancy,
-)
+from clrecon.proof.phantom import sampling, scenes
 from clrecon.proof.phantom.scene_plans import plan_scene
-from clrecon.proof.phantom.scenes import (
-    CEILING_HU,
-    DENSE_HU,
-    MATERIALS,
-    METAL_HU,
-    LabelArray,
-    draw_scene,
-    facts_of_parts,
-)
 from clrecon.proof.phantom.series import RESCALE_INTERCEPT, Placement, place_slices, write_label_map, write_series
 from clrecon.proof.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings, draw_ghosts
 from clrecon.proof.phantom.shapes import choose_body
@@ -119,17 +103,17 @@ _PHASE_HU = 90.0
 
 def _make_voxels(
     settings: PhantomSettings, placement: Placement, progress: Progress | None, phase: int = 0
-) -> tuple[NDArray[np.int16], dict[str, Any], LabelArray | None]:
+) -> tuple[NDArray[np.int16], dict[str, Any], scenes.LabelArray | None]:
     """Make voxels of all slices, truth and, of a scene, materials."""
     affine = placement.affine
     places = placement.places if settings.uneven_mm else None
     surface: dict[str, Any] | None = None
     spine: dict[str, Any] | None = None
     half_maximum: float | None = None
-    labels: LabelArray | None = None
+    labels: scenes.LabelArray | None = None
     scanner = KINDS[settings.kind].scanner
     if KINDS[settings.kind].is_scene:
-        field, labels = draw_scene(plan_scene(settings), settings, affine, progress)
+        field, labels = scenes.draw_scene(plan_scene(settings), settings, affine, progress)
         kind = KINDS[settings.kind]
         pair = kind.bone_and_tissue_hu
         half_maximum = None if pair is None else round(kind.scanner.to_values(sum(pair) / 2.0), 1)
@@ -139,23 +123,25 @@ def _make_voxels(
         spine = facts_of_spine(anatomy, affine, settings)
     else:
         body = choose_body(affine, settings)
-        field = sample_occupancy(body, affine, settings.shape_kji)
+        field = sampling.sample_occupancy(body, affine, settings.shape_kji)
         field *= np.float32(settings.inside_hu - settings.outside_hu)
         field += np.float32(settings.outside_hu)
         surface = body.describe()
         half_maximum = (settings.inside_hu + settings.outside_hu) / 2.0
-    apply_point_spread(field, affine, settings.point_spread_mm, progress, places)
+    sampling.apply_point_spread(field, affine, settings.point_spread_mm, progress, places)
     if labels is not None and scanner.streaks:
-        add_streaks(field, labels == MATERIALS.index("metal"), METAL_HU, affine, scanner.streaks, settings.seed)
+        sampling.add_streaks(
+            field, labels == scenes.MATERIALS.index("metal"), scenes.METAL_HU, affine, scanner.streaks, settings.seed
+        )
     if scanner.cupping_hu:
-        add_cupping(field, affine, scanner.cupping_hu)
-    add_noise(field, settings.noise, settings.seed if phase == 0 else settings.seed + 1000003 * phase)
+        sampling.add_cupping(field, affine, scanner.cupping_hu)
+    sampling.add_noise(field, settings.noise, settings.seed if phase == 0 else settings.seed + 1000003 * phase)
     voxels = np.empty(field.shape, dtype=np.int16)
-    floor, ceiling = (-32768, 32767 + RESCALE_INTERCEPT) if labels is None else (RESCALE_INTERCEPT, CEILING_HU)
+    floor, ceiling = (-32768, 32767 + RESCALE_INTERCEPT) if labels is None else (RESCALE_INTERCEPT, scenes.CEILING_HU)
     for k in range(len(field)):
         voxels[k] = np.rint(scanner.slope * np.clip(field[k], floor, ceiling) + scanner.offset)
     if scanner.padding is not None:
-        voxels[:, outside_disc(field.shape[1:], affine)] = scanner.padding
+        voxels[:, sampling.outside_disc(field.shape[1:], affine)] = scanner.padding
     ghosts = draw_ghosts(voxels, settings.seed) if settings.ghosts else None
     truth = {
         "generator": _GENERATOR,
@@ -172,7 +158,7 @@ def _make_voxels(
         "spine": spine,
         "ghosts": ghosts,
         "unit": scanner.unit,
-        "parts": None if labels is None else facts_of_parts(voxels, labels, affine),
+        "parts": None if labels is None else scenes.facts_of_parts(voxels, labels, affine),
         "noise_hu": settings.noise,
         "point_spread_mm": settings.point_spread_mm,
         "seed": settings.seed,
@@ -187,7 +173,7 @@ def _make_voxels(
 def _iso_value(settings: PhantomSettings, half_maximum: float | None) -> float:
     if half_maximum is not None:
         return half_maximum
-    return _SPINE_ISO_HU if settings.kind == "spine" else DENSE_HU
+    return _SPINE_ISO_HU if settings.kind == "spine" else scenes.DENSE_HU
 
 
 def make_phantom(
@@ -213,11 +199,11 @@ def make_phantom(
     return voxels, placement.affine, truth
 
 
-def label_materials(settings: PhantomSettings) -> LabelArray:
+def label_materials(settings: PhantomSettings) -> scenes.LabelArray:
     """Label each voxel of a scene with its material, an index in `MATERIALS`: the truth of `make_phantom`."""
     if not KINDS[settings.kind].is_scene:
         raise UsageError(f"a {settings.kind} is no scene of materials: its truth is a surface or a list of levels")
-    return draw_scene(plan_scene(settings), settings, place_slices(settings).affine)[1]
+    return scenes.draw_scene(plan_scene(settings), settings, place_slices(settings).affine)[1]
 
 
 def is_phantom_truth(truth: Any) -> bool:

@@ -11,18 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.proof.phantom.spine_parts import (
-    Anatomy,
-    Chain,
-    Disc,
-    Rib,
-    SpineChoice,
-    Vertebra,
-    format_levels,
-    lay_chain,
-    lean_and_roll,
-    plan_outline,
-)
+from clrecon.proof.phantom import spine_parts
 from clrecon.proof.phantom.vertebra import body_extent, bone_extent, centring_shift, close_facets
 
 Float64Array = NDArray[np.float64]
@@ -70,7 +59,7 @@ def _trabecular_waves(generator: np.random.Generator, steps_mm: Float64Array) ->
     return np.column_stack((vectors, phase, math.sqrt(2.0 / count) * damping))
 
 
-def _plan_rib(vertebra: Vertebra, side: int, half_width: float, half_depth: float) -> Rib:
+def _plan_rib(vertebra: spine_parts.Vertebra, side: int, half_width: float, half_depth: float) -> spine_parts.Rib:
     """Return the points of a rib from the costovertebral joint round the chest wall, sloping down to the front."""
     number = int(vertebra.name[1:])
     side_name = "left" if side > 0 else "right"
@@ -90,13 +79,15 @@ def _plan_rib(vertebra: Vertebra, side: int, half_width: float, half_depth: floa
         cut[0::2] = 0.75 * chain[:-1] + 0.25 * chain[1:]
         cut[1::2] = 0.25 * chain[:-1] + 0.75 * chain[1:]
         chain = np.vstack((chain[:1], cut, chain[-1:]))
-    return Rib(f"{side_name} rib {number}", chain[:: 3 if len(chain) > 60 else 2])
+    return spine_parts.Rib(f"{side_name} rib {number}", chain[:: 3 if len(chain) > 60 else 2])
 
 
-def _plan_vertebrae(chain: Chain, generator: np.random.Generator, seed: int, steps_mm: Float64Array) -> list[Vertebra]:
+def _plan_vertebrae(
+    chain: spine_parts.Chain, generator: np.random.Generator, seed: int, steps_mm: Float64Array
+) -> list[spine_parts.Vertebra]:
     neck = np.random.default_rng((seed, 19))
     return [
-        Vertebra(
+        spine_parts.Vertebra(
             name=name,
             center=chain.centres[n],
             axes=chain.frames[n],
@@ -112,7 +103,9 @@ def _plan_vertebrae(chain: Chain, generator: np.random.Generator, seed: int, ste
     ]
 
 
-def _plan_ribs(vertebrae: list[Vertebra], moved: Float64Array, half_width: float, half_depth: float) -> list[Rib]:
+def _plan_ribs(
+    vertebrae: list[spine_parts.Vertebra], moved: Float64Array, half_width: float, half_depth: float
+) -> list[spine_parts.Rib]:
     ribs = []
     for vertebra, away in zip(vertebrae, moved, strict=True):
         for side in (1, -1):
@@ -120,13 +113,16 @@ def _plan_ribs(vertebrae: list[Vertebra], moved: Float64Array, half_width: float
             if vertebra.name[0] == "T" and (vertebra.name, side) != ("T12", 1):
                 home = dataclasses.replace(vertebra, center=vertebra.center - away) if away.any() else vertebra
                 rib = _plan_rib(home, side, half_width, half_depth)
-                ribs.append(Rib(rib.name, rib.points + away) if away.any() else rib)
+                ribs.append(spine_parts.Rib(rib.name, rib.points + away) if away.any() else rib)
     return ribs
 
 
 def plan_anatomy(
-    field_of_view_mm: tuple[float, float, float], steps_mm: Float64Array, seed: int, choice: SpineChoice | None = None
-) -> Anatomy:
+    field_of_view_mm: tuple[float, float, float],
+    steps_mm: Float64Array,
+    seed: int,
+    choice: spine_parts.SpineChoice | None = None,
+) -> spine_parts.Anatomy:
     """Lay out the phantom for a field of view, (width, depth, length) along columns, rows and slices.
 
     The body outline follows width and depth between the limits of a slim child and of an adult; bones keep their size.
@@ -138,7 +134,7 @@ def plan_anatomy(
     generator = np.random.default_rng((seed, 11))
     half_width = float(np.clip(min(0.45 * field_of_view_mm[0], 0.60 * field_of_view_mm[1]), 118.0, 160.0))
     half_depth = float(0.73 * half_width)
-    chain = lay_chain(generator, seed, half_depth, choice)
+    chain = spine_parts.lay_chain(generator, seed, half_depth, choice)
     vertebrae = _plan_vertebrae(chain, generator, seed, steps_mm)
     if choice is not None:
         shown = [v for v in vertebrae if v.name in choice.levels]
@@ -151,12 +147,12 @@ def plan_anatomy(
             continue  # a joint without a disc
         gap = upper.center - lower.center
         length = float(np.linalg.norm(gap))
-        axes = lean_and_roll(math.asin(gap[1] / length), math.asin(gap[0] / length))
+        axes = spine_parts.lean_and_roll(math.asin(gap[1] / length), math.asin(gap[0] / length))
         half = 0.515 * (upper.width + lower.width) / 2.0, 0.515 * (upper.depth + lower.depth) / 2.0
-        discs.append(Disc((upper.center + lower.center) / 2.0, axes, half[0], half[1], length / 2.0))
+        discs.append(spine_parts.Disc((upper.center + lower.center) / 2.0, axes, half[0], half[1], length / 2.0))
     ribs = _plan_ribs(vertebrae, chain.moved, half_width, half_depth)
     z = chain.centres[:, 2] / 100.0
-    outline = plan_outline(chain, half_width, half_depth)
+    outline = spine_parts.plan_outline(chain, half_width, half_depth)
     # On the skin of the left flank, or as far left as a small field of view still shows.
     left = min(half_width + 1.0, 0.42 * field_of_view_mm[0])
     marker_y = 0.0 if left < half_width else half_depth * 0.1
@@ -164,7 +160,7 @@ def plan_anatomy(
     if outline is not None:
         middle_x, middle_y, wide, _, _ = outline.at(np.zeros(1))
         marker = np.array((min(middle_x[0] + wide[0] + 1.0, 0.42 * field_of_view_mm[0]), middle_y[0], 0.0))
-    anatomy = Anatomy(
+    anatomy = spine_parts.Anatomy(
         vertebrae=vertebrae,
         discs=discs,
         ribs=ribs,
@@ -182,7 +178,7 @@ def plan_anatomy(
     return anatomy if choice is None else _keep_chosen(anatomy, choice)
 
 
-def _keep_chosen(anatomy: Anatomy, choice: SpineChoice) -> Anatomy:
+def _keep_chosen(anatomy: spine_parts.Anatomy, choice: spine_parts.SpineChoice) -> spine_parts.Anatomy:
     """Leave out what belongs to levels that are not chosen."""
     names = [v.name for v in anatomy.vertebrae]
     vertebrae = [v for v in anatomy.vertebrae if v.name in choice.levels]
@@ -206,11 +202,11 @@ MOST_SLICES = 9999
 def spine_choice(
     levels: tuple[str, ...], bend: tuple[float, float], facet_gap_mm: float | None, *, centred: bool,
     directions: tuple[float, tuple[float, float, float], bool], length_mm: float | None,
-) -> SpineChoice:  # fmt: skip
+) -> spine_parts.SpineChoice:  # fmt: skip
     """Return a choice, bent by (kyphosis, scoliosis), for slices of directions (tilt, oblique, prone) and a length."""
     row, column, _ = slice_directions(*directions)
     x, y, z = (float(value) for value in np.cross(row, column))
-    return SpineChoice(levels, *bend, facet_gap_mm, centred, (x, y, z), length_mm)
+    return spine_parts.SpineChoice(levels, *bend, facet_gap_mm, centred, (x, y, z), length_mm)
 
 
 def _reach(extent: tuple[float, float]) -> float:
@@ -218,7 +214,7 @@ def _reach(extent: tuple[float, float]) -> float:
 
 
 def fit_slices(
-    choice: SpineChoice, size: tuple[int, int], spacing: tuple[float, float, float], seed: int,
+    choice: spine_parts.SpineChoice, size: tuple[int, int], spacing: tuple[float, float, float], seed: int,
     directions: tuple[float, tuple[float, float, float], bool], slices: int | None,
 ) -> int:  # fmt: skip
     """Return the number of slices: the given one, if it holds the vertebral bodies, else as many as the bones need."""
@@ -226,8 +222,8 @@ def fit_slices(
     open_joints = dataclasses.replace(choice, facet_gap_mm=None)
     extent = size[0] * di, size[1] * dj
     anatomy = plan_anatomy((*extent, 0.0), np.diag((di, dj, dk)), seed, open_joints)
-    shown: list[Vertebra] = anatomy.vertebrae
-    named = f"levels {format_levels(choice.levels)}"
+    shown: list[spine_parts.Vertebra] = anatomy.vertebrae
+    named = f"levels {spine_parts.format_levels(choice.levels)}"
     whole = math.ceil(_reach(bone_extent(shown, choice.normal)) / dk)
     bodies = math.ceil(_reach(body_extent(shown, choice.normal)) / dk)
     row, column, _ = slice_directions(*directions)

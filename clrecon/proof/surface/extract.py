@@ -9,16 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.geometry import Volume, is_left_handed
-from clrecon.geometry.iso_rule import (
-    IsoRule,
-    Level,
-    choose_iso_rule,
-    layer_margins,
-    layer_normal_matrices,
-    slice_normal_matrices,
-    vertex_margin,
-)
+from clrecon.geometry import Volume, is_left_handed, iso_rule
 from clrecon.geometry.vertices import golden_fraction, search_fraction
 from clrecon.proof.surface.case_table import CORNERS, EDGES, case_table
 from clrecon.proof.surface.trilinear_table import CELL_VERTEX, find_row, place_cell_vertices
@@ -30,7 +21,7 @@ _LARGEST_CASE = 8
 """More than the triangles of any case."""
 
 
-def sample_grid(volume: Volume, rule: IsoRule, layers: int) -> NDArray[np.float64]:
+def sample_grid(volume: Volume, rule: iso_rule.IsoRule, layers: int) -> NDArray[np.float64]:
     """Return the samples as float64, extended by `layers` of outside (closed) or of the border's own values (open)."""
     values = volume.voxels.astype(np.float64)
     if rule.closed:
@@ -129,7 +120,7 @@ def _find_trilinear_triangles(
 
 def extract_isosurface(
     volume: Volume,
-    iso_value: Level,
+    iso_value: iso_rule.Level,
     *,
     closed: bool = True,
     topology: str = "separated",
@@ -146,7 +137,9 @@ def extract_isosurface(
     vertex_rule: {"linear", "golden", "golden-search"}
     grown: Function from the samples that are inside, (gk, gj, gi), to the cells whose triangles are wanted; None: all.
     """
-    rule = choose_iso_rule(volume, iso_value, closed=closed, topology=topology, below=below, vertex_rule=vertex_rule)
+    rule = iso_rule.choose_iso_rule(
+        volume, iso_value, closed=closed, topology=topology, below=below, vertex_rule=vertex_rule
+    )
     inside = rule.mark_inside(sample_grid(volume, rule, rule.border))
     if rule.closed:
         inside[[0, -1]] = inside[:, [0, -1]] = inside[:, :, [0, -1]] = False
@@ -160,7 +153,7 @@ def extract_isosurface(
 
 def extract_inside(
     volume: Volume,
-    rule: IsoRule,
+    rule: iso_rule.IsoRule,
     inside: NDArray[np.bool_],
     hu_places: NDArray[np.bool_] | None = None,
     cells: NDArray[np.bool_] | None = None,
@@ -242,15 +235,15 @@ def find_crossed_edges(inside: NDArray[np.bool_]) -> CrossedEdges:
     return CrossedEdges(numbers, (k, j, i), (k + (axis == 2), j + (axis == 1), i + (axis == 0)), axis)
 
 
-def edge_margins(volume: Volume, rule: IsoRule, edges: CrossedEdges) -> NDArray[np.float64]:
+def edge_margins(volume: Volume, rule: iso_rule.IsoRule, edges: CrossedEdges) -> NDArray[np.float64]:
     """Return the smallest distance of each vertex from a sample, in steps, shape (n,)."""
-    margins, layers = vertex_margin(volume, rule.border), layer_margins(volume, rule.border)
+    margins, layers = iso_rule.vertex_margin(volume, rule.border), iso_rule.layer_margins(volume, rule.border)
     return np.asarray(np.where(edges.axis == 2, layers[edges.near[0]], margins[edges.axis]))
 
 
 def build_surface(
     volume: Volume,
-    rule: IsoRule,
+    rule: iso_rule.IsoRule,
     inside: NDArray[np.bool_],
     edges: CrossedEdges,
     places: EdgePlaces,
@@ -266,7 +259,7 @@ def build_surface(
     t = places.t
     slope, next_slope = places.slope.copy(), places.next_slope.copy()
     field = sample_grid(volume, rule, rule.border)
-    margins, layers = vertex_margin(volume, rule.border), layer_margins(volume, rule.border)
+    margins, layers = iso_rule.vertex_margin(volume, rule.border), iso_rule.layer_margins(volume, rule.border)
     step = np.eye(3, dtype=np.int64)[axis]
     origins = volume.slice_origins(rule.border)
     here = np.stack([i, j], axis=1) - rule.border
@@ -275,7 +268,7 @@ def build_surface(
     flat = ~(slope + next_slope).any(axis=1)
     rise = np.where(inside[k1, j1, i1], 1.0, -1.0)
     slope[flat], next_slope[flat] = (rise[:, None] * step)[flat], 0.0
-    at_samples = slice_normal_matrices(volume, rule.border)
+    at_samples = iso_rule.slice_normal_matrices(volume, rule.border)
     up = np.einsum("nij,nj->ni", at_samples[k], slope) + np.einsum("nij,nj->ni", at_samples[k1], next_slope)
     if rule.topology == "separated":
         triangles = _find_triangles(inside, numbers, cells_wanted)
@@ -284,7 +277,7 @@ def build_surface(
         in_cells = np.column_stack([np.broadcast_to(margins[:2], (len(layers), 2)), layers])
         triangles, (cells, points, cell_slope) = _find_trilinear_triangles(inside, numbers, heights, in_cells)
         ck = cells[:, 0]
-        cell_up = np.einsum("nij,nj->ni", layer_normal_matrices(volume, rule.border)[ck], cell_slope)
+        cell_up = np.einsum("nij,nj->ni", iso_rule.layer_normal_matrices(volume, rule.border)[ck], cell_slope)
         in_slice = cells[:, :0:-1] - rule.border + points[:, :2]
         placed = origins[ck] + in_slice @ volume.affine[:3, :2].T + points[:, 2:] * (origins[ck + 1] - origins[ck])
         # Slice by slice: first the vertices on edges, then those inside cells.

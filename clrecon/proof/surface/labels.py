@@ -13,17 +13,7 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.labels.label_levels import FULL, KEEP, REACH, Growth, fill_solid, find_boxes, level_biases, next_level
-from clrecon.proof.surface.extract import (
-    CrossedEdges,
-    EdgePlaces,
-    Surface,
-    build_surface,
-    edge_margins,
-    extract_inside,
-    find_crossed_edges,
-    gradients,
-    sample_grid,
-)
+from clrecon.proof.surface import extract
 
 
 def own_labels(labels: NDArray[Any], volume: Volume, grow_mm: float | None) -> NDArray[np.uint16]:
@@ -67,7 +57,7 @@ def find_solid(
 
 def extract_label(
     volume: Volume, inside: NDArray[np.uint16], number: int, iso_value: float, *, closed: bool = True
-) -> Surface:
+) -> extract.Surface:
     """Extract the surface of one label of a small volume, whose samples `find_solid` found.
 
     Where HU cross the iso level between a sample of the label and one without a label, the vertex lies there, as on the
@@ -76,10 +66,10 @@ def extract_label(
     """
     rule = choose_iso_rule(volume, iso_value, closed=closed)
     grown = np.pad(inside, rule.border)
-    dense = sample_grid(volume, rule, rule.border) >= rule.lowest_inside
+    dense = extract.sample_grid(volume, rule, rule.border) >= rule.lowest_inside
     if rule.closed:
         dense[[0, -1]] = dense[:, [0, -1]] = dense[:, :, [0, -1]] = False
-    return extract_inside(
+    return extract.extract_inside(
         volume, rule, grown == number, hu_places=(dense & (grown == number)) | ((grown == 0) & ~dense)
     )
 
@@ -106,7 +96,7 @@ def extract_label_mask(
     *,
     closed: bool = True,
     enclosed: Mapping[int, int] | None = None,
-) -> Surface:
+) -> extract.Surface:
     """Extract one label's own surface at one level, 1 to `FULL` - 1.
 
     The samples that carry the label are inside, whatever their occupancy.  On an edge from an inside sample to one
@@ -124,7 +114,7 @@ def extract_label_mask(
     volume, border = Volume(labels, affine), int(closed)
     rule = IsoRule(0.5, FULL // 2, FULL / 2, 0.0, closed)
     inside = np.pad(labels == number, border)
-    edges = find_crossed_edges(inside)
+    edges = extract.find_crossed_edges(inside)
     within = np.pad(np.ones(labels.shape, dtype=bool), border)
     leads_out = ~(within[edges.near] & within[edges.far])
     grown = np.pad(labels.astype(np.int64), border, mode="edge")
@@ -133,7 +123,10 @@ def extract_label_mask(
     everyone = (FULL // 4096) * find_occupancy(labels != 0)
     values = [np.pad(field, border, mode="edge") for field in (occupancy, everyone)]
     slopes = [
-        np.pad(gradients(np.pad(field.astype(np.float64), 1, mode="edge"), False), [(border, border)] * 3 + [(0, 0)])
+        np.pad(
+            extract.gradients(np.pad(field.astype(np.float64), 1, mode="edge"), False),
+            [(border, border)] * 3 + [(0, 0)],
+        )
         for field in (occupancy, everyone)
     ]
     starts = inside[edges.near]
@@ -151,20 +144,20 @@ def extract_label_mask(
     value, next_value = np.maximum(lead + before, 1), np.maximum(next_lead - before, 1)
     t[between] = (value / (value + next_value))[between]
     t[leads_out] = 0.5
-    keep = np.maximum(edge_margins(volume, rule, edges), KEEP)
+    keep = np.maximum(extract.edge_margins(volume, rule, edges), KEEP)
     t = np.clip(t, keep, 1.0 - keep)
 
     takes = (alongside & ~between)[:, None]
     slope, next_slope = (np.where(takes, slopes[1][e], slopes[0][e]) for e in (edges.near, edges.far))
     slope, next_slope = (1.0 - t[:, None]) * slope, t[:, None] * next_slope
     slope[leads_out] = next_slope[leads_out] = 0.0
-    return build_surface(volume, rule, inside, edges, EdgePlaces(t, slope, next_slope))
+    return extract.build_surface(volume, rule, inside, edges, extract.EdgePlaces(t, slope, next_slope))
 
 
 def _find_leads(
     labels: NDArray[Any],
     occupancy: NDArray[np.int64],
-    edges: CrossedEdges,
+    edges: extract.CrossedEdges,
     inside: NDArray[np.bool_],
     grown: NDArray[np.int64],
     border: int,

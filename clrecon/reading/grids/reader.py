@@ -22,17 +22,9 @@ from clrecon.errors import RefusedInputError
 from clrecon.geometry import AIR_HU, Volume
 from clrecon.geometry.affine import column_spacing, facts_of_orientation, signed_tilt, slice_normal, tilt_degrees
 from clrecon.geometry.certificate import Certificate
+from clrecon.reading.common import plausibility
 from clrecon.reading.common.likeness import Likeness, judge_slices
 from clrecon.reading.common.padding import fill_disc_padding
-from clrecon.reading.common.plausibility import (
-    PADDING_SHARE,
-    VoxelFindings,
-    examine_voxels,
-    judge_figures,
-    judge_steps,
-    leave_unexamined,
-    list_odd_values,
-)
 from clrecon.reading.common.selection import Rescale
 from clrecon.reading.common.source_facts import PixelFacts, SeriesEntry, SeriesListing, StoredRange
 from clrecon.reading.grids.grid_file import VOLUME, GridFile
@@ -236,11 +228,14 @@ _NOT_DICOM = "not DICOM: position, spacing and the meaning of the values are as 
 def judge_spacing(grid: GridFile) -> Gate:
     """Judge the gate ``plausible_spacing``.  Axes may be in any order; the longest step is that of the slices."""
     *pixels, gap = sorted(column_spacing(grid.affine))
-    return judge_steps(pixels, gap)
+    return plausibility.judge_steps(pixels, gap)
 
 
 def certify_grid(
-    grid: GridFile, values: GridValues | None, warnings: Sequence[str], findings: VoxelFindings | None = None
+    grid: GridFile,
+    values: GridValues | None,
+    warnings: Sequence[str],
+    findings: plausibility.VoxelFindings | None = None,
 ) -> Certificate:
     """Build the report of a volume; entries that depend on its voxels are None where they were not read."""
     facts = None if values is None else values.facts
@@ -301,12 +296,14 @@ def judge_grid(grid: GridFile, values: GridValues | None, value_gates: Sequence[
     if values is None or values.doubts:
         gates.append(unmeasured("plausible_hu", 0, None, "implausible HU values: not read, or hardly HU"))
     else:
-        gates.append(judge_figures(list_odd_values(values.facts)))
-    gates += leave_unexamined() if value_gates is None else value_gates
+        gates.append(plausibility.judge_figures(plausibility.list_odd_values(values.facts)))
+    gates += plausibility.leave_unexamined() if value_gates is None else value_gates
     if values is None:
-        gates.append(unmeasured("padding_share", PADDING_SHARE, None, f"{share}: the voxels were not read"))
+        gates.append(
+            unmeasured("padding_share", plausibility.PADDING_SHARE, None, f"{share}: the voxels were not read")
+        )
     else:
-        gates.append(at_most("padding_share", values.facts.padding_share, PADDING_SHARE, None, share))
+        gates.append(at_most("padding_share", values.facts.padding_share, plausibility.PADDING_SHARE, None, share))
     return gates
 
 
@@ -324,15 +321,17 @@ def read_grid(path: Path, kind: str, *, rescale: Rescale | None = None, progress
     return Volume(values.voxels, grid.affine, report, hu_range=(values.facts.hu_min, values.facts.hu_max))
 
 
-def _examine(grid: GridFile, values: GridValues) -> VoxelFindings:
+def _examine(grid: GridFile, values: GridValues) -> plausibility.VoxelFindings:
     stored: list[StoredRange] = []
     if grid.dtype.kind in "iu":
         stored_range = StoredRange(8 * grid.dtype.itemsize, grid.dtype.kind == "i", grid.slope, grid.intercept)
         stored = [stored_range] * len(values.voxels)
-    return examine_voxels(values.voxels, values.facts, (), known=not values.doubts, stored=stored)
+    return plausibility.examine_voxels(values.voxels, values.facts, (), known=not values.doubts, stored=stored)
 
 
-def _collect_warnings(grid: GridFile, values: GridValues | None, findings: VoxelFindings | None) -> list[str]:
+def _collect_warnings(
+    grid: GridFile, values: GridValues | None, findings: plausibility.VoxelFindings | None
+) -> list[str]:
     """Return warnings about the header, then about the values where they were read."""
     warnings = [_NOT_DICOM, *grid.warnings]
     spacing = judge_spacing(grid)
@@ -345,8 +344,8 @@ def _collect_warnings(grid: GridFile, values: GridValues | None, findings: Voxel
     warnings += [*values.warnings, *values.doubts]
     if values.likeness is not None and values.likeness.is_mixed:
         warnings.append(str(values.likeness))
-    if not values.doubts and (odd := list_odd_values(values.facts)):
-        warnings.append(judge_figures(odd).text)
+    if not values.doubts and (odd := plausibility.list_odd_values(values.facts)):
+        warnings.append(plausibility.judge_figures(odd).text)
     return [*warnings, *findings.warnings, *(gate.text for gate in findings.gates if gate.ok is False)]
 
 

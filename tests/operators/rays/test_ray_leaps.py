@@ -13,8 +13,8 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.opencl import upload
-from clrecon.operators.rays import ray_pictures, ray_slabs
 from clrecon.operators.rays import ray_pictures as composite
+from clrecon.operators.rays import ray_slabs
 from clrecon.operators.rays.render import VolumeRenderer, render
 from clrecon.operators.resident.tables import volume_box
 from clrecon.rendering import UNSHADED, Rendering, TransferFunction
@@ -42,7 +42,7 @@ def take_every_sample(monkeypatch, *arguments, **settings) -> Rendering:
         return upload(resident.device, np.full(output.tiles, -np.inf, np.float32))
 
     with monkeypatch.context() as patch:
-        patch.setattr(ray_pictures, "find_leaps", show_all)
+        patch.setattr(ray_slabs, "find_leaps", show_all)
         patch.setattr(composite, "enter_tiles", enter_at_once)
         return take(*arguments, **settings)
 

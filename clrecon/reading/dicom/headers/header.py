@@ -7,14 +7,7 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-from clrecon.reading.dicom.headers.multiframe import (
-    ENHANCED_CT,
-    count_frames,
-    find_places,
-    read_groups,
-    split_frames,
-    spread_frames,
-)
+from clrecon.reading.dicom.headers import multiframe
 from clrecon.reading.dicom.headers.slice_header import SLICE_PHASES, OtherImage, SeriesIdentity, SliceHeader
 from clrecon.reading.dicom.headers.surplus import check_surplus
 from clrecon.reading.dicom.parse.elements import CorruptFileError, DicomElements, FileStart, read_elements
@@ -78,7 +71,7 @@ def read_headers(
         values.elements = elements = elements._replace(remarks=(*elements.remarks, remark))
     name = escape_text(path.name)
     sop_class = values.word("SOPClassUID") or elements.media_class
-    known_class = "CT" if sop_class in (CT_IMAGE_STORAGE, *ENHANCED_CT) else "unknown"
+    known_class = "CT" if sop_class in (CT_IMAGE_STORAGE, *multiframe.ENHANCED_CT) else "unknown"
     modality = name_term(values.word("Modality").strip().upper(), MODALITIES) or known_class
     series = _share_identity(
         values.word("SeriesInstanceUID"),
@@ -87,7 +80,7 @@ def read_headers(
         modality,
         values.word("StudyInstanceUID"),
     )
-    if modality == OTHER_TERM and sop_class in (CT_IMAGE_STORAGE, *ENHANCED_CT):
+    if modality == OTHER_TERM and sop_class in (CT_IMAGE_STORAGE, *multiframe.ENHANCED_CT):
         problem = f"{name}: Modality (0008,0060) is no term of the standard, expected CT in a CT image"
         return OtherImage(series, path, name, 1, "broken", problem)
     if modality != "CT":
@@ -99,15 +92,15 @@ def read_headers(
         if "ImagePositionPatient" not in values:
             why = "without ImagePositionPatient (0020,0032): no geometry"
         return OtherImage(series, path, name, 1, "capture", f"{name}: secondary capture (SOP class {sop_class}): {why}")
-    if sop_class in ENHANCED_CT:
+    if sop_class in multiframe.ENHANCED_CT:
         return _read_frames(elements, series, path, name, force)
     try:
-        frames = count_frames(values, sop_class)
-        places = find_places(values, sop_class, frames) if frames > 1 else None
+        frames = multiframe.count_frames(values, sop_class)
+        places = multiframe.find_places(values, sop_class, frames) if frames > 1 else None
         header = _validate(values, series, path, name, frames=frames)
         remarks = check_surplus(elements, header, force=force)
         header = replace(header, warnings=(*header.warnings, *remarks)) if remarks else header
-        return [header] if places is None else list(spread_frames(header, places))
+        return [header] if places is None else list(multiframe.spread_frames(header, places))
     except ValueProblem as problem:
         return OtherImage(series, path, name, 1, "broken", f"{name}: {problem}")
 
@@ -120,9 +113,9 @@ def _read_frames(
     headers: list[SliceHeader] = []
     remarks: tuple[str, ...] = ()
     try:
-        groups = read_groups(path, elements)
+        groups = multiframe.read_groups(path, elements)
         frames = len(groups.frames)
-        for number, frame in enumerate(split_frames(elements, groups)):
+        for number, frame in enumerate(multiframe.split_frames(elements, groups)):
             frame_name = f"{name} frame {number + 1}" if frames > 1 else name
             if frame.problem is not None:
                 raise frame.problem

@@ -25,13 +25,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.reading.dicom.headers.slice_header import (
-    CONCATENATION_TAGS,
-    FRAME_PHASES,
-    Concatenation,
-    SliceHeader,
-    read_concatenation,
-)
+from clrecon.reading.dicom.headers import slice_header
 from clrecon.reading.dicom.parse.plain import IMPLICIT_LITTLE, META_START, DicomElements
 from clrecon.reading.dicom.parse.values import (
     Item,
@@ -111,7 +105,7 @@ _UNASSIGNED = _wanted(
 _GROUPS: Schema = {**_MACROS, _REAL_WORLD_VALUES: _MAPPING}
 _SCHEMA: Schema = {
     _DIMENSIONS: _wanted(_DIMENSION_POINTER),
-    **dict.fromkeys(CONCATENATION_TAGS),
+    **dict.fromkeys(slice_header.CONCATENATION_TAGS),
     _SHARED_GROUPS: {**_GROUPS, _UNASSIGNED_SHARED: _UNASSIGNED},
     _FRAME_GROUPS: {**_GROUPS, _UNASSIGNED_FRAME: _UNASSIGNED},
 }
@@ -130,7 +124,7 @@ class Groups:
     shared: Item
     frames: list[Item]
     dimensions: tuple[tuple[int, str], ...]
-    concatenation: Concatenation | None
+    concatenation: slice_header.Concatenation | None
     warnings: tuple[str, ...] = ()
 
 
@@ -181,7 +175,7 @@ def read_groups(path: Path, elements: DicomElements) -> Groups:
         shared[0] if shared else Item(),
         frames,
         tuple(_name_dimensions(top.sequences.get(_DIMENSIONS, []), elements.little_endian)),
-        read_concatenation(top, count, elements.little_endian),
+        slice_header.read_concatenation(top, count, elements.little_endian),
         tuple(f"{name_tag(tag)} is there twice in one item, with the same value" for tag in sorted(top.repeated)),
     )
 
@@ -290,7 +284,7 @@ def _take_real_world_values(frame: DicomElements, mappings: list[Item], warnings
 
 
 def _describe_phase(frame: DicomElements, dimensions: tuple[tuple[int, str], ...]) -> Iterator[tuple[str, str]]:
-    for keyword, tag, form in FRAME_PHASES:
+    for keyword, tag, form in slice_header.FRAME_PHASES:
         raw = frame.values.get(tag)
         if not raw:
             continue
@@ -427,7 +421,7 @@ def _cross(row: tuple[float, ...], column: tuple[float, ...]) -> NDArray[np.floa
     return np.asarray(normal / length if length > 0.0 else normal)
 
 
-def spread_frames(header: SliceHeader, places: FramePlaces) -> Iterator[SliceHeader]:
+def spread_frames(header: slice_header.SliceHeader, places: FramePlaces) -> Iterator[slice_header.SliceHeader]:
     """Return one header for each frame, given that of the first one."""
     normal = _cross(header.row_cosines, header.column_cosines)
     first = np.array(header.position_mm)

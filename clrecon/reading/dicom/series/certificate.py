@@ -20,35 +20,15 @@ from clrecon.errors import RefusedInputError
 from clrecon.geometry import column_spacing
 from clrecon.geometry.affine import facts_of_orientation
 from clrecon.geometry.certificate import Certificate
+from clrecon.reading.common import plausibility
 from clrecon.reading.common.likeness import Likeness
-from clrecon.reading.common.plausibility import (
-    PADDING_SHARE,
-    VoxelFindings,
-    judge_figures,
-    judge_steps,
-    leave_unexamined,
-    list_odd_values,
-)
 from clrecon.reading.common.source_facts import PixelFacts
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
 from clrecon.reading.dicom.parse.transfer_syntaxes import SYNTAX_NAMES
 from clrecon.reading.dicom.series.phases import choose_phase, describe_spacing
 from clrecon.reading.dicom.series.scan import Scan
 from clrecon.reading.dicom.series.series import Series, facts_of_numbers, judge_numbers
-from clrecon.reading.dicom.stack.fit import (
-    ORIENTATION_EXACT,
-    ORIENTATION_LIMIT,
-    ORIENTATION_SPREAD_RAD,
-    STATED_GAP_TOLERANCE,
-    Stack,
-    facts_of_thickness,
-    group_places,
-    measure_directions,
-    measure_extent,
-    measure_stated_gap,
-    median_thickness,
-    summarise_gaps,
-)
+from clrecon.reading.dicom.stack import fit
 from clrecon.reading.dicom.stack.mixtures import describe_differences
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
@@ -76,7 +56,7 @@ _STRAY = "values beyond the stored bits"
 
 def judge_series(
     series: Series,
-    stack: Stack | None,
+    stack: fit.Stack | None,
     facts: PixelFacts | None = None,
     likeness: Likeness | None = None,
     value_gates: Sequence[Gate] | None = None,
@@ -90,7 +70,7 @@ def judge_series(
     if stack is None:
         return gates
     first = stack.slices[0]
-    gates.append(judge_steps((first.di_mm, first.dj_mm), stack.line.gap_median_mm))
+    gates.append(plausibility.judge_steps((first.di_mm, first.dj_mm), stack.line.gap_median_mm))
     gates += _gates_of_places(stack)
     words = "slices at the place of another that differ from it and are no phases"
     gates.append(judge_numbers(series.census, stack, _count_copies(series)))
@@ -102,24 +82,26 @@ def judge_series(
         none_of("measured_images", sum(bool(h.derived) for h in stack.slices), "slices that were computed from others"),
     ]
     gates.append(_judge_hu(stack.slices, facts))
-    gates += leave_unexamined() if value_gates is None else value_gates
+    gates += plausibility.leave_unexamined() if value_gates is None else value_gates
     share = "share of voxels without a measurement (padding)"
     if facts is None:
-        gates.append(unmeasured("padding_share", PADDING_SHARE, None, f"{share}: the pixels were not read"))
+        gates.append(
+            unmeasured("padding_share", plausibility.PADDING_SHARE, None, f"{share}: the pixels were not read")
+        )
         gates.append(unmeasured("stored_bits", 0, None, f"{_STRAY}: the pixels were not read"))
     else:
         gates.append(none_of("stored_bits", facts.stray, facts.stray_text or _STRAY))
-        gates.append(at_most("padding_share", facts.padding_share, PADDING_SHARE, None, share))
+        gates.append(at_most("padding_share", facts.padding_share, plausibility.PADDING_SHARE, None, share))
     return gates
 
 
-def _gates_of_places(stack: Stack) -> Iterator[Gate]:
-    directions = measure_directions(stack.slices)
+def _gates_of_places(stack: fit.Stack) -> Iterator[Gate]:
+    directions = fit.measure_directions(stack.slices)
     words = "ImageOrientationPatient is off unit length or right angle by"
-    yield at_most("orientation_exact", directions.deviation, ORIENTATION_EXACT, None, words)
+    yield at_most("orientation_exact", directions.deviation, fit.ORIENTATION_EXACT, None, words)
     words = "ImageOrientationPatient of a slice differs from the mean by"
-    if directions.deviation > ORIENTATION_LIMIT:
-        yield unmeasured("orientation_same", ORIENTATION_SPREAD_RAD, "rad", f"{words}: there is no mean")
+    if directions.deviation > fit.ORIENTATION_LIMIT:
+        yield unmeasured("orientation_same", fit.ORIENTATION_SPREAD_RAD, "rad", f"{words}: there is no mean")
     else:
         yield at_most("orientation_same", directions.spread_rad, directions.spread_allowed_rad, "rad", words)
     line = stack.line
@@ -134,7 +116,7 @@ def _gates_of_places(stack: Stack) -> Iterator[Gate]:
     yield _judge_stated_places(stack)
 
 
-def _judge_thickness(stack: Stack) -> Gate:
+def _judge_thickness(stack: fit.Stack) -> Gate:
     """Compare gaps with SliceThickness: how much of the tissue was measured."""
     words = "largest gap between slices as a multiple of SliceThickness; above 1 the tissue between was not measured"
     thickness = np.array([header.slice_thickness_mm or 0.0 for header in stack.slices])
@@ -157,8 +139,8 @@ def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
     ):
         odd += [f"{name} {value:g}" for value in (min(values), max(values)) if not low <= value <= high][:1]
     if facts is not None and facts.hu_min <= facts.hu_max and not count_unknown(headers):
-        odd += list_odd_values(facts)
-    return judge_figures(odd)
+        odd += plausibility.list_odd_values(facts)
+    return plausibility.judge_figures(odd)
 
 
 def _judge_one_volume(series: Series, likeness: Likeness | None) -> Gate:
@@ -182,19 +164,19 @@ def _count_doubled(series: Series) -> int:
         places = series.places
     except RefusedInputError:
         return 0  # the pixels cannot be compared: already counted as a reason for refusal
-    return len(places.headers) - len(group_places(places.headers)) if places.problem and not places.phases else 0
+    return len(places.headers) - len(fit.group_places(places.headers)) if places.problem and not places.phases else 0
 
 
-def _judge_stated_gap(stack: Stack) -> Gate:
+def _judge_stated_gap(stack: fit.Stack) -> Gate:
     """Compare SpacingBetweenSlices with the positions: a sign that every second slice is missing."""
-    words, bound = "SpacingBetweenSlices differs from the positions by", 100.0 * STATED_GAP_TOLERANCE
-    stated_gap = measure_stated_gap(stack.slices, stack.positions_mm, stack.line.gap_median_mm)
+    words, bound = "SpacingBetweenSlices differs from the positions by", 100.0 * fit.STATED_GAP_TOLERANCE
+    stated_gap = fit.measure_stated_gap(stack.slices, stack.positions_mm, stack.line.gap_median_mm)
     if stated_gap is None:
         return unmeasured("stated_gap", bound, "%", f"{words}: it is not stated")
     return at_most("stated_gap", 100.0 * stated_gap[2], bound, "%", words)
 
 
-def _judge_stated_places(stack: Stack) -> Gate:
+def _judge_stated_places(stack: fit.Stack) -> Gate:
     """Compare position, orientation and pixel spacing with other elements that say the same."""
     words = "elements that contradict the places of the voxels"
     clashes = [
@@ -206,7 +188,7 @@ def _judge_stated_places(stack: Stack) -> Gate:
     return none_of("stated_places", len(wrong), f"{words} ({'; '.join(wrong)})" if wrong else words)
 
 
-def _compare_locations(stack: Stack) -> str | None:
+def _compare_locations(stack: fit.Stack) -> str | None:
     """Compare SliceLocation with the positions: None where both move alike, "" where it cannot be compared.
 
     It is counted from anywhere in any direction, along the normal, the table or an axis of the patient.
@@ -232,7 +214,7 @@ def _compare_locations(stack: Stack) -> str | None:
     )
 
 
-def _compare_field(stack: Stack) -> str | None:
+def _compare_field(stack: fit.Stack) -> str | None:
     """Compare ReconstructionDiameter with the picture, as `_compare_locations` does; pictures may be cut out of it."""
     first = stack.slices[0]
     diameter, pixel = first.stated_field_mm or 0.0, max(first.di_mm, first.dj_mm)
@@ -246,10 +228,10 @@ def _compare_field(stack: Stack) -> str | None:
     return f"ReconstructionDiameter says {diameter:g} mm, {diameter / pixel:,.0f} pixels of {pixel:g} mm"
 
 
-def _compare_letters(stack: Stack) -> str | None:
+def _compare_letters(stack: fit.Stack) -> str | None:
     """Compare PatientOrientation with the directions, as `_compare_locations` does."""
-    first, directions = stack.slices[0], measure_directions(stack.slices)
-    if not first.stated_letters or first.quadruped or directions.deviation > ORIENTATION_LIMIT:
+    first, directions = stack.slices[0], fit.measure_directions(stack.slices)
+    if not first.stated_letters or first.quadruped or directions.deviation > fit.ORIENTATION_LIMIT:
         return ""
     letters_found = []
     for direction, letters in zip((directions.row, directions.column), first.stated_letters.split("\\"), strict=True):
@@ -337,10 +319,10 @@ def collect_series_warnings(series: Series) -> list[str]:
     return warnings
 
 
-def _describe_long_voxels(stack: Stack) -> list[str]:
+def _describe_long_voxels(stack: fit.Stack) -> list[str]:
     """Describe gaps of many pixels where no thickness says whether the tissue between was measured."""
     gap, pixel = stack.line.gap_median_mm, max(stack.slices[0].di_mm, stack.slices[0].dj_mm)
-    if gap is None or gap < _LONG_VOXELS * pixel or median_thickness(stack.slices) is not None:
+    if gap is None or gap < _LONG_VOXELS * pixel or fit.median_thickness(stack.slices) is not None:
         return []
     return [
         f"slices lie {gap:.4g} mm apart, {gap / pixel:.3g} times the width of a pixel, and no SliceThickness says"
@@ -382,7 +364,7 @@ def _facts_of_phase(series: Series) -> dict[str, Any] | None:
     return {"number": chosen.number, "of": len(series.places.phases), "keyword": chosen.keyword, "value": chosen.value}
 
 
-def _place_slices(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:
+def _place_slices(stack: fit.Stack, is_so: Callable[[SliceHeader], bool]) -> str:
     """Describe slices by count and position along the normal; their file names may contain the patient's name."""
     positions = [place for header, place in zip(stack.slices, stack.distances_mm, strict=True) if is_so(header)]
     if len(positions) == len(stack.slices):
@@ -391,7 +373,9 @@ def _place_slices(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:
     return f"{len(positions)} of {len(stack.slices)} slices, {first}at {positions[0]:.2f} mm"
 
 
-def _facts_of_rescale(headers: Sequence[SliceHeader], scan: Scan, findings: VoxelFindings | None) -> dict[str, Any]:
+def _facts_of_rescale(
+    headers: Sequence[SliceHeader], scan: Scan, findings: plausibility.VoxelFindings | None
+) -> dict[str, Any]:
     slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
     return {
         "slope": [min(slopes), max(slopes)],
@@ -409,12 +393,12 @@ class SeriesPixels:
     voxels: NDArray[Any]
     facts: PixelFacts
     likeness: Likeness | None
-    findings: VoxelFindings
+    findings: plausibility.VoxelFindings
 
 
 def certify(
     series: Series,
-    stack: Stack,
+    stack: fit.Stack,
     pixels: SeriesPixels | None,
     scan: Scan,
     affine: NDArray[np.float64] | None,
@@ -443,7 +427,7 @@ def certify(
         slices_missing=stack.missing,
         shape_ijk=[first.columns, first.rows, len(headers)],
         spacing_mm=None if affine is None else list(column_spacing(affine)),
-        extent_mm=None if affine is None else measure_extent(stack),
+        extent_mm=None if affine is None else fit.measure_extent(stack),
         affine_ijk_to_lps_mm=None if affine is None else affine.tolist(),
         orientation=None if affine is None else facts_of_orientation(affine),
         patient_position=(lay.pop() or None) if len(lay) == 1 else None,
@@ -454,10 +438,10 @@ def certify(
         grid_tolerance_mm=line.tolerance_mm,
         gap_mm={"min": line.gap_min_mm, "max": line.gap_max_mm, "median": line.gap_median_mm},
         uneven=line.uneven,
-        gap_runs=summarise_gaps(stack.distances_mm) if line.uneven else None,
+        gap_runs=fit.summarise_gaps(stack.distances_mm) if line.uneven else None,
         slice_positions_mm=stack.positions_mm.tolist() if line.uneven else None,
-        slice_thickness_mm=median_thickness(headers),
-        thickness=facts_of_thickness(headers, stack.distances_mm),
+        slice_thickness_mm=fit.median_thickness(headers),
+        thickness=fit.facts_of_thickness(headers, stack.distances_mm),
         stated_gap_mm=stated,
         numbering=facts_of_numbers(series.census, stack),
         frame_of_reference_hash=hash_uid(first.frame_of_reference),
