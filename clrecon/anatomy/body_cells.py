@@ -116,8 +116,7 @@ def _count_dense(slab: NDArray[Any], counts: dict[float, NDArray[Any]], sj: int,
     dense = np.flatnonzero(slab > DENSE_HU)
     if not len(dense):
         return
-    columns = counts[DENSE_HU].shape[1]
-    cell = (dense // ni % nj // sj) * columns + dense % ni // si
+    cell = (dense // ni % nj // sj) * counts[DENSE_HU].shape[1] + dense % ni // si
     values = slab.reshape(-1)[dense]
     for bound, count in counts.items():
         count[...] = np.bincount(cell[values > bound], minlength=count.size).reshape(count.shape)

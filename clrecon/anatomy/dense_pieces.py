@@ -298,8 +298,7 @@ def _thickness(cells: Cells, pieces: _Pieces, chosen: Mask) -> Float64Array:
     thickest = np.zeros(len(chosen))
     boxes = ndimage.find_objects(pieces.labels)
     for number in np.flatnonzero(chosen):
-        box = boxes[number - 1]
-        thickest[number] = _depth(pieces.labels[box] == number, cells.size_mm[::-1]).max()
+        thickest[number] = _depth(pieces.labels[boxes[number - 1]] == number, cells.size_mm[::-1]).max()
     return thickest
 
 

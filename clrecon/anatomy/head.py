@@ -108,8 +108,7 @@ def _outer_air(volume: Volume) -> tuple[NDArray[np.bool_], NDArray[Any]]:
     steps = np.maximum(1, np.round(PIXEL_MM / spacing).astype(int))
     air = volume.voxels[tuple(slice(None, None, step) for step in steps)] < AIR_HU
     reach = 2 * np.round(OPEN_MM / 2.0 / (spacing * steps)).astype(int) + 1
-    wide = ndimage.minimum_filter(air, size=tuple(reach), mode="nearest")
-    parts, count = ndimage.label(wide)
+    parts, count = ndimage.label(ndimage.minimum_filter(air, size=tuple(reach), mode="nearest"))
     at_border = np.zeros(count + 1, bool)
     for axis in range(3):
         for end in (0, -1):

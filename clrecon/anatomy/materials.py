@@ -96,8 +96,7 @@ def leave_padding(histogram: Float64Array, counted: int, report: dict[str, Any])
 def smooth_counts(histogram: Float64Array) -> Float64Array:
     reach = int(4 * SMOOTHING_HU)
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / SMOOTHING_HU) ** 2)
-    padded = np.pad(histogram, reach)
-    return np.convolve(padded, weights / weights.sum(), mode="valid")
+    return np.convolve(np.pad(histogram, reach), weights / weights.sum(), mode="valid")
 
 
 def _find_mode(smooth: Float64Array, low: int, high: int) -> tuple[float, float] | None:

@@ -67,8 +67,7 @@ def measure_noise(volume: Volume) -> Noise:
     """
     nk = volume.shape_ijk[2]
     ks = np.unique(np.linspace(0, nk - 1, min(nk, MOST_SLICES)).round().astype(int)).tolist()
-    blocks = [_block_deviations(volume.voxels[k]) for k in ks]
-    deviations = np.concatenate(blocks)
+    deviations = np.concatenate([_block_deviations(volume.voxels[k]) for k in ks])
     if len(deviations) < _FEWEST_BLOCKS:
         low, high = SOFT_TISSUE_HU
         raise UsageError(

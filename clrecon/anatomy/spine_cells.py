@@ -85,8 +85,7 @@ def average_cells(volume: Volume, lattice: Lattice, done: Callable[[slice], None
 
 def _average_blocks(volume: Volume, lattice: Lattice, done: Callable[[slice], None]) -> Field:
     """Return the means of blocks of voxels, shape (bk, bj, bi); what is left at the far ends is left out."""
-    size = np.array(volume.shape_ijk)
-    whole = size // lattice.block * lattice.block
+    whole = np.array(volume.shape_ijk) // lattice.block * lattice.block
     fi, fj, fk = (int(n) for n in lattice.block)
     means = np.empty((whole // lattice.block)[::-1], np.float32)
     add: np.dtype[Any] = np.dtype(np.float32)

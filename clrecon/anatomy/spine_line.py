@@ -74,8 +74,7 @@ class SpineEnd:
 def follow(likeness: Likeness, path: NDArray[np.int64]) -> NDArray[np.int64]:
     """Follow the canal beyond both ends of a path (n, 3) of cells (k, j, i) by the traits of `STILL`, over `GAP_MM`."""
     below = _beyond(likeness, path[0], -1)[::-1]
-    above = _beyond(likeness, path[-1], 1)
-    return np.concatenate([below, path, above])
+    return np.concatenate([below, path, _beyond(likeness, path[-1], 1)])
 
 
 def _beyond(likeness: Likeness, last: NDArray[np.int64], step: int, *, stop: bool = True) -> NDArray[np.int64]:
@@ -211,8 +210,7 @@ def find_spine_line(volume: Volume, *, sure_only: bool = False, progress: Progre
     cells = average_cells(volume, lattice, steps.take_slice)
     likeness = measure_likeness(cells, steps.take_slice)
     path = _best_path(np.clip(likeness.worth - WORTH, -_WORST, None))
-    sure = likeness.sure[tuple(path.T)]
-    begin, end = _longest_run(sure)
+    begin, end = _longest_run(likeness.sure[tuple(path.T)])
     searched, height = len(cells.values) * CELL_MM[2], (end - begin) * CELL_MM[2]
     if height < SHORTEST_MM:
         missing = missing_traits(cells, likeness, path)
@@ -328,8 +326,7 @@ def _centre_points(cells: SpineCells, path: NDArray[np.int64]) -> Float64Array:
     reach = int(np.ceil(CANAL_WIDTH_MM / min(CELL_MM[:2]))) + 4
     for n, (k, j, i) in enumerate(path):
         rows, columns = slice(max(j - reach, 0), j + reach + 1), slice(max(i - reach, 0), i + reach + 1)
-        box = SpineCells(cells.values[:, rows, columns], cells.origin)
-        bone = grow_cortex(box, k, k + 1, 16.0)[0]
+        bone = grow_cortex(SpineCells(cells.values[:, rows, columns], cells.origin), k, k + 1, 16.0)[0]
         y, x = np.mgrid[: bone.shape[0], : bone.shape[1]] + np.array([rows.start, columns.start])[:, None, None]
         for _ in range(3):
             distance = np.hypot((y - middles[n, 0]) * CELL_MM[1], (x - middles[n, 1]) * CELL_MM[0])

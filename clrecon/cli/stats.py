@@ -114,14 +114,11 @@ def _fit_names(names: Sequence[str], rows: Sequence[Sequence[str]], width: int) 
     """Shorten the names until the table fits into the width, or few characters of them are left."""
     beside = max(len(line) for line in _name_rows([""] * len(names), rows))
     most = max(_LEAST_NAME, width - beside)
-    shown = [name if len(name) <= most else f"{name[: most - 3]}..." for name in names]
-    return _name_rows(shown, rows)
+    return _name_rows([name if len(name) <= most else f"{name[: most - 3]}..." for name in names], rows)
 
 
 def _name_rows(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    return common.table(
-        [(name, *row) for name, row in zip(names, rows, strict=True)], right=range(1, 1 + len(rows[0]))
-    )  # fmt: skip
+    return common.table([(name, *row) for name, row in zip(names, rows, strict=True)], right=range(1, 1 + len(rows[0])))
 
 
 def _ml(value: float) -> str:

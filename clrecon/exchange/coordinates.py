@@ -75,8 +75,7 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
 
 def find_places(vertices: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the first vertex at each place, (p,), in the order of vertices, and the place of each vertex, (n,)."""
-    mixed = _scramble(vertices)
-    _, first, inverse = np.unique(mixed, return_index=True, return_inverse=True)
+    _, first, inverse = np.unique(_scramble(vertices), return_index=True, return_inverse=True)
     if not np.array_equal(vertices[first][inverse], vertices):  # two places with one sum, or NaN
         _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first, kind="stable")

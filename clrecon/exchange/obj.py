@@ -70,8 +70,7 @@ def _name_object(part: Content, number: int) -> str:
 
 def _write_part(stream: BinaryIO, part: Content, before: int, normals_before: int) -> None:
     color = "" if part.color is None else " " + " ".join(f"{value:.4f}" for value in part.color)
-    line = f"v {part.number} {part.number} {part.number}{color}\n"
-    write_lines(stream, line, part.vertices)
+    write_lines(stream, f"v {part.number} {part.number} {part.number}{color}\n", part.vertices)
     face = "f %d %d %d\n"
     if part.normals is not None:
         face = "f %d//%d %d//%d %d//%d\n"
@@ -154,8 +153,7 @@ def _collect_mesh(lines: Sequence[bytes], name: str) -> RawMesh:
     if table.shape[1] not in (3, 4, 6, 7):
         raise RefusedInputError(f"{name} is corrupt: its vertices have {table.shape[1]} numbers")
     corners, of_normals = _corners(faces, before, len(table), name)
-    remarks = read_remarks(comments)
-    mesh = RawMesh("OBJ", table[:, :3], corners, **remarks)
+    mesh = RawMesh("OBJ", table[:, :3], corners, **read_remarks(comments))
     mesh.normals = _normals(normals, corners, of_normals, mesh, name)
     colors = table[:, -3:] if table.shape[1] >= 6 else None
     mesh.parts = _parts(begins[b"o"] or begins[b"g"], corners, colors)

@@ -124,14 +124,12 @@ def _fold(values: NDArray[Any], unsigned: type[np.integer[Any]], signed: type[np
     """Return differences of neighbouring rows with the sign in the lowest bit."""
     first = np.zeros((1, values.shape[1]), dtype=unsigned)
     changes = np.diff(values, axis=0, prepend=first).view(signed)
-    bits = 8 * changes.itemsize
-    return ((changes << 1) ^ (changes >> (bits - 1))).view(unsigned)
+    return ((changes << 1) ^ (changes >> (8 * changes.itemsize - 1))).view(unsigned)
 
 
 def _unfold(folded: NDArray[Any], unsigned: type[np.integer[Any]]) -> NDArray[Any]:
     """Return the rows whose differences `_fold` gave."""
-    changes = (folded >> 1) ^ -(folded & 1)
-    return np.cumsum(changes, axis=0, dtype=unsigned)
+    return np.cumsum((folded >> 1) ^ -(folded & 1), axis=0, dtype=unsigned)
 
 
 def _planes(values: NDArray[Any], count: int) -> list[bytes]:
@@ -203,9 +201,7 @@ def parse_page(page: bytes) -> tuple[dict[str, Any], CodedSurface]:
         raise ValueError("this is no page of a surface")
     facts = json.loads(blocks["facts"])
     data = base64.b64decode(blocks["surface"], validate=True)
-    return facts, CodedSurface(
-        facts["vertices"], facts["triangles"], tuple(facts["low"]), tuple(facts["step"]), data
-    )  # fmt: skip
+    return facts, CodedSurface(facts["vertices"], facts["triangles"], tuple(facts["low"]), tuple(facts["step"]), data)
 
 
 def read_facts(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -110,8 +110,7 @@ def read_mesh(path: Path) -> RawMesh:
                 for start in range(0, count, _PIECE):
                     rows = np.frombuffer(stream.read(_FACET.itemsize * min(_PIECE, count - start)), dtype=_FACET)
                     corners[start : start + len(rows)] = rows["corners"]
-                space = re.search(rb"SPACE=(\w+)", head[:80])
-                return _make_mesh(corners, space)
+                return _make_mesh(corners, re.search(rb"SPACE=(\w+)", head[:80]))
             if head.removeprefix(MARK).lstrip()[:5].lower() != b"solid":
                 raise RefusedInputError(
                     f"{name} is cut or corrupt: {count:,} triangles take {_HEAD + _FACET.itemsize * count:,} bytes, it"

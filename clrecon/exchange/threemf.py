@@ -134,8 +134,7 @@ def _description(content: Content) -> str:
     """Return the remarks and the certificate, one fact a line, with reserved characters of XML as entities."""
     remarks = content.remarks
     known = len(remarks) - len(content.certificate)
-    lines = [" ".join(remarks[:known]), *remarks[known:]]
-    return escape("\n".join(lines), quote=False)
+    return escape("\n".join([" ".join(remarks[:known]), *remarks[known:]]), quote=False)
 
 
 def verify(path: Path, content: Content | Assembly) -> None:

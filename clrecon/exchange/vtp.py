@@ -426,8 +426,7 @@ def read_numbers(document: Document, array: ElementTree.Element, count: int, wid
     if array.get("format") == "ascii":
         values = np.array((array.text or "").split(), dtype=np.float64).astype(kind)
     else:
-        data = _bytes(document, array)
-        values = np.frombuffer(data, dtype=document.order + kind).astype(kind)
+        values = np.frombuffer(_bytes(document, array), dtype=document.order + kind).astype(kind)
     if values.size != count * components:
         raise ValueError(f"the array '{array.get('Name')}' has {values.size:,} numbers, {count * components:,} needed")
     return values.reshape(count, components)
@@ -497,8 +496,7 @@ def _unpack(document: Document, source: _Raw | _From64) -> bytes:
     parts = []
     for number, length in enumerate(packed):
         expected = last_bytes if last_bytes and number == blocks - 1 else block_bytes
-        inflater = zlib.decompressobj()
-        parts.append(inflater.decompress(source.take(length), expected + 1))
+        parts.append(zlib.decompressobj().decompress(source.take(length), expected + 1))
         if len(parts[-1]) != expected:
             raise ValueError(f"a block of {expected:,} bytes has {len(parts[-1]):,}")
     return b"".join(parts)
@@ -595,6 +593,5 @@ def _parts(
         if colors is not None and colors.dtype == np.uint8 and colors.shape[1] == 3:
             red, green, blue = (colors[order[first]] / 255.0).tolist()
             color = (red, green, blue)
-        name = names[int(number)] if 0 <= number < len(names) else ""
-        parts.append(Part(name, int(count), color))
+        parts.append(Part(names[int(number)] if 0 <= number < len(names) else "", int(count), color))
     return parts

@@ -65,8 +65,7 @@ def _fault_of(volume: BaseVolume, holds_shear: bool) -> str | None:
 
 def make_sitk(voxels: NDArray[Any], affine: Float64Array) -> Any:
     """Make a ``SimpleITK.Image``, a copy, of voxels (nk, nj, ni) and their affine."""
-    sitk = import_package("SimpleITK", "an image of SimpleITK")
-    image = sitk.GetImageFromArray(voxels)
+    image = import_package("SimpleITK", "an image of SimpleITK").GetImageFromArray(voxels)
     spacing = column_spacing(affine)
     image.SetSpacing(spacing)
     image.SetOrigin(affine[:3, 3].tolist())
@@ -139,8 +138,7 @@ def take_nibabel(image: Any) -> Taken:
             else f"the image has shape {shape}, a volume has three axes"
         )
     affine = _affine_of(image)
-    values = _as_whole_numbers(np.asanyarray(image.dataobj).reshape(shape[:3]), stored)
-    return values.T, affine
+    return _as_whole_numbers(np.asanyarray(image.dataobj).reshape(shape[:3]), stored).T, affine
 
 
 def _affine_of(image: Any) -> Float64Array:

@@ -119,8 +119,7 @@ def largest_coordinate(volume: Volume, origin: Float64Array | None = None, borde
     """Largest coordinate in mm in the volume's slices, relative to `origin`, with `border` layers around it."""
     ni, nj, _ = volume.shape_ijk
     steps = np.array(list(product((-border, ni - 1 + border), (-border, nj - 1 + border))), dtype=np.float64)
-    origins = volume.slice_origins(border)
-    corners = origins[:, None] + steps @ volume.affine[:3, :2].T
+    corners = volume.slice_origins(border)[:, None] + steps @ volume.affine[:3, :2].T
     return float(np.abs(corners if origin is None else corners - origin).max())
 
 

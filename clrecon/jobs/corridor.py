@@ -196,8 +196,7 @@ def _name_files(files: MeshFiles, names: Sequence[str]) -> None:
     if files.output is not None:
         ends = ["".join(pair) for pair in product(names, ("", "_left", "_right"))]
         meshes = [("the mesh", path) for path in name_outputs(files.output, ends)]
-    report = [] if files.report is None else [("the report", files.report)]
-    check_files(pictures, meshes, report)
+    check_files(pictures, meshes, [] if files.report is None else [("the report", files.report)])
 
 
 def _choose_level(volume: Volume, settings: CorridorSettings, progress: Progress) -> tuple[float, IsoChoice | None]:
@@ -256,8 +255,7 @@ def _grade_screws(
             position = numbers.index(number)
         else:
             axis = screw.entry + np.linspace(0.0, 1.0, 41)[:, None] * (screw.tip - screw.entry)
-            depths = [float(each.bone.depth(axis).mean()) for each in corridors]
-            position = int(np.argmax(depths))
+            position = int(np.argmax([float(each.bone.depth(axis).mean()) for each in corridors]))
         measured = corridors[position]
         graded[position].append((screw, grade_screw(measured.bone, measured.frame, screw, measured.name)))
     return graded

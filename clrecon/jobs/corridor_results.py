@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -162,41 +163,37 @@ _LEAST_RISE = 1e-6
 """Rise of an axis over a plane, as a share of its length, below which the axis lies in the plane."""
 
 
-def _sample_plane(volume: Volume, centre: Float64Array, right: Float64Array, down: Float64Array) -> NDArray[np.float32]:
-    """Return HU (trilinear) of a plane of `_WIDTH_MM`, shape (`PIXELS`, `PIXELS`); air beyond the scan."""
-    steps = (np.arange(PIXELS) - (PIXELS - 1) / 2.0) * (_WIDTH_MM / PIXELS)
-    points = centre + steps[:, None, None] * down + steps[None, :, None] * right
-    return sample_volume(volume, points.reshape(-1, 3)).reshape(PIXELS, PIXELS)
+@dataclass(frozen=True, eq=False)
+class _Plane:
+    centre: Float64Array
+    right: Float64Array
+    down: Float64Array
 
+    def sample(self, volume: Volume) -> NDArray[np.float32]:
+        """Return HU (trilinear) of a square of `_WIDTH_MM`, shape (`PIXELS`, `PIXELS`); air beyond the scan."""
+        steps = (np.arange(PIXELS) - (PIXELS - 1) / 2.0) * (_WIDTH_MM / PIXELS)
+        points = self.centre + steps[:, None, None] * self.down + steps[None, :, None] * self.right
+        return sample_volume(volume, points.reshape(-1, 3)).reshape(PIXELS, PIXELS)
 
-def _flatten_points(
-    points: Float64Array, centre: Float64Array, right: Float64Array, down: Float64Array
-) -> Float64Array:
-    return np.stack(((points - centre) @ right, (points - centre) @ down), axis=1)
+    def flatten(self, points: Float64Array) -> Float64Array:
+        return np.stack(((points - self.centre) @ self.right, (points - self.centre) @ self.down), axis=1)
 
+    def along(self, ends: Float64Array, radius: float, color: Any) -> list[Stroke]:
+        """Return the two sides of a cylinder that lies in the plane, and its axis."""
+        flat = self.flatten(ends)
+        along = (flat[1] - flat[0]) / max(float(np.linalg.norm(flat[1] - flat[0])), 1e-9)
+        across = radius * np.array((-along[1], along[0]))
+        frame = np.stack((flat[0] + across, flat[1] + across, flat[1] - across, flat[0] - across, flat[0] + across))
+        return [Stroke(frame, color), Stroke(flat, color)]
 
-def _along(
-    centre: Float64Array, right: Float64Array, down: Float64Array, ends: Float64Array, radius: float, color: Any
-) -> list[Stroke]:
-    """Return the two sides of a cylinder that lies in the plane, and its axis."""
-    flat = _flatten_points(ends, centre, right, down)
-    along = (flat[1] - flat[0]) / max(float(np.linalg.norm(flat[1] - flat[0])), 1e-9)
-    across = radius * np.array((-along[1], along[0]))
-    frame = np.stack((flat[0] + across, flat[1] + across, flat[1] - across, flat[0] - across, flat[0] + across))
-    return [Stroke(frame, color), Stroke(flat, color)]
-
-
-def _across(
-    centre: Float64Array, right: Float64Array, down: Float64Array, ends: Float64Array, radius: float, color: Any
-) -> list[Stroke]:
-    """Return the circle where a cylinder's axis meets the plane; of one that lies in the plane, its section."""
-    normal = np.cross(right, down)
-    height, far_height = (ends - centre) @ normal
-    if abs(far_height - height) > _LEAST_RISE * float(np.linalg.norm(ends[1] - ends[0])):
-        crossing = ends[0] + height / (height - far_height) * (ends[1] - ends[0])
-        return [Stroke(_flatten_points(crossing[None], centre, right, down), color, radius)]
-    half_width = np.sqrt(max(radius**2 - height**2, 0.0))
-    return _along(centre, right, down, ends, float(half_width), color) if half_width > 0.0 else []
+    def across(self, ends: Float64Array, radius: float, color: Any) -> list[Stroke]:
+        """Return the circle where a cylinder's axis meets the plane; of one that lies in the plane, its section."""
+        height, far_height = (ends - self.centre) @ np.cross(self.right, self.down)
+        if abs(far_height - height) > _LEAST_RISE * float(np.linalg.norm(ends[1] - ends[0])):
+            crossing = ends[0] + height / (height - far_height) * (ends[1] - ends[0])
+            return [Stroke(self.flatten(crossing[None]), color, radius)]
+        half_width = np.sqrt(max(radius**2 - height**2, 0.0))
+        return self.along(ends, float(half_width), color) if half_width > 0.0 else []
 
 
 def draw_corridors(
@@ -249,35 +246,25 @@ def _draw_row(
     planes = ((left, back, "in the plane of line and left"), (back, -up, "of line and cranial"), (-left, -up, "across"))
     panels = []
     for number, (right, down, caption) in enumerate(planes):
-        strokes: list[Stroke] = []
-        for radius, pair, color in _cylinders(corridor, ends, screws, margin):
-            if number < 2:
-                strokes += _along(centre, right, down, pair, radius, color)
-            else:
-                strokes += _across(centre, right, down, pair, radius, color)
+        plane = _Plane(centre, right, down)
+        draw = plane.along if number < 2 else plane.across
+        strokes = list(chain(*(draw(*cylinder) for cylinder in _cylinders(corridor, ends, screws, margin))))
         edges = tuple(orientation_letters(way)[:1] for way in (-right, right, -down, down))
-        panels.append(
-            Panel(
-                _sample_plane(volume, centre, right, down),
-                _WIDTH_MM / PIXELS,
-                [*lines, caption] if number == 0 else [caption],
-                strokes,
-                edges,  # type: ignore[arg-type]
-            )
-        )
+        words = [*lines, caption] if number == 0 else [caption]
+        panels.append(Panel(plane.sample(volume), _WIDTH_MM / PIXELS, words, strokes, edges))  # type: ignore[arg-type]
     return panels
 
 
 def _cylinders(
     corridor: Corridor, ends: Float64Array, screws: Sequence[Screw], margin: float
-) -> list[tuple[float, Float64Array, tuple[int, int, int]]]:
-    """Return radius, ends and colour of what is drawn: corridor, largest screw, given screws."""
+) -> list[tuple[Float64Array, float, tuple[int, int, int]]]:
+    """Return ends, radius and colour of what is drawn: corridor, largest screw, given screws."""
     drawn = []
     if corridor.radius is not None:
-        drawn.append((corridor.radius, ends, _CORRIDOR))
+        drawn.append((ends, corridor.radius, _CORRIDOR))
         if corridor.radius > margin:
-            drawn.append((corridor.radius - margin, ends, LIMIT))
-    drawn += [(screw.diameter / 2.0, np.stack((screw.entry, screw.tip)), GIVEN) for screw in screws]
+            drawn.append((ends, corridor.radius - margin, LIMIT))
+    drawn += [(np.stack((screw.entry, screw.tip)), screw.diameter / 2.0, GIVEN) for screw in screws]
     return drawn
 
 

@@ -41,8 +41,7 @@ def describe_input(
     if selected.chosen is not None:
         problem = _judge_entry(next(entry for entry in entries if entry["number"] == selected.chosen))
         if problem is None:
-            failed = _judge_gates(listing) if settings.strict else None
-            return InputListing(listing, notes, failed)
+            return InputListing(listing, notes, _judge_gates(listing) if settings.strict else None)
         refused, listing["chosen"] = selected.chosen, None
         notes.append(str(problem))
     if settings.series is None and not settings.strict and any(not entry["problems"] for entry in entries):

@@ -170,8 +170,7 @@ def _check_files(
     outputs = check_outputs(output, report_path, first)
     if picture is not None:
         check_pictures(picture, settings.view)
-        drawn = [("the picture", path) for path in name_outputs(picture, first)]
-        outputs += drawn
+        outputs += [("the picture", path) for path in name_outputs(picture, first)]
         check_files(outputs)
     check_kept(outputs, source, settings.labels)
 

@@ -194,8 +194,7 @@ def _mask_of(
     from clrecon.operators.masks.mask import Mask
 
     if rule.kind == "box":
-        corners = np.asarray(rule.numbers).reshape(3, 2)
-        turned = np.sort(_to_lps(corners.T, space), axis=0)
+        turned = np.sort(_to_lps(np.asarray(rule.numbers).reshape(3, 2).T, space), axis=0)
         return Mask.from_box(resident, turned.T.reshape(-1).tolist())
     if rule.kind == "hu":
         return Mask.from_band(resident, (rule.numbers[0], rule.numbers[1]))

@@ -218,6 +218,5 @@ def _slopes(heights: Float64Array, middles: Float64Array) -> Float64Array:
 
 def _front_of(section: Bits, x: Float64Array, y: Float64Array) -> tuple[float, float]:
     """Return the middle of a section from side to side, and its front: the median over columns of their lowest y."""
-    columns = section.any(axis=0)
-    lowest = np.where(section, y, np.inf).min(axis=0)[columns]
+    lowest = np.where(section, y, np.inf).min(axis=0)[section.any(axis=0)]
     return float(x[section].min() + x[section].max()) / 2.0, float(np.median(lowest))

@@ -117,8 +117,7 @@ def _read_segments(grid: GridFile) -> tuple[list[_Segment], list[str]]:
     empty = [n for n, value in values.items() if value == 0]
     if empty:
         remarks.append(f"{len(empty)} of {len(names)} segments have LabelValue 0, which is no label: left out")
-    segments = [_Segment(v, names[n], layers.get(n, 0), v) for n, v in values.items() if v != 0]
-    return segments, remarks
+    return [_Segment(v, names[n], layers.get(n, 0), v) for n, v in values.items() if v != 0], remarks
 
 
 def _read_numbers(grid: GridFile, segments: Iterable[int], key: str) -> dict[int, int]:

@@ -368,5 +368,4 @@ def label_ml(labels: LabelMap, number: int) -> float:
 
 def count_ml(voxels: NDArray[Any], number: int, box: Box, voxel_ml: NDArray[np.float64]) -> float:
     """Return the ml of the voxels with a number, which all lie in the box; `voxel_ml` is that of `slice_voxel_ml`."""
-    counts = np.count_nonzero(voxels[box] == number, axis=(1, 2))
-    return float(counts @ voxel_ml[box[0]])
+    return float(np.count_nonzero(voxels[box] == number, axis=(1, 2)) @ voxel_ml[box[0]])

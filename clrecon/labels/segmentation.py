@@ -289,8 +289,7 @@ def _parse_dataset(path: Path, name: str, most: int = LARGEST_BYTES) -> Any:
     from pydicom.filereader import read_file_meta_info
 
     try:
-        meta = read_file_meta_info(path)
-        syntax = str(meta.get("TransferSyntaxUID", ""))
+        syntax = str(read_file_meta_info(path).get("TransferSyntaxUID", ""))
         if syntax not in (IMPLICIT_LITTLE, EXPLICIT_LITTLE, RLE):
             raise RefusedInputError(
                 f"{name} is stored with transfer syntax {escape_text(syntax)}: of DICOM SEG uncompressed little endian"

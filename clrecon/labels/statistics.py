@@ -185,8 +185,7 @@ def _take_values(
     if box is None:
         return volume.voxels[:0, 0, 0], np.zeros(0)
     mask = labels[box] == number
-    counts = np.count_nonzero(mask, axis=(1, 2))
-    return volume.voxels[box][mask], np.repeat(voxel_ml[box[0]], counts)
+    return volume.voxels[box][mask], np.repeat(voxel_ml[box[0]], np.count_nonzero(mask, axis=(1, 2)))
 
 
 def _measure_values(values: NDArray[Any], ml: NDArray[np.float64], percentiles: Sequence[float]) -> dict[str, Any]:

@@ -178,8 +178,7 @@ def _decimals(values: Any) -> list[Any]:
 def _shared(labels: LabelMap) -> Any:
     di, dj, _ = labels.spacing
     row, column = labels.affine[:3, 0] / di, labels.affine[:3, 1] / dj
-    step = labels.affine[:3, 2]
-    gap = _decimals([abs(float(np.cross(row, column) @ step))])[0]
+    gap = _decimals([abs(float(np.cross(row, column) @ labels.affine[:3, 2]))])[0]
     measures = _item(PixelSpacing=_decimals((dj, di)), SliceThickness=gap, SpacingBetweenSlices=gap)
     return _item(
         PixelMeasuresSequence=[measures],

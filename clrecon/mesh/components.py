@@ -100,7 +100,7 @@ def keep_triangles(mesh: Own, is_kept: NDArray[np.bool_]) -> Own:
     normals = None if mesh.normals is None else mesh.normals[used]
     reduced = type(mesh)(
         mesh.vertices[used], number[triangles].astype(np.uint32), normals, dict(mesh.report), trusted=True
-    )  # fmt: skip
+    )
     return give_values(mesh, reduced, used, is_kept)
 
 

@@ -153,8 +153,7 @@ class PagePool:
     def empty(self, shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
         """Return an uninitialised array, C-contiguous, aligned for every vector type."""
         dtype = np.dtype(dtype)
-        count = int(np.prod(shape, dtype=object))
-        size = count * dtype.itemsize
+        size = int(np.prod(shape, dtype=object)) * dtype.itemsize
         if size < SMALLEST_BYTES:
             return np.empty(shape, dtype)
         block = self._take(size)

@@ -170,7 +170,8 @@ def prepare_caches() -> Caches:
         os.environ["PYOPENCL_NO_CACHE"] = "1"
     if home_name in faults or f"{home_name}/mesa_shader_cache" in faults:
         os.environ.update(_MESA_OFF)
-    warnings = (f"caches of built kernels are not used, every process builds them anew: {_join_faults(faults)}",)
+    found = "; ".join(f"{name} {fault}" for name, fault in faults.items())
+    warnings = (f"caches of built kernels are not used, every process builds them anew: {found}",)
     refusal = ""
     if of_pocl:
         pocl, refusal = _temporary_folder(pocl)
@@ -201,10 +202,6 @@ def _temporary_folder(refused: Path) -> tuple[Path, str]:
     folder = Path(temporary) / _OWN
     fault = find_fault(folder)
     return folder, fault and f"the temporary folder {fault}"
-
-
-def _join_faults(faults: dict[str, str]) -> str:
-    return "; ".join(f"{name} {fault}" for name, fault in faults.items())
 
 
 def cache_warnings() -> tuple[str, ...]:

@@ -150,7 +150,9 @@ def load_program(device: Device, name: str, variants: Mapping[str, str] | None =
 
 
 def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
-    source, start = _complete(device, read_kernel_source(name)), time.perf_counter()
+    source, start = read_kernel_source(name), time.perf_counter()
+    if device.first_header:
+        source = read_kernel_source(device.first_header) + source
     if device.trace is not None:
         device.trace(f"the build of cl/{name}")
     if device.known_good is not None:
@@ -171,11 +173,6 @@ def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
     origin = "source" if from_binary is None else "a kept binary"
     log.debug("cl/%s %s built from %s in %.3f s", name, options, origin, time.perf_counter() - start)
     return program
-
-
-def _complete(device: Device, source: str) -> str:
-    """Return the text of a kernel file with the header that the device needs before it."""
-    return read_kernel_source(device.first_header) + source if device.first_header else source
 
 
 def _key(device: Device, source: str, options: tuple[str, ...]) -> str:

@@ -103,8 +103,7 @@ def distance_ratios(
 
     means, nearest: Mean distance of each point (n,) to its neighbours, itself not among them, and to the nearest, mm.
     """
-    counts = np.bincount(cells)
-    spacing = np.bincount(cells, nearest) / np.maximum(counts, 1)
+    spacing = np.bincount(cells, nearest) / np.maximum(np.bincount(cells), 1)
     expected = spacing[cells]
     apart = np.asarray(means, dtype=np.float64)
     return np.divide(apart, expected, out=np.where(apart > 0.0, np.inf, 0.0), where=expected > 0.0)

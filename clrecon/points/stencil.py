@@ -93,8 +93,7 @@ class Stencil:
     @property
     def joins_columns(self) -> bool:
         """True where neighbouring voxels of a row are within eps."""
-        in_column = (self.rows[:, 0] == 0) & (self.rows[:, 1] == 0)
-        return bool((self.rows[in_column, 3] > 0).any())
+        return bool((self.rows[(self.rows[:, 0] == 0) & (self.rows[:, 1] == 0), 3] > 0).any())
 
     def holds(self, shape_ijk: tuple[int, int, int]) -> bool:
         """Tell whether all voxels of a volume of this shape are within eps of each other."""
@@ -114,8 +113,7 @@ class Stencil:
                 own_rows = self.rows[begin:end]
                 dj, dk = own_rows[:, 0], own_rows[:, 1]
                 after = own_rows[(dk > 0) | ((dk == 0) & (dj >= 0))].copy()
-                same = (after[:, 0] == 0) & (after[:, 1] == 0)
-                after[same, 2] = 1
+                after[(after[:, 0] == 0) & (after[:, 1] == 0), 2] = 1
                 first = sum(map(len, rows))
                 rows.append(after[after[:, 3] >= after[:, 2]])
                 done[begin, end] = first, first + len(rows[-1])
@@ -139,8 +137,7 @@ def make_stencil(lattice: Lattice, eps: float) -> Stencil:
         ahead = [plane.rows_at(dk * step, dk) for dk in range(nk) if dk == 0 or plane.reaches(dk * step)]
         whole = np.concatenate([*ahead, *map(_mirror, ahead[1:])])
         whole = whole[_order(plane, whole, whole[:, 1:2] * step)]
-        tables = np.tile(np.array([[0, len(whole)]], np.int32), (nk, 1))
-        return _finish_stencil(nk, [whole], tables)
+        return _finish_stencil(nk, [whole], np.tile(np.array([[0, len(whole)]], np.int32), (nk, 1)))
     return _finish_stencil(nk, *_uneven_tables(lattice.origins, plane))
 
 
@@ -179,8 +176,7 @@ class _Plane:
         first = np.where(self._within(aim, first - 1), first - 1, np.where(self._within(aim, first), first, first + 1))
         last = np.where(self._within(aim, last + 1), last + 1, np.where(self._within(aim, last), last, last - 1))
         first, last = np.maximum(first, 1 - self.ni), np.minimum(last, self.ni - 1)
-        rows = np.stack([dj, np.full_like(dj, dk), first, last], axis=1)
-        return rows[first <= last].astype(np.int32)
+        return np.stack([dj, np.full_like(dj, dk), first, last], axis=1)[first <= last].astype(np.int32)
 
     def _within(self, aim: Float64Array, di: NDArray[np.int64]) -> NDArray[np.bool_]:
         near: NDArray[np.bool_] = ((aim + di[:, None] * self.steps[:, 0]) ** 2).sum(axis=1) <= self.radius**2

@@ -68,9 +68,10 @@ def _fill_folder(folder: Path, chosen: Device, progress: Progress | None) -> dic
     settings = PhantomSettings(kind="spine", size=(256, 192), slices=110, spacing=(1.0, 1.0, 1.25))
     truth = write_phantom(folder / "ct", settings, progress=progress)
     watch.lap("phantom")
-    picture = make_pictures(
-        folder / "ct", PictureFiles(folder / "bone.png"), _choose_look(str(chosen.index)), progress=progress
+    look = RenderSettings.of(
+        preset="bone", views=["25,10"], ray_step=0.25, letters=True, scale_bar=True, device=str(chosen.index)
     )
+    picture = make_pictures(folder / "ct", PictureFiles(folder / "bone.png"), look, progress=progress)
     watch.lap("picture")
     report = make_mesh(
         folder / "ct",
@@ -93,10 +94,6 @@ def _fill_folder(folder: Path, chosen: Device, progress: Progress | None) -> dic
         "mesh": report,
         "picture": picture,
     }
-
-
-def _choose_look(device: str) -> RenderSettings:
-    return RenderSettings.of(preset="bone", views=["25,10"], ray_step=0.25, letters=True, scale_bar=True, device=device)
 
 
 def check_sphere(device: Device) -> dict[str, Any]:

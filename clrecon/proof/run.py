@@ -118,8 +118,7 @@ def _run_part(
                 yield result
             if not left or is_over.is_set():
                 return
-            words = child.describe_end()
-            yield _failed(left[0], words, child.seconds)
+            yield _failed(left[0], child.describe_end(), child.seconds)
             left = left[1:]
             if child.hangs:
                 for check in left:

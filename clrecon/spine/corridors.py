@@ -494,7 +494,6 @@ def _walls(
     offsets, _ = segment_offsets(surface, first, last)
     distance = np.linalg.norm(offsets, axis=1)
     nearest = int(distance.argmin())
-    across = (offsets[nearest] / distance[nearest]) @ frame.axes
-    voxel = float(np.abs(bone.steps.T @ across).max())
+    voxel = float(np.abs(bone.steps.T @ ((offsets[nearest] / distance[nearest]) @ frame.axes)).max())
     beside = distance <= radius + BESIDE_MM
     return float(distance[nearest]), 2.0 * radius / voxel, float(bone.by_hu[beside].mean())

@@ -208,8 +208,7 @@ def look_at_bodies(scan: Field) -> Looks:
     middle = 0.5 * (BODY_BACK_MM + front)
     n = len(scan)
     brightness = np.full((n, len(TILTS_DEG)), np.nan, np.float32)
-    shares = np.linspace(0.1, 0.9, 13)
-    ahead = BODY_BACK_MM + shares * (front - BODY_BACK_MM)[:, None]
+    ahead = BODY_BACK_MM + np.linspace(0.1, 0.9, 13) * (front - BODY_BACK_MM)[:, None]
     for tilt_number, tilt in enumerate(np.radians(TILTS_DEG)):
         along = np.arange(n)[:, None] + np.tan(tilt) * (ahead - middle[:, None])
         middle_hu = _median(_lines(core, along, ahead), least=0.75)
@@ -287,8 +286,7 @@ def _usual_depth(best: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the depth of a usual disc at each place: the scan's, or less where all within reach are shallower."""
     from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-    near = _GAPS_MM[0] // 2
-    highest = maximum_filter1d(best, 2 * near + 1, mode="nearest")
+    highest = maximum_filter1d(best, 2 * (_GAPS_MM[0] // 2) + 1, mode="nearest")
     peaks = np.where((best > 0) & (best == highest), best, 0.0).astype(np.float64)
     if not peaks.any():
         return np.zeros(len(best))

@@ -125,8 +125,7 @@ def _look_through(points: Float64Array) -> tuple[float, Float64Array, Float64Arr
         good = pairs[radii >= 0.93 * radii.max()]
         middle = good[np.abs(good - pairs[radii.argmax()]).max(axis=1) <= 2.0 * step].mean(axis=0)
         step /= 2.0
-        offsets = np.arange(-2, 3) * step
-        tried = [(middle[0] + a, middle[1] + b) for a, b in product(offsets, repeat=2)]
+        tried = [(middle[0] + a, middle[1] + b) for a, b in product(np.arange(-2, 3) * step, repeat=2)]
     basis = _basis(*middle)
     radius, centre = _hole(points, basis, PIXELS_MM[1])
     return radius, basis, centre
@@ -156,8 +155,7 @@ def find_frame(bone: SolidBone, subject: str) -> VertebraFrame:
     up = basis[2]
     axes = _point_front(middle, canal_point, up)
     for _ in range(4):
-        local = (points - middle) @ axes.T
-        up, shift, height = _fit_plates(local, axes, subject)
+        up, shift, height = _fit_plates((points - middle) @ axes.T, axes, subject)
         middle = middle + shift * axes[2]
         axes = _point_front(middle, canal_point + ((middle - canal_point) @ basis[2]) * basis[2], up)
     middle, axes = _halve(bone, points, middle, axes)

@@ -129,8 +129,7 @@ def measure_bias(bone: SolidBone, frame: VertebraFrame, first: Float64Array, las
         begin = max(0, wall - near)
         peak = begin + int(hu[begin : wall + 1].argmax())
         # tissue up to where HU rise again, to the next bone
-        beyond = hu[wall : wall + near]
-        low = float(beyond.min())
+        low = float(hu[wall : wall + near].min())
         half = (float(hu[peak]) + low) / 2.0
         below = np.flatnonzero(hu[peak : wall + near] < half)
         crossed = np.flatnonzero(hu[peak : wall + near] < bone.level)

@@ -112,8 +112,7 @@ def cut_part(volume: Volume, course: Course, looks: Looks) -> Part:
     from scipy.ndimage import maximum_filter1d
 
     sides = list(product((-_RIB_MM[1], _RIB_MM[1]), (-_FRONT_MM, _BEHIND_MM)))
-    corners = np.concatenate([course.canal + np.array([x, y, 0.0]) for x, y in sides])
-    ijk = volume.lps_to_ijk(corners)
+    ijk = volume.lps_to_ijk(np.concatenate([course.canal + np.array([x, y, 0.0]) for x, y in sides]))
     low = np.clip(np.floor(ijk.min(axis=0)).astype(int), 0, np.array(volume.shape_ijk) - 1)
     high = np.clip(np.ceil(ijk.max(axis=0)).astype(int) + 1, low + 1, volume.shape_ijk)
     box = volume.voxels[low[2] : high[2], low[1] : high[1], low[0] : high[0]]

@@ -200,8 +200,7 @@ def fill_vertebra(
     Inside is what has the level, HU, and is the label's own (or one voxel beyond), and what that encloses, see
     `clrecon.labels.label_levels.fill_solid`.  The canal is open above and below, and so stays outside.
     """
-    spacing = np.array(volume.spacing)
-    margin = tuple(int(np.ceil(MARGIN_MM / step)) + 1 for step in spacing[::-1])
+    margin = tuple(int(np.ceil(MARGIN_MM / step)) + 1 for step in np.array(volume.spacing)[::-1])
     box = label_box(labels, number, margin)  # type: ignore[arg-type]
     if box is None:
         raise RefusedInputError(f"no voxel of {subject} lies in the scan")

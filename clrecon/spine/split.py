@@ -34,7 +34,7 @@ from clrecon.spine.discs import (
     follow_canal,
     look_at_bodies,
     sample_course,
-)  # fmt: skip
+)
 from clrecon.spine.regions import CONFIDENT, Piece, beside_share, cut_part, divide, fill_bone, judge, planes_of, weigh
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.base_classes import Message
@@ -43,9 +43,7 @@ from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 from clrecon.system.text import count_of
 
-LEVELS = (
-    *(f"C{n}" for n in range(1, 8)), *(f"T{n}" for n in range(1, 13)), *(f"L{n}" for n in range(1, 7))
-)  # fmt: skip
+LEVELS = (*(f"C{n}" for n in range(1, 8)), *(f"T{n}" for n in range(1, 13)), *(f"L{n}" for n in range(1, 7)))
 """Levels from the head downwards; place n has the number n + 1 in the VerSe data set, L6 included."""
 
 

@@ -34,8 +34,7 @@ def in_python(parameter: str, value: object = None) -> str:
     """Return the words for a caller in Python; capital letters stand for a value: ``N``, ``(BONE, TISSUE)``."""
     if value is None:
         return parameter
-    placeholder = isinstance(value, str) and value == value.upper()
-    return f"{parameter}={value if placeholder else repr(value)}"
+    return f"{parameter}={value if isinstance(value, str) and value == value.upper() else repr(value)}"
 
 
 _DESTINATIONS = {

@@ -176,8 +176,7 @@ def wall_thickness(
     Returns: ndarray, shape (samples,), mm. NaN where the ray meets nothing: between triangles that do not close, or on
         an edge.
     """
-    origin = local_origin(vertices)
-    near = vertices - origin
+    near = vertices - local_origin(vertices)
     points, rows = sample_surface_points(near, triangles, samples)
     a, b, c = near[triangles[rows]].transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)

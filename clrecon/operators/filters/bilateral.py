@@ -223,8 +223,7 @@ def run_bilateral(
 ) -> Filtered:
     """Filter the voxels of a volume, slab by slab where they do not fit the device as a whole."""
     run = _Run(resident, settings, stopwatch or Stopwatch(), progress)
-    nk = resident.volume.shape_ijk[2]
-    planned = resident.plan(_BILATERAL, nk, run.needs)
+    planned = resident.plan(_BILATERAL, resident.volume.shape_ijk[2], run.needs)
     if planned == 0:
         limits = resident.limits
         raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
@@ -308,9 +307,7 @@ class _Run:
             there_first, there_end = max(0, first - self.halo), min(end + self.halo, self.nk)
             voxels_d = self.resident.part(there_first, there_end, stopwatch)
             part, part_d = ocl.empty_output(device, (end - first, self.nj, self.ni), self.dtype)
-            there = SlicesThere(
-                voxels_d, self.ni, self.nj, there_first, there_end - there_first, first, end - first
-            )  # fmt: skip
+            there = SlicesThere(voxels_d, self.ni, self.nj, there_first, there_end - there_first, first, end - first)
             groups += self._filter(there, part_d)
             with stopwatch.timed("download"):
                 filtered[first:end] = ocl.download(device, part, part_d)

@@ -394,8 +394,7 @@ def _measure_ml(mask: Mask, ml: NDArray[np.float64]) -> float:
 def _lies_in_air(bone: Mask, sealed: Mask, spaces: Spaces, seal_mm: float) -> bool:
     """Tell whether most of what lies beside the bone, outside, is air, as round a specimen."""
     inner = sealed | spaces.choose(np.ones(spaces.count, bool))
-    step = float(np.max(bone.scan.spacing))
-    beside = bone.dilate(2.0 * max(seal_mm, step)) - inner
+    beside = bone.dilate(2.0 * max(seal_mm, float(np.max(bone.scan.spacing)))) - inner
     low = float(np.finfo(np.float32).min)
     air = Mask.from_band(bone.scan, (low, AIR_LIMIT_HU), device=bone.device, memory=bone.memory)
     return bool(2 * (beside & air).count > beside.count)

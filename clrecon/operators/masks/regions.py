@@ -137,8 +137,7 @@ def _capsule(
         spans.append((np.maximum(side[0], between[0]), np.minimum(side[1], between[1])))
     ends = [(np.where(a <= b, a, np.inf), np.where(a <= b, b, -np.inf)) for a, b in spans]
     first = np.minimum.reduce([a for a, _ in ends])
-    last = np.maximum.reduce([b for _, b in ends])
-    return k * nj + j, first, last
+    return k * nj + j, first, np.maximum.reduce([b for _, b in ends])
 
 
 def _within(away: Float64Array, step: Float64Array, radius: float) -> Ends:

@@ -284,8 +284,8 @@ def find_extents(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int]) -
 
 
 def replace_outside(
-    device: Device, voxels_d: Any, dtype: np.dtype[Any], mask_d: Any, shape_ijk: tuple[int, int, int], outside: float,
-) -> tuple[NDArray[Any], Any]:  # fmt: skip
+    device: Device, voxels_d: Any, dtype: np.dtype[Any], mask_d: Any, shape_ijk: tuple[int, int, int], outside: float
+) -> tuple[NDArray[Any], Any]:
     """Return voxels with `outside` where the mask is not set: a host array, (nk, nj, ni), and a buffer."""
     ni, nj, nk = shape_ijk
     words, rows = _words(shape_ijk)

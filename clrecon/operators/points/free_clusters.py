@@ -80,8 +80,7 @@ def plan_cells(points: ArrayLike, eps: float) -> GridPlan:
     if float(np.sqrt((extent**2).sum())) <= eps:  # one cell, whatever the number of points
         return plan_grid(places, 1.01 * float(extent.max()) if extent.any() else 1.0)
     edge = eps / math.sqrt(3.0)
-    along = float(extent.max()) / edge
-    return plan_grid(places, edge * (1.0 - _CELL_SLACK - min(4e-7 * along, 0.1)))
+    return plan_grid(places, edge * (1.0 - _CELL_SLACK - min(4e-7 * (float(extent.max()) / edge), 0.1)))
 
 
 def cluster_free_points(
@@ -148,8 +147,7 @@ def find_clusters(
     progress: Progress = ignore_progress,
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], int, int]:
     """Return labels, cores, numbers of clusters and cells of a plan; equal for any `per_chunk` of `_CELLS_AN_ITEM`."""
-    n = len(plan.points)
-    needs = {**plan.needs(device), "clusters": 23 * n}
+    needs = {**plan.needs(device), "clusters": 23 * len(plan.points)}
     ocl.require_room(ocl.memory_limits(device, memory), needs, "the clusters of the points cannot be found")
     grid = fill_grid(device, plan, memory=memory)
     progress("clusters", 1, 4)

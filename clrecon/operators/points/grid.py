@@ -146,8 +146,7 @@ def plan_grid(points: ArrayLike, edge: float) -> GridPlan:
         places, box = (places - base).astype(np.float32), (box - base).astype(np.float32)
     cell = np.float32(edge)
     corner = (box[0].astype(np.float64) - MARGIN * float(cell)).astype(np.float32)
-    shape = _count_cells(box, corner, cell)
-    return GridPlan(places, base, corner, cell, shape)
+    return GridPlan(places, base, corner, cell, _count_cells(box, corner, cell))
 
 
 def _count_cells(box: NDArray[np.float32], corner: NDArray[np.float32], edge: np.float32) -> tuple[int, int, int]:

@@ -141,8 +141,7 @@ def grow_cells(
     grid = fill_grid(device, plan, memory=memory)
     labels = _label_cells(device, program, grid, fewest)
     starts = ocl.download(device, np.empty(grid.cells + 1, np.uint32), grid.starts_d).astype(np.int64)
-    counts = starts[1:] - starts[:-1]
-    kinds, facts = _judge_cells(labels, counts, threshold, largest)
+    kinds, facts = _judge_cells(labels, starts[1:] - starts[:-1], threshold, largest)
     removed, removed_d = ocl.empty_output(device, (grid.n,), np.uint8)
     ocl.launch(
         device, program["mark_places"], grid.cells,

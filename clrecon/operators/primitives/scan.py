@@ -62,8 +62,7 @@ def exclusive_scan(device: Device, counts_d: Any, n: int, *, in_place: bool = Fa
     _check_size(n)
     offsets_d = counts_d if in_place else allocate(device, 4 * n)
     total_d = enqueue_scan(device, counts_d, offsets_d, n)
-    total = download(device, np.empty(1, dtype=np.uint64), total_d)
-    return Scanned(offsets_d, total_d, int(total[0]))
+    return Scanned(offsets_d, total_d, int(download(device, np.empty(1, dtype=np.uint64), total_d)[0]))
 
 
 def _check_size(n: int) -> None:
@@ -118,9 +117,7 @@ def compact(device: Device, mask_d: Any, words: int) -> Compacted:
     program = _load_compact(device)
     chunks = -(-words // COMPACT_WORDS)
     counts_d = allocate(device, 4 * chunks)
-    launch(
-        device, program["count_set_bits"], chunks, mask=mask_d, counts=counts_d, words=words
-    )  # fmt: skip
+    launch(device, program["count_set_bits"], chunks, mask=mask_d, counts=counts_d, words=words)
     scanned = exclusive_scan(device, counts_d, chunks)
     positions_d = allocate(device, 4 * scanned.total)
     launch(

@@ -226,4 +226,4 @@ def make_part(mesh: Mesh, look: MeshLook) -> MeshPart:
     planes = np.zeros((0, 4)) if look.clip is None else look.clip.planes
     return MeshPart(
         vertices, mesh.triangles, normals, tuple(look.rgb.tolist()), colors, look.opacity, look.light, planes, base
-    )  # fmt: skip
+    )

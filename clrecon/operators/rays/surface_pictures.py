@@ -184,5 +184,4 @@ def _slices_per_mm(volume: Volume) -> float:
     """Return the most slices that a ray crosses in a mm."""
     origins = volume.slice_origins(border=1)
     normal = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
-    gaps = np.abs(np.diff(origins @ (normal / np.linalg.norm(normal))))
-    return float(1.0 / gaps.min())
+    return float(1.0 / np.abs(np.diff(origins @ (normal / np.linalg.norm(normal)))).min())

@@ -17,9 +17,7 @@ from clrecon.geometry.iso_rule import slice_normal_matrices
 from clrecon.opencl import Device, Program, allocate, kernel_constant, launch, load_program, upload
 from clrecon.system.light_dataclass import dataclass
 
-_NAMES = {
-    "int8": "char", "uint8": "uchar", "int16": "short", "uint16": "ushort", "int32": "int", "float32": "float",
-}  # fmt: skip
+_NAMES = {"int8": "char", "uint8": "uchar", "int16": "short", "uint16": "ushort", "int32": "int", "float32": "float"}
 
 
 def voxel_variants(dtype: DTypeLike) -> dict[str, str]:

@@ -162,8 +162,8 @@ class Components:
 
 
 def choose_components(
-    device: Device, grid: SampleGrid, classified: Classified, runs: Runs, components: Components, seeds: Seeds,
-) -> None:  # fmt: skip
+    device: Device, grid: SampleGrid, classified: Classified, runs: Runs, components: Components, seeds: Seeds
+) -> None:
     program, (gi, gj, gk) = prepare_choosing(device), grid.shape
     sizes = {"gi": gi, "gj": gj, "gk": gk, "words": grid.words}
     run = ocl.launcher(device, program)
@@ -289,10 +289,7 @@ class _Search:
         device, n = self.device, runs.total
         parents_d, cells_d, chosen_d, roots_d = (ocl.allocate(device, 4 * n) for _ in range(4))
         sums_d = ocl.allocate(device, 4 * SUMS["SUMS"])
-        self.run(
-            "begin_cell_runs", n, parents=parents_d, run_cells=cells_d, chosen=chosen_d, sums=sums_d,
-            runs=n,
-        )  # fmt: skip
+        self.run("begin_cell_runs", n, parents=parents_d, run_cells=cells_d, chosen=chosen_d, sums=sums_d, runs=n)
         self.run(
             "join_cell_runs", self.rows, mask=self.classified.mask_d, active_cells=runs.active_d,
             word_runs=runs.words_d, parents=parents_d, **runs.places, **self.sizes,
@@ -312,10 +309,7 @@ class _Search:
             "mark_grown", self.rows, active_cells=runs.active_d, grown=grown_d, grown_extents=extents_d,
             **runs.places, **components.places, **self.sizes,
         )  # fmt: skip
-        self.run(
-            "count_visited", self.rows, grown=grown_d, grown_extents=extents_d, counts=counts_d,
-            **self.sizes,
-        )  # fmt: skip
+        self.run("count_visited", self.rows, grown=grown_d, grown_extents=extents_d, counts=counts_d, **self.sizes)
         return grown_d, extents_d, enqueue_scan(device, counts_d, counts_d, self.rows)
 
 
@@ -332,9 +326,7 @@ def growing_needs(grid: SampleGrid) -> dict[str, int]:
     }
 
 
-def join_slabs(
-    resident: DeviceVolume, grid: SampleGrid, slabs: Iterator[tuple[Slab, Classified]]
-) -> Classified:  # fmt: skip
+def join_slabs(resident: DeviceVolume, grid: SampleGrid, slabs: Iterator[tuple[Slab, Classified]]) -> Classified:
     """Return the inside mask of the whole grid, from those of slabs that follow each other."""
     device, (_, gj, gk) = resident.device, grid.shape
     mask_d, extents_d = ocl.allocate(device, 4 * gj * gk * grid.words), ocl.allocate(device, 4 * gj * gk)

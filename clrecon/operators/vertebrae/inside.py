@@ -291,8 +291,7 @@ def vertebra_inside(
         dense_bone = in_band & solid
         if not dense_bone.count:
             raise _refuse_band(crop, solid, band)
-        bone = solid.to_numpy()
-        canal_found = find_canal(bone, crop.volume) if crop.axial else None
+        canal_found = find_canal(solid.to_numpy(), crop.volume) if crop.axial else None
         canal = None
         if canal_found is not None:  # other labels that are bone are neighbours; the cord and the sac have labels too
             canal = Mask.from_array(resident, canal_found.voxels) - (others & _mark_bone(resident))

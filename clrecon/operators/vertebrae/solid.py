@@ -55,8 +55,7 @@ def crop_label(volume: Volume, labels: LabelMap, label: int | str, margin_mm: fl
     box = find_boxes(labels.voxels, (number,), (0, 0, 0))[number]
     low, high = (np.array([getattr(part, end) for part in box[::-1]]) for end in ("start", "stop"))
     corners = np.stack(np.meshgrid(*zip(low - 0.5, high - 0.5, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
-    places = labels.ijk_to_lps(corners)
-    first, end = _window(volume, places, margin_mm)
+    first, end = _window(volume, labels.ijk_to_lps(corners), margin_mm)
     if share == 0.0 or (first >= end).any():
         raise RefusedInputError(f"{called} has no voxel in the CT: it lies outside")
     around = volume.ijk_to_lps(
@@ -84,8 +83,7 @@ def _window(
         steps[2] *= grid.spacing[2] / max(float(gaps.min(initial=grid.spacing[2])), 1e-6)
     more = margin_mm * steps + _SPARE_VOXELS
     first = np.clip(np.floor(indices.min(axis=0) - more), 0, grid.shape_ijk).astype(np.int64)
-    end = np.clip(np.ceil(indices.max(axis=0) + more) + 1, 0, grid.shape_ijk).astype(np.int64)
-    return first, end
+    return first, np.clip(np.ceil(indices.max(axis=0) + more) + 1, 0, grid.shape_ijk).astype(np.int64)
 
 
 def _cut_map(labels: LabelMap, first: NDArray[np.int64], end: NDArray[np.int64]) -> LabelMap:

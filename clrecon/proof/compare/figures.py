@@ -132,14 +132,12 @@ def draw_plane(
     steps = np.array([volume.spacing[plane.across], volume.spacing[plane.down]])
     axes = [plane.across, plane.down]
     low, high = box[0, axes] - MARGIN_MM / steps, box[1, axes] + MARGIN_MM / steps
-    shape = np.array([grey.shape[1], grey.shape[0]])
-    low, high = np.maximum(low, -0.5), np.minimum(high, shape - 0.5)
+    low, high = np.maximum(low, -0.5), np.minimum(high, np.array([grey.shape[1], grey.shape[0]]) - 0.5)
     drawn = [(segments, colors[name]) for name, segments in contours.items()]
     whole = _draw_slice(grey, plane, steps, low, high, "whole", drawn)
     middle = _find_detail(contours.get(reference, np.empty((0, 2, 2))), steps, 0.5 * (low + high))
     half = 0.5 * _DETAIL_MM / steps
-    detail = _draw_slice(grey, plane, steps, middle - half, middle + half, "detail", drawn)
-    return whole, detail
+    return whole, _draw_slice(grey, plane, steps, middle - half, middle + half, "detail", drawn)
 
 
 def _find_detail(segments: Segments, steps: NDArray[np.float64], default: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -149,8 +147,7 @@ def _find_detail(segments: Segments, steps: NDArray[np.float64], default: NDArra
     middles = segments.mean(axis=1)
     squares = np.floor(middles * steps / (0.5 * _DETAIL_MM)).astype(np.int64)
     distinct, counts = np.unique(squares, axis=0, return_counts=True)
-    best = distinct[int(np.argmax(counts))]
-    return np.asarray(middles[(squares == best).all(axis=1)].mean(axis=0))
+    return np.asarray(middles[(squares == distinct[int(np.argmax(counts))]).all(axis=1)].mean(axis=0))
 
 
 def _draw_slice(

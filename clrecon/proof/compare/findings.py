@@ -258,8 +258,7 @@ def _of_decimation(done: Rows, reference: str) -> Iterator[str]:
         row = done.get(name)
         if not (row and whole and row.triangles and whole.triangles and row.surfaces and row.slices):
             continue
-        quality = row.quality or {}
-        closed = "closed" if quality.get("closed") else "no longer closed"
+        closed = "closed" if (row.quality or {}).get("closed") else "no longer closed"
         yield (
             f"{row.title} keeps {100.0 * row.triangles / whole.triangles:.0f} % of the triangles at a sub-voxel"
             f" Dice of {share(row.slices['dice'])}, HD95 {row.surfaces['hd95_mm']:.3f} mm and at most"

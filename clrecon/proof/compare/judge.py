@@ -83,8 +83,7 @@ class Judge:
 
     def _measure_points(self, points: Any) -> dict[str, Any]:
         """Measure points of a cloud: distances from the reference, and signed ones from the true surface."""
-        step = max(1, len(points) // SAMPLES)
-        sample = np.asarray(points[::step], dtype=np.float64)
+        sample = np.asarray(points[:: max(1, len(points) // SAMPLES)], dtype=np.float64)
         figures: dict[str, Any] = {"samples": len(sample), "to_reference_mm": None, "bias_mm": None, "scatter_mm": None}
         if self.reference is not None:
             distance = SurfaceDistance(self.reference.vertices, self.reference.triangles)

@@ -263,8 +263,7 @@ def _tested(
         pair = np.repeat(np.arange(len(part)), count)
         rank = np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
         ni, nj = extent[pair, 0], extent[pair, 1]
-        offset = np.stack([rank % ni, rank // ni % nj, rank // (ni * nj)], axis=1)
-        cells = low[part][pair] + offset
+        cells = low[part][pair] + np.stack([rank % ni, rank // ni % nj, rank // (ni * nj)], axis=1)
         meets = meets_box(corners[part[pair]] - (cells + 0.5)[:, None], 0.5 - margin)
         yield cells[meets], part[pair[meets]]
 

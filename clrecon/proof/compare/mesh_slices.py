@@ -215,8 +215,7 @@ def find_piercings(ijk: Float64Array, triangles: NDArray[np.uint32], lattice: La
     piercings += [_pierce(points[triangles[where]], lattice.shape_ijk) for where in chunks(len(triangles), _PIECE)]
     keys = np.sort(np.concatenate(piercings))
     fresh = np.flatnonzero(np.diff(keys, prepend=-1))
-    odd = np.diff(fresh, append=len(keys)) % 2 == 1
-    return keys[fresh[odd]]
+    return keys[fresh[np.diff(fresh, append=len(keys)) % 2 == 1]]
 
 
 def _spread_rows(first: IntArray, end: IntArray) -> tuple[IntArray, IntArray]:
@@ -240,8 +239,7 @@ def _pierce(corners: Float64Array, shape_ijk: tuple[int, int, int]) -> IntArray:
     swapped = (first[:, 1] > second[:, 1])[:, None]
     first, second = np.where(swapped, second, first), np.where(swapped, first, second)
     line, at_row = _spread_rows(*(_first_from(end[:, 1], nj) for end in (first, second)))
-    crossing = _points_at(first[line], second[line], at_row, 1)[:, 0]
-    i = _first_from(crossing, ni)
+    i = _first_from(_points_at(first[line], second[line], at_row, 1)[:, 0], ni)
     return np.asarray((plane[line] * nj + at_row) * (ni + 1) + i)
 
 
@@ -334,8 +332,7 @@ def _slices_with_border(volume: Volume, rule: IsoRule, first: int, end: int) -> 
     if not border:
         return slices
     before = max(border - first, 0)
-    after = end - first - before - len(slices)
-    widths = ((before, after), (border, border), (border, border))
+    widths = ((before, end - first - before - len(slices)), (border, border), (border, border))
     return np.pad(slices, widths, constant_values=np.array(rule.outside).astype(slices.dtype))
 
 

@@ -233,8 +233,7 @@ def _is_cut(truth: SignedSurface, grid: Grid, low: NDArray[np.int64]) -> NDArray
         return np.zeros(0, dtype=bool)
     places = 2 * low[:, None] + _cell_corners(3)
     unique, number = np.unique(places.reshape(-1, 3), axis=0, return_inverse=True)
-    within = _is_inside(truth, grid.ijk_to_lps(0.5 * unique))
-    inside = within[number.reshape(len(low), -1)].sum(axis=1)
+    inside = _is_inside(truth, grid.ijk_to_lps(0.5 * unique))[number.reshape(len(low), -1)].sum(axis=1)
     return np.asarray((inside > 0) & (inside < 27))
 
 

@@ -308,8 +308,7 @@ def _views(report: CompareReport, figures: Figures) -> str:
     for record in report.methods:
         if record.name not in figures.images:
             continue
-        alt = f"{record.title}, {report.view} view"
-        images = _image(figures.images[record.name], alt)
+        images = _image(figures.images[record.name], f"{record.title}, {report.view} view")
         difference = figures.images.get(f"{record.name}-difference")
         caption = "the reference" if record.name == report.reference else ""
         if difference is not None:

@@ -260,8 +260,7 @@ def write_phantom(
             for phase in range(1, settings.phases):
                 voxels, _, _ = _make_voxels(settings, placement, progress, phase)
                 write_series(finished, voxels, settings, placement, progress, phase)
-            text = json.dumps(truth, indent=2) + "\n"
-            (finished / TRUTH_NAME).write_text(text, encoding="utf-8")
+            (finished / TRUTH_NAME).write_text(json.dumps(truth, indent=2) + "\n", encoding="utf-8")
             if labels is not None:
                 write_label_map(finished / _MATERIALS_NAME, labels, placement.affine)
             if settings.spine_choice is not None:

@@ -216,8 +216,7 @@ def _bent_plate(center: tuple[float, float, float], half: tuple[float, float, fl
             outer = ellipsoid(x, y, z, half)
             return np.minimum(outer - np.float32(inset), np.float32(8.0 - inset) - outer)
 
-        low = (-half[0], -half[1], -half[2])
-        return cut(Part(material, hu, distance, low, half, center), keep)
+        return cut(Part(material, hu, distance, (-half[0], -half[1], -half[2]), half, center), keep)
 
     return [plate(0.0, "bone", 900.0), plate(1.8, "bone", _SPONGY_HU)]
 
@@ -397,7 +396,7 @@ def plan_hip() -> Plan:
         ball("metal", METAL_HU, head, (14.0, 14.0, 14.0)),
         rod("metal", METAL_HU, head, neck, 6.0),
         rod("metal", METAL_HU, neck, tip, 6.5, 5.0),
-    ]  # fmt: skip
+    ]
     return Plan(parts, front=-62.0, back=66.0)
 
 
@@ -445,5 +444,4 @@ PLANS: dict[str, Callable[[], Plan]] = {
 def plan_scene(settings: PhantomSettings) -> list[Part]:
     """Plan all parts of the scene in the order of painting: the table first, then the body that lies on it."""
     plan = PLANS[settings.kind]()
-    table = lay_under(plan, settings.table_used, settings.table_gap_mm, settings.prone)
-    return [*table, *plan.parts]
+    return [*lay_under(plan, settings.table_used, settings.table_gap_mm, settings.prone), *plan.parts]

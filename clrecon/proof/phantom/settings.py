@@ -49,8 +49,7 @@ def draw_ghosts(voxels: NDArray[np.int16], seed: int) -> dict[str, Any]:
     capture, sagittal = ghost_places(len(voxels))
     view = _sagittal(voxels)
     rows = np.arange(voxels.shape[1]) * view.shape[0] // voxels.shape[1]
-    columns = np.arange(voxels.shape[2]) * view.shape[1] // voxels.shape[2]
-    voxels[sagittal] = view[rows][:, columns]
+    voxels[sagittal] = view[rows][:, np.arange(voxels.shape[2]) * view.shape[1] // voxels.shape[2]]
     voxels[capture] = _screen_capture(voxels.shape[1:], seed)
     return {
         "slices": [

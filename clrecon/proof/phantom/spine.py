@@ -116,8 +116,7 @@ def _draw_organs(painter: _Painter, anatomy: Anatomy, cavity: Field, x: Field, y
     mediastinum = ellipse(x - np.float32(6.0), y + np.float32(0.25 * deep), 0.34 * wide + 6.0, 0.85 * deep)
     # Heart and great vessels are one piece, in a rim of fat.
     painter.fill(np.minimum(np.minimum(mediastinum - np.float32(4.0), above), cavity), painter.blood_hu)
-    lung = np.minimum(np.minimum(cavity + np.float32(9.0), above), -mediastinum)
-    return lung
+    return np.minimum(np.minimum(cavity + np.float32(9.0), above), -mediastinum)
 
 
 _BAND = 24000

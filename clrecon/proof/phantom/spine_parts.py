@@ -200,8 +200,7 @@ def _bend(chain: Chain, anchor: int, choice: SpineChoice) -> Chain:
     up /= np.linalg.norm(up, axis=1)[:, None]
     frames = [lean_and_roll(math.asin(y), math.asin(x)) for x, y, _ in up]
     centres = _stack(chain.sizes, frames, anchor, chain.centres[anchor])
-    shown = slice(first, last + 1)
-    away = (centres - chain.centres)[shown]
+    away = (centres - chain.centres)[slice(first, last + 1)]
     centres[:, 0] -= (away[:, 0].min() + away[:, 0].max()) / 2.0
     centres[:, 1] -= away[:, 1].max()
     moved = centres - chain.centres

@@ -155,8 +155,7 @@ def plan_anatomy(
     outline = spine_parts.plan_outline(chain, half_width, half_depth)
     # On the skin of the left flank, or as far left as a small field of view still shows.
     left = min(half_width + 1.0, 0.42 * field_of_view_mm[0])
-    marker_y = 0.0 if left < half_width else half_depth * 0.1
-    marker = np.array((left, marker_y, 0.0))
+    marker = np.array((left, 0.0 if left < half_width else half_depth * 0.1, 0.0))
     if outline is not None:
         middle_x, middle_y, wide, _, _ = outline.at(np.zeros(1))
         marker = np.array((min(middle_x[0] + wide[0] + 1.0, 0.42 * field_of_view_mm[0]), middle_y[0], 0.0))

@@ -305,8 +305,7 @@ _RIM_MM = 1.0
 def _body_reach(vertebra: Vertebra, direction: Float64Array) -> float:
     """Return how far a vertebral body, or the space in the ring of C1, reaches from its middle."""
     x, y, z = vertebra.axes @ direction
-    across = np.hypot(x * vertebra.width, y * vertebra.depth)
-    return float(across + abs(z) * vertebra.height) / 2.0
+    return float(np.hypot(x * vertebra.width, y * vertebra.depth) + abs(z) * vertebra.height) / 2.0
 
 
 def body_extent(vertebrae: Sequence[Vertebra], direction: ArrayLike) -> tuple[float, float]:

@@ -284,8 +284,7 @@ SETTINGS = FieldSettings(0.65, 1.5, 0.1, 1.3)
 
 def _two_balls() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return points on two balls of 14 and 6 mm, and their normals, of which one in twenty points inward."""
-    rng = np.random.default_rng(5)
-    normals = rng.normal(size=(7000, 3))
+    normals = np.random.default_rng(5).normal(size=(7000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = 14.0 * normals
     points[6000:] = 6.0 * normals[6000:] + (0.0, 0.0, 130.0)

@@ -105,8 +105,7 @@ def cluster_points(points: ArrayLike, eps: float, min_samples: int) -> tuple[int
     if n == 0:
         return 0, labels, np.zeros(0, dtype=bool)
     pairs = cKDTree(points).query_pairs(eps * (1.0 + 1e-6), output_type="ndarray")
-    counts = 1 + np.bincount(pairs.reshape(-1), minlength=n)
-    cores = counts >= min_samples
+    cores = 1 + np.bincount(pairs.reshape(-1), minlength=n) >= min_samples
     first, second = pairs[cores[pairs].all(axis=1)].T
     _, parts = connected_components(coo_array((np.ones(len(first), bool), (first, second)), shape=(n, n)), False)
     # A component's number is the rank of its first core point.
@@ -154,8 +153,7 @@ def join_chunks(grid: GridTwin, cores: NDArray[np.bool_], reach: float, per_chun
 def note_words(grid: GridTwin, labels: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """Return the root of the core cells of each word of the mask, (nz * ny * words,) uint32."""
     words = grid.ranks.size
-    counts = np.diff(np.append(grid.ranks.reshape(-1), len(labels)))
-    word_of = np.repeat(np.arange(words), counts)
+    word_of = np.repeat(np.arange(words), np.diff(np.append(grid.ranks.reshape(-1), len(labels))))
     is_core = labels != NO_CELL
     low, high = np.full(words, NO_CELL), np.zeros(words, np.uint32)
     np.minimum.at(low, word_of[is_core], labels[is_core])
@@ -209,8 +207,7 @@ def extract_voxels(
     if shell:
         marked = mark_shell(marked)
     k, j, i = np.nonzero(marked)
-    origins = volume.slice_origins()
-    slice_origin = origins[np.zeros_like(k) if paper else k]
+    slice_origin = volume.slice_origins()[np.zeros_like(k) if paper else k]
     points = slice_origin + i[:, None] * volume.affine[:3, 0] + j[:, None] * volume.affine[:3, 1]
     return points, volume.voxels[marked].astype(np.float32), np.stack([i, j, k], axis=1)
 

@@ -54,10 +54,8 @@ def find_neighbours(points: NDArray[np.float32], k: int) -> tuple[NDArray[np.int
         return _compare_all(points, np.arange(n), k)
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(points.astype(np.float64))
-    far, numbers = tree.query(points.astype(np.float64), k + _SPARE)
-    distances = float32_distances(points[numbers] - points[:, None])
-    indices, nearest = _order(distances, numbers, k)
+    far, numbers = cKDTree(points.astype(np.float64)).query(points.astype(np.float64), k + _SPARE)
+    indices, nearest = _order(float32_distances(points[numbers] - points[:, None]), numbers, k)
     doubtful = np.flatnonzero(~(nearest[:, -1].astype(np.float64) * (1.0 + ROUNDING) < far[:, -1]))
     for first in range(0, len(doubtful), ROWS_AT_ONCE):
         rows = doubtful[first : first + ROWS_AT_ONCE]
@@ -90,8 +88,7 @@ def principal_axes(
     """
     near = np.asarray(points, dtype=np.float64)[indices]
     away = near - near.mean(axis=1, keepdims=True)
-    covariance = np.einsum("nki,nkj->nij", away, away) / indices.shape[1]
-    eigenvalues, axes = np.linalg.eigh(covariance)
+    eigenvalues, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away) / indices.shape[1])
     eigenvalues = np.maximum(eigenvalues, 0.0)
     low, middle, high = eigenvalues.T
     has_plane = low * middle + low * high + middle * high > NO_WIDTH * eigenvalues.sum(axis=1) ** 2

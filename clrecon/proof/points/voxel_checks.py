@@ -128,9 +128,7 @@ def _compare_points(device: Device, dtype: str, uneven: bool, kind: Any, labels:
     chosen = None if labels is None else random_integers(WIDE, labels, 3)
     label_map = None if chosen is None else LabelMap(chosen, OBLIQUE)
     number = 2 if labels == "uint8" else 0
-    cloud = extract_points(
-        volume, kind=kind, hu=BAND, labels=label_map, label=number or None, device=device
-    )  # fmt: skip
+    cloud = extract_points(volume, kind=kind, hu=BAND, labels=label_map, label=number or None, device=device)
     points, hu, ijk = twin.extract_voxels(volume, *BAND, shell=kind == "shell", labels=chosen, label=number)
     subject = f"{kind} of {dtype} voxels{'' if labels is None else f' with labels of {labels}'}"
     require_whole(cloud.report)

@@ -69,8 +69,7 @@ def _soup() -> tuple[Mesh, NDArray[np.uint8]]:
 def _still(camera: Camera) -> Still:
     """Return a sheet in the middle of the triangles, opaque in a third of the picture, translucent in another."""
     width, height = SIZE
-    along = camera.rays(SIZE)[1] @ camera.basis().forward
-    depth = (camera.distance / along).astype(np.float32)
+    depth = (camera.distance / (camera.rays(SIZE)[1] @ camera.basis().forward)).astype(np.float32)
     image = np.full((height, width, 4), (40, 90, 200, 255), np.uint8)
     image[:, : width // 3, 3] = 100
     depth[:, 2 * width // 3 :] = np.nan
@@ -99,9 +98,7 @@ def _blend_layers(
     for layer in range(int(np.bincount(pixels).max())):
         places = np.where(opacity < 1.0, nth_layer(every, layer, SIZE), -1)
         assert mesh.normals is not None
-        rgb, depth = shade_layer(
-            every, places, mesh.vertices, triangles, mesh.normals, colors / 255.0, camera, FIXED
-        )  # fmt: skip
+        rgb, depth = shade_layer(every, places, mesh.vertices, triangles, mesh.normals, colors / 255.0, camera, FIXED)
         triangle_numbers = np.where(places >= 0, every.triangles[places], 0)
         is_sheet = triangle_numbers == count
         rgb[is_sheet] = still.image[is_sheet][:, :3] / 255.0

@@ -165,9 +165,7 @@ def _check_tiles(device: Device) -> str:
 
 LEAP_CHECKS = (
     Check(
-        "leaps of rays",
-        ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along", "look_ahead"),
-        _check_leaps,
+        "leaps of rays", ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along", "look_ahead"), _check_leaps
     ),
     Check(
         "entries of tiles",
@@ -175,7 +173,7 @@ LEAP_CHECKS = (
         _check_tiles,
         {"rays/leaps.cl": ("UNEVEN",), "rays/tiles.cl": ("UNEVEN",)},
     ),
-)  # fmt: skip
+)
 
 
 SIZE = (96, 60)

@@ -384,8 +384,7 @@ class _SteepSegments:
         length = rays.t_out[ray] - rays.t_in[ray]
         last = np.ceil(length / self.step) - 1.0
         t_last = rays.t_in[ray] + last * self.step + part * (length - last * self.step)
-        t = np.minimum(rays.t_in[ray] + (number + part) * self.step, t_last)
-        ijk, _ = rays.places(ray, t)
+        ijk, _ = rays.places(ray, np.minimum(rays.t_in[ray] + (number + part) * self.step, t_last))
         return (sample_field(rays.volume.voxels, ijk) - self.low) * self.scale + 0.5
 
     def take_parts(
@@ -481,8 +480,7 @@ def _plane_samples(rays: _Rays, step: float) -> Iterator[tuple[NDArray[np.int64]
     axis = np.abs(rates).argmax(axis=1)[:, None]
     rate = np.take_along_axis(rates, axis, axis=1)[:, 0]
     start = np.take_along_axis(rays.origins @ inverse[:3, :3].T + inverse[:3, 3], axis, axis=1)[:, 0]
-    parts = np.maximum(np.ceil(1.0 / (np.abs(rate) * step) - _PART_SLACK), 1.0)
-    spacing = 1.0 / (np.abs(rate) * parts)
+    spacing = 1.0 / (np.abs(rate) * np.maximum(np.ceil(1.0 / (np.abs(rate) * step) - _PART_SLACK), 1.0))
     t_of_plane_0 = -start / rate
     valid = rays.t_out > rays.t_in
     t_in, t_out = np.where(valid, rays.t_in, 0.0), np.where(valid, rays.t_out, -1.0)

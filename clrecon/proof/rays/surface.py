@@ -34,8 +34,7 @@ class _ClosedField:
         self.level, self.outside = rule.iso_level, rule.outside
         self.closed = np.pad(voxels, 1, constant_values=rule.outside)
         wider = np.pad(voxels, 2, constant_values=rule.outside)
-        matrices = slice_normal_matrices(volume, 2)
-        self.gradients = voxel_gradients(wider, matrices)[1:-1, 1:-1, 1:-1]
+        self.gradients = voxel_gradients(wider, slice_normal_matrices(volume, 2))[1:-1, 1:-1, 1:-1]
         self.last = np.array(volume.shape_ijk) - 1.0
 
     def inside(self, points: Float64Array) -> NDArray[np.bool_]:

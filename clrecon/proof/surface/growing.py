@@ -22,9 +22,7 @@ from numpy.typing import NDArray
 
 def _corners(inside: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
     gk, gj, gi = inside.shape
-    return [
-        inside[z : gk - 1 + z, y : gj - 1 + y, x : gi - 1 + x] for z, y, x in product((0, 1), repeat=3)
-    ]  # fmt: skip
+    return [inside[z : gk - 1 + z, y : gj - 1 + y, x : gi - 1 + x] for z, y, x in product((0, 1), repeat=3)]
 
 
 def find_active(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -121,8 +119,7 @@ def find_seeded(
     inside: NDArray[np.bool_], seeds: NDArray[np.bool_], numbers: NDArray[np.int64], count: int
 ) -> NDArray[np.bool_]:
     """Mark the components with a cell that has an inside corner among seeds, which are voxels (nk, nj, ni)."""
-    border = (inside.shape[0] - seeds.shape[0]) // 2
-    marked = np.pad(seeds, border) & inside
+    marked = np.pad(seeds, (inside.shape[0] - seeds.shape[0]) // 2) & inside
     seeded = np.logical_or.reduce(_corners(marked)) & (numbers >= 0)
     return np.isin(np.arange(count), numbers[seeded])
 

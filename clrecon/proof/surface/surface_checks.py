@@ -233,7 +233,7 @@ SURFACE_CHECKS = (
         ("classify_samples", *(kernel for kernel in _MARCHING if kernel != "emit_triangles"), *TRILINEAR),
         partial(_check_variant, make=noise, shape=LONG, level=2.5, topology="trilinear"),
     ),
-)  # fmt: skip
+)
 
 
 SUMS = 700
@@ -256,8 +256,7 @@ def _check_labels(device: Device) -> str:
     ):
         volume = stack(waves(WIDE, dtype), OBLIQUE, uneven=uneven)
         big = 2 if label_dtype == "uint8" else 300
-        numbers = _blocks(label_dtype, (big, big, big, big, big, big, 0))
-        label_map = LabelMap(numbers, volume.affine)
+        label_map = LabelMap(_blocks(label_dtype, (big, big, big, big, big, big, 0)), volume.affine)
         placed = resample_labels(label_map, volume).voxels
         inside = twin.find_solid(volume, placed, 30.0, closed=closed, solid=(big,) if solid else ())
         meshes = extract_labels(volume, label_map, 30.0, device=device, closed=closed, solid=solid)
@@ -327,7 +326,7 @@ LABEL_CHECKS = (
         {"surface/marching_cubes.cl": ("MASKS",)},
     ),
     Check("volumes of masks", ("sum_volumes",), _check_volumes),
-)  # fmt: skip
+)
 
 
 PLACES = 700

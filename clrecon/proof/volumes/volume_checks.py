@@ -115,8 +115,7 @@ def _check_bricks(device: Device) -> str:
         shift = (rows % 5).repeat(8, 0).repeat(8, 1)[: _BRICK_SHAPE[0], : _BRICK_SHAPE[1], None]
         voxels = np.where(shift == 4, 0, voxels // 4 + 20 * shift).astype(dtype)
         measured = measure_bricks(device, upload(device, voxels), _BRICK_SHAPE[::-1], voxels.dtype)
-        shape = (*measured.shape[::-1], 2)
-        ranges = download(device, np.empty(shape, voxels.dtype), measured.ranges_d)
+        ranges = download(device, np.empty((*measured.shape[::-1], 2), voxels.dtype), measured.ranges_d)
         expected = twin.measure_bricks(voxels)
         require_equal(ranges, expected, f"ranges of bricks of {dtype} voxels")
         level = voxels.dtype.type(45)
@@ -241,8 +240,7 @@ def _check_bilateral(device: Device, types: tuple[str, ...], uneven: bool) -> st
 
 def _check_near_level(device: Device) -> str:
     """Compare the listed groups with the twin's, and a filter of them alone with that of all."""
-    shape = (30, 40, 1100)
-    k, j, i = np.indices(shape)
+    k, j, i = np.indices((30, 40, 1100))
     values = 100.0 + 60.0 * np.sin(0.12 * j + 0.2 * k + 0.004 * i)
     volume = stack(np.rint(values).astype(np.int16), np.diag((0.9, 1.0, 1.1, 1.0)))
     ni, nj, nk = volume.shape_ijk

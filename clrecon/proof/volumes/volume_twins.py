@@ -23,8 +23,7 @@ def exclusive_scan(counts: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], int]
 
 def compact(mask: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """Return the positions of the set bits of a bit mask in ascending order; bit b of word w is position 32 w + b."""
-    bits = mask[:, None] >> np.arange(32, dtype=np.uint32) & 1
-    return np.flatnonzero(bits).astype(np.uint32)
+    return np.flatnonzero(mask[:, None] >> np.arange(32, dtype=np.uint32) & 1).astype(np.uint32)
 
 
 def radix_sort(keys: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
@@ -260,8 +259,7 @@ EDGE = 2.0**-20
 def is_inside(volume: Volume, points: Float64Array) -> NDArray[np.bool_]:
     """True for points (..., 3) in LPS mm within the box of a volume, half a voxel beyond the outer voxel centres."""
     ijk = volume.lps_to_ijk(points.reshape(-1, 3))
-    last = np.array(volume.shape_ijk) - 1
-    inside = ((ijk >= -0.5 - EDGE) & (ijk <= last + 0.5 + EDGE)).all(axis=1)
+    inside = ((ijk >= -0.5 - EDGE) & (ijk <= np.array(volume.shape_ijk) - 1 + 0.5 + EDGE)).all(axis=1)
     return np.asarray(inside.reshape(points.shape[:-1]))
 
 

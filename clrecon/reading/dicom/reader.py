@@ -112,9 +112,7 @@ def read_series(path: str | os.PathLike[str], selection: Selection, progress: Pr
             raise RefusedInputError(_describe_refusal(chosen))
         pixels = _read_pixels(stack, progress)
     voxels, facts = pixels.voxels, pixels.facts
-    warnings = [
-        *collect_series_warnings(chosen), *_warn_of_pixels(pixels), *collect_scan_warnings(scan), *left
-    ]  # fmt: skip
+    warnings = [*collect_series_warnings(chosen), *_warn_of_pixels(pixels), *collect_scan_warnings(scan), *left]
     report = certify(chosen, stack, pixels, scan, stack.affine, warnings)
     log.info("series %d of %d read: %s voxels %s", chosen.number, len(listed), voxels.shape[::-1], voxels.dtype)
     log_warnings(log, report.warnings)

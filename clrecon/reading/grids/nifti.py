@@ -232,8 +232,7 @@ def _write_parts(stream: Any, content: VolumeContent) -> None:
     place_in_header(header, content.affine)
     header["descrip"] = b"HU; certificate of clrecon in the header extension"
     text = "\n".join(("clrecon", *content.lines)).encode("ascii")
-    extension = nibabel.nifti1.Nifti1Extension(_COMMENT_CODE, text)
-    header.extensions.append(extension)
+    header.extensions.append(nibabel.nifti1.Nifti1Extension(_COMMENT_CODE, text))
     header["vox_offset"] = header.single_vox_offset + header.extensions.get_sizeondisk()
     header.write_to(stream)
     for k, layer in enumerate(content.voxels):

@@ -72,8 +72,7 @@ def name_of_grid(path: Path) -> str:
 
 def open_grid(path: Path, kind: str, purpose: str) -> GridFile:
     """Read the header of a file of one of the `kind` "NIfTI", "NRRD" and "MetaImage"."""
-    opener = {"NIfTI": open_nifti, "NRRD": open_nrrd, "MetaImage": open_metaimage}[kind]
-    return opener(path, purpose)
+    return {"NIfTI": open_nifti, "NRRD": open_nrrd, "MetaImage": open_metaimage}[kind](path, purpose)
 
 
 _LADDER = (np.dtype(np.int16), np.dtype(np.int32), np.dtype(np.float32))

@@ -68,8 +68,7 @@ def load_transfer_function(path: str | os.PathLike[str], name: str | None = None
     """
     shown = repr(Path(path).name[:200])
     try:
-        entries = _entries(_read_file(Path(path), shown))
-        found_name, make = _choose_entry(entries, name, shown)
+        found_name, make = _choose_entry(_entries(_read_file(Path(path), shown)), name, shown)
         parameters = make()
         parameters["name"] = parameters.get("name", found_name)
         return TransferFunction(**parameters)
@@ -259,8 +258,7 @@ def read_slicer_xml(data: bytes) -> list[Entry]:
 
     def start_element(tag: str, attributes: dict[str, str]) -> None:
         if tag in ("VolumeProperty", "VolumePropertyNode"):
-            line = parser.CurrentLineNumber
-            path = f"line {line} ({attributes.get('name', tag)[:64]!r})"
+            path = f"line {parser.CurrentLineNumber} ({attributes.get('name', tag)[:64]!r})"
             entries.append(
                 (attributes.get("name", ""), lambda: _slicer_parameters(attributes, lambda name: f"{path}: {name}"))
             )

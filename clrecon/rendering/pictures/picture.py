@@ -164,8 +164,7 @@ class Rendering(PictureData):
         """
 
         with keep_existing(keep=no_clobber):
-            content = encode_image(self, check_image_path(path), quality)
-            return _replace_image(path, content)
+            return _replace_image(path, encode_image(self, check_image_path(path), quality))
 
     @explains_arguments
     def save_depth(self, path: str | os.PathLike[str], *, expected: bool = False, no_clobber: bool = False) -> int:

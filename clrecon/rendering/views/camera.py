@@ -320,8 +320,7 @@ class Camera:
             pixel = pixel * along
             depths = np.linalg.norm(from_position, axis=1) + 0.0 * along
         x = 0.5 * width + from_position @ right / pixel
-        y = 0.5 * height - from_position @ up / pixel
-        return np.column_stack([x, y]), depths
+        return np.column_stack([x, 0.5 * height - from_position @ up / pixel]), depths
 
     @explains_arguments
     def orbit(self, azimuth: float, elevation: float = 0.0) -> Camera:

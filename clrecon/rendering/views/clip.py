@@ -237,5 +237,4 @@ def _corners_of_extents(volume: Volume, extents: Float64Array, reach: float) -> 
         (np.maximum(low_j - 1.0, -0.5), np.minimum(high_j + 1.0, most[1])),
         (np.maximum(k - reach, -0.5), np.minimum(k + reach, most[2])),
     ]
-    points = [np.column_stack(corner) for corner in product(*ends)]
-    return volume.ijk_to_lps(np.concatenate(points))
+    return volume.ijk_to_lps(np.concatenate([np.column_stack(corner) for corner in product(*ends)]))

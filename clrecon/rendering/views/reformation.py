@@ -184,8 +184,7 @@ def plane_sheet(camera: Camera, size: Sequence[int], offset_mm: float = 0.0) -> 
     position = np.add(camera.position, shift)
     plane_camera = Camera(as_point(position), as_point(centre), camera.up, parallel_scale=0.5 * height * pixel)
     above = 0.5 * height - 0.5 - np.arange(height)
-    first = centre + (0.5 - 0.5 * width) * pixel * right
-    origins = first + (pixel * above)[:, None] * up
+    origins = centre + (0.5 - 0.5 * width) * pixel * right + (pixel * above)[:, None] * up
     return Sheet(origins, np.tile(pixel * right, (height, 1)), np.tile(forward, (height, 1)), width), plane_camera
 
 
@@ -229,8 +228,7 @@ def straightened_sheet(
     width, height = size
     arcs = _fine_arcs(curve.length, pixel)
     places, tangents = curve.at(arcs), curve.tangents(arcs)
-    helper = np.eye(3)[np.abs(tangents[0]).argmin()]
-    normals = rotation_minimising_normals(places, tangents, helper)
+    normals = rotation_minimising_normals(places, tangents, np.eye(3)[np.abs(tangents[0]).argmin()])
     binormals = np.cross(tangents, normals)
     along_normal, along_binormal = float((normals @ across).sum()), float((binormals @ across).sum())
     if np.hypot(along_normal, along_binormal) < 1e-3 * len(arcs):

@@ -163,8 +163,7 @@ class Painter(Stage):
 
     def pick_slice(self, state: ViewState, plane: str, size: Sequence[int], x: float, y: float) -> Pick:
         camera = self.slice_camera(state, plane, checked_size(size))
-        spot = pixel_camera(camera, checked_size(size), x, y)
-        point = spot.focal_point
+        point = pixel_camera(camera, checked_size(size), x, y).focal_point
         with self.lock:
             key, number = None, None
             sliced = self._sliced(state)

@@ -53,8 +53,7 @@ def cut_mesh(mesh: Mesh, clip: Clip) -> Mesh:
 def _cut_mesh(mesh: Mesh, plane: NDArray[np.float64]) -> Mesh:
     """Cut by a plane; a triangle is turned so that the corner that is alone on its side comes first."""
     heights = mesh.vertices @ plane[:3] - plane[3]
-    inside = heights >= 0.0
-    corners = inside[mesh.triangles]
+    corners = (heights >= 0.0)[mesh.triangles]
     count = corners.sum(axis=1)
     if (count == 3).all():
         return mesh

@@ -188,7 +188,7 @@ def _describe_parts(
                 count=count,
                 box=_box_of(volume, low, high),
                 inside=(x, y, z),
-            )  # fmt: skip
+            )
         )
     below = f"below {format_hu(iso_value)} HU"
     return (*parts, ShownPart(key=f"{scan}/0", name=below, kind="rest", object=scan, number=0))

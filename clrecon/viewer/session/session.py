@@ -435,8 +435,7 @@ class ViewSession(Closing):
 
     def pick(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Return what is seen at a pixel of the picture, or of a slice."""
-        picked = self._pick(x, y, size, plane)
-        return {"pick": self._facts_of_pick(picked)}
+        return {"pick": self._facts_of_pick(self._pick(x, y, size, plane))}
 
     def cross_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Move the slices to what is seen at a pixel."""

@@ -109,8 +109,7 @@ def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHe
 
 def _describe_digits(headers: Sequence[SliceHeader]) -> str:
     """Say that places fall together because positions have too few digits; empty if they have enough."""
-    normal = np.cross(headers[0].row_cosines, headers[0].column_cosines)
-    unit, digits = measure_unit(headers, normal)
+    unit, digits = measure_unit(headers, np.cross(headers[0].row_cosines, headers[0].column_cosines))
     thickness = headers[0].slice_thickness_mm or 0.0
     if not 0.0 < thickness < unit:
         return ""
