@@ -170,8 +170,8 @@ def prepare_caches() -> Caches:
         os.environ["PYOPENCL_NO_CACHE"] = "1"
     if home_name in faults or f"{home_name}/mesa_shader_cache" in faults:
         os.environ.update(_MESA_OFF)
-    found = "; ".join(f"{name} {fault}" for name, fault in faults.items())
-    warnings = (f"caches of built kernels are not used, every process builds them anew: {found}",)
+    fault_list = "; ".join(f"{name} {fault}" for name, fault in faults.items())
+    warnings = (f"caches of built kernels are not used, every process builds them anew: {fault_list}",)
     refusal = ""
     if of_pocl:
         pocl, refusal = _temporary_folder(pocl)

@@ -230,21 +230,17 @@ class IsoDistance(Record):
     away_from_metal_voxel: DistanceSummary | None = None
 
 
-def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, samples: int = SAMPLES) -> IsoDistance:
-    """Measure how far vertices and centres of triangles lie from the iso surface that a mesh was made from.
-
-    The vertices of an extracted surface lie on it, up to the rounding of float32; the centres show the error of flat
-    triangles.  After smoothing and decimation both show the error that these have added.
-
-    samples: Most vertices and triangles that are measured; of more, every n-th.
-    """
-    return measure_iso_distances([mesh], volume, rule, samples)[0]
-
-
 def measure_iso_distances(
     meshes: Sequence[Mesh], volume: Volume, rule: IsoRule, samples: int = SAMPLES
 ) -> list[IsoDistance]:
-    """Do it for several meshes, small ones together: a call costs as much for ten points as for a thousand."""
+    """Measure how far vertices and centres of triangles lie from the iso surface that meshes were made from.
+
+    The vertices of an extracted surface lie on it, up to the rounding of float32; the centres show the error of flat
+    triangles.  After smoothing and decimation both show the error that these have added.  Small meshes are measured
+    together: a call costs as much for ten points as for a thousand.
+
+    samples: Most vertices and triangles of a mesh that are measured; of more, every n-th.
+    """
     result: list[IsoDistance] = []
     waiting: list[Float64Array] = []
     for number, mesh in enumerate(meshes, start=1):

@@ -147,21 +147,16 @@ def mark_band(
     return mask
 
 
+@dataclass(frozen=True, eq=False)
 class _Marking:
     """One mask, whatever the number of slices in a slab."""
 
-    def __init__(
-        self,
-        resident: DeviceVolume,
-        bounds: tuple[Any, Any],
-        words: int,
-        pad: int,
-        stopwatch: Stopwatch,
-        progress: Progress,
-    ):
-        self.resident, self.bounds = resident, bounds
-        self.words, self.pad = words, pad
-        self.stopwatch, self.progress = stopwatch, progress
+    resident: DeviceVolume
+    bounds: tuple[Any, Any]
+    words: int
+    pad: int
+    stopwatch: Stopwatch
+    progress: Progress
 
     def mark(self, slices: int) -> VoxelMask:
         resident, device = self.resident, self.resident.device

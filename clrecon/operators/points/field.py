@@ -5,6 +5,7 @@ cl/points/field.cl and cl/points/field_signs.cl.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any, ClassVar
@@ -374,7 +375,7 @@ class NodeField:
             resident = {"grid": self.grid.nbytes, "list of bricks": 4 * self.bricks, **self._kept(self.grid.n)}
             return ocl.describe_shortage(self.limits, {**resident, **slab_needs})
 
-        thick = _largest(layers, lambda count: not shortage(count))
+        thick = bisect_left(range(1, layers + 1), True, key=lambda count: shortage(count) != "")
         if thick == 0:
             raise DeviceMemoryError(f"no surface can be made of the cloud: {shortage(1)}")
         return cut_slabs(thick)
@@ -455,13 +456,3 @@ class NodeField:
                 nodes_y=nodes.shape[1], bricks_y=bricks_y, brick_words=nodes.brick_words,
                 least=LEAST_SHARE * float(nodes.spacing), count=count, **sizes,
             )  # fmt: skip
-
-
-def _largest(most: int, fits: Callable[[int], bool]) -> int:
-    if fits(most):
-        return most
-    low, high = 0, most
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return low

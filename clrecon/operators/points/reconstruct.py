@@ -17,7 +17,7 @@ from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
 from clrecon.system.arguments import explains_arguments, name_parameter
-from clrecon.system.light_dataclass import dataclass
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_share
 
@@ -351,22 +351,16 @@ def _choose_lengths(
     return FieldSettings(spacing, r, s, b)
 
 
+@dataclass(eq=False)
 class _Reconstruction:
-    def __init__(
-        self,
-        cloud: PointCloud,
-        normals: NDArray[np.float32],
-        settings: FieldSettings,
-        device: Device,
-        memory: int | None,
-        progress: Progress,
-    ):
-        self.cloud, self.normals = cloud, normals
-        self.settings = settings
-        self.device, self.memory = device, memory
-        self.progress = progress
-        self.stopwatch = Stopwatch()
-        self.warnings: list[str] = []
+    cloud: PointCloud
+    normals: NDArray[np.float32]
+    settings: FieldSettings
+    device: Device
+    memory: int | None
+    progress: Progress
+    stopwatch: Stopwatch = field(default_factory=Stopwatch)
+    warnings: list[str] = field(default_factory=list)
 
     def make(self, widenings: int) -> Mesh:
         """Make the mesh, with a wider bridge where inside and outside are joined."""

@@ -14,7 +14,6 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare import iso_distance
 from clrecon.mesh.compare.iso_distance import (
     distances_to_iso_surface,
-    measure_iso_distance,
     rule_of_report,
     smallest_voxel_mm,
     trilinear_field,
@@ -26,6 +25,10 @@ pytestmark = pytest.mark.unit
 
 SHEARED = compose_affine((0.0, 0.7, 0.1), (0.5, 0.0, -0.05), (0.3, 0.2, 2.5), (-250.0, 130.5, -846.25))
 SHAPE_IJK = (11, 9, 7)
+
+
+def measure_iso_distance(mesh, volume, rule, **options) -> iso_distance.IsoDistance:
+    return iso_distance.measure_iso_distances([mesh], volume, rule, **options)[0]
 
 
 def centres(shape_ijk=SHAPE_IJK) -> np.ndarray:

@@ -12,7 +12,7 @@ from variants import daily, daily_rows
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.mesh.compare.iso_distance import measure_iso_distance, rule_of_report
+from clrecon.mesh.compare.iso_distance import measure_iso_distances, rule_of_report
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
 from clrecon.proof.surface import extract as twin
@@ -192,7 +192,7 @@ def test_the_scale_of_float_values_does_not_matter(device):
 def test_distances_are_those_to_the_nearer_end(device, level, options):
     volume = smooth_volume()
     mesh = extract_isosurface(volume, level, device=device, **options)
-    found = measure_iso_distance(mesh, volume, rule_of_report(mesh.report))
+    found = measure_iso_distances([mesh], volume, rule_of_report(mesh.report))[0]
     assert found["vertices_voxel"]["max"] < 1e-3
     assert found["not_found"] < 0.01 * found["samples"]["centres"]
 
