@@ -42,9 +42,7 @@ _LUNG_WALL, _AIR_WALL = 0.2, 0.7
 """Least share of a cavity's wall that must be thick tissue: for lung, and for larger regions of air."""
 LUNG_HU, MOST_AIR = -950.0, 0.2
 """A region is lung when less than `MOST_AIR` of its cells is below `LUNG_HU`; air, foam and blankets have more."""
-FOAM_HU = -900.0
-FOAM_WALL = 0.3
-FOAM_MM = 10.0
+FOAM_HU, FOAM_WALL, FOAM_MM = -900.0, 0.3, 10.0
 """Foam that fits a body closely is not lung.  A region is foam when most of it is below `FOAM_HU`, at most the share
 `FOAM_WALL` of its wall is thick, and it is nowhere thicker than 2 `FOAM_MM`, unlike the lungs of three scans."""
 _FEWEST_UNMEASURED = 16

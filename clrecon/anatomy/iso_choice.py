@@ -169,10 +169,7 @@ def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float, float]:
     return edges.where(~edges.flat), share, share
 
 
-STREAKS_HU = 3000
-FEWEST_METAL = 20
-METAL_SLICES = 3
-STREAKS_SPREAD = 0.7
+STREAKS_HU, FEWEST_METAL, METAL_SLICES, STREAKS_SPREAD = 3000, 20, 3, 0.7
 """A slice with so many voxels above this shows metal, whose streaks, and whose rim so many slices away, have the values
 of bone.  Streaks spread the levels of single edges: without metal slices these lie at most this part as far apart."""
 

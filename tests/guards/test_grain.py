@@ -12,7 +12,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 93_607,
+    "lines": 93_598,
     "modules": 410,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
@@ -24,7 +24,7 @@ CEILINGS = {
 HABITS = {
     "functions_with_pronouns": 29,
     "functions_without_object": 46,
-    "assignments_of_three": 15,
+    "assignments_of_three": 19,
     "nested_conditionals": 0,
     "comprehensions_of_two_loops": 23,
     "positional_flags": 0,

@@ -13,6 +13,8 @@ from house import ROOT
 from refusals import assert_one_line, refused
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
+from clrecon.jobs.batch.plan import read_cases
+from clrecon.jobs.options import ScanSettings
 from clrecon.labels import read_labels
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 from clrecon.reading import list_series, read_volume
@@ -28,6 +30,7 @@ READERS: dict[str, Callable[..., object]] = {
     "labels": read_labels,
     "curve": read_curve_points,
     "transfer function": load_transfer_function,
+    "manifest": lambda path: read_cases(path, ScanSettings()),
 }
 
 
@@ -115,6 +118,8 @@ OWN = {
     "proof/compare/job.py": "what it has just written",
     "proof/compare/page.py": "its own style",
     "jobs/run.py": "the system",
+    "jobs/batch/case.py": "reports of its own cases",
+    "jobs/batch/cohort.py": "tables and pages of its own cases",
     "rendering/movies.py": "new frames, its own temporary files",
 }
 """Modules that open files by themselves, and what they are."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import json
 import os
 import re
@@ -18,7 +19,7 @@ from clrecon.jobs.options import DeviceSettings, ScanSettings
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import asdict, dataclass, fields, replace
 from clrecon.system.options import option
-from clrecon.system.paths import find_extension, shown_path
+from clrecon.system.paths import find_extension, open_regular, shown_path
 from clrecon.system.text import escape_text, guess_word
 from clrecon.version import package_version
 
@@ -196,7 +197,7 @@ def read_cases(manifest: str | Path, selection: ScanSettings) -> list[Case]:
 def _read_table(path: str | Path) -> list[Case]:
     name = escape_text(os.path.basename(path))
     try:
-        with open(path, newline="", encoding="utf-8-sig") as stream:
+        with io.TextIOWrapper(open_regular(path), "utf-8-sig", newline="") as stream:
             rows = csv.reader(stream, strict=True)
             places = _find_columns(name, next(rows, []))
             cases = _read_rows(name, rows, places, os.path.dirname(os.path.abspath(path)))

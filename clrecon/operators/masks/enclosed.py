@@ -210,9 +210,7 @@ LARGEST_MARROW_MM = 35.0
 """Radius of the smallest ball that fits into no marrow: the head of a femur is 20 to 29 mm in radius, the skull of a
 newborn more than 45."""
 
-SATURATED_HU = 3000.0
-METAL_STEPS = 2.0
-METAL_SHARE = 0.05
+SATURATED_HU, METAL_STEPS, METAL_SHARE = 3000.0, 2.0, 0.05
 """What is filled within so many radii of the ball of values above the first is beside metal, in joints of it and in
 canals round it, and warned of from this share of the solid body on."""
 

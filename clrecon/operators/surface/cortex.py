@@ -58,10 +58,7 @@ _SMALLEST_SCALE, _LARGEST_SCALE = 0.001, 1.4
 WEIGHT_MM = 2.2
 """Width of the Gaussian of the samples' weights, at a scale of 1 mm."""
 
-INNER_SHARE = 0.25
-INNER_SPREAD = 0.6
-CORTEX_SPREAD = 0.15
-OUTER_SPREAD_HU = 1000.0
+INNER_SHARE, INNER_SPREAD, CORTEX_SPREAD, OUTER_SPREAD_HU = 0.25, 0.6, 0.15, 1000.0
 """What is expected before the fit: marrow has a quarter of the HU of cortex, within 0.6 of them; the cortex of a place
 lies within 15 % of that of the scan; tissue may be anything from air on."""
 
