@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
@@ -21,19 +21,28 @@ pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="processes are looked up in /proc"),
 ]
 
-COMMAND = [sys.executable, "-m", "clrecon", "batch"]
+COMMAND = [sys.executable, "-m", "clrecon", "batch", "--no-picture"]
+
+
+def write_ball(folder: Path, size: int) -> None:
+    settings = PhantomSettings(
+        kind="sphere", size=(size, size), slices=size // 2, spacing=(0.5, 0.5, 0.5), radius_mm=size / 12, noise=0.0
+    )
+    write_phantom(folder, settings)
+
+
+def write_manifest(folder: Path, inputs: Mapping[str, str]) -> None:
+    rows = [f"{case},{scan}\n" for case, scan in inputs.items()]
+    (folder / "m.csv").write_text("".join(["case,input\n", *rows]))
 
 
 @pytest.fixture
-def cohort(tmp_path: Path) -> Path:
-    """A folder with a large case among small ones, so that something can happen while it is made."""
-    for name, size in (("small", 24), ("large", 256)):
-        settings = PhantomSettings(
-            kind="sphere", size=(size, size), slices=size // 2, spacing=(0.5, 0.5, 0.5), radius_mm=size / 12, noise=0.0
-        )
-        write_phantom(tmp_path / name, settings)
-    (tmp_path / "m.csv").write_text("case,input\nfirst,small\nsecond,large\nthird,small\n")
-    return tmp_path
+def many(tmp_path: Path) -> list[str]:
+    """Names of so many small cases that none of these tests meets the last one."""
+    write_ball(tmp_path / "small", 24)
+    names = [f"case{number}" for number in range(40)]
+    write_manifest(tmp_path, dict.fromkeys(names, "small"))
+    return names
 
 
 def start(folder: Path, *options: str, prepare: Callable[[], None] | None = None) -> subprocess.Popen[str]:
@@ -53,61 +62,69 @@ def children_of(process: subprocess.Popen[str]) -> list[int]:
     return [int(word) for task in tasks.iterdir() for word in (task / "children").read_text().split()]
 
 
-def wait_for_work(folder: Path, process: subprocess.Popen[str], done: str) -> None:
-    """Wait until a case is being made behind `done`: kernels are built then, and no file of a driver is left cut."""
-    output = folder / "out"
+def wait_until(process: subprocess.Popen[str], has_happened: Callable[[], bool]) -> None:
     end = time.monotonic() + 120.0
-    while not (os.path.exists(output / done) and list(output.glob(".clrecon-*.folder"))):
+    while not has_happened():
         assert process.poll() is None and time.monotonic() < end
         time.sleep(0.002)
 
 
-def test_killed_worker_takes_its_own_case_along_and_is_named(cohort: Path) -> None:
-    process = start(cohort)
-    wait_for_work(cohort, process, "first")
+def test_killed_worker_takes_its_own_case_along_and_is_named(tmp_path: Path, many: list[str]) -> None:
+    process = start(tmp_path)
+    wait_until(process, (tmp_path / "out" / many[0]).exists)  # no kernel is built any more, whose file could be cut
     (worker,) = children_of(process)
     os.kill(worker, signal.SIGKILL)
     _, errors = process.communicate(timeout=240)
     assert process.returncode == 8
-    assert statuses(cohort) == {"first": "done", "second": "lost", "third": "done"}
-    assert "second" in errors and "SIGKILL" in errors
-    report = json.loads((cohort / "out" / "second" / "case.json").read_text())
+    found = statuses(tmp_path)
+    (lost,) = (case for case, status in found.items() if status == "lost")
+    assert found == dict.fromkeys(many, "done") | {lost: "lost"}
+    assert lost in errors and "SIGKILL" in errors
+    report = json.loads((tmp_path / "out" / lost / "case.json").read_text())
     assert "SIGKILL" in report["error"]["message"]
-    again = start(cohort, "--resume", "--json")
+    again = start(tmp_path, "--resume", "--json")
     output, _ = again.communicate(timeout=240)
     assert again.returncode == 0
-    assert (json.loads(output)["made"], json.loads(output)["kept"]) == (1, 2)
+    assert (json.loads(output)["made"], json.loads(output)["kept"]) == (1, len(many) - 1)
 
 
-def test_case_of_a_killed_worker_among_several_is_made_again_alone(cohort: Path) -> None:
-    process = start(cohort, "--workers", "2")
-    wait_for_work(cohort, process, "first")
+def test_case_of_a_killed_worker_among_several_is_made_again_alone(tmp_path: Path) -> None:
+    write_ball(tmp_path / "small", 24)
+    cases = ("first", "second", "third")
+    write_manifest(tmp_path, dict.fromkeys(cases, "small"))
+    process = start(tmp_path, "--workers", "2")
+    wait_until(process, lambda: len(children_of(process)) == 2)  # each has been given a case, and still starts
     for worker in children_of(process):
         os.kill(worker, signal.SIGKILL)
     process.communicate(timeout=240)
     assert process.returncode == 0
-    assert statuses(cohort) == dict.fromkeys(("first", "second", "third"), "done")
+    assert statuses(tmp_path) == dict.fromkeys(cases, "done")
 
 
-def test_interrupt_leaves_whole_cases_alone(cohort: Path) -> None:
-    process = start(cohort)
-    wait_for_work(cohort, process, "first")
+def test_interrupt_leaves_whole_cases_alone(tmp_path: Path, many: list[str]) -> None:
+    process = start(tmp_path)
+    wait_until(process, (tmp_path / "out" / many[0]).exists)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130 and "Traceback" not in errors
-    assert [path.name for path in (cohort / "out").iterdir()] == ["first"]
+    left = sorted((tmp_path / "out").iterdir(), key=lambda folder: many.index(folder.name))
+    assert [folder.name for folder in left] == many[: len(left)] and len(left) < len(many)
+    assert all((folder / "mesh.stl").is_file() and (folder / "case.json").is_file() for folder in left)
 
 
-def test_disk_that_takes_no_more_ends_the_batch_which_resumes_later(cohort: Path) -> None:
+def test_disk_that_takes_no_more_ends_the_batch_which_resumes_later(tmp_path: Path) -> None:
     import resource
 
+    write_ball(tmp_path / "small", 24)
+    write_ball(tmp_path / "large", 256)
+    write_manifest(tmp_path, {"first": "small", "second": "large", "third": "small"})
     limit = (1_500_000, 1_500_000)  # bytes of a file: built kernels and a small mesh fit, the large mesh does not
-    process = start(cohort, "--no-picture", prepare=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit))
+    process = start(tmp_path, prepare=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit))
     _, errors = process.communicate(timeout=240)
     assert process.returncode == 6, errors
     assert len(errors.splitlines()) == 1 and "second" in errors
-    assert [path.name for path in (cohort / "out").iterdir()] == ["first"]
-    again = start(cohort, "--no-picture", "--resume", "--json")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["first"]
+    again = start(tmp_path, "--resume", "--json")
     output, _ = again.communicate(timeout=240)
     assert again.returncode == 0
     assert (json.loads(output)["made"], json.loads(output)["kept"]) == (2, 1)
