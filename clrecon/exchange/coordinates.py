@@ -75,13 +75,18 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
 
 def find_places(vertices: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the first vertex at each place, (p,), in the order of vertices, and the place of each vertex, (n,)."""
-    _, first, inverse = np.unique(_scramble(vertices), return_index=True, return_inverse=True)
-    if not np.array_equal(vertices[first][inverse], vertices):  # two places with one sum, or NaN
+    mixed = _scramble(vertices)
+    order = np.argsort(mixed)
+    mixed = mixed.take(order)
+    start = np.flatnonzero(np.append(True, mixed[1:] != mixed[:-1])[: len(mixed)])
+    first = np.minimum.reduceat(order, start) if len(start) else start
+    first_of_each = np.empty(len(vertices), np.int64)
+    first_of_each[order] = np.repeat(first, np.diff(start, append=len(vertices)))
+    if not np.array_equal(vertices.take(first_of_each, axis=0), vertices):  # two places with one sum, or NaN
         _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first, kind="stable")
-    number = np.empty(len(first), np.int64)
-    number[order] = np.arange(len(first))
-    return first[order], number[inverse.reshape(-1)]
+        first_of_each = first[inverse.reshape(-1)]
+    is_first = first_of_each == np.arange(len(vertices))
+    return np.flatnonzero(is_first), (np.cumsum(is_first) - 1).take(first_of_each)
 
 
 def _scramble(vertices: NDArray[np.floating]) -> NDArray[np.uint64]:

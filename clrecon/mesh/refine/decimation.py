@@ -148,9 +148,8 @@ def _collapse_in_rounds(
     clusters: Clusters, deviation: Deviation, wanted: float, bound: float, tell: Callable[[int], None]
 ) -> tuple[int, int]:
     """Collapse and repair until few triangles are left, or hardly any more go; return rounds and undone collapses."""
-    left = len(clusters.faces())
+    left, is_last = len(clusters.faces()), False
     rounds, taken_back = 0, 0
-    is_last = False
     while left > _nearly(wanted) and rounds < _ROUNDS:
         tell(left)
         if rounds == 0:

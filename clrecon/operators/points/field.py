@@ -80,9 +80,8 @@ class _Decision:
     """The passes of cl/points/field_signs.cl."""
 
     def __init__(self, masks: Masks, limits: MemoryLimits, memory: int | None, used: int):
-        self.masks = masks
+        self.masks, self.memory = masks, memory
         self.device = masks.device
-        self.memory = memory
         self._limits, self._taken = limits, used
         self._program = ocl.load_program(masks.device, "points/field_signs.cl")
         self._lines = {"words": masks.words, "rows": masks.rows}

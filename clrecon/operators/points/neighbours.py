@@ -225,9 +225,8 @@ class NeighbourSearch:
         """Write the neighbours of the points of a part, (place_count, k), as places in the sorted order; with their
         distances as numbers, both to the rows of these points in (n, k).
         """
-        grid = self.grid
+        grid, by_place = self.grid, distances_d is None
         one_lane = _has_one_lane(self.device)
-        by_place = distances_d is None
         distances_d = neighbours_d if by_place else distances_d
         (nx, ny, nz), (x, y, z) = grid.shape, (float(value) for value in grid.origin - grid.base)
         ocl.launch(

@@ -102,9 +102,8 @@ class _Splats:
         has_normals: bool,
     ):
         camera, self.size, background, self.progress = shot
-        self.device = device
+        self.device, self.lighting = device, lighting
         self.radius = np.float32(radius_mm)
-        self.lighting = lighting
         shading = "normals" if has_normals else "depths"
         self.shading = shading if lighting.shades else "none"
         self.table = eye_table(camera, self.size, lighting, np.zeros(3) if base is None else base)

@@ -382,8 +382,7 @@ def fit_meshes(meshes: Sequence[Mesh], resident: DeviceVolume, *, progress: Prog
     Those that show none stay as they are, with ``{"reason": words}`` in place of figures; that none does is an error.
     """
     constants = None
-    fitted = list(meshes)
-    refused = []
+    fitted, refused = list(meshes), []
     for row in sorted(range(len(meshes)), key=lambda row: -meshes[row].vertex_count):
         try:
             for attempt in resident.with_fallback():
