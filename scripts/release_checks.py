@@ -59,6 +59,11 @@ CHECKS = {
         "ten minutes of harmed input without a fault, where .ci/run tries the first cases of each family",
         ("scripts/fuzz/fuzz.py", "--seconds", "600"),
     ),
+    "outliers": ReleaseCheck(
+        "every command with its common options ends on an ugly scan, and the table says which take over five seconds or"
+        " three times their peer: docs/benchmarks.md; needs SimpleITK and pyvista for the peers",
+        ("scripts/bench/outliers.py", "--json", str(KEPT / "outliers.json")),
+    ),
 }
 
 
