@@ -144,7 +144,7 @@ def test_the_page_stands_alone(device: Any, whole: Path) -> None:
     assert find_faults(page) == []
     assert len(page.encode()) < MOST_BYTES
     check = PageCheck(page)
-    assert len(check.pictures) == 13 + 11 + 4
+    assert len(check.pictures) == 14 + 12 + 4
     assert all(picture["src"].startswith("data:image/webp;base64,") for picture in check.pictures)
     assert page.count("<svg") == 3 and "<text" in page and page.count("<style") == 1
     assert "prefers-color-scheme: dark" in page and "@media print" in page

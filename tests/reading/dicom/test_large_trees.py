@@ -63,7 +63,7 @@ def test_row_47_many_files_are_walked_once_and_stay_small(
         return read_start(file, limit)
 
     monkeypatch.setattr(disk, "read_start", count_start)
-    monkeypatch.setattr(scan, "read_headers", lambda *given: parses.append(1) or heads(*given))  # type: ignore[func-returns-value]
+    monkeypatch.setattr(scan, "read_headers", lambda *given, **how: parses.append(1) or heads(*given, **how))  # type: ignore[func-returns-value]
     monkeypatch.setattr(elements, "parse_carefully", None)
     calls: list[tuple[str, int, int]] = []
     gc.collect()
