@@ -6,6 +6,9 @@ that reaches a user is a fault of clrecon.
 
 from __future__ import annotations
 
+PARTLY_DONE = 8
+"""Exit code of a command that has done some of its work; what could be written is there."""
+
 
 class ClreconError(Exception):
     """Base of all errors that clrecon raises on purpose.

@@ -7,10 +7,10 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
+from clrecon.errors import PARTLY_DONE
 from clrecon.jobs.options import hu_option, series_option
 from clrecon.system.text import format_digits
 
-PARTLY_DONE = 8
 _RUNS = 7
 
 

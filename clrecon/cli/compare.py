@@ -10,10 +10,8 @@ from typing import Any
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.errors import UsageError
+from clrecon.errors import PARTLY_DONE, UsageError
 from clrecon.proof.compare.methods import COMPARED, CompareSettings
-
-PARTLY_DONE = 8
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

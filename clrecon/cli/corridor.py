@@ -9,10 +9,9 @@ from typing import Any
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
+from clrecon.errors import PARTLY_DONE
 from clrecon.jobs.outputs import MESH_FILES, MeshFiles, name_outputs
 from clrecon.jobs.settings import CorridorSettings
-
-PARTLY_DONE = 8
 
 _EPILOG = """\
 For each side of a vertebra: the straight line whose least distance to the outside of the solid bone is largest, from

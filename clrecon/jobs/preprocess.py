@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.anatomy.body import describe_pieces, mask_field_of_view, remove_table
-from clrecon.anatomy.spine_line import find_spine_line
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
 from clrecon.geometry import frame_from_lps
 from clrecon.geometry.blocks import describe_extent
@@ -36,6 +34,8 @@ def mask_volume(volume: Volume, settings: options.InputSettings, progress: Progr
     """Return the volume with air outside the field of view and the body, as the settings ask for it."""
     if settings.field_of_view is None and not settings.remove_table:
         return volume
+    from clrecon.anatomy.body import describe_pieces, mask_field_of_view, remove_table
+
     warnings = list(volume.report.get("warnings", ()))
     if settings.field_of_view is not None:
         radius = settings.field_of_view
@@ -64,6 +64,8 @@ def mask_volume(volume: Volume, settings: options.InputSettings, progress: Progr
 
 
 def _describe_bone_left(facts: dict[str, Any]) -> str:
+    from clrecon.anatomy.body import describe_pieces
+
     if facts["bone_kept"] is None:
         return " no bone above 300 HU;"
     bone = "the dry bone" if facts["specimen"] else "the bone"
@@ -211,6 +213,8 @@ def _mask_of(
 
 def _line_of(volume: Volume, rule: options.RegionRule, facts: dict[str, Any]) -> Any:
     """Return the centre line of a tube, LPS mm."""
+    from clrecon.anatomy.spine_line import find_spine_line
+
     if rule.path is not None:
         from clrecon.rendering.views.centre_line import read_curve_points
 

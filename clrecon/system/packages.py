@@ -8,9 +8,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import shlex
-import shutil
-import subprocess
 import sys
 from importlib import import_module
 from typing import Any
@@ -45,6 +42,10 @@ def install_command(*packages: str) -> str:
     A bare ``pip`` may belong to another Python, and an extra of clrecon can be named only where an index has clrecon.
     Environments without pip, as uv makes them, get uv's own command.
     """
+    import shlex
+    import shutil
+    import subprocess
+
     python = [sys.executable or "python3"]
     if importlib.util.find_spec("pip") is None and shutil.which("uv") is not None:
         words = ["uv", "pip", "install", "-p", *python, *packages]

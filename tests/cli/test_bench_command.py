@@ -13,6 +13,7 @@ from printed_text import Printer
 
 from clrecon.cli import bench as command
 from clrecon.cli.main import main
+from clrecon.errors import PARTLY_DONE
 
 CONTRACT = {
     "input", "iso_value_hu", "iso_level_hu", "runs", "processor", "platform", "version", "cores", "free_cores",
@@ -55,7 +56,7 @@ def test_a_failed_device_is_partly_done(
     device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("clrecon.opencl.list_devices", lambda: [BurntDevice(device), device])
-    assert main(["bench", str(ct), "--runs", "1", "--device", "all"]) == command.PARTLY_DONE
+    assert main(["bench", str(ct), "--runs", "1", "--device", "all"]) == PARTLY_DONE
     captured = capsys.readouterr()
     assert "failed: it caught fire" in captured.out
     assert "it caught fire" in captured.err and "flying edges" in captured.out

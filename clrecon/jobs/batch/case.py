@@ -249,7 +249,6 @@ def _open_device(plan: Plan) -> DeviceError | None:
 
     with suppress(ImportError):  # before threads: one that imports scipy beside one with nibabel gets it half made
         import_module("scipy")
-
     try:
         choose_device(plan.device)
     except DeviceError as error:

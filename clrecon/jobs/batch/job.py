@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
 
-from clrecon.errors import OutputError, UsageError
+from clrecon.errors import PARTLY_DONE, OutputError, UsageError
 from clrecon.jobs.batch.case import DONE, LOST, fail_case, read_report
 from clrecon.jobs.batch.cohort import write_cohort
 from clrecon.jobs.batch.plan import PAGE, TABLE, Case, Plan, check_places
@@ -19,9 +19,6 @@ from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.paths import resolve_target, shown_path, system_errors
 from clrecon.system.progress import Progress, ignore_progress
-
-PARTLY_DONE = 8
-"""Exit code where some cases are not done."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -107,8 +104,7 @@ def _check_choice(plan: Plan) -> None:
         given.append(name_parameter("no_clobber", True))
     if len(given) > 1:
         raise UsageError(f"{' and '.join(given)} say different things of cases that are there: take one of them")
-    settings = plan.plain or plan.labelled
-    if plan.batch.devices is not None and settings is not None and settings.device is not None:
+    if plan.batch.devices is not None and plan.device is not None:
         raise UsageError(f"{name_parameter('devices', 'D,D')} names the devices: leave {name_parameter('device')} out")
     if plan.batch.collect and plan.batch.part is not None:
         raise UsageError(

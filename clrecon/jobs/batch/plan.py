@@ -87,13 +87,12 @@ class BatchSettings:
 
 
 class Case(NamedTuple):
-    """A row of a manifest; `line` is its place in the file, from 1, of a folder the number of the series."""
+    """A row of a manifest, or a series of a folder."""
 
     name: str
     source: str
     series: str | None
     labels: str | None
-    line: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,7 +249,7 @@ def _read_rows(name: str, rows: Any, places: dict[str, int], folder: str) -> lis
         source, labels = (
             os.path.join(folder, path) if (path := cells.get(column, "")) else None for column in ("input", "labels")
         )
-        cases.append(Case(case, source or "", cells.get("series") or None, labels, line))
+        cases.append(Case(case, source or "", cells.get("series") or None, labels))
     return cases
 
 
@@ -269,10 +268,7 @@ def _find_series(folder: str | Path, selection: ScanSettings) -> list[Case]:
             f" {', '.join(COLUMNS)}"
         )
     width = max(3, len(str(stacks[-1].number)))
-    return [
-        Case(f"series-{stack.number:0{width}d}", str(stack.folder), stack.series, None, stack.number)
-        for stack in stacks
-    ]
+    return [Case(f"series-{stack.number:0{width}d}", str(stack.folder), stack.series, None) for stack in stacks]
 
 
 def check_places(cases: Sequence[Case], output: str | Path) -> None:

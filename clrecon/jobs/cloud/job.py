@@ -16,7 +16,6 @@ from clrecon.jobs.inputs import describe_cloud, is_cloud_file, refuse_other_clou
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.run import Run, RunReport
 from clrecon.points import SURFACE_KINDS, PointCloud
-from clrecon.points.cloud_reader import read_points
 from clrecon.points.ghost_slices import fill_ghost_slices
 from clrecon.system.arguments import name_parameter
 from clrecon.system.files import allow_open_files
@@ -88,6 +87,8 @@ def _check_kind(settings: CloudSettings, is_cloud: bool) -> None:
 def _read_input(source: str | Path, is_cloud: bool, run: Run) -> tuple[Volume | PointCloud, LabelMap | None]:
     settings: CloudSettings = run.settings
     if is_cloud:
+        from clrecon.points.cloud_reader import read_points
+
         run.progress("read", 0, 0)
         return read_points(source, space=settings.input_space), None
     if settings.labels is None:

@@ -17,7 +17,6 @@ from clrecon.jobs.run import trial_cube
 from clrecon.points import PointCloud
 from clrecon.points.cloud import count_numbers
 from clrecon.points.ghost_slices import drop_ghost_slices
-from clrecon.points.keep import keep_clusters
 from clrecon.points.stencil import Lattice
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
@@ -134,6 +133,7 @@ def _cluster_points(
 ) -> None:
     """Cluster the points; drop noise and the clusters that no keep rule names."""
     from clrecon.operators.points.clusters import cluster_points
+    from clrecon.points.keep import keep_clusters
 
     eps, volume = chosen.eps, resident
     if resident is not None and not steps.cloud.has_ijk:  # points of a surface: free, but of that scan

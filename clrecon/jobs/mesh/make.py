@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clrecon.anatomy.surroundings import leave_outside_air
 from clrecon.errors import DeviceFailedError, NoSurfaceError, UsageError
 from clrecon.geometry import frame_from_lps
 from clrecon.geometry.certificate import amend
@@ -258,6 +257,8 @@ def drop_outside_air(volume: Volume, settings: MeshSettings, progress: Progress)
     """Return the volume without the air around the patient, if the settings ask for the values below an iso value."""
     if settings.below is None or settings.keep_outside:
         return volume
+    from clrecon.anatomy.surroundings import leave_outside_air
+
     warnings = list(volume.report.get("warnings", ()))
     levels = [level for level in settings.levels if not isinstance(level, tuple)]
     volume = leave_outside_air(volume, levels, progress=progress)

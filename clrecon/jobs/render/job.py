@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clrecon.anatomy.head import SKIN_SEEN_HU, warn_of_face
-from clrecon.anatomy.surroundings import LEFT_OUT, leave_out_surroundings
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.certificate import amend
@@ -27,7 +26,6 @@ from clrecon.labels import file_suffixes
 from clrecon.mesh import Mesh
 from clrecon.mesh.mesh_reader import read_mesh
 from clrecon.points import PointCloud
-from clrecon.points.cloud_reader import read_points
 from clrecon.rendering.movies import animation_kind, check_animation, stage_animation, turntable_cameras
 from clrecon.rendering.pictures.annotations import check_caption, edge_letters
 from clrecon.rendering.pictures.label_style import NO_LABEL, find_shown
@@ -337,6 +335,8 @@ def _read_input(source: str | Path, run: Run) -> tuple[Volume | PointCloud | Mes
         run.progress("read", 0, 0)
         if settings.mode == "mesh":
             return read_mesh(source, space=settings.mesh_space), None
+        from clrecon.points.cloud_reader import read_points
+
         return read_points(source), None
     path = None if settings.labels is None else settings.labels.path
     read_map = partial(read_look, settings.labels, follow_links=settings.follow_links)
@@ -356,6 +356,8 @@ def _mask_scan(volume: Volume, settings: RenderSettings, device: Device, progres
 
 def _leave_out_surroundings(volume: Volume, settings: RenderSettings, device: Device, progress: Progress) -> Volume:
     """Leave out what lies outside of the body and of the region, whose voxels get a value above those that count."""
+    from clrecon.anatomy.surroundings import LEFT_OUT, leave_out_surroundings
+
     measured = volume.report.get("hu_range")
     volume = leave_out_surroundings(volume, progress=progress)
     bands: list[Band] = [(-math.inf, volume.report[LEFT_OUT]["value_hu"] - 1.0)]

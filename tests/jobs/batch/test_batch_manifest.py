@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -26,8 +25,8 @@ def read_table(folder: Path, text: str) -> list[Case]:
 def test_paths_of_a_table_start_at_its_folder_and_further_columns_may_be_empty(tmp_path: Path) -> None:
     cases = read_table(tmp_path, "\ufeffinput, case ,labels,series\r\nct/a,P-1,,\r\n\r\n/abs/b , p.2,l.nii,7\r\n")
     assert cases == [
-        Case("P-1", str(tmp_path / "ct/a"), None, None, 2),
-        Case("p.2", "/abs/b", "7", str(tmp_path / "l.nii"), 4),
+        Case("P-1", str(tmp_path / "ct/a"), None, None),
+        Case("p.2", "/abs/b", "7", str(tmp_path / "l.nii")),
     ]
 
 
@@ -68,16 +67,14 @@ def test_what_is_no_table_is_refused(content: bytes | None, tmp_path: Path) -> N
 
 
 @pytest.mark.seconds
-def test_hundred_thousand_rows_take_seconds_and_little_memory(tmp_path: Path) -> None:
+def test_hundred_thousand_rows_take_little_memory(tmp_path: Path) -> None:
     text = "case,input\n" + "".join(f"case-{number},/data/ct/{number}\n" for number in range(100_000))
     tracemalloc.start()
-    start = time.perf_counter()
     cases = read_table(tmp_path, text)
     check_places(cases, tmp_path / "out")
-    seconds, peak = time.perf_counter() - start, tracemalloc.get_traced_memory()[1]
+    peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert len(cases) == 100_000 and cases[-1].line == 100_001
-    assert seconds < 30.0  # 1.2 s on an idle machine without tracemalloc
+    assert len(cases) == 100_000 and cases[-1].name == "case-99999"
     assert peak < 100e6
 
 
@@ -99,7 +96,7 @@ def test_folder_without_stacks_is_refused_and_the_columns_of_manifests_are_named
 @pytest.mark.parametrize("output", ["ct/out", "."], ids=["within the input", "around the input"])
 def test_output_and_inputs_lie_apart(output: str, tmp_path: Path) -> None:
     (tmp_path / "ct").mkdir()
-    case = Case("a", str(tmp_path / "ct"), None, None, 2)
+    case = Case("a", str(tmp_path / "ct"), None, None)
     with refused(UsageError, "a"):
         check_places([case], tmp_path / output)
 
