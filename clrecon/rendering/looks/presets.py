@@ -90,7 +90,7 @@ PRESETS: dict[str, Preset] = {
     for preset in (
         _preset(
             "bone",
-            "bone, from thin vertebral cortex on; what contrast medium fills shows too",
+            "bone, from thin vertebral cortex on; vessels and organs filled with contrast medium are visible too",
             _BONE,
             f"{_TISSUE}; thin vertebral cortex in slices of 4 mm has 150 to 200 HU",
         ),
@@ -143,7 +143,7 @@ PRESETS: dict[str, Preset] = {
         ),
         _preset(
             "vessels",
-            "vessels and organs with contrast medium in red, bone paler behind them; a table shows too",
+            "vessels and organs with contrast medium in red, bone paler behind them; a table is visible too",
             [
                 (120.0, _BLOOD, 0.0),
                 (170.0, (0.66, 0.10, 0.08), 0.04),
@@ -158,7 +158,7 @@ PRESETS: dict[str, Preset] = {
         ),
         _preset(
             "muscle",
-            "muscles and organs without skin and fat, bone where it lies bare",
+            "muscles and organs without skin and fat, bone where no muscle covers it",
             [
                 (-40.0, _MUSCLE, 0.0),
                 (10.0, _MUSCLE, 0.1),
@@ -172,7 +172,7 @@ PRESETS: dict[str, Preset] = {
         ),
         _preset(
             "metal",
-            "screws, rods and implants; bone is glass",
+            "screws, rods and implants; bone is as transparent as glass",
             [
                 (150.0, _MARROW, 0.0),
                 (300.0, _SPONGY, 0.02),
