@@ -18,43 +18,62 @@ Report = Mapping[str, Any]
 
 _OPENING = """# Both papers reproduced
 
-clrecon implements two papers on the reconstruction of vertebrae. **Paper A** is "CPU-GPU Rendering of CT Scan Images
-for Vertebra Reconstruction from CT Scan Images with a Calibration Policy". **Paper B** is Liu et al., "Vertebrae CT
-Images 3D Reconstruction with Improve Marching Cubes Algorithm", J. Harbin Inst. Technol. (New Series) 26(6): 69-79,
-2019, DOI 10.11916/j.issn.1005-9113.18042. This page makes their tables again with clrecon, says of each claim what came
-of it, and lists where each of their functions is. It is written by a script, from the reports of `clrecon compare`
+clrecon implements the methods of two papers on the reconstruction of vertebrae:
+
+- **Paper A** is "CPU-GPU Rendering of CT Scan Images for Vertebra Reconstruction from CT Scan Images with a Calibration
+  Policy".
+- **Paper B** is Liu et al., "Vertebrae CT Images 3D Reconstruction with Improve Marching Cubes Algorithm", J. Harbin
+  Inst. Technol. (New Series) 26(6): 69-79, 2019, DOI 10.11916/j.issn.1005-9113.18042.
+
+This page repeats the measurements of both papers with clrecon, gives a verdict on each of their claims, and lists where
+each of their functions is in clrecon. A script writes the page from the reports of `clrecon compare`
 (`docs/papers/*.json`):
 
     python3 scripts/papers/papers.py run --work FOLDER --paper-a CT_FOLDER
     python3 scripts/papers/papers.py page
 
-The series of paper B are synthetic spines of its sizes, `clrecon phantom --levels`; that of paper A has its size. The
-papers' own scans are not public. [compare.md](compare.md) and [measures.md](measures.md) define the measures."""
+The scans of the papers are not public. Paper B is repeated on synthetic spines (`clrecon phantom --levels`) with the
+numbers of slices and vertebrae that the paper used. Paper A is repeated on a chest CT of the same size as the paper's
+scan. [measures.md](measures.md) defines the measures, and [compare.md](compare.md) describes all methods. The main ones
+are:
+
+| name | method |
+|---|---|
+| T-MC | marching cubes over every cell; neighbouring cells share their vertices |
+| T-MC, soup | the same, but each cell has its own vertices, which are welded afterwards (in NumPy) |
+| VTK MC, VTK FE | vtkMarchingCubes and vtkFlyingEdges3D |
+| I-MC | only the cells that are connected to seed points |
+| I-MC, golden | I-MC with each vertex at the golden section of its edge |
+| G-MC | T-MC, then edges are collapsed by quadric error, without an error bound |
+| S-MC | T-MC, then decimation within an error bound; the topology is preserved |"""
 
 _SLICES = """## Sub-voxel slices
 
-Two surfaces can pass through the same cells and be far apart. clrecon therefore also compares mesh and scan on a
-lattice that is three times finer than the voxels and does not coincide with their planes. On the lattice of the
-voxels every surface with one vertex on each crossed edge looks perfect; the error of paper B's golden constant is
-visible only on the finer lattice."""
+Two surfaces can pass through the same cells and still be far apart. clrecon therefore also compares mesh and scan on a
+finer lattice: its points are three times as dense as the voxels and do not lie in the planes of the voxels. On the
+lattice of the voxels, every surface with one vertex on each crossed edge looks perfect. Only the finer lattice shows
+the error of paper B's golden constant, which places each vertex at 0.618 of its edge. HD95 is the 95th percentile of
+the distances to the surface of T-MC."""
 
 _TIMES = """## Paper B, time
 
-Paper B, Tables 2 and 3. Its times are pictures in the print and do not survive as numbers, so only ours stand here:
-seconds from voxels in memory to the mesh in memory, of the first call in a new process and of later ones (median).
-"Visited" are the cells that growing looks at, of all cells."""
+Paper B gives its times in Tables 2 and 3. The printed tables are images without legible numbers, so the tables here
+have only clrecon's times. A time is in seconds, from the voxels in memory to the mesh in memory. "First" is the first
+call in a new process, "later" is the median of later calls. The last column is the number of cells in the volume for
+each cell that the growing of I-MC visits."""
 
 _ACCURACY = """## Paper B, accuracy
 
-Paper B, Table 1 and Fig. 9, calls accuracy the share of "characteristic voxels" that a method repeats. That is the
-recall of the cells that T-MC passes through. Beside it stands what it does not see: the distance of each surface from
-the true one, its mean (bias, which belongs to the level) and its scatter (which belongs to the method)."""
+Table 1 and Fig. 9 of paper B define accuracy as the share of "characteristic voxels" that a method repeats. This is the
+recall of the cells that T-MC passes through. Recall does not show where in a cell the surface lies, so the table also
+has the distance of each surface from the true surface. The mean distance (bias) depends on the iso value, the standard
+deviation (scatter) on the method."""
 
 _SSIM = """## Paper A, SSIM
 
-Paper A compares a picture of the reconstruction with a slice, by SSIM and MSE. Pictures and slice are of one size and
-in one place here (window -200 to 800 HU), which the paper does not say of its own. The controls are no
-reconstructions."""
+Paper A compares a picture of the reconstruction with a slice by SSIM and MSE. It does not say how its pictures were
+aligned with the slice. Here, pictures and slice have the same size and position, and a window of -200 to 800 HU. The
+controls in the last five rows are not reconstructions. They show which scores are reached without one."""
 
 
 def make_page(reports: Mapping[str, Report], growing: Mapping[str, Any] | None, rows: Sequence[PaperFunction]) -> str:
@@ -73,7 +92,7 @@ def make_page(reports: Mapping[str, Report], growing: Mapping[str, Any] | None, 
     parts += ["## Claims", *judge_claims(reports, growing)]
     parts += [
         "## Functions",
-        "The table lists every function in the papers. The last column names the pages with figures.",
+        "The table lists every function in the papers. The last column links to the pages that have figures for it.",
     ]
     parts += ["\n".join(table_of_functions(rows))]
     return "\n\n".join(part if part.startswith(("|", "#")) else _wrap(part) for part in parts) + "\n"
@@ -90,9 +109,9 @@ def _machine(reports: Mapping[str, Report]) -> list[str]:
     devices = sorted({f"{report['device']} ({report['driver']})" for report in reports.values()})
     free = [report["free_cores"] for report in reports.values()]
     return [
-        f"Measured on {' and '.join(dict.fromkeys((days[0], days[-1])))} with clrecon {one['version']}: "
-        f"{one['processor']}, {one['cores']} cores of which {min(free):.1f} to {max(free):.1f} were free, device "
-        f"{', '.join(devices)}."
+        f"The figures were measured on {' and '.join(dict.fromkeys((days[0], days[-1])))} with clrecon "
+        f"{one['version']} on an {one['processor']} with {one['cores']} cores, of which {min(free):.1f} to "
+        f"{min(max(free), one['cores']):.1f} were free. The OpenCL device was {', '.join(devices)}."
     ]
 
 
@@ -146,7 +165,7 @@ def _table_1(reports: Mapping[str, Report]) -> list[str]:
             (
                 str(theirs["method"]), *(_number(_of(theirs, entry)) for entry in ("seconds", "later_s")),
                 "" if row is None else row["title"], _number(_of(row or {}, "first_s")),
-                _number(_of(row or {}, "warm_s")) or ("" if small is None else f"{small:.3g} (reckoned)"),
+                _number(_of(row or {}, "warm_s")) or ("" if small is None else f"{small:.3g} (extrapolated)"),
             )
         )  # fmt: skip
     others = [
@@ -155,11 +174,12 @@ def _table_1(reports: Mapping[str, Report]) -> list[str]:
         if name not in PAPER
     ]
     read = report["read_s"]
-    head = ("paper's row", "paper, s", "later, s", "here", "first, s", "later, s")
+    head = ("row of the paper", "paper, s", "paper, later, s", "method here", "first run, s", "later runs, s")
     return [
         "## Paper A, Table 1",
-        "Seconds; 512 x 512 x 95 voxels as in the paper, which measured on a Core i5 and a GTX 1050. Reading the series"
-        f" takes {read['first']:.2f} s at first and {read['warm']:.2f} s later and is not in the columns.",
+        "The scan has 512 x 512 x 95 voxels, as in the paper. The paper used a Core i5 and a GTX 1050. Reading the "
+        f"series takes {read['first']:.2f} s in the first run and {read['warm']:.2f} s later, "
+        "which the table does not include.",
         _table(head, [*rows, *others]),
     ]
 
@@ -199,7 +219,7 @@ _TIMED = ("t-mc", "g-mc", "s-mc", "i-mc", "i-mc-golden")
 
 
 def _times(reports: Mapping[str, Report], growing: Mapping[str, Any] | None) -> list[str]:
-    head = ("series", "vertebrae", "", "T-MC", "G-MC", "S-MC", "I-MC", "I-MC, golden", "visited, 1 in")
+    head = ("series", "vertebrae", "", "T-MC", "G-MC", "S-MC", "I-MC", "I-MC, golden", "cells / visited")
     tables = []
     for names in (("b54", "b149", "b559"), ("v2", "v3", "v4", "v5", "v12", "b559")):
         rows = []
@@ -219,8 +239,8 @@ def _times(reports: Mapping[str, Report], growing: Mapping[str, Any] | None) -> 
             for each in growing["rows"]
         ]  # fmt: skip
         tables += [
-            f"Seeds in some vertebrae of {SETS['b559'].what}; time beside that of T-MC of the whole, from a volume on "
-            "the device:",
-            _table(("seeds in vertebrae", "cells visited", "of all cells, 1 in", "time / T-MC"), rows),
+            f"The next table has I-MC with seeds in only some of the vertebrae, for {SETS['b559'].what}. Its times are "
+            "divided by the time of T-MC for the whole series. Both start from a volume on the device:",
+            _table(("vertebrae with seeds", "cells visited", "cells / visited", "time / T-MC"), rows),
         ]
     return tables
