@@ -123,7 +123,7 @@ def said_of(found: dict[str, Any]) -> str:
     words = {
         "not HU": ("hu_scale", "hu_known", "not known to be HU"),
         "metal": ("metal",),
-        "part is no bone": ("in part no bone",),
+        "a part is not bone": ("in part no bone",),
         "volume too large": ("too large",),
         "filled beside metal": ("filled lie beside",),
     }
@@ -142,7 +142,8 @@ def make_table(figures: dict[str, dict[str, dict[str, Any]]]) -> str:
                 continue
             off = f"{100.0 * volume_error(found):+.1f} %"
             rows.append([kind, options, found["code"], f"{found['level']:g}", off, found["off_voxels"], said_of(found)])
-    return markdown_table(["scan", "options", "exit", "level", "volume", "voxels off (median)", "said"], rows)
+    heads = ["scan", "options", "exit code", "level", "volume error", "distance, voxels", "warnings"]
+    return markdown_table(heads, rows)
 
 
 def main(names: list[str]) -> int:
