@@ -15,6 +15,7 @@ from clrecon.geometry import Volume
 from clrecon.proof.rays.render import cast_rays
 from clrecon.proof.rays.surface import cast_surface
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
+from clrecon.rendering.pictures.styles import Projection, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera
 
 TURN = rotation((15.0, -25.0, 40.0))
@@ -172,16 +173,19 @@ class TwinCaster:
         mode: str = "dvr",
         transfer_function: TransferFunction | None = None,
         *,
-        iso_value: float | None = None,
-        shadows: bool = False,
-        lighting: Lighting | None = UNSHADED,
+        camera: Camera,
+        size: tuple[int, int],
+        lighting: Lighting = UNSHADED,
         **settings: Any,
     ) -> Shot:
         if mode == "surface":
-            assert iso_value is not None
-            picture = cast_surface(volume, iso_value, lighting=lighting, shadows=shadows, **settings)
+            look = SurfaceLook(color="white", lighting=lighting, **settings)
+            picture = cast_surface(volume, look, camera, size)
+        elif mode == "dvr":
+            assert transfer_function is not None
+            picture = cast_rays(volume, VolumeLook(transfer_function, lighting=lighting, **settings), camera, size)
         else:
-            picture = cast_rays(volume, transfer_function, lighting=lighting, mode=mode, **settings)
+            picture = cast_rays(volume, Projection(mode, **settings), camera, size)  # type: ignore[arg-type]
         return Shot(picture.image(), picture.depth, picture.expected_depth, picture.values)
 
 

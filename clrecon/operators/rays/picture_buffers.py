@@ -194,7 +194,8 @@ class Between:
 
 
 class DrawnVolume(NamedTuple):
-    """A volume for layers, rays from `near_mm`; `sample` adds it to the states between two layers; None: no volume."""
+    """A volume for layers; `sample` adds it to the states between two layers; None: no volume.  Its rays begin at
+    `near_mm`, see `VIEW_NEAR` in cl/rays/view.h."""
 
     device: Device
     sample: Callable[[Between], None] | None

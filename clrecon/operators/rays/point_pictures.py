@@ -56,32 +56,34 @@ class SplatPicture(NamedTuple):
     parts: int
 
 
-def draw_splats(
-    device: Device,
-    points: NDArray[np.float32],
-    colors: NDArray[np.uint8],
-    normals: NDArray[np.float32] | None,
-    shot: Shot,
-    radius_mm: float,
-    *,
-    base: Float64Array | None = None,
-    lighting: Lighting | None = None,
-    memory: int | None = None,
-    stopwatch: Stopwatch | None = None,
-) -> SplatPicture:
-    """Draw each point, (n, 3) float32 mm from `base`, as a disc that faces the camera; the nearest disc is seen.
+class Discs(NamedTuple):
+    """Discs at points (n, 3), mm from `base`, with colours (n, 4): red, green, blue, 255.
 
-    colors: (n, 4) uint8. Red, green, blue, 255.
-    normals: (n, 3) float32. Unit vectors, LPS; without them points are shaded by what lies around them.
-    radius_mm: Of the discs; on the picture it is at least 0.7 and at most 128 pixels.
+    normals: Unit vectors (n, 3), LPS; without them points are shaded by what lies around them.
+    radius_mm: On the picture it is at least 0.7 and at most 128 pixels.
+    """
+
+    points: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+    normals: NDArray[np.float32] | None
+    radius_mm: float
+    lighting: Lighting
+    base: Float64Array | None = None
+
+
+def draw_splats(
+    device: Device, discs: Discs, shot: Shot, *, memory: int | None = None, stopwatch: Stopwatch | None = None
+) -> SplatPicture:
+    """Draw discs that face the camera; the nearest disc is seen.
+
     memory: A cloud over it goes through in parts, and gives the same picture.
     """
-    job = _Splats(device, shot, radius_mm, base, lighting or Lighting(), normals is not None)
-    count = job.plan(len(points), memory)
+    job = _Splats(device, discs, shot)
+    count = job.plan(memory)
     stopwatch = stopwatch or Stopwatch()
     while True:
         try:
-            return job.draw(points, colors, normals, count, stopwatch)
+            return job.draw(count, stopwatch)
         except DeviceMemoryError as error:
             ocl.settle(device, error)
             if count <= FEWEST_POINTS:
@@ -92,29 +94,21 @@ def draw_splats(
 class _Splats:
     """One picture: its table, and its passes over parts of the cloud."""
 
-    def __init__(
-        self,
-        device: Device,
-        shot: Shot,
-        radius_mm: float,
-        base: Float64Array | None,
-        lighting: Lighting,
-        has_normals: bool,
-    ):
+    def __init__(self, device: Device, discs: Discs, shot: Shot):
         camera, self.size, background, self.progress = shot
-        self.device, self.lighting = device, lighting
-        self.radius = np.float32(radius_mm)
-        shading = "normals" if has_normals else "depths"
-        self.shading = shading if lighting.shades else "none"
-        self.table = eye_table(camera, self.size, lighting, np.zeros(3) if base is None else base)
+        self.device, self.discs = device, discs
+        shading = "depths" if discs.normals is None else "normals"
+        self.shading = shading if discs.lighting.shades else "none"
+        base = np.zeros(3) if discs.base is None else discs.base
+        self.table = eye_table(camera, self.size, discs.lighting, base)
         self.background = np.zeros(4, np.float32)
         if background is not None:
             self.background[:] = *find_color(background), 1.0
-        self.disc_pixels = min(max(radius_mm / camera.pixel_mm(self.size), SMALLEST_DISC), LARGEST_DISC)
+        self.disc_pixels = min(max(discs.radius_mm / camera.pixel_mm(self.size), SMALLEST_DISC), LARGEST_DISC)
 
-    def plan(self, points: int, memory: int | None) -> int:
+    def plan(self, memory: int | None) -> int:
         """Return the points of a part: what fits beside the picture, and no more pixels than a launch should have."""
-        width, height = self.size
+        (width, height), points = self.size, len(self.discs.points)
         area = math.pi * self.disc_pixels**2
         if points * area > MOST_PIXELS:
             raise UsageError(
@@ -132,21 +126,15 @@ class _Splats:
     def _point_bytes(self) -> int:
         return 28 if self.shading == "normals" else 16
 
-    def draw(
-        self,
-        points: NDArray[np.float32],
-        colors: NDArray[np.uint8],
-        normals: NDArray[np.float32] | None,
-        count: int,
-        stopwatch: Stopwatch,
-    ) -> SplatPicture:
+    def draw(self, count: int, stopwatch: Stopwatch) -> SplatPicture:
+        points, colors, normals, radius_mm, lighting, _ = self.discs
         device, (width, height) = self.device, self.size
         program = ocl.load_program(device, "rays/splats.cl")
         pixels, n = width * height, len(points)
         image, image_d = ocl.empty_output(device, (height, width, 4), np.uint8)
         depth, depths_d = ocl.empty_output(device, (height, width), np.float32)
         keys_d, numbers_d = ocl.allocate(device, 4 * pixels), ocl.allocate(device, 4 * pixels)
-        view_d, lights_d = ocl.upload(device, self.table), ocl.upload(device, highlight_table(self.lighting))
+        view_d, lights_d = ocl.upload(device, self.table), ocl.upload(device, highlight_table(lighting))
         starts, whole_d = range(0, max(n, 1), max(count, 1)), None
         picture: dict[str, Any] = {"view": view_d, "width": width, "height": height}
 
@@ -170,7 +158,7 @@ class _Splats:
                 with stopwatch.running(device):  # wait: CPU devices read the host's arrays
                     ocl.launch(
                         device, program[kernel], max(piece, 1),
-                        points=points_d, keys=keys_d, radius=self.radius, count=piece, **more, **picture,
+                        points=points_d, keys=keys_d, radius=radius_mm, count=piece, **more, **picture,
                     )  # fmt: skip
                 del points_d
                 tell_done(number * n + first + piece)
@@ -299,13 +287,11 @@ class PointPictures(DeviceWorker):
             is_inside = style.clip.contains(cloud.points)
             points, table = points[is_inside], table[is_inside]
             normals = None if normals is None else normals[is_inside]
+        discs = Discs(points, table, normals, radius, style.light, self._base)
         stopwatch, shot = Stopwatch(), Shot(camera, size, background, progress or ignore_progress)
         for attempt in ocl.with_fallback(self._device):
             with attempt as (device, notes):
-                splats = draw_splats(
-                    device, points, table, normals, shot, radius, base=self._base, lighting=style.light,
-                    memory=self.memory, stopwatch=stopwatch,
-                )  # fmt: skip
+                splats = draw_splats(device, discs, shot, memory=self.memory, stopwatch=stopwatch)
         report = {
             "mode": "points",
             "device": device.label,

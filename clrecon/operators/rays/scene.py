@@ -61,44 +61,33 @@ class LayeredPicture(NamedTuple):
 
 
 def draw_layers(
-    device: Device,
+    volume: DrawnVolume,
     parts: Sequence[mesh_pictures.MeshPart],
     shot: Shot,
     *,
     still: Still | None = None,
-    volume: Callable[[Between], None] | None = None,
-    near_mm: float = 0.0,
     most: int = LAYERS,
     memory: int | None = None,
-    stopwatch: Stopwatch | None = None,
 ) -> LayeredPicture:
     """Draw triangles, with what lies before, between and behind them.
 
+    volume: Its `sample` is called from front to back, and waits.
     parts: Of triangles at the same depth those of lower numbers are nearer, the first of the first part first.
     still: A picture of the same camera: one further layer at its depth.
-    volume: Adds what a volume shows between two layers to the states of the rays, and waits; called from front to back.
-    near_mm: Where the volume's rays begin, see `VIEW_NEAR` in cl/rays/view.h.
     most: Most layers; there is progress before each.
     """
     pixels = math.prod(shot.size)
     needs = {"picture": PIXEL_BYTES * pixels, "triangles": sum(part.device_bytes for part in parts)}
-    ocl.check_budget(device, needs, memory)
-    return _Layers(device, parts, shot, still, near_mm, stopwatch or Stopwatch()).run(volume, most)
+    ocl.check_budget(volume.device, needs, memory)
+    return _Layers(volume, parts, shot, still).run(volume.sample, most)
 
 
 class _Layers:
     """One picture: its buffers, and its passes."""
 
-    def __init__(
-        self,
-        device: Device,
-        parts: Sequence[mesh_pictures.MeshPart],
-        shot: Shot,
-        still: Still | None,
-        near_mm: float,
-        stopwatch: Stopwatch,
-    ):
+    def __init__(self, volume: DrawnVolume, parts: Sequence[mesh_pictures.MeshPart], shot: Shot, still: Still | None):
         camera, size, *_ = self.shot = shot
+        device, _, near_mm, stopwatch, _ = volume
         self.device, self.size = device, size
         self.stopwatch, self.near_mm = stopwatch, near_mm
         self.has_still = still is not None
@@ -122,7 +111,7 @@ class _Layers:
         self.depths_d, self.nearest_d = ocl.allocate(device, 4 * self.pixels), ocl.allocate(device, 4 * self.pixels)
         self.states_d, self.marks_d = ocl.allocate(device, 32 * self.pixels), ocl.allocate(device, 16 * self.pixels)
 
-    def run(self, volume: Callable[[Between], None] | None, most: int) -> LayeredPicture:
+    def run(self, sample: Callable[[Between], None] | None, most: int) -> LayeredPicture:
         device, (width, height) = self.device, self.size
         background = self.shot.background
         with self.stopwatch.running(device):
@@ -134,16 +123,16 @@ class _Layers:
             self.shot.progress("layers", drawn, most)
             self._draw_layer()
             open_pixels = 0 if self.is_single else self._count_open()
-            if volume is not None:
-                self._sample(volume, is_first)
+            if sample is not None:
+                self._sample(sample, is_first)
             with self.stopwatch.running(device):
                 self._launch("blend_layer", **self._layer, **self._rays, **self._place, near_mm=self.near_mm)
             drawn, is_first = drawn + 1, False
             self.keys.go_behind()
             self.depths_d, self.nearest_d = self.nearest_d, self.depths_d
-        if volume is not None and (is_first or open_pixels):  # else all rays have gone to their ends already
+        if sample is not None and (is_first or open_pixels):  # else all rays have gone to their ends already
             self._fill(self.depths_d, np.inf)
-            self._sample(volume, is_first)
+            self._sample(sample, is_first)
         image, image_d = ocl.empty_output(device, (height, width, 4), np.uint8)
         depths, first_d = ocl.empty_output(device, (height, width), np.float32)
         means, means_d = ocl.empty_output(device, (height, width), np.float32)
@@ -174,10 +163,10 @@ class _Layers:
             for triangles in self.triangles:
                 triangles.shade(self.keys, self.layer_d, self.depths_d)
 
-    def _sample(self, volume: Callable[[Between], None], is_first: bool) -> None:
+    def _sample(self, sample: Callable[[Between], None], is_first: bool) -> None:
         if is_first:
             self._fill(self.nearest_d, -np.inf)
-        volume(Between(self.states_d, self.nearest_d, self.depths_d))
+        sample(Between(self.states_d, self.nearest_d, self.depths_d))
 
     def _count_open(self) -> int:
         with self.stopwatch.running(self.device):
@@ -348,10 +337,7 @@ class ScenePictures(DeviceWorker):
 
     def _finish(self, drawn: list[Rendering], shot: Shot, volume: DrawnVolume) -> Rendering:
         device, stopwatch = volume.device, volume.stopwatch
-        layers = draw_layers(
-            device, self._parts, shot, still=_join_stills(drawn), volume=volume.sample, near_mm=volume.near_mm,
-            memory=self.memory, stopwatch=stopwatch,
-        )  # fmt: skip
+        layers = draw_layers(volume, self._parts, shot, still=_join_stills(drawn), memory=self.memory)
         warnings = [*device.warnings, *volume.warnings]
         for rendering in drawn:
             warnings += [text for text in rendering.report["warnings"] if text not in warnings]

@@ -22,7 +22,6 @@ from clrecon.proof.compare.processes import Request
 from clrecon.proof.rays.render import cast_rays
 from clrecon.proof.timing import usable_cores
 from clrecon.rendering import Rendering
-from clrecon.rendering.looks.presets import find_preset
 from clrecon.rendering.views.camera import Camera
 
 Image = NDArray[np.uint8]
@@ -217,8 +216,9 @@ def _cast(scene: Scene, camera: Camera, size: tuple[int, int]) -> Rendering:
 
 def _rays_cpu(scene: Scene) -> Product:
     camera, _ = scene.request.views()["view"]
-    preset = find_preset(_RAYS_PRESET)
-    cast = cast_rays(scene.volume, preset.transfer_function, camera, TWIN_SIZE, lighting=preset.lighting)
+    from clrecon.rendering.pictures.styles import VolumeLook
+
+    cast = cast_rays(scene.volume, VolumeLook(_RAYS_PRESET), camera, TWIN_SIZE)
     depth = cast.depth.astype("float32")
     return Rendering(cast.image(), depth, depth, camera), [{}]
 

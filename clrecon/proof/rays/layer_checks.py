@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.mesh import Mesh
-from clrecon.opencl import Device, download
+from clrecon.opencl import Device, Stopwatch, download
 from clrecon.operators.rays.mesh_pictures import make_part
-from clrecon.operators.rays.picture_buffers import Between, Shot
+from clrecon.operators.rays.picture_buffers import Between, DrawnVolume, Shot
 from clrecon.operators.rays.scene import LayeredPicture, ScenePictures, Still, draw_layers
 from clrecon.proof.checking import (
     OBLIQUE,
@@ -27,7 +27,7 @@ from clrecon.proof.checking import (
     require_share,
     require_whole,
 )
-from clrecon.proof.rays.objects import Meetings, find_meetings, nth_layer, shade_layer
+from clrecon.proof.rays.objects import ColoredMesh, Meetings, find_meetings, nth_layer, shade_layer
 from clrecon.proof.rays.render import cast_rays
 from clrecon.proof.rays.surface import overlay_slices as overlay_twin
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
@@ -92,13 +92,13 @@ def _blend_layers(
     order = np.lexsort((numbers, depths, pixels))
     every = Meetings(pixels[order], numbers[order], depths[order], shares[order])
     triangles = np.concatenate([mesh.triangles, [[0, 1, 2]]])
+    with_sheet = ColoredMesh(mesh.vertices, triangles, colors / 255.0, mesh.normals)
     color, opacity = np.zeros((height, width, 3)), np.zeros((height, width))
     first, depth_sum = np.full((height, width), np.nan), np.zeros((height, width))
     layers = []
     for layer in range(int(np.bincount(pixels).max())):
         places = np.where(opacity < 1.0, nth_layer(every, layer, SIZE), -1)
-        assert mesh.normals is not None
-        rgb, depth = shade_layer(every, places, mesh.vertices, triangles, mesh.normals, colors / 255.0, camera, FIXED)
+        rgb, depth = shade_layer(every, places, with_sheet, camera, FIXED)
         triangle_numbers = np.where(places >= 0, every.triangles[places], 0)
         is_sheet = triangle_numbers == count
         rgb[is_sheet] = still.image[is_sheet][:, :3] / 255.0
@@ -133,10 +133,11 @@ def _check_layers(device: Device) -> str:
             depths = (between.nearest_d, between.farthest_d)
             ways.append([download(device, np.empty(SIZE[::-1], np.float32), each) for each in depths])
 
-        layered = draw_layers(device, parts, Shot(camera, SIZE), still=still, volume=note_ends)
+        drawn = DrawnVolume(device, note_ends, 0.0, Stopwatch(), [])
+        layered = draw_layers(drawn, parts, Shot(camera, SIZE), still=still)
         layers, rgba, depth, mean = _blend_layers(mesh, colors, camera, still)
         _compare_ways(ways, layers, layered)
-        first = draw_layers(device, parts, Shot(camera, SIZE), still=still, most=1)
+        first = draw_layers(drawn._replace(sample=None), parts, Shot(camera, SIZE), still=still, most=1)
         more = np.isfinite(layers[0]) & (first.image[..., 3] < 255)
         require_equal(first.open_pixels, np.count_nonzero(more), "pixels that may have a second layer")
         require_close(layered.depth, depth, DEPTH_MM, "depths of triangles, in mm")
@@ -182,7 +183,6 @@ def _check_between(device: Device, slices: bool) -> str:
     for perspective in (False, True):
         volume = blobs((16, 26, 22), OBLIQUE, "int16")
         camera = look_at(volume, (0.4, 0.9, -0.5), 7.0, perspective=perspective)
-        step = 0.5 * min(volume.spacing)
         mesh, before, behind = _screen(volume, camera)
         look: VolumeLook | SlicesInSpace = VolumeLook(function, lighting=FIXED)
         if slices:
@@ -195,7 +195,7 @@ def _check_between(device: Device, slices: bool) -> str:
             if isinstance(look, SlicesInSpace):
                 rgba, _ = overlay_twin(volume, camera, _WITH_VOLUME, replace(look, clip=clip))
             else:
-                rgba = cast_rays(volume, function, camera, _WITH_VOLUME, step, FIXED, clip).rgba
+                rgba = cast_rays(volume, replace(look, clip=clip), camera, _WITH_VOLUME).rgba
             sides.append(np.clip(rgba, 0.0, 1.0))
         rest = opacity * np.append(color, 1.0) + (1.0 - opacity) * sides[1]
         expected = sides[0] + (1.0 - sides[0][..., 3:]) * rest

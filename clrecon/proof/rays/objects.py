@@ -175,39 +175,38 @@ def nth_layer(meetings: Meetings, layer: int, size: Sequence[int]) -> NDArray[np
     return np.where(counts > layer, first + layer, -1).reshape(height, width)
 
 
+class ColoredMesh(NamedTuple):
+    """Triangles (m, 3) between vertices (n, 3), with their colours and normals, by default those of the triangles."""
+
+    vertices: NDArray[np.floating]
+    triangles: NDArray[np.integer]
+    colors: Float64Array
+    normals: NDArray[np.floating] | None
+
+
 def shade_layer(
-    meetings: Meetings,
-    places: NDArray[np.int64],
-    vertices: NDArray[np.floating],
-    triangles: NDArray[np.integer],
-    normals: NDArray[np.floating] | None,
-    colors: Float64Array,
-    camera: Camera,
-    lighting: Lighting,
+    meetings: Meetings, places: NDArray[np.int64], mesh: ColoredMesh, camera: Camera, lighting: Lighting
 ) -> tuple[Float64Array, Float64Array]:
     """Colour and light a layer, the `places` of `nth_layer` among the meetings: (h, w, 3), and mm along the ray, (h,
-    w), NaN where it has nothing.
-
-    Colours are those of the vertices, normals too, by default those of the triangles.
-    """
+    w), NaN where it has nothing."""
     height, width = places.shape
     there = places >= 0
-    corners = triangles.astype(np.int64)[meetings.triangles[places[there]]]
+    corners = mesh.triangles.astype(np.int64)[meetings.triangles[places[there]]]
     shares = meetings.shares[places[there]]
     directions = camera.rays((width, height))[1][there]
-    a, b, c = np.moveaxis(vertices.astype(np.float64)[corners], 1, 0)
+    a, b, c = np.moveaxis(mesh.vertices.astype(np.float64)[corners], 1, 0)
     face = np.cross(b - a, c - a)
     length = np.linalg.norm(face, axis=1, keepdims=True)
     face = np.where(length > 0.0, face / np.where(length > 0.0, length, 1.0), -directions)
     normal = face
-    if normals is not None:
-        normal = np.einsum("nk,nki->ni", shares, normals.astype(np.float64)[corners])
+    if mesh.normals is not None:
+        normal = np.einsum("nk,nki->ni", shares, mesh.normals.astype(np.float64)[corners])
         normal = np.where(np.einsum("ni,ni->n", normal, face)[:, None] < 0.0, -normal, normal)
     away = np.einsum("ni,ni->n", normal, directions)
     wrong = away * np.einsum("ni,ni->n", face, directions) < 0.0
     normal = normal - np.where(wrong, 1.001 * away, 0.0)[:, None] * directions
     rgb, depth = np.zeros((height, width, 3)), np.full((height, width), np.nan)
-    colors_here = np.einsum("nk,nki->ni", shares, colors[corners])
+    colors_here = np.einsum("nk,nki->ni", shares, mesh.colors[corners])
     rgb[there] = shade(colors_here, normal, directions, lighting) if lighting.shades else colors_here
     along = 1.0 if camera.is_parallel else directions @ camera.basis().forward
     depth[there] = meetings.depths[places[there]] / along

@@ -14,7 +14,7 @@ from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.opencl import Device, Stopwatch, download, upload
 from clrecon.operators.rays.picture_buffers import TILE, PictureBuffers, RayView, Shot
-from clrecon.operators.rays.point_pictures import draw_splats
+from clrecon.operators.rays.point_pictures import Discs, draw_splats
 from clrecon.operators.rays.ray_pictures import MainWay, enter_tiles, look_ahead, take_picture
 from clrecon.operators.rays.ray_slabs import (
     BRICK_CELLS,
@@ -232,9 +232,9 @@ def _check_composite(device: Device, scenes: tuple[tuple[str, TransferFunction, 
         clip = _cut_middle(volume) if options.get("cut") else None
         camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=options.get("perspective", True))
         step = options.get("step", 0.5 * min(volume.spacing))
-        style = VolumeLook(function, lighting=lighting, jitter=jitter, clip=clip)
+        style = VolumeLook(function, lighting=lighting, jitter=jitter, clip=clip, ray_step=step)
         picture = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
-        twin = cast_rays(volume, function, camera, SIZE, step, lighting, clip, "dvr", jitter=jitter)
+        twin = cast_rays(volume, style, camera, SIZE)
         image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
         worst = max(
             worst, _compare_picture(picture, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}")
@@ -290,7 +290,7 @@ def _check_projections(device: Device, kinds: tuple[str, ...], uneven: bool) -> 
             step = 0.5 * min(volume.spacing)
             style = Projection(kind, clip=clip)  # type: ignore[arg-type]
             picture = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
-            twin = cast_rays(volume, None, camera, SIZE, step, None, clip, kind)
+            twin = cast_rays(volume, style, camera, SIZE)
             subject = f"{kind} of {dtype} voxels{' of uneven slices' * uneven}"
             require_whole(picture.report)
             assert picture.values is not None
@@ -311,7 +311,7 @@ def _check_surfaces(device: Device, uneven: bool) -> str:
         step = 0.5 * min(volume.spacing)
         style = SurfaceLook(iso_value, color="white", shadows=shadows, lighting=FIXED, clip=clip)
         picture = cast_surface(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
-        twin = surface_twin(volume, iso_value, camera, SIZE, step, FIXED, clip, shadows=shadows)
+        twin = surface_twin(volume, style, camera, SIZE)
         image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
         worst = max(
             worst, _compare_picture(picture, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}")
@@ -361,7 +361,7 @@ def _check_points(device: Device) -> str:
     for perspective, point_normals in ((False, None), (True, normals.astype(np.float32))):
         scale = {"view_angle": 9.0} if perspective else {"parallel_scale": 7.0}
         camera = Camera((-30.0, -80.0, 25.0), (0.3, 0.2, 0.1), (0.1, 0.2, 1.0), **scale)
-        splats = draw_splats(device, points, colors, point_normals, Shot(camera, SIZE), radius, lighting=FIXED)
+        splats = draw_splats(device, Discs(points, colors, point_normals, radius, FIXED), Shot(camera, SIZE))
         require_equal(splats.parts, 1, "parts of a cloud of 3,000 points")
         depth, numbers = find_splats(points, camera, SIZE, radius)
         apart = round(radius / camera.pixel_mm(SIZE))

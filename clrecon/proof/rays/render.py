@@ -11,26 +11,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array, slice_normal
 from clrecon.geometry.iso_rule import slice_normal_matrices, takes_parts
 from clrecon.rendering import Lighting, TransferFunction
 from clrecon.rendering.looks.lighting import LEAST_SOFT_GRADIENT
 from clrecon.rendering.looks.piecewise import DENSE, PARTS, STEEP, Steepness
+from clrecon.rendering.pictures.styles import Projection, VolumeLook
 from clrecon.rendering.views.camera import Camera
-
-
-class Planes(Protocol):
-    """Form of `clrecon.rendering.views.clip.Clip`: unit normals and offsets (n, 4); kept is normal . p >= offset."""
-
-    @property
-    def planes(self) -> Float64Array: ...
+from clrecon.rendering.views.clip import Clip
 
 
 class Box:
@@ -68,7 +61,7 @@ def box_of(volume: Volume, border: float = 0.5) -> Box:
 
 
 def find_interval(
-    origins: Float64Array, directions: Float64Array, box: Box, clip: Planes | None = None, nearest: float = -np.inf
+    origins: Float64Array, directions: Float64Array, box: Box, clip: Clip | None = None, nearest: float = -np.inf
 ) -> tuple[Float64Array, Float64Array, NDArray[np.int64]]:
     """Find the part of rays that lies in a box and within clip planes, from `nearest` on: 0 for rays that begin at a
     camera.
@@ -158,8 +151,6 @@ def jitter_pixels(width: int, height: int) -> Float64Array:
     return (hash_pixels(x, y) >> np.uint32(8)) * 2.0**-24
 
 
-MODES = ("dvr", "mip", "minip", "mean", "drr")
-
 AIR_HU = -1000.0
 """HU that attenuates nothing; lower values (padding, voxels removed by a mask) count as this."""
 
@@ -209,7 +200,7 @@ class RayPicture:
 class _Rays:
     """The rays of a picture with their way through a volume."""
 
-    def __init__(self, volume: Volume, camera: Camera, size: Sequence[int], clip: Planes | None):
+    def __init__(self, volume: Volume, camera: Camera, size: Sequence[int], clip: Clip | None):
         origins, directions = camera.rays(size)
         self.volume = volume
         self.origins, self.directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
@@ -227,42 +218,27 @@ class _Rays:
         return ijk, np.asarray(in_slice.all(axis=1))
 
 
-def cast_rays(
-    volume: Volume,
-    transfer_function: TransferFunction | None,
-    camera: Camera,
-    size: Sequence[int],
-    ray_step: float | None = None,
-    lighting: Lighting | None = None,
-    clip: Planes | None = None,
-    mode: str = "dvr",
-    *,
-    jitter: bool = False,
-) -> RayPicture:
+def cast_rays(volume: Volume, style: VolumeLook | Projection, camera: Camera, size: Sequence[int]) -> RayPicture:
     """Send a ray through each pixel.
 
     The field is trilinear between voxel centres; up to half a voxel beyond the outermost centres it has their values. A
-    ray is divided into segments of `ray_step`, by default half the smallest spacing, from where it enters the volume
-    within the clip planes; the last segment ends where it leaves.  Each segment has a sample in its middle, or with
-    jitter, which only dvr has, at a place that depends on the pixel alone.  Modes "mip", "minip" and "mean" take the
+    ray is divided into segments of the style's ray step, by default half the smallest spacing, from where it enters the
+    volume within the clip planes; the last segment ends where it leaves.  Each segment has a sample in its middle, or
+    with jitter at a place that depends on the pixel alone.  Modes "mip", "minip" and "mean" take the
     highest, lowest and mean value, the integral along the ray divided by its length.  A radiograph, "drr", is the
     thickness of water with the same attenuation as the ray: the integral of attenuation relative to water; its field
     interpolates max(HU, -1000) / 1000 + 1 between voxels.
     """
-    if mode not in MODES:
-        raise UsageError(f"there is no mode {mode!r}: it is one of {', '.join(MODES)}")
-    step = 0.5 * min(volume.spacing) if ray_step is None else float(ray_step)
-    rays = _Rays(volume, camera, size, clip)
+    step = style.ray_step or 0.5 * min(volume.spacing)
+    rays = _Rays(volume, camera, size, style.clip)
     width, height = size
-    part = jitter_pixels(width, height).ravel() if jitter else np.full(rays.count, 0.5)
-    if mode == "dvr":
-        if transfer_function is None:
-            raise UsageError("dvr needs a transfer function")
-        result = _composite(rays, transfer_function, lighting, step, part)
-    elif mode in ("mean", "drr"):
-        result = _integrate(rays, step, as_water=mode == "drr")
+    if isinstance(style, VolumeLook):
+        part = jitter_pixels(width, height).ravel() if style.jitter else np.full(rays.count, 0.5)
+        result = _composite(rays, style.function, style.light, step, part)
+    elif style.kind in ("mean", "drr"):
+        result = _integrate(rays, step, as_water=style.kind == "drr")
     else:
-        result = _find_extreme(rays, step, 1.0 if mode == "mip" else -1.0)
+        result = _find_extreme(rays, step, 1.0 if style.kind == "mip" else -1.0)
     shape = (height, width)
     rgba, depth, expected_depth, values = result
     return RayPicture(
@@ -321,7 +297,7 @@ def shade(
 
 
 def _composite(
-    rays: _Rays, transfer_function: TransferFunction, lighting: Lighting | None, step: float, part: Float64Array
+    rays: _Rays, transfer_function: TransferFunction, lighting: Lighting, step: float, part: Float64Array
 ) -> Found:
     voxels = rays.volume.voxels
     gradients = voxel_gradients(voxels, slice_normal_matrices(rays.volume, 0))
@@ -342,9 +318,8 @@ def _composite(
         ijk, _ = rays.places(ray, t)
         slope = sample_field(gradients, ijk)
         opacity = opacity * transfer_function.gradient_factor(np.linalg.norm(slope, axis=1))
-        if lighting is not None:
-            softness = max(lighting.soft_gradient, LEAST_SOFT_GRADIENT)
-            colour = shade(colour, slope, rays.directions[ray], lighting, soft_gradient=softness)
+        softness = max(lighting.soft_gradient, LEAST_SOFT_GRADIENT)
+        colour = shade(colour, slope, rays.directions[ray], lighting, soft_gradient=softness)
         opacity = 1.0 - (1.0 - opacity) ** (length / transfer_function.unit_distance)
         weight = (1.0 - rgba[ray, 3]) * opacity
         rgba[ray, :3] += weight[:, None] * colour

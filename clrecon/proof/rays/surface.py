@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import choose_iso_rule, slice_normal_matrices
-from clrecon.proof.rays.render import Planes, RayPicture, box_of, find_interval, sample_field, shade, voxel_gradients
-from clrecon.rendering import Lighting
-from clrecon.rendering.pictures.styles import SlicesInSpace
+from clrecon.proof.rays.render import RayPicture, box_of, find_interval, sample_field, shade, voxel_gradients
+from clrecon.rendering.pictures.styles import SlicesInSpace, SurfaceLook
 from clrecon.rendering.views.camera import Camera
 
 _HALVINGS = 10
@@ -47,50 +46,38 @@ class _ClosedField:
         return sample_field(self.gradients, self.volume.lps_to_ijk(points) + 1.0)
 
 
-def cast_surface(
-    volume: Volume,
-    iso_value: float,
-    camera: Camera,
-    size: Sequence[int],
-    ray_step: float | None = None,
-    lighting: Lighting | None = None,
-    clip: Planes | None = None,
-    colour: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    *,
-    shadows: bool = False,
-) -> RayPicture:
+def cast_surface(volume: Volume, style: SurfaceLook, camera: Camera, size: Sequence[int]) -> RayPicture:
     """Find the surface along the ray of each pixel; both depths are that of the hit, and there are no values.
 
-    Samples lie `ray_step` apart, by default half the smallest spacing, from where the ray enters the closed volume, the
-    last where it leaves; between the first inside and the one before it the surface is found by bisection.  A ray that
-    begins inside, behind a clip plane or at a camera inside, has its hit at once: on the clip plane the cap's normal is
-    the plane's, at a camera it is the ray's own direction.
+    Samples lie the style's ray step apart, by default half the smallest spacing, from where the ray enters the closed
+    volume, the last where it leaves; between the first inside and the one before it the surface is found by bisection.
+    A ray that begins inside, behind a clip plane or at a camera inside, has its hit at once: on the clip plane the
+    cap's normal is the plane's, at a camera it is the ray's own direction.
 
-    With `shadows` a hit has only ambient light if a ray from it towards a fixed light meets something inside, from one
+    With shadows a hit has only ambient light if a ray from it towards a fixed light meets something inside, from one
     step on and within the clip planes.
     """
-    step = 0.5 * min(volume.spacing) if ray_step is None else float(ray_step)
-    field, box = _ClosedField(volume, iso_value), box_of(volume, border=1.0)
+    step = style.ray_step or 0.5 * min(volume.spacing)
+    field, box = _ClosedField(volume, style.iso_value), box_of(volume, border=1.0)
     origins, directions = (rays.reshape(-1, 3) for rays in camera.rays(size))
     nearest = -np.inf if camera.is_parallel else 0.0
-    t_in, t_out, entered_by = find_interval(origins, directions, box, clip, nearest)
+    t_in, t_out, entered_by = find_interval(origins, directions, box, style.clip, nearest)
     hit, at_once = _first_inside(field, origins, directions, t_in, t_out, step)
     rays_hit = np.flatnonzero(~np.isnan(hit))
     points = origins[rays_hit] + hit[rays_hit, None] * directions[rays_hit]
     normals = field.gradient(points)
     for n in np.flatnonzero(at_once[rays_hit]):
         plane = entered_by[rays_hit[n]]
-        normals[n] = directions[rays_hit[n]] if plane < 0 else clip.planes[plane, :3]  # type: ignore[union-attr]
-    colours = np.broadcast_to(np.array(colour, dtype=np.float64), points.shape)
-    if lighting is not None:
-        lit = np.ones(len(rays_hit))
-        if shadows and lighting.direction is not None:
-            light = np.array(lighting.direction, dtype=np.float64)
-            towards = np.broadcast_to(light / np.linalg.norm(light), points.shape)
-            _, far, _ = find_interval(points, towards, box, clip)
-            blocked, _ = _first_inside(field, points, towards, np.full(len(rays_hit), step), far, step)
-            lit = np.where(np.isnan(blocked), 1.0, 0.0)
-        colours = shade(colours, normals, directions[rays_hit], lighting, lit)
+        cut = style.clip if plane >= 0 else None
+        normals[n] = directions[rays_hit[n]] if cut is None else cut.planes[plane, :3]
+    lit = np.ones(len(rays_hit))
+    if style.shadows:
+        light = np.array(style.light.direction, dtype=np.float64)
+        towards = np.broadcast_to(light / np.linalg.norm(light), points.shape)
+        _, far, _ = find_interval(points, towards, box, style.clip)
+        blocked, _ = _first_inside(field, points, towards, np.full(len(rays_hit), step), far, step)
+        lit = np.where(np.isnan(blocked), 1.0, 0.0)
+    colours = shade(np.broadcast_to(style.rgb, points.shape), normals, directions[rays_hit], style.light, lit)
     rgba = np.zeros((len(origins), 4))
     rgba[rays_hit] = np.column_stack([colours, np.ones(len(rays_hit))])
     width, height = size

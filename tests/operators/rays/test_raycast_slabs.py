@@ -12,11 +12,11 @@ from raycast_scenes import DeviceCaster, blobs, even_volume, look, premultiplied
 from soft_function import SOFT
 
 from clrecon.operators.rays.ray_slabs import BRICK_CELLS, MOST_VOXELS, plan_ray_slabs
-from clrecon.proof.rays.render import MODES
 from clrecon.rendering import Lighting
+from clrecon.rendering.pictures.styles import PROJECTIONS
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", ["dvr", *PROJECTIONS])
 @pytest.mark.parametrize("towards", [(0.1, 0.3, 1.0), (-0.1, 0.2, -1.0), (0.5, 1.0, 0.05)])
 @pytest.mark.parametrize("even", [True, False])
 def test_slabs_give_the_picture_of_the_whole(device, mode, towards, even):

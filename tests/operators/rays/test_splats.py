@@ -13,7 +13,7 @@ from variants import each_value
 import clrecon
 from clrecon.errors import DeviceError, UsageError
 from clrecon.operators.rays.picture_buffers import Shot
-from clrecon.operators.rays.point_pictures import MOST_NAMED, PointPictures, cloud_box, draw_splats
+from clrecon.operators.rays.point_pictures import MOST_NAMED, Discs, PointPictures, cloud_box, draw_splats
 from clrecon.points import PointCloud
 from clrecon.proof.rays.objects import find_splats, shade_splats
 from clrecon.rendering import UNSHADED, Lighting
@@ -50,7 +50,7 @@ def test_every_pixel_shows_the_point_of_the_twin(device: Any, name: str, radius:
     colors = np.zeros((len(points), 4), np.uint8)
     colors[:, :2] = np.arange(len(points), dtype="<u2").view(np.uint8).reshape(-1, 2)  # the number as a colour
     colors[:, 2:] = 255
-    found = draw_splats(device, points, colors, None, Shot(camera, SIZE), radius, lighting=UNSHADED)
+    found = draw_splats(device, Discs(points, colors, None, radius, UNSHADED), Shot(camera, SIZE))
     assert (numbers >= 0).any() and (numbers < 0).any() or "inside" in name
     shown = np.where(
         found.image[..., 3] > 0, found.image[..., 0].astype(int) + 256 * found.image[..., 1].astype(int), -1
@@ -78,7 +78,7 @@ def test_the_light_is_that_of_the_twin(device: Any, has_normals: bool, lighting:
     normals[::50] = 0.0  # no direction: full diffuse light
     own = normals if has_normals else None
     for camera in (CAMERAS["parallel"], CAMERAS["perspective"]):
-        found = draw_splats(device, points, colors, own, Shot(camera, SIZE, "navy"), 0.6, lighting=lighting)
+        found = draw_splats(device, Discs(points, colors, own, 0.6, lighting), Shot(camera, SIZE, "navy"))
         depth, numbers = find_splats(points, camera, SIZE, 0.6)
         apart = int(np.clip(round(0.6 / camera.pixel_mm(SIZE)), 1, 8))
         rgba, _ = shade_splats(depth, numbers, colors[:, :3] / 255.0, own, camera, lighting, apart)
@@ -121,25 +121,18 @@ def test_parts_and_permutations_give_the_same_picture(device: Any, name: str) ->
     colors = np.full((250_000, 4), 255, np.uint8)
     colors[:, 0] = np.arange(250_000) % 256
     camera, calls = CAMERAS[name], []
-    whole = draw_splats(device, points, colors, normals, Shot(camera, SIZE), 0.5)
+    discs, shot = Discs(points, colors, normals, 0.5, Lighting()), Shot(camera, SIZE)
+    whole = draw_splats(device, discs, shot)
     memory = 16 * SIZE[0] * SIZE[1] + 28 * 80_000
-    parts = draw_splats(
-        device,
-        points,
-        colors,
-        normals,
-        Shot(camera, SIZE, progress=lambda *call: calls.append(call)),
-        0.5,
-        memory=memory,
-    )
+    parts = draw_splats(device, discs, shot._replace(progress=lambda *call: calls.append(call)), memory=memory)
     assert (whole.parts, parts.parts) == (1, 4)
     assert parts.image.tobytes() == whole.image.tobytes() and parts.depth.tobytes() == whole.depth.tobytes()
     assert calls[0] == ("points", 0, 750_000) and calls[-1] == ("points", 750_000, 750_000)
     order = np.random.default_rng(5).permutation(250_000)
-    other = draw_splats(device, points[order], colors[order], normals[order], Shot(camera, SIZE), 0.5)
+    other = draw_splats(device, Discs(points[order], colors[order], normals[order], 0.5, Lighting()), shot)
     assert other.image.tobytes() == whole.image.tobytes()
     with refused(DeviceError, "points"):
-        draw_splats(device, points, colors, normals, Shot(camera, SIZE), 0.5, memory=16 * SIZE[0] * SIZE[1] + 1000)
+        draw_splats(device, discs, shot, memory=16 * SIZE[0] * SIZE[1] + 1000)
 
 
 def test_a_cloud_far_away_looks_the_same(device: Any) -> None:

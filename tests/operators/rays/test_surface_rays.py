@@ -99,7 +99,9 @@ def scene(name: str) -> tuple[Volume, dict]:
 @pytest.mark.parametrize("name", SCENES)
 def test_the_kernel_is_its_twin(device, name):
     volume, settings = scene(name)
-    expected = cast_twin(volume, 100.0, size=SIZE, **settings)
+    camera = settings["camera"]
+    style = SurfaceLook(100.0, color="white", **{name: value for name, value in settings.items() if name != "camera"})
+    expected = cast_twin(volume, style, camera, SIZE)
     truth = Rendering(expected.image(), expected.depth, expected.depth, None)
     assert_alike(cast(device, volume, 100.0, **settings), truth)
 

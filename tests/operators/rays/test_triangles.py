@@ -14,11 +14,12 @@ from sample_meshes import ball
 import clrecon
 from clrecon import Mesh, MeshLook
 from clrecon.errors import DeviceError, UsageError
+from clrecon.opencl import Stopwatch
 from clrecon.operators.rays import mesh_pictures, scene
 from clrecon.operators.rays.mesh_pictures import make_part
-from clrecon.operators.rays.picture_buffers import Shot
+from clrecon.operators.rays.picture_buffers import DrawnVolume, Shot
 from clrecon.operators.rays.scene import LAYERS, PIXEL_BYTES, Still, draw_layers
-from clrecon.proof.rays.objects import find_meetings, nth_layer, shade_layer
+from clrecon.proof.rays.objects import ColoredMesh, find_meetings, nth_layer, shade_layer
 from clrecon.rendering import UNSHADED, Lighting
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
@@ -34,6 +35,10 @@ CAMERAS = {
     "inside, parallel": Camera((1.0, -3.0, 0.5), (0.0, 5.0, 0.0), (0.1, 0.0, 1.0), parallel_scale=9.0),
 }
 FIXED = Lighting(0.1, 0.7, 0.5, 20.5, direction=(0.4, -1.0, 0.8))
+
+
+def alone(device: Any) -> DrawnVolume:
+    return DrawnVolume(device, None, 0.0, Stopwatch(), [])
 
 
 def soup(count: int = 150, seed: int = 2) -> Mesh:
@@ -74,11 +79,9 @@ def test_every_layer_is_that_of_the_twin(device: Any, name: str, lighting: Light
     meetings = find_meetings(mesh.vertices, mesh.triangles, camera, SIZE)
     for normals in (mesh.normals, None):
         look = MeshLook(vertex_colors=colors, lighting=lighting, flat=normals is None)
-        found = draw_layers(device, [make_part(mesh, look)], Shot(camera, SIZE))
-        rgb, depth = shade_layer(
-            meetings, nth_layer(meetings, 0, SIZE), mesh.vertices, mesh.triangles, normals, colors / 255.0, camera,
-            lighting,
-        )  # fmt: skip
+        found = draw_layers(alone(device), [make_part(mesh, look)], Shot(camera, SIZE))
+        shown = ColoredMesh(mesh.vertices, mesh.triangles, colors / 255.0, normals)
+        rgb, depth = shade_layer(meetings, nth_layer(meetings, 0, SIZE), shown, camera, lighting)
         seen = ~np.isnan(depth)
         assert seen.any() and (not seen.all() or "inside" in name)
         assert np.array_equal(np.isnan(found.depth), ~seen)
@@ -98,13 +101,11 @@ def test_translucent_layers_are_blended_in_the_order_of_the_twin(device: Any, na
     most = int(np.bincount(meetings.pixels).max())
     assert 3 <= most <= LAYERS
     look = MeshLook(vertex_colors=colors, lighting=UNSHADED, opacity=opacity)
-    found = draw_layers(device, [make_part(mesh, look)], Shot(camera, SIZE))
+    found = draw_layers(alone(device), [make_part(mesh, look)], Shot(camera, SIZE))
     premultiplied, seen, way = np.zeros(SIZE[::-1]), np.zeros(SIZE[::-1]), np.zeros(SIZE[::-1])
     for layer in range(most):
-        rgb, depth = shade_layer(
-            meetings, nth_layer(meetings, layer, SIZE), mesh.vertices, mesh.triangles, None, colors / 255.0, camera,
-            UNSHADED,
-        )  # fmt: skip
+        shown = ColoredMesh(mesh.vertices, mesh.triangles, colors / 255.0, None)
+        rgb, depth = shade_layer(meetings, nth_layer(meetings, layer, SIZE), shown, camera, UNSHADED)
         weight = np.where(np.isnan(depth), 0.0, (1.0 - seen) * opacity)
         premultiplied += weight * rgb[..., 0]
         way += weight * np.nan_to_num(depth)
@@ -175,9 +176,9 @@ def test_large_and_small_triangles_and_pieces_of_them(device: Any) -> None:
         np.concatenate([screen.vertices, specks.vertices]), np.concatenate([screen.triangles, specks.triangles + 3])
     )
     look = MeshLook(flat=True, lighting=FIXED)
-    found = draw_layers(device, [make_part(both, look)], Shot(camera, size))
-    apart = draw_layers(device, [make_part(specks, look), make_part(screen, look)], Shot(camera, size))
-    again = draw_layers(device, [make_part(both, look)], Shot(camera, size))
+    found = draw_layers(alone(device), [make_part(both, look)], Shot(camera, size))
+    apart = draw_layers(alone(device), [make_part(specks, look), make_part(screen, look)], Shot(camera, size))
+    again = draw_layers(alone(device), [make_part(both, look)], Shot(camera, size))
     assert found.image.tobytes() == again.image.tobytes() == apart.image.tobytes()
     assert found.depth.tobytes() == again.depth.tobytes() == apart.depth.tobytes()
     meetings = find_meetings(both.vertices, both.triangles, camera, size)
@@ -188,7 +189,7 @@ def test_large_and_small_triangles_and_pieces_of_them(device: Any) -> None:
     colors = np.zeros((both.vertex_count, 3), np.uint8)
     colors[:, :2] = np.repeat(np.arange(both.triangle_count, dtype="<u2"), 3).view(np.uint8).reshape(-1, 2)
     numbered = draw_layers(
-        device, [make_part(both, MeshLook(vertex_colors=colors, lighting=UNSHADED))], Shot(camera, size)
+        alone(device), [make_part(both, MeshLook(vertex_colors=colors, lighting=UNSHADED))], Shot(camera, size)
     )
     assert np.array_equal(numbered.image[..., 0] + 256 * numbered.image[..., 1].astype(int), meetings.triangles[places])
 
@@ -196,8 +197,8 @@ def test_large_and_small_triangles_and_pieces_of_them(device: Any) -> None:
 def test_of_triangles_in_one_place_the_first_is_seen(device: Any) -> None:
     first, second = quad(-20.0, 20.0, 3.0), quad(-20.0, 20.0, 3.0)
     parts = [make_part(mesh, MeshLook(color, lighting=UNSHADED)) for mesh, color in ((first, "red"), (second, "blue"))]
-    assert (draw_layers(device, parts, Shot(FRONT, (17, 17))).image == (255, 0, 0, 255)).all()
-    assert (draw_layers(device, parts[::-1], Shot(FRONT, (17, 17))).image == (0, 0, 255, 255)).all()
+    assert (draw_layers(alone(device), parts, Shot(FRONT, (17, 17))).image == (255, 0, 0, 255)).all()
+    assert (draw_layers(alone(device), parts[::-1], Shot(FRONT, (17, 17))).image == (0, 0, 255, 255)).all()
 
 
 def test_what_is_beside_behind_or_as_small_as_a_pixel(device: Any) -> None:
@@ -268,7 +269,9 @@ def test_bytes_a_pixel_are_those_of_the_buffers(device: Any, monkeypatch: pytest
     def bytes_of(width: int, height: int) -> int:
         taken.clear()
         still = Still(np.zeros((height, width, 4), np.uint8), np.zeros((height, width), np.float32))
-        draw_layers(device, [make_part(quad(-9.0, 9.0, 3.0), MeshLook())], Shot(FRONT, (width, height)), still=still)
+        draw_layers(
+            alone(device), [make_part(quad(-9.0, 9.0, 3.0), MeshLook())], Shot(FRONT, (width, height)), still=still
+        )
         return sum(taken)
 
     assert bytes_of(61, 47) - bytes_of(11, 47) == PIXEL_BYTES * 50 * 47

@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 import tolerances
 from raycast_scenes import STEPS, centre_of, even_volume, look, uneven_volume
-from refusals import refused
 from scipy.ndimage import map_coordinates
 
-from clrecon.errors import UsageError
-from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import slice_normal_matrices
 from clrecon.proof.rays.render import (
     TABLE_NODES,
@@ -24,8 +21,8 @@ from clrecon.proof.rays.render import (
     shade,
     voxel_gradients,
 )
-from clrecon.rendering import Lighting, TransferFunction
-from clrecon.rendering.views.camera import Camera
+from clrecon.rendering import UNSHADED, Lighting, TransferFunction
+from clrecon.rendering.pictures.styles import Projection, VolumeLook
 from clrecon.rendering.views.clip import Clip
 
 SLOPE = np.array([3.0, -2.0, 5.0])
@@ -136,7 +133,7 @@ def test_one_ray_is_the_sum_written_out():
     )
     lighting, step = Lighting(direction=(0.2, -1.0, 0.4)), 0.37
     camera = look(volume, (0.4, 1.0, 0.2), 4.0, perspective=True)
-    picture = cast_rays(volume, function, camera, (3, 3), step, lighting)
+    picture = cast_rays(volume, VolumeLook(function, lighting=lighting, ray_step=step), camera, (3, 3))
     origin, direction = (rays[1, 2] for rays in camera.rays((3, 3)))
     (t_in,), (t_out,), _ = find_interval(origin[None], direction[None], box_of(volume))
     matrices = slice_normal_matrices(volume, 0)
@@ -164,7 +161,7 @@ def test_one_ray_is_the_sum_written_out():
 def test_a_ray_ends_when_it_is_opaque():
     volume = even_volume(lambda p: np.where(p[:, 1] < 0.0, 100.0, 900.0), "even", 30.0)
     wall = TransferFunction([(0, 1, 0, 0, 0.4), (400, 1, 0, 0, 0.4), (400, 0, 1, 0, 1), (1000, 0, 1, 0, 1)])
-    picture = cast_rays(volume, wall, look(volume, (0, 1, 0), 5.0), (4, 4), 0.5)
+    picture = cast_rays(volume, VolumeLook(wall, lighting=UNSHADED, ray_step=0.5), look(volume, (0, 1, 0), 5.0), (4, 4))
     assert (picture.rgba[..., 3] >= 0.99).all() and (picture.rgba[..., 3] < 1.0).all()
     assert not picture.rgba[..., 1].any()  # nothing of the green wall behind
 
@@ -172,7 +169,8 @@ def test_a_ray_ends_when_it_is_opaque():
 def test_the_default_step_is_half_the_smallest_spacing():
     volume = even_volume(lambda p: 50.0 * p[:, 1], "anisotropic", 12.0)
     camera = look(volume, (0.3, 1.0, 0.2), 5.0)
-    default, given = (cast_rays(volume, None, camera, (6, 6), step, mode="mean").values for step in (None, 0.225))
+    styles = [Projection("mean", ray_step=step) for step in (None, 0.225)]
+    default, given = (cast_rays(volume, style, camera, (6, 6)).values for style in styles)
     assert np.array_equal(default, given)
 
 
@@ -201,7 +199,7 @@ def test_jitter_lies_within_each_segment_the_last_one_too():
     camera = look(volume, (0.0, 1.0, 0.0), 4.0)
     thin = TransferFunction([(-12, 1, 1, 1, 0.0), (12, 1, 1, 1, 0.001)])
     step, part = 1.7, jitter_pixels(8, 8)
-    opacity = cast_rays(volume, thin, camera, (8, 8), step, jitter=True).rgba[..., 3]
+    opacity = cast_rays(volume, VolumeLook(thin, jitter=True, ray_step=step), camera, (8, 8)).rgba[..., 3]
     way, inner = 0.9 * volume.shape_ijk[1], 0.5 * 0.9 * (volume.shape_ijk[1] - 1)
     starts = np.arange(0.0, way, step)
     lengths = np.minimum(step, way - starts)
@@ -209,12 +207,3 @@ def test_jitter_lies_within_each_segment_the_last_one_too():
     node = np.floor((places + 12.0) / 24.0 * (TABLE_NODES - 1) + 0.5) / (TABLE_NODES - 1)
     through = ((1.0 - 0.001 * node) ** lengths).prod(axis=-1)
     assert np.abs(opacity - (1.0 - through)).max() < 1e-7
-
-
-def test_nothing_is_cast_in_a_mode_that_is_not_there():
-    volume = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
-    camera = Camera.fit(volume)
-    with refused(UsageError, "xray", "minip"):
-        cast_rays(volume, None, camera, (4, 4), mode="xray")
-    with refused(UsageError, "function", "transfer"):
-        cast_rays(volume, None, camera, (4, 4))
