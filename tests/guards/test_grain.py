@@ -12,7 +12,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 93_598,
+    "lines": 93_530,
     "modules": 410,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
@@ -28,7 +28,7 @@ HABITS = {
     "nested_conditionals": 0,
     "comprehensions_of_two_loops": 23,
     "positional_flags": 0,
-    "functions_of_many_parameters": 36,
+    "functions_of_many_parameters": 28,
     "equal_functions": 0,
     "constants_of_one_file": 0,
     "kernels_with_branches": 0,

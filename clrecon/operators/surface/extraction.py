@@ -202,9 +202,8 @@ class Extraction:
         if self._vertices_only:
             counted = replace(counted, triangles=0)
         self._check_output(slab, counted)
-        part = marching_cubes.Emission(
-            device, slab, program, voxels_d, classified, counted, self.placement, stopwatch
-        ).run(self.vertices)
+        emission = marching_cubes.Emission(device, program, voxels_d, counted, self.placement, stopwatch)
+        part = emission.run(self.vertices)
         self.grid.volume.release_slices(*slab.voxel_slices)
         self.parts.append(part)
         self.vertices, self.triangles = self.vertices + len(part[0]), self.triangles + len(part[2])

@@ -108,10 +108,9 @@ _SAMPLES_PER_FLAGS = 32 * ocl.kernel_constant("surface/label_masks.cl", "STRIP")
 
 def prepare_label_masks(device: Device, label_dtype: DTypeLike = np.uint8) -> tuple[Program, Program]:
     """Build the kernels for labels of this type: those of the occupancy and those of the surface."""
-    mask_program = ocl.load_program(
-        device, "surface/label_masks.cl", {"VOXEL": "short", "VALUE": "int", **label_variants(label_dtype)}
-    )
-    return mask_program, marching_cubes.prepare_marching_cubes(device, np.int16, label_dtype, masks=True)
+    variants = label_variants(label_dtype)
+    program = ocl.load_program(device, "surface/label_masks.cl", {"VOXEL": "short", "VALUE": "int", **variants})
+    return program, marching_cubes.prepare_marching_cubes(device, np.int16, {"MASKS": "1", **variants})
 
 
 @dataclass(frozen=True)
@@ -251,9 +250,7 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
             )  # fmt: skip
             counted = count(device, window, classified)
         self.check_output(window, counted)
-        emission = marching_cubes.Emission(
-            device, window, surface, slab.occupancy_d, classified, counted, self.placement, stopwatch
-        )
+        emission = marching_cubes.Emission(device, surface, slab.occupancy_d, counted, self.placement, stopwatch)
         with stopwatch.running(device):
             emission.triangles()
         return StartedMesh(self, slab, number, box, counted, emission)

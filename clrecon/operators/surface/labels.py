@@ -195,12 +195,10 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
 
     def programs(self) -> tuple[Program, Program]:
         with self.stopwatch.timed("build"):
-            dtype = self.resident.dtype
-            label_dtype = self.labels.dtype
-            variants = {**voxel_variants(dtype), **label_variants(label_dtype)}
-            program = ocl.load_program(self.device, "surface/labels.cl", variants)
+            dtype, variants = self.resident.dtype, label_variants(self.labels.dtype)
+            program = ocl.load_program(self.device, "surface/labels.cl", {**voxel_variants(dtype), **variants})
             return program, marching_cubes.prepare_marching_cubes(
-                self.device, dtype, label_dtype, uneven=self.volume.uneven
+                self.device, dtype, {"LABELS": "1", **variants}, uneven=self.volume.uneven
             )
 
     def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
@@ -273,9 +271,8 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
         if counted.triangles == 0:
             return None
         self.check_output(window, counted)
-        part = marching_cubes.Emission(
-            device, window, surface, slab.voxels_d, classified, counted, self.placement, stopwatch
-        ).run(inside=slab.inside_d, label=number, half_way_count=half_way_d)
+        emission = marching_cubes.Emission(device, surface, slab.voxels_d, counted, self.placement, stopwatch)
+        part = emission.run(inside=slab.inside_d, label=number, half_way_count=half_way_d)
         half_way = int(ocl.download(device, np.empty(1, np.uint32), half_way_d)[0])
         self.share_by_hu = 1.0 - half_way / counted.vertices
         return part

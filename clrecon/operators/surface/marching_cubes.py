@@ -4,7 +4,7 @@ slab.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from clrecon.geometry.vertices import find_vertex_origin
 from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.masks.voxel_mask import prepare_classify
 from clrecon.operators.primitives.scan import enqueue_scan, prepare_scan
-from clrecon.operators.resident.tables import BrickStates, label_variants, voxel_variants
+from clrecon.operators.resident.tables import BrickStates, voxel_variants
 from clrecon.operators.surface.slabs import Slab
 from clrecon.operators.surface.trilinear import CellVertices, count_cells, emit_cells
 from clrecon.system.light_dataclass import dataclass
@@ -60,6 +60,8 @@ class Classified:
 class Counted:
     """Results of `count` for a slab, on the device, and totals of its own rows; `cells` of the trilinear field."""
 
+    slab: Slab
+    classified: Classified
     row_offsets_d: Any
     word_vertices_d: Any
     word_triangles_d: Any
@@ -114,7 +116,10 @@ def count(device: Device, slab: Slab, classified: Classified, voxels_d: Any = No
         words_with_work=flags_d, row_offsets=row_counts_d, active_words=active_words_d, rows=slab.rows,
         rows_to_count=rows, flag_words=grid.flag_words, row_shift=grid.row_shift,
     )  # fmt: skip
-    return Counted(row_counts_d, word_vertices_d, word_triangles_d, active_words_d, vertices, triangles, active, cells)
+    return Counted(
+        slab, classified, row_counts_d, word_vertices_d, word_triangles_d, active_words_d, vertices, triangles, active,
+        cells,
+    )  # fmt: skip
 
 
 LONGEST_ROW = 13_000
@@ -130,15 +135,15 @@ def check_row(ni: int) -> None:
 def prepare_marching_cubes(
     device: Device,
     dtype: DTypeLike,
-    labels: DTypeLike | None = None,
+    labels: Mapping[str, str] | None = None,
     *,
     uneven: bool = False,
     inside: str = "above",
-    masks: bool = False,
     vertex_rule: str = "linear",
     grown: bool = False,
 ) -> Program:
-    """Build the kernels for `dtype`; return emit_vertices, of `labels` (a type) or label `masks`."""
+    """Build the kernels for `dtype`; return emit_vertices, which for labels has their variants, a macro of cl/surface/
+    marching_cubes.cl among them."""
     prepare_scan(device)
     load_cells(device, grown=grown)
     variants = {**voxel_variants(dtype), **device.kernel_variants}
@@ -147,7 +152,7 @@ def prepare_marching_cubes(
     if labels is None:
         prepare_classify(device, dtype, inside)
     else:
-        variants.update({"MASKS" if masks else "LABELS": "1"}, **label_variants(labels))
+        variants.update(labels)
     if grown:
         variants["GROWN"] = "1"
     if uneven:
@@ -240,13 +245,13 @@ class Emission:
     """Passes 3 and 4: the mesh of a slab, on the device until it is downloaded, from slices ``slab.voxel_slices``."""
 
     def __init__(
-        self, device: Device, slab: Slab, program: Program, voxels_d: Any, classified: Classified, counted: Counted,
-        placement: Placement, stopwatch: Stopwatch,
+        self, device: Device, program: Program, voxels_d: Any, counted: Counted, placement: Placement,
+        stopwatch: Stopwatch,
     ):  # fmt: skip
-        self._device, self._slab = device, slab
-        self._program, self._stopwatch = program, stopwatch
-        self._voxels_d, self._classified = voxels_d, classified
+        self._device, self._stopwatch = device, stopwatch
+        self._program, self._voxels_d = program, voxels_d
         self._counted, self._placement = counted, placement
+        slab, classified = self._slab, self._classified = counted.slab, counted.classified
         self.frames_d = ocl.upload(device, placement.slice_frames[slab.first : slab.first + slab.mask_slices])
         self.steps_d = ocl.upload(device, placement.steps)
         self._positions, self.positions_d = ocl.empty_output(device, (counted.vertices, 3), np.float32)

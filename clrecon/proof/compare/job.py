@@ -35,7 +35,7 @@ from clrecon.proof.compare.findings import CompareReport
 from clrecon.proof.compare.methods import COMPARED, CompareSettings
 from clrecon.proof.compare.page import make_page
 from clrecon.proof.compare.processes import Request, measure_in_processes, run_in_process, save_volume
-from clrecon.proof.compare.records import compose_report, make_record
+from clrecon.proof.compare.records import Given, compose_report, make_record
 from clrecon.proof.phantom import phantom_truth
 from clrecon.reading import read_selected
 from clrecon.system.files import StagedFolder, check_folder, temporary_folder
@@ -121,7 +121,8 @@ def make_comparison(
         folder = check_report_folder(output)
     check_kept([("the report", output)], source, settings.truth)
     volume, device, read_s = _open_input(source, settings, progress, watch)
-    volume, level, reason, warnings = _prepare_volume(volume, settings, device, progress)
+    given = _prepare_volume(volume, settings, device, progress)
+    volume, level = given.volume, given.level
     watch.lap("mask")
     with ExitStack() as stack:
         with system_errors(output):
@@ -139,10 +140,7 @@ def make_comparison(
         records = figures.complete(records)
         if settings.paper:
             figures.compare_with_slice()
-        report = compose_report(
-            volume, settings, device, records, figures, level=level, reason=reason, read_s=read_s,
-            warnings=[*warnings, *device.warnings], watch=watch,
-        )  # fmt: skip
+        report = compose_report(given, settings, device, records, figures, read_s, watch)
         with keep_existing(keep=no_clobber):
             staged = stack.enter_context(stage_report_folder(output))
             with system_errors(output):
@@ -180,10 +178,7 @@ def _open_input(
     return volume, device, read_s
 
 
-def _prepare_volume(
-    volume: Volume, settings: CompareSettings, device: Device, progress: Progress
-) -> tuple[Volume, float, str, list[str]]:
-    """Return the volume that all methods get, the level, why it is that, and warnings."""
+def _prepare_volume(volume: Volume, settings: CompareSettings, device: Device, progress: Progress) -> Given:
     wanted = settings.as_mesh()
     surfaces = plan_surfaces(wanted.levels)
     volume = mask_parts(volume, surfaces, wanted, device, progress)
@@ -200,7 +195,7 @@ def _prepare_volume(
         raise NoSurfaceError(
             f"no surface at {level:g} HU: the volume runs from {format_hu(low)} to {format_hu(high)} HU"
         )
-    return volume, float(level), str(facts["iso_value_reason"]), warnings
+    return Given(volume, float(level), str(facts["iso_value_reason"]), warnings)
 
 
 def _run_methods(

@@ -7,7 +7,7 @@ import importlib.metadata
 import platform
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from clrecon.geometry import Volume
 from clrecon.geometry.certificate import without_ids
@@ -97,20 +97,25 @@ def _facts_of_small(method: Compared, result: Mapping[str, Any]) -> dict[str, An
     }
 
 
+class Given(NamedTuple):
+    """What all methods get: the volume, a level in HU, and why it is that; and warnings."""
+
+    volume: Volume
+    level: float
+    reason: str
+    warnings: Sequence[str]
+
+
 def compose_report(
-    volume: Volume,
+    given: Given,
     settings: CompareSettings,
     device: Device,
     records: Sequence[MethodRecord],
     figures: Figures,
-    *,
-    level: float,
-    reason: str,
     read_s: Mapping[str, float],
-    warnings: Sequence[str],
     watch: Laps,
 ) -> CompareReport:
-    """Compose the report of what the methods got: a level in HU, why that one, and warnings."""
+    volume, level = given.volume, given.level
     certificate = dict(volume.report) if settings.keep_ids else dict(without_ids(volume.report))
     notes = [str(text) for text in certificate.pop("warnings", [])]
     cores, free = usable_cores(), free_cores()
@@ -130,7 +135,7 @@ def compose_report(
         spacing_mm=[float(step) for step in volume.spacing],
         iso_value_hu=level,
         iso_level_hu=float(choose_iso_rule(volume, level, closed=settings.closed).iso_level),
-        iso_value_reason=reason,
+        iso_value_reason=given.reason,
         closed_at_border=settings.closed,
         reference=settings.reference,
         repeat=settings.repeat,
@@ -151,7 +156,7 @@ def compose_report(
         memory_allowed_bytes=settings.memory,
         version=package_version(),
         platform=platform_name(),
-        warnings=list(dict.fromkeys([*notes, *warnings])),
+        warnings=list(dict.fromkeys([*notes, *given.warnings, *device.warnings])),
         volume=certificate,
         seconds={part: round(spent, 4) for part, spent in {**watch.seconds, "total": watch.total()}.items()},
         peak_memory_bytes=peak_memory_bytes(),
