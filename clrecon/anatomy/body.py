@@ -29,29 +29,30 @@ from clrecon.system.records import Gate
 from clrecon.system.text import format_ml
 
 TISSUE_HU = -300.0
-"""Cells above this are tissue: the value lies between that of blankets or foam and that of fat."""
+"""Cells with higher values are tissue: blankets and foam lie below this value, fat above it."""
 OPENING_MM = 7.0
-"""Half the thickness of plates that the opening removes: table tops and shells have 2 to 12 mm."""
+"""Half the thickness of plates that a morphological opening removes; table tops and shells are 2 to 12 mm thick."""
 THICK_MM = 11.0
-"""A piece beside the body is kept when a circle of this radius fits into it: into a hand, not into a strap or edge."""
+"""A piece beside the body is kept if a circle of this radius fits into it (into a hand, not into a strap or edge)."""
 LONG_MM = 100.0
-"""Thin parts that hang on the body are kept when they are shorter than this: an ear, not a table."""
+"""Thin parts that are attached to the body are kept if they are shorter than this (an ear, not a table)."""
 SMALL_MM2 = 2500.0
-"""Largest area of an enclosed region of a slice that is always filled: bowel gas, sinuses, the airways."""
+"""Enclosed regions of a slice up to this area are always filled: bowel gas, sinuses, the airways."""
 _LUNG_WALL, _AIR_WALL = 0.2, 0.7
 """Least share of a cavity's wall that must be thick tissue: for lung, and for larger regions of air."""
 LUNG_HU, MOST_AIR = -950.0, 0.2
-"""A region is lung when less than `MOST_AIR` of its cells is below `LUNG_HU`; air, foam and blankets have more."""
+"""Lung has less than the share `MOST_AIR` of its cells below `LUNG_HU`; air, foam and blankets have a larger share."""
 FOAM_HU, FOAM_WALL, FOAM_MM = -900.0, 0.3, 10.0
-"""Foam that fits a body closely is not lung.  A region is foam when most of it is below `FOAM_HU`, at most the share
-`FOAM_WALL` of its wall is thick, and it is nowhere thicker than 2 `FOAM_MM`, unlike the lungs of three scans."""
+"""A region is foam, not lung, if most of it is below `FOAM_HU`, at most the share `FOAM_WALL` of its wall is thick, and
+the region is nowhere thicker than 2 `FOAM_MM`; the lungs of three scans are thicker."""
 _FEWEST_UNMEASURED = 16
 """Least number of connected cells of one value that count as unmeasured; smaller groups occur by chance."""
 MARGIN_MM = 3.0
-"""Width of the untouched margin around the body: it contains the blurred edge of the skin."""
+"""Width of the margin around the body in which values are kept: it contains the blurred edge of the skin."""
 BODY_STEPS = 5
 """Steps of the search for the body, as progress counts them."""
 AIR_RANGE_HU = (-1100.0, -900.0)
+"""Values outside of the body in this range are air; removed voxels get their median."""
 
 
 @explains_arguments

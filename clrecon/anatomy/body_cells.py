@@ -16,13 +16,13 @@ from clrecon.system.pieces import in_threads
 Mask = NDArray[np.bool_]
 
 CELL_MM = 2.0
-"""Size of the cells; a cell has at least one voxel."""
+"""Size of the cells in which the body is searched; a cell has at least one voxel."""
 DENSE_HU = 300.0
-"""Bone has voxels above this; plastic and carbon fibre may have them too."""
+"""Bone has voxels above this value; plastic and carbon fibre may have such voxels too."""
 HARD_HU = 600.0
-"""Compact bone, teeth and metal have voxels above this; plastic and carbon fibre have none (560 HU at most)."""
+"""Compact bone, teeth and metal have voxels above this value; plastic and carbon fibre have at most 560 HU."""
 SURE_METAL_HU = 2200.0
-"""Metal has voxels above this; of bone only the enamel of teeth and a few voxels of the densest cortex."""
+"""Metal has voxels above this value; bone has only a few, in tooth enamel and the densest cortex."""
 
 PIECE = 4
 """Slices that a thread works out together."""

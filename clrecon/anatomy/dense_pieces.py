@@ -32,15 +32,15 @@ METAL_SHARE = 0.25
 """Least share of voxels above `SURE_METAL_HU` among the dense voxels of a piece of metal; their blurred edges are the
 rest.  Jaws with teeth have a share below 0.1."""
 BAR_MM, BAR_RATIO = 50.0, 3.0
-"""Least length of a bar, in mm and in its larger thickness."""
+"""Least length of a bar, in mm and as a multiple of its larger thickness."""
 SECTION_MM = 12.0
-"""Least length of the sections in which a bar is measured."""
+"""Least length of the sections into which a bar is divided to measure its evenness."""
 _SECTION_SPREAD, _EVEN_SECTIONS = 0.1, 0.75
 """At least this share of the sections of a bar differ by at most the first number, a share, from their median."""
 _BEND_CELLS = 0.5
 """Largest distance of the middles of these sections from the axis, root mean square, in cells."""
 THIN_MM = 10.0
-"""A thicker bar is solid along its axis: shafts of bones as thick are hollow."""
+"""A bar thicker than this must be solid along its axis, because the shafts of bones of this thickness are hollow."""
 FEWEST_CELLS = 8
 """Smaller pieces have no shape."""
 _RING_CELLS, _SOFT_RING = 2, 0.8
@@ -112,29 +112,29 @@ BONE_KEPT = 0.98
 _HARD_SHARE = 0.005
 """Least share of hard voxels in a piece of bone.  Tables have none; a thin cortex in coarse voxels has 0.02."""
 SOLID_HU = 200.0
-"""Cells with a higher mean are bone.  The mean is used because noise lifts single voxels over any bound."""
+"""Cells whose mean is higher are bone.  The mean is used because noise lifts single voxels over any bound."""
 _SOFT_PER_SOLID = 0.5
 """Cells of soft tissue for each cell of bone; patients have 2 or more (a head), dry specimens less than 0.1."""
 _STRAIGHT_SHARE = 0.95
 """A column of cells belongs to a table when at least this share of it is dense enough."""
 STRAIGHT_MM = 60.0
-"""Least height of a scan in which tables are looked for; in shorter scans bones are as straight as a table."""
+"""Tables are searched only in scans of at least this height; in shorter scans bones are as straight as a table."""
 UNIFORM_HU = 100.0
-"""Largest standard deviation of the HU along a table, from noise and shadows; the cortex of a bone varies more."""
+"""Largest standard deviation of the HU along a table, due to noise and shadows; the cortex of a bone varies more."""
 RAIL_MM = 10.0
-"""Largest thickness of a rail or a plate, among straight, uniform and hard pieces; shafts of long bones are thicker."""
+"""Straight, uniform, hard pieces up to this thickness are rails or plates; shafts of long bones are thicker."""
 CABLE_MM, CABLE_ML = 5.0, 3.0
-"""A hard piece beside a patient is a cable when its thickness and its volume are both at most these."""
+"""A hard piece beside a patient is a cable if neither its thickness nor its volume is larger than these values."""
 BODY_ML = 10.0
-"""A hard piece beside a patient is a second body from this volume on, with what it encloses in each slice."""
+"""A hard piece beside a patient is a second body from this volume on; areas that it encloses in a slice count too."""
 LONG_MM = 150.0
-"""Thin pieces without hard voxels beside a specimen, and wide thin plates, are equipment from this length on."""
+"""Beside a specimen, thin pieces without hard voxels and wide thin plates are equipment from this length on."""
 GROWTH_MM = 6.0
 """Less dense tissue that touches a bone of a specimen belongs to the bone up to this distance."""
 _MOST_SAID = 3
 """Most pieces that are named."""
 BONELESS_ML = 3.0
-"""Smaller pieces of the body without bone are not named."""
+"""Pieces of the body without bone are reported from this volume on."""
 INSIDE, _HARD_INSIDE = 0.5, 0.25
 """Least share of a piece within the body if it belongs to the patient; for hard pieces the second, lower value."""
 

@@ -18,42 +18,31 @@ from clrecon.geometry import Volume
 from clrecon.geometry.affine import column_spacing
 
 SKIN_HU = (-950.0, 150.0)
-"""Levels between air and bone: the outermost surface is the skin."""
-
+"""At iso values in this range, between air and bone, the outermost surface is the skin."""
 SKIN_SEEN_HU = (-950.0, 100.0)
-"""HU that show the skin in a picture where they are not transparent; colours of bone may begin above."""
-
+"""A picture shows the skin if HU in this range are not transparent; colours of bone may begin above the range."""
 CLEAR_SKIN_HU = (-950.0, -200.0)
-"""Levels between air and fat: nothing but skin.  Here a scan without a vault may be that of a face."""
-
+"""At iso values between air and fat the surface is nothing but skin.  A scan without a vault may then be of a face."""
 BONE_HU, AIR_HU = 220.0, -400.0
+"""Voxels from `BONE_HU` on are bone, and voxels below `AIR_HU` are air."""
 SOFT_HU = (-10.0, 110.0)
-"""Median of what a vault encloses: brain has 20 to 45 HU, contrast medium and hardening add to it."""
-
+"""Median HU inside the vault of a skull: brain has 20 to 45; contrast medium and beam hardening increase them."""
 PIXEL_MM, SLICE_MM = 2.0, 5.0
-"""Steps of the coarse look."""
-
+"""Pixel size and slice distance of the coarse search for a head."""
 VAULT_CM2, VAULT_MM = (35.0, 320.0), (60.0, 210.0)
-"""Area that a vault encloses in a slice, and its extents."""
-
+"""Range of the area that the vault of a skull encloses in a slice, and of the width and length of this area."""
 VAULT_SLICES_MM = 12.0
-"""Least height over which slices show the vault."""
-
+"""Least height over which slices show the vault of a skull."""
 TRUNK_CM2 = 330.0
-"""Area of a slice of the body above which it is a trunk: the largest slice of a head has about 250."""
-
+"""A slice of a body with a larger area belongs to a trunk; the largest slice of a head has about 250 cm2."""
 _CUT_SHARE = 0.75
 """Share of the border of a slice that is body from which the body counts as cut all round."""
-
 SKIN_CM2 = 40.0
-"""Least area of a label's surface beside the air around a head that counts as skin; a face has over 200."""
-
+"""From this area on, a label's surface beside the air around a head counts as skin; a face has over 200 cm2."""
 BESIDE_MM = 2.0
-"""Distance from a surface at which there must be air."""
-
+"""A surface is skin only where there is air at this distance outside of the surface."""
 OPEN_MM = 16.0
-"""Passages narrower than this keep the air of nose, sinuses and ears apart from the air around a head."""
-
+"""Passages narrower than this do not connect the air of nose, sinuses and ears with the air around a head."""
 MOST_SAMPLES = 20_000
 """Triangles that stand for all of a mesh."""
 

@@ -170,8 +170,8 @@ def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float, float]:
 
 
 STREAKS_HU, FEWEST_METAL, METAL_SLICES, STREAKS_SPREAD = 3000, 20, 3, 0.7
-"""A slice with so many voxels above this shows metal, whose streaks, and whose rim so many slices away, have the values
-of bone.  Streaks spread the levels of single edges: without metal slices these lie at most this part as far apart."""
+"""`FEWEST_METAL` voxels from `STREAKS_HU` on show metal: up to `METAL_SLICES` away its streaks have the values of bone.
+Streaks spread the levels of single edges: without metal slices the spread falls to `STREAKS_SPREAD` of it or less."""
 
 CONTRAST_SAID = 0.05
 """Least share of the contrast in flat plateaus that is reported; scans without contrast medium have up to 0.02."""

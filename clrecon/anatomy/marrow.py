@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 BLOCK_MM, FINE_MM = 2.0, 1.0
-"""Side of the blocks by which the width of a space is measured, and near the limit."""
+"""Side of the blocks in which the width of a space is measured, and their side if the width is near the limit."""
 _BLOCKS_OFF, _FINE_BLOCKS_OFF = 2.0, 0.75
 """Blocks by which the width can be wrong, and that of a ball too low, as its middle need not be that of a block."""
 

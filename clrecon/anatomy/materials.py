@@ -23,12 +23,13 @@ SAMPLED_VOXELS = 8_400_000
 """Approximate number of voxels that are examined: 32 slices of 512 x 512."""
 FEWEST_SLICES = 8
 LOWEST_HU, HIGHEST_HU = AIR_HU + 1, 3071
-"""The values that the histogram counts: from just above the padding to the end of the 12-bit scale."""
+"""Range of the histogram: from just above the padding to the end of the 12-bit scale."""
 SMOOTHING_HU = 8.0
+"""Standard deviation of the Gaussian that smooths the histogram."""
 SOFT_TISSUE_HU = (-30, 150)
-"""Range in which muscle, organs, blood and water have their mode."""
+"""The modes of muscle, organs, blood and water lie in this range."""
 FAT_HU = (-150, -31)
-"""Range in which fat has its mode: the background of scans that show no other soft tissue."""
+"""The mode of fat lies in this range; fat is the background of scans that show no other soft tissue."""
 AIR, _SOFT_TISSUE = -1000.0, 40.0
 """HU of the two materials by which a scan with a scale of its own is read."""
 DENSE = 1240.0
@@ -41,16 +42,16 @@ reaches, as a share of the range."""
 _LEAST_OF_PEAK = 0.003
 """Least height of a peak, as a share of the highest: a bone in a wide field of air has marrow of 0.5 % and more."""
 AIR_MODE_HU = -700
-"""Modes below this are air."""
+"""A mode of the histogram below this value is air."""
 SEED_ABOVE_TISSUE_HU = 100
-"""Least distance of bone from the soft-tissue mode: discs, clots and organs end below."""
+"""Bone lies at least this far above the mode of soft tissue; discs, clots and organs lie below."""
 _SEED_SIGMAS = 4.0
 WIDEST_MODE_HU = 150.0
-"""Widest accepted mode: more noise than this hides the tissues, and a ramp between two materials looks wider still."""
+"""Widest accepted mode: stronger noise hides the tissues, and a ramp between two materials looks even wider."""
 SPECIMEN_SEED_HU = 150
-"""Lowest value of bone in a specimen that lies in air."""
+"""Lowest value of bone in a specimen that is surrounded by air."""
 FAT_BELOW_TISSUE_HU = 250
-"""The low side of an edge is soft tissue or fat: at most this far below the mode."""
+"""The low side of an edge is soft tissue or fat if it is at most this far below the mode."""
 
 
 def describe_way_out() -> str:

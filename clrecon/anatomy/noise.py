@@ -13,7 +13,7 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 
 SOFT_TISSUE_HU = (-150.0, 250.0)
-"""All voxels of a block lie here: fat, muscle and organs with noise of up to some 60 HU, no air and no dense bone."""
+"""Noise is measured in blocks within this range: fat, muscle, organs and some 60 HU of noise; no air, no dense bone."""
 
 BLOCK = 6
 """Voxels along each side of a block within a slice."""

@@ -17,7 +17,7 @@ from clrecon.system.pieces import in_threads
 Field = NDArray[np.float32]
 
 CELL_MM = (2.5, 2.5, 4.0)
-"""Size along x, y, z of the cells in which the canal is searched."""
+"""Size along x, y and z of the cells in which the canal is searched."""
 HU_RANGE = (-1024, 1500)
 """Values beyond these count as these in the means."""
 
@@ -198,9 +198,9 @@ def mean_along_z(part: Field, height: int) -> Field:
 
 CANAL_RADIUS, BODY_RADIUS = 5.0, 10.0
 RING_MM = (8.0, 10.0, 12.0, 14.0, 16.0)
-"""Distances from the middle of the canal at which its wall is looked for."""
+"""Distances from the middle of the canal at which its wall is searched."""
 SHELL_MM = (12.0, 15.0, 18.0, 21.0, 24.0)
-"""Distances from the middle of a vertebral body at which its wall is looked for."""
+"""Distances from the middle of a vertebral body at which its wall is searched."""
 BODY_AHEAD_MM = (20.0, 24.0, 28.0)
 """Distances from the middle of the canal to the middle of the vertebral body."""
 DIRECTIONS = 16
@@ -212,9 +212,9 @@ STILL = {name: least for name, least in SURE.items() if name != "mirror"}
 """Beside a sure cell the canal goes on in a cell with these traits: a scan that is cropped at one side, or a patient
 who lies askew, has left and right that are not alike."""
 SOFT_HU = (-80.0, 130.0)
-"""Between these lies what a canal holds: fluid, nerves and fat around them."""
+"""The contents of a canal lie in this range: cerebrospinal fluid, nerves, and the fat around them."""
 TISSUE_HU = -300.0
-"""Rows and columns of cells without a value above this are not looked at; values are cut there for the mirror."""
+"""Rows and columns of cells without a higher value are not searched; the comparison of left and right clips to this."""
 _BORDER = 10
 """Cells around the tissue that are looked at too: farther from it nothing that is measured here is above 0."""
 PIECE = 4

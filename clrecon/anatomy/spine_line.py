@@ -47,7 +47,7 @@ from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, Steps
 
 GAP_MM = 12.0
-"""Largest gap between slices of the canal: an artefact, or a vertebra that looks different."""
+"""Largest gap between slices that show the canal, due to an artefact or a vertebra that looks different."""
 REACH = 2
 """Cells by which the canal may move aside from slice to slice."""
 
@@ -150,10 +150,13 @@ _FORWARD = 0.12
 """A spine is worth at least so much more than the same scan with front and back exchanged; necks 0.2 to 0.3, trunks 0.4
 to 0.5, lower legs less than 0.08."""
 SHORTEST_MM = 35.0
+"""A spine is accepted from this height on."""
 SMOOTH_MM = 12.0
+"""Standard deviation of the Gaussian that smooths the line."""
 POINT_STEP_MM = 15.0
+"""Distance of the points of the line in height."""
 CANAL_WIDTH_MM = 11.0
-"""Space farther than this from the middle of the canal is not in it."""
+"""Voxels farther than this from the middle of the canal do not belong to the canal."""
 
 
 @dataclass(frozen=True)

@@ -31,11 +31,11 @@ from clrecon.system.text import format_ml
 Mask = NDArray[np.bool_]
 
 SKIN_MM = 2.0
-"""Air less deep than this under the outline of the body is outside: folds of the skin, steps of the outline."""
+"""Air less deep than this below the outline of the body is outside: folds of the skin, steps of the outline."""
 DEEP_MM = 5.0
-"""Air that is connected to the outside is a cavity of the body if it reaches this far below `SKIN_MM`."""
+"""Air that is connected to the outside is a cavity of the body if it reaches at least this far below `SKIN_MM`."""
 OPEN_MM = 12.0
-"""Slices in which an airway is open (parted lips) get the outline of the slices above and below, up to this height."""
+"""If an airway is open (parted lips) over at most this height, the outline there is that of the slices around it."""
 
 _OWN_STEPS = 6
 """Steps after the search for the body, as progress counts them."""
@@ -179,7 +179,7 @@ LEFT_OUT = "left_out"
 """Entry of the report of a volume with voxels that are left out."""
 
 LEFT_OUT_SKIN_MM = 3.0
-"""What is left out reaches at least so far under the surface of the body: values mix there with those of the air."""
+"""The region left out reaches at least this far below the skin, because values there mix with those of the air."""
 
 LEAST_ROOM = 2.0
 """The value of what is left out lies so many times the range of the others above them: of a voxel beside it at most a

@@ -12,14 +12,14 @@ from clrecon.system.light_dataclass import dataclass
 Bits = NDArray[np.bool_]
 
 LEAST_HOLE_MM2 = 60.0
-"""Smaller holes of an arch are no canal but gaps of a mask; canals of adults have 150 mm2 and more."""
+"""Smaller holes in an arch are gaps of a mask, not a canal; canals of adults have at least 150 mm2."""
 
 MOST_TOGETHER_MM = 12.0
-"""Slices that close the arch together lie within this height, that of a pedicle: the lamina is lower than the pedicles,
-and in tilted or coarse slices no single one shows a closed ring."""
+"""Slices that together close the arch lie within this height, the height of a pedicle: the lamina is lower than the
+pedicles, and in tilted or coarse slices no single slice shows a closed ring."""
 
 BEYOND_MM = 6.0
-"""What lies so far above and below a hole tells whether it goes on there."""
+"""A hole is a canal if it is open over this distance above and below."""
 
 _MOST_BLOCKED = 0.5
 """Share of a hole's outline that bone may cover there.  The wall of a canal that is tilted by 30 degrees covers a
@@ -29,7 +29,7 @@ STEEPEST = 1.0
 """Largest shift of the canal from slice to slice, mm per mm: 45 degrees."""
 
 SPREAD_MM = 4.0
-"""The canal is at most so much wider than in the nearest closed slice; beyond are gaps of a mask beside it."""
+"""The canal extends at most this far beyond its outline in the nearest closed slice; the rest are gaps of a mask."""
 
 ROUNDS = 3
 """Times that the direction of the canal is found with the wall that follows from the one before."""

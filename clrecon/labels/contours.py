@@ -20,10 +20,10 @@ _MOST_OVER_EACH_OTHER = 20_000
 """Most pairs of contours of one ROI that lie over each other on one slice."""
 
 ROUNDED_MM = 0.01
-"""Contours that are equal in these units are one contour written twice."""
+"""Contours that are equal after rounding to this unit are one contour written twice."""
 
 NOISE_MM = 0.05
-"""Contours of which one goes this little beyond the other do not cross: writers round to 0.01 mm."""
+"""Contours that overlap by at most this do not count as crossing, because programs round to 0.01 mm."""
 
 
 _THIN_PIXELS = 0.25

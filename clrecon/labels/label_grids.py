@@ -138,7 +138,7 @@ def _read_names(extension: bytes) -> dict[int, str]:
 
 
 SAME_GRID_MM = 1e-3
-"""Largest distance of a voxel from its place in the first mask; a sform is float32."""
+"""Largest distance of a voxel from its position in the first mask; the sform of a NIfTI file is float32."""
 
 
 _GRID_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".hdr")

@@ -27,7 +27,7 @@ ON_GRID = 0.01
 """Tolerance in index steps: grids are the same when no voxel is further off than this."""
 
 BONE_HU = 200.0
-"""Voxels of this and above count as bone where a map may be misplaced."""
+"""Voxels of at least this value count as bone in the test for a misplaced label map."""
 
 TIES = 1e-6
 """Tolerance in index steps: half-way between two labels the lower index wins, independent of rounding."""

@@ -35,8 +35,9 @@ _DIRECTIONS_DIFFER = 1e-4
 """Largest difference between direction cosines; the gate of a CT series allows as much between slices."""
 
 SAME_PLACE_MM = 1e-3
+"""Frames that are no farther apart than this have the same position."""
 OFF_GRID_MM = 0.05
-"""Distance of a frame from the even stack.  Writers round positions to 0.01 mm or to seven digits."""
+"""Largest distance of a frame from its place in an even stack.  Writers round positions to 0.01 mm or seven digits."""
 
 MOST_SLICES = 100_000
 

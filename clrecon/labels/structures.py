@@ -75,8 +75,8 @@ LARGEST_BYTES = 2**30
 _MOST_CONTOURS = 1_000_000
 
 ON_SLICE_MM, ON_SLICE_STEPS = 0.1, 0.1
-"""Largest distance of a contour's points from their slice, in mm and in steps to the next slice; writers round to
-0.01 mm, and some take the places of slices from even steps."""
+"""Largest distance of a contour's points from their slice, in mm and in steps to the next slice: programs round to
+0.01 mm, and some compute the positions of slices from even steps."""
 
 _LEAST_POINTS = 3
 """Points that enclose something; rt_utils and others write contours of one and two as well."""

@@ -24,42 +24,39 @@ PAGE, NAME = ROOT / "docs" / "limits.md", "constants in mm and HU"
 ROOMS = ("anatomy", "labels", "operators")
 UNITS = re.compile(r"^[A-Z].*_(MM2?|CM2|ML|HU)(_|$)")
 
-ADULTS = "the object: adults; in no other way"
-HU = "values: HU alone"
-SCALED = (
-    "values: where they are not HU, two materials of the scan stand for 40 and 1240 HU, or air and soft tissue for"
-    " -1000 and 40"
-)
-WRITERS = "files: how writers round"
+ADULTS = "nothing: chosen for adults"
+HU = "values: only HU"
+SCALED = "values: scaled if they are not HU"
+WRITERS = "nothing: how programs round in files"
 LENGTHS = {
-    "anatomy/body.py": "the object: adults and their tables; cells are one voxel at least",
-    "anatomy/body_cells.py": "the voxel: cells are one at least",
-    "anatomy/dense_pieces.py": "the object: adults, their tables and cables",
-    "anatomy/head.py": "the object: heads of people",
-    "anatomy/marrow.py": "the voxel: blocks are whole ones",
+    "anatomy/body.py": "voxel: a cell has at least one; otherwise chosen for adults and their tables",
+    "anatomy/body_cells.py": "voxel: a cell has at least one",
+    "anatomy/dense_pieces.py": "nothing: chosen for adults, their tables and cables",
+    "anatomy/head.py": "nothing: chosen for heads of people",
+    "anatomy/marrow.py": "voxel: a block consists of whole ones",
     "anatomy/spine_cells.py": ADULTS,
     "anatomy/spine_line.py": ADULTS,
-    "anatomy/surroundings.py": "the object: skin and airways of people",
+    "anatomy/surroundings.py": "nothing: chosen for skin and airways of people",
     "labels/canal.py": ADULTS,
     "labels/contours.py": WRITERS,
     "labels/label_grids.py": WRITERS,
     "labels/segmentation.py": WRITERS,
-    "labels/structures.py": WRITERS + ", and the step of the slices",
-    "operators/masks/enclosed.py": "the voxel: the ball of `--solid` is 8 steps at most; the object: a share of the"
-    " largest bone; marrow of adults",
+    "labels/structures.py": "voxel: step to the next slice; otherwise how programs round in files",
+    "operators/masks/enclosed.py": "voxel: the ball of `--solid` has a radius of at most 8 steps; object: volume of the"
+    " bone; otherwise chosen for marrow of adults",
     "operators/masks/regions.py": WRITERS,
     "operators/masks/shapes.py": WRITERS,
     "operators/points/clusters.py": WRITERS,
     "operators/points/free_clusters.py": "nothing: range of float32",
     "operators/rays/mesh_pictures.py": "nothing: range of float32",
-    "operators/rays/point_pictures.py": "the object: the spacing of the cloud where it has one",
+    "operators/rays/point_pictures.py": "object: spacing of the cloud, if it has one",
     "operators/reformat/cut.py": ADULTS,
-    "operators/surface/cortex.py": "the voxel: lengths are at a voxel of 1 mm3 and scale with it",
-    "operators/surface/cortex_mesh.py": "nothing: float32 in mm, and how far is searched",
-    "operators/surface/growing.py": "nothing: how far is searched",
+    "operators/surface/cortex.py": "voxel: scaled from a voxel of 1 mm3",
+    "operators/surface/cortex_mesh.py": "nothing: precision of float32, limit of a search",
+    "operators/surface/growing.py": "nothing: limit of a search",
     "operators/surface/seeds.py": ADULTS,
-    "operators/vertebrae/inside.py": "the object: vertebrae of adults",
-    "operators/vertebrae/solid.py": "the object: vertebrae of adults",
+    "operators/vertebrae/inside.py": "nothing: chosen for vertebrae of adults",
+    "operators/vertebrae/solid.py": "nothing: chosen for vertebrae of adults",
 }
 """What the lengths, areas and volumes of a module follow; a module that has some and no line is an error."""
 
@@ -113,7 +110,7 @@ def make_table(root: Path = ROOT / "clrecon") -> str:
             for names, value, said in find_constants(path.read_text(encoding="utf-8")):
                 cells = (module.removesuffix(".py"), names, value, said, describe_follows(module, names))
                 rows.append([cell.replace("|", "\\|") for cell in cells])
-    return markdown_table(["module", "constant", "value", "made for", "follows"], rows)
+    return markdown_table(["module", "constant", "value", "meaning", "adapts to"], rows)
 
 
 def main() -> int:

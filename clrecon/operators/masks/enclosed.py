@@ -27,7 +27,7 @@ from clrecon.system.records import at_most
 from clrecon.system.text import count_of, format_hu, format_ml
 
 WIDE_ML = 20.0
-"""Smaller spaces are not wide: even a slice of 5 mm through a ball of 35 mm has 19 ml."""
+"""Smaller spaces are not wide: even a disc of 5 mm from the middle of a ball of 35 mm radius has 19 ml."""
 
 
 @dataclass(frozen=True)
@@ -185,12 +185,12 @@ def _open_ends(mask: Mask) -> NDArray[np.int32]:
 
 
 LEAST_SAID_ML = 0.1
-"""Smaller spaces that stay open are in the report alone."""
+"""Spaces that stay open are in a warning from this volume on; smaller ones are only in the report."""
 
 SEAL_MM, LARGEST_SEAL_MM = 2.5, 3.0
-"""Radius of the balls that close pores and vessels of the cortex, and the largest, for coarse voxels: at levels of bone
-the thin cortex of vertebrae has openings of up to 5 mm.  Between centres of voxels the ball closes every pore up to
-twice its radius less one step."""
+"""Radius of the balls that close pores and vessels of the cortex, and the largest radius, for coarse voxels: at levels
+of bone the thin cortex of vertebrae has openings of up to 5 mm.  Between centres of voxels the ball closes every pore
+up to twice its radius less one step."""
 
 _SEAL_STEPS = 1.25
 """The same radius in largest steps of the voxels: below one it would close nothing along that axis."""
@@ -200,22 +200,22 @@ _MOST_SEAL_STEPS, _SEAL_PARTS = 8.0, 7.0
 side of a cube as large as the bone: small bones have small pores, and lie close together."""
 
 BONE_ML, BONE_SHARE = 1.0, 0.05
-"""Pieces at the level from this volume on, or from this share of all bone, are bones of their own: what lies between
-two of them is a joint."""
+"""Pieces from this volume on, or from this share of all bone, are separate bones: the space between two of them is a
+joint."""
 
 _MOST_CLOSED = 0.5
 """Largest share of a solid bone that the ball alone may close; bone with marrow of thin trabeculae has 0.33."""
 
 LARGEST_MARROW_MM = 35.0
-"""Radius of the smallest ball that fits into no marrow: the head of a femur is 20 to 29 mm in radius, the skull of a
-newborn more than 45."""
+"""A ball of this radius fits into no marrow: the head of a femur has a radius of 20 to 29 mm, the skull of a newborn
+more than 45 mm."""
 
 SATURATED_HU, METAL_STEPS, METAL_SHARE = 3000.0, 2.0, 0.05
-"""What is filled within so many radii of the ball of values above the first is beside metal, in joints of it and in
-canals round it, and warned of from this share of the solid body on."""
+"""Filling up to `METAL_STEPS` radii of the ball away from values above `SATURATED_HU` is beside metal, in its joints or
+the canals around it; a warning is given if this filling is more than the share `METAL_SHARE` of the solid body."""
 
 AIR_LIMIT_HU = -200.0
-"""A space whose mean is lower holds air: fat is -100, air cells with thin walls are below -400."""
+"""A space whose mean is lower contains air: fat has -100 HU, air cells with thin walls have less than -400 HU."""
 
 
 @explains_arguments

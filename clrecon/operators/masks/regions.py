@@ -16,7 +16,7 @@ from clrecon.system.light_dataclass import dataclass
 Ends = tuple[Float64Array, Float64Array]
 
 BOX_SLACK_MM = 1e-6
-"""Voxels as far beyond the sides of a box are within, so that a box that ends at voxels holds them."""
+"""Voxels this far beyond the sides of a box still count as inside, so that a box that ends at voxels contains them."""
 
 
 @dataclass(frozen=True)

@@ -151,7 +151,7 @@ def spread_bits(device: Device, mask: VoxelMask, ball: Stencil, *, erode: bool =
 
 
 PLACE_TOLERANCE_MM = 0.01
-"""Voxels of two volumes that lie as close are the same."""
+"""Voxels of two volumes that are no farther apart than this have the same position."""
 
 Bits = TypeVar("Bits", bound="MaskBits")
 

@@ -35,7 +35,7 @@ _WIDE_GAP = 1.5
 """Slice gap in pixels above which ``plane+1`` takes much bone too."""
 
 LAYER_MM = 0.02
-"""Points whose heights differ by less lie in one layer: files round."""
+"""Points whose heights differ by less lie in one layer, because files round coordinates."""
 
 _FEWEST_LAYERS = 4
 """Layers, and points a layer on average, from which on points without an affine are taken to lie in slices."""
@@ -45,7 +45,7 @@ _PLACES_CHECKED = 1 << 14
 search itself."""
 
 PLACE_TOLERANCE_MM = 0.01
-"""Largest distance of a point from its voxel: float32 and files round by less."""
+"""Largest distance of a point from its voxel; rounding to float32 and in files is smaller."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -31,7 +31,7 @@ _EPS_TOLERANCE = 1e-6
 """Distances up to eps times one more than this are within eps."""
 
 LEAST_EPS_MM = 1e-9
-"""Smallest eps: squares of smaller ones leave the range of float32."""
+"""Smallest eps: the squares of smaller values leave the range of float32."""
 
 _UNSURE_SHARE = 1e-6
 """Part of the limit's square within which kernels decide in sums of two floats; both ends are given to them."""

@@ -212,7 +212,7 @@ def eye_table(camera: Camera, size: tuple[int, int], lighting: Lighting, base: F
 
 
 LONE_POINT_MM = 1.0
-"""Radius of the discs of clouds that have no spacing; of others it is their mean spacing, which leaves few gaps."""
+"""Radius of the discs for a cloud without a spacing; for others the radius is the mean spacing, with few gaps."""
 
 _NOISE_COLOR = "#707070"
 _KEPT_COLOR = "#a0a0a0"

@@ -201,7 +201,7 @@ def look_ahead(resident: DeviceVolume, slab: ray_slabs.RaySlab, ray: MainWay, le
 
 
 AIR_HU = kernel_number("rays/project.cl", "AIR_HU")
-"""Attenuates nothing: lower values are padding, or what a mask left."""
+"""Value that attenuates nothing; lower values are padding, or what a mask left."""
 
 PROJECTIONS = {
     mode: kernel_constant("rays/project.cl", macro)

@@ -39,11 +39,11 @@ from clrecon.system.arguments import Combination, CurvedKind, ViewName, WindowNa
 from clrecon.system.progress import Progress, ignore_progress
 
 DEFAULT_WIDTH_MM = 120.0
-"""Default width of a curved reformation without a size: a vertebra with its surroundings."""
+"""Default width of a curved reformation: a vertebra with its surroundings."""
 
 
 BESIDE_MM = 60.0
-"""Least width of a stretched picture beyond what its line sways to the sides: half a vertebra at both."""
+"""A stretched picture is wider than the sideways extent of its line by at least this: half a vertebra on each side."""
 
 LEAST_PIXELS = 768
 """Least pixels along the longer side of a curved reformation without a size, so that short curves are large enough to

@@ -50,29 +50,29 @@ PIECE, SMALLEST_PIECE = 1 << 18, 1 << 8
 """Places of a launch, and the fewest where memory is short."""
 
 STEP_MM = 0.5
-"""Step of a profile where voxels have 1 mm3; half of it gave the same places to 0.003 mm."""
+"""Step of a profile at voxels of 1 mm3; half this step gave the same positions to within 0.003 mm."""
 
 _SMALLEST_SCALE, _LARGEST_SCALE = 0.001, 1.4
 """Bounds of the edge of a voxel's cube, mm, by which profiles are scaled."""
 
 WEIGHT_MM = 2.2
-"""Width of the Gaussian of the samples' weights, at a scale of 1 mm."""
+"""Standard deviation of the Gaussian that weights the samples, at voxels of 1 mm3."""
 
 INNER_SHARE, INNER_SPREAD, CORTEX_SPREAD, OUTER_SPREAD_HU = 0.25, 0.6, 0.15, 1000.0
-"""What is expected before the fit: marrow has a quarter of the HU of cortex, within 0.6 of them; the cortex of a place
-lies within 15 % of that of the scan; tissue may be anything from air on."""
+"""Expected before the fit: marrow has 0.25 of the HU of cortex, with a spread of 0.6 of these HU; the cortex at one
+position differs by 15 % from the cortex of the scan; tissue outside may have any HU from air on."""
 
 _MODEL_ERROR = 0.025
 """What three plateaus leave of a profile without noise, as a share of the cortex' HU."""
 
 CORRELATED_MM = 1.0
-"""Samples nearer than this, at a scale of 1 mm, do not count as several."""
+"""Samples nearer to each other than this, at voxels of 1 mm3, do not count as independent."""
 
 RISE_HU, RISE_SIGMAS = 100.0, 3.0
-"""HU that rise by so much outwards belong to another wall."""
+"""A rise of HU outwards by the larger of these, in HU and in standard deviations of noise, belongs to another wall."""
 
 SILENT_HU = 10.0
-"""Noise that is taken where a scan shows no soft tissue to measure it in."""
+"""Noise that is assumed if a scan shows no soft tissue in which noise can be measured."""
 
 
 @dataclass(frozen=True)

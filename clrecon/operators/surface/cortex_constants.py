@@ -34,8 +34,8 @@ MOST_WALLS, LOOKED_AT = 500, 4000
 """Profiles that the constants are measured in, and vertices among which they are searched."""
 
 LEAST_CONTRAST, LEAST_CORTEX_HU = 0.4, 350.0
-"""A wall is as high, and rises by as much, as this share of the 90th percentile of those of compact bone, or of those
-that reach the second: the shell of a table rises from air, but is low. Fewer than `_FEWEST_WALLS` show no bone."""
+"""Height and rise of a wall exceed this share of the 90th percentile of the heights of compact walls, or of all walls
+from `LEAST_CORTEX_HU` on; the shell of a table rises from air, but is low. Fewer than `_FEWEST_WALLS` show no bone."""
 
 _TRIMMED, _NARROW_SPREAD = 0.8, 0.02
 """Share of the profiles, those fitted best, by which blurs are compared: others touch a second bone or a vessel. Share

@@ -64,6 +64,7 @@ LEAST_ROOM = 2
 """Samples outside of a vertex that belong to its wall, at least."""
 
 MOST_SHIFT_MM = 2.5
+"""Largest shift of a vertex to its wall; a fit with a larger shift counts as bad."""
 
 _ERROR_FACTOR, _LEAST_ERROR = 1.25, 0.06
 """By what the fit's own error is multiplied, and what is added in squares, in blurs: with both, 94 % of the vertices of
@@ -174,7 +175,7 @@ _FEWEST_FITTED = 100
 """Fitted vertices below which nothing is said about a surface."""
 
 KEPT_MM = 1e-3
-"""A vertex farther than this from where its wall is was not moved by all of its shift."""
+"""A vertex that is still farther than this from its wall was not moved by its whole shift."""
 
 _LEAST_TURN = 0.2
 """Least cosine between a triangle before and after it was moved."""

@@ -24,7 +24,7 @@ from clrecon.operators.surface.slabs import SampleGrid, Slab
 from clrecon.system.light_dataclass import dataclass
 
 FARTHEST_TOLD_MM = 50.0
-"""Of a seed in air the nearest cell is looked for up to here, for the message."""
+"""The message about a seed in air states the distance of the nearest cell up to this limit."""
 
 _NEAR_MM = 2.0
 """Most seeds lie on the surface: it is looked for as near as this first, among few cells."""

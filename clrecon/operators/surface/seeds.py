@@ -20,7 +20,7 @@ AUTO = "auto"
 AUTO_SHARE = 0.05
 
 SEED_REACH_MM = 10.0
-"""A point grows the component of the nearest active cell, whose centre is no farther away."""
+"""A seed point selects the component of the nearest active cell, whose centre must be no farther away than this."""
 
 
 @dataclass(frozen=True)

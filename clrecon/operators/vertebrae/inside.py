@@ -28,7 +28,7 @@ from clrecon.system.records import Record
 from clrecon.system.text import format_volume
 
 MOST_RADIUS_MM = 8.0
-"""Bone in which larger balls fit is no shell any more."""
+"""Bone into which a larger ball fits is not a shell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,20 +77,20 @@ def measure_thickness(mask: Mask) -> ShellThickness:
 
 
 DENSE_HU = (450.0, None)
-"""Band of dense bone: from half way between thin cortex (850 HU) and soft tissue on."""
+"""Band of dense bone: values from half way between soft tissue and thin cortex (850 HU) on."""
 
 PARTS = ("dense", "trabecular", "canal", "solid")
 """Parts by the order of their numbers, from 1, in `VertebraInside.to_label_map`; solid is dense and trabecular."""
 
 NEIGHBOUR_HU = 150.0
-"""Voxels of other labels are bone from here on, and no part of a canal; cord and sac lie below 100 HU."""
+"""Voxels of other labels from this value on are bone, not canal; spinal cord and dural sac lie below 100 HU."""
 
 _MISSED_SHARE = 0.1
 """Warn where this share of the band around a label lies in the next voxel outside of it."""
 
 LEAST_CANAL_MM = 4.5
-"""Warn of canals that are lower: pedicles are 6 mm high in the neck and 14 mm in the loin, less where both are cut by
-one slice in a vertebra that is tilted sideways."""
+"""Lower canals give a warning: pedicles are 6 mm high in the neck and 14 mm in the lumbar spine, less if one slice cuts
+both in a vertebra that is tilted sideways."""
 
 
 @dataclass(frozen=True, eq=False)
