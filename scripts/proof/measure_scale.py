@@ -28,6 +28,7 @@ from clrecon.proof.phantom import PhantomSettings, write_phantom  # noqa: E402
 from clrecon.reading.common.plausibility import examine_voxels  # noqa: E402
 from clrecon.reading.common.source_facts import PixelFacts  # noqa: E402
 
+HEADS = ["values", "scans in which `hu_scale` fails"]
 PAGE, FIGURES = ROOT / "docs" / "certificate.md", ROOT / "docs" / "benchmarks" / "scales.json"
 
 PHANTOMS = [
@@ -39,13 +40,13 @@ PHANTOMS = [
     *(PhantomSettings(kind=kind) for kind in ("hip", "mouse", "limb", "pelvis", "spine", "contrast")),
 ]
 CHANGES: dict[str, tuple[float, float]] = {
-    "as it is": (1.0, 0.0),
+    "unchanged": (1.0, 0.0),
     **{f"{shift:+d} HU": (1.0, shift) for shift in (-1024, -324, -150, -100, 100, 150, 200, 324, 500, 800, 1024)},
-    **{f"times {slope:g}": (slope, 0.0) for slope in (0.5, 0.8, 1.2, 2.0)},
-    "air kept, times 0.5": (0.5, -500.0),
-    "air kept, times 1.5": (1.5, 500.0),
-    "0.6, + 400": (0.6, 400.0),
-    "10, + 20,000": (10.0, 20_000.0),
+    **{f"HU x {slope:g}": (slope, 0.0) for slope in (0.5, 0.8, 1.2, 2.0)},
+    "HU x 0.5, air still at -1000 HU": (0.5, -500.0),
+    "HU x 1.5, air still at -1000 HU": (1.5, 500.0),
+    "HU x 0.6 + 400": (0.6, 400.0),
+    "HU x 10 + 20,000": (10.0, 20_000.0),
 }
 """Slope and offset that HU are multiplied with and moved by."""
 
@@ -73,7 +74,7 @@ def main(arguments: list[str]) -> int:
     if arguments == ["page"]:
         figures = json.loads(FIGURES.read_text(encoding="utf-8"))
         rows = [[name, f"{figures['noticed'][name]} of {figures['scans']}"] for name in CHANGES]
-        text = put_table(PAGE.read_text(encoding="utf-8"), "other scales", markdown_table(["values", "noticed"], rows))
+        text = put_table(PAGE.read_text(encoding="utf-8"), "other scales", markdown_table(HEADS, rows))
         PAGE.write_text(text, encoding="utf-8")
         return 0
     found = []

@@ -32,9 +32,9 @@ class Place:
 
 
 RESULTS = {
-    "exact": "read, places exact",
-    "as stated": "read, places as stated",
-    "silent": "**read, places as stated, not noticed**",
+    "exact": "read, positions exact",
+    "as stated": "read, positions as stated",
+    "silent": "**read, positions as stated, not noticed**",
     "refused": "refused",
 }
 
@@ -96,7 +96,7 @@ PLACES = {
         "duplicate slices with different pixels at 1 place", ImagePositionPatient=lambda k: position(4 if k == 5 else k)
     ),
     "one position for all": refused("all 12 images lie in one plane", ImagePositionPatient=position(0)),
-    "position with x and z swapped": refused(
+    "position with x and z exchanged": refused(
         "all 12 images lie in one plane", ImagePositionPatient=lambda k: position(k)[::-1]
     ),
     "position of one slice 0.6 mm off": as_stated(
@@ -115,18 +115,20 @@ PLACES = {
         ImagePositionPatient=lambda k: [1000 * value for value in position(k)],
     ),
     "positions doubled": as_stated("stated_places", "ImagePositionPatient by 2.5 mm", **DOUBLED, **LOCATION),
-    "positions doubled, no other element says where": silent("no SliceLocation, no SpacingBetweenSlices", **DOUBLED),
+    "positions doubled, no other element states positions": silent(
+        "no SliceLocation, no SpacingBetweenSlices", **DOUBLED
+    ),
     "positions in cm": as_stated("stated_places", "ImagePositionPatient by 0.125 mm", **IN_CM, **LOCATION),
-    "positions in cm, no other element says where": silent("slices may overlap as much as they like", **IN_CM),
+    "positions in cm, no other element states positions": silent("slices may overlap by any amount", **IN_CM),
     "position with the wrong sign along the slices": silent(
-        "a mirror of the patient that fits all headers: SliceLocation has no direction",
+        "all headers fit the mirrored patient: SliceLocation has no direction",
         ImagePositionPatient=lambda k: [*position(k)[:2], -position(k)[2]],
         **LOCATION,
     ),
-    "positions of two slices swapped": seen(
+    "positions of two slices exchanged": seen(
         "slices 6 and 7 of 12 seem to lie in each other's place", ImagePositionPatient=swap(5, 6)
     ),
-    "positions of two distant slices swapped": seen(
+    "positions of two distant slices exchanged": seen(
         "slices 4 and 9 of 12 seem to lie in each other's place", ImagePositionPatient=swap(3, 8)
     ),
     "orientation missing": refused("ImageOrientationPatient (0020,0037) is missing", ImageOrientationPatient=None),
@@ -136,7 +138,7 @@ PLACES = {
         "off unit length or right angle", ImageOrientationPatient=[1, 0, 0, 1, 0, 0]
     ),
     "orientation of zeros": refused("off unit length or right angle", ImageOrientationPatient=[0] * 6),
-    "orientation of one slice is another": refused(
+    "orientation of one slice differs": refused(
         "1 slice missing between", ImageOrientationPatient=at_one(5, [0, 1, 0, 0, 0, -1], [1, 0, 0, 0, 1, 0])
     ),
     "orientation of another plane": refused(
@@ -146,12 +148,12 @@ PLACES = {
         "stated_places", "PatientOrientation says L\\P", ImageOrientationPatient=[-1, 0, 0, 0, 1, 0], **LETTERS
     ),
     "orientation with the wrong sign of rows, no PatientOrientation": silent(
-        "pictures seen from the head are as good", ImageOrientationPatient=[-1, 0, 0, 0, 1, 0]
+        "images viewed from the head are equally valid", ImageOrientationPatient=[-1, 0, 0, 0, 1, 0]
     ),
-    "orientation with rows and columns swapped": as_stated(
+    "orientation with rows and columns exchanged": as_stated(
         "stated_places", "by ImageOrientationPatient it is P\\L", ImageOrientationPatient=[0, 1, 0, 1, 0, 0], **LETTERS
     ),
-    "orientation with rows and columns swapped, no PatientOrientation": silent(
+    "orientation with rows and columns exchanged, no PatientOrientation": silent(
         "a patient may lie on the side", ImageOrientationPatient=[0, 1, 0, 1, 0, 0]
     ),
     "pixel spacing missing": refused("PixelSpacing (0028,0030) is missing", PixelSpacing=None),
@@ -165,26 +167,28 @@ PLACES = {
     "pixel spacing doubled": as_stated(
         "stated_places", "ReconstructionDiameter says 11.2 mm", PixelSpacing=[1.4, 1.0], ReconstructionDiameter=11.2
     ),
-    "pixel spacing doubled, no ReconstructionDiameter": silent("no other element says how wide", PixelSpacing=[1.4, 1]),
-    "pixel spacing doubled, cut out of a larger picture": silent(
-        "it still fits into the ReconstructionDiameter", PixelSpacing=[1.4, 1.0], ReconstructionDiameter=358.4
+    "pixel spacing doubled, no ReconstructionDiameter": silent(
+        "no other element states the width", PixelSpacing=[1.4, 1]
+    ),
+    "pixel spacing doubled, image cut out of a larger one": silent(
+        "the image still fits into the ReconstructionDiameter", PixelSpacing=[1.4, 1.0], ReconstructionDiameter=358.4
     ),
     "pixel spacing in cm": as_stated(
         "stated_places", "5,120 pixels of 0.07 mm", PixelSpacing=[0.07, 0.05], ReconstructionDiameter=358.4
     ),
     "pixel spacing in cm, no ReconstructionDiameter": silent(
-        "fine scanners have such pixels", PixelSpacing=[0.07, 0.05]
+        "high-resolution scanners have such pixels", PixelSpacing=[0.07, 0.05]
     ),
-    "pixel spacing of rows and columns swapped": silent(
-        "all other elements are of both sides alike", PixelSpacing=[0.5, 0.7], ReconstructionDiameter=358.4
+    "pixel spacing of rows and columns exchanged": silent(
+        "all other elements are the same for both sides", PixelSpacing=[0.5, 0.7], ReconstructionDiameter=358.4
     ),
     "thickness missing": exact(SliceThickness=None),
     "thickness 0": exact(SliceThickness=0),
     "thickness below 0": exact(SliceThickness=-1.25),
-    "thickness of one slice is another": exact(
+    "thickness of one slice differs": exact(
         "", "SliceThickness differs along the stack", SliceThickness=at_one(5, 5, 1.25)
     ),
-    "thickness half the gap, numbers in steps": exact(
+    "thickness half the gap, instance numbers in steps": exact(
         "complete_series gap_thickness", "slices missing according to the numbers", SliceThickness=0.625
     ),
     "stated gap doubled": exact("stated_gap", "SpacingBetweenSlices says 2.5 mm", SpacingBetweenSlices=2.5),
@@ -192,11 +196,13 @@ PLACES = {
     "stated gap below 0": exact("stated_gap", "SpacingBetweenSlices says -1.25 mm", SpacingBetweenSlices=-1.25),
     "stated gap 0": exact("stated_gap", "SpacingBetweenSlices says 0 mm", SpacingBetweenSlices=0),
     "stated gap in cm": exact("stated_gap", "SpacingBetweenSlices says 0.125 mm", SpacingBetweenSlices=0.125),
-    "numbers missing": exact(InstanceNumber=None),
-    "one number for all": exact(InstanceNumber=1),
-    "numbers below 0": exact(InstanceNumber=lambda k: -k),
-    "numbers in another order": exact(InstanceNumber=lambda k: 5 * k % 12 + 1),
-    "numbers from 11": exact("complete_series", "InstanceNumber begins with 11", InstanceNumber=lambda k: k + 11),
+    "instance numbers missing": exact(InstanceNumber=None),
+    "one instance number for all": exact(InstanceNumber=1),
+    "instance numbers below 0": exact(InstanceNumber=lambda k: -k),
+    "instance numbers in another order": exact(InstanceNumber=lambda k: 5 * k % 12 + 1),
+    "instance numbers from 11": exact(
+        "complete_series", "InstanceNumber begins with 11", InstanceNumber=lambda k: k + 11
+    ),
     "frame of reference missing": exact(FrameOfReferenceUID=None),
     "two frames of reference": refused(
         "FrameOfReferenceUID differ within the series", FrameOfReferenceUID=lambda k: f"1.2.3.{k // 6}"
@@ -207,8 +213,8 @@ PLACES = {
     "rows doubled": refused("truncated: 1152 bytes of pixels expected", Rows=32),
     "rows halved": refused("more pixels than the header says", Rows=8),
     "rows of one slice halved": refused("slice005.dcm: Pixel Data has 576 bytes", Rows=at_one(5, 8, 16)),
-    "rows and columns swapped": seen("Rows and Columns seem to be swapped", Rows=96, Columns=72),
-    "series missing": exact("", "no SeriesInstanceUID", SeriesInstanceUID=None),
+    "rows and columns exchanged": seen("Rows and Columns seem to be swapped", Rows=96, Columns=72),
+    "SeriesInstanceUID missing": exact("", "no SeriesInstanceUID", SeriesInstanceUID=None),
     "a series for each slice": refused(
         "a single slice cannot make a surface: 12 series of one slice each",
         SeriesInstanceUID=lambda k: f"1.2.3.{k + 1}",
@@ -225,7 +231,7 @@ PLACES = {
     ),
     "files stated below 0": exact(NumberOfSeriesRelatedInstances=-3),
     "one SOPInstanceUID for all": exact(SOPInstanceUID="1.2.3"),
-    "another position of the patient": exact(PatientPosition="FFP"),
+    "another PatientPosition": exact(PatientPosition="FFP"),
 }
 
 
@@ -264,40 +270,42 @@ VALUES: dict[str, Row] = {
     "slope and intercept of another scale": stated(
         "hu_scale", "rescale slope seems to be wrong", RescaleSlope=7, RescaleIntercept=-7168
     ),
-    "slope of a thousand": stated("plausible_hu", "RescaleSlope 1000", RescaleSlope=1000),
-    "slope of a ten-thousandth": stated("plausible_hu", "RescaleSlope 0.0001", RescaleSlope=0.0001),
+    "slope of 1000": stated("plausible_hu", "RescaleSlope 1000", RescaleSlope=1000),
+    "slope of 0.0001": stated("plausible_hu", "RescaleSlope 0.0001", RescaleSlope=0.0001),
     "intercept missing": stated("hu_known hu_scale", "intercept seems to be missing", RescaleIntercept=None),
     "intercept 0": stated("hu_scale", "intercept seems to be missing", RescaleIntercept=0),
     "intercept doubled": stated("hu_scale", "applied twice", RescaleIntercept=-2048),
     "intercept with the wrong sign": stated("hu_scale plausible_hu", "lowest voxel 1024 HU", RescaleIntercept=1024),
     "intercept off by 324": stated("hu_scale", "HU too high", RescaleIntercept=-700),
     "intercept off by -324": stated("hu_scale", "HU too low", RescaleIntercept=-1348),
-    "intercept a tenth": stated("hu_scale", "soft tissue near 9", RescaleIntercept=-102.4),
-    "type of other values": stated("hu_known", "RescaleType is 'OD'", RescaleType="OD"),
-    "table in place of slope": stated(
+    "intercept divided by ten": stated("hu_scale", "soft tissue near 9", RescaleIntercept=-102.4),
+    "RescaleType of other values": stated("hu_known", "RescaleType is 'OD'", RescaleType="OD"),
+    "Modality LUT instead of a slope": stated(
         "hu_known hu_scale", "Modality LUT Sequence (0028,3000)", RescaleSlope=None, **LUT, RescaleIntercept=None
     ),
-    "table beside the slope": stated("hu_known", "Modality LUT Sequence (0028,3000)", **LUT),
-    "sign lost": stated("stored_sign", "seem to be signed", Plan(shape=SHAPE, intercept=0), PixelRepresentation=0),
-    "sign made up": stated("stored_sign", "dense bone or metal", TWELVE, PixelRepresentation=1),
-    "padding missing": stated("", UNDECLARED, hu=make_padded()),
-    "padding doubled": stated("", UNDECLARED, hu=make_padded(), PixelPaddingValue=-4000),
-    "padding with the wrong sign": stated("", UNDECLARED, hu=make_padded(), PixelPaddingValue=2000),
-    "padding with the value of muscle": stated("", MASKED, PixelPaddingValue=1074),
-    "padding with the value of bone": stated("", MASKED, PixelPaddingValue=1274),
-    "limit of the padding in tissue": stated(
+    "Modality LUT beside the slope": stated("hu_known", "Modality LUT Sequence (0028,3000)", **LUT),
+    "signed values declared unsigned": stated(
+        "stored_sign", "seem to be signed", Plan(shape=SHAPE, intercept=0), PixelRepresentation=0
+    ),
+    "unsigned values declared signed": stated("stored_sign", "dense bone or metal", TWELVE, PixelRepresentation=1),
+    "padding value missing": stated("", UNDECLARED, hu=make_padded()),
+    "padding value doubled": stated("", UNDECLARED, hu=make_padded(), PixelPaddingValue=-4000),
+    "padding value with the wrong sign": stated("", UNDECLARED, hu=make_padded(), PixelPaddingValue=2000),
+    "padding value of muscle": stated("", MASKED, PixelPaddingValue=1074),
+    "padding value of bone": stated("", MASKED, PixelPaddingValue=1274),
+    "padding range limit in tissue": stated(
         "", MASKED, hu=make_padded(), PixelPaddingValue=-2000, PixelPaddingRangeLimit=980
     ),
-    "limit of the padding with the wrong sign": stated(
+    "padding range limit with the wrong sign": stated(
         "padding_share one_volume", MASKED, hu=make_padded(), PixelPaddingValue=-2000, PixelPaddingRangeLimit=2000
     ),
-    "bits too few": stated("stored_bits", "beyond the 11 stored bits", TWELVE, BitsStored=11, HighBit=10),
+    "too few stored bits": stated("stored_bits", "beyond the 11 stored bits", TWELVE, BitsStored=11, HighBit=10),
 }
 
 
 def list_damages() -> list[str]:
     """Return the lines of the table in docs/certificate.md: damages of places, then those of values."""
-    lines = ["| damage | result | gates that fail | says |", "|---|---|---|---|"]
+    lines = ["| damage | result | gates that fail | message, or why not noticed |", "|---|---|---|---|"]
     for name, place in PLACES.items():
         lines.append(_line(name, RESULTS[place.result], place.gates, place.words))
     for name, row in VALUES.items():

@@ -27,7 +27,8 @@ def test_what_is_said_of_a_damage(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    "name", daily(1, ["intercept off by 324", "slope and intercept of another scale", "sign made up"])
+    "name",
+    daily(1, ["intercept off by 324", "slope and intercept of another scale", "unsigned values declared signed"]),
 )
 def test_every_command_that_reads_says_it(tmp_path, device, capsys, name):
     row = VALUES[name]
