@@ -40,7 +40,7 @@ def test_row_70_heads_are_told_from_other_bodies(kind: str) -> None:
 @pytest.mark.parametrize(
     "settings", daily(1, [{"tilt": 20.0}, {"prone": True}, {"table": "headrest"}]), ids=lambda given: next(iter(given))
 )
-def test_row_70_heads_in_any_position(settings: dict[str, Any]) -> None:
+def test_row_70_head_is_found_in_any_position(settings: dict[str, Any]) -> None:
     assert find_head(phantom("head", **settings)) is True
 
 
@@ -48,7 +48,7 @@ def test_row_70_heads_in_any_position(settings: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("kind", "spacing", "is_head"), [("head", (2.4, 2.4, 3.5), True), ("pelvis", (4.0, 4.0, 4.0), False)]
 )
-def test_row_70_heads_and_trunks_in_slices_along_any_axis(
+def test_row_70_heads_are_told_from_trunks_in_slices_along_any_axis(
     kind: str, spacing: tuple[float, ...], is_head: bool, axes: tuple[int, int, int]
 ) -> None:
     volume = phantom(kind, spacing=spacing)
@@ -145,7 +145,7 @@ def test_row_70_surfaces_of_labels_say_so(
 @pytest.mark.parametrize(
     ("name", "found"), daily_rows(2, [("head_tilt_gaps", True), ("lumbar_4p25mm", False), ("thoracic_0p8mm", False)])
 )
-def test_row_70_real_scans(name: str, found: bool, real_data: Path) -> None:
+def test_row_70_heads_are_told_from_trunks_in_real_scans(name: str, found: bool, real_data: Path) -> None:
     volume = clrecon.read_volume(real_data / name, allow_gaps=True)
     assert find_head(volume) is found
     assert [shows_face(volume, level) for level in (-500.0, 0.0, 100.0)] == [found] * 3

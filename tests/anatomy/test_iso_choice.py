@@ -110,7 +110,7 @@ def test_the_spine_is_cut_where_its_surface_is_nearest(comparison) -> None:
     assert error(comparison.by_otsu(volume)) > best + 0.2  # the measure tells a bad level from a good one
 
 
-def test_confidence_figures_are_what_they_say() -> None:
+def test_spread_noise_and_steepness_are_those_of_a_ball_of_known_blur() -> None:
     clean, noisy = (choose_iso_value(as_volume(make_ball(1040.0, 40.0, 0.8, noise))) for noise in (0.0, 50.0))
     assert clean.spread_hu < 5.0 < noisy.spread_hu < 50.0
     assert clean.noise_hu < 10.0 and noisy.noise_hu == pytest.approx(50.0, rel=0.1)
@@ -136,7 +136,7 @@ def test_faint_bone_is_counted() -> None:
 @pytest.mark.release
 @pytest.mark.parametrize("shift", [-40, -13, 0, 27, 60])
 @pytest.mark.parametrize("scale", [0.8, 1.0, 1.25])
-def test_shift_and_scale_carry_over(shift: int, scale: float) -> None:
+def test_iso_value_follows_shift_and_scale_of_the_values(shift: int, scale: float) -> None:
     field = make_ball(1040.0, 40.0, 0.8, 20.0)
     expected = choose_iso_value(as_volume(field)).iso_value * scale + shift
     found = choose_iso_value(as_volume(field * scale + shift)).iso_value
@@ -177,19 +177,19 @@ def add_metal(spine: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("change", [add_air, add_padding, add_table, add_clothes, add_metal])
-def test_surroundings_do_not_move_it(spine, spine_level, change) -> None:
+def test_iso_value_of_a_spine_stays_whatever_surrounds_the_body(spine, spine_level, change) -> None:
     changed = change(spine)
     assert changed.size > spine.size or not np.array_equal(changed, spine)
     assert abs(choose_iso_value(as_volume(changed)).iso_value - spine_level) <= tolerances.HALF_WAY_SHIFT_HU
 
 
-def test_lone_voxels_do_not_move_it() -> None:
+def test_iso_value_is_the_same_with_lone_bright_voxels() -> None:
     field = make_ball(1040.0, 40.0)
     field[:, 2:42:4, 1:6:2] = 300.0  # clear of the border, which is continued
     assert choose_iso_value(as_volume(field)) == choose_iso_value(as_volume(make_ball(1040.0, 40.0)))
 
 
-def test_contrast_medium_does_not_move_it(spine_level) -> None:
+def test_iso_value_of_a_spine_stays_beside_contrast_medium(spine_level) -> None:
     from clrecon.proof.phantom import build
     from clrecon.proof.phantom import spine as tissue
 
@@ -201,7 +201,7 @@ def test_contrast_medium_does_not_move_it(spine_level) -> None:
 
 
 @pytest.mark.parametrize("dtype", ["int16", "int32", "float32"])
-def test_voxel_types_agree(dtype) -> None:
+def test_iso_value_is_the_same_for_every_voxel_type(dtype) -> None:
     field = np.rint(make_ball(1040.0, 40.0, 0.8, 20.0)).astype(np.int16)
     expected = choose_iso_value(as_volume(field))
     assert choose_iso_value(Volume(field.astype(dtype), np.eye(4))) == expected
@@ -358,7 +358,7 @@ def test_infinities_count_as_metal_and_padding() -> None:
 
 # --- given materials ---
 @pytest.mark.parametrize(("bone", "tissue", "level"), [(1200, 40, 620.0), (0.5, -1000.5, -500.0), (101, 100, 100.5)])
-def test_half_way_between_given_materials(bone, tissue, level) -> None:
+def test_iso_value_of_given_materials_lies_half_way(bone, tissue, level) -> None:
     chosen = half_iso_value(bone, tissue)
     assert (chosen.iso_value, chosen.bone_hu, chosen.tissue_hu, chosen.method) == (level, bone, tissue, "half")
     assert chosen.reason == f"half way between tissue {tissue:g} and bone {bone:g} HU, as given"
@@ -373,7 +373,7 @@ def test_impossible_materials_are_refused(bone, tissue, words) -> None:
         half_iso_value(bone, tissue)
 
 
-def test_it_is_public_and_frozen() -> None:
+def test_iso_choice_cannot_be_changed_and_its_dict_has_all_fields() -> None:
     chosen, name = clrecon.choose_iso_value(as_volume(make_ball(1040.0, 40.0))), "iso_value"
     with pytest.raises(dataclasses.FrozenInstanceError, match=name):
         setattr(chosen, name, 1.0)

@@ -16,14 +16,14 @@ pytestmark = pytest.mark.unit
 
 
 @pytest.mark.parametrize("noise", [3.0, 12.0, 40.0])
-def test_known_noise_in_even_tissue(noise):
+def test_noise_of_even_tissue_is_measured_as_made(noise):
     voxels = np.random.default_rng(1).normal(50.0, noise, (6, 120, 120)) + 0.5 * np.arange(120)
     found = measure_noise(Volume(np.rint(voxels).astype(np.int16), np.eye(4)))
     assert found.hu == pytest.approx(noise, rel=NOISE_SHARE)
     assert found.slices == 6 and found.blocks <= 2400
 
 
-def test_edges_and_air_do_not_count():
+def test_noise_leaves_out_edges_and_air():
     """Stripes of fat and muscle, air around: three quarters of the blocks hold an edge or air."""
     voxels = np.where(np.arange(240) // 20 % 2, 60.0, -90.0) * np.ones((5, 240, 1))
     voxels = voxels + np.random.default_rng(2).normal(0.0, 15.0, voxels.shape)
@@ -32,7 +32,7 @@ def test_edges_and_air_do_not_count():
 
 
 @pytest.mark.parametrize("noise", [8.0, 25.0])
-def test_noise_of_a_phantom(noise):
+def test_noise_of_a_phantom_is_measured_as_made(noise):
     size, spacing = (128, 128), (1.4, 1.4, 2.0)
     settings = PhantomSettings(kind="spine", size=size, slices=12, spacing=spacing, noise=noise, point_spread_mm=0.0)
     voxels, affine, _ = make_phantom(settings)

@@ -131,14 +131,14 @@ def made_up(name: str, phantom) -> Volume:
 
 
 @pytest.mark.parametrize("name", daily(5, ["air", "noise", "ball", "skull", "one voxel", "mirrored", "front", "short"]))
-def test_where_there_is_none_points_are_asked_for(phantom, name):
+def test_scan_without_a_sure_spine_is_refused_and_points_are_asked_for(phantom, name):
     with refused(RefusedInputError, "points"):
         find_spine_line(made_up(name, phantom))
 
 
 @pytest.mark.release
 @pytest.mark.slow
-def test_real_spines_against_their_labels(real_data):
+def test_spine_line_lies_in_the_labelled_canal_of_real_scans(real_data):
     """The cord, as a network drew it at 2 mm; and the holes that vertebrae enclose at 3 mm."""
     folder = real_data / "thoracolumbar_labels"
     labels = read_labels(folder / "ct_2mm_labels.nii.gz")
@@ -200,7 +200,7 @@ def lost_below(phantom, value):
 @pytest.mark.parametrize(
     ("value", "words"), [(600, r"bone in its place \(\d+ HU\)"), (-1000, "air or fat in its place|no vertebral body")]
 )
-def test_where_it_is_lost_is_said_in_mm_and_what_was_found_instead(phantom, value, words):
+def test_end_of_a_lost_spine_is_said_in_mm_with_what_was_found_instead(phantom, value, words):
     line, z_mm = lost_below(phantom, value)
     assert line.upper.lost_mm is None and line.upper.because == ""
     assert re.search(words, line.lower.because), line.lower.because

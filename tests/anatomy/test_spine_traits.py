@@ -102,7 +102,7 @@ def plain_likeness(values):
 @pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize("border", daily(1, [0, 14]))
-def test_the_worth_of_every_cell(border):
+def test_worth_of_every_cell_equals_that_of_the_plain_twin(border):
     cells = some_cells(border=border)
     seen: list[slice] = []
     found = measure_likeness(cells, seen.append)
@@ -130,7 +130,7 @@ def test_some_of_these_cells_are_sure_by_lower_bounds():
 
 
 @pytest.mark.parametrize("radius", [2.0, 4.0, 5.0, 10.0, 12.0])
-def test_means_within_a_disc(radius):
+def test_disc_mean_equals_a_plain_sum(radius):
     field = np.random.default_rng(2).random((2, 17, 21)).astype(np.float32)
     assert np.abs(disc_mean(field, radius) - plain_disc(field, radius)).max() < 1e-6
 

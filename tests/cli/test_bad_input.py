@@ -111,7 +111,7 @@ def test_a_truncated_file_leaves_the_old_mesh(tmp_path: Path, target: Path) -> N
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="the superuser may read everything")
 @pytest.mark.usefixtures("no_device_needed")
-def test_a_folder_without_permission(tmp_path: Path, target: Path, printed: Printer) -> None:
+def test_folder_without_permission_is_refused(tmp_path: Path, target: Path, printed: Printer) -> None:
     folder = write_series(tmp_path / "ct")
     folder.chmod(0)
     try:
@@ -162,7 +162,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_all_work(
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_a_report_in_a_missing_folder(tmp_path: Path, target: Path, printed: Printer) -> None:
+def test_report_in_a_missing_folder_is_refused(tmp_path: Path, target: Path, printed: Printer) -> None:
     report = str(tmp_path / "nowhere" / "report.json")
     check_refused(["mesh", str(tmp_path), "-o", str(target), "--report", report], 6, "nowhere", target, printed)
 
@@ -205,7 +205,9 @@ def test_wrong_options_exit_with_3(extra: list[str], fact: str, tmp_path: Path, 
         (["phantom", "out", "--spacing", "1", "2"], "expected 3 arguments"),
     ],
 )
-def test_wrong_commands(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_commands_exit_with_3_and_a_line(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(arguments) == 3
     captured = capsys.readouterr()
     assert captured.out == ""

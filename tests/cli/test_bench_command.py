@@ -80,7 +80,7 @@ def test_wrong_arguments_are_one_line(extra: list[str], code: int, fact: str | i
     said.assert_error(fact)
 
 
-def test_an_input_that_is_not_there(device: Any, tmp_path: Path, printed: Printer) -> None:
+def test_bench_of_a_missing_input_names_it(device: Any, tmp_path: Path, printed: Printer) -> None:
     code = main(["bench", str(tmp_path / "gone"), "--device", str(device.index)])
     assert code in (2, 3, 4)
     printed().assert_error("gone")

@@ -209,7 +209,9 @@ def test_topology_joins_what_the_trilinear_field_joins(device: Any, tmp_path: Pa
     assert found == [("separated", 2, True, True), ("trilinear", 1, True, True)]
 
 
-def test_two_series_and_the_choice(device: Any, tmp_path: Path, printed: Printer) -> None:
+def test_largest_of_two_series_is_taken_and_an_unknown_one_is_refused(
+    device: Any, tmp_path: Path, printed: Printer
+) -> None:
     folder = write_series(tmp_path / "ct", number=1)
     write_series(folder, np.full((6, 9, 9), -1000, np.int16), number=2)
     assert main(["mesh", str(folder), "-o", str(tmp_path / "a.stl"), "--device", str(device.index)]) == 0
@@ -221,7 +223,9 @@ def test_two_series_and_the_choice(device: Any, tmp_path: Path, printed: Printer
 
 
 @pytest.mark.every_device
-def test_devices_lists_each(device: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_devices_lists_the_chosen_device_with_its_memory_and_reason(
+    device: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["devices", "--json", "--device", str(device.index)]) == 0
     survey = json.loads(capsys.readouterr().out)
     assert survey["chosen"] == device.index
@@ -277,7 +281,7 @@ def test_selftest_that_fails_exits_5(
     assert captured.err.startswith("clrecon: error: the self-test failed on ")
 
 
-def test_phantom_and_its_truth(tmp_path: Path, printed: Printer) -> None:
+def test_info_reads_the_geometry_that_the_truth_of_a_phantom_states(tmp_path: Path, printed: Printer) -> None:
     folder = tmp_path / "ph"
     arguments = ["phantom", str(folder), "--kind", "sphere", "--size", "40x32", "--slices", "24", "--tilt", "-12"]
     arguments += ["--spacing", "0.7", "0.5", "1.0", "--oblique", "10", "-5", "30", "--noise", "0", "--seed", "3"]
@@ -317,7 +321,7 @@ def test_every_command_has_help_and_the_common_options(command: str, capsys: pyt
         assert option in text
 
 
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_is_printed_alone(capsys: pytest.CaptureFixture[str]) -> None:
     import clrecon
 
     assert main(["--version"]) == 0

@@ -138,7 +138,7 @@ def test_a_full_disk_behind_stdout_is_an_error(
     assert capsys.readouterr().err == "clrecon: error: cannot write to standard output: No space left on device\n"
 
 
-def test_no_stdout_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_stdout_is_code_6_only_where_something_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdout", None)
     console = Console()
     assert guard(lambda: 0, console, debug=False) == 0
@@ -211,5 +211,5 @@ def test_table_aligns_columns() -> None:
 @pytest.mark.parametrize(
     ("size", "shown"), [(12, "12 bytes"), (2500, "2.5 kB"), (7_340_000, "7.3 MB"), (4 * 10**9, "4.0 GB")]
 )
-def test_sizes_for_people(size: int, shown: str) -> None:
+def test_sizes_are_shown_in_bytes_kb_mb_and_gb(size: int, shown: str) -> None:
     assert megabytes(size) == shown

@@ -24,7 +24,7 @@ def sphere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_library_that_writes_to_descriptor_1(tmp_path: Path) -> None:
+def test_output_of_a_library_goes_to_stderr_and_own_output_to_stdout(tmp_path: Path) -> None:
     code = (
         "import os, sys; from clrecon.system.foreign_words import hush, own_streams\n"
         "with own_streams(show='show' in sys.argv):\n"
@@ -64,14 +64,14 @@ def test_warnings_of_libraries_are_left_out_and_logged(
     ],
     ids=lambda fields: next(iter(fields)),
 )
-def test_one_line_for_a_bad_metaimage(fields: dict[str, str], tmp_path: Path) -> None:
+def test_bad_metaimage_is_refused_in_one_line(fields: dict[str, str], tmp_path: Path) -> None:
     write_metaimage(tmp_path / "a.mha", make_ct(), **fields)
     done = subprocess.run([*CLRECON, "info", "a.mha"], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (4, "")
     assert done.stderr.count("\n") == 1 and done.stderr.startswith("clrecon: error: a.mha ")
 
 
-def test_one_line_for_a_nifti_with_an_infinite_form(tmp_path: Path) -> None:
+def test_nifti_with_an_infinite_sform_is_refused_in_one_line(tmp_path: Path) -> None:
     nibabel = pytest.importorskip("nibabel")
     import numpy as np
 

@@ -64,12 +64,12 @@ def test_auto_without_bone_ends_with_2_and_the_modes(device: Any, tmp_path: Path
         ("Auto", "'Auto' is no number of HU"),
     ],
 )
-def test_what_hu_does_not_understand(text: str, words: str) -> None:
+def test_values_of_hu_that_are_no_levels_are_refused(text: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         parse_hu(text)
 
 
-def test_what_hu_understands() -> None:
+def test_hu_takes_levels_auto_and_two_materials() -> None:
     assert parse_hu("200,350.5") == {"iso_value": (200.0, 350.5)}
     assert parse_hu("-150") == {"iso_value": (-150.0,)}
     assert parse_hu("auto") == {"half_way": "auto"}

@@ -242,7 +242,7 @@ def test_thousands_of_series_take_one_line_each() -> None:
     assert lines[-1] == "series 1-2000: problem: modality MR is not CT"
 
 
-def test_the_certificate_in_words(tmp_path: Path) -> None:
+def test_certificate_is_described_in_words(tmp_path: Path) -> None:
     from clrecon import list_series
 
     write_plan(tmp_path, Plan(tilt_deg=12, angles=(3, 4, -5)), set_values(PatientPosition="FFP"))
@@ -272,7 +272,7 @@ def test_the_certificate_in_words(tmp_path: Path) -> None:
     assert words["positions"].startswith("uneven, up to 0.34")
 
 
-def test_the_example_of_the_document(
+def test_commands_of_the_certificate_page_print_what_it_shows(
     tmp_path: Path, device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = (CONTRACT.parent / "certificate.md").read_text(encoding="utf-8").split("## An example")[1]

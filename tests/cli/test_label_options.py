@@ -205,7 +205,7 @@ CORNER = ",".join(str(value) for value in np.array(ORIGIN) + SPACING * np.array(
         ],
     ),
 )
-def test_components_and_refinement_of_masks(
+def test_masks_are_split_filtered_smoothed_and_printed_label_by_label(
     options: list[str], names: list[str], failed: list[str], device: Any, ct: Path, pieces: Path, tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
@@ -233,7 +233,7 @@ def test_components_and_refinement_of_masks(
         (["--topology", "trilinear"], 3, "the topology trilinear follows HU"),
     ],
 )
-def test_what_cannot_be_with_masks_is_said_in_one_line(
+def test_options_that_masks_cannot_take_are_refused_in_one_line(
     options: list[str], code: int, words: str, device: Any, ct: Path, pieces: Path, tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
@@ -274,7 +274,7 @@ def test_the_memory_that_is_allowed_counts_for_labels_too(
     printed().assert_error(20000)
 
 
-def test_labels_and_iso_values_together(device: Any, ct: Path, labels: Path, tmp_path: Path) -> None:
+def test_each_label_and_iso_value_gets_a_file(device: Any, ct: Path, labels: Path, tmp_path: Path) -> None:
     options = ("--labels", labels, "--label", 2, "--label", 1, "--hu", "-150,300")
     assert run(ct, "-o", tmp_path / "b.ply", *options, device=device) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == [
@@ -292,7 +292,7 @@ def test_labels_and_iso_values_together(device: Any, ct: Path, labels: Path, tmp
         (["--hu", "-1000"], 2, "every voxel is inside"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(
+def test_impossible_labels_levels_and_growth_are_refused_in_one_line(
     options: list[str], code: int, words: str, device: Any, ct: Path, labels: Path, tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip

@@ -46,7 +46,7 @@ def test_a_small_budget_gives_the_same_file_in_slabs(ct_folder, tmp_path, printe
 
 @pytest.mark.parametrize(("memory", "code", "fact"), [
     ("5kB", 5, 5000), ("0", 3, 0), ("lots", 3, "lots")])  # fmt: skip
-def test_a_budget_that_is_none_or_too_small(ct_folder, tmp_path, printed, memory, code, fact):
+def test_memory_budget_that_is_invalid_or_too_small_is_refused(ct_folder, tmp_path, printed, memory, code, fact):
     assert main(["mesh", str(ct_folder), "-o", str(tmp_path / "x.stl"), "--memory", memory]) == code
     printed().assert_error(fact)
     assert not (tmp_path / "x.stl").exists()

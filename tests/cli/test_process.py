@@ -47,7 +47,7 @@ def test_an_error_is_one_line_on_stderr_and_the_exit_code(tmp_path: Path) -> Non
 
 
 @pytest.mark.skipif(os.name != "posix", reason="pipes and signals of POSIX")
-def test_a_reader_that_leaves_early(tmp_path: Path) -> None:
+def test_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
     write_series(tmp_path / "ct")
     reading, writing = os.pipe()
     os.close(reading)
@@ -64,7 +64,7 @@ def test_a_reader_that_leaves_early(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
-def test_a_full_disk_behind_stdout(tmp_path: Path) -> None:
+def test_full_disk_behind_stdout_exits_with_6(tmp_path: Path) -> None:
     write_series(tmp_path / "ct")
     root = Path(__file__).resolve().parents[2]
     with open("/dev/full", "w") as full:

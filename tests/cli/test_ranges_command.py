@@ -49,7 +49,7 @@ def test_below_is_the_lung_without_the_air_outside(
     assert "can show a face" in shown.err
 
 
-def test_a_range_and_an_iso_value_together(ct: Path, device: Any, tmp_path: Path, printed: Printer) -> None:
+def test_range_and_iso_value_get_a_file_each(ct: Path, device: Any, tmp_path: Path, printed: Printer) -> None:
     assert run(ct, device, tmp_path, "--hu", "-900:-700,0", "-v") == 0
     printed().assert_output(-900, -700, 0)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b_-900to-700hu.stl", "b_0hu.stl"]

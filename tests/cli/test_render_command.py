@@ -147,7 +147,7 @@ def test_background_colour_fills_the_corner_of_the_picture(render: Renders) -> N
     assert transparent[0, 0, 3] == 0 and transparent[..., 3].max() > 200
 
 
-def test_clipping_leaves_out(render: Renders) -> None:
+def test_clip_box_and_plane_leave_out_their_sides(render: Renders) -> None:
     low, high = lps((21.5, -0.5, -0.5)), lps((24.5, 25, 17))
     whole = lit_mm2(*render())
     half, report = render("--clip-box", f",{high[0]},,,,")
@@ -176,7 +176,9 @@ def test_depth_cue_darkens_what_is_far(render: Renders) -> None:
     assert (cued <= plain).all() and cued[lit(plain)].mean() < 0.95 * plain[lit(plain)].mean()
 
 
-def test_shadows_darken(ct: Path, tmp_path: Path, device: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_shadows_darken_a_part_of_the_floor_and_brighten_nothing(
+    ct: Path, tmp_path: Path, device: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
     voxels = np.full(SHAPE_KJI, AIR_HU, np.int16)
     voxels[2:4, 2:23, 2:29] = BLOCK_HU
     voxels[10:13, 8:17, 10:21] = BLOCK_HU
@@ -189,7 +191,7 @@ def test_shadows_darken(ct: Path, tmp_path: Path, device: Any, capsys: pytest.Ca
     assert 20 < (dark < plain - 20).any(axis=-1).sum() < 0.3 * dark.shape[0] * dark.shape[1]
 
 
-def test_ray_step_and_jitter(render: Renders) -> None:
+def test_ray_step_is_reported_and_jitter_changes_the_picture(render: Renders) -> None:
     plain, report = render("--ray-step", "0.9")
     assert report["pictures"][0]["ray_step_mm"] == pytest.approx(0.9)
     jittered, report = render("--ray-step", "0.9", "--jitter")
@@ -219,7 +221,7 @@ def test_depth_is_millimetres(render: Renders) -> None:
     assert np.array_equal(np.asarray(Image.open(render.folder / "d.tif")), depth, equal_nan=True)
 
 
-def test_slabs_combine(render: Renders) -> None:
+def test_slabs_combine_by_mean_maximum_and_minimum(render: Renders) -> None:
     middle = lps((0, 12, 0))[1] - lps((0, 5.5, 0))[1]
     found = {}
     for combine in ("mean", "max", "min"):
@@ -233,7 +235,7 @@ def test_slabs_combine(render: Renders) -> None:
 
 
 @pytest.mark.parametrize("kind", ["straightened", "stretched"])
-def test_a_curve_from_a_file(kind: str, render: Renders) -> None:
+def test_curve_of_a_file_is_straightened_or_stretched_at_its_length(kind: str, render: Renders) -> None:
     points = [lps((24.5, 5.5, k)) for k in (1, 8, 15)]
     (render.folder / "line.csv").write_text("x,y,z\n" + "\n".join(",".join(map(str, point)) for point in points))
     image, report = render("--curve", render.folder / "line.csv", "--cpr", kind)
@@ -243,7 +245,7 @@ def test_a_curve_from_a_file(kind: str, render: Renders) -> None:
     assert side_of(lit(image))[1] == "top"
 
 
-def test_a_transfer_function_from_a_file(render: Renders) -> None:
+def test_transfer_function_of_a_file_colours_the_picture(render: Renders) -> None:
     content = {
         "format": "clrecon transfer function",
         "version": 1,
@@ -257,7 +259,7 @@ def test_a_transfer_function_from_a_file(render: Renders) -> None:
     assert image[..., 1].max() > 240 and image[..., [0, 2]].max() == 0
 
 
-def test_slices_in_space(render: Renders) -> None:
+def test_chosen_slices_are_shown_at_their_place_in_space(render: Renders) -> None:
     image, report = render("--mode", "slices", "--slices", "13,", "--slice-opacity", 1.0, "--view", "superior")
     assert report["pictures"][0]["slices"] == [13]
     assert side_of(lit(image)) == SEEN["superior"]
@@ -287,14 +289,14 @@ def test_labels_have_colours(render: Renders) -> None:
     assert faint[lit(image)][:, 2].mean() < 0.8 * image[lit(image)][:, 2].mean()
 
 
-def test_what_is_drawn(render: Renders) -> None:
+def test_letters_scale_bar_and_caption_are_drawn_beside_the_middle(render: Renders) -> None:
     plain = render("--size", "128")[0]
     for extra in (["--letters"], ["--scale-bar"], ["--caption", "T12"]):
         drawn = render("--size", "128", *extra)[0]
         assert (drawn != plain).any() and not lit(drawn)[60:68, 60:68].any()
 
 
-def test_turntable_as_gif_and_as_folder(render: Renders) -> None:
+def test_turntable_writes_a_gif_or_a_folder_of_frames(render: Renders) -> None:
     report = render.report("--turntable", render.folder / "a.gif", "--frames", "3", "--fps", "10")
     assert report["pictures"] == []
     assert report["turntable"]["output"] == {"format": "gif", "bytes": (render.folder / "a.gif").stat().st_size}
@@ -316,14 +318,14 @@ def test_slabs_make_the_same_picture(render: Renders) -> None:
     assert np.abs(whole.astype(int) - parts).max() <= 2
 
 
-def test_masking_is_done_before(render: Renders) -> None:
+def test_voxels_outside_the_field_of_view_are_masked_before_rendering(render: Renders) -> None:
     report = render("--fov", "5")[1]
     assert report["pictures"][0]["hit_share"] == 0.0
     assert report["volume"]["field_of_view"]["radius_mm"] == 5.0
     assert any("outside of 5 mm" in warning for warning in report["warnings"])
 
 
-def test_what_people_are_told(render: Renders) -> None:
+def test_volume_mode_and_files_are_printed_unless_quiet(render: Renders) -> None:
     assert render.code("-o", render.folder / "a.png", "--view", "anterior,left", "--letters", "-v") == 0
     captured = render.capsys.readouterr()
     assert "17 slices of 31 x 25, spacing 0.8 x 1.1 x 1.5 mm" in captured.out

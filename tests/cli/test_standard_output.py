@@ -125,7 +125,9 @@ def spine(tmp_path_factory):
         ],
     ),
 )
-def test_the_report_of_each_command(device, spine, tmp_path, printed, monkeypatch, arguments, entry):
+def test_report_of_each_command_goes_to_standard_output(
+    device, spine, tmp_path, printed, monkeypatch, arguments, entry
+):
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
     if arguments[0] == "distance":
         assert run("mesh", spine, "-o", tmp_path / "out_a.stl", "-q") == 0

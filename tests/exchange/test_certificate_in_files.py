@@ -75,7 +75,7 @@ def test_certificate_lines_name_the_frame_only_with_ids():
     assert [line for line in with_ids if line not in LINES] == ["frame_of_reference ee740dfa4069b59a"]
 
 
-def test_ply_and_obj_comments(mesh, tmp_path):
+def test_ply_and_obj_hold_the_certificate_in_comments(mesh, tmp_path):
     mesh.save(tmp_path / "box.ply", "ras")
     header = (tmp_path / "box.ply").read_bytes().split(b"end_header\n")[0].decode("ascii").splitlines()
     assert [line for line in header if "CERTIFICATE" in line] == [f"comment CERTIFICATE {line}" for line in LINES]
@@ -85,7 +85,7 @@ def test_ply_and_obj_comments(mesh, tmp_path):
     assert [line for line in lines if "CERTIFICATE" in line] == [f"# CERTIFICATE {line}" for line in LINES]
 
 
-def test_vtp_field_array(mesh, tmp_path):
+def test_vtp_holds_the_certificate_as_a_field_array(mesh, tmp_path):
     pyvista = pytest.importorskip("pyvista")
     mesh.save(tmp_path / "box.vtp")
     fields = pyvista.read(tmp_path / "box.vtp").field_data
@@ -93,7 +93,7 @@ def test_vtp_field_array(mesh, tmp_path):
     assert list(fields["SPACE"]) == ["LPS"]
 
 
-def test_glb_extras_and_3mf_description(mesh, tmp_path):
+def test_glb_and_3mf_hold_the_certificate(mesh, tmp_path):
     mesh.save(tmp_path / "box.glb")
     content = (tmp_path / "box.glb").read_bytes()
     document = json.loads(content[20 : 20 + struct.unpack("<I", content[12:16])[0]])

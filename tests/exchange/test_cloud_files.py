@@ -117,7 +117,7 @@ def test_an_xyz_names_its_columns(tmp_path):
     assert [describe_cloud_losses(cloud.describe("lps"), extension) for extension in KEEPS_ALL] == [[]] * 4
 
 
-def test_npz_without_pickle(tmp_path):
+def test_npz_is_read_without_pickle(tmp_path):
     cloud = make_cloud().changed(ijk=np.arange(3000).reshape(1000, 3))
     cloud.save(tmp_path / "bone.npz")
     with np.load(tmp_path / "bone.npz", allow_pickle=False) as found:

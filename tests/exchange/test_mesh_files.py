@@ -115,7 +115,7 @@ def test_two_runs_give_the_same_bytes(mesh, extension, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("extension", EVERY)
-def test_no_patient_data_and_no_path(mesh, extension, tmp_path):
+def test_mesh_files_hold_no_patient_data_and_no_path(mesh, extension, tmp_path):
     path = tmp_path / f"DOE_JANE{extension}"
     mesh.save(path)
     content = path.read_bytes()
@@ -156,7 +156,7 @@ def test_stl_facet_without_area_has_no_normal(tmp_path):
     assert struct.unpack("<6f", content[84:108]) == (0, 0, 0, 0, 0, 0)
 
 
-def test_ply_header(mesh, tmp_path):
+def test_ply_header_says_remarks_counts_and_normals(mesh, tmp_path):
     mesh.save(tmp_path / "bone.ply")
     lines = (tmp_path / "bone.ply").read_bytes().split(b"end_header\n")[0].decode("ascii").splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
@@ -166,7 +166,7 @@ def test_ply_header(mesh, tmp_path):
     assert ("property float nz" in lines) == (mesh.normals is not None)
 
 
-def test_obj_header_and_exact_digits(mesh, tmp_path):
+def test_obj_has_its_header_and_every_digit_of_float32(mesh, tmp_path):
     mesh.save(tmp_path / "bone.obj", "ras")
     lines = (tmp_path / "bone.obj").read_text("ascii").splitlines()
     assert lines[:3] == ["# SPACE=RAS", "# UNIT=mm", "# ISO_VALUE_HU=249.5"]
@@ -194,7 +194,7 @@ def test_iso_value_is_left_out_when_not_known(tmp_path):
 
 
 @pytest.mark.parametrize("space", ["lps", "ras"])
-def test_glb_document(mesh, space, tmp_path):
+def test_glb_document_says_frame_unit_and_matrix(mesh, space, tmp_path):
     mesh.save(tmp_path / "bone.glb", space)
     content = (tmp_path / "bone.glb").read_bytes()
     magic, version, length, json_length, kind = struct.unpack("<4sIII4s", content[:20])
@@ -250,7 +250,7 @@ def test_glb_stands_upright_and_faces_the_viewer(tmp_path):
     np.testing.assert_allclose(read.vertices, [[0, 1, 0], [0, 0, 1], [1, 0, 0]], atol=1e-7)
 
 
-def test_vtp_field_arrays(mesh, tmp_path):
+def test_vtp_has_frame_unit_level_and_affine_as_field_arrays(mesh, tmp_path):
     pyvista = pytest.importorskip("pyvista")
     mesh.save(tmp_path / "bone.vtp", "ras")
     fields = pyvista.read(tmp_path / "bone.vtp").field_data
@@ -259,7 +259,7 @@ def test_vtp_field_arrays(mesh, tmp_path):
     assert np.asarray(fields["AFFINE_IJK_TO_LPS_MM"]).reshape(4, 4).tolist() == AFFINE
 
 
-def test_3mf_parts(mesh, tmp_path):
+def test_3mf_has_its_three_parts_unit_and_description(mesh, tmp_path):
     mesh.save(tmp_path / "bone.3mf")
     with zipfile.ZipFile(tmp_path / "bone.3mf") as package:
         assert package.namelist() == ["[Content_Types].xml", "_rels/.rels", "3D/3dmodel.model"]
@@ -386,7 +386,7 @@ def test_the_end_of_a_vtp_file_is_quoted_where_it_is_wrong(mesh, tmp_path):
         FORMATS[".vtp"].code.verify(tmp_path / "bone.vtp", mesh.describe("lps"))
 
 
-def test_too_large_for_the_format(mesh, tmp_path, monkeypatch):
+def test_mesh_too_large_for_its_format_is_refused_with_other_formats(mesh, tmp_path, monkeypatch):
     small = FORMATS[".stl"]
     monkeypatch.setitem(FORMATS, ".stl", dataclasses.replace(small, most_bytes=5000))
     with refused(OutputError, "PLY", "VTP", 4):
@@ -395,7 +395,7 @@ def test_too_large_for_the_format(mesh, tmp_path, monkeypatch):
     assert FORMATS[".glb"].most_bytes == small.most_bytes == 2**32 - 1
 
 
-def test_more_than_one_piece(tmp_path):
+def test_meshes_larger_than_a_piece_are_written_whole(tmp_path):
     """Meshes larger than the pieces that writers work in."""
     pyvista = pytest.importorskip("pyvista")
     mesh = Mesh(*samples.torus(301, 113))

@@ -101,7 +101,7 @@ def test_glb_of_others_is_metres_with_y_up(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.unique(turned.vertices, axis=0), np.unique(expected, axis=0), atol=1e-3)
 
 
-def test_obj_of_others(tmp_path: Path) -> None:
+def test_obj_of_other_programs_is_read_with_its_coloured_parts(tmp_path: Path) -> None:
     path = tmp_path / "a.obj"
     first = ["# a tool", "mtllib a.mtl", "o first", "v 0 0 0 1 0 0", "v 1 0 0 1 0 0", "v 0 1 0 1 0 0", "vt 0 0"]
     second = ["o second part", "v 0 0 1 0 0 1", "v  1 0 1 0 0 1", "v 0 1 1 0 0 1", "f -3 -2 \\", "-1", "l 1 2", ""]
@@ -117,7 +117,7 @@ def test_obj_of_others(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", ["ascii", "binary", "appended", "zlib", "base64"])
-def test_vtp_as_vtk_writes_it(tmp_path: Path, mode: str) -> None:
+def test_vtp_in_every_encoding_of_vtk_is_read(tmp_path: Path, mode: str) -> None:
     pyvista = pytest.importorskip("pyvista")
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
@@ -174,7 +174,7 @@ def test_objects_keep_their_names_colours_and_order(tmp_path: Path, extension: s
     ],
     ids=["upper case", "carriage returns", "both", "byte order mark"],
 )
-def test_text_stl_of_odd_programs(tmp_path: Path, text: str) -> None:
+def test_text_stl_in_odd_spelling_is_read(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.stl").write_bytes(text.encode())
     mesh = clrecon.read_mesh(tmp_path / "a.stl")
     assert mesh.vertices.tolist() == [[1, 2, 3], [4, 2, 3], [1, 6, 3]] and mesh.triangle_count == 1

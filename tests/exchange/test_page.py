@@ -143,7 +143,7 @@ def test_a_name_is_text_and_nothing_else(name, tmp_path):
     assert parse(tmp_path / "page.html")[0]["parts"][0]["name"] == name
 
 
-def test_too_many_triangles_for_a_browser(tmp_path, monkeypatch):
+def test_page_of_too_many_triangles_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(pages, "MOST_TRIANGLES", 11)
     with refused(UsageError, 12, 11):
         boxes(1).save(tmp_path / "page.html")
@@ -157,6 +157,6 @@ def test_facts_are_strict_json(tmp_path):
     assert set(facts) == {"vertices", "triangles", "low", "step", "half_step_mm", "space", "parts", "about"}
 
 
-def test_what_is_no_page(tmp_path):
+def test_html_without_a_mesh_is_refused_as_page(tmp_path):
     with pytest.raises(ValueError, match="no page"):
         pages.parse_page(b"<!DOCTYPE html>\n<html></html>\n")

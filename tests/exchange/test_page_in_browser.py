@@ -79,7 +79,7 @@ def measures(page) -> list[float]:
     return [float(re.search(r"[\d.]+", row.text)[0]) for row in rows]
 
 
-def test_it_is_drawn_with_letters_scale_and_facts(page):
+def test_page_shows_the_surface_its_parts_and_facts(page):
     shown = picture(page)
     assert changed_share(shown, np.full_like(shown, shown[3, 3])) > 0.15
     assert len(page.find_elements("css selector", "#parts li")) == 2
@@ -103,7 +103,7 @@ def test_switching_a_part_changes_what_is_shown(page):
     assert changed_share(picture(page), both) > 0.15
 
 
-def test_opacity_and_colour_of_a_part(page):
+def test_opacity_and_colour_of_a_part_change_the_picture(page):
     before = picture(page)
     set_value = "arguments[0].value = arguments[1]; arguments[0].dispatchEvent(new Event('input'));"
     page.execute_script(set_value, page.find_element("css selector", "#parts input[type=range]"), "0.4")
@@ -194,7 +194,7 @@ def test_the_clip_plane_takes_one_side_away(page):
     assert np.flatnonzero(other.any(axis=0)).max() <= whole.shape[1] // 2 + 2
 
 
-def test_wheel_and_keys(page):
+def test_wheel_zooms_and_keys_turn_the_page(page):
     from selenium.webdriver.common.action_chains import ActionChains, ScrollOrigin
 
     scene = page.find_element("id", "scene")

@@ -106,7 +106,7 @@ def test_even_slices_of_a_stack_with_a_gap_become_even():
     check_places(volume, across)
 
 
-def test_one_slice_of_an_uneven_stack():
+def test_crop_of_an_uneven_stack_to_one_slice_is_even_and_in_place():
     volume = uneven(np.arange(6 * 5 * 4, dtype=np.int32).reshape(6, 5, 4))
     table = positions()
     low = table[4] - 1e-3

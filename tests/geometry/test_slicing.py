@@ -103,7 +103,7 @@ def test_random_ranges_are_those_of_nibabel():
         tried += 1
 
 
-def test_spacing_handedness_and_a_single_slice():
+def test_parts_have_the_spacing_handedness_and_place_of_their_steps():
     volume = VOLUMES["oblique"]
     assert volume[::2, ::3].spacing == pytest.approx((0.7, 1.5, 2.5))
     assert is_left_handed(volume[::-1].affine) and not is_left_handed(volume[::-1, ::-1].affine)
@@ -152,7 +152,7 @@ def test_a_part_shares_the_memory_where_numpy_can():
         ("k", "not by str along k"),
     ],
 )
-def test_what_is_no_part_is_refused_in_one_line(key, words):
+def test_index_that_leaves_no_volume_is_refused_in_one_line(key, words):
     with pytest.raises(UsageError, match=words) as refused:
         VOLUMES["oblique"][key]
     assert "\n" not in str(refused.value)
@@ -198,7 +198,7 @@ def test_labels_of_the_whole_body_go_with_a_thin_part():
         resample_labels(labels, labels)
 
 
-def test_crop_by_the_boxes_of_the_command_line():
+def test_crop_takes_the_boxes_of_the_command_line():
     volume = Volume(np.arange(120, dtype=np.int32).reshape(SHAPE), np.diag((2.0, 3.0, 4.0, 1.0)))
     nan, inf = float("nan"), float("inf")
     by_box = volume.crop(clip_box=(2, 4, 3, None, None, 16))
@@ -225,7 +225,7 @@ def test_crop_by_the_boxes_of_the_command_line():
             volume.crop(**wrong)
 
 
-def test_resample_and_bounds():
+def test_resampled_volume_covers_the_bounds_of_an_uneven_one():
     volume = VOLUMES["uneven"]
     low, high = volume.bounds
     assert np.allclose(low, places(volume).min(axis=0)) and np.allclose(high, places(volume).max(axis=0))

@@ -66,7 +66,7 @@ def test_even_positions_are_the_affine():
     assert even.uneven is False and table.uneven is True
 
 
-def test_other_voxels_at_the_same_places():
+def test_volume_with_other_voxels_keeps_places_and_warnings():
     volume = uneven()
     volume.report["warnings"].append("kept")
     other = volume.with_voxels(np.full((6, 5, 4), 7.5, np.float32))

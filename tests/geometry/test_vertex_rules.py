@@ -28,12 +28,12 @@ def test_the_golden_section_divides_as_the_whole() -> None:
 @pytest.mark.parametrize(
     ("axis", "expected"), [(0, (4.618034, 5.0, 6.0)), (1, (4.0, 5.618034, 6.0)), (2, (4.0, 5.0, 6.618034))]
 )
-def test_points_of_the_equations_6_to_8(axis: int, expected: tuple[float, float, float]) -> None:
+def test_points_are_those_of_equations_6_to_8(axis: int, expected: tuple[float, float, float]) -> None:
     assert point_on_edge((4.0, 5.0, 6.0), axis, GOLDEN) == pytest.approx(expected, abs=1e-7)
     assert point_on_edge([(0, 0, 0), (1, 1, 1)], axis, np.array([0.25, 0.5]))[:, axis].tolist() == [0.25, 1.5]
 
 
-def test_normals_of_the_equations_9_to_11() -> None:
+def test_normals_are_those_of_equations_9_to_11() -> None:
     here = np.array([[1.0, 2.0, 3.0]])
     there = np.array([[2.0, 0.0, 3.5]])  # the corner at x + 1 of eq. 9, y + 1 of eq. 10, z + 1 of eq. 11
     assert normal_on_edge(here, there, [GOLDEN])[0] == pytest.approx((1.618034, 0.763932, 3.309017), abs=1e-6)
@@ -41,7 +41,7 @@ def test_normals_of_the_equations_9_to_11() -> None:
     assert normal_on_edge(here, there, [1.0])[0].tolist() == [2.0, 0.0, 3.5]
 
 
-def test_the_linear_fraction() -> None:
+def test_linear_fraction_is_that_of_the_crossing() -> None:
     assert linear_fraction([0.0, 10.0], [4.0, -10.0], 3.0).tolist() == [0.75, 0.35]
 
 

@@ -23,7 +23,7 @@ def test_shape_is_reversed_between_subscripts_and_ijk():
     assert volume.spacing == pytest.approx(tuple(np.linalg.norm(OBLIQUE[:3, :3], axis=0)))
 
 
-def test_ijk_to_lps_and_back_in_float64():
+def test_ijk_to_lps_is_float64_and_inverted_by_lps_to_ijk():
     volume = Volume(np.zeros((5, 6, 7), np.int16), OBLIQUE)
     points = np.random.default_rng(3).uniform(-10, 500, (50, 3))
     mapped = volume.ijk_to_lps(points)

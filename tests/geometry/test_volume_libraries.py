@@ -117,7 +117,7 @@ def test_save_is_write_volume(tmp_path):
         volume.save(tmp_path / "a.stl")
 
 
-def test_the_array_of_a_volume():
+def test_numpy_takes_a_volume_as_its_voxels_without_a_copy():
     volume = numbered(AFFINES["oblique"])
     assert np.asarray(volume) is volume.voxels and np.asarray(volume).shape == volume.shape == SHAPE
     assert not np.shares_memory(np.array(volume), volume.voxels)
@@ -184,7 +184,7 @@ def test_slices_too_near_for_a_grid_are_refused():
         volume.to_pyvista(resample=True)
 
 
-def test_frames_of_pyvista():
+def test_pyvista_image_in_ras_is_turned_and_a_contradiction_refused():
     volume = numbered(AFFINES["oblique"])
     image = volume.to_pyvista()
     turned = pyvista.ImageData(dimensions=image.dimensions, spacing=image.spacing)
@@ -242,7 +242,7 @@ def test_scaled_values_of_nibabel_are_hu(tmp_path):
         assert np.array_equal(read.affine, made.affine)
 
 
-def test_units_and_forms_of_nibabel():
+def test_nibabel_units_are_converted_and_images_without_place_refused():
     image = numbered(AFFINES["oblique"]).to_nibabel()
     image.header.set_xyzt_units("micron")
     assert np.abs(Volume.from_nibabel(image).affine[:3] - 0.001 * AFFINES["oblique"][:3]).max() <= 1e-9

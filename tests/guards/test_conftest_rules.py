@@ -173,7 +173,7 @@ SKIPPED = "import pytest\ndef test_it():\n    pytest.skip('no')\n"
         ],
     ),
 )
-def test_exit_status_of_a_session(tmp_path: Path, test: str, variables: dict[str, str], code: int) -> None:
+def test_session_exits_by_what_is_required(tmp_path: Path, test: str, variables: dict[str, str], code: int) -> None:
     done = run_pytest(tmp_path, test, **variables)
     assert done.returncode == code, done.stdout + done.stderr
 

@@ -97,7 +97,7 @@ def test_a_test_with_assertion_is_accepted(body: str) -> None:
     assert find_tests_without_assertion(f"def test_it():\n    {body}\n") == []
 
 
-def test_no_machine_paths_and_no_unfinished_marks() -> None:
+def test_texts_hold_no_machine_paths_and_no_unfinished_marks() -> None:
     files = project_files(*TEXT_SUFFIXES)
     assert len(files) > 40
     faults = [f"{path.name}:{fault}" for path in files for fault in find_forbidden(path.read_text(encoding="utf-8"))]

@@ -82,7 +82,9 @@ def named_in_package() -> frozenset[str]:
         ("ray_step", None, "ray_step", "ray_step"),
     ],
 )
-def test_words_of_python_and_of_a_command(parameter: str, value: object, python: str, mesh: str) -> None:
+def test_parameters_are_named_in_the_words_of_python_or_of_the_command(
+    parameter: str, value: object, python: str, mesh: str
+) -> None:
     assert name_parameter(parameter, value) == in_python(parameter, value) == python
     with spoken_by(speaker_of(parser_of("mesh"))):
         assert name_parameter(parameter, value) == mesh

@@ -76,7 +76,7 @@ def test_the_frame_is_that_of_space(scan: Path, tmp_path: Path) -> None:
     assert 9.0 <= np.ptp(lps.vertices, axis=0).max() <= 18.0 + 2.0
 
 
-def test_several_cut_each_other(scan: Path, tmp_path: Path) -> None:
+def test_several_crop_boxes_are_intersected(scan: Path, tmp_path: Path) -> None:
     _, report = mesh_of(scan, tmp_path, "--between", "110,130", "--clip-box", ",0,,,115,")
     assert report["volume"]["crop"]["box_mm"] == [[None, None, 115.0], [0.0, None, 130.0]]
     assert report["volume"]["shape_ijk"] == [21, 40, 16]

@@ -18,7 +18,9 @@ FAR = np.array([1e5, -1e5, 5e4])
 
 
 @pytest.mark.parametrize(("extension", "warned"), daily_rows(1, [("ply", False), ("stl", True)]))
-def test_coordinates_of_a_hundred_metres(device: Any, tmp_path: Path, extension: str, warned: bool) -> None:
+def test_mesh_a_hundred_metres_away_is_that_of_the_origin(
+    device: Any, tmp_path: Path, extension: str, warned: bool
+) -> None:
     meshes = []
     for name, origin in (("near", np.zeros(3)), ("far", FAR)):
         plan = Plan(shape=(9, 20, 24), origin=tuple(origin), decimals=6, angles=(0.0, 0.0, 0.0), tilt_deg=7.0)

@@ -66,7 +66,9 @@ def test_parts_of_the_time_sum_to_the_total(device: Any, sphere: tuple[Path, dic
     assert (report["volume_ml"], report["quality"]) == (None, None)
 
 
-def test_outputs_then_device_then_input(sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+def test_mesh_job_refuses_outputs_then_device_before_the_input(
+    sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
     nowhere = tmp_path / "nowhere"
     bad_device = MeshSettings(device="abacus")
     with refused(OutputError, "nowhere"):

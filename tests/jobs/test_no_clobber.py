@@ -135,7 +135,7 @@ def test_row_63_of_many_writers_one_wins(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a.stl"]
 
 
-def test_row_63_functions_of_python(tmp_path: Path) -> None:
+def test_row_63_python_functions_replace_no_file_with_no_clobber(tmp_path: Path) -> None:
     mesh = clrecon.Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32))
     function = clrecon.TransferFunction([(0, 1, 1, 1, 0), (100, 1, 1, 1, 1)])
     for path, save in ((tmp_path / "a.stl", mesh.save), (tmp_path / "a.json", function.save)):

@@ -34,7 +34,7 @@ def test_one_mesh_has_the_name_that_was_given() -> None:
     assert names_of([226.5]) == ["a.b/bone.v2.stl"]
 
 
-def test_several_are_told_apart_before_the_extension() -> None:
+def test_names_of_several_meshes_differ_before_the_extension() -> None:
     assert names_of([200.0, 350]) == ["a.b/bone.v2_200hu.stl", "a.b/bone.v2_350hu.stl"]
     assert names_of([200.0], split=True) == ["a.b/bone.v2_001.stl"]
     assert names_of([-0.0, -150.5], split=True) == ["a.b/bone.v2_0hu_001.stl", "a.b/bone.v2_-150.5hu_001.stl"]

@@ -53,7 +53,7 @@ def test_a_report_that_fails_leaves_the_old_one(tmp_path: Path) -> None:
         stage_report(tmp_path / "nowhere" / "report.json", {}).__enter__()
 
 
-def test_errors_as_json() -> None:
+def test_error_as_json_has_kind_exit_code_and_message() -> None:
     assert error_as_dict(RefusedInputError("two slices at 3 mm")) == {
         "error": {"kind": "RefusedInputError", "exit_code": 4, "message": "two slices at 3 mm"}
     }

@@ -142,7 +142,7 @@ def test_growing_from_labels_needs_them_and_makes_none() -> None:
     [({}, False), ({"keep": "bone"}, True), ({"split": True}, True), ({"keep_largest": 1}, True),
      ({"min_volume_ml": 0.1}, True), ({"seeds": ((0.0, 0.0, 0.0),)}, True)],
 )  # fmt: skip
-def test_settings_that_choose_components(given: dict[str, Any], selects: bool) -> None:
+def test_settings_say_whether_they_choose_components(given: dict[str, Any], selects: bool) -> None:
     assert MeshSettings(**given).selects is selects
 
 

@@ -76,7 +76,7 @@ def test_no_output_replaces_a_slice(scan, how, extension):
             job()
 
 
-def test_the_report_by_the_name_of_a_slice(scan, printed):
+def test_report_replaces_no_slice_of_its_name(scan, printed):
     assert main(["mesh", "ct", "-o", "a.stl", "--report", "ct/IM0001"]) == 6
     told = printed()
     assert told.output_lines == 0
@@ -86,7 +86,7 @@ def test_the_report_by_the_name_of_a_slice(scan, printed):
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="the system has no /proc")
-def test_the_report_by_an_open_descriptor(scan):
+def test_report_replaces_no_slice_behind_an_open_descriptor(scan):
     descriptor = os.open(scan / "IM0001", os.O_RDWR)
     try:
         with pytest.raises(OutputError, match="it leads to an open stream"):
@@ -95,7 +95,7 @@ def test_the_report_by_an_open_descriptor(scan):
         os.close(descriptor)
 
 
-def test_a_dicom_file_that_is_none_of_the_scan(scan, tmp_path):
+def test_report_replaces_no_dicom_file_of_another_scan(scan, tmp_path):
     """Nor does anything else that writes with `replace_file`."""
     other = tmp_path / "other.json"
     other.write_bytes((scan / "IM0001").read_bytes())
@@ -106,7 +106,7 @@ def test_a_dicom_file_that_is_none_of_the_scan(scan, tmp_path):
     assert other.read_bytes() == (scan / "IM0001").read_bytes()
 
 
-def test_a_data_set_without_mark_in_the_folder_of_the_scan(scan):
+def test_report_replaces_no_bare_data_set_of_the_scan(scan):
     file = scan / "IM0003"
     whole = file.read_bytes()
     start = whole.index(b"\x08\0\x08\0CS")
@@ -117,7 +117,7 @@ def test_a_data_set_without_mark_in_the_folder_of_the_scan(scan):
 
 
 @pytest.mark.parametrize("folder", ["ct", ".", "frames"])
-def test_a_folder_of_frames_that_is_the_scan(scan, tmp_path, folder):
+def test_folder_of_frames_replaces_no_scan(scan, tmp_path, folder):
     """Also where its slices are called as frames are."""
     frames = tmp_path / "frames"
     frames.mkdir()
@@ -129,7 +129,7 @@ def test_a_folder_of_frames_that_is_the_scan(scan, tmp_path, folder):
     assert len(list(frames.iterdir())) == 4
 
 
-def test_the_voxels_that_a_header_names(tmp_path, monkeypatch):
+def test_report_replaces_no_voxels_that_a_header_names(tmp_path, monkeypatch):
     pytest.importorskip("SimpleITK")
     import SimpleITK
 

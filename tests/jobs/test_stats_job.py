@@ -60,7 +60,7 @@ def test_table_json_and_csv_say_the_same(files: dict[str, str], tmp_path: Path, 
     assert "peak_memory_bytes" in report and report["volume"]["series"]["uid_hash"] is None
 
 
-def test_json_on_stdout_and_one_label(files: dict[str, str], printed: Printer) -> None:
+def test_stats_of_one_label_are_printed_as_json(files: dict[str, str], printed: Printer) -> None:
     assert main(["stats", files["ct"], "--labels", files["labels"], "--label", "5", "--json"]) == 0
     (one,) = printed().report()["labels"]
     assert one["number"] == 5

@@ -181,7 +181,7 @@ def test_deflated_files_are_refused_before_they_are_inflated(tmp_path):
 
 
 @pytest.mark.fuzz
-def test_cut_anywhere_it_is_refused(tmp_path):
+def test_segmentation_cut_anywhere_is_refused(tmp_path):
     content = write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN)).read_bytes()
     for length in range(0, len(content) - 2, 53):
         (tmp_path / "b.dcm").write_bytes(content[:length])
@@ -190,7 +190,7 @@ def test_cut_anywhere_it_is_refused(tmp_path):
 
 
 @pytest.mark.fuzz
-def test_damaged_anywhere_it_is_read_or_refused(tmp_path):
+def test_segmentation_damaged_anywhere_is_read_or_refused(tmp_path):
     content = write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN), kind="LABELMAP", syntax=RLELossless).read_bytes()
     random = np.random.default_rng(3)
     refused = 0
@@ -272,7 +272,7 @@ def test_a_background_of_its_own_is_no_label(tmp_path):
         read_labels(path)
 
 
-def test_a_binary_segment_twice_at_one_place(tmp_path):
+def test_equal_frames_of_a_segment_are_joined_and_different_ones_refused(tmp_path):
     """Equal frames are one; with other pixels they are two states of one segment, as in several points in time."""
     path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN))
     before = read_labels(path)

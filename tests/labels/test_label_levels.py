@@ -33,7 +33,7 @@ def test_a_step_too_far_goes_half_way_to_the_end():
     assert next_level([(START, 100.0)], 50.0, -1e-9) == (START + LEVELS[1] + 1) // 2
 
 
-def test_newton_and_then_between_two_levels():
+def test_next_level_is_newtons_and_then_lies_between_two():
     assert next_level([(START, 110.0)], 100.0, -2.0) == START + 5
     assert next_level([(START, 100.01)], 100.0, -2.0) == START  # less than 3 in 10,000 off
     assert next_level([(1000, 130.0), (1100, 90.0)], 100.0, -2.0) == 1075

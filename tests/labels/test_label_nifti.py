@@ -118,7 +118,7 @@ def test_a_fourth_axis_of_one_is_no_axis(tmp_path):
     assert np.array_equal(read_labels(write_nifti(tmp_path / "a.nii", voxels[None])).voxels, voxels)
 
 
-def test_without_a_position_it_is_refused(tmp_path):
+def test_nifti_map_without_a_position_is_refused(tmp_path):
     with refused(RefusedInputError, "a.nii", "sform_code"):
         read_labels(write_nifti(tmp_path / "a.nii", make_labels(), sform=False))
     with refused(RefusedInputError, "affine", "b.nii"):
@@ -168,7 +168,7 @@ def test_a_small_file_that_would_fill_the_memory_is_refused(tmp_path, monkeypatc
 
 @pytest.mark.fuzz
 @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
-def test_cut_anywhere_it_is_refused(tmp_path, name):
+def test_nifti_map_cut_anywhere_is_refused(tmp_path, name):
     content = write_nifti(tmp_path / name, make_labels((9, 20, 20)), extension=TABLE).read_bytes()
     cut = tmp_path / f"cut-{name}"
     for length in {*range(0, len(content), 41), len(content) - 1, len(content) - 8}:
@@ -178,7 +178,7 @@ def test_cut_anywhere_it_is_refused(tmp_path, name):
 
 
 @pytest.mark.fuzz
-def test_damaged_anywhere_it_is_read_or_refused(tmp_path):
+def test_nifti_map_damaged_anywhere_is_read_or_refused(tmp_path):
     content = write_nifti(tmp_path / "a.nii", make_labels()).read_bytes()
     random = np.random.default_rng(3)
     refused = 0

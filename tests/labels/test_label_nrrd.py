@@ -204,7 +204,7 @@ def test_a_header_without_end_is_refused(tmp_path):
 
 @pytest.mark.fuzz
 @pytest.mark.parametrize("encoding", ["raw", "gzip"])
-def test_cut_anywhere_it_is_refused(tmp_path, encoding):
+def test_nrrd_map_cut_anywhere_is_refused(tmp_path, encoding):
     content = write_nrrd(tmp_path / "a.nrrd", make_labels((9, 20, 20)), encoding=encoding).read_bytes()
     for length in {*range(0, len(content), 37), len(content) - 1}:
         (tmp_path / "b.nrrd").write_bytes(content[:length])

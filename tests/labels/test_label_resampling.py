@@ -131,7 +131,7 @@ def test_an_empty_map_is_refused():
         resample_labels(LabelMap(np.zeros((2, 2, 2), np.uint8), OBLIQUE), VOLUME)
 
 
-def test_only_label_maps_and_volumes():
+def test_array_in_place_of_a_label_map_is_refused():
     with refused(UsageError, "LabelMap", "labels"):
         resample_labels(VOXELS, VOLUME)
 

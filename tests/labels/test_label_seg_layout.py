@@ -48,7 +48,7 @@ def test_a_file_holds_at_least_its_pixels(kind, bits, syntax, least):
         _read_layout(data_set, "a.dcm", least - 1)
 
 
-def test_one_frame_unless_it_is_said():
+def test_segmentation_without_a_number_of_frames_has_one():
     assert _read_layout(header(), "a.dcm", 100).frames == 1
 
 

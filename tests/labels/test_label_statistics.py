@@ -107,7 +107,7 @@ def test_labels_are_chosen_and_wrong_ones_refused() -> None:
         measure_labels(volume, LabelMap(labels.voxels, away))
 
 
-def test_one_voxel_and_progress() -> None:
+def test_one_voxel_is_measured_and_progress_told() -> None:
     told: list[tuple[str, int, int]] = []
     volume = Volume(np.full((1, 1, 1), -3, np.int8), np.diag([2.0, 3.0, 4.0, 1.0]))
     (one,) = measure_labels(

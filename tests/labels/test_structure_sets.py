@@ -143,7 +143,7 @@ def test_a_hole_of_contours_that_cross_is_a_hole(volume, tmp_path):
     assert labels.counts == {1: 12 * 12 + 15 * 15 - 9 * 9 - 4 * 4 + 2 * 2}
 
 
-def test_contours_to_combine_by_xor(volume, tmp_path):
+def test_xor_contours_leave_out_what_two_share(volume, tmp_path):
     kind = "CLOSEDPLANAR_XOR"
     plus = [(kind, rectangle(volume, 2, *part)[1]) for part in (((5, 1), (7, 15)), ((1, 5), (18, 8)))]
     path = write_structures(
@@ -258,7 +258,7 @@ def test_numbers_from_0_are_moved(volume, tmp_path):
     assert labels.names == {1: "a", 2: "b"} and labels.counts == {1: 9, 2: 9}
 
 
-def test_scans_that_cannot_have_contours(tmp_path):
+def test_contours_without_a_scan_or_beside_it_are_refused(tmp_path):
     stack = uneven()
     path = write_structures(tmp_path / "rt.dcm", {"x": [rectangle(stack, 2, (1, 1), (2, 2))]})
     with refused(UsageError, "contours", "scan", "rt.dcm"):
@@ -334,7 +334,7 @@ def test_corrupt_files_are_one_line(volume, tmp_path, harm):
 @pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.first_device
-def test_commands_take_them(tmp_path, printed):
+def test_commands_take_structure_sets_as_labels(tmp_path, printed):
     dicom_series.write_series(tmp_path / "ct", PLANS["straight"])
     volume = read_volume(tmp_path / "ct")
     rois = {"L3": [rectangle(volume, k, (3, 4), (9, 12)) for k in (2, 3, 4)]}

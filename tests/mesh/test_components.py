@@ -46,7 +46,7 @@ def test_a_cube_of_10_mm_holds_a_millilitre(edge):
         assert [part.tolist() for part in figures] == [[6.0 * edge**2 * areas], [volume_ml * volumes]]
 
 
-def test_keep_largest_by_area():
+def test_keep_largest_keeps_the_component_of_the_largest_area():
     mesh = three_boxes()
     kept = select_components(mesh, keep_largest=1)
     assert (kept.vertex_count, kept.triangle_count) == (8, 12)
@@ -60,7 +60,7 @@ def test_keep_largest_by_area():
     assert kept.triangles.dtype == np.uint32
 
 
-def test_keep_two():
+def test_keep_largest_2_keeps_two_components():
     kept = select_components(three_boxes(), keep_largest=2)
     assert kept.quality()["volume_ml"] == pytest.approx(0.068)
     assert kept.report["components_kept"] == 2
@@ -117,7 +117,7 @@ def test_volume_of_an_open_component_does_not_depend_on_its_place():
     assert select_components(mesh, min_volume_ml=1.0).report["components_kept"] == 1
 
 
-def test_nothing_left():
+def test_components_are_refused_where_none_is_left():
     with refused(NoSurfaceError, 3, 1, 0.06):
         select_components(three_boxes(), min_volume_ml=1.0)
     with refused(NoSurfaceError, "surface"):

@@ -118,7 +118,7 @@ def test_triangles_that_touch_count_as_intersecting():
 @pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize("shift", daily(1, [(3.1, 0.2, 0.3), (11.0, 4.0, -3.0), (19.5, 0.1, 0.2), (21.0, 0.0, 0.0)]))
-def test_spheres_that_cut_each_other(shift):
+def test_spheres_that_cut_each_other_have_the_pairs_of_solving(shift):
     vertices, triangles = samples.join(samples.sphere(rounds=2), samples.sphere(shift, 10.0, 1))
     vertices = vertices.astype(np.float32).astype(float)
     assert count((vertices, triangles)) == count_by_solving(vertices, triangles)
@@ -173,7 +173,7 @@ def test_triangles_with_a_common_corner_cut_each_other_by_the_edges_opposite_to_
         ([6, 7, 8], 0),
     ],
 )
-def test_triangles_in_one_plane(second, expected, turned):
+def test_triangles_in_one_plane_are_counted_where_they_overlap(second, expected, turned):
     vertices = np.array([[0, 0], [4, 0], [0, 4], [3, 3], [1, 1], [2, 5], [2, -3], [-3, -1], [-1, -3]], float)
     vertices = np.column_stack([vertices, vertices @ [2, -1] if turned else np.full(9, 7.25)])
     assert count((vertices, [[0, 1, 2], second])) == count((vertices, [second, [0, 1, 2]])) == expected

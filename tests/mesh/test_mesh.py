@@ -91,7 +91,7 @@ def test_pyvista_sees_the_same_mesh_without_a_copy():
     np.testing.assert_array_equal(polydata.points, expected)
 
 
-def test_what_a_mesh_says_of_itself():
+def test_repr_of_a_mesh_says_vertices_triangles_and_frame():
     assert repr(Mesh(*samples.box())) == "Mesh(8 vertices, 12 triangles, LPS mm)"
 
 

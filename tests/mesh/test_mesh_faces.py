@@ -76,7 +76,7 @@ def test_bad_triangles_are_refused_when_the_mesh_is_made(vertices: object, trian
         Mesh(vertices, triangles)  # type: ignore[arg-type]
 
 
-def test_there_and_back_by_pyvista() -> None:
+def test_mesh_comes_back_from_pyvista_unchanged() -> None:
     vertices, triangles = ball(5.0, 12)
     mesh = Mesh(vertices + (30.0, -200.0, -900.0), triangles, vertices / 5.0)
     data = mesh.to_pyvista()
@@ -97,7 +97,7 @@ def test_there_and_back_by_pyvista() -> None:
     assert (squares.triangle_count, squares.volume) == (12, pytest.approx(2.0, rel=1e-6))
 
 
-def test_there_and_back_by_trimesh() -> None:
+def test_mesh_comes_back_from_trimesh_unchanged() -> None:
     mesh = three_parts()
     other = mesh.to_trimesh()
     assert (other.units, other.metadata["SPACE"]) == ("mm", "LPS")

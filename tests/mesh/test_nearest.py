@@ -34,7 +34,7 @@ def nearest(mesh, point):
         ((2 + 3, 1.5 + 4, 12), 13.0),
     ],
 )
-def test_faces_edges_and_corners(point, distance):
+def test_nearest_distance_is_exact_over_faces_edges_and_corners(point, distance):
     assert nearest(TRIANGLE, point) == (0, pytest.approx(distance, abs=tolerances.NEAREST_MM))
 
 
@@ -53,7 +53,7 @@ def test_a_large_face_beats_a_near_corner():
     assert nearest(samples.join(small, large), (0, 0, 5)) == (0, pytest.approx(1.0))
 
 
-def test_of_equal_ones_the_first():
+def test_nearest_of_two_equal_triangles_is_the_first():
     mesh = samples.join(samples.box((2, 0, 0)), samples.box((-3, 0, 0)))
     triangle, distance = nearest(mesh, (0, 0.5, 0.5))
     assert distance == pytest.approx(2.0)
@@ -74,7 +74,7 @@ def test_distance_from_a_sphere_equals_brute_force(radius):
     assert distance == pytest.approx(least, abs=tolerances.NEAREST_SAMPLED_MM)
 
 
-def test_of_equal_ones_the_first_wherever_they_lie():
+def test_nearest_of_equal_triangles_is_the_first_wherever_they_lie():
     """A point half way between two boxes, whose coordinates are rounded differently at each place."""
     for place in np.random.default_rng(6).uniform(-900, 900, (40, 3)):
         boxes = samples.join(samples.box((2.1, 0, 0)), samples.box((-3.1, 0, 0)))

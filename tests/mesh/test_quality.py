@@ -71,7 +71,7 @@ def test_torus_has_one_handle():
     assert 0.8 * exact < quality["volume_ml"] < exact
 
 
-def test_two_spheres_and_a_cavity():
+def test_quality_counts_two_spheres_and_a_cavity_with_its_volume():
     vertices, triangles = samples.join(
         samples.sphere((-30, 5, 2), 10), samples.sphere((40, 0, 0), 7), samples.sphere((-30, 5, 2), 4)
     )
@@ -83,7 +83,7 @@ def test_two_spheres_and_a_cavity():
     assert quality["area_mm2"] == pytest.approx(measure(samples.sphere(radius=1))["area_mm2"] * (100 + 49 + 16))
 
 
-def test_inside_out():
+def test_inside_out_mesh_has_a_negative_volume():
     vertices, triangles = samples.box(FAR)
     quality = measure((vertices, triangles[:, ::-1]))
     assert figures(quality, "closed", "manifold", "oriented", "outward") == (True, True, True, False)
@@ -123,32 +123,32 @@ def test_moebius_strip_cannot_be_oriented():
     assert figures(quality, "nonmanifold_edges", "nonmanifold_vertices", "boundary_edges") == (0, 0, 22)
 
 
-def test_boxes_that_touch_in_a_corner():
+def test_boxes_that_touch_in_a_corner_are_closed_and_not_manifold():
     quality = measure(samples.weld(samples.join(samples.box(), samples.box((1, 1, 1)))))
     assert figures(quality, "closed", "oriented", "nonmanifold_edges", "nonmanifold_vertices") == (True, True, 0, 1)
     assert figures(quality, "manifold", "components", "genus", "vertices") == (False, 1, None, 15)
 
 
-def test_open_fans_that_touch_in_a_corner():
+def test_open_fans_that_touch_in_a_corner_are_not_manifold():
     vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]]
     quality = measure((vertices, [[0, 1, 2], [0, 3, 4]]))
     assert figures(quality, "nonmanifold_vertices", "manifold", "boundary_edges", "components") == (1, False, 6, 1)
 
 
-def test_boxes_that_share_an_edge():
+def test_boxes_that_share_an_edge_are_not_manifold():
     quality = measure(samples.weld(samples.join(samples.box(), samples.box((1, 1, 0)))))
     assert figures(quality, "nonmanifold_edges", "closed", "manifold", "boundary_edges") == (1, False, False, 0)
     assert quality["genus"] is None
 
 
-def test_duplicate_faces_in_any_order():
+def test_duplicate_faces_are_counted_in_any_order():
     vertices, triangles = samples.box()
     more = np.concatenate([triangles, triangles[3:4, [1, 2, 0]], triangles[3:4, ::-1], triangles[7:8]])
     quality = measure((vertices, more))
     assert figures(quality, "duplicate_faces", "closed", "manifold", "oriented") == (3, False, False, False)
 
 
-def test_faces_without_area():
+def test_faces_without_area_are_counted():
     vertices, triangles = samples.box(FAR)
     vertices = np.concatenate([vertices, vertices[:1] + [0.5, 0, 0], vertices[:1]])
     quality = measure((vertices, np.concatenate([triangles, [[0, 8, 1], [0, 9, 1], [2, 2, 3]]])))
@@ -168,7 +168,7 @@ def test_unused_vertices_are_no_components():
     assert figures(quality, "unused_vertices", "components", "euler_number", "genus") == (2, 1, 2, 0)
 
 
-def test_empty_mesh():
+def test_empty_mesh_has_no_figures():
     quality = measure(([], []))
     assert figures(quality, "vertices", "triangles", "closed", "manifold", "components") == (0, 0, False, False, 0)
     assert figures(quality, "area_mm2", "volume_ml", "bounds_mm", "outward") == (0.0, 0.0, None, False)
@@ -197,7 +197,7 @@ def test_wrong_index_is_refused():
         measure_quality(np.zeros((3, 3), np.float32), np.array([[0, 1, 3]], np.uint32))
 
 
-def test_shortest_edge():
+def test_shortest_edge_is_measured():
     vertices, triangles = samples.box((0, 0, 0), (2.0, 3.0, 5.5))
     for low, high in triangles[7, [[0, 1], [1, 2], [2, 0]]]:
         near = vertices.copy()
@@ -243,7 +243,7 @@ def test_all_faces_with_the_vertices_of_another_are_found():
     assert len(find_duplicate_faces(triangles[:-3], int(triangles.max()) + 1)) == 0
 
 
-def test_a_vertex_with_many_faces():
+def test_vertex_with_many_faces_is_manifold():
     top = np.column_stack([np.cos(np.arange(200) * np.pi / 100), np.sin(np.arange(200) * np.pi / 100), np.zeros(200)])
     ring, after = np.arange(200) + 2, (np.arange(200) + 1) % 200 + 2
     cone = [[0, a, b] for a, b in zip(ring, after, strict=True)] + [[1, b, a] for a, b in zip(ring, after, strict=True)]
@@ -251,12 +251,12 @@ def test_a_vertex_with_many_faces():
     assert figures(quality, "closed", "manifold", "genus", "outward") == (True, True, 0, True)
 
 
-def test_two_triangles_back_to_back():
+def test_two_triangles_back_to_back_are_duplicates_and_closed():
     quality = measure(([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [2, 1, 0]]))
     assert figures(quality, "duplicate_faces", "closed", "oriented", "volume_ml") == (1, True, True, 0.0)
 
 
-def test_edges_between_the_highest_vertex_numbers():
+def test_edges_between_the_highest_vertex_numbers_are_counted():
     last = 2**32 - 2
     edges = find_edges(np.array([[0, last - 1, last], [last, last - 1, 1]], np.uint32), last + 1)
     assert (edges.count, edges.boundary, edges.nonmanifold, edges.oriented) == (5, 4, 0, True)

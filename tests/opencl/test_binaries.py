@@ -85,7 +85,7 @@ def test_row_72_files_are_private_whatever_the_umask(own_cache):
     assert (own_cache / KEY).stat().st_mode & 0o777 == 0o600
 
 
-def test_the_oldest_go(own_cache):
+def test_oldest_binaries_are_removed_beyond_512(own_cache):
     for number in range(512):
         (own_cache / f"{number:03}").touch()
         os.utime(own_cache / f"{number:03}", (number, number))

@@ -56,7 +56,7 @@ def environment_of(tmp_path, **variables):
         ),
     ],
 )
-def test_row_59_no_place_for_built_kernels(device, variables, fault, tmp_path):
+def test_row_59_missing_place_for_built_kernels_is_warned_of(device, variables, fault, tmp_path):
     command = [sys.executable, "-c", CODE, str(device.index)]
     environment = environment_of(tmp_path, **variables)
     done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
@@ -287,7 +287,7 @@ def test_a_folder_that_a_driver_still_writes_to_is_removed(tmp_path):
 @pytest.mark.parametrize(
     ("told", "says"), daily_rows(2, [("", ""), (" ", ""), ("1", ""), ("maybe", "PYOPENCL_NO_CACHE is 'maybe'")])
 )
-def test_the_switch_of_pyopencl_for_its_cache(told, says, tmp_path):
+def test_invalid_switch_of_the_pyopencl_cache_is_named(told, says, tmp_path):
     code = "from clrecon.opencl.quirks import import_pyopencl; import_pyopencl()"
     environment = environment_of(tmp_path, PYOPENCL_NO_CACHE=told)
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
@@ -304,7 +304,7 @@ def test_a_number_of_threads_that_ends_the_process_is_refused(name, told, monkey
 
 
 @pytest.mark.parametrize("told", ["", " ", "0", " 2 ", "+3", "4096"])
-def test_numbers_of_threads_that_work(told, monkeypatch):
+def test_numbers_of_threads_that_work_are_left_as_they_are(told, monkeypatch):
     monkeypatch.setenv("POCL_MAX_PTHREAD_COUNT", told)
     assert quirks.import_pyopencl.__wrapped__() is quirks.import_pyopencl()
     assert os.environ.get("POCL_MAX_PTHREAD_COUNT") == (told if told.strip() else None)

@@ -97,7 +97,7 @@ def of_pocl(device):
 
 @pytest.mark.seconds
 @pytest.mark.every_device
-def test_all_give_the_same_bits(of_pocl):
+def test_inlined_functions_give_the_bits_of_those_of_pocl(of_pocl):
     theirs, ours = (
         import_pyopencl().Program(of_pocl.context, text + all_kernels()).build(["-cl-std=CL1.2"])
         for text in ("", read_kernel_source(HEADER))

@@ -179,7 +179,7 @@ def test_spare_buffers_make_way_where_the_driver_has_no_room(apart, monkeypatch)
 
 @pytest.mark.seconds
 @pytest.mark.every_device
-def test_what_a_surface_and_a_picture_ask_of_the_driver(apart):
+def test_surface_and_picture_ask_no_more_calls_of_the_driver(apart):
     """A discrete card spends most of a surface in waits and allocations: their numbers may only fall."""
     volume = make_ball(48)
     for _ in range(2):

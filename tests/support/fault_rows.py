@@ -228,21 +228,21 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
         "closed streams, no terminal: no traceback, plain progress",
         (
             "cli/test_closed_streams.py::test_closed_streams_keep_the_exit_code",
-            "cli/test_process.py::test_a_reader_that_leaves_early",
+            "cli/test_process.py::test_reader_that_leaves_early_is_no_error",
         ),
     ),
     67: (
         "an empty mesh; more faces or bytes than the format holds: refused",
         (
             "exchange/test_mesh_files.py::test_empty_mesh_writes_nothing",
-            "exchange/test_mesh_files.py::test_too_large_for_the_format",
+            "exchange/test_mesh_files.py::test_mesh_too_large_for_its_format_is_refused_with_other_formats",
         ),
     ),
     68: (
         "STL header: 80 bytes, never begins with solid, no patient data",
         (
             "exchange/test_mesh_files.py::test_stl_has_the_bytes_of_its_definition",
-            "exchange/test_mesh_files.py::test_no_patient_data_and_no_path",
+            "exchange/test_mesh_files.py::test_mesh_files_hold_no_patient_data_and_no_path",
         ),
     ),
     69: ("patient data in headers, comments, logs, names, cache: none; --keep-ids: hashed UIDs", ()),

@@ -75,7 +75,7 @@ def test_points_of_the_surface_are_those_of_the_function(
     assert {path.name for path in tmp_path.iterdir()} == {"out.ply", "r.json"}
 
 
-def test_clusters_rules_and_what_went(
+def test_clustered_cloud_and_removed_points_are_those_of_the_functions(
     device: Any, scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer
 ) -> None:
     options = ["--keep", "no-sheets", "--hu", BAND, "--cluster", "eps=1.2,min=4", "--keep", "largest:1"]
@@ -133,7 +133,7 @@ def test_a_scan_without_foreign_slices_loses_nothing(scan: Path, tmp_path: Path,
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
-def test_seeds_and_files_in_the_frame_of_the_output(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
+def test_seeds_are_read_in_the_frame_of_the_output(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
     centre = AFFINE[:3] @ (34, 16, 26, 1)
     for space, sign in (("lps", 1.0), ("ras", -1.0)):
         seed = ",".join(str(number) for number in centre * (sign, sign, 1.0))
@@ -147,7 +147,7 @@ def test_seeds_and_files_in_the_frame_of_the_output(scan: Path, tmp_path: Path, 
 
 @pytest.mark.parametrize("kind", ["surface", "shell", "voxels"])
 @pytest.mark.parametrize("extension", ["ply", "vtp", "npz", "xyz"])
-def test_kinds_and_formats(
+def test_every_kind_of_points_is_written_to_every_format(
     kind: str, extension: str, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cloud_command(scan, "--points", kind, "--hu", "250", output=f"a.{extension}") == 0
@@ -254,7 +254,9 @@ def test_wrong_options_are_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_files_that_cannot_be(scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer, device: Any) -> None:
+def test_cloud_files_that_cannot_be_read_or_written_have_their_exit_codes(
+    scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer, device: Any
+) -> None:
     assert cloud_command(scan, output="out.stl") == 3
     assert cloud_command(scan, "--report", str(tmp_path / "out.ply")) == 3
     printed().assert_error("out.ply")
@@ -293,13 +295,13 @@ def test_a_cloud_is_read_and_cleaned(
     assert "not finite" in capsys.readouterr().err
 
 
-def test_frames_of_clouds_that_do_not_say_theirs(tmp_path: Path, cloud_command: Any) -> None:
+def test_cloud_without_a_frame_is_turned_by_input_space(tmp_path: Path, cloud_command: Any) -> None:
     (tmp_path / "a.xyz").write_text("1 2 3\n4 5 6\n7 8 9\n")
     assert cloud_command(tmp_path / "a.xyz", "--input-space", "ras") == 0
     assert np.array_equal(clrecon.read_points(tmp_path / "out.ply").points[0], (-1.0, -2.0, 3.0))
 
 
-def test_outliers_filter_and_normals(
+def test_outliers_filter_and_normals_give_what_the_functions_give(
     device: Any, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ["--normals", "--denoise", "bilateral", "--outliers", "3", "--points", "shell", "--hu", "250"]
@@ -341,7 +343,7 @@ def test_points_of_a_surface_keep_the_normals_of_its_field(scan: Path, tmp_path:
     assert np.array_equal(one.normals, two.normals) and moved.normals is None
 
 
-def test_grid_thinning_and_a_surface(
+def test_thinned_cloud_and_its_surface_are_those_of_the_functions(
     device: Any, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mesh_file, told = tmp_path / "out.stl", tmp_path / "r.json"
@@ -390,7 +392,7 @@ def test_a_cancelled_job_leaves_nothing(device: Any, scan: Path, tmp_path: Path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_what_the_settings_refuse() -> None:
+def test_cloud_settings_refuse_half_a_band_and_a_step_twice() -> None:
     with refused(UsageError, "band", 1):
         CloudSettings(hu=(1.0,))
     with refused(UsageError, "bilateral"):

@@ -52,7 +52,7 @@ def test_a_cloud_in_other_units_is_warned_of(
     assert error.count("\n") == bool(unit)
 
 
-def test_the_filter_as_printed_on_a_cloud_that_was_read(tmp_path: Path, cloud_command: Any) -> None:
+def test_paper_option_filters_a_cloud_otherwise_than_the_default(tmp_path: Path, cloud_command: Any) -> None:
     source = write_ball(tmp_path / "free.xyz", 10.0)
     assert cloud_command(source, "--denoise", "bilateral", "--paper", output="a.ply") == 0
     assert cloud_command(source, "--denoise", "bilateral", output="b.ply") == 0

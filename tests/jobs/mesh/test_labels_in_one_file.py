@@ -117,7 +117,7 @@ def test_colours_are_looked_at_when_they_are_chosen() -> None:
 
 
 @pytest.mark.parametrize("option", ["--hide-label=L3", "--label-color=L3=red"])
-def test_they_need_labels(option: str, scan: Path, printed: Printer) -> None:
+def test_label_looks_without_labels_are_refused(option: str, scan: Path, printed: Printer) -> None:
     assert main(["mesh", str(scan / "ct.nii"), "-o", "a.glb", option]) == 3
     printed().assert_error("--labels", "FILE")
 

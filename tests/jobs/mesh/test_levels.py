@@ -98,7 +98,7 @@ def test_a_preset_says_its_reason() -> None:
     assert choose_level(ball(), MeshSettings()) is None
 
 
-def test_settings_with_two_materials() -> None:
+def test_settings_with_two_materials_have_the_level_half_way() -> None:
     settings = MeshSettings(half_way=(1200.0, 40.0))
     assert (settings.levels, settings.preset_used) == ((620.0,), None)
     automatic = MeshSettings(half_way="auto")

@@ -109,7 +109,7 @@ def test_components_of_an_earlier_run_are_left_and_said(device: Any, tmp_path: P
 
 
 @pytest.mark.usefixtures("boxes")
-def test_iso_values_limits_and_split_together(device: Any, tmp_path: Path) -> None:
+def test_limits_and_split_hold_for_each_iso_value(device: Any, tmp_path: Path) -> None:
     report = run(tmp_path, device, iso_value=(200.0, 500.0), split=True, keep_largest=2, min_volume_ml=0.1)
     assert [mesh["name"] for mesh in report["meshes"]] == ["200hu_001", "500hu_001"]
     assert [mesh["components_found"] for mesh in report["meshes"]] == [3, 2]

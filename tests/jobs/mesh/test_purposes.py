@@ -20,7 +20,7 @@ from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 
-def test_what_is_given_wins() -> None:
+def test_given_settings_win_over_those_of_a_purpose() -> None:
     assert settings_for(None, {"smooth": None}) == {"smooth": None}
     plain = settings_for("print", {"smooth": None, "strict": False, "closed": True, "seeds": []})
     assert MeshSettings(**plain) == MeshSettings(
@@ -107,7 +107,9 @@ def test_all_parts_say_how_much_is_left_out_as_no_bone() -> None:
 
 
 @pytest.mark.release
-def test_a_print_of_a_phantom(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_print_of_a_phantom_is_one_closed_piece_of_its_size(
+    device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     settings = PhantomSettings(kind="torus", size=(72, 56), slices=31, spacing=(0.5, 0.7, 1.0), noise=30.0)
     truth = write_phantom(tmp_path / "ct", settings)
     arguments = ["mesh", str(tmp_path / "ct"), "-o", str(tmp_path / "a.stl"), "--hu", f"{truth['iso_value_hu']:g}"]

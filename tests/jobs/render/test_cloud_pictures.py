@@ -65,7 +65,7 @@ def test_the_command_draws_what_the_function_draws(device: Any, file: Path, tmp_
     assert report["cloud"]["file"]["kind"] == "PLY" and report["volume"] == {}
 
 
-def test_views_turntables_and_lights(device: Any, file: Path, tmp_path: Path) -> None:
+def test_views_turntables_and_lights_of_a_cloud_are_drawn(device: Any, file: Path, tmp_path: Path) -> None:
     given = ["--device", str(device.index), "--size", "64", "-q"]
     assert main(["render", str(file), "-o", str(tmp_path / "a.png"), "--view", "left,anterior", *given]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"a_left.png", "a_anterior.png"}
@@ -97,7 +97,7 @@ def test_what_is_about_scans_is_refused(device: Any, file: Path, tmp_path: Path,
     assert not list(tmp_path.iterdir())
 
 
-def test_files_that_are_no_clouds(device: Any, file: Path, tmp_path: Path) -> None:
+def test_files_that_are_no_clouds_are_refused_and_nothing_is_written(device: Any, file: Path, tmp_path: Path) -> None:
     own = {"device": str(device.index), "size": (64, 64)}
     files = PictureFiles(tmp_path / "a.png")
     with refused(UsageError, "points", "cloud"):

@@ -59,7 +59,9 @@ def test_a_mesh_is_an_input(device: Any, files: dict[str, Path], tmp_path: Path,
     assert report.cloud is None and report.mode == "mesh"
 
 
-def test_meshes_without_a_scan(device: Any, files: dict[str, Path], tmp_path: Path, printed: Printer) -> None:
+def test_meshes_without_a_scan_are_drawn_with_their_looks(
+    device: Any, files: dict[str, Path], tmp_path: Path, printed: Printer
+) -> None:
     glb = tmp_path / "other.glb"
     clrecon.read_mesh(files["ras.ply"]).save(glb)
     report = tmp_path / "report.json"
@@ -127,7 +129,7 @@ def test_a_mesh_is_coloured_by_numbers_at_its_vertices(
     assert "a mesh fitted to the cortex has them" in capsys.readouterr().err
 
 
-def test_a_turntable_of_a_mesh(device: Any, files: dict[str, Path], tmp_path: Path) -> None:
+def test_turntable_of_a_mesh_has_its_frames(device: Any, files: dict[str, Path], tmp_path: Path) -> None:
     out = tmp_path / "frames"
     words = ["--turntable", str(out), "--frames", "3", "--size", "32"]
     assert main(["render", str(files["lps.stl"]), *words]) == 0

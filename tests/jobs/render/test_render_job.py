@@ -89,7 +89,9 @@ def test_the_report_is_what_the_contract_says(device: Any, sphere: tuple[Path, d
     )
 
 
-def test_progress_and_order_of_work(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+def test_progress_tells_the_stages_of_pictures_in_order(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
     stages: list[tuple[str, int, int]] = []
     files = PictureFiles(tmp_path / "a.png", turntable=tmp_path / "a.gif")
     settings = RenderSettings.of(size=SIZE, turntable=Turntable(3, 10.0, 90.0), device=str(device.index))
@@ -98,7 +100,7 @@ def test_progress_and_order_of_work(device: Any, sphere: tuple[Path, dict[str, A
     assert [step for step in stages if step[0] == "frames"] == [("frames", done, 3) for done in range(4)]
 
 
-def test_outputs_then_files_then_device_then_input(tmp_path: Path) -> None:
+def test_pictures_refuse_outputs_then_files_then_device_before_the_input(tmp_path: Path) -> None:
     nowhere = tmp_path / "nowhere"
     bad = RenderSettings.of(device="abacus", transfer_function=str(tmp_path / "none.json"))
     with refused(OutputError, "nowhere"):
@@ -269,13 +271,13 @@ def test_a_picture_of_nothing_says_so(
     assert not [text for text in fine["warnings"] if "picture is" in text or "nothing" in text]
 
 
-def test_names_of_views() -> None:
+def test_views_name_their_files() -> None:
     assert [name_view(view, ("left", "30,-5.50")) for view in ("left", "30,-5.50")] == ["left", "az30_el-5.5"]
     assert name_view("left", ("left",)) == ""
     assert (path_of("x/a.png", "left"), path_of("x/a.png", "")) == ("x/a_left.png", "x/a.png")
 
 
-def test_what_the_mode_is() -> None:
+def test_render_settings_choose_mode_preset_and_view() -> None:
     assert [settings.mode for settings in (
         RenderSettings.of(), RenderSettings.of(preset="x-ray"), RenderSettings.of(iso_value=0.0),
         RenderSettings.of(curve="auto"), RenderSettings.of(preset="x-ray", mode="dvr"),

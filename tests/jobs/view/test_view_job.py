@@ -91,7 +91,7 @@ def test_a_scan_is_shown_by_its_components_and_with_labels_by_these(tmp_path, pr
 
 
 @pytest.mark.opencl
-def test_a_scan_and_a_mesh_together(tmp_path, files, printed, device):
+def test_page_shows_a_scan_and_a_mesh_and_says_that_they_lie_apart(tmp_path, files, printed, device):
     page = tmp_path / "both.html"
     source = scan(tmp_path)[0]
     assert main(["view", str(source), str(files["b.ply"]), "--html", str(page), "--hu", "0"]) == 0

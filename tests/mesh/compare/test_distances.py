@@ -30,7 +30,7 @@ def rectangle(height: float, size=(30.0, 20.0)) -> samples.Arrays:
     return corners, np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def test_parallel_planes():
+def test_parallel_planes_lie_their_distance_apart():
     one, other = (Mesh(rectangle(height)[0] + FAR, rectangle(0)[1]) for height in (0.0, 1.25))
     found = compare_meshes(one, other, samples=1000)
     for side in ("to_reference_mm", "from_reference_mm"):
@@ -38,7 +38,7 @@ def test_parallel_planes():
     assert (found["hd95_mm"], found["assd_mm"], found["max_mm"]) == pytest.approx((1.25, 1.25, 1.25))
 
 
-def test_concentric_spheres():
+def test_concentric_spheres_differ_by_their_radii_and_volumes():
     inner, outer = (Mesh(*samples.sphere(FAR, radius, 5)) for radius in (10.0, 10.5))
     found = compare_meshes(outer, inner, samples=5000)
     for name in ("hd95_mm", "assd_mm", "max_mm"):
@@ -71,7 +71,7 @@ def test_an_open_surface_without_volume_has_no_change():
         ((2.0, 2.0, 0.0), 0.0),  # on it
     ],
 )
-def test_distance_to_one_triangle(point, distance):
+def test_distance_to_one_triangle_is_that_of_its_face_edge_or_corner(point, distance):
     vertices, triangles = TRIANGLE
     points = np.array([point]) + FAR
     assert SurfaceDistance(vertices + FAR, triangles)(points) == pytest.approx([distance], abs=1e-9)
@@ -81,7 +81,7 @@ def test_distance_to_one_triangle(point, distance):
 
 
 @pytest.mark.parametrize("scale", [0.125, 1.0, 32.0])
-def test_the_foot_of_a_perpendicular_on_a_face_on_each_edge_and_on_each_corner(scale):
+def test_distance_is_exact_over_the_face_each_edge_and_each_corner(scale):
     """A triangle with legs of 3 and 4: on its edges the foot lies at a third, a quarter and half of the way."""
     a, b, c = np.array([[0.0, 0, 0], [3, 0, 0], [0, 4, 0]])
     cases = [
@@ -113,7 +113,7 @@ def test_each_triangle_around_each_vertex_is_found():
         np.testing.assert_allclose(found, 0.0, atol=1e-15)
 
 
-def test_only_the_triangles_around_the_vertex_count_whether_the_foot_lies_within_or_not():
+def test_distance_counts_only_the_triangles_around_the_vertex():
     vertices, triangles = samples.box()
     near = NearDistance(vertices, triangles.astype(np.uint32))
     points = np.array([[1.0, 0.75, 0.75], [1.25, 0.75, 0.75], [3.0, 2.0, 1.0], [3.0, 2.0, 3.0]])

@@ -66,7 +66,7 @@ def test_a_shared_corner_fails_the_gate_manifold_alone():
     assert failed(of(samples.weld(samples.join(samples.box(), samples.box((1, 1, 1)))))) == {"manifold"}
 
 
-def test_faces_without_area_and_doubled():
+def test_faces_without_area_and_doubled_faces_fail_their_gates():
     vertices, triangles = samples.box()
     flat = np.concatenate([vertices, vertices[:1]])
     assert failed(of((flat, np.concatenate([triangles, [[0, 8, 1], [8, 0, 1]]])))) >= {"zero_area_faces"}
@@ -83,7 +83,7 @@ def test_faces_without_area_and_doubled():
         (10.3, {"volume_change", "deviation_mean", "deviation_p95"}),
     ],
 )
-def test_a_deviation_in_voxels(radius, expected):
+def test_deviation_fails_its_gates_by_its_size_in_voxels(radius, expected):
     one, other = (Mesh(*samples.sphere(radius=r, rounds=4)) for r in (radius, 10.0))
     gates = judge_mesh(deviation=compare_meshes(one, other, 2000), voxel_mm=1.0)
     assert len(gates) == 3
@@ -92,7 +92,7 @@ def test_a_deviation_in_voxels(radius, expected):
     assert failed(twice) == ({"deviation_mean"} if radius == 10.3 else set())
 
 
-def test_vertices_off_the_iso_surface():
+def test_vertices_off_the_iso_surface_fail_their_gates():
     def at(p95: float, mean: float) -> set[str]:
         return failed(judge_mesh(iso_distance={"surface_voxel": {"p95": p95, "mean": mean}, "not_found": 0}))
 
@@ -134,7 +134,7 @@ def test_enclosed_volume_is_that_of_the_quality():
     assert enclosed_ml(mesh.vertices, mesh.triangles[:, ::-1]) == pytest.approx(-volume_ml, rel=1e-12)
 
 
-def test_a_surface_that_is_open_once_vertices_at_one_place_are_joined():
+def test_surface_that_joined_vertices_open_fails_the_gate_closed():
     gates = of(samples.join(samples.box(), samples.box((1, 1, 0))))
     assert failed(gates) == {"closed"}
     assert "once vertices at one place are joined" in failed_gates(gates)[0]

@@ -69,7 +69,7 @@ def test_an_open_volume_ends_at_its_border():
 
 
 @pytest.mark.parametrize("normal", [(1.0, 0.0, 0.0), (0.3, -0.5, 0.8), (-0.2, 0.9, 0.1)])
-def test_a_plane_through_sheared_voxels(normal):
+def test_distance_to_a_plane_through_sheared_voxels_is_exact(normal):
     """A linear field is trilinear itself: distances are exact, along the normal in mm and not in index space."""
     normal = np.array(normal) / np.linalg.norm(normal)
     middle = (SHEARED @ [5, 4, 3, 1])[:3]
@@ -82,7 +82,7 @@ def test_a_plane_through_sheared_voxels(normal):
     np.testing.assert_allclose(found, np.abs(offset), atol=1e-4)  # voxels are float32
 
 
-def test_points_off_a_sphere():
+def test_points_off_a_sphere_have_their_offset_as_distance():
     affine = np.diag([0.7, 0.5, 0.9, 1.0])
     shape, radius = (40, 55, 32), 8.0
     centre = (affine @ [19.3, 27.4, 15.6, 1])[:3]
@@ -95,7 +95,7 @@ def test_points_off_a_sphere():
     np.testing.assert_allclose(found, np.abs(offset), atol=tolerances.ISO_SPHERE_SAGITTA_MM)
 
 
-def test_the_border_cell_of_a_closed_volume():
+def test_surface_in_the_border_cell_of_a_closed_volume_is_found():
     volume = Volume(np.full((4, 4, 4), 1000, np.int16), np.diag([2.0, 1.0, 1.0, 1.0]))
     rule = choose_iso_rule(volume, 0, closed=True)
     surface = -2.0 * (1000 + 0.5) / (1000 - rule.outside)  # in x, half a unit below the integer
@@ -131,7 +131,7 @@ def test_a_level_half_a_unit_off_is_found():
     assert measure_iso_distance(mesh, volume, choose_iso_rule(volume, 101))["vertices_voxel"]["mean"] > 1e-4
 
 
-def test_only_so_many_samples():
+def test_iso_distance_takes_no_more_samples_than_asked():
     volume = noise_volume()
     vertices, _, triangles = extract_isosurface(volume, 100)
     found = measure_iso_distance(Mesh(vertices, triangles), volume, choose_iso_rule(volume, 100), samples=100)
@@ -209,7 +209,7 @@ def test_a_surface_is_looked_for_within_eleven_half_voxels_along_the_gradient():
     np.testing.assert_allclose(found, [5.45, np.nan, 5.45, np.nan], atol=1e-4)
 
 
-def test_a_point_far_beyond_the_last_slice_of_a_closed_volume():
+def test_point_beyond_a_closed_volume_has_its_distance_to_the_border_surface():
     """The surface lies just before the border, where a step from the border is short."""
     volume = Volume(np.full((4, 4, 4), 1000, np.int16), np.eye(4))
     rule = choose_iso_rule(volume, 0, closed=True)

@@ -58,7 +58,7 @@ def is_rail(volume: Volume, points: np.ndarray) -> bool:
         ({"leave_out": (11.0, 15.25)}, True, True),
     ],
 )
-def test_each_bound_of_a_rail(bar, straight, thin):
+def test_bar_is_a_rail_within_each_bound_and_none_beyond(bar, straight, thin):
     volume = make_volume()
     points = make_bar(volume, **bar)
     assert is_straight(points, volume) == straight

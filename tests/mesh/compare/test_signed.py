@@ -42,7 +42,7 @@ def test_the_sign_is_that_of_the_winding_number(body: str) -> None:
     np.testing.assert_allclose(turned, distance, rtol=0.0, atol=1e-9)
 
 
-def test_faces_edges_corners_and_the_surface_itself() -> None:
+def test_signed_distance_is_exact_at_faces_edges_corners_and_the_surface() -> None:
     vertices, triangles = box()
     measure = SignedDistance(vertices, triangles.astype(np.uint32))
     points = np.array(
@@ -61,7 +61,7 @@ def test_faces_edges_corners_and_the_surface_itself() -> None:
     assert not np.signbit(measure(points)[5:]).any()
 
 
-def test_a_ball_in_a_ball() -> None:
+def test_ball_in_a_ball_has_signed_distances_of_the_gap() -> None:
     """Vertices lie on the spheres, and the triangles up to 0.02 mm within them."""
     small, large = (Mesh(*ball(radius, 60)) for radius in (10.0, 12.0))
     found = clrecon.measure_distance(small, large, 5000)

@@ -29,7 +29,7 @@ def test_a_slab_is_as_thick_as_it_is():
     np.testing.assert_array_equal(thickness, wall_thickness(vertices, triangles.astype(np.uint32), 3000))
 
 
-def test_the_wall_of_a_shell():
+def test_wall_of_a_shell_has_its_thickness():
     vertices, triangles = shell(20.0, 18.8)
     found = measure_walls(vertices, triangles.astype(np.uint32), 1.0, 4000)
     assert found["median_mm"] == pytest.approx(1.2, abs=0.03)
@@ -46,7 +46,7 @@ def test_an_open_sheet_has_no_wall():
     assert (found["min_mm"], found["thin_share"], found["not_measured"]) == (None, None, 50)
 
 
-def test_the_figures_of_known_thicknesses(monkeypatch):
+def test_figures_of_known_thicknesses_are_their_percentiles(monkeypatch):
     """From 0 to 100 mm in steps of 1 mm: each percentile is its own number."""
     lengths = np.append(np.arange(101.0), [np.nan, np.nan])
     monkeypatch.setattr(distances, "wall_thickness", lambda *_: lengths)

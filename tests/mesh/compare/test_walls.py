@@ -66,7 +66,7 @@ VESSEL = ((34, 20, 12, 11, 380),)
         (((20, 20, 12, 12, 260), (20, 9, 12, 1.9, 800), (24, 30, 12, 1.9, 800)), "faint bone"),
     ],
 )
-def test_what_a_wall_looks_like(bodies, looks_like):
+def test_bodies_are_told_as_bone_medium_or_metal_by_their_walls(bodies, looks_like):
     found = judge(make_volume(*bodies))[0]
     assert found["looks_like"] == looks_like
     assert looks_like_bone(found) == ("bone" in looks_like and looks_like != "no bone")
@@ -154,7 +154,7 @@ def test_depths_are_in_voxels_along_the_normal():
 @pytest.mark.parametrize(
     ("wall_hu", "compact", "metal"), [(599.5, 0, 0), (600.0, 1, 0), (2000.0, 1, 0), (2000.5, 1, 1)]
 )
-def test_where_bone_is_compact_and_where_metal_begins(wall_hu, compact, metal):
+def test_walls_count_as_compact_bone_or_metal_by_their_hu(wall_hu, compact, metal):
     found = judge_walls(Walls(np.zeros((3, 3)), np.full(3, wall_hu), np.zeros(3, bool)))
     assert (found["compact_share"], found["metal_share"], found["contrast_share"]) == (compact, metal, 0.0)
 
@@ -196,7 +196,7 @@ def test_a_cell_and_its_26_neighbours_are_near():
     np.testing.assert_array_equal(_is_near(far + 0.5, middle, 7.0), within)
 
 
-def test_points_near_a_line_of_several_pieces():
+def test_points_near_any_piece_of_a_line_are_found():
     line = np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0]])
     points = np.array([[5.0, 1, 0], [5, 3, 0], [11, 5, 0], [8.5, 5, 0], [-1.5, 0, 0], [-2.5, 0, 0], [10, 12, 1]])
     assert lie_near_line(points, line, 2.0).tolist() == [True, False, True, True, True, False, False]

@@ -260,7 +260,7 @@ def test_impossible_shares_are_refused(fraction):
         decimate_mesh(Mesh(*samples.sphere()), fraction, 1.0)
 
 
-def test_the_public_names():
+def test_mesh_refinement_is_public():
     import clrecon
 
     assert {"smooth_mesh", "decimate_mesh", "compare_meshes"} <= set(clrecon.__all__)

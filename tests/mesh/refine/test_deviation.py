@@ -15,7 +15,7 @@ pytestmark = pytest.mark.unit
 BOUND = 0.5
 
 
-def test_points_inside_of_an_edge_and_of_a_triangle():
+def test_inner_weights_divide_edges_and_triangles_evenly():
     assert _inner_weights(2, 2).tolist() == [[0.5, 0.5]]
     assert _inner_weights(4, 2).tolist() == [[0.25, 0.75], [0.5, 0.5], [0.75, 0.25]]
     third = [1 / 3] * 3

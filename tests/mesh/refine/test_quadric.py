@@ -99,12 +99,12 @@ def test_vertices_without_faces_are_in_no_component_that_is_lost():
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -0.1, 90.0, float("nan")])
-def test_impossible_shares(fraction):
+def test_impossible_shares_are_refused(fraction):
     with refused(UsageError, 0, 1):
         collapse_quadric(Mesh(*samples.sphere()), fraction)
 
 
-def test_nothing_to_collapse_and_nothing_left():
+def test_meshes_with_nothing_to_collapse_or_nothing_left_are_refused():
     with refused(NoSurfaceError, "refine"):
         collapse_quadric(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.uint32)), 0.5)
     with refused(NoSurfaceError, 12, 0.99):

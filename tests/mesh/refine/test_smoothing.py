@@ -189,7 +189,7 @@ def test_impossible_iterations_are_refused(iterations):
 
 
 @pytest.mark.parametrize("bound", [0.0, -1.0, float("nan"), float("inf")])
-def test_impossible_bounds(bound):
+def test_impossible_bounds_are_refused(bound):
     with refused(UsageError, "length", 0):
         smooth_mesh(noisy_sphere(0.1), 20, bound)
 

@@ -47,7 +47,7 @@ def expected_of(volume, settings):
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)
-def test_equals_the_twin(device, dtype):
+def test_bilateral_filter_equals_its_twin(device, dtype):
     """Rows of 1 to 70 voxels: ends of rows overlap in the short ones."""
     for shape in SHAPES:
         voxels = np.random.default_rng(5).integers(0, 120, shape).astype(dtype)
@@ -62,7 +62,7 @@ def test_equals_the_twin(device, dtype):
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_equals_the_twin_in_uneven_stacks(device, sign):
+def test_bilateral_filter_equals_its_twin_in_uneven_stacks(device, sign):
     shape = uneven(sign=sign).voxels.shape
     volume = uneven(np.random.default_rng(6).integers(0, 120, shape).astype(np.float32), sign)
     found, settings = run(device, volume, 30.0, 0.9)
@@ -71,7 +71,7 @@ def test_equals_the_twin_in_uneven_stacks(device, sign):
 
 
 @pytest.mark.seconds
-def test_the_same_bits_on_every_device(device):
+def test_filter_gives_the_same_bits_on_every_device(device):
     others = [one for one in list_devices() if one.type == "cpu" and not one.is_simulator and not one.shortcoming]
     if len(others) < 2:
         pytest.skip("one device")
@@ -81,13 +81,13 @@ def test_the_same_bits_on_every_device(device):
 
 
 @pytest.mark.oclgrind
-def test_under_a_simulator(device):
+def test_filter_runs_cleanly_under_a_simulator(device):
     found, settings = run(device, ball((3, 4, 35)), taps=27)
     near, _ = run(device, ball((3, 4, 35)), taps=27, near=100)
     assert found.voxels.shape == near.voxels.shape == (3, 4, 35)
 
 
-def test_equals_itk_at_equal_taps(device):
+def test_bilateral_filter_equals_itk_at_equal_taps(device):
     sitk = pytest.importorskip("SimpleITK")
     volume = ball(dtype="float32", affine=np.diag((0.7, 0.7, 1.4, 1.0)))
     image = sitk.GetImageFromArray(volume.voxels)
@@ -98,7 +98,7 @@ def test_equals_itk_at_equal_taps(device):
     assert np.abs(found.voxels - theirs).max() <= FILTER_ITK_HU
 
 
-def test_equals_opencv(device):
+def test_bilateral_filter_equals_opencv(device):
     cv2 = pytest.importorskip("cv2")
     volume = ball((2, 30, 50), dtype="float32")
     theirs = [cv2.bilateralFilter(layer, 5, 75.0, 1.3, borderType=cv2.BORDER_REPLICATE) for layer in volume.voxels]
@@ -159,7 +159,7 @@ NEAR = {
 
 @pytest.mark.parametrize("dimensions", [2, 3])
 @pytest.mark.parametrize("make", NEAR)
-def test_near_a_level_it_is_exact_there(device, make, dimensions):
+def test_filter_near_a_level_is_exact_there(device, make, dimensions):
     """Sides of the level everywhere; values at both ends of every crossed edge; with normals those around, too."""
     volume, level = NEAR[make](), 100.0
     whole, _ = run(device, volume, 20.0, dimensions=dimensions)
@@ -287,7 +287,7 @@ def test_the_report_says_what_was_done(device):
     assert 0.0 < few.report["filtered"]["steps"][0]["filtered_share"] < 1.0
 
 
-def test_progress_is_told(device):
+def test_filter_tells_its_progress_by_slices(device):
     told = []
     clrecon.filter_bilateral(ball(), sigma_hu=30.0, device=device, progress=lambda *step: told.append(step))
     assert told[0] == ("filter", 0, 20) and told[-1] == ("filter", 20, 20)
@@ -303,7 +303,7 @@ def test_progress_near_a_level_goes_on_over_the_slabs(device):
     assert counts == sorted(set(counts)) and counts[-1] == 20 and len(counts) > 2
 
 
-def test_the_memory_of_a_slab_near_a_level(device):
+def test_slab_near_a_level_needs_the_memory_of_its_groups(device):
     """Of 700 voxels in a row: 44 groups in 2 words.  Four masks of the rows that are there, one of the core, a list."""
     volume = ball((9, 6, 700))
     settings = BilateralSettings.checked(volume, None, 40.0, 3, 100.0, False, 27)
@@ -318,7 +318,7 @@ def refuse(stage, done, total):
     raise clrecon.Cancelled("enough")
 
 
-def test_progress_can_end_it(device):
+def test_filter_is_ended_by_its_progress(device):
     with refused(clrecon.Cancelled, "enough"):
         clrecon.filter_bilateral(ball(), sigma_hu=30.0, device=device, progress=refuse)
 

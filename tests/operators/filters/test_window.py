@@ -19,7 +19,7 @@ def cube(spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Volume:
 
 
 @pytest.mark.parametrize(("diameter", "taps"), [(3, 5), (5, 13), (7, 29), (9, 49)])
-def test_discs_of_opencv(diameter, taps):
+def test_window_holds_the_disc_of_opencv(diameter, taps):
     """OpenCV's window of diameter d holds the pixels within d // 2 steps."""
     window = choose_window(cube(), 5.0, 2, taps)
     steps = np.arange(-(diameter // 2), diameter // 2 + 1)
@@ -32,7 +32,7 @@ def test_discs_of_opencv(diameter, taps):
     ("spacing", "sigma", "reach"),
     [((1, 1, 1), 0.8, (2, 2, 2)), ((0.7, 0.7, 1.4), 0.56, (2, 2, 1)), ((0.5, 1, 2), 0.4, (2, 1, 1))],
 )
-def test_boxes_of_itk(spacing, sigma, reach):
+def test_window_holds_the_box_of_itk(spacing, sigma, reach):
     """ITK's radius is ceil(2.5 sigma / step) along each axis."""
     window = choose_window(cube(spacing), sigma, 3, 4096)
     assert window.reach == reach
@@ -49,7 +49,7 @@ def test_a_cap_leaves_whole_rings():
     assert choose_window(cube(), 1.0, 3, 7).taps == 7
 
 
-def test_the_largest_reach():
+def test_window_of_a_large_sigma_ends_at_the_largest_reach():
     window = choose_window(cube(), 100.0, 2, 4096)
     assert max(window.reach) == LARGEST_REACH == 14
     assert window.share == pytest.approx(29**2 / (2 * np.pi * 100.0**2), rel=0.01)

@@ -61,24 +61,24 @@ def test_noise_equals_the_twin(device, affine, mm, density):
 @pytest.mark.every_device
 @pytest.mark.parametrize("ni", [1, 31, 32, 33, 512, 513, 2049])
 @pytest.mark.parametrize("affine", daily(1, [FINE, TILTED]), ids=["fine", "tilted"])
-def test_rows_of_every_length(device, ni, affine):
+def test_opening_and_closing_of_rows_of_every_length_equal_the_twin(device, ni, affine):
     chosen = noise((3, 4, ni), 0.97)
     check_all(device, volume_of(chosen.shape, affine), chosen, 1.5)
 
 
 @pytest.mark.parametrize("shape", [(1, 9, 41), (1, 1, 41), (9, 1, 41), (7, 9, 1)])
-def test_flat_volumes(device, shape):
+def test_opening_and_closing_of_flat_volumes_equal_the_twin(device, shape):
     check_all(device, volume_of(shape, OBLIQUE), noise(shape, 0.8), 1.5)
 
 
 @pytest.mark.parametrize("affine", [FINE, TILTED, None], ids=["fine", "tilted", "uneven"])
-def test_discs_of_each_slice(device, affine):
+def test_opening_and_closing_slice_by_slice_equal_the_twin(device, affine):
     chosen = noise((6, 9, 41), 0.9)
     check_all(device, volume_of(chosen.shape, affine), chosen, 1.5, by_slice=True)
 
 
 @pytest.mark.parametrize("density", [0.0, 1.0])
-def test_nothing_and_all(device, density):
+def test_empty_and_full_masks_stay_when_opened_and_closed(device, density):
     chosen = noise((5, 9, 41), density)
     for affine in (FINE, TILTED, None):
         check_all(device, volume_of((6, 9, 41), affine), noise((6, 9, 41), density), 2.0)
@@ -96,7 +96,7 @@ def test_a_radius_below_a_voxel_changes_nothing_but_one_that_holds_the_volume_al
     assert mask.close(80.0).share == 1.0
 
 
-def test_long_rows_and_wide_balls(device):
+def test_opening_and_closing_of_long_rows_by_wide_balls_equal_the_twin(device):
     """A row of two pieces, and a ball that is wider than a word: its rows are split."""
     volume = volume_of((1, 3, 700), np.diag((0.1, 5.0, 5.0, 1.0)))
     chosen = np.zeros((1, 3, 700), bool)

@@ -284,7 +284,7 @@ def test_a_vertebra_of_the_phantom_is_as_large_as_its_truth_and_what_the_level_a
         assert (solid["closed"], solid["manifold"]) == (True, True)
 
 
-def test_values_types_and_a_volume_on_a_device(device):
+def test_filled_body_is_the_same_for_every_voxel_type_and_on_the_device(device):
     values = body(distances((41, 41, 41)), 15.0, 10.0)
     short = whole(values)
     as_float = Volume(values.astype(np.float32), np.eye(4))

@@ -40,7 +40,7 @@ def test_holes_of_noise_equal_the_twin_and_scipy(device, shape, density):
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("ni", daily(4, [31, 32, 33, 512, 513, 2049]))
-def test_rows_of_every_length(device, ni):
+def test_holes_and_growth_of_rows_of_every_length_equal_scipy_and_the_twin(device, ni):
     chosen = noise((4, 9, ni), 0.62)
     mask = mask_of(device, chosen)
     np.testing.assert_array_equal(mask.fill_holes().to_numpy(), ndimage.binary_fill_holes(chosen))
@@ -48,7 +48,7 @@ def test_rows_of_every_length(device, ni):
     np.testing.assert_array_equal(mask.grow(mask.scan.ijk_to_lps(start[:, ::-1])).to_numpy(), twin.grow(chosen, start))
 
 
-def test_the_densest_runs(device):
+def test_holes_of_a_chess_board_are_filled_and_nothing_grows(device):
     """A chess board: half of all voxels is a run, none has a neighbour by a face."""
     chosen = np.indices((9, 20, 70)).sum(axis=0) % 2 == 0
     mask = mask_of(device, chosen)
@@ -90,7 +90,7 @@ def test_components_equal_those_of_scipy(device, density):
     assert grown.name == "(an array) grown from 3 points"
 
 
-def test_points_of_an_uneven_stack(device):
+def test_growth_from_points_of_an_uneven_stack_equals_the_twin(device):
     volume = uneven(noise((6, 9, 40), 0.4).astype(np.int16))
     chosen = volume.voxels > 0
     seeds = np.argwhere(chosen)[[3, -5]]

@@ -190,7 +190,7 @@ def test_memory_is_summed_before_it_is_taken(device):
 
 
 @pytest.mark.oclgrind
-def test_under_a_simulator(device):
+def test_masks_are_computed_cleanly_under_a_simulator(device):
     volume = Volume(np.zeros((5, 6, 41), np.int16), OBLIQUE)
     chosen = np.random.default_rng(3).random((5, 6, 41)) < 0.4
     mask = clrecon.Mask.from_array(volume, chosen, device=device)

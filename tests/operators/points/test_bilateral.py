@@ -135,7 +135,7 @@ def test_a_cloud_of_several_parts_is_filtered_as_its_twin(device):
 
 
 @pytest.mark.oclgrind
-def test_a_small_cloud_of_every_kernel(device):
+def test_small_cloud_is_filtered_by_every_kernel(device):
     points = sphere(3.0).points
     step = denoise_points(PointCloud(points), 6, features="variation", device=device)
     assert 0.01 < step.facts["rms_move_mm"] < 1.0

@@ -44,7 +44,7 @@ def check_voxels(cloud, volume, **choice: Any) -> None:
 
 @pytest.mark.parametrize("columns", [1, 31, 32, 33, 63, 64, 65, 130])
 @pytest.mark.parametrize("kind", ["voxels", "shell"])
-def test_rows_of_every_length(device, columns, kind):
+def test_points_of_rows_of_every_length_equal_the_twin(device, columns, kind):
     volume = make_volume((5, 7, columns))
     check_voxels(extract_points(volume, hu=BAND, kind=kind, device=device), volume, shell=kind == "shell")
 
@@ -60,7 +60,7 @@ def test_slabs_are_joined_in_their_order(lengths):
         np.testing.assert_array_equal(array, expected)
 
 
-def test_the_form_of_the_other_kind_of_device(device, monkeypatch):
+def test_points_by_the_kernels_of_the_other_kind_of_device_equal_the_twin(device, monkeypatch):
     """An item takes a word on GPUs, a row of words on CPUs."""
     lanes = "1" if device.kernel_variants["LANES"] == "8" else "8"
     monkeypatch.setattr(device, "kernel_variants", {**device.kernel_variants, "LANES": lanes})
@@ -69,13 +69,13 @@ def test_the_form_of_the_other_kind_of_device(device, monkeypatch):
 
 
 @pytest.mark.parametrize("dtype", [kind for kind in VOXEL_TYPES if kind != "float32"])
-def test_types_of_voxels(device, dtype):
+def test_points_of_every_voxel_type_equal_the_twin(device, dtype):
     volume = make_volume((6, 11, 70), dtype)
     check_voxels(extract_points(volume, hu=BAND, device=device), volume)
 
 
 @pytest.mark.release
-def test_floats_and_uneven_tilted_slices(device):
+def test_points_of_float_voxels_in_uneven_slices_lie_at_their_places(device):
     volume = make_volume((9, 12, 40), "float32", uneven=True)
     cloud = extract_points(volume, hu=(20.0, 60.0), device=device)
     check_voxels(cloud, volume)
@@ -83,7 +83,7 @@ def test_floats_and_uneven_tilted_slices(device):
 
 
 @pytest.mark.oclgrind
-def test_a_label_within_a_shell(device):
+def test_points_of_a_label_are_its_voxels_or_their_shell(device):
     volume = make_volume((4, 6, 40))
     numbers = np.random.default_rng(3).integers(0, 3, volume.voxels.shape).astype(np.uint8)
     labels = LabelMap(numbers, volume.affine)
@@ -100,7 +100,7 @@ def test_a_label_within_a_shell(device):
 
 
 @pytest.mark.first_device
-def test_wide_label_numbers(device):
+def test_points_of_a_label_above_255_are_its_voxels(device):
     volume = make_volume((4, 6, 40))
     numbers = 300 * np.random.default_rng(3).integers(0, 3, volume.voxels.shape).astype(np.uint16)
     cloud = extract_points(volume, hu=BAND, labels=LabelMap(numbers, volume.affine), label=600, device=device)
@@ -136,7 +136,7 @@ def test_far_from_the_origin_points_are_float64(device):
     assert any("float64" in text for text in cloud.report["warnings"])
 
 
-def test_the_whole_volume_and_its_report(device):
+def test_report_of_points_of_the_whole_volume_counts_all_voxels(device):
     volume = make_volume((3, 5, 33))
     cloud = extract_points(volume, hu=(0, None), device=device)
     assert len(cloud) == volume.voxels.size and cloud.report["share"] == 1.0
@@ -152,7 +152,7 @@ def test_the_whole_volume_and_its_report(device):
 
 
 @pytest.mark.parametrize(("high", "points"), [(-1, 0), (99, 495)])
-def test_the_bytes_of_a_volume_with_and_without_points(device, high, points):
+def test_bytes_of_point_extraction_are_those_of_its_buffers(device, high, points):
     """3 x 5 x 33 voxels of two bytes; a mask of two words a row, its ends, and counts of each row; 20 bytes a point."""
     volume = Volume(np.zeros((3, 5, 33), np.int16), np.eye(4))
     emission = VoxelEmission(DeviceVolume(volume, device=device), Selection(np.int16(-5), np.int16(high)))
@@ -178,7 +178,7 @@ def test_surface_points_are_the_vertices_of_the_mesh(device):
     assert band.hu is None
 
 
-def test_surface_points_of_labels(device):
+def test_surface_points_of_labels_are_the_vertices_of_their_meshes(device):
     volume = make_volume((8, 12, 40))
     labels = LabelMap((np.indices(volume.voxels.shape)[2] // 14).astype(np.uint8), volume.affine, {1: "bone"})
     cloud = extract_points(volume, 50, labels=labels, label="bone", device=device)
@@ -189,7 +189,7 @@ def test_surface_points_of_labels(device):
     assert set(both.labels.tolist()) == {1, 2} and both.report["label"] is None
 
 
-def test_a_ball_and_its_points(device):
+def test_points_of_a_ball_fill_it_or_lie_on_its_surface(device):
     """Voxels fill the ball, the shell lies within a voxel's diagonal of its surface, surface points lie on it."""
     spacing, radius = np.array([0.64, 0.64, 0.8]), 20.0
     k, j, i = np.indices((56, 68, 68))
@@ -259,7 +259,7 @@ def test_wrong_arguments_are_refused(choice, words):
         extract_points(make_volume((3, 5, 33)), **choice)
 
 
-def test_the_twin_of_shells_on_a_cube():
+def test_twin_marks_the_shell_of_a_cube():
     cube = np.zeros((5, 5, 5), bool)
     cube[1:4, 1:4, 1:4] = True
     assert mark_shell(cube).sum() == 26 and not mark_shell(cube)[2, 2, 2]

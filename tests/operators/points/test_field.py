@@ -52,17 +52,17 @@ def lengths(spacing, reach=2.0, smoothing=0.1, bridge=2.0):
 
 
 @pytest.mark.parametrize("shares", [(2.0, 0.1, 2.0), (3.0, 1000.0, 1.5), (4.0, 1.0, 1.0), (2.6, 0.1, 2.5)])
-def test_a_small_sphere(device, shares):
+def test_field_of_a_sphere_equals_the_twin(device, shares):
     check_equal(device, sphere_cloud(700, 4.0), lengths(0.6, *shares))
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 60, 255, 256, 257, 1000])
-def test_scattered_points_whose_normals_do_not_agree(device, n):
+def test_field_of_points_with_contrary_normals_equals_the_twin(device, n):
     check_equal(device, scattered_cloud(n), lengths(0.8))
 
 
 @pytest.mark.oclgrind
-def test_a_field_of_every_kernel(device):
+def test_small_field_of_every_kernel_equals_the_twin(device):
     check_equal(device, sphere_cloud(150, 2.5), lengths(0.9))
 
 
@@ -87,14 +87,14 @@ def test_points_in_one_place_are_gathered_in_turn(device):
 
 
 @pytest.mark.parametrize("length", [6.1, 6.2, 14.2, 25.0])
-def test_rows_around_whole_bricks_and_words(device, length):
+def test_field_around_whole_bricks_and_words_equals_the_twin(device, length):
     cloud = cube_cloud(500, 2.0)
     stretched = PointCloud(cloud.points * (length, 1.0, 1.0), cloud.normals)
     check_equal(device, stretched, lengths(0.8, bridge=1.25))
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_signs_of_masks_at_random(device, seed):
+def test_signs_of_random_masks_equal_the_twin(device, seed):
     rng = np.random.default_rng(seed)
     shape = (8 * int(rng.integers(1, 9)), 4 * int(rng.integers(1, 4)), 4 * int(rng.integers(1, 4)))
     near = rng.random(shape[::-1]) < (0.1, 0.5, 0.7, 0.9, 0.99, 0.6)[seed]

@@ -46,7 +46,7 @@ def check_equal(device, points, eps, min_samples):
 @pytest.mark.parametrize("n", [1, 2, 31, 32, 33, 1000, 9001])
 @pytest.mark.parametrize("min_samples", [1, 2, 5])
 @pytest.mark.parametrize("eps", daily(1, [0.8, 2.0]))
-def test_scattered_points(device, form, n, min_samples, eps):
+def test_clusters_of_scattered_points_equal_the_twin(device, form, n, min_samples, eps):
     check_equal(device, scattered_points(n, (30.0, 14.0, 11.0)), eps, min_samples)
 
 
@@ -58,7 +58,7 @@ def test_chunks_of_any_size_give_the_same(device, form, per_chunk):
 
 
 @pytest.mark.oclgrind
-def test_a_small_cloud_in_small_chunks(device):
+def test_clusters_found_in_small_chunks_equal_the_twin(device):
     points = scattered_points(400, (12.0, 8.0, 6.0))
     labels, cores, count, _ = find_clusters(device, plan_cells(points, 1.1), 1.1, 4, per_chunk=32)
     expected_count, expected, expected_cores = twin.cluster_points(points, 1.1, 4)
@@ -68,7 +68,7 @@ def test_a_small_cloud_in_small_chunks(device):
 
 
 @pytest.mark.parametrize("n", [0, 1, 4])
-def test_what_is_said_of_points_that_are_fewer_than_a_core_needs(n):
+def test_points_fewer_than_a_core_needs_are_noise_with_a_warning(n):
     """No device is needed: nothing is compared."""
     found = cluster_free_points(np.zeros((n, 3)), 2.0, 5)
     assert found.facts == {"eps_mm": 2.0, "min_samples": 5, "clusters": 0, "core_points": 0, "noise_points": n}
@@ -103,7 +103,7 @@ def test_the_passes_equal_their_twins(device, form):
     assert (roots == twin.SEVERAL_ROOTS).any()
 
 
-def test_a_lattice_at_its_own_spacing(device, form):
+def test_clusters_of_a_lattice_at_its_own_spacing_equal_the_twin(device, form):
     """Distances equal eps, times what the rounding of the coordinates makes of them."""
     lattice = np.stack(np.meshgrid(*[np.arange(-7, 8)] * 3, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
     assert check_equal(device, lattice, 1.0, 7).count == 1
@@ -144,7 +144,7 @@ def test_equal_points_are_one_cluster_at_once(device):
 
 
 @pytest.mark.parametrize(("gap", "clusters"), [(1.001, 2), (0.999, 1)])
-def test_two_dense_spots(device, gap, clusters):
+def test_dense_spots_are_joined_up_to_the_distance(device, gap, clusters):
     """Their boxes are compared before their points."""
     spot = np.random.default_rng(5).random((4000, 3)) * 0.02
     spot[0], spot[1] = 0.0, 0.02
@@ -247,7 +247,7 @@ def test_free_points_need_a_distance_and_no_volume(device):
 
 
 @pytest.mark.every_device
-def test_a_large_cloud_where_work_items_end_early(device):
+def test_clusters_of_a_large_cloud_are_right_where_work_items_end_early(device):
     """Shares of a core would be longer than llvmpipe's loops: nearly all labels were wrong, without a word."""
     if device.most_steps is None:
         pytest.skip("work-items of this device do not end early")

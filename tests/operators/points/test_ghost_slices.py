@@ -54,7 +54,7 @@ def test_counts_equal_the_twin(device, shape):
 
 
 @pytest.mark.oclgrind
-def test_counts_under_a_simulator(device):
+def test_ghost_counts_hold_every_point_under_a_simulator(device):
     voxels = np.random.default_rng(4).integers(0, 2, (5, 3, 40)).astype(np.int16)
     assert find_ghost_slices(Volume(voxels, np.eye(4)), (1, 1), device=device).points.sum() == voxels.sum()
 
@@ -76,7 +76,7 @@ def test_a_planted_slice_is_found(device, kind, at):
 @pytest.mark.parametrize(
     ("places", "found"), [((0,), ()), ((19,), ()), ((9, 10), ()), ((5, 8), (5, 8)), ((5, 12), (5, 12))]
 )
-def test_what_the_test_can_and_cannot_find(device, places, found):
+def test_ghosts_are_found_but_for_those_at_the_ends_or_side_by_side(device, places, found):
     """The ends have one neighbour; two ghosts side by side look like each other."""
     voxels = rods()
     for place in places:

@@ -36,12 +36,12 @@ def check_equal(device, points, edge):
 
 @pytest.mark.parametrize("n", [1, 2, 15, 16, 17, 63, 64, 65, 4097, 20_001])
 @pytest.mark.parametrize("edge", [0.37, 1.0, 11.0])
-def test_scattered_points(device, n, edge):
+def test_grid_of_scattered_points_equals_the_twin(device, n, edge):
     check_equal(device, scattered_points(n), edge)
 
 
 @pytest.mark.parametrize("cells", [31, 32, 33, 64, 65])
-def test_rows_around_whole_words(device, cells):
+def test_grid_of_rows_around_whole_words_equals_the_twin(device, cells):
     points = np.zeros((cells, 3), np.float32)
     points[:, 0] = np.random.default_rng(cells).permutation(cells) + 0.5
     made = check_equal(device, points, 1.0)
@@ -50,11 +50,11 @@ def test_rows_around_whole_words(device, cells):
 
 
 @pytest.mark.oclgrind
-def test_a_small_grid_of_every_kernel(device):
+def test_small_grid_of_every_kernel_equals_the_twin(device):
     check_equal(device, scattered_points(700), 2.0)
 
 
-def test_a_lattice_whose_points_lie_on_borders_of_cells(device):
+def test_grid_of_points_on_borders_of_cells_equals_the_twin(device):
     lattice = np.stack(np.meshgrid(*[np.arange(-6, 7)] * 3, indexing="ij"), -1).reshape(-1, 3)
     check_equal(device, (0.7 * lattice).astype(np.float32), 0.7)
 

@@ -42,18 +42,18 @@ def check_equal(device, points, k):
 
 @pytest.mark.parametrize("n", [1, 2, 63, 64, 65, 1023, 1025, 4097])
 @pytest.mark.parametrize("k", [1, 2, 16, 37])
-def test_scattered_points(device, n, k):
+def test_neighbours_of_scattered_points_equal_the_twin(device, n, k):
     check_equal(device, scattered_points(n), min(k, n))
 
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("cloud", CLOUDS)
 @pytest.mark.parametrize("k", daily(1, [1, 16]))
-def test_awkward_clouds(device, cloud, k):
+def test_neighbours_of_awkward_clouds_equal_the_twin(device, cloud, k):
     check_equal(device, CLOUDS[cloud], k)
 
 
-def test_the_most_neighbours(device):
+def test_most_neighbours_allowed_equal_the_twin(device):
     check_equal(device, scattered_points(900), neighbours.MOST_NEIGHBOURS)
 
 
@@ -72,7 +72,7 @@ def test_a_cloud_of_several_parts_has_the_neighbours_of_its_twin_and_tells_each_
 
 
 @pytest.mark.oclgrind
-def test_a_small_cloud_with_every_way_through_the_kernel(device):
+def test_neighbours_of_a_small_cloud_equal_the_twin_on_every_way(device):
     points = np.r_[scattered_points(150), np.zeros((30, 3)), [[300.0, 0.0, 0.0]]]
     check_equal(device, points, 7)
 

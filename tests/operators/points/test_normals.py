@@ -43,7 +43,7 @@ def test_axes_equal_their_twin(device, shape, noisy):
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("n", [3, 7, 8, 9, 15, 16, 17])
-def test_every_size_of_the_last_vector(device, n):
+def test_normals_equal_their_twin_at_every_size_of_the_last_vector(device, n):
     points = np.random.default_rng(n).normal(size=(n, 3)).astype(np.float32)
     found = estimate_normals(PointCloud(points), 3, device=device).cloud.normals
     axes, _ = principal_axes(points, find_neighbours(points, 3)[0])
@@ -222,7 +222,7 @@ def test_normals_of_a_cloud_of_several_parts_point_outward(device):
 
 
 @pytest.mark.oclgrind
-def test_a_small_cloud_with_its_volume(device):
+def test_normals_of_a_small_cloud_look_outward_by_its_volume(device):
     volume, middle = ball(shape=(12, 12, 12), radius=4.0)
     points = middle + 4.0 * sphere(2.0).normals
     step = estimate_normals(PointCloud(points), 6, volume=volume, device=device)

@@ -46,7 +46,7 @@ def test_a_ring_of_equal_distances_keeps_all(device):
 
 
 @pytest.mark.oclgrind
-def test_a_small_cloud(device):
+def test_far_point_of_a_small_cloud_is_removed(device):
     points = np.r_[sphere(3.0).points, [[30.0, 0.0, 0.0]]]
     step = remove_outliers(PointCloud(points), 6, device=device)
     assert step.removed[-1] == 1
@@ -58,7 +58,7 @@ def test_wrong_deviations_are_refused(device, deviations):
         remove_outliers(PointCloud(np.eye(3)), 2, deviations, device=device)
 
 
-def test_one_point_alone_is_refused_in_words(device):
+def test_one_point_alone_stays_with_a_warning(device):
     step = remove_outliers(PointCloud(np.zeros((1, 3))), device=device)
     assert len(step.cloud) == 1
     assert "the cloud has 1 points" in step.warnings[0]

@@ -31,7 +31,7 @@ def check_closed(mesh, components=1):
     return quality
 
 
-def test_a_sphere_without_noise(device):
+def test_surface_of_a_sphere_without_noise_is_closed_and_near_it(device):
     mesh = reconstruct_surface(sphere_cloud(), 0.65, device=device)
     quality = check_closed(mesh)
     assert sphere_error(mesh) < 0.015  # measured 0.007; 0.026 was asked for
@@ -47,7 +47,7 @@ def test_a_sphere_without_noise(device):
     assert outward.min() > 0.8
 
 
-def test_a_cube_without_noise(device):
+def test_surface_of_a_cube_without_noise_is_closed_and_near_it(device):
     mesh = reconstruct_surface(cube_cloud(), 0.64, device=device)
     quality = check_closed(mesh)
     assert rms(cube_distances(mesh.vertices)) < 0.046  # measured 0.034
@@ -129,7 +129,7 @@ def test_less_memory_gives_the_same_mesh(device):
     assert np.array_equal(whole.triangles, parts.triangles)
 
 
-def test_the_surface_of_the_points_of_a_surface(device):
+def test_surface_of_vertices_lies_near_the_mesh_they_came_from(device):
     settings = PhantomSettings(kind="torus", size=(72, 56), slices=31, spacing=(0.7, 0.7, 1.0), tilt=15.0, noise=20.0)
     voxels, affine, _ = make_phantom(settings)
     volume = Volume(voxels, affine)

@@ -19,7 +19,7 @@ from clrecon.proof.points import clusters as twin
 @pytest.mark.parametrize("n", [20, 64, 4097])
 @pytest.mark.parametrize(("fewest", "threshold"), [(1, 1), (2, 2), (2, 5), (3, 2), (4, 9)])
 @pytest.mark.parametrize("largest", [False, True])
-def test_what_becomes_of_each_point(device, n, fewest, threshold, largest):
+def test_sparse_cells_mark_each_point_as_the_twin_does(device, n, fewest, threshold, largest):
     points = scattered_points(n, (30.0, 20.0, 10.0), seed=n)
     edge = 1.15 * (6000.0 / n) ** (1 / 3)
     grown = grow_cells(device, plan_grid(points, edge), fewest, threshold, largest)
@@ -27,7 +27,7 @@ def test_what_becomes_of_each_point(device, n, fewest, threshold, largest):
 
 
 @pytest.mark.oclgrind
-def test_a_small_cloud(device):
+def test_sparse_cells_of_a_small_cloud_equal_the_twin(device):
     points = scattered_points(600, (20.0, 14.0, 9.0))
     grown = grow_cells(device, plan_grid(points, 1.5), 2, 3, True)
     assert set(np.unique(grown.removed)) == {0, 1, 2, 3}

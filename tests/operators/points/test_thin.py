@@ -22,7 +22,7 @@ def test_chosen_points_equal_the_twin(device, n, spacing):
 
 
 @pytest.mark.oclgrind
-def test_a_small_cloud(device):
+def test_thinned_points_of_a_small_cloud_equal_the_twin(device):
     points = scattered_points(600)
     assert np.array_equal(choose_points(device, plan_grid(points, 3.0)), twin.choose_points(points, 3.0))
 
@@ -60,7 +60,7 @@ def test_every_occupied_cell_keeps_one_point(device):
     assert len(step.cloud) == len(cells(points))
 
 
-def test_far_and_equal_points(device):
+def test_thinning_keeps_far_points_exact_and_one_of_equal_ones(device):
     points = scattered_points(500).astype(np.float64) + (1e5, 2e5, -1e5)
     step = thin_points(PointCloud(points), 5.0, device=device)
     assert step.cloud.points.dtype == np.float64

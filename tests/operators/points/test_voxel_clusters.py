@@ -61,28 +61,28 @@ def test_noise_equals_the_twin(device, density, samples):
 
 
 @pytest.mark.parametrize("ni", [1, 2, 31, 32, 33, 63, 64, 65, 255, 256, 257])
-def test_rows_of_every_length(device, ni):
+def test_clusters_of_rows_of_every_length_equal_the_twin(device, ni):
     check_equal(device, Volume(noise((3, 5, ni), 0.4), FINE), 0.9, 5)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 90), (1, 40, 1), (40, 1, 1), (1, 40, 40)])
-def test_flat_volumes(device, shape):
+def test_clusters_of_flat_volumes_equal_the_twin(device, shape):
     check_equal(device, Volume(noise(shape, 0.5), OBLIQUE), 1.3, 3)
 
 
 @pytest.mark.parametrize("eps", [0.6, 1.1, 2.3])
-def test_uneven_and_oblique_stacks(device, eps):
+def test_clusters_of_uneven_and_oblique_stacks_equal_the_twin(device, eps):
     assert check_equal(device, uneven(noise((6, 20, 33), 0.35)), eps, 4) > 0
     assert check_equal(device, Volume(noise((8, 12, 40), 0.3), OBLIQUE), eps, 3) > 0
 
 
-def test_a_stencil_beyond_several_words(device):
+def test_clusters_of_a_stencil_beyond_several_words_equal_the_twin(device):
     """eps reaches 34 columns: 3 words on either side."""
     volume = Volume(noise((2, 6, 200), 0.02), np.diag((0.3, 2.0, 9.0, 1.0)))
     assert check_equal(device, volume, 10.3, 3) > 0
 
 
-def test_rows_whose_columns_are_no_neighbours(device):
+def test_clusters_of_rows_whose_columns_are_no_neighbours_equal_the_twin(device):
     """eps joins rows and slices, and not the voxels of a row: each is a node of its own."""
     volume = Volume(noise((6, 9, 70), 0.5), np.diag((2.0, 0.5, 0.8, 1.0)))
     assert check_equal(device, volume, 0.9, 2) > 0
@@ -99,7 +99,7 @@ def test_a_run_is_met_by_two_widened_runs(device):
     assert check_equal(device, volume, 1.5, 1) == 2
 
 
-def test_one_cluster_through_all_rows(device):
+def test_path_through_all_rows_is_one_cluster(device):
     """A path back and forth through every row and slice: labels pass through all parts of the rows."""
     voxels = np.zeros((9, 63, 65), np.int16)
     voxels[:, ::2] = 1
@@ -112,7 +112,7 @@ def test_one_cluster_through_all_rows(device):
 
 
 @pytest.mark.parametrize("value", [0, 1])
-def test_empty_and_full_volumes(device, value):
+def test_empty_and_full_volumes_have_no_or_one_cluster(device, value):
     volume = Volume(np.full((4, 5, 70), value, np.int16), FINE)
     assert check_equal(device, volume, 1.2, 6) == value
 
@@ -138,14 +138,14 @@ def test_parts_of_any_size_give_the_same(device):
 
 
 @pytest.mark.oclgrind
-def test_clusters_under_a_simulator(device):
+def test_clusters_under_a_simulator_equal_the_twin(device):
     check_equal(device, Volume(noise((3, 5, 70), 0.4), FINE), 1.0, 4)
     cloud = voxel_cloud(Volume(noise((3, 4, 40), 0.4), FINE))
     assert cluster_points(cloud.select(np.arange(len(cloud))[::-1]), 1.0, 4, device=device).facts["clusters"] > 0
 
 
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)
-def test_every_type_of_voxel(device, dtype):
+def test_clusters_of_every_voxel_type_equal_the_twin(device, dtype):
     voxels = np.random.default_rng(1).integers(0, 100, (4, 6, 40)).astype(dtype)
     step = cluster_points(Volume(voxels, FINE), 0.8, 3, hu=(30.5, 60), device=device)
     inside = (voxels >= 30.5) & (voxels <= 60)
@@ -360,7 +360,7 @@ def test_bad_input_is_refused(device, arguments, words):
         cluster_points(Volume(noise((3, 4, 40), 0.4), FINE), device=device, **arguments)
 
 
-def test_bands_that_no_voxel_can_have(device):
+def test_bands_that_no_voxel_can_have_are_refused(device):
     volume = Volume(noise((3, 4, 40), 0.4), FINE)
     for band in ((0.2, 0.8), (40_000, 50_000)):
         with refused(NoSurfaceError, "voxel"):

@@ -59,7 +59,7 @@ def test_a_total_beyond_32_bits_is_exact(device):
 
 
 @pytest.mark.oclgrind
-def test_more_blocks_than_a_group_has_items(device, monkeypatch):
+def test_scan_of_more_blocks_than_group_items_equals_the_twin(device, monkeypatch):
     """With groups of one wavefront this is a large scan; small groups make it one that a simulator can check."""
     monkeypatch.setattr(device, "max_work_group_size", 4)
     counts = np.random.default_rng(4).integers(0, 50, 4 * SCAN_PER_ITEM * 5 + 3).astype(np.uint32)
@@ -77,7 +77,7 @@ def test_sizes_that_do_not_fit_are_refused(device):
         compact(device, None, 2**27 + 1)
 
 
-def test_the_twin_is_what_it_says():
+def test_twins_of_scan_and_compact_are_right_by_hand():
     offsets, total = twin.exclusive_scan(np.array([3, 0, 2, 7], np.uint32))
     assert offsets.tolist() == [0, 3, 3, 5]
     assert total == 12

@@ -43,7 +43,7 @@ def check_equal(device, triangles: np.ndarray, vertex_count: int, other=twin.lab
 @pytest.mark.every_device
 @pytest.mark.parametrize("vertices", [1, 2, 31, 63, 64, 65, 1023, 1024, 1025])
 @pytest.mark.parametrize("share", [0.1, 0.35, 3.0])
-def test_random_triangles(device, vertices, share):
+def test_components_of_random_triangles_equal_the_twin(device, vertices, share):
     check_equal(device, soup(vertices, max(1, int(share * vertices))), vertices)
 
 
@@ -127,7 +127,7 @@ def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch)
 
 
 @pytest.mark.oclgrind
-def test_several_rounds_under_a_simulator(device):
+def test_components_after_several_rounds_under_a_simulator_equal_the_twin(device):
     """A shuffled strip takes several rounds, a row of basins several passes; unused vertices and one alone."""
     number = np.random.default_rng(6).permutation(70).astype(np.uint32)
     path = 70 + np.arange(40).reshape(2, 20).T.ravel()
@@ -136,7 +136,7 @@ def test_several_rounds_under_a_simulator(device):
     check_equal(device, triangles, 112)
 
 
-def test_a_mesh_without_triangles(device):
+def test_mesh_without_triangles_has_no_components(device):
     assert label_components(device, np.empty((0, 3), np.uint32), 0)[0] == 0
     count, labels = label_components(device, [], 3)
     assert (count, labels.tolist()) == (0, [-1, -1, -1])

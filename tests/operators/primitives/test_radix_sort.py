@@ -41,19 +41,19 @@ def form(request, device, monkeypatch):
 
 
 @pytest.mark.parametrize("n", SIZES)
-def test_random_keys_of_all_bits(device, form, n):
+def test_random_keys_of_all_bits_are_sorted(device, form, n):
     check_sorted(device, np.random.default_rng(n).integers(0, 2**32, n, dtype=np.uint32))
 
 
 @pytest.mark.parametrize("bits", [0, 1, 2, RADIX_BITS - 1, RADIX_BITS, RADIX_BITS + 1, 21, 22, 23, 31, 32])
-def test_keys_of_few_bits_with_many_equal_ones(device, form, bits):
+def test_keys_of_few_bits_are_sorted_stably(device, form, bits):
     keys = np.random.default_rng(bits).integers(0, 2**bits, 9001, dtype=np.uint32)
     keys[::3] = keys[0]
     check_sorted(device, keys, bits)
 
 
 @pytest.mark.parametrize("order", ["ascending", "descending", "equal", "greatest"])
-def test_keys_in_order(device, form, order):
+def test_keys_in_order_or_equal_are_sorted(device, form, order):
     keys = {
         "ascending": np.arange(12_345, dtype=np.uint32),
         "descending": np.arange(12_345, dtype=np.uint32)[::-1].copy(),
@@ -64,14 +64,14 @@ def test_keys_in_order(device, form, order):
 
 
 @pytest.mark.oclgrind
-def test_several_small_chunks(device, form):
+def test_keys_in_several_small_chunks_are_sorted(device, form):
     """Chunks of 100 elements: a simulator can check many of them."""
     check_sorted(device, np.random.default_rng(5).integers(0, 40, 1234, dtype=np.uint32), 6, fewest=100)
     check_sorted(device, np.random.default_rng(6).integers(0, 2**13, 633, dtype=np.uint32), 13, fewest=100)
 
 
 @pytest.mark.parametrize("group", daily(1, [1, 16]))
-def test_devices_with_small_work_groups(device, form, group, monkeypatch):
+def test_keys_are_sorted_on_devices_with_small_work_groups(device, form, group, monkeypatch):
     monkeypatch.setattr(device, "max_work_group_size", group)
     check_sorted(device, np.random.default_rng(group).integers(0, 500, 5000, dtype=np.uint32), 9)
 
@@ -97,7 +97,7 @@ def test_what_cannot_be_sorted_is_refused(device):
 
 
 @pytest.mark.every_device
-def test_many_keys_where_work_items_end_early(device):
+def test_many_keys_are_sorted_where_work_items_end_early(device):
     """Shares of a core would be longer than llvmpipe's loops: they were sorted wrongly, without a word."""
     if device.most_steps is None:
         pytest.skip("work-items of this device do not end early")

@@ -168,7 +168,7 @@ def test_wrong_arguments_are_refused_first(arguments: dict[str, Any], words: str
         bench.run_bench(None, device="abacus", **arguments)
 
 
-def test_outputs_then_device_then_input(tmp_path: Path) -> None:
+def test_bench_refuses_outputs_then_device_before_the_input(tmp_path: Path) -> None:
     nowhere = tmp_path / "nowhere"
     with refused(OutputError, "nowhere"):
         bench.run_bench(nowhere, device="abacus", report_path=nowhere / "b.json")

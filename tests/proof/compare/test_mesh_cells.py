@@ -141,7 +141,7 @@ def test_cells_beyond_the_grid_are_counted():
     assert found.common_cells == 1
 
 
-def test_progress_is_told():
+def test_search_for_cells_tells_its_progress():
     told = []
     on = grid()
     find_mesh_cells(placed(samples.box(), on), on, progress=lambda *what: told.append(what))

@@ -33,7 +33,7 @@ def edit(path, old, new):
 
 @pytest.mark.fuzz
 @pytest.mark.parametrize("name", daily(4, WRITERS))
-def test_cut_anywhere_it_is_refused(tmp_path, name):
+def test_grid_file_cut_anywhere_is_refused(tmp_path, name):
     path = WRITERS[name](tmp_path / name, make_ct((6, 12, 12)), OBLIQUE)
     beside = [other for other in tmp_path.iterdir() if other != path]
     for part in (path, *beside):
@@ -277,7 +277,7 @@ def test_a_field_of_nrrd_without_its_value_is_refused(tmp_path):
         clrecon.read_volume(path)
 
 
-def test_without_a_position_it_is_refused(tmp_path):
+def test_grid_file_without_a_position_is_refused(tmp_path):
     with pytest.raises(RefusedInputError, match="does not say where it lies"):
         clrecon.read_volume(write_nifti(tmp_path / "a.nii", make_ct(), sform=False))
     path = edit(write_nrrd(tmp_path / "a.nrrd", make_ct()), b"space: left-posterior-superior\n", b"")
