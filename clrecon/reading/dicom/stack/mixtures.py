@@ -158,12 +158,12 @@ ELEMENT_KINDS = (
     ),
     ElementKind(
         "phases",
-        "the writer numbers or names acquisitions with it",
+        "it numbers or names acquisitions",
         frozenset({0x00080017, 0x00083010, 0x00200012, 0x00200100, 0x00209056, 0x00209128, 0x00209156}),
     ),
     ElementKind(
         "phases",
-        "contrast medium is there or not in a whole pass",
+        "a whole pass is with or without contrast medium",
         frozenset({
             0x00180010, 0x00180012, 0x00181040, 0x00181041, 0x00181042, 0x00181043, 0x00181044, 0x00181046, 0x00181047,
             0x00181048, 0x00181049,
@@ -181,22 +181,22 @@ ELEMENT_KINDS = (
     ),
     ElementKind(
         "phases",
-        "people and consoles describe whole volumes with it",
+        "it describes a whole volume",
         frozenset({0x00080070, 0x00081010, 0x00081030, 0x0008103E, 0x00181030, 0x00204000, 0x00400254}),
     ),
     ElementKind("pixels", "it says how a slice is displayed", frozenset({0x00281050, 0x00281051, 0x00281055})),
-    ElementKind("pixels", "its order is the writer's", frozenset({0x00200013})),
+    ElementKind("pixels", "the writer of the files chooses the order", frozenset({0x00200013})),
     ElementKind("pixels", "it says when a file was written", frozenset({0x00080012, 0x00080013})),
     ElementKind(
         "pixels",
-        "the dose follows the patient",
+        "the dose is adapted to the patient from slice to slice",
         frozenset({
             0x00181150, 0x00181151, 0x00181152, 0x00181153, 0x00181170, 0x00189330, 0x00189332, 0x00189345,
         }),
     ),
     ElementKind(
         "nothing",
-        "each turn of the gantry has its own: scanners turn to and fro",
+        "it changes from one rotation of the gantry to the next",
         frozenset({0x00181140, 0x00189305}),
     ),
 )  # fmt: skip
