@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.anatomy import dense_pieces
-from clrecon.anatomy.body_cells import DENSE_HU, PIECE, Cells, Mask, count_cells, grow, measure_cells
+from clrecon.anatomy.body_cells import DENSE_HU, PIECE, Cells, count_cells, grow, measure_cells, spread_mask
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.certificate import amend
+from clrecon.geometry.regions import FACES, IN_SLICE, Mask, Regions, find_holes
 from clrecon.geometry.resample import air_of
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments, name_parameter
@@ -28,7 +29,7 @@ from clrecon.system.progress import Progress, Steps
 from clrecon.system.records import Gate
 from clrecon.system.text import format_ml
 
-TISSUE_HU = -300.0
+TISSUE_HU = -300
 """Cells with higher values are tissue: blankets and foam lie below this value, fat above it."""
 OPENING_MM = 7.0
 """Half the thickness of plates that a morphological opening removes; table tops and shells are 2 to 12 mm thick."""
@@ -104,7 +105,7 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
 
     def outside(k: int) -> Mask:
         nk, nj, ni = volume.voxels.shape
-        return np.asarray(~np.repeat(np.repeat(body[k // step[2]], step[1], 0), step[0], 1)[:nj, :ni])
+        return np.asarray(~np.repeat(np.repeat(body[k // step[2]], step[0], 1), step[1], 0)[:nj, :ni])
 
     figures = {"body_share": round(float(body.mean()), 4), **bone, "bone_removed": removed}
     boneless = [] if pieces.specimen else dense_pieces.find_boneless(cells, body, cells.mean > TISSUE_HU)
@@ -181,16 +182,20 @@ def _turn_into_air(
     volume: Volume, outside: Callable[[int], Mask], name: str, figures: dict[str, Any], steps: Steps, gate: Gate | None
 ) -> Volume:
     """Give the voxels outside the value of the air there; `outside` returns the mask of a slice."""
-    voxels = np.array(volume.voxels)
-    removed = dense = 0
+    voxels = np.empty_like(volume.voxels, subok=False)
+    counts = np.zeros((2, len(voxels)), dtype=np.int64)
     air = _air_level(volume, outside)
-    for k, layer in enumerate(voxels):
-        mask = outside(k)
-        removed += int(np.count_nonzero(mask))
-        dense += int(np.count_nonzero(mask & (layer > TISSUE_HU)))
-        np.copyto(layer, air, where=mask)
-        volume.release_slices(k, k + 1)
-        steps.take()
+
+    def clear_slices(slices: slice) -> None:
+        for k in range(slices.start, slices.stop):
+            layer, mask = volume.voxels[k], outside(k)
+            counts[:, k] = np.count_nonzero(mask), np.count_nonzero(mask & (layer > TISSUE_HU))
+            np.copyto(voxels[k], layer)
+            np.copyto(voxels[k], air, where=mask)
+            volume.release_slices(k, k + 1)
+
+    in_threads(clear_slices, len(voxels), PIECE, steps.take_slice)
+    removed, dense = counts.sum(axis=1).tolist()
     share = removed / voxels.size
     facts = {"voxels_removed": removed, "dense_voxels_removed": dense, "removed_share": round(share, 4), **figures}
     facts["air_hu"] = float(air)
@@ -255,36 +260,22 @@ def _describe_dense(cells: Cells) -> str:
 
 
 def _fill_holes(mask: Mask) -> None:
-    from scipy import ndimage
-
     rows, columns = (np.flatnonzero(mask.any(axis=axes)) for axes in ((0, 2), (0, 1)))
     if not len(rows):
         return
     box = mask[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-
-    def fill_layers(layers: slice) -> None:
-        for layer in box[layers]:
-            # All that is outside is one region with its frame, and the first.
-            regions, _ = ndimage.label(np.pad(~layer, 1, constant_values=True))
-            layer |= regions[1:-1, 1:-1] > 1
-
-    in_threads(fill_layers, len(box), PIECE)
+    box |= find_holes(box)
 
 
 def _thick_parts(tissue: Mask, across: float) -> Mask:
     """Return the largest piece left after opening, and the others that are thick; all False if nothing is left."""
-    from scipy import ndimage
-
     core = grow(tissue, -OPENING_MM / across)
-    pieces, count = ndimage.label(core)
-    if count == 0:
+    pieces = Regions(core, FACES)
+    if pieces.count == 0:
         return np.zeros_like(tissue)
-    sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:]
-    is_thick = np.zeros(count + 1, dtype=bool)
-    is_thick[pieces[grow(core, -(THICK_MM - OPENING_MM) / across)]] = True
-    is_thick[1 + int(sizes.argmax())] = True
-    is_thick[0] = False
-    return grow(is_thick[pieces], OPENING_MM / across) & tissue
+    is_thick = pieces.sum_of(grow(core, -(THICK_MM - OPENING_MM) / across)) > 0
+    is_thick[1 + int(pieces.sizes[1:].argmax())] = True
+    return grow(pieces.cells_of(is_thick), OPENING_MM / across) & tissue
 
 
 def _find_cavities(cells: NDArray[np.float32], tissue: Mask, thick: Mask, across: float) -> Mask:
@@ -294,70 +285,38 @@ def _find_cavities(cells: NDArray[np.float32], tissue: Mask, thick: Mask, across
     cells enclose it and it is small, or where nearly all of its wall is thick.  So the inside of a table does not count
     (its wall is thin shells), nor the gap between back and table (one side of its wall is the thin table top).
     """
-    from scipy import ndimage
-
-    in_plane = ndimage.generate_binary_structure(2, 1)[None]
     unmeasured = grow(find_unmeasured(cells), 2)
-    regions, count = ndimage.label(~tissue & ~unmeasured, np.pad(in_plane, ((1, 1), (0, 0), (0, 0))))
-
-    def cells_beside(mask: Mask) -> NDArray[np.int64]:
-        return np.bincount(regions[grow(mask, 1)], minlength=count + 1)
-
-    thick_wall = cells_beside(thick) / np.maximum(cells_beside(tissue), 1)
+    regions = Regions(~tissue & ~unmeasured, IN_SLICE)
+    thick_wall = regions.sum_of(grow(thick, 1)) / np.maximum(regions.sum_of(grow(tissue, 1)), 1.0)
     at_border = unmeasured
     at_border[:, [0, -1]] = at_border[:, :, [0, -1]] = True
-    is_open = cells_beside(at_border) > 0
-    size = np.bincount(regions.ravel(), minlength=count + 1)
-    is_lung = np.bincount(regions[cells < LUNG_HU], minlength=count + 1) < MOST_AIR * size
-    small = size * across**2 < SMALL_MM2
+    is_open = regions.sum_of(grow(at_border, 1)) > 0
+    is_lung = regions.sum_of(cells < LUNG_HU) < MOST_AIR * regions.sizes
+    small = regions.sizes * across**2 < SMALL_MM2
     foam = is_lung & ~small & (thick_wall > _LUNG_WALL) & (thick_wall <= FOAM_WALL)
-    foam &= np.bincount(regions[cells < FOAM_HU], minlength=count + 1) > 0.5 * size
-    foam[0] = False
+    foam &= regions.sum_of(cells < FOAM_HU) > 0.5 * regions.sizes
     if foam.any():
-        foam[regions[grow(foam[regions], -FOAM_MM / across)]] = False
+        foam &= regions.sum_of(grow(regions.cells_of(foam), -FOAM_MM / across)) == 0
     is_cavity = np.where(is_lung, thick_wall > _LUNG_WALL, ~is_open & (small | (thick_wall > _AIR_WALL)))
-    is_cavity &= ~foam
-    is_cavity[0] = False
-    return np.asarray(is_cavity[regions])
+    return regions.cells_of(is_cavity & ~foam)
 
 
 def find_unmeasured(cells: NDArray[Any]) -> Mask:
     """Mark regions of one value that begin at the corners of a slice: padding, air without noise."""
-    from scipy import ndimage
-
     unmeasured = np.zeros(cells.shape, dtype=bool)
 
     def mark_layers(layers: slice) -> None:
         for layer, out in zip(cells[layers], unmeasured[layers], strict=True):
             for corner in set(layer[np.ix_((0, -1), (0, -1))].flat):
                 out |= layer == corner
-            if np.count_nonzero(out) < _FEWEST_UNMEASURED:
-                out[...] = False
-                continue
-            pieces, count = ndimage.label(out)
-            outer = np.zeros(count + 1, dtype=bool)
-            for side in (pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]):
-                outer[side] = True
-            outer &= np.bincount(pieces.ravel(), minlength=count + 1) >= _FEWEST_UNMEASURED
-            outer[0] = False
-            np.take(outer, pieces, out=out)
 
     in_threads(mark_layers, len(cells), PIECE)
-    return unmeasured
+    regions = Regions(unmeasured, IN_SLICE)
+    return regions.cells_of(regions.reach_border() & (regions.sizes >= _FEWEST_UNMEASURED))
 
 
 def _thin_parts(tissue: Mask, body: Mask, cell_mm: tuple[float, float, float]) -> Mask:
     """Find dense parts that touch the body and are not long."""
-    from scipy import ndimage
-
-    near = ndimage.binary_dilation(body, ndimage.generate_binary_structure(3, 1))
-    pieces, count = ndimage.label(tissue & ~body)
-    if count == 0:
-        return np.zeros_like(body)
-    hangs = np.zeros(count + 1, dtype=bool)
-    hangs[pieces[near]] = True
-    for number, box in enumerate(ndimage.find_objects(pieces), start=1):
-        extent = [(part.stop - part.start) * length for part, length in zip(box, cell_mm[::-1], strict=True)]
-        hangs[number] &= math.hypot(*extent) < LONG_MM
-    hangs[0] = False
-    return np.asarray(hangs[pieces])
+    pieces = Regions(tissue & ~body, FACES)
+    hangs = pieces.sum_of(spread_mask(body)) > 0
+    return pieces.cells_of(hangs & (pieces.measure_diagonals(cell_mm) < LONG_MM))

@@ -23,8 +23,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.anatomy.body_cells import DENSE_HU, Cells, Mask
+from clrecon.anatomy.body_cells import DENSE_HU, Cells, spread_mask
 from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.regions import CORNERS, Mask, Regions, find_holes
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.records import Gate, at_least, unmeasured
 
@@ -47,20 +48,15 @@ _RING_CELLS, _SOFT_RING = 2, 0.8
 """A piece lies in soft tissue if at least this share of the cells within so many cells of it is tissue."""
 
 
-def find_equipment(cells: Cells, labels: NDArray[np.int32], chosen: Mask, tissue: Mask) -> Mask:
-    """Return which of the chosen pieces (n,), numbered in `labels`, are bars or metal and do not lie in soft tissue."""
-    from scipy import ndimage
-
+def find_equipment(cells: Cells, pieces: Regions, chosen: Mask, tissue: Mask) -> Mask:
+    """Return which of the chosen pieces (count + 1,) are bars or metal and do not lie in soft tissue."""
     is_equipment = np.zeros_like(chosen)
-    boxes = ndimage.find_objects(labels)
-    for number in np.flatnonzero(chosen):
-        box = tuple(slice(max(0, part.start - _RING_CELLS), part.stop + _RING_CELLS) for part in boxes[number - 1])
-        piece = labels[box] == number
-        metal = cells.metal[box] > 0
+    for number in np.flatnonzero(chosen).tolist():
+        box, piece = pieces.crop(number, _RING_CELLS)
         # A clip on a rail is one piece with it: without the metal a bar is left.
-        bar = piece & ~ndimage.binary_dilation(metal)
+        bar = piece & ~spread_mask(cells.metal[box] > 0)
         if _is_metal(cells, box, piece) or _is_bar(bar, cells.mean[box], cells.size_mm[::-1]):
-            ring = ndimage.binary_dilation(piece, iterations=_RING_CELLS) & ~piece
+            ring = spread_mask(piece, _RING_CELLS) & ~piece
             is_equipment[number] = not ring.any() or tissue[box][ring].mean() < _SOFT_RING
     return is_equipment
 
@@ -152,7 +148,7 @@ class DensePieces:
 class _Pieces:
     """Connected components, with the number of voxels of each; entry 0 is for cells in no component."""
 
-    labels: NDArray[np.int32]
+    regions: Regions
     dense: Float64Array
     hard: Float64Array
 
@@ -164,26 +160,12 @@ class _Pieces:
 
     def share_in(self, cells: Cells, mask: Mask) -> Float64Array:
         """Return for each piece the share of its dense voxels that lies in the mask."""
-        within = np.bincount(self.labels[mask], weights=cells.dense[mask], minlength=len(self.dense))
-        return np.asarray(within / np.maximum(self.dense, 1.0))
-
-    def cells_of(self, chosen: Mask) -> Mask:
-        picked = chosen.copy()
-        picked[0] = False
-        return np.asarray(picked[self.labels])
+        return np.asarray(self.regions.sum_of(cells.dense * mask) / np.maximum(self.dense, 1.0))
 
 
 def _label(cells: Cells, mask: Mask) -> _Pieces:
-    from scipy import ndimage
-
-    labels, count = ndimage.label(mask, np.ones((3, 3, 3)))
-    dense, hard = (_sum_by(labels, of, count) for of in (cells.dense, cells.hard))
-    return _Pieces(labels, dense, hard)
-
-
-def _sum_by(labels: NDArray[np.int32], of: NDArray[Any], count: int) -> Float64Array:
-    labelled = labels > 0
-    return np.bincount(labels[labelled], weights=of[labelled], minlength=count + 1).astype(np.float64)
+    regions = Regions(mask, CORNERS)
+    return _Pieces(regions, regions.sum_of(cells.dense), regions.sum_of(cells.hard))
 
 
 def find_dense_pieces(cells: Cells, tissue: Mask, thick: Mask, body: Mask) -> DensePieces:
@@ -192,10 +174,8 @@ def find_dense_pieces(cells: Cells, tissue: Mask, thick: Mask, body: Mask) -> De
     tissue, thick: Cells (ck, cj, ci) that are not air, and the thick ones among these.
     body: Cells found by their thickness, without margin; perhaps none.
     """
-    from scipy import ndimage
-
     solid = cells.mean > SOLID_HU
-    soft = thick & ~ndimage.binary_dilation(solid, iterations=2)
+    soft = thick & ~spread_mask(solid, 2)
     specimen = np.count_nonzero(soft) < _SOFT_PER_SOLID * np.count_nonzero(solid)
     return _of_specimen(cells, tissue) if specimen else _of_patient(cells, tissue, body)
 
@@ -213,15 +193,15 @@ def _of_patient(cells: Cells, tissue: Mask, body: Mask) -> DensePieces:
     added = (inside >= INSIDE) | (hard & (inside >= _HARD_INSIDE))
     straight = np.broadcast_to((tissue & ~body).mean(axis=0) >= _STRAIGHT_SHARE, body.shape)
     loose = hard & ~added & (pieces.share_in(cells, straight) < 0.5)
-    loose &= ~find_equipment(cells, pieces.labels, loose, tissue)
+    loose &= ~find_equipment(cells, pieces.regions, loose, tissue)
     apart = loose & (inside == 0.0)
     if apart.any():
         apart &= (_thickness(cells, pieces, apart) > CABLE_MM) | (pieces.dense * cells.voxel_ml > CABLE_ML)
     large = apart & (_room(cells, pieces, apart) >= BODY_ML)
-    mask = pieces.cells_of(added)
+    mask = pieces.regions.cells_of(added)
     if large.any():
-        mask |= _with_edges(cells, pieces.cells_of(large), tissue)
-    return DensePieces(False, mask, pieces.cells_of(added | apart | (loose & (inside > 0.0))))
+        mask |= _with_edges(cells, pieces.regions.cells_of(large), tissue)
+    return DensePieces(False, mask, pieces.regions.cells_of(added | apart | (loose & (inside > 0.0))))
 
 
 def _of_specimen(cells: Cells, tissue: Mask) -> DensePieces:
@@ -231,17 +211,18 @@ def _of_specimen(cells: Cells, tissue: Mask) -> DensePieces:
     bones = pieces.is_hard
     soft = (pieces.dense > 0) & ~bones
     if soft.any():
-        soft &= ~((_lengths(cells, pieces) >= LONG_MM) & (_thickness(cells, pieces, soft) <= RAIL_MM))
-    bone = pieces.cells_of(bones | soft)
+        soft &= ~(
+            (pieces.regions.measure_diagonals(cells.size_mm) >= LONG_MM) & (_thickness(cells, pieces, soft) <= RAIL_MM)
+        )
+    bone = pieces.regions.cells_of(bones | soft)
     return DensePieces(True, _with_edges(cells, bone, tissue & ~table) if bone.any() else bone, bone)
 
 
 def _with_edges(cells: Cells, bone: Mask, tissue: Mask) -> Mask:
     """Return dry bone and the less dense cells that touch it."""
-    from scipy import ndimage
-
-    rounds = max(1, round(GROWTH_MM / cells.across))
-    return np.asarray(ndimage.binary_dilation(bone, iterations=rounds, mask=tissue) | bone)
+    for _ in range(max(1, round(GROWTH_MM / cells.across))):
+        bone = bone | (spread_mask(bone) & tissue)
+    return bone
 
 
 def _straight_plates(cells: Cells, tissue: Mask) -> Mask:
@@ -266,21 +247,10 @@ def _straight_plates(cells: Cells, tissue: Mask) -> Mask:
     uniform = ndimage.maximum(cells.mean.std(axis=0), groups, numbers) <= UNIFORM_HU
     wall = ndimage.maximum(_depth(firm, size), groups, numbers)
     whole = ndimage.maximum(_depth(ndimage.binary_fill_holes(firm), size), groups, numbers)
-    wide = np.array([False, *(_diagonal(box, size) >= LONG_MM for box in ndimage.find_objects(groups))])
+    wide = Regions(firm[None], CORNERS).measure_diagonals((*cells.size_mm[:2], 0.0)) >= LONG_MM
     plates = uniform & ((whole <= RAIL_MM) | (wide & (wall <= RAIL_MM)))
     plates[0] = False
     return np.asarray(table | plates[groups])
-
-
-def _diagonal(box: tuple[slice, ...], size_mm: tuple[float, ...]) -> float:
-    return math.hypot(*((part.stop - part.start) * length for part, length in zip(box, size_mm, strict=True)))
-
-
-def _lengths(cells: Cells, pieces: _Pieces) -> Float64Array:
-    """Return the diagonal of the bounding box of each piece, mm."""
-    from scipy import ndimage
-
-    return np.array([0.0, *(_diagonal(box, cells.size_mm[::-1]) for box in ndimage.find_objects(pieces.labels))])
 
 
 def _depth(mask: Mask, size_mm: tuple[float, ...]) -> Float64Array:
@@ -293,24 +263,19 @@ def _depth(mask: Mask, size_mm: tuple[float, ...]) -> Float64Array:
 
 def _thickness(cells: Cells, pieces: _Pieces, chosen: Mask) -> Float64Array:
     """Return the largest thickness of each chosen piece, mm; 0 for the others."""
-    from scipy import ndimage
-
     thickest = np.zeros(len(chosen))
-    boxes = ndimage.find_objects(pieces.labels)
-    for number in np.flatnonzero(chosen):
-        thickest[number] = _depth(pieces.labels[boxes[number - 1]] == number, cells.size_mm[::-1]).max()
+    for number in np.flatnonzero(chosen).tolist():
+        thickest[number] = _depth(pieces.regions.crop(number)[1], cells.size_mm[::-1]).max()
     return thickest
 
 
 def _room(cells: Cells, pieces: _Pieces, chosen: Mask) -> Float64Array:
     """Return the volume of each chosen piece with the regions that it encloses in each slice, ml; 0 for the others."""
-    from scipy import ndimage
 
     room = np.zeros(len(chosen))
-    boxes = ndimage.find_objects(pieces.labels)
-    for number in np.flatnonzero(chosen):
-        layers = pieces.labels[boxes[number - 1]] == number
-        room[number] = sum(np.count_nonzero(ndimage.binary_fill_holes(layer)) for layer in layers)
+    for number in np.flatnonzero(chosen).tolist():
+        _, layers = pieces.regions.crop(number)
+        room[number] = np.count_nonzero(layers | find_holes(layers))
     return room * math.prod(cells.size_mm) / 1000.0
 
 
@@ -340,7 +305,7 @@ def _judge_share(name: str, share: float | None, words: str) -> Gate:
 def find_removed(cells: Cells, pieces: DensePieces, chosen: Mask) -> list[Piece]:
     """Return the largest pieces of bone that are removed; parameters as of `judge_bone`."""
     lost = _label(cells, pieces.counted & ~chosen)
-    return _list_largest(cells, lost.labels, lost.dense, cells.dense)
+    return _list_largest(cells, lost.regions, lost.dense, cells.dense)
 
 
 def find_boneless(cells: Cells, chosen: Mask, tissue: Mask) -> list[Piece]:
@@ -349,19 +314,18 @@ def find_boneless(cells: Cells, chosen: Mask, tissue: Mask) -> list[Piece]:
     has_bone = parts.is_hard & (parts.hard > 0.0)
     if not has_bone.any():
         return []
-    voxels = _sum_by(parts.labels, math.prod(cells.step) * tissue, len(has_bone) - 1)
+    voxels = math.prod(cells.step) * parts.regions.sum_of(tissue)
     voxels[has_bone | (voxels * cells.voxel_ml < BONELESS_ML)] = 0.0
-    return _list_largest(cells, parts.labels, voxels, tissue)
+    return _list_largest(cells, parts.regions, voxels, tissue)
 
 
-def _list_largest(cells: Cells, labels: NDArray[np.int32], voxels: Float64Array, weights: NDArray[Any]) -> list[Piece]:
+def _list_largest(cells: Cells, regions: Regions, voxels: Float64Array, weights: NDArray[Any]) -> list[Piece]:
     """Return the pieces with the most voxels, at most `_MOST_SAID`, with their middles."""
-    from scipy import ndimage
-
     largest = []
     for number in np.argsort(-voxels, kind="stable")[:_MOST_SAID]:
         if voxels[number]:
-            middle = ndimage.center_of_mass(weights, labels, int(number))[::-1]
+            places = regions.places_of(number)
+            middle = np.average(places[::-1], axis=1, weights=weights[places])
             ijk = tuple((place + 0.5) * step - 0.5 for place, step in zip(middle, cells.step, strict=True))
             largest.append((int(voxels[number]), ijk))
     return largest

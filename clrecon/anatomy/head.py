@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import column_spacing
+from clrecon.geometry.regions import FACES, Regions
 
 SKIN_HU = (-950.0, 150.0)
 """At iso values in this range, between air and bone, the outermost surface is the skin."""
@@ -97,13 +98,8 @@ def _outer_air(volume: Volume) -> tuple[NDArray[np.bool_], NDArray[Any]]:
     steps = np.maximum(1, np.round(PIXEL_MM / spacing).astype(int))
     air = volume.voxels[tuple(slice(None, None, step) for step in steps)] < AIR_HU
     reach = 2 * np.round(OPEN_MM / 2.0 / (spacing * steps)).astype(int) + 1
-    parts, count = ndimage.label(ndimage.minimum_filter(air, size=tuple(reach), mode="nearest"))
-    at_border = np.zeros(count + 1, bool)
-    for axis in range(3):
-        for end in (0, -1):
-            at_border[np.take(parts, end, axis=axis)] = True
-    at_border[0] = False
-    return ndimage.maximum_filter(at_border[parts], size=tuple(reach)) & air, steps
+    parts = Regions(ndimage.minimum_filter(air, size=tuple(reach), mode="nearest"), FACES)
+    return ndimage.maximum_filter(parts.cells_of(parts.reach_border((0, 1, 2))), size=tuple(reach)) & air, steps
 
 
 def shows_face(volume: Volume, hu: float) -> bool:

@@ -12,23 +12,21 @@ get a value above all others, which is never the lowest along a ray; a ray that 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clrecon.anatomy.body import BODY_STEPS, MARGIN_MM, TISSUE_HU, find_body, find_unmeasured
-from clrecon.anatomy.body_cells import count_cells, grow
+from clrecon.anatomy.body_cells import count_cells, grow, spread_mask
 from clrecon.errors import NoSurfaceError, RefusedInputError
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.grid import AIR_HU
+from clrecon.geometry.regions import FACES, Mask, Regions
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, Steps
 from clrecon.system.text import format_ml
-
-Mask = NDArray[np.bool_]
 
 SKIN_MM = 2.0
 """Air less deep than this below the outline of the body is outside: folds of the skin, steps of the outline."""
@@ -69,8 +67,10 @@ def leave_outside_air(volume: Volume, levels: Sequence[float], *, progress: Prog
     steps.take()
     # A lung that is cut by the circle of the reconstruction reaches up to it: unmeasured voxels must not shrink the
     # body.
-    inner = _shrink(body | unmeasured[:: step[2], :: step[1], :: step[0]], (MARGIN_MM + SKIN_MM) / across)
-    deep = _to_voxels(_shrink(body, (MARGIN_MM + SKIN_MM + DEEP_MM) / across, border=False), step, volume)
+    inner = grow(body | unmeasured[:: step[2], :: step[1], :: step[0]], -(MARGIN_MM + SKIN_MM) / across)
+    # Within a frame the border of the scan erodes too.
+    framed = grow(np.pad(body, ((0, 0), (1, 1), (1, 1))), -(MARGIN_MM + SKIN_MM + DEEP_MM) / across)
+    deep = _to_voxels(framed[:, 1:-1, 1:-1], step, volume)
     within = _to_voxels(inner, step, volume)
     steps.take()
 
@@ -108,29 +108,19 @@ def leave_outside_air(volume: Volume, levels: Sequence[float], *, progress: Prog
 
 def _find_cavities(air: Mask, within: Mask, deep: Mask) -> Mask:
     """Find air within the outline that is either not connected to the air outside, or reaches deep."""
-    from scipy import ndimage
-
-    pieces, count = ndimage.label(air & within)
-    keep = np.zeros(count + 1, dtype=bool)
-    keep[pieces[deep]] = True
-    joined = np.zeros(count + 1, dtype=bool)
-    outside = air & ~within
-    for low, high in _neighbours():
-        joined[pieces[low][outside[high]]] = True
-        joined[pieces[high][outside[low]]] = True
-    keep |= ~joined
-    keep[0] = False
-    return np.asarray(keep[pieces])
+    pieces = Regions(air & within, FACES)
+    is_joined = pieces.sum_of(spread_mask(air & ~within)) > 0
+    return pieces.cells_of(~is_joined | (pieces.sum_of(deep) > 0))
 
 
 def _touching_mm2(inside: Mask, outside: Mask, volume: Volume) -> float:
     """Return the area of the faces between the voxels of two masks, mm2."""
     steps = volume.affine[:3, :3].T
-    areas = [float(np.linalg.norm(np.cross(steps[(axis + 1) % 3], steps[(axis + 2) % 3]))) for axis in (2, 1, 0)]
     total = 0.0
-    for area, (low, high) in zip(areas, _neighbours(), strict=True):
-        faces = np.count_nonzero(inside[low] & outside[high]) + np.count_nonzero(outside[low] & inside[high])
-        total += area * int(faces)
+    for axis in range(3):  # k, j, i
+        area = float(np.linalg.norm(np.cross(steps[(3 - axis) % 3], steps[1 - axis])))
+        here, there = np.moveaxis(inside, axis, 0), np.moveaxis(outside, axis, 0)
+        total += area * int(np.count_nonzero(here[:-1] & there[1:]) + np.count_nonzero(there[:-1] & here[1:]))
     return total
 
 
@@ -139,24 +129,6 @@ def _millilitres(mask: Mask, volume: Volume) -> float:
     steps = np.gradient(volume.slice_origins(border=1), axis=0)[1:-1]
     across = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
     return float(np.count_nonzero(mask, axis=(1, 2)) @ np.abs(steps @ across)) / 1000.0
-
-
-def _neighbours() -> Iterator[tuple[Any, Any]]:
-    """Yield for k, j and i the subscripts of the lower and of the upper voxel of each pair of neighbours."""
-    for axis in range(3):
-        low, high = [slice(None)] * 3, [slice(None)] * 3
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        yield tuple(low), tuple(high)
-
-
-def _shrink(mask: Mask, cells: float, *, border: bool = True) -> Mask:
-    """Erode slice by slice; the border of the scan erodes too where `border` is False."""
-    from scipy import ndimage
-
-    for turn in range(max(1, round(cells))):
-        shape = ndimage.generate_binary_structure(2, 1 + turn % 2)[None]
-        mask = ndimage.binary_erosion(mask, shape, border_value=border)
-    return mask
 
 
 def _to_voxels(cells: Mask, step: tuple[int, int, int], volume: Volume) -> Mask:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.regions import FACES, IN_SLICE, Regions, find_holes
 from clrecon.system.light_dataclass import dataclass
 
 Bits = NDArray[np.bool_]
@@ -122,12 +123,6 @@ class _Places:
         return shifted
 
 
-def _fill_slices(solid: Bits) -> Bits:
-    from scipy.ndimage import binary_fill_holes
-
-    return np.stack([binary_fill_holes(section) for section in solid])
-
-
 def _join_holes(solid: Bits, places: _Places) -> tuple[Bits | None, int]:
     """Return the largest hole, joined over the slices, and how many slices close it together; None without one."""
     nk = len(solid)
@@ -135,7 +130,8 @@ def _join_holes(solid: Bits, places: _Places) -> tuple[Bits | None, int]:
         if together > 1 and places.ends[together] - places.ends[0] > MOST_TOGETHER_MM:
             break
         joined = np.stack([solid[k : k + together].any(axis=0) for k in range(nk - together + 1)])
-        holes = _large_sections(_fill_slices(joined) & ~joined, LEAST_HOLE_MM2 / places.area)
+        parts = Regions(find_holes(joined), IN_SLICE)
+        holes = parts.cells_of(parts.sizes >= LEAST_HOLE_MM2 / places.area)
         if holes.any():
             spread = np.zeros_like(solid)
             for k, hole in enumerate(holes):
@@ -146,38 +142,20 @@ def _join_holes(solid: Bits, places: _Places) -> tuple[Bits | None, int]:
     return None, 0
 
 
-def _large_sections(holes: Bits, least: float) -> Bits:
-    """Keep the parts of each slice that have at least so many voxels."""
-    from scipy.ndimage import label as find_components
-
-    large = np.zeros_like(holes)
-    for k in np.flatnonzero(holes.any(axis=(1, 2))):
-        components, _ = find_components(holes[k])
-        sizes = np.bincount(components.ravel())
-        sizes[0] = 0
-        large[k] = (sizes >= least)[components]
-    return large
-
-
 def _largest_open(holes: Bits, solid: Bits, places: _Places) -> Bits | None:
     """Return the largest hole, joined over the slices, that goes on above and below; None without one.
 
     A hollow endplate is a ring in the slices through its rim, but bone lies on one side of its hole.  Gaps of a mask in
     the body lie in front of the middle of all bone, the canal behind it.
     """
-    from scipy.ndimage import find_objects
-    from scipy.ndimage import label as find_components
-
-    components, _ = find_components(holes)
-    sizes = np.bincount(components.ravel())
-    boxes = find_objects(components)
+    components = Regions(holes, FACES)
     middle = places.mean_y(solid)
-    for number in np.argsort(-sizes[1:], kind="stable") + 1:
-        hole = components == number
+    for number in np.argsort(-components.sizes[1:], kind="stable") + 1:
+        hole = components.cells_of(np.arange(components.count + 1) == number)
         if places.mean_y(hole) <= middle:
             continue
         section = hole.any(axis=0)
-        first, last = boxes[number - 1][0].start, boxes[number - 1][0].stop - 1
+        first, last = components.boxes[number, 0]
         away = places.heights - places.heights[[first, last]][:, None]
         above = (away[1] > 0.0) & (away[1] <= max(BEYOND_MM, away[1, min(last + 1, len(solid) - 1)]))
         below = (away[0] < 0.0) & (away[0] >= min(-BEYOND_MM, away[0, max(first - 1, 0)]))
@@ -188,8 +166,6 @@ def _largest_open(holes: Bits, solid: Bits, places: _Places) -> Bits | None:
 
 def _find_front(solid: Bits, main: Bits, places: _Places) -> tuple[Bits, Float64Array, Bits]:
     """Return the canal's front half in the pedicles' slices, its shift in x and y per mm of height, the wall behind."""
-    from scipy.ndimage import label as find_components
-
     middle = float(np.mean(places.heights[np.nonzero(main)[0]]))
     behind = places.mean_y(main)
     slope = np.zeros(2)
@@ -198,10 +174,9 @@ def _find_front(solid: Bits, main: Bits, places: _Places) -> tuple[Bits, Float64
         limits = behind + slope[1] * (places.heights - middle)
         wall = np.stack([places.y(n) >= limit for n, limit in enumerate(limits)])
         blocked = solid | wall
-        components, _ = find_components(_fill_slices(blocked) & ~blocked)
-        sizes = np.bincount(components[main])
-        sizes[0] = 0
-        front = components == np.argmax(sizes) if sizes.any() else np.zeros_like(solid)
+        components = Regions(find_holes(blocked), FACES)
+        sizes = components.sum_of(main)
+        front = components.cells_of((sizes > 0) & (np.arange(len(sizes)) == np.argmax(sizes)))
         rows = np.flatnonzero(front.any(axis=(1, 2)))
         if len(rows) < 3:
             break

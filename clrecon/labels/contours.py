@@ -14,6 +14,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.geometry.regions import number_connected
 from clrecon.system.light_dataclass import dataclass
 
 _MOST_OVER_EACH_OTHER = 20_000
@@ -135,7 +136,7 @@ def _paint(
     shape: tuple[int, int],
 ) -> NDArray[np.bool_]:
     """Fill contours from the outer to the inner ones: one within an odd number of regions, or crossing, is a hole."""
-    region = _join_regions(len(contours), crossing)
+    region = number_connected(len(contours), *np.array(crossing).T).tolist()
     around: list[set[int]] = [set() for _ in contours]
     for outer, inner in nested:
         around[inner].add(region[outer])
@@ -201,13 +202,3 @@ def _goes_beyond(first: _Patch, second: _Patch) -> bool:
     left = first.surely.copy()
     left[first.common(second)] &= ~second.maybe[second.common(first)]
     return bool(left.any())
-
-
-def _join_regions(count: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
-    """Return for each of `count` members the number of its region; pairs are of one region."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    ends = np.array(list(pairs)).T
-    _, regions = connected_components(coo_array((np.ones(ends.shape[1]), ends), shape=(count, count)), directed=False)
-    return [int(region) for region in regions]

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.blocks import MM3_PER_ML
+from clrecon.geometry.regions import FACES, Regions
 from clrecon.labels.label_map import LabelMap
 from clrecon.system.light_dataclass import dataclass
 
@@ -350,15 +351,8 @@ def _close_ends(passable: NDArray[np.bool_], box: Box, shape: tuple[int, ...]) -
 
 def _reach_from_faces(passable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mark the samples that can be reached from the sides of the box through face neighbours."""
-    from scipy.ndimage import label as find_components
-
-    components, count = find_components(passable)
-    reached = np.zeros(count + 1, dtype=bool)
-    for axis in range(3):
-        for side in (0, -1):
-            reached[np.unique(np.moveaxis(components, axis, 0)[side])] = True
-    reached[0] = False
-    return np.asarray(reached[components])
+    components = Regions(passable, FACES)
+    return components.cells_of(components.reach_border((0, 1, 2)))
 
 
 def label_ml(labels: LabelMap, number: int) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.regions import FACES, IN_SLICE, Regions
 from clrecon.geometry.volume import Volume
 from clrecon.spine.discs import AHEAD_MM, ASIDE_MM, BODY_BACK_MM, TILTS_DEG, Bound, Course, Field, Looks
 from clrecon.system.light_dataclass import dataclass
@@ -166,7 +167,7 @@ def _ball(spacing: tuple[float, float, float]) -> Mask:
 
 def fill_bone(part: Part, level: float) -> Mask:
     """Return bone from the level on, closed as far as vertebrae reach, without holes in slices but the canal."""
-    from scipy.ndimage import binary_closing, binary_fill_holes, label
+    from scipy.ndimage import binary_closing
 
     dense = (part.values >= level) & part.within
     raw = dense & (np.abs(part.aside) <= BESIDE_MM)
@@ -175,24 +176,15 @@ def fill_bone(part: Part, level: float) -> Mask:
     inner = tuple(slice(n, n + size) for (n, _), size in zip(margins, raw.shape, strict=True))
     bone = np.asarray(binary_closing(np.pad(raw, margins, mode="edge"), ball)[inner]) | raw
     canal = np.hypot(part.ahead, part.aside) <= _CANAL_MM
-    for plane, tube in zip(bone, canal, strict=True):
-        holes, count = label(binary_fill_holes(plane) & ~plane)
-        fills = np.ones(count + 1, bool)
-        fills[0] = False
-        fills[np.unique(holes[tube])] = False
-        plane |= fills[holes]
+    gaps = Regions(~bone, IN_SLICE)
+    bone |= gaps.cells_of(~gaps.reach_border() & (gaps.sum_of(canal) == 0))
     return np.asarray((bone & part.within & (np.abs(part.aside) <= BESIDE_MM)) | dense)
 
 
 def _find_ribs(part: Part, bone: Mask) -> Mask:
     """Return the bone beside the bodies that joins bone far beside them."""
-    from scipy.ndimage import label
-
-    beside, count = label(bone & part.beside)
-    is_rib = np.zeros(count + 1, bool)
-    is_rib[np.unique(beside[np.abs(part.aside) >= _RIB_MM[0]])] = True
-    is_rib[0] = False
-    return np.asarray(is_rib[beside])
+    beside = Regions(bone & part.beside, FACES)
+    return beside.cells_of(beside.sum_of(np.abs(part.aside) >= _RIB_MM[0]) > 0)
 
 
 def divide(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import AIR_HU, Volume
 from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.regions import FACES, Regions
 from clrecon.labels.label_levels import Growth, fill_solid
 from clrecon.system.light_dataclass import dataclass
 
@@ -279,14 +280,10 @@ def _sample(
 
 def _largest(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the largest piece of a solid, without the cavities in it."""
-    from scipy.ndimage import binary_fill_holes, label
-
-    pieces, count = label(solid)
-    if count > 1:
-        sizes = np.bincount(pieces.ravel())
-        sizes[0] = 0
-        solid = pieces == int(sizes.argmax())
-    return np.asarray(binary_fill_holes(solid), dtype=bool)
+    pieces = Regions(solid, FACES)
+    solid = pieces.cells_of(np.arange(len(pieces.sizes)) == pieces.sizes.argmax())
+    gaps = Regions(~solid, FACES)
+    return solid | gaps.cells_of(~gaps.reach_border((0, 1, 2)))
 
 
 def _cross(

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.anatomy.spine_line import SpineLine, find_spine_line
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array, checked_points
+from clrecon.geometry.regions import FACES, Regions
 from clrecon.geometry.volume import Volume
 from clrecon.labels import LabelMap
 from clrecon.spine.discs import (
@@ -365,7 +366,7 @@ def _spans(
     voxel_ml: float, level: float,
 ) -> tuple[list[tuple[int, Piece]], list[str]]:  # fmt: skip
     """Return the number and span of each piece that is a vertebra, and what else was seen."""
-    from scipy.ndimage import find_objects, label
+    from scipy.ndimage import find_objects
 
     bounds, course = discs.bounds, discs.course
     volumes = np.bincount(pieces.ravel(), minlength=len(bounds) + 2) * voxel_ml
@@ -378,8 +379,8 @@ def _spans(
         begin, end = (upper.at if upper else 0), (lower.at if lower else len(course))
         share = 0.0
         if boxes[n] is not None:
-            parts = np.bincount(label(pieces[boxes[n]] == n + 1)[0].ravel())[1:]
-            share = float(parts.max() / parts.sum())
+            sizes = Regions(pieces[boxes[n]] == n + 1, FACES).sizes
+            share = float(sizes.max() / sizes.sum())
         if end <= begin:
             continue
         piece = Piece(

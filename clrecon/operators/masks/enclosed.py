@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.anatomy.iso_choice import settle_level
-from clrecon.anatomy.marrow import find_open_places, holds_ball
 from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.iso_rule import choose_iso_rule
+from clrecon.geometry.regions import find_open_places, holds_ball
 from clrecon.opencl import Device, download, result_pages, upload, wait
 from clrecon.operators.masks.mask import Mask
 from clrecon.operators.masks.regions import checked_mm

@@ -1,4 +1,4 @@
-"""How wide a space is: balls, ends of the volume, discs in them."""
+"""Connected components against those of scipy; how wide a space is: balls, ends of the volume, discs in them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 from variants import daily
 
-from clrecon.anatomy.marrow import find_open_places, holds_ball, measure_width
+from clrecon.geometry.regions import (
+    CORNERS,
+    FACES,
+    IN_SLICE,
+    Regions,
+    find_holes,
+    find_open_places,
+    holds_ball,
+    measure_width,
+)
 
 FREE = ((False, False),) * 3
 
@@ -66,3 +75,48 @@ def test_places_of_an_end_are_open_outside_of_rings():
     expected = face == 0
     expected[2, 2:4] = False
     np.testing.assert_array_equal(find_open_places(face), expected)
+
+
+CONNECTIONS = {
+    "slice": (IN_SLICE, [np.zeros((3, 3)), [[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.zeros((3, 3))]),
+    "faces": (FACES, None),
+    "corners": (CORNERS, np.ones((3, 3, 3))),
+}
+
+
+@pytest.mark.parametrize("connection", CONNECTIONS)
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.6, 0.95, 1.0])
+@pytest.mark.parametrize("shape", [(5, 13, 17), (4, 9, 64), (1, 1, 9), (3, 7, 1), (1, 1, 1)])
+def test_components_are_numbered_and_measured_as_those_of_scipy(shape, share, connection):
+    ndimage = pytest.importorskip("scipy.ndimage")
+    random = np.random.default_rng(7)
+    mask, other = random.random(shape) < share, random.random(shape) < 0.5
+    values = random.integers(0, 60_000, shape).astype(np.uint16) * (random.random(shape) < 0.2)
+    touching, structure = CONNECTIONS[connection]
+    labels, count = ndimage.label(mask, structure)
+    regions = Regions(mask, touching)
+    painted = sum(number * regions.cells_of(np.arange(count + 1) == number) for number in range(1, count + 1))
+    assert regions.count == count
+    np.testing.assert_array_equal(np.broadcast_to(painted, shape), labels)
+    for sums, weights in ((regions.sizes, mask), (regions.sum_of(other), other), (regions.sum_of(values), values)):
+        inside = np.where(labels > 0, weights, 0).ravel()
+        np.testing.assert_array_equal(sums, np.bincount(labels.ravel(), inside, count + 1))
+    for number, box in enumerate(ndimage.find_objects(labels), start=1):
+        assert [slice(first, last + 1) for first, last in regions.boxes[number]] == list(box)
+        np.testing.assert_array_equal(regions.crop(number)[1], labels[box] == number)
+
+
+def test_a_bar_that_joins_many_fingers_makes_one_component_of_them():
+    """The worst order for joining pairs one by one: all ends come before what connects them."""
+    mask = np.zeros((1, 40, 2001), dtype=bool)
+    mask[0, :, ::2] = True
+    mask[0, -1] = True
+    assert Regions(mask, FACES).count == 1
+
+
+def test_holes_are_those_within_a_slice_and_not_open_to_its_border():
+    mask = np.ones((2, 5, 6), dtype=bool)
+    mask[0, 2, 2:4] = mask[1, 1, 4:] = False
+    expected = np.zeros_like(mask)
+    expected[0, 2, 2:4] = True
+    np.testing.assert_array_equal(find_holes(mask), expected)
