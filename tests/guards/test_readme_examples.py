@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -96,10 +97,10 @@ def test_the_examples_of_styles_run(folder, device, monkeypatch):
 def test_the_examples_of_volumes_run(folder, monkeypatch):
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     blocks = re.findall(r"((?:^    .*\n)+)", text, re.MULTILINE)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     monkeypatch.chdir(folder)
     volume, labels = clrecon.read_volume("ct"), clrecon.read_labels("segmentation.seg.nrrd")
-    made: dict[str, Any] = {"clrecon": clrecon, "numpy": np, "volume": volume, "labels": labels}
+    made: dict[str, Any] = {"clrecon": clrecon, "numpy": np, "threading": threading, "volume": volume, "labels": labels}
     made |= {"mesh": clrecon.extract_isosurface(volume, 226), "second_volume": volume[3:20, 5:]}
     made.update({name: pytest.importorskip(name) for name in ("SimpleITK", "nibabel")})
     for block in blocks:
@@ -107,5 +108,6 @@ def test_the_examples_of_volumes_run(folder, monkeypatch):
     assert made["spine"].shape == (30, 64, 32) and made["slab"].shape == (1, 64, 64)
     assert made["coarse"].spacing == pytest.approx((6.0, 6.0, 6.0))
     assert made["same"].affine == pytest.approx(volume.affine) and made["scan"].dtype == volume.dtype
+    assert made["surface"].quality().closed
     assert made["mean_hu"] >= 226 and made["even"].spacing == pytest.approx((2.0, 2.0, 2.0))
     assert made["loin"].shape[0] == 16 and made["near"].shape_ijk == (20, 20, 20)
