@@ -69,7 +69,7 @@ def test_row_70_every_level_below_bone_is_warned_of() -> None:
 
 @pytest.mark.release
 @pytest.mark.seconds
-def test_row_70_meshes_of_python_say_so(device: Any) -> None:
+def test_row_70_meshes_of_python_warn_of_a_face(device: Any) -> None:
     head = phantom("head")
 
     def warnings(level: Any, volume: Volume = head, **given: Any) -> list[str]:
@@ -83,7 +83,7 @@ def test_row_70_meshes_of_python_say_so(device: Any) -> None:
 
 @pytest.mark.release
 @pytest.mark.slow
-def test_row_70_commands_say_so_once(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_row_70_commands_warn_of_a_face_once(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_phantom(tmp_path / "ct", PhantomSettings(kind="head", **COARSE))
 
     def said(*arguments: str) -> int:
@@ -115,7 +115,7 @@ def test_row_70_the_skin_that_a_surface_shows_is_measured() -> None:
 
 
 @pytest.mark.slow
-def test_row_70_surfaces_of_labels_say_so(
+def test_row_70_surfaces_of_labels_warn_of_a_face(
     device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = PhantomSettings(kind="head", **COARSE)

@@ -40,7 +40,9 @@ def test_the_table_names_stages_kernels_and_the_peer(device: Any, ct: Path, caps
         assert words in out
 
 
-def test_json_and_report_are_the_contract(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
+def test_json_and_report_of_a_bench_have_the_names_of_the_contract(
+    device: Any, ct: Path, tmp_path: Path, printed: Printer
+) -> None:
     report = tmp_path / "b.json"
     arguments = ["bench", str(ct), "--runs", "1", "--device", str(device.index), "--json", "--report", str(report)]
     assert main(arguments) == 0

@@ -152,7 +152,7 @@ def test_several_levels_make_several_files(levels: Any, words: str) -> None:
         (ZeroDivisionError("b"), ClreconError.exit_code, "clrecon: error: unexpected error (ZeroDivisionError: b)"),
     ],
 )
-def test_errors_have_their_line_and_code(
+def test_errors_are_printed_in_a_line_with_their_exit_code(
     error: Exception, code: int, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert common._report_error(error, Console(), debug=False) == code
@@ -165,7 +165,7 @@ def test_files_have_their_units() -> None:
 
 
 @pytest.mark.parametrize("levels", [(200.0, 300.0), ((200.0, 300.0),)])
-def test_methods_are_compared_at_one_level(levels: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_comparison_at_two_levels_or_a_range_is_refused(levels: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(common, "pick", lambda *given: {"iso_value": {"iso_value": levels}})
     with refused(UsageError, "value"):
         compare.run(argparse.Namespace(), Console())
@@ -191,7 +191,7 @@ def test_the_quality_of_a_mesh_is_a_line(closed: bool, words: str) -> None:
     assert mesh_command._describe_quality(report) == [f"         2 components, {words}, manifold, 1,234 mm2"]
 
 
-def test_volumes_of_labels_are_compared() -> None:
+def test_volume_of_a_label_mesh_is_printed_beside_that_of_the_label() -> None:
     one = {"label_number": 1, "iso_value_hu": 200.0, "label_mesh_ml": 11.0, "label_compared_ml": 10.0}
     assert mesh_command._describe_volumes([one, one]) == ["         11.00 ml of mesh for 10.00 ml of labels (+10.0 %)"]
 

@@ -64,7 +64,7 @@ def listing(*entries: dict[str, Any], chosen: int | None = 1) -> dict[str, Any]:
     return {"series": list(entries), "chosen": chosen, "certificate": None}
 
 
-def test_json_is_the_contract(ct: Path, printed: Printer) -> None:
+def test_json_of_info_has_the_names_of_the_contract(ct: Path, printed: Printer) -> None:
     assert main(["info", str(ct), "--json"]) == 0
     said = printed()
     found = said.report()
@@ -172,7 +172,7 @@ def test_a_refused_series_has_its_certificate(tmp_path: Path, capsys: pytest.Cap
     assert "series 1 cannot be used: 1 slice missing" in captured.err
 
 
-def test_quiet_prints_nothing(ct: Path, printed: Printer) -> None:
+def test_info_prints_nothing_when_quiet(ct: Path, printed: Printer) -> None:
     assert main(["info", str(ct), "-q"]) == 0
     assert printed().is_silent
 

@@ -201,7 +201,7 @@ def test_ray_step_is_reported_and_jitter_changes_the_picture(render: Renders) ->
     assert default == pytest.approx(0.5 * min(SPACING))
 
 
-def test_window_is_black_and_white(render: Renders) -> None:
+def test_window_maps_its_ends_to_black_and_white(render: Renders) -> None:
     image, report = render("--mode", "mip", "--window", f"{AIR_HU},{3 * BLOCK_HU}", "--values", render.folder / "v.npy")
     assert report["pictures"][0]["window_hu"] == [AIR_HU, 3 * BLOCK_HU]
     values = np.load(render.folder / "v.npy")
@@ -210,7 +210,7 @@ def test_window_is_black_and_white(render: Renders) -> None:
     assert image[..., :3].max() == round(expected)
 
 
-def test_depth_is_millimetres(render: Renders) -> None:
+def test_depth_file_holds_millimetres_from_the_camera(render: Renders) -> None:
     report = render("--iso", ISO, "--depth", render.folder / "d.npy")[1]
     depth = np.load(render.folder / "d.npy")
     assert depth.dtype == np.float32 and depth.shape == (SIDE, SIDE)

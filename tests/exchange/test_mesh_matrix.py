@@ -35,7 +35,7 @@ def test_every_corner_comes_back_to_its_place(case: MeshCase, tmp_path: Path) ->
     assert read_with_clrecon(path, case).partition(",")[2] == ""
 
 
-def test_the_table_has_these_rows_and_what_clrecon_does(tmp_path: Path) -> None:
+def test_table_of_the_page_has_every_mesh_case_and_its_outcome(tmp_path: Path) -> None:
     from marked_tables import find_table
 
     text = (ROOT / "docs" / "calibration.md").read_text(encoding="utf-8")

@@ -64,7 +64,7 @@ def test_a_row_that_waits_has_no_test_and_says_why() -> None:
     assert not set(PENDING) & set(ROWS) and all(PENDING.values())
 
 
-def test_names_hold_rows() -> None:
+def test_rows_are_read_from_the_names_of_tests() -> None:
     tests = {"a.py": {"test_row_46_a_file", "test_rows_38_and_40_streams"}}
     rows = dict.fromkeys(EXPECTED, ("", ()))
     left = {int(fault.split()[1]) for fault in find_faults(rows, tests)}

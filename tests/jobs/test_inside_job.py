@@ -90,7 +90,7 @@ def test_solid_bone_ends_at_the_surface_fitted_to_it(inside: Any, printed: Print
     assert "200 HU, " in _describe_vertebra(report)[1] and "error 0." in _describe_vertebra(report)[1]
 
 
-def test_what_is_there_stays_with_no_clobber(inside: Any, tmp_path: Path, printed: Printer) -> None:
+def test_existing_file_of_inside_stays_with_no_clobber(inside: Any, tmp_path: Path, printed: Printer) -> None:
     (tmp_path / "in_L2_canal.stl").write_text("kept")
     assert inside("--label", "L1", "--label", "L2", "--no-clobber") == 6
     printed().assert_error("in_L2_canal.stl")

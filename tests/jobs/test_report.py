@@ -32,7 +32,7 @@ def test_numpy_becomes_plain_and_nan_becomes_null() -> None:
     }
 
 
-def test_what_json_cannot_hold_is_an_error() -> None:
+def test_value_that_json_cannot_hold_is_an_error() -> None:
     with pytest.raises(TypeError, match="PosixPath|WindowsPath"):
         to_json({"path": Path("x")})
 

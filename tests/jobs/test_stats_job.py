@@ -100,7 +100,7 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
     check_refused(["stats", files["ct"], *given], code, fact, tmp_path, printed)
 
 
-def test_what_exists_stays_with_no_clobber(files: dict[str, str], tmp_path: Path, printed: Printer) -> None:
+def test_existing_table_of_stats_stays_with_no_clobber(files: dict[str, str], tmp_path: Path, printed: Printer) -> None:
     (tmp_path / "a.csv").write_text("mine")
     given = ["stats", files["ct"], "--labels", files["labels"], "--csv", str(tmp_path / "a.csv")]
     assert main([*given, "--no-clobber"]) == 6

@@ -171,7 +171,7 @@ def test_a_scan_that_is_not_dicom_has_no_segmentation(written: Path, tmp_path: P
     printed().assert_error("NIfTI")
 
 
-def test_what_exists_stays_with_no_clobber(scan: Path, tmp_path: Path, printed: Printer) -> None:
+def test_existing_picture_of_vertebrae_stays_with_no_clobber(scan: Path, tmp_path: Path, printed: Printer) -> None:
     (tmp_path / "a.png").write_text("mine")
     assert main(["vertebrae", str(scan), "-o", str(tmp_path / "a.nii.gz"), "--no-clobber"]) == 6
     printed().assert_error("a.png")

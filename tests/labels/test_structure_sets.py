@@ -106,7 +106,7 @@ def test_what_lies_beyond_the_slices_is_cut_off(volume, tmp_path):
     assert labels.warnings == ("ROI x: 2 contours beyond the slices of the scan left out",)
 
 
-def test_what_is_left_out_is_said(volume, tmp_path):
+def test_points_and_gaps_of_an_roi_are_warned_of(volume, tmp_path):
     point = ("POINT", volume.ijk_to_lps([(4, 4, 4)]))
     rois = {"x": [rectangle(volume, 1, (2, 2), (4, 4)), rectangle(volume, 5, (2, 2), (4, 4)), point], "iso": [point]}
     labels = read_labels(write_structures(tmp_path / "rt.dcm", rois), volume=volume)

@@ -35,7 +35,7 @@ def keeper(device, monkeypatch):
     return device
 
 
-def test_what_was_stored_is_read(own_cache):
+def test_stored_binary_is_read_back(own_cache):
     assert read_binary(KEY) is None
     store_binary(KEY, b"program")
     assert read_binary(KEY) == b"program"

@@ -146,7 +146,7 @@ def build(store, tmp_path):
     return is_there
 
 
-def test_what_worked_is_used_again(records, tmp_path):
+def test_programs_that_worked_are_used_again(records, tmp_path):
     store = records()
     assert not build(store, tmp_path)
     store.record()

@@ -43,7 +43,7 @@ def numbers(size, seed=0):
 @pytest.mark.parametrize(
     "size", [1, 100, LEAST_BYTES - 1, LEAST_BYTES, PIECE_BYTES, PIECE_BYTES + 1, (PIECES + 3) * PIECE_BYTES + 17]
 )
-def test_arrays_come_back_as_they_went(apart, size):
+def test_arrays_come_back_from_the_device_unchanged(apart, size):
     array = numbers(size)
     array_d = upload(apart, array)
     assert np.array_equal(download(apart, np.empty_like(array), array_d), array)

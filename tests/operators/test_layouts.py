@@ -35,7 +35,14 @@ from clrecon.operators.primitives.scan import (
 )
 from clrecon.operators.rays import ray_pictures
 from clrecon.operators.rays.picture_buffers import TILE, PictureBuffers, Shot
-from clrecon.operators.rays.point_pictures import DARKEST_SHARE, LARGEST_DISC, SMALLEST_DISC, _choose_window, _Splats
+from clrecon.operators.rays.point_pictures import (
+    DARKEST_SHARE,
+    LARGEST_DISC,
+    SMALLEST_DISC,
+    Discs,
+    _choose_window,
+    _Splats,
+)
 from clrecon.operators.resident import tables as stack_table
 from clrecon.operators.resident.tables import FieldFrame
 from clrecon.operators.surface import label_masks
@@ -50,7 +57,7 @@ NOWHERE = np.zeros(3)
 
 
 @pytest.mark.parametrize(("bricks", "words"), [(1, 1), (3, 1), (4, 1), (5, 2), (8, 2), (9, 3), (132, 33), (133, 34)])
-def test_words_of_nodes_of_a_field(bricks, words):
+def test_words_of_a_field_hold_the_nodes_of_whole_bricks(bricks, words):
     nodes = Nodes(NOWHERE.astype(np.float32), NOWHERE, np.float32(1.0), (bricks, 2, 3))
     assert BRICK == (8, 4, 4)
     assert nodes.shape == (8 * bricks, 8, 12)
@@ -60,12 +67,12 @@ def test_words_of_nodes_of_a_field(bricks, words):
 
 
 @pytest.mark.parametrize(("cells", "words"), [(1, 1), (32, 1), (33, 2), (64, 2), (1056, 33), (1057, 34)])
-def test_words_of_cells_of_a_grid(cells, words):
+def test_words_of_a_grid_hold_32_cells_each(cells, words):
     plan = GridPlan(np.zeros((1, 3), np.float32), NOWHERE, NOWHERE.astype(np.float32), np.float32(1.0), (cells, 3, 5))
     assert (plan.words, plan.total_words) == (words, 15 * words)
 
 
-def test_bytes_of_a_grid_where_each_point_has_its_own_cell():
+def test_grid_with_a_cell_for_each_point_needs_the_bytes_of_its_buffers():
     """The order of the points stays beside their sorted coordinates and the first point of each cell."""
     for n in (1, 1000):
         points = np.zeros((n, 3), np.float32)
@@ -89,12 +96,12 @@ def sample_grid(ni: int, nj: int = 4, nk: int = 5) -> SampleGrid:
     ("ni", "words", "shift"),
     [(2, 1, 5), (32, 1, 5), (33, 2, 5), (1024, 32, 5), (1025, 33, 6), (2048, 64, 6), (2049, 65, 7)],
 )
-def test_words_of_samples(ni, words, shift):
+def test_words_of_samples_hold_32_each(ni, words, shift):
     grid = sample_grid(ni)
     assert (grid.words, grid.row_shift, grid.flag_words) == (words, shift, 2 ** (shift - 5))
 
 
-def test_slices_and_rows_of_a_slab():
+def test_slab_counts_its_slices_rows_and_bytes():
     grid = sample_grid(40, 7, 12)
     for first, end, classified, counted in ((0, 12, 12, 12), (3, 6, 5, 4), (3, 11, 9, 9), (9, 10, 3, 2)):
         slab = Slab(grid, first, end)
@@ -111,7 +118,7 @@ def test_slices_and_rows_of_a_slab():
         assert all(type(size) is int for size in slab.scratch().values())
 
 
-def test_bytes_of_masks_and_of_a_search():
+def test_masks_and_searches_need_the_bytes_of_their_buffers():
     assert mask_bytes((64, 3, 5)) == {"mask of the voxels": 4 * 2 * 15, "row extents": 60}
     assert mask_bytes((65, 3, 5), pad=2) == {"mask of the voxels": 4 * 5 * 15, "row extents": 60}
     for reach, pad in ((0, 0), (1, 1), (32, 1), (33, 2)):
@@ -135,7 +142,7 @@ def test_several_slabs_of_voxels_are_told(slices, ends):
     assert emission.marked == emission.slabs == max(len(ends), 1)
 
 
-def test_bytes_of_a_slab_of_voxels():
+def test_slab_of_voxels_needs_the_bytes_of_its_buffers():
     emission: Any = SimpleNamespace(
         volume=SimpleNamespace(shape_ijk=(65, 7, 20)),
         selection=SimpleNamespace(labels=None, shell=False),
@@ -159,7 +166,7 @@ def device(cores: int, has_long_items: bool = True) -> Any:
     return SimpleNamespace(compute_units=cores, has_long_items=has_long_items)
 
 
-def test_chunks_and_bytes_of_a_sort():
+def test_chunks_and_digits_of_a_sort_are_planned_by_cores_and_keys():
     assert _plan_chunks(device(1), 1) == (FEWEST_PER_CHUNK, 1)
     n = 16 * FEWEST_PER_CHUNK + 1  # 16 chunks on one core: they get longer by one
     assert _plan_chunks(device(1), n - 1) == (FEWEST_PER_CHUNK, 16)
@@ -175,7 +182,7 @@ def test_chunks_and_bytes_of_a_sort():
     assert sort_bytes(device(1), n, 3) == 8 * n + 32 * 16
 
 
-def test_cells_of_a_chunk_of_clusters():
+def test_chunks_of_clusters_grow_with_the_cells_a_core():
     def chunk(cells: int, cores: int, is_cpu: bool = True) -> int:
         search: Any = SimpleNamespace(_is_cpu=is_cpu, _grid=SimpleNamespace(cells=cells), _device=device(cores))
         return ClusterSearch._plan_chunk(search)
@@ -186,7 +193,7 @@ def test_cells_of_a_chunk_of_clusters():
     assert chunk(12 * a_core, 4) == 3 * CELLS_A_CHUNK
 
 
-def test_items_of_a_picture():
+def test_items_of_a_picture_are_those_of_its_tiles():
     for size, tiles in (((TILE, TILE), 1), ((TILE + 1, TILE), 2), ((3 * TILE, 2 * TILE + 1), 9)):
         picture: Any = SimpleNamespace(size=size)
         picture.tiles = PictureBuffers.tiles.fget(picture)  # type: ignore[attr-defined]
@@ -222,7 +229,7 @@ def test_the_window_of_a_cloud_begins_below_its_lowest_values():
 
 
 @pytest.mark.parametrize("k", [8, 16])
-def test_the_edge_of_cells_by_the_density_of_points(k):
+def test_edge_of_cells_follows_the_density_of_points(k):
     """27 cells of even points hold 5.6 k of them, or 40."""
     points = np.random.default_rng(7).random((20_000, 3)).astype(np.float32)
     wanted = max(40.0, 5.6 * k)
@@ -232,7 +239,7 @@ def test_the_edge_of_cells_by_the_density_of_points(k):
     assert choose_cell_edge(np.ones((5, 3), np.float32), k) == 1.0
 
 
-def test_edges_that_are_not_passed_once_each_way():
+def test_edges_that_are_not_passed_once_each_way_are_counted():
     closed = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]])
     assert _count_open_edges(closed, 4) == 0
     assert _count_open_edges(closed[:3], 4) > 0
@@ -247,7 +254,7 @@ def test_what_a_search_for_ghosts_takes_beside_its_band_is_named():
     assert {name for name, kind in kinds.items() if kind == Parameter.POSITIONAL_OR_KEYWORD} == {"volume", "hu"}
 
 
-def test_the_first_step_to_the_volume_of_a_label(monkeypatch):
+def test_first_step_to_the_volume_of_a_label_is_by_its_slope(monkeypatch):
     """The slope by which levels move the volume, of 300 vertices over voxels of 3 mm3."""
     told = []
     monkeypatch.setattr(label_masks, "next_level", lambda tried, wanted, slope: told.append((wanted, slope)) or 7)
@@ -284,14 +291,16 @@ def test_voxels_of_a_box_of_more_than_2_to_the_31_are_told_apart():
 
 
 @pytest.mark.parametrize(("radius", "pixels"), [(4.0, 8.0), (1.5, 3.0), (1e-9, SMALLEST_DISC), (1e9, LARGEST_DISC)])
-def test_discs_in_pixels(radius, pixels):
+def test_discs_have_their_radius_in_pixels_within_limits(radius, pixels):
     """Half a mm a pixel."""
     camera = Camera((0.0, -50.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), parallel_scale=11.75)
-    splats = _Splats(device(1), Shot(camera, (61, 47)), radius, None, Lighting(), True)
+    nothing = np.zeros((0, 3), np.float32)
+    discs = Discs(nothing, np.zeros((0, 4), np.uint8), nothing, radius, Lighting())
+    splats = _Splats(device(1), discs, Shot(camera, (61, 47)))
     assert splats.disc_pixels == pytest.approx(pixels)
 
 
-def test_the_table_of_an_uneven_stack(monkeypatch):
+def test_table_of_an_uneven_stack_has_heights_steps_and_shifts(monkeypatch):
     """Heights, steps and shifts as the volume was made with; three rows of each slice are its normal matrix."""
     monkeypatch.setattr(stack_table, "upload", lambda device, array: array)
     volume = uneven()

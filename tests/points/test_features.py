@@ -26,7 +26,7 @@ def area_under_curve(scores, wanted):
     return (ranks[wanted].sum() - count * (count + 1) / 2) / (count * (len(scores) - count))
 
 
-def test_a_small_cloud_by_hand():
+def test_distance_ratios_of_a_small_cloud_are_those_by_hand():
     means, nearest = np.array([2.0, 3.0, 1.0, 8.0]), np.array([1.0, 2.0, 0.5, 4.0])
     ratios = distance_ratios(means, nearest, np.array([0, 0, 2, 2]))
     assert ratios.tolist() == [2.0 / 1.5, 3.0 / 1.5, 1.0 / 2.25, 8.0 / 2.25]
@@ -49,7 +49,7 @@ def test_the_median_is_the_same_whatever_the_shape(shape):
     assert 2.4 < np.median(ratios_of(truth.clean)) < 3.1
 
 
-def test_it_does_not_see_edges_and_the_variation_does():
+def test_distance_ratio_misses_edges_and_the_variation_finds_them():
     truth = cube()
     edges = truth.regions["edges"]
     assert 0.35 < area_under_curve(ratios_of(truth.points), edges) < 0.5

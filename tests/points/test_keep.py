@@ -80,7 +80,7 @@ def test_a_sheet_has_no_thickness_and_enough_points() -> None:
     assert figures.sheets.tolist() == [True, False, False, False]  # the third has 480 points
 
 
-def test_figures_of_a_turned_cluster() -> None:
+def test_figures_of_a_turned_cluster_are_those_of_its_points() -> None:
     rng = np.random.default_rng(3)
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     points = (rng.normal(size=(5000, 3)) * (0.5, 2.0, 7.0)) @ turn.T + (900.0, -300.0, 40.0)

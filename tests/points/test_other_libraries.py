@@ -66,7 +66,7 @@ def test_parts_are_ranges_masks_and_numbers():
         iter(cloud)
 
 
-def test_the_box_of_a_cloud():
+def test_bounds_of_a_cloud_are_its_extremes_and_nan_without_points():
     cloud = make_cloud()
     np.testing.assert_array_equal(cloud.bounds, [cloud.points.min(axis=0), cloud.points.max(axis=0)])
     assert np.isnan(cloud[:0].bounds).all()

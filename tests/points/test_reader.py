@@ -34,7 +34,7 @@ def ply(lines: str, form: str = "ascii") -> str:
 AXES = "property float x\nproperty float y\nproperty float z\n"
 
 
-def test_ascii_ply_with_crlf_other_names_and_faces(tmp_path):
+def test_ascii_ply_with_crlf_other_names_and_faces_is_read(tmp_path):
     head = ply(
         "comment made by another program\nobj_info scanned\nelement vertex 3\nproperty double x\nproperty double y\n"
         "property double z\nproperty uchar red\nproperty float intensity\nproperty int cluster\n"
@@ -54,7 +54,7 @@ def test_ascii_ply_with_crlf_other_names_and_faces(tmp_path):
 
 
 @pytest.mark.parametrize(("form", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")])
-def test_binary_ply_of_both_orders(form, order, tmp_path):
+def test_binary_ply_of_both_byte_orders_is_read(form, order, tmp_path):
     head = ply(
         f"element camera 2\nproperty double a\nproperty uchar b\nelement vertex 3\n{AXES}property short scalar_HU\n"
         "property float nx\nproperty float ny\nproperty float nz\n",
@@ -69,7 +69,7 @@ def test_binary_ply_of_both_orders(form, order, tmp_path):
 
 @pytest.mark.parametrize("mark", [" ", "\t", ",", ", ", ";", " ; "])
 @pytest.mark.parametrize("head", ["", "# a word\n", "//X Y Z scalar_HU\n", "x,y,z,hu\n"])
-def test_tables_of_numbers(mark, head, tmp_path):
+def test_tables_of_numbers_are_read_with_any_separator_and_head(mark, head, tmp_path):
     rows = "".join(mark.join(map(str, [*p, hu])) + "\n" for p, hu in zip(POINTS, HU, strict=True))
     cloud = read_points(write(tmp_path / "a.txt", head + rows + "\n"))
     np.testing.assert_array_equal(cloud.points, POINTS)
@@ -81,7 +81,7 @@ def test_tables_of_numbers(mark, head, tmp_path):
         assert warnings == ["columns 4 to 4 have no names in a line before the first point and are left out"]
 
 
-def test_npz_of_other_programs(tmp_path):
+def test_npz_of_other_programs_is_read_with_a_warning(tmp_path):
     np.savez_compressed(tmp_path / "a.npz", xyz=POINTS.astype(np.float64), hu=HU, labels=np.array([0.5, 1, 2]))
     cloud = read_points(tmp_path / "a.npz")
     np.testing.assert_array_equal(cloud.points, POINTS)
@@ -137,7 +137,7 @@ def test_a_surface_of_vtp_gives_its_vertices(tmp_path):
     assert cloud.report["file"]["warnings"] == [f"elements left out: {ball.n_cells:,} lines, strips and polygons"]
 
 
-def test_the_frame_of_a_file(tmp_path):
+def test_frame_of_a_cloud_is_that_of_its_file_or_of_the_caller(tmp_path):
     PointCloud(POINTS).save(tmp_path / "ras.ply", "ras")
     bare = write(tmp_path / "bare.xyz", "1 2 3\n")
     assert read_points(bare).points.tolist() == [[1, 2, 3]]
@@ -206,7 +206,7 @@ def test_bad_files_are_refused_in_one_line(name, content, words, tmp_path):
     assert "\n" not in str(caught.value) and str(tmp_path) not in str(caught.value)
 
 
-def test_missing_files_folders_and_archives_of_something_else(tmp_path):
+def test_missing_files_folders_and_other_archives_are_refused_as_clouds(tmp_path):
     with pytest.raises(UsageError, match=r"there is no cloud .*/none\.ply"):
         read_points(tmp_path / "none.ply")
     with pytest.raises(RefusedInputError, match="cannot be read"):

@@ -8,7 +8,7 @@ import pytest
 from clrecon.points.ghost_slices import judge_slices
 
 
-def test_figures_of_five_slices() -> None:
+def test_figures_of_five_slices_are_those_by_hand() -> None:
     """The middle slice is the likest of its neighbours to none: 2 * 10 / 50 behind, and these are 2 * 11 / 40 alike."""
     counts = np.array([[10, 20, 30, 20, 10], [6, 5, 10, 9, 0], [4, 11, 5, 0, 0]])
     found = judge_slices(counts, 100, (200.0, np.inf), ("a word",))

@@ -63,7 +63,7 @@ def test_two_voxels_see_each_other_or_neither_does() -> None:
     assert any(dk for _, _, _, dk in seen)
 
 
-def test_figures_of_known_scans() -> None:
+def test_stencils_of_known_scans_have_the_members_of_the_design() -> None:
     """Members that the design of the clusters names: 19 at 0.8 mm gaps and eps 1.2, 275 at 4.25 mm and eps 6.4."""
     thoracic = make_stencil(Lattice((512, 512, 95), THORACIC), 1.2)
     assert (thoracic.in_plane, thoracic.members) == (9, (19, 19))

@@ -84,7 +84,9 @@ def test_permissions_are_those_of_the_folder_that_is_replaced(tmp_path: Path) ->
 
 @pytest.mark.parametrize("when", ["before", "after"])
 @pytest.mark.parametrize("place", [1, 2, 3])
-def test_an_interrupt_between_two_renames(place: int, when: str, older: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupt_between_two_renames_leaves_one_whole_folder(
+    place: int, when: str, older: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The older folder goes, the new one comes, the older one gets a name to be removed by: none of it alone."""
     true_way, done = os.rename, []
 

@@ -117,7 +117,7 @@ def test_a_large_frame_of_a_gif_is_as_near_as_one_whose_every_pixel_chose_the_co
     assert off < 1.05 * known_off, (off, known_off)
 
 
-def test_a_gif_of_two_colours(tmp_path):
+def test_gif_of_two_colours_keeps_them(tmp_path):
     frames = [np.full((5, 4, 3), shade, np.uint8) for shade in (0, 255)]
     frames[1][0, 0] = 0
     write_animation(iter(frames), tmp_path / "a.gif")
@@ -139,7 +139,7 @@ def test_apng_keeps_everything(tmp_path, channels):
 
 
 @pytest.mark.parametrize("name", ["turn", "turn/", "v1.2/"])
-def test_a_folder_of_frames(tmp_path, name):
+def test_animation_to_a_folder_writes_its_frames(tmp_path, name):
     pictures = [make_picture(background=(0, 0, 0, opacity)) for opacity in (0, 120, 255)]
     size = write_animation(iter(pictures), f"{tmp_path}/{name}")
     folder = tmp_path / name
@@ -187,7 +187,7 @@ def test_an_interrupted_run_leaves_nothing_and_the_older_file(tmp_path, name, re
 
 
 @pytest.mark.parametrize("name", ["turn.gif", "turn"])
-def test_what_is_not_committed_leaves_the_older_one(tmp_path, name):
+def test_animation_that_is_not_committed_leaves_the_older_one(tmp_path, name):
     write_animation(moving_frames(2), tmp_path / name)
     with stage_animation(moving_frames(3), tmp_path / name) as staged:
         assert count_frames(tmp_path / name) == 2 and staged.size > 0

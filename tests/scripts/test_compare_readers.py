@@ -57,7 +57,7 @@ def test_two_frames_have_no_distance():
 
 
 @pytest.mark.release
-def test_a_row_of_the_table(tmp_path, capsys):
+def test_readers_are_compared_in_a_row_of_the_table(tmp_path, capsys):
     """highdicom takes a tilt of 1 degree for none: 23 gaps of 1.25 mm, 0.50 mm off at both ends together."""
     arguments = ["--small", "--only", "tilt 1 deg", "--readers", "clrecon,highdicom", "--markdown"]
     assert compare_readers.main([*arguments, "--json", str(tmp_path / "table.json")]) == 0
@@ -70,7 +70,7 @@ def test_a_row_of_the_table(tmp_path, capsys):
     assert "tilt -1.00 degrees" in cells["clrecon"]["told"]
 
 
-def test_what_is_not_installed_and_what_is_not_known(monkeypatch, capsys):
+def test_missing_readers_are_shown_as_such_and_unknown_ones_refused(monkeypatch, capsys):
     monkeypatch.setitem(compare_readers.READERS, "highdicom", ("no-such-distribution", None))
     assert compare_readers.main(["--small", "--only", "axial", "--readers", "highdicom"]) == 0
     shown = capsys.readouterr().out

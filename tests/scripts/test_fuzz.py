@@ -82,7 +82,7 @@ def test_outcomes_are_told_apart(kind, run) -> None:
     assert judge(run) == kind
 
 
-def test_what_nothing_contradicts_is_no_fault() -> None:
+def test_change_that_nothing_contradicts_is_no_fault() -> None:
     assert judge(lambda: Answer({"voxels": "b"}), contradicted=False) == "agreed"
 
 
@@ -212,14 +212,14 @@ def test_a_harmed_value_leaves_the_other_elements_readable(keyword) -> None:
         (["mesh", "--json"], 0, "vtk says {}", "", "noise"),
     ],
 )
-def test_calls_that_went_wrong(given, code, out, err, kind) -> None:
+def test_calls_that_went_wrong_are_told_by_their_kind(given, code, out, err, kind) -> None:
     with pytest.raises(WrongOutcome) as caught:
         commands.check_call(given, code, out, err)
     assert caught.value.kind == kind
 
 
 @pytest.mark.parametrize(("code", "name"), [(3, "out.stl"), (0, ".out.stl.tmp")])
-def test_files_that_are_left(code, name) -> None:
+def test_files_that_are_left_behind_are_a_fault(code, name) -> None:
     with pytest.raises(WrongOutcome, match="left"):
         commands.check_files(code, [Path(name)])
     commands.check_files(0, [Path("out.stl")])

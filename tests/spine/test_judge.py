@@ -56,7 +56,7 @@ def traits_of(piece: Piece, gaps: tuple[float, ...] = (), depths: dict[int, floa
     return {name: value for name, (value, _) in judged(piece, gaps, depths).items()}
 
 
-def test_every_trait_of_a_whole_vertebra() -> None:
+def test_whole_vertebra_has_every_trait_with_its_share() -> None:
     found = traits_of(WHOLE, (10.0, 28.0, 99.0), {20: 36.0})
     assert found == pytest.approx(
         {
@@ -97,7 +97,7 @@ def test_a_changed_vertebra_loses_the_trait_of_the_change(
     assert found[name] == pytest.approx(min(value, 1.0), rel=1e-6)
 
 
-def test_what_is_said_of_each_trait() -> None:
+def test_each_trait_is_described_with_its_figure() -> None:
     assert [text for _, text in judged(WHOLE, (10.0, 28.0, 99.0), {20: 36.0}).values()] == [
         "the disc at its upper end is 40 HU darker than bone",
         "the disc at its lower end is 20 HU darker than bone",
@@ -129,7 +129,7 @@ def test_a_wall_is_dense_and_60_hu_denser_than_what_lies_beyond(wall: float, bey
     assert _walls(np.repeat(page[None], PLACES, axis=0), looks, WHOLE) == pytest.approx(share * 12 / 18)
 
 
-def test_traits_that_only_a_whole_vertebra_has() -> None:
+def test_part_of_a_vertebra_lacks_disc_height_and_arch() -> None:
     part = traits_of(replace(WHOLE, lower=None), (28.0,))
     assert set(traits_of(WHOLE, (28.0,))) - set(part) == {"lower disc", "height", "arch"}
     assert "height" not in traits_of(WHOLE)
@@ -160,7 +160,7 @@ def test_confidence_is_what_the_traits_take_from_the_logarithm() -> None:
     assert weigh({**good, "arch": (0.0, "no arch"), "line": (0.8, "no line")}) == (pytest.approx(math.exp(-0.48)), [])
 
 
-def test_bone_beside_a_body() -> None:
+def test_bone_beside_a_body_is_counted_at_its_places() -> None:
     """Within 4 mm of 7 mm beside the wall of the body above, 6 to 20 mm before the canal, at the places 20 to 39."""
     looks, scan = looks_of(), np.full((PLACES, len(AHEAD_MM), len(ASIDE_MM)), np.nan, np.float32)
     looks.side_mm[:10] = 12.0

@@ -327,7 +327,7 @@ def test_the_middle_plane_shows_scan_labels_and_discs() -> None:
 
 
 @pytest.mark.release
-def test_progress_and_level() -> None:
+def test_given_level_is_used_and_progress_told() -> None:
     volume, _, _ = phantom("T12-L3")
     told: list[tuple[str, int, int]] = []
     dense = clrecon.split_vertebrae(volume, level=260.0, keep_unsure=True, progress=lambda *step: told.append(step))

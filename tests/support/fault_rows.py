@@ -21,7 +21,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     3: ("tilt of 1, 2.5, 12, -20 degrees: exact by shear, told", (TRAPS, GEOMETRY + "test_tilt_is_reported")),
     4: (
         "one slice missing: refused; --allow-gaps: true positions, told",
-        (TRAPS, "reading/dicom/test_trap_matrix.py::test_a_refused_row_read_on_request"),
+        (TRAPS, "reading/dicom/test_trap_matrix.py::test_refused_row_is_read_on_request_within_its_bound"),
     ),
     5: ("spacing changes half way: exact positions, told", (TRAPS,)),
     6: ("drift of 0.19 mm a gap: exact positions, told", (TRAPS,)),
@@ -93,7 +93,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     ),
     27: (
         "12-bit signed pixels under overlay bits: right HU",
-        (PIXELS + "test_twelve_bit_signed_values_under_overlay_bits",),
+        (PIXELS + "test_signed_values_of_twelve_bits_are_read_under_overlay_bits",),
     ),
     28: (
         "MONOCHROME1: told; colour, palette, secondary capture: refused",
@@ -131,12 +131,12 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
         "empty, text, PNG, cut at every byte: refused or passed over, never a traceback",
         (
             BAD_INPUT + "test_mesh_refuses_input",
-            "reading/dicom/test_truncation.py::test_a_slice_cut_anywhere",
-            "reading/dicom/test_lost_slices.py::test_what_may_be_left_of_a_slice",
+            "reading/dicom/test_truncation.py::test_slice_cut_anywhere_is_never_read_as_whole",
+            "reading/dicom/test_lost_slices.py::test_file_that_may_be_left_of_a_slice_refuses_the_series",
         ),
     ),
     36: ("no preamble or meta header: only with --force", ()),
-    37: ("sequences nested 300 or 5000 deep: refused", (HOSTILE + "test_deeply_nested_sequences",)),
+    37: ("sequences nested 300 or 5000 deep: refused", (HOSTILE + "test_deeply_nested_sequences_are_refused",)),
     38: ("deflate, RLE, JPEG 2000 bombs: refused before inflating", ()),
     39: (
         "65535 x 65535 voxels, 2^31 - 1 frames: refused before memory is taken",
@@ -149,7 +149,10 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     ),
     42: (
         "big endian; implicit under explicit: right, told",
-        (PIXELS + "test_native_syntaxes_give_the_same_hu", HOSTILE + "test_implicit_elements_under_an_explicit_syntax"),
+        (
+            PIXELS + "test_native_syntaxes_give_the_same_hu",
+            HOSTILE + "test_implicit_elements_under_an_explicit_syntax_are_read_with_a_warning",
+        ),
     ),
     43: (
         "DICOMDIR, links, loops, pipes, devices, sockets, folders with names of files: nothing outside is opened",
@@ -163,8 +166,8 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     46: (
         "bad character set, no permission, a file that vanishes, a disk that hangs: named",
         (
-            "reading/dicom/test_lost_slices.py::test_a_file_that_cannot_be_opened",
-            "reading/dicom/test_lost_slices.py::test_a_folder_that_cannot_be_read",
+            "reading/dicom/test_lost_slices.py::test_file_that_cannot_be_opened_refuses_the_series",
+            "reading/dicom/test_lost_slices.py::test_folder_that_cannot_be_read_refuses_the_series",
         ),
     ),
     47: ("100,000 files, 10,000 series: headers only, bounded memory", ()),
@@ -212,18 +215,18 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     61: (
         "disk full, quota, EPERM, a folder, a name too long: refused, the older file intact",
         (
-            FILES + "test_system_errors",
+            FILES + "test_errors_of_the_system_are_told_in_words",
             FILES + "test_full_disk_is_foreseen",
-            FILES + "test_limit_on_the_size_of_files",
+            FILES + "test_limit_on_the_size_of_files_leaves_the_older_one",
             "exchange/test_mesh_files.py::test_every_writer_notices_a_full_disk",
         ),
     ),
     62: (
         "SIGINT, SIGTERM, SIGKILL in the middle: the older file intact, temporary files removed by the next run",
-        (FILES + "test_process_that_is_stopped", "cli/test_process.py::test_an_interrupt_leaves_nothing"),
+        (FILES + "test_stopped_process_leaves_the_older_file", "cli/test_process.py::test_an_interrupt_leaves_nothing"),
     ),
     63: ("the target exists: replaced as a whole; --no-clobber: refused before any work", ()),
-    64: ("two writers of one name: one whole file", (FILES + "test_many_writers_of_one_name",)),
+    64: ("two writers of one name: one whole file", (FILES + "test_many_writers_of_one_name_leave_a_whole_file",)),
     66: (
         "closed streams, no terminal: no traceback, plain progress",
         (

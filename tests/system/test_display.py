@@ -37,7 +37,7 @@ START = {"display": True, "window": "vtkXOpenGLRenderWindow"}
         ),
     ],
 )
-def test_each_fault_has_its_words(words, code, fault, monkeypatch):
+def test_each_fault_of_a_display_is_described(words, code, fault, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":5")
     assert read_words(words, code) == Display(fault)
 

@@ -103,7 +103,7 @@ def test_replaced_file_keeps_its_mode(older):
         (errno.EIO, os.strerror(errno.EIO).split()[0]),
     ],
 )
-def test_system_errors(older, code, fact):
+def test_errors_of_the_system_are_told_in_words(older, code, fact):
     with pytest.raises(OutputError) as caught:
         replace_file(older, raise_in_the_middle(OSError(code, os.strerror(code))))
     assert_one_line(caught.value, fact, older.name)
@@ -126,7 +126,7 @@ def test_a_folder_that_vanishes_is_said(tmp_path):
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), UsageError("no"), RuntimeError("no"), SystemExit(3)])
-def test_other_errors_pass_through(older, error):
+def test_other_errors_leave_the_older_file_and_pass_through(older, error):
     with pytest.raises(type(error), match=f"^{error}$"):
         replace_file(older, raise_in_the_middle(error))
     check_untouched(older)
@@ -141,7 +141,7 @@ def test_older_file_stays_when_verifying_is_interrupted(older):
     check_untouched(older)
 
 
-def test_failed_check(older):
+def test_file_that_fails_its_check_leaves_the_older_one(older):
     def verify(temporary: Path) -> None:
         raise OutputError("3 triangles, 4 expected")
 
@@ -162,7 +162,7 @@ def test_bytes_that_are_lost_are_noticed(older):
 
 
 @pytest.mark.parametrize("piece", [100_000, 300])  # more and less than the buffer holds
-def test_limit_on_the_size_of_files(older, piece):
+def test_limit_on_the_size_of_files_leaves_the_older_one(older, piece):
     """A real limit of the system, in a process of its own."""
     code = f"""
         import resource
@@ -200,7 +200,7 @@ class TestRefusedTargets:
             action(tmp_path / "no" / "bone.stl")
         assert names(tmp_path) == []
 
-    def test_parent_is_a_file(self, action, older):
+    def test_file_below_a_file_is_refused(self, action, older):
         with refused(OutputError, "bone.stl", "folder"):
             action(older / "bone.stl")
         check_untouched(older)
@@ -231,18 +231,18 @@ class TestRefusedTargets:
             with refused(OutputError, "socket"):
                 action("s")
 
-    def test_name_too_long(self, action, tmp_path):
+    def test_name_too_long_is_refused(self, action, tmp_path):
         with refused(OutputError, "long"):
             action(tmp_path / ("x" * 300 + ".stl"))
         assert names(tmp_path) == []
 
-    def test_link_loop(self, action, tmp_path):
+    def test_link_loop_is_refused(self, action, tmp_path):
         (tmp_path / "a").symlink_to(tmp_path / "b")
         (tmp_path / "b").symlink_to(tmp_path / "a")
         with refused(OutputError, "itself"):
             action(tmp_path / "a")
 
-    def test_null_character(self, action, tmp_path):
+    def test_null_character_in_a_name_is_refused(self, action, tmp_path):
         with refused(OutputError, "character"):
             action(f"{tmp_path}/a\0b")
 
@@ -251,7 +251,7 @@ class TestRefusedTargets:
             action(tmp_path / "no\nfolder\x1b[31m" / "x.stl")
         assert_one_line(caught.value, "exist")
 
-    def test_no_permission(self, action, older, monkeypatch):
+    def test_missing_permission_is_refused(self, action, older, monkeypatch):
         real = os.open
 
         def refuse(path, flags, *rest, **more):
@@ -264,7 +264,7 @@ class TestRefusedTargets:
             action(older)
         check_untouched(older)
 
-    def test_write_protected_file(self, action, older, monkeypatch):
+    def test_write_protected_file_is_refused(self, action, older, monkeypatch):
         monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write to everything
         with pytest.raises(OutputError, match="write-protected"):
             action(older)
@@ -291,7 +291,7 @@ def test_link_is_followed(tmp_path):
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_process_that_is_stopped(older, how):
+def test_stopped_process_leaves_the_older_file(older, how):
     """The older file stays; what a killed process leaves is removed by the next writer, and only that."""
     code = f"""
         import sys, time
@@ -323,7 +323,7 @@ def test_process_that_is_stopped(older, how):
     assert names(older.parent) == [".clrecon-notes", "bone.stl", "other.stl"]
 
 
-def test_many_writers_of_one_name(tmp_path):
+def test_many_writers_of_one_name_leave_a_whole_file(tmp_path):
     """Whoever is last, the file is whole; nobody's temporary file is swept away."""
     path = tmp_path / "bone.stl"
     failures: list[BaseException] = []

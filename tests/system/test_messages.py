@@ -136,7 +136,7 @@ def test_every_public_class_is_a_message_or_owns_a_device():
 
 
 @pytest.mark.parametrize("name", [name for name in clrecon.__all__ if name.endswith("Error") or name == "Cancelled"])
-def test_errors_travel(name):
+def test_errors_are_pickled_with_their_message(name):
     error = travel(getattr(clrecon, name)("what, where, and what to do"))
     assert type(error) is getattr(clrecon, name)
     assert str(error) == "what, where, and what to do"

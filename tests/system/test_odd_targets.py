@@ -37,7 +37,7 @@ sys.exit(main(sys.argv[1:]))
         ],
     ),
 )
-def test_a_deleted_current_folder(command: str, tmp_path: Path) -> None:
+def test_deleted_current_folder_is_told_by_every_command(command: str, tmp_path: Path) -> None:
     call = [sys.executable, "-c", IN_A_DELETED_FOLDER, *command.split()]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (6, "")
@@ -51,7 +51,7 @@ def test_a_deleted_current_folder(command: str, tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not os.path.exists("/dev/stdout"), reason="the system has no /dev/stdout")
 @pytest.mark.parametrize("sink", ["pipe", "file"])
-def test_a_link_to_standard_output(sink: str, tmp_path: Path) -> None:
+def test_link_to_standard_output_is_refused(sink: str, tmp_path: Path) -> None:
     """A pipe cannot be replaced; a file would be, and whoever reads the stream would see nothing of it."""
     (tmp_path / "out.stl").symlink_to("/dev/stdout")
     code = "import sys; from clrecon.cli.main import main; sys.exit(main(['mesh', 'ct', '-o', 'out.stl']))"
@@ -64,7 +64,7 @@ def test_a_link_to_standard_output(sink: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "why"), [("a\0b", "a null character"), ("\ud800", "no file name of this system")])
-def test_names_that_no_file_can_have(name: str, why: str) -> None:
+def test_names_that_no_file_can_have_are_refused(name: str, why: str) -> None:
     with pytest.raises(OutputError, match=why):
         resolve_target(name)
 

@@ -42,7 +42,7 @@ def test_defaults_are_those_of_the_fields() -> None:
         Settings()  # type: ignore[call-arg]
 
 
-def test_numbers_with_commas() -> None:
+def test_numbers_with_commas_are_read_by_their_count() -> None:
     point = numbers_reader(2, "is no place")
     assert point(" 1,-2.5") == (1.0, -2.5)
     for text in ("", "1", "1,2,3", "1,x", "1,"):

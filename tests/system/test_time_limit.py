@@ -10,7 +10,7 @@ from clrecon.errors import UsageError
 from clrecon.system.progress import DEFAULT_SECONDS, device_seconds, time_limit
 
 
-def test_time_limits():
+def test_time_limits_are_nested_and_wrong_ones_refused():
     assert device_seconds() == DEFAULT_SECONDS
     with time_limit(3):
         assert device_seconds() == 3.0

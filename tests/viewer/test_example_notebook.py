@@ -36,7 +36,7 @@ def check_outputs(notebook) -> None:
 
 
 @pytest.mark.release
-def test_it_runs_and_shows_what_the_kept_one_shows(device):
+def test_notebook_runs_and_shows_what_the_kept_one_shows(device):
     nbformat = pytest.importorskip("nbformat")
     nbclient = pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")
@@ -52,7 +52,7 @@ def test_it_runs_and_shows_what_the_kept_one_shows(device):
 
 
 @pytest.mark.release
-def test_its_page_is_drawn_in_what_nbconvert_writes(tmp_path):
+def test_page_of_the_notebook_is_drawn_after_nbconvert(tmp_path):
     nbconvert = pytest.importorskip("nbconvert")
     text, _ = nbconvert.HTMLExporter().from_filename(str(NOTEBOOK))
     path = tmp_path / "notebook.html"

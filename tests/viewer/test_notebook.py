@@ -92,7 +92,7 @@ def test_without_a_device_nothing_is_raised(monkeypatch):
 
 
 @pytest.mark.unit
-def test_what_is_empty_and_what_is_not_ours():
+def test_notebook_shows_empty_meshes_and_no_other_objects():
     assert "0 triangles" in Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))._repr_html_()
     assert clrecon.to_html("text") is None  # type: ignore[arg-type]
 

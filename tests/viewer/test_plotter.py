@@ -48,7 +48,7 @@ def shows_bone(seen: np.ndarray) -> bool:
 
 
 @pytest.mark.release
-def test_a_session_at_the_window(display, scan, tmp_path):
+def test_window_turns_clips_and_steps_the_level(display, scan, tmp_path):
     with open_view(display, [scan, "--window", "--hu", f"{ISO:g}"], tmp_path) as window:
         before = window.wait(shows_bone, "the surface")
         assert before.shape[:2] == SIZE[::-1]
@@ -82,7 +82,7 @@ def test_a_distance_is_measured_between_two_clicks(display, tmp_path):
 
 @pytest.mark.release
 @pytest.mark.parametrize("how", daily(1, ["interrupt", "window manager"]))  # a session below is closed by the latter
-def test_it_ends_by_ctrl_c_and_by_the_window_manager(display, tmp_path, how):
+def test_window_ends_by_ctrl_c_and_by_the_window_manager(display, tmp_path, how):
     make_mesh().save(tmp_path / "ball.stl")
     with open_view(display, ["ball.stl", "--window"], tmp_path) as window:
         window.wait(shows_bone, "the ball")

@@ -17,7 +17,7 @@ from clrecon.proof.surface.extract import extract_isosurface
 
 
 @pytest.mark.parametrize("without_table", [False, True])
-def test_rails_that_are_left_out_say_so(without_table):
+def test_rails_that_are_left_out_are_warned_of(without_table):
     k, j, i = np.indices((36, 24, 36))
     hu = np.where((abs(i - 28) < 4) & (abs(j - 12) < 4), 1500.0, 0.0)
     hu[np.hypot(i - 11, j - 12) < 5 + 3 * np.sin(k / 4)] = 1000.0

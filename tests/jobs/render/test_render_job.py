@@ -70,7 +70,9 @@ def test_views_have_scales_of_their_own_until_zoom_makes_them_one(
         assert alone["pictures"][0]["pixel_mm"] == pytest.approx(largest, rel=1e-4)
 
 
-def test_the_report_is_what_the_contract_says(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+def test_report_of_pictures_has_the_names_of_the_contract(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
     files = PictureFiles(tmp_path / "a.png", turntable=tmp_path / "frames", depth=tmp_path / "a.npy")
     settings = RenderSettings.of(
         "mip", window=(-100, 100), size=SIZE, turntable=Turntable(2), device=str(device.index), memory=10**9

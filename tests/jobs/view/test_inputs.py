@@ -108,7 +108,7 @@ def test_inputs_are_told_one_by_one_meshes_before_scans(files):
         (["cloud.pcd"], UsageError, "convert"),
     ],
 )
-def test_what_cannot_be_read_is_said(files, names, error, words):
+def test_inputs_of_a_view_that_cannot_be_read_are_refused(files, names, error, words):
     for name in ("text.stl", "text.ply", "cloud.pcd"):
         (files / name).write_text("no such thing")
     with pytest.raises(error, match=words):

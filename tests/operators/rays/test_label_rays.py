@@ -82,7 +82,7 @@ def test_what_is_translucent_shows_what_is_behind(device, grid):
         assert np.abs(found.expected_depth - mean)[both].max() <= tolerances.SURFACE_RAY_VOXEL * max(volume.spacing)
 
 
-def test_it_is_translucent_where_nothing_is_behind(device):
+def test_translucent_label_is_translucent_where_nothing_is_behind(device):
     volume, labels = two_balls("even")
     camera = look(volume, (1.0, 0.0, 0.0), 12.0)
     found = cast(device, volume, camera, labelled(labels, {}, {"L1": 0.4}))
@@ -156,7 +156,7 @@ def test_slabs_give_the_picture_of_the_whole(device, towards):
 
 
 @pytest.mark.oclgrind
-def test_a_small_picture_under_the_simulator(device):
+def test_small_surface_of_labels_is_seen_under_the_simulator(device):
     volume, labels = two_blocks()
     style = labelled(labels, None, {"L1": 0.3, "L2": 0.6})
     clip = Clip.plane(centre_of(volume), (0.0, 0.5, 1.0))

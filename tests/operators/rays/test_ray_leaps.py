@@ -55,7 +55,7 @@ def assert_same(one: Rendering, other: Rendering) -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_thin_slices_of_wide_voxels_at_a_wide_angle(device, monkeypatch, seed):
+def test_thin_slices_of_wide_voxels_are_seen_at_a_wide_angle(device, monkeypatch, seed):
     """Rays of a tile that are as far along are at other heights: some voxels where these are thin."""
     rng = np.random.default_rng(seed)
     voxels = np.zeros((300, 12, 12), np.int16)
@@ -94,7 +94,7 @@ def scattered(rng, uneven: bool) -> Volume:
 
 
 @pytest.mark.parametrize("uneven", daily(1, [False, True]))
-def test_scattered_voxels_from_anywhere(device, monkeypatch, uneven):
+def test_scattered_voxels_are_seen_from_anywhere(device, monkeypatch, uneven):
     """The last sample of a ray lies before its place in the row: with few samples a brick alone may hold it."""
     shown = 0
     for seed in range(40):
@@ -172,7 +172,7 @@ def test_what_is_opaque_is_so_in_the_shortest_last_segment(device):
 
 
 @pytest.mark.parametrize("tilt", [2e-4, -2e-4])
-def test_slabs_in_the_order_of_rays_that_run_almost_along_the_slices(device, monkeypatch, tilt):
+def test_slabs_of_rays_almost_along_the_slices_give_the_picture_of_the_whole(device, monkeypatch, tilt):
     """Rays pass from slab to slab half way through: what they see first is in front all the same."""
     voxels = np.zeros((64, 40, 16), np.int16)
     voxels[:, :20] = 450

@@ -57,7 +57,7 @@ REFUSED: dict[str, tuple[dict[str, Any], list[str]]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_is_refused_in_one_line(device, name):
+def test_impossible_pictures_are_refused_in_one_line(device, name):
     from clrecon.operators.rays.render import render
 
     settings, words = REFUSED[name]

@@ -113,7 +113,7 @@ def assert_alike(found: Any, expected: Any, mode: str) -> None:
 
 
 @pytest.mark.parametrize("name", daily(10, SCENES))
-def test_the_kernel_is_its_twin(device, name):
+def test_raycast_of_every_scene_equals_its_twin(device, name):
     volume, settings = SCENES[name]()
     assert_alike(DeviceCaster(device)(volume, **settings), TwinCaster()(volume, **settings), settings["mode"])
 
@@ -121,7 +121,7 @@ def test_the_kernel_is_its_twin(device, name):
 @pytest.mark.every_device
 @pytest.mark.usefixtures("users_kernels")
 @pytest.mark.parametrize("name", ["soft", "mip", "drr"])
-def test_the_kernel_of_users_is_its_twin(device, name):
+def test_raycast_by_kernels_of_users_equals_its_twin(device, name):
     volume, settings = SCENES[name]()
     assert_alike(DeviceCaster(device)(volume, **settings), TwinCaster()(volume, **settings), settings["mode"])
 
@@ -210,7 +210,7 @@ def test_jitter_has_the_same_bits_on_devices(device):
 
 
 @pytest.mark.every_device
-def test_two_pictures_of_one_camera_are_one(device):
+def test_pictures_of_one_camera_are_the_same_each_time(device):
     volume, settings = SCENES["steep"]()
     first, again = (DeviceCaster(device)(volume, **settings) for _ in range(2))
     assert np.array_equal(first.image, again.image) and np.array_equal(first.depth, again.depth, equal_nan=True)

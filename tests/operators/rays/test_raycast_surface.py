@@ -126,7 +126,7 @@ def test_a_full_volume_is_closed_half_way_to_the_air_around_it(cast):
             assert np.abs(shot.depth - truth).max() <= 2e-3 * spacing[axis]
 
 
-def test_a_clip_plane_through_it_is_capped(cast):
+def test_surface_cut_by_a_clip_plane_is_capped(cast):
     radius, size = 9.0, (40, 40)
     volume = even_volume(lambda p: 300.0 + 30.0 * (radius - np.linalg.norm(p, axis=1)), "mirrored", 24.0)
     normal = np.array([0.3, 1.0, 0.2]) / np.linalg.norm([0.3, 1.0, 0.2])

@@ -171,7 +171,7 @@ def test_a_device_that_is_too_small_is_named(device, monkeypatch):
         clrecon.render(body(), size=(16384, 16384), device=device, memory=1 << 28)
 
 
-def test_pictures_stay_what_they_were(device):
+def test_pictures_are_not_changed_by_later_ones(device):
     """Their pages are lent from a pool, and later pictures of the same size come from the same pool."""
     with clrecon.VolumeRenderer(body(), device=device) as renderer:
         kept = renderer.render("mip", size=(640, 512), view=(10, 20))

@@ -125,7 +125,7 @@ def test_what_has_no_mesh_before_it_looks_as_alone(device: Any) -> None:
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("name", ["parallel", "perspective"])
-def test_slices_before_and_behind_a_mesh(device: Any, name: str) -> None:
+def test_slices_before_and_behind_a_mesh_are_blended_in_order(device: Any, name: str) -> None:
     """Each of a pixel's slices and both faces of the box come in the order of their depth."""
     camera, chosen = CAMERAS[name], [2, 7, 12, 17]
     mesh, opacity = screen(1.0), 0.3
@@ -199,7 +199,7 @@ def test_cameras_fit_all_objects(device: Any) -> None:
     assert ((pixels > 0.0) & (pixels < SIZE)).all()
 
 
-def test_several_pictures_of_one_scene_and_two_threads_of_looks(device: Any) -> None:
+def test_pictures_of_one_scene_are_the_same_each_time_and_from_the_device(device: Any) -> None:
     with ScenePictures([(block(), VolumeLook(FOG)), (Mesh(*ball(5.0, 10)), MeshLook())], device=device) as pictures:
         one = pictures.take(CAMERAS["parallel"], SIZE)
         other = pictures.take(CAMERAS["inside"], SIZE)

@@ -47,12 +47,12 @@ def assert_twin(device, volume, camera, slices, clip=None, opacity=0.4, lowest=-
 @pytest.mark.every_device
 @pytest.mark.parametrize("perspective", [False, True])
 @pytest.mark.parametrize("grid", GRIDS)
-def test_the_kernel_is_its_twin(device, grid, perspective):
+def test_slice_overlay_equals_its_twin(device, grid, perspective):
     volume = make_volume(blobs, grid, dtype=np.int16)
     assert_twin(device, volume, look(volume, (0.4, 0.8, -0.7), 14.0, perspective), [1, 4, 7, 12])
 
 
-def test_from_below_through_clip_planes_and_in_floats(device):
+def test_slices_from_below_behind_a_clip_plane_equal_the_twin(device):
     volume = make_volume(blobs, "uneven")
     clip = Clip.plane(centre_of(volume), (0.5, 0.4, 1.0))
     assert_twin(device, volume, look(volume, (0.3, -0.6, 0.8), 14.0), [2, 3, 9, 14, 15], clip)
@@ -67,7 +67,7 @@ def test_a_camera_between_the_slices_sees_them_on_both_sides(device):
 
 
 @pytest.mark.oclgrind
-def test_a_few_slices_under_the_simulator(device):
+def test_few_slices_under_the_simulator_equal_the_twin(device):
     volume = make_volume(blobs, "sheared", 6.0, np.int16)
     camera = look(volume, (0.4, 0.8, -0.7), 5.0)
     found = overlay_slices(DeviceVolume(volume, device=device), camera, (12, 9), slices=[0, 2, 4], window=WINDOW)
@@ -113,7 +113,7 @@ def test_opacity_adds_up_and_front_hides_back(device):
     assert np.abs(hidden[0].depth - (150.0 - 5.0)).max() < 0.1  # slice 6 lies 5 mm above the middle
 
 
-def test_colours_of_a_transfer_function(device):
+def test_slices_take_the_colours_of_a_transfer_function(device):
     volume = make_volume(lambda p: np.full(len(p), 150.0), "even", 8.0, np.int16)
     function = TransferFunction([(0, 1, 0, 0, 0), (300, 0, 1, 0, 0)])
     found = overlay_slices(
@@ -140,7 +140,7 @@ def test_parts_that_fit_the_memory_give_the_same_picture(device):
         overlay_slices(DeviceVolume(volume, device=device, memory=picture), camera, size, slices=slices)
 
 
-def test_slices_that_are_seen_edge_on_say_so(device):
+def test_slices_that_are_seen_edge_on_are_warned_of(device):
     volume = make_volume(blobs, "even", 8.0, np.int16)
     camera = Camera.fit(volume, "anterior")
     assert "edge-on" in overlay_slices(DeviceVolume(volume, device=device), camera, (8, 8)).report["warnings"][0]

@@ -144,7 +144,7 @@ def test_a_cloud_far_away_looks_the_same(device: Any) -> None:
     assert (np.abs(far.image.astype(int) - near.image).max(axis=-1) > 2).mean() < tolerances.FAR_SPLAT_SHARE
 
 
-def test_colours_by_hu_label_and_reason(device: Any) -> None:
+def test_points_are_coloured_by_hu_label_or_reason(device: Any) -> None:
     points = np.array([(x, 0, 0) for x in (-6, -2, 2, 6)], np.float32)
     cloud = PointCloud(points, hu=[0, 100, 200, 300], labels=[-1, 0, 2, 0], report={"label_names": {2: "sheet"}})
 

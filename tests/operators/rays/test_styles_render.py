@@ -105,7 +105,7 @@ def test_pixel_width_and_angle_of_a_cut_change_its_picture(device: Any) -> None:
     assert straight is not None and turned is not None and not np.array_equal(straight, turned, equal_nan=True)
 
 
-def test_what_a_style_does_not_say_is_checked_beside_it(device: Any) -> None:
+def test_keywords_beside_a_style_are_refused_where_they_mean_nothing(device: Any) -> None:
     with VolumeRenderer(body(), device=device) as renderer:
         with pytest.raises(UsageError, match="leave out color, or the style"):
             renderer.render(SurfaceLook(), color="red")

@@ -97,7 +97,7 @@ def scene(name: str) -> tuple[Volume, dict]:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_the_kernel_is_its_twin(device, name):
+def test_surface_of_every_scene_equals_its_twin(device, name):
     volume, settings = scene(name)
     camera = settings["camera"]
     style = SurfaceLook(100.0, color="white", **{name: value for name, value in settings.items() if name != "camera"})
@@ -109,7 +109,7 @@ def test_the_kernel_is_its_twin(device, name):
 @pytest.mark.release
 @pytest.mark.usefixtures("users_kernels")
 @pytest.mark.parametrize("name", daily(1, ["soft", "clipped", "uneven"]))
-def test_one_sample_at_a_time_gives_the_same(device, name, monkeypatch):
+def test_surface_found_by_one_sample_at_a_time_is_the_same(device, name, monkeypatch):
     volume, settings = scene(name)
     found = cast(device, volume, 100.0, **settings)
     monkeypatch.setitem(device.kernel_variants, "LANES", "1")
@@ -160,7 +160,7 @@ def test_depths_are_those_of_the_extracted_mesh_caps_included(device, grid):
     assert near.mean() >= 1.0 - tolerances.SURFACE_OUTLINE_SHARE
 
 
-def test_a_clip_plane_through_it_is_flat_and_lit_by_its_own_normal(device):
+def test_cap_of_a_clipped_surface_is_flat_and_lit_by_the_plane(device):
     volume = make_volume(ball, "mirrored", 20.0)
     normal = np.array([0.3, 1.0, 0.2]) / np.linalg.norm([0.3, 1.0, 0.2])
     middle = centre_of(volume) + 2.0 * normal
@@ -243,7 +243,7 @@ def test_a_light_has_a_direction_and_no_length(device):
 
 @pytest.mark.oclgrind
 @pytest.mark.parametrize("grid", daily(1, ["sheared", "uneven"]))
-def test_a_small_picture_under_the_simulator(device, grid):
+def test_small_surface_is_seen_under_the_simulator(device, grid):
     volume = make_volume(blobs, grid, 6.0, np.int16)
     camera = look(volume, (0.4, 1.0, -0.3), 4.0, perspective=True)
     clip = Clip.plane(centre_of(volume), (0.3, 1.0, 0.2))

@@ -167,7 +167,7 @@ def _fan(vertices: np.ndarray) -> list[tuple[int, int, int]]:
     return [(0, int(a), int(b)) for a, b in zip(order, np.roll(order, -1), strict=True)]
 
 
-def test_large_and_small_triangles_and_pieces_of_them(device: Any) -> None:
+def test_large_and_small_triangles_are_drawn_as_the_twin_in_any_order(device: Any) -> None:
     """A screen behind specks: all boxes, and both orders of the meshes, show the same."""
     camera, size = CAMERAS["perspective"], (333, 150)
     screen = Mesh([(-900.0, 30.0, -900.0), (900.0, 40.0, -900.0), (0.0, 35.0, 900.0)], [(0, 1, 2)])
@@ -201,7 +201,7 @@ def test_of_triangles_in_one_place_the_first_is_seen(device: Any) -> None:
     assert (draw_layers(alone(device), parts[::-1], Shot(FRONT, (17, 17))).image == (0, 0, 255, 255)).all()
 
 
-def test_what_is_beside_behind_or_as_small_as_a_pixel(device: Any) -> None:
+def test_triangles_beside_or_behind_the_camera_are_not_drawn_and_small_ones_are(device: Any) -> None:
     look = MeshLook("white", lighting=UNSHADED)
     aside = quad(100.0, 120.0, 0.0)
     assert np.isnan(clrecon.render(aside, look, camera=FRONT, size=SIZE, device=device).depth).all()

@@ -66,7 +66,7 @@ def test_a_picture_has_1024_x_1024_pixels_unless_asked_otherwise(device):
     assert render(volume, "slice", view="axial", device=device).image.shape[:2] == (1024, 1024)
 
 
-def test_the_other_axes_and_the_letters_of_anatomy(device):
+def test_slices_along_every_axis_have_the_sides_of_anatomy(device):
     """Axes along the patient: an axial slice has the left at the right, a sagittal one the front at the left."""
     volume = Volume(random_voxels((6, 8, 12)), np.diag((1.0, 1.0, 1.0, 1.0)))
     middle = volume.ijk_to_lps([(6.0, 4.0, 3.0)])[0]  # a voxel beside the middle: pixels lie on voxels

@@ -39,7 +39,7 @@ def test_ranges_and_states_equal_those_of_the_twin(device, shape, dtype):
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
 @pytest.mark.parametrize("shape", [(3, 9, 7), (9, 10, 33), (24, 17, 64), (5, 30, 100), (2, 3, 1030)])
-def test_the_surface_is_the_same_with_and_without(device, shape, dtype, closed):
+def test_surface_is_the_same_with_and_without_bricks(device, shape, dtype, closed):
     """Blocks of equal values, so that there are bricks of all kinds at every place of a word."""
     random = np.random.default_rng(3)
     blocks = random.integers(0, 4, [-(-n // 6) for n in shape])

@@ -56,7 +56,7 @@ def largest_edge(steps: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("grid", GRIDS)
-def test_sphere_from_its_distance_field(device, grid):
+def test_sphere_of_its_distance_field_is_closed_and_near_it(device, grid):
     steps = make_grid(grid)
     voxel = largest_edge(steps)
     radius = 5.0 * voxel

@@ -87,7 +87,7 @@ def test_a_fit_scales_with_the_voxels(device):
 @pytest.mark.parametrize(
     ("uneven", "few"), [(False, False), (True, False), (False, True)], ids=["even", "uneven", "few places at a time"]
 )
-def test_slabs_change_nothing(device, uneven, few):
+def test_cortex_fitted_in_slabs_is_that_of_the_whole(device, uneven, few):
     even = hollow_ball(thickness=2.0)
     volume = stack(even.voxels, OBLIQUE, uneven=uneven)
     mesh, whole = fit_surface(volume, device)
@@ -102,7 +102,7 @@ def test_slabs_change_nothing(device, uneven, few):
         assert np.array_equal(getattr(slabs, name), getattr(whole, name), equal_nan=True), name
 
 
-def test_what_is_no_wall_is_told(device):
+def test_vertices_on_vessels_metal_and_ends_are_told_as_no_wall(device):
     volume = hollow_ball(thickness=2.0)
     voxels = volume.voxels.copy()
     k, j, i = np.indices(voxels.shape)

@@ -63,7 +63,7 @@ def test_fitting_keeps_triangles_and_topology(level, fitted):
     assert len(find_self_intersections(fitted.vertices, fitted.triangles)) == 0
 
 
-def test_what_is_said(fitted, level):
+def test_report_of_a_fitted_cortex_counts_every_vertex(fitted, level):
     found = fitted.report["cortex"]
     assert found["moved"] and found["vertices"] == level.vertex_count
     assert sum(found[name] for name in ("fitted", "not_bone", "metal", "badly_fitted", "no_room")) == found["vertices"]
@@ -208,7 +208,7 @@ def test_a_dry_specimen_wants_a_low_level(shell, tmp_path, capsys):
         assert not warned or "stay below 200 HU" in said.err and "--hu -200 finds them" in said.err
 
 
-def test_where_there_is_no_bone_it_is_said(shell, tmp_path, capsys):
+def test_cortex_of_a_scan_without_bone_says_its_reason(shell, tmp_path, capsys):
     soft = shell.with_voxels(np.where(shell.voxels > 500, 250, shell.voxels // 2).astype(np.int16))
     soft.save(tmp_path / "ct.nii.gz")
     given = (tmp_path / "ct.nii.gz", "-o", tmp_path / "a.stl", "--report", tmp_path / "a.json")
@@ -242,6 +242,6 @@ def test_a_label_lies_on_the_bone(shell, tmp_path):
         (["--surface", "cortex", "--method", "skimage"], "vertices of one mesh"),
     ],
 )
-def test_the_command_refuses(options, words, tmp_path, capsys):
+def test_cortex_options_without_sense_are_refused(options, words, tmp_path, capsys):
     assert run(tmp_path, "-o", tmp_path / "a.stl", *options) == 3
     assert words in capsys.readouterr().err

@@ -50,7 +50,7 @@ def test_levels_double_their_edge_and_the_finest_has_few_rows():
 
 
 @pytest.mark.oclgrind
-def test_a_few_triangles(device):
+def test_few_crossing_triangles_are_marked_as_by_the_twin(device):
     vertices, triangles = scattered(150, extent=(8.0, 8.0, 8.0))
     found = mark_crossings(device, plan_crossings(vertices, triangles))
     assert np.array_equal(found, twin.mark_crossings(vertices, triangles)) and found.any()
@@ -67,7 +67,7 @@ def test_pairs_are_those_of_the_host(device, sizes, extent, place):
 
 
 @pytest.mark.parametrize("fewest", [1, 10_000])
-def test_pairs_with_a_changed_triangle(device, fewest):
+def test_crossings_with_a_changed_triangle_are_those_of_the_host(device, fewest):
     vertices, triangles = scattered(900)
     changed = np.arange(900) % 4 == 1
     every = find_self_intersections(vertices, triangles)
@@ -78,7 +78,7 @@ def test_pairs_with_a_changed_triangle(device, fewest):
 
 
 @pytest.mark.parametrize("scale", daily(1, [2.0**-60, 2.0**-9, 1.0, 2.0**30]))
-def test_bodies_that_cut_each_other(device, scale):
+def test_bodies_that_cut_each_other_have_the_pairs_of_the_host_at_any_scale(device, scale):
     """Whatever the unit of length; two spheres whose triangles lie in each other's planes too."""
     sphere = samples.sphere(rounds=3)
     for shift in ((11.0, 4.0, -3.0), (0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (25.0, 0.0, 0.0)):

@@ -39,13 +39,13 @@ def test_steps_have_the_bits_of_the_twin(device, iterations):
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("size", [7, 8, 9, 31])
-def test_open_surfaces_of_all_sizes_do_too(device, size):
+def test_open_surfaces_of_all_sizes_are_smoothed_to_the_bits_of_the_twin(device, size):
     vertices, triangles = sheet(size)
     assert has_same_bits(device, rough(vertices), triangles, 5)
 
 
 @pytest.mark.oclgrind
-def test_a_small_surface(device):
+def test_small_surface_is_smoothed_to_the_bits_of_the_twin(device):
     vertices, triangles = samples.box()
     assert has_same_bits(device, rough(vertices), triangles, 3)
 

@@ -69,7 +69,7 @@ def test_slabs_give_the_same_mesh(device):
     assert np.array_equal(whole.vertices, parts.vertices) and np.array_equal(whole.triangles, parts.triangles)
 
 
-def test_labels_are_as_exact(device):
+def test_labels_far_from_the_origin_are_as_exact_as_near_it(device):
     volume, near = make_sphere(FAR), make_sphere()
     numbers = (volume.voxels > -500).astype(np.uint8)
     far_label = extract_labels(volume, LabelMap(numbers, volume.affine), 1, device=device)[1]

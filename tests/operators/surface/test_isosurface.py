@@ -121,7 +121,7 @@ def test_an_object_that_leaves_the_volume_is_closed_or_left_open(device):
 
 
 @pytest.mark.every_device
-def test_the_order_is_the_same_on_every_run(device):
+def test_order_of_vertices_and_triangles_is_the_same_on_every_run(device):
     volume = smooth_volume()
     first, second = (extract_isosurface(volume, 100, device=device) for _ in range(2))
     assert np.array_equal(first.triangles, second.triangles)
@@ -289,7 +289,7 @@ def test_the_report_says_how_the_mesh_was_made(device):
 
 
 @pytest.mark.oclgrind
-def test_every_pass_on_a_small_volume(device):
+def test_every_pass_over_a_small_volume_equals_the_twin(device):
     """Small enough for a checking simulator: whole words, a word's rest, and rows shorter than a word."""
     for shape in [(3, 4, 33), (2, 3, 5)]:
         volume = random_volume(shape)

@@ -60,7 +60,7 @@ def assert_sound(mesh) -> dict:
 @pytest.mark.every_device
 @pytest.mark.parametrize("closed", daily(1, [True, False]))
 @pytest.mark.parametrize("shape", daily(4, SHAPES))
-def test_device_equals_twin(device, shape, closed):
+def test_surfaces_of_label_masks_equal_their_twin(device, shape, closed):
     if not closed and min(shape) < 2:
         pytest.skip("an open map of one layer has no cells")
     affine = MIRRORED if shape[0] % 2 else OBLIQUE
@@ -396,7 +396,7 @@ def test_the_report_says_what_was_done(device):
     assert set(mesh.report["seconds"]) == {"upload", "build", "kernels", "download"}
 
 
-def test_what_cannot_be_is_refused(device):
+def test_arrays_empty_maps_and_unknown_labels_are_refused(device):
     labels = LabelMap(np.ones((2, 3, 4), np.uint8), np.eye(4))
     with refused(UsageError, "LabelMap", "labels"):
         extract_label_masks(labels.voxels, device=device)
@@ -407,7 +407,7 @@ def test_what_cannot_be_is_refused(device):
 
 
 @pytest.mark.oclgrind
-def test_every_pass_on_a_small_map(device):
+def test_every_pass_over_a_small_map_equals_the_twin(device):
     labels = random_labels((3, 4, 34), numbers=(0, 0, 3, 300))
     for number, mesh in extract_label_masks(LabelMap(labels, OBLIQUE), device=device).items():
         level = round(mesh.report["mask_level"] * FULL)

@@ -62,7 +62,7 @@ def count_half_way(volume, inside, number, iso_value) -> int:
 @pytest.mark.parametrize("closed", daily(1, [True, False]))
 @pytest.mark.parametrize("solid", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_device_equals_twin(device, shape, solid, closed):
+def test_surfaces_of_labels_equal_their_twin(device, shape, solid, closed):
     volume, labels = random_volume(shape), random_labels(shape)
     numbers = (3, 7, 300)
     inside = twin.find_solid(volume, labels, 3, grow_mm=1.2, closed=closed, solid=numbers if solid else ())
@@ -257,7 +257,7 @@ def test_a_label_outside_the_volume_is_refused_when_asked_for(device):
 
 
 @pytest.mark.oclgrind
-def test_every_pass_on_a_small_volume(device):
+def test_every_pass_over_small_labels_equals_the_twin(device):
     volume, labels = random_volume((4, 4, 33)), random_labels((4, 4, 33))
     inside = twin.find_solid(volume, labels, 3, grow_mm=1.2)
     for number, mesh in extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, grow_mm=1.2).items():
@@ -265,7 +265,7 @@ def test_every_pass_on_a_small_volume(device):
 
 
 @pytest.mark.oclgrind
-def test_a_label_without_growth_between_other_slices(device):
+def test_label_without_growth_between_other_slices_equals_the_twin(device):
     """The slices that are held reach as far as those that are read."""
     volume, labels = random_volume((12, 4, 33)), np.zeros((12, 4, 33), np.uint16)
     labels[4:6] = 3

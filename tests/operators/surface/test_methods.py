@@ -57,7 +57,7 @@ def test_scikit_image_is_placed_and_wound_alike(affine: np.ndarray | None, devic
     assert theirs["area_mm2"] == pytest.approx(ours["area_mm2"], rel=0.02)
 
 
-def test_grown_and_decimated_methods(device: Any) -> None:
+def test_methods_that_grow_or_decimate_do_so(device: Any) -> None:
     volume = smooth_volume()
     grown = extract_by_method(volume, 250, "i-mc", device=device)
     assert_sound(grown)
@@ -79,7 +79,7 @@ def test_grown_and_decimated_methods(device: Any) -> None:
         ("t-mc-soup", {"plain": False}, ("value",)),
     ],
 )
-def test_what_does_not_go_together_is_refused(method: str, options: dict[str, Any], words: str) -> None:
+def test_methods_refuse_options_that_they_do_not_have(method: str, options: dict[str, Any], words: str) -> None:
     with refused(UsageError, *words):
         check_method(method, **options)
 

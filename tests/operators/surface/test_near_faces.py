@@ -86,7 +86,7 @@ def test_what_is_left_is_beyond_the_limit(device):
     assert seen > 20
 
 
-def test_vertices_without_faces_and_empty_requests(device):
+def test_vertices_without_faces_have_infinite_bounds_and_empty_requests_none(device):
     vertices, triangles = sheet(4)
     bounds = DeviceBounds(device, np.concatenate([vertices, [[9.0, 9.0, 9.0]]]), triangles)
     length, rows = bounds.find_bounds(np.array([[0.3, 0.2, 1.0]] * 2), np.array([[16, 16], [16, 0]]), 0.0, walks=2)
@@ -126,7 +126,7 @@ def test_long_requests_are_made_in_parts(device):
 
 
 @pytest.mark.oclgrind
-def test_a_small_surface(device):
+def test_bounds_and_witnesses_of_a_small_surface_are_found(device):
     vertices, triangles = samples.box()
     bounds = DeviceBounds(device, vertices, triangles.astype(np.uint32))
     length, _ = bounds.find_bounds(vertices * 1.1, np.arange(8)[:, None], 0.0, 2)

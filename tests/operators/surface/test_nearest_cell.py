@@ -25,7 +25,7 @@ SHEARED = np.array([[0.7, 0.0, 0.4, -80.0], [0.0, 0.8, 0.5, 3.0], [0.0, 0.1, 2.0
 
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize("affine", [OBLIQUE, MIRRORED, SHEARED, None], ids=["oblique", "mirrored", "sheared", "uneven"])
-def test_it_is_the_nearest_of_all(affine: Any, closed: bool, device: Any) -> None:
+def test_nearest_cell_is_the_nearest_of_all(affine: Any, closed: bool, device: Any) -> None:
     made = smooth_volume((19, 30, 90))
     volume = uneven(made.voxels[4:10]) if affine is None else Volume(made.voxels, affine)
     rule = choose_iso_rule(volume, 300, closed=closed)

@@ -252,7 +252,7 @@ def test_the_report_says_what_is_inside(device):
 
 
 @pytest.mark.oclgrind
-def test_every_pass_on_a_small_volume(device):
+def test_every_pass_over_a_small_range_equals_the_twin(device):
     for shape in [(3, 4, 33), (2, 3, 5)]:
         assert_equals_twin(random_volume(shape), (2, 3), device)
         assert_equals_twin(random_volume(shape), 3, device, below=True)

@@ -141,7 +141,7 @@ def test_normals_look_the_way_the_faces_do(device):
 
 
 @pytest.mark.every_device
-def test_the_order_is_the_same_on_every_run(device):
+def test_order_of_vertices_and_triangles_is_the_same_on_every_run(device):
     volume = random_volume((6, 9, 70), high=1000)
     first, second = (extract(volume, 500, device) for _ in range(2))
     assert np.array_equal(first.triangles, second.triangles)

@@ -185,7 +185,7 @@ def test_a_band_without_bone_is_refused(dense, device):
         clrecon.vertebra_inside(volume, labels, 1, dense=dense, device=device)
 
 
-def test_real_vertebrae(real_data, device):
+def test_canals_and_volumes_of_real_vertebrae_are_plausible(real_data, device):
     folder = real_data / "thoracolumbar_labels"
     volume = clrecon.read_volume(folder / "example_ct.nii.gz")  # 3 mm: cortex is thinner than a voxel
     labels = clrecon.read_labels(folder / "spine_report" / "totalseg.nii.gz")
@@ -226,7 +226,7 @@ def test_tilted_and_oblique_scans_have_the_same_parts(turned, device):
     assert 12.0 <= inside.canal_found.height_mm <= 15.6
 
 
-def test_the_canal_of_real_masks(real_data, device):
+def test_canals_of_real_masks_are_plausible(real_data, device):
     labels = clrecon.read_labels(real_data / "vertebra_masks" / "sub-verse004_seg-vert_msk.nii.gz")  # sagittal slices
     volume = Volume(np.where(labels.voxels > 0, 500, 0).astype(np.int16), labels.affine)
     for number in labels.numbers:

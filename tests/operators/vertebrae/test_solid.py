@@ -124,7 +124,7 @@ def test_an_uneven_stack_keeps_its_places(device):
     assert np.allclose(np.sort(np.unique(places[:, 2])), np.unique(positions[held.to_numpy().any(axis=(1, 2)), 2]))
 
 
-def test_what_cannot_be_is_refused_in_words(device):
+def test_solid_bone_refuses_arrays_and_unknown_labels(device):
     voxels, ring = tube()
     affine = np.eye(4)
     volume, labels = Volume(voxels, affine), LabelMap(ring, affine, {1: "ring"})

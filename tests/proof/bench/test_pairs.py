@@ -48,7 +48,7 @@ def test_without_warming_nothing_runs_beforehand() -> None:
 
 
 @pytest.mark.parametrize(("limit", "pairs"), [(100.0, 9), (16.0, 5), (0.0, FEWEST_PAIRS), (None, 9)])
-def test_the_limit_ends_it_after_the_fewest_pairs(limit: float | None, pairs: int) -> None:
+def test_time_limit_ends_the_pairs_after_the_fewest(limit: float | None, pairs: int) -> None:
     time = FakeTime()
     ours, theirs = alternate(time.worker("a", 1.0), time.worker("b", 2.0), 9, limit_s=limit, clock=time.clock)
     assert len(ours) == len(theirs) == pairs
@@ -63,7 +63,7 @@ def test_ratios_are_those_of_pairs() -> None:
         summarise([1.0], [1.0, 2.0])
 
 
-def test_the_processor_is_read(tmp_path: Path) -> None:
+def test_processor_name_is_read_from_the_system(tmp_path: Path) -> None:
     file = tmp_path / "cpuinfo"
     file.write_text("processor\t: 0\nmodel name\t: Some CPU @ 2 GHz\nmodel name\t: other\n")
     assert processor_name(file) == "Some CPU @ 2 GHz"

@@ -59,7 +59,7 @@ def test_runs_are_those_of_the_trilinear_field(made, finer, offsets, closed):
     assert count_points(keys) == np.count_nonzero(wanted)
 
 
-def test_nothing_and_everything_inside():
+def test_lattice_counts_no_point_or_all_of_a_constant_volume():
     for value, closed, inside in ((0, True, 0), (0, False, 0), (9, False, 3 * 4 * 5), (9, True, 3 * 4 * 5)):
         volume = Volume(np.full((4, 5, 6), value, np.int16), OBLIQUE)
         rule = choose_iso_rule(volume, 5.0, closed=closed)
@@ -68,7 +68,7 @@ def test_nothing_and_everything_inside():
         assert found == (4 * 5 * 6 if closed and inside else inside)
 
 
-def test_exclusive_or_of_runs():
+def test_exclusive_or_of_runs_holds_what_one_alone_has():
     one, other = np.array([1, 4, 6, 9]), np.array([2, 4, 6, 7, 20, 21])
     apart = exclusive_or(one, other)
     assert apart.tolist() == [1, 2, 7, 9, 20, 21]

@@ -66,7 +66,7 @@ def test_a_shift_is_scatter_alone():
     assert found.max_mm == pytest.approx(0.3, abs=tolerances.BALL_SAGITTA_MM)
 
 
-def test_a_torus():
+def test_torus_with_a_thicker_tube_has_that_bias_and_no_scatter():
     found = measure_truth(Mesh(*samples.torus(300, 120, minor=6.25)), Ring())
     assert found.bias_mm == pytest.approx(0.25, abs=tolerances.BALL_SAGITTA_MM)
     assert found.scatter_mm < tolerances.BALL_SAGITTA_MM
@@ -146,7 +146,7 @@ def test_cells_of_a_phantom_are_near_its_surface(kind):
     assert np.abs(truth.signed_distance(grid.ijk_to_lps(cut.ijk + 0.5))).max() <= half
 
 
-def test_cells_of_a_mesh_against_those_of_its_truth():
+def test_cells_of_a_mesh_agree_with_those_of_its_truth():
     grid = Volume(np.zeros((33, 33, 33), np.int16), np.eye(4))
     truth = Ball((16.2, 15.9, 16.4))
     mesh = Mesh(*samples.sphere((16.2, 15.9, 16.4), RADIUS, 6))

@@ -116,7 +116,7 @@ def test_analytic_voxels_hold_the_stated_volume_and_level(kind: str) -> None:
 
 
 @pytest.mark.release
-def test_same_seed_same_bytes_other_seed_other_bytes(tmp_path: Path) -> None:
+def test_phantom_has_the_same_bytes_with_the_same_seed_alone(tmp_path: Path) -> None:
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
         write_phantom(tmp_path / name, PhantomSettings(kind="spine", **AWKWARD, seed=seed))
     content = {name: {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()} for name in ("a", "b", "c")}

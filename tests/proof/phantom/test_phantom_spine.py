@@ -81,7 +81,7 @@ def test_left_marker_and_missing_left_rib_show_which_side_is_left(spine: tuple) 
 
 
 @pytest.mark.release
-def test_same_anatomy_in_tilted_and_oblique_slices() -> None:
+def test_spine_has_the_same_anatomy_in_tilted_and_oblique_slices() -> None:
     size = {"size": (150, 140), "slices": 60, "spacing": (1.7, 1.6, 2.0)}
     straight = make_phantom(PhantomSettings(**size, **CLEAN))
     turned = make_phantom(PhantomSettings(**size, **CLEAN, tilt=14.0, oblique=(6.0, -9.0, 12.0)))

@@ -53,7 +53,7 @@ def test_components_are_numbered_by_their_first_cell() -> None:
     assert (np.diff(firsts) > 0).all() and len(firsts) > 5
 
 
-def test_known_components() -> None:
+def test_components_of_blocks_are_counted_as_known() -> None:
     assert label_cells(scenes()["two blocks"])[0] == 2
     assert label_cells(scenes()["a hollow block"])[0] == 2
     # Two cells that share an edge alone: the faces between them and their neighbours are all alike or mixed.

@@ -244,7 +244,7 @@ def test_files_of_other_scanners_raise_no_alarm():
     assert warn_of(Path(pydicom.data.get_testdata_file("CT_small.dcm", download=False))) == []
 
 
-def test_a_scanner_that_pads_in_silence():
+def test_padding_that_a_scanner_does_not_declare_is_told():
     said = warn_of(Path(pydicom.data.get_testdata_file("J2K_pixelrep_mismatch.dcm", download=False)))
     assert len(said) == 1 and said[0].startswith("21.5 % of the voxels are at -2000 HU")
 

@@ -206,7 +206,7 @@ def test_a_stated_slope_tells_a_stretched_body_from_a_specimen(tmp_path, make):
     assert gates_of(read_volume(plain).report)["hu_scale"]["ok"]
 
 
-def test_no_verdict_without_air_and_soft_tissue():
+def test_scale_is_not_judged_without_air_and_soft_tissue():
     gate = judge(make_layers(600, (30, 900), noise=40))
     assert (gate.ok, gate.measured) == (None, None) and gate.text.endswith("neither was found")
 
@@ -260,7 +260,7 @@ def test_a_sign_that_is_right_is_kept(tmp_path, hu, plan):
 
 
 @pytest.mark.parametrize("name", ["a.nii.gz", "a.nrrd"])
-def test_a_grid_file_that_lost_its_sign(tmp_path, name):
+def test_grid_file_that_lost_its_sign_fails_the_gate_of_signs(tmp_path, name):
     """HU that were stored as uint16: 64,536 for air."""
     nibabel = pytest.importorskip("nibabel")
     hu = make_body().astype(np.int16)
@@ -276,7 +276,7 @@ def test_a_grid_file_that_lost_its_sign(tmp_path, name):
     assert gates_of(volume.report)["stored_sign"]["text"] in volume.report["warnings"]
 
 
-def test_a_grid_file_on_another_scale(tmp_path):
+def test_grid_file_on_another_scale_fails_the_gate_of_hu(tmp_path):
     path = tmp_path / "a.nii.gz"
     Volume((make_body() + 324).astype(np.int16), np.diag([1.0, 1.0, 2.0, 1.0])).save(path)
     report = read_volume(path).report

@@ -102,7 +102,7 @@ def test_row_36_a_bare_enhanced_image_is_refused_with_its_reason(tmp_path):
         read_volume(tmp_path, force=True)
 
 
-def test_row_36_on_the_command_line(tmp_path, printed):
+def test_row_36_force_reads_bare_data_sets_on_the_command_line(tmp_path, printed):
     folder = write_cut(tmp_path / "ct", make_series(NATIVE["implicit"]), cut_all)
     assert main(["info", str(folder)]) == 2
     printed().assert_error("--force")
@@ -110,7 +110,7 @@ def test_row_36_on_the_command_line(tmp_path, printed):
     printed().assert_output("VR")
 
 
-def test_long_headers_and_cut_pixels(tmp_path):
+def test_bare_slices_with_long_headers_are_read_and_cut_ones_refused(tmp_path):
     """Bytes are counted in the file itself, not in what stands for its start."""
     plan = Plan(shape=(3, 3, 4))
     for k in range(3):

@@ -117,19 +117,19 @@ def test_numbers_out_of_order_and_no_count_are_not_judged(tmp_path):
 
 
 @pytest.mark.parametrize("wider", [False, True])
-def test_the_bound_of_the_gap(tmp_path, wider):
+def test_numbers_that_skip_count_from_a_bound_of_the_gap_on(tmp_path, wider):
     write(tmp_path, numbered(up), ODD, gap=0.5 * WIDER * (1.01 if wider else 0.99))
     assert judge(tmp_path)["ok"] is not wider
 
 
 @pytest.mark.parametrize("far", [False, True])
-def test_the_bound_of_the_steps(tmp_path, far):
+def test_steps_of_numbers_count_up_to_a_bound_of_the_gap(tmp_path, far):
     write(tmp_path, numbered(lambda k: 5 * k), gap=5 * CLOSEST * (1.01 if far else 0.99))
     assert judge(tmp_path)["ok"] is not far
 
 
 @pytest.mark.parametrize("lost", [LOCALIZERS, LOCALIZERS + 1, SLICES // 2 - 1, SLICES // 2])
-def test_the_bounds_of_the_start(tmp_path, lost):
+def test_slices_lost_at_the_start_count_between_localizers_and_half(tmp_path, lost):
     write(tmp_path, numbered(up), range(lost))
     assert judge(tmp_path)["ok"] is (lost in (LOCALIZERS, SLICES // 2))
 
@@ -184,7 +184,7 @@ def test_an_acquisition_that_was_reconstructed_twice_is_counted_once(tmp_path):
     assert judge(tmp_path, series=1)["measured"] == SLICES
 
 
-def test_a_series_that_is_numbered_on_from_another(tmp_path):
+def test_series_numbered_on_from_another_is_complete(tmp_path):
     study = set_values(StudyInstanceUID=f"{ROOT}.77")
     write(tmp_path / "1", numbered(up, study), range(10, SLICES))
     write(tmp_path / "2", numbered(lambda k: k + 11, study), series=2)
@@ -198,7 +198,7 @@ def test_files_with_many_frames_count_once(tmp_path):
     assert "(NumberOfSeriesRelatedInstances says 3, there is 1): 2, none allowed" in judge(tmp_path)["text"]
 
 
-def test_the_figures_are_in_the_certificate(tmp_path):
+def test_certificate_holds_the_figures_of_the_numbering(tmp_path):
     write(tmp_path, numbered(up, set_values(ImagesInAcquisition=SLICES)), ODD)
     assert read_volume(tmp_path).report["numbering"] == {
         "first": 1, "last": 23, "step": 2, "images": 12, "images_stated": SLICES, "files": 12, "files_stated": None

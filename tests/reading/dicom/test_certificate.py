@@ -38,7 +38,7 @@ def unmeasured(certificate) -> set[str]:
     return {gate["name"] for gate in certificate["gates"] if gate["ok"] is None}
 
 
-def test_the_certificate_is_the_contract(tmp_path):
+def test_certificate_has_the_names_of_the_contract(tmp_path):
     write_series(tmp_path)
     from_headers, from_pixels, report = certify(tmp_path), certify(tmp_path, pixels=True), read_volume(tmp_path).report
     assert set(from_headers) == set(report) == names_in("The certificate")
@@ -73,7 +73,7 @@ def test_headers_alone_say_nothing_of_pixels(tmp_path, monkeypatch):
         certify(tmp_path, pixels=True)
 
 
-def test_an_oblique_tilted_series(tmp_path):
+def test_certificate_of_an_oblique_tilted_series_has_its_geometry(tmp_path):
     plan = write_series(tmp_path, Plan(tilt_deg=12, angles=(3, 4, -5)), set_values(PatientPosition="FFP"))
     found = read_volume(tmp_path).report
     row, column, normal = plan.directions
@@ -97,7 +97,7 @@ def test_an_oblique_tilted_series(tmp_path):
     assert failed(found) == set()
 
 
-def test_thickness_that_leaves_tissue_unmeasured(tmp_path):
+def test_thickness_that_leaves_tissue_unmeasured_has_a_negative_overlap(tmp_path):
     def thin(ds, k):
         ds.SliceThickness = 1.0 if k < 3 else 0.5
 
@@ -121,14 +121,14 @@ def test_thickness_that_leaves_tissue_unmeasured(tmp_path):
         (((1, 0, 0), (0, 0.8, 0.6), (0, -0.6, 0.8)), "LPS", True, 36.8698976),
     ],
 )
-def test_directions_in_the_patient(steps, axes, right_handed, off_axis):
+def test_directions_are_named_in_the_patient(steps, axes, right_handed, off_axis):
     i_step, j_step, k_step = steps
     found = facts_of_orientation(compose_affine(i_step, j_step, k_step, (0, 0, 0)))
     assert (found["axes"], found["right_handed"]) == (axes, right_handed)
     assert found["off_axis_deg"] == pytest.approx(off_axis)
 
 
-def test_runs_of_equal_gaps():
+def test_runs_of_equal_gaps_are_summed_up():
     distances = np.cumsum([0.0, *[4.002] * 3, 1.081, *[6.999] * 2])
     assert summarise_gaps(distances) == [
         {"count": 3, "gap_mm": pytest.approx(4.002)},
@@ -160,7 +160,7 @@ ONE_GATE = {
 
 
 @pytest.mark.parametrize("case", ONE_GATE)
-def test_a_gate_of_a_series_that_can_be_read(tmp_path, case):
+def test_series_that_fails_one_gate_is_read_with_a_warning(tmp_path, case):
     plan, change = ONE_GATE[case]
     write_series(tmp_path, plan, change)
     report = read_volume(tmp_path).report
@@ -197,7 +197,7 @@ def test_files_that_cannot_be_read_fail_a_gate(tmp_path):
     assert failed(certify(tmp_path)) == {"usable", "readable"}
 
 
-def test_padding_that_masks_nearly_all(tmp_path):
+def test_padding_that_masks_nearly_all_fails_its_gate(tmp_path):
     def pad(ds, k):
         ds.PixelPaddingValue = -2000
         pixels = np.full(30, -2000, "i2")
@@ -212,7 +212,7 @@ def test_padding_that_masks_nearly_all(tmp_path):
     assert failed(certify(tmp_path)) == set()
 
 
-def test_nothing_of_the_patient(tmp_path):
+def test_certificate_holds_nothing_of_the_patient(tmp_path):
     def spoil(ds, k):
         IDENTITY(ds, k)
         ds.RescaleType = "US"

@@ -47,7 +47,7 @@ def refusal(path):
 
 
 @pytest.mark.parametrize("plan", [PLAN, OBLIQUE], ids=["axial", "oblique"])
-def test_frames_in_steps_of_the_stated_spacing(tmp_path, plan):
+def test_frames_in_steps_of_the_stated_spacing_are_placed_with_a_warning(tmp_path, plan):
     save_dataset(make_frames(plan), tmp_path / "scan.dcm")
     volume = read_volume(tmp_path / "scan.dcm")
     assert_right(volume, plan)
@@ -84,7 +84,7 @@ def test_offsets_say_which_way_frames_run(tmp_path, plan, down):
 
 
 @pytest.mark.parametrize("orientation", [(0, 0, 0), (180, 0, 0)], ids=["normal to the head", "normal to the feet"])
-def test_offsets_that_are_z_itself(tmp_path, orientation):
+def test_offsets_that_are_z_itself_place_the_frames(tmp_path, orientation):
     plan = replace(PLAN, angles=orientation)
     z = [plan.position(k)[2] for k in range(7)]
     save_dataset(make_frames(plan, GridFrameOffsetVector=z), tmp_path / "scan")
@@ -100,7 +100,7 @@ def test_uneven_offsets_keep_their_places(tmp_path):
     assert_right(volume, plan)
 
 
-def test_frames_in_no_order(tmp_path):
+def test_frames_in_no_order_lie_at_their_offsets_with_a_warning(tmp_path):
     order = [3, 0, 6, 1, 5, 2, 4]
     offsets = [(k - 3) * PLAN.gap for k in order]
     save_dataset(make_frames(PLAN, order, GridFrameOffsetVector=offsets), tmp_path / "scan")
@@ -109,7 +109,7 @@ def test_frames_in_no_order(tmp_path):
     assert "they are in no order, as GridFrameOffsetVector says" in volume.report["warnings"][0]
 
 
-def test_compressed_frames(tmp_path):
+def test_compressed_frames_of_a_classic_image_are_read(tmp_path):
     ds = make_frames()
     ds.file_meta.TransferSyntaxUID = PLAN.syntax
     ds.compress(RLELossless, generate_instance_uid=False)
@@ -118,7 +118,7 @@ def test_compressed_frames(tmp_path):
 
 
 @pytest.mark.parametrize("pointer", sorted(PLACE_POINTERS))
-def test_frames_that_are_slices_by_their_pointer(tmp_path, pointer):
+def test_frames_that_are_slices_by_their_pointer_are_read(tmp_path, pointer):
     save_dataset(make_frames(FrameIncrementPointer=Tag(pointer)), tmp_path / "scan")
     assert_right(read_volume(tmp_path), PLAN)
 
@@ -161,7 +161,7 @@ def test_one_slice_of_a_series_alone_names_the_folder(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["65537", "2147483647"])
-def test_implausible_numbers_of_frames(tmp_path, text):
+def test_implausible_numbers_of_frames_are_refused(tmp_path, text):
     ds = make_frames()
     set_raw("NumberOfFrames", text)(ds, 0)
     save_dataset(ds, tmp_path / "scan")

@@ -24,7 +24,9 @@ EVERY_DAY = [
 
 
 @pytest.mark.parametrize(("name", "kind"), daily_rows(5, EVERY_DAY + [row for row in ROWS if row not in EVERY_DAY]))
-def test_what_is_said_of_a_damaged_kind(shared_folder: Path, tmp_path: Path, name: str, kind: str) -> None:
+def test_damaged_scan_of_every_kind_is_refused_or_warned_of(
+    shared_folder: Path, tmp_path: Path, name: str, kind: str
+) -> None:
     scan, _ = make_scan(shared_folder, kind)
     said = SAID[name][list(SLICES).index(kind)]
     folder = damage(scan, tmp_path / "ct", name)
@@ -39,5 +41,5 @@ def test_what_is_said_of_a_damaged_kind(shared_folder: Path, tmp_path: Path, nam
     assert said or kind == "hip" or report["warnings"] == []
 
 
-def test_the_page_has_the_damages() -> None:
+def test_page_lists_the_damaged_kinds() -> None:
     assert list_damages() in (ROOT / "docs" / "calibration.md").read_text(encoding="utf-8")

@@ -33,7 +33,7 @@ def damage(folder, values, body=None):
 
 
 @pytest.mark.parametrize("name", PLACES)
-def test_what_becomes_of_a_damage(tmp_path, name):
+def test_damaged_places_are_refused_warned_of_or_harmless_as_listed(tmp_path, name):
     row = PLACES[name]
     hu = make_patient() if row.body else STACK.hu()
     plan = damage(tmp_path, row.values, hu if row.body else None)
@@ -80,6 +80,6 @@ def test_odd_slice_locations_and_diameters_give_no_warning(tmp_path, values):
     assert read_volume(tmp_path).report["warnings"] == []
 
 
-def test_the_page_has_the_table():
+def test_page_lists_the_damaged_places():
     text = PAGE.read_text(encoding="utf-8")
     assert "\n".join(list_damages()) in text

@@ -18,7 +18,7 @@ def damage(folder, row):
 
 
 @pytest.mark.parametrize("name", VALUES)
-def test_what_is_said_of_a_damage(tmp_path, name):
+def test_damaged_values_fail_their_gates_with_words(tmp_path, name):
     row = VALUES[name]
     report = read_volume(damage(tmp_path, row)).report
     failed = {gate["name"] for gate in report["gates"] if gate["ok"] is False}
@@ -30,7 +30,7 @@ def test_what_is_said_of_a_damage(tmp_path, name):
     "name",
     daily(1, ["intercept off by 324", "slope and intercept of another scale", "unsigned values declared signed"]),
 )
-def test_every_command_that_reads_says_it(tmp_path, device, capsys, name):
+def test_every_command_tells_damaged_values(tmp_path, device, capsys, name):
     row = VALUES[name]
     folder = str(damage(tmp_path / "ct", row))
     (gate,) = row.gates

@@ -82,7 +82,7 @@ def test_a_decoder_that_is_not_installed_is_named(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["JPEG lossless 6", "JPEG-LS", "JPEG 2000", "RLE"])
-def test_signed_values_and_eight_bits(tmp_path, name):
+def test_signed_values_and_eight_bits_are_decoded(tmp_path, name):
     syntax, encode = ENCODERS[name]
     signed = (IMAGES[0].astype(np.int16) - 2000) * 7
     (pixels,) = place(tmp_path, encapsulate([encode(signed.view(np.uint16))]) + END, syntax, signed=True)
@@ -131,7 +131,7 @@ def test_an_extended_offset_table_is_not_needed(tmp_path):
     assert np.array_equal(place(tmp_path, data + END, frames=4), IMAGES)
 
 
-def test_one_frame_in_many_fragments_and_as_jp2(tmp_path):
+def test_one_frame_in_many_fragments_or_as_jp2_is_decoded(tmp_path):
     data = encode_jpeg_2000(IMAGES[0])
     (pixels,) = place(tmp_path, encapsulate([data], fragments_per_frame=5, has_bot=False) + END)
     assert np.array_equal(pixels, IMAGES[0])
@@ -196,7 +196,7 @@ def test_items_are_walked_once_and_nothing_else_is_read(monkeypatch, tmp_path):
     assert len(calls) == 1
 
 
-def test_frames_of_plain_and_deflated_files(tmp_path, monkeypatch):
+def test_frames_of_plain_and_deflated_files_are_found(tmp_path, monkeypatch):
     head, pixels = b"head" * 5, IMAGES.tobytes()
     plain = tmp_path / "plain"
     plain.write_bytes(head + pixels)
@@ -273,7 +273,7 @@ def test_another_library_gives_the_same_pixels(tmp_path, real_data, ending):
     assert np.array_equal(pixels.astype(int) * int(ds.RescaleSlope) + int(ds.RescaleIntercept), other)
 
 
-def test_row_42_big_endian(tmp_path):
+def test_row_42_big_endian_pixels_are_read(tmp_path):
     plan = Plan(shape=(2, 5, 6), syntax=ExplicitVRBigEndian)
     for k in range(2):
         ds = make_dataset(plan, k)

@@ -45,7 +45,7 @@ def test_headers_alone_tell_spacings_and_rescale(tmp_path):
     assert any("(RescaleSlope -1): 1, none allowed" in text for text in certificate["warnings"])
 
 
-def test_a_thickness_that_is_not_stated(tmp_path):
+def test_thickness_that_is_not_stated_is_told_of_wide_gaps(tmp_path):
     write_series(tmp_path, Plan(gap=7.0), set_values(SliceThickness=None, InstanceNumber=None))
     warnings, failed = judge(tmp_path)
     assert [text for text in warnings if "times the width" in text] == [
@@ -56,7 +56,7 @@ def test_a_thickness_that_is_not_stated(tmp_path):
 
 
 @pytest.mark.parametrize(("gap", "thickness"), [(6.9, None), (7.0, 5.0)])
-def test_gaps_of_which_nothing_is_said(tmp_path, gap, thickness):
+def test_gaps_that_are_narrow_or_covered_are_not_warned_of(tmp_path, gap, thickness):
     write_series(tmp_path, Plan(gap=gap), set_values(SliceThickness=thickness))
     assert not any("times the width" in text for text in judge(tmp_path)[0])
 
@@ -89,14 +89,14 @@ def test_slopes_beyond_any_scale_are_refused(tmp_path, slope, is_read):
         ({"RescaleSlope": 8, "RescaleIntercept": -8192}, None),
     ],
 )
-def test_rescale_and_range(tmp_path, values, words):
+def test_rescale_without_sense_and_values_out_of_range_are_told(tmp_path, values, words):
     write_series(tmp_path, change=set_values(**values))
     warnings, failed = judge(tmp_path)
     assert ("plausible_hu" in failed) == (words is not None)
     assert words is None or any(words in text for text in warnings), warnings
 
 
-def test_one_slice_with_another_slope(tmp_path):
+def test_one_slice_with_another_slope_fails_the_gate_of_hu(tmp_path):
     write_series(tmp_path, change=set_values(only=3, RescaleSlope=-1))
     warnings, failed = judge(tmp_path)
     assert "plausible_hu" in failed and any("RescaleSlope -1" in text for text in warnings)

@@ -220,13 +220,13 @@ DOUBTFUL = {
 
 
 @pytest.mark.parametrize("case", DOUBTFUL)
-def test_what_is_in_doubt_is_left_open(case: str) -> None:
+def test_doubtful_headers_are_left_to_the_careful_parser(case: str) -> None:
     implicit, doubtful = DOUBTFUL[case]
     assert plain.parse_plainly(wrap(b"", implicit), 500, WANTED_TAGS) is not None
     assert plain.parse_plainly(wrap(doubtful, implicit), 500, WANTED_TAGS) is None
 
 
-def test_as_deep_as_the_plain_parser_goes() -> None:
+def test_plain_parser_reads_the_deepest_nesting_it_allows() -> None:
     assert check_alike(wrap(nest(plain.DEEPEST), False), 5000)
     assert check_alike(wrap(nest(plain.DEEPEST, implicit=True), True), 5000)
 
@@ -258,7 +258,7 @@ def test_a_header_that_is_not_whole_is_left_open(tmp_path: Path, cut: int) -> No
 
 
 @pytest.mark.parametrize("large", [20_000, 300_000])
-def test_headers_longer_than_what_is_read_first(tmp_path: Path, large: int) -> None:
+def test_headers_longer_than_what_is_read_first_are_read_whole(tmp_path: Path, large: int) -> None:
     """Longer than the first prefix; longer than the second too."""
 
     def change(ds: pydicom.Dataset, k: int) -> None:
@@ -272,7 +272,7 @@ def test_headers_longer_than_what_is_read_first(tmp_path: Path, large: int) -> N
     ("syntax", "careful"),
     [(plain.IMPLICIT_LITTLE, False), ("1.2.840.10008.1.2.1", False), (DeflatedExplicitVRLittleEndian, True)],
 )
-def test_what_takes_long_to_load_is_loaded_only_where_it_is_needed(tmp_path: Path, syntax: str, careful: bool) -> None:
+def test_pydicom_is_loaded_only_where_it_is_needed(tmp_path: Path, syntax: str, careful: bool) -> None:
     write_series(tmp_path, Plan(syntax=syntax))
     code = "import sys, clrecon; clrecon.read_volume(sys.argv[1]); print([n in sys.modules for n in sys.argv[2:]])"
     environment = {**os.environ, "PYTHONPATH": str(Path(elements.__file__).parents[4])}

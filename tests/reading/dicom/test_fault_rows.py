@@ -36,7 +36,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pydicom")  # it wri
         ("ImagePositionPatient", "", "missing"),
     ],
 )
-def test_row_15_positions_and_orientations_without_sense_in_all_slices(tmp_path, keyword, text, fact):
+def test_row_15_places_without_sense_in_all_slices_are_refused(tmp_path, keyword, text, fact):
     write_series(tmp_path, Plan(**PLAN), set_raw(keyword, text))
     with refused(RefusedInputError, keyword, fact, "slice000.dcm"):
         read_volume(tmp_path)
@@ -55,7 +55,7 @@ def stack_of(directions, origin, hu, folder):
     write_series(folder, plan, change)
 
 
-def test_row_17_one_object_stored_in_every_order(tmp_path):
+def test_row_17_object_lies_in_its_place_however_it_is_stored(tmp_path):
     """Every axis reversed, left-handed orders too: the same HU at the same LPS places."""
     hu = np.arange(3 * 4 * 5).reshape(3, 4, 5)
     expected = {int(hu[k, j, i]): (10.0 + i, 20.0 + j, 30.0 + k) for k, j, i in np.ndindex(hu.shape)}

@@ -71,7 +71,7 @@ def test_float_padding_becomes_air(tmp_path, width, value, limit):
         (3e38, "values from -964 to 3e\\+38"),
     ],
 )
-def test_row_32_nan_and_infinite_voxels(tmp_path, value, words):
+def test_row_32_nan_infinite_and_huge_voxels_are_refused(tmp_path, value, words):
     def spoil(array, k):
         if k == 3:
             array[2, 2] = value
@@ -82,7 +82,7 @@ def test_row_32_nan_and_infinite_voxels(tmp_path, value, words):
         read_volume(tmp_path)
 
 
-def test_row_32_all_nan(tmp_path):
+def test_row_32_volume_of_nan_is_refused(tmp_path):
     write_series(tmp_path, change=set_floats(lambda array, k: array * np.nan))
     with refused(RefusedInputError, "NaN", 30, 0):
         read_volume(tmp_path)
@@ -96,7 +96,7 @@ def test_row_32_all_nan(tmp_path):
         (set_floats(lambda array, k: array * 0 + 3.5), "all 210 voxels are 3.5 HU"),
     ],
 )
-def test_row_32_constant_volumes(tmp_path, change, words):
+def test_row_32_constant_volumes_are_refused(tmp_path, change, words):
     write_series(tmp_path, change=change)
     with pytest.raises(RefusedInputError, match=words):
         read_volume(tmp_path)

@@ -58,7 +58,7 @@ def check_tail(tail: bytes) -> None:
         long_element(0xFFFCFFFB) + long_element(0xFFFCFFFD),
     ],
 )
-def test_elements_behind_the_pixels(tail):
+def test_private_and_padding_elements_behind_the_pixels_are_accepted(tail):
     check_tail(tail)
 
 
@@ -76,7 +76,7 @@ def test_elements_behind_the_pixels(tail):
     ],
     ids=["cut", "two", "before", "cut-value", "after-padding", "no-letter", "no-capital", "cut-long"],
 )
-def test_what_are_no_elements_behind_the_pixels(tail):
+def test_bytes_that_are_no_elements_behind_the_pixels_are_told_apart(tail):
     with refused(CorruptFileError, len(tail), "DICOM"):
         check_tail(tail)
 
@@ -95,7 +95,7 @@ def test_other_bytes_are_no_value_representation(vr):
     assert _looks_implicit(io.BytesIO(element(0x00080005, vr)), 0) is True
 
 
-def test_the_head_of_pixel_data():
+def test_head_of_pixel_data_is_read_or_left_open():
     assert read_pixel_head(b"", 500, False, True) == (None, -1, 0, "")
     assert read_pixel_head(element(0x7FE10010), 500, False, True) == (None, -1, 0, "")
     assert read_pixel_head(long_element(0x7FE00010, b"OW", bytes(4))[:12], 500, False, True) == (
@@ -149,7 +149,7 @@ def test_an_even_number_of_bytes_has_no_byte_of_padding(tmp_path, more, said):
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(0, 5), (5, 0), (0, 0)])
-def test_images_without_rows_or_columns(rows, columns):
+def test_images_without_rows_or_columns_are_refused(rows, columns):
     _check_matrix(1, "MONOCHROME2", 1, 1)
     with refused(ValueProblem, rows, columns):
         _check_matrix(1, "MONOCHROME2", rows, columns)
@@ -188,12 +188,12 @@ def test_padding_values_are_binary_numbers():
             values_of(padding=(0x00280120, raw, vr)).padding(16, 16, True)
 
 
-def test_tags_of_overlays():
+def test_tags_of_overlays_are_the_sixteen_even_groups():
     assert [f"{tag:08X}" for tag in OVERLAY_BITS] == [f"60{group:02X}0102" for group in range(0, 32, 2)]
     assert describe_stray_bits([None], [SimpleNamespace()]) == (0, "")  # type: ignore[list-item]
 
 
-def test_elements_that_converters_leave_over_and_where_a_data_set_begins():
+def test_elements_that_converters_leave_over_are_listed_and_the_data_set_found():
     assert {keyword_for_tag(tag) for tag in multiframe._UNASSIGNED} == {
         *("AcquisitionDate", "ContentDate", "AcquisitionTime", "ContentTime", "KVP", "TriggerTime"),
         *("ConvolutionKernel", "AcquisitionNumber", "TemporalPositionIdentifier", "PixelPaddingValue"),
@@ -229,7 +229,7 @@ def box(kind: bytes, value: bytes, form: str) -> bytes:
 
 @pytest.mark.parametrize("form", ["short", "long", "to the end"])
 @pytest.mark.parametrize("before", ["short", "long"])
-def test_the_codestream_in_a_jp2_file(form, before):
+def test_codestream_in_a_jp2_file_is_found(form, before):
     start = stored._JP2_START + box(b"ftyp", b"jp2 12", before)
     after = b"" if form == "to the end" else box(b"uuid", b"more", "short")
     assert stored._unwrap_jp2(start + box(b"jp2c", b"\xff\x4f\xff\x51 codes", form) + after) == (
@@ -267,7 +267,7 @@ def test_replies_of_decoders_are_written_whole():
         ),
     ],
 )
-def test_problems_of_a_series_and_which_of_them_hide_others(kind, bad, expected):
+def test_problems_of_a_series_are_listed_without_those_that_hide_the_cause(kind, bad, expected):
     series = SimpleNamespace(
         kind=kind,
         others=[SimpleNamespace(problem=f"bad {number}") for number in range(bad)],
@@ -301,7 +301,7 @@ def test_a_decoder_answers_with_as_many_bytes_as_it_was_asked_for():
         assert ask(worker((READY, 0), (status, 5)), {}, b"", out, 1.0) == (status, "5 letters")
 
 
-def test_why_there_is_no_decoder():
+def test_worker_that_ends_says_why_only_without_a_decoder():
     for status, why in ((NO_DECODER, "5 letters"), (FAILED, ""), (NO_MEMORY, ""), (DONE, "")):
         process = worker((status, 5))
         with pytest.raises(decoder_pool._WorkerEndedError):

@@ -58,7 +58,7 @@ def cut_end(data):
         ("RLE", lambda d: d[:-200], "do not decode"),
     ],
 )
-def test_rows_38_and_40_codestreams_that_lie_or_are_cut(tmp_path, name, spoil, words):
+def test_rows_38_and_40_codestreams_that_lie_or_are_cut_are_refused(tmp_path, name, spoil, words):
     syntax, encode = ENCODERS[name]
     data = item(b"") + item(even(spoil(encode(IMAGES[0])))) + END
     with pytest.raises(RefusedInputError, match=f"^pixels: .*({words})"):

@@ -17,7 +17,7 @@ PLAN = {"shape": (3, 3, 4), "name": "{}".format}
 
 
 @pytest.mark.parametrize("depth", [300, 5000])
-def test_deeply_nested_sequences(tmp_path, depth):
+def test_deeply_nested_sequences_are_refused(tmp_path, depth):
     write_series(tmp_path, Plan(**PLAN))
     whole = (tmp_path / "1").read_bytes()
     start = whole.index(b"\x08\x00\x60\x00CS")  # before Modality
@@ -32,7 +32,7 @@ def test_deeply_nested_sequences(tmp_path, depth):
         read_volume(tmp_path)
 
 
-def test_implicit_elements_under_an_explicit_syntax(tmp_path):
+def test_implicit_elements_under_an_explicit_syntax_are_read_with_a_warning(tmp_path):
     plan = Plan(**PLAN)
     for k in range(3):
         ds = make_dataset(Plan(syntax=ImplicitVRLittleEndian, **PLAN), k)

@@ -63,7 +63,7 @@ def test_a_link_that_leads_nowhere_may_have_been_a_slice(tmp_path, plan):
 
 
 @pytest.mark.parametrize("beside", [True, False], ids=["beside the slices", "elsewhere"])
-def test_a_link_to_a_folder(tmp_path, plan, beside):
+def test_link_to_a_folder_refuses_only_a_series_beside_it(tmp_path, plan, beside):
     """It refuses only a series that has slices beside it."""
     whole = write_series(tmp_path / "other", Plan(series=2, shape=(7, 5, 6)))
     os.symlink(tmp_path / "other", tmp_path / ("ct" if beside else ".") / "more")

@@ -52,20 +52,20 @@ def deny(monkeypatch):
 
 
 @pytest.mark.parametrize("cut", ["slice000.dcm", "slice003.dcm", "slice006.dcm"])
-def test_a_cut_file_beside_the_slices(tmp_path, cut):
+def test_cut_file_beside_the_slices_refuses_the_series(tmp_path, cut):
     write_series(tmp_path)
     (tmp_path / cut).write_bytes((tmp_path / cut).read_bytes()[:600])
     check_refused(tmp_path, f"{cut}: ends within")
 
 
-def test_a_file_that_cannot_be_opened(tmp_path, deny):
+def test_file_that_cannot_be_opened_refuses_the_series(tmp_path, deny):
     write_series(tmp_path)
     deny(tmp_path / "slice006.dcm")
     check_refused(tmp_path, "slice006.dcm: not readable")
     assert list_series(tmp_path).skipped == {"not readable": 1}
 
 
-def test_a_folder_that_cannot_be_read(tmp_path, deny):
+def test_folder_that_cannot_be_read_refuses_the_series(tmp_path, deny):
     write_series(tmp_path, APART)
     deny(tmp_path / "6")
     check_refused(tmp_path, "6: folder not readable")
@@ -80,7 +80,7 @@ def test_unreadable_files_alone_are_no_dicom(tmp_path, deny):
 
 @pytest.mark.parametrize("length", [0, 1, 127, 128, 131, 132, 300, 700])
 @pytest.mark.parametrize("name", ["{}/image", "{}/image.dcm"])
-def test_a_cut_slice_in_a_folder_of_its_own(tmp_path, name, length):
+def test_cut_slice_in_a_folder_of_its_own_refuses_the_series(tmp_path, name, length):
     plan = write_series(tmp_path, Plan(name=name.format))
     file = tmp_path / plan.name(6)
     file.write_bytes(file.read_bytes()[:length])
@@ -131,7 +131,7 @@ def test_a_corrupt_file_among_slices_of_another_series_is_counted(tmp_path, chan
         ("._slice000.dcm", b"y" * 200, "._slice000.dcm: named like DICOM but is none"),
     ],
 )
-def test_what_may_be_left_of_a_slice(tmp_path, name, content, words):
+def test_file_that_may_be_left_of_a_slice_refuses_the_series(tmp_path, name, content, words):
     plan = write_series(tmp_path / "ct")
     (tmp_path / "ct" / name).write_bytes(content)
     if words:

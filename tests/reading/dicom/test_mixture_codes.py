@@ -39,7 +39,7 @@ def test_instance_numbers_are_two_heaps_from_twelve_slices_on():
     assert ways(INSTANCE_NUMBER, [*range(11), "x"]) == []
 
 
-def test_the_elements_whose_alternation_is_judged():
+def test_elements_whose_alternation_is_judged_are_those_of_the_page():
     kinds = {(kind.verdict, kind.reason): {keyword_for_tag(tag) for tag in kind.tags} for kind in ELEMENT_KINDS}
     assert all("" not in keywords for keywords in kinds.values())
     assert len(kinds) == len(ELEMENT_KINDS) and sum(map(len, kinds.values())) == len(set().union(*kinds.values()))
@@ -62,7 +62,7 @@ def test_the_elements_whose_alternation_is_judged():
         (0x00291010, "pixels", "pixels"),  # private
     ],
 )
-def test_verdicts_in_even_and_uneven_stacks(tag, even, uneven):
+def test_alternating_elements_have_their_verdict_in_even_and_uneven_stacks(tag, even, uneven):
     assert (find_verdict(tag, True), find_verdict(tag, False)) == (even, uneven)
 
 

@@ -110,7 +110,7 @@ def test_three_volumes_and_volumes_in_pairs(tmp_path):
     assert "2 phases whose slices lie between" in refusal(tmp_path / "pairs")
 
 
-def test_a_volume_within_a_part_of_another(tmp_path):
+def test_volume_within_a_part_of_another_is_told_apart(tmp_path):
     write_volumes(tmp_path, {"ProtocolName": "A"}, {"ProtocolName": "B"}, slices=(20, 8), offsets=(0.0, 6.5 * GAP))
     assert "[1: ProtocolName value 1, 20 slices], [2: ProtocolName value 2, 8 slices]" in refusal(tmp_path)
 
@@ -175,7 +175,7 @@ def test_doubtful_elements_and_other_pixels_are_two_volumes(tmp_path, elements):
     assert [gate["name"] for gate in report["gates"] if gate["ok"] is False] == ["one_volume"]
 
 
-def test_numbers_of_two_passes_and_other_pixels(tmp_path):
+def test_two_passes_by_number_with_other_pixels_are_told_apart(tmp_path):
     own = [{"InstanceNumber": lambda k: k + 1}, {"InstanceNumber": lambda k: k + 13}]
     write_volumes(tmp_path, *own, pixels=picture(6))
     assert "[1: order of InstanceNumber 1, 12 slices]" in refusal(tmp_path)
@@ -244,7 +244,7 @@ def test_alternating_values_are_told_from_runs(codes, expected):
     assert alternates([ord(code) for code in codes], [1.0] * (len(codes) - 1)) is expected
 
 
-def test_a_part_where_slices_lie_closer():
+def test_part_where_slices_lie_closer_and_codes_alternate_is_told():
     codes, gaps = [0] * 6 + [1, 0] * 4 + [0] * 5, [1.0] * 5 + [0.5] * 9 + [1.0] * 4
     assert alternates(codes, gaps) and not alternates(codes, [1.0] * 18)
 
@@ -259,7 +259,7 @@ def body(slices, seed=1, noise=20.0):
     return hu + np.random.default_rng(seed).normal(0, noise, hu.shape)
 
 
-def test_one_volume_is_alike():
+def test_slices_of_one_volume_are_alike():
     found = measure_likeness(body(24).astype(np.int16))
     assert not found.is_mixed and found.whole < 1.0 and found.part < 1.2
 

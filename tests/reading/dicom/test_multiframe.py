@@ -58,7 +58,7 @@ def split_headers(path):
     return headers
 
 
-def test_dimensions_that_number_places():
+def test_dimensions_that_number_places_are_the_seven_of_the_standard():
     assert {pydicom.datadict.keyword_for_tag(tag) for tag in DIMENSIONS_OF_PLACE} == {
         "ImagePositionPatient", "ImageOrientationPatient", "InStackPositionNumber", "SliceLocation", "InstanceNumber",
         "PlanePositionSequence", "PlaneOrientationSequence",
@@ -103,7 +103,7 @@ def test_fault_22_every_frame_has_its_own_rescale(tmp_path):
     "syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian]
 )
 @pytest.mark.parametrize("undefined", [False, True], ids=["lengths", "delimiters"])
-def test_every_uncompressed_encoding(tmp_path, syntax, undefined):
+def test_enhanced_images_of_every_uncompressed_encoding_are_read(tmp_path, syntax, undefined):
     def leave_lengths_out(ds):
         for element in ds:
             if element.VR == "SQ":
@@ -121,7 +121,7 @@ def test_every_uncompressed_encoding(tmp_path, syntax, undefined):
 @pytest.mark.parametrize(
     "table, fragments", [("basic", 1), ("none", 1), ("extended", 1), ("basic", 3), ("none", 3)], ids=str
 )
-def test_compressed_frames(tmp_path, syntax, table, fragments):
+def test_compressed_frames_of_enhanced_images_are_read(tmp_path, syntax, table, fragments):
     if syntax == RLELossless and fragments > 1:
         pytest.skip("a frame of RLE is one fragment (PS3.5 A.4.2)")
     plan = Plan(shape=(5, 32, 48), signed=False)
@@ -435,7 +435,7 @@ def test_a_series_that_highdicom_converts_reads_the_same(tmp_path, plan):
     assert ("FrameAcquisitionNumber", "4") in split_headers(tmp_path / "mf")[0].phase
 
 
-def test_real_legacy_converted_image(real_data):
+def test_real_legacy_converted_image_lies_in_its_place(real_data):
     volume = read_volume(real_data / "seg_and_labels" / "enhanced_24x38x3")
     expected = np.diag([0.7, 0.7, 2.5, 1.0])
     expected[:3, 3] = 46.4649, 5.01881, -177.75  # frame 1 is the lowest: stored from the head down

@@ -225,7 +225,7 @@ def nest(levels):
 
 
 @pytest.mark.parametrize("levels", [10, 300, 5000])
-def test_fault_37_nests_in_the_groups(tmp_path, levels):
+def test_fault_37_nests_in_the_groups_are_read_or_refused(tmp_path, levels):
     payload = nest(levels)
     marker = bytes([0xA5]) * (len(payload) - 12)
 

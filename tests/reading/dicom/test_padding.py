@@ -161,7 +161,7 @@ def test_broken_slopes_and_other_slices_keep_one_value(tmp_path):
     assert np.count_nonzero(volume.voxels != -1001) == len(volume.voxels)
 
 
-def test_no_padding_says_so(tmp_path):
+def test_report_of_a_scan_without_padding_says_none(tmp_path):
     write_series(tmp_path)
     assert read_volume(tmp_path).report["padding_hu"] is None
 

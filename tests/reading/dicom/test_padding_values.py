@@ -24,7 +24,7 @@ from clrecon.reading import read_volume
         (12, "US", (0x8000).to_bytes(2, "little"), 0x8000),
     ],
 )
-def test_padding_in_any_writing_of_its_bits(tmp_path, bits, vr, raw, cell):
+def test_padding_is_masked_in_any_writing_of_its_bits(tmp_path, bits, vr, raw, cell):
     """Signed pixels, with and without the sign in the unused bits, and the value in another width or sign."""
 
     def change(ds, k):

@@ -86,7 +86,7 @@ def test_phases_are_listed_and_chosen(tmp_path, first, second, keyword, values):
         assert not any("2020" in text or "2021" in text for text in volume.report["warnings"])
 
 
-def test_phases_of_different_extent(tmp_path):
+def test_phases_of_different_extent_are_read_each(tmp_path):
     write_phase(tmp_path, 1, AcquisitionNumber=1)
     write_phase(tmp_path, 2, 9, Plan(shape=(4, 5, 6), name="b{}".format), AcquisitionNumber=2)
     assert [phase["slices"] for phase in list_series(tmp_path).series[0].phases] == [7, 4]
@@ -132,7 +132,7 @@ def test_copies_within_phases_are_dropped_first(tmp_path):
 @pytest.mark.parametrize(
     ("phase", "says"), [(3, "no phase 3"), (0, "number from 1"), ("2", "number"), (True, "number")]
 )
-def test_phases_that_are_not_there(tmp_path, phase, says):
+def test_phases_that_are_not_there_are_refused(tmp_path, phase, says):
     write_phase(tmp_path, 1, AcquisitionNumber=1)
     write_phase(tmp_path, 2, 500, AcquisitionNumber=2)
     with pytest.raises(UsageError, match=says):

@@ -45,12 +45,12 @@ def test_native_syntaxes_give_the_same_hu(tmp_path, syntax):
     assert volume.report["hu_range"] == [plan.hu().min(), plan.hu().max()]
 
 
-def test_headers_longer_than_the_first_read(tmp_path):
+def test_headers_of_200_kb_are_read_whole(tmp_path):
     plan = write_series(tmp_path, change=lambda ds, k: ds.add_new(0x00420011, "OB", bytes(200_000)))
     assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
 
 
-def test_sequences_without_lengths_that_outlast_the_first_read(tmp_path):
+def test_sequences_without_lengths_longer_than_the_first_read_are_read(tmp_path):
     def spoil(ds, k):
         item = pydicom.Dataset()
         item.add_new(0x00420011, "OB", bytes(200_000))
@@ -85,7 +85,7 @@ def test_broken_slopes_become_float32(tmp_path):
     assert np.array_equal(volume.voxels, (plan.hu() + 1024) * 0.25 - 1024)
 
 
-def test_unsigned_values_over_the_signed_range(tmp_path):
+def test_unsigned_values_over_the_signed_range_are_widened_where_needed(tmp_path):
     plan = Plan(signed=False, intercept=-32768)
     write_series(tmp_path, plan, set_pixels(lambda array, k: array.view(np.uint16) + 50_000))
     volume = read_volume(tmp_path)
@@ -97,7 +97,7 @@ def test_unsigned_values_over_the_signed_range(tmp_path):
     assert volume.voxels[0, 0, 0] == 50_900
 
 
-def test_twelve_bit_signed_values_under_overlay_bits(tmp_path):
+def test_signed_values_of_twelve_bits_are_read_under_overlay_bits(tmp_path):
     def spoil(array, k):
         values = array - 1000  # -100 up: both signs
         return (values & 0x0FFF) | 0x5000
@@ -107,7 +107,7 @@ def test_twelve_bit_signed_values_under_overlay_bits(tmp_path):
     assert np.array_equal(read_volume(tmp_path).voxels, plan.hu() - 1000)
 
 
-def test_bits_that_do_not_start_at_zero(tmp_path):
+def test_bits_that_do_not_start_at_zero_are_shifted(tmp_path):
     plan = Plan(bits_stored=12, signed=False)
     write_series(tmp_path, plan, set_pixels(lambda array, k: (array << 4) | 0x9, HighBit=15))
     assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
@@ -131,7 +131,7 @@ def test_pixels_of_8_and_32_bits_are_read(tmp_path, bits):
     [(-2000, None, True), (63536, None, True), (-2000, -1990, True), (-1990, -2000, True), (63536, None, False)],
     ids=["signed", "as unsigned", "range", "range turned round", "unsigned"],
 )
-def test_padding_becomes_air(tmp_path, padding, limit, signed):
+def test_padding_of_any_writing_becomes_air(tmp_path, padding, limit, signed):
     def pad(array, k):
         array[0, :3] = -2000
         if limit is not None:
@@ -155,7 +155,7 @@ def test_padding_becomes_air(tmp_path, padding, limit, signed):
     assert volume.report["hu_range"] == [-1024, expected.max()]
 
 
-def test_a_slice_of_padding_alone(tmp_path):
+def test_slice_of_padding_alone_becomes_air(tmp_path):
     change = set_pixels(lambda array, k: array * 0 - 2000 if k == 2 else array, PixelPaddingValue=-2000)
     plan = write_series(tmp_path, change=change)
     volume = read_volume(tmp_path)
@@ -253,7 +253,7 @@ def test_row_38_a_deflate_bomb_is_not_inflated(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("slope", "intercept"), [(1, -1024), (3, -1000), (3, 0), (1, 40000), (0.25, 0), (0.3125, 1), (-1, 500)]
 )
-def test_padding_and_range_with_any_rescale(tmp_path, slope, intercept):
+def test_padding_is_air_and_in_no_range_with_any_rescale(tmp_path, slope, intercept):
     """Whatever way the padding takes to air, it counts in no range but as air."""
 
     def pad(array, k):

@@ -61,7 +61,7 @@ def plan_with(style):
 
 @pytest.mark.parametrize("style", STYLES)
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_what_is_left_of_an_end_slice(tmp_path, style, damage):
+def test_remains_of_an_end_slice_refuse_the_series(tmp_path, style, damage):
     plan = write_series(tmp_path, plan_with(style))
     change, _ = DAMAGE[damage]
     file = tmp_path / plan.name(COUNT - 1)
@@ -78,7 +78,7 @@ def test_what_is_left_of_an_end_slice(tmp_path, style, damage):
 
 
 @pytest.mark.parametrize("added", [".gz", ".bz2", ".part", ".tmp"])
-def test_a_packed_slice_and_a_packed_copy(tmp_path, added):
+def test_packed_slice_is_refused_and_a_packed_copy_is_not(tmp_path, added):
     plan = write_series(tmp_path, plan_with("IM0001"))
     last = tmp_path / plan.name(COUNT - 1)
     packed = last.with_name(last.name + added)
@@ -89,7 +89,7 @@ def test_a_packed_slice_and_a_packed_copy(tmp_path, added):
         read_volume(tmp_path)
 
 
-def test_a_slice_under_another_name(tmp_path):
+def test_damaged_slice_under_another_name_is_told_by_its_size(tmp_path):
     """Neither name nor place tells; that it is as large as a slice does."""
     plan = write_series(tmp_path, plan_with("IM0001"))
     last = tmp_path / plan.name(COUNT - 1)
@@ -102,7 +102,7 @@ def test_a_slice_under_another_name(tmp_path):
     assert read_volume(tmp_path).report["warnings"] == []
 
 
-def test_what_lies_beside_slices_and_is_none(tmp_path):
+def test_files_beside_slices_that_are_none_refuse_nothing(tmp_path):
     plan = write_series(tmp_path, plan_with("IM0001"))
     size = (tmp_path / plan.name(0)).stat().st_size
     beside = {
@@ -146,7 +146,7 @@ def test_a_dicomdir_is_no_image(tmp_path):
     assert volume.report["files"]["skipped"] == {"DICOMDIR": 1} and volume.report["warnings"] == []
 
 
-def test_an_image_that_says_it_is_a_dicomdir(tmp_path):
+def test_image_that_says_it_is_a_dicomdir_is_read_with_a_warning(tmp_path):
     plan = write_series(tmp_path, plan_with("IM0001"))
     last = tmp_path / plan.name(COUNT - 1)
     last.write_bytes(swap_media_class(last.read_bytes()))
@@ -162,7 +162,7 @@ def test_a_damaged_modality_is_no_other_series(tmp_path):
 
 
 @pytest.mark.parametrize("path", [".", "../ct", "ct/../../ct/"])
-def test_a_folder_by_any_name(tmp_path, monkeypatch, path):
+def test_remains_are_found_however_the_folder_is_named(tmp_path, monkeypatch, path):
     plan = write_series(tmp_path / "ct", plan_with("IM0001"))
     (tmp_path / "ct" / "ct").mkdir()
     (tmp_path / "ct" / plan.name(COUNT - 1)).write_bytes(b"")
@@ -171,7 +171,7 @@ def test_a_folder_by_any_name(tmp_path, monkeypatch, path):
         read_volume(path)
 
 
-def test_both_ends_at_once(tmp_path):
+def test_remains_at_both_ends_are_named(tmp_path):
     plan = write_series(tmp_path, plan_with("IM0001"))
     for k in (0, COUNT - 1):
         (tmp_path / plan.name(k)).write_bytes(b"")
@@ -193,7 +193,7 @@ def test_what_lies_apart_is_a_warning(tmp_path):
 @pytest.mark.parametrize(
     ("start", "what"), [(b"", "empty"), (b"\0", "blank, all bytes 00"), (b"ab", "text"), (b"a\0b", "no DICOM")]
 )
-def test_starts(start, what):
+def test_file_is_described_by_its_first_bytes(start, what):
     assert describe_start(start) == what
 
 

@@ -42,7 +42,7 @@ def test_given_rescale_makes_hu_of_a_grid_file(tmp_path):
     assert volume.report["rescale"]["given"] and SAID in volume.report["warnings"]
 
 
-def test_without_it_nothing_is_said_of_it(tmp_path):
+def test_report_without_a_given_rescale_says_none(tmp_path):
     assert "given" not in read_volume(write_values(tmp_path, make_body())).report["rescale"]
 
 

@@ -102,7 +102,7 @@ def test_places_that_fall_together_name_the_digits(tmp_path):
         read_volume(tmp_path)
 
 
-def test_exponents_count(tmp_path):
+def test_exponents_of_positions_count_as_decimals(tmp_path):
     def change(ds, k):
         ds.SliceThickness = 0.0105
         set_raw("ImagePositionPatient", f"-1\\-1\\{3.0 + 0.0105 * k:.2e}")(ds, k)

@@ -38,7 +38,7 @@ def two_series(tmp_path):
     return tmp_path
 
 
-def test_listing_is_the_contract(two_series):
+def test_listing_has_the_names_of_the_contract(two_series):
     listing = list_series(two_series)
     entries = [entry.as_dict() for entry in listing.series]
     assert [list(entry)[: len(CONTRACT)] for entry in entries] == [CONTRACT, CONTRACT]
@@ -236,7 +236,7 @@ def test_descriptions_keep_their_character_set(tmp_path):
     assert list_series(tmp_path).series[0].description == "Rücken 背骨"
 
 
-def test_no_patient_data_and_no_folder_in_the_report(tmp_path):
+def test_report_holds_no_patient_data_and_no_folder(tmp_path):
     folder = tmp_path / "Doe^John"
     plan = Plan(tilt_deg=3, name="Doe{}.dcm".format)
 
@@ -319,7 +319,7 @@ def test_links_and_pipes_are_passed_over(tmp_path):
     assert read_volume(tmp_path / "named").report["slices"] == 7
 
 
-def test_dicomdir_trees_of_pydicom(tmp_path):
+def test_dicomdir_tree_of_pydicom_lists_its_series(tmp_path):
     source = get_testdata_file("DICOMDIR")
     folder = tmp_path / "tree"
     shutil.copytree(
@@ -333,7 +333,7 @@ def test_dicomdir_trees_of_pydicom(tmp_path):
         read_volume(folder / "DICOMDIR")
 
 
-def test_ct_small_of_pydicom():
+def test_single_slice_of_pydicom_is_listed_and_refused():
     with refused(RefusedInputError, "surface"):
         read_volume(get_testdata_file("CT_small.dcm"))
     entry = list_series(get_testdata_file("CT_small.dcm")).series[0]

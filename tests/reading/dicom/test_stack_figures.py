@@ -60,7 +60,7 @@ def test_the_median_of_an_even_count_lies_between_the_middle_two():
     assert (median([3.0, 1.0, 2.0]), median([1.0, 8.0, 4.0, 2.0]), median([5.0])) == (2.0, 3.0, 5.0)
 
 
-def test_the_cross_product():
+def test_cross_product_is_that_of_the_formula():
     assert _cross(np.array([1.0, 2.0, 3.0]), np.array([5.0, 7.0, 11.0])).tolist() == [1.0, 4.0, -3.0]
 
 
@@ -91,7 +91,7 @@ def test_a_run_begins_and_ends_anywhere():
             assert _find_runs(gaps).tolist() == expected.tolist()
 
 
-def test_thickness_and_overlap():
+def test_thickness_and_overlap_are_measured_where_every_slice_states_it():
     found = facts_of_thickness(thick(3.0, 3.0, 5.0), np.array([0.0, 2.0, 5.0]))
     assert found == {
         "min_mm": 3.0,
@@ -153,7 +153,7 @@ def test_a_long_even_stack_is_looked_at_in_three_windows_first(monkeypatch):
     assert seen == [*range(100), *range(96)]
 
 
-def test_elements_that_are_compared():
+def test_elements_but_series_rows_and_overlays_are_compared():
     study, series, rows, overlay, length = 0x0020000D, 0x0020000E, 0x00280010, 0x60003000, 0x00080000
     assert _is_compared(study) and _is_compared(0x00080032) and _is_compared(0x00281050)
     assert not any(map(_is_compared, (series, rows, overlay, length)))
@@ -228,7 +228,7 @@ def test_a_disk_that_does_not_answer_is_given_up_after_300_seconds():
         (False, (-1, 0), False),
     ],
 )
-def test_padding_that_twelve_stored_bits_can_hold(signed, padding, fits):
+def test_padding_counts_where_twelve_stored_bits_can_hold_it(signed, padding, fits):
     header: Any = SimpleNamespace(bits_stored=12, signed=signed, padding=padding)
     assert _fits_stored_bits(header) == fits
 
@@ -355,7 +355,7 @@ def test_a_doubt_about_the_order_is_said_once():
         (False, True, "a sign"),
     ],
 )
-def test_the_sign_of_ten_decoded_bits_where_twelve_are_stored(declared, coded, doubtful):
+def test_sign_of_decoded_bits_is_doubted_where_header_and_code_differ(declared, coded, doubtful):
     header: Any = SimpleNamespace(bits_stored=12, signed=declared)
     frame: Any = SimpleNamespace(bits=10, signed=coded)
     stored._settle_sign(header, frame, np.array([[0, 511]], np.int16))  # without the tenth bit both readings agree

@@ -77,7 +77,7 @@ def test_other_bytes_behind_the_pixels_are_refused_unless_forced(tmp_path, synta
 
 
 @pytest.mark.parametrize("change", [{"Columns": 9}, {"Rows": 7}, {"BitsAllocated": 8, "BitsStored": 8, "HighBit": 7}])
-def test_a_header_with_fewer_pixels_than_there_are(tmp_path, change):
+def test_header_with_fewer_pixels_than_there_are_is_refused(tmp_path, change):
     write(tmp_path, lambda ds, k: ds.update(change))
     check_refused(tmp_path, "Pixel Data has 160 bytes", "more pixels than the header says")
 
@@ -158,7 +158,7 @@ def append(folder, data):
 
 
 @pytest.mark.parametrize("syntax", SYNTAXES[:3])
-def test_elements_behind_the_pixels(tmp_path, syntax):
+def test_elements_behind_the_pixels_are_left_out(tmp_path, syntax):
     plan = write(tmp_path, None, syntax)
     private = element(0x7FE10010, b"OB", b"MAKER ", syntax) + element(0x7FE11010, b"OB", b"\n" * 50, syntax)
     append(tmp_path, private + element(0xFFFCFFFC, b"OB", bytes(30), syntax))
@@ -217,7 +217,7 @@ NOISY = Plan(shape=(3, 80, 80), name=NAME)
 @pytest.mark.parametrize("syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian])
 @pytest.mark.parametrize(("old", "new"), [(b"\n", b"\r\n"), (b"\r\n", b"\n"), (b"\r", b"\r\n")])
 @pytest.mark.parametrize("whole", [True, False])
-def test_line_ends_that_were_changed_on_the_way(tmp_path, syntax, old, new, whole):
+def test_line_ends_that_were_changed_on_the_way_are_refused(tmp_path, syntax, old, new, whole):
     write(tmp_path, noise, syntax, NOISY)
     for file in tmp_path.iterdir():
         data = file.read_bytes()
@@ -229,7 +229,7 @@ def test_line_ends_that_were_changed_on_the_way(tmp_path, syntax, old, new, whol
 
 
 @pytest.mark.parametrize("tail", [b"", element(0xFFFCFFFC, b"OB", bytes(5000), ExplicitVRLittleEndian)])
-def test_frames_that_were_sent_as_text(tmp_path, tail):
+def test_frames_that_were_sent_as_text_are_refused(tmp_path, tail):
     ds = make_enhanced(NOISY)
     noise(ds, 1)
     ds.PixelData *= 3
@@ -241,7 +241,7 @@ def test_frames_that_were_sent_as_text(tmp_path, tail):
 
 
 @pytest.mark.parametrize("name", [*COMPRESSED, "deflated"])
-def test_compressed_pixels_that_were_sent_as_text(tmp_path, name):
+def test_compressed_pixels_that_were_sent_as_text_are_refused(tmp_path, name):
     for k in range(3):
         ds = make_dataset(Plan(**{**vars(NOISY), "syntax": NATIVE.get(name, ExplicitVRLittleEndian)}), k)
         noise(ds, k)
@@ -255,7 +255,7 @@ def test_compressed_pixels_that_were_sent_as_text(tmp_path, name):
 
 # --- compressed ---
 @pytest.mark.parametrize("name", daily(1, COMPRESSED))
-def test_what_follows_compressed_pixels(tmp_path, name):
+def test_elements_behind_compressed_pixels_are_left_out_and_bytes_refused(tmp_path, name):
     for k, data in enumerate(make_series(COMPRESSED[name])):
         (tmp_path / NAME(k)).write_bytes(data)
     whole = read_volume(tmp_path).voxels
@@ -267,7 +267,7 @@ def test_what_follows_compressed_pixels(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", [*COMPRESSED, *NATIVE])
-def test_two_files_in_one(tmp_path, name):
+def test_two_files_in_one_are_refused(tmp_path, name):
     """The second is not read in silence: neither its pixels nor that it is there."""
     files = make_series((COMPRESSED | NATIVE)[name])
     for k, data in enumerate(files):
@@ -277,7 +277,7 @@ def test_two_files_in_one(tmp_path, name):
 
 @pytest.mark.parametrize("name", COMPRESSED)
 @pytest.mark.parametrize(("keyword", "value"), [("Columns", 31), ("Rows", 31), ("Columns", 16)])
-def test_compressed_pixels_of_another_size(tmp_path, name, keyword, value):
+def test_compressed_pixels_of_another_size_are_refused(tmp_path, name, keyword, value):
     for k, data in enumerate(make_series(COMPRESSED[name])):
         (tmp_path / NAME(k)).write_bytes(data)
         edit_value(tmp_path / NAME(k), keyword, lambda old: struct.pack("<H", value))

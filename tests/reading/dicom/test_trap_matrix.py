@@ -56,7 +56,7 @@ def test_each_trap_gets_its_verdict(tmp_path: Path, case: Case) -> None:
 @pytest.mark.parametrize(
     "case", daily(8, [c for c in CASES.values() if c.again]), ids=[c.name for c in CASES.values() if c.again]
 )
-def test_a_refused_row_read_on_request(tmp_path: Path, case: Case) -> None:
+def test_refused_row_is_read_on_request_within_its_bound(tmp_path: Path, case: Case) -> None:
     truth = case.write(tmp_path, Size())
     volume = read_volume(tmp_path, **dict(case.again or {}))
     check_warnings(volume, EXACT if "series" in dict(case.again or {}) else WARNED, case.again_words)
@@ -74,7 +74,7 @@ def test_the_check_sees_a_shift_and_a_swap(tmp_path: Path) -> None:
             check_marks(wrong, truth, AFFINE_MM)
 
 
-def test_every_verdict_is_there() -> None:
+def test_trap_cases_cover_every_verdict() -> None:
     def count(verdict: Any) -> int:
         return sum(case.verdict == verdict for case in CASES.values())
 

@@ -25,7 +25,7 @@ def lengths(seed: Seed) -> list[int]:
 
 @pytest.mark.fuzz
 @pytest.mark.parametrize("name", daily(1, SEEDS))
-def test_a_slice_cut_anywhere(tmp_path, name, capfd):
+def test_slice_cut_anywhere_is_never_read_as_whole(tmp_path, name, capfd):
     seed = SEEDS[name]
     folder = tmp_path / "ct"
     folder.mkdir()
@@ -56,7 +56,7 @@ def test_a_slice_cut_anywhere(tmp_path, name, capfd):
 
 @pytest.mark.fuzz
 @pytest.mark.parametrize("name", daily(1, SEEDS))
-def test_listing_a_file_cut_at_every_byte(tmp_path, name):
+def test_file_cut_at_every_byte_is_listed_or_refused(tmp_path, name):
     seed = SEEDS[name]
     outcomes = set()
     for length in lengths(seed)[:: 1 if len(seed.series) > 1 else 2]:

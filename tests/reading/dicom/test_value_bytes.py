@@ -59,7 +59,7 @@ def test_a_nul_within_a_number_is_no_number(tmp_path, keyword, old, new):
     check_refused(tmp_path, f"{keyword} (", "\\x00", "expected")
 
 
-def test_a_nul_in_place_of_the_sign_of_one_slice(tmp_path):
+def test_nul_in_place_of_the_sign_of_one_slice_is_refused(tmp_path):
     """x of the last slice was +98 in place of -98, and nothing said so."""
     write_series(tmp_path, PLAN)
     edit_value(tmp_path / "IM0003", "ImagePositionPatient", lambda value: b"\0" + value[1:])
@@ -124,7 +124,7 @@ def test_an_element_twice_with_two_values_is_corrupt(tmp_path, keyword, value, i
     check_refused(tmp_path, f"IM0000: {keyword} (", "is there twice, with two values")
 
 
-def test_the_second_before_the_first_and_apart(tmp_path):
+def test_two_values_of_an_element_out_of_order_are_refused(tmp_path):
     write_series(tmp_path, PLAN)
     for file in tmp_path.iterdir():
         insert_after(file, "Modality", element_bytes("PixelSpacing", b"7\\7 "))
@@ -193,7 +193,7 @@ def write_frames(path: Path, syntax: str, change: Callable[[bytes], bytes]) -> N
 
 
 @pytest.mark.parametrize("syntax", [ImplicitVRLittleEndian, ExplicitVRLittleEndian])
-def test_a_value_twice_within_functional_groups(tmp_path, syntax):
+def test_value_twice_within_functional_groups_is_told_or_refused(tmp_path, syntax):
     write_frames(tmp_path / "one", syntax, lambda element: element)
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, PLAN.hu())
@@ -205,7 +205,7 @@ def test_a_value_twice_within_functional_groups(tmp_path, syntax):
     )
 
 
-def test_a_sequence_twice_within_functional_groups(tmp_path):
+def test_sequence_twice_within_functional_groups_is_refused(tmp_path):
     write_frames(tmp_path / "one", ExplicitVRLittleEndian, lambda element: b"")
     data = (tmp_path / "one").read_bytes()
     end = struct.pack("<HHL", 0xFFFE, 0xE00D, 0) + struct.pack("<HHL", 0xFFFE, 0xE0DD, 0)

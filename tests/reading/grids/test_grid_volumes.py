@@ -223,7 +223,7 @@ def test_labels_of_the_same_kind_of_file_lie_on_their_volume_exactly(tmp_path, n
 
 @pytest.mark.parametrize("name", daily(2, ["a.nii.gz", "gzip.nrrd", "packed.mha", "a.mha"]))
 @pytest.mark.parametrize("kind", daily(1, ["whole", "fractions", "a fraction at the end"]))
-def test_no_more_than_two_volumes_of_memory(tmp_path, name, kind):
+def test_grid_file_is_read_in_the_memory_of_two_volumes(tmp_path, name, kind):
     voxels = np.repeat(make_ct((50, 150, 100)), 3, axis=2).astype(np.float32)
     if kind == "fractions":
         voxels += 0.25

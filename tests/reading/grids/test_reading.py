@@ -26,7 +26,7 @@ pytest.importorskip("SimpleITK")
 
 
 @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "gzip.nrrd", "packed.mha"])
-def test_names_are_not_trusted(tmp_path, name):
+def test_grid_files_are_read_whatever_their_name(tmp_path, name):
     path = WRITERS[name](tmp_path / name, make_ct(), OBLIQUE)
     for other in ("plain", "b.dcm", "c.nii.gz", "d.mha", "e.nrrd"):
         shutil.copy(path, tmp_path / other)
@@ -46,7 +46,7 @@ def test_dicom_is_dicom_whatever_it_is_called_and_whatever_stands_before_it(tmp_
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"\x1f\x8b nonsense", bytes(600)])
-def test_what_is_nothing_of_it_is_refused(tmp_path, content):
+def test_files_of_neither_kind_are_refused(tmp_path, content):
     (tmp_path / "a.nii.gz").write_bytes(content)
     with refused(RefusedInputError, "a.nii.gz", "NIfTI"):
         clrecon.read_volume(tmp_path / "a.nii.gz")
@@ -103,7 +103,7 @@ def test_the_report_and_the_listing_have_the_entries_of_dicom(tmp_path, name):
     assert entry["modality"] == "unknown" and entry["description"].endswith("voxels int16")
 
 
-def test_doubts_fail_gates_that_strict_counts(tmp_path):
+def test_doubtful_grid_files_fail_a_gate_that_strict_counts(tmp_path):
     plain = WRITERS["a.nii"](tmp_path / "a.nii", make_ct(), OBLIQUE)
     offset = WRITERS["raw.nrrd"](tmp_path / "a.nrrd", make_ct((8, 20, 20), low=0), OBLIQUE)
     unclear = write_metaimage(tmp_path / "a.mha", make_ct(), BinaryDataByteOrderMSB=None)
@@ -149,7 +149,7 @@ def test_two_volumes_between_each_other_show_in_any_order_of_the_axes(tmp_path, 
         assert listed["one_volume"] is listed["plausible_hu"] is None
 
 
-def test_the_command_line_takes_them(tmp_path, printed, device):
+def test_commands_take_grid_files(tmp_path, printed, device):
     sphere = np.linalg.norm(np.indices((24, 24, 24)) - 11.7, axis=0)
     hu = np.clip(1000 - 250 * (sphere - 7), -1000, 1000).astype(np.int16)
     path = WRITERS["packed.mha"](tmp_path / "a.mha", hu, OBLIQUE)

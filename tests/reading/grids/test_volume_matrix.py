@@ -24,7 +24,7 @@ def rows() -> dict[str, dict[str, str]]:
     return {row[0]: dict(zip(head[1:], row[1:], strict=True)) for row in cells}
 
 
-def test_the_page_has_these_rows(rows: dict[str, dict[str, str]]) -> None:
+def test_cases_of_grid_files_are_those_of_the_page(rows: dict[str, dict[str, str]]) -> None:
     assert list(rows) == NAMES and len(NAMES) >= 60
 
 

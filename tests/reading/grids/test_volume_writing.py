@@ -66,7 +66,7 @@ def test_pynrrd_finds_a_shear_in_lps(tmp_path):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_clrecon_reads_it_back(tmp_path, name):
+def test_written_volume_is_read_back_unchanged(tmp_path, name):
     volume = scan(tmp_path, "oblique")
     write_volume(volume, tmp_path / name)
     back = read_volume(tmp_path / name)

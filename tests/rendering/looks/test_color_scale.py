@@ -12,7 +12,7 @@ from clrecon.rendering.looks.colors import ColorScale, round_up
 from clrecon.rendering.pictures.sheets import add_scale
 
 
-def test_colours_about_zero_and_from_zero_on() -> None:
+def test_colours_of_distances_are_blue_below_zero_and_red_above() -> None:
     colors = ColorScale(2.0).colors([-5.0, -2.0, 0.0, 2.0, 9.0])
     assert colors.dtype == np.uint8 and np.array_equal(colors[0], colors[1]) and np.array_equal(colors[3], colors[4])
     assert colors[2].tolist() == [222, 222, 222]

@@ -26,7 +26,7 @@ def passes(name: str, hu: float, mm: float) -> float:
     return float((1 - function([hu])[0, 3]) ** (mm / function.unit_distance))
 
 
-def test_they_are_there_and_found() -> None:
+def test_presets_are_found_by_name_and_unknown_ones_refused() -> None:
     assert list(PRESETS) == NAMES
     assert find_preset(DEFAULT_PRESET).name == "bone"
     for name in ("bonne", "xyz", "", None):
@@ -34,7 +34,7 @@ def test_they_are_there_and_found() -> None:
             find_preset(name)
 
 
-def test_each_is_whole() -> None:
+def test_every_preset_has_a_name_source_and_range() -> None:
     for name, preset in PRESETS.items():
         assert preset.name == preset.transfer_function.name == name
         assert preset.description and preset.source
@@ -45,7 +45,7 @@ def test_each_is_whole() -> None:
         assert -1100 < low < high < 3100
 
 
-def test_modes_and_windows() -> None:
+def test_presets_have_their_modes_and_windows() -> None:
     modes = {name: preset.mode for name, preset in PRESETS.items() if preset.mode != "dvr"}
     assert modes == {"x-ray": "drr", "mip": "mip", "minip": "minip"}
     assert PRESETS["mip"].window == (0, 1000)
@@ -95,7 +95,7 @@ def test_x_ray_grows_with_attenuation() -> None:
     assert opacity[0] == 0 and np.all(np.diff(opacity) > 0)
 
 
-def test_the_document_says_what_they_are() -> None:
+def test_page_describes_every_preset_as_it_is() -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([\w-]+)` \| (.*?) \| (\w+) \| (.*?) ?\|$", text, re.MULTILINE)
     assert [row[0] for row in rows] == NAMES

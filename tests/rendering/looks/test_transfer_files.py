@@ -153,7 +153,7 @@ def test_the_python_of_the_document_runs() -> None:
     assert said in " ".join(text.split())
 
 
-def test_an_older_file_stays_when_the_new_one_cannot_be_written(tmp_path: Path) -> None:
+def test_transfer_function_that_cannot_be_written_leaves_no_file(tmp_path: Path) -> None:
     function = TransferFunction([(1, 0, 0, 0, 0), (2, 1, 1, 1, 1)])
     with refused(OutputError, "f.json", "folder"):
         function.save(tmp_path / "gone" / "f.json")
@@ -162,7 +162,7 @@ def test_an_older_file_stays_when_the_new_one_cannot_be_written(tmp_path: Path) 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_fields_that_are_left_out_have_their_defaults(tmp_path: Path) -> None:
+def test_fields_left_out_of_a_transfer_file_have_their_defaults(tmp_path: Path) -> None:
     function = load_transfer_function(put(tmp_path, OWN))
     assert function == TransferFunction([(100, 1, 0.5, 0, 0), (300, 1, 1, 1, 0.5)])
     nothing = {**OWN, "lighting": None, "gradient_opacity": None}
@@ -206,7 +206,7 @@ def test_fields_that_are_left_out_have_their_defaults(tmp_path: Path) -> None:
         (["lighting"], {"direction": [0, 0]}, "three finite numbers in LPS"),
     ],
 )
-def test_wrong_fields_of_ours(tmp_path: Path, place: list[Any], new: Any, message: str) -> None:
+def test_wrong_fields_of_our_transfer_files_are_named(tmp_path: Path, place: list[Any], new: Any, message: str) -> None:
     with pytest.raises(RefusedInputError, match=f"^'file.json': .*{message}") as caught:
         load_transfer_function(put(tmp_path, changed(OWN, place, new)))
     assert "\n" not in str(caught.value)
@@ -232,12 +232,14 @@ def test_wrong_fields_of_ours(tmp_path: Path, place: list[Any], new: Any, messag
         ('<?xml version="1.0" encoding="no-such"?><MRML/>', ("XML",)),
     ],
 )
-def test_files_that_are_something_else(tmp_path: Path, content: str | bytes, facts: tuple[str | int, ...]) -> None:
+def test_files_that_are_no_transfer_functions_are_refused(
+    tmp_path: Path, content: str | bytes, facts: tuple[str | int, ...]
+) -> None:
     with refused(RefusedInputError, "file.json", *facts):
         load_transfer_function(put(tmp_path, content))
 
 
-def test_no_file_a_folder_a_pipe(tmp_path: Path) -> None:
+def test_missing_files_folders_and_pipes_are_refused_as_transfer_functions(tmp_path: Path) -> None:
     with refused(UsageError, "gone.json"):
         load_transfer_function(tmp_path / "gone.json")
     with refused(UsageError, "folder"):
@@ -283,7 +285,9 @@ def test_slicer_text_is_read_with_any_line_ends(tmp_path: Path) -> None:
         (9, "0", (9, "colorTransfer", 0)),
     ],
 )
-def test_wrong_lines_of_slicer_text(tmp_path: Path, line: int, new: str, facts: tuple[str | int, ...]) -> None:
+def test_wrong_lines_of_slicer_text_are_named(
+    tmp_path: Path, line: int, new: str, facts: tuple[str | int, ...]
+) -> None:
     lines = TEXT.splitlines()
     lines[line - 1] = new
     with refused(RefusedInputError, "a.vp", *facts):
@@ -292,7 +296,7 @@ def test_wrong_lines_of_slicer_text(tmp_path: Path, line: int, new: str, facts: 
         load_transfer_function(put(tmp_path, "\n".join(TEXT.splitlines()[:8]), "a.vp"))
 
 
-def test_slicer_presets_by_name_and_number(tmp_path: Path) -> None:
+def test_presets_of_slicer_are_chosen_by_name_or_number(tmp_path: Path) -> None:
     path = put(tmp_path, XML, "presets.xml")
     one = load_transfer_function(path, "ct-one")
     assert (one.name, one.lighting) == ("CT-One", Lighting(0.1, 0.9, 0.2, 10))
@@ -317,7 +321,7 @@ def test_slicer_presets_by_name_and_number(tmp_path: Path) -> None:
         load_transfer_function(twice, "CT-One")
 
 
-def test_slicer_json(tmp_path: Path) -> None:
+def test_json_of_slicer_is_read_with_lighting_gradient_and_steps(tmp_path: Path) -> None:
     function = load_transfer_function(put(tmp_path, SLICER, "a.vp.json"))
     assert (function.unit_distance, function.lighting) == (2.5, Lighting(0.2, 1, 0, 1))
     assert np.array_equal(function.gradient_opacity, [[0, 0.25], [100, 1]])
@@ -350,7 +354,7 @@ def test_slicer_json(tmp_path: Path) -> None:
         ([0, "components", 0, "lighting"], 3, "lighting"),
     ],
 )
-def test_wrong_fields_of_slicer_json(tmp_path: Path, place: list[Any], new: Any, field: str) -> None:
+def test_wrong_fields_of_slicer_json_are_named(tmp_path: Path, place: list[Any], new: Any, field: str) -> None:
     value = changed(SLICER, ["volumeProperties", *place], new) if place else {**SLICER, "volumeProperties": []}
     with refused(RefusedInputError, "file.json", field):
         load_transfer_function(put(tmp_path, value))

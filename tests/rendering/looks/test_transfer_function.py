@@ -18,7 +18,7 @@ pytestmark = pytest.mark.unit
 STEPPED = [(0, 0, 0, 0, 0), (100, 1, 1, 1, 0.2), (100, 1, 0, 0, 0.6), (300, 1, 1, 0.5, 1)]
 
 
-def test_linear_between_points_and_constant_beyond() -> None:
+def test_transfer_function_is_linear_between_points_and_constant_beyond() -> None:
     function = TransferFunction([(-100, 0.2, 0, 1, 0.1), (300, 0.6, 1, 0, 0.9)])
     found = function([-5000, -100, 0, 100, 300, 5000])
     want = [[0.2, 0, 1, 0.1]] * 2 + [[0.3, 0.25, 0.75, 0.3], [0.4, 0.5, 0.5, 0.5]] + [[0.6, 1, 0, 0.9]] * 2
@@ -33,7 +33,7 @@ def test_a_step_has_its_second_point_from_its_hu_on() -> None:
 
 
 @pytest.mark.parametrize("opacities", [(0.0, 1.0), (0.75, 0.25)])
-def test_steps_at_the_ends(opacities: tuple[float, float]) -> None:
+def test_steps_at_the_ends_have_their_second_value_from_their_hu_on(opacities: tuple[float, float]) -> None:
     low, high = opacities
     threshold = TransferFunction([(200, 1, 1, 1, low), (200, 1, 1, 1, high)])
     assert threshold([-1e5, 199.999, 200, 1e5])[:, 3].tolist() == [low, low, high, high]
@@ -66,7 +66,7 @@ def test_a_table_of_nothing_is_refused(table: tuple[float, float, int]) -> None:
         TransferFunction(STEPPED).table(*table)
 
 
-def test_gradient_opacity() -> None:
+def test_gradient_opacity_is_linear_with_steps() -> None:
     function = TransferFunction(STEPPED, gradient_opacity=[(10, 0), (50, 1), (50, 0.5)])
     assert function.gradient_factor([0, 10, 30, 50, 1000]).tolist() == [0, 0, 0.5, 0.5, 0.5]
     assert function.gradient_table(60, 3).tolist() == [0, 0.5, 0.5]
@@ -74,7 +74,7 @@ def test_gradient_opacity() -> None:
     assert TransferFunction(STEPPED).gradient_opacity is None
 
 
-def test_it_cannot_be_changed_and_leaves_its_input_alone() -> None:
+def test_transfer_function_cannot_be_changed_and_copies_its_input() -> None:
     points = np.array(STEPPED, dtype=np.float64)
     gradient = np.array([(0, 0), (5, 1.0)])
     function = TransferFunction(points, gradient_opacity=gradient)
@@ -89,7 +89,7 @@ def test_it_cannot_be_changed_and_leaves_its_input_alone() -> None:
             setattr(function, name, None)
 
 
-def test_scaled_and_shifted() -> None:
+def test_transfer_function_is_scaled_and_shifted() -> None:
     function = TransferFunction(
         STEPPED, unit_distance=2, gradient_opacity=[(0, 1), (5, 0)], name="x", lighting=UNSHADED
     )
@@ -150,7 +150,7 @@ def test_equal_is_what_gives_the_same_picture() -> None:
         ([(1e7, 1, 1, 1, 1)], r"point 1 .* 1e\+07 HU, beyond a million"),
     ],
 )
-def test_points_that_cannot_be_right(points: object, message: str) -> None:
+def test_points_of_a_wrong_form_are_refused(points: object, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         TransferFunction(points)
 
@@ -172,7 +172,7 @@ def test_points_that_cannot_be_right(points: object, message: str) -> None:
         ({"name": 3}, "name and description"),
     ],
 )
-def test_parameters_that_cannot_be_right(parameters: dict, message: str) -> None:
+def test_parameters_out_of_range_are_refused(parameters: dict, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         TransferFunction(STEPPED, **parameters)
 
@@ -201,6 +201,6 @@ def test_lighting_keeps_a_unit_direction() -> None:
         ({"direction": "up"}, ("LPS",)),
     ],
 )
-def test_lighting_that_cannot_be_right(parameters: dict, message: str) -> None:
+def test_lighting_out_of_range_is_refused(parameters: dict, message: str) -> None:
     with refused(UsageError, *message):
         Lighting(**parameters)

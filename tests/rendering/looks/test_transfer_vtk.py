@@ -44,7 +44,7 @@ def test_vtk_says_what_the_function_says() -> None:
 
 @pytest.mark.parametrize("gradient", [None, [(0, 0), (50, 1), (50, 0.5)]])
 @pytest.mark.parametrize("light", [LIGHT, UNSHADED])
-def test_there_and_back_is_the_same(gradient: object, light: Lighting) -> None:
+def test_transfer_function_comes_back_from_vtk_unchanged(gradient: object, light: Lighting) -> None:
     function = TransferFunction(STEPPED, unit_distance=0.25, gradient_opacity=gradient, lighting=light)
     assert TransferFunction.from_vtk(function.to_vtk()) == function
     assert TransferFunction.from_vtk(function.to_vtk(voxel_mm=0.5), voxel_mm=0.5) == function
@@ -62,7 +62,7 @@ def test_every_preset_goes_there_and_back() -> None:
 
 
 @pytest.mark.parametrize("clamped", [True, False])
-def test_bent_ways_and_ends_as_vtk_has_them(clamped: bool) -> None:
+def test_bent_functions_of_vtk_are_read_with_their_ends(clamped: bool) -> None:
     rng = np.random.default_rng(7)
     at = rng.uniform(-1500, 2500, 500)
     for _ in range(40):
@@ -79,7 +79,7 @@ def test_bent_ways_and_ends_as_vtk_has_them(clamped: bool) -> None:
 
 
 @pytest.mark.parametrize("space", ["HSV", "Lab", "Diverging"])
-def test_ways_through_other_colour_spaces(space: str) -> None:
+def test_functions_of_vtk_in_other_colour_spaces_are_read(space: str) -> None:
     colors, opacity = vtk_core.vtkColorTransferFunction(), vtk_data.vtkPiecewiseFunction()
     getattr(colors, f"SetColorSpaceTo{space}")()
     for x, color in ((-100, (0.2, 0.3, 0.8)), (200, (0.8, 0.8, 0.3)), (900, (0.7, 0.1, 0.1))):
@@ -91,7 +91,7 @@ def test_ways_through_other_colour_spaces(space: str) -> None:
     np.testing.assert_allclose(function(at)[:, :3], [colors.GetColor(x) for x in at], atol=COLOR_SPACE_WAY)
 
 
-def test_grey_properties_without_shading() -> None:
+def test_grey_property_of_vtk_without_shading_is_read() -> None:
     grey, opacity = vtk_data.vtkPiecewiseFunction(), vtk_data.vtkPiecewiseFunction()
     for function in (grey, opacity):
         function.AddPoint(0, 0)
@@ -104,7 +104,7 @@ def test_grey_properties_without_shading() -> None:
     assert (found.lighting, found.gradient_opacity, found.name) == (UNSHADED, None, "grey")
 
 
-def test_properties_that_cannot_be_read() -> None:
+def test_properties_of_vtk_that_cannot_be_read_are_refused() -> None:
     empty = make_property(vtk_data.vtkPiecewiseFunction(), vtk_core.vtkColorTransferFunction())
     with pytest.raises(UsageError, match="its colour function has no points"):
         TransferFunction.from_vtk(empty)
@@ -151,7 +151,9 @@ def test_pyvista_gives_what_its_scene_shows(opacity: object) -> None:
         ("bone", "linear", (0, np.nan), "a lower and a higher HU"),
     ],
 )
-def test_what_pyvista_does_not_take(cmap: str, opacity: object, clim: tuple[float, float], message: str) -> None:
+def test_maps_and_limits_that_pyvista_does_not_take_are_refused(
+    cmap: str, opacity: object, clim: tuple[float, float], message: str
+) -> None:
     pytest.importorskip("pyvista")
     with pytest.raises(UsageError, match=message):
         TransferFunction.from_pyvista(cmap, opacity, clim)

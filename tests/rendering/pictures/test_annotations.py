@@ -36,12 +36,12 @@ BLACK, WHITE, CLEAR = (0, 0, 0, 255), (255, 255, 255, 255), (0, 0, 0, 0)
         ("inferior", "RLAP"),
     ],
 )
-def test_letters_of_the_views(view, letters):
+def test_letters_of_the_views_are_those_of_the_patient(view, letters):
     camera = Camera.fit(Volume(np.zeros((4, 5, 6), np.int16), np.eye(4)), view)
     assert list(edge_letters(camera).items()) == list(zip(("left", "right", "top", "bottom"), letters, strict=True))
 
 
-def test_letters_of_an_oblique_view():
+def test_letters_of_an_oblique_view_name_two_and_three_sides():
     assert edge_letters(PARALLEL.orbit(30.0, 20.0)) == {"left": "RA", "right": "LP", "top": "SPR", "bottom": "IAL"}
 
 
@@ -182,7 +182,7 @@ def test_a_caption_is_cut_where_the_picture_ends():
     assert np.nonzero(drawn(picture.annotated(letters=True), with_letters))[1].max() < 100
 
 
-def test_nothing_asked_is_nothing_done():
+def test_annotations_that_are_not_asked_for_leave_the_picture():
     picture = make_picture()
     assert picture.annotated() is picture
 
@@ -196,6 +196,6 @@ def test_nothing_asked_is_nothing_done():
         (make_picture(camera=None), {"scale_bar": True}, "size of this picture's pixels is not known"),
     ],
 )
-def test_what_cannot_be_drawn_is_said(picture, wanted, message):
+def test_annotations_without_room_or_camera_are_refused(picture, wanted, message):
     with pytest.raises(UsageError, match=message):
         picture.annotated(**wanted)

@@ -59,7 +59,7 @@ def test_labels_without_a_colour_and_pixels_without_a_scan_stay() -> None:
     assert (drawn(image=clear)[3] == 0).all()
 
 
-def test_what_is_drawn_is_named() -> None:
+def test_labels_that_are_drawn_are_listed_with_their_pixels() -> None:
     look = LabelStyle.of(LABELS, {1: "#ff0000", 2: "#0000ff"}, {1: 0.0})
     assert facts_of_overlay(NUMBERS, look) == [
         {"label_number": 2, "label": "vertebrae_L2", "color": "#0000ff", "pixels": 30}

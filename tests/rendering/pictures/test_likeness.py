@@ -19,7 +19,7 @@ def picture(shape=(40, 50), top=10, left=12, size=20) -> np.ndarray:
     return pixels
 
 
-def test_equal_pictures():
+def test_equal_pictures_have_no_error():
     found = measure_pictures(picture(), picture())
     assert (found.mse, found.ssim, found.box) == (0.0, 1.0, (10, 12, 30, 32))
 
@@ -52,7 +52,7 @@ def test_a_small_thing_gets_the_window_of_ssim():
     assert measure_pictures(one[::-1, ::-1], one[::-1, ::-1]).box == (0, 0, 7, 7)
 
 
-def test_colour_and_alpha():
+def test_pictures_are_compared_in_grey_over_the_background():
     grey = picture()
     colour = np.stack([grey] * 3, axis=2)
     clear = np.dstack([np.where(grey[:, :, None] > 0, colour, 77), np.where(grey > 0, 255, 0)]).astype(np.uint8)

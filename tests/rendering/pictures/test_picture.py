@@ -192,7 +192,7 @@ def test_a_missing_pillow_is_said(monkeypatch):
         make_picture().save("a.png")
 
 
-def test_colours_by_name_and_number():
+def test_colours_are_found_by_name_and_number():
     for color in ("orange", " Orange ", "#ffa500", "#FFA500", (1.0, 165 / 255, 0.0)):
         assert find_color(color) == pytest.approx([1.0, 165 / 255, 0.0])
     assert find_color("#f0a") == pytest.approx([1.0, 0.0, 170 / 255])

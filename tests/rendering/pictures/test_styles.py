@@ -138,7 +138,9 @@ def test_every_field_of_every_style_is_tried() -> None:
 
 
 @pytest.mark.parametrize(("style", "name", "value", "says"), EVERY_WRONG)
-def test_what_cannot_be_is_refused_when_a_style_is_made(style: type[Style], name: str, value: Any, says: str) -> None:
+def test_impossible_values_are_refused_when_a_style_is_made(
+    style: type[Style], name: str, value: Any, says: str
+) -> None:
     with pytest.raises(UsageError) as error:
         style(**{name: value})
     assert says in str(error.value)
@@ -157,7 +159,7 @@ def test_styles_do_not_change_and_travel(style: type[Style]) -> None:
         assert type(other) is style and other == made
 
 
-def test_two_that_exclude_each_other_are_refused() -> None:
+def test_fields_of_a_style_that_exclude_each_other_are_refused() -> None:
     with refused(UsageError, "window", "function"):
         SlicesInSpace(window=(0, 9), transfer_function=GLASS)
     with refused(UsageError, "angle", "pictures", 5.0):
@@ -181,7 +183,7 @@ def test_fields_are_brought_to_one_form() -> None:
     assert CurveCut(LINE).curve.length == pytest.approx(9.0)  # type: ignore[union-attr]
 
 
-def test_what_a_style_comes_to() -> None:
+def test_style_resolves_function_light_and_labels() -> None:
     assert VolumeLook().function is find_preset("bone").transfer_function
     assert VolumeLook(GLASS).function is GLASS
     assert VolumeLook().light == find_preset("bone").lighting

@@ -20,7 +20,7 @@ CAMERAS = [
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_there_and_back_nothing_changes(camera):
+def test_camera_comes_back_from_pyvista_unchanged(camera):
     made = camera.to_pyvista()
     assert isinstance(made, pyvista.Camera)
     assert Camera.from_pyvista(made) == camera

@@ -271,7 +271,7 @@ def test_the_table_goes_in_the_background_and_it_is_said_how_much(session, monke
 
 
 @pytest.mark.opencl
-def test_it_closes_within_a_second_while_it_works(session, monkeypatch):
+def test_session_closes_within_a_second_while_it_works(session, monkeypatch):
     view = session()
 
     monkeypatch.setattr(view.painter, "find_parts", search_for_ever)

@@ -377,7 +377,7 @@ def test_escape_stops_the_work(page, served, monkeypatch) -> None:
     assert not facts(page)["parts_known"]
 
 
-def test_what_has_to_be_said_is_said(page) -> None:
+def test_page_shows_the_description_and_what_was_removed(page) -> None:
     assert "a ball of triangles" in page.find_element("id", "about").text
     page.find_element("id", "table").click()
     wait_for(page, "return /of the voxels are air now/.test(document.getElementById('hint').textContent)")

@@ -35,14 +35,14 @@ def test_every_key_and_tool_has_words() -> None:
     assert set(re.findall(r': "(\w+)"', tools[1])) == set(words["hints"])
 
 
-def test_it_asks_for_commands_that_there_are() -> None:
+def test_page_asks_only_for_commands_that_there_are() -> None:
     asked = set(re.findall(r"""\b(?:run|last|sumUp)\(["'](\w+)["']""", SCRIPT))
     asked |= set(re.findall(r"""\bdo: ["'](\w+)["']""", SCRIPT)) | set(re.findall(r"""["'](\w+_at)["']""", SCRIPT))
     assert len(asked) > 15
     assert asked - set(COMMANDS) == set()
 
 
-def test_it_holds_no_place_that_was_not_filled_and_no_address() -> None:
+def test_page_holds_no_open_placeholder_and_no_address() -> None:
     page = compose_page("127.0.0.1:1").content.decode()
     assert not re.search(r"@[A-Z]+@", page)
     assert set(re.findall(r"https?://[\w.]+", page)) == {"http://www.w3.org"}  # the name of SVG

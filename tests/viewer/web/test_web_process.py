@@ -69,7 +69,7 @@ def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, 
 @pytest.mark.opencl
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize("number", daily(1, [signal.SIGINT, signal.SIGTERM]))
-def test_a_signal_ends_it_while_pictures_are_drawn(device, scan: Path, number: int) -> None:
+def test_signal_ends_the_server_while_pictures_are_drawn(device, scan: Path, number: int) -> None:
     with running(str(scan), "--device", str(device.index), "--hu", "321") as (process, said):
         server = SimpleNamespace(port=said["port"], address=said["address"])
 
@@ -91,7 +91,7 @@ def test_a_signal_ends_it_while_pictures_are_drawn(device, scan: Path, number: i
 @pytest.mark.seconds
 @pytest.mark.opencl
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-def test_it_leaves_no_file_behind_and_opens_no_browser_without_a_screen(device, scan: Path, tmp_path: Path) -> None:
+def test_server_leaves_no_file_and_opens_no_browser_without_a_screen(device, scan: Path, tmp_path: Path) -> None:
     os.environ["TMPDIR"], before = str(tmp_path), os.environ.get("TMPDIR")
     try:
         with running(str(scan), "--device", str(device.index)) as (process, said):

@@ -110,12 +110,12 @@ def test_behind_a_tunnel_the_port_is_another(served: WebServer) -> None:
     assert get(served, f"/?secret={secret_of(served)}", Host="localhost:9999", Origin="http://localhost:9999")[0] == 200
 
 
-def test_there_is_nothing_else(served: WebServer) -> None:
+def test_other_paths_are_not_found(served: WebServer) -> None:
     for path in ("/nothing", "/../etc/passwd", "/saved/", "/saved/wrong"):
         assert get(served, f"{path}?secret={secret_of(served)}")[0] == 404
 
 
-def test_it_listens_on_the_loopback_address_alone() -> None:
+def test_server_listens_on_the_loopback_address_alone() -> None:
     with bind_port() as listener:
         assert listener.getsockname()[0] == "127.0.0.1"
 
