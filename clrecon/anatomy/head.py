@@ -27,7 +27,7 @@ CLEAR_SKIN_HU = (-950.0, -200.0)
 BONE_HU, AIR_HU = 220.0, -400.0
 """Voxels from `BONE_HU` on are bone, and voxels below `AIR_HU` are air."""
 SOFT_HU = (-10.0, 110.0)
-"""Median HU inside the vault of a skull: brain has 20 to 45; contrast medium and beam hardening increase them."""
+"""Median HU inside the vault of a skull: brain has 20 to 45; contrast medium and beam hardening increase it."""
 PIXEL_MM, SLICE_MM = 2.0, 5.0
 """Pixel size and slice distance of the coarse search for a head."""
 VAULT_CM2, VAULT_MM = (35.0, 320.0), (60.0, 210.0)

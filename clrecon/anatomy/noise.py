@@ -13,7 +13,7 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 
 SOFT_TISSUE_HU = (-150.0, 250.0)
-"""Noise is measured in blocks within this range: fat, muscle, organs and some 60 HU of noise; no air, no dense bone."""
+"""Blocks for measuring noise lie in this range: fat, muscle, organs with up to 60 HU of noise; no air or dense bone."""
 
 BLOCK = 6
 """Voxels along each side of a block within a slice."""

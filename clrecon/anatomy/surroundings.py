@@ -29,7 +29,7 @@ from clrecon.system.progress import Progress, Steps
 from clrecon.system.text import format_ml
 
 SKIN_MM = 2.0
-"""Air less deep than this below the outline of the body is outside: folds of the skin, steps of the outline."""
+"""Air less deep than this below the outline of the body counts as outside: folds of the skin, steps of the outline."""
 DEEP_MM = 5.0
 """Air that is connected to the outside is a cavity of the body if it reaches at least this far below `SKIN_MM`."""
 OPEN_MM = 12.0

@@ -173,7 +173,7 @@ def _camera_planes(camera: Camera, planes: Float64Array) -> NDArray[np.float32]:
 
 
 FARTHEST_MM = 1e9
-"""Largest coordinate of a vertex, 1000 km as for cameras: products of two coordinates fit float32."""
+"""Largest coordinate of a vertex, 1000 km as for cameras, so that the product of two coordinates fits float32."""
 
 SMALLEST_SIDE_MM = 1e-3
 """Least side of the box around an object, so that the camera has a view direction and a height."""

@@ -69,7 +69,7 @@ CORRELATED_MM = 1.0
 """Samples nearer to each other than this, at voxels of 1 mm3, do not count as independent."""
 
 RISE_HU, RISE_SIGMAS = 100.0, 3.0
-"""A rise of HU outwards by the larger of these, in HU and in standard deviations of noise, belongs to another wall."""
+"""A rise outwards by the larger of `RISE_HU` and `RISE_SIGMAS` times the noise belongs to another wall."""
 
 SILENT_HU = 10.0
 """Noise that is assumed if a scan shows no soft tissue in which noise can be measured."""
