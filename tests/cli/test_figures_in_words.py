@@ -177,7 +177,7 @@ def test_a_method_is_missed_if_it_failed_or_was_asked_for() -> None:
     assert missed == [True, False, True, False, False]
 
 
-def test_what_was_filled_is_a_line() -> None:
+def test_filled_volume_is_printed_in_a_line() -> None:
     assert mesh_command._describe_solid(None) == []
     solid = {"open": {"air": {"ml": 2.0}, "end": {"ml": 3.0}}, "filled_share": 0.25, "filled_ml": 12.0}
     assert mesh_command._describe_solid(solid) == [

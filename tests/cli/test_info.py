@@ -87,7 +87,7 @@ def test_pixels_are_read_on_request(ct: Path, printed: Printer) -> None:
     printed().assert_output(-1000, 700)
 
 
-def test_what_pixels_tell_is_said_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_warnings_of_pixels_are_printed_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bright = set_values(PixelData=np.full((30, 30), 4095, np.uint16).tobytes(), BitsStored=12, HighBit=11)
     write_plan(tmp_path, Plan(shape=(4, 30, 30), signed=False), lambda ds, k: bright(ds, k) if k == 2 else None)
     text = "900 voxels are at 3071 HU, the ceiling of 12 bits"

@@ -146,7 +146,7 @@ def test_a_mask_that_leaves_the_ct_goes_on_there(device: Any, ct: Path, tmp_path
         (["--surface", "nets"], "labels have no surface 'nets': it is hu or mask"),
     ],
 )
-def test_what_masks_do_not_look_at_is_refused(
+def test_options_that_masks_do_not_look_at_are_refused(
     options: list[str], words: str, ct: Path, labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(ct, "-o", tmp_path / "b.stl", "--labels", labels, "--surface", "mask", *options) == 3

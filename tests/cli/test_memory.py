@@ -13,12 +13,12 @@ from clrecon.jobs.options import parse_bytes
     [("1000", 1000), ("512B", 512), ("1.5kB", 1500), ("500MB", 500_000_000), ("2GiB", 2 * 2**30), ("2g", 2 * 10**9),
      ("64 MiB", 64 * 2**20), ("1TB", 10**12)],
 )  # fmt: skip
-def test_amounts_are_read(text, size):
+def test_amounts_of_memory_are_read(text, size):
     assert parse_bytes(text) == size
 
 
 @pytest.mark.parametrize("text", ["", "much", "-5MB", "5XB", "5iB", "MB", "1e9", "5MB5"])
-def test_what_is_no_amount_is_refused(text):
+def test_text_that_is_no_amount_of_memory_is_refused(text):
     with pytest.raises(ValueError, match="500MB or 2GiB"):
         parse_bytes(text)
 

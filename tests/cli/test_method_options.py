@@ -99,7 +99,7 @@ def test_other_methods_write_the_mesh(method: str, bones: Path, tmp_path: Path, 
         (["--grow-from", "label:7", "--labels", "LABELS", "--label", "7"], "leave the labels for meshes out"),
     ],
 )
-def test_what_does_not_go_together_is_one_line_and_writes_nothing(
+def test_methods_and_options_that_exclude_each_other_are_refused_in_one_line(
     options: list[str], words: str, bones: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], device: Any
 ) -> None:
     given = [str(bones / "labels.nii.gz") if option == "LABELS" else option for option in options]

@@ -42,7 +42,7 @@ def parse(*words: str) -> Settings:
     return make_settings(Settings, parser.parse_args(list(words)))
 
 
-def test_what_is_not_given_is_the_default_of_the_field() -> None:
+def test_option_that_is_not_given_is_the_default_of_its_field() -> None:
     assert parse() == Settings()
     assert parse("--count", "5", "--even", "4", "--open", "--no-solid") == Settings(count=5, even=4, is_open=True)
     assert parse("--name", "a", "--name", "b", "--solid") == Settings(names=("a", "b"), is_solid=True)

@@ -33,7 +33,7 @@ def run(ct: Path, device: Any, tmp_path: Path, *arguments: str) -> int:
     return main(["mesh", str(ct), "-o", str(tmp_path / "b.stl"), "--device", str(device.index), *arguments])
 
 
-def test_below_is_the_lung_without_the_air_outside(
+def test_option_below_gives_the_lung_without_the_air_outside(
     ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(ct, device, tmp_path, "--below", "-400", "--strict", "--json") == 0
@@ -64,7 +64,7 @@ def test_range_and_iso_value_get_a_file_each(ct: Path, device: Any, tmp_path: Pa
         ("100:b", "'b' in '100:b' is no number of HU"),
     ],
 )
-def test_what_is_no_range_is_said(text: str, said: str) -> None:
+def test_text_that_is_no_range_is_refused(text: str, said: str) -> None:
     with pytest.raises(ValueError, match="is no") as caught:
         parse_hu(text)
     assert said in str(caught.value)

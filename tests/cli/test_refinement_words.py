@@ -69,7 +69,7 @@ def test_a_gate_of_the_scan_and_one_of_the_mesh_have_codes_of_their_own(
         ),
     ],
 )
-def test_how_much_was_smoothed_is_said(left: int, expected: str) -> None:
+def test_amount_of_smoothing_is_printed(left: int, expected: str) -> None:
     deviation: dict[str, Any] = {"hd95_mm": 0.1, "assd_mm": 0.05, "max_mm": 0.2, "volume_change_percent": None}
     found = {"iterations": 1, "components_left": left, "roughness_before_mm": 0.2, "roughness_after_mm": 0.05}
     line = describe_refinement([{"refinement": {"smooth": found, "deviation": deviation, "voxel_mm": 0.7}}])[0]

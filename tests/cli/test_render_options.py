@@ -28,7 +28,7 @@ def parser() -> Parser:
 
 
 @pytest.mark.parametrize("name", GIVEN_TWICE)
-def test_what_may_be_given_again_makes_a_list(name: str, parser: Parser) -> None:
+def test_options_that_may_be_given_again_make_a_list(name: str, parser: Parser) -> None:
     texts, values = GIVEN_TWICE[name]
     option = f"--{name.replace('_', '-')}"
     (action,) = (action for action in parser._actions if option in action.option_strings)

@@ -75,7 +75,7 @@ def test_for_print_is_solid_unless_it_shall_not_be(device, bone, tmp_path, print
         (["--solid", "--seal", "2mm"], "'2mm' is no number: write the length in mm, without a unit"),
     ],
 )
-def test_what_solid_does_not_go_with_is_refused_in_one_line(options, words, bone, tmp_path, capsys):
+def test_options_that_exclude_solid_are_refused_in_one_line(options, words, bone, tmp_path, capsys):
     assert run(bone, "-o", tmp_path / "a.stl", *options) == 3
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1

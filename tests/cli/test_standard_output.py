@@ -91,7 +91,7 @@ def test_results_of_other_commands_go_to_standard_output(device, ct, capfdbinary
         (("mesh", "-o", "-", "--hu", "5000"), 2, "the volume runs from"),
     ],
 )
-def test_what_one_stream_cannot_hold_is_refused_in_one_line(ct, capfdbinary, arguments, code, words):
+def test_outputs_that_one_stream_cannot_hold_are_refused_in_one_line(ct, capfdbinary, arguments, code, words):
     command, *rest = arguments
     assert run(command, ct, *rest) == code
     out, err = capfdbinary.readouterr()

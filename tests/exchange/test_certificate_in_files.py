@@ -107,7 +107,7 @@ def test_glb_and_3mf_hold_the_certificate(mesh, tmp_path):
 
 
 @pytest.mark.parametrize("extension", [".ply", ".obj", ".glb", ".3mf"])
-def test_another_library_still_reads_the_file(mesh, extension, tmp_path):
+def test_files_with_a_certificate_are_read_by_another_library(mesh, extension, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     mesh.save(tmp_path / f"box{extension}")
     read = trimesh.load_scene(tmp_path / f"box{extension}", process=False).to_mesh()
@@ -121,7 +121,7 @@ def test_vtk_still_reads_ply(mesh, tmp_path):
 
 
 @pytest.mark.parametrize("extension", [".stl", ".ply", ".obj", ".glb", ".3mf", ".vtp"])
-def test_nothing_else_of_the_report_gets_out(mesh, extension, tmp_path):
+def test_files_hold_nothing_else_of_the_report(mesh, extension, tmp_path):
     path = tmp_path / f"box{extension}"
     mesh.save(path)
     content = path.read_bytes()
@@ -147,7 +147,7 @@ def test_nothing_else_of_the_report_gets_out(mesh, extension, tmp_path):
         {"gap_mm": {"min": 1, "max": None, "median": 2}, "gap_runs": [{"count": 1}], "hu_range": [1, 2]},
     ],
 )
-def test_what_is_not_known_has_no_line(report):
+def test_facts_that_are_not_known_have_no_line(report):
     assert certificate_lines(report) == ()
 
 

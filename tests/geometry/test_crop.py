@@ -115,7 +115,7 @@ def test_crop_of_an_uneven_stack_to_one_slice_is_even_and_in_place():
     check_places(volume, cropped)
 
 
-def test_nothing_left_and_wrong_boxes_are_one_line():
+def test_crops_that_leave_nothing_and_wrong_boxes_are_refused_in_one_line():
     with refused(UsageError, "LPS", 100, 120):
         crop_volume(numbered(), *between(100, 120))
     with refused(UsageError, 9, 3):

@@ -67,7 +67,7 @@ def test_a_spline_of_a_few_points_is_that_of_the_whole_volume():
     assert volume.sample(volume.ijk_to_lps(ijk), order=3) == pytest.approx(whole, abs=1e-5)
 
 
-def test_beyond_half_a_voxel_there_is_nothing():
+def test_samples_beyond_half_a_voxel_are_outside():
     volume = VOLUMES["tilted"]
     places = [(-0.49, 3, 3), (-0.51, 3, 3), (3, 3, 11.49), (3, 3, 11.51), (np.nan, 0, 0), (np.inf, 0, 0)]
     with np.errstate(invalid="ignore"):
@@ -92,7 +92,7 @@ def test_what_is_no_point_is_refused(points):
         VOLUMES["tilted"].sample(points)
 
 
-def test_another_order_is_refused():
+def test_sampling_of_another_order_is_refused():
     with refused(UsageError, 0, 1, 3):
         VOLUMES["tilted"].sample((0, 0, 0), order=2)
 

@@ -34,7 +34,7 @@ def test_the_map_is_linear_in_each_layer_and_has_an_inverse(sign):
     assert np.abs(low + part * (high - low) - lps).max() <= tolerances.FLOAT64_PLACE_MM
 
 
-def test_beyond_the_ends_the_steps_of_the_ends_go_on():
+def test_steps_of_the_ends_go_on_beyond_an_uneven_stack():
     volume = uneven()
     origins = volume.slice_origins(border=2)
     steps = np.diff(origins, axis=0)

@@ -56,7 +56,7 @@ def test_a_circle_of_inner_rooms_is_found() -> None:
         ({"a": ["a"]}, [["a"]]),
     ],
 )
-def test_circles_are_found(imports: dict[str, list[str]], circles: list[list[str]]) -> None:
+def test_circles_of_files_are_found(imports: dict[str, list[str]], circles: list[list[str]]) -> None:
     assert find_circles(imports) == circles
 
 

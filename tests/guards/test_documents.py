@@ -55,7 +55,7 @@ def test_every_named_file_is_there(name: str) -> None:
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / ".github").rglob("*.yml")), ids=lambda path: path.stem)
-def test_what_a_form_or_workflow_asks_for_is_there(path: Path) -> None:
+def test_files_that_forms_and_workflows_name_are_there(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     for arguments in re.findall(r"`clrecon ([^`]+)`", text):
         parse_command(shlex.split(arguments))

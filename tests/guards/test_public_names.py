@@ -64,7 +64,7 @@ def test_the_stub_says_each_name_once_and_says_them_all() -> None:
         assert there == name and getattr(clrecon, name) is getattr(import_module(module), name)
 
 
-def test_what_is_no_public_name_is_not_there() -> None:
+def test_name_that_is_not_public_is_not_there() -> None:
     for name in ("choose_device", "list_devices", "import_module_", "rendr", "_nothing"):
         with pytest.raises(AttributeError, match=name):
             getattr(clrecon, name)
@@ -90,6 +90,6 @@ def test_a_device_by_position_is_found() -> None:
     assert by_position(takes) == ["device"]
 
 
-def test_what_takes_long_tells_its_progress() -> None:
+def test_functions_that_take_long_tell_their_progress() -> None:
     take = {name for name, function in public_callables() if "progress" in inspect.signature(function).parameters}
     assert take == TAKE_PROGRESS

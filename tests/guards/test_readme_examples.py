@@ -71,7 +71,7 @@ def test_vertebrae_of_the_readme_are_named_so_that_the_next_command_finds_l3(fol
     assert found[:, 2].min() > l3[:, 2].min() - 5.0 and found[:, 2].max() < l3[:, 2].max() + 5.0
 
 
-def test_the_tour_runs(folder, device, monkeypatch):
+def test_code_of_the_tour_runs(folder, device, monkeypatch):
     source = block_of("docs/tour.md")
     for text, other in SMALLER.items():
         assert text in source, text

@@ -103,7 +103,7 @@ def test_wrong_calls_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert [path.name for path in tmp_path.iterdir()] == ["ct"]
 
 
-def test_nothing_is_replaced_where_that_is_asked(tmp_path: Path) -> None:
+def test_export_replaces_no_file_with_no_clobber(tmp_path: Path) -> None:
     scan = series(tmp_path)
     (tmp_path / "a.nii").write_bytes(b"older")
     assert run("export", scan, "-o", tmp_path / "a.nii", "--no-clobber") == 6

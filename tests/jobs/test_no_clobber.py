@@ -39,7 +39,7 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("what", COMMANDS)
-def test_row_63_what_exists_is_refused_before_any_work(
+def test_row_63_existing_outputs_are_refused_before_any_work(
     what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Neither the input nor a device is looked for: there is none of either."""

@@ -171,7 +171,7 @@ def test_pictures_say_what_was_left_out(odd: OddBodies, device: Any, tmp_path: P
 
 
 @pytest.mark.parametrize("name", ("water", "empty"))
-def test_what_holds_no_bone_says_so_once(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
+def test_body_without_bone_is_warned_of_once(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     report, _ = mesh_of(odd, device, tmp_path, name, half_way="auto")
     (said,) = [warning for warning in report["warnings"] if "like bone" in warning or "contrast" in warning]
     assert "nothing here looks like bone, none of" in said
@@ -236,7 +236,7 @@ def test_air_within_a_body_is_told_from_the_air_around_it(
 
 
 @pytest.mark.parametrize("name", daily(2, ("limb", "pair", "pelvis", "water", "empty")))
-def test_what_holds_no_air_of_a_body_is_refused(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
+def test_scan_without_air_of_a_body_is_refused(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     expected = (
         "no body found" if name == "empty" else r"nothing below -400 HU lies within the body: [\d,.]+ ml are outside"
     )

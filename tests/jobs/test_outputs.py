@@ -72,7 +72,7 @@ def test_too_many_files_are_refused() -> None:
         name_outputs("bone.stl", names)
 
 
-def test_each_file_is_looked_at_before_the_work(tmp_path: Path) -> None:
+def test_outputs_are_checked_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "bone_350hu.stl").mkdir()
     with refused(OutputError, "bone_350hu.stl"):
         check_outputs(tmp_path / "bone.stl", None, ["200hu", "350hu"])

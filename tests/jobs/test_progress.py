@@ -64,7 +64,7 @@ def test_progress_is_told_and_changes_nothing(works: dict[str, tuple[str, Work]]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_progress_raises_ends_the_work(works: dict[str, tuple[str, Work]], name: str) -> None:
+def test_error_of_progress_ends_the_work(works: dict[str, tuple[str, Work]], name: str) -> None:
     told: list[int] = []
     raised = clrecon.Cancelled("enough")
 

@@ -216,7 +216,7 @@ def test_a_cloud_and_a_picture_are_of_the_region(device: Any, scan: Path, tmp_pa
     assert shares[0] > 2 * shares[1] > 2.2 * shares[2] > 0
 
 
-def test_what_lies_below_a_level_is_cut_by_a_region_too(report_of: Any) -> None:
+def test_surface_below_a_level_is_cut_by_a_region_too(report_of: Any) -> None:
     report, vertices = report_of("--below", "0", "--keep-outside", "--region", box_around(SMALL, 9.0))
     assert report["closed"]
     assert np.abs(vertices - to_lps(SMALL)).max() < 9.0 + 0.8

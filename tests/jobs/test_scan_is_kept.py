@@ -143,7 +143,7 @@ def test_report_replaces_no_voxels_that_a_header_names(tmp_path, monkeypatch):
     assert Path("ct.raw").read_bytes() == voxels
 
 
-def test_what_was_written_before_is_replaced(scan, tmp_path):
+def test_earlier_outputs_are_replaced(scan, tmp_path):
     """An older report or mesh, also beside the slices, is no slice."""
     for name in ("a.json", "ct2.json"):
         Path(name).write_text("{}")

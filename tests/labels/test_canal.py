@@ -118,7 +118,7 @@ def test_uneven_and_turned_slices_keep_their_places():
     assert canal.height_mm == pytest.approx(14.0, abs=1.01)
 
 
-def test_what_is_shifted_beyond_a_slice_is_left_out():
+def test_canal_shifted_beyond_a_slice_is_left_out():
     places = _Places(Volume(np.zeros((2, 3, 4), np.int16), np.eye(4)))
     full = np.ones((3, 4), bool)
     for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1), (2, -2)):

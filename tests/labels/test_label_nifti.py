@@ -79,7 +79,7 @@ def test_the_qform_places_what_has_no_sform(tmp_path):
     assert np.abs(labels.affine - affine).max() <= tolerances.NIFTI_AFFINE_MM
 
 
-def test_metres_become_millimetres(tmp_path):
+def test_nifti_in_metres_is_converted_to_millimetres(tmp_path):
     path = write_nifti(tmp_path / "a.nii", make_labels(), np.diag((1e-3, 1e-3, 2e-3, 1.0)))
     content = bytearray(path.read_bytes())
     content[123] = 1
@@ -204,7 +204,7 @@ def test_header_and_voxels_in_two_files_are_read(tmp_path):
         read_labels(tmp_path / "a.hdr")
 
 
-def test_without_nibabel_the_command_is_named(tmp_path, monkeypatch):
+def test_missing_nibabel_is_named_with_its_command(tmp_path, monkeypatch):
     path = write_nifti(tmp_path / "a.nii", make_labels())
     monkeypatch.setitem(__import__("sys").modules, "nibabel", None)
     with refused(UsageError, "package"):

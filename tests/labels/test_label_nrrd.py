@@ -169,7 +169,7 @@ def test_layers_whose_segments_are_not_known_are_refused(tmp_path, segments, wor
         read_labels(write_nrrd(tmp_path / "a.seg.nrrd", voxels, **fields))
 
 
-def test_what_no_segment_of_a_layer_has_is_said(tmp_path):
+def test_values_that_no_segment_has_are_warned_of(tmp_path):
     voxels, fields = bare_layers(segment(0, "one", 1, 0), segment(1, "air", 0, 1), segment(2, "three", 3, 1))
     labels = read_labels(write_nrrd(tmp_path / "a.seg.nrrd", voxels, **fields))
     assert labels.counts == {1: 1} and "air" not in labels.names.values()
@@ -212,7 +212,7 @@ def test_nrrd_map_cut_anywhere_is_refused(tmp_path, encoding):
             read_labels(tmp_path / "b.nrrd")
 
 
-def test_without_pynrrd_the_command_is_named(tmp_path, monkeypatch):
+def test_missing_pynrrd_is_named_with_its_command(tmp_path, monkeypatch):
     path = write_nrrd(tmp_path / "a.nrrd", make_labels())
     monkeypatch.setitem(__import__("sys").modules, "nrrd", None)
     with refused(UsageError, "package"):

@@ -82,7 +82,7 @@ def test_half_way_the_lower_index_wins():
     assert resample_labels(LabelMap(row[None, None], fine), volume).voxels.tolist() == [[[3, 7, 0]]]
 
 
-def test_how_much_of_each_label_is_inside_is_known():
+def test_share_of_each_label_inside_is_known():
     moved = OBLIQUE.copy()
     moved[:, 3] = OBLIQUE @ (4, 0, 0, 1)
     voxels = np.zeros((5, 7, 8), np.uint8)
@@ -93,7 +93,7 @@ def test_how_much_of_each_label_is_inside_is_known():
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_what_lies_beyond_any_side_is_not_inside(axis, side):
+def test_voxels_beyond_any_side_are_not_inside(axis, side):
     moved = OBLIQUE.copy()
     moved[:3, 3] += side * OBLIQUE[:3, axis]
     size = VOXELS.shape[2 - axis]

@@ -126,7 +126,7 @@ PLACES = [
     ],
     ids=lambda keywords: "-".join(keywords[-2:]),
 )
-def test_what_places_and_names_segments_occurs_once(keywords):
+def test_elements_that_place_and_name_segments_occur_once(keywords):
     _check_elements(nested(*keywords, twice=False), "a.dcm", implicit=False)
     with refused(RefusedInputError, "a.dcm", "DICOM", keywords[-1]):
         _check_elements(nested(*keywords, twice=True), "a.dcm", implicit=False)

@@ -61,7 +61,7 @@ def test_deep_voxels_and_holes_are_filled_and_counted():
     assert fill_solid(solid, labels, 7, box, True) == 0 and solid[4, 4, 4] == 0
 
 
-def test_what_is_inside_of_another_label_stays_so():
+def test_samples_inside_another_label_stay_so():
     labels = ball()
     solid = np.zeros_like(labels)
     solid[4, 4, 4] = 5

@@ -79,7 +79,7 @@ def test_a_map_on_another_grid_is_brought_to_the_scan() -> None:
     assert one.mean_hu == volume.voxels[2:4, 2:4, 2:4].mean()
 
 
-def test_what_is_not_in_the_scan_is_said() -> None:
+def test_labels_outside_the_scan_are_told() -> None:
     volume = Volume(np.zeros((4, 4, 4), np.float32), np.eye(4))
     volume.voxels[0, 0, 0] = np.nan
     voxels = np.zeros((9, 4, 4), np.uint8)

@@ -99,7 +99,7 @@ def test_neighbours_share_no_pixel_and_leave_none_out():
     assert one[:, :5].all() and other[:, 5:].all()  # centres on the common side belong to the right one
 
 
-def test_what_lies_beyond_the_slices_is_cut_off(volume, tmp_path):
+def test_contours_beyond_the_slices_are_cut_off(volume, tmp_path):
     rois = {"x": [rectangle(volume, 1, (-30, -30), (5, 90)), *(rectangle(volume, k, (2, 2), (4, 4)) for k in (-3, 9))]}
     labels = read_labels(write_structures(tmp_path / "rt.dcm", rois), volume=volume)
     assert labels.counts == {1: 20 * 6}

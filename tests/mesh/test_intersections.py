@@ -253,7 +253,7 @@ def test_cells_are_enlarged_where_there_would_be_too_many():
     assert beside.tolist() == [True, True, False, False]
 
 
-def test_what_touches_a_changed_triangle_lies_beside_it():
+def test_triangles_that_touch_a_changed_one_lie_beside_it():
     rng = np.random.default_rng(4)
     vertices = rng.uniform(-40.0, 60.0, (600, 3))
     vertices = (vertices[:, None] + rng.normal(0.0, 6.0, (600, 3, 3))).reshape(-1, 3)
@@ -270,7 +270,7 @@ def test_what_touches_a_changed_triangle_lies_beside_it():
     assert sorted(map(sorted, found.tolist())) == sorted(map(sorted, touched.tolist()))
 
 
-def test_what_finds_crossings_elsewhere_is_asked_where_many_have_changed():
+def test_search_for_crossings_elsewhere_is_asked_where_many_have_changed():
     vertices, triangles = samples.join(samples.box(), samples.box((0.4, 0.5, 0.6)))
     triangles = np.asarray(triangles, np.uint32)
     asked: list[object] = []

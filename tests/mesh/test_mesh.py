@@ -24,7 +24,7 @@ def test_arrays_of_the_right_type_are_not_copied():
     assert (mesh.vertex_count, mesh.triangle_count, mesh.report) == (3, 1, {})
 
 
-def test_other_types_are_converted():
+def test_arrays_of_other_types_are_converted():
     mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 2.5, 0]], np.array([[0, 1, 2]], np.int64)[:, ::-1])
     assert (mesh.vertices.dtype, mesh.triangles.dtype) == (np.float32, np.uint32)
     assert mesh.vertices[2, 1] == 2.5
@@ -102,7 +102,7 @@ def test_contents_of_a_file_have_name_and_colour_of_a_part():
     assert (plain.name, plain.color) == (None, None)
 
 
-def test_what_is_empty_still_has_three_columns():
+def test_empty_mesh_has_arrays_of_three_columns():
     assert Mesh([], []).vertices.shape == Mesh(np.zeros((0, 3)), []).vertices.shape == (0, 3)
     with refused(UsageError, 3, 0, 2):
         Mesh(np.zeros((0, 2)), [])
@@ -137,7 +137,7 @@ def test_a_mirrored_mesh_still_looks_outward():
 @pytest.mark.parametrize(
     ("matrix", "words"), [(np.eye(3), ("4x4",)), (np.diag([1.0, 0, 1, 1]), ("singular",)), (np.ones((4, 4)), ("row",))]
 )
-def test_what_moves_a_mesh_is_an_affine(matrix, words):
+def test_matrix_that_is_no_affine_moves_no_mesh(matrix, words):
     with refused(UsageError, *words):
         Mesh(*samples.sphere((0, 0, 0))).transformed(matrix)
 

@@ -21,7 +21,7 @@ BALL = Mesh(*ball(8.0, 12))
 
 @pytest.mark.parametrize("space", ["lps", "ras"])
 @pytest.mark.parametrize("extension", MESH_INPUTS)
-def test_what_is_written_comes_back(tmp_path: Path, extension: str, space: str) -> None:
+def test_written_mesh_is_read_back_unchanged(tmp_path: Path, extension: str, space: str) -> None:
     mesh = Mesh(BALL.vertices, BALL.triangles, BALL.vertices / 8.0, {"iso_value_hu": 250.0})
     path = tmp_path / f"ball{extension}"
     mesh.save(path, space)

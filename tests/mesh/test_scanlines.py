@@ -32,7 +32,7 @@ def test_lines_are_crossed_at_their_places():
     assert (np.bincount(lines) % 2 == 0).all() and set(rows.tolist()) == set(range(8))
 
 
-def test_what_reaches_beyond_the_lattice_is_cut():
+def test_mesh_beyond_the_lattice_is_cut():
     vertices, triangles = octahedron(6.0, 1.0)
     inside = fill_surface(vertices, triangles, (4, 3, 5))
     far = sum(np.abs(axis - 1.0) for axis in np.indices((4, 3, 5)))

@@ -90,7 +90,7 @@ def test_row_59_damaged_kernels_are_built_anew(damage, device, built):
 
 
 @pytest.mark.seconds
-def test_row_59_what_a_dead_process_built_is_built_anew(device, built):
+def test_row_59_programs_of_a_dead_process_are_built_anew(device, built):
     """The process before died: PoCL's files are there, cut by a full disk, and nobody has seen them work."""
     shutil.rmtree(built / "records")
     cut(built)
@@ -221,7 +221,7 @@ def test_programs_built_beside_by_another_process_do_not_stay_in_a_record(record
     assert json.loads((tmp_path / "records" / KEY).read_bytes()).keys() == {PROGRAM}
 
 
-def test_what_turned_out_wrong_is_forgotten(records, tmp_path):
+def test_program_that_turned_out_wrong_is_forgotten(records, tmp_path):
     store = records()
     build(store, tmp_path)
     store.record()
@@ -238,7 +238,7 @@ def test_a_folder_that_is_removed_meanwhile_is_no_error(records, tmp_path):
     store.record()
 
 
-def test_what_another_process_is_building_stays(records, tmp_path):
+def test_program_that_another_process_builds_stays(records, tmp_path):
     touch(tmp_path)
     store = records()
     other = os.open(tmp_path / "in-use", os.O_RDWR)
@@ -256,7 +256,7 @@ def test_what_another_process_is_building_stays(records, tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
 @pytest.mark.parametrize("is_shared", [True, False])
-def test_what_another_process_replaces_is_built_again_without_a_word(is_shared, records, tmp_path):
+def test_program_that_another_process_replaces_is_built_again_in_silence(is_shared, records, tmp_path):
     """Two processes build one program; the first has recorded its files when the second replaces them."""
     store = records()
     build(store, tmp_path)

@@ -219,6 +219,6 @@ def test_conditions_are_those_of_c(condition, holds):
         "__kernel void work(unsigned long long a) {}\n",
     ],
 )
-def test_what_the_reader_of_signatures_does_not_know_is_an_error(source):
+def test_signature_that_its_reader_does_not_know_is_an_error(source):
     with pytest.raises(ValueError, match=r"#if|#warning|macros that name themselves|a type and a name"):
         find_signatures(source, {})

@@ -167,7 +167,7 @@ def test_row_57_a_device_that_computes_wrongly_is_passed_over_or_refused(machine
      ({"version": "OpenCL 1.1 x"}, "OpenCL 1.2 is needed"),
      ({"endian_little": sys.byteorder != "little"}, "byte order")],
 )  # fmt: skip
-def test_shortcomings_are_named(changed, says):
+def test_shortcomings_of_devices_are_named(changed, says):
     good = {
         "available": 1,
         "compiler_available": 1,

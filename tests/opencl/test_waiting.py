@@ -51,7 +51,7 @@ def own_commands(device, monkeypatch):
 pytestmark = pytest.mark.usefixtures("own_commands")
 
 
-def test_what_a_kernel_works_in_lives_until_it_is_over(device):
+def test_buffers_of_a_kernel_live_until_it_is_over(device):
     """A CPU device works in numpy's memory, which must not be given back while a launch is in flight."""
 
     class Buffer:
@@ -71,7 +71,7 @@ def test_what_a_kernel_works_in_lives_until_it_is_over(device):
     assert alive() is None
 
 
-def test_nothing_is_remembered_of_what_has_ended(device):
+def test_kernels_that_have_ended_are_not_remembered(device):
     launched = Stopwatch()
     program = load_program(device, "primitives/scan.cl", {"SCAN_GROUP": str(device.group_size)})
     counts_d, sums_d = upload(device, np.arange(50, dtype=np.uint32)), allocate(device, 4)

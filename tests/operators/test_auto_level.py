@@ -56,7 +56,7 @@ def test_auto_is_the_measured_level_and_the_report_says_why(name: str, volume: c
     assert said["iso_value_choice"]["bone_hu"] == choice.bone_hu
 
 
-def test_where_nothing_can_be_measured_auto_says_so_and_no_other_word_is_a_level(device: Any) -> None:
+def test_auto_is_refused_without_a_measure_and_no_other_word_is_a_level(device: Any) -> None:
     flat = clrecon.Volume(np.full((8, 8, 8), 40, np.int16), np.eye(4))
     with refused(NoSurfaceError, "bone", 40, 8):
         clrecon.extract_isosurface(flat, "auto", device=device)

@@ -112,7 +112,7 @@ def test_row_57_the_check_runs_once_for_a_driver_a_device_and_a_version(
     assert select.find_fault(FakeDevice()) == "" and len(checked) == 5  # type: ignore[arg-type]
 
 
-def test_row_57_what_fails_is_not_remembered_for_the_next_process(checked: list[Any]) -> None:
+def test_row_57_failed_check_is_not_remembered_for_the_next_process(checked: list[Any]) -> None:
     for count in (1, 2):
         wrong: Any = FakeDevice(name="wrong")
         assert select.find_fault(wrong) == select.find_fault(wrong) == "wrong sums"

@@ -67,7 +67,7 @@ def test_voxels_by_number_stay_numbers_until_their_indices_are_asked_for() -> No
     assert PointCloud(np.zeros((2, 3))).voxel_slices() is None
 
 
-def test_what_is_changed_is_checked() -> None:
+def test_changed_arrays_of_a_cloud_are_checked() -> None:
     cloud = PointCloud(np.zeros((3, 3)), hu=[1, 2, 3], report={"a": 1})
     changed = cloud.changed(hu=None, normals=np.eye(3))
     assert changed.hu is None and changed.normals.dtype == np.float32 and cloud.normals is None

@@ -33,7 +33,7 @@ def test_distance_ratios_of_a_small_cloud_are_those_by_hand():
     assert ratio_threshold(ratios) == pytest.approx(D0_OF_MEDIAN * np.median(ratios))
 
 
-def test_what_equals_the_threshold_is_no_feature():
+def test_point_at_the_threshold_is_no_feature():
     assert find_features(np.array([1.0, 2.0, 2.0000001]), 2.0).tolist() == [False, False, True]
 
 

@@ -49,7 +49,7 @@ def test_a_cloud_goes_to_open3d_and_comes_back():
 
 @pytest.mark.parametrize("make", ["from_pyvista", "from_open3d"])
 @pytest.mark.parametrize("given", ["a", None, np.zeros((3, 3))])
-def test_what_is_no_cloud_of_theirs_is_named(make, given):
+def test_objects_that_are_no_clouds_of_other_libraries_are_refused(make, given):
     with pytest.raises(UsageError, match="is no"):
         getattr(clrecon.PointCloud, make)(given)
 
@@ -72,7 +72,7 @@ def test_bounds_of_a_cloud_are_its_extremes_and_nan_without_points():
     assert np.isnan(cloud[:0].bounds).all()
 
 
-def test_what_a_step_says_of_itself_is_short(device):
+def test_repr_of_a_step_is_short(device):
     cloud = clrecon.PointCloud(np.random.default_rng(6).uniform(0, 10, (1000, 3)))
     clusters = clrecon.cluster_points(cloud, 1.0, 3, device=device)
     assert repr(clusters) == "Clustering(PointCloud(1000 points, with labels, LPS mm) of 1,000)"

@@ -129,7 +129,7 @@ def test_row_57_every_check_passes_and_launches_what_it_declares(
     assert {kernel for kernel in judged if most[kernel] <= LEAST_ITEMS} == set(FEW) & judged
 
 
-def test_what_is_left_out_are_checks() -> None:
+def test_names_that_are_left_out_are_checks() -> None:
     assert EVERY_DAY < ASKED_BY_OPERATORS < {check.name for check in CHECKS}
 
 
@@ -212,7 +212,7 @@ def storied(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize("error", [ModuleNotFoundError("No module named 'scipy'"), IndexError("9 is out of bounds")])
-def test_what_a_check_raises_is_its_failure_in_words(device: Device, error: Exception) -> None:
+def test_error_of_a_check_is_its_failure_in_words(device: Device, error: Exception) -> None:
     def fail(device: Device) -> str:
         raise error
 

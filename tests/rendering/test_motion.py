@@ -127,7 +127,7 @@ def test_gif_of_two_colours_keeps_them(tmp_path):
 
 
 @pytest.mark.parametrize("channels", [3, 4])
-def test_apng_keeps_everything(tmp_path, channels):
+def test_apng_keeps_every_pixel_of_the_frames(tmp_path, channels):
     path = tmp_path / "turn.apng"
     frames = list(moving_frames(5, channels=channels))
     assert write_animation(iter(frames), path, 12.5) == path.stat().st_size

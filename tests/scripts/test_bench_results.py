@@ -120,7 +120,7 @@ def test_cases_and_ratios_can_be_picked(tmp_path: Path, capsys: pytest.CaptureFi
     assert results.pick(results.load_results(folder), None, ["nothing"]) == {}
 
 
-def test_seconds_are_short() -> None:
+def test_seconds_are_printed_short() -> None:
     assert [tables.seconds(value) for value in (2.345, 0.0345, 0.00034)] == ["2.35 s", "34.5 ms", "0.34 ms"]
 
 

@@ -21,7 +21,7 @@ def test_each_function_has_its_place_test_and_figure() -> None:
 
 
 @pytest.mark.parametrize("row", [row for row in ROWS if row.command], ids=lambda row: str(row.number))
-def test_commands_are_understood(row: paper_functions.PaperFunction) -> None:
+def test_commands_of_the_papers_are_understood(row: paper_functions.PaperFunction) -> None:
     assert row.command is not None
     parse_command(shlex.split(row.command))
 

@@ -247,7 +247,7 @@ def test_a_spine_with_a_gap_is_refused() -> None:
 
 
 @pytest.mark.parametrize("kind", ["head", "limb", "empty", "water"])
-def test_other_bodies_are_refused(kind: str) -> None:
+def test_bodies_that_are_no_spine_are_refused(kind: str) -> None:
     settings = PhantomSettings(kind=kind, size=(64, 64), slices=48, spacing=(3.6, 3.6, 3.6))
     voxels, affine, _ = make_phantom(settings)
     with refused(RefusedInputError, "vertebrae"):

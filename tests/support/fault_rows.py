@@ -18,7 +18,7 @@ SLABS = "operators/surface/test_slabs.py::"
 ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     1: ("row and column spacing differ: right", (TRAPS, GEOMETRY + "test_voxels_lie_where_they_were_written")),
     2: ("random order, no extension, lying InstanceNumber: right", (TRAPS,)),
-    3: ("tilt of 1, 2.5, 12, -20 degrees: exact by shear, told", (TRAPS, GEOMETRY + "test_tilt_is_reported")),
+    3: ("tilt of 1, 2.5, 12, -20 degrees: exact by shear, told", (TRAPS, GEOMETRY + "test_gantry_tilt_is_reported")),
     4: (
         "one slice missing: refused; --allow-gaps: true positions, told",
         (TRAPS, "reading/dicom/test_trap_matrix.py::test_refused_row_is_read_on_request_within_its_bound"),
@@ -140,7 +140,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     38: ("deflate, RLE, JPEG 2000 bombs: refused before inflating", ()),
     39: (
         "65535 x 65535 voxels, 2^31 - 1 frames: refused before memory is taken",
-        ("reading/dicom/test_multiframe_faults.py::test_what_is_wrong_is_refused_by_name",),
+        ("reading/dicom/test_multiframe_faults.py::test_faults_of_multi_frame_images_are_refused_by_name",),
     ),
     40: ("garbage for JPEG 2000 or JPEG-LS, a decoder that crashes: that file refused", ()),
     41: (
@@ -183,7 +183,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     51: (
         "no fp64, no images, small groups, 32-bit sizes, big endian: right, or refused in words",
         (
-            "opencl/test_select.py::test_shortcomings_are_named",
+            "opencl/test_select.py::test_shortcomings_of_devices_are_named",
             "operators/primitives/test_compaction.py::test_devices_with_small_work_groups_get_the_same",
         ),
     ),

@@ -277,7 +277,7 @@ def test_check_writable_leaves_nothing(older):
     check_untouched(older)
 
 
-def test_link_is_followed(tmp_path):
+def test_link_to_a_file_is_followed(tmp_path):
     (tmp_path / "there").mkdir()
     real, link, dangling = tmp_path / "there" / "real.stl", tmp_path / "link.stl", tmp_path / "dangling.stl"
     real.write_bytes(b"older")

@@ -64,7 +64,7 @@ def test_a_kept_binary_that_is_damaged_is_said(
     assert caplog.messages == ["a kept binary is damaged: it is built anew and replaced"]
 
 
-def test_nothing_is_printed_unasked(scan: Path) -> None:
+def test_log_is_not_printed_unasked(scan: Path) -> None:
     code = "import clrecon, sys; volume = clrecon.read_volume(sys.argv[1]); assert volume.report['warnings']"
     done = subprocess.run([sys.executable, "-c", code, str(scan)], capture_output=True, check=True)
     assert (done.stdout, done.stderr) == (b"", b"")

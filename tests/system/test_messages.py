@@ -143,7 +143,7 @@ def test_errors_are_pickled_with_their_message(name):
 
 
 @pytest.mark.parametrize("way", [travel, copy.deepcopy])
-def test_what_cannot_be_written_stays_so(way):
+def test_arrays_that_cannot_be_written_stay_so_in_another_process(way):
     frozen = VOXELS.copy()
     frozen.flags.writeable = False
     volume = way(Volume(frozen, AFFINE, slice_positions=POSITIONS))
@@ -185,7 +185,7 @@ def test_mapped_voxels_travel_as_their_place(tmp_path, kind):
     assert len(pickle.dumps(copy.deepcopy(message))) < 10_000
 
 
-def test_what_was_written_to_a_mapping_travels(file):
+def test_values_written_to_a_mapping_travel(file):
     mapped = np.load(file, mmap_mode="r+")
     volume = Volume(mapped, AFFINE)
     mapped[1, 2, 3] = -77

@@ -76,7 +76,7 @@ def test_a_record_cannot_be_changed_and_its_dict_can() -> None:
 
 
 @pytest.mark.parametrize("way", [copy.copy, copy.deepcopy])
-def test_copies_are_records(way: Any) -> None:
+def test_copies_of_records_are_records(way: Any) -> None:
     copied = way(CERTIFICATE)
     assert type(copied) is Certificate
     assert copied == CERTIFICATE

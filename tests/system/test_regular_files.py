@@ -51,7 +51,7 @@ def no_file(request, tmp_path):
 
 
 @pytest.mark.parametrize("reader", READERS)
-def test_no_reader_waits(no_file, reader):
+def test_readers_refuse_irregular_files_without_waiting(no_file, reader):
     with pytest.raises(ClreconError) as caught:
         READERS[reader](no_file)
     assert_one_line(caught.value)

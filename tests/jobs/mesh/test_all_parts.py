@@ -112,7 +112,7 @@ def test_too_many_objects_are_refused_with_the_number_of_crumbs(device, bones, t
         ({"all_parts": True, "seeds": [(0, 0, 0)], "purpose": "print"}, "all_parts=True keeps all bones"),
     ],
 )
-def test_what_all_parts_does_not_go_with_is_refused(given, words):
+def test_options_that_exclude_all_parts_are_refused(given, words):
     with pytest.raises(UsageError, match=words):
         MeshSettings(**given)
 

@@ -229,7 +229,7 @@ def test_ranges_and_iso_values_are_named_by_their_ends(device: Any, tmp_path: Pa
 
 
 @pytest.mark.usefixtures("boxes")
-def test_below_encloses_the_rest(device: Any, tmp_path: Path) -> None:
+def test_surface_below_a_level_encloses_the_rest(device: Any, tmp_path: Path) -> None:
     report = run(tmp_path, device, below=(200.0, 500.0), keep_outside=True)
     assert [mesh["name"] for mesh in report["meshes"]] == ["below200hu", "below500hu"]
     assert [mesh["components"] for mesh in report["meshes"]] == [4, 3]
@@ -251,7 +251,7 @@ def test_below_encloses_the_rest(device: Any, tmp_path: Path) -> None:
         ({"iso_value": ((810.0, 900.0),)}, (810, 900, "HU")),
     ],
 )
-def test_what_holds_all_or_nothing_is_refused(settings: Any, said: str, device: Any, tmp_path: Path) -> None:
+def test_levels_that_hold_all_or_nothing_are_refused(settings: Any, said: str, device: Any, tmp_path: Path) -> None:
     with refused(NoSurfaceError, *said):
         run(tmp_path, device, **settings, **({"keep_outside": True} if "below" in settings else {}))
     assert not list(tmp_path.iterdir())

@@ -57,7 +57,7 @@ def test_an_open_surface_passes_its_gates(device: Any, noisy_torus: Any, tmp_pat
     assert report["iso_distance"]["vertices_voxel"]["max"] < tolerances.DEVICE_ISO_VERTEX_VOXEL
 
 
-def test_what_is_smoothed_and_decimated_is_written(device: Any, noisy_torus: Any, tmp_path: Path) -> None:
+def test_smoothed_and_decimated_mesh_is_written(device: Any, noisy_torus: Any, tmp_path: Path) -> None:
     folder, truth = noisy_torus
     plain = MeshSettings(iso_value=truth["iso_value_hu"], keep_largest=1, device=str(device.index))
     before = make_mesh(folder, tmp_path / "a.stl", plain, measure=True)

@@ -34,7 +34,7 @@ def test_rails_that_are_left_out_are_warned_of(without_table):
 
 
 @pytest.mark.parametrize("remove_table", [False, True])
-def test_what_is_even_beneath_may_be_a_table(remove_table):
+def test_walls_that_are_even_beneath_advise_to_remove_the_table(remove_table):
     walls = WallLook("bone", 0.5, 0.1, 0.0, {"median": 400.0, "p90": 900.0, "p99": 1200.0}, 1000)
     part = Part(Surface(300.0, ""), "", Mesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.uint32)))
     part.facts["walls"] = walls

@@ -79,7 +79,9 @@ def test_views_turntables_and_lights_of_a_cloud_are_drawn(device: Any, file: Pat
     assert set(np.unique(flat)) == {0, 255} and len(np.unique(lit)) > 20
 
 
-def test_what_is_about_scans_is_refused(device: Any, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_options_about_scans_are_refused_for_clouds(
+    device: Any, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     out = ["-o", str(tmp_path / "a.png"), "--device", str(device.index)]
     for option, says in (
         (["--mode", "mip"], "which mode points shows, and not mode mip"),

@@ -136,7 +136,7 @@ def test_turntable_of_a_mesh_has_its_frames(device: Any, files: dict[str, Path],
     assert len(list(out.iterdir())) == 3
 
 
-def test_what_has_no_meaning_is_refused(files: dict[str, Path], tmp_path: Path, capsys: Any) -> None:
+def test_options_without_meaning_for_meshes_are_refused(files: dict[str, Path], tmp_path: Path, capsys: Any) -> None:
     out, ball_file = str(tmp_path / "out.png"), str(files["lps.stl"])
     for words, text in (
         ([str(files["scan.nii"]), "--mode", "mip", "--mesh", ball_file], "--mesh means nothing in mode mip"),

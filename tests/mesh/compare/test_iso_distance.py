@@ -160,7 +160,7 @@ def test_a_mesh_where_no_surface_is_counts_all_its_points():
     assert (found["not_found"], found["vertices_voxel"], found["centres_voxel"]) == (4, None, None)
 
 
-def test_where_the_gradient_leads_nowhere_rays_find_the_surface():
+def test_rays_find_the_surface_where_the_gradient_leads_nowhere():
     """In a flat plateau beside a step the gradient is zero; the surface lies within two voxels."""
     volume = volume_of(lambda lps: np.zeros(len(lps)))
     volume.voxels[:, :, 5:] = 900.0  # i from 5 on; between 4 and 5 the field rises
@@ -266,7 +266,7 @@ def test_vertices_near_metal_are_counted_and_left_out(level, iso_value, near):
     assert found["away_from_metal_voxel"]["max"] == np.nanmax(away)  # the centre of the second triangle is near
 
 
-def test_where_most_is_metal_all_is_judged():
+def test_mesh_mostly_of_metal_is_judged_whole():
     volume, mesh = metal_volume(3071, 4)
     found = measure_iso_distance(mesh, volume, choose_iso_rule(volume, 200, closed=False))
     assert (found["near_metal"], found["away_from_metal_voxel"]) == (4, None)

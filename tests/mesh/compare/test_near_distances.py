@@ -30,7 +30,7 @@ def test_an_upper_bound_is_never_less_than_the_distance(thin):
         assert (found - exact <= 2.0 * frames.slack).mean() > 0.2
 
 
-def test_over_a_face_the_bound_is_the_distance():
+def test_bound_over_a_face_is_the_distance():
     vertices, triangles = samples.sphere(radius=10.0, rounds=3)
     centres = vertices[triangles].mean(axis=1)
     frames = FaceFrames(vertices, triangles.astype(np.uint32))
@@ -40,7 +40,7 @@ def test_over_a_face_the_bound_is_the_distance():
     np.testing.assert_allclose(np.sqrt(square), exact, atol=frames.slack)
 
 
-def test_what_is_surely_within_is_within_and_the_rest_is_exact():
+def test_points_surely_within_are_within_and_the_rest_are_exact():
     vertices, triangles = samples.torus(40, 24)
     near = NearDistance(vertices, triangles.astype(np.uint32))
     rng = np.random.default_rng(3)

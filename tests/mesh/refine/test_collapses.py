@@ -85,7 +85,7 @@ def test_three_planes_meet_in_the_best_place():
     assert (np.abs(place[1:]) < 1e-3).all()
 
 
-def test_in_a_plane_the_best_place_is_the_mean():
+def test_best_place_in_a_plane_is_the_mean():
     vertices = np.array([[0.0, 0.0, 3.0], [4.0, 0.0, 3.0], [0.0, 4.0, 3.0], [9.0, 9.0, 9.0]])
     quadrics = quadrics_of(vertices, np.array([[0, 1, 2]]))
     found = quadrics.best_places(np.array([1, 1, 1, 0]), np.array([0, 1, 2, 3]), 2)

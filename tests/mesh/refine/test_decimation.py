@@ -96,7 +96,7 @@ def test_no_triangle_of_either_surface_is_further_than_the_bound(seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", daily(1, range(2)))
-def test_what_is_not_looked_at_again_is_still_within_the_bound(seed):
+def test_faces_not_looked_at_again_stay_within_the_bound(seed):
     """After some rounds of mending, which look at what has changed, all of both surfaces is looked at."""
     mesh = smooth_mesh(noise_surface(seed, (24, 25, 15)))
     clusters = Clusters(mesh.vertices - FAR, mesh.triangles, FAR)
@@ -143,7 +143,7 @@ def test_an_open_surface_keeps_its_border_in_the_plane():
     assert (after["manifold"], after["components"]) == (before["manifold"], before["components"])
 
 
-def test_what_ended_the_decimation_is_said():
+def test_report_says_what_ended_the_decimation():
     sphere = Mesh(*samples.sphere(FAR, 20.0, 5))
     said = [decimate_mesh(sphere, 0.9, bound).report["refinement"]["decimate"] for bound in (0.5, 0.001)]
     assert [each["ended_by"] for each in said] == ["share", "bound"]
@@ -236,7 +236,7 @@ def test_the_cluster_of_a_vertex_that_is_left_behind_is_found_once():
     assert found == [[one], [], [], []]
 
 
-def test_what_is_left_of_a_cluster_at_a_border_stays_there():
+def test_rest_of_a_cluster_at_a_border_stays_there():
     """Two vertices of the border of a sheet that is bent, and one collapse of the two undone."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(4), np.arange(3)))
     vertices = np.column_stack([x, y, 0.25 * y**2]).astype(float)

@@ -40,7 +40,7 @@ def test_a_tunnel_that_is_pinched_shut_is_torn_where_it_was():
     assert find_torn(triangles, names).tolist() == [0, SIDES - 1]
 
 
-def test_what_collapses_to_a_disc_tears_nothing():
+def test_collapse_to_a_disc_tears_nothing():
     vertices, triangles = samples.sphere(rounds=2)
     triangles = triangles.astype(np.uint32)
     names = np.arange(len(vertices))
@@ -65,7 +65,7 @@ def test_an_open_border_is_no_tear():
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_beside_what_is_new_the_same_faults_are_found(seed):
+def test_faults_beside_new_faces_are_those_of_the_whole(seed):
     """Vertices of a torus are merged at random; all faults lie at vertices that are called new."""
     _, triangles = samples.torus(24, 12)
     rng = np.random.default_rng(seed)

@@ -41,7 +41,7 @@ def test_a_sphere_and_a_torus_stay_what_they_are():
 
 
 @pytest.mark.parametrize("shares", [(0.9, "components_lost"), (0.7, "edges_opened")])
-def test_what_is_lost_or_opened_is_warned_of(shares):
+def test_lost_or_opened_components_are_warned_of(shares):
     """Three specks lie 30 mm from all else: only their own vertices say how far away a result without them is."""
     fraction, name = shares
     specks = [samples.sphere((40.0, 4.0 * i, 0.0), 0.05, 0) for i in range(3)]

@@ -264,7 +264,7 @@ def test_steps_are_taken_back_as_if_all_triangles_were_looked_at_after_each_roun
     assert max(looked_at[2:]) < 0.5 * len(triangles) and looked_at[-1] < 0.05 * len(triangles)
 
 
-def test_what_is_in_the_way_back_is_found():
+def test_vertices_in_the_way_back_are_found():
     """Boxes that would go into a wall find another half way, of which nothing lies where they were to go.
 
     Boxes and walls have blocks of 64 triangles of their own.

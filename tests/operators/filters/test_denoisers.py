@@ -39,7 +39,7 @@ def test_noise_goes_and_the_report_says_how(name):
     assert told[0] == ("filter", 0, 14) and told[-1] == ("filter", 14, 14)
 
 
-def test_lengths_are_mm():
+def test_lengths_of_filters_are_in_mm():
     """An impulse spreads as far in mm along each axis."""
     voxels = np.zeros((31, 41, 41), np.float32)
     voxels[15, 20, 20] = 1.0

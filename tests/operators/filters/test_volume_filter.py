@@ -200,7 +200,7 @@ def test_surfaces_of_a_near_filter_are_those_of_the_whole_one(device, normals):
 
 
 @pytest.mark.parametrize("closed", [True, False])
-def test_where_the_volume_ends_a_closed_surface_differs_and_the_report_says_so(device, closed):
+def test_report_says_that_a_closed_surface_differs_where_the_volume_ends(device, closed):
     """A bar through the volume: its open surface is the same, its closed ends are not."""
     bar = np.repeat(ball(noise=10.0).voxels[10:11], 12, axis=0) + np.arange(12, dtype=np.int16)[:, None, None]
     volume = Volume(bar, np.eye(4))

@@ -120,7 +120,7 @@ def test_a_space_that_one_end_of_the_scan_cuts_is_at_an_end(device, axis, from_e
     assert facts["at_ends"] == facts["spaces"] == 1
 
 
-def test_what_is_too_wide_for_marrow_stays_open_with_the_end_of_the_scan_as_its_lid_too(device):
+def test_spaces_too_wide_for_marrow_stay_open_with_an_end_of_the_scan_as_lid_too(device):
     distance = distances((93, 93, 93))
     skull = whole(body(distance, 44.0, 40.0))
     left = clrecon.fill_enclosed(skull, 400, device=device)
@@ -210,7 +210,7 @@ def test_a_ball_that_closes_more_than_half_of_the_bone_fails_a_gate(device):
 
 
 @pytest.mark.parametrize(("hardest", "said"), [(3071, True), (1900, False)])
-def test_what_is_filled_beside_metal_is_said(device, hardest, said):
+def test_filling_beside_metal_is_warned_of(device, hardest, said):
     k, j, i = np.indices((24, 30, 30))
     radius = np.hypot(j - 14.5, i - 14.5)
     hu = np.where(radius < 12, 800, 50)

@@ -81,7 +81,7 @@ def test_the_device_reaches_the_truths(device, shape, region, expected):
     assert truth.rms(step.cloud.points, region) == pytest.approx(expected, rel=FILTER_TRUTH_SHARE)
 
 
-def test_moves_are_measured(device):
+def test_moves_of_filtered_points_are_measured(device):
     points = sphere(8.0).points
     step = denoise_points(PointCloud(points, hu=np.arange(len(points)), normals=points), device=device)
     away = np.linalg.norm(step.cloud.points.astype(np.float64) - points, axis=1)

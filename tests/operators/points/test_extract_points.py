@@ -237,7 +237,7 @@ def test_a_resident_volume_is_uploaded_once(device):
         ({"iso_value": 2000}, "no surface at 2000 HU"),
     ],
 )
-def test_nothing_found_is_an_error(device, choice, words):
+def test_extraction_that_finds_no_point_is_an_error(device, choice, words):
     with pytest.raises(NoSurfaceError, match=words):
         extract_points(make_volume((3, 5, 33)), device=device, **choice)
 

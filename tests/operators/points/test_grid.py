@@ -148,7 +148,7 @@ def test_buffers_are_as_long_as_what_the_kernels_write(device):
     assert grid.nbytes == sum(buffer.size for buffer in buffers)
 
 
-def test_where_loops_end_early_only_clouds_beyond_that_are_warned_of(device, monkeypatch):
+def test_clouds_beyond_the_end_of_loops_alone_are_warned_of(device, monkeypatch):
     told: list[str] = []
     monkeypatch.setattr(device, "most_steps", 1000 * STEPS_A_POINT)
     monkeypatch.setattr(device, "remark", told.append)

@@ -151,7 +151,7 @@ def test_clouds_that_cannot_be_searched_are_refused(device):
         find_neighbours(crowded, device=device)
 
 
-def test_memory_is_forecast(device):
+def test_memory_of_a_search_for_neighbours_is_forecast(device):
     with refused(DeviceMemoryError, 10000, "points"):
         find_neighbours(scattered_points(10_000), 16, device=device, memory=500_000)
 

@@ -54,7 +54,7 @@ def test_surface_of_a_cube_without_noise_is_closed_and_near_it(device):
     assert quality.volume_ml == pytest.approx(27.0, rel=1e-3)
 
 
-def test_noise_is_averaged(device):
+def test_noise_of_points_is_averaged_in_their_surface(device):
     cloud = sphere_cloud(noise=0.2)
     clean, noisy = (reconstruct_surface(cloud, 0.65, noisy=choice, device=device) for choice in (False, True))
     assert sphere_error(clean) == pytest.approx(0.125, rel=0.1)

@@ -49,7 +49,7 @@ def test_the_whole_volume_fits_where_nothing_is_taken_away(two_blocks, device):
         3, [*each_value(["clip", "mask"], ["dvr", "slices", "surface", "mip"]), ("label", "surface"), ("label", "dvr")]
     ),
 )
-def test_what_is_left_fills_the_picture(two_blocks, device, kind, mode):
+def test_rest_of_a_masked_volume_fills_the_picture(two_blocks, device, kind, mode):
     volume, labels = two_blocks
     look: dict[str, object] = {"iso_value": 200.0} if mode == "surface" else {}
     if kind == "label":

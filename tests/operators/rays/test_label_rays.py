@@ -66,7 +66,7 @@ def depth_of_ball(camera: Camera, centre: np.ndarray, radius: float) -> np.ndarr
 
 
 @pytest.mark.parametrize("grid", STEPS)
-def test_what_is_translucent_shows_what_is_behind(device, grid):
+def test_translucent_label_shows_what_is_behind(device, grid):
     volume, labels = two_balls(grid)
     camera = look(volume, (0.0, 1.0, 0.1), 8.0)
     front, back = (depth_of_ball(camera, centre_of(volume) + (0, y, 0), r) for y, r in ((-5.0, 4.0), (7.0, 6.0)))
@@ -108,7 +108,7 @@ def test_labels_that_touch_have_their_border(device):
     assert (inner == (0, 0, 255, 255)).all()  # seen head-on: its normal is that of the border
 
 
-def test_what_has_no_label_or_is_not_named_looks_as_it_does_without(device):
+def test_surface_without_a_named_label_looks_as_without_labels(device):
     volume, labels = two_blocks()
     camera = look(volume, (0.1, 1.0, -0.2), 10.0)
     plain = cast(device, volume, camera, None, color="bone")
@@ -167,7 +167,7 @@ def test_small_surface_of_labels_is_seen_under_the_simulator(device):
     assert 20 < (found.image[..., 3] > 0).sum()
 
 
-def test_what_has_no_label_can_be_hidden(device):
+def test_surface_without_a_label_can_be_hidden(device):
     volume, labels = two_blocks()
     camera = Camera.fit(volume, "anterior")
     whole, left, faint = (

@@ -150,7 +150,7 @@ LOST_ONCE = (4406, 7282, 8362, 9701, 13084)
 
 @pytest.mark.release
 @pytest.mark.seconds
-def test_what_is_free_ahead_hides_nothing(device, monkeypatch):
+def test_free_space_ahead_hides_nothing(device, monkeypatch):
     shown = 0
     for seed in (*range(200), *LOST_ONCE):
         volume, camera, settings = scene(seed)
@@ -162,7 +162,7 @@ def test_what_is_free_ahead_hides_nothing(device, monkeypatch):
 
 
 @pytest.mark.oclgrind
-def test_what_is_opaque_is_so_in_the_shortest_last_segment(device):
+def test_opaque_voxels_are_so_in_the_shortest_last_segment(device):
     voxels = np.zeros((20, 6, 6), np.int16)
     voxels[10:] = 1000
     camera = Camera((2.5, 2.5, -20.0), (2.5, 2.5, 0.0), (0.0, -1.0, 0.0), parallel_scale=2.0)

@@ -322,7 +322,7 @@ def test_volumes_of_few_voxels_are_boxes_of_their_size(cast, shape):
             assert np.nanmax(np.abs(values - 700.0)) <= tolerances.RAY_AXIS_HU
 
 
-def test_what_is_never_opaque_leaves_the_picture_empty(cast):
+def test_transparent_function_leaves_the_picture_empty(cast):
     volume = even_volume(blobs, "even", 10.0)
     clear = TransferFunction([(-1000, 1, 1, 1, 0.0), (3000, 1, 1, 1, 0.0)])
     shot = cast(volume, "dvr", clear, camera=look(volume, (0, 1, 0), 6.0), size=(16, 12))

@@ -107,7 +107,7 @@ def test_fog_before_and_behind_a_screen_is_a_closed_form(
     assert picture.report["objects"] == ["dvr", "mesh"] and picture.mode == "dvr"
 
 
-def test_what_has_no_mesh_before_it_looks_as_alone(device: Any) -> None:
+def test_volume_without_a_mesh_before_it_looks_as_alone(device: Any) -> None:
     volume, camera = block(), CAMERAS["perspective"]
     look = VolumeLook(FOG)
     alone = clrecon.render(volume, look, camera=camera, size=SIZE, device=device, background="transparent")

@@ -193,7 +193,7 @@ def test_bad_input_is_refused(device, wrong, says):
         overlay_slices(DeviceVolume(volume, device=device), Camera.fit(volume), (8, 8), **wrong)
 
 
-def test_each_slice_is_told(device):
+def test_progress_of_an_overlay_counts_its_slices(device):
     volume = make_volume(blobs, "uneven", dtype=np.int16)
     told: list[tuple] = []
     style = SlicesInSpace(slices=[1, 4, 7], opacity=0.4, lowest_hu=-300.0, window=WINDOW)

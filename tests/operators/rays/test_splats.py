@@ -177,7 +177,7 @@ def test_points_are_coloured_by_hu_label_or_reason(device: Any) -> None:
     assert [entry["points"] for entry in wide.report["legend"]] == [1, 2, 1]
 
 
-def test_what_is_clipped_does_not_show(device: Any) -> None:
+def test_clipped_points_do_not_show(device: Any) -> None:
     points, normals = ball()
     cloud = PointCloud(points, normals, hu=points[:, 0])
     cut = Clip.plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))

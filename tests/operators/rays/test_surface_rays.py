@@ -209,7 +209,7 @@ def test_a_ball_throws_its_shadow_on_a_floor(device):
     assert np.abs(dark.image[..., 0] - truth)[sure].max() <= 1.5
 
 
-def test_what_is_nearer_is_brighter_with_a_depth_cue(device):
+def test_nearer_surface_is_brighter_with_a_depth_cue(device):
     volume = make_volume(lambda p: 300.0 - 40.0 * (p @ (0.0, -1.0, 0.5)), "even", 18.0)
     camera = look(volume, (0.0, 1.0, -0.2), 6.0)
     plain, cued = (cast(device, volume, 300.0, camera, depth_cue=cue) for cue in (0.0, 0.6))

@@ -53,7 +53,7 @@ def even_volume(dtype="int16", angles=(0.0, 0.0, 0.0), spacing=(0.7, 0.7, 2.5), 
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)
 @pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (20.0, -35.0, 10.0)])
 @pytest.mark.parametrize("shear", [0.0, 0.8])
-def test_where_a_pixel_is_a_voxel_it_has_its_value(device, dtype, angles, shear):
+def test_pixel_on_a_voxel_has_its_value(device, dtype, angles, shear):
     volume = even_volume(dtype, angles, shear=shear)
     for k in range(6):
         cut = cut_slice(volume, camera_of_slice(volume, k), (11, 8), device=device)

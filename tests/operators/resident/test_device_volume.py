@@ -125,7 +125,7 @@ def test_a_turntable_of_labels_brings_the_map_to_the_grid_once(device, volume, m
     assert len(calls) == 1
 
 
-def test_what_is_kept_makes_room_for_what_is_needed(device, volume):
+def test_kept_buffers_make_room_for_needed_ones(device, volume):
     """Enough memory for any of them alone, not for what all would like to keep."""
     voxels = volume.voxels.nbytes
     with DeviceVolume(volume, device=device, memory=3 * voxels) as resident:
@@ -136,7 +136,7 @@ def test_what_is_kept_makes_room_for_what_is_needed(device, volume):
     assert np.array_equal(first.vertices, again.vertices)
 
 
-def test_what_is_kept_counts_for_the_mesh_of_another_operator(device, volume):
+def test_kept_buffers_count_for_the_mesh_of_another_operator(device, volume):
     """The mesh fits beside the volume, and not beside what ray pictures keep: that goes, and no slabs are needed."""
     with DeviceVolume(volume, device=device) as alone:
         needed = sum(clrecon.extract_isosurface(alone, 100).report["device_bytes"].values())

@@ -107,7 +107,7 @@ def test_triangles_without_area_are_left_to_the_host(device):
 
 
 @pytest.mark.parametrize("case", ["small", "float64", "no room"])
-def test_what_the_device_does_not_take_the_host_does(device, case, monkeypatch):
+def test_triangles_that_the_device_does_not_take_are_left_to_the_host(device, case, monkeypatch):
     given: dict = {} if case == "small" else {"fewest": 1}
     monkeypatch.setattr(decimation, "mark_crossings", None)
     vertices, triangles = scattered(600)

@@ -92,7 +92,7 @@ def test_the_bound_is_where_steps_of_float32_pass_it(device):
     assert np.array_equal(origin, np.rint(origin))  # whole mm: adding it is exact to 1e-11 mm
 
 
-def test_what_is_measured_and_refined_agrees(device):
+def test_far_meshes_are_measured_and_refined_as_near_ones(device):
     near, far = (extract_isosurface(make_sphere(shift), 0.5, device=device) for shift in ((0, 0, 0), FAR))
     for one, other in ((near, far), *([(clrecon.decimate_mesh(clrecon.smooth_mesh(m), 0.7) for m in (near, far))])):
         assert other.vertices.dtype == np.float64

@@ -206,7 +206,7 @@ def test_values_that_cannot_be_used_are_refused(device):
         extract_isosurface(Volume(np.zeros((1, 1, 13_999), np.int8), np.eye(4)), 1, device=device)
 
 
-def test_only_volumes_have_surfaces(device):
+def test_surface_of_what_is_no_volume_is_refused(device):
     with refused(UsageError, "Volume", "clrecon.Volume"):
         extract_isosurface(np.zeros((3, 4, 5)), 1, device=device)
 

@@ -61,7 +61,7 @@ def test_witnesses_are_the_faces_that_show_it(device, case):
     assert (witnesses[:, 0].tolist(), int(left[0])) == expected
 
 
-def test_what_is_left_is_beyond_the_limit(device):
+def test_vertices_that_are_left_lie_beyond_the_limit(device):
     vertices, triangles, rng = rough(24)
     places = (vertices + rng.normal(0.0, 0.2, vertices.shape)).astype(np.float32)
     names, limit = np.arange(len(vertices)), 0.3

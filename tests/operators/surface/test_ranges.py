@@ -82,7 +82,7 @@ def test_random_floats_in_ranges_are_sound(device):
 
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
 @pytest.mark.parametrize("topology", ["separated", "trilinear"])
-def test_below_is_the_surface_of_the_iso_value_turned_round(device, dtype, topology):
+def test_surface_below_a_level_is_that_of_the_iso_value_turned_round(device, dtype, topology):
     volume = random_volume((7, 9, 40), dtype, high=50)
     above = extract_isosurface(volume, 20, device=device, closed=False, topology=topology)
     below = extract_isosurface(volume, 20, device=device, closed=False, topology=topology, below=True)
@@ -125,7 +125,7 @@ def test_a_shell_between_two_spheres_has_their_volume(device):
 
 
 @pytest.mark.parametrize("dtype", ["float32", "int16"])
-def test_what_is_below_and_what_is_above_fill_the_box(device, dtype):
+def test_bodies_below_and_above_a_level_fill_the_box(device, dtype):
     field = 100.0 * np.maximum(ball(10.0).voxels, -2.0)
     volume = Volume(field.astype(dtype), np.diag((0.7, 0.5, 0.9, 1.0)))
     empty = volume.with_voxels(np.full_like(volume.voxels, -200))

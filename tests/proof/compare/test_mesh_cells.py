@@ -99,7 +99,7 @@ def clip(polygon: np.ndarray) -> np.ndarray:
     return polygon
 
 
-def test_overlap_is_counted():
+def test_overlap_of_cells_is_counted():
     one = GridCells([[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 0, 0]])
     other = GridCells([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0], [-1, 0, 0]], "t-mc")
     found = measure_cells(one, other, grid())

@@ -80,7 +80,7 @@ def test_the_wall_of_a_cavity_is_not_the_outer_side():
     assert found.outer_share == pytest.approx(10.2**2 / (10.2**2 + 9.2**2), abs=1e-3)
 
 
-def test_what_lies_beyond_the_reach_is_left_out():
+def test_mesh_beyond_the_reach_of_its_truth_is_left_out():
     one, other = ball(), ball(radius=3.0, shift=(40.0, 0.0, 0.0), rounds=3)
     both = Mesh(*samples.join((one.vertices, one.triangles), (other.vertices, other.triangles)))
     found = measure_truth(both, Ball())

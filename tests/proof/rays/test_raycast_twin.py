@@ -100,7 +100,7 @@ def test_the_table_has_the_values_of_its_nodes_and_exact_ends():
 
 
 @pytest.mark.parametrize("direction", [None, (0.3, -2.0, 1.0)])
-def test_shading_is_phongs(direction):
+def test_shading_is_that_of_phong(direction):
     lighting = Lighting(0.1, 0.6, 0.3, 9.0, direction)
     rng = np.random.default_rng(8)
     gradients, directions = rng.normal(size=(2, 20, 3))

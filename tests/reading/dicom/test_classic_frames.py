@@ -149,7 +149,7 @@ def test_frames_that_are_slices_by_their_pointer_are_read(tmp_path, pointer):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, dict) else None,
 )
-def test_what_leaves_the_places_open_is_refused(tmp_path, elements, words):
+def test_frames_whose_places_are_open_are_refused(tmp_path, elements, words):
     save_dataset(make_frames(**elements), tmp_path / "scan")
     said = refusal(tmp_path / "scan")
     assert words in said and "name the folder" not in said

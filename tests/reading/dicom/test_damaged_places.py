@@ -52,7 +52,7 @@ def test_damaged_places_are_refused_warned_of_or_harmless_as_listed(tmp_path, na
     assert (same and bool(np.abs(places - plan.truth(IJK)).max() < 1e-6)) is (row.result == "exact")
 
 
-def test_nothing_is_said_of_a_sound_series_with_all_elements(tmp_path):
+def test_sound_series_with_all_elements_has_no_warning(tmp_path):
     body = make_patient()
     plan = damage(tmp_path, {**LOCATION, **LETTERS, "ReconstructionDiameter": 50.4}, body)
     report = read_volume(tmp_path).report

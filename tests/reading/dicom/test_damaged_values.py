@@ -47,7 +47,7 @@ def test_every_command_tells_damaged_values(tmp_path, device, capsys, name):
 
 
 @pytest.mark.parametrize(("value", "limit"), [(-2000, None), (-2000, 24), (1074, None), (1074, 1075)])
-def test_nothing_is_said_of_padding_around_the_picture(tmp_path, value, limit):
+def test_padding_around_the_picture_is_not_warned_of(tmp_path, value, limit):
     """Below air, up to air, and with a value of tissue that nothing in the picture has."""
     body = make_body()
     body[np.isin(body, (50, 51))] = 52

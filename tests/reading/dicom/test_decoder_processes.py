@@ -118,7 +118,7 @@ def test_limits_grow_with_the_frame():
     assert 180 < large.seconds < 200 and 2**32 <= large.memory_bytes < 2**33
 
 
-def test_what_a_decoder_prints_disturbs_nothing(capfd):
+def test_output_of_a_decoder_disturbs_nothing(capfd):
     with make_pool("print_much") as pool:
         assert np.array_equal(decode(pool, "print_much"), PIXELS)
     assert capfd.readouterr() == ("", "")

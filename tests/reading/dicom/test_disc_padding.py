@@ -56,7 +56,7 @@ def test_one_value_outside_of_a_disc_is_padding(tmp_path, value):
     ],
     ids=["no disc", "bone in water", "no noise", "square", "below air", "air"],
 )
-def test_nothing_else_is_padding(hu):
+def test_scans_without_a_filled_disc_have_no_padding(hu):
     voxels = hu.astype(np.int16)
     assert fill_disc_padding(voxels) is None and np.array_equal(voxels, hu)
 

@@ -299,7 +299,7 @@ def test_row_46_a_bad_character_set_spoils_no_image(tmp_path: Path, charset: str
     assert list_series(tmp_path).series[0].description == "series 1"
 
 
-def test_what_is_not_plain_is_left_to_the_careful_parser(tmp_path: Path) -> None:
+def test_headers_that_are_not_plain_are_left_to_the_careful_parser(tmp_path: Path) -> None:
     for syntax in (ImplicitVRLittleEndian, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian):
         ds = make_dataset(Plan(syntax=syntax), 0)
         save_dataset(ds, tmp_path / "file")

@@ -82,7 +82,7 @@ def refusal(folder):
         ],
     ),
 )
-def test_whatever_alternates_parts_two_volumes(tmp_path, first, second, keyword):
+def test_alternating_elements_part_two_volumes(tmp_path, first, second, keyword):
     plans = write_volumes(tmp_path, first, second)
     said = refusal(tmp_path)
     assert f"2 phases whose slices lie between each other, choose one with phase: [1: {keyword} " in said
@@ -135,7 +135,7 @@ def test_a_long_stack_is_looked_at_in_places_first(tmp_path):
     ],
     ids=["rows", "slabs", "halves", "irregular", "window", "tube current", "rescale", "numbers", "location"],
 )
-def test_what_changes_within_one_volume_is_no_second_one(tmp_path, elements):
+def test_elements_that_change_within_one_volume_make_no_second_one(tmp_path, elements):
     plan = write_series(tmp_path, Plan(shape=(24, 5, 6)), lambda ds, k: [
         setattr(ds, keyword, value(k)) for keyword, value in elements.items()
     ] and None)  # fmt: skip

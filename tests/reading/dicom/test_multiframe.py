@@ -283,7 +283,7 @@ def test_frames_at_one_place_are_told_apart(tmp_path, syntax, sequence, keyword,
     assert [phase["slices"] for phase in list_series(tmp_path).series[0].phases] == [7, 7]
 
 
-def test_what_a_frame_says_of_itself_stands_over_what_is_shared(tmp_path):
+def test_elements_of_a_frame_stand_over_shared_ones(tmp_path):
     def spoil(ds):
         ds.SharedFunctionalGroupsSequence[0].CTReconstructionSequence = [item(ConvolutionKernel="B30")]
         frame_groups(ds, 2).CTReconstructionSequence = [item(ConvolutionKernel="B70")]

@@ -169,7 +169,7 @@ FAULTS = {
 
 @pytest.mark.filterwarnings("ignore:Invalid value for VR IS")
 @pytest.mark.parametrize("change, words", FAULTS.values(), ids=FAULTS)
-def test_what_is_wrong_is_refused_by_name(tmp_path, change, words):
+def test_faults_of_multi_frame_images_are_refused_by_name(tmp_path, change, words):
     write_enhanced(tmp_path / "mf", change=change, shared=())
     start = time.process_time()
     assert words in refusal(tmp_path)

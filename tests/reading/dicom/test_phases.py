@@ -312,7 +312,7 @@ def test_volumes_whose_slices_lie_between_each_other_are_phases(tmp_path, keywor
         ({"AcquisitionNumber": lambda k: k}, None),
     ],
 )
-def test_what_differs_along_a_stack_is_said(tmp_path, elements, told):
+def test_elements_that_differ_along_a_stack_are_told(tmp_path, elements, told):
     write_phase(tmp_path, 1, **elements)
     warnings = read_volume(tmp_path).report["warnings"]
     assert len(warnings) == (told is not None)

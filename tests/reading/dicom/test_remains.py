@@ -179,7 +179,7 @@ def test_remains_at_both_ends_are_named(tmp_path):
         read_volume(tmp_path)
 
 
-def test_what_lies_apart_is_a_warning(tmp_path):
+def test_remains_that_lie_apart_are_a_warning(tmp_path):
     """In a folder without slices, where all slices are in one other, nothing can be of their stack."""
     plan = write_series(tmp_path / "ct", plan_with("IM0001"))
     save_dataset(make_dataset(plan, 0), tmp_path / "old" / "IM0001")

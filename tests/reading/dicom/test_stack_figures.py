@@ -65,7 +65,7 @@ def test_cross_product_is_that_of_the_formula():
 
 
 @pytest.mark.parametrize("step", [0.5, 8.0])
-def test_what_counts_as_even_grows_with_the_gaps(step):
+def test_tolerance_of_even_gaps_grows_with_them(step):
     distances = step * np.arange(5.0)
     line = measure_line(np.outer(distances, [0.0, 0.6, 0.8]), distances)
     assert line.tolerance_mm == max(POSITION_TOLERANCE_MM, POSITION_TOLERANCE_GAPS * step)

@@ -47,7 +47,7 @@ def test_voxels_lie_where_they_were_written(tmp_path, plan):
 
 
 @pytest.mark.parametrize("tilt", [1.0, 2.5, 12.0, -20.0])
-def test_tilt_is_reported(tmp_path, tilt):
+def test_gantry_tilt_is_reported(tmp_path, tilt):
     write_series(tmp_path, Plan(tilt_deg=tilt))
     report = read_volume(tmp_path).report
     assert report["tilt_deg"] == pytest.approx(-tilt, abs=1e-6)  # a plan leans back

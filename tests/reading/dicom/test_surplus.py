@@ -180,7 +180,7 @@ def test_a_sequence_behind_the_pixels_is_left_out_and_a_cut_one_refused(tmp_path
 
 @pytest.mark.parametrize("syntax", SYNTAXES[:3])
 @pytest.mark.parametrize("fault", ["junk", "short", "falling", "pixels again", "behind the padding", "too long", "one"])
-def test_what_is_no_element_behind_the_pixels(tmp_path, syntax, fault):
+def test_bytes_behind_the_pixels_that_are_no_element_are_refused(tmp_path, syntax, fault):
     write(tmp_path, None, syntax)
     padding = element(0xFFFCFFFC, b"OB", b"ab", syntax)
     append(tmp_path, {

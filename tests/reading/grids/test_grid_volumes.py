@@ -110,7 +110,7 @@ def test_a_packed_metaimage_needs_no_size_of_its_data(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["s.nii.gz", "s.nrrd", "s.nhdr", "s.mha", "s.mhd"])
-def test_what_simpleitk_makes_of_a_dicom_series_is_the_same_volume(tmp_path, name):
+def test_dicom_series_converted_by_simpleitk_is_the_same_volume(tmp_path, name):
     plan = Plan(shape=(7, 5, 6), angles=(20.0, -10.0, 5.0), gap=2.5)
     write_series(tmp_path / "ct", plan)
     files = sorted(map(str, (tmp_path / "ct").iterdir()))

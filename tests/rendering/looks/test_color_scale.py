@@ -25,7 +25,7 @@ def test_colours_of_distances_are_blue_below_zero_and_red_above() -> None:
 
 
 @pytest.mark.parametrize(("value", "limit"), [(0.3, 0.5), (1.0, 1.0), (1.01, 2.0), (7.0, 10.0), (0.0021, 0.005)])
-def test_limits_are_round(value: float, limit: float) -> None:
+def test_limits_of_colour_scales_are_round(value: float, limit: float) -> None:
     assert round_up(value) == pytest.approx(limit, rel=1e-12)
 
 

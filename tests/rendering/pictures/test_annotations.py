@@ -121,7 +121,7 @@ def test_the_bar_is_as_long_as_it_says(size, background, ink):
         assert abs(bar_pixels(marked, ink).max() - bar_length(pixel * size[0]) / pixel) <= 0.5
 
 
-def test_on_white_the_bar_is_black():
+def test_scale_bar_on_white_is_black():
     picture = make_picture((300, 200), WHITE)
     marked = picture.annotated(scale_bar=True)
     bar = bar_pixels(marked, 0)

@@ -270,7 +270,7 @@ def test_a_style_stands_alone() -> None:
         find_style("mip", {"mode": "dvr"})
 
 
-def test_keywords_are_fields() -> None:
+def test_keywords_of_pictures_are_fields_of_their_styles() -> None:
     assert keywords_of("cpr")["cpr"] == "kind"
     for mode, kind in MODES.items():
         assert set(keywords_of(mode).values()) == {own.name for own in fields(kind.style)}

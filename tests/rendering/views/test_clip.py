@@ -31,7 +31,7 @@ def test_a_plane_keeps_the_side_of_its_normal():
     assert np.array_equal(clip.contains(POINTS), (POINTS - (1, 2, 3)) @ (0.0, 3.0, 4.0) >= 0.0)
 
 
-def test_both_keep_what_each_keeps():
+def test_two_clips_keep_what_each_keeps():
     first, second = Clip.box((-5, -5, -5), (5, 5, 5)), Clip.plane((0, 0, 0), (1, 1, 0))
     both = first & second
     assert both.planes.shape == (7, 4)

@@ -22,7 +22,7 @@ def test_slices_across_the_axes_of_the_patient_are_seen_from_the_first_view(norm
     assert default_view("slices", stack(normal)) == SLICES_VIEWS[0] == (30.0, 30.0)
 
 
-def test_whatever_way_slices_lie_they_show() -> None:
+def test_slices_show_whatever_way_they_lie() -> None:
     normals = np.random.default_rng(3).normal(size=(500, 3))
     seen = set()
     for normal in normals / np.linalg.norm(normals, axis=1)[:, None]:

@@ -24,7 +24,7 @@ def session(device):
 
 @pytest.mark.opencl
 @pytest.mark.parametrize("name", ["a.stl", "a.ply", "a.glb", "a.3mf", "a.obj", "a.vtp", "a.html"])
-def test_what_is_shown_is_saved_to_every_mesh_format(session, tmp_path, name):
+def test_shown_meshes_are_saved_to_every_mesh_format(session, tmp_path, name):
     view = session()
     view.do({"do": "find_parts"})
     assert view.wait(PATIENCE)
@@ -40,7 +40,7 @@ def test_what_is_shown_is_saved_to_every_mesh_format(session, tmp_path, name):
 
 
 @pytest.mark.opencl
-def test_what_comes_behind_a_hidden_object_is_saved(session):
+def test_object_behind_a_hidden_one_is_saved(session):
     view = session()
     before = view.painter.mesh_of_shown(view.model.state)
     assert len(before) == 2
@@ -95,7 +95,7 @@ def test_a_screenshot_is_as_large_as_asked_for(session, tmp_path, name):
 
 
 @pytest.mark.opencl
-def test_what_cannot_be_saved_is_said(session, tmp_path):
+def test_views_that_cannot_be_saved_are_refused(session, tmp_path):
     view = session(scenes.make_mesh())
     with pytest.raises(UsageError, match="no scan"):
         view.do({"do": "save", "path": str(tmp_path / "a.nii.gz")})

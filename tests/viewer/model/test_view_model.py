@@ -171,7 +171,7 @@ def test_facts_are_json_and_say_what_is_there():
     assert "mesh 2" in model.facts()["notes"][0]
 
 
-def test_without_a_scan_only_what_means_something_is_there():
+def test_view_without_a_scan_has_only_what_means_something():
     meshes, labels = make_model(scenes.make_mesh()), make_model(scenes.make_labels())
     assert list(meshes.modes) == ["surface"] and meshes.facts()["iso"] is None
     assert list(labels.modes) == ["labels"] and labels.state.mode == "labels"

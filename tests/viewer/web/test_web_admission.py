@@ -45,7 +45,7 @@ def test_a_foreign_origin_is_refused_with_the_right_secret(origin: str) -> None:
     assert "another server" in refuse_request("127.0.0.1:8000", origin, SECRET, SECRET)
 
 
-def test_what_only_pages_ask_for_needs_an_origin() -> None:
+def test_requests_that_only_pages_make_need_an_origin() -> None:
     assert refuse_request("127.0.0.1:8000", None, SECRET, SECRET) is None
     assert "another server" in refuse_request("127.0.0.1:8000", None, SECRET, SECRET, by_page=True)
 

@@ -434,7 +434,7 @@ def test_clip_planes_and_a_box_cut(page) -> None:
     assert page.find_element("id", "box").is_displayed()
 
 
-def test_what_is_shown_is_saved_as_a_download(page, folder: Path) -> None:
+def test_shown_view_is_saved_as_a_download(page, folder: Path) -> None:
     from selenium.webdriver.support.ui import Select
 
     from clrecon.mesh.mesh_reader import read_mesh

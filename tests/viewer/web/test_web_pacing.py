@@ -33,7 +33,7 @@ def test_each_view_that_is_shown_is_drawn_once(pace: Pace) -> None:
     assert drain(pace) == []
 
 
-def test_what_changes_is_coarse_first_and_sharp_at_rest(pace: Pace) -> None:
+def test_changing_view_is_coarse_first_and_sharp_at_rest(pace: Pace) -> None:
     drain(pace)
     assert pace.is_done
     pace.change([SCENE])
@@ -90,7 +90,7 @@ def test_pictures_lie_over_their_ground_rounded_to_whole_numbers(ground: tuple[i
     assert np.abs(_lay_over(image, ground) - exact).max() <= 0.5 + 1e-9
 
 
-def test_what_waits_in_a_connection_that_closes_is_cancelled() -> None:
+def test_pictures_waiting_in_a_closing_connection_are_cancelled() -> None:
     told: list[object] = []
 
     async def close() -> None:

@@ -106,7 +106,7 @@ def test_a_socket_needs_an_origin(served: WebServer, views: Views) -> None:
     assert views.sessions == []
 
 
-def test_behind_a_tunnel_the_port_is_another(served: WebServer) -> None:
+def test_page_behind_a_tunnel_may_have_another_port(served: WebServer) -> None:
     assert get(served, f"/?secret={secret_of(served)}", Host="localhost:9999", Origin="http://localhost:9999")[0] == 200
 
 
@@ -165,7 +165,7 @@ def test_a_browser_gets_facts_and_pictures_of_the_size_that_it_has(served: WebSe
     asyncio.run(look())
 
 
-def test_what_moves_is_coarse_and_sharp_at_rest(served: WebServer, views: Views) -> None:
+def test_moving_view_is_coarse_and_sharp_at_rest(served: WebServer, views: Views) -> None:
     async def look() -> None:
         async with browsing(served) as client:
             await client.lay_out()
