@@ -267,26 +267,43 @@ def test_chosen_slices_are_shown_at_their_place_in_space(render: Renders) -> Non
     assert not lit(render("--mode", "slices", "--slices", "1,2", "--view", "superior")[0]).any()
 
 
-@pytest.mark.seconds
-def test_labels_have_colours(render: Renders) -> None:
+@pytest.fixture
+def label_20(render: Renders) -> Path:
+    """A label map in which the block has the label 20."""
     pytest.importorskip("nibabel")
     voxels = np.zeros(SHAPE_KJI, np.uint8)
     voxels[BLOCK] = 20
     affine = np.diag([*SPACING, 1.0])
     affine[:3, 3] = ORIGIN
-    path = write_nifti(render.folder / "labels.nii.gz", voxels, affine)
-    surface = ("--iso", ISO, "--light", "none", "--labels", path)
-    image, report = render(*surface, "--label-color", "20=blue")
-    assert report["labels"] == [{"label_number": 20, "label": report["labels"][0]["label"], "color": "blue",
-                                 "opacity": None}]  # fmt: skip
+    return write_nifti(render.folder / "labels.nii.gz", voxels, affine)
+
+
+@pytest.mark.seconds
+@pytest.mark.parametrize("mode", [["--iso", ISO], []], ids=["surface", "volume"])
+def test_label_has_the_colour_that_is_given(render: Renders, label_20: Path, mode: list[Any]) -> None:
+    image, report = render(*mode, "--light", "none", "--labels", label_20, "--label-color", "20=blue")
+    (label,) = report["labels"]
+    assert (label["label_number"], label["color"], label["opacity"]) == (20, "blue", None)
     assert image[lit(image)][:, 2].mean() > 2.0 * image[lit(image)][:, 0].mean()
-    plain = render(*surface[:4], "--color", "red")[0]
-    assert plain[..., :3][lit(plain)].mean(axis=0) == pytest.approx([255, 0, 0], abs=5)
-    through = render("--labels", path, "--label-color", "20=blue", "--light", "none")[0]
-    assert through[lit(through)][:, 2].mean() > 2.0 * through[lit(through)][:, 0].mean()
-    assert not lit(render("--labels", path, "--label-opacity", "20=0")[0])[lit(through)].all()
-    faint = render(*surface, "--label-color", "20=blue", "--label-opacity", "20=0.3")[0]
-    assert faint[lit(image)][:, 2].mean() < 0.8 * image[lit(image)][:, 2].mean()
+
+
+@pytest.mark.seconds
+def test_label_of_opacity_0_leaves_pixels_dark(render: Renders, label_20: Path) -> None:
+    shown = lit(render("--labels", label_20)[0])
+    assert not lit(render("--labels", label_20, "--label-opacity", "20=0")[0])[shown].all()
+
+
+@pytest.mark.seconds
+def test_label_of_opacity_0_3_is_fainter(render: Renders, label_20: Path) -> None:
+    surface = ("--iso", ISO, "--light", "none", "--labels", label_20, "--label-color", "20=blue")
+    whole, faint = render(*surface)[0], render(*surface, "--label-opacity", "20=0.3")[0]
+    assert faint[lit(whole)][:, 2].mean() < 0.8 * whole[lit(whole)][:, 2].mean()
+
+
+@pytest.mark.seconds
+def test_surface_has_the_colour_that_is_given(render: Renders) -> None:
+    image = render("--iso", ISO, "--light", "none", "--color", "red")[0]
+    assert image[..., :3][lit(image)].mean(axis=0) == pytest.approx([255, 0, 0], abs=5)
 
 
 def test_letters_scale_bar_and_caption_are_drawn_beside_the_middle(render: Renders) -> None:

@@ -87,6 +87,13 @@ def test_holes_of_the_body_are_no_canal():
     assert find_canal(hollow, volume) is None
 
 
+def test_closed_chamber_behind_the_canal_is_no_canal():
+    solid, volume, expected = block()
+    solid[16:28, 58:86, 10:60] = True  # a large spinous process, whose chamber is larger than the canal
+    solid[18:26, 61:83, 13:57] = False
+    assert np.array_equal(find_canal(solid, volume).voxels, expected)
+
+
 def test_small_gaps_of_an_arch_are_no_canal():
     solid, volume, _ = block(pedicles=(8, 8))
     solid[18:24, 30:60, 30:60] = True

@@ -128,7 +128,7 @@ def test_labels_of_another_grid_are_brought_to_the_volume(device):
     assert (fine.image == rough.image).all(axis=-1).mean() > 0.8
 
 
-def test_shadows_of_what_is_translucent_are_as_dark(device):
+def test_shadow_of_a_translucent_label_is_half_as_dark(device):
     volume, labels = two_balls("even", gap=3.0)
     camera = look(volume, (1.0, 1.0, 0.0), 12.0)
     light = Lighting(0.2, 0.8, 0.0, direction=(0.0, -1.0, 0.0))

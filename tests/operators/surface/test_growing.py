@@ -227,7 +227,7 @@ def test_a_seed_in_air_is_refused_with_its_distance(device: Any) -> None:
     voxels = np.full((12, 40, 90), -1000, np.int16)
     voxels[4:8, 4:9, 4:9] = 500
     volume = Volume(voxels, np.diag((1.0, 1.0, 1.0, 1.0)))
-    with refused(UsageError, 30, -1000, 0):
+    with refused(UsageError, 30, -1000, 21.5, 0):
         extract_isosurface(volume, 0, device=device, grow_from=(30, 6, 6))
     with refused(UsageError, 50, 0, 10):
         extract_isosurface(volume, 0, device=device, grow_from=(80, 6, 6))

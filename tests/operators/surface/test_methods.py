@@ -84,10 +84,13 @@ def test_methods_refuse_options_that_they_do_not_have(method: str, options: dict
         check_method(method, **options)
 
 
-def test_shares_are_for_methods_that_decimate_and_a_level_crosses_something() -> None:
+def test_share_of_triangles_is_refused_by_methods_that_do_not_decimate() -> None:
     assert [name for name, method in METHODS.items() if method.decimates] == ["g-mc", "s-mc"]
     with refused(UsageError, "triangles", "t-mc-soup"):
         extract_by_method(smooth_volume((4, 5, 6)), 0, "t-mc-soup", decimate=0.5)
-    for method in ("t-mc-soup", "skimage"):
-        with refused(NoSurfaceError, 9000, "surface"):
-            extract_by_method(smooth_volume((4, 5, 6)), 9000, method)
+
+
+@pytest.mark.parametrize("method", ["t-mc-soup", "skimage"])
+def test_level_above_all_voxels_has_no_surface_by_any_method(method: str) -> None:
+    with refused(NoSurfaceError, 9000, "surface"):
+        extract_by_method(smooth_volume((4, 5, 6)), 9000, method)

@@ -28,8 +28,9 @@ def test_camera_comes_back_from_pyvista_unchanged(camera):
 
 
 def test_an_oblique_up_becomes_a_unit_vector():
-    camera = CAMERAS[0].orbit(33.0, 21.0)
+    camera = Camera((10.1, -400.3, 870.7), (12.0, -30.0, 850.0), (2.0, 1.0, 3.0), parallel_scale=123.4)
     back = Camera.from_pyvista(camera.to_pyvista())
+    assert np.linalg.norm(back.up) == pytest.approx(1.0)
     assert back.position == camera.position and back.parallel_scale == camera.parallel_scale
     assert np.abs(np.subtract(back.basis(), camera.basis())).max() <= tolerances.FLOAT64_PLACE_MM
 
