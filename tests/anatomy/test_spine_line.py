@@ -175,7 +175,7 @@ def test_a_long_real_spine_is_found(real_data):
     assert line.height_mm >= 290.0 and line.sure_share > 0.9
 
 
-def test_a_scan_that_is_cropped_at_one_side_is_followed(phantom):
+def test_spine_of_a_scan_cropped_at_one_side_is_followed(phantom):
     """Beside the canal 14 mm of the left are there: left and right are not alike, but where a half of it is whole."""
     volume, canal = phantom
     middle = volume.lps_to_ijk([canal.mean(axis=0)])[0, 0]

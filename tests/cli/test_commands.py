@@ -307,7 +307,7 @@ def test_phantom_refuses_a_folder_with_other_files(tmp_path: Path, printed: Prin
 @pytest.mark.parametrize(
     ("extra", "fact"), [(["--kind", "cat"], "sphere"), (["--size", "huge"], "huge"), (["--tilt", "80"], "80")]
 )
-def test_phantom_refuses_settings(extra: list[str], fact: str, tmp_path: Path, printed: Printer) -> None:
+def test_phantom_command_refuses_wrong_settings(extra: list[str], fact: str, tmp_path: Path, printed: Printer) -> None:
     assert main(["phantom", str(tmp_path / "ph"), *extra]) == 3
     printed().assert_error(fact)
     assert list(tmp_path.iterdir()) == []

@@ -245,7 +245,7 @@ def test_a_simulator_is_named_as_one() -> None:
     ]
 
 
-def test_help_alone_and_of_a_command() -> None:
+def test_word_help_becomes_the_option_of_the_command_behind_it() -> None:
     assert main._as_help_option(["help", "mesh"]) == ["mesh", "--help-all"]
     assert main._as_help_option(["help"]) == ["--help"]
     assert main._as_help_option(["mesh", "help"]) == ["mesh", "help"]

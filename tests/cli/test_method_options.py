@@ -69,7 +69,7 @@ def test_points_and_labels_choose_one(bones: Path, tmp_path: Path, device: Any) 
 
 
 @pytest.mark.parametrize("method", daily(2, ["t-mc-soup", "skimage", "s-mc", "g-mc"]))
-def test_other_methods_write_the_mesh(method: str, bones: Path, tmp_path: Path, device: Any) -> None:
+def test_mesh_is_written_by_every_other_method(method: str, bones: Path, tmp_path: Path, device: Any) -> None:
     if method == "skimage":
         pytest.importorskip("skimage")
     more = ["--decimate", "0.3"] if method in ("s-mc", "g-mc") else []

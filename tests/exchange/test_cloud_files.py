@@ -61,7 +61,7 @@ def check_same(read: PointCloud, cloud: PointCloud, extension: str) -> None:
 @pytest.mark.parametrize("space", ["lps", "ras"])
 @pytest.mark.parametrize("extension", EVERY)
 @pytest.mark.parametrize("bare", [False, True])
-def test_our_reader_gives_the_same_cloud(extension, space, bare, tmp_path):
+def test_cloud_is_read_back_unchanged_from_every_format(extension, space, bare, tmp_path):
     cloud = make_cloud(bare=bare)
     path = tmp_path / f"bone{extension}"
     assert cloud.save(path, space) == path.stat().st_size
@@ -131,7 +131,7 @@ def test_npz_is_read_without_pickle(tmp_path):
 
 
 @pytest.mark.parametrize("extension", [".ply", ".vtp"])
-def test_pyvista_reads_the_same(extension, tmp_path):
+def test_pyvista_reads_the_same_cloud(extension, tmp_path):
     pyvista = pytest.importorskip("pyvista")
     cloud = make_cloud()
     cloud.save(tmp_path / f"bone{extension}", "ras")
@@ -145,7 +145,7 @@ def test_pyvista_reads_the_same(extension, tmp_path):
         assert list(read.field_data["SPACE"]) == ["RAS"] and list(read.field_data["CERTIFICATE"])[0] == "tilt_deg 18.5"
 
 
-def test_trimesh_reads_the_same(tmp_path):
+def test_trimesh_reads_the_same_cloud(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     cloud = make_cloud()
     cloud.save(tmp_path / "bone.ply")
@@ -154,7 +154,7 @@ def test_trimesh_reads_the_same(tmp_path):
     np.testing.assert_array_equal(fields["scalar_HU"].ravel(), cloud.hu)
 
 
-def test_laspy_reads_the_same(tmp_path):
+def test_laspy_reads_the_same_cloud(tmp_path):
     laspy = pytest.importorskip("laspy")
     cloud = make_cloud()
     cloud.save(tmp_path / "bone.las")
@@ -186,7 +186,7 @@ def test_hashes_of_identifiers_stay_out_of_files(tmp_path):
 
 
 @pytest.mark.release
-def test_open3d_reads_the_same(tmp_path):
+def test_open3d_reads_the_same_cloud(tmp_path):
     open3d = pytest.importorskip("open3d", exc_type=ImportError)
     cloud = make_cloud()
     cloud.save(tmp_path / "bone.ply")
@@ -333,7 +333,7 @@ def test_an_older_file_survives_a_failed_check(extension, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("extension", EVERY)
-def test_estimate_is_about_right(extension, tmp_path):
+def test_estimated_size_of_a_cloud_file_is_near_the_true_one(extension, tmp_path):
     cloud = make_cloud(40000)  # more than two pieces
     size = cloud.save(tmp_path / f"bone{extension}")
     estimate = CLOUD_FORMATS[extension].code.estimate(cloud.describe("lps"))

@@ -71,7 +71,7 @@ def read_polydata(path):
 
 @pytest.mark.parametrize("space", ["lps", "ras"])
 @pytest.mark.parametrize("extension", [e for e in EVERY if e not in (".vtp", ".html")])
-def test_trimesh_reads_the_same(mesh, extension, space, tmp_path):
+def test_trimesh_reads_the_same_mesh(mesh, extension, space, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     path = tmp_path / f"bone{extension}"
     assert mesh.save(path, space=space) == path.stat().st_size
@@ -90,7 +90,7 @@ def test_trimesh_reads_the_same(mesh, extension, space, tmp_path):
 
 @pytest.mark.parametrize("space", ["lps", "ras"])
 @pytest.mark.parametrize("extension", [e for e in EVERY if e not in (".3mf", ".html")])
-def test_vtk_reads_the_same(mesh, extension, space, tmp_path):
+def test_vtk_reads_the_same_mesh(mesh, extension, space, tmp_path):
     path = tmp_path / f"bone{extension}"
     mesh.save(path, space=space)
     points, polydata = read_polydata(path)
@@ -350,7 +350,7 @@ def test_an_older_file_survives_a_failed_check(mesh, extension, tmp_path, monkey
 
 
 @pytest.mark.parametrize("extension", EVERY)
-def test_estimate_is_about_right(extension, tmp_path):
+def test_estimated_size_of_a_mesh_file_is_near_the_true_one(extension, tmp_path):
     mesh = Mesh(*samples.torus(200, 100))
     size = mesh.save(tmp_path / f"bone{extension}")
     estimate = FORMATS[extension].code.estimate(mesh.describe("lps"))

@@ -36,7 +36,7 @@ def written_twice(source: str) -> set[str]:
 
 
 @pytest.mark.parametrize(("python", "file", "macro"), PAIRS)
-def test_python_and_kernel_agree(python: str, file: str, macro: str) -> None:
+def test_constants_of_python_and_kernels_are_equal(python: str, file: str, macro: str) -> None:
     module, _, name = python.rpartition(".")
     assert kernel_number(file, macro) == getattr(import_module(module), name)
 

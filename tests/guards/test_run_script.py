@@ -60,7 +60,7 @@ def test_a_finished_environment_is_used_as_it_is(tmp_path: Path) -> None:
 
 @posix_only
 @pytest.mark.parametrize("change", ["setup.cfg", "stamp cut", "no stamp", "program gone"])
-def test_anything_else_installs_again(tmp_path: Path, change: str) -> None:
+def test_environment_that_is_changed_or_incomplete_is_installed_again(tmp_path: Path, change: str) -> None:
     project = copy_scripts(tmp_path)
     stamp = finish_by_hand(project)
     if change == "setup.cfg":
@@ -84,7 +84,7 @@ def test_without_venv_it_says_what_to_install(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["run.py", "test.py"])
-def test_an_old_python_is_told_so(name: str) -> None:
+def test_old_python_is_refused_in_a_line(name: str) -> None:
     script = ROOT / "scripts" / name
     code = f"import runpy, sys\nsys.version_info = (3, 9, 2)\nrunpy.run_path({str(script)!r}, run_name='__main__')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

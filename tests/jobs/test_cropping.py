@@ -80,7 +80,7 @@ def test_report_of_a_crop_counts_the_voxels_that_stay(scan: Path, tmp_path: Path
     assert any("cropped to z from 120 mm (LPS): 32,000 of 64,000 voxels stay (50 %)" in w for w in report["warnings"])
 
 
-def test_the_frame_is_that_of_space(scan: Path, tmp_path: Path) -> None:
+def test_crop_is_read_in_the_frame_of_space(scan: Path, tmp_path: Path) -> None:
     lps, _ = mesh_of(scan, tmp_path, "--around", "8,52,126,9")
     ras, _ = mesh_of(scan, tmp_path, "--around", "-8,-52,126,9", "--space", "ras")
     assert np.allclose(np.sort(ras.vertices, axis=0), np.sort(lps.vertices, axis=0), atol=1e-4)  # both are read as LPS

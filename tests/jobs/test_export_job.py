@@ -34,7 +34,7 @@ def run(*words: object) -> int:
     return main([str(word) for word in words])
 
 
-def test_a_crop_lies_where_it_lay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_exported_crop_lies_in_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scan = series(tmp_path, angles=(10, -20, 35))
     volume = read_volume(scan)
     x, y, z = volume.ijk_to_lps([(12, 10, 6)])[0]

@@ -51,7 +51,7 @@ def test_a_tilted_canal_goes_on_in_its_direction(tilt):
     assert both >= 0.97 * canal.voxels.sum()
 
 
-def test_coarse_and_anisotropic_voxels_hold():
+def test_canal_is_found_in_coarse_and_anisotropic_voxels():
     for spacing in ((3.0, 3.0, 3.0), (0.8, 1.1, 4.0), (2.0, 2.0, 1.0)):
         solid, volume, expected = block(spacing)
         assert np.array_equal(find_canal(solid, volume).voxels, expected)

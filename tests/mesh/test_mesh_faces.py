@@ -25,7 +25,7 @@ def three_parts() -> Mesh:
     return Mesh(vertices, np.concatenate([faces, bands + 8, walls[:, ::-1] + 8 + len(ring)]), report={"a": 1})
 
 
-def test_bounds_area_and_volume_in_mm() -> None:
+def test_bounds_area_and_volume_are_in_mm() -> None:
     mesh = Mesh(*box((-3.0, 4.0, -800.0), (2.0, 3.0, 5.0)))
     assert mesh.bounds.tolist() == [[-3.0, 4.0, -800.0], [-1.0, 7.0, -795.0]]
     assert (mesh.area, mesh.volume) == pytest.approx((62.0, 30.0), rel=1e-6)

@@ -186,7 +186,7 @@ def test_order_of_vertices_and_faces_does_not_matter():
     assert one["genus"] == 1
 
 
-def test_large_mesh_crosses_the_pieces():
+def test_quality_of_a_mesh_of_several_pieces_is_right():
     quality = measure(samples.torus(250, 131))
     assert figures(quality, "triangles", "closed", "manifold", "genus") == (65500, True, True, 1)
     assert quality["volume_ml"] == pytest.approx(samples.torus_volume_ml(250, 131), rel=tolerances.MESH_VOLUME)

@@ -12,7 +12,7 @@ from clrecon.errors import DeviceError
 from clrecon.opencl import kernel_files, load_program, read_kernel_source, sources
 
 
-def test_every_theme_is_found():
+def test_kernel_files_are_found_in_every_folder():
     names = kernel_files()
     assert {name.split("/")[0] for name in names} == {
         "primitives",

@@ -34,7 +34,7 @@ def test_a_value_that_changed_is_named() -> None:
         ({"a": 1}, {"a": 1.5}, "a: 1 became 1.5"),
     ],
 )
-def test_names_order_and_lengths_count(old: dict, new: dict, line: str) -> None:
+def test_reports_that_differ_in_names_order_or_length_are_told(old: dict, new: dict, line: str) -> None:
     assert list(differing_names(old, new)) == [line]
 
 

@@ -206,7 +206,7 @@ def test_the_largest_screw_keeps_the_margin(radius: float, margin: float, diamet
 
 
 @pytest.mark.release
-def test_a_label_map_by_name_gives_the_same() -> None:
+def test_corridors_of_a_label_by_name_are_the_same() -> None:
     vertebra = BoxVertebra()
     volume, labels = vertebra.scan(*grid_around(vertebra))
     found = find_corridors(volume, LabelMap(labels, volume.affine, {3: "L3"}), "L3", HALF_HU)

@@ -147,6 +147,6 @@ def test_files_that_are_read_go_through_one_helper():
     assert found == set(OWN)
 
 
-def test_the_search_finds_what_it_should():
+def test_search_for_openings_finds_each_way_to_open_a_file():
     assert find_openings("open(path)") == find_openings("path.open('rb')") == find_openings("os.open(p, 0)") == 1
     assert find_openings("path.read_text()") == 1 and find_openings("open_regular(p); source.open(name)") == 0

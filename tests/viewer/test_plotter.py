@@ -121,7 +121,7 @@ def test_everything_lies_in_one_scene_and_the_slider_sets_the_surface(device, mo
             assert np.argmax(np.abs(away)) == axis and sign * away[axis] > 0.999 * np.linalg.norm(away)
 
 
-def test_methods_and_the_function_show_the_same(monkeypatch):
+def test_show_by_method_and_by_function_is_the_same_picture(monkeypatch):
     asked: list[tuple[tuple[object, ...], dict[str, object]]] = []
     monkeypatch.setattr(clrecon, "show", lambda *shown, **given: asked.append((shown, given)), raising=False)
     volume, mesh = make_scan(), make_mesh()

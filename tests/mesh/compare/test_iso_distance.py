@@ -45,7 +45,7 @@ def noise_volume(dtype=np.int16) -> Volume:
     return Volume(np.random.default_rng(4).integers(-900, 900, SHAPE_IJK[::-1]).astype(dtype), SHEARED)
 
 
-def test_field_and_gradient_as_scipy_and_differences_have_them():
+def test_field_and_gradient_equal_scipy_and_differences():
     volume = noise_volume()
     rule = choose_iso_rule(volume, 100, closed=True)
     ijk = np.random.default_rng(5).uniform(-1, SHAPE_IJK, (400, 3))

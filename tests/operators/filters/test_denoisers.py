@@ -52,7 +52,7 @@ def test_lengths_of_filters_are_in_mm():
     assert wide.report["filtered"]["steps"][0]["window"] == [5, 5, 3]
 
 
-def test_a_device_volume_gives_one(device):
+def test_filter_of_a_device_volume_gives_a_device_volume(device):
     volume, _ = noisy()
     with clrecon.DeviceVolume(volume, device=device) as resident:
         made = clrecon.filter_volume(resident, "median")

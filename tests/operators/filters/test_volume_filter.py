@@ -255,7 +255,7 @@ def test_slabs_give_the_same_bits(device, make, near):
     assert max(slabs) > 2 or make == "uneven"
 
 
-def test_a_device_volume_gives_one_that_is_there(device):
+def test_filter_of_a_device_volume_gives_one_that_is_held_there(device):
     volume = ball()
     with DeviceVolume(volume, device=device) as resident:
         filtered = clrecon.filter_bilateral(resident, sigma_hu=30.0)

@@ -72,7 +72,7 @@ def test_a_sheared_window_holds_the_ball():
     assert {tuple(offset) for offset in window.offsets.tolist()} >= {(0, 0, 0), (1, 0, 0), (-2, 0, 1), (2, 0, -1)}
 
 
-def test_rows_list_the_taps():
+def test_rows_of_a_window_list_its_taps():
     window = choose_window(cube((0.5, 1, 2)), 1.2, 3, 60)
     listed = [(first + n, j, k) for j, k, first, count in window.rows().tolist() for n in range(count)]
     assert listed == [tuple(offset) for offset in window.offsets.tolist()]

@@ -105,7 +105,7 @@ def test_labels_are_chosen_by_number_and_name(device):
 
 
 @pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
-def test_volumes_keep_what_is_chosen(device, dtype):
+def test_mask_keeps_the_chosen_voxels_of_a_volume(device, dtype):
     volume = random_volume((4, 5, 40), dtype=dtype, high=100)
     made = clrecon.Mask.from_band(volume, (30, 60), device=device)
     outside = 0 if dtype == "uint8" else -1024

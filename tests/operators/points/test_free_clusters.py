@@ -51,7 +51,7 @@ def test_clusters_of_scattered_points_equal_the_twin(device, form, n, min_sample
 
 
 @pytest.mark.parametrize("per_chunk", [32, 64, 640])
-def test_chunks_of_any_size_give_the_same(device, form, per_chunk):
+def test_clusters_are_the_same_in_chunks_of_any_size(device, form, per_chunk):
     points = scattered_points(4000, (30.0, 14.0, 11.0), seed=2)
     labels = find_clusters(device, plan_cells(points, 1.0), 1.0, 3, per_chunk=per_chunk)[0]
     assert np.array_equal(labels, twin.cluster_points(points, 1.0, 3)[1])

@@ -143,7 +143,7 @@ def test_a_slice_without_points_is_no_ghost(device):
     assert found.slices == () and found.points[7] == 0
 
 
-def test_slabs_find_the_same(device):
+def test_ghost_slices_found_in_slabs_are_the_same(device):
     voxels = rods()
     voxels[6] = other("capture")
     volume = Volume(voxels, np.eye(4))
@@ -178,7 +178,7 @@ def test_points_of_ghosts_are_dropped():
 @pytest.mark.release
 @pytest.mark.first_device
 @pytest.mark.parametrize("hu", [200, -300])
-def test_no_false_alarm_on_real_scans(device, real_data, hu):
+def test_real_scans_have_no_false_ghost_slices(device, real_data, hu):
     for name in ("thoracic_0p8mm", "lumbar_4p25mm", "head_tilt_gaps"):
         volume = clrecon.read_volume(real_data / name, allow_gaps=True)
         found = find_ghost_slices(volume, (hu, np.inf), device=device)

@@ -126,12 +126,12 @@ def test_more_samples_than_a_stencil_has_is_all_noise(device):
 @pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize("group", daily(1, [16, 1]))
-def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch):
+def test_clusters_on_devices_with_small_work_groups_equal_the_twin(device, group, monkeypatch):
     monkeypatch.setattr(device, "max_work_group_size", group)
     check_equal(device, Volume(noise((6, 9, 70), 0.3), FINE), 1.2, 5)
 
 
-def test_parts_of_any_size_give_the_same(device):
+def test_clusters_are_the_same_in_parts_of_any_size(device):
     volume = Volume(noise((6, 9, 70), 0.3), FINE)
     labels = [search(device, volume, 1.2, 5, parts_per_core=parts).label() for parts in (1, 7, 1000)]
     np.testing.assert_array_equal(labels, [search(device, volume, 1.2, 5).label()] * 3)
@@ -163,7 +163,7 @@ def voxel_cloud(volume: Volume) -> PointCloud:
 
 @pytest.mark.release
 @pytest.mark.parametrize(("eps", "samples"), daily_rows(1, [(1.2, 6), (0.85, 1), (1.6, 20)]))
-def test_scikit_learn_says_the_same(device, eps, samples):
+def test_clusters_of_voxels_equal_scikit_learn(device, eps, samples):
     sklearn = pytest.importorskip("sklearn.cluster")
     volume = Volume(noise((10, 30, 40), 0.25), np.diag((0.644531, 0.644531, 0.8, 1.0)))
     expected = sklearn.DBSCAN(eps=eps * (1 + 1e-6), min_samples=samples).fit(points_of(volume))

@@ -39,7 +39,7 @@ def test_a_scan_may_take_the_place_of_its_counts(device, n):
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("group", [1, 16])
-def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch):
+def test_scan_on_devices_with_small_work_groups_equals_the_twin(device, group, monkeypatch):
     monkeypatch.setattr(device, "max_work_group_size", group)
     counts = np.random.default_rng(group).integers(0, 50, 5000).astype(np.uint32)
     scanned = exclusive_scan(device, upload(device, counts), counts.size)

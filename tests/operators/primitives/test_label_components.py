@@ -111,7 +111,7 @@ def test_noisy_surfaces_equal_scipy(device, density):
     check_equal(device, mesh.triangles, mesh.vertex_count, connectivity.label_components)
 
 
-def test_sheets_of_one_cell_stay_apart(device):
+def test_sheets_through_one_cell_are_two_components(device):
     """Two voxels across the diagonal of a cell share its cells and no vertex: one component of cells, two surfaces."""
     voxels = np.zeros((4, 4, 4), np.int16)
     voxels[1, 1, 1] = voxels[2, 2, 2] = 10
@@ -121,7 +121,7 @@ def test_sheets_of_one_cell_stay_apart(device):
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("group", daily(1, [1, 16]))
-def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch):
+def test_components_on_devices_with_small_work_groups_equal_the_twin(device, group, monkeypatch):
     monkeypatch.setattr(device, "max_work_group_size", group)
     check_equal(device, soup(500, 200), 500)
 

@@ -88,7 +88,7 @@ def test_the_light_is_that_of_the_twin(device: Any, has_normals: bool, lighting:
         assert found.shading == ("none" if not lighting.shades else "normals" if has_normals else "depths")
 
 
-def test_a_disc_covers_what_it_should(device: Any) -> None:
+def test_disc_of_a_point_covers_its_radius_and_hides_farther_ones(device: Any) -> None:
     """A disc of 3 mm before a larger one; the nearer hides the other, and of equals the first is seen."""
     points = np.array([(0, 0, 0), (0, -5, 0), (0, -5, 0), (3.1, 10, 0)], np.float32)
     cloud = PointCloud(points, labels=[7, 3, 5, 1])

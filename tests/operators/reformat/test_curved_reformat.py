@@ -116,7 +116,7 @@ def test_a_slab_lies_across_the_picture(device):
         assert thin.values.max() == 0
 
 
-def test_the_device_equals_its_twin(device):
+def test_curved_reformation_equals_its_twin(device):
     volume = list(grids())[1]
     values = np.random.default_rng(4).integers(0, 100, volume.voxels.shape).astype(np.int16)
     volume = volume.with_voxels(values)

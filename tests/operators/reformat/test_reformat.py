@@ -175,7 +175,7 @@ VOLUMES = {
 @pytest.mark.every_device
 @pytest.mark.parametrize("name", VOLUMES)
 @pytest.mark.parametrize("dtype", daily(1, ["int16", "uint8", "float32"]))
-def test_the_device_equals_its_twin(device, name, dtype):
+def test_reformation_equals_its_twin(device, name, dtype):
     volume = VOLUMES[name](dtype)
     for view, thickness, combine in [("axial", 0.0, "mean"), ((20.0, 30.0), 2.3, "max"), ("sagittal", 7.0, "mean"),
                                      ((-75.0, 10.0), 3.0, "min")]:  # fmt: skip

@@ -33,7 +33,7 @@ def pairs(found) -> set[tuple[int, int]]:
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("count", [1, 2, 31, 32, 33, 200])
-def test_marks_equal_the_twin(device, count):
+def test_crossing_triangles_are_marked_as_by_the_twin(device, count):
     vertices, triangles = scattered(count, sizes=(0.3, 1.0, 5.0))
     found = mark_crossings(device, plan_crossings(vertices, triangles))
     assert np.array_equal(found, twin.mark_crossings(vertices, triangles))
@@ -59,7 +59,7 @@ def test_few_crossing_triangles_are_marked_as_by_the_twin(device):
 @pytest.mark.parametrize("sizes", [(0.01, 1.0, 40.0), (1.0,), (0.02, 0.021)])
 @pytest.mark.parametrize("extent", [(60.0, 50.0, 40.0), (0.0, 90.0, 5.0), (500.0, 1.0, 1.0)])
 @pytest.mark.parametrize("place", daily(1, [3000.0, 0.0]))
-def test_pairs_are_those_of_the_host(device, sizes, extent, place):
+def test_crossing_pairs_are_those_of_the_host(device, sizes, extent, place):
     vertices, triangles = scattered(1200, sizes, extent=extent)
     vertices += np.float32(place)
     expected = find_self_intersections(vertices, triangles)

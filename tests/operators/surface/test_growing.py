@@ -96,7 +96,7 @@ def test_types_ranges_and_uneven_slices_equal_the_twin(dtype: str, device: Any) 
 
 
 @pytest.mark.release
-def test_the_identity_holds_on_a_spine(device: Any) -> None:
+def test_cells_grown_on_a_spine_are_those_of_the_frontier(device: Any) -> None:
     """The cells are those that the paper's frontier enters, one by one: the twin asserts that beside the mesh."""
     voxels, affine, _ = make_phantom(PhantomSettings(size=(64, 64), slices=24, spacing=(2.4, 2.4, 3.3), noise=40.0))
     volume = Volume(voxels, affine)

@@ -22,7 +22,7 @@ from clrecon.proof.surface import extract as twin
 @pytest.mark.every_device
 @pytest.mark.parametrize("closed", daily(1, [True, False]))
 @pytest.mark.parametrize("shape", SHAPES)
-def test_device_equals_twin_at_word_borders(device, shape, closed):
+def test_surface_equals_its_twin_at_word_borders(device, shape, closed):
     volume = random_volume(shape)
     vertices, normals, triangles = twin.extract_isosurface(volume, 3, closed=closed)
     mesh = extract_isosurface(volume, 3, device=device, closed=closed)
@@ -33,7 +33,7 @@ def test_device_equals_twin_at_word_borders(device, shape, closed):
 
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)
 @pytest.mark.parametrize("affine", daily(1, [MIRRORED, OBLIQUE]), ids=["left-handed", "right-handed"])
-def test_device_equals_twin_for_every_voxel_type(device, dtype, affine):
+def test_surface_equals_its_twin_for_every_voxel_type(device, dtype, affine):
     volume = random_volume((6, 7, 37), dtype, high=100, affine=affine)
     for iso_value in (1, 40, 40.5, 99):
         vertices, normals, triangles = twin.extract_isosurface(volume, iso_value)

@@ -78,7 +78,7 @@ def test_surfaces_of_labels_equal_their_twin(device, shape, solid, closed):
 
 
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)
-def test_device_equals_twin_for_every_voxel_type(device, dtype):
+def test_surfaces_of_labels_equal_their_twin_for_every_voxel_type(device, dtype):
     shape = (6, 7, 37)
     volume, labels = random_volume(shape, dtype, MIRRORED, high=100), random_labels(shape)
     for iso_value in (40, 40.3):

@@ -47,7 +47,7 @@ def ball(radius: float, size: int = 33) -> Volume:
         1, [("int16", OBLIQUE), ("float32", MIRRORED), ("int16", MIRRORED), ("uint8", OBLIQUE), ("int32", MIRRORED)]
     ),
 )
-def test_device_equals_twin_for_voxel_types(device, dtype, affine):
+def test_surface_of_a_range_equals_its_twin_for_voxel_types(device, dtype, affine):
     """Of whole numbers one of each kind: with a sign, without one, and beyond what float32 holds."""
     volume = random_volume((5, 6, 37), dtype, high=100, affine=affine)
     for level, options in CASES:
@@ -57,7 +57,7 @@ def test_device_equals_twin_for_voxel_types(device, dtype, affine):
 @pytest.mark.every_device
 @pytest.mark.parametrize("closed", daily(1, [True, False]))
 @pytest.mark.parametrize("shape", SHAPES)
-def test_device_equals_twin_at_word_borders(device, shape, closed):
+def test_surface_of_a_range_equals_its_twin_at_word_borders(device, shape, closed):
     volume = random_volume(shape)
     assert_equals_twin(volume, (2, 3), device, closed=closed)
     assert_equals_twin(volume, 3, device, closed=closed, below=True)

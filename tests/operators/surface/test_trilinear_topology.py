@@ -32,13 +32,13 @@ def assert_equals_twin(volume, iso_value, device, closed=True) -> None:
 
 @pytest.mark.parametrize("closed", daily(1, [True, False]))
 @pytest.mark.parametrize("shape", daily(8, SHAPES))
-def test_device_equals_twin_at_word_borders(device, shape, closed):
+def test_trilinear_surface_equals_its_twin_at_word_borders(device, shape, closed):
     assert_equals_twin(random_volume(shape, high=50), 25, device, closed)
 
 
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)
 @pytest.mark.parametrize("affine", daily(1, [MIRRORED, OBLIQUE]), ids=["left-handed", "right-handed"])
-def test_device_equals_twin_for_every_voxel_type(device, dtype, affine):
+def test_trilinear_surface_equals_its_twin_for_every_voxel_type(device, dtype, affine):
     volume = random_volume((5, 6, 37), dtype, high=100, affine=affine)
     for iso_value in (30, 50.3):
         assert_equals_twin(volume, iso_value, device)

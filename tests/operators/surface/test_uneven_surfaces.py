@@ -85,7 +85,7 @@ def test_planes_have_their_places_and_normals_everywhere(device, topology):
 @pytest.mark.parametrize("topology", ["separated", "trilinear"])
 @pytest.mark.parametrize("closed", daily(1, [True, False]))
 @pytest.mark.parametrize("dtype", [np.int16, np.float32])
-def test_the_device_gives_what_the_twin_gives(device, topology, closed, dtype):
+def test_surfaces_of_uneven_slices_equal_the_twin(device, topology, closed, dtype):
     rng = np.random.default_rng(11)
     volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), (9, 11), GAPS[5:15], dtype=dtype)
     mesh = extract_isosurface(volume, 25, device=device, closed=closed, topology=topology)

@@ -129,7 +129,7 @@ def test_every_method_has_its_row_and_its_picture(device: Any, whole: Path) -> N
 
 @pytest.mark.release
 @pytest.mark.long
-def test_parts_of_time_add_up(device: Any, whole: Path) -> None:
+def test_parts_of_the_time_of_a_method_add_up(device: Any, whole: Path) -> None:
     for method in read_report(whole)["methods"]:
         parts = method["first_parts_s"]
         assert set(parts) == {"read", "build", "upload", "kernels", "host", "download", "draw"}

@@ -181,7 +181,7 @@ def test_boxes_hold_whole_vertebrae() -> None:
 
 
 @pytest.mark.parametrize("levels", daily(1, ["C1-C3", "C7-T1", "L4-L5"]))
-def test_levels_lie_apart(levels: str) -> None:
+def test_vertebrae_of_any_levels_lie_apart(levels: str) -> None:
     assert min(gaps(planned(levels))) > 2.0
 
 

@@ -161,7 +161,7 @@ def test_scenes_have_no_surface_as_a_function() -> None:
         clrecon.phantom_truth(PhantomSettings(kind="skull"))
 
 
-def test_covers_have_no_holes() -> None:
+def test_cover_of_a_vertebra_has_no_holes() -> None:
     """Each point of the surface has one of the cover within the diagonal of a cell."""
     truth = truth_of("scoliotic, with facets")
     vertebra = truth._bone.vertebrae[0]

@@ -50,7 +50,7 @@ def loop_edges(loops) -> set:
     return {(loop[n - 1], loop[n]) for loop in loops for n in range(len(loop))}
 
 
-def test_all_states_and_tunnels_are_there():
+def test_table_has_all_states_and_tunnels_of_a_cell():
     assert len(all_states()) == 656
     assert len(all_rows()) - len(all_states()) == 160
     assert max(len(row.triangles) for _, _, row in all_rows()) == MAX_TRILINEAR_TRIANGLES

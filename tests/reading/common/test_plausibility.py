@@ -228,7 +228,7 @@ def test_nothing_but_padding_is_refused(tmp_path):
         read_volume(folder)
 
 
-def test_two_values_are_a_picture(tmp_path):
+def test_volume_of_two_values_raises_no_alarm(tmp_path):
     hu = np.full(SHAPE, 40.0)
     hu[3, 5, 5] = 41
     assert told(write_hu(tmp_path, hu)) == []

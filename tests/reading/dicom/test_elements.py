@@ -73,7 +73,7 @@ def test_the_tables_are_those_of_pydicom() -> None:
     assert not any(codecs.describe_undecodable(uid) for uid in codecs.SYNTAX_NAMES)
 
 
-def test_files_of_pydicom_give_the_same() -> None:
+def test_files_of_pydicom_are_parsed_alike() -> None:
     files = corpus()
     taken = [name for name, data in files.items() if check_alike(data, len(data))]
     assert len(files) > 120
@@ -82,7 +82,7 @@ def test_files_of_pydicom_give_the_same() -> None:
 
 
 @pytest.mark.fuzz
-def test_mutated_files_give_the_same_or_nothing() -> None:
+def test_mutated_files_are_parsed_alike_or_left_open() -> None:
     bases = []
     for data in corpus().values():
         found = plain.parse_plainly(data, len(data), WANTED_TAGS)
@@ -170,7 +170,7 @@ def make_element(chance: random.Random, implicit: bool, depth: int = 3) -> bytes
 @pytest.mark.release
 @pytest.mark.fuzz
 @pytest.mark.parametrize("implicit", [False, True])
-def test_built_headers_give_the_same_or_nothing(implicit: bool) -> None:
+def test_built_headers_are_parsed_alike_or_left_open(implicit: bool) -> None:
     chance = random.Random(176)
     for _ in range(300):
         whole = wrap(b"".join(make_element(chance, implicit) for _ in range(chance.randrange(7))), implicit)

@@ -113,7 +113,7 @@ def fragments(count: int) -> io.BytesIO:
     return io.BytesIO(items + struct.pack("<HHL", 0xFFFE, 0xE0DD, 0))
 
 
-def test_a_thousand_fragments_a_frame_and_a_thousand_more():
+def test_more_than_a_thousand_fragments_a_frame_and_a_thousand_are_refused():
     """The first item is the table of offsets; a frame in RLE may have several fragments."""
     file = fragments(2000)
     assert [len(pieces) for pieces in transfer_syntaxes.find_frames(file, 0, len(file.getvalue()), 1, RLE)] == [1999]

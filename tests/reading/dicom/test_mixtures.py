@@ -103,7 +103,7 @@ def test_alternating_elements_part_two_volumes(tmp_path, first, second, keyword)
         )
 
 
-def test_three_volumes_and_volumes_in_pairs(tmp_path):
+def test_three_volumes_and_volumes_in_pairs_are_told_as_phases(tmp_path):
     write_volumes(tmp_path / "three", *({"ProtocolName": name} for name in "ABC"))
     assert "3 phases whose slices lie between" in refusal(tmp_path / "three")
     write_series(tmp_path / "pairs", Plan(shape=(16, 5, 6)), lambda ds, k: setattr(ds, "ProtocolName", "AABB"[k % 4]))

@@ -391,7 +391,7 @@ def test_frames_lost_within_a_concatenation_are_missed(tmp_path):
 # --- other opinions ---
 
 
-def test_highdicom_reads_the_same(tmp_path):
+def test_highdicom_reads_the_same_volume_of_an_enhanced_image(tmp_path):
     import highdicom
 
     plan = Plan(tilt_deg=0, angles=(20, -35, 50))

@@ -79,7 +79,7 @@ def test_one_slice_that_asks_for_more_widens_the_volume(tmp_path, place, value, 
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_other_libraries_agree(tmp_path, name):
+def test_grid_volumes_equal_those_of_other_libraries(tmp_path, name):
     path = WRITERS[name](tmp_path / name, make_ct(), ROTATED)
     volume = clrecon.read_volume(path)
     if name != "two.nii":  # SimpleITK does not read NIfTI-2

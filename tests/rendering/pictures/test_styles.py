@@ -259,7 +259,7 @@ def test_names_and_keywords_that_cannot_be_are_refused(look: dict[str, Any], say
     assert says in str(error.value)
 
 
-def test_a_style_stands_alone() -> None:
+def test_style_is_found_by_object_or_name_and_takes_no_other_keywords() -> None:
     style = SurfaceLook()
     assert find_style(style, {}) is style
     assert find_style("mip", {"window": (1, 2)}) == Projection(window=(1.0, 2.0))

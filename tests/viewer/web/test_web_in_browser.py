@@ -229,7 +229,7 @@ def test_a_part_is_hidden_by_a_click_and_listed_with_its_ml(page) -> None:
     wait_for(page, "return clrecon.facts.parts.every((part) => part.visible)")
 
 
-def test_shift_and_click_says_what_it_is_and_the_slices_go_there(page) -> None:
+def test_shift_click_names_the_part_and_moves_the_slices_there(page) -> None:
     from selenium.webdriver.common.keys import Keys
 
     wait_for(page, PARTS)
