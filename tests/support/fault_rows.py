@@ -184,7 +184,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
         "no fp64, no images, small groups, 32-bit sizes, big endian: right, or refused in words",
         (
             "opencl/test_select.py::test_shortcomings_of_devices_are_named",
-            "operators/primitives/test_compaction.py::test_devices_with_small_work_groups_get_the_same",
+            "operators/primitives/test_compaction.py::test_scan_on_devices_with_small_work_groups_equals_the_twin",
         ),
     ),
     52: ("a kernel that does not build, a kernel file that is missing: refused with the log or the file", ()),
