@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import chain, islice
 from typing import IO, Any, Protocol
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from clrecon.errors import OutputError
 from clrecon.geometry import frame_from_lps
 from clrecon.system.light_dataclass import dataclass, field
-from clrecon.system.pieces import chunks
+from clrecon.system.pieces import chunks, side_by_side
 
 LINE_LENGTH = 256
 """Longest line.  Readers of PLY keep comments in buffers of fixed size; a widely used one has 1024 bytes."""
@@ -200,11 +201,33 @@ class Assembly:
 
 
 def write_lines(stream: IO[bytes], form: str, rows: NDArray[Any]) -> None:
-    """Write a line of text for each row of numbers (n, k)."""
-    # One % for many lines takes two thirds of the time of one % for each line.
+    """Write a line of text for each row of numbers (n, k), of at least 0 where they are whole: ``%d``."""
+    format_rows = _format_whole_numbers if rows.dtype.kind in "iu" else _format_numbers
+    text = b""
     for lines in chunks(len(rows), _LINES_AT_ONCE):
-        numbers = rows[lines]
-        stream.write((form * len(numbers) % tuple(numbers.ravel().tolist())).encode("ascii"))
+        # Streams pack what they get, meanwhile the next lines are made.
+        text, _ = side_by_side(partial(format_rows, form, rows[lines]), partial(stream.write, text))
+    stream.write(text)
+
+
+def _format_numbers(form: str, rows: NDArray[Any]) -> bytes:
+    # One % for many lines takes two thirds of the time of one % for each line.
+    return (form * len(rows) % tuple(rows.ravel().tolist())).encode("ascii")
+
+
+def _format_whole_numbers(form: str, rows: NDArray[Any]) -> bytes:
+    """Do what `_format_numbers` does in half of the time: all digits of a place at once, NUL where there is none."""
+    numbers = rows.reshape(len(rows), -1).T
+    digits = len(str(int(numbers.max())))
+    texts = form.encode("ascii").split(b"%d")
+    canvas = np.tile(np.frombuffer(bytes(digits).join(texts), dtype=np.uint8), (len(rows), 1))
+    columns = np.cumsum([len(text) + digits for text in texts]) - digits
+    for column, rest in zip(columns, numbers, strict=False):
+        for digit in range(digits - 1, -1, -1):
+            number, rest = rest, rest // 10
+            canvas[:, column + digit] = np.where((number > 0) | (digit == digits - 1), number - 10 * rest + ord("0"), 0)
+    text = canvas.tobytes()
+    return text.translate(None, b"\0") if b"\0" in text else text
 
 
 def parts_of(content: Content | Assembly) -> tuple[Content, ...]:

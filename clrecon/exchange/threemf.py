@@ -17,7 +17,7 @@ from array import array
 from collections.abc import Callable, Sequence
 from html import escape  # that of xml.sax loads all of urllib
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import Any, BinaryIO
 from xml.parsers import expat
 
 import numpy as np
@@ -77,16 +77,12 @@ def write(stream: BinaryIO, content: Content | Assembly) -> None:
             model.write(_opening(parts).encode("ascii"))
             for number, part in enumerate(parts):
                 model.write(_object(parts, number).encode("ascii"))
-                _write_mesh(model, part)
+                write_lines(model, _vertex(part), part.vertices)
+                model.write(b"</vertices>\n<triangles>\n")
+                write_lines(model, _TRIANGLE, part.triangles)
+                model.write(b"</triangles>\n</mesh>\n</object>\n")
             items = "".join(f'<item objectid="{_object_id(parts, number)}"/>\n' for number in range(len(parts)))
             model.write(f"</resources>\n<build>\n{items}</build>\n</model>\n".encode("ascii"))
-
-
-def _write_mesh(model: IO[bytes], part: Content) -> None:
-    write_lines(model, _vertex(part), part.vertices)
-    model.write(b"</vertices>\n<triangles>\n")
-    write_lines(model, _TRIANGLE, part.triangles)
-    model.write(b"</triangles>\n</mesh>\n</object>\n")
 
 
 def _has_colors(parts: Sequence[Content]) -> bool:

@@ -139,9 +139,10 @@ def _count_up(begin: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np
     return np.arange(ends[-1] if len(ends) else 0) + np.repeat(begin - ends + counts, counts)
 
 
-def number_connected(count: int, first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:
+def number_connected(count: int, first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.int64]:
     """Number the components of nodes that are connected in pairs, from 1 in the order of their first nodes."""
     roots = np.arange(count)
+    first, second = first.astype(np.int64), second.astype(np.int64)
     while len(first):
         np.minimum.at(roots, np.maximum(first, second), np.minimum(first, second))
         while not np.array_equal(above := roots[roots], roots):

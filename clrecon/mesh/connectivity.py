@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.geometry.regions import number_connected
 from clrecon.system.light_dataclass import dataclass
 
 _MOST_STEPS = 64
@@ -194,9 +195,9 @@ def _find_split_vertices_of_any_mesh(corners: NDArray[np.uint32], vertex_count: 
         np.concatenate([first, one_end]),
         np.concatenate([np.where(parallel, second, other_end), np.where(parallel, other_end, second)]),
     )
-    count, labels = _connect(*joined, corners.size)
-    vertex_of_fan = np.empty(count, dtype=np.int64)
-    vertex_of_fan[labels] = corners  # all corners of a fan have one vertex
+    fans = number_connected(corners.size, *joined) - 1
+    vertex_of_fan = np.empty(fans.max(initial=-1) + 1, dtype=np.int64)
+    vertex_of_fan[fans] = corners  # all corners of a fan have one vertex
     return np.flatnonzero(np.bincount(vertex_of_fan, minlength=vertex_count) > 1)
 
 
@@ -205,7 +206,7 @@ def label_components(
 ) -> tuple[int, NDArray[np.int64]]:
     """Number the components: triangles that share a vertex belong to one component.
 
-    edges: If they are already known, labelling takes a third of the time.
+    edges: If they are already known, labelling takes less time.
     Returns:
     count: Number of components, not counting vertices that no triangle uses.
     labels: ndarray, shape (vertex_count,), int64. Component of each vertex, numbered in order of the first vertex; -1
@@ -213,44 +214,14 @@ def label_components(
     """
     used = np.zeros(vertex_count, dtype=bool)
     used[triangles.reshape(-1)] = True
-    if edges is None:
-        starts = np.concatenate([triangles[:, 0], triangles[:, 1]])
-        ends = np.concatenate([triangles[:, 1], triangles[:, 2]])
-        groups, labels = _connect(starts, ends, vertex_count)
-    else:
-        groups, labels = _connect_edges(edges, vertex_count)
-    if used.all():
-        return groups, labels
-    is_component = np.zeros(groups, dtype=bool)
-    is_component[labels[used]] = True
-    number = np.cumsum(is_component) - 1
-    return int(np.count_nonzero(is_component)), np.where(used, number[labels], -1)
-
-
-def _connect_edges(edges: Edges, vertex_count: int) -> tuple[int, NDArray[np.int64]]:
-    """Find connected components over edges, which already are the rows of a sparse matrix."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
-
-    low, high = edges.ends
-    kind = _index_type(max(edges.count, vertex_count) + 1)
-    rows = np.zeros(vertex_count + 1, dtype=kind)
-    np.cumsum(np.bincount(low, minlength=vertex_count), out=rows[1:])
-    links = csr_array((np.ones(edges.count), high.astype(kind), rows), shape=(vertex_count, vertex_count))
-    count, labels = connected_components(links, directed=False)
-    return int(count), labels.astype(np.int64)
-
-
-def _connect(starts: NDArray[np.integer], ends: NDArray[np.integer], size: int) -> tuple[int, NDArray[np.int64]]:
-    """Find the connected components of an undirected graph with `size` nodes, numbered in order of the first node."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    index_type = _index_type(size)
-    # bool: duplicate entries are combined by "or"; as numbers their sum could be 0
-    links = (np.ones(len(starts), dtype=bool), (starts.astype(index_type), ends.astype(index_type)))
-    count, labels = connected_components(coo_matrix(links, shape=(size, size)).tocsr(), directed=False)
-    return int(count), labels.astype(np.int64)
+    corners = triangles.T
+    pairs = edges.ends if edges is not None else np.concatenate((corners[:2], corners[1:]), axis=1)
+    labels = number_connected(vertex_count, *pairs)
+    if not used.all():
+        is_component = np.zeros(vertex_count + 1, dtype=bool)
+        is_component[labels[used]] = True
+        labels = np.where(used, np.cumsum(is_component)[labels], 0)
+    return int(labels.max(initial=0)), labels - 1
 
 
 def count_duplicate_faces(triangles: NDArray[np.uint32], vertex_count: int, opposite: IntArray | None = None) -> int:

@@ -16,6 +16,7 @@ from refusals import refused
 
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
 from clrecon.exchange import formats as writers
+from clrecon.exchange.content import write_lines
 from clrecon.exchange.coordinates import _scramble, find_places, rounded_apart
 from clrecon.exchange.formats import FORMATS
 from clrecon.mesh import Mesh
@@ -441,3 +442,13 @@ def test_places_of_one_sum_are_told_apart():
     assert np.isfinite(vertices).all() and len(np.unique(_scramble(vertices))) == 2
     first, place = find_places(vertices)
     assert (first.tolist(), place.tolist()) == ([0, 1, 4], [0, 1, 0, 1, 2])
+
+
+@pytest.mark.parametrize("form", ["f %d %d %d\n", "%d,%d,%d;"])
+@pytest.mark.parametrize("highest", [1, 10, 12_345, 4_294_967_296])
+def test_whole_numbers_are_written_digit_for_digit(form, highest):
+    rows = np.random.default_rng(3).integers(0, highest, (500, 3))
+    rows[0] = 0, highest - 1, min(9, highest - 1)
+    stream = io.BytesIO()
+    write_lines(stream, form, rows)
+    assert stream.getvalue().decode() == "".join(form % tuple(row) for row in rows.tolist())
