@@ -1,7 +1,7 @@
 """Arrays on a device, its memory budget, and pages for results.
 
 All buffers of an operator are summed and compared with the device before any is allocated.  On a CPU device they use
-numpy's memory without a copy.
+numpy's memory without a copy, and on a part of a processor volumes and results do.
 
 When a kernel first writes to a new page, the system has to find and clear it, which for the mesh of a CT series takes
 as long as computing it.  So arrays made here return their pages when their last view is gone, for a later result.
@@ -9,6 +9,7 @@ as long as computing it.  So arrays made here return their pages when their last
 
 from __future__ import annotations
 
+import math
 import mmap
 import threading
 import weakref
@@ -27,6 +28,7 @@ from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.transfers import LEAST_BYTES, read_buffers, write_buffer
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass, replace
+from clrecon.system.memory import aligned_empty
 
 
 def _mib(size: int, *, up: bool = False) -> str:
@@ -200,6 +202,33 @@ result_pages = PagePool()
 SHARED_BYTES = 1 << 20
 """Arrays smaller than this are copied to the device even if it could use them in place."""
 
+_CACHE_LINE = 64
+"""GPUs use arrays in place that are whole lines of a cache and begin with a page; drivers copy all others."""
+
+
+def _shares_memory(device: Device, array: NDArray[Any]) -> bool:
+    """Return whether kernels work in the array itself: a CPU in any, a GPU without memory of its own in whole pages."""
+    if device.type != "gpu" or device.has_own_memory or device.is_simulator:
+        return device.shares_host_memory
+    if array.nbytes < SHARED_BYTES or array.nbytes % _CACHE_LINE or array.ctypes.data % mmap.PAGESIZE:
+        return False
+    return array.flags.writeable and device.of_context(_works_in_place)
+
+
+def _works_in_place(device: Device) -> bool:
+    """Return whether arrays have what a device writes to buffers in their memory: a driver may keep copies of them."""
+    cl = import_pyopencl()
+    source, target = aligned_empty((2, SHARED_BYTES), np.uint8)
+    source[:], target[:] = 1, 0
+    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
+    try:
+        source_d, target_d = (buffers.ask_driver(device, flags, len(array), array) for array in (source, target))
+    except cl.Error:
+        return False
+    copy_buffer(device, source_d, target_d, len(source))
+    wait(device)
+    return bool(target.all())
+
 
 def _make_buffer(device: Device, flags: Any, size: int, host: NDArray[Any] | None = None) -> Any:
     cl = import_pyopencl()
@@ -228,7 +257,7 @@ def upload(device: Device, array: NDArray[Any]) -> Any:
     array = np.ascontiguousarray(array)
     flags = cl.mem_flags.READ_ONLY
     # float4 and similar types need an alignment that numpy does not guarantee: small tables are copied.
-    if device.shares_host_memory and array.nbytes >= SHARED_BYTES:
+    if array.nbytes >= SHARED_BYTES and _shares_memory(device, array):
         return _make_buffer(device, flags | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
     if device.shares_host_memory or device.is_simulator:
         return _make_buffer(device, flags | cl.mem_flags.COPY_HOST_PTR, array.nbytes, array)
@@ -259,12 +288,14 @@ def copy_buffer(
 def empty_output(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[Any], Any]:
     """Return an uninitialised host array and a buffer for the device to write it; `download` fills the array."""
     cl = import_pyopencl()
+    size = math.prod(shape) * np.dtype(dtype).itemsize
     try:
-        array = result_pages.empty(shape, dtype)
+        lines = result_pages.empty((-(-size // _CACHE_LINE) * _CACHE_LINE,), np.uint8)
     except MemoryError as error:
         raise DeviceMemoryError(f"the memory of this computer does not suffice: {error}") from error
-    if device.shares_host_memory and array.nbytes:
-        return array, _make_buffer(device, cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
+    array = lines[:size].view(dtype).reshape(shape)
+    if size and _shares_memory(device, lines):
+        return array, _make_buffer(device, cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR, len(lines), lines)
     return array, allocate(device, array.nbytes)
 
 

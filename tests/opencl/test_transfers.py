@@ -25,6 +25,7 @@ def apart(device, monkeypatch):
     if device.is_simulator:
         pytest.skip("simulators take the driver's way, which checks more")
     monkeypatch.setattr(device, "shares_host_memory", False)
+    monkeypatch.setattr(device, "has_own_memory", True)
     return device
 
 

@@ -17,7 +17,7 @@ def pretended_gpu(device: Device) -> Device:
     """Return a GPU with its own memory that computes on the same hardware, and has the CPU device as its stand-in."""
     gpu = Device(device.index, device.cl_device.platform, device.cl_device)
     gpu.name, gpu.type, gpu.shares_host_memory, gpu.keeps_binaries = "a pretended GPU", "gpu", False, False
-    gpu.kernel_variants = device.kernel_variants
+    gpu.has_own_memory, gpu.kernel_variants = True, device.kernel_variants
     return gpu.with_stand_in(device)
 
 

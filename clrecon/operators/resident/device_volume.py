@@ -59,7 +59,7 @@ class DeviceVolume(Closing, Volume):
         Another one once the CPU device took over, see `with_fallback`.
     memory : int or None
     uploaded_bytes : int
-        Bytes of voxels uploaded so far.  CPU devices read the computer's own memory: nothing is copied.
+        Bytes of voxels uploaded so far.  CPUs and their GPUs read the computer's own memory: nothing is copied.
     values : ValueRange
         Range of the voxels' values.
     most_slices : dict of str to int
