@@ -195,7 +195,7 @@ def read_mesh(path: Path) -> RawMesh:
             model = _read_model(package, _find_model(package, name), name)
         shapes = _place_shapes(model)
     except (
-        OSError, EOFError, ValueError, KeyError, OverflowError, MemoryError, NotImplementedError, RuntimeError,
+        OSError, EOFError, ValueError, LookupError, OverflowError, MemoryError, NotImplementedError, RuntimeError,
         zipfile.BadZipFile, zlib.error, expat.ExpatError,
     ) as error:  # fmt: skip
         raise say_cut(name, error) from error

@@ -310,7 +310,7 @@ def _read_document(path: Path, collect: Callable[[Document, str], Raw]) -> Raw:
         with open_regular(path) as stream:
             document = parse_document(stream.read(), name)
         return collect(document, name)
-    except (OSError, ValueError, OverflowError, MemoryError, ElementTree.ParseError, zlib.error) as error:
+    except (OSError, ValueError, LookupError, OverflowError, MemoryError, ElementTree.ParseError, zlib.error) as error:
         raise say_cut(name, error) from error
 
 

@@ -161,6 +161,8 @@ def _remove_tree(folder: str) -> None:
 def prepare_caches() -> Caches:
     """Check the folders of built kernels, once in a process, and set the environment of the drivers accordingly."""
     home, home_name = _cache_home()
+    if os.environ.get("XDG_CACHE_HOME") == "":  # Mesa would make a folder without a name, and complain
+        del os.environ["XDG_CACHE_HOME"]
     folder = home / _OWN
     faults = _find_faults(home, home_name, folder)
     pocl, pocl_name, of_pocl = _pocl_folder(home, home_name)

@@ -192,6 +192,10 @@ THREEMF = {
     "not a zip": (lambda path: path.write_bytes(b"PK\3\4 and no more"), "cut or corrupt"),
     "other archive": (lambda path: zipfile.ZipFile(path, "w").writestr("a.txt", "a"), "no 3MF file"),
     "bomb": (lambda path: write_3mf(path, "<!--" + " " * 40_000_000 + "-->", ""), "bytes of XML cannot come from"),
+    "unknown encoding": (
+        lambda path: write_3mf(path, "", "", head='<?xml version="1.0" encoding="no-such"?>'),
+        "unknown encoding: no-such",
+    ),
     "entities": (
         lambda path: write_3mf(path, "&a;", "", head='<!DOCTYPE m [<!ENTITY a "ha"><!ENTITY b "&a;&a;">]>'),
         "declares a document type",
@@ -299,6 +303,7 @@ def test_a_scene_without_triangles_is_an_empty_mesh(tmp_path: Path) -> None:
             "in line 4 .*'quality float x'",
         ),
         ("a.vtp", b'<VTKFile type="PolyData"><PolyData/></VTKFile>', "no triangles"),
+        ("a.vtp", b'<?xml version="1.0" encoding="no-such"?><VTKFile/>', "unknown encoding: no-such"),
         ("a.vtp", b'<!DOCTYPE a><VTKFile type="PolyData"></VTKFile>', "document type"),
     ],
 )

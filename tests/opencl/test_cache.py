@@ -217,6 +217,7 @@ def test_row_59_a_folder_that_depends_on_the_current_one_is_not_used(fresh, tmp_
     assert warning.endswith(f"anew: {name} is no absolute path") and not caches.refusal
     assert not caches.is_lasting and caches.binaries is None and os.environ["PYOPENCL_NO_CACHE"] == "1"
     assert not list(tmp_path.iterdir())
+    assert os.environ.get("XDG_CACHE_HOME") != "", "Mesa would make a folder without a name"
 
 
 def test_row_59_the_other_caches_are_switched_off_one_by_one(fresh, tmp_path):

@@ -218,6 +218,10 @@ def test_calls_that_went_wrong_are_told_by_their_kind(given, code, out, err, kin
     assert caught.value.kind == kind
 
 
+def test_words_on_stderr_beside_an_output_on_stdout_are_right() -> None:
+    commands.check_call(["mesh", "ct", "-o", "-"], 0, "solid", "wrote    standard output\n")
+
+
 @pytest.mark.parametrize(("code", "name"), [(3, "out.stl"), (0, ".out.stl.tmp")])
 def test_files_that_are_left_behind_are_a_fault(code, name) -> None:
     with pytest.raises(WrongOutcome, match="left"):
