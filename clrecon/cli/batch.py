@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_output(parser, "folder that gets a folder for each case, the table and the page")
     common.add_fields(parser.add_argument_group("what is made of each case"), BatchSettings, "make")
     common.add_fields(parser.add_argument_group("how it runs"), BatchSettings, "run")
-    common.add_fields(parser.add_argument_group("cases that are there"), BatchSettings, "again")
+    common.add_fields(parser.add_argument_group("existing cases"), BatchSettings, "again")
     add_mesh_options(parser, without=("path",))
 
 

@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             *(f"  {name:<{width}}  {text}" for name, text in STEPS.items()),
             "",
             "Points are in patient millimetres, by default in the DICOM frame (LPS: left, posterior, superior).",
-            "All files appear as a whole at the end or not at all, and older files of these names stay until then.",
+            "All files appear at the end, completely or not at all; until then older files of these names are kept.",
             "",
             _EXAMPLES,
         )
@@ -47,15 +47,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     steps = parser.add_argument_group("steps")
     common.add_fields(steps, CloudSettings, "steps")
     steps.add_argument(
-        "--surface", metavar="FILE", help="write a closed mesh around the points too, which need normals for it"
+        "--surface", metavar="FILE", help="also write a closed mesh around the points, which need normals for it"
     )
     common.add_device(parser.add_argument_group("device"))
     checks = parser.add_argument_group("files and checks")
     checks.add_argument(
         "--removed",
         metavar="FILE",
-        help="write the points before any of them went, each with the number of the reason why it went as label (0:"
-        " kept)",
+        help="also write all points as they were before any removal; the label is the reason why a point was removed"
+        " (0: kept)",
     )
     common.add_fields(checks, CloudSettings, "checks")
     common.add_no_clobber(checks)

@@ -285,7 +285,7 @@ def add_no_clobber(container: argparse._ActionsContainer, *, with_ids: bool = Tr
     container.add_argument(
         "--no-clobber",
         action="store_true",
-        help="replace nothing: what exists of the files and folders to be written is an error, before any work",
+        help="replace nothing: stop before any work if a file or folder to be written exists already",
     )
     if with_ids:
         add_fields(container, ScanSettings, "ids")
@@ -299,8 +299,8 @@ def add_device(container: argparse._ActionsContainer, *, computes: bool = True, 
             "--timeout",
             type=_parse_seconds,
             metavar="SECONDS",
-            help="give up (exit code 5) when the device has finished nothing for so long: a kernel has hung"
-            f" (default: {DEFAULT_SECONDS:g}; 0: never)",
+            help="stop with exit code 5 if the device finishes nothing for this long, as when a kernel hangs"
+            f" (default: {DEFAULT_SECONDS:g}; 0 disables the timeout)",
         )
     if memory:
         add_fields(container, DeviceSettings, "memory")
@@ -329,8 +329,8 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
 
 
 _CROP = """\
-Whole voxels outside of the box are left out, after --remove-table and --fov and before --region.
-Surfaces end there as at the ends of a scan. Of several boxes, what is in all of them stays."""
+Whole voxels outside the box are left out, after --remove-table and --fov and before --region.
+Surfaces end there as at the ends of a scan. Several boxes are intersected."""
 
 
 def add_masking(parser: argparse.ArgumentParser, *, crop: bool = False) -> None:

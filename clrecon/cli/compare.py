@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "Each method runs in a process of its own, one after another: first, then warm. OUT/index.html is one page",
             "without script or network, OUT/report.json has its numbers, and the pictures lie beside it as PNG. A"
             " method",
-            "that declines the scan, or whose library is not installed, is a row that says so. Exit code 8: one that",
+            "that declines the scan, or whose library is not installed, has a row that says so. Exit code 8: one that",
             "--methods names did not run, or one failed. The folder appears as a whole or not at all; that of an",
             "earlier comparison is replaced. No name, ID or path of the scan is in it.",
             "How far two meshes lie apart is what clrecon distance measures.",

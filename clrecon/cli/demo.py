@@ -13,7 +13,7 @@ from clrecon.cli.mesh import describe_mesh
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Writes a synthetic CT series of a spine to OUT/ct, a picture of it to OUT/bone.png, its bone surface to\n"
-        "OUT/bone.stl and the report to OUT/report.json, and holds a sphere of known size against its mesh.\n"
+        "OUT/bone.stl and the report to OUT/report.json, and compares a sphere of known size with its mesh.\n"
         "A second run replaces the first."
     )
     parser.add_argument("output", metavar="OUT", nargs="?", help="folder (default: clrecon-demo)")

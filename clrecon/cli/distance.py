@@ -12,8 +12,8 @@ from clrecon.jobs.settings import DistanceSettings
 from clrecon.system.text import format_volume
 
 _EPILOG = """\
-From points that cover each mesh evenly by area to the nearest triangle of the other, in mm. Where the other
-mesh is closed, distances have a sign: + is outside of it. See docs/distance.md. To compare methods on a scan,
+Distances are measured from points spread evenly over each mesh to the nearest triangle of the other, in mm. If
+the other mesh is closed, distances have a sign: + is outside of it. See docs/distance.md. To compare methods on a scan,
 use clrecon compare.
 
 examples:
@@ -26,12 +26,12 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("mesh", metavar="A", help=f"mesh: {', '.join(MESH_INPUTS)}")
-    parser.add_argument("reference", metavar="B", help="mesh that it is measured against; with --surface a scan")
+    parser.add_argument("reference", metavar="B", help="mesh to compare with; with --surface a scan")
     common.add_fields(parser, DistanceSettings)
     common.add_fields(parser.add_argument_group("scan"), DistanceSettings, "scan")
     output = parser.add_argument_group("files")
     common.add_output(output, "write A coloured by its distance from B: .ply", metavar="PLY", required=False)
-    common.add_picture(output, "picture of it with its scale: .png, .jpg or .tif")
+    common.add_picture(output, "draw the coloured mesh with its scale: .png, .jpg or .tif")
     common.add_fields(output, DistanceSettings, "picture")
     common.add_report(output, "all figures")
     common.add_no_clobber(output)

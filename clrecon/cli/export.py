@@ -13,7 +13,7 @@ from clrecon.jobs.settings import ExportSettings
 _PARTS = ("read", "mask", "resample", "write")
 _EPILOG = """\
 Values are HU, as they were measured: int16 where they fit,
-else int32, and float32 for fractions. Each voxel lies where
+otherwise int32, and float32 for fractions. Each voxel lies where
 the scan has it: NIfTI in RAS mm, NRRD and MetaImage in LPS
 mm, as these formats have it. Uneven slices fit into no such
 file and are refused without --resample; so is gantry tilt

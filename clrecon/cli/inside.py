@@ -17,9 +17,9 @@ _EPILOG = """\
 parts, each a mesh of its own:
   solid       all bone: the label, or what is at --hu and above in it, or within the surface fitted to the cortex
               (--surface cortex); closed and filled, without the canal
-  dense       what of it lies in the band --dense: no measure of cortex, which looks thicker than it is
+  dense       its voxels in the band --dense; not a measure of the cortex, which looks thicker than it is
   trabecular  the rest of the solid bone
-  canal       the hole of the arch, at the height of the pedicles; left out, with a warning, where no arch is closed
+  canal       the hole of the arch, at the height of the pedicles; left out, with a warning, if no arch is closed
 
 The files are named by their parts: inside_solid.stl, inside_dense.stl; of several vertebrae inside_L3_solid.stl.
 

@@ -30,25 +30,25 @@ class _Command(NamedTuple):
 
 
 COMMANDS = {
-    "mesh": _Command("clrecon.cli.mesh", "make a mesh from a CT series: the main job"),
+    "mesh": _Command("clrecon.cli.mesh", "make a mesh from a CT series"),
     "cloud": _Command("clrecon.cli.cloud", "make a cloud of points from a CT series, or clean one"),
-    "inside": _Command("clrecon.cli.inside", "take vertebrae apart: dense and trabecular bone, canal, volumes"),
-    "render": _Command("clrecon.cli.render", "make pictures of a CT series, still or moving"),
-    "view": _Command("clrecon.cli.view", "look at a CT series or meshes: a page that turns, clips and measures"),
+    "inside": _Command("clrecon.cli.inside", "measure dense and trabecular bone and canal of vertebrae, as meshes"),
+    "render": _Command("clrecon.cli.render", "make pictures and animations of a CT series"),
+    "view": _Command("clrecon.cli.view", "view a CT series or meshes in the browser: turn, clip, measure"),
     "export": _Command("clrecon.cli.export", "write the volume of a CT series as NIfTI, NRRD or MetaImage"),
     "vertebrae": _Command("clrecon.cli.vertebrae", "make a first guess of a label map of the vertebrae"),
     "corridor": _Command("clrecon.cli.corridor", "find the widest straight line through each pedicle of a vertebra"),
-    "stats": _Command("clrecon.cli.stats", "measure each label of a label map: ml, and HU with percentiles"),
-    "distance": _Command("clrecon.cli.distance", "measure how far two meshes lie apart, in mm and in colours"),
-    "batch": _Command("clrecon.cli.batch", "make the meshes of many scans, with a table and a page of all"),
+    "stats": _Command("clrecon.cli.stats", "measure volume and HU of each label of a label map"),
+    "distance": _Command("clrecon.cli.distance", "measure the distance between two meshes, in mm and as colours"),
+    "batch": _Command("clrecon.cli.batch", "make the meshes of many scans, with a table and a page"),
     "info": _Command("clrecon.cli.info", "show which series a folder holds and whether they can be used"),
     "devices": _Command("clrecon.cli.devices", "show the OpenCL devices and which one would be used"),
     "phantom": _Command("clrecon.cli.phantom", "write a synthetic CT series with a known surface"),
-    "selftest": _Command("clrecon.cli.selftest", "check that a device computes rightly"),
+    "selftest": _Command("clrecon.cli.selftest", "check that a device computes correctly"),
     "bench": _Command("clrecon.cli.bench", "time every stage on this computer, beside VTK's flying edges"),
-    "compare": _Command("clrecon.cli.compare", "compare methods of surfaces and clouds on your own scan, as a page"),
-    "demo": _Command("clrecon.cli.demo", "phantom, mesh, picture and report in one go: what clrecon does, in seconds"),
-    "completion": _Command("clrecon.cli.completion", "print a script by which a shell completes clrecon's words"),
+    "compare": _Command("clrecon.cli.compare", "compare methods of surfaces and clouds on your own scan"),
+    "demo": _Command("clrecon.cli.demo", "make a phantom, its mesh, a picture and a report, in seconds"),
+    "completion": _Command("clrecon.cli.completion", "print a script for completion in the shell"),
 }
 
 HELP = "help"

@@ -36,9 +36,9 @@ def _epilog() -> str:
             *lines,
             "",
             "The mesh is in patient millimetres, by default in the DICOM frame (LPS: left, posterior, superior).",
-            "It is written as a whole or not at all, and an older file of that name stays until then.",
-            "Several meshes get names of their own: bone_200hu.stl, bone_001.stl, bone_200hu_001.stl.",
-            "Area, volume and components cost time and are measured with --report, --json or -v only.",
+            "It is written completely or not at all; until it is complete, an older file of that name is kept.",
+            "Several meshes get different names: bone_200hu.stl, bone_001.stl, bone_200hu_001.stl.",
+            "Area, volume and components take time: they are measured only with --report, --json or -v.",
             "",
             "examples:",
             "  clrecon mesh CT_FOLDER -o bone.stl",
@@ -70,7 +70,7 @@ def add_mesh_options(parser: argparse.ArgumentParser, without: Container[str] = 
     common.add_reading(parser)
     common.add_masking(parser, crop=True)
     common.add_fields(add_levels(parser, "surface"), MeshSettings, "kind", "surface")
-    method = parser.add_argument_group("method", "marching cubes as papers compare them: see docs/methods.md")
+    method = parser.add_argument_group("method", "variants of marching cubes that papers compare: see docs/methods.md")
     common.add_fields(method, MeshSettings, "method")
     common.add_fields(parser.add_argument_group("components"), MeshSettings, "selection", "files")
     add_labels(parser, without)
@@ -91,7 +91,7 @@ def add_levels(parser: argparse.ArgumentParser, title: str) -> argparse._Argumen
 
 
 def add_labels(parser: argparse.ArgumentParser, without: Container[str] = ()) -> None:
-    about = "one mesh a label: the label picks the cells, HU place the vertices"
+    about = "one mesh for each label: the label chooses the cells, HU place the vertices"
     common.add_fields(parser.add_argument_group("labels", about), LabelChoice, without=without)
 
 

@@ -98,7 +98,7 @@ class Looks:
 
     mode: str | None = option(
         "--mode M",
-        f"one of: {', '.join(describe_modes())} (default: what the other options ask)",
+        f"one of: {', '.join(describe_modes())} (default: as the other options require)",
         parse=str.lower,
         first=True,
         words=describe_modes(),
@@ -116,35 +116,35 @@ class Looks:
     color: str | None = option(
         "--color C",
         "colour of a surface or of points, such as orange or #ff8000 (default: bone); of points also"
-        f" {', '.join(POINT_COLORS)} (default: label, else hu, where points have them); of a mesh with numbers at its"
+        f" {', '.join(POINT_COLORS)} (default: label, otherwise hu, if points have them); of a mesh with numbers at its"
         f" vertices {', '.join(MESH_COLORS)}, with a scale in mm",
         words=(*COLORS, *MESH_COLORS),
     )
-    radius_mm: float | None = option("--point-radius MM", "of points, which are discs (default: their mean spacing)")
-    opacity: float | None = option("--opacity SHARE", "of the mesh in mode mesh (default: 1)")
+    radius_mm: float | None = option("--point-radius MM", "radius of points (default: their mean spacing)")
+    opacity: float | None = option("--opacity SHARE", "opacity of the mesh in mode mesh (default: 1)")
     flat: bool = option("--flat", "light each triangle of a mesh by its own normal")
     window: str | Sequence[float] | None = option(
         "--window LOW,HIGH|NAME",
-        f"HU that are black and white, of modes that show HU, or one of {', '.join(WINDOWS)}; mm of water in mode drr",
+        f"HU shown as black and white, in modes that show HU, or one of {', '.join(WINDOWS)}; mm of water in mode drr",
         parse=_parse_window,
         first=True,
     )
-    keep_air: bool = option("--keep-air", "of mode minip: count what lies outside of the body and of masks too")
-    ray_step: float | None = option("--ray-step MM", "mm between samples (default: half the smallest spacing)")
+    keep_air: bool = option("--keep-air", "in mode minip: include the air outside the body and outside masks")
+    ray_step: float | None = option("--ray-step MM", "step along rays (default: half the smallest spacing)")
     light: str | Sequence[float] | None = option(
         "--light L",
-        "head: a light at the camera; a side of the patient, or X,Y,Z in LPS: a light that stays where it is; none:"
-        " colours as they are (default: what the preset says)",
+        "head: a headlight; a side of the patient, or X,Y,Z in LPS: a light from this fixed direction; none: no shading"
+        " (default: that of the preset)",
         parse=parse_direction,
     )
     depth_cue: float | None = option(
         "--depth-cue SHARE", "share of its brightness that a surface loses from its nearest to its farthest point"
     )
-    shadows: bool = option("--shadows", "shadows on a surface; wants a light beside the camera")
-    jitter: bool = option("--jitter", "begin each ray at a place of its own: grain in place of rings")
+    shadows: bool = option("--shadows", "draw shadows on a surface; needs a light away from the camera")
+    jitter: bool = option("--jitter", "start each ray at an offset of its own: grain instead of rings")
     clip_planes: Sequence[Sequence[float]] = option(
         "--clip PX,PY,PZ,NX,NY,NZ",
-        "keep the side of a plane through a point that a normal points to; may be given again",
+        "keep the side of a plane to which its normal points; may be given again",
         group="clipping",
         default=(),
         parse=numbers_reader(
@@ -152,34 +152,34 @@ class Looks:
         ),
         action="append",
     )
-    thickness: float | None = _slices_option("--thickness MM", "of a thick slice (default: 0, a plane)")
+    thickness: float | None = _slices_option("--thickness MM", "thickness of a slice (default: 0, a plane)")
     combine: str | None = _slices_option(
         "--combine HOW",
-        "mean, max or min of a thick slice (default: mean)",
+        "show the mean, max or min of a thick slice (default: mean)",
         parse=str.lower,
         words=("mean", "max", "min"),
     )
-    offset_mm: float | None = _slices_option("--offset MM", "move the slice away from the camera by so much")
+    offset_mm: float | None = _slices_option("--offset MM", "move the slice away from the camera by this distance")
     slices: int | Sequence[int] | None = _slices_option(
         "--slices N|K,K,...",
-        "of mode slices and of a sheet: every N-th, or with a comma those numbers, from 0 (default: about twelve)",
+        "in mode slices and on a sheet: every N-th slice, or slices by number from 0 (default: about twelve)",
         parse=_parse_slices,
     )
     sheet: int | str | None = _slices_option(
         "--sheet N|MMmm",
-        f"contact sheet of mode slice: N slices side by side (default: {SHEET_SLICES}), or one every so many mm, such"
-        " as 5mm; --view says in which plane, --slices which planes of voxels",
+        f"draw a contact sheet of N slices (default: {SHEET_SLICES}), or of one slice every so many mm, such as 5mm;"
+        " --view chooses the plane, --slices the planes of voxels",
         nargs="?",
         const=SHEET_SLICES,
     )
-    slice_opacity: float | None = _slices_option("--slice-opacity SHARE", "of each slice of mode slices (default: 0.5)")
+    slice_opacity: float | None = _slices_option("--slice-opacity SHARE", "opacity in mode slices (default: 0.5)")
     curve: str | None = _slices_option(
         "--curve FILE|auto",
         "centre line: a text, CSV or JSON file of points in LPS mm, or markups of 3D Slicer; auto: the spinal canal,"
         " found in the scan",
     )
     cpr: str | None = _slices_option(
-        "--cpr KIND", "straightened or stretched (default: straightened)", parse=str.lower, words=CURVED_KINDS
+        "--cpr KIND", "kind of curved slice: straightened (default) or stretched", parse=str.lower, words=CURVED_KINDS
     )
 
 
@@ -192,8 +192,8 @@ def add_meshes(parser: argparse.ArgumentParser) -> None:
         metavar="FILE[=COLOUR[,OPACITY]]",
         action="append",
         default=[],
-        help=f"show a mesh too ({', '.join(MESH_INPUTS)}), in modes dvr, surface, slices, points and mesh; may be given"
-        " again",
+        help=f"also show a mesh ({', '.join(MESH_INPUTS)}), in modes dvr, surface, slices, points and mesh; may be"
+        " given again",
     )
     common.add_fields(group, RenderSettings, "meshes")
 
@@ -209,7 +209,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "presets:",
             *(f"  {name:<{width}}  {text}" for name, text in presets.items()),
             "",
-            "The patient's left is at the right of an anterior view. Every file is written as a whole or not at all.",
+            "The patient's left is at the right of an anterior view. Every file is written completely or not at all.",
             "",
             _EXAMPLES,
         )
@@ -233,7 +233,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--turntable",
         metavar="OUT",
-        help="turn round the patient: .mp4, .gif, .apng, or a folder of PNG files",
+        help="write an animation that turns around the patient: .mp4, .gif, .apng, or a folder of PNG files",
         first=True,
     )
     common.add_fields(group, Turntable)

@@ -11,7 +11,7 @@ from clrecon.errors import DeviceError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Runs every kernel on small volumes and compares with plain numpy. Exit code 5 when one differs."
+    parser.epilog = "Compares every kernel with its reference implementation. Exit code 5 if one differs."
     common.add_device(parser, memory=False)
 
 

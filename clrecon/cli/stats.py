@@ -14,8 +14,8 @@ from clrecon.cli.mesh import describe_volume
 from clrecon.jobs.settings import StatsSettings
 
 _EPILOG = """\
-Each voxel counts with its own volume: slices that lie unevenly are right. A label map on another grid is brought to
-the scan's, voxel by voxel the nearest label in mm. Only --surface needs an OpenCL device. See docs/statistics.md.
+Each voxel counts with its own volume, also in unevenly spaced slices. A label map on another grid is resampled to the
+grid of the scan: each voxel gets the nearest label. Only --surface needs an OpenCL device. See docs/statistics.md.
 
 examples:
   clrecon stats CT_FOLDER --labels spine.nii.gz
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_fields(surface, StatsSettings, "surface")
     common.add_device(surface)
     output = parser.add_argument_group("files")
-    output.add_argument("--csv", metavar="FILE", help="write the figures as a table, one line a label", first=True)
+    output.add_argument("--csv", metavar="FILE", help="write the figures as a table, a line for each label", first=True)
     common.add_report(output, "figures, certificate of the scan and warnings")
     common.add_no_clobber(output)
     common.add_reading(parser)

@@ -40,24 +40,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "inputs",
         metavar="INPUT",
         nargs="+",
-        help="mesh file (.stl, .ply), or a scan: DICOM folder or file, NIfTI, NRRD or MetaImage file",
+        help="file of a mesh or cloud, or a scan: DICOM folder or file, NIfTI, NRRD or MetaImage file",
     )
     shown = parser.add_argument_group("what is shown")
     shown.add_argument("--html", metavar="FILE", help="write a page that shows the inputs: .html", first=True)
     shown.add_argument(
-        "--window", action="store_true", help="open a plain window of PyVista in place of the browser", first=True
+        "--window", action="store_true", help="open a plain window of PyVista instead of the browser", first=True
     )
     shown.add_argument(
         "--no-open", dest="opens", action="store_false", help="only print the address, do not open the browser"
     )
-    shown.add_argument("--port", type=int, metavar="N", help="of the view, on 127.0.0.1 (default: a free one)")
+    shown.add_argument("--port", type=int, metavar="N", help="port on 127.0.0.1 (default: a free one)")
     shown.add_argument(
         "--save-as",
         action="append",
         default=[],
         metavar="FILE",
-        help="what the key s writes into the current folder: a mesh, cloud, volume or picture by its extension;"
-        " numbered where it exists; repeat it for several (default: a download)",
+        help="file that the key s writes into the current folder: a mesh, cloud, volume or picture by its extension;"
+        " numbered if it exists; may be given again (default: a download)",
         first=True,
     )
     common.add_fields(shown, ViewSettings)

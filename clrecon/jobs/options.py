@@ -119,15 +119,15 @@ class DeviceSettings:
     device: str | None = option(
         "--device D",
         'OpenCL device: an index of "clrecon devices", "cpu", "gpu" or a part of its name'
-        " (default: CLRECON_DEVICE, else the best)",
+        " (default: CLRECON_DEVICE, otherwise the best)",
         group="device",
         first=True,
         words=("cpu", "gpu"),
     )
     memory: int | None = option(
         "--memory SIZE",
-        "memory that may be taken on the device, such as 500MB or 2GiB (default: all of it);"
-        " what does not fit goes through in slabs, with the same result",
+        "limit the memory that is used on the device, such as 500MB or 2GiB (default: all of it);"
+        " what does not fit is processed in slabs, with the same result",
         group="memory",
         parse=parse_bytes,
     )
@@ -143,8 +143,8 @@ class ScanSettings(Selection):
 
     keep_ids: bool = option(
         "--keep-ids",
-        "write hashes of the UIDs of series and frame of reference into what is written and printed, by which outputs"
-        " of one scan are told; never the UIDs",
+        "write hashes of the UIDs of series and frame of reference, which identify outputs of the same scan; never"
+        " the UIDs",
         group="ids",
     )
 
@@ -164,7 +164,7 @@ def label_map_option(**how: Any) -> Any:
     )
 
 
-def label_option(text: str = "this label only; may be given again", **how: Any) -> Any:
+def label_option(text: str = "use only this label; may be given again", **how: Any) -> Any:
     """Declare a field for chosen labels of a map, with ``action=None`` for one."""
     return option("--label NAME|N", text, **{"action": "append"} | how)
 
@@ -189,7 +189,7 @@ def strict_option(text: str, **how: Any) -> Any:
 
 
 def grow_option(when: str = "", **how: Any) -> Any:
-    text = f"{when}dense voxels this near to a label are its own (default: one voxel each way)"
+    text = f"{when}add dense voxels within this distance of a label to it (default: one voxel each way)"
     return option("--grow MM", text, **how)
 
 
@@ -212,8 +212,8 @@ def surface_option(of_hu: str, more: str = "", **how: Any) -> Any:
     words = ("hu", "cortex", *(more.split(":")[:1] if more else ()))
     return option(
         f"--surface {'|'.join(words)}",
-        f"hu: {of_hu}; cortex: each vertex is moved onto the bone, whose place is read from the whole profile of HU"
-        f" across its wall (docs/iso_value.md){f'; {more}' if more else ''}",
+        f"hu: {of_hu}; cortex: each vertex is moved onto the bone surface, found from the HU profile across the wall"
+        f" (docs/iso_value.md){f'; {more}' if more else ''}",
         parse=str.lower,
         words=words,
         **how,
@@ -239,7 +239,7 @@ def mesh_space_option(text: str, group: str = "") -> Any:
 
 
 def label_color_option(text: str) -> Any:
-    text = f"colour of a label{text}; may be given again"
+    text = f"set the colour of a label{text}; may be given again"
     return option("--label-color LABEL=COLOUR", text, default=(), parse=parse_label_color, action="append")
 
 
@@ -253,24 +253,24 @@ class InputSettings(ScanSettings, DeviceSettings):
     """
 
     remove_table: bool = _masking_option(
-        "--remove-table", "turn what is not the patient's body into air first: table, blankets, cables", first=True
+        "--remove-table", "set everything outside the patient's body to air first: table, blankets, cables", first=True
     )
     allow_bone_loss: bool = _masking_option(
         "--allow-bone-loss",
-        "go on where --remove-table takes more than 2 %% of the bone, or a step of --preprocess more than half of"
-        " what is at the level and above, which else is refused",
+        "continue if --remove-table removes more than 2 %% of the bone, or a step of --preprocess more than half of"
+        " what is at the level and above; otherwise both are refused",
     )
     field_of_view: float | str | None = _masking_option(
         "--fov RADIUS_MM",
-        "turn what lies further from the centre of the slices into air first (without a number: the largest circle"
-        " that fits the slice)",
+        "set everything farther from the centre of the slices to air first (without a number: outside the largest"
+        " circle that fits the slice)",
         parse=_parse_radius,
         nargs="?",
         const="auto",
     )
     clip_box: Sequence[float] | None = _crop_option(
         "--clip-box X0,X1,Y0,Y1,Z0,Z1",
-        "keep a box; a side that is left empty is open",
+        "keep a box; an empty side is open",
         parse=numbers_reader(
             6, "is no box: X0,X1,Y0,Y1,Z0,Z1 in mm, a side that stays open empty, such as ,,-50,20,,", ends=True
         ),
@@ -284,20 +284,20 @@ class InputSettings(ScanSettings, DeviceSettings):
     )
     around: Sequence[float] | None = _crop_option(
         "--around X,Y,Z,R",
-        "keep a cube: R mm from a point to each side",
+        "keep a cube that extends R mm from a point to each side",
         parse=numbers_reader(4, "is no point and length: X,Y,Z,R in mm, such as 10,-124,-424,30"),
     )
     region: Sequence[str] | None = _masking_option(
         "--region RULE",
-        f"turn what lies outside of the region of interest into air first: {REGION_FORMS}; several of one kind add"
-        " up, of different kinds cut each other; a seed grows within the others; a tube without a file goes along the"
-        " spinal canal",
+        f"set everything outside the region of interest to air first: {REGION_FORMS}; rules of one kind are united,"
+        " of different kinds intersected; a seed grows within the others; a tube without a file follows the spinal"
+        " canal",
         action="append",
     )
     preprocess: str | Sequence[str] | None = _masking_option(
         "--preprocess STEP[,STEP...]",
-        f"steps before the surface, in this order: {PREPROCESS_FORMS}; morphology works on what is at the iso"
-        " value and above, or at level:HU; region is the place of --region, which else comes first",
+        f"run these steps before the surface, in the given order: {PREPROCESS_FORMS}; morphology works on voxels at the"
+        " iso value and above, or at level:HU; region is the place of --region, which otherwise runs first",
     )
 
     def __post_init__(self) -> None:

@@ -72,13 +72,13 @@ PURPOSES: dict[str, Purpose] = {
         Purpose(
             "print",
             {"keep": "bone", "keep_largest": 1, "solid": True, "smooth": 20, "decimate": 0.9, "strict": True},
-            "one closed piece, of solid bone at iso values of bone; size and thickness of walls are said",
+            "one closed piece, of solid bone at iso values of bone; size and wall thickness are reported",
             is_for_print=True,
         ),
         Purpose(
             "paper-b",
             {"preprocess": "bilateral-2d,open:1", "method": "i-mc", "vertex_rule": "golden"},
-            "improved marching cubes as Liu et al. 2019 have it; the vertex rule linear is more exact",
+            "improved marching cubes as in Liu et al. 2019; the vertex rule linear is more accurate",
         ),
     )
 }

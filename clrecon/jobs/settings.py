@@ -47,10 +47,10 @@ class InfoSettings(Selection):
 
     pixels: bool = option(
         "--pixels",
-        "read the pixels of the series marked * too: share of padding, range of HU, saturated metal",
+        "also read the pixels of the series marked *: share of padding, range of HU, saturated metal",
         first=True,
     )
-    strict: bool = options.strict_option("4 when it fails a gate, see docs/certificate.md", first=True)
+    strict: bool = options.strict_option("4 if the series fails a gate, see docs/certificate.md", first=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +62,7 @@ class ExportSettings(options.InputSettings):
         "resample (trilinear) to a regular grid with this step along all axes; without it voxels stay as they are",
         first=True,
     )
-    space: Space = options.space_option("patient frame of the numbers of crop and region; the file's is its format's")
+    space: Space = options.space_option("patient frame of crop and region; that of the file follows from its format")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -117,14 +117,14 @@ class DistanceSettings(options.ScanSettings, options.DeviceSettings):
     mesh_space: Space | None = options.mesh_space_option("files that do not name theirs")
     samples: int | None = option("--samples N", "points on each mesh, evenly by area (default: 50000)")
     surface: SurfaceKind | None = options.surface_option(
-        "B is a scan, and measured against is the surface of its bone at the level", group="scan", first=True
+        "B is a scan: compare with its bone surface at the level", group="scan", first=True
     )
     iso_value: float | None = options.hu_option(
         f"level of that surface (default: that of bone, {FITTED_FROM_HU:g})", group="scan"
     )
     range_mm: float | None = option(
         "--range MM",
-        "distance at which the colours end (default: 1, 2 or 5 x 10^n mm that hold 95 %% of the distances)",
+        "distance at which the colours end (default: 1, 2 or 5 x 10^n mm that cover 95 %% of the distances)",
         group="picture",
         first=True,
     )
@@ -179,8 +179,8 @@ class InsideSettings(options.ScanSettings, options.DeviceSettings):
         words=("anterior", "posterior", "left", "right", "superior", "inferior"),
     )
     iso_value: float | None = options.hu_option(
-        "level of the solid bone, within one voxel of the label (default: the label's own voxels; of the cortex"
-        f" {FITTED_FROM_HU:g})",
+        "level of the solid bone, within one voxel of the label (default: the label's own voxels; with --surface"
+        f" cortex {FITTED_FROM_HU:g})",
         group="parts",
         first=True,
     )
@@ -190,7 +190,7 @@ class InsideSettings(options.ScanSettings, options.DeviceSettings):
     dense: Sequence[float | None] | None = _parts_option(
         "--dense A[:B]", "HU of dense bone, from A on or from A to B (default: 450)", parse=_parse_band
     )
-    close_mm: float | None = _parts_option("--close MM", "pores that close by balls (default: 1.5)")
+    close_mm: float | None = _parts_option("--close MM", "close pores by balls of this radius (default: 1.5)")
     grow_mm: float | None = options.grow_option("with --hu: ", group="parts")
     space: Space = options.space_option("patient frame of the meshes", group="parts")
 
@@ -224,10 +224,10 @@ class VertebraeSettings(options.ScanSettings):
     """Settings of the search for vertebrae; see `clrecon.split_vertebrae`."""
 
     level: float | None = options.hu_option(
-        "bone is N HU and more (default: half way between discs and marrow, 120 to 226)", group="vertebrae", first=True
+        "level of bone in HU (default: half way between discs and marrow, 120 to 226)", group="vertebrae", first=True
     )
     seeds: Sequence[Sequence[float]] = options.seeds_option(
-        "a point in the body of a vertebra, LPS mm; one for each vertebra, in place of the search for discs",
+        "a point in the body of a vertebra, LPS mm; one for each vertebra, instead of the search for discs",
         group="vertebrae",
         first=True,
     )
@@ -280,18 +280,15 @@ class CorridorSettings(options.ScanSettings, options.DeviceSettings):
         "a vertebra of the map; may be given again", default=(), first=True
     )
     iso_value: float | None = options.hu_option(
-        "HU at which the bone's surface lies (default: auto, half way between bone and the tissue beside it; of the"
-        f" cortex {FITTED_FROM_HU:g})",
+        "level of the bone surface in HU (default: auto, half way between bone and the tissue beside it; with"
+        f" --surface cortex {FITTED_FROM_HU:g})",
         "auto|N",
         parse=_parse_level,
         first=True,
     )
     surface: SurfaceKind = options.surface_option("the surface lies at the level (default)", default="hu", first=True)
     margin: float = option(
-        "--margin MM",
-        "distance that a screw of the largest diameter keeps from the surface (default: 1)",
-        default=1.0,
-        first=True,
+        "--margin MM", "distance between the largest screw and the bone surface (default: 1)", default=1.0, first=True
     )
     screws: tuple[Any, ...] = ()
     space: Space = options.space_option("patient frame of points and meshes", group="space")

@@ -81,5 +81,5 @@ def test_words_with_hyphens_stay_whole_and_prose_has_one_margin(narrow, capsys):
         assert not [line for line in lines if line.rstrip().endswith(("bilateral-", "soft-", "non-"))]
     assert main(["inside", "--help-all"]) == 0
     lines = capsys.readouterr().out.split("\n")
-    at = lines.index("take vertebrae apart: dense and trabecular bone, canal,")
-    assert lines[at + 1] == "volumes"
+    at = lines.index("measure dense and trabecular bone and canal of vertebrae, as")
+    assert lines[at + 1] == "meshes"

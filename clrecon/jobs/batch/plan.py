@@ -51,26 +51,26 @@ class BatchSettings:
     )
     picture: bool = option("--no-picture", "leave out the picture of each case", group="make", default=True)
     workers: int | None = option(
-        "--workers N", "processes that make cases side by side (default: one for each device)", group="run", first=True
+        "--workers N", "processes that run cases in parallel (default: one for each device)", group="run", first=True
     )
     devices: str | None = option(
         "--devices D,D",
-        "OpenCL devices by their indexes, to which the workers are dealt in turn (default: that of --device)",
+        "OpenCL devices by index, assigned to the workers in turn (default: that of --device)",
         group="run",
     )
     part: tuple[int, int] | None = option(
         "--part I/N",
-        "make each N-th case alone, from the I-th on, 1/N to N/N; the table and the page are for --collect then",
+        "make only every N-th case, from the I-th on, 1/N to N/N; write the table and the page with --collect",
         group="run",
         parse=_parse_part,
     )
     resume: bool = option(
-        "--resume", "leave out cases that are there, made of the same files with the same settings", group="again",
+        "--resume", "skip cases that exist already, made from the same files with the same settings", group="again",
         first=True,
     )  # fmt: skip
-    retry: bool = option("--retry", "make again those cases alone that are not done", group="again", first=True)
+    retry: bool = option("--retry", "repeat only the cases that are not done", group="again", first=True)
     collect: bool = option(
-        "--collect", "make nothing: write the table and the page of the cases that are there", group="again", first=True
+        "--collect", "make no case: write the table and the page of the existing cases", group="again", first=True
     )
 
     def __post_init__(self) -> None:

@@ -22,17 +22,17 @@ _GHOSTS = ("keep", "drop")
 
 STEPS = {
     "read": "the scan, or a cloud from a file",
-    "ghost slices": "foreign slices inside the stack are told by their neighbours; with drop the points in them go",
-    "masks": "the field of view, the body and the region: what is outside becomes air; a crop takes it away",
-    "preprocessing": "filters of HU, and morphology of what is in the band",
+    "ghost slices": "slices inside the stack that are unlike both neighbours are found; drop removes their points",
+    "masks": "the field of view, the body and the region: everything outside is set to air; a crop removes it",
+    "preprocessing": "filters of HU, and morphology of the voxels in the band",
     "points": "the surface, the shell or the voxels of the HU band or the label",
-    "clusters": "density clusters (DBSCAN), each point with the number of its own",
-    "keep": "noise and the clusters that the rules do not keep go",
-    "sparse cells": "points alone in a cell of a grid go, and what growth from denser cells does not reach",
-    "outliers": "points whose neighbours are far go",
-    "bilateral": "points move along their normals to the weighted mean height of their neighbours, edges stay",
+    "clusters": "density clusters (DBSCAN); each point gets the number of its cluster",
+    "keep": "noise and the clusters that no rule keeps are removed",
+    "sparse cells": "points alone in a cell of a grid are removed, and cells that denser cells do not reach by growth",
+    "outliers": "points far from their neighbours are removed",
+    "bilateral": "points move along their normals to the weighted mean height of their neighbours; edges are preserved",
     "normals": "unit vectors that point out of bone",
-    "spacing": "one point for each cell of that size stays",
+    "spacing": "one point is kept for each cell of that size",
     "surface": "a closed mesh around the points, in a file of its own",
 }
 """The steps in the order in which they run, whatever the order of the options."""
@@ -105,35 +105,35 @@ class CloudSettings(InputSettings):
     )
     points: PointKind | None = _points_option(
         f"--points {'|'.join(POINT_KINDS)}",
-        "surface: where the HU cross the iso value, between the voxels; cortex: each of these moved onto the bone"
-        " (docs/iso_value.md); voxels: the centres of those within; shell: of"
-        " these the outer ones (default: surface, with a band voxels)",
+        "surface: where the HU cross the iso value, between the voxels; cortex: these, moved onto the bone surface"
+        " (docs/iso_value.md); voxels: the centres of the voxels inside; shell: only the outer ones of these"
+        " (default: surface; with a band: voxels)",
         parse=str.lower,
         first=True,
     )
     hu: float | Sequence[float] | None = hu_option(
-        "iso value, inside is N and above; or a band, both ends included (default: that of bone)",
+        "iso value, inside is N and above; or a band, both ends included (default: the preset bone)",
         "N|LO,HI",
         group="points",
         parse=_parse_level,
         first=True,
     )
     labels: str | Path | None = label_map_option(group="points")
-    label: str | None = label_option("points of this label only (default: of all)", group="points", action=None)
+    label: str | None = label_option("use only the points of this label (default: all)", group="points", action=None)
     paper: bool = _points_option(
-        "--paper", "place and filter voxels as the papers print it, and say by how much that is wrong"
+        "--paper", "place and filter voxels as the papers print it, and report the resulting error"
     )
     ghost_slices: str = _steps_option(
         f"--ghost-slices {'|'.join(_GHOSTS)}",
-        "slices inside the stack that are unlike both neighbours, as screen captures and localizers are: drop takes"
-        f" their points away, keep warns of them (default: {_GHOSTS[0]})",
+        "what to do with slices that are unlike both neighbours, such as screen captures and localizers: drop removes"
+        f" their points, keep only warns (default: {_GHOSTS[0]})",
         default=_GHOSTS[0],
         parse=str.lower,
     )
     clusters: Clustering | None = _steps_option(
         "--cluster eps=MM,min=N",
-        "density clusters (DBSCAN) without noise: neighbours are within eps, and a core point has min of them, itself"
-        " included; min=plane+1 makes noise of lone slices (default: 1.5 times the largest voxel step, 6)",
+        "find density clusters (DBSCAN) and remove noise: neighbours are within eps, a core point has min of them,"
+        " itself included; min=plane+1 treats lone slices as noise (default: 1.5 times the largest voxel step, 6)",
         parse=_parse_clusters,
         nargs="?",
         const={},
@@ -141,41 +141,41 @@ class CloudSettings(InputSettings):
     )
     keep: Sequence[str] = _steps_option(
         "--keep RULE",
-        "clusters that stay: largest, largest:N, min:POINTS, seed:X,Y,Z (the nearest), no-sheets (tables and image"
-        " planes go); may be given again",
+        "keep these clusters: largest, largest:N, min:POINTS, seed:X,Y,Z (the nearest), no-sheets (no tables and image"
+        " planes); may be given again",
         default=(),
         action="append",
         first=True,
     )
     outliers: float | None = _steps_option(
         "--outliers SD",
-        "points go whose mean distance to the 15 nearest is SD standard deviations over the mean (without a number: 2)",
+        "remove points whose mean distance to the 15 nearest is SD standard deviations above the mean (no number: 2)",
         nargs="?",
         const=2.0,
     )
     denoise: Sequence[str] = _steps_option(
         f"--denoise {','.join(DENOISERS)}",
-        "grid: points alone in a cell of a grid go; bilateral: points move along their normals to the weighted mean"
-        " height of their neighbours, edges stay",
+        "grid: remove points that are alone in a cell of a grid; bilateral: move points along their normals to the"
+        " weighted mean height of their neighbours; edges are preserved",
         default=(),
         parse=_parse_denoisers,
         first=True,
     )
     normals: bool = _steps_option(
         "--normals",
-        "unit normals that point out of bone; points of a surface have those of the scan until they are moved",
+        "add unit normals that point out of bone; points of a surface have those of the scan until they are moved",
         first=True,
     )
     viewpoint: Sequence[float] | None = _steps_option(
         "--viewpoint X,Y,Z",
-        "a point inside of the object, mm in the frame of --space: normals of a cloud that was read point away from it"
-        " (a scan turns its own by HU)",
+        "a point inside the object, mm in the frame of --space: normals of a cloud file point away from it (those of a"
+        " scan follow the HU)",
         parse=parse_point,
     )
     spacing: float | None = _steps_option("--spacing MM", "keep one point for each cell of that size")
     allow_point_loss: bool = option(
         "--allow-point-loss",
-        "go on where a step that should take noise alone takes more than half of the points, which else is refused",
+        "continue if a step that removes noise removes more than half of the points; otherwise this is refused",
         group="checks",
     )
 

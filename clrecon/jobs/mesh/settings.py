@@ -29,10 +29,10 @@ class LabelChoice:
     path: str | Path = options.label_map_option(default=MISSING)
     label: tuple[str | int, ...] = options.label_option(default=())
     hidden: tuple[str | int, ...] = option(
-        "--hide-label NAME|N", "not this label; may be given again", default=(), action="append"
+        "--hide-label NAME|N", "leave this label out; may be given again", default=(), action="append"
     )
     colors: tuple[tuple[str | int, str], ...] = options.label_color_option(
-        " in .ply and in the formats of several objects, such as L3=orange"
+        " in .ply and in formats that hold several objects, such as L3=orange"
     )
     surface: str = "hu"
     grow_mm: float | None = options.grow_option()
@@ -201,7 +201,7 @@ class MeshSettings(options.InputSettings):
 
     purpose: str | None = option(
         "--for PURPOSE",
-        "what the mesh is for, with the settings that this takes (others given beside it win); "
+        "choose the settings for a purpose (options given beside it win); "
         + "; ".join(map(_describe_purpose, PURPOSES.values())),
         group="purpose",
         parse=str.lower,
@@ -213,35 +213,35 @@ class MeshSettings(options.InputSettings):
     )
     below: float | Sequence[float] | None = option(
         "--below N[,N...]",
-        "in place of an iso value: inside is what lies below N HU, such as lungs, airways and sinuses (-400); the air"
-        " round the patient is left out",
+        "enclose the voxels below N HU instead, such as lungs, airways and sinuses (-400); the air around the patient"
+        " is left out",
         group="level",
         parse=options.parse_levels,
     )
     preset: str | None = options.iso_preset_option()
     half_way: str | Sequence[float] | None = None
-    keep_outside: bool = _inside_option("--keep-outside", "with --below: leave the air round the patient in")
+    keep_outside: bool = _inside_option("--keep-outside", "with --below: keep the air around the patient")
     solid: bool = _inside_option(
         "--solid",
-        "fill what the bone encloses: marrow, and canals that the ends of the scan cut; the brain, the chest and air"
-        " stay out; with --labels: what is less dense within a label",
+        "fill what the bone encloses: marrow, and canals that the ends of the scan cut; brain, chest and air stay open;"
+        " with --labels: fill the less dense voxels within each label",
         action="yes-no",
         first=True,
     )
     seal_mm: float | None = _inside_option(
-        "--seal MM", "with --solid: close pores up to twice as wide, less one voxel (default: 2.5 to 3, by the voxels)"
+        "--seal MM", "with --solid: close pores up to 2 x MM wide, less one voxel (default: depends on the voxels)"
     )
     surface: str = options.surface_option(
         "vertices lie at the level (default)",
-        "mask: with --labels the label's own surface, whatever the HU: organs, lungs, what HU do not show",
+        "mask: with --labels the surface of the label's voxels, regardless of the HU, as for organs and lungs",
         group="kind",
         default="hu",
     )
     space: Space = options.space_option("patient frame of the mesh", group="surface")
     topology: Topology = option(
         "--topology T",
-        "what is done where the voxels leave open which of them are joined: separated keeps them apart (default),"
-        " trilinear joins those that the trilinear interpolation joins",
+        "resolve ambiguous marching-cubes cases: separated keeps corners apart (default), trilinear joins those that"
+        " trilinear interpolation joins",
         group="surface",
         default="separated",
         parse=str.lower,
@@ -250,48 +250,47 @@ class MeshSettings(options.InputSettings):
     closed: bool = options.closed_option()
     method: MethodName | None = _method_option(
         f"--method {'|'.join(METHOD_NAMES)}",
-        "t-mc: every cell (default); i-mc: only what hangs together with seeds; g-mc: t-mc, then quadric collapse"
-        " without a bound; s-mc: t-mc, then decimation within a bound; t-mc-soup, skimage: on the CPU, to compare with",
+        "t-mc: every cell (default); i-mc: only components connected to seeds; g-mc: t-mc, then quadric collapse"
+        " without an error bound; s-mc: t-mc, then decimation within one; t-mc-soup, skimage: on the CPU, to compare",
         parse=str.lower,
     )
     grow_from: Sequence[str | Sequence[float]] = _method_option(
         "--grow-from auto|X,Y,Z|label:NAME",
-        "seeds of i-mc: auto takes the parts with at least 1/20 of the cells of the largest; a point in mm of the"
-        " frame of --space, at most 10 mm from the surface; a label of --labels. May be given again",
+        "seeds of i-mc: auto, all parts with at least 1/20 of the cells of the largest; a point in mm of the frame of"
+        " --space, at most 10 mm from the surface; or a label of --labels; may be given again",
         default=(),
         parse=_parse_seed,
         action="append",
     )
     vertex_rule: VertexRule = _method_option(
         "--vertex-rule linear|golden|golden-search",
-        "where on an edge a vertex lies: linear (default); golden: at 0.618 whatever the HU, up to 0.6 voxels off;"
+        "place vertices on their edges: linear (default); golden: at 0.618 regardless of the HU, up to 0.6 voxels off;"
         " golden-search: where a cubic crosses the iso value, no better than linear",
         default="linear",
         parse=str.lower,
     )
     keep: str | None = _selection_option(
         "--keep bone",
-        "bone: keep the components whose walls look like bone, not heart and vessels with contrast medium, nor a table",
+        "keep the components whose walls look like bone, not heart and vessels with contrast medium, nor a table",
         parse=str.lower,
     )
-    keep_largest: int | None = _selection_option("--keep-largest N", "keep the N largest components only", first=True)
+    keep_largest: int | None = _selection_option("--keep-largest N", "keep only the N largest components", first=True)
     min_volume_ml: float | None = _selection_option(
-        "--min-volume ML", "keep components of at least ML millilitres only", first=True
+        "--min-volume ML", "keep only components of at least ML millilitres", first=True
     )
     seeds: Sequence[Sequence[float]] = options.seeds_option(
-        "keep the component whose surface lies nearest to this point, in mm of the frame of --space; repeat it for"
-        " several",
+        "keep the component whose surface is nearest to this point, in mm of the frame of --space; may be given again",
         group="selection",
     )
     all_parts: bool = _files_option(
         "--all-parts",
-        "with --for print: keep all bones, not the largest alone; named objects of a .3mf, one mesh in other formats",
+        "with --for print: keep all bones, not only the largest; named objects in a .3mf, one mesh in other formats",
     )
-    split: bool = _files_option("--split", "write one file a component, the largest first")
+    split: bool = _files_option("--split", "write one file for each component, the largest first")
     one_file: bool = _files_option(
         "--one-file",
-        f"labels, components of --split or several iso values in one file ({OBJECT_FILES}), each an object with its"
-        " name and a colour of its own",
+        f"write labels, components of --split or several iso values into one file ({OBJECT_FILES}), each as an object"
+        " with its name and colour",
     )
     labels: LabelChoice | None = None
     smooth: int | None = _refinement_option(
@@ -302,16 +301,16 @@ class MeshSettings(options.InputSettings):
     )
     decimate: float | None = _refinement_option(
         "--decimate SHARE",
-        "take away this share of the triangles, such as 0.9, or as much as the largest deviation lets",
+        "remove this share of the triangles, such as 0.9, or as many as the error bound allows",
         first=True,
     )
     max_deviation_mm: float | None = _refinement_option(
         "--max-deviation MM",
-        "smoothing and decimation each move nothing further (default: a quarter of the shortest voxel step)",
+        "error bound of smoothing, and of decimation (default: a quarter of the shortest voxel step)",
     )
     strict: bool = options.strict_option(
-        f"{GATE_FAILED} when a gate of a mesh fails (closed, manifold, no cuts, close to the scan ...), with"
-        f' {SCAN_GATE_FAILED} when only gates of the scan do (see "clrecon info")',
+        f"{GATE_FAILED} if a gate of a mesh fails (closed, manifold, no self-intersections, close to the scan ...),"
+        f' with {SCAN_GATE_FAILED} if only gates of the scan fail (see "clrecon info")',
         group="strict",
     )
 

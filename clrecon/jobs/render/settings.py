@@ -105,8 +105,8 @@ class Turntable:
     """Settings of a turntable, an animation of a turning volume."""
 
     frames: int = option("--frames N", "frames of the turn (default: 100)", default=100)
-    fps: float = option("--fps N", "frames a second (default: 25)", default=25.0)
-    degrees: float = option("--degrees D", "how far it turns, to the patient's left (default: 360)", default=360.0)
+    fps: float = option("--fps N", "frames per second (default: 25)", default=25.0)
+    degrees: float = option("--degrees D", "angle of the turn, to the patient's left (default: 360)", default=360.0)
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class LabelLook:
     colors: Mapping[str, str] = label_color_option(", by name or number")
     opacities: Mapping[str, float] = option(
         "--label-opacity LABEL=SHARE",
-        "factor on the opacity of a label, 0 to 1, label 0 is all without a label; over slices the share of its colour"
+        "multiply the opacity of a label by 0 to 1 (label 0: all without a label); over slices: share of its colour"
         " (default: 0.3); may be given again",
         default=(),
         parse=_parse_label_opacity,
@@ -183,9 +183,9 @@ class RenderSettings(InputSettings):
     light: str | Sequence[float] | None = None
     views: Sequence[str] = view_option(
         "V[,V...]|AZ,EL",
-        f"where the camera stands: {', '.join(VIEWS)}; or degrees from anterior to the patient's left and to the head;"
-        " of slices also axial, coronal, sagittal (default: anterior; of mode slice axial, of slices 30,30, of cpr"
-        " left); several make a picture each: out_left.png; may be given again",
+        f"place the camera: {', '.join(VIEWS)}; or degrees from anterior to the patient's left and to the head; for"
+        " slices also axial, coronal, sagittal (default: anterior; in mode slice axial, in slices 30,30, in cpr left);"
+        " several make a picture each: out_left.png; may be given again",
         group="camera",
         default=(),
         parse=_parse_views,
@@ -194,12 +194,12 @@ class RenderSettings(InputSettings):
         words=(*directions.DIRECTIONS, *PLANES),
     )
     up: str | Sequence[float] | None = _camera_option(
-        "--up SIDE|X,Y,Z", "what is at the top (default: superior, else anterior)", parse=parse_direction
+        "--up SIDE|X,Y,Z", "direction at the top (default: superior, otherwise anterior)", parse=parse_direction
     )
-    zoom: float = _camera_option("--zoom F", "2 shows everything twice as large", default=1.0)
+    zoom: float = _camera_option("--zoom F", "magnify: 2 shows everything twice as large", default=1.0)
     center: Sequence[float] | None = _camera_option(
         "--center X,Y,Z",
-        "LPS mm in the middle of the picture, of a slice too (default: the middle of what is shown)",
+        "LPS mm at the centre of the picture, also of a slice (default: the centre of what is shown)",
         parse=numbers_reader(3, "is not a place X,Y,Z in LPS mm, such as -12,40,310"),
     )
     size: tuple[int, int] | None = _camera_option(
@@ -207,7 +207,7 @@ class RenderSettings(InputSettings):
     )
     view_angle: float | None = _camera_option(
         "--perspective DEGREES",
-        f"perspective of so many degrees from bottom to top ({DEFAULT_VIEW_ANGLE:g} without a number; default:"
+        f"perspective of this many degrees from bottom to top ({DEFAULT_VIEW_ANGLE:g} without a number; default:"
         " parallel)",
         nargs="?",
         const=DEFAULT_VIEW_ANGLE,

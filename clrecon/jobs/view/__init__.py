@@ -26,7 +26,7 @@ class ViewSettings:
     scan: MeshSettings = field(default_factory=MeshSettings)
     names: Sequence[str] = option(
         "--name TEXT",
-        "name of an input on the page, in the order of the inputs; repeat it for several (default: surface 1 ...)",
+        "name of an input on the page, in the order of the inputs; may be given again (default: surface 1 ...)",
         default=(),
         action="append",
     )

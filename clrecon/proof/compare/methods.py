@@ -96,8 +96,8 @@ class CompareSettings(InputSettings):
     )
     paper: bool = _comparison_option(
         "--paper",
-        "also compare a picture of each method with the middle slice by SSIM and MSE, as a paper does, beside controls"
-        " that show what this is worth",
+        "also compare a picture of each method with the middle slice by SSIM and MSE, as a paper does, and controls"
+        " that show how little these figures mean",
         first=True,
     )
     repeat: int = _comparison_option(

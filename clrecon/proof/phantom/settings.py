@@ -300,17 +300,17 @@ class PhantomSettings:
 
     kind: str = option(
         "--kind K",
-        "what to make; see below (default: spine)",
+        "kind of phantom, see below (default: spine)",
         default="spine",
         parse=str.lower,
         first=True,
         words=KINDS,
     )
     size: tuple[int, int] = option(  # two numbers once constructed
-        "--size N", "columns and rows, like 256 or 256x192 (default: by kind, mostly 256)", parse=parse_size, first=True
+        "--size N", "columns and rows, as 256 or 256x192 (default: by kind, mostly 256)", parse=parse_size, first=True
     )
     slices: int = option(  # a number once constructed
-        "--slices N", "default: as many as the levels need, else by kind, mostly 120", first=True
+        "--slices N", "number of slices (default: as the levels need, otherwise by kind, mostly 120)", first=True
     )
     spacing: tuple[float, float, float] = option(  # three numbers once constructed
         "--spacing DJ DI DK",
@@ -341,10 +341,10 @@ class PhantomSettings:
         first=True,
         words=TABLE_NAMES,
     )
-    table_gap_mm: float = option("--table-gap MM", "between body and table (default: 0, they touch)", default=0.0)
-    prone: bool = option("--prone", "the patient lies on the face")
-    ghosts: bool = option("--ghosts", "of a spine: two foreign slices, and a localizer")
-    levels: str | None = _spine_option("--levels C1-L5", "vertebrae to show, like L4-L5 or C3-C7,T1-T5", first=True)
+    table_gap_mm: float = option("--table-gap MM", "gap between body and table (default: 0, they touch)", default=0.0)
+    prone: bool = option("--prone", "the patient lies face down")
+    ghosts: bool = option("--ghosts", "add two foreign slices and a localizer to a spine")
+    levels: str | None = _spine_option("--levels C1-L5", "vertebrae to show, such as L4-L5 or C3-C7,T1-T5", first=True)
     facet_gap_mm: float | None = _spine_option("--facet-gap MM", "distance of neighbours in the facet joints")
     kyphosis_deg: float = _spine_option(
         "--kyphosis DEG", "angle between the first and the last level; positive: the back is round", default=0.0
@@ -354,15 +354,15 @@ class PhantomSettings:
         "angle between the first and the last level; positive: the middle lies to the left",
         default=0.0,
     )
-    uneven_mm: float = _spine_option("--uneven MM", "the gaps of the slices vary by up to this much", default=0.0)
+    uneven_mm: float = _spine_option("--uneven MM", "vary the gaps between slices by up to this much", default=0.0)
     missing: tuple[int, ...] = option(
         "--missing N,M-O",
-        "numbers of slices that are left out, like 20-22,40",
+        "leave out slices by number, such as 20-22,40",
         group="missing",
         default=(),
         parse=parse_missing,
     )
-    phases: int = _spine_option("--phases N", "series at the same places, with ever more contrast medium", default=1)
+    phases: int = _spine_option("--phases N", "series at the same positions, each with more contrast medium", default=1)
     transfer_syntax: str = "explicit"
 
     def __post_init__(self) -> None:

@@ -27,28 +27,27 @@ class Selection:
 
     series: int | str | None = series_option(
         'number, hash, UID (or the start of one) or description of the series, see "clrecon info" (default: the CT'
-        " series with most slices; of similar ones original before derived, then the thinnest)",
+        " series with most slices; of similar ones, original before derived, then the thinnest slices)",
         group="reading",
         first=True,
     )
     phase: int | None = _reading_option(
-        "--phase N", "number of the phase, of a series with several volumes at one place"
+        "--phase N", "read this phase of a series with several volumes at the same position"
     )
     allow_gaps: bool = _reading_option(
-        "--allow-gaps", "read a stack with missing slices: what is there is placed exactly, surfaces bridge the gap"
+        "--allow-gaps", "read a stack with missing slices: the others are placed exactly, and surfaces bridge the gap"
     )
     force: bool = _reading_option(
         "--force",
-        "read data sets without preamble or meta header too, their encoding guessed; leave out what is left"
-        " over behind the pixels",
+        "read data sets without preamble or meta header too, with a guessed encoding; ignore trailing data after"
+        " the pixel data",
     )
     follow_links: bool = _reading_option(
-        "--follow-links",
-        "read the files and folders that symbolic links out of the folder lead to (git-annex, DataLad)",
+        "--follow-links", "read files and folders outside the folder to which symbolic links lead (git-annex, DataLad)"
     )
     rescale: tuple[float, float] | None = _reading_option(
         "--rescale SLOPE,INTERCEPT",
-        "compute HU as SLOPE x stored value + INTERCEPT, regardless of the files, like 1,-1024",
+        "compute HU as SLOPE x stored value + INTERCEPT, regardless of the files, such as 1,-1024",
         parse=numbers_reader(2, "is no slope and intercept: SLOPE,INTERCEPT, such as 1,-1024"),
     )
 

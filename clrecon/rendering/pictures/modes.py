@@ -45,7 +45,7 @@ MODES = {
     "mip": Mode(Projection, "the highest HU along each ray"),
     "minip": Mode(Projection, "the lowest HU along each ray"),
     "mean": Mode(Projection, "the mean HU along each ray"),
-    "drr": Mode(Projection, "a radiograph: the water that attenuates as much as all along the ray, mm"),
+    "drr": Mode(Projection, "a radiograph: water-equivalent thickness along the ray, mm"),
     "surface": Mode(SurfaceLook, "the shaded surface at an iso value"),
     "slices": Mode(SlicesInSpace, "slices of the scan in space, translucent, each where it lies"),
     "slice": Mode(PlaneCut, "a plane through the volume in any direction, as thick as wanted"),
