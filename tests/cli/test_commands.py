@@ -38,37 +38,47 @@ def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.every_device
-@pytest.mark.parametrize("space", ["lps", "ras"])
+@pytest.mark.parametrize(("space", "signs"), [("lps", (1, 1, 1)), ("ras", (-1, -1, 1))])
 def test_mesh_writes_the_sphere_where_it_is(
-    device: Any, space: str, ct: Path, tmp_path: Path, printed: Printer
+    device: Any, space: str, signs: tuple[int, ...], ct: Path, tmp_path: Path
 ) -> None:
+    output = tmp_path / "a.stl"
+    arguments = ["mesh", str(ct), "-o", str(output), "--hu", "-150", "--space", space]
+    assert main([*arguments, "--device", str(device.index), "-q"]) == 0
+    corners = read_stl(output).reshape(-1, 3)
+    centre = (np.array(ORIGIN) + np.array(SPACING) * np.array([15, 12, 8])) * signs
+    np.testing.assert_allclose(0.5 * (corners.min(axis=0) + corners.max(axis=0)), centre, atol=0.05)
+
+
+def test_mesh_reports_the_sphere_and_its_file(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
     output, report_path = tmp_path / "Kugel ä.stl", tmp_path / "a report.json"
-    arguments = ["mesh", str(ct), "-o", str(output), "--report", str(report_path), "--hu", "-150", "--space", space]
+    arguments = ["mesh", str(ct), "-o", str(output), "--report", str(report_path), "--hu", "-150", "--space", "lps"]
     assert main([*arguments, "--device", str(device.index)]) == 0
     captured = printed()
     assert captured.error_lines == 0
     captured.assert_output(17, 31, 25, -150, "Kugel")
+    report, corners = json.loads(report_path.read_text()), read_stl(output)
+    assert (report["closed"], report["manifold"], report["components"]) == (True, True, 1)
+    assert report["volume_ml"] == pytest.approx(TRUE_VOLUME_ML, rel=tolerances.CLI_SPHERE_VOLUME_SHARE)
+    assert (report["iso_value_hu"], report["preset"], report["space"]) == (-150.0, None, "lps")
+    assert (report["output"], report["triangles"]) == ({"format": "stl", "bytes": output.stat().st_size}, len(corners))
+    bounds = [corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)]
+    np.testing.assert_allclose(report["bounds_mm"], bounds, atol=1e-4)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["Kugel ä.stl", "a report.json"]
 
-    report = json.loads(report_path.read_text())
+
+def test_report_of_a_mesh_has_the_names_of_the_contract_and_the_affine_of_the_scan(
+    device: Any, ct: Path, tmp_path: Path, printed: Printer
+) -> None:
+    arguments = ["mesh", str(ct), "-o", str(tmp_path / "a.stl"), "--json", "--device", str(device.index)]
+    assert main(arguments) == 0
+    report = printed().report()
     assert CONTRACT <= set(report)
     assert SECONDS <= set(report["seconds"])
     assert report["seconds"]["total"] >= report["seconds"]["read"] > 0.0
     expected = np.diag([*SPACING, 1.0])
     expected[:3, 3] = ORIGIN
     np.testing.assert_allclose(report["affine_ijk_to_lps_mm"], expected, atol=1e-9)
-    assert (report["closed"], report["manifold"], report["components"]) == (True, True, 1)
-    assert report["volume_ml"] == pytest.approx(TRUE_VOLUME_ML, rel=tolerances.CLI_SPHERE_VOLUME_SHARE)
-    assert (report["iso_value_hu"], report["preset"], report["space"]) == (-150.0, None, space)
-    assert report["output"] == {"format": "stl", "bytes": output.stat().st_size}
-
-    corners = read_stl(output)
-    assert len(corners) == report["triangles"]
-    bounds = [corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)]
-    np.testing.assert_allclose(report["bounds_mm"], bounds, atol=1e-4)
-    signs = np.array([1, 1, 1]) if space == "lps" else np.array([-1, -1, 1])
-    centre = (np.array(ORIGIN) + np.array(SPACING) * np.array([15, 12, 8])) * signs
-    np.testing.assert_allclose(np.mean(bounds, axis=0), centre, atol=0.05)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["Kugel ä.stl", "a report.json"]
 
 
 def test_mesh_says_nothing_of_the_patient(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:

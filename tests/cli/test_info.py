@@ -289,30 +289,49 @@ def test_commands_of_the_certificate_page_print_what_it_shows(
 
 
 @pytest.mark.release
-def test_mesh_strict_counts_the_gates_of_the_volume(
-    tmp_path: Path, device: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mesh_strict_passes_a_scan_whose_gates_pass(tmp_path: Path, device: Any) -> None:
     folder = write_series(tmp_path / "ct")
     arguments = ["mesh", str(folder), "-o", str(tmp_path / "a.ply"), "--hu", "100", "--device", str(device.index)]
     assert main([*arguments, "--strict"]) == 0
     assert b"comment CERTIFICATE gates 19 passed 0 failed" in (tmp_path / "a.ply").read_bytes()
+
+
+@pytest.fixture
+def lossy_mesh(tmp_path: Path, device: Any) -> list[str]:
+    """The words that make tmp_path/a.ply of a scan that says that it was compressed with loss."""
     import pydicom
 
+    folder = write_series(tmp_path / "ct")
     for path in folder.iterdir():
         ds = pydicom.dcmread(path)
         ds.LossyImageCompression = "01"
         ds.save_as(path)
-    capsys.readouterr()
-    assert main([*arguments, "--strict", "-q"]) == 7
+    return ["mesh", str(folder), "-o", str(tmp_path / "a.ply"), "--hu", "100", "--device", str(device.index)]
+
+
+def test_mesh_strict_exits_with_7_where_a_gate_of_the_scan_fails(
+    lossy_mesh: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*lossy_mesh, "--strict", "-q"]) == 7
     assert capsys.readouterr().err.startswith("clrecon: error: volume: gate lossless failed: slices with lossy")
-    assert main([*arguments, "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+
+
+def test_report_and_file_of_a_mesh_tell_the_failed_gate_of_the_scan(
+    lossy_mesh: list[str], tmp_path: Path, printed: Printer
+) -> None:
+    assert main([*lossy_mesh, "--json"]) == 0
+    report = printed().report()
     assert [gate["name"] for gate in report["volume"]["gates"] if gate["ok"] is False] == ["lossless"]
     assert any("lossy compression" in text for text in report["warnings"])
+    assert b"comment CERTIFICATE gate_failed lossless: slices with lossy" in (tmp_path / "a.ply").read_bytes()
+
+
+def test_report_of_a_mesh_has_the_names_of_the_contract(lossy_mesh: list[str], printed: Printer) -> None:
+    assert main([*lossy_mesh, "--json"]) == 0
+    report = printed().report()
     assert set(report["volume"]) == names_in("The certificate") - {"warnings"}
     assert set(report) == names_in("clrecon mesh") - {"preset_reason"}
     assert set(report["meshes"][0]) - set(report) <= names_in("clrecon mesh", "For each mesh in `meshes`")
-    assert b"comment CERTIFICATE gate_failed lossless: slices with lossy" in (tmp_path / "a.ply").read_bytes()
 
 
 def test_mesh_strict_takes_slices_that_are_placed_one_by_one(tmp_path: Path, device: Any, printed: Printer) -> None:

@@ -77,30 +77,46 @@ def test_one_label_is_the_output_itself(device: Any, ct: Path, labels: Path, tmp
     assert [path.name for path in tmp_path.iterdir()] == ["one.stl"]
 
 
-def test_a_mesh_that_is_not_of_its_labels_size_is_said(
-    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+LARGE_LABEL = np.zeros(sphere_voxels().shape, np.uint8)
+LARGE_LABEL[2:-2, 2:-2, 2:-2] = 1
+"""A label half of which is as thin as air: as lung meshed at the level of bone."""
+
+
+@pytest.fixture
+def large(tmp_path: Path) -> tuple[object, ...]:
+    """Options for a mesh of `LARGE_LABEL`, with a report."""
+    map_file = write_nifti(tmp_path / "a.nii.gz", LARGE_LABEL, AFFINE)
+    return "-o", tmp_path / "b.stl", "--labels", map_file, "--hu", -150, "--report", tmp_path / "r.json"
+
+
+def test_mesh_far_smaller_than_its_label_is_warned_of(
+    device: Any, ct: Path, large: tuple[object, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A label half of which is as thin as air: as lung meshed at the level of bone."""
-    voxels = np.zeros(sphere_voxels().shape, np.uint8)
-    voxels[2:-2, 2:-2, 2:-2] = 1
-    map_file = write_nifti(tmp_path / "a.nii.gz", voxels, AFFINE)
-    options = ("--labels", map_file, "--hu", -150)
-    assert run(ct, "-o", tmp_path / "b.stl", *options, device=device) == 0  # said without a report too
+    assert run(ct, *large[:-2], device=device) == 0  # without a report too
     captured = capsys.readouterr()
     assert "gate label_volume failed: the mesh has" in captured.err
     assert "what lies below -150 HU is left out; --solid" in captured.err and "--surface mask" in captured.err
     assert "ml of mesh for" in captured.out
-    arguments = (*options, "--strict", "--report", tmp_path / "r.json")
-    assert run(ct, "-o", tmp_path / "b.stl", *arguments, device=device) == 8
+
+
+def test_mesh_far_smaller_than_its_label_fails_its_gate(
+    device: Any, ct: Path, large: tuple[object, ...], tmp_path: Path
+) -> None:
+    assert run(ct, *large, "--strict", device=device) == 8
     report = json.loads((tmp_path / "r.json").read_text())
     (mesh,) = report["meshes"]
-    label_ml = np.count_nonzero(voxels) * np.prod(SPACING) / 1000.0
+    label_ml = np.count_nonzero(LARGE_LABEL) * np.prod(SPACING) / 1000.0
     assert mesh["label_ml"] == pytest.approx(label_ml, rel=1e-6)  # NIfTI holds spacings as float32
     assert mesh["label_taken_ml"] == pytest.approx(label_ml, rel=1e-6)
     assert mesh["label_mesh_ml"] == pytest.approx(SPHERE_ML, rel=tolerances.CLI_SPHERE_VOLUME_SHARE)
     (gate,) = (gate for gate in report["gates"] if gate["name"] == "label_volume")
     assert gate["measured"] == pytest.approx(100 * (1 - mesh["label_mesh_ml"] / label_ml)) and gate["ok"] is False
-    assert run(ct, "-o", tmp_path / "b.stl", *options, "--open", "--report", tmp_path / "r.json", device=device) == 0
+
+
+def test_open_mesh_of_a_label_has_no_volume_to_judge(
+    device: Any, ct: Path, large: tuple[object, ...], tmp_path: Path
+) -> None:
+    assert run(ct, *large, "--open", device=device) == 0
     report = json.loads((tmp_path / "r.json").read_text())
     assert [gate["ok"] for gate in report["gates"] if gate["name"] == "label_volume"] == [None]
     assert report["meshes"][0]["label_mesh_ml"] is None

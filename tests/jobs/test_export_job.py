@@ -9,6 +9,7 @@ from pathlib import Path
 import dicom_series
 import numpy as np
 import pytest
+from printed_text import Printer
 
 from clrecon import read_volume
 from clrecon.cli.main import main
@@ -55,6 +56,12 @@ def test_exported_crop_lies_in_its_place(tmp_path: Path, capsys: pytest.CaptureF
     place = image.TransformIndexToPhysicalPoint([1, 2, 3])
     assert np.allclose(place, volume.ijk_to_lps([first + (1, 2, 3)])[0], atol=1e-4)
     assert report["output"]["space"] == "ras" and report["output"]["type"] == "int16" and report["device"] is None
+
+
+def test_exported_files_hold_no_patient_data(tmp_path: Path) -> None:
+    scan = series(tmp_path)
+    assert run("export", scan, "-o", tmp_path / "a.nii.gz", "--report", tmp_path / "a.json") == 0
+    report = json.loads((tmp_path / "a.json").read_text())
     assert report["volume"]["gates"] and report["volume"]["series"]["uid_hash"] is None
     for content in (gzip.decompress((tmp_path / "a.nii.gz").read_bytes()), (tmp_path / "a.json").read_bytes()):
         assert b"Geheimnis" not in content
@@ -71,18 +78,31 @@ def test_outside_of_a_region_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert np.array_equal(found, np.where(volume.voxels >= middle, volume.voxels, -1024))
 
 
-def test_tilt_is_kept_or_resampled_when_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scan = series(tmp_path, tilt_deg=12.0)
-    assert run("export", scan, "-o", tmp_path / "a.mha") == 3
+@pytest.fixture
+def tilted(tmp_path: Path) -> Path:
+    """A scan with a gantry tilt of 12 degrees."""
+    return series(tmp_path, tilt_deg=12.0)
+
+
+def test_tilted_scan_is_refused_by_a_format_without_shear(
+    tilted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("export", tilted, "-o", tmp_path / "a.mha") == 3
     assert "sheared by 12.00 degrees (.nii.gz and .nrrd hold that)" in (said := capsys.readouterr().err)
     assert "--resample MM" in said and not (tmp_path / "a.mha").exists()
-    assert run("export", scan, "-o", tmp_path / "a.nii") == 0
-    assert "refuse a sheared NIfTI" in capsys.readouterr().err
-    assert np.allclose(nibabel.load(tmp_path / "a.nii").affine[:2] * -1, read_volume(scan).affine[:2], atol=1e-4)
-    assert run("export", scan, "-o", tmp_path / "a.mha", "--resample", "0.7") == 0
-    assert "sheared" not in capsys.readouterr().err
+
+
+def test_tilt_is_kept_in_nifti_with_a_warning(tilted: Path, tmp_path: Path, printed: Printer) -> None:
+    assert run("export", tilted, "-o", tmp_path / "a.nii") == 0
+    printed().assert_error("sheared", "NIfTI")
+    assert np.allclose(nibabel.load(tmp_path / "a.nii").affine[:2] * -1, read_volume(tilted).affine[:2], atol=1e-4)
+
+
+def test_tilt_is_resampled_when_asked(tilted: Path, tmp_path: Path) -> None:
+    assert run("export", tilted, "-o", tmp_path / "a.mha", "--resample", "0.7") == 0
     image = sitk.ReadImage(str(tmp_path / "a.mha"))
     assert np.allclose(image.GetSpacing(), 0.7)
+    assert np.allclose(image.GetDirection(), np.round(image.GetDirection()))
 
 
 def test_wrong_calls_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

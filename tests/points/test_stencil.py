@@ -104,7 +104,7 @@ def test_rows_are_sorted_by_distance() -> None:
     assert (np.diff(np.linalg.norm(middle * np.diag(THORACIC)[:3], axis=1)) > -1e-9).all()
 
 
-def test_forward_rows_and_their_mirror_are_all() -> None:
+def test_forward_rows_and_their_mirror_are_the_whole_stencil() -> None:
     for lattice in (Lattice((30, 30, 30), SHEARED), Lattice.of(uneven())):
         stencil = make_stencil(lattice, 2.4)
         forward = stencil.forward()

@@ -254,45 +254,72 @@ def test_wrong_options_are_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_cloud_files_that_cannot_be_read_or_written_have_their_exit_codes(
-    scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer, device: Any
+@pytest.mark.parametrize(
+    ("options", "output", "code"),
+    [
+        ([], "out.stl", 3),
+        ([], "nowhere/out.ply", 6),
+        (["--report", "{folder}/out.ply"], "out.ply", 3),
+        (["--no-clobber"], "out.ply", 6),
+        (["--hu", "5000"], "out.ply", 2),
+        (["--hu", "5000,6000"], "out.ply", 2),
+        (["--device", "99"], "out.ply", 5),
+    ],
+    ids=["a mesh", "no folder", "one file twice", "a file that exists", "no point", "no point in a band", "no device"],
+)
+def test_cloud_that_cannot_be_made_has_its_exit_code_and_leaves_the_older_file(
+    scan: Path, tmp_path: Path, cloud_command: Any, options: list[str], output: str, code: int
 ) -> None:
-    assert cloud_command(scan, output="out.stl") == 3
-    assert cloud_command(scan, "--report", str(tmp_path / "out.ply")) == 3
-    printed().assert_error("out.ply")
-    assert cloud_command(scan, output="nowhere/out.ply") == 6
-    assert cloud_command(tmp_path / "missing") == 2
-    (tmp_path / "empty").mkdir()
-    assert cloud_command(tmp_path / "empty") == 2
-    (tmp_path / "empty").rmdir()
     (tmp_path / "out.ply").write_text("mine")
-    assert cloud_command(scan, "--no-clobber") == 6
-    assert cloud_command(scan, "--hu", "5000") == 2
-    assert cloud_command(scan, "--hu", "5000,6000") == 2
-    assert main(["cloud", str(scan), "-o", str(tmp_path / "out.ply"), "--device", "99"]) == 5
+    assert cloud_command(scan, *(word.format(folder=tmp_path) for word in options), output=output) == code
     assert (tmp_path / "out.ply").read_text() == "mine"
     assert {path.name for path in tmp_path.iterdir()} == {"out.ply"}
 
 
-def test_a_cloud_is_read_and_cleaned(
-    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("is_there", [False, True], ids=["missing", "empty"])
+def test_cloud_of_a_missing_or_empty_folder_exits_with_2(tmp_path: Path, cloud_command: Any, is_there: bool) -> None:
+    folder = tmp_path / "ct"
+    if is_there:
+        folder.mkdir()
+    assert cloud_command(folder) == 2
+    assert not (tmp_path / "out.ply").exists()
+
+
+@pytest.fixture
+def first(scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer) -> Path:
+    """A cloud of the scan in a file."""
     assert cloud_command(scan, "--hu", BAND, output="first.npz") == 0
-    capsys.readouterr()
-    assert cloud_command(tmp_path / "first.npz", "--keep", "largest", "--json", output="second.ply") == 0
-    report = json.loads(capsys.readouterr().out)
+    printed()
+    return tmp_path / "first.npz"
+
+
+def test_a_cloud_is_read_and_cleaned(first: Path, tmp_path: Path, cloud_command: Any, printed: Printer) -> None:
+    assert cloud_command(first, "--keep", "largest", "--json", output="second.ply") == 0
+    report = printed().report()
     assert report["cloud_read"]["points"] == report["points_first"] and report["volume"] == {}
     assert report["kind"] is None and np.allclose(report["affine_ijk_to_lps_mm"], AFFINE)
-    before, after = (clrecon.read_points(tmp_path / name) for name in ("first.npz", "second.ply"))
+    before, after = (clrecon.read_points(path) for path in (first, tmp_path / "second.ply"))
     assert 0 < len(after) < len(before)
-    for option in (["--remove-table"], ["--hu", "200"], ["--points", "shell"], ["--series", "1"]):
-        assert cloud_command(tmp_path / "first.npz", *option, output="third.ply") == 3
-        assert "is about a scan: leave it out" in capsys.readouterr().err
-    assert cloud_command(tmp_path / "first.npz", output="first.npz") == 3
-    bad = tmp_path / "bad.xyz"
-    bad.write_text("1 2 3\n4 nan 6\n")
-    assert cloud_command(bad, output="third.ply") == 4
-    assert "not finite" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--remove-table", "--hu=200", "--points=shell", "--series=1"])
+def test_options_about_scans_are_refused_for_a_cloud(
+    first: Path, cloud_command: Any, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cloud_command(first, option, output="third.ply") == 3
+    assert "is about a scan: leave it out" in capsys.readouterr().err
+
+
+def test_cloud_that_is_read_is_not_replaced(first: Path, cloud_command: Any) -> None:
+    before = first.read_bytes()
+    assert cloud_command(first, output="first.npz") == 3
+    assert first.read_bytes() == before
+
+
+def test_cloud_with_a_point_that_is_not_finite_is_refused(tmp_path: Path, cloud_command: Any, printed: Printer) -> None:
+    (tmp_path / "bad.xyz").write_text("1 2 3\n4 nan 6\n")
+    assert cloud_command(tmp_path / "bad.xyz", output="third.ply") == 4
+    printed().assert_error("bad.xyz", "finite")
 
 
 def test_cloud_without_a_frame_is_turned_by_input_space(tmp_path: Path, cloud_command: Any) -> None:

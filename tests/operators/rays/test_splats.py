@@ -144,36 +144,55 @@ def test_a_cloud_far_away_looks_the_same(device: Any) -> None:
     assert (np.abs(far.image.astype(int) - near.image).max(axis=-1) > 2).mean() < tolerances.FAR_SPLAT_SHARE
 
 
-def test_points_are_coloured_by_hu_label_or_reason(device: Any) -> None:
-    points = np.array([(x, 0, 0) for x in (-6, -2, 2, 6)], np.float32)
-    cloud = PointCloud(points, hu=[0, 100, 200, 300], labels=[-1, 0, 2, 0], report={"label_names": {2: "sheet"}})
+FOUR = np.array([(x, 0, 0) for x in (-6, -2, 2, 6)], np.float32)
 
-    def colors(**look: Any) -> tuple[list[tuple[int, ...]], dict[str, Any]]:
-        own = PointLook(radius_mm=1.0, lighting=UNSHADED, **look)
-        picture = clrecon.render(cloud, own, camera=FRONT, size=(47, 47), device=device)
-        return [tuple(picture.image[23, at, :3].tolist()) for at in (11, 19, 27, 35)], picture.report
 
-    grey, report = colors(color_by="hu", window=(0, 200))
-    assert grey == [(0,) * 3, (128,) * 3, (255,) * 3, (255,) * 3] and report["window_hu"] == (0.0, 200.0)
-    by_label, report = colors()
-    assert report["color_by"] == "label" and by_label[1] == by_label[3] != by_label[2] and by_label[0] == (112,) * 3
+def colors_of_four(device: Any, **look: Any) -> tuple[list[tuple[int, ...]], dict[str, Any]]:
+    """Return the colours of four points from 0 to 300 HU, labelled noise, 0, "sheet" and 0, and the report."""
+    cloud = PointCloud(FOUR, hu=[0, 100, 200, 300], labels=[-1, 0, 2, 0], report={"label_names": {2: "sheet"}})
+    own = PointLook(radius_mm=1.0, lighting=UNSHADED, **look)
+    picture = clrecon.render(cloud, own, camera=FRONT, size=(47, 47), device=device)
+    return [tuple(picture.image[23, at, :3].tolist()) for at in (11, 19, 27, 35)], picture.report
+
+
+def test_points_are_grey_by_hu(device: Any) -> None:
+    colors, report = colors_of_four(device, color_by="hu", window=(0, 200))
+    assert colors == [(0,) * 3, (128,) * 3, (255,) * 3, (255,) * 3] and report["window_hu"] == (0.0, 200.0)
+
+
+def test_points_have_the_colours_of_their_labels_and_noise_is_grey(device: Any) -> None:
+    colors, report = colors_of_four(device)
+    assert report["color_by"] == "label" and colors[1] == colors[3] != colors[2] and colors[0] == (112,) * 3
     assert [(e["label"], e["name"], e["points"]) for e in report["legend"]] == [
         (-1, "noise", 1),
         (0, None, 2),
         (2, "sheet", 1),
     ]
-    removed, report = colors(color_by="removed")
-    assert removed[1] == removed[3] == (160,) * 3 and removed[2] not in ((160,) * 3, (112,) * 3)
+
+
+def test_kept_points_are_grey_beside_removed_ones(device: Any) -> None:
+    colors, report = colors_of_four(device, color_by="removed")
+    assert colors[1] == colors[3] == (160,) * 3 and colors[2] not in ((160,) * 3, (112,) * 3)
     assert [e["name"] for e in report["legend"]] == [None, "kept", "sheet"]
-    assert colors(color="red")[0] == [(255, 0, 0)] * 4
-    plain = clrecon.render(cloud.changed(labels=None, hu=None), size=SIZE, device=device)
-    assert plain.report["color_by"] == "none"
-    hu = clrecon.render(cloud.changed(labels=None), size=SIZE, device=device)
-    assert hu.report["color_by"] == "hu"
-    many = PointCloud(np.repeat(points, 10, axis=0), labels=np.arange(40))
-    many_report = clrecon.render(many, size=SIZE, device=device).report
-    assert len(many_report["legend"]) == MOST_NAMED and many_report["legend_left_out"] == 40 - MOST_NAMED
-    wide = clrecon.render(PointCloud(points, labels=[5, -(2**31), 2**31 - 1, 5]), size=SIZE, device=device)
+
+
+def test_points_have_the_one_colour_that_is_given(device: Any) -> None:
+    assert colors_of_four(device, color="red")[0] == [(255, 0, 0)] * 4
+
+
+@pytest.mark.parametrize(("hu", "color_by"), [(None, "none"), ([0, 100, 200, 300], "hu")])
+def test_points_without_labels_are_coloured_by_hu_if_they_have_some(device: Any, hu: Any, color_by: str) -> None:
+    assert clrecon.render(PointCloud(FOUR, hu=hu), size=SIZE, device=device).report["color_by"] == color_by
+
+
+def test_legend_names_the_largest_labels_and_counts_the_rest(device: Any) -> None:
+    many = PointCloud(np.repeat(FOUR, 10, axis=0), labels=np.arange(40))
+    report = clrecon.render(many, size=SIZE, device=device).report
+    assert len(report["legend"]) == MOST_NAMED and report["legend_left_out"] == 40 - MOST_NAMED
+
+
+def test_labels_as_far_apart_as_32_bits_are_told_apart(device: Any) -> None:
+    wide = clrecon.render(PointCloud(FOUR, labels=[5, -(2**31), 2**31 - 1, 5]), size=SIZE, device=device)
     assert [entry["points"] for entry in wide.report["legend"]] == [1, 2, 1]
 
 

@@ -65,39 +65,56 @@ def test_volumes_are_those_of_the_phantom(spine, device):
     assert inside.warnings == []
 
 
-def test_parts_fit_together_and_have_surfaces_of_their_volumes(spine, device):
-    volume, labels = spine
-    inside = clrecon.vertebra_inside(volume, labels, 20, device=device)
-    assert list(inside.masks) == list(PARTS)
-    assert not (inside.dense & inside.trabecular).count
-    assert not (inside.canal & inside.solid).count
-    assert ((inside.dense | inside.trabecular) ^ inside.solid).count == 0
-    hu = inside.volume.voxels[inside.dense.to_numpy()]
-    assert hu.min() >= 450
-    assert (inside.volume.voxels[inside.trabecular.to_numpy()] < 450).all()
-    volumes = inside.volumes_ml
+@pytest.fixture(scope="module")
+def inside_20(spine, device):
+    """Vertebra 20 of the phantom, taken apart."""
+    return clrecon.vertebra_inside(*spine, 20, device=device)
+
+
+def test_dense_and_trabecular_bone_fill_the_solid_beside_the_canal(inside_20):
+    assert list(inside_20.masks) == list(PARTS)
+    assert not (inside_20.dense & inside_20.trabecular).count
+    assert not (inside_20.canal & inside_20.solid).count
+    assert ((inside_20.dense | inside_20.trabecular) ^ inside_20.solid).count == 0
+    volumes = inside_20.volumes_ml
     assert volumes["dense"] + volumes["trabecular"] == pytest.approx(volumes["solid"])
-    meshes = inside.extract_meshes()
+
+
+def test_dense_bone_begins_at_450_hu(inside_20):
+    voxels = inside_20.volume.voxels
+    assert voxels[inside_20.dense.to_numpy()].min() >= 450
+    assert (voxels[inside_20.trabecular.to_numpy()] < 450).all()
+
+
+def test_meshes_of_parts_are_closed_and_enclose_their_volumes(inside_20):
+    meshes = inside_20.extract_meshes()
     assert list(meshes) == list(PARTS)
     for name, mesh in meshes.items():
         quality = mesh.quality()
-        assert quality.closed
-        assert quality.manifold
-        assert quality.volume_ml == pytest.approx(volumes[name], rel=0.01)
-        assert mesh.report["label_name"] == name
+        assert quality.closed and quality.manifold and mesh.report["label_name"] == name
+        assert quality.volume_ml == pytest.approx(inside_20.volumes_ml[name], rel=0.01)
     shared = {tuple(vertex) for vertex in meshes["dense"].vertices} & {tuple(v) for v in meshes["trabecular"].vertices}
     assert len(shared) > 1000
-    found = inside.to_label_map()
+
+
+def test_label_map_of_a_vertebra_has_its_parts(spine, inside_20, device):
+    found = inside_20.to_label_map()
     assert found.names == {1: "dense", 2: "trabecular", 3: "canal"}
-    whole = clrecon.Mask.from_labels(volume, found, ["dense"], device=device)  # the same voxels of the whole scan
-    assert whole.count == inside.dense.count
-    told = json.loads(json.dumps(inside.as_dict()))
-    assert told["volumes_ml"] == volumes
+    whole = clrecon.Mask.from_labels(spine[0], found, ["dense"], device=device)  # the same voxels of the whole scan
+    assert whole.count == inside_20.dense.count
+
+
+def test_dict_of_a_vertebra_says_its_volumes_and_what_they_are_of(inside_20):
+    told = json.loads(json.dumps(inside_20.as_dict()))
+    assert told["volumes_ml"] == inside_20.volumes_ml
     assert told["dense_hu"] == [450.0, None]
     assert told["solid_of"] == "label"
-    assert "solid" in repr(inside)
+
+
+def test_vertebra_cannot_be_pickled_and_says_what_can(inside_20):
+    assert "solid" in repr(inside_20)
     with refused(TypeError, "to_label_map", "as_dict"):
-        pickle.dumps(inside)
+        pickle.dumps(inside_20)
 
 
 def slab(thickness, spacing=(0.5, 0.5, 0.5), hu=900):
