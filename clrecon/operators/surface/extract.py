@@ -19,7 +19,6 @@ from clrecon.operators.masks.enclosed import fill_enclosed
 from clrecon.operators.resident.device_volume import DeviceVolume, VolumeWorker
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Extraction
-from clrecon.operators.surface.marching_cubes import Placement
 from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 from clrecon.operators.surface.trilinear import check_row
@@ -57,7 +56,6 @@ class SurfaceExtractor(VolumeWorker):
     ):
         super().__init__(volume, device, memory, "a surface")
         marching_cubes.check_row(self.volume.shape_ijk[0])
-        self._placements: dict[int, Placement] = {}
 
     @explains_arguments
     def forecast(self, *, closed: bool = True, topology: Topology = "separated") -> dict[str, int]:
@@ -111,7 +109,7 @@ class SurfaceExtractor(VolumeWorker):
             seeds, grid = Seeds.read(grow_from, self._resident), replace(grid, grows=True)
         for attempt in self._resident.with_fallback():
             with attempt as (_, warnings):
-                run = Extraction(self._resident, grid, self._placement(grid), warnings, seeds=seeds)
+                run = Extraction(self._resident, grid, warnings, seeds=seeds)
                 positions, normals, triangles = run.run(progress or ignore_progress)
                 report = run.describe(len(positions), len(triangles)) | chosen
                 mesh = Mesh(run.placement.to_lps(positions), triangles, normals, report, trusted=True)
@@ -133,7 +131,7 @@ class SurfaceExtractor(VolumeWorker):
         grid = self._choose_grid(level, closed, "separated", below)
         for attempt in self._resident.with_fallback():
             with attempt as (_, warnings):
-                run = Extraction(self._resident, grid, self._placement(grid), warnings, vertices_only=True)
+                run = Extraction(self._resident, grid, warnings, vertices_only=True)
                 positions, normals, _ = run.run(progress or ignore_progress)
                 report = run.describe(len(positions), 0) | chosen
                 level = report["iso_value_hu"]
@@ -160,12 +158,6 @@ class SurfaceExtractor(VolumeWorker):
         if min(grid.shape) < 2:
             raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
         return grid
-
-    def _placement(self, grid: SampleGrid) -> Placement:
-        border = grid.rule.border
-        if border not in self._placements:
-            self._placements[border] = Placement.of(self.volume, border)
-        return self._placements[border]
 
 
 @explains_arguments

@@ -112,7 +112,6 @@ class Extraction:
         self,
         resident: DeviceVolume,
         grid: SampleGrid,
-        placement: Placement,
         warnings: list[str],
         *,
         vertices_only: bool = False,
@@ -121,7 +120,8 @@ class Extraction:
         self.resident = resident
         self.device = resident.device
         self.grid = grid
-        self.placement = placement
+        border = grid.rule.border
+        self.placement = resident.keep("places of the samples", border, 0, lambda: Placement.of(grid.volume, border))
         self._vertices_only = vertices_only
         self._seeds = seeds
         self._grown: Grown | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -232,6 +233,10 @@ class Camera:
         UsageError
             Position and focal point coincide, or ``up`` is along the view.
         """
+        return self._basis
+
+    @cached_property
+    def _basis(self) -> CameraBasis:
         forward = np.subtract(self.focal_point, self.position)
         length = np.linalg.norm(forward)
         if length < 1e-6:
@@ -243,7 +248,10 @@ class Camera:
         if size < 1e-12 or np.linalg.norm(right) < 1e-6 * size:
             raise UsageError("the up direction of a camera runs along its view: name another one")
         right /= np.linalg.norm(right)
-        return CameraBasis(right, np.cross(right, forward), forward)
+        basis = CameraBasis(right, np.cross(right, forward), forward)
+        for vector in basis:
+            vector.flags.writeable = False  # all pictures of the camera share them
+        return basis
 
     def half_height(self) -> float:
         """Half the height of the picture: in mm, or for perspective in mm per mm of distance along the view."""
