@@ -109,16 +109,15 @@ def decode_surface(coded: CodedSurface) -> tuple[NDArray[np.float64], NDArray[np
     return vertices, normals, indices.reshape(-1, 3).astype(np.uint32)
 
 
-def _renumber(triangles: NDArray[np.integer], count: int) -> tuple[NDArray[np.intp], NDArray[np.signedinteger[Any]]]:
+def _renumber(triangles: NDArray[np.integer], count: int) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
     """Return the used vertices in the order of their first use, and the corners as numbers in that order."""
-    kind = np.int32 if triangles.size < 2**31 else np.int64
     corners = triangles.reshape(-1)
-    first = np.full(count, -1, dtype=kind)
-    first[corners[::-1]] = np.arange(len(corners) - 1, -1, -1, dtype=kind)  # of equal indices the last one stays
+    first = np.full(count, -1, dtype=np.int32)
+    first[corners[::-1]] = np.arange(len(corners) - 1, -1, -1, dtype=np.int32)  # of equal indices the last one stays
     is_first = np.zeros(len(corners), dtype=bool)
     is_first[first[first >= 0]] = True
     order = corners[is_first].astype(np.intp)
-    first[order] = np.arange(len(order), dtype=kind)
+    first[order] = np.arange(len(order), dtype=np.int32)
     return order, first[corners]
 
 

@@ -21,12 +21,12 @@ import struct
 import subprocess
 import tempfile
 import zlib
-from collections.abc import Iterable, Iterator
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache, partial
 from io import BytesIO
 from itertools import chain
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,7 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.files import Staged, StagedFolder, check_folder, check_writable, stage_file, temporary_folder
 from clrecon.system.packages import install_command
 from clrecon.system.paths import final_mode, keep_existing, system_errors
+from clrecon.system.pieces import side_by_side
 from clrecon.system.progress import Progress
 from clrecon.system.text import guess_word
 
@@ -199,9 +200,8 @@ def _checked_frames(
         image = np.asarray(getattr(frame, "image", frame))
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4) or image.size == 0:
             raise UsageError(f"frame {done} is no picture of uint8 (h, w, 3 or 4): {image.dtype} {image.shape}")
-        if shape is None:
-            shape = image.shape
-        elif image.shape != shape:
+        shape = shape or image.shape
+        if image.shape != shape:
             raise UsageError(f"frame {done} has shape {image.shape}, the frames before it {shape}")
         if extension in (".mp4", ".gif") and image.shape[2] == 4:
             if (image[..., 3] != 255).any():
@@ -210,7 +210,7 @@ def _checked_frames(
                     " APNG or a folder of PNG files"
                 )
             image = image[..., :3]
-        yield np.ascontiguousarray(image)
+        yield np.array(image, order="C")  # a caller may draw the next frame into the same array
         done += 1
         if progress is not None:
             progress("frames", done, total)
@@ -262,17 +262,24 @@ def write_gif(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float)
     height, width = first.shape[:2]
     stream.write(b"GIF89a" + struct.pack("<HHBBB", width, height, 0x70, 0, 0) + _REPEAT_FOR_EVER)
     shown = 0
-    for number, frame in enumerate(chain([first], frames)):
+    for number, (palette, blocks) in enumerate(_pack_frames(_gif_picture, chain([first], frames))):
         # Durations in hundredths of a second, rounded so that the total is right.
         delay = round(100.0 * (number + 1) / fps) - shown
         shown += delay
-        palette, blocks = _gif_picture(frame)
         bits = max(1, (len(palette) // 3 - 1).bit_length())
         palette = palette.ljust(3 << bits, b"\0")
         stream.write(b"\x21\xf9\x04" + struct.pack("<BHBB", 1 << 2, delay, 0, 0))
         stream.write(b"\x2c" + struct.pack("<HHHHB", 0, 0, width, height, 0x80 | (bits - 1)))
         stream.write(palette + blocks)
     stream.write(b"\x3b")
+
+
+def _pack_frames(pack: Callable[[NDArray[np.uint8]], Any], frames: Iterator[NDArray[np.uint8]]) -> Iterator[Any]:
+    """Yield what `pack` makes of each frame; the next one is drawn meanwhile."""
+    frame = next(frames, None)
+    while frame is not None:
+        packed, frame = side_by_side(partial(pack, frame), partial(next, frames, None))
+        yield packed
 
 
 def _gif_picture(frame: NDArray[np.uint8]) -> tuple[bytes, bytes]:
@@ -313,11 +320,10 @@ def write_apng(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float
     numerator, denominator = (1, round(fps)) if fps == round(fps) else (1000, round(1000 * fps))
     if denominator > 0xFFFF:
         numerator, denominator = 100, round(100 * fps)
-    written = sequence = 0
-    control_at = 0
-    for frame in chain([first], frames):
-        chunks = list(_png_chunks(frame))
-        if written == 0:
+    written = sequence = control_at = 0
+    packed = _pack_frames(lambda frame: list(_png_chunks(frame)), chain([first], frames))
+    for written, chunks in enumerate(packed, start=1):
+        if written == 1:
             stream.write(b"\x89PNG\r\n\x1a\n")
             _write_chunk(stream, *chunks[0])  # IHDR
             control_at = stream.tell()
@@ -326,12 +332,11 @@ def write_apng(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float
         _write_chunk(stream, b"fcTL", control)
         sequence += 1
         for kind, body in chunks:
-            if kind == b"IDAT" and written == 0:
+            if kind == b"IDAT" and written == 1:
                 _write_chunk(stream, kind, body)
             elif kind == b"IDAT":
                 _write_chunk(stream, b"fdAT", struct.pack(">I", sequence) + body)
                 sequence += 1
-        written += 1
     _write_chunk(stream, b"IEND", b"")
     end = stream.tell()
     stream.seek(control_at)

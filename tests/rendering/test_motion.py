@@ -138,6 +138,23 @@ def test_apng_keeps_every_pixel_of_the_frames(tmp_path, channels):
             assert np.array_equal(np.array(read), frame)
 
 
+@pytest.mark.parametrize("name", ["turn.gif", "turn.apng"])
+def test_frames_drawn_one_after_another_into_one_array_are_all_kept(tmp_path, name):
+    """The next frame is drawn while one is packed."""
+
+    def frames_in_one_array():
+        canvas = np.empty((300, 300, 3), np.uint8)
+        for value in (20, 120, 220):
+            canvas[...] = value
+            yield canvas
+
+    write_animation(frames_in_one_array(), tmp_path / name)
+    with Image.open(tmp_path / name) as animation:
+        for number, value in enumerate((20, 120, 220)):
+            animation.seek(number)
+            assert np.abs(np.asarray(animation.convert("RGB")).astype(int) - value).max() <= 4
+
+
 @pytest.mark.parametrize("name", ["turn", "turn/", "v1.2/"])
 def test_animation_to_a_folder_writes_its_frames(tmp_path, name):
     pictures = [make_picture(background=(0, 0, 0, opacity)) for opacity in (0, 120, 255)]
