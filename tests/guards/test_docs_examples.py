@@ -27,8 +27,8 @@ FOR_A_RELEASE = {"clouds", "corridor", "inside", "measures", "tasks", "transfer_
 ELSEWHERE = {"certificate", "python", "tour", "view"}
 """Pages with tests of their own, and without Python that begins by itself."""
 
-OPTIONAL = ("dask", "pandas", "pyacvd", "tetgen")
-"""What a block may import that is installed for a release alone; without it the block is left out."""
+OPTIONAL = ("dask", "open3d", "pandas", "pyacvd", "tetgen")
+"""What a block may import, or convert to, that is installed for a release alone; without it the block is left out."""
 
 SMALLER = {
     '"CT_FOLDER"': '"ct"',
@@ -128,7 +128,7 @@ def test_the_python_of_a_page_runs(name: str, series: Path, device: Any, monkeyp
     before, files = set(made), set(os.listdir())
     missing = [package for package in OPTIONAL if find_spec(package) is None]
     for block in PAGES[name]:
-        if any(re.search(rf"^(import|from) {package}\b", block, re.MULTILINE) for package in missing):
+        if any(re.search(rf"^(import|from) {package}\b|_{package}\(", block, re.MULTILINE) for package in missing):
             continue
         for long, short in SMALLER.items():
             block = block.replace(long, short)
