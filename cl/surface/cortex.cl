@@ -20,7 +20,7 @@
 
 #define SAMPLES 13 /* of a profile */
 #define CENTRE 7 /* the sample at the vertex: one more lies on the side of the bone */
-#define RESULTS 10 /* numbers of a fit: x0, t, outer, cortex, inner, residual, variances of x0 and t, peak, room */
+#define RESULTS 9 /* numbers of a fit: x0, t, outer, cortex, inner, residual, variance of x0, peak, room */
 #define ROUNDS 6 /* steps of Levenberg and Marquardt */
 #define SLACK 1.0003f /* a step that costs so little more counts as one that helps: near the best place costs are rounding */
 #define ROWS 15 /* of a profile: samples, square of the normal's part across the slices, square of the gap there */
@@ -243,8 +243,8 @@ static inline void find_wall(
 /* Parameters  profiles    in   (ROWS, stride) see sample_profiles
  *             weights     in   (SAMPLES) of the samples
  *             fits        out  (RESULTS, stride) x0, t in mm; outer, cortex, inner, residual (root mean square) in HU;
- *                              variances of x0 and t in mm2, for samples with a variance of 1 HU2 each; highest value of
- *                              the wall in HU, NaN where the vertex lies beyond the volume; mm from the vertex to the last
+ *                              variance of x0 in mm2, for samples with a variance of 1 HU2 each; highest value of the
+ *                              wall in HU, NaN where the vertex lies beyond the volume; mm from the vertex to the last
  *                              sample outwards that belongs to the wall
  *             first_mm step_mm  place of sample n: first_mm + n * step_mm
  *             blur across       mm: width of the Gaussian within the slices, and across them at the usual gap
@@ -311,7 +311,6 @@ __kernel void fit_profiles(
     store_lanes(1000.0f * now.inner + cortex, fit + 4 * (size_t)stride);
     store_lanes(1000.0f * sqrt(greater(now.samples, (floats)(0.0f)) / total), fit + 5 * (size_t)stride);
     store_lanes(scale * tt, fit + 6 * (size_t)stride);
-    store_lanes(scale * xx, fit + 7 * (size_t)stride);
-    store_lanes(peak, fit + 8 * (size_t)stride);
-    store_lanes(room, fit + 9 * (size_t)stride);
+    store_lanes(peak, fit + 7 * (size_t)stride);
+    store_lanes(room, fit + 8 * (size_t)stride);
 }

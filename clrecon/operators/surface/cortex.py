@@ -91,11 +91,6 @@ class ProfileScale:
         places = step * (np.arange(SAMPLES) - CENTRE)
         return cls(-step * CENTRE, step, np.exp(-0.5 * (places / (WEIGHT_MM * scale)) ** 2).astype(np.float32))
 
-    @property
-    def independent(self) -> float:
-        """Share of the samples that count as independent of each other."""
-        return STEP_MM / CORRELATED_MM
-
 
 class StackFrame:
     """Where points lie between the slices of a volume, even or not: in steps of slice 0, and in mm of height.
@@ -179,7 +174,7 @@ class WallFits:
     thickness_mm: At most the length of a profile, which stands for solid bone.
     outer_hu, cortex_hu, inner_hu: The plateaus.
     residual_hu: Root mean square of what the fit leaves.
-    shift_variance, thickness_variance: mm2 for samples with a variance of 1 HU2 each.
+    shift_variance: mm2 for samples with a variance of 1 HU2 each.
     peak_hu: Highest value; NaN where the vertex lies beyond the volume.
     room_mm: From the vertex outwards to the next wall, or to the end of the profile.
     """
@@ -191,7 +186,6 @@ class WallFits:
     inner_hu: Float32Array
     residual_hu: Float32Array
     shift_variance: Float32Array
-    thickness_variance: Float32Array
     peak_hu: Float32Array
     room_mm: Float32Array
 
@@ -237,7 +231,7 @@ class WallProfiles:
         """Fit a wall to each profile."""
         device, lanes = self._device, int(self._device.kernel_variants["LANES"])
         fits, fits_d = empty_output(device, (RESULTS, self._stride), np.float32)
-        outer, cortex, inner = expected_precisions(cortex_hu, noise_hu, cortex_spread, self._scale.independent)
+        outer, cortex, inner = expected_precisions(cortex_hu, noise_hu, cortex_spread)
         launch(
             device, self._program["fit_profiles"], -(-self._count // lanes),
             profiles=self._values_d, weights=self._weights_d, fits=fits_d,
@@ -260,11 +254,9 @@ def stride_of(count: int) -> int:
     return 8 * -(-count // 8)
 
 
-def expected_precisions(
-    cortex_hu: float, noise_hu: float, cortex_spread: float, independent: float
-) -> tuple[float, float, float]:
+def expected_precisions(cortex_hu: float, noise_hu: float, cortex_spread: float) -> tuple[float, float, float]:
     """Return the weights of what is expected of outer, cortex and inner HU, in units of a sample's weight."""
-    variance = unexplained_hu(cortex_hu, noise_hu) ** 2 / independent
+    variance = unexplained_hu(cortex_hu, noise_hu) ** 2 * CORRELATED_MM / STEP_MM
     spreads = (OUTER_SPREAD_HU, cortex_spread * cortex_hu, INNER_SPREAD * cortex_hu)
     outer, cortex, inner = (variance / spread**2 for spread in spreads)
     return outer, cortex, inner

@@ -20,6 +20,8 @@ from clrecon.opencl import Device, Stopwatch
 from clrecon.operators.primitives.union_find import label_components
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.surface.cortex import (
+    CORRELATED_MM,
+    STEP_MM,
     CortexConstants,
     Float32Array,
     ProfileSampler,
@@ -57,8 +59,13 @@ these blurs is badly fitted: thick slices hide where within them it lies."""
 _RINGS, _CORNERS = 3, 12.0
 """Rounds in which hidden walls ask their neighbours, and about how many corners of them there are."""
 
-_MOST_RESIDUAL = 3.0
-"""Residual, in what noise and model explain, from which on a profile is not that of a wall."""
+_MOST_RESIDUAL, _LEAST_CORTEX = 3.0, 0.7
+"""Residual, in what noise and model explain, from which on a profile is not that of a wall, and the share of the scan's
+cortex below which a wall is not of bone alone: a vessel with contrast medium or a disc touches it."""
+
+_STEPPED = 1.5
+"""Slices that blur across by more than so often what they blur within make steps of slanted walls, whose normals are 30
+to 40 degrees off: the fit is made again along those of the moved surface, as means over the triangles around."""
 
 LEAST_ROOM = 2
 """Samples outside of a vertex that belong to its wall, at least."""
@@ -80,7 +87,7 @@ class CortexFit:
     hidden: bool. Badly fitted because thick slices hide the wall.
     shift_mm: From the vertex along its normal, outwards positive.
     thickness_mm: Of the wall; at most the length of a profile, which stands for solid bone.
-    error_mm, thickness_error_mm: Standard errors.
+    error_mm: Standard error of the shift.
     room_mm: From the vertex outwards to the next wall, or to the end of the profile.
     """
 
@@ -91,7 +98,6 @@ class CortexFit:
     shift_mm: Float32Array
     thickness_mm: Float32Array
     error_mm: Float32Array
-    thickness_error_mm: Float32Array
     room_mm: Float32Array
 
     def counts(self) -> dict[str, int]:
@@ -123,7 +129,7 @@ def fit_walls(
         groups = find_groups(sampler, resident.volume, points, normals, components, constants)
     levels = tuple(known.cortex_hu for _, known in groups[1:])
     marks = np.empty(count, np.uint8), np.empty(count, bool)
-    fit = CortexFit(constants, levels, *marks, *(np.empty(count, np.float32) for _ in range(5)))
+    fit = CortexFit(constants, levels, *marks, *(np.empty(count, np.float32) for _ in range(4)))
     steep = np.square(normals @ sampler.frame.normal)
     for members, known in groups:
         for piece, values_d in sampler.pieces(points[members], normals[members]):
@@ -137,7 +143,7 @@ def fit_walls(
             fit.hidden[rows] = hidden & (fit.states[rows] == _BADLY_FITTED)
             fit.shift_mm[rows], fit.thickness_mm[rows] = walls.shift_mm, walls.thickness_mm
             fit.room_mm[rows] = walls.room_mm
-            fit.error_mm[rows], fit.thickness_error_mm[rows] = standard_errors(walls, known, sampler.scale)
+            fit.error_mm[rows] = standard_errors(walls, known)
     return fit
 
 
@@ -150,6 +156,7 @@ def judge_walls(
     thin = walls.thickness_mm < _THINNEST_BLURS * constants.blur_mm
     states[walls.residual_hu > _MOST_RESIDUAL * explained] = _BADLY_FITTED
     states[np.abs(walls.shift_mm) > MOST_SHIFT_MM] = _BADLY_FITTED
+    states[walls.cortex_hu < _LEAST_CORTEX * cortex] = _BADLY_FITTED
     states[thin & (walls.inner_hu < EDGE_SHARE * cortex)] = NOT_BONE
     states[hidden] = _BADLY_FITTED
     states[walls.peak_hu >= METAL_HU] = METAL
@@ -157,15 +164,17 @@ def judge_walls(
     return states
 
 
-def standard_errors(
-    walls: WallFits, constants: CortexConstants, scale: ProfileScale
-) -> tuple[Float32Array, Float32Array]:
-    """Return the standard errors of shift and thickness, mm: noise, what the model leaves, and the constants'."""
+def standard_errors(walls: WallFits, constants: CortexConstants) -> Float32Array:
+    """Return the standard errors of shifts, mm: noise, what the model leaves, and the constants'.
+
+    Where the cortex differs from that of the scan by more than it may, the error grows by the ratio.
+    """
     explained = unexplained_hu(constants.cortex_hu, constants.known_noise)
-    left = np.maximum(walls.residual_hu, np.float32(explained)) / np.float32(np.sqrt(scale.independent))
+    left = np.maximum(walls.residual_hu, np.float32(explained)) * np.float32(np.sqrt(CORRELATED_MM / STEP_MM))
     least = np.float32(_LEAST_ERROR * constants.blur_mm)
-    fit_errors = np.float32(_ERROR_FACTOR) * np.sqrt(walls.shift_variance) * left
-    return np.hypot(fit_errors, least), np.float32(_ERROR_FACTOR) * np.sqrt(walls.thickness_variance) * left
+    differs = np.abs(walls.cortex_hu - constants.cortex_hu) / (constants.cortex_spread * constants.cortex_hu)
+    factors = np.maximum(differs, 1.0).astype(np.float32)
+    return factors * np.hypot(np.float32(_ERROR_FACTOR) * np.sqrt(walls.shift_variance) * left, least)
 
 
 _MOST_LOOKED_AT = 20_000
@@ -237,6 +246,15 @@ def choose_shifts(fit: CortexFit, triangles: NDArray[np.uint32], fans: Fans) -> 
         weights[rows] = weight / _CORNERS
         doubtful = doubtful[fit.hidden[doubtful]]
     return np.clip(shifts, -MOST_SHIFT_MM, MOST_SHIFT_MM)
+
+
+def _place_vertices(
+    fit: CortexFit, mesh: Mesh, normals: NDArray[np.float32], fans: Fans
+) -> tuple[Float64Array, Float64Array]:
+    """Return where the vertices of a mesh should go, and where they go without a triangle turned over."""
+    shifts = choose_shifts(fit, mesh.triangles, fans)
+    wanted = mesh.vertices.astype(np.float64) + shifts[:, None] * normals
+    return wanted, calm_vertices(mesh.vertices, wanted, mesh.triangles, fans)
 
 
 def calm_vertices(
@@ -338,27 +356,24 @@ def fit_cortex(
 
 
 def fit_mesh(
-    mesh: Mesh,
-    resident: DeviceVolume,
-    *,
-    constants: CortexConstants | None = None,
-    progress: Progress = ignore_progress,
+    mesh: Mesh, resident: DeviceVolume, constants: CortexConstants | None, progress: Progress = ignore_progress
 ) -> Mesh:
     """Do what `fit_cortex` does, with constants of the scan that are known."""
     from clrecon.operators.surface.decimation import find_crossings
 
     steps = Steps(progress, "cortex", 4)
     _refuse_few(mesh.vertex_count, mesh.vertex_count)
-    normals = _normals_of(mesh)
-    fit = fit_walls(
-        resident, mesh.vertices, normals, stopwatch=Stopwatch(), constants=constants, components=_label(mesh, resident)
-    )
+    fans, normals = Fans(mesh.triangles, mesh.vertex_count), _normals_of(mesh)
+    fit_along = partial(fit_walls, resident, mesh.vertices, stopwatch=Stopwatch(), components=_label(mesh, resident))
+    fit = fit_along(normals, constants=constants)
     _refuse_few(int(np.count_nonzero(fit.states == FITTED)), len(fit.states))
     steps.take()
-    fans = Fans(mesh.triangles, mesh.vertex_count)
-    shifts = choose_shifts(fit, mesh.triangles, fans)
-    wanted = mesh.vertices + shifts[:, None] * normals.astype(np.float64)
-    calm = calm_vertices(mesh.vertices, wanted, mesh.triangles, fans)
+    wanted, calm = _place_vertices(fit, mesh, normals, fans)
+    if fit.constants.blur_across_mm > _STEPPED * fit.constants.blur_mm:
+        around = fans.sums(vertex_normals(calm, mesh.triangles), mesh.triangles, np.arange(mesh.vertex_count))
+        normals = around / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), np.float32(1e-12))
+        fit = fit_along(normals, constants=fit.constants)
+        wanted, calm = _place_vertices(fit, mesh, normals, fans)
     steps.take()
     vertices, _ = move_vertices(
         mesh.vertices, mesh.triangles, calm - mesh.vertices, partial(find_crossings, resident.device), fans=fans
@@ -367,7 +382,7 @@ def fit_mesh(
     fitted = fit.states == FITTED
     unmoved = int(np.count_nonzero(fitted & (np.abs(vertices - wanted).max(axis=1) > KEPT_MM)))
     known = np.isin(fit.states, (FITTED, _BADLY_FITTED))
-    report = _describe_fit(fit, resident, mesh.vertices, normals, True, unmoved)
+    report = _describe_fit(fit, resident, mesh.vertices, normals, unmoved)
     moved = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), {**mesh.report, "cortex": report})
     moved.values = {
         "thickness_mm": np.where(known, fit.thickness_mm, np.float32(np.nan)),
@@ -388,7 +403,7 @@ def fit_meshes(meshes: Sequence[Mesh], resident: DeviceVolume, *, progress: Prog
         try:
             for attempt in resident.with_fallback():
                 with attempt:
-                    fitted[row] = fit_mesh(meshes[row], resident, constants=constants, progress=progress)
+                    fitted[row] = fit_mesh(meshes[row], resident, constants, progress)
             constants = fitted[row].report["cortex"].constants
         except NoSurfaceError as error:
             refused.append(error)
@@ -424,7 +439,7 @@ def measure_outside(mesh: Mesh, resident: DeviceVolume, *, constants: CortexCons
     points, normals = mesh.vertices[rows], _normals_of(mesh)[rows]
     fit = fit_walls(resident, points, normals, stopwatch=Stopwatch(), constants=constants)
     _refuse_few(int(np.count_nonzero(fit.states == FITTED)), len(fit.states))
-    return _describe_fit(fit, resident, points, normals, False, 0)
+    return _describe_fit(fit, resident, points, normals, None)
 
 
 def _label(mesh: Mesh, resident: DeviceVolume) -> NDArray[np.int64]:
@@ -455,25 +470,23 @@ def _describe_fit(
     resident: DeviceVolume,
     points: NDArray[np.floating],
     normals: NDArray[np.floating],
-    moved: bool,
-    unmoved: int,
+    unmoved: int | None,
 ) -> CortexReport:
+    """Report a fit; unmoved is None where the surface was not moved."""
     fitted = fit.states == FITTED
     shift, thickness = fit.shift_mm[fitted].astype(np.float64), fit.thickness_mm[fitted]
+    blur_mm = fit.constants.blur_mm
     return CortexReport(
-        moved=moved,
+        moved=unmoved is not None,
         constants=fit.constants,
         own_cortex_hu=list(fit.own_cortex_hu),
         vertices=len(fit.states),
         **{name.replace(" ", "_"): count for name, count in fit.counts().items()},
-        kept=unmoved,
+        kept=unmoved or 0,
         outside_mm={"mean": float(-shift.mean()), **_percentiles(-shift, 5, 50, 95)},
         error_mm=_percentiles(fit.error_mm[fitted], 50, 95),
         bias_mm=_measure_bias(fit, resident, points, normals),
-        thickness_mm={
-            **_percentiles(thickness, 5, 50, 95),
-            "thin_share": float(np.mean(thickness < fit.constants.blur_mm)),
-        },
+        thickness_mm={**_percentiles(thickness, 5, 50, 95), "thin_share": float((thickness < blur_mm).mean())},
     )
 
 
@@ -492,9 +505,7 @@ def _measure_bias(
     changes = []
     for name in ("blur_mm", "blur_across_mm", "cortex_hu"):
         error = getattr(known, f"{name.removesuffix('_mm').removesuffix('_hu')}_error_{name[-2:]}")
-        ends = []
-        for sign in (-1.0, 1.0):
-            shifted = known.changed(**{name: getattr(known, name) + sign * error})
-            ends.append(walls.fit_with(shifted).shift_mm.astype(np.float64).mean())
-        changes.append(0.5 * (ends[1] - ends[0]))
+        below, above = (known.changed(**{name: getattr(known, name) + change}) for change in (-error, error))
+        apart = walls.fit_with(above).shift_mm.astype(np.float64) - walls.fit_with(below).shift_mm
+        changes.append(0.5 * apart.mean())
     return float(np.linalg.norm(changes))

@@ -123,7 +123,7 @@ def fit_profiles(
     precisions: tuple[float, float, float],
     rise: float,
 ) -> Float64Array:
-    """Return results (10, n) of profiles (SAMPLES + 2, n); `precisions` of the HU around, of cortex and inside."""
+    """Return results (9, n) of profiles (SAMPLES + 2, n); `precisions` of the HU around, of cortex and inside."""
     steep, gap = profiles[SAMPLES], profiles[SAMPLES + 1]
     over = np.maximum(blur_mm**2 + (across_mm**2 - blur_mm**2) * gap, 0.1 * blur_mm**2)
     width = np.sqrt(blur_mm**2 * (1.0 - steep) + over * steep)
@@ -174,6 +174,6 @@ def fit_profiles(
         damping = damping * np.where(following.cost < SLACK * now.cost, 0.2, 5.0)
         now = now.replaced(following, SLACK)
     now.square[:, (0, 1), (0, 1)] += ease
-    variances = 1e-6 * np.linalg.inv(now.square)[:, (0, 1), (0, 1)].T
+    variance = 1e-6 * np.linalg.inv(now.square)[:, 0, 0]
     residual = 1000.0 * np.sqrt(np.maximum(now.samples, 0.0) / (weights.sum(axis=1) + 1e-6))
-    return np.vstack([now.x0, now.t, 1000.0 * now.plateaus.T + cortex_hu, residual, variances, peak, room])
+    return np.vstack([now.x0, now.t, 1000.0 * now.plateaus.T + cortex_hu, residual, variance, peak, room])

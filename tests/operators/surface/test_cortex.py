@@ -13,9 +13,18 @@ from clrecon.geometry import Volume
 from clrecon.opencl import Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import cortex
-from clrecon.operators.surface.cortex import CortexConstants, ProfileSampler
+from clrecon.operators.surface.cortex import CortexConstants, ProfileSampler, ProfileScale, WallFits
 from clrecon.operators.surface.cortex_constants import MOST_WALLS
-from clrecon.operators.surface.cortex_mesh import _STATES, FITTED, METAL, NO_ROOM, NOT_BONE, fit_walls
+from clrecon.operators.surface.cortex_mesh import (
+    _STATES,
+    FITTED,
+    METAL,
+    NO_ROOM,
+    NOT_BONE,
+    fit_walls,
+    judge_walls,
+    standard_errors,
+)
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.proof.checking import OBLIQUE, stack
 from clrecon.proof.surface.surface_checks import CORTEX_CHECKS
@@ -118,6 +127,20 @@ def test_vertices_on_vessels_metal_and_ends_are_told_as_no_wall(device):
     assert (fit.states[beside] == NOT_BONE).mean() > 0.95
     assert set(fit.states[near_metal].tolist()) == {METAL}
     assert sum(fit.counts().values()) == mesh.vertex_count
+
+
+@pytest.mark.parametrize("cortex_hu, state, factor", [(1000.0, "fitted", 1.0), (1140.0, "fitted", 1.0),
+                                                      (1450.0, "fitted", 3.0), (710.0, "fitted", 29.0 / 15.0),
+                                                      (690.0, "badly fitted", 31.0 / 15.0)])  # fmt: skip
+def test_walls_unlike_the_cortex_of_the_scan_have_larger_errors_or_follow(cortex_hu, state, factor):
+    constants = CortexConstants(0.7, 0.7, 1000.0, 0.02, 0.02, 50.0, 10.0, 20.0, 500, 100)
+    scale = ProfileScale.of(hollow_ball())
+    rows = (0.0, 2.0, 50.0, cortex_hu, 250.0, 5.0, 1e-6, 900.0, 2.5)
+    walls = WallFits(*(np.array([value], np.float32) for value in rows))
+    usual = WallFits(*(np.array([value], np.float32) for value in (*rows[:3], 1000.0, *rows[4:])))
+    assert _STATES[judge_walls(walls, constants, scale, np.zeros(1, bool))[0]] == state
+    error, of_usual = (standard_errors(fits, constants) for fits in (walls, usual))
+    np.testing.assert_allclose(error, factor * of_usual, rtol=1e-5)
 
 
 def test_thick_slices_hide_thin_walls_across_them_alone(device):

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from refusals import refused
 from scipy.special import ndtr
+from surface_volumes import MIDDLE as BALL
+from surface_volumes import hollow_ball
 
 import clrecon
 from clrecon.errors import NoSurfaceError, UsageError
@@ -17,9 +19,11 @@ from clrecon.jobs.mesh.make import _try_steps
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.intersections import find_self_intersections
+from clrecon.opencl import Stopwatch
 from clrecon.opencl.launching import launch
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import cortex, decimation
-from clrecon.operators.surface.cortex_mesh import CortexFit, calm_vertices, choose_shifts, find_turned
+from clrecon.operators.surface.cortex_mesh import CortexFit, calm_vertices, choose_shifts, find_turned, fit_walls
 from clrecon.operators.surface.extract import extract_isosurface
 
 MIDDLE = np.array([19.5, 19.0, 18.0])
@@ -94,10 +98,26 @@ def test_walls_that_thick_slices_hide_follow_their_neighbours():
     states = np.where(columns < 3, 0, 3).astype(np.uint8).ravel()
     shift, error = np.where(states == 0, -0.5, 9.0).astype(np.float32), np.full(81, 0.1, np.float32)
     hidden = (states == 3) & (rows < 5).ravel()
-    fit = CortexFit(None, (), states, hidden, shift, error, error, error, error)
+    fit = CortexFit(None, (), states, hidden, shift, error, error, error)
     shifts = choose_shifts(fit, triangles, Fans(triangles, 81)).reshape(9, 9)
     np.testing.assert_allclose(shifts[:4], np.where(columns < 6, -0.5, 0.0)[:4], rtol=1e-6)
     np.testing.assert_allclose(shifts[6:], np.where(columns < 4, -0.5, 0.0)[6:], rtol=1e-6)
+
+
+def test_thick_slices_are_fitted_again_along_the_normals_of_the_moved_surface(device):
+    """Slices of 3 mm make steps of a ball: their field's normals are off where it is slanted."""
+    volume = hollow_ball(thickness=1.5, spacing=(1.0, 1.0, 3.0))
+    level = extract_isosurface(volume, 200.0, device=device)
+    with DeviceVolume(volume, device=device) as resident:
+        once = fit_walls(resident, level.vertices, level.normals, stopwatch=Stopwatch())
+    shifts = choose_shifts(once, level.triangles, Fans(level.triangles, level.vertex_count))
+    outer = np.linalg.norm(level.vertices - BALL, axis=1) > 11.5
+
+    def mean_error(vertices):
+        return np.abs(np.linalg.norm(vertices[outer] - BALL, axis=1) - 13.0).mean()
+
+    twice = clrecon.fit_cortex(level, volume, device=device)
+    assert mean_error(twice.vertices) < 0.9 * mean_error(level.vertices + shifts[:, None] * level.normals)
 
 
 def test_sums_over_triangles_are_twice_those_over_neighbours(level):
