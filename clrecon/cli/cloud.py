@@ -125,8 +125,8 @@ def _describe_step(step: dict[str, Any]) -> str:
         return f"{after:,} normals, {step['doubtful']:,} doubtful, oriented by {step['oriented_by'] or 'nothing'}"
     removed = [f"{count:,} {reason}" for reason, count in step["removed"].items() if count]
     if not removed:
-        return f"{after:,} points, none went"
-    return f"{after:,} of {step['points_before']:,} points stay, {', '.join(removed)} went"
+        return f"{after:,} points, none removed"
+    return f"{after:,} of {step['points_before']:,} points kept, removed {', '.join(removed)}"
 
 
 def _describe_removed(report: dict[str, Any]) -> list[str]:

@@ -115,7 +115,7 @@ _STAGES = {
     "slabs": "rendering slab by slab",
     "select": "selecting components",
     "smooth": "smoothing",
-    "decimate": "taking triangles away",
+    "decimate": "removing triangles",
     "compare": "comparing with the surface before",
     "write": "writing",
     "measure": "measuring the mesh, and its distance from the scan",

@@ -270,7 +270,7 @@ def describe_cortex(meshes: list[dict[str, Any]]) -> list[str]:
     ends = f"5 % to 95 %: {outside['p5']:+.2f} to {outside['p95']:+.2f}"
     if not cortex["moved"]:
         side = "outside" if outside["mean"] >= 0.0 else "inside"
-        return [f"cortex   lies {abs(outside['mean']):.2f} mm {side} of the bone ({ends}), told at {share:.0f} % of it"]
+        return [f"cortex   lies {abs(outside['mean']):.2f} mm {side} of the bone ({ends}), measured at {share:.0f} %"]
     return [
         f"cortex   {share:.0f} % of the vertices lie on the bone, {outside['mean']:.2f} mm inside of the level"
         f" ({ends}); error {error['p50']:.2f} mm (95 %: {error['p95']:.2f}), of all {cortex['bias_mm']:.2f}; walls"
@@ -365,9 +365,9 @@ def _describe_decimation(decimation: dict[str, Any]) -> str:
     asked, reached = 100 * decimation["fraction"], 100 * decimation["reached"]
     topology = _describe_topology(decimation["topology"])
     if decimation["ended_by"] == "share":
-        return f"{reached:.1f} % of the triangles taken away, as asked, {topology}"
-    bound = f"the bound of {format_digits(decimation['max_deviation_mm'])} mm"
-    return f"{reached:.1f} % of the triangles taken away of {asked:g} % asked for: {bound} ended it, {topology}"
+        return f"{reached:.1f} % of the triangles removed, as asked, {topology}"
+    bound = f"the error bound of {format_digits(decimation['max_deviation_mm'])} mm"
+    return f"{reached:.1f} % of the triangles removed; {bound} does not allow {asked:g} %; {topology}"
 
 
 def _describe_topology(topology: Mapping[str, Any]) -> str:

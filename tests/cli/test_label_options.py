@@ -241,7 +241,7 @@ def test_masks_are_split_filtered_smoothed_and_printed_label_by_label(
         (["--seed", "1,2"], 3, "'1,2' is no point: three numbers in mm with commas"),
         (["--keep-largest", "0"], 3, "the number of components to keep must be 1 or more"),
         (["--min-volume", "-1"], 3, "the smallest volume to keep must be above 0 ml"),
-        (["--decimate", "2"], 3, "the share of triangles to take away lies between 0 and 1"),
+        (["--decimate", "2"], 3, "the share of triangles to remove is between 0 and 1"),
         (["--smooth", "0"], 3, "smoothing takes from 1 to 1000 iterations"),
         (["--max-deviation", "0.1"], 3, "a largest deviation bounds smoothing and decimation"),
         (["--keep", "bone"], 3, "labels say what is kept"),

@@ -84,7 +84,7 @@ def test_mesh_is_written_by_every_other_method(method: str, bones: Path, tmp_pat
     [
         (["--method", "mc33"], "there is no --method mc33: it is one of t-mc, i-mc, g-mc, s-mc, t-mc-soup, skimage"),
         (["--method", "t-mc", "--grow-from", "auto"], "--method t-mc makes the whole surface: leave --grow-from out"),
-        (["--grow-from", "auto", "--topology", "trilinear"], "--topology trilinear cannot be grown"),
+        (["--grow-from", "auto", "--topology", "trilinear"], "leave out --topology trilinear"),
         (["--grow-from", "spine"], "'spine' is neither auto nor X,Y,Z in mm nor label:NAME"),
         (["--grow-from", "label:"], "--grow-from is auto, X,Y,Z in mm or label:NAME"),
         (["--grow-from", "1,2,nan"], "a seed is a point of three numbers in mm"),

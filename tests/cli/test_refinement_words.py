@@ -24,7 +24,7 @@ def told(**topology: int) -> str:
 
 
 def test_the_euler_number_is_said_before_and_after() -> None:
-    start = "refined  83.6 % of the triangles taken away of 90 % asked for: the bound of 0.175 mm ended it, "
+    start = "refined  83.6 % of the triangles removed; the error bound of 0.175 mm does not allow 90 %; "
     assert told() == start + "Euler number 1454 before and after"
     assert told(euler_number_after=1456, components_changed=1) == (
         start + "Euler number 1454 before, 1456 after (changed in 1 of 932 components)"

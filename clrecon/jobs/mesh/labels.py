@@ -182,4 +182,4 @@ def _advise(too_small: bool, origin: dict[str, Any]) -> str:
     if origin["solid"]:
         return f"much of the label lies {below} up to its border; a lower {level} or {mask} takes it in"
     solid = name_parameter("solid", True)
-    return f"what lies {below} is left out; {solid} fills the marrow of bones, {mask} takes organs and all else"
+    return f"what lies {below} is left out; {solid} fills the marrow of bones, {mask} suits organs and everything else"

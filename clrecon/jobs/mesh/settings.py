@@ -490,7 +490,7 @@ class MeshSettings(options.InputSettings):
         if self.smooth is not None and not 1 <= self.smooth <= 1000:
             raise UsageError(f"smoothing takes from 1 to 1000 iterations, not {self.smooth}")
         if self.decimate is not None and not 0.0 < self.decimate < 1.0:
-            raise UsageError(f"the share of triangles to take away lies between 0 and 1, {self.decimate:g} does not")
+            raise UsageError(f"the share of triangles to remove is between 0 and 1, not {self.decimate:g}")
         if self.max_deviation_mm is None:
             return
         if self.method == "g-mc":

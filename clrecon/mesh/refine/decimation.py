@@ -80,7 +80,7 @@ def check_refinement(mesh: Mesh, max_deviation_mm: float | None) -> float:
 def check_share(fraction: float) -> None:
     """Check a share of triangles to remove; raises UsageError."""
     if not 0.0 < fraction < 1.0:
-        raise UsageError(f"the share of triangles to take away lies between 0 and 1, {fraction:g} does not")
+        raise UsageError(f"the share of triangles to remove is between 0 and 1, not {fraction:g}")
 
 
 def check_triangles(mesh: Mesh) -> None:

@@ -153,7 +153,7 @@ def check_method(
         )
     if (grows or chosen.grows) and topology != "separated":
         raise UsageError(
-            f"a surface of {name_parameter('topology', topology)} cannot be grown: it is grown cell by cell"
+            f"growing from seeds needs the default topology: leave out {name_parameter('topology', topology)}"
         )
     if chosen.on_device:
         return chosen

@@ -127,7 +127,7 @@ def check_known(mode: str, keyword: str, called: str | None = None) -> None:
     modes = [name for name in modes if name in _ALONE.get(keyword, modes)]
     if mode not in modes:
         named = name_parameter(called or keyword)
-        raise UsageError(f"{named} means nothing in mode {mode}: it belongs to {', '.join(modes)}")
+        raise UsageError(f"{named} does not apply to mode {mode}, only to {', '.join(modes)}")
 
 
 def choose_mode(mode: str | None = None, preset: str | None = None, **look: object) -> str:

@@ -206,7 +206,7 @@ class Projection(Style):
         super().__post_init__()
         if self.keep_air and self.kind != "minip":
             raise UsageError(
-                f"{name_parameter('keep_air')} means nothing in mode {self.kind}: minip alone leaves air out"
+                f"{name_parameter('keep_air')} does not apply to mode {self.kind}: only minip leaves air out"
             )
         if self.kind == "drr" and isinstance(named, str):
             raise UsageError(

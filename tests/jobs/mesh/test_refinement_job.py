@@ -118,7 +118,7 @@ def test_strict_is_an_exit_code_and_nothing_else(
     assert main(arguments) == 0
     told = capsys.readouterr()
     assert "clrecon: warning: gate deviation_p95 failed: distance from the surface before" in told.err
-    assert "% of the triangles taken away" in told.out
+    assert "% of the triangles removed" in told.out
     content = output.read_bytes()
     output.unlink()
 
@@ -151,7 +151,7 @@ def test_strict_passes_what_is_good(
     ("options", "complaint"),
     [
         ({"smooth": 0}, "from 1 to 1000 iterations, not 0"),
-        ({"decimate": 90.0}, "between 0 and 1, 90 does not"),
+        ({"decimate": 90.0}, "between 0 and 1, not 90"),
         ({"decimate": 0.5, "max_deviation_mm": 0.0}, "above 0, not 0"),
         ({"decimate": 0.5, "max_deviation_mm": float("nan")}, "above 0, not nan"),
         ({"max_deviation_mm": 0.2}, "ask for one of them too"),

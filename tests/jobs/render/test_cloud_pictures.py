@@ -87,12 +87,12 @@ def test_options_about_scans_are_refused_for_clouds(
         (["--mode", "mip"], "which mode points shows, and not mode mip"),
         (["--remove-table"], "--remove-table is about a scan"),
         (["--phase", "2"], "--phase is about a scan"),
-        (["--iso", "300"], "--iso means nothing in mode points"),
-        (["--shadows"], "--shadows means nothing in mode points"),
+        (["--iso", "300"], "--iso does not apply to mode points"),
+        (["--shadows"], "--shadows does not apply to mode points"),
         (["--color", "hue"], "unknown colour 'hue'"),
         (["--point-radius", "0"], "the radius of points is a length in mm"),
         (["--color", "label", "--window", "0,9"], "--color hu"),
-        (["--values", str(tmp_path / "v.npy")], "--values means nothing in mode points"),
+        (["--values", str(tmp_path / "v.npy")], "--values does not apply to mode points"),
     ):
         assert main(["render", str(file), *out, *option]) == 3, option
         assert says in capsys.readouterr().err

@@ -139,7 +139,7 @@ def test_turntable_of_a_mesh_has_its_frames(device: Any, files: dict[str, Path],
 def test_options_without_meaning_for_meshes_are_refused(files: dict[str, Path], tmp_path: Path, capsys: Any) -> None:
     out, ball_file = str(tmp_path / "out.png"), str(files["lps.stl"])
     for words, text in (
-        ([str(files["scan.nii"]), "--mode", "mip", "--mesh", ball_file], "--mesh means nothing in mode mip"),
+        ([str(files["scan.nii"]), "--mode", "mip", "--mesh", ball_file], "--mesh does not apply to mode mip"),
         ([str(files["scan.nii"]), "--mesh-space", "ras"], "name one with --mesh"),
         ([str(files["scan.nii"]), "--mesh", ball_file + "=octarine"], "unknown colour 'octarine'"),
         ([str(files["scan.nii"]), "--mesh", ball_file + "=red,2"], "opacity of a mesh"),
@@ -149,7 +149,7 @@ def test_options_without_meaning_for_meshes_are_refused(files: dict[str, Path], 
         ([ball_file, "--fov"], "the input is a mesh"),
         ([ball_file, "--mesh-space", "ras"], "leave the space out"),
         ([str(files["scan.nii"]), "--mode", "mesh"], ".stl, .ply"),
-        ([str(files["scan.nii"]), "--opacity", "0.5"], "--opacity means nothing in mode dvr"),
+        ([str(files["scan.nii"]), "--opacity", "0.5"], "--opacity does not apply to mode dvr"),
     ):
         assert main(["render", *words, "-o", out]) != 0
         error = capsys.readouterr().err

@@ -48,7 +48,7 @@ REFUSED: dict[str, tuple[dict[str, Any], list[str]]] = {
         ["leave out view, up and view_angle, or the camera"],
     ),
     "camera and up of a slice": ({"camera": AHEAD, "up": (0, 0, 1), "mode": "slice"}, ["leave out up, or"]),
-    "zoom of a curve": ({"mode": "cpr", "zoom": 2.0}, ["zoom means nothing in mode cpr"]),
+    "zoom of a curve": ({"mode": "cpr", "zoom": 2.0}, ["zoom does not apply to mode cpr"]),
     "lighting": ({"lighting": 3}, ["lighting"]),
     "clip": ({"clip": [(0, 0, 1)]}, ["clip"]),
     "function of numbers": ({"transfer_function": [(0, 1, 1, 1, 1)]}, ["transfer function"]),

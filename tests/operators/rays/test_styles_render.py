@@ -109,7 +109,7 @@ def test_keywords_beside_a_style_are_refused_where_they_mean_nothing(device: Any
     with VolumeRenderer(body(), device=device) as renderer:
         with pytest.raises(UsageError, match="leave out color, or the style"):
             renderer.render(SurfaceLook(), color="red")
-        with pytest.raises(UsageError, match="view_angle means nothing in mode slice"):
+        with pytest.raises(UsageError, match="view_angle does not apply to mode slice"):
             renderer.render(PlaneCut(), view_angle=20.0)
         with pytest.raises(UsageError, match="a curved reformation has no camera"):
             renderer.render(CurveCut(LINE), camera=clrecon.Camera.fit(renderer.volume))
