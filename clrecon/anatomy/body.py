@@ -246,7 +246,7 @@ def _find_body(cells: Cells, steps: Steps) -> tuple[Mask, dense_pieces.DensePiec
     body |= _thin_parts(tissue, body, cells.size_mm)
     body |= pieces.added
     steps.take()
-    _fill_holes(body)
+    body |= find_holes(body)
     body = grow(body, MARGIN_MM / across)
     steps.take()
     return body, pieces
@@ -257,14 +257,6 @@ def _describe_dense(cells: Cells) -> str:
     if not dense:
         return f"no voxel above {DENSE_HU:g} HU"
     return f"{dense:,} voxels above {DENSE_HU:g} HU, all of tables, rails or cables by their shape"
-
-
-def _fill_holes(mask: Mask) -> None:
-    rows, columns = (np.flatnonzero(mask.any(axis=axes)) for axes in ((0, 2), (0, 1)))
-    if not len(rows):
-        return
-    box = mask[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    box |= find_holes(box)
 
 
 def _thick_parts(tissue: Mask, across: float) -> Mask:

@@ -31,7 +31,7 @@ from clrecon.exchange.content import BONE_COLOR, Assembly, Content, check_same, 
 from clrecon.exchange.coordinates import find_places
 from clrecon.exchange.raw_content import MOST_LEVELS, Part, PlacedShapes, RawMesh, Shape, say_cut
 from clrecon.system.paths import open_regular
-from clrecon.system.pieces import local_origin
+from clrecon.system.pieces import list_distinct, local_origin
 from clrecon.system.text import escape_text
 
 _NAMELESS = "surface"
@@ -350,7 +350,7 @@ def _joined(shape: Shape) -> Shape:
     """Join corners that coincide; normals that differ there are left out."""
     if (shape.triangles >= len(shape.vertices)).any():
         raise ValueError(f"a triangle refers to vertex {int(shape.triangles.max()):,} of {len(shape.vertices):,}")
-    used = np.unique(shape.triangles)
+    used = list_distinct(shape.triangles)
     first, inverse = find_places(shape.vertices[used])
     number = np.zeros(len(shape.vertices), np.int64)
     number[used] = inverse

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clrecon.anatomy.body import _fill_holes, _find_cavities, find_unmeasured
+from clrecon.anatomy.body import _find_cavities, find_unmeasured
 from clrecon.anatomy.body_cells import count_cells, grow, measure_cells
 from clrecon.geometry import Volume
 
@@ -59,21 +59,6 @@ def test_counts_of_cells_hold_every_voxel_of_micro_ct(mm, n):
     assert cells.step == (n, n, n)
     assert cells.dense.ravel().tolist() == [n**3, 3 * n * n]
     assert cells.hard.ravel().tolist() == [n**3 - 1, 3 * n * n]
-
-
-def test_holes_are_those_of_each_slice():
-    from scipy.ndimage import binary_fill_holes
-
-    mask = np.random.default_rng(3).random((9, 30, 33)) < 0.55
-    mask[:, :4] = mask[:, :, -3:] = False
-    mask[4] = False
-    expected = np.stack([binary_fill_holes(layer) for layer in mask])
-    assert (expected != mask).any()
-    _fill_holes(mask)
-    assert np.array_equal(mask, expected)
-    nothing = np.zeros((2, 3, 4), bool)
-    _fill_holes(nothing)
-    assert not nothing.any()
 
 
 def test_what_is_not_measured_begins_at_the_corners_and_is_large():

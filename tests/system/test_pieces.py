@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 
+import numpy as np
 import pytest
 
-from clrecon.system.pieces import side_by_side
+from clrecon.system.pieces import list_distinct, side_by_side
 
 pytestmark = pytest.mark.unit
 
@@ -31,3 +32,10 @@ def test_what_one_of_two_functions_raises_is_raised_after_both_have_ended(first)
         else:
             side_by_side(lambda: ended.append(1), fail)
     assert ended == [1]
+
+
+@pytest.mark.parametrize("numbers", [[], [7], [3, 3, 3], [[5, -1], [2, 5]]])
+def test_distinct_numbers_rise_and_are_each_there_once(numbers):
+    found = list_distinct(np.array(numbers, dtype=np.int32))
+    assert found.dtype == np.int32
+    assert found.tolist() == sorted(set(np.ravel(numbers).tolist()))

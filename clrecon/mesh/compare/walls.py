@@ -20,6 +20,7 @@ from clrecon.geometry.iso_rule import IsoRule
 from clrecon.mesh.compare.iso_distance import trilinear_values
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.pieces import list_distinct
 from clrecon.system.records import Record
 
 COMPACT_HU = 600.0
@@ -213,9 +214,9 @@ def _is_near(points: NDArray[np.float64], marked: NDArray[np.bool_], size_mm: fl
     cells = np.floor((points - points.min(axis=0)) / size_mm).astype(np.int64) + 1
     sizes = cells.max(axis=0) + 2
     strides = np.array([sizes[1] * sizes[2], sizes[2], 1])
-    near = np.unique(cells[marked] @ strides)
+    near = list_distinct(cells[marked] @ strides)
     for stride in strides:
-        near = np.unique(np.concatenate([near - stride, near, near + stride]))
+        near = list_distinct(np.concatenate([near - stride, near, near + stride]))
     return np.isin(cells @ strides, near)
 
 

@@ -24,6 +24,7 @@ from clrecon.operators.points.grid import (
 from clrecon.points import PointCloud
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.pieces import list_distinct
 from clrecon.system.progress import Progress, ignore_progress
 
 _CANDIDATES = 5.6
@@ -67,7 +68,7 @@ def choose_cell_edge(points: NDArray[np.floating], k: int) -> float:
     share = min(-math.log(_ALONE) / wanted, 1.0)
     groups = max(1, min(round(1.0 / share), round(_SAMPLED / max(share * n, 1.0))))
     rng = np.random.default_rng(0)
-    chosen = np.unique(rng.integers(0, n, min(n, round(groups * share * n) + 1)))
+    chosen = list_distinct(rng.integers(0, n, min(n, round(groups * share * n) + 1)))
     places = np.asarray(points[chosen], dtype=np.float64) - low
     group = rng.integers(0, groups, len(chosen))
     shortest = max(extent / (0.99 * MOST_CELLS_ALONG), _edge_of_box(high - low, max(_MANY_CELLS, _CELLS_A_POINT * n)))

@@ -21,7 +21,7 @@ from clrecon.geometry.iso_rule import layer_normal_matrices
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.base_classes import Message
-from clrecon.system.pieces import chunks
+from clrecon.system.pieces import chunks, list_distinct
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 
@@ -95,7 +95,7 @@ class GridCells(Message):
             raise UsageError(
                 f"cells are whole numbers of shape (n, 3), these are {corners.dtype} of shape {corners.shape}"
             )
-        self._keys = np.unique(_pack(corners.astype(np.int64)))
+        self._keys = list_distinct(_pack(corners.astype(np.int64)))
         self._keys.flags.writeable = False
         self.name = name
 
@@ -195,9 +195,9 @@ def find_mesh_cells(mesh: Mesh, grid: Grid, *, name: str = "", progress: Progres
     packed = []
     for piece in chunks(mesh.triangle_count, _PIECE):
         report("cells", piece.start, mesh.triangle_count)
-        packed += [np.unique(_pack(cells)) for cells in _cells_of(ijk[mesh.triangles[piece]], min(margin, 0.25))]
+        packed += [list_distinct(_pack(cells)) for cells in _cells_of(ijk[mesh.triangles[piece]], min(margin, 0.25))]
     report("cells", mesh.triangle_count, mesh.triangle_count)
-    return GridCells(_unpack(np.unique(np.concatenate(packed))), name)
+    return GridCells(_unpack(list_distinct(np.concatenate(packed))), name)
 
 
 def _steps_per_mm(grid: Grid) -> float:
