@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("input", metavar="MANIFEST", help="table of the cases, or a folder whose series are the cases")
     common.add_output(parser, "folder that gets a folder for each case, the table and the page")
-    common.add_fields(parser.add_argument_group("what is made of each case"), BatchSettings, "make")
+    common.add_fields(parser.add_argument_group("output of each case"), BatchSettings, "make")
     common.add_fields(parser.add_argument_group("how it runs"), BatchSettings, "run")
     common.add_fields(parser.add_argument_group("existing cases"), BatchSettings, "again")
     add_mesh_options(parser, without=("path",))

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     width = max(map(len, STEPS))
     parser.epilog = "\n".join(
         (
-            "The steps run in this order, whatever the order of the options:",
+            "The steps run in this order, in whichever order the options are given:",
             *(f"  {name:<{width}}  {text}" for name, text in STEPS.items()),
             "",
             "Points are in patient millimetres, by default in the DICOM frame (LPS: left, posterior, superior).",

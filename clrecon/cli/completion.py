@@ -39,11 +39,11 @@ class _Words:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "The script is made from the options of this version. Where it goes:\n"
+        "The script is made from the options of this version. Where to save it:\n"
         "  bash   clrecon completion bash > ~/.local/share/bash-completion/completions/clrecon\n"
         '  zsh    clrecon completion zsh > "${fpath[1]}/_clrecon"\n'
         "  fish   clrecon completion fish > ~/.config/fish/completions/clrecon.fish\n"
-        "For this shell alone: source <(clrecon completion bash), or source <(clrecon completion zsh) after compinit."
+        "For this shell only: source <(clrecon completion bash), or source <(clrecon completion zsh) after compinit."
     )
     parser.add_argument("shell", metavar="|".join(SHELLS), type=str.lower, help="the shell that completes")
 

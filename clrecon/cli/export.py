@@ -12,13 +12,12 @@ from clrecon.jobs.settings import ExportSettings
 
 _PARTS = ("read", "mask", "resample", "write")
 _EPILOG = """\
-Values are HU, as they were measured: int16 where they fit,
-otherwise int32, and float32 for fractions. Each voxel lies where
-the scan has it: NIfTI in RAS mm, NRRD and MetaImage in LPS
-mm, as these formats have it. Uneven slices fit into no such
-file and are refused without --resample; so is gantry tilt
-in .mha. The file has the certificate of the scan, see
-docs/export.md.
+Values are HU as measured: int16 if they fit, otherwise int32,
+and float32 for fractions. Each voxel keeps its position in the
+scan: NIfTI in RAS mm, NRRD and MetaImage in LPS mm. None of
+these formats can hold uneven slices, and .mha no gantry tilt:
+both are refused without --resample. The file holds the
+certificate of the scan, see docs/export.md.
 
 examples:
   clrecon export CT_FOLDER -o ct.nii.gz

@@ -367,10 +367,9 @@ def _wrap(text: str, width: int, indent: str) -> list[str]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        'The series marked * is the one that "clrecon mesh" would use; beneath the table stands what is known of it,\n'
-        "and the gates that it is held against. Only headers are read, unless --pixels is given. Exit code 0 when\n"
-        "there is a series that can be used, 4 when the series found are refused (their problems are listed) or a\n"
-        "gate failed with --strict, 2 when there is no CT series."
+        'The series marked * is the one that "clrecon mesh" would use; its certificate and gates are below the table.\n'
+        "Only headers are read, unless --pixels is given. Exit code 0: a series can be used; 4: all are refused\n"
+        "(their problems are listed), or a gate failed with --strict; 2: there is no CT series."
     )
     common.add_input(parser)
     common.add_fields(parser, InfoSettings)

@@ -14,8 +14,8 @@ from clrecon.jobs.settings import InsideSettings
 from clrecon.system.text import format_volume
 
 _EPILOG = """\
-parts, each a mesh of its own:
-  solid       all bone: the label, or what is at --hu and above in it, or within the surface fitted to the cortex
+parts, each a separate mesh:
+  solid       all bone: the label, or its voxels at --hu and above, or within the surface fitted to the cortex
               (--surface cortex); closed and filled, without the canal
   dense       its voxels in the band --dense; not a measure of the cortex, which looks thicker than it is
   trabecular  the rest of the solid bone

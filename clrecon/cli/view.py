@@ -15,13 +15,13 @@ from clrecon.jobs.view import ViewSettings
 from clrecon.system.text import format_volume
 
 _EPILOG = """\
-Without --html and --window everything is shown in a browser of this computer, drawn on the OpenCL device: a slider for
-the iso value, presets, slices, parts, measures, clips, and files of what is shown; h shows all keys. It needs no
-OpenGL; over a network use an ssh tunnel. Ctrl-C, or q in the page, ends it.
+Without --html and --window the inputs are shown in a browser of this computer and drawn on the OpenCL device: a slider
+for the iso value, presets, slices, parts, measurements, clips, and saved files; the key h shows all keys. OpenGL is not
+needed; over a network use an ssh tunnel. Ctrl-C, or q in the page, ends the command.
 
-The page of --html is one file: any browser from 2023 on shows it, without a server and offline. It asks for nothing
-from outside and holds no patient data: files are numbered, not named, unless --name is given. It turns, clips and
-measures; parts (components, labels, files) are switched one by one. See docs/view.md.
+The page of --html is one file: any browser from 2023 on shows it, without a server and offline. It loads nothing from
+outside and holds no patient data: files are numbered, not named, unless --name is given. It turns, clips and measures,
+and shows or hides each part (component, label, file). See docs/view.md.
 
 examples:
   clrecon view CT_FOLDER

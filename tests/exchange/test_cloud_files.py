@@ -160,6 +160,8 @@ def test_laspy_reads_the_same_cloud(tmp_path):
     cloud.save(tmp_path / "bone.las")
     las = laspy.read(tmp_path / "bone.las")
     assert np.abs(np.stack([las.x, las.y, las.z], 1) - cloud.points).max() <= tolerances.LAS_POINT_MM
+    middle = (cloud.points.min(axis=0).astype(np.float64) + cloud.points.max(axis=0)) / 2.0
+    np.testing.assert_array_equal(las.header.offsets, np.rint(middle))
     np.testing.assert_array_equal(las["HU"], cloud.hu)
     np.testing.assert_array_equal(las["label"], cloud.labels)
     np.testing.assert_array_equal(las["nz"], cloud.normals[:, 2])

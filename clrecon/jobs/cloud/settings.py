@@ -33,7 +33,7 @@ STEPS = {
     "bilateral": "points move along their normals to the weighted mean height of their neighbours; edges are preserved",
     "normals": "unit vectors that point out of bone",
     "spacing": "one point is kept for each cell of that size",
-    "surface": "a closed mesh around the points, in a file of its own",
+    "surface": "a closed mesh around the points, in a separate file",
 }
 """The steps in the order in which they run, whatever the order of the options."""
 

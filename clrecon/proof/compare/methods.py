@@ -44,7 +44,7 @@ COMPARED = {
         Compared("s-mc", "S-MC", "T-MC, then decimation within a bound, topology kept"),
         Compared("cortex", "Fitted", "T-MC, each vertex moved onto the bone, read from the HU across its wall"),
         Compared("cloud-surface", "Cloud surface", "closed surface around the points of the cloud"),
-        Compared("cloud", "Cloud", "voxels at the border of what is at the level and above, by the affine", CLOUD),
+        Compared("cloud", "Cloud", "voxels at the border of those at the level and above, placed by the affine", CLOUD),
         Compared("rays", "Ray casting", "samples along rays, preset bone, with light", PICTURE),
         Compared("rays-cpu", "Ray casting, CPU", "the same in plain numpy", PICTURE, on_device=False),
     )

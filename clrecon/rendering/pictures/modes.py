@@ -47,10 +47,10 @@ MODES = {
     "mean": Mode(Projection, "the mean HU along each ray"),
     "drr": Mode(Projection, "a radiograph: water-equivalent thickness along the ray, mm"),
     "surface": Mode(SurfaceLook, "the shaded surface at an iso value"),
-    "slices": Mode(SlicesInSpace, "slices of the scan in space, translucent, each where it lies"),
-    "slice": Mode(PlaneCut, "a plane through the volume in any direction, as thick as wanted"),
+    "slices": Mode(SlicesInSpace, "slices of the scan in space, translucent, at their positions"),
+    "slice": Mode(PlaneCut, "a plane through the volume in any direction, of any thickness"),
     "cpr": Mode(CurveCut, "curved planar reformation along a centre line"),
-    "points": Mode(PointLook, "the points of a cloud, coloured by HU, label or what was removed"),
+    "points": Mode(PointLook, "the points of a cloud, coloured by HU, label or reason of removal"),
     "mesh": Mode(MeshLook, "the triangles of a mesh, shaded"),
 }
 
