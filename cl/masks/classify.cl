@@ -9,6 +9,7 @@
  * -D RANGE: inside are the voxels from `level` to `highest`, both included.
  * -D BORDER_INSIDE: the border counts as inside, so that inside samples enclose the others. */
 #include "include/bricks.h"
+#include "include/lanes.h"
 #include "include/volume.h"
 #include "include/mask_rows.h"
 
@@ -64,6 +65,16 @@ static inline uint classify_word(__global const VOXEL *row, int first, int ni, i
     return first - begin < 32 ? bits >> (first - begin) : 0;
 }
 
+/* Inside bits of 32 voxels that begin at a multiple of the size of a VOXEL8, which GPUs load as fast as one voxel. */
+static inline uint classify_vectors(__global const VOXEL8 *voxels, inside_bounds bounds)
+{
+    const short8 first = convert_short8(IS_INSIDE(voxels[0], bounds));
+    const short8 second = convert_short8(IS_INSIDE(voxels[1], bounds));
+    const short8 third = convert_short8(IS_INSIDE(voxels[2], bounds));
+    const short8 fourth = convert_short8(IS_INSIDE(voxels[3], bounds));
+    return pack_lanes((short16)(first, second)) | pack_lanes((short16)(third, fourth)) << 16;
+}
+
 /* Bits of word w of a row of ni voxels that belong to its border; all of the row's where it lies in the border. */
 #ifdef BORDER_INSIDE
 #define BORDER_IS_INSIDE 1
@@ -77,6 +88,19 @@ static inline uint border_bits(int w, int ni, int border, int row_in_volume)
 #define BORDER_IS_INSIDE 0
 static inline uint border_bits(int w, int ni, int border, int row_in_volume) { return 0; }
 #endif
+
+/* The first word of a row with a bit set, any number behind the row without one, and the word after the last, or 0. */
+typedef struct {
+    int begin, end;
+} word_extent;
+
+/* Store the word behind those that were stored. */
+static inline void store_word(__global uint *row_mask, int w, uint bits, word_extent *extent)
+{
+    row_mask[w] = bits;
+    extent->begin = bits != 0 ? min(extent->begin, w) : extent->begin;
+    extent->end = bits != 0 ? w + 1 : extent->end;
+}
 
 /* Parameters  voxels     in   slices of the volume from first_slice on
  *             mask       out  (gk, gj, words) bit set where voxel >= level
@@ -114,14 +138,20 @@ __kernel void classify_samples(
     }
     const inside_bounds bounds = RANGE_BOUNDS;
     __global const VOXEL *row_voxels = voxels + voxel_index(0, j, k - first_slice, ni, nj);
-    int begin = words, end = 0;
-    for (int w = 0; w < words; ++w) {
-        const uint bits = classify_word(row_voxels, 32 * w - border, ni, bounds) | border_bits(w, ni, border, 1);
-        row_mask[w] = bits;
-        begin = min(begin, bits != 0 ? w : words);
-        end = bits != 0 ? w + 1 : end;
+    word_extent set = {words, 0};
+    int w = 0;
+    uint before = 0; /* the last voxel of the word before, which a border moves into the next one */
+    for (; LANES == 1 && ni % 8 == 0 && w < ni / 32; ++w) {
+        const uint voxel_bits = classify_vectors((__global const VOXEL8 *)(row_voxels + 32 * w), bounds);
+        const uint bits = voxel_bits << border | before | border_bits(w, ni, border, 1);
+        before = voxel_bits >> 31 & (uint)border;
+        store_word(row_mask, w, bits, &set);
     }
-    row_extents[row] = (ushort2)((ushort)min(begin, end), (ushort)end);
+    for (; w < words; ++w) {
+        const uint bits = classify_word(row_voxels, 32 * w - border, ni, bounds) | border_bits(w, ni, border, 1);
+        store_word(row_mask, w, bits, &set);
+    }
+    row_extents[row] = (ushort2)((ushort)min(set.begin, set.end), (ushort)set.end);
 }
 
 #if !defined(RANGE) && !defined(BORDER_INSIDE)
@@ -154,7 +184,7 @@ __kernel void classify_bricks(
     __global const VOXEL *row_voxels = voxels + (in_volume ? voxel_index(0, j, k, ni, nj) : 0);
     __global const uchar *row_states = word_states + brick_row * words;
     const inside_bounds bounds = {level};
-    int begin = words, end = 0;
+    word_extent set = {words, 0};
     for (int w = extent.x; w < extent.y; ++w) {
         const int first = 32 * w - border;
         uint bits = 0;
@@ -163,10 +193,8 @@ __kernel void classify_bricks(
             PREFETCH(row_voxels + 2 * ni + first);
         } else if (row_states[w] == BRICK_INSIDE)
             bits = (uint)(low_bits(min(32, ni - first)) & ~low_bits(max(0, -first)));
-        row_mask[w] = bits;
-        begin = min(begin, bits != 0 ? w : words);
-        end = bits != 0 ? w + 1 : end;
+        store_word(row_mask, w, bits, &set);
     }
-    row_extents[row] = (ushort2)((ushort)min(begin, end), (ushort)end);
+    row_extents[row] = (ushort2)((ushort)min(set.begin, set.end), (ushort)set.end);
 }
 #endif

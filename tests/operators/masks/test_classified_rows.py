@@ -1,0 +1,47 @@
+"""The inside mask of GPUs against numpy: rows of whole vectors, and all others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from surface_volumes import random_volume
+
+from clrecon.geometry.iso_rule import choose_iso_rule
+from clrecon.opencl import Device, download, upload
+from clrecon.operators.surface.marching_cubes import classify
+from clrecon.operators.surface.slabs import SampleGrid, Slab
+
+
+@pytest.fixture(scope="module")
+def one_lane(device):
+    """The device with the kernels of GPUs."""
+    gpu = Device(device.index, device.cl_device.platform, device.cl_device)
+    gpu.kernel_variants, gpu.fault = {"LANES": "1", "WORDS_PER_ITEM": "1"}, ""
+    return gpu
+
+
+def inside_rows(inside, border, words):
+    """Return the mask of samples (gk, gj, words), and the first and last words with a bit."""
+    samples = np.pad(inside, border)
+    padded = np.pad(samples, ((0, 0), (0, 0), (0, 32 * words - samples.shape[2])))
+    mask = np.packbits(padded, axis=2, bitorder="little").view("<u4")
+    is_set = mask != 0
+    last = words - np.argmax(is_set[..., ::-1], axis=2)
+    extents = np.stack([np.argmax(is_set, axis=2), np.where(is_set.any(axis=2), last, 0)], axis=2)
+    return mask, extents
+
+
+@pytest.mark.oclgrind
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
+@pytest.mark.parametrize("ni", [8, 31, 32, 40, 64, 65, 72, 128])
+def test_inside_bits_and_extents_equal_those_of_numpy(one_lane, ni, dtype, closed):
+    volume = random_volume((3, 5, ni), dtype, high=100)
+    volume.voxels[1, 2] = 0  # a row without bits
+    volume.voxels[0, :, -1] = 99
+    slab = Slab(SampleGrid(volume, choose_iso_rule(volume, 60, closed=closed)), 0, 3 + 2 * closed)
+    level = np.dtype(dtype).type(slab.grid.rule.lowest_inside)
+    made = classify(one_lane, slab, upload(one_lane, volume.voxels), [level])
+    mask, extents = inside_rows(volume.voxels >= level, slab.grid.rule.border, slab.grid.words)
+    assert np.array_equal(download(one_lane, np.empty_like(mask), made.mask_d), mask)
+    assert np.array_equal(download(one_lane, np.empty(extents.shape, np.uint16), made.row_extents_d), extents)
