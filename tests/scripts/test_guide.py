@@ -151,7 +151,7 @@ def test_every_command_has_a_page_with_its_options(site: Path) -> None:
 
 def test_options_are_those_of_the_help() -> None:
     text = describe_options("distance")
-    assert "`--picture FILE`\n: picture of it with its scale" in text
+    assert "`--picture FILE`\n: draw the coloured mesh with its scale" in text
     assert text.startswith("## Options\n") and "clrecon distance printed.stl bone.stl" in text
 
 
