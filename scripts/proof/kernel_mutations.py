@@ -28,6 +28,7 @@ EQUIVALENT = {
 """Mutations that change nothing, with the reason."""
 
 BITS = (("row_mask[w] = bits;", "row_mask[w] = ~bits;"),)
+STORED_BITS = (("store_word(row_mask, w, bits, &set);", "store_word(row_mask, w, ~bits, &set);"),)
 MARK = (("mask[word] = bits;", "mask[word] = ~bits;"),)
 IMAGE = ("= finish_color(", "= (uchar4)(255) - finish_color(")
 RAY_IMAGE = (("image[pixel] = finish_color(", "image[pixel] = (uchar4)(255) - finish_color("),)
@@ -206,8 +207,8 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "values": (("values[pixel] = value;", "values[pixel] = -value;"),),
         "weights": (("weights[pixel] = weight;", "weights[pixel] = -weight;"),),
     },
-    "classify_samples": {"mask": BITS},
-    "classify_bricks": {"mask": BITS},
+    "classify_samples": {"mask": STORED_BITS},
+    "classify_bricks": {"mask": STORED_BITS},
     "count_rows": {
         "vertices": (("row_counts[row] = vertices;", "row_counts[row] = 99 * words - vertices;"),),
         "triangles": (("= triangles;", "= 99 * words - triangles;"),),
