@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
+from clrecon.system.pieces import chunks
 
 BONE_WINDOW = (-450.0, 1050.0)
 """Level 300, width 1500 HU: distinguishes marrow, cortex and soft tissue."""
@@ -54,11 +55,13 @@ def checked_window(window: Sequence[float] | str) -> tuple[float, float]:
 def grey_image(values: NDArray[Any], window: Sequence[float]) -> NDArray[np.uint8]:
     """Turn values (h, w), HU or NaN for empty pixels, into a picture (h, w, 4), where these have opacity 0."""
     low, high = checked_window(window)
-    there = ~np.isnan(values)
-    share = np.clip((np.where(there, values, low) - low) / (high - low), 0.0, 1.0)
-    grey = np.rint(255.0 * share).astype("<u4")
-    image = (grey * 0x010101 + there.astype("<u4") * 0xFF000000).view(np.uint8).reshape(*values.shape, 4)
-    return image
+    pixels = np.empty(values.shape, "<u4")
+    grey, flat = pixels.reshape(-1), values.reshape(-1)
+    for part in chunks(len(flat)):  # in the caches: a picture as a whole takes six times as long
+        there = ~np.isnan(flat[part])
+        share = np.clip((np.where(there, flat[part], low) - low) / (high - low), 0.0, 1.0)
+        grey[part] = np.rint(255.0 * share).astype("<u4") * 0x010101 + there.astype("<u4") * 0xFF000000
+    return pixels.view(np.uint8).reshape(*values.shape, 4)
 
 
 def choose_window(values: NDArray[Any]) -> tuple[float, float]:

@@ -34,3 +34,13 @@ def test_names_that_are_none_are_listed():
         checked_window("liver")
     with refused(UsageError, "lung", "water"):
         Projection("drr", window="lung")
+
+
+@pytest.mark.parametrize("shape", [(0, 7), (1, 1), (130, 127), (3, 16_384)])
+def test_grey_of_each_pixel_is_its_share_of_the_window(shape):
+    values = np.random.default_rng(1).uniform(-200, 1200, shape).astype(np.float32)
+    values[:, ::5] = np.nan
+    pixels = grey_image(values, (0, 1000))
+    shades = np.rint(255 * np.clip(np.nan_to_num(values) / np.float32(1000), 0, 1))
+    assert np.array_equal(pixels[..., :3], np.repeat(shades[..., None], 3, axis=2))
+    assert np.array_equal(pixels[..., 3], np.where(np.isnan(values), 0, 255))
