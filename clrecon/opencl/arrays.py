@@ -199,9 +199,6 @@ result_pages = PagePool()
 """The pool of this process."""
 
 
-SHARED_BYTES = 1 << 20
-"""Arrays smaller than this are copied to the device even if it could use them in place."""
-
 _CACHE_LINE = 64
 """GPUs use arrays in place that are whole lines of a cache and begin with a page; drivers copy all others."""
 
@@ -210,7 +207,7 @@ def _shares_memory(device: Device, array: NDArray[Any]) -> bool:
     """Return whether kernels work in the array itself: a CPU in any, a GPU without memory of its own in whole pages."""
     if device.type != "gpu" or device.has_own_memory or device.is_simulator:
         return device.shares_host_memory
-    if array.nbytes < SHARED_BYTES or array.nbytes % _CACHE_LINE or array.ctypes.data % mmap.PAGESIZE:
+    if array.nbytes < LEAST_BYTES or array.nbytes % _CACHE_LINE or array.ctypes.data % mmap.PAGESIZE:
         return False
     return array.flags.writeable and device.of_context(_works_in_place)
 
@@ -218,7 +215,7 @@ def _shares_memory(device: Device, array: NDArray[Any]) -> bool:
 def _works_in_place(device: Device) -> bool:
     """Return whether arrays have what a device writes to buffers in their memory: a driver may keep copies of them."""
     cl = import_pyopencl()
-    source, target = aligned_empty((2, SHARED_BYTES), np.uint8)
+    source, target = aligned_empty((2, LEAST_BYTES), np.uint8)
     source[:], target[:] = 1, 0
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
     try:
@@ -246,7 +243,7 @@ def _make_buffer(device: Device, flags: Any, size: int, host: NDArray[Any] | Non
 def allocate(device: Device, size: int) -> Any:
     """Return a buffer of `size` bytes (at least 4, since OpenCL has no empty buffers)."""
     cl = import_pyopencl()
-    if device.shares_host_memory and size >= SHARED_BYTES:
+    if device.shares_host_memory and size >= LEAST_BYTES:
         return empty_output(device, (size,), np.uint8)[1]  # pages that an earlier call has already used
     return _make_buffer(device, cl.mem_flags.READ_WRITE, max(size, 4))
 
@@ -257,7 +254,7 @@ def upload(device: Device, array: NDArray[Any]) -> Any:
     array = np.ascontiguousarray(array)
     flags = cl.mem_flags.READ_ONLY
     # float4 and similar types need an alignment that numpy does not guarantee: small tables are copied.
-    if array.nbytes >= SHARED_BYTES and _shares_memory(device, array):
+    if array.nbytes >= LEAST_BYTES and _shares_memory(device, array):
         return _make_buffer(device, flags | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
     if device.shares_host_memory or device.is_simulator:
         return _make_buffer(device, flags | cl.mem_flags.COPY_HOST_PTR, array.nbytes, array)

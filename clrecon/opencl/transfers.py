@@ -34,7 +34,7 @@ _IN_TRANSFER = 3
 """Pieces on the bus; the others are those that threads copy."""
 
 LEAST_BYTES = 1 << 20
-"""Smaller transfers are left to the driver."""
+"""Smaller transfers are left to the driver, and smaller arrays copied even if the device could use them in place."""
 
 MOST_THREADS = 8
 

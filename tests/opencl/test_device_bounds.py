@@ -73,9 +73,7 @@ def test_memory_is_a_whole_number_from_1(memory: Any) -> None:
         arrays.check_memory(memory)
 
 
-@pytest.mark.parametrize(
-    ("size", "shared"), [(arrays.SHARED_BYTES - 1, False), (arrays.SHARED_BYTES, True), (arrays.SHARED_BYTES + 1, True)]
-)
+@pytest.mark.parametrize(("size", "shared"), [(LEAST_BYTES - 1, False), (LEAST_BYTES, True), (LEAST_BYTES + 1, True)])
 def test_large_buffers_are_pages_of_the_host(size: int, shared: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arrays, "empty_output", lambda *given: (None, "pages"))
     monkeypatch.setattr(buffers, "ask_driver", lambda *given: "buffer")

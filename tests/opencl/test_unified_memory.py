@@ -14,8 +14,8 @@ from house import ROOT
 
 import clrecon
 from clrecon.opencl import buffers, download, empty_output, upload
-from clrecon.opencl.arrays import SHARED_BYTES
 from clrecon.opencl.device import Device
+from clrecon.opencl.transfers import LEAST_BYTES
 from clrecon.system.memory import aligned_empty
 
 
@@ -65,23 +65,23 @@ def test_driver_that_copies_arrays_gets_copies_of_volumes(part, monkeypatch):
     part.give_up()
     monkeypatch.setattr(buffers, "ask_driver", ask_for_copy)
     counts, mesh = extract(volume, part)
-    assert counts["uploads, bytes"] > volume.voxels.nbytes and max(sent) == SHARED_BYTES
+    assert counts["uploads, bytes"] > volume.voxels.nbytes and max(sent) == LEAST_BYTES
     assert mesh == expected
 
 
 @pytest.mark.parametrize("fault", ["begins within a page", "ends within a line", "is read-only", "is small"])
 def test_array_that_is_no_whole_page_is_copied(part, fault):
-    memory = aligned_empty((SHARED_BYTES + 8192,), np.uint8)
+    memory = aligned_empty((LEAST_BYTES + 8192,), np.uint8)
     memory[:] = np.arange(len(memory)) % 251
-    array = memory[: SHARED_BYTES + 4096]
+    array = memory[: LEAST_BYTES + 4096]
     if fault == "begins within a page":
-        array = memory[64 : SHARED_BYTES + 64]
+        array = memory[64 : LEAST_BYTES + 64]
     elif fault == "ends within a line":
-        array = memory[: SHARED_BYTES + 4]
+        array = memory[: LEAST_BYTES + 4]
     elif fault == "is read-only":
         array.flags.writeable = False
     else:
-        array = memory[: SHARED_BYTES - 4096]
+        array = memory[: LEAST_BYTES - 4096]
     with counting_calls() as counts:
         array_d = upload(part, array)
     assert counts["uploads, bytes"] == array.nbytes
@@ -89,7 +89,7 @@ def test_array_that_is_no_whole_page_is_copied(part, fault):
 
 
 def test_array_in_whole_pages_is_used_where_it_is(part):
-    array = aligned_empty((SHARED_BYTES,), np.uint8)
+    array = aligned_empty((LEAST_BYTES,), np.uint8)
     array[:] = np.arange(len(array)) % 251
     with counting_calls() as counts:
         array_d = upload(part, array)
