@@ -301,10 +301,11 @@ def find_unmeasured(cells: NDArray[Any]) -> Mask:
         for layer, out in zip(cells[layers], unmeasured[layers], strict=True):
             for corner in set(layer[np.ix_((0, -1), (0, -1))].flat):
                 out |= layer == corner
+        regions = Regions(unmeasured[layers], IN_SLICE)
+        unmeasured[layers] = regions.cells_of(regions.reach_border() & (regions.sizes >= _FEWEST_UNMEASURED))
 
     in_threads(mark_layers, len(cells), PIECE)
-    regions = Regions(unmeasured, IN_SLICE)
-    return regions.cells_of(regions.reach_border() & (regions.sizes >= _FEWEST_UNMEASURED))
+    return unmeasured
 
 
 def _thin_parts(tissue: Mask, body: Mask, cell_mm: tuple[float, float, float]) -> Mask:

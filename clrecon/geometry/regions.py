@@ -34,21 +34,22 @@ class Regions:
     """
 
     def __init__(self, mask: Mask, connection: Connection) -> None:
-        flat = mask.reshape(-1)
-        first, last = np.empty(mask.shape, dtype=bool), np.empty(mask.shape, dtype=bool)
-        np.greater(flat[1:], flat[:-1], out=first.reshape(-1)[1:])
-        np.greater(flat[:-1], flat[1:], out=last.reshape(-1)[:-1])
-        first[..., 0], last[..., -1] = mask[..., 0], mask[..., -1]
+        kind = np.int32 if mask.size < 2**30 else np.int64  # noise has many runs
+        flat, is_end = mask.reshape(-1), np.empty(mask.shape, dtype=bool)
+        np.greater(flat[1:], flat[:-1], out=is_end.reshape(-1)[1:])
+        is_end[..., 0] = mask[..., 0]
+        self.starts = np.flatnonzero(is_end).astype(kind)
+        np.greater(flat[:-1], flat[1:], out=is_end.reshape(-1)[:-1])
+        is_end[..., -1] = mask[..., -1]
+        self.ends = np.flatnonzero(is_end).astype(kind) + 1
         self.shape = mask.shape
-        self.starts = np.flatnonzero(first)
-        self.ends = np.flatnonzero(last) + 1
         self.numbers = number_connected(len(self.starts), *self._find_touching(connection))
         self.count = int(self.numbers.max(initial=0))
         self.sizes = np.bincount(self.numbers, weights=self.ends - self.starts, minlength=self.count + 1)
         """Number of cells of each component."""
 
-    def _find_touching(self, connection: Connection) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the pairs of runs that touch."""
+    def _find_touching(self, connection: Connection) -> NDArray[np.signedinteger[Any]]:
+        """Return the pairs of runs that touch, (2, n)."""
         _, nj, ni = self.shape
         reach, steps = connection
         # A cell after each row, and a row after each slice, keep apart what does not touch.
@@ -60,9 +61,9 @@ class Regions:
             step = (dk * (nj + 1) + dj) * (ni + 1)
             begin = np.searchsorted(ends, starts + (step - reach), side="right")
             counts = np.searchsorted(starts, ends + (step + reach)) - begin
-            pairs.append((np.repeat(np.arange(len(counts)), counts), _count_up(begin, counts)))
-        first, second = zip(*pairs, strict=True)
-        return np.concatenate(first), np.concatenate(second)
+            runs = np.repeat(np.arange(len(counts)), counts), _count_up(begin, counts)
+            pairs.append(np.stack(runs, dtype=starts.dtype, casting="same_kind"))
+        return np.concatenate(pairs, axis=1)
 
     def sum_of(self, values: NDArray[Any]) -> Float64Array:
         """Sum the values of the cells of each component; of a mask, count the cells in it."""
@@ -133,16 +134,16 @@ def find_holes(mask: Mask) -> Mask:
     return gaps.cells_of(~gaps.reach_border())
 
 
-def _count_up(begin: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def _count_up(begin: NDArray[Any], counts: NDArray[Any]) -> NDArray[np.int64]:
     """Return ``begin, begin + 1, ...`` of each length in turn."""
     ends = np.cumsum(counts)
     return np.arange(ends[-1] if len(ends) else 0) + np.repeat(begin - ends + counts, counts)
 
 
-def number_connected(count: int, first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.int64]:
+def number_connected(count: int, first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.signedinteger[Any]]:
     """Number the components of nodes that are connected in pairs, from 1 in the order of their first nodes."""
-    roots = np.arange(count)
-    first, second = first.astype(np.int64), second.astype(np.int64)
+    roots = np.arange(count, dtype=np.int32 if count < 2**31 else np.int64)
+    first, second = (nodes.astype(roots.dtype, copy=False) for nodes in (first, second))
     while len(first):
         np.minimum.at(roots, np.maximum(first, second), np.minimum(first, second))
         while not np.array_equal(above := roots[roots], roots):
@@ -150,7 +151,7 @@ def number_connected(count: int, first: NDArray[Any], second: NDArray[Any]) -> N
         first, second = roots[first], roots[second]
         apart = first != second
         first, second = first[apart], second[apart]
-    return np.cumsum(roots == np.arange(count))[roots]
+    return np.cumsum(roots == np.arange(count), dtype=roots.dtype)[roots]
 
 
 def holds_ball(

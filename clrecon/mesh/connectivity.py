@@ -221,7 +221,7 @@ def label_components(
         is_component = np.zeros(vertex_count + 1, dtype=bool)
         is_component[labels[used]] = True
         labels = np.where(used, np.cumsum(is_component)[labels], 0)
-    return int(labels.max(initial=0)), labels - 1
+    return int(labels.max(initial=0)), labels.astype(np.int64) - 1
 
 
 def count_duplicate_faces(triangles: NDArray[np.uint32], vertex_count: int, opposite: IntArray | None = None) -> int:
