@@ -18,6 +18,7 @@ from dicom_series import Plan, set_values
 from dicom_series import write_series as write_plan
 from printed_text import Printer
 
+from clrecon import list_series
 from clrecon.cli.info import describe_certificate, render_listing
 from clrecon.cli.main import main
 
@@ -66,17 +67,28 @@ def listing(*entries: dict[str, Any], chosen: int | None = 1) -> dict[str, Any]:
 
 def test_json_of_info_has_the_names_of_the_contract(ct: Path, printed: Printer) -> None:
     assert main(["info", str(ct), "--json"]) == 0
+    facts = printed().report()
+    (series,) = facts["series"]
+    assert set(facts) == names_in("clrecon info") == {"series", "chosen", "certificate"}
+    assert set(series) == names_in("clrecon info", "For each series:")
+    assert set(facts["certificate"]) == names_in("The certificate")
+
+
+def test_json_of_info_states_the_stack_of_its_folder(ct: Path, printed: Printer) -> None:
+    assert main(["info", str(ct), "--json"]) == 0
+    facts = printed().report()
+    stack = {"number": 1, "slices": 17, "shape_ijk": [31, 25, 17], "modality": "CT", "kind": "stack"}
+    assert stack.items() <= facts["series"][0].items()
+    assert facts["series"][0]["spacing_mm"] == pytest.approx(SPACING)
+    assert facts["chosen"] == 1
+    assert facts["certificate"]["padding_share"] is None  # measured by --pixels only
+
+
+def test_json_of_info_neither_warns_nor_names_the_patient(ct: Path, printed: Printer) -> None:
+    assert main(["info", str(ct), "--json"]) == 0
     said = printed()
-    found = said.report()
-    assert set(found) == names_in("clrecon info") == {"series", "chosen", "certificate"}
-    assert found["chosen"] == 1
-    (one,) = found["series"]
-    assert set(one) == names_in("clrecon info", "For each series:")
-    assert (one["slices"], one["shape_ijk"], one["modality"], one["kind"]) == (17, [31, 25, 17], "CT", "stack")
-    assert one["spacing_mm"] == pytest.approx(SPACING)
-    assert set(found["certificate"]) == names_in("The certificate")
-    assert found["certificate"]["padding_share"] is None
-    assert said.error_lines == 0 and PATIENT.split("^")[0] not in said.everything
+    assert said.error_lines == 0
+    assert PATIENT.split("^")[0] not in said.everything
 
 
 def test_pixels_are_read_on_request(ct: Path, printed: Printer) -> None:
@@ -87,76 +99,133 @@ def test_pixels_are_read_on_request(ct: Path, printed: Printer) -> None:
     printed().assert_output(-1000, 700)
 
 
-def test_warnings_of_pixels_are_printed_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+CEILING_WARNING = "900 voxels are at 3071 HU, the ceiling of 12 bits"
+"""On one slice of 30 x 30 voxels that all hold 4095, with the intercept -1024."""
+
+
+@pytest.fixture
+def bright_slice(tmp_path: Path) -> str:
     bright = set_values(PixelData=np.full((30, 30), 4095, np.uint16).tobytes(), BitsStored=12, HighBit=11)
     write_plan(tmp_path, Plan(shape=(4, 30, 30), signed=False), lambda ds, k: bright(ds, k) if k == 2 else None)
-    text = "900 voxels are at 3071 HU, the ceiling of 12 bits"
-    assert main(["info", str(tmp_path)]) == 0
-    captured = capsys.readouterr()
-    assert text not in captured.out + captured.err
-    assert main(["info", str(tmp_path), "--pixels"]) == 0
-    captured = capsys.readouterr()
-    assert captured.out.count(text) == 1 and text not in captured.err
-    assert main(["info", str(tmp_path), "--pixels", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["series"][0]["warnings"] == found["certificate"]["warnings"]
-    assert text in found["certificate"]["warnings"][-1]
+    return str(tmp_path)
 
 
-def test_the_table_marks_the_choice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_warnings_of_pixels_are_not_made_without_pixels(bright_slice: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", bright_slice]) == 0
+    captured = capsys.readouterr()
+    assert CEILING_WARNING not in captured.out + captured.err
+
+
+def test_warnings_of_pixels_are_printed_once(bright_slice: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", bright_slice, "--pixels"]) == 0
+    captured = capsys.readouterr()
+    assert captured.out.count(CEILING_WARNING) == 1
+    assert CEILING_WARNING not in captured.err
+
+
+def test_warnings_of_pixels_are_those_of_series_and_certificate(
+    bright_slice: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["info", bright_slice, "--pixels", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["series"][0]["warnings"] == facts["certificate"]["warnings"]
+    assert CEILING_WARNING in facts["certificate"]["warnings"][-1]
+
+
+@pytest.fixture
+def table_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """The lines on a folder of the CT of 31 x 25 voxels, a smaller one, and three series of MR."""
     folder = write_series(tmp_path / "ct", number=1)
     write_series(folder, np.full((6, 9, 9), -1000, np.int16), number=2)
     for number in (3, 4, 6):
         write_series(folder, np.full((3, 9, 9), 5, np.int16), number=number, modality="MR")
     assert main(["info", str(folder)]) == 0
-    rows = capsys.readouterr().out.splitlines()
-    assert rows[0].split()[:4] == ["series", "hash", "kind", "slices"]
-    assert rows[2].split()[:2] == ["*", "1"] and rows[3].split()[0] == "2"
-    assert "31 x 25" in rows[2] and "0.8 x 1.1 x 1.5" in rows[2]
-    assert "series 3-5: not read: modality MR is not CT" in rows
-    assert "series 1, as clrecon mesh would read it" in rows
-    assert any(re.fullmatch(r"  slices +17 used, none dropped", row) for row in rows)
+    return capsys.readouterr().out.splitlines()
 
 
-def test_equal_series_name_the_way_out(tmp_path: Path, printed: Printer) -> None:
+def test_the_table_marks_the_largest_ct(table_rows: list[str]) -> None:
+    assert table_rows[0].split()[:4] == ["series", "hash", "kind", "slices"]
+    assert table_rows[2].split()[:2] == ["*", "1"] and table_rows[3].split()[0] == "2"
+    assert "31 x 25" in table_rows[2] and "0.8 x 1.1 x 1.5" in table_rows[2]
+
+
+def test_below_the_table_stand_what_is_not_read_and_the_choice(table_rows: list[str]) -> None:
+    assert "series 3-5: not read: modality MR is not CT" in table_rows
+    assert "series 1, as clrecon mesh would read it" in table_rows
+    assert any(re.fullmatch(r"  slices +17 used, none dropped", row) for row in table_rows)
+
+
+@pytest.fixture
+def equal_series(tmp_path: Path) -> str:
     folder = write_series(tmp_path / "ct", number=1)
-    write_series(folder, number=2)
-    assert main(["info", str(folder), "--json"]) == 0
-    captured = printed()
-    found = captured.report()
-    assert (found["chosen"], found["certificate"]) == (None, None)
-    captured.assert_error("--series")
-    assert main(["info", str(folder), "--series", "2", "--json"]) == 0
-    found = printed().report()
-    assert found["chosen"] == found["certificate"]["series"]["number"] == 2
-    uid_hash = found["series"][1]["uid_hash"]
-    assert main(["info", str(folder), "--series", uid_hash, "--json"]) == 0
+    return str(write_series(folder, number=2))
+
+
+def test_of_equal_series_none_is_chosen_and_the_option_named(equal_series: str, printed: Printer) -> None:
+    assert main(["info", equal_series, "--json"]) == 0
+    said = printed()
+    facts = said.report()
+    assert (facts["chosen"], facts["certificate"]) == (None, None)
+    said.assert_error("--series")
+
+
+def test_equal_series_are_chosen_by_number(equal_series: str, printed: Printer) -> None:
+    assert main(["info", equal_series, "--series", "2", "--json"]) == 0
+    facts = printed().report()
+    assert facts["chosen"] == facts["certificate"]["series"]["number"] == 2
+
+
+def test_equal_series_are_chosen_by_hash(equal_series: str, printed: Printer) -> None:
+    assert main(["info", equal_series, "--json"]) == 0
+    uid_hash = printed().report()["series"][1]["uid_hash"]
+    assert main(["info", equal_series, "--series", uid_hash, "--json"]) == 0
     assert printed().report()["chosen"] == 2
-    assert main(["info", str(folder), "--series", "7"]) == 3
-    printed().assert_error("--series", "CT", 7, 1)
-    assert main(["info", str(folder), "--strict"]) == 4
-    printed().assert_error("--series")
 
 
-def test_strict_holds_a_series_against_its_gates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_plan(tmp_path / "good")
-    assert main(["info", str(tmp_path / "good"), "--strict"]) == 0
-    shown = capsys.readouterr().out
+@pytest.mark.parametrize(
+    ("options", "code", "facts"),
+    [(["--series", "7"], 3, ("--series", "CT", 7, 1)), (["--strict"], 4, ("--series",))],
+    ids=["no such number", "strict without a choice"],
+)
+def test_equal_series_are_refused_without_a_choice(
+    equal_series: str, printed: Printer, options: list[str], code: int, facts: tuple[Any, ...]
+) -> None:
+    assert main(["info", equal_series, *options]) == code
+    printed().assert_error(*facts)
+
+
+def test_strict_passes_a_series_that_keeps_its_gates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_plan(tmp_path)
+    assert main(["info", str(tmp_path), "--strict"]) == 0
     unmeasured = (
         "stated_gap, stated_places, one_volume, hu_scale, stored_sign, shown_places, padding_share, stored_bits"
     )
-    assert re.search(rf"gates +\d+ kept, 0 failed, not measured: {unmeasured}", shown)
-    write_plan(tmp_path / "lossy", change=set_values(LossyImageCompression="01", RescaleType="US"))
-    assert main(["info", str(tmp_path / "lossy")]) == 0
-    capsys.readouterr()
-    assert main(["info", str(tmp_path / "lossy"), "--strict"]) == 4
+    assert re.search(rf"gates +\d+ kept, 0 failed, not measured: {unmeasured}", capsys.readouterr().out)
+
+
+@pytest.fixture
+def lossy(tmp_path: Path) -> str:
+    """Seven slices of lossy compression whose values are of no known unit: two gates fail."""
+    write_plan(tmp_path, change=set_values(LossyImageCompression="01", RescaleType="US"))
+    return str(tmp_path)
+
+
+def test_without_strict_a_series_that_fails_gates_is_no_error(lossy: str) -> None:
+    assert main(["info", lossy]) == 0
+
+
+def test_strict_fails_with_the_gates_that_failed(lossy: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", lossy, "--strict"]) == 4
     captured = capsys.readouterr()
     assert "FAILED     lossless: slices with lossy compression: 7, none allowed" in captured.out
     assert captured.err == (
         "clrecon: error: series 1 fails 2 gates: hu_known: slices whose values are not known to be HU: 7, "
         "none allowed; lossless: slices with lossy compression: 7, none allowed\n"
     )
-    assert main(["info", str(tmp_path / "lossy"), "--strict", "--json", "-q"]) == 4
+
+
+def test_strict_with_json_prints_the_report_beside_its_error(lossy: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", lossy, "--strict", "--json", "-q"]) == 4
     captured = capsys.readouterr()
     assert json.loads(captured.out)["chosen"] == 1
     assert captured.err.startswith("clrecon: error: series 1 fails 2 gates")
@@ -243,28 +312,28 @@ def test_thousands_of_series_take_one_line_each() -> None:
 
 
 def test_certificate_is_described_in_words(tmp_path: Path) -> None:
-    from clrecon import list_series
-
     write_plan(tmp_path, Plan(tilt_deg=12, angles=(3, 4, -5)), set_values(PatientPosition="FFP"))
     words = dict(describe_certificate(list_series(tmp_path, pixels=True).certificate))
-    assert words["voxels"] == "6 x 5 x 7 of 0.5 x 0.7 x 1.278 mm; the box is 3.0 x 3.5 x 8.8 mm"
-    assert words["directions"] == (
-        "rows run to the left, columns to the back, slices to the head, their normal 5.0 degrees off that axis; "
-        "feet first, prone (FFP)"
-    )
-    assert words["positions"] == "within 0.001 mm of even steps (allowed 0.0125)"
-    assert words["gaps"] == "1.25 mm"
-    assert words["thickness"] == "5 mm: 3.75 mm overlap between neighbouring slices (300 % of the gap)"
-    assert words["tilt"] == "-12.00 degrees (back edge towards the head), kept exactly as a shear"
-    assert words["padding"] == "0.0 % of the voxels hold no measurement"
-    assert words["values"] == "-124 to 145 HU; slope 1, intercept -1024"
-    assert words["stored"] == "Explicit VR Little Endian"
-    assert (
-        words["gates"]
-        == "17 kept, 0 failed, not measured: stated_gap, stated_places, one_volume, hu_scale, shown_places"
-    )
-    write_plan(tmp_path / "uneven", Plan(offsets={3: 0.4}), set_values(SliceThickness=1))
-    words = dict(describe_certificate(list_series(tmp_path / "uneven").certificate))
+    assert {
+        "voxels": "6 x 5 x 7 of 0.5 x 0.7 x 1.278 mm; the box is 3.0 x 3.5 x 8.8 mm",  # 1.25 / cos 12 deg
+        "directions": (
+            "rows run to the left, columns to the back, slices to the head, their normal 5.0 degrees off that axis; "
+            "feet first, prone (FFP)"
+        ),
+        "positions": "within 0.001 mm of even steps (allowed 0.0125)",
+        "gaps": "1.25 mm",
+        "thickness": "5 mm: 3.75 mm overlap between neighbouring slices (300 % of the gap)",
+        "tilt": "-12.00 degrees (back edge towards the head), kept exactly as a shear",
+        "padding": "0.0 % of the voxels hold no measurement",
+        "values": "-124 to 145 HU; slope 1, intercept -1024",
+        "stored": "Explicit VR Little Endian",
+        "gates": "17 kept, 0 failed, not measured: stated_gap, stated_places, one_volume, hu_scale, shown_places",
+    }.items() <= words.items()
+
+
+def test_certificate_of_uneven_slices_describes_each_gap(tmp_path: Path) -> None:
+    write_plan(tmp_path, Plan(offsets={3: 0.4}), set_values(SliceThickness=1))  # one of 7 slices is 0.4 mm too high
+    words = dict(describe_certificate(list_series(tmp_path).certificate))
     assert words["gaps"] == "2 of 1.25, then 1 of 1.65, then 1 of 0.85, then 2 of 1.25 mm"
     assert words["thickness"] == (
         "1 mm: neighbouring slices overlap by up to 0.15 mm, or up to 0.65 mm between them are not measured"
