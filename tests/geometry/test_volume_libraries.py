@@ -67,23 +67,34 @@ def test_volumes_return_unchanged_from_other_libraries(way, name, dtype):
 
 
 @pytest.mark.parametrize("name", AFFINES)
-def test_the_libraries_put_every_voxel_where_it_is(name):
-    """By their own words: physical points of ITK in LPS, an affine to RAS, and points of VTK."""
+def test_simpleitk_puts_every_voxel_where_it_is(name):
+    """By its own physical points, which are in LPS."""
     volume = numbered(AFFINES[name])
-    places = volume.ijk_to_lps(IJK)
-    values = [volume.voxels[k, j, i] for i, j, k in IJK]
     image = volume.to_sitk()
     assert image.GetSize() == (3, 4, 5) and image.GetPixelIDTypeAsString() == "16-bit signed integer"
-    theirs = [image.TransformIndexToPhysicalPoint([int(n) for n in ijk]) for ijk in IJK]
-    assert np.abs(places - theirs).max() <= tolerances.FLOAT64_PLACE_MM
-    assert [image[tuple(map(int, ijk))] for ijk in IJK] == values
-    other = volume.to_nibabel()
-    assert other.shape == (3, 4, 5) and np.shares_memory(other.dataobj, volume.voxels)
-    theirs = nibabel.affines.apply_affine(other.affine, IJK) * (-1, -1, 1)
-    assert np.abs(places - theirs).max() <= tolerances.FLOAT64_PLACE_MM
-    assert [other.dataobj[tuple(ijk)] for ijk in IJK] == values
-    assert other.header.get_xyzt_units()[0] == "mm" and other.header["sform_code"] == other.header["qform_code"] == 1
-    assert nibabel.aff2axcodes(other.affine) == nibabel.aff2axcodes(np.diag((-1, -1, 1, 1)) @ volume.affine)
+    places = [image.TransformIndexToPhysicalPoint(ijk) for ijk in IJK.tolist()]
+    assert np.abs(volume.ijk_to_lps(IJK) - places).max() <= tolerances.FLOAT64_PLACE_MM
+    assert [image[tuple(ijk)] for ijk in IJK.tolist()] == volume.voxels.ravel().tolist()
+
+
+@pytest.mark.parametrize("name", AFFINES)
+def test_nibabel_puts_every_voxel_where_it_is(name):
+    """By its own affine, which leads to RAS."""
+    volume = numbered(AFFINES[name])
+    image = volume.to_nibabel()
+    assert image.shape == (3, 4, 5) and np.shares_memory(image.dataobj, volume.voxels)
+    places = nibabel.affines.apply_affine(image.affine, IJK) * (-1, -1, 1)
+    assert np.abs(volume.ijk_to_lps(IJK) - places).max() <= tolerances.FLOAT64_PLACE_MM
+    assert [image.dataobj[tuple(ijk)] for ijk in IJK] == volume.voxels.ravel().tolist()
+
+
+@pytest.mark.parametrize("name", AFFINES)
+def test_nibabel_knows_unit_frame_and_directions(name):
+    volume = numbered(AFFINES[name])
+    image = volume.to_nibabel()
+    assert image.header.get_xyzt_units()[0] == "mm"
+    assert image.header["sform_code"] == image.header["qform_code"] == 1
+    assert nibabel.aff2axcodes(image.affine) == nibabel.aff2axcodes(np.diag((-1, -1, 1, 1)) @ volume.affine)
 
 
 @pytest.mark.parametrize("name", AFFINES)
@@ -105,33 +116,67 @@ def test_save_is_write_volume(tmp_path):
     volume = numbered(SHEARED)
     assert volume.save(tmp_path / "a.nrrd") == clrecon.write_volume(volume, tmp_path / "b.nrrd")
     assert (tmp_path / "a.nrrd").read_bytes() == (tmp_path / "b.nrrd").read_bytes()
-    with pytest.raises(UsageError, match="right angles"):
-        volume.save(tmp_path / "a.mha")
+
+
+def test_a_sheared_volume_is_resampled_to_be_saved_at_right_angles(tmp_path):
     told: list[tuple[str, int, int]] = []
-    volume.save(tmp_path / "a.mha", resample=0.5, progress=lambda *call: told.append(call))
+    numbered(SHEARED).save(tmp_path / "a.mha", resample=0.5, progress=lambda *call: told.append(call))
     assert Volume.from_sitk(sitk.ReadImage(str(tmp_path / "a.mha"))).spacing == pytest.approx((0.5, 0.5, 0.5))
     assert {"resample", "write"} == {stage for stage, _, _ in told}
-    with pytest.raises(OutputError, match="exists"):
-        volume.save(tmp_path / "a.nrrd", no_clobber=True)
-    with pytest.raises(UsageError, match="ends with one of"):
-        volume.save(tmp_path / "a.stl")
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "kind", "facts"),
+    [
+        ("a.mha", {}, UsageError, ("angles", "resample")),
+        ("a.stl", {}, UsageError, (".nrrd",)),
+        ("older.nrrd", {"no_clobber": True}, OutputError, ("older.nrrd", "exists")),
+    ],
+    ids=["sheared", "no name of volumes", "exists"],
+)
+def test_a_volume_that_cannot_be_saved_is_refused(tmp_path, name, options, kind, facts):
+    (tmp_path / "older.nrrd").write_text("older")
+    with refused(kind, *facts):
+        numbered(SHEARED).save(tmp_path / name, **options)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["older"]
 
 
 def test_numpy_takes_a_volume_as_its_voxels_without_a_copy():
     volume = numbered(AFFINES["oblique"])
-    assert np.asarray(volume) is volume.voxels and np.asarray(volume).shape == volume.shape == SHAPE
+    assert np.asarray(volume) is volume.voxels
+    assert (volume.shape, volume.dtype) == (SHAPE, np.int16)
+
+
+def test_numpy_takes_a_label_map_as_its_voxels_without_a_copy():
+    labels = LabelMap(np.ones(SHAPE, np.uint8), np.eye(4))
+    assert np.asarray(labels) is labels.voxels
+    assert (labels.shape, labels.dtype) == (SHAPE, np.uint8)
+
+
+def test_an_array_made_of_a_volume_is_a_copy():
+    volume = numbered(AFFINES["oblique"])
     assert not np.shares_memory(np.array(volume), volume.voxels)
+    assert not np.shares_memory(volume.__array__(copy=True), volume.voxels)
+
+
+def test_numpy_takes_a_volume_as_another_type():
+    volume = numbered(AFFINES["oblique"])
     wide = np.asarray(volume, dtype=np.float64)
     assert wide.dtype == np.float64 and np.array_equal(wide, volume.voxels)
-    assert not np.shares_memory(volume.__array__(copy=True), volume.voxels)
-    if np.lib.NumpyVersion(np.__version__) >= "2.0.0":
-        assert np.asarray(volume, copy=False) is volume.voxels
-        with refused(ValueError, "int16", "float32"):
-            np.asarray(volume, dtype="f4", copy=False)
-    assert np.mean(volume) == volume.voxels.mean() and (np.asarray(volume) > 3).sum() == 26
-    assert volume.dtype == np.int16
-    labels = LabelMap(np.ones(SHAPE, np.uint8), np.eye(4))
-    assert np.asarray(labels) is labels.voxels and labels.shape == SHAPE and labels.dtype == np.uint8
+
+
+@pytest.mark.skipif(np.lib.NumpyVersion(np.__version__) < "2.0.0", reason="asarray has no copy= before numpy 2")
+def test_numpy_is_refused_another_type_without_a_copy():
+    volume = numbered(AFFINES["oblique"])
+    assert np.asarray(volume, copy=False) is volume.voxels
+    with refused(ValueError, "int16", "float32"):
+        np.asarray(volume, dtype="f4", copy=False)
+
+
+def test_functions_of_numpy_take_a_volume():
+    volume = numbered(AFFINES["oblique"])  # the numbers -30 to 29
+    assert np.mean(volume) == -0.5
+    assert (np.asarray(volume) > 3).sum() == 26
 
 
 @pytest.mark.parametrize("way", ["pyvista", "SimpleITK"])

@@ -142,20 +142,34 @@ def test_matrix_that_is_no_affine_moves_no_mesh(matrix, words):
         Mesh(*samples.sphere((0, 0, 0))).transformed(matrix)
 
 
-def test_numbers_at_vertices_go_with_the_mesh(tmp_path):
+@pytest.fixture
+def sphere_and_cube():
+    """Two parts from pyvista; the number at each vertex is twice its x."""
     pyvista = pytest.importorskip("pyvista")
     mesh = Mesh.from_pyvista(pyvista.Sphere() + pyvista.Cube(center=(9, 0, 0)).triangulate())
     mesh.values = {"HU": mesh.vertices[:, 0] * 2.0}
-    surface = mesh.to_pyvista()
-    np.testing.assert_array_equal(surface.point_data["HU"], mesh.values["HU"])
+    return mesh
+
+
+def test_numbers_at_vertices_are_point_data_of_pyvista(sphere_and_cube):
+    surface = sphere_and_cube.to_pyvista()
+    np.testing.assert_array_equal(surface.point_data["HU"], sphere_and_cube.values["HU"])
+
+
+def test_of_the_point_data_of_pyvista_only_named_numbers_are_taken(sphere_and_cube):
+    surface = sphere_and_cube.to_pyvista()
     surface.point_data["vectors"], surface.point_data["with space"] = surface.points, surface.points[:, 0]
-    back = Mesh.from_pyvista(surface)
-    assert set(back.values) == {"HU"}
-    moved = back.transformed(np.diag([1.0, 2.0, 1.0, 1.0]))
-    largest = moved.keep_largest()
-    np.testing.assert_allclose(largest.values["HU"], largest.vertices[:, 0] * 2.0, rtol=1e-6)
-    assert len(largest.values["HU"]) == largest.vertex_count < mesh.vertex_count
-    back.save(tmp_path / "a.ply")
+    assert set(Mesh.from_pyvista(surface).values) == {"HU"}
+
+
+def test_numbers_at_vertices_stay_with_a_moved_part(sphere_and_cube):
+    sphere = sphere_and_cube.transformed(np.diag([1.0, 2.0, 1.0, 1.0])).keep_largest()
+    assert len(sphere.values["HU"]) == sphere.vertex_count < sphere_and_cube.vertex_count
+    np.testing.assert_allclose(sphere.values["HU"], sphere.vertices[:, 0] * 2.0, rtol=1e-6)
+
+
+def test_numbers_at_vertices_are_scalars_of_a_ply(sphere_and_cube, tmp_path):
+    sphere_and_cube.save(tmp_path / "a.ply")
     assert b"property float scalar_HU" in (tmp_path / "a.ply").read_bytes()
 
 
@@ -177,73 +191,171 @@ def test_numbers_that_fit_no_vertex_are_refused(values, words, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_merged_meshes_keep_their_arrays_and_numbers_and_the_shortest_voxel():
+@pytest.fixture
+def two_boxes():
+    """A box at the origin with HU, and one at x = 5 with mm; their reports differ in voxel and device."""
     one = Mesh(*samples.box(), report={"voxel_mm": 0.5, "iso_value_hu": 226, "device": "a"})
     other = Mesh(*samples.box((5.0, 0.0, 0.0)), report={"voxel_mm": 2.0, "iso_value_hu": 226, "device": "b"})
     one.values["HU"], other.values["mm"] = np.arange(8.0), np.ones(8)
-    both = one.merge(other, one)
-    assert both.vertices.tolist() == [*one.vertices.tolist(), *other.vertices.tolist(), *one.vertices.tolist()]
-    assert both.triangles[12:24].tolist() == (other.triangles + 8).tolist() and both.volume == pytest.approx(3.0)
-    np.testing.assert_array_equal(both.values["HU"], [*range(8), *[np.nan] * 8, *range(8)])
-    np.testing.assert_array_equal(both.values["mm"], [*[np.nan] * 8, *[1.0] * 8, *[np.nan] * 8])
-    assert both.report == {"iso_value_hu": 226, "voxel_mm": 0.5} and both.normals is None
-    assert one.values.keys() == {"HU"} and len(one.split()) == 1 and len(both.split()) == 3
-    turned = Mesh(one.vertices, one.triangles, np.tile([0.0, 0.0, 1.0], (8, 1)))
-    assert turned.merge(turned).normals.shape == (16, 3) and turned.merge(one).normals is None
+    return one, other
+
+
+def test_merged_meshes_stand_one_after_the_other(two_boxes):
+    one, other = two_boxes
+    merged = one.merge(other, one)
+    np.testing.assert_array_equal(merged.vertices, np.concatenate([one.vertices, other.vertices, one.vertices]))
+    np.testing.assert_array_equal(merged.triangles[12:24], other.triangles + 8)
+    assert merged.volume == pytest.approx(3.0)
+    assert len(merged.split()) == 3
+
+
+def test_numbers_that_a_merged_mesh_lacks_are_nan(two_boxes):
+    one, other = two_boxes
+    merged = one.merge(other, one)
+    np.testing.assert_array_equal(merged.values["HU"], [*range(8), *[np.nan] * 8, *range(8)])
+    np.testing.assert_array_equal(merged.values["mm"], [*[np.nan] * 8, *[1.0] * 8, *[np.nan] * 8])
+
+
+def test_report_of_merged_meshes_keeps_what_is_equal_and_the_shortest_voxel(two_boxes):
+    one, other = two_boxes
+    assert one.merge(other, one).report == {"iso_value_hu": 226, "voxel_mm": 0.5}
+
+
+def test_merging_leaves_the_first_mesh_as_it_is(two_boxes):
+    one, other = two_boxes
+    one.merge(other, one)
+    assert one.values.keys() == {"HU"}
+    assert len(one.split()) == 1
+
+
+def test_normals_are_merged_only_where_every_mesh_has_them(two_boxes):
+    plain, _ = two_boxes
+    with_normals = Mesh(plain.vertices, plain.triangles, np.tile([0.0, 0.0, 1.0], (8, 1)))
+    assert with_normals.merge(with_normals).normals.shape == (16, 3)
+    assert with_normals.merge(plain).normals is None
+    assert plain.merge(plain).normals is None
+
+
+def test_merging_a_list_of_meshes_is_refused(two_boxes):
+    one, other = two_boxes
     with refused(UsageError, "mesh.merge", "meshes"):
         one.merge([other])
 
 
-def test_the_values_of_a_volume_are_sampled_at_vertices_and_points_and_kept_by_files(tmp_path):
-    volume = Volume(np.arange(4 * 5 * 6, dtype=np.int16).reshape(4, 5, 6), np.diag([0.5, 0.7, 2.0, 1.0]))
-    mesh = Mesh(*samples.box((0.3, 0.6, 1.0)), report={"iso_value_hu": 226})
-    made = mesh.sample(volume).sample(volume, "nearest", 0).sample(volume[:1], "first", outside=-1024)
-    assert mesh.values == {} and made.report == mesh.report and made.report is not mesh.report
-    np.testing.assert_array_equal(made.values["HU"], volume.sample(mesh.vertices).astype(np.float32))
-    np.testing.assert_array_equal(made.values["nearest"], volume.sample(mesh.vertices, order=0))
-    assert made.values["first"].min() == -1024 and np.isfinite(made.values["HU"]).all()
-    for name in ("a.ply", "a.vtp"):
-        made.save(tmp_path / name)
-        back = read_mesh(tmp_path / name).values
-        assert {name: values.tolist() for name, values in back.items()} == {
-            name: values.tolist() for name, values in made.values.items()
-        }
-    made.save(tmp_path / "a.glb")
+@pytest.fixture
+def volume():
+    return Volume(np.arange(4 * 5 * 6, dtype=np.int16).reshape(4, 5, 6), np.diag([0.5, 0.7, 2.0, 1.0]))
+
+
+@pytest.fixture
+def box_in_the_volume():
+    return Mesh(*samples.box((0.3, 0.6, 1.0)), report={"iso_value_hu": 226})
+
+
+def test_a_mesh_is_sampled_at_its_vertices(volume, box_in_the_volume):
+    sampled = box_in_the_volume.sample(volume).sample(volume, "nearest", 0)
+    np.testing.assert_array_equal(sampled.values["HU"], volume.sample(sampled.vertices).astype(np.float32))
+    np.testing.assert_array_equal(sampled.values["nearest"], volume.sample(sampled.vertices, order=0))
+    assert np.isfinite(sampled.values["HU"]).all()
+
+
+def test_a_vertex_outside_of_the_volume_gets_the_given_value(volume, box_in_the_volume):
+    sampled = box_in_the_volume.sample(volume[:1], "first", outside=-1024)  # one slice: all vertices lie beside it
+    assert sampled.values["first"].min() == -1024
+
+
+def test_sampling_makes_a_mesh_of_its_own(volume, box_in_the_volume):
+    sampled = box_in_the_volume.sample(volume)
+    assert box_in_the_volume.values == {}
+    assert sampled.report == box_in_the_volume.report and sampled.report is not box_in_the_volume.report
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.vtp"])
+def test_sampled_values_are_kept_by_mesh_files(volume, box_in_the_volume, tmp_path, name):
+    sampled = box_in_the_volume.sample(volume).sample(volume, "nearest", 0)
+    sampled.save(tmp_path / name)
+    kept = read_mesh(tmp_path / name).values
+    assert kept.keys() == {"HU", "nearest"}
+    for column, values in kept.items():
+        np.testing.assert_array_equal(values, sampled.values[column])
+
+
+def test_sampled_values_are_an_attribute_of_a_glb(volume, box_in_the_volume, tmp_path):
+    box_in_the_volume.sample(volume).save(tmp_path / "a.glb")
     assert b'"_HU":' in (tmp_path / "a.glb").read_bytes()
-    cloud = PointCloud(mesh.vertices, labels=np.arange(8)).sample(volume)
-    cloud.save(tmp_path / "a.npz")
-    again = read_points(tmp_path / "a.npz")
-    assert again.hu.tolist() == made.values["HU"].tolist() and again.labels.tolist() == list(range(8))
-    for asked in (mesh, cloud):
-        with refused(UsageError, "Volume", "volume"):
-            asked.sample(mesh)
+
+
+def test_sampled_values_and_labels_of_a_cloud_are_kept_by_its_file(volume, box_in_the_volume, tmp_path):
+    vertices = box_in_the_volume.vertices
+    PointCloud(vertices, labels=np.arange(8)).sample(volume).save(tmp_path / "a.npz")
+    kept = read_points(tmp_path / "a.npz")
+    np.testing.assert_array_equal(kept.hu, volume.sample(vertices).astype(np.float32))
+    assert kept.labels.tolist() == list(range(8))
+
+
+@pytest.mark.parametrize("kind", [Mesh, PointCloud])
+def test_sampling_what_is_no_volume_is_refused(kind, box_in_the_volume):
+    subject = box_in_the_volume if kind is Mesh else PointCloud(box_in_the_volume.vertices)
+    with refused(UsageError, "Volume", "volume"):
+        subject.sample(box_in_the_volume)
+
+
+def test_sampling_under_a_name_with_a_space_is_refused(volume, box_in_the_volume):
     with refused(UsageError, "_", "names"):
-        mesh.sample(volume, "mean HU")
+        box_in_the_volume.sample(volume, "mean HU")
 
 
-def test_numbers_at_faces_go_with_the_mesh_and_its_files(tmp_path):
-    pytest.importorskip("trimesh")
+@pytest.fixture
+def numbered_faces():
+    """A box of 12 triangles and one eight times as large of 12, numbered from 0 to 23, with HU at the 16 vertices."""
     mesh = Mesh(*samples.box()).merge(Mesh(*samples.box((5.0, 0.0, 0.0), (2.0, 2.0, 2.0))))
-    assert mesh.face_values == {}
     mesh.face_values["stress"], mesh.values["HU"] = np.arange(24), np.arange(16.0)
-    np.testing.assert_array_equal(mesh.keep_largest().face_values["stress"], np.arange(12, 24))
-    assert [part.face_values["stress"][0] for part in mesh.split()] == [12, 0]
-    mirrored = mesh.transformed(np.diag([-1.0, 1.0, 1.0, 1.0]))
-    np.testing.assert_array_equal(mirrored.face_values["stress"], np.arange(24))
-    both = mesh.merge(Mesh(*samples.box()))
-    np.testing.assert_array_equal(both.face_values["stress"], [*range(24), *[np.nan] * 12])
-    for name in ("a.ply", "a.vtp"):
-        mirrored.save(tmp_path / name)
-    for back in (
-        read_mesh(tmp_path / "a.ply"),
-        read_mesh(tmp_path / "a.vtp"),
-        Mesh.from_pyvista(mirrored.to_pyvista()),
-        Mesh.from_trimesh(mirrored.to_trimesh()),
-    ):
-        np.testing.assert_array_equal(back.triangles, mirrored.triangles)
-        assert back.face_values["stress"].tolist() == list(range(24))
-        assert back.values["HU"].tolist() == list(range(16))
-        assert back.values.keys() == {"HU"} and back.face_values.keys() == {"stress"}
-    mesh.face_values["stress"] = np.zeros(16)
+    return mesh
+
+
+def test_merged_meshes_without_numbers_at_faces_have_none():
+    assert Mesh(*samples.box()).merge(Mesh(*samples.box())).face_values == {}
+
+
+def test_parts_keep_the_numbers_at_their_faces(numbered_faces):
+    assert numbered_faces.keep_largest().face_values["stress"].tolist() == list(range(12, 24))
+    assert [part.face_values["stress"][0] for part in numbered_faces.split()] == [12, 0]
+
+
+def test_a_mirrored_mesh_keeps_the_numbers_at_its_faces(numbered_faces):
+    mirrored = numbered_faces.transformed(np.diag([-1.0, 1.0, 1.0, 1.0]))
+    assert mirrored.face_values["stress"].tolist() == list(range(24))
+
+
+def test_faces_of_a_merged_mesh_without_numbers_are_nan(numbered_faces):
+    merged = numbered_faces.merge(Mesh(*samples.box()))
+    np.testing.assert_array_equal(merged.face_values["stress"], [*range(24), *[np.nan] * 12])
+
+
+def by_file(mesh, path):
+    mesh.save(path)
+    return read_mesh(path)
+
+
+@pytest.mark.parametrize(
+    "there_and_back",
+    [
+        lambda mesh, folder: by_file(mesh, folder / "a.ply"),
+        lambda mesh, folder: by_file(mesh, folder / "a.vtp"),
+        lambda mesh, folder: Mesh.from_pyvista(mesh.to_pyvista()),
+        lambda mesh, folder: Mesh.from_trimesh(mesh.to_trimesh()),
+    ],
+    ids=["ply", "vtp", "pyvista", "trimesh"],
+)
+def test_numbers_at_faces_come_back_from_files_and_libraries(numbered_faces, tmp_path, there_and_back):
+    pytest.importorskip("trimesh")
+    back = there_and_back(numbered_faces, tmp_path)
+    np.testing.assert_array_equal(back.triangles, numbered_faces.triangles)
+    assert {name: values.tolist() for name, values in back.face_values.items()} == {"stress": list(range(24))}
+    assert {name: values.tolist() for name, values in back.values.items()} == {"HU": list(range(16))}
+
+
+def test_numbers_at_faces_that_are_too_few_are_refused(numbered_faces, tmp_path):
+    numbered_faces.face_values["stress"] = np.zeros(16)
     with refused(UsageError, "face_values", "stress", 24):
-        mesh.save(tmp_path / "b.vtp")
+        numbered_faces.save(tmp_path / "b.vtp")

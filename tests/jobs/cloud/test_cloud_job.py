@@ -55,76 +55,156 @@ def cloud_command(device: Any, tmp_path: Path) -> Any:
     return run
 
 
-def test_points_of_the_surface_are_those_of_the_function(
-    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer
+def run_with_report(folder: Path, device: Any, source: Path, *options: str) -> dict[str, Any]:
+    """Write out.npz and r.json into an empty folder; return the report."""
+    files = ["-o", str(folder / "out.npz"), "--report", str(folder / "r.json")]
+    assert main(["cloud", str(source), *files, "--device", str(device.index), *options]) == 0
+    return dict(json.loads((folder / "r.json").read_text()))
+
+
+@pytest.fixture(scope="module")
+def surface_folder(device: Any, scan: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """out.npz and r.json of a run without options."""
+    folder = tmp_path_factory.mktemp("surface")
+    run_with_report(folder, device, scan)
+    return folder
+
+
+def test_points_of_the_surface_are_those_of_the_function(device: Any, scan: Path, surface_folder: Path) -> None:
+    level = PRESETS[DEFAULT_PRESET].iso_value
+    expected = clrecon.extract_points(clrecon.read_volume(scan), level, kind="surface", device=device)
+    written = clrecon.read_points(surface_folder / "out.npz")
+    assert np.array_equal(written.points, expected.points)
+    assert np.array_equal(written.normals, expected.normals)
+    assert (written.hu == level).all()
+
+
+def test_report_of_a_surface_cloud_describes_the_points_in_its_file(surface_folder: Path) -> None:
+    written = clrecon.read_points(surface_folder / "out.npz")
+    report = json.loads((surface_folder / "r.json").read_text())
+    expected = {
+        "kind": "surface", "iso_value_hu": PRESETS[DEFAULT_PRESET].iso_value,
+        "points": len(written), "points_first": len(written), "removed": {},
+        "normals": True, "has_hu": True, "labels": 0,
+    }  # fmt: skip
+    assert {name: report[name] for name in expected} == expected
+    assert np.allclose(report["bounds_mm"], [written.points.min(axis=0), written.points.max(axis=0)])
+    assert [step["step"] for step in report["steps"]] == ["points"]
+
+
+def test_report_of_a_cloud_names_its_only_output(surface_folder: Path) -> None:
+    (output,) = json.loads((surface_folder / "r.json").read_text())["outputs"]
+    assert output["bytes"] == (surface_folder / "out.npz").stat().st_size
+    assert {path.name for path in surface_folder.iterdir()} == {"out.npz", "r.json"}
+
+
+def test_json_of_a_cloud_is_its_report_with_the_names_of_the_contract(
+    scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer
 ) -> None:
     assert cloud_command(scan, "--report", str(tmp_path / "r.json"), "--json") == 0
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert printed().report() == report
+    report = printed().report()
+    assert report == json.loads((tmp_path / "r.json").read_text())
     assert set(report) == names_in("clrecon cloud INPUT")
-    level = PRESETS[DEFAULT_PRESET].iso_value
-    own = clrecon.extract_points(clrecon.read_volume(scan), level, kind="surface", device=device)
-    written = clrecon.read_points(tmp_path / "out.ply")
-    assert np.array_equal(written.points, own.points) and np.array_equal(written.normals, own.normals)
-    assert (written.hu == level).all() and report["iso_value_hu"] == level
-    assert report["points"] == report["points_first"] == len(own) and report["kind"] == "surface"
-    assert report["normals"] and report["has_hu"] and not report["labels"] and report["removed"] == {}
-    assert np.allclose(report["bounds_mm"], [own.points.min(axis=0), own.points.max(axis=0)])
-    assert [step["step"] for step in report["steps"]] == ["points"]
-    assert report["outputs"][0]["bytes"] == (tmp_path / "out.ply").stat().st_size
-    assert {path.name for path in tmp_path.iterdir()} == {"out.ply", "r.json"}
+
+
+CLUSTERED = ("--keep", "no-sheets", "--hu", BAND, "--cluster", "eps=1.2,min=4", "--keep", "largest:1")
+"""Of the scan the large ball: label 1 is the small ball, 2 the plate (a sheet), the three lone voxels are noise."""
+
+
+@pytest.fixture(scope="module")
+def clustered_folder(device: Any, scan: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """out.npz, went.npz and r.json of a run with the options `CLUSTERED`."""
+    folder = tmp_path_factory.mktemp("clustered")
+    run_with_report(folder, device, scan, *CLUSTERED, "--removed", str(folder / "went.npz"))
+    return folder
 
 
 def test_clustered_cloud_and_removed_points_are_those_of_the_functions(
-    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer
+    device: Any, scan: Path, clustered_folder: Path
 ) -> None:
-    options = ["--keep", "no-sheets", "--hu", BAND, "--cluster", "eps=1.2,min=4", "--keep", "largest:1"]
-    removed, told = tmp_path / "went.npz", tmp_path / "r.json"
-    assert cloud_command(scan, *options, "--removed", str(removed), "--report", str(told)) == 0
-    said = printed()
-    said.assert_output(3, 0, 1, 2)
     volume = clrecon.read_volume(scan)
     first = clrecon.extract_points(volume, hu=(200, 3000), device=device)
-    found = clrecon.cluster_points(first, 1.2, 4, volume=volume, device=device)
-    step = clrecon.keep_clusters(found.cloud, ["no-sheets", "largest:1"], cores=found.cores)
-    written, went = clrecon.read_points(tmp_path / "out.ply"), clrecon.read_points(removed)
-    assert np.array_equal(written.points, step.cloud.points) and np.array_equal(written.labels, step.cloud.labels)
-    assert np.array_equal(went.points, first.points) and np.array_equal(went.labels == 0, step.removed == 0)
-    report = json.loads(told.read_text())
-    balls = (written.points[:, 2] > 104) & (written.points[:, 2] < 124)
-    assert balls.all() and report["removed"]["noise"] == 3 and report["removed"]["sheet"] == 32 * 40
+    clusters = clrecon.cluster_points(first, 1.2, 4, volume=volume, device=device)
+    expected = clrecon.keep_clusters(clusters.cloud, ["no-sheets", "largest:1"], cores=clusters.cores)
+    written, went = (clrecon.read_points(clustered_folder / name) for name in ("out.npz", "went.npz"))
+    assert np.array_equal(written.points, expected.cloud.points)
+    assert np.array_equal(written.labels, expected.cloud.labels)
+    assert np.array_equal(went.points, first.points)
+    assert np.array_equal(went.labels == 0, expected.removed == 0)
+
+
+def test_the_kept_cluster_is_the_large_ball(clustered_folder: Path) -> None:
+    z = clrecon.read_points(clustered_folder / "out.npz").points[:, 2]
+    assert (np.abs(z - 114.0) < 10.0).all()  # radius 9.3 mm around slice 14, slice 0 at 100 mm
+
+
+def test_report_of_clusters_counts_what_was_removed_and_why(clustered_folder: Path) -> None:
+    report = json.loads((clustered_folder / "r.json").read_text())
+    first = clrecon.read_points(clustered_folder / "went.npz")
+    assert report["removed"]["noise"] == 3
+    assert report["removed"]["sheet"] == 32 * 40  # every voxel of the plate
+    assert report["removed_labels"][2] == {"label": 2, "reason": "sheet"}
     assert report["points_first"] == len(first) == sum(report["removed"].values()) + report["points"]
+    assert report["gates"][0]["ok"]
+
+
+def test_clusters_are_made_before_points_are_kept(clustered_folder: Path) -> None:
+    report = json.loads((clustered_folder / "r.json").read_text())
     assert [step["step"] for step in report["steps"]] == ["points", "clusters", "keep"]
     assert list(STEPS).index("clusters") < list(STEPS).index("keep")
-    assert report["gates"][0]["ok"] and report["removed_labels"][2] == {"label": 2, "reason": "sheet"}
-    assert [entry["what"] for entry in report["outputs"]] == ["cloud", "removed"]
+    assert [output["what"] for output in report["outputs"]] == ["cloud", "removed"]
 
 
-@pytest.mark.parametrize("options", [["--hu", BAND], ["--fov", "20"], ["--hu", BAND, "--points", "shell"]])
-def test_points_of_foreign_slices_are_warned_of_and_dropped(
-    options: list[str], tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_clustered_cloud_is_printed_with_its_counts(scan: Path, cloud_command: Any, printed: Printer) -> None:
+    assert cloud_command(scan, *CLUSTERED) == 0
+    printed().assert_output(3, 32 * 40)  # lone voxels, and those of the plate
+
+
+@pytest.fixture(scope="module")
+def foreign_slice(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scan with a pattern of another one in slice 14, which lies at 114 mm."""
     voxels = make_voxels()
     voxels[14, 4:40, :40] = np.where(np.indices((36, 40)).sum(axis=0) % 7 < 2, 900, -1000)
-    source = tmp_path / "foreign" / "scan.nrrd"
-    source.parent.mkdir()
-    write_nrrd(source, voxels, AFFINE)
-    assert cloud_command(source, *options, output="kept.npz") == 0
-    captured = capsys.readouterr()
-    assert "slice 14 of 40, counted from 0, is unlike both neighbours" in captured.err
-    assert "(--ghost-slices drop)" in captured.err
-    kept = clrecon.read_points(tmp_path / "kept.npz")
-    there = kept.points[:, 2] - 100.0
-    assert (np.abs(there - 14.0) < 0.5).sum() > 300
-    told = tmp_path / "r.json"
-    assert cloud_command(source, *options, "--ghost-slices", "drop", "--report", str(told), output="out.npz") == 0
-    left = clrecon.read_points(tmp_path / "out.npz")
-    assert not (np.abs(left.points[:, 2] - 114.0) < 0.5).any() and len(left) > 1000
-    report = json.loads(told.read_text())
-    assert report["removed"] == {"ghost slice": len(kept) - len(left)} or "--fov" in options
+    path = tmp_path_factory.mktemp("foreign") / "scan.nrrd"
+    write_nrrd(path, voxels, AFFINE)
+    return path
+
+
+KINDS_OF_POINTS = pytest.mark.parametrize(
+    "options", [["--hu", BAND], ["--fov", "20"], ["--hu", BAND, "--points", "shell"]], ids=["band", "fov", "shell"]
+)
+
+
+@KINDS_OF_POINTS
+def test_points_of_foreign_slices_stay_and_are_warned_of(
+    options: list[str], foreign_slice: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cloud_command(foreign_slice, *options, output="kept.npz") == 0
+    warning = capsys.readouterr().err
+    assert "slice 14 of 40, counted from 0, is unlike both neighbours" in warning
+    assert "(--ghost-slices drop)" in warning
+    z = clrecon.read_points(tmp_path / "kept.npz").points[:, 2]
+    assert (np.abs(z - 114.0) < 0.5).sum() > 300
+
+
+@KINDS_OF_POINTS
+def test_points_of_foreign_slices_are_dropped_on_request(
+    options: list[str], foreign_slice: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = run_with_report(tmp_path, device, foreign_slice, *options, "--ghost-slices", "drop")
+    z = clrecon.read_points(tmp_path / "out.npz").points[:, 2]
+    assert not (np.abs(z - 114.0) < 0.5).any()
+    assert len(z) > 1000
     step = next(step for step in report["steps"] if step["step"] == "ghost slices")
-    assert [entry["slice"] for entry in step["ghost_slices"]] == [14] and step["slices"] == 40
-    assert capsys.readouterr().err.count("unlike both") == 0
+    assert [entry["slice"] for entry in step["ghost_slices"]] == [14]
+    assert step["slices"] == 40
+    assert "unlike both" not in capsys.readouterr().err
+
+
+def test_report_counts_the_points_of_dropped_slices(foreign_slice: Path, device: Any, tmp_path: Path) -> None:
+    report = run_with_report(tmp_path, device, foreign_slice, "--hu", BAND, "--ghost-slices", "drop")
+    assert report["removed"] == {"ghost slice": report["points_first"] - report["points"]}
+    assert report["removed"]["ghost slice"] > 300
 
 
 def test_a_scan_without_foreign_slices_loses_nothing(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
@@ -328,25 +408,32 @@ def test_cloud_without_a_frame_is_turned_by_input_space(tmp_path: Path, cloud_co
     assert np.array_equal(clrecon.read_points(tmp_path / "out.ply").points[0], (-1.0, -2.0, 3.0))
 
 
-def test_outliers_filter_and_normals_give_what_the_functions_give(
-    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    options = ["--normals", "--denoise", "bilateral", "--outliers", "3", "--points", "shell", "--hu", "250"]
-    assert cloud_command(scan, *options, "--report", str(tmp_path / "r.json"), output="out.npz") == 0
-    said = capsys.readouterr().out
-    assert "mm rms, at most" in said and "oriented by gradient" in said
+FILTERED = ("--normals", "--denoise", "bilateral", "--outliers", "3", "--points", "shell", "--hu", "250")
+
+
+def test_outliers_filter_and_normals_give_what_the_functions_give(device: Any, scan: Path, tmp_path: Path) -> None:
+    run_with_report(tmp_path, device, scan, *FILTERED)
     volume = clrecon.read_volume(scan)
     cloud = clrecon.extract_points(volume, 250, kind="shell", device=device)
     cloud = clrecon.remove_outliers(cloud, deviations=3.0, device=device).cloud
     cloud = clrecon.denoise_points(cloud, device=device).cloud
     cloud = clrecon.estimate_normals(cloud, volume=volume, device=device).cloud
     written = clrecon.read_points(tmp_path / "out.npz")
-    assert np.array_equal(written.points, cloud.points) and np.array_equal(written.normals, cloud.normals)
+    assert np.array_equal(written.points, cloud.points)
+    assert np.array_equal(written.normals, cloud.normals)
+
+
+def test_steps_of_a_filtered_cloud_are_reported_in_their_order(
+    scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cloud_command(scan, *FILTERED, "--report", str(tmp_path / "r.json"), output="out.npz") == 0
     report = json.loads((tmp_path / "r.json").read_text())
-    assert [step["step"] for step in report["steps"]] == ["points", "outliers", "bilateral", "normals"]
-    places = [list(STEPS).index(step["step"]) for step in report["steps"]]
-    assert places == sorted(places) and report["removed"].get("outlier", 0) > 0
+    steps = [step["step"] for step in report["steps"]]
+    assert steps == ["points", "outliers", "bilateral", "normals"] == sorted(steps, key=list(STEPS).index)
+    assert report["removed"]["outlier"] > 0
     assert [gate["name"] for gate in report["gates"]] == ["points_kept_outliers"]
+    said = capsys.readouterr().out
+    assert "mm rms, at most" in said and "oriented by gradient" in said
 
 
 def test_doubtful_normals_of_far_slices_are_warned_of(
@@ -370,24 +457,35 @@ def test_points_of_a_surface_keep_the_normals_of_its_field(scan: Path, tmp_path:
     assert np.array_equal(one.normals, two.normals) and moved.normals is None
 
 
-def test_thinned_cloud_and_its_surface_are_those_of_the_functions(
-    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    mesh_file, told = tmp_path / "out.stl", tmp_path / "r.json"
-    options = ["--surface", str(mesh_file), "--spacing", "1.2", "--denoise", "grid", "--report", str(told)]
-    assert cloud_command(scan, *options, output="out.npz") == 0
-    said = capsys.readouterr().out
-    assert "closed, " in said and "sparse cells: " in said and "spacing: " in said
+THINNED = ("--spacing", "1.2", "--denoise", "grid")
+
+
+def test_thinned_cloud_and_its_surface_are_those_of_the_functions(device: Any, scan: Path, tmp_path: Path) -> None:
+    report = run_with_report(tmp_path, device, scan, *THINNED, "--surface", str(tmp_path / "out.stl"))
     cloud = clrecon.extract_points(clrecon.read_volume(scan), PRESETS[DEFAULT_PRESET].iso_value, device=device)
     cloud = clrecon.remove_sparse_cells(cloud, device=device).cloud
     cloud = clrecon.thin_points(cloud, 1.2, device=device).cloud
     assert np.array_equal(clrecon.read_points(tmp_path / "out.npz").points, cloud.points)
     mesh = clrecon.reconstruct_surface(cloud, device=device)
-    report = json.loads(told.read_text())
+    triangles_in_file = ((tmp_path / "out.stl").stat().st_size - 84) // 50  # binary STL: header of 84 bytes, 50 each
+    assert report["surface"]["triangles"] == mesh.triangle_count == triangles_in_file
+
+
+def test_report_of_a_thinned_cloud_with_surface_has_steps_outputs_and_names(
+    device: Any, scan: Path, tmp_path: Path
+) -> None:
+    report = run_with_report(tmp_path, device, scan, *THINNED, "--surface", str(tmp_path / "out.stl"))
     assert set(report) == names_in("clrecon cloud INPUT")
-    assert report["surface"]["triangles"] == mesh.triangle_count == (mesh_file.stat().st_size - 84) // 50
     assert [step["step"] for step in report["steps"]] == ["points", "sparse cells", "spacing"]
-    assert [entry["what"] for entry in report["outputs"]] == ["cloud", "surface"]
+    assert [output["what"] for output in report["outputs"]] == ["cloud", "surface"]
+
+
+def test_steps_of_a_thinned_cloud_with_surface_are_printed(
+    scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cloud_command(scan, *THINNED, "--surface", str(tmp_path / "out.stl")) == 0
+    said = capsys.readouterr().out
+    assert "closed, " in said and "sparse cells: " in said and "spacing: " in said
 
 
 def test_free_points_are_clustered(scan: Path, tmp_path: Path, cloud_command: Any) -> None:

@@ -155,18 +155,42 @@ def test_a_slow_drag_is_one_step_of_undo_and_the_next_another():
     assert model.undo() == "the shift" and model.state == states[0]
 
 
-def test_facts_are_json_and_say_what_is_there():
+def facts_of_all_kinds():
+    """The facts, by way of JSON, of a view in RAS of a scan, mesh, cloud and labels, cut from above."""
     model = make_model(scenes.make_scan(), scenes.make_mesh(), scenes.make_cloud(), scenes.make_labels(), space="ras")
     model.add_clip("superior")
-    facts = json.loads(json.dumps(model.facts()))
+    return json.loads(json.dumps(model.facts()))
+
+
+def test_facts_list_objects_and_parts_by_key():
+    facts = facts_of_all_kinds()
     assert [each["kind"] for each in facts["objects"]] == ["scan", "mesh", "cloud", "labels"]
     assert [each["key"] for each in facts["parts"]] == ["1", "2", "3", "4", "4/1", "4/2", "4/0"]
-    assert facts["parts"][4]["name"] == "one" and facts["parts"][4]["ml"] == pytest.approx(22.3, abs=0.1)
-    assert facts["letters"]["left"].startswith("R") and facts["letters"]["top"] == "S"
-    assert facts["iso"] == {"hu": 200.0, "low": -800.0, "high": 1000.0}
+
+
+def test_facts_of_a_label_have_its_name_and_volume():
+    label = facts_of_all_kinds()["parts"][4]
+    assert label["name"] == "one"
+    voxel_ml = abs(np.linalg.det(scenes.AFFINE)) / 1000.0
+    assert label["ml"] == pytest.approx(voxel_ml * np.count_nonzero(scenes.make_labels().voxels == 1), abs=0.001)
+
+
+def test_facts_name_the_sides_and_the_cross_in_the_frame_of_the_output():
+    facts = facts_of_all_kinds()
     assert facts["space"] == "RAS" and facts["cross_text"].endswith("mm RAS")
-    assert facts["cross"][0] == pytest.approx(-float(facts["cross_text"].split(",")[0]), abs=0.06)
+    assert facts["letters"]["left"].startswith("R") and facts["letters"]["top"] == "S"
+    x_ras = float(facts["cross_text"].split(",")[0])
+    assert facts["cross"][0] == pytest.approx(-x_ras, abs=0.06)  # in LPS; the text has one digit
+
+
+def test_facts_hold_the_modes_and_the_range_of_the_level():
+    facts = facts_of_all_kinds()
+    assert facts["iso"] == {"hu": 200.0, "low": -800.0, "high": 1000.0}
     assert {"surface", "bone", "mip", "minip", "drr", "slices", "labels"} <= {each["name"] for each in facts["modes"]}
+
+
+def test_facts_note_a_mesh_that_the_mode_does_not_show():
+    model = make_model(scenes.make_scan(), scenes.make_mesh())
     model.set_mode("mip")
     assert "mesh 2" in model.facts()["notes"][0]
 
@@ -182,40 +206,72 @@ def test_view_without_a_scan_has_only_what_means_something():
         ViewModel([])
 
 
-def test_objects_are_numbered_named_and_checked():
+def test_objects_are_named_as_given_or_by_kind_and_number():
     scan, labels = show_objects([scenes.make_scan(), scenes.make_labels()], ["left knee"], [["a remark"]])
-    assert isinstance(scan, ShownScan) and scan.name == "left knee" and scan.said == ("a remark",)
-    assert isinstance(labels, ShownLabels) and labels.name == "labels 2" and labels.within == 1
+    assert isinstance(scan, ShownScan) and (scan.name, scan.said) == ("left knee", ("a remark",))
+    assert isinstance(labels, ShownLabels) and (labels.name, labels.within) == ("labels 2", 1)
+
+
+def test_a_shown_mesh_gets_normals():
     (mesh,) = show_objects([scenes.make_mesh()])
     assert isinstance(mesh, ShownMesh) and mesh.mesh.normals is not None
-    for wrong, words in (([], "nothing"), ([3], "not int")):
-        with pytest.raises(UsageError, match=words):
-            show_objects(wrong)
 
 
-def test_measures_are_made_of_points_in_mm():
+@pytest.mark.parametrize(("objects", "fact"), [([], "nothing"), ([3], "int")], ids=["none", "a number"])
+def test_what_cannot_be_shown_as_an_object_is_refused(objects, fact):
+    with refused(UsageError, fact):
+        show_objects(objects)
+
+
+def measure(model, tool, *points):
+    """Return what the last of the points, or the end of a curve, makes."""
+    model.start_tool(tool)
+    made = [model.add_point(Pick(point=point)) for point in points]
+    return model.end_tool() if tool == "curve" else made[-1]
+
+
+def test_a_distance_is_made_of_two_points_in_mm():
     model = make_model()
     model.start_tool("distance")
     assert model.add_point(Pick(point=(0.0, 0.0, 0.0))) is None
-    made = model.add_point(Pick(point=(3.0, 4.0, 12.0)))
-    assert made is not None and made.value == pytest.approx(13.0) and made.text == "13.0 mm"
-    model.start_tool("angle")
-    for point in ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 2.0, 0.0)):
-        made = model.add_point(Pick(point=point))
-    assert made.value == pytest.approx(90.0) and made.unit == "degrees"
+    distance = model.add_point(Pick(point=(3.0, 4.0, 12.0)))
+    assert distance.value == pytest.approx(13.0)  # 9 + 16 + 144 = 13 * 13
+    assert distance.text == "13.0 mm"
+
+
+def test_an_angle_is_made_at_the_second_of_three_points_in_degrees():
+    angle = measure(make_model(), "angle", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 2.0, 0.0))
+    assert angle.value == pytest.approx(90.0)
+    assert angle.unit == "degrees"
+
+
+def test_a_curve_is_made_of_its_points_when_its_tool_ends():
+    model = make_model()
+    points = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.0, 0.0, 0.0), (3.0, 0.0, 0.0))
     model.start_tool("curve")
-    for x in range(4):
-        assert model.add_point(Pick(point=(float(x), 0.0, 0.0))) is None
-    made = model.end_tool()
-    assert made.value == pytest.approx(3.0) and len(model.state.curve) == 4 and model.state.tool is None
-    model.start_tool("seed")
-    assert model.add_point(Pick(point=(1.0, 2.0, 3.0))).value is None
-    assert [each.kind for each in model.state.measures] == ["distance", "angle", "curve", "seed"]
-    assert model.facts()["measures"][3]["text"] == "1.0, 2.0, 3.0 mm LPS"
+    assert [model.add_point(Pick(point=point)) for point in points] == [None] * 4
+    assert model.end_tool().value == pytest.approx(3.0)
+    assert model.state.curve == points
+    assert model.state.tool is None
+
+
+def test_a_seed_is_made_of_one_point_and_has_its_place_as_text():
+    model = make_model()
+    assert measure(model, "seed", (1.0, 2.0, 3.0)).value is None
+    assert model.facts()["measures"][0]["text"] == "1.0, 2.0, 3.0 mm LPS"
+
+
+def test_measures_are_undone_one_by_one_and_cleared_together():
+    model = make_model()
+    measure(model, "seed", (1.0, 2.0, 3.0))
+    measure(model, "distance", (0.0, 0.0, 0.0), (3.0, 4.0, 12.0))
+    measure(model, "seed", (4.0, 5.0, 6.0))
     model.undo()
-    assert len(model.state.measures) == 3
+    assert [each.kind for each in model.state.measures] == ["seed", "distance"]
     model.clear_measures()
-    assert model.state.measures == () and model.undo() == "the measures" and len(model.state.measures) == 3
+    assert model.state.measures == ()
+    assert model.undo() == "the measures"
+    assert [each.kind for each in model.state.measures] == ["seed", "distance"]
 
 
 def test_the_curve_of_a_view_is_the_one_that_was_made_last():
@@ -237,18 +293,34 @@ def test_an_angle_of_points_in_one_place_is_refused():
         model.add_point(Pick(point=(1.0, 0.0, 0.0)))
 
 
-def test_clip_planes_keep_the_other_side_and_turn_round():
+@pytest.fixture
+def clipped():
+    """A model cut from the left, and a point at the right that stays with one at the left that goes."""
     model = make_model(scenes.make_scan())
     model.add_clip("left")
-    corners = model.objects[0].corners
-    low, high = corners[:, 0].min(), corners[:, 0].max()
-    inside, outside = (low + 1.0, 0.0, 0.0), (high - 1.0, 0.0, 0.0)
-    assert model.state.clip.contains([inside, outside]).tolist() == [True, False]
+    x = model.objects[0].corners[:, 0]
+    return model, [(x.min() + 1.0, 0.0, 0.0), (x.max() - 1.0, 0.0, 0.0)]
+
+
+def test_a_clip_plane_from_the_left_keeps_the_right(clipped):
+    model, right_and_left = clipped
+    assert model.state.clip.contains(right_and_left).tolist() == [True, False]
+
+
+def test_a_flipped_clip_plane_keeps_the_other_side(clipped):
+    model, right_and_left = clipped
     model.flip_clip(0)
-    assert model.state.clip.contains([inside, outside]).tolist() == [False, True]
-    model.flip_clip(0)
+    assert model.state.clip.contains(right_and_left).tolist() == [False, True]
+
+
+def test_a_clip_plane_moved_to_the_end_keeps_everything(clipped):
+    model, right_and_left = clipped
     model.move_clip(0, 1.0)
-    assert model.state.clip.contains([inside, outside]).all()
+    assert model.state.clip.contains(right_and_left).all()
+
+
+def test_a_removed_clip_plane_is_gone(clipped):
+    model, _ = clipped
     model.remove_clip(0)
     assert model.state.clip is None and model.state.clips == ()
 
