@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -197,13 +198,13 @@ def test_a_missing_trimesh_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         three_parts().to_trimesh()
 
 
-def with_unit(unit: str) -> trimesh.Trimesh:
+def with_unit(unit: str) -> Any:
     made = trimesh.creation.box()
     made.units = unit
     return made
 
 
-def with_frame(space: str) -> trimesh.Trimesh:
+def with_frame(space: str) -> Any:
     made = trimesh.creation.box()
     made.metadata["SPACE"] = space
     return made

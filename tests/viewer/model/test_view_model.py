@@ -269,7 +269,7 @@ def test_measures_are_undone_one_by_one_and_cleared_together():
     model.undo()
     assert [each.kind for each in model.state.measures] == ["seed", "distance"]
     model.clear_measures()
-    assert model.state.measures == ()
+    assert list(model.state.measures) == []
     assert model.undo() == "the measures"
     assert [each.kind for each in model.state.measures] == ["seed", "distance"]
 
