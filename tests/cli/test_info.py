@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import re
 import shlex
 import sys
@@ -110,24 +109,21 @@ def bright_slice(tmp_path: Path) -> str:
     return str(tmp_path)
 
 
-def test_warnings_of_pixels_are_not_made_without_pixels(bright_slice: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_warnings_of_pixels_are_not_made_without_pixels(bright_slice: str, printed: Printer) -> None:
     assert main(["info", bright_slice]) == 0
-    captured = capsys.readouterr()
-    assert CEILING_WARNING not in captured.out + captured.err
+    assert CEILING_WARNING not in printed().everything
 
 
-def test_warnings_of_pixels_are_printed_once(bright_slice: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_warnings_of_pixels_are_printed_once(bright_slice: str, printed: Printer) -> None:
     assert main(["info", bright_slice, "--pixels"]) == 0
-    captured = capsys.readouterr()
-    assert captured.out.count(CEILING_WARNING) == 1
-    assert CEILING_WARNING not in captured.err
+    said = printed()
+    assert said.error_lines == 0
+    assert said.everything.count(CEILING_WARNING) == 1
 
 
-def test_warnings_of_pixels_are_those_of_series_and_certificate(
-    bright_slice: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_warnings_of_pixels_are_those_of_series_and_certificate(bright_slice: str, printed: Printer) -> None:
     assert main(["info", bright_slice, "--pixels", "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    facts = printed().report()
     assert facts["series"][0]["warnings"] == facts["certificate"]["warnings"]
     assert CEILING_WARNING in facts["certificate"]["warnings"][-1]
 
@@ -224,11 +220,11 @@ def test_strict_fails_with_the_gates_that_failed(lossy: str, capsys: pytest.Capt
     )
 
 
-def test_strict_with_json_prints_the_report_beside_its_error(lossy: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_strict_with_json_prints_the_report_beside_its_error(lossy: str, printed: Printer) -> None:
     assert main(["info", lossy, "--strict", "--json", "-q"]) == 4
-    captured = capsys.readouterr()
-    assert json.loads(captured.out)["chosen"] == 1
-    assert captured.err.startswith("clrecon: error: series 1 fails 2 gates")
+    said = printed()
+    assert said.report()["chosen"] == 1
+    said.assert_error("series", 1, "gates", 2)
 
 
 def test_a_refused_series_has_its_certificate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

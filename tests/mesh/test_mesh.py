@@ -309,7 +309,7 @@ def test_sampling_under_a_name_with_a_space_is_refused(volume, box_in_the_volume
 def numbered_faces():
     """A box of 12 triangles and one eight times as large of 12, numbered from 0 to 23, with HU at the 16 vertices."""
     mesh = Mesh(*samples.box()).merge(Mesh(*samples.box((5.0, 0.0, 0.0), (2.0, 2.0, 2.0))))
-    mesh.face_values["stress"], mesh.values["HU"] = np.arange(24), np.arange(16.0)
+    mesh.face_values["stress"], mesh.values["HU"] = np.arange(24.0), np.arange(16.0)
     return mesh
 
 

@@ -177,19 +177,17 @@ KINDS_OF_POINTS = pytest.mark.parametrize(
 
 @KINDS_OF_POINTS
 def test_points_of_foreign_slices_stay_and_are_warned_of(
-    options: list[str], foreign_slice: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+    options: list[str], foreign_slice: Path, tmp_path: Path, cloud_command: Any, printed: Printer
 ) -> None:
     assert cloud_command(foreign_slice, *options, output="kept.npz") == 0
-    warning = capsys.readouterr().err
-    assert "slice 14 of 40, counted from 0, is unlike both neighbours" in warning
-    assert "(--ghost-slices drop)" in warning
+    printed().assert_error("--ghost-slices", "slice", 14, 40)
     z = clrecon.read_points(tmp_path / "kept.npz").points[:, 2]
     assert (np.abs(z - 114.0) < 0.5).sum() > 300
 
 
 @KINDS_OF_POINTS
 def test_points_of_foreign_slices_are_dropped_on_request(
-    options: list[str], foreign_slice: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], foreign_slice: Path, device: Any, tmp_path: Path, printed: Printer
 ) -> None:
     report = run_with_report(tmp_path, device, foreign_slice, *options, "--ghost-slices", "drop")
     z = clrecon.read_points(tmp_path / "out.npz").points[:, 2]
@@ -198,7 +196,7 @@ def test_points_of_foreign_slices_are_dropped_on_request(
     step = next(step for step in report["steps"] if step["step"] == "ghost slices")
     assert [entry["slice"] for entry in step["ghost_slices"]] == [14]
     assert step["slices"] == 40
-    assert "unlike both" not in capsys.readouterr().err
+    assert "unlike both" not in printed().everything
 
 
 def test_report_counts_the_points_of_dropped_slices(foreign_slice: Path, device: Any, tmp_path: Path) -> None:
