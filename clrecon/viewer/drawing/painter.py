@@ -29,7 +29,7 @@ from clrecon.system.text import unknown_name
 from clrecon.viewer.drawing.looks import LEAST_OPACITY, LabelledLook, Looks, to_voxels
 from clrecon.viewer.drawing.shown_meshes import coarsen_mesh, make_meshes
 from clrecon.viewer.drawing.stage import Stage, take_strips, warm_kernels
-from clrecon.viewer.model.changes import pixel_camera, shift_camera
+from clrecon.viewer.model.changes import pixel_camera, shift_camera, zoom_camera
 from clrecon.viewer.model.objects import (
     ShownCloud,
     ShownLabels,
@@ -136,9 +136,11 @@ class Painter(Stage):
         sliced = self._sliced(state)
         grid = sliced[0].volume if sliced is not None else box_around([each.corners for each in self.objects])
         camera = find_plane(grid, plane, size)
-        forward = camera.basis().forward
-        shift = float(forward @ np.subtract(state.cross, camera.focal_point)) * forward
-        return shift_camera(camera, shift)
+        frame, forward = state.frame(plane), camera.basis().forward
+        center = np.array(camera.focal_point if frame is None else frame.center)
+        center += float(forward @ (state.cross - center)) * forward
+        camera = shift_camera(camera, center - camera.focal_point)
+        return camera if frame is None else zoom_camera(camera, frame.zoom)
 
     # Places
 

@@ -41,11 +41,34 @@ def fit_camera(
 def plane_step(scans: Sequence[ShownScan], plane: str) -> Float64Array:
     """Return the step (3,) in mm to a plane's next slice, away from the eye: a voxel of the first scan, or 1 mm."""
     normal = -np.array(DIRECTIONS[PLANES[plane]])
-    if not scans:
-        return normal
-    columns = scans[0].volume.affine[:3, :3]
-    along = np.abs(normal @ columns)
-    return normal * float(along[int(np.argmax(along / np.linalg.norm(columns, axis=0)))])
+    return normal * abs(_step_along(scans[0], normal)[1]) if scans else normal
+
+
+def _step_along(scan: ShownScan, normal: Float64Array) -> tuple[int, float]:
+    """Return the axis of the voxels that runs most along a normal, and its step there in mm, with its sign."""
+    columns = scan.volume.affine[:3, :3]
+    along = normal @ columns
+    axis = int(np.argmax(np.abs(along) / np.linalg.norm(columns, axis=0)))
+    return axis, float(along[axis])
+
+
+def describe_slice(scans: Sequence[ShownScan], plane: str, cross: Sequence[float]) -> dict[str, Any]:
+    """Return the side and mm of a slice through a cross, and which of the first scan's layers it cuts there, from 1.
+
+    Layers are counted away from the eye, as `plane_step` goes.
+    """
+    normal = np.array(DIRECTIONS[PLANES[plane]])
+    axis = int(np.argmax(np.abs(normal)))
+    side = ("RL", "AP", "IS")[axis][cross[axis] > 0.0]
+    described: dict[str, Any] = {"place": f"{side} {abs(cross[axis]):.1f} mm"}
+    if scans:
+        volume = scans[0].volume
+        ordinal, step = _step_along(scans[0], -normal)
+        count = volume.shape_ijk[ordinal]
+        index = round(float(volume.lps_to_ijk([cross])[0, ordinal]), 6)
+        layer = min(max(math.floor(index + 0.5), 0), count - 1)
+        described |= {"number": layer + 1 if step > 0.0 else count - layer, "count": count}
+    return described
 
 
 _TURN_DEGREES = 180.0

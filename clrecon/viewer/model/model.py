@@ -20,7 +20,14 @@ from clrecon.rendering.views.directions import as_point, checked_vector, default
 from clrecon.rendering.views.reformation import PLANES
 from clrecon.system.arguments import Space
 from clrecon.system.text import format_hu, unknown_name
-from clrecon.viewer.model.changes import ChangingView, checked_numbers, fit_camera, height_mm, plane_step
+from clrecon.viewer.model.changes import (
+    ChangingView,
+    checked_numbers,
+    describe_slice,
+    fit_camera,
+    height_mm,
+    plane_step,
+)
 from clrecon.viewer.model.objects import (
     ShownLabels,
     ShownObject,
@@ -37,6 +44,7 @@ from clrecon.viewer.model.state import (
     ClipPlane,
     Measure,
     Pick,
+    SliceFrame,
     ViewState,
     clip_direction,
     measure_points,
@@ -176,6 +184,18 @@ class ViewModel(ChangingView):
         point_in_box = np.clip(np.array(checked_vector("the cross", point)), low, high)
         self._change("cross", "the place of the slices", cross=as_point(point_in_box))
 
+    def frame_slice(self, plane: str, zoom: float, center: Sequence[float]) -> None:
+        """Show a slice so many times as large as it fits, about a place (LPS mm) within the scan."""
+        (factor,) = checked_numbers("the zoom of a slice", zoom)
+        point = np.clip(np.array(checked_vector("the middle of a slice", center)), *self._span())
+        frame = SliceFrame(plane=plane, zoom=factor, center=as_point(point))
+        others = tuple(each for each in self.state.frames if each.plane != plane)
+        self._change(f"zoom {plane}", f"the zoom of the {plane} slice", frames=(*others, frame))
+
+    def fit_slices(self) -> None:
+        """Show the slices as they fit."""
+        self._change("fit", "the fit of the slices", frames=())
+
     # Tools
 
     def start_tool(self, name: str) -> None:
@@ -293,6 +313,7 @@ class ViewModel(ChangingView):
             "picture_window": list(state.picture_window or mode.window or ()) or None,
             "table": state.table,
             "cross": [round(value, 3) for value in state.cross],
+            "slices": {plane: describe_slice(self.scans, plane, state.cross) for plane in PLANES},
             "cross_text": self.say_place(state.cross),
             "parts": [each.describe() for each in state.parts],
             "parts_known": self.parts_known,

@@ -191,6 +191,15 @@ class ShownPart:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SliceFrame:
+    """What of a plane its slice shows: `zoom` times as large as it fits, about a place in LPS mm."""
+
+    plane: str
+    zoom: float
+    center: Point
+
+
+@dataclass(frozen=True, kw_only=True)
 class ViewState:
     """What a view shows; places are LPS mm.
 
@@ -199,6 +208,7 @@ class ViewState:
     picture_window: The same in projections; None: that of the mode.
     table: Table and blankets are shown.
     cross: Where the three slices go through.
+    frames: Of the slices that were zoomed or shifted; the others fit.
     parts_at: Iso value of the clusters; None: they are not known.
     parts_table: Of which volume, see `table`.
     points: Points of the tool that is used.
@@ -209,6 +219,7 @@ class ViewState:
     iso_value: float
     window: tuple[float, float]
     cross: Point
+    frames: tuple[SliceFrame, ...] = ()
     picture_window: tuple[float, float] | None = None
     table: bool = True
     parts: tuple[ShownPart, ...] = ()
@@ -234,6 +245,9 @@ class ViewState:
         if self.tool == "curve" and len(self.points) > 1:
             return tuple(each.point for each in self.points)
         return next((each.points for each in reversed(self.measures) if each.kind == "curve"), ())
+
+    def frame(self, plane: str) -> SliceFrame | None:
+        return next((each for each in self.frames if each.plane == plane), None)
 
     def part(self, key: str) -> ShownPart | None:
         return next((each for each in self.parts if each.key == key), None)

@@ -106,6 +106,12 @@ _model("set_window", "HU of black and white; of: slices or picture", "set_window
 _session("set_table", "show or take away table and blankets", "set_table", shown=_flag)
 _session("toggle_table", "take table and blankets away, or show them", "toggle_table")
 _model("scroll", "move a slice by steps of its voxels", "scroll", plane=_text, steps=_check_number)
+_session("zoom_slice", "show a slice of a size larger; about: from the middle, in shares of the height", "zoom_slice",
+         plane=_text, factor=_check_number, size=_size, takes={"about": _check_numbers(2)})  # fmt: skip
+_session("pan_slice", "shift a slice of a size, in shares of the height", "pan_slice",
+         plane=_text, dx=_check_number, dy=_check_number, size=_size)  # fmt: skip
+_model("fit_slices", "show the slices as they fit", "fit_slices")
+_session("probe", "HU at a place, LPS mm", "probe", point=_check_numbers(3))
 _model("set_cross", "move the slices to a place, LPS mm", "set_cross", point=_check_numbers(3))
 _session("find_parts", "find the parts of the scans at the iso value", "find_parts")
 _model("show", "show or hide a part", "show", key=_text, visible=_flag)
@@ -206,6 +212,14 @@ _SECTIONS: dict[str, dict[str, Key]] = {
         "ArrowLeft": Key(f"{_ISO_STEP:g} HU lower; Right: higher", {"do": "step_iso", "by": -_ISO_STEP}, name="Left"),
         "ArrowRight": Key("", {"do": "step_iso", "by": _ISO_STEP}),
     },
+    "Slices": {
+        "z": Key("one view at full size, or all views", "full"),
+        "PageUp": Key("slice before; Page Down: slice behind", "before", name="Page Up"),
+        "PageDown": Key("", "behind"),
+        "+": Key("larger; -: smaller", "larger"),
+        "-": Key("", "smaller"),
+        "0": Key("slices as they fit", {"do": "fit_slices"}),
+    },
     "Measure": {
         "m": Key("distance: two clicks", "distance"),
         "a": Key("angle: three clicks", "angle"),
@@ -246,7 +260,10 @@ _MOUSE = {
     "Mouse on a slice": (
         ("click, drag", "the other slices go there"),
         ("wheel", "scroll; touch: one finger"),
-        ("right drag", "window (right: wider) and level (down: higher); touch: two fingers"),
+        ("Ctrl and wheel", "zoom; touch: two fingers, which move it too"),
+        ("Shift and drag", "move; also with the middle button"),
+        ("right drag", "window (right: wider) and level (down: higher)"),
+        ("double click", "full size, or all views again; also on the picture"),
     ),
 }
 

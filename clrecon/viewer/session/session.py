@@ -20,7 +20,7 @@ from clrecon.errors import Cancelled, ClreconError, UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.opencl import Device
 from clrecon.rendering import Rendering
-from clrecon.rendering.views.directions import checked_size
+from clrecon.rendering.views.directions import checked_size, checked_vector
 from clrecon.system.arguments import Space
 from clrecon.system.base_classes import Closing
 from clrecon.system.light_dataclass import dataclass, field
@@ -28,6 +28,7 @@ from clrecon.system.log import get_logger
 from clrecon.system.text import format_volume
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.drawing.saving import check_target, save_shown
+from clrecon.viewer.model.changes import pan_camera, zoom_camera
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownMesh, ShownObject
 from clrecon.viewer.model.state import Pick, ViewState
@@ -163,6 +164,9 @@ VIEWS = (SCENE, *SLICES, "curve")
 REST_SECONDS = 0.2
 """After the last change until pictures are drawn sharp."""
 
+_LEAST_ZOOM, _MOST_ZOOM = 0.5, 50.0
+"""Of slices, by how they fit."""
+
 _STEPS = 64
 """Places on each line that are compared with the picture's depth."""
 
@@ -178,7 +182,7 @@ def picture_key(state: ViewState, view: str) -> Hashable:
         cut = (state.clips, state.clip_box)
         return (state.camera, state.mode, state.iso_value, state.picture_window, state.table, parts, cut)
     if view in SLICES:
-        return (state.cross, state.window, state.table, parts)
+        return (state.cross, state.frame(view), state.window, state.table, parts)
     return (state.curve, state.window, state.table)
 
 
@@ -451,6 +455,27 @@ class ViewSession(Closing):
             return {"pick": None, "measure": None}
         measure = self.model.add_point(picked)
         return {"pick": self._facts_of_pick(picked), "measure": None if measure is None else measure.describe()}
+
+    def probe(self, point: Sequence[float]) -> dict[str, Any]:
+        """Return what the first scan holds at a place, LPS mm, without looking whether it is shown."""
+        position = checked_vector("a place", point)
+        return {"probe": {"hu": self.painter.hu_at(position), "words": self.model.say_place(position)}}
+
+    def zoom_slice(
+        self, plane: str, factor: float, size: Sequence[int], about: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
+        """Show a slice of (width, height) pixels larger; what is seen at `about` stays, see `zoom_camera`."""
+        camera = self.painter.slice_camera(self.model.state, plane, checked_size(size))
+        frame, zoomed = self.model.state.frame(plane), zoom_camera(camera, factor, about)
+        zoom = factor if frame is None else factor * frame.zoom
+        if _LEAST_ZOOM <= zoom <= _MOST_ZOOM:
+            self.model.frame_slice(plane, zoom, zoomed.focal_point)
+
+    def pan_slice(self, plane: str, dx: float, dy: float, size: Sequence[int]) -> None:
+        """Shift a slice of (width, height) pixels by shares of its height, to the right and down."""
+        camera = self.painter.slice_camera(self.model.state, plane, checked_size(size))
+        frame = self.model.state.frame(plane)
+        self.model.frame_slice(plane, 1.0 if frame is None else frame.zoom, pan_camera(camera, dx, dy).focal_point)
 
     def mark_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Keep what is seen at a pixel as a seed, without a tool."""

@@ -192,7 +192,7 @@ LARGEST_SIDE = 2048
 _MOST_WAITING = 256
 """Messages of a browser that wait; more are left in the connection."""
 
-_SAID_ONCE = ("pick", "measure", "undone")
+_SAID_ONCE = ("pick", "probe", "measure", "undone")
 """What the answer to a command holds beside the facts."""
 
 _NOT_FOR_BROWSERS = frozenset({"save"})

@@ -1,4 +1,3 @@
-(() => {
   const SLICES = ["axial", "coronal", "sagittal"];
   const TOOLS = { distance: "distance", angle: "angle", trace: "curve", seed: "seed", only: "only", hide: "hide" };
   const SVG = "http://www.w3.org/2000/svg";
@@ -8,6 +7,7 @@
   const CROSS_PIXELS = 11, GAP = 7;
 
   let fixed = null, facts = null, choosing = "", chosen = "", curveOff = false, pictures = 0, asked = false, held = 0;
+  let full = "", probed = null;
   const message = find("message");
 
   // The connection: commands as JSON, pictures and facts back.
@@ -29,6 +29,7 @@
     if (told.facts) takeFacts(told.facts);
     if (told.error !== undefined) hint(told.error, true);
     if (told.pick !== undefined) picked(told.pick);
+    if (told.probe) { probed = told.probe; for (const view of Object.values(views)) if (view.pointer) annotate(view); }
     if (told.undone !== undefined) hint(told.undone ? `Taken back: ${told.undone}.` : "There is nothing to take back.");
     if (told.saved) fetchSaved(told.saved);
     if (told.written !== undefined) find("saved").textContent = told.written;
@@ -43,13 +44,34 @@
 
   const views = Object.fromEntries([...document.querySelectorAll(".view")].map((box) => {
     const canvas = element("canvas"), over = document.createElementNS(SVG, "svg");
-    box.append(canvas, over);
-    return [box.dataset.view, { name: box.dataset.view, box, canvas, over, pen: null, camera: null }];
+    const icon = document.createElementNS(SVG, "svg"), path = document.createElementNS(SVG, "path");
+    const enlarge = element("button", "", { type: "button", className: "enlarge", title: "full size, or all views again (z)",
+      ariaLabel: `${box.dataset.view} at full size`, onclick: () => setFull(box.dataset.view) });
+    path.setAttribute("d", "M9 2h5v5M14 2 9 7M7 14H2V9M2 14l5-5");
+    icon.setAttribute("viewBox", "0 0 16 16");
+    icon.append(path);
+    enlarge.append(icon);
+    box.append(canvas, over, enlarge);
+    return [box.dataset.view, { name: box.dataset.view, box, canvas, over, enlarge, pen: null, camera: null }];
   }));
   const isShown = (view) => !view.box.hidden && view.box.clientWidth > 0;
 
+  // One view takes the place of all, or gives it back.
+  function setFull(name) {
+    full = full ? "" : name;
+    for (const view of Object.values(views)) view.pointer = null;  // it lies elsewhere in them now
+    layOut();
+  }
+
   function layOut() {
-    find("stage").classList.toggle("alone", !find("sliced").checked || !facts || !facts.iso);
+    const alone = !find("sliced").checked || !facts || !facts.iso;
+    if (full && (views[full].box.hidden || (alone && SLICES.includes(full)))) full = "";
+    find("stage").classList.toggle("alone", alone);
+    find("stage").classList.toggle("full", full !== "");
+    for (const { name, box, enlarge } of Object.values(views)) {
+      box.classList.toggle("large", name === full);
+      enlarge.setAttribute("aria-pressed", String(name === full));
+    }
     find("stage").classList.toggle("curved", !views.curve.box.hidden);
     const sharp = Math.min(devicePixelRatio || 1, 2), sizes = {};
     for (const view of Object.values(views)) {
@@ -76,6 +98,7 @@
     pictures += 1;
     message.textContent = "";
     annotate(view);
+    probe(view);
     const [width, height] = head.size;
     if (head.view === "scene") {
       find("status").textContent = [
@@ -84,210 +107,6 @@
       ].filter(Boolean).join(" · ");
     }
     Object.assign(document.documentElement.dataset, { pictures, [head.view]: head.sharp ? "sharp" : "coarse" });
-  }
-
-  // Where a point of the patient (LPS mm) appears, in CSS pixels; null behind the eye.
-  function project(view, point) {
-    const camera = view.camera;
-    if (!camera) return null;
-    const away = minus(point, camera.position), deep = dot(away, camera.forward);
-    if (!camera.parallel && deep <= 0) return null;
-    const mm = ((2 * camera.half_height) / view.box.clientHeight) * (camera.parallel ? 1 : deep);
-    return [view.box.clientWidth / 2 + dot(away, camera.right) / mm,
-      view.box.clientHeight / 2 - dot(away, camera.up) / mm];
-  }
-
-  // What lies over a picture: sides of the patient, scale, cross, measures.
-
-  function annotate(view) {
-    if (!isShown(view) || !(view.camera || view.name === "curve")) { view.over.replaceChildren(); return; }
-    const width = view.box.clientWidth, height = view.box.clientHeight, camera = view.camera, drawn = [];
-    const make = (kind, more) => {
-      const one = document.createElementNS(SVG, kind);
-      for (const [name, value] of Object.entries(more)) one.setAttribute(name, value);
-      drawn.push(one);
-      return one;
-    };
-    const write = (text, x, y, name, anchor = "middle") => {
-      const one = make("text", { x, y, class: name, "text-anchor": anchor });
-      one.textContent = text;
-    };
-    const line = (points, name) => make("polyline", { points: points.map((point) => point.join()).join(" "), class: name });
-    const segments = (drawn, name) => {
-      for (const [from, to] of drawn) line([from, to], name);
-    };
-    if (view.name !== "scene") write(view.name === "curve" ? "along the curve" : view.name, 10, 14, `name ${view.name}`, "start");
-    if (!camera) { view.over.replaceChildren(...drawn); return; }  // a curve is straightened: it has no sides
-    const less = (row) => row.map((value) => -value);
-    write(sideOf(camera.up), width / 2, 14, "side");
-    write(sideOf(less(camera.up)), width / 2, height - 14, "side");
-    write(sideOf(less(camera.right)), 20, height / 2, "side");
-    write(sideOf(camera.right), width - 20, height / 2, "side");
-    const focal = camera.parallel ? 1 : facts ? dot(minus(facts.camera.focal_point, camera.position), camera.forward) : 1;
-    const mm = ((2 * camera.half_height) / height) * focal, length = roundLength((width / 4) * mm);
-    const end = 14 + length / mm, low = height - 16;
-    line([[14, low - 6], [14, low], [end, low], [end, low - 6]], "halo");
-    line([[14, low - 6], [14, low], [end, low], [end, low - 6]], "bar");
-    write(sayLength(length) + (camera.parallel ? "" : " in the middle"), 14, low - 17, "side", "start");
-    if (facts && facts.iso) annotateCross(view, segments, width, height);
-    if (facts) annotateMeasures(view, line, write, width, height);
-    view.over.replaceChildren(...drawn);
-  }
-
-  // Where the slices meet: in a slice the lines of the two others, in the picture a short line along each axis.
-  function annotateCross(view, segments, width, height) {
-    const [x, y] = project(view, facts.cross) || [];
-    if (x === undefined) return;
-    for (const [plane, axis] of Object.entries(ACROSS)) {
-      if (view.name === "scene") {
-        const mm = (facts.camera.height_mm / height) * CROSS_PIXELS;
-        const ends = [-mm, mm].map((by) => project(view, facts.cross.map((value, at) => value + (at === axis ? by : 0))));
-        if (ends.every(Boolean)) segments([ends], `cross ${plane}`);
-      } else if (plane !== view.name) {
-        const upright = Math.abs(view.camera.right[axis]) > Math.abs(view.camera.up[axis]);
-        segments(upright ? [[[x, 0], [x, y - GAP]], [[x, y + GAP], [x, height]]]
-          : [[[0, y], [x - GAP, y]], [[x + GAP, y], [width, y]]], `cross ${plane}`);
-      }
-    }
-  }
-
-  // Texts of measures stand in the nearer upper corner, with a thin line to what they belong to: bone stays free.
-  function annotateMeasures(view, line, write, width, height) {
-    const placed = { start: 0, end: 0 };
-    const unfinished = facts.points.length ? [{ points: facts.points.map(({ point }) => point), text: "" }] : [];
-    for (const measure of [...facts.measures, ...unfinished]) {
-      const points = measure.points.map((point) => project(view, point)).filter(Boolean);
-      if (points.length !== measure.points.length || !isNear(view, measure.points)) continue;
-      for (const name of ["halo", "line"]) {
-        if (points.length > 1) line(points, view.name === "scene" ? `${name} behind` : name);
-        for (const [x, y] of points) { line([[x - 5, y], [x + 5, y]], name); line([[x, y - 5], [x, y + 5]], name); }
-      }
-      if (!measure.text) continue;
-      const middle = points.length === 3 && measure.kind === "angle" ? points[1]
-        : [0, 1].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
-      const side = middle[0] < width / 2 ? "start" : "end", x = side === "start" ? 12 : width - 12;
-      const y = 18 + 20 * placed[side]++;
-      line([[x + (side === "start" ? 1 : -1) * (4 + 8 * measure.text.length), y], middle], "lead");
-      write(measure.text, x, y, "measure", side);
-    }
-    if (view.name !== "scene") return;
-    for (const piece of facts.seen_lines) {  // what no bone hides
-      const ends = piece.map((point) => project(view, point));
-      if (ends.every(Boolean)) line(ends, "line seen");
-    }
-  }
-
-  // In a slice only what lies within 3 mm of its plane.
-  function isNear(view, points) {
-    if (!SLICES.includes(view.name)) return view.name !== "curve";
-    return points.every((point) => Math.abs(dot(minus(point, facts.cross), view.camera.forward)) < 3);
-  }
-
-  // Gestures: what came since the last frame goes out as one command each.
-
-  const waiting = new Map();
-
-  function gather(key, join) {
-    waiting.set(key, join(waiting.get(key)));
-    if (!asked) requestAnimationFrame(flush);
-    asked = true;
-  }
-
-  function flush() {
-    asked = false;
-    for (const what of waiting.values()) run(what.do, what.more);
-    waiting.clear();
-  }
-
-  const sumUp = (name, x, y) => gather(name, (old) => (
-    { do: name, more: { dx: x + (old ? old.more.dx : 0), dy: y + (old ? old.more.dy : 0) } }
-  ));
-  const last = (name, more, key = name) => gather(key, () => ({ do: name, more }));
-
-  function zoomBy(view, factor, x, y) {
-    const { clientWidth: width, clientHeight: height } = view.box, at = [(x - width / 2) / height, (y - height / 2) / height];
-    gather("zoom", (old) => ({ do: "zoom", more: { factor: factor * (old ? old.more.factor : 1), at } }));
-  }
-
-  const scrollBy = (view, steps) => gather(`scroll ${view.name}`, (old) => (
-    { do: "scroll", more: { plane: view.name, steps: steps + (old ? old.more.steps : 0) } }
-  ));
-
-  function windowBy(x, y) {
-    const [low, high] = waiting.has("set_window") ? Object.values(waiting.get("set_window").more) : facts.window;
-    const width = Math.max(1, (high - low) * Math.exp(x / 200)), level = (low + high) / 2 + (y * (high - low)) / 300;
-    facts.window = [level - width / 2, level + width / 2];
-    last("set_window", { low: facts.window[0], high: facts.window[1] });
-    showWindow();
-  }
-
-  function turnAt(view, x, y) {  // Ctrl and drag: about the middle of the picture
-    const now = Math.atan2(y - view.box.clientHeight / 2, x - view.box.clientWidth / 2);
-    const by = view.angle === undefined ? 0 : ((now - view.angle) * 180) / Math.PI;
-    view.angle = now;
-    const degrees = by > 180 ? by - 360 : by < -180 ? by + 360 : by;
-    gather("roll", (old) => ({ do: "roll", more: { degrees: degrees + (old ? old.more.degrees : 0) } }));
-  }
-
-  for (const view of Object.values(views)) {
-    const fingers = new Map(), slice = SLICES.includes(view.name);
-    let moved = 0, steps = 0;
-    const at = (event) => {
-      const box = view.box.getBoundingClientRect();
-      return [event.clientX - box.left, event.clientY - box.top];
-    };
-    view.box.addEventListener("pointerdown", (event) => {
-      view.box.setPointerCapture(event.pointerId);
-      fingers.set(event.pointerId, at(event));
-      moved = fingers.size > 1 ? Infinity : 0;
-      steps = 0;
-      last("hold", { on: true });
-      delete view.angle;
-    });
-    view.box.addEventListener("pointermove", (event) => {
-      view.pointer = at(event);
-      const before = fingers.get(event.pointerId);
-      if (!before || view.name === "curve") return;
-      const now = at(event), x = now[0] - before[0], y = now[1] - before[1], height = view.box.clientHeight;
-      moved += Math.hypot(x, y);
-      if (moved < 4) return;
-      if (slice) {
-        if (event.buttons & 2 || fingers.size > 1) windowBy(x / fingers.size, y / fingers.size);
-        else if (event.pointerType === "touch") {
-          steps += y / 6;
-          if (Math.trunc(steps)) scrollBy(view, Math.trunc(steps));
-          steps -= Math.trunc(steps);
-        } else if (!choosing) last("cross_at", pixel(view, now));
-      } else if (fingers.size > 1) {
-        const other = [...fingers].find(([id]) => id !== event.pointerId)[1];
-        const apart = (finger) => Math.max(Math.hypot(finger[0] - other[0], finger[1] - other[1]), 1);
-        sumUp("pan", x / 2 / height, y / 2 / height);
-        zoomBy(view, apart(now) / apart(before), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
-      } else if (event.ctrlKey && event.shiftKey) {
-        zoomBy(view, 6 ** (-y / height), view.box.clientWidth / 2, height / 2);
-      } else if (event.ctrlKey) turnAt(view, ...now);
-      else if (event.shiftKey || event.buttons & 6) sumUp("pan", x / height, y / height);
-      else sumUp("turn", x / height, y / height);
-      fingers.set(event.pointerId, now);
-    });
-    for (const name of ["pointerup", "pointercancel"]) {
-      view.box.addEventListener(name, (event) => {
-        fingers.delete(event.pointerId);
-        if (!fingers.size) last("hold", { on: false }, "release");
-        if (name === "pointerup" && moved < 4 && event.button === 0) click(view, at(event), event.shiftKey);
-      });
-    }
-    view.box.addEventListener("pointerleave", () => { view.pointer = null; });
-    view.box.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      const by = Math.max(-1, Math.min(1, event.deltaY / 100));
-      if (slice) {
-        steps += by;
-        if (Math.trunc(steps)) scrollBy(view, Math.trunc(steps));
-        steps -= Math.trunc(steps);
-      } else if (view.name === "scene") zoomBy(view, Math.exp(-0.2 * by), ...at(event));
-    }, { passive: false });
-    view.box.addEventListener("contextmenu", (event) => event.preventDefault());
   }
 
   // Tools.
@@ -573,6 +392,22 @@
   find("help").onclick = () => find("keys").showModal();
   find("closekeys").onclick = () => find("keys").close();
 
+  // The view that the Tab key went to, else the one under the pointer.
+  const aimed = () => Object.values(views).find(({ box }) => box.matches(":focus-visible"))
+    || Object.values(views).find(({ pointer }) => pointer);
+
+  function scrollAimed(steps) {
+    const view = aimed();
+    if (view && SLICES.includes(view.name)) scrollBy(view, steps);
+    else hint("Point at a slice first.");
+  }
+
+  function zoomAimed(factor) {
+    const view = aimed();
+    if (view && view.name !== "curve") zoomBy(view, factor, ...middleOf(view));
+    else hint("Point at a picture first.");
+  }
+
   // What the page does itself at a key; what else keys do are commands of the session.
   const press = (id) => () => { if (!find(id).hidden) find(id).click(); };
   const OWN = {
@@ -580,6 +415,11 @@
     curve: () => { if (choosing === "curve" || find("curved").hidden) find("trace").click(); else find("along").click(); },
     escape: () => { if (choosing) choose(""); else { run("cancel"); run("dismiss"); hint(""); } },
     quit: () => tell({ quit: true }),
+    full: () => setFull((aimed() || views.scene).name),
+    before: () => scrollAimed(-1),
+    behind: () => scrollAimed(1),
+    larger: () => zoomAimed(1.25),
+    smaller: () => zoomAimed(0.8),
   };
 
   // A command for what lies under the pointer; elsewhere what is like it for the part that was chosen in the list.
@@ -599,6 +439,7 @@
     if (isRange && event.key.startsWith("Arrow")) return;
     const does = fixed.keys[event.key];
     if (does === undefined) return;
+    if (event.key.startsWith("Page")) event.preventDefault();
     if (typeof does === "string") OWN[does]();
     else if (fixed.at_pointer.includes(event.key)) runAtPointer(does.do);
     else tell(does);
@@ -609,4 +450,3 @@
   window.clrecon = Object.freeze({
     get facts() { return facts; }, project: (name, point) => project(views[name], point), run, get pictures() { return pictures; },
   });
-})();

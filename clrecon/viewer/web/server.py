@@ -95,7 +95,8 @@ def compose_page(host: str) -> Page:
 @cache
 def _compose() -> tuple[bytes, str, str]:
     """Return the document and the hashes of its script and style."""
-    script = "\n".join((read_page_code("page_shared.js"), read_page_code("page.js", __package__)))
+    parts = "\n".join(read_page_code(name, __package__) for name in ("page.js", "panes.js"))
+    script = f"{read_page_code('page_shared.js')}\n(() => {{\n{parts}}})();\n"
     style = "\n".join((read_page_code("page.css"), read_page_code("page.css", __package__)))
     filled = {"STYLE": style, "SCRIPT": script}
     document = re.sub("@([A-Z]+)@", lambda place: filled[place[1]], read_page_code("page.html", __package__) + "\n")

@@ -12,6 +12,7 @@ import view_scenes as scenes
 from refusals import refused
 
 from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import Volume
 from clrecon.labels.resample import ResampledLabels
 from clrecon.points import PointCloud
 from clrecon.viewer.drawing.painter import Painter
@@ -65,6 +66,7 @@ CHANGES = {
     "table": lambda m: m.set_table(False),
     "scroll": lambda m: m.scroll("axial", 3),
     "cross": lambda m: m.set_cross((-40.0, -20.0, 210.0)),
+    "frame": lambda m: m.frame_slice("coronal", 2.0, (-40.0, -20.0, 210.0)),
     "hide": lambda m: m.show("1/1", False),
     "only": lambda m: m.only("1/2"),
     "color": lambda m: m.set_color("2", (1.0, 0.5, 0.0)),
@@ -103,6 +105,8 @@ def test_every_change_grows_the_version_and_can_be_undone(change):
         (lambda m: m.set_window(5.0, 9.0, "page"), "slices"),
         (lambda m: m.scroll("axal", 1), "axial"),
         (lambda m: m.set_cross((1.0, 2.0)), "three finite numbers"),
+        (lambda m: m.frame_slice("axial", float("inf"), (0.0, 0.0, 0.0)), "finite"),
+        (lambda m: m.frame_slice("axial", 2.0, (0.0, 0.0)), "three finite numbers"),
         (lambda m: m.show("7", True), "unknown part"),
         (lambda m: m.set_color("2", (2.0, 0.0, 0.0)), "from 0 to 1"),
         (lambda m: m.set_opacity("2", 1.5), "from 0 to 1"),
@@ -291,6 +295,25 @@ def test_an_angle_of_points_in_one_place_is_refused():
     model.add_point(Pick(point=(0.0, 0.0, 0.0)))
     with refused(UsageError, "angle", "points"):
         model.add_point(Pick(point=(1.0, 0.0, 0.0)))
+
+
+def test_slices_are_numbered_away_from_the_eye():
+    affine = np.diag([-1.0, 1.0, 2.0, 1.0])  # i runs to the right, j to the back, k up
+    model = make_model(Volume(np.zeros((5, 4, 3), np.int16), affine))
+    model.set_cross((-2.0, 1.0, 0.0))
+    slices = model.facts()["slices"]
+    assert slices == {
+        "axial": {"place": "I 0.0 mm", "number": 1, "count": 5},
+        "coronal": {"place": "P 1.0 mm", "number": 2, "count": 4},
+        "sagittal": {"place": "R 2.0 mm", "number": 3, "count": 3},
+    }
+    model.scroll("axial", 3)
+    assert model.facts()["slices"]["axial"] == {"place": "S 6.0 mm", "number": 4, "count": 5}
+
+
+def test_slices_without_a_scan_have_a_place_and_no_number():
+    model = make_model(scenes.make_mesh())
+    assert set(model.facts()["slices"]["sagittal"]) == {"place"}
 
 
 @pytest.fixture

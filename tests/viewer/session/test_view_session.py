@@ -65,6 +65,10 @@ RIGHT: dict[str, dict[str, Any]] = {
     "scroll": {"plane": "axial", "steps": 2},
     "step_iso": {"by": -5},
     "set_cross": {"point": [-40, -20, 210]},
+    "zoom_slice": {"plane": "axial", "factor": 2, "about": [0.1, 0.1], **AT},
+    "fit_slices": {},
+    "pan_slice": {"plane": "axial", "dx": 0.1, "dy": 0.1, **AT},
+    "probe": {"point": [-40, -20, 210]},
     "show": {"key": "2", "visible": False},
     "only": {"key": "2"},
     "show_all": {},
@@ -134,6 +138,11 @@ def test_every_command_is_done_and_undone(session):
         ({"do": "turn", "dx": 1, "dy": None}, "is a number"),
         ({"do": "zoom", "factor": 2, "at": [1]}, "2 numbers"),
         ({"do": "zoom", "factor": 2, "at": "ab"}, "2 numbers"),
+        ({"do": "zoom_slice", "plane": "axial", "factor": -2, **AT}, "above 0"),
+        ({"do": "zoom_slice", "plane": "axal", "factor": 2, **AT}, "axial"),
+        ({"do": "zoom_slice", "plane": "axial", "factor": 2}, "needs size"),
+        ({"do": "pan_slice", "plane": "axial", "dx": 1, "dy": float("nan"), **AT}, "three finite numbers"),
+        ({"do": "probe", "point": [1, 2]}, "3 numbers"),
         ({"do": "look", "view": [0, 95]}, "-90"),
         ({"do": "show", "key": 2, "visible": True}, "is a name"),
         ({"do": "show", "key": "x" * 300, "visible": True}, "is a name"),
@@ -366,3 +375,50 @@ def test_news_of_the_background_are_told(session):
     view.prepare()
     view.do({"do": "find_parts"})
     assert view.wait(PATIENCE) and len(told) >= 4 and view.facts()["error"] is None
+
+
+def place_in_slice(view: ViewSession, x: float, y: float) -> list[float]:
+    return view.do({"do": "pick", "x": x, "y": y, "plane": "coronal", **AT})["pick"]["point"]
+
+
+@pytest.mark.opencl
+def test_a_slice_is_zoomed_about_what_is_under_the_pointer(session):
+    view = session()
+    before, middle = place_in_slice(view, 70.0, 20.0), place_in_slice(view, 48.0, 40.0)
+    about = [(70.0 - 48.0) / 80.0, (20.0 - 40.0) / 80.0]
+    for factor in (2.0, 1.5):
+        view.do({"do": "zoom_slice", "plane": "coronal", "factor": factor, "about": about, **AT})
+    assert place_in_slice(view, 70.0, 20.0) == pytest.approx(before, abs=2e-3)
+    away = np.subtract(place_in_slice(view, 48.0, 40.0), before)
+    assert away == pytest.approx(np.subtract(middle, before) / 3.0, abs=2e-3)
+    view.do({"do": "fit_slices"})
+    assert place_in_slice(view, 48.0, 40.0) == pytest.approx(middle, abs=2e-3)
+
+
+@pytest.mark.opencl
+def test_a_slice_is_shifted_by_shares_of_its_height(session):
+    view = session()
+    view.do({"do": "zoom_slice", "plane": "coronal", "factor": 3.0, **AT})
+    before = place_in_slice(view, 48.0, 40.0)
+    view.do({"do": "pan_slice", "plane": "coronal", "dx": 0.1, "dy": 0.05, **AT})
+    assert place_in_slice(view, 56.0, 44.0) == pytest.approx(before, abs=2e-3)
+
+
+@pytest.mark.opencl
+def test_a_zoom_beyond_the_largest_leaves_a_slice_as_it_is(session):
+    view = session()
+    view.do({"do": "zoom_slice", "plane": "axial", "factor": 40.0, **AT})
+    before = view.model.state
+    view.do({"do": "zoom_slice", "plane": "axial", "factor": 2.0, "about": [0.2, 0.2], **AT})
+    assert view.model.state == before
+
+
+@pytest.mark.opencl
+def test_a_probe_says_hu_and_place_and_changes_nothing(session):
+    view = session()
+    before = view.model.state
+    inside = view.do({"do": "probe", "point": scenes.middle(0).tolist()})["probe"]
+    outside = view.do({"do": "probe", "point": [500.0, 0.0, 0.0]})["probe"]
+    assert inside["hu"] == pytest.approx(1000.0, abs=1.0) and inside["words"].endswith("mm LPS")
+    assert outside == {"hu": None, "words": "500.0, 0.0, 0.0 mm LPS"}
+    assert view.model.state == before

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import io
-import json
 import re
 import time
 from pathlib import Path
@@ -12,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import view_scenes as scenes
-from browser import open_browser, outside_requests, severe_lines, wait_for
+from browser import severe_lines, wait_for
 from open_views import search_for_ever
+from view_pages import SETTLED, changed_share, click, drag, facts, picture, point_at, press, settle
 from web_views import PATIENCE, serving
 
 from clrecon.viewer.drawing.painter import Painter
@@ -23,108 +21,8 @@ from clrecon.viewer.session.session import ViewSession
 
 pytestmark = [pytest.mark.slow, pytest.mark.opencl]
 
-SETTLED = "return clrecon.facts && clrecon.facts.settled && clrecon.pictures > 0"
 PARTS = "return clrecon.facts.parts.filter((part) => part.kind === 'cluster').length === 3"
 ISO = scenes.ISO
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("downloads")
-
-
-@pytest.fixture(scope="module")
-def browser(folder):
-    with open_browser(1200, 800) as driver:
-        driver.execute_cdp_cmd("Page.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(folder)})
-        yield driver
-
-
-@pytest.fixture(scope="module")
-def served(device):
-    objects = show_objects([scenes.make_scan(), scenes.make_mesh()])
-    objects[1] = dataclasses.replace(objects[1], said=("a ball of triangles",))
-    with (
-        Painter(objects, device=device) as painter,
-        serving(lambda heard: ViewSession(objects, painter, iso_value=ISO, on_change=heard)) as running,
-    ):
-        yield running
-
-
-@pytest.fixture
-def page(browser, served):
-    """The page, just opened and drawn; after the test it has logged no error and asked nobody else for anything."""
-    severe_lines(browser), outside_requests(browser)
-    browser.get(served.address)
-    wait_for(browser, SETTLED)
-    yield browser
-    assert severe_lines(browser) == []
-    own = (f"http://127.0.0.1:{served.port}/", f"ws://127.0.0.1:{served.port}/")
-    assert [address for address in outside_requests(browser) if not address.startswith(own)] == []
-
-
-def picture(page, name: str = "scene") -> np.ndarray:
-    """What a view shows, (h, w, 3), with what lies over it."""
-    from PIL import Image
-
-    content = page.find_element("id", name).screenshot_as_png
-    return np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
-
-
-def changed_share(one: np.ndarray, other: np.ndarray) -> float:
-    return float((np.abs(one - other).max(axis=2) > 24).mean())
-
-
-def facts(page) -> dict:
-    return json.loads(page.execute_script("return JSON.stringify(clrecon.facts)"))
-
-
-def settle(page) -> None:
-    """Wait until everything is shown as it is after what was done."""
-    time.sleep(0.3)  # a change needs a frame and the way to the server
-    wait_for(page, SETTLED)
-
-
-def drag(page, element, x: int, y: int, dx: int, dy: int, steps: int = 15) -> None:
-    """Drag from a place beside the middle of an element, in small moves."""
-    from selenium.webdriver import ActionChains
-
-    actions = ActionChains(page, duration=15).move_to_element_with_offset(element, x, y).click_and_hold()
-    for _ in range(steps):
-        actions = actions.move_by_offset(round(dx / steps), round(dy / steps))
-    actions.release().perform()
-
-
-def point_at(page, name: str, point: np.ndarray) -> None:
-    """Move the pointer to the place of a point of the patient."""
-    from selenium.webdriver import ActionChains
-
-    element = page.find_element("id", name)
-    x, y = page.execute_script("return clrecon.project(arguments[0], arguments[1])", name, [float(v) for v in point])
-    ActionChains(page).move_to_element_with_offset(
-        element, round(x - element.size["width"] / 2), round(y - element.size["height"] / 2)
-    ).perform()
-
-
-def click(page, name: str, point: np.ndarray, *held: str) -> None:
-    """Click at the place of a point of the patient, with keys held."""
-    from selenium.webdriver import ActionChains
-
-    point_at(page, name, point)
-    actions = ActionChains(page)
-    for key in held:
-        actions.key_down(key)
-    actions.click()
-    for key in held:
-        actions.key_up(key)
-    actions.perform()
-
-
-def press(page, *keys: str) -> None:
-    """Press keys with the pointer where it is."""
-    from selenium.webdriver import ActionChains
-
-    ActionChains(page).send_keys(*keys).perform()
 
 
 def test_a_drag_turns_the_picture_and_leaves_the_slices(page) -> None:
@@ -259,7 +157,7 @@ def test_the_cross_is_seen_in_the_picture_and_slices_have_names_and_colours(page
     assert len(every) == 3
     for name in ("axial", "coronal", "sagittal"):
         label = page.find_element("css selector", f"#{name} .name")
-        assert label.text == name
+        assert label.text.split()[0] == name
         own = page.execute_script("return getComputedStyle(arguments[0]).fill", label)
         assert colors(name) == every - {own}
     marks = page.find_elements("css selector", "#marks span")

@@ -12,7 +12,7 @@ from clrecon.viewer.web.server import compose_page
 
 pytestmark = pytest.mark.unit
 
-SCRIPT = (files("clrecon.viewer.web") / "page.js").read_text(encoding="utf-8")
+SCRIPT = "".join((files("clrecon.viewer.web") / name).read_text(encoding="utf-8") for name in ("page.js", "panes.js"))
 
 
 def test_keys_are_commands_or_what_the_page_does_itself() -> None:

@@ -1,0 +1,253 @@
+  // What lies over the pictures, and the gestures on them; in one scope with page.js.
+
+  // Where a point of the patient (LPS mm) appears, in CSS pixels; null behind the eye.
+  function project(view, point) {
+    const camera = view.camera;
+    if (!camera) return null;
+    const away = minus(point, camera.position), deep = dot(away, camera.forward);
+    if (!camera.parallel && deep <= 0) return null;
+    const mm = ((2 * camera.half_height) / view.box.clientHeight) * (camera.parallel ? 1 : deep);
+    return [view.box.clientWidth / 2 + dot(away, camera.right) / mm,
+      view.box.clientHeight / 2 - dot(away, camera.up) / mm];
+  }
+
+  const WIDE = 240;  // pixels of a slice that has room for all of its words
+
+  // What lies over a picture: sides of the patient, scale, cross, measures.
+
+  function annotate(view) {
+    if (!isShown(view) || !(view.camera || view.name === "curve")) { view.over.replaceChildren(); return; }
+    const width = view.box.clientWidth, height = view.box.clientHeight, camera = view.camera, drawn = [];
+    const make = (kind, more) => {
+      const one = document.createElementNS(SVG, kind);
+      for (const [name, value] of Object.entries(more)) one.setAttribute(name, value);
+      drawn.push(one);
+      return one;
+    };
+    const write = (text, x, y, name, anchor = "middle") => {
+      const one = make("text", { x, y, class: name, "text-anchor": anchor });
+      one.textContent = text;
+    };
+    const line = (points, name) => make("polyline", { points: points.map((point) => point.join()).join(" "), class: name });
+    const segments = (drawn, name) => {
+      for (const [from, to] of drawn) line([from, to], name);
+    };
+    if (view.name === "curve") write("along the curve", 10, 14, "name curve", "start");
+    if (SLICES.includes(view.name)) annotateSlice(view, write, width, height);
+    if (!camera) { view.over.replaceChildren(...drawn); return; }  // a curve is straightened: it has no sides
+    const less = (row) => row.map((value) => -value);
+    write(sideOf(camera.up), width / 2, 14, "side");
+    write(sideOf(less(camera.up)), width / 2, height - 14, "side");
+    write(sideOf(less(camera.right)), 20, height / 2, "side");
+    write(sideOf(camera.right), width - 20, height / 2, "side");
+    const focal = camera.parallel ? 1 : facts ? dot(minus(facts.camera.focal_point, camera.position), camera.forward) : 1;
+    const mm = ((2 * camera.half_height) / height) * focal, length = roundLength((width / 4) * mm);
+    const end = 14 + length / mm, low = height - 16;
+    line([[14, low - 6], [14, low], [end, low], [end, low - 6]], "halo");
+    line([[14, low - 6], [14, low], [end, low], [end, low - 6]], "bar");
+    write(sayLength(length) + (camera.parallel ? "" : " in the middle"), 14, low - 17, "side", "start");
+    if (facts && facts.iso) annotateCross(view, segments, width, height);
+    if (facts) annotateMeasures(view, line, write, width, height);
+    view.over.replaceChildren(...drawn);
+  }
+
+  // Which slice it is, its window, and HU and mm under the pointer.
+  function annotateSlice(view, write, width, height) {
+    const { number, count, place } = facts ? facts.slices[view.name] : {}, wide = width >= WIDE;
+    const [low, high] = facts ? facts.window : [0, 0], level = Math.round((low + high) / 2), span = Math.round(high - low);
+    const which = count ? `${number} / ${count}` : "";
+    write(wide ? `${view.name} ${which}` : view.name, wide ? 10 : 5, 14, `name ${wide ? "" : "small "}${view.name}`, "start");
+    if (!facts) return;
+    write(wide ? place : which, wide ? 10 : 5, 32, "words", "start");
+    view.canvas.ariaLabel = `${view.name} slice ${count ? `${number} of ${count}` : ""}, ${place}, level ${level}, width ${span} HU`;
+    if (!wide) return;
+    write(`L ${level} W ${span}`, width - 10, height - 14, "words", "end");
+    if (!view.pointer || !probed) return;
+    write(probed.words, width - 10, height - 31, "words probe", "end");
+    write(probed.hu === null ? "outside" : `${probed.hu.toFixed(0)} HU`, width - 10, height - 48, "words probe", "end");
+  }
+
+  // Where the slices meet: in a slice the lines of the two others, in the picture a short line along each axis.
+  function annotateCross(view, segments, width, height) {
+    const [x, y] = project(view, facts.cross) || [];
+    if (x === undefined) return;
+    for (const [plane, axis] of Object.entries(ACROSS)) {
+      if (view.name === "scene") {
+        const mm = (facts.camera.height_mm / height) * CROSS_PIXELS;
+        const ends = [-mm, mm].map((by) => project(view, facts.cross.map((value, at) => value + (at === axis ? by : 0))));
+        if (ends.every(Boolean)) segments([ends], `cross ${plane}`);
+      } else if (plane !== view.name) {
+        const upright = Math.abs(view.camera.right[axis]) > Math.abs(view.camera.up[axis]);
+        segments(upright ? [[[x, 0], [x, y - GAP]], [[x, y + GAP], [x, height]]]
+          : [[[0, y], [x - GAP, y]], [[x + GAP, y], [width, y]]], `cross ${plane}`);
+      }
+    }
+  }
+
+  // Texts of measures stand in the nearer upper corner, with a thin line to what they belong to: bone stays free.
+  function annotateMeasures(view, line, write, width, height) {
+    const placed = SLICES.includes(view.name) ? { start: 2, end: 1 } : { start: 0, end: 1 };  // words, and the button
+    const unfinished = facts.points.length ? [{ points: facts.points.map(({ point }) => point), text: "" }] : [];
+    for (const measure of [...facts.measures, ...unfinished]) {
+      const points = measure.points.map((point) => project(view, point)).filter(Boolean);
+      if (points.length !== measure.points.length || !isNear(view, measure.points)) continue;
+      for (const name of ["halo", "line"]) {
+        if (points.length > 1) line(points, view.name === "scene" ? `${name} behind` : name);
+        for (const [x, y] of points) { line([[x - 5, y], [x + 5, y]], name); line([[x, y - 5], [x, y + 5]], name); }
+      }
+      if (!measure.text) continue;
+      const middle = points.length === 3 && measure.kind === "angle" ? points[1]
+        : [0, 1].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
+      const side = middle[0] < width / 2 ? "start" : "end", x = side === "start" ? 12 : width - 12;
+      const y = 18 + 20 * placed[side]++;
+      line([[x + (side === "start" ? 1 : -1) * (4 + 8 * measure.text.length), y], middle], "lead");
+      write(measure.text, x, y, "measure", side);
+    }
+    if (view.name !== "scene") return;
+    for (const piece of facts.seen_lines) {  // what no bone hides
+      const ends = piece.map((point) => project(view, point));
+      if (ends.every(Boolean)) line(ends, "line seen");
+    }
+  }
+
+  // In a slice only what lies within 3 mm of its plane.
+  function isNear(view, points) {
+    if (!SLICES.includes(view.name)) return view.name !== "curve";
+    return points.every((point) => Math.abs(dot(minus(point, facts.cross), view.camera.forward)) < 3);
+  }
+
+  // Gestures: what came since the last frame goes out as one command each.
+
+  const waiting = new Map();
+
+  function gather(key, join) {
+    waiting.set(key, join(waiting.get(key)));
+    if (!asked) requestAnimationFrame(flush);
+    asked = true;
+  }
+
+  function flush() {
+    asked = false;
+    for (const what of waiting.values()) run(what.do, what.more);
+    waiting.clear();
+  }
+
+  const sumUp = (name, x, y) => gather(name, (old) => (
+    { do: name, more: { dx: x + (old ? old.more.dx : 0), dy: y + (old ? old.more.dy : 0) } }
+  ));
+  const last = (name, more, key = name) => gather(key, () => ({ do: name, more }));
+
+  const sizeOf = ({ box }) => [box.clientWidth, box.clientHeight];
+  const middleOf = (view) => sizeOf(view).map((value) => value / 2);
+
+  function zoomBy(view, factor, x, y) {
+    const [width, height] = sizeOf(view), at = [(x - width / 2) / height, (y - height / 2) / height];
+    const make = SLICES.includes(view.name)
+      ? (by) => ({ do: "zoom_slice", more: { factor: by, about: at, plane: view.name, size: [width, height] } })
+      : (by) => ({ do: "zoom", more: { factor: by, at } });
+    gather(`zoom ${view.name}`, (old) => make(factor * (old ? old.more.factor : 1)));
+  }
+
+  function panBy(view, x, y) {  // pixels
+    const height = view.box.clientHeight, dx = x / height, dy = y / height;
+    if (!SLICES.includes(view.name)) { sumUp("pan", dx, dy); return; }
+    gather(`pan ${view.name}`, (old) => ({ do: "pan_slice",
+      more: { dx: dx + (old ? old.more.dx : 0), dy: dy + (old ? old.more.dy : 0), plane: view.name, size: sizeOf(view) } }));
+  }
+
+  // Ask what a slice shows under the pointer.
+  function probe(view) {
+    if (!facts || !view.pointer || !view.camera || !SLICES.includes(view.name)) return;
+    const { position, right, up, forward, half_height: half } = view.camera, [x, y] = view.pointer;
+    const mm = (2 * half) / view.box.clientHeight, [middleX, middleY] = middleOf(view);
+    const deep = dot(minus(facts.cross, position), forward);
+    last("probe", { point: position.map((value, axis) => value + (x - middleX) * mm * right[axis]
+      - (y - middleY) * mm * up[axis] + deep * forward[axis]) });
+  }
+
+  const scrollBy = (view, steps) => gather(`scroll ${view.name}`, (old) => (
+    { do: "scroll", more: { plane: view.name, steps: steps + (old ? old.more.steps : 0) } }
+  ));
+
+  function windowBy(x, y) {
+    const [low, high] = waiting.has("set_window") ? Object.values(waiting.get("set_window").more) : facts.window;
+    const width = Math.max(1, (high - low) * Math.exp(x / 200)), level = (low + high) / 2 + (y * (high - low)) / 300;
+    facts.window = [level - width / 2, level + width / 2];
+    last("set_window", { low: facts.window[0], high: facts.window[1] });
+    showWindow();
+  }
+
+  function turnAt(view, x, y) {  // Ctrl and drag: about the middle of the picture
+    const now = Math.atan2(y - view.box.clientHeight / 2, x - view.box.clientWidth / 2);
+    const by = view.angle === undefined ? 0 : ((now - view.angle) * 180) / Math.PI;
+    view.angle = now;
+    const degrees = by > 180 ? by - 360 : by < -180 ? by + 360 : by;
+    gather("roll", (old) => ({ do: "roll", more: { degrees: degrees + (old ? old.more.degrees : 0) } }));
+  }
+
+  for (const view of Object.values(views)) {
+    const fingers = new Map(), slice = SLICES.includes(view.name);
+    let moved = 0, steps = 0;
+    const at = (event) => {
+      const box = view.box.getBoundingClientRect();
+      return [event.clientX - box.left, event.clientY - box.top];
+    };
+    view.box.addEventListener("pointerdown", (event) => {
+      if (event.target.closest("button")) return;
+      view.box.setPointerCapture(event.pointerId);
+      fingers.set(event.pointerId, at(event));
+      moved = fingers.size > 1 ? Infinity : 0;
+      steps = 0;
+      last("hold", { on: true });
+      delete view.angle;
+    });
+    view.box.addEventListener("pointermove", (event) => {
+      view.pointer = at(event);
+      const before = fingers.get(event.pointerId);
+      if (!before) probe(view);
+      if (!before || view.name === "curve") return;
+      const now = at(event), x = now[0] - before[0], y = now[1] - before[1], height = view.box.clientHeight;
+      moved += Math.hypot(x, y);
+      if (moved < 4) return;
+      if (fingers.size > 1) {
+        const other = [...fingers].find(([id]) => id !== event.pointerId)[1];
+        const apart = (finger) => Math.max(Math.hypot(finger[0] - other[0], finger[1] - other[1]), 1);
+        panBy(view, x / 2, y / 2);
+        zoomBy(view, apart(now) / apart(before), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
+      } else if (slice && event.buttons & 2) windowBy(x, y);
+      else if (slice && (event.shiftKey || event.buttons & 4)) panBy(view, x, y);
+      else if (slice && event.pointerType === "touch") {
+        steps += y / 6;
+        if (Math.trunc(steps)) scrollBy(view, Math.trunc(steps));
+        steps -= Math.trunc(steps);
+      } else if (slice) {
+        if (!choosing) last("cross_at", pixel(view, now));
+      } else if (event.ctrlKey && event.shiftKey) {
+        zoomBy(view, 6 ** (-y / height), view.box.clientWidth / 2, height / 2);
+      } else if (event.ctrlKey) turnAt(view, ...now);
+      else if (event.shiftKey || event.buttons & 6) panBy(view, x, y);
+      else sumUp("turn", x / height, y / height);
+      fingers.set(event.pointerId, now);
+    });
+    for (const name of ["pointerup", "pointercancel"]) {
+      view.box.addEventListener(name, (event) => {
+        if (!fingers.delete(event.pointerId)) return;
+        if (!fingers.size) last("hold", { on: false }, "release");
+        if (name === "pointerup" && moved < 4 && event.button === 0) click(view, at(event), event.shiftKey);
+      });
+    }
+    view.box.addEventListener("pointerleave", () => { view.pointer = null; annotate(view); });
+    view.box.addEventListener("dblclick", (event) => {
+      if (!choosing && !event.target.closest("button")) setFull(view.name);
+    });
+    view.box.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      const by = Math.max(-1, Math.min(1, event.deltaY / 100));
+      if (slice && !event.ctrlKey) {
+        steps += by;
+        if (Math.trunc(steps)) scrollBy(view, Math.trunc(steps));
+        steps -= Math.trunc(steps);
+      } else if (view.name !== "curve") zoomBy(view, Math.exp(-0.2 * by), ...at(event));
+    }, { passive: false });
+    view.box.addEventListener("contextmenu", (event) => event.preventDefault());
+  }

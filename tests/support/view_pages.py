@@ -1,0 +1,76 @@
+"""What tests do with the page of a view in a real browser: point, click, drag, press, and look at it."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+
+import numpy as np
+from browser import wait_for
+
+SETTLED = "return clrecon.facts && clrecon.facts.settled && clrecon.pictures > 0"
+
+
+def picture(page, name: str = "scene") -> np.ndarray:
+    """What a view shows, (h, w, 3), with what lies over it."""
+    from PIL import Image
+
+    content = page.find_element("id", name).screenshot_as_png
+    return np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
+
+
+def changed_share(one: np.ndarray, other: np.ndarray) -> float:
+    return float((np.abs(one - other).max(axis=2) > 24).mean())
+
+
+def facts(page) -> dict:
+    return json.loads(page.execute_script("return JSON.stringify(clrecon.facts)"))
+
+
+def settle(page) -> None:
+    """Wait until everything is shown as it is after what was done."""
+    time.sleep(0.3)  # a change needs a frame and the way to the server
+    wait_for(page, SETTLED)
+
+
+def drag(page, element, x: int, y: int, dx: int, dy: int, steps: int = 15) -> None:
+    """Drag from a place beside the middle of an element, in small moves."""
+    from selenium.webdriver import ActionChains
+
+    actions = ActionChains(page, duration=15).move_to_element_with_offset(element, x, y).click_and_hold()
+    for _ in range(steps):
+        actions = actions.move_by_offset(round(dx / steps), round(dy / steps))
+    actions.release().perform()
+
+
+def point_at(page, name: str, point: np.ndarray) -> None:
+    """Move the pointer to the place of a point of the patient."""
+    from selenium.webdriver import ActionChains
+
+    element = page.find_element("id", name)
+    x, y = page.execute_script("return clrecon.project(arguments[0], arguments[1])", name, [float(v) for v in point])
+    ActionChains(page).move_to_element_with_offset(
+        element, round(x - element.size["width"] / 2), round(y - element.size["height"] / 2)
+    ).perform()
+
+
+def click(page, name: str, point: np.ndarray, *held: str) -> None:
+    """Click at the place of a point of the patient, with keys held."""
+    from selenium.webdriver import ActionChains
+
+    point_at(page, name, point)
+    actions = ActionChains(page)
+    for key in held:
+        actions.key_down(key)
+    actions.click()
+    for key in held:
+        actions.key_up(key)
+    actions.perform()
+
+
+def press(page, *keys: str) -> None:
+    """Press keys with the pointer where it is."""
+    from selenium.webdriver import ActionChains
+
+    ActionChains(page).send_keys(*keys).perform()
