@@ -6,7 +6,7 @@
 --fast runs all guards, and of the other tests the first parameter on the first device, without those marked seconds,
 slow, long or fuzz and without the Oclgrind check.  Everything else goes to pytest; without such arguments the whole
 suite runs in as many processes as there are cores, four at most.  The exit status is not 0 if a step fails or no test
-ran.  See CONTRIBUTING.md for the variables that choose devices.
+ran.  See docs/guide/development/tests.md for the variables that choose devices.
 """
 
 import os

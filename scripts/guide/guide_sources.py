@@ -43,6 +43,14 @@ changes
 contributing
 ```
 """,
+    "contributing.md": """
+```{{toctree}}
+:hidden:
+:glob:
+
+development/*
+```
+""",
     "how_to.md": """# How to
 
 ```{{toctree}}
