@@ -183,18 +183,16 @@ _LEAST_CONTRAST_SIGMAS = 6.0
 class IsoChoice:
     """An iso value half way between two materials, with the measurements behind it.
 
-    iso_value: HU, half way between `bone_hu` and `tissue_hu`; a whole number where it was measured.
+    iso_value: HU, half way between ``bone_hu`` and ``tissue_hu``; a whole number where it was measured.
     bone_hu, tissue_hu: The plateaus on both sides of the edge of bone, HU.
-    method: "auto": measured.  "half": computed from given plateaus; then `background` and all that follows is None.
+    method: "auto": measured.  "half": computed from given plateaus; then ``background`` and all that follows is None.
     reason: The choice in words, one line.
     background: {"soft tissue", "air"}. The material that the bone lies in.
     background_mode_hu, noise_hu: The mode of the background in the histogram and its width, HU.
     spread_hu: Half the interquartile range of the half-way levels of single edges.
-    steepness_hu_per_voxel: Median of the steepest step of an edge along a row or column: `spread_hu` / this is what the
-        spread means in voxels, at most.
-    faint_share: Share of the edges whose bone stays below the iso value.  That bone, thin, poor in mineral or touched
-        in passing by a slice, is lost.
-    contrast_medium_share: Share of the contrast left out because it ends in a flat plateau below `CONTRAST_MEDIUM_HU`.
+    steepness_hu_per_voxel: Median steepest step of an edge along a row or column; the spread over it is in voxels.
+    faint_share: Share of the edges whose bone, thin or poor in mineral, stays below the iso value and is lost.
+    contrast_medium_share: Share of the contrast left out because it ends in a flat plateau below ``CONTRAST_MEDIUM_HU``.
     flat_share: The same before that decision: where it is above three quarters, flat plateaus are taken for bone.
     slices, slice_step: Number of slices examined, and the distance from one to the next in slices.
     seen_at_lps_mm: A place where an edge has both materials.

@@ -142,7 +142,7 @@ class Mesh(BaseMesh, ShownAsHtml):
     def merge(self, *others: Mesh) -> Mesh:
         """Return this mesh and others as one, each as it is: no vertex is joined and nothing is cut.
 
-        What only some have is NaN elsewhere (`values`) or left out (normals, facts of the scan).  Unions of solids are
+        What only some have is NaN elsewhere (``values``) or left out (normals, facts of the scan).  Unions of solids are
         those of trimesh: ``clrecon.Mesh.from_trimesh(trimesh.boolean.union([a.to_trimesh(), b.to_trimesh()]))``.
         A `UsageError` where one is no Mesh.
         """
@@ -197,7 +197,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         point, normal : array_like, shape (3,)
             A point of the plane, LPS mm, and a vector of any length but 0.
         capped : bool
-            True: the cut is filled, so that a closed mesh stays closed; an open one is refused.  Its `face_values`
+            True: the cut is filled, so that a closed mesh stays closed; an open one is refused.  Its ``face_values``
             are NaN.  False: it ends open.
 
         Raises
@@ -295,13 +295,13 @@ class Mesh(BaseMesh, ShownAsHtml):
         return TriangleTree(self.vertices - origin, self.triangles).first_hits(begin, begin + far * unit) + origin
 
     def self_intersections(self) -> NDArray[np.int64]:
-        """Find the pairs of triangles that cut each other, as rows of `triangles`, shape (k, 2), exactly."""
+        """Find the pairs of triangles that cut each other, as rows of ``triangles``, shape (k, 2), exactly."""
         return find_self_intersections(self.vertices, self.triangles)
 
     def to_pyvista(self) -> Any:
         """Return the mesh as ``pyvista.PolyData`` in LPS mm, sharing the memory of vertices and normals.
 
-        The normals are the active point normals, named ``Normals``; `values` are point arrays, `face_values` cell
+        The normals are the active point normals, named ``Normals``; ``values`` are point arrays, ``face_values`` cell
         arrays; the field arrays ``SPACE`` and ``UNIT`` name frame and unit.
 
         Raises
@@ -324,7 +324,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         ----------
         polydata : pyvista.PolyData or vtkPolyData
             In mm.  Its point normals, if it has any that are named ``Normals``, are taken over; its point and cell
-            arrays of one number each, whose names are letters, digits and _, become `values` and `face_values`.
+            arrays of one number each, whose names are letters, digits and _, become ``values`` and ``face_values``.
         space : {"lps", "ras"}, optional
             Patient frame of the points; None: that of the field array ``SPACE``, which `to_pyvista` and 3D Slicer
             write, else LPS.
@@ -342,7 +342,7 @@ class Mesh(BaseMesh, ShownAsHtml):
     def to_trimesh(self) -> Any:
         """Return the mesh as ``trimesh.Trimesh`` in LPS mm, its ``units`` "mm" and ``metadata["SPACE"]`` "LPS".
 
-        Vertices and triangles keep their order and number (``process=False``); `values` and `face_values` are its
+        Vertices and triangles keep their order and number (``process=False``); ``values`` and ``face_values`` are its
         ``vertex_attributes`` and ``face_attributes``.
 
         Raises
@@ -372,7 +372,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         Parameters
         ----------
         mesh : trimesh.Trimesh
-            In mm.  Its attributes of one number each become `values` and `face_values`.  Its normals are not taken
+            In mm.  Its attributes of one number each become ``values`` and ``face_values``.  Its normals are not taken
             over: trimesh makes them of the triangles when they are asked for.
         space : {"lps", "ras"}, optional
             Patient frame of the vertices; None: that of ``metadata["SPACE"]``, which `to_trimesh` sets, else LPS.

@@ -21,10 +21,8 @@ from clrecon.system.records import Record
 class MeshQuality(Record):
     """The figures of a triangle surface.
 
-    closed: There are triangles and every edge is in exactly two, also after coincident vertices are joined, as readers
-        of STL do.
-    manifold: No edge in more than two faces, no two faces along an edge in one direction, the faces around every vertex
-        one fan, no face with a vertex twice.
+    closed: Every edge is in exactly two triangles, also after coincident vertices are joined, as readers of STL do.
+    manifold: Oriented, no edge in more than two faces, faces around a vertex one fan, no face with a vertex twice.
     oriented: No two faces run along an edge in the same direction.
     boundary_edges, nonmanifold_edges: Edges in one face, in more than two.
     nonmanifold_vertices: Vertices whose faces form several fans.
@@ -34,12 +32,10 @@ class MeshQuality(Record):
     euler_number: Used vertices - edges + faces.
     genus: Handles of all parts together; None if not closed and manifold.
     shortest_edge_mm: None without edges.
-    volume_ml: Enclosed volume, signed: cavities count negative, a surface turned inside out is negative as a whole.
-        Means nothing unless `closed`: it is then relative to the centre of the bounds.
+    volume_ml: Enclosed volume; cavities count negative, and so does a surface turned inside out.  Only if closed.
     outward: The volume is positive.
     bounds_mm: [[x, y, z], [x, y, z]] or None. Lowest and highest corner; None without vertices.
-    self_intersections: Pairs of triangles that cut or touch each other beside common corners, or overlap in one plane,
-        as CGAL counts them.  ``mesh.quality()`` does not look for them: None.  A strict mesh job does.
+    self_intersections: Pairs of triangles that cut each other, as CGAL counts them; None unless a strict job looked.
     """
 
     _SHOWN = ("triangles", "closed", "manifold", "components", "volume_ml")

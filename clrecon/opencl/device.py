@@ -198,19 +198,16 @@ class Device:
     type: "gpu", "accelerator", "cpu" or "custom".
     memory_bytes, max_allocation_bytes: All memory of the device, and the largest single buffer.
     has_own_memory: A graphics card, not a part of the processor that shares its memory.
-    most_steps, kernel_variants, first_header, build_options, is_simulator: See `clrecon.opencl.quirks`.
+    most_steps, kernel_variants, first_header, build_options, is_simulator: See ``clrecon.opencl.quirks``.
     shortcoming: Why the device cannot be used; empty if it can.
     fault: What the check at first use found wrong, empty if nothing; None before the check.
-    keeps_binaries: Built programs are kept for the next process by `clrecon.opencl.cache`: the driver keeps
-        none.
+    keeps_binaries: The driver keeps no programs, so ``clrecon.opencl.cache`` keeps them for the next process.
     known_good: The check of the programs that PoCL keeps; None for other drivers, and where nothing is kept.
     lock: Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
-    stand_in: The CPU device that takes over if this one fails, see `clrecon.opencl.select`; None for a device that
-        was named.
+    stand_in: The CPU device that takes over if this one fails (``clrecon.opencl.select``); None where one was named.
     handed_over: The warning that says so, once it did.
-    commands: What is in the queue; `clrecon.opencl.launching` waits for it.
-    trace: Told in words what is done, before a kernel file is built or a kernel is launched; each launch is then waited
-        for.  For the self-test, which has to say what a driver crashed in.
+    commands: What is in the queue; ``clrecon.opencl.launching`` waits for it.
+    trace: Told in words what is built or launched, for the self-test, which says what a driver crashed in.
     """
 
     def __init__(self, index: int, cl_platform: Any, cl_device: Any):
@@ -281,12 +278,12 @@ class Device:
             self._remarks.append(text)
 
     def checked_cache(self, key: str) -> AbstractContextManager[None]:
-        """Return the context in which the driver may look for program `key` in its cache."""
+        """Return the context in which the driver may look for program ``key`` in its cache."""
         return nullcontext() if self.known_good is None else self.known_good.building(key)
 
     @property
     def score(self) -> tuple[int, bool, int, tuple[int, ...], int, int]:
-        """Sort key of the automatic choice, see `choose_device`."""
+        """Sort key of the automatic choice, see ``choose_device``."""
         rank = {"gpu": 3, "accelerator": 2, "cpu": 1}.get(self.type, 0)
         if quirks.is_software_gpu(self.name):
             rank = 0
@@ -306,7 +303,7 @@ class Device:
 
     @property
     def has_long_items(self) -> bool:
-        """A work-item may do the share of a core: on CPUs, unless `most_steps` ends it."""
+        """A work-item may do the share of a core: on CPUs, unless ``most_steps`` ends it."""
         return int(self.kernel_variants["LANES"]) > 1 and self.most_steps is None
 
     @property
@@ -345,7 +342,7 @@ class Device:
             return self._opened.queue
 
     def of_context(self, make: Callable[[Device], Kept]) -> Kept:
-        """Return what `make` makes of the device, once for each context."""
+        """Return what ``make`` makes of the device, once for each context."""
         with self.lock:
             if make not in self._opened.kept:
                 self._opened.kept[make] = make(self)

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cached_property
 from itertools import chain
+from typing import Any
 
 from house import ROOT
 
+import clrecon
+
 QUOTED = re.compile(r"(?<!`)`([a-z_][a-z0-9_]*)`(?!`)")
 CALLED = re.compile(r"\b(\w+)\(")
+LINKED = re.compile(r"(?<!`)`([A-Za-z_][\w.]*)(?:\(\))?`(?!`)")
+HANGING = re.compile(r"^\w[\w, ]*\w: .*\n {4}", re.MULTILINE)
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DEFINITIONS = (*FUNCTIONS, ast.ClassDef)
 
@@ -60,3 +67,45 @@ def test_docstrings_name_what_is_there() -> None:
 def test_the_old_name_of_a_parameter_is_found() -> None:
     source = 'def run(item):\n    """Run `item`; `what` names it, `helper` and `KEPT` help."""\n    return item.kept'
     assert list(find_strangers(ast.parse(source), {"helper"})) == ["run: what"]
+
+
+def find_unlinked(docstring: str, owner: type | None) -> list[str]:
+    """Names in single backticks that are no link of the Guide: neither public nor methods of the class itself."""
+    methods = (Callable, property, classmethod, staticmethod, cached_property)
+
+    def is_method(name: str) -> bool:
+        return isinstance(inspect.getattr_static(owner, name, None), methods)
+
+    def is_public(name: str) -> bool:
+        value: Any = clrecon
+        for part in name.removeprefix("clrecon.").split("."):
+            value = getattr(value, part, None)
+        return value is not None
+
+    return [name for name in LINKED.findall(docstring) if not is_method(name) and not is_public(name)]
+
+
+def public_docstrings() -> Iterator[tuple[str, str, type | None]]:
+    """Names, docstrings and classes of what the Guide describes: public functions, classes and their methods."""
+    for name in dir(clrecon):
+        public = getattr(clrecon, name)
+        if name.startswith("_") or not callable(public):
+            continue
+        owner = public if inspect.isclass(public) else None
+        yield name, inspect.getdoc(public) or "", owner
+        for method in vars(owner) if owner else ():
+            if not method.startswith("_"):
+                yield f"{name}.{method}", inspect.getdoc(getattr(owner, method)) or "", owner
+
+
+def test_docstrings_of_public_names_become_pages_of_the_guide() -> None:
+    found = {name: find_unlinked(text, owner) for name, text, owner in public_docstrings()}
+    assert len(found) > 200
+    assert {name: unlinked for name, unlinked in found.items() if unlinked} == {}
+    assert [name for name, text, _ in public_docstrings() if HANGING.search(text)] == []
+
+
+def test_what_the_guide_cannot_link_is_found() -> None:
+    text = "As `Mesh.save`, `save` and `gone`: see ``vertices``."
+    assert find_unlinked(text, clrecon.Mesh) == ["gone"]
+    assert HANGING.search("A box.\n\nlow, high: Corners\n    in mm.")

@@ -110,7 +110,7 @@ class DeviceVolume(Closing, Volume):
 
     @property
     def report(self) -> dict[str, Any]:
-        """That of `volume`."""
+        """That of ``volume``."""
         return self.volume.report
 
     @report.setter
@@ -186,7 +186,7 @@ class DeviceVolume(Closing, Volume):
         return voxels_d
 
     def keep(self, name: str, of: Hashable, nbytes: int, make: Callable[[], Made]) -> Made:
-        """Return what an operator made of the volume and `of`, and will need again; one object of each kind is kept.
+        """Return what an operator made of the volume and ``of``, and will need again; one object of each kind is kept.
 
         It is dropped when one of its kind for other inputs is asked for, when the voxels are dropped, or when another
         operator needs the room.
@@ -285,7 +285,7 @@ class DeviceVolume(Closing, Volume):
         """Return the number of slices in a slab: ``total`` if all fit, else as many as fit, or 0.
 
         name: Purpose of the slabs.  Thinner ones that were necessary for it before, see `attempts`, are planned again.
-        needs: Function from a number of slices to bytes of every buffer, by description; `counted` as in `shortage`.
+        needs: Function from a number of slices to bytes of every buffer, by description; ``counted`` as in `shortage`.
         most: Most slices that kernels can process together.
         """
         limits = self.limits

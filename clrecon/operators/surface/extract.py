@@ -31,7 +31,7 @@ class SurfaceExtractor(VolumeWorker):
     """A volume on a device, from which surfaces are extracted at one iso value after the other.
 
     The volume is uploaded once if it fits the device as a whole.  A larger one is processed slab by slab each time,
-    with the same mesh bit for bit.  Use it as a context manager, or `close` it.
+    with the same mesh bit for bit.  Use it as a context manager, or ``close`` it.
 
     Parameters
     ----------

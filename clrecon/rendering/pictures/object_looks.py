@@ -87,7 +87,7 @@ class MeshLook(Style, Lit):
             raise UsageError("a mesh has one colour, a colour for each vertex, or is coloured by numbers at them")
 
     def find_scale(self, values: Mapping[str, NDArray[np.floating]]) -> tuple[ColorScale, NDArray[np.floating]]:
-        """Return the scale of `color_by` for a mesh with these numbers at its vertices, and those that it shows."""
+        """Return the scale of ``color_by`` for a mesh with these numbers at its vertices, and those that it shows."""
         name = f"{self.color_by}_mm"
         known = np.abs(values[name][np.isfinite(values[name])]) if name in values else np.zeros(0)
         if not len(known):

@@ -130,7 +130,7 @@ class Rendering(PictureData):
 
     @explains_arguments
     def annotated(self, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None) -> Rendering:
-        """Return the same picture with sides, a scale bar or a line, see `clrecon.rendering.pictures.annotations`."""
+        """Return the same picture with sides, a scale bar or a line, see ``clrecon.rendering.pictures.annotations``."""
         from clrecon.rendering.pictures.annotations import annotate
 
         image = annotate(self, letters=letters, scale_bar=scale_bar, caption=caption)
