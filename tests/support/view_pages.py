@@ -2,14 +2,49 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
-from browser import wait_for
+import view_scenes as scenes
+from browser import outside_requests, severe_lines, wait_for
+from web_views import serving
+
+from clrecon.viewer.drawing.painter import Painter
+from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.session.session import ViewSession
+from clrecon.viewer.web.server import WebServer
 
 SETTLED = "return clrecon.facts && clrecon.facts.settled && clrecon.pictures > 0"
+
+
+@contextmanager
+def serve_scene(device: Any) -> Iterator[WebServer]:
+    """Serve a scan and a mesh."""
+    objects = show_objects([scenes.make_scan(), scenes.make_mesh()])
+    objects[1] = dataclasses.replace(objects[1], said=("a ball of triangles",))
+    with (
+        Painter(objects, device=device) as painter,
+        serving(lambda heard: ViewSession(objects, painter, iso_value=scenes.ISO, on_change=heard)) as running,
+    ):
+        yield running
+
+
+@contextmanager
+def open_view_page(browser: Any, served: WebServer) -> Iterator[Any]:
+    """Open the page and wait until it is drawn; in the end it has logged no error and asked nobody else."""
+    severe_lines(browser), outside_requests(browser)
+    browser.get(served.address)
+    wait_for(browser, SETTLED)
+    yield browser
+    assert severe_lines(browser) == []
+    own = (f"http://127.0.0.1:{served.port}/", f"ws://127.0.0.1:{served.port}/")
+    assert [address for address in outside_requests(browser) if not address.startswith(own)] == []
 
 
 def picture(page, name: str = "scene") -> np.ndarray:

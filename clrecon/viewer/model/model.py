@@ -28,6 +28,7 @@ from clrecon.viewer.model.changes import (
     height_mm,
     plane_step,
 )
+from clrecon.viewer.model.measures import POINTS_OF, TOOLS, Measure, measure_points
 from clrecon.viewer.model.objects import (
     ShownLabels,
     ShownObject,
@@ -37,18 +38,7 @@ from clrecon.viewer.model.objects import (
     find_modes,
     first_parts,
 )
-from clrecon.viewer.model.state import (
-    POINTS_OF,
-    TOOLS,
-    Box,
-    ClipPlane,
-    Measure,
-    Pick,
-    SliceFrame,
-    ViewState,
-    clip_direction,
-    measure_points,
-)
+from clrecon.viewer.model.state import Box, ClipPlane, Pick, SliceFrame, ViewState, clip_direction
 
 _BOX_SHARE = 0.5
 """Of what there is along each axis, in a clip box about the cross."""

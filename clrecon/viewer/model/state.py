@@ -1,8 +1,7 @@
-"""`ViewState`: everything that a view shows, frozen, which a painter draws; picks, measures and clip planes."""
+"""`ViewState`: everything that a view shows, frozen, which a painter draws; picks and clip planes."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,15 +14,10 @@ from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import DIRECTIONS, checked_vector
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.text import unknown_name
+from clrecon.viewer.model.measures import Measure, Point
 
 Color = tuple[float, float, float]
-Point = tuple[float, float, float]
 Box = tuple[Point, Point]
-
-POINTS_OF = {"distance": 2, "angle": 3, "curve": None, "seed": 1}
-"""Tools, and the points that make a measure of each; a curve has as many as it gets."""
-
-TOOLS = tuple(POINTS_OF)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,50 +36,6 @@ class Pick:
             "part": self.part,
             "hu": None if self.hu is None else round(self.hu, 1),
         }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Measure:
-    """What was measured between points in LPS mm.
-
-    kind: "distance", "angle", "curve" (its length) or "seed", which has no value.
-    unit: "mm", "degrees" or "".
-    text: As it is written beside the picture.
-    """
-
-    kind: str
-    points: tuple[Point, ...]
-    value: float | None
-    unit: str
-    text: str
-
-    def describe(self) -> dict[str, Any]:
-        points = [[round(value, 3) for value in point] for point in self.points]
-        return {"kind": self.kind, "points": points, "value": self.value, "unit": self.unit, "text": self.text}
-
-
-def measure_points(kind: str, points: Sequence[Point]) -> Measure:
-    """Measure points in LPS mm by one of `TOOLS`; the angle is that at the second of three."""
-    places = np.array(points, dtype=np.float64).reshape(-1, 3)
-    if kind == "seed":
-        (point,) = points
-        return Measure(kind=kind, points=(point,), value=None, unit="", text=", ".join(f"{x:.1f}" for x in point))
-    if kind == "angle":
-        if len(places) != 3:
-            raise UsageError(f"an angle is made of 3 points, not of {len(places)}")
-        sides = places[[0, 2]] - places[1]
-        lengths = np.linalg.norm(sides, axis=1)
-        if lengths.min() < 1e-6:
-            raise UsageError("two points of the angle lie in one place: pick them anew")
-        cosine = float(sides[0] @ sides[1] / (lengths[0] * lengths[1]))
-        value = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
-        return Measure(kind=kind, points=tuple(points), value=round(value, 3), unit="degrees", text=f"{value:.1f}°")
-    if len(places) < 2:
-        raise UsageError(
-            f"a {kind} is made of at least 2 points, there {'is' if len(places) == 1 else 'are'} {len(places)}"
-        )
-    value = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
-    return Measure(kind=kind, points=tuple(points), value=round(value, 4), unit="mm", text=f"{value:.1f} mm")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,9 +10,10 @@ import view_scenes as scenes
 
 from clrecon.rendering import Rendering
 from clrecon.rendering.views.camera import Camera
+from clrecon.viewer.model.measures import seen_pieces
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import show_objects
-from clrecon.viewer.session.session import VIEWS, picture_key, seen_pieces
+from clrecon.viewer.session.session import VIEWS, picture_key
 
 pytestmark = pytest.mark.unit
 

@@ -9,9 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import view_scenes as scenes
-from browser import severe_lines, wait_for
+from browser import open_browser, severe_lines, wait_for
 from open_views import search_for_ever
-from view_pages import SETTLED, changed_share, click, drag, facts, picture, point_at, press, settle
+from view_pages import (
+    SETTLED,
+    changed_share,
+    click,
+    drag,
+    facts,
+    open_view_page,
+    picture,
+    point_at,
+    press,
+    serve_scene,
+    settle,
+)
 from web_views import PATIENCE, serving
 
 from clrecon.viewer.drawing.painter import Painter
@@ -23,6 +35,30 @@ pytestmark = [pytest.mark.slow, pytest.mark.opencl]
 
 PARTS = "return clrecon.facts.parts.filter((part) => part.kind === 'cluster').length === 3"
 ISO = scenes.ISO
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("downloads")
+
+
+@pytest.fixture(scope="module")
+def browser(folder):
+    with open_browser(1200, 800) as driver:
+        driver.execute_cdp_cmd("Page.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(folder)})
+        yield driver
+
+
+@pytest.fixture(scope="module")
+def served(device):
+    with serve_scene(device) as running:
+        yield running
+
+
+@pytest.fixture
+def page(browser, served):
+    with open_view_page(browser, served) as opened:
+        yield opened
 
 
 def test_a_drag_turns_the_picture_and_leaves_the_slices(page) -> None:
