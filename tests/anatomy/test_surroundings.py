@@ -26,18 +26,31 @@ def make_trunk(dtype: type = np.int16, step: int = 1) -> tuple[Volume, np.ndarra
 
 @pytest.mark.parametrize("dtype", [np.int16, np.int32, np.float32])
 def test_what_is_not_surely_in_the_body_is_left_out(dtype: type) -> None:
-    volume, radius, ball = make_trunk(dtype)
+    volume, radius, gas = make_trunk(dtype)  # skin at 60 mm, a plate in the rows 80 to 82, a ball of gas
     made = leave_out_surroundings(volume)
-    out = made.voxels > made.report[LEFT_OUT]["highest_hu"]
-    assert made.report[LEFT_OUT]["highest_hu"] == PLATE and made.report[LEFT_OUT]["body"] is True
-    assert made.voxels.dtype == dtype and np.array_equal(made.voxels[~out], volume.voxels[~out])
+    out = made.voxels > PLATE
     assert out[radius > 60.0].all() and out[:, 80:83].all()
-    assert not out[radius < 50.0].any() and not out[ball].any()  # the gas in it counts
+    assert not out[radius < 50.0].any() and not out[gas].any()
     rim = (radius > 58.0) & (radius <= 60.0)
     assert out[rim].mean() > 0.97, "the edge of the skin, which real scans mix with the air outside"
-    said = count_left_out(made)
-    assert said == {"voxels": int(out.sum()), "share": round(float(out.mean()), 4), "body": True, "region": False}
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.int32, np.float32])
+def test_what_is_left_out_lies_far_above_the_highest_value_and_the_rest_stays(dtype: type) -> None:
+    volume, _, _ = make_trunk(dtype)
+    made = leave_out_surroundings(volume)
+    out = made.voxels > PLATE
+    assert made.voxels.dtype == dtype
     assert made.voxels[out].min() >= PLATE + 2 * (PLATE - AIR)
+    assert np.array_equal(made.voxels[~out], volume.voxels[~out])
+
+
+def test_report_counts_what_is_left_out_beside_a_body() -> None:
+    made = leave_out_surroundings(make_trunk(np.int16)[0])
+    out = made.voxels > PLATE
+    assert made.report[LEFT_OUT]["highest_hu"] == PLATE and made.report[LEFT_OUT]["body"] is True
+    expected = {"voxels": int(out.sum()), "share": round(float(out.mean()), 4), "body": True, "region": False}
+    assert count_left_out(made) == expected
 
 
 def test_types_without_room_above_their_values_become_floats() -> None:

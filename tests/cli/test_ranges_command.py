@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -34,15 +33,20 @@ def run(ct: Path, device: Any, tmp_path: Path, *arguments: str) -> int:
 
 
 def test_option_below_gives_the_lung_without_the_air_outside(
-    ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ct: Path, device: Any, tmp_path: Path, printed: Printer
 ) -> None:
     assert run(ct, device, tmp_path, "--below", "-400", "--strict", "--json") == 0
-    report = json.loads(capsys.readouterr().out)
+    report = printed().report()
     assert (report["components"], report["inside_hu"], report["iso_level_hu"]) == (1, [None, -400.0], -400.5)
-    assert report["volume_ml"] == pytest.approx(4.0 / 3.0 * np.pi, rel=0.03)
+    assert report["volume_ml"] == pytest.approx(4.0 / 3.0 * np.pi, rel=0.03)  # a ball of 1 cm
     assert report["volume"]["outside_air"]["opening_mm2"] == 0.0
     assert any(text.startswith("air outside of the body was left out: ") for text in report["warnings"])
     assert not any("face" in text for text in report["warnings"])
+
+
+def test_option_below_with_the_air_outside_warns_of_a_face(
+    ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(ct, device, tmp_path, "--below", "-400", "--keep-outside") == 0
     shown = capsys.readouterr()
     assert "surface  below -400 HU (as given), closed" in shown.out

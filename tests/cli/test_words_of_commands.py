@@ -18,16 +18,24 @@ from clrecon.system.text import count_of, guess_word
 from clrecon.version import package_version
 
 
-def test_help_is_a_command(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["help"]) == 0
-    alone = capsys.readouterr().out
-    assert main(["--help"]) == 0
-    assert capsys.readouterr().out == alone
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [(["help"], ["--help"]), (["help", "mesh"], ["mesh", "--help-all"])],
+    ids=["alone", "of a command"],
+)
+def test_help_as_a_command_prints_what_its_option_does(command: list[str], option: list[str], printed: Printer) -> None:
+    assert main(command) == 0
+    by_command = printed().everything
+    assert main(option) == 0
+    assert printed().everything == by_command
+
+
+def test_help_of_mesh_has_its_options(printed: Printer) -> None:
     assert main(["help", "mesh"]) == 0
-    of_mesh = capsys.readouterr().out
-    assert main(["mesh", "--help-all"]) == 0
-    assert capsys.readouterr().out == of_mesh
-    assert "--keep-largest" in of_mesh
+    printed().assert_output("--keep-largest")
+
+
+def test_help_of_help_is_there() -> None:
     assert main(["help", "help"]) == 0
 
 

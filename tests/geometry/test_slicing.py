@@ -165,24 +165,42 @@ def test_a_volume_is_no_sequence_of_parts():
         3 in VOLUMES["oblique"]  # type: ignore[operator]  # noqa: B015
 
 
-@pytest.mark.parametrize("tilt", [0.0, 12.0, -12.0])
-def test_the_certificate_is_that_of_the_part(tmp_path, tilt):
-    dicom_series.write_series(tmp_path, dicom_series.Plan(shape=(7, 6, 9), gap=1.25, tilt_deg=tilt))
-    volume = read_volume(tmp_path)
-    part = volume[5:1:-2, 1:4]
+@pytest.fixture(scope="module", params=[0.0, 12.0, -12.0])
+def tilted(request, tmp_path_factory):
+    """The tilt, a series of 7 slices of 9 x 6, and of its slices 5 and 3 the rows 1 to 3."""
+    folder = tmp_path_factory.mktemp("tilted")
+    dicom_series.write_series(folder, dicom_series.Plan(shape=(7, 6, 9), gap=1.25, tilt_deg=request.param))
+    volume = read_volume(folder)
+    return request.param, volume, volume[5:1:-2, 1:4]
+
+
+def test_the_certificate_is_that_of_the_part(tilted):
+    _, volume, part = tilted
     own = part.certificate
-    assert own is not None and own.shape_ijk == list(part.shape_ijk) and own.slices == 2
-    assert own["sliced"] == {"first_ijk": [0, 1, 5], "step_ijk": [1, 1, -2], "shape_ijk_before": [9, 6, 7]}
+    assert own.shape_ijk == list(part.shape_ijk) and own.slices == 2
     assert np.allclose(own.affine_ijk_to_lps_mm, part.affine) and own.hu_range == list(part.hu_range)
     assert own.gap_mm["median"] == pytest.approx(2 * volume.certificate.gap_mm["median"])
     assert own.orientation == facts_of_orientation(part.affine) and not own.orientation["right_handed"]
-    assert own.tilt_deg == pytest.approx(volume.certificate.tilt_deg, abs=1e-6)
-    assert abs(own.tilt_deg) == pytest.approx(abs(tilt), abs=1e-3) and own.tilt_deg * tilt <= 0.0
     assert own.frame_of_reference_hash == volume.certificate.frame_of_reference_hash is not None
-    assert own.warnings[-1].startswith("sliced to 5:1:-2, 1:4, : of k, j, i: 54 of 378 voxels stay")
+
+
+def test_the_certificate_of_a_part_keeps_the_tilt(tilted):
+    tilt, volume, part = tilted
+    assert part.certificate.tilt_deg == pytest.approx(volume.certificate.tilt_deg, abs=1e-6)
+    assert abs(part.certificate.tilt_deg) == pytest.approx(abs(tilt), abs=1e-3)
+    assert part.certificate.tilt_deg * tilt <= 0.0  # the plan's 12 degrees are -12 of a certificate
+
+
+def test_the_certificate_of_a_part_says_what_was_taken(tilted):
+    _, volume, part = tilted
+    assert part.certificate["sliced"] == {
+        "first_ijk": [0, 1, 5], "step_ijk": [1, 1, -2], "shape_ijk_before": [9, 6, 7],
+    }  # fmt: skip
+    assert part.certificate.warnings[-1].startswith(
+        "sliced to 5:1:-2, 1:4, : of k, j, i: 54 of 378 voxels stay"  # 9 x 3 x 2 of 9 x 6 x 7
+    )
     assert "sliced" not in volume.report
-    again = part[:, :1]
-    assert again.report["sliced"]["shape_ijk_before"] == [9, 3, 2]
+    assert part[:, :1].report["sliced"]["shape_ijk_before"] == [9, 3, 2]
 
 
 def test_labels_of_the_whole_body_go_with_a_thin_part():

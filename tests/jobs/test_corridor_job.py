@@ -20,7 +20,7 @@ from made_once import make_once
 from printed_text import Printer
 from refusals import refused
 from surface_volumes import hollow_ball
-from variants import daily_rows
+from variants import daily
 
 from clrecon.cli.main import main
 from clrecon.errors import NoSurfaceError, UsageError
@@ -135,55 +135,102 @@ def run_in(folder: Path, *arguments: object) -> None:
     (folder / "said.txt").write_text(said.getvalue())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("made", "bar"), daily_rows(1, [("whole", tolerances.CORRIDOR_HALF_MM), ("plain", tolerances.CORRIDOR_226_MM)])
+@pytest.fixture(
+    scope="module", params=daily(1, [("whole", tolerances.CORRIDOR_HALF_MM), ("plain", tolerances.CORRIDOR_226_MM)])
 )
-def test_the_line_keeps_its_distance_in_the_truth(
-    device: Any, request: pytest.FixtureRequest, made: str, bar: float
-) -> None:
-    folder: Path = request.getfixturevalue(made)
-    said = (folder / "said.txt").read_text()
-    assert "not for planning an operation" in said and "sagittal not determined" in said and "at 226 HU" in said
+def reported(request: pytest.FixtureRequest, device: Any) -> Any:
+    """Report and words of a run, the signs from its frame to LPS, and how far its radius may be off."""
+    name, bar = request.param
+    folder: Path = request.getfixturevalue(name)
     report = load(folder / "report.json")
-    assert report["notice"].startswith("not for planning an operation")
-    assert "226 HU" in report["level_bias"]
-    assert (report["grade_scale"] is None) == (made == "plain")
-    to_lps = np.array([-1.0, -1.0, 1.0]) if made == "whole" else np.ones(3)
+    return SimpleNamespace(
+        name=name,
+        bar=bar,
+        report=report,
+        said=(folder / "said.txt").read_text(),
+        to_lps=np.array([-1.0, -1.0, 1.0]) if name == "whole" else np.ones(3),
+        sides=report["vertebrae"][0]["corridors"],
+    )
+
+
+@pytest.mark.slow
+def test_the_line_keeps_its_distance_in_the_truth(reported: Any) -> None:
+    for side in reported.sides:
+        assert abs(side["radius_mm"] - true_radius_mm(side, reported.to_lps)) <= reported.bar
+
+
+@pytest.mark.slow
+def test_a_corridor_of_a_phantom_enters_at_its_surface_from_behind(reported: Any) -> None:
     truth = phantom_truth(SETTINGS)
-    (vertebra,) = report["vertebrae"]
-    for side in vertebra["corridors"]:
-        entry, counted_from, tip = (to_lps * side[name] for name in ("entry_mm", "counted_from_mm", "tip_mm"))
-        assert abs(side["radius_mm"] - true_radius_mm(side, to_lps)) <= bar
+    for side in reported.sides:
+        entry, counted_from, tip = (reported.to_lps * side[f"{at}_mm"] for at in ("entry", "counted_from", "tip"))
+        assert abs(truth.signed_distance(entry[None])[0]) < 1.0
+        assert entry[1] > counted_from[1] > tip[1]  # y grows to the back
+
+
+@pytest.mark.slow
+def test_radius_and_angles_of_a_phantom_are_those_of_a_pedicle(reported: Any) -> None:
+    """Bounds that catch a wrong line or unit; the test above compares with the truth."""
+    for side in reported.sides:
         assert 2.5 < side["radius_mm"] < 5.0
         assert 5.0 < side["medial_angle_deg"] < 20.0
         low, high = side["sagittal_angle_range_deg"]
         assert low <= side["sagittal_angle_deg"] <= high and high - low > 5.0
         assert side["level_bias_mm"]["rays"] > 60
-        on_surface = truth.signed_distance(entry[None])[0]
-        assert abs(on_surface) < 1.0
-        assert entry[1] > counted_from[1] > tip[1]
-    left, right = vertebra["corridors"]
-    assert left["side"] == "left" and to_lps[0] * left["entry_mm"][0] > to_lps[0] * right["entry_mm"][0]
 
 
 @pytest.mark.slow
-def test_files_are_written_and_screws_graded(
-    device: Any, ct: Path, plain: Path, whole: Path, tmp_path: Path, printed: Printer
-) -> None:
+def test_the_left_corridor_lies_at_the_left_of_the_right_one(reported: Any) -> None:
+    left, right = reported.sides
+    assert left["side"] == "left"
+    assert reported.to_lps[0] * left["entry_mm"][0] > reported.to_lps[0] * right["entry_mm"][0]
+
+
+@pytest.mark.slow
+def test_corridors_are_told_not_to_be_for_an_operation_and_what_is_not_known(reported: Any) -> None:
+    notice = "not for planning an operation"
+    assert notice in reported.said and reported.report["notice"].startswith(notice)
+    assert "sagittal not determined" in reported.said
+    assert "at 226 HU" in reported.said and "226 HU" in reported.report["level_bias"]
+
+
+@pytest.mark.slow
+def test_the_scale_of_grades_is_reported_with_screws_alone(reported: Any) -> None:
+    assert (reported.report["grade_scale"] is not None) == (reported.name == "whole")  # `plain` has no screws
+
+
+@pytest.mark.slow
+def test_a_screw_wider_than_its_corridor_is_graded_b(whole: Path) -> None:
+    wide, _ = load(whole / "report.json")["vertebrae"][0]["screws"]
+    assert wide["grade"] == "B"
+    assert 0.4 < wide["breach_mm"] < 1.1  # 1.5 mm wider than the corridor: 0.75 mm on each side
+    assert wide["direction"] in ("medial", "lateral", "cranial", "caudal")
+
+
+@pytest.mark.slow
+def test_a_screw_within_the_right_corridor_is_graded_a(plain: Path, whole: Path) -> None:
+    _, inner = load(whole / "report.json")["vertebrae"][0]["screws"]
+    assert (inner["name"], inner["grade"], inner["side"]) == ("inner", "A", "right")
+    right = load(plain / "report.json")["vertebrae"][0]["corridors"][1]
+    np.testing.assert_allclose(np.multiply(inner["entry_mm"], (-1, -1, 1)), right["entry_mm"], atol=2e-3)  # from RAS
+
+
+@pytest.mark.slow
+def test_grades_of_screws_are_printed_with_their_scale(whole: Path) -> None:
     said = (whole / "said.txt").read_text()
     assert "grade B" in said and "grade A, no breach" in said and "Gertzbein-Robbins in five grades" in said
-    report = load(whole / "report.json")
-    wide_grade, inner_grade = report["vertebrae"][0]["screws"]
-    assert wide_grade["grade"] == "B" and 0.4 < wide_grade["breach_mm"] < 1.1
-    assert wide_grade["direction"] in ("medial", "lateral", "cranial", "caudal")
-    assert (inner_grade["name"], inner_grade["grade"], inner_grade["side"]) == ("inner", "A", "right")
-    right = load(plain / "report.json")["vertebrae"][0]["corridors"][1]
-    np.testing.assert_allclose(np.multiply(inner_grade["entry_mm"], (-1, -1, 1)), right["entry_mm"], atol=2e-3)
+
+
+@pytest.mark.slow
+def test_a_vertebra_its_corridors_and_screws_are_one_mesh_each(whole: Path) -> None:
     names = ["L1", "L1_left", "L1_right", "L1_screw_1", "L1_screw_2"]
-    assert [each["name"] for each in report["outputs"] if each["kind"] == "mesh"] == names
-    written = sorted(path.name for path in whole.iterdir())
-    assert written == sorted([*(f"l1_{name}.ply" for name in names), "l1.png", "report.json", "said.txt"])
+    outputs = load(whole / "report.json")["outputs"]
+    assert [output["name"] for output in outputs if output["kind"] == "mesh"] == names
+    written = {path.name for path in whole.iterdir()}
+    assert written == {*(f"l1_{name}.ply" for name in names), "l1.png", "report.json", "said.txt"}
+
+
+def test_an_older_mesh_of_a_corridor_is_refused_with_no_clobber(ct: Path, tmp_path: Path, printed: Printer) -> None:
     (tmp_path / "l1_L1.ply").write_text("mine")
     options = ("--labels", ct / "levels.nrrd", "--label", "L1", "-o", tmp_path / "l1.ply")
     assert run(ct, *options, "--no-clobber") == 6

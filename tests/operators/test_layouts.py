@@ -166,20 +166,43 @@ def device(cores: int, has_long_items: bool = True) -> Any:
     return SimpleNamespace(compute_units=cores, has_long_items=has_long_items)
 
 
-def test_chunks_and_digits_of_a_sort_are_planned_by_cores_and_keys():
-    assert _plan_chunks(device(1), 1) == (FEWEST_PER_CHUNK, 1)
-    n = 16 * FEWEST_PER_CHUNK + 1  # 16 chunks on one core: they get longer by one
-    assert _plan_chunks(device(1), n - 1) == (FEWEST_PER_CHUNK, 16)
-    assert _plan_chunks(device(1), n) == (FEWEST_PER_CHUNK + 1, 16)
-    assert _plan_chunks(device(3), 24 * 5000 + 1) == (5001, 24)
-    assert _plan_chunks(device(3, False), 24 * 5000 + 1) == (FEWEST_PER_CHUNK, 30)
-    assert _plan_chunks(device(10_000), MOST_CHUNKS * 5000) == (5000, MOST_CHUNKS)
+SIXTEEN_CHUNKS = 16 * FEWEST_PER_CHUNK
+"""Keys of the most chunks that one core gets before they grow longer."""
+
+
+@pytest.mark.parametrize(
+    ("planned_for", "keys", "chunks"),
+    [
+        (device(1), 1, (FEWEST_PER_CHUNK, 1)),
+        (device(1), SIXTEEN_CHUNKS, (FEWEST_PER_CHUNK, 16)),
+        (device(1), SIXTEEN_CHUNKS + 1, (FEWEST_PER_CHUNK + 1, 16)),
+        (device(3), 24 * 5000 + 1, (5001, 24)),
+        (device(3, False), 24 * 5000 + 1, (FEWEST_PER_CHUNK, 30)),
+        (device(10_000), MOST_CHUNKS * 5000, (5000, MOST_CHUNKS)),
+    ],
+    ids=["one key", "sixteen chunks", "one key more", "three cores", "short items", "most chunks"],
+)
+def test_chunks_of_a_sort_are_planned_by_cores_and_keys(planned_for, keys, chunks):
+    assert _plan_chunks(planned_for, keys) == chunks
+
+
+def test_digits_of_a_sort_share_the_bits_of_its_keys():
     assert _plan_digits(RADIX_BITS) == [(0, RADIX_BITS)]
     assert _plan_digits(2 * RADIX_BITS - 1) == [(0, RADIX_BITS - 1), (RADIX_BITS - 1, RADIX_BITS)]
-    assert sort_bytes(device(1), 1000, RADIX_BITS) == 8 * 1000 + (4 << RADIX_BITS)
-    assert sort_bytes(device(1), 1000, RADIX_BITS + 1) == 16 * 1000 + (4 << RADIX_BITS)
-    assert sort_bytes(device(1), 1000, 3) == 8 * 1000 + 32
-    assert sort_bytes(device(1), n, 3) == 8 * n + 32 * 16
+
+
+@pytest.mark.parametrize(
+    ("keys", "bits", "size"),
+    [
+        (1000, RADIX_BITS, 8 * 1000 + (4 << RADIX_BITS)),
+        (1000, RADIX_BITS + 1, 16 * 1000 + (4 << RADIX_BITS)),
+        (1000, 3, 8 * 1000 + 4 * 2**3),
+        (SIXTEEN_CHUNKS + 1, 3, 8 * (SIXTEEN_CHUNKS + 1) + 4 * 2**3 * 16),
+    ],
+    ids=["one digit", "two digits", "three bits", "sixteen chunks"],
+)
+def test_bytes_of_a_sort_are_its_keys_a_pass_and_a_count_of_each_digit_a_chunk(keys, bits, size):
+    assert sort_bytes(device(1), keys, bits) == size
 
 
 def test_chunks_of_clusters_grow_with_the_cells_a_core():

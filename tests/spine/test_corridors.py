@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,44 +38,81 @@ POSES = {
 }
 
 
+@pytest.fixture(scope="module", params=daily(1, POSES))
+def posed(request: pytest.FixtureRequest) -> Any:
+    """A vertebra in one of the poses, its frame and corridors, each beside its radius and axis in the truth."""
+    vertebra, options = POSES[request.param]
+    affine, shape = grid_around(vertebra, **options)
+    corridors = measure_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3")
+    left, right = corridors.corridors
+    return SimpleNamespace(
+        vertebra=vertebra,
+        found=corridors,
+        off_mm=tolerances.CORRIDOR_RADIUS_MM * (2.0 if request.param == "thick slices" else 1.0),
+        sides=[(left, vertebra.left_radius, vertebra.axis(1.0)), (right, vertebra.right_radius, vertebra.axis(-1.0))],
+    )
+
+
+def in_vertebra(vertebra: BoxVertebra, *points: Any) -> np.ndarray:
+    """Points in mm along the axes of the vertebra, from its centre."""
+    return (np.stack(points) - np.array(vertebra.centre)) @ vertebra.axes.T
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", daily(1, POSES))
-def test_the_cylinder_is_the_corridor(name: str) -> None:
-    vertebra, options = POSES[name]
-    off_mm = tolerances.CORRIDOR_RADIUS_MM * (2.0 if name == "thick slices" else 1.0)
-    affine, shape = grid_around(vertebra, **options)  # type: ignore[arg-type]
-    volume, labels = vertebra.scan(affine, shape)
-    found = measure_corridors(volume, labels, 3, HALF_HU, "L3")
-    assert found.warnings == ()
-    angles = np.degrees(np.arccos(np.clip((found.frame.axes * vertebra.axes).sum(axis=1), -1.0, 1.0)))
-    assert angles.max() < tolerances.CORRIDOR_FRAME_DEG
-    for corridor, sign, radius in zip(
-        found.corridors, (1.0, -1.0), (vertebra.left_radius, vertebra.right_radius), strict=True
-    ):
-        assert corridor.side == ("left" if sign > 0.0 else "right")
-        assert corridor.refused is None
-        assert corridor.radius == pytest.approx(radius, abs=off_mm)
-        assert corridor.canal == pytest.approx(radius, abs=2.0 * off_mm)
-        start, way = vertebra.axis(sign)
-        ends = (np.stack((corridor.back, corridor.tip)) - np.array(vertebra.centre)) @ vertebra.axes.T
-        cosine = (ends[1] - ends[0]) @ way / np.linalg.norm(ends[1] - ends[0])
+def test_the_cylinder_is_the_corridor(posed: Any) -> None:
+    for corridor, radius, (start, direction) in posed.sides:
+        assert corridor.radius == pytest.approx(radius, abs=posed.off_mm)
+        back, tip = in_vertebra(posed.vertebra, corridor.back, corridor.tip)
+        cosine = (tip - back) @ direction / np.linalg.norm(tip - back)
         assert np.degrees(np.arccos(min(1.0, cosine))) < tolerances.CORRIDOR_ANGLE_DEG
-        assert abs(corridor.medial_deg - vertebra.medial_deg) < tolerances.CORRIDOR_ANGLE_DEG
-        off = ends[0] - start
-        assert np.linalg.norm(off - (off @ way) * way) < 0.5
-        assert ends[0, 1] == pytest.approx(CANAL_Y, abs=1.0)
-        assert ends[1, 1] == pytest.approx(BODY_HALF[1] - 2.0 * BODY_SHARE * BODY_HALF[1], abs=1.0)
-        entry = (corridor.entry - np.array(vertebra.centre)) @ vertebra.axes.T
+        off = back - start
+        assert np.linalg.norm(off - (off @ direction) * direction) < 0.5  # mm beside the axis of the cylinder
+
+
+@pytest.mark.slow
+def test_the_frame_of_a_posed_vertebra_follows_its_axes(posed: Any) -> None:
+    cosines = (posed.found.frame.axes * posed.vertebra.axes).sum(axis=1)
+    assert np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).max() < tolerances.CORRIDOR_FRAME_DEG
+
+
+@pytest.mark.slow
+def test_both_sides_of_a_posed_vertebra_have_a_corridor(posed: Any) -> None:
+    assert posed.found.warnings == ()
+    assert [(side.side, side.refused) for side in posed.found.corridors] == [("left", None), ("right", None)]
+
+
+@pytest.mark.slow
+def test_a_corridor_runs_from_the_plate_past_the_canal_into_the_body(posed: Any) -> None:
+    for corridor, _, _ in posed.sides:
+        entry, back, tip = in_vertebra(posed.vertebra, corridor.entry, corridor.back, corridor.tip)
         assert entry[1] == pytest.approx(PLATE_Y + PLATE_HALF[1], abs=1.0)
+        assert back[1] == pytest.approx(CANAL_Y, abs=1.0)
+        assert tip[1] == pytest.approx(BODY_HALF[1] - 2.0 * BODY_SHARE * BODY_HALF[1], abs=1.0)
         assert corridor.length == pytest.approx(np.linalg.norm(corridor.tip - corridor.entry), abs=1e-6)
-        assert set(corridor.margins) == {"medial", "lateral", "cranial", "caudal"}
-        assert min(value for value in corridor.margins.values() if value is not None) == pytest.approx(
-            corridor.radius, abs=0.02
-        )
-        assert abs(corridor.bias.median_mm) <= 0.2
-        assert corridor.by_hu_share > 0.95
+
+
+@pytest.mark.slow
+def test_the_medial_angle_of_a_corridor_is_that_of_the_cylinder(posed: Any) -> None:
+    for corridor, _, _ in posed.sides:
+        assert abs(corridor.medial_deg - posed.vertebra.medial_deg) < tolerances.CORRIDOR_ANGLE_DEG
         low, high = corridor.medial_range_deg
         assert low <= corridor.medial_deg <= high
+
+
+@pytest.mark.slow
+def test_a_corridor_keeps_its_radius_to_the_nearest_wall_and_the_canal(posed: Any) -> None:
+    for corridor, radius, _ in posed.sides:
+        assert corridor.margins.keys() == {"medial", "lateral", "cranial", "caudal"}
+        nearest = min(margin for margin in corridor.margins.values() if margin is not None)
+        assert nearest == pytest.approx(corridor.radius, abs=0.02)
+        assert corridor.canal == pytest.approx(radius, abs=2.0 * posed.off_mm)
+
+
+@pytest.mark.slow
+def test_walls_of_a_corridor_are_placed_by_hu_without_bias(posed: Any) -> None:
+    for corridor, _, _ in posed.sides:
+        assert abs(corridor.bias.median_mm) <= 0.2
+        assert corridor.by_hu_share > 0.95
 
 
 @pytest.mark.release

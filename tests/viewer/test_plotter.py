@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -96,8 +97,9 @@ def test_window_ends_by_ctrl_c_and_by_the_window_manager(display, tmp_path, how)
     assert "Traceback" not in complained
 
 
-@pytest.mark.opencl
-def test_everything_lies_in_one_scene_and_the_slider_sets_the_surface(device, monkeypatch):
+@pytest.fixture
+def scene(device, monkeypatch):
+    """A plotter of a scan, a mesh named front, a cloud and labels; keys by letter, and the widgets asked for."""
     need_screen()
     plotters, asked, keys = pytest.importorskip("pyvista").Plotter, [], {}
     monkeypatch.setattr(plotters, "add_key_event", lambda self, key, callback: keys.update({key: callback}))
@@ -105,20 +107,49 @@ def test_everything_lies_in_one_scene_and_the_slider_sets_the_surface(device, mo
         monkeypatch.setattr(plotters, name, lambda *given, name=name, **named: asked.append(name))
     objects = show_objects([make_scan(), make_mesh(), make_cloud(), make_labels()], ["", "front"])
     with open_plotter(objects, iso_value=ISO, device=device, off_screen=True) as plotter:
-        actors = plotter.renderer.actors
-        assert {"scan 1", "front", "cloud 3", "labels 4 one", "labels 4 two"} <= set(actors)
-        surface = actors["scan 1"].mapper.dataset
-        mesh = clrecon.extract_isosurface(make_scan(), ISO, device=device)
-        np.testing.assert_array_equal(np.sort(surface.points, axis=0), np.sort(mesh.vertices, axis=0))
-        assert actors["cloud 3"].prop.point_size == 3
-        assert plotter.camera.position[1] < plotter.camera.focal_point[1]  # it looks from anterior
-        for key in "mmcc":
-            keys[key]()
-        assert asked == ["add_measurement_widget", "clear_measure_widgets", "add_plane_widget", "clear_plane_widgets"]
-        for key, axis, sign in (("3", 0, 1), ("4", 0, -1), ("5", 2, 1), ("6", 2, -1)):  # left, right, above, below
-            keys[key]()
-            away = np.subtract(plotter.camera.position, plotter.camera.focal_point)
-            assert np.argmax(np.abs(away)) == axis and sign * away[axis] > 0.999 * np.linalg.norm(away)
+        yield SimpleNamespace(plotter=plotter, keys=keys, asked=asked)
+
+
+@pytest.mark.opencl
+def test_every_object_is_an_actor_of_one_scene(scene):
+    actors = scene.plotter.renderer.actors
+    assert {"scan 1", "front", "cloud 3", "labels 4 one", "labels 4 two"} <= set(actors)
+    assert actors["cloud 3"].prop.point_size == 3
+
+
+@pytest.mark.opencl
+def test_the_scan_of_a_scene_is_its_isosurface(scene, device):
+    shown = scene.plotter.renderer.actors["scan 1"].mapper.dataset
+    mesh = clrecon.extract_isosurface(make_scan(), ISO, device=device)
+    np.testing.assert_array_equal(np.sort(shown.points, axis=0), np.sort(mesh.vertices, axis=0))
+
+
+@pytest.mark.opencl
+def test_a_scene_is_first_seen_from_anterior(scene):
+    camera = scene.plotter.camera
+    assert camera.position[1] < camera.focal_point[1]
+
+
+@pytest.mark.opencl
+def test_keys_of_a_scene_put_widgets_on_and_off(scene):
+    for key in "mmcc":
+        scene.keys[key]()
+    assert scene.asked == [
+        "add_measurement_widget", "clear_measure_widgets", "add_plane_widget", "clear_plane_widgets",
+    ]  # fmt: skip
+
+
+@pytest.mark.opencl
+@pytest.mark.parametrize(
+    ("key", "axis", "sign"),
+    [("3", 0, 1), ("4", 0, -1), ("5", 2, 1), ("6", 2, -1)],
+    ids=["left", "right", "above", "below"],
+)
+def test_keys_of_a_scene_turn_the_view(scene, key, axis, sign):
+    scene.keys[key]()
+    away = np.subtract(scene.plotter.camera.position, scene.plotter.camera.focal_point)
+    assert np.argmax(np.abs(away)) == axis
+    assert sign * away[axis] > 0.999 * np.linalg.norm(away)
 
 
 def test_show_by_method_and_by_function_is_the_same_picture(monkeypatch):

@@ -20,28 +20,54 @@ from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 
-def test_given_settings_win_over_those_of_a_purpose() -> None:
+def test_without_a_purpose_settings_stay_as_given() -> None:
     assert settings_for(None, {"smooth": None}) == {"smooth": None}
-    plain = settings_for("print", {"smooth": None, "strict": False, "closed": True, "seeds": []})
-    assert MeshSettings(**plain) == MeshSettings(
+
+
+def test_defaults_give_way_to_the_settings_of_a_print() -> None:
+    defaults = {"smooth": None, "strict": False, "closed": True, "seeds": []}
+    assert MeshSettings(**settings_for("print", defaults)) == MeshSettings(
         keep="bone", keep_largest=1, solid=True, smooth=20, decimate=0.9, strict=True, purpose="print", seeds=[]
     )
-    own = settings_for("print", {"keep_largest": 2, "smooth": 5, "decimate": 0.5})
-    assert (own["keep_largest"], own["smooth"], own["decimate"]) == (2, 5, 0.5)
-    for hollow in ({"solid": False}, {"iso_value": (200, 300)}, {"iso_value": -300}, {"below": -400}):
-        assert not settings_for("print", hollow).get("solid")
-    for other in ({"seeds": [(0, 0, 0)]}, {"min_volume_ml": 1.0}, {"split": True}):
-        assert settings_for("print", {**other, "keep_largest": None})["keep_largest"] is None
+
+
+def test_given_settings_win_over_those_of_a_print() -> None:
+    given = {"keep_largest": 2, "smooth": 5, "decimate": 0.5}
+    assert given.items() <= settings_for("print", given).items()
+
+
+@pytest.mark.parametrize(
+    "given", [{"solid": False}, {"iso_value": (200, 300)}, {"iso_value": -300}, {"below": -400}], ids=str
+)
+def test_a_print_of_what_is_no_solid_bone_stays_hollow(given: dict[str, Any]) -> None:
+    assert not settings_for("print", given).get("solid")
+
+
+@pytest.mark.parametrize("given", [{"seeds": [(0, 0, 0)]}, {"min_volume_ml": 1.0}, {"split": True}], ids=str)
+def test_a_print_keeps_all_parts_where_these_are_chosen_otherwise(given: dict[str, Any]) -> None:
+    assert settings_for("print", {**given, "keep_largest": None})["keep_largest"] is None
 
 
 def test_labels_are_printed_solid() -> None:
     assert settings_for("print", {"labels": LabelChoice("a")})["labels"] == LabelChoice("a", solid=True)
-    for left in (LabelChoice("a", surface="mask"), LabelChoice("a", solid=True)):  # a mask is solid by itself
-        assert settings_for("print", {"labels": left})["labels"] == left
-    hollow = settings_for("print", {"labels": LabelChoice("a"), "solid": False})
-    assert not hollow["labels"].solid and not MeshSettings(**hollow).solid
-    seeds = settings_for("print", {"labels": LabelChoice("a"), "grow_from": ("label:L1",)})
-    assert not seeds["labels"].solid
+
+
+@pytest.mark.parametrize(
+    "labels", [LabelChoice("a", surface="mask"), LabelChoice("a", solid=True)], ids=["mask", "solid"]
+)
+def test_labels_that_are_solid_by_themselves_are_printed_as_given(labels: LabelChoice) -> None:
+    assert settings_for("print", {"labels": labels})["labels"] == labels
+
+
+def test_labels_are_printed_hollow_on_request() -> None:
+    settings = settings_for("print", {"labels": LabelChoice("a"), "solid": False})
+    assert not settings["labels"].solid
+    assert not MeshSettings(**settings).solid
+
+
+def test_labels_that_are_seeds_alone_are_not_made_solid() -> None:
+    settings = settings_for("print", {"labels": LabelChoice("a"), "grow_from": ("label:L1",)})
+    assert not settings["labels"].solid
 
 
 @pytest.mark.parametrize(

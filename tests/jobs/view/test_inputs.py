@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -37,22 +36,53 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_each_kind_is_told_by_its_file_and_lies_in_its_place(files):
+def test_the_kind_of_an_input_is_told_by_its_file(files):
     names = ["scan.nii.gz", "lps.stl", "ras.ply", "cloud.ply", "cloud.xyz", "labels.nii.gz"]
     opened = open_inputs([files / name for name in names])
-    assert [type(each.subject) for each in opened] == [Volume, Mesh, Mesh, PointCloud, PointCloud, LabelMap]
-    subjects: list[Any] = [each.subject for each in opened]
-    scan, lps, ras, cloud, plain, labels = subjects
+    kinds = [type(each.subject) for each in opened]
+    assert kinds == [Volume, Mesh, Mesh, PointCloud, PointCloud, LabelMap]
+
+
+def test_a_scan_and_labels_are_opened_at_their_place(files):
+    opened = open_inputs([files / "scan.nii.gz", files / "labels.nii.gz"])
+    scan, labels = opened[0].subject, opened[1].subject
+    assert isinstance(scan, Volume) and isinstance(labels, LabelMap)
     assert np.allclose(scan.affine, scenes.AFFINE, atol=1e-4)
-    assert np.allclose(lps.bounds, ras.bounds, atol=1e-4)
-    assert np.allclose(cloud.points, plain.points, atol=1e-3)
-    assert labels.numbers == (5,) and np.allclose(labels.affine, scenes.AFFINE, atol=1e-4)
-    said = [" ".join(each.said) for each in opened]
-    assert "ras.ply was turned from RAS to LPS" in said[2] and "cloud.ply was turned from RAS to LPS" in said[3]
-    assert "turned" not in said[1] and "taken for a label map" in said[5]
-    shown = wrap_inputs(opened, ["knee"])
-    assert [each.name for each in shown] == ["knee", "mesh 2", "mesh 3", "cloud 4", "cloud 5", "labels 6"]
-    assert isinstance(shown[5], ShownLabels) and shown[5].within == 1 and shown[2].said == opened[2].said
+    assert np.allclose(labels.affine, scenes.AFFINE, atol=1e-4)
+    assert labels.numbers == (5,)
+
+
+def test_integers_of_few_values_are_taken_for_labels_and_told(files):
+    (labels,) = open_inputs([files / "labels.nii.gz"])
+    assert "taken for a label map" in " ".join(labels.said)
+
+
+def points_of(subject):
+    """Points of a cloud or vertices of a mesh, in the order of their places."""
+    points = subject.points if isinstance(subject, PointCloud) else subject.vertices
+    return points[np.lexsort(np.rint(points.T))]
+
+
+@pytest.mark.parametrize(
+    ("in_lps", "in_ras"), [("lps.stl", "ras.ply"), ("cloud.xyz", "cloud.ply")], ids=["mesh", "cloud"]
+)
+def test_an_input_in_ras_is_turned_and_that_is_told(files, in_lps, in_ras):
+    lps, ras = open_inputs([files / in_lps, files / in_ras])
+    assert np.allclose(points_of(lps.subject), points_of(ras.subject), atol=1e-3)
+    assert f"{in_ras} was turned from RAS to LPS" in " ".join(ras.said)
+    assert "turned" not in " ".join(lps.said)
+
+
+def test_inputs_are_shown_under_given_names_or_kind_and_number(files):
+    shown = wrap_inputs(open_inputs([files / "scan.nii.gz", files / "ras.ply", files / "labels.nii.gz"]), ["knee"])
+    assert [each.name for each in shown] == ["knee", "mesh 2", "labels 3"]
+
+
+def test_labels_are_shown_within_their_scan_with_what_was_told(files):
+    opened = open_inputs([files / "scan.nii.gz", files / "labels.nii.gz"])
+    _, labels = wrap_inputs(opened)
+    assert isinstance(labels, ShownLabels) and labels.within == 1
+    assert labels.said == opened[1].said
 
 
 def test_a_frame_is_said_by_the_caller_where_the_file_names_none(files):

@@ -131,40 +131,62 @@ def test_a_space_that_one_end_of_the_scan_cuts_is_at_an_end(device, axis, from_e
     assert facts["at_ends"] == facts["spaces"] == 1
 
 
-def test_spaces_too_wide_for_marrow_stay_open_with_an_end_of_the_scan_as_lid_too(device):
-    distance = distances((93, 93, 93))
-    skull = whole(body(distance, 44.0, 40.0))
-    left = clrecon.fill_enclosed(skull, 400, device=device)
-    wide = left.report["solid"]["open"]["wide"]
-    assert wide["spaces"] == 1 and wide["ml"] == pytest.approx(4 / 3 * np.pi * 40**3 / 1000, rel=0.01)
-    assert np.linalg.norm(np.array(wide["at_mm"]) - 46) < 40  # within
-    assert left.report["solid"]["filled_ml"] == 0.0
-    [first, _] = left.report["warnings"]
+@pytest.fixture(scope="module")
+def skull():
+    """A shell of bone from 40 to 44 mm around voxel 46."""
+    return whole(body(distances((93, 93, 93)), 44.0, 40.0))
+
+
+SKULL_ML = 4 / 3 * np.pi * 40**3 / 1000
+
+
+def test_a_space_too_wide_for_marrow_stays_open_and_is_warned_of(device, skull):
+    report = clrecon.fill_enclosed(skull, 400, device=device).report
+    wide = report["solid"]["open"]["wide"]
+    assert wide["spaces"] == 1 and wide["ml"] == pytest.approx(SKULL_ML, rel=0.01)
+    assert np.linalg.norm(np.array(wide["at_mm"]) - 46) < 40  # within the skull
+    assert report["solid"]["filled_ml"] == 0.0
+    [first, _] = report["warnings"]
     assert first.startswith(f"solid: {wide['ml']:.3g} ml stay open in 1 enclosed space (too wide for marrow, round ")
-    everything = clrecon.fill_enclosed(skull, 400, largest_mm=None, device=device)
-    assert everything.report["solid"]["filled_ml"] == pytest.approx(wide["ml"], rel=0.1)
-    [more] = everything.report["warnings"]
-    assert "more than the" in more and "of the bone itself" in more
-    lid = whole(body(distance, 44.0, 40.0)[:30])  # a cap of the skull, cut 17 mm over its middle
-    assert clrecon.fill_enclosed(lid, 400, device=device).report["solid"]["open"]["wide"]["spaces"] == 1
-    head_of_femur = whole(body(distances((69, 69, 69)), 32.0, 29.0))
-    assert clrecon.fill_enclosed(head_of_femur, 400, device=device).report["solid"]["open"]["wide"]["spaces"] == 0
 
 
-def test_air_in_bone_stays_open_in_a_patient_and_is_filled_in_a_dry_bone(device):
-    distance = distances((41, 41, 41))
-    sinus = clrecon.fill_enclosed(whole(body(distance, 15.0, 11.0, (40, 800, -950))), 400, device=device)
-    assert sinus.report["solid"]["filled_ml"] == 0.0
-    air = sinus.report["solid"]["open"]["air"]
+def test_a_wide_space_is_filled_without_a_limit_with_a_warning(device, skull):
+    report = clrecon.fill_enclosed(skull, 400, largest_mm=None, device=device).report
+    assert report["solid"]["filled_ml"] == pytest.approx(SKULL_ML, rel=0.1)
+    [warning] = report["warnings"]
+    assert "more than the" in warning and "of the bone itself" in warning
+
+
+def test_a_wide_space_stays_open_where_the_end_of_the_scan_is_its_lid(device):
+    cap = whole(body(distances((93, 93, 93)), 44.0, 40.0)[:30])  # cut 17 mm over the middle
+    assert clrecon.fill_enclosed(cap, 400, device=device).report["solid"]["open"]["wide"]["spaces"] == 1
+
+
+def test_the_head_of_a_femur_is_not_too_wide(device):
+    head = whole(body(distances((69, 69, 69)), 32.0, 29.0))
+    assert clrecon.fill_enclosed(head, 400, device=device).report["solid"]["open"]["wide"]["spaces"] == 0
+
+
+def with_air_inside(around: int) -> Volume:
+    """A shell of 800 HU between 11 and 15 mm, with air in it, in surroundings of so many HU."""
+    return whole(body(distances((41, 41, 41)), 15.0, 11.0, (around, 800, -950)))
+
+
+def test_air_in_bone_stays_open_in_a_patient(device):
+    report = clrecon.fill_enclosed(with_air_inside(40), 400, device=device).report
+    air = report["solid"]["open"]["air"]
+    assert report["solid"]["filled_ml"] == 0.0
     assert air["spaces"] == 1 and air["at_mm"] is not None
-    assert any("air, as in sinuses and airways" in text for text in sinus.report["warnings"])
-    for options in ({"keep_air": False}, {}):
-        around = 40 if options else -1000
-        dry = clrecon.fill_enclosed(
-            whole(body(distance, 15.0, 11.0, (around, 800, -950))), 400, **options, device=device
-        )
-        facts = dry.report["solid"]
-        assert facts["filled_ml"] > facts["filled_air_ml"] > 0.8 * facts["filled_ml"] > 4.5
+    assert any("air, as in sinuses and airways" in text for text in report["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("around", "options"), [(40, {"keep_air": False}), (-1000, {})], ids=["patient, on request", "dry bone"]
+)
+def test_air_in_bone_is_filled_on_request_and_in_a_dry_bone(device, around, options):
+    facts = clrecon.fill_enclosed(with_air_inside(around), 400, **options, device=device).report["solid"]
+    assert facts["filled_ml"] > 4.5  # a ball of 11 mm has 5.6 ml
+    assert facts["filled_ml"] > facts["filled_air_ml"] > 0.8 * facts["filled_ml"]
 
 
 def tubes(step, *bones):

@@ -31,18 +31,26 @@ def test_walls_at_random_equal_their_twin(shape):
 
 
 def test_the_walls_of_a_void_enclose_its_volume():
-    """A box of 6 x 8 x 10 nodes without support within a body, and a flat wall, which encloses nothing."""
+    """A box of 6 x 8 x 10 nodes without support within a body."""
     inside = np.ones((20, 20, 20), bool)
     inside[4:10, 5:13, 6:16] = False
     walls = find_walls(pack(inside), pack(inside & False), pack(inside), 20)
     assert walls.faces.sum() == walls.walls.sum() == 2 * (6 * 8 + 8 * 10 + 6 * 10)
-    assert walls.lost == pytest.approx(480.0)
+    assert walls.lost == pytest.approx(6 * 8 * 10)
     assert (walls.share, walls.worst(3)) == (1.0, [(0, 0, 0)])
-    half = np.zeros((20, 20, 20), bool)
-    half[10:] = True
-    assert find_walls(pack(half), pack(half & False), pack(half), 20).lost == pytest.approx(0.0)
-    supported = find_walls(pack(half | True), pack(half), pack(half), 20)
-    assert (supported.faces.sum(), supported.walls.sum(), supported.worst(3)) == (400, 0, [])
+
+
+HALF = np.repeat(np.arange(20) >= 10, 400).reshape(20, 20, 20)
+"""The upper half of a body of 20 nodes: one flat face of 400."""
+
+
+def test_a_flat_wall_encloses_nothing():
+    assert find_walls(pack(HALF), pack(HALF & False), pack(HALF), 20).lost == pytest.approx(0.0)
+
+
+def test_a_face_with_support_is_no_wall():
+    supported = find_walls(pack(HALF | True), pack(HALF), pack(HALF), 20)
+    assert (supported.faces.sum(), supported.walls.sum(), supported.worst(3)) == (20 * 20, 0, [])
 
 
 def balls(holes, radius=7.0, hole=2.6):
@@ -57,18 +65,36 @@ def balls(holes, radius=7.0, hole=2.6):
     return PointCloud(np.concatenate(points), np.concatenate(normals))
 
 
-def test_one_open_ball_of_twelve_is_told_with_its_place_and_loss(device):
-    whole, broken = (reconstruct_surface(balls(holes), 0.65, device=device) for holes in (0, 1))
-    assert whole.report["warnings"] == [] and whole.report["open_cubes"] == []
-    assert whole.report["wall_share"] < 0.01 and whole.report["lost_share"] == 0.0
-    report = broken.report
+@pytest.fixture(scope="module")
+def whole_balls(device):
+    return reconstruct_surface(balls(holes=0), 0.65, device=device)
+
+
+@pytest.fixture(scope="module")
+def one_open_ball(device):
+    """The ball with the hole is the first, around the origin."""
+    return reconstruct_surface(balls(holes=1), 0.65, device=device)
+
+
+def test_balls_without_holes_are_not_warned_of(whole_balls):
+    report = whole_balls.report
+    assert (report["warnings"], report["open_cubes"], report["lost_share"]) == ([], [], 0.0)
+    assert report["wall_share"] < 0.01
+
+
+def test_one_open_ball_of_twelve_is_told_with_its_place(one_open_ball):
+    report = one_open_ball.report
     assert report["votes_against_share"] < 0.05 and report["tries"] == 1  # outvoted: the share over all is not enough
-    lost = 1.0 - broken.quality().volume_ml / whole.quality().volume_ml
-    assert lost > 0.02 and report["lost_share"] == pytest.approx(lost, rel=0.5)
-    assert len(report["warnings"]) == 1
-    assert "of the surface are walls that no points support, most of it within 10.4 mm of" in report["warnings"][0]
+    (warning,) = report["warnings"]
+    assert "of the surface are walls that no points support, most of it within 10.4 mm of" in warning
     assert np.linalg.norm(report["open_cubes"][0]["centre_mm"]) < 20.0
     assert report["open_cubes"][0]["wall_share"] > 1.0 / 3.0
+
+
+def test_the_share_that_an_open_ball_loses_is_told(whole_balls, one_open_ball):
+    lost = 1.0 - one_open_ball.quality().volume_ml / whole_balls.quality().volume_ml
+    assert lost > 0.02
+    assert one_open_ball.report["lost_share"] == pytest.approx(lost, rel=0.5)
 
 
 @pytest.mark.parametrize(("shape", "spacing"), [(sphere_cloud, 0.65), (cube_cloud, 0.64)])

@@ -56,22 +56,43 @@ def test_a_kept_volume_is_made_of_an_image_of_another_library(library: str, volu
 
 
 @pytest.mark.first_device
-def test_parts_of_a_kept_volume_are_kept_on_its_device(volume, labels, device, tmp_path) -> None:
-    kept = DeviceVolume(volume, device=device, memory=2**28)
-    part = kept[4:16]
-    assert isinstance(part, DeviceVolume) and (part.device, part.memory) == (device, 2**28)
-    part.report = {"warnings": ["told"]}
-    assert part.volume.report["warnings"] == ["told"] and "warnings" in kept.report and kept.report is volume.report
+def test_parts_of_a_kept_volume_are_kept_on_its_device(volume, device) -> None:
+    part = DeviceVolume(volume, device=device, memory=2**28)[4:16]
+    assert isinstance(part, DeviceVolume)
+    assert (part.device, part.memory) == (device, 2**28)
     assert np.array_equal(
         clrecon.extract_isosurface(part, 100).vertices, clrecon.extract_isosurface(volume[4:16], 100).vertices
     )
-    assert [one.ml for one in clrecon.measure_labels(kept, labels)] == [
-        one.ml for one in clrecon.measure_labels(volume, labels)
-    ]
+
+
+@pytest.mark.first_device
+def test_the_report_of_a_kept_volume_is_that_of_its_volume(volume, device) -> None:
+    kept = DeviceVolume(volume, device=device)
+    assert kept.report is volume.report and "warnings" in kept.report
+    part = kept[4:16]
+    part.report = {"warnings": ["told"]}
+    assert part.volume.report["warnings"] == ["told"]
+
+
+@pytest.mark.first_device
+def test_a_kept_volume_is_measured_and_saved_as_its_volume(volume, labels, device, tmp_path) -> None:
+    kept = DeviceVolume(volume, device=device)
+    ml_of_kept, ml = ([label.ml for label in clrecon.measure_labels(each, labels)] for each in (kept, volume))
+    assert ml_of_kept == ml
     assert kept.save(tmp_path / "a.nii") == volume.save(tmp_path / "b.nii")
-    assert DeviceVolume(kept, device=device).volume is volume
+
+
+@pytest.mark.first_device
+def test_a_kept_volume_of_a_kept_volume_holds_the_same_volume(volume, device) -> None:
+    assert DeviceVolume(DeviceVolume(volume, device=device), device=device).volume is volume
+
+
+@pytest.mark.first_device
+def test_a_kept_volume_shows_its_volume_and_no_inner_names(volume, device) -> None:
+    kept = DeviceVolume(volume, device=device)
     assert repr(kept).startswith("DeviceVolume(Volume(45 x 26 x 22 ")
-    assert not {"keep", "plan", "attempts", "upload"} & set(dir(kept)) and {"crop", "close", "volume"} <= set(dir(kept))
+    assert not {"keep", "plan", "attempts", "upload"} & set(dir(kept))
+    assert {"crop", "close", "volume"} <= set(dir(kept))
 
 
 @pytest.mark.first_device

@@ -133,24 +133,35 @@ def test_a_volume_and_a_mesh_arrive_as_they_were(tmp_path: Path, device: Any) ->
     np.testing.assert_array_equal(back.triangles, mesh.triangles)
 
 
-def test_the_judge_measures_the_reference_as_equal_to_itself(tmp_path: Path, device: Any) -> None:
+@pytest.fixture
+def judge(tmp_path: Path, device: Any) -> Judge:
+    """Of the surface of a ball: t-mc is all of it, vtk-mc half of its triangles, cloud its vertices 50 mm above."""
     volume = make_ball()
     save_volume(tmp_path, volume)
     mesh = surface_of(volume, device)
     save_mesh(tmp_path, "t-mc", mesh)
     save_mesh(tmp_path, "vtk-mc", Mesh(mesh.vertices, mesh.triangles[: mesh.triangle_count // 2]))
     np.save(tmp_path / "cloud-points.npy", mesh.vertices + np.float32([0.0, 0.0, 50.0]))
-    judge = Judge({"folder": tmp_path, "reference": "t-mc", "iso_value": 200, "closed": True, "truth": None})
-    own = judge.measure("t-mc")
-    assert own["reasons"] == {} and own["truth"] is None and own["points"] is None
-    assert own["cells"]["dice"] == 1.0 and own["surfaces"]["max_mm"] < 1e-4
-    assert own["slices"]["dice"] > 0.98 and own["slices"]["voxel_dice"] == 1.0
+    return Judge({"folder": tmp_path, "reference": "t-mc", "iso_value": 200, "closed": True, "truth": None})
+
+
+def test_the_judge_measures_the_reference_as_equal_to_itself(judge: Judge) -> None:
+    reference = judge.measure("t-mc")
+    assert (reference["reasons"], reference["truth"], reference["points"]) == ({}, None, None)
+    assert reference["cells"]["dice"] == 1.0 and reference["surfaces"]["max_mm"] < 1e-4
+    assert reference["slices"]["dice"] > 0.98 and reference["slices"]["voxel_dice"] == 1.0
+
+
+def test_the_judge_measures_half_of_a_mesh_as_open_and_incomplete(judge: Judge) -> None:
     half = judge.measure("vtk-mc")
     assert half["slices"] is None and "open" in half["reasons"]["slices"] and not half["quality"]["closed"]
     assert half["cells"]["recall"] < 0.7 < 0.9 < half["cells"]["precision"]
+
+
+def test_the_judge_measures_how_far_a_cloud_lies_from_the_reference(judge: Judge) -> None:
     cloud = judge.measure("cloud")
     assert cloud["points"]["to_reference_mm"]["max"] == pytest.approx(50.0, abs=1.0)
-    assert cloud["points"]["bias_mm"] is None and cloud["slices"] is None
+    assert (cloud["points"]["bias_mm"], cloud["slices"]) == (None, None)
 
 
 PARTS = {"build": 0.5, "upload": 0.1, "kernels": 0.02, "host": 0.3, "download": 0.08, "draw": 4.0}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pydicom
@@ -33,34 +34,54 @@ def read_back(folder: Path) -> tuple[np.ndarray, np.ndarray, list[pydicom.Datase
     return hu, affine, headers
 
 
-@pytest.mark.parametrize(
-    "extra",
-    [{}, {"tilt": 18.5}, {"tilt": -12.0, "oblique": (10.0, -5.0, 33.0), "transfer_syntax": "implicit"}],
+@pytest.fixture(
+    scope="module",
+    params=[{}, {"tilt": 18.5}, {"tilt": -12.0, "oblique": (10.0, -5.0, 33.0), "transfer_syntax": "implicit"}],
     ids=["straight", "tilted", "tilted-oblique-implicit"],
 )
-@pytest.mark.parametrize("kind", daily(1, ["sphere", "spine"]))
-def test_files_hold_the_affine_and_voxels_of_the_truth(tmp_path: Path, kind: str, extra: dict) -> None:
-    settings = PhantomSettings(kind=kind, **AWKWARD, **extra)
-    truth = write_phantom(tmp_path / "ct", settings)
-    hu, affine, headers = read_back(tmp_path / "ct")
-    assert truth == json.loads((tmp_path / "ct" / "truth.json").read_text())
-    assert affine == pytest.approx(np.array(truth["affine_ijk_to_lps_mm"]), abs=tolerances.PHANTOM_POSITION_MM)
-    assert list(hu.shape[::-1]) == truth["shape_ijk"] == [38, 30, 14]
-    voxels, made_affine, made_truth = make_phantom(settings)
-    assert np.array_equal(hu, voxels) and np.array_equal(made_affine, truth["affine_ijk_to_lps_mm"])
-    assert made_truth == truth
-    assert truth["tilt_deg"] == pytest.approx(extra.get("tilt", 0.0), abs=1e-6)
-    normal = np.cross(affine[:3, 0], affine[:3, 1])
-    gap = affine[:3, 2] @ normal / np.linalg.norm(normal)
-    assert gap == pytest.approx(2.5, abs=1e-9)
-    assert [np.linalg.norm(affine[:3, 0]), np.linalg.norm(affine[:3, 1])] == pytest.approx([0.5, 0.7])
-    first = headers[0]
+def extra(request: pytest.FixtureRequest) -> dict:
+    """What a phantom has beside `AWKWARD`."""
+    return request.param
+
+
+@pytest.fixture(scope="module", params=daily(1, ["sphere", "spine"]))
+def written(request: pytest.FixtureRequest, extra: dict, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """A phantom as asked for, as told by its truth, and as its files hold it."""
+    folder = tmp_path_factory.mktemp("phantom") / "ct"
+    settings = PhantomSettings(kind=request.param, **AWKWARD, **extra)
+    truth = write_phantom(folder, settings)
+    hu, affine, headers = read_back(folder)
+    return SimpleNamespace(folder=folder, settings=settings, truth=truth, hu=hu, affine=affine, headers=headers)
+
+
+def test_files_hold_the_affine_and_voxels_of_the_truth(written: SimpleNamespace) -> None:
+    voxels, affine, truth = make_phantom(written.settings)
+    assert written.truth == truth == json.loads((written.folder / "truth.json").read_text())
+    assert np.array_equal(written.hu, voxels)
+    assert np.array_equal(affine, truth["affine_ijk_to_lps_mm"])
+    assert written.affine == pytest.approx(affine, abs=tolerances.PHANTOM_POSITION_MM)
+
+
+def test_files_hold_the_size_spacing_and_tilt_that_were_asked_for(written: SimpleNamespace, extra: dict) -> None:
+    row, column, step = written.affine[:3, :3].T
+    normal = np.cross(row, column)
+    assert list(written.hu.shape[::-1]) == written.truth["shape_ijk"] == [38, 30, 14]
+    assert [np.linalg.norm(row), np.linalg.norm(column)] == pytest.approx([0.5, 0.7])
+    assert step @ normal / np.linalg.norm(normal) == pytest.approx(2.5, abs=1e-9)
+    assert written.truth["tilt_deg"] == pytest.approx(extra.get("tilt", 0.0), abs=1e-6)
+
+
+def test_headers_of_a_phantom_are_those_of_a_ct(written: SimpleNamespace, extra: dict) -> None:
+    first = written.headers[0]
     assert first.file_meta.TransferSyntaxUID.is_implicit_VR == (extra.get("transfer_syntax") == "implicit")
     assert first.SOPClassUID == pydicom.uid.CTImageStorage and first.PatientPosition == "HFS"
     assert (first.BitsStored, first.PixelRepresentation, first.RescaleIntercept) == (16, 1, -1024)
     assert ("GantryDetectorTilt" in first) == ("tilt" in extra)
-    assert len({header.SOPInstanceUID for header in headers}) == 14
-    assert len({header.SeriesInstanceUID for header in headers}) == 1
+
+
+def test_slices_of_a_phantom_are_of_one_series_and_have_names_of_their_own(written: SimpleNamespace) -> None:
+    assert len({header.SOPInstanceUID for header in written.headers}) == 14
+    assert len({header.SeriesInstanceUID for header in written.headers}) == 1
 
 
 def test_decimal_strings_fit_into_sixteen_characters(tmp_path: Path) -> None:

@@ -82,28 +82,33 @@ def test_header_with_fewer_pixels_than_there_are_is_refused(tmp_path, change):
     check_refused(tmp_path, "Pixel Data has 160 bytes", "more pixels than the header says")
 
 
-@pytest.mark.parametrize("hidden", [1, 3])
-def test_a_picture_that_ends_in_zeros_shows_its_columns(tmp_path, hidden):
-    """The bytes that one column less leaves over are zeros here: only the picture tells them from padding."""
-    plan = Plan(shape=(3, 32, 32), name=NAME, signed=False, intercept=-1024)
-    j, i = np.mgrid[:32, :32]
-    disc = np.where((i - 15.5) ** 2 + (j - 15.5) ** 2 < 144, 1000 + 20 * i, 0).astype("u2")
+DISC = np.where(np.hypot(*(np.mgrid[:32, :32] - 15.5)) < 12, 1000 + 20 * np.arange(32), 0).astype("u2")
+"""Zeros around it: the bytes that one column less leaves over are zeros, only the picture tells them from padding."""
+
+
+def write_disc(folder, columns, pixels):
+    """Three slices of 32 rows whose headers name so many columns."""
 
     def change(ds, k):
-        ds.PixelData = disc.tobytes()
-        ds.Columns = 32 - hidden
+        ds.PixelData = pixels
+        ds.Columns = columns
 
-    write_series(tmp_path, plan, change)
+    write_series(folder, Plan(shape=(3, 32, 32), name=NAME, signed=False, intercept=-1024), change)
+
+
+@pytest.mark.parametrize("hidden", [1, 3])
+def test_a_picture_that_ends_in_zeros_shows_columns_that_its_header_hides(tmp_path, hidden):
+    write_disc(tmp_path, 32 - hidden, DISC.tobytes())
     check_refused(tmp_path, f"Pixel Data has 2048 bytes, {32 - hidden} x 32 x 16 bit take {64 * (32 - hidden)}",
                   "rows are more alike with 32 columns")  # fmt: skip
 
-    def pad(ds, k):
-        ds.PixelData = disc[:, : 32 - hidden].tobytes() + bytes(64 * hidden)
-        ds.Columns = 32 - hidden
 
-    write_series(tmp_path, plan, pad)
+@pytest.mark.parametrize("padded", [1, 3])
+def test_a_picture_before_zeros_that_fits_its_columns_is_padded(tmp_path, padded):
+    kept = DISC[:, : 32 - padded]
+    write_disc(tmp_path, 32 - padded, kept.tobytes() + bytes(64 * padded))
     volume = read_volume(tmp_path)
-    assert np.array_equal(volume.voxels[0], disc[:, : 32 - hidden].astype(int) - 1024)
+    assert np.array_equal(volume.voxels[0], kept.astype(int) - 1024)
     assert "the rest is zeros, taken as padding" in volume.report["warnings"][0]
 
 

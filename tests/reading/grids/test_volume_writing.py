@@ -124,15 +124,20 @@ def test_uneven_slices_and_sheared_mha_are_refused(tmp_path):
     assert not [path for path in tmp_path.iterdir() if path.name != "ct"]
 
 
-def test_other_names_are_refused(tmp_path):
-    volume = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
-    for name in ("a.stl", "a", ".nii", "a.gz", "a.mhd"):
-        with refused(UsageError, ".nii.gz"):
-            write_volume(volume, tmp_path / name)
+@pytest.mark.parametrize("name", ["a.stl", "a", ".nii", "a.gz", "a.mhd"])
+def test_a_file_whose_name_is_of_no_volume_is_refused(tmp_path, name):
+    with refused(UsageError, ".nii.gz"):
+        write_volume(Volume(np.zeros((2, 2, 2), np.int16), np.eye(4)), tmp_path / name)
+
+
+def test_writing_an_array_as_a_volume_is_refused(tmp_path):
     with refused(UsageError, "volume", "ndarray"):
-        write_volume(volume.voxels, tmp_path / "a.nii")
-    with pytest.raises(OutputError):
-        write_volume(volume, tmp_path / "no folder" / "a.nii")
+        write_volume(np.zeros((2, 2, 2), np.int16), tmp_path / "a.nii")
+
+
+def test_writing_a_volume_into_no_folder_is_refused(tmp_path):
+    with refused(OutputError, "a.nii"):
+        write_volume(Volume(np.zeros((2, 2, 2), np.int16), np.eye(4)), tmp_path / "none" / "a.nii")
 
 
 def test_one_slice_is_written(tmp_path):

@@ -113,24 +113,32 @@ def test_picks_lie_on_the_mesh(view):
     assert away.max() <= 0.3 and np.median(away) <= 0.02
 
 
-def test_a_pick_finds_the_nearest_object_in_each_projection(view):
+MIDDLE_OF_THE_MESH = scenes.middle(0) + (0.0, -25.0, 0.0)
+"""It lies in front of the first ball of the scan."""
+
+
+@pytest.mark.parametrize("perspective", [False, True], ids=["parallel", "perspective"])
+@pytest.mark.parametrize(("number", "point"), [(1, scenes.middle(2)), (2, MIDDLE_OF_THE_MESH)], ids=["scan", "mesh"])
+def test_a_pick_finds_the_nearest_object_in_each_projection(view, perspective, number, point):
     model, painter = view(scenes.make_scan(), scenes.make_mesh())
-    spots = {
-        number: model.camera.project([point], SIZE)[0][0]
-        for number, point in ((1, scenes.middle(2)), (2, scenes.middle(0) + (0.0, -25.0, 0.0)))
-    }
-    for number, (x, y) in spots.items():
-        pick = painter.pick(model.state, SIZE, x, y)
-        assert pick is not None and pick.object == number and pick.part == str(number)
+    model.set_perspective(perspective)
+    x, y = model.camera.project([point], SIZE)[0][0]
+    pick = painter.pick(model.state, SIZE, x, y)
+    assert (pick.object, pick.part) == (number, str(number))
+
+
+def test_a_pick_beside_everything_finds_nothing(view):
+    model, painter = view(scenes.make_scan(), scenes.make_mesh())
     assert painter.pick(model.state, SIZE, 0.5, 0.5) is None
-    model.set_perspective(True)
-    x, y = model.camera.project([scenes.middle(0) + (0.0, -25.0, 0.0)], SIZE)[0][0]
-    assert painter.pick(model.state, SIZE, x, y).object == 2
+
+
+def test_a_pick_of_a_cloud_is_one_of_its_points_without_hu(view):
     cloud = scenes.make_cloud()
     model, painter = view(cloud)
-    nearest = cloud.points[np.argmin(cloud.points[:, 1])]
+    nearest = cloud.points[np.argmin(cloud.points[:, 1])]  # the view is from anterior
     pick = painter.pick(model.state, SIZE, *model.camera.project([nearest], SIZE)[0][0])
-    assert pick.object == 1 and pick.point == pytest.approx(nearest, abs=0.2) and pick.hu is None
+    assert pick.point == pytest.approx(nearest, abs=0.2)
+    assert (pick.object, pick.hu) == (1, None)
 
 
 def test_slices_map_pixels_to_the_patient_and_show_the_scan(view):
