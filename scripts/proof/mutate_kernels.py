@@ -60,8 +60,8 @@ def run_mutations(mutations: Sequence[Mutation], device: int) -> Iterator[tuple[
                 child.stdin.close()
                 for result in _answers(child):
                     mutation = left.pop(0)
-                    if result["caught"] is None and mutation not in again:  # the driver may have lost a file by a kill
-                        again.add(mutation)
+                    if not result["caught"] and not mutation.reason and mutation not in again:
+                        again.add(mutation)  # memory may hold right values of an earlier run, or a kill lost a file
                         left.append(mutation)
                     else:
                         yield mutation, result
