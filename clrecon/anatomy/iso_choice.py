@@ -192,7 +192,7 @@ class IsoChoice:
     spread_hu: Half the interquartile range of the half-way levels of single edges.
     steepness_hu_per_voxel: Median steepest step of an edge along a row or column; the spread over it is in voxels.
     faint_share: Share of the edges whose bone, thin or poor in mineral, stays below the iso value and is lost.
-    contrast_medium_share: Share of the contrast left out because it ends in a flat plateau below ``CONTRAST_MEDIUM_HU``.
+    contrast_medium_share: Share of the contrast left out as it ends in a flat plateau below ``CONTRAST_MEDIUM_HU``.
     flat_share: The same before that decision: where it is above three quarters, flat plateaus are taken for bone.
     slices, slice_step: Number of slices examined, and the distance from one to the next in slices.
     seen_at_lps_mm: A place where an edge has both materials.

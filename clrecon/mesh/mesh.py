@@ -142,8 +142,8 @@ class Mesh(BaseMesh, ShownAsHtml):
     def merge(self, *others: Mesh) -> Mesh:
         """Return this mesh and others as one, each as it is: no vertex is joined and nothing is cut.
 
-        What only some have is NaN elsewhere (``values``) or left out (normals, facts of the scan).  Unions of solids are
-        those of trimesh: ``clrecon.Mesh.from_trimesh(trimesh.boolean.union([a.to_trimesh(), b.to_trimesh()]))``.
+        What only some have is NaN elsewhere (``values``) or left out (normals, facts of the scan).  Unions of solids
+        are those of trimesh: ``clrecon.Mesh.from_trimesh(trimesh.boolean.union([a.to_trimesh(), b.to_trimesh()]))``.
         A `UsageError` where one is no Mesh.
         """
         parts = (self, *others)

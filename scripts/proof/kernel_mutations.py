@@ -54,7 +54,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     },
     "enter_triangles": {
         "places": (("row[0] = at.x;", "row[0] = -at.x;"),),
-        "names": (("stride + entry] = name;", "stride + entry] = name + 1;"),),
+        "names": (("stride + entry] = name;", "stride + entry] = name + corner;"),),
     },
     "mark_crossings": {"marks": (("&& may_cut(own,", "&& !may_cut(own,"),)},
     "clear_labels": {"labels": (("= UNUSED;", "= ~UNUSED;"),)},
