@@ -131,11 +131,22 @@ def test_a_record_of_many_fields_shows_some_in_one_line_and_has_all_as_entries()
         unmeasured=0, mean_hu=364.7322142286171, sd_hu=194.14300870016297, min_hu=-69.0, max_hu=1777.0,
         percentiles_hu=dict.fromkeys("12345", 1.0),
     )  # fmt: skip
-    said = "LabelFigures(number=28, name='vertebrae_L4', ml=39.0938, mean_hu=364.732, sd_hu=194.143, ...)"
-    assert repr(figures) == said and len(figures) == 13
-    for kind in (Certificate, IsoChoice, LabelFigures, MeshQuality, SeriesEntry, SpineLine, Vertebra, VertebraSplit):
-        own = kind.__new__(kind)
-        vars(own).update(dict.fromkeys((field.name for field in fields(kind)), 12345.678), points=np.zeros((2, 3)))
-        assert len(repr(own)) < 120 and "\n" not in repr(own)
+    shown = "LabelFigures(number=28, name='vertebrae_L4', ml=39.0938, mean_hu=364.732, sd_hu=194.143, ...)"
+    assert repr(figures) == shown
+    assert len(figures) == 13  # the twelve above, and the warnings
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [Certificate, IsoChoice, LabelFigures, MeshQuality, SeriesEntry, SpineLine, Vertebra, VertebraSplit],
+    ids=lambda kind: kind.__name__,
+)
+def test_every_large_record_is_shown_in_one_short_line(kind: Any) -> None:
+    record = kind.__new__(kind)
+    vars(record).update(dict.fromkeys((field.name for field in fields(kind)), 12345.678), points=np.zeros((2, 3)))
+    assert len(repr(record)) < 120 and "\n" not in repr(record)
+
+
+def test_a_listing_is_shown_by_its_counts() -> None:
     listing = SeriesListing(["x" * 999] * 3, 2, {}, [])
     assert repr(listing) == "SeriesListing(3 series, chosen=2, 0 warnings)"

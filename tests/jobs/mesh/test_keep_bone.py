@@ -75,15 +75,21 @@ def test_auto_says_that_there_is_contrast_medium(read: Any, device: Any, tmp_pat
     assert "flat" not in report["iso_value_reason"]
 
 
-def test_a_scan_of_contrast_medium_alone_is_said_and_holds_no_bone(read: Any, device: Any, tmp_path: Path) -> None:
+def test_a_surface_of_contrast_medium_alone_is_warned_of(read: Any, device: Any, tmp_path: Path) -> None:
     read(make_scan(bone=0.0))
-    report = run(tmp_path, device, half_way="auto")
-    assert any("too much to be left out of the choice" in text for text in report["warnings"])
-    assert any("the surface looks like contrast medium" in text for text in report["warnings"])
-    before = (tmp_path / "b.ply").read_bytes()
+    warnings = run(tmp_path, device, half_way="auto")["warnings"]
+    assert any("too much to be left out of the choice" in text for text in warnings)
+    assert any("the surface looks like contrast medium" in text for text in warnings)
+
+
+def test_bone_in_a_scan_of_contrast_medium_alone_is_refused_and_an_older_file_stays(
+    read: Any, device: Any, tmp_path: Path
+) -> None:
+    read(make_scan(bone=0.0))
+    (tmp_path / "b.ply").write_bytes(b"older")
     with refused(NoSurfaceError, 200, "looks"):
         run(tmp_path, device, iso_value=200.0, keep="bone")
-    assert (tmp_path / "b.ply").read_bytes() == before
+    assert (tmp_path / "b.ply").read_bytes() == b"older"
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ def test_vertices_without_triangles_bound_nothing():
 
 
 @pytest.mark.parametrize("case", FLAT_CASES)
-def test_witnesses_are_the_faces_that_show_it(case):
+def test_witnesses_are_the_faces_within_the_limit(case):
     bounds, arguments, expected = flat_case(SurfaceBounds, case)
     witnesses, left = bounds.find_witnesses(*arguments, FLAT_BOUND)
     assert (witnesses[:, 0].tolist(), int(left[0])) == expected

@@ -55,7 +55,7 @@ def test_walks_and_limits_are_those_of_the_twin(device, limit, walks):
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("case", FLAT_CASES)
-def test_witnesses_are_the_faces_that_show_it(device, case):
+def test_witnesses_are_the_faces_within_the_limit(device, case):
     bounds, arguments, expected = flat_case(partial(DeviceBounds, device), case)
     witnesses, left = bounds.find_witnesses(*arguments, FLAT_BOUND)
     assert (witnesses[:, 0].tolist(), int(left[0])) == expected

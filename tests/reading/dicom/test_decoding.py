@@ -96,19 +96,35 @@ def test_signed_values_and_eight_bits_are_decoded(tmp_path, name):
         assert pixels.dtype == np.uint16 and np.array_equal(pixels, narrow)
 
 
-def test_values_whose_sign_cannot_be_told_are_refused(tmp_path):
-    low, high = IMAGES[0] % 2048, IMAGES[0]
-    for syntax, encode in (
-        (JPEG + "70", lambda image: encode_lossless(image, 1, 12)),
-        (JPEG + "90", lambda image: encode_jpeg_2000(image, bitspersample=12)),
-    ):
-        (pixels,) = place(tmp_path, encapsulate([encode(low)]) + END, syntax, signed=True)
-        assert np.array_equal(pixels, low)
-        with refused(RefusedInputError, 12, 16):
-            place(tmp_path, encapsulate([encode(high)]) + END, syntax, signed=True)
-        # With 12 bits stored the highest bit is the sign; it is extended later, with the unused bits.
-        (pixels,) = place(tmp_path, encapsulate([encode(high)]) + END, syntax, signed=True, bits_stored=12, high_bit=11)
-        assert np.array_equal(pixels & 0xFFF, high)
+TWELVE_SIGNED_BITS = {
+    "JPEG lossless": (JPEG + "70", lambda image: encode_lossless(image, 1, 12)),
+    "JPEG 2000": (JPEG + "90", lambda image: encode_jpeg_2000(image, bitspersample=12)),
+}
+"""Codestreams of 12 bits without a sign, in pixels whose header says 16 bits with one."""
+
+
+@pytest.mark.parametrize("name", TWELVE_SIGNED_BITS)
+def test_values_whose_sign_cannot_be_told_are_refused(tmp_path, name):
+    syntax, encode = TWELVE_SIGNED_BITS[name]
+    with refused(RefusedInputError, 12, 16):
+        place(tmp_path, encapsulate([encode(IMAGES[0])]) + END, syntax, signed=True)
+
+
+@pytest.mark.parametrize("name", TWELVE_SIGNED_BITS)
+def test_values_below_the_doubtful_sign_are_decoded(tmp_path, name):
+    syntax, encode = TWELVE_SIGNED_BITS[name]
+    low = IMAGES[0] % 2048  # 11 bits
+    (pixels,) = place(tmp_path, encapsulate([encode(low)]) + END, syntax, signed=True)
+    assert np.array_equal(pixels, low)
+
+
+@pytest.mark.parametrize("name", TWELVE_SIGNED_BITS)
+def test_the_highest_of_twelve_stored_bits_is_the_sign(tmp_path, name):
+    """It is extended later, with the unused bits."""
+    syntax, encode = TWELVE_SIGNED_BITS[name]
+    data = encapsulate([encode(IMAGES[0])]) + END
+    (pixels,) = place(tmp_path, data, syntax, signed=True, bits_stored=12, high_bit=11)
+    assert np.array_equal(pixels & 0xFFF, IMAGES[0])
 
 
 # --- frames in a file ---

@@ -198,14 +198,19 @@ def test_a_gantry_that_turns_to_and_fro_over_unlike_pictures_is_doubted(tmp_path
     assert any("maybe two volumes between each other" in text for text in warnings)
 
 
-def test_an_element_of_no_row_leaves_an_even_stack_to_the_pixels(tmp_path):
-    own = ({"TableHeight": 100}, {"TableHeight": 101})
-    write_volumes(tmp_path / "moved", *own, pixels=picture(6))
-    assert "2 phases whose slices lie between each other, choose one with phase: [1: TableHeight" in refusal(
-        tmp_path / "moved"
-    )
-    write_volumes(tmp_path / "alike", *own, pixels=picture(0))
-    report = read_volume(tmp_path / "alike").report
+TWO_TABLE_HEIGHTS = ({"TableHeight": 100}, {"TableHeight": 101})
+"""An element that is not in the table of those that part volumes."""
+
+
+def test_an_element_of_no_row_parts_volumes_of_unlike_pictures(tmp_path):
+    write_volumes(tmp_path, *TWO_TABLE_HEIGHTS, pixels=picture(6))  # every second slice lies 6 voxels aside
+    said = refusal(tmp_path)
+    assert "2 phases whose slices lie between each other, choose one with phase: [1: TableHeight" in said
+
+
+def test_an_element_of_no_row_that_alternates_over_like_pictures_is_doubted(tmp_path):
+    write_volumes(tmp_path, *TWO_TABLE_HEIGHTS, pixels=picture(0))
+    report = read_volume(tmp_path).report
     assert any("TableHeight alternates along the stack: maybe several volumes" in text for text in report["warnings"])
     assert [gate["name"] for gate in report["gates"] if gate["ok"] is False] == ["one_volume"]
 

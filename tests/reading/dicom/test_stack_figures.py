@@ -166,21 +166,39 @@ def part(number: int, first: int | None, frames: int = 10, parts: int | None = 3
     return SimpleNamespace(concatenation=Concatenation("1.2", number, parts, first, frames))
 
 
-def test_parts_of_a_concatenation_that_are_missing_or_do_not_fit():
-    assert describe_missing_parts([part(1, 0), part(2, 10), part(3, 20), part(3, 20)]) == []
-    assert describe_missing_parts([part(1, None), part(2, None), part(3, None)]) == []
-    assert describe_missing_parts([part(1, 0), part(2, None), part(3, 21)]) == []  # the end of part 2 is not known
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [part(1, 0), part(2, 10), part(3, 20), part(3, 20)],
+        [part(1, None), part(2, None), part(3, None)],
+        [part(1, 0), part(2, None), part(3, 21)],
+        [SimpleNamespace(concatenation=None)],
+    ],
+    ids=["one part twice", "no starts", "the end of part 2 is not known", "no concatenation"],
+)
+def test_parts_of_a_concatenation_that_may_be_whole_are_not_told(parts: list[Any]) -> None:
+    assert describe_missing_parts(parts) == []
+
+
+def test_parts_of_a_concatenation_that_do_not_fit_are_told():
     assert describe_missing_parts([part(3, 20), part(1, 0), part(2, 11)]) == [
         "file 2 of a concatenation starts at frame 11, the one before it ends at frame 10 "
         "(ConcatenationFrameOffsetNumber (0020,9228))",
         "file 3 of a concatenation starts at frame 20, the one before it ends at frame 21 "
         "(ConcatenationFrameOffsetNumber (0020,9228))",
     ]
-    (one,) = describe_missing_parts([part(1, 0), part(3, 20)])
-    assert one == "file 2 of the 3 of a concatenation is missing (InConcatenationNumber (0020,9162))"
-    (two,) = describe_missing_parts([part(2, 10, parts=None), part(4, 30, parts=None)])
-    assert two == "files 1, 3 of the 4 of a concatenation are missing (InConcatenationNumber (0020,9162))"
-    assert describe_missing_parts([SimpleNamespace(concatenation=None)]) == []  # type: ignore[list-item]
+
+
+@pytest.mark.parametrize(
+    ("parts", "missing"),
+    [
+        ([part(1, 0), part(3, 20)], "file 2 of the 3 of a concatenation is missing"),
+        ([part(2, 10, parts=None), part(4, 30, parts=None)], "files 1, 3 of the 4 of a concatenation are missing"),
+    ],
+    ids=["of a known number", "up to the last that is there"],
+)
+def test_parts_of_a_concatenation_that_are_missing_are_told(parts: list[Any], missing: str) -> None:
+    assert describe_missing_parts(parts) == [f"{missing} (InConcatenationNumber (0020,9162))"]
 
 
 def test_a_damaged_start_is_found_from_its_first_byte_on():
