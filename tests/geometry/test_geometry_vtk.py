@@ -67,19 +67,32 @@ def uneven_positions(affine: np.ndarray) -> np.ndarray:
     return ORIGIN + np.concatenate([[0.0], np.cumsum(steps)])[:, None] * affine[:3, 2]
 
 
-@pytest.mark.parametrize("name", AFFINES)
-def test_every_point_is_its_voxel(name):
+@pytest.fixture(scope="module", params=AFFINES)
+def numbers_and_image(request):
+    """The name of an affine, a volume of random numbers on it, and its image in pyvista."""
     values = np.random.default_rng(1).integers(-1000, 2000, SHAPE, dtype=np.int16)
-    volume = Volume(values, AFFINES[name])
-    image = volume.to_pyvista()
+    volume = Volume(values, AFFINES[request.param])
+    return request.param, volume, volume.to_pyvista()
+
+
+def test_every_point_is_its_voxel(numbers_and_image):
+    _, volume, image = numbers_and_image
+    ijk = np.rint(volume.lps_to_ijk(image.points)).astype(int)
+    assert len(np.unique(ijk, axis=0)) == volume.voxels.size
+    assert np.abs(image.points - volume.ijk_to_lps(ijk)).max() <= tolerances.IMAGE_POINT_MM
+    assert np.array_equal(image.point_data["HU"], volume.voxels[tuple(ijk.T[::-1])])
+
+
+def test_an_image_has_the_size_and_spacing_of_its_volume_and_is_right_handed(numbers_and_image):
+    _, _, image = numbers_and_image
     assert image.dimensions == SHAPE[::-1]
     assert image.spacing == pytest.approx(SPACING, abs=tolerances.FLOAT64_PLACE_MM)
-    ijk = np.rint(volume.lps_to_ijk(image.points)).astype(int)
-    assert len(np.unique(ijk, axis=0)) == values.size
-    assert np.abs(image.points - volume.ijk_to_lps(ijk)).max() <= tolerances.IMAGE_POINT_MM
-    assert np.array_equal(image.point_data["HU"], values[tuple(ijk.T[::-1])])
     direction = np.array([image.GetDirectionMatrix().GetElement(r, c) for r in range(3) for c in range(3)])
     assert np.linalg.det(direction.reshape(3, 3)) == pytest.approx(1.0)
+
+
+def test_an_image_names_frame_unit_and_the_turned_order_of_its_slices(numbers_and_image):
+    name, _, image = numbers_and_image
     assert (image.field_data["SPACE"][0], image.field_data["UNIT"][0]) == ("LPS", "mm")
     assert ("SLICES" in image.field_data) == ("mirrored" in name)
     assert image.active_scalars_name == "HU" and "RESAMPLED" not in image.field_data

@@ -61,23 +61,49 @@ def test_a_ratio_falls_when_no_spread_explains_it(now: float, half: float, fell:
     assert compare.has_fallen(spread_of(2.0), spread_of(now, half), percent=10.0) is fell
 
 
-def test_compare_exits_by_what_it_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    base = keep(tmp_path / "base", make_result(), make_result(given="spine559"))
-    better = keep(tmp_path / "better", make_result(ratio=2.4))
-    worse = keep(tmp_path / "worse", make_result(ratio=1.2), make_result(given="cube64"))
-    other = keep(tmp_path / "other", make_result(given="cube64"))
-    assert bench.main(["compare", str(base), str(better)]) == 0
-    captured = capsys.readouterr()
-    assert "2.00 (1.90 to 2.10) | 2.40 (2.30 to 2.50) | 1.20" in captured.out
-    assert "spine559 pocl-3.1-debian: only in the baseline" in captured.err
-    assert bench.main(["compare", str(base), str(worse)]) == 1
-    captured = capsys.readouterr()
-    assert captured.out.count("FELL") == 1
-    assert "cube64 pocl-3.1-debian: only in the new results" in captured.err
-    assert bench.main(["compare", str(base), str(worse), "--percent", "60"]) == 0
-    assert bench.main(["compare", str(base), str(other)]) == 2
-    assert bench.main(["compare", str(base), str(tmp_path / "nowhere")]) == 3
-    assert "nowhere is not a folder" in capsys.readouterr().err
+@pytest.fixture
+def result_folders(tmp_path: Path) -> dict[str, str]:
+    """Results of two cases with the ratio 2, of one with 2.4, of one with 1.2 beside a new case, and of that alone."""
+    kept = {
+        "base": keep(tmp_path / "base", make_result(), make_result(given="spine559")),
+        "better": keep(tmp_path / "better", make_result(ratio=2.4)),
+        "worse": keep(tmp_path / "worse", make_result(ratio=1.2), make_result(given="cube64")),
+        "other": keep(tmp_path / "other", make_result(given="cube64")),
+    }
+    return {name: str(folder) for name, folder in kept.items()} | {"nowhere": str(tmp_path / "nowhere")}
+
+
+@pytest.mark.parametrize(
+    ("new", "options", "code"),
+    [("better", [], 0), ("worse", [], 1), ("worse", ["--percent", "60"], 0), ("other", [], 2), ("nowhere", [], 3)],
+    ids=["better", "fell", "fell less than allowed", "nothing in common", "no folder"],
+)
+def test_compare_exits_by_what_it_finds(
+    result_folders: dict[str, str], new: str, options: list[str], code: int
+) -> None:
+    assert bench.main(["compare", result_folders["base"], result_folders[new], *options]) == code
+
+
+def test_compare_prints_both_ratios_and_their_quotient(result_folders: dict[str, str], printed: Printer) -> None:
+    bench.main(["compare", result_folders["base"], result_folders["better"]])
+    assert "2.00 (1.90 to 2.10) | 2.40 (2.30 to 2.50) | 1.20" in printed().everything
+
+
+def test_compare_marks_the_ratio_that_fell(result_folders: dict[str, str], printed: Printer) -> None:
+    bench.main(["compare", result_folders["base"], result_folders["worse"]])
+    assert printed().everything.count("FELL") == 1
+
+
+def test_compare_names_cases_of_one_side_alone(result_folders: dict[str, str], printed: Printer) -> None:
+    bench.main(["compare", result_folders["base"], result_folders["worse"]])
+    said = printed().everything
+    assert "spine559 pocl-3.1-debian: only in the baseline" in said
+    assert "cube64 pocl-3.1-debian: only in the new results" in said
+
+
+def test_compare_names_a_folder_that_is_missing(result_folders: dict[str, str], printed: Printer) -> None:
+    bench.main(["compare", result_folders["base"], result_folders["nowhere"]])
+    printed().assert_error("nowhere", "folder")
 
 
 def test_a_lost_ratio_is_said(tmp_path: Path) -> None:

@@ -73,28 +73,47 @@ def test_headers_alone_say_nothing_of_pixels(tmp_path, monkeypatch):
         certify(tmp_path, pixels=True)
 
 
-def test_certificate_of_an_oblique_tilted_series_has_its_geometry(tmp_path):
-    plan = write_series(tmp_path, Plan(tilt_deg=12, angles=(3, 4, -5)), set_values(PatientPosition="FFP"))
-    found = read_volume(tmp_path).report
-    row, column, normal = plan.directions
-    assert found["extent_mm"] == pytest.approx([6 * 0.5, 5 * 0.7, 7 * 1.25])
-    assert found["gap_mm"] == pytest.approx({"min": 1.25, "max": 1.25, "median": 1.25})
-    assert found["tilt_deg"] == pytest.approx(-12.0, abs=1e-6)
-    assert found["grid_residual_max_mm"] <= tolerances.AFFINE_MM
-    assert found["grid_tolerance_mm"] == pytest.approx(0.0125)
-    for name, direction in (("row", row), ("column", column), ("normal", normal)):
-        assert found["orientation"][name] == pytest.approx(list(direction), abs=1e-8)
-    assert found["orientation"]["axes"] == "LPS" and found["orientation"]["right_handed"]
-    assert found["orientation"]["off_axis_deg"] == pytest.approx(np.degrees(np.arccos(normal[2])))
-    assert found["patient_position"] == "FFP"
-    assert (found["uneven"], found["gap_runs"], found["slice_positions_mm"]) == (False, None, None)
-    assert (found["slices"], found["slices_missing"], found["dropped"]) == (7, 0, {})
-    # Slices 5 mm thick every 1.25 mm share 3.75 mm, three times the gap.
-    assert found["thickness"] == {
+@pytest.fixture(scope="module")
+def oblique_tilted(tmp_path_factory):
+    """The plan of 7 slices of 6 x 5 pixels, tilted by 12 degrees and oblique, and the report of their volume."""
+    folder = tmp_path_factory.mktemp("oblique")
+    plan = write_series(folder, Plan(tilt_deg=12, angles=(3, 4, -5)), set_values(PatientPosition="FFP"))
+    return plan, read_volume(folder).report
+
+
+def test_certificate_of_an_oblique_tilted_series_has_its_geometry(oblique_tilted):
+    _, report = oblique_tilted
+    assert report["extent_mm"] == pytest.approx([6 * 0.5, 5 * 0.7, 7 * 1.25])
+    assert report["gap_mm"] == pytest.approx({"min": 1.25, "max": 1.25, "median": 1.25})
+    assert report["tilt_deg"] == pytest.approx(-12.0, abs=1e-6)  # the plan's 12: the back edge towards the head
+    assert report["grid_residual_max_mm"] <= tolerances.AFFINE_MM
+    assert report["grid_tolerance_mm"] == pytest.approx(0.0125)  # a hundredth of the gap
+
+
+def test_certificate_of_an_oblique_series_has_its_directions(oblique_tilted):
+    plan, report = oblique_tilted
+    orientation, (row, column, normal) = report["orientation"], plan.directions
+    assert orientation["row"] == pytest.approx(list(row), abs=1e-8)
+    assert orientation["column"] == pytest.approx(list(column), abs=1e-8)
+    assert orientation["normal"] == pytest.approx(list(normal), abs=1e-8)
+    assert orientation["off_axis_deg"] == pytest.approx(np.degrees(np.arccos(normal[2])))
+    assert (orientation["axes"], orientation["right_handed"]) == ("LPS", True)
+    assert report["patient_position"] == "FFP"
+
+
+def test_certificate_of_an_even_series_misses_nothing_and_passes_its_gates(oblique_tilted):
+    _, report = oblique_tilted
+    assert (report["uneven"], report["gap_runs"], report["slice_positions_mm"]) == (False, None, None)
+    assert (report["slices"], report["slices_missing"], report["dropped"]) == (7, 0, {})
+    assert failed(report) == set()
+
+
+def test_slices_thicker_than_their_gap_overlap(oblique_tilted):
+    """Slices 5 mm thick every 1.25 mm share 3.75 mm, three times the gap."""
+    assert oblique_tilted[1]["thickness"] == {
         "min_mm": 5.0, "max_mm": 5.0, "median_mm": 5.0, "overlap_percent": pytest.approx(300.0),
         "overlap_mm": pytest.approx({"min": 3.75, "max": 3.75, "median": 3.75}),
     }  # fmt: skip
-    assert failed(found) == set()
 
 
 def test_thickness_that_leaves_tissue_unmeasured_has_a_negative_overlap(tmp_path):

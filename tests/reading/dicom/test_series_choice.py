@@ -39,22 +39,28 @@ def two_series(tmp_path):
 
 
 def test_listing_has_the_names_of_the_contract(two_series):
-    listing = list_series(two_series)
-    entries = [entry.as_dict() for entry in listing.series]
+    entries = [entry.as_dict() for entry in list_series(two_series).series]
     assert [list(entry)[: len(CONTRACT)] for entry in entries] == [CONTRACT, CONTRACT]
-    assert listing.chosen == 1
     assert json.loads(json.dumps(entries)) == entries
-    first = entries[0]
-    assert first["uid_hash"] == hash_of(2)
-    assert (first["number"], first["description"], first["modality"], first["slices"]) == (1, "series 2", "CT", 7)
-    assert first["shape_ijk"] == [6, 5, 7]
-    assert first["spacing_mm"] == pytest.approx([0.5, 0.7, 1.25])
-    assert np.array(first["affine_ijk_to_lps_mm"])[:3, 3] == pytest.approx([-12.5, 31.25, -400.0])
-    assert first["tilt_deg"] == pytest.approx(0, abs=1e-6)
-    assert first["gap_mm"] == pytest.approx({"min": 1.25, "max": 1.25, "median": 1.25})
-    assert first["grid_residual_max_mm"] < 1e-9
-    assert (first["uneven"], first["warnings"], first["problems"]) == (False, [], [])
-    assert entries[1]["slices"] == 4 and entries[1]["number"] == 2
+
+
+def test_listing_begins_with_the_largest_series_and_chooses_it(two_series):
+    listing = list_series(two_series)
+    assert listing.chosen == 1
+    assert [(entry.number, entry.slices) for entry in listing.series] == [(1, 7), (2, 4)]
+
+
+def test_listing_describes_a_series_by_its_stack(two_series):
+    entry = list_series(two_series).series[0].as_dict()
+    expected = {
+        "uid_hash": hash_of(2), "description": "series 2", "modality": "CT",
+        "shape_ijk": [6, 5, 7], "spacing_mm": pytest.approx([0.5, 0.7, 1.25]),
+        "gap_mm": pytest.approx({"min": 1.25, "max": 1.25, "median": 1.25}),
+        "tilt_deg": pytest.approx(0, abs=1e-6), "uneven": False, "warnings": [], "problems": [],
+    }  # fmt: skip
+    assert {name: entry[name] for name in expected} == expected
+    assert np.array(entry["affine_ijk_to_lps_mm"])[:3, 3] == pytest.approx([-12.5, 31.25, -400.0])  # of the plan
+    assert entry["grid_residual_max_mm"] < 1e-9
 
 
 def test_the_largest_series_is_taken_and_the_rest_said(two_series):
