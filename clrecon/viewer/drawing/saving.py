@@ -19,11 +19,12 @@ from clrecon.points import PointCloud
 from clrecon.reading.grids.write_volume import FORMATS as VOLUME_FORMATS
 from clrecon.rendering.pictures.picture import IMAGE_FORMATS
 from clrecon.system.arguments import Space
-from clrecon.system.files import check_writable
+from clrecon.system.files import check_writable, replace_file
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress
 from clrecon.system.text import count_of, escape_text
 from clrecon.viewer.drawing.painter import Painter
+from clrecon.viewer.model.measures import MEASURE_FORMATS, encode_measures
 from clrecon.viewer.model.objects import ShownCloud, ShownScan
 from clrecon.viewer.model.state import ViewState
 
@@ -32,6 +33,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     "mesh": tuple(FORMATS),
     "cloud": tuple(CLOUD_FORMATS),
     "volume": tuple(VOLUME_FORMATS),
+    "measures": MEASURE_FORMATS,
 }
 """What is written, and the extensions of its files; those of meshes and clouds both are meshes where one is shown."""
 
@@ -47,6 +49,8 @@ def check_target(path: str | os.PathLike[str], painter: Painter, state: ViewStat
     kind = kinds[0]
     if kind == "mesh" and "cloud" in kinds and shown and all(isinstance(each, ShownCloud) for each in shown):
         kind = "cloud"
+    if kind == "measures" and not state.measures:
+        raise UsageError("nothing was measured: there is no measure to write")
     if kind == "volume" and not any(isinstance(each, ShownScan) for each in painter.objects):
         raise UsageError("there is no scan: a file of a volume needs one")
     if kind == "mesh" and not [each for each in shown if not isinstance(each, ShownCloud)]:
@@ -57,9 +61,8 @@ def check_target(path: str | os.PathLike[str], painter: Painter, state: ViewStat
 def free_name(wanted: str | Path) -> Path:
     """Return the wanted name, or where it is taken with the first free number: ``bone-2.nii.gz``."""
     path = Path(wanted)
-    ends = (
-        "".join(path.suffixes[-2:]) if path.name.lower().endswith((".nii.gz", ".xyz.gz", ".seg.nrrd")) else path.suffix
-    )
+    is_double = path.name.lower().endswith((".nii.gz", ".xyz.gz", ".seg.nrrd", ".mrk.json"))
+    ends = "".join(path.suffixes[-2:]) if is_double else path.suffix
     stem = path.name.removesuffix(ends)
     number, tried = 1, path
     while tried.exists() or tried.is_symlink():
@@ -99,6 +102,11 @@ def save_shown(
         picture = picture.with_background("black").annotated(letters=True, scale_bar=True)
         written = picture.save(path, no_clobber=no_clobber)
         return [f"{name}: picture of {picture.size[0]} x {picture.size[1]} pixels, {_megabytes(written)}"]
+    if kind == "measures":
+        content = encode_measures(state.measures, name, space)
+        with keep_existing(keep=no_clobber):
+            written = replace_file(path, lambda stream: stream.write(content), expected_bytes=len(content))
+        return [f"{name}: {count_of(len(state.measures), 'measure')}, {_megabytes(written)}"]
     if kind == "volume":
         volume = shown_volume(painter, state, progress)
         ni, nj, nk = volume.shape_ijk

@@ -1,16 +1,21 @@
-"""Measures between places that were picked, and which pieces of their lines a picture does not hide."""
+"""Measures between places that were picked: names, files, and which pieces of their lines a picture does not hide."""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import count
 from typing import Any
 
 import numpy as np
 
 from clrecon.errors import UsageError
-from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.affine import Float64Array, frame_from_lps
 from clrecon.rendering import Rendering
+from clrecon.system.arguments import Space
 from clrecon.system.light_dataclass import dataclass
 
 Point = tuple[float, float, float]
@@ -27,7 +32,7 @@ class Measure:
 
     kind: "distance", "angle", "curve" (its length) or "seed", which has no value.
     unit: "mm", "degrees" or "".
-    text: As it is written beside the picture.
+    text: As it is written beside the picture, behind the name.
     """
 
     kind: str
@@ -35,34 +40,111 @@ class Measure:
     value: float | None
     unit: str
     text: str
+    name: str = ""
 
     def describe(self) -> dict[str, Any]:
         points = [[round(value, 3) for value in point] for point in self.points]
-        return {"kind": self.kind, "points": points, "value": self.value, "unit": self.unit, "text": self.text}
+        fields = {"name": self.name, "kind": self.kind, "points": points}
+        return {**fields, "value": self.value, "unit": self.unit, "text": self.text}
 
 
-def measure_points(kind: str, points: Sequence[Point]) -> Measure:
+def measure_points(kind: str, points: Sequence[Point], name: str = "") -> Measure:
     """Measure points in LPS mm by one of `TOOLS`; the angle is that at the second of three."""
     places = np.array(points, dtype=np.float64).reshape(-1, 3)
+    value: float | None = None
     if kind == "seed":
-        (point,) = points
-        return Measure(kind=kind, points=(point,), value=None, unit="", text=", ".join(f"{x:.1f}" for x in point))
-    if kind == "angle":
-        if len(places) != 3:
-            raise UsageError(f"an angle is made of 3 points, not of {len(places)}")
-        sides = places[[0, 2]] - places[1]
-        lengths = np.linalg.norm(sides, axis=1)
-        if lengths.min() < 1e-6:
-            raise UsageError("two points of the angle lie in one place: pick them anew")
-        cosine = float(sides[0] @ sides[1] / (lengths[0] * lengths[1]))
-        value = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
-        return Measure(kind=kind, points=tuple(points), value=round(value, 3), unit="degrees", text=f"{value:.1f}°")
-    if len(places) < 2:
-        raise UsageError(
-            f"a {kind} is made of at least 2 points, there {'is' if len(places) == 1 else 'are'} {len(places)}"
-        )
-    value = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
-    return Measure(kind=kind, points=tuple(points), value=round(value, 4), unit="mm", text=f"{value:.1f} mm")
+        unit, text = "", ", ".join(f"{x:.1f}" for x in places[0])
+    elif kind == "angle":
+        value = round(_angle_degrees(places), 3)
+        unit, text = "degrees", f"{value:.1f}°"
+    else:
+        if len(places) < 2:
+            raise UsageError(
+                f"a {kind} is made of at least 2 points, there {'is' if len(places) == 1 else 'are'} {len(places)}"
+            )
+        value = round(float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()), 4)
+        unit, text = "mm", f"{value:.1f} mm"
+    return Measure(kind=kind, points=tuple(points), value=value, unit=unit, text=text, name=name)
+
+
+def _angle_degrees(places: Float64Array) -> float:
+    if len(places) != 3:
+        raise UsageError(f"an angle is made of 3 points, not of {len(places)}")
+    sides = places[[0, 2]] - places[1]
+    lengths = np.linalg.norm(sides, axis=1)
+    if lengths.min() < 1e-6:
+        raise UsageError("two points of the angle lie in one place: pick them anew")
+    cosine = float(sides[0] @ sides[1] / (lengths[0] * lengths[1]))
+    return math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
+
+
+def free_measure_name(kind: str, measures: Sequence[Measure]) -> str:
+    """Return the first name of a kind that no measure has: "distance 1"; a seed is a "place"."""
+    names = {each.name for each in measures}
+    word = "place" if kind == "seed" else kind
+    return next(name for number in count(1) if (name := f"{word} {number}") not in names)
+
+
+_MOST_NAME = 80
+
+
+def checked_measure_name(name: Any) -> str:
+    """Return a name without spaces around it: one line of characters that can be seen."""
+    short = name.strip() if isinstance(name, str) else ""
+    if not (0 < len(short) <= _MOST_NAME and short.isprintable()):
+        raise UsageError(f"the name of a measure is 1 to {_MOST_NAME} visible characters, not {name!r:.60}")
+    return short
+
+
+MEASURE_FORMATS = (".mrk.json", ".json", ".csv")
+
+_SCHEMA = (
+    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
+    "markups-schema-v1.0.3.json#"
+)
+"""The name by which 3D Slicer knows its files; nothing is fetched from there."""
+
+_MARKUPS = {"distance": "Line", "angle": "Angle", "curve": "Curve", "seed": "Fiducial"}
+
+
+def encode_measures(measures: Sequence[Measure], name: str, space: Space) -> bytes:
+    """Return the content of a file of `MEASURE_FORMATS` by its name: markups are in LPS, the others in `space`."""
+    if name.lower().endswith(".mrk.json"):
+        markups = [_describe_markup(each) for each in measures]
+        return _encode_json({"@schema": _SCHEMA, "markups": markups})
+    signs = np.diag(frame_from_lps(space))
+    rows = [each.describe() for each in measures]
+    for row, measure in zip(rows, measures, strict=True):
+        row["points"] = [[round(float(value), 3) + 0.0 for value in signs * point] for point in measure.points]
+        del row["text"]
+    if name.lower().endswith(".json"):
+        return _encode_json({"space": space.upper(), "points_unit": "mm", "measures": rows})
+    stream = io.StringIO()
+    table = csv.writer(stream, lineterminator="\n")
+    table.writerow(["name", "kind", "value", "unit", "space", "points_mm"])
+    for row in rows:
+        points = "; ".join(" ".join(f"{value:.3f}" for value in point) for point in row["points"])
+        table.writerow([row["name"], row["kind"], row["value"], row["unit"], space.upper(), points])
+    return stream.getvalue().encode()
+
+
+def _describe_markup(measure: Measure) -> dict[str, Any]:
+    points = [
+        {"id": str(number), "label": measure.name if len(measure.points) == 1 else f"{measure.name}-{number}",
+         "position": [round(value, 3) for value in point]}
+        for number, point in enumerate(measure.points, 1)
+    ]  # fmt: skip
+    return {
+        "type": _MARKUPS[measure.kind],
+        "name": measure.name,
+        "coordinateSystem": "LPS",
+        "coordinateUnits": "mm",
+        "controlPoints": points,
+    }
+
+
+def _encode_json(content: Mapping[str, Any]) -> bytes:
+    return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
 
 
 _STEPS = 64

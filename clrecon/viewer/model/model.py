@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from time import monotonic
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,7 +28,15 @@ from clrecon.viewer.model.changes import (
     height_mm,
     plane_step,
 )
-from clrecon.viewer.model.measures import POINTS_OF, TOOLS, Measure, measure_points
+from clrecon.viewer.model.measures import (
+    POINTS_OF,
+    TOOLS,
+    Measure,
+    Point,
+    checked_measure_name,
+    free_measure_name,
+    measure_points,
+)
 from clrecon.viewer.model.objects import (
     ShownLabels,
     ShownObject,
@@ -39,6 +47,8 @@ from clrecon.viewer.model.objects import (
     first_parts,
 )
 from clrecon.viewer.model.state import Box, ClipPlane, Pick, SliceFrame, ViewState, clip_direction
+
+_Item = TypeVar("_Item")
 
 _BOX_SHARE = 0.5
 """Of what there is along each axis, in a clip box about the cross."""
@@ -203,13 +213,13 @@ class ViewModel(ChangingView):
         if len(points) != POINTS_OF[tool]:
             self._change("point", "the point", points=points)
             return None
-        measure = measure_points(tool, [each.point for each in points])
+        measure = self._measured(tool, [each.point for each in points])
         self._change("point", f"the {tool}", points=(), measures=(*self.state.measures, measure))
         return measure
 
     def add_seed(self, pick: Pick) -> None:
         """Keep a place as a seed, whatever tool is used."""
-        measure = measure_points("seed", [pick.point])
+        measure = self._measured("seed", [pick.point])
         self._change("point", "the seed", measures=(*self.state.measures, measure))
 
     def end_tool(self) -> Measure | None:
@@ -217,10 +227,25 @@ class ViewModel(ChangingView):
         tool, points = self.state.tool, [each.point for each in self.state.points]
         if tool is None:
             return None
-        measure = measure_points(tool, points) if tool == "curve" and len(points) > 1 else None
+        measure = self._measured(tool, points) if tool == "curve" and len(points) > 1 else None
         measures = self.state.measures if measure is None else (*self.state.measures, measure)
         self._change("end tool", f"the end of the {tool}", tool=None, points=(), measures=measures)
         return measure
+
+    def _measured(self, tool: str, points: Sequence[Point]) -> Measure:
+        return measure_points(tool, points, free_measure_name(tool, self.state.measures))
+
+    def rename_measure(self, n: int, name: str) -> None:
+        """Give the measure of number n (from 0) a name."""
+        measures, short = list(self.state.measures), checked_measure_name(name)
+        measure = _numbered("measure", measures, n)
+        measures[n] = replace(measure, name=short)
+        self._change("rename", f"the name {short}", measures=tuple(measures))
+
+    def remove_measure(self, n: int) -> None:
+        measures = self.state.measures
+        name = _numbered("measure", measures, n).name
+        self._change("remove measure", f"the removal of {name}", measures=(*measures[:n], *measures[n + 1 :]))
 
     def clear_measures(self) -> None:
         self._change("clear measures", "the measures", measures=(), points=())
@@ -345,12 +370,15 @@ class ViewModel(ChangingView):
         self._change(kind, "the clip plane", clips=clips)
 
     def _clip(self, n: int) -> ClipPlane:
-        count = len(self.state.clips)
-        if isinstance(n, bool) or not isinstance(n, int) or not 0 <= n < count:
-            raise UsageError(f"there is no clip plane {n!r}: there are {count}, numbered from 0")
-        return self.state.clips[n]
+        return _numbered("clip plane", self.state.clips, n)
 
     def _span(self, objects: Sequence[ShownObject] = ()) -> tuple[Float64Array, Float64Array]:
         """Return the lowest and highest corner of the box around objects; by default the scans, if there are any."""
         corners = np.concatenate([each.corners for each in objects or self.scans or self.objects])
         return corners.min(axis=0), corners.max(axis=0)
+
+
+def _numbered(noun: str, items: Sequence[_Item], n: int) -> _Item:
+    if isinstance(n, bool) or not isinstance(n, int) or not 0 <= n < len(items):
+        raise UsageError(f"there is no {noun} {n!r}: there are {len(items)}, numbered from 0")
+    return items[n]

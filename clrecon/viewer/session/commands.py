@@ -130,6 +130,8 @@ _session("add_point", "add what is seen at a pixel to the tool", "add_point", ta
 _session("mark_at", "keep the place at a pixel as a seed", "mark_at", takes={"plane": _or_none(_text)}, **_AT)
 _model("start_tool", "take points for: distance, angle, curve, seed", "start_tool", name=_text)
 _model("end_tool", "put the tool away; a curve is made", "end_tool")
+_model("rename_measure", "name a measure by its number, from 0", "rename_measure", n=_whole, name=_text)
+_model("remove_measure", "drop one measure", "remove_measure", n=_whole)
 _model("clear_measures", "drop all measures", "clear_measures")
 _model("add_clip", "cut with a plane towards a side", "add_clip", direction=_direction)
 _model("move_clip", "move a plane, 0 to 1", "move_clip", n=_whole, share=_check_number)

@@ -289,8 +289,41 @@
   }
 
   function showMeasures() {
-    find("clear").hidden = !facts.measures.length;
-    find("measures").replaceChildren(...facts.measures.map(({ kind, text }) => element("li", `${kind === "seed" ? "place" : kind} ${text}`)));
+    const list = find("measures"), { measures } = facts;
+    find("clear").hidden = find("exports").hidden = !measures.length;
+    while (list.children.length > measures.length) list.lastChild.remove();
+    while (list.children.length < measures.length) list.append(makeMeasureRow(list.children.length));
+    measures.forEach((measure, n) => {
+      const [name, text, drop] = list.children[n].children;
+      if (document.activeElement !== name) name.value = measure.name;
+      text.textContent = measure.text;
+      name.ariaLabel = `name of ${measure.name}`;
+      text.ariaLabel = `${measure.name}, ${measure.text}: slices go there`;
+      drop.ariaLabel = `remove ${measure.name}`;
+    });
+  }
+
+  // Rows stay where they are when facts come: the focus is not lost.
+  function makeMeasureRow(n) {
+    const row = element("li");
+    const name = element("input", "", { type: "text", maxLength: 80, title: "name" });
+    const text = element("button", "", { type: "button", title: "slices go there" });
+    const drop = element("button", "×", { type: "button", title: "remove this measure" });
+    name.onchange = () => {
+      if (name.value.trim()) run("rename_measure", { n, name: name.value });
+      else name.value = facts.measures[n].name;
+    };
+    name.onkeydown = ({ key }) => {
+      if (key === "Escape") name.value = facts.measures[n].name;
+      if (key === "Escape" || key === "Enter") name.blur();
+    };
+    text.onclick = () => {
+      const { points } = facts.measures[n];
+      run("set_cross", { point: [0, 1, 2].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length) });
+    };
+    drop.onclick = () => run("remove_measure", { n });
+    row.append(name, text, drop);
+    return row;
   }
 
   function showClips() {
@@ -381,6 +414,7 @@
   find("sliced").onchange = layOut;
   find("end").onclick = () => choose("");
   find("along").onchange = () => { curveOff = !find("along").checked; takeFacts(facts); };
+  for (const button of find("exports").children) button.onclick = () => save(button.dataset.format);
   find("clear").onclick = () => run("clear_measures");
   find("all").onclick = () => run("show_all");
   find("colors").onclick = () => run("toggle_colors");

@@ -12,6 +12,7 @@
   }
 
   const WIDE = 240;  // pixels of a slice that has room for all of its words
+  const MOST_LETTERS = 24;  // of a name beside a picture; the list has all of it
 
   // What lies over a picture: sides of the patient, scale, cross, measures.
 
@@ -96,12 +97,15 @@
         for (const [x, y] of points) { line([[x - 5, y], [x + 5, y]], name); line([[x, y - 5], [x, y + 5]], name); }
       }
       if (!measure.text) continue;
+      const wide = width >= WIDE, value = measure.kind === "seed" ? "" : measure.text;
+      const name = measure.name.length > MOST_LETTERS ? `${measure.name.slice(0, MOST_LETTERS - 1)}…` : measure.name;
+      const words = wide ? `${name} ${value}`.trim() : value || name;
       const middle = points.length === 3 && measure.kind === "angle" ? points[1]
         : [0, 1].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
       const side = middle[0] < width / 2 ? "start" : "end", x = side === "start" ? 12 : width - 12;
       const y = 18 + 20 * placed[side]++;
-      line([[x + (side === "start" ? 1 : -1) * (4 + 8 * measure.text.length), y], middle], "lead");
-      write(measure.text, x, y, "measure", side);
+      line([[x + (side === "start" ? 1 : -1) * (4 + 8 * words.length), y], middle], "lead");
+      write(words, x, y, wide ? "measure" : "measure small", side);
     }
     if (view.name !== "scene") return;
     for (const piece of facts.seen_lines) {  // what no bone hides

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import view_scenes as scenes
 from open_views import open_sessions
+from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.mesh.mesh_reader import read_mesh
 from clrecon.points.cloud_reader import read_points
 from clrecon.reading import read_volume
 from clrecon.viewer.drawing.saving import free_name
+from clrecon.viewer.model.state import Pick
 
 PATIENCE = 60.0
 
@@ -134,3 +136,22 @@ def test_names_are_counted_until_one_is_free(tmp_path, wanted, second, third):
     assert free_name(tmp_path / wanted) == tmp_path / second
     (tmp_path / second).symlink_to(tmp_path / "nowhere")  # a name that is taken, though nothing is there
     assert free_name(tmp_path / wanted) == tmp_path / third
+
+
+@pytest.mark.opencl
+def test_measures_are_saved_to_a_table_and_numbered_where_it_exists(session, tmp_path):
+    view = session()
+    view.model.add_seed(Pick(point=(1.0, 2.0, 3.0)))
+    for name in ("a.csv", "a.json", "a.mrk.json"):
+        view.do({"do": "save", "path": str(tmp_path / name)})
+        assert view.wait(PATIENCE)
+        assert view.facts()["error"] is None and f"{name}: 1 measure" in view.facts()["said"]
+        assert "place 1" in (tmp_path / name).read_text(encoding="utf-8")
+    assert free_name(tmp_path / "a.mrk.json").name == "a-2.mrk.json"
+
+
+@pytest.mark.opencl
+def test_a_table_without_measures_is_refused(session, tmp_path):
+    with refused(UsageError, "measure"):
+        session().do({"do": "save", "path": str(tmp_path / "a.csv")})
+    assert not (tmp_path / "a.csv").exists()

@@ -73,6 +73,7 @@ CHANGES = {
     "colors": lambda m: m.color_parts(),
     "opacity": lambda m: m.set_opacity("1/2", 0.4),
     "tool": lambda m: m.start_tool("angle"),
+    "measure": lambda m: m.add_seed(Pick(point=(1.0, 2.0, 3.0))),
     "clip": lambda m: m.add_clip("left"),
     "clip by the view": lambda m: m.add_clip("view"),
     "box": lambda m: m.set_clip_box((-50.0, -40.0, 200.0), (-20.0, -20.0, 220.0)),
@@ -276,6 +277,54 @@ def test_measures_are_undone_one_by_one_and_cleared_together():
     assert list(model.state.measures) == []
     assert model.undo() == "the measures"
     assert [each.kind for each in model.state.measures] == ["seed", "distance"]
+
+
+def test_measures_are_named_by_their_kind_with_the_first_free_number():
+    model = make_model()
+    for x in (1.0, 2.0, 3.0):
+        measure(model, "seed", (x, 0.0, 0.0))
+    measure(model, "distance", (0.0, 0.0, 0.0), (3.0, 4.0, 12.0))
+    model.remove_measure(1)
+    measure(model, "seed", (4.0, 0.0, 0.0))
+    assert [each.name for each in model.state.measures] == ["place 1", "place 3", "distance 1", "place 2"]
+
+
+def test_a_measure_is_renamed_without_spaces_around_and_undone():
+    model = make_model()
+    measure(model, "distance", (0.0, 0.0, 0.0), (3.0, 4.0, 12.0))
+    model.rename_measure(0, "  L3 height ")
+    assert model.facts()["measures"][0]["name"] == "L3 height"
+    assert model.undo() == "the name L3 height"
+    assert model.facts()["measures"][0]["name"] == "distance 1"
+
+
+def test_a_removed_measure_comes_back_by_undo_in_its_order():
+    model = make_model()
+    for x in (1.0, 2.0, 3.0):
+        measure(model, "seed", (x, 0.0, 0.0))
+    before = model.state
+    model.remove_measure(1)
+    assert [each.name for each in model.state.measures] == ["place 1", "place 3"]
+    model.undo()
+    assert model.state == before
+
+
+@pytest.mark.parametrize("name", ["", "   ", "a" * 81, "two\nlines", "turned\u202eround", 3], ids=repr)
+def test_a_name_that_cannot_be_read_is_refused(name):
+    model = make_model()
+    measure(model, "seed", (1.0, 2.0, 3.0))
+    with refused(UsageError, "name", 80):
+        model.rename_measure(0, name)
+    assert model.state.measures[0].name == "place 1"
+
+
+@pytest.mark.parametrize("n", [-1, 1, True, 0.0])
+def test_a_number_without_a_measure_is_refused(n):
+    model = make_model()
+    measure(model, "seed", (1.0, 2.0, 3.0))
+    with refused(UsageError, "measure", repr(n)):
+        model.remove_measure(n)
+    assert len(model.state.measures) == 1
 
 
 def test_the_curve_of_a_view_is_the_one_that_was_made_last():

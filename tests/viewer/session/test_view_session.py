@@ -98,6 +98,8 @@ RIGHT: dict[str, dict[str, Any]] = {
     "cross_at": {"x": 3, "y": 3, **AT},
     "add_point": {"x": 3, "y": 3, **AT},
     "mark_at": {"x": 48, "y": 40, **AT},
+    "rename_measure": {"n": 0, "name": "entry"},
+    "remove_measure": {"n": 0},
 }
 
 
@@ -143,6 +145,8 @@ def test_every_command_is_done_and_undone(session):
         ({"do": "zoom_slice", "plane": "axial", "factor": 2}, "needs size"),
         ({"do": "pan_slice", "plane": "axial", "dx": 1, "dy": float("nan"), **AT}, "three finite numbers"),
         ({"do": "probe", "point": [1, 2]}, "3 numbers"),
+        ({"do": "rename_measure", "n": 0, "name": 3}, "is a name"),
+        ({"do": "remove_measure", "n": 0.5}, "a whole number"),
         ({"do": "look", "view": [0, 95]}, "-90"),
         ({"do": "show", "key": 2, "visible": True}, "is a name"),
         ({"do": "show", "key": "x" * 300, "visible": True}, "is a name"),

@@ -224,7 +224,7 @@ def test_keys_use_what_lies_under_the_pointer_in_slices_too(page) -> None:
     wait_for(page, "return clrecon.facts.measures.length === 1")
     (seed,) = facts(page)["measures"]
     assert (seed["kind"], facts(page)["tool"]) == ("seed", None)
-    assert "place" in page.find_element("id", "measures").text
+    assert page.find_element("css selector", "#measures input").get_attribute("value") == "place 1"
     page.execute_script("clrecon.run('set_cross', { point: arguments[0] })", scenes.middle(0).tolist())
     wait_for(page, f"return Math.abs(clrecon.facts.cross[2] - {scenes.middle(0)[2]}) < 0.01")
     settle(page)

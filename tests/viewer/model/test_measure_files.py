@@ -1,0 +1,55 @@
+"""Files of measures: tables, JSON and markups of 3D Slicer, with names, values and frames."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import pytest
+
+from clrecon.rendering.views.centre_line import read_curve_points
+from clrecon.viewer.model.measures import encode_measures, measure_points
+
+pytestmark = pytest.mark.unit
+
+MEASURES = (
+    measure_points("distance", [(1.0, 2.0, 3.0), (4.0, 6.0, 15.0)], 'L3, "height"'),
+    measure_points("angle", [(1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)], "Winkel für T12"),
+    measure_points("seed", [(1.5, -2.25, 0.0)], "place 1"),
+)
+
+
+def test_the_table_has_a_row_for_each_measure() -> None:
+    text = encode_measures(MEASURES, "a.csv", "lps").decode()
+    rows = list(csv.DictReader(io.StringIO(text)))
+    assert [row["name"] for row in rows] == ['L3, "height"', "Winkel für T12", "place 1"]
+    assert [(row["value"], row["unit"]) for row in rows] == [("13.0", "mm"), ("90.0", "degrees"), ("", "")]
+    assert rows[0]["points_mm"] == "1.000 2.000 3.000; 4.000 6.000 15.000"
+
+
+def test_json_says_its_frame_and_turns_points_to_it() -> None:
+    content = json.loads(encode_measures(MEASURES, "A.JSON", "ras"))
+    assert (content["space"], content["points_unit"]) == ("RAS", "mm")
+    assert content["measures"][2] == {
+        "name": "place 1", "kind": "seed", "points": [[-1.5, 2.25, 0.0]], "value": None, "unit": "",
+    }  # fmt: skip
+
+
+def test_markups_are_in_lps_whatever_the_frame_of_the_view() -> None:
+    content = json.loads(encode_measures(MEASURES, "a.mrk.json", "ras"))
+    assert content["@schema"].endswith("markups-schema-v1.0.3.json#")
+    markups = content["markups"]
+    assert [(each["type"], each["coordinateSystem"]) for each in markups] == [
+        ("Line", "LPS"), ("Angle", "LPS"), ("Fiducial", "LPS"),
+    ]  # fmt: skip
+    assert markups[0]["name"] == 'L3, "height"'
+    assert [each["position"] for each in markups[0]["controlPoints"]] == [[1.0, 2.0, 3.0], [4.0, 6.0, 15.0]]
+    assert markups[2]["controlPoints"][0]["label"] == "place 1"
+
+
+def test_markups_of_one_curve_are_read_as_a_centre_line(tmp_path) -> None:
+    points = [(0.0, 0.0, 0.0), (0.0, 1.0, 10.0), (0.0, 0.0, 20.0)]
+    path = tmp_path / "curve.mrk.json"
+    path.write_bytes(encode_measures([measure_points("curve", points, "canal")], path.name, "lps"))
+    assert read_curve_points(path).tolist() == [list(point) for point in points]
