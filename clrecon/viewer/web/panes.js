@@ -11,7 +11,7 @@
       view.box.clientHeight / 2 - dot(away, camera.up) / mm];
   }
 
-  const WIDE = 240;  // pixels of a slice that has room for all of its words
+  const WIDE = 240, FAIR = 190;  // pixels of a slice that has room for all of its words, for most of them
   const MOST_LETTERS = 24;  // of a name beside a picture; the list has all of it
 
   // What lies over a picture: sides of the patient, scale, cross, measures.
@@ -61,11 +61,12 @@
     if (!facts) return;
     write(wide ? place : which, wide ? 10 : 5, 32, "words", "start");
     view.canvas.ariaLabel = `${view.name} slice ${count ? `${number} of ${count}` : ""}, ${place}, level ${level}, width ${span} HU`;
-    if (!wide) return;
-    write(`L ${level} W ${span}`, width - 10, height - 14, "words", "end");
-    if (!view.pointer || !probed) return;
-    write(probed.words, width - 10, height - 31, "words probe", "end");
-    write(probed.hu === null ? "outside" : `${probed.hu.toFixed(0)} HU`, width - 10, height - 48, "words probe", "end");
+    const lines = width >= FAIR ? [`L ${level} W ${span}`] : [];
+    if (view.pointer && probed) {
+      if (width >= FAIR) lines.push(probed.words);
+      lines.push(probed.hu === null ? "outside" : `${probed.hu.toFixed(0)} HU`);
+    }
+    lines.forEach((line, n) => write(line, width - 8, height - 14 - 17 * n, n || width < FAIR ? "words probe" : "words", "end"));
   }
 
   // Where the slices meet: in a slice the lines of the two others, in the picture a short line along each axis.

@@ -74,6 +74,16 @@ def test_a_slice_says_number_place_window_and_what_is_under_the_mouse(page) -> N
     wait_for(page, "return !document.querySelector('#axial .probe')")
 
 
+@pytest.mark.parametrize(("stage", "lines"), [(700, 2), (400, 1)])
+def test_a_narrow_slice_says_hu_and_what_else_has_room(page, stage: int, lines: int) -> None:
+    go_to(page, scenes.middle(0))
+    page.execute_script("document.getElementById('stage').style.maxWidth = `${arguments[0]}px`", stage)
+    wait_for(page, f"return axial.clientWidth < {stage / 3} && clrecon.facts.settled")
+    point_at(page, "axial", scenes.middle(0))
+    wait_for(page, f"return document.querySelectorAll('#axial .probe').length === {lines}")
+    assert "1000 HU" in words_of(page, "axial") and "axial" in words_of(page, "axial")
+
+
 def test_the_wheel_with_ctrl_zooms_a_slice_about_the_mouse_and_0_fits_it(page) -> None:
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
