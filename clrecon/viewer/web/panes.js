@@ -63,8 +63,8 @@
     view.canvas.ariaLabel = `${view.name} slice ${count ? `${number} of ${count}` : ""}, ${place}, level ${level}, width ${span} HU`;
     const lines = width >= FAIR ? [`L ${level} W ${span}`] : [];
     if (view.pointer && probed) {
-      if (width >= FAIR) lines.push(probed.words);
       lines.push(probed.hu === null ? "outside" : `${probed.hu.toFixed(0)} HU`);
+      if (width >= FAIR) lines.push(probed.words);  // above the words of the scale
     }
     lines.forEach((line, n) => write(line, width - 8, height - 14 - 17 * n, n || width < FAIR ? "words probe" : "words", "end"));
   }

@@ -66,7 +66,7 @@ def test_a_slice_says_number_place_window_and_what_is_under_the_mouse(page) -> N
     cross = facts(page)["cross"]
     point_at(page, "axial", scenes.middle(0) + (3.0, 0.0, 0.0))
     wait_for(page, "return document.querySelectorAll('#axial .probe').length === 2")
-    place, hu = (each.text for each in page.find_elements("css selector", "#axial .probe"))
+    hu, place = (each.text for each in page.find_elements("css selector", "#axial .probe"))
     x, y, z = (float(value) for value in re.findall(r"-?[0-9.]+", place))
     assert (x, y, z) == pytest.approx(tuple(scenes.middle(0) + (3.0, 0.0, 0.0)), abs=0.6)
     assert hu == "1000 HU" and facts(page)["cross"] == cross
