@@ -69,8 +69,9 @@ def test_a_drag_turns_the_picture_and_leaves_the_slices(page) -> None:
     assert changed_share(before, picture(page)) > 0.01
     assert changed_share(slice_before, picture(page, "axial")) == 0.0
     assert page.execute_script("return clrecon.pictures") > count + 1  # coarse ones on the way
+    page.execute_script("window.shown = clrecon.pictures")
     page.find_element("id", "undo").click()
-    wait_for(page, "return JSON.stringify(clrecon.facts.camera) === window.first")
+    wait_for(page, "return JSON.stringify(clrecon.facts.camera) === window.first && clrecon.pictures > window.shown")
     wait_for(page, SETTLED)
     assert changed_share(before, picture(page)) < 0.002
 
