@@ -11,10 +11,10 @@ import tempfile
 import textwrap
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from clrecon.errors import OutputError, UsageError
 
@@ -153,6 +153,7 @@ class Console:
         self.has_result = False
         self._streams_result, self._said_on_stderr = False, False
         self._hidden_name, self._shown_name = "", ""
+        self._held: list[str] = []
         self._stdout_closed, self._lacks_stdout = sys.stdout is None, False
         self._stage = ""
         self._drawn = 0
@@ -174,15 +175,20 @@ class Console:
         self._said_on_stderr = True
         self._hidden_name, self._shown_name = path, name
 
-    def send(self, piece: bytes) -> None:
-        self.clear()
-        self._guard_stdout(lambda: sys.stdout.buffer.write(piece))
+    def send(self, stream: BinaryIO) -> None:
+        """Copy a file to stdout, then say that it is written; not to a reader that closed."""
+        self._guard_stdout(lambda: shutil.copyfileobj(stream, sys.stdout.buffer, _PIECE))
+        self.finish()
+        for line in [] if self._stdout_closed else self._held:
+            self._to_stderr(line)
 
     def say(self, text: str = "", *, whole: bool = False) -> None:
         """Print a line of the result for people; nothing with ``--json`` or ``-q``.  A `whole` one is not broken."""
         if self.as_json or self.quiet:
             return
-        if self._said_on_stderr:
+        if self._held or (self._hidden_name and self._hidden_name in text):
+            self._held.append(text)  # until stdout has taken the file
+        elif self._said_on_stderr:
             self._to_stderr(text)
         else:
             self._to_stdout(text if whole else fit(text, sys.stdout))
@@ -265,39 +271,31 @@ class Console:
             return
         try:
             action()
-        except BrokenPipeError:
-            self._stdout_closed = True
-            _discard_stdout()
         except OSError as error:
             self._stdout_closed = True
             _discard_stdout()
-            raise OutputError(f"cannot write to standard output: {error.strerror or error}") from error
+            if not isinstance(error, BrokenPipeError):
+                raise OutputError(f"cannot write to standard output: {error.strerror or error}") from error
 
 
 def _write_text(stream: Any, text: str) -> None:
-    try:
+    with suppress(OSError):  # nobody reads the stream any more, and there is no other place for a message
         stream.write(text)
         stream.flush()
-    except OSError:  # nobody reads the stream any more, and there is no other place for a message
-        pass
 
 
 def _discard_stdout() -> None:
     """Point file descriptor 1 to the null device: Python flushes stdout once more when it ends."""
-    try:
-        descriptor = sys.stdout.fileno()
-    except (OSError, ValueError):
-        return
     null = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, descriptor)
+    with suppress(OSError, ValueError):
+        os.dup2(null, sys.stdout.fileno())
     os.close(null)
 
 
 def _columns() -> int:
-    try:
+    with suppress(OSError):
         return os.get_terminal_size(2).columns
-    except OSError:
-        return 80
+    return 80
 
 
 DASH = "-"
@@ -320,8 +318,10 @@ _PIECE = 1 << 20
 @contextmanager
 def filled_streams(command: str, options: argparse.Namespace, console: Console) -> Iterator[None]:
     """Let a command run in the block; files meant for ``-`` go to standard output, whole, once it is done."""
-    wanted = {name: str(getattr(options, name, None) or "") for name in _FILES}
+    wanted = {name: str(getattr(options, name, None) or "") for name in (*_FILES, "turntable")}
     wanted = {name: value for name, value in wanted.items() if value == DASH or value.startswith(f"{DASH}.")}
+    if moving := wanted.get("turntable"):
+        raise UsageError(f"--turntable {moving}: an animation needs a file or a folder: name one, such as bone.mp4")
     has_report = getattr(options, "report", None) == DASH
     takers = [_FILES[name] for name in wanted] + ["--report"] * has_report
     if not takers:
@@ -364,8 +364,7 @@ def _streamed_file(
         if names != [path.name]:
             raise UsageError(f"{_FILES[option]} {value}: {len(names)} files were made, and one stream holds one")
         with open(path, "rb") as stream:
-            while piece := stream.read(_PIECE):
-                console.send(piece)
+            console.send(stream)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

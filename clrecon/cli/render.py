@@ -263,22 +263,18 @@ def render_settings(options: argparse.Namespace) -> RenderSettings:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    from clrecon.jobs.render.job import PictureFiles, make_pictures
+    from clrecon.jobs.render.job import PictureFiles, make_pictures, path_of
 
     if options.input is None:
         _show_meshes_alone(options)
     files = PictureFiles(options.output, options.depth, options.values, options.turntable, options.report)
-    if options.mode is None and options.color in MESH_COLORS:
+    if options.mode is None and (options.color in MESH_COLORS or is_only_mesh(options.input)):
         options.mode = "mesh"
     if options.mode is None and is_cloud_file(options.input):
         options.mode = "points"
-    if options.mode is None and is_only_mesh(options.input):
-        options.mode = "mesh"
     report = make_pictures(
         options.input, files, render_settings(options), no_clobber=options.no_clobber, progress=console.progress
     )
-    from clrecon.jobs.render.job import path_of
-
     lines = []
     for entry, path in (("output", files.picture), ("depth_output", files.depth), ("values_output", files.values)):
         for picture in report["pictures"]:
@@ -286,9 +282,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
                 named = path_of(path, picture["name"] or "")
                 lines.append(f"wrote    {printable(named)}, {common.megabytes(picture[entry]['bytes'])}")
     if report["turntable"]:
-        lines.append(
-            f"wrote    {printable(files.turntable)}, {common.megabytes(report['turntable']['output']['bytes'])}"
-        )
+        size = common.megabytes(report["turntable"]["output"]["bytes"])
+        lines.append(f"wrote    {printable(files.turntable)}, {size}")
     common.show_report(report, describe_report(report) + lines, options, console)
     return 0
 

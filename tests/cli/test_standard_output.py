@@ -87,6 +87,13 @@ def test_results_of_other_commands_go_to_standard_output(device, ct, capfdbinary
         (("mesh", "-o", "-", "--split"), 3, "-o -: the components of --split make several files"),
         (("mesh", "-o", "-.ply", "--labels", "gone.nii"), 3, "-o -.ply: labels (name one with --label) make several"),
         (("render", "-o", "-", "--view", "left,right"), 3, "-o -: several views make several files"),
+        (
+            ("render", "-o", "-", "--turntable", "-", "--frames", "3"),
+            3,
+            "--turntable -: an animation needs a file or a",
+        ),
+        (("render", "--turntable", "-", "--frames", "3"), 3, "--turntable -: an animation needs a file or a folder"),
+        (("render", "--turntable=-.mp4"), 3, "--turntable -.mp4: an animation needs a file or a folder"),
         (("compare", "-o", "-"), 3, "-o -: compare writes several files, which one stream cannot hold"),
         (("mesh", "-o", "-", "--hu", "5000"), 2, "the volume runs from"),
     ],
@@ -97,7 +104,7 @@ def test_outputs_that_one_stream_cannot_hold_are_refused_in_one_line(ct, capfdbi
     out, err = capfdbinary.readouterr()
     if "--json" not in rest:
         assert out == b""
-    assert b"input    " not in err  # refused before any work
+    assert b"input    " not in err and not os.path.exists("-")  # refused before any work
     assert words in err.decode() and b"/stream" not in err
     assert len([line for line in err.decode().splitlines() if "error" in line]) == 1
 
@@ -185,6 +192,21 @@ def test_a_reader_that_closes_early_is_no_error(device, ct):
     job.stderr.close()
     assert job.wait(120) == 0, errors
     assert "Traceback" not in errors and "error" not in errors
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
+@pytest.mark.parametrize("command", ["mesh", "stats"])
+def test_a_full_disk_behind_standard_output_is_no_written_file(device, ct, spine, command):
+    """A table fits the buffer of the stream: its error comes with the last flush."""
+    given = {
+        "mesh": [ct, "--hu", 200, "-o", "-", "--device", device.index],
+        "stats": [spine, "--labels", spine / "levels.nrrd", "--csv", "-"],
+    }
+    words = [sys.executable, "-m", "clrecon", command, *map(str, given[command])]
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
+    assert done.returncode == 6
+    assert "wrote" not in done.stderr and done.stderr.count("cannot write to standard output") == 1
 
 
 def test_each_streamed_command_has_the_option():
