@@ -184,6 +184,7 @@ def read_cloud(path: Path) -> RawCloud:
         np.stack([columns.pop(axis) for axis in ("x", "y", "z")], axis=1),
         columns,
         warnings=[f"elements left out: {', '.join(others)}"] if others else [],
+        has_faces=any(each.name == "face" and each.count for each in header.elements),
         **read_remarks(header.comments),
     )
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import SPACES, frame_from_lps
+from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.text import escape_text, join_names
 
@@ -33,8 +34,11 @@ class RawCloud:
     iso_value_hu: float | None = None
     certificate: Sequence[str] = ()
     warnings: list[str] = field(default_factory=list)
+    has_faces: bool = False
 
     def __post_init__(self) -> None:
+        if self.has_faces:
+            self.warnings.append(f"clrecon render draws the faces of this file with {name_parameter('mode', 'mesh')}")
         self._by_name = {name.strip().lower(): name for name in reversed(self.columns)}
         self._used: set[str] = set()
 

@@ -346,7 +346,7 @@ def parse_document(data: bytes, name: str) -> Document:
 
 def _collect_points(document: Document, name: str) -> RawCloud:
     points, columns = [], []
-    left_out = 0
+    lines = faces = 0
     normals = None
     for piece in document.root.iterfind("PolyData/Piece"):
         count = read_count(piece, "NumberOfPoints")
@@ -357,7 +357,8 @@ def _collect_points(document: Document, name: str) -> RawCloud:
         data = piece.find("PointData")
         normals = normals or (None if data is None else data.get("Normals"))
         columns.append(_arrays(document, piece, "PointData", count))
-        left_out += sum(read_count(piece, f"NumberOf{kind}") for kind in ("Lines", "Strips", "Polys"))
+        faces += sum(read_count(piece, f"NumberOf{kind}") for kind in ("Strips", "Polys"))
+        lines += read_count(piece, "NumberOfLines")
     if not points:
         raise RefusedInputError(f"{name} has no points")
     texts, numbers = read_fields(document)
@@ -370,7 +371,8 @@ def _collect_points(document: Document, name: str) -> RawCloud:
         affine=affine.reshape(4, 4) if affine is not None and affine.size == 16 else None,
         iso_value_hu=float(iso_value[0]) if iso_value is not None and iso_value.size == 1 else None,
         certificate=texts.get("CERTIFICATE", ()),
-        warnings=[f"elements left out: {left_out:,} lines, strips and polygons"] if left_out else [],
+        warnings=[f"elements left out: {lines + faces:,} lines, strips and polygons"] if lines + faces else [],
+        has_faces=faces > 0,
     )
 
 

@@ -48,6 +48,7 @@ def test_ascii_ply_with_crlf_other_names_and_faces_is_read(tmp_path):
     assert (facts["kind"], facts["space"], facts["space_from"], facts["points"]) == ("PLY", "LPS", "assumed", 3)
     assert facts["warnings"] == [
         "elements left out: 1 of 'face'",
+        "clrecon render draws the faces of this file with mode='mesh'",
         "HU is taken from the column 'intensity'",
         "columns left out: red",
     ]
@@ -134,7 +135,15 @@ def test_a_surface_of_vtp_gives_its_vertices(tmp_path):
     ball.save(tmp_path / "a.vtp")
     cloud = read_points(tmp_path / "a.vtp")
     assert len(cloud) == ball.n_points and cloud.normals is not None
-    assert cloud.report["file"]["warnings"] == [f"elements left out: {ball.n_cells:,} lines, strips and polygons"]
+    left_out, hint = cloud.report["file"]["warnings"]
+    assert left_out == f"elements left out: {ball.n_cells:,} lines, strips and polygons" and "mode='mesh'" in hint
+
+
+def test_lines_of_vtp_are_no_faces_to_draw(tmp_path):
+    pyvista = pytest.importorskip("pyvista")
+    pyvista.Line().save(tmp_path / "a.vtp")
+    said = " ".join(read_points(tmp_path / "a.vtp").report["file"]["warnings"])
+    assert "elements left out: 1 lines" in said and "mode=" not in said
 
 
 def test_frame_of_a_cloud_is_that_of_its_file_or_of_the_caller(tmp_path):

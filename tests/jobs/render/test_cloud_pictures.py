@@ -119,3 +119,11 @@ def test_clouds_are_told_by_their_names(tmp_path: Path) -> None:
     assert not is_cloud_file("a.nii.gz") and not is_cloud_file("folder")
     (tmp_path / "scan.ply").mkdir()
     assert not is_cloud_file(tmp_path / "scan.ply")
+
+
+def test_a_mesh_drawn_as_points_names_the_mode_of_its_faces(device: Any, tmp_path: Path, printed: Printer) -> None:
+    vertices = np.array([(0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (0.0, 9.0, 0.0)])
+    clrecon.Mesh(vertices, np.array([(0, 1, 2)])).save(tmp_path / "bone.ply")
+    files = [str(tmp_path / "bone.ply"), "-o", str(tmp_path / "a.png")]
+    assert main(["render", *files, "--size", SIZE, "--device", str(device.index)]) == 0
+    printed().assert_error("--mode", "mesh")
