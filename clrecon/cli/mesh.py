@@ -268,11 +268,11 @@ def describe_cortex(meshes: list[dict[str, Any]]) -> list[str]:
     walls = cortex["thickness_mm"]
     share = 100.0 * cortex["fitted"] / cortex["vertices"]
     ends = f"5 % to 95 %: {outside['p5']:+.2f} to {outside['p95']:+.2f}"
+    side = "outside" if (outside["mean"] < 0.0) == cortex["moved"] else "inside"
     if not cortex["moved"]:
-        side = "outside" if outside["mean"] >= 0.0 else "inside"
         return [f"cortex   lies {abs(outside['mean']):.2f} mm {side} of the bone ({ends}), measured at {share:.0f} %"]
     return [
-        f"cortex   {share:.0f} % of the vertices lie on the bone, {outside['mean']:.2f} mm inside of the level"
+        f"cortex   {share:.0f} % of the vertices lie on the bone, {abs(outside['mean']):.2f} mm {side} of the level"
         f" ({ends}); error {error['p50']:.2f} mm (95 %: {error['p95']:.2f}), of all {cortex['bias_mm']:.2f}; walls"
         f" {walls['p50']:.1f} mm ({walls['p5']:.1f} to {walls['p95']:.1f})"
     ]

@@ -191,6 +191,25 @@ def test_the_quality_of_a_mesh_is_a_line(closed: bool, words: str) -> None:
     assert mesh_command._describe_quality(report) == [f"         2 components, {words}, manifold, 1,234 mm2"]
 
 
+@pytest.mark.parametrize(
+    ("moved", "mean", "words"),
+    [
+        (True, 0.06, " 0.06 mm inside of the level"),
+        (True, -0.06, " 0.06 mm outside of the level"),
+        (False, 0.06, " 0.06 mm outside of the bone"),
+        (False, -0.06, " 0.06 mm inside of the bone"),
+    ],
+)
+def test_the_side_of_the_bone_is_a_word_and_no_sign(moved: bool, mean: float, words: str) -> None:
+    spread = {"p5": -0.2, "p50": 0.0, "p95": 0.3}
+    cortex = {
+        "moved": moved, "constants": {"blur_mm": 0.6}, "vertices": 200, "fitted": 100, "bias_mm": 0.05,
+        "outside_mm": {"mean": mean, **spread}, "error_mm": spread, "thickness_mm": spread,
+    }  # fmt: skip
+    (line,) = mesh_command.describe_cortex([{"cortex": cortex}])
+    assert words in line
+
+
 def test_volume_of_a_label_mesh_is_printed_beside_that_of_the_label() -> None:
     one = {"label_number": 1, "iso_value_hu": 200.0, "label_mesh_ml": 11.0, "label_compared_ml": 10.0}
     assert mesh_command._describe_volumes([one, one]) == ["         11.00 ml of mesh for 10.00 ml of labels (+10.0 %)"]

@@ -26,6 +26,7 @@ from clrecon.proof.phantom.vertebra import bone_points
 from clrecon.system.files import temporary_folder
 from clrecon.system.paths import existing_stay, place_folder, read_regular, refuse_existing, resolve_target
 from clrecon.system.progress import Progress
+from clrecon.system.text import count_of
 from clrecon.version import package_version
 
 Float64Array = NDArray[np.float64]
@@ -226,10 +227,8 @@ def _check_replaceable(folder: Path) -> None:
         return
     foreign = [name for name in names if not _OURS.fullmatch(name)]
     if foreign or TRUTH_NAME not in names:
-        example = (foreign or names)[0]
-        raise UsageError(
-            f"{folder.name} holds {len(names)} files that are not a phantom ({example}): give a new or empty folder"
-        )
+        files = count_of(len(names), "file that is no phantom", "files that are no phantom")
+        raise UsageError(f"{folder.name} holds {files} ({(foreign or names)[0]}): give a new or empty folder")
     try:
         known = json.loads(read_regular(folder / TRUTH_NAME, LARGEST_TRUTH))
     except (OSError, ValueError) as error:

@@ -166,7 +166,10 @@ def test_an_earlier_phantom_is_replaced_and_anything_else_refused(tmp_path: Path
         write_phantom(other, settings)
     (other / "truth.json").unlink()
     (other / "IM0001.dcm").write_bytes(b"a scan of somebody")
-    with pytest.raises(UsageError, match="IM0001.dcm"):
+    with refused(UsageError, 1, "file", "IM0001.dcm"):
+        write_phantom(other, settings)
+    (other / "IM0002.dcm").write_bytes(b"another")
+    with refused(UsageError, 2, "files", "IM0001.dcm"):
         write_phantom(other, settings)
     with pytest.raises(OutputError, match="does not exist"):
         write_phantom(tmp_path / "missing" / "ct", settings)
