@@ -74,8 +74,8 @@ MOST_SHIFT_MM = 2.5
 """Largest shift of a vertex to its wall; a fit with a larger shift counts as bad."""
 
 _ERROR_FACTOR, _LEAST_ERROR = 1.125, 0.054
-"""By what the fit's own error is multiplied, and what is added in squares, in blurs: so 75 % of the places of 22 phantoms
-lie within the stated error, and 94 % within 1.96 times that."""
+"""By what the fit's own error is multiplied, and what is added in squares, in blurs: so 75 % of the places of 22
+phantoms lie within the stated error, and 94 % within 1.96 times that."""
 
 
 @dataclass(frozen=True)
