@@ -264,7 +264,7 @@ class Stage(DeviceWorker):
         volume = scan.volume
         ijk = volume.lps_to_ijk([point])[0]
         last = np.array(volume.shape_ijk) - 1
-        if (ijk < -0.5).any() or (ijk > last + 0.5).any():
+        if (np.abs(ijk - 0.5 * last) > 0.5 * last + 0.51).any():  # places are rounded to 0.001 mm
             return None
         ijk = np.clip(ijk, 0, last)
         low = np.minimum(ijk.astype(np.int64), np.maximum(last - 1, 0))

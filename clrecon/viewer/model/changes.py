@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import UsageError
+from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.operators.rays.mesh_pictures import box_around
 from clrecon.rendering.pictures.label_style import distinct_colors
@@ -38,24 +39,42 @@ def fit_camera(
     return Camera.fit(box_around([points]), view, view_angle=view_angle, size=size)
 
 
-def plane_step(scans: Sequence[ShownScan], plane: str) -> Float64Array:
-    """Return the step (3,) in mm to a plane's next slice, away from the eye: a voxel of the first scan, or 1 mm."""
-    normal = -np.array(DIRECTIONS[PLANES[plane]])
-    return normal * abs(_step_along(scans[0], normal)[1]) if scans else normal
+def near_layers(volume: Volume, point: Sequence[float] | Float64Array) -> Float64Array:
+    """Return the index (i, j, k) of the layers of voxels at a place; beside the volume they go on."""
+    return np.floor(np.round(volume.lps_to_ijk(point), 6) + 0.5)
 
 
-def _step_along(scan: ShownScan, normal: Float64Array) -> tuple[int, float]:
-    """Return the axis of the voxels that runs most along a normal, and its step there in mm, with its sign."""
-    columns = scan.volume.affine[:3, :3]
-    along = normal @ columns
-    axis = int(np.argmax(np.abs(along) / np.linalg.norm(columns, axis=0)))
-    return axis, float(along[axis])
+def _layers_across(volume: Volume, normal: Float64Array) -> tuple[int, Float64Array]:
+    """Return the axis whose layers of voxels lie most across a normal, and by what its index grows along x, y and z."""
+    growths = np.linalg.inv(volume.affine[:3, :3])
+    axis = int(np.argmax(np.abs(growths @ normal) / np.linalg.norm(growths, axis=1)))
+    return axis, growths[axis]
+
+
+def move_to_layer(scans: Sequence[ShownScan], plane: str, cross: Sequence[float], steps: float) -> Float64Array:
+    """Return a cross (3,) moved away from the eye by layers of the first scan, to the middle of one; else by mm."""
+    normal, point = -np.array(DIRECTIONS[PLANES[plane]]), np.array(cross)
+    if not scans:
+        return point + steps * normal
+    heights = np.concatenate([_outer_layers(scan, normal) @ normal for scan in scans])
+    volume, index = scans[0].volume, scans[0].volume.lps_to_ijk(point)
+    axis, growth = _layers_across(volume, normal)
+    index[axis] = near_layers(volume, point)[axis] + np.sign(growth @ normal) * np.clip(steps, -1e6, 1e6)
+    distance = growth @ (volume.ijk_to_lps(index) - point) / (growth @ normal)
+    return point + np.clip(distance, heights.min() - point @ normal, heights.max() - point @ normal) * normal
+
+
+def _outer_layers(scan: ShownScan, normal: Float64Array) -> Float64Array:
+    """Return corners (n, 3) of a scan from the middle of its first layer across a normal to that of the last."""
+    ends, (axis, _) = scan.volume.lps_to_ijk(scan.corners), _layers_across(scan.volume, normal)
+    ends[:, axis] = np.clip(ends[:, axis], 0, scan.volume.shape_ijk[axis] - 1)
+    return scan.volume.ijk_to_lps(ends)
 
 
 def describe_slice(scans: Sequence[ShownScan], plane: str, cross: Sequence[float]) -> dict[str, Any]:
     """Return the side and mm of a slice through a cross, and which of the first scan's layers it cuts there, from 1.
 
-    Layers are counted away from the eye, as `plane_step` goes.
+    Layers are counted away from the eye, as `move_to_layer` goes.
     """
     normal = np.array(DIRECTIONS[PLANES[plane]])
     axis = int(np.argmax(np.abs(normal)))
@@ -63,11 +82,10 @@ def describe_slice(scans: Sequence[ShownScan], plane: str, cross: Sequence[float
     described: dict[str, Any] = {"place": f"{side} {abs(cross[axis]):.1f} mm"}
     if scans:
         volume = scans[0].volume
-        ordinal, step = _step_along(scans[0], -normal)
+        ordinal, growth = _layers_across(volume, normal)
         count = volume.shape_ijk[ordinal]
-        index = round(float(volume.lps_to_ijk([cross])[0, ordinal]), 6)
-        layer = min(max(math.floor(index + 0.5), 0), count - 1)
-        described |= {"number": layer + 1 if step > 0.0 else count - layer, "count": count}
+        layer = min(max(int(near_layers(volume, cross)[ordinal]), 0), count - 1)
+        described |= {"number": layer + 1 if growth @ normal < 0.0 else count - layer, "count": count}
     return described
 
 
@@ -101,7 +119,10 @@ def shift_camera(camera: Camera, shift: Float64Array, **changes: Any) -> Camera:
 def pan_camera(camera: Camera, dx: float, dy: float) -> Camera:
     """Shift what is seen by shares of the picture's height, at the focal point."""
     right, up, _ = camera.basis()
-    return shift_camera(camera, height_mm(camera) * (dy * up - dx * right))
+    x, y = (height_mm(camera) * share for share in checked_numbers("a shift", dx, dy))
+    if max(abs(x), abs(y)) > 10.0 * _MOST_MM:
+        raise UsageError(f"a shift goes {10.0 * _MOST_MM:,.0f} mm at most, not {max(abs(x), abs(y)):g} mm")
+    return shift_camera(camera, y * up - x * right)
 
 
 def zoom_camera(camera: Camera, factor: float, point: tuple[float, float] = (0.0, 0.0)) -> Camera:
@@ -182,7 +203,7 @@ class ChangingView:
 
     def pan(self, dx: float, dy: float) -> None:
         """Shift what is seen by shares of the picture's height, to the right and down."""
-        self._change("pan", "the shift", camera=pan_camera(self.camera, *checked_numbers("a shift", dx, dy)))
+        self._change("pan", "the shift", camera=pan_camera(self.camera, dx, dy))
 
     def zoom(self, factor: float, at: tuple[float, float] = (0.0, 0.0)) -> None:
         """Show everything larger by a factor; what is seen at `at` stays there, see `zoom_camera`."""

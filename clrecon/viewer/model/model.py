@@ -26,7 +26,8 @@ from clrecon.viewer.model.changes import (
     describe_slice,
     fit_camera,
     height_mm,
-    plane_step,
+    move_to_layer,
+    near_layers,
 )
 from clrecon.viewer.model.measures import (
     POINTS_OF,
@@ -81,6 +82,8 @@ class ViewModel(ChangingView):
         corners = np.concatenate([each.corners for each in objects])
         sliced = scans[0].corners if scans else corners
         middle = 0.5 * (sliced.min(axis=0) + sliced.max(axis=0))
+        if scans:
+            middle = scans[0].volume.ijk_to_lps(near_layers(scans[0].volume, middle))
         only_labels = not scans and any(isinstance(each, ShownLabels) for each in objects)
         first = ViewState(
             camera=fit_camera(corners, "anterior", 1.0),
@@ -169,25 +172,23 @@ class ViewModel(ChangingView):
         self._change("table", "the table", table=bool(shown))
 
     def scroll(self, plane: str, steps: float) -> None:
-        """Move the cross through a plane, by the distance of the voxels there; positive steps go away from the eye."""
+        """Move the cross by layers of the first scan, to the middle of one; positive steps go away from the eye."""
         if plane not in PLANES:
             raise UsageError(unknown_name("plane", plane, PLANES))
         (count,) = checked_numbers("steps", steps)
-        step = plane_step(self.scans, plane)
-        low, high = self._span()
-        moved = np.clip(np.array(self.state.cross) + count * step, low, high)
+        moved = np.clip(move_to_layer(self.scans, plane, self.state.cross, count), *self._span())
         self._change(f"scroll {plane}", "the slice", cross=as_point(moved))
 
     def set_cross(self, point: Sequence[float]) -> None:
         """Move the cross to a place, LPS mm; outside of everything it goes to the nearest place within."""
-        low, high = self._span()
-        point_in_box = np.clip(np.array(checked_vector("the cross", point)), low, high)
+        point_in_box = np.clip(checked_vector("the cross", point), *self._span())
         self._change("cross", "the place of the slices", cross=as_point(point_in_box))
 
-    def frame_slice(self, plane: str, zoom: float, center: Sequence[float]) -> None:
-        """Show a slice so many times as large as it fits, about a place (LPS mm) within the scan."""
+    def frame_slice(self, plane: str, zoom: float, center: Sequence[float], beside: Float64Array | float = 0.0) -> None:
+        """Show a slice so many times as large as it fits, about a place (LPS mm) so many mm beside the scan at most."""
         (factor,) = checked_numbers("the zoom of a slice", zoom)
-        point = np.clip(np.array(checked_vector("the middle of a slice", center)), *self._span())
+        low, high = self._span()
+        point = np.clip(checked_vector("the middle of a slice", center), low - beside, high + beside)
         frame = SliceFrame(plane=plane, zoom=factor, center=as_point(point))
         others = tuple(each for each in self.state.frames if each.plane != plane)
         self._change(f"zoom {plane}", f"the zoom of the {plane} slice", frames=(*others, frame))

@@ -19,6 +19,7 @@ import numpy as np
 from clrecon.errors import Cancelled, ClreconError, UsageError
 from clrecon.opencl import Device
 from clrecon.rendering import Rendering
+from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import checked_size, checked_vector
 from clrecon.system.arguments import Space
 from clrecon.system.base_classes import Closing
@@ -439,16 +440,20 @@ class ViewSession(Closing):
     ) -> None:
         """Show a slice of (width, height) pixels larger; what is seen at `about` stays, see `zoom_camera`."""
         camera = self.painter.slice_camera(self.model.state, plane, checked_size(size))
-        frame, zoomed = self.model.state.frame(plane), zoom_camera(camera, factor, about)
-        zoom = factor if frame is None else factor * frame.zoom
-        if _LEAST_ZOOM <= zoom <= _MOST_ZOOM:
-            self.model.frame_slice(plane, zoom, zoomed.focal_point)
+        self._frame_slice(plane, factor, zoom_camera(camera, factor, about), size)
 
     def pan_slice(self, plane: str, dx: float, dy: float, size: Sequence[int]) -> None:
         """Shift a slice of (width, height) pixels by shares of its height, to the right and down."""
         camera = self.painter.slice_camera(self.model.state, plane, checked_size(size))
-        frame = self.model.state.frame(plane)
-        self.model.frame_slice(plane, 1.0 if frame is None else frame.zoom, pan_camera(camera, dx, dy).focal_point)
+        self._frame_slice(plane, 1.0, pan_camera(camera, dx, dy), size)
+
+    def _frame_slice(self, plane: str, factor: float, camera: Camera, size: Sequence[int]) -> None:
+        """Show what a camera sees of a slice; its picture of (width, height) pixels reaches the scan."""
+        frame, (right, up, _) = self.model.state.frame(plane), np.abs(camera.basis())
+        reach = camera.half_height() * (up + size[0] / size[1] * right)
+        zoom = factor if frame is None else factor * frame.zoom
+        if _LEAST_ZOOM <= zoom <= _MOST_ZOOM:
+            self.model.frame_slice(plane, zoom, camera.focal_point, reach)
 
     def mark_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Keep what is seen at a pixel as a seed, without a tool."""

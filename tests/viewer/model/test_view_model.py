@@ -448,16 +448,65 @@ def test_looks_of_parts_go_over_to_another_iso_value_by_their_place():
 
 def test_slices_begin_in_the_middle_of_the_scan_whatever_lies_beside_it():
     far = scenes.make_mesh(np.array([500.0, 0.0, 0.0]))
-    corners = make_model(scenes.make_scan(), far).objects[0].corners
-    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-    assert make_model(far, scenes.make_scan()).state.cross == pytest.approx(middle)
+    cross = make_model(far, scenes.make_scan()).state.cross
+    assert scenes.make_scan().lps_to_ijk(cross) == pytest.approx([22.0, 20.0, 11.0])  # of 44 x 40 x 22 voxels
 
 
-def test_slices_scroll_by_voxels_and_stay_within():
-    model = make_model(scenes.make_scan())
+def paged(affine, plane: str, positions=None) -> list[tuple[int, float]]:
+    """Number and index along k of every position that paging reaches, the way back included, of 3 x 4 x 5 voxels."""
+    volume = Volume(np.zeros((5, 4, 3), np.int16), np.array(affine), slice_positions=positions)
+    model = make_model(volume)
+    model.set_cross(volume.ijk_to_lps([1.0, 2.0, 2.3]))
+    model.scroll(plane, -1e308)
+    places = []
+    for step in (1, -1):
+        version = -1
+        while version != model.version:
+            version = model.version
+            number = model.facts()["slices"][plane]["number"]
+            places.append((number, round(float(volume.lps_to_ijk(model.state.cross)[2]), 6)))
+            model.scroll(plane, step)
+    assert places[: len(places) // 2] == places[len(places) // 2 :][::-1]
+    return places[: len(places) // 2]
+
+
+TURNED = [[0.0, 0.0, 2.5, 0.0], [0.7, 0.0, 0.0, 0.0], [0.0, 0.7, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]  # k runs to the left
+TILTED = [[0.7, 0.0, 0.0, 0.0], [0.0, 0.7, 0.7, 0.0], [0.0, 0.0, 2.5, 0.0], [0.0, 0.0, 0.0, 1.0]]  # gantry tilt
+UNEVEN = np.outer([0.0, 2.5, 3.0, 9.0, 10.0], [0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("affine", "plane", "positions", "last_first"),
+    [
+        (np.diag([0.7, 0.7, 2.5, 1.0]), "axial", None, False),
+        (np.diag([0.7, 0.7, -2.5, 1.0]), "axial", None, True),
+        (np.diag([0.7, 0.7, 2.5, 1.0]), "axial", UNEVEN, False),
+        (TURNED, "sagittal", None, True),
+        (TILTED, "axial", None, False),
+    ],
+    ids=["upwards", "downwards", "uneven", "turned", "tilted"],
+)
+def test_paging_shows_each_layer_once_at_its_middle(affine, plane, positions, last_first):
+    layers = [4.0, 3.0, 2.0, 1.0, 0.0] if last_first else [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert paged(affine, plane, positions) == list(zip([1, 2, 3, 4, 5], layers, strict=True))
+
+
+def test_paging_an_oblique_scan_goes_to_the_middle_of_the_next_layer_at_the_cross():
+    scan = scenes.make_scan()
+    model = make_model(scan)
+    model.set_cross(scan.ijk_to_lps([22.0, 20.0, 11.3]))
+    for plane, axis, layers in (("axial", 2, [10.0, 11.0]), ("sagittal", 0, [21.0, 20.0])):
+        model.scroll(plane, -1 if plane == "axial" else 1)
+        first = scan.lps_to_ijk(model.state.cross)[axis]
+        model.scroll(plane, 1)
+        assert [first, scan.lps_to_ijk(model.state.cross)[axis]] == pytest.approx(layers), plane
+
+
+def test_slices_without_a_scan_scroll_by_mm_and_stay_within():
+    model = make_model(scenes.make_mesh())
     before = model.state.cross[2]
     model.scroll("axial", 1)
-    assert model.state.cross[2] - before == pytest.approx(1.4, abs=0.01)
+    assert model.state.cross[2] == pytest.approx(before + 1.0)
     model.scroll("axial", 10_000)
     assert model.state.cross[2] == pytest.approx(model.objects[0].corners[:, 2].max())
 

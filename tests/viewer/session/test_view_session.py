@@ -14,6 +14,7 @@ import view_scenes as scenes
 from open_views import open_sessions, search_for_ever
 
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry import Volume
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.objects import ShownMesh, show_objects
 from clrecon.viewer.session.commands import COMMANDS
@@ -143,7 +144,10 @@ def test_every_command_is_done_and_undone(session):
         ({"do": "zoom_slice", "plane": "axial", "factor": -2, **AT}, "above 0"),
         ({"do": "zoom_slice", "plane": "axal", "factor": 2, **AT}, "axial"),
         ({"do": "zoom_slice", "plane": "axial", "factor": 2}, "needs size"),
-        ({"do": "pan_slice", "plane": "axial", "dx": 1, "dy": float("nan"), **AT}, "three finite numbers"),
+        ({"do": "pan_slice", "plane": "axial", "dx": 1, "dy": float("nan"), **AT}, "a shift is a finite number"),
+        ({"do": "pan_slice", "plane": "axial", "dx": 1e308, "dy": 0, **AT}, "a shift"),
+        ({"do": "pan", "dx": 0, "dy": -1e300}, "at most"),
+        ({"do": "zoom_slice", "plane": "axial", "factor": 2, "about": [1e308, 0], **AT}, "a shift"),
         ({"do": "probe", "point": [1, 2]}, "3 numbers"),
         ({"do": "rename_measure", "n": 0, "name": 3}, "is a name"),
         ({"do": "remove_measure", "n": 0.5}, "a whole number"),
@@ -397,6 +401,33 @@ def test_a_slice_is_zoomed_about_what_is_under_the_pointer(session):
     assert away == pytest.approx(np.subtract(middle, before) / 3.0, abs=2e-3)
     view.do({"do": "fit_slices"})
     assert place_in_slice(view, 48.0, 40.0) == pytest.approx(middle, abs=2e-3)
+
+
+@pytest.mark.opencl
+@pytest.mark.parametrize("factor", [3.0, 0.6])
+def test_a_slice_of_a_thin_stack_is_zoomed_about_the_pointer_beside_it(session, factor):
+    view = session(Volume(np.zeros((3, 60, 60), np.int16), np.diag([3.0, 3.0, 5.0, 1.0])))
+    before = place_in_slice(view, 64.0, 32.0)
+    assert before[2] > 12.5
+    view.do({"do": "zoom_slice", "plane": "coronal", "factor": factor, "about": [0.2, -0.1], **AT})
+    assert place_in_slice(view, 64.0, 32.0) == pytest.approx(before, abs=2e-3)
+
+
+@pytest.mark.opencl
+def test_a_slice_that_is_shifted_far_stays_at_the_border_of_the_picture(session):
+    view = session(Volume(np.zeros((3, 60, 60), np.int16), np.diag([3.0, 3.0, 5.0, 1.0])))
+    view.do({"do": "pan_slice", "plane": "coronal", "dx": 0, "dy": 1000, **AT})
+    assert place_in_slice(view, 48.0, 80.0)[2] == pytest.approx(12.5)
+
+
+@pytest.mark.opencl
+def test_a_probe_at_either_end_of_paging_and_at_the_borders_is_inside(session):
+    affine = [[0.7123457, 0, 0, -3.1415926], [0, 0.4, 0, 2.7182818], [0, 0, 1.2345678, -100.00049], [0, 0, 0, 1]]
+    view = session(Volume(np.full((4, 6, 8), 70, np.int16), np.array(affine)))
+    ends = [{"do": "scroll", "plane": "axial", "steps": -99}, {"do": "scroll", "plane": "axial", "steps": 99}]
+    ends += [{"do": "set_cross", "point": [-1e6, -1e6, -1e6]}, {"do": "set_cross", "point": [1e6, 1e6, 1e6]}]
+    for end in ends:
+        assert view.do({"do": "probe", "point": view.do(end)["cross"]})["probe"]["hu"] == pytest.approx(70.0), end
 
 
 @pytest.mark.opencl
