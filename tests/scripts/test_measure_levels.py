@@ -28,7 +28,7 @@ def test_the_printed_line_says_what_the_default_costs_in_soft_tissue() -> None:
     biases = [one["preset"]["bias_mm"] for one in FIGURES if one["group"] not in level_phantoms.NOT_IN_TISSUE]
     low, high = re.findall(r"\d\.\d", WHAT_BONE_COSTS)
     assert (f"{min(biases):.1f}", f"{max(biases):.1f}") == (low, high)
-    assert f"{min(biases):.2f} to {max(biases):.2f} mm outside of the bone" in PAGE
+    assert f"{min(biases):.2f} to {max(biases):.2f} mm outside the bone" in PAGE
 
 
 def test_figures_are_of_the_phantoms_that_are_there() -> None:

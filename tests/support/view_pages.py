@@ -47,7 +47,7 @@ def open_view_page(browser: Any, served: WebServer) -> Iterator[Any]:
     assert [address for address in outside_requests(browser) if not address.startswith(own)] == []
 
 
-def picture(page, name: str = "scene") -> np.ndarray:
+def picture(page: Any, name: str = "scene") -> np.ndarray:
     """What a view shows, (h, w, 3), with what lies over it."""
     from PIL import Image
 
@@ -59,17 +59,17 @@ def changed_share(one: np.ndarray, other: np.ndarray) -> float:
     return float((np.abs(one - other).max(axis=2) > 24).mean())
 
 
-def facts(page) -> dict:
+def facts(page: Any) -> dict[str, Any]:
     return json.loads(page.execute_script("return JSON.stringify(clrecon.facts)"))
 
 
-def settle(page) -> None:
+def settle(page: Any) -> None:
     """Wait until everything is shown as it is after what was done."""
     time.sleep(0.3)  # a change needs a frame and the way to the server
     wait_for(page, SETTLED)
 
 
-def drag(page, element, x: int, y: int, dx: int, dy: int, steps: int = 15) -> None:
+def drag(page: Any, element: Any, x: int, y: int, dx: int, dy: int, steps: int = 15) -> None:
     """Drag from a place beside the middle of an element, in small moves."""
     from selenium.webdriver import ActionChains
 
@@ -79,7 +79,7 @@ def drag(page, element, x: int, y: int, dx: int, dy: int, steps: int = 15) -> No
     actions.release().perform()
 
 
-def point_at(page, name: str, point: np.ndarray) -> None:
+def point_at(page: Any, name: str, point: np.ndarray) -> None:
     """Move the pointer to the place of a point of the patient."""
     from selenium.webdriver import ActionChains
 
@@ -90,7 +90,7 @@ def point_at(page, name: str, point: np.ndarray) -> None:
     ).perform()
 
 
-def click(page, name: str, point: np.ndarray, *held: str) -> None:
+def click(page: Any, name: str, point: np.ndarray, *held: str) -> None:
     """Click at the place of a point of the patient, with keys held."""
     from selenium.webdriver import ActionChains
 
@@ -104,7 +104,7 @@ def click(page, name: str, point: np.ndarray, *held: str) -> None:
     actions.perform()
 
 
-def press(page, *keys: str) -> None:
+def press(page: Any, *keys: str) -> None:
     """Press keys with the pointer where it is."""
     from selenium.webdriver import ActionChains
 

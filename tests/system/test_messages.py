@@ -6,6 +6,7 @@ import copy
 import pickle
 import subprocess
 import sys
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -115,7 +116,11 @@ def look(value, seen=None):
         return type(value), [look(entry) for entry in value]
     if isinstance(value, Exception):
         return type(value), value.args
-    return (type(value), look(vars(value))) if hasattr(value, "__dict__") else value
+    if not hasattr(value, "__dict__"):
+        return value
+    kind = type(value)
+    kept = {name: each for name, each in vars(value).items() if not isinstance(vars(kind).get(name), cached_property)}
+    return kind, look(kept)
 
 
 @pytest.mark.parametrize("way", [travel, copy.deepcopy, copy.copy])

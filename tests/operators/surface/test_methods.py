@@ -74,7 +74,7 @@ def test_methods_that_grow_or_decimate_do_so(device: Any) -> None:
     [
         ("mc33", {}, ("method=", "mc33", "t-mc", "i-mc")),
         ("t-mc", {"grows": True}, ("method=", "t-mc", "grow_from")),
-        ("i-mc", {"topology": "trilinear"}, ("grown",)),
+        ("i-mc", {"topology": "trilinear"}, ("growing",)),
         ("skimage", {"vertex_rule": "golden"}, ("method=", "vertex_rule=")),
         ("t-mc-soup", {"plain": False}, ("value",)),
     ],
