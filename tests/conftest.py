@@ -277,6 +277,30 @@ def odd(shared_folder: Path) -> Any:
     return OddBodies(shared_folder)
 
 
+@pytest.fixture(scope="module")
+def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where `view_browser` saves what a page gives it."""
+    return tmp_path_factory.mktemp("downloads")
+
+
+@pytest.fixture(scope="module")
+def view_browser(downloads: Path) -> Iterator[Any]:
+    from browser import open_browser
+
+    with open_browser(1200, 800) as driver:
+        driver.execute_cdp_cmd("Page.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(downloads)})
+        yield driver
+
+
+@pytest.fixture(scope="module")
+def view_server(device: Any) -> Iterator[Any]:
+    """A view of a scan and a mesh, for pages in `view_browser`."""
+    from view_pages import serve_scene
+
+    with serve_scene(device) as running:
+        yield running
+
+
 @pytest.fixture(scope="session", autouse=True)
 def interruptible() -> Iterator[None]:
     """Ctrl-C as in a terminal, here and in processes of tests: what a shell starts in the background ignores it."""

@@ -9,21 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import view_scenes as scenes
-from browser import open_browser, severe_lines, wait_for
+from browser import severe_lines, wait_for
 from open_views import search_for_ever
-from view_pages import (
-    SETTLED,
-    changed_share,
-    click,
-    drag,
-    facts,
-    open_view_page,
-    picture,
-    point_at,
-    press,
-    serve_scene,
-    settle,
-)
+from view_pages import SETTLED, changed_share, click, drag, facts, open_view_page, picture, point_at, press, settle
 from web_views import PATIENCE, serving
 
 from clrecon.viewer.drawing.painter import Painter
@@ -37,27 +25,9 @@ PARTS = "return clrecon.facts.parts.filter((part) => part.kind === 'cluster').le
 ISO = scenes.ISO
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("downloads")
-
-
-@pytest.fixture(scope="module")
-def browser(folder):
-    with open_browser(1200, 800) as driver:
-        driver.execute_cdp_cmd("Page.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(folder)})
-        yield driver
-
-
-@pytest.fixture(scope="module")
-def served(device):
-    with serve_scene(device) as running:
-        yield running
-
-
 @pytest.fixture
-def page(browser, served):
-    with open_view_page(browser, served) as opened:
+def page(view_browser, view_server):
+    with open_view_page(view_browser, view_server) as opened:
         yield opened
 
 
@@ -300,7 +270,7 @@ def test_k_makes_a_curve_shows_its_picture_and_takes_that_away(page) -> None:
     assert curve.is_displayed()
 
 
-def test_escape_stops_the_work(page, served, monkeypatch) -> None:
+def test_escape_stops_the_work(page, view_server, monkeypatch) -> None:
     from selenium.webdriver.common.keys import Keys
 
     wait_for(page, PARTS)
@@ -369,7 +339,7 @@ def test_clip_planes_and_a_box_cut(page) -> None:
     assert page.find_element("id", "box").is_displayed()
 
 
-def test_shown_view_is_saved_as_a_download(page, folder: Path) -> None:
+def test_shown_view_is_saved_as_a_download(page, downloads: Path) -> None:
     from selenium.webdriver.support.ui import Select
 
     from clrecon.mesh.mesh_reader import read_mesh
@@ -377,14 +347,14 @@ def test_shown_view_is_saved_as_a_download(page, folder: Path) -> None:
     Select(page.find_element("id", "format")).select_by_value(".stl")
     page.find_element("id", "save").click()
     end = time.monotonic() + PATIENCE
-    while not (folder / "view.stl").exists():
+    while not (downloads / "view.stl").exists():
         assert time.monotonic() < end, page.find_element("id", "saved").text
         time.sleep(0.05)
-    mesh = read_mesh(folder / "view.stl", space="lps")
+    mesh = read_mesh(downloads / "view.stl", space="lps")
     assert mesh.triangle_count > 1000
 
 
-def test_files_that_were_named_are_written_here_and_q_ends_it(browser, device, tmp_path: Path) -> None:
+def test_files_that_were_named_are_written_here_and_q_ends_it(view_browser, device, tmp_path: Path) -> None:
     from clrecon.mesh.mesh_reader import read_mesh
 
     objects = show_objects([scenes.make_mesh()])
@@ -394,28 +364,28 @@ def test_files_that_were_named_are_written_here_and_q_ends_it(browser, device, t
         Painter(objects, device=device) as painter,
         serving(lambda heard: ViewSession(objects, painter, on_change=heard), save_as=names, wrote=wrote.append) as own,
     ):
-        browser.get(own.address)
-        wait_for(browser, SETTLED)
+        view_browser.get(own.address)
+        wait_for(view_browser, SETTLED)
         for count in (2, 4):
-            press(browser, "s")
+            press(view_browser, "s")
             end = time.monotonic() + PATIENCE
             while len(wrote) < count:
-                assert time.monotonic() < end, browser.find_element("id", "saved").text
+                assert time.monotonic() < end, view_browser.find_element("id", "saved").text
                 time.sleep(0.05)
-        press(browser, "q")
-        wait_for(browser, "return document.documentElement.dataset.closed === '1001'")
-        assert "the server has ended" in browser.find_element("id", "message").text
+        press(view_browser, "q")
+        wait_for(view_browser, "return document.documentElement.dataset.closed === '1001'")
+        assert "the server has ended" in view_browser.find_element("id", "message").text
     assert sorted(path.name for path in tmp_path.iterdir()) == ["shown-2.ply", "shown-2.png", "shown.ply", "shown.png"]
     assert read_mesh(tmp_path / "shown-2.ply", space="lps").triangle_count == scenes.make_mesh().triangle_count
 
 
 @pytest.mark.release
-def test_another_browser_has_a_view_of_its_own(page, served) -> None:
+def test_another_browser_has_a_view_of_its_own(page, view_server) -> None:
     page.execute_script("clrecon.run('set_iso', { hu: 350 })")
     wait_for(page, "return clrecon.facts.iso.hu === 350")
     first = page.current_window_handle
     page.switch_to.new_window("tab")
-    page.get(served.address)
+    page.get(view_server.address)
     wait_for(page, SETTLED)
     assert facts(page)["iso"]["hu"] == ISO
     page.close()
@@ -423,7 +393,7 @@ def test_another_browser_has_a_view_of_its_own(page, served) -> None:
     assert facts(page)["iso"]["hu"] == 350
 
 
-def test_without_the_secret_there_is_no_page(browser, served) -> None:
-    browser.get(f"http://127.0.0.1:{served.port}/")
-    assert "the secret is missing or wrong" in browser.find_element("tag name", "body").text
-    severe_lines(browser)
+def test_without_the_secret_there_is_no_page(view_browser, view_server) -> None:
+    view_browser.get(f"http://127.0.0.1:{view_server.port}/")
+    assert "the secret is missing or wrong" in view_browser.find_element("tag name", "body").text
+    severe_lines(view_browser)

@@ -9,35 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import view_scenes as scenes
-from browser import open_browser, wait_for
-from view_pages import facts, open_view_page, picture, press, serve_scene
+from browser import wait_for
+from view_pages import facts, open_view_page, picture, press
 from web_views import PATIENCE
 
 pytestmark = [pytest.mark.slow, pytest.mark.opencl]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("measures")
-
-
-@pytest.fixture(scope="module")
-def browser(folder):
-    with open_browser(1200, 800) as driver:
-        driver.execute_cdp_cmd("Page.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(folder)})
-        yield driver
-
-
-@pytest.fixture(scope="module")
-def served(device):
-    with serve_scene(device) as running:
-        yield running
-
-
 @pytest.fixture
-def page(browser, served):
+def page(view_browser, view_server):
     """The page with two places: in the middle of an axial slice, and beside it."""
-    with open_view_page(browser, served) as opened:
+    with open_view_page(view_browser, view_server) as opened:
         size = picture(opened, "axial").shape[1::-1]
         for count, share in enumerate((0.5, 0.6), 1):
             at = {"x": share * size[0], "y": 0.5 * size[1], "size": list(size), "plane": "axial"}
@@ -95,13 +77,13 @@ def test_the_slices_go_to_a_measure_of_the_list(page) -> None:
     assert np.allclose(facts(page)["cross"], point, atol=0.01)
 
 
-def test_measures_are_saved_as_markups_and_buttons_come_with_the_first(page, folder: Path) -> None:
+def test_measures_are_saved_as_markups_and_buttons_come_with_the_first(page, downloads: Path) -> None:
     page.find_element("css selector", "#exports [data-format='.mrk.json']").click()
     end = time.monotonic() + PATIENCE
-    while not (folder / "view.mrk.json").exists():
+    while not (downloads / "view.mrk.json").exists():
         assert time.monotonic() < end, page.find_element("id", "saved").text
         time.sleep(0.05)
-    content = json.loads((folder / "view.mrk.json").read_text(encoding="utf-8"))
+    content = json.loads((downloads / "view.mrk.json").read_text(encoding="utf-8"))
     assert [each["controlPoints"][0]["position"] for each in content["markups"]] == [
         measure["points"][0] for measure in facts(page)["measures"]
     ]

@@ -7,27 +7,15 @@ import re
 import numpy as np
 import pytest
 import view_scenes as scenes
-from browser import open_browser, wait_for
-from view_pages import SETTLED, changed_share, facts, open_view_page, picture, point_at, press, serve_scene
+from browser import wait_for
+from view_pages import SETTLED, changed_share, facts, open_view_page, picture, point_at, press
 
 pytestmark = [pytest.mark.slow, pytest.mark.opencl]
 
 
-@pytest.fixture(scope="module")
-def browser():
-    with open_browser(1200, 800) as driver:
-        yield driver
-
-
-@pytest.fixture(scope="module")
-def served(device):
-    with serve_scene(device) as running:
-        yield running
-
-
 @pytest.fixture
-def page(browser, served):
-    with open_view_page(browser, served) as opened:
+def page(view_browser, view_server):
+    with open_view_page(view_browser, view_server) as opened:
         yield opened
 
 
