@@ -119,8 +119,8 @@ def test_values_below_the_doubtful_sign_are_decoded(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", TWELVE_SIGNED_BITS)
-def test_the_highest_of_twelve_stored_bits_is_the_sign(tmp_path, name):
-    """It is extended later, with the unused bits."""
+def test_all_twelve_stored_bits_of_signed_values_are_kept(tmp_path, name):
+    """The bits above them get the sign later."""
     syntax, encode = TWELVE_SIGNED_BITS[name]
     data = encapsulate([encode(IMAGES[0])]) + END
     (pixels,) = place(tmp_path, data, syntax, signed=True, bits_stored=12, high_bit=11)
