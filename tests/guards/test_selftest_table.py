@@ -67,7 +67,8 @@ SWITCHES = {
 }
 
 
-def test_row_57_every_kernel_and_every_variant_has_a_check() -> None:
+@pytest.mark.fault_row(57)
+def test_every_kernel_and_every_variant_has_a_check() -> None:
     assert find_gaps(CHECKS, find_kernels(), SWITCHES) == []
     assert all(macro in find_switches(read_kernel_source(file)) for file, macro in NEVER_BUILT)
     names = [check.name for check in CHECKS]
@@ -79,7 +80,8 @@ def test_row_57_every_kernel_and_every_variant_has_a_check() -> None:
 
 
 @pytest.mark.parametrize("kernel", ["trace_surface", "compact"])
-def test_row_57_a_gap_is_found(kernel: str) -> None:
+@pytest.mark.fault_row(57)
+def test_a_gap_is_found(kernel: str) -> None:
     kernels = find_kernels()
     fewer = tuple(check for check in CHECKS if kernel not in check.kernels and check.name != kernel)
     assert find_gaps(fewer, kernels, SWITCHES)
@@ -89,7 +91,8 @@ def test_row_57_a_gap_is_found(kernel: str) -> None:
     assert find_gaps(CHECKS, kernels, more) == ["cl/rays/slices.cl has no check with -D UPSIDE_DOWN"]
 
 
-def test_row_57_every_kernel_has_its_mutations() -> None:
+@pytest.mark.fault_row(57)
+def test_every_kernel_has_its_mutations() -> None:
     kernels = find_kernels()
     assert set(INVERSIONS) == set(kernels) and all(INVERSIONS.values())
     mutations = all_mutations()

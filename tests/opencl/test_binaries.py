@@ -53,7 +53,8 @@ def test_a_damaged_file_is_not_trusted(own_cache, damage):
     assert read_binary(KEY) is None
 
 
-def test_row_59_a_binary_in_the_place_of_another_is_not_trusted(own_cache):
+@pytest.mark.fault_row(59)
+def test_a_binary_in_the_place_of_another_is_not_trusted(own_cache):
     """Whole, with a hash that is right, but of another source, device or driver."""
     other = binary_key("other device", "source")
     store_binary(other, b"program")
@@ -76,7 +77,8 @@ def test_a_folder_that_vanished_is_no_error(own_cache):
     assert read_binary(KEY) is None
 
 
-def test_row_72_files_are_private_whatever_the_umask(own_cache):
+@pytest.mark.fault_row(72)
+def test_files_are_private_whatever_the_umask(own_cache):
     before = os.umask(0)
     try:
         store_binary(KEY, b"program")

@@ -56,7 +56,8 @@ def environment_of(tmp_path, **variables):
         ),
     ],
 )
-def test_row_59_missing_place_for_built_kernels_is_warned_of(device, variables, fault, tmp_path):
+@pytest.mark.fault_row(59)
+def test_missing_place_for_built_kernels_is_warned_of(device, variables, fault, tmp_path):
     command = [sys.executable, "-c", CODE, str(device.index)]
     environment = environment_of(tmp_path, **variables)
     done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
@@ -69,7 +70,8 @@ def test_row_59_missing_place_for_built_kernels_is_warned_of(device, variables, 
 
 
 @pytest.mark.parametrize("command", daily(2, ["devices", "render", "mesh"]))
-def test_row_59_every_command_with_a_device_warns_once(command, device, tmp_path, phantom_folder):
+@pytest.mark.fault_row(59)
+def test_every_command_with_a_device_warns_once(command, device, tmp_path, phantom_folder):
     """The folder of pickles is refused; kernels are found as ever, so that nothing is built for this test."""
     spoil(tmp_path / "home" / "pytools", "others")
     arguments = {
@@ -85,7 +87,8 @@ def test_row_59_every_command_with_a_device_warns_once(command, device, tmp_path
     assert done.stderr.count("XDG_CACHE_HOME/pytools can be written by other users") == 1, done.stderr
 
 
-def test_row_59_reports_of_other_commands_and_pictures_have_the_warnings(device):
+@pytest.mark.fault_row(59)
+def test_reports_of_other_commands_and_pictures_have_the_warnings(device):
     from clrecon.geometry import Volume
     from clrecon.jobs import devices
     from clrecon.operators.reformat.cut import cut_slice
@@ -140,7 +143,8 @@ def test_good_folders_are_used_as_they_are(fresh, tmp_path, monkeypatch):
     assert fresh().pocl == tmp_path / "named" / "clrecon"
 
 
-def test_row_72_folders_of_caches_are_private_whatever_the_umask(fresh, tmp_path):
+@pytest.mark.fault_row(72)
+def test_folders_of_caches_are_private_whatever_the_umask(fresh, tmp_path):
     before = os.umask(0)
     try:
         caches = fresh()
@@ -183,7 +187,8 @@ FAULTS = {
 
 @pytest.mark.parametrize("how", FAULTS)
 @pytest.mark.parametrize("place", ["home/pocl", "home/pocl/clrecon", "named", "named/clrecon"])
-def test_row_59_a_folder_that_another_user_prepared_is_not_loaded(fresh, tmp_path, monkeypatch, place, how):
+@pytest.mark.fault_row(59)
+def test_a_folder_that_another_user_prepared_is_not_loaded(fresh, tmp_path, monkeypatch, place, how):
     if how == "owner" and os.getuid():
         pytest.skip("only root can give a folder away")
     (tmp_path / "home").mkdir(mode=0o700)
@@ -207,7 +212,8 @@ def test_row_59_a_folder_that_another_user_prepared_is_not_loaded(fresh, tmp_pat
         ({"XDG_CACHE_HOME": "", "HOME": ""}, "~/.cache"),
     ],
 )
-def test_row_59_a_folder_that_depends_on_the_current_one_is_not_used(fresh, tmp_path, monkeypatch, variables, name):
+@pytest.mark.fault_row(59)
+def test_a_folder_that_depends_on_the_current_one_is_not_used(fresh, tmp_path, monkeypatch, variables, name):
     """Libraries look for their caches elsewhere then."""
     monkeypatch.chdir(tmp_path)
     for variable, value in variables.items():
@@ -220,7 +226,8 @@ def test_row_59_a_folder_that_depends_on_the_current_one_is_not_used(fresh, tmp_
     assert os.environ.get("XDG_CACHE_HOME") != "", "Mesa would make a folder without a name"
 
 
-def test_row_59_the_other_caches_are_switched_off_one_by_one(fresh, tmp_path):
+@pytest.mark.fault_row(59)
+def test_the_other_caches_are_switched_off_one_by_one(fresh, tmp_path):
     for place in ("pytools", "mesa_shader_cache", "clrecon/kernels"):
         spoil(tmp_path / "home" / place, "others")
     caches = fresh()
@@ -230,14 +237,16 @@ def test_row_59_the_other_caches_are_switched_off_one_by_one(fresh, tmp_path):
     assert os.environ["PYOPENCL_NO_CACHE"] == "1" and os.environ["MESA_SHADER_CACHE_DISABLE"] == "true"
 
 
-def test_row_59_a_folder_that_others_can_replace_is_not_trusted(tmp_path):
+@pytest.mark.fault_row(59)
+def test_a_folder_that_others_can_replace_is_not_trusted(tmp_path):
     tmp_path.chmod(0o777)
     assert find_fault(tmp_path / "pocl") == "lies in a folder that other users can write to"
     tmp_path.chmod(0o1777)
     assert find_fault(tmp_path / "pocl") == ""
 
 
-def test_row_59_a_folder_without_room_is_not_used(fresh, monkeypatch):
+@pytest.mark.fault_row(59)
+def test_a_folder_without_room_is_not_used(fresh, monkeypatch):
     def disk_usage(folder):
         return SimpleNamespace(free=63 << 20 if "home" in folder.parts else 64 << 20)
 
@@ -248,7 +257,8 @@ def test_row_59_a_folder_without_room_is_not_used(fresh, monkeypatch):
     assert not caches.is_lasting and caches.binaries is None
 
 
-def test_row_59_no_room_anywhere_is_an_error(fresh, monkeypatch):
+@pytest.mark.fault_row(59)
+def test_no_room_anywhere_is_an_error(fresh, monkeypatch):
     room = SimpleNamespace(disk_usage=lambda folder: SimpleNamespace(free=0), rmtree=shutil.rmtree)
     monkeypatch.setattr(cache, "shutil", room)
     caches = fresh()
@@ -260,7 +270,8 @@ def test_row_59_no_room_anywhere_is_an_error(fresh, monkeypatch):
 @pytest.mark.parametrize(
     "limit, says", daily_rows(1, [("-f 100", "files may have 0.10 MB here"), ("-v 500000", "want of memory")])
 )
-def test_row_59_limits_of_the_process_are_named(limit, says, device, tmp_path):
+@pytest.mark.fault_row(59)
+def test_limits_of_the_process_are_named(limit, says, device, tmp_path):
     command = ["bash", "-c", f'ulimit {limit}; exec "$@"', "bash", sys.executable, "-c", CODE, str(device.index)]
     done = subprocess.run(command, env=environment_of(tmp_path), capture_output=True, text=True)
     assert done.returncode == 1 and says in done.stderr.splitlines()[-1], done.stderr

@@ -83,14 +83,16 @@ def swap(folder):
 
 @pytest.mark.release
 @pytest.mark.parametrize("damage", daily(2, [overwrite, swap, cut, empty]))
-def test_row_59_damaged_kernels_are_built_anew(damage, device, built):
+@pytest.mark.fault_row(59)
+def test_damaged_kernels_are_built_anew(damage, device, built):
     damage(built)
     assert run_child(device, built) == [DAMAGED]
     assert run_child(device, built) == []
 
 
 @pytest.mark.seconds
-def test_row_59_programs_of_a_dead_process_are_built_anew(device, built):
+@pytest.mark.fault_row(59)
+def test_programs_of_a_dead_process_are_built_anew(device, built):
     """The process before died: PoCL's files are there, cut by a full disk, and nobody has seen them work."""
     shutil.rmtree(built / "records")
     cut(built)
@@ -100,7 +102,8 @@ def test_row_59_programs_of_a_dead_process_are_built_anew(device, built):
 
 @pytest.mark.release
 @pytest.mark.seconds
-def test_row_59_a_process_that_dies_leaves_no_record(device, tmp_path):
+@pytest.mark.fault_row(59)
+def test_a_process_that_dies_leaves_no_record(device, tmp_path):
     if not is_pocl(device.platform):
         pytest.skip("this driver does not end the process")
     run_child(device, tmp_path / "clrecon", end="killed")

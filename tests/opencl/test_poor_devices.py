@@ -32,7 +32,8 @@ def beyond_the_core(source: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", kernel_files())
-def test_row_51_kernels_need_no_fp64_and_no_images(name):
+@pytest.mark.fault_row(51)
+def test_kernels_need_no_fp64_and_no_images(name):
     assert beyond_the_core(read_kernel_source(name)) == []
 
 
@@ -57,7 +58,8 @@ def lacking(device: Device, **properties) -> Device:
     return Device(device.index, device.cl_device.platform, Lacking(device.cl_device, **properties))
 
 
-def test_row_51_a_device_with_32_bit_sizes_has_at_most_4_gib(device):
+@pytest.mark.fault_row(51)
+def test_a_device_with_32_bit_sizes_has_at_most_4_gib(device):
     poor = lacking(device, address_bits=32, global_mem_size=1 << 36, max_mem_alloc_size=1 << 35)
     assert (poor.memory_bytes, poor.max_allocation_bytes) == ((1 << 32) - 1, (1 << 32) - 1)
     assert memory_limits(poor).buffer_bytes < 1 << 32
@@ -73,7 +75,8 @@ def test_row_51_a_device_with_32_bit_sizes_has_at_most_4_gib(device):
         ({"max_work_group_size": 1024, "max_work_item_sizes": [1024, 1024, 64]}, 64),
     ],
 )
-def test_row_51_groups_are_as_large_as_the_device_allows(device, properties, size):
+@pytest.mark.fault_row(51)
+def test_groups_are_as_large_as_the_device_allows(device, properties, size):
     assert lacking(device, **properties).group_size == size
 
 
@@ -90,7 +93,8 @@ def labels(volume):
 @pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize(("size", "works"), daily_rows(1, [(1, ("surface",)), (7, ("labels", "slice"))]))
-def test_row_51_small_groups_give_the_same_bytes(device, volume, labels, monkeypatch, size, works):
+@pytest.mark.fault_row(51)
+def test_small_groups_give_the_same_bytes(device, volume, labels, monkeypatch, size, works):
     """Drivers build a kernel anew for each size of its groups, so not all kinds of work are tried with all."""
     with DeviceVolume(volume, device=device) as resident:
         expected = {work: WORK[work](resident, labels) for work in works}
@@ -102,7 +106,8 @@ def test_row_51_small_groups_give_the_same_bytes(device, volume, labels, monkeyp
             assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f"), work
 
 
-def test_row_51_a_device_of_the_other_byte_order_is_refused_in_a_line(device, tmp_path, capsys, monkeypatch):
+@pytest.mark.fault_row(51)
+def test_a_device_of_the_other_byte_order_is_refused_in_a_line(device, tmp_path, capsys, monkeypatch):
     other = lacking(device, endian_little=sys.byteorder != "little")
     monkeypatch.setattr("clrecon.opencl.select.list_devices", lambda: [other])
     monkeypatch.delenv("CLRECON_DEVICE", raising=False)
@@ -114,7 +119,8 @@ def test_row_51_a_device_of_the_other_byte_order_is_refused_in_a_line(device, tm
     assert not (tmp_path / "out.stl").exists()
 
 
-def test_row_51_a_kernel_whose_groups_the_driver_refuses_is_an_error_in_a_line(device, volume, monkeypatch):
+@pytest.mark.fault_row(51)
+def test_a_kernel_whose_groups_the_driver_refuses_is_an_error_in_a_line(device, volume, monkeypatch):
     monkeypatch.setattr(Device, "group_size", 1 << 20)
     with refused(Exception, "INVALID_WORK_GROUP_SIZE"):
         WORK["mip"](DeviceVolume(volume, device=choose_device(device)), None)

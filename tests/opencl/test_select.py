@@ -97,7 +97,8 @@ def test_a_simulator_is_never_chosen_silently(machine, monkeypatch):
         (None, {"PYOPENCL_CTX": "0:0"}, True),
     ],
 )
-def test_row_50_a_simulator_that_nobody_named_is_told(machine, wanted, variables, is_told, monkeypatch):
+@pytest.mark.fault_row(50)
+def test_a_simulator_that_nobody_named_is_told(machine, wanted, variables, is_told, monkeypatch):
     for name, text in variables.items():
         monkeypatch.setenv(name, text)
     context = SimpleNamespace(devices=["Oclgrind Simulator"])
@@ -115,7 +116,8 @@ def test_a_device_that_cannot_work_is_passed_over(machine):
         choose_device("h200")
 
 
-def test_row_57_what_is_remembered_chooses_the_device_that_is_shown(machine, monkeypatch):
+@pytest.mark.fault_row(57)
+def test_what_is_remembered_chooses_the_device_that_is_shown(machine, monkeypatch):
     found = {"H200": "wrong sums"}
     monkeypatch.setattr(select, "remembered_fault", lambda device: found.get(device.name, ""))
     assert select.choose_remembered().name == "Radeon"
@@ -141,7 +143,8 @@ def test_the_choice_is_explained(machine, monkeypatch):
     assert select.explain_choice() == "no other one"
 
 
-def test_row_57_a_device_that_computes_wrongly_is_passed_over_or_refused(machine, monkeypatch):
+@pytest.mark.fault_row(57)
+def test_a_device_that_computes_wrongly_is_passed_over_or_refused(machine, monkeypatch):
     machine[3].fault = "7 of 9 vertices of a ball lie beside it"
     assert choose_device().name == "Radeon"
     words = "H200 (NVIDIA CUDA) is not used, it computes wrongly: 7 of 9 vertices of a ball lie beside it"

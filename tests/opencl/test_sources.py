@@ -78,7 +78,8 @@ def test_a_compiler_error_names_the_true_file_and_line(device, monkeypatch):
 
 
 @pytest.mark.parametrize("missing", ["primitives/compact.cl", "include/volume.h"])
-def test_row_52_a_missing_kernel_file_is_a_damaged_installation(missing, tmp_path, monkeypatch):
+@pytest.mark.fault_row(52)
+def test_a_missing_kernel_file_is_a_damaged_installation(missing, tmp_path, monkeypatch):
     root = tmp_path / "cl"
     shutil.copytree(str(sources.kernel_root()), root)
     (root / missing).unlink()
@@ -88,7 +89,8 @@ def test_row_52_a_missing_kernel_file_is_a_damaged_installation(missing, tmp_pat
         sources.read_kernel_source.__wrapped__(name)
 
 
-def test_row_52_an_installation_without_kernels_is_damaged(tmp_path, monkeypatch):
+@pytest.mark.fault_row(52)
+def test_an_installation_without_kernels_is_damaged(tmp_path, monkeypatch):
     monkeypatch.setattr(sources.resources, "files", lambda name: tmp_path)
     with refused(DeviceError, "volume.h", "kernels") as caught:
         sources.kernel_root.__wrapped__()

@@ -92,7 +92,8 @@ def test_kernels_that_have_ended_are_not_remembered(device):
         (-14, DeviceFailedError, "EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST"),
     ],
 )
-def test_row_56_a_kernel_that_fails_on_the_device_is_an_error(device, status, kind, words):
+@pytest.mark.fault_row(56)
+def test_a_kernel_that_fails_on_the_device_is_an_error(device, status, kind, words):
     device.commands.add("kernel one", Event(status), QUEUE)
     device.commands.add("kernel two", Event(0), QUEUE)
     with refused(kind, words) as caught:
@@ -102,7 +103,8 @@ def test_row_56_a_kernel_that_fails_on_the_device_is_an_error(device, status, ki
     assert device.commands.last is None
 
 
-def test_row_56_only_a_device_without_progress_counts_as_hung(device):
+@pytest.mark.fault_row(56)
+def test_only_a_device_without_progress_counts_as_hung(device):
     """Four kernels of 0.3 s take longer than the limit of 0.5 s, together."""
     events = [Event() for _ in range(4)]
     for number, event in enumerate(events):
@@ -113,7 +115,8 @@ def test_row_56_only_a_device_without_progress_counts_as_hung(device):
     assert device.commands.last is None
 
 
-def test_row_56_a_device_without_progress_is_an_error_that_names_the_kernel(device):
+@pytest.mark.fault_row(56)
+def test_a_device_without_progress_is_an_error_that_names_the_kernel(device):
     ended, hung, after = Event(0), Event(), Event()
     for number, event in enumerate((ended, hung, after)):
         device.commands.add(f"kernel {number}", event, QUEUE)
@@ -129,7 +132,8 @@ def test_row_56_a_device_without_progress_is_an_error_that_names_the_kernel(devi
 
 
 @pytest.mark.parametrize("is_short", [True, False])
-def test_row_56_an_interrupt_keeps_the_context_of_a_device_that_ends_in_time(device, monkeypatch, is_short):
+@pytest.mark.fault_row(56)
+def test_an_interrupt_keeps_the_context_of_a_device_that_ends_in_time(device, monkeypatch, is_short):
     event, context = Event(), object()
     device.commands.add("kernel one", event, QUEUE)
     monkeypatch.setattr(device._opened, "context", context)

@@ -94,7 +94,8 @@ def remember(monkeypatch: pytest.MonkeyPatch, module: ModuleType, name: str) -> 
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.every_device
-def test_row_57_every_check_passes_and_launches_what_it_declares(
+@pytest.mark.fault_row(57)
+def test_every_check_passes_and_launches_what_it_declares(
     device: Device, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So each kernel and each of its variants is compared with its twin on every device."""
@@ -168,7 +169,8 @@ def test_operators_ask_what_is_left_out(device: Device, tmp_path: Path) -> None:
             assert all(set(macros) <= built[file] for file, macros in check.variants.items()), check.name
 
 
-def test_row_57_mismatches_are_told() -> None:
+@pytest.mark.fault_row(57)
+def test_mismatches_are_told() -> None:
     require_equal([1, 2], [1, 2], "numbers")
     with refused(DeviceError, "numbers", 1, 2):
         require_equal([1, 3], [1, 2], "numbers")
@@ -220,7 +222,8 @@ def test_error_of_a_check_is_its_failure_in_words(device: Device, error: Excepti
     assert not outcome["passed"] and outcome["detail"] == f"{type(error).__name__}: {error}"
 
 
-def test_row_57_a_driver_that_crashes_or_hangs_becomes_words(storied: Device) -> None:
+@pytest.mark.fault_row(57)
+def test_a_driver_that_crashes_or_hangs_becomes_words(storied: Device) -> None:
     names = ["first", "crash", "second", "exit", "third", "hang", "last"]
     outcomes = list(run_selftest(storied, [check_named(name) for name in names], silent_seconds=1.5, processes=1))
     assert [outcome["operator"] for outcome in outcomes] == names

@@ -33,13 +33,15 @@ def commit() -> str:
 
 
 @pytest.mark.slow
-def test_row_57_broken_kernels_are_noticed(device: Device) -> None:
+@pytest.mark.fault_row(57)
+def test_broken_kernels_are_noticed(device: Device) -> None:
     drawn = random.Random(commit()).sample([m for m in all_mutations() if not m.reason], DRAWN)
     outcomes = {mutation: judge(mutation, result) for mutation, result in run_mutations(drawn, device.index)}
     assert outcomes == dict.fromkeys(drawn, "caught")
 
 
-def test_row_57_what_is_not_noticed_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+@pytest.mark.fault_row(57)
+def test_what_is_not_noticed_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """With results that are known already nothing is run."""
     noticed, survivor, unbuilt = [mutation for mutation in all_mutations() if not mutation.reason][:3]
     same, wrongly_named = [mutation for mutation in all_mutations() if mutation.reason][:2]
