@@ -53,6 +53,7 @@ class TriangleTree:
             a, b, c = (column.take(corner, mode="clip") for corner in triangles.T)
             np.nextafter(np.minimum(np.minimum(a, b), c), -np.inf, out=lows[axis], dtype=np.float32)
             np.nextafter(np.maximum(np.maximum(a, b), c), np.inf, out=highs[axis], dtype=np.float32)
+        self._slack = 2.0 * float(np.spacing(np.abs(lows).max() + np.abs(highs).max()))
         self._curve = _Curve(lows + highs)
         codes = self._curve.codes(lows + highs)
         order = np.argsort(codes, kind="stable")
@@ -99,7 +100,7 @@ class TriangleTree:
         pairs = self._descend(
             lambda items, boxes: _squares_to_boxes(columns[:, items], boxes),
             nearest[2].copy(),
-            lambda items, boxes: _squares_to_corners(columns[:, items], boxes),
+            lambda items, boxes: _squares_to_contents(columns[:, items], boxes, self._slack),
         )
         if pairs is None:
             halves = [self._find_nearest(half) for half in np.array_split(points, 2)]
@@ -163,7 +164,7 @@ class TriangleTree:
         """Return pairs of an item and a leaf, in the order of items, and their bounds; None: too many for one piece.
 
         lowest: Bounds of items in the boxes (k, 6, `_FAN`) of a node, which they go down where these are below limits.
-        highest: Bounds in boxes (k, 6) from which their triangles keep below: no limit needs to be higher.
+        highest: Bounds for boxes (k, 6) below which they surely hold an answer: no limit needs to be higher.
         """
         items = np.arange(len(limits))
         nodes, bounds = np.zeros(len(limits), np.intp), np.zeros(len(limits))
@@ -211,12 +212,17 @@ def _squares_to_boxes(columns: NDArray[np.floating], boxes: NDArray[np.float32])
     return squares
 
 
-def _squares_to_corners(columns: Columns, boxes: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return squared distances (k,) of points (3, k) from the farthest corners of boxes (k, 6)."""
-    squares = np.zeros(len(boxes))
-    for axis, column in enumerate(columns):
-        squares += np.square(np.maximum(column - boxes[:, axis], boxes[:, axis + 3] - column))
-    return squares
+def _squares_to_contents(columns: Columns, boxes: NDArray[np.float32], slack: float) -> NDArray[np.float64]:
+    """Return squared distances (k,) from points (3, k) within which boxes (k, 6) surely have a place of the surface.
+
+    Each face of a box touches a triangle, to `slack` mm.  So the nearer face along an axis has a place, at most as far
+    across that axis as the farthest corner (Roussopoulos, Kelley and Vincent 1995).
+    """
+    to_low = np.abs(columns - boxes[:, :3].T)
+    to_high = np.abs(columns - boxes[:, 3:].T)
+    near, far = np.minimum(to_low, to_high) + slack, np.maximum(to_low, to_high)
+    far *= far
+    return np.asarray((near * near - far).min(axis=0) + far.sum(axis=0))
 
 
 def _enter_boxes(begin: Columns, direction: Columns, boxes: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from sample_meshes import sphere
 
 from clrecon.mesh import triangle_tree
 from clrecon.mesh.compare.distances import triangle_distances
@@ -38,6 +39,17 @@ def test_the_nearest_place_is_that_of_all_triangles(count: int) -> None:
     np.testing.assert_allclose(np.linalg.norm(places - points, axis=1), distances, rtol=1e-12)
     for place, row in zip(places, rows, strict=True):
         assert least_distance(vertices, triangles[row : row + 1], place[None]) == pytest.approx(0.0, abs=1e-6), row
+
+
+@pytest.mark.parametrize("away_mm", [1.0, 30.0, 1000.0])
+def test_the_nearest_place_of_far_points_is_that_of_all_triangles(away_mm: float) -> None:
+    vertices, triangles = sphere(radius=10.0, rounds=3)
+    directions = RANDOM.normal(size=(300, 3))
+    points = (10.0 + away_mm) * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+    distances = TriangleTree(vertices, triangles).nearest(points)[2]
+
+    np.testing.assert_allclose(distances, least_distance(vertices, triangles, points), rtol=1e-12)
 
 
 def test_pieces_with_too_many_pairs_part(monkeypatch: pytest.MonkeyPatch) -> None:
