@@ -1,4 +1,4 @@
-"""Built programs in the cache folder: found again, never trusted blindly, never in the way."""
+"""Built programs (binaries) in the cache folder: stored once, loaded by later processes, and checked before use."""
 
 from __future__ import annotations
 
@@ -35,50 +35,67 @@ def keeper(device, monkeypatch):
     return device
 
 
-def test_stored_binary_is_read_back(own_cache):
+def test_stored_binary_is_read_back_from_a_file_named_by_its_key(own_cache):
     assert read_binary(KEY) is None
     store_binary(KEY, b"program")
     assert read_binary(KEY) == b"program"
     assert [path.name for path in own_cache.iterdir()] == [KEY]
 
 
-def test_keys_tell_apart_what_is_joined_differently():
-    assert len({binary_key("ab", "c"), binary_key("a", "bc"), binary_key("abc"), binary_key("ab", "c", "")}) == 4
+def test_binary_keys_differ_where_the_same_text_is_divided_differently():
+    keys = [binary_key("ab", "c"), binary_key("a", "bc"), binary_key("abc"), binary_key("ab", "c", "")]
+    assert len(set(keys)) == len(keys)
 
 
-@pytest.mark.parametrize("damage", [lambda c: c[:-1], lambda c: c[:30], lambda c: b"", lambda c: c[:-1] + b"x"])
-def test_a_damaged_file_is_not_trusted(own_cache, damage):
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(lambda content: content[:-1], id="without its last byte"),
+        pytest.param(lambda content: content[:30], id="cut within its header"),
+        pytest.param(lambda content: b"", id="empty"),
+        pytest.param(lambda content: content[:-1] + b"x", id="with another last byte"),
+    ],
+)
+def test_damaged_binary_is_not_read(own_cache, damage):
     store_binary(KEY, b"program")
     (own_cache / KEY).write_bytes(damage((own_cache / KEY).read_bytes()))
     assert read_binary(KEY) is None
 
 
+@pytest.fixture
+def misplaced_binary(own_cache):
+    """A whole binary of another source, device or driver, under the name of `KEY`."""
+    other_key = binary_key("other device", "source")
+    store_binary(other_key, b"program of another device")
+    (own_cache / other_key).rename(own_cache / KEY)
+
+
 @pytest.mark.fault_row(59)
-def test_a_binary_in_the_place_of_another_is_not_trusted(own_cache):
-    """Whole, with a hash that is right, but of another source, device or driver."""
-    other = binary_key("other device", "source")
-    store_binary(other, b"program")
-    (own_cache / other).rename(own_cache / KEY)
+def test_binary_of_another_key_is_not_read(misplaced_binary):
     assert read_binary(KEY) is None
+
+
+def test_binary_of_another_key_is_replaced_by_the_next_that_is_stored(misplaced_binary):
     store_binary(KEY, b"program")
     assert read_binary(KEY) == b"program"
 
 
-def test_without_a_folder_nothing_is_kept(own_cache, monkeypatch):
+def test_without_a_cache_folder_no_binary_is_stored(own_cache, monkeypatch):
     caches = prepare_caches()._replace(binaries=None)
     monkeypatch.setattr(cache, "prepare_caches", lambda: caches)
     store_binary(KEY, b"program")
-    assert read_binary(KEY) is None and not list(own_cache.iterdir())
+    assert read_binary(KEY) is None
+    assert list(own_cache.iterdir()) == []
 
 
-def test_a_folder_that_vanished_is_no_error(own_cache):
+def test_storing_in_a_cache_folder_that_was_removed_raises_no_error(own_cache):
     own_cache.rmdir()
     store_binary(KEY, b"program")
     assert read_binary(KEY) is None
 
 
 @pytest.mark.fault_row(72)
-def test_files_are_private_whatever_the_umask(own_cache):
+def test_stored_binary_is_for_its_owner_alone_even_with_umask_0(own_cache):
     before = os.umask(0)
     try:
         store_binary(KEY, b"program")
@@ -87,46 +104,55 @@ def test_files_are_private_whatever_the_umask(own_cache):
     assert (own_cache / KEY).stat().st_mode & 0o777 == 0o600
 
 
-def test_oldest_binaries_are_removed_beyond_512(own_cache):
-    for number in range(512):
-        (own_cache / f"{number:03}").touch()
-        os.utime(own_cache / f"{number:03}", (number, number))
-    for number in range(2):
-        store_binary(binary_key(str(number)), b"program")
-    assert len(list(own_cache.iterdir())) == 512
-    assert [(own_cache / f"{number:03}").exists() for number in range(4)] == [False, False, True, True]
-    assert all(read_binary(binary_key(str(number))) == b"program" for number in range(2))
+def test_beyond_512_binaries_the_oldest_are_removed(own_cache):
+    older = [own_cache / f"{number:03}" for number in range(512)]
+    for seconds, path in enumerate(older):
+        path.touch()
+        os.utime(path, (seconds, seconds))  # the first is the oldest
+    newer = [binary_key("first"), binary_key("second")]
+
+    for key in newer:
+        store_binary(key, b"program")
+
+    left = {path.name for path in own_cache.iterdir()}
+    assert left == {path.name for path in older[2:]} | set(newer)
 
 
-def test_the_next_process_takes_the_binary(keeper, monkeypatch):
-    """What is built from source is stored: once; then, with no program in memory, the binary is taken."""
+def forget_programs(device, monkeypatch):
+    """What a new process knows: no program has been built or loaded."""
+    monkeypatch.setattr(device, "programs", {})
+
+
+def test_program_is_stored_once_and_loaded_by_later_processes(keeper, monkeypatch):
     stored = []
     monkeypatch.setattr(program, "store_binary", lambda *kept: stored.append(kept) or store_binary(*kept))
     for _ in range(3):
-        monkeypatch.setattr(keeper, "programs", {})
+        forget_programs(keeper, monkeypatch)
         assert load_program(keeper, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
     assert len(stored) == 1
 
 
-def test_binaries_compute_what_sources_do(keeper, monkeypatch):
+def test_loaded_binary_computes_what_its_source_does(keeper, monkeypatch):
     from clrecon.opencl import upload
     from clrecon.operators.primitives.scan import compact
 
     mask = np.random.default_rng(0).integers(0, 2**32, 1000, dtype=np.uint32)
-    for _ in range(2):
-        monkeypatch.setattr(keeper, "programs", {})
-        assert compact(keeper, upload(keeper, mask), 1000).count == int(np.unpackbits(mask.view(np.uint8)).sum())
+    set_bits = int(np.unpackbits(mask.view(np.uint8)).sum())
+    for _ in ("built from source", "loaded from its binary"):
+        forget_programs(keeper, monkeypatch)
+        assert compact(keeper, upload(keeper, mask), len(mask)).count == set_bits
 
 
-def test_a_binary_that_the_driver_refuses_is_built_from_source(keeper, monkeypatch):
-    options = ()
-    store_binary(program._key(keeper, read_kernel_source("primitives/compact.cl"), options), b"no program at all")
-    monkeypatch.setattr(keeper, "programs", {})
+def test_program_whose_binary_the_driver_refuses_is_built_from_source(keeper, monkeypatch):
+    no_options = ()
+    key = program._key(keeper, read_kernel_source("primitives/compact.cl"), no_options)
+    store_binary(key, b"no program at all")
+    forget_programs(keeper, monkeypatch)
     assert load_program(keeper, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
 
 
-def test_a_program_without_kernels_is_an_error(keeper, monkeypatch):
+def test_program_without_kernels_is_refused_with_its_file(keeper, monkeypatch):
     monkeypatch.setattr(program.Program, "kernel_names", [])
-    monkeypatch.setattr(keeper, "programs", {})
+    forget_programs(keeper, monkeypatch)
     with refused(DeviceError, "kernel", "compact.cl"):
         load_program(keeper, "primitives/compact.cl")

@@ -1,4 +1,4 @@
-"""Bounds, defaults and words of the layer of OpenCL, most of them without a device."""
+"""Bounds, defaults and messages of the layer of OpenCL, most of them without a device."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ from clrecon.opencl.sources import find_signatures
 from clrecon.opencl.transfers import LEAST_BYTES
 
 
-def test_a_cache_may_fill_the_disk_to_the_room_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_folder_is_at_fault_from_one_byte_below_the_room_it_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     free = cache.ROOM_BYTES
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
     assert cache.find_fault(tmp_path / "a") == ""
@@ -30,78 +32,123 @@ def test_a_cache_may_fill_the_disk_to_the_room_it_needs(tmp_path: Path, monkeypa
 
 
 @pytest.mark.parametrize(
-    ("system", "words"),
+    ("system", "advice"),
     [("Linux", "pocl"), ("Windows", "intel-opencl-rt"), ("Darwin", "conda-forge"), ("Zephyr", "OpenCL driver (ICD)")],
 )
-def test_each_system_has_its_advice(system: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_advice_on_drivers_is_for_the_operating_system(
+    system: str, advice: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(select.platform, "system", lambda: system)
-    assert words in select.driver_advice()
+    assert advice in select.driver_advice()
 
 
-def test_without_a_device_the_limit_of_memory_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("limit_bytes", [5 * 10**17, None], ids=["5e8 GB", "unlimited"])
+def test_error_without_a_device_names_the_limit_of_memory_if_there_is_one(
+    limit_bytes: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     resource = pytest.importorskip("resource")
     monkeypatch.setattr(select, "list_devices", list)
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (5 * 10**17, 0))
-    with refused(DeviceError, "GB", "memory"):
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (limit_bytes or resource.RLIM_INFINITY, 0))
+    with refused(DeviceError, "OpenCL") as caught:
         select.find_candidates(None)
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (resource.RLIM_INFINITY, 0))
-    with refused(DeviceError, "OpenCL", "device"):
-        select.find_candidates(None)
+    assert ("500000000.00 GB" in str(caught.value)) == (limit_bytes is not None)
 
 
-def test_devices_that_a_name_means_are_told_with_what_they_lack(monkeypatch: pytest.MonkeyPatch) -> None:
-    def make(index: int, shortcoming: str, score: int) -> Any:
-        return SimpleNamespace(
-            index=index, label=f"D{index}", shortcoming=shortcoming, type="cpu", platform="P", name=f"D{index}",
-            is_simulator=False, score=score,
-        )  # fmt: skip
+def fake_device(index: int, *, score: int, shortcoming: str = "") -> Any:
+    return SimpleNamespace(
+        index=index, label=f"D{index}", shortcoming=shortcoming, type="cpu", platform="P", name=f"D{index}",
+        is_simulator=False, score=score,
+    )  # fmt: skip
 
-    good, better, bad = make(0, "", 1), make(1, "", 2), make(2, "no compiler", 9)
-    monkeypatch.setattr(select, "list_devices", lambda: [good, better, bad])
-    assert select.find_candidates("cpu") == ([better, good], False)
-    with refused(DeviceError, "D2", "device"):
+
+@pytest.fixture
+def three_devices(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    devices = [fake_device(0, score=1), fake_device(1, score=2), fake_device(2, score=9, shortcoming="no compiler")]
+    monkeypatch.setattr(select, "list_devices", lambda: devices)
+    return devices
+
+
+def test_candidates_of_a_type_are_the_usable_devices_by_falling_score(three_devices: list[Any]) -> None:
+    good, better, _ = three_devices
+    candidates, _ = select.find_candidates("cpu")
+    assert candidates == [better, good]
+
+
+@pytest.mark.usefixtures("three_devices")
+def test_named_device_with_a_shortcoming_is_refused_with_its_label() -> None:
+    with refused(DeviceError, "D2", "compiler"):
         select.find_candidates("2")
-    with refused(DeviceError, "D0", "D1", 7, 0, 1):
+
+
+@pytest.mark.usefixtures("three_devices")
+def test_unknown_device_index_is_refused_with_the_usable_devices() -> None:
+    with refused(DeviceError, 7, "D0", 0, "D1", 1):
         select.find_candidates("7")
 
 
 @pytest.mark.parametrize("memory", [0, -1, True, 1.0, "1"])
-def test_memory_is_a_whole_number_from_1(memory: Any) -> None:
-    arrays.check_memory(None)
-    arrays.check_memory(1)
+def test_memory_that_is_no_whole_number_from_1_is_refused(memory: Any) -> None:
     with refused(UsageError, "number"):
         arrays.check_memory(memory)
 
 
-@pytest.mark.parametrize(("size", "shared"), [(LEAST_BYTES - 1, False), (LEAST_BYTES, True), (LEAST_BYTES + 1, True)])
-def test_large_buffers_are_pages_of_the_host(size: int, shared: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(arrays, "empty_output", lambda *given: (None, "pages"))
-    monkeypatch.setattr(buffers, "ask_driver", lambda *given: "buffer")
-    device: Any = SimpleNamespace(shares_host_memory=True)
-    assert arrays.allocate(device, size) == ("pages" if shared else "buffer")
-
-
-def test_a_card_keeps_a_quarter_512_mib_or_a_tenth() -> None:
-    def usable(memory: int, own: bool = True) -> Any:
-        return Device.usable_bytes.fget(SimpleNamespace(memory_bytes=memory, has_own_memory=own))  # type: ignore[attr-defined]
-
-    gib = 1 << 30
-    assert HEADROOM_BYTES == 1 << 29
-    assert (usable(gib), usable(4 * gib), usable(100 * gib)) == (3 * gib // 4, 7 * gib // 2, 90 * gib)
-    assert usable(gib, own=False) == gib
+@pytest.mark.parametrize("memory", [None, 1])
+def test_memory_of_one_byte_or_without_a_limit_is_accepted(memory: int | None) -> None:
+    arrays.check_memory(memory)
 
 
 @pytest.mark.parametrize(
-    ("version", "words"),
-    [("OpenCL 1.1 x", "OpenCL 1.2 is needed"), ("OpenCL 1.2", ""), ("OpenCL 1.2.1", ""), ("OpenCL 1.10", "")],
+    ("size", "memory"),
+    [(LEAST_BYTES - 1, "buffer"), (LEAST_BYTES, "pages"), (LEAST_BYTES + 1, "pages")],
+    ids=["a byte less than the least size", "the least size", "a byte more"],
 )
-def test_devices_need_opencl_1_2(version: str, words: str) -> None:
-    device = SimpleNamespace(version=version, available=True, compiler_available=True, endian_little=True)
-    found = _find_shortcoming(device)
-    assert words in found and bool(words) == bool(found)
+def test_buffers_from_the_least_size_on_are_pages_of_the_host_where_the_device_shares_them(
+    size: int, memory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(arrays, "empty_output", lambda *given: (None, "pages"))
+    monkeypatch.setattr(buffers, "ask_driver", lambda *given: "buffer")
+    device: Any = SimpleNamespace(shares_host_memory=True)
+    assert arrays.allocate(device, size) == memory
 
 
-def test_a_command_is_looked_at_until_it_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+GIB = 1 << 30
+
+
+@pytest.mark.parametrize(
+    ("memory_bytes", "usable_bytes"),
+    [
+        pytest.param(1 * GIB, GIB - GIB // 4, id="small card keeps a quarter"),
+        pytest.param(4 * GIB, 4 * GIB - HEADROOM_BYTES, id="usual card keeps the headroom"),
+        pytest.param(100 * GIB, 100 * GIB - 10 * GIB, id="large card keeps a tenth"),
+    ],
+)
+def test_card_with_its_own_memory_keeps_some_of_it_free(memory_bytes: int, usable_bytes: int) -> None:
+    card = SimpleNamespace(memory_bytes=memory_bytes, has_own_memory=True)
+    assert Device.usable_bytes.fget(card) == usable_bytes  # type: ignore[attr-defined]
+
+
+def test_device_in_the_memory_of_the_host_may_use_all_of_it() -> None:
+    part_of_processor = SimpleNamespace(memory_bytes=GIB, has_own_memory=False)
+    assert Device.usable_bytes.fget(part_of_processor) == GIB  # type: ignore[attr-defined]
+
+
+def shortcoming_of_version(version: str) -> str:
+    """The shortcoming of a little-endian device that lacks nothing but perhaps a newer version of OpenCL."""
+    return _find_shortcoming(
+        SimpleNamespace(version=version, available=True, compiler_available=True, endian_little=True)
+    )
+
+
+def test_device_below_opencl_1_2_has_a_shortcoming() -> None:
+    assert "OpenCL 1.2 is needed" in shortcoming_of_version("OpenCL 1.1 x")
+
+
+@pytest.mark.parametrize("version", ["OpenCL 1.2", "OpenCL 1.2.1", "OpenCL 1.10"])
+def test_device_of_opencl_1_2_or_later_has_no_shortcoming(version: str) -> None:
+    assert shortcoming_of_version(version) == ""
+
+
+def test_status_of_a_command_is_asked_until_it_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     left = [3, 2, 1, 0]
 
     class Event:
@@ -113,55 +160,88 @@ def test_a_command_is_looked_at_until_it_has_ended(monkeypatch: pytest.MonkeyPat
     assert launching._ends_soon(SimpleNamespace(event=Event())) and left == []  # type: ignore[arg-type]
 
 
-def test_kernels_are_found_from_the_first_letter_on_and_where_conditions_keep_them() -> None:
+def test_kernel_at_the_first_letter_of_its_source_is_found() -> None:
     assert list(find_signatures("__kernel void a(int n) {}\n__kernel void b(int n) {}", {})) == ["a", "b"]
-    inner = "#if 0\n#ifdef X\n__kernel void a(int n) {}\n#else\n__kernel void b(int n) {}\n#endif\n#else\n"
-    assert list(find_signatures(f"{inner}__kernel void c(int n) {{}}\n#endif\n", {})) == ["c"]
 
 
-def test_a_float4_has_four_numbers() -> None:
+def test_kernels_of_conditions_inside_a_false_condition_are_not_found() -> None:
+    source = (
+        "#if 0\n"
+        "#ifdef X\n"
+        "__kernel void a(int n) {}\n"
+        "#else\n"
+        "__kernel void b(int n) {}\n"
+        "#endif\n"
+        "#else\n"
+        "__kernel void c(int n) {}\n"
+        "#endif\n"
+    )
+    assert list(find_signatures(source, {})) == ["c"]
+
+
+def test_array_of_four_float32_is_passed_as_float4_without_a_copy() -> None:
     four = np.zeros(4, np.float32)
-    assert program._take_float4(four) is four and program._take_float4([1, 2, 3, 4]).tolist() == [1, 2, 3, 4]
-    for wrong in (np.zeros(3, np.float32), np.zeros(5, np.float32), np.zeros((4, 1), np.float32)):
-        with refused(ValueError, "float4", 4):
-            program._take_float4(wrong)
+    assert program._take_float4(four) is four
 
 
-@pytest.mark.parametrize("there", [pocl.UNKNOWN, b"a", b"znver4"])
-def test_the_name_of_a_cpu_replaces_the_unknown_one_alone(there: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    written: list[bytes] = []
-    memory = SimpleNamespace(read_text=lambda place: there, write=lambda place, text: written.append(text))
-    monkeypatch.setattr(pocl, "_Memory", lambda: _Opened(memory))
-    own: Any = SimpleNamespace(name="haswell", _place=7)
-    if there == pocl.UNKNOWN:
-        pocl.NameOfCpu.write(own)
-        assert written == [b"haswell".ljust(len(pocl.UNKNOWN), b"\0")]
-    else:
-        with pytest.raises(LookupError, match="has changed"):
-            pocl.NameOfCpu.write(own)
-        assert written == []
+def test_list_of_four_numbers_becomes_a_float4() -> None:
+    assert program._take_float4([1, 2, 3, 4]).tolist() == [1, 2, 3, 4]
 
 
-class _Opened:
-    def __init__(self, memory: Any):
-        self.memory = memory
+@pytest.mark.parametrize("shape", [(3,), (5,), (4, 1)])
+def test_array_that_is_no_float4_is_refused(shape: tuple[int, ...]) -> None:
+    with refused(ValueError, "float4", 4):
+        program._take_float4(np.zeros(shape, np.float32))
 
-    def __enter__(self) -> Any:
-        return self.memory
+
+class MemoryWithText:
+    """The memory of the process, opened, with `text` at any place; what is written there is kept."""
+
+    def __init__(self, text: bytes):
+        self.text = text
+        self.written: list[bytes] = []
+
+    def __enter__(self) -> MemoryWithText:
+        return self
 
     def __exit__(self, *error: object) -> None:
         pass
 
+    def read_text(self, place: int) -> bytes:
+        return self.text
+
+    def write(self, place: int, text: bytes) -> None:
+        self.written.append(text)
+
+
+NAME_AT_ADDRESS_7: Any = SimpleNamespace(name="haswell", _place=7)
+
+
+def test_name_of_a_cpu_is_written_over_the_unknown_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = MemoryWithText(pocl.UNKNOWN)
+    monkeypatch.setattr(pocl, "_Memory", lambda: memory)
+    pocl.NameOfCpu.write(NAME_AT_ADDRESS_7)
+    assert memory.written == [b"haswell".ljust(len(pocl.UNKNOWN), b"\0")]
+
+
+@pytest.mark.parametrize("present", [b"a", b"znver4"])
+def test_name_of_a_cpu_is_not_written_over_another_one(present: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = MemoryWithText(present)
+    monkeypatch.setattr(pocl, "_Memory", lambda: memory)
+    with pytest.raises(LookupError, match="has changed"):
+        pocl.NameOfCpu.write(NAME_AT_ADDRESS_7)
+    assert memory.written == []
+
 
 @pytest.mark.parametrize(("value", "kept"), [("", False), (" ", False), ("1", True)])
-def test_a_variable_set_to_nothing_is_none(value: str, kept: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blank_switch_of_the_pyopencl_cache_is_unset(value: str, kept: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYOPENCL_NO_CACHE", value)
     monkeypatch.setattr(quirks, "prepare_caches", lambda: None)
     quirks.import_pyopencl.__wrapped__()
     assert ("PYOPENCL_NO_CACHE" in os.environ) is kept
 
 
-def test_kernels_lie_beside_the_sources_where_they_are_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_are_read_beside_the_sources_where_they_are_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     def is_missing(name: str) -> Any:
         raise ModuleNotFoundError(name)
 
@@ -172,8 +252,9 @@ def test_kernels_lie_beside_the_sources_where_they_are_not_installed(monkeypatch
 @pytest.mark.parametrize(
     ("size", "simulator", "way"),
     [(LEAST_BYTES - 1, False, "copy"), (LEAST_BYTES, False, "pieces"), (LEAST_BYTES, True, "copy")],
+    ids=["a byte less than the least size", "the least size", "the least size, a simulator"],
 )
-def test_large_arrays_come_back_in_pieces(
+def test_arrays_from_the_least_size_on_are_read_in_pieces_but_from_simulators(
     size: int, simulator: bool, way: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ways: list[str] = []
@@ -189,12 +270,14 @@ def test_large_arrays_come_back_in_pieces(
     assert ways == [way]
 
 
-def test_the_log_says_how_long_a_build_took(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[tuple[Any, ...]] = []
-    seconds = iter((5.0, 7.5))
-    monkeypatch.setattr(program, "log", SimpleNamespace(debug=lambda *words: told.append(words)))
-    monkeypatch.setattr(program, "time", SimpleNamespace(perf_counter=lambda: next(seconds)))
+def test_log_has_the_seconds_and_the_options_of_a_build(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    logged: list[str] = []
+    before_and_after = iter((5.0, 7.5))
+    monkeypatch.setattr(program, "log", SimpleNamespace(debug=lambda text, *values: logged.append(text % values)))
+    monkeypatch.setattr(program, "time", SimpleNamespace(perf_counter=lambda: next(before_and_after)))
     monkeypatch.setattr(device, "programs", {})
     monkeypatch.setattr(device, "keeps_binaries", False)
+
     load_program(device, "primitives/compact.cl")
-    assert told == [("cl/%s %s built from %s in %.3f s", "primitives/compact.cl", device.build_options, "source", 2.5)]
+
+    assert logged == [f"cl/primitives/compact.cl {device.build_options} built from source in 2.500 s"]

@@ -8,6 +8,7 @@ import random
 import shutil
 import subprocess
 import sys
+from contextlib import contextmanager, nullcontext
 
 import pytest
 from variants import daily
@@ -16,7 +17,7 @@ from clrecon.opencl import pocl
 from clrecon.opencl.pocl import DAMAGED, UNFINISHED, KnownGood
 from clrecon.opencl.quirks import is_pocl
 
-CODE = """
+COUNT_BITS_ON_DEVICE = """
 import json, os, sys
 import numpy as np
 import clrecon
@@ -31,14 +32,14 @@ if sys.argv[2] == "killed":
 """
 
 
-def run_child(device, folder, end="well"):
-    """Build and launch two small programs in a process; returns its warnings."""
+def warnings_of_process(device, folder, end="well"):
+    """Build and launch two small programs in a process with this folder for PoCL's kernels; returns its warnings."""
     environment = {**os.environ, "POCL_CACHE_DIR": str(folder), "CLRECON_CHILD": "1"}
-    command = [sys.executable, "-c", CODE, str(device.index), end]
+    command = [sys.executable, "-c", COUNT_BITS_ON_DEVICE, str(device.index), end]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == (0 if end == "well" else -6), done.stderr
     count, warnings = json.loads(done.stdout)
-    assert count == 140
+    assert count == 70 * 2  # of 70 words with the value 5, which has two set bits
     return warnings
 
 
@@ -49,7 +50,7 @@ def built(device, shared_folder, tmp_path):
         pytest.skip("this driver does not end the process")
     made = shared_folder / f"built-on-{device.index}"
     if not made.exists():
-        assert run_child(device, made / "clrecon") == []
+        assert warnings_of_process(device, made / "clrecon") == []
     return shutil.copytree(made / "clrecon", tmp_path / "clrecon")
 
 
@@ -59,22 +60,22 @@ def files_of(folder, suffix):
     return found
 
 
-def cut(folder):
+def cut_programs(folder):
     for path in files_of(folder, ".bc"):
         os.truncate(path, 100)
 
 
-def empty(folder):
+def empty_kernels(folder):
     for path in files_of(folder, ".so"):
         os.truncate(path, 0)
 
 
-def overwrite(folder):
+def overwrite_all(folder):
     for path in (*files_of(folder, ".bc"), *files_of(folder, ".so")):
         path.write_bytes(random.Random(59).randbytes(path.stat().st_size))
 
 
-def swap(folder):
+def swap_two_programs(folder):
     first, second, *_ = (path for path in files_of(folder, ".bc") if path.name == "program.bc")
     content = first.read_bytes()
     first.write_bytes(second.read_bytes())
@@ -82,44 +83,47 @@ def swap(folder):
 
 
 @pytest.mark.release
-@pytest.mark.parametrize("damage", daily(2, [overwrite, swap, cut, empty]))
+@pytest.mark.parametrize("damage", daily(2, [overwrite_all, swap_two_programs, cut_programs, empty_kernels]))
 @pytest.mark.fault_row(59)
-def test_damaged_kernels_are_built_anew(damage, device, built):
+def test_damaged_kernels_are_built_anew_with_a_warning_once(damage, device, built):
     damage(built)
-    assert run_child(device, built) == [DAMAGED]
-    assert run_child(device, built) == []
+    assert warnings_of_process(device, built) == [DAMAGED]
+    assert warnings_of_process(device, built) == []  # the next process finds them whole
 
 
 @pytest.mark.seconds
 @pytest.mark.fault_row(59)
-def test_programs_of_a_dead_process_are_built_anew(device, built):
-    """The process before died: PoCL's files are there, cut by a full disk, and nobody has seen them work."""
+def test_kernels_without_a_record_are_built_anew_with_a_warning_once(device, built):
+    """As after a process that died: PoCL's files are there, cut by a full disk, and nobody has seen them work."""
     shutil.rmtree(built / "records")
-    cut(built)
-    assert run_child(device, built) == [UNFINISHED]
-    assert run_child(device, built) == []
+    cut_programs(built)
+    assert warnings_of_process(device, built) == [UNFINISHED]
+    assert warnings_of_process(device, built) == []
 
 
 @pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.fault_row(59)
-def test_a_process_that_dies_leaves_no_record(device, tmp_path):
+def test_kernels_of_a_process_that_was_killed_are_not_recorded_and_the_next_warns(device, tmp_path):
     if not is_pocl(device.platform):
         pytest.skip("this driver does not end the process")
-    run_child(device, tmp_path / "clrecon", end="killed")
-    assert files_of(tmp_path / "clrecon", ".bc") and not list((tmp_path / "clrecon" / "records").iterdir())
-    assert run_child(device, tmp_path) == [UNFINISHED]
+    warnings_of_process(device, tmp_path / "clrecon", end="killed")
+    assert files_of(tmp_path / "clrecon", ".bc")
+    assert list((tmp_path / "clrecon" / "records").iterdir()) == []
+    assert warnings_of_process(device, tmp_path) == [UNFINISHED]
 
 
-# Without a driver: a folder with files as PoCL writes them
+# Without a driver: a folder with files as PoCL writes them, and records of those that worked
 
 
 KEY, PROGRAM = "a" * 64, "AB/CDEFG"
+"""The key of a source with its options, and the folder in which PoCL keeps what it built from them."""
+KERNEL = f"{PROGRAM}/scan/64/scan.so"
 
 
 @pytest.fixture
-def records(tmp_path, monkeypatch):
-    """Makes a `KnownGood` as in a new process, with no end of it but `record`."""
+def new_process(tmp_path, monkeypatch):
+    """Makes the `KnownGood` of a new process; the earlier process has ended, and what it has not recorded is lost."""
     monkeypatch.setattr(pocl.atexit, "register", lambda call: None)
     made: list[KnownGood] = []
 
@@ -132,157 +136,200 @@ def records(tmp_path, monkeypatch):
     return make
 
 
-def touch(folder, kernel=b"kernel"):
-    program = folder / PROGRAM
-    (program / "scan" / "64").mkdir(parents=True, exist_ok=True)
-    (program / "last_accessed").write_bytes(b"")
-    if not (program / "program.bc").exists():
-        (program / "program.bc").write_bytes(b"program")
-    if not (program / "scan" / "64" / "scan.so").exists():
-        (program / "scan" / "64" / "scan.so").write_bytes(kernel)
+def write_program(folder, program=PROGRAM):
+    """Write the files of a program and its kernel as PoCL does, those that are not there."""
+    (folder / program / "scan" / "64").mkdir(parents=True, exist_ok=True)
+    (folder / program / "last_accessed").write_bytes(b"")
+    for name in ("program.bc", "scan/64/scan.so"):
+        path = folder / program / name
+        if not path.exists():
+            path.write_bytes(b"built")
 
 
-def build(store, tmp_path):
+def build_program(store, folder, program=PROGRAM):
+    """Build a program as PoCL does; returns whether it was still there, and need not be built."""
     with store.building(KEY):
-        is_there = (tmp_path / PROGRAM).exists()
-        touch(tmp_path)
+        is_there = (folder / program).exists()
+        write_program(folder, program)
     return is_there
 
 
-def test_programs_that_worked_are_used_again(records, tmp_path):
-    store = records()
-    assert not build(store, tmp_path)
-    store.record()
-    store = records()
-    assert build(store, tmp_path) and store.warnings == []
+def recorded_programs(folder):
+    return set(json.loads((folder / "records" / KEY).read_bytes()))
 
 
-def test_a_copy_of_the_folder_is_as_good(records, tmp_path):
-    store = records()
-    build(store, tmp_path)
+@pytest.fixture
+def recorded_folder(new_process, tmp_path):
+    """A folder in which a process has built a program and recorded it."""
+    store = new_process()
+    assert not build_program(store, tmp_path)
     store.record()
-    for path in tmp_path.rglob("*.*"):
+    return tmp_path
+
+
+def test_program_that_an_earlier_process_recorded_is_used(new_process, recorded_folder):
+    store = new_process()
+    assert build_program(store, recorded_folder)
+    assert store.warnings == []
+
+
+def test_recorded_program_is_used_after_the_times_of_its_files_changed(new_process, recorded_folder):
+    """As in a copy of the folder."""
+    for path in recorded_folder.rglob("*.*"):
         os.utime(path)
-    store = records()
-    assert build(store, tmp_path) and store.warnings == []
+    store = new_process()
+    assert build_program(store, recorded_folder)
+    assert store.warnings == []
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b'{"AB/CDEFG": {"program.bc": [1]}}', b"\xff{"])
-def test_a_record_that_cannot_be_read_is_none(content, records, tmp_path):
-    store = records()
-    build(store, tmp_path)
+def test_program_whose_record_cannot_be_read_is_built_anew_with_a_warning(content, new_process, recorded_folder):
+    (recorded_folder / "records" / KEY).write_bytes(content)
+    store = new_process()
+    assert not build_program(store, recorded_folder)
+    assert store.warnings == [UNFINISHED]
+
+
+def test_kernel_that_the_process_builds_after_its_record_is_recorded_too(new_process, tmp_path):
+    store = new_process()
+    build_program(store, tmp_path)
     store.record()
-    (tmp_path / "records" / KEY).write_bytes(content)
-    store = records()
-    assert not build(store, tmp_path) and store.warnings == [UNFINISHED]
-
-
-def test_files_that_were_added_later_are_recorded_by_the_process_that_made_them(records, tmp_path):
-    store = records()
-    build(store, tmp_path)
+    (tmp_path / PROGRAM / "scan" / "128.so").write_bytes(b"kernel for larger groups")
     store.record()
-    added = tmp_path / PROGRAM / "scan" / "128.so"
-    added.write_bytes(b"kernel")
-    store.record()
-    store = records()
-    assert build(store, tmp_path) and store.warnings == []
-    (tmp_path / PROGRAM / "scan" / "256.so").write_bytes(b"of a process that died")
-    store = records()
-    assert not build(store, tmp_path) and store.warnings == [UNFINISHED]
+
+    store = new_process()
+    assert build_program(store, tmp_path)
+    assert store.warnings == []
 
 
-def test_two_environments_keep_their_programs_of_the_same_text(records, tmp_path, monkeypatch):
+def test_kernel_that_no_process_recorded_makes_its_program_built_anew_with_a_warning(new_process, recorded_folder):
+    (recorded_folder / PROGRAM / "scan" / "256.so").write_bytes(b"of a process that died")
+    store = new_process()
+    assert not build_program(store, recorded_folder)
+    assert store.warnings == [UNFINISHED]
+
+
+def test_record_keeps_the_programs_that_two_environments_build_from_the_same_source(new_process, tmp_path):
     for program in (PROGRAM, "AB/OF_ANOTHER", PROGRAM, "AB/OF_ANOTHER"):
-        monkeypatch.setitem(globals(), "PROGRAM", program)
-        for path in tmp_path.rglob("*.bc"):
-            os.utime(path, (1, 1))
-        for path in tmp_path.rglob("last_accessed"):
-            os.utime(path, (1, 1))
-        store = records()
-        build(store, tmp_path)
+        for path in (*tmp_path.rglob("*.bc"), *tmp_path.rglob("last_accessed")):
+            os.utime(path, (1, 1))  # not used since
+        store = new_process()
+        build_program(store, tmp_path, program)
         store.record()
         assert store.warnings == []
-    assert json.loads((tmp_path / "records" / KEY).read_bytes()).keys() == {PROGRAM, "AB/OF_ANOTHER", "AB/CDEFG"}
+    assert recorded_programs(tmp_path) == {PROGRAM, "AB/OF_ANOTHER"}
 
 
-def test_programs_built_beside_by_another_process_do_not_stay_in_a_record(records, tmp_path):
-    store = records()
+def test_record_drops_the_program_that_another_process_has_built_at_the_same_time(new_process, tmp_path):
+    """A program that appears during a build may belong to it, until the record of another key has it."""
+    store = new_process()
     with store.building(KEY):
-        touch(tmp_path)
+        write_program(tmp_path)
         (tmp_path / "AB" / "OTHER").mkdir()
         (tmp_path / "AB" / "OTHER" / "program.bc").write_bytes(b"of another process")
     store.record()
-    assert json.loads((tmp_path / "records" / KEY).read_bytes()).keys() == {PROGRAM, "AB/OTHER"}
+    assert recorded_programs(tmp_path) == {PROGRAM, "AB/OTHER"}
     (tmp_path / "records" / ("b" * 64)).write_text(json.dumps({"AB/OTHER": {"program.bc": [1, 1, "of its own"]}}))
     os.utime(tmp_path / "AB" / "OTHER" / "program.bc", (1, 1))
-    (tmp_path / "AB" / "LATER").mkdir()
-    store = records()
-    with store.building(KEY):
-        touch(tmp_path)
-        (tmp_path / "AB" / "LATER" / "program.bc").write_bytes(b"of another process too")
+
+    store = new_process()
+    build_program(store, tmp_path)
     store.record()
-    assert json.loads((tmp_path / "records" / KEY).read_bytes()).keys() == {PROGRAM}
+
+    assert recorded_programs(tmp_path) == {PROGRAM}
 
 
-def test_program_that_turned_out_wrong_is_forgotten(records, tmp_path):
-    store = records()
-    build(store, tmp_path)
+def test_program_that_appears_while_a_recorded_one_is_used_is_not_recorded(new_process, recorded_folder):
+    (recorded_folder / "AB" / "LATER").mkdir()
+    store = new_process()
+    with store.building(KEY):
+        write_program(recorded_folder)
+        (recorded_folder / "AB" / "LATER" / "program.bc").write_bytes(b"of another process")
+    store.record()
+    assert recorded_programs(recorded_folder) == {PROGRAM}
+
+
+def test_forgotten_program_is_built_anew_in_silence(new_process, tmp_path):
+    """A program is forgotten when it computes wrongly."""
+    store = new_process()
+    build_program(store, tmp_path)
     store.record()
     store.forget(KEY)
     store.record()
-    store = records()
-    assert not build(store, tmp_path) and store.warnings == []
+
+    store = new_process()
+    assert not build_program(store, tmp_path)
+    assert store.warnings == []
 
 
-def test_a_folder_that_is_removed_meanwhile_is_no_error(records, tmp_path):
-    store = records()
+def test_building_and_recording_in_a_removed_folder_raise_no_error(new_process, tmp_path):
+    store = new_process()
     shutil.rmtree(tmp_path)
-    assert not build(store, tmp_path)
+    assert not build_program(store, tmp_path)
     store.record()
 
 
-def test_program_that_another_process_builds_stays(records, tmp_path):
-    touch(tmp_path)
-    store = records()
-    other = os.open(tmp_path / "in-use", os.O_RDWR)
+@contextmanager
+def another_process_at_work(folder):
+    """Another process builds programs in this folder: it holds the lock of those that use it."""
+    handle = os.open(folder / "in-use", os.O_RDWR)
     try:
-        pocl.fcntl.flock(other, pocl.fcntl.LOCK_SH)
-        assert build(store, tmp_path) and store.warnings == []
-        (tmp_path / "tempfile_abc.so").write_bytes(b"")
-        records()
-        assert (tmp_path / "tempfile_abc.so").exists()
+        pocl.fcntl.flock(handle, pocl.fcntl.LOCK_SH)
+        yield
     finally:
-        os.close(other)
-    records()
-    assert not (tmp_path / "tempfile_abc.so").exists()
+        os.close(handle)
+
+
+def test_program_without_a_record_is_kept_while_another_process_is_at_work(new_process, tmp_path):
+    write_program(tmp_path)
+    store = new_process()
+    with another_process_at_work(tmp_path):
+        assert build_program(store, tmp_path)
+    assert store.warnings == []
+
+
+def test_temporary_files_are_removed_once_no_other_process_is_at_work(new_process, tmp_path):
+    new_process()
+    temporary = tmp_path / "tempfile_abc.so"
+    temporary.write_bytes(b"")
+    with another_process_at_work(tmp_path):
+        new_process()
+        assert temporary.exists()
+    new_process()
+    assert not temporary.exists()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
-@pytest.mark.parametrize("is_shared", [True, False])
-def test_program_that_another_process_replaces_is_built_again_in_silence(is_shared, records, tmp_path):
-    """Two processes build one program; the first has recorded its files when the second replaces them."""
-    store = records()
-    build(store, tmp_path)
-    store.record()
-    store = records()
-    other = KnownGood(tmp_path)
-    try:
-        (tmp_path / PROGRAM / "scan" / "64" / "scan.so").write_bytes(b"of the second process")
-        if not is_shared:
-            os.close(other._handle)
-        assert not build(store, tmp_path) and store.warnings == ([] if is_shared else [DAMAGED])
-    finally:
-        if is_shared:
-            os.close(other._handle)
-    store.record()
-    store = records()
-    assert build(store, tmp_path) and store.warnings == []
+@pytest.mark.parametrize(
+    ("is_other_at_work", "warnings"), [(True, []), (False, [DAMAGED])], ids=["by another process", "by nobody"]
+)
+def test_kernel_that_was_replaced_is_built_anew_with_a_warning_if_no_other_process_is_at_work(
+    is_other_at_work, warnings, new_process, recorded_folder
+):
+    store = new_process()
+    (recorded_folder / KERNEL).write_bytes(b"of another process")
+    with another_process_at_work(recorded_folder) if is_other_at_work else nullcontext():
+        assert not build_program(store, recorded_folder)
+    assert store.warnings == warnings
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
-def test_a_process_that_asked_in_vain_still_counts(records, tmp_path):
+def test_program_built_anew_after_another_process_replaced_it_is_recorded(new_process, recorded_folder):
+    store = new_process()
+    (recorded_folder / KERNEL).write_bytes(b"of another process")
+    with another_process_at_work(recorded_folder):
+        build_program(store, recorded_folder)
+    store.record()
+
+    store = new_process()
+    assert build_program(store, recorded_folder)
+    assert store.warnings == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
+def test_two_processes_that_each_asked_whether_they_are_alone_still_see_each_other(new_process, tmp_path):
     """A lock that cannot be made exclusive is lost: it has to be taken again."""
-    first, second = records(), KnownGood(tmp_path)
+    first, second = new_process(), KnownGood(tmp_path)
     try:
         assert not second._is_alone()
         assert not first._is_alone()
@@ -291,9 +338,9 @@ def test_a_process_that_asked_in_vain_still_counts(records, tmp_path):
     assert first._is_alone()
 
 
-def test_a_long_process_records_what_has_worked_for_some_seconds(records, tmp_path, monkeypatch):
-    store = records()
-    build(store, tmp_path)
+def test_process_records_its_programs_before_its_end_only_after_some_seconds(new_process, tmp_path, monkeypatch):
+    store = new_process()
+    build_program(store, tmp_path)
     store.record_when_due()
     assert not (tmp_path / "records" / KEY).exists()
     monkeypatch.setattr(pocl.time, "perf_counter", lambda: float("inf"))
