@@ -1,4 +1,4 @@
-"""Choosing a device: by name, by environment, by rank; never a simulator silently."""
+"""Choosing a device: by name, by environment, by rank; never a simulator without a warning."""
 
 from __future__ import annotations
 
@@ -46,9 +46,8 @@ def machine(monkeypatch):
     return devices
 
 
-def test_the_best_is_a_gpu_with_most_memory(machine):
-    assert choose_device().name == "H200"
-    assert choose_device("auto").name == "H200"
+def test_gpu_with_most_memory_is_chosen_when_none_is_named(machine):
+    assert [choose_device().name, choose_device("auto").name] == ["H200", "H200"]
 
 
 @pytest.mark.parametrize(
@@ -57,34 +56,43 @@ def test_the_best_is_a_gpu_with_most_memory(machine):
      ("nvidia", "H200"), ("cpu", "pthread-Xeon"),
      ("gpu", "H200"), ("llvmpipe", "llvmpipe"), ("oclgrind", "Oclgrind Simulator"), ("0", "Oclgrind Simulator")],
 )  # fmt: skip
-def test_a_device_is_found_by_index_type_or_part_of_its_name(machine, wanted, name):
+def test_device_is_chosen_by_index_type_or_part_of_its_name(machine, wanted, name):
     assert choose_device(wanted).name == name
 
 
-def test_the_environment_names_a_device_and_the_argument_wins(machine, monkeypatch):
+def test_device_named_by_the_environment_is_chosen(machine, monkeypatch):
     monkeypatch.setenv("CLRECON_DEVICE", "radeon")
     assert choose_device().name == "Radeon"
+
+
+def test_device_named_by_the_argument_is_chosen_over_that_of_the_environment(machine, monkeypatch):
+    monkeypatch.setenv("CLRECON_DEVICE", "radeon")
     assert choose_device("cpu").name == "pthread-Xeon"
 
 
 @pytest.mark.parametrize("wanted", ["9", "geforce", "²"])
-def test_a_device_that_is_not_there_lists_what_is(machine, wanted, monkeypatch):
+def test_unknown_device_is_refused_with_a_list_of_the_devices(machine, wanted):
     with refused(DeviceError, wanted, "Radeon", 2):
         choose_device(wanted)
+
+
+@pytest.mark.parametrize("wanted", ["9", "geforce", "²"])
+def test_unknown_device_of_the_environment_is_refused_with_the_name_of_the_variable(machine, wanted, monkeypatch):
     monkeypatch.setenv("CLRECON_DEVICE", wanted)
-    with refused(DeviceError, "CLRECON_DEVICE"):
+    with refused(DeviceError, "CLRECON_DEVICE", wanted):
         choose_device()
 
 
-def test_a_simulator_is_never_chosen_silently(machine, monkeypatch):
-    monkeypatch.setattr(select, "list_devices", lambda: machine[:1])
-    with refused(DeviceError, "Oclgrind", "Simulator", 0):
+def test_simulator_is_not_chosen_unless_it_is_named(machine, monkeypatch):
+    simulator = machine[0]
+    monkeypatch.setattr(select, "list_devices", lambda: [simulator])
+    with refused(DeviceError, "Oclgrind", "Simulator", simulator.index):
         choose_device()
-    assert choose_device("oclgrind").is_simulator
+    assert choose_device("oclgrind") is simulator
 
 
 @pytest.mark.parametrize(
-    ("wanted", "variables", "is_told"),
+    ("wanted", "variables", "has_warning"),
     [
         ("oclgrind", {}, False),
         ("simulator", {}, False),
@@ -98,133 +106,250 @@ def test_a_simulator_is_never_chosen_silently(machine, monkeypatch):
     ],
 )
 @pytest.mark.fault_row(50)
-def test_a_simulator_that_nobody_named_is_told(machine, wanted, variables, is_told, monkeypatch):
+def test_simulator_chosen_by_its_index_alone_has_a_warning(machine, wanted, variables, has_warning, monkeypatch):
     for name, text in variables.items():
         monkeypatch.setenv(name, text)
-    context = SimpleNamespace(devices=["Oclgrind Simulator"])
+    context = SimpleNamespace(devices=["Oclgrind Simulator"])  # what pyopencl makes of PYOPENCL_CTX
     monkeypatch.setattr(import_pyopencl(), "create_some_context", lambda interactive: context)
+
     chosen = choose_device(wanted)
+
     assert chosen.is_simulator
-    assert ["is a simulator" in text for text in chosen.warnings] == [True] * is_told
+    assert ["is a simulator" in warning for warning in chosen.warnings] == [True] * has_warning
 
 
-def test_a_device_that_cannot_work_is_passed_over(machine):
+@pytest.mark.parametrize("wanted", [None, "gpu"])
+def test_device_with_a_shortcoming_is_passed_over_for_the_next_best(machine, wanted):
     machine[3].shortcoming = "it has no compiler"
-    assert choose_device().name == "Radeon"
-    assert choose_device("gpu").name == "Radeon"
-    with refused(DeviceError, "H200", "NVIDIA"):
+    assert choose_device(wanted).name == "Radeon"
+
+
+def test_device_with_a_shortcoming_is_refused_when_it_is_named(machine):
+    machine[3].shortcoming = "it has no compiler"
+    with refused(DeviceError, "H200", "NVIDIA", "compiler"):
         choose_device("h200")
 
 
+@pytest.fixture
+def wrong_h200(machine, monkeypatch):
+    """The machine, after an earlier check has found that its H200 computes wrongly."""
+    monkeypatch.setattr(select, "remembered_fault", lambda device: "wrong sums" if device.name == "H200" else "")
+    return machine
+
+
 @pytest.mark.fault_row(57)
-def test_what_is_remembered_chooses_the_device_that_is_shown(machine, monkeypatch):
-    found = {"H200": "wrong sums"}
-    monkeypatch.setattr(select, "remembered_fault", lambda device: found.get(device.name, ""))
+def test_device_with_a_remembered_fault_is_passed_over(wrong_h200):
     assert select.choose_remembered().name == "Radeon"
-    assert select.choose_remembered("h200").name == select.choose_remembered("gpu").name == "H200"
-    found.update({device.name: "wrong sums" for device in machine})
-    assert select.choose_remembered().name == "H200"  # none is better
-
-
-def test_the_choice_is_explained(machine, monkeypatch):
-    monkeypatch.setattr(select, "remembered_fault", lambda device: "")
-    assert select.explain_choice() == "before 2: it has more memory"
-    assert select.explain_choice("gpu") == "named, before 2: it has more memory"
-    assert select.explain_choice("radeon") == "named, no other one"
-    radeon = machine[2]
-    for at, value, why in ((3, (2,), "its driver is newer"), (2, 2, "it has more compute units"),
-                           (1, True, "it has memory of its own")):  # fmt: skip
-        radeon.score = (*radeon.score[:at], value, *radeon.score[at + 1 :])
-        assert select.explain_choice() == f"before 3: {why}"
-    del machine[2:4]
-    monkeypatch.setattr(select, "list_devices", lambda: machine)
-    assert select.explain_choice() == "before 4: GPUs come before accelerators, CPUs and software"
-    monkeypatch.setattr(select, "remembered_fault", lambda device: "wrong sums" if device.index == 4 else "")
-    assert select.explain_choice() == "no other one"
 
 
 @pytest.mark.fault_row(57)
-def test_a_device_that_computes_wrongly_is_passed_over_or_refused(machine, monkeypatch):
-    machine[3].fault = "7 of 9 vertices of a ball lie beside it"
-    assert choose_device().name == "Radeon"
-    words = "H200 (NVIDIA CUDA) is not used, it computes wrongly: 7 of 9 vertices of a ball lie beside it"
-    assert machine[2].warnings == [words]
-    assert select.choose_unchecked().name == "H200"
-    for named in ("h200", "gpu", 3):
-        with pytest.raises(DeviceError, match=f"^{re.escape(words)}: update its driver or choose another") as caught:
-            choose_device(named)
-        assert caught.value.exit_code == 5
-    monkeypatch.setenv("CLRECON_DEVICE", "h200")
-    with pytest.raises(DeviceError, match="computes wrongly"):
-        choose_device()
-    monkeypatch.delenv("CLRECON_DEVICE")
-    for other in machine:
-        other.fault = "every normal of a ball points elsewhere"
-    with pytest.raises(DeviceError, match=r"^H200 .*; Radeon .*; pthread-Xeon .*; llvmpipe .*: update its driver"):
-        choose_device()
+@pytest.mark.parametrize("wanted", ["h200", "gpu"])
+def test_device_with_a_remembered_fault_is_chosen_when_it_or_its_type_is_named(wrong_h200, wanted):
+    assert select.choose_remembered(wanted).name == "H200"
+
+
+@pytest.mark.fault_row(57)
+def test_best_device_is_chosen_when_all_have_remembered_faults(machine, monkeypatch):
+    monkeypatch.setattr(select, "remembered_fault", lambda device: "wrong sums")
+    assert select.choose_remembered().name == "H200"
+
+
+MEMORY_OF_ITS_OWN, COMPUTE_UNITS, DRIVER = 1, 2, 3
+"""Places in the score of a device."""
+
+
+@pytest.fixture
+def faultless(machine, monkeypatch):
+    """The machine, with no remembered fault."""
+    monkeypatch.setattr(select, "remembered_fault", lambda device: "")
+    return machine
 
 
 @pytest.mark.parametrize(
-    ("changed", "says"),
+    ("wanted", "explanation"),
+    [
+        (None, "before 2: it has more memory"),
+        ("gpu", "named, before 2: it has more memory"),
+        ("radeon", "named, no other one"),
+    ],
+)
+def test_choice_is_explained_by_the_next_best_device_and_whether_it_was_named(faultless, wanted, explanation):
+    assert select.explain_choice(wanted) == explanation
+
+
+@pytest.mark.parametrize(
+    ("place", "better", "explanation"),
+    [
+        (DRIVER, (2,), "before 3: its driver is newer"),
+        (COMPUTE_UNITS, 2, "before 3: it has more compute units"),
+        (MEMORY_OF_ITS_OWN, True, "before 3: it has memory of its own"),
+    ],
+    ids=["newer driver", "more compute units", "own memory"],
+)
+def test_choice_is_explained_by_the_part_of_the_score_that_is_better(faultless, place, better, explanation):
+    radeon = faultless[2]
+    radeon.score = (*radeon.score[:place], better, *radeon.score[place + 1 :])
+    assert select.explain_choice() == explanation
+
+
+def test_choice_of_a_cpu_before_a_rasteriser_is_explained_by_their_types(faultless, monkeypatch):
+    _, cpu, _, _, rasteriser = faultless
+    monkeypatch.setattr(select, "list_devices", lambda: [cpu, rasteriser])
+    assert select.explain_choice() == "before 4: GPUs come before accelerators, CPUs and software"
+
+
+def test_device_with_a_remembered_fault_is_no_other_one_in_the_explanation(machine, monkeypatch):
+    _, cpu, _, _, rasteriser = machine
+    monkeypatch.setattr(select, "list_devices", lambda: [cpu, rasteriser])
+    monkeypatch.setattr(select, "remembered_fault", lambda device: "wrong sums" if device is rasteriser else "")
+    assert select.explain_choice() == "no other one"
+
+
+H200_IS_WRONG = "H200 (NVIDIA CUDA) is not used, it computes wrongly: 7 of 9 vertices of a ball lie beside it"
+
+
+@pytest.fixture
+def faulty_h200(machine):
+    """The machine, whose H200 has failed the check at first use."""
+    machine[3].fault = "7 of 9 vertices of a ball lie beside it"
+    return machine
+
+
+@pytest.mark.fault_row(57)
+def test_device_that_computes_wrongly_is_passed_over_with_a_warning(faulty_h200):
+    chosen = choose_device()
+    assert chosen.name == "Radeon"
+    assert chosen.warnings == [H200_IS_WRONG]
+
+
+@pytest.mark.fault_row(57)
+def test_device_that_computes_wrongly_is_chosen_by_what_does_not_check_devices(faulty_h200):
+    assert select.choose_unchecked().name == "H200"
+
+
+@pytest.mark.fault_row(57)
+@pytest.mark.parametrize("wanted", ["h200", "gpu", 3])
+def test_device_that_computes_wrongly_is_refused_when_it_or_its_type_is_named(faulty_h200, wanted):
+    words = f"^{re.escape(H200_IS_WRONG)}: update its driver or choose another"
+    with pytest.raises(DeviceError, match=words) as caught:
+        choose_device(wanted)
+    assert caught.value.exit_code == 5
+
+
+@pytest.mark.fault_row(57)
+def test_device_that_computes_wrongly_is_refused_when_the_environment_names_it(faulty_h200, monkeypatch):
+    monkeypatch.setenv("CLRECON_DEVICE", "h200")
+    with refused(DeviceError, "H200", 7, 9):
+        choose_device()
+
+
+@pytest.mark.fault_row(57)
+def test_all_devices_are_refused_by_name_where_all_compute_wrongly(machine):
+    for each in machine:
+        each.fault = "every normal of a ball points elsewhere"
+    with refused(DeviceError, "H200", "Radeon", "pthread-Xeon", "llvmpipe"):
+        choose_device()
+
+
+WORKING = {
+    "available": 1,
+    "compiler_available": 1,
+    "version": "OpenCL 3.0 x",
+    "endian_little": sys.byteorder == "little",
+}
+"""Properties of a device without a shortcoming."""
+
+
+def test_working_device_has_no_shortcoming():
+    assert _find_shortcoming(SimpleNamespace(**WORKING)) == ""
+
+
+@pytest.mark.parametrize(
+    ("changed", "shortcoming"),
     [({"available": False}, "not available"), ({"compiler_available": False}, "no compiler"),
      ({"version": "OpenCL 1.1 x"}, "OpenCL 1.2 is needed"),
      ({"endian_little": sys.byteorder != "little"}, "byte order")],
 )  # fmt: skip
-def test_shortcomings_of_devices_are_named(changed, says):
-    good = {
-        "available": 1,
-        "compiler_available": 1,
-        "version": "OpenCL 3.0 x",
-        "endian_little": sys.byteorder == "little",
-    }
-    assert _find_shortcoming(SimpleNamespace(**good)) == ""
-    assert says in _find_shortcoming(SimpleNamespace(**{**good, **changed}))
+def test_shortcoming_of_a_device_is_named(changed, shortcoming):
+    assert shortcoming in _find_shortcoming(SimpleNamespace(**{**WORKING, **changed}))
 
 
-def test_no_device_says_how_to_get_a_driver(monkeypatch):
+def test_error_without_a_device_says_how_to_get_a_driver(monkeypatch):
     monkeypatch.setattr(select, "list_devices", lambda: [])
-    with refused(DeviceError, "OpenCL", "device"):
+    with refused(DeviceError, "OpenCL", "device", "install"):
         choose_device()
 
 
-def test_no_device_under_a_limit_of_memory_names_it(monkeypatch):
-    monkeypatch.setattr(select, "list_devices", list)
+def test_error_without_a_device_names_the_limit_of_memory_of_the_process(monkeypatch):
     resource = pytest.importorskip("resource")
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (2_500_000_000, resource.RLIM_INFINITY))
-    with refused(DeviceError, 2.5, "memory"):
+    limit_bytes = 2_500_000_000
+    monkeypatch.setattr(select, "list_devices", list)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (limit_bytes, resource.RLIM_INFINITY))
+    with refused(DeviceError, 2.5, "GB", "memory"):
         choose_device()
 
 
-def test_the_budget_names_the_buffer_that_is_too_large(machine):
-    cpu = machine[1]
-    assert check_budget(cpu, {"volume": 2**20, "mesh": 2**21}) == 3 * 2**20
+MIB = 2**20
+"""Messages about buffers count in MiB."""
+
+
+@pytest.fixture
+def cpu(machine):
+    """The CPU of the machine: 32,768 MiB of memory, 8,192 MiB in one buffer."""
+    return machine[1]
+
+
+def test_bytes_of_buffers_within_the_budget_are_added_up(cpu):
+    assert check_budget(cpu, {"volume": 1 * MIB, "mesh": 2 * MIB}) == 3 * MIB
+
+
+def test_buffer_larger_than_the_device_allows_is_refused_with_both_sizes(cpu):
     with refused(DeviceError, "volume", 8193, 8192):
-        check_budget(cpu, {"volume": 2**33 + 2**20})
-    parts = {f"part {n}": 2**33 for n in range(5)}
-    with refused(DeviceError, 40960, 8192, 32768):
-        check_budget(cpu, parts)
+        check_budget(cpu, {"volume": 8193 * MIB})
 
 
-def test_the_budget_names_the_limit_that_is_in_the_way(machine):
-    cpu = machine[1]
-    parts = {"volume": 2**20, "picture": 2**19}
-    with refused(DeviceError, 2, 1, 524288, 1000000):  # fmt: skip
-        check_budget(cpu, parts, 10**6)
-    with refused(DeviceError, 1, "MiB"):  # one buffer alone is over it
-        check_budget(cpu, {"volume": 2**22}, 2**20)
-    assert check_budget(cpu, parts, 2**21) == 3 * 2**19
-    huge = {f"part {n}": 2**33 for n in range(5)}
-    for memory in (10**6, 2**36):  # where the device has no room either, allowing more would not help
-        with refused(DeviceError, 32768, "MiB"):
-            check_budget(cpu, huge, memory)
+FIVE_LARGE_BUFFERS = {f"part {n}": 8192 * MIB for n in range(5)}
+
+
+def test_buffers_larger_than_the_device_together_are_refused_with_their_sum(cpu):
+    with refused(DeviceError, 5 * 8192, 8192, 32768):
+        check_budget(cpu, FIVE_LARGE_BUFFERS)
+
+
+def test_buffers_larger_than_the_allowed_memory_together_are_refused_with_the_limit(cpu):
+    with refused(DeviceError, 2, 1, 524288, 1000000):  # MiB, rounded up and down, and bytes of the picture and allowed
+        check_budget(cpu, {"volume": 1 * MIB, "picture": MIB // 2}, 1_000_000)
+
+
+def test_buffer_larger_than_the_allowed_memory_is_refused(cpu):
+    with refused(DeviceError, "volume", 4, 1, "MiB"):
+        check_budget(cpu, {"volume": 4 * MIB}, 1 * MIB)
+
+
+def test_buffers_within_the_allowed_memory_are_accepted(cpu):
+    assert check_budget(cpu, {"volume": 1 * MIB, "picture": MIB // 2}, 2 * MIB) == 3 * MIB // 2
+
+
+@pytest.mark.parametrize("allowed_bytes", [10**6, 2**36])
+def test_buffers_larger_than_the_device_are_refused_with_its_memory_whatever_is_allowed(cpu, allowed_bytes):
+    """To allow more would not help."""
+    with refused(DeviceError, 32768, "MiB"):
+        check_budget(cpu, FIVE_LARGE_BUFFERS, allowed_bytes)
+
+
+def test_devices_of_this_machine_are_numbered_in_their_order():
+    devices = list_devices()
+    assert [each.index for each in devices] == list(range(len(devices)))
 
 
 @pytest.mark.every_device
-def test_devices_of_this_machine_describe_themselves(device):
-    devices = list_devices()
-    assert [d.index for d in devices] == list(range(len(devices)))
+def test_device_of_this_machine_has_a_known_type_memory_and_a_listed_platform(device):
     facts = device.describe()
     assert facts["type"] in ("gpu", "accelerator", "cpu", "custom")
     assert facts["memory_bytes"] >= facts["max_allocation_bytes"] > 0
     assert device.platform in {platform["name"] for platform in list_platforms()}
+
+
+@pytest.mark.every_device
+def test_device_of_this_machine_is_chosen_by_its_index(device):
     assert choose_device(device.index) is device

@@ -175,7 +175,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     49: (
         "no platform or driver: refused with what to install",
         (
-            "opencl/test_select.py::test_no_device_says_how_to_get_a_driver",
+            "opencl/test_select.py::test_error_without_a_device_says_how_to_get_a_driver",
             "cli/test_commands.py::test_no_driver_says_how_to_get_one",
         ),
     ),
@@ -183,7 +183,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     51: (
         "no fp64, no images, small groups, 32-bit sizes, big endian: right, or refused in words",
         (
-            "opencl/test_select.py::test_shortcomings_of_devices_are_named",
+            "opencl/test_select.py::test_shortcoming_of_a_device_is_named",
             "operators/primitives/test_compaction.py::test_scan_on_devices_with_small_work_groups_equals_the_twin",
         ),
     ),
