@@ -27,22 +27,26 @@ VARIANTS = [
 """Options that change which kernels there are, or their arguments."""
 
 
-def scan_program(device):
-    return load_program(device, "primitives/scan.cl", {"SCAN_GROUP": str(device.group_size)})
+def sum_blocks_kernel(device):
+    """The kernel that adds up the counts of each block of 16 for a work-item of a group."""
+    return load_program(device, "primitives/scan.cl", {"SCAN_GROUP": str(device.group_size)})["sum_blocks"]
 
 
-def scan_buffers(device):
+def sum_blocks_arguments(device):
+    """The arguments of sum_blocks for the counts 0 to 49."""
     counts = np.arange(50, dtype=np.uint32)
-    return {"counts": upload(device, counts), "block_sums": allocate(device, 4), "n": 50}
+    return {"counts": upload(device, counts), "block_sums": allocate(device, 4), "n": len(counts)}
 
 
 @pytest.mark.every_device
-def test_arguments_are_passed_by_name_in_any_order(device):
-    buffers = scan_buffers(device)
-    backwards = dict(reversed(buffers.items()))
-    launch(device, scan_program(device)["sum_blocks"], device.group_size, **backwards)
-    sums = download(device, np.empty(1, np.uint32), buffers["block_sums"])
-    assert sums[0] == sum(range(min(50, 16 * device.group_size)))
+def test_kernel_takes_its_arguments_by_name_in_any_order(device):
+    arguments = sum_blocks_arguments(device)
+    backwards = dict(reversed(arguments.items()))
+    launch(device, sum_blocks_kernel(device), device.group_size, **backwards)
+
+    [block_sum] = download(device, np.empty(1, np.uint32), arguments["block_sums"])
+    counts_in_block = min(50, 16 * device.group_size)
+    assert block_sum == sum(range(counts_in_block))
 
 
 @pytest.mark.parametrize(
@@ -57,92 +61,111 @@ def test_arguments_are_passed_by_name_in_any_order(device):
         ({"counts": np.zeros(3)}, r"sum_blocks: counts is a buffer, not array"),
     ],
 )
-def test_a_wrong_argument_is_an_error_before_the_launch(device, change, message, monkeypatch):
-    kernel = scan_program(device)["sum_blocks"]
+def test_wrong_argument_is_refused_before_the_launch(device, change, message, monkeypatch):
+    kernel = sum_blocks_kernel(device)
     monkeypatch.setattr(kernel, "cl_kernel", None)  # a launch would call it
-    arguments = {name: value for name, value in {**scan_buffers(device), **change}.items() if value is not None}
+    arguments = {name: value for name, value in {**sum_blocks_arguments(device), **change}.items() if value is not None}
     with pytest.raises(TypeError, match=message):
         launch(device, kernel, device.group_size, **arguments)
 
 
-def test_a_trace_refuses_to_write_what_is_for_reading_alone(device, monkeypatch):
-    buffers = scan_buffers(device)
-    launch(device, scan_program(device)["sum_blocks"], device.group_size, **buffers)
+def test_launch_under_a_trace_refuses_an_input_buffer_as_output(device, monkeypatch):
     monkeypatch.setattr(device, "trace", lambda doing: None)
-    launch(device, scan_program(device)["sum_blocks"], device.group_size, **buffers)
-    buffers["block_sums"] = upload(device, np.zeros(1, np.uint32))
+    arguments = sum_blocks_arguments(device)
+    launch(device, sum_blocks_kernel(device), device.group_size, **arguments)  # its output was allocated
+
+    arguments["block_sums"] = upload(device, np.zeros(1, np.uint32))  # uploaded: to be read alone
     with refused(TypeError, "sum_blocks", "block_sums"):
-        launch(device, scan_program(device)["sum_blocks"], device.group_size, **buffers)
+        launch(device, sum_blocks_kernel(device), device.group_size, **arguments)
+
+
+def order_sum_volumes(device, **numbers):
+    """The arguments of the kernel sum_volumes as they are given to the driver, without its three buffers."""
+    kernel = load_program(device, "surface/label_masks.cl")["sum_volumes"]
+    buffers = {name: allocate(device, 4) for name in ("positions", "triangles", "sums")}
+    return kernel.order({**buffers, **numbers})[len(buffers) :]
 
 
 @pytest.mark.every_device
-def test_numbers_become_what_the_kernel_takes(device):
-    """The driver is given four bytes, whatever a number was."""
-    kernel = load_program(device, "surface/label_masks.cl")["sum_volumes"]
-    buffers = {name: allocate(device, 4) for name in ("positions", "triangles", "sums")}
-    ordered = kernel.order({**buffers, "centre": [1, 2.5, 3, 0], "triangle_count": 7, "triangles_per_sum": np.int64(9)})
-    assert ordered[3].dtype == np.float32
-    assert ordered[3].tolist() == [1, 2.5, 3, 0]
-    assert ordered[4:] == (7, 9)
-    assert {type(value) for value in ordered[4:]} == {np.uint32}
+def test_numbers_are_given_to_the_driver_as_the_types_of_the_kernel(device):
+    centre, triangle_count, triangles_per_sum = order_sum_volumes(
+        device, centre=[1, 2.5, 3, 0], triangle_count=7, triangles_per_sum=np.int64(9)
+    )
+    assert (centre.dtype, centre.tolist()) == (np.float32, [1, 2.5, 3, 0])
+    assert (type(triangle_count), triangle_count) == (np.uint32, 7)
+    assert (type(triangles_per_sum), triangles_per_sum) == (np.uint32, 9)
+
+
+def test_three_numbers_for_a_float4_are_refused(device):
     with refused(TypeError, "float4"):
-        kernel.order({**buffers, "centre": [1, 2, 3], "triangle_count": 7, "triangles_per_sum": 9})
+        order_sum_volumes(device, centre=[1, 2, 3], triangle_count=7, triangles_per_sum=9)
 
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)
-def test_the_hundredth_launch_gives_what_the_first_gives(device, dtype):
-    """After some launches pyopencl is told the types of all arguments."""
-    values = np.array([[0, 5], [7, 9], [3, 7], [1, 2]], dtype)
-    ranges = BrickRanges(upload(device, values), (1, 2, 2), np.dtype(dtype))
+def test_launches_after_pyopencl_knows_the_argument_types_give_what_the_first_gives(device, dtype):
+    lowest_and_highest = np.array([[0, 5], [7, 9], [3, 7], [1, 2]], dtype)
+    below, above, between = 0, 1, 2  # states of the four bricks at the iso value 7
+    ranges = BrickRanges(upload(device, lowest_and_highest), (1, 2, 2), np.dtype(dtype))
     found = []
     for _ in range(LAUNCHES_BEFORE_TYPES + 2):
         states = compare_bricks(device, ranges, np.dtype(dtype).type(7), 8, 0)
         found.append(download(device, np.empty(4, np.uint8), states.states_d).tolist())
-    assert found == [[0, 1, 2, 0]] * len(found)
+    assert found == [[below, above, between, below]] * (LAUNCHES_BEFORE_TYPES + 2)
 
 
 @pytest.mark.parametrize("name", kernel_files())
-def test_every_argument_can_be_named_in_python(name):
-    for options in VARIANTS:
-        for kernel, arguments in find_signatures(read_kernel_source(name), definitions_of(options)).items():
-            names = [argument.name for argument in arguments]
-            assert len(set(names)) == len(names), kernel
-            assert not [name for name in names if keyword.iskeyword(name)], kernel
+def test_every_kernel_argument_has_a_name_of_its_own_that_python_accepts(name):
+    signatures = [find_signatures(read_kernel_source(name), definitions_of(options)) for options in VARIANTS]
+    assert any(signatures), "there is no kernel in this file"
+    for kernel, arguments in (item for variant in signatures for item in variant.items()):
+        names = [argument.name for argument in arguments]
+        assert len(set(names)) == len(names), kernel
+        assert not any(keyword.iskeyword(name) for name in names), kernel
+
+
+def build_with_argument_info(device, source, options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return (
+            import_pyopencl()
+            .Program(device.context, source)
+            .build(["-cl-std=CL1.2", "-cl-kernel-arg-info", *device.build_options, *options])
+        )
+
+
+def arguments_by_compiler(kernel):
+    """The arguments of a built kernel, as the compiler of the device knows them."""
+    cl = import_pyopencl()
+    info, access, qualifiers = cl.kernel_arg_info, cl.kernel_arg_address_qualifier, cl.kernel_arg_type_qualifier
+    return tuple(
+        KernelArgument(
+            kernel.get_arg_info(n, info.NAME),
+            kernel.get_arg_info(n, info.TYPE_NAME).rstrip("*"),
+            (is_buffer := kernel.get_arg_info(n, info.ADDRESS_QUALIFIER) == access.GLOBAL),
+            is_buffer and not kernel.get_arg_info(n, info.TYPE_QUALIFIER) & qualifiers.CONST,
+        )
+        for n in range(kernel.num_args)
+    )
 
 
 @pytest.mark.release
 @pytest.mark.parametrize("options", daily(1, VARIANTS), ids=lambda options: " ".join(options) or "plain")
-def test_names_and_types_are_those_that_the_compiler_knows(options, device):
-    cl = import_pyopencl()
-    info, access, qualifiers = cl.kernel_arg_info, cl.kernel_arg_address_qualifier, cl.kernel_arg_type_qualifier
-    found, known = {}, {}
+def test_argument_names_and_types_read_from_sources_are_those_of_the_compiler(options, device):
+    by_reader, by_compiler = {}, {}
     for name in kernel_files():
         source = read_kernel_source(name)
         if options and not re.search(r"\b(?:" + "|".join(definitions_of(options[:1])) + r")\b", source):
-            continue
+            continue  # the same kernels as without options
         signatures = find_signatures(source, definitions_of(options))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            built = cl.Program(device.context, source).build(
-                ["-cl-std=CL1.2", "-cl-kernel-arg-info", *device.build_options, *options]
-            )
-        for kernel in built.all_kernels():
-            found[name, kernel.function_name] = signatures[kernel.function_name]
+        for kernel in build_with_argument_info(device, source, options).all_kernels():
+            by_reader[name, kernel.function_name] = signatures[kernel.function_name]
             try:
-                known[name, kernel.function_name] = tuple(
-                    KernelArgument(
-                        kernel.get_arg_info(n, info.NAME),
-                        kernel.get_arg_info(n, info.TYPE_NAME).rstrip("*"),
-                        (is_buffer := kernel.get_arg_info(n, info.ADDRESS_QUALIFIER) == access.GLOBAL),
-                        is_buffer and not kernel.get_arg_info(n, info.TYPE_QUALIFIER) & qualifiers.CONST,
-                    )
-                    for n in range(kernel.num_args)
-                )
-            except cl.Error as error:
+                by_compiler[name, kernel.function_name] = arguments_by_compiler(kernel)
+            except import_pyopencl().Error as error:
                 pytest.skip(f"{device.label} does not know the arguments of its kernels: {error}")
-    assert found == known
-    assert found
+    assert by_reader
+    assert by_reader == by_compiler
 
 
 SOURCE = """
@@ -187,7 +210,7 @@ __kernel void never(const int a) { }
         (("-DLANES=8", "-DNAMED", "-DWIDE", "-cl-mad-enable"), "data:long* count:long place:float4"),
     ],
 )
-def test_signatures_follow_the_preprocessor(options, expected):
+def test_kernel_arguments_are_those_that_the_preprocessor_leaves(options, expected):
     signatures = find_signatures(SOURCE, definitions_of(options))
     assert list(signatures) == ["work"]
     arguments = [f"{each.name}:{each.type}{'*' * each.is_buffer}" for each in signatures["work"]]
@@ -202,7 +225,7 @@ def test_signatures_follow_the_preprocessor(options, expected):
         ("(SIZE + 1) / 3 <= 3", True), ("7 / 2 == 3", True), ("defined SIZE && (MISSING || 1)", True),
     ],
 )  # fmt: skip
-def test_conditions_are_those_of_c(condition, holds):
+def test_kernel_in_a_condition_is_found_where_the_condition_holds_in_c(condition, holds):
     source = f"#if {condition}\n__kernel void work(const int a) {{}}\n#endif\n"
     assert list(find_signatures(source, {"SIZE": "8"})) == (["work"] if holds else [])
 
@@ -219,6 +242,6 @@ def test_conditions_are_those_of_c(condition, holds):
         "__kernel void work(unsigned long long a) {}\n",
     ],
 )
-def test_signature_that_its_reader_does_not_know_is_an_error(source):
+def test_source_that_the_reader_of_signatures_does_not_understand_is_refused(source):
     with pytest.raises(ValueError, match=r"#if|#warning|macros that name themselves|a type and a name"):
         find_signatures(source, {})

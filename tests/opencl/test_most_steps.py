@@ -1,4 +1,4 @@
-"""After how many steps the loops of a work-item end: what `Device.most_steps` says is so."""
+"""After how many steps a driver ends the loops of a work-item: `Device.most_steps` knows it."""
 
 from __future__ import annotations
 
@@ -20,17 +20,23 @@ __kernel void count_steps(__global uint *restrict counts, const uint steps)
 """
 
 
-def count_steps(device, steps):
-    """Return how often a work-item of count_steps goes round, for odd and even steps together."""
+def run_loop(device, steps):
+    """Return how many steps of a loop of `steps`, an even number, a work-item makes."""
     cl = import_pyopencl()
     counts_d = allocate(device, 8)
     cl.enqueue_copy(device.queue, raw(counts_d), np.array([0, 0], np.uint32))
     kernel = cl.Program(device.context, SOURCE).build().count_steps
     kernel(device.queue, (1,), (1,), raw(counts_d), np.uint32(steps))
-    return 2 * int(download(device, np.empty(2, np.uint32), counts_d)[1])
+    odd_steps = int(download(device, np.empty(2, np.uint32), counts_d)[1])
+    return 2 * odd_steps
 
 
 @pytest.mark.every_device
-def test_loops_end_where_the_device_says(device):
-    assert count_steps(device, 20_000) == 20_000
-    assert (count_steps(device, 200_000) == 200_000) == (device.most_steps is None)
+def test_loop_of_20000_steps_is_run_to_its_end_on_every_device(device):
+    assert run_loop(device, 20_000) == 20_000
+
+
+@pytest.mark.every_device
+def test_loop_of_200000_steps_is_cut_short_only_on_devices_that_have_most_steps(device):
+    is_run_to_its_end = run_loop(device, 200_000) == 200_000
+    assert is_run_to_its_end == (device.most_steps is None)
