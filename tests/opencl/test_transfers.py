@@ -1,11 +1,11 @@
 """Transfers to devices with memory of their own, their buffers, and what a surface and a picture ask of the driver.
 
-Devices that work in numpy's memory are told that they do not: the way of a graphics card is then taken on any."""
+The device of the tests is treated as one whose memory is its own, as a graphics card's is, also where it works in
+numpy's memory."""
 
 from __future__ import annotations
 
 import gc
-import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -20,8 +20,8 @@ from clrecon.rendering.pictures.styles import Projection, VolumeLook
 
 
 @pytest.fixture
-def apart(device, monkeypatch):
-    """A device whose memory is its own."""
+def card(device, monkeypatch):
+    """The device as a graphics card: its memory is its own."""
     if device.is_simulator:
         pytest.skip("simulators take the driver's way, which checks more")
     monkeypatch.setattr(device, "shares_host_memory", False)
@@ -30,74 +30,89 @@ def apart(device, monkeypatch):
 
 
 def make_ball(size):
+    """A ball in a cube of `size` voxels a side, whose surface is at 0 HU."""
     axis = np.arange(size) - (size - 1) / 2
     distance = np.sqrt(axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2)
     voxels = np.rint(30.0 * (size * 0.35 - distance)).clip(-1000, 1500).astype(np.int16)
     return clrecon.Volume(voxels, np.diag((0.7, 0.5, 2.5, 1.0)))
 
 
-def numbers(size, seed=0):
+def random_bytes(size, seed=0):
     return np.random.default_rng(seed).integers(0, 256, size).astype(np.uint8)
 
 
+TRANSFER_SIZES = {
+    "one byte": 1,
+    "100 bytes": 100,
+    "largest copied by the driver": LEAST_BYTES - 1,
+    "smallest sent in pieces": LEAST_BYTES,
+    "one piece": PIECE_BYTES,
+    "one piece and a byte": PIECE_BYTES + 1,
+    "more pieces than there are": (PIECES + 3) * PIECE_BYTES + 17,
+}
+
+
 @pytest.mark.every_device
-@pytest.mark.parametrize(
-    "size", [1, 100, LEAST_BYTES - 1, LEAST_BYTES, PIECE_BYTES, PIECE_BYTES + 1, (PIECES + 3) * PIECE_BYTES + 17]
-)
-def test_arrays_come_back_from_the_device_unchanged(apart, size):
-    array = numbers(size)
-    array_d = upload(apart, array)
-    assert np.array_equal(download(apart, np.empty_like(array), array_d), array)
-    tail = np.empty(size - size // 3, np.uint8)
-    assert np.array_equal(download(apart, tail, array_d, size // 3), array[size // 3 :])
+@pytest.mark.parametrize("size", TRANSFER_SIZES.values(), ids=TRANSFER_SIZES)
+def test_array_comes_back_from_a_card_unchanged(card, size):
+    array = random_bytes(size)
+    array_d = upload(card, array)
+    assert np.array_equal(download(card, np.empty_like(array), array_d), array)
+
+
+@pytest.mark.every_device
+@pytest.mark.parametrize("size", TRANSFER_SIZES.values(), ids=TRANSFER_SIZES)
+def test_last_two_thirds_of_an_array_are_read_from_a_card(card, size):
+    array = random_bytes(size)
+    start = size // 3
+    tail = np.empty(size - start, np.uint8)
+    assert np.array_equal(download(card, tail, upload(card, array), start), array[start:])
 
 
 @pytest.mark.parametrize("size", [1000, 3 * PIECE_BYTES])
-def test_an_array_may_change_after_its_upload(apart, size):
-    array = numbers(size)
-    kept = array.copy()
-    array_d = upload(apart, array)
+def test_array_that_changes_after_its_upload_stays_as_it_was_on_the_card(card, size):
+    array = random_bytes(size)
+    before = array.copy()
+    array_d = upload(card, array)
     array[:] = 0
-    assert np.array_equal(download(apart, np.empty_like(array), array_d), kept)
+    assert np.array_equal(download(card, np.empty_like(array), array_d), before)
 
 
-def test_several_arrays_are_read_at_once(apart):
-    arrays = [numbers(size, seed) for seed, size in enumerate((10, LEAST_BYTES + 5, 0, 2 * PIECE_BYTES))]
-    wanted = [(np.empty_like(array), upload(apart, array) if len(array) else None, 0) for array in arrays]
+def test_arrays_of_several_sizes_are_read_with_one_wait(card):
+    arrays = [random_bytes(size, seed) for seed, size in enumerate((10, LEAST_BYTES + 5, 0, 2 * PIECE_BYTES))]
+    reads = [(np.empty_like(array), upload(card, array) if len(array) else None, 0) for array in arrays]
     with counting_calls() as counts:
-        download_all(apart, *wanted)
+        download_all(card, *reads)
     assert counts["blocking reads"] == 1
-    for (read, _, _), array in zip(wanted, arrays, strict=True):
+    for (read, _, _), array in zip(reads, arrays, strict=True):
         assert np.array_equal(read, array)
 
 
 @pytest.mark.parametrize("count", [2, 5, 20])
-def test_a_piece_is_used_again_only_when_it_was_emptied(apart, monkeypatch, count):
-    """Each transfer ends before the next one begins, and copying out begins late: what is in a piece has to stay."""
+def test_pinned_piece_is_not_filled_again_before_it_was_copied_to_its_array(card, monkeypatch, count):
+    """Each transfer into a piece ends before the next begins, and copying out of it begins late."""
     cl = import_pyopencl()
-    arrays = [numbers(LEAST_BYTES + 7 * n, n) for n in range(count)]
-    there = [upload(apart, array) for array in arrays]
-    copy = cl.enqueue_copy
+    arrays = [random_bytes(LEAST_BYTES + 7 * n, n) for n in range(count)]
+    reads = [(np.empty_like(array), upload(card, array), 0) for array in arrays]
+    enqueue_copy = cl.enqueue_copy
 
     def copy_and_wait(*arguments, **options):
-        event = copy(*arguments, **options)
+        event = enqueue_copy(*arguments, **options)
         event.wait()
         return event
 
     monkeypatch.setattr(cl, "enqueue_copy", copy_and_wait)
-    apart.of_context(PinnedPieces)._pieces.clear()
-    wanted = [(np.empty_like(array), array_d, 0) for array, array_d in zip(arrays, there, strict=True)]
-    download_all(apart, *wanted)
-    for (read, _, _), array in zip(wanted, arrays, strict=True):
+    card.of_context(PinnedPieces)._pieces.clear()
+    download_all(card, *reads)
+
+    for (read, _, _), array in zip(reads, arrays, strict=True):
         assert np.array_equal(read, array)
 
 
-def test_a_piece_that_is_filled_stays_until_it_is_sent(apart, monkeypatch):
-    """Threads end as soon as nobody looks: a piece that is full is not filled again before it is sent."""
+def test_pinned_piece_is_not_filled_again_before_it_was_sent_to_the_card(card, monkeypatch):
+    """Its copy ends at once, and is seen to have ended at every other look alone."""
 
-    class Hidden:
-        """A copy that has ended, which is seen at every other look alone."""
-
+    class CopySeenLate:
         def __init__(self):
             self.looks = 0
 
@@ -110,103 +125,117 @@ def test_a_piece_that_is_filled_stays_until_it_is_sent(apart, monkeypatch):
 
     def copy_at_once(pool, copy, *arguments):
         copy(*arguments)
-        return Hidden()
+        return CopySeenLate()
 
     monkeypatch.setattr(ThreadPoolExecutor, "submit", copy_at_once)
-    apart.of_context(PinnedPieces)._pieces.clear()
-    array = numbers(9 * PIECE_BYTES + 5)
-    array_d = upload(apart, array)
-    assert np.array_equal(download(apart, np.empty_like(array), array_d), array)
+    card.of_context(PinnedPieces)._pieces.clear()
+    array = random_bytes(9 * PIECE_BYTES + 5)
+    array_d = upload(card, array)
+    assert np.array_equal(download(card, np.empty_like(array), array_d), array)
 
 
-def test_threads_share_the_pieces_and_the_pool(apart):
-    wrong: list[object] = []
-
-    def work(seed):
+def test_arrays_that_six_threads_copy_on_a_card_at_once_come_back_unchanged(card):
+    def copy_arrays(seed):
         rng = np.random.default_rng(seed)
-        for turn in range(6):
-            array = numbers(int(rng.integers(1000, 3 * LEAST_BYTES)), seed)
-            copy_d = allocate(apart, array.nbytes)
-            copy_buffer(apart, upload(apart, array), copy_d, array.nbytes)
-            if not np.array_equal(download(apart, np.empty_like(array), copy_d), array):
-                wrong.append((seed, turn))
+        for _ in range(6):
+            array = random_bytes(int(rng.integers(1000, 3 * LEAST_BYTES)), seed)
+            copy_d = allocate(card, array.nbytes)
+            copy_buffer(card, upload(card, array), copy_d, array.nbytes)
+            assert np.array_equal(download(card, np.empty_like(array), copy_d), array)
 
-    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not wrong
+    with ThreadPoolExecutor(6) as threads:
+        list(threads.map(copy_arrays, range(6)))  # raises what a thread raises
 
 
-def test_the_pool_lends_a_buffer_again(apart):
-    pool = buffers.BufferPool(apart)
-    one = pool.take(5000)
-    number = one.buffer.int_ptr
-    other = pool.take(5000)
-    assert other.buffer.int_ptr != number
-    assert one.buffer.size >= 5000
-    del one
+def test_buffer_pool_lends_different_buffers_at_the_same_time(card):
+    pool = buffers.BufferPool(card)
+    first, second = pool.take(5000), pool.take(5000)
+    assert first.buffer.size >= 5000
+    assert first.buffer.int_ptr != second.buffer.int_ptr
+
+
+def test_buffer_pool_lends_a_returned_buffer_again_for_fewer_bytes(card):
+    pool = buffers.BufferPool(card)
+    lent = pool.take(5000)
+    number = lent.buffer.int_ptr
+    del lent
     gc.collect()
     assert pool.take(4990).buffer.int_ptr == number
 
 
-def test_the_pool_keeps_no_more_than_its_limit(apart):
-    pool = buffers.BufferPool(apart)
-    lent = [pool.take(1 << 26) for _ in range(6)]
+def test_buffer_pool_keeps_256_mib_of_384_mib_that_were_returned(card):
+    pool = buffers.BufferPool(card)
+    lent = [pool.take(64 << 20) for _ in range(6)]
     lent.clear()
     gc.collect()
-    assert pool.spare_bytes == 1 << 28
+    assert pool.spare_bytes == 256 << 20
 
 
-def test_spare_buffers_make_way_where_the_driver_has_no_room(apart, monkeypatch):
+def test_spare_buffers_are_released_when_the_driver_has_no_memory_left(card, monkeypatch):
     cl = import_pyopencl()
-    pool = buffers.BufferPool(apart)
+    pool = buffers.BufferPool(card)
     lent = pool.take(1 << 20)
     del lent
     gc.collect()
-    ask, refused = buffers.ask_driver, []
+    ask_driver, refused_sizes = buffers.ask_driver, []
 
-    def ask_once_more(device, flags, size, host):
+    def refuse_while_buffers_are_spare(device, flags, size, host):
         if pool.spare_bytes:
-            refused.append(size)
+            refused_sizes.append(size)
             raise cl.MemoryError("create_buffer", cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE, "none left")
-        return ask(device, flags, size, host)
+        return ask_driver(device, flags, size, host)
 
-    monkeypatch.setattr(buffers, "ask_driver", ask_once_more)
+    monkeypatch.setattr(buffers, "ask_driver", refuse_while_buffers_are_spare)
     assert pool.take(2 << 20).buffer.size == 2 << 20
-    assert refused == [2 << 20]
+    assert refused_sizes == [2 << 20]
 
 
 @pytest.mark.seconds
 @pytest.mark.every_device
-def test_surface_and_picture_ask_no_more_calls_of_the_driver(apart):
+def test_surface_on_a_card_makes_no_more_calls_of_the_driver_than_counted_before(card):
     """A discrete card spends most of a surface in waits and allocations: their numbers may only fall."""
     volume = make_ball(48)
-    for _ in range(2):
-        mesh = clrecon.extract_isosurface(volume, 0.0, device=apart)
+    for _ in range(2):  # builds the kernels, then fills the pools
+        mesh = clrecon.extract_isosurface(volume, 0.0, device=card)
     with counting_calls() as counts:
-        again = clrecon.extract_isosurface(volume, 0.0, device=apart)
-    assert np.array_equal(again.vertices, mesh.vertices)
+        clrecon.extract_isosurface(volume, 0.0, device=card)
+
     assert counts["launches"] == 9
-    assert counts["blocking reads"] <= 2 and counts["allocations"] <= 1 and counts["uploads"] <= 3
-    assert counts["uploads, bytes"] <= volume.voxels.nbytes + 8192
-    totals, arrays = 32, mesh.vertices.nbytes + mesh.normals.nbytes + mesh.triangles.nbytes
-    assert counts["blocking reads, bytes"] <= arrays + totals
-    with clrecon.VolumeRenderer(volume, device=apart) as renderer:
-        for angle in (0, 10):
-            renderer.render(VolumeLook("bone"), view=(angle, 0), size=(64, 64))
-        with counting_calls() as counts:
-            renderer.render(VolumeLook("bone"), view=(20, 0), size=(64, 64))
-        with counting_calls() as of_projection:
-            renderer.render(Projection("mip"), view=(20, 0), size=(64, 64))
-    assert counts["launches"] == 3 and counts["blocking reads"] == 1 and counts["allocations"] == 0
-    assert counts["blocking reads, bytes"] == 12 * 64 * 64 and of_projection["blocking reads, bytes"] == 8 * 64 * 64
+    assert counts["blocking reads"] <= 2  # the totals, then the arrays
+    assert counts["allocations"] <= 1
+    assert counts["uploads"] <= 3
+    tables = 8192
+    assert counts["uploads, bytes"] <= volume.voxels.nbytes + tables
+    totals = 32
+    arrays = mesh.vertices.nbytes + mesh.normals.nbytes + mesh.triangles.nbytes
+    assert counts["blocking reads, bytes"] <= totals + arrays
 
 
 @pytest.mark.seconds
 @pytest.mark.every_device
-def test_memory_of_its_own_changes_no_bit(device, monkeypatch):
+@pytest.mark.parametrize(
+    ("style", "launches", "bytes_of_pixel"),
+    [
+        pytest.param(VolumeLook("bone"), 3, 4 + 4 + 4, id="volume: colours, first and mean depths"),
+        pytest.param(Projection("mip"), 1, 4 + 4, id="mip: HU and depths"),
+    ],
+)
+def test_picture_on_a_card_makes_no_more_calls_of_the_driver_than_counted_before(card, style, launches, bytes_of_pixel):
+    with clrecon.VolumeRenderer(make_ball(48), device=card) as renderer:
+        for angle in (0, 10):  # builds the kernels, then fills the pools
+            renderer.render(style, view=(angle, 0), size=(64, 64))
+        with counting_calls() as counts:
+            renderer.render(style, view=(20, 0), size=(64, 64))
+
+    assert counts["launches"] == launches
+    assert counts["blocking reads"] == 1
+    assert counts["allocations"] == 0
+    assert counts["blocking reads, bytes"] == bytes_of_pixel * 64 * 64
+
+
+@pytest.mark.seconds
+@pytest.mark.every_device
+def test_surface_picture_and_cloud_are_the_same_bytes_with_memory_of_the_host_and_of_a_card(device, monkeypatch):
     if device.is_simulator:
         pytest.skip("simulators take the driver's way, which checks more")
     volume = make_ball(64)
@@ -217,7 +246,9 @@ def test_memory_of_its_own_changes_no_bit(device, monkeypatch):
         cloud = clrecon.extract_points(volume, hu=(0.0, None), device=device)
         return mesh.vertices, mesh.normals, mesh.triangles, picture.image, picture.values, cloud.points, cloud.hu
 
-    shared = results()
+    with_memory_of_the_host = results()
     monkeypatch.setattr(device, "shares_host_memory", False)
-    for one, other in zip(shared, results(), strict=True):
-        assert one.tobytes() == other.tobytes()
+    with_memory_of_a_card = results()
+
+    for array, expected in zip(with_memory_of_a_card, with_memory_of_the_host, strict=True):
+        assert array.tobytes() == expected.tobytes()

@@ -18,9 +18,11 @@ linux_only = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
 POCL = "Portable Computing Language"
 ZEN_5 = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-generic"
+"""The version that PoCL has on a CPU that its compiler does not know: generic."""
+TARGET = b"x86_64-unknown-linux-gnu"
 
 
-class Structure:
+class DriverStructure:
     """What a driver's structure of a device looks like: numbers, and pointers to strings."""
 
     def __init__(self, *texts: bytes):
@@ -34,80 +36,110 @@ class Structure:
         return [string.value for string in self.strings]
 
 
-def flags(*names: str) -> str:
-    return f"processor\t: 0\nflags\t\t: fpu sse2 {' '.join(names)} \npower management:\n"
+def cpu_info(*flags: str) -> str:
+    return f"processor\t: 0\nflags\t\t: fpu sse2 {' '.join(flags)} \npower management:\n"
 
 
 @pytest.mark.parametrize("name", [name for name, _ in CPU_NAMES])
-def test_the_name_is_the_best_that_the_flags_allow(name):
-    needs = dict(CPU_NAMES)[name]
-    assert choose_name(flags(*needs, "avx512_vnni" if name == "skx" else "avx")) == name
-    for lacking in needs:
-        assert choose_name(flags(*(needs - {lacking}))) != name
+def test_cpu_gets_the_first_name_whose_flags_it_has(name):
+    needed_flags = dict(CPU_NAMES)[name]
+    another_flag = "avx512_vnni" if name == "skx" else "avx"
+    assert choose_name(cpu_info(*needed_flags, another_flag)) == name
 
 
-def test_names_fit_where_the_unknown_one_was():
-    assert all(len(name) <= len(UNKNOWN) for name, _ in CPU_NAMES)
+@pytest.mark.parametrize(("name", "flag"), [(name, flag) for name, flags in CPU_NAMES for flag in sorted(flags)])
+def test_cpu_that_lacks_one_flag_does_not_get_the_name(name, flag):
+    assert choose_name(cpu_info(*(dict(CPU_NAMES)[name] - {flag}))) != name
+
+
+def test_cpu_without_known_flags_gets_the_name_of_any_64_bit_cpu():
     assert choose_name("no flags at all") == "x86-64"
 
 
-@linux_only
-def test_only_pocl_on_a_cpu_that_it_does_not_know_is_touched(monkeypatch):
-    monkeypatch.setattr(pocl.platform, "machine", lambda: "x86_64")
-    assert has_unknown_cpu(POCL, ZEN_5) and has_unknown_cpu(POCL, ZEN_5.replace("pthread", "basic") + " ")
-    for known in ("znver3", "skylake-avx512"):
-        assert not has_unknown_cpu(POCL, ZEN_5.replace("generic", known))
-    assert not has_unknown_cpu("rusticl", ZEN_5)
-    assert not has_unknown_cpu(POCL, ZEN_5.replace("x86_64", "aarch64"))
-    monkeypatch.setattr(pocl.platform, "machine", lambda: "aarch64")
-    assert not has_unknown_cpu(POCL, ZEN_5)
+@pytest.mark.parametrize("name", [name for name, _ in CPU_NAMES])
+def test_name_of_a_cpu_is_not_longer_than_the_one_that_it_replaces(name):
+    assert len(name) <= len(UNKNOWN)
 
 
 @linux_only
-def test_the_name_behind_the_target_is_replaced_and_nothing_else():
-    before = [b"pthread", UNKNOWN, b"x86_64-unknown-linux-gnu", UNKNOWN, b"AuthenticAMD"]
-    made = Structure(*before)
-    cpu = NameOfCpu(made.address)
-    assert made.texts == before
-    words = bytes(made.words)
-    for _ in range(2):  # a second device object of the same driver finds the name that the first one wrote
-        cpu.write()
-        assert made.texts == [*before[:3], cpu.name.encode(), before[4]]
-        assert NameOfCpu(made.address).name == cpu.name
-    assert bytes(made.words) == words
+@pytest.mark.parametrize(
+    ("machine", "platform", "version", "is_unknown"),
+    [
+        pytest.param("x86_64", POCL, ZEN_5, True, id="pthread device"),
+        pytest.param("x86_64", POCL, ZEN_5.replace("pthread", "basic") + " ", True, id="basic device"),
+        pytest.param("x86_64", POCL, ZEN_5.replace("generic", "znver3"), False, id="known Zen 3"),
+        pytest.param("x86_64", POCL, ZEN_5.replace("generic", "skylake-avx512"), False, id="known Skylake"),
+        pytest.param("x86_64", "rusticl", ZEN_5, False, id="another driver"),
+        pytest.param("x86_64", POCL, ZEN_5.replace("x86_64", "aarch64"), False, id="target of another processor"),
+        pytest.param("aarch64", POCL, ZEN_5, False, id="on another processor"),
+    ],
+)
+def test_only_pocl_for_a_generic_cpu_on_x86_64_does_not_know_its_cpu(
+    machine, platform, version, is_unknown, monkeypatch
+):
+    monkeypatch.setattr(pocl.platform, "machine", lambda: machine)
+    assert has_unknown_cpu(platform, version) == is_unknown
+
+
+@linux_only
+def test_name_of_the_cpu_replaces_the_string_behind_the_target_and_nothing_else():
+    before = [b"pthread", UNKNOWN, TARGET, UNKNOWN, b"AuthenticAMD"]
+    structure = DriverStructure(*before)
+    words = bytes(structure.words)
+
+    cpu = NameOfCpu(structure.address)
+    assert structure.texts == before  # nothing is written yet
+    cpu.write()
+
+    assert structure.texts == [b"pthread", UNKNOWN, TARGET, cpu.name.encode(), b"AuthenticAMD"]
+    assert bytes(structure.words) == words
+
+
+@linux_only
+def test_name_of_the_cpu_that_another_device_object_has_written_is_found_and_written_again():
+    structure = DriverStructure(TARGET, UNKNOWN)
+    first = NameOfCpu(structure.address)
+    first.write()
+
+    second = NameOfCpu(structure.address)
+    second.write()
+
+    assert second.name == first.name
+    assert structure.texts == [TARGET, first.name.encode()]
 
 
 @linux_only
 @pytest.mark.parametrize(
     "texts",
-    [[b"pthread", b"generic"], [b"x86_64-unknown-linux-gnu", b"pthread", b"generic"],
-     [b"x86_64-unknown-linux-gnu", b"znver3"], [b"x86_64-unknown-linux-gnu", b"generic-with-more"],
+    [[b"pthread", b"generic"], [TARGET, b"pthread", b"generic"], [TARGET, b"znver3"], [TARGET, b"generic-with-more"],
      [b"x86_64-a", b"generic", b"x86_64-b", b"generic"]],
+    ids=["no target", "no name behind the target", "known name", "longer name", "two targets"],
 )  # fmt: skip
-def test_what_is_not_exactly_so_is_left_alone(texts):
-    made = Structure(*texts)
+def test_structure_without_exactly_one_generic_name_behind_the_target_is_refused_and_unchanged(texts):
+    structure = DriverStructure(*texts)
     with refused(LookupError, "CPUs", "names"):
-        NameOfCpu(made.address)
-    assert made.texts == texts
+        NameOfCpu(structure.address)
+    assert structure.texts == texts
 
 
 @linux_only
-def test_memory_that_is_not_there_is_an_error_and_no_crash():
+def test_address_without_memory_is_refused_and_does_not_end_the_process():
+    unmapped = 4096
     with refused(LookupError, "Input/output"):
-        NameOfCpu(4096)
+        NameOfCpu(unmapped)
 
 
 @linux_only
-def test_a_name_that_has_changed_meanwhile_is_left_alone():
-    made = Structure(b"x86_64-unknown-linux-gnu", UNKNOWN)
-    cpu = NameOfCpu(made.address)
-    made.strings[1].value = b"znver5"
+def test_name_that_changed_after_it_was_found_is_not_overwritten():
+    structure = DriverStructure(TARGET, UNKNOWN)
+    cpu = NameOfCpu(structure.address)
+    structure.strings[1].value = b"znver5"
     with refused(LookupError, "changed"):
         cpu.write()
-    assert made.texts[1] == b"znver5"
+    assert structure.texts[1] == b"znver5"
 
 
-def make_device(device: Device, address: int) -> Device:
+def pocl_device_on_unknown_cpu(device: Device, address: int) -> Device:
     """A device of PoCL on an unknown CPU whose structure lies at `address`."""
 
     class Answers:
@@ -121,39 +153,59 @@ def make_device(device: Device, address: int) -> Device:
 
 
 @linux_only
-def test_a_device_whose_cpu_cannot_be_named_says_what_to_install(device, monkeypatch):
+def test_device_whose_cpu_cannot_be_named_has_a_shortcoming_that_says_what_to_install(device, monkeypatch):
     monkeypatch.setattr(pocl.platform, "machine", lambda: "x86_64")
-    made = Structure(b"nothing", b"of the kind")
-    found = make_device(device, made.address)
-    assert found.shortcoming.startswith(
+    structure = DriverStructure(b"nothing", b"of the kind")
+    unusable = pocl_device_on_unknown_cpu(device, structure.address)
+    assert unusable.shortcoming.startswith(
         "its compiler is older than this CPU and builds nothing for it (0 names of CPUs"
     )
-    assert "pocl-opencl-icd" in found.shortcoming
-    assert not any("CPU_NAME" in option for option in found.build_options)
+    assert "pocl-opencl-icd" in unusable.shortcoming
+    assert not any("CPU_NAME" in option for option in unusable.build_options)
+
+
+@pytest.fixture
+def cpu_structure(monkeypatch):
+    """The structure of a device of PoCL on a processor that its compiler does not know."""
+    monkeypatch.setattr(pocl.platform, "machine", lambda: "x86_64")
+    return DriverStructure(TARGET, UNKNOWN)
 
 
 @linux_only
-def test_a_device_names_its_cpu_when_it_is_opened_and_not_before(device, monkeypatch):
-    monkeypatch.setattr(pocl.platform, "machine", lambda: "x86_64")
-    made = Structure(b"x86_64-unknown-linux-gnu", UNKNOWN)
-    found = make_device(device, made.address)
-    assert found.shortcoming == "" and made.texts[1] == UNKNOWN
-    [option] = [option for option in found.build_options if "CPU_NAME" in option]
-    opened = []
-    monkeypatch.setattr("pyopencl.Context", lambda devices: opened.append(made.texts[1].decode()))
-    assert found.context is None
-    assert [f"-DCPU_NAME={name}" for name in opened] == [option]
-    made.strings[1].value = b"znver5"
+def test_name_of_the_cpu_is_written_when_the_device_is_opened_and_is_a_build_option(device, cpu_structure, monkeypatch):
+    named = pocl_device_on_unknown_cpu(device, cpu_structure.address)
+    assert named.shortcoming == ""
+    assert cpu_structure.texts[1] == UNKNOWN  # not opened yet
+    names_when_opened = []
+    monkeypatch.setattr("pyopencl.Context", lambda devices: names_when_opened.append(cpu_structure.texts[1].decode()))
+
+    assert named.context is None  # opens the device
+
+    [name] = names_when_opened
+    assert f"-DCPU_NAME={name}" in named.build_options
+
+
+@linux_only
+def test_device_is_refused_when_another_name_of_its_cpu_was_written_before_it_is_opened(
+    device, cpu_structure, monkeypatch
+):
+    monkeypatch.setattr("pyopencl.Context", lambda devices: None)
+    named = pocl_device_on_unknown_cpu(device, cpu_structure.address)
+    cpu_structure.strings[1].value = b"znver5"
     with refused(DeviceError, "CPU"):
-        _ = found.context
+        _ = named.context
 
 
 @pytest.mark.every_device
-def test_programs_get_what_tells_caches_apart(device, monkeypatch):
+def test_programs_are_kept_by_file_and_all_options_those_of_the_call_sorted(device, monkeypatch):
     from clrecon.opencl import load_program
 
     monkeypatch.setattr(device, "programs", {})
     load_program(device, "primitives/compact.cl", {"B": "2", "A": "1"})
     assert list(device.programs) == [("primitives/compact.cl", (*device.build_options, "-DA=1", "-DB=2"))]
+
+
+@pytest.mark.every_device
+def test_build_options_name_the_cpu_exactly_where_pocl_does_not_know_it(device):
     names_cpu = any("CPU_NAME" in option for option in device.build_options)
     assert names_cpu == has_unknown_cpu(device.platform, device.version)

@@ -1,4 +1,4 @@
-"""The one place that waits for a device: errors of commands, the time limit, interrupts, and what commands use."""
+"""Waiting for a device, in one place: errors of commands, the time limit, interrupts, and what commands use."""
 
 from __future__ import annotations
 
@@ -51,40 +51,58 @@ def own_commands(device, monkeypatch):
 pytestmark = pytest.mark.usefixtures("own_commands")
 
 
-def test_buffers_of_a_kernel_live_until_it_is_over(device):
+class Buffer:
+    pass
+
+
+def test_buffer_of_a_running_kernel_is_kept_alive_until_the_kernel_ends(device):
     """A CPU device works in numpy's memory, which must not be given back while a launch is in flight."""
-
-    class Buffer:
-        pass
-
     buffer, event = Buffer(), Event()
-    alive = weakref.ref(buffer)
+    buffer_if_alive = weakref.ref(buffer)
     device.commands.add("kernel one", event, QUEUE, buffer)
     del buffer
     device.give_up()
+
     gc.collect()
-    assert alive() is not None
+    assert buffer_if_alive() is not None
+    event.end()
+    has_hung_commands()  # looks at the event
+    gc.collect()
+    assert buffer_if_alive() is None
+
+
+def test_kernel_on_a_device_that_was_given_up_counts_as_hung_until_it_ends(device):
+    event = Event()
+    device.commands.add("kernel one", event, QUEUE)
+    device.give_up()
     assert has_hung_commands()
     event.end()
     assert not has_hung_commands()
-    gc.collect()
-    assert alive() is None
 
 
-def test_kernels_that_have_ended_are_not_remembered(device):
-    launched = Stopwatch()
+def launch_sum_blocks(device):
+    """Launch a kernel of the scan; returns the buffer of its result."""
     program = load_program(device, "primitives/scan.cl", {"SCAN_GROUP": str(device.group_size)})
     counts_d, sums_d = upload(device, np.arange(50, dtype=np.uint32)), allocate(device, 4)
-    with launched.running(device):
-        launch(device, program["sum_blocks"], device.group_size, counts=counts_d, block_sums=sums_d, n=50)
+    launch(device, program["sum_blocks"], device.group_size, counts=counts_d, block_sums=sums_d, n=50)
+    return sums_d
+
+
+def test_last_command_is_the_launched_kernel_until_a_stopwatch_has_waited_for_it(device):
+    with Stopwatch().running(device):
+        launch_sum_blocks(device)
         assert device.commands.last.what == "kernel sum_blocks"
     assert device.commands.last is None
+
+
+def test_no_command_is_remembered_after_a_download(device):
+    sums_d = launch_sum_blocks(device)
     download(device, np.empty(1, np.uint32), sums_d)
     assert device.commands.last is None
 
 
 @pytest.mark.parametrize(
-    ("status", "kind", "words"),
+    ("status", "kind", "name_of_status"),
     [
         (-4, DeviceMemoryError, "MEM_OBJECT_ALLOCATION_FAILURE"),
         (-5, DeviceLostError, "OUT_OF_RESOURCES"),
@@ -93,10 +111,12 @@ def test_kernels_that_have_ended_are_not_remembered(device):
     ],
 )
 @pytest.mark.fault_row(56)
-def test_a_kernel_that_fails_on_the_device_is_an_error(device, status, kind, words):
+def test_kernel_that_fails_on_the_device_raises_the_error_of_its_status_and_closes_the_device(
+    device, status, kind, name_of_status
+):
     device.commands.add("kernel one", Event(status), QUEUE)
     device.commands.add("kernel two", Event(0), QUEUE)
-    with refused(kind, words) as caught:
+    with refused(kind, name_of_status) as caught:
         wait(device)
     assert type(caught.value) is kind
     assert device._opened.context is None
@@ -104,7 +124,7 @@ def test_a_kernel_that_fails_on_the_device_is_an_error(device, status, kind, wor
 
 
 @pytest.mark.fault_row(56)
-def test_only_a_device_without_progress_counts_as_hung(device):
+def test_time_limit_applies_to_each_kernel_and_not_to_their_sum(device):
     """Four kernels of 0.3 s take longer than the limit of 0.5 s, together."""
     events = [Event() for _ in range(4)]
     for number, event in enumerate(events):
@@ -116,61 +136,89 @@ def test_only_a_device_without_progress_counts_as_hung(device):
 
 
 @pytest.mark.fault_row(56)
-def test_a_device_without_progress_is_an_error_that_names_the_kernel(device):
-    ended, hung, after = Event(0), Event(), Event()
-    for number, event in enumerate((ended, hung, after)):
+def test_kernel_over_the_time_limit_is_an_error_that_names_it_the_limit_and_how_to_lift_it(device):
+    for number, event in enumerate([Event(0), Event(), Event()]):  # kernel 0 has ended, 1 and 2 run on
         device.commands.add(f"kernel {number}", event, QUEUE)
-    with time_limit(0.2), refused(DeviceTimeoutError, 1, 0.2) as caught:
+    with time_limit(0.2), refused(DeviceTimeoutError, "kernel", 1, 0.2) as caught:
         wait(device)
     assert caught.value.exit_code == 5
     assert "(0: none)" in str(caught.value)
+
+
+def test_kernels_over_the_time_limit_count_as_hung_until_they_end(device):
+    running = [Event(), Event()]
+    for event in running:
+        device.commands.add("kernel", event, QUEUE)
+    with time_limit(0.2), pytest.raises(DeviceTimeoutError):
+        wait(device)
     assert has_hung_commands()
-    wait(device)  # later work does not wait for it
-    for event in (hung, after):
+    for event in running:
         event.end()
     assert not has_hung_commands()
 
 
-@pytest.mark.parametrize("is_short", [True, False])
-@pytest.mark.fault_row(56)
-def test_an_interrupt_keeps_the_context_of_a_device_that_ends_in_time(device, monkeypatch, is_short):
-    event, context = Event(), object()
+def test_later_work_does_not_wait_for_a_kernel_over_the_time_limit(device):
+    event = Event()
     device.commands.add("kernel one", event, QUEUE)
-    monkeypatch.setattr(device._opened, "context", context)
-    monkeypatch.setattr("clrecon.opencl.launching._watch", _interrupt)
-    if is_short:
-        threading.Timer(0.1, event.end).start()
-    with pytest.raises(KeyboardInterrupt):
+    with time_limit(0.2), pytest.raises(DeviceTimeoutError):
         wait(device)
-    assert (device._opened.context is context) == is_short
-    assert has_hung_commands() == (not is_short)
+    with time_limit(0.2):
+        wait(device)  # no second timeout
     event.end()
 
 
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
+@pytest.fixture
+def interrupted(monkeypatch):
+    """Who watches the device is interrupted at once."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("clrecon.opencl.launching._watch", interrupt)
 
 
-def test_after_an_error_running_kernels_are_waited_for(device):
+@pytest.mark.usefixtures("interrupted")
+@pytest.mark.parametrize("ends_in_time", [True, False])
+@pytest.mark.fault_row(56)
+def test_interrupt_keeps_the_context_of_a_device_only_if_its_kernel_ends_in_time(device, monkeypatch, ends_in_time):
+    event, context = Event(), object()
+    device.commands.add("kernel one", event, QUEUE)
+    monkeypatch.setattr(device._opened, "context", context)
+    if ends_in_time:
+        threading.Timer(0.1, event.end).start()
+
+    with pytest.raises(KeyboardInterrupt):
+        wait(device)
+
+    assert (device._opened.context is context) == ends_in_time
+    assert has_hung_commands() == (not ends_in_time)
+    event.end()
+
+
+def test_running_kernel_is_waited_for_after_an_error_of_the_caller(device):
     event = Event()
     device.commands.add("kernel one", event, QUEUE)
     device.give_up()
     threading.Timer(0.1, event.end).start()
     settle(device, ValueError("of the caller"))
     assert event.command_execution_status == 0
-    device.commands.add("kernel two", Event(), QUEUE)
+
+
+def test_kernel_over_the_time_limit_after_an_error_of_the_caller_counts_as_hung(device):
+    event = Event()
+    device.commands.add("kernel one", event, QUEUE)
     with time_limit(0.1):
         settle(device, ValueError("of the caller"))
     assert has_hung_commands()
+    event.end()
 
 
-def test_a_driver_that_refuses_to_wait_is_an_error(device, monkeypatch):
-    cl, event = import_pyopencl(), Event()
-    monkeypatch.setattr(event, "wait", lambda: _refuse(cl))
+def test_error_of_a_driver_that_refuses_to_wait_names_the_kernel(device, monkeypatch):
+    def refuse() -> None:
+        raise import_pyopencl().RuntimeError("refused")
+
+    event = Event()
+    monkeypatch.setattr(event, "wait", refuse)
     device.commands.add("kernel one", event, QUEUE)
     with refused(DeviceFailedError, "one", "refused"):
         wait(device)
-
-
-def _refuse(cl) -> None:
-    raise cl.RuntimeError("refused")
