@@ -214,20 +214,25 @@ class MemoryWithText:
         self.written.append(text)
 
 
+@pytest.fixture
+def memory(monkeypatch: pytest.MonkeyPatch) -> MemoryWithText:
+    """The memory of the process, with the name of an unknown CPU."""
+    memory = MemoryWithText(pocl.UNKNOWN)
+    monkeypatch.setattr(pocl, "_Memory", lambda: memory)
+    return memory
+
+
 NAME_AT_ADDRESS_7: Any = SimpleNamespace(name="haswell", _place=7)
 
 
-def test_name_of_a_cpu_is_written_over_the_unknown_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    memory = MemoryWithText(pocl.UNKNOWN)
-    monkeypatch.setattr(pocl, "_Memory", lambda: memory)
+def test_name_of_a_cpu_is_written_over_the_unknown_one(memory: MemoryWithText) -> None:
     pocl.NameOfCpu.write(NAME_AT_ADDRESS_7)
     assert memory.written == [b"haswell".ljust(len(pocl.UNKNOWN), b"\0")]
 
 
 @pytest.mark.parametrize("present", [b"a", b"znver4"])
-def test_name_of_a_cpu_is_not_written_over_another_one(present: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    memory = MemoryWithText(present)
-    monkeypatch.setattr(pocl, "_Memory", lambda: memory)
+def test_name_of_a_cpu_is_not_written_over_another_one(present: bytes, memory: MemoryWithText) -> None:
+    memory.text = present
     with pytest.raises(LookupError, match="has changed"):
         pocl.NameOfCpu.write(NAME_AT_ADDRESS_7)
     assert memory.written == []
