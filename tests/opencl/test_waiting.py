@@ -19,14 +19,18 @@ from clrecon.opencl.quirks import import_pyopencl
 from clrecon.system.progress import time_limit
 
 
-class Event:
-    """An event whose state tests set; who waits for it waits for `end`."""
+RUNNING, ENDED = 1, 0
+"""States of a command, as OpenCL numbers them; a negative one is an error."""
 
-    def __init__(self, status: int = 1):
+
+class Event:
+    """The event of a command, whose state tests set; who waits for it waits for `end`."""
+
+    def __init__(self, status: int = RUNNING):
         self.command_execution_status = status
         self._ended = threading.Event()
 
-    def end(self, status: int = 0) -> None:
+    def end(self, status: int = ENDED) -> None:
         self.command_execution_status = status
         self._ended.set()
 
@@ -115,7 +119,7 @@ def test_kernel_that_fails_on_the_device_raises_the_error_of_its_status_and_clos
     device, status, kind, name_of_status
 ):
     device.commands.add("kernel one", Event(status), QUEUE)
-    device.commands.add("kernel two", Event(0), QUEUE)
+    device.commands.add("kernel two", Event(ENDED), QUEUE)
     with refused(kind, name_of_status) as caught:
         wait(device)
     assert type(caught.value) is kind
@@ -137,7 +141,7 @@ def test_time_limit_applies_to_each_kernel_and_not_to_their_sum(device):
 
 @pytest.mark.fault_row(56)
 def test_kernel_over_the_time_limit_is_an_error_that_names_it_the_limit_and_how_to_lift_it(device):
-    for number, event in enumerate([Event(0), Event(), Event()]):  # kernel 0 has ended, 1 and 2 run on
+    for number, event in enumerate([Event(ENDED), Event(), Event()]):  # kernel 0 has ended, 1 and 2 run on
         device.commands.add(f"kernel {number}", event, QUEUE)
     with time_limit(0.2), refused(DeviceTimeoutError, "kernel", 1, 0.2) as caught:
         wait(device)
@@ -163,7 +167,8 @@ def test_later_work_does_not_wait_for_a_kernel_over_the_time_limit(device):
     with time_limit(0.2), pytest.raises(DeviceTimeoutError):
         wait(device)
     with time_limit(0.2):
-        wait(device)  # no second timeout
+        wait(device)  # raises no second timeout
+    assert event.command_execution_status == RUNNING
     event.end()
 
 
@@ -201,7 +206,7 @@ def test_running_kernel_is_waited_for_after_an_error_of_the_caller(device):
     device.give_up()
     threading.Timer(0.1, event.end).start()
     settle(device, ValueError("of the caller"))
-    assert event.command_execution_status == 0
+    assert event.command_execution_status == ENDED
 
 
 def test_kernel_over_the_time_limit_after_an_error_of_the_caller_counts_as_hung(device):
