@@ -18,7 +18,6 @@ from clrecon.opencl.device import Commands, _Opened, has_hung_commands
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.system.progress import time_limit
 
-
 RUNNING, ENDED = 1, 0
 """States of a command, as OpenCL numbers them; a negative one is an error."""
 
