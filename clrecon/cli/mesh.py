@@ -386,15 +386,15 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
     prints = [mesh["print"] for mesh in meshes if mesh.get("print")]
     if not prints:
         return []
-    facts, wall = prints[0], prints[0]["wall"]
-    left_out = prints[0]["left_out"]
+    facts, left_out = prints[0], prints[0]["left_out"]
     which = "print    " if len(prints) == 1 else "print    (first mesh) "
     lines = [f"{which}size {' x '.join(f'{length:.1f}' for length in facts['size_mm'])} mm"]
-    if wall["median_mm"] is not None:
-        lines[0] += (
-            f", walls {wall['median_mm']:.1f} mm (median), 5 % below {format_digits(wall['p5_mm'], 2)} mm,"
-            f" {100 * wall['thin_share']:.1f} % below {wall['thin_mm']:g} mm"
-        )
+    for of, wall in (("print", facts["wall"]), ("bone, as fitted", facts["bone_wall"])):
+        if wall is not None and wall["median_mm"] is not None:
+            lines.append(
+                f"         walls of the {of}: {wall['median_mm']:.1f} mm (median), 5 % below"
+                f" {format_digits(wall['p5_mm'], 2)} mm, {100 * wall['thin_share']:.1f} % below {wall['thin_mm']:g} mm"
+            )
     pieces = f"{count_of(left_out['pieces'], 'piece')} of {format_ml(left_out['pieces_ml'])} together"
     cavities = (
         f"{count_of(left_out['cavities'], 'closed cavity', 'closed cavities')} of {format_ml(left_out['cavities_ml'])}"

@@ -33,10 +33,11 @@ def measure_print(phantom: Phantom, surface: str, folder: Path) -> str:
     mesh = clrecon.read_mesh(mesh_path)
     errors = find_on_mesh(sample_profiles(phantom, volume), mesh.vertices, mesh.triangles)[0]
     found = errors[np.isfinite(errors)]
-    thin = json.loads(report_path.read_text())["meshes"][0]["print"]["wall"]["thin_share"]
+    facts = json.loads(report_path.read_text())["meshes"][0]["print"]
+    thin, thin_bone = (facts[name]["thin_share"] for name in ("wall", "bone_wall"))
     return (
         f"{phantom.name}, {surface}: exit code {code}, {found.mean():+.2f} mm, {np.abs(found).mean():.2f} mm off,"
-        f" {1.0 - len(found) / len(errors):.1%} lost, walls below 1 mm {thin:.1%},"
+        f" {1.0 - len(found) / len(errors):.1%} lost, walls below 1 mm {thin:.1%}, of the bone {thin_bone:.1%},"
         f" {enclosed_ml(mesh.vertices, mesh.triangles):.0f} ml"
     )
 

@@ -12,7 +12,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 93_805,
+    "lines": 93_843,
     "modules": 411,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,

@@ -209,8 +209,9 @@ def test_a_picture_that_shows_something_is_not_empty(depth: float, values: float
 
 
 def test_parts_without_figures_of_a_print_have_no_warnings() -> None:
-    part: Any = SimpleNamespace(pieces=None, facts={}, name="")
-    assert purposes.describe_purposes([part], MeshSettings()) == [] and part.facts == {"print": None}
+    part: Any = SimpleNamespace(facts={}, name="")
+    nothing: Any = None
+    assert purposes.describe_purposes([part], MeshSettings(), nothing, nothing) == [] and part.facts == {"print": None}
 
 
 @pytest.mark.parametrize(("name", "is_refused"), [("a.jpg", True), ("a.png", False)])

@@ -290,7 +290,7 @@ def make_mesh(
         warnings = [
             *warn_of_crumbs(parts, settings, result.device),
             *warn_of_shift(parts, settings),
-            *describe_purposes(parts, settings),
+            *describe_purposes(parts, settings, result.volume, result.device),
             *warn_of_gates(gates),
         ]
         run.lap("measure")

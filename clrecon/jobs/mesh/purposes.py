@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from clrecon.mesh import Mesh
+    from clrecon.geometry import Volume
+    from clrecon.opencl import Device
+    from clrecon.operators.resident.device_volume import DeviceVolume
 
 
 def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
@@ -102,14 +104,20 @@ def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
     }
 
 
-def describe_print(mesh: Mesh, all_pieces: dict[str, float], pieces: dict[str, float]) -> dict[str, Any]:
-    """Return ``print`` of the report for a mesh as it is written, from `measure_pieces` before and after the choice."""
-    from clrecon.mesh.compare.distances import measure_walls
+def describe_print(part: Part, resident: DeviceVolume) -> dict[str, Any]:
+    """Return ``print`` of the report for a part as it is written, with `pieces` before and after the choice."""
+    from clrecon.mesh.compare.distances import WallFigures, cast_walls
+    from clrecon.operators.surface.cortex_mesh import measure_bone_walls
 
+    assert part.pieces is not None
+    mesh, (all_pieces, pieces) = part.mesh, part.pieces
+    rays, constants = cast_walls(mesh.vertices, mesh.triangles), (mesh.report.get("cortex") or {}).get("constants")
+    bone_mm = None if constants is None else measure_bone_walls(*rays, resident, constants, THIN_MM)
     size = mesh.vertices.max(axis=0).astype(float) - mesh.vertices.min(axis=0)
     return {
         "size_mm": size.tolist(),
-        "wall": measure_walls(mesh.vertices, mesh.triangles, THIN_MM),
+        "wall": WallFigures.of(rays[2], THIN_MM),
+        "bone_wall": None if bone_mm is None else WallFigures.of(bone_mm, THIN_MM),
         "left_out": {
             **{name: max(all_pieces[name] - pieces[name], 0) for name in all_pieces},
             **{name: mesh.report.get(name) for name in ("not_bone", "not_bone_ml")},
@@ -122,10 +130,17 @@ def warn_of_print(facts: dict[str, Any]) -> list[str]:
     """Return warnings about the facts of `describe_print`: thin walls, closed cavities, the wrong piece."""
     warnings = []
     wall, left_out = facts["wall"], facts["left_out"]
-    if wall["thin_share"] is not None and wall["thin_share"] > _THIN_SHARE:
+    thin, thin_bone = (facts[name] and facts[name]["thin_share"] for name in ("wall", "bone_wall"))
+    if thin is not None and thin > _THIN_SHARE:
         warnings.append(
-            f"{100 * wall['thin_share']:.0f} % of the surface has a wall below {wall['thin_mm']:g} mm, which can break"
+            f"{100 * thin:.0f} % of the surface has a wall below {wall['thin_mm']:g} mm, which can break"
             f" or be lost in a print: lower {name_parameter('iso_value')}, or print it larger"
+        )
+    elif thin_bone is not None and thin_bone > _THIN_SHARE:
+        warnings.append(
+            f"{100 * thin_bone:.0f} % of the surface is that of bone thinner than {wall['thin_mm']:g} mm, and"
+            f" {100 * (thin or 0.0):.0f} % of the print is as thin: its surface lies outside of the bone, so that thin"
+            " walls become thicker"
         )
     if facts["cavities"]:
         warnings.append(
@@ -160,15 +175,19 @@ def warn_of_other_pieces(facts: Sequence[dict[str, Any]]) -> list[str]:
     ]
 
 
-def describe_purposes(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
+def describe_purposes(parts: Sequence[Part], settings: MeshSettings, volume: Volume, device: Device) -> list[str]:
     """Measure what the purpose of the meshes needs, as ``print`` in the `facts` of each; return warnings."""
+    for part in parts:
+        part.facts["print"] = None
+    if not settings.is_for_print:
+        return []
+    from clrecon.operators.resident.device_volume import DeviceVolume
 
     warnings = []
-    for part in parts:
-        part.facts["print"] = None if part.pieces is None else describe_print(part.mesh, *part.pieces)
-        if part.facts["print"] is not None:
-            name = f"{part.name}: " if part.name else ""
-            warnings += [name + text for text in warn_of_print(part.facts["print"])]
+    with DeviceVolume(volume, device=device, memory=settings.memory) as resident:
+        for part in parts:
+            facts = part.facts["print"] = describe_print(part, resident)
+            warnings += [f"{part.name}: {text}" if part.name else text for text in warn_of_print(facts)]
     if settings.all_parts:
-        warnings += warn_of_other_pieces([facts for part in parts if (facts := part.facts["print"]) is not None])
+        warnings += warn_of_other_pieces([part.facts["print"] for part in parts])
     return warnings

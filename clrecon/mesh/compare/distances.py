@@ -166,32 +166,33 @@ _INWARD = 1e-3
 """Depth below the surface, mm, at which a ray begins, so that it does not meet its own triangle."""
 
 
-def wall_thickness(
+def cast_walls(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], samples: int = _WALL_SAMPLES
-) -> NDArray[np.float64]:
-    """Measure the wall thickness at points that cover a closed surface evenly by area, the same points at every call.
+) -> tuple[Points, Points, NDArray[np.float64]]:
+    """Go through the walls at points that cover a closed surface evenly by area, the same points at every call.
 
     From each point a ray goes inward, against the normal of its triangle, to the first triangle that it meets.
 
-    Returns: ndarray, shape (samples,), mm. NaN where the ray meets nothing: between triangles that do not close, or on
-        an edge.
+    Returns: points and normals, shape (samples, 3), and lengths, (samples,), mm.  Those are NaN where the ray meets
+        nothing: between triangles that do not close, or on an edge.
     """
-    near = vertices - local_origin(vertices)
+    origin = local_origin(vertices)
+    near = vertices - origin
     points, rows = sample_surface_points(near, triangles, samples)
     a, b, c = near[triangles[rows]].transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     farthest = float(np.linalg.norm(near.max(axis=0) - near.min(axis=0))) + 1.0
     hits = TriangleTree(near, triangles).first_hits(points - _INWARD * normals, points - farthest * normals)
-    return np.asarray(np.linalg.norm(hits - points, axis=1))
+    return points + origin, normals, np.asarray(np.linalg.norm(hits - points, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class WallFigures(Record):
-    """How thick the walls of a surface are; None where no ray met anything.
+    """How thick the walls of a surface are; None where none was measured.
 
     thin_share: Share of the surface whose wall is below `thin_mm`.
-    not_measured: Points whose ray met nothing.
+    not_measured: Points whose wall is not known.
     """
 
     min_mm: float | None
@@ -202,19 +203,16 @@ class WallFigures(Record):
     samples: int
     not_measured: int
 
-
-def measure_walls(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], thin_mm: float, samples: int = _WALL_SAMPLES
-) -> WallFigures:
-    """Summarise `wall_thickness`; walls below `thin_mm` are thin."""
-    thickness = wall_thickness(vertices, triangles, samples)
-    measured = thickness[np.isfinite(thickness)]
-    missed = samples - len(measured)
-    if not len(measured):
-        return WallFigures(None, None, None, None, thin_mm, samples, missed)
-    p5, median = float(np.percentile(measured, 5)), float(np.median(measured))
-    share = float(np.mean(measured < thin_mm))
-    return WallFigures(float(measured.min()), p5, median, share, thin_mm, samples, missed)
+    @classmethod
+    def of(cls, lengths: NDArray[np.float64], thin_mm: float) -> WallFigures:
+        """Summarise thicknesses in mm, NaN where none was measured; walls below `thin_mm` are thin."""
+        measured = lengths[np.isfinite(lengths)]
+        missed = len(lengths) - len(measured)
+        if not len(measured):
+            return cls(None, None, None, None, thin_mm, len(lengths), missed)
+        p5, median = float(np.percentile(measured, 5)), float(np.median(measured))
+        share = float(np.mean(measured < thin_mm))
+        return cls(float(measured.min()), p5, median, share, thin_mm, len(lengths), missed)
 
 
 _PIECE = 1 << 13

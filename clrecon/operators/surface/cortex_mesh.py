@@ -442,6 +442,27 @@ def measure_outside(mesh: Mesh, resident: DeviceVolume, *, constants: CortexCons
     return _describe_fit(fit, resident, points, normals, None)
 
 
+def measure_bone_walls(
+    points: Float64Array, normals: Float64Array, lengths: Float64Array, resident: DeviceVolume,
+    constants: CortexConstants, thin_mm: float,
+) -> Float64Array:  # fmt: skip
+    """Return how thick bone is along rays through the walls of a surface, see `cast_walls`: from fit to fit, mm.
+
+    The thickness of a fit is that of one cortex; bone has two of them, and marrow between.  NaN where a face is not
+    fitted, unless the rays are so long that no shift makes the wall as thin as `thin_mm`.
+    """
+    rows = np.flatnonzero(np.isfinite(lengths))
+    along, thickness = normals[rows], np.full(len(lengths), np.nan)
+    ends = (points[rows], along), (points[rows] - lengths[rows, None] * along, -along)
+    for attempt in resident.with_fallback():
+        with attempt:
+            fits = [fit_walls(resident, *end, stopwatch=Stopwatch(), constants=constants) for end in ends]
+    shifts = [np.where(fit.states == FITTED, fit.shift_mm, np.float32(np.nan)) for fit in fits]
+    bone = lengths[rows] + shifts[0] + shifts[1]
+    thickness[rows] = np.where(np.isnan(bone) & (lengths[rows] > thin_mm + 2.0 * MOST_SHIFT_MM), lengths[rows], bone)
+    return thickness
+
+
 def _label(mesh: Mesh, resident: DeviceVolume) -> NDArray[np.int64]:
     """Return the component of each vertex, by the host where the device has no room."""
     try:

@@ -109,9 +109,12 @@ def test_impossible_purposes_are_refused() -> None:
 
 def test_warnings_say_what_can_go_wrong() -> None:
     wall = {"thin_share": 0.01, "thin_mm": 1.0}
-    good = {"wall": wall, "left_out": {"pieces_ml": 1.0}, "pieces_ml": 2.0, "cavities": 0, "cavities_ml": 0.0}
+    cavities = {"cavities": 0, "cavities_ml": 0.0}
+    good = {"wall": wall, "bone_wall": None, "left_out": {"pieces_ml": 1.0}, "pieces_ml": 2.0, **cavities}
     assert warn_of_print(good) == []
     assert "20 % of the surface" in warn_of_print({**good, "wall": {**wall, "thin_share": 0.2}})[0]
+    (hidden,) = warn_of_print({**good, "bone_wall": {**wall, "thin_share": 0.25}})
+    assert "25 %" in hidden and "bone thinner than 1 mm" in hidden and " 1 %" in hidden
     assert "closed cavities" in warn_of_print({**good, "cavities": 3, "cavities_ml": 0.2})[0]
     assert "is it the right piece" in warn_of_print({**good, "left_out": {"pieces_ml": 2.1}})[0]
     told = {"pieces_ml": 4.1, "not_bone": 1, "not_bone_ml": 3.2}  # bone of 0.9 ml beside 2 ml
