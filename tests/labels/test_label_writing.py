@@ -6,6 +6,7 @@ import dicom_series
 import numpy as np
 import pydicom
 import pytest
+import tolerances
 from refusals import refused
 
 from clrecon.errors import RefusedInputError
@@ -22,14 +23,25 @@ PLANS = {
 NAMES = {2: "T12", 5: "L1 <body> & arch", 300: "wei\u00df"}
 
 
-def labels_of(volume, numbers=(0, 0, 2, 5, 300)):
+def make_labels_on(volume, numbers=(0, 0, 2, 5, 300)):
+    """Return a map of random labels on the voxels of `volume`; its first and last slice are empty."""
     voxels = np.random.default_rng(4).choice(numbers, volume.voxels.shape).astype(np.uint16)
     voxels[[0, -1]] = 0
     return LabelMap(voxels, volume.affine, {n: name for n, name in NAMES.items() if n in numbers})
 
 
+def write_segmentation(path, labels, scan):
+    path.write_bytes(encode_segmentation(labels, list_slices(scan, Selection())))
+    return path
+
+
+def read_slices(scan):
+    return [pydicom.dcmread(path) for path, _, _ in list_slices(scan, Selection())]
+
+
 @pytest.fixture(params=PLANS)
 def scan(request, tmp_path):
+    """A folder with a CT series."""
     dicom_series.write_series(
         tmp_path / "ct", PLANS[request.param], lambda ds, k: setattr(ds, "StudyInstanceUID", "1.2.7")
     )
@@ -37,88 +49,128 @@ def scan(request, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
-def test_nifti_is_read_back_the_same(scan, tmp_path, name):
+def test_labels_written_as_nifti_are_read_back_the_same(scan, tmp_path, name):
     pytest.importorskip("nibabel")
-    labels = labels_of(read_volume(scan))
-    content = encode_nifti(labels, packed=name.endswith(".gz"))
-    assert content == encode_nifti(labels, packed=name.endswith(".gz"))
-    (tmp_path / name).write_bytes(content)
+    labels = make_labels_on(read_volume(scan))
+    (tmp_path / name).write_bytes(encode_nifti(labels, packed=name.endswith(".gz")))
+
     back = read_labels(tmp_path / name)
-    assert np.array_equal(back.voxels, labels.voxels) and back.voxels.dtype == labels.voxels.dtype
-    assert np.allclose(back.affine, labels.affine, atol=1e-4)
-    assert back.names == labels.names and back.warnings == ()
+
+    assert back.voxels.dtype == labels.voxels.dtype
+    assert np.array_equal(back.voxels, labels.voxels)
+    assert np.allclose(back.affine, labels.affine, atol=tolerances.LABEL_NIFTI_MM)
+    assert back.names == labels.names
+    assert back.warnings == ()
+
+
+@pytest.mark.parametrize("packed", [False, True], ids=["nii", "nii.gz"])
+@pytest.mark.parametrize("scan", ["oblique"], indirect=True)
+def test_labels_encoded_twice_give_the_same_bytes_of_nifti(scan, packed):
+    labels = make_labels_on(read_volume(scan))
+    assert encode_nifti(labels, packed=packed) == encode_nifti(labels, packed=packed)
 
 
 @pytest.mark.parametrize("scan", ["oblique"], indirect=True)  # ITK has no shear, and refuses one
-def test_another_reader_of_nifti_sees_the_same(scan, tmp_path):
+def test_simpleitk_reads_voxels_and_places_of_a_written_nifti(scan, tmp_path):
     sitk = pytest.importorskip("SimpleITK")
-    labels = labels_of(read_volume(scan))
+    labels = make_labels_on(read_volume(scan))
     (tmp_path / "a.nii.gz").write_bytes(encode_nifti(labels, packed=True))
+
     image = sitk.ReadImage(str(tmp_path / "a.nii.gz"))
+
     assert np.array_equal(sitk.GetArrayFromImage(image), labels.voxels)
-    corner = image.TransformIndexToPhysicalPoint([3, 2, 5])
-    assert np.allclose(corner, labels.ijk_to_lps([(3, 2, 5)])[0], atol=1e-4)
+    index = (3, 2, 5)  # i, j, k of any voxel
+    place = image.TransformIndexToPhysicalPoint(index)
+    assert np.allclose(place, labels.ijk_to_lps([index])[0], atol=tolerances.LABEL_NIFTI_MM)
 
 
-def test_a_segmentation_lies_on_its_scan(scan, tmp_path):
+def test_written_segmentation_lies_on_its_scan(scan, tmp_path):
     volume = read_volume(scan)
-    labels = labels_of(volume)
-    content = encode_segmentation(labels, list_slices(scan, Selection()))
-    assert content == encode_segmentation(labels, list_slices(scan, Selection()))
-    (tmp_path / "a.dcm").write_bytes(content)
-    back = read_labels(tmp_path / "a.dcm")
+    labels = make_labels_on(volume)
+
+    back = read_labels(write_segmentation(tmp_path / "a.dcm", labels, scan))
+
+    on_scan = resample_labels(back, volume)
+    assert on_scan.exact
+    assert np.array_equal(on_scan.voxels, labels.voxels)
     assert back.names == labels.names
-    taken = resample_labels(back, volume)
-    assert taken.exact
-    assert np.array_equal(taken.voxels, labels.voxels)
-    frame = volume.report["frame_of_reference_hash"]
-    assert frame is not None and back.frame_of_reference_hash == frame
 
 
-def test_a_segmentation_references_its_slices_and_names_nobody(scan, tmp_path):
-    labels = labels_of(read_volume(scan))
-    (tmp_path / "a.dcm").write_bytes(encode_segmentation(labels, list_slices(scan, Selection())))
-    seg, slices = (
-        pydicom.dcmread(tmp_path / "a.dcm"),
-        [pydicom.dcmread(path) for path, _, _ in list_slices(scan, Selection())],
-    )
-    assert seg.StudyInstanceUID == slices[0].StudyInstanceUID
-    assert seg.FrameOfReferenceUID == slices[0].FrameOfReferenceUID
-    (series,) = seg.ReferencedSeriesSequence
-    assert series.SeriesInstanceUID == slices[0].SeriesInstanceUID != seg.SeriesInstanceUID
-    assert [one.ReferencedSOPInstanceUID for one in series.ReferencedInstanceSequence] == [
-        one.SOPInstanceUID for one in slices
-    ]
-    for group in seg.PerFrameFunctionalGroupsSequence:
-        k = group.FrameContentSequence[0].DimensionIndexValues[1] - 1
+@pytest.mark.parametrize("scan", ["oblique"], indirect=True)
+def test_written_segmentation_has_the_frame_of_reference_of_its_scan(scan, tmp_path):
+    volume = read_volume(scan)
+    back = read_labels(write_segmentation(tmp_path / "a.dcm", make_labels_on(volume), scan))
+    assert back.frame_of_reference_hash is not None
+    assert back.frame_of_reference_hash == volume.report["frame_of_reference_hash"]
+
+
+@pytest.mark.parametrize("scan", ["oblique"], indirect=True)
+def test_labels_encoded_twice_give_the_same_bytes_of_a_segmentation(scan):
+    labels, slices = make_labels_on(read_volume(scan)), list_slices(scan, Selection())
+    assert encode_segmentation(labels, slices) == encode_segmentation(labels, slices)
+
+
+def test_written_segmentation_references_study_frame_and_series_of_its_scan(scan, tmp_path):
+    labels = make_labels_on(read_volume(scan))
+    segmentation = pydicom.dcmread(write_segmentation(tmp_path / "a.dcm", labels, scan))
+    slices = read_slices(scan)
+    assert segmentation.StudyInstanceUID == slices[0].StudyInstanceUID
+    assert segmentation.FrameOfReferenceUID == slices[0].FrameOfReferenceUID
+    (series,) = segmentation.ReferencedSeriesSequence
+    assert series.SeriesInstanceUID == slices[0].SeriesInstanceUID != segmentation.SeriesInstanceUID
+    referenced = [instance.ReferencedSOPInstanceUID for instance in series.ReferencedInstanceSequence]
+    assert referenced == [one.SOPInstanceUID for one in slices]
+
+
+def test_each_frame_of_a_written_segmentation_lies_on_the_slice_that_it_references(scan, tmp_path):
+    labels = make_labels_on(read_volume(scan))
+    segmentation = pydicom.dcmread(write_segmentation(tmp_path / "a.dcm", labels, scan))
+    slices = read_slices(scan)
+    assert segmentation.NumberOfFrames == len(segmentation.PerFrameFunctionalGroupsSequence) > 0
+    for group in segmentation.PerFrameFunctionalGroupsSequence:
+        k = group.FrameContentSequence[0].DimensionIndexValues[1] - 1  # segment and slice, both counted from 1
         (source,) = group.DerivationImageSequence[0].SourceImageSequence
         assert source.ReferencedSOPInstanceUID == slices[k].SOPInstanceUID
-        place = [float(value) for value in group.PlanePositionSequence[0].ImagePositionPatient]
-        assert np.allclose(place, [float(value) for value in slices[k].ImagePositionPatient], atol=1e-6)
+        position = np.array(group.PlanePositionSequence[0].ImagePositionPatient, float)
+        assert np.allclose(position, np.array(slices[k].ImagePositionPatient, float), atol=tolerances.DICOM_PLACE_MM)
+
+
+@pytest.mark.parametrize("scan", ["oblique"], indirect=True)
+def test_written_segmentation_has_no_name_nor_date_of_the_patient(scan, tmp_path):
+    labels = make_labels_on(read_volume(scan))
+    segmentation = pydicom.dcmread(write_segmentation(tmp_path / "a.dcm", labels, scan))
     for keyword in ("PatientName", "PatientID", "PatientBirthDate", "StudyDate", "AccessionNumber"):
-        assert str(seg[keyword].value or "") == ""
+        assert str(segmentation[keyword].value or "") == ""
 
 
-def test_highdicom_reads_the_segmentation(scan, tmp_path):
+def test_highdicom_reads_names_and_voxels_of_a_written_segmentation(scan, tmp_path):
     highdicom = pytest.importorskip("highdicom")
-    labels = labels_of(read_volume(scan))
-    (tmp_path / "a.dcm").write_bytes(encode_segmentation(labels, list_slices(scan, Selection())))
-    seg = highdicom.seg.segread(tmp_path / "a.dcm")
-    assert list(seg.segment_numbers) == sorted(NAMES)
-    assert [seg.get_segment_description(n).segment_label for n in seg.segment_numbers] == list(NAMES.values())
-    uids = [pydicom.dcmread(path).SOPInstanceUID for path, _, _ in list_slices(scan, Selection())]
-    pixels = seg.get_pixels_by_source_instance(uids, assert_missing_frames_are_empty=True)
-    for place, number in enumerate(sorted(NAMES)):
-        assert np.array_equal(pixels[..., place] > 0, labels.voxels == number)
+    labels = make_labels_on(read_volume(scan))
+
+    segmentation = highdicom.seg.segread(write_segmentation(tmp_path / "a.dcm", labels, scan))
+
+    numbers = list(segmentation.segment_numbers)
+    assert {n: segmentation.get_segment_description(n).segment_label for n in numbers} == NAMES
+    slices = [one.SOPInstanceUID for one in read_slices(scan)]
+    pixels = segmentation.get_pixels_by_source_instance(slices, assert_missing_frames_are_empty=True)
+    for channel, number in enumerate(NAMES):
+        assert np.array_equal(pixels[..., channel] > 0, labels.voxels == number)
 
 
-def test_what_a_segmentation_cannot_be_made_of_is_refused(scan, tmp_path):
-    labels = labels_of(read_volume(scan))
-    slices = list_slices(scan, Selection())
+@pytest.mark.parametrize("scan", ["oblique"], indirect=True)
+def test_segmentation_of_7_slices_is_not_written_for_6(scan):
+    labels = make_labels_on(read_volume(scan))
     with refused(RefusedInputError, "slices", 7, 6):
-        encode_segmentation(labels, slices[:-1])
-    dataset = pydicom.dcmread(slices[2][0])
+        encode_segmentation(labels, list_slices(scan, Selection())[:-1])
+
+
+@pytest.mark.parametrize("scan", ["oblique"], indirect=True)
+def test_segmentation_is_not_written_for_a_slice_without_a_study(scan):
+    labels = make_labels_on(read_volume(scan))
+    slices = list_slices(scan, Selection())
+    path = slices[2][0]
+    dataset = pydicom.dcmread(path)
     del dataset.StudyInstanceUID
-    dataset.save_as(slices[2][0])
+    dataset.save_as(path)
     with refused(RefusedInputError, "StudyInstanceUID", "DICOM"):
         encode_segmentation(labels, slices)

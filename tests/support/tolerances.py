@@ -77,6 +77,10 @@ JITTER_AFFINE_MM = 1e-4  # directions off by 0.001 degrees in every slice: 8e-5 
 THOUSAND_FRAMES_S = 1.0  # of processors, for headers of 1000 frames in one file; measured 0.11
 
 # --- labels ---
+LABEL_FLOAT64 = 1e-12  # relative; volumes, means and places of some hundred voxels in float64
+LABEL_SD_FLOAT64 = 1e-9  # relative; a root of a sum of squares in float64
+LABEL_NIFTI_MM = 1e-4  # places of some 100 mm from a sform in float32, at voxels away from the first
+DICOM_PLACE_MM = 1e-6  # positions written as decimal strings of 16 characters
 NIFTI_LARGE_AFFINE_MM = 5e-5  # the same of coordinates up to 1000 mm: half a unit of float32 is 3e-5
 NIFTI_AFFINE_MM = 1e-5  # sform entries and quaternions are float32: coordinates of some 100 mm
 
