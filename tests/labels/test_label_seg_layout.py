@@ -1,4 +1,4 @@
-"""What the header of a SEG may say, with data sets made by hand: sizes to the byte, elements that occur twice."""
+"""What the header_with of a SEG may say, with data sets made by hand: sizes to the byte, elements that occur twice."""
 
 from __future__ import annotations
 
@@ -21,76 +21,89 @@ from clrecon.labels.segmentation import _check_elements, _FramePixels, _Layout, 
 META = bytes(128) + b"DICM" + struct.pack("<HH2sHL", 2, 0, b"UL", 4, 0)
 
 
-def header(kind="LABELMAP", bits=8, syntax=ExplicitVRLittleEndian, **values):
-    found = Dataset()
-    found.SegmentationType, found.Rows, found.Columns, found.BitsAllocated = kind, 10, 10, bits
-    found.file_meta = FileMetaDataset()
-    found.file_meta.TransferSyntaxUID = syntax
+def header_with(kind="LABELMAP", bits=8, syntax=ExplicitVRLittleEndian, **values):
+    """A SEG of frames of 10 x 10 pixels."""
+    data_set = Dataset()
+    data_set.SegmentationType, data_set.Rows, data_set.Columns, data_set.BitsAllocated = kind, 10, 10, bits
+    data_set.file_meta = FileMetaDataset()
+    data_set.file_meta.TransferSyntaxUID = syntax
     for keyword, value in values.items():
-        setattr(found, keyword, value)
-    return found
+        setattr(data_set, keyword, value)
+    return data_set
 
 
 @pytest.mark.parametrize(
-    ("kind", "bits", "syntax", "least"),
+    ("kind", "bits", "syntax", "least_bytes"),
     [
-        ("LABELMAP", 8, ExplicitVRLittleEndian, 300),
-        ("LABELMAP", 16, ExplicitVRLittleEndian, 600),
-        ("BINARY", 8, ExplicitVRLittleEndian, 300),
-        ("BINARY", 1, ExplicitVRLittleEndian, 38),  # eight pixels a byte: 304
-        ("LABELMAP", 8, RLELossless, 5),  # at most 64 bytes from one: 320
+        pytest.param("LABELMAP", 8, ExplicitVRLittleEndian, 3 * 100, id="bytes"),
+        pytest.param("LABELMAP", 16, ExplicitVRLittleEndian, 3 * 200, id="two bytes a pixel"),
+        pytest.param("BINARY", 8, ExplicitVRLittleEndian, 3 * 100, id="binary in bytes"),
+        pytest.param("BINARY", 1, ExplicitVRLittleEndian, 38, id="bits: 8 x 38 are 304"),
+        pytest.param("LABELMAP", 8, RLELossless, 5, id="RLE, at most 64 from one: 320"),
     ],
 )
-def test_a_file_holds_at_least_its_pixels(kind, bits, syntax, least):
-    data_set = header(kind, bits, syntax, NumberOfFrames=3)
-    assert _read_layout(data_set, "a.dcm", least) == _Layout(kind, 10, 10, 3, bits)
+def test_header_of_three_frames_is_read_from_a_file_that_can_hold_their_pixels(kind, bits, syntax, least_bytes):
+    data_set = header_with(kind, bits, syntax, NumberOfFrames=3)
+    assert _read_layout(data_set, "a.dcm", least_bytes) == _Layout(kind, 10, 10, 3, bits)
     with refused(RefusedInputError, "a.dcm", 10):
-        _read_layout(data_set, "a.dcm", least - 1)
+        _read_layout(data_set, "a.dcm", least_bytes - 1)
 
 
-def test_segmentation_without_a_number_of_frames_has_one():
-    assert _read_layout(header(), "a.dcm", 100).frames == 1
+def test_segmentation_that_does_not_say_its_number_of_frames_has_one():
+    assert _read_layout(header_with(), "a.dcm", 100).frames == 1
 
 
 @pytest.mark.parametrize(("kind", "bits"), [("BINARY", 16), ("LABELMAP", 1), ("LABELMAP", 32)])
-def test_bits_are_those_of_the_kind(kind, bits):
+def test_bits_a_pixel_that_the_kind_of_segmentation_does_not_have_are_refused(kind, bits):
     with refused(RefusedInputError, 1, bits):
-        _read_layout(header(kind, bits), "a.dcm", 1000)
+        _read_layout(header_with(kind, bits), "a.dcm", 1000)
 
 
 @pytest.mark.parametrize("frames", [0, 1_000_001])
-def test_frames_are_counted_from_one_to_a_million(frames):
+def test_number_of_frames_outside_of_one_to_a_million_is_refused(frames):
     with refused(RefusedInputError, frames):
-        _read_layout(header(NumberOfFrames=frames), "a.dcm", 1000)
-    assert _read_layout(header(NumberOfFrames=1_000_000), "a.dcm", 10**8).frames == 1_000_000
+        _read_layout(header_with(NumberOfFrames=frames), "a.dcm", 1_000_001 * 100)
 
 
-def test_pixels_fill_their_bytes_to_the_last_bit():
+def test_a_million_frames_are_accepted():
+    assert _read_layout(header_with(NumberOfFrames=1_000_000), "a.dcm", 1_000_000 * 100).frames == 1_000_000
+
+
+def test_pixels_of_one_bit_are_read_over_the_ends_of_bytes_to_the_last_bit():
     # 3 frames of 3 x 3 pixels are 27 bits: 4 bytes; the second frame begins at bit 9.
-    data = bytes([0xFF, 0x03, 0x00, 0x04])
-    layout = _Layout("BINARY", 3, 3, 3, 1)
-    pixels = _FramePixels(header("BINARY", 1, PixelData=data), layout, "a.dcm")
-    assert [pixels.read(frame).ravel().tolist() for frame in range(3)] == [[1] * 9, [1] + [0] * 8, [0] * 8 + [1]]
+    data = bytes([0b11111111, 0b00000011, 0b00000000, 0b00000100])
+    pixels = _FramePixels(header_with("BINARY", 1, PixelData=data), _Layout("BINARY", 3, 3, 3, 1), "a.dcm")
+    frames = [pixels.read(frame).ravel().tolist() for frame in range(3)]
+    assert frames == [[1] * 9, [1] + [0] * 8, [0] * 8 + [1]]
+
+
+def test_pixels_of_one_bit_that_lack_their_last_byte_are_refused():
     with refused(RefusedInputError, 3, "frames"):
-        _FramePixels(header("BINARY", 1, PixelData=data[:3]), layout, "a.dcm")
+        _FramePixels(header_with("BINARY", 1, PixelData=bytes(3)), _Layout("BINARY", 3, 3, 3, 1), "a.dcm")
 
 
-@pytest.mark.parametrize(("bits", "frames"), [(1, 2), (8, 1), (8, 3)])
-def test_compressed_frames_are_as_many_as_said_and_of_whole_bytes(bits, frames):
-    data = header("BINARY", bits, RLELossless, PixelData=encapsulate([bytes(66), bytes(66)]))
+TWO_RLE_FRAMES = encapsulate([bytes(66), bytes(66)])
+
+
+@pytest.mark.parametrize(("bits", "frames"), [(1, 2), (8, 1), (8, 3)], ids=["bits", "one too many", "one too few"])
+def test_compressed_frames_of_bits_or_of_another_number_than_stated_are_refused(bits, frames):
+    data_set = header_with("BINARY", bits, RLELossless, PixelData=TWO_RLE_FRAMES)
     with pytest.raises(ValueError, match=f"compressed frames of {bits} bits|frame"):
-        _FramePixels(data, _Layout("BINARY", 3, 3, frames, bits), "a.dcm")
-    sound = header("BINARY", 8, RLELossless, PixelData=encapsulate([bytes(66), bytes(66)]))
-    assert len(_FramePixels(sound, _Layout("BINARY", 3, 3, 2, 8), "a.dcm")._fragments) == 2
+        _FramePixels(data_set, _Layout("BINARY", 3, 3, frames, bits), "a.dcm")
 
 
-def test_pixels_of_two_bytes_come_lowest_byte_first():
+def test_compressed_frames_of_bytes_in_the_stated_number_are_accepted():
+    data_set = header_with("BINARY", 8, RLELossless, PixelData=TWO_RLE_FRAMES)
+    assert len(_FramePixels(data_set, _Layout("BINARY", 3, 3, 2, 8), "a.dcm")._fragments) == 2
+
+
+def test_pixels_of_two_bytes_are_read_lowest_byte_first():
     data = struct.pack("<12H", *range(300, 312))
-    pixels = _FramePixels(header(bits=16, PixelData=data), _Layout("LABELMAP", 2, 3, 2, 16), "a.dcm")
+    pixels = _FramePixels(header_with(bits=16, PixelData=data), _Layout("LABELMAP", 2, 3, 2, 16), "a.dcm")
     assert pixels.read(1).tolist() == [[306, 307, 308], [309, 310, 311]]
 
 
-def nested(*keywords, twice):
+def element_in_sequences(*keywords, twice):
     """A value in sequences, with a second value of the same element behind it if `twice`."""
     *sequences, last = keywords
     data = element_bytes(last, b"1 ") + (element_bytes(last, b"2 ") if twice else b"")
@@ -101,51 +114,51 @@ def nested(*keywords, twice):
     return META + data
 
 
-PLACES = [
+ELEMENTS_OF_FRAMES = [
     ("PlanePositionSequence", "ImagePositionPatient"),
     ("PlaneOrientationSequence", "ImageOrientationPatient"),
     *(("PixelMeasuresSequence", name) for name in ("SliceThickness", "SpacingBetweenSlices", "PixelSpacing")),
     ("SegmentIdentificationSequence", "ReferencedSegmentNumber"),
 ]
+ELEMENTS = [
+    *((name,) for name in ("FrameOfReferenceUID", "NumberOfFrames", "Rows", "Columns", "BitsAllocated", "BitsStored")),
+    ("SegmentationType",),
+    ("SegmentSequence", "SegmentNumber"),
+    ("SegmentSequence", "SegmentLabel"),
+    *(("SharedFunctionalGroupsSequence", *element) for element in ELEMENTS_OF_FRAMES),
+    *(("PerFrameFunctionalGroupsSequence", *element) for element in ELEMENTS_OF_FRAMES),
+]
+"""Sequences from outside in, and the element in the innermost."""
 
 
-@pytest.mark.parametrize(
-    "keywords",
-    [
-        *(
-            (name,)
-            for name in (
-                *("FrameOfReferenceUID", "NumberOfFrames", "Rows", "Columns", "BitsAllocated", "BitsStored"),
-                "SegmentationType",
-            )
-        ),
-        ("SegmentSequence", "SegmentNumber"),
-        ("SegmentSequence", "SegmentLabel"),
-        *(("SharedFunctionalGroupsSequence", *place) for place in PLACES),
-        *(("PerFrameFunctionalGroupsSequence", *place) for place in PLACES),
-    ],
-    ids=lambda keywords: "-".join(keywords[-2:]),
-)
-def test_elements_that_place_and_name_segments_occur_once(keywords):
-    _check_elements(nested(*keywords, twice=False), "a.dcm", implicit=False)
+@pytest.mark.parametrize("keywords", ELEMENTS, ids=lambda keywords: "-".join(keywords[-2:]))
+def test_element_that_places_or_names_segments_is_refused_where_it_occurs_twice(keywords):
+    _check_elements(element_in_sequences(*keywords, twice=False), "a.dcm", implicit=False)
     with refused(RefusedInputError, "a.dcm", "DICOM", keywords[-1]):
-        _check_elements(nested(*keywords, twice=True), "a.dcm", implicit=False)
+        _check_elements(element_in_sequences(*keywords, twice=True), "a.dcm", implicit=False)
 
 
-def test_files_beyond_four_gigabytes_are_not_read(tmp_path: Path):
-    class Long(bytes):
+def test_elements_of_a_file_beyond_four_gigabytes_are_not_read():
+    class FourGigabytesAndOne(bytes):
         def __len__(self) -> int:
             return 2**32 + 1
 
     with pytest.raises(RefusedInputError, match="a.dcm is larger than 4,294,967,296 bytes"):
-        _check_elements(Long(META), "a.dcm", implicit=False)
+        _check_elements(FourGigabytesAndOne(META), "a.dcm", implicit=False)
+
+
+def test_elements_of_a_file_of_the_most_bytes_are_read():
     content = META + element_bytes("Rows", b"\1\0")
     _check_elements(content, "a.dcm", implicit=False, most=len(content))
+
+
+def test_data_set_of_a_file_is_parsed_up_to_the_most_bytes(tmp_path: Path):
     data_set = Dataset()
     data_set.preamble, data_set.file_meta = bytes(128), FileMetaDataset()
     data_set.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
     data_set.save_as(tmp_path / "a.dcm", enforce_file_format=False)
     size = (tmp_path / "a.dcm").stat().st_size
-    for most, words in ((size, "is DICOM but no segmentation"), (size - 1, f"is larger than {size - 1:,} bytes")):
-        with pytest.raises(RefusedInputError, match=words):
-            segmentation._parse_dataset(tmp_path / "a.dcm", "a.dcm", most)
+    with pytest.raises(RefusedInputError, match="is DICOM but no segmentation"):  # parsed
+        segmentation._parse_dataset(tmp_path / "a.dcm", "a.dcm", size)
+    with pytest.raises(RefusedInputError, match=f"is larger than {size - 1:,} bytes"):
+        segmentation._parse_dataset(tmp_path / "a.dcm", "a.dcm", size - 1)

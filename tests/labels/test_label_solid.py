@@ -10,67 +10,95 @@ import pytest
 from clrecon.labels.label_levels import _close_ends, _reach_from_faces, fill_solid, find_boxes
 
 
-def slices(*ends):
+def box_of(*ends):
     return tuple(slice(*end) for end in ends)
 
 
-def test_a_box_reaches_one_sample_further_and_ends_with_the_grid():
+def test_box_of_a_label_reaches_its_margin_and_a_sample_further_and_ends_with_the_grid():
     labels = np.zeros((20, 30, 40), np.uint16)
-    labels[10:12, 14:17, 20], labels[0, 29, 39] = 2, 4
-    boxes = find_boxes(labels, (2, 3, 4), (1, 2, 3))  # i, j, k
-    assert boxes == {2: slices((6, 16), (11, 20), (18, 23)), 4: slices((0, 5), (26, 30), (37, 40))}
-    assert find_boxes(labels, (), (0, 0, 0)) == {}
+    labels[10:12, 14:17, 20] = 2
+    labels[0, 29, 39] = 4  # in a corner of the grid
+    margins_ijk = (1, 2, 3)
+    boxes = find_boxes(labels, (2, 3, 4), margins_ijk)  # no voxel has label 3
+    assert boxes == {2: box_of((6, 16), (11, 20), (18, 23)), 4: box_of((0, 5), (26, 30), (37, 40))}
 
 
-@pytest.mark.parametrize("face", list(product(range(3), (0, 2))), ids=str)
-def test_a_way_from_any_side_is_found(face):
-    axis, side = face
+def test_no_labels_have_no_boxes():
+    assert find_boxes(np.ones((2, 2, 2), np.uint16), (), (0, 0, 0)) == {}
+
+
+def test_voxel_without_a_way_to_any_face_is_not_reached():
     passable = np.zeros((3, 3, 3), bool)
     passable[1, 1, 1] = True
     assert not _reach_from_faces(passable).any()
+
+
+@pytest.mark.parametrize("face", list(product(range(3), (0, 2))), ids=str)
+def test_voxel_beside_a_passable_one_in_any_face_is_reached(face):
+    axis, side = face
+    passable = np.zeros((3, 3, 3), bool)
+    passable[1, 1, 1] = True
     np.moveaxis(passable, axis, 0)[side, 1, 1] = True
     assert np.array_equal(_reach_from_faces(passable), passable)
 
 
-@pytest.mark.parametrize("axis", range(3))
-def test_no_way_begins_where_the_volume_ends(axis):
-    box = slices((0, 3), (1, 4), (2, 5))  # of 3 x 9 x 5: at both ends, at none, at the upper end
-    passable = np.ones((5, 5, 5), bool)
-    _close_ends(passable, box, (3, 9, 5))
-    blocked = [[not np.moveaxis(passable, axis, 0)[side, 1:4, 1:4].any() for side in (0, -1)] for axis in range(3)]
-    assert blocked[axis] == [[True, True], [False, False], [False, True]][axis]
+@pytest.mark.parametrize(
+    ("axis", "ends_of_volume"),
+    [(0, [True, True]), (1, [False, False]), (2, [False, True])],
+    ids=["k: both ends", "j: no end", "i: upper end"],
+)
+def test_faces_of_a_box_are_closed_where_the_volume_ends(axis, ends_of_volume):
+    box, volume_shape = box_of((0, 3), (1, 4), (2, 5)), (3, 9, 5)
+    passable = np.ones((5, 5, 5), bool)  # the box and a voxel around it
+    _close_ends(passable, box, volume_shape)
+    lower_and_upper_face = np.moveaxis(passable, axis, 0)[[0, -1], 1:4, 1:4]
+    assert [not face.any() for face in lower_and_upper_face] == ends_of_volume
     assert passable[1:4, 1:4, 1:4].all()
 
 
-def ball(size=5):
-    """A cube of a label around one empty voxel, all but the middle inside of it."""
-    labels = np.zeros((size + 4,) * 3, np.uint16)
+INNER_BOX = box_of((1, 8), (1, 8), (1, 8))
+"""The cube of label 7 with a voxel around it."""
+
+
+def cube_of_label_7():
+    """A cube of 5 x 5 x 5 voxels with two empty voxels around it."""
+    labels = np.zeros((9, 9, 9), np.uint16)
     labels[2:-2, 2:-2, 2:-2] = 7
     return labels
 
 
-def test_deep_voxels_and_holes_are_filled_and_counted():
-    labels = ball()
-    box = slices((1, 8), (1, 8), (1, 8))
-    assert fill_solid(np.zeros_like(labels), labels, 7, box, True) == 27  # all neighbours carry the label
+def test_voxels_whose_neighbours_all_carry_the_label_are_filled_and_counted():
+    labels = cube_of_label_7()
+    assert fill_solid(np.zeros_like(labels), labels, 7, INNER_BOX, True) == 3**3  # all but the outermost voxels
+
+
+def test_hole_within_a_label_is_filled_and_counted():
+    labels = cube_of_label_7()
     labels[4, 4, 4] = 0
-    solid = np.where(labels == 7, labels, 0)
-    assert fill_solid(solid, labels, 7, box, True) == 1 and solid[4, 4, 4] == 7
-    solid = np.where(labels == 7, labels, 0)
-    labels[4, 4, 4] = 3  # another label stays what it is
-    assert fill_solid(solid, labels, 7, box, True) == 0 and solid[4, 4, 4] == 0
+    solid = labels.copy()
+    assert fill_solid(solid, labels, 7, INNER_BOX, True) == 1
+    assert solid[4, 4, 4] == 7
 
 
-def test_samples_inside_another_label_stay_so():
-    labels = ball()
+def test_voxel_of_another_label_within_a_label_is_not_filled():
+    labels = cube_of_label_7()
+    labels[4, 4, 4] = 3
+    solid = np.where(labels == 7, labels, 0)
+    assert fill_solid(solid, labels, 7, INNER_BOX, True) == 0
+    assert solid[4, 4, 4] == 0
+
+
+def test_voxel_that_another_solid_label_has_filled_keeps_that_label():
+    labels = cube_of_label_7()
     solid = np.zeros_like(labels)
     solid[4, 4, 4] = 5
-    assert fill_solid(solid, labels, 7, slices((1, 8), (1, 8), (1, 8)), True) == 26 and solid[4, 4, 4] == 5
+    assert fill_solid(solid, labels, 7, INNER_BOX, True) == 3**3 - 1
+    assert solid[4, 4, 4] == 5
 
 
-@pytest.mark.parametrize("axis", range(3))
-def test_a_hole_with_a_way_out_stays_a_hole(axis):
-    labels = ball()
-    np.moveaxis(labels, axis, 0)[2:5, 4, 4] = 0
-    solid = np.where(labels == 7, labels, 0)
-    assert fill_solid(solid, labels, 7, slices((1, 8), (1, 8), (1, 8)), True) == 0
+@pytest.mark.parametrize("axis", range(3), ids=["k", "j", "i"])
+def test_hole_with_a_way_out_of_the_label_is_not_filled(axis):
+    labels = cube_of_label_7()
+    np.moveaxis(labels, axis, 0)[2:5, 4, 4] = 0  # from a face of the cube to its middle
+    solid = labels.copy()
+    assert fill_solid(solid, labels, 7, INNER_BOX, True) == 0

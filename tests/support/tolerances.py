@@ -79,9 +79,12 @@ THOUSAND_FRAMES_S = 1.0  # of processors, for headers of 1000 frames in one file
 # --- labels ---
 LABEL_FLOAT64 = 1e-12  # relative; volumes, means and places of some hundred voxels in float64
 LABEL_SD_FLOAT64 = 1e-9  # relative; a root of a sum of squares in float64
+TILTED_CANAL_DICE = 0.97  # of a canal of 20 x 16 x 14 mm tilted by 20 degrees: its shift is rounded to whole voxels
+EQUAL_DISTANCE_MM = 1e-9  # distances of a few mm in float64 that are equal but for rounding
 LABEL_NIFTI_MM = 1e-4  # places of some 100 mm from a sform in float32, at voxels away from the first
 DICOM_PLACE_MM = 1e-6  # positions written as decimal strings of 16 characters
 NIFTI_LARGE_AFFINE_MM = 5e-5  # the same of coordinates up to 1000 mm: half a unit of float32 is 3e-5
+VTK_PLACE_MM = 1e-5  # points of a grid of VTK, float32
 NIFTI_AFFINE_MM = 1e-5  # sform entries and quaternions are float32: coordinates of some 100 mm
 
 REAL_SOLID_VOLUME = 0.05  # a vertebra at 2 mm and 200 HU against its mask, which a network drew; measured -1.2 %
