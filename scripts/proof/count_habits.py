@@ -166,10 +166,15 @@ def _is_table_without_ids(node: ast.AST) -> bool:
         return False
     rows = getattr(node.args[1], "elts", [])
     named = any(keyword.arg == "ids" for keyword in node.keywords)
+    named_rows = [row for row in rows if any(keyword.arg == "id" for keyword in getattr(row, "keywords", []))]
     return (
         len(rows) >= LONG_TABLE
         and not named
-        and any(all(isinstance(value, ast.Call) for value in getattr(row, "elts", [row])) for row in rows)
+        and any(
+            all(isinstance(value, ast.Call) for value in getattr(row, "elts", [row]))
+            for row in rows
+            if row not in named_rows
+        )
     )
 
 

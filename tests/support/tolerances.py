@@ -79,7 +79,10 @@ THOUSAND_FRAMES_S = 1.0  # of processors, for headers of 1000 frames in one file
 # --- labels ---
 LABEL_FLOAT64 = 1e-12  # relative; volumes, means and places of some hundred voxels in float64
 LABEL_SD_FLOAT64 = 1e-9  # relative; a root of a sum of squares in float64
+UNEVEN_LABEL_VOLUME = 0.01  # a map with four even slices to the smallest of uneven gaps; measured 0.004
+DECIMAL_PLACE_MM = 1e-9  # affines of NRRD and MetaImage, whose decimals say a float64 exactly
 TILTED_CANAL_DICE = 0.97  # of a canal of 20 x 16 x 14 mm tilted by 20 degrees: its shift is rounded to whole voxels
+HEADER_PEAK_BYTES = 8e6  # what reading a header may take that is refused; its file has some hundred bytes
 EQUAL_DISTANCE_MM = 1e-9  # distances of a few mm in float64 that are equal but for rounding
 LABEL_NIFTI_MM = 1e-4  # places of some 100 mm from a sform in float32, at voxels away from the first
 DICOM_PLACE_MM = 1e-6  # positions written as decimal strings of 16 characters
