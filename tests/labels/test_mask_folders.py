@@ -7,6 +7,7 @@ import json
 import dicom_series
 import numpy as np
 import pytest
+import tolerances
 from label_files import OBLIQUE, make_labels, write_nifti, write_nrrd
 from refusals import refused
 from volume_files import write_metaimage
@@ -21,39 +22,53 @@ pytestmark = pytest.mark.unit
 SHAPE = (4, 6, 7)
 
 
-def mask(*boxes):
+VOXELS_A_SLICE = 6 * 7
+
+
+def mask_of_slices(*ranges):
+    """A mask of all voxels of slices `first` to `end` - 1, for each (first, end)."""
     voxels = np.zeros(SHAPE, np.uint8)
-    for low, high in boxes:
-        voxels[low:high] = 1
+    for first, end in ranges:
+        voxels[first:end] = 1
     return voxels
 
 
-def write_folder(path, affine=OBLIQUE):
-    """Three structures that share a slice each, one that is absent, and what lies beside them."""
+def write_masks(path, affine=OBLIQUE):
+    """Masks on slices 0-1 (L3), 1-2 (aorta) and 2-3 (liver), an empty one (spleen), and what lies beside them."""
     path.mkdir()
-    write_nifti(path / "vertebrae_L3.nii.gz", mask((0, 2)), affine)
-    write_nrrd(path / "aorta.seg.nrrd", mask((1, 3)) * 255, affine)
-    write_metaimage(path / "liver.mha", mask((2, 4)).astype(np.int16), affine)
-    write_nifti(path / "spleen.nii", mask(), affine)
+    write_nifti(path / "vertebrae_L3.nii.gz", mask_of_slices((0, 2)), affine)
+    write_nrrd(path / "aorta.seg.nrrd", mask_of_slices((1, 3)) * 255, affine)
+    write_metaimage(path / "liver.mha", mask_of_slices((2, 4)).astype(np.int16), affine)
+    write_nifti(path / "spleen.nii", mask_of_slices(), affine)
     (path / "statistics.json").write_text("{}")
     (path / "._aorta.nii.gz").write_bytes(b"\0\5\x16\7")
     return path
 
 
-def test_each_file_is_a_label_with_its_name(tmp_path):
-    labels = read_labels(write_folder(tmp_path / "masks"))
+def test_each_mask_of_a_folder_is_a_label_named_by_its_file(tmp_path):
+    labels = read_labels(write_masks(tmp_path / "masks"))
     assert labels.names == {1: "aorta", 2: "liver", 3: "spleen", 4: "vertebrae_L3"}
-    assert [int(number) for number in labels.voxels[:, 0, 0]] == [4, 1, 1, 2]
-    assert labels.counts == {1: 84, 2: 42, 4: 42} and labels.find("L3") == 4
-    assert np.allclose(labels.affine, OBLIQUE, atol=1e-5)
-    assert labels.warnings == (
+    assert labels.find("L3") == 4
+    assert np.allclose(labels.affine, OBLIQUE, atol=tolerances.NIFTI_AFFINE_MM)
+
+
+def test_voxels_of_two_masks_belong_to_the_first_in_alphabetical_order(tmp_path):
+    labels = read_labels(write_masks(tmp_path / "masks"))
+    aorta, liver, l3 = 1, 2, 4
+    label_of_slice = [int(number) for number in labels.voxels[:, 0, 0]]
+    assert label_of_slice == [l3, aorta, aorta, liver]
+    assert labels.counts == {aorta: 2 * VOXELS_A_SLICE, liver: VOXELS_A_SLICE, l3: VOXELS_A_SLICE}
+
+
+def test_empty_and_overlapping_masks_are_warned_of(tmp_path):
+    assert read_labels(write_masks(tmp_path / "masks")).warnings == (
         "1 of 4 masks holds no voxel: spleen",
         "the masks overlap in 84 voxels: each belongs to the first of its masks in alphabetical order, labels that were"
         " chosen before others",
     )
 
 
-def link_out(folder, name):
+def replace_by_link(folder, name):
     """Move a mask out of its folder and leave a link, as git-annex does."""
     store = folder.parent / "store"
     store.mkdir(exist_ok=True)
@@ -61,59 +76,91 @@ def link_out(folder, name):
     (folder / name).symlink_to(store / name)
 
 
-def test_masks_that_are_links_out_of_the_folder_are_followed_on_request_alone(tmp_path):
-    whole = read_labels(write_folder(tmp_path / "whole"))
-    folder = write_folder(tmp_path / "masks")
-    link_out(folder, "aorta.seg.nrrd")
-    link_out(folder, "liver.mha")
+@pytest.fixture
+def masks_with_links_out(tmp_path):
+    folder = write_masks(tmp_path / "masks")
+    replace_by_link(folder, "aorta.seg.nrrd")
+    replace_by_link(folder, "liver.mha")
+    return folder
+
+
+def test_links_out_of_a_folder_of_masks_are_refused(masks_with_links_out):
     with refused(RefusedInputError, "aorta.seg.nrrd", "liver.mha", 2):
-        read_labels(folder)
-    assert not is_large_map(folder)
-    labels = read_labels(folder, follow_links=True)
-    assert np.array_equal(labels.voxels, whole.voxels) and labels.names == whole.names
+        read_labels(masks_with_links_out)
 
 
-def test_links_inside_of_the_folder_are_left_out_and_lost_ones_are_told(tmp_path):
-    folder = write_folder(tmp_path / "masks")
+def test_links_out_of_a_folder_of_masks_are_followed_on_request(masks_with_links_out, tmp_path):
+    labels = read_labels(masks_with_links_out, follow_links=True)
+    without_links = read_labels(write_masks(tmp_path / "without links"))
+    assert np.array_equal(labels.voxels, without_links.voxels)
+    assert labels.names == without_links.names
+
+
+def test_folder_with_links_out_of_it_is_not_called_large(masks_with_links_out):
+    assert not is_large_map(masks_with_links_out)
+
+
+def test_links_between_masks_of_a_folder_are_left_out(tmp_path):
+    folder = write_masks(tmp_path / "masks")
     (folder / "copy.nii.gz").symlink_to("vertebrae_L3.nii.gz")
     assert "copy" not in read_labels(folder).names.values()
+
+
+def test_link_to_a_mask_that_is_missing_is_refused_by_its_name(tmp_path):
+    folder = write_masks(tmp_path / "masks")
     (folder / "rib.nii.gz").symlink_to("../gone.nii.gz")
     with refused(RefusedInputError, "rib.nii.gz", 1):
         read_labels(folder, follow_links=True)
-    (folder / "rib.nii.gz").unlink()
+
+
+def test_link_to_a_file_that_is_no_mask_is_left_out(tmp_path):
+    folder = write_masks(tmp_path / "masks")
     (tmp_path / "readme.txt").write_text("text")
     (folder / "readme.txt").symlink_to("../readme.txt")
-    assert read_labels(folder).counts == {1: 84, 2: 42, 4: 42}
+    assert "readme" not in read_labels(folder).names.values()
 
 
-def test_commands_follow_links_to_masks_on_request(tmp_path, printed):
+def test_command_names_the_option_that_follows_links_to_masks_and_reads_them_with_it(tmp_path, printed):
     dicom_series.write_series(tmp_path / "ct", dicom_series.Plan(shape=SHAPE))
-    folder = write_folder(tmp_path / "masks", read_volume(tmp_path / "ct").affine)
-    link_out(folder, "aorta.seg.nrrd")
+    folder = write_masks(tmp_path / "masks", read_volume(tmp_path / "ct").affine)
+    replace_by_link(folder, "aorta.seg.nrrd")
     command = ["stats", str(tmp_path / "ct"), "--labels", str(folder)]
-    assert main(command) == 4
+
+    assert main(command) == RefusedInputError.exit_code
     printed().assert_error("--follow-links")
+
     assert main([*command, "--follow-links"]) == 0
     printed().assert_output("aorta")
 
 
-def test_chosen_masks_win_overlaps_and_unknown_ones_are_refused(tmp_path):
-    folder = write_folder(tmp_path / "masks")
-    alone = read_labels(folder, ["liver", "L3"])
-    assert alone.counts == {2: 84, 4: 84} and alone.names == {2: "liver", 4: "vertebrae_L3"} and alone.warnings == ()
-    assert read_all_labels(folder, ["liver"]).counts == {1: 42, 2: 84, 4: 42}
-    with refused(UsageError, "rib", 1, 2):
-        read_labels(folder, ["rib"])
-    with refused(UsageError, "label"):
-        read_labels(folder, [])
-    with refused(UsageError, "spleen", "masks"):
-        read_labels(folder, ["spleen"])
+def test_chosen_masks_are_read_alone_with_all_their_voxels(tmp_path):
+    labels = read_labels(write_masks(tmp_path / "masks"), ["liver", "L3"])
+    assert labels.names == {2: "liver", 4: "vertebrae_L3"}
+    assert labels.counts == {2: 2 * VOXELS_A_SLICE, 4: 2 * VOXELS_A_SLICE}
+    assert labels.warnings == ()
 
 
-def test_a_folder_says_whether_it_is_large(tmp_path):
-    folder = write_folder(tmp_path / "masks")
-    for most, large in ((335, True), (336, False)):  # 168 voxels of 16 bits
-        assert is_large_map(folder, most_bytes=most) == large
+def test_chosen_mask_keeps_the_voxels_that_it_shares_where_all_are_read(tmp_path):
+    aorta, liver, l3 = 1, 2, 4
+    labels = read_all_labels(write_masks(tmp_path / "masks"), ["liver"])
+    assert labels.counts == {aorta: VOXELS_A_SLICE, liver: 2 * VOXELS_A_SLICE, l3: VOXELS_A_SLICE}
+
+
+@pytest.mark.parametrize(
+    ("only", "facts"),
+    [(["rib"], ("rib", 1, 2)), ([], ("label",)), (["spleen"], ("spleen", "masks"))],
+    ids=["unknown", "none", "without a voxel"],
+)
+def test_choice_of_masks_that_are_not_there_is_refused(tmp_path, only, facts):
+    with refused(UsageError, *facts):
+        read_labels(write_masks(tmp_path / "masks"), only)
+
+
+def test_folder_of_masks_is_called_large_by_the_bytes_of_its_map(tmp_path):
+    folder = write_masks(tmp_path / "masks")
+    stored_bytes = 4 * VOXELS_A_SLICE * 2  # of 16 bits
+    assert is_large_map(folder, most_bytes=stored_bytes - 1)
+    assert not is_large_map(folder, most_bytes=stored_bytes)
 
 
 @pytest.mark.parametrize(
@@ -129,54 +176,74 @@ def test_a_folder_says_whether_it_is_large(tmp_path):
         ("no voxel", r"masks is empty: no voxel has a label"),
     ],
 )
-def test_folders_that_are_no_masks_are_refused(tmp_path, harm, words):
+def test_folder_that_is_no_folder_of_masks_is_refused_with_the_reason(tmp_path, harm, words):
     folder = tmp_path / "masks"
     folder.mkdir()
     if harm != "empty":
-        write_nifti(folder / "a.nii", mask() if harm == "no voxel" else mask((0, 1)))
+        write_nifti(folder / "a.nii", mask_of_slices() if harm == "no voxel" else mask_of_slices((0, 1)))
     if harm == "several":
         write_nifti(folder / "b.nii", make_labels())
     elif harm == "moved":
         moved = OBLIQUE.copy()
         moved[0, 3] += 0.01
-        write_nifti(folder / "b.nii", mask((1, 2)), moved)
+        write_nifti(folder / "b.nii", mask_of_slices((1, 2)), moved)
     elif harm == "shape":
-        write_nifti(folder / "b.nii", mask((1, 2))[:3])
+        write_nifti(folder / "b.nii", mask_of_slices((1, 2))[:3])
     elif harm == "twice":
-        write_nrrd(folder / "a.nrrd", mask((1, 2)))
+        write_nrrd(folder / "a.nrrd", mask_of_slices((1, 2)))
     elif harm == "dicom":
         dicom_series.write_series(folder, dicom_series.Plan(shape=(3, 4, 5)))
     elif harm == "cut":
-        content = write_nifti(folder / "b.nii", mask((1, 2))).read_bytes()
+        content = write_nifti(folder / "b.nii", mask_of_slices((1, 2))).read_bytes()
         (folder / "b.nii").write_bytes(content[:-20])
     with pytest.raises(RefusedInputError, match=words):
         read_labels(folder)
 
 
-def test_one_mask_is_named_by_its_file(tmp_path):
-    for name, write in (("liver.nii.gz", write_nifti), ("L3.seg.nrrd", write_nrrd), ("aorta.mha", write_metaimage)):
-        for value in (1, 255):
-            labels = read_labels(write(tmp_path / name, mask((1, 2)) * np.uint8(value)))
-            assert labels.names == {value: name.split(".")[0]}
-    assert read_labels(write_nifti(tmp_path / "a.nii", mask((1, 2)) * 27)).names == {27: "label_27"}
+@pytest.mark.parametrize("value", [1, 255])
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [("liver.nii.gz", write_nifti), ("L3.seg.nrrd", write_nrrd), ("aorta.mha", write_metaimage)],
+    ids=["NIfTI", "NRRD", "MetaImage"],
+)
+def test_single_mask_of_value_1_or_255_is_named_by_its_file(tmp_path, name, write, value):
+    labels = read_labels(write(tmp_path / name, mask_of_slices((1, 2)) * np.uint8(value)))
+    assert labels.names == {value: name.split(".")[0]}
+
+
+def test_single_label_of_another_value_is_named_by_its_number(tmp_path):
+    path = write_nifti(tmp_path / "a.nii", mask_of_slices((1, 2)) * 27)
+    assert read_labels(path).names == {27: "label_27"}
+
+
+def test_single_mask_with_a_label_table_is_named_by_that(tmp_path):
     table = b'<Label Key="1">spleen</Label>'
-    assert read_labels(write_nifti(tmp_path / "b.nii", mask((1, 2)), extension=table)).names == {1: "spleen"}
+    path = write_nifti(tmp_path / "b.nii", mask_of_slices((1, 2)), extension=table)
+    assert read_labels(path).names == {1: "spleen"}
 
 
 @pytest.mark.release
 @pytest.mark.first_device
-def test_commands_take_a_folder(tmp_path, printed):
-    dicom_series.write_series(tmp_path / "ct", dicom_series.Plan(shape=(4, 6, 7)))
-    folder = write_folder(tmp_path / "masks", read_volume(tmp_path / "ct").affine)
-    words = ["--labels", str(folder), "-q", "--report", str(tmp_path / "s.json")]
-    assert main(["stats", str(tmp_path / "ct"), *words]) == 0, printed()
-    report = json.loads((tmp_path / "s.json").read_text())
-    assert [(one["name"], one["voxels"]) for one in report["labels"]] == [
-        ("aorta", 84),
-        ("liver", 42),
-        ("vertebrae_L3", 42),
+def test_command_stats_measures_the_masks_of_a_folder_and_warns_of_overlaps(tmp_path):
+    dicom_series.write_series(tmp_path / "ct", dicom_series.Plan(shape=SHAPE))
+    folder = write_masks(tmp_path / "masks", read_volume(tmp_path / "ct").affine)
+    report_path = tmp_path / "s.json"
+    assert main(["stats", str(tmp_path / "ct"), "--labels", str(folder), "-q", "--report", str(report_path)]) == 0
+    report = json.loads(report_path.read_text())
+    assert [(label["name"], label["voxels"]) for label in report["labels"]] == [
+        ("aorta", 2 * VOXELS_A_SLICE),
+        ("liver", VOXELS_A_SLICE),
+        ("vertebrae_L3", VOXELS_A_SLICE),
     ]
     assert any("the masks overlap in 84 voxels" in warning for warning in report["warnings"])
-    mesh = ["mesh", str(tmp_path / "ct"), "-o", str(tmp_path / "a.stl"), "--surface", "mask", *words]
-    assert main(mesh) == 0, printed()
-    assert (tmp_path / "a_vertebrae_L3.stl").exists()
+
+
+@pytest.mark.release
+@pytest.mark.first_device
+def test_command_mesh_writes_a_file_for_each_mask_of_a_folder(tmp_path, printed):
+    dicom_series.write_series(tmp_path / "ct", dicom_series.Plan(shape=SHAPE))
+    folder = write_masks(tmp_path / "masks", read_volume(tmp_path / "ct").affine)
+    output = ["-o", str(tmp_path / "a.stl"), "--surface", "mask", "-q"]
+    assert main(["mesh", str(tmp_path / "ct"), "--labels", str(folder), *output]) == 0, printed()
+    for name in ("aorta", "liver", "vertebrae_L3"):
+        assert (tmp_path / f"a_{name}.stl").exists()

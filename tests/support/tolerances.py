@@ -78,6 +78,7 @@ THOUSAND_FRAMES_S = 1.0  # of processors, for headers of 1000 frames in one file
 
 # --- labels ---
 LABEL_FLOAT64 = 1e-12  # relative; volumes, means and places of some hundred voxels in float64
+INSIDE_SHARE = 1e-12  # shares of some hundred voxels in float64
 LABEL_SD_FLOAT64 = 1e-9  # relative; a root of a sum of squares in float64
 UNEVEN_LABEL_VOLUME = 0.01  # a map with four even slices to the smallest of uneven gaps; measured 0.004
 DECIMAL_PLACE_MM = 1e-9  # affines of NRRD and MetaImage, whose decimals say a float64 exactly
