@@ -84,6 +84,12 @@ SCAN_OF_30_VOXELS, SCAN_OF_35_VOXELS = (Volume(np.zeros((1, 5, ni), np.int16), n
 """The segmentation has 270 voxels, 9 times 30 and less than 8 times 35; a large one is read up to 8 times its scan."""
 
 
+@pytest.fixture
+def segmentation_is_large(monkeypatch):
+    """Let `masks_of_two` be large by a byte."""
+    monkeypatch.setattr("clrecon.labels.reader.LARGE_BYTES", STORED_BYTES - 1)
+
+
 @FRAMES_AND_SYNTAX
 def test_segmentation_is_called_large_by_the_bytes_of_its_frames(tmp_path, kind, syntax):
     path = write_seg(tmp_path / "a.dcm", masks_of_two(), ct_slices(PLAN), kind=kind, syntax=syntax)
@@ -99,16 +105,16 @@ def test_small_segmentation_is_read_however_many_times_the_voxels_of_its_scan_it
 
 
 @FRAMES_AND_SYNTAX
-def test_large_segmentation_of_less_than_8_times_the_voxels_of_its_scan_is_read(tmp_path, monkeypatch, kind, syntax):
+@pytest.mark.usefixtures("segmentation_is_large")
+def test_large_segmentation_of_less_than_8_times_the_voxels_of_its_scan_is_read(tmp_path, kind, syntax):
     path = write_seg(tmp_path / "a.dcm", masks_of_two(), ct_slices(PLAN), kind=kind, syntax=syntax)
-    monkeypatch.setattr("clrecon.labels.reader.LARGE_BYTES", STORED_BYTES - 1)
     assert read_labels(path, volume=SCAN_OF_35_VOXELS).numbers == (1, 2)
 
 
 @FRAMES_AND_SYNTAX
+@pytest.mark.usefixtures("segmentation_is_large")
 def test_large_segmentation_out_of_proportion_is_refused_before_it_is_unpacked(tmp_path, monkeypatch, kind, syntax):
     path = write_seg(tmp_path / "a.dcm", masks_of_two(), ct_slices(PLAN), kind=kind, syntax=syntax)
-    monkeypatch.setattr("clrecon.labels.reader.LARGE_BYTES", STORED_BYTES - 1)
     monkeypatch.setattr("clrecon.labels.segmentation._FramePixels", None)  # cannot be called
     with refused(RefusedInputError, "a.dcm", 9, 6, 5):
         read_labels(path, volume=SCAN_OF_30_VOXELS)
