@@ -205,7 +205,7 @@ def test_nifti_map_cut_anywhere_is_refused(tmp_path, name):
     cut = tmp_path / f"cut-{name}"
     for length in {*range(0, len(content), 41), len(content) - 1, len(content) - 8}:
         cut.write_bytes(content[:length])
-        with pytest.raises(RefusedInputError):
+        with refused(RefusedInputError, cut.name):
             read_labels(cut)
 
 

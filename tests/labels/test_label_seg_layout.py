@@ -147,9 +147,11 @@ def test_elements_of_a_file_beyond_four_gigabytes_are_not_read():
         _check_elements(FourGigabytesAndOne(META), "a.dcm", implicit=False)
 
 
-def test_elements_of_a_file_of_the_most_bytes_are_read():
+def test_elements_of_a_file_are_read_up_to_the_most_bytes():
     content = META + element_bytes("Rows", b"\1\0")
     _check_elements(content, "a.dcm", implicit=False, most=len(content))
+    with refused(RefusedInputError, "a.dcm", len(content) - 1):
+        _check_elements(content, "a.dcm", implicit=False, most=len(content) - 1)
 
 
 def test_data_set_of_a_file_is_parsed_up_to_the_most_bytes(tmp_path: Path):
