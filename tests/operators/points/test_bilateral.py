@@ -17,7 +17,7 @@ from clrecon.proof.points import neighbours as twin
 from clrecon.proof.points.neighbours import find_neighbours, mean_distances, principal_axes
 
 
-def run_twin(points, k=16, factor=2.0, features=None):
+def filter_by_twin(points, k=16, factor=2.0, features=None):
     indices, distances = find_neighbours(points, k)
     axes, eigenvalues = principal_axes(points, indices)
     scales = twin.filter_scales(points, axes, indices, factor)
@@ -43,25 +43,28 @@ def run_twin(points, k=16, factor=2.0, features=None):
 def test_filtered_points_equal_their_twin(device, shape, k, factor):
     points = shape().points
     step = denoise_points(PointCloud(points), k, factor, device=device)
-    away = np.abs(step.cloud.points - run_twin(points, k, factor)).max(axis=1)
+    away = np.abs(step.cloud.points - filter_by_twin(points, k, factor)).max(axis=1)
+
+    # Where the two smaller eigenvalues are nearly equal, the normal is any direction of a plane.
     _, eigenvalues = principal_axes(points, find_neighbours(points, k)[0])
-    clear = (eigenvalues[:, 1] - eigenvalues[:, 0]) / eigenvalues[:, 2] > 0.03  # else the axis is any of a plane
-    assert clear.mean() > 0.97
-    assert away[clear].max() < TWIN_FILTER_MM
+    has_normal = (eigenvalues[:, 1] - eigenvalues[:, 0]) / eigenvalues[:, 2] > 0.03
+    assert has_normal.mean() > 0.97
+    assert away[has_normal].max() < TWIN_FILTER_MM
 
 
 @pytest.mark.parametrize("features", ["paper", "variation"])
-def test_points_that_are_no_features_take_their_whole_cell(device, features):
+def test_points_that_are_no_features_are_filtered_by_their_whole_cell_as_by_the_twin(device, features):
     points = cube(12.0).points
     step = denoise_points(PointCloud(points), features=features, device=device)
-    expected = run_twin(points, features=features)
+    expected = filter_by_twin(points, features=features)
     away = np.abs(step.cloud.points - expected).max(axis=1)
-    assert np.mean(away > TWIN_FILTER_MM) < 0.002  # ratios that float32 puts on the other side of D0
+    assert np.mean(away > TWIN_FILTER_MM) < 0.002  # ratios that float32 puts on the other side of the threshold
     assert 0 < step.facts["feature_points"] < len(points)
-    assert np.abs(expected - run_twin(points)).max() > 0.05
+    by_neighbours_alone = filter_by_twin(points)
+    assert np.abs(expected - by_neighbours_alone).max() > 0.05, "the choice of features does nothing here"
 
 
-def test_paper_mode_is_factor_one_with_its_features(device):
+def test_paper_mode_is_range_factor_one_with_the_features_of_the_paper(device):
     points = sphere(8.0).points
     paper = denoise_points(PointCloud(points), paper=True, device=device)
     same = denoise_points(PointCloud(points), range_factor=1.0, features="paper", device=device)
@@ -70,54 +73,73 @@ def test_paper_mode_is_factor_one_with_its_features(device):
 
 
 @pytest.mark.every_device
-@pytest.mark.parametrize(("shape", "region", "expected"), [
+@pytest.mark.parametrize(("shape", "region", "measured_rms_mm"), [
     (cube, "edges", 0.150),
     pytest.param(plane, "inner", 0.076, marks=pytest.mark.first_device),
     pytest.param(sphere, "everywhere", 0.080, marks=pytest.mark.first_device),
 ])  # fmt: skip
-def test_the_device_reaches_the_truths(device, shape, region, expected):
-    truth = shape()
-    step = denoise_points(PointCloud(truth.points), device=device)
-    assert truth.rms(step.cloud.points, region) == pytest.approx(expected, rel=FILTER_TRUTH_SHARE)
+def test_filtered_points_lie_nearer_to_their_shape_than_the_noise_of_0p2_mm(device, shape, region, measured_rms_mm):
+    noisy = shape()
+    step = denoise_points(PointCloud(noisy.points), device=device)
+    assert noisy.rms(step.cloud.points, region) == pytest.approx(measured_rms_mm, rel=FILTER_TRUTH_SHARE)
 
 
-def test_moves_of_filtered_points_are_measured(device):
+@pytest.fixture(scope="module")
+def filtered_sphere(device):
+    """A sphere of 8 mm with HU and normals, and what the filter makes of it."""
     points = sphere(8.0).points
-    step = denoise_points(PointCloud(points, hu=np.arange(len(points)), normals=points), device=device)
-    away = np.linalg.norm(step.cloud.points.astype(np.float64) - points, axis=1)
-    assert step.facts["rms_move_mm"] == pytest.approx(np.sqrt((away**2).mean()), rel=1e-4)
-    assert step.facts["largest_move_mm"] == pytest.approx(away.max(), rel=1e-4)
+    cloud = PointCloud(points, hu=np.arange(len(points)), normals=points)
+    return cloud, denoise_points(cloud, device=device)
+
+
+def test_moves_of_filtered_points_are_reported(filtered_sphere):
+    cloud, step = filtered_sphere
+    moves = np.linalg.norm(step.cloud.points.astype(np.float64) - cloud.points, axis=1)
+    assert step.facts["rms_move_mm"] == pytest.approx(np.sqrt((moves**2).mean()), rel=1e-4)  # float32 on the device
+    assert step.facts["largest_move_mm"] == pytest.approx(moves.max(), rel=1e-4)
+
+
+def test_filtered_points_keep_their_hu_and_lose_their_normals(filtered_sphere):
+    cloud, step = filtered_sphere
+    assert np.array_equal(step.cloud.hu, cloud.hu)
     assert step.cloud.normals is None
-    assert np.array_equal(step.cloud.hu, np.arange(len(points)))
+
+
+def test_no_point_is_removed_by_the_filter(filtered_sphere):
+    cloud, step = filtered_sphere
     assert not step.removed.any()
+    assert len(step.cloud) == len(cloud)
 
 
-def test_three_narrow_passes_are_as_strong_as_a_wide_one(device):
-    truth = plane()
-    thrice = denoise_points(PointCloud(truth.points), 16, 1.0, 3, device=device)
-    assert truth.rms(thrice.cloud.points, "inner") == pytest.approx(0.075, rel=FILTER_TRUTH_SHARE)
+def test_three_passes_of_range_factor_one_leave_as_little_noise_as_one_of_two(device):
+    noisy = plane()
+    thrice = denoise_points(PointCloud(noisy.points), range_factor=1.0, iterations=3, device=device)
+    measured_rms_mm = 0.075  # and 0.076 by one pass of factor 2, the default
+    assert noisy.rms(thrice.cloud.points, "inner") == pytest.approx(measured_rms_mm, rel=FILTER_TRUTH_SHARE)
     assert thrice.facts["iterations"] == 3
 
 
-def test_a_plane_without_noise_stays(device):
-    tilted = plane(20.0).clean @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0].astype(np.float32)
-    step = denoise_points(PointCloud(tilted), device=device)
+def test_points_of_a_tilted_plane_without_noise_stay(device):
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0].astype(np.float32)
+    step = denoise_points(PointCloud(plane(20.0).clean @ turn), device=device)
     assert step.facts["largest_move_mm"] < FILTERED_PLANE_MM
 
 
-def test_equal_points_and_lines_stay(device):
-    points = np.r_[np.zeros((40, 3)), np.outer(np.arange(40.0), [1, 1, 0])].astype(np.float32)
-    for features in (None, "paper", "variation"):
-        step = denoise_points(PointCloud(points), 8, features=features, device=device)
-        assert np.array_equal(step.cloud.points, points)
+@pytest.mark.parametrize("features", [None, "paper", "variation"])
+def test_equal_points_and_points_of_a_line_stay(device, features):
+    equal, line = np.zeros((40, 3)), np.outer(np.arange(40.0), [1, 1, 0])
+    points = np.r_[equal, line].astype(np.float32)
+    step = denoise_points(PointCloud(points), 8, features=features, device=device)
+    assert np.array_equal(step.cloud.points, points)
 
 
-def test_a_shift_changes_nothing_but_rounding(device):
+def test_shifted_cloud_is_filtered_alike_except_for_rounding(device):
+    shift = 1e5
     points = np.round(sphere(8.0).points.astype(np.float64), 3)
     near = denoise_points(PointCloud(points), device=device).cloud.points
-    far = denoise_points(PointCloud(points + 1e5), device=device).cloud.points
+    far = denoise_points(PointCloud(points + shift), device=device).cloud.points
     assert far.dtype == np.float64
-    assert np.abs(far - 1e5 - near).max() < 1e-4
+    assert np.abs(far - shift - near).max() < 1e-4  # float32 relative to the cloud's middle; measured 8e-7
 
 
 def test_permuted_points_give_permuted_results(device):
@@ -129,23 +151,25 @@ def test_permuted_points_give_permuted_results(device):
 
 
 def test_a_cloud_of_several_parts_is_filtered_as_its_twin(device):
+    """A kernel takes a part of a large cloud at a time; devices without long work-items take larger parts."""
     points = sphere(48.0 if device.has_long_items else 190.0).points
     step = denoise_points(PointCloud(points), 8, device=device)
-    assert np.quantile(np.abs(step.cloud.points - run_twin(points, 8)), 0.999) < TWIN_FILTER_MM  # but of unclear axes
+    away = np.abs(step.cloud.points - filter_by_twin(points, 8))
+    assert np.quantile(away, 0.999) < TWIN_FILTER_MM  # others have two nearly equal eigenvalues
 
 
 @pytest.mark.oclgrind
-def test_small_cloud_is_filtered_by_every_kernel(device):
+def test_points_of_a_small_cloud_are_moved_less_than_a_millimetre(device):
     points = sphere(3.0).points
     step = denoise_points(PointCloud(points), 6, features="variation", device=device)
-    assert 0.01 < step.facts["rms_move_mm"] < 1.0
+    assert 0.01 < step.facts["rms_move_mm"] < 1.0  # noise of 0.2 mm
 
 
-def test_few_points_are_filtered_with_a_warning(device):
-    for n in (1, 2, 3, 9):
-        step = denoise_points(PointCloud(np.random.default_rng(n).normal(size=(n, 3))), device=device)
-        assert len(step.cloud) == n
-        assert f"the cloud has {n} points" in step.warnings[0]
+@pytest.mark.parametrize("n", [1, 2, 3, 9])
+def test_few_points_are_filtered_with_a_warning(device, n):
+    step = denoise_points(PointCloud(np.random.default_rng(n).normal(size=(n, 3))), device=device)
+    assert len(step.cloud) == n
+    assert f"the cloud has {n} points" in step.warnings[0]
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ def scattered_cloud(n, size=(9.0, 7.0, 8.0), seed=3):
     return PointCloud((rng.random((n, 3)) - 0.5) * size, normals)
 
 
-def check_equal(device, cloud, settings, **options):
+def assert_field_equals_twin(device, cloud, settings, **options):
     """Compare every step with the twin; return the volume."""
     field = NodeField(device, cloud, cloud.normals, settings, **options)
     expected, near, core = twin_field(cloud, field.nodes, settings)
@@ -47,66 +47,75 @@ def check_equal(device, cloud, settings, **options):
     return volume
 
 
-def lengths(spacing, reach=2.0, smoothing=0.1, bridge=2.0):
+def settings_of_spacing(spacing, reach=2.0, smoothing=0.1, bridge=2.0):
+    """Lengths of a field in mm from shares of its spacing."""
     return FieldSettings(spacing, reach * spacing, smoothing * spacing, bridge * spacing)
 
 
-@pytest.mark.parametrize("shares", [(2.0, 0.1, 2.0), (3.0, 1000.0, 1.5), (4.0, 1.0, 1.0), (2.6, 0.1, 2.5)])
-def test_field_of_a_sphere_equals_the_twin(device, shares):
-    check_equal(device, sphere_cloud(700, 4.0), lengths(0.6, *shares))
+@pytest.mark.parametrize(
+    ("reach", "smoothing", "bridge"), [(2.0, 0.1, 2.0), (3.0, 1000.0, 1.5), (4.0, 1.0, 1.0), (2.6, 0.1, 2.5)]
+)
+def test_field_of_a_sphere_equals_the_twin(device, reach, smoothing, bridge):
+    assert_field_equals_twin(device, sphere_cloud(700, 4.0), settings_of_spacing(0.6, reach, smoothing, bridge))
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 60, 255, 256, 257, 1000])
-def test_field_of_points_with_contrary_normals_equals_the_twin(device, n):
-    check_equal(device, scattered_cloud(n), lengths(0.8))
+def test_field_of_points_with_random_normals_equals_the_twin(device, n):
+    assert_field_equals_twin(device, scattered_cloud(n), settings_of_spacing(0.8))
 
 
 @pytest.mark.oclgrind
 def test_small_field_of_every_kernel_equals_the_twin(device):
-    check_equal(device, sphere_cloud(150, 2.5), lengths(0.9))
+    assert_field_equals_twin(device, sphere_cloud(150, 2.5), settings_of_spacing(0.9))
 
 
-def test_a_point_at_the_end_of_its_cell_reaches_the_first_nodes_of_a_brick(device):
+def test_a_point_at_the_end_of_its_cell_reaches_the_first_nodes_of_the_next_brick(device):
     """Cells begin 0.002 mm below the lowest point and are 2 mm long: the second point is 0.0003 mm below the next one.
 
-    Nodes begin 4.5 mm below the lowest point; along z a brick has four, and the third brick begins at 3.5 mm.
+    Nodes begin 4.5 mm below the lowest point; along z a brick has four, and the third brick begins at 3.5 mm, which is
+    1.5023 mm above the second point and within its reach.
     """
     cloud = PointCloud([[0.0, 0.0, 0.0], [0.5, 0.5, 1.9977]], np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))
     settings = FieldSettings(1.0, reach=1.5025, smoothing=0.1, bridge=3.5)
-    check_equal(device, cloud, settings)
+    assert_field_equals_twin(device, cloud, settings)
+
     field = NodeField(device, cloud, cloud.normals, settings)
     assert field.nodes.bricks == (2, 3, 3) and field.nodes.corner.tolist() == [-4.5, -4.5, -4.5]
-    near = fetch_masks(field.masks)[0]
-    assert np.argwhere(near[8:]).tolist() == [[0, 5, 5]]  # k, j, i: 1.5023 mm above the second point
+    near, _, _ = fetch_masks(field.masks)
+    third_brick = near[8:]
+    assert np.argwhere(third_brick).tolist() == [[0, 5, 5]]  # k, j, i of the node at (0.5, 0.5, 3.5)
 
 
-def test_points_in_one_place_are_gathered_in_turn(device):
+def test_field_around_600_points_in_one_place_equals_the_twin(device):
+    """The kernel gathers 256 points of a brick at a time."""
     points = np.concatenate([np.full((600, 3), (0.3, 0.1, -0.2)), sphere_cloud(300, 3.0).points])
     normals = np.concatenate([np.tile((0.0, 0.6, 0.8), (600, 1)), sphere_cloud(300, 3.0).normals])
-    check_equal(device, PointCloud(points, normals), lengths(0.7))
+    assert_field_equals_twin(device, PointCloud(points, normals), settings_of_spacing(0.7))
 
 
 @pytest.mark.parametrize("length", [6.1, 6.2, 14.2, 25.0])
-def test_field_around_whole_bricks_and_words_equals_the_twin(device, length):
+def test_field_of_nodes_around_whole_bricks_and_words_equals_the_twin(device, length):
+    """Nodes along x on both sides of a brick of 8 and of a word of 32."""
     cloud = cube_cloud(500, 2.0)
     stretched = PointCloud(cloud.points * (length, 1.0, 1.0), cloud.normals)
-    check_equal(device, stretched, lengths(0.8, bridge=1.25))
+    assert_field_equals_twin(device, stretched, settings_of_spacing(0.8, bridge=1.25))
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_signs_of_random_masks_equal_the_twin(device, seed):
+@pytest.mark.parametrize("rounds", [0, 1, 4])
+@pytest.mark.parametrize(("seed", "share_near"), list(enumerate((0.1, 0.5, 0.7, 0.9, 0.99, 0.6))))
+def test_signs_of_random_masks_equal_the_twin(device, seed, share_near, rounds):
     rng = np.random.default_rng(seed)
-    shape = (8 * int(rng.integers(1, 9)), 4 * int(rng.integers(1, 4)), 4 * int(rng.integers(1, 4)))
-    near = rng.random(shape[::-1]) < (0.1, 0.5, 0.7, 0.9, 0.99, 0.6)[seed]
+    shape = (8 * int(rng.integers(1, 9)), 4 * int(rng.integers(1, 4)), 4 * int(rng.integers(1, 4)))  # whole bricks
+    near = rng.random(shape[::-1]) < share_near
     core, negative = near & (rng.random(near.shape) < 0.4), near & (rng.random(near.shape) < 0.5)
-    near[0, 0, 0] = core[0, 0, 0] = negative[0, 0, 0] = False
+    near[0, 0, 0] = core[0, 0, 0] = negative[0, 0, 0] = False  # the first node is outside of everything
     masks = put_masks(device, near, core, negative)
-    for rounds in (0, 1, 4):
-        signs = decide_signs(masks, memory_limits(device), rounds)
-        expected = twin.decide_signs(near, core, negative, rounds)
-        np.testing.assert_array_equal(fetch_mask(masks, signs.inside_d), expected.inside)
-        assert (signs.votes, signs.against, signs.regions) == (expected.votes, expected.against, expected.regions)
-        masks = put_masks(device, near, core, negative)
+
+    signs = decide_signs(masks, memory_limits(device), rounds)
+
+    expected = twin.decide_signs(near, core, negative, rounds)
+    np.testing.assert_array_equal(fetch_mask(masks, signs.inside_d), expected.inside)
+    assert (signs.votes, signs.against, signs.regions) == (expected.votes, expected.against, expected.regions)
 
 
 def put_masks(device, *arrays):
@@ -128,37 +137,55 @@ def write(device, to_d, from_d, size):
 
 
 def test_slabs_give_the_same_field_bit_for_bit(device):
-    cloud, settings = sphere_cloud(3000, 12.0), lengths(0.5)
+    cloud, settings = sphere_cloud(3000, 12.0), settings_of_spacing(0.5)
     whole = NodeField(device, cloud, cloud.normals, settings)
     assert len(whole.slabs) == 1
-    signs = decide_signs(whole.masks, whole.limits, settings.rounds)
-    expected = whole.fill(signs)
-    needs = whole.grid.nbytes + whole.nbytes + 12 * len(cloud)
+    expected = whole.fill(decide_signs(whole.masks, whole.limits, settings.rounds))
+
+    point_bytes = 3 * 4  # of float32
+    needs = whole.grid.nbytes + whole.nbytes + point_bytes * len(cloud)
     parts = NodeField(device, cloud, cloud.normals, settings, memory=needs + expected.nbytes // 6)
     assert len(parts.slabs) > 2
     parts_signs = decide_signs(parts.masks, whole.limits, settings.rounds)
     assert np.array_equal(parts.fill(parts_signs), expected)
 
 
-def test_without_room_for_a_layer_of_bricks_the_needs_are_said(device):
+def test_memory_below_a_layer_of_bricks_is_refused_with_what_is_needed(device):
     cloud = sphere_cloud(3000, 12.0)
-    with refused(DeviceMemoryError, "surface", "cloud", 200000):
-        NodeField(device, cloud, cloud.normals, lengths(0.5), memory=200_000)
+    with refused(DeviceMemoryError, "surface", "cloud", 200_000):
+        NodeField(device, cloud, cloud.normals, settings_of_spacing(0.5), memory=200_000)
 
 
-def test_nodes_reach_beyond_the_points():
-    cloud, settings = sphere_cloud(500, 5.0), lengths(0.7, bridge=2.3)
-    nodes = plan_nodes(plan_grid(cloud, 1.4), settings)
-    first, last = nodes.affine[:3, 3], nodes.affine[:3, 3] + 0.7 * (np.array(nodes.shape) - 1)
-    margin = settings.bridge + 0.69
+@pytest.fixture(scope="module")
+def sphere_nodes():
+    """A sphere of 5 mm, lengths of a field, and the nodes planned around it."""
+    cloud, settings = sphere_cloud(500, 5.0), settings_of_spacing(0.7, bridge=2.3)
+    return cloud, settings, plan_nodes(plan_grid(cloud, 1.4), settings)
+
+
+def test_nodes_reach_beyond_the_points_by_the_bridge_and_a_node(sphere_nodes):
+    cloud, settings, nodes = sphere_nodes
+    first = nodes.affine[:3, 3]
+    last = first + settings.spacing * (np.array(nodes.shape) - 1)
+    margin = settings.bridge + 0.99 * settings.spacing  # but for rounding
     assert (cloud.points.min(axis=0) - first > margin).all()
     assert (last - cloud.points.max(axis=0) > margin).all()
-    assert nodes.shape[0] % 8 == nodes.shape[1] % 4 == nodes.shape[2] % 4 == 0
 
 
-def test_too_many_nodes_are_refused_with_their_number():
-    points = np.array([(0, 0, 0), (900, 900, 900)], np.float32)
-    with refused(UsageError, 2147483648, "nodes"):
-        plan_nodes(plan_grid(points, 1.0), lengths(0.5))
-    nodes = plan_nodes(plan_grid(points, 1.5), lengths(0.75))
-    assert nodes.count <= MOST_NODES
+def test_nodes_fill_whole_bricks_of_8_x_4_x_4(sphere_nodes):
+    _, _, nodes = sphere_nodes
+    assert [size % brick for size, brick in zip(nodes.shape, (8, 4, 4), strict=True)] == [0, 0, 0]
+
+
+FAR_CORNERS = np.array([(0, 0, 0), (900, 900, 900)], np.float32)
+
+
+def test_too_many_nodes_are_refused_with_the_most_allowed():
+    with refused(UsageError, MOST_NODES, "nodes"):
+        plan_nodes(plan_grid(FAR_CORNERS, 1.0), settings_of_spacing(0.5))
+
+
+def test_as_many_nodes_as_allowed_are_planned():
+    """Some 1210 nodes 0.75 mm apart along each side of 900 mm."""
+    nodes = plan_nodes(plan_grid(FAR_CORNERS, 1.5), settings_of_spacing(0.75))
+    assert 1200**3 < nodes.count <= MOST_NODES
