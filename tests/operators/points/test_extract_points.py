@@ -438,7 +438,7 @@ def test_points_of_the_cortex_of_labels_are_those_of_their_fitted_meshes(device,
     meshes = extract_labels(hollow_bone, labels, 200.0, device=device)
     assert np.array_equal(np.bincount(cloud.labels)[1:], [meshes[1].vertex_count, meshes[2].vertex_count])
     fitted = np.concatenate([fit_cortex(mesh, hollow_bone, device=device).vertices for mesh in meshes.values()])
-    # HU of bone and tissue are estimated from all labels together, and from each mesh alone.
+    # The cloud takes the HU of bone from its largest mesh, `fit_cortex` from each.
     assert np.percentile(np.linalg.norm(cloud.points - fitted, axis=1), 95) < 0.05
 
 

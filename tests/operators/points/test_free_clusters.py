@@ -22,39 +22,54 @@ from clrecon.proof.points import clusters as twin
 
 
 @pytest.fixture(params=["own form", "other form"])
-def form(request, device, monkeypatch):
-    """Both forms of the kernels on every device."""
+def kernel_form(request, device, monkeypatch):
+    """Both forms of the kernels on every device: for CPUs, and for GPUs."""
     if request.param == "other form":
         lanes = "1" if device.kernel_variants["LANES"] == "8" else "8"
         monkeypatch.setattr(device, "kernel_variants", {**device.kernel_variants, "LANES": lanes})
 
 
-def check_equal(device, points, eps, min_samples):
-    before = points.copy()
+BOX = (30.0, 14.0, 11.0)  # mm
+
+
+def assert_clusters_equal_twin(device, points, eps, min_samples):
     found = cluster_free_points(points, eps, min_samples, device=device)
     count, labels, cores = twin.cluster_points(points, eps, min_samples)
     assert found.labels.dtype == np.int32
     assert found.count == count
     np.testing.assert_array_equal(found.cores, cores)
     np.testing.assert_array_equal(found.labels, labels)
-    assert np.array_equal(points, before)
-    assert found.facts["clusters"] == count
-    assert found.facts["noise_points"] == (labels < 0).sum()
     return found
 
 
 @pytest.mark.parametrize("n", [1, 2, 31, 32, 33, 1000, 9001])
 @pytest.mark.parametrize("min_samples", [1, 2, 5])
 @pytest.mark.parametrize("eps", daily(1, [0.8, 2.0]))
-def test_clusters_of_scattered_points_equal_the_twin(device, form, n, min_samples, eps):
-    check_equal(device, scattered_points(n, (30.0, 14.0, 11.0)), eps, min_samples)
+def test_clusters_of_scattered_points_equal_the_twin(device, kernel_form, n, min_samples, eps):
+    assert_clusters_equal_twin(device, scattered_points(n, BOX), eps, min_samples)
+
+
+def test_report_of_free_clusters_counts_clusters_and_noise(device):
+    points = scattered_points(1000, BOX)
+    facts = cluster_free_points(points, 0.8, 5, device=device).facts
+    count, labels, _ = twin.cluster_points(points, 0.8, 5)
+    assert facts["clusters"] == count > 0
+    assert facts["noise_points"] == np.count_nonzero(labels < 0) > 0
+
+
+def test_clustering_leaves_the_points_as_they_are(device):
+    points = scattered_points(1000, BOX)
+    before = points.copy()
+    cluster_free_points(points, 0.8, 5, device=device)
+    assert np.array_equal(points, before)
 
 
 @pytest.mark.parametrize("per_chunk", [32, 64, 640])
-def test_clusters_are_the_same_in_chunks_of_any_size(device, form, per_chunk):
-    points = scattered_points(4000, (30.0, 14.0, 11.0), seed=2)
-    labels = find_clusters(device, plan_cells(points, 1.0), 1.0, 3, per_chunk=per_chunk)[0]
-    assert np.array_equal(labels, twin.cluster_points(points, 1.0, 3)[1])
+def test_clusters_are_the_same_in_chunks_of_any_size(device, kernel_form, per_chunk):
+    points = scattered_points(4000, BOX, seed=2)
+    labels, _, _, _ = find_clusters(device, plan_cells(points, 1.0), 1.0, 3, per_chunk=per_chunk)
+    _, expected, _ = twin.cluster_points(points, 1.0, 3)
+    assert np.array_equal(labels, expected)
 
 
 @pytest.mark.oclgrind
@@ -68,107 +83,149 @@ def test_clusters_found_in_small_chunks_equal_the_twin(device):
 
 
 @pytest.mark.parametrize("n", [0, 1, 4])
-def test_points_fewer_than_a_core_needs_are_noise_with_a_warning(n):
-    """No device is needed: nothing is compared."""
-    found = cluster_free_points(np.zeros((n, 3)), 2.0, 5)
+def test_points_fewer_than_min_samples_are_noise_with_a_warning(n):
+    found = cluster_free_points(np.zeros((n, 3)), 2.0, 5)  # no device is needed: nothing is compared
+    assert (found.count, found.labels.tolist(), found.cores.tolist()) == (0, [-1] * n, [False] * n)
     assert found.facts == {"eps_mm": 2.0, "min_samples": 5, "clusters": 0, "core_points": 0, "noise_points": n}
     assert found.warnings == (f"{n} points are fewer than min_samples 5: all are noise",)
-    assert (found.count, found.labels.tolist(), found.cores.tolist()) == (0, [-1] * n, [False] * n)
 
 
-def test_cells_of_far_points_are_smaller_by_a_tenth_at_most():
-    """They are 1 / sqrt(3) mm, less 0.001 and what coordinates in float32 need, or a tenth: then there are too many."""
+def test_cells_of_far_points_are_smaller_by_the_rounding_of_their_coordinates():
+    """A cell's diagonal is eps, less a thousandth, and less what float32 may move points 10 m apart by."""
+    eps, extent = 1.0, 1e4
+    edge = eps / 3**0.5
+    plan = plan_cells([[0.0, 0.0, 0.0], [extent, 0.0, 0.0]], eps)
+    assert float(plan.edge) == pytest.approx(edge * (0.999 - 4e-7 * extent / edge), rel=1e-7)
+
+
+def test_points_too_far_apart_for_cells_of_eps_are_refused():
     with refused(UsageError, 0, "cells"):
         plan_cells([[0.0, 0.0, 0.0], [1e7, 0.0, 0.0]], 1.0)
-    near = plan_cells([[0.0, 0.0, 0.0], [1e4, 0.0, 0.0]], 1.0)
-    assert float(near.edge) == pytest.approx((0.999 - 4e-7 * 1e4 * 3**0.5) / 3**0.5, rel=1e-7)
 
 
-def test_the_passes_equal_their_twins(device, form):
-    points = scattered_points(5000, (30.0, 14.0, 11.0), seed=3)
-    plan = plan_cells(points, 0.9)
-    grid = grid_twin.make_grid(points, float(plan.edge))
-    search = ClusterSearch(device, fill_grid(device, plan), 0.9, 3, 64)
-    pairs = twin.count_pairs(grid, float(plan.edge), 3)
-    assert np.array_equal(search.count_pairs(), pairs)
+POINTS_OF_PASSES = scattered_points(5000, BOX, seed=3)
+EPS_OF_PASSES = 0.9
+
+
+def start_search(device):
+    """A search among `POINTS_OF_PASSES` with min_samples 3 in chunks of 64, and the twin's grid of it."""
+    plan = plan_cells(POINTS_OF_PASSES, EPS_OF_PASSES)
+    search = ClusterSearch(device, fill_grid(device, plan), EPS_OF_PASSES, 3, 64)
+    return search, grid_twin.make_grid(POINTS_OF_PASSES, float(plan.edge)), float(plan.edge)
+
+
+def test_pairs_of_a_search_are_counted_as_by_the_twin(device, kernel_form):
+    search, grid, edge = start_search(device)
+    assert np.array_equal(search.count_pairs(), twin.count_pairs(grid, edge, 3))
+
+
+def test_core_points_joined_within_chunks_equal_the_twin(device, kernel_form):
+    search, grid, _ = start_search(device)
+    search.find_cores()
+    search.join_within()
+    _, _, cores = twin.cluster_points(POINTS_OF_PASSES, EPS_OF_PASSES, 3)
+    expected = twin.join_chunks(grid, cores[grid.order], EPS_OF_PASSES * (1 + 1e-6), 64)
+    found = module.ocl.download(device, np.empty(len(expected), np.uint32), search.labels_d)
+    assert np.array_equal(found, expected)
+
+
+def test_words_of_the_grid_note_the_root_of_their_points_as_the_twin_does(device, kernel_form):
+    search, grid, _ = start_search(device)
     search.find_cores()
     search.join_within()
     search.note_words()
-    cores = twin.cluster_points(points, 0.9, 3)[2][grid.order]
-    labels = twin.join_chunks(grid, cores, 0.9 * (1 + 1e-6), 64)
-    found = module.ocl.download(device, np.empty(len(labels), np.uint32), search.labels_d)
-    assert np.array_equal(found, labels)
-    roots = twin.note_words(grid, labels)
-    assert np.array_equal(module.ocl.download(device, np.empty(len(roots), np.uint32), search.roots_d), roots)
-    assert (roots == twin.SEVERAL_ROOTS).any()
+    _, _, cores = twin.cluster_points(POINTS_OF_PASSES, EPS_OF_PASSES, 3)
+    expected = twin.note_words(grid, twin.join_chunks(grid, cores[grid.order], EPS_OF_PASSES * (1 + 1e-6), 64))
+    assert (expected == twin.SEVERAL_ROOTS).any(), "no word has several roots"
+    assert np.array_equal(module.ocl.download(device, np.empty(len(expected), np.uint32), search.roots_d), expected)
 
 
-def test_clusters_of_a_lattice_at_its_own_spacing_equal_the_twin(device, form):
-    """Distances equal eps, times what the rounding of the coordinates makes of them."""
-    lattice = np.stack(np.meshgrid(*[np.arange(-7, 8)] * 3, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
-    assert check_equal(device, lattice, 1.0, 7).count == 1
-    assert check_equal(device, lattice, 0.999, 2).count == 0
-    for eps in (0.7, 0.7 * np.sqrt(2.0), 0.7 * np.sqrt(3.0), 1.4):
-        check_equal(device, lattice * np.float32(0.7), eps, 9)
+LATTICE = np.stack(np.meshgrid(*[np.arange(-7, 8)] * 3, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
+
+
+@pytest.mark.parametrize(("eps", "min_samples", "clusters"), [(1.0, 7, 1), (0.999, 2, 0)], ids=["equal", "below"])
+def test_points_of_a_lattice_are_one_cluster_at_eps_of_its_spacing_and_noise_below(
+    device, kernel_form, eps, min_samples, clusters
+):
+    """Points 1 mm apart: seven are within 1 mm of an inner one, itself included."""
+    assert assert_clusters_equal_twin(device, LATTICE, eps, min_samples).count == clusters
+
+
+@pytest.mark.parametrize("eps", [0.7, 0.7 * np.sqrt(2.0), 0.7 * np.sqrt(3.0), 1.4])
+def test_clusters_of_a_lattice_whose_distances_round_to_eps_equal_the_twin(device, kernel_form, eps):
+    """0.7 is no number of float32: distances are eps times what rounding makes of them."""
+    assert_clusters_equal_twin(device, LATTICE * np.float32(0.7), eps, 9)
 
 
 @pytest.mark.every_device
-def test_distances_at_the_limit_are_decided_as_in_exact_arithmetic(device, form):
-    """Pairs of points about eps apart: float32 alone would take some of them wrongly."""
+def test_distances_at_the_limit_are_decided_as_in_exact_arithmetic(device, kernel_form):
+    """3000 pairs of points within 1e-7 of eps of being eps apart, each pair 5 mm from the next."""
     rng, eps, n = np.random.default_rng(4), 1.25, 3000
     limit = eps * (1.0 + 1e-6)
     ways = rng.normal(size=(n, 3))
     ways *= limit * (1.0 + rng.uniform(-1e-7, 1e-7, (n, 1))) / np.linalg.norm(ways, axis=1, keepdims=True)
     places = 5.0 * np.stack(np.unravel_index(np.arange(n), (15, 15, 15)), axis=1) - 35.0 + rng.random((n, 3))
     points = np.concatenate([places, places + ways]).astype(np.float32)
+
     found = cluster_free_points(points, eps, 2, device=device)
-    a, b = points[:n], points[n:]
 
     def is_near(first, second):
         parts = [Fraction(float(x)) - Fraction(float(y)) for x, y in zip(first, second, strict=True)]
         return sum(part * part for part in parts) <= Fraction(limit) ** 2
 
-    exact = np.array([is_near(first, second) for first, second in zip(a, b, strict=True)])
-    assert 0.2 < exact.mean() < 0.8
-    in_float32 = ((b - a) ** 2).sum(axis=1) <= np.float32(limit) ** 2
-    assert (in_float32 != exact).any()
-    assert np.array_equal(found.cores[:n], exact)
-    assert np.array_equal(found.cores[n:], exact)
+    firsts, seconds = points[:n], points[n:]
+    exact = np.array([is_near(first, second) for first, second in zip(firsts, seconds, strict=True)])
+    in_float32 = ((seconds - firsts) ** 2).sum(axis=1) <= np.float32(limit) ** 2
+    assert (in_float32 != exact).any(), "float32 alone would be right"
+    assert np.array_equal(found.cores, np.concatenate([exact, exact]))
 
 
-def test_equal_points_are_one_cluster_at_once(device):
+def test_equal_points_are_one_cluster_in_one_cell(device):
     found = cluster_free_points(np.full((200_000, 3), 7.25, np.float32), 0.5, 6, device=device)
+    assert found.facts["cells"] == 1
     assert (found.labels == 0).all()
     assert found.cores.all()
-    assert found.facts["cells"] == 1
 
 
-@pytest.mark.parametrize(("gap", "clusters"), [(1.001, 2), (0.999, 1)])
-def test_dense_spots_are_joined_up_to_the_distance(device, gap, clusters):
-    """Their boxes are compared before their points."""
-    spot = np.random.default_rng(5).random((4000, 3)) * 0.02
-    spot[0], spot[1] = 0.0, 0.02
-    points = np.concatenate([spot, spot + (gap + 0.02, 0, 0)]).astype(np.float32)
-    points[4000, 1:] = points[1, 1:]
+@pytest.mark.parametrize(("gap", "clusters"), [(1.001, 2), (0.999, 1)], ids=["beyond eps", "within eps"])
+def test_dense_spots_are_joined_where_their_gap_is_within_eps(device, gap, clusters):
+    """4000 points in a cube of 0.02 mm, and the same again: their boxes are compared before their points."""
+    side = 0.02
+    spot = np.random.default_rng(5).random((4000, 3)) * side
+    spot[0], spot[1] = 0.0, side
+    points = np.concatenate([spot, spot + (gap + side, 0, 0)]).astype(np.float32)
+    points[4000, 1:] = points[1, 1:]  # the nearest points of both, `gap` apart along x
     found = cluster_free_points(points, 1.0, 6, device=device)
     assert found.count == clusters
     assert found.cores.all()
 
 
-def test_permuted_points_have_the_same_clusters(device):
-    points = scattered_points(5000, (30.0, 14.0, 11.0), seed=6)
+@pytest.fixture(scope="module")
+def clusters_in_two_orders(device):
+    """Clusters of points, and those of the points permuted; the permutation."""
+    points = scattered_points(5000, BOX, seed=6)
     order = np.random.default_rng(7).permutation(len(points))
-    one, other = (cluster_free_points(cloud, 0.9, 4, device=device) for cloud in (points, points[order]))
-    assert np.array_equal(one.cores[order], other.cores)
-    pairs = np.unique(np.stack([one.labels[order], other.labels])[:, other.cores], axis=1)
-    assert pairs.shape[1] == one.count == other.count
-    firsts = [np.flatnonzero(other.cores & (other.labels == number))[0] for number in range(other.count)]
+    straight, permuted = (cluster_free_points(cloud, 0.9, 4, device=device) for cloud in (points, points[order]))
+    return straight, permuted, order
+
+
+def test_permuted_points_have_the_same_cores_in_the_same_clusters(clusters_in_two_orders):
+    straight, permuted, order = clusters_in_two_orders
+    assert np.array_equal(straight.cores[order], permuted.cores)
+    pairs_of_numbers = np.unique(np.stack([straight.labels[order], permuted.labels])[:, permuted.cores], axis=1)
+    assert pairs_of_numbers.shape[1] == straight.count == permuted.count
+
+
+def test_clusters_are_numbered_by_their_first_core_point(clusters_in_two_orders):
+    _, permuted, _ = clusters_in_two_orders
+    firsts = [np.flatnonzero(permuted.cores & (permuted.labels == number))[0] for number in range(permuted.count)]
+    assert len(firsts) > 1
     assert firsts == sorted(firsts)
 
 
 def test_far_clouds_have_the_clusters_of_near_ones(device):
     """Coordinates are relative to whole millimetres, so these are the same numbers."""
-    points = np.rint(scattered_points(3000, (30.0, 14.0, 11.0), seed=8) * 256.0) / 256.0
+    points = np.rint(scattered_points(3000, BOX, seed=8) * 256.0) / 256.0
     near = cluster_free_points(points, 0.9, 3, device=device)
     far = cluster_free_points(PointCloud(points + (1e5, -2e5, 3e5)), 0.9, 3, device=device)
     assert near.count > 1
@@ -176,10 +233,10 @@ def test_far_clouds_have_the_clusters_of_near_ones(device):
 
 
 @pytest.mark.parametrize("eps", [60.0, 1e6, 1e30])
-def test_eps_beyond_the_box_gives_one_cluster(device, eps):
-    found = cluster_free_points(scattered_points(500, (30.0, 14.0, 11.0)), eps, 500, device=device)
-    assert (found.labels == 0).all()
+def test_eps_beyond_the_box_gives_one_cluster_in_one_cell(device, eps):
+    found = cluster_free_points(scattered_points(500, BOX), eps, 500, device=device)
     assert found.facts["cells"] == 1
+    assert (found.labels == 0).all()
 
 
 @pytest.mark.parametrize("eps", [0, -1.0, np.nan, np.inf, 1e-10, "1"])
@@ -194,25 +251,39 @@ def test_min_samples_that_are_no_count_are_refused(min_samples):
         cluster_free_points(scattered_points(10), 1.0, min_samples)
 
 
-def test_points_that_cannot_be_clustered_are_refused(device):
+def test_points_of_two_coordinates_are_refused(device):
+    with refused(UsageError, 100, 2):
+        cluster_free_points(scattered_points(100)[:, :2], 1.0)
+
+
+def test_points_that_are_not_finite_are_refused_with_their_number(device):
     points = scattered_points(100)
-    with pytest.raises(UsageError, match=r"points have shape \(n, 3\), these have \(100, 2\)"):
-        cluster_free_points(points[:, :2], 1.0)
     points[7] = np.nan
-    with pytest.raises(UsageError, match="1 of 100 points are not finite"):
+    with refused(UsageError, 1, 100):
         cluster_free_points(points, 1.0, device=device)
-    with pytest.raises(UsageError, match="has 5,[0-9,]+ x 3,[0-9,]+ x 3,[0-9,]+ of them"):
-        cluster_free_points(scattered_points(100), 0.0129, device=device)
 
 
-def test_too_many_pairs_are_refused_before_they_are_compared(device):
-    points = scattered_points(2_000_000, (3.0, 3.0, 3.0))
-    with refused(UsageError, 2_000_000, 64, 1e12):
-        cluster_free_points(points, 1.5, 6, device=device)
-    assert cluster_free_points(points, 6.0, 6, device=device).count == 1  # one cell needs no pairs
+def test_eps_that_needs_too_many_cells_is_refused_with_their_numbers(device):
+    with pytest.raises(UsageError, match="has 5,[0-9,]+ x 3,[0-9,]+ x 3,[0-9,]+ of them"):  # 40 mm / (eps / sqrt(3))
+        cluster_free_points(scattered_points(100, (40.0, 25.0, 30.0)), 0.0129, device=device)
 
 
-def test_the_forecast_of_memory_is_refused_first(device):
+@pytest.fixture(scope="module")
+def two_million_points():
+    """In a cube of 3 mm."""
+    return scattered_points(2_000_000, (3.0, 3.0, 3.0))
+
+
+def test_too_many_pairs_are_refused_before_they_are_compared(device, two_million_points):
+    with refused(UsageError, 2_000_000, 64, 1e12):  # points, cells, and the most pairs
+        cluster_free_points(two_million_points, 1.5, 6, device=device)
+
+
+def test_points_of_one_cell_are_one_cluster_however_many_pairs_they_have(device, two_million_points):
+    assert cluster_free_points(two_million_points, 6.0, 6, device=device).count == 1
+
+
+def test_too_little_memory_for_free_clusters_is_refused(device):
     with refused(DeviceMemoryError, "clusters", "points"):
         cluster_free_points(scattered_points(50_000), 1.0, device=device, memory=2_000_000)
 
@@ -223,33 +294,48 @@ def test_progress_is_told_in_four_steps(device):
     assert told == [("clusters", done, 4) for done in range(1, 5)]
 
 
-def test_clouds_without_voxels_are_clustered_as_free_points(device):
-    points = scattered_points(2000, (30.0, 14.0, 11.0))
-    cloud = PointCloud(points, hu=np.arange(2000))
-    step = cluster_points(cloud, 1.1, 3, device=device)
-    count, labels, cores = twin.cluster_points(points, 1.1, 3)
+@pytest.fixture(scope="module")
+def clustered_cloud(device):
+    """A cloud without voxels, and what `cluster_points` makes of it with eps 1.1 mm and 3 samples."""
+    cloud = PointCloud(scattered_points(2000, BOX), hu=np.arange(2000))
+    return cloud, cluster_points(cloud, 1.1, 3, device=device)
+
+
+def test_clouds_without_voxels_are_clustered_as_free_points(clustered_cloud):
+    cloud, step = clustered_cloud
+    count, labels, cores = twin.cluster_points(cloud.points, 1.1, 3)
     assert np.array_equal(step.cloud.labels, labels)
-    assert np.array_equal(step.cloud.hu, cloud.hu)
     assert np.array_equal(step.cores, cores)
-    assert not step.removed.any()
     assert step.facts["clusters"] == count
     assert step.facts["largest_clusters"][0]["points"] == np.bincount(labels[labels >= 0]).max()
 
 
-def test_free_points_need_a_distance_and_no_volume(device):
-    cloud = PointCloud(scattered_points(100))
+def test_clustering_of_a_cloud_keeps_all_points_and_their_hu(clustered_cloud):
+    cloud, step = clustered_cloud
+    assert not step.removed.any()
+    assert np.array_equal(step.cloud.hu, cloud.hu)
+
+
+def test_free_points_without_eps_are_refused(device):
     with refused(UsageError, "lattice", "distance"):
-        cluster_points(cloud, device=device)
+        cluster_points(PointCloud(scattered_points(100)), device=device)
+
+
+def test_free_points_with_min_samples_of_a_plane_are_refused(device):
     with refused(UsageError, 1, "planes"):
-        cluster_points(cloud, 1.0, "plane+1", device=device)
-    with pytest.raises(UsageError, match="a volume says nothing of them"):
-        cluster_points(cloud, 1.0, volume=Volume(np.zeros((2, 2, 2), np.int16), np.eye(4)), device=device)
+        cluster_points(PointCloud(scattered_points(100)), 1.0, "plane+1", device=device)
+
+
+def test_free_points_beside_a_volume_are_refused(device):
+    volume = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
+    with refused(UsageError, "volume"):
+        cluster_points(PointCloud(scattered_points(100)), 1.0, volume=volume, device=device)
 
 
 @pytest.mark.every_device
-def test_clusters_of_a_large_cloud_are_right_where_work_items_end_early(device):
+def test_clusters_of_a_large_cloud_equal_the_twin_with_a_warning_where_work_items_end_early(device):
     """Shares of a core would be longer than llvmpipe's loops: nearly all labels were wrong, without a word."""
     if device.most_steps is None:
         pytest.skip("work-items of this device do not end early")
-    check_equal(device, scattered_points(60_000, (60.0, 40.0, 30.0)), 1.2, 4)
+    assert_clusters_equal_twin(device, scattered_points(60_000, (60.0, 40.0, 30.0)), 1.2, 4)
     assert any("ends the loops of a work-item" in text for text in device.warnings)

@@ -22,45 +22,52 @@ from clrecon.points import PointCloud
 from clrecon.proof.points import clusters as twin
 
 
-def check_equal(device, points, edge):
-    before = points.copy()
+def grid_equal_to_twin(device, points, edge):
+    """The grid of the device, all whose arrays equal those of the twin."""
     made, expected = make_grid(device, points, edge), twin.make_grid(points, edge)
     assert (made.n, made.shape, made.words) == (len(points), expected.shape, expected.mask.shape[2])
     assert np.array_equal((made.origin - made.base).astype(np.float32), expected.corner)
     assert made.cells == len(expected.starts) - 1
     for name, array in fetch_grid(made).items():
         np.testing.assert_array_equal(array, getattr(expected, name), err_msg=name)
-    assert np.array_equal(points, before)
     return made
+
+
+def test_making_a_grid_leaves_the_points_as_they_are(device):
+    points = scattered_points(4097)
+    before = points.copy()
+    make_grid(device, points, 1.0)
+    assert np.array_equal(points, before)
 
 
 @pytest.mark.parametrize("n", [1, 2, 15, 16, 17, 63, 64, 65, 4097, 20_001])
 @pytest.mark.parametrize("edge", [0.37, 1.0, 11.0])
 def test_grid_of_scattered_points_equals_the_twin(device, n, edge):
-    check_equal(device, scattered_points(n), edge)
+    grid_equal_to_twin(device, scattered_points(n), edge)
 
 
 @pytest.mark.parametrize("cells", [31, 32, 33, 64, 65])
 def test_grid_of_rows_around_whole_words_equals_the_twin(device, cells):
+    """A point in each cell of one row; a word marks 32 cells."""
     points = np.zeros((cells, 3), np.float32)
     points[:, 0] = np.random.default_rng(cells).permutation(cells) + 0.5
-    made = check_equal(device, points, 1.0)
+    made = grid_equal_to_twin(device, points, 1.0)
     assert made.shape == (cells, 1, 1)
     assert made.cells == cells
 
 
 @pytest.mark.oclgrind
 def test_small_grid_of_every_kernel_equals_the_twin(device):
-    check_equal(device, scattered_points(700), 2.0)
+    grid_equal_to_twin(device, scattered_points(700), 2.0)
 
 
 def test_grid_of_points_on_borders_of_cells_equals_the_twin(device):
     lattice = np.stack(np.meshgrid(*[np.arange(-6, 7)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    check_equal(device, (0.7 * lattice).astype(np.float32), 0.7)
+    grid_equal_to_twin(device, (0.7 * lattice).astype(np.float32), 0.7)
 
 
 def test_equal_points_lie_in_one_cell(device):
-    made = check_equal(device, np.full((5000, 3), (3.25, -7.5, 11.0), np.float32), 1.0)
+    made = grid_equal_to_twin(device, np.full((5000, 3), (3.25, -7.5, 11.0), np.float32), 1.0)
     assert made.cells == 1
     assert made.shape == (1, 1, 1)
 
@@ -69,46 +76,83 @@ def test_equal_points_lie_in_one_cell(device):
 def test_two_far_points_leave_an_empty_grid_between_them(device, axis):
     points = np.zeros((2, 3), np.float32)
     points[1, axis] = 3000.0
-    made = check_equal(device, points, 0.5)
-    assert made.shape[axis] == 6001
-    assert made.cells == 2
+    made = grid_equal_to_twin(device, points, 0.5)
+    assert made.shape[axis] == 3000 / 0.5 + 1
+    assert made.cells == 2  # with points
 
 
-def test_points_lie_in_their_cells_but_for_the_rounding(device):
+def test_points_lie_in_their_cells_except_for_the_rounding_of_float32(device):
     points = scattered_points(20_000, (900.0, 20.0, 20.0))
     made = make_grid(device, points, 0.21)
     cells = twin.find_cells(points, (made.origin - made.base).astype(np.float32), np.float32(made.edge))
-    from_corner = points.astype(np.float64) - made.origin
-    slack = CELL_ROUNDING * from_corner
-    assert ((from_corner >= made.edge * cells - slack) & (from_corner <= made.edge * (cells + 1) + slack)).all()
-    assert (from_corner > 0).all()
+    from_origin = points.astype(np.float64) - made.origin
+    assert (from_origin > 0).all()
+    rounding = CELL_ROUNDING * from_origin
+    assert (from_origin >= made.edge * cells - rounding).all()
+    assert (from_origin <= made.edge * (cells + 1) + rounding).all()
 
 
-def test_far_clouds_are_sorted_relative_to_their_base(device):
-    near = scattered_points(3000).astype(np.float64)
-    far = near + (100_000.0, -50_000.0, 70_000.0)
-    grid = make_grid(device, PointCloud(far), 1.5)
+SHIFT = np.array((100_000.0, -50_000.0, 70_000.0))  # mm
+
+
+@pytest.fixture(scope="module")
+def far_grid(device):
+    """A cloud 130 m from the origin, and its grid."""
+    far = scattered_points(3000).astype(np.float64) + SHIFT
+    return far, make_grid(device, PointCloud(far), 1.5)
+
+
+def test_base_of_a_far_grid_is_whole_millimetres_within_its_points(far_grid):
+    far, grid = far_grid
     assert np.array_equal(grid.base, np.rint(grid.base))
-    assert np.abs(grid.base - far.mean(axis=0)).max() < 10.0
+    assert (far.min(axis=0) < grid.base).all()
+    assert (grid.base < far.max(axis=0)).all()
+
+
+def test_points_of_a_far_grid_and_its_base_are_the_cloud(far_grid):
+    far, grid = far_grid
     found = fetch_grid(grid)
-    assert np.abs(found["points"] + grid.base - far[found["order"]]).max() < 2e-6
-    shifted = far - grid.base
-    assert np.array_equal(found["order"], twin.make_grid(shifted.astype(np.float32), 1.5).order)
-    assert np.array_equal(make_grid(device, near, 1.5).base, np.zeros(3))
+    step_of_float32 = np.spacing(np.float32(20.0))  # as far as points lie from their base, mm
+    assert np.abs(found["points"] + grid.base - far[found["order"]]).max() <= step_of_float32
 
 
-def test_grids_that_are_too_large_are_refused_with_their_numbers():
-    points = np.array([(0, 0, 0), (3000, 2000, 1000)], np.float32)
-    with refused(UsageError, 0.5, 3000, 2000, 1000, 6001, 4001, 2001, 2**31, 2**17):
-        plan_grid(points, 0.5)
-    line = np.array([(0, 0, 0), (MOST_CELLS_ALONG, 0, 0)], np.float32)
-    with refused(UsageError, 131_073):
-        plan_grid(line, 1.0)
-    assert plan_grid(line[:, [1, 0, 2]], 1.00001).shape == (1, MOST_CELLS_ALONG - 1, 1)
-    plan = plan_grid(points * np.float32(0.25), 0.72)
-    assert np.prod(plan.shape) <= MOST_CELLS
+def test_points_of_a_far_grid_are_sorted_as_those_relative_to_its_base(far_grid):
+    far, grid = far_grid
+    expected = twin.make_grid((far - grid.base).astype(np.float32), 1.5)
+    assert np.array_equal(fetch_grid(grid)["order"], expected.order)
+
+
+def test_base_of_a_grid_around_the_origin_is_the_origin(device):
+    assert np.array_equal(make_grid(device, scattered_points(3000), 1.5).base, np.zeros(3))
+
+
+CORNERS = np.array([(0, 0, 0), (3000, 2000, 1000)], np.float32)
+LINE = np.array([(0, 0, 0), (MOST_CELLS_ALONG, 0, 0)], np.float32)  # one mm too long for cells of 1 mm
+
+
+def test_grid_of_too_many_cells_is_refused_with_extent_cells_and_limits():
+    with refused(UsageError, 0.5, 3000, 2000, 1000, 6001, 4001, 2001, MOST_CELLS, MOST_CELLS_ALONG):
+        plan_grid(CORNERS, 0.5)
+
+
+def test_grid_of_fewer_than_the_most_cells_is_planned():
+    cells = np.prod(plan_grid(CORNERS * np.float32(0.25), 0.72).shape)  # 750 x 500 x 250 mm / 0.72^3 = 2.5e8
+    assert 2e8 < cells <= MOST_CELLS
+
+
+def test_grid_of_too_many_cells_along_an_axis_is_refused_with_their_number():
+    with refused(UsageError, MOST_CELLS_ALONG + 1):
+        plan_grid(LINE, 1.0)
+
+
+def test_grid_of_as_many_cells_along_an_axis_as_allowed_is_planned():
+    along_y = LINE[:, [1, 0, 2]]
+    assert plan_grid(along_y, 1.00001).shape == (1, MOST_CELLS_ALONG - 1, 1)
+
+
+def test_grid_of_cells_so_small_that_their_number_overflows_is_refused():
     with refused(UsageError, 1e-36):
-        plan_grid(points, 1e-36)
+        plan_grid(CORNERS, 1e-36)
 
 
 @pytest.mark.parametrize("edge", [0.0, -1.0, np.nan, np.inf, 1e-60])
@@ -117,44 +161,57 @@ def test_edges_that_are_no_length_are_refused(edge):
         plan_grid(np.zeros((1, 3), np.float32), edge)
 
 
-def test_points_that_are_none_are_refused():
+def test_grid_of_no_points_is_refused():
     with refused(UsageError, 0, 3):
         plan_grid(np.zeros((0, 3)), 1.0)
+
+
+def test_grid_of_points_that_are_not_finite_is_refused_with_their_number():
     points = scattered_points(1000)
     points[[3, 500], [0, 2]] = np.nan, np.inf
     with refused(UsageError, 2, 1000):
         plan_grid(points, 1.0)
 
 
-def test_the_forecast_is_refused_before_anything_is_taken(device):
+def test_needs_of_a_grid_are_the_bytes_of_its_points_and_cells(device):
     plan = plan_grid(scattered_points(10_000), 1.0)
     needs = plan.needs(device)
-    assert needs["points"] == 120_000
-    assert needs["cells of the grid"] == 8 * plan.total_words
+    assert needs["points"] == 10_000 * 3 * 4
+    assert needs["cells of the grid"] == 2 * 4 * plan.total_words  # a mask, and the cells before each word
     assert needs["sorted points"] <= 28 * 10_000 + 2**20
-    with refused(DeviceMemoryError, "points", "cells", 120000):
-        fill_grid(device, plan, memory=sum(needs.values()) - 1)
-    grid = fill_grid(device, plan, memory=sum(needs.values()))
-    assert grid.nbytes <= sum(needs.values())
 
 
-def test_buffers_are_as_long_as_what_the_kernels_write(device):
+def test_grid_is_refused_with_a_byte_less_than_it_needs(device):
+    plan = plan_grid(scattered_points(10_000), 1.0)
+    with refused(DeviceMemoryError, "points", "cells", 120_000):
+        fill_grid(device, plan, memory=sum(plan.needs(device).values()) - 1)
+
+
+def test_grid_fits_into_the_bytes_it_needs(device):
+    plan = plan_grid(scattered_points(10_000), 1.0)
+    needed = sum(plan.needs(device).values())
+    assert fill_grid(device, plan, memory=needed).nbytes <= needed
+
+
+def test_buffers_of_a_grid_are_as_long_as_what_the_kernels_write(device):
     grid = make_grid(device, scattered_points(1000), 0.9)
     words = grid.words * grid.shape[1] * grid.shape[2]
     assert [grid.mask_d.size, grid.ranks_d.size] == [4 * words] * 2
     assert [grid.x_d.size, grid.y_d.size, grid.z_d.size] == [4 * (1000 + PADDING)] * 3
     assert grid.starts_d.size == 4 * (grid.cells + 1)
+
+
+def test_bytes_of_a_grid_are_those_of_its_buffers(device):
+    grid = make_grid(device, scattered_points(1000), 0.9)
     buffers = (grid.mask_d, grid.ranks_d, grid.x_d, grid.y_d, grid.z_d, grid.order_d, grid.starts_d)
     assert grid.nbytes == sum(buffer.size for buffer in buffers)
 
 
-def test_clouds_beyond_the_end_of_loops_alone_are_warned_of(device, monkeypatch):
+@pytest.mark.parametrize(("n", "warned"), [(999, False), (1000, False), (1001, True)])
+def test_clouds_of_more_points_than_the_loops_of_a_device_can_take_are_warned_of(device, monkeypatch, n, warned):
+    most_steps = 1000 * STEPS_A_POINT
     told: list[str] = []
-    monkeypatch.setattr(device, "most_steps", 1000 * STEPS_A_POINT)
+    monkeypatch.setattr(device, "most_steps", most_steps)
     monkeypatch.setattr(device, "remark", told.append)
-    for n in (999, 1000):
-        make_grid(device, scattered_points(n), 0.9)
-    assert told == []
-    make_grid(device, scattered_points(1001), 0.9)
-    (text,) = told
-    assert f"after {1000 * STEPS_A_POINT:,} steps" in text
+    make_grid(device, scattered_points(n), 0.9)
+    assert [f"after {most_steps:,} steps" in text for text in told] == [True] * warned

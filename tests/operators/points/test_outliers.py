@@ -16,17 +16,22 @@ from clrecon.proof.points.neighbours import find_neighbours, find_outliers, mean
 
 @pytest.mark.parametrize("deviations", [0.0, 1.0, 2.0, 3.5])
 @pytest.mark.parametrize("k", [2, 16])
-def test_outliers_equal_their_twin(device, deviations, k):
+def test_outliers_and_their_mean_distance_equal_the_twin(device, deviations, k):
     points = sphere(10.0).points
     step = remove_outliers(PointCloud(points), k, deviations, device=device)
     _, distances = find_neighbours(points, k)
     assert np.array_equal(step.removed, find_outliers(distances, deviations))
     assert step.facts["mean_distance_mm"] == pytest.approx(mean_distances(distances).mean(), rel=MEAN_DISTANCE_SHARE)
+
+
+def test_points_that_are_no_outliers_stay_and_outliers_are_counted(device):
+    points = sphere(10.0).points
+    step = remove_outliers(PointCloud(points), device=device)
     assert np.array_equal(step.cloud.points, points[step.removed == 0])
-    assert step.counts == {"outlier": int(step.removed.sum())}
+    assert step.counts == {"outlier": np.count_nonzero(step.removed)}
 
 
-def test_far_points_go_and_the_shape_stays(device):
+def test_far_points_are_outliers_and_nearly_all_of_a_sphere_stays_with_its_hu(device):
     shape, rng = sphere(10.0).points, np.random.default_rng(5)
     far = rng.uniform(-60, 60, (30, 3))
     far = far[np.linalg.norm(far, axis=1) > 20]
@@ -34,19 +39,21 @@ def test_far_points_go_and_the_shape_stays(device):
     step = remove_outliers(cloud, device=device)
     assert step.removed[len(shape) :].all()
     assert step.removed[: len(shape)].mean() < 0.01
-    assert np.array_equal(step.cloud.hu, np.flatnonzero(step.removed == 0))
+    assert np.array_equal(step.cloud.hu, np.flatnonzero(step.removed == 0))  # HU are numbers of points
 
 
-def test_a_ring_of_equal_distances_keeps_all(device):
+def test_a_ring_of_equal_distances_has_no_outlier(device):
     angles = 2.0 * np.pi * np.arange(64) / 64
-    step = remove_outliers(PointCloud(np.c_[np.cos(angles), np.sin(angles), 0 * angles]), 3, 2.0, device=device)
-    assert not step.removed.any()
-    equal = remove_outliers(PointCloud(np.zeros((50, 3))), device=device)
-    assert not equal.removed.any()
+    ring = np.c_[np.cos(angles), np.sin(angles), np.zeros(64)]
+    assert not remove_outliers(PointCloud(ring), 3, 2.0, device=device).removed.any()
+
+
+def test_equal_points_have_no_outlier(device):
+    assert not remove_outliers(PointCloud(np.zeros((50, 3))), device=device).removed.any()
 
 
 @pytest.mark.oclgrind
-def test_far_point_of_a_small_cloud_is_removed(device):
+def test_far_point_of_a_small_cloud_is_an_outlier(device):
     points = np.r_[sphere(3.0).points, [[30.0, 0.0, 0.0]]]
     step = remove_outliers(PointCloud(points), 6, device=device)
     assert step.removed[-1] == 1

@@ -27,44 +27,62 @@ def test_thinned_points_of_a_small_cloud_equal_the_twin(device):
     assert np.array_equal(choose_points(device, plan_grid(points, 3.0)), twin.choose_points(points, 3.0))
 
 
-def test_the_point_nearest_to_the_mean_stays_and_of_several_the_first(device):
+def test_the_point_nearest_to_the_mean_of_its_cell_stays_and_of_equally_near_ones_the_first(device):
+    """The mean of the four is (0.4375, 0.125, 0): the third and fourth are equally near, the others farther away."""
     cell = np.array([(0, 0.125, 0), (0.75, 0.125, 0), (0.5, 0.25, 0), (0.5, 0, 0)], np.float32)
-    points = np.concatenate([cell[[0, 3, 1, 2]], cell + np.float32((7, 0, 0))])
-    step = thin_points(points, 1.0, device=device)
-    assert np.flatnonzero(step.removed == 0).tolist() == [1, 6]
+    fourth_before_third, as_listed = cell[[0, 3, 1, 2]], cell + np.float32((7, 0, 0))
+    step = thin_points(np.concatenate([fourth_before_third, as_listed]), 1.0, device=device)
+    assert np.flatnonzero(step.removed == 0).tolist() == [1, 4 + 2]
 
 
-def test_the_step_keeps_order_and_all_that_is_known(device):
-    points = scattered_points(5000)
+@pytest.fixture(scope="module")
+def thinned_cloud(device):
+    """A cloud of 5000 points with HU, labels and a report, and what a spacing of 2.5 mm leaves of it."""
     hu = np.arange(5000, dtype=np.float32)
-    cloud = PointCloud(points, hu=hu, labels=np.arange(5000), report={"iso_value_hu": 226.0})
-    step = thin_points(cloud, 2.5, device=device)
+    cloud = PointCloud(scattered_points(5000), hu=hu, labels=np.arange(5000), report={"iso_value_hu": 226.0})
+    return cloud, thin_points(cloud, 2.5, device=device)
+
+
+def test_thinned_cloud_keeps_the_order_of_its_points_with_their_hu_and_labels(thinned_cloud):
+    cloud, step = thinned_cloud
     kept = step.removed == 0
-    assert np.array_equal(step.cloud.points, points[kept])
-    assert np.array_equal(step.cloud.hu, hu[kept])
-    assert step.cloud.report == {"iso_value_hu": 226.0}
-    assert step.counts == {"thinned": 5000 - len(step.cloud)}
-    assert 0 < len(step.cloud) < 2500
+    assert 0 < np.count_nonzero(kept) < len(cloud) / 2
+    assert np.array_equal(step.cloud.points, cloud.points[kept])
+    assert np.array_equal(step.cloud.hu, cloud.hu[kept])
+    assert np.array_equal(step.cloud.labels, cloud.labels[kept])
+
+
+def test_thinned_cloud_keeps_its_report(thinned_cloud):
+    cloud, step = thinned_cloud
+    assert step.cloud.report == cloud.report
+
+
+def test_points_removed_by_thinning_are_counted_with_the_spacing(thinned_cloud):
+    cloud, step = thinned_cloud
+    assert step.counts == {"thinned": len(cloud) - len(step.cloud)}
     assert step.as_dict()["spacing_mm"] == 2.5
 
 
 def test_every_occupied_cell_keeps_one_point(device):
-    points = scattered_points(8000)
-    step = thin_points(points, 1.7, device=device)
-    plan = plan_grid(points, 1.7)
+    points, spacing = scattered_points(8000), 1.7
+    step = thin_points(points, spacing, device=device)
+    corner = plan_grid(points, spacing).corner
 
-    def cells(places):
-        return np.unique(np.floor((places.astype(np.float64) - plan.corner) / 1.7), axis=0)
+    def occupied_cells(places):
+        return np.unique(np.floor((places.astype(np.float64) - corner) / spacing), axis=0)
 
-    assert np.array_equal(cells(step.cloud.points), cells(points))
-    assert len(step.cloud) == len(cells(points))
+    assert np.array_equal(occupied_cells(step.cloud.points), occupied_cells(points))
+    assert len(step.cloud) == len(occupied_cells(points))
 
 
-def test_thinning_keeps_far_points_exact_and_one_of_equal_ones(device):
+def test_thinning_keeps_points_far_from_the_origin_exact(device):
     points = scattered_points(500).astype(np.float64) + (1e5, 2e5, -1e5)
     step = thin_points(PointCloud(points), 5.0, device=device)
     assert step.cloud.points.dtype == np.float64
     assert np.array_equal(step.cloud.points, points[step.removed == 0])
+
+
+def test_thinning_keeps_one_of_equal_points(device):
     assert len(thin_points(np.zeros((9000, 3), np.float32), 1.0, device=device).cloud) == 1
 
 
@@ -74,10 +92,16 @@ def test_spacings_that_are_no_length_are_refused(spacing):
         thin_points(scattered_points(10), spacing)
 
 
-def test_what_cannot_be_thinned_is_refused(device):
+def test_thinning_of_an_empty_cloud_is_refused():
     with refused(UsageError, "cloud", "empty"):
         thin_points(np.zeros((0, 3)), 1.0)
+
+
+def test_spacing_that_needs_too_many_cells_is_refused(device):
     with refused(UsageError, "cells", 0.0001):
         thin_points(scattered_points(10), 1e-4, device=device)
-    with refused(DeviceMemoryError, "cloud", 1000000):
+
+
+def test_too_little_memory_for_thinning_is_refused(device):
+    with refused(DeviceMemoryError, "cloud", 1_000_000):
         thin_points(scattered_points(50_000), 1.0, device=device, memory=1_000_000)
