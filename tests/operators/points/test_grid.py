@@ -22,8 +22,8 @@ from clrecon.points import PointCloud
 from clrecon.proof.points import clusters as twin
 
 
-def grid_equal_to_twin(device, points, edge):
-    """The grid of the device, all whose arrays equal those of the twin."""
+def assert_grid_equals_twin(device, points, edge):
+    """All arrays of the grid equal those of the twin; return the grid."""
     made, expected = make_grid(device, points, edge), twin.make_grid(points, edge)
     assert (made.n, made.shape, made.words) == (len(points), expected.shape, expected.mask.shape[2])
     assert np.array_equal((made.origin - made.base).astype(np.float32), expected.corner)
@@ -43,7 +43,7 @@ def test_making_a_grid_leaves_the_points_as_they_are(device):
 @pytest.mark.parametrize("n", [1, 2, 15, 16, 17, 63, 64, 65, 4097, 20_001])
 @pytest.mark.parametrize("edge", [0.37, 1.0, 11.0])
 def test_grid_of_scattered_points_equals_the_twin(device, n, edge):
-    grid_equal_to_twin(device, scattered_points(n), edge)
+    assert_grid_equals_twin(device, scattered_points(n), edge)
 
 
 @pytest.mark.parametrize("cells", [31, 32, 33, 64, 65])
@@ -51,23 +51,23 @@ def test_grid_of_rows_around_whole_words_equals_the_twin(device, cells):
     """A point in each cell of one row; a word marks 32 cells."""
     points = np.zeros((cells, 3), np.float32)
     points[:, 0] = np.random.default_rng(cells).permutation(cells) + 0.5
-    made = grid_equal_to_twin(device, points, 1.0)
+    made = assert_grid_equals_twin(device, points, 1.0)
     assert made.shape == (cells, 1, 1)
     assert made.cells == cells
 
 
 @pytest.mark.oclgrind
 def test_small_grid_of_every_kernel_equals_the_twin(device):
-    grid_equal_to_twin(device, scattered_points(700), 2.0)
+    assert_grid_equals_twin(device, scattered_points(700), 2.0)
 
 
 def test_grid_of_points_on_borders_of_cells_equals_the_twin(device):
     lattice = np.stack(np.meshgrid(*[np.arange(-6, 7)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    grid_equal_to_twin(device, (0.7 * lattice).astype(np.float32), 0.7)
+    assert_grid_equals_twin(device, (0.7 * lattice).astype(np.float32), 0.7)
 
 
 def test_equal_points_lie_in_one_cell(device):
-    made = grid_equal_to_twin(device, np.full((5000, 3), (3.25, -7.5, 11.0), np.float32), 1.0)
+    made = assert_grid_equals_twin(device, np.full((5000, 3), (3.25, -7.5, 11.0), np.float32), 1.0)
     assert made.cells == 1
     assert made.shape == (1, 1, 1)
 
@@ -76,7 +76,7 @@ def test_equal_points_lie_in_one_cell(device):
 def test_two_far_points_leave_an_empty_grid_between_them(device, axis):
     points = np.zeros((2, 3), np.float32)
     points[1, axis] = 3000.0
-    made = grid_equal_to_twin(device, points, 0.5)
+    made = assert_grid_equals_twin(device, points, 0.5)
     assert made.shape[axis] == 3000 / 0.5 + 1
     assert made.cells == 2  # with points
 
