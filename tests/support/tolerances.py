@@ -139,6 +139,9 @@ DEVICE_ISO_VERTEX_VOXEL = (
 )
 REFINED_TORUS_VOLUME = 0.03  # partial volume takes 1.2 % off so thin a torus, the gate on refinement 0.5 %
 ISO_SPHERE_SAGITTA_MM = 0.025  # between samples 0.7, 0.5 and 0.9 mm apart a sphere of 8 mm sags sum(h^2) / 8 R
+CORTEX_SHELL_VOLUME = 0.025  # shells of 9 and 13 mm in voxels of 1 mm, blurred by 0.7 mm: measured 0.016
+CORTEX_SHELL_AREA = 0.03  # the same: measured 0.013
+CORTEX_SHELL_WALL_MM = 0.3  # their walls of 2 and 3 mm: measured 0.22
 
 # --- rays ---
 RAY_CHORD = 0.005  # the bar; linear interpolation takes h^2 / 12 of the curvature of a ball: measured 0.0026
