@@ -243,24 +243,23 @@ def test_job_with_one_empty_surface_is_refused_and_an_older_file_stays(
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
 
 
-@pytest.mark.usefixtures("boxes")
-def test_more_components_than_a_job_writes_are_refused_with_the_volume_that_leaves_fewer(
-    device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def two_files_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(make, "MOST_FILES", 2)
 
+
+@pytest.mark.usefixtures("boxes", "two_files_at_most")
+def test_more_components_than_a_job_writes_are_refused_with_the_volume_that_leaves_fewer(
+    device: Any, tmp_path: Path
+) -> None:
     with refused(UsageError, "min_volume_ml=0.1", 3, 2):  # 3 components, 2 files at most
         mesh_boxes(tmp_path, device, iso_value=200.0, split=True)
 
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.usefixtures("boxes")
-def test_as_many_components_as_a_job_writes_are_written(
-    device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(make, "MOST_FILES", 2)
-
+@pytest.mark.usefixtures("boxes", "two_files_at_most")
+def test_as_many_components_as_a_job_writes_are_written(device: Any, tmp_path: Path) -> None:
     report = mesh_boxes(tmp_path, device, iso_value=200.0, split=True, keep_largest=2)
 
     assert len(report["meshes"]) == 2
