@@ -24,6 +24,7 @@ from clrecon.system.progress import ignore_progress
 
 
 def ball(bone: float = 1040.0, tissue: float = 40.0) -> Volume:
+    """A ball of bone of 10 mm in soft tissue, in HU, its edge blurred over 3 mm."""
     distance = np.linalg.norm(np.indices((36, 36, 36)).reshape(3, -1).T - (17.7, 17.4, 18.1), axis=1) - 10.0
     field = tissue + (bone - tissue) * np.clip(0.5 - distance / 3.0, 0.0, 1.0).reshape(36, 36, 36)
     voxels = np.rint(field).astype(np.int16)
@@ -38,71 +39,114 @@ def scan(monkeypatch: pytest.MonkeyPatch) -> list[Volume]:
     return volumes
 
 
-def run(tmp_path: Path, device: Any, **settings: Any) -> dict[str, Any]:
+def mesh_scan(tmp_path: Path, device: Any, **settings: Any) -> dict[str, Any]:
+    """Mesh what `scan` gives to b.ply and b.json; return the report."""
     return make_mesh(
         "scan", tmp_path / "b.ply", MeshSettings(device=str(device.index), **settings), report_path=tmp_path / "b.json"
     )
 
 
 @pytest.mark.usefixtures("scan")
-def test_auto_is_the_mesh_at_the_chosen_value(device: Any, tmp_path: Path) -> None:
-    report = run(tmp_path, device, half_way="auto")
-    automatic = (tmp_path / "b.ply").read_bytes()
-    assert abs(report["iso_value_hu"] - 540.0) <= tolerances.HALF_WAY_STEP_SHARE * 1000.0
+def test_auto_chooses_the_iso_value_half_way_between_the_medians_of_tissue_and_bone(
+    device: Any, tmp_path: Path
+) -> None:
+    report = mesh_scan(tmp_path, device, half_way="auto")
+
+    half_way, step = (1040.0 + 40.0) / 2, 1040.0 - 40.0
+    assert abs(report["iso_value_hu"] - half_way) <= tolerances.HALF_WAY_STEP_SHARE * step
     choice = report["iso_value_choice"]
     assert (choice["method"], choice["bone_hu"], choice["tissue_hu"]) == ("auto", 1040.0, 40.0)
     assert report["iso_value_reason"].startswith("half way between tissue 40 and bone 1040 HU, medians of ")
-    assert (report["preset"], report["meshes"][0]["name"]) == (None, None)
-    assert report["seconds"]["choose"] > 0.0
-    assert json.loads((tmp_path / "b.json").read_text())["iso_value_choice"] == choice
-    given = run(tmp_path, device, iso_value=report["iso_value_hu"])
-    assert (tmp_path / "b.ply").read_bytes() == automatic
+
+
+@pytest.mark.usefixtures("scan")
+def test_written_report_of_auto_has_the_choice_and_its_time_and_no_preset(device: Any, tmp_path: Path) -> None:
+    report = mesh_scan(tmp_path, device, half_way="auto")
+
+    written = json.loads((tmp_path / "b.json").read_text())
+    assert written["iso_value_choice"] == report["iso_value_choice"]
+    assert written["seconds"]["choose"] > 0.0
+    assert (written["preset"], written["meshes"][0]["name"]) == (None, None)
+
+
+@pytest.mark.usefixtures("scan")
+def test_mesh_of_auto_is_that_of_its_iso_value_given_as_a_number(device: Any, tmp_path: Path) -> None:
+    automatic = mesh_scan(tmp_path, device, half_way="auto")
+    mesh_of_auto = (tmp_path / "b.ply").read_bytes()
+
+    given = mesh_scan(tmp_path, device, iso_value=automatic["iso_value_hu"])
+
+    assert (tmp_path / "b.ply").read_bytes() == mesh_of_auto
     assert (given["iso_value_choice"], given["iso_value_reason"]) == (None, "as given")
 
 
 @pytest.mark.usefixtures("scan")
-def test_given_materials_are_the_mesh_half_way(device: Any, tmp_path: Path) -> None:
-    report = run(tmp_path, device, half_way=(1000, 40), split=True)
-    assert (report["iso_value_hu"], report["meshes"][0]["name"]) == (520.0, "001")
+def test_mesh_of_two_given_materials_has_the_iso_value_half_way_between_them(device: Any, tmp_path: Path) -> None:
+    report = mesh_scan(tmp_path, device, half_way=(1000, 40), split=True)
+
+    assert report["iso_value_hu"] == (1000 + 40) / 2
     assert report["iso_value_reason"] == "half way between tissue 40 and bone 1000 HU, as given"
-    assert report["iso_value_choice"]["edges"] is None and report["warnings"] == []
+    assert report["iso_value_choice"]["edges"] is None  # none was looked at
+    assert report["meshes"][0]["name"] == "001"
+    assert report["warnings"] == []
 
 
-def test_nothing_is_written_where_auto_finds_no_bone(scan: list[Volume], device: Any, tmp_path: Path) -> None:
+def test_auto_without_bone_in_the_scan_is_refused_and_writes_nothing(
+    scan: list[Volume], device: Any, tmp_path: Path
+) -> None:
     scan[0] = ball(bone=60.0)
+
     with refused(NoSurfaceError, "bone", "half_way"):
-        run(tmp_path, device, half_way="auto")
+        mesh_scan(tmp_path, device, half_way="auto")
+
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_material_that_the_scan_does_not_hold_is_said() -> None:
+def test_given_bone_brighter_than_the_scan_is_warned_of() -> None:
     entries, warnings = describe_level(ball(), MeshSettings(half_way=(1800, 40)), half_iso_value(1800, 40))
+
     assert entries["iso_value_choice"]["bone_hu"] == 1800
     (warning,) = warnings
     assert "bone was given as 1800 HU, but the volume runs from 40 to 1040 HU" in warning
 
 
-@pytest.mark.parametrize(("spacing", "expected"), [(2.0, 0), (3.0, 1)])
-def test_thick_slices_are_said(spacing: float, expected: int) -> None:
-    volume = ball()
-    thick = Volume(volume.voxels, np.diag((1.0, 1.0, spacing, 1.0)), volume.report)
+def warn_of_auto_level(slice_spacing_mm: float) -> list[str]:
+    """Warnings for the iso value that ``half_way="auto"`` chooses in the ball with slices so far apart."""
+    volume = Volume(ball().voxels, np.diag((1.0, 1.0, slice_spacing_mm, 1.0)))
     settings = MeshSettings(half_way="auto")
-    warnings = describe_level(thick, settings, choose_level(thick, settings))[1]
-    assert len(warnings) == expected
-    assert all("slices are 3 mm apart" in warning and "540 HU" in warning for warning in warnings)
+    return describe_level(volume, settings, choose_level(volume, settings))[1]
 
 
-def test_a_preset_says_its_reason() -> None:
+def test_auto_in_slices_3_mm_apart_is_warned_of_with_its_iso_value() -> None:
+    (warning,) = warn_of_auto_level(slice_spacing_mm=3.0)
+    assert "slices are 3 mm apart" in warning
+    assert "540 HU" in warning
+
+
+def test_auto_in_slices_2_mm_apart_has_no_warning() -> None:
+    assert warn_of_auto_level(slice_spacing_mm=2.0) == []
+
+
+def test_reason_of_an_iso_value_names_its_preset() -> None:
     entries, warnings = describe_level(ball(), MeshSettings(preset="bone"), None)
-    assert entries["iso_value_reason"].startswith("preset bone: ") and warnings == []
+
+    assert entries["iso_value_reason"].startswith("preset bone: ")
+    assert warnings == []
+
+
+def test_no_iso_value_is_chosen_from_the_scan_without_half_way() -> None:
     assert choose_level(ball(), MeshSettings()) is None
 
 
-def test_settings_with_two_materials_have_the_level_half_way() -> None:
+def test_settings_with_two_materials_have_the_level_half_way_and_no_preset() -> None:
     settings = MeshSettings(half_way=(1200.0, 40.0))
-    assert (settings.levels, settings.preset_used) == ((620.0,), None)
-    automatic = MeshSettings(half_way="auto")
-    assert math.isnan(automatic.levels[0]) and automatic.preset_used is None
+    assert (settings.levels, settings.preset_used) == (((1200.0 + 40.0) / 2,), None)
+
+
+def test_settings_with_auto_have_an_unknown_level_and_no_preset() -> None:
+    settings = MeshSettings(half_way="auto")
+    assert math.isnan(settings.levels[0])
+    assert settings.preset_used is None
 
 
 @pytest.mark.parametrize(
@@ -121,14 +165,24 @@ def test_impossible_materials_are_refused(settings: dict, words: str) -> None:
         MeshSettings(**settings)
 
 
-@pytest.mark.parametrize("report", [None, {}])
-def test_steps_of_the_job_take_volumes_made_from_arrays(report: dict[str, Any] | None) -> None:
-    volume = Volume(np.arange(1000, dtype=np.int16).reshape(10, 10, 10), np.eye(4), report)
-    check_levels(volume, plan_surfaces([500.0]))
+VALUES_0_TO_999 = np.arange(1000, dtype=np.int16).reshape(10, 10, 10)
+
+
+@pytest.mark.parametrize("report", [None, {}], ids=["no report", "an empty report"])
+def test_level_within_a_volume_made_from_an_array_is_accepted(report: dict[str, Any] | None) -> None:
+    check_levels(Volume(VALUES_0_TO_999, np.eye(4), report), plan_surfaces([500.0]))
+
+
+@pytest.mark.parametrize("report", [None, {}], ids=["no report", "an empty report"])
+def test_level_at_the_lowest_value_of_a_volume_made_from_an_array_is_refused(report: dict[str, Any] | None) -> None:
     with refused(NoSurfaceError, 0, 999):
-        check_levels(volume, plan_surfaces([0.0]))
-    settings = MeshSettings(half_way=(2000.0, 40.0))
-    warnings = describe_level(volume, settings, choose_level(volume, settings))[1]
-    assert "bone was given as 2000 HU, but the volume runs from 0 to 999 HU" in warnings[0]
+        check_levels(Volume(VALUES_0_TO_999, np.eye(4), report), plan_surfaces([0.0]))
+
+
+@pytest.mark.parametrize("report", [None, {}], ids=["no report", "an empty report"])
+def test_field_of_view_removed_from_a_volume_made_from_an_array_is_warned_of(report: dict[str, Any] | None) -> None:
+    volume = Volume(VALUES_0_TO_999, np.eye(4), report)
+
     masked = mask_volume(volume, MeshSettings(field_of_view=3.0), ignore_progress)
+
     assert len(masked.report["warnings"]) == 1
