@@ -48,7 +48,7 @@ def test_a_print_keeps_all_parts_where_these_are_chosen_otherwise(given: dict[st
     assert settings_for("print", {**given, "keep_largest": None})["keep_largest"] is None
 
 
-def test_labels_are_printed_solid() -> None:
+def test_print_of_labels_makes_them_solid() -> None:
     assert settings_for("print", {"labels": LabelChoice("a")})["labels"] == LabelChoice("a", solid=True)
 
 
@@ -98,90 +98,158 @@ def test_bone_is_kept_where_the_level_is_that_of_bone_and_nothing_else_is_chosen
     assert MeshSettings(**settings_for("print", given)).keep == keep
 
 
-def test_impossible_purposes_are_refused() -> None:
+def test_unknown_purpose_is_refused() -> None:
     with refused(UsageError, "fun"):
         settings_for("fun", {})
-    with refused(UsageError, "closed=False"):
-        settings_for("print", {"closed": False})
     with refused(UsageError, "fun"):
         MeshSettings(purpose="fun")
 
 
-def test_warnings_say_what_can_go_wrong() -> None:
-    wall = {"thin_share": 0.01, "thin_mm": 1.0}
-    cavities = {"cavities": 0, "cavities_ml": 0.0}
-    good = {"wall": wall, "bone_wall": None, "left_out": {"pieces_ml": 1.0}, "pieces_ml": 2.0, **cavities}
-    assert warn_of_print(good) == []
-    assert "20 % of the surface" in warn_of_print({**good, "wall": {**wall, "thin_share": 0.2}})[0]
-    (hidden,) = warn_of_print({**good, "bone_wall": {**wall, "thin_share": 0.25}})
-    assert "25 %" in hidden and "bone thinner than 1 mm" in hidden and " 1 %" in hidden
-    assert "closed cavities" in warn_of_print({**good, "cavities": 3, "cavities_ml": 0.2})[0]
-    assert "is it the right piece" in warn_of_print({**good, "left_out": {"pieces_ml": 2.1}})[0]
-    told = {"pieces_ml": 4.1, "not_bone": 1, "not_bone_ml": 3.2}  # bone of 0.9 ml beside 2 ml
-    assert warn_of_print({**good, "left_out": told}) == []
-    told["not_bone_ml"] = 3.0
-    assert "bone that was left out encloses 1.1 ml" in warn_of_print({**good, "left_out": told})[0]
-    mouse = {**good, "pieces_ml": 0.0328, "left_out": {"pieces_ml": 0.0808}}
-    assert "encloses 80.8 mm3, beside the 32.8 mm3 that were kept" in warn_of_print(mouse)[0]
+def test_print_of_an_open_mesh_is_refused() -> None:
+    with refused(UsageError, "closed=False"):
+        settings_for("print", {"closed": False})
 
 
-def test_all_parts_say_how_much_is_left_out_as_no_bone() -> None:
-    facts = [{"left_out": {"not_bone": 27, "not_bone_ml": 2.1}, "pieces_ml": 30.0}, {"pieces_ml": 11.9}]
-    (text,) = warn_of_other_pieces(facts)
-    assert text.startswith("27 pieces of 2.1 ml together were left out, crumbs or with walls that do not reach 600 HU")
-    assert "min_volume_ml=0.1 in place of all_parts=True keeps" in text
-    assert warn_of_other_pieces([*facts, {"pieces_ml": 0.2}]) == []
-    facts[0]["left_out"]["not_bone_ml"] = None  # bone was not told from other things
-    assert warn_of_other_pieces(facts) == warn_of_other_pieces([]) == []
+GOOD_PRINT = {
+    "wall": {"thin_share": 0.01, "thin_mm": 1.0},
+    "bone_wall": None,
+    "left_out": {"pieces_ml": 1.0},
+    "pieces_ml": 2.0,
+    "cavities": 0,
+    "cavities_ml": 0.0,
+}
+"""What a job knows of a print without faults: half as much is left out as is kept."""
+
+
+def test_print_without_faults_has_no_warning() -> None:
+    assert warn_of_print(GOOD_PRINT) == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        pytest.param({"wall": {"thin_share": 0.2, "thin_mm": 1.0}}, "20 % of the surface", id="thin walls"),
+        pytest.param({"cavities": 3, "cavities_ml": 0.2}, "closed cavities", id="cavities"),
+        pytest.param({"left_out": {"pieces_ml": 2.1}}, "is it the right piece", id="more left out than kept"),
+        pytest.param(
+            {"pieces_ml": 0.0328, "left_out": {"pieces_ml": 0.0808}},
+            "encloses 80.8 mm3, beside the 32.8 mm3 that were kept",
+            id="more left out of a small animal",
+        ),
+    ],
+)
+def test_fault_of_a_print_is_warned_of(fault: dict[str, Any], said: str) -> None:
+    (warning,) = warn_of_print({**GOOD_PRINT, **fault})
+    assert said in warning
+
+
+def test_walls_that_are_thicker_than_their_bone_are_warned_of_with_both_shares() -> None:
+    bone_wall = {"thin_share": 0.25, "thin_mm": 1.0}
+
+    (warning,) = warn_of_print({**GOOD_PRINT, "bone_wall": bone_wall})
+
+    assert "25 %" in warning
+    assert "bone thinner than 1 mm" in warning
+    assert " 1 %" in warning  # of the walls of the print
+
+
+def test_bone_left_out_of_a_print_is_warned_of_where_it_is_more_than_half_of_what_is_kept() -> None:
+    assert GOOD_PRINT["pieces_ml"] == 2.0
+    bone_of_0_9_ml = {"pieces_ml": 4.1, "not_bone": 1, "not_bone_ml": 3.2}
+    bone_of_1_1_ml = {"pieces_ml": 4.1, "not_bone": 1, "not_bone_ml": 3.0}
+
+    assert warn_of_print({**GOOD_PRINT, "left_out": bone_of_0_9_ml}) == []
+    (warning,) = warn_of_print({**GOOD_PRINT, "left_out": bone_of_1_1_ml})
+    assert "bone that was left out encloses 1.1 ml" in warning
+
+
+def test_print_of_all_parts_warns_where_more_than_a_twentieth_is_left_out_as_no_bone() -> None:
+    left_out = {"not_bone": 27, "not_bone_ml": 2.1}
+    kept_41_9_ml = [{"left_out": left_out, "pieces_ml": 30.0}, {"pieces_ml": 11.9}]
+    kept_42_1_ml = [*kept_41_9_ml, {"pieces_ml": 0.2}]
+
+    (warning,) = warn_of_other_pieces(kept_41_9_ml)
+    assert warning.startswith(
+        "27 pieces of 2.1 ml together were left out, crumbs or with walls that do not reach 600 HU"
+    )
+    assert "min_volume_ml=0.1 in place of all_parts=True keeps" in warning
+    assert warn_of_other_pieces(kept_42_1_ml) == []
+
+
+@pytest.mark.parametrize(
+    "facts",
+    [[], [{"left_out": {"not_bone": 27, "not_bone_ml": None}, "pieces_ml": 30.0}]],
+    ids=["no part", "bone not told from other things"],
+)
+def test_print_of_all_parts_has_no_warning_where_nothing_is_known_as_no_bone(facts: list[dict[str, Any]]) -> None:
+    assert warn_of_other_pieces(facts) == []
+
+
+@pytest.fixture(scope="module")
+def torus(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
+    """The folder of a noisy CT of a torus, and the iso value of its surface."""
+    folder = tmp_path_factory.mktemp("torus") / "ct"
+    settings = PhantomSettings(kind="torus", size=(72, 56), slices=31, spacing=(0.5, 0.7, 1.0), noise=30.0)
+    return folder, write_phantom(folder, settings)["iso_value_hu"]
 
 
 @pytest.mark.release
-def test_print_of_a_phantom_is_one_closed_piece_of_its_size(
-    device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_print_of_a_torus_is_one_closed_piece_with_its_size_volume_and_walls(
+    device: Any, torus: tuple[Path, float], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    settings = PhantomSettings(kind="torus", size=(72, 56), slices=31, spacing=(0.5, 0.7, 1.0), noise=30.0)
-    truth = write_phantom(tmp_path / "ct", settings)
-    arguments = ["mesh", str(tmp_path / "ct"), "-o", str(tmp_path / "a.stl"), "--hu", f"{truth['iso_value_hu']:g}"]
-    arguments += ["--device", str(device.index), "--for", "print", "--report", str(tmp_path / "a.json")]
-    assert main(arguments) == 0
-    told = capsys.readouterr().out
+    folder, level = torus
+    command = ["mesh", str(folder), "-o", str(tmp_path / "a.stl"), "--hu", f"{level:g}", "--for", "print"]
+
+    assert main([*command, "--device", str(device.index), "--report", str(tmp_path / "a.json")]) == 0
+
     report = json.loads((tmp_path / "a.json").read_text())
-    facts = report["print"]
     assert (report["purpose"], report["keep_largest"], report["components"]) == ("print", 1, 1)
-    size = np.ptp(np.array(report["bounds_mm"]), axis=0)
-    np.testing.assert_allclose(facts["size_mm"], size, atol=1e-4)
-    assert "print    size " + " x ".join(f"{length:.1f}" for length in size) in told
+    facts = report["print"]
     assert (facts["pieces"], facts["cavities"]) == (1, 0)
+    size = np.ptp(np.array(report["bounds_mm"]), axis=0)
+    np.testing.assert_allclose(facts["size_mm"], size, atol=1e-4)  # float32 coordinates of some 100 mm
+    assert "print    size " + " x ".join(f"{length:.1f}" for length in size) in capsys.readouterr().out
     assert facts["pieces_ml"] == pytest.approx(report["volume_ml"], rel=0.01)
     assert 0.0 < facts["wall"]["p5_mm"] <= facts["wall"]["median_mm"] <= size.max()
-    assert main([*arguments, "--open"]) == 3
 
 
-def test_paper_b_is_the_way_of_the_paper() -> None:
+def test_print_with_the_option_open_is_refused(torus: tuple[Path, float], tmp_path: Path, printed: Printer) -> None:
+    assert main(["mesh", str(torus[0]), "-o", str(tmp_path / "a.stl"), "--for", "print", "--open"]) == 3
+    printed().assert_error("--open")
+
+
+def test_purpose_paper_b_sets_the_steps_method_and_vertex_rule_of_the_paper() -> None:
     settings = MeshSettings(**settings_for("paper-b", {"region": ["hu:100,"], "closed": False}))
-    assert (settings.preprocess, settings.method_used, settings.vertex_rule) == (
-        "bilateral-2d,open:1,region", "i-mc", "golden",
-    )  # fmt: skip
+
+    assert settings.preprocess == "bilateral-2d,open:1,region"
+    assert (settings.method_used, settings.vertex_rule) == ("i-mc", "golden")
     assert not settings.is_for_print
-    own = MeshSettings(**settings_for("paper-b", {"vertex_rule": "linear", "preprocess": "fill"}))
-    assert (own.preprocess, own.vertex_rule) == ("fill", "linear")
+
+
+def test_purpose_paper_b_without_a_region_has_no_step_for_it() -> None:
     assert MeshSettings(**settings_for("paper-b", {})).preprocess == "bilateral-2d,open:1"
 
 
-def test_paper_b_runs_as_a_whole(device: Any, tmp_path: Path, printed: Printer) -> None:
+def test_given_settings_win_over_those_of_paper_b() -> None:
+    settings = MeshSettings(**settings_for("paper-b", {"vertex_rule": "linear", "preprocess": "fill"}))
+    assert (settings.preprocess, settings.vertex_rule) == ("fill", "linear")
+
+
+def test_command_for_paper_b_reports_its_steps_method_and_cells(device: Any, tmp_path: Path, printed: Printer) -> None:
     write_phantom(tmp_path / "ct", PhantomSettings(size=(96, 96), slices=40, spacing=(1.6, 1.6, 2.0), noise=12.0))
     report_path, mesh_path = tmp_path / "r.json", tmp_path / "bone.stl"
     options = ["--for", "paper-b", "--hu", "250", "--region", "tube:60", "--device", str(device.index)]
+
     assert main(["mesh", str(tmp_path / "ct"), "-o", str(mesh_path), "--report", str(report_path), *options]) == 0
+
     report = json.loads(report_path.read_text())
     steps = [step["step"] for step in report["volume"]["preprocess"]]
     assert steps == ["bilateral-2d", "open:1", "region"]
     assert (report["method"], report["vertex_rule"]) == ("i-mc", "golden")
     cells = report["meshes"][0]["cells"]
     assert 0 < cells["active"] <= cells["all"]
-    said = printed()
-    said.assert_output("cells")
-    assert any("0.618 of their edges" in warning for warning in report["warnings"])
+    printed().assert_output("cells")
+    assert any("0.618 of their edges" in warning for warning in report["warnings"])  # where the rule puts vertices
 
 
 def make_hip() -> Volume:
@@ -200,20 +268,30 @@ def make_hip() -> Volume:
     return Volume(np.rint(np.minimum(hu, 3071)).astype(np.int16), np.diag([1.0, 1.0, 1.5, 1.0]))
 
 
+@pytest.fixture(scope="module")
+def hip_report(device: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The report of a print of the hip: some 40 % of its vertices lie near metal."""
+    folder = tmp_path_factory.mktemp("hip")
+    make_hip().save(folder / "hip.nii.gz")
+    command = ["mesh", str(folder / "hip.nii.gz"), "-o", str(folder / "a.stl"), "--for", "print", "-q"]
+    assert main([*command, "--device", str(device.index), "--report", str(folder / "a.json")]) == 0
+    report = json.loads((folder / "a.json").read_text())
+    assert 0.3 < report["iso_distance"]["near_metal"] / report["iso_distance"]["samples"]["vertices"] < 0.5
+    return report
+
+
 @pytest.mark.release
 @pytest.mark.seconds
-def test_metal_is_named_and_distances_are_judged_without_it(device: Any, tmp_path: Path) -> None:
-    make_hip().save(tmp_path / "hip.nii.gz")
-    arguments = ["mesh", str(tmp_path / "hip.nii.gz"), "-o", str(tmp_path / "a.stl"), "--for", "print"]
-    arguments += ["--device", str(device.index), "--report", str(tmp_path / "a.json")]
-    assert main(arguments) == 0
-    report = json.loads((tmp_path / "a.json").read_text())
-    found, gates = report["iso_distance"], {gate["name"]: gate for gate in report["gates"]}
-    assert 0.3 < found["near_metal"] / found["samples"]["vertices"] < 0.5
-    nearer = min((found[of] for of in ("vertices_voxel", "surface_voxel")), key=lambda one: one["mean"])
-    for name, bound in (("p95", 0.25), ("mean", 0.1)):
-        whole, away, gate = (nearer[name], found["away_from_metal_voxel"][name], gates[f"iso_distance_{name}"])
-        assert whole > bound > 1.5 * away
-        assert (gate["measured"], gate["ok"]) == (away, True)
-        metal = f"{found['near_metal']:,} of {found['samples']['vertices']:,} vertices near metal (above 2000 HU)"
-        assert f"(without {metal}, with them {whole:.3g})" in gate["text"]
+@pytest.mark.parametrize(("figure", "bound"), [("p95", 0.25), ("mean", 0.1)])
+def test_gate_of_the_iso_distance_is_judged_without_vertices_near_metal_and_names_them(
+    figure: str, bound: float, hip_report: dict[str, Any]
+) -> None:
+    found = hip_report["iso_distance"]
+    (gate,) = (gate for gate in hip_report["gates"] if gate["name"] == f"iso_distance_{figure}")
+
+    nearer = min((found["vertices_voxel"], found["surface_voxel"]), key=lambda distances: distances["mean"])
+    whole, away = nearer[figure], found["away_from_metal_voxel"][figure]
+    assert whole > bound > 1.5 * away
+    assert (gate["measured"], gate["ok"]) == (away, True)
+    metal = f"{found['near_metal']:,} of {found['samples']['vertices']:,} vertices near metal (above 2000 HU)"
+    assert f"(without {metal}, with them {whole:.3g})" in gate["text"]

@@ -11,13 +11,13 @@ from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS, find_iso_preset
 
 
-def test_bone_is_the_default() -> None:
+def test_default_settings_are_of_bone_at_200_hu_closed_in_lps_on_any_device() -> None:
     settings = MeshSettings()
     assert (settings.levels, settings.preset_used) == ((200.0,), "bone")
     assert (settings.space, settings.closed, settings.device) == ("lps", True, None)
 
 
-def test_a_value_beats_the_default_preset() -> None:
+def test_given_iso_value_replaces_the_default_preset() -> None:
     settings = MeshSettings(iso_value=-0.0)
     assert (settings.levels, settings.preset_used) == ((0.0,), None)
 
@@ -35,20 +35,31 @@ def test_several_iso_values_keep_their_order() -> None:
         ({"keep_largest": 1, "min_volume_ml": 1.0}, True),
     ],
 )
-def test_components_are_told_apart_only_where_asked(settings: dict, selects: bool) -> None:
+def test_components_are_told_apart_only_where_a_setting_needs_them(settings: dict, selects: bool) -> None:
     assert MeshSettings(**settings).selects is selects
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
-def test_presets_are_whole_numbers_of_hu_in_the_range_of_ct(name: str) -> None:
+def test_preset_has_a_whole_number_of_hu_in_the_range_of_ct(name: str) -> None:
+    iso_value = find_iso_preset(name).iso_value
+
+    assert MeshSettings(preset=name).levels == (iso_value,)
+    assert iso_value == int(iso_value)
+    air_hu, highest_of_12_bits_hu = -1000, 3071
+    assert air_hu < iso_value < highest_of_12_bits_hu
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_preset_has_its_name_a_description_and_a_source(name: str) -> None:
     preset = find_iso_preset(name)
-    assert (preset.name, MeshSettings(preset=name).levels) == (name, (preset.iso_value,))
-    assert preset.iso_value == int(preset.iso_value)
-    assert -1000 < preset.iso_value < 3071
-    assert preset.description and preset.source
+
+    assert preset.name == name
+    assert preset.description
+    assert preset.source
 
 
-def test_the_default_preset_keeps_thin_cortex() -> None:
+def test_default_preset_is_low_enough_for_thin_cortex() -> None:
+    # Thin vertebral cortex in slices of 4 mm needs 150 to 200 HU.
     assert 150 <= PRESETS[DEFAULT_PRESET].iso_value <= 200
 
 
@@ -74,6 +85,6 @@ def test_the_default_preset_keeps_thin_cortex() -> None:
         ({"iso_value": (200.0, 350.0), "preset": "bone"}, "not both"),
     ],
 )
-def test_impossible_settings_are_refused(settings: dict, words: str) -> None:
+def test_impossible_settings_of_a_mesh_are_refused(settings: dict, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         MeshSettings(**settings)

@@ -11,22 +11,29 @@ from clrecon.jobs.mesh.make import BESIDE_SLICES, _remember_filled
 from clrecon.mesh import Mesh
 
 
-@pytest.mark.parametrize("middle", [(10.0, 8.0, 3.0), (10.0, 8.0, 90.0), (10.0, 8.0, 147.0)])
-def test_slices_around_a_mesh_are_those_of_the_solid_volume(middle: tuple[float, float, float]) -> None:
+@pytest.mark.parametrize("middle_mm", [3.0, 90.0, 147.0], ids=["lowest", "middle", "highest"])
+def test_slices_about_a_mesh_are_those_of_the_solid_volume_and_no_more_than_needed(middle_mm: float) -> None:
+    slices, spacing_mm, radius_mm = 100, 1.5, 2.0
     random = np.random.default_rng(4)
-    scan = Volume(random.integers(-100, 100, (100, 16, 21)).astype(np.int16), np.diag([1.0, 1.0, 1.5, 1.0]))
-    solid = scan.with_voxels(np.where(random.random(scan.voxels.shape) < 0.3, np.int16(500), scan.voxels))
+    noise = random.integers(-100, 100, (slices, 16, 21)).astype(np.int16)
+    scan = Volume(noise, np.diag([1.0, 1.0, spacing_mm, 1.0]))
+    solid = scan.with_voxels(np.where(random.random(noise.shape) < 0.3, np.int16(500), noise))
     solid.report = {"solid": {"filled_hu": 500.0}}
-    mesh = Mesh(ball(2.0, 10)[0] + middle, ball(2.0, 10)[1])
+    vertices, triangles = ball(radius_mm, 10)
+    mesh = Mesh(vertices + (10.0, 8.0, middle_mm), triangles)
+
     part = _remember_filled(scan, solid)([mesh])
-    first = round(part.ijk_to_lps([[0.0, 0.0, 0.0]])[0, 2] / 1.5)
-    low, high = (end[2] / 1.5 for end in mesh.bounds)
-    assert first <= max(low - BESIDE_SLICES, 0) and first + len(part.voxels) > min(high + BESIDE_SLICES - 1, 99)
-    assert len(part.voxels) < 40, "not the whole volume"
-    np.testing.assert_array_equal(part.voxels, solid.voxels[first : first + len(part.voxels)])
+
+    first = round(part.ijk_to_lps([[0.0, 0.0, 0.0]])[0, 2] / spacing_mm)
+    count = len(part.voxels)
+    low, high = (middle_mm - radius_mm) / spacing_mm, (middle_mm + radius_mm) / spacing_mm  # slices of the mesh
+    assert first <= max(low - BESIDE_SLICES, 0)
+    assert first + count > min(high + BESIDE_SLICES - 1, slices - 1)
+    assert count < 40  # far from all 100
+    np.testing.assert_array_equal(part.voxels, solid.voxels[first : first + count])
     assert scan.report is solid.report
 
 
-def test_a_volume_that_was_not_filled_is_the_scan() -> None:
+def test_slices_of_a_volume_that_was_not_filled_are_the_scan_itself() -> None:
     scan = Volume(np.zeros((3, 3, 3), np.int16), np.eye(4))
     assert _remember_filled(scan, scan)([]) is scan

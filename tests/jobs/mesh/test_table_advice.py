@@ -16,60 +16,89 @@ from clrecon.mesh.connectivity import label_components
 from clrecon.proof.surface.extract import extract_isosurface
 
 
-@pytest.mark.parametrize("without_table", [False, True])
-def test_rails_that_are_left_out_are_warned_of(without_table):
+def make_mesh_of(volume: Volume, iso_value: float) -> Mesh:
+    """The surface of a volume of whole HU, as a job has it."""
+    vertices, normals, triangles = extract_isosurface(volume, iso_value)
+    report = {**choose_iso_rule(volume, iso_value).as_report(), "iso_level_hu": iso_value - 0.5}
+    return Mesh(vertices, triangles, normals.astype(np.float32), report)
+
+
+@pytest.mark.parametrize("without_table", [False, True], ids=["table there", "table taken away"])
+def test_rail_left_out_as_no_bone_is_warned_of_with_remove_table_where_the_table_is_there(without_table):
     k, j, i = np.indices((36, 24, 36))
-    hu = np.where((abs(i - 28) < 4) & (abs(j - 12) < 4), 1500.0, 0.0)
-    hu[np.hypot(i - 11, j - 12) < 5 + 3 * np.sin(k / 4)] = 1000.0
+    hu = np.where((abs(i - 28) < 4) & (abs(j - 12) < 4), 1500.0, 0.0)  # a rail, the same in all slices
+    hu[np.hypot(i - 11, j - 12) < 5 + 3 * np.sin(k / 4)] = 1000.0  # bone, a rod of changing radius
     volume = Volume(np.rint(hu).astype(np.int16), np.diag((1.0, 1.0, 2.0, 1.0)))
-    vertices, normals, triangles = extract_isosurface(volume, 300.0)
-    report = {**choose_iso_rule(volume, 300.0).as_report(), "iso_level_hu": 299.5}
-    mesh = Mesh(vertices, triangles, normals.astype(np.float32), report)
+    mesh = make_mesh_of(volume, 300.0)
     labelled = label_components(mesh.triangles, mesh.vertex_count)
-    bone = find_bone(mesh, volume, Surface(300.0, ""), labelled, without_table=without_table, advice="")
-    assert bone.sum() == 1 and len(bone) == 2
-    (said,) = mesh.report["warnings"]
-    assert "1 component is as dense as bone but the same in all slices" in said and ": left out" in said
-    assert ("remove_table=True" in said) != without_table
+
+    is_bone = find_bone(mesh, volume, Surface(300.0, ""), labelled, without_table=without_table, advice="")
+
+    assert sorted(is_bone) == [False, True]
+    (warning,) = mesh.report["warnings"]
+    assert "1 component is as dense as bone but the same in all slices" in warning
+    assert ": left out" in warning
+    assert ("remove_table=True" in warning) != without_table
 
 
 @pytest.mark.parametrize("remove_table", [False, True])
-def test_walls_that_are_even_beneath_advise_to_remove_the_table(remove_table):
-    walls = WallLook("bone", 0.5, 0.1, 0.0, {"median": 400.0, "p90": 900.0, "p99": 1200.0}, 1000)
+def test_bone_with_even_walls_is_warned_of_with_remove_table_where_it_is_not_set(remove_table):
+    tenth_even = WallLook("bone", 0.5, 0.1, 0.0, {"median": 400.0, "p90": 900.0, "p99": 1200.0}, 1000)
     part = Part(Surface(300.0, ""), "", Mesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.uint32)))
-    part.facts["walls"] = walls
-    (said,) = warn_of_walls([part], MeshSettings(keep="bone", remove_table=remove_table))
-    assert "about 10 % is even beneath" in said and "a higher iso value parts them" in said
-    assert ("remove_table=True" in said) != remove_table
+    part.facts["walls"] = tenth_even
+
+    (warning,) = warn_of_walls([part], MeshSettings(keep="bone", remove_table=remove_table))
+
+    assert "about 10 % is even beneath" in warning
+    assert "a higher iso value parts them" in warning
+    assert ("remove_table=True" in warning) != remove_table
 
 
-@pytest.mark.parametrize("failed", ["hu_known", "hu_scale", None])
-def test_walls_are_judged_by_hu_where_values_are_hu(failed):
-    """A plate of 380 is even beneath, as contrast medium is in HU; on another scale it may be bone."""
+FAILED_GATE = {"name": "hu_known", "ok": False, "text": "no HU"}
+
+
+def judge_walls_of_a_block(gates: list[dict]) -> tuple[Part, list[str]]:
+    """Judge the surface of an even block of 380 in a volume with these gates; return it and the warnings."""
     voxels = np.zeros((40, 40, 40), np.int16)
     voxels[10:30, 10:30, 10:30] = 380
-    volume = Volume(voxels, np.eye(4))
-    if failed:
-        volume.report["gates"] = [{"name": failed, "ok": False, "text": "no HU"}]
-    vertices, normals, triangles = extract_isosurface(volume, 190.0)
-    report = {**choose_iso_rule(volume, 190.0).as_report(), "iso_level_hu": 189.5}
-    part = Part(Surface("", 190.0), "", Mesh(vertices, triangles, normals.astype(np.float32), report))
+    volume = Volume(voxels, np.eye(4), {"gates": gates})
+    part = Part(Surface("", 190.0), "", make_mesh_of(volume, 190.0))
     settings = MeshSettings(half_way="auto")
     judge_surfaces([part], volume, settings, lambda mesh: label_components(mesh.triangles, mesh.vertex_count))
-    said = warn_of_walls([part], settings)
-    assert ([], None) == (said, part.facts["walls"]) if failed else "nothing here looks like bone" in said[0]
+    return part, warn_of_walls([part], settings)
 
 
-@pytest.mark.parametrize("failed", ["hu_known", None])
-def test_bone_that_is_kept_by_values_that_are_no_hu_says_so(failed):
+def test_even_block_of_380_hu_is_warned_of_as_no_bone():
+    _, warnings = judge_walls_of_a_block(gates=[])
+    assert "nothing here looks like bone" in warnings[0]
+
+
+@pytest.mark.parametrize("name", ["hu_known", "hu_scale"])
+def test_even_block_is_not_judged_where_values_are_not_known_to_be_hu(name):
+    """On another scale 380 may be bone."""
+    part, warnings = judge_walls_of_a_block(gates=[{**FAILED_GATE, "name": name}])
+
+    assert part.facts["walls"] is None
+    assert warnings == []
+
+
+def keep_bone_of_a_ball(gates: list[dict]) -> tuple[list[bool], list[str]]:
+    """Find bone in a ball of 1000 in a volume with these gates; return which components are bone, and the warnings."""
     hu = np.where(np.linalg.norm(np.indices((24, 24, 24)) - 11.5, axis=0) < 8, 1000, 0)
-    volume = Volume(hu.astype(np.int16), np.eye(4))
-    if failed:
-        volume.report["gates"] = [{"name": failed, "ok": False, "text": "no HU"}]
-    vertices, normals, triangles = extract_isosurface(volume, 500.0)
-    report = {**choose_iso_rule(volume, 500.0).as_report(), "iso_level_hu": 499.5}
-    mesh = Mesh(vertices, triangles, normals.astype(np.float32), report)
+    volume = Volume(hu.astype(np.int16), np.eye(4), {"gates": gates})
+    mesh = make_mesh_of(volume, 500.0)
     labelled = label_components(mesh.triangles, mesh.vertex_count)
-    assert find_bone(mesh, volume, Surface("", 500.0), labelled, advice="").tolist() == [True]
-    said = mesh.report.get("warnings", [])
-    assert ["bone was told by walls of 600 HU" in one and "(hu_known)" in one for one in said] == [True] * bool(failed)
+    is_bone = find_bone(mesh, volume, Surface("", 500.0), labelled, advice="")
+    return is_bone.tolist(), mesh.report.get("warnings", [])
+
+
+def test_bone_kept_by_values_that_are_not_known_to_be_hu_is_warned_of():
+    is_bone, (warning,) = keep_bone_of_a_ball(gates=[FAILED_GATE])
+
+    assert is_bone == [True]
+    assert "bone was told by walls of 600 HU" in warning
+    assert "(hu_known)" in warning
+
+
+def test_bone_kept_by_hu_has_no_warning():
+    assert keep_bone_of_a_ball(gates=[]) == ([True], [])
