@@ -6,6 +6,7 @@ import io
 import json
 import os
 from contextlib import redirect_stdout
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -48,41 +49,76 @@ def ct(shared_folder: Path) -> Path:
     return make_once(shared_folder, "phantom-of-corridors", lambda folder: write_phantom(folder, SETTINGS))
 
 
-def test_the_bone_of_a_vertebra_ends_where_the_fitted_surface_lies(device: Any) -> None:
+@dataclass
+class FittedVertebra:
+    """The box vertebra of label 3, its solid bone on a lattice, and points of the lattice with their depth in mm."""
+
+    vertebra: BoxVertebra
+    bone: Any
+    places: np.ndarray
+    depth_mm: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def fitted_vertebra(device: Any) -> FittedVertebra:
     vertebra = BoxVertebra()
     affine, shape = grid_around(vertebra, spacing=(1.0, 1.0, 1.0))
     volume, labels = vertebra.scan(affine, shape)
     with DeviceVolume(volume, device=device) as resident:
         mesh = fit_labels(resident, LabelMap(labels, affine), 150.0, 3)[3]
     bone = fill_vertebra(volume, labels, 3, 150.0, "L3", partial(lay_on_lattice, mesh))
-    off = vertebra.depth(bone.surface)
-    assert abs(np.median(off)) < 0.06 and np.abs(off).mean() < 0.12  # at the level 0.35
-    assert bone.fitted and bone.by_hu.mean() > 0.95
-    some = np.random.default_rng(1).integers(0, bone.solid.shape, (20_000, 3))
-    depth, solid = vertebra.depth(bone.lattice.points(some)), bone.solid[tuple(some.T)]
-    assert solid[depth > 0.5].mean() > 0.999 and solid[depth < -0.5].mean() < 0.001
+    places = np.random.default_rng(1).integers(0, bone.solid.shape, (20_000, 3))
+    return FittedVertebra(vertebra, bone, places, vertebra.depth(bone.lattice.points(places)))
 
 
-def test_a_label_without_bone_beside_one_with_it_is_refused_in_words(tmp_path: Path, device: Any) -> None:
+def test_surface_of_the_bone_of_a_vertebra_is_fitted_within_a_fraction_of_a_voxel(
+    fitted_vertebra: FittedVertebra,
+) -> None:
+    off_mm = fitted_vertebra.vertebra.depth(fitted_vertebra.bone.surface)
+
+    assert abs(np.median(off_mm)) < 0.06  # voxels of 1 mm; at the level of 150 HU it is 0.35
+    assert np.abs(off_mm).mean() < 0.12
+
+
+def test_most_of_the_surface_of_the_bone_is_placed_by_hu(fitted_vertebra: FittedVertebra) -> None:
+    assert fitted_vertebra.bone.fitted
+    assert fitted_vertebra.bone.by_hu.mean() > 0.95  # the rest lies where pedicles meet the body
+
+
+def test_bone_of_a_vertebra_is_solid_to_half_a_mm_from_its_surface(fitted_vertebra: FittedVertebra) -> None:
+    solid = fitted_vertebra.bone.solid[tuple(fitted_vertebra.places.T)]
+    inside, outside = fitted_vertebra.depth_mm > 0.5, fitted_vertebra.depth_mm < -0.5
+
+    assert solid[inside].mean() > 0.999
+    assert solid[outside].mean() < 0.001
+
+
+def test_label_with_too_little_bone_to_be_fitted_is_refused_with_its_name(tmp_path: Path, device: Any) -> None:
     voxels = hollow_ball(thickness=3.0).voxels.copy()
     numbers = (voxels > 190).astype(np.uint8)
-    voxels[6:9, 6:9, -4:-1], numbers[6:9, 6:9, -4:-1] = 260, 2  # too little to be fitted
+    voxels[6:9, 6:9, -4:-1], numbers[6:9, 6:9, -4:-1] = 260, 2  # 27 voxels
     write_nifti(tmp_path / "ct.nii", voxels, np.eye(4))
     write_nifti(tmp_path / "l.nii", numbers, np.eye(4))
     settings = CorridorSettings(labels=tmp_path / "l.nii", label=(1, 2), surface="cortex", device=str(device.index))
+
     with refused(NoSurfaceError, "label_2", "surface"):
         make_corridors(tmp_path / "ct.nii", settings)
 
 
 @pytest.mark.release
-def test_corridors_of_the_fitted_bone_are_those_of_the_truth(ct: Path, tmp_path: Path, device: Any) -> None:
+def test_corridors_of_bone_with_a_fitted_surface_have_the_radius_of_the_truth(
+    ct: Path, tmp_path: Path, device: Any
+) -> None:
     options = ("--labels", ct / "levels.nrrd", "--label", "L1", "--surface", "cortex", "--device", device.index)
+
     assert run(ct, *options, "-o", tmp_path / "l1.ply", "--report", tmp_path / "r.json") == 0
+
     report = load(tmp_path / "r.json")
     assert (report["surface"], report["iso_value_hu"]) == ("cortex", 200.0)
     for side in report["vertebrae"][0]["corridors"]:
-        assert side["radius_mm"] == pytest.approx(true_radius_mm(side), abs=0.2)
-        assert side["level_bias_mm"] is None and side["placed_by_hu_share"] > 0.9
+        assert side["radius_mm"] == pytest.approx(true_radius_mm(side), abs=0.2)  # of voxels of 0.9 x 0.9 x 1.25 mm
+        assert side["level_bias_mm"] is None  # there is no level
+        assert side["placed_by_hu_share"] > 0.9
 
 
 def run(*arguments: object) -> int:
@@ -154,77 +190,102 @@ def reported(request: pytest.FixtureRequest, device: Any) -> Any:
 
 
 @pytest.mark.slow
-def test_the_line_keeps_its_distance_in_the_truth(reported: Any) -> None:
+def test_radius_of_a_corridor_is_the_distance_of_its_line_from_the_true_surface(reported: Any) -> None:
     for side in reported.sides:
         assert abs(side["radius_mm"] - true_radius_mm(side, reported.to_lps)) <= reported.bar
 
 
 @pytest.mark.slow
-def test_a_corridor_of_a_phantom_enters_at_its_surface_from_behind(reported: Any) -> None:
+def test_corridor_enters_at_the_true_surface_and_runs_from_back_to_front(reported: Any) -> None:
     truth = phantom_truth(SETTINGS)
     for side in reported.sides:
         entry, counted_from, tip = (reported.to_lps * side[f"{at}_mm"] for at in ("entry", "counted_from", "tip"))
-        assert abs(truth.signed_distance(entry[None])[0]) < 1.0
+        assert abs(truth.signed_distance(entry[None])[0]) < 1.0  # a voxel
         assert entry[1] > counted_from[1] > tip[1]  # y grows to the back
 
 
 @pytest.mark.slow
-def test_radius_and_angles_of_a_phantom_are_those_of_a_pedicle(reported: Any) -> None:
-    """Bounds that catch a wrong line or unit; the test above compares with the truth."""
+def test_corridor_has_the_radius_and_angles_of_a_lumbar_pedicle(reported: Any) -> None:
+    """Bounds that catch a wrong line or unit; the radius is compared with the truth in a test of its own."""
     for side in reported.sides:
         assert 2.5 < side["radius_mm"] < 5.0
         assert 5.0 < side["medial_angle_deg"] < 20.0
-        low, high = side["sagittal_angle_range_deg"]
-        assert low <= side["sagittal_angle_deg"] <= high and high - low > 5.0
-        assert side["level_bias_mm"]["rays"] > 60
+        lowest, highest = side["sagittal_angle_range_deg"]
+        assert lowest <= side["sagittal_angle_deg"] <= highest
+        assert highest - lowest > 5.0  # a line may turn within a pedicle higher than wide
 
 
 @pytest.mark.slow
-def test_the_left_corridor_lies_at_the_left_of_the_right_one(reported: Any) -> None:
+def test_bias_of_the_level_is_estimated_from_many_rays(reported: Any) -> None:
+    assert min(side["level_bias_mm"]["rays"] for side in reported.sides) > 60
+
+
+@pytest.mark.slow
+def test_left_corridor_lies_at_the_left_of_the_right_one(reported: Any) -> None:
     left, right = reported.sides
-    assert left["side"] == "left"
-    assert reported.to_lps[0] * left["entry_mm"][0] > reported.to_lps[0] * right["entry_mm"][0]
+
+    assert (left["side"], right["side"]) == ("left", "right")
+    assert reported.to_lps[0] * left["entry_mm"][0] > reported.to_lps[0] * right["entry_mm"][0]  # x of LPS grows so
 
 
 @pytest.mark.slow
-def test_corridors_are_told_not_to_be_for_an_operation_and_what_is_not_known(reported: Any) -> None:
+def test_words_and_report_say_that_corridors_are_not_for_planning_an_operation(reported: Any) -> None:
     notice = "not for planning an operation"
-    assert notice in reported.said and reported.report["notice"].startswith(notice)
+    assert notice in reported.said
+    assert reported.report["notice"].startswith(notice)
+
+
+@pytest.mark.slow
+def test_words_and_report_name_what_a_corridor_does_not_determine_and_the_bias_at_226_hu(reported: Any) -> None:
     assert "sagittal not determined" in reported.said
-    assert "at 226 HU" in reported.said and "226 HU" in reported.report["level_bias"]
+    assert "at 226 HU" in reported.said
+    assert "226 HU" in reported.report["level_bias"]
 
 
 @pytest.mark.slow
-def test_the_scale_of_grades_is_reported_with_screws_alone(reported: Any) -> None:
-    assert (reported.report["grade_scale"] is not None) == (reported.name == "whole")  # `plain` has no screws
+def test_scale_of_grades_is_reported_where_screws_are_given(whole: Path) -> None:
+    assert load(whole / "report.json")["grade_scale"] is not None
 
 
 @pytest.mark.slow
-def test_a_screw_wider_than_its_corridor_is_graded_b(whole: Path) -> None:
+def test_scale_of_grades_is_not_reported_without_screws(plain: Path) -> None:
+    assert load(plain / "report.json")["grade_scale"] is None
+
+
+@pytest.mark.slow
+def test_screw_wider_than_its_corridor_by_one_and_a_half_mm_is_graded_b_with_its_breach(whole: Path) -> None:
     wide, _ = load(whole / "report.json")["vertebrae"][0]["screws"]
+
     assert wide["grade"] == "B"
-    assert 0.4 < wide["breach_mm"] < 1.1  # 1.5 mm wider than the corridor: 0.75 mm on each side
+    on_each_side_mm = 1.5 / 2
+    assert wide["breach_mm"] == pytest.approx(on_each_side_mm, abs=0.35)  # the reported radius of its line
     assert wide["direction"] in ("medial", "lateral", "cranial", "caudal")
 
 
 @pytest.mark.slow
-def test_a_screw_within_the_right_corridor_is_graded_a(plain: Path, whole: Path) -> None:
+def test_screw_within_the_right_corridor_is_graded_a_at_its_given_entry(plain: Path, whole: Path) -> None:
     _, inner = load(whole / "report.json")["vertebrae"][0]["screws"]
+
     assert (inner["name"], inner["grade"], inner["side"]) == ("inner", "A", "right")
     right = load(plain / "report.json")["vertebrae"][0]["corridors"][1]
-    np.testing.assert_allclose(np.multiply(inner["entry_mm"], (-1, -1, 1)), right["entry_mm"], atol=2e-3)  # from RAS
+    entry_lps = np.multiply(inner["entry_mm"], (-1, -1, 1))  # from RAS
+    np.testing.assert_allclose(entry_lps, right["entry_mm"], atol=2e-3)  # reports have 3 decimals
 
 
 @pytest.mark.slow
 def test_grades_of_screws_are_printed_with_their_scale(whole: Path) -> None:
     said = (whole / "said.txt").read_text()
-    assert "grade B" in said and "grade A, no breach" in said and "Gertzbein-Robbins in five grades" in said
+    assert "grade B" in said
+    assert "grade A, no breach" in said
+    assert "Gertzbein-Robbins in five grades" in said
 
 
 @pytest.mark.slow
-def test_a_vertebra_its_corridors_and_screws_are_one_mesh_each(whole: Path) -> None:
+def test_vertebra_corridors_and_screws_are_written_as_one_mesh_each(whole: Path) -> None:
     names = ["L1", "L1_left", "L1_right", "L1_screw_1", "L1_screw_2"]
+
     outputs = load(whole / "report.json")["outputs"]
+
     assert [output["name"] for output in outputs if output["kind"] == "mesh"] == names
     written = {path.name for path in whole.iterdir()}
     assert written == {*(f"l1_{name}.ply" for name in names), "l1.png", "report.json", "said.txt"}
@@ -237,32 +298,44 @@ def test_an_older_mesh_of_a_corridor_is_refused_with_no_clobber(ct: Path, tmp_pa
     printed().assert_error("l1_L1.ply")
 
 
-@pytest.mark.parametrize(("height", "rise"), [(0.0, 0.0), (1.0, 0.0), (0.0, 1e-12), (3.0, 0.0), (1.0, 5.0)])
-def test_a_screw_across_its_corridor_is_drawn_where_it_meets_the_section(height: float, rise: float) -> None:
-    """Its section in the plane square to the corridor is a circle, or two lines; none if the plane misses it."""
+@pytest.mark.parametrize(
+    ("above_mm", "fall_mm"),
+    [(0.0, 0.0), (1.0, 0.0), (0.0, 1e-12), (3.0, 0.0), (1.0, 5.0)],
+    ids=["along the section", "1 mm beside it", "nearly along it", "3 mm beside it", "through it"],
+)
+def test_screw_across_its_corridor_is_drawn_in_the_section_that_it_meets(above_mm: float, fall_mm: float) -> None:
+    """The plane square to the corridor cuts a screw of radius 2 mm in a circle or two lines, or misses it."""
     volume = Volume(np.zeros((100, 100, 100), np.int16), np.eye(4))
     frame = VertebraFrame(np.full(3, 50.0), np.eye(3), (0.0, 20.0), (0.0, 0.0), 9.0, (-15.0, 15.0), 25.0)
     none = Corridor("left", "no room")
     found: Any = SimpleNamespace(name="L2", frame=frame, corridors=(none,))
-    entry = np.array((56.0, 65.0 + height, 50.0))  # the section lies at y = 65
-    screw = Screw(entry, entry + (20.0, -rise, 0.0), 4.0, "given")
+    section_y, radius_mm = 65.0, 2.0
+    entry = np.array((56.0, section_y + above_mm, 50.0))
+    screw = Screw(entry, entry + (20.0, -fall_mm, 0.0), 2 * radius_mm, "given")
+
     pixels = draw_corridors(volume, found, [screw], 1.0, []).image.astype(int)
-    red = np.asarray((np.abs(pixels[..., :3] - GIVEN) <= 40).all(axis=2))
+
+    is_screw = np.asarray((np.abs(pixels[..., :3] - GIVEN) <= 40).all(axis=2))  # of 255: smoothed edges
     third = pixels.shape[1] // 3
-    assert red[:, :third].any()
-    assert red[:, 2 * third :].any() == (height < 2.0)
+    along_the_corridor, section = is_screw[:, :third], is_screw[:, 2 * third :]
+    assert along_the_corridor.any()
+    assert section.any() == (above_mm < radius_mm)
 
 
-def test_a_cylinder_is_closed_and_as_large_as_it_should_be() -> None:
-    first, last = np.array([1.0, 2.0, 3.0]), np.array([4.0, 6.0, 15.0])
-    mesh = cylinder_mesh(first, last, 2.0)
+def test_cylinder_mesh_is_closed_and_outward_with_the_volume_of_a_cylinder() -> None:
+    first, last, radius_mm = np.array([1.0, 2.0, 3.0]), np.array([4.0, 6.0, 15.0]), 2.0
+    length_mm = 13.0  # of (3, 4, 12)
+
+    mesh = cylinder_mesh(first, last, radius_mm)
+
     quality = mesh.quality()
     assert quality.closed and quality.manifold
-    assert quality.volume_ml == pytest.approx(np.pi * 4.0 * 13.0 / 1000.0, rel=4e-3)
-    with_normals = mesh.vertices[mesh.triangles].astype(float)
-    outward = np.cross(with_normals[:, 1] - with_normals[:, 0], with_normals[:, 2] - with_normals[:, 0])
-    middle = with_normals.mean(axis=1) - (first + last) / 2.0
-    assert ((outward * middle).sum(axis=1) > 0.0).all()
+    # A prism of n sides has n / 2 pi * sin(2 pi / n) of the area of the circle: 0.2 % less for 48.
+    assert quality.volume_ml == pytest.approx(np.pi * radius_mm**2 * length_mm / 1000.0, rel=4e-3)
+    corners = mesh.vertices[mesh.triangles].astype(float)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    from_middle = corners.mean(axis=1) - (first + last) / 2.0
+    assert ((normals * from_middle).sum(axis=1) > 0.0).all()
 
 
 @pytest.mark.parametrize(
@@ -280,7 +353,7 @@ def test_a_cylinder_is_closed_and_as_large_as_it_should_be() -> None:
         (("--label", "L1", "--hu", "3000"), 4, "no voxel of L1 has 3000 HU or more"),
     ],
 )
-def test_wrong_arguments_end_in_one_line(
+def test_wrong_arguments_of_corridor_are_refused_in_one_line_and_write_nothing(
     ct: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -290,37 +363,68 @@ def test_wrong_arguments_end_in_one_line(
     said: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
+
     assert run(ct, "--labels", ct / "levels.nrrd", *arguments) == code
-    lines = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
-    assert len(lines) == 1 and said in lines[0]
+
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    assert said in line
     assert list(tmp_path.iterdir()) == []
 
 
-def test_screws_come_from_json_and_csv(tmp_path: Path) -> None:
+def test_screws_of_a_csv_in_ras_are_read_in_lps_with_name_label_and_diameter(tmp_path: Path) -> None:
     table = tmp_path / "s.csv"
     table.write_text(
         "name,label,entry_x,entry_y,entry_z,tip_x,tip_y,tip_z,diameter\n,L3,1,2,3,4,5,16,6.5\nb,,1,2,3,4,5,26,7\n"
     )
+
     first, second = read_screws(table, "ras")
+
     assert (first.name, first.label, first.diameter) == ("screw 1", "L3", 6.5)
-    assert (second.name, second.label) == ("b", None)
+    assert (second.name, second.label, second.diameter) == ("b", None, 7.0)
     np.testing.assert_allclose(first.entry, (-1.0, -2.0, 3.0))
-    np.testing.assert_allclose(parse_screw("1,2,3,4,5,16,6", "lps").tip, (4.0, 5.0, 16.0))
-    for text, said in (
-        ("", "has no column entry_x"),
-        ("[", "is no JSON"),
-        ("[1]", "is no list of screws"),
-        ("[]", "has 0 screws"),
-        ('[{"entry": [1, 2], "tip": [1, 2, 3], "diameter": 5}]', "screw 1 of s.json has no three numbers"),
-        ('[{"entry": [1, 2, "x"], "tip": [1, 2, 3], "diameter": 5}]', "screw 1 of s.json has no three numbers"),
-        ('[{"entry": [0, 0, 0], "tip": [0, 0, 30], "diameter": null}]', "and a diameter"),
-    ):
-        path = tmp_path / "s.json"
-        path.write_text(text)
-        with pytest.raises(UsageError, match=said):
-            read_screws(path, "lps")
-    with pytest.raises(UsageError, match=r"the screws in gone.csv cannot be read"):
+
+
+def test_screw_of_an_option_has_its_entry_tip_and_diameter() -> None:
+    screw = parse_screw("1,2,3,4,5,16,6", "lps")
+
+    np.testing.assert_allclose(screw.entry, (1.0, 2.0, 3.0))
+    np.testing.assert_allclose(screw.tip, (4.0, 5.0, 16.0))
+    assert screw.diameter == 6.0
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        pytest.param("", "has no column entry_x", id="empty"),
+        pytest.param("[", "is no JSON", id="broken JSON"),
+        pytest.param("[1]", "is no list of screws", id="a number"),
+        pytest.param("[]", "has 0 screws", id="no screw"),
+        pytest.param(
+            '[{"entry": [1, 2], "tip": [1, 2, 3], "diameter": 5}]',
+            "screw 1 of s.json has no three numbers",
+            id="two coordinates",
+        ),
+        pytest.param(
+            '[{"entry": [1, 2, "x"], "tip": [1, 2, 3], "diameter": 5}]',
+            "screw 1 of s.json has no three numbers",
+            id="a letter",
+        ),
+        pytest.param('[{"entry": [0, 0, 0], "tip": [0, 0, 30], "diameter": null}]', "and a diameter", id="no diameter"),
+    ],
+)
+def test_wrong_file_of_screws_is_refused(text: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "s.json"
+    path.write_text(text)
+    with pytest.raises(UsageError, match=said):
+        read_screws(path, "lps")
+
+
+def test_missing_file_of_screws_is_refused(tmp_path: Path) -> None:
+    with refused(UsageError, "gone.csv"):
         read_screws(tmp_path / "gone.csv", "lps")
+
+
+def test_file_of_screws_that_is_no_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(UsageError, match=r"b.csv is no text"):
+    with refused(UsageError, "b.csv", "text"):
         read_screws(tmp_path / "b.csv", "lps")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tolerances
 from label_files import write_nrrd
 from refusals import refused
 
@@ -23,22 +24,22 @@ pytestmark = pytest.mark.first_device
 AFFINE = np.diag((0.8, 0.8, 1.0, 1.0))
 AFFINE[:3, 3] = (-16.0, 30.0, 100.0)
 SHAPE = (40, 40, 40)
-CENTRE, RADIUS = np.array([0.0, 46.0, 120.0]), 12.0
+CENTRE_MM, RADIUS_MM = np.array([0.0, 46.0, 120.0]), 12.0
+"""A ball, LPS."""
 """A ball, LPS mm."""
 
 
-def places() -> np.ndarray:
+def distance_from_centre() -> np.ndarray:
+    """Of each voxel of the scan, in mm."""
     k, j, i = np.indices(SHAPE).reshape(3, -1).astype(float)
-    return np.column_stack([i, j, k]) * AFFINE.diagonal()[:3] + AFFINE[:3, 3]
-
-
-def away() -> np.ndarray:
-    return np.linalg.norm(places() - CENTRE, axis=1).reshape(SHAPE)
+    places = np.column_stack([i, j, k]) * AFFINE.diagonal()[:3] + AFFINE[:3, 3]
+    return np.linalg.norm(places - CENTRE_MM, axis=1).reshape(SHAPE)
 
 
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    voxels = np.clip(100.0 * (RADIUS - away()) + 300.0, -1000, 1000).astype(np.int16)
+    """A scan of 40 x 40 x 40 voxels whose surface at 300 HU is the ball."""
+    voxels = np.clip(100.0 * (RADIUS_MM - distance_from_centre()) + 300.0, -1000, 1000).astype(np.int16)
     return write_nrrd(tmp_path_factory.mktemp("ball") / "ct.nrrd", voxels, AFFINE)
 
 
@@ -46,83 +47,131 @@ def run(*words: object) -> int:
     return main([str(word) for word in words])
 
 
-def mesh_of(scan: Path, folder: Path, *words: str) -> tuple[Any, dict[str, Any]]:
+def mesh_at_300_hu(scan: Path, folder: Path, *words: str) -> tuple[Any, dict[str, Any]]:
+    """The mesh and its report."""
     assert run("mesh", scan, "-o", folder / "a.stl", "--report", folder / "a.json", "--hu", "300", "-q", *words) == 0
     return read_mesh(folder / "a.stl"), json.loads((folder / "a.json").read_text())
 
 
-HALF = ("--between", f"{CENTRE[2]:g},")
+UPPER_HALF = ("--between", f"{CENTRE_MM[2]:g},")
 
 
-def test_half_a_ball_is_closed_at_the_crop(scan: Path, tmp_path: Path) -> None:
-    _, report = mesh_of(scan, tmp_path, *HALF)
+def test_mesh_of_a_cropped_ball_is_closed_at_the_crop(scan: Path, tmp_path: Path) -> None:
+    _, report = mesh_at_300_hu(scan, tmp_path, *UPPER_HALF)
+
     assert report["closed"] and report["manifold"]
-    half_ml = 2.0 / 3.0 * np.pi * RADIUS**3 / 1000.0
+    half_ml = 2.0 / 3.0 * np.pi * RADIUS_MM**3 / 1000.0
     # Up to one slice goes on beyond the lowest centre, where it meets the air outside.
-    slice_ml = np.pi * RADIUS**2 * 1.0 / 1000.0
+    slice_ml = np.pi * RADIUS_MM**2 * 1.0 / 1000.0
     assert half_ml < report["volume_ml"] < half_ml + slice_ml
 
 
-def test_half_a_ball_is_open_at_the_crop_on_request(scan: Path, tmp_path: Path) -> None:
-    left, report = mesh_of(scan, tmp_path, *HALF, "--open")
-    assert not report["closed"] and left.vertices[:, 2].min() >= CENTRE[2]
+def test_mesh_of_a_cropped_ball_is_open_at_the_crop_on_request(scan: Path, tmp_path: Path) -> None:
+    half, report = mesh_at_300_hu(scan, tmp_path, *UPPER_HALF, "--open")
+
+    assert not report["closed"]
+    assert half.vertices[:, 2].min() >= CENTRE_MM[2]
 
 
-def test_vertices_away_from_the_crop_are_those_of_the_whole(scan: Path, tmp_path: Path) -> None:
-    whole, half = (mesh_of(scan, tmp_path, *options)[0].vertices for options in ((), HALF))
-    above = [np.unique(vertices[vertices[:, 2] > CENTRE[2] + 0.5], axis=0) for vertices in (whole, half)]
-    assert np.array_equal(*above) and len(above[0]) > 100
+def test_vertices_of_a_cropped_mesh_away_from_the_crop_are_those_of_the_whole(scan: Path, tmp_path: Path) -> None:
+    whole, _ = mesh_at_300_hu(scan, tmp_path)
+    half, _ = mesh_at_300_hu(scan, tmp_path, *UPPER_HALF)
+
+    half_a_slice_above = CENTRE_MM[2] + 0.5
+    of_whole, of_half = (
+        np.unique(mesh.vertices[mesh.vertices[:, 2] > half_a_slice_above], axis=0) for mesh in (whole, half)
+    )
+    assert len(of_half) > 100
+    assert np.array_equal(of_half, of_whole)
 
 
-def test_report_of_a_crop_counts_the_voxels_that_stay(scan: Path, tmp_path: Path) -> None:
-    _, report = mesh_of(scan, tmp_path, *HALF)
-    assert report["volume"]["crop"]["voxels"] == 40 * 40 * 20 and report["volume"]["shape_ijk"] == [40, 40, 20]
+def test_report_of_a_crop_has_the_voxels_that_stay_and_a_warning(scan: Path, tmp_path: Path) -> None:
+    _, report = mesh_at_300_hu(scan, tmp_path, *UPPER_HALF)
+
+    slices_from_120_mm = 20  # of 40 from 100 mm on, 1 mm apart
+    assert report["volume"]["shape_ijk"] == [40, 40, slices_from_120_mm]
+    assert report["volume"]["crop"]["voxels"] == 40 * 40 * slices_from_120_mm
     assert any("cropped to z from 120 mm (LPS): 32,000 of 64,000 voxels stay (50 %)" in w for w in report["warnings"])
 
 
-def test_crop_is_read_in_the_frame_of_space(scan: Path, tmp_path: Path) -> None:
-    lps, _ = mesh_of(scan, tmp_path, "--around", "8,52,126,9")
-    ras, _ = mesh_of(scan, tmp_path, "--around", "-8,-52,126,9", "--space", "ras")
-    assert np.allclose(np.sort(ras.vertices, axis=0), np.sort(lps.vertices, axis=0), atol=1e-4)  # both are read as LPS
-    assert 9.0 <= np.ptp(lps.vertices, axis=0).max() <= 18.0 + 2.0
+def test_crop_in_ras_is_that_in_lps_with_x_and_y_turned(scan: Path, tmp_path: Path) -> None:
+    lps, _ = mesh_at_300_hu(scan, tmp_path, "--around", "8,52,126,9")
+    ras, _ = mesh_at_300_hu(scan, tmp_path, "--around", "-8,-52,126,9", "--space", "ras")
+
+    in_lps = ras.vertices  # read_mesh turns a file that says RAS
+    assert np.allclose(np.sort(in_lps, axis=0), np.sort(lps.vertices, axis=0), atol=tolerances.FRAME_MM)
+    side_mm, voxel_mm = 2 * 9.0, 1.0
+    assert np.ptp(lps.vertices, axis=0).max() <= side_mm + 2 * voxel_mm
 
 
-def test_several_crop_boxes_are_intersected(scan: Path, tmp_path: Path) -> None:
-    _, report = mesh_of(scan, tmp_path, "--between", "110,130", "--clip-box", ",0,,,115,")
+def test_slab_and_box_are_intersected(scan: Path, tmp_path: Path) -> None:
+    _, report = mesh_at_300_hu(scan, tmp_path, "--between", "110,130", "--clip-box", ",0,,,115,")
+
     assert report["volume"]["crop"]["box_mm"] == [[None, None, 115.0], [0.0, None, 130.0]]
+    # x from -16 mm every 0.8 mm to 0, y whole, z from 115 to 130 mm
     assert report["volume"]["shape_ijk"] == [21, 40, 16]
 
 
-def test_labels_end_at_the_crop(scan: Path, tmp_path: Path) -> None:
-    labels = write_nrrd(tmp_path / "l.nrrd", (away() < RADIUS).astype(np.uint8), AFFINE)
-    for surface in ("hu", "mask"):
-        words = ["mesh", scan, "-o", tmp_path / "b.stl", "--labels", labels, "--surface", surface, "-q"]
-        assert run(*words, "--between", "120,") == 0
-        assert 118.9 < read_mesh(tmp_path / "b.stl").vertices[:, 2].min() < 120.0
-        assert run(*words, "--between", "134,") == 4  # no label there
+@pytest.fixture
+def label_map(tmp_path: Path) -> Path:
+    """Label 1: the ball."""
+    return write_nrrd(tmp_path / "l.nrrd", (distance_from_centre() < RADIUS_MM).astype(np.uint8), AFFINE)
 
 
-def test_points_end_at_the_crop(scan: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("surface", ["hu", "mask"])
+def test_mesh_of_a_label_ends_within_a_slice_below_the_crop(
+    surface: str, scan: Path, label_map: Path, tmp_path: Path
+) -> None:
+    words = ["--labels", label_map, "--surface", surface, "-q"]
+
+    assert run("mesh", scan, "-o", tmp_path / "b.stl", *words, "--between", "120,") == 0
+
+    assert 119.0 <= read_mesh(tmp_path / "b.stl").vertices[:, 2].min() < 120.0
+
+
+@pytest.mark.parametrize("surface", ["hu", "mask"])
+def test_crop_that_leaves_no_voxel_of_a_label_ends_with_4(
+    surface: str, scan: Path, label_map: Path, tmp_path: Path
+) -> None:
+    above_the_ball = "134,"
+    words = ["--labels", label_map, "--surface", surface, "-q"]
+    assert run("mesh", scan, "-o", tmp_path / "b.stl", *words, "--between", above_the_ball) == 4
+
+
+def test_cloud_of_a_crop_has_the_points_within_it(scan: Path, tmp_path: Path) -> None:
     words = ["cloud", scan, "-o", tmp_path / "c.npz", "--hu", "300", "-q"]
     assert run(*words) == 0
-    whole = len(read_points(tmp_path / "c.npz").points)
+    whole = read_points(tmp_path / "c.npz").points
+
     assert run(*words, "--around", "0,46,132,8") == 0
+
     part = read_points(tmp_path / "c.npz").points
-    assert 0 < len(part) < whole
-    assert (np.abs(part - (0, 46, 132)) <= 8.0 + 1.0).all()
+    assert 0 < len(part) < len(whole)
+    half_side_mm, voxel_mm = 8.0, 1.0
+    assert (np.abs(part - (0, 46, 132)) <= half_side_mm + voxel_mm).all()
 
 
-def test_pictures_are_framed_on_the_crop(scan: Path, tmp_path: Path) -> None:
-    words = ["render", scan, "-o", tmp_path / "p.png", "--iso", "300", "--size", "64", "-q", "--report"]
-    figures = {}
-    for name, more in {"whole": [], "part": ["--around", "0,46,120,8"]}.items():
-        assert run(*words, tmp_path / f"{name}.json", *more) == 0
-        figures[name] = json.loads((tmp_path / f"{name}.json").read_text())
-    assert figures["part"]["pictures"][0]["pixel_mm"] < figures["whole"]["pictures"][0]["pixel_mm"]
-    assert len(figures["part"]["clip_planes_lps_mm"]) == 6  # rays end exactly at the box
-    assert figures["part"]["volume"]["shape_ijk"] == [23, 23, 19]  # one voxel more on each side
-    assert run(*words, tmp_path / "s.json", "--mode", "slice", "--between", "110,130", "--iso", "300") == 3
+def test_picture_of_a_crop_shows_it_larger_and_is_cut_at_its_six_sides(scan: Path, tmp_path: Path) -> None:
+    command = ["render", scan, "-o", tmp_path / "p.png", "--iso", "300", "--size", "64", "-q", "--report"]
+
+    assert run(*command, tmp_path / "whole.json") == 0
+    assert run(*command, tmp_path / "part.json", "--around", "0,46,120,8") == 0
+
+    whole, part = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("whole", "part"))
+    assert part["pictures"][0]["pixel_mm"] < whole["pictures"][0]["pixel_mm"]
+    assert len(part["clip_planes_lps_mm"]) == 6
+    # 21 x 21 x 17 voxels of 0.8, 0.8 and 1 mm lie within 8 mm, and one more on each side
+    assert part["volume"]["shape_ijk"] == [23, 23, 19]
+
+
+def test_slice_of_a_crop_is_drawn(scan: Path, tmp_path: Path) -> None:
     assert run("render", scan, "-o", tmp_path / "p.png", "--mode", "slice", "--between", "110,130", "-q") == 0
+    assert (tmp_path / "p.png").exists()
+
+
+def test_iso_value_of_a_slice_is_refused_with_a_crop(scan: Path, tmp_path: Path) -> None:
+    words = ["--mode", "slice", "--between", "110,130", "--iso", "300", "-q"]
+    assert run("render", scan, "-o", tmp_path / "p.png", *words) == 3
 
 
 @pytest.mark.parametrize(
@@ -140,28 +189,61 @@ def test_pictures_are_framed_on_the_crop(scan: Path, tmp_path: Path) -> None:
         (("--between", "100,110", "--around", "0,46,130,5"), "the boxes have nothing in common: along z"),
     ],
 )
-def test_wrong_boxes_are_one_line(
-    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], line: str
-) -> None:
-    for command, name in (("mesh", "a.stl"), ("export", "a.nrrd")):
-        assert run(command, scan, "-o", tmp_path / name, *words) == 3
-        said = capsys.readouterr().err
-        assert line in said and len(said.strip().splitlines()) == 1
-        assert not list(tmp_path.iterdir())
+@pytest.mark.parametrize(("command", "output"), [("mesh", "a.stl"), ("export", "a.nrrd")])
+def test_wrong_crop_is_refused_in_one_line_and_writes_nothing(
+    command: str, output: str, scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...],
+    line: str,
+) -> None:  # fmt: skip
+    assert run(command, scan, "-o", tmp_path / output, *words) == 3
+
+    (said,) = capsys.readouterr().err.splitlines()
+    assert line in said
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.unit
-def test_crop_box_is_the_common_part_of_its_limits() -> None:
-    assert crop_box(None, None, None) is None
+def test_crop_box_is_the_common_part_of_box_slab_and_cube() -> None:
+    box, slab, cube = (0, 9, 0, 9, 0, 9), (3, 20), (1, 5, 5, 4)  # X0,X1,Y0,Y1,Z0,Z1; Z0,Z1; centre and half a side
+
+    low, high = crop_box(box, slab, cube)
+
+    assert low == (0, max(0, 5 - 4), max(0, 3, 5 - 4))
+    assert high == (min(9, 1 + 4), min(9, 5 + 4), min(9, 20, 5 + 4))
+
+
+@pytest.mark.unit
+def test_crop_box_of_a_slab_has_no_end_across_it() -> None:
     everywhere = float("inf")
     assert crop_box(None, (1, 2), None) == ((-everywhere, -everywhere, 1), (everywhere, everywhere, 2))
-    assert crop_box((0, 9, 0, 9, 0, 9), (3, 20), (1, 5, 5, 4)) == ((0, 1, 3), (5, 9, 9))
+
+
+@pytest.mark.unit
+def test_crop_box_without_limits_is_none() -> None:
+    assert crop_box(None, None, None) is None
+
+
+@pytest.mark.unit
+def test_crop_box_of_a_long_text_is_refused_with_its_beginning() -> None:
     with refused(UsageError, "clip_box", "x" * 60):
         crop_box("x" * 99, None, None)
+
+
+@pytest.mark.unit
+def test_crop_box_of_two_numbers_is_refused() -> None:
     with refused(UsageError, "clip_box", 2):
         MeshSettings(clip_box=(1, 2))
-    assert RenderSettings.of(clip_box=(0, 1, 0, 1, 0, 1)).crop_margin == 1
-    assert RenderSettings.of("slice", clip_box=(0, 1, 0, 1, 0, 1)).crop_margin == 0
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(("mode", "margin"), [("dvr", 1), ("slice", 0)])
+def test_rays_read_a_voxel_beyond_the_crop_and_slices_none(mode: str, margin: int) -> None:
+    assert RenderSettings.of(mode, clip_box=(0, 1, 0, 1, 0, 1)).crop_margin == margin
+
+
+@pytest.mark.unit
+def test_crop_of_points_clips_them_by_planes_and_no_volume() -> None:
     points = RenderSettings.of("points", between=(0, 1))
-    assert isinstance(points.style, PointLook) and points.style.clip is not None
-    assert points.crop is None and len(points.style.clip.planes) == 2
+
+    assert points.crop is None
+    assert isinstance(points.style, PointLook)
+    assert len(points.style.clip.planes) == 2
