@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tolerances
 from label_files import write_nrrd
 from printed_text import Printer
 from variants import daily_rows
@@ -22,6 +23,8 @@ pytestmark = pytest.mark.first_device
 AFFINE = np.array([[0.8, 0.1, 0.0, -20.0], [-0.1, 0.8, 0.0, 30.0], [0.0, 0.0, 1.0, 100.0], [0.0, 0.0, 0.0, 1.0]])
 SHAPE = (40, 44, 48)
 LARGE, SMALL = np.array([15.0, 16.0, 14.0]), np.array([37.0, 16.0, 14.0])
+"""Centres (i, j, k) of a hollow ball of 9 voxels and of a full one of 5; a rod of 2 voxels joins them.  A block of
+3 x 3 x 3 voxels lies apart: the scan has three surfaces, that of the hollow counted."""
 """Centres (i, j, k) of a hollow ball of 9 voxels and of a full one of 5; a rod of 2 voxels joins them."""
 
 
@@ -68,8 +71,8 @@ def map_file(scan: Path) -> Path:
 
 
 @pytest.fixture
-def report_of(device: Any, scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Run ``clrecon mesh`` and return its report, and the vertices of its mesh."""
+def mesh_with(device: Any, scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Any:
+    """A function that runs ``clrecon mesh`` with options and returns its report, and the vertices of its mesh."""
 
     def run(*options: str) -> tuple[dict[str, Any], np.ndarray]:
         output = str(tmp_path / "out.ply")
@@ -81,93 +84,118 @@ def report_of(device: Any, scan: Path, tmp_path: Path, capsys: pytest.CaptureFix
     return run
 
 
-def test_a_box_keeps_what_lies_in_it(report_of: Any) -> None:
-    whole, _ = report_of()
-    assert (whole["components"], whole["volume"].get("region")) == (3, None)
-    report, vertices = report_of("--region", box_around(SMALL, 6.43))
+HALF_SIDE_MM, VOXEL_MM = 6.43, 0.8
+"""Of a box that holds the small ball and no other bone."""
+
+
+def test_scan_without_a_region_is_meshed_whole(mesh_with: Any) -> None:
+    report, _ = mesh_with()
+    assert (report["components"], report["volume"].get("region")) == (3, None)
+
+
+def test_region_of_a_box_keeps_the_surface_in_it_and_closes_it(mesh_with: Any) -> None:
+    report, vertices = mesh_with("--region", box_around(SMALL, HALF_SIDE_MM))
+
     assert (report["components"], report["closed"]) == (1, True)
-    assert np.abs(vertices - to_lps(SMALL)).max() < 6.43 + 0.8
+    assert np.abs(vertices - to_lps(SMALL)).max() < HALF_SIDE_MM + VOXEL_MM
+
+
+def test_report_of_a_region_counts_its_voxels_and_cells(mesh_with: Any) -> None:
+    report, _ = mesh_with("--region", box_around(SMALL, HALF_SIDE_MM))
+
+    ijk = np.stack(np.indices(SHAPE[::-1]).reshape(3, -1), axis=1)
+    inside = (np.abs(to_lps(ijk) - to_lps(SMALL)) <= HALF_SIDE_MM).all(axis=1).reshape(SHAPE[::-1])
+    cells = np.lib.stride_tricks.sliding_window_view(inside, (2, 2, 2)).all(axis=(3, 4, 5))  # with all eight corners
     facts = report["volume"]["region"]
-    i, j, k = np.indices(SHAPE[::-1]).reshape(3, -1)
-    inside = (np.abs(to_lps(np.stack([i, j, k], axis=1)) - to_lps(SMALL)) <= 6.43).all(axis=1)
-    marked = inside.reshape(SHAPE[::-1])
-    cells = np.lib.stride_tricks.sliding_window_view(marked, (2, 2, 2)).all(axis=(3, 4, 5))
-    assert facts["voxels"] == np.count_nonzero(marked)
-    assert facts["cells"] == np.count_nonzero(cells)
-    assert facts["voxels_all"] == marked.size
-    assert facts["cells_all"] == cells.size
-    assert any(f"{facts['voxels']:,} of {marked.size:,} voxels stay" in warning for warning in report["warnings"])
+    assert (facts["voxels"], facts["voxels_all"]) == (np.count_nonzero(inside), inside.size)
+    assert (facts["cells"], facts["cells_all"]) == (np.count_nonzero(cells), cells.size)
+    assert any(f"{facts['voxels']:,} of {inside.size:,} voxels stay" in warning for warning in report["warnings"])
 
 
-def test_a_box_follows_the_frame_of_the_output(report_of: Any) -> None:
-    _, in_lps = report_of("--region", box_around(SMALL, 6.43))
-    _, in_ras = report_of("--region", box_around(SMALL, 6.43, "ras"), "--space", "ras")
-    np.testing.assert_allclose(in_ras, in_lps, atol=1e-4)  # the file says its frame
+def test_region_of_a_box_in_ras_is_that_in_lps_with_x_and_y_turned(mesh_with: Any) -> None:
+    _, in_lps = mesh_with("--region", box_around(SMALL, HALF_SIDE_MM))
+    _, in_ras = mesh_with("--region", box_around(SMALL, HALF_SIDE_MM, "ras"), "--space", "ras")
+
+    np.testing.assert_allclose(in_ras, in_lps, atol=tolerances.FRAME_MM)  # points of a file that says RAS are turned
 
 
 @pytest.mark.parametrize(
     ("rules", "components", "near"),
     [
-        (["hu:100,3000", "seed:{large}"], 2, LARGE),
-        (["label:{map}:3"], 1, np.array([41.0, 36.0, 33.0])),
-        (["label:{map}:2"], 1, SMALL),
-        (["mask:{map}"], 2, None),
-        (["mask:{map}", "hu:300,3000", "seed:{small}"], 1, SMALL),
-        (["label:{map}:3", "label:{map}:2"], 2, None),
-        (["tube:8:{line}"], 1, SMALL),
+        pytest.param(["hu:100,3000", "seed:{large}"], 2, LARGE, id="grown from a seed: ball and its hollow"),
+        pytest.param(["label:{map}:3"], 1, np.array([41.0, 36.0, 33.0]), id="label of the block"),
+        pytest.param(["label:{map}:2"], 1, SMALL, id="label of the small ball"),
+        pytest.param(["mask:{map}"], 2, None, id="all labels"),
+        pytest.param(["mask:{map}", "hu:300,3000", "seed:{small}"], 1, SMALL, id="grown within all labels"),
+        pytest.param(["label:{map}:3", "label:{map}:2"], 2, None, id="two labels"),
+        pytest.param(["tube:8:{line}"], 1, SMALL, id="tube about a line"),
     ],
 )
-def test_rules_choose_their_parts(
-    report_of: Any, map_file: Path, tmp_path: Path, rules: list[str], components: int, near: np.ndarray | None
+def test_rules_of_a_region_keep_the_components_that_they_choose(
+    mesh_with: Any, map_file: Path, tmp_path: Path, rules: list[str], components: int, near: np.ndarray | None
 ) -> None:
-    line = tmp_path / "line.csv"
+    line_file = tmp_path / "line.csv"
     ends = to_lps([SMALL - (0, 0, 9), SMALL + (0, 0, 9)])
-    line.write_text("x,y,z\n" + "\n".join(",".join(f"{v:.3f}" for v in point) for point in ends) + "\n")
-    places = {name: ",".join(f"{v:.3f}" for v in to_lps(at)) for name, at in
-              (("large", LARGE + (6, 0, 0)), ("small", SMALL))}  # fmt: skip
-    given = [part for rule in rules for part in ("--region", rule.format(map=map_file, line=line, **places))]
-    report, vertices = report_of(*given)
+    line_file.write_text("x,y,z\n" + "\n".join(",".join(f"{v:.3f}" for v in point) for point in ends) + "\n")
+    in_the_wall_of_large = ",".join(f"{v:.3f}" for v in to_lps(LARGE + (6, 0, 0)))
+    middle_of_small = ",".join(f"{v:.3f}" for v in to_lps(SMALL))
+    names = {"map": map_file, "line": line_file, "large": in_the_wall_of_large, "small": middle_of_small}
+
+    report, vertices = mesh_with(*(part for rule in rules for part in ("--region", rule.format(**names))))
+
     assert (report["components"], report["closed"]) == (components, True)
     if near is not None:
-        assert np.linalg.norm(vertices - to_lps(near), axis=1).min() < 10.0
+        assert np.linalg.norm(vertices - to_lps(near), axis=1).min() < 10.0  # mm, the radius of the large ball and more
+
+
+def test_report_of_a_region_of_labels_does_not_name_the_folder_of_their_file(mesh_with: Any, map_file: Path) -> None:
+    report, _ = mesh_with("--region", f"label:{map_file}:3")
     assert str(map_file.parent) not in json.dumps(report["volume"])
 
 
-def test_opening_parts_what_a_rod_joins(report_of: Any) -> None:
-    report, _ = report_of("--preprocess", "open:2")
-    # the hollow ball has two surfaces; the small block of 2.4 x 2.4 x 3 mm goes with the rod
+def test_opening_removes_the_rod_between_two_balls(mesh_with: Any) -> None:
+    report, _ = mesh_with("--preprocess", "open:2")
+
+    # Two balls, and the hollow of one; the block of 2.4 x 2.4 x 3 mm goes with the rod.
     assert (report["components"], report["closed"]) == (3, True)
+
+
+def test_report_of_opening_counts_the_bone_that_it_took_and_warns_of_it(mesh_with: Any) -> None:
+    report, _ = mesh_with("--preprocess", "open:2")
+
     (step,) = report["volume"]["preprocess"]
-    assert step["step"] == "open:2"
-    assert step["band_hu"] == [200.0, None]
+    assert (step["step"], step["band_hu"]) == ("open:2", [200.0, None])
     assert step["voxels"] == np.count_nonzero(make_voxels() >= 200)
-    assert 0 < step["taken"] < 0.1 * step["voxels"]
+    assert 0 < step["taken"] < 0.1 * step["voxels"]  # rod and block
     assert step["added"] == 0
     assert step["outside_hu"] < 200 < step["inside_hu"]
     assert any(f"open:2 took {step['taken']:,} of" in warning for warning in report["warnings"])
 
 
-def test_filling_closes_a_hollow_ball(report_of: Any) -> None:
-    report, _ = report_of("--preprocess", "fill", "--region", box_around(LARGE, 8.4))
-    (step,) = report["volume"]["preprocess"]
+def test_filling_adds_the_voxels_of_the_hollow_of_a_ball(mesh_with: Any) -> None:
+    report, _ = mesh_with("--preprocess", "fill", "--region", box_around(LARGE, 8.4))
+
     k, j, i = np.indices(SHAPE)
     in_the_hollow = np.sqrt((i - LARGE[0]) ** 2 + (j - LARGE[1]) ** 2 + (k - LARGE[2]) ** 2) < 5.0
+    (step,) = report["volume"]["preprocess"]
     assert (step["step"], step["added"]) == ("fill", np.count_nonzero(in_the_hollow & (make_voxels() < 200)))
     assert report["components"] == 1
 
 
-def test_steps_run_in_their_order_and_a_region_has_its_place(report_of: Any) -> None:
+def test_steps_and_the_region_among_them_are_reported_in_their_order(mesh_with: Any) -> None:
     box = box_around(LARGE, 8.4)
-    report, _ = report_of("--preprocess", "bilateral:0.8:30,region,level:250,fill", "--region", box)
+
+    report, _ = mesh_with("--preprocess", "bilateral:0.8:30,region,level:250,fill", "--region", box)
+
     steps = report["volume"]["preprocess"]
     assert [step["step"] for step in steps] == ["bilateral:0.8:30", "region", "level:250", "fill"]
-    assert steps[3]["band_hu"] == [250.0, None]
+    assert steps[3]["band_hu"] == [250.0, None]  # of the level set before
     assert all(step["seconds"] >= 0.0 for step in steps)
     assert report["volume"]["region"]["rules"] == [str(parse_region_rules(box)[0])]
 
 
 @pytest.mark.parametrize(
-    ("step", "given"),
+    ("step", "numbers"),
     daily_rows(
         3,
         [
@@ -180,45 +208,71 @@ def test_steps_run_in_their_order_and_a_region_has_its_place(report_of: Any) -> 
         ],
     ),
 )
-def test_every_filter_takes_its_numbers(report_of: Any, step: str, given: dict[str, Any]) -> None:
+def test_filter_step_is_reported_with_the_numbers_that_it_was_given(
+    mesh_with: Any, step: str, numbers: dict[str, Any]
+) -> None:
     if step.startswith(("median", "curvature-flow")):
         pytest.importorskip("SimpleITK")
-    report, _ = report_of("--preprocess", step)
-    (told,) = report["volume"]["preprocess"]
-    assert {"step": step, **given}.items() <= told.items()
+
+    report, _ = mesh_with("--preprocess", step)
+
+    (reported,) = report["volume"]["preprocess"]
+    assert {"step": step, **numbers}.items() <= reported.items()
 
 
-def test_the_range_of_hu_is_that_of_what_stays(report_of: Any) -> None:
-    whole, _ = report_of()
-    assert whole["volume"]["hu_range"] == [-100.0, 700.0]
-    report, _ = report_of("--region", box_around(SMALL, 6.43))
-    assert report["volume"]["hu_range"] == [-1024.0, 700.0]
-    report, _ = report_of("--preprocess", "open:2")
-    assert report["volume"]["hu_range"][0] == min(-100.0, report["volume"]["preprocess"][0]["outside_hu"])
+def test_range_of_hu_of_the_whole_scan_is_that_of_its_voxels(mesh_with: Any) -> None:
+    report, _ = mesh_with()
+    assert report["volume"]["hu_range"] == [make_voxels().min(), make_voxels().max()]
 
 
-def test_a_cloud_and_a_picture_are_of_the_region(device: Any, scan: Path, tmp_path: Path, printed: Printer) -> None:
-    box = box_around(SMALL, 6.43)
-    given = ["--device", str(device.index), "--region", box, "--json"]
-    assert main(["cloud", str(scan), "-o", str(tmp_path / "c.ply"), *given]) == 0
+def test_range_of_hu_with_a_region_begins_at_the_value_outside_of_it(mesh_with: Any) -> None:
+    report, _ = mesh_with("--region", box_around(SMALL, HALF_SIDE_MM))
+    outside_hu = -1024.0
+    assert report["volume"]["hu_range"] == [outside_hu, make_voxels().max()]
+
+
+def test_range_of_hu_after_opening_holds_the_value_of_what_was_taken(mesh_with: Any) -> None:
+    report, _ = mesh_with("--preprocess", "open:2")
+    (step,) = report["volume"]["preprocess"]
+    assert report["volume"]["hu_range"][0] == min(make_voxels().min(), step["outside_hu"])
+
+
+def test_cloud_has_the_points_in_the_region(device: Any, scan: Path, tmp_path: Path, printed: Printer) -> None:
+    box = box_around(SMALL, HALF_SIDE_MM)
+    command = ["cloud", str(scan), "-o", str(tmp_path / "c.ply"), "--device", str(device.index), "--json"]
+
+    assert main([*command, "--region", box]) == 0
+
     assert printed().report()["volume"]["region"]["rules"] == [str(parse_region_rules(box)[0])]
     points = np.asarray(read_points(str(tmp_path / "c.ply")).points)
     assert len(points) > 100
-    assert np.abs(points - to_lps(SMALL)).max() < 6.43 + 0.8
-    picture = ["--mode", "surface", "--size", "64", "--depth", str(tmp_path / "d.npy")]
-    shares = []
-    for more in ([], ["--region", box], ["--region", box, "--preprocess", "erode:1"]):
-        arguments = ["render", str(scan), "-o", str(tmp_path / "p.png"), *given[:2], *more, "--json", *picture]
-        assert main(arguments) == 0
-        step = printed().report()["pictures"][0]["pixel_mm"]  # pictures fit what is left
-        shares.append(np.isfinite(np.load(tmp_path / "d.npy")).sum() * step**2)
-    assert shares[0] > 2 * shares[1] > 2.2 * shares[2] > 0
+    assert np.abs(points - to_lps(SMALL)).max() < HALF_SIDE_MM + VOXEL_MM
 
 
-def test_surface_below_a_level_is_cut_by_a_region_too(report_of: Any) -> None:
-    report, vertices = report_of("--below", "0", "--keep-outside", "--region", box_around(SMALL, 9.0))
+def test_picture_shows_the_region_alone_and_less_of_it_after_erosion(
+    device: Any, scan: Path, tmp_path: Path, printed: Printer
+) -> None:
+    depth = str(tmp_path / "d.npy")
+    command = ["render", str(scan), "-o", str(tmp_path / "p.png"), "--mode", "surface", "--size", "64"]
+    command += ["--depth", depth, "--device", str(device.index), "--json"]
+
+    def area_with(*options: str) -> float:
+        assert main([*command, *options]) == 0
+        pixel_mm = printed().report()["pictures"][0]["pixel_mm"]  # pictures fit what is left
+        return float(np.isfinite(np.load(depth)).sum() * pixel_mm**2)
+
+    box = ["--region", box_around(SMALL, HALF_SIDE_MM)]
+    whole_mm2, region_mm2, eroded_mm2 = area_with(), area_with(*box), area_with(*box, "--preprocess", "erode:1")
+
+    assert whole_mm2 > 2 * region_mm2  # balls of 9 and 5 voxels, a rod and a block against the ball of 5
+    assert region_mm2 > 1.1 * eroded_mm2 > 0  # a ball of 4.2 mm loses 1 mm of its radius
+
+
+def test_surface_below_a_level_is_closed_at_its_region_by_a_value_above(mesh_with: Any) -> None:
+    report, vertices = mesh_with("--below", "0", "--keep-outside", "--region", box_around(SMALL, 9.0))
+
     assert report["closed"]
-    assert np.abs(vertices - to_lps(SMALL)).max() < 9.0 + 0.8
+    assert np.abs(vertices - to_lps(SMALL)).max() < 9.0 + VOXEL_MM
     assert report["volume"]["region"]["outside_hu"] > 0
 
 
@@ -241,41 +295,43 @@ def test_surface_below_a_level_is_cut_by_a_region_too(report_of: Any) -> None:
         (["--preprocess", "region"], 3, "there is none"),
     ],
 )
-def test_bad_input_is_one_line_and_writes_nothing(
+def test_region_or_steps_without_sense_are_refused_in_one_line_and_write_nothing(
     device: Any, scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], code: int,
     words: str,
 ) -> None:  # fmt: skip
     output = tmp_path / "out.stl"
+
     assert main(["mesh", str(scan), "-o", str(output), "--device", str(device.index), *options]) == code
+
     (message,) = (line for line in capsys.readouterr().err.splitlines() if "error:" in line)
     assert words in message
     assert not list(tmp_path.iterdir())
 
 
-def test_the_value_outside_is_outside() -> None:
-    inf = float("inf")
-    assert value_outside([(200.0, inf)], np.dtype(np.int16)) == -1024.0
-    assert value_outside([], np.dtype(np.float32)) == -1024.0
-    assert value_outside([(-inf, -400.0)], np.dtype(np.int16)) == 224.0
-    assert value_outside([(-2000.0, 100.0)], np.dtype(np.int16)) == 1224.0
-    assert value_outside([(200.0, inf)], np.dtype(np.uint8)) == 0.0
+@pytest.mark.parametrize(
+    ("bands", "voxel_type", "expected"),
+    [
+        pytest.param([(200.0, np.inf)], np.int16, -1024.0, id="above 200 HU"),
+        pytest.param([], np.float32, -1024.0, id="no band"),
+        pytest.param([(-np.inf, -400.0)], np.int16, -400.0 + (-400.0 + 1024.0), id="below -400 HU"),
+        pytest.param([(-2000.0, 100.0)], np.int16, 100.0 + (100.0 + 1024.0), id="a band from below air"),
+        pytest.param([(200.0, np.inf)], np.uint8, 0.0, id="no negative values"),
+    ],
+)
+def test_value_outside_of_a_region_is_air_or_where_air_is_inside_as_far_above_the_band_as_that_is_above_air(
+    bands: list[tuple[float, float]], voxel_type: type, expected: float
+) -> None:
+    assert value_outside(bands, np.dtype(voxel_type)) == expected
 
 
-def test_warnings_of_a_label_file_are_those_of_its_region(tmp_path):
+def test_warning_of_a_label_file_is_reported_where_a_region_reads_it(tmp_path: Path) -> None:
     scan = write_nrrd(tmp_path / "ct.nrrd", make_voxels(), AFFINE)
-    fields = {"Segment0_LabelValue": "1", "Segment0_Name": "bone", "Segment1_Name": "no value"}
-    labels = write_nrrd(tmp_path / "map.nrrd", (make_voxels() > 200).astype(np.uint8), AFFINE, **fields)
-    words = [
-        "mesh",
-        str(scan),
-        "-o",
-        str(tmp_path / "a.stl"),
-        "--hu",
-        "200",
-        "-q",
-        "--report",
-        str(tmp_path / "r.json"),
-    ]
-    assert main([*words, "--region", f"label:{labels}:bone"]) == 0
-    said = "1 of 2 segments have no LabelValue: their names are not known"
-    assert said in json.loads((tmp_path / "r.json").read_text())["warnings"]
+    without_a_value = {"Segment0_LabelValue": "1", "Segment0_Name": "bone", "Segment1_Name": "no value"}
+    labels = write_nrrd(tmp_path / "map.nrrd", (make_voxels() > 200).astype(np.uint8), AFFINE, **without_a_value)
+    output, report = str(tmp_path / "a.stl"), tmp_path / "r.json"
+    command = ["mesh", str(scan), "-o", output, "--hu", "200", "-q", "--report", str(report)]
+
+    assert main([*command, "--region", f"label:{labels}:bone"]) == 0
+
+    warning = "1 of 2 segments have no LabelValue: their names are not known"
+    assert warning in json.loads(report.read_text())["warnings"]
