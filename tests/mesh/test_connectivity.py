@@ -11,28 +11,54 @@ from clrecon.mesh.connectivity import Fans, find_used
 pytestmark = pytest.mark.unit
 
 
-def test_fans_list_the_triangles_around_each_vertex():
-    triangles = np.array([[0, 1, 2], [2, 1, 4], [4, 1, 0]], np.uint32)
-    fans = Fans(triangles, 6)
-    rows, count = fans.around(np.array([1, 3, 0, 5, 4]))
-    assert rows.tolist() == [0, 1, 2, 0, 2, 1, 2] and count.tolist() == [3, 0, 2, 0, 2]
-    assert fans.touching(np.array([2, 3])).tolist() == [0, 1]
-    assert fans.touching(np.array([4, 1, 4])).tolist() == [0, 1, 2]
-    assert fans.touching(np.zeros(0, int)).tolist() == []
-    assert fans.begin.tolist() == [0, 2, 5, 7, 7, 9, 9]
+@pytest.fixture
+def fans_of_three_triangles():
+    """Triangle 0 has the vertices 0, 1, 2; triangle 1: 2, 1, 4; triangle 2: 4, 1, 0; no triangle has 3 or 5."""
+    return Fans(np.array([[0, 1, 2], [2, 1, 4], [4, 1, 0]], np.uint32), 6)
 
 
-def test_fans_equal_a_look_at_all_triangles():
-    _, triangles = samples.torus(12, 8)
-    fans = Fans(triangles.astype(np.uint32), int(triangles.max()) + 1)
+def test_fans_list_the_triangles_around_each_given_vertex_and_their_number(fans_of_three_triangles):
+    rows, count = fans_of_three_triangles.around(np.array([1, 3, 0, 5, 4]))
+    assert rows.tolist() == [0, 1, 2] + [] + [0, 2] + [] + [1, 2]
+    assert count.tolist() == [3, 0, 2, 0, 2]
+
+
+@pytest.mark.parametrize(
+    ("vertices", "triangles"), [([2, 3], [0, 1]), ([4, 1, 4], [0, 1, 2]), ([], [])], ids=["two", "one twice", "none"]
+)
+def test_triangles_that_touch_any_of_some_vertices_are_listed_once(fans_of_three_triangles, vertices, triangles):
+    assert fans_of_three_triangles.touching(np.array(vertices, int)).tolist() == triangles
+
+
+def test_fans_begin_where_those_of_the_vertices_before_end(fans_of_three_triangles):
+    triangles_at_vertices = [2, 3, 2, 0, 2, 0]
+    assert fans_of_three_triangles.begin.tolist() == [0, *np.cumsum(triangles_at_vertices)]
+
+
+@pytest.fixture
+def torus_triangles():
+    """Triangles between 96 vertices."""
+    return samples.torus(12, 8)[1].astype(np.uint32)
+
+
+def test_triangles_that_touch_some_vertices_are_those_that_name_one_of_them(torus_triangles):
     some = np.array([3, 40, 41, 95])
-    assert fans.touching(some).tolist() == np.flatnonzero(np.isin(triangles, some).any(axis=1)).tolist()
-    for vertex in some:
-        rows, count = fans.around(np.array([vertex]))
-        assert rows.tolist() == np.flatnonzero((triangles == vertex).any(axis=1)).tolist() and count == len(rows)
+    expected = np.flatnonzero(np.isin(torus_triangles, some).any(axis=1))
+    assert Fans(torus_triangles, 96).touching(some).tolist() == expected.tolist()
 
 
-def test_numbers_that_occur_are_each_found_once():
+@pytest.mark.parametrize("vertex", [3, 40, 41, 95])
+def test_triangles_around_a_vertex_are_those_that_name_it(torus_triangles, vertex):
+    rows, count = Fans(torus_triangles, 96).around(np.array([vertex]))
+    expected = np.flatnonzero((torus_triangles == vertex).any(axis=1)).tolist()
+    assert rows.tolist() == expected
+    assert count.tolist() == [len(expected)]
+
+
+def test_vertices_that_triangles_use_are_listed_once_and_in_order():
     triangles = np.array([[5, 0, 3], [3, 0, 1]], np.uint32)
     assert find_used(triangles, 7).tolist() == [0, 1, 3, 5]
-    assert find_used(triangles[:0], 7).tolist() == []
+
+
+def test_no_triangles_use_no_vertices():
+    assert find_used(np.zeros((0, 3), np.uint32), 7).tolist() == []

@@ -15,9 +15,14 @@ from clrecon.mesh.intersections import find_beside, find_changed_intersections, 
 pytestmark = pytest.mark.unit
 
 
-def count(arrays: samples.Arrays) -> int:
+def count_pairs(arrays: samples.Arrays) -> int:
     mesh = Mesh(*arrays)
     return len(find_self_intersections(mesh.vertices, mesh.triangles))
+
+
+def as_sets(pairs: np.ndarray) -> set[frozenset[int]]:
+    """Pairs of triangles without their order."""
+    return {frozenset(pair) for pair in pairs.tolist()}
 
 
 def count_by_solving(vertices: np.ndarray, triangles: np.ndarray) -> int:
@@ -98,97 +103,137 @@ def _cross(a, b, c):
     return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
 
 
-def test_good_surfaces_have_none():
-    assert count(samples.torus(60, 30)) == 0
-    assert count(samples.sphere((300, -500, 20), 10, 4)) == 0
-    assert count(([], [])) == 0
+@pytest.mark.parametrize(
+    "surface",
+    [samples.torus(60, 30), samples.sphere((300, -500, 20), 10, 4), ([], [])],
+    ids=["torus", "sphere", "empty"],
+)
+def test_a_surface_that_does_not_cut_itself_has_no_pairs(surface):
+    assert count_pairs(surface) == 0
 
 
-def test_triangles_that_touch_count_as_intersecting():
-    flat, upright = [[0, 0, 0], [4, 0, 0], [0, 4, 0]], [[1, 1, -1], [1, 1, 3], [2, 1, 3]]
-    assert count((np.array(flat + upright, float), [[0, 1, 2], [3, 4, 5]])) == 1
-    above = np.array(flat + upright, float)
-    above[3:, 2] += 1.0
-    assert count((above, [[0, 1, 2], [3, 4, 5]])) == 1  # a corner touches the face
-    above[3:, 2] += 2.0**-20
-    assert count((above, [[0, 1, 2], [3, 4, 5]])) == 0
-    assert count((np.array(flat + flat, float), [[0, 1, 2], [3, 4, 5]])) == 0  # the same: counted as such elsewhere
+FLAT = [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
+UPRIGHT = [[1, 1, -1], [1, 1, 3], [2, 1, 3]]
+"""A triangle that stands on its corner (1, 1, -1), below the face of FLAT."""
+
+
+@pytest.mark.parametrize(
+    ("raised_by", "pairs"),
+    [(0.0, 1), (1.0, 1), (1.0 + 2.0**-20, 0)],
+    ids=["cuts the face", "touches the face in a corner", "just above the face"],
+)
+def test_triangles_that_cut_or_touch_count_as_intersecting(raised_by, pairs):
+    upright = np.array(UPRIGHT) + [0.0, 0.0, raised_by]
+    assert count_pairs((np.concatenate([FLAT, upright]), [[0, 1, 2], [3, 4, 5]])) == pairs
+
+
+def test_two_triangles_with_the_same_corners_do_not_count_as_intersecting():
+    """Quality counts them as duplicate faces."""
+    assert count_pairs((np.array(FLAT + FLAT, float), [[0, 1, 2], [3, 4, 5]])) == 0
 
 
 @pytest.mark.release
 @pytest.mark.seconds
-@pytest.mark.parametrize("shift", daily(1, [(3.1, 0.2, 0.3), (11.0, 4.0, -3.0), (19.5, 0.1, 0.2), (21.0, 0.0, 0.0)]))
-def test_spheres_that_cut_each_other_have_the_pairs_of_solving(shift):
-    vertices, triangles = samples.join(samples.sphere(rounds=2), samples.sphere(shift, 10.0, 1))
-    vertices = vertices.astype(np.float32).astype(float)
-    assert count((vertices, triangles)) == count_by_solving(vertices, triangles)
-    assert (count((vertices, triangles)) > 0) == (shift[0] < 20)
-
-
-def test_random_triangles_intersect_as_solving_says():
-    rng = np.random.default_rng(9)
-    corners = rng.uniform(0, 10, (60, 1, 3)) + rng.normal(size=(60, 3, 3)) * rng.choice([0.3, 1.0, 4.0], (60, 1, 1))
-    vertices = corners.reshape(-1, 3).astype(np.float32).astype(float)
-    triangles = np.arange(180).reshape(-1, 3)
-    assert count((vertices, triangles)) == count_by_solving(vertices, triangles) > 20
-
-
-@pytest.mark.parametrize("scale", [2.0**-9, 2.0**9])
-def test_the_unit_of_length_changes_no_pair(scale):
-    """A power of two changes no digit: what small volumes would leave unseen is found as in mm."""
-    vertices, triangles = samples.join(samples.sphere(rounds=1), samples.sphere((11, 4, -3), 10.0, 1))
-    assert count((scale * vertices.astype(np.float32), triangles)) == count((vertices, triangles)) > 0
-    # An edge that ends just above the face, in a triangle that passes its plane elsewhere.
-    beside = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.25, 0.25, 2], [0.25, 0.25, 0.5], [5, 5, -1]])
-    assert count((scale * beside, [[0, 1, 2], [3, 4, 5]])) == 0
-
-
-def test_the_bound_of_rounding_is_not_below_the_proven_one():
-    half_step = 2.0**-53
-    assert (7.0 + 56.0 * half_step) * half_step <= intersections._ROUNDING <= 2.0**-50  # of a volume; of an area 3 + 16
-
-
-def test_triangles_with_a_common_corner_cut_each_other_by_the_edges_opposite_to_it():
-    """The edge from vertex 3 to 4 passes through the inside of the first triangle, and then beside it."""
-    vertices = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, -1], [1, 1.5, 3], [0.5, 0.5, 3.0]])
-    assert count((vertices, [[0, 1, 2], [5, 3, 4]])) == 1
-    for corners in ([0, 3, 4], [3, 4, 0], [4, 0, 3]):
-        assert count((vertices, [[0, 1, 2], corners])) == count((vertices, [[1, 2, 0], corners])) == 1
-    vertices[3:5] = (-1, 1, -1), (-1, 1, 3)
-    assert count((vertices, [[0, 1, 2], [0, 3, 4]])) == 0
-
-
-@pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize(
-    ("second", "expected"),
+    "centre_of_second", daily(1, [(3.1, 0.2, 0.3), (11.0, 4.0, -3.0), (19.5, 0.1, 0.2), (21.0, 0.0, 0.0)])
+)
+def test_two_spheres_have_as_many_pairs_as_edges_solved_for_faces(centre_of_second):
+    """Both have a radius of 10: from centres 20 mm apart they do not meet."""
+    vertices, triangles = samples.join(samples.sphere(rounds=2), samples.sphere(centre_of_second, 10.0, 1))
+    vertices = vertices.astype(np.float32).astype(float)
+    pairs = count_pairs((vertices, triangles))
+    assert pairs == count_by_solving(vertices, triangles)
+    assert (pairs > 0) == (centre_of_second[0] < 20)
+
+
+def test_random_triangles_have_as_many_pairs_as_edges_solved_for_faces():
+    rng = np.random.default_rng(9)
+    count = 60
+    sizes = rng.choice([0.3, 1.0, 4.0], (count, 1, 1))
+    corners = rng.uniform(0, 10, (count, 1, 3)) + rng.normal(size=(count, 3, 3)) * sizes
+    vertices = corners.reshape(-1, 3).astype(np.float32).astype(float)
+    triangles = np.arange(3 * count).reshape(-1, 3)
+    assert count_pairs((vertices, triangles)) == count_by_solving(vertices, triangles) > 20
+
+
+tiny_and_huge = pytest.mark.parametrize("scale", [2.0**-9, 2.0**9])
+"""A power of two changes no digit: what small volumes would leave unseen is found as in mm."""
+
+
+@tiny_and_huge
+def test_the_unit_of_length_changes_no_pair_of_two_spheres(scale):
+    vertices, triangles = samples.join(samples.sphere(rounds=1), samples.sphere((11, 4, -3), 10.0, 1))
+    in_mm = count_pairs((vertices.astype(np.float32), triangles))
+    assert count_pairs((scale * vertices.astype(np.float32), triangles)) == in_mm > 0
+
+
+@tiny_and_huge
+def test_an_edge_that_ends_above_the_face_meets_nothing_in_any_unit_of_length(scale):
+    """The second triangle passes the plane of the first, but beside it."""
+    first, second = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0.25, 0.25, 2], [0.25, 0.25, 0.5], [5, 5, -1]]
+    assert count_pairs((scale * np.array(first + second), [[0, 1, 2], [3, 4, 5]])) == 0
+
+
+def test_the_bound_of_rounding_is_at_least_the_proven_one_and_at_most_4_times_as_large():
+    half_step = 2.0**-53
+    proven = (7.0 + 56.0 * half_step) * half_step  # of a volume of three differences (Shewchuk 1997, orient3d)
+    assert proven <= intersections._ROUNDING <= 2.0**-50
+
+
+THROUGH_THE_FACE = [(1, 1, -1), (1, 1.5, 3)]
+BESIDE_THE_FACE = [(-1, 1, -1), (-1, 1, 3)]
+
+
+def test_an_edge_through_the_face_cuts_a_triangle_without_a_common_corner():
+    vertices = np.array([*FLAT, *THROUGH_THE_FACE, (0.5, 0.5, 3.0)])
+    assert count_pairs((vertices, [[0, 1, 2], [5, 3, 4]])) == 1
+
+
+@pytest.mark.parametrize("first", [[0, 1, 2], [1, 2, 0]])
+@pytest.mark.parametrize("second", [[0, 3, 4], [3, 4, 0], [4, 0, 3]])
+def test_the_edge_opposite_to_a_common_corner_cuts_whatever_the_order_of_corners(first, second):
+    vertices = np.array([*FLAT, *THROUGH_THE_FACE])
+    assert count_pairs((vertices, [first, second])) == 1
+
+
+def test_triangles_with_a_common_corner_whose_opposite_edge_passes_beside_do_not_cut():
+    vertices = np.array([*FLAT, *BESIDE_THE_FACE])
+    assert count_pairs((vertices, [[0, 1, 2], [0, 3, 4]])) == 0
+
+
+@pytest.mark.parametrize("slope", [(0, 0), (2, -1)], ids=["level", "sloping"])
+@pytest.mark.parametrize(
+    ("second", "pairs"),
     [
-        ([0, 1, 6], 0),  # the neighbour beyond a common edge
-        ([0, 1, 4], 1),  # folded onto the first: inside of it
-        ([0, 1, 3], 1),  # and partly outside
-        ([0, 7, 8], 0),  # beside it at a corner
-        ([0, 3, 5], 1),  # a common corner and an overlap
-        ([0, 2, 7], 0),
-        ([0, 2, 5], 1),
-        ([4, 3, 5], 1),  # no common corner
-        ([6, 7, 8], 0),
+        pytest.param([0, 1, 6], 0, id="neighbour beyond a common edge"),
+        pytest.param([0, 1, 4], 1, id="folded onto the first"),
+        pytest.param([0, 1, 3], 1, id="folded onto the first and beyond"),
+        pytest.param([0, 7, 8], 0, id="common corner, beside it"),
+        pytest.param([0, 3, 5], 1, id="common corner, over it"),
+        pytest.param([0, 2, 7], 0, id="neighbour beyond another edge"),
+        pytest.param([0, 2, 5], 1, id="folded over another edge"),
+        pytest.param([4, 3, 5], 1, id="no common corner, over it"),
+        pytest.param([6, 7, 8], 0, id="no common corner, beside it"),
     ],
 )
-def test_triangles_in_one_plane_are_counted_where_they_overlap(second, expected, turned):
-    vertices = np.array([[0, 0], [4, 0], [0, 4], [3, 3], [1, 1], [2, 5], [2, -3], [-3, -1], [-1, -3]], float)
-    vertices = np.column_stack([vertices, vertices @ [2, -1] if turned else np.full(9, 7.25)])
-    assert count((vertices, [[0, 1, 2], second])) == count((vertices, [second, [0, 1, 2]])) == expected
+def test_triangles_in_one_plane_are_counted_where_they_overlap(second, pairs, slope):
+    x_y = np.array([[0, 0], [4, 0], [0, 4], [3, 3], [1, 1], [2, 5], [2, -3], [-3, -1], [-1, -3]], float)
+    vertices = np.column_stack([x_y, 7.25 + x_y @ slope])
+    assert count_pairs((vertices, [[0, 1, 2], second])) == pairs
+    assert count_pairs((vertices, [second, [0, 1, 2]])) == pairs
 
 
-def test_corners_at_one_place_count_as_the_same():
-    vertices = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 0], [1, -3, 2], [-2, 1, 5]], float)
-    assert count((vertices, [[0, 1, 2], [3, 4, 5]])) == 0
-    vertices[3] = (1, 1, 0)  # within the face
-    assert count((vertices, [[0, 1, 2], [3, 4, 5]])) == 1
+@pytest.mark.parametrize(
+    ("corner", "pairs"), [((0, 0, 0), 0), ((1, 1, 0), 1)], ids=["at a corner of the first", "within its face"]
+)
+def test_a_corner_at_the_place_of_another_counts_as_common_and_one_in_the_face_as_a_touch(corner, pairs):
+    vertices = np.array([*FLAT, corner, [1, -3, 2], [-2, 1, 5]], float)
+    assert count_pairs((vertices, [[0, 1, 2], [3, 4, 5]])) == pairs
 
 
 @pytest.mark.parametrize("kind", daily(3, ["whole", "plane", "turned", "float64"]))
 @pytest.mark.parametrize("seed", daily(1, range(2)))
-def test_pairs_that_touch_fold_and_overlap_are_counted_exactly(kind, seed):
+def test_as_many_pairs_touch_fold_and_overlap_as_in_exact_fractions(kind, seed):
     """Triangles over few places: most pairs have common corners, touch, or lie in one plane."""
     random = np.random.default_rng(seed)
     places = np.unique(random.integers(0, 4, (24, 3)), axis=0).astype(float)
@@ -200,106 +245,173 @@ def test_pairs_that_touch_fold_and_overlap_are_counted_exactly(kind, seed):
     elif kind == "float64":
         places = 1e3 * places + 1.0 / 3.0
     triangles = np.array([random.choice(len(places), 3, replace=False) for _ in range(30)], np.uint32)
-    found = len(find_self_intersections(places, triangles))
-    assert found == count_exactly(places, triangles) > 50
+    assert len(find_self_intersections(places, triangles)) == count_exactly(places, triangles) > 50
 
 
-def test_triangles_with_a_corner_that_is_not_finite_are_left_out():
+@pytest.fixture
+def two_boxes_that_cut_each_other():
     vertices, triangles = samples.join(samples.box(), samples.box((0.4, 0.5, 0.6)))
-    triangles = np.asarray(triangles, np.uint32)
-    every = find_self_intersections(vertices, triangles)
-    for value in (np.nan, np.inf):
-        spoilt = vertices.copy()
-        spoilt[triangles[every[0, 0], 0], 1] = value
-        sound = np.isfinite(spoilt[triangles]).all(axis=(1, 2))
-        expected = every[sound[every].all(axis=1)]
-        found = find_self_intersections(spoilt, triangles)
-        assert sorted(map(sorted, found.tolist())) == sorted(map(sorted, expected.tolist()))
-        assert 0 < len(expected) < len(every)
+    return vertices, np.asarray(triangles, np.uint32)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_triangles_with_a_corner_that_is_not_finite_are_left_out(two_boxes_that_cut_each_other, value):
+    vertices, triangles = two_boxes_that_cut_each_other
+    all_pairs = find_self_intersections(vertices, triangles)
+    corner_of_a_pair = triangles[all_pairs[0, 0], 0]
+    vertices[corner_of_a_pair, 1] = value
+
+    pairs = find_self_intersections(vertices, triangles)
+
+    is_finite = np.isfinite(vertices[triangles]).all(axis=(1, 2))
+    expected = all_pairs[is_finite[all_pairs].all(axis=1)]
+    assert 0 < len(expected) < len(all_pairs)
+    assert as_sets(pairs) == as_sets(expected)
+
+
+def test_a_mesh_without_finite_vertices_has_no_pairs():
     assert len(find_self_intersections(np.full((3, 3), np.nan), np.array([[0, 1, 2]], np.uint32))) == 0
 
 
-def test_triangles_that_are_points_cut_nothing():
-    assert count((np.zeros((3, 3)), [[0, 1, 2]])) == 0
-    assert count((np.ones((1, 3)), [[0, 0, 0]] * 3)) == 0
+@pytest.mark.parametrize(
+    ("vertices", "triangles"),
+    [(np.zeros((3, 3)), [[0, 1, 2]]), (np.ones((1, 3)), [[0, 0, 0]] * 3)],
+    ids=["three vertices at one place", "one vertex thrice"],
+)
+def test_triangles_that_are_points_cut_nothing(vertices, triangles):
+    assert count_pairs((vertices, triangles)) == 0
+
+
+def row_of_triangles(axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """40 triangles along an axis, each in a box 2 mm long, one every 4.5 mm; coarse cells are 2 mm long, too."""
+    face = np.roll([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.5]], axis, axis=1)
+    step = np.roll([4.5, 0.0, 0.0], axis)
+    vertices = (face + np.arange(40)[:, None, None] * step).reshape(-1, 3)
+    return vertices, np.arange(120, dtype=np.uint32).reshape(-1, 3)
+
+
+def list_beside(vertices: np.ndarray, triangles: np.ndarray, changed: int) -> list[int]:
+    """Numbers of triangles beside one that has changed, with itself."""
+    return np.flatnonzero(find_beside(vertices, triangles, np.arange(len(triangles)) == changed)).tolist()
+
+
+@pytest.mark.parametrize("changed", [0, 20, 39], ids=["first", "middle", "last"])
+@pytest.mark.parametrize("axis", range(3))
+def test_triangles_2_mm_from_a_changed_one_do_not_lie_beside_it(axis, changed):
+    assert list_beside(*row_of_triangles(axis), changed) == [changed]
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_only_triangles_that_can_touch_a_changed_one_lie_beside_it(axis):
-    """Triangles in a row, in boxes of 2 with steps of 4.5, and cells as long as the changed one: 2."""
-    face = np.roll([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.5]], axis, axis=1)
-    along = np.roll([4.5, 0.0, 0.0], axis)
-    vertices = (face + np.arange(40)[:, None, None] * along).reshape(-1, 3)
-    triangles = np.arange(120, dtype=np.uint32).reshape(-1, 3)
-    # The 20th reaches from 90 to 92, cells 45 and 46; its neighbours from 85.5 to 87.5, cells 42 and 43, and from 94.5
-    # on, cell 47.  From 90 on the one before meets cell 45.
-    changed = np.arange(40) == 20
-    assert np.flatnonzero(find_beside(vertices, triangles, changed)).tolist() == [20]
-    longer = vertices.copy()
-    longer[58] += np.roll([2.5, 0.0, 0.0], axis)
-    assert np.flatnonzero(find_beside(longer, triangles, changed)).tolist() == [19, 20]
-    for number in (0, 39):
-        assert np.flatnonzero(find_beside(vertices, triangles, np.arange(40) == number)).tolist() == [number]
-    assert not find_beside(vertices, triangles, np.zeros(40, bool)).any()
-    assert find_beside(vertices, triangles, np.ones(40, bool)).all()
+def test_a_triangle_that_reaches_the_cell_of_a_changed_one_lies_beside_it(axis):
+    """The 20th triangle is in cells 45 and 46, from 90 to 92 mm; the 19th ends at 87.5 and then at 90 mm."""
+    vertices, triangles = row_of_triangles(axis)
+    farthest_corner_of_19 = triangles[19, 1]
+    vertices[farthest_corner_of_19] += np.roll([2.5, 0.0, 0.0], axis)
+    assert list_beside(vertices, triangles, 20) == [19, 20]
 
 
-def test_cells_are_enlarged_where_there_would_be_too_many():
-    """A speck that has changed, far from another: 1/64 of 10 mm is as fine as 4096 cells of a cube can be."""
-    face = np.array([[0.0, 0.0, 0.0], [1e-6, 0.0, 0.0], [0.0, 1e-6, 1e-6]])
-    vertices = np.concatenate([face, face + [0.05, 0.0, 0.0], face + [2.0, 2.0, 0.0], face + 10.0])
+@pytest.mark.parametrize("changed", [False, True], ids=["none", "all"])
+def test_none_or_all_triangles_lie_beside_where_none_or_all_have_changed(changed):
+    assert (find_beside(*row_of_triangles(axis=0), np.full(40, changed)) == changed).all()
+
+
+def test_coarse_cells_of_a_speck_are_enlarged_to_a_64th_of_the_mesh():
+    """A cube of 10 mm has 4096 cells at most, of 10/64 mm: a speck 0.05 mm off lies in that of the changed one."""
+    speck = np.array([[0.0, 0.0, 0.0], [1e-6, 0.0, 0.0], [0.0, 1e-6, 1e-6]])
+    vertices = np.concatenate([speck, speck + [0.05, 0.0, 0.0], speck + [2.0, 2.0, 0.0], speck + 10.0])
     triangles = np.arange(12, dtype=np.uint32).reshape(-1, 3)
-    beside = find_beside(vertices, triangles, np.arange(4) == 0)
-    assert beside.tolist() == [True, True, False, False]
+    assert list_beside(vertices, triangles, 0) == [0, 1]
 
 
-def test_triangles_that_touch_a_changed_one_lie_beside_it():
+@pytest.fixture(scope="module")
+def triangles_of_which_every_30th_has_changed():
+    """600 random triangles of some 6 mm in 100 mm, which have changed, and the pairs with a changed one."""
     rng = np.random.default_rng(4)
-    vertices = rng.uniform(-40.0, 60.0, (600, 3))
-    vertices = (vertices[:, None] + rng.normal(0.0, 6.0, (600, 3, 3))).reshape(-1, 3)
-    triangles = np.arange(1800, dtype=np.uint32).reshape(-1, 3)
-    changed = np.arange(600) % 30 == 7
+    count = 600
+    centres = rng.uniform(-40.0, 60.0, (count, 3))
+    vertices = (centres[:, None] + rng.normal(0.0, 6.0, (count, 3, 3))).reshape(-1, 3)
+    triangles = np.arange(3 * count, dtype=np.uint32).reshape(-1, 3)
+    changed = np.arange(count) % 30 == 7
     pairs = find_self_intersections(vertices, triangles)
-    touched = pairs[changed[pairs].any(axis=1)]
+    pairs = pairs[changed[pairs].any(axis=1)]
+    assert len(pairs) > 5
+    return vertices, triangles, changed, pairs
+
+
+def test_triangles_that_touch_a_changed_one_lie_beside_it_and_most_others_do_not(
+    triangles_of_which_every_30th_has_changed,
+):
+    vertices, triangles, changed, pairs = triangles_of_which_every_30th_has_changed
     beside = find_beside(vertices, triangles, changed)
-    assert len(touched) > 5 and beside[touched].all() and beside[changed].all() and 20 < beside.sum() < 400
-    numbers = np.flatnonzero(beside)
-    found = numbers[find_self_intersections(vertices, triangles[beside], changed[beside])]
-    assert sorted(map(sorted, found.tolist())) == sorted(map(sorted, touched.tolist()))
-    found = find_changed_intersections(vertices, triangles, changed)
-    assert sorted(map(sorted, found.tolist())) == sorted(map(sorted, touched.tolist()))
+    assert beside[changed].all()
+    assert beside[pairs].all()
+    assert beside.sum() < 400  # of 600
 
 
-def test_search_for_crossings_elsewhere_is_asked_where_many_have_changed():
-    vertices, triangles = samples.join(samples.box(), samples.box((0.4, 0.5, 0.6)))
-    triangles = np.asarray(triangles, np.uint32)
-    asked: list[object] = []
+def test_pairs_with_a_changed_triangle_are_those_of_a_search_through_all(triangles_of_which_every_30th_has_changed):
+    vertices, triangles, changed, pairs = triangles_of_which_every_30th_has_changed
+    assert as_sets(find_changed_intersections(vertices, triangles, changed)) == as_sets(pairs)
 
-    def elsewhere(*arguments):
-        asked.append(arguments[2])
+
+def test_pairs_with_a_changed_triangle_are_found_among_the_triangles_beside_alone(
+    triangles_of_which_every_30th_has_changed,
+):
+    vertices, triangles, changed, pairs = triangles_of_which_every_30th_has_changed
+    rows = np.flatnonzero(find_beside(vertices, triangles, changed))
+    among_them = find_self_intersections(vertices, triangles[rows], changed[rows])
+    assert as_sets(rows[among_them]) == as_sets(pairs)
+
+
+@pytest.mark.parametrize(
+    ("changed", "is_asked"),
+    [(range(24), True), (range(2), True), ([0], False), ([], False)],
+    ids=["all", "two of 24", "one of 24", "none"],
+)
+def test_the_given_search_is_asked_where_more_than_a_twentieth_of_the_triangles_have_changed(
+    two_boxes_that_cut_each_other, changed, is_asked
+):
+    vertices, triangles = two_boxes_that_cut_each_other
+    has_changed = np.isin(np.arange(24), changed)
+    calls = []
+
+    def find_crossings(*arguments):
+        calls.append(arguments)
         return find_self_intersections(*arguments)
 
-    every = find_self_intersections(vertices, triangles)
-    assert len(every) > 3
-    for changed in (np.ones(24, bool), np.arange(24) < 2, np.arange(24) == every[0, 0]):
-        found = find_changed_intersections(vertices, triangles, changed, elsewhere)
-        assert sorted(map(sorted, found.tolist())) == sorted(map(sorted, every[changed[every].any(axis=1)].tolist()))
-    assert asked[0] is None and len(asked) == 2  # one of 24 is less than one of twenty
-    assert find_changed_intersections(vertices, triangles, np.zeros(24, bool), elsewhere).shape == (0, 2)
-    assert len(asked) == 2
+    pairs = find_changed_intersections(vertices, triangles, has_changed, find_crossings)
+
+    all_pairs = find_self_intersections(vertices, triangles)
+    assert as_sets(pairs) == as_sets(all_pairs[has_changed[all_pairs].any(axis=1)])
+    assert len(calls) == is_asked
+
+
+def test_the_given_search_is_told_of_no_changed_triangles_where_all_have(two_boxes_that_cut_each_other):
+    vertices, triangles = two_boxes_that_cut_each_other
+    told = []
+
+    def find_crossings(vertices, triangles, changed):
+        told.append(changed)
+        return np.zeros((0, 2), np.int64)
+
+    find_changed_intersections(vertices, triangles, np.ones(24, bool), find_crossings)
+    assert told == [None]
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_pairs_whose_boxes_are_apart_are_left_out(axis, monkeypatch):
-    """Both triangles share a cell of the grid, which is 1.5 of their boxes long."""
-    seen = []
-    monkeypatch.setattr(
-        intersections._Planes,
-        "not_apart",
-        lambda self, points, one, other, common: seen.append(len(one)) or (one[:0], other[:0]),
-    )
+@pytest.mark.parametrize(
+    ("shift", "pairs_looked_at"), [(1.25, [0]), (0.75, [1])], ids=["boxes apart", "boxes that overlap"]
+)
+def test_of_triangles_in_one_cell_only_pairs_whose_boxes_overlap_are_looked_at(
+    axis, shift, pairs_looked_at, monkeypatch
+):
+    """A triangle in a box of 1 mm and the same shifted: both lie in a cell of the grid, which is 1.5 mm long."""
+    looked_at = []
+
+    def find_no_pair(self, points, one, other, common):
+        looked_at.append(len(one))
+        return one[:0], other[:0]
+
+    monkeypatch.setattr(intersections._Planes, "not_apart", find_no_pair)
     face = np.array([[0.0, 0, 0], [1, 0.5, 0.25], [0.5, 1, 1]])
-    for shift, pairs in ((1.25, [0]), (0.75, [0, 1])):
-        both = np.concatenate([face, face + shift * np.eye(3)[axis]])
-        assert count((both, [[0, 1, 2], [3, 4, 5]])) == 0
-        assert seen == pairs
+    count_pairs((np.concatenate([face, face + shift * np.eye(3)[axis]]), [[0, 1, 2], [3, 4, 5]]))
+    assert looked_at == pairs_looked_at

@@ -7,6 +7,7 @@ import gc
 import numpy as np
 import pytest
 import sample_meshes as samples
+import tolerances
 from refusals import refused
 
 from clrecon import PointCloud, Volume, read_mesh, read_points
@@ -20,17 +21,27 @@ def test_arrays_of_the_right_type_are_not_copied():
     vertices = np.zeros((3, 3), np.float32)
     triangles = np.array([[0, 1, 2]], np.uint32)
     mesh = Mesh(vertices, triangles, vertices)
-    assert mesh.vertices is vertices and mesh.triangles is triangles and mesh.normals is vertices
+    assert mesh.vertices is vertices
+    assert mesh.triangles is triangles
+    assert mesh.normals is vertices
+
+
+def test_new_mesh_counts_its_vertices_and_triangles_and_has_an_empty_report():
+    mesh = Mesh(np.eye(3), [[0, 1, 2]])
     assert (mesh.vertex_count, mesh.triangle_count, mesh.report) == (3, 1, {})
 
 
-def test_arrays_of_other_types_are_converted():
-    mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 2.5, 0]], np.array([[0, 1, 2]], np.int64)[:, ::-1])
+def test_lists_and_other_integers_become_float32_vertices_and_contiguous_uint32_triangles():
+    reversed_columns = np.array([[0, 1, 2]], np.int64)[:, ::-1]
+    mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 2.5, 0]], reversed_columns)
     assert (mesh.vertices.dtype, mesh.triangles.dtype) == (np.float32, np.uint32)
-    assert mesh.vertices[2, 1] == 2.5
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 2.5, 0]]
     assert mesh.triangles.tolist() == [[2, 1, 0]]
     assert mesh.triangles.flags.c_contiguous
-    assert mesh.normals is None
+
+
+def test_mesh_made_without_normals_has_none():
+    assert Mesh(np.eye(3), [[0, 1, 2]]).normals is None
 
 
 @pytest.mark.parametrize(
@@ -44,49 +55,112 @@ def test_arrays_of_other_types_are_converted():
         (([["a", "b", "c"]], []), "vertices are numbers"),
         (([[0, 0, 0]], [], [[0, 0, 1], [0, 0, 1]]), "2 normals for 1 vertices"),
     ],
+    ids=[
+        "two columns of vertices",
+        "four corners a triangle",
+        "corners are floats",
+        "negative corner",
+        "corner beyond 32 bits",
+        "vertices are text",
+        "more normals than vertices",
+    ],
 )
 def test_wrong_arrays_are_refused(arguments, words):
     with pytest.raises(UsageError, match=words):
         Mesh(*arguments)
 
 
-def test_check_finds_what_the_constructor_does_not_look_at():
-    corners = np.eye(3)
+def test_check_refuses_a_triangle_that_names_a_missing_vertex():
     with refused(UsageError, "vertex", 7, 3):
-        Mesh(corners, [[0, 1, 7]]).check()
-    corners[1, 2] = np.nan
+        Mesh(np.eye(3), [[0, 1, 7]]).check()
+
+
+def test_check_refuses_a_vertex_that_is_not_finite():
+    vertices = np.eye(3)
+    vertices[1, 2] = np.nan
     with refused(UsageError, 1, "vertex"):
-        Mesh(corners, [[0, 1, 2]]).check()
+        Mesh(vertices, [[0, 1, 2]]).check()
+
+
+def test_normals_that_are_not_finite_are_refused_on_the_way_to_pyvista():
+    normals = np.eye(3)
+    normals[1, 2] = np.nan
     with refused(UsageError, 1, "normal"):
-        Mesh(np.eye(3), [[0, 1, 2]], corners).to_pyvista()
+        Mesh(np.eye(3), [[0, 1, 2]], normals).to_pyvista()
 
 
-def test_ras_is_a_half_turn():
-    vertices, triangles = samples.sphere((3, 0, -7))
-    mesh = Mesh(vertices, triangles, (vertices - (3, 0, -7)) / 10)
-    turned, normals = mesh.in_space("ras")
-    np.testing.assert_array_equal(turned, mesh.vertices * [-1, -1, 1])
+SPHERE_CENTRE = (3, 0, -7)
+
+
+def sphere_with_normals(report: dict | None = None) -> Mesh:
+    """A sphere of 10 mm about (3, 0, -7)."""
+    vertices, triangles = samples.sphere(SPHERE_CENTRE, 10.0)
+    return Mesh(vertices, triangles, (vertices - SPHERE_CENTRE) / 10.0, report)
+
+
+def test_vertices_and_normals_in_ras_have_x_and_y_negated():
+    mesh = sphere_with_normals()
+    vertices, normals = mesh.in_space("ras")
+    np.testing.assert_array_equal(vertices, mesh.vertices * [-1, -1, 1])
     np.testing.assert_array_equal(normals, mesh.normals * [-1, -1, 1])
-    assert not np.signbit(turned[turned == 0]).any()
-    assert Mesh(turned, triangles).quality()["volume_ml"] == pytest.approx(mesh.quality()["volume_ml"])
+
+
+def test_coordinates_in_ras_hold_no_negative_zero():
+    vertices, _ = sphere_with_normals().in_space("ras")
+    zeros = vertices[vertices == 0]
+    assert len(zeros) > 0
+    assert not np.signbit(zeros).any()
+
+
+def test_a_mesh_in_ras_keeps_its_volume_and_its_sign():
+    mesh = sphere_with_normals()
+    in_ras = Mesh(mesh.in_space("ras")[0], mesh.triangles)
+    assert in_ras.volume == pytest.approx(mesh.volume)
+
+
+def test_vertices_in_lps_are_those_of_the_mesh_without_a_copy():
+    mesh = sphere_with_normals()
     assert mesh.in_space("lps")[0] is mesh.vertices
+
+
+def test_a_frame_that_is_neither_lps_nor_ras_is_refused():
     with refused(UsageError, "RAI", "space"):
-        mesh.in_space("RAI")
+        sphere_with_normals().in_space("RAI")
 
 
-def test_pyvista_sees_the_same_mesh_without_a_copy():
+@pytest.fixture
+def torus_with_normals():
+    """A closed torus; each vertex has the normal (0, 0, 1)."""
     vertices, triangles = samples.torus()
-    mesh = Mesh(vertices, triangles, np.tile(np.float32([0, 0, 1]), (len(vertices), 1)))
-    polydata = mesh.to_pyvista()
-    assert np.shares_memory(np.asarray(polydata.points), mesh.vertices)
-    assert np.shares_memory(np.asarray(polydata.point_data["Normals"]), mesh.normals)
-    np.testing.assert_array_equal(polydata.regular_faces, triangles)
-    assert polydata.is_manifold and polydata.n_open_edges == 0
-    assert polydata.volume / 1000 == pytest.approx(mesh.quality()["volume_ml"], rel=1e-5)
+    return Mesh(vertices, triangles, np.tile(np.float32([0, 0, 1]), (len(vertices), 1)))
+
+
+def test_pyvista_shares_the_memory_of_vertices_and_normals(torus_with_normals):
+    polydata = torus_with_normals.to_pyvista()
+    assert np.shares_memory(np.asarray(polydata.points), torus_with_normals.vertices)
+    assert np.shares_memory(np.asarray(polydata.point_data["Normals"]), torus_with_normals.normals)
+
+
+def test_pyvista_has_the_same_closed_triangles_and_volume(torus_with_normals):
+    polydata = torus_with_normals.to_pyvista()
+    np.testing.assert_array_equal(polydata.regular_faces, torus_with_normals.triangles)
+    assert polydata.is_manifold
+    assert polydata.n_open_edges == 0
+    assert polydata.volume == pytest.approx(torus_with_normals.volume, rel=tolerances.PEER_MEASURE)
+
+
+def test_pyvista_data_name_their_normals_frame_and_unit(torus_with_normals):
+    polydata = torus_with_normals.to_pyvista()
     assert polydata.point_data.active_normals_name == "Normals"
-    assert (list(polydata.field_data["SPACE"]), list(polydata.field_data["UNIT"])) == (["LPS"], ["mm"])
+    assert list(polydata.field_data["SPACE"]) == ["LPS"]
+    assert list(polydata.field_data["UNIT"]) == ["mm"]
+
+
+def test_pyvista_data_outlive_their_mesh():
+    mesh = Mesh(*samples.torus())
     expected = mesh.vertices.copy()
-    del mesh, vertices
+    polydata = mesh.to_pyvista()
+    del mesh
     gc.collect()
     np.testing.assert_array_equal(polydata.points, expected)
 
@@ -98,46 +172,88 @@ def test_repr_of_a_mesh_says_vertices_triangles_and_frame():
 def test_contents_of_a_file_have_name_and_colour_of_a_part():
     content = Mesh(*samples.box(), None, {"part_name": "001", "color": [1, 0.5, 0]}).describe("LPS")
     assert (content.name, content.color) == ("001", (1.0, 0.5, 0.0))
-    plain = Mesh(*samples.box()).describe("LPS")
-    assert (plain.name, plain.color) == (None, None)
 
 
-def test_empty_mesh_has_arrays_of_three_columns():
-    assert Mesh([], []).vertices.shape == Mesh(np.zeros((0, 3)), []).vertices.shape == (0, 3)
+def test_contents_of_a_file_of_a_mesh_without_a_part_have_no_name_and_no_colour():
+    content = Mesh(*samples.box()).describe("LPS")
+    assert (content.name, content.color) == (None, None)
+
+
+@pytest.mark.parametrize("no_vertices", [[], np.zeros((0, 3))], ids=["list", "array"])
+def test_empty_mesh_has_vertices_of_three_columns(no_vertices):
+    assert Mesh(no_vertices, []).vertices.shape == (0, 3)
+
+
+def test_empty_vertices_of_two_columns_are_refused():
     with refused(UsageError, 3, 0, 2):
         Mesh(np.zeros((0, 2)), [])
 
 
-def test_a_moved_turned_and_scaled_mesh_has_its_points_normals_and_volume():
-    vertices, triangles = samples.sphere((3, 0, -7))
-    mesh = Mesh(vertices, triangles, (vertices - (3, 0, -7)) / 10, {"iso_value_hu": 200.0, "certificate": {"a": 1}})
-    turn_and_stretch = np.array([[0, -2, 0, 5], [1, 0, 0, 6], [0, 0, 3, 7], [0, 0, 0, 1.0]])
-    moved = mesh.transformed(turn_and_stretch)
+TURN_AND_STRETCH = np.array([[0, -2, 0, 5], [1, 0, 0, 6], [0, 0, 3, 7], [0, 0, 0, 1.0]])
+"""(x, y, z) -> (5 - 2 y, 6 + x, 7 + 3 z): its determinant, the factor of volumes, is 6."""
+
+
+def test_transformed_vertices_lie_where_the_matrix_puts_them():
+    mesh = sphere_with_normals()
     x, y, z = mesh.vertices.T
-    np.testing.assert_allclose(moved.vertices, np.stack([5 - 2 * y, 6 + x, 7 + 3 * z], axis=1), rtol=0, atol=1e-5)
-    assert moved.quality()["volume_ml"] == pytest.approx(6 * mesh.quality()["volume_ml"], rel=1e-5)
-    towards = np.stack([-mesh.normals[:, 1] / 2, mesh.normals[:, 0], mesh.normals[:, 2] / 3], axis=1)
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    np.testing.assert_allclose(moved.normals, towards, rtol=0, atol=1e-6)
-    assert moved.report == {"iso_value_hu": 200.0, "moved_by": turn_and_stretch.tolist()}
-    np.testing.assert_array_equal(mesh.vertices, vertices.astype(np.float32))
-    back = moved.transformed(np.linalg.inv(turn_and_stretch))
-    np.testing.assert_allclose(back.vertices, mesh.vertices, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(back.report["moved_by"], np.eye(4), rtol=0, atol=1e-12)
+    moved = mesh.transformed(TURN_AND_STRETCH)
+    expected = np.stack([5 - 2 * y, 6 + x, 7 + 3 * z], axis=1)
+    np.testing.assert_allclose(moved.vertices, expected, rtol=0, atol=tolerances.MOVED_VERTEX_MM)
+
+
+def test_volume_of_a_transformed_mesh_changes_by_the_determinant():
+    mesh = sphere_with_normals()
+    moved = mesh.transformed(TURN_AND_STRETCH)
+    assert moved.volume == pytest.approx(np.linalg.det(TURN_AND_STRETCH) * mesh.volume, rel=tolerances.PEER_MEASURE)
+
+
+def test_transformed_normals_stay_square_to_the_surface():
+    """Normals are stretched by the inverse of what points are stretched by, and made of length 1 again."""
+    mesh = sphere_with_normals()
+    x, y, z = mesh.normals.T
+    expected = np.stack([-y / 2, x, z / 3], axis=1)
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    moved = mesh.transformed(TURN_AND_STRETCH)
+    np.testing.assert_allclose(moved.normals, expected, rtol=0, atol=tolerances.MESH_UNIT_NORMAL)
+
+
+def test_report_of_a_transformed_mesh_names_the_matrix_and_drops_the_certificate():
+    mesh = sphere_with_normals({"iso_value_hu": 200.0, "certificate": {"a": 1}})
+    moved = mesh.transformed(TURN_AND_STRETCH)
+    assert moved.report == {"iso_value_hu": 200.0, "moved_by": TURN_AND_STRETCH.tolist()}
+
+
+def test_transforming_leaves_the_given_mesh_as_it_is():
+    mesh = sphere_with_normals()
+    before = mesh.vertices.copy()
+    mesh.transformed(TURN_AND_STRETCH)
+    np.testing.assert_array_equal(mesh.vertices, before)
+
+
+def test_the_inverse_matrix_moves_a_mesh_back():
+    mesh = sphere_with_normals()
+    back = mesh.transformed(TURN_AND_STRETCH).transformed(np.linalg.inv(TURN_AND_STRETCH))
+    np.testing.assert_allclose(back.vertices, mesh.vertices, rtol=0, atol=tolerances.MOVED_VERTEX_MM)
+    np.testing.assert_allclose(back.report["moved_by"], np.eye(4), rtol=0, atol=tolerances.FLOAT64_SHARE)
 
 
 def test_a_mirrored_mesh_still_looks_outward():
     mesh = Mesh(*samples.torus())
     mirrored = mesh.transformed(np.diag([-1.0, 1.0, 1.0, 1.0]))
-    assert mirrored.quality()["volume_ml"] == pytest.approx(mesh.quality()["volume_ml"], rel=1e-6)
-    assert mirrored.normals is None
     np.testing.assert_array_equal(mirrored.triangles, mesh.triangles[:, ::-1])
+    assert mirrored.volume == pytest.approx(mesh.volume, rel=tolerances.MESH_VOLUME)
+
+
+def test_a_transformed_mesh_without_normals_has_none():
+    assert Mesh(*samples.torus()).transformed(np.diag([-1.0, 1.0, 1.0, 1.0])).normals is None
 
 
 @pytest.mark.parametrize(
-    ("matrix", "words"), [(np.eye(3), ("4x4",)), (np.diag([1.0, 0, 1, 1]), ("singular",)), (np.ones((4, 4)), ("row",))]
+    ("matrix", "words"),
+    [(np.eye(3), ("4x4",)), (np.diag([1.0, 0, 1, 1]), ("singular",)), (np.ones((4, 4)), ("row",))],
+    ids=["3x3", "singular", "last row of ones"],
 )
-def test_matrix_that_is_no_affine_moves_no_mesh(matrix, words):
+def test_a_matrix_that_is_no_invertible_affine_is_refused(matrix, words):
     with refused(UsageError, *words):
         Mesh(*samples.sphere((0, 0, 0))).transformed(matrix)
 
@@ -156,16 +272,18 @@ def test_numbers_at_vertices_are_point_data_of_pyvista(sphere_and_cube):
     np.testing.assert_array_equal(surface.point_data["HU"], sphere_and_cube.values["HU"])
 
 
-def test_of_the_point_data_of_pyvista_only_named_numbers_are_taken(sphere_and_cube):
+def test_vectors_and_names_with_a_space_in_point_data_of_pyvista_are_left_out(sphere_and_cube):
     surface = sphere_and_cube.to_pyvista()
-    surface.point_data["vectors"], surface.point_data["with space"] = surface.points, surface.points[:, 0]
+    surface.point_data["vectors"] = surface.points
+    surface.point_data["with space"] = surface.points[:, 0]
     assert set(Mesh.from_pyvista(surface).values) == {"HU"}
 
 
 def test_numbers_at_vertices_stay_with_a_moved_part(sphere_and_cube):
+    """The matrix doubles y alone: x, of which the numbers are twice, stays."""
     sphere = sphere_and_cube.transformed(np.diag([1.0, 2.0, 1.0, 1.0])).keep_largest()
-    assert len(sphere.values["HU"]) == sphere.vertex_count < sphere_and_cube.vertex_count
-    np.testing.assert_allclose(sphere.values["HU"], sphere.vertices[:, 0] * 2.0, rtol=1e-6)
+    assert sphere.vertex_count < sphere_and_cube.vertex_count
+    np.testing.assert_allclose(sphere.values["HU"], sphere.vertices[:, 0] * 2.0, rtol=tolerances.FLOAT32_SHARE)
 
 
 def test_numbers_at_vertices_are_scalars_of_a_ply(sphere_and_cube, tmp_path):
@@ -181,10 +299,12 @@ def test_numbers_at_vertices_are_scalars_of_a_ply(sphere_and_cube, tmp_path):
         ({"HU": ["a"] * 4}, "one number a vertex"),
         ({"a b": np.zeros(4)}, "letters, digits and _"),
     ],
+    ids=["too few", "two columns", "text", "space in the name"],
 )
-def test_numbers_that_fit_no_vertex_are_refused(values, words, tmp_path):
+def test_values_that_are_not_one_number_a_vertex_under_a_plain_name_are_not_written(values, words, tmp_path):
     corners = np.vstack([np.zeros(3), np.eye(3)])
-    mesh = Mesh(corners, [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
+    tetrahedron = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+    mesh = Mesh(corners, tetrahedron)
     mesh.values = values
     with pytest.raises(UsageError, match=words):
         mesh.save(tmp_path / "a.ply")
@@ -196,7 +316,8 @@ def two_boxes():
     """A box at the origin with HU, and one at x = 5 with mm; their reports differ in voxel and device."""
     one = Mesh(*samples.box(), report={"voxel_mm": 0.5, "iso_value_hu": 226, "device": "a"})
     other = Mesh(*samples.box((5.0, 0.0, 0.0)), report={"voxel_mm": 2.0, "iso_value_hu": 226, "device": "b"})
-    one.values["HU"], other.values["mm"] = np.arange(8.0), np.ones(8)
+    one.values["HU"] = np.arange(8.0)
+    other.values["mm"] = np.ones(8)
     return one, other
 
 
@@ -204,9 +325,13 @@ def test_merged_meshes_stand_one_after_the_other(two_boxes):
     one, other = two_boxes
     merged = one.merge(other, one)
     np.testing.assert_array_equal(merged.vertices, np.concatenate([one.vertices, other.vertices, one.vertices]))
-    np.testing.assert_array_equal(merged.triangles[12:24], other.triangles + 8)
-    assert merged.volume == pytest.approx(3.0)
-    assert len(merged.split()) == 3
+    expected = np.concatenate([one.triangles, other.triangles + 8, one.triangles + 16])  # 8 vertices a box
+    np.testing.assert_array_equal(merged.triangles, expected)
+
+
+def test_merged_meshes_stay_components_of_their_own(two_boxes):
+    one, other = two_boxes
+    assert len(one.merge(other, one).split()) == 3
 
 
 def test_numbers_that_a_merged_mesh_lacks_are_nan(two_boxes):
@@ -216,7 +341,7 @@ def test_numbers_that_a_merged_mesh_lacks_are_nan(two_boxes):
     np.testing.assert_array_equal(merged.values["mm"], [*[np.nan] * 8, *[1.0] * 8, *[np.nan] * 8])
 
 
-def test_report_of_merged_meshes_keeps_what_is_equal_and_the_shortest_voxel(two_boxes):
+def test_report_of_merged_meshes_keeps_equal_entries_and_the_shortest_voxel(two_boxes):
     one, other = two_boxes
     assert one.merge(other, one).report == {"iso_value_hu": 226, "voxel_mm": 0.5}
 
@@ -252,22 +377,28 @@ def box_in_the_volume():
     return Mesh(*samples.box((0.3, 0.6, 1.0)), report={"iso_value_hu": 226})
 
 
-def test_a_mesh_is_sampled_at_its_vertices(volume, box_in_the_volume):
-    sampled = box_in_the_volume.sample(volume).sample(volume, "nearest", 0)
-    np.testing.assert_array_equal(sampled.values["HU"], volume.sample(sampled.vertices).astype(np.float32))
-    np.testing.assert_array_equal(sampled.values["nearest"], volume.sample(sampled.vertices, order=0))
-    assert np.isfinite(sampled.values["HU"]).all()
+def test_a_mesh_is_sampled_at_its_vertices_between_voxels_or_in_the_nearest(volume, box_in_the_volume):
+    vertices = box_in_the_volume.vertices
+    between_voxels = box_in_the_volume.sample(volume).values["HU"]
+    in_the_nearest = box_in_the_volume.sample(volume, "nearest", 0).values["nearest"]
+    np.testing.assert_array_equal(between_voxels, volume.sample(vertices).astype(np.float32))
+    np.testing.assert_array_equal(in_the_nearest, volume.sample(vertices, order=0))
+    assert np.isfinite(between_voxels).all()
 
 
 def test_a_vertex_outside_of_the_volume_gets_the_given_value(volume, box_in_the_volume):
-    sampled = box_in_the_volume.sample(volume[:1], "first", outside=-1024)  # one slice: all vertices lie beside it
-    assert sampled.values["first"].min() == -1024
+    first_slice = volume[:1]  # 2 mm thick: it ends at z = 1, where the lower four corners of the box lie
+    sampled = box_in_the_volume.sample(first_slice, "first", outside=-1024)
+    is_outside = box_in_the_volume.vertices[:, 2] == 2.0
+    assert is_outside.sum() == 4
+    np.testing.assert_array_equal(sampled.values["first"] == -1024, is_outside)
 
 
-def test_sampling_makes_a_mesh_of_its_own(volume, box_in_the_volume):
+def test_sampling_leaves_the_values_and_the_report_of_the_given_mesh(volume, box_in_the_volume):
     sampled = box_in_the_volume.sample(volume)
     assert box_in_the_volume.values == {}
-    assert sampled.report == box_in_the_volume.report and sampled.report is not box_in_the_volume.report
+    assert sampled.report == box_in_the_volume.report
+    assert sampled.report is not box_in_the_volume.report
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.vtp"])
@@ -276,8 +407,8 @@ def test_sampled_values_are_kept_by_mesh_files(volume, box_in_the_volume, tmp_pa
     sampled.save(tmp_path / name)
     kept = read_mesh(tmp_path / name).values
     assert kept.keys() == {"HU", "nearest"}
-    for column, values in kept.items():
-        np.testing.assert_array_equal(values, sampled.values[column])
+    np.testing.assert_array_equal(kept["HU"], sampled.values["HU"])
+    np.testing.assert_array_equal(kept["nearest"], sampled.values["nearest"])
 
 
 def test_sampled_values_are_an_attribute_of_a_glb(volume, box_in_the_volume, tmp_path):
@@ -294,7 +425,7 @@ def test_sampled_values_and_labels_of_a_cloud_are_kept_by_its_file(volume, box_i
 
 
 @pytest.mark.parametrize("kind", [Mesh, PointCloud])
-def test_sampling_what_is_no_volume_is_refused(kind, box_in_the_volume):
+def test_sampling_from_a_mesh_in_place_of_a_volume_is_refused(kind, box_in_the_volume):
     subject = box_in_the_volume if kind is Mesh else PointCloud(box_in_the_volume.vertices)
     with refused(UsageError, "Volume", "volume"):
         subject.sample(box_in_the_volume)
@@ -309,7 +440,8 @@ def test_sampling_under_a_name_with_a_space_is_refused(volume, box_in_the_volume
 def numbered_faces():
     """A box of 12 triangles and one eight times as large of 12, numbered from 0 to 23, with HU at the 16 vertices."""
     mesh = Mesh(*samples.box()).merge(Mesh(*samples.box((5.0, 0.0, 0.0), (2.0, 2.0, 2.0))))
-    mesh.face_values["stress"], mesh.values["HU"] = np.arange(24.0), np.arange(16.0)
+    mesh.face_values["stress"] = np.arange(24.0)
+    mesh.values["HU"] = np.arange(16.0)
     return mesh
 
 
@@ -317,9 +449,14 @@ def test_merged_meshes_without_numbers_at_faces_have_none():
     assert Mesh(*samples.box()).merge(Mesh(*samples.box())).face_values == {}
 
 
-def test_parts_keep_the_numbers_at_their_faces(numbered_faces):
+def test_the_largest_part_keeps_the_numbers_at_its_faces(numbered_faces):
     assert numbered_faces.keep_largest().face_values["stress"].tolist() == list(range(12, 24))
-    assert [part.face_values["stress"][0] for part in numbered_faces.split()] == [12, 0]
+
+
+def test_split_parts_keep_the_numbers_at_their_faces(numbered_faces):
+    large, small = numbered_faces.split()
+    assert large.face_values["stress"].tolist() == list(range(12, 24))
+    assert small.face_values["stress"].tolist() == list(range(12))
 
 
 def test_a_mirrored_mesh_keeps_the_numbers_at_its_faces(numbered_faces):
@@ -332,7 +469,7 @@ def test_faces_of_a_merged_mesh_without_numbers_are_nan(numbered_faces):
     np.testing.assert_array_equal(merged.face_values["stress"], [*range(24), *[np.nan] * 12])
 
 
-def by_file(mesh, path):
+def save_and_read(mesh, path):
     mesh.save(path)
     return read_mesh(path)
 
@@ -340,14 +477,14 @@ def by_file(mesh, path):
 @pytest.mark.parametrize(
     "there_and_back",
     [
-        lambda mesh, folder: by_file(mesh, folder / "a.ply"),
-        lambda mesh, folder: by_file(mesh, folder / "a.vtp"),
+        lambda mesh, folder: save_and_read(mesh, folder / "a.ply"),
+        lambda mesh, folder: save_and_read(mesh, folder / "a.vtp"),
         lambda mesh, folder: Mesh.from_pyvista(mesh.to_pyvista()),
         lambda mesh, folder: Mesh.from_trimesh(mesh.to_trimesh()),
     ],
     ids=["ply", "vtp", "pyvista", "trimesh"],
 )
-def test_numbers_at_faces_come_back_from_files_and_libraries(numbered_faces, tmp_path, there_and_back):
+def test_numbers_at_faces_and_vertices_come_back_from_files_and_libraries(numbered_faces, tmp_path, there_and_back):
     pytest.importorskip("trimesh")
     back = there_and_back(numbered_faces, tmp_path)
     np.testing.assert_array_equal(back.triangles, numbered_faces.triangles)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tolerances
 from refusals import refused
 from sample_meshes import ball, box, torus, torus_volume_ml
 
@@ -18,8 +19,11 @@ pyvista = pytest.importorskip("pyvista")
 trimesh = pytest.importorskip("trimesh")
 
 
+TORUS_FACES = 240
+
+
 def three_parts() -> Mesh:
-    """Return a cube of 2 mm, a torus 100 mm to the left, and a cavity of 1 mm in the cube."""
+    """Return a cube of 2 mm at the origin, a torus around (100, 0, -700), and a cavity of 1 mm in the cube."""
     cube, faces = box((0.0, 0.0, 0.0), (2.0, 2.0, 2.0))
     ring, bands = torus()
     hollow, walls = box((0.5, 0.5, 0.5))
@@ -34,9 +38,13 @@ def test_bounds_area_and_volume_of_a_box_are_in_mm() -> None:
     assert mesh.volume == pytest.approx(2 * 3 * 5, rel=1e-6)
 
 
-def test_volume_of_a_torus_is_that_of_its_tetrahedra_and_of_its_quality() -> None:
+def test_volume_of_a_torus_is_that_of_its_tetrahedra() -> None:
     ring = Mesh(*torus())
-    assert ring.volume == pytest.approx(1000.0 * torus_volume_ml(), rel=1e-5)
+    assert ring.volume == pytest.approx(1000.0 * torus_volume_ml(), rel=tolerances.PEER_MEASURE)
+
+
+def test_volume_of_a_mesh_is_that_of_its_quality_in_mm3() -> None:
+    ring = Mesh(*torus())
     assert ring.volume == pytest.approx(1000.0 * ring.quality().volume_ml)
 
 
@@ -45,40 +53,45 @@ def test_volume_of_a_mesh_that_looks_inward_is_negative() -> None:
     assert Mesh(ring.vertices, ring.triangles[:, ::-1]).volume == pytest.approx(-ring.volume)
 
 
-def test_an_empty_mesh_has_no_bounds_and_no_area() -> None:
+def test_an_empty_mesh_has_bounds_of_nan_and_no_area_or_volume() -> None:
     nothing = Mesh([], [])
     assert np.isnan(nothing.bounds).all()
     assert (nothing.area, nothing.volume) == (0.0, 0.0)
 
 
-def test_parts_are_meshes_largest_first() -> None:
+def test_components_are_meshes_the_largest_first() -> None:
     ring, cube, cavity = parts = three_parts().components()
     assert [type(part) for part in parts] == [Mesh] * 3
-    assert [part.triangle_count for part in parts] == [240, 12, 12]
-    assert ring.volume == pytest.approx(1000.0 * torus_volume_ml(), rel=1e-4)
-    assert [cube.volume, cavity.volume] == pytest.approx([8.0, -1.0], rel=1e-6)
+    assert ring.volume == pytest.approx(1000.0 * torus_volume_ml(), rel=tolerances.FAR_MEASURE)
+    assert cube.volume == pytest.approx(2.0**3, rel=tolerances.MESH_VOLUME)
+    assert cavity.volume == pytest.approx(-(1.0**3), rel=tolerances.MESH_VOLUME)
 
 
-def test_keep_largest_keeps_as_many_parts_as_asked() -> None:
-    mesh = three_parts()
-    assert [mesh.keep_largest(count).triangle_count for count in (1, 2, 3)] == [240, 252, 264]
-    assert mesh.keep_largest().triangle_count == 240
-    assert mesh.keep_largest(2).volume == pytest.approx(mesh.keep_largest().volume + 8.0, rel=1e-5)
+@pytest.mark.parametrize(("number", "triangles"), [(1, TORUS_FACES), (2, TORUS_FACES + 12), (3, TORUS_FACES + 24)])
+def test_keep_largest_keeps_as_many_parts_as_asked(number: int, triangles: int) -> None:
+    assert three_parts().keep_largest(number).triangle_count == triangles
+
+
+def test_keep_largest_keeps_one_part_where_no_number_is_given() -> None:
+    assert three_parts().keep_largest().triangle_count == TORUS_FACES
 
 
 def test_keep_largest_amends_a_copy_of_the_report() -> None:
     mesh = three_parts()
-    assert mesh.keep_largest(3).report["a"] == 1
+    kept = mesh.keep_largest(1)
+    assert kept.report == {"a": 1, "components_found": 3, "components_kept": 1}
     assert mesh.report == {"a": 1}
 
 
 def test_split_leaves_out_parts_below_a_volume() -> None:
-    assert [part.triangle_count for part in three_parts().split(min_volume_ml=0.005)] == [240, 12]  # the cavity: 0.001
+    kept = three_parts().split(min_volume_ml=0.005)  # the cube has 0.008 ml, its cavity 0.001
+    assert [part.triangle_count for part in kept] == [TORUS_FACES, 12]
 
 
 def test_split_keeps_the_part_nearest_to_a_seed() -> None:
-    (cube,) = three_parts().split(seeds=[(0.0, 0.0, -1.0)])
-    assert cube.volume == pytest.approx(8.0, rel=1e-6)
+    below_the_cube = (0.0, 0.0, -1.0)
+    (cube,) = three_parts().split(seeds=[below_the_cube])
+    assert cube.volume == pytest.approx(2.0**3, rel=tolerances.MESH_VOLUME)
 
 
 def test_keep_largest_of_no_part_is_refused() -> None:
@@ -92,7 +105,7 @@ def test_components_of_an_empty_mesh_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("vertices", "triangles", "words"),
+    ("vertices", "triangles", "facts"),
     [
         (np.eye(3), [[0, 1, 2], [0, 1, 7]], (1, 7, 3)),
         (np.eye(3), [[1, 2, 3]], (0,)),
@@ -104,13 +117,27 @@ def test_components_of_an_empty_mesh_are_refused() -> None:
         (np.eye(3), [[True, False, True]], ("integers",)),
         (np.eye(3) * 1j, [[0, 1, 2]], ("vertices",)),
     ],
+    ids=[
+        "a corner of the second triangle is missing",
+        "a corner of the first triangle is missing",
+        "no vertices",
+        "vertex of NaN",
+        "vertex of infinity",
+        "one row of corners",
+        "corners are floats",
+        "corners are truth values",
+        "vertices are complex",
+    ],
 )
-def test_bad_triangles_are_refused_when_the_mesh_is_made(vertices: object, triangles: object, words: str) -> None:
-    with refused(UsageError, *words):
+def test_a_mesh_of_triangles_or_vertices_that_cannot_be_is_refused(
+    vertices: object, triangles: object, facts: tuple[str | int, ...]
+) -> None:
+    with refused(UsageError, *facts):
         Mesh(vertices, triangles)  # type: ignore[arg-type]
 
 
 def far_ball() -> Mesh:
+    """A ball of 5 mm about (30, -200, -900), with normals."""
     vertices, triangles = ball(5.0, 12)
     return Mesh(vertices + (30.0, -200.0, -900.0), triangles, vertices / 5.0)
 
@@ -121,25 +148,34 @@ def test_mesh_comes_back_from_pyvista_unchanged() -> None:
     np.testing.assert_array_equal(back.vertices, mesh.vertices)
     np.testing.assert_array_equal(back.triangles, mesh.triangles)
     np.testing.assert_array_equal(back.normals, mesh.normals)
-    assert not np.shares_memory(back.vertices, mesh.vertices)
+
+
+def test_mesh_from_pyvista_has_vertices_of_its_own() -> None:
+    data = far_ball().to_pyvista()
+    assert not np.shares_memory(Mesh.from_pyvista(data).vertices, np.asarray(data.points))
 
 
 def test_pyvista_measures_the_same_area_and_volume() -> None:
     mesh = far_ball()
     data = mesh.to_pyvista()
-    assert (data.area, data.volume) == pytest.approx((mesh.area, mesh.volume), rel=1e-5)
+    assert (data.area, data.volume) == pytest.approx((mesh.area, mesh.volume), rel=tolerances.PEER_MEASURE)
 
 
 @pytest.mark.parametrize("named", ["by the caller", "in the data"])
-def test_pyvista_data_in_ras_are_turned(named: str) -> None:
+def test_pyvista_data_in_ras_become_a_mesh_in_lps(named: str) -> None:
     mesh = far_ball()
     data = pyvista.PolyData(mesh.vertices * (-1, -1, 1), mesh.to_pyvista().faces)
     if named == "in the data":
         data.field_data["SPACE"] = ["RAS"]
-    turned = Mesh.from_pyvista(data, "ras" if named == "by the caller" else None)
-    np.testing.assert_allclose(turned.vertices, mesh.vertices, atol=1e-5)
-    assert turned.volume == pytest.approx(mesh.volume, rel=1e-5)
-    assert turned.normals is None
+    in_lps = Mesh.from_pyvista(data, "ras" if named == "by the caller" else None)
+    np.testing.assert_array_equal(in_lps.vertices, mesh.vertices)
+    assert in_lps.volume == pytest.approx(mesh.volume)
+
+
+def test_pyvista_data_without_normals_become_a_mesh_without() -> None:
+    mesh = far_ball()
+    data = pyvista.PolyData(mesh.vertices, mesh.to_pyvista().faces)
+    assert Mesh.from_pyvista(data, "lps").normals is None
 
 
 def test_pyvista_data_whose_frame_contradicts_the_caller_are_refused() -> None:
@@ -149,10 +185,10 @@ def test_pyvista_data_whose_frame_contradicts_the_caller_are_refused() -> None:
         Mesh.from_pyvista(data, "lps")
 
 
-def test_squares_of_pyvista_become_triangles() -> None:
+def test_squares_of_pyvista_become_two_triangles_each() -> None:
     squares = Mesh.from_pyvista(pyvista.Cube(x_length=2.0))
     assert squares.triangle_count == 6 * 2
-    assert squares.volume == pytest.approx(2.0 * 1.0 * 1.0, rel=1e-6)
+    assert squares.volume == pytest.approx(2.0 * 1.0 * 1.0, rel=tolerances.MESH_VOLUME)
 
 
 def test_mesh_comes_back_from_trimesh_unchanged() -> None:
@@ -162,51 +198,53 @@ def test_mesh_comes_back_from_trimesh_unchanged() -> None:
     np.testing.assert_array_equal(back.triangles, mesh.triangles)
 
 
-def test_trimesh_measures_the_same_and_knows_unit_and_frame() -> None:
+def test_trimesh_knows_unit_and_frame() -> None:
+    other = three_parts().to_trimesh()
+    assert (other.units, other.metadata["SPACE"]) == ("mm", "LPS")
+
+
+def test_trimesh_measures_the_same_area_volume_bounds_and_number_of_parts() -> None:
     mesh = three_parts()
     other = mesh.to_trimesh()
-    assert (other.units, other.metadata["SPACE"]) == ("mm", "LPS")
-    assert (other.area, other.volume) == pytest.approx((mesh.area, mesh.volume), rel=1e-6)
-    np.testing.assert_allclose(other.bounds, mesh.bounds, atol=1e-6)
+    assert (other.area, other.volume) == pytest.approx((mesh.area, mesh.volume), rel=tolerances.MESH_VOLUME)
+    np.testing.assert_array_equal(other.bounds, mesh.bounds)
     assert len(other.split(only_watertight=False)) == 3
 
 
-def test_a_trimesh_in_ras_is_turned() -> None:
+def test_a_trimesh_in_ras_becomes_a_mesh_in_lps() -> None:
     mesh = three_parts()
     other = mesh.to_trimesh()
     other.metadata["SPACE"] = "RAS"
     turned = Mesh.from_trimesh(other)
     np.testing.assert_array_equal(turned.vertices, mesh.vertices * np.float32([-1, -1, 1]))
-    assert turned.volume == pytest.approx(mesh.volume, rel=1e-6)
+    assert turned.volume == pytest.approx(mesh.volume, rel=tolerances.MESH_VOLUME)
 
 
 def test_vertices_in_double_precision_come_back_from_trimesh_to_the_bit() -> None:
-    far = Mesh(np.eye(3) + 1e5 + 1e-7, [[0, 1, 2]])  # float32 ends at 0.008 mm there
-    assert far.vertices.dtype == np.float64
-    np.testing.assert_array_equal(Mesh.from_trimesh(far.to_trimesh()).vertices, far.vertices)
+    far = Mesh(np.eye(3) + 1e5 + 1e-7, [[0, 1, 2]])  # a step of float32 is 0.008 mm there
+    back = Mesh.from_trimesh(far.to_trimesh())
+    assert back.vertices.dtype == np.float64
+    np.testing.assert_array_equal(back.vertices, far.vertices)
 
 
-def test_normals_go_to_trimesh() -> None:
+def test_trimesh_has_the_normals_of_the_mesh() -> None:
     vertices, triangles = ball(1.0, 6)
     mesh = Mesh(vertices, triangles, vertices)
-    np.testing.assert_allclose(mesh.to_trimesh().vertex_normals, mesh.normals, atol=1e-6)
+    np.testing.assert_allclose(mesh.to_trimesh().vertex_normals, mesh.normals, atol=tolerances.MESH_UNIT_NORMAL)
 
 
-def test_a_missing_trimesh_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_to_trimesh_is_refused_where_the_package_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with refused(UsageError, "to_trimesh", "package"):
         three_parts().to_trimesh()
 
 
-def with_unit(unit: str) -> Any:
+def box_of_trimesh(unit: str | None = None, space: str | None = None) -> Any:
     made = trimesh.creation.box()
-    made.units = unit
-    return made
-
-
-def with_frame(space: str) -> Any:
-    made = trimesh.creation.box()
-    made.metadata["SPACE"] = space
+    if unit is not None:
+        made.units = unit
+    if space is not None:
+        made.metadata["SPACE"] = space
     return made
 
 
@@ -217,12 +255,14 @@ def with_frame(space: str) -> Any:
         (lambda: Mesh.from_pyvista(pyvista.PolyData(np.eye(3))), (3, "points")),
         (lambda: Mesh.from_trimesh(pyvista.Cube()), ("trimesh.Trimesh",)),
         (lambda: Mesh.from_trimesh(trimesh.Scene()), ("Scene",)),
-        (lambda: Mesh.from_trimesh(with_unit("meters")), ("convert_units", "mm")),
-        (lambda: Mesh.from_trimesh(trimesh.creation.box(), "xyz"), ("xyz",)),
-        (lambda: Mesh.from_trimesh(with_frame("scanner")), ("scanner", "Trimesh")),
+        (lambda: Mesh.from_trimesh(box_of_trimesh(unit="meters")), ("convert_units", "mm")),
+        (lambda: Mesh.from_trimesh(box_of_trimesh(), "xyz"), ("xyz",)),
+        (lambda: Mesh.from_trimesh(box_of_trimesh(space="scanner")), ("scanner", "Trimesh")),
     ],
     ids=["image", "points", "pyvista as trimesh", "scene", "metres", "unknown frame", "unknown frame in the data"],
 )
-def test_what_is_no_mesh_is_refused(convert: Callable[[], Mesh], facts: tuple[str | int, ...]) -> None:
+def test_objects_of_libraries_that_are_no_mesh_in_mm_and_a_known_frame_are_refused(
+    convert: Callable[[], Mesh], facts: tuple[str | int, ...]
+) -> None:
     with refused(UsageError, *facts):
         convert()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from refusals import refused
+import tolerances
+from refusals import assert_one_line, refused
 from sample_meshes import ball
 
 import clrecon
@@ -19,99 +21,166 @@ from clrecon.exchange.vtp import has_polygons
 BALL = Mesh(*ball(8.0, 12))
 
 
-@pytest.mark.parametrize("space", ["lps", "ras"])
-@pytest.mark.parametrize("extension", MESH_INPUTS)
-def test_written_mesh_is_read_back_unchanged(tmp_path: Path, extension: str, space: str) -> None:
-    mesh = Mesh(BALL.vertices, BALL.triangles, BALL.vertices / 8.0, {"iso_value_hu": 250.0})
+every_format = pytest.mark.parametrize("extension", MESH_INPUTS)
+both_frames = pytest.mark.parametrize("space", ["lps", "ras"])
+
+
+@pytest.fixture
+def written(tmp_path: Path, extension: str, space: str) -> Path:
+    """A file of the ball, with normals and the entry iso_value_hu of its report."""
     path = tmp_path / f"ball{extension}"
-    mesh.save(path, space)
-    back = clrecon.read_mesh(path)
-    assert np.array_equal(back.vertices[back.triangles], mesh.vertices[mesh.triangles])
-    assert back.vertex_count == mesh.vertex_count and back.quality().closed
-    facts = back.report["file"]
+    Mesh(BALL.vertices, BALL.triangles, BALL.vertices / 8.0, {"iso_value_hu": 250.0}).save(path, space)
+    return path
+
+
+@every_format
+@both_frames
+def test_corners_of_a_written_mesh_are_read_back_to_the_bit_and_closed(written: Path) -> None:
+    back = clrecon.read_mesh(written)
+    assert np.array_equal(back.vertices[back.triangles], BALL.vertices[BALL.triangles])
+    assert back.vertex_count == BALL.vertex_count
+    assert back.quality().closed
+
+
+@every_format
+@both_frames
+def test_frame_of_a_written_mesh_is_read_from_the_file_without_a_warning(written: Path, space: str) -> None:
+    facts = clrecon.read_mesh(written).report["file"]
     assert (facts["space"], facts["space_from"], facts["warnings"]) == (space.upper(), "file", [])
-    if extension == ".ply":
-        assert back.normals is not None and np.allclose(back.normals, mesh.normals, atol=1e-6)
-        assert np.array_equal(back.triangles, mesh.triangles) and back.report["iso_value_hu"] == 250.0
+
+
+@pytest.mark.parametrize("extension", [".ply"])
+@both_frames
+def test_ply_gives_back_normals_order_of_triangles_and_report(written: Path) -> None:
+    back = clrecon.read_mesh(written)
+    assert np.array_equal(back.triangles, BALL.triangles)
+    assert back.normals is not None
+    assert np.allclose(back.normals, BALL.vertices / 8.0, atol=tolerances.MESH_UNIT_NORMAL)
+    assert back.report["iso_value_hu"] == 250.0
+
+
+@every_format
+@both_frames
+def test_reading_a_mesh_in_a_frame_that_its_file_contradicts_is_refused(written: Path, space: str) -> None:
     with refused(UsageError, "space"):
-        clrecon.read_mesh(path, space="ras" if space == "lps" else "lps")
+        clrecon.read_mesh(written, space="ras" if space == "lps" else "lps")
 
 
-def test_files_of_others_are_lps_unless_said(tmp_path: Path) -> None:
-    facet = "facet normal 0 0 1\n outer loop\n  vertex 1 2 3\n  vertex 4 2 3\n  vertex 1 6e0 3\n endloop\nendfacet\n"
-    text = tmp_path / "a.stl"
-    text.write_text(f"solid some thing\n{facet}{facet}endsolid\n")
-    mesh = clrecon.read_mesh(text)
-    assert mesh.vertices.tolist() == [[1, 2, 3], [4, 2, 3], [1, 6, 3]] and mesh.triangle_count == 2
-    assert mesh.report["file"]["space_from"] == "assumed" and "no patient frame" in mesh.report["file"]["warnings"][0]
-    turned = clrecon.read_mesh(text, space="ras")
-    assert turned.vertices.tolist() == [[-1, -2, 3], [-4, -2, 3], [-1, -6, 3]]
-    assert turned.report["file"]["space_from"] == "argument" and not turned.report["file"]["warnings"]
-    ply = tmp_path / "a.ply"
-    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-    ply.write_text(
-        head + "element face 1\nproperty list uchar int vertex_index\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
-    )
-    assert clrecon.read_mesh(ply).triangles.tolist() == [[0, 1, 2]]
+FACET = "facet normal 0 0 1\n outer loop\n  vertex 1 2 3\n  vertex 4 2 3\n  vertex 1 6e0 3\n endloop\nendfacet\n"
+
+
+@pytest.fixture
+def foreign_stl(tmp_path: Path) -> Path:
+    """An STL of another program: two equal facets as text, of no named frame."""
+    path = tmp_path / "a.stl"
+    path.write_text(f"solid some thing\n{FACET}{FACET}endsolid\n")
+    return path
+
+
+def test_a_file_that_names_no_frame_is_read_as_lps_with_a_warning(foreign_stl: Path) -> None:
+    mesh = clrecon.read_mesh(foreign_stl)
+    assert mesh.vertices.tolist() == [[1, 2, 3], [4, 2, 3], [1, 6, 3]]
+    assert mesh.triangle_count == 2
+    assert mesh.report["file"]["space_from"] == "assumed"
+    assert "no patient frame" in mesh.report["file"]["warnings"][0]
+
+
+def test_a_file_that_names_no_frame_is_read_in_the_frame_that_the_caller_names(foreign_stl: Path) -> None:
+    in_lps = clrecon.read_mesh(foreign_stl, space="ras")
+    assert in_lps.vertices.tolist() == [[-1, -2, 3], [-4, -2, 3], [-1, -6, 3]]
+    assert in_lps.report["file"]["space_from"] == "argument"
+    assert not in_lps.report["file"]["warnings"]
+
+
+PLY_VERTICES = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+PLY_FACES = "element face 1\nproperty list uchar int vertex_index\nend_header\n"
+
+
+def test_a_ply_of_text_with_vertex_index_in_place_of_vertex_indices_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    path.write_text(f"{PLY_VERTICES}{PLY_FACES}0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    assert clrecon.read_mesh(path).triangles.tolist() == [[0, 1, 2]]
+
+
+def test_only_scalars_of_a_ply_whose_name_is_plain_become_values(tmp_path: Path) -> None:
     columns = "".join(f"property float {name}\n" for name in ("confidence", "scalar_HU", "scalar_2nd", "scalar_"))
-    rows = "".join(f"{point} 1 {n} 3 4\n" for n, point in enumerate(("0 0 0", "1 0 0", "0 1 0")))
-    faces = "element face 1\nproperty list uchar int vertex_index\nend_header\n"
-    ply.write_text(f"{head}{columns}{faces}{rows}3 0 1 2\n")
-    assert {name: values.tolist() for name, values in clrecon.read_mesh(ply).values.items()} == {"HU": [0, 1, 2]}
+    rows = "".join(f"{point} 1 {number} 3 4\n" for number, point in enumerate(("0 0 0", "1 0 0", "0 1 0")))
+    path = tmp_path / "a.ply"
+    path.write_text(f"{PLY_VERTICES}{columns}{PLY_FACES}{rows}3 0 1 2\n")
+    assert {name: values.tolist() for name, values in clrecon.read_mesh(path).values.items()} == {"HU": [0, 1, 2]}
 
 
-def test_polygons_are_looked_for_in_the_first_mebibyte(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("beyond", "found"), [(0, True), (1, False)], ids=["at its end", "a byte beyond"])
+def test_polygons_of_a_vtp_are_looked_for_in_the_first_mebibyte(tmp_path: Path, beyond: int, found: bool) -> None:
     mark = b'NumberOfPolys="1"'
-    for before, found in ((2**20 - len(mark), True), (2**20 - len(mark) + 1, False)):
-        (tmp_path / "a.vtp").write_bytes(bytes(before) + mark + bytes(9))
-        assert has_polygons(tmp_path / "a.vtp") == found
+    (tmp_path / "a.vtp").write_bytes(bytes(2**20 - len(mark) + beyond) + mark + bytes(9))
+    assert has_polygons(tmp_path / "a.vtp") == found
 
 
-def test_corners_are_joined_where_they_are_equal() -> None:
-    corners = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 0, 0), (-0.0, 0, 0), (0, 1, 1)], np.float32)
-    vertices, triangles = join_corners(corners)
-    assert len(vertices) == 4 and np.array_equal(vertices[triangles].reshape(-1, 3), corners)
-    broken = corners.copy()
-    broken[2, 0] = np.nan
-    assert len(join_corners(broken)[1]) == 2
+CORNERS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 0, 0), (-0.0, 0, 0), (0, 1, 1)], np.float32)
+"""Of two triangles; their corners 0 and 4, 1 and 3 are equal."""
 
 
-def test_harmed_files_are_refused_in_one_line(tmp_path: Path) -> None:
-    whole = tmp_path / "ball.stl"
-    BALL.save(whole)
-    stl = whole.read_bytes()
-    BALL.save(tmp_path / "ball.ply")
-    ply = (tmp_path / "ball.ply").read_bytes()
-    nan = bytearray(stl)
-    nan[84 + 12 : 84 + 16] = np.float32(np.nan).tobytes()
-    quads = ply.replace(b"property list uchar int vertex_indices", b"property list uchar int vertex_indexes")
-    far = bytearray(ply)
-    far[-4:] = b"\xff\xff\xff\x7f"
-    four = bytearray(ply)
-    four[-13] = 4
-    for name, content, text in (
-        ("cut.stl", stl[:-7], "cut or corrupt"),
-        ("long.stl", stl + b"0", "cut or corrupt"),
-        ("nan.stl", bytes(nan), "not finite"),
-        ("empty.stl", b"", "cut or corrupt"),
-        ("text.stl", b"solid\nfacet\nvertex 1 2 3\n", "whole facets"),
-        ("words.stl", b"solid\nvertex a b c\nvertex 1 2 3\nvertex 1 2 3\nendfacet\n", "cut or corrupt"),
-        ("cut.ply", ply[:-3], "cut or corrupt"),
-        ("far.ply", bytes(far), "refers to vertex"),
-        ("four.ply", bytes(four), "4 corners"),
-        ("lists.ply", quads, "one list, of vertices, is read"),
-        (
-            "cloud.ply",
-            ply[: ply.index(b"element face")] + b"end_header\n" + ply[ply.index(b"end_header") + 11 :],
-            "no faces",
-        ),
-    ):
-        path = tmp_path / name
-        path.write_bytes(content)
-        with pytest.raises(RefusedInputError, match=text) as error:
-            clrecon.read_mesh(path)
-        assert "\n" not in str(error.value) and name in str(error.value)
+def test_equal_corners_of_triangles_become_one_vertex() -> None:
+    vertices, triangles = join_corners(CORNERS)
+    assert len(vertices) == 4
+    assert np.array_equal(vertices[triangles].reshape(-1, 3), CORNERS)
+
+
+def test_corners_that_are_not_finite_leave_both_triangles() -> None:
+    with_nan = CORNERS.copy()
+    with_nan[2, 0] = np.nan
+    assert len(join_corners(with_nan)[1]) == 2
+
+
+def stl_with_nan(stl: bytes) -> bytes:
+    first_corner = 84 + 12  # after the head, the count and the normal
+    return stl[:first_corner] + np.float32(np.nan).tobytes() + stl[first_corner + 4 :]
+
+
+def ply_without_faces(ply: bytes) -> bytes:
+    return ply[: ply.index(b"element face")] + b"end_header\n" + ply[ply.index(b"end_header") + 11 :]
+
+
+HARMED_STL: dict[str, tuple[Callable[[bytes], bytes], str]] = {
+    "last bytes cut": (lambda stl: stl[:-7], "cut or corrupt"),
+    "a byte too many": (lambda stl: stl + b"0", "cut or corrupt"),
+    "corner of NaN": (stl_with_nan, "not finite"),
+    "empty": (lambda _: b"", "cut or corrupt"),
+    "text of one corner": (lambda _: b"solid\nfacet\nvertex 1 2 3\n", "whole facets"),
+    "text of words": (lambda _: b"solid\nvertex a b c\nvertex 1 2 3\nvertex 1 2 3\nendfacet\n", "cut or corrupt"),
+}
+HARMED_PLY: dict[str, tuple[Callable[[bytes], bytes], str]] = {
+    "last bytes cut": (lambda ply: ply[:-3], "cut or corrupt"),
+    "corner beyond the vertices": (lambda ply: ply[:-4] + b"\xff\xff\xff\x7f", "refers to vertex"),
+    "face of four corners": (lambda ply: ply[:-13] + b"\x04" + ply[-12:], "4 corners"),
+    "list of another name": (
+        lambda ply: ply.replace(b"property list uchar int vertex_indices", b"property list uchar int vertex_indexes"),
+        "one list, of vertices, is read",
+    ),
+    "no faces": (ply_without_faces, "no faces"),
+}
+HARMED = [(".stl", *row) for row in HARMED_STL.values()] + [(".ply", *row) for row in HARMED_PLY.values()]
+HARMED_IDS = [f"stl, {name}" for name in HARMED_STL] + [f"ply, {name}" for name in HARMED_PLY]
+
+
+@pytest.mark.parametrize(("extension", "harm", "words"), HARMED, ids=HARMED_IDS)
+def test_a_harmed_file_is_refused_in_one_line_that_names_it(
+    tmp_path: Path, extension: str, harm: Callable[[bytes], bytes], words: str
+) -> None:
+    path = tmp_path / f"ball{extension}"
+    BALL.save(path)
+    path.write_bytes(harm(path.read_bytes()))
+    with pytest.raises(RefusedInputError, match=words) as error:
+        clrecon.read_mesh(path)
+    assert_one_line(error.value, path.name)
+
+
+def test_a_format_that_is_not_read_is_refused_with_those_that_are(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"\.stl, \.ply"):
         clrecon.read_mesh(tmp_path / "a.off")
-    with pytest.raises(UsageError, match=f"there is no mesh {tmp_path}/missing.stl"):
+
+
+def test_a_missing_file_is_refused_with_its_path(tmp_path: Path) -> None:
+    with refused(UsageError, f"{tmp_path}/missing.stl"):
         clrecon.read_mesh(tmp_path / "missing.stl")

@@ -23,83 +23,102 @@ def nearest(mesh, point):
 @pytest.mark.parametrize(
     ("point", "distance"),
     [
-        ((1, 1, 2), 2.0),
-        ((1, 1, -2), 2.0),
-        ((1, 1, 0), 0.0),
-        ((4, 0, 0), 0.0),
-        ((1, -3, 4), 5.0),
-        ((-2, -1, 2), 3.0),
-        ((7, 0, 4), 5.0),
-        ((2 + 3, 1.5 + 4, 0), 5.0),
-        ((2 + 3, 1.5 + 4, 12), 13.0),
+        pytest.param((1, 1, 2), 2.0, id="above the face"),
+        pytest.param((1, 1, -2), 2.0, id="below the face"),
+        pytest.param((1, 1, 0), 0.0, id="in the face"),
+        pytest.param((4, 0, 0), 0.0, id="at a corner"),
+        pytest.param((1, -3, 4), 5.0, id="beside an edge"),
+        pytest.param((-2, -1, 2), 3.0, id="beyond one corner"),
+        pytest.param((7, 0, 4), 5.0, id="beyond another corner"),
+        pytest.param((2 + 3, 1.5 + 4, 0), 5.0, id="beside the long edge"),
+        pytest.param((2 + 3, 1.5 + 4, 12), 13.0, id="beside the long edge and above"),
     ],
 )
 def test_nearest_distance_is_exact_over_faces_edges_and_corners(point, distance):
     assert nearest(TRIANGLE, point) == (0, pytest.approx(distance, abs=tolerances.NEAREST_MM))
 
 
-def test_a_triangle_without_area_is_its_edges():
-    line = (np.array([[0, 0, 0], [2, 0, 0], [6, 0, 0]]), np.array([[0, 1, 2]]))
-    assert nearest(line, (4, 3, 0))[1] == pytest.approx(3.0)
-    spot = (np.array([[1.0, 2, 3]]), np.array([[0, 0, 0]]))
-    assert nearest(spot, (1, 2, 7))[1] == pytest.approx(4.0)
+@pytest.mark.parametrize(
+    ("vertices", "triangle", "point", "distance"),
+    [([[0, 0, 0], [2, 0, 0], [6, 0, 0]], [0, 1, 2], (4, 3, 0), 3.0), ([[1.0, 2, 3]], [0, 0, 0], (1, 2, 7), 4.0)],
+    ids=["line", "point"],
+)
+def test_distance_to_a_triangle_without_area_is_that_to_its_edges(vertices, triangle, point, distance):
+    assert nearest((np.array(vertices), np.array([triangle])), point) == (0, pytest.approx(distance))
 
 
-def test_a_large_face_beats_a_near_corner():
-    """The nearest corner of all belongs to another triangle than the nearest face."""
-    large = (np.array([[-50, -50, 0], [50, -50, 0], [0, 80, 0]]), np.array([[0, 1, 2]]))
+@pytest.mark.parametrize(
+    ("point", "triangle", "distance"),
+    [((0, 0, 2), 1, 2.0), ((0, 0, 5), 0, 1.0)],
+    ids=["near the large face", "near the small triangle"],
+)
+def test_the_nearest_face_is_found_where_the_nearest_corner_belongs_to_another_triangle(point, triangle, distance):
+    """The small triangle lies 6 mm over the middle of the large one, whose corners are 70 mm away."""
     small = (np.array([[0, 0, 6], [1, 0, 6], [0, 1, 6]]), np.array([[0, 1, 2]]))
-    assert nearest(samples.join(small, large), (0, 0, 2)) == (1, pytest.approx(2.0))
-    assert nearest(samples.join(small, large), (0, 0, 5)) == (0, pytest.approx(1.0))
+    large = (np.array([[-50, -50, 0], [50, -50, 0], [0, 80, 0]]), np.array([[0, 1, 2]]))
+    assert nearest(samples.join(small, large), point) == (triangle, pytest.approx(distance))
 
 
-def test_nearest_of_two_equal_triangles_is_the_first():
+def test_of_triangles_at_equal_distance_the_first_is_found():
+    """The origin lies 2 mm from a box of 12 triangles on the right, and from one on the left."""
     mesh = samples.join(samples.box((2, 0, 0)), samples.box((-3, 0, 0)))
     triangle, distance = nearest(mesh, (0, 0.5, 0.5))
     assert distance == pytest.approx(2.0)
     assert triangle < 12
 
 
-@pytest.mark.parametrize("radius", [0.0, 3.0, 9.9, 14.0])
-def test_distance_from_a_sphere_equals_brute_force(radius):
-    vertices, triangles = samples.sphere((1000.0, -2000.0, 500.0), 10.0, 4)
-    direction = np.array([0.36, -0.48, 0.8])
-    point = np.array([1000.0, -2000.0, 500.0]) + radius * direction
+@pytest.mark.parametrize("from_centre_mm", [0.0, 3.0, 9.9, 14.0])
+def test_distance_to_a_sphere_is_that_to_the_nearest_of_many_points_on_its_triangles(from_centre_mm):
+    centre = np.array([1000.0, -2000.0, 500.0])
+    vertices, triangles = samples.sphere(centre, 10.0, 4)
+    point = centre + from_centre_mm * np.array([0.36, -0.48, 0.8])  # a direction of length 1
+
     _, distance = nearest((vertices, triangles), point)
+
     a, b, c = (vertices.astype(np.float32).astype(float)[triangles[:, corner]] for corner in range(3))
-    share = np.random.default_rng(4).dirichlet((1, 1, 1), 400)
-    sampled = share[:, :1, None] * a + share[:, 1:2, None] * b + share[:, 2:, None] * c
-    least = np.linalg.norm(sampled - point, axis=2).min()
+    share = np.random.default_rng(4).dirichlet((1, 1, 1), 400)  # 400 points on each triangle
+    points_on_triangles = share[:, :1, None] * a + share[:, 1:2, None] * b + share[:, 2:, None] * c
+    least = np.linalg.norm(points_on_triangles - point, axis=2).min()
     assert distance <= least
     assert distance == pytest.approx(least, abs=tolerances.NEAREST_SAMPLED_MM)
 
 
-def test_nearest_of_equal_triangles_is_the_first_wherever_they_lie():
+@pytest.mark.parametrize("seed", range(40))
+def test_of_triangles_at_equal_distance_the_first_is_found_wherever_they_lie(seed):
     """A point half way between two boxes, whose coordinates are rounded differently at each place."""
-    for place in np.random.default_rng(6).uniform(-900, 900, (40, 3)):
-        boxes = samples.join(samples.box((2.1, 0, 0)), samples.box((-3.1, 0, 0)))
-        triangle, distance = nearest((boxes[0] + place, boxes[1]), place + (0, 0.5, 0.5))
-        assert distance == pytest.approx(2.1, abs=1e-3)
-        assert triangle < 12
+    place = np.random.default_rng(seed).uniform(-900, 900, 3)
+    vertices, triangles = samples.join(samples.box((2.1, 0, 0)), samples.box((-3.1, 0, 0)))
+    triangle, distance = nearest((vertices + place, triangles), place + (0, 0.5, 0.5))
+    assert distance == pytest.approx(2.1, abs=tolerances.FLOAT32_POINT_MM)
+    assert triangle < 12
 
 
 @pytest.mark.parametrize("scale", [0.125, 32.0])
-def test_short_and_long_edges_have_the_distance_of_their_scale(scale):
+@pytest.mark.parametrize(
+    ("point", "distance"),
+    [((1, -3, 4), 5.0), ((7, 0, 4), 5.0), ((-2, 1.5, 0), 2.0), ((5, 5.5, 12), 13.0)],
+    ids=["beside an edge", "beyond a corner", "beside another edge", "beside the long edge"],
+)
+def test_distance_to_a_larger_or_smaller_triangle_is_larger_or_smaller_alike(point, distance, scale):
     vertices, triangles = TRIANGLE
-    for point, distance in (((1, -3, 4), 5.0), ((7, 0, 4), 5.0), ((-2, 1.5, 0), 2.0), ((5, 5.5, 12), 13.0)):
-        found = nearest((scale * vertices, triangles), scale * np.array(point))
-        assert found == (0, pytest.approx(scale * distance, rel=1e-12))
+    scaled = nearest((scale * vertices, triangles), scale * np.array(point))
+    assert scaled == (0, pytest.approx(scale * distance, rel=tolerances.FLOAT64_SHARE))
 
 
 def test_only_triangles_whose_box_is_near_are_measured_exactly(monkeypatch):
+    """A row of 100 cubes, and a point 1 mm over one of them."""
     measured = []
-    exactly = searching._distances_from_origin
+    measure = searching._distances_from_origin
 
-    def watch(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    def count_and_measure(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
         measured.append(len(a))
-        return exactly(a, b, c)
+        return measure(a, b, c)
 
-    monkeypatch.setattr(searching, "_distances_from_origin", watch)
-    squares = samples.join(*(samples.box((3 * k, 0, 0)) for k in range(100)))
-    assert nearest(squares, (30.5, 0.5, 2.0))[1] == pytest.approx(1.0)
-    assert measured == [2 + 2 * 4]  # of one box: the two faces on top, and two on each side, whose boxes reach up to it
+    monkeypatch.setattr(searching, "_distances_from_origin", count_and_measure)
+    cubes = samples.join(*(samples.box((3 * k, 0, 0)) for k in range(100)))
+    _, distance = nearest(cubes, (30.5, 0.5, 2.0))
+
+    assert distance == pytest.approx(1.0)
+    assert measured == [
+        2 + 2 * 4
+    ]  # of one cube: two triangles on top, and two on each side, whose boxes reach up to it

@@ -33,7 +33,7 @@ def figures(quality: dict, *names: str) -> tuple:
     return tuple(quality[name] for name in names)
 
 
-def test_a_box_far_from_the_origin_has_its_area_and_volume():
+def test_quality_of_a_box_far_from_the_origin_has_every_figure_of_a_sound_mesh():
     quality = measure(samples.box(FAR, (2.0, 3.0, 5.5)))
     assert quality == {
         "vertices": 8,
@@ -53,8 +53,8 @@ def test_a_box_far_from_the_origin_has_its_area_and_volume():
         "duplicate_faces": 0,
         "unused_vertices": 0,
         "shortest_edge_mm": 2.0,
-        "area_mm2": pytest.approx(67.0, rel=tolerances.MESH_VOLUME),
-        "volume_ml": pytest.approx(0.033, rel=tolerances.MESH_VOLUME),
+        "area_mm2": pytest.approx(2 * (2.0 * 3.0 + 3.0 * 5.5 + 5.5 * 2.0), rel=tolerances.MESH_VOLUME),
+        "volume_ml": pytest.approx(2.0 * 3.0 * 5.5 / 1000.0, rel=tolerances.MESH_VOLUME),
         "outward": True,
         "bounds_mm": [FAR.tolist(), (FAR + (2.0, 3.0, 5.5)).tolist()],
         "self_intersections": None,
@@ -64,221 +64,279 @@ def test_a_box_far_from_the_origin_has_its_area_and_volume():
 def test_torus_has_one_handle():
     quality = measure(samples.torus())
     assert figures(quality, "closed", "manifold", "euler_number", "genus", "components") == (True, True, 0, 1, 1)
-    assert {type(quality[name]) for name in ("euler_number", "genus", "components")} == {int}  # as in JSON: 1, not 1.0
-    assert quality["volume_ml"] == pytest.approx(samples.torus_volume_ml(), rel=tolerances.MESH_VOLUME)
-    # The triangles lie inside the torus (major 20, minor 6), less than a fifth of it is lost.
-    exact = 2 * np.pi**2 * 20.0 * 6.0**2 / 1000.0
-    assert 0.8 * exact < quality["volume_ml"] < exact
 
 
-def test_quality_counts_two_spheres_and_a_cavity_with_its_volume():
-    vertices, triangles = samples.join(
-        samples.sphere((-30, 5, 2), 10), samples.sphere((40, 0, 0), 7), samples.sphere((-30, 5, 2), 4)
+def test_counts_are_whole_numbers_as_in_json():
+    quality = measure(samples.torus())
+    assert {type(quality[name]) for name in ("euler_number", "genus", "components")} == {int}  # 1, not 1.0
+
+
+def test_volume_of_a_torus_is_the_sum_of_its_tetrahedra():
+    volume_ml = measure(samples.torus())["volume_ml"]
+    assert volume_ml == pytest.approx(samples.torus_volume_ml(), rel=tolerances.MESH_VOLUME)
+    # The triangles lie inside of the round torus (major 20, minor 6 mm): measured 0.87 of its volume.
+    round_ml = 2 * np.pi**2 * 20.0 * 6.0**2 / 1000.0
+    assert 0.8 * round_ml < volume_ml < round_ml
+
+
+@pytest.fixture
+def two_spheres_and_a_cavity():
+    """Quality of spheres of 10 and 7 mm, with a cavity of 4 mm in the first."""
+    large, small, cavity = (
+        samples.sphere((-30, 5, 2), 10),
+        samples.sphere((40, 0, 0), 7),
+        samples.sphere((-30, 5, 2), 4),
     )
-    triangles[-128:] = triangles[-128:, ::-1]  # the wall of the cavity looks inward
-    quality = measure((vertices, triangles))
-    assert figures(quality, "closed", "manifold", "components", "euler_number", "genus") == (True, True, 3, 6, 0)
-    one = measure(samples.sphere(radius=1))["volume_ml"]
-    assert quality["volume_ml"] == pytest.approx(one * (10**3 + 7**3 - 4**3), rel=tolerances.MESH_VOLUME)
-    assert quality["area_mm2"] == pytest.approx(measure(samples.sphere(radius=1))["area_mm2"] * (100 + 49 + 16))
+    inward = (cavity[0], cavity[1][:, ::-1])
+    return measure(samples.join(large, small, inward))
 
 
-def test_inside_out_mesh_has_a_negative_volume():
+def test_two_spheres_and_a_cavity_are_three_closed_components_without_a_handle(two_spheres_and_a_cavity):
+    names = ("closed", "manifold", "components", "euler_number", "genus")
+    assert figures(two_spheres_and_a_cavity, *names) == (True, True, 3, 6, 0)
+
+
+def test_volume_of_a_cavity_is_taken_off_and_its_area_is_added(two_spheres_and_a_cavity):
+    unit = measure(samples.sphere(radius=1))
+    volume_ml = unit["volume_ml"] * (10**3 + 7**3 - 4**3)
+    area_mm2 = unit["area_mm2"] * (10**2 + 7**2 + 4**2)
+    assert two_spheres_and_a_cavity["volume_ml"] == pytest.approx(volume_ml, rel=tolerances.MESH_VOLUME)
+    assert two_spheres_and_a_cavity["area_mm2"] == pytest.approx(area_mm2, rel=tolerances.MESH_VOLUME)
+
+
+def test_inside_out_mesh_is_sound_but_not_outward_and_has_a_negative_volume():
     vertices, triangles = samples.box(FAR)
     quality = measure((vertices, triangles[:, ::-1]))
     assert figures(quality, "closed", "manifold", "oriented", "outward") == (True, True, True, False)
-    assert quality["volume_ml"] == pytest.approx(-0.001)
+    assert quality["volume_ml"] == pytest.approx(-0.001)  # a cube of 1 mm
 
 
-def test_a_hole_opens_the_mesh_and_changes_its_euler_number():
+def test_a_missing_face_leaves_three_boundary_edges_an_euler_number_of_1_and_no_genus():
     vertices, triangles = samples.sphere()
-    quality = measure((vertices, np.delete(triangles, 17, axis=0)))
-    assert figures(quality, "closed", "manifold", "boundary_edges", "euler_number", "genus") == (
-        False,
-        True,
-        3,
-        1,
-        None,
-    )
+    quality = measure((vertices, np.delete(triangles, 17, axis=0)))  # 17: any face
+    names = ("closed", "manifold", "boundary_edges", "euler_number", "genus")
+    assert figures(quality, *names) == (False, True, 3, 1, None)
 
 
 def test_volume_of_an_open_surface_does_not_depend_on_its_place():
     vertices, triangles = samples.box((0, 0, 0), (2, 2, 2))
     opened = np.delete(triangles, 4, axis=0)
-    here, there = measure((vertices, opened)), measure((vertices + (4096, -8192, 512), opened))
-    assert there["volume_ml"] == here["volume_ml"] == pytest.approx(0.008 * 11 / 12)
+    here = measure((vertices, opened))["volume_ml"]
+    there = measure((vertices + (4096, -8192, 512), opened))["volume_ml"]
+    assert there == here == pytest.approx(0.008 * 11 / 12)  # pyramids from the centre over 11 of 12 equal faces
 
 
-def test_a_flipped_face_is_not_oriented_but_closed():
+def test_a_mesh_with_a_flipped_face_is_closed_but_neither_oriented_nor_manifold():
     vertices, triangles = samples.torus()
-    triangles[40] = triangles[40, ::-1]
+    triangles[40] = triangles[40, ::-1]  # 40: any face
     quality = measure((vertices, triangles))
     assert figures(quality, "closed", "oriented", "manifold", "genus") == (True, False, False, None)
     assert figures(quality, "nonmanifold_edges", "nonmanifold_vertices", "boundary_edges") == (0, 0, 0)
 
 
-def test_moebius_strip_cannot_be_oriented():
-    quality = measure(samples.moebius())
+def test_moebius_strip_is_neither_oriented_nor_manifold_and_has_one_boundary():
+    quality = measure(samples.moebius(pieces=11))
     assert figures(quality, "oriented", "manifold", "closed", "euler_number") == (False, False, False, 0)
-    assert figures(quality, "nonmanifold_edges", "nonmanifold_vertices", "boundary_edges") == (0, 0, 22)
+    # Each of the 11 pieces has an edge on either side of the strip.
+    assert figures(quality, "nonmanifold_edges", "nonmanifold_vertices", "boundary_edges") == (0, 0, 2 * 11)
 
 
-def test_boxes_that_touch_in_a_corner_are_closed_and_not_manifold():
+def test_boxes_that_share_a_corner_are_closed_and_not_manifold_at_one_vertex():
     quality = measure(samples.weld(samples.join(samples.box(), samples.box((1, 1, 1)))))
+    assert quality["vertices"] == 2 * 8 - 1
     assert figures(quality, "closed", "oriented", "nonmanifold_edges", "nonmanifold_vertices") == (True, True, 0, 1)
-    assert figures(quality, "manifold", "components", "genus", "vertices") == (False, 1, None, 15)
+    assert figures(quality, "manifold", "components", "genus") == (False, 1, None)
 
 
-def test_open_fans_that_touch_in_a_corner_are_not_manifold():
+def test_two_triangles_that_share_one_corner_alone_are_not_manifold():
     vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]]
     quality = measure((vertices, [[0, 1, 2], [0, 3, 4]]))
     assert figures(quality, "nonmanifold_vertices", "manifold", "boundary_edges", "components") == (1, False, 6, 1)
 
 
-def test_boxes_that_share_an_edge_are_not_manifold():
+def test_boxes_that_share_an_edge_are_not_manifold_and_not_closed():
     quality = measure(samples.weld(samples.join(samples.box(), samples.box((1, 1, 0)))))
     assert figures(quality, "nonmanifold_edges", "closed", "manifold", "boundary_edges") == (1, False, False, 0)
     assert quality["genus"] is None
 
 
-def test_duplicate_faces_are_counted_in_any_order():
+def test_duplicate_faces_are_counted_whatever_the_order_of_their_corners():
     vertices, triangles = samples.box()
-    more = np.concatenate([triangles, triangles[3:4, [1, 2, 0]], triangles[3:4, ::-1], triangles[7:8]])
-    quality = measure((vertices, more))
+    turned, reversed_corners, same = triangles[3:4, [1, 2, 0]], triangles[3:4, ::-1], triangles[7:8]
+    quality = measure((vertices, np.concatenate([triangles, turned, reversed_corners, same])))
     assert figures(quality, "duplicate_faces", "closed", "manifold", "oriented") == (3, False, False, False)
 
 
-def test_faces_without_area_are_counted():
+def test_faces_whose_corners_lie_in_a_line_or_at_one_place_are_counted_as_without_area():
     vertices, triangles = samples.box(FAR)
-    vertices = np.concatenate([vertices, vertices[:1] + [0.5, 0, 0], vertices[:1]])
-    quality = measure((vertices, np.concatenate([triangles, [[0, 8, 1], [0, 9, 1], [2, 2, 3]]])))
+    on_an_edge = vertices[0] + [0.5, 0, 0]  # vertex 8: half way from vertex 0 to 1
+    at_a_corner = vertices[0]  # vertex 9
+    flat = [[0, 8, 1], [0, 9, 1], [2, 2, 3]]
+    quality = measure((np.concatenate([vertices, [on_an_edge, at_a_corner]]), np.concatenate([triangles, flat])))
     assert figures(quality, "zero_area_faces", "manifold", "unused_vertices") == (3, False, 0)
 
 
-def test_face_with_one_vertex_twice_is_not_manifold():
+def test_face_with_one_vertex_twice_has_no_area_and_is_not_manifold():
     vertices, triangles = samples.box()
     quality = measure((vertices, np.concatenate([np.delete(triangles, 0, axis=0), [[4, 4, 5]]])))
     assert quality["manifold"] is False
     assert quality["zero_area_faces"] == 1
 
 
-def test_unused_vertices_are_no_components():
+def test_unused_vertices_are_counted_and_are_no_components():
     vertices, triangles = samples.box()
-    quality = measure((np.concatenate([[[9.0, 9, 9]], vertices, [[8.0, 8, 8]]]), triangles + 1))
+    with_two_more = np.concatenate([[[9.0, 9, 9]], vertices, [[8.0, 8, 8]]])
+    quality = measure((with_two_more, triangles + 1))
     assert figures(quality, "unused_vertices", "components", "euler_number", "genus") == (2, 1, 2, 0)
 
 
-def test_empty_mesh_has_no_figures():
+def test_quality_of_an_empty_mesh_is_zeros_open_and_without_bounds():
     quality = measure(([], []))
     assert figures(quality, "vertices", "triangles", "closed", "manifold", "components") == (0, 0, False, False, 0)
     assert figures(quality, "area_mm2", "volume_ml", "bounds_mm", "outward") == (0.0, 0.0, None, False)
 
 
-def test_order_of_vertices_and_faces_does_not_matter():
+def test_quality_does_not_depend_on_the_order_of_vertices_faces_and_corners():
     rng = np.random.default_rng(5)
     vertices, triangles = samples.join(samples.torus(), samples.sphere((60, 3, 1)))
-    place = rng.permutation(len(vertices))
+    new_number = rng.permutation(len(vertices))
     moved = np.empty_like(vertices)
-    moved[place] = vertices
-    turned = np.array([np.roll(row, rng.integers(3)) for row in place[triangles]])
+    moved[new_number] = vertices
+    turned = np.array([np.roll(row, rng.integers(3)) for row in new_number[triangles]])
+
     one, other = measure((vertices, triangles)), measure((moved, rng.permutation(turned)))
+
     assert other == {name: pytest.approx(value) if type(value) is float else value for name, value in one.items()}
-    assert one["genus"] == 1
 
 
-def test_quality_of_a_mesh_of_several_pieces_is_right():
-    quality = measure(samples.torus(250, 131))
-    assert figures(quality, "triangles", "closed", "manifold", "genus") == (65500, True, True, 1)
-    assert quality["volume_ml"] == pytest.approx(samples.torus_volume_ml(250, 131), rel=tolerances.MESH_VOLUME)
+def test_quality_of_a_mesh_that_is_measured_in_pieces_is_that_of_the_whole():
+    rings, sides = 250, 131  # 65,500 triangles; a piece holds 16,384
+    quality = measure(samples.torus(rings, sides))
+    assert figures(quality, "triangles", "closed", "manifold", "genus") == (2 * rings * sides, True, True, 1)
+    assert quality["volume_ml"] == pytest.approx(samples.torus_volume_ml(rings, sides), rel=tolerances.MESH_VOLUME)
 
 
-def test_wrong_index_is_refused():
+def test_a_triangle_that_names_a_missing_vertex_is_refused():
     with refused(UsageError, 3, "vertex"):
         measure_quality(np.zeros((3, 3), np.float32), np.array([[0, 1, 3]], np.uint32))
 
 
-def test_shortest_edge_is_measured():
+@pytest.mark.parametrize("edge", [[0, 1], [1, 2], [2, 0]], ids=["first", "second", "third"])
+def test_shortest_edge_is_measured_wherever_it_stands_in_its_triangle(edge):
+    """One edge of a triangle of the box shrinks to 1/64: it is the shortest, 2 to 6.3 mm before."""
     vertices, triangles = samples.box((0, 0, 0), (2.0, 3.0, 5.5))
-    for low, high in triangles[7, [[0, 1], [1, 2], [2, 0]]]:
-        near = vertices.copy()
-        near[high] = near[low] + (near[high] - near[low]) / 64
-        expected = min(
-            np.linalg.norm(near[a] - near[b]) for a, b, _ in np.concatenate([triangles, triangles[:, [1, 2, 0]]])
-        )
-        assert measure((near, triangles))["shortest_edge_mm"] == pytest.approx(expected, rel=tolerances.MESH_VOLUME)
+    low, high = triangles[7, edge]
+    towards = (vertices[high] - vertices[low]) / 64
+    vertices[high] = vertices[low] + towards
+    expected = np.linalg.norm(towards)
+    assert measure((vertices, triangles))["shortest_edge_mm"] == pytest.approx(expected, rel=tolerances.MESH_VOLUME)
+
+
+def test_an_empty_mesh_has_no_shortest_edge():
     assert measure(([], []))["shortest_edge_mm"] is None
 
 
-@pytest.mark.parametrize("size", [1, 40, 100_000])
-def test_order_by_number_is_a_stable_sort(size):
-    numbers = np.random.default_rng(size).integers(0, size, 300)
-    np.testing.assert_array_equal(order_by_number(numbers, size), np.argsort(numbers, kind="stable"))
+@pytest.mark.parametrize("limit", [1, 40, 100_000], ids=["all equal", "many equal", "few equal"])
+def test_order_by_number_is_a_stable_sort(limit):
+    numbers = np.random.default_rng(limit).integers(0, limit, 300)
+    np.testing.assert_array_equal(order_by_number(numbers, limit), np.argsort(numbers, kind="stable"))
 
 
-def test_going_round_the_vertices_finds_what_joining_the_corners_finds():
-    """Spheres glued in vertices at random: both ways of looking for split vertices, faces around them in any order."""
+@pytest.fixture
+def glued_spheres():
+    """Triangles and vertex count of six spheres; each after the first shares a random vertex with the first."""
     rng = np.random.default_rng(11)
-    vertices, triangles = samples.join(*[samples.sphere(rounds=1)] * 6)
-    place = np.arange(len(vertices))
-    for ball, (one, other) in enumerate(rng.integers(0, len(vertices) // 6, (5, 2)) + [0, len(vertices) // 6]):
-        place[place == place[ball * len(vertices) // 6 + one]] = place[ball * len(vertices) // 6 + other]
-    glued = rng.permutation(place[triangles]).astype(np.uint32)
-    edges = find_edges(glued, len(vertices))
-    opposite = opposite_half_edges(glued, edges)
-    assert opposite is not None
-    found = find_split_vertices(glued, len(vertices), edges, opposite)
-    np.testing.assert_array_equal(found, find_split_vertices(glued, len(vertices), edges))
-    assert 3 <= len(found) <= 5
-    assert count_duplicate_faces(glued, len(vertices), opposite) == count_duplicate_faces(glued, len(vertices)) == 0
+    spheres = 6
+    vertices, triangles = samples.join(*[samples.sphere(rounds=1)] * spheres)
+    of_a_sphere = len(vertices) // spheres
+    number = np.arange(len(vertices))
+    for start in of_a_sphere * np.arange(1, spheres):
+        number[start + rng.integers(of_a_sphere)] = rng.integers(of_a_sphere)
+    return rng.permutation(number[triangles]).astype(np.uint32), len(vertices)
 
 
-def test_all_faces_with_the_vertices_of_another_are_found():
-    _, triangles = samples.sphere(rounds=1)
-    triangles = np.concatenate([triangles, triangles[[5, 9]][:, (2, 0, 1)], triangles[[9]][:, (1, 0, 2)]]).astype(
-        np.uint32
-    )
-    last = len(triangles) - 3
-    assert find_duplicate_faces(triangles, int(triangles.max()) + 1).tolist() == [5, 9, last, last + 1, last + 2]
-    assert count_duplicate_faces(triangles, int(triangles.max()) + 1) == 3
-    assert len(find_duplicate_faces(triangles[:-3], int(triangles.max()) + 1)) == 0
+def test_split_vertices_are_the_same_by_neighbouring_half_edges_and_by_joined_corners(glued_spheres):
+    triangles, count = glued_spheres
+    edges = find_edges(triangles, count)
+    opposite = opposite_half_edges(triangles, edges)
+    by_half_edges = find_split_vertices(triangles, count, edges, opposite)
+    by_corners = find_split_vertices(triangles, count, edges)
+    assert 3 <= len(by_corners) <= 5  # five vertices were drawn from 18, some of them perhaps twice
+    np.testing.assert_array_equal(by_half_edges, by_corners)
 
 
-def test_vertex_with_many_faces_is_manifold():
-    top = np.column_stack([np.cos(np.arange(200) * np.pi / 100), np.sin(np.arange(200) * np.pi / 100), np.zeros(200)])
-    ring, after = np.arange(200) + 2, (np.arange(200) + 1) % 200 + 2
-    cone = [[0, a, b] for a, b in zip(ring, after, strict=True)] + [[1, b, a] for a, b in zip(ring, after, strict=True)]
-    quality = measure((np.concatenate([[[0, 0, 1], [0, 0, -1]], top]), cone))
+def test_spheres_that_share_vertices_have_no_duplicate_faces(glued_spheres):
+    triangles, count = glued_spheres
+    opposite = opposite_half_edges(triangles, find_edges(triangles, count))
+    assert count_duplicate_faces(triangles, count) == 0
+    assert count_duplicate_faces(triangles, count, opposite) == 0
+
+
+@pytest.fixture
+def sphere_with_three_copied_faces():
+    """Triangles and vertex count of a sphere of 32 faces; the last three are a copy of face 5 and two of face 9."""
+    vertices, triangles = samples.sphere(rounds=1)
+    copies = [triangles[[5]][:, (2, 0, 1)], triangles[[9]][:, (2, 0, 1)], triangles[[9]][:, (1, 0, 2)]]
+    return np.concatenate([triangles, *copies]).astype(np.uint32), len(vertices)
+
+
+def test_duplicate_faces_are_found_with_the_faces_that_they_repeat(sphere_with_three_copied_faces):
+    assert find_duplicate_faces(*sphere_with_three_copied_faces).tolist() == [5, 9, 32, 33, 34]
+
+
+def test_each_face_that_repeats_another_counts_once(sphere_with_three_copied_faces):
+    assert count_duplicate_faces(*sphere_with_three_copied_faces) == 3
+
+
+def test_a_sphere_has_no_duplicate_faces():
+    vertices, triangles = samples.sphere(rounds=1)
+    assert len(find_duplicate_faces(triangles.astype(np.uint32), len(vertices))) == 0
+
+
+def test_a_double_cone_with_200_faces_at_each_tip_is_manifold():
+    rim = 200
+    angle = 2 * np.pi * np.arange(rim) / rim
+    vertices = np.concatenate([[[0, 0, 1], [0, 0, -1]], np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])])
+    upper, lower = 0, 1
+    here = np.arange(rim) + 2
+    there = np.roll(here, -1)
+    triangles = [[upper, a, b] for a, b in zip(here, there, strict=True)]
+    triangles += [[lower, b, a] for a, b in zip(here, there, strict=True)]
+    quality = measure((vertices, triangles))
     assert figures(quality, "closed", "manifold", "genus", "outward") == (True, True, 0, True)
 
 
-def test_two_triangles_back_to_back_are_duplicates_and_closed():
+def test_two_triangles_back_to_back_are_closed_duplicates_without_volume():
     quality = measure(([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [2, 1, 0]]))
     assert figures(quality, "duplicate_faces", "closed", "oriented", "volume_ml") == (1, True, True, 0.0)
 
 
 def test_edges_between_the_highest_vertex_numbers_are_counted():
+    """Two triangles with one edge in common: 5 edges, 4 of them in one triangle only."""
     last = 2**32 - 2
     edges = find_edges(np.array([[0, last - 1, last], [last, last - 1, 1]], np.uint32), last + 1)
     assert (edges.count, edges.boundary, edges.nonmanifold, edges.oriented) == (5, 4, 0, True)
 
 
-def test_vertices_at_one_place_are_joined_before_a_surface_is_called_closed():
-    """Two boxes that touch along an edge, each closed: STL makes one of them, with an edge in four faces."""
-    apart = samples.join(samples.box(), samples.box((2, 2, 0)))
-    edge = samples.join(samples.box(), samples.box((1, 1, 0)))
-    corner = samples.join(samples.box(), samples.box((1, 1, 1)))
-    for mesh, coincident, open_edges in ((apart, 0, 0), (edge, 4, 1), (corner, 2, 0)):
-        quality = Mesh(*mesh).quality()
-        assert (quality["boundary_edges"], quality["nonmanifold_edges"]) == (0, 0)
-        assert (quality["coincident_vertices"], quality["open_edges_by_place"]) == (coincident, open_edges)
-        assert quality["closed"] == (open_edges == 0)
+@pytest.mark.parametrize(
+    ("second_at", "coincident", "open_edges"),
+    [((2, 2, 0), 0, 0), ((1, 1, 0), 4, 1), ((1, 1, 1), 2, 0)],
+    ids=["apart", "common edge", "common corner"],
+)
+def test_vertices_at_one_place_are_joined_before_a_surface_is_called_closed(second_at, coincident, open_edges):
+    """Two closed boxes: STL would join vertices at one place, and put a common edge into four faces."""
+    quality = measure(samples.join(samples.box(), samples.box(second_at)))
+    assert figures(quality, "boundary_edges", "nonmanifold_edges") == (0, 0)
+    assert figures(quality, "coincident_vertices", "open_edges_by_place") == (coincident, open_edges)
+    assert quality["closed"] == (open_edges == 0)
 
 
-def test_vertices_that_nothing_uses_do_not_count_by_place():
+def test_unused_vertices_are_not_coincident_with_used_ones():
     vertices, triangles = samples.box()
     quality = Mesh(np.concatenate([vertices, vertices]), triangles).quality()
     assert (quality["coincident_vertices"], quality["open_edges_by_place"], quality["closed"]) == (0, 0, True)
 
 
-def test_numbers_of_half_edges_take_the_smallest_type_that_holds_them():
-    assert (_index_type(2**31 - 1), _index_type(2**31), _index_type(2**31 + 1)) == (np.int32, np.int64, np.int64)
+@pytest.mark.parametrize(("count", "kind"), [(2**31 - 1, np.int32), (2**31, np.int64), (2**31 + 1, np.int64)])
+def test_numbers_of_half_edges_take_the_smallest_type_that_holds_them(count, kind):
+    assert _index_type(count) == kind

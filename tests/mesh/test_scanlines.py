@@ -1,48 +1,70 @@
-"""Points inside of a closed surface: against the ball, and surfaces whose vertices lie on the lines themselves."""
+"""Points inside of a closed surface: against closed forms, of surfaces whose vertices lie on the lines themselves."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
 
 from clrecon.mesh.scanlines import cross_lines, fill_surface
 
+SURFACE = 1e-3
+"""Points of a lattice that lie on a surface may count on either side: only those farther from it are compared."""
+
 
 def octahedron(radius: float, middle: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices on lines of the lattice, triangles outwards."""
+    """Where |x| + |y| + |z| from the middle is the radius: vertices on lines of the lattice, triangles outwards."""
     vertices = middle + radius * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])
     triangles = [(a, b, c) if (a + b + c) % 2 else (b, a, c) for a in (0, 1) for b in (2, 3) for c in (4, 5)]
     return vertices, np.array(triangles, np.uint32)
 
 
-@pytest.mark.parametrize("radius", [3.0, 3.4, 6.0])
-def test_points_inside_are_those_of_the_closed_form(radius):
-    vertices, triangles = octahedron(radius, 7.0)
-    inside = fill_surface(vertices, triangles, (15, 14, 16))
-    far = sum(np.abs(axis - 7.0) for axis in np.indices((15, 14, 16)))
-    sure = np.abs(far - radius) > 1e-3  # points of the surface itself are on either side
-    assert np.array_equal(inside[sure], far[sure] < radius)
+def octahedral_distance(shape: tuple[int, int, int], middle: float) -> np.ndarray:
+    """Return |x| + |y| + |z| from the middle, for each point of a lattice."""
+    return sum(np.abs(axis - middle) for axis in np.indices(shape))
 
 
-def test_lines_are_crossed_at_their_places():
-    vertices, triangles = octahedron(5.5, 7.0)
-    lines, places, rows = cross_lines(vertices, triangles, (15, 15, 15))
-    a, b = lines // 15, lines % 15
-    assert np.allclose(np.abs(a - 7) + np.abs(b - 7) + np.abs(places - 7.0), 5.5, atol=1e-4)
-    assert (np.bincount(lines) % 2 == 0).all() and set(rows.tolist()) == set(range(8))
+@pytest.mark.parametrize(
+    ("radius", "middle", "shape"),
+    [(3.0, 7.0, (15, 14, 16)), (3.4, 7.0, (15, 14, 16)), (6.0, 7.0, (15, 14, 16)), (6.0, 1.0, (4, 3, 5))],
+    ids=["corners on points", "corners between points", "large", "cut by the lattice"],
+)
+def test_filled_points_are_those_nearer_to_the_middle_than_the_octahedron(radius, middle, shape):
+    inside = fill_surface(*octahedron(radius, middle), shape)
+    distance = octahedral_distance(shape, middle)
+    is_clear = np.abs(distance - radius) > SURFACE
+    assert inside.any()
+    assert np.array_equal(inside[is_clear], distance[is_clear] < radius)
 
 
-def test_mesh_beyond_the_lattice_is_cut():
-    vertices, triangles = octahedron(6.0, 1.0)
-    inside = fill_surface(vertices, triangles, (4, 3, 5))
-    far = sum(np.abs(axis - 1.0) for axis in np.indices((4, 3, 5)))
-    sure = np.abs(far - 6.0) > 1e-3
-    assert np.array_equal(inside[sure], far[sure] < 6.0)
+@pytest.fixture
+def crossings():
+    """Numbers of lines, the place of each crossing along its line, and its triangle: an octahedron of 5.5 about 7."""
+    return cross_lines(*octahedron(5.5, 7.0), (15, 15, 15))
 
 
-def test_a_cavity_is_outside():
-    outer, inner = octahedron(6.3, 7.0), octahedron(3.3, 7.0)
-    vertices, triangles = np.concatenate([outer[0], inner[0]]), np.concatenate([outer[1], inner[1][:, ::-1] + 6])
-    inside = fill_surface(vertices, triangles.astype(np.uint32), (15, 15, 15))
-    far = sum(np.abs(axis - 7.0) for axis in np.indices((15, 15, 15)))
-    assert np.array_equal(inside, (far < 6.3) & (far > 3.3))
+def test_crossings_lie_on_the_surface(crossings):
+    lines, places, _ = crossings
+    a, b = np.divmod(lines, 15)
+    distance = np.abs(a - 7.0) + np.abs(b - 7.0) + np.abs(places - 7.0)
+    np.testing.assert_allclose(distance, 5.5, atol=tolerances.CROSSING_STEP)
+
+
+def test_every_line_crosses_a_closed_surface_an_even_number_of_times(crossings):
+    lines, _, _ = crossings
+    assert len(lines) > 0
+    assert (np.bincount(lines) % 2 == 0).all()
+
+
+def test_every_triangle_of_an_octahedron_is_crossed(crossings):
+    _, _, triangles = crossings
+    assert set(triangles.tolist()) == set(range(8))
+
+
+def test_points_in_a_cavity_are_not_filled():
+    (outer, outer_faces), (inner, inner_faces) = octahedron(6.3, 7.0), octahedron(3.3, 7.0)
+    triangles = np.concatenate([outer_faces, inner_faces[:, ::-1] + len(outer)]).astype(np.uint32)
+    shape = (15, 15, 15)
+    inside = fill_surface(np.concatenate([outer, inner]), triangles, shape)
+    distance = octahedral_distance(shape, 7.0)
+    assert np.array_equal(inside, (distance < 6.3) & (distance > 3.3))

@@ -120,7 +120,14 @@ VTK_VOLUME = 2e-3  # the bar; measured 5e-5 at 226 HU, at most 8e-4 from 200 to 
 # --- mesh ---
 MESH_VOLUME = 1e-6  # relative; float32 corners of a solid with exact corners, summed in float64
 MESH_UNIT_NORMAL = 1e-6  # float32 components; the text formats keep six decimals
+PEER_MEASURE = 1e-5  # relative areas and volumes of float32 vertices, summed by another program or about another origin
+FAR_MEASURE = 1e-4  # relative volume of a body of 26 mm, float32 vertices rounded 700 mm from the origin
+MOVED_VERTEX_MM = 1e-5  # float32 coordinates of some 100 mm: half a step is 4e-6
+FLOAT32_SHARE = 1e-6  # relative, a value rounded to float32 a few times
 NEAREST_MM = 1e-12  # a distance of a few mm in float64
+FLAT_TRIANGLE_MM = 1e-7  # of triangles whose corners nearly lie in a line: the root of rounding 1e-14 mm2
+VTK_HIT_MM = 1e-6  # lines and points some 20 mm from float32 triangles, both in float64
+CROSSING_STEP = 1e-4  # steps of a lattice: lines lie 2e-5 beside its points
 NEAREST_SAMPLED_MM = 0.02  # 400 random points on each triangle of 0.6 mm, seen from inside or 4 mm away
 FAR_FILE_MM = 1e-6  # fifteen digits, float64, or float32 of 15 mm with the rest in the matrix, at 1e5 mm
 GLB_METRES = 1e-7  # relative; float32 coordinates through a float64 matrix, read back by another library
