@@ -201,21 +201,21 @@ def test_triangles_with_a_common_corner_whose_opposite_edge_passes_beside_do_not
     assert count_pairs((vertices, [[0, 1, 2], [0, 3, 4]])) == 0
 
 
+SECOND_IN_PLANE = {
+    "neighbour beyond a common edge": ([0, 1, 6], 0),
+    "folded onto the first": ([0, 1, 4], 1),
+    "folded onto the first and beyond": ([0, 1, 3], 1),
+    "common corner, beside it": ([0, 7, 8], 0),
+    "common corner, over it": ([0, 3, 5], 1),
+    "neighbour beyond another edge": ([0, 2, 7], 0),
+    "folded over another edge": ([0, 2, 5], 1),
+    "no common corner, over it": ([4, 3, 5], 1),
+    "no common corner, beside it": ([6, 7, 8], 0),
+}
+
+
 @pytest.mark.parametrize("slope", [(0, 0), (2, -1)], ids=["level", "sloping"])
-@pytest.mark.parametrize(
-    ("second", "pairs"),
-    [
-        pytest.param([0, 1, 6], 0, id="neighbour beyond a common edge"),
-        pytest.param([0, 1, 4], 1, id="folded onto the first"),
-        pytest.param([0, 1, 3], 1, id="folded onto the first and beyond"),
-        pytest.param([0, 7, 8], 0, id="common corner, beside it"),
-        pytest.param([0, 3, 5], 1, id="common corner, over it"),
-        pytest.param([0, 2, 7], 0, id="neighbour beyond another edge"),
-        pytest.param([0, 2, 5], 1, id="folded over another edge"),
-        pytest.param([4, 3, 5], 1, id="no common corner, over it"),
-        pytest.param([6, 7, 8], 0, id="no common corner, beside it"),
-    ],
-)
+@pytest.mark.parametrize(("second", "pairs"), SECOND_IN_PLANE.values(), ids=SECOND_IN_PLANE)
 def test_triangles_in_one_plane_are_counted_where_they_overlap(second, pairs, slope):
     x_y = np.array([[0, 0], [4, 0], [0, 4], [3, 3], [1, 1], [2, 5], [2, -3], [-3, -1], [-1, -3]], float)
     vertices = np.column_stack([x_y, 7.25 + x_y @ slope])

@@ -20,20 +20,20 @@ def nearest(mesh, point):
     return find_nearest_triangle(vertices.astype(np.float32), triangles.astype(np.uint32), np.array(point, float))
 
 
-@pytest.mark.parametrize(
-    ("point", "distance"),
-    [
-        pytest.param((1, 1, 2), 2.0, id="above the face"),
-        pytest.param((1, 1, -2), 2.0, id="below the face"),
-        pytest.param((1, 1, 0), 0.0, id="in the face"),
-        pytest.param((4, 0, 0), 0.0, id="at a corner"),
-        pytest.param((1, -3, 4), 5.0, id="beside an edge"),
-        pytest.param((-2, -1, 2), 3.0, id="beyond one corner"),
-        pytest.param((7, 0, 4), 5.0, id="beyond another corner"),
-        pytest.param((2 + 3, 1.5 + 4, 0), 5.0, id="beside the long edge"),
-        pytest.param((2 + 3, 1.5 + 4, 12), 13.0, id="beside the long edge and above"),
-    ],
-)
+POINTS_AND_DISTANCES = {
+    "above the face": ((1, 1, 2), 2.0),
+    "below the face": ((1, 1, -2), 2.0),
+    "in the face": ((1, 1, 0), 0.0),
+    "at a corner": ((4, 0, 0), 0.0),
+    "beside an edge": ((1, -3, 4), 5.0),
+    "beyond one corner": ((-2, -1, 2), 3.0),
+    "beyond another corner": ((7, 0, 4), 5.0),
+    "beside the long edge": ((2 + 3, 1.5 + 4, 0), 5.0),
+    "beside the long edge and above": ((2 + 3, 1.5 + 4, 12), 13.0),
+}
+
+
+@pytest.mark.parametrize(("point", "distance"), POINTS_AND_DISTANCES.values(), ids=POINTS_AND_DISTANCES)
 def test_nearest_distance_is_exact_over_faces_edges_and_corners(point, distance):
     assert nearest(TRIANGLE, point) == (0, pytest.approx(distance, abs=tolerances.NEAREST_MM))
 
