@@ -25,153 +25,230 @@ FAR = np.array([-1250.5, 3071.25, -846.25])
 TRIANGLE = (np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[0, 1, 2]], np.uint32))
 
 
-def rectangle(height: float, size=(30.0, 20.0)) -> samples.Arrays:
-    corners = np.array([[0, 0, height], [size[0], 0, height], [*size, height], [0, size[1], height]], dtype=float)
+def rectangle(z: float, size: tuple[float, float] = (30.0, 20.0)) -> samples.Arrays:
+    """Two triangles in a plane at z, from (0, 0) to `size` in x and y."""
+    corners = np.array([[0, 0, z], [size[0], 0, z], [*size, z], [0, size[1], z]], dtype=float)
     return corners, np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def test_parallel_planes_lie_their_distance_apart():
-    one, other = (Mesh(rectangle(height)[0] + FAR, rectangle(0)[1]) for height in (0.0, 1.25))
-    found = compare_meshes(one, other, samples=1000)
-    for side in ("to_reference_mm", "from_reference_mm"):
-        assert found[side] == pytest.approx(dict.fromkeys(("mean", "rms", "p95", "max"), 1.25))
-    assert (found["hd95_mm"], found["assd_mm"], found["max_mm"]) == pytest.approx((1.25, 1.25, 1.25))
-
-
-def test_concentric_spheres_differ_by_their_radii_and_volumes():
+@pytest.fixture(scope="module")
+def concentric_spheres():
+    """The comparison of a sphere of 10.5 mm with one of 10 mm about the same centre, from 5000 samples of each."""
     inner, outer = (Mesh(*samples.sphere(FAR, radius, 5)) for radius in (10.0, 10.5))
-    found = compare_meshes(outer, inner, samples=5000)
-    for name in ("hd95_mm", "assd_mm", "max_mm"):
-        assert found[name] == pytest.approx(0.5, abs=tolerances.SPHERE_SAGITTA_MM)
-    assert found["volume_change_percent"] == pytest.approx(100 * (1.05**3 - 1), rel=1e-5)
-    assert found["samples"] == 5000
+    return compare_meshes(outer, inner, samples=5000)
 
 
-def test_hd95_takes_the_worse_side_and_assd_both():
-    plane = Mesh(*rectangle(0.0))
-    half = Mesh(*rectangle(0.0, (15.0, 20.0)))
-    found = compare_meshes(half, plane, samples=20_000)
-    assert found["to_reference_mm"]["max"] == pytest.approx(0.0, abs=1e-12)
-    # Beyond the edge at x = 15 the distance grows to 15: 95 % of all points of 30 mm end at 13.5.
-    assert found["hd95_mm"] == pytest.approx(13.5, abs=0.01)
-    assert found["assd_mm"] == pytest.approx(0.5 * 15.0 / 4.0, abs=0.01)
+@pytest.fixture(scope="module")
+def parallel_planes():
+    """The comparison of two equal rectangles 1.25 mm apart."""
+    below, above = (Mesh(rectangle(z)[0] + FAR, rectangle(z)[1]) for z in (0.0, 1.25))
+    return compare_meshes(below, above, samples=1000)
 
 
-def test_an_open_surface_without_volume_has_no_change():
+@pytest.mark.parametrize("side", ["to_reference_mm", "from_reference_mm"])
+def test_every_figure_of_parallel_planes_is_their_distance_from_either_side(parallel_planes, side):
+    assert parallel_planes[side] == pytest.approx(dict.fromkeys(("mean", "rms", "p95", "max"), 1.25))
+
+
+def test_figures_of_both_sides_of_parallel_planes_are_their_distance(parallel_planes):
+    figures = [parallel_planes[name] for name in ("hd95_mm", "assd_mm", "max_mm")]
+    assert figures == pytest.approx([1.25, 1.25, 1.25])
+
+
+@pytest.mark.parametrize("figure", ["hd95_mm", "assd_mm", "max_mm"])
+def test_concentric_spheres_are_apart_by_the_difference_of_their_radii(concentric_spheres, figure):
+    assert concentric_spheres[figure] == pytest.approx(10.5 - 10.0, abs=tolerances.SPHERE_SAGITTA_MM)
+
+
+def test_volume_change_of_concentric_spheres_is_that_of_the_cubes_of_their_radii(concentric_spheres):
+    expected = 100 * ((10.5 / 10.0) ** 3 - 1)
+    assert concentric_spheres["volume_change_percent"] == pytest.approx(expected, rel=tolerances.PEER_MEASURE)
+
+
+def test_a_comparison_says_how_many_samples_it_took(concentric_spheres):
+    assert concentric_spheres["samples"] == 5000
+
+
+def test_hd95_is_that_of_the_worse_side_and_assd_the_mean_of_both():
+    """Half of a plane lies on the plane, but the other half of the plane up to 15 mm from it.
+
+    From x = 15 to 30 mm the distance grows evenly from 0 to 15 mm: 95 % of the whole plane ends at 28.5, that is
+    13.5 mm.  Its mean is 7.5 mm over half of the plane and 0 over the rest, and 0 from the other side.
+    """
+    plane, half = Mesh(*rectangle(0.0, (30.0, 20.0))), Mesh(*rectangle(0.0, (15.0, 20.0)))
+    measured = compare_meshes(half, plane, samples=20_000)
+    assert measured["to_reference_mm"]["max"] == pytest.approx(0.0, abs=tolerances.NEAREST_MM)
+    assert measured["hd95_mm"] == pytest.approx(13.5, abs=tolerances.SAMPLED_PLANE_MM)
+    assert measured["assd_mm"] == pytest.approx((7.5 / 2 + 0.0) / 2, abs=tolerances.SAMPLED_PLANE_MM)
+
+
+def test_a_plane_without_volume_has_no_change_of_volume():
     assert compare_meshes(Mesh(*rectangle(0.0)), Mesh(*rectangle(0.0)), 10)["volume_change_percent"] is None
 
 
-@pytest.mark.parametrize(
+points_around_a_triangle = pytest.mark.parametrize(
     ("point", "distance"),
     [
-        ((1.0, 1.0, 3.0), 3.0),  # over the face
-        ((2.0, -5.0, 0.0), 5.0),  # beside an edge
-        ((-3.0, -4.0, 0.0), 5.0),  # at a corner
-        ((4.0, 4.0, 0.0), np.sqrt(8.0)),  # beside the long edge
-        ((2.0, 2.0, 0.0), 0.0),  # on it
+        ((1.0, 1.0, 3.0), 3.0),
+        ((2.0, -5.0, 0.0), 5.0),
+        ((-3.0, -4.0, 0.0), 5.0),
+        ((4.0, 4.0, 0.0), np.sqrt(8.0)),
+        ((2.0, 2.0, 0.0), 0.0),
     ],
+    ids=["over the face", "beside an edge", "beyond a corner", "beside the long edge", "on the long edge"],
 )
-def test_distance_to_one_triangle_is_that_of_its_face_edge_or_corner(point, distance):
+
+
+@points_around_a_triangle
+def test_surface_distance_to_one_triangle_is_that_to_its_face_edge_or_corner(point, distance):
     vertices, triangles = TRIANGLE
-    points = np.array([point]) + FAR
-    assert SurfaceDistance(vertices + FAR, triangles)(points) == pytest.approx([distance], abs=1e-9)
-    for vertex in range(3):
-        near = NearDistance(vertices + FAR, triangles)(points, np.array([vertex]), 0.5)
-        assert near == pytest.approx([distance], abs=1e-9)
+    measure = SurfaceDistance(vertices + FAR, triangles)
+    assert measure(np.array([point]) + FAR) == pytest.approx([distance], abs=tolerances.FLOAT64_PLACE_MM)
+
+
+@points_around_a_triangle
+@pytest.mark.parametrize("vertex", range(3))
+def test_distance_near_any_corner_of_one_triangle_is_that_to_its_face_edge_or_corner(point, distance, vertex):
+    vertices, triangles = TRIANGLE
+    measure = NearDistance(vertices + FAR, triangles)
+    measured = measure(np.array([point]) + FAR, np.array([vertex]), 0.5)
+    assert measured == pytest.approx([distance], abs=tolerances.FLOAT64_PLACE_MM)
+
+
+DISTANCES_TO_LEGS_OF_3_AND_4 = {
+    "over the face": ((1.0, 1.0, 2.0), 2.0),
+    "in the plane beside an edge": ((1.0, -2.0, 0.0), 2.0),
+    "above and beside an edge": ((1.0, -3.0, 4.0), 5.0),
+    "beside the other leg": ((-2.0, 1.0, 0.0), 2.0),
+    "above and beside the long edge": ((1.5 + 4.0, 2.0 + 3.0, 12.0), 13.0),
+    "beyond the right angle": ((-3.0, -4.0, 0.0), 5.0),
+    "beyond the second corner": ((5.0, -2.0, 1.0), 3.0),
+    "beyond the third corner": ((-3.0, 8.0, 0.0), 5.0),
+    "on the long edge": ((1.5, 2.0, 0.0), 0.0),
+}
 
 
 @pytest.mark.parametrize("scale", [0.125, 1.0, 32.0])
-def test_distance_is_exact_over_the_face_each_edge_and_each_corner(scale):
-    """A triangle with legs of 3 and 4: on its edges the foot lies at a third, a quarter and half of the way."""
-    a, b, c = np.array([[0.0, 0, 0], [3, 0, 0], [0, 4, 0]])
-    cases = [
-        ((1.0, 1.0, 2.0), 2.0),  # over the face
-        ((1.0, -2.0, 0.0), 2.0),  # beside each edge
-        ((1.0, -3.0, 4.0), 5.0),
-        ((-2.0, 1.0, 0.0), 2.0),
-        ((1.5 + 4.0, 2.0 + 3.0, 12.0), 13.0),
-        ((-3.0, -4.0, 0.0), 5.0),  # beyond each corner
-        ((5.0, -2.0, 1.0), 3.0),
-        ((-3.0, 8.0, 0.0), 5.0),
-        ((1.5, 2.0, 0.0), 0.0),  # on an edge
-    ]
-    points = scale * np.array([point for point, _ in cases])
-    for turned in ((a, b, c), (b, c, a), (c, b, a)):
-        corners = [np.repeat(scale * corner[:, None], len(cases), axis=1) for corner in turned]
-        found = triangle_distances(points.T, *corners)
-        np.testing.assert_allclose(found, [scale * distance for _, distance in cases], rtol=1e-12, atol=1e-12)
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 1, 0)])
+@pytest.mark.parametrize(("point", "distance"), DISTANCES_TO_LEGS_OF_3_AND_4.values(), ids=DISTANCES_TO_LEGS_OF_3_AND_4)
+def test_distance_is_exact_over_the_face_each_edge_and_each_corner(point, distance, order, scale):
+    corners = scale * np.array([[0.0, 0, 0], [3, 0, 0], [0, 4, 0]])
+    columns = [corners[number][:, None] for number in (*order,)]
+    measured = triangle_distances(scale * np.array(point)[:, None], *columns)
+    assert measured == pytest.approx([scale * distance], rel=tolerances.FLOAT64_SHARE, abs=tolerances.NEAREST_MM)
 
 
-def test_each_triangle_around_each_vertex_is_found():
+@pytest.mark.parametrize("vertex", range(8))
+def test_the_nearest_triangle_around_a_corner_is_the_one_that_the_point_lies_on(vertex):
     vertices, triangles = samples.box()
+    around = np.flatnonzero((triangles == vertex).any(axis=1))
+    centres = vertices[triangles[around]].mean(axis=1)
     near = NearDistance(vertices, triangles.astype(np.uint32))
-    for vertex in range(8):
-        rows = np.flatnonzero((triangles == vertex).any(axis=1))
-        centres = vertices[triangles[rows]].mean(axis=1)
-        found, nearest = near.find_around(centres, np.full((len(rows), 1), vertex))
-        assert nearest.tolist() == rows.tolist()
-        np.testing.assert_allclose(found, 0.0, atol=1e-15)
+    distances, nearest = near.find_around(centres, np.full((len(around), 1), vertex))
+    assert nearest.tolist() == around.tolist()
+    np.testing.assert_allclose(distances, 0.0, atol=tolerances.NEAREST_MM)
 
 
 def test_distance_counts_only_the_triangles_around_the_vertex():
+    """Around the corner (1, 1, 1) of a cube lie triangles of the faces x = 1, y = 1 and z = 1."""
     vertices, triangles = samples.box()
     near = NearDistance(vertices, triangles.astype(np.uint32))
-    points = np.array([[1.0, 0.75, 0.75], [1.25, 0.75, 0.75], [3.0, 2.0, 1.0], [3.0, 2.0, 3.0]])
-    found, rows = near.find_within(points, np.full(4, 7), 0.5)
-    np.testing.assert_allclose(found, [0.0, 0.25, np.sqrt(5.0), 3.0], rtol=1e-15)
-    assert all(7 in triangles[row] for row in rows)
+    on_the_face, beside_it, beyond_an_edge, above = [1, 0.75, 0.75], [1.25, 0.75, 0.75], [3, 2, 1], [3, 2, 3]
+    points = np.array([on_the_face, beside_it, beyond_an_edge, above], float)
+    distances, rows = near.find_within(points, np.full(4, 7), 0.5)
+    expected = [0.0, 0.25, np.hypot(2, 1), np.sqrt(2**2 + 1**2 + 2**2)]
+    np.testing.assert_allclose(distances, expected, rtol=tolerances.FLOAT64_SHARE)
+    assert (triangles[rows] == 7).any(axis=1).all()
 
 
-def test_distances_near_a_vertex_are_exact_or_within_the_limit():
+def test_distances_near_a_vertex_are_upper_bounds_and_exact_where_beyond_the_limit():
+    limit_mm = 0.8
     vertices, triangles = samples.torus(40, 24)
     triangles = triangles.astype(np.uint32)
     rng = np.random.default_rng(3)
     near = rng.integers(0, len(vertices), 500)
     points = vertices[near] + rng.normal(scale=1.5, size=(500, 3))
+
     exact = SurfaceDistance(vertices, triangles)(points)
-    found = NearDistance(vertices, triangles)(points, near, 0.8)
-    assert (found >= exact - 1e-9).all()
-    assert ((found <= 0.8) | (np.abs(found - exact) < 1e-9)).all()
-    assert (found > 0.8).sum() > 50 < (found < 0.8).sum()
+    bounds = NearDistance(vertices, triangles)(points, near, limit_mm)
+
+    beyond = bounds > limit_mm
+    assert 50 < beyond.sum() < 450, "points on both sides of the limit"
+    assert (bounds >= exact - tolerances.FLOAT64_PLACE_MM).all()
+    np.testing.assert_allclose(bounds[beyond], exact[beyond], rtol=0, atol=tolerances.FLOAT64_PLACE_MM)
 
 
-def test_samples_cover_the_area_evenly():
+@pytest.fixture(scope="module")
+def two_triangles_of_one_and_three_parts_of_the_area():
+    """Right triangles with legs of 3 and 1 mm, and of 9 and 1 mm from x = 10 on; the last has no area."""
     vertices = np.array([[0.0, 0, 0], [3, 0, 0], [0, 1, 0], [10, 0, 0], [19, 0, 0], [10, 1, 0], [0, 0, 0]])
-    triangles = np.array([[0, 1, 2], [3, 4, 5], [0, 6, 6]], np.uint32)
+    return vertices, np.array([[0, 1, 2], [3, 4, 5], [0, 6, 6]], np.uint32)
+
+
+def test_triangles_have_samples_in_proportion_to_their_area(two_triangles_of_one_and_three_parts_of_the_area):
+    vertices, triangles = two_triangles_of_one_and_three_parts_of_the_area
     points = sample_surface(vertices, triangles, 4000)
-    on_second = points[:, 0] >= 10.0
-    assert on_second.sum() == 3000  # areas 1.5 and 4.5
-    np.testing.assert_allclose(points[on_second].mean(axis=0), [13.0, 1 / 3, 0.0], atol=0.02)
-    assert (points[on_second][:, 1] <= 1 - (points[on_second][:, 0] - 10) / 9 + 1e-12).all()
-    np.testing.assert_array_equal(points, sample_surface(vertices, triangles, 4000))
+    assert (points[:, 0] >= 10.0).sum() == 3 / 4 * 4000
 
 
-@pytest.mark.seconds
-def test_nothing_to_measure_is_refused():
-    plane = Mesh(*rectangle(0.0))
+def test_samples_lie_within_their_triangle_and_evenly_about_its_centre(
+    two_triangles_of_one_and_three_parts_of_the_area,
+):
+    vertices, triangles = two_triangles_of_one_and_three_parts_of_the_area
+    points = sample_surface(vertices, triangles, 4000)
+    x, y, z = points[points[:, 0] >= 10.0].T
+    assert (y <= 1 - (x - 10) / 9 + tolerances.NEAREST_MM).all()
+    centre = [(10 + 19 + 10) / 3, 1 / 3, 0.0]
+    np.testing.assert_allclose([x.mean(), y.mean(), z.mean()], centre, atol=tolerances.SAMPLED_CENTRE_MM)
+
+
+def test_sampling_twice_gives_the_same_points(two_triangles_of_one_and_three_parts_of_the_area):
+    vertices, triangles = two_triangles_of_one_and_three_parts_of_the_area
+    first, second = (sample_surface(vertices, triangles, 4000) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize(
+    "without_area",
+    [Mesh([], []), Mesh([[0, 0, 0], [1, 1, 1]], [[0, 1, 1]])],
+    ids=["empty", "one triangle of two vertices"],
+)
+def test_comparing_a_mesh_without_area_is_refused(without_area):
     with refused(NoSurfaceError, "area"):
-        compare_meshes(plane, Mesh([], []))
+        compare_meshes(Mesh(*rectangle(0.0)), without_area)
     with refused(NoSurfaceError, "area"):
-        compare_meshes(Mesh([[0, 0, 0], [1, 1, 1]], [[0, 1, 1]]), plane)
+        compare_meshes(without_area, Mesh(*rectangle(0.0)))
+
+
+def test_comparing_without_samples_is_refused():
     with refused(UsageError, "sample", 1, 0):
-        compare_meshes(plane, plane, samples=0)
+        compare_meshes(Mesh(*rectangle(0.0)), Mesh(*rectangle(0.0)), samples=0)
 
 
-def test_the_triangles_around_each_of_several_vertices_count():
+def test_the_nearest_triangle_is_looked_for_around_each_of_several_vertices():
+    """The point lies 2 mm from the corner 7 of a cube, (1, 1, 1), and 3 mm from the triangles around corner 0."""
     vertices, triangles = samples.box()
-    near = NearDistance(np.concatenate([vertices, [[5.0, 5.0, 5.0]]]), triangles)  # no triangle uses vertex 8
-    points = np.array([[3.0, 1.0, 1.0]] * 5)  # 2 mm from corner 7 and 3 mm from the face around corner 0
-    found, rows = near.find_around(points, np.array([[0, 7], [7, 0], [8, 7], [8, 8], [7, 8]]))
-    assert found.tolist() == [2.0, 2.0, 2.0, np.inf, 2.0]
-    assert (rows == -1).tolist() == [False, False, False, True, False]
-    assert all(7 in triangles[row] for row in rows[found == 2.0])
+    unused = 8
+    near = NearDistance(np.concatenate([vertices, [[5.0, 5.0, 5.0]]]), triangles)
+    around = np.array([[0, 7], [7, 0], [unused, 7], [7, unused], [unused, unused]])
+    distances, rows = near.find_around(np.array([[3.0, 1.0, 1.0]] * 5), around)
+    assert distances.tolist() == [2.0, 2.0, 2.0, 2.0, np.inf]
+    assert (triangles[rows[:4]] == 7).any(axis=1).all()
+    assert rows[4] == -1
 
 
-def test_each_sample_lies_in_the_triangle_that_its_share_of_the_area_names():
-    """Four triangles of one area after one without: a sample of each, from the second on."""
-    corners = np.array([[[3.0 * k, 0, 0], [3.0 * k + 2, 0, 0], [3.0 * k, 1, 0]] for k in range(4)]).reshape(-1, 3)
-    triangles = np.concatenate([[[0, 0, 1]], np.arange(12).reshape(-1, 3)]).astype(np.uint32)
-    points, rows = sample_surface_points(corners, triangles, 4)
-    assert rows.tolist() == [1, 2, 3, 4]
-    assert (points[:, 0] // 3.0).tolist() == [0.0, 1.0, 2.0, 3.0]
-    assert points[0].tolist() == [0.0, 0.0, 0.0]  # the sequence begins in the first corner
+FOUR_EQUAL_TRIANGLES = np.array([[[3.0 * k, 0, 0], [3.0 * k + 2, 0, 0], [3.0 * k, 1, 0]] for k in range(4)]).reshape(
+    -1, 3
+)
+ONE_WITHOUT_AREA_AND_FOUR = np.concatenate([[[0, 0, 1]], np.arange(12).reshape(-1, 3)]).astype(np.uint32)
+
+
+def test_four_samples_of_four_equal_triangles_lie_one_in_each():
+    points, rows = sample_surface_points(FOUR_EQUAL_TRIANGLES, ONE_WITHOUT_AREA_AND_FOUR, 4)
+    assert rows.tolist() == [1, 2, 3, 4]  # 0 has no area
+    assert (points[:, 0] // 3.0).tolist() == [0.0, 1.0, 2.0, 3.0]  # they begin 3 mm apart
+
+
+def test_the_first_sample_is_the_first_corner_of_the_first_triangle_with_area():
+    points, _ = sample_surface_points(FOUR_EQUAL_TRIANGLES, ONE_WITHOUT_AREA_AND_FOUR, 4)
+    assert points[0].tolist() == [0.0, 0.0, 0.0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import sample_meshes as samples
@@ -9,7 +11,7 @@ import tolerances
 from scipy.ndimage import map_coordinates
 
 from clrecon.geometry import Volume, compose_affine
-from clrecon.geometry.iso_rule import choose_iso_rule
+from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare import iso_distance
 from clrecon.mesh.compare.iso_distance import (
@@ -27,45 +29,56 @@ SHEARED = compose_affine((0.0, 0.7, 0.1), (0.5, 0.0, -0.05), (0.3, 0.2, 2.5), (-
 SHAPE_IJK = (11, 9, 7)
 
 
-def measure_iso_distance(mesh, volume, rule, **options) -> iso_distance.IsoDistance:
+def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, **options: Any) -> iso_distance.IsoDistance:
     return iso_distance.measure_iso_distances([mesh], volume, rule, **options)[0]
 
 
-def centres(shape_ijk=SHAPE_IJK) -> np.ndarray:
+def voxel_indices(shape_ijk=SHAPE_IJK) -> np.ndarray:
+    """Indices i, j, k of all voxels, shape (n, 3)."""
     k, j, i = np.meshgrid(*(np.arange(n) for n in shape_ijk[::-1]), indexing="ij")
     return np.column_stack([i.ravel(), j.ravel(), k.ravel()])
 
 
 def volume_of(field, affine=SHEARED, shape_ijk=SHAPE_IJK, dtype=np.float32) -> Volume:
+    """Voxels with the values of a function of LPS points."""
     empty = Volume(np.zeros(shape_ijk[::-1], dtype), affine)
-    return Volume(field(empty.ijk_to_lps(centres(shape_ijk))).reshape(shape_ijk[::-1]).astype(dtype), affine)
+    return Volume(field(empty.ijk_to_lps(voxel_indices(shape_ijk))).reshape(shape_ijk[::-1]).astype(dtype), affine)
 
 
 def noise_volume(dtype=np.int16) -> Volume:
+    """Sheared voxels of -900 to 900 HU."""
     return Volume(np.random.default_rng(4).integers(-900, 900, SHAPE_IJK[::-1]).astype(dtype), SHEARED)
 
 
-def test_field_and_gradient_equal_scipy_and_differences():
+def test_trilinear_values_are_those_of_scipy():
     volume = noise_volume()
     rule = choose_iso_rule(volume, 100, closed=True)
     ijk = np.random.default_rng(5).uniform(-1, SHAPE_IJK, (400, 3))
+    values, _ = trilinear_field(volume, rule, ijk)
     padded = np.pad(volume.voxels.astype(float), 1, constant_values=rule.outside)
-    value, gradient = trilinear_field(volume, rule, ijk)
     expected = map_coordinates(padded, ijk.T[::-1] + 1, order=1)
-    np.testing.assert_allclose(value, expected, rtol=0, atol=tolerances.TRILINEAR * 1000)
-    inner = ijk[(np.abs(ijk - np.round(ijk)) > 1e-3).all(axis=1)]
-    for axis in range(3):
-        step = 1e-4 * np.eye(3)[axis]
-        change = trilinear_field(volume, rule, inner + step)[0] - trilinear_field(volume, rule, inner - step)[0]
-        found = trilinear_field(volume, rule, inner)[1][:, axis]
-        np.testing.assert_allclose(found, change / 2e-4, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(values, expected, rtol=0, atol=tolerances.TRILINEAR * 1000)  # values up to 1000 HU
 
 
-def test_an_open_volume_ends_at_its_border():
+@pytest.mark.parametrize("axis", range(3))
+def test_trilinear_gradient_is_the_difference_of_values_over_a_short_step(axis):
     volume = noise_volume()
+    rule = choose_iso_rule(volume, 100, closed=True)
+    ijk = np.random.default_rng(5).uniform(-1, SHAPE_IJK, (400, 3))
+    within_cells = ijk[(np.abs(ijk - np.round(ijk)) > 1e-3).all(axis=1)]
+    step = 1e-4 * np.eye(3)[axis]
+    after, before = (trilinear_field(volume, rule, within_cells + side * step)[0] for side in (1, -1))
+    _, gradient = trilinear_field(volume, rule, within_cells)
+    np.testing.assert_allclose(gradient[:, axis], (after - before) / 2e-4, rtol=0, atol=tolerances.DIFFERENCE_HU)
+
+
+def test_points_beyond_an_open_volume_have_the_value_of_its_border():
+    volume = noise_volume()  # indices up to (10, 8, 6)
     rule = choose_iso_rule(volume, 100, closed=False)
-    beyond, border = np.array([[-0.5, 3.0, 9.0], [4.2, 8.9, 2.0]]), np.array([[0.0, 3.0, 6.0], [4.2, 8.0, 2.0]])
-    np.testing.assert_array_equal(trilinear_field(volume, rule, beyond)[0], trilinear_field(volume, rule, border)[0])
+    beyond = np.array([[-0.5, 3.0, 9.0], [4.2, 8.9, 2.0]])
+    at_the_border = np.array([[0.0, 3.0, 6.0], [4.2, 8.0, 2.0]])
+    expected, _ = trilinear_field(volume, rule, at_the_border)
+    np.testing.assert_array_equal(trilinear_field(volume, rule, beyond)[0], expected)
 
 
 @pytest.mark.parametrize("normal", [(1.0, 0.0, 0.0), (0.3, -0.5, 0.8), (-0.2, 0.9, 0.1)])
@@ -76,106 +89,129 @@ def test_distance_to_a_plane_through_sheared_voxels_is_exact(normal):
     volume = volume_of(lambda points: 40.0 * (points - middle) @ normal)
     rule = choose_iso_rule(volume, 0.0, closed=False)
     rng = np.random.default_rng(6)
-    across = rng.uniform(-0.6, 0.6, (50, 3)) @ (np.eye(3) - np.outer(normal, normal))
+    within_plane = rng.uniform(-0.6, 0.6, (50, 3)) @ (np.eye(3) - np.outer(normal, normal))
     offset = rng.uniform(-0.3, 0.3, 50)
-    found = distances_to_iso_surface(volume, rule, middle + across + offset[:, None] * normal)
-    np.testing.assert_allclose(found, np.abs(offset), atol=1e-4)  # voxels are float32
+    distances = distances_to_iso_surface(volume, rule, middle + within_plane + offset[:, None] * normal)
+    np.testing.assert_allclose(distances, np.abs(offset), atol=tolerances.FLOAT32_PLANE_MM)
 
 
 def test_points_off_a_sphere_have_their_offset_as_distance():
-    affine = np.diag([0.7, 0.5, 0.9, 1.0])
-    shape, radius = (40, 55, 32), 8.0
-    centre = (affine @ [19.3, 27.4, 15.6, 1])[:3]
+    affine, shape, radius = np.diag([0.7, 0.5, 0.9, 1.0]), (40, 55, 32), 8.0
+    centre = (affine @ [19.3, 27.4, 15.6, 1])[:3]  # near the middle, between voxels
     volume = volume_of(lambda points: radius - np.linalg.norm(points - centre, axis=1), affine, shape)
     directions = np.random.default_rng(7).normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     offset = np.linspace(-0.5, 0.5, 300)
+
     points = centre + directions * (radius + offset)[:, None]
-    found = distances_to_iso_surface(volume, choose_iso_rule(volume, 0.0), points)
-    np.testing.assert_allclose(found, np.abs(offset), atol=tolerances.ISO_SPHERE_SAGITTA_MM)
+    distances = distances_to_iso_surface(volume, choose_iso_rule(volume, 0.0), points)
+
+    np.testing.assert_allclose(distances, np.abs(offset), atol=tolerances.ISO_SPHERE_SAGITTA_MM)
 
 
 def test_surface_in_the_border_cell_of_a_closed_volume_is_found():
     volume = Volume(np.full((4, 4, 4), 1000, np.int16), np.diag([2.0, 1.0, 1.0, 1.0]))
     rule = choose_iso_rule(volume, 0, closed=True)
-    surface = -2.0 * (1000 + 0.5) / (1000 - rule.outside)  # in x, half a unit below the integer
-    points = np.array([[surface + 0.1, 1.5, 1.5], [surface, 1.2, 2.0]])
-    np.testing.assert_allclose(distances_to_iso_surface(volume, rule, points), [0.1, 0.0], atol=1e-9)
+    # Between the first voxel and one outside, 2 mm before it, to the level of 0 HU: half a unit below the integer.
+    surface_x = -2.0 * (1000 + 0.5) / (1000 - rule.outside)
+    points = np.array([[surface_x + 0.1, 1.5, 1.5], [surface_x, 1.2, 2.0]])
+    distances = distances_to_iso_surface(volume, rule, points)
+    np.testing.assert_allclose(distances, [0.1, 0.0], atol=tolerances.FLOAT64_PLACE_MM)
 
 
-def test_a_flat_field_has_no_surface_nearby():
+def test_a_point_in_a_flat_field_has_no_distance():
     volume = Volume(np.zeros((4, 4, 4), np.int16), np.eye(4))
     rule = choose_iso_rule(volume, 500, closed=False)
     assert np.isnan(distances_to_iso_surface(volume, rule, np.array([[1.5, 1.5, 1.5]]))).all()
-    mesh = Mesh([[1, 1, 1], [2, 1, 1], [1, 2, 1]], [[0, 1, 2]])
-    found = measure_iso_distance(mesh, volume, rule)
-    assert (found["not_found"], found["vertices_mm"], found["centres_voxel"]) == (4, None, None)
 
 
-@pytest.mark.parametrize("closed", [True, False])
+def test_vertices_and_centres_in_a_flat_field_are_counted_and_have_no_figures():
+    volume = Volume(np.zeros((4, 4, 4), np.int16), np.eye(4))
+    triangle = Mesh([[1, 1, 1], [2, 1, 1], [1, 2, 1]], [[0, 1, 2]])
+    measured = measure_iso_distance(triangle, volume, choose_iso_rule(volume, 500, closed=False))
+    assert measured["not_found"] == 3 + 1
+    assert (measured["vertices_mm"], measured["centres_voxel"]) == (None, None)
+
+
+@pytest.mark.parametrize("closed", [True, False], ids=["closed", "open"])
 @pytest.mark.parametrize("iso_value", [100, 33.25])
-def test_vertices_of_an_extracted_surface_lie_on_it(iso_value, closed):
+def test_vertices_of_an_extracted_surface_lie_on_it_and_centres_of_its_flat_triangles_beside_it(iso_value, closed):
     volume = noise_volume()
     vertices, _, triangles = extract_isosurface(volume, iso_value, closed=closed)
-    found = measure_iso_distance(Mesh(vertices, triangles), volume, choose_iso_rule(volume, iso_value, closed=closed))
-    assert found["vertices_voxel"]["max"] < tolerances.ISO_VERTEX_VOXEL
-    assert found["centres_voxel"]["p95"] > 0.01  # flat triangles on noise
-    assert found["vertices_mm"]["max"] == pytest.approx(found["vertices_voxel"]["max"] * smallest_voxel_mm(volume))
-    assert smallest_voxel_mm(volume) == pytest.approx(np.hypot(0.5, 0.05))
+    rule = choose_iso_rule(volume, iso_value, closed=closed)
+    measured = measure_iso_distance(Mesh(vertices, triangles), volume, rule)
+    assert measured["vertices_voxel"]["max"] < tolerances.ISO_VERTEX_VOXEL
+    assert measured["centres_voxel"]["p95"] > 100 * tolerances.ISO_VERTEX_VOXEL
 
 
-def test_a_level_half_a_unit_off_is_found():
+def test_distances_in_mm_are_those_in_voxels_times_the_shortest_step():
     volume = noise_volume()
     vertices, _, triangles = extract_isosurface(volume, 100)
-    mesh = Mesh(vertices, triangles)
-    assert measure_iso_distance(mesh, volume, choose_iso_rule(volume, 101))["vertices_voxel"]["mean"] > 1e-4
+    measured = measure_iso_distance(Mesh(vertices, triangles), volume, choose_iso_rule(volume, 100))
+    in_mm, in_voxels = measured["vertices_mm"]["max"], measured["vertices_voxel"]["max"]
+    assert in_mm == pytest.approx(in_voxels * smallest_voxel_mm(volume))
 
 
-def test_iso_distance_takes_no_more_samples_than_asked():
+def test_the_shortest_step_of_sheared_voxels_is_the_length_of_a_column():
+    assert smallest_voxel_mm(noise_volume()) == pytest.approx(np.hypot(0.5, 0.05))
+
+
+def test_vertices_at_a_level_1_hu_off_are_measured_off_the_surface():
     volume = noise_volume()
     vertices, _, triangles = extract_isosurface(volume, 100)
-    found = measure_iso_distance(Mesh(vertices, triangles), volume, choose_iso_rule(volume, 100), samples=100)
-    assert 50 < found["samples"]["vertices"] <= 100
-    assert 50 < found["samples"]["centres"] <= 100
+    measured = measure_iso_distance(Mesh(vertices, triangles), volume, choose_iso_rule(volume, 101))
+    assert measured["vertices_voxel"]["mean"] > tolerances.ISO_VERTEX_VOXEL
 
 
-def test_the_rule_is_read_from_the_report_of_a_mesh():
-    closed = {"iso_value_hu": 226.0, "iso_level_hu": 225.5, "closed_at_border": True, "outside_hu": -1024.0}
-    rule = rule_of_report(closed)
+@pytest.mark.parametrize("of", ["vertices", "centres"])
+def test_iso_distance_takes_more_than_half_of_the_samples_asked_for_and_not_more(of):
+    volume = noise_volume()
+    vertices, _, triangles = extract_isosurface(volume, 100)
+    measured = measure_iso_distance(Mesh(vertices, triangles), volume, choose_iso_rule(volume, 100), samples=100)
+    assert 50 < measured["samples"][of] <= 100
+
+
+CLOSED_REPORT = {"iso_value_hu": 226.0, "iso_level_hu": 225.5, "closed_at_border": True, "outside_hu": -1024.0}
+
+
+def test_the_rule_of_a_closed_mesh_is_read_from_its_report():
+    rule = rule_of_report(CLOSED_REPORT)
     assert rule is not None
     assert (rule.iso_level, rule.outside, rule.border) == (225.5, -1024.0, 1)
-    opened = rule_of_report({**closed, "closed_at_border": False, "outside_hu": None})
-    assert opened is not None
-    assert (opened.closed, opened.border) == (False, 0)
-    assert rule_of_report({}) is None
-    assert rule_of_report({**closed, "outside_hu": None}) is None
 
 
-def test_a_mesh_where_no_surface_is_counts_all_its_points():
-    volume = volume_of(lambda lps: np.where(lps[:, 0] > lps[:, 0].mean(), 900.0, -900.0))
-    rule = choose_iso_rule(volume, 100, closed=False)
-    far = volume.ijk_to_lps(np.array([[0.2, 1, 1], [0.3, 2, 1], [0.1, 1, 2]], float))
-    flat = volume_of(lambda lps: np.full(len(lps), -900.0))
-    found = measure_iso_distance(Mesh(far, [[0, 1, 2]]), flat, rule)
-    assert (found["not_found"], found["vertices_voxel"], found["centres_voxel"]) == (4, None, None)
+def test_the_rule_of_an_open_mesh_has_no_border():
+    rule = rule_of_report({**CLOSED_REPORT, "closed_at_border": False, "outside_hu": None})
+    assert rule is not None
+    assert (rule.closed, rule.border) == (False, 0)
 
 
-def test_rays_find_the_surface_where_the_gradient_leads_nowhere():
-    """In a flat plateau beside a step the gradient is zero; the surface lies within two voxels."""
+@pytest.mark.parametrize("report", [{}, {**CLOSED_REPORT, "outside_hu": None}], ids=["empty", "no outside value"])
+def test_a_report_without_the_level_or_the_outside_of_a_closed_mesh_has_no_rule(report):
+    assert rule_of_report(report) is None
+
+
+def test_a_surface_within_two_voxels_is_found_along_lines_where_the_gradient_is_zero():
+    """On a flat plateau beside a step, between i = 4 and 5 from 0 to 900 HU: the level of 450 lies at i = 4.5.
+
+    One step along i is `step_mm` straight to the plane, but longer along the sheared grid.
+    """
     volume = volume_of(lambda lps: np.zeros(len(lps)))
-    volume.voxels[:, :, 5:] = 900.0  # i from 5 on; between 4 and 5 the field rises
+    volume.voxels[:, :, 5:] = 900.0
     rule = choose_iso_rule(volume, 450, closed=False)
-    point = volume.ijk_to_lps(np.array([[3.8, 4.0, 3.0], [4.2, 4.0, 3.0], [0.5, 4.0, 3.0]]))
-    distances = distances_to_iso_surface(volume, rule, point)
-    normal = np.linalg.inv(volume.affine[:3, :3])[0]
-    across = 1.0 / np.linalg.norm(normal)  # of one step along i, straight to the plane
-    assert 0.7 * across <= distances[0] <= 1.4 * 0.7 * across  # the rays follow the sheared grid
-    assert distances[1] == pytest.approx(0.3 * across, abs=1e-3)
+    step_mm = 1.0 / np.linalg.norm(np.linalg.inv(volume.affine[:3, :3])[0])
+
+    on_the_plateau, in_the_step, far_away = [3.8, 4.0, 3.0], [4.2, 4.0, 3.0], [0.5, 4.0, 3.0]
+    points = volume.ijk_to_lps(np.array([on_the_plateau, in_the_step, far_away]))
+    distances = distances_to_iso_surface(volume, rule, points)
+
+    assert 0.7 * step_mm <= distances[0] <= 1.4 * 0.7 * step_mm  # 1.4: the lines follow the sheared grid
+    assert distances[1] == pytest.approx(0.3 * step_mm, abs=tolerances.ISO_VERTEX_VOXEL)
     assert np.isnan(distances[2])
 
 
-def layers(axis: int, first: int, low: float = 0.0, high: float = 900.0, count: int = 12) -> Volume:
-    """Voxels of 1 mm: `low` below a number along an axis, `high` from it on."""
+def two_layers(axis: int, first: int, low: float = 0.0, high: float = 900.0, count: int = 12) -> Volume:
+    """Voxels of 1 mm: `low` below the index `first` of an axis, `high` from it on."""
     shape = [4, 4, 4]
     shape[axis] = count
     along = np.indices(shape)[axis]
@@ -183,55 +219,68 @@ def layers(axis: int, first: int, low: float = 0.0, high: float = 900.0, count: 
 
 
 @pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize(("at", "first", "distance"), [(1.5, 3, 1.0), (1.5, 4, None), (4.5, 4, 1.0), (4.5, 3, None)])
-def test_lines_reach_the_voxels_of_the_cell_and_of_its_neighbours(axis, at, first, distance):
+@pytest.mark.parametrize(
+    ("along_axis", "first", "distance"),
+    [(1.5, 3, 1.0), (1.5, 4, np.nan), (4.5, 4, 1.0), (4.5, 3, np.nan)],
+    ids=["rises in the next cell", "a cell further", "rose in the cell before", "a cell before that"],
+)
+def test_lines_reach_the_voxels_of_the_cell_and_of_its_neighbours(axis, along_axis, first, distance):
     """In a flat cell the gradient is zero; the level lies half way to the voxels that differ."""
-    volume = layers(axis, first)
+    volume = two_layers(axis, first)
     point = np.full((1, 3), 2.0)
-    point[0, axis] = at
-    found = distances_to_iso_surface(volume, choose_iso_rule(volume, 450.0, closed=False), point)
-    np.testing.assert_allclose(found, [np.nan if distance is None else distance], atol=1e-9)
+    point[0, axis] = along_axis
+    distances = distances_to_iso_surface(volume, choose_iso_rule(volume, 450.0, closed=False), point)
+    np.testing.assert_allclose(distances, [distance], atol=tolerances.FLOAT64_PLACE_MM)
 
 
-def test_lines_find_a_level_between_values_less_than_1_apart():
-    """Half way between two voxels, and just before the end of the lines."""
-    volume = layers(0, 3, 0.0, 0.5)
-    for level, distance in ((0.25, 1.0), (0.485, 1.47)):
-        rule = choose_iso_rule(volume, level, closed=False)
-        assert distances_to_iso_surface(volume, rule, np.array([[1.5, 2.0, 2.0]])) == pytest.approx([distance])
+@pytest.mark.parametrize(("level", "at_i"), [(0.25, 2.5), (0.485, 2.97)], ids=["half way", "at the end of the lines"])
+def test_lines_find_a_level_between_values_less_than_1_apart(level, at_i):
+    """The values rise from 0 at i = 2 to 0.5 at i = 3; the point lies at i = 1.5."""
+    volume = two_layers(0, 3, 0.0, 0.5)
+    rule = choose_iso_rule(volume, level, closed=False)
+    assert distances_to_iso_surface(volume, rule, np.array([[1.5, 2.0, 2.0]])) == pytest.approx([at_i - 1.5])
 
 
 def test_a_surface_is_looked_for_within_eleven_half_voxels_along_the_gradient():
-    """Of twelve steps of half a voxel at most, the last shows that the surface is reached."""
+    """A ramp that reaches its level at i = 10; of twelve steps of half a voxel the last shows that it is reached."""
     volume = Volume(np.tile(100.0 * np.arange(24.0), (4, 4, 1)).astype(np.float32), np.eye(4))
     rule = choose_iso_rule(volume, 1000.0, closed=False)
-    found = distances_to_iso_surface(volume, rule, np.array([[4.55, 2, 2], [4.45, 2, 2], [15.45, 2, 2], [15.55, 2, 2]]))
-    np.testing.assert_allclose(found, [5.45, np.nan, 5.45, np.nan], atol=1e-4)
+    within, beyond = [10 - 5.45, 10 + 5.45], [10 - 5.55, 10 + 5.55]
+    points = np.array([[i, 2.0, 2.0] for i in within + beyond])
+    distances = distances_to_iso_surface(volume, rule, points)
+    np.testing.assert_allclose(distances, [5.45, 5.45, np.nan, np.nan], atol=tolerances.ISO_VERTEX_VOXEL)
 
 
-def test_point_beyond_a_closed_volume_has_its_distance_to_the_border_surface():
-    """The surface lies just before the border, where a step from the border is short."""
+@pytest.mark.parametrize("point", [[1.5, 1.5, 5.25], [1.5, 5.25, 1.5], [1.5, 1.5, -2.25]], ids=["k", "j", "below k"])
+def test_point_beyond_a_closed_volume_has_its_distance_to_the_border_surface(point):
+    """The surface lies just before the border, where a step from the border is short; each point 2.25 mm beyond."""
     volume = Volume(np.full((4, 4, 4), 1000, np.int16), np.eye(4))
     rule = choose_iso_rule(volume, 0, closed=True)
-    surface = 3.0 + (1000 + 0.5) / (1000 - rule.outside)
-    found = distances_to_iso_surface(volume, rule, np.array([[1.5, 1.5, 5.25], [1.5, 5.25, 1.5], [1.5, 1.5, -2.25]]))
-    np.testing.assert_allclose(found, 5.25 - surface, atol=1e-9)
+    from_last_voxel_mm = (1000 + 0.5) / (1000 - rule.outside)
+    distances = distances_to_iso_surface(volume, rule, np.array([point]))
+    np.testing.assert_allclose(distances, 2.25 - from_last_voxel_mm, atol=tolerances.FLOAT64_PLACE_MM)
 
 
-def test_flat_fields_divide_by_no_zero():
+def test_a_point_in_a_flat_field_is_measured_without_a_division_by_zero():
     volume = Volume(np.zeros((4, 4, 4), np.int16), np.eye(4))
     with np.errstate(all="raise"):
         assert np.isnan(distances_to_iso_surface(volume, choose_iso_rule(volume, 500, closed=False), np.ones((1, 3))))
 
 
-def test_of_more_points_than_100_000_every_second_is_measured(monkeypatch):
+@pytest.mark.parametrize(("count", "measured"), [(100_000, 100_000), (100_001, 50_001), (250_000, 83_334)])
+def test_of_more_than_100_000_points_every_second_or_third_is_measured(count, measured, monkeypatch):
     monkeypatch.setattr(iso_distance, "distances_to_iso_surface", lambda volume, rule, points: np.zeros(len(points)))
     volume = Volume(np.zeros((4, 4, 4), np.int16), np.eye(4))
-    for count, measured in ((100_000, 100_000), (100_001, 50_001), (250_000, 83_334)):
-        mesh = Mesh(np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint32))
-        found = measure_iso_distance(mesh, volume, choose_iso_rule(volume, 500, closed=False))
-        assert found["samples"] == {"vertices": measured, "centres": measured}
-        assert found == found.as_dict()  # a record is equal to its entries
+    mesh = Mesh(np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint32))
+    distance = measure_iso_distance(mesh, volume, choose_iso_rule(volume, 500, closed=False))
+    assert distance["samples"] == {"vertices": measured, "centres": measured}
+
+
+def test_an_iso_distance_is_equal_to_the_dictionary_of_its_entries():
+    volume = Volume(np.zeros((4, 4, 4), np.int16), np.eye(4))
+    triangle = Mesh([[1, 1, 1], [2, 1, 1], [1, 2, 1]], [[0, 1, 2]])
+    distance = measure_iso_distance(triangle, volume, choose_iso_rule(volume, 500, closed=False))
+    assert distance == distance.as_dict()
 
 
 def test_a_mesh_that_does_not_say_whether_it_is_closed_is_open():
@@ -240,69 +289,104 @@ def test_a_mesh_that_does_not_say_whether_it_is_closed_is_open():
     assert (rule.closed, rule.iso_level) == (False, 225.5)
 
 
-def metal_volume(level: float, count: int) -> tuple[Volume, Mesh]:
-    """Bone below i = 5 and one voxel of the level at (8, 3, 3); `count` of six vertices lie within two voxels of it."""
+BONE_EDGE = (4.5, 1, 1)
+WITHIN_TWO_VOXELS_OF_METAL = [(6, 3, 3), (8, 1, 5), (10, 5, 1)]
+JUST_BEYOND = (11, 3, 3)
+
+
+def bone_beside_a_dense_voxel(level: float) -> Volume:
+    """900 HU below i = 5, and one voxel of the level at (8, 3, 3); voxels of 1 mm."""
     voxels = np.zeros((7, 7, 14), np.int16)
     voxels[:, :, :5] = 900
     voxels[3, 3, 8] = level
-    places: list[tuple[float, float, float]] = (
-        [(6, 3, 3), (8, 1, 5), (10, 5, 1), (11, 3, 3)] if count == 3 else [(8, 3, 3)] * count
+    return Volume(voxels, np.eye(4))
+
+
+TWO_TRIANGLES = [[0, 1, 2], [3, 4, 5]]
+METAL_HU, DENSE_BONE_HU = 2001, 2000
+
+
+def test_vertices_within_two_voxels_of_metal_are_counted_and_left_out():
+    volume = bone_beside_a_dense_voxel(METAL_HU)
+    rule = choose_iso_rule(volume, 200, closed=False)
+    others = [JUST_BEYOND, BONE_EDGE, BONE_EDGE]
+    measured = measure_iso_distance(
+        Mesh(np.array([*WITHIN_TWO_VOXELS_OF_METAL, *others], float), TWO_TRIANGLES), volume, rule
     )
-    places += [(4.5, 1, 1)] * (6 - len(places))
-    return Volume(voxels, np.eye(4)), Mesh(np.array(places, float), [[0, 1, 2], [3, 4, 5]])
+    assert measured["near_metal"] == 3
+    of_others = distances_to_iso_surface(volume, rule, np.array(others, float))
+    assert np.isfinite(of_others).sum() >= 2
+    assert measured["away_from_metal_voxel"]["max"] == np.nanmax(of_others)
 
 
-@pytest.mark.parametrize(("level", "iso_value", "near"), [(2001, 200, 3), (2000, 200, 0), (3071, 2500, 0)])
-def test_vertices_near_metal_are_counted_and_left_out(level, iso_value, near):
-    volume, mesh = metal_volume(level, 3)
+@pytest.mark.parametrize(
+    ("level", "iso_value"), [(DENSE_BONE_HU, 200), (3071, 2500)], ids=["dense bone", "metal is what is looked for"]
+)
+def test_vertices_near_dense_bone_and_on_a_surface_of_metal_are_not_left_out(level, iso_value):
+    volume = bone_beside_a_dense_voxel(level)
+    vertices = np.array([*WITHIN_TWO_VOXELS_OF_METAL, JUST_BEYOND, BONE_EDGE, BONE_EDGE], float)
     rule = choose_iso_rule(volume, iso_value, closed=False)
-    found = measure_iso_distance(mesh, volume, rule)
-    assert found["near_metal"] == near
-    if not near:
-        assert found["away_from_metal_voxel"] is None
-        return
-    away = distances_to_iso_surface(volume, rule, mesh.vertices[3:].astype(np.float64))
-    assert np.isfinite(away).sum() >= 2
-    assert found["away_from_metal_voxel"]["max"] == np.nanmax(away)  # the centre of the second triangle is near
+    measured = measure_iso_distance(Mesh(vertices, TWO_TRIANGLES), volume, rule)
+    assert (measured["near_metal"], measured["away_from_metal_voxel"]) == (0, None)
 
 
-def test_mesh_mostly_of_metal_is_judged_whole():
-    volume, mesh = metal_volume(3071, 4)
-    found = measure_iso_distance(mesh, volume, choose_iso_rule(volume, 200, closed=False))
-    assert (found["near_metal"], found["away_from_metal_voxel"]) == (4, None)
+def test_a_mesh_with_most_vertices_near_metal_has_no_figures_away_from_it():
+    volume = bone_beside_a_dense_voxel(METAL_HU)
+    vertices = np.array([(8, 3, 3)] * 4 + [BONE_EDGE] * 2, float)
+    measured = measure_iso_distance(Mesh(vertices, TWO_TRIANGLES), volume, choose_iso_rule(volume, 200, closed=False))
+    assert (measured["near_metal"], measured["away_from_metal_voxel"]) == (4, None)
 
 
-def test_few_triangles_of_a_ball_are_judged_by_their_surface_not_by_their_corners():
-    """Corners lie outside of what is round where the volume is right: their mean alone is past the bound."""
-    far = np.linalg.norm(np.indices((15, 15, 15)).reshape(3, -1).T - 7.0, axis=1).reshape(15, 15, 15)
-    volume = Volume(np.rint(1000.0 - 150.0 * (far - 4.5)).astype(np.int16), np.eye(4))
-    rule = choose_iso_rule(volume, 1000.0)
-    ball = Mesh(*samples.sphere(radius=4.5, rounds=2))
-    right = (4.0 / 3.0 * np.pi * 4.5**3 / (1000.0 * ball.quality()["volume_ml"])) ** (1.0 / 3.0)
-    measured = {
-        larger: measure_iso_distance(Mesh(7.0 + larger * right * ball.vertices, ball.triangles), volume, rule)
-        for larger in (1.0, 1.03, 0.9)
-    }
-    of_vertices = {larger: one["vertices_voxel"]["mean"] for larger, one in measured.items()}
-    assert of_vertices[1.0] > DEVIATION_MEAN_VOXEL
-    gates = {larger: judge_mesh(iso_distance=one)[2] for larger, one in measured.items()}
-    assert {larger: gate["ok"] for larger, gate in gates.items()} == {1.0: True, 1.03: False, 0.9: False}
-    assert {gate["name"] for gate in gates.values()} == {"iso_distance_mean"}
+BALL_RADIUS = 4.5
 
 
-def test_meshes_are_measured_together_as_each_alone(monkeypatch):
+def measure_coarse_ball(larger: float) -> iso_distance.IsoDistance:
+    """128 triangles with the volume of the ball that 15 voxels an edge show, `larger` times as large."""
+    from_centre = np.linalg.norm(np.indices((15, 15, 15)) - 7.0, axis=0)
+    volume = Volume(np.rint(1000.0 - 150.0 * (from_centre - BALL_RADIUS)).astype(np.int16), np.eye(4))
+    inscribed = Mesh(*samples.sphere(radius=BALL_RADIUS, rounds=2))
+    of_its_volume = (4.0 / 3.0 * np.pi * BALL_RADIUS**3 / inscribed.volume) ** (1.0 / 3.0)
+    ball = Mesh(7.0 + larger * of_its_volume * inscribed.vertices, inscribed.triangles)
+    return measure_iso_distance(ball, volume, choose_iso_rule(volume, 1000.0))
+
+
+@pytest.mark.parametrize(
+    ("larger", "ok"), [(1.0, True), (1.03, False), (0.9, False)], ids=["right", "0.14 mm larger", "0.45 mm smaller"]
+)
+def test_few_triangles_of_a_ball_are_judged_by_their_surface_of_the_right_size(larger, ok):
+    _, _, mean_gate = judge_mesh(iso_distance=measure_coarse_ball(larger))
+    assert (mean_gate["name"], mean_gate["ok"]) == ("iso_distance_mean", ok)
+
+
+def test_corners_of_few_triangles_with_the_volume_of_a_ball_lie_outside_of_it_beyond_the_bound():
+    assert measure_coarse_ball(1.0)["vertices_voxel"]["mean"] > DEVIATION_MEAN_VOXEL
+
+
+@pytest.fixture(scope="module")
+def seven_meshes():
+    """Seven meshes, each of every seventh triangle of a surface through noise, with the volume and its rule."""
     volume = noise_volume()
-    rule = choose_iso_rule(volume, 100)
     vertices, _, triangles = extract_isosurface(volume, 100)
-    meshes = [Mesh(vertices, triangles[start::7]) for start in range(7)]
-    alone = [measure_iso_distance(mesh, volume, rule) for mesh in meshes]
+    return [Mesh(vertices, triangles[start::7]) for start in range(7)], volume, choose_iso_rule(volume, 100)
+
+
+def test_meshes_that_are_measured_together_have_the_figures_of_each_alone(seven_meshes):
+    meshes, volume, rule = seven_meshes
+    together = iso_distance.measure_iso_distances(meshes, volume, rule)
+    for mesh, among_others in zip(meshes, together, strict=True):
+        alone = measure_iso_distance(mesh, volume, rule)
+        assert among_others["samples"] == alone["samples"]
+        for figures in ("vertices_mm", "centres_mm", "centres_voxel"):
+            assert dict(among_others[figures]) == pytest.approx(alone[figures], rel=tolerances.FLOAT64_SHARE), figures
+
+
+def test_points_of_several_meshes_are_measured_in_one_call(seven_meshes, monkeypatch):
     calls = []
-    measure = iso_distance.distances_to_iso_surface
-    monkeypatch.setattr(
-        iso_distance, "distances_to_iso_surface", lambda *given: calls.append(len(given[2])) or measure(*given)
-    )
-    for one, other in zip(iso_distance.measure_iso_distances(meshes, volume, rule), alone, strict=True):
-        assert one["samples"] == other["samples"], "samples of a mesh among others"
-        for of in ("vertices_mm", "centres_mm", "centres_voxel"):
-            assert dict(one[of]) == pytest.approx(other[of], rel=1e-9), of
-    assert len(calls) == 1, calls
+
+    def count_calls(volume, rule, points):
+        calls.append(len(points))
+        return np.zeros(len(points))
+
+    monkeypatch.setattr(iso_distance, "distances_to_iso_surface", count_calls)
+    iso_distance.measure_iso_distances(*seven_meshes)
+    assert len(calls) == 1

@@ -1,10 +1,12 @@
-"""Signed distances: known bodies, the winding number as another opinion, and the figures of `compare_meshes`."""
+"""Signed distances: known bodies, the winding_number number as another opinion, and the figures of `compare_meshes`."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from sample_meshes import ball, box, torus
+import tolerances
+from refusals import refused
+from sample_meshes import Arrays, ball, box, torus
 
 import clrecon
 from clrecon.errors import NoSurfaceError, UsageError
@@ -12,7 +14,7 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare.signed import SignedDistance, measure_distance, measure_vertex_distances
 
 
-def winding(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def winding_number(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """How often a surface goes round each point, by the solid angles of its triangles (Van Oosterom, Strackee 1983)."""
     a, b, c = (vertices[triangles[:, i]][None] - points[:, None] for i in range(3))
     la, lb, lc = (np.linalg.norm(side, axis=2) for side in (a, b, c))
@@ -21,95 +23,179 @@ def winding(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> 
     return (2.0 * np.arctan2(top, low)).sum(axis=1) / (4.0 * np.pi)
 
 
-@pytest.mark.parametrize("body", ["torus", "spikes", "box", "hollow"])
-def test_the_sign_is_that_of_the_winding_number(body: str) -> None:
-    random = np.random.default_rng(5)
-    vertices, triangles = box() if body in ("box", "hollow") else torus()
-    if body == "spikes":
-        vertices = vertices * (1.0 + 0.35 * random.random((len(vertices), 1)))
-    if body == "hollow":  # an inner wall, which faces the cavity
-        inner, faces = box((0.25, 0.25, 0.25), (0.5, 0.5, 0.5))
-        triangles = np.concatenate([triangles, faces[:, ::-1] + len(vertices)])
-        vertices = np.concatenate([vertices, inner])
-    vertices, triangles = vertices + (0.0, 900.0, -1500.0), triangles.astype(np.uint32)
+def spiky_torus() -> Arrays:
+    vertices, triangles = torus()
+    return vertices * (1.0 + 0.35 * np.random.default_rng(5).random((len(vertices), 1))), triangles
+
+
+def hollow_box() -> Arrays:
+    """A cube of 1 mm with a cavity of half a millimetre, whose wall faces the cavity."""
+    (outer, outer_faces), (inner, inner_faces) = box(), box((0.25, 0.25, 0.25), (0.5, 0.5, 0.5))
+    return np.concatenate([outer, inner]), np.concatenate([outer_faces, inner_faces[:, ::-1] + len(outer)])
+
+
+@pytest.fixture(params=[torus, spiky_torus, box, hollow_box])
+def body_and_points(request: pytest.FixtureRequest) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices and triangles of a body far from the origin, and 1500 random points in and around it."""
+    vertices, triangles = request.param()
+    vertices = vertices + (0.0, 900.0, -1500.0)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    room = 0.3 * (high - low)
-    points = low - room + random.random((1500, 3)) * (high - low + 2.0 * room)
-    distance = SignedDistance(vertices, triangles)(points)
-    inside = winding(points, vertices, triangles) > 0.5
-    assert np.array_equal(distance < 0.0, inside) and 50 < inside.sum() < 1450
-    turned = SignedDistance(vertices, triangles[:, ::-1], outward=False)(points)
-    np.testing.assert_allclose(turned, distance, rtol=0.0, atol=1e-9)
+    around = 0.3 * (high - low)
+    points = np.random.default_rng(6).uniform(low - around, high + around, (1500, 3))
+    return vertices, triangles.astype(np.uint32), points
 
 
-def test_signed_distance_is_exact_at_faces_edges_corners_and_the_surface() -> None:
+def test_distances_are_negative_where_the_winding_number_says_inside(
+    body_and_points: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    vertices, triangles, points = body_and_points
+    is_inside = winding_number(points, vertices, triangles) > 0.5
+    assert 50 < is_inside.sum() < 1450, "points inside and outside"
+    np.testing.assert_array_equal(SignedDistance(vertices, triangles)(points) < 0.0, is_inside)
+
+
+def test_an_inside_out_surface_that_is_said_to_be_so_has_the_same_signed_distances(
+    body_and_points: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    vertices, triangles, points = body_and_points
+    distances = SignedDistance(vertices, triangles)(points)
+    inside_out = SignedDistance(vertices, triangles[:, ::-1], outward=False)(points)
+    np.testing.assert_allclose(inside_out, distances, rtol=0.0, atol=tolerances.FLOAT64_PLACE_MM)
+
+
+DISTANCES_OF_A_CUBE_OF_1_MM = {
+    "centre": ((0.5, 0.5, 0.5), -0.5),
+    "inside, near a face": ((0.9, 0.5, 0.5), -0.1),
+    "over a face": ((0.5, 0.5, 2.0), 1.0),
+    "beside an edge": ((0.5, -3.0, -4.0), 5.0),
+    "beyond a corner": ((2.0, 2.0, 2.0), np.sqrt(3.0)),
+}
+
+
+@pytest.mark.parametrize(("point", "distance"), DISTANCES_OF_A_CUBE_OF_1_MM.values(), ids=DISTANCES_OF_A_CUBE_OF_1_MM)
+def test_signed_distance_to_faces_edges_and_corners_is_exact(point: tuple[float, ...], distance: float) -> None:
     vertices, triangles = box()
     measure = SignedDistance(vertices, triangles.astype(np.uint32))
-    points = np.array(
-        [
-            (0.5, 0.5, 0.5),
-            (0.5, 0.5, 2.0),
-            (0.5, -3.0, -4.0),
-            (2.0, 2.0, 2.0),
-            (0.9, 0.5, 0.5),
-            (0.3, 0.2, 1.0),
-            (0, 0, 0),
-        ]
-    )
-    expected = [-0.5, 1.0, 5.0, np.sqrt(3.0), -0.1, 0.0, 0.0]
-    assert measure(points) == pytest.approx(expected, abs=1e-12)
-    assert not np.signbit(measure(points)[5:]).any()
+    assert measure(np.array([point])) == pytest.approx([distance], abs=tolerances.NEAREST_MM)
 
 
-def test_ball_in_a_ball_has_signed_distances_of_the_gap() -> None:
-    """Vertices lie on the spheres, and the triangles up to 0.02 mm within them."""
-    small, large = (Mesh(*ball(radius, 60)) for radius in (10.0, 12.0))
-    found = clrecon.measure_distance(small, large, 5000)
-    there, back = found.to_reference_signed_mm, found.from_reference_signed_mm
-    assert there is not None and back is not None and found.warnings == []
+def test_signed_distance_on_a_face_and_at_a_corner_is_zero_and_not_negative_zero() -> None:
+    vertices, triangles = box()
+    distances = SignedDistance(vertices, triangles.astype(np.uint32))(np.array([(0.3, 0.2, 1.0), (0.0, 0.0, 0.0)]))
+    assert distances == pytest.approx([0.0, 0.0], abs=tolerances.NEAREST_MM)
+    assert not np.signbit(distances).any()
+
+
+@pytest.fixture(scope="module")
+def small_and_large_ball() -> tuple[Mesh, Mesh]:
+    """Balls of 10 and 12 mm about one centre: vertices lie on the spheres, the triangles up to 0.02 mm within."""
+    return Mesh(*ball(10.0, 60)), Mesh(*ball(12.0, 60))
+
+
+GAP_MM = 12.0 - 10.0
+
+
+def test_every_figure_of_a_ball_in_a_larger_one_is_the_gap_negative_inside(
+    small_and_large_ball: tuple[Mesh, Mesh],
+) -> None:
+    distance = clrecon.measure_distance(*small_and_large_ball, 5000)
+    to_large, to_small = distance.to_reference_signed_mm, distance.from_reference_signed_mm
+    assert to_large is not None
+    assert to_small is not None
     for figure in ("mean", "p5", "median", "p95", "min", "max"):
-        assert getattr(there, figure) == pytest.approx(-2.0, abs=0.03)
-        assert getattr(back, figure) == pytest.approx(2.0, abs=0.03)
-    assert (there.outside_share, back.outside_share) == (0.0, 1.0)
-    assert there.sd < 0.01 and found.hausdorff_mm == pytest.approx(2.0, abs=0.03)
-    distances, signed = measure_vertex_distances(large, small)
-    assert signed and distances == pytest.approx(2.0, abs=0.03)
+        assert getattr(to_large, figure) == pytest.approx(-GAP_MM, abs=tolerances.TWO_BALLS_MM), figure
+        assert getattr(to_small, figure) == pytest.approx(GAP_MM, abs=tolerances.TWO_BALLS_MM), figure
+    assert distance.hausdorff_mm == pytest.approx(GAP_MM, abs=tolerances.TWO_BALLS_MM)
+
+
+def test_a_ball_in_a_larger_one_has_no_share_outside_and_the_larger_one_all(
+    small_and_large_ball: tuple[Mesh, Mesh],
+) -> None:
+    distance = clrecon.measure_distance(*small_and_large_ball, 5000)
+    assert distance.to_reference_signed_mm.outside_share == 0.0  # type: ignore[union-attr]
+    assert distance.from_reference_signed_mm.outside_share == 1.0  # type: ignore[union-attr]
+
+
+def test_an_even_gap_between_closed_balls_has_nearly_no_spread_and_no_warning(
+    small_and_large_ball: tuple[Mesh, Mesh],
+) -> None:
+    distance = clrecon.measure_distance(*small_and_large_ball, 5000)
+    assert distance.to_reference_signed_mm.sd < tolerances.TWO_BALLS_MM  # type: ignore[union-attr]
+    assert distance.warnings == []
+
+
+def test_each_vertex_of_the_larger_ball_has_the_gap_as_its_signed_distance(
+    small_and_large_ball: tuple[Mesh, Mesh],
+) -> None:
+    small, large = small_and_large_ball
+    distances, is_signed = measure_vertex_distances(large, small)
+    assert is_signed
+    assert distances == pytest.approx(GAP_MM, abs=tolerances.TWO_BALLS_MM)
 
 
 def test_the_figures_without_sign_are_those_of_compare_meshes() -> None:
-    one = Mesh(*torus())
-    other = one.transformed([[1.0, 0.02, 0, 0.7], [0, 1.1, 0, 0], [0, 0, 1, -0.4], [0, 0, 0, 1]])
-    found, wanted = measure_distance(one, other, 4000), clrecon.compare_meshes(one, other, 4000)
-    assert found.hausdorff_mm == pytest.approx(wanted.max_mm, rel=1e-9)
-    for side in ("to_reference_mm", "from_reference_mm"):
-        assert dict(found[side]) == pytest.approx(dict(wanted[side]), rel=1e-9)
-    assert (found.hd95_mm, found.assd_mm) == pytest.approx((wanted.hd95_mm, wanted.assd_mm), rel=1e-9)
+    mesh = Mesh(*torus())
+    sheared = mesh.transformed([[1.0, 0.02, 0, 0.7], [0, 1.1, 0, 0], [0, 0, 1, -0.4], [0, 0, 0, 1]])
+    signed, unsigned = measure_distance(mesh, sheared, 4000), clrecon.compare_meshes(mesh, sheared, 4000)
+    assert dict(signed.to_reference_mm) == pytest.approx(dict(unsigned.to_reference_mm))
+    assert dict(signed.from_reference_mm) == pytest.approx(dict(unsigned.from_reference_mm))
+    assert signed.hausdorff_mm == pytest.approx(unsigned.max_mm)
+    assert signed.hd95_mm == pytest.approx(unsigned.hd95_mm)
+    assert signed.assd_mm == pytest.approx(unsigned.assd_mm)
 
 
-def test_an_open_mesh_gives_no_sign_and_an_inside_out_one_is_turned_back() -> None:
-    vertices, triangles = box()
-    whole, opened, turned = (Mesh(vertices, each) for each in (triangles, triangles[1:], triangles[:, ::-1]))
-    shifted = Mesh(0.5 * vertices + 0.25, triangles)
-    found = measure_distance(shifted, opened, 100, names=("a.stl", "b.stl"))
-    assert found.to_reference_signed_mm is None and found.from_reference_signed_mm is not None
-    assert found.warnings == ["b.stl is not closed (3 edges not in two triangles): distances from it have no sign"]
-    assert measure_vertex_distances(shifted, opened)[1] is False
-    found = measure_distance(shifted, turned, 100)
-    assert "inside out" in found.warnings[0]
-    assert found.to_reference_signed_mm == measure_distance(shifted, whole, 100).to_reference_signed_mm
-    mixed = triangles.copy()
+CORNERS, FACES = box()
+INNER_BOX = Mesh(0.5 * CORNERS + 0.25, FACES)
+"""A cube of half a millimetre in the middle of the cube of 1 mm."""
+
+
+def test_distances_from_an_open_mesh_have_no_sign_and_a_warning_names_its_file() -> None:
+    opened = Mesh(CORNERS, FACES[1:])
+    distance = measure_distance(INNER_BOX, opened, 100, names=("a.stl", "b.stl"))
+    assert distance.to_reference_signed_mm is None
+    assert distance.from_reference_signed_mm is not None
+    assert distance.warnings == ["b.stl is not closed (3 edges not in two triangles): distances from it have no sign"]
+
+
+def test_distances_of_vertices_from_an_open_mesh_are_said_to_have_no_sign() -> None:
+    _, is_signed = measure_vertex_distances(INNER_BOX, Mesh(CORNERS, FACES[1:]))
+    assert is_signed is False
+
+
+def test_an_inside_out_mesh_is_measured_as_if_turned_back_and_a_warning_says_so() -> None:
+    distance = measure_distance(INNER_BOX, Mesh(CORNERS, FACES[:, ::-1]), 100)
+    outward = measure_distance(INNER_BOX, Mesh(CORNERS, FACES), 100)
+    assert "inside out" in distance.warnings[0]
+    assert distance.to_reference_signed_mm == outward.to_reference_signed_mm
+
+
+def test_distances_from_a_mesh_with_a_flipped_triangle_have_no_sign_and_a_warning_says_why() -> None:
+    mixed = FACES.copy()
     mixed[0] = mixed[0, ::-1]
-    found = measure_distance(whole, Mesh(vertices, mixed), 100)
-    assert "do not agree" in found.warnings[0] and found.to_reference_signed_mm is None
+    distance = measure_distance(INNER_BOX, Mesh(CORNERS, mixed), 100)
+    assert "do not agree" in distance.warnings[0]
+    assert distance.to_reference_signed_mm is None
 
 
-def test_what_cannot_be_measured_is_refused() -> None:
-    mesh, empty = Mesh(*box()), Mesh(np.zeros((3, 3)), np.zeros((0, 3), np.uint32))
-    with pytest.raises(UsageError, match="at least 1 sample"):
-        measure_distance(mesh, mesh, 0)
-    with pytest.raises(NoSurfaceError, match="no triangles"):
-        measure_distance(mesh, empty)
-    with pytest.raises(NoSurfaceError, match="without area"):
-        measure_distance(empty, mesh)
-    with pytest.raises(UsageError, match="closed"):
-        SignedDistance(mesh.vertices, mesh.triangles[1:])
+WHOLE_BOX, NO_TRIANGLES = Mesh(CORNERS, FACES), Mesh(np.zeros((3, 3)), np.zeros((0, 3), np.uint32))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "reference", "samples", "error", "words"),
+    [
+        (WHOLE_BOX, WHOLE_BOX, 0, UsageError, "at least 1 sample"),
+        (WHOLE_BOX, NO_TRIANGLES, 100, NoSurfaceError, "no triangles"),
+        (NO_TRIANGLES, WHOLE_BOX, 100, NoSurfaceError, "without area"),
+    ],
+    ids=["no samples", "reference without triangles", "mesh without triangles"],
+)
+def test_a_distance_without_samples_or_triangles_is_refused(
+    mesh: Mesh, reference: Mesh, samples: int, error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        measure_distance(mesh, reference, samples)
+
+
+def test_signed_distances_from_an_open_surface_are_refused() -> None:
+    with refused(UsageError, "closed"):
+        SignedDistance(CORNERS, FACES[1:])
