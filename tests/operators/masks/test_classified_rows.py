@@ -13,7 +13,7 @@ from clrecon.operators.surface.slabs import SampleGrid, Slab
 
 
 @pytest.fixture(scope="module")
-def one_lane(device):
+def device_as_gpu(device):
     """The device with the kernels of GPUs."""
     gpu = Device(device.index, device.cl_device.platform, device.cl_device)
     gpu.kernel_variants, gpu.fault = {"LANES": "1", "WORDS_PER_ITEM": "1"}, ""
@@ -34,14 +34,17 @@ def inside_rows(inside, border, words):
 @pytest.mark.oclgrind
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
-@pytest.mark.parametrize("ni", [8, 31, 32, 40, 64, 65, 72, 128])
-def test_inside_bits_and_extents_equal_those_of_numpy(one_lane, ni, dtype, closed):
-    volume = random_volume((3, 5, ni), dtype, high=100)
+@pytest.mark.parametrize("columns", [8, 31, 32, 40, 64, 65, 72, 128])
+def test_inside_bits_and_extents_of_rows_equal_those_of_numpy(device_as_gpu, columns, dtype, closed):
+    volume = random_volume((3, 5, columns), dtype, high=100)
     volume.voxels[1, 2] = 0  # a row without bits
-    volume.voxels[0, :, -1] = 99
-    slab = Slab(SampleGrid(volume, choose_iso_rule(volume, 60, closed=closed)), 0, 3 + 2 * closed)
-    level = np.dtype(dtype).type(slab.grid.rule.lowest_inside)
-    made = classify(one_lane, slab, upload(one_lane, volume.voxels), [level])
-    mask, extents = inside_rows(volume.voxels >= level, slab.grid.rule.border, slab.grid.words)
-    assert np.array_equal(download(one_lane, np.empty_like(mask), made.mask_d), mask)
-    assert np.array_equal(download(one_lane, np.empty(extents.shape, np.uint16), made.row_extents_d), extents)
+    volume.voxels[0, :, -1] = 99  # rows whose last bit is set
+    grid = SampleGrid(volume, choose_iso_rule(volume, 60, closed=closed))
+    slab = Slab(grid, 0, 3 + 2 * closed)  # a closed surface has a slice more at either end
+    level = np.dtype(dtype).type(grid.rule.lowest_inside)
+
+    made = classify(device_as_gpu, slab, upload(device_as_gpu, volume.voxels), [level])
+
+    mask, extents = inside_rows(volume.voxels >= level, grid.rule.border, grid.words)
+    assert np.array_equal(download(device_as_gpu, np.empty_like(mask), made.mask_d), mask)
+    assert np.array_equal(download(device_as_gpu, np.empty(extents.shape, np.uint16), made.row_extents_d), extents)
