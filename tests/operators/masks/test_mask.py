@@ -173,8 +173,9 @@ def test_label_map_of_a_mask_gives_the_mask_back(device, labelled):
 
 
 def test_mask_of_an_unknown_label_is_refused_with_its_name(device, labelled):
+    volume, labels = labelled
     with refused(UsageError, "L9"):
-        clrecon.Mask.from_labels(*labelled, ["L9"], device=device)
+        clrecon.Mask.from_labels(volume, labels, ["L9"], device=device)
 
 
 def test_mask_of_an_array_in_place_of_a_label_map_is_refused(device, labelled):
