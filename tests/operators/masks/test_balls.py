@@ -90,10 +90,10 @@ def test_empty_and_full_masks_stay_when_closed(device, share):
     assert mask.close(2.0).share == share
 
 
-@pytest.fixture(params=FRAMES.values(), ids=FRAMES.keys())
+@pytest.fixture(params=FRAMES)
 def random_40_percent(request, device):
     chosen = random_mask((6, 9, 41), 0.4)
-    return clrecon.Mask.from_array(volume_of(chosen.shape, request.param), chosen, device=device)
+    return clrecon.Mask.from_array(volume_of(chosen.shape, FRAMES[request.param]), chosen, device=device)
 
 
 @pytest.mark.parametrize("change", ["dilate", "erode", "open", "close"])

@@ -159,12 +159,14 @@ PAIRS_OF_THE_CELL_OF_FOUR = 4 * 4  # equal points are no pairs, and a cell of th
 
 
 def test_pairs_of_a_crowded_cell_up_to_the_most_are_accepted(crowded_grid):
-    check_pairs(*crowded_grid, crowded=3, most=PAIRS_OF_THE_CELL_OF_FOUR)
+    grid, starts = crowded_grid
+    check_pairs(grid, starts, crowded=3, most=PAIRS_OF_THE_CELL_OF_FOUR)
 
 
 def test_pairs_of_a_crowded_cell_beyond_the_most_are_refused(crowded_grid):
+    grid, starts = crowded_grid
     with refused(UsageError, 5, 12, 1):  # the fullest cell, the points, and the cell's edge in mm
-        check_pairs(*crowded_grid, crowded=3, most=PAIRS_OF_THE_CELL_OF_FOUR - 1)
+        check_pairs(grid, starts, crowded=3, most=PAIRS_OF_THE_CELL_OF_FOUR - 1)
 
 
 @pytest.mark.parametrize("k", [0, -1, 129, 2.0, True, None])
