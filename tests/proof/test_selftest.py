@@ -1,4 +1,4 @@
-"""The self-test: every check passes and launches what it declares, and a driver that ends badly becomes words."""
+"""The self-test: every check passes and launches what it declares; a driver that crashes or hangs is reported."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from clrecon.proof.rays import ray_checks
 from clrecon.proof.run import CHECKS, run_check, run_selftest
 from clrecon.proof.surface import surface_checks
 
-FEW = {"scan_block_sums": 64, "total_counts": 64}
+OF_ONE_GROUP = frozenset({"scan_block_sums", "total_counts"})
 """Kernels that are launched over one work-group, whatever the data."""
 
 ASKED_BY_OPERATORS = frozenset({
@@ -60,8 +60,8 @@ OF_TYPES = {"VOXEL", "VALUE", "LABEL", "VOXEL_IS_SHORT"}
 OF_DEVICES = {"LANES", "WORDS_PER_ITEM", "HAS_BUILTIN_PREFETCH", "SCAN_GROUP", "CPU_NAME", "ATOMIC_LOADS"}
 
 
-def macros_of(programs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
-    """What programs were built with, beside types and what the device needs."""
+def variants_of(programs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
+    """The macros that programs of each file were built with, beside those of types and of the device."""
     found: dict[str, set[str]] = {}
     for file, options in programs:
         switched = {macro for macro, value in definitions_of(options).items() if value != "0"}
@@ -91,46 +91,62 @@ def remember(monkeypatch: pytest.MonkeyPatch, module: ModuleType, name: str) -> 
     monkeypatch.setattr(module, name, ask)
 
 
+@pytest.fixture
+def left_out_checks(request: pytest.FixtureRequest) -> frozenset[str]:
+    """Names of the checks that are not run in this session on this device."""
+    if is_set("CLRECON_RELEASE_TESTS"):
+        return frozenset()
+    is_further = request.node.get_closest_marker("further_device") is not None
+    return ASKED_BY_OPERATORS - (EVERY_DAY if is_further else frozenset())
+
+
+def count_launched_items(device: Device, monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+    """Return the most work-items of each kernel that is launched from now on."""
+    items: dict[str, int] = {}
+
+    def note_launch(doing: str) -> None:
+        match = re.fullmatch(r"kernel (\w+) \(([\d,]+) items\)", doing)
+        if match is not None:
+            items[match[1]] = max(items.get(match[1], 0), int(match[2].replace(",", "")))
+
+    monkeypatch.setattr(device, "trace", note_launch)
+    return items
+
+
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.every_device
 @pytest.mark.fault_row(57)
-def test_every_check_passes_and_launches_what_it_declares(
-    device: Device, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+def test_every_check_passes_and_launches_the_kernels_and_variants_that_it_declares_over_enough_items(
+    device: Device, left_out_checks: frozenset[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So each kernel and each of its variants is compared with its twin on every device."""
-    is_further = request.node.get_closest_marker("further_device") is not None
-    left_out = ASKED_BY_OPERATORS - (EVERY_DAY if is_further else frozenset())
-    if is_set("CLRECON_RELEASE_TESTS"):
-        left_out = frozenset()
-    checks = [check for check in CHECKS if check.name not in left_out]
-    launched: dict[str, int] = {}
-
-    def note(doing: str) -> None:
-        match = re.fullmatch(r"kernel (\w+) \(([\d,]+) items\)", doing)
-        if match is not None:
-            launched[match[1]] = max(launched.get(match[1], 0), int(match[2].replace(",", "")))
-
     for module, name in ((ray_checks, "cast_rays"), (ray_checks, "surface_twin"), (surface_checks, "extract_twin")):
         remember(monkeypatch, module, name)
-    monkeypatch.setattr(device, "trace", note)
-    most: dict[str, int] = {}
-    for check in checks:
-        launched.clear()
+    launched_items = count_launched_items(device, monkeypatch)
+    most_items: dict[str, int] = {}
+    for check in CHECKS:
+        if check.name in left_out_checks:
+            continue
+        launched_items.clear()
         monkeypatch.setattr(device, "programs", {})
+
         outcome = run_check(device, check)
+
         assert outcome["passed"], outcome
-        assert set(check.kernels) <= set(launched), check.name
-        built = macros_of(device.programs)
+        assert set(check.kernels) <= set(launched_items), check.name
+        built = variants_of(device.programs)
         for file, macros in check.variants.items():
             assert set(macros) <= built.get(file, set()), (check.name, file)
         for kernel in check.kernels:
-            most[kernel] = max(most.get(kernel, 0), launched[kernel])
-    judged = set(most) - {kernel for check in CHECKS if check.name in left_out for kernel in check.kernels}
-    assert {kernel for kernel in judged if most[kernel] <= LEAST_ITEMS} == set(FEW) & judged
+            most_items[kernel] = max(most_items.get(kernel, 0), launched_items[kernel])
+
+    of_left_out = {kernel for check in CHECKS if check.name in left_out_checks for kernel in check.kernels}
+    judged = set(most_items) - of_left_out
+    assert {kernel for kernel in judged if most_items[kernel] <= LEAST_ITEMS} == OF_ONE_GROUP & judged
 
 
-def test_names_that_are_left_out_are_checks() -> None:
+def test_checks_that_run_for_a_release_or_on_further_devices_alone_exist() -> None:
     assert EVERY_DAY < ASKED_BY_OPERATORS < {check.name for check in CHECKS}
 
 
@@ -151,7 +167,9 @@ def pytest_sessionfinish():
 
 
 @pytest.mark.release
-def test_operators_ask_what_is_left_out(device: Device, tmp_path: Path) -> None:
+def test_tests_of_operators_launch_the_kernels_and_variants_of_the_checks_that_are_for_a_release(
+    device: Device, tmp_path: Path
+) -> None:
     (tmp_path / "launched.py").write_text(LAUNCHED)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "launched", "-p", "no:cacheprovider"]
     command += ["-m", "every_device or oclgrind", "tests/operators", "tests/opencl"]
@@ -162,34 +180,58 @@ def test_operators_ask_what_is_left_out(device: Device, tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stdout
     kernels, programs = json.loads((tmp_path / "launched.json").read_text())
-    built = macros_of(programs)
-    for check in CHECKS:
-        if check.name in ASKED_BY_OPERATORS:
-            assert set(check.kernels) <= set(kernels), check.name
-            assert all(set(macros) <= built[file] for file, macros in check.variants.items()), check.name
+    built = variants_of(programs)
+    for check in (check for check in CHECKS if check.name in ASKED_BY_OPERATORS):
+        assert set(check.kernels) <= set(kernels), check.name
+        assert all(set(macros) <= built[file] for file, macros in check.variants.items()), check.name
 
 
 @pytest.mark.fault_row(57)
-def test_mismatches_are_told() -> None:
-    require_equal([1, 2], [1, 2], "numbers")
-    with refused(DeviceError, "numbers", 1, 2):
+def test_first_unequal_number_fails_a_check_of_equality() -> None:
+    with refused(DeviceError, "numbers", 1, 2):  # one of two numbers
         require_equal([1, 3], [1, 2], "numbers")
+
+
+@pytest.mark.fault_row(57)
+def test_another_count_of_numbers_fails_a_check_of_equality() -> None:
     with refused(DeviceError, "numbers", 3, 2):
         require_equal([1, 3, 4], [1, 2], "numbers")
+
+
+@pytest.mark.fault_row(57)
+def test_check_of_closeness_returns_the_largest_difference_within_the_tolerance() -> None:
     assert require_close([1.0, np.nan], [1.25, np.nan], 0.5, "numbers") == 0.25
-    for found in ([1.0, 2.0], [1.6, np.nan], [np.inf, np.nan]):
-        with refused(DeviceError, 2, 0.5):
-            require_close(found, [1.0, np.nan], 0.5, "numbers")
-    assert require_share([0.0] * 99 + [9.0], [0.0] * 100, 1.0, 0.01, "numbers") == 0.0
+
+
+@pytest.mark.fault_row(57)
+@pytest.mark.parametrize(
+    "found",
+    [[1.0, 2.0], [1.6, np.nan], [np.inf, np.nan]],
+    ids=["a number where NaN is expected", "0.6 above", "infinite"],
+)
+def test_number_beyond_the_tolerance_fails_a_check_of_closeness(found: list[float]) -> None:
+    with refused(DeviceError, 2, 0.5):  # of two numbers, tolerance 0.5
+        require_close(found, [1.0, np.nan], 0.5, "numbers")
+
+
+@pytest.mark.fault_row(57)
+def test_numbers_beyond_the_tolerance_pass_a_check_of_shares_up_to_the_allowed_share() -> None:
+    one_of_100_apart = [0.0] * 99 + [9.0]
+    assert require_share(one_of_100_apart, [0.0] * 100, 1.0, 0.01, "numbers") == 0.0
+
+
+@pytest.mark.fault_row(57)
+def test_numbers_beyond_the_tolerance_above_the_allowed_share_fail_with_count_and_largest_difference() -> None:
+    two_of_100_apart = [0.0] * 98 + [9.0, 2.0]
     with refused(DeviceError, 2, 100, 9):
-        require_share([0.0] * 98 + [9.0, 2.0], [0.0] * 100, 1.0, 0.01, "numbers")
+        require_share(two_of_100_apart, [0.0] * 100, 1.0, 0.01, "numbers")
 
 
 def check_named(name: str) -> Check:
     return Check(name, (), lambda device: "")
 
 
-STORY = """
+SCRIPTED_CHECKS = """
 import json, os, signal, sys, time
 checks = json.load(sys.stdin)["checks"]
 for check in checks:
@@ -207,52 +249,81 @@ for check in checks:
 
 
 @pytest.fixture
-def storied(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Device:
-    """The device, whose self-test runs `STORY` in the place of checks."""
-    run_instead(monkeypatch, tmp_path / "code", "clrecon.proof.run", STORY)
+def scripted_device(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Device:
+    """The device, whose checks pass, crash, exit or hang in the processes of the self-test as their names say."""
+    run_instead(monkeypatch, tmp_path / "code", "clrecon.proof.run", SCRIPTED_CHECKS)
     return device
 
 
 @pytest.mark.parametrize("error", [ModuleNotFoundError("No module named 'scipy'"), IndexError("9 is out of bounds")])
-def test_error_of_a_check_is_its_failure_in_words(device: Device, error: Exception) -> None:
+def test_check_that_raises_an_error_fails_with_its_type_and_message(device: Device, error: Exception) -> None:
     def fail(device: Device) -> str:
         raise error
 
     outcome = run_check(device, Check("a check", (), fail))
-    assert not outcome["passed"] and outcome["detail"] == f"{type(error).__name__}: {error}"
+    assert outcome["passed"] is False
+    assert outcome["detail"] == f"{type(error).__name__}: {error}"
+
+
+def run_checks(device: Device, names: list[str], processes: int = 1) -> dict[str, dict[str, Any]]:
+    """Run checks of these names in the order given; returns their outcomes by name, in the order of their ends."""
+    checks = [check_named(name) for name in names]
+    outcomes = run_selftest(device, checks, silent_seconds=1.5, processes=processes)
+    return {outcome["operator"]: outcome for outcome in outcomes}
 
 
 @pytest.mark.fault_row(57)
-def test_a_driver_that_crashes_or_hangs_becomes_words(storied: Device) -> None:
-    names = ["first", "crash", "second", "exit", "third", "hang", "last"]
-    outcomes = list(run_selftest(storied, [check_named(name) for name in names], silent_seconds=1.5, processes=1))
-    assert [outcome["operator"] for outcome in outcomes] == names
-    assert [outcome["passed"] for outcome in outcomes] == [True, False, True, False, True, False, False]
-    words = {outcome["operator"]: outcome["detail"] for outcome in outcomes}
-    assert words["crash"] == "the driver crashed with SIGSEGV in kernel of_crash (64 items)"
-    assert words["exit"] == "the process of the test ended with exit code 7 in kernel of_exit (64 items)"
-    assert words["hang"] == "the driver hangs: nothing for 1.5 s in kernel of_hang (64 items)"
-    assert storied.warnings == ["a remark of the process"]
-    assert words["last"] == "not run: the driver hangs"
+@pytest.mark.parametrize(
+    ("name", "detail"),
+    [
+        ("crash", "the driver crashed with SIGSEGV in kernel of_crash (64 items)"),
+        ("exit", "the process of the test ended with exit code 7 in kernel of_exit (64 items)"),
+        ("hang", "the driver hangs: nothing for 1.5 s in kernel of_hang (64 items)"),
+    ],
+)
+def test_driver_that_crashes_exits_or_hangs_fails_its_check_with_the_kernel(
+    scripted_device: Device, name: str, detail: str
+) -> None:
+    outcomes = run_checks(scripted_device, [name])
+    assert (outcomes[name]["passed"], outcomes[name]["detail"]) == (False, detail)
 
 
-def test_processes_run_side_by_side_and_one_that_hangs_holds_no_other(storied: Device) -> None:
-    names = ["hang", "first", "left", "second", "last", "crash", "fourth", "third"]
-    outcomes = list(run_selftest(storied, [check_named(name) for name in names], silent_seconds=1.5, processes=2))
-    assert {outcome["operator"]: outcome["passed"] for outcome in outcomes} == {
-        "hang": False, "left": False, "last": False, "fourth": False,
-        "first": True, "second": True, "crash": False, "third": True,
+@pytest.mark.fault_row(57)
+def test_checks_after_a_crash_or_an_exit_are_run(scripted_device: Device) -> None:
+    outcomes = run_checks(scripted_device, ["first", "crash", "second", "exit", "third"])
+    assert {name: outcome["passed"] for name, outcome in outcomes.items()} == {
+        "first": True, "crash": False, "second": True, "exit": False, "third": True,
     }  # fmt: skip
-    assert [outcome["operator"] for outcome in outcomes][0] == "first"  # it does not wait for the other process
-    assert sorted(outcome["detail"] for outcome in outcomes if "not run" in outcome["detail"]) == (
-        ["not run: the driver hangs"] * 3
-    )
 
 
-def test_a_caller_that_leaves_ends_all_processes(storied: Device) -> None:
-    names = ["hang", "first", "left", "second"]
-    outcomes = run_selftest(storied, [check_named(name) for name in names], silent_seconds=600.0, processes=2)
+@pytest.mark.fault_row(57)
+def test_check_after_one_that_hangs_is_not_run_and_fails(scripted_device: Device) -> None:
+    outcomes = run_checks(scripted_device, ["hang", "last"])
+    assert (outcomes["last"]["passed"], outcomes["last"]["detail"]) == (False, "not run: the driver hangs")
+
+
+def test_warnings_of_the_processes_of_checks_are_those_of_the_device_each_once(scripted_device: Device) -> None:
+    run_checks(scripted_device, ["first", "second"])
+    assert scripted_device.warnings == ["a remark of the process"]
+
+
+def test_process_whose_check_hangs_leaves_its_checks_and_holds_up_no_other_process(scripted_device: Device) -> None:
+    of_first, of_second = ["hang", "left", "last", "fourth"], ["first", "second", "crash", "third"]
+    in_turn = [name for pair in zip(of_first, of_second, strict=True) for name in pair]
+
+    outcomes = run_checks(scripted_device, in_turn, processes=2)
+
+    assert next(iter(outcomes)) == "first"  # it does not wait for the check that hangs
+    assert [outcomes[name]["passed"] for name in of_second] == [True, True, False, True]
+    not_run = ["not run: the driver hangs"] * 3
+    assert [outcomes[name]["detail"] for name in of_first[1:]] == not_run
+
+
+def test_caller_that_stops_reading_outcomes_ends_the_process_that_hangs(scripted_device: Device) -> None:
+    checks = [check_named(name) for name in ("hang", "first", "left", "second")]
+    outcomes = run_selftest(scripted_device, checks, silent_seconds=600.0, processes=2)
     assert next(outcomes)["operator"] == "first"
     began = time.perf_counter()
     outcomes.close()
-    assert time.perf_counter() - began < 20.0
+    seconds_of_the_hanging_check = 60.0
+    assert time.perf_counter() - began < seconds_of_the_hanging_check / 3
