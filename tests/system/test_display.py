@@ -1,4 +1,4 @@
-"""What the words and the end of the child that tries a display mean; real displays are tried with the window."""
+"""What the output and the exit code of the process that tries a display mean; windows try real displays."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from clrecon.system.display import Display, DisplayProbe, read_words
 
 
-def told(*facts: dict[str, object]) -> bytes:
+def printed_by_child(*facts: dict[str, object]) -> bytes:
     return b"".join(json.dumps(each).encode() + b"\n" for each in facts)
 
 
@@ -19,41 +19,50 @@ START = {"display": True, "window": "vtkXOpenGLRenderWindow"}
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="displays have names in X11")
 @pytest.mark.parametrize(
-    ("words", "code", "fault"),
+    ("output", "code", "fault"),
     [
-        (told({"display": False}), 0, "the display :5 does not answer"),
-        (told(START), -11, "OpenGL does not work on the display :5: drawing ended a process with -11"),
+        (printed_by_child({"display": False}), 0, "the display :5 does not answer"),
+        (printed_by_child(START), -11, "OpenGL does not work on the display :5: drawing ended a process with -11"),
         (b"", 139, "OpenGL does not work on the display :5: drawing ended a process with 139"),
-        (told({"display": True, "missing": "no vtk"}), 0, "VTK cannot be imported (no vtk)"),
+        (printed_by_child({"display": True, "missing": "no vtk"}), 0, "VTK cannot be imported (no vtk)"),
         (
-            told({"display": True, "window": "vtkEGLRenderWindow", "drawn": True}),
+            printed_by_child({"display": True, "window": "vtkEGLRenderWindow", "drawn": True}),
             0,
             "the display :5 has no OpenGL (GLX)",
         ),
         (
-            told(START, {**START, "drawn": False}),
+            printed_by_child(START, {**START, "drawn": False}),
             0,
             "OpenGL does not work on the display :5: what was drawn is not seen",
         ),
     ],
+    ids=["no answer", "crash", "crash in a shell", "no VTK", "no GLX", "nothing drawn"],
 )
-def test_each_fault_of_a_display_is_described(words, code, fault, monkeypatch):
+def test_fault_of_a_display_is_read_from_the_output_and_exit_code(output, code, fault, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":5")
-    assert read_words(words, code) == Display(fault)
+    assert read_words(output, code) == Display(fault)
 
 
-def test_a_display_that_draws_has_none_and_its_driver_is_known(monkeypatch):
+def test_display_that_draws_has_no_fault_and_the_name_of_its_driver(monkeypatch):
     monkeypatch.setenv("DISPLAY", ":5")
-    found = read_words(told(START, {**START, "drawn": True, "driver": ["llvmpipe (LLVM 15)"]}), 0)
-    assert found == Display(None, "llvmpipe (LLVM 15)") and found.is_software
-    assert not Display(None, "NVIDIA H100").is_software
+    output = printed_by_child(START, {**START, "drawn": True, "driver": ["llvmpipe (LLVM 15)"]})
+    assert read_words(output, 0) == Display(None, "llvmpipe (LLVM 15)")
+
+
+@pytest.mark.parametrize(("driver", "is_software"), [("llvmpipe (LLVM 15)", True), ("NVIDIA H100", False)])
+def test_llvmpipe_is_a_software_driver(driver, is_software):
+    assert Display(None, driver).is_software == is_software
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="displays have names in X11")
-def test_without_a_display_no_child_is_started(monkeypatch):
+@pytest.mark.parametrize(
+    ("wayland", "words"),
+    [(None, "there is no display here (DISPLAY is not set)"), ("wayland-0", "Xwayland")],
+    ids=["no display at all", "Wayland alone"],
+)
+def test_probe_without_an_x11_display_finds_a_fault(wayland, words, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    assert DisplayProbe().wait().fault == "there is no display here (DISPLAY is not set)"
-    monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
-    fault = DisplayProbe().wait().fault
-    assert fault is not None and "Xwayland" in fault
+    if wayland is not None:
+        monkeypatch.setenv("WAYLAND_DISPLAY", wayland)
+    assert words in (DisplayProbe().wait().fault or "")

@@ -1,10 +1,11 @@
-"""What clrecon says to Python's logging: enough to find out what happened, nothing about a patient, nothing unasked."""
+"""The log of clrecon by Python's logging: what a job did, nothing about a patient, and not printed by itself."""
 
 from __future__ import annotations
 
 import logging
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,42 +30,107 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_job_says_what_a_batch_looks_for(
-    device: Any, scan: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.DEBUG, "clrecon")
+class CollectedRecords(logging.Handler):
+    """All records of a log."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.records: list[logging.LogRecord] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.records.append(record)
+
+
+@dataclass
+class LoggedJob:
+    """A job that made a mesh: its report, the file that it wrote, and what it logged."""
+
+    report: dict[str, Any]
+    written: Path
+    records: list[logging.LogRecord]
+
+    @property
+    def messages(self) -> list[str]:
+        return [record.getMessage() for record in self.records]
+
+
+@pytest.fixture(scope="module")
+def job(device: Any, scan: Path, tmp_path_factory: pytest.TempPathFactory) -> LoggedJob:
+    """A mesh of the scan, whose folder, file names and header name the patient."""
+    written = tmp_path_factory.mktemp("job") / f"{NAME}.stl"
     settings = MeshSettings(iso_value=200.0, device=str(device.index))
-    report = make_mesh(scan, tmp_path / f"{NAME}.stl", settings, report_path=tmp_path / "a.json")
-    said = [record.getMessage() for record in caplog.records]
-    assert any(text.startswith(f"device {device.index} chosen of") and device.label in text for text in said)
-    assert "series 1 of 1 read: (30, 31, 20) voxels int16" in said
-    assert f"file written: {(tmp_path / f'{NAME}.stl').stat().st_size} bytes" in said
-    assert any(text.startswith("1 meshes made, ") and device.label in text for text in said)
-    assert {text.split(":")[0] for text in said} > {"read", "device", "surface", "measure", "write"}
-    assert all(record.name.startswith("clrecon.") for record in caplog.records)
-    warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
-    assert report["warnings"]
-    assert sorted(warnings) == sorted(report["warnings"])  # each once
-    assert not any("Mueller" in text or str(tmp_path) in text for text in said)
+    collected = CollectedRecords()
+    logger = logging.getLogger("clrecon")
+    level = logger.level
+    logger.addHandler(collected)
+    logger.setLevel(logging.DEBUG)
+    try:
+        report = make_mesh(scan, written, settings, report_path=written.with_name("a.json"))
+    finally:
+        logger.removeHandler(collected)
+        logger.setLevel(level)
+    return LoggedJob(report, written, collected.records)
 
 
-@pytest.mark.parametrize("content", [b"", b"damaged"])
-def test_a_kept_binary_that_is_damaged_is_said(
-    content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_log_of_a_job_has_its_device_series_file_and_meshes(job: LoggedJob, device: Any) -> None:
+    [chosen] = [text for text in job.messages if text.startswith(f"device {device.index} chosen of")]
+    [made] = [text for text in job.messages if text.startswith("1 meshes made, ")]
+    assert device.label in chosen
+    assert device.label in made
+    assert "series 1 of 1 read: (30, 31, 20) voxels int16" in job.messages
+    assert f"file written: {job.written.stat().st_size} bytes" in job.messages
+
+
+def test_log_of_a_job_has_each_of_its_stages(job: LoggedJob) -> None:
+    assert {text.split(":")[0] for text in job.messages} > {"read", "device", "surface", "measure", "write"}
+
+
+def test_log_of_a_job_has_each_warning_of_its_report_once(job: LoggedJob) -> None:
+    warnings = [record.getMessage() for record in job.records if record.levelno >= logging.WARNING]
+    assert warnings
+    assert sorted(warnings) == sorted(job.report["warnings"])
+
+
+def test_log_of_a_job_comes_from_loggers_of_clrecon(job: LoggedJob) -> None:
+    assert job.records
+    assert all(record.name.startswith("clrecon.") for record in job.records)
+
+
+def test_log_of_a_job_names_no_patient_and_no_folder(job: LoggedJob) -> None:
+    log = "\n".join(job.messages)
+    assert "read" in log
+    assert "Mueller" not in log
+    assert str(job.written.parent) not in log
+
+
+@pytest.fixture
+def binary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> Path:
+    """The folder of built programs, whose log is read."""
     caplog.set_level(logging.INFO, "clrecon")
     caches = prepare_caches()._replace(binaries=tmp_path)
     monkeypatch.setattr(cache, "prepare_caches", lambda: caches)
-    assert cache.read_binary("key") is None  # none is there: nothing to say
+    return tmp_path
+
+
+@pytest.mark.parametrize("content", [b"", b"damaged"])
+def test_damaged_binary_of_a_program_is_logged(
+    content: bytes, binary_folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     cache.store_binary("key", b"binary")
-    assert cache.read_binary("key") == b"binary"
-    assert caplog.messages == []
-    (tmp_path / "key").write_bytes(content)
-    assert cache.read_binary("key") is None
+    (binary_folder / "key").write_bytes(content)
+    cache.read_binary("key")
     assert caplog.messages == ["a kept binary is damaged: it is built anew and replaced"]
 
 
-def test_log_is_not_printed_unasked(scan: Path) -> None:
+@pytest.mark.usefixtures("binary_folder")
+def test_missing_and_whole_binaries_of_programs_are_not_logged(caplog: pytest.LogCaptureFixture) -> None:
+    assert cache.read_binary("key") is None
+    cache.store_binary("key", b"binary")
+    assert cache.read_binary("key") == b"binary"
+    assert caplog.messages == []
+
+
+def test_log_of_reading_is_not_printed_without_a_handler(scan: Path) -> None:
     code = "import clrecon, sys; volume = clrecon.read_volume(sys.argv[1]); assert volume.report['warnings']"
     done = subprocess.run([sys.executable, "-c", code, str(scan)], capture_output=True, check=True)
     assert (done.stdout, done.stderr) == (b"", b"")
@@ -76,7 +142,7 @@ def test_import_and_help_do_not_load_logging() -> None:
     assert done.stdout == "False\n"
 
 
-def test_a_volume_made_from_arrays_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
+def test_volume_made_from_an_array_is_not_logged(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, "clrecon")
     assert clrecon.Volume(np.zeros((2, 3, 4), np.int16), np.eye(4)).hu_range == (0.0, 0.0)
     assert caplog.records == []

@@ -1,4 +1,4 @@
-"""Memory-mapped voxels: found through views, and let go without losing anything."""
+"""Memory-mapped voxels: their mapping is found through views, and released pages are read again from the file."""
 
 from __future__ import annotations
 
@@ -20,47 +20,66 @@ def file(tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["r", "r+"])
-def test_a_mapping_is_found_through_views(file, mode):
-    mapped = np.load(file, mmap_mode=mode)
-    for view in (mapped, np.asarray(mapped), mapped[2:5], np.ascontiguousarray(mapped)[1:]):
-        mapping = find_mapping(view)
-        assert mapping is not None
-        assert mapping.address < view.ctypes.data < mapping.address + len(mapping.file)
+@pytest.mark.parametrize(
+    "make_view",
+    [
+        pytest.param(lambda mapped: mapped, id="the mapped array"),
+        pytest.param(np.asarray, id="a plain array"),
+        pytest.param(lambda mapped: mapped[2:5], id="some slices"),
+        pytest.param(lambda mapped: np.ascontiguousarray(mapped)[1:], id="slices of a contiguous array"),
+    ],
+)
+def test_mapping_of_a_file_is_found_through_a_view_of_it(file, mode, make_view):
+    view = make_view(np.load(file, mmap_mode=mode))
+    mapping = find_mapping(view)
+    assert mapping is not None
+    assert mapping.address < view.ctypes.data < mapping.address + len(mapping.file)
 
 
-def test_ordinary_memory_and_private_mappings_are_left_alone(file):
+def test_array_in_ordinary_memory_has_no_mapping():
+    assert find_mapping(VOXELS) is None
+
+
+def test_array_in_an_anonymous_mapping_has_no_mapping_of_a_file():
+    anonymous = np.frombuffer(mmap.mmap(-1, VOXELS.nbytes), np.int16).reshape(VOXELS.shape)
+    assert find_mapping(anonymous) is None
+
+
+def test_value_written_to_a_private_mapping_is_kept_when_its_slices_are_released(file):
+    """It stands in memory alone: a released page would be read from the file."""
     private = np.load(file, mmap_mode="c")
     private[0, 0, 0] = -5
     assert find_mapping(private) is None
-    assert find_mapping(VOXELS) is None
-    anonymous = np.frombuffer(mmap.mmap(-1, VOXELS.nbytes), np.int16).reshape(VOXELS.shape)
-    assert find_mapping(anonymous) is None
     Volume(private, np.eye(4)).release_slices(0, 6)
     assert private[0, 0, 0] == -5
 
 
-def test_released_slices_are_read_again(file):
+@pytest.mark.parametrize(("first", "end"), [(0, 6), (1, 2), (5, 6), (3, 3)])
+def test_released_slices_of_a_shared_mapping_keep_their_values(file, first, end):
     mapped = np.load(file, mmap_mode="r+")
     mapped[3, 2, 1] = -77
+    expected = mapped.copy()
     volume = Volume(mapped, np.eye(4))
-    for first, end in [(0, 6), (1, 2), (5, 6), (3, 3)]:
-        volume.release_slices(first, end)
-    assert volume.voxels[3, 2, 1] == -77
-    assert np.array_equal(volume.voxels[4:], VOXELS[4:])
+    volume.release_slices(first, end)
+    assert np.array_equal(volume.voxels, expected)
 
 
-def test_releasing_takes_whole_pages_within_the_part(file, monkeypatch):
+def test_only_whole_pages_within_the_released_slices_are_released(file):
     mapped = np.load(file, mmap_mode="r")
     mapping = find_mapping(mapped)
-    calls = []
+    released = []
 
     class File:
         def madvise(self, option, start, length):
-            calls.append((start, length))
+            released.append((start, length))
 
     object.__setattr__(mapping, "file", File())
     mapping.release(mapped[1:5])
-    ((start, length),) = calls
+
+    [(start, length)] = released
     begin = mapped[1].ctypes.data - mapping.address
-    assert start % mmap.PAGESIZE == length % mmap.PAGESIZE == 0
-    assert begin <= start and start + length <= begin + 4 * mapped[1].nbytes
+    end = begin + mapped[1:5].nbytes
+    assert start % mmap.PAGESIZE == 0
+    assert length % mmap.PAGESIZE == 0
+    assert begin <= start
+    assert end - 2 * mmap.PAGESIZE < start + length <= end

@@ -1,4 +1,4 @@
-"""Everything that goes to another process and back arrives as it was."""
+"""Objects that go to another process and back by pickle arrive as they were: volumes, meshes, settings, errors."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 from functools import cached_property
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -102,65 +103,81 @@ HELD_BY_A_DEVICE = {"Device", "DeviceVolume", "Mask", "SurfaceExtractor", "Verte
 """Public classes that are no messages: they own memory of a device."""
 
 
-def travel(message):
+def pickled(message):
     return pickle.loads(pickle.dumps(message))
 
 
-def look(value, seen=None):
+def content_of(value):
     """All plain values that an object holds, arrays with their type and whether they can be written."""
     if isinstance(value, np.ndarray):
         return value.dtype.str, value.shape, value.flags.writeable, value.tobytes()
     if isinstance(value, dict):
-        return {key: look(entry) for key, entry in value.items()}
+        return {key: content_of(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return type(value), [look(entry) for entry in value]
+        return type(value), [content_of(entry) for entry in value]
     if isinstance(value, Exception):
         return type(value), value.args
     if not hasattr(value, "__dict__"):
         return value
     kind = type(value)
-    kept = {name: each for name, each in vars(value).items() if not isinstance(vars(kind).get(name), cached_property)}
-    return kind, look(kept)
+    stored = {name: each for name, each in vars(value).items() if not isinstance(vars(kind).get(name), cached_property)}
+    return kind, content_of(stored)
 
 
-@pytest.mark.parametrize("way", [travel, copy.deepcopy, copy.copy])
+@pytest.mark.parametrize("copy_by", [pickled, copy.deepcopy, copy.copy])
 @pytest.mark.parametrize("name", MESSAGES)
-def test_a_message_arrives_as_it_was(name, way):
+def test_pickled_or_copied_object_has_the_type_and_the_content_of_its_original(name, copy_by):
     message = MESSAGES[name]
-    arrived = way(message)
-    assert type(arrived) is type(message)
-    assert arrived is not message
-    assert look(arrived) == look(message)
+    copied = copy_by(message)
+    assert copied is not message
+    assert type(copied) is type(message)
+    assert content_of(copied) == content_of(message)
 
 
-def test_every_public_class_is_a_message_or_owns_a_device():
+def test_every_public_class_is_pickled_in_these_tests_or_owns_memory_of_a_device():
     public = {name for name in clrecon.__all__ if isinstance(getattr(clrecon, name), type)} - {"Style"}  # of all styles
     errors = {name for name in public if issubclass(getattr(clrecon, name), Exception)}
-    seen = {kind.__name__ for message in MESSAGES.values() for kind in type(message).__mro__}
-    assert public - errors - HELD_BY_A_DEVICE <= seen
+    pickled_here = {kind.__name__ for message in MESSAGES.values() for kind in type(message).__mro__}
+    assert public - errors - HELD_BY_A_DEVICE <= pickled_here
 
 
 @pytest.mark.parametrize("name", [name for name in clrecon.__all__ if name.endswith("Error") or name == "Cancelled"])
-def test_errors_are_pickled_with_their_message(name):
-    error = travel(getattr(clrecon, name)("what, where, and what to do"))
+def test_pickled_error_has_its_type_and_message(name):
+    error = pickled(getattr(clrecon, name)("what, where, and what to do"))
     assert type(error) is getattr(clrecon, name)
     assert str(error) == "what, where, and what to do"
 
 
-@pytest.mark.parametrize("way", [travel, copy.deepcopy])
-def test_arrays_that_cannot_be_written_stay_so_in_another_process(way):
-    frozen = VOXELS.copy()
-    frozen.flags.writeable = False
-    volume = way(Volume(frozen, AFFINE, slice_positions=POSITIONS))
-    clip, function = way(MESSAGES["clip"]), way(MESSAGES["transfer function"])
-    assert volume.uneven
-    for array in (volume.voxels, volume.affine, volume._inverse, volume._stack.positions, clip.planes, function.points):
-        with refused(ValueError, "read-only"):
-            array[0] = 7
-    assert way(Volume(VOXELS, AFFINE)).voxels.flags.writeable
+def read_only_volume():
+    voxels = VOXELS.copy()
+    voxels.flags.writeable = False
+    return Volume(voxels, AFFINE, slice_positions=POSITIONS)
 
 
-def test_a_deep_copy_shares_nothing_that_can_be_written():
+@pytest.mark.parametrize("copy_by", [pickled, copy.deepcopy])
+@pytest.mark.parametrize(
+    ("message", "array"),
+    [
+        (read_only_volume(), "voxels"),
+        (read_only_volume(), "affine"),
+        (read_only_volume(), "_inverse"),
+        (read_only_volume(), "_stack.positions"),
+        (MESSAGES["clip"], "planes"),
+        (MESSAGES["transfer function"], "points"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else type(value).__name__,
+)
+def test_read_only_array_of_a_pickled_or_copied_object_is_read_only(message, array, copy_by):
+    with refused(ValueError, "read-only"):
+        attrgetter(array)(copy_by(message))[0] = 7
+
+
+@pytest.mark.parametrize("copy_by", [pickled, copy.deepcopy])
+def test_voxels_that_can_be_written_can_be_written_in_a_pickled_or_copied_volume(copy_by):
+    assert copy_by(Volume(VOXELS, AFFINE)).voxels.flags.writeable
+
+
+def test_change_of_a_deep_copy_leaves_the_voxels_and_the_report_of_its_volume():
     volume = Volume(VOXELS.copy(), AFFINE)
     copied = copy.deepcopy(volume)
     copied.voxels[0, 0, 0] = -99
@@ -175,67 +192,90 @@ def file(tmp_path):
     return tmp_path / "voxels.npy"
 
 
-@pytest.mark.parametrize("kind", [Volume, LabelMap])
-def test_mapped_voxels_travel_as_their_place(tmp_path, kind):
-    large = np.zeros((64, 64, 64), np.uint16)
-    large[5:] = np.arange(64, dtype=np.uint16)
-    np.save(tmp_path / "large.npy", large)
-    message = kind(np.load(tmp_path / "large.npy", mmap_mode="r")[3:60], AFFINE)
-    sent = pickle.dumps(message)
-    assert len(sent) < 10_000
-    arrived = pickle.loads(sent)
-    assert np.array_equal(arrived.voxels, large[3:60])
+LARGE = np.broadcast_to(np.arange(64, dtype=np.uint16), (64, 64, 64))
+"""Voxels of 512 KiB, whose place in a file takes some hundred bytes."""
+
+
+@pytest.fixture(params=[Volume, LabelMap])
+def mapped_message(request, tmp_path):
+    """Slices 3 to 59 of the large voxels, mapped read-only from a file."""
+    np.save(tmp_path / "large.npy", LARGE)
+    return request.param(np.load(tmp_path / "large.npy", mmap_mode="r")[3:60], AFFINE)
+
+
+def is_sent_by_place(message):
+    """Whether the pickle of a message holds the place of its voxels in a file, and not their values."""
+    return len(pickle.dumps(message)) < LARGE.nbytes / 50
+
+
+def test_mapped_voxels_are_sent_by_their_place_in_the_file_and_arrive_read_only(mapped_message):
+    assert is_sent_by_place(mapped_message)
+    arrived = pickled(mapped_message)
+    assert np.array_equal(arrived.voxels, LARGE[3:60])
     assert not arrived.voxels.flags.writeable
-    assert len(pickle.dumps(arrived)) < 10_000  # it is mapped again, and can travel on
-    assert len(pickle.dumps(copy.deepcopy(message))) < 10_000
 
 
-def test_values_written_to_a_mapping_travel(file):
+def test_mapped_voxels_that_arrived_are_sent_on_by_their_place_in_the_file(mapped_message):
+    assert is_sent_by_place(pickled(mapped_message))
+
+
+def test_deep_copy_of_mapped_voxels_is_sent_by_their_place_in_the_file(mapped_message):
+    assert is_sent_by_place(copy.deepcopy(mapped_message))
+
+
+def test_value_written_through_a_shared_mapping_arrives_in_read_only_voxels(file):
     mapped = np.load(file, mmap_mode="r+")
     volume = Volume(mapped, AFFINE)
     mapped[1, 2, 3] = -77
-    arrived, copied = travel(volume), copy.deepcopy(volume)
-    assert arrived.voxels[1, 2, 3] == copied.voxels[1, 2, 3] == -77
+    arrived = pickled(volume)
+    assert arrived.voxels[1, 2, 3] == -77
     assert not arrived.voxels.flags.writeable
-    copied.voxels[0, 0, 0] = 5  # in memory: the file stays as it is
+
+
+def test_deep_copy_of_a_shared_mapping_has_its_written_values_and_writes_none_to_the_file(file):
+    mapped = np.load(file, mmap_mode="r+")
+    mapped[1, 2, 3] = -77
+    copied = copy.deepcopy(Volume(mapped, AFFINE))
+    assert copied.voxels[1, 2, 3] == -77
+    copied.voxels[0, 0, 0] = 5
     assert mapped[0, 0, 0] == 0
 
 
-def test_private_mappings_travel_with_their_values(file):
+def test_private_mapping_is_sent_with_its_values(file):
     mapped = np.load(file, mmap_mode="c")
     mapped[1, 2, 3] = -77
     volume = Volume(mapped, AFFINE)
     file.unlink()
-    assert travel(volume).voxels[1, 2, 3] == -77
+    assert pickled(volume).voxels[1, 2, 3] == -77
 
 
-@pytest.mark.parametrize("replaced", [False, True])
-def test_a_file_that_went_before_the_message_left_is_no_matter(file, replaced):
+@pytest.mark.parametrize("is_replaced", [False, True])
+def test_mapped_voxels_whose_file_was_removed_or_replaced_before_are_sent_with_their_values(file, is_replaced):
     volume = Volume(np.load(file, mmap_mode="r"), AFFINE)
     file.unlink()
-    if replaced:
+    if is_replaced:
         np.save(file, VOXELS + 1)
-    arrived = travel(volume)
+    arrived = pickled(volume)
     assert np.array_equal(arrived.voxels, VOXELS)
     assert not arrived.voxels.flags.writeable
 
 
-def test_a_file_that_went_on_the_way_is_said(file):
+def test_message_whose_file_was_removed_on_its_way_is_refused_with_the_file(file):
     sent = pickle.dumps(Volume(np.load(file, mmap_mode="r"), AFFINE))
     file.unlink()
     with refused(RefusedInputError, "voxels.npy"):
         pickle.loads(sent)
 
 
-@pytest.mark.parametrize("values", [VOXELS + 1, VOXELS[:2]])
-def test_a_file_that_was_changed_on_the_way_is_said(file, values):
+@pytest.mark.parametrize("values", [VOXELS + 1, VOXELS[:2]], ids=["other values", "fewer values"])
+def test_message_whose_file_was_changed_on_its_way_is_refused_with_the_file(file, values):
     sent = pickle.dumps(Volume(np.load(file, mmap_mode="r"), AFFINE))
     np.save(file, values)
     with refused(RefusedInputError, "voxels.npy"):
         pickle.loads(sent)
 
 
-THERE = """
+SUM_IN_ANOTHER_PROCESS = """
 import pickle, sys
 import numpy as np
 volume = pickle.loads(sys.stdin.buffer.read())
@@ -245,9 +285,10 @@ sys.stdout.buffer.write(pickle.dumps(volume))
 """
 
 
-def test_a_mapped_volume_goes_to_another_process_and_back(file):
+def test_mapped_volume_comes_back_from_another_process_with_its_voxels_slices_and_report(file):
     volume = Volume(np.load(file, mmap_mode="r"), AFFINE, {"warnings": []}, POSITIONS)
-    done = subprocess.run([sys.executable, "-c", THERE], input=pickle.dumps(volume), capture_output=True, check=True)
+    command = [sys.executable, "-c", SUM_IN_ANOTHER_PROCESS]
+    done = subprocess.run(command, input=pickle.dumps(volume), capture_output=True, check=True)
     back = pickle.loads(done.stdout)
     assert back.report == {"warnings": [], "sum": int(VOXELS.sum())}
     assert np.array_equal(back.voxels, VOXELS)
