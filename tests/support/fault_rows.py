@@ -215,18 +215,24 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     61: (
         "disk full, quota, EPERM, a folder, a name too long: refused, the older file intact",
         (
-            FILES + "test_errors_of_the_system_are_told_in_words",
-            FILES + "test_full_disk_is_foreseen",
-            FILES + "test_limit_on_the_size_of_files_leaves_the_older_one",
+            FILES + "test_error_of_the_system_while_writing_is_told_in_one_line_and_leaves_the_older_file",
+            FILES + "test_file_larger_than_the_free_space_is_refused_before_it_is_written",
+            FILES + "test_file_beyond_the_largest_size_that_the_system_allows_is_refused_and_leaves_the_older_file",
             "exchange/test_mesh_files.py::test_every_writer_notices_a_full_disk",
         ),
     ),
     62: (
         "SIGINT, SIGTERM, SIGKILL in the middle: the older file intact, temporary files removed by the next run",
-        (FILES + "test_stopped_process_leaves_the_older_file", "cli/test_process.py::test_an_interrupt_leaves_nothing"),
+        (
+            FILES + "test_process_that_is_stopped_while_writing_leaves_the_older_file",
+            "cli/test_process.py::test_an_interrupt_leaves_nothing",
+        ),
     ),
     63: ("the target exists: replaced as a whole; --no-clobber: refused before any work", ()),
-    64: ("two writers of one name: one whole file", (FILES + "test_many_writers_of_one_name_leave_a_whole_file",)),
+    64: (
+        "two writers of one name: one whole file",
+        (FILES + "test_six_threads_that_write_to_one_name_leave_one_whole_file",),
+    ),
     66: (
         "closed streams, no terminal: no traceback, plain progress",
         (

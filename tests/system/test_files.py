@@ -12,7 +12,8 @@ import stat
 import subprocess
 import sys
 import textwrap
-import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -28,11 +29,11 @@ pytestmark = [
 ]
 
 
-def names(folder: Path) -> list[str]:
+def names_in(folder: Path) -> list[str]:
     return sorted(entry.name for entry in folder.iterdir())
 
 
-def raise_in_the_middle(error: BaseException):
+def writing_half_then_raising(error: BaseException):
     def write(stream) -> None:
         stream.write(b"half")
         raise error
@@ -42,42 +43,53 @@ def raise_in_the_middle(error: BaseException):
 
 @pytest.fixture
 def older(tmp_path) -> Path:
+    """A file that is there before another is written in its place."""
     path = tmp_path / "bone.stl"
     path.write_bytes(b"older")
     return path
 
 
-def check_untouched(path: Path) -> None:
-    assert path.read_bytes() == b"older"
-    assert names(path.parent) == [path.name]
+def check_untouched(older: Path) -> None:
+    """Assert that the older file has its content, and that there is no other file beside it."""
+    assert older.read_bytes() == b"older"
+    assert names_in(older.parent) == [older.name]
 
 
-def test_new_file_appears_once_it_is_verified(tmp_path):
-    seen = []
+def test_new_file_is_verified_whole_under_a_temporary_private_name_before_it_appears(tmp_path):
+    target = tmp_path / "bone.stl"
+    verified: list[Path] = []
 
     def verify(temporary: Path) -> None:
-        seen.append((temporary.parent, temporary.read_bytes(), stat.S_IMODE(temporary.stat().st_mode)))
-        assert temporary.name.startswith(".clrecon-")
-        assert not (tmp_path / "bone.stl").exists()
+        verified.append(temporary)
+        assert temporary.read_bytes() == b"12345"
+        assert stat.S_IMODE(temporary.stat().st_mode) == 0o600
+        assert not target.exists()
 
-    assert replace_file(tmp_path / "bone.stl", lambda stream: stream.write(b"12345"), verify) == 5
-    assert seen == [(tmp_path, b"12345", 0o600)]
-    assert (tmp_path / "bone.stl").read_bytes() == b"12345"
-    assert names(tmp_path) == ["bone.stl"]
+    replace_file(target, lambda stream: stream.write(b"12345"), verify)
+
+    [temporary] = verified
+    assert temporary.parent == tmp_path
+    assert temporary.name.startswith(".clrecon-")
+    assert target.read_bytes() == b"12345"
+    assert names_in(tmp_path) == ["bone.stl"]
 
 
-def test_older_file_is_replaced_in_one_step(older):
+def test_older_file_has_its_content_until_the_newer_one_is_written(older):
     def write(stream) -> None:
         stream.write(b"newer and longer")
         stream.flush()
         assert older.read_bytes() == b"older"
 
-    assert replace_file(str(older), write) == 16
+    replace_file(str(older), write)
     assert older.read_bytes() == b"newer and longer"
 
 
+def test_size_of_the_written_file_is_returned(tmp_path):
+    assert replace_file(tmp_path / "a", lambda stream: stream.write(b"12345")) == 5
+
+
 @pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o000, 0o666), (0o027, 0o640)])
-def test_new_file_has_the_mode_of_the_umask(tmp_path, umask, mode):
+def test_new_file_has_the_mode_that_the_umask_leaves_and_the_umask_is_kept(tmp_path, umask, mode):
     before = os.umask(umask)
     try:
         replace_file(tmp_path / "x", lambda stream: None)
@@ -103,21 +115,21 @@ def test_replaced_file_keeps_its_mode(older):
         (errno.EIO, os.strerror(errno.EIO).split()[0]),
     ],
 )
-def test_errors_of_the_system_are_told_in_words(older, code, fact):
+def test_error_of_the_system_while_writing_is_told_in_one_line_and_leaves_the_older_file(older, code, fact):
     with pytest.raises(OutputError) as caught:
-        replace_file(older, raise_in_the_middle(OSError(code, os.strerror(code))))
+        replace_file(older, writing_half_then_raising(OSError(code, os.strerror(code))))
     assert_one_line(caught.value, fact, older.name)
     assert caught.value.exit_code == 6
     check_untouched(older)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
-def test_a_folder_of_the_system_takes_no_files():
+def test_target_in_a_folder_of_the_system_that_takes_no_files_is_refused():
     with refused(OutputError, "a.stl"):
         check_writable("/proc/a.stl")
 
 
-def test_a_folder_that_vanishes_is_said(tmp_path):
+def test_folder_that_is_removed_before_its_file_appears_is_an_error_that_says_so(tmp_path):
     target = tmp_path / "folder" / "a.stl"
     target.parent.mkdir()
     with refused(OutputError, "a.stl", "vanished"), stage_file(target, lambda stream: stream.write(b"1")) as staged:
@@ -126,31 +138,31 @@ def test_a_folder_that_vanishes_is_said(tmp_path):
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), UsageError("no"), RuntimeError("no"), SystemExit(3)])
-def test_other_errors_leave_the_older_file_and_pass_through(older, error):
+def test_error_of_the_writing_function_is_raised_and_leaves_the_older_file(older, error):
     with pytest.raises(type(error), match=f"^{error}$"):
-        replace_file(older, raise_in_the_middle(error))
+        replace_file(older, writing_half_then_raising(error))
     check_untouched(older)
 
 
-def test_older_file_stays_when_verifying_is_interrupted(older):
-    def verify(temporary: Path) -> None:
+def test_interrupt_while_verifying_leaves_the_older_file(older):
+    def interrupt(temporary: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt, match="^$"):
-        replace_file(older, lambda stream: stream.write(b"newer"), verify)
+        replace_file(older, lambda stream: stream.write(b"newer"), interrupt)
     check_untouched(older)
 
 
-def test_file_that_fails_its_check_leaves_the_older_one(older):
-    def verify(temporary: Path) -> None:
+def test_file_that_fails_its_verification_leaves_the_older_file(older):
+    def find_fault(temporary: Path) -> None:
         raise OutputError("3 triangles, 4 expected")
 
     with refused(OutputError, "triangles", 3, 4):
-        replace_file(older, lambda stream: stream.write(b"newer"), verify)
+        replace_file(older, lambda stream: stream.write(b"newer"), find_fault)
     check_untouched(older)
 
 
-def test_bytes_that_are_lost_are_noticed(older):
+def test_file_that_has_lost_bytes_on_the_disk_is_refused_and_leaves_the_older_file(older):
     def write(stream) -> None:
         stream.write(b"12345678")
         stream.flush()
@@ -161,8 +173,8 @@ def test_bytes_that_are_lost_are_noticed(older):
     check_untouched(older)
 
 
-@pytest.mark.parametrize("piece", [100_000, 300])  # more and less than the buffer holds
-def test_limit_on_the_size_of_files_leaves_the_older_one(older, piece):
+@pytest.mark.parametrize("piece", [100_000, 300], ids=["pieces above the buffer", "pieces within the buffer"])
+def test_file_beyond_the_largest_size_that_the_system_allows_is_refused_and_leaves_the_older_file(older, piece):
     """A real limit of the system, in a process of its own."""
     code = f"""
         import resource
@@ -180,63 +192,74 @@ def test_limit_on_the_size_of_files_leaves_the_older_one(older, piece):
     check_untouched(older)
 
 
-def test_full_disk_is_foreseen(older):
+PETABYTE = 10**15
+
+
+def test_file_larger_than_the_free_space_is_refused_before_it_is_written(older):
     calls: list = []
-    with refused(OutputError, "MB", "free", 1e9):
-        replace_file(older, calls.append, expected_bytes=10**15)
-    with refused(OutputError, "MB", "free", 1e9):
-        check_writable(older, expected_bytes=10**15)
-    with pytest.raises(OutputError) as caught:
-        check_writable(older, expected_bytes=10**15)
-    assert caught.value.__cause__.errno == errno.ENOSPC  # as where the disk fills while it is written
+    with refused(OutputError, "MB", "free", PETABYTE / 10**6):
+        replace_file(older, calls.append, expected_bytes=PETABYTE)
     assert calls == []
     check_untouched(older)
 
 
-@pytest.mark.parametrize("action", [check_writable, lambda path: replace_file(path, lambda stream: None)])
+def test_target_without_enough_free_space_is_refused_as_a_full_disk_is(older):
+    with refused(OutputError, "MB", "free", PETABYTE / 10**6) as caught:
+        check_writable(older, expected_bytes=PETABYTE)
+    assert caught.value.__cause__.errno == errno.ENOSPC
+    check_untouched(older)
+
+
+def write_nothing(path) -> None:
+    replace_file(path, lambda stream: None)
+
+
+@pytest.mark.parametrize("action", [check_writable, write_nothing])
 class TestRefusedTargets:
-    def test_a_file_in_a_missing_folder_is_refused(self, action, tmp_path):
+    def test_file_in_a_missing_folder_is_refused(self, action, tmp_path):
         with refused(OutputError, "folder"):
             action(tmp_path / "no" / "bone.stl")
-        assert names(tmp_path) == []
+        assert names_in(tmp_path) == []
 
     def test_file_below_a_file_is_refused(self, action, older):
         with refused(OutputError, "bone.stl", "folder"):
             action(older / "bone.stl")
         check_untouched(older)
 
-    def test_a_folder_in_place_of_the_file_is_refused(self, action, tmp_path):
-        with pytest.raises(OutputError, match="it is a folder"):
-            action(tmp_path)
-        with pytest.raises(OutputError, match="this names a folder"):
-            action(f"{tmp_path}/new/")
-        with pytest.raises(OutputError, match="this names a folder"):
-            action("")
+    @pytest.mark.parametrize(
+        ("name", "words"),
+        [(".", "it is a folder"), ("new/", "this names a folder"), ("", "this names a folder")],
+        ids=["a folder", "a name that ends with a slash", "no name"],
+    )
+    def test_name_of_a_folder_is_refused(self, action, name, words, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(OutputError, match=words):
+            action(name)
 
-    def test_a_fifo_in_place_of_the_file_is_refused(self, action, tmp_path):
+    def test_fifo_in_place_of_the_file_is_refused_and_left(self, action, tmp_path):
         os.mkfifo(tmp_path / "x.stl")
         with refused(OutputError, "FIFO"):
             action(tmp_path / "x.stl")
         assert stat.S_ISFIFO((tmp_path / "x.stl").stat().st_mode)
 
-    def test_a_character_device_in_place_of_the_file_is_refused(self, action):
+    def test_character_device_in_place_of_the_file_is_refused_and_left(self, action):
         with refused(OutputError, "character", "device"):
             action("/dev/null")
         assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
 
-    def test_a_socket_in_place_of_the_file_is_refused(self, action, tmp_path, monkeypatch):
+    def test_socket_in_place_of_the_file_is_refused(self, action, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)  # the name of a socket must be short
         with socket.socket(socket.AF_UNIX) as server:
             server.bind("s")
             with refused(OutputError, "socket"):
                 action("s")
 
-    def test_name_too_long_is_refused(self, action, tmp_path):
+    def test_file_name_of_300_letters_is_refused(self, action, tmp_path):
         with refused(OutputError, "long"):
             action(tmp_path / ("x" * 300 + ".stl"))
-        assert names(tmp_path) == []
+        assert names_in(tmp_path) == []
 
-    def test_link_loop_is_refused(self, action, tmp_path):
+    def test_link_that_leads_to_itself_is_refused(self, action, tmp_path):
         (tmp_path / "a").symlink_to(tmp_path / "b")
         (tmp_path / "b").symlink_to(tmp_path / "a")
         with refused(OutputError, "itself"):
@@ -246,62 +269,69 @@ class TestRefusedTargets:
         with refused(OutputError, "character"):
             action(f"{tmp_path}/a\0b")
 
-    def test_message_is_one_line(self, action, tmp_path):
+    def test_message_about_a_name_with_a_line_break_is_one_printable_line(self, action, tmp_path):
         with pytest.raises(OutputError) as caught:
             action(tmp_path / "no\nfolder\x1b[31m" / "x.stl")
         assert_one_line(caught.value, "exist")
 
-    def test_missing_permission_is_refused(self, action, older, monkeypatch):
-        real = os.open
+    def test_folder_without_permission_to_create_files_is_refused(self, action, older, monkeypatch):
+        open_file = os.open
 
-        def refuse(path, flags, *rest, **more):
+        def refuse_to_create(path, flags, *rest, **more):
             if flags & os.O_CREAT:
                 raise PermissionError(errno.EACCES, "Permission denied")
-            return real(path, flags, *rest, **more)
+            return open_file(path, flags, *rest, **more)
 
-        monkeypatch.setattr(os, "open", refuse)
+        monkeypatch.setattr(os, "open", refuse_to_create)
         with refused(OutputError, "permission", "folder"):
             action(older)
         check_untouched(older)
 
-    def test_write_protected_file_is_refused(self, action, older, monkeypatch):
+    def test_write_protected_file_is_refused_and_left(self, action, older, monkeypatch):
         monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write to everything
         with pytest.raises(OutputError, match="write-protected"):
             action(older)
         check_untouched(older)
 
 
-def test_check_writable_leaves_nothing(older):
-    assert check_writable(older) is None
-    assert check_writable(older.parent / "new.stl") is None
+def test_check_of_a_target_leaves_the_older_file_and_makes_no_new_one(older):
+    check_writable(older)
+    check_writable(older.parent / "new.stl")
     check_untouched(older)
 
 
-def test_link_to_a_file_is_followed(tmp_path):
-    (tmp_path / "there").mkdir()
-    real, link, dangling = tmp_path / "there" / "real.stl", tmp_path / "link.stl", tmp_path / "dangling.stl"
+def test_file_behind_a_link_is_replaced_and_the_link_kept(tmp_path):
+    (tmp_path / "folder").mkdir()
+    real, link = tmp_path / "folder" / "real.stl", tmp_path / "link.stl"
     real.write_bytes(b"older")
     link.symlink_to(real)
-    dangling.symlink_to(tmp_path / "there" / "new.stl")
     replace_file(link, lambda stream: stream.write(b"newer"))
-    replace_file(dangling, lambda stream: stream.write(b"new"))
-    assert link.is_symlink() and real.read_bytes() == b"newer"
-    assert dangling.is_symlink() and (tmp_path / "there" / "new.stl").read_bytes() == b"new"
-    assert names(tmp_path / "there") == ["new.stl", "real.stl"]
+    assert link.is_symlink()
+    assert real.read_bytes() == b"newer"
+    assert names_in(tmp_path / "folder") == ["real.stl"]
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_stopped_process_leaves_the_older_file(older, how):
-    """The older file stays; what a killed process leaves is removed by the next writer, and only that."""
+def test_file_behind_a_dangling_link_is_made_and_the_link_kept(tmp_path):
+    (tmp_path / "folder").mkdir()
+    new, link = tmp_path / "folder" / "new.stl", tmp_path / "link.stl"
+    link.symlink_to(new)
+    replace_file(link, lambda stream: stream.write(b"new"))
+    assert link.is_symlink()
+    assert new.read_bytes() == b"new"
+
+
+@contextlib.contextmanager
+def process_writing_to(target: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
+    """A process that has written half of a file, and its temporary file; it ends by a signal alone."""
     code = f"""
-        import sys, time
+        import time
         from clrecon.system.files import replace_file
         def write(stream):
             stream.write(b"half")
             stream.flush()
             print("writing", flush=True)
             time.sleep(60)
-        replace_file({str(older)!r}, write)
+        replace_file({str(target)!r}, write)
     """
     process = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -309,68 +339,97 @@ def test_stopped_process_leaves_the_older_file(older, how):
     assert process.stdout is not None
     with process, process.stdout:
         assert process.stdout.readline() == "writing\n"
-        temporary = [name for name in names(older.parent) if name.startswith(".clrecon-")]
-        assert len(temporary) == 1
-        # A living process keeps its file, although another one writes into the same folder.
-        replace_file(older.parent / "other.stl", lambda stream: stream.write(b"x"))
-        assert (older.parent / temporary[0]).read_bytes() == b"half"
-        process.send_signal(how)
-        process.wait(timeout=30)
+        [temporary] = target.parent.glob(".clrecon-*")
+        try:
+            yield process, temporary
+        finally:
+            process.kill()
+
+
+def stop(process: subprocess.Popen[str], by: signal.Signals) -> None:
+    process.send_signal(by)
+    process.wait(timeout=30)
+
+
+@pytest.mark.parametrize("by", [signal.SIGKILL, signal.SIGINT])
+def test_process_that_is_stopped_while_writing_leaves_the_older_file(older, by):
+    with process_writing_to(older) as (process, _):
+        stop(process, by)
     assert older.read_bytes() == b"older"
-    assert (temporary[0] in names(older.parent)) == (how == signal.SIGKILL)
+
+
+def test_process_that_is_interrupted_while_writing_removes_its_temporary_file(older):
+    with process_writing_to(older) as (process, temporary):
+        stop(process, signal.SIGINT)
+    assert not temporary.exists()
+
+
+def test_temporary_file_of_a_process_that_is_writing_is_kept_by_other_writers(older):
+    with process_writing_to(older) as (_, temporary):
+        replace_file(older.parent / "other.stl", lambda stream: stream.write(b"x"))
+        assert temporary.read_bytes() == b"half"
+
+
+def test_temporary_file_of_a_killed_process_and_no_other_file_is_removed_by_the_next_writer(older):
+    with process_writing_to(older) as (process, temporary):
+        stop(process, signal.SIGKILL)
+    assert temporary.exists()
     (older.parent / ".clrecon-notes").write_text("of the user")
     replace_file(older.parent / "other.stl", lambda stream: stream.write(b"y"))
-    assert names(older.parent) == [".clrecon-notes", "bone.stl", "other.stl"]
+    assert names_in(older.parent) == [".clrecon-notes", "bone.stl", "other.stl"]
 
 
-def test_many_writers_of_one_name_leave_a_whole_file(tmp_path):
-    """Whoever is last, the file is whole; nobody's temporary file is swept away."""
+def test_six_threads_that_write_to_one_name_leave_one_whole_file(tmp_path):
     path = tmp_path / "bone.stl"
-    failures: list[BaseException] = []
 
-    def work(number: int) -> None:
-        try:
-            for _ in range(15):
-                replace_file(path, lambda stream: stream.write(bytes([number]) * 5000))
-        except BaseException as error:
-            failures.append(error)
+    def write_15_times(number: int) -> None:
+        for _ in range(15):
+            replace_file(path, lambda stream: stream.write(bytes([number]) * 5000))
 
-    threads = [threading.Thread(target=work, args=(number,)) for number in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert failures == []
+    with ThreadPoolExecutor(6) as threads:
+        list(threads.map(write_15_times, range(6)))  # raises what a thread raises
+
     content = path.read_bytes()
-    assert len(content) == 5000 and len(set(content)) == 1
-    assert names(tmp_path) == ["bone.stl"]
+    assert content in [bytes([number]) * 5000 for number in range(6)]
+    assert names_in(tmp_path) == ["bone.stl"]
 
 
-def test_a_file_swept_before_it_was_locked_is_made_again(tmp_path, monkeypatch):
+def test_temporary_file_that_another_writer_removed_before_it_was_locked_is_made_again(tmp_path, monkeypatch):
     fcntl = pytest.importorskip("fcntl")
-    flock, calls = fcntl.flock, []
+    flock, locked = fcntl.flock, []
 
-    def lock(descriptor, operation):
-        calls.append(descriptor)
-        if len(calls) == 1:
+    def remove_then_lock(descriptor, operation):
+        if not locked:
             for entry in tmp_path.iterdir():
                 entry.unlink()
+        locked.append(descriptor)
         flock(descriptor, operation)
 
-    monkeypatch.setattr(fcntl, "flock", lock)
-    assert replace_file(tmp_path / "x", lambda stream: stream.write(b"abc")) == 3
-    assert len(calls) == 2
+    monkeypatch.setattr(fcntl, "flock", remove_then_lock)
+    replace_file(tmp_path / "x", lambda stream: stream.write(b"abc"))
+    assert len(locked) == 2
     assert (tmp_path / "x").read_bytes() == b"abc"
 
 
-def test_a_folder_is_searched_once_for_files_that_belong_together(tmp_path, monkeypatch):
-    """Each search lists the folder: with one a file, a thousand files took a million looks."""
-    searched = []
-    scan = os.scandir
-    monkeypatch.setattr(os, "scandir", lambda folder: searched.append(folder) or scan(folder))
+@pytest.fixture
+def listed_folders(monkeypatch) -> list[Path]:
+    """The folders that have been listed since, in their order."""
+    listed: list[Path] = []
+    scandir = os.scandir
+    monkeypatch.setattr(os, "scandir", lambda folder: listed.append(folder) or scandir(folder))
+    return listed
+
+
+def test_folder_is_listed_once_for_all_files_that_are_staged_at_the_same_time(tmp_path, listed_folders):
+    """Listed once for each file, a folder of a thousand files took a million looks."""
     with contextlib.ExitStack() as stack:
         for number in range(5):
             stack.enter_context(stage_file(tmp_path / f"{number}.bin", lambda stream: stream.write(b"x")))
-    assert searched == [tmp_path]
-    with stage_file(tmp_path / "later.bin", lambda stream: stream.write(b"x")):
-        assert searched == [tmp_path, tmp_path]
+    assert listed_folders == [tmp_path]
+
+
+def test_folder_is_listed_again_for_a_file_that_is_staged_later(tmp_path, listed_folders):
+    for _ in range(2):
+        with stage_file(tmp_path / "a.bin", lambda stream: stream.write(b"x")):
+            pass
+    assert listed_folders == [tmp_path, tmp_path]

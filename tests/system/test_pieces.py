@@ -13,29 +13,33 @@ pytestmark = pytest.mark.unit
 
 
 def test_two_functions_run_at_the_same_time():
-    meeting = threading.Barrier(2, timeout=20.0)
-    one, other = side_by_side(lambda: ("one", meeting.wait()), lambda: ("other", meeting.wait()))
-    assert (one[0], other[0]) == ("one", "other")
-    assert {one[1], other[1]} == {0, 1}  # each has met the other
+    barrier = threading.Barrier(2, timeout=20.0)  # lets two callers pass together, with the numbers 0 and 1
+    assert set(side_by_side(barrier.wait, barrier.wait)) == {0, 1}
 
 
-@pytest.mark.parametrize("first", [True, False])
-def test_what_one_of_two_functions_raises_is_raised_after_both_have_ended(first):
+def test_results_of_two_functions_are_returned_in_their_order():
+    assert tuple(side_by_side(lambda: "first", lambda: "second")) == ("first", "second")
+
+
+@pytest.mark.parametrize("fails_first", [True, False])
+def test_error_of_one_of_two_functions_is_raised_after_both_have_ended(fails_first):
     ended = []
 
     def fail() -> None:
         raise ZeroDivisionError("one of two")
 
+    def end() -> None:
+        ended.append("the other")
+
     with pytest.raises(ZeroDivisionError, match="one of two"):
-        if first:
-            side_by_side(fail, lambda: ended.append(1))
-        else:
-            side_by_side(lambda: ended.append(1), fail)
-    assert ended == [1]
+        side_by_side(*((fail, end) if fails_first else (end, fail)))
+    assert ended == ["the other"]
 
 
-@pytest.mark.parametrize("numbers", [[], [7], [3, 3, 3], [[5, -1], [2, 5]]])
-def test_distinct_numbers_rise_and_are_each_there_once(numbers):
+@pytest.mark.parametrize(
+    ("numbers", "distinct"), [([], []), ([7], [7]), ([3, 3, 3], [3]), ([[5, -1], [2, 5]], [-1, 2, 5])]
+)
+def test_distinct_numbers_of_an_array_are_listed_once_in_rising_order_with_its_type(numbers, distinct):
     found = list_distinct(np.array(numbers, dtype=np.int32))
     assert found.dtype == np.int32
-    assert found.tolist() == sorted(set(np.ravel(numbers).tolist()))
+    assert found.tolist() == distinct

@@ -35,52 +35,58 @@ READERS: dict[str, Callable[..., object]] = {
 
 
 @pytest.fixture(params=["fifo", "link to a fifo", "zero", "random", "folder"])
-def no_file(request, tmp_path):
-    """What is there and is no regular file."""
-    place = tmp_path / "odd"
+def irregular_file(request, tmp_path):
+    """What has a name and is no regular file."""
+    path = tmp_path / "odd"
     if request.param == "fifo":
-        os.mkfifo(place)
+        os.mkfifo(path)
     elif request.param == "link to a fifo":
         os.mkfifo(tmp_path / "pipe")
-        place.symlink_to("pipe")
+        path.symlink_to("pipe")
     elif request.param == "folder":
-        place.mkdir()
+        path.mkdir()
     else:
-        place.symlink_to(f"/dev/{request.param}")
-    return place
+        path.symlink_to(f"/dev/{request.param}")
+    return path
 
 
 @pytest.mark.parametrize("reader", READERS)
-def test_readers_refuse_irregular_files_without_waiting(no_file, reader):
+def test_reader_refuses_an_irregular_file_in_one_line_without_waiting(irregular_file, reader):
     with pytest.raises(ClreconError) as caught:
-        READERS[reader](no_file)
+        READERS[reader](irregular_file)
     assert_one_line(caught.value)
 
 
-def test_what_is_no_regular_file_is_not_opened(no_file):
-    before = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").is_dir() else 0
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="open files are counted in /proc")
+def test_irregular_file_that_was_refused_is_not_left_open(irregular_file):
+    open_before = len(os.listdir("/proc/self/fd"))
     with refused(OSError, "regular", "file"):
-        open_regular(no_file)
-    assert before == 0 or len(os.listdir("/proc/self/fd")) == before
+        open_regular(irregular_file)
+    assert len(os.listdir("/proc/self/fd")) == open_before
 
 
-def test_a_regular_file_is_read_as_far_as_it_may(tmp_path):
+def test_regular_file_is_read_up_to_the_largest_size_and_refused_above(tmp_path):
     (tmp_path / "a").write_bytes(b"12345")
     assert read_regular(tmp_path / "a", 5) == b"12345"
     with refused(OSError, "bytes", 4):
         read_regular(tmp_path / "a", 4)
+
+
+def test_regular_file_is_opened_as_a_stream(tmp_path):
+    (tmp_path / "a").write_bytes(b"12345")
     with open_regular(tmp_path / "a", 0) as stream:
         assert stream.read(2) == b"12"
 
 
-def test_the_points_of_a_curve_are_bounded(tmp_path):
+def test_file_of_curve_points_larger_than_16_mib_is_refused(tmp_path):
+    assert LARGEST_BYTES == 16 << 20
     with open(tmp_path / "large", "wb") as stream:
         stream.truncate(LARGEST_BYTES + 1)
-    with refused(RefusedInputError, 16777216):
+    with refused(RefusedInputError, LARGEST_BYTES):
         read_curve_points(tmp_path / "large")
 
 
-def test_a_phantom_does_not_wait_for_its_truth(tmp_path):
+def test_phantom_is_refused_without_waiting_where_a_fifo_has_the_name_of_its_truth(tmp_path):
     folder = tmp_path / "phantom"
     folder.mkdir()
     os.mkfifo(folder / "truth.json")
@@ -88,7 +94,7 @@ def test_a_phantom_does_not_wait_for_its_truth(tmp_path):
         write_phantom(folder, PhantomSettings(kind="sphere"))
 
 
-OWN = {
+OPENING_MODULES = {
     "system/files.py": "locks of folders",
     "system/foreign_words.py": "streams of a command",
     "system/paths.py": "a name that is taken; the helper itself",
@@ -125,7 +131,7 @@ OWN = {
 """Modules that open files by themselves, and what they are."""
 
 
-def find_openings(text: str) -> int:
+def count_openings(text: str) -> int:
     """Calls of open, of methods of that name with a mode, and of those of paths that read."""
     count = 0
     for node in ast.walk(ast.parse(text)):
@@ -141,12 +147,17 @@ def find_openings(text: str) -> int:
 
 
 @pytest.mark.seconds
-def test_files_that_are_read_go_through_one_helper():
+def test_only_listed_modules_open_files_without_the_helper_for_regular_files():
     folder = ROOT / "clrecon"
-    found = {str(path.relative_to(folder)) for path in folder.rglob("*.py") if find_openings(path.read_text())}
-    assert found == set(OWN)
+    opening = {str(path.relative_to(folder)) for path in folder.rglob("*.py") if count_openings(path.read_text())}
+    assert opening == set(OPENING_MODULES)
 
 
-def test_search_for_openings_finds_each_way_to_open_a_file():
-    assert find_openings("open(path)") == find_openings("path.open('rb')") == find_openings("os.open(p, 0)") == 1
-    assert find_openings("path.read_text()") == 1 and find_openings("open_regular(p); source.open(name)") == 0
+@pytest.mark.parametrize("code", ["open(path)", "path.open('rb')", "os.open(p, 0)", "path.read_text()"])
+def test_each_way_to_open_a_file_is_counted(code):
+    assert count_openings(code) == 1
+
+
+@pytest.mark.parametrize("code", ["open_regular(p)", "source.open(name)"])
+def test_helper_and_methods_without_a_mode_are_not_counted(code):
+    assert count_openings(code) == 0

@@ -13,39 +13,50 @@ from clrecon.system.progress import Steps
 pytestmark = pytest.mark.unit
 
 
-def test_steps_begin_at_none_and_end_with_all():
-    told: list[tuple[str, int, int]] = []
-    steps = Steps(lambda *step: told.append(step), "mask", 7)
+def test_steps_are_reported_from_none_to_all_and_never_above():
+    reported: list[tuple[str, int, int]] = []
+    steps = Steps(lambda *step: reported.append(step), "mask", 7)
     steps.take()
     steps.take_slice(slice(3, 8))
-    steps.take(4)  # work that was begun again: there is never more done than there is
-    assert told == [("mask", 0, 7), ("mask", 1, 7), ("mask", 6, 7), ("mask", 7, 7)]
-    Steps(None, "mask", 1).take()
+    steps.take(4)  # 10 of 7: work that was begun again
+    assert reported == [("mask", 0, 7), ("mask", 1, 7), ("mask", 6, 7), ("mask", 7, 7)]
+
+
+def test_steps_without_a_report_are_counted():
+    steps = Steps(None, "mask", 2)
+    steps.take()
+    assert steps.done == 1
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_pieces_are_reported_in_order_in_the_thread_of_the_caller(threads, monkeypatch):
+def test_pieces_of_work_are_reported_in_order_in_the_thread_of_the_caller_after_their_end(threads, monkeypatch):
     monkeypatch.setattr(pieces, "count_readers", lambda count, most: min(count, threads))
     worked: set[int] = set()
-    told: list[tuple[int, int, int]] = []
+    reported: list[tuple[int, int]] = []
+    reporting_threads: set[int] = set()
 
-    def done(piece: slice) -> None:
+    def work(piece: slice) -> None:
+        worked.update(range(piece.start, piece.stop))
+
+    def report(piece: slice) -> None:
         assert set(range(piece.start, piece.stop)) <= worked
-        told.append((piece.start, piece.stop, threading.get_ident()))
+        reported.append((piece.start, piece.stop))
+        reporting_threads.add(threading.get_ident())
 
-    pieces.in_threads(lambda piece: worked.update(range(piece.start, piece.stop)), 23, 5, done)
-    here = threading.get_ident()
-    assert told == [(0, 5, here), (5, 10, here), (10, 15, here), (15, 20, here), (20, 23, here)]
+    pieces.in_threads(work, 23, 5, report)
+
+    assert reported == [(0, 5), (5, 10), (10, 15), (15, 20), (20, 23)]
+    assert reporting_threads == {threading.get_ident()}
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_a_report_may_end_the_work(threads, monkeypatch):
+def test_work_in_threads_is_ended_by_an_error_of_its_report(threads, monkeypatch):
     monkeypatch.setattr(pieces, "count_readers", lambda count, most: min(count, threads))
     worked: list[int] = []
 
-    def done(piece: slice) -> None:
+    def cancel(piece: slice) -> None:
         raise Cancelled("enough")
 
     with pytest.raises(Cancelled):
-        pieces.in_threads(lambda piece: worked.append(piece.start), 1000, 1, done)
+        pieces.in_threads(lambda piece: worked.append(piece.start), 1000, 1, cancel)
     assert len(worked) < 1000

@@ -15,7 +15,7 @@ from clrecon.system.text import format_digits, format_hu
         (5e-6, 2, "0.000005"), (float("inf"), 3, "inf"), (float("nan"), 3, "nan"), (1e300, 3, "1e+300"),
     ],
 )  # fmt: skip
-def test_digits_are_sensible_and_never_an_exponent(value, digits, text):
+def test_number_is_written_with_grouped_digits_and_no_exponent_unless_it_is_huge(value, digits, text):
     assert format_digits(value, digits) == text
 
 
@@ -23,5 +23,5 @@ def test_digits_are_sensible_and_never_an_exponent(value, digits, text):
     ("value", "text"),
     [(-1024.0, "-1024"), (3071, "3071"), (-311.789, "-312"), (0.25, "0.25"), (-0.0, "0"), (4e6, "4,000,000")],
 )
-def test_hu_are_whole_where_fractions_mean_nothing(value, text):
+def test_hu_are_written_whole_or_with_three_significant_digits(value, text):
     assert format_hu(value) == text

@@ -20,5 +20,5 @@ pytestmark = pytest.mark.unit
         (0.0, "0 ml", "0 ml"),
     ],
 )
-def test_volumes_below_a_tenth_of_a_millilitre_are_said_in_mm3(ml, short, long):
+def test_volumes_are_written_in_ml_and_below_a_tenth_of_a_ml_in_mm3(ml, short, long):
     assert (format_ml(ml), format_volume(ml)) == (short, long)

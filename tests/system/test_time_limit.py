@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import math
 
+import pytest
 from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.system.progress import DEFAULT_SECONDS, device_seconds, time_limit
 
 
-def test_time_limits_are_nested_and_wrong_ones_refused():
+def test_time_limit_counts_within_its_block_and_the_outer_one_again_after_it():
     assert device_seconds() == DEFAULT_SECONDS
     with time_limit(3):
-        assert device_seconds() == 3.0
-        with time_limit(0):
-            assert device_seconds() == math.inf
+        with time_limit(5):
+            assert device_seconds() == 5.0
         assert device_seconds() == 3.0
     assert device_seconds() == DEFAULT_SECONDS
-    for wrong in (-1, math.nan, "5", None, True):
-        with refused(UsageError, "limit", "seconds"), time_limit(wrong):
-            pass
+
+
+def test_time_limit_of_0_seconds_is_no_limit():
+    with time_limit(0):
+        assert device_seconds() == math.inf
+
+
+@pytest.mark.parametrize("limit", [-1, math.nan, "5", None, True])
+def test_time_limit_that_is_no_positive_number_or_0_is_refused(limit):
+    with refused(UsageError, "limit", "seconds"), time_limit(limit):
+        pass
