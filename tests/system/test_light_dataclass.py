@@ -234,5 +234,7 @@ def test_plain_class_derived_from_a_frozen_one_takes_and_loses_other_attributes(
 
 
 def test_plain_class_derived_from_a_frozen_one_takes_no_new_value_of_a_field() -> None:
+    extended = Extended(3)
     with pytest.raises(dataclasses.FrozenInstanceError):
-        Extended(3).value = 4  # type: ignore[misc]
+        extended.value = 4  # type: ignore[misc]
+    assert extended.value == 3

@@ -90,8 +90,10 @@ def test_change_of_an_entry_of_a_record_is_refused_with_its_class_and_as_dict(
 
 
 def test_change_of_a_field_of_a_record_is_refused() -> None:
+    pair = Pair(1.0, GATE)
     with pytest.raises(FrozenInstanceError):
-        Pair(1.0, GATE).low = 2.0  # type: ignore[misc]
+        pair.low = 2.0  # type: ignore[misc]
+    assert pair.low == 1.0
 
 
 def test_dict_of_a_record_and_of_records_in_it_can_be_changed_without_changing_them() -> None:
