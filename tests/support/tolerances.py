@@ -132,6 +132,13 @@ NEAREST_SAMPLED_MM = 0.02  # 400 random points on each triangle of 0.6 mm, seen 
 FAR_FILE_MM = 1e-6  # fifteen digits, float64, or float32 of 15 mm with the rest in the matrix, at 1e5 mm
 GLB_METRES = 1e-7  # relative; float32 coordinates through a float64 matrix, read back by another library
 
+GLB_SCENE_M = 1e-7  # metres of a scene of 1 m in float32
+EXACT_MATRIX = 1e-12  # products of matrices of millimetres and metres in float64
+FAR_STL_STEPS_MM = 0.05  # 100 m from the origin a step of float32 is 0.008 mm; vertices are moved by a few
+PAGE_CORNER_MM = 2e-3  # half a step of 200 mm in 65,535
+ROUNDED_STEP = 1e-9  # relative, over half a step: float64 coordinates of some 900 mm
+ESTIMATE_LOW, ESTIMATE_HIGH = 0.5, 1.1  # of the size of a file: digits and compression are guessed
+
 # --- smoothing, decimation, distances ---
 SPHERE_SAGITTA_MM = 0.004  # triangles of 0.49 mm on a sphere of 10 mm sag 0.003 mm
 BALL_SAGITTA_MM = 0.011  # triangles of up to 0.8 mm on balls of 10 mm sag 0.0097 mm, tori of 0.4 mm less

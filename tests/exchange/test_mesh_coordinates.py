@@ -1,0 +1,54 @@
+"""Coordinates and indices in files: vertices that stay apart, places that are found, numbers digit for digit."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+
+from clrecon.exchange.content import write_lines
+from clrecon.exchange.coordinates import _scramble, find_places, rounded_apart
+
+pytestmark = pytest.mark.unit
+
+
+def test_rounding_brings_no_vertex_to_the_place_of_others():
+    """1 km from the origin: 500 pairs of vertices at one place each stay pairs, and no third vertex joins them."""
+    rng = np.random.default_rng(3)
+    points = 1e6 + rng.uniform(0.0, 2.0, (10_000, 3))
+    points[-500:] = points[:500]
+    rounded = rounded_apart(points)
+    assert np.array_equal(rounded[-500:], rounded[:500])
+    assert len(np.unique(rounded, axis=0)) == 10_000 - 500
+
+
+def test_vertices_at_one_place_get_one_number_whatever_the_sign_of_zero():
+    vertices = np.array([[1, 2, 3], [0, 0, 0], [1, 2, 3], [-0.0, 0, 0], [3, 2, 1]])
+    first_of_place, place_of_vertex = find_places(vertices)
+    assert first_of_place.tolist() == [0, 1, 4]
+    assert place_of_vertex.tolist() == [0, 1, 0, 1, 2]
+
+
+def test_places_with_one_hash_are_told_apart():
+    vertices = np.array([[1, 2, 3], [0, 0, 0], [1, 2, 3], [-0.0, 0, 0], [3, 2, 1]])
+    hash_of_1, hash_of_3 = _scramble(vertices[[0, 4], :1])
+    y_bits = hash_of_1 ^ hash_of_3 ^ vertices[0, 1].view(np.uint64)  # makes the last vertex hash as the first
+    vertices[4, 1:] = y_bits.view(np.float64), 3.0
+    assert np.isfinite(vertices).all()
+    assert len(np.unique(_scramble(vertices))) == 2
+
+    first_of_place, place_of_vertex = find_places(vertices)
+
+    assert first_of_place.tolist() == [0, 1, 4]
+    assert place_of_vertex.tolist() == [0, 1, 0, 1, 2]
+
+
+@pytest.mark.parametrize("form", ["f %d %d %d\n", "%d,%d,%d;"], ids=["faces of OBJ", "commas"])
+@pytest.mark.parametrize("above", [1, 10, 12_345, 4_294_967_296])
+def test_whole_numbers_are_written_as_python_formats_them(form, above):
+    rows = np.random.default_rng(3).integers(0, above, (500, 3))
+    rows[0] = 0, above - 1, min(9, above - 1)
+    stream = io.BytesIO()
+    write_lines(stream, form, rows)
+    assert stream.getvalue().decode() == "".join(form % tuple(row) for row in rows.tolist())
