@@ -133,6 +133,11 @@ FAR_FILE_MM = 1e-6  # fifteen digits, float64, or float32 of 15 mm with the rest
 GLB_METRES = 1e-7  # relative; float32 coordinates through a float64 matrix, read back by another library
 
 GLB_SCENE_M = 1e-7  # metres of a scene of 1 m in float32
+SCALED_MM = 1e-7  # relative; coordinates times a unit, in float32
+GLB_COLOR = 1e-4  # linear colours of glTF and back to sRGB
+ASSEMBLY_COLOR = 1e-3  # colours of 8 bits, or linear ones with few digits
+GLB_NODE_MM = 1e-3  # float32 metres of some metres through matrices of nodes
+SAME_SURFACE_MM = 1e-6  # distances of a surface of 8 mm from itself in float32
 EXACT_MATRIX = 1e-12  # products of matrices of millimetres and metres in float64
 FAR_STL_STEPS_MM = 0.05  # 100 m from the origin a step of float32 is 0.008 mm; vertices are moved by a few
 PAGE_CORNER_MM = 2e-3  # half a step of 200 mm in 65,535
