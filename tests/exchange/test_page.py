@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import sample_meshes as samples
+import tolerances
 from refusals import refused
 
 from clrecon.errors import UsageError
@@ -22,7 +23,8 @@ from clrecon.mesh import Mesh
 pytestmark = pytest.mark.unit
 
 
-def parse(path):
+def read_page(path):
+    """Facts, vertices, normals and triangles of a page."""
     facts, coded = pages.parse_page(path.read_bytes())
     return facts, *decode_surface(coded)
 
@@ -37,126 +39,178 @@ def noisy_surface(seed: int):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_surface_comes_back_within_half_a_step(seed):
+def test_coded_surface_comes_back_within_half_a_step(seed):
     vertices, normals, triangles = noisy_surface(seed)
     coded = encode_surface(vertices, normals, triangles)
-    found, turned, corners = decode_surface(coded)
-    assert coded.vertices == len(found) == len(np.unique(triangles))
-    spread = np.ptp(vertices[np.unique(triangles)], axis=0)
-    np.testing.assert_allclose(coded.step_mm, spread / STEPS, rtol=1e-12)
-    assert coded.half_step_mm == 0.5 * max(coded.step_mm)
+    back, back_normals, back_triangles = decode_surface(coded)
     for axis in range(3):
-        off = np.abs(found[corners][..., axis] - vertices[triangles][..., axis]).max()
-        assert 0.0 < off <= 0.5 * coded.step_mm[axis] * (1 + 1e-9)
-    assert np.abs(turned[corners] - normals[triangles]).max() <= 0.5 / 127 + 1e-6
-    # In the order of first use: a new vertex is always the next one.
-    flat = corners.reshape(-1).astype(int)
-    assert (flat <= np.concatenate(([0], np.maximum.accumulate(flat)[:-1] + 1))).all()
+        error = np.abs(back[back_triangles][..., axis] - vertices[triangles][..., axis]).max()
+        assert 0.0 < error <= tolerances.HALF_STEP * coded.step_mm[axis]
+    assert np.abs(back_normals[back_triangles] - normals[triangles]).max() <= tolerances.PAGE_NORMAL
 
 
-def test_a_flat_surface_of_one_triangle_comes_back_exactly():
+def test_step_of_a_coded_surface_is_its_extent_over_65_535():
+    vertices, normals, triangles = noisy_surface(0)
+    coded = encode_surface(vertices, normals, triangles)
+    extent = np.ptp(vertices[np.unique(triangles)], axis=0)
+    assert STEPS == 2**16 - 1
+    np.testing.assert_allclose(coded.step_mm, extent / STEPS, rtol=tolerances.PAGE_STEP_SHARE)
+    assert coded.half_step_mm == 0.5 * max(coded.step_mm)
+
+
+def test_coded_surface_has_the_vertices_that_triangles_use_in_the_order_of_first_use():
+    vertices, normals, triangles = noisy_surface(0)
+    coded = encode_surface(vertices, normals, triangles)
+    back, _, back_triangles = decode_surface(coded)
+    assert coded.vertices == len(back) == len(np.unique(triangles))
+    numbers = back_triangles.reshape(-1).astype(int)
+    highest_before = np.concatenate(([-1], np.maximum.accumulate(numbers)[:-1]))
+    assert (numbers <= highest_before + 1).all()  # a new vertex is always the next one
+
+
+def test_coded_surface_of_one_flat_triangle_comes_back_exactly():
     vertices = np.array([[0.0, 0.0, 7.0], [30.0, 0.0, 7.0], [0.0, 40.0, 7.0]])
-    coded = encode_surface(vertices, np.tile(np.float32([0, 0, -1]), (3, 1)), np.array([[2, 0, 1]], np.uint32))
-    found, turned, corners = decode_surface(coded)
-    np.testing.assert_allclose(found[corners[0]], vertices[[2, 0, 1]], atol=1e-12)
-    np.testing.assert_array_equal(turned, np.tile(np.float32([0, 0, -1]), (3, 1)))
+    down = np.tile(np.float32([0, 0, -1]), (3, 1))
+    coded = encode_surface(vertices, down, np.array([[2, 0, 1]], np.uint32))
+    back, back_normals, back_triangles = decode_surface(coded)
+    np.testing.assert_allclose(back[back_triangles[0]], vertices[[2, 0, 1]], atol=tolerances.PAGE_FLAT_MM)
+    np.testing.assert_array_equal(back_normals, down)
     assert coded.step_mm[2] == 0.0
 
 
+CODED = encode_surface(*noisy_surface(5))
+
+
 @pytest.mark.faults
-def test_harmed_bytes_are_found():
-    coded = encode_surface(*noisy_surface(5))
-    for harmed in (
-        replace(coded, data=coded.data[:-20]),
-        replace(coded, data=b"x" + coded.data),
-        replace(coded, triangles=coded.triangles + 1),
-        replace(coded, vertices=coded.vertices - 4, triangles=coded.triangles + 3),
-    ):
-        with refused(ValueError, "surface"):
-            decode_surface(harmed)
+@pytest.mark.parametrize(
+    "harmed",
+    [
+        pytest.param(replace(CODED, data=CODED.data[:-20]), id="cut"),
+        pytest.param(replace(CODED, data=b"x" + CODED.data), id="a byte more"),
+        pytest.param(replace(CODED, triangles=CODED.triangles + 1), id="a triangle more"),
+        pytest.param(
+            replace(CODED, vertices=CODED.vertices - 4, triangles=CODED.triangles + 3), id="other counts, same bytes"
+        ),
+    ],
+)
+def test_coded_surface_that_was_harmed_is_refused(harmed):
+    with refused(ValueError, "surface"):
+        decode_surface(harmed)
 
 
-def boxes(count: int) -> Mesh:
+def cubes(count: int) -> Mesh:
     """Cubes with edges of 10, 11, 12 ... mm beside each other, the smallest first."""
-    made = [samples.box((40.0 * n, 0, 0), (10.0 + n,) * 3) for n in range(count)]
-    return Mesh(*samples.join(*made), report={"iso_value_hu": 300.0})
+    arrays = [samples.box((40.0 * n, 0, 0), (10.0 + n,) * 3) for n in range(count)]
+    return Mesh(*samples.join(*arrays), report={"iso_value_hu": 300.0})
 
 
-def test_components_are_parts_with_ml_and_the_largest_first(tmp_path):
-    mesh = boxes(3)
-    mesh.save(tmp_path / "page.html")
-    facts, vertices, _, triangles = parse(tmp_path / "page.html")
-    assert [(part["name"], part["first"], part["count"]) for part in facts["parts"]] == [
+CUBES_ML = [1.0, 1.331, 1.728]
+"""Of edges of 10, 11 and 12 mm."""
+
+
+def test_components_of_a_page_are_parts_with_the_largest_first(tmp_path):
+    cubes(3).save(tmp_path / "page.html")
+    parts = read_page(tmp_path / "page.html")[0]["parts"]
+    assert [(part["name"], part["first"], part["count"]) for part in parts] == [
         ("part 1", 0, 12), ("part 2", 12, 12), ("part 3", 24, 12),
     ]  # fmt: skip
-    assert [part["ml"] for part in facts["parts"]] == pytest.approx([1.728, 1.331, 1.0])
-    for part, n in zip(facts["parts"], (2, 1, 0), strict=True):
-        own = vertices[triangles[part["first"] : part["first"] + part["count"]].reshape(-1)]
-        np.testing.assert_allclose([own[:, 0].min(), own[:, 0].max()], [40.0 * n, 40.0 * n + 10.0 + n], atol=2e-3)
-    assert facts["about"][0] == "Surface: iso value 300 HU."
-    assert f"moved by at most {facts['half_step_mm']:.2g} mm" in facts["about"][1]
-    assert "No certificate" in facts["about"][2]
+    assert [part["ml"] for part in parts] == pytest.approx(CUBES_ML[::-1])
 
 
-def test_many_components_end_in_one_part(tmp_path):
-    boxes(MOST_PARTS + 3).save(tmp_path / "page.html")
-    parts = parse(tmp_path / "page.html")[0]["parts"]
+def test_triangles_of_each_part_of_a_page_are_those_of_its_component(tmp_path):
+    cubes(3).save(tmp_path / "page.html")
+    facts, vertices, _, triangles = read_page(tmp_path / "page.html")
+    for part, cube in zip(facts["parts"], (2, 1, 0), strict=True):
+        x = vertices[triangles[part["first"] : part["first"] + part["count"]].reshape(-1), 0]
+        ends = 40.0 * cube, 40.0 * cube + 10.0 + cube
+        np.testing.assert_allclose([x.min(), x.max()], ends, atol=tolerances.PAGE_CORNER_MM)
+
+
+def test_page_says_iso_value_rounding_and_that_there_is_no_certificate(tmp_path):
+    cubes(1).save(tmp_path / "page.html")
+    facts = read_page(tmp_path / "page.html")[0]
+    iso_value, rounding, certificate = facts["about"][:3]
+    assert iso_value == "Surface: iso value 300 HU."
+    assert f"moved by at most {facts['half_step_mm']:.2g} mm" in rounding
+    assert "No certificate" in certificate
+
+
+def test_components_beyond_the_most_parts_of_a_page_are_one_part(tmp_path):
+    cubes(MOST_PARTS + 3).save(tmp_path / "page.html")
+    parts = read_page(tmp_path / "page.html")[0]["parts"]
+    assert len(parts) == MOST_PARTS + 1
     assert [part["name"] for part in parts[-2:]] == [f"part {MOST_PARTS}", "3 smaller parts"]
-    assert (len(parts), parts[-1]["count"]) == (MOST_PARTS + 1, 36)
-    assert parts[-1]["ml"] == pytest.approx(1.0 + 1.331 + 1.728)
+    assert parts[-1]["count"] == 3 * 12
+    assert parts[-1]["ml"] == pytest.approx(sum(CUBES_ML))
 
 
-def test_several_meshes_keep_names_colours_and_frame(tmp_path):
-    first = Mesh(*samples.box((0, 0, 0), (10, 20, 30)), report={"part_name": "L1", "color": (1.0, 0.5, 0.0)})
-    second = boxes(2)
-    with stage_assembly([first, second], tmp_path / "page.html", "ras") as staged:
+@pytest.fixture
+def page_of_two_meshes(tmp_path):
+    """A page in RAS of a box "L1" of 6 ml, orange, and of two cubes without name and colour."""
+    box = Mesh(*samples.box((0, 0, 0), (10, 20, 30)), report={"part_name": "L1", "color": (1.0, 0.5, 0.0)})
+    with stage_assembly([box, cubes(2)], tmp_path / "page.html", "ras") as staged:
         staged.commit()
-    facts, vertices, _, _ = parse(tmp_path / "page.html")
-    assert facts["space"] == "RAS"
-    assert [part["name"] for part in facts["parts"]] == ["L1", "surface 2"]
-    assert [part["color"] for part in facts["parts"]] == ["#ff8000", "#e3dbc7"]
-    assert [part["ml"] for part in facts["parts"]] == pytest.approx([6.0, 2.331])
-    assert vertices.min() >= -1e-9  # LPS, whatever the frame in which places are told
+    return read_page(tmp_path / "page.html")
 
 
-def test_the_page_allows_its_own_script_and_style_alone(tmp_path):
-    boxes(1).save(tmp_path / "page.html")
-    page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)[1]
+def test_meshes_of_a_page_are_parts_with_their_names_colours_and_volumes(page_of_two_meshes):
+    parts = page_of_two_meshes[0]["parts"]
+    assert [part["name"] for part in parts] == ["L1", "surface 2"]
+    assert [part["color"] for part in parts] == ["#ff8000", "#e3dbc7"]  # the second is that of bone
+    assert [part["ml"] for part in parts] == pytest.approx([6.0, CUBES_ML[0] + CUBES_ML[1]])
+
+
+def test_page_in_ras_has_its_vertices_in_lps(page_of_two_meshes):
+    facts, vertices, _, _ = page_of_two_meshes
+    assert facts["space"] == "RAS"  # in which the page tells places
+    assert vertices.min() >= -tolerances.ROUNDED_STEP  # all of them left of and behind the origin
+
+
+@pytest.fixture
+def page_text(tmp_path):
+    cubes(1).save(tmp_path / "page.html")
+    return (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+def test_content_policy_of_a_page_allows_its_own_script_and_style_alone(page_text):
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page_text)[1]
     assert policy.startswith("default-src 'none'; ")
     for tag, source in (("script", "script-src"), ("style", "style-src")):
-        (own,) = re.findall(rf"<{tag}>(.*?)</{tag}>", page, re.DOTALL)
-        digest = base64.b64encode(hashlib.sha256(own.encode()).digest()).decode()
+        (content,) = re.findall(rf"<{tag}>(.*?)</{tag}>", page_text, re.DOTALL)
+        digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
         assert f"{source} 'sha256-{digest}';" in policy
-    assert "unsafe" not in policy and "http" not in policy
-    assert not re.search(r"\b(src|href|srcset|action)=", page)
-    assert not re.search(r"(?:https?:)?//\w", re.sub(r"<script id.*?</script>", "", page, flags=re.DOTALL))
+    assert "unsafe" not in policy
+    assert "http" not in policy
+
+
+def test_page_refers_to_no_other_file_and_no_address(page_text):
+    assert not re.search(r"\b(src|href|srcset|action)=", page_text)
+    without_data = re.sub(r"<script id.*?</script>", "", page_text, flags=re.DOTALL)
+    assert not re.search(r"(?:https?:)?//\w", without_data)
 
 
 @pytest.mark.parametrize("name", ["</script><script>alert(1)</script>", "@SURFACE@", 'a "quoted" <b>', "R\u00fccken"])
-def test_a_name_is_text_and_nothing_else(name, tmp_path):
-    mesh = boxes(1)
+def test_name_of_a_part_is_text_in_a_page_and_adds_no_script(name, tmp_path):
+    mesh = cubes(1)
     mesh.report["part_name"] = name
     mesh.save(tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert page.count("<script") == page.count("</script>") == 3
-    assert parse(tmp_path / "page.html")[0]["parts"][0]["name"] == name
+    assert page.count("<script") == page.count("</script>") == 3  # facts, surface and the script itself
+    assert read_page(tmp_path / "page.html")[0]["parts"][0]["name"] == name
 
 
-def test_page_of_too_many_triangles_is_refused(tmp_path, monkeypatch):
+def test_page_of_more_than_the_most_triangles_is_refused_and_nothing_is_written(tmp_path, monkeypatch):
     monkeypatch.setattr(pages, "MOST_TRIANGLES", 11)
     with refused(UsageError, 12, 11):
-        boxes(1).save(tmp_path / "page.html")
+        cubes(1).save(tmp_path / "page.html")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_facts_are_strict_json(tmp_path):
-    boxes(1).save(tmp_path / "page.html")
-    page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    facts = json.loads(re.search(r'id="facts" type="application/json">([^<]*)<', page)[1])
+def test_facts_of_a_page_are_json_with_the_known_keys(page_text):
+    facts = json.loads(re.search(r'id="facts" type="application/json">([^<]*)<', page_text)[1])
     assert set(facts) == {"vertices", "triangles", "low", "step", "half_step_mm", "space", "parts", "about"}
 
 
-def test_html_without_a_mesh_is_refused_as_page(tmp_path):
+def test_html_without_a_surface_is_refused_as_a_page():
     with pytest.raises(ValueError, match="no page"):
         pages.parse_page(b"<!DOCTYPE html>\n<html></html>\n")
