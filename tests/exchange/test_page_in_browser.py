@@ -8,7 +8,9 @@ import re
 import numpy as np
 import pytest
 import sample_meshes as samples
+import tolerances
 from browser import open_browser, open_page, outside_requests, severe_lines, wait_for
+from PIL import Image
 
 from clrecon.mesh import Mesh
 
@@ -44,10 +46,8 @@ def page(browser, path):
     assert outside_requests(browser) == []
 
 
-def picture(page) -> np.ndarray:
-    """What is drawn, (h, w, 3) uint8, after the next frame."""
-    from PIL import Image
-
+def draw_page(page) -> np.ndarray:
+    """What is drawn after the next frame, (h, w, 3)."""
     page.execute_async_script(
         "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => done()));"
     )
@@ -55,8 +55,27 @@ def picture(page) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
 
 
+def changed_pixels(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Pixels whose colour differs by more than 24 of 255, (h, w) bool."""
+    return np.abs(one - other).max(axis=2) > 24
+
+
 def changed_share(one: np.ndarray, other: np.ndarray) -> float:
-    return float((np.abs(one - other).max(axis=2) > 24).mean())
+    return float(changed_pixels(one, other).mean())
+
+
+def columns_of(pixels: np.ndarray) -> np.ndarray:
+    return np.flatnonzero(pixels.any(axis=0))
+
+
+def project(page, point) -> np.ndarray:
+    """Where a point of the patient is drawn, in CSS pixels from the upper left corner."""
+    return np.array(page.execute_script("return clrecon.project(arguments[0])", [float(value) for value in point]))
+
+
+def set_value(page, element, value: str) -> None:
+    script = "arguments[0].value = arguments[1]; arguments[0].dispatchEvent(new Event('input'));"
+    page.execute_script(script, element, value)
 
 
 def click(page, x: float, y: float) -> None:
@@ -71,84 +90,107 @@ def click(page, x: float, y: float) -> None:
 
 
 def click_point(page, point) -> None:
-    click(page, *page.execute_script("return clrecon.project(arguments[0])", [float(value) for value in point]))
+    click(page, *project(page, point))
 
 
-def measures(page) -> list[float]:
+def listed_measures(page) -> list[float]:
     rows = page.find_elements("css selector", "#measures li")
     return [float(re.search(r"[\d.]+", row.text)[0]) for row in rows]
 
 
-def test_page_shows_the_surface_its_parts_and_facts(page):
-    shown = picture(page)
-    assert changed_share(shown, np.full_like(shown, shown[3, 3])) > 0.15
+def test_page_shows_the_surface_on_an_even_background(page):
+    shown = draw_page(page)
+    background = np.full_like(shown, shown[3, 3])
+    assert changed_share(shown, background) > 0.15  # sphere and box fill about a fifth of the picture
+
+
+def test_page_lists_the_parts_with_their_ml(page):
     assert len(page.find_elements("css selector", "#parts li")) == 2
     assert page.find_element("css selector", "#parts .ml").text == "112.9 ml"  # of the polyhedron; 113.1 of the sphere
+
+
+def test_page_tells_the_iso_value_and_shows_no_message(page):
     assert "iso value 300 HU" in page.find_element("id", "about").text
-    assert page.find_element("id", "message").is_displayed() is False
+    assert not page.find_element("id", "message").is_displayed()
 
 
-def test_switching_a_part_changes_what_is_shown(page):
-    both = picture(page)
-    boxes = page.find_elements("css selector", "#parts input[type=checkbox]")
-    boxes[1].click()
-    one = picture(page)
-    width = both.shape[1]
-    changed = np.abs(one - both).max(axis=2) > 24
-    assert changed.mean() > 0.03
-    assert np.flatnonzero(changed.any(axis=0)).min() > width // 2  # the box is the patient's left, right in the view
-    boxes[1].click()
-    assert changed_share(picture(page), both) == 0.0
+def test_part_that_is_switched_off_vanishes_from_its_side_and_comes_back(page):
+    both = draw_page(page)
+    box_is_shown = page.find_elements("css selector", "#parts input[type=checkbox]")[1]
+
+    box_is_shown.click()
+    changed = changed_pixels(draw_page(page), both)
+    assert changed.mean() > tolerances.PAGE_VISIBLE_SHARE
+    middle = both.shape[1] // 2
+    assert columns_of(changed).min() > middle  # the box is the patient's left, right in the view
+
+    box_is_shown.click()
+    assert changed_share(draw_page(page), both) == 0.0
+
+
+def test_button_none_hides_all_parts(page):
+    both = draw_page(page)
     page.find_element("id", "none").click()
-    assert changed_share(picture(page), both) > 0.15
+    nothing = draw_page(page)
+    assert changed_share(nothing, both) > 0.15  # as much as there is on the background
+    assert changed_share(nothing, np.full_like(nothing, nothing[3, 3])) < 0.01  # but for marks of sides
 
 
-def test_opacity_and_colour_of_a_part_change_the_picture(page):
-    before = picture(page)
-    set_value = "arguments[0].value = arguments[1]; arguments[0].dispatchEvent(new Event('input'));"
-    page.execute_script(set_value, page.find_element("css selector", "#parts input[type=range]"), "0.4")
-    translucent = picture(page)
-    assert changed_share(translucent, before) > 0.05
-    page.execute_script(set_value, page.find_element("css selector", "#parts input[type=color]"), "#ff0000")
-    red = picture(page)
-    assert (red[..., 0] - red[..., 2] > 60).mean() > 0.05
+def test_opacity_of_a_part_changes_the_picture(page):
+    before = draw_page(page)
+    set_value(page, page.find_element("css selector", "#parts input[type=range]"), "0.4")
+    assert changed_share(draw_page(page), before) > 0.05  # the sphere is more than that
+
+
+def test_colour_of_a_part_changes_the_picture(page):
+    set_value(page, page.find_element("css selector", "#parts input[type=color]"), "#ff0000")
+    red = draw_page(page)
+    assert (red[..., 0] - red[..., 2] > 60).mean() > 0.05  # of pixels: more red than blue on the sphere
 
 
 @pytest.mark.parametrize(
     ("letter", "sides"), [("A", "SIRL"), ("P", "SILR"), ("L", "SIAP"), ("R", "SIPA"), ("S", "APLR"), ("I", "APRL")]
 )
-def test_the_six_views_show_their_sides(page, letter, sides):
-    """Up, down, left and right of each view, by where points of the patient come to lie."""
+def test_each_of_the_six_views_has_its_sides_up_down_left_and_right(page, letter, sides):
+    """By where points 10 mm from the centre of the sphere towards each side of the patient are drawn."""
     page.find_element("css selector", f"#views button:nth-of-type({'APLRSI'.index(letter) + 1})").click()
-    ways = {"L": (1, 0, 0), "R": (-1, 0, 0), "P": (0, 1, 0), "A": (0, -1, 0), "S": (0, 0, 1), "I": (0, 0, -1)}
-    project = "return clrecon.project(arguments[0])"
-    middle = page.execute_script(project, CENTRE.tolist())
-    for side, way in zip(sides, ((0, -1), (0, 1), (-1, 0), (1, 0)), strict=True):
-        there = page.execute_script(project, (CENTRE + 10.0 * np.array(ways[side])).tolist())
-        moved = np.subtract(there, middle)
-        assert moved @ way == pytest.approx(np.linalg.norm(moved))
+    towards = {"L": (1, 0, 0), "R": (-1, 0, 0), "P": (0, 1, 0), "A": (0, -1, 0), "S": (0, 0, 1), "I": (0, 0, -1)}
+    up, down, left, right = (0, -1), (0, 1), (-1, 0), (1, 0)  # in pixels
+    for side, direction in zip(sides, (up, down, left, right), strict=True):
+        moved = project(page, CENTRE + 10.0 * np.array(towards[side])) - project(page, CENTRE)
         assert np.linalg.norm(moved) > 1.0
+        assert moved @ direction == pytest.approx(np.linalg.norm(moved))
 
 
-def test_distances_and_angles_are_those_of_the_surface(page):
-    """Two and three clicks; expected values by the exact sphere under the middle of each clicked pixel."""
+def test_distance_between_two_clicks_on_the_sphere_is_that_of_its_points(page):
+    first, second = sphere_point(-0.6, -0.3), sphere_point(0.5, 0.55)
     page.find_element("id", "distance").click()
-    for turn in ((-0.6, -0.3), (0.5, 0.55)):  # along L and S, in radii
-        click_point(page, sphere_point(*turn))
-    (found,) = measures(page)
-    assert found == pytest.approx(np.linalg.norm(sphere_point(-0.6, -0.3) - sphere_point(0.5, 0.55)), abs=0.3)
-    # An edge of the box: two corners of its anterior face, a millimetre inside each.
-    low = BOX_CORNER + (1.0, 0.0, 1.0)
-    high = BOX_CORNER + (19.0, 0.0, 39.0)
-    click_point(page, low)
-    click_point(page, high)
-    assert measures(page)[1] == pytest.approx(np.hypot(18.0, 38.0), abs=0.3)
+    click_point(page, first)
+    click_point(page, second)
+    assert listed_measures(page) == pytest.approx([np.linalg.norm(first - second)], abs=tolerances.PAGE_CLICK_MM)
+
+
+def test_distance_between_two_clicks_on_the_box_is_that_of_its_points(page):
+    page.find_element("id", "distance").click()
+    for corner in ((1.0, 0.0, 1.0), (19.0, 0.0, 39.0)):  # of its anterior face, a millimetre inside
+        click_point(page, BOX_CORNER + corner)
+    assert listed_measures(page) == pytest.approx([np.hypot(18.0, 38.0)], abs=tolerances.PAGE_CLICK_MM)
+
+
+def test_angle_of_three_clicks_at_a_corner_of_the_box_is_a_right_one(page):
     page.find_element("id", "angle").click()
     for corner in ((1.0, 0.0, 39.0), (1.0, 0.0, 1.0), (19.0, 0.0, 1.0)):
         click_point(page, BOX_CORNER + corner)
-    assert measures(page)[2] == pytest.approx(90.0, abs=1.0)
+    assert listed_measures(page) == pytest.approx([90.0], abs=tolerances.PAGE_CLICK_DEGREES)
+
+
+def test_button_clear_removes_all_measures(page):
+    page.find_element("id", "distance").click()
+    click_point(page, sphere_point(-0.6, -0.3))
+    click_point(page, sphere_point(0.5, 0.55))
+    assert len(listed_measures(page)) == 1
     page.find_element("id", "clear").click()
-    assert measures(page) == []
+    assert listed_measures(page) == []
 
 
 def sphere_point(left: float, up: float) -> np.ndarray:
@@ -156,89 +198,113 @@ def sphere_point(left: float, up: float) -> np.ndarray:
     return CENTRE + RADIUS * np.array([left, -np.sqrt(1.0 - left**2 - up**2), up])
 
 
-def test_picks_lie_on_the_surface_after_turning(page):
-    """A drag turns; 60 picks over the picture lie on the sphere or on a face of the box."""
+def drag_scene(page) -> None:
     from selenium.webdriver import ActionChains
 
-    scene = page.find_element("id", "scene")
-    before = picture(page)
-    drag = ActionChains(page, duration=0).move_to_element(scene).click_and_hold()
+    drag = ActionChains(page, duration=0).move_to_element(page.find_element("id", "scene")).click_and_hold()
     for _ in range(12):
         drag.move_by_offset(7, 4)
     drag.release().perform()
-    assert changed_share(picture(page), before) > 0.05
-    size = scene.size
-    places = [(x, y) for x in np.linspace(0, 1, 14)[1:-1] for y in np.linspace(0, 1, 9)[1:-1]]
-    picks = "return arguments[0].map(([x, y]) => clrecon.pick(x, y))"
-    found = page.execute_script(picks, [[x * size["width"], y * size["height"]] for x, y in places])
-    points = np.array([hit["point"] for hit in found if hit])
-    parts = np.array([hit["part"] for hit in found if hit])
-    assert len(points) > 12 and set(parts) == {0, 1}
+
+
+def test_drag_turns_the_view(page):
+    before = draw_page(page)
+    drag_scene(page)
+    assert changed_share(draw_page(page), before) > 0.05  # of a picture of which a fifth is surface
+
+
+def test_picks_after_a_drag_lie_on_the_sphere_and_on_faces_of_the_box(page):
+    drag_scene(page)
+    size = page.find_element("id", "scene").size
+    grid = [(x, y) for x in np.linspace(0, 1, 14)[1:-1] for y in np.linspace(0, 1, 9)[1:-1]]  # shares of the picture
+    picks = page.execute_script(
+        "return arguments[0].map(([x, y]) => clrecon.pick(x, y))",
+        [[x * size["width"], y * size["height"]] for x, y in grid],
+    )
+    hits = [pick for pick in picks if pick]
+    points, parts = np.array([hit["point"] for hit in hits]), np.array([hit["part"] for hit in hits])
+    assert len(hits) > 12  # of 84
+    assert set(parts) == {0, 1}  # sphere and box
+
     off_sphere = np.abs(np.linalg.norm(points[parts == 0] - CENTRE, axis=1) - RADIUS)
-    assert off_sphere.max() < 0.3
-    inside = points[parts == 1] - BOX_CORNER
-    assert np.abs(np.minimum(np.abs(inside), np.abs(inside - BOX_SIZE)).min(axis=1)).max() < 0.01
+    assert off_sphere.max() < tolerances.PAGE_SPHERE_MM
+    in_box = points[parts == 1] - BOX_CORNER
+    off_nearest_face = np.minimum(np.abs(in_box), np.abs(in_box - BOX_SIZE)).min(axis=1)
+    assert off_nearest_face.max() < tolerances.PAGE_BOX_MM
 
 
-def test_the_clip_plane_takes_one_side_away(page):
-    whole = picture(page)
+def clip_at_the_middle(page) -> None:
     page.execute_script(
         "const clip = document.getElementById('clip'); clip.value = '0'; clip.dispatchEvent(new Event('change'));"
     )
-    half = picture(page)
-    changed = np.abs(half - whole).max(axis=2) > 24
-    assert changed.mean() > 0.03
-    assert np.flatnonzero(changed.any(axis=0)).min() >= whole.shape[1] // 2 - 2
+
+
+def test_clip_plane_in_the_middle_takes_the_right_half_of_the_view_away(page):
+    whole = draw_page(page)
+    clip_at_the_middle(page)
+    changed = changed_pixels(draw_page(page), whole)
+    assert changed.mean() > tolerances.PAGE_VISIBLE_SHARE
+    middle = whole.shape[1] // 2
+    assert columns_of(changed).min() >= middle - 2  # pixels at the edge of the cut
+
+
+def test_flipped_clip_plane_takes_the_left_half_of_the_view_away(page):
+    whole = draw_page(page)
+    clip_at_the_middle(page)
     page.find_element("id", "flip").click()
-    other = np.abs(picture(page) - whole).max(axis=2) > 24
-    assert np.flatnonzero(other.any(axis=0)).max() <= whole.shape[1] // 2 + 2
+    changed = changed_pixels(draw_page(page), whole)
+    assert changed.mean() > tolerances.PAGE_VISIBLE_SHARE
+    assert columns_of(changed).max() <= whole.shape[1] // 2 + 2
 
 
-def test_wheel_zooms_and_keys_turn_the_page(page):
+def pixels_of_10_mm_to_the_left(page) -> float:
+    """How far to the right 10 mm towards the patient's left are drawn."""
+    return (project(page, CENTRE + (10, 0, 0)) - project(page, CENTRE))[0]
+
+
+def test_wheel_zooms_the_view(page):
     from selenium.webdriver.common.action_chains import ActionChains, ScrollOrigin
 
+    before = pixels_of_10_mm_to_the_left(page)
     scene = page.find_element("id", "scene")
-    project = "return clrecon.project(arguments[0])"
-    apart = lambda: np.subtract(  # noqa: E731
-        page.execute_script(project, (CENTRE + (10, 0, 0)).tolist()), page.execute_script(project, CENTRE.tolist())
-    )
-    before = apart()[0]
     ActionChains(page).scroll_from_origin(ScrollOrigin.from_element(scene), 0, -300).perform()
     wait_for(page, f"return clrecon.project({(CENTRE + (10, 0, 0)).tolist()})[0] !== 0")
-    assert apart()[0] > 1.2 * before
-    scene.send_keys("2")  # from behind: left is on the left
-    assert apart()[0] == pytest.approx(-before)
+    assert pixels_of_10_mm_to_the_left(page) > 1.2 * before
 
 
-def test_two_fingers_zoom_and_move(page):
-    """Touch: the distance of two fingers doubles, and so does the picture."""
+def test_key_2_shows_the_view_from_behind(page):
+    before = pixels_of_10_mm_to_the_left(page)
+    page.find_element("id", "scene").send_keys("2")
+    assert pixels_of_10_mm_to_the_left(page) == pytest.approx(-before)
+
+
+def test_two_fingers_at_twice_their_distance_zoom_to_twice_the_size(page):
     scene = page.find_element("id", "scene")
-    y = scene.rect["y"] + scene.rect["height"] / 2
-    x = scene.rect["x"] + scene.rect["width"] / 2
-    project = f"return clrecon.project({(CENTRE + (10, 0, 0)).tolist()})[0] - clrecon.project({CENTRE.tolist()})[0]"
-    before = page.execute_script(project)
+    x, y = scene.rect["x"] + scene.rect["width"] / 2, scene.rect["y"] + scene.rect["height"] / 2
 
-    def touch(kind: str, *apart: float) -> None:
-        points = [{"x": x + way * half, "y": y, "id": n} for half in apart for n, way in enumerate((-1, 1))]
+    def touch(kind: str, *half_distances: float) -> None:
+        points = [
+            {"x": x + side * half, "y": y, "id": finger}
+            for half in half_distances
+            for finger, side in enumerate((-1, 1))
+        ]
         page.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
 
+    before = pixels_of_10_mm_to_the_left(page)
     touch("touchStart", 60)
     for half in np.linspace(65, 120, 12):
         touch("touchMove", float(half))
     touch("touchEnd")
-    assert page.execute_script(project) == pytest.approx(2.0 * before, rel=0.1)
+    assert pixels_of_10_mm_to_the_left(page) == pytest.approx(2.0 * before, rel=tolerances.PAGE_TOUCH_ZOOM)
 
 
 @pytest.mark.release
-def test_a_page_whose_surface_is_harmed_says_so(browser, path, tmp_path):
-    """The browser logs the error, and the page says it in words."""
+def test_page_whose_surface_is_harmed_says_that_it_cannot_be_shown(browser, path, tmp_path):
     text = path.read_text(encoding="utf-8")
     start = text.index('type="text/plain">') + 60
     harmed = tmp_path / "harmed.html"
     harmed.write_text(text[:start] + "AAAAAAAA" + text[start + 8 :], encoding="utf-8")
     browser.get(harmed.as_uri())
-    found = (
-        "const text = document.getElementById('message').textContent; return text.includes('cannot be shown') && text"
-    )
-    assert wait_for(browser, found)
-    severe_lines(browser)
+    message = "document.getElementById('message').textContent"
+    assert wait_for(browser, f"return {message}.includes('cannot be shown')")
+    severe_lines(browser)  # the browser logs the error: no later test is to find it

@@ -218,7 +218,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
             FILES + "test_error_of_the_system_while_writing_is_told_in_one_line_and_leaves_the_older_file",
             FILES + "test_file_larger_than_the_free_space_is_refused_before_it_is_written",
             FILES + "test_file_beyond_the_largest_size_that_the_system_allows_is_refused_and_leaves_the_older_file",
-            "exchange/test_mesh_files.py::test_every_writer_notices_a_full_disk",
+            "exchange/test_mesh_files.py::test_writer_of_every_mesh_format_notices_a_full_disk",
         ),
     ),
     62: (
@@ -243,15 +243,15 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     67: (
         "an empty mesh; more faces or bytes than the format holds: refused",
         (
-            "exchange/test_mesh_files.py::test_empty_mesh_writes_nothing",
-            "exchange/test_mesh_files.py::test_mesh_too_large_for_its_format_is_refused_with_other_formats",
+            "exchange/test_mesh_files.py::test_mesh_without_triangles_is_refused_and_nothing_is_written",
+            "exchange/test_mesh_files.py::test_mesh_too_large_for_its_format_is_refused_with_formats_that_hold_it",
         ),
     ),
     68: (
         "STL header: 80 bytes, never begins with solid, no patient data",
         (
-            "exchange/test_mesh_files.py::test_stl_has_the_bytes_of_its_definition",
-            "exchange/test_mesh_files.py::test_mesh_files_hold_no_patient_data_and_no_path",
+            "exchange/test_mesh_files.py::test_stl_has_frame_unit_and_number_of_triangles_in_its_header",
+            "exchange/test_mesh_files.py::test_mesh_file_holds_no_patient_no_device_and_no_path",
         ),
     ),
     69: ("patient data in headers, comments, logs, names, cache: none; --keep-ids: hashed UIDs", ()),
