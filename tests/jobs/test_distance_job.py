@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_lines import check_refused
+from PIL import Image
 from printed_text import Printer
 from sample_meshes import ball, box
 from surface_volumes import MIDDLE, hollow_ball
@@ -20,6 +21,8 @@ from clrecon.mesh import Mesh
 
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, str]:
+    """Meshes of balls of 10 mm: a.stl, made 2 mm higher at both ends, and b.ply, in RAS, with one centre; a without the
+    name of its frame, in RAS; b with a hole of a triangle; and a in metres."""
     vertices, triangles = ball(10.0, 30)
     middle = np.array([40.0, -25.0, -800.0])
     found = {name: str(tmp_path / name) for name in ("a.stl", "b.ply", "plain.stl", "open.stl", "metres.stl")}
@@ -34,106 +37,187 @@ def files(tmp_path: Path) -> dict[str, str]:
     return found
 
 
-def run(*given: str) -> tuple[int, dict[str, Any]]:
+SAMPLED_MM = 0.05
+"""Of a largest distance, from 4000 points on facets of up to 1 mm."""
+
+
+def report_distances(*given: str) -> dict[str, Any]:
+    """Run the command with these arguments, the first of them a file, and return its report."""
     out = Path(given[0]).parent / "report.json"
-    code = main(["distance", *given, "--samples", "4000", "--report", str(out), "-q"])
-    return code, json.loads(out.read_text()) if out.exists() else {}
+    assert main(["distance", *given, "--samples", "4000", "--report", str(out), "-q"]) == 0
+    return dict(json.loads(out.read_text()))
 
 
-def test_a_file_in_ras_is_turned_and_both_directions_are_measured(files: dict[str, str], capsys: Any) -> None:
-    code, report = run(files["a.stl"], files["b.ply"])
-    assert code == 0 and report["warnings"] == [] and report["outputs"] == [] and report["device"] is None
+def test_meshes_of_files_in_two_frames_are_compared_in_one(files: dict[str, str]) -> None:
+    report = report_distances(files["a.stl"], files["b.ply"])
+
     assert (report["a"]["space"], report["b"]["space"], report["b"]["space_from"]) == ("LPS", "RAS", "file")
-    assert report["hausdorff_mm"] == pytest.approx(2.0, abs=0.05)
+    assert report["hausdorff_mm"] == pytest.approx(10.0 * 1.2 - 10.0, abs=SAMPLED_MM)
+    assert report["warnings"] == []
+    assert (report["outputs"], report["device"]) == ([], None)  # nothing was asked for that needs them
+
+
+def test_signed_distances_are_positive_outside_in_both_directions(files: dict[str, str]) -> None:
+    report = report_distances(files["a.stl"], files["b.ply"])
+
     there, back = report["a_to_b_signed_mm"], report["b_to_a_signed_mm"]
-    assert there["max"] == pytest.approx(2.0, abs=0.05) and there["min"] == pytest.approx(0.0, abs=0.05)
-    assert there["outside_share"] > 0.9 > 0.1 > back["outside_share"]
+    assert there["max"] == pytest.approx(2.0, abs=SAMPLED_MM)
+    assert there["min"] == pytest.approx(0.0, abs=SAMPLED_MM)
+    assert there["outside_share"] > 0.9  # a encloses b
+    assert back["outside_share"] < 0.1
+
+
+def test_words_of_distance_name_the_turned_frame_in_lines_of_60_letters(
+    files: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["distance", files["a.stl"], files["b.ply"], "--samples", "500"]) == 0
+
     shown = capsys.readouterr().out
-    assert "RAS, named by the file, turned to LPS" in shown and max(map(len, shown.splitlines())) <= 60
+    assert "RAS, named by the file, turned to LPS" in shown
+    assert max(map(len, shown.splitlines())) <= 60
 
 
-def test_a_file_without_a_frame_is_doubted_until_it_is_said(files: dict[str, str]) -> None:
-    code, report = run(files["plain.stl"], files["b.ply"])
-    assert code == 0 and report["hausdorff_mm"] > 50.0
+def test_mesh_file_that_names_no_frame_is_taken_as_lps_and_doubted_where_it_lies_apart(files: dict[str, str]) -> None:
+    report = report_distances(files["plain.stl"], files["b.ply"])
+
+    assert report["hausdorff_mm"] > 50.0  # x and y of its middle, 40 and -25 mm, have the other sign
     assert any("taken as LPS" in text for text in report["warnings"])
     assert any("apart: is the frame of the file that names none another?" in text for text in report["warnings"])
-    code, report = run(files["plain.stl"], files["b.ply"], "--mesh-space", "ras")
-    assert code == 0 and report["hausdorff_mm"] == pytest.approx(2.0, abs=0.05) and report["warnings"] == []
+
+
+def test_mesh_file_that_names_no_frame_is_read_in_the_given_one_without_a_warning(files: dict[str, str]) -> None:
+    report = report_distances(files["plain.stl"], files["b.ply"], "--mesh-space", "ras")
+
     assert report["a"]["space_from"] == "argument"
+    assert report["hausdorff_mm"] == pytest.approx(2.0, abs=SAMPLED_MM)
+    assert report["warnings"] == []
 
 
-def test_a_mesh_is_measured_against_the_bone_of_a_scan(tmp_path: Path, printed: Printer, device: Any) -> None:
-    volume = hollow_ball(thickness=3.0)
-    volume.save(tmp_path / "ct.nrrd")
+@pytest.fixture
+def ball_and_scan(tmp_path: Path) -> tuple[str, str]:
+    """A mesh of a ball of 13.5 mm and a scan of a shell of bone of 13 mm about the same centre."""
+    hollow_ball(thickness=3.0).save(tmp_path / "ct.nrrd")
     vertices, triangles = ball(13.5, 30)
-    mesh = str(tmp_path / "a.stl")
-    Mesh(vertices + MIDDLE, triangles).save(mesh)
-    found = {}
-    for kind in ("hu", "cortex"):
-        code, found[kind] = run(mesh, str(tmp_path / "ct.nrrd"), "--surface", kind, "--device", str(device.index))
-        assert code == 0 and (found[kind]["b"]["kind"], found[kind]["b"]["iso_value_hu"]) == ("scan", 200.0)
-    level, fitted = (found[kind]["a_to_b_signed_mm"]["mean"] for kind in ("hu", "cortex"))
-    assert fitted == pytest.approx(0.5, abs=0.08) and level < 0.1
-    assert found["cortex"]["b"]["cortex"]["moved"] and found["hu"]["b"]["cortex"] is None
-    assert main(["distance", mesh, str(tmp_path / "ct.nrrd"), "--surface", "cortex", "--samples", "500"]) == 0
-    printed().assert_output(200, 100, 0)
+    Mesh(vertices + MIDDLE, triangles).save(tmp_path / "a.stl")
+    return str(tmp_path / "a.stl"), str(tmp_path / "ct.nrrd")
 
 
-def test_an_open_mesh_and_one_in_metres_are_said(files: dict[str, str]) -> None:
-    _, report = run(files["a.stl"], files["open.stl"])
-    assert report["a_to_b_signed_mm"] is None and report["b_to_a_signed_mm"] is not None
-    assert "open.stl is not closed (3 edges" in report["warnings"][0] and report["b"]["volume_ml"] is None
-    _, report = run(files["a.stl"], files["metres.stl"])
+def test_mesh_is_half_a_mm_outside_of_the_surface_fitted_to_the_bone_of_a_scan(
+    ball_and_scan: tuple[str, str], device: Any
+) -> None:
+    report = report_distances(*ball_and_scan, "--surface", "cortex", "--device", str(device.index))
+
+    assert (report["b"]["kind"], report["b"]["iso_value_hu"]) == ("scan", 200.0)
+    assert report["b"]["cortex"]["moved"] > 0
+    assert report["a_to_b_signed_mm"]["mean"] == pytest.approx(13.5 - 13.0, abs=0.08)  # of voxels of 1 mm
+
+
+def test_mesh_is_nearer_to_the_iso_surface_of_a_scan_than_to_its_bone(
+    ball_and_scan: tuple[str, str], device: Any
+) -> None:
+    report = report_distances(*ball_and_scan, "--surface", "hu", "--device", str(device.index))
+
+    assert (report["b"]["kind"], report["b"]["iso_value_hu"], report["b"]["cortex"]) == ("scan", 200.0, None)
+    assert report["a_to_b_signed_mm"]["mean"] < 0.1  # 200 HU lies 0.7 mm outside of bone blurred by 0.7 mm
+
+
+@pytest.mark.usefixtures("device")
+def test_words_of_a_distance_from_a_scan_name_its_iso_value_and_the_shares_of_its_fit(
+    ball_and_scan: tuple[str, str], printed: Printer
+) -> None:
+    assert main(["distance", *ball_and_scan, "--surface", "cortex", "--samples", "500"]) == 0
+    printed().assert_output(200, 100, 0)  # HU, and shares of the fit in percent
+
+
+def test_open_mesh_has_no_volume_and_none_outside_of_it_and_is_warned_of(files: dict[str, str]) -> None:
+    report = report_distances(files["a.stl"], files["open.stl"])
+
+    assert report["a_to_b_signed_mm"] is None
+    assert report["b_to_a_signed_mm"] is not None  # a is closed
+    assert report["b"]["volume_ml"] is None
+    assert "open.stl is not closed (3 edges" in report["warnings"][0]
+
+
+def test_mesh_a_thousand_times_smaller_is_doubted_to_be_in_another_unit(files: dict[str, str]) -> None:
+    report = report_distances(files["a.stl"], files["metres.stl"])
     assert any("in another unit?" in text for text in report["warnings"])
 
 
-def test_different_frames_of_reference_are_said(files: dict[str, str], tmp_path: Path) -> None:
+@pytest.fixture
+def two_of_one_shape(tmp_path: Path) -> tuple[str, str]:
+    """The same mesh in two files that name different frames of reference."""
     vertices, triangles = ball(5.0, 12)
-    paths = [str(tmp_path / f"{name}.ply") for name in "xy"]
+    paths = str(tmp_path / "x.ply"), str(tmp_path / "y.ply")
     for path, code in zip(paths, ("0123456789abcdef", "fedcba9876543210"), strict=True):
-        told = {"certificate": {"frame_of_reference_hash": code}}
-        Mesh(vertices, triangles, report=told).save(path, keep_ids=True)
-    _, report = run(*paths)
+        report = {"certificate": {"frame_of_reference_hash": code}}
+        Mesh(vertices, triangles, report=report).save(path, keep_ids=True)
+    return paths
+
+
+def test_meshes_of_different_frames_of_reference_are_warned_of(two_of_one_shape: tuple[str, str]) -> None:
+    report = report_distances(*two_of_one_shape)
     assert "different frames of reference" in report["warnings"][0]
-    _, report = run(paths[0], paths[0])
-    assert report["warnings"] == [] and report["hausdorff_mm"] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_the_coloured_mesh_has_colours_and_distances(files: dict[str, str], tmp_path: Path) -> None:
-    import trimesh
+def test_mesh_has_no_distance_from_itself_and_no_warning(two_of_one_shape: tuple[str, str]) -> None:
+    report = report_distances(two_of_one_shape[0], two_of_one_shape[0])
+    assert report["hausdorff_mm"] == pytest.approx(0.0, abs=1e-6)  # points on triangles in float64
+    assert report["warnings"] == []
 
+
+def test_written_mesh_has_its_vertices_in_ras_and_the_distance_at_each(files: dict[str, str], tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
     out = tmp_path / "out.ply"
-    code, report = run(files["a.stl"], files["b.ply"], "-o", str(out), "--range", "1", "--space", "ras")
-    assert code == 0 and report["colors"]["signed"] is True and report["colors"]["range_mm"] == 1.0
-    assert 0.05 < report["colors"]["beyond_share"] < 0.9
-    a = clrecon.read_mesh(files["a.stl"])
-    distances, _ = clrecon.measure_vertex_distances(a, clrecon.read_mesh(files["b.ply"]))
-    read = trimesh.load(out, process=False)
-    np.testing.assert_allclose(np.asarray(read.vertices) * (-1, -1, 1), a.vertices, atol=1e-4)
-    vertex = read.metadata["_ply_raw"]["vertex"]["data"]
-    np.testing.assert_allclose(np.ravel(vertex["scalar_distance_mm"]), distances, atol=1e-5)
-    colors = np.asarray(read.visual.vertex_colors)[:, :3].astype(int)
+
+    report = report_distances(files["a.stl"], files["b.ply"], "-o", str(out), "--space", "ras")
+
+    assert report["outputs"][0]["name"] == "out.ply"
+    assert report["outputs"][0]["bytes"] == out.stat().st_size
+    a, b = clrecon.read_mesh(files["a.stl"]), clrecon.read_mesh(files["b.ply"])
+    assert clrecon.read_mesh(out).triangle_count == a.triangle_count
+    written = trimesh.load(out, process=False)
+    np.testing.assert_allclose(np.asarray(written.vertices) * (-1, -1, 1), a.vertices, atol=1e-4)  # float32 of 800 mm
+    distances, _ = clrecon.measure_vertex_distances(a, b)
+    values = written.metadata["_ply_raw"]["vertex"]["data"]["scalar_distance_mm"]
+    np.testing.assert_allclose(np.ravel(values), distances, atol=1e-5)  # float32
+
+
+def test_written_mesh_is_red_beyond_the_range_and_light_where_there_is_no_distance(
+    files: dict[str, str], tmp_path: Path
+) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    out = tmp_path / "out.ply"
+
+    report = report_distances(files["a.stl"], files["b.ply"], "-o", str(out), "--range", "1")
+
+    distances = clrecon.read_mesh(out).values["distance_mm"]
     far, near = distances > 1.0, np.abs(distances) < 0.02
     assert far.any() and near.any()
-    assert (colors[far] == (178, 24, 43)).all() and (np.abs(colors[near] - 222) < 8).all()
-    assert report["outputs"][0]["name"] == "out.ply" and report["outputs"][0]["bytes"] == out.stat().st_size
-    assert clrecon.read_mesh(out).triangle_count == a.triangle_count
+    assert (report["colors"]["signed"], report["colors"]["range_mm"]) == (True, 1.0)
+    assert 0.05 < report["colors"]["beyond_share"] < 0.9  # of the area: the ends
+    colors = np.asarray(trimesh.load(out, process=False).visual.vertex_colors)[:, :3].astype(int)
+    dark_red, light_grey = (178, 24, 43), 222  # the end of the scale, and its middle
+    assert (colors[far] == dark_red).all()
+    assert (np.abs(colors[near] - light_grey) < 8).all()
 
 
-def test_the_picture_shows_red_ends_and_its_scale(device: Any, files: dict[str, str], tmp_path: Path) -> None:
-    from PIL import Image
-
+def test_picture_of_distances_is_red_at_the_ends_alone_with_its_scale_beside(
+    device: Any, files: dict[str, str], tmp_path: Path
+) -> None:
     out = tmp_path / "out.png"
-    code, report = run(files["a.stl"], files["b.ply"], "--picture", str(out), "--device", str(device.index))
-    assert code == 0 and report["device"]
+
+    report = report_distances(files["a.stl"], files["b.ply"], "--picture", str(out), "--device", str(device.index))
+
+    assert report["device"]
     with Image.open(out) as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
     height, width = pixels.shape[:2]
-    assert height == 1024 and width > 1100
-    ball_itself = pixels[:, :1024]
-    red = np.any(ball_itself[..., 0] > ball_itself[..., 2] + 60, axis=1)
-    assert red[: height // 4].any() and red[-height // 3 :].any() and not red[height // 2 - 20 : height // 2 + 20].any()
+    assert height == 1024
+    assert width > 1100  # the bar of the scale, beside the ball in 1024 columns
+    red_rows = np.any(pixels[:, :1024, 0] > pixels[:, :1024, 2] + 60, axis=1)
+    assert red_rows[: height // 4].any()
+    assert red_rows[-height // 3 :].any()
+    assert not red_rows[height // 2 - 20 : height // 2 + 20].any()
 
 
 @pytest.mark.parametrize(
@@ -153,7 +237,7 @@ def test_the_picture_shows_red_ends_and_its_scale(device: Any, files: dict[str, 
         (["x.off"], 3, ".stl"),
     ],
 )
-def test_wrong_usage_is_one_line_and_writes_nothing(
+def test_wrong_usage_of_distance_is_refused_in_one_line_and_writes_nothing(
     extra: list[str], code: int, fact: str | int, files: dict[str, str], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch, printed: Printer,
 ) -> None:  # fmt: skip
@@ -162,9 +246,13 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
     check_refused(["distance", files["a.stl"], *given], code, fact, tmp_path, printed)
 
 
-def test_a_mesh_of_nothing_has_no_distances(files: dict[str, str], tmp_path: Path, capsys: Any) -> None:
+def test_mesh_whose_triangles_have_no_area_is_refused(
+    files: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     vertices, triangles = box()
     flat = tmp_path / "flat.stl"
-    Mesh(vertices * (0.0, 0.0, 1.0), triangles).save(flat)
+    Mesh(vertices * (0.0, 0.0, 1.0), triangles).save(flat)  # a line
+
     assert main(["distance", files["a.stl"], str(flat), "-q"]) == 2
+
     assert "no triangle with an area" in capsys.readouterr().err

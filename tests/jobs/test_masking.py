@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from dicom_series import Plan, write_series
-from printed_text import Printer
 from refusals import refused
 
 from clrecon.cli.main import main
@@ -35,37 +34,63 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def mesh_with(scan: Path, tmp_path: Path, device: Any, *options: str) -> dict[str, Any]:
+    """Mesh the scan with further options; return the report."""
+    report = tmp_path / "report.json"
+    command = ["mesh", str(scan), "-o", str(tmp_path / "bone.stl"), "--report", str(report), "-q"]
+    assert main([*command, "--device", str(device.index), *options]) == 0
+    return dict(json.loads(report.read_text()))
+
+
+def test_mesh_without_masks_has_bone_and_table_and_no_warning_of_air(device: Any, scan: Path, tmp_path: Path) -> None:
+    report = mesh_with(scan, tmp_path, device)
+
+    assert report["components"] == 2
+    assert not any("is air now" in text for text in report["warnings"])
+
+
+@pytest.mark.parametrize("options", [["--remove-table"], ["--fov", "40"]], ids=["table", "field of view"])
+def test_mesh_without_the_table_is_that_of_the_bone_alone(
+    device: Any, scan: Path, tmp_path: Path, options: list[str]
+) -> None:
+    report = mesh_with(scan, tmp_path, device, *options)
+    assert (report["components"], report["closed"]) == (1, True)
+
+
 @pytest.mark.parametrize(
-    ("options", "components", "entry"),
-    [([], 2, None), (["--remove-table"], 1, "remove_table"), (["--fov", "40"], 1, "field_of_view")],
+    ("options", "entry"),
+    [(["--remove-table"], "remove_table"), (["--fov", "40"], "field_of_view")],
+    ids=["table", "field of view"],
 )
-def test_the_mesh_has_no_table(
-    device: Any, scan: Path, tmp_path: Path, printed: Printer, options: list[str],
-    components: int, entry: str | None,
-) -> None:  # fmt: skip
-    arguments = ["mesh", str(scan), "-o", str(tmp_path / "bone.stl"), "--json", "--device", str(device.index), *options]
-    assert main(arguments) == 0
-    report = printed().report()
-    assert (report["components"], report["closed"]) == (components, True)
-    assert len([words for words in report["warnings"] if "is air now" in words]) == (entry is not None)
-    if entry is not None:
-        facts = report["volume"][entry]
-        assert facts["air_hu"] == pytest.approx(-1000, abs=2)
-        assert 0 < facts["dense_voxels_removed"] <= facts["voxels_removed"]
-        assert f"{facts['dense_voxels_removed']:,} of them dense" in report["warnings"][0]
-        assert report["seconds"]["mask"] > 0.0
+def test_report_counts_the_voxels_that_a_mask_made_air_and_warns_of_them(
+    device: Any, scan: Path, tmp_path: Path, options: list[str], entry: str
+) -> None:
+    report = mesh_with(scan, tmp_path, device, *options)
+
+    facts = report["volume"][entry]
+    assert facts["air_hu"] == pytest.approx(-1000, abs=2)  # in noise of 5 HU
+    assert 0 < facts["dense_voxels_removed"] <= facts["voxels_removed"]
+    (warning,) = [text for text in report["warnings"] if "is air now" in text]
+    assert f"{facts['dense_voxels_removed']:,} of them dense" in warning
+    assert report["seconds"]["mask"] > 0.0
 
 
-def test_the_circle_that_fits_needs_no_number(device: Any, scan: Path, tmp_path: Path) -> None:
-    arguments = ["mesh", str(scan), "-o", str(tmp_path / "bone.stl"), "--device", str(device.index)]
-    assert main([*arguments, "--report", str(tmp_path / "report.json"), "--fov"]) == 0
-    assert json.loads((tmp_path / "report.json").read_text())["volume"]["field_of_view"]["radius_mm"] == 64.0
+def test_field_of_view_without_a_number_is_the_circle_that_fits_into_the_slices(
+    device: Any, scan: Path, tmp_path: Path
+) -> None:
+    report = mesh_with(scan, tmp_path, device, "--fov")
+
+    half_of_64_pixels_of_2_mm = 64.0
+    assert report["volume"]["field_of_view"]["radius_mm"] == half_of_64_pixels_of_2_mm
 
 
 @pytest.mark.parametrize("radius", ["0", "-3", "nan"])
-def test_impossible_radii_are_wrong_usage(scan: Path, tmp_path: Path, radius: str) -> None:
+def test_impossible_radius_of_the_field_of_view_is_refused(scan: Path, tmp_path: Path, radius: str) -> None:
     assert main(["mesh", str(scan), "-o", str(tmp_path / "bone.stl"), f"--fov={radius}"]) == 3
     with refused(UsageError, "field", "view"):
         MeshSettings(field_of_view=float(radius))
+
+
+def test_field_of_view_of_another_word_than_auto_is_refused() -> None:
     with refused(UsageError, "wide", "auto"):
         MeshSettings(field_of_view="wide")

@@ -20,44 +20,51 @@ from clrecon.system.files import replace_file, stage_file
 from clrecon.system.paths import keep_existing
 
 FRAMES = [np.zeros((8, 8, 3), np.uint8)] * 2
+MADE_BEFORE = b'{"generator": "clrecon phantom"}'
+"""An older file, which a folder of a phantom may hold too."""
+
 COMMANDS = {
-    "mesh": ("mesh scan -o {old}.stl", ".stl"),
-    "report of a mesh": ("mesh scan -o new.stl --report {old}.json", ".json"),
+    "mesh": ("mesh scan -o old.stl", "old.stl"),
+    "report of a mesh": ("mesh scan -o new.stl --report old.json", "old.json"),
     "one of several meshes": ("mesh scan -o bone.stl --hu 200,350", "bone_350hu.stl"),
     "components": ("mesh scan -o bone.stl --split", "bone_002.stl"),
-    "picture": ("render scan -o {old}.png", ".png"),
+    "picture": ("render scan -o old.png", "old.png"),
     "one of several views": ("render scan -o bone.png --view left,right", "bone_right.png"),
-    "depths": ("render scan -o new.png --depth {old}.npy", ".npy"),
-    "report of a picture": ("render scan -o new.png --report {old}.json", ".json"),
-    "movie": ("render scan --turntable {old}.gif", ".gif"),
-    "frames": ("render scan --turntable {old}", "old/frame_0000.png"),
-    "phantom": ("phantom {old} --kind sphere --size 16 --slices 8", "old/truth.json"),
-    "demo": ("demo {old}", "old/report.json"),
-    "comparison": ("compare scan -o {old}", "old/report.json"),
-    "report of a bench": ("bench --report {old}.json", ".json"),
+    "depths": ("render scan -o new.png --depth old.npy", "old.npy"),
+    "report of a picture": ("render scan -o new.png --report old.json", "old.json"),
+    "movie": ("render scan --turntable old.gif", "old.gif"),
+    "frames": ("render scan --turntable old", "old/frame_0000.png"),
+    "phantom": ("phantom old --kind sphere --size 16 --slices 8", "old/truth.json"),
+    "demo": ("demo old", "old/report.json"),
+    "comparison": ("compare scan -o old", "old/report.json"),
+    "report of a bench": ("bench --report old.json", "old.json"),
 }
+"""Commands, and the file that each would replace."""
 
 
-@pytest.mark.parametrize("what", COMMANDS)
-def test_row_63_existing_outputs_are_refused_before_any_work(
-    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("command", "existing"), COMMANDS.values(), ids=COMMANDS)
+def test_row_63_command_with_no_clobber_is_refused_before_any_work_where_a_file_exists(
+    command: str, existing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Neither the input nor a device is looked for: there is none of either."""
-    command, name = COMMANDS[what]
-    old = tmp_path / (f"old{name}" if name.startswith(".") else name)
+    old = tmp_path / existing
     old.parent.mkdir(exist_ok=True)
-    old.write_bytes(b'{"generator": "clrecon phantom"}')
+    old.write_bytes(MADE_BEFORE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CLRECON_DEVICE", "no such device")
-    assert main([*command.format(old="old").split(), "--no-clobber"]) == 6
-    told = capsys.readouterr()
-    assert told.out == "" and told.err.count("\n") == 1
-    assert told.err.endswith("already and stays (--no-clobber): name another\n") or "exist already and stay" in told.err
-    assert old.read_bytes() == b'{"generator": "clrecon phantom"}'
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [old]
+
+    assert main([*command.split(), "--no-clobber"]) == 6
+
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    (line,) = printed.err.splitlines()
+    assert line.endswith("already and stays (--no-clobber): name another") or "exist already and stay" in line
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == {old: MADE_BEFORE}
 
 
-def test_row_63_labels_are_refused_before_the_scan_is_read(tmp_path: Path, device: object) -> None:
+def test_row_63_existing_mesh_of_a_label_is_refused_with_no_clobber_before_the_scan_is_read(
+    tmp_path: Path, device: object
+) -> None:
     from clrecon.jobs.mesh.job import make_mesh
     from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 
@@ -67,55 +74,90 @@ def test_row_63_labels_are_refused_before_the_scan_is_read(tmp_path: Path, devic
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "labels.nii")
     (tmp_path / "bone_label_2.stl").write_bytes(b"older")
     settings = MeshSettings(labels=LabelChoice(str(tmp_path / "labels.nii")), device=str(device.index))  # type: ignore[attr-defined]
+
     with refused(OutputError, "bone_label_2.stl", "no_clobber=True"):
         make_mesh(tmp_path / "no scan", tmp_path / "bone.stl", settings, no_clobber=True)
 
 
-def test_row_63_new_names_and_empty_folders_are_written(tmp_path: Path) -> None:
+PHANTOM = ["--kind=sphere", "--size=16", "--slices=8", "-q"]
+
+
+def test_row_63_phantom_in_a_new_folder_is_written_with_no_clobber(tmp_path: Path) -> None:
+    assert main(["phantom", str(tmp_path / "ct"), *PHANTOM, "--no-clobber"]) == 0
+    assert (tmp_path / "ct" / "truth.json").exists()
+
+
+def test_row_63_phantom_over_an_earlier_one_is_refused_with_no_clobber_alone(tmp_path: Path) -> None:
+    assert main(["phantom", str(tmp_path / "ct"), *PHANTOM]) == 0
+
+    assert main(["phantom", str(tmp_path / "ct"), *PHANTOM, "--no-clobber"]) == 6
+    assert main(["phantom", str(tmp_path / "ct"), *PHANTOM]) == 0
+
+
+def test_row_63_frames_in_an_empty_folder_are_written_with_no_clobber(tmp_path: Path) -> None:
     (tmp_path / "turn").mkdir()
+
     assert write_animation(FRAMES, tmp_path / "turn", no_clobber=True) > 0
-    assert (
-        main(["phantom", str(tmp_path / "ct"), "--kind=sphere", "--size=16", "--slices=8", "--no-clobber", "-q"]) == 0
-    )
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["ct", "turn"]
-    assert (
-        main(["phantom", str(tmp_path / "ct"), "--kind=sphere", "--size=16", "--slices=8", "--no-clobber", "-q"]) == 6
-    )
-    assert main(["phantom", str(tmp_path / "ct"), "--kind=sphere", "--size=16", "--slices=8", "-q"]) == 0
+
+    assert len(list((tmp_path / "turn").iterdir())) == len(FRAMES)
+
+
+def test_row_63_frames_over_earlier_ones_are_refused_with_no_clobber(tmp_path: Path) -> None:
+    write_animation(FRAMES, tmp_path / "turn")
     with refused(OutputError, "turn", "no_clobber=True"):
         write_animation(FRAMES, tmp_path / "turn", no_clobber=True)
 
 
-@pytest.mark.parametrize("links", [True, False], ids=["links", "no links"])
-def test_row_63_a_file_that_comes_meanwhile_stays(links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(params=["hard links", "no hard links"])
+def file_system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file system that has hard links, and one that refuses them."""
+
     def refuse(*_: object) -> None:
         raise OSError(errno.EPERM, "not permitted")
 
-    if not links:
+    if request.param == "no hard links":
         monkeypatch.setattr(os, "link", refuse)
+
+
+@pytest.mark.usefixtures("file_system")
+def test_row_63_file_that_comes_before_the_last_step_stays_with_no_clobber(tmp_path: Path) -> None:
     target = tmp_path / "a.stl"
+
     with keep_existing(), stage_file(target, lambda stream: stream.write(b"new")) as staged:
         target.write_bytes(b"came meanwhile")
         with refused(OutputError, "a.stl", "no_clobber=True"):
             staged.commit()
+
     assert target.read_bytes() == b"came meanwhile"
-    target.unlink()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.stl"]
+
+
+@pytest.mark.usefixtures("file_system")
+def test_row_63_new_file_is_written_with_no_clobber(tmp_path: Path) -> None:
+    target = tmp_path / "a.stl"
+
     with keep_existing():
-        assert replace_file(target, lambda stream: stream.write(b"new")) == 3
-    assert target.read_bytes() == b"new" and [path.name for path in tmp_path.iterdir()] == ["a.stl"]
+        bytes_written = replace_file(target, lambda stream: stream.write(b"new"))
+
+    assert bytes_written == 3
+    assert target.read_bytes() == b"new"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.stl"]
 
 
-def test_row_63_frames_that_come_meanwhile_stay(tmp_path: Path) -> None:
+def test_row_63_frames_that_come_before_the_last_step_stay_with_no_clobber(tmp_path: Path) -> None:
     with keep_existing(), stage_animation(FRAMES, tmp_path / "turn") as staged:
         write_animation(FRAMES[:1], tmp_path / "turn")
         with refused(OutputError, "turn", "no_clobber=True"):
             staged.commit()
+
     assert [path.name for path in (tmp_path / "turn").iterdir()] == ["frame_0000.png"]
     assert [path.name for path in tmp_path.iterdir()] == ["turn"]
 
 
-def test_row_63_of_many_writers_one_wins(tmp_path: Path) -> None:
-    target, won, together = tmp_path / "a.stl", [], threading.Barrier(8)
+def test_row_63_one_of_many_writers_at_once_writes_with_no_clobber(tmp_path: Path) -> None:
+    target = tmp_path / "a.stl"
+    written: list[int] = []
+    together = threading.Barrier(8)
 
     def write(number: int) -> None:
         with keep_existing(), stage_file(target, lambda stream: stream.write(b"%d" % number)) as staged:
@@ -124,31 +166,53 @@ def test_row_63_of_many_writers_one_wins(tmp_path: Path) -> None:
                 staged.commit()
             except OutputError:
                 return
-            won.append(number)
+            written.append(number)
 
     threads = [threading.Thread(target=write, args=(number,)) for number in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(won) == 1 and target.read_bytes() == b"%d" % won[0]
+
+    (first,) = written
+    assert target.read_bytes() == b"%d" % first
     assert [path.name for path in tmp_path.iterdir()] == ["a.stl"]
 
 
-def test_row_63_python_functions_replace_no_file_with_no_clobber(tmp_path: Path) -> None:
-    mesh = clrecon.Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32))
-    function = clrecon.TransferFunction([(0, 1, 1, 1, 0), (100, 1, 1, 1, 1)])
-    for path, save in ((tmp_path / "a.stl", mesh.save), (tmp_path / "a.json", function.save)):
+SAVING = {
+    "a.stl": clrecon.Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32)).save,
+    "a.json": clrecon.TransferFunction([(0, 1, 1, 1, 0), (100, 1, 1, 1, 1)]).save,
+}
+
+
+@pytest.mark.parametrize("name", SAVING)
+def test_row_63_save_from_python_is_refused_with_no_clobber_where_the_file_exists(name: str, tmp_path: Path) -> None:
+    path, save = tmp_path / name, SAVING[name]
+    path.write_bytes(b"older")
+
+    with refused(OutputError, "no_clobber=True"):
         save(path, no_clobber=True)
-        before = path.read_bytes()
-        with refused(OutputError, "no_clobber=True"):
-            save(path, no_clobber=True)
-        save(path)
-        assert path.read_bytes() == before
+
+    assert path.read_bytes() == b"older"
 
 
-def test_row_63_numbered_files_are_replaced_unless_they_are_kept(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", SAVING)
+def test_row_63_save_from_python_writes_a_new_file_with_no_clobber_as_without_it(name: str, tmp_path: Path) -> None:
+    new, again, save = tmp_path / name, tmp_path / f"again_{name}", SAVING[name]
+    again.write_bytes(b"older")
+
+    save(new, no_clobber=True)
+    save(again)
+
+    assert new.read_bytes() == again.read_bytes()
+
+
+def test_row_63_numbered_file_is_refused_with_no_clobber(tmp_path: Path) -> None:
     (tmp_path / "bone_001.stl").write_bytes(b"")
-    refuse_numbered(tmp_path / "bone.stl")
     with keep_existing(), refused(OutputError, "bone.stl", "no_clobber=True", 1):
         refuse_numbered(tmp_path / "bone.stl")
+
+
+def test_row_63_numbered_file_is_not_refused_without_no_clobber(tmp_path: Path) -> None:
+    (tmp_path / "bone_001.stl").write_bytes(b"")
+    refuse_numbered(tmp_path / "bone.stl")  # raises nothing

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pydicom
 import pytest
+from PIL import Image
 from printed_text import Printer
 
 from clrecon.cli.main import main
@@ -21,6 +22,7 @@ pytest.importorskip("nibabel")
 
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A phantom of three vertebrae, L1 to L3, in voxels of 2.2 x 2.2 x 2.5 mm."""
     folder = tmp_path_factory.mktemp("vertebrae") / "ct"
     write_phantom(folder, PhantomSettings(levels="L1-L3", facet_gap_mm=0.0, size=(96, 96), spacing=(2.2, 2.2, 2.5)))
     return folder
@@ -37,25 +39,41 @@ def written(scan: Path) -> Path:
 
 
 @pytest.mark.seconds
-def test_a_run_writes_map_picture_and_report(written: Path) -> None:
-    from PIL import Image
+def test_vertebrae_are_numbered_in_the_written_label_map_and_the_report(written: Path) -> None:
+    labels = read_labels(written / "a.nii.gz")
+    report = json.loads((written / "a.json").read_text())
 
     assert sorted(path.name for path in written.iterdir()) == ["a.json", "a.nii.gz", "a.png"]
-    report = json.loads((written / "a.json").read_text())
-    labels = read_labels(written / "a.nii.gz")
     assert labels.names == {1: "vertebra_1", 2: "vertebra_2", 3: "vertebra_3"}
-    assert [one["number"] for one in report["vertebrae"]] == list(labels.numbers)
-    assert (report["low_confidence"], report["written"], len(report["discs"])) == (0, 3, 2)
+    assert [one["number"] for one in report["vertebrae"]] == [1, 2, 3]
+    assert (report["written"], report["low_confidence"], len(report["discs"])) == (3, 0, 2)
+
+
+def test_reported_volume_of_each_vertebra_is_that_of_its_voxels(written: Path) -> None:
+    labels = read_labels(written / "a.nii.gz")
+    report = json.loads((written / "a.json").read_text())
+
     voxel_ml = 2.2 * 2.2 * 2.5 / 1000
-    for one in report["vertebrae"]:
-        assert one["volume_ml"] == pytest.approx(labels.counts[one["number"]] * voxel_ml, rel=1e-3)
-    assert "warnings" not in report["volume"] and report["volume"]["series"]["uid_hash"] is None
+    volumes = {one["number"]: one["volume_ml"] for one in report["vertebrae"]}
+    assert volumes == pytest.approx({number: labels.counts[number] * voxel_ml for number in (1, 2, 3)}, rel=1e-3)
+
+
+def test_report_of_vertebrae_has_no_hash_of_the_series_and_warnings_once(written: Path) -> None:
+    report = json.loads((written / "a.json").read_text())
+
+    assert report["volume"]["series"]["uid_hash"] is None
+    assert "warnings" in report
+    assert "warnings" not in report["volume"]
+
+
+def test_picture_of_vertebrae_has_a_yellow_line_for_each_disc(written: Path) -> None:
     with Image.open(written / "a.png") as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
+
     assert pixels.shape[0] > 300
-    yellow = (np.abs(pixels - [255, 230, 0]).max(axis=2) < 10).any(axis=1)
-    rows = np.flatnonzero(yellow)
-    assert len(np.split(rows, np.flatnonzero(np.diff(rows) > 20) + 1)) >= 2  # one line a disc at least
+    yellow_rows = np.flatnonzero((np.abs(pixels - [255, 230, 0]).max(axis=2) < 10).any(axis=1))
+    lines = 1 + np.count_nonzero(np.diff(yellow_rows) > 20)  # rows apart
+    assert lines >= 2
 
 
 @pytest.mark.release
@@ -73,68 +91,114 @@ def test_front_and_back_come_from_the_affine_where_no_patient_position_is_stated
     assert np.array_equal(read_labels(tmp_path / "a.nii.gz").voxels, read_labels(written / "a.nii.gz").voxels)
 
 
-def test_without_a_landmark_the_command_says_how_to_name_levels(
+def test_vertebrae_without_a_landmark_are_said_to_be_numbers_from_the_head(
+    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["vertebrae", str(scan), "-o", str(tmp_path / "a.nii.gz")]) == 0
+    assert "numbers, counted from the head" in capsys.readouterr().out
+
+
+def test_level_in_a_map_of_numbers_is_refused_and_they_are_listed(
+    scan: Path, written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    labels = ["--labels", str(written / "a.nii.gz"), "--label", "L3"]
+
+    assert main(["mesh", str(scan), "-o", str(tmp_path / "a.stl"), *labels]) == 3
+
+    assert "1 vertebra_1, 2 vertebra_2, 3 vertebra_3. These are numbers and no levels" in capsys.readouterr().err
+
+
+NUMBER_OF_L1 = 20
+"""In label maps; L2 and L3 follow."""
+
+
+def test_vertebrae_with_a_first_level_are_the_same_voxels_with_the_names_of_levels(
     scan: Path, written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "a.nii.gz"
-    assert main(["vertebrae", str(scan), "-o", str(path)]) == 0
-    assert "numbers, counted from the head" in capsys.readouterr().out
-    mesh = ["mesh", str(scan), "-o", str(tmp_path / "a.stl"), "--labels"]
-    assert main([*mesh, str(path), "--label", "L3"]) == 3
-    assert "1 vertebra_1, 2 vertebra_2, 3 vertebra_3. These are numbers and no levels" in capsys.readouterr().err
+
     assert main(["vertebrae", str(scan), "-o", str(path), "--first", "l1"]) == 0
-    assert "numbers, counted from the head" not in capsys.readouterr().out
-    assert read_labels(path).names == {20: "L1", 21: "L2", 22: "L3"}
-    assert np.array_equal(
-        np.where(read_labels(path).voxels, read_labels(path).voxels - 19, 0), read_labels(written / "a.nii.gz").voxels
-    )
 
-
-def test_the_segmentation_is_the_same_map(scan: Path, written: Path, tmp_path: Path) -> None:
-    report = json.loads((written / "a.json").read_text())
-    point = ",".join(str(value) for value in report["vertebrae"][1]["centre_mm"])
-    path, picture = tmp_path / "s.dcm", tmp_path / "other.png"
-    assert (
-        main(["vertebrae", str(scan), "-o", str(path), "--picture", str(picture), "--name-at", f"{point}=L2", "-q"])
-        == 0
-    )
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["other.png", "s.dcm"]
     named = read_labels(path)
     assert named.names == {20: "L1", 21: "L2", 22: "L3"}
-    taken = resample_labels(named, read_volume(scan))
-    assert taken.exact
-    assert np.array_equal(np.where(taken.voxels, taken.voxels - 19, 0), read_labels(written / "a.nii.gz").voxels)
-    assert str(pydicom.dcmread(path).PatientName) == "" and b"PHANTOM" not in path.read_bytes()
+    from_1_on = np.where(named.voxels, named.voxels - (NUMBER_OF_L1 - 1), 0)
+    assert np.array_equal(from_1_on, read_labels(written / "a.nii.gz").voxels)
+    assert "numbers, counted from the head" not in capsys.readouterr().out
 
 
-@pytest.mark.seconds
-def test_vertebrae_of_low_confidence_are_left_out_with_exit_code_8(
-    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.fixture(scope="module")
+def segmentation(scan: Path, written: Path) -> Path:
+    """The folder of a run that wrote a DICOM SEG with L2 named at its centre, and other.png."""
+    folder = scan.parent / "segmentation"
+    folder.mkdir()
+    middle = json.loads((written / "a.json").read_text())["vertebrae"][1]["centre_mm"]
+    name = f"{','.join(str(value) for value in middle)}=L2"
+    command = ["vertebrae", str(scan), "-o", str(folder / "s.dcm"), "--picture", str(folder / "other.png"), "-q"]
+    assert main([*command, "--name-at", name]) == 0
+    return folder
+
+
+def test_dicom_seg_of_vertebrae_has_the_voxels_of_the_nifti_map_with_the_names_of_levels(
+    scan: Path, written: Path, segmentation: Path
 ) -> None:
+    named = read_labels(segmentation / "s.dcm")
+
+    assert named.names == {20: "L1", 21: "L2", 22: "L3"}
+    on_the_scan = resample_labels(named, read_volume(scan))
+    assert on_the_scan.exact
+    from_1_on = np.where(on_the_scan.voxels, on_the_scan.voxels - (NUMBER_OF_L1 - 1), 0)
+    assert np.array_equal(from_1_on, read_labels(written / "a.nii.gz").voxels)
+
+
+def test_dicom_seg_of_vertebrae_does_not_name_the_patient(segmentation: Path) -> None:
+    assert str(pydicom.dcmread(segmentation / "s.dcm").PatientName) == ""
+    assert b"PHANTOM" not in (segmentation / "s.dcm").read_bytes()  # the name in the scan
+
+
+def test_picture_of_vertebrae_has_the_given_name(segmentation: Path) -> None:
+    assert sorted(path.name for path in segmentation.iterdir()) == ["other.png", "s.dcm"]
+
+
+@pytest.fixture
+def doubted_middle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The vertebra between two discs has two reasons for a low confidence, the others none."""
     from clrecon.spine import split
 
-    def doubt(piece: Any, *given: Any) -> dict[str, tuple[float, str]]:
-        low = piece.upper is not None and piece.upper.is_disc and piece.lower is not None and piece.lower.is_disc
-        value = 0.0 if low else 1.0
+    def judge(piece: Any, *given: Any) -> dict[str, tuple[float, str]]:
+        between = piece.upper is not None and piece.upper.is_disc and piece.lower is not None and piece.lower.is_disc
+        value = 0.0 if between else 1.0
         return {
             "volume": (value, "a doubt of the test"),
             "arch": (value, "a greater one"),
             "line": (0.9, "a small one"),
         }
 
-    monkeypatch.setattr(split, "judge", doubt)
-    given = ["vertebrae", str(scan), "-o", str(tmp_path / "a.nii.gz")]
-    assert main(given) == 8
-    told = capsys.readouterr()
-    assert (
-        "vertebra_2 has low confidence (0.42) and is not in the label map: a greater one; a doubt of the test"
-        in told.err
-    )
-    assert "1 of low confidence" in told.out
+    monkeypatch.setattr(split, "judge", judge)
+
+
+@pytest.mark.usefixtures("doubted_middle")
+@pytest.mark.seconds
+def test_vertebra_of_low_confidence_is_left_out_with_its_reasons_and_exit_code_8(
+    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["vertebrae", str(scan), "-o", str(tmp_path / "a.nii.gz")]) == 8
+
     assert read_labels(tmp_path / "a.nii.gz").numbers == (1, 3)
-    assert main([*given, "--keep-unsure"]) == 8
-    assert "is in the label map all the same" in capsys.readouterr().err
+    printed = capsys.readouterr()
+    reasons = "is not in the label map: a greater one; a doubt of the test"
+    assert f"vertebra_2 has low confidence (0.42) and {reasons}" in printed.err
+    assert "1 of low confidence" in printed.out
+
+
+@pytest.mark.usefixtures("doubted_middle")
+@pytest.mark.seconds
+def test_vertebra_of_low_confidence_is_kept_on_request_with_exit_code_8(
+    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["vertebrae", str(scan), "-o", str(tmp_path / "a.nii.gz"), "--keep-unsure"]) == 8
+
     assert read_labels(tmp_path / "a.nii.gz").numbers == (1, 2, 3)
+    assert "is in the label map all the same" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -155,18 +219,20 @@ def test_vertebrae_of_low_confidence_are_left_out_with_exit_code_8(
         (["-o", "a.nii.gz", "--first", "T1", "--name-at", "1,2,3=L1"], 3, "--first and --name-at both name levels"),
     ],
 )
-def test_wrong_usage_is_one_line_and_writes_nothing(
+def test_wrong_usage_of_vertebrae_is_refused_in_one_line_and_writes_nothing(
     extra: list[str], code: int, words: str, scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
+
     assert main(["vertebrae", str(scan), *extra, "-q"]) == code
+
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_scan_that_is_not_dicom_has_no_segmentation(written: Path, tmp_path: Path, printed: Printer) -> None:
+def test_dicom_seg_of_a_scan_that_is_not_dicom_is_refused(written: Path, tmp_path: Path, printed: Printer) -> None:
     assert main(["vertebrae", str(written / "a.nii.gz"), "-o", str(tmp_path / "a.dcm")]) == 3
     printed().assert_error("NIfTI")
 
