@@ -207,12 +207,9 @@ def test_row_63_save_from_python_writes_a_new_file_with_no_clobber_as_without_it
     assert new.read_bytes() == again.read_bytes()
 
 
-def test_row_63_numbered_file_is_refused_with_no_clobber(tmp_path: Path) -> None:
+def test_row_63_numbered_file_is_refused_with_no_clobber_alone(tmp_path: Path) -> None:
     (tmp_path / "bone_001.stl").write_bytes(b"")
+
+    refuse_numbered(tmp_path / "bone.stl")
     with keep_existing(), refused(OutputError, "bone.stl", "no_clobber=True", 1):
         refuse_numbered(tmp_path / "bone.stl")
-
-
-def test_row_63_numbered_file_is_not_refused_without_no_clobber(tmp_path: Path) -> None:
-    (tmp_path / "bone_001.stl").write_bytes(b"")
-    refuse_numbered(tmp_path / "bone.stl")  # raises nothing
