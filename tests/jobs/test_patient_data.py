@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pydicom
 import pytest
 from ct_files import write_series
 from printed_text import Printer
-from variants import but_seldom
+from variants import but_seldom, daily
 
 from clrecon.cli.main import main
 
@@ -32,11 +33,14 @@ WORDS = [
     *(part for text in SECRETS.values() for part in re.split(r"\^", text)), "Jolanthe", "1.2.276.47114711",
 ]  # fmt: skip
 """Words so long that no picture or figure has them by chance."""
-HASHES = [hashlib.sha256(uid.encode()).hexdigest()[:16] for uid in (SERIES_UID, SECRETS["FrameOfReferenceUID"])]
+SERIES_HASH, FRAME_HASH = HASHES = [
+    hashlib.sha256(uid.encode()).hexdigest()[:16] for uid in (SERIES_UID, SECRETS["FrameOfReferenceUID"])
+]
 
 
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of two series of one patient, numbers 1 and 2, with `SECRETS` in their headers."""
     folder = write_series(tmp_path_factory.mktemp("patient") / "ct")
     write_series(folder, number=2)
     for place, path in enumerate(sorted(folder.iterdir())):
@@ -72,39 +76,66 @@ COMMANDS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", but_seldom(COMMANDS, ("mesh .obj", "mesh .glb", "mesh .vtp", "bench", "compare")))
-def test_row_69_no_file_and_no_word_names_the_patient(
-    what: str,
-    device: Any,
-    scan: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    printed: Printer,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    command = [*COMMANDS[what].format(scan=scan).split(), "--series", "1", "--device", str(device.index)]
+MESHES_AND_PICTURES = [what for what in COMMANDS if what not in ("bench", "compare")]
+
+
+@pytest.fixture
+def command_for(device: Any, scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A function that gives the words of one of `COMMANDS`; the working folder is that of the test."""
     monkeypatch.chdir(tmp_path)
+    return lambda what: [*COMMANDS[what].format(scan=scan).split(), "--series", "1", "--device", str(device.index)]
+
+
+@pytest.mark.parametrize("what", but_seldom(COMMANDS, ("mesh .obj", "mesh .glb", "mesh .vtp", "bench", "compare")))
+def test_row_69_files_words_and_log_of_a_command_do_not_name_the_patient(
+    what: str, command_for: Any, tmp_path: Path, printed: Printer, caplog: pytest.LogCaptureFixture
+) -> None:
     with caplog.at_level(logging.DEBUG):
-        assert main([*command, "-v"]) == 0
-        assert main([*command, "--json"]) == 0
+        assert main([*command_for(what), "-v"]) == 0
+        assert main([*command_for(what), "--json"]) == 0
+
     assert find_words(tmp_path, printed().everything, caplog.text) == []
-    if what in ("bench", "compare"):
-        return
-    assert main([*command, "--json", "--keep-ids"]) == 0
-    report = printed().report()["volume"]
-    assert [report["series"]["uid_hash"], report["frame_of_reference_hash"]] == HASHES
-    assert find_words(tmp_path) == HASHES
+
+
+@pytest.mark.parametrize("what", but_seldom(MESHES_AND_PICTURES, ("mesh .obj", "mesh .glb", "mesh .vtp")))
+def test_row_69_report_has_hashes_of_series_and_frame_of_reference_where_they_are_asked_for(
+    what: str, command_for: Any, tmp_path: Path, printed: Printer
+) -> None:
+    assert main([*command_for(what), "--json", "--keep-ids"]) == 0
+
+    volume = printed().report()["volume"]
+    assert (volume["series"]["uid_hash"], volume["frame_of_reference_hash"]) == (SERIES_HASH, FRAME_HASH)
+    assert find_words(tmp_path) == [SERIES_HASH, FRAME_HASH]  # and no word of the patient
+
+
+@pytest.mark.parametrize("kind", daily(1, ["ply", "obj", "glb", "vtp"]))
+def test_row_69_comment_of_a_mesh_has_the_hash_of_its_frame_of_reference_where_it_is_asked_for(
+    kind: str, command_for: Any, tmp_path: Path
+) -> None:
+    assert main([*command_for(f"mesh .{kind}"), "--keep-ids"]) == 0
+
     (tmp_path / "r.json").unlink()
-    in_comments = what.startswith("mesh") and what[-3:] != "stl"
-    packed = what.endswith("3mf")
-    assert find_words(tmp_path) == (HASHES[1:] if in_comments and not packed else [])
-    if packed:
-        import zipfile
-
-        with zipfile.ZipFile(tmp_path / "a.3mf") as archive:
-            assert HASHES[1].encode() in archive.read("3D/3dmodel.model")
+    assert find_words(tmp_path) == [FRAME_HASH]
 
 
+def test_row_69_model_of_a_3mf_has_the_hash_of_its_frame_of_reference_where_it_is_asked_for(
+    command_for: Any, tmp_path: Path
+) -> None:
+    assert main([*command_for("mesh .3mf"), "--keep-ids"]) == 0
+
+    with zipfile.ZipFile(tmp_path / "a.3mf") as archive:
+        assert FRAME_HASH.encode() in archive.read("3D/3dmodel.model")
+
+
+@pytest.mark.parametrize("what", ["mesh .stl", "picture", "movie"])
+def test_row_69_file_without_room_for_a_comment_has_no_hash(what: str, command_for: Any, tmp_path: Path) -> None:
+    assert main([*command_for(what), "--keep-ids"]) == 0
+
+    (tmp_path / "r.json").unlink()
+    assert find_words(tmp_path) == []
+
+
+@pytest.mark.parametrize("form", ["--json", "--debug"])
 @pytest.mark.parametrize(
     ("arguments", "code"),
     [
@@ -114,27 +145,29 @@ def test_row_69_no_file_and_no_word_names_the_patient(
         ([], 4),  # two of one size
         (["--series", "1", "--labels", "{scan}/s1_000.dcm"], 4),
     ],
-    ids=["none", "both", "phase", "choice", "labels"],
+    ids=["no series", "both series", "missing phase", "no choice", "slice as label map"],
 )
-def test_row_69_errors_name_a_series_by_its_number(
-    arguments: list[str], code: int, device: Any, scan: Path, tmp_path: Path, printed: Printer
+def test_row_69_errors_do_not_name_the_patient_in_json_nor_with_their_traceback(
+    arguments: list[str], code: int, form: str, device: Any, scan: Path, tmp_path: Path, printed: Printer
 ) -> None:
-    said = [argument.format(scan=scan) for argument in arguments]
-    command = ["mesh", str(scan), "-o", str(tmp_path / "a.stl"), "--device", str(device.index), *said]
-    assert main([*command, "--json"]) == code
-    assert find_words(tmp_path, printed().everything) == []
-    assert main([*command, "--debug"]) == code
+    given = [argument.format(scan=scan) for argument in arguments]
+    command = ["mesh", str(scan), "-o", str(tmp_path / "a.stl"), "--device", str(device.index), *given]
+
+    assert main([*command, form]) == code
+
     said = printed()
-    said.assert_error("Traceback")
+    assert said.everything
     assert find_words(tmp_path, said.everything) == []
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("form", ["--pixels", "--json"])
-def test_row_69_info_describes_a_series_and_says_no_more(
+def test_row_69_info_shows_description_and_hashes_of_a_series_and_nothing_else_of_the_patient(
     form: str, scan: Path, tmp_path: Path, printed: Printer
 ) -> None:
     assert main(["info", str(scan), "--series", "1", form]) == 0
+
     shown = printed().everything
-    assert SECRETS["SeriesDescription"] in shown and HASHES[0] in shown
-    assert find_words(tmp_path, shown.replace(SECRETS["SeriesDescription"], "")) == HASHES
+    description = SECRETS["SeriesDescription"]
+    assert description in shown
+    assert find_words(tmp_path, shown.replace(description, "")) == [SERIES_HASH, FRAME_HASH]

@@ -49,31 +49,50 @@ NAMES = (
 
 
 @pytest.mark.parametrize("name", daily(2, NAMES))
-def test_progress_is_told_and_changes_nothing(works: dict[str, tuple[str, Work]], name: str) -> None:
+def test_progress_of_a_function_names_its_stage_and_rises_to_its_total(
+    works: dict[str, tuple[str, Work]], name: str
+) -> None:
     stage, work = works[name]
     calls: list[tuple[str, int, int]] = []
-    result = work(progress=lambda *call: calls.append(call))
+
+    work(progress=lambda *call: calls.append(call))
+
     assert {call[0] for call in calls} == {stage}
-    done, totals = [call[1] for call in calls], {call[2] for call in calls}
-    assert done == sorted(done) and len(set(done)) > 1 and len(totals) == 1
-    assert done[-1] == totals.pop()
-    alone = work()
+    done = [call[1] for call in calls]
+    (total,) = {call[2] for call in calls}
+    assert done == sorted(done)
+    assert len(set(done)) > 1
+    assert done[-1] == total
+
+
+@pytest.mark.parametrize("name", daily(2, NAMES))
+def test_result_of_a_function_with_progress_is_that_without_it(works: dict[str, tuple[str, Work]], name: str) -> None:
+    _, work = works[name]
+
+    watched, alone = work(progress=lambda *call: None), work()
+
     for array in ("voxels", "vertices", "points"):
-        if hasattr(result, array):
-            assert np.array_equal(getattr(result, array), getattr(alone, array))
+        if hasattr(alone, array):
+            assert np.array_equal(getattr(watched, array), getattr(alone, array))
+    assert type(watched) is type(alone)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_error_of_progress_ends_the_work(works: dict[str, tuple[str, Work]], name: str) -> None:
-    told: list[int] = []
+def test_error_raised_by_progress_ends_a_function_at_once_and_arrives_as_it_is(
+    works: dict[str, tuple[str, Work]], name: str
+) -> None:
+    _, work = works[name]
+    calls: list[int] = []
     raised = clrecon.Cancelled("enough")
 
     def progress(stage: str, done: int, total: int) -> None:
-        told.append(done)
-        if len(told) == 2:
+        calls.append(done)
+        if len(calls) == 2:
             raise raised
 
     takes: Progress = progress
     with pytest.raises(clrecon.Cancelled) as error:
-        works[name][1](progress=takes)
-    assert error.value is raised and len(told) == 2
+        work(progress=takes)
+
+    assert error.value is raised
+    assert len(calls) == 2

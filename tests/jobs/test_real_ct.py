@@ -41,43 +41,77 @@ def contour_with_vtk(folder: Path) -> tuple[np.ndarray, np.ndarray, cKDTree]:
 
 
 def enclosed_ml(points: np.ndarray, faces: np.ndarray) -> float:
+    """The volume within a closed mesh, in ml."""
     points = points - points.mean(axis=0)
     a, b, c = (points[faces[:, corner]] for corner in range(3))
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6000.0)
 
 
+@pytest.fixture(scope="module")
+def mesh_of(real_data, device, tmp_path_factory):
+    """A function that meshes a series once; returns the STL and the report."""
+
+    @cache
+    def make(folder):
+        output = tmp_path_factory.mktemp("real") / "bone.stl"
+        report = output.with_suffix(".json")
+        make_mesh(real_data / folder, output, MeshSettings(iso_value=HU, device=device), report_path=report)
+        return output, json.loads(report.read_text())
+
+    return make
+
+
 @pytest.mark.release
 @pytest.mark.parametrize(("folder", "origin", "spacing"), SERIES, ids=["lumbar_4p25mm", "thoracic_0p8mm"])
-def test_real_series_mesh_like_vtk_in_the_true_place(real_data, device, tmp_path, folder, origin, spacing):
-    trimesh = pytest.importorskip("trimesh")
-    output, report_path = tmp_path / "bone.stl", tmp_path / "report.json"
-    make_mesh(real_data / folder, output, MeshSettings(iso_value=HU, device=device), report_path=report_path)
-    report = json.loads(report_path.read_text())
-    expected_affine = np.diag((*spacing, 1.0))
-    expected_affine[:3, 3] = origin
-    assert np.abs(np.array(report["affine_ijk_to_lps_mm"]) - expected_affine).max() < 1e-5
-    assert report["closed"] and report["manifold"]
+def test_affine_of_a_real_series_is_that_of_independent_readers(mesh_of, folder, origin, spacing):
+    _, report = mesh_of(folder)
 
-    points, faces, points_tree = contour_with_vtk(real_data / folder)
-    written = trimesh.load_mesh(output, process=False)
-    vertices = np.unique(written.vertices, axis=0)
-    voxel = min(spacing)
-    both_ways = [points_tree.query(vertices)[0], cKDTree(vertices).query(points)[0]]
-    for distances in both_ways:  # vertex to vertex: no less than to the surface
-        assert np.percentile(distances, 95) <= tolerances.VTK_SURFACE_HD95_VOXEL * voxel
+    expected = np.diag((*spacing, 1.0))
+    expected[:3, 3] = origin
+    assert np.abs(np.array(report["affine_ijk_to_lps_mm"]) - expected).max() < 1e-5  # these have six decimals
+
+
+@pytest.mark.release
+@pytest.mark.parametrize(("folder", "origin", "spacing"), SERIES, ids=["lumbar_4p25mm", "thoracic_0p8mm"])
+def test_mesh_of_a_real_series_is_closed_with_the_triangles_and_volume_of_vtk(
+    real_data, mesh_of, folder, origin, spacing
+):
+    _, report = mesh_of(folder)
+
+    points, faces, _ = contour_with_vtk(real_data / folder)
+    assert report["closed"] and report["manifold"]
     assert report["triangles"] == len(faces)
     assert report["volume_ml"] == pytest.approx(enclosed_ml(points, faces), rel=tolerances.VTK_VOLUME)
 
 
 @pytest.mark.release
-def test_real_ct_stays_sound_with_the_topology_of_the_trilinear_field(real_data, device):
-    """Few cells differ: the two surfaces have nearly the same triangles and volume."""
+@pytest.mark.parametrize(("folder", "origin", "spacing"), SERIES, ids=["lumbar_4p25mm", "thoracic_0p8mm"])
+def test_vertices_of_a_real_series_lie_on_those_of_vtk(real_data, mesh_of, folder, origin, spacing):
+    trimesh = pytest.importorskip("trimesh")
+    output, _ = mesh_of(folder)
+
+    points, _, points_tree = contour_with_vtk(real_data / folder)
+    vertices = np.unique(trimesh.load_mesh(output, process=False).vertices, axis=0)
+    most_mm = tolerances.VTK_SURFACE_HD95_VOXEL * min(spacing)
+    # From vertex to vertex: no less than to the surface.
+    assert np.percentile(points_tree.query(vertices)[0], 95) <= most_mm
+    assert np.percentile(cKDTree(vertices).query(points)[0], 95) <= most_mm
+
+
+@pytest.mark.release
+def test_trilinear_topology_of_a_real_scan_is_closed_with_nearly_the_triangles_and_volume_of_the_default(
+    real_data, device
+):
+    """The two differ in few cells."""
     volume = read_volume(real_data / "thoracic_0p8mm")
-    meshes = [
-        extract_isosurface(volume, HU, device=device, topology=topology) for topology in ("separated", "trilinear")
-    ]
-    default, resolved = (mesh.quality() for mesh in meshes)
-    assert resolved["closed"] and resolved["manifold"] and resolved["zero_area_faces"] == 0
-    assert resolved["euler_number"] != default["euler_number"]
-    assert resolved["triangles"] == pytest.approx(default["triangles"], rel=tolerances.TOPOLOGY_SHARE)
-    assert resolved["volume_ml"] == pytest.approx(default["volume_ml"], rel=tolerances.TOPOLOGY_SHARE)
+
+    separated, trilinear = (
+        extract_isosurface(volume, HU, device=device, topology=topology).quality()
+        for topology in ("separated", "trilinear")
+    )
+
+    assert trilinear["closed"] and trilinear["manifold"]
+    assert trilinear["zero_area_faces"] == 0
+    assert trilinear["euler_number"] != separated["euler_number"]
+    assert trilinear["triangles"] == pytest.approx(separated["triangles"], rel=tolerances.TOPOLOGY_SHARE)
+    assert trilinear["volume_ml"] == pytest.approx(separated["volume_ml"], rel=tolerances.TOPOLOGY_SHARE)

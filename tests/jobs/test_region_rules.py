@@ -35,11 +35,11 @@ from clrecon.jobs.options import (
         ("tube:30:line.csv", RegionRule("tube", (30.0,), "line.csv")),
     ],
 )
-def test_a_rule_is_read(text: str, rule: RegionRule) -> None:
+def test_rule_of_a_region_is_read_with_its_numbers_file_and_label(text: str, rule: RegionRule) -> None:
     assert parse_region_rules(text) == (rule,)
 
 
-def test_a_rule_describes_itself_without_folders() -> None:
+def test_text_of_a_rule_names_its_file_without_folders() -> None:
     rules = parse_region_rules(["label:maps/of/spine.nii:T12", "box:,2,3,,5,", "tube:30:a\\b\\line.csv"])
     assert [str(rule) for rule in rules] == ["label:spine.nii:T12", "box:,2,3,,5,", "tube:30:line.csv"]
 
@@ -65,20 +65,22 @@ def test_a_rule_describes_itself_without_folders() -> None:
         ("seed:1,2,", "is not known"),
     ],
 )
-def test_a_rule_of_another_form_is_refused(text: str, words: str) -> None:
+def test_rule_of_another_form_is_refused(text: str, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         parse_region_rules(text)
 
 
-def test_steps_are_read_in_their_order() -> None:
+def test_steps_of_one_text_are_read_in_their_order() -> None:
     steps = parse_preprocess("bilateral, Open:1.5,level:250,fill,bilateral-2d:0.7:36,region,fill-slices")
     assert [str(step) for step in steps] == [
         "bilateral", "open:1.5", "level:250", "fill", "bilateral-2d:0.7:36", "region", "fill-slices",
     ]  # fmt: skip
-    assert parse_preprocess(["erode:1", "dilate:2"]) == (
-        PreprocessStep("erode", (1.0,)),
-        PreprocessStep("dilate", (2.0,)),
-    )
+
+
+def test_steps_of_several_texts_are_read_with_their_numbers() -> None:
+    erode, dilate = parse_preprocess(["erode:1", "dilate:2"])
+    assert erode == PreprocessStep("erode", (1.0,))
+    assert dilate == PreprocessStep("dilate", (2.0,))
 
 
 @pytest.mark.parametrize(
@@ -100,27 +102,41 @@ def test_steps_are_read_in_their_order() -> None:
         ("curvature-flow:2.5", "needs a whole number"),
     ],
 )
-def test_a_step_of_another_form_is_refused(text: str, words: str) -> None:
+def test_step_of_another_form_is_refused(text: str, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         parse_preprocess(text)
 
 
-def test_help_names_every_form() -> None:
-    for name in (*FILTERS, *MORPHOLOGY, "level", "region"):
-        assert name in PREPROCESS_FORMS
-    for kind in ("box:", "hu:", "label:", "mask:", "seed:", "tube:"):
-        assert kind in REGION_FORMS
+@pytest.mark.parametrize("name", [*FILTERS, *MORPHOLOGY, "level", "region"])
+def test_help_of_preprocessing_names_every_step(name: str) -> None:
+    assert name in PREPROCESS_FORMS
 
 
-def test_settings_refuse_a_place_for_no_region() -> None:
+@pytest.mark.parametrize("kind", ["box:", "hu:", "label:", "mask:", "seed:", "tube:"])
+def test_help_of_regions_names_every_kind_of_rule(kind: str) -> None:
+    assert kind in REGION_FORMS
+
+
+def test_step_region_without_a_region_is_refused() -> None:
     with refused(UsageError, "none"):
         MeshSettings(preprocess="open:1,region")
-    settings = MeshSettings(preprocess="open:1,region", region=("tube:30",), space="ras")
-    assert settings.region_later and settings.space_of_points == "ras"
-    assert not MeshSettings(region=("tube:30",)).region_later
 
 
-def test_bone_loss_is_allowed_where_something_takes_bone() -> None:
+@pytest.mark.parametrize(
+    ("preprocess", "is_later"), [("open:1,region", True), (None, False)], ids=["as a step", "before all steps"]
+)
+def test_region_is_applied_at_its_step_or_first(preprocess: str | None, is_later: bool) -> None:
+    assert MeshSettings(region=("tube:30",), preprocess=preprocess).region_later == is_later
+
+
+def test_points_of_a_region_are_in_the_frame_of_the_output() -> None:
+    assert MeshSettings(region=("tube:30",), space="ras").space_of_points == "ras"
+
+
+def test_allowed_bone_loss_is_refused_where_nothing_takes_bone() -> None:
     with pytest.raises(UsageError, match="nothing takes any"):
         MeshSettings(allow_bone_loss=True)
+
+
+def test_allowed_bone_loss_is_accepted_with_a_step_that_takes_bone() -> None:
     assert MeshSettings(allow_bone_loss=True, preprocess="erode:1").allow_bone_loss
