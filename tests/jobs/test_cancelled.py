@@ -36,7 +36,7 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def moments(work: Callable[[Progress], object]) -> Calls:
+def pick_calls(work: Callable[[Progress], object]) -> Calls:
     """The calls of progress of a whole run: of each stage the last, and of those with parts one in the middle."""
     calls: Calls = []
     work(lambda *call: calls.append(call))
@@ -47,8 +47,8 @@ def moments(work: Callable[[Progress], object]) -> Calls:
     return list(dict.fromkeys(chosen))
 
 
-def cancel(work: Callable[[Progress], object], moment: tuple[str, int, int]) -> None:
-    """Run `work` until `moment`; what arrives must be the error that was raised there, not another in its place."""
+def cancel_at(work: Callable[[Progress], object], moment: tuple[str, int, int]) -> None:
+    """Run `work` until `moment`; what arrives must be the error that was raised files_in, not another in its place."""
     raised = clrecon.Cancelled(f"enough at {moment}")
     caller = threading.get_ident()
 
@@ -69,7 +69,7 @@ def cancel(work: Callable[[Progress], object], moment: tuple[str, int, int]) -> 
 
 
 class Buffers:
-    """The buffers on devices that somebody still holds."""
+    """The buffers on devices that were made since the patch, and how many of them somebody still holds."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch):
         cl = pytest.importorskip("pyopencl")
@@ -103,23 +103,32 @@ def old_files(folder: Path, *names: str) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def there(folder: Path) -> dict[str, bytes]:
+def files_in(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_reading_can_be_cancelled_at_every_report(scan: Path) -> None:
-    found = moments(lambda progress: clrecon.read_volume(scan, progress=progress))
-    assert {stage for stage, _, _ in found} == {"scan", "read"}
-    for moment in found:
-        cancel(lambda progress: clrecon.read_volume(scan, progress=progress), moment)
-        cancel(lambda progress: clrecon.list_series(scan, pixels=True, progress=progress), moment)
+@pytest.mark.parametrize(
+    "read",
+    [
+        pytest.param(clrecon.read_volume, id="read_volume"),
+        pytest.param(
+            lambda scan, progress: clrecon.list_series(scan, pixels=True, progress=progress), id="list_series"
+        ),
+    ],
+)
+def test_reading_cancelled_at_any_progress_ends_its_threads(read: Callable[..., object], scan: Path) -> None:
+    calls = pick_calls(lambda progress: clrecon.read_volume(scan, progress=progress))
+    assert {stage for stage, _, _ in calls} == {"scan", "read"}
+
+    for moment in calls:
+        cancel_at(lambda progress: read(scan, progress=progress), moment)
+
     assert [thread.name for thread in threading.enumerate() if thread.name.startswith("ThreadPool")] == []
-    assert clrecon.read_volume(scan).voxels.shape[0] == 16
 
 
 @pytest.mark.release
 @pytest.mark.slow
-def test_a_mesh_job_can_be_cancelled_at_every_report(scan: Path, device: Any, tmp_path: Path) -> None:
+def test_mesh_job_cancelled_at_any_progress_leaves_older_files(scan: Path, device: Any, tmp_path: Path) -> None:
     settings = MeshSettings(
         iso_value=(100.0, 200.0), smooth=2, decimate=0.5, split=True, field_of_view=14.0, device=str(device.index)
     )
@@ -127,7 +136,7 @@ def test_a_mesh_job_can_be_cancelled_at_every_report(scan: Path, device: Any, tm
     def work(progress: Progress) -> object:
         return make_mesh(scan, tmp_path / "a.stl", settings, report_path=tmp_path / "a.json", progress=progress)
 
-    found = moments(work)
+    found = pick_calls(work)
     stages = {stage for stage, _, _ in found}
     assert stages == {
         "device", "scan", "read", "mask", "build", "select", "smooth", "decimate", "compare", "measure",
@@ -136,56 +145,100 @@ def test_a_mesh_job_can_be_cancelled_at_every_report(scan: Path, device: Any, tm
     assert ("write", 1, 2) in found  # between the files
     before = old_files(tmp_path, "a.stl", "a_100hu_001.stl", "a.json")
     for moment in found if is_set("CLRECON_RELEASE_TESTS") else last_of_each_stage(found):
-        cancel(work, moment)
-        assert there(tmp_path) == before
+        cancel_at(work, moment)
+        assert files_in(tmp_path) == before
 
 
-def test_a_cancelled_surface_frees_its_buffers(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+SLABS_BYTES = 120_000
+"""A budget of memory for which `block` is worked on in several slabs."""
+
+
+@pytest.fixture
+def block() -> Volume:
     voxels = np.zeros((40, 30, 30), np.int16)
     voxels[5:35, 5:25, 5:25] = 1000
-    volume = Volume(voxels, np.eye(4))
-    memory = 120_000
-    whole = clrecon.extract_isosurface(volume, 500, device=device)
-    buffers = Buffers(monkeypatch)
-    kept = buffers.held
-    found = moments(
-        lambda progress: clrecon.extract_isosurface(volume, 500, device=device, memory=memory, progress=progress)
+    return Volume(voxels, np.eye(4))
+
+
+def pick_calls_of_surface(volume: Volume, device: Any) -> Calls:
+    """Calls of progress of its surface in slabs."""
+    calls = pick_calls(
+        lambda progress: clrecon.extract_isosurface(volume, 500, device=device, memory=SLABS_BYTES, progress=progress)
     )
-    assert len([moment for moment in found if moment[0] == "slabs"]) > 1
-    for moment in found:
+    assert len([call for call in calls if call[0] == "slabs"]) > 1
+    return calls
+
+
+def test_surface_in_slabs_cancelled_at_any_progress_holds_no_buffers(
+    block: Volume, device: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = pick_calls_of_surface(block, device)
+    buffers = Buffers(monkeypatch)
+
+    for moment in calls:
         before = buffers.made
-        cancel(
-            lambda progress: clrecon.extract_isosurface(volume, 500, device=device, memory=memory, progress=progress),
+        cancel_at(
+            lambda progress: clrecon.extract_isosurface(
+                block, 500, device=device, memory=SLABS_BYTES, progress=progress
+            ),
             moment,
         )
         assert buffers.made > before or moment[0] == "build"
-        assert buffers.held == kept
-    with clrecon.SurfaceExtractor(volume, device=device, memory=memory) as extractor:
-        for moment in found:
-            cancel(lambda progress: extractor.extract(500, progress=progress), moment)
-        assert np.array_equal(extractor.extract(500).vertices, whole.vertices)  # it can be used again
-        assert buffers.held == kept
-    with clrecon.SurfaceExtractor(volume, device=device) as extractor:
+        assert buffers.held == 0
+
+
+def test_surface_extractor_in_slabs_can_be_used_after_it_was_cancelled(block: Volume, device: Any) -> None:
+    calls = pick_calls_of_surface(block, device)
+    whole = clrecon.extract_isosurface(block, 500, device=device)
+
+    with clrecon.SurfaceExtractor(block, device=device, memory=SLABS_BYTES) as extractor:
+        for moment in calls:
+            cancel_at(lambda progress: extractor.extract(500, progress=progress), moment)
+        assert np.array_equal(extractor.extract(500).vertices, whole.vertices)
+
+
+def test_surface_extractor_in_slabs_holds_no_buffers_after_it_was_cancelled(
+    block: Volume, device: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = pick_calls_of_surface(block, device)
+    buffers = Buffers(monkeypatch)
+
+    with clrecon.SurfaceExtractor(block, device=device, memory=SLABS_BYTES) as extractor:
+        for moment in calls:
+            cancel_at(lambda progress: extractor.extract(500, progress=progress), moment)
+        assert buffers.held == 0
+
+
+def test_surface_extractor_holds_its_volume_on_the_device_until_it_is_closed(
+    block: Volume, device: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    buffers = Buffers(monkeypatch)
+
+    with clrecon.SurfaceExtractor(block, device=device) as extractor:
         extractor.extract(500)
-        assert buffers.held > kept  # the volume stays there
-    assert buffers.held == kept
+        assert buffers.held > 0
+    assert buffers.held == 0
 
 
-def test_a_slice_made_in_slabs_can_be_cancelled(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cancelled_slice_made_in_slabs_holds_no_buffers(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     voxels = np.random.default_rng(0).integers(-1000, 1000, (60, 40, 40)).astype(np.int16)
     volume = Volume(voxels, np.eye(4))
     cut = {"size": (64, 64), "memory": 100_000}
     clrecon.cut_slice(volume, "coronal", device=device, **cut)
     buffers = Buffers(monkeypatch)
-    found = moments(lambda progress: clrecon.cut_slice(volume, "coronal", device=device, progress=progress, **cut))
+    found = pick_calls(lambda progress: clrecon.cut_slice(volume, "coronal", device=device, progress=progress, **cut))
     assert len(found) > 1
     for moment in found:
-        cancel(lambda progress: clrecon.cut_slice(volume, "coronal", device=device, progress=progress, **cut), moment)
+        cancel_at(
+            lambda progress: clrecon.cut_slice(volume, "coronal", device=device, progress=progress, **cut), moment
+        )
         assert buffers.held == 0
 
 
-@pytest.mark.parametrize("own", daily(1, [False, True]))
-def test_surfaces_of_labels_can_be_cancelled(own: bool, device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("of_masks", daily(1, [False, True]))
+def test_cancelled_surfaces_of_labels_hold_no_buffers(
+    of_masks: bool, device: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     voxels = np.zeros((24, 24, 24), np.int16)
     marks = np.zeros(voxels.shape, np.uint8)
     for number, first in enumerate((2, 9, 16), start=1):
@@ -194,22 +247,22 @@ def test_surfaces_of_labels_can_be_cancelled(own: bool, device: Any, monkeypatch
     volume, labels = Volume(voxels, np.eye(4)), LabelMap(marks, np.eye(4))
 
     def work(progress: Progress) -> object:
-        if own:
+        if of_masks:
             return clrecon.extract_label_masks(labels, device=device, progress=progress)
         return clrecon.extract_labels(volume, labels, 500, device=device, progress=progress)
 
-    found = moments(work)
+    found = pick_calls(work)
     assert found == [("labels", 0, 3), ("labels", 1, 3), ("labels", 2, 3)]
     buffers = Buffers(monkeypatch)
     for moment in found:
-        cancel(work, moment)
+        cancel_at(work, moment)
         assert buffers.held == 0
     assert buffers.made > 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", daily(1, ["a.apng", "a.gif", "a.mp4", "frames"]))
-def test_a_turntable_can_be_cancelled_at_every_report(
+def test_turntable_cancelled_at_any_progress_leaves_older_files_and_holds_no_buffers(
     name: str, scan: Path, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = RenderSettings.of(
@@ -220,7 +273,7 @@ def test_a_turntable_can_be_cancelled_at_every_report(
     def work(progress: Progress) -> object:
         return make_pictures(scan, files, settings, progress=progress)
 
-    found = moments(work)
+    found = pick_calls(work)
     assert {stage for stage, _, _ in found} == {"device", "scan", "read", "render", "frames"}
     if name != "a.apng":  # before the frames, all kinds of movies are one job
         found = [moment for moment in found if moment[0] in ("render", "frames")]
@@ -230,12 +283,12 @@ def test_a_turntable_can_be_cancelled_at_every_report(
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     buffers = Buffers(monkeypatch)
     for moment in found:
-        cancel(work, moment)
+        cancel_at(work, moment)
         assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
         assert buffers.held == 0
     assert buffers.made > 0
 
 
-def test_a_missing_device_does_not_take_the_place_of_cancelled() -> None:
+def test_cancelled_arrives_though_the_device_is_missing_too() -> None:
     with refused(clrecon.Cancelled, "enough"), DeviceOpening("abacus", lambda device: None):
         raise clrecon.Cancelled("enough")

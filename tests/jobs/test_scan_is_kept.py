@@ -33,7 +33,7 @@ def scan(tmp_path, monkeypatch):
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
 
 
-def lead(how: str, slice_file: Path, name: str) -> str:
+def make_path_to(how: str, slice_file: Path, name: str) -> str:
     """A name with the extension of `name` that leads to the slice."""
     other = slice_file.parent.parent / name
     if how == "link":
@@ -47,36 +47,36 @@ def lead(how: str, slice_file: Path, name: str) -> str:
     return str(other)
 
 
-def jobs(path: str) -> list[Callable[[], object]]:
-    """Every output of every job in the place `path`, which is asked for by its extension."""
-    turntable = RenderSettings.of(turntable=Turntable(frames=2))
-    places: dict[str, list[Callable[[], object]]] = {
-        ".stl": [lambda: make_mesh("ct", path)],
-        ".json": [
-            lambda: make_mesh("ct", "a.stl", report_path=path),
-            lambda: make_pictures("ct", PictureFiles("a.png", report=path)),
-            lambda: run_bench("ct", report_path=path),
-        ],
-        ".png": [lambda: make_pictures("ct", PictureFiles(path))],
-        ".npy": [
-            lambda: make_pictures("ct", PictureFiles("a.png", depth=path)),
-            lambda: make_pictures("ct", PictureFiles("a.png", values=path), RenderSettings.of(mode="mip")),
-        ],
-        ".gif": [lambda: make_pictures("ct", PictureFiles(turntable=path), turntable)],
-    }
-    return places[Path(path).suffix]
+OUTPUTS: dict[str, tuple[str, Callable[[str], object]]] = {
+    "mesh": (".stl", lambda path: make_mesh("ct", path)),
+    "report of a mesh": (".json", lambda path: make_mesh("ct", "a.stl", report_path=path)),
+    "report of a picture": (".json", lambda path: make_pictures("ct", PictureFiles("a.png", report=path))),
+    "report of a bench": (".json", lambda path: run_bench("ct", report_path=path)),
+    "picture": (".png", lambda path: make_pictures("ct", PictureFiles(path))),
+    "depths": (".npy", lambda path: make_pictures("ct", PictureFiles("a.png", depth=path))),
+    "values": (
+        ".npy",
+        lambda path: make_pictures("ct", PictureFiles("a.png", values=path), RenderSettings.of(mode="mip")),
+    ),
+    "movie": (
+        ".gif",
+        lambda path: make_pictures(
+            "ct", PictureFiles(turntable=path), RenderSettings.of(turntable=Turntable(frames=2))
+        ),
+    ),
+}
+"""Each output of each job: its extension, and a job that writes it to a path."""
 
 
-@pytest.mark.parametrize("how", ["link", "link to a link", "hard link"])
-@pytest.mark.parametrize("extension", [".stl", ".json", ".png", ".npy", ".gif"])
-def test_no_output_replaces_a_slice(scan, how, extension):
-    path = lead(how, scan / "IM0001", f"out{extension}")
-    for job in jobs(path):
-        with pytest.raises(OutputError, match=DICOM_THERE):
-            job()
+@pytest.mark.parametrize("link", ["link", "link to a link", "hard link"])
+@pytest.mark.parametrize(("extension", "run_job"), OUTPUTS.values(), ids=OUTPUTS)
+def test_output_of_any_job_over_a_slice_by_a_link_is_refused(scan, link, extension, run_job):
+    path = make_path_to(link, scan / "IM0001", f"out{extension}")
+    with pytest.raises(OutputError, match=DICOM_THERE):
+        run_job(path)
 
 
-def test_report_replaces_no_slice_of_its_name(scan, printed):
+def test_report_over_a_slice_is_refused_in_one_line_and_no_mesh_is_written(scan, printed):
     assert main(["mesh", "ct", "-o", "a.stl", "--report", "ct/IM0001"]) == 6
     told = printed()
     assert told.output_lines == 0
@@ -86,7 +86,7 @@ def test_report_replaces_no_slice_of_its_name(scan, printed):
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="the system has no /proc")
-def test_report_replaces_no_slice_behind_an_open_descriptor(scan):
+def test_report_over_a_slice_by_an_open_descriptor_is_refused(scan):
     descriptor = os.open(scan / "IM0001", os.O_RDWR)
     try:
         with pytest.raises(OutputError, match="it leads to an open stream"):
@@ -95,29 +95,41 @@ def test_report_replaces_no_slice_behind_an_open_descriptor(scan):
         os.close(descriptor)
 
 
-def test_report_replaces_no_dicom_file_of_another_scan(scan, tmp_path):
-    """Nor does anything else that writes with `replace_file`."""
+def test_report_over_a_dicom_file_of_another_scan_is_refused(scan, tmp_path):
     other = tmp_path / "other.json"
     other.write_bytes((scan / "IM0001").read_bytes())
+
     with refused(OutputError, "other.json", "DICOM"):
         make_mesh("ct", "a.stl", report_path=other)
-    with refused(OutputError, "other.json", "DICOM"):
-        replace_file(other, lambda stream: stream.write(b"new"))
+
     assert other.read_bytes() == (scan / "IM0001").read_bytes()
 
 
-def test_report_replaces_no_bare_data_set_of_the_scan(scan):
+def test_replacing_a_dicom_file_is_refused_whatever_the_writer(scan, tmp_path):
+    other = tmp_path / "other.json"
+    other.write_bytes((scan / "IM0001").read_bytes())
+
+    with refused(OutputError, "other.json", "DICOM"):
+        replace_file(other, lambda stream: stream.write(b"new"))
+
+    assert other.read_bytes() == (scan / "IM0001").read_bytes()
+
+
+def test_report_over_a_slice_without_the_head_of_dicom_files_is_refused(scan):
     file = scan / "IM0003"
     whole = file.read_bytes()
-    start = whole.index(b"\x08\0\x08\0CS")
-    file.write_bytes(whole[start:])
+    first_element = whole.index(b"\x08\0\x08\0CS")  # ImageType
+    file.write_bytes(whole[first_element:])
+
     with refused(UsageError, "DICOM", "data"):
         make_mesh("ct", "a.stl", report_path=file)
-    file.write_bytes(whole)
+
+    assert file.read_bytes() == whole[first_element:]
+    file.write_bytes(whole)  # as `scan` expects it
 
 
 @pytest.mark.parametrize("folder", ["ct", ".", "frames"])
-def test_folder_of_frames_replaces_no_scan(scan, tmp_path, folder):
+def test_folder_of_frames_over_a_scan_is_refused(scan, tmp_path, folder):
     """Also where its slices are called as frames are."""
     frames = tmp_path / "frames"
     frames.mkdir()
@@ -129,23 +141,37 @@ def test_folder_of_frames_replaces_no_scan(scan, tmp_path, folder):
     assert len(list(frames.iterdir())) == 4
 
 
-def test_report_replaces_no_voxels_that_a_header_names(tmp_path, monkeypatch):
-    pytest.importorskip("SimpleITK")
-    import SimpleITK
-
+@pytest.fixture
+def header_and_voxels(tmp_path, monkeypatch):
+    """ct.mhd, and ct.raw, which it names."""
+    sitk = pytest.importorskip("SimpleITK")
     monkeypatch.chdir(tmp_path)
-    SimpleITK.WriteImage(SimpleITK.GetImageFromArray(np.zeros((3, 4, 5), "i2")), "ct.mhd")
-    voxels = Path("ct.raw").read_bytes()
+    sitk.WriteImage(sitk.GetImageFromArray(np.zeros((3, 4, 5), "i2")), "ct.mhd")
+
+
+@pytest.mark.usefixtures("header_and_voxels")
+def test_report_over_the_voxel_file_that_a_header_names_is_refused():
+    before = Path("ct.raw").read_bytes()
+
     with refused(UsageError, "ct.raw"):
         make_mesh("ct.mhd", "a.stl", report_path="ct.raw")
+
+    assert Path("ct.raw").read_bytes() == before
+
+
+@pytest.mark.usefixtures("header_and_voxels")
+def test_report_over_the_header_of_a_scan_is_refused():
+    before = Path("ct.mhd").read_bytes()
+
     with refused(UsageError, "report", "ct.mhd"):
         run_bench("ct.mhd", report_path="ct.mhd")
-    assert Path("ct.raw").read_bytes() == voxels
+
+    assert Path("ct.mhd").read_bytes() == before
 
 
-def test_earlier_outputs_are_replaced(scan, tmp_path):
-    """An older report or mesh, also beside the slices, is no slice."""
-    for name in ("a.json", "ct2.json"):
-        Path(name).write_text("{}")
-        replace_file(name, lambda stream: stream.write(b"[]"))
-        assert Path(name).read_text() == "[]"
+@pytest.mark.usefixtures("scan")
+@pytest.mark.parametrize("name", ["a.json", "ct2.json"])
+def test_earlier_json_beside_a_scan_is_replaced(name):
+    Path(name).write_text("{}")
+    replace_file(name, lambda stream: stream.write(b"[]"))
+    assert Path(name).read_text() == "[]"

@@ -33,7 +33,9 @@ def gpu(device, monkeypatch):
 @pytest.mark.seconds
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("first", daily(1, [1, 2]))
-def test_row_54_a_job_goes_on_on_the_cpu_device(device, gpu, tmp_path, capsys, monkeypatch, command, first):
+def test_row_54_job_whose_device_fails_is_done_again_on_the_cpu_device_with_a_warning(
+    device, gpu, tmp_path, capsys, monkeypatch, command, first
+):
     output, options = COMMANDS[command]
     write_series(tmp_path / "ct")
     (tmp_path / "alone").mkdir()
@@ -52,7 +54,7 @@ def test_row_54_a_job_goes_on_on_the_cpu_device(device, gpu, tmp_path, capsys, m
 
 
 @pytest.mark.parametrize("command", daily(1, COMMANDS))
-def test_row_54_a_named_device_fails_with_the_number_of_the_cpu_device(
+def test_row_54_job_on_a_named_device_that_fails_is_refused_with_the_number_of_the_cpu_device(
     device, gpu, tmp_path, printed, monkeypatch, command
 ):
     name, options = COMMANDS[command]
@@ -64,7 +66,7 @@ def test_row_54_a_named_device_fails_with_the_number_of_the_cpu_device(
     assert not output.exists()
 
 
-def test_row_56_a_job_survives_the_loss_of_its_device(gpu, tmp_path, printed, monkeypatch):
+def test_row_56_job_whose_device_is_lost_is_done_again_on_it_in_a_new_context(gpu, tmp_path, printed, monkeypatch):
     write_series(tmp_path / "ct")
     # nothing is tried beside the reading: the launch that fails is one of the work
     monkeypatch.setattr("clrecon.jobs.mesh.make._try_steps", lambda device, settings: None)
