@@ -74,6 +74,13 @@ SCAN_PEAK_BYTES_A_FILE = 1300  # with the list of paths and 64 starts of files: 
 FAR_AFFINE_MM = 1e-3  # coordinates of 1e5 mm, positions written with 6 decimals: measured 1e-6
 JITTER_AFFINE_MM = 1e-4  # directions off by 0.001 degrees in every slice: 8e-5 mm over a corner 4.6 mm away
 
+PEAK_HU = 12  # noise of 12 HU; peaks are found in bins of a few HU
+SMALL_BODY_PEAK_HU = 15  # the same of a finger, whose soft tissue is blurred over a twentieth of the picture
+GRID_PLACE_MM = 1e-4  # ITK and sforms of NIfTI keep float32 of places of some 100 mm
+GRID_SPACING_MM = 1e-5  # pixdim of NIfTI is float32
+RESAMPLED_HU = 1e-3  # a linear field of up to 1500 HU, interpolated in float32
+GRID_REFUSAL_BYTES = 8e6  # what a refused file may take; it would need 19 MB
+
 THOUSAND_FRAMES_S = 1.0  # of processors, for headers of 1000 frames in one file; measured 0.11
 
 # --- labels ---

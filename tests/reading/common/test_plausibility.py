@@ -45,28 +45,32 @@ def write_hu(folder, hu, plan=None, **values):
     return folder
 
 
-def told(folder):
+def read_warnings(folder):
     return read_volume(folder).report["warnings"]
 
 
 # --- shifted ---
 @pytest.mark.parametrize("lungs", [False, True])
+@pytest.mark.parametrize("intercept", [-1024, -1000])
+def test_scan_with_its_intercept_has_no_warning(tmp_path, intercept, lungs):
+    assert read_warnings(write_hu(tmp_path, make_scan(lungs=lungs), RescaleIntercept=intercept)) == []
+
+
+@pytest.mark.parametrize("lungs", [False, True])
 @pytest.mark.parametrize(
     ("intercept", "words"),
     [
-        (-1024, None),
-        (-1000, None),
         (0, r"air lies near 24 HU and soft tissue near 10\d\d HU, .* the rescale intercept seems to be missing"),
         (-2048, r"air lies near -2024 HU and soft tissue near -9\d\d HU, .* seems to have been applied twice"),
     ],
+    ids=["missing", "doubled"],
 )
-def test_an_intercept_that_is_missing_or_doubled_shows(tmp_path, intercept, words, lungs):
-    warnings = told(write_hu(tmp_path, make_scan(lungs=lungs), RescaleIntercept=intercept))
-    assert len(warnings) == (words is not None)
-    assert words is None or re.match(words, warnings[0])
+def test_intercept_that_is_missing_or_doubled_is_warned_of(tmp_path, intercept, words, lungs):
+    (warning,) = read_warnings(write_hu(tmp_path, make_scan(lungs=lungs), RescaleIntercept=intercept))
+    assert re.match(words, warning)
 
 
-def test_padding_does_not_hide_a_missing_intercept(tmp_path):
+def test_missing_intercept_is_warned_of_beside_declared_padding(tmp_path):
     """Declared padding goes to -1024 where no air is beside it, and says nothing of the scan."""
     hu = make_scan()
     hu[:, :6] = -976  # stored 48; padding below is put there as a stored value
@@ -102,46 +106,46 @@ def make_specimen():
         ("water in air", np.where(make_scan() > -500, 0.0, -1000.0)),
     ],
 )
-def test_scans_that_are_merely_unusual_raise_no_alarm(tmp_path, name, hu):
+def test_scan_that_is_merely_unusual_has_no_warning(tmp_path, name, hu):
     noisy = np.rint(hu + np.random.default_rng(4).normal(0, 8, SHAPE))
     if name == "bone in tissue":  # a cut out of a spine: partial volume lies between tissue and dense bone
         noisy[:, 10:30, 10:30] = np.random.default_rng(5).uniform(40, 1060, (SHAPE[0], 20, 20)).round()
-    assert told(write_hu(tmp_path, noisy)) == []
+    assert read_warnings(write_hu(tmp_path, noisy)) == []
 
 
-def test_dry_bone_with_silent_padding_is_not_taken_for_a_doubled_intercept(tmp_path):
+def test_dry_bone_with_padding_that_is_not_declared_is_warned_of_for_its_padding_alone(tmp_path):
     hu = make_specimen()
     hu[:, :8] = -2000
-    warnings = told(write_hu(tmp_path, hu))
-    assert len(warnings) == 1 and "padding that the files do not declare" in warnings[0]
+    (warning,) = read_warnings(write_hu(tmp_path, hu))
+    assert "padding that the files do not declare" in warning
 
 
 # --- silent padding ---
 @pytest.mark.parametrize("value", [-1200, -2000, -3024])
-def test_padding_that_is_not_declared_is_told_with_its_share(tmp_path, value):
+def test_padding_that_is_not_declared_is_warned_of_and_kept(tmp_path, value):
     hu = make_scan()
-    hu[:, :12] = value
+    hu[:, :12] = value  # of 48 rows
     volume = read_volume(write_hu(tmp_path, hu))
     assert volume.report["warnings"][0].startswith(f"25 % of the voxels are at {value} HU, below air: padding that")
-    assert np.array_equal(volume.voxels, hu)  # told, not altered
     assert volume.report["padding_hu"] is None
+    assert np.array_equal(volume.voxels, hu)
 
 
-def test_the_share_is_that_of_all_voxels(tmp_path):
+def test_share_of_padding_in_a_warning_is_that_of_all_voxels(tmp_path):
     """Rows and slices that a sample leaves out count as well."""
     shape = (40, 200, 160)
     hu = np.random.default_rng(7).integers(-1010, -990, shape).astype(float)
     hu[:, 40:160, 30:130] = np.random.default_rng(8).integers(20, 60, (40, 120, 100))
     hu[: 8 + 3, :33] = -1500
     hu[20:, :, :29] = -1500
-    (warning,) = told(write_hu(tmp_path, hu))
+    (warning,) = read_warnings(write_hu(tmp_path, hu))
     assert warning.startswith(f"{100.0 * (hu == -1500).mean():.3g} % of the voxels are at -1500 HU")
 
 
-def test_noise_below_air_is_no_padding(tmp_path):
+def test_noise_far_below_air_is_not_taken_for_padding(tmp_path):
     hu = np.where(make_scan() < -900, np.random.default_rng(3).normal(-1000, 90, SHAPE).round(), make_scan())
     assert hu.min() < -1200
-    assert told(write_hu(tmp_path, hu)) == []
+    assert read_warnings(write_hu(tmp_path, hu)) == []
 
 
 # --- saturated ---
@@ -154,12 +158,18 @@ def test_noise_below_air_is_no_padding(tmp_path):
     ],
     ids=["signed HU", "another intercept", "14 bits"],
 )
-def test_the_ceiling_of_12_bits_is_one_however_the_values_are_stored(tmp_path, plan):
+def test_metal_at_3071_hu_is_warned_of_as_saturated_however_it_is_stored(tmp_path, plan):
     hu = make_scan()
-    hu[:, 23:25, 23:25] = 3071
-    assert told(write_hu(tmp_path, hu, plan)) == [
+    hu[:, 23:25, 23:25] = 3071  # 6 slices of 2 x 2 voxels
+    assert read_warnings(write_hu(tmp_path, hu, plan)) == [
         "24 voxels are at 3071 HU, the ceiling of 12 bits: metal is saturated, its surface displaced"
     ]
+
+
+def write_scan_with_24_voxels_at(folder, top, bits, signed):
+    hu = np.clip(make_scan(), -1024, top - 1)
+    hu[:, 23:25, 23:25] = top
+    return write_hu(folder, hu, Plan(shape=SHAPE, bits_stored=bits, signed=signed))
 
 
 @pytest.mark.parametrize(
@@ -170,94 +180,98 @@ def test_the_ceiling_of_12_bits_is_one_however_the_values_are_stored(tmp_path, p
         (12, False, 3071, "ceiling of 12 bits: metal is saturated"),
         (12, True, 1023, "ceiling of 12 bits: metal or dense bone is cut off"),
         (14, False, 15359, "ceiling of 14 bits: metal is saturated"),
-        (16, True, 3000, None),
-        (14, False, 3072, None),
     ],
 )
-def test_the_top_of_the_stored_bits_is_a_ceiling(tmp_path, bits, signed, top, words):
-    hu = np.clip(make_scan(), -1024, top - 1)
-    hu[:, 23:25, 23:25] = top
-    warnings = told(write_hu(tmp_path, hu, Plan(shape=SHAPE, bits_stored=bits, signed=signed)))
-    assert len(warnings) == (words is not None)
-    if words is not None:
-        assert warnings[0].startswith(f"24 voxels are at {top} HU, the ") and words in warnings[0]
+def test_voxels_at_the_largest_value_of_the_stored_bits_are_warned_of(tmp_path, bits, signed, top, words):
+    (warning,) = read_warnings(write_scan_with_24_voxels_at(tmp_path, top, bits, signed))
+    assert warning.startswith(f"24 voxels are at {top} HU, the ")
+    assert words in warning
 
 
-def test_values_that_go_on_beyond_12_bits_mean_that_3071_is_no_ceiling(tmp_path):
+@pytest.mark.parametrize(("bits", "signed", "top"), [(16, True, 3000), (14, False, 3072)])
+def test_voxels_at_another_value_are_not_warned_of_as_saturated(tmp_path, bits, signed, top):
+    assert read_warnings(write_scan_with_24_voxels_at(tmp_path, top, bits, signed)) == []
+
+
+def test_scan_whose_values_go_on_beyond_3071_hu_is_not_warned_of_as_saturated(tmp_path):
     hu = make_scan()
     hu[:, 20:28, 20:28] = 3040 + np.arange(SHAPE[0] * 64).reshape(-1, 8, 8) % 64  # six voxels at each value
-    hu[:, 20:28, 20] = 3072  # and a crowd beside
-    assert told(write_hu(tmp_path, hu)) == []
+    hu[:, 20:28, 20] = 3072  # and 48 beside
+    assert read_warnings(write_hu(tmp_path, hu)) == []
 
 
-def test_a_ceiling_with_a_few_values_beyond_is_one(tmp_path):
+def test_metal_at_3071_hu_with_a_few_values_above_is_warned_of_with_both_counts(tmp_path):
     hu = make_scan()
     hu[:, 18:26, 18:26] = np.random.default_rng(6).integers(2600, 3071, (SHAPE[0], 8, 8))
-    hu[1:5, 20:24, 20:28] = 3071
-    hu[5, 20, 18:22] = hu[0, 20:25, 18:23] = 3500
-    warnings = told(write_hu(tmp_path, hu))
-    assert [text.split(":")[0] for text in warnings] == [
+    hu[1:5, 20:24, 20:28] = 3071  # 4 x 4 x 8 voxels
+    hu[5, 20, 18:22] = hu[0, 20:25, 18:23] = 3500  # 4 and 5 x 5 voxels
+    (warning,) = read_warnings(write_hu(tmp_path, hu))
+    assert warning.split(":")[0] == (
         "128 voxels are at 3071 HU, the ceiling of 12 bits and 29 are above it, at most at 3500 HU"
-    ]
+    )
 
 
-def test_each_slice_has_its_own_ceiling(tmp_path):
+def test_saturated_voxels_of_slices_with_another_intercept_are_warned_of_apart(tmp_path):
     plan = Plan(shape=SHAPE, bits_stored=12, signed=False)
 
     def change(ds, k):
         stored = (make_scan()[k] + 1024).astype(np.int16)
-        stored[20:24, 20:24] = 4095
+        stored[20:24, 20:24] = 4095  # 16 voxels in each of 6 slices
         ds.PixelData = stored.tobytes()
         ds.RescaleIntercept = -1024 + 100 * (k == 2)
 
     write_series(tmp_path, plan, change)
-    of_its_own, *ceilings = [text.split(",")[0] for text in told(tmp_path)]
-    assert of_its_own.startswith("RescaleIntercept is not -1024 as in the other slices")
-    assert ceilings == ["80 voxels are at 3071 HU", "16 voxels are at 3171 HU"]
+    about_intercept, *about_ceilings = read_warnings(tmp_path)
+    assert about_intercept.startswith("RescaleIntercept is not -1024 as in the other slices")
+    assert [warning.split(",")[0] for warning in about_ceilings] == [
+        "80 voxels are at 3071 HU",
+        "16 voxels are at 3171 HU",
+    ]
 
 
 # --- constant ---
-def test_a_constant_volume_is_refused(tmp_path):
-    with refused(RefusedInputError, 13824, 40):
+def test_volume_of_one_value_is_refused(tmp_path):
+    with refused(RefusedInputError, 6 * 48 * 48, 40):
         read_volume(write_hu(tmp_path, np.full(SHAPE, 40.0)))
 
 
-def test_nothing_but_padding_is_refused(tmp_path):
-    folder = write_hu(tmp_path, np.full(SHAPE, -1024.0), PixelPaddingValue=0)
-    with refused(RefusedInputError, 13824, "voxels"):
+def test_volume_of_declared_padding_alone_is_refused(tmp_path):
+    stored_padding = 0  # -1024 HU
+    folder = write_hu(tmp_path, np.full(SHAPE, -1024.0), PixelPaddingValue=stored_padding)
+    with refused(RefusedInputError, 6 * 48 * 48, "voxels"):
         read_volume(folder)
 
 
-def test_volume_of_two_values_raises_no_alarm(tmp_path):
+def test_volume_of_two_values_has_no_warning(tmp_path):
     hu = np.full(SHAPE, 40.0)
     hu[3, 5, 5] = 41
-    assert told(write_hu(tmp_path, hu)) == []
+    assert read_warnings(write_hu(tmp_path, hu)) == []
 
 
 # --- no false alarms ---
-def test_a_small_volume_has_no_shares(tmp_path):
+def test_padding_of_a_volume_of_210_voxels_is_not_warned_of(tmp_path):
     hu = np.where(np.arange(210).reshape(7, 5, 6) % 3 == 0, -2000.0, 40.0)
-    assert told(write_hu(tmp_path, hu)) == []
+    assert read_warnings(write_hu(tmp_path, hu)) == []
 
 
-def test_files_of_other_scanners_raise_no_alarm():
-    assert warn_of(Path(pydicom.data.get_testdata_file("CT_small.dcm", download=False))) == []
+def test_ct_of_another_scanner_has_no_warning_of_its_voxels():
+    assert warnings_of_voxels(Path(pydicom.data.get_testdata_file("CT_small.dcm", download=False))) == []
 
 
-def test_padding_that_a_scanner_does_not_declare_is_told():
-    said = warn_of(Path(pydicom.data.get_testdata_file("J2K_pixelrep_mismatch.dcm", download=False)))
-    assert len(said) == 1 and said[0].startswith("21.5 % of the voxels are at -2000 HU")
+def test_padding_that_a_scanner_does_not_declare_is_warned_of():
+    (warning,) = warnings_of_voxels(Path(pydicom.data.get_testdata_file("J2K_pixelrep_mismatch.dcm", download=False)))
+    assert warning.startswith("21.5 % of the voxels are at -2000 HU")
 
 
 @pytest.mark.release
 @pytest.mark.parametrize(
     "folder", ["lumbar_4p25mm", "thoracic_0p8mm", "head_tilt_gaps", "thoracolumbar_labels/ct_2mm_jpeg2000"]
 )
-def test_real_scans_raise_no_alarm(real_data, folder):
-    assert warn_of(real_data / folder) == []
+def test_real_scan_has_no_warning_of_its_voxels(real_data, folder):
+    assert warnings_of_voxels(real_data / folder) == []
 
 
-def warn_of(path):
+def warnings_of_voxels(path):
     """Warnings of the voxels of the CT series at a path, whatever its geometry."""
     series = next(one for one in group_series(scan_path(path)) if one.stack is not None and one.kind != "other")
     voxels, facts = read_voxels(series.stack.slices)
