@@ -277,6 +277,7 @@ def test_lost_sign_fails_with_its_range_and_the_right_pixel_representation(read_
     volume, _, wrong, words = read_without_sign
     gate = value_gates_of(volume.report)["stored_sign"]
     assert gate["ok"] is False
+    assert gate["measured"] >= 50  # pairs of neighbours that are a whole range apart
     assert words in gate["text"]
     assert f"PixelRepresentation is {wrong}" in gate["text"]
     assert f"write the files anew with PixelRepresentation {1 - wrong}" in gate["text"]
