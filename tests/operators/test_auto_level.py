@@ -41,24 +41,38 @@ def boxed(volume: clrecon.Volume) -> clrecon.LabelMap:
 
 
 @pytest.mark.first_device
-@pytest.mark.parametrize("name", TAKERS)
-def test_auto_is_the_measured_level_and_the_report_says_why(name: str, volume: clrecon.Volume, device: Any) -> None:
-    choice = clrecon.choose_iso_value(volume)
-    auto, given = (TAKERS[name](volume, level, device) for level in ("auto", choice.iso_value))
+@pytest.mark.parametrize("taker", TAKERS)
+def test_auto_is_the_level_that_choose_iso_value_measures(taker: str, volume: clrecon.Volume, device: Any) -> None:
+    measured = clrecon.choose_iso_value(volume).iso_value
+    auto, given = (TAKERS[taker](volume, level, device) for level in ("auto", measured))
     if isinstance(auto, clrecon.Mesh):
         assert_same(auto, given)
     elif isinstance(auto, clrecon.PointCloud):
         assert np.array_equal(auto.points, given.points)
     else:
         assert np.array_equal(auto, given)
-    said, without = (made.report["solid"] if name == "filled" else made.report for made in (auto, given))
-    assert said["iso_value_reason"] == choice.reason and "iso_value_reason" not in without
-    assert said["iso_value_choice"]["bone_hu"] == choice.bone_hu
 
 
-def test_auto_is_refused_without_a_measure_and_no_other_word_is_a_level(device: Any) -> None:
-    flat = clrecon.Volume(np.full((8, 8, 8), 40, np.int16), np.eye(4))
+@pytest.mark.first_device
+@pytest.mark.parametrize("taker", TAKERS)
+def test_report_says_why_auto_chose_its_level(taker: str, volume: clrecon.Volume, device: Any) -> None:
+    choice = clrecon.choose_iso_value(volume)
+    auto, given = (TAKERS[taker](volume, level, device).report for level in ("auto", choice.iso_value))
+    if taker == "filled":
+        auto, given = auto["solid"], given["solid"]
+    assert auto["iso_value_reason"] == choice.reason
+    assert auto["iso_value_choice"]["bone_hu"] == choice.bone_hu
+    assert "iso_value_reason" not in given
+
+
+SOFT_TISSUE = clrecon.Volume(np.full((8, 8, 8), 40, np.int16), np.eye(4))
+
+
+def test_auto_is_refused_in_a_volume_without_bone(device: Any) -> None:
     with refused(NoSurfaceError, "bone", 40, 8):
-        clrecon.extract_isosurface(flat, "auto", device=device)
+        clrecon.extract_isosurface(SOFT_TISSUE, "auto", device=device)
+
+
+def test_a_word_other_than_auto_is_refused_as_a_level(device: Any) -> None:
     with refused(UsageError, "bone"):
-        clrecon.extract_isosurface(flat, "bone", device=device)  # type: ignore[arg-type]
+        clrecon.extract_isosurface(SOFT_TISSUE, "bone", device=device)  # type: ignore[arg-type]

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from refusals import refused
 from sample_meshes import sphere
 from variants import daily_rows
@@ -30,14 +31,16 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts" / "proof"
 
 from kernel_mutations import Mutation  # noqa: E402
 
+pytestmark = pytest.mark.fault_row(57)
+
 
 @pytest.mark.every_device
-def test_row_57_a_device_that_computes_rightly_passes(device: Device) -> None:
+def test_a_device_that_computes_rightly_passes(device: Device) -> None:
     assert check_ball(device) == ""
 
 
 @pytest.mark.parametrize(
-    ("kernel", "name", "words"),
+    ("kernel", "mutation_name", "fault"),
     daily_rows(
         1,
         [
@@ -47,21 +50,30 @@ def test_row_57_a_device_that_computes_rightly_passes(device: Device) -> None:
         ],
     ),
 )
-def test_row_57_a_device_that_computes_wrongly_does_not(
-    device: Device, monkeypatch: pytest.MonkeyPatch, kernel: str, name: str, words: str
+def test_a_device_that_computes_the_surface_of_a_ball_wrongly_fails_with_the_fault(
+    device: Device, monkeypatch: pytest.MonkeyPatch, kernel: str, mutation_name: str, fault: str
 ) -> None:
     file = "surface/cells.cl" if kernel == "emit_triangles" else "surface/marching_cubes.cl"
-    mutation, original = Mutation(file, kernel, name), program.read_kernel_source
-    source = mutation.source()
-    monkeypatch.setattr(program, "read_kernel_source", lambda file: source if file == mutation.file else original(file))
+    wrong_source, read_source = Mutation(file, kernel, mutation_name).source(), program.read_kernel_source
+    monkeypatch.setattr(
+        program, "read_kernel_source", lambda asked: wrong_source if asked == file else read_source(asked)
+    )
     monkeypatch.setattr(device, "programs", {})
-    assert words in check_ball(device)
+    assert fault in check_ball(device)
 
 
-def test_row_57_a_vertex_without_triangles_is_none_of_a_ball() -> None:
+def ball_with_normals() -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     vertices, triangles = sphere(CENTRE, RADIUS, 5)
-    normals = (vertices - CENTRE) / RADIUS
+    return vertices, triangles, (vertices - CENTRE) / RADIUS
+
+
+def test_mesh_of_a_ball_has_no_fault() -> None:
+    vertices, triangles, normals = ball_with_normals()
     assert _compare_mesh(Mesh(vertices, triangles, normals)) == ""
+
+
+def test_mesh_of_a_ball_with_a_vertex_of_no_triangle_has_a_fault() -> None:
+    vertices, triangles, normals = ball_with_normals()
     more = Mesh(np.concatenate([vertices, vertices[:1]]), triangles, np.concatenate([normals, normals[:1]]))
     assert _compare_mesh(more) == f"the surface of a ball has 0 open edges and {len(triangles):,} triangles"
 
@@ -97,136 +109,181 @@ def checked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
     select.register(operators._check_device, "-m", "clrecon.operators.first_use")
 
 
-def test_row_57_the_check_runs_once_for_a_driver_a_device_and_a_version(
-    checked: list[Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first: Any = FakeDevice()
+def fake_device(**changed: Any) -> Any:
+    return FakeDevice(**changed)
+
+
+def test_a_device_is_checked_once_for_all_processes(checked: list[Any]) -> None:
+    first, of_another_process = fake_device(), fake_device()
     assert select.find_fault(first) == select.find_fault(first) == ""
+    assert select.find_fault(of_another_process) == ""
     assert checked == [first]
-    another_process: Any = FakeDevice()
-    assert select.find_fault(another_process) == "" and len(checked) == 1
-    for changed in ({"driver": "2.1"}, {"name": "M"}, {"platform_version": "1.1"}):
-        other: Any = FakeDevice(**changed)
-        assert select.find_fault(other) == "" and checked[-1] is other
+
+
+@pytest.mark.parametrize("changed", [{"driver": "2.1"}, {"name": "M"}, {"platform_version": "1.1"}])
+def test_another_driver_device_or_platform_is_checked_anew(checked: list[Any], changed: dict[str, str]) -> None:
+    first, other = fake_device(), fake_device(**changed)
+    select.find_fault(first)
+    select.find_fault(other)
+    assert checked == [first, other]
+
+
+def test_another_version_of_the_package_checks_anew(checked: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    first, later = fake_device(), fake_device()
+    select.find_fault(first)
     monkeypatch.setattr(select, "package_version", lambda: "0.0")
-    assert select.find_fault(FakeDevice()) == "" and len(checked) == 5  # type: ignore[arg-type]
+    select.find_fault(later)
+    assert checked == [first, later]
 
 
-def test_row_57_failed_check_is_not_remembered_for_the_next_process(checked: list[Any]) -> None:
-    for count in (1, 2):
-        wrong: Any = FakeDevice(name="wrong")
+def test_a_failed_check_is_made_again_in_the_next_process(checked: list[Any]) -> None:
+    of_first_process, of_next_process = fake_device(name="wrong"), fake_device(name="wrong")
+    for wrong in (of_first_process, of_next_process):
         assert select.find_fault(wrong) == select.find_fault(wrong) == "wrong sums"
-        assert len(checked) == count
+    assert checked == [of_first_process, of_next_process]
 
 
 @pytest.fixture
-def kept(checked: list[Any]) -> dict[str, bytes]:
-    """What the files say."""
+def cached_files(checked: list[Any]) -> dict[str, bytes]:
+    """What the files of the cache hold, by their keys."""
     return select.read_binary.__self__  # type: ignore[attr-defined, no-any-return]
 
 
-def test_row_57_what_was_found_is_told_without_a_check(checked: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, words in (("wrong", "wrong sums"), ("right", "")):
-        device: Any = FakeDevice(name=name)
-        assert select.remembered_fault(device) == ""
-        select.find_fault(device)
-        assert select.remembered_fault(FakeDevice(name=name)) == words  # type: ignore[arg-type]
-    assert len(checked) == 2
-    assert select.remembered_fault(FakeDevice(name="wrong", is_simulator=True)) == ""  # type: ignore[arg-type]
-    monkeypatch.setenv(select.VARIABLE, "off")
-    assert select.remembered_fault(FakeDevice(name="wrong")) == ""  # type: ignore[arg-type]
+@pytest.mark.parametrize(("name", "fault"), [("wrong", "wrong sums"), ("right", "")])
+def test_what_a_check_found_is_remembered_without_another(checked: list[Any], name: str, fault: str) -> None:
+    first = fake_device(name=name)
+    assert select.remembered_fault(first) == ""  # nothing is known yet
+    select.find_fault(first)
+    assert select.remembered_fault(fake_device(name=name)) == fault
+    assert checked == [first]
 
 
-def test_row_57_an_interrupted_check_says_nothing(
-    checked: list[Any], kept: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+def test_no_fault_of_a_simulator_is_remembered(checked: list[Any]) -> None:
+    select.find_fault(fake_device(name="wrong"))
+    assert select.remembered_fault(fake_device(name="wrong", is_simulator=True)) == ""
+
+
+def test_no_fault_is_remembered_where_the_check_is_switched_off(
+    checked: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    select.find_fault(fake_device(name="wrong"))
+    monkeypatch.setenv(select.VARIABLE, "off")
+    assert select.remembered_fault(fake_device(name="wrong")) == ""
+
+
+def test_an_interrupted_check_leaves_no_fault(checked: list[Any], cached_files: dict[str, bytes]) -> None:
     def interrupt(device: Any) -> str:
-        assert list(kept.values()) == [select._BEGUN]
+        assert list(cached_files.values()) == [select._BEGUN]
         raise KeyboardInterrupt
 
     select.register(interrupt)
     with pytest.raises(KeyboardInterrupt):
-        select.find_fault(FakeDevice())  # type: ignore[arg-type]
-    assert list(kept.values()) == [b""] and select.remembered_fault(FakeDevice()) == ""  # type: ignore[arg-type]
+        select.find_fault(fake_device())
+    assert list(cached_files.values()) == [b""]
+    assert select.remembered_fault(fake_device()) == ""
+
+
+ENDED = "a process ended while it checked this device"
 
 
 @pytest.mark.parametrize(
-    ("code", "fault", "remembered"),
+    ("kept_by_last_process", "fault"),
+    [(select._BEGUN, ENDED), (select._CRASHED + b"earlier", "earlier")],
+    ids=["begun", "crashed"],
+)
+def test_fault_of_a_check_that_a_process_did_not_end_is_remembered(
+    checked: list[Any], cached_files: dict[str, bytes], kept_by_last_process: bytes, fault: str
+) -> None:
+    cached_files[select._key(fake_device())] = kept_by_last_process
+    assert select.remembered_fault(fake_device()) == fault
+
+
+@pytest.mark.parametrize(
+    "kept_by_last_process", [select._BEGUN, select._CRASHED + b"earlier"], ids=["begun", "crashed"]
+)
+@pytest.mark.parametrize(
+    ("code_of_child", "fault", "mark"),
     [
         ("import os; os.abort()", "its driver ends the process (SIGABRT)", select._CRASHED),
         ("raise SystemExit(3)", "its driver ends the process (exit code 3)", select._CRASHED),
         ("print('of a driver'); print('\"wrong sums\"')", "wrong sums", select._WRONG),
         ("print('\"\"')", "", select._PASSED),
     ],
+    ids=["aborts", "exits", "finds a fault", "finds none"],
 )
-def test_row_57_where_a_process_died_in_the_check_a_child_makes_it(
+def test_a_check_that_a_process_did_not_end_is_made_again_by_a_child(
     checked: list[Any],
-    kept: dict[str, bytes],
-    monkeypatch: pytest.MonkeyPatch,
-    code: str,
+    cached_files: dict[str, bytes],
+    kept_by_last_process: bytes,
+    code_of_child: str,
     fault: str,
-    remembered: bytes,
+    mark: bytes,
 ) -> None:
-    select.register(check_ball, "-c", code)
-    key = select._key(FakeDevice())  # type: ignore[arg-type]
-    for before in (select._BEGUN, select._CRASHED + b"earlier"):
-        kept[key] = before
-        expected = {select._BEGUN: "a process ended while it checked this device"}.get(before, "earlier")
-        assert select.remembered_fault(FakeDevice()) == expected  # type: ignore[arg-type]
-        device: Any = FakeDevice(index=0)
-        assert select.find_fault(device) == fault
-        assert kept[key] == remembered + (fault.encode() if fault else b"")
-    assert checked == []
+    select.register(check_ball, "-c", code_of_child)
+    key = select._key(fake_device())
+    cached_files[key] = kept_by_last_process
+    assert select.find_fault(fake_device(index=0)) == fault
+    assert cached_files[key] == mark + fault.encode()
+    assert checked == []  # not by this process
+
+
+def test_a_check_that_a_process_did_not_end_stays_a_fault_where_no_child_can_be_started(
+    checked: list[Any], cached_files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cached_files[select._key(fake_device())] = select._BEGUN
     monkeypatch.setattr(sys, "executable", "")
-    kept[key] = select._BEGUN
-    assert select.find_fault(FakeDevice(index=0)) == "a process ended while it checked this device"  # type: ignore[arg-type]
+    assert select.find_fault(fake_device(index=0)) == ENDED
 
 
-CRASH = """
+CRASH_IN_THE_CHECK = """
 import os, sys
 import clrecon.operators, clrecon.operators.first_use
 from clrecon.opencl import choose_device
 clrecon.operators.first_use.check_ball = lambda device: os.abort()
 choose_device(int(sys.argv[1]))
 """
+TAKE_THE_DEVICE = "import sys; import clrecon; clrecon.device(int(sys.argv[1]))"
 
 
 @pytest.mark.release
 @pytest.mark.seconds
-def test_row_57_a_crash_in_the_check_becomes_words_in_the_next_process(device: Device, tmp_path: Path) -> None:
+def test_a_crash_in_the_check_is_listed_as_a_fault_until_a_process_finds_none(device: Device, tmp_path: Path) -> None:
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
     environment.pop(select.VARIABLE, None)
 
-    def devices() -> dict[str, Any]:
+    def listed_fault() -> str:
         line = [sys.executable, "-m", "clrecon.cli.main", "devices", "--json"]
         done = subprocess.run(line, env=environment, capture_output=True, text=True, check=True)
-        return json.loads(done.stdout)["devices"][device.index]
+        return str(json.loads(done.stdout)["devices"][device.index]["fault"])
 
-    assert devices()["fault"] == ""
-    done = subprocess.run([sys.executable, "-c", CRASH, str(device.index)], env=environment, check=False)
-    assert done.returncode == -signal.SIGABRT
-    assert devices()["fault"] == "a process ended while it checked this device"
-    take = "import sys; import clrecon; clrecon.device(int(sys.argv[1]))"
-    subprocess.run([sys.executable, "-c", take, str(device.index)], env=environment, check=True)
-    assert devices()["fault"] == ""  # the child has found nothing wrong
+    def run_code(code: str) -> int:
+        return subprocess.run([sys.executable, "-c", code, str(device.index)], env=environment, check=False).returncode
+
+    assert listed_fault() == ""
+    assert run_code(CRASH_IN_THE_CHECK) == -signal.SIGABRT
+    assert listed_fault() == ENDED
+    assert run_code(TAKE_THE_DEVICE) == 0
+    assert listed_fault() == ""
 
 
-def test_row_57_simulators_and_those_who_say_so_are_not_checked(
+def test_a_simulator_is_not_checked(checked: list[Any]) -> None:
+    assert select.find_fault(fake_device(is_simulator=True)) == ""
+    assert checked == []
+
+
+def test_a_device_is_not_checked_but_remarked_where_the_check_is_switched_off(
     checked: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    simulator: Any = FakeDevice(is_simulator=True)
-    assert select.find_fault(simulator) == ""
     monkeypatch.setenv(select.VARIABLE, "off")
-    wrong: Any = FakeDevice(name="wrong")
-    assert select.find_fault(wrong) == "" and checked == []
+    wrong = fake_device(name="wrong")
+    assert select.find_fault(wrong) == ""
+    assert checked == []
     assert wrong.remarks == [
         "N (P) was not checked at its first use (CLRECON_DEVICE_CHECK=off): its results may be wrong"
     ]
 
 
-def test_row_57_operators_refuse_a_device_that_computes_wrongly(
-    device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_operators_refuse_a_device_that_computes_wrongly(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device, "fault", "wrong sums")
     volume = Volume(np.arange(24, dtype=np.int16).reshape(2, 3, 4), np.eye(4))
     with refused(DeviceError, "computes", "sums"):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from refusals import refused
+from tolerances import FLOAT64_PLACE_MM
 from uneven_volume import HEIGHTS, SIDEWAYS, uneven
 
 from clrecon.errors import DeviceMemoryError, UsageError
@@ -56,35 +57,50 @@ pytestmark = pytest.mark.unit
 NOWHERE = np.zeros(3)
 
 
+def nodes_of_bricks(along_x: int, along_y: int = 2, along_z: int = 3) -> Nodes:
+    return Nodes(NOWHERE.astype(np.float32), NOWHERE, np.float32(1.0), (along_x, along_y, along_z))
+
+
 @pytest.mark.parametrize(("bricks", "words"), [(1, 1), (3, 1), (4, 1), (5, 2), (8, 2), (9, 3), (132, 33), (133, 34)])
 def test_words_of_a_field_hold_the_nodes_of_whole_bricks(bricks, words):
-    nodes = Nodes(NOWHERE.astype(np.float32), NOWHERE, np.float32(1.0), (bricks, 2, 3))
+    """A brick has 8 x 4 x 4 nodes, and a word 32 of a row."""
+    nodes = nodes_of_bricks(bricks)
     assert BRICK == (8, 4, 4)
-    assert nodes.shape == (8 * bricks, 8, 12)
-    assert (nodes.words, nodes.rows, nodes.mask_bytes) == (words, 96, 384 * words)
-    assert nodes.brick_words == -(-bricks // 32)
-    assert nodes.layer_bytes == 4 * 8 * bricks * 8 * 4
+    assert nodes.shape == (8 * bricks, 4 * 2, 4 * 3)
+    rows = 4 * 2 * 4 * 3
+    assert (nodes.words, nodes.rows, nodes.mask_bytes) == (words, rows, 4 * words * rows)
+
+
+@pytest.mark.parametrize(("bricks", "words"), [(1, 1), (32, 1), (33, 2), (132, 5)])
+def test_words_of_bricks_hold_32_each(bricks, words):
+    assert nodes_of_bricks(bricks).brick_words == words
+
+
+def test_layer_of_bricks_takes_four_bytes_a_node():
+    assert nodes_of_bricks(5, 2).layer_bytes == 4 * (8 * 5) * (4 * 2) * 4
 
 
 @pytest.mark.parametrize(("cells", "words"), [(1, 1), (32, 1), (33, 2), (64, 2), (1056, 33), (1057, 34)])
 def test_words_of_a_grid_hold_32_cells_each(cells, words):
-    plan = GridPlan(np.zeros((1, 3), np.float32), NOWHERE, NOWHERE.astype(np.float32), np.float32(1.0), (cells, 3, 5))
-    assert (plan.words, plan.total_words) == (words, 15 * words)
+    shape = (cells, 3, 5)
+    plan = GridPlan(np.zeros((1, 3), np.float32), NOWHERE, NOWHERE.astype(np.float32), np.float32(1.0), shape)
+    assert (plan.words, plan.total_words) == (words, 3 * 5 * words)
 
 
-def test_grid_with_a_cell_for_each_point_needs_the_bytes_of_its_buffers():
+@pytest.mark.parametrize("points", [1, 1000])
+def test_grid_needs_the_bytes_of_its_buffers(points):
     """The order of the points stays beside their sorted coordinates and the first point of each cell."""
-    for n in (1, 1000):
-        points = np.zeros((n, 3), np.float32)
-        plan = GridPlan(points, NOWHERE, NOWHERE.astype(np.float32), np.float32(1.0), (33, 3, 5))
-        gathering = 4 * n + 4 * n + 3 * 4 * (n + PADDING) + 4 * (n + 1)
-        sorting = 4 * n + sort_bytes(device(1), n, n.bit_length())
-        assert plan.needs(device(1)) == {
-            "points": 12 * n,
-            "sorted points": max(gathering, sorting),
-            "cells of the grid": 8 * 30,
-        }
-    assert gathering > sorting
+    shape = (33, 3, 5)  # two words a row
+    places = np.zeros((points, 3), np.float32)
+    plan = GridPlan(places, NOWHERE, NOWHERE.astype(np.float32), np.float32(1.0), shape)
+    cells, order, coordinates, starts = 4 * points, 4 * points, 3 * 4 * (points + PADDING), 4 * (points + 1)
+    gathering = cells + order + coordinates + starts
+    sorting = order + sort_bytes(device(1), points, points.bit_length())
+    assert plan.needs(device(1)) == {
+        "points": 3 * 4 * points,
+        "sorted points": max(gathering, sorting),
+        "cells of the grid": 2 * 4 * (2 * 3 * 5),  # marks, and points before each word
+    }
 
 
 def sample_grid(ni: int, nj: int = 4, nk: int = 5) -> SampleGrid:
@@ -96,44 +112,67 @@ def sample_grid(ni: int, nj: int = 4, nk: int = 5) -> SampleGrid:
     ("ni", "words", "shift"),
     [(2, 1, 5), (32, 1, 5), (33, 2, 5), (1024, 32, 5), (1025, 33, 6), (2048, 64, 6), (2049, 65, 7)],
 )
-def test_words_of_samples_hold_32_each(ni, words, shift):
+def test_words_of_samples_hold_32_each_and_are_flagged_by_a_power_of_two_of_words(ni, words, shift):
+    """Of 2^shift words, at least 32, each has a bit in the flags of its row."""
     grid = sample_grid(ni)
-    assert (grid.words, grid.row_shift, grid.flag_words) == (words, shift, 2 ** (shift - 5))
+    assert words <= 2**shift
+    assert (grid.words, grid.row_shift, grid.flag_words) == (words, shift, 2**shift // 32)
 
 
-def test_slab_counts_its_slices_rows_and_bytes():
-    grid = sample_grid(40, 7, 12)
-    for first, end, classified, counted in ((0, 12, 12, 12), (3, 6, 5, 4), (3, 11, 9, 9), (9, 10, 3, 2)):
-        slab = Slab(grid, first, end)
-        assert (slab.slices, slab.rows, slab.is_whole) == (end - first, 7 * (end - first), end - first == 12)
-        assert (slab.mask_slices, slab.mask_rows, slab.counted_rows) == (classified, 7 * classified, 7 * counted)
-        assert slab.scratch() == {
-            "inside mask": 4 * 7 * classified * 2,
-            "word counts": 4 * 7 * counted * 2,
-            "row extents": 4 * 7 * classified,
-            "row counts": 12 * 7 * counted,
-            "word flags": 4 * 7 * counted,
-            "active words": 4 * 7 * (end - first) * 2,
-        }
-        assert all(type(size) is int for size in slab.scratch().values())
+@pytest.fixture(
+    params=[(0, 12, 12, 12), (3, 6, 5, 4), (3, 11, 9, 9), (9, 10, 3, 2)], ids=["all", "3 to 5", "3 to 10", "9"]
+)
+def slab_of_twelve(request) -> tuple[Slab, int, int, int]:
+    """A slab of 12 slices of 7 rows and 40 columns; its slices, those that are classified, and those counted."""
+    first, end, classified, counted = request.param
+    return Slab(sample_grid(40, nj=7, nk=12), first, end), end - first, classified, counted
 
 
-def test_masks_and_searches_need_the_bytes_of_their_buffers():
-    assert mask_bytes((64, 3, 5)) == {"mask of the voxels": 4 * 2 * 15, "row extents": 60}
-    assert mask_bytes((65, 3, 5), pad=2) == {"mask of the voxels": 4 * 5 * 15, "row extents": 60}
-    for reach, pad in ((0, 0), (1, 1), (32, 1), (33, 2)):
-        assert pad_for(SimpleNamespace(reach=reach)) == pad  # type: ignore[arg-type]
+def test_slab_has_the_rows_of_its_slices_and_of_their_neighbours(slab_of_twelve):
+    slab, slices, classified, counted = slab_of_twelve
+    assert (slab.slices, slab.rows, slab.is_whole) == (slices, 7 * slices, slices == 12)
+    assert (slab.mask_slices, slab.mask_rows, slab.counted_rows) == (classified, 7 * classified, 7 * counted)
+
+
+def test_slab_needs_the_bytes_of_its_buffers(slab_of_twelve):
+    slab, slices, classified, counted = slab_of_twelve
+    words = 2  # of 40 columns
+    assert slab.scratch() == {
+        "inside mask": 4 * 7 * classified * words,
+        "word counts": 4 * 7 * counted * words,
+        "row extents": 4 * 7 * classified,
+        "row counts": 3 * 4 * 7 * counted,
+        "word flags": 4 * 7 * counted,
+        "active words": 4 * 7 * slices * words,
+    }
+    assert {type(size) for size in slab.scratch().values()} == {int}
+
+
+@pytest.mark.parametrize(("columns", "pad", "words"), [(64, 0, 2), (65, 2, 3 + 2)])
+def test_mask_needs_the_bytes_of_its_words_and_row_extents(columns, pad, words):
+    rows = 3 * 5
+    assert mask_bytes((columns, 3, 5), pad=pad) == {"mask of the voxels": 4 * words * rows, "row extents": 4 * rows}
+
+
+@pytest.mark.parametrize(("reach", "pad"), [(0, 0), (1, 1), (32, 1), (33, 2)])
+def test_mask_is_padded_by_the_words_that_a_stencil_reaches(reach, pad):
+    assert pad_for(SimpleNamespace(reach=reach)) == pad  # type: ignore[arg-type]
+
+
+def test_search_for_clusters_needs_the_bytes_of_its_mask_counts_and_stencil():
     stencil: Any = SimpleNamespace(rows=np.zeros(7, np.int32), tables=np.zeros(11, np.int32))
-    assert search_bytes(mask_bytes((64, 3, 5)), stencil, 15) == {
-        **mask_bytes((64, 3, 5)),
-        "mask of core voxels": 120,
-        "counts of rows": 180,
-        "stencil": 56 + 88,
+    rows, words = 3 * 5, 2
+    mask = mask_bytes((64, 3, 5))
+    assert search_bytes(mask, stencil, rows) == {
+        **mask,
+        "mask of core voxels": 4 * words * rows,
+        "counts of rows": 3 * 4 * rows,
+        "stencil": 2 * 4 * 7 + 2 * 4 * 11,
     }
 
 
 @pytest.mark.parametrize(("slices", "ends"), [(10, []), (5, [5, 10]), (4, [4, 8, 10])])
-def test_several_slabs_of_voxels_are_told(slices, ends):
+def test_progress_of_voxel_extraction_is_told_after_each_of_several_slabs(slices, ends):
     emission: Any = SimpleNamespace(volume=SimpleNamespace(shape_ijk=(4, 4, 10)), _next=0, _parts=[], marked=0, slabs=0)
     emission._one_slab = lambda first, end: ((None, []), 1)
     told: list[tuple] = []
@@ -142,24 +181,44 @@ def test_several_slabs_of_voxels_are_told(slices, ends):
     assert emission.marked == emission.slabs == max(len(ends), 1)
 
 
-def test_slab_of_voxels_needs_the_bytes_of_its_buffers():
-    emission: Any = SimpleNamespace(
+SLICE_OF_65_X_7 = 65 * 7 * 2  # bytes
+WORDS_OF_65 = 3
+
+
+def emission_of_20_slices(labels: Any = None, shell: bool = False) -> Any:
+    return SimpleNamespace(
         volume=SimpleNamespace(shape_ijk=(65, 7, 20)),
-        selection=SimpleNamespace(labels=None, shell=False),
-        resident=SimpleNamespace(slice_bytes=65 * 7 * 2),
+        selection=SimpleNamespace(labels=labels, shell=shell),
+        resident=SimpleNamespace(slice_bytes=SLICE_OF_65_X_7),
     )
-    inside = {"volume": 4 * 910, "masks": 4 * 4 * 7 * 3, "rows": 13 * 4 * 7}
-    assert VoxelEmission.needs(emission, 4) == inside
-    assert VoxelEmission.needs(emission, 4, 10) == {**inside, "points": 200}
-    emission.selection = SimpleNamespace(labels=np.zeros(0, np.uint16), shell=True)
-    assert VoxelEmission.needs(emission, 4) == {
-        "volume": 6 * 910,
-        "masks": 4 * 6 * 7 * 3 * 2,
-        "rows": 4 * 6 * 7 + 9 * 4 * 7,
-        "labels": 6 * 910,
+
+
+def test_slab_of_voxels_needs_the_bytes_of_its_buffers():
+    inside = {"volume": 4 * SLICE_OF_65_X_7, "masks": 4 * 4 * 7 * WORDS_OF_65, "rows": (4 + 9) * 4 * 7}
+    assert VoxelEmission.needs(emission_of_20_slices(), slices=4) == inside
+    assert VoxelEmission.needs(emission_of_20_slices(), slices=4, points=10) == {**inside, "points": 20 * 10}
+
+
+def test_slab_of_the_shell_of_a_label_needs_the_bytes_of_a_slice_more_at_either_end():
+    emission = emission_of_20_slices(labels=np.zeros(0, np.uint16), shell=True)
+    read = 4 + 2
+    assert VoxelEmission.needs(emission, slices=4) == {
+        "volume": read * SLICE_OF_65_X_7,
+        "masks": 2 * 4 * read * 7 * WORDS_OF_65,  # of the voxels, and of the shell
+        "rows": 4 * read * 7 + 9 * 4 * 7,
+        "labels": read * SLICE_OF_65_X_7,
     }
-    assert VoxelEmission.needs(emission, 19)["volume"] == 20 * 910
-    assert all(type(size) is int for size in VoxelEmission.needs(emission, 4).values())
+
+
+def test_slab_of_a_shell_reads_no_more_slices_than_the_volume_has():
+    emission = emission_of_20_slices(labels=np.zeros(0, np.uint16), shell=True)
+    assert VoxelEmission.needs(emission, slices=19)["volume"] == 20 * SLICE_OF_65_X_7
+
+
+def test_bytes_of_a_slab_of_voxels_are_python_integers():
+    """Those of numpy would overflow."""
+    emission = emission_of_20_slices(labels=np.zeros(0, np.uint16), shell=True)
+    assert {type(size) for size in VoxelEmission.needs(emission, slices=4).values()} == {int}
 
 
 def device(cores: int, has_long_items: bool = True) -> Any:
@@ -186,9 +245,14 @@ def test_chunks_of_a_sort_are_planned_by_cores_and_keys(planned_for, keys, chunk
     assert _plan_chunks(planned_for, keys) == chunks
 
 
-def test_digits_of_a_sort_share_the_bits_of_its_keys():
-    assert _plan_digits(RADIX_BITS) == [(0, RADIX_BITS)]
-    assert _plan_digits(2 * RADIX_BITS - 1) == [(0, RADIX_BITS - 1), (RADIX_BITS - 1, RADIX_BITS)]
+@pytest.mark.parametrize(
+    ("bits", "digits"),
+    [(RADIX_BITS, [(0, RADIX_BITS)]), (2 * RADIX_BITS - 1, [(0, RADIX_BITS - 1), (RADIX_BITS - 1, RADIX_BITS)])],
+    ids=["one digit", "two digits"],
+)
+def test_digits_of_a_sort_share_the_bits_of_its_keys(bits, digits):
+    """Each digit begins at a bit and has so many."""
+    assert _plan_digits(bits) == digits
 
 
 @pytest.mark.parametrize(
@@ -205,76 +269,116 @@ def test_bytes_of_a_sort_are_its_keys_a_pass_and_a_count_of_each_digit_a_chunk(k
     assert sort_bytes(device(1), keys, bits) == size
 
 
-def test_chunks_of_clusters_grow_with_the_cells_a_core():
-    def chunk(cells: int, cores: int, is_cpu: bool = True) -> int:
-        search: Any = SimpleNamespace(_is_cpu=is_cpu, _grid=SimpleNamespace(cells=cells), _device=device(cores))
-        return ClusterSearch._plan_chunk(search)
-
-    a_core = CHUNKS_A_CORE * CELLS_A_CHUNK
-    assert chunk(10**6, 2, is_cpu=False) == CELLS_A_CHUNK
-    assert (chunk(1, 4), chunk(4 * a_core, 4), chunk(4 * a_core + 1, 4)) == (32, CELLS_A_CHUNK, 2 * CELLS_A_CHUNK)
-    assert chunk(12 * a_core, 4) == 3 * CELLS_A_CHUNK
+CELLS_OF_FOUR_CORES = 4 * CHUNKS_A_CORE * CELLS_A_CHUNK
 
 
-def test_items_of_a_picture_are_those_of_its_tiles():
-    for size, tiles in (((TILE, TILE), 1), ((TILE + 1, TILE), 2), ((3 * TILE, 2 * TILE + 1), 9)):
-        picture: Any = SimpleNamespace(size=size)
-        picture.tiles = PictureBuffers.tiles.fget(picture)  # type: ignore[attr-defined]
-        assert picture.tiles == tiles
-        for queues, lanes in ((1, 1), (2, 8), (4, 1)):
-            items = PictureBuffers.items(picture, queues, lanes)
-            assert items == -(-tiles // queues) * queues * TILE * TILE // lanes
-            assert type(items) is int
-    assert PictureBuffers.needs((30, 20)) == ({"picture": 7200}, {"states of the rays": 19200})
+def plan_chunk(cells: int, is_cpu: bool) -> int:
+    """Cells of a chunk on a device of four cores."""
+    search: Any = SimpleNamespace(_is_cpu=is_cpu, _grid=SimpleNamespace(cells=cells), _device=device(4))
+    return ClusterSearch._plan_chunk(search)
 
 
-def test_the_table_of_colours_has_ten_bits_a_channel(monkeypatch):
+@pytest.mark.parametrize(
+    ("cells", "chunk"),
+    [
+        (1, 32),
+        (CELLS_OF_FOUR_CORES, CELLS_A_CHUNK),
+        (CELLS_OF_FOUR_CORES + 1, 2 * CELLS_A_CHUNK),
+        (3 * CELLS_OF_FOUR_CORES, 3 * CELLS_A_CHUNK),
+    ],
+    ids=["one cell", "whole chunks", "one cell more", "three times as many"],
+)
+def test_chunks_of_clusters_grow_with_the_cells_a_core_of_a_cpu(cells, chunk):
+    assert plan_chunk(cells, is_cpu=True) == chunk
+
+
+def test_chunks_of_clusters_are_of_one_size_on_a_gpu():
+    assert plan_chunk(10**6, is_cpu=False) == CELLS_A_CHUNK
+
+
+@pytest.mark.parametrize(("queues", "lanes"), [(1, 1), (2, 8), (4, 1)])
+@pytest.mark.parametrize(
+    ("size", "tiles"), [((TILE, TILE), 1), ((TILE + 1, TILE), 2), ((3 * TILE, 2 * TILE + 1), 3 * 3)]
+)
+def test_work_items_of_a_picture_are_those_of_its_tiles_shared_among_queues_and_lanes(size, tiles, queues, lanes):
+    picture: Any = SimpleNamespace(size=size)
+    picture.tiles = PictureBuffers.tiles.fget(picture)  # type: ignore[attr-defined]
+    assert picture.tiles == tiles
+    items = PictureBuffers.items(picture, queues, lanes)
+    tiles_a_queue = -(-tiles // queues)
+    assert items == tiles_a_queue * queues * TILE * TILE // lanes
+    assert type(items) is int
+
+
+def test_picture_needs_12_bytes_a_pixel_and_32_for_the_state_of_its_ray():
+    assert PictureBuffers.needs((30, 20)) == ({"picture": 12 * 30 * 20}, {"states of the rays": 32 * 30 * 20})
+
+
+@pytest.mark.parametrize(
+    ("node", "channels"), [(0, (1.0, 0.5, 0.0)), (-1, (0.0, 0.5, 1.0))], ids=["first node", "last node"]
+)
+def test_colours_of_the_transfer_table_have_ten_bits_a_channel(monkeypatch, node, channels):
+    monkeypatch.setattr(ray_pictures, "upload", lambda device, table: table)
+    function = TransferFunction([(0, 1.0, 0.5, 0.0, 0.0), (100, 0.0, 0.5, 1.0, 1.0)])  # HU, colour, opacity
+    color = int(ray_pictures.TransferTables.of(device(1), function, 1.0).colors_d[node])
+    assert [color >> 20, color >> 10 & 1023, color & 1023] == pytest.approx(1023 * np.array(channels), abs=1.0)
+
+
+def test_transfer_table_begins_at_the_lowest_hu_and_shows_all_nodes_but_the_transparent_first(monkeypatch):
     monkeypatch.setattr(ray_pictures, "upload", lambda device, table: table)
     function = TransferFunction([(0, 1.0, 0.5, 0.0, 0.0), (100, 0.0, 0.5, 1.0, 1.0)])
     tables = ray_pictures.TransferTables.of(device(1), function, 1.0)
-    assert (tables.low, len(tables.colors_d), tables.shown_ends) == (
-        0.0,
-        ray_pictures.NODES,
-        (1, ray_pictures.NODES - 1),
-    )
-    for node, expected in ((0, (1023, 511.5, 0)), (-1, (0, 511.5, 1023))):
-        color = int(tables.colors_d[node])
-        assert [color >> 20, color >> 10 & 1023, color & 1023] == pytest.approx(expected, abs=1.0)
+    assert tables.low == 0.0
+    assert len(tables.colors_d) == ray_pictures.NODES
+    assert tables.shown_ends == (1, ray_pictures.NODES - 1)
 
 
-def test_the_window_of_a_cloud_begins_below_its_lowest_values():
+def test_the_window_of_a_cloud_begins_below_its_lowest_values_by_the_darkest_share():
     hu = np.linspace(100.0, 400.0, 30_001).astype(np.float32)
     low, high = _choose_window(hu)
-    lowest = (low + DARKEST_SHARE * high) / (1.0 + DARKEST_SHARE)
-    assert 100.0 <= lowest < high <= 400.0
-    assert low == pytest.approx(lowest - DARKEST_SHARE * (high - lowest))
-    assert low < 100.0
+    lowest = (low + DARKEST_SHARE * high) / (1.0 + DARKEST_SHARE)  # that a grey of the darkest share stands for
+    assert low < 100.0 <= lowest < high <= 400.0
 
 
+@pytest.mark.parametrize("size", [1.0, 100.0])
 @pytest.mark.parametrize("k", [8, 16])
-def test_edge_of_cells_follows_the_density_of_points(k):
+def test_edge_of_cells_follows_the_density_of_points(k, size):
     """27 cells of even points hold 5.6 k of them, or 40."""
     points = np.random.default_rng(7).random((20_000, 3)).astype(np.float32)
-    wanted = max(40.0, 5.6 * k)
-    expected = (wanted / len(points)) ** (1 / 3) / 3.0
-    assert choose_cell_edge(points, k) == pytest.approx(expected, rel=0.1)
-    assert choose_cell_edge(100.0 * points, k) == pytest.approx(100.0 * expected, rel=0.1)
-    assert choose_cell_edge(np.ones((5, 3), np.float32), k) == 1.0
+    share_of_points = max(40.0, 5.6 * k) / len(points)
+    side_of_27_cells = share_of_points ** (1 / 3)
+    assert choose_cell_edge(size * points, k) == pytest.approx(size * side_of_27_cells / 3.0, rel=0.1)
 
 
-def test_edges_that_are_not_passed_once_each_way_are_counted():
-    closed = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]])
-    assert _count_open_edges(closed, 4) == 0
-    assert _count_open_edges(closed[:3], 4) > 0
-    assert _count_open_edges(np.concatenate([closed[:3], closed[3:, ::-1]]), 4) > 0
-    assert _count_open_edges(np.concatenate([closed, closed]), 4) == 12  # each twice
+def test_edge_of_cells_of_equal_points_is_one_millimetre():
+    assert choose_cell_edge(np.ones((5, 3), np.float32), 8) == 1.0
 
 
-def test_what_a_search_for_ghosts_takes_beside_its_band_is_named():
+TETRAHEDRON = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]])
+
+
+def test_closed_tetrahedron_has_no_open_edge():
+    assert _count_open_edges(TETRAHEDRON, 4) == 0
+
+
+@pytest.mark.parametrize(
+    "triangles",
+    [TETRAHEDRON[:3], np.concatenate([TETRAHEDRON[:3], TETRAHEDRON[3:, ::-1]])],
+    ids=["a face less", "a face turned"],
+)
+def test_edges_of_a_missing_or_turned_face_are_open(triangles):
+    assert _count_open_edges(triangles, 4) > 0
+
+
+def test_edges_that_are_passed_twice_each_way_are_open():
+    each_face_twice = np.concatenate([TETRAHEDRON, TETRAHEDRON])
+    assert _count_open_edges(each_face_twice, 4) == 2 * 6  # six edges, each way
+
+
+def test_search_for_ghost_slices_takes_device_memory_and_progress_by_name_alone():
     kinds = {name: parameter.kind for name, parameter in signature(find_ghost_slices).parameters.items()}
-    named = {"device", "memory", "progress"}
-    assert {name for name, kind in kinds.items() if kind == Parameter.KEYWORD_ONLY} == named
-    assert {name for name, kind in kinds.items() if kind == Parameter.POSITIONAL_OR_KEYWORD} == {"volume", "hu"}
+    by_name = dict.fromkeys(("device", "memory", "progress"), Parameter.KEYWORD_ONLY)
+    assert kinds == dict.fromkeys(("volume", "hu"), Parameter.POSITIONAL_OR_KEYWORD) | by_name
 
 
 def test_first_step_to_the_volume_of_a_label_is_by_its_slope(monkeypatch):
@@ -292,30 +396,45 @@ def test_first_step_to_the_volume_of_a_label_is_by_its_slope(monkeypatch):
     assert (wanted, slope) == (10.0, pytest.approx(-(300 / FACES_PER_AREA) * 3.0 / (STEEPNESS * FULL)))
 
 
-def test_heights_of_an_uneven_volume_count_from_its_first_slice():
-    for sign in (1.0, -1.0):
-        volume = uneven(sign=sign)
-        places = FieldFrame.of(volume).places(volume.slice_origins())
-        np.testing.assert_allclose(places[0], 0.0, atol=1e-9)
-        np.testing.assert_allclose(np.abs(places[:, 2]), HEIGHTS, atol=1e-9)
-        inner = FieldFrame.of(volume).places(volume.ijk_to_lps(np.array([[2.0, 1.0, 0.0]])))
-        np.testing.assert_allclose(inner, [[2.0, 1.0, 0.0]], atol=1e-9)
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["along the normal", "against it"])
+def test_heights_of_an_uneven_volume_count_from_its_first_slice(sign):
+    volume = uneven(sign=sign)
+    places = FieldFrame.of(volume).places(volume.slice_origins())
+    np.testing.assert_allclose(places[0], 0.0, atol=FLOAT64_PLACE_MM)
+    np.testing.assert_allclose(np.abs(places[:, 2]), HEIGHTS, atol=FLOAT64_PLACE_MM)
 
 
-def test_voxels_of_a_box_of_more_than_2_to_the_31_are_told_apart():
-    """The number of the last is 2^32: in 32 bits it is that of the first."""
-    ijk = np.array([[0, 0, 0], [2047, 2047, 0], [0, 0, 1024]], np.int32)
-    assert _order_voxels(ijk)[0] is None
-    order, ordered = _order_voxels(ijk[::-1])
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["along the normal", "against it"])
+def test_places_of_the_first_slice_of_an_uneven_volume_are_its_columns_and_rows(sign):
+    volume = uneven(sign=sign)
+    column_2_row_1 = volume.ijk_to_lps(np.array([[2.0, 1.0, 0.0]]))
+    places = FieldFrame.of(volume).places(column_2_row_1)
+    np.testing.assert_allclose(places, [[2.0, 1.0, 0.0]], atol=FLOAT64_PLACE_MM)
+
+
+FAR_VOXELS = np.array([[0, 0, 0], [2047, 2047, 0], [0, 0, 1024]], np.int32)
+"""In a box of 2048 x 2048 x 1025: the number of the last is 2^32, in 32 bits that of the first."""
+
+
+def test_voxels_in_their_order_need_no_other():
+    assert _order_voxels(FAR_VOXELS)[0] is None
+
+
+def test_voxels_of_a_box_of_more_than_2_to_the_31_are_ordered():
+    order, ordered = _order_voxels(FAR_VOXELS[::-1])
     assert order is not None
-    assert (order.tolist(), ordered.tolist()) == ([2, 1, 0], ijk.tolist())
+    assert order.tolist() == [2, 1, 0]
+    assert ordered.tolist() == FAR_VOXELS.tolist()
+
+
+def test_a_voxel_twice_is_refused_with_how_many_there_are():
     with refused(UsageError, "points", 1, 4):
-        _order_voxels(ijk[[0, 1, 2, 1]])
+        _order_voxels(FAR_VOXELS[[0, 1, 2, 1]])
 
 
 @pytest.mark.parametrize(("radius", "pixels"), [(4.0, 8.0), (1.5, 3.0), (1e-9, SMALLEST_DISC), (1e9, LARGEST_DISC)])
 def test_discs_have_their_radius_in_pixels_within_limits(radius, pixels):
-    """Half a mm a pixel."""
+    """The camera shows 11.75 mm above and below the middle in 47 rows: half a millimetre a pixel."""
     camera = Camera((0.0, -50.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), parallel_scale=11.75)
     nothing = np.zeros((0, 3), np.float32)
     discs = Discs(nothing, np.zeros((0, 4), np.uint8), nothing, radius, Lighting())
@@ -323,26 +442,45 @@ def test_discs_have_their_radius_in_pixels_within_limits(radius, pixels):
     assert splats.disc_pixels == pytest.approx(pixels)
 
 
-def test_table_of_an_uneven_stack_has_heights_steps_and_shifts(monkeypatch):
-    """Heights, steps and shifts as the volume was made with; three rows of each slice are its normal matrix."""
+@pytest.fixture
+def stack_of_uneven(monkeypatch):
+    """The table of an uneven volume that the device would get."""
     monkeypatch.setattr(stack_table, "upload", lambda device, array: array)
-    volume = uneven()
-    made = stack_table.StackTable.of(volume, device(1))
-    table, gaps = made.arguments["stack_slices"], np.diff(HEIGHTS)
-    np.testing.assert_allclose(table[:, 0, 0], HEIGHTS, atol=1e-5)
-    np.testing.assert_allclose(table[:, 0, 1:3], np.column_stack([0.0 * SIDEWAYS, SIDEWAYS]), atol=1e-5)
-    np.testing.assert_allclose(table[:, 0, 3], [*(1.0 / gaps), 0.0], rtol=1e-5)
-    np.testing.assert_array_equal(table[:, 1:, :3], slice_normal_matrices(volume, border=0).astype(np.float32))
-    np.testing.assert_allclose(made.slope, [0.0, np.abs(np.diff(SIDEWAYS) / gaps).max(), 1 / 0.25, 0.0], atol=1e-5)
-    np.testing.assert_allclose(
-        made.index_steps(np.array([1.0, 2.0, 0.5])), [1.0, 2.0 + 0.5 * made.slope[1], 2.0], rtol=1e-6
-    )
-    assert (made.arguments["stack_nk"], len(made.arguments["stack_layers"])) == (6, made.arguments["layer_count"])
+    return stack_table.StackTable.of(uneven(), device(1))
 
 
-@pytest.mark.parametrize(("room", "ends"), [(1, [1, 2, 3, 4, 5]), (2, [2, 4, 5]), (4, [4, 5]), (5, [5]), (9, [5])])
-def test_slabs_of_a_field_are_as_thick_as_there_is_room(room, ends, monkeypatch):
-    nodes = Nodes(NOWHERE.astype(np.float32), NOWHERE, np.float32(1.0), (3, 2, 5))
+GAPS = np.diff(HEIGHTS)
+TABLE_MM = 1e-5  # float32
+
+
+def test_table_of_an_uneven_stack_has_heights_shifts_and_inverse_gaps(stack_of_uneven):
+    table = stack_of_uneven.arguments["stack_slices"]
+    np.testing.assert_allclose(table[:, 0, 0], HEIGHTS, atol=TABLE_MM)
+    np.testing.assert_allclose(table[:, 0, 1:3], np.column_stack([0.0 * SIDEWAYS, SIDEWAYS]), atol=TABLE_MM)
+    np.testing.assert_allclose(table[:, 0, 3], [*(1.0 / GAPS), 0.0], rtol=1e-5)
+
+
+def test_table_of_an_uneven_stack_has_the_normal_matrix_of_each_slice(stack_of_uneven):
+    expected = slice_normal_matrices(uneven(), border=0).astype(np.float32)
+    np.testing.assert_array_equal(stack_of_uneven.arguments["stack_slices"][:, 1:, :3], expected)
+
+
+def test_table_of_an_uneven_stack_has_the_steepest_shift_and_the_smallest_gap(stack_of_uneven):
+    steepest = np.abs(np.diff(SIDEWAYS) / GAPS).max()
+    np.testing.assert_allclose(stack_of_uneven.slope, [0.0, steepest, 1 / GAPS.min(), 0.0], atol=TABLE_MM)
+    way = np.array([1.0, 2.0, 0.5])  # along columns, rows and height
+    steps = [1.0, 2.0 + 0.5 * steepest, 0.5 / GAPS.min()]
+    np.testing.assert_allclose(stack_of_uneven.index_steps(way), steps, rtol=1e-6)
+
+
+def test_table_of_an_uneven_stack_counts_slices_and_layers(stack_of_uneven):
+    arguments = stack_of_uneven.arguments
+    assert (arguments["stack_nk"], len(arguments["stack_layers"])) == (len(HEIGHTS), arguments["layer_count"])
+
+
+def plan_field_slabs(monkeypatch, layers_of_room):
+    """Slabs of a field of 3 x 2 x 5 bricks, all of them with nodes, on a device with room for so many layers."""
+    nodes = nodes_of_bricks(3, 2, 5)
     monkeypatch.setattr(
         field.ocl,
         "describe_shortage",
@@ -352,13 +490,22 @@ def test_slabs_of_a_field_are_as_thick_as_there_is_room(room, ends, monkeypatch)
         nodes=nodes,
         _list=np.arange(0, 32 * 2 * 5, 4),  # eight of the 32 places of each row of bricks
         grid=SimpleNamespace(nbytes=0, n=1),
-        limits=room,
+        limits=layers_of_room,
         bricks=80,
         _kept=lambda n: {},
     )
-    slabs = NodeField._plan_slabs(planned)
+    return NodeField._plan_slabs(planned)
+
+
+@pytest.mark.parametrize(("room", "ends"), [(1, [1, 2, 3, 4, 5]), (2, [2, 4, 5]), (4, [4, 5]), (5, [5]), (9, [5])])
+def test_slabs_of_a_field_are_as_thick_as_there_is_room(room, ends, monkeypatch):
+    slabs = plan_field_slabs(monkeypatch, layers_of_room=room)
     assert [(slab.first, slab.end) for slab in slabs] == list(zip([0, *ends[:-1]], ends, strict=True))
-    assert [(slab.first_brick, slab.end_brick) for slab in slabs] == [(16 * s.first, 16 * s.end) for s in slabs]
-    planned.limits = 0
+    bricks_a_layer = 2 * 8
+    assert [slab.end_brick for slab in slabs] == [bricks_a_layer * end for end in ends]
+    assert [slab.first_brick for slab in slabs] == [0, *(bricks_a_layer * end for end in ends[:-1])]
+
+
+def test_a_field_without_room_for_a_layer_is_refused(monkeypatch):
     with refused(DeviceMemoryError, "surface", "cloud"):
-        NodeField._plan_slabs(planned)
+        plan_field_slabs(monkeypatch, layers_of_room=0)
