@@ -36,7 +36,10 @@ def fit_surface(volume: Volume, device, level=200.0, constants=None):
         return mesh, fit_walls(resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch(), constants=constants)
 
 
-def outer_places(mesh, fit, radius):
+OUTER_RADIUS = 13.0  # of `hollow_ball`, mm
+
+
+def outer_places(mesh, fit, radius=OUTER_RADIUS):
     """Distances of the fitted outer surface from its radius, mm, and the rows of its vertices."""
     places = mesh.vertices + fit.shift_mm[:, None] * mesh.normals
     far = np.linalg.norm(places - MIDDLE, axis=1)
@@ -46,121 +49,194 @@ def outer_places(mesh, fit, radius):
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("check", CORTEX_CHECKS, ids=lambda check: check.name)
-def test_profiles_and_walls_are_those_of_the_twin(device, check):
+def test_profiles_and_walls_equal_the_twin(device, check):
     assert check.run(device)
 
 
-@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.7, 0.7, 1.5)])
-@pytest.mark.parametrize("thickness", [1.0, 2.0, 4.0])
-def test_fitted_shell_is_nearer_to_the_truth(device, thickness, spacing):
-    _, of_thick = fit_surface(hollow_ball(thickness=4.0, spacing=spacing), device)
-    volume = hollow_ball(thickness=thickness, spacing=spacing)
-    mesh, fit = fit_surface(volume, device, constants=of_thick.constants)
-    away, rows = outer_places(mesh, fit, 13.0)
-    level = np.linalg.norm(mesh.vertices[rows] - MIDDLE, axis=1) - 13.0
+@pytest.fixture(params=[(1.0, 1.0, 1.0), (0.7, 0.7, 1.5)], ids=str)
+def shell_spacing(request):
+    return request.param
+
+
+@pytest.fixture(params=[1.0, 2.0, 4.0], ids=lambda mm: f"{mm:g} mm")
+def fitted_shell(request, shell_spacing, device):
+    """The thickness of a shell, its surface at 200 HU, and its walls, fitted with the constants of a thick one."""
+    _, of_thick = fit_surface(hollow_ball(thickness=4.0, spacing=shell_spacing), device)
+    volume = hollow_ball(thickness=request.param, spacing=shell_spacing)
+    return request.param, *fit_surface(volume, device, constants=of_thick.constants)
+
+
+def test_fitted_shell_lies_nearer_to_the_bone_than_the_surface_of_a_level(fitted_shell):
+    _, mesh, fit = fitted_shell
+    away, rows = outer_places(mesh, fit)
+    away_of_level = np.linalg.norm(mesh.vertices[rows] - MIDDLE, axis=1) - OUTER_RADIUS
     assert len(rows) > 1000
-    assert np.abs(level).mean() > 0.4  # what a level costs
+    assert np.abs(away_of_level).mean() > 0.4
     assert np.abs(away).mean() < 0.12
-    assert abs(np.median(fit.thickness_mm[rows]) - thickness) < 0.35
+
+
+def test_fitted_shell_has_its_thickness_to_a_third_of_a_voxel(fitted_shell):
+    thickness, mesh, fit = fitted_shell
+    _, rows = outer_places(mesh, fit)
+    assert np.median(fit.thickness_mm[rows]) == pytest.approx(thickness, abs=0.35)
+
+
+def test_errors_of_a_fitted_shell_hold_nine_tenths_of_its_distances_from_the_truth(fitted_shell):
+    """A standard error of 1.96 would hold 95 % of a normal distribution."""
+    _, mesh, fit = fitted_shell
+    away, rows = outer_places(mesh, fit)
     assert (np.abs(away) < 1.96 * fit.error_mm[rows]).mean() > 0.9
 
 
-def test_constants_are_those_of_the_scan(device):
+def test_constants_are_the_blur_and_density_of_the_scan(device):
+    _, fit = fit_surface(hollow_ball(thickness=4.0, blur=0.8, cortex=1000.0), device)
+    constants = fit.constants
+    blur_mm = np.hypot(0.8, 0.37)  # interpolation between voxels of 1 mm blurs further: measured 0.88
+    assert constants.blur_mm == pytest.approx(blur_mm, abs=0.08)
+    assert constants.blur_across_mm == pytest.approx(blur_mm, abs=0.08)
+    assert constants.cortex_hu == pytest.approx(1000.0, rel=0.04)
+
+
+def test_constants_are_taken_from_the_most_walls_allowed_and_many_thick_ones(device):
     _, fit = fit_surface(hollow_ball(thickness=4.0, blur=0.8), device)
-    found = fit.constants
-    # Interpolation between voxels of 1 mm blurs further: by about 0.4 mm, in squares.
-    assert found.blur_mm == pytest.approx(0.88, abs=0.08) and found.blur_across_mm == pytest.approx(0.88, abs=0.08)
-    assert found.cortex_hu == pytest.approx(1000.0, rel=0.04)
-    assert found.places == MOST_WALLS and found.thick > 100
+    assert fit.constants.places == MOST_WALLS
+    assert fit.constants.thick > 100
 
 
-def test_noise_makes_no_cortex_denser(device):
+def test_noise_makes_the_cortex_neither_denser_nor_moves_it(device):
     """Thick walls' percentile holds noise, the blur follows it, and it the blur: 15 % and 0.13 mm inwards."""
     quiet = hollow_ball(thickness=2.6, blur=0.5)
     noise = np.random.default_rng(3).normal(0.0, 40.0, quiet.voxels.shape)
-    mesh, fit = fit_surface(quiet.with_voxels(np.rint(quiet.voxels + noise).astype(np.int16)), device, level=500.0)
+    noisy = quiet.with_voxels(np.rint(quiet.voxels + noise).astype(np.int16))
+
+    mesh, fit = fit_surface(noisy, device, level=500.0)
+
     assert fit.constants.cortex_hu == pytest.approx(1000.0, rel=0.04)
-    assert fit.constants.blur_mm == pytest.approx(0.64, abs=0.08)  # with that of the interpolation
-    assert abs(np.mean(outer_places(mesh, fit, 13.0)[0])) < 0.05
+    assert fit.constants.blur_mm == pytest.approx(np.hypot(0.5, 0.4), abs=0.08)  # with that of the interpolation
+    away, _ = outer_places(mesh, fit)
+    assert abs(np.mean(away)) < 0.05
 
 
-def test_a_fit_scales_with_the_voxels(device):
-    large = hollow_ball(thickness=3.0)
-    fits = [fit_surface(Volume(large.voxels, np.diag([mm, mm, mm, 1.0])), device)[1] for mm in (1.0, 0.02)]
-    for name in ("shift_mm", "thickness_mm", "error_mm"):
-        one, small = (getattr(fit, name)[fit.states == FITTED].mean() for fit in fits)
-        assert small / 0.02 == pytest.approx(one, rel=0.03, abs=0.01), name
-    assert fits[1].constants.blur_mm / 0.02 == pytest.approx(fits[0].constants.blur_mm, rel=0.05)
+@pytest.mark.parametrize("name", ["shift_mm", "thickness_mm", "error_mm"])
+def test_lengths_of_a_fit_scale_with_the_voxels(device, name):
+    voxels = hollow_ball(thickness=3.0).voxels
+    large, small = (fit_surface(Volume(voxels, np.diag([mm, mm, mm, 1.0])), device)[1] for mm in (1.0, 0.02))
+    of_large, of_small = (getattr(fit, name)[fit.states == FITTED].mean() for fit in (large, small))
+    assert of_small / 0.02 == pytest.approx(of_large, rel=0.03, abs=0.01)
+
+
+def test_blur_of_a_fit_scales_with_the_voxels(device):
+    voxels = hollow_ball(thickness=3.0).voxels
+    large, small = (fit_surface(Volume(voxels, np.diag([mm, mm, mm, 1.0])), device)[1] for mm in (1.0, 0.02))
+    assert small.constants.blur_mm / 0.02 == pytest.approx(large.constants.blur_mm, rel=0.05)
 
 
 @pytest.mark.parametrize(
     ("uneven", "few"), [(False, False), (True, False), (False, True)], ids=["even", "uneven", "few places at a time"]
 )
 def test_cortex_fitted_in_slabs_is_that_of_the_whole(device, uneven, few):
-    even = hollow_ball(thickness=2.0)
-    volume = stack(even.voxels, OBLIQUE, uneven=uneven)
+    volume = stack(hollow_ball(thickness=2.0).voxels, OBLIQUE, uneven=uneven)
     mesh, whole = fit_surface(volume, device)
-    places = 140 * cortex.SMALLEST_PIECE if few else 140 * cortex.stride_of(mesh.vertex_count)
-    limit = volume.voxels.nbytes // 2 + places
     assert mesh.vertex_count > 4 * cortex.SMALLEST_PIECE
-    with DeviceVolume(volume, device=device, memory=limit) as resident:
+    places = cortex.SMALLEST_PIECE if few else cortex.stride_of(mesh.vertex_count)
+    place_bytes = 140
+    memory = volume.voxels.nbytes // 2 + place_bytes * places
+
+    with DeviceVolume(volume, device=device, memory=memory) as resident:
         sampler = ProfileSampler(resident, Stopwatch())
         assert len(list(sampler.pieces(mesh.vertices, mesh.normals))) > 1
         slabs = fit_walls(resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch(), constants=whole.constants)
+
     for name in ("states", "shift_mm", "thickness_mm", "error_mm", "room_mm"):
         assert np.array_equal(getattr(slabs, name), getattr(whole, name), equal_nan=True), name
 
 
-def test_vertices_on_vessels_metal_and_ends_are_told_as_no_wall(device):
+@pytest.fixture(scope="module")
+def surface_with_vessel_and_metal(device):
+    """A shell of bone, a vessel with contrast medium from end to end, and a block of metal; their surface and fit."""
     volume = hollow_ball(thickness=2.0)
     voxels = volume.voxels.copy()
     k, j, i = np.indices(voxels.shape)
-    vessel = 50.0 + 270.0 * ndtr((3.0 - np.hypot(i - 4.0, j - 4.0)) / 0.7)  # contrast medium, from end to end
+    vessel = 50.0 + 270.0 * ndtr((3.0 - np.hypot(i - 4.0, j - 4.0)) / 0.7)
     voxels = np.maximum(voxels, np.rint(vessel).astype(np.int16))
     voxels[(np.abs(i - 35) < 2) & (np.abs(j - 35) < 2) & (np.abs(k - 20) < 4)] = 3000
-    mesh, fit = fit_surface(volume.with_voxels(voxels), device)
-    x, y, z = mesh.vertices.T
-    at_end = (z < 0.0) | (z > voxels.shape[0] - 1)
-    beside = (np.hypot(x - 4, y - 4) < 4) & (z > 3) & (z < 36)
-    near_metal = (x > 32) & (y > 32)
+    return fit_surface(volume.with_voxels(voxels), device)
+
+
+def test_vertices_at_the_ends_of_the_scan_have_no_room(surface_with_vessel_and_metal):
+    mesh, fit = surface_with_vessel_and_metal
+    z = mesh.vertices[:, 2]
+    at_end = (z < 0.0) | (z > 39.0)  # the last of 40 slices is at 39 mm
     assert set(fit.states[at_end].tolist()) == {NO_ROOM}
-    assert (fit.states[beside] == NOT_BONE).mean() > 0.95
-    assert set(fit.states[near_metal].tolist()) == {METAL}
+
+
+def test_vertices_on_a_vessel_are_no_bone(surface_with_vessel_and_metal):
+    mesh, fit = surface_with_vessel_and_metal
+    x, y, z = mesh.vertices.T
+    on_vessel = (np.hypot(x - 4, y - 4) < 4) & (z > 3) & (z < 36)
+    assert (fit.states[on_vessel] == NOT_BONE).mean() > 0.95
+
+
+def test_vertices_on_metal_are_told_as_metal(surface_with_vessel_and_metal):
+    mesh, fit = surface_with_vessel_and_metal
+    x, y, _ = mesh.vertices.T
+    assert set(fit.states[(x > 32) & (y > 32)].tolist()) == {METAL}
+
+
+def test_counts_of_the_states_of_a_fit_add_up_to_its_vertices(surface_with_vessel_and_metal):
+    mesh, fit = surface_with_vessel_and_metal
     assert sum(fit.counts().values()) == mesh.vertex_count
 
 
-@pytest.mark.parametrize("cortex_hu, state, factor", [(1000.0, "fitted", 1.0), (1140.0, "fitted", 1.0),
-                                                      (1450.0, "fitted", 3.0), (710.0, "fitted", 29.0 / 15.0),
-                                                      (690.0, "badly fitted", 31.0 / 15.0)])  # fmt: skip
-def test_walls_unlike_the_cortex_of_the_scan_have_larger_errors_or_follow(cortex_hu, state, factor):
+@pytest.mark.parametrize(
+    ("cortex_hu", "state", "factor"),
+    [
+        (1000.0, "fitted", 1.0),
+        (1140.0, "fitted", 1.0),
+        (1450.0, "fitted", 3.0),
+        (710.0, "fitted", 29.0 / 15.0),
+        (690.0, "badly fitted", 31.0 / 15.0),
+    ],
+)
+def test_walls_unlike_the_cortex_of_the_scan_have_errors_larger_by_a_factor_and_are_badly_fitted_below_70_percent(
+    cortex_hu, state, factor
+):
+    """The cortex of the scan has 1000 HU: what a wall differs by is divided by 150 HU where that is above 1."""
     constants = CortexConstants(0.7, 0.7, 1000.0, 0.02, 0.02, 50.0, 10.0, 20.0, 500, 100)
-    scale = ProfileScale.of(hollow_ball())
-    rows = (0.0, 2.0, 50.0, cortex_hu, 250.0, 5.0, 1e-6, 900.0, 2.5)
-    walls = WallFits(*(np.array([value], np.float32) for value in rows))
-    usual = WallFits(*(np.array([value], np.float32) for value in (*rows[:3], 1000.0, *rows[4:])))
-    assert _STATES[judge_walls(walls, constants, scale, np.zeros(1, bool))[0]] == state
-    error, of_usual = (standard_errors(fits, constants) for fits in (walls, usual))
-    np.testing.assert_allclose(error, factor * of_usual, rtol=1e-5)
+    row = (0.0, 2.0, 50.0, cortex_hu, 250.0, 5.0, 1e-6, 900.0, 2.5)
+    wall = WallFits(*(np.array([value], np.float32) for value in row))
+    usual = WallFits(*(np.array([value], np.float32) for value in (*row[:3], 1000.0, *row[4:])))
+    (found_state,) = judge_walls(wall, constants, ProfileScale.of(hollow_ball()), np.zeros(1, bool))
+    assert _STATES[found_state] == state
+    np.testing.assert_allclose(standard_errors(wall, constants), factor * standard_errors(usual, constants), rtol=1e-5)
 
 
-def test_thick_slices_hide_thin_walls_across_them_alone(device):
-    volume = hollow_ball(thickness=1.0, spacing=(1.0, 1.0, 4.0))
-    constants = CortexConstants(0.7, 2.0, 1000.0, 0.02, 0.05, 50.0, 10.0, 20.0, 500, 100)
-    mesh, fit = fit_surface(volume, device, constants=constants)
-    assert fit.hidden.sum() > 20 and np.abs(mesh.normals[fit.hidden, 2]).min() > 0.2
-    assert set(fit.states[fit.hidden].tolist()) == {_STATES.index("badly fitted")}
-    same = fit_surface(volume, device, constants=constants.changed(blur_across_mm=0.8))[1]
-    assert not same.hidden.any()
+THICK_SLICES = hollow_ball(thickness=1.0, spacing=(1.0, 1.0, 4.0))
+CONSTANTS_OF_THICK_SLICES = CortexConstants(0.7, 2.0, 1000.0, 0.02, 0.05, 50.0, 10.0, 20.0, 500, 100)
 
 
-def test_thin_walls_alone_do_not_show_their_density(device):
+def test_thick_slices_hide_thin_walls_that_lie_across_them(device):
+    mesh, fit = fit_surface(THICK_SLICES, device, constants=CONSTANTS_OF_THICK_SLICES)
+    assert np.count_nonzero(fit.hidden) > 20
+    assert np.abs(mesh.normals[fit.hidden, 2]).min() > 0.2  # walls along the slices' axis have 0
+    assert {_STATES[state] for state in fit.states[fit.hidden]} == {"badly fitted"}
+
+
+def test_slices_that_blur_no_more_than_their_pixels_hide_no_wall(device):
+    sharp_across = CONSTANTS_OF_THICK_SLICES.changed(blur_across_mm=0.8)
+    _, fit = fit_surface(THICK_SLICES, device, constants=sharp_across)
+    assert not fit.hidden.any()
+
+
+def test_thin_walls_alone_are_taken_for_thicker_and_less_dense_ones(device):
+    """Walls of 0.8 mm and 1000 HU in a blur of 0.7 mm."""
     mesh, fit = fit_surface(hollow_ball(thickness=0.8), device)
-    away, _ = outer_places(mesh, fit, 13.0)
     assert fit.constants.cortex_hu < 800.0
-    assert 0.1 < np.mean(away) < 0.35  # the walls are taken for thicker, less dense ones
+    away, _ = outer_places(mesh, fit)
+    assert 0.1 < np.mean(away) < 0.35  # mm outside of the bone
 
 
-def test_the_shell_of_a_table_says_nothing_of_bone(device):
+def test_sheets_of_a_couch_around_a_shell_leave_the_constants_of_its_bone(device):
     """Sheets of 250 HU between air rise by more than bone does, and have more vertices."""
     voxels = hollow_ball(thickness=3.0).voxels.copy()
     for beside in (slice(0, 5), slice(-5, None)):
@@ -168,42 +244,58 @@ def test_the_shell_of_a_table_says_nothing_of_bone(device):
         voxels[:, beside] = -900
     voxels[:, :, (2, -3)] = 250
     voxels[:, (2, -3)] = 250
-    constants = fit_surface(Volume(voxels, np.eye(4)), device)[1].constants
-    assert constants.cortex_hu == pytest.approx(1000.0, rel=0.05) and constants.thick > 300
-    assert constants.blur_mm == pytest.approx(0.8, abs=0.1)
+
+    _, fit = fit_surface(Volume(voxels, np.eye(4)), device)
+
+    assert fit.constants.cortex_hu == pytest.approx(1000.0, rel=0.05)
+    assert fit.constants.blur_mm == pytest.approx(np.hypot(0.7, 0.4), abs=0.1)  # with that of the interpolation
+    assert fit.constants.thick > 300
 
 
-def test_bones_of_different_density_have_constants_each(device):
-    volumes = [hollow_ball(thickness=4.0, cortex=cortex) for cortex in (1400.0, 900.0)]
-    volume = Volume(np.concatenate([one.voxels for one in volumes]), np.eye(4))
+@pytest.fixture(scope="module")
+def two_densities(device):
+    """A shell of 1400 HU below one of 900: their surface, which vertices are of the second, and where its middle is."""
+    dense, less_dense = (hollow_ball(thickness=4.0, cortex=cortex) for cortex in (1400.0, 900.0))
+    volume = Volume(np.concatenate([dense.voxels, less_dense.voxels]), np.eye(4))
+    height = len(dense.voxels)
     mesh = extract_isosurface(volume, 200.0, device=device)
-    second = (mesh.vertices[:, 2] > len(volumes[0].voxels)).astype(np.int64)
+    return volume, mesh, (mesh.vertices[:, 2] > height).astype(np.int64), MIDDLE + [0.0, 0.0, height]
+
+
+def fit_components(device, volume, mesh, components):
     with DeviceVolume(volume, device=device) as resident:
-        one, each = (
-            fit_walls(resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch(), components=components)
-            for components in (None, second)
-        )
-    assert one.own_cortex_hu == () and each.own_cortex_hu[-1] == pytest.approx(900.0, rel=0.05)
-    middle = MIDDLE + [0.0, 0.0, len(volumes[0].voxels)]
-    away = [
-        np.linalg.norm(mesh.vertices + fit.shift_mm[:, None] * mesh.normals - middle, axis=1) - 13.0
-        for fit in (one, each)
-    ]
-    outer = (second == 1) & (np.linalg.norm(mesh.vertices - middle, axis=1) > 12.5)
-    assert np.abs(away[1][outer]).mean() < 0.06 < np.abs(away[0][outer]).mean()
+        return fit_walls(resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch(), components=components)
 
 
-def test_a_scan_without_bone_has_no_cortex(device):
-    volume = hollow_ball(cortex=260.0, inner=260.0)
+def test_bones_of_different_density_have_a_cortex_each_where_components_are_given(device, two_densities):
+    volume, mesh, is_second, _ = two_densities
+    assert fit_components(device, volume, mesh, None).own_cortex_hu == ()
+    assert fit_components(device, volume, mesh, is_second).own_cortex_hu[-1] == pytest.approx(900.0, rel=0.05)
+
+
+def test_the_less_dense_of_two_bones_is_found_nearer_to_the_truth_by_its_own_cortex(device, two_densities):
+    volume, mesh, is_second, middle = two_densities
+    outer = (is_second == 1) & (np.linalg.norm(mesh.vertices - middle, axis=1) > OUTER_RADIUS - 0.5)
+
+    def mean_distance(components):
+        fit = fit_components(device, volume, mesh, components)
+        places = mesh.vertices + fit.shift_mm[:, None] * mesh.normals
+        return np.abs(np.linalg.norm(places[outer] - middle, axis=1) - OUTER_RADIUS).mean()
+
+    assert mean_distance(is_second) < 0.06 < mean_distance(None)
+
+
+def test_a_scan_without_bone_is_refused(device):
+    soft = hollow_ball(cortex=260.0, inner=260.0)
     with refused(NoSurfaceError, "walls", "bone"):
-        fit_surface(volume, device, 150.0)
+        fit_surface(soft, device, 150.0)
 
 
 @pytest.mark.oclgrind
-def test_profiles_find_the_wall_at_a_few_points(device):
-    volume = hollow_ball()
-    points = MIDDLE + 13.5 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
-    with DeviceVolume(volume, device=device) as resident:
+def test_profiles_half_a_millimetre_outside_of_a_wall_find_it(device):
+    ways = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
+    points = MIDDLE + (OUTER_RADIUS + 0.5) * ways
+    with DeviceVolume(hollow_ball(), device=device) as resident:
         sampler = ProfileSampler(resident, Stopwatch())
-        walls = sampler.take(sampler.values(points, (points - MIDDLE) / 13.5)).fit(0.75, 0.75, 1000.0, 10.0)
-    assert np.abs(walls.shift_mm + 0.5).max() < 0.15
+        walls = sampler.take(sampler.values(points, ways)).fit(0.75, 0.75, 1000.0, 10.0)
+    assert walls.shift_mm == pytest.approx([-0.5] * 3, abs=0.15)

@@ -37,23 +37,31 @@ def test_crossing_triangles_are_marked_as_by_the_twin(device, count):
     vertices, triangles = scattered(count, sizes=(0.3, 1.0, 5.0))
     found = mark_crossings(device, plan_crossings(vertices, triangles))
     assert np.array_equal(found, twin.mark_crossings(vertices, triangles))
-    assert count < 700 or 0.05 < found.mean() < 0.95
 
 
-def test_levels_double_their_edge_and_the_finest_has_few_rows():
-    plan = plan_crossings(*scattered(700, sizes=(*[0.1] * 60, 6.0)), most_rows=100)
+MANY_SMALL_TRIANGLES = (*[0.1] * 60, 6.0)  # mm
+
+
+def test_edges_of_levels_double_and_hold_the_longest_side_of_their_triangles():
+    plan = plan_crossings(*scattered(700, sizes=MANY_SMALL_TRIANGLES), most_rows=100)
     edges, longest = plan.edges.T
+    assert len(edges) == len(plan.levels) > 1
     np.testing.assert_allclose(edges, edges[0] * 2.0 ** np.arange(len(edges)), rtol=1e-6)
     assert (longest <= edges).all()
+
+
+def test_finest_level_has_no_more_rows_than_allowed_and_more_than_half_of_them():
+    plan = plan_crossings(*scattered(700, sizes=MANY_SMALL_TRIANGLES), most_rows=100)
     rows = plan.levels[:, 1].astype(int) * plan.levels[:, 2]
-    assert 50 < rows[0] <= 100 and len(rows) == len(plan.edges) > 1
+    assert 50 < rows[0] <= 100
 
 
 @pytest.mark.oclgrind
-def test_few_crossing_triangles_are_marked_as_by_the_twin(device):
+def test_crossing_triangles_of_a_small_body_are_marked_as_by_the_twin(device):
     vertices, triangles = scattered(150, extent=(8.0, 8.0, 8.0))
     found = mark_crossings(device, plan_crossings(vertices, triangles))
-    assert np.array_equal(found, twin.mark_crossings(vertices, triangles)) and found.any()
+    assert found.any()
+    assert np.array_equal(found, twin.mark_crossings(vertices, triangles))
 
 
 @pytest.mark.parametrize("sizes", [(0.01, 1.0, 40.0), (1.0,), (0.02, 0.021)])
@@ -66,71 +74,88 @@ def test_crossing_pairs_are_those_of_the_host(device, sizes, extent, place):
     assert pairs(find_crossings(device, vertices, triangles, fewest=1)) == pairs(expected)
 
 
-@pytest.mark.parametrize("fewest", [1, 10_000])
-def test_crossings_with_a_changed_triangle_are_those_of_the_host(device, fewest):
+@pytest.mark.parametrize("fewest", [1, 10_000], ids=["device", "host"])
+def test_crossings_with_a_changed_triangle_are_those_of_all_that_have_one(device, fewest):
     vertices, triangles = scattered(900)
     changed = np.arange(900) % 4 == 1
     every = find_self_intersections(vertices, triangles)
     expected = every[changed[every].any(axis=1)]
-    assert pairs(find_crossings(device, vertices, triangles, changed, fewest=fewest)) == pairs(expected) and 10 < len(
-        expected
-    ) < len(every)
+    assert 10 < len(expected) < len(every)
+    assert pairs(find_crossings(device, vertices, triangles, changed, fewest=fewest)) == pairs(expected)
 
 
 @pytest.mark.parametrize("scale", daily(1, [2.0**-60, 2.0**-9, 1.0, 2.0**30]))
-def test_bodies_that_cut_each_other_have_the_pairs_of_the_host_at_any_scale(device, scale):
-    """Whatever the unit of length; two spheres whose triangles lie in each other's planes too."""
-    sphere = samples.sphere(rounds=3)
-    for shift in ((11.0, 4.0, -3.0), (0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (25.0, 0.0, 0.0)):
-        vertices, triangles = samples.join(sphere, samples.sphere(shift, 10.0, 3))
-        arrays = (scale * vertices).astype(np.float32), np.asarray(triangles, np.uint32)
-        expected = find_self_intersections(*arrays)
-        assert pairs(find_crossings(device, *arrays, fewest=1)) == pairs(expected)
-        assert len(expected) > 0 or shift[0] != 11.0
+@pytest.mark.parametrize(
+    "shift",
+    [(11.0, 4.0, -3.0), (0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (25.0, 0.0, 0.0)],
+    ids=["cut", "equal", "in each other's planes", "apart"],
+)
+def test_two_spheres_have_the_crossing_pairs_of_the_host_at_any_scale(device, scale, shift):
+    """Spheres of 10 units, the second shifted."""
+    vertices, triangles = samples.join(samples.sphere(rounds=3), samples.sphere(shift, 10.0, 3))
+    arrays = (scale * vertices).astype(np.float32), np.asarray(triangles, np.uint32)
+    assert pairs(find_crossings(device, *arrays, fewest=1)) == pairs(find_self_intersections(*arrays))
 
 
-def test_a_closed_surface_leaves_nothing_to_look_at(device):
+def test_two_spheres_that_cut_each_other_have_crossing_pairs(device):
+    vertices, triangles = samples.join(samples.sphere(rounds=3), samples.sphere((11.0, 4.0, -3.0), 10.0, 3))
+    assert len(find_crossings(device, vertices.astype(np.float32), np.asarray(triangles, np.uint32), fewest=1)) > 0
+
+
+def test_no_triangle_of_a_torus_is_marked(device):
     """Neighbours share vertices, and what lies farther is told apart in float32."""
     vertices, triangles = samples.torus(120, 60)
     found = mark_crossings(device, plan_crossings(vertices.astype(np.float32), np.asarray(triangles, np.uint32)))
     assert not found.any()
 
 
-def test_triangles_without_area_are_left_to_the_host(device):
-    nothing = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)
-    assert len(find_crossings(device, *nothing, fewest=1)) == 0
+def test_a_triangle_without_area_crosses_nothing(device):
+    point = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)
+    assert len(find_crossings(device, *point, fewest=1)) == 0
+
+
+def test_crossings_among_triangles_without_area_are_those_of_the_host(device):
     vertices, triangles = scattered(400)
-    vertices[::7] = vertices[1::7][: len(vertices[::7])]
-    assert pairs(find_crossings(device, vertices, triangles, fewest=1)) == pairs(
-        find_self_intersections(vertices, triangles)
-    )
+    vertices[::7] = vertices[1::7][: len(vertices[::7])]  # two corners in one place
+    found = find_crossings(device, vertices, triangles, fewest=1)
+    assert pairs(found) == pairs(find_self_intersections(vertices, triangles))
 
 
-@pytest.mark.parametrize("case", ["small", "float64", "no room"])
-def test_triangles_that_the_device_does_not_take_are_left_to_the_host(device, case, monkeypatch):
-    given: dict = {} if case == "small" else {"fewest": 1}
+@pytest.mark.parametrize(
+    ("dtype", "options"),
+    [(np.float32, {}), (np.float64, {"fewest": 1}), (np.float32, {"fewest": 1, "memory": 1})],
+    ids=["too few", "float64", "no room"],
+)
+def test_triangles_that_the_device_does_not_take_have_the_crossings_of_the_host(device, dtype, options, monkeypatch):
     monkeypatch.setattr(decimation, "mark_crossings", None)
     vertices, triangles = scattered(600)
-    own = vertices.astype(np.float64) if case == "float64" else vertices
     told: list[tuple[str, int, int]] = []
     steps = Steps(lambda *step: told.append(step), "crossings", 600)
-    found = find_crossings(device, own, triangles, memory=1 if case == "no room" else None, steps=steps, **given)
-    assert pairs(found) == pairs(find_self_intersections(vertices, triangles)) and len(found) > 10
-    assert told[0] == ("crossings", 0, 600) and told[-1] == ("crossings", 600, 600)
+    found = find_crossings(device, vertices.astype(dtype), triangles, steps=steps, **options)
+    assert len(found) > 10
+    assert pairs(found) == pairs(find_self_intersections(vertices, triangles))
+    assert told[0] == ("crossings", 0, 600)
+    assert told[-1] == ("crossings", 600, 600)
 
 
-def test_progress_counts_triangles_and_may_end_the_work(device):
-    plan = plan_crossings(*scattered(600))
+def test_progress_of_crossings_is_told_after_each_piece(device):
     told: list[int] = []
-    mark_crossings(device, plan, piece=256, steps=Steps(lambda *step: told.append(step[1]), "crossings", 600))
+    steps = Steps(lambda *step: told.append(step[1]), "crossings", 600)
+    mark_crossings(device, plan_crossings(*scattered(600)), piece=256, steps=steps)
     assert told == [0, 256, 512, 600]
 
+
+def test_progress_of_crossings_may_end_the_work(device):
     def cancel(stage: str, done: int, total: int) -> None:
         if done:
             raise Cancelled("enough")
 
-    with pytest.raises(Cancelled):
-        mark_crossings(device, plan, piece=256, steps=Steps(cancel, "crossings", 600))
-    told.clear()
+    with pytest.raises(Cancelled, match="enough"):
+        mark_crossings(device, plan_crossings(*scattered(600)), piece=256, steps=Steps(cancel, "crossings", 600))
+
+
+def test_progress_of_crossings_counts_all_triangles_of_one_piece_at_once(device):
+    told: list[int] = []
     steps = Steps(lambda *step: told.append(step[1]), "crossings", 600)
-    assert len(find_crossings(device, *scattered(600), fewest=1, steps=steps)) > 10 and told == [0, 600]
+    assert len(find_crossings(device, *scattered(600), fewest=1, steps=steps)) > 10
+    assert told == [0, 600]

@@ -18,56 +18,64 @@ def rough(vertices: np.ndarray, seed: int = 1) -> np.ndarray:
     return (vertices + np.random.default_rng(seed).normal(0.0, 0.1, vertices.shape)).astype(np.float32)
 
 
-def has_same_bits(device: object, vertices: np.ndarray, triangles: np.ndarray, iterations: int) -> bool:
+def assert_steps_have_bits_of_twin(
+    device: object, vertices: np.ndarray, triangles: np.ndarray, iterations: int
+) -> None:
+    """Bends, normals and steps of the vertices have the same bits by the device and by the host."""
     rings = Rings.of(triangles.astype(np.uint32), len(vertices))
-    bends: list[np.ndarray] = []
-    normals: list[np.ndarray] = []
-    steps: list[np.ndarray] = []
-    for each in (DeviceFilter(device, rings), Filter(rings)):
-        for found, all_found in zip(each.measure_bends(vertices), (bends, normals), strict=True):
-            all_found.append(found)
-        steps.append(each.find_steps(bends[0], sinc_terms(iterations)))
-    return all(np.array_equal(*both) for both in (bends, normals, steps))
+    on_device, on_host = DeviceFilter(device, rings), Filter(rings)
+    for found, expected in zip(on_device.measure_bends(vertices), on_host.measure_bends(vertices), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    bends, _ = on_host.measure_bends(vertices)
+    steps = sinc_terms(iterations)
+    np.testing.assert_array_equal(on_device.find_steps(bends, steps), on_host.find_steps(bends, steps))
 
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("iterations", [1, 2, 20, 300])
 def test_steps_have_the_bits_of_the_twin(device, iterations):
     vertices, triangles = samples.sphere((0, 0, 0), 20.0, 4)
-    assert has_same_bits(device, rough(vertices), triangles, iterations)
+    assert_steps_have_bits_of_twin(device, rough(vertices), triangles, iterations)
 
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("size", [7, 8, 9, 31])
 def test_open_surfaces_of_all_sizes_are_smoothed_to_the_bits_of_the_twin(device, size):
     vertices, triangles = sheet(size)
-    assert has_same_bits(device, rough(vertices), triangles, 5)
+    assert_steps_have_bits_of_twin(device, rough(vertices), triangles, 5)
 
 
 @pytest.mark.oclgrind
 def test_small_surface_is_smoothed_to_the_bits_of_the_twin(device):
     vertices, triangles = samples.box()
-    assert has_same_bits(device, rough(vertices), triangles, 3)
+    assert_steps_have_bits_of_twin(device, rough(vertices), triangles, 3)
 
 
-@pytest.mark.parametrize("scale", [1.0, 200.0])
-def test_a_mesh_is_the_same_with_a_device_and_without(device, scale):
-    """Two rough spheres that nearly touch, a speck and a vertex without triangles; near the origin and far from it."""
+def rough_spheres_that_nearly_touch(origin: float) -> Mesh:
+    """Two rough spheres 0.4 mm apart, a speck and a vertex without triangles, so many mm from the origin along x."""
     ball, faces = samples.sphere((0, 0, 0), 5.0, 4)
-    speck, its = samples.box((0.0, 9.0, 0.0), (0.2, 0.2, 0.2))
-    parts = samples.join((rough(ball), faces), (rough(ball, 2) + [10.4, 0, 0], faces), (speck, its))
-    vertices = np.concatenate([parts[0], [[1.0, 2.0, 3.0]]]) + [1e4 * (scale > 1.0), 0.0, 0.0]
-    mesh = Mesh(vertices, parts[1])
-    assert mesh.vertices.dtype == (np.float32 if scale == 1.0 else np.float64)
-    own, other = clrecon.smooth_mesh(mesh, 20, 0.25, device=device), clrecon.smooth_mesh(mesh, 20, 0.25)
-    np.testing.assert_array_equal(own.vertices, other.vertices)
-    np.testing.assert_array_equal(own.normals, other.normals)
-    assert own.report == other.report
-    said = own.report["refinement"]["smooth"]
-    assert said["roughness_after_mm"] < 0.6 * said["roughness_before_mm"]
+    speck, its_faces = samples.box((0.0, 9.0, 0.0), (0.2, 0.2, 0.2))
+    vertices, triangles = samples.join((rough(ball), faces), (rough(ball, 2) + [10.4, 0, 0], faces), (speck, its_faces))
+    return Mesh(np.concatenate([vertices, [[1.0, 2.0, 3.0]]]) + [origin, 0.0, 0.0], triangles)
 
 
-def test_a_device_without_room_leaves_it_to_the_host(device, monkeypatch):
+@pytest.mark.parametrize(("origin", "dtype"), [(0.0, np.float32), (1e4, np.float64)], ids=["near", "far"])
+def test_a_smoothed_mesh_is_the_same_with_a_device_and_without(device, origin, dtype):
+    mesh = rough_spheres_that_nearly_touch(origin)
+    assert mesh.vertices.dtype == dtype
+    with_device, without = clrecon.smooth_mesh(mesh, 20, 0.25, device=device), clrecon.smooth_mesh(mesh, 20, 0.25)
+    np.testing.assert_array_equal(with_device.vertices, without.vertices)
+    np.testing.assert_array_equal(with_device.normals, without.normals)
+    assert with_device.report == without.report
+
+
+def test_smoothing_takes_two_fifths_off_the_roughness(device):
+    report = clrecon.smooth_mesh(rough_spheres_that_nearly_touch(0.0), 20, 0.25, device=device).report
+    roughness = report["refinement"]["smooth"]
+    assert roughness["roughness_after_mm"] < 0.6 * roughness["roughness_before_mm"]
+
+
+def test_a_mesh_is_smoothed_by_the_host_where_the_device_has_no_room(device, monkeypatch):
     vertices, triangles = samples.sphere((0, 0, 0), 20.0, 3)
     mesh = Mesh(rough(vertices), triangles)
     expected = clrecon.smooth_mesh(mesh, 5, 0.25, device=device)
