@@ -66,7 +66,7 @@ def fitted_shell(request, shell_spacing, device):
     return request.param, *fit_surface(volume, device, constants=of_thick.constants)
 
 
-def test_fitted_shell_lies_nearer_to_the_bone_than_the_surface_of_a_level(fitted_shell):
+def test_fitted_shell_is_nearer_to_bone_than_the_level(fitted_shell):
     _, mesh, fit = fitted_shell
     away, rows = outer_places(mesh, fit)
     away_of_level = np.linalg.norm(mesh.vertices[rows] - MIDDLE, axis=1) - OUTER_RADIUS
