@@ -71,7 +71,8 @@ SHOWN_BY = {
     "operators/masks/enclosed.py": "operators/masks/test_enclosed.py::test_the_default_seal_follows_voxels_and_bone",
     "operators/rays/point_pictures.py": "operators/rays/test_point_pictures.py"
     "::test_discs_are_as_large_as_points_lie_apart",
-    "operators/surface/cortex.py": "operators/surface/test_cortex.py::test_fitted_shell_is_nearer_to_bone_than_the_level",
+    "operators/surface/cortex.py": "operators/surface/test_cortex.py"
+    "::test_fitted_shell_is_nearer_to_bone_than_the_level",
 }
 """The test that shows what is said of a module whose constants follow the voxel or the values."""
 
