@@ -63,10 +63,12 @@ VALUES = {"anatomy/iso_choice.py": SCALED, "anatomy/materials.py": SCALED}
 """What the constants in HU of a module follow, where they do not mean HU alone."""
 
 SHOWN_BY = {
-    "anatomy/body.py": "anatomy/test_body_bone.py::test_a_block_of_micro_ct_is_kept_whole",
+    "anatomy/body.py": "anatomy/test_body_bone.py::test_a_block_of_micro_ct_with_large_cells_stays_whole",
     "anatomy/body_cells.py": "anatomy/test_body_cells.py::test_counts_of_cells_hold_every_voxel_of_micro_ct",
-    "anatomy/iso_choice.py": "anatomy/test_iso_choice.py::test_two_materials_are_found_on_any_scale",
-    "anatomy/materials.py": "anatomy/test_iso_choice.py::test_two_materials_are_found_on_any_scale",
+    "anatomy/iso_choice.py": "anatomy/test_iso_choice.py"
+    "::test_iso_value_of_any_scale_lies_half_way_between_two_materials",
+    "anatomy/materials.py": "anatomy/test_iso_choice.py"
+    "::test_iso_value_of_any_scale_lies_half_way_between_two_materials",
     "labels/structures.py": "labels/test_structure_sets.py::test_contours_may_be_a_tenth_of_the_step_off",
     "operators/masks/enclosed.py": "operators/masks/test_enclosed.py::test_the_default_seal_follows_voxels_and_bone",
     "operators/rays/point_pictures.py": "operators/rays/test_point_pictures.py"

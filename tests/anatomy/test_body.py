@@ -15,8 +15,8 @@ from clrecon.geometry import AIR_HU, Volume
 SPACING = (2.0, 1.8, 2.5)
 
 
-def widen_by_six(patient):
-    """The margin around a patient, in whole cells of two voxels."""
+def add_margin(patient):
+    """A patient with the margin of 6 cells of two voxels around it that is never removed."""
     near = patient.copy()
     for _ in range(6):
         near[1:] |= near[:-1].copy()
@@ -26,122 +26,168 @@ def widen_by_six(patient):
     return near
 
 
-@pytest.mark.parametrize("lungs", [False, True])
-@pytest.mark.parametrize("gap", [1.0, 6.0, 25.0])
-def test_the_table_goes_and_the_patient_stays_to_the_bit(gap, lungs):
+with_and_without_lungs = pytest.mark.parametrize("lungs", [False, True], ids=["no lungs", "lungs"])
+gap_below_the_back = pytest.mark.parametrize("gap_mm", [1.0, 6.0, 25.0])
+
+
+@pytest.fixture
+def patient_on_a_table(gap_mm, lungs):
+    """The scan, the mask of the patient in its slices, and that of the table."""
     hu, patient = make_patient(lungs)
-    table = add_table(hu, patient, gap)
-    volume = as_volume(hu)
-    before = volume.voxels.copy()
+    table = add_table(hu, patient, gap_mm)
+    return as_volume(hu), patient, table
+
+
+@with_and_without_lungs
+@gap_below_the_back
+def test_the_patient_stays_to_the_bit_where_a_table_is_removed(patient_on_a_table):
+    volume, patient, _ = patient_on_a_table
     cleaned = remove_table(volume)
-    near = widen_by_six(patient)
-    assert np.array_equal(volume.voxels, before)  # the input is not touched
-    assert np.array_equal(cleaned.voxels[:, patient], before[:, patient])
-    assert (table & ~near).any() and not (cleaned.voxels[:, ~near] >= -300).any()
+    assert np.array_equal(cleaned.voxels[:, patient], volume.voxels[:, patient])
 
 
-@pytest.mark.parametrize("lungs", [False, True])
-def test_a_table_farther_away_than_the_margin_goes_as_a_whole(lungs):
-    hu, patient = make_patient(lungs)
-    table = add_table(hu, patient, 25.0)
-    assert not (remove_table(as_volume(hu)).voxels[:, table] >= -300).any()
+@with_and_without_lungs
+@gap_below_the_back
+def test_the_table_is_removed_outside_of_the_margin_around_the_patient(patient_on_a_table):
+    volume, patient, table = patient_on_a_table
+    outside = ~add_margin(patient)
+    assert (table & outside).any()
+    assert not (remove_table(volume).voxels[:, outside] >= -300).any()
 
 
-@pytest.mark.parametrize("lungs", [False, True])
-@pytest.mark.parametrize("gap", [1.0, 6.0, 25.0])
-def test_report_of_a_removed_table_counts_what_lies_outside_of_the_body(gap, lungs):
-    hu, patient = make_patient(lungs)
-    add_table(hu, patient, gap)
-    volume = as_volume(hu)
+@with_and_without_lungs
+@gap_below_the_back
+def test_removing_a_table_leaves_the_given_scan_as_it_is(patient_on_a_table):
+    volume, _, _ = patient_on_a_table
+    before = volume.voxels.copy()
+    remove_table(volume)
+    assert np.array_equal(volume.voxels, before)
+
+
+@with_and_without_lungs
+@pytest.mark.parametrize("gap_mm", [25.0])
+def test_a_table_farther_away_than_the_margin_is_removed_as_a_whole(patient_on_a_table):
+    volume, _, table = patient_on_a_table
+    assert not (remove_table(volume).voxels[:, table] >= -300).any()
+
+
+@with_and_without_lungs
+@gap_below_the_back
+def test_all_voxels_outside_of_the_body_become_the_reported_air_and_are_counted(patient_on_a_table):
+    volume, _, _ = patient_on_a_table
     cleaned = remove_table(volume)
     facts = cleaned.report["remove_table"]
     body, step = find_body(volume)
     assert step == (1, 1, 1)
-    assert facts["voxels_removed"] == np.count_nonzero(~body)
     assert (cleaned.voxels[~body] == facts["air_hu"]).all()
-    assert facts["dense_voxels_removed"] > 1000
+    assert facts["voxels_removed"] == np.count_nonzero(~body)
+    assert facts["dense_voxels_removed"] == np.count_nonzero(volume.voxels[~body] >= -300)
 
 
-def test_bone_surface_within_the_body_is_the_same_surface():
+def test_the_surface_of_bone_is_that_of_the_same_patient_without_a_table():
     from clrecon.proof.surface.extract import extract_isosurface
 
     hu, patient = make_patient(arms=False)
-    plain = as_volume(hu)
+    without_table = as_volume(hu)
     add_table(hu, patient, 12.0)
-    expected = extract_isosurface(plain, 250)
-    found = extract_isosurface(remove_table(as_volume(hu)), 250)
-    assert len(expected[0]) == len(found[0]) > 1000
-    assert all(np.array_equal(one, other) for one, other in zip(expected, found, strict=True))
+    vertices, normals, triangles = extract_isosurface(remove_table(as_volume(hu)), 250)
+    expected = extract_isosurface(without_table, 250)
+    assert len(vertices) > 1000
+    np.testing.assert_array_equal(vertices, expected[0])
+    np.testing.assert_array_equal(normals, expected[1])
+    np.testing.assert_array_equal(triangles, expected[2])
 
 
-@pytest.mark.parametrize("padded", [False, True])
-def test_a_chest_that_the_circle_cuts_keeps_its_wall(padded):
-    """The lungs lie open at the border of the scan, and ribs hang on walls of 14 mm."""
+def test_a_chest_that_the_circle_of_reconstruction_cuts_keeps_its_wall():
+    """The lungs lie open at the border of the circle, ribs hang on walls of 14 mm, and padding lies outside."""
     hu, patient = make_patient(lungs=True, arms=False)
     add_table(hu, patient, 6.0)
     outside = np.hypot(X, Y) > 98.0
     hu[:, outside] = -1000.0
     volume = as_volume(hu)
-    volume.voxels[:, outside] = -1000 if padded else hu[:, outside]
-    cleaned = remove_table(volume)
     inside = patient & ~outside
-    assert np.array_equal(cleaned.voxels[:, inside], volume.voxels[:, inside])
+    assert np.array_equal(remove_table(volume).voxels[:, inside], volume.voxels[:, inside])
 
 
-def test_a_cropped_scan_has_no_outside():
+def test_nothing_is_removed_from_a_scan_that_shows_nothing_outside_of_the_body():
     hu, _ = make_patient(lungs=True, arms=False)
-    volume = as_volume(hu[:, 57:105, 60:140])  # below the bubble
-    assert np.array_equal(remove_table(volume).voxels, volume.voxels)
-    assert remove_table(volume).report["remove_table"]["removed_share"] == 0.0
+    within_the_trunk = as_volume(hu[:, 57:105, 60:140])  # below the bubble of gas
+    cleaned = remove_table(within_the_trunk)
+    assert np.array_equal(cleaned.voxels, within_the_trunk.voxels)
+    assert cleaned.report["remove_table"]["removed_share"] == 0.0
 
 
-def test_uneven_slices_types_and_report_stay():
+@pytest.fixture
+def uneven_scan():
+    """A patient on a table in float32 and slices 1 to 4 mm apart, with entries in its report."""
     hu, patient = make_patient()
     add_table(hu, patient)
-    positions = AFFINE[:3, 3] + np.cumsum(np.linspace(1.0, 4.0, SHAPE[0]))[:, None] * np.array([0.0, 0.0, 1.0])
-    volume = Volume(hu.astype(np.float32), AFFINE, {"warnings": ["one"], "tilt_deg": 3.0}, positions)
-    cleaned = remove_table(volume)
-    assert cleaned.voxels.dtype == np.float32 and cleaned.uneven
-    assert np.array_equal(cleaned.slice_origins(), volume.slice_origins())
+    heights = np.cumsum(np.linspace(1.0, 4.0, SHAPE[0]))
+    positions = AFFINE[:3, 3] + heights[:, None] * np.array([0.0, 0.0, 1.0])
+    return Volume(hu.astype(np.float32), AFFINE, {"warnings": ["one"], "tilt_deg": 3.0}, positions)
+
+
+def test_type_and_positions_of_uneven_slices_stay_where_a_table_is_removed(uneven_scan):
+    cleaned = remove_table(uneven_scan)
+    assert cleaned.voxels.dtype == np.float32
+    assert cleaned.uneven
+    assert np.array_equal(cleaned.slice_origins(), uneven_scan.slice_origins())
+
+
+def test_report_of_a_removed_table_keeps_other_entries_and_the_given_report_stays(uneven_scan):
+    cleaned = remove_table(uneven_scan)
     assert (cleaned.report["warnings"], cleaned.report["tilt_deg"]) == (["one"], 3.0)
-    assert "remove_table" not in volume.report
+    assert "remove_table" in cleaned.report
+    assert "remove_table" not in uneven_scan.report
 
 
-def test_what_becomes_air_has_the_level_of_the_air_there():
+def test_removed_voxels_become_the_level_of_the_air_of_the_scan():
     """No iso value shows where the mask ends, but those in the noise of the air itself."""
-    hu, patient = make_patient()
+    hu, _ = make_patient()
     hu[hu < -900] += 12.0  # the air of this scan: -988 HU
-    cleaned = remove_table(as_volume(hu))
-    assert cleaned.report["remove_table"]["air_hu"] == pytest.approx(-988, abs=1)
+    assert remove_table(as_volume(hu)).report["remove_table"]["air_hu"] == pytest.approx(-988, abs=1)
 
 
-def test_nothing_thick_is_no_body():
+def test_a_scan_without_anything_14_mm_thick_is_refused():
     hu = np.full(SHAPE, -1000.0)
-    hu[:, 100:102] = 300.0
+    two_rows = np.s_[:, 100:102]
+    hu[two_rows] = 300.0
     with refused(RefusedInputError, -300, 14):
         remove_table(as_volume(hu))
 
 
 # --- field of view ---
-@pytest.mark.parametrize(("radius", "expected"), [(None, 153.0), (80.0, 80.0), (400.0, 400.0)])
-def test_outside_of_the_circle_is_air(radius, expected):
-    hu, _ = make_patient()
-    volume = as_volume(hu)
-    masked = mask_field_of_view(volume, radius)
+circles = pytest.mark.parametrize(
+    ("radius_mm", "expected_mm"),
+    [(None, 170 * 1.8 / 2), (80.0, 80.0), (400.0, 400.0)],
+    ids=["circle of the scan", "80 mm", "beyond the slice"],
+)
+
+
+@circles
+def test_voxels_outside_of_the_circle_become_air_and_those_inside_stay(radius_mm, expected_mm):
+    volume = as_volume(make_patient()[0])
+    masked = mask_field_of_view(volume, radius_mm)
     distance = np.hypot(X, Y)
-    assert np.array_equal(masked.voxels[:, distance < expected - 1e-6], volume.voxels[:, distance < expected - 1e-6])
-    outside = distance > expected + 1e-6
-    facts = masked.report["field_of_view"]
-    assert facts["radius_mm"] == expected
+    inside, outside = distance < expected_mm - 1e-6, distance > expected_mm + 1e-6
+    assert np.array_equal(masked.voxels[:, inside], volume.voxels[:, inside])
+    assert (masked.voxels[:, outside] == masked.report["field_of_view"]["air_hu"]).all()
+
+
+@circles
+def test_report_of_a_circle_has_its_radius_and_counts_the_voxels_outside(radius_mm, expected_mm):
+    facts = mask_field_of_view(as_volume(make_patient()[0]), radius_mm).report["field_of_view"]
+    outside = np.hypot(X, Y) > expected_mm + 1e-6
+    assert facts["radius_mm"] == pytest.approx(expected_mm)
     assert facts["voxels_removed"] == SHAPE[0] * np.count_nonzero(outside)
-    assert facts["removed_share"] == pytest.approx(outside.mean(), abs=1e-4)
-    assert (masked.voxels[:, outside] == facts["air_hu"]).all()
+    assert facts["removed_share"] == pytest.approx(outside.mean(), abs=1e-4)  # four digits are kept
 
 
-def test_types_that_cannot_hold_air_get_their_lowest_value():
-    volume = Volume(np.full((2, 9, 9), 200, np.uint8), np.eye(4))
-    assert mask_field_of_view(volume, 2.0).voxels[0, 0, 0] == 0
-    assert mask_field_of_view(Volume(np.full((2, 9, 9), 200, np.int16), np.eye(4)), 2.0).voxels[0, 0, 0] == AIR_HU
+@pytest.mark.parametrize(("dtype", "value"), [(np.uint8, 0), (np.int16, AIR_HU)])
+def test_outside_of_the_circle_is_air_or_the_lowest_value_that_the_type_holds(dtype, value):
+    volume = Volume(np.full((2, 9, 9), 200, dtype), np.eye(4))
+    corner = mask_field_of_view(volume, 2.0).voxels[0, 0, 0]
+    assert corner == value
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, np.nan, 0.1])
@@ -152,14 +198,21 @@ def test_circles_without_a_voxel_are_refused(radius):
 
 
 # --- real scans ---
-@pytest.mark.parametrize(("folder", "table_voxels"), [("lumbar_4p25mm", 40_000), ("thoracic_0p8mm", 2_000)])
-def test_real_tables_go_and_real_bone_stays(real_data, folder, table_voxels):
-    """What is as dense as bone may only go below the back, and at the raised rims of the table beside it."""
+def test_of_real_scans_only_dense_voxels_below_the_back_and_at_the_rims_of_the_table_are_removed(
+    real_data, folder, table_voxels
+):
+    """The back lies above row 390, and the raised rims of the table 190 columns from the middle."""
     volume = clrecon.read_volume(real_data / folder)
     cleaned = clrecon.remove_table(volume)
-    gone = (cleaned.voxels != volume.voxels) & (volume.voxels >= 250)
-    assert np.count_nonzero(gone) > table_voxels
-    _, rows, columns = np.nonzero(gone)
+    removed = (cleaned.voxels != volume.voxels) & (volume.voxels >= 250)
+    _, rows, columns = np.nonzero(removed)
+    assert len(rows) > table_voxels
     assert ((rows >= 390) | (abs(columns - 255.5) > 190)).all()
-    below = cleaned.voxels[:, 430:]
-    assert np.count_nonzero(below >= 250) == 0
+
+
+@pytest.mark.parametrize("folder", ["lumbar_4p25mm", "thoracic_0p8mm"])
+def test_no_dense_voxel_is_left_in_the_lowest_rows_of_real_scans(real_data, folder):
+    lowest_rows = np.s_[:, 430:]
+    volume = clrecon.read_volume(real_data / folder)
+    assert (volume.voxels[lowest_rows] >= 250).any()
+    assert not (clrecon.remove_table(volume).voxels[lowest_rows] >= 250).any()

@@ -19,7 +19,7 @@ from clrecon.labels import LabelMap
 from clrecon.proof.phantom import MATERIALS, PhantomSettings, label_materials, make_phantom, write_phantom
 
 COARSE: dict[str, Any] = {"size": (96, 96), "slices": 48, "spacing": (2.4, 2.4, 3.5)}
-SAID = "a surface of the skin can show a face: treat the file as one that identifies the patient"
+FACE_WARNING = "a surface of the skin can show a face: treat the file as one that identifies the patient"
 
 
 @cache
@@ -27,125 +27,242 @@ def phantom(kind: str, **settings: Any) -> Volume:
     return Volume(*make_phantom(PhantomSettings(kind=kind, **{**COARSE, **settings}))[:2])
 
 
+def pelvis() -> Volume:
+    return phantom("pelvis", spacing=(4.0, 4.0, 4.0))
+
+
+@pytest.mark.fault_row(70)
 @pytest.mark.parametrize(
     "kind", daily(5, ["head", "skull", "bones", "limb", "pair", "pelvis", "contrast", "water", "spine", "sphere"])
 )
-def test_row_70_heads_are_told_from_other_bodies(kind: str) -> None:
-    spacing = {"pelvis": (4.0, 4.0, 4.0), "contrast": (3.8, 3.8, 5.0), "spine": (2.7, 2.7, 3.2)}.get(
-        kind, COARSE["spacing"]
-    )
-    assert (find_head(phantom(kind, spacing=spacing)) is True) == (kind == "head")
+def test_of_ten_bodies_the_head_alone_is_found_to_be_one(kind: str) -> None:
+    coarse_enough = {"pelvis": (4.0, 4.0, 4.0), "contrast": (3.8, 3.8, 5.0), "spine": (2.7, 2.7, 3.2)}
+    volume = phantom(kind, spacing=coarse_enough.get(kind, COARSE["spacing"]))
+    assert (find_head(volume) is True) == (kind == "head")
 
 
+@pytest.mark.fault_row(70)
 @pytest.mark.parametrize(
     "settings", daily(1, [{"tilt": 20.0}, {"prone": True}, {"table": "headrest"}]), ids=lambda given: next(iter(given))
 )
-def test_row_70_head_is_found_in_any_position(settings: dict[str, Any]) -> None:
+def test_a_head_is_found_when_tilted_when_prone_and_on_a_headrest(settings: dict[str, Any]) -> None:
     assert find_head(phantom("head", **settings)) is True
 
 
+@pytest.mark.fault_row(70)
 @pytest.mark.parametrize("axes", [(0, 1, 2), (1, 0, 2), (2, 1, 0)], ids=["axial", "coronal", "sagittal"])
 @pytest.mark.parametrize(
     ("kind", "spacing", "is_head"), [("head", (2.4, 2.4, 3.5), True), ("pelvis", (4.0, 4.0, 4.0), False)]
 )
-def test_row_70_heads_are_told_from_trunks_in_slices_along_any_axis(
+def test_heads_are_told_from_trunks_in_slices_along_any_axis(
     kind: str, spacing: tuple[float, ...], is_head: bool, axes: tuple[int, int, int]
 ) -> None:
     volume = phantom(kind, spacing=spacing)
     affine = volume.affine.copy()
-    affine[:3, :3] = volume.affine[:3, 2::-1][:, list(axes)][:, ::-1]
+    steps_kji = volume.affine[:3, 2::-1]
+    affine[:3, :3] = steps_kji[:, list(axes)][:, ::-1]
     assert find_head(Volume(np.transpose(volume.voxels, axes), affine)) is is_head
 
 
-def test_row_70_every_level_below_bone_is_warned_of() -> None:
-    head, spine = phantom("head"), phantom("pelvis", spacing=(4.0, 4.0, 4.0))
-    levels = (-1000.0, -950.0, -500.0, -200.0, -100.0, 0.0, 50.0, 100.0, 150.0, 151.0, 300.0)
-    assert [shows_face(head, level) for level in levels] == [False, *[True] * 8, False, False]
-    assert not any(shows_face(spine, level) for level in levels)
-    unknown = phantom("limb")  # as before: nothing says that it is no face
-    assert [shows_face(unknown, level) for level in levels] == [False, *[True] * 3, *[False] * 7]
-    assert warn_of_face(head, [None, 400.0], "surface") == [] and warn_of_face(head, [None, 40.0], "surface") == [SAID]
+LEVELS = (-1000.0, -950.0, -500.0, -200.0, -100.0, 0.0, 50.0, 100.0, 150.0, 151.0, 300.0)
+SKIN_LEVELS = {-950.0, -500.0, -200.0, -100.0, 0.0, 50.0, 100.0, 150.0}
+LEVELS_BETWEEN_AIR_AND_FAT = {-950.0, -500.0, -200.0}
 
 
+def list_face_levels(volume: Volume) -> set[float]:
+    return {level for level in LEVELS if shows_face(volume, level)}
+
+
+@pytest.mark.fault_row(70)
+def test_a_head_shows_a_face_at_every_level_between_air_and_bone() -> None:
+    assert list_face_levels(phantom("head")) == SKIN_LEVELS
+
+
+@pytest.mark.fault_row(70)
+def test_a_trunk_shows_no_face_at_any_level() -> None:
+    assert list_face_levels(pelvis()) == set()
+
+
+@pytest.mark.fault_row(70)
+def test_a_body_that_may_be_a_face_shows_one_at_levels_between_air_and_fat() -> None:
+    assert find_head(phantom("limb")) is None
+    assert list_face_levels(phantom("limb")) == LEVELS_BETWEEN_AIR_AND_FAT
+
+
+@pytest.mark.fault_row(70)
+@pytest.mark.parametrize(("level", "warnings"), [(400.0, []), (40.0, [FACE_WARNING])], ids=["bone", "skin"])
+def test_a_surface_of_a_head_is_warned_of_at_the_level_of_skin(level: float, warnings: list[str]) -> None:
+    assert warn_of_face(phantom("head"), [None, level], "surface") == warnings
+
+
+@pytest.mark.fault_row(70)
 @pytest.mark.release
 @pytest.mark.seconds
-def test_row_70_meshes_of_python_warn_of_a_face(device: Any) -> None:
-    head = phantom("head")
+@pytest.mark.parametrize(
+    ("kind", "level", "options", "warnings"),
+    [
+        ("head", -100, {}, [FACE_WARNING]),
+        ("head", 20, {}, [FACE_WARNING]),
+        ("head", 100, {}, [FACE_WARNING]),
+        ("head", (-150, -30), {}, [FACE_WARNING]),
+        ("head", -300, {"below": True}, [FACE_WARNING]),
+        ("head", 300, {}, []),
+        ("head", (200, 400), {}, []),
+        ("pelvis", 50, {}, []),
+    ],
+    ids=["fat", "skin", "muscle", "range of fat", "below fat", "bone", "range of bone", "pelvis"],
+)
+def test_report_of_a_mesh_warns_of_a_face_at_levels_of_the_skin_of_a_head(
+    kind: str, level: Any, options: dict[str, Any], warnings: list[str], device: Any
+) -> None:
+    volume = pelvis() if kind == "pelvis" else phantom(kind)
+    mesh = clrecon.extract_isosurface(volume, level, device=device, **options)
+    assert [text for text in mesh.report["warnings"] if "face" in text] == warnings
 
-    def warnings(level: Any, volume: Volume = head, **given: Any) -> list[str]:
-        mesh = clrecon.extract_isosurface(volume, level, device=device, **given)
-        return [text for text in mesh.report["warnings"] if "face" in text]
 
-    assert [warnings(level) for level in (-100, 20, 100)] == [[SAID]] * 3
-    assert warnings((-150, -30)) == warnings(-300, below=True) == [SAID]
-    assert warnings(300) == warnings((200, 400)) == warnings(50, phantom("pelvis", spacing=(4.0, 4.0, 4.0))) == []
+@pytest.fixture(scope="module")
+def head_series(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("head") / "ct"
+    write_phantom(folder, PhantomSettings(kind="head", **COARSE))
+    return folder
 
 
+def count_face_warnings(capsys: pytest.CaptureFixture[str], device: Any, *arguments: str) -> int:
+    """Run a command, which succeeds, and count its lines on standard error that warn of a face."""
+    assert main([*arguments, "--device", str(device.index)]) == 0
+    return capsys.readouterr().err.count("can show a face")
+
+
+@pytest.mark.fault_row(70)
 @pytest.mark.release
 @pytest.mark.slow
-def test_row_70_commands_warn_of_a_face_once(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_phantom(tmp_path / "ct", PhantomSettings(kind="head", **COARSE))
-
-    def said(*arguments: str) -> int:
-        assert main([*arguments, "--device", str(device.index)]) == 0
-        return capsys.readouterr().err.count("can show a face")
-
-    mesh = ("mesh", str(tmp_path / "ct"), "-o", str(tmp_path / "a.stl"), "--hu")
-    assert [said(*mesh, level) for level in ("-50", "100", "-100,100", "300")] == [1, 1, 1, 0]
-    render = ("render", str(tmp_path / "ct"), "-o", str(tmp_path / "a.png"), "--size", "64")
-    looks = (["--iso", "0"], ["--preset", "muscle"], ["--preset", "bone"], ["--iso", "300"], ["--mode", "slice"])
-    assert [said(*render, *look) for look in looks] == [1, 1, 0, 0, 0]
-
-
-def test_row_70_the_skin_that_a_surface_shows_is_measured() -> None:
-    """Of a plate amid air one half is skin; in a closed case of plates all its surface is apart from the air around."""
-    k, j, i = np.indices((40, 40, 40))
-    plate = np.where((k >= 20) & (k < 24), 40, -1000).astype(np.int16)
-    square = np.array([[10.0, 10.0, 23.5], [30.0, 10.0, 23.5], [30.0, 30.0, 23.5], [10.0, 30.0, 23.5]]) * 2.0
-    upwards = np.array([[0, 1, 2], [0, 2, 3]])
-    volume = Volume(plate, np.diag([2.0, 2.0, 2.0, 1.0]))
-    assert measure_skin(volume, square, upwards) == pytest.approx(16.0)  # 40 mm x 40 mm
-    assert measure_skin(volume, square, upwards[:, ::-1]) == 0.0
-    case = (abs(k - 20) < 18) & (abs(j - 20) < 18) & (abs(i - 20) < 18) & (plate < 0)
-    hollow = np.where(case & ~((abs(k - 20) < 15) & (abs(j - 20) < 15) & (abs(i - 20) < 15)), 40, plate)
-    assert measure_skin(Volume(hollow, volume.affine), square, upwards) == 0.0
-    for side, area in ((8.0, 0.0), (24.0, 16.0)):  # mm of a passage through the lid
-        drilled = np.where((k >= 34) & (abs(j - 20) < side / 4) & (abs(i - 20) < side / 4), -1000, hollow)
-        assert measure_skin(Volume(drilled, volume.affine), square, upwards) == pytest.approx(area, abs=1.0)
-
-
-@pytest.mark.slow
-def test_row_70_surfaces_of_labels_warn_of_a_face(
-    device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("levels", "warnings"), [("-50", 1), ("100", 1), ("-100,100", 1), ("300", 0)])
+def test_command_mesh_warns_once_of_levels_of_the_skin_of_a_head(
+    levels: str, warnings: int, head_series: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    settings = PhantomSettings(kind="head", **COARSE)
-    head = Volume(phantom("head").voxels, phantom("head").affine)  # of which nothing is known yet
-    map_ = LabelMap(label_materials(settings), head.affine)
-    tissue, bone = MATERIALS.index("tissue"), MATERIALS.index("bone")
-
-    def told(iso_value: float) -> dict[int, int]:
-        meshes = clrecon.extract_labels(head, map_, iso_value, label=[tissue, bone], device=device)
-        return {number: mesh.report["warnings"].count(SAID) for number, mesh in meshes.items()}
-
-    looks: list[int] = []
-    thin = ndimage.minimum_filter
-    monkeypatch.setattr(ndimage, "minimum_filter", lambda air, **how: looks.append(air.size) or thin(air, **how))
-    assert told(-100.0) == {tissue: 1, bone: 0} and told(200.0)[bone] == 0
-    assert len(looks) == 1  # for all labels
-    write_phantom(tmp_path / "ct", settings)
-    for number, count in ((tissue, 1), (bone, 0)):
-        given = ["--labels", str(tmp_path / "ct" / "materials.nrrd"), "--label", str(number), "--surface", "mask"]
-        assert (
-            main(["mesh", str(tmp_path / "ct"), "-o", str(tmp_path / "a.stl"), *given, "--device", str(device.index)])
-            == 0
-        )
-        assert capsys.readouterr().err.count("can show a face") == count
+    command = ("mesh", str(head_series), "-o", str(tmp_path / "a.stl"), "--hu", levels)
+    assert count_face_warnings(capsys, device, *command) == warnings
 
 
+@pytest.mark.fault_row(70)
+@pytest.mark.release
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "found"), daily_rows(2, [("head_tilt_gaps", True), ("lumbar_4p25mm", False), ("thoracic_0p8mm", False)])
+    ("look", "warnings"),
+    [
+        (("--iso", "0"), 1),
+        (("--preset", "muscle"), 1),
+        (("--preset", "bone"), 0),
+        (("--iso", "300"), 0),
+        (("--mode", "slice"), 0),
+    ],
+    ids=["iso of skin", "preset muscle", "preset bone", "iso of bone", "slice"],
 )
-def test_row_70_heads_are_told_from_trunks_in_real_scans(name: str, found: bool, real_data: Path) -> None:
+def test_command_render_warns_once_of_looks_that_show_the_skin_of_a_head(
+    look: tuple[str, str],
+    warnings: int,
+    head_series: Path,
+    device: Any,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    command = ("render", str(head_series), "-o", str(tmp_path / "a.png"), "--size", "64", *look)
+    assert count_face_warnings(capsys, device, *command) == warnings
+
+
+SLICE, ROW, COLUMN = np.indices((40, 40, 40))
+PLATE = np.where((SLICE >= 20) & (SLICE < 24), 40, -1000).astype(np.int16)
+"""Tissue in four slices, in voxels of 2 mm; air elsewhere."""
+SQUARE = 2.0 * np.array([[10.0, 10.0, 23.5], [30.0, 10.0, 23.5], [30.0, 30.0, 23.5], [10.0, 30.0, 23.5]])
+"""Corners, in mm, of a square of 40 x 40 mm at the upper face of the plate."""
+SQUARE_CM2 = 4.0 * 4.0
+UPWARDS = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def add_case(tissue: np.ndarray, passage_mm: float = 0.0) -> Volume:
+    """A closed case of tissue, three voxels thick, around the plate, with a square passage through its lid."""
+
+    def cube(half: int) -> np.ndarray:
+        return (abs(SLICE - 20) < half) & (abs(ROW - 20) < half) & (abs(COLUMN - 20) < half)
+
+    with_case = np.where(cube(18) & ~cube(15), 40, tissue)
+    passage = (SLICE >= 34) & (abs(ROW - 20) < passage_mm / 4) & (abs(COLUMN - 20) < passage_mm / 4)
+    return Volume(np.where(passage, -1000, with_case).astype(np.int16), np.diag([2.0, 2.0, 2.0, 1.0]))
+
+
+@pytest.mark.fault_row(70)
+@pytest.mark.parametrize(
+    ("triangles", "area_cm2"), [(UPWARDS, SQUARE_CM2), (UPWARDS[:, ::-1], 0.0)], ids=["towards air", "towards tissue"]
+)
+def test_a_surface_that_faces_the_air_around_is_skin(triangles: np.ndarray, area_cm2: float) -> None:
+    volume = Volume(PLATE, np.diag([2.0, 2.0, 2.0, 1.0]))
+    assert measure_skin(volume, SQUARE, triangles) == pytest.approx(area_cm2)
+
+
+@pytest.mark.fault_row(70)
+@pytest.mark.parametrize(
+    ("passage_mm", "area_cm2"), [(0.0, 0.0), (8.0, 0.0), (24.0, SQUARE_CM2)], ids=["closed", "narrow", "wide"]
+)
+def test_a_surface_inside_of_a_case_is_skin_only_behind_a_passage_wider_than_16_mm(
+    passage_mm: float, area_cm2: float
+) -> None:
+    area = measure_skin(add_case(PLATE, passage_mm), SQUARE, UPWARDS)
+    assert area == pytest.approx(area_cm2, abs=1.0)  # right to some cm2
+
+
+TISSUE_LABEL, BONE_LABEL = MATERIALS.index("tissue"), MATERIALS.index("bone")
+
+
+def count_label_warnings(head: Volume, iso_value: float, device: Any) -> dict[int, int]:
+    """The warnings of a face in the reports of the meshes of tissue and of bone."""
+    labels = LabelMap(label_materials(PhantomSettings(kind="head", **COARSE)), head.affine)
+    meshes = clrecon.extract_labels(head, labels, iso_value, label=[TISSUE_LABEL, BONE_LABEL], device=device)
+    return {number: mesh.report["warnings"].count(FACE_WARNING) for number, mesh in meshes.items()}
+
+
+@pytest.mark.fault_row(70)
+@pytest.mark.slow
+@pytest.mark.parametrize(("iso_value", "of_tissue"), [(-100.0, {TISSUE_LABEL: 1}), (200.0, {})], ids=["skin", "bone"])
+def test_a_mesh_of_labelled_skin_warns_of_a_face_and_one_of_bone_does_not(
+    iso_value: float, of_tissue: dict[int, int], device: Any
+) -> None:
+    warnings = count_label_warnings(phantom("head"), iso_value, device)
+    assert {**warnings, **of_tissue} == warnings
+    assert warnings[BONE_LABEL] == 0
+
+
+@pytest.mark.fault_row(70)
+@pytest.mark.slow
+def test_the_air_around_a_head_is_looked_for_once_for_all_labels(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    unknown_head = Volume(phantom("head").voxels, phantom("head").affine)  # of which nothing is remembered
+    searches: list[int] = []
+    minimum_filter = ndimage.minimum_filter
+
+    def count_searches(air: np.ndarray, **options: Any) -> np.ndarray:
+        searches.append(air.size)
+        return minimum_filter(air, **options)
+
+    monkeypatch.setattr(ndimage, "minimum_filter", count_searches)
+    count_label_warnings(unknown_head, -100.0, device)
+    assert len(searches) == 1
+
+
+@pytest.mark.fault_row(70)
+@pytest.mark.slow
+@pytest.mark.parametrize(("label", "warnings"), [(TISSUE_LABEL, 1), (BONE_LABEL, 0)], ids=["tissue", "bone"])
+def test_command_mesh_warns_of_a_face_in_the_mask_of_a_label(
+    label: int, warnings: int, head_series: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    labels = ("--labels", str(head_series / "materials.nrrd"), "--label", str(label), "--surface", "mask")
+    command = ("mesh", str(head_series), "-o", str(tmp_path / "a.stl"), *labels)
+    assert count_face_warnings(capsys, device, *command) == warnings
+
+
+@pytest.mark.fault_row(70)
+@pytest.mark.parametrize(
+    ("name", "is_head"), daily_rows(2, [("head_tilt_gaps", True), ("lumbar_4p25mm", False), ("thoracic_0p8mm", False)])
+)
+def test_a_real_head_shows_a_face_and_real_trunks_show_none(name: str, is_head: bool, real_data: Path) -> None:
     volume = clrecon.read_volume(real_data / name, allow_gaps=True)
-    assert find_head(volume) is found
-    assert [shows_face(volume, level) for level in (-500.0, 0.0, 100.0)] == [found] * 3
+    assert find_head(volume) is is_head
+    assert list_face_levels(volume) == (SKIN_LEVELS if is_head else set())

@@ -36,8 +36,8 @@ def phantom():
     return Volume(voxels, affine), canal.at(np.linspace(0.0, canal.length, 1500))
 
 
-def distances(points, line) -> np.ndarray:
-    """Of the points at heights of the line."""
+def distances_from_line(points, line) -> np.ndarray:
+    """Distances in mm of those of the points that lie at heights of the line."""
     curve = Curve(line.points)
     places = curve.at(np.linspace(0.0, curve.length, 2000))
     beside = points[(points[:, 2] <= places[0, 2]) & (points[:, 2] >= places[-1, 2])]
@@ -45,49 +45,85 @@ def distances(points, line) -> np.ndarray:
     return np.linalg.norm(beside[:, None] - places, axis=2).min(axis=1)
 
 
-def check_canal(line, canal) -> None:
-    away = distances(canal, line)
-    assert away.mean() <= tolerances.CANAL_MEAN_MM and away.max() <= tolerances.CANAL_MAX_MM
-    upper, lower = line.sure_mm
-    assert line.points[0, 2] >= upper > lower + 0.3 * line.height_mm and lower >= line.points[-1, 2]
-    assert len(line.points) == round((line.height_mm + CELL_MM[2]) / 15.0) + 1
+def check_lies_in_canal(line, canal) -> None:
+    away = distances_from_line(canal, line)
+    assert away.mean() <= tolerances.CANAL_MEAN_MM
+    assert away.max() <= tolerances.CANAL_MAX_MM
+
+
+@pytest.fixture(scope="module")
+def phantom_line(phantom):
+    return find_spine_line(phantom[0])
 
 
 @pytest.mark.release
 @pytest.mark.seconds
-def test_the_canal_of_the_phantom_is_found_over_its_whole_height(phantom):
-    volume, canal = phantom
-    line = find_spine_line(volume)
-    assert line.searched_mm == pytest.approx(60 * 2.5, abs=5.0) and line.height_mm >= 0.9 * line.searched_mm
-    assert line.sure_share > 0.9 and np.all(np.diff(line.points[:, 2]) < 0.0)
-    check_canal(line, canal)
+def test_the_line_of_a_phantom_lies_in_its_canal(phantom, phantom_line):
+    check_lies_in_canal(phantom_line, phantom[1])
+
+
+@pytest.mark.release
+@pytest.mark.seconds
+def test_the_line_of_a_phantom_is_found_over_its_whole_height_and_sure_over_most_of_it(phantom_line):
+    assert phantom_line.searched_mm == pytest.approx(60 * 2.5, abs=2 * 2.5)  # 60 slices of 2.5 mm
+    assert phantom_line.height_mm >= 0.9 * phantom_line.searched_mm
+    assert phantom_line.sure_share > 0.9
+
+
+@pytest.mark.release
+@pytest.mark.seconds
+def test_the_line_of_a_phantom_has_a_point_every_15_mm_from_top_to_bottom(phantom_line):
+    heights = phantom_line.points[:, 2]
+    assert (np.diff(heights) < 0.0).all()
+    assert len(heights) == round((phantom_line.height_mm + CELL_MM[2]) / 15.0) + 1
+
+
+@pytest.mark.release
+@pytest.mark.seconds
+def test_the_sure_part_of_a_line_lies_within_it(phantom_line):
+    upper, lower = phantom_line.sure_mm
+    first, last = phantom_line.points[[0, -1], 2]
+    assert first >= upper > lower >= last
 
 
 @pytest.mark.parametrize(
     ("cell", "more", "bends"),
-    # Straight on is free, a step aside costs 0.05, and one across the corner that times the root of 2: 0.0707.
     [((1, 2), 0.049, False), ((1, 2), 0.051, True), ((0, 0), 0.070, False), ((0, 0), 0.0715, True)],
+    ids=["aside for too little", "aside", "across the corner for too little", "across the corner"],
 )
-def test_a_bend_costs_its_length(cell, more, bends):
+def test_a_path_bends_to_a_cell_that_gains_more_than_the_length_of_the_bend_costs(cell, more, bends):
+    """Straight on is free, a step aside costs 0.05, and one across the corner that times the root of 2: 0.0707."""
+    middle = (1, 1)
     gain = np.full((2, 3, 3), -1.0, np.float32)
     gain[:, 1, 1] = 0.5
     gain[1][cell] = 0.5 + more
-    assert _best_path(gain).tolist() == [[0, 1, 1], [1, *(cell if bends else (1, 1))]]
+    assert _best_path(gain).tolist() == [[0, *middle], [1, *(cell if bends else middle)]]
 
 
 @pytest.mark.release
-def test_how_the_voxels_are_ordered_and_how_the_patient_lies_does_not_matter(phantom):
+def test_the_canal_is_found_where_i_and_k_run_the_other_way(phantom):
     volume, canal = phantom
     flip = np.eye(4)
     flip[:3, :3] = np.diag((-1.0, 1.0, -1.0))
     flip[:3, 3] = (volume.shape_ijk[0] - 1, 0.0, volume.shape_ijk[2] - 1)
-    check_canal(find_spine_line(Volume(volume.voxels[::-1, :, ::-1], volume.affine @ flip)), canal)
-    turned = np.eye(4)
-    turned[:3, :3] = rotation((8.0, 6.0, 4.0))
-    line = find_spine_line(Volume(volume.voxels, turned @ volume.affine))
-    check_canal(line, canal @ turned[:3, :3].T)
+    flipped = Volume(volume.voxels[::-1, :, ::-1], volume.affine @ flip)
+    check_lies_in_canal(find_spine_line(flipped), canal)
+
+
+@pytest.mark.release
+def test_the_canal_of_a_patient_who_lies_askew_is_found(phantom):
+    volume, canal = phantom
+    turn = np.eye(4)
+    turn[:3, :3] = rotation((8.0, 6.0, 4.0))  # degrees
+    turned = Volume(volume.voxels, turn @ volume.affine)
+    check_lies_in_canal(find_spine_line(turned), canal @ turn[:3, :3].T)
+
+
+@pytest.mark.release
+def test_the_canal_is_found_in_sagittal_slices(phantom):
+    volume, canal = phantom
     sagittal = Volume(volume.voxels.transpose(2, 0, 1), volume.affine[:, [1, 2, 0, 3]])
-    check_canal(find_spine_line(sagittal), canal)
+    check_lies_in_canal(find_spine_line(sagittal), canal)
 
 
 def test_a_canal_with_more_of_the_body_behind_it_than_in_front_is_found(phantom):
@@ -97,17 +133,17 @@ def test_a_canal_with_more_of_the_body_behind_it_than_in_front_is_found(phantom)
     voxels = np.array(volume.voxels)
     voxels[:, : row - 30] = -1000
     voxels[:, row:-8][voxels[:, row:-8] < -200] = 40
-    check_canal(find_spine_line(Volume(voxels, volume.affine)), canal)
+    check_lies_in_canal(find_spine_line(Volume(voxels, volume.affine)), canal)
 
 
-def test_uneven_slices_are_where_they_are(phantom):
+def test_the_canal_is_found_where_every_fourth_slice_is_missing(phantom):
     volume, canal = phantom
     kept = np.flatnonzero(np.arange(60) % 4 != 1)
     uneven = Volume(volume.voxels[kept], volume.affine, slice_positions=volume.slice_origins()[kept])
-    check_canal(find_spine_line(uneven), canal)
+    check_lies_in_canal(find_spine_line(uneven), canal)
 
 
-def made_up(name: str, phantom) -> Volume:
+def make_scan_without_a_spine(name: str, phantom) -> Volume:
     k, j, i = np.indices((60, 80, 80))
     random = np.random.default_rng(1)
     grid = np.diag((2.5, 2.5, 2.5, 1.0))
@@ -131,65 +167,94 @@ def made_up(name: str, phantom) -> Volume:
 
 
 @pytest.mark.parametrize("name", daily(5, ["air", "noise", "ball", "skull", "one voxel", "mirrored", "front", "short"]))
-def test_scan_without_a_sure_spine_is_refused_and_points_are_asked_for(phantom, name):
+def test_a_scan_without_a_sure_spine_is_refused_and_points_are_asked_for(phantom, name):
     with refused(RefusedInputError, "points"):
-        find_spine_line(made_up(name, phantom))
+        find_spine_line(make_scan_without_a_spine(name, phantom))
+
+
+def check_lies_in_real_canal(line, canal) -> None:
+    away = distances_from_line(canal, line)
+    assert away.mean() <= tolerances.REAL_CANAL_MEAN_MM
+    assert away.max() <= tolerances.REAL_CANAL_MAX_MM
 
 
 @pytest.mark.release
 @pytest.mark.slow
-def test_spine_line_lies_in_the_labelled_canal_of_real_scans(real_data):
-    """The cord, as a network drew it at 2 mm; and the holes that vertebrae enclose at 3 mm."""
+def test_the_line_of_a_real_scan_lies_in_the_cord_that_a_network_drew(real_data):
     folder = real_data / "thoracolumbar_labels"
     labels = read_labels(folder / "ct_2mm_labels.nii.gz")
-    cord = [
-        (*np.argwhere(plane)[:, ::-1].mean(axis=0), k) for k, plane in enumerate(labels.voxels == 79) if plane.any()
+    cord_label = 79
+    middles = [
+        (*np.argwhere(plane == cord_label)[:, ::-1].mean(axis=0), k)
+        for k, plane in enumerate(labels.voxels)
+        if (plane == cord_label).any()
     ]
-    away = distances(labels.ijk_to_lps(cord), find_spine_line(read_volume(folder / "ct_2mm_jpeg2000")))
-    assert away.mean() <= tolerances.REAL_CANAL_MEAN_MM and away.max() <= tolerances.REAL_CANAL_MAX_MM
+    line = find_spine_line(read_volume(folder / "ct_2mm_jpeg2000"))
+    check_lies_in_real_canal(line, labels.ijk_to_lps(middles))
 
+
+@pytest.mark.release
+@pytest.mark.slow
+def test_the_line_of_a_real_scan_lies_in_the_holes_that_labelled_vertebrae_enclose(real_data):
     from scipy.ndimage import binary_fill_holes, label
 
-    labels = read_labels(folder / "spine_report" / "totalseg.nii.gz")
-    holes = []
-    for k, plane in enumerate(labels.voxels > 26):  # without the sacrum
-        inside, count = label(binary_fill_holes(plane) & ~plane)
-        sizes = np.bincount(inside.ravel())[1:]
-        if count and sizes.max() >= 9:
-            holes.append((*np.argwhere(inside == sizes.argmax() + 1)[:, ::-1].mean(axis=0), k))
-    away = distances(labels.ijk_to_lps(holes), find_spine_line(read_volume(folder / "example_ct.nii.gz")))
-    assert away.mean() <= tolerances.REAL_CANAL_MEAN_MM and away.max() <= tolerances.REAL_CANAL_MAX_MM
+    folder = real_data / "thoracolumbar_labels" / "spine_report"
+    labels = read_labels(folder / "totalseg.nii.gz")
+    last_label_of_the_sacrum, fewest_pixels = 26, 9
+    middles = []
+    for k, plane in enumerate(labels.voxels > last_label_of_the_sacrum):
+        holes, count = label(binary_fill_holes(plane) & ~plane)
+        sizes = np.bincount(holes.ravel())[1:]
+        if count and sizes.max() >= fewest_pixels:
+            middles.append((*np.argwhere(holes == sizes.argmax() + 1)[:, ::-1].mean(axis=0), k))
+    line = find_spine_line(read_volume(folder / "example_ct.nii.gz"))
+    check_lies_in_real_canal(line, labels.ijk_to_lps(middles))
 
 
-def test_real_scans_are_found_or_refused(real_data):
+def test_the_line_of_a_real_chest_is_found_over_its_whole_height(real_data):
     line = find_spine_line(read_volume(real_data / "thoracic_0p8mm"))
-    assert line.height_mm >= 0.9 * line.searched_mm and line.sure_share > 0.9
-    with pytest.raises(RefusedInputError, match="no spine was found"):
+    assert line.height_mm >= 0.9 * line.searched_mm
+    assert line.sure_share > 0.9
+
+
+def test_a_real_head_without_a_sure_spine_is_refused(real_data):
+    with refused(RefusedInputError, "spine"):
         find_spine_line(read_volume(real_data / "head_tilt_gaps"))
 
 
 @pytest.mark.release
 @pytest.mark.slow
-def test_a_long_real_spine_is_found(real_data):
+def test_the_line_of_a_real_trunk_is_found_over_290_mm(real_data):
     line = find_spine_line(read_volume(real_data / "lumbar_4p25mm"))
-    assert line.height_mm >= 290.0 and line.sure_share > 0.9
+    assert line.height_mm >= 290.0  # of 306 mm: 72 slices
+    assert line.sure_share > 0.9
 
 
-def test_spine_of_a_scan_cropped_at_one_side_is_followed(phantom):
-    """Beside the canal 14 mm of the left are there: left and right are not alike, but where a half of it is whole."""
+@pytest.fixture(scope="module")
+def cropped_scan(phantom):
+    """In the lower 32 of 60 slices only 26 mm to the left of the canal are there: left and right are not alike."""
     volume, canal = phantom
     middle = volume.lps_to_ijk([canal.mean(axis=0)])[0, 0]
     voxels = np.array(volume.voxels)
     voxels[:32, :, round(middle + 26.0 / 1.9) :] = -1000
-    cropped = Volume(voxels, volume.affine)
-    sure, whole = find_spine_line(cropped, sure_only=True), find_spine_line(cropped)
-    assert sure.height_mm < 0.75 * whole.height_mm and sure.ends == {"upper": None, "lower": None}
-    assert whole.height_mm >= 0.85 * whole.searched_mm and whole.sure_share < 0.8
-    assert whole.upper.lost_mm is None and whole.lower.lost_mm is None
-    check_canal(whole, canal)
+    return Volume(voxels, volume.affine)
 
 
-def lost_below(phantom, value):
+def test_the_line_follows_a_spine_through_slices_that_are_cropped_at_one_side(phantom, cropped_scan):
+    line = find_spine_line(cropped_scan)
+    assert line.height_mm >= 0.85 * line.searched_mm
+    assert line.sure_share < 0.8
+    assert (line.upper.lost_mm, line.lower.lost_mm) == (None, None)
+    check_lies_in_canal(line, phantom[1])
+
+
+def test_only_the_sure_part_of_a_line_is_returned_on_request(cropped_scan):
+    sure, whole = find_spine_line(cropped_scan, sure_only=True), find_spine_line(cropped_scan)
+    assert sure.height_mm < 0.75 * whole.height_mm
+    assert sure.ends == {"upper": None, "lower": None}
+
+
+def line_above_lost_slices(phantom, value):
     """Return the line of the phantom with one value in all of its lower slices, and the height where these begin."""
     volume, _ = phantom
     voxels = np.array(volume.voxels)
@@ -198,23 +263,37 @@ def lost_below(phantom, value):
 
 
 @pytest.mark.parametrize(
-    ("value", "words"), [(600, r"bone in its place \(\d+ HU\)"), (-1000, "air or fat in its place|no vertebral body")]
+    ("value", "words"),
+    [(600, r"bone in its place \(\d+ HU\)"), (-1000, "air or fat in its place|no vertebral body")],
+    ids=["bone", "air"],
 )
-def test_end_of_a_lost_spine_is_said_in_mm_with_what_was_found_instead(phantom, value, words):
-    line, z_mm = lost_below(phantom, value)
-    assert line.upper.lost_mm is None and line.upper.because == ""
+def test_the_end_of_a_lost_spine_names_its_height_and_what_was_found_instead(phantom, value, words):
+    line, z_mm = line_above_lost_slices(phantom, value)
     assert re.search(words, line.lower.because), line.lower.because
-    assert line.lower.lost_mm == pytest.approx(z_mm, abs=10.0) and line.lower.lost_mm < line.lower.z_mm
+    assert line.lower.lost_mm == pytest.approx(z_mm, abs=10.0)  # cells are 4 mm high, and means are taken over several
+    assert line.lower.lost_mm < line.lower.z_mm
     assert line.points[-1, 2] == pytest.approx(line.lower.z_mm, abs=0.1)
 
 
-def test_a_scan_with_too_little_of_a_spine_says_where_that_is(phantom):
-    volume, canal = phantom
+def test_the_end_of_a_spine_that_the_scan_cuts_is_not_lost(phantom):
+    line, _ = line_above_lost_slices(phantom, 600)
+    assert (line.upper.lost_mm, line.upper.because) == (None, "")
+
+
+def test_a_scan_of_20_mm_of_a_spine_is_refused_with_the_35_mm_that_are_needed(phantom):
+    volume, _ = phantom
     with refused(RefusedInputError, 20, 35):
         find_spine_line(Volume(volume.voxels[:8], volume.affine))
+
+
+def test_a_scan_of_air_is_refused_with_what_to_look_at(phantom):
     with refused(RefusedInputError, "look", "points"):
-        find_spine_line(made_up("air", phantom))
-    askew = np.eye(4)
-    askew[:3, :3] = rotation((0.0, 0.0, 20.0))
+        find_spine_line(make_scan_without_a_spine("air", phantom))
+
+
+def test_a_patient_turned_by_20_degrees_is_refused_with_the_height_over_which_a_canal_was_found(phantom):
+    volume, _ = phantom
+    turn = np.eye(4)
+    turn[:3, :3] = rotation((0.0, 0.0, 20.0))
     with refused(RefusedInputError, "canal", 4, 35):
-        find_spine_line(Volume(volume.voxels, askew @ volume.affine))
+        find_spine_line(Volume(volume.voxels, turn @ volume.affine))
