@@ -10,14 +10,18 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
 from clrecon.anatomy.iso_choice import settle_level
 from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume
 from clrecon.jobs.view import ViewSettings
 from clrecon.jobs.view.inputs import check_view_settings
+from clrecon.operators.surface.cortex_mesh import fit_cortex
 from clrecon.operators.surface.extract import SurfaceExtractor
 from clrecon.operators.surface.label_masks import extract_label_masks
 from clrecon.rendering.pictures.label_style import distinct_colors
+from clrecon.rendering.pictures.object_looks import MESH_COLORS, MeshLook
 from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
 from clrecon.rendering.views.directions import DIRECTIONS
@@ -32,6 +36,7 @@ from clrecon.viewer.model.objects import (
     find_iso_range,
     show_objects,
 )
+from clrecon.viewer.model.state import FIT_COLORS
 
 if TYPE_CHECKING:
     import pyvista
@@ -43,7 +48,10 @@ if TYPE_CHECKING:
 SIZE = (1100, 850)
 BONE = (0.90, 0.86, 0.78)
 
-KEYS = "c: clip plane, again: without   m: measure, again: without   1 to 6: sides of the patient   q: quit"
+KEYS = (
+    "c: clip plane, again: without   m: measure, again: without   1 to 6: sides of the patient   q: quit\n"
+    "t: surface fitted to the bone, again: at the iso value   T: its thickness, its error, plain"
+)
 
 _SIDES = {str(key): side for key, side in enumerate(DIRECTIONS.values(), start=1)}
 """Where the camera stands, LPS: anterior, posterior, left, right, superior, inferior."""
@@ -136,7 +144,9 @@ def open_plotter(
                 extractor = opened.enter_context(SurfaceExtractor(shown.volume, device=device, memory=memory))
                 extractors.append((shown.name, extractor))
         if extractors:
-            _add_iso_slider(plotter, extractors, find_iso_range(scans), iso_value)
+            surfaces = _Surfaces(plotter, extractors, find_iso_range(scans), iso_value)
+            plotter.add_key_event("t", surfaces.toggle_fitted)
+            plotter.add_key_event("T", surfaces.step_color_by)
         plotter.add_axes(xlabel="L", ylabel="P", zlabel="S", color="white")
         plotter.add_text(KEYS, position="upper_left", font_size=9, color="white", name="keys")
         _add_keys(plotter)
@@ -154,33 +164,81 @@ def _add_labels(plotter: pyvista.Plotter, shown: ShownLabels, device: Any, memor
         plotter.add_mesh(mesh.to_pyvista(), color=color, name=name, smooth_shading=True, opacity=opacity)
 
 
-def _add_iso_slider(
-    plotter: pyvista.Plotter,
-    extractors: Sequence[tuple[str, SurfaceExtractor]],
-    limits: tuple[float, float],
-    iso_value: float | None,
-) -> None:
-    """Add the surfaces of volumes, and a slider that extracts them anew where it is let go."""
-    import pyvista
+class _Surfaces:
+    """The surfaces of volumes, and a slider that makes them anew where it is let go, at the iso value or fitted."""
 
-    surfaces = {name: pyvista.PolyData() for name, _ in extractors}
+    def __init__(
+        self,
+        plotter: pyvista.Plotter,
+        extractors: Sequence[tuple[str, SurfaceExtractor]],
+        limits: tuple[float, float],
+        iso_value: float | None,
+    ) -> None:
+        import pyvista
 
-    def extract_surfaces(hu: float) -> None:
-        for name, extractor in extractors:
+        self._plotter, self._extractors = plotter, extractors
+        self._fitted, self._color_by = False, 0
+        self._surfaces = {name: pyvista.PolyData() for name, _ in extractors}
+        self._actors: dict[str, Any] = {}
+        self._hu = min(max(DEFAULT_ISO_VALUE if iso_value is None else iso_value, limits[0]), limits[1])
+        self._make_surfaces(self._hu)
+        for name, surface in self._surfaces.items():
+            self._actors[name] = plotter.add_mesh(surface, color=BONE, name=name)
+            self._actors[name].prop.interpolation = "Phong"  # by our normals, without a copy
+        plotter.add_slider_widget(
+            self._make_surfaces, limits, value=self._hu, title="iso value, HU", pointa=(0.25, 0.08),
+            pointb=(0.75, 0.08), fmt="%.0f", color="white",
+        )  # fmt: skip
+
+    def toggle_fitted(self) -> None:
+        self._fitted, self._color_by = not self._fitted, 0
+        self._make_surfaces(self._hu)
+
+    def step_color_by(self) -> None:
+        """Colour by the next number, which only fitted surfaces have."""
+        if self._fitted:
+            self._color_by = (self._color_by + 1) % (len(FIT_COLORS) + 1)
+            self._color_surfaces()
+
+    def _make_surfaces(self, hu: float) -> None:
+        import pyvista
+
+        self._hu, refused = hu, ""
+        for name, extractor in self._extractors:
+            shown = pyvista.PolyData()
             try:
-                mesh = extractor.extract(round(hu)).to_pyvista()
-            except NoSurfaceError:
-                mesh = pyvista.PolyData()
-            surfaces[name].copy_from(mesh, deep=False)
+                mesh = extractor.extract(round(hu))
+                shown = mesh.to_pyvista()
+                if self._fitted:
+                    shown = fit_cortex(mesh, extractor.volume, device=extractor.device).to_pyvista()
+            except NoSurfaceError as error:
+                refused += f"{name}: {error}\n" * self._fitted
+            self._surfaces[name].copy_from(shown, deep=False)
+        self._plotter.add_text(
+            refused, position=(0.01, 0.12), viewport=True, font_size=9, color="yellow", name="refused"
+        )
+        self._color_surfaces()
 
-    start = min(max(DEFAULT_ISO_VALUE if iso_value is None else iso_value, limits[0]), limits[1])
-    extract_surfaces(start)
-    for name, surface in surfaces.items():
-        plotter.add_mesh(surface, color=BONE, name=name).prop.interpolation = "Phong"  # by our normals, without a copy
-    plotter.add_slider_widget(
-        extract_surfaces, limits, value=start, title="iso value, HU", pointa=(0.25, 0.08), pointb=(0.75, 0.08),
-        fmt="%.0f", color="white",
-    )  # fmt: skip
+    def _color_surfaces(self) -> None:
+        """Colour the surfaces that have the number at their vertices, with a scale in mm beside them."""
+        import pyvista
+
+        name = (None, *FIT_COLORS)[self._color_by]
+        for title in [*self._plotter.scalar_bars.keys()]:
+            self._plotter.remove_scalar_bar(title)
+        for surface_name, actor in self._actors.items():
+            surface, mapper = self._surfaces[surface_name], actor.mapper
+            mapper.scalar_visibility = f"{name}_mm" in surface.point_data
+            if name is None or not mapper.scalar_visibility:
+                continue
+            scale, _ = MeshLook(color_by=name).find_scale(surface.point_data)
+            ends = scale.low, scale.limit
+            steps = np.full((256, 4), 255, np.uint8)
+            steps[:, :3] = scale.colors(np.linspace(*ends, len(steps)))
+            surface.point_data.active_scalars_name = f"{name}_mm"
+            mapper.lookup_table = pyvista.LookupTable(values=steps, scalar_range=ends, nan_color="gray")
+            mapper.scalar_range = ends
+            self._plotter.add_scalar_bar(MESH_COLORS[name], mapper=mapper, color="white", vertical=True)
 
 
 def _add_keys(plotter: pyvista.Plotter) -> None:

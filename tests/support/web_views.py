@@ -15,7 +15,9 @@ import numpy as np
 import view_scenes as scenes
 from PIL import Image
 
+from clrecon.errors import NoSurfaceError
 from clrecon.rendering import Rendering
+from clrecon.rendering.looks.colors import ColorScale
 from clrecon.viewer.model.objects import show_objects
 from clrecon.viewer.model.state import Pick
 from clrecon.viewer.session.session import ViewSession
@@ -34,6 +36,7 @@ class FakePainter:
     def __init__(self) -> None:
         self.drawn: list[tuple[str, bool]] = []
         self.fault: Exception | None = None
+        self.is_fitted, self.has_bone = False, True
 
     def _paint(self, state: Any, size: Any, view: str, sharp: bool) -> Rendering:
         self.drawn.append((view, sharp))
@@ -63,6 +66,18 @@ class FakePainter:
 
     def has_parts(self, state: Any) -> bool:
         return True
+
+    def has_fits(self, state: Any) -> bool:
+        return self.is_fitted
+
+    def fit_scans(self, state: Any, progress: Any = None) -> list[str]:
+        if not self.has_bone:
+            raise NoSurfaceError("no walls of bone")
+        self.is_fitted = True
+        return ["fitted"]
+
+    def find_fit_scale(self, state: Any) -> ColorScale | None:
+        return ColorScale(2.0, signed=False) if state.color_by else None
 
     def prepare(self, progress: Any = None) -> None:
         pass

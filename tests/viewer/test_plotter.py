@@ -125,6 +125,23 @@ def test_the_scan_of_a_scene_is_its_isosurface(scene, device):
 
 
 @pytest.mark.opencl
+def test_keys_of_a_scene_fit_the_scan_to_the_bone_and_colour_it(scene):
+    actor = scene.plotter.renderer.actors["scan 1"]
+    level = np.array(actor.mapper.dataset.points)
+    scene.keys["T"]()
+    assert not actor.mapper.scalar_visibility and not scene.plotter.scalar_bars.keys()
+    scene.keys["t"]()
+    fitted = actor.mapper.dataset
+    assert np.linalg.norm(fitted.points - level, axis=1).mean() > 0.05
+    scene.keys["T"]()
+    assert actor.mapper.scalar_visibility and fitted.point_data.active_scalars_name == "thickness_mm"
+    assert list(scene.plotter.scalar_bars.keys()) == ["mm thick"]
+    scene.keys["t"]()
+    assert not actor.mapper.scalar_visibility and not scene.plotter.scalar_bars.keys()
+    np.testing.assert_array_equal(actor.mapper.dataset.points, level)
+
+
+@pytest.mark.opencl
 def test_a_scene_is_first_seen_from_anterior(scene):
     camera = scene.plotter.camera
     assert camera.position[1] < camera.focal_point[1]

@@ -19,6 +19,8 @@ from clrecon.operators.rays.scene import ScenePictures
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.rendering import Rendering
+from clrecon.rendering.looks.colors import ColorScale
+from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.pictures.styles import CurveCut, Projection, SlicesInSpace, Style, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import as_point, checked_size
@@ -27,7 +29,16 @@ from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress
 from clrecon.system.text import unknown_name
 from clrecon.viewer.drawing.looks import LEAST_OPACITY, LabelledLook, Looks, to_voxels
-from clrecon.viewer.drawing.shown_meshes import coarsen_mesh, make_meshes
+from clrecon.viewer.drawing.shown_meshes import (
+    COARSE_TRIANGLES,
+    coarsen_mesh,
+    divide_fit,
+    find_fit_scale,
+    fit_scans,
+    fitted_scans,
+    make_meshes,
+    shows_fits,
+)
 from clrecon.viewer.drawing.stage import Stage, take_strips, warm_kernels
 from clrecon.viewer.model.changes import pixel_camera, shift_camera, zoom_camera
 from clrecon.viewer.model.objects import (
@@ -49,9 +60,6 @@ _COARSE_STEP_VOXELS = 2.0
 
 MOST_FOUND = 6
 """Sets of parts that are kept, of all views together."""
-
-_COARSE_TRIANGLES = 200_000
-"""Meshes with more triangles are drawn by a coarse one while anything moves."""
 
 
 def never() -> bool:
@@ -76,6 +84,7 @@ class Painter(Stage):
         self._looks = Looks()
         self._scene: tuple[tuple[Any, ...], ScenePictures] | None = None
         self._coarse: dict[int, Mesh] = {}
+        self._fitted: dict[tuple[int, bool], tuple[tuple[Any, ...], list[_Drawn]]] = {}
 
     def close(self) -> None:
         with self.lock:
@@ -160,7 +169,7 @@ class Painter(Stage):
             depth, drawn = nearest
             origins, directions = camera.rays((1, 1))
             point = as_point(origins[0, 0] + depth * directions[0, 0])
-            part = self._part_at(drawn, point)
+            part = self._part_at(drawn, point, state)
             return Pick(point=point, object=drawn.number, part=part, hu=self.hu_at(point))
 
     def pick_slice(self, state: ViewState, plane: str, size: Sequence[int], x: float, y: float) -> Pick:
@@ -175,15 +184,28 @@ class Painter(Stage):
                 number = None if part is None else part.object
             return Pick(point=point, object=number, part=key, hu=self.hu_at(point))
 
-    def _part_at(self, drawn: _Drawn, point: tuple[float, float, float]) -> str:
+    def _part_at(self, drawn: _Drawn, point: tuple[float, float, float], state: ViewState) -> str:
         labelled = drawn.labelled
-        if labelled is None or not isinstance(drawn.subject, DeviceVolume):
+        if labelled is None:
             return str(drawn.number)
-        key = _key_of(labelled, self._number_at(drawn.subject, labelled, point))
+        resident = drawn.subject if isinstance(drawn.subject, DeviceVolume) else self.resident(drawn.number, state)
+        key = _key_of(labelled, self._number_at(resident, labelled, point))
         return key or str(drawn.number)
 
     def _number_at(self, resident: DeviceVolume, labelled: LabelledLook, point: tuple[float, float, float]) -> int:
         return number_at(resident.volume, self.labels_on(resident, labelled), point)
+
+    def fit_scans(self, state: ViewState, progress: Progress | None = None) -> list[str]:
+        """Fit the surfaces of the scans that are shown to the bone, once; return lines about them."""
+        return fit_scans(self, state, progress)
+
+    def has_fits(self, state: ViewState) -> bool:
+        """True where the surfaces of the scans that are shown are fitted to the bone."""
+        return None not in fitted_scans(self, state)
+
+    def find_fit_scale(self, state: ViewState) -> ColorScale | None:
+        """Return the scale of the colours of fitted surfaces, None where they show no numbers."""
+        return find_fit_scale(self, state)
 
     def mesh_of_shown(self, state: ViewState, progress: Progress | None = None) -> list[Mesh]:
         """Make the meshes of what is shown, see `clrecon.viewer.drawing.saving`."""
@@ -207,10 +229,10 @@ class Painter(Stage):
     def make_coarse(self, cancelled: Callable[[], bool] = never) -> None:
         """Make the coarse meshes that are drawn while anything moves, once."""
         for shown in self.objects:
-            if isinstance(shown, ShownMesh) and shown.mesh.triangle_count > _COARSE_TRIANGLES:
+            if isinstance(shown, ShownMesh) and shown.mesh.triangle_count > COARSE_TRIANGLES:
                 if shown.number not in self._coarse:
                     _stop(cancelled)
-                    self._coarse[shown.number] = coarsen_mesh(shown.mesh, _COARSE_TRIANGLES)
+                    self._coarse[shown.number] = coarsen_mesh(shown.mesh, COARSE_TRIANGLES)[0]
 
     def _drawn(self, state: ViewState, sharp: bool, *, opaque: bool = False) -> list[_Drawn]:
         """Return what a state shows, with looks, in the order of the objects; meshes opaque where that is enough."""
@@ -220,7 +242,9 @@ class Painter(Stage):
             whole = state.whole(shown.number)
             if whole is None or not whole.visible:
                 continue
-            if isinstance(shown, ShownScan):
+            if isinstance(shown, ShownScan) and shows_fits(state) and self.has_fits(state):
+                drawn += self._drawn_fit(shown, state, whole, sharp, opaque or not sharp)
+            elif isinstance(shown, ShownScan):
                 if mode.kind == "labels" or (drawn and not mode.joins):
                     continue
                 used = mode if not any(isinstance(one.subject, DeviceVolume) for one in drawn) else _SURFACE
@@ -236,6 +260,25 @@ class Painter(Stage):
             elif isinstance(shown, ShownLabels) and (mode.kind == "labels" or shown.within is None):
                 drawn.append(self._drawn_labels(shown, state, whole, sharp))
         return drawn
+
+    def _drawn_fit(
+        self, scan: ShownScan, state: ViewState, whole: ShownPart, sharp: bool, opaque: bool
+    ) -> list[_Drawn]:
+        """Return the pieces of a surface fitted to the bone; they are the same objects as long as their looks are."""
+        labelled, scale = self.labelled(scan.number, state), find_fit_scale(self, state)
+        looks = None if labelled is None else (id(labelled.labels), labelled.parts)
+        key = (state.iso_value, state.table, state.color_by, scale, state.clip, whole, looks, opaque)
+        if self._fitted.get((scan.number, sharp), ((), []))[0] != key:
+            pieces = []
+            for mesh, part in divide_fit(self, scan, state, whole, coarse=not sharp):
+                opacity = 1.0 if opaque else part.opacity * (1.0 if part is whole else whole.opacity)
+                colors = None if scale is None else scale.colors(mesh.values[f"{state.color_by}_mm"])
+                color = None if colors is not None else part.color or whole.color
+                if part.opacity * whole.opacity >= LEAST_OPACITY:
+                    look = MeshLook(color, opacity=opacity, vertex_colors=colors, clip=state.clip)
+                    pieces.append(_Drawn(scan.number, mesh, look, labelled))
+            self._fitted[scan.number, sharp] = key, pieces
+        return self._fitted[scan.number, sharp][1]
 
     def _drawn_scan(self, scan: ShownScan, state: ViewState, mode: ViewMode, whole: ShownPart, sharp: bool) -> _Drawn:
         resident = self.resident(scan.number, state)

@@ -17,7 +17,9 @@ from clrecon.mesh import Mesh
 from clrecon.operators.masks.mask import Mask
 from clrecon.points import PointCloud
 from clrecon.reading.grids.write_volume import FORMATS as VOLUME_FORMATS
+from clrecon.rendering.pictures.object_looks import MESH_COLORS
 from clrecon.rendering.pictures.picture import IMAGE_FORMATS
+from clrecon.rendering.pictures.sheets import add_scale
 from clrecon.system.arguments import Space
 from clrecon.system.files import check_writable, replace_file
 from clrecon.system.paths import keep_existing
@@ -100,6 +102,9 @@ def save_shown(
     if kind == "picture":
         picture = painter.picture(state, size, sharp=True)
         picture = picture.with_background("black").annotated(letters=True, scale_bar=True)
+        scale = painter.find_fit_scale(state)
+        if scale is not None and state.color_by is not None:
+            picture = add_scale(picture, scale, MESH_COLORS[state.color_by])
         written = picture.save(path, no_clobber=no_clobber)
         return [f"{name}: picture of {picture.size[0]} x {picture.size[1]} pixels, {_megabytes(written)}"]
     if kind == "measures":

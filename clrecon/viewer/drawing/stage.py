@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,9 +24,11 @@ from clrecon.operators.rays.volume_renderer import VolumeRenderer
 from clrecon.operators.resident.device_volume import DeviceVolume, DeviceWorker
 from clrecon.operators.surface.extract import SurfaceExtractor
 from clrecon.rendering import Rendering
+from clrecon.rendering.looks.colors import ColorScale
 from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.pictures.styles import PlaneCut, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.viewer.drawing.looks import LabelledLook
 from clrecon.viewer.model.changes import shift_camera
@@ -124,6 +126,20 @@ def _warm_scan(volume: Volume, device: Device, tell: Progress) -> None:
             renderer.render(style, camera=camera, size=PICTURE, background="transparent")
 
 
+@dataclass(frozen=True, eq=False)
+class FittedScan:
+    """The surface of a scan fitted to the bone, and a coarse one; `scales` of the colours of its numbers, by name.
+
+    inner, coarse_inner: Of each vertex the voxel by which its part is known, a place in memory; -1: none.
+    """
+
+    mesh: Mesh
+    inner: NDArray[np.int64]
+    coarse: Mesh
+    coarse_inner: NDArray[np.int64]
+    scales: Mapping[str, ColorScale]
+
+
 MOST_FOUND, _MOST_FOUND_BYTES = 6, 1 << 29
 """Sets of parts kept, of all views together, and bytes of their label maps; two are kept whatever their size."""
 
@@ -143,6 +159,7 @@ class Stage(DeviceWorker):
         self._takers: dict[int, VolumeRenderer | PointPictures] = {}
         self._found: OrderedDict[tuple[int, float, bool], FoundParts] = OrderedDict()
         self._blank: dict[int, LabelledLook] = {}
+        self.fits: OrderedDict[tuple[int, float, bool], FittedScan] = OrderedDict()
 
     def close(self) -> None:
         with self.lock:

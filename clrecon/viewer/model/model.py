@@ -47,7 +47,7 @@ from clrecon.viewer.model.objects import (
     find_modes,
     first_parts,
 )
-from clrecon.viewer.model.state import Box, ClipPlane, Pick, SliceFrame, ViewState, clip_direction
+from clrecon.viewer.model.state import FIT_COLORS, Box, ClipPlane, Pick, SliceFrame, ViewState, clip_direction
 
 _Item = TypeVar("_Item")
 
@@ -170,6 +170,31 @@ class ViewModel(ChangingView):
         if not self.scans:
             raise UsageError("there is no scan: there is no table to take away")
         self._change("table", "the table", table=bool(shown))
+
+    def check_fit(self) -> None:
+        """Refuse to show a surface fitted to the bone where there is none."""
+        if not self.scans:
+            raise UsageError("there is no scan: a surface is fitted to the bone in the HU of one")
+        if self.modes[self.state.mode].kind != "surface":
+            raise UsageError(f"the mode {self.state.mode} shows no surface to fit to the bone: take the mode surface")
+
+    def set_fitted(self, shown: bool) -> None:
+        """Show the surfaces of scans where they were fitted to the bone, or at the iso value."""
+        words = "the surface fitted to the bone" if self.state.fitted else "the surface at the iso value"
+        self._change("fitted", words, fitted=bool(shown), color_by=self.state.color_by if shown else None)
+
+    def set_color_by(self, name: str | None) -> None:
+        """Colour fitted surfaces by a number of `FIT_COLORS`; None: as parts look by themselves."""
+        if name is not None and name not in FIT_COLORS:
+            raise UsageError(unknown_name("colour of a fitted surface", name, FIT_COLORS))
+        if name is not None and not self.state.fitted:
+            raise UsageError(f"the {name} is that of a fitted surface: show the surface fitted to the bone first")
+        self._change("shade", "the colours of the fitted surface", color_by=name)
+
+    def step_color_by(self) -> None:
+        """Go to the next number that colours fitted surfaces, behind the last one to none."""
+        names = (None, *FIT_COLORS)
+        self.set_color_by(names[(names.index(self.state.color_by) + 1) % len(names)])
 
     def scroll(self, plane: str, steps: float) -> None:
         """Move the cross by layers of the first scan, to the middle of one; positive steps go away from the eye."""
@@ -328,6 +353,8 @@ class ViewModel(ChangingView):
             "window": list(state.window),
             "picture_window": list(state.picture_window or mode.window or ()) or None,
             "table": state.table,
+            "fitted": state.fitted if self.scans and mode.kind == "surface" else None,
+            "color_by": state.color_by,
             "cross": [round(value, 3) for value in state.cross],
             "slices": {plane: describe_slice(self.scans, plane, state.cross) for plane in PLANES},
             "cross_text": self.say_place(state.cross),

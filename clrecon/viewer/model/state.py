@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Hashable, Sequence
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from clrecon.rendering.views.directions import DIRECTIONS, checked_vector
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.text import unknown_name
 from clrecon.viewer.model.measures import Measure, Point
+
+FIT_COLORS: tuple[Literal["thickness", "error"], ...] = ("thickness", "error")
+"""Numbers at the vertices of a fitted surface that colours can show, in mm."""
 
 Color = tuple[float, float, float]
 Box = tuple[Point, Point]
@@ -157,6 +160,8 @@ class ViewState:
     window: HU shown as black and white in slices.
     picture_window: The same in projections; None: that of the mode.
     table: Table and blankets are shown.
+    fitted: The surfaces of scans lie where they were fitted to the bone, in the mode "surface".
+    color_by: Number at the vertices of fitted surfaces that their colours show, one of `FIT_COLORS`.
     cross: Where the three slices go through.
     frames: Of the slices that were zoomed or shifted; the others fit.
     parts_at: Iso value of the clusters; None: they are not known.
@@ -172,6 +177,8 @@ class ViewState:
     frames: tuple[SliceFrame, ...] = ()
     picture_window: tuple[float, float] | None = None
     table: bool = True
+    fitted: bool = False
+    color_by: str | None = None
     parts: tuple[ShownPart, ...] = ()
     parts_at: float | None = None
     parts_table: bool = True
@@ -207,3 +214,23 @@ class ViewState:
 
     def whole(self, number: int) -> ShownPart | None:
         return next((each for each in self.parts if each.object == number and each.is_whole), None)
+
+
+SCENE, SLICES = "scene", ("axial", "coronal", "sagittal")
+VIEWS = (SCENE, *SLICES, "curve")
+"""The picture in three dimensions, the three slices, and the reformation along the points of the curve tool."""
+
+
+def picture_key(state: ViewState, view: str) -> Hashable:
+    """Return what the picture of a view depends on: equal keys, equal pictures."""
+    looks = tuple(part for part in state.parts if not part.is_plain)  # the others are drawn as if they were not known
+    parts = (looks, (state.parts_at, state.parts_table) if looks else None)
+    if view == SCENE:
+        cut = (state.clips, state.clip_box)
+        return (
+            *(state.camera, state.mode, state.iso_value, state.picture_window, state.table),
+            *(state.fitted, state.color_by, parts, cut),
+        )
+    if view in SLICES:
+        return (state.cross, state.frame(view), state.window, state.table, parts)
+    return (state.curve, state.window, state.table)

@@ -105,6 +105,10 @@ _model("set_window", "HU of black and white; of: slices or picture", "set_window
        low=_check_number, high=_check_number, takes={"of": _text})  # fmt: skip
 _session("set_table", "show or take away table and blankets", "set_table", shown=_flag)
 _session("toggle_table", "take table and blankets away, or show them", "toggle_table")
+_session("set_fitted", "show surfaces fitted to the bone, or at the iso value", "set_fitted", shown=_flag)
+_session("toggle_fitted", "fit surfaces to the bone, or stop that, or show them at the iso value", "toggle_fitted")
+_model("set_color_by", "colour fitted surfaces by thickness or error; null: not", "set_color_by", name=_or_none(_text))
+_model("step_color_by", "colour fitted surfaces by the next number, or not", "step_color_by")
 _model("scroll", "move a slice by steps of its voxels", "scroll", plane=_text, steps=_check_number)
 _session("zoom_slice", "show a slice of a size larger; about: from the middle, in shares of the height", "zoom_slice",
          plane=_text, factor=_check_number, size=_size, takes={"about": _check_numbers(2)})  # fmt: skip
@@ -211,6 +215,8 @@ _SECTIONS: dict[str, dict[str, Key]] = {
         "o": Key("next mode; O: the one before", {"do": "step_mode", "steps": 1}),
         "O": Key("", {"do": "step_mode", "steps": -1}),
         "b": Key("table and blankets away, or shown", {"do": "toggle_table"}),
+        "t": Key("surface fitted to the bone, or at the iso value", {"do": "toggle_fitted"}),
+        "T": Key("fitted surface: thickness of the walls, error, plain", {"do": "step_color_by"}),
         "ArrowLeft": Key(f"{_ISO_STEP:g} HU lower; Right: higher", {"do": "step_iso", "by": -_ISO_STEP}, name="Left"),
         "ArrowRight": Key("", {"do": "step_iso", "by": _ISO_STEP}),
     },

@@ -16,169 +16,32 @@ from typing import Any
 
 import numpy as np
 
-from clrecon.errors import Cancelled, ClreconError, UsageError
+from clrecon.errors import ClreconError, UsageError
 from clrecon.opencl import Device
 from clrecon.rendering import Rendering
+from clrecon.rendering.pictures.object_looks import MESH_COLORS
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import checked_size, checked_vector
 from clrecon.system.arguments import Space
 from clrecon.system.base_classes import Closing
-from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.log import get_logger
+from clrecon.system.progress import CLOSE_S, Job, Worker
 from clrecon.system.text import format_volume
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.drawing.saving import check_target, save_shown
+from clrecon.viewer.drawing.shown_meshes import shows_fits
 from clrecon.viewer.model.changes import pan_camera, zoom_camera
 from clrecon.viewer.model.measures import seen_pieces
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownMesh, ShownObject
-from clrecon.viewer.model.state import Pick, ViewState
+from clrecon.viewer.model.state import SCENE, Pick, picture_key
 from clrecon.viewer.session.commands import check_command
-
-_CLOSE_S = 1.0
-"""Longest wait for work that is cancelled; threads that still run then end with the process."""
-
-
-@dataclass(eq=False)
-class Job:
-    """Work that was asked for; `cancelled` says whether it is still wanted."""
-
-    kind: str
-    work: Callable[[Job], Any]
-    rank: int
-    gives_way: bool = True
-    _stop: threading.Event = field(default_factory=threading.Event, repr=False)
-
-    def cancelled(self) -> bool:
-        """True where the result is no longer wanted."""
-        return self._stop.is_set()
-
-    def cancel(self) -> None:
-        self._stop.set()
-
-    def progress(self, stage: str, done: int = 0, total: int = 0) -> None:
-        """A progress function that ends the work where it is no longer wanted."""
-        if self.cancelled():
-            raise Cancelled
-
-
-class Worker:
-    """A thread with one place for each kind of work; `on_error` gets kind and words of an error."""
-
-    def __init__(self, name: str, on_error: Callable[[str, str], None], on_change: Callable[[], None] = lambda: None):
-        self._on_error, self._on_change = on_error, on_change
-        self._wake = threading.Condition()
-        self._waiting: dict[str, Job] = {}
-        self._running: Job | None = None
-        self._closed = False
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
-
-    def ask(self, kind: str, work: Callable[[Job], Any], rank: int = 0, *, gives_way: bool = True) -> Job | None:
-        """Ask for work; one of the same kind that waits is dropped, and one that runs is cancelled if it gives way.
-
-        rank: Lower ones come first.
-        gives_way: False: once it runs it is finished: pictures are seen while requests come faster than pictures.
-        Returns: None after `close`.
-        """
-        job = Job(kind, work, rank, gives_way)
-        with self._wake:
-            if self._closed:
-                return None
-            old = self._waiting.pop(kind, None)
-            if old is not None:
-                old.cancel()
-            running = self._running
-            if running is not None and running.kind == kind and running.gives_way:
-                running.cancel()
-            self._waiting[kind] = job
-            self._wake.notify_all()
-        return job
-
-    def cancel(self, kind: str) -> None:
-        with self._wake:
-            waiting = self._waiting.pop(kind, None)
-            for job in (waiting, self._running):
-                if job is not None and job.kind == kind:
-                    job.cancel()
-            self._wake.notify_all()
-
-    @property
-    def busy(self) -> list[str]:
-        with self._wake:
-            running = [] if self._running is None else [self._running.kind]
-            return [*running, *(kind for kind in self._waiting if kind not in running)]
-
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait until nothing runs or waits; False where time ran out."""
-        with self._wake:
-            return self._wake.wait_for(lambda: not self._waiting and self._running is None, timeout)
-
-    def stop(self) -> None:
-        """Cancel everything, and take nothing more."""
-        with self._wake:
-            self._closed = True
-            for job in (*self._waiting.values(), self._running):
-                if job is not None:
-                    job.cancel()
-            self._waiting.clear()
-            self._wake.notify_all()
-
-    def close(self, timeout: float = _CLOSE_S) -> bool:
-        """Cancel everything and wait for the thread to end; False where it still runs after `timeout` seconds."""
-        self.stop()
-        if threading.current_thread() is not self._thread:
-            self._thread.join(timeout)
-        return not self._thread.is_alive()
-
-    def _run(self) -> None:
-        while True:
-            with self._wake:
-                self._wake.wait_for(lambda: self._closed or self._waiting)
-                if self._closed:
-                    return
-                job = min(self._waiting.values(), key=lambda each: each.rank)
-                del self._waiting[job.kind]
-                self._running = job
-            self._on_change()
-            try:
-                if not job.cancelled():
-                    job.work(job)
-            except Cancelled:
-                pass
-            except ClreconError as error:
-                self._on_error(job.kind, str(error))
-            except Exception as error:  # a fault of ours: the view goes on, and says so
-                log.exception("%s failed", job.kind)
-                self._on_error(job.kind, f"{type(error).__name__}: {error} (a fault of clrecon: please report it)")
-            finally:
-                with self._wake:
-                    self._running = None
-                    self._wake.notify_all()
-                self._on_change()
-
-
-SCENE, SLICES = "scene", ("axial", "coronal", "sagittal")
-VIEWS = (SCENE, *SLICES, "curve")
-"""The picture in three dimensions, the three slices, and the reformation along the points of the curve tool."""
 
 REST_SECONDS = 0.2
 """After the last change until pictures are drawn sharp."""
 
 _LEAST_ZOOM, _MOST_ZOOM = 0.5, 50.0
 """Of slices, by how they fit."""
-
-
-def picture_key(state: ViewState, view: str) -> Hashable:
-    """Return what the picture of a view depends on: equal keys, equal pictures."""
-    looks = tuple(part for part in state.parts if not part.is_plain)  # the others are drawn as if they were not known
-    parts = (looks, (state.parts_at, state.parts_table) if looks else None)
-    if view == SCENE:
-        cut = (state.clips, state.clip_box)
-        return (state.camera, state.mode, state.iso_value, state.picture_window, state.table, parts, cut)
-    if view in SLICES:
-        return (state.cross, state.frame(view), state.window, state.table, parts)
-    return (state.curve, state.window, state.table)
 
 
 log = get_logger(__name__)
@@ -191,6 +54,9 @@ LEAST_SHARE = 0.15
 
 _FIRST_SHARE = 0.5
 
+_SCALE_STEPS = 64
+"""Colours in which a page draws a scale."""
+
 _MANY_TRIANGLES = 2_000_000
 """Triangles of a mesh above which it is said that pictures take their time."""
 
@@ -198,6 +64,7 @@ _WORDS = {
     "prepare": "building kernels",
     "parts": "finding parts",
     "table": "taking the table away",
+    "fit": "fitting the surface to the bone",
     "coarse": "making coarse meshes",
     "save": "writing",
 }
@@ -240,7 +107,7 @@ class ViewSession(Closing):
         self._pictures = Worker("view-pictures", self._failed)
         self._work = Worker("view-work", self._failed, self._changed)
 
-    def close(self, timeout: float = _CLOSE_S) -> None:
+    def close(self, timeout: float = CLOSE_S) -> None:
         """Cancel everything, and wait for at most `timeout` seconds: a driver that builds a kernel does not stop."""
         if self._closed:
             return
@@ -298,7 +165,8 @@ class ViewSession(Closing):
 
     def picture_key(self, view: str) -> Hashable:
         """Return what the picture of a view depends on, see the function of this name."""
-        return picture_key(self.model.state, view)
+        state = self.model.state
+        return picture_key(state, view), view == SCENE and state.fitted and self.painter.has_fits(state)
 
     def slice(self, plane: str, size: Sequence[int], then: Callable[[Rendering], None]) -> None:
         """Ask for a slice through the cross: "axial", "coronal" or "sagittal"; the latest of each plane wins."""
@@ -345,6 +213,7 @@ class ViewSession(Closing):
             return {
                 **notes,
                 "seen_lines": self._seen_lines(),
+                "scale": self._describe_scale(),
                 "busy": busy,
                 "error": self._error,
                 "said": self._said,
@@ -358,8 +227,11 @@ class ViewSession(Closing):
             state = self.model.state
             wanted = bool(self.model.scans) and not self._parts_failed
             known = self.model.parts_known and self.painter.has_parts(state)
+            fitted = not shows_fits(state) or self.painter.has_fits(state)
         if wanted and not known and "parts" not in self._work.busy:
             self.find_parts()
+        if not fitted and "fit" not in self._work.busy:
+            self._fit()
 
     def find_parts(self, then: Callable[[], None] | None = None) -> None:
         """Find the parts of the scans in the background; `then` is called in its thread with the lock held."""
@@ -410,6 +282,33 @@ class ViewSession(Closing):
                 for facts in by_scan.values()
             )
         self.rest()
+
+    def set_fitted(self, shown: bool) -> None:
+        """Show surfaces fitted to the bone, which takes a moment the first time, or those at the iso value."""
+        self._work.cancel("fit")
+        if not shown:
+            self.model.set_fitted(False)
+            return
+        self.model.check_fit()
+        self._fit()
+
+    def toggle_fitted(self) -> None:
+        self.set_fitted(not (self.model.state.fitted or "fit" in self._work.busy))
+
+    def _fit(self) -> None:
+        """Fit the surfaces that are shown in the background, and show them."""
+
+        def fit_scans(job: Job) -> None:
+            with self._lock:
+                state = self.model.state
+            lines = self.painter.fit_scans(state, job.progress)
+            with self._lock:
+                if not job.cancelled():
+                    self.model.set_fitted(True)
+                    self._said = "; ".join(lines)
+            self._changed()
+
+        self._work.ask("fit", fit_scans, rank=3)
 
     def pick(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Return what is seen at a pixel of the picture, or of a slice."""
@@ -557,6 +456,15 @@ class ViewSession(Closing):
             words.append(f"{picked.hu:.0f} HU")
         return {**picked.describe(), "words": ", ".join([*words, self.model.say_place(picked.point)])}
 
+    def _describe_scale(self) -> dict[str, Any] | None:
+        """Return the scale of the colours of fitted surfaces for JSON, its colours from the lowest number on."""
+        state = self.model.state
+        scale = None if state.color_by is None else self.painter.find_fit_scale(state)
+        if scale is None or state.color_by is None:
+            return None
+        colors = scale.colors(np.linspace(scale.low, scale.limit, _SCALE_STEPS)).tolist()
+        return {"title": MESH_COLORS[state.color_by], "ticks": scale.ticks, "colors": colors}
+
     def _seen_lines(self) -> list[list[list[float]]]:
         """Return the pieces of measured lines that are not hidden in the picture that was taken last."""
         state = self.model.state
@@ -585,6 +493,8 @@ class ViewSession(Closing):
         with self._lock:
             self._error = words
             self._parts_failed |= kind == "parts"
+            if kind == "fit":
+                self.model.set_fitted(False)
         self._changed()
 
     def _changed(self) -> None:

@@ -29,8 +29,9 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.viewer.drawing.saving import KINDS, free_name
+from clrecon.viewer.model.state import SCENE, SLICES, VIEWS
 from clrecon.viewer.session.commands import page_words
-from clrecon.viewer.session.session import REST_SECONDS, SCENE, SLICES, VIEWS
+from clrecon.viewer.session.session import REST_SECONDS
 
 if TYPE_CHECKING:
     from aiohttp import web

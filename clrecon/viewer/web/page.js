@@ -7,7 +7,7 @@
   const CROSS_PIXELS = 11, GAP = 7;
 
   let fixed = null, facts = null, choosing = "", chosen = "", curveOff = false, pictures = 0, asked = false, held = 0;
-  let full = "", probed = null;
+  let full = "", probed = null, seen = null;
   const message = find("message");
 
   // The connection: commands as JSON, pictures and facts back.
@@ -99,14 +99,20 @@
     message.textContent = "";
     annotate(view);
     probe(view);
-    const [width, height] = head.size;
     if (head.view === "scene") {
-      find("status").textContent = [
-        facts && facts.iso && `${facts.iso.hu.toFixed(0)} HU`, `${head.ms.toFixed(0)} ms`, `${width} × ${height}`,
-        facts && facts.device, head.sharp ? "sharp" : "coarse", ...((facts && facts.busy) || []),
-      ].filter(Boolean).join(" · ");
+      seen = head;
+      showStatus();
     }
     Object.assign(document.documentElement.dataset, { pictures, [head.view]: head.sharp ? "sharp" : "coarse" });
+  }
+
+  function showStatus() {
+    if (!facts || !seen) return;
+    const { size: [width, height], ms, sharp } = seen;
+    find("status").textContent = [
+      facts.iso && `${facts.iso.hu.toFixed(0)} HU`, `${ms.toFixed(0)} ms`, `${width} × ${height}`, facts.device,
+      sharp ? "sharp" : "coarse", ...facts.busy,
+    ].filter(Boolean).join(" · ");
   }
 
   // Tools.
@@ -193,6 +199,10 @@
     }
     find("mode").value = now.mode;
     find("table").checked = now.table;
+    find("fitting").hidden = now.fitted === null;
+    find("fitted").checked = Boolean(now.fitted);
+    find("shade").hidden = !now.fitted;
+    find("shade").value = now.color_by || "";
     find("perspective").checked = !now.camera.parallel;
     find("undo").disabled = !now.undo;
     find("undo").title = now.undo ? `take back ${now.undo} (u)` : "nothing to take back (u)";
@@ -206,6 +216,7 @@
     if (told("notes") || told("objects") || told("warnings")) showAbout();
     if (told("said") && now.said) hint(now.said);
     showTools();
+    showStatus();
     const curves = (all) => all.measures.filter(({ kind }) => kind === "curve").length;
     if (before && curves(now) > curves(before)) curveOff = false;
     const curved = Boolean(now.iso && (curves(now) || (now.tool === "curve" && now.points.length > 1)));
@@ -405,6 +416,8 @@
   find("level").onchange = find("width").onchange = setWindow;
   find("mode").onchange = () => run("set_mode", { name: find("mode").value });
   find("table").onchange = () => run("set_table", { shown: find("table").checked });
+  find("fitted").onchange = () => run("set_fitted", { shown: find("fitted").checked });
+  find("shade").onchange = () => run("set_color_by", { name: find("shade").value || null });
   find("perspective").onchange = () => run("set_perspective", { on: find("perspective").checked });
   find("iso").addEventListener("wheel", (event) => {
     event.preventDefault();

@@ -47,6 +47,7 @@
     line([[14, low - 6], [14, low], [end, low], [end, low - 6]], "halo");
     line([[14, low - 6], [14, low], [end, low], [end, low - 6]], "bar");
     write(sayLength(length) + (camera.parallel ? "" : " in the middle"), 14, low - 17, "side", "start");
+    if (facts && facts.scale && view.name === "scene") annotateScale(make, write, width, height);
     if (facts && facts.iso) annotateCross(view, segments, width, height);
     if (facts) annotateMeasures(view, line, write, width, height);
     view.over.replaceChildren(...drawn);
@@ -67,6 +68,14 @@
       if (width >= FAIR) lines.push(probed.words);  // above the words of the scale
     }
     lines.forEach((line, n) => write(line, width - 8, height - 14 - 17 * n, n || width < FAIR ? "words probe" : "words", "end"));
+  }
+
+  // The scale of the colours of a surface, its numbers in mm beside it.
+  function annotateScale(make, write, width, height) {
+    const { title, ticks, colors } = facts.scale, top = height / 2 + 48, low = height - 22, step = (low - top) / colors.length;
+    colors.forEach((rgb, n) => make("rect", { x: width - 26, y: low - (n + 1) * step, width: 14, height: step + 0.5, fill: `rgb(${rgb})` }));
+    ticks.forEach((tick, n) => write(String(tick), width - 32, low - (n / (ticks.length - 1)) * (low - top), "words", "end"));
+    write(title, width - 12, top - 18, "words", "end");
   }
 
   // Where the slices meet: in a slice the lines of the two others, in the picture a short line along each axis.

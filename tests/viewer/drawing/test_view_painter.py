@@ -289,6 +289,7 @@ def test_a_coarse_mesh_is_near_the_fine_one():
     from clrecon.viewer.drawing.shown_meshes import coarsen_mesh
 
     fine = scenes.make_mesh(radius=20.0)
-    coarse = coarsen_mesh(fine, 500)
+    coarse, first = coarsen_mesh(fine, 500)
+    assert np.linalg.norm(coarse.vertices - fine.vertices[first], axis=1).max() < 8.0
     assert 200 < coarse.triangle_count < 1200
     assert coarse.area == pytest.approx(fine.area, rel=0.1) and coarse.normals is not None

@@ -13,7 +13,7 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.viewer.model.measures import seen_pieces
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import show_objects
-from clrecon.viewer.session.session import VIEWS, picture_key
+from clrecon.viewer.model.state import VIEWS, picture_key
 
 pytestmark = pytest.mark.unit
 

@@ -52,6 +52,10 @@ def settle(session: ViewSession) -> None:
 
 
 RIGHT: dict[str, dict[str, Any]] = {
+    "set_fitted": {"shown": True},
+    "set_color_by": {"name": "error"},
+    "step_color_by": {},
+    "toggle_fitted": {},
     "turn": {"dx": 0.1, "dy": 0},
     "pan": {"dx": 0.1, "dy": 0.1},
     "zoom": {"factor": 2, "at": [0.1, 0.1]},

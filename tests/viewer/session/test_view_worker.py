@@ -8,7 +8,7 @@ import time
 import pytest
 
 from clrecon.errors import Cancelled, DeviceError
-from clrecon.viewer.session.session import Worker
+from clrecon.system.progress import Worker
 
 pytestmark = pytest.mark.unit
 

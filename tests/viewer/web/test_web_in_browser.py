@@ -83,6 +83,25 @@ def test_an_iso_value_that_is_none_changes_nothing(page) -> None:
     assert page.find_element("id", "hu").get_attribute("value") == "321"
 
 
+def test_the_surface_is_fitted_to_the_bone_and_coloured_with_a_scale(page) -> None:
+    before, bars = picture(page), "return document.querySelectorAll('#scene rect').length"
+    assert not page.find_element("id", "shade").is_displayed() and page.execute_script(bars) == 0
+    press(page, "t")
+    wait_for(page, "return clrecon.facts.fitted === true")
+    settle(page)
+    assert page.find_element("id", "fitted").is_selected()
+    assert changed_share(before, picture(page)) > 0.001
+    page.find_element("css selector", "#shade option[value=thickness]").click()
+    wait_for(page, "return clrecon.facts.scale !== null")
+    settle(page)
+    assert page.execute_script(bars) == 64
+    assert "mm thick" in page.find_element("css selector", "#scene svg").text
+    page.find_element("id", "fitted").click()
+    wait_for(page, "return clrecon.facts.fitted === false && clrecon.facts.scale === null")
+    page.find_element("css selector", "#mode option[value=drr]").click()
+    wait_for(page, "return document.getElementById('fitting').hidden")
+
+
 def test_keys_look_from_the_sides_with_their_letters(page) -> None:
     from selenium.webdriver.common.keys import Keys
 

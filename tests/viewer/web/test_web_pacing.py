@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clrecon.viewer.session.session import SCENE
+from clrecon.viewer.model.state import SCENE
 from clrecon.viewer.web.connection import Asked, Connection, Pace, _lay_over
 
 pytestmark = pytest.mark.unit

@@ -165,6 +165,36 @@ def test_a_browser_gets_facts_and_pictures_of_the_size_that_it_has(served: WebSe
     asyncio.run(look())
 
 
+def test_a_fitted_surface_and_its_scale_come_through_the_socket(served: WebServer) -> None:
+    async def look() -> None:
+        async with browsing(served) as client:
+            await client.lay_out()
+            await client.tell(do="set_fitted", shown=True)
+            await client.until(lambda: client.facts.get("fitted"))
+            await client.until(lambda: client.facts["settled"])
+            before = len(client.pictures)
+            await client.tell(do="set_color_by", name="thickness")
+            await client.until(lambda: client.facts["scale"] is not None and len(client.pictures) > before)
+            assert client.facts["scale"]["ticks"] == [0.0, 0.5, 1.0, 1.5, 2.0]
+            await client.tell(do="set_color_by", name="hardness")
+            await client.until(lambda: any("hardness" in note.get("error", "") for note in client.notes))
+
+    asyncio.run(look())
+
+
+def test_a_fit_that_fails_is_said_and_the_surface_stays(served: WebServer, views: Views) -> None:
+    views.painter.has_bone = False
+
+    async def look() -> None:
+        async with browsing(served) as client:
+            await client.lay_out()
+            await client.tell(do="set_fitted", shown=True)
+            await client.until(lambda: any("walls" in note.get("error", "") for note in client.notes))
+            assert client.facts["fitted"] is False
+
+    asyncio.run(look())
+
+
 def test_moving_view_is_coarse_and_sharp_at_rest(served: WebServer, views: Views) -> None:
     async def look() -> None:
         async with browsing(served) as client:

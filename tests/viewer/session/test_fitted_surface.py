@@ -1,0 +1,168 @@
+"""Surfaces fitted to the bone in a view: made once in the background, coloured, picked, saved, or refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import view_scenes as scenes
+from open_views import open_sessions, shown_pixels
+from PIL import Image
+from refusals import refused
+from surface_volumes import MIDDLE, hollow_ball
+
+from clrecon import read_mesh
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.rendering import Rendering
+from clrecon.viewer.session.session import ViewSession
+
+pytestmark = pytest.mark.opencl
+
+SIZE, PATIENCE = (160, 120), 120.0
+
+
+@pytest.fixture
+def session(device):
+    with open_sessions(device) as make:
+        yield make
+
+
+@pytest.fixture
+def two_balls() -> Volume:
+    """Shells of bone 13 mm wide, the second one 40 mm above the first."""
+    voxels = hollow_ball(thickness=3.0).voxels
+    return Volume(np.concatenate([voxels, voxels]), np.eye(4))
+
+
+def do(view: ViewSession, command: str, **arguments: Any) -> dict[str, Any]:
+    """Do a command, and what rest and background work follow from it."""
+    view.do({"do": command, **arguments})
+    view.rest()
+    assert view.wait(PATIENCE)
+    return view.facts()
+
+
+def picture(view: ViewSession, moving: bool = False) -> Rendering:
+    taken: list[Rendering] = []
+    view.picture(SIZE, moving, taken.append)
+    assert view.wait(PATIENCE) and view.facts()["error"] is None
+    return taken[-1]
+
+
+def picked_radius(view: ViewSession) -> float:
+    """Distance of what is seen in front of the middle of the ball from that middle, mm."""
+    x, y = view.model.camera.project([MIDDLE], SIZE)[0][0]
+    pick = view.do({"do": "pick", "x": float(x), "y": float(y), "size": list(SIZE)})["pick"]
+    return float(np.linalg.norm(np.subtract(pick["point"], MIDDLE)))
+
+
+def test_the_fit_is_announced_and_lies_on_the_bone(session) -> None:
+    view = session(hollow_ball(thickness=3.0))
+    assert picked_radius(view) > 13.4
+    assert "fitting the surface to the bone" in view.do({"do": "toggle_fitted"})["busy"]
+    assert view.wait(PATIENCE)
+    assert view.facts()["fitted"] is True and "vertices lie on the bone" in view.facts()["said"]
+    assert picked_radius(view) == pytest.approx(13.0, abs=0.15)
+    assert do(view, "toggle_fitted")["fitted"] is False
+    assert picked_radius(view) > 13.4
+
+
+def test_a_surface_is_fitted_once_for_each_iso_value(session) -> None:
+    view = session(hollow_ball(thickness=3.0))
+    do(view, "set_fitted", shown=True)
+    (first,) = view.painter.fits.values()
+    key = view.picture_key("scene")
+    assert do(view, "set_iso", hu=350)["fitted"] is True
+    assert len(view.painter.fits) == 2 and view.picture_key("scene") != key
+    do(view, "set_iso", hu=scenes.ISO)
+    assert view.picture_key("scene") == key and first in view.painter.fits.values() and len(view.painter.fits) == 2
+
+
+def test_a_scan_without_walls_of_bone_stays_at_the_iso_value(session) -> None:
+    view = session(hollow_ball(cortex=260.0, inner=260.0))
+    do(view, "set_iso", hu=150)
+    facts = do(view, "set_fitted", shown=True)
+    assert facts["fitted"] is False and "scan 1 at 150 HU is not fitted to the bone" in facts["error"]
+    assert "no walls of bone" in facts["error"] and view.facts()["busy"] == []
+
+
+def test_a_fit_is_refused_where_no_surface_is_shown(session) -> None:
+    view = session(scenes.make_mesh())
+    with refused(UsageError, "scan", "HU"):
+        view.do({"do": "set_fitted", "shown": True})
+    view = session(scenes.make_scan())
+    with refused(UsageError, "thickness", "fitted"):
+        view.do({"do": "set_color_by", "name": "thickness"})
+    do(view, "set_mode", name="drr")
+    with refused(UsageError, "drr", "surface"):
+        view.do({"do": "toggle_fitted"})
+    assert view.facts()["fitted"] is None
+
+
+def test_a_fit_under_way_is_given_up_by_the_same_key(session, monkeypatch) -> None:
+    view = session(hollow_ball(thickness=3.0))
+
+    def fit_for_ever(state: Any, progress: Any) -> None:
+        while True:
+            progress("cortex", 0, 1)
+
+    monkeypatch.setattr(view.painter, "fit_scans", fit_for_ever)
+    view.do({"do": "toggle_fitted"})
+    view.do({"do": "toggle_fitted"})
+    assert view.wait(PATIENCE)
+    assert view.facts()["fitted"] is False and view.facts()["error"] is None
+
+
+def test_colours_show_numbers_by_one_scale(session) -> None:
+    view = session(hollow_ball(thickness=3.0))
+    do(view, "set_fitted", shown=True)
+    plain = picture(view).image
+    assert view.facts()["scale"] is None
+    scale = do(view, "step_color_by")["scale"]
+    assert scale["title"] == "mm thick" and scale["ticks"] == [0.0, 1.25, 2.5, 3.75, 5.0]
+    assert len(scale["colors"]) > 32 and scale["colors"][0] == [255, 255, 178]
+    for moving in (True, False):
+        assert np.abs(picture(view, moving).image[..., :3].astype(int)).max() > 100
+    assert np.abs(picture(view).image.astype(int) - plain).max() > 50
+    assert do(view, "step_color_by")["scale"]["title"] == "mm of error"
+    assert do(view, "step_color_by")["color_by"] is None
+    with refused(UsageError, "hardness", "thickness"):
+        view.do({"do": "set_color_by", "name": "hardness"})
+
+
+def test_parts_of_a_fitted_surface_are_hidden_picked_and_translucent(session, two_balls: Volume) -> None:
+    view = session(two_balls)
+    do(view, "set_fitted", shown=True)
+    both, one_key = shown_pixels(picture(view)), "1/1"
+    do(view, "show", key=one_key, visible=False)
+    assert 0.4 * both < shown_pixels(picture(view)) < 0.6 * both
+    do(view, "show", key=one_key, visible=True)
+    x, y = view.model.camera.project([MIDDLE + [0.0, 0.0, 40.0]], SIZE)[0][0]
+    upper = view.do({"do": "pick", "x": float(x), "y": float(y), "size": list(SIZE)})["pick"]["part"]
+    assert upper in ("1/1", "1/2") and view.model.state.part(upper).kind == "cluster"
+    do(view, "set_opacity", key=upper, value=0.3)
+    image = picture(view).image
+    assert image[round(y), round(x), 3] == pytest.approx(255 * (1.0 - 0.7**4), abs=40)  # of two walls with two faces
+
+
+def test_what_is_saved_is_the_fitted_surface_with_its_numbers_and_scale(session, tmp_path: Path) -> None:
+    view = session(hollow_ball(thickness=3.0))
+    do(view, "set_fitted", shown=True)
+    do(view, "set_color_by", name="thickness")
+    for name in ("a.ply", "a.png"):
+        view.save(tmp_path / name, size=(200, 200))
+        assert view.wait(PATIENCE) and view.facts()["error"] is None
+    mesh = read_mesh(tmp_path / "a.ply")
+    outer = np.linalg.norm(mesh.vertices - MIDDLE, axis=1)
+    assert np.median(outer[outer > 11.5]) == pytest.approx(13.0, abs=0.1)
+    assert np.nanmedian(mesh.values["thickness_mm"][outer > 11.5]) == pytest.approx(3.0, abs=0.3)
+    with Image.open(tmp_path / "a.png") as written:
+        assert written.size[0] > 230 and written.size[1] == 200
+    do(view, "add_clip", direction="left")
+    view.save(tmp_path / "b.ply")
+    assert view.wait(PATIENCE)
+    half = read_mesh(tmp_path / "b.ply")
+    assert half.triangle_count < 0.6 * mesh.triangle_count and "error_mm" in half.values
