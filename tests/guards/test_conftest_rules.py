@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import conftest
 import pytest
@@ -29,32 +29,57 @@ RUSTICL = SimpleNamespace(platform="rusticl", version="OpenCL 3.0", driver="22.3
         ("Intel", [POCL], ["Intel"]),
         ("3.1", [RUSTICL, POCL], []),
     ],
+    ids=["none", "two drivers", "one driver for two entries", "two of one driver", "absent", "by version"],
 )
-def test_each_entry_needs_a_device_of_its_own(wanted: str, devices: list[SimpleNamespace], missing: list[str]) -> None:
+def test_required_platforms_without_a_device_of_their_own_are_missing(
+    wanted: str, devices: list[SimpleNamespace], missing: list[str]
+) -> None:
     assert conftest.missing_platforms(wanted, devices) == missing
 
 
-def test_rows_of_tables_are_named_by_their_values() -> None:
-    row = {"up": (0, 1.5), "order": abs, "plan": object()}
-    assert conftest.pytest_make_parametrize_id(None, row, "row") == "up=0,1.5,order=abs,plan=object"
-    assert conftest.pytest_make_parametrize_id(None, ["x" * 99], "row") == "x" * 60
-    assert conftest.pytest_make_parametrize_id(None, "text", "row") is None
+@pytest.mark.parametrize(
+    ("value", "name"),
+    [
+        ({"up": (0, 1.5), "order": abs, "plan": object()}, "up=0,1.5,order=abs,plan=object"),
+        (["x" * 99], "x" * 60),
+        ("text", None),
+    ],
+    ids=["a dict by its entries", "a long list cut to 60 letters", "a text as pytest does"],
+)
+def test_row_of_a_table_is_named_by_its_values(value: object, name: str | None) -> None:
+    config: Any = None
+    assert conftest.pytest_make_parametrize_id(config, value, "row") == name
 
 
-def test_facts_of_a_refusal_are_numbers_and_names_not_sentences() -> None:
-    text = "slice003.dcm: 13,824 voxels at -5.50 mm, --crop x:1:2 (allow_gaps=True), 1.2e+06 mm"
-    assert_facts(text, "slice003.dcm", 13824, -5.5, "--crop", "allow_gaps=True", 1.2e6)
-    for absent in (3, 824, 5.5, 50, "crop-box", "gaps"):
-        with pytest.raises(AssertionError):
-            assert_facts(text, absent)
-    for sentence in ((), ("",), ("13,824 voxels",)):
-        with pytest.raises(ValueError, match="one word each"):
-            assert_facts(text, *sentence)
-    with pytest.raises(KeyError), refused(UserWarning, 3):
-        raise KeyError(3)
+MESSAGE = "slice003.dcm: 13,824 voxels at -5.50 mm, --crop x:1:2 (allow_gaps=True), 1.2e+06 mm"
+
+
+@pytest.mark.parametrize("fact", ["slice003.dcm", 13824, -5.5, "--crop", "allow_gaps=True", 1.2e6])
+def test_number_or_name_in_a_message_is_found_as_a_fact(fact: str | float) -> None:
+    assert_facts(MESSAGE, fact)
+
+
+@pytest.mark.parametrize("part", [3, 824, 5.5, 50, "crop-box", "gaps"])
+def test_part_of_a_number_or_name_in_a_message_is_no_fact(part: str | float) -> None:
+    with pytest.raises(AssertionError, match="is not in: slice003"):
+        assert_facts(MESSAGE, part)
+
+
+@pytest.mark.parametrize("facts", [(), ("",), ("13,824 voxels",)], ids=["none", "empty", "two words"])
+def test_sentence_in_place_of_facts_is_refused(facts: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match="one word each"):
+        assert_facts(MESSAGE, *facts)
+
+
+def test_error_of_the_expected_kind_with_its_facts_is_caught() -> None:
     with refused(KeyError, 3) as caught:
         raise KeyError(3)
     assert caught.type is KeyError
+
+
+def test_error_of_another_kind_than_expected_is_raised() -> None:
+    with pytest.raises(KeyError, match="3"), refused(UserWarning, 3):
+        raise KeyError(3)
 
 
 def run_pytest(tmp_path: Path, test: str, *options: str, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -124,37 +149,43 @@ def test_marked(three):
 WORKERS = ["-p", "xdist", "-n", "2", "--dist", "loadfile"]
 
 
-@pytest.mark.release
+@pytest.mark.release  # as is the coverage itself
 @pytest.mark.parametrize(
     ("options", "parameters", "mark", "lines", "branches"),
     [
-        (WORKERS, [1], "every_device", "62.5", "75.0"),  # a mark of those that are traced
-        ([], [1, "long", 2], "untraced", "37.5", "25.0"),  # nothing new for a long time: the rest is not traced
-        # the coverage is measured for a release
-        pytest.param(WORKERS, [1], "slow", "37.5", "25.0", marks=pytest.mark.release),  # def, if, return
-        pytest.param([], [1, 1, 2], "slow", "62.5", "75.0", marks=pytest.mark.release),
-        pytest.param([], ["long", 2], "slow", "62.5", "75.0", marks=pytest.mark.release),
+        pytest.param(WORKERS, [1], "every_device", 5, 3, id="two workers, a traced mark"),
+        pytest.param([], [1, "long", 2], "untraced", 3, 1, id="nothing new for a long time: the rest is not traced"),
+        pytest.param(WORKERS, [1], "slow", 3, 1, id="two workers, slow tests are not traced: def, if, return"),
+        pytest.param([], [1, 1, 2], "slow", 5, 3, id="one process"),
+        pytest.param([], ["long", 2], "slow", 5, 3, id="one process, the first test is long"),
     ],
 )
-def test_the_coverage_is_said_before_the_last_line(
-    tmp_path: Path, options: list[str], parameters: list[object], mark: str, lines: str, branches: str
+def test_coverage_of_lines_and_branches_is_printed_before_the_last_line(
+    tmp_path: Path, options: list[str], parameters: list[object], mark: str, lines: int, branches: int
 ) -> None:
     for name, text in PROJECT.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     test = COVERED.replace("PARAMETERS", repr(parameters)).replace("MARK", mark)
     search = os.pathsep.join([str(tmp_path / "tests" / "support"), str(tmp_path)])
+
     done = run_pytest(tmp_path, test, *options, CLRECON_COVERAGE="1", PYTHONPATH=search)
+
     assert done.returncode == 0, done.stdout + done.stderr
-    *_, said, last = done.stdout.splitlines()
-    figure = re.match(r"coverage of clrecon: (\d+\.\d) % of 8 lines and (\d+\.\d) % of 4 branches", said)
-    assert figure and f"{len(parameters) + 1} passed" in last, done.stdout
-    assert figure.groups() == (lines, branches)
+    *_, coverage, last = done.stdout.splitlines()
+    assert f"{len(parameters) + 1} passed" in last, done.stdout
+    shares = f"{100 * lines / 8:.1f} % of 8 lines and {100 * branches / 4:.1f} % of 4 branches"
+    assert coverage.startswith(f"coverage of clrecon: {shares}")
 
 
 NO_DRIVER = "import clrecon.opencl\nclrecon.opencl.list_devices = lambda: []\n"
 USES_DEVICE = "def test_it(device):\n    assert device.name\n"
+USES_DATA = "def test_it(real_data):\n    assert real_data.is_dir()\n"
 SKIPPED = "import pytest\ndef test_it():\n    pytest.skip('no')\n"
+PASSES = "def test_it():\n    assert 1 + 1 == 2\n"
+
+OK, FAILED = pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED
+WRONG, NO_TESTS = pytest.ExitCode.INTERRUPTED, pytest.ExitCode.NO_TESTS_COLLECTED
 
 
 @pytest.mark.parametrize(
@@ -162,18 +193,22 @@ SKIPPED = "import pytest\ndef test_it():\n    pytest.skip('no')\n"
     daily_rows(
         4,
         [
-            ("def test_it():\n    assert 1 + 1 == 2\n", {"CLRECON_REQUIRE_TESTS": "1"}, 0),
-            (SKIPPED, {}, 0),
-            (SKIPPED, {"CLRECON_REQUIRE_TESTS": "1"}, 5),
-            (NO_DRIVER + USES_DEVICE, {}, 0),
-            (NO_DRIVER + USES_DEVICE, {"CLRECON_REQUIRE_DEVICE": "1"}, 1),
-            (NO_DRIVER + USES_DEVICE, {"CLRECON_REQUIRE_PLATFORMS": "Intel"}, 2),
-            (USES_DEVICE, {"CLRECON_TEST_DEVICE": "no such device"}, 2),
-            ("def test_it(real_data):\n    assert real_data.is_dir()\n", {"CLRECON_TEST_DATA": "no-such-folder"}, 1),
+            pytest.param(PASSES, {"CLRECON_REQUIRE_TESTS": "1"}, OK, id="required test runs"),
+            pytest.param(SKIPPED, {}, OK, id="all skipped"),
+            pytest.param(SKIPPED, {"CLRECON_REQUIRE_TESTS": "1"}, NO_TESTS, id="required test skipped"),
+            pytest.param(NO_DRIVER + USES_DEVICE, {}, OK, id="no driver"),
+            pytest.param(NO_DRIVER + USES_DEVICE, {"CLRECON_REQUIRE_DEVICE": "1"}, FAILED, id="no required device"),
+            pytest.param(
+                NO_DRIVER + USES_DEVICE, {"CLRECON_REQUIRE_PLATFORMS": "Intel"}, WRONG, id="no required platform"
+            ),
+            pytest.param(USES_DEVICE, {"CLRECON_TEST_DEVICE": "no such device"}, WRONG, id="no named device"),
+            pytest.param(USES_DATA, {"CLRECON_TEST_DATA": "no-such-folder"}, FAILED, id="no named data"),
         ],
     ),
 )
-def test_session_exits_by_what_is_required(tmp_path: Path, test: str, variables: dict[str, str], code: int) -> None:
+def test_session_fails_where_a_required_or_named_test_device_or_folder_is_missing(
+    tmp_path: Path, test: str, variables: dict[str, str], code: pytest.ExitCode
+) -> None:
     done = run_pytest(tmp_path, test, **variables)
     assert done.returncode == code, done.stdout + done.stderr
 
@@ -206,15 +241,21 @@ def test_release():
     daily_rows(
         2,
         [
-            ({}, "6 passed, 1 deselected"),  # one parameter and what a simulator watches on both, the rest on the first
-            ({"CLRECON_TEST_EVERY_DEVICE": "1"}, "1 failed, 7 passed, 1 deselected"),
-            ({"CLRECON_RELEASE_TESTS": "1"}, "7 passed"),
-            ({"CLRECON_FAST_TESTS": "1"}, "3 passed, 5 deselected"),
-            ({"CLRECON_TEST_DEVICE": "0"}, "4 passed"),  # the 0 in the name of the other is no index
+            # int16 and what a simulator watches on both devices, int8 and test_first on the first
+            pytest.param({}, "6 passed, 1 deselected", id="every day"),
+            # test_first fails on the second device
+            pytest.param({"CLRECON_TEST_EVERY_DEVICE": "1"}, "1 failed, 7 passed, 1 deselected", id="every device"),
+            pytest.param({"CLRECON_RELEASE_TESTS": "1"}, "7 passed", id="release"),
+            # of each test the first parameter on the first device
+            pytest.param({"CLRECON_FAST_TESTS": "1"}, "3 passed, 5 deselected", id="fast"),
+            # the 0 in the name of the second is no index
+            pytest.param({"CLRECON_TEST_DEVICE": "0"}, "4 passed", id="device 0"),
         ],
     ),
 )
-def test_what_is_for_every_device_runs_on_every_device(tmp_path: Path, variables: dict[str, str], passed: str) -> None:
+def test_tests_run_on_the_devices_of_their_marks_and_of_the_variables(
+    tmp_path: Path, variables: dict[str, str], passed: str
+) -> None:
     done = run_pytest(tmp_path, TWO_DEVICES, **variables)
     assert passed in done.stdout.splitlines()[-1], done.stdout + done.stderr
 
@@ -229,12 +270,12 @@ def test_long():
 """
 
 
-def test_a_run_begins_with_what_takes_long(tmp_path: Path) -> None:
+def test_test_marked_long_runs_before_the_others(tmp_path: Path) -> None:
     done = run_pytest(tmp_path, LONG_AND_SHORT, "-vv")
     assert done.stdout.index("test_long PASSED") < done.stdout.index("test_short PASSED"), done.stdout + done.stderr
 
 
-def test_required_platforms_are_there(device: object) -> None:
+def test_required_platforms_are_found_in_this_session(device: object) -> None:
     """Asks for the devices of this session, so that a platform that got lost shows in every run."""
     wanted = os.environ.get("CLRECON_REQUIRE_PLATFORMS", "")
     named = os.environ.get("CLRECON_TEST_DEVICE", "").strip()

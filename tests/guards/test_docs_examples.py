@@ -79,12 +79,34 @@ def series(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_blocks_of_a_page_are_found() -> None:
-    text = (
-        "x\n\n    clrecon mesh A -o b.stl\n\ny\n\n    a = clrecon.f()\n\n    b = 1\n\n```json\n    clrecon.g()\n```\n\n"
-        "```python\nimport clrecon\n```\n    P = S + X\n"
-    )
-    assert find_python(text) == ["a = clrecon.f()\n\nb = 1\n", "import clrecon\n"]
+PAGE = """\
+x
+
+    clrecon mesh A -o b.stl
+
+y
+
+    a = clrecon.f()
+
+    b = 1
+
+```json
+    clrecon.g()
+```
+
+```python
+import clrecon
+```
+    P = S + X
+"""
+"""A command, indented Python, JSON, fenced Python and a formula."""
+
+
+def test_indented_and_fenced_python_of_a_page_is_found() -> None:
+    assert find_python(PAGE) == ["a = clrecon.f()\n\nb = 1\n", "import clrecon\n"]
+
+
+def test_pages_with_python_examples_are_found() -> None:
     assert {"clouds", "export", "filters", "masks", "measures", "rendering", "slices", "solid"} <= set(PAGES)
 
 
@@ -105,21 +127,27 @@ def find_wrong_calls(source: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", PAGES)
-def test_the_calls_of_a_page_are_those_of_the_signatures(name: str) -> None:
+def test_calls_of_clrecon_on_a_page_match_the_signatures(name: str) -> None:
     assert [wrong for block in PAGES[name] for wrong in find_wrong_calls(block)] == []
 
 
-def test_a_wrong_call_is_found() -> None:
-    assert find_wrong_calls(
-        "clrecon.Mesh.load(x)\nclrecon.cut_slice(v, size=(2, 2))\nf(clrecon.read_mesh('a', b=1))"
-    ) == [
-        "clrecon.Mesh.load: type object 'Mesh' has no attribute 'load'",
-        "clrecon.read_mesh: got an unexpected keyword argument 'b'",
-    ]
+@pytest.mark.parametrize(
+    ("source", "faults"),
+    [
+        ("clrecon.Mesh.load(x)", ["clrecon.Mesh.load: type object 'Mesh' has no attribute 'load'"]),
+        ("f(clrecon.read_mesh('a', b=1))", ["clrecon.read_mesh: got an unexpected keyword argument 'b'"]),
+        ("clrecon.cut_slice(v, size=(2, 2))", []),
+    ],
+    ids=["no such method", "no such keyword", "right"],
+)
+def test_call_that_does_not_match_its_signature_is_found(source: str, faults: list[str]) -> None:
+    assert find_wrong_calls(source) == faults
 
 
 @pytest.mark.parametrize("name", but_seldom(PAGES, FOR_A_RELEASE))
-def test_the_python_of_a_page_runs(name: str, series: Path, device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_examples_of_a_page_run_and_make_something(
+    name: str, series: Path, device: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(series)
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
     made: dict[str, Any] = {"clrecon": clrecon}

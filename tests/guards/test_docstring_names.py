@@ -55,7 +55,7 @@ def definitions_in(tree: ast.Module) -> Iterator[str]:
             yield from names_in(part)
 
 
-def test_docstrings_name_what_is_there() -> None:
+def test_names_in_docstrings_of_functions_exist() -> None:
     trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted((ROOT / "clrecon").rglob("*.py"))}
     known = {path.stem for path in trees}.union(*map(definitions_in, trees.values()))
     for path in chain((ROOT / "cl").rglob("*.cl"), (ROOT / "cl").rglob("*.h")):
@@ -64,7 +64,7 @@ def test_docstrings_name_what_is_there() -> None:
     assert {name: strangers for name, strangers in found.items() if strangers} == {}
 
 
-def test_the_old_name_of_a_parameter_is_found() -> None:
+def test_name_in_a_docstring_that_the_code_no_longer_has_is_found() -> None:
     source = 'def run(item):\n    """Run `item`; `what` names it, `helper` and `KEPT` help."""\n    return item.kept'
     assert list(find_strangers(ast.parse(source), {"helper"})) == ["run: what"]
 
@@ -98,14 +98,22 @@ def public_docstrings() -> Iterator[tuple[str, str, type | None]]:
                 yield f"{name}.{method}", inspect.getdoc(getattr(owner, method)) or "", owner
 
 
-def test_docstrings_of_public_names_become_pages_of_the_guide() -> None:
-    found = {name: find_unlinked(text, owner) for name, text, owner in public_docstrings()}
-    assert len(found) > 200
-    assert {name: unlinked for name, unlinked in found.items() if unlinked} == {}
-    assert [name for name, text, _ in public_docstrings() if HANGING.search(text)] == []
+def test_names_in_docstrings_of_public_names_can_be_linked_by_the_guide() -> None:
+    unlinked = {name: find_unlinked(text, owner) for name, text, owner in public_docstrings()}
+    assert len(unlinked) > 200
+    assert {name: names for name, names in unlinked.items() if names} == {}
 
 
-def test_what_the_guide_cannot_link_is_found() -> None:
+def test_no_docstring_of_a_public_name_has_a_hanging_paragraph() -> None:
+    docstrings = [(name, text) for name, text, _ in public_docstrings()]
+    assert len(docstrings) > 200
+    assert [name for name, text in docstrings if HANGING.search(text)] == []
+
+
+def test_name_in_a_docstring_that_the_guide_cannot_link_is_found() -> None:
     text = "As `Mesh.save`, `save` and `gone`: see ``vertices``."
     assert find_unlinked(text, clrecon.Mesh) == ["gone"]
-    assert HANGING.search("A box.\n\nlow, high: Corners\n    in mm.")
+
+
+def test_hanging_paragraph_of_a_docstring_is_found() -> None:
+    assert HANGING.search("A box.\n\nlow, high: Corners\n    in mm.") is not None

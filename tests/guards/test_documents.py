@@ -1,4 +1,4 @@
-"""What README, CONTRIBUTING and the documents name is there, and their commands are understood."""
+"""Files that README, CONTRIBUTING and the documents name exist, and their commands are understood."""
 
 from __future__ import annotations
 
@@ -26,6 +26,13 @@ GONE = re.compile(
 """Phrases that readers stumbled over; CONTRIBUTING and docs/guide/development speak of the code, which has twins."""
 
 
+PAGES_WITH_COMMANDS = ("clouds", "export", "mesh", "rendering", "vertebrae")
+
+
+def read_document(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
 def find_missing_files(text: str, folder: Path) -> list[str]:
     """Files that `text`, a document in `folder`, links to or names in code, and that are not there."""
     links = [name for name in LINK.findall(text) if "://" not in name]
@@ -41,94 +48,137 @@ def find_commands(text: str) -> list[list[str]]:
 @pytest.mark.parametrize(
     "name", [name for name in DOCUMENTS if name != "CONTRIBUTING.md" and "/development/" not in name]
 )
-def test_phrases_that_readers_stumble_over_are_gone(name: str) -> None:
-    prose = re.sub(r"`[^`]*`", "", (ROOT / name).read_text(encoding="utf-8"))
+def test_phrases_that_readers_stumble_over_are_in_no_document_for_users(name: str) -> None:
+    prose = re.sub(r"`[^`]*`", "", read_document(name))
     assert GONE.findall(prose) == []
 
 
-def test_a_phrase_that_readers_stumble_over_is_found() -> None:
+def test_phrase_that_readers_stumble_over_is_found() -> None:
     assert GONE.findall("nothing is resampled unasked, else it fails") == ["unasked", ", else"]
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
-def test_every_named_file_is_there(name: str) -> None:
-    path = ROOT / name
-    assert find_missing_files(path.read_text(encoding="utf-8"), path.parent) == []
+def test_files_that_a_document_names_exist(name: str) -> None:
+    assert find_missing_files(read_document(name), (ROOT / name).parent) == []
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / ".github").rglob("*.yml")), ids=lambda path: path.stem)
-def test_files_that_forms_and_workflows_name_are_there(path: Path) -> None:
-    text = path.read_text(encoding="utf-8")
-    for arguments in re.findall(r"`clrecon ([^`]+)`", text):
-        parse_command(shlex.split(arguments))
-    programs = re.findall(r"(?:python3? |run: )(\S*(?:scripts/\w+\.py|\.ci/run))", text)
+FORMS = sorted((ROOT / ".github").rglob("*.yml"))
+"""Forms for issues, and workflows."""
+
+
+@pytest.mark.parametrize("path", FORMS, ids=lambda path: path.stem)
+def test_programs_that_a_form_or_workflow_names_exist(path: Path) -> None:
+    programs = re.findall(r"(?:python3? |run: )(\S*(?:scripts/\w+\.py|\.ci/run))", path.read_text(encoding="utf-8"))
     assert [name for name in programs if not (ROOT / name).is_file()] == []
 
 
-def test_the_workflow_runs_every_check_and_the_oldest_and_newest_python() -> None:
-    text = (ROOT / ".github/workflows/tests.yml").read_text(encoding="utf-8")
-    setup = (ROOT / "setup.cfg").read_text(encoding="utf-8")
-    oldest = re.search(r"python_requires = >= ([\d.]+)", setup)
-    assert "- run: .ci/run" in text and "scripts/test.py --fast" in text
-    assert oldest is not None and f'python: ["{oldest[1]}", "3.14"]' in text
+def test_commands_that_forms_and_workflows_name_are_understood() -> None:
+    commands = [command for path in FORMS for command in re.findall(r"`clrecon ([^`]+)`", path.read_text("utf-8"))]
+    assert commands
+    for command in commands:
+        parse_command(shlex.split(command))  # raises UsageError where it is not understood
 
 
-def test_a_missing_file_is_found() -> None:
-    text = (
-        "See [this](docs/contract.md), [that](docs/contrakt.md), [home](https://x.org/a.md), `scripts/gone.py`, `--hu`."
-    )
-    assert find_missing_files(text, ROOT) == ["docs/contrakt.md", "scripts/gone.py"]
+def test_workflow_runs_all_checks_on_linux_and_the_fast_ones_elsewhere() -> None:
+    workflow = read_document(".github/workflows/tests.yml")
+    assert "- run: .ci/run" in workflow
+    assert "scripts/test.py --fast" in workflow
 
 
-def test_the_commands_of_documents_are_understood() -> None:
-    commands = find_commands((ROOT / "README.md").read_text(encoding="utf-8"))
-    assert {command[0] for command in commands} >= {"demo", "mesh", "render", "info", "devices", "phantom", "selftest"}
-    more = find_commands((ROOT / "docs" / "certificate.md").read_text(encoding="utf-8"))
-    assert [command[0] for command in more] == ["phantom", "info"]
-    for path in sorted((ROOT / "docs").glob("*.md")):
-        found = find_commands(path.read_text(encoding="utf-8"))
-        assert found or path.stem not in ("clouds", "export", "mesh", "rendering", "vertebrae"), path.stem
-        more += found
-    for command in commands + more:
-        parse_command(command)
+def test_workflow_runs_the_oldest_and_the_newest_python() -> None:
+    [oldest] = re.findall(r"python_requires = >= ([\d.]+)", read_document("setup.cfg"))
+    assert f'python: ["{oldest}", "3.14"]' in read_document(".github/workflows/tests.yml")
 
 
-@pytest.mark.parametrize("command", ["mesh A --hu 300", "mesh A -o b.stl --iso 3", "mash A", "info"])
-def test_a_wrong_command_is_found(command: str) -> None:
+@pytest.mark.parametrize(
+    ("text", "missing"),
+    [
+        ("See [this](docs/contract.md).", []),
+        ("See [that](docs/contrakt.md).", ["docs/contrakt.md"]),
+        ("See [home](https://x.org/a.md).", []),
+        ("Run `scripts/gone.py`.", ["scripts/gone.py"]),
+        ("Take `--hu`.", []),
+    ],
+)
+def test_file_that_is_linked_or_quoted_and_does_not_exist_is_found(text: str, missing: list[str]) -> None:
+    assert find_missing_files(text, ROOT) == missing
+
+
+PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").glob("*.md"))
+
+
+@pytest.mark.parametrize("name", ["README.md", *PAGES])
+def test_commands_of_a_document_are_understood(name: str) -> None:
+    commands = find_commands(read_document(name))
+    assert commands or name not in {f"docs/{page}.md" for page in PAGES_WITH_COMMANDS}
+    for command in commands:
+        parse_command(command)  # raises UsageError where it is not understood
+
+
+def test_readme_shows_the_commands_that_a_beginner_needs() -> None:
+    shown = {command for command, *_ in find_commands(read_document("README.md"))}
+    assert shown >= {"demo", "mesh", "render", "info", "devices", "phantom", "selftest"}
+
+
+def test_page_of_the_certificate_shows_the_commands_phantom_and_info() -> None:
+    commands = find_commands(read_document("docs/certificate.md"))
+    assert [command for command, *_ in commands] == ["phantom", "info"]
+
+
+@pytest.mark.parametrize(
+    ("command", "fault"),
+    [
+        ("mesh A --hu 300", "required"),
+        ("mesh A -o b.stl --iso 3", "unrecognized"),
+        ("mash A", "no command"),
+        ("info", "required"),
+    ],
+)
+def test_command_of_a_document_that_is_not_understood_is_found(command: str, fault: str) -> None:
     from clrecon.errors import UsageError
 
-    (arguments,) = find_commands(f"text\n\n    clrecon {command}   # why\n")
-    with pytest.raises(UsageError, match="required|unrecognized|no command"):
+    [arguments] = find_commands(f"text\n\n    clrecon {command}   # why\n")
+    with pytest.raises(UsageError, match=fault):
         parse_command(arguments)
 
 
-def test_the_readme_is_short_and_leads_to_every_document() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    pages = {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
-    assert pages <= set(LINK.findall(text)) and text.count("\n") < 150
+def test_readme_links_every_page_of_the_documents() -> None:
+    assert set(PAGES) <= set(LINK.findall(read_document("README.md")))
 
 
-def test_each_version_of_the_changelog_is_short_and_in_order() -> None:
-    _, *versions = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
-    kinds = ["Added", "Changed", "Deprecated", "Removed", "Fixed"]
-    for text in versions:
-        found = re.findall(r"^### (.+)$", text, re.MULTILINE)
-        assert found == [kind for kind in kinds if kind in found], text.splitlines()[0]
-        assert text.count("\n") <= 150, text.splitlines()[0]
+def test_readme_is_shorter_than_150_lines() -> None:
+    assert read_document("README.md").count("\n") < 150
 
 
-def test_the_contents_of_the_readme_are_its_sections() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+def versions_of_changelog() -> list[str]:
+    _, *versions = re.split(r"^## ", read_document("CHANGELOG.md"), flags=re.MULTILINE)
+    return versions
+
+
+@pytest.mark.parametrize("text", versions_of_changelog(), ids=lambda text: text.splitlines()[0])
+def test_version_of_the_changelog_has_its_kinds_of_changes_in_the_usual_order(text: str) -> None:
+    usual = ["Added", "Changed", "Deprecated", "Removed", "Fixed"]
+    kinds = re.findall(r"^### (.+)$", text, re.MULTILINE)
+    assert kinds == [kind for kind in usual if kind in kinds]
+
+
+@pytest.mark.parametrize("text", versions_of_changelog(), ids=lambda text: text.splitlines()[0])
+def test_version_of_the_changelog_has_at_most_150_lines(text: str) -> None:
+    assert text.count("\n") <= 150
+
+
+def test_contents_of_the_readme_link_each_of_its_sections_in_order() -> None:
+    text = read_document("README.md")
     sections = [name.lower().replace(" ", "-") for name in re.findall(r"^## (.+)$", text, re.MULTILINE)]
     assert re.findall(r"\]\(#([\w-]+)\)", text) == sections
 
 
-def test_exit_codes_are_documented() -> None:
+def test_every_exit_code_of_an_error_has_a_row_in_the_contract() -> None:
     from clrecon import errors
 
     codes = {kind.exit_code for kind in vars(errors).values() if isinstance(kind, type) and hasattr(kind, "exit_code")}
     assert len(codes) > 3
-    rows = re.findall(r"^\| (\d+) \|", (ROOT / "docs" / "contract.md").read_text(encoding="utf-8"), re.MULTILINE)
+    rows = re.findall(r"^\| (\d+) \|", read_document("docs/contract.md"), re.MULTILINE)
     assert codes <= {int(row) for row in rows}
 
 
@@ -150,7 +200,6 @@ def test_exit_codes_are_documented() -> None:
         ),
     ],
 )
-def test_the_contract_names_what_it_promises(heading: str, names: str) -> None:
-    text = (ROOT / "docs" / "contract.md").read_text(encoding="utf-8")
-    section = text.split(f"## {heading}")[1].split("\n## ")[0]
+def test_contract_names_the_entries_of_the_report_of_a_command(heading: str, names: str) -> None:
+    section = read_document("docs/contract.md").split(f"## {heading}")[1].split("\n## ")[0]
     assert [name for name in names.split() if f"`{name}`" not in section] == []
