@@ -46,24 +46,32 @@ def write_smaller(text: str) -> str:
     return text
 
 
-def test_every_command_has_a_page_that_shows_it() -> None:
-    pages = {Path(name).stem for name in PAGES if name.startswith("commands/")} - {"index"}
-    assert pages <= set(COMMANDS)
-    for name in pages:
-        text = (GUIDE / "commands" / f"{name}.md").read_text(encoding="utf-8")
-        assert text.startswith(f"# clrecon {name}\n") and f"clrecon {name}" in text.split("\n", 1)[1], name
+PAGES_OF_COMMANDS = sorted({Path(name).stem for name in PAGES if name.startswith("commands/")} - {"index"})
+
+
+@pytest.mark.parametrize("command", PAGES_OF_COMMANDS)
+def test_page_of_a_command_has_its_name_as_title_and_shows_it(command: str) -> None:
+    assert command in COMMANDS
+    title, text = (GUIDE / "commands" / f"{command}.md").read_text(encoding="utf-8").split("\n", 1)
+    assert title == f"# clrecon {command}"
+    assert f"clrecon {command}" in text
 
 
 @pytest.mark.parametrize("name", sorted(WITH_COMMANDS))
-def test_the_commands_of_a_page_are_understood(name: str) -> None:
-    for line in COMMAND.findall((GUIDE / name).read_text(encoding="utf-8")):
-        parse_command(shlex.split(write_smaller(line)))
+def test_commands_of_a_page_of_the_guide_are_understood(name: str) -> None:
+    commands = COMMAND.findall((GUIDE / name).read_text(encoding="utf-8"))
+    assert commands
+    for line in commands:
+        parse_command(shlex.split(write_smaller(line)))  # raises UsageError where it is not understood
+
+
+def test_pages_whose_commands_are_for_a_release_alone_are_some_of_those_with_commands() -> None:
     assert FOR_A_RELEASE < WITH_COMMANDS
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", but_seldom(sorted(WITH_COMMANDS), FOR_A_RELEASE))
-def test_the_commands_of_a_page_run(name: str, series: Path, device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_of_a_page_of_the_guide_run(name: str, series: Path, device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(series)
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
     for line in COMMAND.findall((GUIDE / name).read_text(encoding="utf-8")):
@@ -74,18 +82,20 @@ def test_the_commands_of_a_page_run(name: str, series: Path, device, monkeypatch
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in PAGES if PYTHON.search((GUIDE / name).read_text(encoding="utf-8"))])
-def test_the_python_of_a_page_runs(name: str, series: Path, device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_of_a_page_of_the_guide_makes_a_volume_or_a_mesh(
+    name: str, series: Path, device, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(series)
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
     for block in PYTHON.findall((GUIDE / name).read_text(encoding="utf-8")):
-        made: dict[str, object] = {}
-        exec(compile(textwrap.dedent(write_smaller(block)), name, "exec"), made)
-        assert {"volume", "mesh"} & set(made)
+        variables: dict[str, object] = {}
+        exec(compile(textwrap.dedent(write_smaller(block)), name, "exec"), variables)
+        assert {"volume", "mesh"} & set(variables)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", daily(2, [path.stem for path in sorted((GUIDE / "gallery").glob("*.py"))]))
-def test_a_script_of_the_gallery_makes_its_picture(
+def test_script_of_the_gallery_writes_a_picture_of_many_colours(
     name: str, tmp_path: Path, device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from clrecon.rendering.pictures.pillow import load_pillow
@@ -97,24 +107,36 @@ def test_a_script_of_the_gallery_makes_its_picture(
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
     runpy.run_path(str(GUIDE / "gallery" / f"{name}.py"), run_name="__main__")
     colours = Image.open("picture.png").convert("RGB").getcolors(2**20)
-    assert colours is not None and len(colours) > 100
+    assert colours is not None
+    assert len(colours) > 100  # an empty picture has one, a shaded surface thousands
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (GUIDE / "gallery").glob("*.py")))
+def test_script_of_the_gallery_has_its_picture_among_the_documents(name: str) -> None:
     assert (ROOT / "docs" / "images" / f"gallery-{name}.png").is_file()
 
 
-def find_rows(text: str) -> dict[str, list[str]]:
-    """The tables of a page: cells by the first of each row."""
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
+def read_tables(path: Path) -> dict[str, list[str]]:
+    """The tables of a page: the cells of each row by its first cell."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
     return {row[0]: row[1:] for row in rows}
 
 
-def test_the_errors_to_expect_are_those_that_were_measured() -> None:
-    said = find_rows((GUIDE / "concepts.md").read_text(encoding="utf-8"))
-    measured = find_rows((ROOT / "docs" / "iso_value.md").read_text(encoding="utf-8"))
-    names = [name for name in said if "mm" in name]
-    assert len(names) == 7
-    for name in names:
-        best, preset, *_, auto = (re.findall(r"\((.*?)\)", cell)[0] for cell in measured[name] if "(" in cell)
-        assert said[name] == [best, preset, auto], name
+MEASURED = read_tables(ROOT / "docs" / "iso_value.md")
+"""The page with the measured errors of surfaces, from which the guide's page of concepts takes its own."""
+
+
+def test_errors_of_walls_on_the_page_of_concepts_are_those_of_the_page_of_iso_values() -> None:
+    stated = {name: cells for name, cells in read_tables(GUIDE / "concepts.md").items() if "mm" in name}
+    assert stated
+    for name, cells in stated.items():
+        in_brackets = [found[1] for cell in MEASURED[name] if (found := re.search(r"\((.*?)\)", cell))]
+        best, preset, *_, auto = in_brackets
+        assert cells == [best, preset, auto], name
+
+
+def test_shares_without_a_surface_on_the_page_of_concepts_are_those_of_the_page_of_iso_values() -> None:
     text = " ".join((GUIDE / "concepts.md").read_text(encoding="utf-8").split())
-    lost = [measured[level][2] for level in ("auto", "preset")]
-    assert f"at {lost[0]} of the places on 22 phantoms there is no surface, with the preset at {lost[1]}" in text
+    auto, preset = (MEASURED[level][2] for level in ("auto", "preset"))
+    assert f"at {auto} of the places on 22 phantoms there is no surface, with the preset at {preset}" in text

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 from house import PACKAGE, ROOT
@@ -36,12 +37,14 @@ def written_twice(source: str) -> set[str]:
 
 
 @pytest.mark.parametrize(("python", "file", "macro"), PAIRS)
-def test_constants_of_python_and_kernels_are_equal(python: str, file: str, macro: str) -> None:
+def test_constant_that_is_written_in_python_and_in_a_kernel_is_equal_in_both(
+    python: str, file: str, macro: str
+) -> None:
     module, _, name = python.rpartition(".")
     assert kernel_number(file, macro) == getattr(import_module(module), name)
 
 
-def test_no_other_constant_is_written_twice() -> None:
+def test_only_listed_constants_are_written_in_python_and_in_a_kernel() -> None:
     known = {name for name, _, _ in PAIRS}
     found = {
         f"{'.'.join(path.relative_to(ROOT).with_suffix('').parts)}.{name}"
@@ -51,40 +54,57 @@ def test_no_other_constant_is_written_twice() -> None:
     assert found - known == set()
 
 
-def test_no_comment_says_as_in_a_kernel_file() -> None:
-    said = [
-        path.name for path in PACKAGE.rglob("*.py") if re.search(r"as in cl/\w+/\w+\.(cl|h)", path.read_text("utf-8"))
-    ]
-    assert said == []
+def test_no_comment_in_python_refers_to_a_number_as_in_a_kernel_file() -> None:
+    comments = {path: path.read_text("utf-8") for path in PACKAGE.rglob("*.py")}
+    assert len(comments) > 300
+    assert [path for path, text in comments.items() if re.search(r"as in cl/\w+/\w+\.(cl|h)", text)] == []
 
 
-def test_modes_and_combinations_have_numbers_of_their_own() -> None:
-    assert sorted(COMBINATIONS.values()) == [0, 1, 2]
-    assert sorted(PROJECTIONS.values()) == [0, 1, 2, 3]
+@pytest.mark.parametrize("numbers", [COMBINATIONS, PROJECTIONS], ids=["combinations", "projections"])
+def test_modes_that_kernels_tell_apart_are_numbered_from_0(numbers: dict[str, int]) -> None:
+    assert sorted(numbers.values()) == list(range(len(numbers)))
+    assert len(numbers) > 1
 
 
-def test_numbers_are_read_as_the_compiler_reads_them() -> None:
-    assert kernel_constant("rays/leap.h", "BRICK_CELLS") == 4
-    assert isinstance(kernel_constant("rays/leap.h", "BRICK_CELLS"), int)
-    assert kernel_number("rays/project.cl", "AIR_HU") == -1000.0
-    assert kernel_number("rays/project.cl", "WATER_PER_HU") == 0.001
-    with pytest.raises(KeyError, match=r"cl/rays/leap.h defines no number NODES"):
-        kernel_constant("rays/leap.h", "NODES")
-    with pytest.raises(KeyError, match="NO_HIT"):
-        kernel_number("rays/surface.cl", "NO_HIT")
-    with pytest.raises(ValueError, match="no whole number"):
-        kernel_constant("rays/project.cl", "WATER_PER_HU")
-
-
-def test_a_number_that_depends_on_the_variant_is_refused(tmp_path, monkeypatch) -> None:
+@pytest.fixture
+def header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The name of a header with numbers, some of them of a variant."""
     (tmp_path / "rays").mkdir()
-    (tmp_path / "rays/a.h").write_text("#ifdef WIDE\n#define LENGTH 8\n#else\n#define LENGTH 4 /* narrow */\n#endif\n")
+    (tmp_path / "rays/a.h").write_text(
+        "#define CELLS 4\n#define AIR_HU -1000.0f\n#define SHARE 0.001f\n#define WORD uint\n"
+        "#ifdef WIDE\n#define LENGTH 8\n#else\n#define LENGTH 4 /* narrow */\n#endif\n"
+    )
     monkeypatch.setattr("clrecon.opencl.sources.kernel_root", lambda: tmp_path)
+    return "rays/a.h"
+
+
+def test_whole_number_of_a_kernel_is_read_as_an_integer(header: str) -> None:
+    assert kernel_constant(header, "CELLS") == 4
+    assert type(kernel_constant(header, "CELLS")) is int
+
+
+@pytest.mark.parametrize(("macro", "number"), [("AIR_HU", -1000.0), ("SHARE", 0.001)])
+def test_number_of_a_kernel_is_read_as_written_there(header: str, macro: str, number: float) -> None:
+    assert kernel_number(header, macro) == number
+
+
+@pytest.mark.parametrize("macro", ["NODES", "WORD"], ids=["not defined", "no number"])
+def test_macro_of_a_kernel_that_is_no_number_is_refused(header: str, macro: str) -> None:
+    with pytest.raises(KeyError, match=rf"cl/rays/a.h defines no number {macro}"):
+        kernel_number(header, macro)
+
+
+def test_fraction_in_place_of_a_whole_number_of_a_kernel_is_refused(header: str) -> None:
+    with pytest.raises(ValueError, match="no whole number"):
+        kernel_constant(header, "SHARE")
+
+
+def test_number_of_a_kernel_that_depends_on_the_variant_is_refused_with_its_values(header: str) -> None:
     with refused(KeyError, "LENGTH", 4, 8):
-        kernel_number("rays/a.h", "LENGTH")
+        kernel_number(header, "LENGTH")
 
 
-def test_importing_clrecon_reads_no_kernel_file() -> None:
+def test_import_of_clrecon_reads_no_kernel_file() -> None:
     code = (
         "import sys, clrecon, clrecon.cli.main;"
         "sources = sys.modules.get('clrecon.opencl.sources');"
@@ -94,7 +114,14 @@ def test_importing_clrecon_reads_no_kernel_file() -> None:
     assert done.stdout.strip() == "0"
 
 
-def test_a_constant_that_is_written_twice_would_be_seen() -> None:
-    assert written_twice('BRICK = 8\n"""Voxels along a side, see cl/include/bricks.h."""\n') == {"BRICK"}
-    assert written_twice('BRICK = 8\n"""Voxels along a side."""\n') == set()
-    assert written_twice('BRICK = kernel_constant("a.h", "B")\n"""Voxels, see cl/include/bricks.h."""\n') == set()
+@pytest.mark.parametrize(
+    ("source", "constants"),
+    [
+        ('BRICK = 8\n"""Voxels along a side, see cl/include/bricks.h."""\n', {"BRICK"}),
+        ('BRICK = 8\n"""Voxels along a side."""\n', set()),
+        ('BRICK = kernel_constant("a.h", "B")\n"""Voxels, see cl/include/bricks.h."""\n', set()),
+    ],
+    ids=["number that names a kernel file", "number of Python alone", "number read from the kernel"],
+)
+def test_number_in_python_whose_docstring_names_a_kernel_file_is_found(source: str, constants: set[str]) -> None:
+    assert written_twice(source) == constants

@@ -23,7 +23,7 @@ WITHOUT_KERNELS = {"vertebrae"}
 """Rooms that call operators of other rooms alone."""
 
 
-def find_strays(kernels: list[str], operators: dict[str, str]) -> list[str]:
+def find_unused_kernels(kernels: list[str], operators: dict[str, str]) -> list[str]:
     """Kernel files that no operator of the same room names; `operators` has the source of each by its path."""
     return [
         name
@@ -32,7 +32,7 @@ def find_strays(kernels: list[str], operators: dict[str, str]) -> list[str]:
     ]
 
 
-def find_themes(root: Path) -> dict[str, set[str]]:
+def find_folders_of_headers(root: Path) -> dict[str, set[str]]:
     """For each header the folders whose kernel files need it, over other headers too."""
     themes: dict[str, set[str]] = {}
 
@@ -57,29 +57,35 @@ def find_misplaced(themes: dict[str, set[str]]) -> dict[str, set[str]]:
     }
 
 
-def test_folders_are_those_of_the_operators() -> None:
+def test_folders_of_kernels_are_those_of_the_operators() -> None:
     folders = {path.name for path in KERNELS.iterdir() if path.is_dir() and any(path.iterdir())}
     rooms = {path.name for path in OPERATORS.iterdir() if (path / "__init__.py").is_file()}
     assert folders - {"include", "__pycache__"} == rooms - WITHOUT_KERNELS
     assert rooms >= WITHOUT_KERNELS
 
 
-def test_kernel_files_lie_with_their_operators() -> None:
+def test_every_kernel_file_is_loaded_by_an_operator_of_the_same_folder() -> None:
     operators = {path.relative_to(OPERATORS).as_posix(): path.read_text("utf-8") for path in OPERATORS.rglob("*.py")}
     assert len(kernel_files()) > 10
-    assert find_strays(kernel_files(), operators) == []
+    assert find_unused_kernels(kernel_files(), operators) == []
 
 
-def test_headers_lie_with_those_that_need_them() -> None:
-    themes = find_themes(KERNELS)
-    assert themes.keys() | FIRST_HEADERS == {path.relative_to(KERNELS).as_posix() for path in KERNELS.rglob("*.h")}
-    assert not themes.keys() & FIRST_HEADERS
-    assert find_misplaced(themes) == {}
-
-
-def test_these_guards_see_what_is_in_the_wrong_place(tmp_path: Path) -> None:
+def test_kernel_file_that_only_operators_of_another_folder_load_is_found() -> None:
     operators = {"rays/pictures.py": 'load("rays/composite.cl")', "masks/mask.py": 'load("rays/cast.cl")'}
-    assert find_strays(["rays/cast.cl", "rays/composite.cl"], operators) == ["rays/cast.cl"]
+    assert find_unused_kernels(["rays/cast.cl", "rays/composite.cl"], operators) == ["rays/cast.cl"]
+
+
+def test_every_header_is_included_by_a_kernel_or_put_before_all_by_the_host() -> None:
+    included = find_folders_of_headers(KERNELS).keys()
+    assert included | FIRST_HEADERS == {path.relative_to(KERNELS).as_posix() for path in KERNELS.rglob("*.h")}
+    assert included & FIRST_HEADERS == set()
+
+
+def test_every_header_is_in_the_folder_of_its_kernels_and_shared_ones_in_include() -> None:
+    assert find_misplaced(find_folders_of_headers(KERNELS)) == {}
+
+
+def test_header_of_one_folder_in_include_and_shared_header_of_a_folder_are_found(tmp_path: Path) -> None:
     for name, text in (
         ("rays/a.cl", '#include "rays/near.h"\n#include "include/lone.h"\n'),
         ("surface/b.cl", '#include "rays/near.h"\n'),
@@ -89,4 +95,5 @@ def test_these_guards_see_what_is_in_the_wrong_place(tmp_path: Path) -> None:
     ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
-    assert find_misplaced(find_themes(tmp_path)) == {"rays/near.h": {"rays", "surface"}, "include/lone.h": {"rays"}}
+    misplaced = find_misplaced(find_folders_of_headers(tmp_path))
+    assert misplaced == {"rays/near.h": {"rays", "surface"}, "include/lone.h": {"rays"}}

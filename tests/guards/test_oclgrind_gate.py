@@ -1,4 +1,4 @@
-"""The Oclgrind check is red for a faulty kernel although Oclgrind itself exits 0, and green for a sound one."""
+"""The Oclgrind check fails for a faulty kernel although Oclgrind itself exits 0, and passes for a sound one."""
 
 from __future__ import annotations
 
@@ -28,12 +28,17 @@ queue.finish()
 """
 
 
-def check(statement: str, *options: str) -> subprocess.CompletedProcess[str]:
-    script = ROOT / "scripts" / "proof" / "check_oclgrind.py"
-    code = PROGRAM.replace("STATEMENT)", f"{statement!r})")
+def check_python(code: str, *options: str) -> subprocess.CompletedProcess[str]:
+    """Run Python code under the check."""
+    script = str(ROOT / "scripts" / "proof" / "check_oclgrind.py")
     return subprocess.run(
-        [sys.executable, str(script), *options, sys.executable, "-c", code], capture_output=True, text=True
+        [sys.executable, script, *options, sys.executable, "-c", code], capture_output=True, text=True
     )
+
+
+def check_kernel(statement: str, *options: str) -> subprocess.CompletedProcess[str]:
+    """Run 16 work-items of a kernel with this statement, which may write 16 integers to `out`, under the check."""
+    return check_python(PROGRAM.replace("STATEMENT)", f"{statement!r})"), *options)
 
 
 @pytest.fixture
@@ -47,28 +52,38 @@ def oclgrind() -> str:
 
 
 @pytest.mark.parametrize(("statement", "fault"), [("out[i + 1] = i", "Invalid write"), ("out[0] = i", "data race")])
-def test_a_faulty_kernel_is_red(oclgrind: str, statement: str, fault: str) -> None:
-    done = check(statement)
+@pytest.mark.usefixtures("oclgrind")
+def test_oclgrind_check_fails_for_a_faulty_kernel_and_names_the_fault(statement: str, fault: str) -> None:
+    done = check_kernel(statement)
     assert done.returncode == 1
-    assert "Oclgrind reports faults" in done.stderr and fault in done.stderr
+    assert "Oclgrind reports faults" in done.stderr
+    assert fault in done.stderr
 
 
-def test_uninitialised_values_are_reported_on_request(oclgrind: str) -> None:
-    statement = "out[i] = scratch[i] > 3 ? 1 : 2"
-    assert check(statement).returncode == 0
-    done = check(statement, "--uninitialized")
+READS_UNWRITTEN = "out[i] = scratch[i] > 3 ? 1 : 2"
+
+
+@pytest.mark.usefixtures("oclgrind")
+def test_oclgrind_check_passes_for_uninitialised_values_by_default() -> None:
+    assert check_kernel(READS_UNWRITTEN).returncode == 0
+
+
+@pytest.mark.usefixtures("oclgrind")
+def test_oclgrind_check_fails_for_uninitialised_values_on_request() -> None:
+    done = check_kernel(READS_UNWRITTEN, "--uninitialized")
     assert done.returncode == 1
     assert "Uninitialized value" in done.stderr
 
 
-def test_a_sound_kernel_is_green(oclgrind: str) -> None:
-    done = check("out[i] = i")
+@pytest.mark.usefixtures("oclgrind")
+def test_oclgrind_check_passes_for_a_sound_kernel() -> None:
+    done = check_kernel("out[i] = i")
     assert (done.returncode, done.stdout.strip()) == (0, "Oclgrind reports nothing"), done.stderr
 
 
-@pytest.mark.parametrize(("code", "said"), [("raise SystemExit(3)", "exit status 3"), ("pass", "no log")])
-def test_a_failing_or_idle_command_is_red(oclgrind: str, code: str, said: str) -> None:
-    script = str(ROOT / "scripts" / "proof" / "check_oclgrind.py")
-    done = subprocess.run([sys.executable, script, sys.executable, "-c", code], capture_output=True, text=True)
+@pytest.mark.usefixtures("oclgrind")
+@pytest.mark.parametrize(("code", "fault"), [("raise SystemExit(3)", "exit status 3"), ("pass", "no log")])
+def test_oclgrind_check_fails_for_a_command_that_fails_or_launches_nothing(code: str, fault: str) -> None:
+    done = check_python(code)
     assert done.returncode == 1
-    assert said in done.stderr
+    assert fault in done.stderr
