@@ -54,42 +54,54 @@ def by_position(function: Callable[..., Any]) -> list[str]:
     return [own.name for own in parameters if own.name in KEYWORDS and own.kind is not own.KEYWORD_ONLY]
 
 
-def test_the_stub_says_each_name_once_and_says_them_all() -> None:
-    imported = re.findall(r"^from ([\w.]+) import (\w+) as (\w+)$", STUB, re.MULTILINE)
+IMPORTED = re.findall(r"^from ([\w.]+) import (\w+) as (\w+)$", STUB, re.MULTILINE)
+"""Module, name there, and public name."""
+
+
+def test_stub_declares_each_public_name_once() -> None:
     assigned = re.findall(r"^(\w+) = \w+$", STUB, re.MULTILINE)
-    names = [*(name for _, _, name in imported), *assigned, "__version__"]
-    assert sorted(names) == sorted(clrecon.__all__)
-    assert len(set(names)) == len(names) > 40
-    for module, there, name in imported:
-        assert there == name and getattr(clrecon, name) is getattr(import_module(module), name)
+    names = [*(name for _, _, name in IMPORTED), *assigned, "__version__"]
+    assert sorted(names) == sorted(set(clrecon.__all__))
 
 
-def test_name_that_is_not_public_is_not_there() -> None:
-    for name in ("choose_device", "list_devices", "import_module_", "rendr", "_nothing"):
-        with pytest.raises(AttributeError, match=name):
-            getattr(clrecon, name)
+@pytest.mark.parametrize(("module", "name_there", "name"), IMPORTED, ids=lambda value: value)
+def test_public_name_is_the_object_that_the_stub_imports(module: str, name_there: str, name: str) -> None:
+    assert name_there == name
+    assert getattr(clrecon, name) is getattr(import_module(module), name)
+
+
+@pytest.mark.parametrize("name", ["choose_device", "list_devices", "import_module_", "rendr", "_nothing"])
+def test_name_that_is_not_public_is_no_attribute_of_clrecon(name: str) -> None:
+    with pytest.raises(AttributeError, match=name):
+        getattr(clrecon, name)
+
+
+def test_dir_of_clrecon_has_the_public_names_alone() -> None:
     assert {name for name in dir(clrecon) if not name.startswith("__")} == set(clrecon.__all__) - {"__version__"}
+
+
+def test_clrecon_has_at_most_110_public_names() -> None:
     assert len(clrecon.__all__) <= 110
 
 
 def test_star_import_takes_the_public_names() -> None:
-    space: dict[str, Any] = {}
-    exec("from clrecon import *", space)
-    assert set(clrecon.__all__) <= set(space)
+    namespace: dict[str, Any] = {}
+    exec("from clrecon import *", namespace)
+    assert set(clrecon.__all__) <= set(namespace)
 
 
-def test_device_memory_and_progress_are_given_by_name() -> None:
-    found = dict(public_callables())
-    assert len(found) > 60
-    assert {name: own for name, function in found.items() if (own := by_position(function))} == {}
+def test_no_public_function_takes_device_memory_or_progress_by_position() -> None:
+    functions = dict(public_callables())
+    assert len(functions) > 60
+    assert {name: found for name, function in functions.items() if (found := by_position(function))} == {}
 
 
-def test_a_device_by_position_is_found() -> None:
-    def takes(volume: int, device: int, *, memory: int) -> None: ...
+def test_parameter_device_that_is_taken_by_position_is_found() -> None:
+    def extract(volume: int, device: int, *, memory: int) -> None: ...
 
-    assert by_position(takes) == ["device"]
+    assert by_position(extract) == ["device"]
 
 
-def test_functions_that_take_long_tell_their_progress() -> None:
-    take = {name for name, function in public_callables() if "progress" in inspect.signature(function).parameters}
-    assert take == TAKE_PROGRESS
+def test_public_functions_that_report_progress_are_those_listed_as_taking_long() -> None:
+    reporting = {name for name, function in public_callables() if "progress" in inspect.signature(function).parameters}
+    assert reporting == TAKE_PROGRESS

@@ -45,69 +45,121 @@ def block_of(name: str) -> str:
     return blocks[0]
 
 
-def test_the_example_of_the_readme_runs(folder, device, monkeypatch):
+@pytest.fixture
+def in_folder(folder, device, monkeypatch) -> Path:
+    """The folder of examples, which is the current one; `clrecon` takes the device of the test."""
     monkeypatch.chdir(folder)
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
-    made: dict = {}
-    exec(compile(block_of("README.md").replace('"CT_FOLDER"', '"ct"'), "README.md", "exec"), made)
-    assert made["mesh"].quality()["closed"] and made["choice"].method == "auto"
-    assert {"bone.stl", "spine.png"} <= {path.name for path in folder.iterdir()}
+    return folder
 
 
-def test_vertebrae_of_the_readme_are_named_so_that_the_next_command_finds_l3(folder, device, monkeypatch):
+def run_python(source: str, name: str, **variables: Any) -> dict[str, Any]:
+    """Run a block of a document; returns the variables that it makes."""
+    exec(compile(source, name, "exec"), variables)
+    return variables
+
+
+def is_drawn(picture: clrecon.Rendering) -> bool:
+    return bool(picture.image[..., :3].any())
+
+
+def test_example_of_the_readme_makes_a_closed_mesh_and_a_picture(in_folder):
+    source = block_of("README.md").replace('"CT_FOLDER"', '"ct"')
+    variables = run_python(source, "README.md")
+    assert variables["mesh"].quality()["closed"]
+    assert {"bone.stl", "spine.png"} <= {path.name for path in in_folder.iterdir()}
+
+
+def test_commands_of_the_readme_name_vertebrae_so_that_l3_is_meshed_within_its_label(in_folder):
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    chain = re.search(r"^    (clrecon vertebrae .*)\n    (clrecon mesh .* --label L3)$", text, re.MULTILINE)
-    assert chain is not None
-    loin = PhantomSettings(levels="T12-L3", facet_gap_mm=0.0, size=(112, 112), spacing=(2.0, 2.0, 2.5))
-    write_phantom(folder / "loin", loin)
-    monkeypatch.chdir(folder)
-    monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
-    for command in chain.groups():
+    commands = re.search(r"^    (clrecon vertebrae .*)\n    (clrecon mesh .* --label L3)$", text, re.MULTILINE)
+    assert commands is not None
+    write_phantom(
+        in_folder / "loin", PhantomSettings(levels="T12-L3", facet_gap_mm=0.0, size=(112, 112), spacing=(2.0, 2.0, 2.5))
+    )
+
+    for command in commands.groups():
         assert main([*command.replace("CT_FOLDER", "loin").split()[1:], "-q"]) == 0
+
     truth = clrecon.read_labels("loin/levels.nrrd")
     l3 = truth.ijk_to_lps(np.argwhere(truth.voxels == truth.find("L3"))[:, ::-1])
-    found = clrecon.read_mesh("l3.stl").vertices
-    assert np.abs(found.mean(axis=0) - l3.mean(axis=0)).max() < 5.0
-    assert found[:, 2].min() > l3[:, 2].min() - 5.0 and found[:, 2].max() < l3[:, 2].max() + 5.0
+    vertices = clrecon.read_mesh("l3.stl").vertices
+    tolerance_mm = 5.0  # two slices: vertebrae are divided at discs, a level is 30 mm high
+    assert np.abs(vertices.mean(axis=0) - l3.mean(axis=0)).max() < tolerance_mm
+    assert vertices[:, 2].min() > l3[:, 2].min() - tolerance_mm
+    assert vertices[:, 2].max() < l3[:, 2].max() + tolerance_mm
 
 
-def test_code_of_the_tour_runs(folder, device, monkeypatch):
+def test_example_of_the_tour_makes_a_closed_vertebra_and_pictures(in_folder):
     source = block_of("docs/tour.md")
-    for text, other in SMALLER.items():
+    for text, smaller in SMALLER.items():
         assert text in source, text
-        source = source.replace(text, other)
-    monkeypatch.chdir(folder)
-    monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
-    made: dict = {}
-    exec(compile(source, "docs/tour.md", "exec"), made)
-    assert made["vertebra"].quality()["closed"] and made["front"].image[..., :3].any()
-    assert {"bone.stl", "spine.png", "bone.gif"} <= {path.name for path in folder.iterdir()}
+        source = source.replace(text, smaller)
+
+    variables = run_python(source, "docs/tour.md")
+
+    assert variables["vertebra"].quality()["closed"]
+    assert is_drawn(variables["front"])
+    assert {"bone.stl", "spine.png", "bone.gif"} <= {path.name for path in in_folder.iterdir()}
 
 
-def test_the_examples_of_styles_run(folder, device, monkeypatch):
+def test_examples_of_styles_on_the_page_of_rendering_draw_each_of_their_pictures(in_folder):
     text = (ROOT / "docs" / "rendering.md").read_text(encoding="utf-8")
     block = re.search(r"(    bone = clrecon\.SurfaceLook.*?)\n\n", text, re.DOTALL)
     assert block is not None
-    monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
-    made: dict[str, Any] = {"clrecon": clrecon, "volume": clrecon.read_volume(folder / "ct")}
-    exec(compile(textwrap.dedent(block[1]), "docs/rendering.md", "exec"), made)
-    assert all(made[name].image[..., :3].any() for name in ("picture", "front", "side", "chest", "spine"))
+    volume = clrecon.read_volume("ct")
+    variables = run_python(textwrap.dedent(block[1]), "docs/rendering.md", clrecon=clrecon, volume=volume)
+    pictures = ("picture", "front", "side", "chest", "spine")
+    assert [name for name in pictures if not is_drawn(variables[name])] == []
 
 
-def test_the_examples_of_volumes_run(folder, monkeypatch):
+@pytest.fixture(scope="module")
+def scan(folder) -> clrecon.Volume:
+    """64 x 64 x 48 voxels of 3 mm."""
+    return clrecon.read_volume(folder / "ct")
+
+
+@pytest.fixture(scope="module")
+def of_python_page(folder, scan) -> dict[str, Any]:
+    """The variables that the examples of docs/python.md make, from top to bottom."""
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     blocks = re.findall(r"((?:^    .*\n)+)", text, re.MULTILINE)
-    assert len(blocks) == 5
-    monkeypatch.chdir(folder)
-    volume, labels = clrecon.read_volume("ct"), clrecon.read_labels("segmentation.seg.nrrd")
-    made: dict[str, Any] = {"clrecon": clrecon, "numpy": np, "threading": threading, "volume": volume, "labels": labels}
-    made |= {"mesh": clrecon.extract_isosurface(volume, 226), "second_volume": volume[3:20, 5:]}
-    made.update({name: pytest.importorskip(name) for name in ("SimpleITK", "nibabel")})
-    for block in blocks:
-        exec(compile(textwrap.dedent(block), "docs/python.md", "exec"), made)
-    assert made["spine"].shape == (30, 64, 32) and made["slab"].shape == (1, 64, 64)
-    assert made["coarse"].spacing == pytest.approx((6.0, 6.0, 6.0))
-    assert made["same"].affine == pytest.approx(volume.affine) and made["scan"].dtype == volume.dtype
-    assert made["surface"].quality().closed
-    assert made["mean_hu"] >= 226 and made["even"].spacing == pytest.approx((2.0, 2.0, 2.0))
-    assert made["loin"].shape[0] == 16 and made["near"].shape_ijk == (20, 20, 20)
+    variables: dict[str, Any] = {"clrecon": clrecon, "numpy": np, "threading": threading, "volume": scan}
+    variables |= {"mesh": clrecon.extract_isosurface(scan, 226), "second_volume": scan[3:20, 5:]}
+    variables |= {name: pytest.importorskip(name) for name in ("SimpleITK", "nibabel")}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        variables["labels"] = clrecon.read_labels("segmentation.seg.nrrd")
+        for block in blocks:
+            exec(compile(textwrap.dedent(block), "docs/python.md", "exec"), variables)
+    return variables
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"), [("spine", (30, 64, 32)), ("slab", (1, 64, 64))], ids=["slices and columns", "one slice"]
+)
+def test_sliced_volume_of_the_page_on_python_has_the_shape_of_its_slices(of_python_page, name, shape):
+    assert of_python_page[name].shape == shape
+
+
+@pytest.mark.parametrize(("name", "spacing"), [("coarse", (6.0, 6.0, 6.0)), ("even", (2.0, 2.0, 2.0))])
+def test_resampled_volume_of_the_page_on_python_has_its_spacing(of_python_page, name, spacing):
+    assert of_python_page[name].spacing == pytest.approx(spacing)
+
+
+def test_volume_of_the_page_on_python_comes_back_from_simpleitk_and_nibabel_unchanged(of_python_page, scan):
+    assert of_python_page["same"].affine == pytest.approx(scan.affine)
+    assert of_python_page["scan"].dtype == scan.dtype
+
+
+def test_surface_of_the_page_on_python_is_closed(of_python_page):
+    assert of_python_page["surface"].quality().closed
+
+
+def test_mean_of_the_bone_of_the_page_on_python_is_above_its_iso_value(of_python_page):
+    assert of_python_page["mean_hu"] >= 226
+
+
+def test_region_of_the_page_on_python_has_its_slices_and_its_box(of_python_page):
+    assert of_python_page["loin"].shape[0] == 16
+    assert of_python_page["near"].shape_ijk == (20, 20, 20)
