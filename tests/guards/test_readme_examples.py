@@ -63,9 +63,10 @@ def is_drawn(picture: clrecon.Rendering) -> bool:
     return bool(picture.image[..., :3].any())
 
 
-def test_example_of_the_readme_makes_a_closed_mesh_and_a_picture(in_folder):
+def test_example_of_the_readme_makes_a_closed_mesh_at_the_automatic_iso_value_and_a_picture(in_folder):
     source = block_of("README.md").replace('"CT_FOLDER"', '"ct"')
     variables = run_python(source, "README.md")
+    assert variables["choice"].method == "auto"
     assert variables["mesh"].quality()["closed"]
     assert {"bone.stl", "spine.png"} <= {path.name for path in in_folder.iterdir()}
 
@@ -147,8 +148,11 @@ def test_resampled_volume_of_the_page_on_python_has_its_spacing(of_python_page, 
     assert of_python_page[name].spacing == pytest.approx(spacing)
 
 
-def test_volume_of_the_page_on_python_comes_back_from_simpleitk_and_nibabel_unchanged(of_python_page, scan):
+def test_volume_of_the_page_on_python_comes_back_from_pyvista_with_its_affine(of_python_page, scan):
     assert of_python_page["same"].affine == pytest.approx(scan.affine)
+
+
+def test_volume_of_the_page_on_python_comes_back_from_nibabel_with_its_type(of_python_page, scan):
     assert of_python_page["scan"].dtype == scan.dtype
 
 
@@ -160,6 +164,11 @@ def test_mean_of_the_bone_of_the_page_on_python_is_above_its_iso_value(of_python
     assert of_python_page["mean_hu"] >= 226
 
 
-def test_region_of_the_page_on_python_has_its_slices_and_its_box(of_python_page):
-    assert of_python_page["loin"].shape[0] == 16
-    assert of_python_page["near"].shape_ijk == (20, 20, 20)
+def test_region_between_two_heights_of_the_page_on_python_has_its_slices(of_python_page):
+    slices_in_50_mm = 50 // 3  # from -450 to -400 mm in slices of 3 mm
+    assert of_python_page["loin"].shape[0] == slices_in_50_mm
+
+
+def test_region_around_a_point_of_the_page_on_python_is_a_cube_of_its_radius(of_python_page):
+    voxels_in_60_mm = 2 * 30 // 3  # a radius of 30 mm in voxels of 3 mm
+    assert of_python_page["near"].shape_ijk == (voxels_in_60_mm,) * 3

@@ -1,4 +1,4 @@
-"""scripts/run.py makes its environment once, says what is wrong where it cannot, and then gets out of the way."""
+"""scripts/run.py makes its environment once, says what is wrong where it cannot, and then runs clrecon in it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def copy_scripts(tmp_path: Path) -> Path:
     return project
 
 
-def start(project: Path, *arguments: str, before: str = "") -> subprocess.CompletedProcess[str]:
+def run_script(project: Path, *arguments: str, before: str = "") -> subprocess.CompletedProcess[str]:
     """Run scripts/run.py, with the statements `before` executed first in the same process."""
     script = str(project / "scripts" / "run.py")
     code = f"import runpy, sys\n{before}\nsys.path.insert(0, {str(project / 'scripts')!r})\n"
@@ -32,8 +32,8 @@ def start(project: Path, *arguments: str, before: str = "") -> subprocess.Comple
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
 
 
-def finish_by_hand(project: Path) -> Path:
-    """Put a finished environment in place whose clrecon says what it is called with."""
+def make_finished_environment(project: Path) -> Path:
+    """Put a finished environment in place whose clrecon prints its arguments and exits with 5; returns its stamp."""
     code = "import _environment as e; print(e._wanted_stamp(''), end='')"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=project / "scripts", capture_output=True, text=True, check=True
@@ -49,20 +49,30 @@ def finish_by_hand(project: Path) -> Path:
 
 
 @posix_only
-def test_a_finished_environment_is_used_as_it_is(tmp_path: Path) -> None:
+def test_clrecon_of_a_finished_environment_runs_with_the_arguments_and_its_exit_code(tmp_path: Path) -> None:
     project = copy_scripts(tmp_path)
-    finish_by_hand(project)
-    done = start(project, "mesh", "A FOLDER", "-o", "x.stl")
+    make_finished_environment(project)
+    done = run_script(project, "mesh", "A FOLDER", "-o", "x.stl")
     assert (done.returncode, done.stdout, done.stderr) == (5, "called with mesh A FOLDER -o x.stl\n", "")
-    assert start(project).stdout == "called with --help\n"
-    assert not (project / ".venv.lock").exists()
+    assert not (project / ".venv.lock").exists()  # nothing is installed
+
+
+@posix_only
+def test_run_script_without_arguments_shows_the_help(tmp_path: Path) -> None:
+    project = copy_scripts(tmp_path)
+    make_finished_environment(project)
+    assert run_script(project).stdout == "called with --help\n"
+
+
+WITHOUT_ENSUREPIP = "sys.modules['ensurepip'] = None"
+"""As on a system without its package for virtual environments: stops the installation at its first step."""
 
 
 @posix_only
 @pytest.mark.parametrize("change", ["setup.cfg", "stamp cut", "no stamp", "program gone"])
 def test_environment_that_is_changed_or_incomplete_is_installed_again(tmp_path: Path, change: str) -> None:
     project = copy_scripts(tmp_path)
-    stamp = finish_by_hand(project)
+    stamp = make_finished_environment(project)
     if change == "setup.cfg":
         (project / change).write_text((project / change).read_text().replace("numpy >= 1.24", "numpy >= 1.25"))
     elif change == "stamp cut":
@@ -71,38 +81,41 @@ def test_environment_that_is_changed_or_incomplete_is_installed_again(tmp_path: 
         stamp.unlink()
     else:
         (project / ".venv" / "bin" / "clrecon").unlink()
-    done = start(project, before="sys.modules['ensurepip'] = None")  # stops the installation at its first step
+
+    done = run_script(project, before=WITHOUT_ENSUREPIP)
+
     assert done.returncode == 1
     assert "called with" not in done.stdout
 
 
-def test_without_venv_it_says_what_to_install(tmp_path: Path) -> None:
-    done = start(copy_scripts(tmp_path), before="sys.modules['ensurepip'] = None")
+def test_run_script_without_ensurepip_says_what_to_install(tmp_path: Path) -> None:
+    done = run_script(copy_scripts(tmp_path), before=WITHOUT_ENSUREPIP)
     assert done.returncode == 1
     assert "sudo apt install python3-venv" in done.stderr
     assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("name", ["run.py", "test.py"])
-def test_old_python_is_refused_in_a_line(name: str) -> None:
+def test_script_under_an_old_python_is_refused_in_one_line(name: str) -> None:
     script = ROOT / "scripts" / name
     code = f"import runpy, sys\nsys.version_info = (3, 9, 2)\nrunpy.run_path({str(script)!r}, run_name='__main__')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 1
-    assert done.stderr.startswith("clrecon needs Python 3.10 or newer")
-    assert len(done.stderr.splitlines()) == 1
+    [line] = done.stderr.splitlines()
+    assert line.startswith("clrecon needs Python 3.10 or newer")
 
 
 @posix_only
-def test_a_project_that_cannot_be_written_is_told_so(tmp_path: Path) -> None:
+def test_run_script_says_that_a_project_cannot_be_written(tmp_path: Path) -> None:
     project = copy_scripts(tmp_path)
     (project / ".venv.lock").mkdir()  # for root as for others: not a file that can be opened
-    done = start(project)
+    done = run_script(project)
     assert done.returncode == 1
-    assert "cannot be written" in done.stderr and "Traceback" not in done.stderr
+    assert "cannot be written" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
-SLOW = """
+SLOW_INSTALLATION = """
 import sys, time
 for step in range(3):
     print("Collecting part", step, flush=True)
@@ -112,26 +125,41 @@ sys.exit(int(sys.argv[2]))
 """
 
 
-@pytest.mark.parametrize("code", [0, 3])
-def test_an_installation_says_how_far_it_is(code: int, tmp_path: Path) -> None:
+def install_slowly(tmp_path: Path, exit_code: int) -> subprocess.CompletedProcess[str]:
+    """Run an installation of 4.5 MB in three parts, its output logged, and its progress printed each tenth second."""
     folder = tmp_path / "env"
     folder.mkdir()
-    (tmp_path / "slow.py").write_text(SLOW)
-    command = [sys.executable, str(tmp_path / "slow.py"), str(folder), str(code)]
-    lines = "e._TICK_SECONDS = e._LINE_SECONDS = 0.1; "
-    source = f"import sys, _environment as e; {lines}sys.exit(e._run_logged({command}, {str(tmp_path / 'log')!r}, "
-    source += f"{str(folder)!r}, 1200))"
-    done = subprocess.run([sys.executable, "-c", source], cwd=ROOT / "scripts", capture_output=True, text=True)
-    assert done.returncode == code and done.stdout == ""
-    said = done.stderr.splitlines()
-    assert re.fullmatch(r" +\d+ s, \d of about 1,200 MB(: Collecting part \d)?", said[0])
-    assert any("2 of about 1,200 MB" in line for line in said) and "part 2" in " ".join(said)
-    assert (re.fullmatch(r"installed in \d+ s: 4 MB in env", said[-1]) is not None) == (code == 0)
+    (tmp_path / "slow.py").write_text(SLOW_INSTALLATION)
+    command = [sys.executable, str(tmp_path / "slow.py"), str(folder), str(exit_code)]
+    source = (
+        "import sys, _environment as e\n"
+        "e._TICK_SECONDS = e._LINE_SECONDS = 0.1\n"
+        f"sys.exit(e._run_logged({command}, {str(tmp_path / 'log')!r}, {str(folder)!r}, 1200))"
+    )
+    return subprocess.run([sys.executable, "-c", source], cwd=ROOT / "scripts", capture_output=True, text=True)
+
+
+def test_installation_prints_its_seconds_megabytes_and_last_line(tmp_path: Path) -> None:
+    *progress, last = install_slowly(tmp_path, exit_code=0).stderr.splitlines()
+    assert re.fullmatch(r" +\d+ s, \d of about 1,200 MB(: Collecting part \d)?", progress[0])
+    assert any("2 of about 1,200 MB" in line for line in progress)
+    assert any("Collecting part 2" in line for line in progress)
+    assert re.fullmatch(r"installed in \d+ s: 4 MB in env", last)
+
+
+def test_installation_that_fails_has_its_exit_code_and_is_not_called_installed(tmp_path: Path) -> None:
+    done = install_slowly(tmp_path, exit_code=3)
+    assert done.returncode == 3
+    assert "installed" not in done.stderr
+
+
+def test_output_of_an_installation_is_written_to_its_log_alone(tmp_path: Path) -> None:
+    assert install_slowly(tmp_path, exit_code=0).stdout == ""
     assert (tmp_path / "log").read_text().splitlines() == [f"Collecting part {step}" for step in range(3)]
 
 
 @posix_only
-def test_commits_are_checked_as_the_script_checks() -> None:
+def test_hooks_of_commits_run_the_quick_checks_of_the_test_script() -> None:
     """The same programs with the same arguments, which .pre-commit-config.yaml cannot import."""
     hooks = (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8")
     checks = runpy.run_path(str(ROOT / "scripts" / "test.py"))["quick_checks"](".venv-test")
@@ -150,7 +178,7 @@ def program_path(_, name): return sys.executable if name == "python" else "true"
 
 @pytest.mark.release
 @posix_only
-def test_a_test_that_ends_its_process_ends_the_run(tmp_path: Path) -> None:
+def test_run_of_tests_fails_without_waiting_when_a_test_ends_its_process(tmp_path: Path) -> None:
     """Two processes on a file of tests each, one of which is killed: no waiting for it, and no success."""
     for name, text in {
         "scripts/_environment.py": STAND_IN,
@@ -164,6 +192,9 @@ def test_a_test_that_ends_its_process_ends_the_run(tmp_path: Path) -> None:
     code += f"sys.argv = ['test.py', '--fast']\nrunpy.run_path({str(script)!r}, run_name='__main__')"
     # The time tells a wait for ever from a busy machine, on which three starts of Python have taken a minute.
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
-    assert done.returncode == 1 and "INTERNALERROR" not in done.stdout, done.stdout + done.stderr
-    assert "crashed while running" in done.stdout and "FAILED test_a.py::test_one" in done.stdout
-    assert done.stdout.splitlines()[-1].startswith("1 failed") and done.stderr.splitlines()[-1] == "failed: pytest"
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "INTERNALERROR" not in done.stdout
+    assert "crashed while running" in done.stdout
+    assert "FAILED test_a.py::test_one" in done.stdout
+    assert done.stdout.splitlines()[-1].startswith("1 failed")
+    assert done.stderr.splitlines()[-1] == "failed: pytest"

@@ -1,4 +1,4 @@
-"""No kernel and no variant without a check of the self-test, and none whose breakage is not tried."""
+"""Every kernel and every variant has a check of the self-test, and mutations that the checks must notice."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from clrecon.proof.run import CHECKS
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "scripts" / "proof"))
 
-from kernel_mutations import EQUIVALENT, INVERSIONS, all_mutations, find_kernels  # noqa: E402
+from kernel_mutations import EQUIVALENT, INVERSIONS, Mutation, all_mutations, find_kernels  # noqa: E402
 
 OF_TYPES = {"VOXEL", "VALUE", "LABEL", "VOXEL_IS_SHORT"}
 OF_DEVICES = {"LANES", "WORDS_PER_ITEM", "HAS_BUILTIN_PREFETCH", "SCAN_GROUP", "NO_WINDOWS", "CPU_NAME", "ATOMIC_LOADS"}
@@ -70,34 +70,65 @@ SWITCHES = {
 @pytest.mark.fault_row(57)
 def test_every_kernel_and_every_variant_has_a_check() -> None:
     assert find_gaps(CHECKS, find_kernels(), SWITCHES) == []
-    assert all(macro in find_switches(read_kernel_source(file)) for file, macro in NEVER_BUILT)
-    names = [check.name for check in CHECKS]
-    assert len(set(names)) == len(names)
-    assert {macro for macros in SWITCHES.values() for macro in macros} == {
+
+
+def test_macros_of_variants_are_read_from_the_kernels() -> None:
+    assert set().union(*SWITCHES.values()) == {
         "BETWEEN", "BORDER_INSIDE", "GOLDEN", "GOLDEN_SEARCH", "GRADIENT_OPACITY", "GROWN", "LABELS",
         "LEAST_VALUE", "MASKS", "RANGE", "TAKES_PARTS", "UNEVEN",
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("kernel", ["trace_surface", "compact"])
+@pytest.mark.parametrize(("file", "macro"), NEVER_BUILT)
+def test_macro_that_no_operator_gives_to_a_file_is_one_that_the_file_asks_for(file: str, macro: str) -> None:
+    assert macro in find_switches(read_kernel_source(file))
+
+
+def test_checks_have_different_names() -> None:
+    names = [check.name for check in CHECKS]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("kernel", ["trace_surface", "sum_blocks"])
 @pytest.mark.fault_row(57)
-def test_a_gap_is_found(kernel: str) -> None:
+def test_kernel_without_a_check_is_found(kernel: str) -> None:
     kernels = find_kernels()
-    fewer = tuple(check for check in CHECKS if kernel not in check.kernels and check.name != kernel)
-    assert find_gaps(fewer, kernels, SWITCHES)
-    without = {name: file for name, file in kernels.items() if name != "sum_blocks"}
+    others = tuple(check for check in CHECKS if kernel not in check.kernels)
+    assert f"kernel {kernel} of cl/{kernels[kernel]} has no check" in find_gaps(others, kernels, SWITCHES)
+
+
+@pytest.mark.fault_row(57)
+def test_check_of_a_kernel_that_does_not_exist_is_found() -> None:
+    without = {name: file for name, file in find_kernels().items() if name != "sum_blocks"}
     assert find_gaps(CHECKS, without, SWITCHES) == ["there is no kernel sum_blocks"]
-    more = {**SWITCHES, "rays/slices.cl": {"BETWEEN", "UPSIDE_DOWN"}}
-    assert find_gaps(CHECKS, kernels, more) == ["cl/rays/slices.cl has no check with -D UPSIDE_DOWN"]
 
 
 @pytest.mark.fault_row(57)
-def test_every_kernel_has_its_mutations() -> None:
+def test_variant_of_a_kernel_file_without_a_check_is_found() -> None:
+    more = {**SWITCHES, "rays/slices.cl": {"BETWEEN", "UPSIDE_DOWN"}}
+    assert find_gaps(CHECKS, find_kernels(), more) == ["cl/rays/slices.cl has no check with -D UPSIDE_DOWN"]
+
+
+@pytest.fixture(scope="module")
+def mutated_sources() -> dict[Mutation, str]:
+    """The source of each mutation; its text is found in the kernel file, or this raises an error."""
+    return {mutation: mutation.source() for mutation in all_mutations()}
+
+
+@pytest.mark.fault_row(57)
+def test_every_kernel_has_mutations_of_its_results_and_three_in_the_mean() -> None:
     kernels = find_kernels()
-    assert set(INVERSIONS) == set(kernels) and all(INVERSIONS.values())
-    mutations = all_mutations()
-    sources = {mutation: mutation.source() for mutation in mutations}  # every text is found
-    assert len(mutations) >= 3 * len(kernels)
-    assert all(text != read_kernel_source(mutation.file) for mutation, text in sources.items())
-    assert len(set(sources.values())) == len(mutations)
-    assert set(EQUIVALENT) <= {(mutation.kernel, mutation.name) for mutation in mutations}
+    assert set(INVERSIONS) == set(kernels)
+    assert all(INVERSIONS.values())
+    assert len(all_mutations()) >= 3 * len(kernels)
+
+
+@pytest.mark.fault_row(57)
+def test_every_mutation_changes_the_source_of_its_kernel_in_its_own_way(mutated_sources: dict[Mutation, str]) -> None:
+    unchanged = [mutation for mutation, text in mutated_sources.items() if text == read_kernel_source(mutation.file)]
+    assert unchanged == []
+    assert len(set(mutated_sources.values())) == len(mutated_sources)
+
+
+def test_mutations_listed_as_equivalent_exist(mutated_sources: dict[Mutation, str]) -> None:
+    assert set(EQUIVALENT) <= {(mutation.kernel, mutation.name) for mutation in mutated_sources}

@@ -1,4 +1,4 @@
-"""The texts of the project: tests that assert, no machine paths, no unfinished marks, generated files up to date."""
+"""The files of the project: tests that assert, no machine paths, no unfinished marks, generated files up to date."""
 
 from __future__ import annotations
 
@@ -62,25 +62,34 @@ def test_every_test_asserts_a_value() -> None:
 _FROM_TESTS = re.compile(r"(?m)^\s*(?:from|import) (?:tests\b|guards\b|test_\w+)")
 
 
-def test_helpers_of_tests_are_imported_one_way() -> None:
-    folder = ROOT / "tests"
-    files = [path for path in project_files(".py") if path.is_relative_to(folder)]
-    helpers = [path for path in files if not path.name.startswith(("test_", "conftest"))]
-    assert len(helpers) > 10 and {path.parent for path in helpers} == {folder / "support"}
-    assert [path.name for path in files if _FROM_TESTS.search(path.read_text(encoding="utf-8"))] == []
-    assert _FROM_TESTS.search("import numpy\nfrom tests.support import house\n")
-    assert _FROM_TESTS.search("def f():\n    import test_texts\n")
+FILES_OF_TESTS = [path for path in project_files(".py") if path.is_relative_to(ROOT / "tests")]
 
 
-def test_test_files_have_names_of_their_own() -> None:
-    names = [path.name for path in project_files(".py") if path.is_relative_to(ROOT / "tests")]
+def test_helpers_of_tests_are_in_the_folder_support() -> None:
+    helpers = [path for path in FILES_OF_TESTS if not path.name.startswith(("test_", "conftest"))]
+    assert {path.parent for path in helpers} == {ROOT / "tests" / "support"}
+
+
+def test_no_file_of_tests_imports_another_one_by_its_folder_or_a_test() -> None:
+    assert [path.name for path in FILES_OF_TESTS if _FROM_TESTS.search(path.read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.parametrize(
+    "source", ["import numpy\nfrom tests.support import house\n", "def f():\n    import test_texts\n"]
+)
+def test_import_of_a_folder_of_tests_or_of_a_test_is_found(source: str) -> None:
+    assert _FROM_TESTS.search(source) is not None
+
+
+def test_no_two_files_of_tests_have_the_same_name() -> None:
+    names = [path.name for path in FILES_OF_TESTS]
     assert sorted(names) == sorted(set(names))
 
 
 @pytest.mark.parametrize(
     "body", ["pass", "assert True", "run()", "with pytest.raises(ValueError):\n        run()", "print(assert_all)"]
 )
-def test_a_test_without_assertion_is_found(body: str) -> None:
+def test_test_that_asserts_no_value_is_found(body: str) -> None:
     assert find_tests_without_assertion(f"def test_it():\n    {body}\n") == ["test_it"]
 
 
@@ -93,11 +102,11 @@ def test_a_test_without_assertion_is_found(body: str) -> None:
         "with refused(ValueError, 3):\n        run()",
     ],
 )
-def test_a_test_with_assertion_is_accepted(body: str) -> None:
+def test_test_that_asserts_a_value_or_expects_a_message_is_accepted(body: str) -> None:
     assert find_tests_without_assertion(f"def test_it():\n    {body}\n") == []
 
 
-def test_texts_hold_no_machine_paths_and_no_unfinished_marks() -> None:
+def test_no_file_has_a_path_of_one_machine_or_an_unfinished_mark() -> None:
     files = project_files(*TEXT_SUFFIXES)
     assert len(files) > 40
     faults = [f"{path.name}:{fault}" for path in files for fault in find_forbidden(path.read_text(encoding="utf-8"))]
@@ -114,13 +123,15 @@ def test_texts_hold_no_machine_paths_and_no_unfinished_marks() -> None:
         ">" * 7 + " a1b2",
     ],
 )
-def test_a_forbidden_line_is_found(line: str) -> None:
-    assert len(find_forbidden(f"fine\n{line}\n")) == 1
+def test_line_with_a_path_of_one_machine_or_an_unfinished_mark_is_found(line: str) -> None:
+    [fault] = find_forbidden(f"fine\n{line}\n")
+    assert fault.startswith("2: ")
 
 
-def test_files_are_short() -> None:
-    longest = {path.name: len(path.read_text().splitlines()) for path in project_files(".py", ".cl")}
-    assert {name: lines for name, lines in longest.items() if lines > 600} == {}
+def test_no_file_of_python_or_kernels_has_more_than_600_lines() -> None:
+    counts = {path: len(path.read_text().splitlines()) for path in project_files(".py", ".cl")}
+    assert len(counts) > 600
+    assert {path.name: lines for path, lines in counts.items() if lines > 600} == {}
 
 
 _FUNCTION = re.compile(r"^( *)(?:async )?def ", re.MULTILINE)
@@ -143,27 +154,50 @@ def long_functions(source: str, limit: int = 80) -> list[str]:
     ]
 
 
-def test_functions_are_short() -> None:
-    found = {path.name: names for path in project_files(".py") if (names := long_functions(path.read_text()))}
-    assert found == {}
-    assert long_functions("def f():\n" + "    x = 1\n" * 80) == ["f"]
-    assert long_functions("def f():\n" + "    x = 1\n" * 79) == []
-    inner = "class C:\n    def f():\n        try:\n            pass\n        except E:\n            def g():\n"
-    assert long_functions(inner + "                x = 1\n" * 80) == ["f", "g"]
+def test_no_function_has_more_than_80_lines() -> None:
+    assert {path.name: names for path in project_files(".py") if (names := long_functions(path.read_text()))} == {}
 
 
-def test_generated_files_are_up_to_date_and_a_changed_one_is_found(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rendered = {name: render() for name, render in derive_mc_tables.HEADERS.items()}
-    check = partial(
-        derive_mc_tables.main, ["--check"], headers={name: partial(str, text) for name, text in rendered.items()}
+@pytest.mark.parametrize(
+    ("source", "functions"),
+    [
+        pytest.param("def f():\n" + "    x = 1\n" * 79, [], id="80 lines"),
+        pytest.param("def f():\n" + "    x = 1\n" * 80, ["f"], id="81 lines"),
+        pytest.param(
+            "class C:\n    def f():\n        try:\n            pass\n        except E:\n            def g():\n"
+            + "                x = 1\n" * 80,
+            ["f", "g"],
+            id="function in a method",
+        ),
+    ],
+)
+def test_function_of_more_than_80_lines_is_found(source: str, functions: list[str]) -> None:
+    assert long_functions(source) == functions
+
+
+@pytest.fixture(scope="module")
+def rendered_tables() -> dict[str, str]:
+    """Headers with the tables of marching cubes, as the script derives them now: it takes a second."""
+    return {name: render() for name, render in derive_mc_tables.HEADERS.items()}
+
+
+def check_tables(rendered: dict[str, str], **folder: Path) -> int:
+    return derive_mc_tables.main(
+        ["--check"], headers={name: partial(str, text) for name, text in rendered.items()}, **folder
     )
-    assert (check(), capsys.readouterr().out) == (0, "")
-    assert len(rendered) == 2
-    for changed in (None, *rendered):
-        for name, text in rendered.items():
-            (tmp_path / name).write_text(text.replace("0x", "0X", 1) if name == changed else text)
-        assert check(folder=tmp_path) == (changed is not None)
-        said = capsys.readouterr().out
-        assert said.count("is not what the table gives") == (changed is not None) and (changed or "") in said
+
+
+def test_generated_tables_of_marching_cubes_are_those_that_the_script_derives(rendered_tables: dict[str, str]) -> None:
+    assert check_tables(rendered_tables) == 0
+
+
+@pytest.mark.parametrize("changed", derive_mc_tables.HEADERS)
+def test_generated_table_that_was_changed_is_found_by_its_name(
+    changed: str, rendered_tables: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, text in rendered_tables.items():
+        (tmp_path / name).write_text(text.replace("0x", "0X", 1) if name == changed else text)
+    assert check_tables(rendered_tables, folder=tmp_path) == 1
+    [line] = capsys.readouterr().out.splitlines()
+    assert changed in line
+    assert "is not what the table gives" in line

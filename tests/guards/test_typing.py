@@ -174,7 +174,7 @@ def checked_by_pyright(folder: Path) -> list[str]:
 @pytest.mark.release
 @pytest.mark.untraced
 @pytest.mark.parametrize("check", [checked_by_mypy, checked_by_pyright])
-def test_right_scripts_are_clean_and_each_wrong_call_is_named(
+def test_type_checker_accepts_right_scripts_and_the_pages_and_finds_each_wrong_call(
     check: Callable[[Path], list[str]], tmp_path: Path
 ) -> None:
     (tmp_path / "right.py").write_text(RIGHT, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Nothing that clrecon reads is run as code: row 71 of the list of faults."""
+"""Nothing that clrecon reads is run as code."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def find_unsafe(source: str) -> list[str]:
 
 
 @pytest.mark.fault_row(71)
-def test_no_input_is_run_as_code() -> None:
+def test_no_module_of_clrecon_calls_what_runs_its_input_as_code() -> None:
     assert len(MODULES) > 300
     found = {path.relative_to(ROOT).as_posix(): find_unsafe(path.read_text()) for path in MODULES}
     assert {path: calls for path, calls in found.items() if calls} == {}
@@ -57,5 +57,5 @@ def test_no_input_is_run_as_code() -> None:
         ("json.loads(text)", []),
     ],
 )
-def test_unsafe_calls_are_found(source: str, unsafe: list[str]) -> None:
+def test_call_or_import_that_may_run_its_input_as_code_is_found(source: str, unsafe: list[str]) -> None:
     assert find_unsafe(source) == unsafe

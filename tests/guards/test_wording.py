@@ -82,7 +82,7 @@ def named_in_package() -> frozenset[str]:
         ("ray_step", None, "ray_step", "ray_step"),
     ],
 )
-def test_parameters_are_named_in_the_words_of_python_or_of_the_command(
+def test_parameter_in_a_message_is_an_option_within_a_command_and_of_python_elsewhere(
     parameter: str, value: object, python: str, mesh: str
 ) -> None:
     assert name_parameter(parameter, value) == in_python(parameter, value) == python
@@ -91,31 +91,38 @@ def test_parameters_are_named_in_the_words_of_python_or_of_the_command(
     assert name_parameter(parameter, value) == python
 
 
-def test_the_same_parameter_has_another_option_in_another_command() -> None:
-    assert speaker_of(parser_of("render"))("iso_value", 300) == "--iso 300"
-    assert speaker_of(parser_of("mesh"))("iso_value", 300) == "--hu 300"
+@pytest.mark.parametrize(("command", "option"), [("render", "--iso 300"), ("mesh", "--hu 300")])
+def test_parameter_in_a_message_is_the_option_of_the_command_that_runs(command: str, option: str) -> None:
+    assert speaker_of(parser_of(command))("iso_value", 300) == option
 
 
-def test_a_parameter_may_be_a_part_of_an_option() -> None:
-    speak = speaker_of(parser_of("cloud"))
-    assert [speak("eps", 0.5), speak("min_samples", 4)] == ["--cluster eps=0.5", "--cluster min=4"]
-    assert [speak("eps", None), speak("min_samples", None)] == ["--cluster eps=MM", "--cluster min=N"]
+@pytest.mark.parametrize(
+    ("parameter", "value", "option"),
+    [
+        ("eps", 0.5, "--cluster eps=0.5"),
+        ("min_samples", 4, "--cluster min=4"),
+        ("eps", None, "--cluster eps=MM"),
+        ("min_samples", None, "--cluster min=N"),
+    ],
+)
+def test_parameter_in_a_message_may_be_a_part_of_an_option(parameter: str, value: object, option: str) -> None:
+    assert speaker_of(parser_of("cloud"))(parameter, value) == option
 
 
-def test_words_of_python_come_back_after_an_error() -> None:
+def test_parameters_in_messages_are_those_of_python_again_after_an_error_in_a_command() -> None:
     with pytest.raises(ValueError, match="in a block"), spoken_by(lambda parameter, value: "another"):
         raise ValueError("in a block")
     assert name_parameter("force", True) == "force=True"
 
 
-def test_every_parameter_that_the_library_names_has_an_option() -> None:
+def test_every_parameter_that_a_message_names_is_an_option_of_some_command() -> None:
     speakers = [speaker_of(parser_of(command)) for command in COMMANDS]
     named = named_in_package()
     assert len(named) > 10
     assert {name for name in named if all(speak(name, None) == name for speak in speakers)} == set()
 
 
-def test_every_parameter_that_the_library_names_is_one_of_its_own() -> None:
+def test_every_parameter_that_a_message_names_is_one_of_a_public_function_or_settings() -> None:
     public = [getattr(clrecon, name) for name in clrecon.__all__]
     is_error = [isinstance(each, type) and issubclass(each, Exception) for each in public]
     functions = [each for each, error in zip(public, is_error, strict=True) if callable(each) and not error]
@@ -135,20 +142,19 @@ def test_every_parameter_that_the_library_names_is_one_of_its_own() -> None:
     assert named - known == set()
 
 
-def test_the_command_line_says_all_that_pictures_may_be_told() -> None:
+def test_every_setting_of_pictures_but_the_listed_ones_is_an_option_of_the_command_render() -> None:
     speak = speaker_of(parser_of("render"))
-    of_python = {name for name in RenderSettings.keywords() if speak(name, None) == name}
-    # Fields that other options make (--light, --clip-box and --clip), and those that only Python has.
-    of_meshes = {"vertex_colors"}
-    assert of_python == {"style", "lighting", "clip", "angle", "width_mm", "pixel_mm", "lowest_hu"} | of_meshes
+    without_option = {name for name in RenderSettings.keywords() if speak(name, None) == name}
+    made_by_other_options = {"lighting", "clip"}  # --light, --clip-box and --clip
+    of_python_alone = {"style", "angle", "width_mm", "pixel_mm", "lowest_hu", "vertex_colors"}
+    assert without_option == made_by_other_options | of_python_alone
 
 
-def test_every_other_name_of_a_parameter_is_needed() -> None:
-    named = named_in_package()
-    assert set(_DESTINATIONS) - named == set()
+def test_every_parameter_with_an_option_of_another_name_is_named_by_a_message() -> None:
+    assert set(_DESTINATIONS) - named_in_package() == set()
 
 
-def test_no_option_is_named_outside_of_the_command_line() -> None:
+def test_no_module_outside_of_the_command_line_names_an_option() -> None:
     found = {
         path.relative_to(ROOT).as_posix(): options
         for path in PACKAGE.rglob("*.py")
@@ -157,7 +163,18 @@ def test_no_option_is_named_outside_of_the_command_line() -> None:
     assert found == {}
 
 
-def test_a_named_option_and_a_named_parameter_are_found() -> None:
-    assert find_options('raise UsageError("leave --open out, or -o; a--b, x - -y, ---")') == ["--open"]
-    assert find_options('a: int = option("--open N", "see --report")\nb = "--seed"') == ["--seed"]
-    assert named_parameters("x = f\"{name_parameter('force', True)}\"\nname_parameter(setting)") == {"force"}
+@pytest.mark.parametrize(
+    ("source", "options"),
+    [
+        ('raise UsageError("leave --open out, or -o; a--b, x - -y, ---")', ["--open"]),
+        ('a: int = option("--open N", "see --report")\nb = "--seed"', ["--seed"]),
+    ],
+    ids=["in a message", "beside a declared option"],
+)
+def test_option_in_a_text_of_a_module_is_found_unless_it_is_declared_there(source: str, options: list[str]) -> None:
+    assert find_options(source) == options
+
+
+def test_parameter_that_a_message_names_by_a_literal_is_found() -> None:
+    source = "x = f\"{name_parameter('force', True)}\"\nname_parameter(setting)"
+    assert named_parameters(source) == {"force"}

@@ -154,7 +154,7 @@ def faults(function: Callable[..., Any], folder: Path) -> Iterator[str]:
 
 @pytest.mark.untraced
 @pytest.mark.parametrize("name", public_callables())
-def test_a_wrong_argument_is_refused_by_its_name(
+def test_wrong_argument_of_a_public_function_is_refused_with_the_name_of_the_parameter(
     name: str, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -184,26 +184,36 @@ def sample(
         ({"names": ("a",)}, "names must be 2 values, not tuple"),
     ],
 )
-def test_the_message_says_what_is_wanted_and_what_came(arguments: dict[str, Any], words: str) -> None:
+def test_message_about_a_wrong_argument_says_what_is_expected_and_what_was_given(
+    arguments: dict[str, Any], words: str
+) -> None:
     with pytest.raises(UsageError) as refused:
         sample(**{"volume": things()["Volume"], **arguments})
-    assert str(refused.value) == words and refused.value.__cause__ is not None
+    assert str(refused.value) == words
+    assert refused.value.__cause__ is not None  # the error that the wrong argument has led to
 
 
-def test_sound_arguments_and_errors_of_another_cause_stay_as_they_are() -> None:
-    volume = things()["Volume"]
-    assert sample(volume, np.uint8(3), np.float32(0.5), ["a", "b"]) == (13, 0, 1)  # type: ignore[arg-type]
+def test_arguments_of_numpy_types_and_a_list_in_place_of_a_tuple_are_accepted() -> None:
+    ten_slices = things()["Volume"]
+    result = sample(ten_slices, np.uint8(3), np.float32(0.5), ["a", "b"])  # type: ignore[arg-type]
+    assert result == (10 + 3, round(0.5), len("b"))
+
+
+def test_missing_argument_raises_the_error_of_python() -> None:
     with refused(TypeError, "volume"):
         sample()  # type: ignore[call-arg]
-    with pytest.raises(IndexError):
-        sample(volume, 100)
 
 
-def test_the_sweep_finds_a_function_that_checks_nothing(tmp_path: Path) -> None:
-    def careless(mesh: Any) -> int:
+def test_error_of_right_arguments_is_raised_as_it_is() -> None:
+    with refused(IndexError, "range"):
+        sample(things()["Volume"], 100)  # of a range of 100
+
+
+def test_function_that_checks_no_argument_is_found(tmp_path: Path) -> None:
+    def count_vertices(mesh: Any) -> int:
         return len(mesh.vertices)
 
-    assert any("AttributeError" in each for each in faults(careless, tmp_path))
+    assert any("AttributeError" in each for each in faults(count_vertices, tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -214,7 +224,9 @@ def test_the_sweep_finds_a_function_that_checks_nothing(tmp_path: Path) -> None:
         (clrecon.fill_ghost_slices, "found must be a GhostSlices, not ndarray: see clrecon.find_ghost_slices"),
     ],
 )
-def test_what_is_wanted_has_a_public_name_or_a_public_maker(function: Callable[..., Any], words: str) -> None:
+def test_message_about_a_wrong_argument_names_the_public_class_and_how_to_make_it(
+    function: Callable[..., Any], words: str
+) -> None:
     first = (things()["Volume"],) if function is clrecon.fill_ghost_slices else ()
     with pytest.raises(UsageError) as refused:
         function(*first, np.zeros((5, 3)))
