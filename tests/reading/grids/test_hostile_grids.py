@@ -9,6 +9,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+import tolerances
 from label_files import OBLIQUE, write_nifti, write_nrrd
 from refusals import assert_one_line, refused
 from variants import daily
@@ -19,16 +20,27 @@ from clrecon.errors import ClreconError, RefusedInputError
 from clrecon.reading.grids.metaimage import UNUSED_NUMBERS
 
 nibabel = pytest.importorskip("nibabel")
-pytest.importorskip("nrrd")
+nrrd = pytest.importorskip("nrrd")
 pytest.importorskip("SimpleITK")
 
 
-def edit(path, old, new):
+def replace_in_header(path, old, new):
     """Replace text in a header that is text."""
     content = path.read_bytes()
     assert old in content
     path.write_bytes(content.replace(old, new, 1))
     return path
+
+
+XYZT_UNITS, THIRD_PIXDIM, SROW_X_OFFSET = 123, 88, 292
+"""Bytes of fields in a header of NIfTI-1."""
+
+
+def overwrite(path, start, field):
+    """Overwrite the bytes of a field of a file, from its start."""
+    content = bytearray(path.read_bytes())
+    content[start : start + len(field)] = field
+    path.write_bytes(content)
 
 
 @pytest.mark.fuzz
@@ -50,11 +62,11 @@ def test_grid_file_cut_anywhere_is_refused(tmp_path, name):
 
 @pytest.mark.fuzz
 @pytest.mark.parametrize("name", daily(2, ["a.nii.gz", "gzip.nrrd", "packed.mha", "packed.mhd"]))
-def test_damaged_compressed_voxels_are_refused(tmp_path, name):
+def test_grid_file_with_a_damaged_byte_of_compressed_voxels_is_refused(tmp_path, name):
     path = WRITERS[name](tmp_path / name, make_ct((6, 12, 12)), OBLIQUE)
     part = path.with_suffix(".zraw") if path.suffix == ".mhd" else path
     content = part.read_bytes()
-    for at in range(len(content) - 1200, len(content) - 10, 13):
+    for at in range(len(content) - 1200, len(content) - 10, 13):  # the compressed voxels are longer than that
         damaged = bytearray(content)
         damaged[at] ^= 0x5A
         part.write_bytes(damaged)
@@ -64,20 +76,21 @@ def test_damaged_compressed_voxels_are_refused(tmp_path, name):
 
 @pytest.mark.fuzz
 @pytest.mark.parametrize("name", ["a.nii", "raw.nrrd"])
-def test_a_damaged_header_is_read_or_refused(tmp_path, name):
+def test_grid_file_with_a_damaged_header_is_read_or_refused(tmp_path, name):
     content = WRITERS[name](tmp_path / name, make_ct(), OBLIQUE).read_bytes()
     random = np.random.default_rng(5)
-    refused = 0
-    for _ in range(200):
+    trials, header_bytes = 200, 350
+    refusals = 0
+    for _ in range(trials):
         damaged = bytearray(content)
-        for at in random.integers(0, 350, 2):
+        for at in random.integers(0, header_bytes, 2):
             damaged[at] = random.integers(0, 256)
         (tmp_path / "b").write_bytes(damaged)
         try:
             clrecon.read_volume(tmp_path / "b")
         except ClreconError:
-            refused += 1
-    assert 20 < refused < 200
+            refusals += 1
+    assert 20 < refusals < trials  # some bytes matter, some do not
 
 
 MUTATE = """
@@ -106,13 +119,14 @@ print("read", read)
 
 
 @pytest.mark.fuzz
-def test_a_damaged_metaimage_header_never_ends_the_process(tmp_path):
+def test_metaimage_with_a_damaged_header_never_ends_the_process(tmp_path):
     path = write_metaimage(tmp_path / "a.mha", make_ct())
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", MUTATE, str(path), str(tmp_path / "b.mha")], capture_output=True, text=True, timeout=120
     )
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert 10 < int(done.stdout.split()[-1]) < 300  # some changes do no harm: comments, one digit for another
+    assert process.returncode == 0, process.stderr[-2000:]
+    files_read = int(process.stdout.split()[-1])
+    assert 10 < files_read < 300  # of 400: some changes do no harm, as in comments, or one digit for another
 
 
 @pytest.mark.parametrize(
@@ -163,7 +177,7 @@ def test_a_damaged_metaimage_header_never_ends_the_process(tmp_path):
         ("ElementDataFile", "", "expected LOCAL or one file"),
     ],
 )  # fmt: skip
-def test_hostile_metaimages_are_refused(tmp_path, capfd, key, value, message):
+def test_metaimage_with_an_impossible_field_is_refused(tmp_path, capfd, key, value, message):
     folder = tmp_path / "here"
     folder.mkdir()
     (folder / "folder").mkdir()
@@ -185,26 +199,39 @@ def test_hostile_metaimages_are_refused(tmp_path, capfd, key, value, message):
         assert capfd.readouterr().err == ""
 
 
-def test_units_of_length_become_mm(tmp_path):
-    micron = np.diag((1e3, 1e3, 1e3, 1.0)) @ OBLIQUE
-    volume = clrecon.read_volume(write_metaimage(tmp_path / "a.mha", make_ct(), micron, DistanceUnits="um"))
-    assert np.allclose(volume.affine, OBLIQUE, atol=1e-9)
-    volume = clrecon.read_volume(write_nrrd(tmp_path / "a.nrrd", make_ct(), micron, **{"space units": ["um"] * 3}))
-    assert np.allclose(volume.affine, OBLIQUE, atol=1e-9)
+def test_metaimage_in_micrometres_is_read_in_mm(tmp_path):
+    in_um = np.diag((1e3, 1e3, 1e3, 1.0)) @ OBLIQUE
+    volume = clrecon.read_volume(write_metaimage(tmp_path / "a.mha", make_ct(), in_um, DistanceUnits="um"))
+    assert np.allclose(volume.affine, OBLIQUE, atol=tolerances.DECIMAL_PLACE_MM)
+
+
+def test_nrrd_in_micrometres_is_read_in_mm(tmp_path):
+    in_um = np.diag((1e3, 1e3, 1e3, 1.0)) @ OBLIQUE
+    volume = clrecon.read_volume(write_nrrd(tmp_path / "a.nrrd", make_ct(), in_um, **{"space units": ["um"] * 3}))
+    assert np.allclose(volume.affine, OBLIQUE, atol=tolerances.DECIMAL_PLACE_MM)
+
+
+def test_nrrd_in_an_unknown_unit_is_refused(tmp_path):
     path = write_nrrd(tmp_path / "b.nrrd", make_ct(), **{"space units": ["mm", "mm", "parsec"]})
     with refused(RefusedInputError, "b.nrrd", "unknown"):
         clrecon.read_volume(path)
-    for code, scale in ((1, 1000.0), (3, 1e-3), (0, 1.0)):
-        path = write_nifti(tmp_path / "a.nii", make_ct(), np.diag((2.0, 3.0, 4.0, 1.0)))
-        content = bytearray(path.read_bytes())
-        content[123] = code
-        path.write_bytes(content)
-        volume = clrecon.read_volume(path)
-        assert volume.spacing == pytest.approx((2 * scale, 3 * scale, 4 * scale))
-        assert any("spacings that no scanner has" in text for text in volume.report["warnings"]) == (scale != 1.0)
 
 
-def test_the_byte_order_of_a_metaimage_that_does_not_say_is_a_warning(tmp_path):
+@pytest.mark.parametrize(
+    ("code", "mm", "is_plausible"),
+    [(1, 1000.0, False), (3, 1e-3, False), (0, 1.0, True)],
+    ids=["metres", "micrometres", "unknown: mm"],
+)
+def test_nifti_is_read_in_mm_with_a_warning_of_spacings_that_no_scanner_has(tmp_path, code, mm, is_plausible):
+    path = write_nifti(tmp_path / "a.nii", make_ct(), np.diag((2.0, 3.0, 4.0, 1.0)))
+    overwrite(path, XYZT_UNITS, bytes([code]))
+    volume = clrecon.read_volume(path)
+    assert volume.spacing == pytest.approx((2 * mm, 3 * mm, 4 * mm))
+    is_warned_of = any("spacings that no scanner has" in text for text in volume.report["warnings"])
+    assert is_warned_of is not is_plausible
+
+
+def test_metaimage_that_does_not_say_its_byte_order_is_read_with_a_warning(tmp_path):
     voxels = make_ct()
     volume = clrecon.read_volume(write_metaimage(tmp_path / "a.mha", voxels, BinaryDataByteOrderMSB=None))
     assert np.array_equal(volume.voxels, voxels)
@@ -212,143 +239,161 @@ def test_the_byte_order_of_a_metaimage_that_does_not_say_is_a_warning(tmp_path):
 
 
 @pytest.mark.parametrize("field", ["ElementMin =", "ImagePosition = 1"])
-def test_a_field_that_swallows_the_spacing_is_refused(tmp_path, field):
+def test_metaimage_with_a_field_of_too_few_numbers_before_its_spacing_is_refused(tmp_path, field):
     """SimpleITK takes the name of the next field for a number, and 1 mm for the spacing that it then does not see."""
     path = write_metaimage(tmp_path / "a.mha", make_ct())
-    edit(path, b"ElementSpacing", f"{field}\nElementSpacing".encode())
+    replace_in_header(path, b"ElementSpacing", f"{field}\nElementSpacing".encode())
     with pytest.raises(RefusedInputError, match="it can be read in two ways"):
         clrecon.read_volume(path)
 
 
-@pytest.mark.parametrize("frames", [1, 5])
-def test_one_point_in_time_is_a_volume_and_several_are_refused(tmp_path, frames):
-    voxels = np.stack([make_ct(seed=n) for n in range(frames)])
-    steps = np.diag((1.0, 1.0, 1.0, 1.0))
+def write_points_in_time(folder, extension, points):
+    """A file of four axes: `points` volumes of 7 x 6 x 4 voxels; and the voxels."""
+    voxels = np.stack([make_ct(seed=n) for n in range(points)])
+    path = folder / f"a{extension}"
+    if extension == ".nii.gz":
+        return write_nifti(path, voxels, np.eye(4)), voxels
+    if extension == ".nrrd":
+        axes = np.vstack([np.eye(3), np.full((1, 3), np.nan)])
+        header = {"space": "left-posterior-superior", "space origin": np.zeros(3), "space directions": axes,
+                  "kinds": ["domain"] * 3 + ["time"]}  # fmt: skip
+        nrrd.write(str(path), voxels.transpose(3, 2, 1, 0), header)
+        return path, voxels
     fields = {
-        "NDims": "4", "DimSize": f"7 6 4 {frames}", "ElementSpacing": "1 1 1 1", "Offset": "0 0 0 0",
+        "NDims": "4", "DimSize": f"7 6 4 {points}", "ElementSpacing": "1 1 1 1", "Offset": "0 0 0 0",
         "TransformMatrix": "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "CenterOfRotation": "0 0 0 0",
     }  # fmt: skip
-    directions = np.vstack([steps[:3, :3], np.full((1, 3), np.nan)])
-    nrrd_header = {"space directions": directions, "kinds": ["domain"] * 3 + ["time"]}
-    paths = [
-        write_nifti(tmp_path / "a.nii.gz", voxels, steps),
-        write_metaimage(tmp_path / "a.mha", voxels.reshape(4 * frames, 6, 7), steps, **fields),
-        write_nrrd_frames(tmp_path / "a.nrrd", voxels, nrrd_header),
-    ]
-    for path in paths:
-        if frames == 1:
-            assert np.array_equal(clrecon.read_volume(path).voxels, voxels[0])
-        else:
-            with refused(RefusedInputError, 4, 7, 6):
-                clrecon.read_volume(path)
+    return write_metaimage(path, voxels.reshape(4 * points, 6, 7), np.eye(4), **fields), voxels
 
 
-def write_nrrd_frames(path, voxels, fields):
-    import nrrd
-
-    header = {"space": "left-posterior-superior", "space origin": np.zeros(3), **fields}
-    nrrd.write(str(path), voxels.transpose(3, 2, 1, 0), header)
-    return path
+@pytest.mark.parametrize("extension", [".nii.gz", ".nrrd", ".mha"])
+def test_grid_file_of_one_point_in_time_is_read_as_its_volume(tmp_path, extension):
+    path, voxels = write_points_in_time(tmp_path, extension, points=1)
+    assert np.array_equal(clrecon.read_volume(path).voxels, voxels[0])
 
 
-def test_colours_are_refused(tmp_path):
+@pytest.mark.parametrize("extension", [".nii.gz", ".nrrd", ".mha"])
+def test_grid_file_of_five_points_in_time_is_refused(tmp_path, extension):
+    path, _ = write_points_in_time(tmp_path, extension, points=5)
+    with refused(RefusedInputError, 4, 7, 6):
+        clrecon.read_volume(path)
+
+
+def test_nifti_of_colours_is_refused(tmp_path):
     colours = np.zeros((7, 6, 4), dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")])
     nibabel.save(nibabel.Nifti1Image(colours, np.eye(4)), tmp_path / "a.nii")
     with refused(RefusedInputError, "volume", "voxels", "a.nii"):
         clrecon.read_volume(tmp_path / "a.nii")
-    path = write_nrrd(tmp_path / "a.nrrd", np.zeros((4, 6, 7, 3), np.uint8), kinds=["RGB-color"] + ["domain"] * 3)
-    with refused(RefusedInputError, 4, "axes"):
-        clrecon.read_volume(path)
-    path = write_nrrd(tmp_path / "b.nrrd", np.zeros((4, 6, 7, 2), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("channels", "header"),
+    [(3, {"kinds": ["RGB-color"] + ["domain"] * 3}), (2, {})],
+    ids=["colours", "two values a voxel"],
+)
+def test_nrrd_of_several_values_a_voxel_is_refused(tmp_path, channels, header):
+    path = write_nrrd(tmp_path / "a.nrrd", np.zeros((4, 6, 7, channels), np.uint8), **header)
     with refused(RefusedInputError, 4, "axes"):
         clrecon.read_volume(path)
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_single_slice_is_no_volume(tmp_path, name):
+def test_grid_file_of_a_single_slice_is_refused(tmp_path, name):
     path = WRITERS[name](tmp_path / name, make_ct((1, 6, 7)), OBLIQUE)
     with refused(RefusedInputError, 7, 6, 1):
         clrecon.read_volume(path)
 
 
-def test_a_field_of_nrrd_without_its_value_is_refused(tmp_path):
-    path = edit(write_nrrd(tmp_path / "a.nrrd", make_ct()), b"space origin: ", b"space origin: \n#")
+def test_nrrd_with_a_field_without_its_value_is_refused(tmp_path):
+    path = replace_in_header(write_nrrd(tmp_path / "a.nrrd", make_ct()), b"space origin: ", b"space origin: \n#")
     with refused(RefusedInputError, "NRRD", "header"):
         clrecon.read_volume(path)
 
 
-def test_grid_file_without_a_position_is_refused(tmp_path):
-    with pytest.raises(RefusedInputError, match="does not say where it lies"):
+def test_nifti_without_a_position_is_refused(tmp_path):
+    with refused(RefusedInputError, "a.nii", "sform_code"):
         clrecon.read_volume(write_nifti(tmp_path / "a.nii", make_ct(), sform=False))
-    path = edit(write_nrrd(tmp_path / "a.nrrd", make_ct()), b"space: left-posterior-superior\n", b"")
+
+
+def test_nrrd_without_a_frame_is_refused(tmp_path):
+    path = replace_in_header(write_nrrd(tmp_path / "a.nrrd", make_ct()), b"space: left-posterior-superior\n", b"")
     with pytest.raises(RefusedInputError, match="does not say where it lies"):
         clrecon.read_volume(path)
 
 
-def test_an_analyze_file_is_refused(tmp_path):
+def test_analyze_file_is_refused(tmp_path):
     nibabel.save(nibabel.AnalyzeImage(make_ct().transpose(2, 1, 0), np.eye(4)), tmp_path / "a.hdr")
     with refused(RefusedInputError, "Analyze"):
         clrecon.read_volume(tmp_path / "a.hdr")
 
 
-def test_the_voxels_of_a_pair_stay_beside_their_header(tmp_path):
+def test_file_of_voxels_of_a_nifti_pair_is_refused_without_its_header(tmp_path):
+    WRITERS["a.hdr"](tmp_path / "a.hdr", make_ct(), OBLIQUE)
+    with refused(RefusedInputError, "NIfTI"):
+        clrecon.read_volume(tmp_path / "a.img")
+
+
+def test_nifti_pair_whose_voxels_are_a_link_to_another_folder_is_refused(tmp_path):
     (tmp_path / "in").mkdir()
     path = WRITERS["a.hdr"](tmp_path / "in" / "a.hdr", make_ct(), OBLIQUE)
-    with refused(RefusedInputError, "NIfTI"):
-        clrecon.read_volume(tmp_path / "in" / "a.img")
     (tmp_path / "in" / "a.img").rename(tmp_path / "a.img")
     (tmp_path / "in" / "a.img").symlink_to(tmp_path / "a.img")
     with refused(RefusedInputError, "a.img", "a.hdr"):
         clrecon.read_volume(path)
 
 
-def test_pixdim_that_is_not_the_spacing_of_the_sform_is_said(tmp_path):
-    path = write_nifti(tmp_path / "a.nii", make_ct())
-    assert len(clrecon.read_volume(path).report["warnings"]) == 1
-    content = bytearray(path.read_bytes())
-    content[88:92] = np.float32(5).tobytes()
-    path.write_bytes(content)
+def test_pixdim_other_than_the_spacing_of_the_sform_is_not_used_and_warned_of(tmp_path):
+    path = write_nifti(tmp_path / "a.nii", make_ct(), OBLIQUE)
+    overwrite(path, THIRD_PIXDIM, np.float32(5).tobytes())
     volume = clrecon.read_volume(path)
     assert volume.spacing == pytest.approx(np.linalg.norm(OBLIQUE[:3, :3], axis=0))
     assert "pixdim says a spacing of 0.7071 x 0.5123 x 5 mm, the affine" in volume.report["warnings"][1]
 
 
-def test_more_numbers_than_the_header_says_are_refused(tmp_path):
-    voxels = make_ct((6, 40, 40))
-    for name, old, new in (("raw.nrrd", b"sizes: 40 40 6", b"sizes: 40 40 3"), ("a.mha", b"40 40 6", b"40 40 3"),
-                           ("packed.mha", b"40 40 6", b"40 40 3")):  # fmt: skip
-        path = edit(WRITERS[name](tmp_path / name, voxels, OBLIQUE), old, new)
-        with refused(RefusedInputError, "header", "numbers"):
-            clrecon.read_volume(path)
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [("raw.nrrd", b"sizes: "), ("a.mha", b""), ("packed.mha", b"")],
+    ids=["NRRD", "MetaImage", "packed"],
+)
+def test_grid_file_of_6_slices_whose_header_says_3_is_refused(tmp_path, name, key):
+    path = WRITERS[name](tmp_path / name, make_ct((6, 40, 40)), OBLIQUE)
+    replace_in_header(path, key + b"40 40 6", key + b"40 40 3")
+    with refused(RefusedInputError, "header", "numbers"):
+        clrecon.read_volume(path)
 
 
-def test_sform_and_qform_that_differ_are_said(tmp_path):
+def test_sform_of_a_volume_is_used_before_a_qform_that_differs_with_a_warning(tmp_path):
     path = write_nifti(tmp_path / "a.nii", make_ct(), np.diag((1.0, 1.0, 2.0, 1.0)), qform=True)
-    content = bytearray(path.read_bytes())
-    content[292:296] = np.float32(5).tobytes()
-    path.write_bytes(content)
-    assert "sform and qform lie 5 mm apart: the sform is used" in clrecon.read_volume(path).report["warnings"]
+    overwrite(path, SROW_X_OFFSET, np.float32(5).tobytes())
+    volume = clrecon.read_volume(path)
+    assert volume.affine[0, 3] == -5.0  # x of LPS
+    assert "sform and qform lie 5 mm apart: the sform is used" in volume.report["warnings"]
 
 
-def test_a_small_file_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch):
-    from clrecon.system import memory
-
-    path = write_nifti(tmp_path / "a.nii.gz", np.zeros((60, 400, 400), np.int16))
+def test_small_file_that_would_fill_the_memory_is_refused_without_taking_it(tmp_path, monkeypatch):
+    path = write_nifti(tmp_path / "a.nii.gz", np.zeros((60, 400, 400), np.int16))  # 19 MB
     assert path.stat().st_size < 100_000
-    monkeypatch.setattr(memory, "available_memory_bytes", lambda: 2**20)
+    monkeypatch.setattr("clrecon.system.memory.available_memory_bytes", lambda: 2**20)
+
     tracemalloc.start()
-    before = tracemalloc.get_traced_memory()[0]
+    before, _ = tracemalloc.get_traced_memory()
     tracemalloc.reset_peak()
     with refused(RefusedInputError, "a.nii.gz", 400, 60, "GiB"):
         clrecon.read_volume(path)
-    assert tracemalloc.get_traced_memory()[1] - before < 8e6
+    _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
 
+    assert peak - before < tolerances.GRID_REFUSAL_BYTES
 
-def test_texts_of_a_file_are_escaped_and_never_in_the_report(tmp_path):
+
+def test_name_and_comment_of_a_file_are_not_in_the_report(tmp_path):
     path = write_metaimage(tmp_path / "Jane\x1b[31mDoe.mha", make_ct(), Comment="Doe^Jane\x1b]0;x")
-    volume = clrecon.read_volume(path)
-    assert "Doe" not in repr(volume.report) + repr(clrecon.list_series(path))
-    with pytest.raises(RefusedInputError) as caught:
-        clrecon.read_volume(write_metaimage(path, make_ct(), ElementSpacing="\x1b[31m"))
-    assert_one_line(caught.value)
+    assert "Doe" not in repr(clrecon.read_volume(path).report)
+    assert "Doe" not in repr(clrecon.list_series(path))
+
+
+def test_refusal_of_a_file_whose_name_and_field_have_control_characters_is_one_printable_line(tmp_path):
+    path = write_metaimage(tmp_path / "Jane\x1b[31mDoe.mha", make_ct(), ElementSpacing="\x1b[31m")
+    with pytest.raises(RefusedInputError) as refusal:
+        clrecon.read_volume(path)
+    assert_one_line(refusal.value)
