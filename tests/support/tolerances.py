@@ -81,6 +81,15 @@ GRID_SPACING_MM = 1e-5  # pixdim of NIfTI is float32
 RESAMPLED_HU = 1e-3  # a linear field of up to 1500 HU, interpolated in float32
 GRID_REFUSAL_BYTES = 8e6  # what a refused file may take; it would need 19 MB
 
+DISC_SHARE = 0.001  # of voxels: pixels at the rim of a disc of 46 voxels
+DISC_AIR_HU = 5  # the middle of a peak of air with noise of 40 HU
+OWN_SCALE_HU = 25  # levels found on another scale, in HU: a step of the histogram
+OWN_SCALE_BONE_HU = 40  # the same of bone, whose peak is wide
+OWN_SCALE_PEAK = 15  # of the scan's own values
+TILT_DEG = 1e-6  # from positions with 9 decimals
+DIRECTION = 1e-8  # direction cosines with 9 decimals
+INVERSE_AFFINE_VOXEL = 1e-5  # positions with 9 decimals through the inverse, in voxels of half a mm and more
+
 THOUSAND_FRAMES_S = 1.0  # of processors, for headers of 1000 frames in one file; measured 0.11
 
 # --- labels ---

@@ -10,54 +10,84 @@ from variants import daily
 
 from clrecon import read_volume
 from clrecon.cli.main import main
+from clrecon.errors import RefusedInputError
+from clrecon.jobs.mesh.settings import SCAN_GATE_FAILED
 
 
-def damage(folder, row):
+def write_damaged(folder, row):
     write_values(folder, make_body() if row.hu is None else row.hu, row.plan, **row.values)
     return folder
 
 
 @pytest.mark.parametrize("name", VALUES)
-def test_damaged_values_fail_their_gates_with_words(tmp_path, name):
+def test_damaged_values_fail_the_gates_of_their_row_with_a_warning(tmp_path, name):
     row = VALUES[name]
-    report = read_volume(damage(tmp_path, row)).report
-    failed = {gate["name"] for gate in report["gates"] if gate["ok"] is False}
-    assert failed == row.gates
-    assert any(row.words in text for text in report["warnings"])
+    report = read_volume(write_damaged(tmp_path, row)).report
+    assert {gate["name"] for gate in report["gates"] if gate["ok"] is False} == row.gates
+    assert any(row.words in warning for warning in report["warnings"])
+
+
+ONE_GATE = daily(1, ["intercept off by 324", "slope and intercept of another scale", "unsigned values declared signed"])
+"""Rows of VALUES that fail one gate."""
+
+
+@pytest.fixture(params=ONE_GATE)
+def damaged(request, tmp_path):
+    """A damaged series, the name of the gate that it fails, and words of its warning."""
+    row = VALUES[request.param]
+    (gate,) = row.gates
+    return str(write_damaged(tmp_path / "ct", row)), gate, row.words
+
+
+def test_command_info_shows_the_gate_that_damaged_values_fail(damaged, capsys):
+    folder, gate, _ = damaged
+    assert main(["info", folder, "--pixels"]) == 0
+    assert f"FAILED     {gate}: " in capsys.readouterr().out
+
+
+def test_command_info_refuses_damaged_values_with_strict(damaged, capsys):
+    folder, gate, _ = damaged
+    assert main(["info", folder, "--pixels", "--strict"]) == RefusedInputError.exit_code
+    assert f"{gate}: " in capsys.readouterr().err
+
+
+def test_command_mesh_warns_of_damaged_values_and_writes_the_failed_gate_into_the_mesh(
+    damaged, tmp_path, device, capsys
+):
+    folder, gate, words = damaged
+    output = tmp_path / "a.ply"
+    assert main(["mesh", folder, "-o", str(output), "--hu", "300", "--device", str(device.index)]) == 0
+    assert words in capsys.readouterr().err
+    assert f"comment CERTIFICATE gate_failed {gate}: ".encode() in output.read_bytes()
+
+
+def test_command_mesh_fails_for_damaged_values_with_strict(damaged, tmp_path, device, capsys):
+    folder, gate, _ = damaged
+    mesh = ["mesh", folder, "-o", str(tmp_path / "a.ply"), "--hu", "300", "--device", str(device.index)]
+    assert main([*mesh, "--strict"]) == SCAN_GATE_FAILED
+    assert f"gate {gate} failed" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    "name",
-    daily(1, ["intercept off by 324", "slope and intercept of another scale", "unsigned values declared signed"]),
+    ("stored_padding", "limit"),
+    [
+        pytest.param(-2000, None, id="below air"),
+        pytest.param(-2000, 24, id="from below air up to air"),
+        pytest.param(1074, None, id="tissue of 50 HU"),
+        pytest.param(1074, 1075, id="tissue of 50 and 51 HU"),
+    ],
 )
-def test_every_command_tells_damaged_values(tmp_path, device, capsys, name):
-    row = VALUES[name]
-    folder = str(damage(tmp_path / "ct", row))
-    (gate,) = row.gates
-    assert main(["info", folder, "--pixels"]) == 0
-    assert f"FAILED     {gate}: " in capsys.readouterr().out
-    assert main(["info", folder, "--pixels", "--strict"]) == 4
-    assert f"{gate}: " in capsys.readouterr().err
-    mesh = ["mesh", folder, "-o", str(tmp_path / "a.ply"), "--hu", "300", "--device", str(device.index)]
-    assert main(mesh) == 0
-    assert row.words in capsys.readouterr().err
-    assert main([*mesh, "--strict"]) == 7
-    assert f"gate {gate} failed" in capsys.readouterr().err
-    assert f"comment CERTIFICATE gate_failed {gate}: ".encode() in (tmp_path / "a.ply").read_bytes()
-
-
-@pytest.mark.parametrize(("value", "limit"), [(-2000, None), (-2000, 24), (1074, None), (1074, 1075)])
-def test_padding_around_the_picture_is_not_warned_of(tmp_path, value, limit):
-    """Below air, up to air, and with a value of tissue that nothing in the picture has."""
+def test_declared_padding_around_the_picture_is_not_warned_of(tmp_path, stored_padding, limit):
     body = make_body()
-    body[np.isin(body, (50, 51))] = 52
-    hu = np.where(radius_from() > 46, value - 1024, body)
-    elements = {"PixelPaddingValue": value, **({} if limit is None else {"PixelPaddingRangeLimit": limit})}
+    body[np.isin(body, (50, 51))] = 52  # no voxel of the picture has a value of tissue that is padding
+    hu = np.where(radius_from() > 46, stored_padding - 1024, body)
+    elements = {"PixelPaddingValue": stored_padding, **({} if limit is None else {"PixelPaddingRangeLimit": limit})}
     report = read_volume(write_values(tmp_path, hu, **elements)).report
-    assert report["warnings"] == [] and report["padding_share"] > 0.2
+    assert report["warnings"] == []
+    assert report["padding_share"] > 0.2  # around a circle of 46 pixels in a square of 96
 
 
-def test_masked_tissue_is_counted_exactly(tmp_path):
+def test_tissue_that_declared_padding_masks_is_warned_of_with_its_voxels(tmp_path):
     body = make_body()
-    folder = write_values(tmp_path, body, PixelPaddingValue=1074)
+    folder = write_values(tmp_path, body, PixelPaddingValue=1074)  # 50 HU
     assert read_volume(folder).report["warnings"][0].startswith(f"{np.count_nonzero(body == 50):,} {MASKED}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
 from dicom_series import Plan
 from value_series import SHAPE, make_body, make_jaw, make_layers, radius_from, write_values
 
@@ -11,7 +12,7 @@ from clrecon import choose_iso_value, read_volume
 from clrecon.reading.common.padding import fill_disc_padding
 
 
-def read(folder, hu):
+def read_signed(folder, hu):
     return read_volume(write_values(folder, hu, Plan(shape=SHAPE, intercept=0)))
 
 
@@ -20,28 +21,36 @@ def read(folder, hu):
 )
 @pytest.mark.parametrize("padding", [None, 0.0, 300.0])
 @pytest.mark.parametrize("noise", [15.0, 40.0])
-def test_offset_grey_values_fail_the_gate_with_and_without_padding(tmp_path, slope, offset, padding, noise):
-    volume = read(tmp_path, make_jaw(slope, offset, padding, noise))
-    failed = {gate["name"]: gate["text"] for gate in volume.report["gates"] if gate["ok"] is False}
-    assert set(failed) == {"hu_scale"}
-    assert (volume.report["padding_share"] > 0.2) == (padding is not None)
+def test_cone_beam_on_another_scale_fails_that_gate_alone_with_and_without_padding(
+    tmp_path, slope, offset, padding, noise
+):
+    report = read_signed(tmp_path, make_jaw(slope, offset, padding, noise)).report
+    assert {gate["name"] for gate in report["gates"] if gate["ok"] is False} == {"hu_scale"}
+    assert (report["padding_share"] > 0.2) == (padding is not None)  # around a circle of 46 pixels in a square of 96
+
+
+OUTSIDE_OF_DISC = radius_from() > 46
 
 
 @pytest.mark.parametrize("value", [0.0, 300.0, -500.0])
-def test_one_value_outside_of_a_disc_is_padding(tmp_path, value):
+def test_one_value_outside_of_a_disc_is_replaced_by_the_hu_of_air(tmp_path, value):
     hu = make_jaw(1, 0, value)
-    volume = read(tmp_path, hu)
-    outside = radius_from() > 46
-    share = outside.mean()
-    assert volume.report["padding_share"] == pytest.approx(share, abs=0.001)
-    assert volume.report["padding_hu"] == pytest.approx(-1000, abs=5)
-    assert np.array_equal(volume.voxels[:, ~outside], hu[:, ~outside])
-    assert (volume.voxels[:, outside] == volume.report["padding_hu"]).all()
-    assert volume.report["warnings"] == [
+    volume = read_signed(tmp_path, hu)
+    assert volume.report["padding_hu"] == pytest.approx(-1000, abs=tolerances.DISC_AIR_HU)
+    assert (volume.voxels[:, OUTSIDE_OF_DISC] == volume.report["padding_hu"]).all()
+    assert np.array_equal(volume.voxels[:, ~OUTSIDE_OF_DISC], hu[:, ~OUTSIDE_OF_DISC])
+
+
+@pytest.mark.parametrize("value", [0.0, 300.0, -500.0])
+def test_one_value_outside_of_a_disc_is_warned_of_with_its_share(tmp_path, value):
+    report = read_signed(tmp_path, make_jaw(1, 0, value)).report
+    share = OUTSIDE_OF_DISC.mean()
+    assert report["padding_share"] == pytest.approx(share, abs=tolerances.DISC_SHARE)
+    assert report["warnings"] == [
         f"{100 * share:.3g} % of the voxels, all outside of a round field of view, are at {value:g} HU: padding that"
-        f" the files do not declare, {volume.report['padding_hu']:g} HU is taken for it"
+        f" the files do not declare, {report['padding_hu']:g} HU is taken for it"
     ]
-    assert all(gate["ok"] is not False for gate in volume.report["gates"])
+    assert all(gate["ok"] is not False for gate in report["gates"])
 
 
 @pytest.mark.parametrize(
@@ -56,23 +65,47 @@ def test_one_value_outside_of_a_disc_is_padding(tmp_path, value):
     ],
     ids=["no disc", "bone in water", "no noise", "square", "below air", "air"],
 )
-def test_scans_without_a_filled_disc_have_no_padding(hu):
+def test_scan_without_a_disc_whose_outside_is_above_air_is_left_as_it_is(hu):
     voxels = hu.astype(np.int16)
-    assert fill_disc_padding(voxels) is None and np.array_equal(voxels, hu)
+    assert fill_disc_padding(voxels) is None
+    assert np.array_equal(voxels, hu)
+
+
+@pytest.fixture(params=[(1, 200), (1, 400), (1, 800), (0.6, 400), (1, 324)], ids=str)
+def jaw_on_own_scale(request, tmp_path):
+    """Slope and offset of a jaw on its own scale, its volume, and the iso value of the same jaw in HU."""
+    slope, offset = request.param
+    in_hu = choose_iso_value(read_signed(tmp_path / "hu", make_jaw(1, 0, None, noise=15.0)))
+    return slope, offset, read_signed(tmp_path / "own", make_jaw(slope, offset, 0.0, noise=15.0)), in_hu
+
+
+def test_iso_value_of_a_scan_on_its_own_scale_is_that_in_hu_on_that_scale(jaw_on_own_scale):
+    slope, offset, volume, in_hu = jaw_on_own_scale
+    chosen = choose_iso_value(volume)
+    for name, bound in (
+        ("iso_value", tolerances.OWN_SCALE_HU),
+        ("bone_hu", tolerances.OWN_SCALE_BONE_HU),
+        ("tissue_hu", tolerances.OWN_SCALE_HU),
+    ):
+        assert getattr(chosen, name) == pytest.approx(slope * getattr(in_hu, name) + offset, abs=bound * slope)
 
 
 @pytest.mark.parametrize(("slope", "offset"), [(1, 200), (1, 400), (1, 800), (0.6, 400), (1, 324)])
-@pytest.mark.parametrize("padding", [None, 0.0])
-def test_auto_finds_the_level_of_bone_on_any_scale(tmp_path, slope, offset, padding):
-    """The level is where a scan in HU has it, on the scale of the scan."""
-    true = choose_iso_value(read(tmp_path / "hu", make_jaw(1, 0, None, 15.0)))
-    volume = read(tmp_path / "own", make_jaw(slope, offset, padding, 15.0))
-    found = choose_iso_value(volume)
-    assert found.iso_value == pytest.approx(slope * true.iso_value + offset, abs=25 * slope)
-    assert found.bone_hu == pytest.approx(slope * true.bone_hu + offset, abs=40 * slope)
-    assert found.tissue_hu == pytest.approx(slope * true.tissue_hu + offset, abs=25 * slope)
+def test_iso_value_of_a_scan_on_its_own_scale_without_padding_is_that_in_hu_on_that_scale(tmp_path, slope, offset):
+    in_hu = choose_iso_value(read_signed(tmp_path / "hu", make_jaw(1, 0, None, noise=15.0)))
+    chosen = choose_iso_value(read_signed(tmp_path / "own", make_jaw(slope, offset, None, noise=15.0)))
+    expected = slope * in_hu.iso_value + offset
+    assert chosen.iso_value == pytest.approx(expected, abs=tolerances.OWN_SCALE_HU * slope)
+
+
+def test_reason_of_an_iso_value_says_that_the_scan_has_a_scale_of_its_own(jaw_on_own_scale):
+    _, _, volume, in_hu = jaw_on_own_scale
+    assert "on the scan's own scale, with air near" in choose_iso_value(volume).reason
+    assert "own scale" not in in_hu.reason
+
+
+def test_report_of_a_scan_on_its_own_scale_has_the_values_of_air_and_soft_tissue(jaw_on_own_scale):
+    slope, offset, volume, _ = jaw_on_own_scale
     rescale = volume.report["rescale"]
-    assert (rescale["air"], rescale["soft_tissue"]) == pytest.approx(
-        (offset - 1000 * slope, offset + 50 * slope), abs=15
-    )
-    assert "on the scan's own scale, with air near" in found.reason and "own scale" not in true.reason
+    assert rescale["air"] == pytest.approx(offset - 1000 * slope, abs=tolerances.OWN_SCALE_PEAK)
+    assert rescale["soft_tissue"] == pytest.approx(offset + 50 * slope, abs=tolerances.OWN_SCALE_PEAK)

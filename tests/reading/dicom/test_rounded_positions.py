@@ -27,7 +27,7 @@ def write_rounded(folder, step, digits, stated=None, keyword="SliceThickness", *
     return write_series(folder, Plan(shape=shape, gap=step, origin=(-1.0, -1.0, 3.0), **plan), change)
 
 
-@pytest.mark.parametrize(
+ROUNDED_STEPS = pytest.mark.parametrize(
     ("step", "digits", "keyword"),
     daily_rows(
         2,
@@ -39,74 +39,92 @@ def write_rounded(folder, step, digits, stated=None, keyword="SliceThickness", *
         ],
     ),
 )
-def test_rounded_even_steps_are_one_even_stack(tmp_path, step, digits, keyword):
+
+
+@ROUNDED_STEPS
+def test_even_steps_rounded_to_few_digits_are_read_as_one_even_stack(tmp_path, step, digits, keyword):
     write_rounded(tmp_path, step, digits, keyword=keyword)
     report = read_volume(tmp_path).report
-    unit = 10.0**-digits
-    assert not report["uneven"] and report["slices_missing"] == 0
-    assert report["spacing_mm"][2] == pytest.approx(step, abs=unit / SLICES)
-    assert report["gap_mm"]["median"] == pytest.approx(step, abs=unit / SLICES)
-    assert report["grid_tolerance_mm"] == pytest.approx(unit)
-    (said,) = report["warnings"]
+    last_digit_mm = 10.0**-digits
+    assert (report["uneven"], report["slices_missing"]) == (False, 0)
+    assert report["spacing_mm"][2] == pytest.approx(step, abs=last_digit_mm / SLICES)
+    assert report["gap_mm"]["median"] == pytest.approx(step, abs=last_digit_mm / SLICES)
+    assert report["grid_tolerance_mm"] == pytest.approx(last_digit_mm)
+    assert [gate["name"] for gate in report["gates"] if gate["ok"] is False] == []
+
+
+@ROUNDED_STEPS
+def test_even_steps_rounded_to_few_digits_are_warned_of_with_the_stated_distance(tmp_path, step, digits, keyword):
+    write_rounded(tmp_path, step, digits, keyword=keyword)
+    (warning,) = read_volume(tmp_path).report["warnings"]
     decimals = f"{digits} decimal{'s' * (digits != 1)}"
-    assert said.startswith(
+    assert warning.startswith(
         f"positions are written with {decimals}, too few for slices that are {step:g} mm apart by {keyword}: "
         "all of them are even steps, rounded; placed by even steps of "
     )
-    failed = [gate["name"] for gate in report["gates"] if gate["ok"] is False]
-    assert failed == []
 
 
 @pytest.mark.parametrize("lost", daily(3, [1, 2, 20, 30, 57, 58]))
-def test_a_missing_slice_is_no_rounding(tmp_path, lost):
+def test_missing_slice_among_rounded_positions_is_refused(tmp_path, lost):
     write_rounded(tmp_path, 0.0105, 2, leave_out=(lost,))
     with refused(RefusedInputError, "slice", "missing"):
         read_volume(tmp_path)
 
 
 @pytest.mark.parametrize("lost", daily(1, [1, 30, 58]))
-def test_whole_millimetres_hide_no_missing_slice(tmp_path, lost):
+def test_missing_slice_among_positions_in_whole_millimetres_is_refused(tmp_path, lost):
     """Steps that are a multiple of the unit are not changed by rounding."""
     write_rounded(tmp_path, 1.0, 0, leave_out=(lost,))
     with refused(RefusedInputError, "slice", "missing", 1):
         read_volume(tmp_path)
 
 
-@pytest.mark.parametrize(("stated", "digits"), daily_rows(1, [(5, 2), (0.02, 2), (0.0105, 3)]))
-def test_another_thickness_or_more_digits_explain_nothing(tmp_path, stated, digits):
-    write_rounded(tmp_path, 0.0105, digits, stated=stated, leave_out=() if digits == 2 else (30,))
+@pytest.mark.parametrize("stated", daily(1, [5, 0.02]), ids=str)
+def test_rounded_positions_whose_headers_state_another_distance_are_refused(tmp_path, stated):
+    write_rounded(tmp_path, 0.0105, digits=2, stated=stated)
     with refused(RefusedInputError, "slice", "missing"):
         read_volume(tmp_path)
 
 
-def test_a_slice_off_its_even_place_is_no_rounding(tmp_path):
-    write_rounded(tmp_path, 1.5, 1, offsets={20: 0.3})
+def test_missing_slice_among_positions_with_enough_digits_is_refused(tmp_path):
+    write_rounded(tmp_path, 0.0105, digits=3, leave_out=(30,))
+    with refused(RefusedInputError, "slice", "missing"):
+        read_volume(tmp_path)
+
+
+def test_slice_further_off_its_even_place_than_rounding_makes_the_stack_uneven(tmp_path):
+    write_rounded(tmp_path, 1.5, digits=1, offsets={20: 0.3})
     report = list_series(tmp_path).certificate
-    assert report["uneven"] and not any("decimal" in text for text in report["warnings"])
+    assert report["uneven"]
+    assert not any("decimal" in warning for warning in report["warnings"])
 
 
-def test_zeros_that_were_left_out_count_as_digits(tmp_path):
+def test_decimals_of_positions_are_the_most_that_any_of_them_has(tmp_path):
+    """Where zeros at the end are left out: 3, 3.01, ... 3.1."""
+
     def change(ds, k):
         ds.SliceThickness = 0.0105
-        ds.ImagePositionPatient = [-1, -1, round(3 + 0.0105 * k, 2)]  # 3, 3.01, ... 3.1
+        ds.ImagePositionPatient = [-1, -1, round(3 + 0.0105 * k, 2)]
 
     write_series(tmp_path, Plan(shape=(SLICES, 4, 4)), change)
     report = read_volume(tmp_path).report
-    assert not report["uneven"] and report["spacing_mm"][2] == pytest.approx(0.0105, abs=1e-4)
+    assert not report["uneven"]
+    assert report["spacing_mm"][2] == pytest.approx(0.0105, abs=0.01 / SLICES)
     assert report["warnings"][0].startswith("positions are written with 2 decimals")
 
 
-def test_places_that_fall_together_name_the_digits(tmp_path):
-    write_rounded(tmp_path, 0.6, 0)
+def test_slices_that_rounding_puts_at_one_place_are_refused_with_the_digits(tmp_path):
+    write_rounded(tmp_path, 0.6, digits=0)
     with refused(RefusedInputError, "decimals", "digits", 0, 0.6):
         read_volume(tmp_path)
 
 
-def test_exponents_of_positions_count_as_decimals(tmp_path):
+def test_decimals_of_positions_with_an_exponent_are_counted(tmp_path):
     def change(ds, k):
         ds.SliceThickness = 0.0105
-        set_raw("ImagePositionPatient", f"-1\\-1\\{3.0 + 0.0105 * k:.2e}")(ds, k)
+        set_raw("ImagePositionPatient", f"-1\\-1\\{3.0 + 0.0105 * k:.2e}")(ds, k)  # as 3.01e+00
 
     write_series(tmp_path, Plan(shape=(SLICES, 4, 4)), change)
-    assert read_volume(tmp_path).report["warnings"][0].startswith("positions are written with 2 decimals")
-    assert np.isfinite(read_volume(tmp_path).affine).all()
+    volume = read_volume(tmp_path)
+    assert volume.report["warnings"][0].startswith("positions are written with 2 decimals")
+    assert np.isfinite(volume.affine).all()
