@@ -64,7 +64,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     18: ("oblique or sagittal acquisition: the same in LPS", (TRAPS,)),
     19: (
         "coordinates of 1e5 mm: right to 1e-3 mm",
-        (TRAPS, "operators/surface/test_far_volumes.py::test_vertices_lie_on_the_sphere_and_on_the_twin"),
+        (TRAPS, "operators/surface/test_far_volumes.py::test_vertices_far_from_the_origin_lie_on_their_sphere"),
     ),
     20: (
         "a single slice: refused",
@@ -116,7 +116,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     ),
     31: (
         "whole HU that equal the iso value: watertight",
-        ("operators/surface/test_isosurface.py::test_random_integers_at_every_iso_value_are_sound",),
+        ("operators/surface/test_isosurface.py::test_surfaces_of_random_integers_at_every_iso_value_are_sound",),
     ),
     32: (
         "constant volume, NaN, infinite voxels: refused",

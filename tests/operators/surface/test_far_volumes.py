@@ -36,37 +36,48 @@ def make_sphere(shift=(0.0, 0.0, 0.0), dtype="int16") -> Volume:
 
 @pytest.mark.parametrize("topology", ["separated", "trilinear"])
 @pytest.mark.parametrize("shift", [FAR, (0.0, 5000.0, 0.0), (-8e5, 3.25, 1e6)], ids=str)
-def test_vertices_are_those_at_the_origin_and_the_shift(device, shift, topology):
+def test_surface_of_a_shifted_volume_is_the_shifted_surface_in_float64(device, shift, topology):
     near = extract_isosurface(make_sphere(), 0.5, device=device, topology=topology)
     far = extract_isosurface(make_sphere(shift), 0.5, device=device, topology=topology)
     assert (near.vertices.dtype, far.vertices.dtype) == (np.float32, np.float64)
     assert np.array_equal(near.triangles, far.triangles)
     assert np.array_equal(near.normals, far.normals)
     assert np.abs(far.vertices - shift - near.vertices).max() <= tolerances.FAR_VERTEX_MM
-    assert [text for text in far.report["warnings"] if "vertices are float64" in text]
-    assert not [text for text in near.report["warnings"] if "float64" in text]
+
+
+@pytest.mark.parametrize(("shift", "warned"), [(FAR, True), ((0.0, 0.0, 0.0), False)], ids=["far", "near"])
+def test_vertices_in_float64_are_warned_of(device, shift, warned):
+    warnings = extract_isosurface(make_sphere(shift), 0.5, device=device).report["warnings"]
+    assert any("vertices are float64" in text for text in warnings) == warned
 
 
 @pytest.mark.every_device
-def test_vertices_lie_on_the_sphere_and_on_the_twin(device):
+def test_vertices_far_from_the_origin_lie_on_their_sphere(device):
     volume = make_sphere(FAR, "float32")
     mesh = extract_isosurface(volume, 0.0, device=device)
     centre = volume.ijk_to_lps(CENTRE_IJK[None])[0]
     radius = np.linalg.norm(mesh.vertices - centre, axis=1)
     assert np.abs(radius - RADIUS_MM).max() <= tolerances.SPHERE_DISTANCE_FIELD_VOXEL * max(volume.spacing)
+
+
+@pytest.mark.every_device
+def test_surface_far_from_the_origin_equals_the_twin(device):
+    volume = make_sphere(FAR, "float32")
+    mesh = extract_isosurface(volume, 0.0, device=device)
     vertices, normals, triangles = twin.extract_isosurface(volume, 0.0)
     assert np.array_equal(mesh.triangles, triangles)
     assert np.abs(mesh.vertices - vertices).max() <= tolerances.FAR_VERTEX_MM
     assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_NORMAL
 
 
-def test_slabs_give_the_same_mesh(device):
+def test_slabs_of_a_far_volume_give_the_same_mesh(device):
     volume = make_sphere(FAR)
     whole = extract_isosurface(volume, 0.5, device=device)
     with clrecon.SurfaceExtractor(volume, device=device, memory=140_000) as extractor:
         assert extractor.forecast()["slabs"] > 1
         parts = extractor.extract(0.5)
-    assert np.array_equal(whole.vertices, parts.vertices) and np.array_equal(whole.triangles, parts.triangles)
+    assert np.array_equal(whole.vertices, parts.vertices)
+    assert np.array_equal(whole.triangles, parts.triangles)
 
 
 def test_labels_far_from_the_origin_are_as_exact_as_near_it(device):
@@ -78,32 +89,58 @@ def test_labels_far_from_the_origin_are_as_exact_as_near_it(device):
     assert np.abs(far_label.vertices - FAR - near_label.vertices).max() <= tolerances.FAR_VERTEX_MM
 
 
-def test_the_bound_is_where_steps_of_float32_pass_it(device):
-    """A volume that stays below 4096 mm with its border keeps the path, and the bits, that it had."""
-    volume = make_sphere()
-    reach = np.abs(volume.ijk_to_lps([(-1, -1, -1), (50, 40, 30)])).max()
-    below = make_sphere((0.0, 0.0, FAR_MM - reach - 40.0))
-    above = make_sphere((0.0, 0.0, FAR_MM))
-    assert find_vertex_origin(below) is None and find_vertex_origin(above) is not None
-    assert float32_step(FAR_MM - 1.0) < 2.5e-4 < float32_step(FAR_MM)
+STEP_BOUND_MM = 2.5e-4
+
+
+def volume_that_reaches(height: float) -> Volume:
+    """The sphere, shifted along z so that its volume with a voxel around it ends there at most."""
+    reach = np.abs(make_sphere().ijk_to_lps([(-1, -1, -1), (50, 40, 30)])).max()
+    return make_sphere((0.0, 0.0, height - reach))
+
+
+def test_volumes_are_far_from_where_steps_of_float32_pass_their_bound():
+    assert float32_step(FAR_MM - 1.0) < STEP_BOUND_MM < float32_step(FAR_MM)
+
+
+def test_vertices_of_a_volume_below_the_bound_are_float32(device):
+    below = volume_that_reaches(FAR_MM - 40.0)
+    assert find_vertex_origin(below) is None
     assert extract_isosurface(below, 0.5, device=device).vertices.dtype == np.float32
-    assert extract_isosurface(above, 0.5, device=device).vertices.dtype == np.float64
-    origin = find_vertex_origin(above)
-    assert np.array_equal(origin, np.rint(origin))  # whole mm: adding it is exact to 1e-11 mm
 
 
-def test_far_meshes_are_measured_and_refined_as_near_ones(device):
-    near, far = (extract_isosurface(make_sphere(shift), 0.5, device=device) for shift in ((0, 0, 0), FAR))
-    for one, other in ((near, far), *([(clrecon.decimate_mesh(clrecon.smooth_mesh(m), 0.7) for m in (near, far))])):
-        assert other.vertices.dtype == np.float64
-        expected, found = one.quality(), other.quality()
-        for name in ("volume_ml", "area_mm2"):
-            assert found[name] == pytest.approx(expected[name], rel=1e-6), name
-        for name in ("closed", "manifold", "outward", "components", "zero_area_faces", "triangles"):
-            assert found[name] == expected[name], name
-        assert np.abs(np.subtract(found["bounds_mm"], expected["bounds_mm"]) - FAR).max() < 1e-3
-    parts = clrecon.compare_meshes(clrecon.smooth_mesh(far), far)
-    assert 0.0 < parts["max_mm"] <= 0.25 * 0.51
+def test_vertices_of_a_volume_beyond_the_bound_are_float64_from_an_origin_of_whole_millimetres(device):
+    beyond = make_sphere((0.0, 0.0, FAR_MM))
+    origin = find_vertex_origin(beyond)
+    assert np.array_equal(origin, np.rint(origin))  # adding it is exact to 1e-11 mm
+    assert extract_isosurface(beyond, 0.5, device=device).vertices.dtype == np.float64
+
+
+@pytest.fixture(scope="module")
+def near_and_far(device):
+    """The surface of the sphere near the origin, and that of the one at `FAR`."""
+    return tuple(extract_isosurface(make_sphere(shift), 0.5, device=device) for shift in ((0, 0, 0), FAR))
+
+
+def refine(mesh: Mesh) -> Mesh:
+    return clrecon.decimate_mesh(clrecon.smooth_mesh(mesh), 0.7)
+
+
+@pytest.mark.parametrize("change", [lambda mesh: mesh, refine], ids=["extracted", "refined"])
+def test_a_far_mesh_has_the_measures_of_a_near_one(near_and_far, change):
+    near, far = (change(mesh) for mesh in near_and_far)
+    assert far.vertices.dtype == np.float64
+    expected, found = near.quality(), far.quality()
+    for name in ("volume_ml", "area_mm2"):
+        assert found[name] == pytest.approx(expected[name], rel=1e-6), name
+    for name in ("closed", "manifold", "outward", "components", "zero_area_faces", "triangles"):
+        assert found[name] == expected[name], name
+    assert np.abs(np.subtract(found["bounds_mm"], expected["bounds_mm"]) - FAR).max() < 1e-3
+
+
+def test_smoothing_moves_a_far_mesh_by_half_a_quarter_of_a_voxel_at_most(near_and_far):
+    _, far = near_and_far
+    distances = clrecon.compare_meshes(clrecon.smooth_mesh(far), far)
+    assert 0.0 < distances["max_mm"] <= 0.25 * 0.51  # pixels of 0.5 mm, sheared
 
 
 # --- files ---
@@ -137,29 +174,51 @@ def read_back(path, space):
 
 
 @pytest.mark.parametrize("space", ["lps", "ras"])
-@pytest.mark.parametrize("extension", sorted(FORMATS))
-def test_files_hold_what_the_mesh_does(far_mesh, extension, space, tmp_path):
+@pytest.mark.parametrize("extension", sorted(set(FORMATS) - {".stl", ".html"}))
+def test_files_of_a_far_mesh_hold_its_vertices_exactly(far_mesh, extension, space, tmp_path):
     path = tmp_path / f"far{extension}"
-    assert far_mesh.vertices.dtype == np.float64
     assert far_mesh.save(path, space) == path.stat().st_size
     points, faces = read_back(path, space)
-    warnings = describe_rounding(far_mesh, extension)
-    expected = far_mesh.vertices[far_mesh.triangles]
-    off = np.abs(points[faces] - expected)
-    if extension == ".stl":
-        meeting = np.isin(far_mesh.triangles, find_coincident(far_mesh.vertices.astype(np.float32)))
-        assert off[~meeting].max() <= 0.5 * float32_step(1e5)
-        assert off[meeting].max(initial=0.0) <= 1.5 * float32_step(1e5)  # rounding joins them: one goes on by a step
-        assert "steps of 0.0078 mm" in warnings[0]
-    elif extension == ".html":
-        assert off.max() <= 1.001 * read_facts(path)["half_step_mm"] <= 0.001
-    else:
-        assert off.max() <= tolerances.FAR_FILE_MM
-        assert warnings == []
+    off = np.abs(points[faces] - far_mesh.vertices[far_mesh.triangles])
+    assert off.max() <= tolerances.FAR_FILE_MM
+    assert describe_rounding(far_mesh, extension) == []
 
 
-def test_near_meshes_have_no_warning_and_float32():
-    mesh = Mesh([[0.0, 0, 0], [4095.0, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    assert mesh.vertices.dtype == np.float32 and describe_rounding(mesh, ".stl") == []
-    assert Mesh(np.float32([[0, 0, 0], [1e5, 0, 0], [0, 1, 0]]), [[0, 1, 2]]).vertices.dtype == np.float32
-    assert Mesh([[0.0, 0, 0], [-4096.0, 0, 0], [0, 1, 0]], [[0, 1, 2]]).vertices.dtype == np.float64
+@pytest.mark.parametrize("space", ["lps", "ras"])
+def test_stl_of_a_far_mesh_is_rounded_to_float32_with_a_warning(far_mesh, space, tmp_path):
+    """Of vertices that rounding joins one goes on by a step."""
+    path = tmp_path / "far.stl"
+    assert far_mesh.save(path, space) == path.stat().st_size
+    points, faces = read_back(path, space)
+    off = np.abs(points[faces] - far_mesh.vertices[far_mesh.triangles])
+    joined = np.isin(far_mesh.triangles, find_coincident(far_mesh.vertices.astype(np.float32)))
+    step = float32_step(1e5)
+    assert off[~joined].max() <= 0.5 * step
+    assert off[joined].max(initial=0.0) <= 1.5 * step
+    assert "steps of 0.0078 mm" in describe_rounding(far_mesh, ".stl")[0]
+
+
+@pytest.mark.parametrize("space", ["lps", "ras"])
+def test_page_of_a_far_mesh_holds_its_vertices_to_a_micrometre(far_mesh, space, tmp_path):
+    path = tmp_path / "far.html"
+    assert far_mesh.save(path, space) == path.stat().st_size
+    points, faces = read_back(path, space)
+    off = np.abs(points[faces] - far_mesh.vertices[far_mesh.triangles])
+    assert off.max() <= 1.001 * read_facts(path)["half_step_mm"] <= 0.001
+
+
+@pytest.mark.parametrize(
+    ("vertices", "dtype"),
+    [
+        ([[0.0, 0, 0], [4095.0, 0, 0], [0, 1, 0]], np.float32),
+        ([[0.0, 0, 0], [-4096.0, 0, 0], [0, 1, 0]], np.float64),
+        (np.float32([[0, 0, 0], [1e5, 0, 0], [0, 1, 0]]), np.float32),
+    ],
+    ids=["near", "far", "far, given as float32"],
+)
+def test_vertices_of_a_mesh_beyond_4096_mm_are_kept_in_float64_unless_given_in_float32(vertices, dtype):
+    assert Mesh(vertices, [[0, 1, 2]]).vertices.dtype == dtype
+
+
+def test_stl_of_a_near_mesh_has_no_warning():
+    assert describe_rounding(Mesh([[0.0, 0, 0], [4095.0, 0, 0], [0, 1, 0]], [[0, 1, 2]]), ".stl") == []

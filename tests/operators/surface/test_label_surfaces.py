@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tolerances
 from refusals import refused
+from slab_surfaces import assert_same
 from variants import VOXEL_TYPES, daily
 
 from clrecon.errors import DeviceError, NoSurfaceError, RefusedInputError, UsageError
@@ -46,8 +47,8 @@ def assert_equals_twin(mesh, volume, inside, number, iso_value, closed=True):
     assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_NORMAL
 
 
-def count_half_way(volume, inside, number, iso_value) -> int:
-    """Crossed edges of a closed label that HU do not place."""
+def share_placed_by_hu(volume, inside, number, iso_value, vertices) -> float:
+    """The share of crossed edges of a closed label that HU place; others carry their vertex half way."""
     inside = np.pad(inside, 1)
     dense = np.pad(volume.voxels >= iso_value, 1)
     half_way = 0
@@ -55,14 +56,14 @@ def count_half_way(volume, inside, number, iso_value) -> int:
         (a, b), (da, db) = ((np.moveaxis(x, axis, 0)[:-1], np.moveaxis(x, axis, 0)[1:]) for x in (inside, dense))
         placed = ((a == number) & da & (b == 0) & ~db) | ((b == number) & db & (a == 0) & ~da)
         half_way += int(np.count_nonzero(((a == number) != (b == number)) & ~placed))
-    return half_way
+    return 1.0 - half_way / vertices
 
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("closed", daily(1, [True, False]))
 @pytest.mark.parametrize("solid", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_surfaces_of_labels_equal_their_twin(device, shape, solid, closed):
+def test_surfaces_of_labels_and_their_share_placed_by_hu_equal_the_twin(device, shape, solid, closed):
     volume, labels = random_volume(shape), random_labels(shape)
     numbers = (3, 7, 300)
     inside = twin.find_solid(volume, labels, 3, grow_mm=1.2, closed=closed, solid=numbers if solid else ())
@@ -73,18 +74,20 @@ def test_surfaces_of_labels_equal_their_twin(device, shape, solid, closed):
     for number, mesh in meshes.items():
         assert_equals_twin(mesh, volume, inside, number, 3, closed)
         if closed:
-            by_hu = 1.0 - count_half_way(volume, inside, number, 3) / len(mesh.vertices)
-            assert mesh.report["vertices_by_hu_share"] == pytest.approx(by_hu, abs=1e-12)
+            by_hu = share_placed_by_hu(volume, inside, number, 3, len(mesh.vertices))
+            assert mesh.report["vertices_by_hu_share"] == pytest.approx(by_hu, abs=tolerances.FLOAT64_SHARE)
 
 
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)
-def test_surfaces_of_labels_equal_their_twin_for_every_voxel_type(device, dtype):
+@pytest.mark.parametrize("iso_value", [40, 40.3])
+def test_surfaces_of_labels_equal_their_twin_for_every_voxel_type(device, dtype, iso_value):
     shape = (6, 7, 37)
     volume, labels = random_volume(shape, dtype, MIRRORED, high=100), random_labels(shape)
-    for iso_value in (40, 40.3):
-        inside = twin.find_solid(volume, labels, iso_value)
-        for number, mesh in extract_labels(volume, LabelMap(labels, MIRRORED), iso_value, device=device).items():
-            assert_equals_twin(mesh, volume, inside, number, iso_value)
+    inside = twin.find_solid(volume, labels, iso_value)
+    meshes = extract_labels(volume, LabelMap(labels, MIRRORED), iso_value, device=device)
+    assert tuple(meshes) == (3, 7, 300)
+    for number, mesh in meshes.items():
+        assert_equals_twin(mesh, volume, inside, number, iso_value)
 
 
 @pytest.mark.release
@@ -102,199 +105,319 @@ def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("grow_mm", [None, 0.0, 0.6, 2.7, 5.3])
-def test_growth_is_that_of_the_twin_to_the_last_sample(device, grow_mm):
-    """The buffer of the device is looked at itself: sizes on both sides of a work-group, ties of distance."""
-    for shape in [(5, 7, 9), (4, 4, 4), (5, 5, 5), (1, 1, 63), (3, 1, 65)]:
-        for affine in (OBLIQUE, np.eye(4)):
-            volume, labels = random_volume(shape, affine=affine), random_labels(shape, numbers=(0, 0, 0, 0, 2, 9))
-            growth = Growth.of(volume, grow_mm)
-            rule = choose_iso_rule(volume, 3)
-            taken = resample_labels(LabelMap(labels, affine), volume)
-            run = operator.LabelExtraction(DeviceVolume(volume, device=device), taken, rule, growth, False, [])
-            held = run.hold({1: (slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2]))})
-            inside = operator.ocl.download(device, np.empty_like(taken.voxels), held.inside_d)
-            assert np.array_equal(inside, twin.find_solid(volume, labels, 3, grow_mm=grow_mm))
+@pytest.mark.parametrize("affine", [OBLIQUE, np.eye(4)], ids=["oblique", "straight"])
+@pytest.mark.parametrize("shape", [(5, 7, 9), (4, 4, 4), (5, 5, 5), (1, 1, 63), (3, 1, 65)])
+def test_samples_that_labels_grow_to_equal_the_twin(device, shape, affine, grow_mm):
+    """Sizes on both sides of a work-group of 64; in a straight grid distances tie."""
+    volume, labels = random_volume(shape, affine=affine), random_labels(shape, numbers=(0, 0, 0, 0, 2, 9))
+    growth = Growth.of(volume, grow_mm)
+    taken = resample_labels(LabelMap(labels, affine), volume)
+    resident = DeviceVolume(volume, device=device)
+    run = operator.LabelExtraction(resident, taken, choose_iso_rule(volume, 3), growth, False, [])
+
+    held = run.hold({1: (slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2]))})
+
+    inside = operator.ocl.download(device, np.empty_like(taken.voxels), held.inside_d)
+    assert np.array_equal(inside, twin.find_solid(volume, labels, 3, grow_mm=grow_mm))
 
 
-def test_labels_are_closed_manifold_and_share_their_border(device):
+@pytest.fixture(scope="module")
+def random_label_meshes(device):
+    """A volume, its labels 3, 7 and 300, and their surfaces at 2.3 HU."""
     shape = (12, 13, 40)
     volume, labels = random_volume(shape, high=9), random_labels(shape)
-    meshes = extract_labels(volume, LabelMap(labels, OBLIQUE), 2.3, device=device)
-    points = {}
-    for number, mesh in meshes.items():
-        quality = mesh.quality()
-        assert quality["closed"] and quality["manifold"] and quality["volume_ml"] > 0
-        assert quality["zero_area_faces"] == 0 and quality["unused_vertices"] == 0
-        points[number] = {row.tobytes() for row in mesh.vertices}
-        assert len(points[number]) == len(mesh.vertices)
+    return volume, labels, extract_labels(volume, LabelMap(labels, OBLIQUE), 2.3, device=device)
+
+
+@pytest.mark.parametrize("number", [3, 7, 300])
+def test_surface_of_a_label_is_closed_and_manifold_with_no_vertex_twice(random_label_meshes, number):
+    _, _, meshes = random_label_meshes
+    quality = meshes[number].quality()
+    assert quality["closed"] and quality["manifold"] and quality["volume_ml"] > 0
+    assert (quality["zero_area_faces"], quality["unused_vertices"]) == (0, 0)
+    assert len(np.unique(meshes[number].vertices, axis=0)) == len(meshes[number].vertices)
+
+
+@pytest.mark.parametrize(("one", "other"), [(3, 7), (3, 300), (7, 300)])
+def test_labels_share_a_vertex_for_each_face_between_their_voxels(random_label_meshes, one, other):
+    volume, labels, meshes = random_label_meshes
     inside = twin.find_solid(volume, labels, 2.3)
-    for one, other in ((3, 7), (3, 300), (7, 300)):
-        borders = 0
-        for axis in range(3):
-            a, b = np.moveaxis(inside, axis, 0)[1:], np.moveaxis(inside, axis, 0)[:-1]
-            borders += int(((a == one) & (b == other) | (a == other) & (b == one)).sum())
-        assert len(points[one] & points[other]) == borders > 0
+    faces = 0
+    for axis in range(3):
+        a, b = np.moveaxis(inside, axis, 0)[1:], np.moveaxis(inside, axis, 0)[:-1]
+        faces += int(((a == one) & (b == other) | (a == other) & (b == one)).sum())
+    shared = {row.tobytes() for row in meshes[one].vertices} & {row.tobytes() for row in meshes[other].vertices}
+    assert len(shared) == faces > 0
 
 
-def test_one_label_alone_is_the_same_as_among_others(device):
+@pytest.mark.parametrize("number", [7, 9])
+def test_surface_of_a_label_alone_is_the_same_as_among_others(device, number):
     shape = (20, 9, 40)
     volume, labels = random_volume(shape), np.zeros(shape, np.uint16)
     labels[2:6], labels[6:13, 2:], labels[15:] = 3, 7, 9
-    together = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device)
-    for number in (7, 9):
-        alone = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, label=[number])[number]
-        assert np.array_equal(alone.vertices, together[number].vertices)
-        assert np.array_equal(alone.normals, together[number].normals)
-        assert np.array_equal(alone.triangles, together[number].triangles)
+    label_map = LabelMap(labels, OBLIQUE)
+    together = extract_labels(volume, label_map, 3, device=device)[number]
+    assert_same(extract_labels(volume, label_map, 3, device=device, label=[number])[number], together)
 
 
 @pytest.mark.every_device
-def test_a_label_of_everything_is_the_plain_surface(device):
-    for closed in (True, False):
-        volume = random_volume((9, 8, 45))
-        labels = LabelMap(np.ones(volume.voxels.shape, np.uint8), OBLIQUE)
-        plain = extract_isosurface(volume, 3, device=device, closed=closed)
-        mesh = extract_labels(volume, labels, 3, device=device, closed=closed)[1]
-        assert np.array_equal(mesh.vertices, plain.vertices)
-        assert np.array_equal(mesh.normals, plain.normals)
-        assert np.array_equal(mesh.triangles, plain.triangles)
-        assert mesh.report["vertices_by_hu_share"] == 1.0
+@pytest.mark.parametrize("closed", [True, False])
+def test_surface_of_a_label_of_all_voxels_is_that_of_the_volume(device, closed):
+    volume = random_volume((9, 8, 45))
+    labels = LabelMap(np.ones(volume.voxels.shape, np.uint8), OBLIQUE)
+    mesh = extract_labels(volume, labels, 3, device=device, closed=closed)[1]
+    assert_same(mesh, extract_isosurface(volume, 3, device=device, closed=closed))
+    assert mesh.report["vertices_by_hu_share"] == 1.0
 
 
-def test_labels_that_do_not_fit_together_go_through_one_by_one(device, monkeypatch):
-    shape = (60, 40, 40)
-    volume, labels = random_volume(shape), np.zeros(shape, np.uint16)
+@pytest.fixture(scope="module")
+def three_layers() -> tuple[Volume, LabelMap]:
+    """Labels 3, 7 and 9 at the bottom, in the middle and at the top of 60 slices."""
+    labels = np.zeros((60, 40, 40), np.uint16)
     labels[:6], labels[28:31], labels[55:] = 3, 7, 9
-    expected = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, solid=True)
+    return random_volume(labels.shape), LabelMap(labels, OBLIQUE)
+
+
+@pytest.mark.parametrize("number", [3, 7, 9])
+def test_labels_that_do_not_fit_together_have_the_same_surfaces_one_by_one(device, three_layers, number):
+    volume, labels = three_layers
+    memory = 500_000
+    together = extract_labels(volume, labels, 3, device=device, solid=True)[number]
+    alone = extract_labels(volume, labels, 3, device=device, solid=True, memory=memory)[number]
+    assert (together.report["slabs"], alone.report["slabs"]) == (1, 3)
+    assert sum(alone.report["device_bytes"].values()) <= memory
+    assert_same(alone, together)
+
+
+def test_labels_that_do_not_fit_together_upload_three_slabs_each(device, three_layers, monkeypatch):
+    volume, labels = three_layers
     uploads, true_upload = [], device_volume.ocl.upload
     monkeypatch.setattr(device_volume.ocl, "upload", lambda d, a: uploads.append(a.shape) or true_upload(d, a))
-    meshes = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, solid=True, memory=500_000)
-    assert sum(len(shape) == 3 and shape[1:] == (40, 40) for shape in uploads) == 9  # three for each label
-    for number, mesh in meshes.items():
-        assert mesh.report["slabs"] == 3 and sum(mesh.report["device_bytes"].values()) <= 500_000
-        assert expected[number].report["slabs"] == 1
-        assert np.array_equal(mesh.vertices, expected[number].vertices)
-        assert np.array_equal(mesh.normals, expected[number].normals)
-        assert np.array_equal(mesh.triangles, expected[number].triangles)
-    with refused(DeviceError, 50000):
-        extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, memory=50_000)
+    extract_labels(volume, labels, 3, device=device, solid=True, memory=500_000)
+    slabs = [shape for shape in uploads if len(shape) == 3 and shape[1:] == (40, 40)]
+    assert len(slabs) == 3 * 3
+
+
+def test_labels_that_do_not_fit_alone_are_refused(device, three_layers):
+    volume, labels = three_layers
+    with refused(DeviceError, 50_000):
+        extract_labels(volume, labels, 3, device=device, memory=50_000)
 
 
 @pytest.mark.every_device
-def test_labels_on_another_grid_are_the_same_where_it_covers_the_volume(device):
+@pytest.mark.parametrize("number", [3, 7, 300])
+def test_labels_on_a_turned_grid_of_the_same_voxels_have_the_same_surfaces(device, number):
     volume, labels = random_volume((6, 7, 33)), random_labels((6, 7, 33))
     turned = OBLIQUE @ np.array([[0, 0, 1, 0], [0, -1, 0, 6], [1, 0, 0, 0], [0, 0, 0, 1.0]])
-    expected = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device)
-    meshes = extract_labels(volume, LabelMap(labels[:, ::-1].transpose(2, 1, 0), turned), 3, device=device)
-    assert all(np.array_equal(meshes[n].vertices, expected[n].vertices) for n in expected)
+    turned_labels = LabelMap(labels[:, ::-1].transpose(2, 1, 0), turned)
+    expected = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device)[number]
+    assert np.array_equal(extract_labels(volume, turned_labels, 3, device=device)[number].vertices, expected.vertices)
 
 
-def test_the_report_says_what_was_done(device):
+@pytest.fixture(scope="module")
+def report_of_t12(device):
+    """The report of the surface of a label named after its vertebra, in a doubtful map."""
     volume, labels = random_volume((5, 7, 9)), random_labels((5, 7, 9))
     label_map = LabelMap(labels, OBLIQUE, {3: "vertebrae_T12"}, warnings=["doubtful"])
-    mesh = extract_labels(volume, label_map, 3, device=device, label=["T12"])[3]
-    assert mesh.report["label"] == 3 and mesh.report["label_name"] == "vertebrae_T12"
-    assert mesh.report["label_inside_share"] == 1.0 and mesh.report["solid"] is False
-    assert mesh.report["grow_mm"] is None
-    assert 0.1 < mesh.report["vertices_by_hu_share"] < 0.9
-    assert "doubtful" in mesh.report["warnings"]
-    assert set(mesh.report["seconds"]) == {"upload", "build", "kernels", "download"}
+    return extract_labels(volume, label_map, 3, device=device, label=["T12"])[3].report
 
 
-def test_a_label_that_leaves_the_volume_is_said(device):
-    volume = random_volume((5, 7, 9))
+def test_report_of_a_label_names_it_and_has_the_warnings_of_its_map(report_of_t12):
+    assert (report_of_t12["label"], report_of_t12["label_name"]) == (3, "vertebrae_T12")
+    assert "doubtful" in report_of_t12["warnings"]
+
+
+def test_report_of_a_label_has_its_shares_and_settings(report_of_t12):
+    assert report_of_t12["label_inside_share"] == 1.0
+    assert 0.1 < report_of_t12["vertices_by_hu_share"] < 0.9
+    assert (report_of_t12["solid"], report_of_t12["grow_mm"]) == (False, None)
+
+
+def test_report_of_a_label_has_the_seconds_of_its_steps(report_of_t12):
+    assert set(report_of_t12["seconds"]) == {"upload", "build", "kernels", "download"}
+
+
+def test_a_label_that_leaves_the_volume_is_closed_at_its_end_with_a_warning(device):
+    """Shifted by 3 of 5 slices."""
     shifted = OBLIQUE.copy()
     shifted[:, 3] = OBLIQUE @ (0, 0, 3, 1)
-    mesh = extract_labels(volume, LabelMap(np.full((5, 7, 9), 2), shifted), 3, device=device)[2]
-    assert "60 % of label 2 lie outside the CT" in mesh.report["warnings"][-1]
+    mesh = extract_labels(random_volume((5, 7, 9)), LabelMap(np.full((5, 7, 9), 2), shifted), 3, device=device)[2]
     assert mesh.quality()["closed"]
+    assert "60 % of label 2 lie outside the CT" in mesh.report["warnings"][-1]
 
 
-def test_labels_without_a_surface_are_refused_or_left_out(device):
+@pytest.fixture(scope="module")
+def liver_and_bone() -> tuple[Volume, LabelMap]:
+    """Label 2, the liver, of 1 HU in the first slice, and label 5 with 0 to 5 HU in the last two."""
     volume, labels = random_volume((5, 7, 9)), np.zeros((5, 7, 9), np.uint8)
     labels[0], labels[3:] = 2, 5
     volume.voxels[:3] = 1
-    label_map = LabelMap(labels, OBLIQUE, {2: "liver"})
-    assert tuple(extract_labels(volume, label_map, 3, device=device)) == (5,)
-    with refused(NoSurfaceError, 2, 3, 1):
-        extract_labels(volume, label_map, 3, device=device, label=[5, 2])
+    return volume, LabelMap(labels, OBLIQUE, {2: "liver"})
+
+
+def test_a_label_without_a_surface_is_left_out_where_all_are_asked_for(device, liver_and_bone):
+    volume, labels = liver_and_bone
+    assert tuple(extract_labels(volume, labels, 3, device=device)) == (5,)
+
+
+def test_a_label_without_a_surface_is_refused_where_it_is_asked_for(device, liver_and_bone):
+    volume, labels = liver_and_bone
+    with refused(NoSurfaceError, 2, 3, 1):  # the label, the level, and its highest HU
+        extract_labels(volume, labels, 3, device=device, label=[5, 2])
+
+
+def test_labels_of_which_none_has_a_surface_are_refused(device, liver_and_bone):
+    volume, labels = liver_and_bone
     with refused(NoSurfaceError, 6, "label"):
-        extract_labels(volume, label_map, 6, device=device)
+        extract_labels(volume, labels, 6, device=device)
+
+
+def test_an_unknown_label_is_refused_with_those_there_are(device, liver_and_bone):
+    volume, labels = liver_and_bone
     with refused(UsageError, "label_5", 9, 2, 5):
-        extract_labels(volume, label_map, 3, device=device, label=[9])
+        extract_labels(volume, labels, 3, device=device, label=[9])
+
+
+def test_an_empty_choice_of_labels_is_refused(device, liver_and_bone):
+    volume, labels = liver_and_bone
     with refused(UsageError, "label"):
-        extract_labels(volume, label_map, 3, device=device, label=[])
-    far = OBLIQUE.copy()
-    far[0, 3] += 1000
+        extract_labels(volume, labels, 3, device=device, label=[])
+
+
+def test_labels_a_metre_beside_the_volume_are_refused(device, liver_and_bone):
+    volume, labels = liver_and_bone
+    beside = OBLIQUE.copy()
+    beside[0, 3] += 1000
     with refused(RefusedInputError, 0, "labels"):
-        extract_labels(volume, LabelMap(labels, far), 3, device=device)
+        extract_labels(volume, LabelMap(labels.voxels, beside), 3, device=device)
 
 
-@pytest.mark.parametrize("numbers", [None, [1]])
-def test_a_label_that_is_the_whole_of_an_open_volume_has_no_surface(device, numbers):
+@pytest.fixture(scope="module")
+def block_in_a_label_of_all() -> tuple[Volume, LabelMap]:
+    """A block of 300 HU in 0 HU, and a label of all voxels."""
     hu = np.zeros((5, 7, 9), np.int16)
     hu[2:4, 2:5, 2:6] = 300
-    volume, label_map = Volume(hu, OBLIQUE), LabelMap(np.ones((5, 7, 9), np.uint8), OBLIQUE, {1: "all"})
-    for closed, solid in ((True, False), (True, True), (False, False)):
-        assert 1 in extract_labels(volume, label_map, 30, device=device, label=numbers, closed=closed, solid=solid)
-    # Nothing leads to its dense voxels from outside: solid, all of it is inside.
+    return Volume(hu, OBLIQUE), LabelMap(np.ones((5, 7, 9), np.uint8), OBLIQUE, {1: "all"})
+
+
+@pytest.mark.parametrize("chosen", [None, [1]])
+@pytest.mark.parametrize(("closed", "solid"), [(True, False), (True, True), (False, False)])
+def test_a_block_within_a_label_of_all_voxels_has_a_surface(device, block_in_a_label_of_all, chosen, closed, solid):
+    volume, labels = block_in_a_label_of_all
+    meshes = extract_labels(volume, labels, 30, device=device, label=chosen, closed=closed, solid=solid)
+    assert tuple(meshes) == (1,)
+
+
+@pytest.mark.parametrize("chosen", [None, [1]])
+def test_an_open_solid_surface_of_a_label_of_all_voxels_is_refused(device, block_in_a_label_of_all, chosen):
+    """Nothing leads to its dense voxels from outside: solid, all of it is inside."""
+    volume, labels = block_in_a_label_of_all
     with refused(NoSurfaceError, "CT", 1, 30):
-        extract_labels(volume, label_map, 30, device=device, label=numbers, closed=False, solid=True)
-    full = Volume(np.full((5, 7, 9), 50, np.int16), OBLIQUE)
+        extract_labels(volume, labels, 30, device=device, label=chosen, closed=False, solid=True)
+
+
+@pytest.mark.parametrize("chosen", [None, [1]])
+def test_an_open_surface_of_a_label_of_all_voxels_that_are_dense_is_refused(device, block_in_a_label_of_all, chosen):
+    _, labels = block_in_a_label_of_all
+    dense = Volume(np.full((5, 7, 9), 50, np.int16), OBLIQUE)
     with refused(NoSurfaceError, "CT", 1, 30):
-        extract_labels(full, label_map, 30, device=device, label=numbers, closed=False)
+        extract_labels(dense, labels, 30, device=device, label=chosen, closed=False)
+
+
+@pytest.mark.parametrize("chosen", [None, [1]])
+def test_a_surface_of_labels_above_all_their_hu_is_refused(device, block_in_a_label_of_all, chosen):
+    volume, labels = block_in_a_label_of_all
     with refused(NoSurfaceError, 500):
-        extract_labels(volume, label_map, 500, device=device, label=numbers, closed=False, solid=True)
+        extract_labels(volume, labels, 500, device=device, label=chosen, closed=False, solid=True)
 
 
-def test_a_label_outside_the_volume_is_refused_when_asked_for(device):
-    volume, labels = random_volume((5, 7, 9)), np.zeros((10, 7, 9), np.uint8)
+@pytest.fixture(scope="module")
+def label_beyond_the_volume() -> tuple[Volume, LabelMap]:
+    """Label 2 in the five slices of the volume, and label 4 in slices 8 and 9 of the map."""
+    labels = np.zeros((10, 7, 9), np.uint8)
     labels[:5], labels[8:] = 2, 4
-    label_map = LabelMap(labels, OBLIQUE)
-    assert tuple(extract_labels(volume, label_map, 3, device=device)) == (2,)
+    return random_volume((5, 7, 9)), LabelMap(labels, OBLIQUE)
+
+
+def test_a_label_outside_the_volume_is_left_out_where_all_are_asked_for(device, label_beyond_the_volume):
+    volume, labels = label_beyond_the_volume
+    assert tuple(extract_labels(volume, labels, 3, device=device)) == (2,)
+
+
+def test_a_label_outside_the_volume_is_refused_where_it_is_asked_for(device, label_beyond_the_volume):
+    volume, labels = label_beyond_the_volume
     with refused(NoSurfaceError, "label_4", "CT", 4):
-        extract_labels(volume, label_map, 3, device=device, label=[4])
+        extract_labels(volume, labels, 3, device=device, label=[4])
 
 
 @pytest.mark.oclgrind
-def test_every_pass_over_small_labels_equals_the_twin(device):
+@pytest.mark.parametrize("number", [3, 7, 300])
+def test_triangles_of_a_label_of_a_small_volume_equal_the_twin(device, number):
     volume, labels = random_volume((4, 4, 33)), random_labels((4, 4, 33))
     inside = twin.find_solid(volume, labels, 3, grow_mm=1.2)
-    for number, mesh in extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, grow_mm=1.2).items():
-        assert np.array_equal(mesh.triangles, twin.extract_label(volume, inside, number, 3)[2])
+    mesh = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, grow_mm=1.2)[number]
+    _, _, triangles = twin.extract_label(volume, inside, number, 3)
+    assert np.array_equal(mesh.triangles, triangles)
 
 
 @pytest.mark.oclgrind
-def test_label_without_growth_between_other_slices_equals_the_twin(device):
+def test_triangles_of_a_label_without_growth_between_other_slices_equal_the_twin(device):
     """The slices that are held reach as far as those that are read."""
     volume, labels = random_volume((12, 4, 33)), np.zeros((12, 4, 33), np.uint16)
     labels[4:6] = 3
     inside = twin.find_solid(volume, labels, 3, grow_mm=0)
     mesh = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, grow_mm=0)[3]
-    assert np.array_equal(mesh.triangles, twin.extract_label(volume, inside, 3, 3)[2])
+    _, _, triangles = twin.extract_label(volume, inside, 3, 3)
+    assert np.array_equal(mesh.triangles, triangles)
 
 
-@pytest.mark.release
-def test_a_real_vertebra_is_sound(device, real_data):
+T12, T11 = 32, 33
+
+
+@pytest.fixture(scope="module")
+def real_vertebrae(device, real_data):
+    """Hollow and solid surfaces of T12 and T11 in a real scan at 200 HU, and the volume of T12's mask in ml."""
     from clrecon.labels import read_labels
     from clrecon.reading import read_volume
 
     folder = real_data / "thoracolumbar_labels"
     volume, labels = read_volume(folder / "ct_2mm_jpeg2000"), read_labels(folder / "ct_2mm_labels.nii.gz")
-    hollow, full = (
+    hollow, solid = (
         extract_labels(volume, labels, 200, device=device, label=["T12", "T11"], solid=solid) for solid in (False, True)
     )
-    for mesh in (*hollow.values(), *full.values()):
+    mask_ml = np.count_nonzero(resample_labels(labels, volume).voxels == T12) * np.prod(volume.spacing) / 1000
+    return hollow, solid, mask_ml
+
+
+@pytest.mark.release
+@pytest.mark.parametrize("number", [T12, T11], ids=["T12", "T11"])
+def test_hollow_and_solid_surfaces_of_a_real_vertebra_are_closed_and_manifold(real_vertebrae, number):
+    hollow, solid, _ = real_vertebrae
+    for mesh in (hollow[number], solid[number]):
         assert mesh.quality()["closed"] and mesh.quality()["manifold"]
-    mask_ml = np.count_nonzero(resample_labels(labels, volume).voxels == 32) * np.prod(volume.spacing) / 1000
-    assert full[32].quality()["volume_ml"] == pytest.approx(mask_ml, rel=tolerances.REAL_SOLID_VOLUME)
-    assert hollow[32].quality()["volume_ml"] < 0.7 * mask_ml
-    shared = {row.tobytes() for row in full[32].vertices} & {row.tobytes() for row in full[33].vertices}
+
+
+@pytest.mark.release
+def test_a_solid_real_vertebra_has_the_volume_of_its_mask_and_a_hollow_one_less(real_vertebrae):
+    hollow, solid, mask_ml = real_vertebrae
+    assert solid[T12].quality()["volume_ml"] == pytest.approx(mask_ml, rel=tolerances.REAL_SOLID_VOLUME)
+    assert hollow[T12].quality()["volume_ml"] < 0.7 * mask_ml
+
+
+@pytest.mark.release
+def test_two_real_vertebrae_share_vertices_where_they_touch(real_vertebrae):
+    _, solid, _ = real_vertebrae
+    shared = {row.tobytes() for row in solid[T12].vertices} & {row.tobytes() for row in solid[T11].vertices}
     assert len(shared) > 100
-    assert full[32].report["vertices_by_hu_share"] > 0.6
 
 
-@pytest.mark.parametrize(("missing", "slices"), [(0, (0, 40)), (1, (16, 26))])
+@pytest.mark.release
+def test_most_vertices_of_a_real_vertebra_are_placed_by_hu(real_vertebrae):
+    _, solid, _ = real_vertebrae
+    assert solid[T12].report["vertices_by_hu_share"] > 0.6
+
+
+@pytest.mark.parametrize(("missing", "slices"), [(0, (0, 40)), (1, (16, 26))], ids=["room", "a byte too few"])
 def test_a_volume_that_is_held_is_used_whole_where_a_mesh_of_half_the_bytes_fits(device, missing, slices):
     """Voxels of two bytes, labels and the samples inside of one each, and half of that: six bytes a voxel."""
     volume = random_volume((40, 5, 8), affine=np.eye(4))
@@ -305,5 +428,5 @@ def test_a_volume_that_is_held_is_used_whole_where_a_mesh_of_half_the_bytes_fits
         rule, growth = choose_iso_rule(volume, 3), Growth.of(volume, 1.0)
         taken = resample_labels(LabelMap(labels, np.eye(4)), volume)
         run = operator.LabelExtraction(resident, taken, rule, growth, False, [])
-        assert run.slices_for({1: (slice(20, 22), slice(1, 4), slice(2, 6))}) == slices
         assert sum(run.needs(0, 40).values()) == 4 * volume.voxels.size
+        assert run.slices_for({1: (slice(20, 22), slice(1, 4), slice(2, 6))}) == slices
