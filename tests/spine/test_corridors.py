@@ -13,6 +13,7 @@ from refusals import refused
 from variants import daily
 
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.spine.corridors import (
     BODY_SHARE,
@@ -40,176 +41,249 @@ POSES = {
 
 @pytest.fixture(scope="module", params=daily(1, POSES))
 def posed(request: pytest.FixtureRequest) -> Any:
-    """A vertebra in one of the poses, its frame and corridors, each beside its radius and axis in the truth."""
+    """A vertebra in one of the poses, what was measured of it, and each side's corridor with its true radius and axis.
+
+    `off_mm` is the tolerance on the radius, twice as large where slices are thick.
+    """
     vertebra, options = POSES[request.param]
     affine, shape = grid_around(vertebra, **options)
-    corridors = measure_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3")
-    left, right = corridors.corridors
+    measured = measure_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3")
+    left, right = measured.corridors
     return SimpleNamespace(
         vertebra=vertebra,
-        found=corridors,
+        measured=measured,
         off_mm=tolerances.CORRIDOR_RADIUS_MM * (2.0 if request.param == "thick slices" else 1.0),
         sides=[(left, vertebra.left_radius, vertebra.axis(1.0)), (right, vertebra.right_radius, vertebra.axis(-1.0))],
     )
 
 
-def in_vertebra(vertebra: BoxVertebra, *points: Any) -> np.ndarray:
+def to_frame_of(vertebra: BoxVertebra, *points: Any) -> np.ndarray:
     """Points in mm along the axes of the vertebra, from its centre."""
     return (np.stack(points) - np.array(vertebra.centre)) @ vertebra.axes.T
 
 
 @pytest.mark.slow
-def test_the_cylinder_is_the_corridor(posed: Any) -> None:
-    for corridor, radius, (start, direction) in posed.sides:
+def test_a_corridor_has_the_radius_of_the_cylinder_of_its_pedicle(posed: Any) -> None:
+    for corridor, radius, _ in posed.sides:
         assert corridor.radius == pytest.approx(radius, abs=posed.off_mm)
-        back, tip = in_vertebra(posed.vertebra, corridor.back, corridor.tip)
-        cosine = (tip - back) @ direction / np.linalg.norm(tip - back)
-        assert np.degrees(np.arccos(min(1.0, cosine))) < tolerances.CORRIDOR_ANGLE_DEG
-        off = back - start
-        assert np.linalg.norm(off - (off @ direction) * direction) < 0.5  # mm beside the axis of the cylinder
 
 
 @pytest.mark.slow
-def test_the_frame_of_a_posed_vertebra_follows_its_axes(posed: Any) -> None:
-    cosines = (posed.found.frame.axes * posed.vertebra.axes).sum(axis=1)
+def test_a_corridor_runs_along_the_axis_of_the_cylinder(posed: Any) -> None:
+    for corridor, _, (start, direction) in posed.sides:
+        back, tip = to_frame_of(posed.vertebra, corridor.back, corridor.tip)
+        cosine = (tip - back) @ direction / np.linalg.norm(tip - back)
+        beside_axis = (back - start) - ((back - start) @ direction) * direction
+        assert np.degrees(np.arccos(min(1.0, cosine))) < tolerances.CORRIDOR_ANGLE_DEG
+        assert np.linalg.norm(beside_axis) < tolerances.CORRIDOR_PLACE_MM
+
+
+@pytest.mark.slow
+def test_the_frame_of_a_posed_vertebra_has_its_axes(posed: Any) -> None:
+    cosines = (posed.measured.frame.axes * posed.vertebra.axes).sum(axis=1)
     assert np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).max() < tolerances.CORRIDOR_FRAME_DEG
 
 
 @pytest.mark.slow
-def test_both_sides_of_a_posed_vertebra_have_a_corridor(posed: Any) -> None:
-    assert posed.found.warnings == ()
-    assert [(side.side, side.refused) for side in posed.found.corridors] == [("left", None), ("right", None)]
+def test_both_sides_of_a_posed_vertebra_have_a_corridor_without_a_warning(posed: Any) -> None:
+    assert posed.measured.warnings == ()
+    assert [(side.side, side.refused) for side in posed.measured.corridors] == [("left", None), ("right", None)]
 
 
 @pytest.mark.slow
 def test_a_corridor_runs_from_the_plate_past_the_canal_into_the_body(posed: Any) -> None:
+    behind_the_plate = PLATE_Y + PLATE_HALF[1]
+    within_the_body = BODY_HALF[1] - BODY_SHARE * (2.0 * BODY_HALF[1])  # from its back wall
     for corridor, _, _ in posed.sides:
-        entry, back, tip = in_vertebra(posed.vertebra, corridor.entry, corridor.back, corridor.tip)
-        assert entry[1] == pytest.approx(PLATE_Y + PLATE_HALF[1], abs=1.0)
-        assert back[1] == pytest.approx(CANAL_Y, abs=1.0)
-        assert tip[1] == pytest.approx(BODY_HALF[1] - 2.0 * BODY_SHARE * BODY_HALF[1], abs=1.0)
-        assert corridor.length == pytest.approx(np.linalg.norm(corridor.tip - corridor.entry), abs=1e-6)
+        entry, back, tip = to_frame_of(posed.vertebra, corridor.entry, corridor.back, corridor.tip)
+        assert entry[1] == pytest.approx(behind_the_plate, abs=tolerances.CORRIDOR_END_MM)
+        assert back[1] == pytest.approx(CANAL_Y, abs=tolerances.CORRIDOR_END_MM)
+        assert tip[1] == pytest.approx(within_the_body, abs=tolerances.CORRIDOR_END_MM)
 
 
 @pytest.mark.slow
-def test_the_medial_angle_of_a_corridor_is_that_of_the_cylinder(posed: Any) -> None:
+def test_the_length_of_a_corridor_is_that_from_entry_to_tip(posed: Any) -> None:
     for corridor, _, _ in posed.sides:
-        assert abs(corridor.medial_deg - posed.vertebra.medial_deg) < tolerances.CORRIDOR_ANGLE_DEG
+        assert corridor.length == pytest.approx(np.linalg.norm(corridor.tip - corridor.entry))
+
+
+@pytest.mark.slow
+def test_the_medial_angle_of_a_corridor_is_that_of_the_cylinder_and_lies_in_its_range(posed: Any) -> None:
+    for corridor, _, _ in posed.sides:
         low, high = corridor.medial_range_deg
         assert low <= corridor.medial_deg <= high
+        assert corridor.medial_deg == pytest.approx(posed.vertebra.medial_deg, abs=tolerances.CORRIDOR_ANGLE_DEG)
 
 
 @pytest.mark.slow
-def test_a_corridor_keeps_its_radius_to_the_nearest_wall_and_the_canal(posed: Any) -> None:
-    for corridor, radius, _ in posed.sides:
+def test_the_nearest_wall_of_a_corridor_is_its_radius_away(posed: Any) -> None:
+    for corridor, _, _ in posed.sides:
         assert corridor.margins.keys() == {"medial", "lateral", "cranial", "caudal"}
         nearest = min(margin for margin in corridor.margins.values() if margin is not None)
-        assert nearest == pytest.approx(corridor.radius, abs=0.02)
+        assert nearest == pytest.approx(corridor.radius, abs=0.02)  # the step of the search for the widest line
+
+
+@pytest.mark.slow
+def test_the_canal_is_as_far_from_a_corridor_as_the_cylinder_is_wide(posed: Any) -> None:
+    for corridor, radius, _ in posed.sides:
         assert corridor.canal == pytest.approx(radius, abs=2.0 * posed.off_mm)
 
 
 @pytest.mark.slow
-def test_walls_of_a_corridor_are_placed_by_hu_without_bias(posed: Any) -> None:
+def test_walls_at_the_half_maximum_are_placed_by_hu_without_bias(posed: Any) -> None:
     for corridor, _, _ in posed.sides:
-        assert abs(corridor.bias.median_mm) <= 0.2
         assert corridor.by_hu_share > 0.95
+        assert abs(corridor.bias.median_mm) <= 0.2  # a quarter of a voxel
 
 
 @pytest.mark.release
-def test_angles_of_the_patient_follow_the_pose() -> None:
+def test_medial_angles_in_the_patient_differ_by_the_turn_of_the_vertebra() -> None:
+    """Its left points backwards: a line of the left side runs more to the left, and less towards the midline."""
     vertebra = BoxVertebra(rotation=turned(0.0, 0.0, 15.0))
     affine, shape = grid_around(vertebra)
-    found = measure_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3")
-    left, right = found.corridors
-    # its left points backwards: a line of the left side runs more to the left, and less towards the midline
-    turn = np.degrees(np.arctan2(vertebra.axes[0, 1], vertebra.axes[0, 0]))
-    assert left.medial_lps_deg - left.medial_deg == pytest.approx(-turn, abs=2.0)
-    assert right.medial_lps_deg - right.medial_deg == pytest.approx(turn, abs=2.0)
+    left, right = measure_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3").corridors
+    turn_deg = np.degrees(np.arctan2(vertebra.axes[0, 1], vertebra.axes[0, 0]))
+    assert left.medial_lps_deg - left.medial_deg == pytest.approx(-turn_deg, abs=tolerances.CORRIDOR_FRAME_DEG)
+    assert right.medial_lps_deg - right.medial_deg == pytest.approx(turn_deg, abs=tolerances.CORRIDOR_FRAME_DEG)
+
+
+@pytest.fixture(scope="module")
+def at_a_tenth_of_the_contrast() -> Any:
+    """The corridors of pedicles of 4 and 3 mm at 100 of 1000 HU, in voxels of 1 mm.
+
+    Partial volume reaches half a voxel to both sides: a tenth of the contrast lies 0.4 mm outside of the half.
+    """
+    vertebra = BoxVertebra()
+    affine, shape = grid_around(vertebra, spacing=(1.0, 1.0, 1.0))
+    return measure_corridors(*vertebra.scan(affine, shape), 3, 100.0, "L3").corridors
 
 
 @pytest.mark.release
-def test_a_level_farther_out_is_told() -> None:
-    """Partial volume reaches half a voxel to both sides: a tenth of the contrast lies 0.4 voxel outside of the half."""
-    vertebra = BoxVertebra()
-    affine, shape = grid_around(vertebra, spacing=(1.0, 1.0, 1.0))
-    found = measure_corridors(*vertebra.scan(affine, shape), 3, 100.0, "L3")
-    for corridor, radius in zip(found.corridors, (4.0, 3.0), strict=True):
+def test_corridors_at_a_lower_level_are_wider_by_the_way_to_it(at_a_tenth_of_the_contrast: Any) -> None:
+    for corridor, radius in zip(at_a_tenth_of_the_contrast, (4.0, 3.0), strict=True):
         assert corridor.radius == pytest.approx(radius + 0.4, abs=2.0 * tolerances.CORRIDOR_RADIUS_MM)
-        assert corridor.bias.median_mm == pytest.approx(0.4, abs=0.25)
+
+
+@pytest.mark.release
+def test_the_bias_of_a_lower_level_is_its_way_from_the_half_maximum(at_a_tenth_of_the_contrast: Any) -> None:
+    for corridor in at_a_tenth_of_the_contrast:
+        assert corridor.bias.median_mm == pytest.approx(0.4, abs=0.25)  # a quarter of a voxel
         assert corridor.bias.half_hu == pytest.approx(HALF_HU, abs=30.0)
 
 
 @pytest.mark.seconds
-def test_a_pedicle_below_two_voxels_is_refused() -> None:
+def test_a_pedicle_less_than_two_voxels_wide_has_no_corridor_and_the_wider_one_has() -> None:
     vertebra = BoxVertebra(left_radius=4.5, right_radius=2.0)
     affine, shape = grid_around(vertebra, spacing=(2.5, 2.5, 2.5))
     left, right = measure_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3").corridors
-    assert left.refused is None and left.radius == pytest.approx(4.5, abs=0.6)
-    assert right.radius is None and right.refused is not None
-    assert "not resolved" in right.refused
+    assert left.refused is None
+    assert left.radius == pytest.approx(4.5, abs=0.6)  # a quarter of a voxel
+    assert right.radius is None
+    assert "not resolved" in str(right.refused)
 
 
-def test_what_is_no_vertebra_is_refused() -> None:
+@pytest.fixture(scope="module")
+def without_an_arch() -> tuple[Volume, np.ndarray]:
+    """A scan and labels of a body without pedicles and plate."""
     vertebra = BoxVertebra(arch=False)
-    affine, shape = grid_around(vertebra)
-    volume, labels = vertebra.scan(affine, shape)
-    with refused(RefusedInputError, "label", "vertebra"):
-        measure_corridors(volume, labels, 3, HALF_HU, "liver")
-    with refused(RefusedInputError, "L9", "scan"):
-        measure_corridors(volume, labels, 9, HALF_HU, "L9")
-    with refused(RefusedInputError, "L3", 2000, 1000):
-        measure_corridors(volume, labels, 3, 2000.0, "L3")
+    return vertebra.scan(*grid_around(vertebra))
+
+
+@pytest.mark.parametrize(
+    ("number", "level_hu", "name", "facts"),
+    [
+        (3, HALF_HU, "liver", ("label", "vertebra")),
+        (9, HALF_HU, "L9", ("L9", "scan")),
+        (3, 2000.0, "L3", ("L3", 2000, 1000)),
+    ],
+    ids=["no vertebra by its name", "label not in the scan", "level above all bone"],
+)
+def test_corridors_of_a_label_that_is_no_vertebra_or_has_no_bone_are_refused(
+    without_an_arch: tuple[Volume, np.ndarray], number: int, level_hu: float, name: str, facts: tuple[str | int, ...]
+) -> None:
+    with refused(RefusedInputError, *facts):
+        measure_corridors(*without_an_arch, number, level_hu, name)
+
+
+def test_corridors_of_a_label_too_small_for_a_vertebra_are_refused(without_an_arch: tuple[Volume, np.ndarray]) -> None:
+    volume, labels = without_an_arch
     few = np.zeros_like(labels)
     few[20:30, 40:50, 40:50] = 3
-    volume = volume.with_voxels(np.where(few > 0, 900, 0).astype(np.int16))
     with refused(RefusedInputError, "volume", "vertebra", "L3"):
-        measure_corridors(volume, few, 3, HALF_HU, "L3")
+        measure_corridors(volume.with_voxels(np.where(few > 0, 900, 0).astype(np.int16)), few, 3, HALF_HU, "L3")
 
 
-@pytest.mark.seconds
-def test_a_cut_body_is_refused_and_a_cut_process_is_told() -> None:
+@pytest.fixture(scope="module")
+def whole_vertebra() -> tuple[Volume, np.ndarray, int, int]:
+    """A scan, its labels, and the first and last row of the vertebra, from front to back."""
     vertebra = BoxVertebra()
-    affine, (nk, nj, ni) = grid_around(vertebra)
-    volume, labels = vertebra.scan(affine, (nk, nj, ni))
-    marked = np.argwhere(labels == 3)
-    first, last = marked[:, 1].min(), marked[:, 1].max()
-    cut = slice(0, last - 3)  # through the plate behind the canal
-    shorter = type(volume)(volume.voxels[:, cut], affine)
-    found = measure_corridors(shorter, labels[:, cut], 3, HALF_HU, "L3")
-    assert found.warnings == ("L3 touches the end of the scan with its processes; body and pedicles are whole",)
-    assert found.corridors[0].radius == pytest.approx(4.0, abs=tolerances.CORRIDOR_RADIUS_MM)
-    front = affine.copy()
-    front[:3, 3] += affine[:3, 1] * (first + 4)
-    shorter = type(volume)(volume.voxels[:, first + 4 :], front)
-    with refused(RefusedInputError, "L3", "voxels"):
-        measure_corridors(shorter, labels[:, first + 4 :], 3, HALF_HU, "L3")
+    volume, labels = vertebra.scan(*grid_around(vertebra))
+    rows = np.argwhere(labels == 3)[:, 1]
+    return volume, labels, int(rows.min()), int(rows.max())
 
 
 @pytest.mark.seconds
-def test_distances_of_segments_are_those_of_their_nearest_points() -> None:
+def test_a_vertebra_whose_plate_the_scan_cuts_has_its_corridors_and_a_warning(
+    whole_vertebra: tuple[Volume, np.ndarray, int, int],
+) -> None:
+    volume, labels, _, last = whole_vertebra
+    through_the_plate = np.s_[:, : last - 3]
+    shorter = Volume(volume.voxels[through_the_plate], volume.affine)
+    measured = measure_corridors(shorter, labels[through_the_plate], 3, HALF_HU, "L3")
+    assert measured.warnings == ("L3 touches the end of the scan with its processes; body and pedicles are whole",)
+    assert measured.corridors[0].radius == pytest.approx(4.0, abs=tolerances.CORRIDOR_RADIUS_MM)
+
+
+@pytest.mark.seconds
+def test_corridors_of_a_vertebra_whose_body_the_scan_cuts_are_refused(
+    whole_vertebra: tuple[Volume, np.ndarray, int, int],
+) -> None:
+    volume, labels, first, _ = whole_vertebra
+    through_the_body = np.s_[:, first + 4 :]
+    affine = volume.affine.copy()
+    affine[:3, 3] += affine[:3, 1] * (first + 4)
+    with refused(RefusedInputError, "L3", "voxels"):
+        measure_corridors(Volume(volume.voxels[through_the_body], affine), labels[through_the_body], 3, HALF_HU, "L3")
+
+
+@pytest.mark.seconds
+def test_distances_of_segments_from_points_are_the_least_of_many_places_along_them() -> None:
     generator = np.random.default_rng(4)
     points = generator.uniform(-20.0, 20.0, (500, 3))
-    first, last = generator.uniform(-20.0, 20.0, (2, 40, 3))
-    share = np.linspace(0.0, 1.0, 4001)[:, None]
+    starts, ends = generator.uniform(-20.0, 20.0, (2, 40, 3))
+    share = np.linspace(0.0, 1.0, 4001)[:, None, None]
     expected = [
-        np.sqrt(((a + share[:, None] * (b - a) - points) ** 2).sum(axis=-1).min())
-        for a, b in zip(first, last, strict=True)
+        np.linalg.norm(start + share * (end - start) - points, axis=-1).min()
+        for start, end in zip(starts, ends, strict=True)
     ]
-    np.testing.assert_allclose(segment_distances(first, last, points), expected, atol=tolerances.SEGMENT_DISTANCE_MM)
-    assert np.isinf(segment_distances(first, last, np.zeros((0, 3)))).all()
-    # beyond the ends, beside the middle, and a segment without length
-    ends = (
-        np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]),
-        np.array([[10.0, 0, 0], [10.0, 0, 0], [3.0, 0, 0]]),
-    )
-    for point, wanted in (
-        ((13.0, 4.0, 0.0), (5.0, 5.0, np.hypot(10, 4))),
-        ((4.0, 0.0, 2.0), (2.0, 2.0, np.hypot(1, 2))),
-    ):
-        np.testing.assert_allclose(segment_distances(*ends, np.array([point])), wanted, atol=1e-5)
+    np.testing.assert_allclose(segment_distances(starts, ends, points), expected, atol=tolerances.SEGMENT_DISTANCE_MM)
 
 
-def test_the_radius_of_a_line_is_its_distance_from_all_points_of_the_surface() -> None:
+def test_distances_of_segments_from_no_points_are_infinite() -> None:
+    starts, ends = np.zeros((2, 3)), np.ones((2, 3))
+    assert segment_distances(starts, ends, np.zeros((0, 3))).tolist() == [np.inf, np.inf]
+
+
+@pytest.mark.parametrize(
+    ("point", "from_segment", "from_place"),
+    [((13.0, 4.0, 0.0), 5.0, np.hypot(10, 4)), ((4.0, 0.0, 2.0), 2.0, np.hypot(1, 2))],
+    ids=["beyond the end", "beside the middle"],
+)
+def test_distance_of_a_segment_and_of_one_without_length_is_that_of_its_nearest_point(
+    point: tuple[float, ...], from_segment: float, from_place: float
+) -> None:
+    """A segment along x from 0 to 10 mm, and one that begins and ends at x = 3 mm."""
+    starts, ends = np.array([[0.0, 0, 0], [3.0, 0, 0]]), np.array([[10.0, 0, 0], [3.0, 0, 0]])
+    distances = segment_distances(starts, ends, np.array([point]))
+    np.testing.assert_allclose(distances, [from_segment, from_place], atol=tolerances.SEGMENT_DISTANCE_MM)
+
+
+@pytest.fixture
+def judge_and_lines() -> tuple[LineJudge, np.ndarray, np.ndarray, np.ndarray]:
+    """A judge of lines in random points with a tunnel of 3 mm, 180 lines, their ends, and the points.
+
+    The first 60 lines lie near those that the judge knows, the others farther and farther away.
+    """
     generator = np.random.default_rng(5)
     surface = generator.uniform(-25.0, 25.0, (3000, 3))
     surface = surface[np.hypot(surface[:, 0], surface[:, 2]) > 3.0]
@@ -218,46 +292,75 @@ def test_the_radius_of_a_line_is_its_distance_from_all_points_of_the_surface() -
     known[:, 0] = (-0.5, 0.0, 0.5)
     judge = LineJudge.beside(known, 5.0, lambda points: points[:, 0], surface, span)
     lines = np.concatenate([generator.normal(0.0, spread, (60, 4)) for spread in (0.3, 1.0, 8.0)])
-    ends = line_points(lines, span)[:, [0, -1]].transpose(1, 0, 2)
-    radii = judge.radius(lines)
-    np.testing.assert_allclose(radii, segment_distances(*ends, surface), atol=1e-3)
-    beside = segment_distances(*ends, judge.walls)
+    return judge, lines, line_points(lines, span)[:, [0, -1]].transpose(1, 0, 2), surface
+
+
+def test_the_radius_of_a_line_is_its_distance_from_all_points_of_the_surface(
+    judge_and_lines: tuple[LineJudge, np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    judge, lines, (starts, ends), surface = judge_and_lines
+    expected = segment_distances(starts, ends, surface)
+    np.testing.assert_allclose(judge.radius(lines), expected, atol=tolerances.SEGMENT_DISTANCE_MM)
+
+
+def test_a_judge_keeps_less_than_a_quarter_of_the_surface_which_is_enough_for_lines_near_known_ones(
+    judge_and_lines: tuple[LineJudge, np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    judge, lines, (starts, ends), surface = judge_and_lines
+    too_large_by = segment_distances(starts, ends, judge.walls) - judge.radius(lines)
     assert len(judge.walls) < len(surface) / 4
-    assert (beside - radii > 0.1).any() and (np.abs(beside - radii)[:60] < 1e-3).all()
+    assert (np.abs(too_large_by[:60]) < tolerances.SEGMENT_DISTANCE_MM).all()
+    assert too_large_by[60:].max() > 0.1, "lines farther away need the whole surface"
 
 
 def test_of_two_lines_as_far_from_the_surface_the_deeper_scores_higher() -> None:
+    """Lines at x = -3 and 3 mm beside a surface of one point; the depth is 10 + x mm."""
     span = Span(1.0, 20.0, -20.0, 0.0)
     lines = np.array([[-3.0, 0.0, 0.0, 0.0], [3.0, 0.0, 0.0, 0.0]])
-    surface = np.array([[0.0, 0.0, 0.0]])
-    judge = LineJudge.beside(lines, 5.0, lambda points: 10.0 + points[:, 0], surface, span)
-    np.testing.assert_allclose(judge.radius(lines), 3.0, atol=1e-3)
+    judge = LineJudge.beside(lines, 5.0, lambda points: 10.0 + points[:, 0], np.zeros((1, 3)), span)
+    np.testing.assert_allclose(judge.radius(lines), [3.0, 3.0], atol=tolerances.SEGMENT_DISTANCE_MM)
     shallow, deep = judge.score(lines)
-    assert 3.0 < shallow < deep < 3.5
+    assert 3.0 < shallow < deep < 3.5  # the radius counts most
 
 
 @pytest.mark.parametrize(
     ("radius", "margin", "diameter"), [(3.5, 1.0, 5.0), (3.56, 1.0, 5.1), (0.9, 1.0, 0.0), (3.0, 0.0, 6.0)]
 )
-def test_the_largest_screw_keeps_the_margin(radius: float, margin: float, diameter: float) -> None:
+def test_the_largest_screw_keeps_the_margin_on_both_sides_in_whole_tenths_of_a_millimetre(
+    radius: float, margin: float, diameter: float
+) -> None:
     assert screw_diameter(radius, margin) == pytest.approx(diameter)
 
 
 @pytest.mark.release
-def test_corridors_of_a_label_by_name_are_the_same() -> None:
-    vertebra = BoxVertebra()
-    volume, labels = vertebra.scan(*grid_around(vertebra))
-    found = find_corridors(volume, LabelMap(labels, volume.affine, {3: "L3"}), "L3", HALF_HU)
-    wanted = measure_corridors(volume, labels, 3, HALF_HU, "L3")
-    assert [each.radius for each in found.corridors] == [each.radius for each in wanted.corridors]
-    assert found.name == "L3"
+def test_corridors_of_a_label_by_name_are_those_of_its_number(
+    whole_vertebra: tuple[Volume, np.ndarray, int, int],
+) -> None:
+    volume, labels, _, _ = whole_vertebra
+    by_name = find_corridors(volume, LabelMap(labels, volume.affine, {3: "L3"}), "L3", HALF_HU)
+    by_number = measure_corridors(volume, labels, 3, HALF_HU, "L3")
+    assert by_name.name == "L3"
+    assert [side.radius for side in by_name.corridors] == [side.radius for side in by_number.corridors]
+
+
+def test_corridors_of_a_name_that_the_labels_lack_are_refused(
+    whole_vertebra: tuple[Volume, np.ndarray, int, int],
+) -> None:
+    volume, labels, _, _ = whole_vertebra
     with refused(UsageError, "L4"):
         find_corridors(volume, LabelMap(labels, volume.affine, {3: "L3"}), "L4", HALF_HU)
 
 
-def test_the_canal_wall_ends_three_quarters_of_a_body_from_its_middle() -> None:
+@pytest.mark.parametrize(
+    ("solid_above_mm", "heights_of_wall"),
+    [(np.inf, [-30.0, -29.9, 0.0, 29.9, 30.0]), (29.95, [-30.0, -29.9, 0.0, 29.9])],
+    ids=["free canal", "bone before the wall above 29.95 mm"],
+)
+def test_the_canal_wall_ends_three_quarters_of_a_body_from_its_middle_and_where_bone_hides_it(
+    solid_above_mm: float, heights_of_wall: list[float]
+) -> None:
+    """A body 40 mm high, a straight canal along z, and points of the surface 5 mm beside it."""
     heights = np.array((-31.0, -30.0, -29.9, 0.0, 29.9, 30.0, 31.0))
-    wall = np.stack((np.full(7, 5.0), np.zeros(7), heights), axis=1)
     frame = SimpleNamespace(
         body_height=40.0,
         to_frame=lambda points: points,
@@ -265,25 +368,29 @@ def test_the_canal_wall_ends_three_quarters_of_a_body_from_its_middle() -> None:
         canal_at=lambda z: np.stack((np.zeros_like(z), np.zeros_like(z), z), axis=1),
     )
     bone = SimpleNamespace(
-        surface=wall, lattice=SimpleNamespace(step=0.5), is_solid=lambda points: np.zeros(len(points), bool)
+        surface=np.stack((np.full(7, 5.0), np.zeros(7), heights), axis=1),
+        lattice=SimpleNamespace(step=0.5),
+        is_solid=lambda points: points[:, 2] > solid_above_mm,
     )
-    assert heights[canal_wall(bone, frame)].tolist() == [-30.0, -29.9, 0.0, 29.9, 30.0]
-    bone.is_solid = lambda points: points[:, 2] > 29.95  # what stands before the wall hides it
-    assert heights[canal_wall(bone, frame)].tolist() == [-30.0, -29.9, 0.0, 29.9]
+    assert heights[canal_wall(bone, frame)].tolist() == heights_of_wall
 
 
-def test_the_nearest_wall_lies_beside_the_line_or_beyond_its_ends() -> None:
-    surface = np.array([(5.0, 3.0, 0.0), (-4.0, 0.0, 0.0), (14.0, 3.0, 0.0), (5.0, 0.0, 40.0)])
-    by_hu, steps, frame = (
-        np.array((True, False, False, True)),
-        np.diag((0.5, 1.5, 2.0)),
-        SimpleNamespace(axes=np.eye(3)),
-    )
+@pytest.mark.parametrize(
+    ("left_out", "radius", "distance_mm", "in_voxels", "by_hu_share"),
+    [(0, 3.0, 3.0, 6.0 / 1.5, 0.5), (1, 4.0, 4.0, 8.0 / 0.5, 0.0), (2, 5.0, 5.0, None, None)],
+    ids=["beside the line", "before its start", "beyond its end"],
+)
+def test_the_nearest_wall_lies_beside_the_line_or_beyond_its_ends(
+    left_out: int, radius: float, distance_mm: float, in_voxels: float | None, by_hu_share: float | None
+) -> None:
+    """A line along x from 0 to 10 mm; points 3 mm beside it, 4 mm before its start, 5 mm beyond its end, far away.
 
-    def walls(begin: int, radius: float) -> tuple[float, float, float]:
-        bone = SimpleNamespace(steps=steps, by_hu=by_hu[begin:])
-        return _walls(bone, frame, surface[begin:], np.zeros(3), np.array((10.0, 0.0, 0.0)), radius)
-
-    assert walls(0, 3.0) == pytest.approx((3.0, 6.0 / 1.5, 0.5))
-    assert walls(1, 4.0) == pytest.approx((4.0, 8.0 / 0.5, 0.0))
-    assert walls(2, 5.0)[0] == pytest.approx(5.0)
+    The nearest is left out first, then the next.  The diameter is said in voxels along the way to the nearest.
+    """
+    surface = np.array([(5.0, 3.0, 0.0), (-4.0, 0.0, 0.0), (14.0, 3.0, 0.0), (5.0, 0.0, 40.0)])[left_out:]
+    by_hu = np.array((True, False, False, True))[left_out:]
+    bone, frame = SimpleNamespace(steps=np.diag((0.5, 1.5, 2.0)), by_hu=by_hu), SimpleNamespace(axes=np.eye(3))
+    measured = _walls(bone, frame, surface, np.zeros(3), np.array((10.0, 0.0, 0.0)), radius)  # type: ignore[arg-type]
+    assert measured[0] == pytest.approx(distance_mm)
+    if in_voxels is not None:
+        assert measured[1:] == pytest.approx((in_voxels, by_hu_share))

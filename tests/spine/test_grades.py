@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from box_vertebra import HALF_HU, BoxVertebra, grid_around, turned
+from box_vertebra import BODY_HALF, HALF_HU, BoxVertebra, grid_around, turned
 from variants import daily
 
 from clrecon.errors import UsageError
 from clrecon.spine.frame import VertebraFrame, _basis, _look_through, find_frame
-from clrecon.spine.measures import Screw, grade_breach, grade_screw
+from clrecon.spine.measures import Screw, ScrewGrade, grade_breach, grade_screw
 from clrecon.spine.solid_bone import SolidBone, fill_vertebra
 
 RADIUS = 4.0
@@ -18,95 +18,149 @@ OFFSETS = {"medial": (-1.0, 0.0), "lateral": (1.0, 0.0), "cranial": (0.0, 1.0), 
 
 
 @pytest.fixture(scope="module")
-def placed() -> tuple[SolidBone, VertebraFrame]:
+def bone_and_frame() -> tuple[SolidBone, VertebraFrame]:
     affine, shape = grid_around(VERTEBRA)
     volume, labels = VERTEBRA.scan(affine, shape)
     bone = fill_vertebra(volume, labels, 3, HALF_HU, "L3")
     return bone, find_frame(bone, "L3")
 
 
-def put(side: float, outward: float, up: float, diameter: float, front: float = -5.0) -> Screw:
-    """A screw along a pedicle's axis, shifted outward and up, from behind the plate to y = `front`."""
+def place_screw(side: float, outward: float, up: float, diameter: float, front: float = -5.0) -> Screw:
+    """A screw along a pedicle's axis, shifted outward and up, from behind the plate to y = `front`; lengths in mm."""
     start, _ = VERTEBRA.axis(side)
     x, z = start[0] + side * outward, start[2] + up
     ends = np.array([(x, 48.0, z), (x, front, z)]) @ VERTEBRA.axes + np.array(VERTEBRA.centre)
     return Screw(ends[0], ends[1], diameter)
 
 
-@pytest.mark.seconds
-@pytest.mark.parametrize("side", daily(1, [1.0, -1.0]))
-@pytest.mark.parametrize("direction", OFFSETS)
-def test_the_breach_is_what_lies_outside(placed: tuple[SolidBone, VertebraFrame], side: float, direction: str) -> None:
+BREACH_MM = 0.25
+"""Tolerance: the lattice of the solid bone has steps of half a millimetre; measured 0.16."""
+
+
+@pytest.fixture(params=[(2.5, 6.0), (4.0, 5.0)], ids=["1.5 mm", "2.5 mm"])
+def breaching(
+    request: pytest.FixtureRequest, bone_and_frame: tuple[SolidBone, VertebraFrame], side: float, direction: str
+) -> tuple[ScrewGrade, float]:
+    """The grade of a screw shifted towards a direction, and by how much of it leaves the pedicle of 4 mm, in mm."""
+    shift, diameter = request.param
     outward, up = OFFSETS[direction]
-    for shift, diameter in ((2.5, 6.0), (4.0, 5.0)):
-        grade = grade_screw(*placed, put(side, shift * outward, shift * up, diameter), "L3")
-        breach = shift + diameter / 2.0 - RADIUS
-        assert grade.side == ("left" if side > 0.0 else "right")
-        assert grade.direction == direction
-        assert grade.breach_mm == pytest.approx(breach, abs=0.25)
-        assert grade.grade == grade_breach(breach)
-        assert grade.margins_mm[direction] == pytest.approx(-breach, abs=0.25)
-        if direction != "lateral":  # the body is 21 mm wide there, and ends too
-            assert grade.front_mm == 0.0
+    grade = grade_screw(*bone_and_frame, place_screw(side, shift * outward, shift * up, diameter), "L3")
+    return grade, shift + diameter / 2.0 - RADIUS
 
 
-def test_a_screw_in_the_middle_has_no_breach(placed: tuple[SolidBone, VertebraFrame]) -> None:
-    grade = grade_screw(*placed, put(1.0, 0.0, 0.0, 5.0), "L3")
+on_each_side = pytest.mark.parametrize("side", daily(1, [1.0, -1.0]))
+
+
+@pytest.mark.seconds
+@on_each_side
+@pytest.mark.parametrize("direction", OFFSETS)
+def test_the_breach_of_a_screw_is_what_lies_outside_of_the_pedicle(
+    breaching: tuple[ScrewGrade, float], direction: str
+) -> None:
+    grade, breach_mm = breaching
+    assert grade.direction == direction
+    assert grade.breach_mm == pytest.approx(breach_mm, abs=BREACH_MM)
+    assert grade.margins_mm[direction] == pytest.approx(-breach_mm, abs=BREACH_MM)
+    assert grade.grade == grade_breach(breach_mm)
+
+
+@pytest.mark.seconds
+@on_each_side
+@pytest.mark.parametrize("direction", ["medial"])
+def test_a_screw_has_the_side_of_its_pedicle(breaching: tuple[ScrewGrade, float], side: float) -> None:
+    assert breaching[0].side == ("left" if side > 0.0 else "right")
+
+
+@pytest.mark.seconds
+@on_each_side
+@pytest.mark.parametrize("direction", ["medial", "cranial", "caudal"])
+def test_a_screw_whose_tip_lies_in_the_body_does_not_stand_out_in_front(breaching: tuple[ScrewGrade, float]) -> None:
+    assert breaching[0].front_mm == 0.0
+
+
+def test_a_screw_in_the_middle_of_a_pedicle_has_grade_a_without_a_breach(
+    bone_and_frame: tuple[SolidBone, VertebraFrame],
+) -> None:
+    grade = grade_screw(*bone_and_frame, place_screw(1.0, 0.0, 0.0, 5.0), "L3")
     assert (grade.grade, grade.breach_mm, grade.direction) == ("A", 0.0, None)
     assert set(grade.breaches_mm.values()) == {0.0}
-    assert grade.margins_mm["medial"] == pytest.approx(RADIUS - 2.5, abs=0.2)
+    assert grade.margins_mm["medial"] == pytest.approx(RADIUS - 5.0 / 2, abs=BREACH_MM)
 
 
-def test_a_screw_through_the_canal_is_the_worst(placed: tuple[SolidBone, VertebraFrame]) -> None:
-    grade = grade_screw(*placed, put(1.0, -12.0, 0.0, 6.0), "L3")
+def test_a_screw_through_the_canal_has_grade_e(bone_and_frame: tuple[SolidBone, VertebraFrame]) -> None:
+    grade = grade_screw(*bone_and_frame, place_screw(1.0, -12.0, 0.0, 6.0), "L3")
     assert (grade.grade, grade.direction) == ("E", "medial")
     assert grade.breach_mm > 6.0
 
 
-def test_a_tip_beyond_the_body_is_told_apart(placed: tuple[SolidBone, VertebraFrame]) -> None:
-    grade = grade_screw(*placed, put(-1.0, 0.0, 0.0, 5.0, front=-20.0), "L3")
+def test_a_tip_beyond_the_front_of_the_body_is_measured_and_changes_no_grade(
+    bone_and_frame: tuple[SolidBone, VertebraFrame],
+) -> None:
+    """The body ends at y = -15 mm."""
+    grade = grade_screw(*bone_and_frame, place_screw(-1.0, 0.0, 0.0, 5.0, front=-20.0), "L3")
     assert grade.grade == "A"
-    assert grade.front_mm == pytest.approx(5.0, abs=0.3)
+    assert grade.front_mm == pytest.approx(20.0 - BODY_HALF[1], abs=BREACH_MM)
 
 
 @pytest.mark.parametrize(
     ("breach", "grade"),
     [(0.0, "A"), (0.1, "B"), (1.99, "B"), (2.0, "C"), (3.99, "C"), (4.0, "D"), (5.99, "D"), (6.0, "E"), (40.0, "E")],
 )
-def test_the_grades_end_where_they_should(breach: float, grade: str) -> None:
+def test_grades_change_at_0_2_4_and_6_mm_of_breach(breach: float, grade: str) -> None:
     assert grade_breach(breach) == grade
 
 
-def test_screws_that_cannot_be_graded_are_refused(placed: tuple[SolidBone, VertebraFrame]) -> None:
-    there = put(1.0, 0.0, 0.0, 5.0)
+SCREW = place_screw(1.0, 0.0, 0.0, 5.0)
+
+
+@pytest.mark.parametrize("up_mm", [0.0, -40.0, 40.0], ids=["in the pedicle", "below", "above"])
+def test_a_screw_that_runs_from_front_to_back_is_refused_at_any_height(
+    bone_and_frame: tuple[SolidBone, VertebraFrame], up_mm: float
+) -> None:
+    shift = np.array((0.0, 0.0, up_mm))
     with pytest.raises(UsageError, match="screw runs from front to back in L3"):
-        grade_screw(*placed, Screw(there.tip, there.entry, 5.0), "L3")
-    for up in (-40.0, 40.0):  # the way along the vertebra's height does not matter
-        shift = np.array((0.0, 0.0, up))
-        with pytest.raises(UsageError, match="screw runs from front to back in L3"):
-            grade_screw(*placed, Screw(there.tip + shift, there.entry + shift, 5.0), "L3")
-        with pytest.raises(UsageError, match="screw lies"):
-            grade_screw(*placed, Screw(there.entry + 5 * shift, there.tip + 5 * shift, 5.0), "L3")
+        grade_screw(*bone_and_frame, Screw(SCREW.tip + shift, SCREW.entry + shift, 5.0), "L3")
+
+
+@pytest.mark.parametrize("shift", [(0, 0, -200.0), (0, 0, 200.0), (300.0, 300.0, 300.0)], ids=["below", "above", "far"])
+def test_a_screw_beside_the_vertebra_is_refused_with_its_distance(
+    bone_and_frame: tuple[SolidBone, VertebraFrame], shift: tuple[float, ...]
+) -> None:
     with pytest.raises(UsageError, match=r"screw lies \d+ mm or more from L3"):
-        grade_screw(*placed, Screw(there.entry + 300.0, there.tip + 300.0, 5.0), "L3")
+        grade_screw(*bone_and_frame, Screw(SCREW.entry + shift, SCREW.tip + shift, 5.0), "L3")
+
+
+def test_a_screw_whose_tip_lies_behind_the_body_is_refused(bone_and_frame: tuple[SolidBone, VertebraFrame]) -> None:
     with pytest.raises(UsageError, match="the tip of screw lies behind the body of L3"):
-        grade_screw(*placed, put(1.0, 0.0, 0.0, 5.0, front=30.0), "L3")
-    for entry, diameter, said in (
+        grade_screw(*bone_and_frame, place_screw(1.0, 0.0, 0.0, 5.0, front=30.0), "L3")
+
+
+@pytest.mark.parametrize(
+    ("entry", "diameter", "words"),
+    [
         ((0.0, 0.0, np.nan), 5.0, "needs finite numbers"),
-        (there.tip, 5.0, "0 mm long"),
-        (there.entry, 0.0, "0 mm thick"),
-        (there.entry, 40.0, "40 mm thick"),
-    ):
-        with pytest.raises(UsageError, match=said):
-            Screw(np.array(entry), there.tip, diameter)
+        (SCREW.tip, 5.0, "0 mm long"),
+        (SCREW.entry, 0.0, "0 mm thick"),
+        (SCREW.entry, 40.0, "40 mm thick"),
+    ],
+    ids=["entry of NaN", "no length", "no thickness", "too thick"],
+)
+def test_a_screw_without_length_or_of_an_impossible_thickness_is_refused(
+    entry: np.ndarray, diameter: float, words: str
+) -> None:
+    with pytest.raises(UsageError, match=words):
+        Screw(np.array(entry), SCREW.tip, diameter)
 
 
-def test_a_tube_is_looked_through_along_its_axis() -> None:
-    """A wall of 1.5 mm round a hole of 12 mm that leans between the directions that are tried first."""
+def test_the_axis_and_hole_of_a_tube_are_found_between_the_directions_that_are_tried_first() -> None:
+    """A wall of 1.5 mm around a hole of 12 mm radius that leans by 3.3 and -11 degrees; pixels are 1 mm."""
     basis = _basis(3.3, -11.0)
     around = np.linspace(0.0, 2.0 * np.pi, 110, endpoint=False)
     radius, angle, height = np.meshgrid(np.arange(12.0, 13.6, 0.5), around, np.arange(-20.0, 20.5))
     tube = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1).reshape(-1, 3)
-    found, axes, centre = _look_through(tube @ basis)
+
+    hole_mm, axes, centre = _look_through(tube @ basis)
+
     assert np.degrees(np.arccos(axes[2] @ basis[2])) < 0.3
-    assert found == pytest.approx(11.0, abs=0.5) and np.abs(centre).max() < 0.5
+    assert hole_mm == pytest.approx(12.0 - 1.0, abs=0.5)  # the wall fills the pixels at its rim
+    assert np.abs(centre).max() < 0.5

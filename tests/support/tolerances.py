@@ -292,6 +292,10 @@ CORRIDOR_RADIUS_MM = 0.15
 """Corridors of a cylinder with partial volume: a trilinear surface of 0.8 to 1 mm voxels, and the last step of the
 search."""
 
+CORRIDOR_PLACE_MM = 0.5
+CORRIDOR_END_MM = 1.0
+"""The line of a corridor lies within half a voxel beside the axis of its cylinder, and ends within one."""
+
 CORRIDOR_FRAME_DEG = 2.5
 CORRIDOR_ANGLE_DEG = 4.0
 """A line of 0.1 mm less radius may turn by some degrees within a short cylinder."""
