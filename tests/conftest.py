@@ -28,6 +28,7 @@ CLRECON_REQUIRE_TESTS=1
 from __future__ import annotations
 
 import gc
+import json
 import os
 import signal
 import tempfile
@@ -230,6 +231,25 @@ def own_remarks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
     if "device" in request.fixturenames:
         device = request.getfixturevalue("device")
         monkeypatch.setattr(device, "_remarks", list(getattr(device, "_remarks", ())), raising=False)
+
+
+@pytest.fixture(autouse=True)
+def reports_keep_their_schemas(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Each report that a test makes is held against its JSON Schema in docs/schemas."""
+    from clrecon.jobs import run
+
+    to_json, faults = run.to_json, []
+
+    def to_checked_json(value: Any, indent: int | None = 2) -> str:
+        from report_schemas import find_faults
+
+        text = to_json(value, indent)
+        faults.extend(find_faults(json.loads(text)))
+        return text
+
+    monkeypatch.setattr(run, "to_json", to_checked_json)
+    yield
+    assert faults == []
 
 
 @pytest.fixture

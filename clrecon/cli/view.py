@@ -12,6 +12,7 @@ from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.options import space_option
 from clrecon.jobs.view import ViewSettings
+from clrecon.system.records import name_schema
 from clrecon.system.text import format_volume
 
 _EPILOG = """\
@@ -129,7 +130,7 @@ def _show_window(options: argparse.Namespace, console: Console) -> int:
             f"{error}; without --window this is shown in a browser, --html page.html writes a page, and clrecon render"
             " draws pictures"
         ) from error
-    console.result({"warnings": warnings})
+    console.result(name_schema("view", {"warnings": warnings}))
     return 0
 
 
@@ -148,7 +149,8 @@ def _serve(options: argparse.Namespace, settings: ViewSettings, console: Console
 
     def ready(server: Any, view: Any, warnings: list[str]) -> None:
         device = view.painter.device.label
-        console.result({"address": server.address, "port": server.port, "device": device, "warnings": warnings})
+        facts = {"address": server.address, "port": server.port, "device": device, "warnings": warnings}
+        console.result(name_schema("view", facts))
         for warning in warnings:
             console.warn(warning)
         console.say(f"device   {printable(device)}")

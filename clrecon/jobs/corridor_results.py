@@ -37,6 +37,8 @@ KNOWN_CORTEX_BIAS = (
 class CorridorReport(ScanReport):
     """The report of the corridor job; docs/contract.md explains its entries."""
 
+    SCHEMA = "corridor"
+
     notice: str
     level_bias: str
     surface: str

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from clrecon.errors import DeviceError
+from clrecon.system.records import name_schema
 
 
 def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError | None]:
@@ -25,14 +26,17 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
         warnings = device.warnings
     except DeviceError as error:
         problem = error
-    survey = {
-        "platforms": list_platforms(),
-        "devices": [
-            {**device.describe(), "fault": remembered_fault(device), "chosen": device.index == chosen}
-            for device in devices
-        ],
-        "chosen": chosen,
-        "reason": reason,
-        "warnings": list(warnings),
-    }
+    survey = name_schema(
+        "devices",
+        {
+            "platforms": list_platforms(),
+            "devices": [
+                {**device.describe(), "fault": remembered_fault(device), "chosen": device.index == chosen}
+                for device in devices
+            ],
+            "chosen": chosen,
+            "reason": reason,
+            "warnings": list(warnings),
+        },
+    )
     return survey, problem

@@ -40,6 +40,8 @@ _LEAST_RANGE_MM = 1e-3
 class DistanceReport(JobReport):
     """Report of `measure_meshes`; docs/contract.md explains its entries."""
 
+    SCHEMA = "distance"
+
     a: Mapping[str, Any]
     b: Mapping[str, Any]
     hausdorff_mm: float

@@ -22,6 +22,8 @@ from clrecon.system.progress import Progress
 class ExportReport(ScanReport):
     """Report of `export_volume`; its ``volume`` is the one that was written."""
 
+    SCHEMA = "export"
+
     output: Mapping[str, Any]
     device: str | None
 

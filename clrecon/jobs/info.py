@@ -9,6 +9,7 @@ from clrecon.errors import ClreconError, NoDicomError, RefusedInputError
 from clrecon.jobs.settings import InfoSettings
 from clrecon.reading import list_selected
 from clrecon.system.progress import Progress
+from clrecon.system.records import name_schema
 
 
 class InputListing(NamedTuple):
@@ -34,7 +35,8 @@ def describe_input(
     settings = settings or InfoSettings()
     selected = list_selected(source, settings, pixels=settings.pixels, progress=progress)
     entries = [entry.as_dict() for entry in selected.series]
-    listing: dict[str, Any] = {"series": entries, "chosen": selected.chosen, "certificate": selected.certificate}
+    listing = {"series": entries, "chosen": selected.chosen, "certificate": selected.certificate}
+    listing = name_schema("info", listing)
     notes = list(selected.warnings)
     problem = selected.refusal
     refused = None

@@ -78,6 +78,8 @@ log = get_logger(__name__)
 class InsideReport(RunReport):
     """The report of the job; docs/contract.md explains its entries."""
 
+    SCHEMA = "inside"
+
     vertebrae: list[dict[str, Any]]
     close_mm: float
     space: str

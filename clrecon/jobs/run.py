@@ -22,7 +22,7 @@ from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.paths import extension_of, keep_existing
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.records import Record
+from clrecon.system.records import Record, name_schema
 from clrecon.version import package_version
 
 if TYPE_CHECKING:
@@ -154,7 +154,8 @@ def stage_report(path: str | Path, report: Mapping[str, Any]) -> AbstractContext
 
 def error_as_dict(error: ClreconError) -> dict[str, Any]:
     """Return the JSON form of an error: ``{"error": {"kind", "exit_code", "message"}}``."""
-    return {"error": {"kind": type(error).__name__, "exit_code": error.exit_code, "message": str(error)}}
+    facts = {"kind": type(error).__name__, "exit_code": error.exit_code, "message": str(error)}
+    return name_schema("error", {"error": facts})
 
 
 def platform_name() -> str:
@@ -188,6 +189,8 @@ def peak_memory_bytes(status: Path = _OWN_STATUS) -> int | None:
 class JobReport(Record):
     """The entries that all reports share.  In JSON they come last: first those that a report declares itself."""
 
+    SCHEMA: ClassVar[str] = ""
+    """Name of its JSON Schema in docs/schemas; empty: it has none."""
     _LAST: ClassVar[tuple[str, ...]] = ("version", "platform", "warnings", "volume", "seconds", "peak_memory_bytes")
     """Names of the entries at the end, in their order."""
     PARTS: ClassVar[tuple[str, ...]] = ()
@@ -201,9 +204,9 @@ class JobReport(Record):
 
     def _entries(self) -> dict[str, Any]:
         entries = super()._entries()
-        return {name: entries[name] for name in entries if name not in self._LAST} | {
-            name: entries[name] for name in self._LAST if name in entries
-        }
+        first = {name: entries[name] for name in entries if name not in self._LAST}
+        entries = first | {name: entries[name] for name in self._LAST if name in entries}
+        return name_schema(self.SCHEMA, entries) if self.SCHEMA else entries
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -29,6 +29,8 @@ class StatsReport(ScanReport):
     resampled: The map was brought to the grid of the scan, and its voxels do not all coincide with those of the scan.
     """
 
+    SCHEMA = "stats"
+
     labels: list[LabelFigures]
     percentiles: list[float]
     resampled: bool

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 class VertebraeReport(ScanReport):
     """Report of `make_vertebrae`; docs/contract.md explains its entries."""
 
+    SCHEMA = "vertebrae"
+
     vertebrae: list[Vertebra]
     low_confidence: int
     written: int

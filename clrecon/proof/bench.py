@@ -19,6 +19,7 @@ from clrecon.proof.timing import alternate, free_cores, processor_name, spread, 
 from clrecon.system.files import check_writable
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.records import name_schema
 from clrecon.version import package_version
 
 if TYPE_CHECKING:
@@ -120,22 +121,25 @@ def run_bench(
     volume, suggested = _get_volume(source, series, progress)
     watch.lap("make" if source is None else "read")
     hu = suggested if iso_value is None else iso_value
-    result = {
-        "input": {
-            "kind": "phantom" if source is None else "series",
-            "shape_ijk": volume.shape_ijk,
-            "spacing_mm": volume.spacing,
-            "voxels": volume.voxels.size,
-            "bytes": volume.voxels.nbytes,
+    result = name_schema(
+        "bench",
+        {
+            "input": {
+                "kind": "phantom" if source is None else "series",
+                "shape_ijk": volume.shape_ijk,
+                "spacing_mm": volume.spacing,
+                "voxels": volume.voxels.size,
+                "bytes": volume.voxels.nbytes,
+            },
+            "iso_value_hu": hu,
+            "runs": runs,
+            "processor": processor_name(),
+            "cores": usable_cores(),
+            "free_cores": round(free_cores(), 2),
+            "platform": platform_name(),
+            "version": package_version(),
         },
-        "iso_value_hu": hu,
-        "runs": runs,
-        "processor": processor_name(),
-        "cores": usable_cores(),
-        "free_cores": round(free_cores(), 2),
-        "platform": platform_name(),
-        "version": package_version(),
-    }
+    )
     measured = _measure_devices(devices, volume, hu, runs, progress)
     result["iso_level_hu"] = next(entry["iso_level_hu"] for entry in measured if entry["error"] is None)
     result["devices"] = measured

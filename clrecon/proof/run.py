@@ -28,6 +28,7 @@ from clrecon.proof.surface import decimation_checks, surface_checks
 from clrecon.proof.timing import usable_cores
 from clrecon.proof.volumes import volume_checks
 from clrecon.system.progress import Progress, device_seconds, ignore_progress
+from clrecon.system.records import name_schema
 
 CHECKS: tuple[Check, ...] = (
     *volume_checks.PRIMITIVE_CHECKS,
@@ -274,7 +275,8 @@ def run_device_selftest(
     rank = {check.name: n for n, check in enumerate(checks)}
     results.sort(key=lambda result: rank.get(result["operator"], len(rank)))  # processes run side by side
     passed = bool(results) and all(result["passed"] for result in results)
-    return {"device": device.describe(), "passed": passed, "operators": results, "warnings": device.warnings}
+    facts = {"device": device.describe(), "passed": passed, "operators": results, "warnings": device.warnings}
+    return name_schema("selftest", facts)
 
 
 if __name__ == "__main__":

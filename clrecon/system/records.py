@@ -46,6 +46,11 @@ class Record(dict[str, Any]):
     clear = pop = popitem = setdefault = update = _refuse  # type: ignore[assignment]
 
 
+def name_schema(schema: str, entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a JSON object with its schema, docs/schemas/`schema`.json, as the first."""
+    return {"schema": f"clrecon-{schema}-1", **entries}
+
+
 def _fields_of(record: Record) -> dict[str, Any]:
     return {field.name: getattr(record, field.name) for field in fields(record)}  # type: ignore[arg-type]
 

@@ -92,7 +92,8 @@ def test_debug_shows_the_traceback_and_keeps_the_code(capsys: pytest.CaptureFixt
 def test_an_error_is_an_object_with_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert guard(raising(DeviceError("no driver")), Console(as_json=True), debug=False) == 5
     captured = capsys.readouterr()
-    assert json.loads(captured.out) == {"error": {"kind": "DeviceError", "exit_code": 5, "message": "no driver"}}
+    error = json.loads(captured.out)["error"]
+    assert error == {"kind": "DeviceError", "exit_code": 5, "message": "no driver"}
     assert captured.err == "clrecon: error: no driver\n"
 
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from contract_tables import CONTRACT, names_in
 from ct_files import PATIENT, SPACING, write_series
 from dicom_series import Plan, set_values
 from dicom_series import write_series as write_plan
+from house import ROOT
 from printed_text import Printer
 
 from clrecon import list_series
@@ -62,15 +62,6 @@ def entry(number: int, **changes: Any) -> dict[str, Any]:
 
 def listing(*entries: dict[str, Any], chosen: int | None = 1) -> dict[str, Any]:
     return {"series": list(entries), "chosen": chosen, "certificate": None}
-
-
-def test_json_of_info_has_the_names_of_the_contract(ct: Path, printed: Printer) -> None:
-    assert main(["info", str(ct), "--json"]) == 0
-    facts = printed().report()
-    (series,) = facts["series"]
-    assert set(facts) == names_in("clrecon info") == {"series", "chosen", "certificate"}
-    assert set(series) == names_in("clrecon info", "For each series:")
-    assert set(facts["certificate"]) == names_in("The certificate")
 
 
 def test_json_of_info_states_the_stack_of_its_folder(ct: Path, printed: Printer) -> None:
@@ -340,7 +331,7 @@ def test_certificate_of_uneven_slices_describes_each_gap(tmp_path: Path) -> None
 def test_commands_of_the_certificate_page_print_what_it_shows(
     tmp_path: Path, device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = (CONTRACT.parent / "certificate.md").read_text(encoding="utf-8").split("## An example")[1]
+    page = (ROOT / "docs" / "certificate.md").read_text(encoding="utf-8").split("## An example")[1]
     blocks = [block.splitlines() for block in re.findall(r"(?:^    .*\n)+", page, re.MULTILINE)]
     commands, words, comments = ([line[4:] for line in block] for block in blocks)
     monkeypatch.chdir(tmp_path)
@@ -389,14 +380,6 @@ def test_report_and_file_of_a_mesh_tell_the_failed_gate_of_the_scan(
     assert [gate["name"] for gate in report["volume"]["gates"] if gate["ok"] is False] == ["lossless"]
     assert any("lossy compression" in text for text in report["warnings"])
     assert b"comment CERTIFICATE gate_failed lossless: slices with lossy" in (tmp_path / "a.ply").read_bytes()
-
-
-def test_report_of_a_mesh_has_the_names_of_the_contract(lossy_mesh: list[str], printed: Printer) -> None:
-    assert main([*lossy_mesh, "--json"]) == 0
-    report = printed().report()
-    assert set(report["volume"]) == names_in("The certificate") - {"warnings"}
-    assert set(report) == names_in("clrecon mesh") - {"preset_reason"}
-    assert set(report["meshes"][0]) - set(report) <= names_in("clrecon mesh", "For each mesh in `meshes`")
 
 
 def test_mesh_strict_takes_slices_that_are_placed_one_by_one(tmp_path: Path, device: Any, printed: Printer) -> None:

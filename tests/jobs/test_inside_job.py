@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from contract_tables import names_in
 from printed_text import Printer
 from refusals import refused
 
@@ -69,15 +68,6 @@ def inside_of_l1(device: Any, spine: Path, tmp_path_factory: pytest.TempPathFact
 def test_inside_writes_a_mesh_of_each_part_and_the_report(inside_of_l1: InsideRun) -> None:
     meshes = {"in_dense.stl", "in_trabecular.stl", "in_canal.stl", "in_solid.stl"}
     assert {path.name for path in inside_of_l1.folder.iterdir()} == {*meshes, "r.json"}
-
-
-@pytest.mark.release
-def test_report_of_inside_has_the_names_of_the_contract(inside_of_l1: InsideRun) -> None:
-    section = "clrecon inside INPUT -o OUT --report FILE"
-    (vertebra,) = inside_of_l1.report["vertebrae"]
-
-    assert set(inside_of_l1.report) == names_in(section, "The report") | {"warnings", "volume"}
-    assert set(vertebra) == names_in(section, "Each object of `vertebrae`")
 
 
 @pytest.mark.release

@@ -74,9 +74,8 @@ def test_report_in_a_missing_folder_is_refused(tmp_path: Path) -> None:
 
 
 def test_error_as_json_has_kind_exit_code_and_message() -> None:
-    assert error_as_dict(RefusedInputError("two slices at 3 mm")) == {
-        "error": {"kind": "RefusedInputError", "exit_code": 4, "message": "two slices at 3 mm"}
-    }
+    error = error_as_dict(RefusedInputError("two slices at 3 mm"))["error"]
+    assert error == {"kind": "RefusedInputError", "exit_code": 4, "message": "two slices at 3 mm"}
 
 
 def test_computer_is_described_by_its_python_and_not_by_its_name() -> None:

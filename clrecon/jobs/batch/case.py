@@ -44,6 +44,8 @@ class CaseReport(JobReport):
     mesh, labels, volume: Entries of the reports of both jobs; None where a case failed, or has no label map.
     """
 
+    SCHEMA = "case"
+
     _LAST = ("device", "driver", *JobReport._LAST)
 
     case: str
@@ -58,7 +60,7 @@ class CaseReport(JobReport):
     volume: Mapping[str, Any] | None = None
 
 
-_SHARED = {"device", "driver", "memory_allowed_bytes", *JobReport._LAST}
+_SHARED = {"schema", "device", "driver", "memory_allowed_bytes", *JobReport._LAST}
 
 
 class Answer(NamedTuple):

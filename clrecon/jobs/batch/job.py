@@ -30,6 +30,8 @@ class BatchReport(JobReport):
     statuses: How many of the cases have each status, see docs/batch.md.
     """
 
+    SCHEMA = "batch"
+
     cases: int
     made: int
     kept: int

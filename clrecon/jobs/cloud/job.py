@@ -182,6 +182,8 @@ class CloudFiles:
 class CloudReport(RunReport):
     """The report of a cloud job; docs/contract.md explains its entries."""
 
+    SCHEMA = "cloud"
+
     PARTS = ("device", "read", "mask", "steps", "surface", "write")
 
     kind: str | None

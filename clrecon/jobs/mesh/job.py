@@ -83,6 +83,8 @@ class MeshReport(RunReport):
     `manifold` are true if they are for each mesh, and entries that differ or cannot be summed are None.
     """
 
+    SCHEMA = "mesh"
+
     _LEFT_OUT = ("preset_reason",)
     _LAST = (
         *("device", "driver", "memory_allowed_bytes", "slabs", "device_bytes", "version", "platform", "warnings"),

@@ -138,6 +138,8 @@ def warn_of_picture(picture: Rendering, known: Collection[str] = ()) -> list[str
 class PictureReport(RunReport):
     """Report of a render job; docs/contract.md explains its entries, None where a mode has no such thing."""
 
+    SCHEMA = "render"
+
     PARTS = ("device", "read", "mask", "render", "turntable", "write")
 
     mode: str

@@ -186,6 +186,8 @@ def _name_and_color(shown: Sequence[_ShownInput], settings: ViewSettings) -> lis
 class ViewReport(JobReport):
     """Report of `write_view`; docs/contract.md explains its entries."""
 
+    SCHEMA = "page"
+
     _LAST = ("device", *JobReport._LAST)
 
     inputs: list[dict[str, Any]]
