@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.coordinates import rounding_step
 from clrecon.mesh.base import BaseMesh, give_values
-from clrecon.mesh.connectivity import label_components
+from clrecon.mesh.connectivity import label_components, number_used
 from clrecon.mesh.quality import measure_components
 from clrecon.mesh.triangles import find_nearest_triangle
 from clrecon.system.arguments import as_numbers, name_parameter
@@ -93,14 +93,9 @@ def select_components(
 
 
 def keep_triangles(mesh: Own, is_kept: NDArray[np.bool_]) -> Own:
-    triangles = mesh.triangles[is_kept]
-    used = np.zeros(mesh.vertex_count, dtype=bool)
-    used[triangles] = True
-    number = np.cumsum(used, dtype=np.int64) - 1
+    used, triangles = number_used(mesh.triangles[is_kept], mesh.vertex_count)
     normals = None if mesh.normals is None else mesh.normals[used]
-    reduced = type(mesh)(
-        mesh.vertices[used], number[triangles].astype(np.uint32), normals, dict(mesh.report), trusted=True
-    )
+    reduced = type(mesh)(mesh.vertices[used], triangles, normals, dict(mesh.report), trusted=True)
     return give_values(mesh, reduced, used, is_kept)
 
 

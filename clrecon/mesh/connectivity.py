@@ -79,6 +79,14 @@ def find_used(numbers: IntArray, size: int) -> IntArray:
     return np.flatnonzero(used)
 
 
+def number_used(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[IntArray, NDArray[np.uint32]]:
+    """Return the vertices that some triangles use, ascending, and the triangles with the places of these as corners."""
+    used = find_used(triangles.reshape(-1), vertex_count)
+    places = np.empty(vertex_count, np.uint32)
+    places[used] = np.arange(len(used), dtype=np.uint32)
+    return used, places[triangles]
+
+
 class Fans:
     """The triangles around each vertex: of vertex v `rows` from ``begin[v]`` to ``begin[v + 1]``, in their order."""
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 
-from clrecon.mesh.connectivity import Fans, find_used
+from clrecon.mesh.connectivity import Fans, find_used, number_used
 
 pytestmark = pytest.mark.unit
 
@@ -62,3 +62,9 @@ def test_vertices_that_triangles_use_are_listed_once_and_in_order():
 
 def test_no_triangles_use_no_vertices():
     assert find_used(np.zeros((0, 3), np.uint32), 7).tolist() == []
+
+
+def test_triangles_are_numbered_by_the_vertices_that_they_use():
+    used, corners = number_used(np.array([[5, 0, 3], [3, 0, 1]], np.uint32), 7)
+    assert used.tolist() == [0, 1, 3, 5]
+    assert corners.tolist() == [[3, 0, 2], [2, 0, 1]]

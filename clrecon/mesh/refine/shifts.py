@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import as_stored, find_coincident
-from clrecon.mesh.connectivity import Fans, find_edges, find_used, label_components, order_by_number
+from clrecon.mesh.connectivity import Fans, find_edges, find_used, label_components, number_used, order_by_number
 from clrecon.mesh.intersections import (
     FindCrossings,
     find_beside,
@@ -216,8 +216,7 @@ class _Near:
         pieces = find_boxes_beside(self._low, self._high, *boxes)
         rows = np.sort(self._order[np.repeat(pieces, _IN_A_BLOCK)[: len(changed)]])
         rows = rows[find_beside(moved, self._triangles[rows], changed[rows])]
-        used, local = np.unique(self._triangles[rows], return_inverse=True)
-        corners = local.reshape(-1, 3).astype(np.uint32)
+        used, corners = number_used(self._triangles[rows], len(moved))
         return used[_find_spoilt(moved[used], corners, changed[rows], find_crossings)]
 
 

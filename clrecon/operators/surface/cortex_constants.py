@@ -104,31 +104,24 @@ def measure_constants(
         noise = measure_noise(volume).hu
     except UsageError:  # a specimen in air
         noise = None
-    return _measure_walls(sampler, volume, values, noise)
+    fit = _fit_with(sampler, values, noise)
+    return _measure_errors(fit, values, *_search(fit, values, volume), noise)
 
 
-def _measure_walls(
-    sampler: ProfileSampler, volume: Volume, values: Float32Array, noise: float | None
-) -> CortexConstants:
-    dense, usual = np.percentile(values[: CENTRE + 2].max(axis=0), (95.0, _DENSE_PERCENTILE)).tolist()
-    step = volume.spacing
-    within, across = (min(0.7 * edge**0.5, edge) for edge in (math.sqrt(step[0] * step[1]), step[2]))
-    trial = _Trial(within, max(across, 0.45 * step[2]), min(1.03 * dense, 1.2 * usual))
-    known = noise if noise is not None else SILENT_HU
-    profiles = sampler.take(values)
+def _fit_with(sampler: ProfileSampler, values: Float32Array, noise: float | None) -> _Fit:
+    profiles, known = sampler.take(values), SILENT_HU if noise is None else noise
+    return functools.cache(lambda trial, spread: profiles.fit(*trial, known, cortex_spread=spread))
 
-    @functools.cache
-    def fit(trial: _Trial, cortex_spread: float) -> WallFits:
-        return profiles.fit(*trial, known, cortex_spread=cortex_spread)
 
-    trial, thick = _search(fit, values, trial)
+def _measure_errors(fit: _Fit, values: Float32Array, trial: _Trial, thick: int, noise: float | None) -> CortexConstants:
+    """Return the constants of a trial with their uncertainties."""
     parts = []
-    for part in (slice(first, None, 4) for first in range(4)):
+    for part in [slice(first, None, 4) for first in range(4)]:
         blurs = _search_blurs(fit, part, trial, SEARCH_STEPS[1:])[:2]
         parts.append((*blurs, _measure_cortex(fit, values, part, trial)[0]))
     of_cortex = _LEAST_CORTEX_ERROR if thick >= _FEWEST_THICK else _THIN_CORTEX_ERROR
-    least = np.array([_LEAST_BLUR_ERROR, _LEAST_BLUR_ERROR, of_cortex])
-    errors = np.maximum(np.std(parts, axis=0) / 2.0, least * np.mean(parts, axis=0)).tolist()
+    least = np.array([_LEAST_BLUR_ERROR, _LEAST_BLUR_ERROR, of_cortex]) * np.mean(parts, axis=0)
+    errors = np.maximum(np.std(parts, axis=0) / 2.0, least).tolist()
     residual = float(np.sqrt(np.mean(np.square(fit(trial, CORTEX_SPREAD).residual_hu))))
     return CortexConstants(*trial, errors[0], errors[1], errors[2], noise, residual, values.shape[1], thick)
 
@@ -156,10 +149,11 @@ def find_groups(
             continue
         if not _may_differ(sampler, values, scan):
             continue
-        part_constants = _measure_walls(sampler, volume, values, scan.noise_hu)
-        is_bone = part_constants.thick >= _FEWEST_THICK and part_constants.cortex_hu >= COMPACT_HU
-        if is_bone and abs(part_constants.cortex_hu - scan.cortex_hu) > _DIFFERENT * scan.cortex_hu:
-            groups.append((rows, part_constants))
+        fit = _fit_with(sampler, values, scan.noise_hu)
+        trial, thick = _search(fit, values, volume)
+        is_bone = thick >= _FEWEST_THICK and trial.cortex_hu >= COMPACT_HU
+        if is_bone and abs(trial.cortex_hu - scan.cortex_hu) > _DIFFERENT * scan.cortex_hu:
+            groups.append((rows, _measure_errors(fit, values, trial, thick, scan.noise_hu)))
             left[rows] = False
     return [(np.flatnonzero(left), scan), *groups]
 
@@ -198,8 +192,12 @@ def _may_differ(sampler: ProfileSampler, values: Float32Array, scan: CortexConst
     return thick < _FEWEST_THICK or abs(shown - scan.cortex_hu) > _ALIKE * scan.cortex_hu
 
 
-def _search(fit: _Fit, values: Float32Array, start: _Trial) -> tuple[_Trial, int]:
+def _search(fit: _Fit, values: Float32Array, volume: Volume) -> tuple[_Trial, int]:
     """Return the constants that describe the profiles, and how many walls are thick enough to show their HU."""
+    dense, usual = np.percentile(values[: CENTRE + 2].max(axis=0), (95.0, _DENSE_PERCENTILE)).tolist()
+    x_mm, y_mm, z_mm = volume.spacing
+    within, across = (min(0.7 * edge**0.5, edge) for edge in (math.sqrt(x_mm * y_mm), z_mm))
+    start = _Trial(within, max(across, 0.45 * z_mm), min(1.03 * dense, 1.2 * usual))
     best = _search_blurs(fit, slice(None), start, SEARCH_STEPS)
     cortex_hu, thick = _measure_cortex(fit, values, slice(None), best)
     shown = thick >= _THICK_SHARE * values.shape[1]

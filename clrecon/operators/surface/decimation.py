@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from clrecon import opencl as ocl
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import rounding_of_bounds
-from clrecon.mesh.connectivity import Fans
+from clrecon.mesh.connectivity import Fans, number_used
 from clrecon.mesh.intersections import find_boxes, find_self_intersections
 from clrecon.mesh.refine import decimation
 from clrecon.mesh.refine.deviation import WITNESSES, SurfaceBounds
@@ -155,7 +155,8 @@ def find_crossings(
     if ocl.describe_shortage(ocl.memory_limits(device, memory), plan.needs()):
         return find_self_intersections(vertices, triangles, changed, steps=steps)
     marked = np.flatnonzero(mark_crossings(device, plan, steps=steps))
-    return marked[find_self_intersections(vertices, triangles[marked], None if changed is None else changed[marked])]
+    used, corners = number_used(triangles[marked], len(vertices))
+    return marked[find_self_intersections(vertices[used], corners, None if changed is None else changed[marked])]
 
 
 _PART = 1 << 20
