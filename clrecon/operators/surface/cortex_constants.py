@@ -119,9 +119,8 @@ def _measure_errors(fit: _Fit, values: Float32Array, trial: _Trial, thick: int, 
     for part in [slice(first, None, 4) for first in range(4)]:
         blurs = _search_blurs(fit, part, trial, SEARCH_STEPS[1:])[:2]
         parts.append((*blurs, _measure_cortex(fit, values, part, trial)[0]))
-    of_cortex = _LEAST_CORTEX_ERROR if thick >= _FEWEST_THICK else _THIN_CORTEX_ERROR
-    least = np.array([_LEAST_BLUR_ERROR, _LEAST_BLUR_ERROR, of_cortex]) * np.mean(parts, axis=0)
-    errors = np.maximum(np.std(parts, axis=0) / 2.0, least).tolist()
+    least = np.array([_LEAST_BLUR_ERROR] * 2 + [_LEAST_CORTEX_ERROR if thick >= _FEWEST_THICK else _THIN_CORTEX_ERROR])
+    errors = np.maximum(np.std(parts, axis=0) / 2.0, least * np.mean(parts, axis=0)).tolist()
     residual = float(np.sqrt(np.mean(np.square(fit(trial, CORTEX_SPREAD).residual_hu))))
     return CortexConstants(*trial, errors[0], errors[1], errors[2], noise, residual, values.shape[1], thick)
 
