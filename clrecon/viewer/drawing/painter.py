@@ -19,7 +19,6 @@ from clrecon.operators.rays.scene import ScenePictures
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.rendering import Rendering
-from clrecon.rendering.looks.colors import ColorScale
 from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.pictures.styles import CurveCut, Projection, SlicesInSpace, Style, VolumeLook
 from clrecon.rendering.views.camera import Camera
@@ -29,17 +28,16 @@ from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress
 from clrecon.system.text import unknown_name
 from clrecon.viewer.drawing.looks import LEAST_OPACITY, LabelledLook, Looks, to_voxels
-from clrecon.viewer.drawing.shown_meshes import (
+from clrecon.viewer.drawing.shown_meshes import divide_surface, make_meshes
+from clrecon.viewer.drawing.stage import (
     COARSE_TRIANGLES,
+    FittedScan,
+    Stage,
     coarsen_mesh,
-    divide_fit,
-    find_fit_scale,
-    fit_scans,
-    fitted_scans,
-    make_meshes,
     shows_fits,
+    take_strips,
+    warm_kernels,
 )
-from clrecon.viewer.drawing.stage import Stage, take_strips, warm_kernels
 from clrecon.viewer.model.changes import pixel_camera, shift_camera, zoom_camera
 from clrecon.viewer.model.objects import (
     ShownCloud,
@@ -195,18 +193,6 @@ class Painter(Stage):
     def _number_at(self, resident: DeviceVolume, labelled: LabelledLook, point: tuple[float, float, float]) -> int:
         return number_at(resident.volume, self.labels_on(resident, labelled), point)
 
-    def fit_scans(self, state: ViewState, progress: Progress | None = None) -> list[str]:
-        """Fit the surfaces of the scans that are shown to the bone, once; return lines about them."""
-        return fit_scans(self, state, progress)
-
-    def has_fits(self, state: ViewState) -> bool:
-        """True where the surfaces of the scans that are shown are fitted to the bone."""
-        return None not in fitted_scans(self, state)
-
-    def find_fit_scale(self, state: ViewState) -> ColorScale | None:
-        """Return the scale of the colours of fitted surfaces, None where they show no numbers."""
-        return find_fit_scale(self, state)
-
     def mesh_of_shown(self, state: ViewState, progress: Progress | None = None) -> list[Mesh]:
         """Make the meshes of what is shown, see `clrecon.viewer.drawing.saving`."""
         return make_meshes(self, state, progress)
@@ -242,8 +228,9 @@ class Painter(Stage):
             whole = state.whole(shown.number)
             if whole is None or not whole.visible:
                 continue
-            if isinstance(shown, ShownScan) and shows_fits(state) and self.has_fits(state):
-                drawn += self._drawn_fit(shown, state, whole, sharp, opaque or not sharp)
+            fit = self.find_fits(state)[shown.number] if isinstance(shown, ShownScan) and shows_fits(state) else None
+            if isinstance(shown, ShownScan) and fit is not None:
+                drawn += self._drawn_fit(shown, fit, state, whole, sharp=sharp, opaque=opaque or not sharp)
             elif isinstance(shown, ShownScan):
                 if mode.kind == "labels" or (drawn and not mode.joins):
                     continue
@@ -262,15 +249,15 @@ class Painter(Stage):
         return drawn
 
     def _drawn_fit(
-        self, scan: ShownScan, state: ViewState, whole: ShownPart, sharp: bool, opaque: bool
+        self, scan: ShownScan, fit: FittedScan, state: ViewState, whole: ShownPart, *, sharp: bool, opaque: bool
     ) -> list[_Drawn]:
         """Return the pieces of a surface fitted to the bone; they are the same objects as long as their looks are."""
-        labelled, scale = self.labelled(scan.number, state), find_fit_scale(self, state)
+        labelled, scale = self.labelled(scan.number, state), self.find_fit_scale(state)
         looks = None if labelled is None else (id(labelled.labels), labelled.parts)
-        key = (state.iso_value, state.table, state.color_by, scale, state.clip, whole, looks, opaque)
+        key = (id(fit), state.color_by, scale, state.clip, whole, looks, opaque)
         if self._fitted.get((scan.number, sharp), ((), []))[0] != key:
             pieces = []
-            for mesh, part in divide_fit(self, scan, state, whole, coarse=not sharp):
+            for mesh, part in divide_surface(self, scan, state, whole, fit.sharp if sharp else fit.coarse):
                 opacity = 1.0 if opaque else part.opacity * (1.0 if part is whole else whole.opacity)
                 colors = None if scale is None else scale.colors(mesh.values[f"{state.color_by}_mm"])
                 color = None if colors is not None else part.color or whole.color

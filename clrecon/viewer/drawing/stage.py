@@ -17,12 +17,14 @@ from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.labels.resample import ResampledLabels
 from clrecon.mesh import Mesh
+from clrecon.mesh.triangles import vertex_normals
 from clrecon.opencl import Device
 from clrecon.operators.rays.point_pictures import PointPictures
 from clrecon.operators.rays.scene import ScenePictures
 from clrecon.operators.rays.volume_renderer import VolumeRenderer
 from clrecon.operators.resident.device_volume import DeviceVolume, DeviceWorker
-from clrecon.operators.surface.extract import SurfaceExtractor
+from clrecon.operators.surface.cortex_mesh import fit_cortex
+from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import ColorScale
 from clrecon.rendering.pictures.object_looks import MeshLook
@@ -30,11 +32,12 @@ from clrecon.rendering.pictures.styles import PlaneCut, Style, SurfaceLook, Volu
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.text import format_hu
 from clrecon.viewer.drawing.looks import LabelledLook
 from clrecon.viewer.model.changes import shift_camera
-from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownObject, ShownScan
-from clrecon.viewer.model.parts import FoundParts, find_clusters
-from clrecon.viewer.model.state import Point, ViewState
+from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownObject, ShownScan, find_modes
+from clrecon.viewer.model.parts import FoundParts, find_clusters, find_inner
+from clrecon.viewer.model.state import FIT_COLORS, Point, ViewState
 
 _STRIP_PIXELS = 1 << 18
 """Pixels of a strip: some 50 ms of volume rendering on two cores."""
@@ -126,18 +129,52 @@ def _warm_scan(volume: Volume, device: Device, tell: Progress) -> None:
             renderer.render(style, camera=camera, size=PICTURE, background="transparent")
 
 
+_TRIANGLES_A_CELL = 2.0
+"""Triangles that a surface leaves in each cell that it passes through."""
+
+
+def coarsen_mesh(mesh: Mesh, triangles: int) -> tuple[Mesh, NDArray[np.int64]]:
+    """Return a coarse mesh for pictures: vertices that share a cell become one (Rossignac and Borrel 1993).
+
+    With the row of the first of them for each vertex, whose values it has.
+    """
+    vertices = mesh.vertices.astype(np.float64)
+    cell = float(np.sqrt(_TRIANGLES_A_CELL * mesh.area / triangles))
+    low = vertices.min(axis=0)
+    counts = np.floor(np.ptp(vertices, axis=0) / max(cell, 1e-9)).astype(np.int64) + 1
+    i, j, k = np.floor((vertices - low) / max(cell, 1e-9)).astype(np.int64).T
+    _, first, group = np.unique((k * counts[1] + j) * counts[0] + i, return_index=True, return_inverse=True)
+    group = group.ravel()
+    sizes = np.bincount(group)
+    places = np.stack([np.bincount(group, vertices[:, axis]) / sizes for axis in range(3)], axis=1)
+    joined = group[mesh.triangles]
+    a, b, c = joined.T
+    triangles_left = joined[(a != b) & (b != c) & (c != a)]
+    points = places.astype(mesh.vertices.dtype)
+    used = triangles_left.astype(np.uint32)
+    coarse = Mesh(points, used, vertex_normals(points, used), dict(mesh.report), trusted=True)
+    coarse.values = {name: values[first] for name, values in mesh.values.items()}
+    return coarse, first
+
+
+COARSE_TRIANGLES, _MOST_FITS = 200_000, 4
+"""Meshes with more triangles are drawn by a coarse one while anything moves; fitted surfaces that are kept."""
+
+
 @dataclass(frozen=True, eq=False)
 class FittedScan:
-    """The surface of a scan fitted to the bone, and a coarse one; `scales` of the colours of its numbers, by name.
+    """The surface of a scan fitted to the bone, and a coarse one, with `find_inner` of each.
 
-    inner, coarse_inner: Of each vertex the voxel by which its part is known, a place in memory; -1: none.
+    scales: Of the colours of its numbers, by their names.
     """
 
-    mesh: Mesh
-    inner: NDArray[np.int64]
-    coarse: Mesh
-    coarse_inner: NDArray[np.int64]
+    sharp: tuple[Mesh, NDArray[np.int64]]
+    coarse: tuple[Mesh, NDArray[np.int64]]
     scales: Mapping[str, ColorScale]
+
+
+def shows_fits(state: ViewState) -> bool:
+    return state.fitted and find_modes()[state.mode].kind == "surface"
 
 
 MOST_FOUND, _MOST_FOUND_BYTES = 6, 1 << 29
@@ -159,7 +196,7 @@ class Stage(DeviceWorker):
         self._takers: dict[int, VolumeRenderer | PointPictures] = {}
         self._found: OrderedDict[tuple[int, float, bool], FoundParts] = OrderedDict()
         self._blank: dict[int, LabelledLook] = {}
-        self.fits: OrderedDict[tuple[int, float, bool], FittedScan] = OrderedDict()
+        self._fits: OrderedDict[tuple[int, float, bool], FittedScan] = OrderedDict()
 
     def close(self) -> None:
         with self.lock:
@@ -221,6 +258,68 @@ class Stage(DeviceWorker):
     def knows_table(self) -> bool:
         """True once `remove_table` is done."""
         return all(each.number in self._bare for each in self.objects if isinstance(each, ShownScan))
+
+    # Surfaces fitted to the bone
+
+    def find_fits(self, state: ViewState) -> dict[int, FittedScan | None]:
+        """Return the fitted surface of each scan that is shown by its number, None where it is still to be made."""
+        return {key[0]: self._fits.get(key) for key in self._fit_keys(state)}
+
+    def has_fits(self, state: ViewState) -> bool:
+        return None not in self.find_fits(state).values()
+
+    def find_fit_scale(self, state: ViewState) -> ColorScale | None:
+        """Return the scale of the colours of fitted surfaces, the longest of theirs; None where they show no number."""
+        fits = [fit for fit in self.find_fits(state).values() if fit is not None]
+        if state.color_by is None or not fits or not shows_fits(state):
+            return None
+        return max((fit.scales[state.color_by] for fit in fits), key=lambda scale: scale.limit)
+
+    def fit_scans(self, state: ViewState, progress: Progress | None = None) -> list[str]:
+        """Fit the surfaces of the scans that are shown, where that was not done before; return lines about them."""
+        lines = []
+        for key in self._fit_keys(state):
+            if key not in self._fits:
+                fit = self._fit_scan(self.resident(key[0], state).volume, key[0], state.iso_value, progress)
+                with self.lock:
+                    self._fits[key] = fit
+            with self.lock:
+                self._fits.move_to_end(key)
+                cortex = self._fits[key].sharp[0].report["cortex"]
+                while len(self._fits) > max(_MOST_FITS, len(self.objects)):
+                    self._fits.popitem(last=False)
+            share, walls = 100.0 * cortex["fitted"] / cortex["vertices"], cortex["thickness_mm"]["p50"]
+            lines.append(
+                f"{self._name(key[0])}: {share:.0f} % of the vertices lie on the bone, error"
+                f" {cortex['error_mm']['p50']:.2f} mm, walls {walls:.1f} mm (median)"
+            )
+        return lines
+
+    def _fit_scan(self, volume: Volume, number: int, iso_value: float, progress: Progress | None) -> FittedScan:
+        """Fit a surface with a copy of the scan on the device: pictures are taken meanwhile."""
+        with DeviceVolume(volume, device=self.device, memory=self.memory) as resident:
+            try:
+                level = extract_isosurface(resident, iso_value, progress=progress)
+                mesh = fit_cortex(level, resident, progress=progress)
+            except NoSurfaceError as error:
+                subject = f"{self._name(number)} at {format_hu(iso_value)} HU"
+                raise NoSurfaceError(f"{subject} is not fitted to the bone: {error}") from error
+        coarse, inner = mesh, find_inner(level.vertices, volume, iso_value)
+        rows: NDArray[Any] | slice = slice(None)
+        if mesh.triangle_count > COARSE_TRIANGLES:
+            coarse, rows = coarsen_mesh(mesh, COARSE_TRIANGLES)
+        scales: dict[str, ColorScale] = {
+            name: MeshLook(color_by=name).find_scale(mesh.values)[0] for name in FIT_COLORS
+        }
+        return FittedScan((mesh, inner), (coarse, inner[rows]), scales)
+
+    def _fit_keys(self, state: ViewState) -> list[tuple[int, float, bool]]:
+        scans = [each for each in self.objects if isinstance(each, ShownScan)]
+        shown = [scan for scan in scans if (whole := state.whole(scan.number)) is not None and whole.visible]
+        return [(scan.number, state.iso_value, state.table) for scan in shown]
+
+    def _name(self, number: int) -> str:
+        return next(each.name for each in self.objects if each.number == number)
 
     # What is drawn
 

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.labels import LabelMap
 from clrecon.labels.resample import ResampledLabels
 from clrecon.opencl import download
@@ -73,6 +74,31 @@ def number_at(volume: Volume, numbers: NDArray[Any], point: Point) -> int:
         return 0
     i, j, k = ijk
     return int(numbers[k, j, i])
+
+
+def number_vertices(inner: NDArray[np.int64], voxels: NDArray) -> NDArray:
+    """Return the number of the voxel that `find_inner` found for each vertex, 0 for none."""
+    return np.where(inner >= 0, voxels.reshape(-1)[inner], 0)
+
+
+def find_inner(vertices: NDArray[np.floating], volume: Volume, iso_value: float) -> NDArray[np.int64]:
+    """Return the place in memory of the voxel that is inside at the edge of each vertex of an iso surface, or -1."""
+    level = choose_iso_rule(volume, iso_value).iso_level
+    ijk = volume.lps_to_ijk(vertices)
+    near = np.rint(ijk)
+    axis = np.argmax(np.abs(ijk - near), axis=1)
+    rows = np.arange(len(ijk))
+    ends = np.stack([near, near]).astype(np.int64)
+    ends[0, rows, axis] = np.floor(ijk[rows, axis])
+    ends[1, rows, axis] = ends[0, rows, axis] + 1
+    last = np.array(volume.shape_ijk) - 1
+    inner = np.full(len(ijk), -1, np.int64)
+    for end in ends:
+        within = ((end >= 0) & (end <= last)).all(axis=1)
+        i, j, k = np.clip(end, 0, last).T
+        inside = within & (volume.voxels[k, j, i] > level)
+        inner[inside] = np.ravel_multi_index((k, j, i), volume.voxels.shape)[inside]
+    return inner
 
 
 @dataclass(frozen=True, eq=False)

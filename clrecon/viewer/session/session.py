@@ -29,7 +29,7 @@ from clrecon.system.progress import CLOSE_S, Job, Worker
 from clrecon.system.text import format_volume
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.drawing.saving import check_target, save_shown
-from clrecon.viewer.drawing.shown_meshes import shows_fits
+from clrecon.viewer.drawing.stage import shows_fits
 from clrecon.viewer.model.changes import pan_camera, zoom_camera
 from clrecon.viewer.model.measures import seen_pieces
 from clrecon.viewer.model.model import ViewModel

@@ -286,7 +286,7 @@ def test_kernels_are_built_for_every_kind_of_voxels(device):
 
 @pytest.mark.unit
 def test_a_coarse_mesh_is_near_the_fine_one():
-    from clrecon.viewer.drawing.shown_meshes import coarsen_mesh
+    from clrecon.viewer.drawing.stage import coarsen_mesh
 
     fine = scenes.make_mesh(radius=20.0)
     coarse, first = coarsen_mesh(fine, 500)

@@ -73,12 +73,12 @@ def test_the_fit_is_announced_and_lies_on_the_bone(session) -> None:
 def test_a_surface_is_fitted_once_for_each_iso_value(session) -> None:
     view = session(hollow_ball(thickness=3.0))
     do(view, "set_fitted", shown=True)
-    (first,) = view.painter.fits.values()
+    first = view.painter.find_fits(view.model.state)
     key = view.picture_key("scene")
     assert do(view, "set_iso", hu=350)["fitted"] is True
-    assert len(view.painter.fits) == 2 and view.picture_key("scene") != key
+    assert view.picture_key("scene") != key and view.painter.find_fits(view.model.state) != first
     do(view, "set_iso", hu=scenes.ISO)
-    assert view.picture_key("scene") == key and first in view.painter.fits.values() and len(view.painter.fits) == 2
+    assert view.picture_key("scene") == key and view.painter.find_fits(view.model.state) == first
 
 
 def test_a_scan_without_walls_of_bone_stays_at_the_iso_value(session) -> None:
