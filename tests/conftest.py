@@ -321,6 +321,17 @@ def view_server(device: Any) -> Iterator[Any]:
         yield running
 
 
+@pytest.fixture
+def cloud_command(device: Any, tmp_path: Path) -> Any:
+    """A function that runs ``clrecon cloud`` with options into an empty folder and returns the exit code."""
+    from clrecon.cli.main import main
+
+    def run(source: Path, *options: str, output: str = "out.ply") -> int:
+        return main(["cloud", str(source), "-o", str(tmp_path / output), "--device", str(device.index), *options])
+
+    return run
+
+
 @pytest.fixture(scope="session", autouse=True)
 def interruptible() -> Iterator[None]:
     """Ctrl-C as in a terminal, here and in processes of tests: what a shell starts in the background ignores it."""

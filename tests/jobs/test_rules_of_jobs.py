@@ -31,34 +31,48 @@ pytestmark = pytest.mark.unit
 
 
 @pytest.mark.parametrize("kind", ["nii", "nii.gz", "dcm", "NII.GZ"])
-def test_a_picture_lies_beside_its_label_map(kind: str) -> None:
+def test_picture_of_vertebrae_is_named_after_the_label_map_beside_it(kind: str) -> None:
     assert picture_beside(f"a.b/spine.{kind}") == "a.b/spine.png"
 
 
-def test_bands_are_what_surfaces_enclose() -> None:
+def test_band_of_a_surface_holds_the_hu_that_it_encloses() -> None:
     surfaces = [Surface("", 200.0), Surface("", -400.0, below=True), Surface("", (100.0, 300.0)), Surface("", None)]
     assert make._bands_of(surfaces) == [(200.0, math.inf), (-math.inf, -400.0), (100.0, 300.0)]
 
 
+@pytest.fixture
+def raw_volume() -> Any:
+    """A volume whose values are not known to be HU."""
+    return SimpleNamespace(report={"gates": [{"name": "hu_known", "ok": False, "text": "no slope"}]})
+
+
 @pytest.mark.parametrize(
-    ("given", "is_refused"),
+    "given", [{"purpose": "print"}, {"purpose": "print", "half_way": "auto"}], ids=["preset of bone", "auto"]
+)
+def test_print_of_values_that_are_not_known_to_be_hu_is_refused_without_a_level(
+    given: dict[str, Any], raw_volume: Any
+) -> None:
+    with refused(RefusedInputError, "hu_known", "slope"):
+        check_known_values(raw_volume, MeshSettings(**given))
+
+
+@pytest.mark.parametrize(
+    "given",
     [
-        ({"purpose": "print"}, True), ({"purpose": "print", "iso_value": (200.0,)}, False), ({}, False),
-        ({"purpose": "print", "half_way": (1200.0, 40.0)}, False), ({"purpose": "print", "half_way": "auto"}, True),
-        ({"purpose": "print", "labels": LabelChoice("a", surface="mask")}, False),
+        {},
+        {"purpose": "print", "iso_value": (200.0,)},
+        {"purpose": "print", "half_way": (1200.0, 40.0)},
+        {"purpose": "print", "labels": LabelChoice("a", surface="mask")},
     ],
-)  # fmt: skip
-def test_a_print_needs_a_level_that_is_known(given: dict[str, Any], is_refused: bool) -> None:
-    volume: Any = SimpleNamespace(report={"gates": [{"name": "hu_known", "ok": False, "text": "no slope"}]})
-    settings = MeshSettings(**given)
-    if is_refused:
-        with refused(RefusedInputError, "hu_known", "slope"):
-            check_known_values(volume, settings)
-    else:
-        check_known_values(volume, settings)
+    ids=["no print", "iso value", "two materials", "surface of labels"],
+)
+def test_mesh_of_values_that_are_not_known_to_be_hu_is_accepted_where_none_is_assumed(
+    given: dict[str, Any], raw_volume: Any
+) -> None:
+    assert check_known_values(raw_volume, MeshSettings(**given)) is None
 
 
-def test_levels_that_are_named_are_not_chosen() -> None:
+def test_given_iso_value_or_materials_are_not_chosen_from_the_scan() -> None:
     volume: Any = None
     assert choose_level(volume, MeshSettings(iso_value=(200.0,))) is None
     chosen = choose_level(volume, MeshSettings(half_way=(1200.0, 40.0)))
@@ -68,31 +82,36 @@ def test_levels_that_are_named_are_not_chosen() -> None:
 @pytest.mark.parametrize(
     ("text", "fields"),
     [
-        ("auto", {"half_way": "auto"}), ("half:1200,40", {"half_way": (1200.0, 40.0)}), ("2", {"iso_value": (2.0,)}),
-        ("100:300,5", {"iso_value": ((100.0, 300.0), 5.0)}), ("half:1", None), ("half:1,2,3", None),
+        ("auto", {"half_way": "auto"}),
+        ("half:1200,40", {"half_way": (1200.0, 40.0)}),
+        ("2", {"iso_value": (2.0,)}),
+        ("100:300,5", {"iso_value": ((100.0, 300.0), 5.0)}),
     ],
-)  # fmt: skip
-def test_levels_are_read_from_text(text: str, fields: dict[str, Any] | None) -> None:
-    if fields is None:
-        with refused(ValueError, "materials"):
-            parse_hu(text)
-    else:
-        assert parse_hu(text) == fields
+)
+def test_option_hu_is_read_as_a_setting(text: str, fields: dict[str, Any]) -> None:
+    assert parse_hu(text) == fields
+
+
+@pytest.mark.parametrize("text", ["half:1", "half:1,2,3"])
+def test_option_hu_half_way_between_other_than_two_materials_is_refused(text: str) -> None:
+    with refused(ValueError, "materials"):
+        parse_hu(text)
 
 
 @pytest.mark.parametrize(
-    ("text", "size"), [("5", 5), ("5B", 5), ("5k", 5000), ("2KiB", 2048), ("1.5 GB", 1_500_000_000), ("5i", None)]
+    ("text", "size"), [("5", 5), ("5B", 5), ("5k", 5000), ("2KiB", 2048), ("1.5 GB", 1_500_000_000)]
 )
-def test_memory_is_read_from_text(text: str, size: int | None) -> None:
-    if size is None:
-        with refused(ValueError, "memory"):
-            parse_bytes(text)
-    else:
-        assert parse_bytes(text) == size
+def test_size_of_memory_is_read_in_bytes(text: str, size: int) -> None:
+    assert parse_bytes(text) == size
+
+
+def test_size_of_memory_in_an_unknown_unit_is_refused() -> None:
+    with refused(ValueError, "memory"):
+        parse_bytes("5i")
 
 
 @pytest.mark.parametrize("text", ["unknown", "level:1:2", "level:nan", "region:1", "median:0"])
-def test_steps_that_are_not_known_are_refused(text: str) -> None:
+def test_unknown_step_of_preprocessing_is_refused(text: str) -> None:
     with refused(UsageError, "step"):
         parse_preprocess(text)
 
@@ -101,40 +120,50 @@ def test_steps_that_are_not_known_are_refused(text: str) -> None:
     ("given", "solid"),
     [({}, True), ({"solid": False}, None), ({"solid": True}, True), ({"iso_value": (200.0, 300.0)}, None)],
 )
-def test_a_print_is_solid_at_one_level_unless_it_shall_not(given: dict[str, Any], solid: bool | None) -> None:
+def test_print_at_one_iso_value_is_solid_unless_it_is_asked_to_be_hollow(
+    given: dict[str, Any], solid: bool | None
+) -> None:
     assert bool(settings_for("print", given).get("solid")) is bool(solid)
 
 
 @pytest.mark.parametrize(("solid", "filled"), [(None, True), (False, False)])
-def test_labels_of_a_print_are_solid_one_by_one(solid: bool | None, filled: bool) -> None:
+def test_labels_of_a_print_are_solid_unless_it_is_asked_to_be_hollow(solid: bool | None, filled: bool) -> None:
     labels = settings_for("print", {"labels": LabelChoice("a"), **({} if solid is None else {"solid": solid})})[
         "labels"
     ]
     assert labels.solid is filled
 
 
-def test_labels_pick_cells_of_one_topology() -> None:
-    MeshSettings(topology="trilinear")
-    MeshSettings(labels=LabelChoice("a"))
+def test_topology_of_labels_is_refused() -> None:
     with refused(UsageError, "labels"):
         MeshSettings(labels=LabelChoice("a"), topology="trilinear")
 
 
-def test_growing_from_labels_needs_them_and_makes_none() -> None:
-    def check(method: str, grow_from: tuple[str, ...], has: bool, makes: bool) -> None:
-        check_growing(
-            method, grow_from, "linear", topology="separated", inside="above", has_labels=has, makes_labels=makes
-        )
+def check_growing_of(method: str, grow_from: tuple[str, ...], *, has_labels: bool, makes_labels: bool) -> None:
+    check_growing(
+        method, grow_from, "linear", topology="separated", inside="above", has_labels=has_labels,
+        makes_labels=makes_labels,
+    )  # fmt: skip
 
-    check("t-mc", (), True, True)
-    check("t-mc", (), False, False)
-    for grow_from, has, makes, words in (
-        (("label:L3",), False, False, "map"),
-        (("label:L3",), True, True, "meshes"),
-        (("auto",), True, False, "cells"),
-    ):
-        with refused(UsageError, words):
-            check("i-mc", grow_from, has, makes)
+
+@pytest.mark.parametrize(
+    ("grow_from", "has_labels", "makes_labels", "fact"),
+    [
+        pytest.param(("label:L3",), False, False, "map", id="from a label without a map"),
+        pytest.param(("label:L3",), True, True, "meshes", id="into meshes of labels"),
+        pytest.param(("auto",), True, False, "cells", id="labels without a use"),
+    ],
+)
+def test_growing_that_does_not_fit_the_labels_is_refused(
+    grow_from: tuple[str, ...], has_labels: bool, makes_labels: bool, fact: str
+) -> None:
+    with refused(UsageError, fact):
+        check_growing_of("i-mc", grow_from, has_labels=has_labels, makes_labels=makes_labels)
+
+
+@pytest.mark.parametrize("has_labels", [True, False])
+def test_method_that_does_not_grow_is_accepted_with_and_without_labels(has_labels: bool) -> None:
+    assert check_growing_of("t-mc", (), has_labels=has_labels, makes_labels=has_labels) is None
 
 
 @pytest.mark.parametrize(
@@ -142,12 +171,14 @@ def test_growing_from_labels_needs_them_and_makes_none() -> None:
     [({}, False), ({"keep": "bone"}, True), ({"split": True}, True), ({"keep_largest": 1}, True),
      ({"min_volume_ml": 0.1}, True), ({"seeds": ((0.0, 0.0, 0.0),)}, True)],
 )  # fmt: skip
-def test_settings_say_whether_they_choose_components(given: dict[str, Any], selects: bool) -> None:
+def test_settings_that_choose_components_are_told_from_those_that_keep_all(
+    given: dict[str, Any], selects: bool
+) -> None:
     assert MeshSettings(**given).selects is selects
 
 
 @pytest.mark.parametrize("radius", [None, 4.0])
-def test_a_corridor_has_a_screw_where_it_has_a_radius(radius: float | None) -> None:
+def test_corridor_with_a_radius_has_the_diameter_of_a_screw_and_one_without_has_none(radius: float | None) -> None:
     names = (
         *("side", "refused", "length", "medial_deg", "sagittal_deg", "medial_range_deg", "sagittal_range_deg", "tried"),
         *("medial_lps_deg", "sagittal_lps_deg", "entry", "tip", "back", "pass_point", "margins", "canal", "bias"),
@@ -158,46 +189,75 @@ def test_a_corridor_has_a_screw_where_it_has_a_radius(radius: float | None) -> N
     assert found == (None if radius is None else screw_diameter(radius, 1.0))
 
 
-def test_a_file_turned_from_ras_gives_a_warning() -> None:
+def test_file_in_lps_has_no_warning_of_its_frame() -> None:
     assert inputs._describe_frame("a", {"space": "LPS", "warnings": []}) == ()
+
+
+def test_file_turned_from_ras_has_a_warning_before_its_own() -> None:
     assert inputs._describe_frame("a", {"space": "RAS", "warnings": ["w"]}) == ("a was turned from RAS to LPS", "w")
 
 
-def test_inputs_of_a_page_have_names_and_colours() -> None:
-    def shown(*reports: dict[str, Any]) -> Any:
-        return SimpleNamespace(meshes=[Mesh(*samples.box(), None, report) for report in reports])
+def read_input(*reports: dict[str, Any]) -> Any:
+    """What a file of a box for each report gives."""
+    return SimpleNamespace(meshes=[Mesh(*samples.box(), None, report) for report in reports])
 
+
+def test_single_mesh_of_a_page_gets_no_name_and_no_colour() -> None:
+    (mesh,) = view_job._name_and_color([read_input({})], SimpleNamespace(names=[]))  # type: ignore[arg-type]
+    assert mesh.report == {}
+
+
+def test_meshes_of_a_page_get_the_given_names_then_numbers_and_one_colour_a_file() -> None:
+    red = [1, 0, 0]
+    files = [read_input({"color": red}), read_input({"part_name": "a"}, {})]
     settings: Any = SimpleNamespace(names=["left"])
-    (one,) = view_job._name_and_color([shown({})], SimpleNamespace(names=[]))  # type: ignore[arg-type]
-    assert one.report == {}
-    first, second, third = view_job._name_and_color(
-        [shown({"color": [1, 0, 0]}), shown({"part_name": "a"}, {})], settings
-    )
-    assert [mesh.report["part_name"] for mesh in (first, second, third)] == ["left", "surface 2 a", "surface 2"]
-    assert first.report["color"] == [1, 0, 0] and second.report["color"] == third.report["color"] != [1, 0, 0]
+
+    first, second, third = view_job._name_and_color(files, settings)
+
+    names = [mesh.report["part_name"] for mesh in (first, second, third)]
+    assert names == ["left", "surface 2 a", "surface 2"]
+    assert first.report["color"] == red  # its own
+    assert second.report["color"] == third.report["color"] != red
 
 
-def test_a_surface_without_bone_has_no_advice_on_contrast_medium(monkeypatch: pytest.MonkeyPatch) -> None:
-    def warnings_of(looks_like: str, bones: Any, contrast_share: float) -> list[str]:
-        look = WallLook(looks_like, 0.0, 0.0, 0.0, {"median": 300.0, "p99": 400.0}, 1000)
-        part: Any = SimpleNamespace(surface=surface, bones=bones, facts={"walls": look})
-        choice: Any = SimpleNamespace(contrast_medium_share=contrast_share)
-        return bone.warn_of_walls([part], MeshSettings(), choice)
-
+def warn_of_surface(monkeypatch: pytest.MonkeyPatch, looks_like: str, bones: Any, contrast_share: float) -> list[str]:
+    """Warnings for a surface whose walls look so, in a scan with this share of contrast medium."""
     monkeypatch.setattr(bone, "warn_of_contrast", lambda choice: ["contrast"])
     (surface,) = plan_surfaces([200.0])
-    boneless = SimpleNamespace(bone=0, components=3, rails=0)
-    contrast, whole = warnings_of("contrast medium", None, 0.3)
-    assert contrast == "contrast" and "keeps what looks like bone" in whole
-    (none,) = warnings_of("no bone", boneless, 0.3)
-    assert "nothing here looks like bone, none of 3 components" in none
-    assert warnings_of("no bone", boneless, 0.0) == ["contrast", none]
+    look = WallLook(looks_like, 0.0, 0.0, 0.0, {"median": 300.0, "p99": 400.0}, 1000)
+    part: Any = SimpleNamespace(surface=surface, bones=bones, facts={"walls": look})
+    choice: Any = SimpleNamespace(contrast_medium_share=contrast_share)
+    return bone.warn_of_walls([part], MeshSettings(), choice)
+
+
+BONELESS = SimpleNamespace(bone=0, components=3, rails=0)
+
+
+def test_surface_of_contrast_medium_is_warned_of_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
+    contrast, whole = warn_of_surface(monkeypatch, "contrast medium", None, contrast_share=0.3)
+
+    assert contrast == "contrast"
+    assert "keeps what looks like bone" in whole
+
+
+def test_surface_without_bone_has_no_advice_on_contrast_medium(monkeypatch: pytest.MonkeyPatch) -> None:
+    (warning,) = warn_of_surface(monkeypatch, "no bone", BONELESS, contrast_share=0.3)
+    assert "nothing here looks like bone, none of 3 components" in warning
+
+
+def test_surface_without_bone_is_warned_of_too_where_contrast_medium_is_not_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    contrast, none = warn_of_surface(monkeypatch, "no bone", BONELESS, contrast_share=0.0)
+
+    assert contrast == "contrast"
+    assert "nothing here looks like bone" in none
 
 
 @pytest.mark.parametrize(
     ("depth", "values", "words"), [(5.0, None, None), (np.nan, None, "nothing of the"), (5.0, np.nan, None)]
 )
-def test_a_picture_that_shows_something_is_not_empty(depth: float, values: float | None, words: str | None) -> None:
+def test_picture_without_any_depth_is_warned_of_as_empty(depth: float, values: float | None, words: str | None) -> None:
     def full(value: float) -> np.ndarray:
         return np.full((2, 2), value)
 
@@ -208,22 +268,23 @@ def test_a_picture_that_shows_something_is_not_empty(depth: float, values: float
     assert found is None if words is None else words in str(found)
 
 
-def test_parts_without_figures_of_a_print_have_no_warnings() -> None:
+def test_part_without_figures_of_a_print_has_no_warning_of_it() -> None:
     part: Any = SimpleNamespace(facts={}, name="")
     nothing: Any = None
     assert purposes.describe_purposes([part], MeshSettings(), nothing, nothing) == [] and part.facts == {"print": None}
 
 
-@pytest.mark.parametrize(("name", "is_refused"), [("a.jpg", True), ("a.png", False)])
-def test_some_pictures_hold_no_transparency(name: str, is_refused: bool, tmp_path: Any) -> None:
-    settings = RenderSettings(background="transparent")
-    if is_refused:
-        with refused(UsageError, "JPG", "background"):
-            check_pictures(PictureFiles(str(tmp_path / name)), settings)
-    else:
-        check_pictures(PictureFiles(str(tmp_path / name)), settings)
+def test_transparent_background_of_a_jpeg_is_refused(tmp_path: Any) -> None:
+    with refused(UsageError, "JPG", "background"):
+        check_pictures(PictureFiles(str(tmp_path / "a.jpg")), RenderSettings(background="transparent"))
 
 
-def test_a_turntable_needs_a_file_and_a_turn(tmp_path: Any) -> None:
+def test_transparent_background_of_a_png_is_accepted(tmp_path: Any) -> None:
+    picture = str(tmp_path / "a.png")
+    checked = check_pictures(PictureFiles(picture), RenderSettings(background="transparent"))
+    assert checked == [("the picture", picture)]
+
+
+def test_turntable_with_a_file_and_no_turn_is_refused(tmp_path: Any) -> None:
     with pytest.raises(UsageError, match="a turntable needs both"):
         make_pictures("a", PictureFiles(turntable=str(tmp_path / "a.gif")), RenderSettings())

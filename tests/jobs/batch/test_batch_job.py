@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ def cohort(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_one_bad_case_stops_no_other(cohort: Path) -> None:
+def test_case_without_a_scan_is_refused_and_the_others_are_done(cohort: Path) -> None:
     rows = read_rows(cohort / "out")
     assert [*rows] == ["A", "B", "gone", "C"]
     assert [row["status"] for row in rows.values()] == ["done", "done", "refused", "done"]
@@ -51,7 +52,7 @@ def test_one_bad_case_stops_no_other(cohort: Path) -> None:
     assert sorted(path.name for path in (cohort / "out" / "gone").iterdir()) == ["case.json"]
 
 
-def test_refused_case_is_told_with_what_its_input_lacks(tmp_path: Path, printed: Any) -> None:
+def test_case_without_a_scan_is_named_with_its_input(tmp_path: Path, printed: Any) -> None:
     (tmp_path / "m.csv").write_text("case,input\ngone,nowhere-4711\n")
     assert main(["batch", str(tmp_path / "m.csv"), "-o", str(tmp_path / "out")]) == 8
     printed().assert_error("gone", "nowhere-4711")
@@ -62,68 +63,128 @@ def test_mesh_of_a_case_is_that_of_the_mesh_command(cohort: Path, tmp_path: Path
     assert (cohort / "out" / "B" / "mesh.stl").read_bytes() == (tmp_path / "b.stl").read_bytes()
 
 
-def test_report_of_a_case_names_its_files_and_holds_mesh_certificate_and_gates(cohort: Path) -> None:
-    report = json.loads((cohort / "out" / "C" / "case.json").read_text())
+def test_report_of_a_case_has_the_sizes_of_its_files(cohort: Path) -> None:
     folder = cohort / "out" / "C"
-    assert {file["name"]: file["bytes"] for file in report["files"]} == {
+
+    files = json.loads((folder / "case.json").read_text())["files"]
+
+    assert {file["name"]: file["bytes"] for file in files} == {
         name: (folder / name).stat().st_size for name in ("mesh.stl", "picture.png")
     }
-    assert report["mesh"]["volume_ml"] == pytest.approx(4 / 3 * np.pi * 0.5**3, rel=0.05)
-    assert {gate["name"] for gate in report["mesh"]["gates"]} >= {"closed", "manifold"}
-    assert report["volume"]["slices"] == 24 and report["volume"]["series"]["uid_hash"] is None
+
+
+def test_report_of_a_case_has_the_volume_and_gates_of_its_mesh(cohort: Path) -> None:
+    mesh = json.loads((cohort / "out" / "C" / "case.json").read_text())["mesh"]
+
+    radius_cm = 0.5
+    assert mesh["volume_ml"] == pytest.approx(4 / 3 * np.pi * radius_cm**3, rel=0.05)  # in voxels of 1 mm
+    assert {gate["name"] for gate in mesh["gates"]} >= {"closed", "manifold"}
+
+
+def test_report_of_a_case_has_the_facts_of_its_scan_and_of_the_run(cohort: Path) -> None:
+    report = json.loads((cohort / "out" / "C" / "case.json").read_text())
+
+    assert report["volume"]["slices"] == 12 + 4 * 3  # of the third ball
+    assert report["volume"]["series"]["uid_hash"] is None
     assert {"seconds", "peak_memory_bytes", "version", "device", "warnings"} <= {*report}
 
 
-def test_figures_of_the_table_are_those_of_the_reports(cohort: Path) -> None:
+def test_row_of_a_case_in_the_table_has_the_figures_of_its_report(cohort: Path) -> None:
     row = read_rows(cohort / "out")["A"]
     report = json.loads((cohort / "out" / "A" / "case.json").read_text())
-    assert int(row["triangles"]) == report["mesh"]["triangles"] and int(row["slices"]) == 16
-    assert float(row["volume_ml"]) == pytest.approx(report["mesh"]["volume_ml"], abs=1e-6)
+
+    assert int(row["triangles"]) == report["mesh"]["triangles"]
+    assert int(row["slices"]) == report["volume"]["slices"]
+    assert float(row["volume_ml"]) == pytest.approx(report["mesh"]["volume_ml"], abs=1e-6)  # six decimals
+
+
+@dataclass
+class PartialBatch:
+    """Three balls and a case without a scan, of which the first two were made; then the mesh of A was cut off."""
+
+    folder: Path
+
+    def run(self, *options: str, hu: str = "0") -> None:
+        assert main(["batch", str(self.folder / "m.csv"), "-o", str(self.folder / "out"), "--hu", hu, *options]) == 8
+
+
+@pytest.fixture
+def partial_batch(tmp_path: Path) -> PartialBatch:
+    batch = PartialBatch(write_cohort(tmp_path))
+    batch.run("--part", "1/2", "-q")  # A and the case that is gone
+    (tmp_path / "out" / "A" / "mesh.stl").write_bytes(b"cut")
+    return batch
 
 
 @pytest.mark.seconds
-def test_resume_makes_what_is_missing_or_changed_and_ends_with_the_same_bytes(
-    cohort: Path, tmp_path: Path, printed: Any
+def test_part_of_a_batch_writes_its_cases_and_no_table(partial_batch: PartialBatch) -> None:
+    assert sorted(path.name for path in (partial_batch.folder / "out").iterdir()) == ["A", "gone"]
+
+
+@pytest.mark.seconds
+def test_resume_makes_missing_and_changed_cases_and_ends_with_the_files_of_a_whole_run(
+    cohort: Path, partial_batch: PartialBatch, printed: Any
 ) -> None:
-    folder = write_cohort(tmp_path)
-    command = ["batch", str(folder / "m.csv"), "-o", str(folder / "out"), "--hu", "0"]
-    assert main([*command, "--part", "1/2", "-q"]) == 8  # A and the case that is gone
-    assert not (folder / "out" / "cohort.csv").exists()
-    (folder / "out" / "A" / "mesh.stl").write_bytes(b"cut")
     printed()
-    assert main([*command, "--resume", "--json"]) == 8
+    partial_batch.run("--resume", "--json")
+
     report = printed().report()
-    assert (report["cases"], report["made"], report["kept"]) == (4, 4, 0)  # of the case that is gone no file tells
-    assert main([*command, "--resume", "--json"]) == 8
+    assert (report["cases"], report["made"], report["kept"]) == (4, 4, 0)  # the case that is gone is tried again
+    whole = {name: data for name, data in files_of(cohort / "out").items() if name.endswith((".stl", ".png"))}
+    assert len(whole) == 2 * 3  # a mesh and a picture of each ball
+    resumed = files_of(partial_batch.folder / "out")
+    assert {name: resumed[name] for name in whole} == whole
+
+
+@pytest.mark.seconds
+def test_resume_of_a_whole_batch_keeps_its_cases_and_tries_refused_ones_again(
+    partial_batch: PartialBatch, printed: Any
+) -> None:
+    partial_batch.run("--resume", "-q")
+    printed()
+
+    partial_batch.run("--resume", "--json")
+
     report = printed().report()
     assert (report["made"], report["kept"], report["statuses"]) == (1, 3, {"done": 3, "refused": 1})
-    meshes = {name: data for name, data in files_of(cohort / "out").items() if name.endswith((".stl", ".png"))}
-    assert {name: data for name, data in files_of(folder / "out").items() if name in meshes} == meshes
-    assert main([*command[:-1], "250", "--resume", "--json"]) == 8
+
+
+@pytest.mark.seconds
+def test_resume_with_another_setting_makes_all_cases(partial_batch: PartialBatch, printed: Any) -> None:
+    partial_batch.run("--resume", "-q")
+    printed()
+
+    partial_batch.run("--resume", "--json", hu="250")
+
     assert printed().report()["kept"] == 0
 
 
 @pytest.mark.seconds
-def test_retry_makes_failed_cases_alone(cohort: Path, tmp_path: Path, printed: Any) -> None:
+def test_retry_makes_refused_cases_again_and_leaves_done_ones_as_they_are(tmp_path: Path, printed: Any) -> None:
     folder = write_cohort(tmp_path)
     command = ["batch", str(folder / "m.csv"), "-o", str(folder / "out"), "--no-picture", "--no-measure"]
     assert main([*command, "--hu", "300", "-q"]) == 8
     before = files_of(folder / "out" / "A")
-    (folder / "ball1").rename(folder / "ball4")
+    (folder / "ball1").rename(folder / "ball4")  # the scan of the case that was gone
     printed()
+
     assert main([*command, "--hu", "400", "--retry", "--json"]) == 0
+
     report = printed().report()
     assert (report["made"], report["kept"], report["statuses"]) == (1, 3, {"done": 4})
     assert files_of(folder / "out" / "A") == before
 
 
-def test_collect_names_what_is_missing_and_makes_nothing(cohort: Path, tmp_path: Path, printed: Any) -> None:
+def test_collect_lists_a_case_that_was_not_made_as_missing_and_makes_none(cohort: Path, printed: Any) -> None:
     (cohort / "more.csv").write_text("case,input\nA,ball1\nlater,ball2\n")
     before = files_of(cohort / "out" / "A")
+
     assert main(["batch", str(cohort / "more.csv"), "-o", str(cohort / "out"), "--collect", "--json"]) == 8
+
     assert printed().report()["statuses"] == {"done": 1, "missing": 1}
     assert read_rows(cohort / "out")["later"]["status"] == "missing"
     assert files_of(cohort / "out" / "A") == before
+    # The table of all cases, for the other tests.
     assert main(["batch", str(cohort / "m.csv"), "-o", str(cohort / "out"), "--collect", "-q"]) == 8
 
 
@@ -134,33 +195,45 @@ def test_existing_cases_stay_with_no_clobber(cohort: Path, printed: Any) -> None
     assert files_of(cohort / "out") == before
 
 
-@pytest.mark.seconds
-def test_labels_of_a_row_give_meshes_and_statistics(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def labelled_batch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Output of two cases of a cube of 400 HU: `with` a label map of its two halves of 108 voxels, and `without`."""
+    folder = tmp_path_factory.mktemp("labelled")
     affine = np.diag([2.0, 2.0, 2.0, 1.0])
     voxels = np.zeros((12, 12, 12), np.int16)
     voxels[3:9, 3:9, 3:9] = 400
     labels = np.zeros(voxels.shape, np.uint8)
     labels[3:6, 3:9, 3:9] = 1
     labels[6:9, 3:9, 3:9] = 2
-    write_nifti(tmp_path / "ct.nii", voxels, affine)
-    write_nifti(tmp_path / "l.nii", labels, affine)
-    (tmp_path / "m.csv").write_text("case,input,labels\nwith,ct.nii,l.nii\nwithout,ct.nii,\n")
-    output = tmp_path / "out"
-    assert main(["batch", str(tmp_path / "m.csv"), "-o", str(output), "--hu", "200", "-q"]) == 0
-    assert sorted(path.name for path in (output / "with").iterdir()) == [
+    write_nifti(folder / "ct.nii", voxels, affine)
+    write_nifti(folder / "l.nii", labels, affine)
+    (folder / "m.csv").write_text("case,input,labels\nwith,ct.nii,l.nii\nwithout,ct.nii,\n")
+    assert main(["batch", str(folder / "m.csv"), "-o", str(folder / "out"), "--hu", "200", "-q"]) == 0
+    return folder / "out"
+
+
+@pytest.mark.seconds
+def test_case_with_a_label_map_has_a_mesh_of_each_label_and_a_table_of_their_statistics(labelled_batch: Path) -> None:
+    assert sorted(path.name for path in (labelled_batch / "with").iterdir()) == [
         "case.json", "labels.csv", "mesh_label_1.stl", "mesh_label_2.stl", "picture.png",
     ]  # fmt: skip
-    assert not (output / "without" / "labels.csv").exists()
-    with (output / "cohort_labels.csv").open(newline="") as stream:
+    assert not (labelled_batch / "without" / "labels.csv").exists()
+
+
+@pytest.mark.seconds
+def test_statistics_of_labels_are_in_the_report_of_the_case_and_the_table_of_the_cohort(labelled_batch: Path) -> None:
+    with (labelled_batch / "cohort_labels.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
+    report = json.loads((labelled_batch / "with" / "case.json").read_text())
+
     assert [(row["case"], row["number"], float(row["mean_hu"])) for row in rows] == [
         ("with", "1", 400.0), ("with", "2", 400.0),
     ]  # fmt: skip
-    report = json.loads((output / "with" / "case.json").read_text())
-    assert [label["ml"] for label in report["labels"]] == [pytest.approx(108 * 0.008)] * 2
+    voxel_ml = 2.0**3 / 1000
+    assert [label["ml"] for label in report["labels"]] == [pytest.approx(108 * voxel_ml)] * 2
 
 
-def test_strict_gates_are_a_status_of_their_own(tmp_path: Path) -> None:
+def test_case_that_fails_a_strict_gate_has_status_gate_and_keeps_its_mesh(tmp_path: Path) -> None:
     write_phantom(tmp_path / "ct", PhantomSettings(kind="sphere", size=(24, 24), slices=16, noise=0.0, missing=(7,)))
     (tmp_path / "m.csv").write_text("case,input\na,ct\n")
     command = ["batch", str(tmp_path / "m.csv"), "-o", str(tmp_path / "out"), "--hu", "300", "--allow-gaps", "-q"]
@@ -169,14 +242,16 @@ def test_strict_gates_are_a_status_of_their_own(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "a" / "mesh.stl").exists()
 
 
-def test_no_file_of_a_batch_and_no_word_names_the_patient(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    write_series(tmp_path / "scan of Jolanthe", number=1)
-    (tmp_path / "scan of Jolanthe" / "broken.dcm").write_bytes(b"\0" * 128 + b"DICM")
-    write_series(tmp_path / "scan of Jolanthe" / "more", number=2)
-    output = tmp_path / "out"
-    main(["batch", str(tmp_path / "scan of Jolanthe"), "-o", str(output), "--hu", "0", "-v"])
-    streams = "".join(capfd.readouterr())
+def test_files_and_words_of_a_batch_do_not_name_the_patient(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    folder, output = tmp_path / "scan of Jolanthe", tmp_path / "out"
+    write_series(folder, number=1)
+    (folder / "broken.dcm").write_bytes(b"\0" * 128 + b"DICM")
+    write_series(folder / "more", number=2)
+
+    main(["batch", str(folder), "-o", str(output), "--hu", "0", "-v"])
+
+    streams = "".join(capfd.readouterr()).encode()
+    files = files_of(output)
     assert {"series-001", "series-002"} <= {path.name for path in output.iterdir()}
-    names = "\n".join(files_of(output)).encode()
-    tables = [data for name, data in files_of(output).items() if "broken" not in name]
-    assert find_words(names + streams.encode() + b"\n".join(tables)) == []
+    contents = [data for name, data in files.items() if "broken" not in name]
+    assert find_words(b"\n".join([*(name.encode() for name in files), streams, *contents])) == []

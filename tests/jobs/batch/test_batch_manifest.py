@@ -58,7 +58,7 @@ def test_bad_table_is_refused_with_what_is_wrong_and_where(what: str, tmp_path: 
 
 
 @pytest.mark.parametrize("content", [b"case,input\n\xff,x\n", b"\0" * 200, None], ids=["Latin-1", "zeros", "no file"])
-def test_what_is_no_table_is_refused(content: bytes | None, tmp_path: Path) -> None:
+def test_manifest_that_is_no_text_or_missing_is_refused_with_its_name(content: bytes | None, tmp_path: Path) -> None:
     path = tmp_path / "scan.csv"
     if content is not None:
         path.write_bytes(content)
@@ -67,7 +67,7 @@ def test_what_is_no_table_is_refused(content: bytes | None, tmp_path: Path) -> N
 
 
 @pytest.mark.seconds
-def test_hundred_thousand_rows_take_little_memory(tmp_path: Path) -> None:
+def test_manifest_of_a_hundred_thousand_rows_is_read_in_less_than_100_mb(tmp_path: Path) -> None:
     text = "case,input\n" + "".join(f"case-{number},/data/ct/{number}\n" for number in range(100_000))
     tracemalloc.start()
     cases = read_table(tmp_path, text)
@@ -94,14 +94,14 @@ def test_folder_without_stacks_is_refused_and_the_columns_of_manifests_are_named
 
 
 @pytest.mark.parametrize("output", ["ct/out", "."], ids=["within the input", "around the input"])
-def test_output_and_inputs_lie_apart(output: str, tmp_path: Path) -> None:
+def test_output_within_or_about_an_input_is_refused(output: str, tmp_path: Path) -> None:
     (tmp_path / "ct").mkdir()
     case = Case("a", str(tmp_path / "ct"), None, None)
     with refused(UsageError, "a"):
         check_places([case], tmp_path / output)
 
 
-def test_folder_of_somebody_else_is_never_replaced(tmp_path: Path, printed: Any) -> None:
+def test_folder_of_a_case_with_other_files_is_refused_and_stays(tmp_path: Path, printed: Any) -> None:
     thesis = tmp_path / "out" / "a" / "thesis.txt"
     thesis.parent.mkdir(parents=True)
     thesis.write_text("years of work")

@@ -37,8 +37,8 @@ def write_manifest(folder: Path, inputs: Mapping[str, str]) -> None:
 
 
 @pytest.fixture
-def many(tmp_path: Path) -> list[str]:
-    """Names of so many small cases that none of these tests meets the last one."""
+def forty_cases(tmp_path: Path) -> list[str]:
+    """Names of so forty_cases small cases that none of these tests meets the last one."""
     write_ball(tmp_path / "small", 24)
     names = [f"case{number}" for number in range(40)]
     write_manifest(tmp_path, dict.fromkeys(names, "small"))
@@ -69,23 +69,28 @@ def wait_until(process: subprocess.Popen[str], has_happened: Callable[[], bool])
         time.sleep(0.002)
 
 
-def test_killed_worker_takes_its_own_case_along_and_is_named(tmp_path: Path, many: list[str]) -> None:
+def test_case_of_a_killed_worker_is_lost_alone_and_named_with_the_signal_and_resume_makes_it(
+    tmp_path: Path, forty_cases: list[str]
+) -> None:
     process = start(tmp_path)
-    wait_until(process, (tmp_path / "out" / many[0]).exists)  # no kernel is built any more, whose file could be cut
+    first_case = tmp_path / "out" / forty_cases[0]
+    wait_until(process, first_case.exists)  # no kernel is built any more, whose file could be cut
     (worker,) = children_of(process)
     os.kill(worker, signal.SIGKILL)
     _, errors = process.communicate(timeout=240)
+
     assert process.returncode == 8
     found = statuses(tmp_path)
     (lost,) = (case for case, status in found.items() if status == "lost")
-    assert found == dict.fromkeys(many, "done") | {lost: "lost"}
+    assert found == dict.fromkeys(forty_cases, "done") | {lost: "lost"}
     assert lost in errors and "SIGKILL" in errors
     report = json.loads((tmp_path / "out" / lost / "case.json").read_text())
     assert "SIGKILL" in report["error"]["message"]
+
     again = start(tmp_path, "--resume", "--json")
-    output, _ = again.communicate(timeout=240)
+    resumed = json.loads(again.communicate(timeout=240)[0])
     assert again.returncode == 0
-    assert (json.loads(output)["made"], json.loads(output)["kept"]) == (1, len(many) - 1)
+    assert (resumed["made"], resumed["kept"]) == (1, len(forty_cases) - 1)
 
 
 def test_case_of_a_killed_worker_among_several_is_made_again_alone(tmp_path: Path) -> None:
@@ -101,18 +106,18 @@ def test_case_of_a_killed_worker_among_several_is_made_again_alone(tmp_path: Pat
     assert statuses(tmp_path) == dict.fromkeys(cases, "done")
 
 
-def test_interrupt_leaves_whole_cases_alone(tmp_path: Path, many: list[str]) -> None:
+def test_interrupted_batch_ends_with_130_and_leaves_only_whole_cases(tmp_path: Path, forty_cases: list[str]) -> None:
     process = start(tmp_path)
-    wait_until(process, (tmp_path / "out" / many[0]).exists)
+    wait_until(process, (tmp_path / "out" / forty_cases[0]).exists)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130 and "Traceback" not in errors
-    left = sorted((tmp_path / "out").iterdir(), key=lambda folder: many.index(folder.name))
-    assert [folder.name for folder in left] == many[: len(left)] and len(left) < len(many)
+    left = sorted((tmp_path / "out").iterdir(), key=lambda folder: forty_cases.index(folder.name))
+    assert [folder.name for folder in left] == forty_cases[: len(left)] and len(left) < len(forty_cases)
     assert all((folder / "mesh.stl").is_file() and (folder / "case.json").is_file() for folder in left)
 
 
-def test_disk_that_takes_no_more_ends_the_batch_which_resumes_later(tmp_path: Path) -> None:
+def test_batch_on_a_full_disk_ends_with_6_and_resumes_when_there_is_room(tmp_path: Path) -> None:
     import resource
 
     write_ball(tmp_path / "small", 24)

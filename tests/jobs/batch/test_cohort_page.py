@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -52,40 +53,76 @@ def output(tmp_path: Path) -> Path:
     return output
 
 
-def test_outlier_among_nine_cases_is_named_in_the_table(output: Path) -> None:
+def read_rows(output: Path) -> dict[str, dict[str, str]]:
     with (output / "cohort.csv").open(newline="") as stream:
-        rows = {row["case"]: row for row in csv.DictReader(stream)}
-    assert [*rows][0] == "case-10" and [*rows][-2:] == ["hostile", "gone"]
-    far = {name: row["outliers"] for name, row in rows.items() if row["outliers"]}
-    assert far == {"case-6": "area_mm2 volume_ml"}
-    assert rows["case-6"]["gates_failed"] == "manifold" and rows["gone"]["status"] == "missing"
+        return {row["case"]: row for row in csv.DictReader(stream)}
 
 
-def test_page_is_whole_marks_what_is_far_and_runs_no_words_of_a_report(output: Path) -> None:
-    text = (output / "cohort.html").read_text(encoding="utf-8")
-    page = PageCheck(text)
+def test_case_with_fifteen_times_the_volume_of_the_others_is_an_outlier_in_the_table(output: Path) -> None:
+    outliers = {name: row["outliers"] for name, row in read_rows(output).items() if row["outliers"]}
+    assert outliers == {"case-6": "area_mm2 volume_ml"}  # 1500 ml among some 100 ml
+
+
+def test_table_lists_cases_in_the_order_of_the_manifest_with_failed_gates_and_missing_ones(output: Path) -> None:
+    rows = read_rows(output)
+
+    assert [*rows] == [*(f"case-{number}" for number in range(10, 1, -1)), "hostile", "gone"]
+    assert {name: row["gates_failed"] for name, row in rows.items() if row["gates_failed"]} == {"case-6": "manifold"}
+    assert (rows["hostile"]["status"], rows["gone"]["status"]) == ("failed", "missing")
+
+
+def test_page_of_a_cohort_is_sound_html_with_a_row_for_each_case(output: Path) -> None:
+    page = PageCheck((output / "cohort.html").read_text(encoding="utf-8"))
+
     assert [fault for fault in page.faults if not fault.endswith("/case.json>")] == []  # the files beside it
     (rows,) = page.tables
-    assert len(rows) == 1 + len(VOLUMES) + 2
-    assert text.count('class="far"') == 2
-    assert "<script>alert" not in text and "&lt;script&gt;alert" in text
+    heading, missing_and_hostile = 1, 2
+    assert len(rows) == heading + len(VOLUMES) + missing_and_hostile
 
 
-def test_page_sorts_by_a_click_and_asks_nobody(output: Path) -> None:
+def test_page_of_a_cohort_marks_the_figures_of_an_outlier(output: Path) -> None:
+    text = (output / "cohort.html").read_text(encoding="utf-8")
+    assert text.count('class="far"') == 2  # area and volume of case-6
+
+
+def test_page_of_a_cohort_shows_script_in_a_report_as_text(output: Path) -> None:
+    text = (output / "cohort.html").read_text(encoding="utf-8")
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert" in text
+
+
+@pytest.fixture
+def page_driver(output: Path) -> Iterator[Any]:
+    """A browser that shows the page of the cohort."""
     with open_browser() as driver:
         driver.get((output / "cohort.html").as_uri())
+        yield driver
 
-        def click_on(heading: str) -> list[str]:
-            driver.execute_script(
-                "[...document.querySelectorAll('thead button')].find(b => b.textContent === arguments[0]).click()",
-                heading,
-            )
-            return driver.execute_script(
-                "return [...document.querySelector('tbody').rows].map(r => r.cells[1].textContent)"
-            )
 
-        assert click_on("case")[:2] == ["case-2", "case-3"] and click_on("case")[0] == "hostile"
-        rising, falling = click_on("volume, ml"), click_on("volume, ml")
-        assert (rising[0], rising[8], falling[0]) == ("case-2", "case-6", "case-6")
-        assert {*rising[-2:]} == {*falling[-2:]} == {"hostile", "gone"}
-        assert outside_requests(driver) == [] and severe_lines(driver) == []
+def click_on(driver: Any, heading: str) -> list[str]:
+    """Click on the heading of a column; return the names of the cases from top to bottom."""
+    driver.execute_script(
+        "[...document.querySelectorAll('thead button')].find(b => b.textContent === arguments[0]).click()", heading
+    )
+    return driver.execute_script("return [...document.querySelector('tbody').rows].map(r => r.cells[1].textContent)")
+
+
+def test_click_on_the_heading_of_cases_sorts_their_numbers_as_numbers(page_driver: Any) -> None:
+    assert click_on(page_driver, "case")[:3] == [f"case-{number}" for number in (2, 3, 4)]
+
+
+def test_clicks_on_the_heading_of_volumes_sort_them_upwards_then_downwards_with_cases_without_one_last(
+    page_driver: Any,
+) -> None:
+    rising, falling = click_on(page_driver, "volume, ml"), click_on(page_driver, "volume, ml")
+
+    smallest, largest = "case-2", "case-6"
+    assert (rising[0], rising[8]) == (smallest, largest)
+    assert falling[0] == largest
+    assert {*rising[-2:]} == {*falling[-2:]} == {"hostile", "gone"}
+
+
+def test_page_of_a_cohort_loads_nothing_from_outside_and_has_no_faults_in_the_console(page_driver: Any) -> None:
+    click_on(page_driver, "case")
+    assert outside_requests(page_driver) == []
+    assert severe_lines(page_driver) == []

@@ -8,33 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cloud_scans import AFFINE, BAND, make_voxels, run_with_report
+from contract_tables import names_in
 from label_files import write_nrrd
 from printed_text import Printer
 from refusals import refused
 
 import clrecon
-from clrecon.cli.main import main
-from clrecon.errors import RefusedInputError, UsageError
+from clrecon.errors import UsageError
 from clrecon.jobs.cloud.job import CloudFiles, make_cloud
-from clrecon.jobs.cloud.settings import STEPS, CloudSettings, Clustering
+from clrecon.jobs.cloud.settings import STEPS, CloudSettings
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 
 pytestmark = pytest.mark.first_device
-
-AFFINE = np.array([[0.8, 0.1, 0.0, -20.0], [-0.1, 0.8, 0.0, 30.0], [0.0, 0.0, 1.0, 100.0], [0.0, 0.0, 0.0, 1.0]])
-BAND = "200,3000"
-
-
-def make_voxels() -> np.ndarray:
-    """Two balls of 9 and 5 voxels, a plate without thickness below them, and lone voxels around."""
-    k, j, i = np.indices((40, 44, 48))
-    balls = [9.3 - np.sqrt((k - 14) ** 2 + (j - 16) ** 2 + (i - 15) ** 2)]
-    balls.append(5.2 - np.sqrt((k - 26) ** 2 + (j - 16) ** 2 + (i - 34) ** 2))
-    voxels = np.clip(np.rint(100.0 * np.max(balls, axis=0) + 200.0), -1000, 900).astype(np.int16)
-    voxels[4:36, 38, 4:44] = 600
-    for place in ((36, 5, 5), (2, 30, 44), (37, 30, 40)):
-        voxels[place] = 700
-    return voxels
 
 
 @pytest.fixture(scope="module")
@@ -42,23 +28,6 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("cloud") / "scan.nrrd"
     write_nrrd(path, make_voxels(), AFFINE)
     return path
-
-
-@pytest.fixture
-def cloud_command(device: Any, tmp_path: Path) -> Any:
-    """Run the command in an empty folder; returns the exit code."""
-
-    def run(source: Path, *options: str, output: str = "out.ply") -> int:
-        return main(["cloud", str(source), "-o", str(tmp_path / output), "--device", str(device.index), *options])
-
-    return run
-
-
-def run_with_report(folder: Path, device: Any, source: Path, *options: str) -> dict[str, Any]:
-    """Write out.npz and r.json into an empty folder; return the report."""
-    files = ["-o", str(folder / "out.npz"), "--report", str(folder / "r.json")]
-    assert main(["cloud", str(source), *files, "--device", str(device.index), *options]) == 0
-    return dict(json.loads((folder / "r.json").read_text()))
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +98,7 @@ def test_clustered_cloud_and_removed_points_are_those_of_the_functions(
     assert np.array_equal(went.labels == 0, expected.removed == 0)
 
 
-def test_the_kept_cluster_is_the_large_ball(clustered_folder: Path) -> None:
+def test_kept_cluster_is_the_large_ball(clustered_folder: Path) -> None:
     z = clrecon.read_points(clustered_folder / "out.npz").points[:, 2]
     assert (np.abs(z - 114.0) < 10.0).all()  # radius 9.3 mm around slice 14, slice 0 at 100 mm
 
@@ -144,14 +113,14 @@ def test_report_of_clusters_counts_what_was_removed_and_why(clustered_folder: Pa
     assert report["gates"][0]["ok"]
 
 
-def test_clusters_are_made_before_points_are_kept(clustered_folder: Path) -> None:
+def test_clusters_are_reported_before_the_rules_that_keep_them_whatever_their_order(clustered_folder: Path) -> None:
     report = json.loads((clustered_folder / "r.json").read_text())
     assert [step["step"] for step in report["steps"]] == ["points", "clusters", "keep"]
     assert list(STEPS).index("clusters") < list(STEPS).index("keep")
     assert [output["what"] for output in report["outputs"]] == ["cloud", "removed"]
 
 
-def test_a_clustered_cloud_is_printed_with_its_counts(scan: Path, cloud_command: Any, printed: Printer) -> None:
+def test_clustered_cloud_is_printed_with_its_counts(scan: Path, cloud_command: Any, printed: Printer) -> None:
     assert cloud_command(scan, *CLUSTERED) == 0
     printed().assert_output(3, 32 * 40)  # lone voxels, and those of the plate
 
@@ -201,82 +170,104 @@ def test_report_counts_the_points_of_dropped_slices(foreign_slice: Path, device:
     assert report["removed"]["ghost slice"] > 300
 
 
-def test_a_scan_without_foreign_slices_loses_nothing(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
+def test_cloud_of_a_scan_without_foreign_slices_is_the_same_where_they_are_dropped(
+    scan: Path, tmp_path: Path, cloud_command: Any
+) -> None:
     assert cloud_command(scan, "--hu", BAND, output="a.npz") == 0
     assert cloud_command(scan, "--hu", BAND, "--ghost-slices", "drop", output="b.npz") == 0
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
-def test_seeds_are_read_in_the_frame_of_the_output(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
-    centre = AFFINE[:3] @ (34, 16, 26, 1)
-    for space, sign in (("lps", 1.0), ("ras", -1.0)):
-        seed = ",".join(str(number) for number in centre * (sign, sign, 1.0))
-        given = ["--hu", BAND, "--keep", f"seed:{seed}", "--space", space]
-        assert cloud_command(scan, *given, output=f"{space}.ply") == 0
-    lps, ras = (clrecon.read_points(tmp_path / f"{space}.ply") for space in ("lps", "ras"))
-    assert np.allclose(lps.points, ras.points, atol=1e-4) and len(lps) < 1000
-    assert np.linalg.norm(lps.points - centre, axis=1).max() < 5.5
-    assert b"SPACE=RAS" in (tmp_path / "ras.ply").read_bytes()[:2000]
-
-
-@pytest.mark.parametrize("kind", ["surface", "shell", "voxels"])
-@pytest.mark.parametrize("extension", ["ply", "vtp", "npz", "xyz"])
-def test_every_kind_of_points_is_written_to_every_format(
-    kind: str, extension: str, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("space", "sign"), [("lps", 1.0), ("ras", -1.0)])
+def test_seed_in_the_frame_of_the_output_keeps_the_cluster_at_it(
+    space: str, sign: float, scan: Path, tmp_path: Path, cloud_command: Any
 ) -> None:
+    small_ball_lps = AFFINE[:3] @ (34, 16, 26, 1)
+    seed = ",".join(str(number) for number in small_ball_lps * (sign, sign, 1.0))
+
+    assert cloud_command(scan, "--hu", BAND, "--keep", f"seed:{seed}", "--space", space) == 0
+
+    points = clrecon.read_points(tmp_path / "out.ply").points  # in LPS, whatever the file says
+    assert 100 < len(points) < 1000
+    assert np.linalg.norm(points - small_ball_lps, axis=1).max() < 5.5  # mm: 5.2 voxels of up to 1 mm
+    assert f"SPACE={space.upper()}".encode() in (tmp_path / "out.ply").read_bytes()[:2000]
+
+
+@pytest.mark.parametrize(
+    ("kind", "taken"),
+    [("surface", "surface of 250 HU"), ("shell", "shell of 250 HU and more"), ("voxels", "voxels of 250 HU and more")],
+    ids=["surface", "shell", "voxels"],
+)
+@pytest.mark.parametrize("extension", ["ply", "vtp", "npz", "xyz"])
+def test_each_kind_of_points_is_written_to_each_format(
+    kind: str, taken: str, extension: str, scan: Path, tmp_path: Path, cloud_command: Any,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
     assert cloud_command(scan, "--points", kind, "--hu", "250", output=f"a.{extension}") == 0
-    said = capsys.readouterr()
+
     cloud = clrecon.read_points(tmp_path / f"a.{extension}")
-    taken = "surface of 250 HU" if kind == "surface" else f"{kind} of 250 HU and more"
-    assert len(cloud) > 200 and f"{len(cloud):,} points ({taken})" in said.out
-    assert (cloud.normals is not None) == (kind == "surface" and extension != "xyz")
-    assert ("XYZ has no place for normals" in said.err) == (kind == "surface" and extension == "xyz")
+    assert len(cloud) > 200
+    assert f"{len(cloud):,} points ({taken})" in capsys.readouterr().out
 
 
-def test_labels_choose_points(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
+@pytest.mark.parametrize("extension", ["ply", "vtp", "npz"])
+def test_points_of_a_surface_are_written_with_their_normals(
+    extension: str, scan: Path, tmp_path: Path, cloud_command: Any
+) -> None:
+    assert cloud_command(scan, "--points", "surface", output=f"a.{extension}") == 0
+    assert clrecon.read_points(tmp_path / f"a.{extension}").normals is not None
+
+
+def test_normals_of_a_surface_are_left_out_of_xyz_with_a_warning(
+    scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cloud_command(scan, "--points", "surface", output="a.xyz") == 0
+
+    assert clrecon.read_points(tmp_path / "a.xyz").normals is None
+    assert "XYZ has no place for normals" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "centre_ijk", "radius_mm"),
+    [
+        pytest.param(["--label", "right", "--hu", BAND], (34, 16, 26), 6.0, id="by name, the small ball"),
+        pytest.param(["--label", "1"], (15, 16, 14), 10.0, id="by number, the large ball"),
+    ],
+)
+def test_cloud_of_a_label_has_the_points_of_the_ball_in_it(
+    options: list[str], centre_ijk: tuple[int, int, int], radius_mm: float, scan: Path, tmp_path: Path,
+    cloud_command: Any,
+) -> None:  # fmt: skip
     labels = np.zeros(make_voxels().shape, np.uint8)
     labels[4:34, :30, :26], labels[4:34, :30, 26:] = 1, 2
-    header = {f"Segment{n}_{what}": value for n, name in ((0, "left"), (1, "right")) for what, value in (
-        ("LabelValue", str(n + 1)), ("Layer", "0"), ("Name", name))}  # fmt: skip
+    header = {
+        "Segment0_LabelValue": "1", "Segment0_Layer": "0", "Segment0_Name": "left",
+        "Segment1_LabelValue": "2", "Segment1_Layer": "0", "Segment1_Name": "right",
+    }  # fmt: skip
     write_nrrd(tmp_path / "labels.seg.nrrd", labels, AFFINE, **header)
-    given = ["--labels", str(tmp_path / "labels.seg.nrrd")]
-    assert cloud_command(scan, *given, "--label", "right", "--hu", BAND, output="r.ply") == 0
-    assert cloud_command(scan, *given, "--label", "1", output="l.ply") == 0
-    right, left = (clrecon.read_points(tmp_path / name) for name in ("r.ply", "l.ply"))
-    assert np.linalg.norm(right.points - AFFINE[:3] @ (34, 16, 26, 1), axis=1).max() < 6.0
-    assert np.linalg.norm(left.points - AFFINE[:3] @ (15, 16, 14, 1), axis=1).max() < 10.0
+
+    assert cloud_command(scan, "--labels", str(tmp_path / "labels.seg.nrrd"), *options) == 0
+
+    points = clrecon.read_points(tmp_path / "out.ply").points
+    assert len(points) > 100
+    assert np.linalg.norm(points - AFFINE[:3] @ (*centre_ijk, 1), axis=1).max() < radius_mm
 
 
-def test_the_placing_of_the_paper_says_how_wrong_it_is(
+def test_points_placed_as_in_the_paper_lie_in_one_plane_and_their_error_is_reported(
     scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer
 ) -> None:
     assert cloud_command(scan, "--hu", BAND, "--paper", "--json") == 0
+
+    z = clrecon.read_points(tmp_path / "out.ply").points[:, 2]
+    assert np.ptp(z) < 1e-3  # mm, in float32
     report = printed().report()
-    paper = report["steps"][0]["paper"]
-    assert report["paper"] and paper["error_max_mm"] > 30.0
-    assert np.ptp(clrecon.read_points(tmp_path / "out.ply").points[:, 2]) < 1e-3
+    assert report["paper"]
+    assert report["steps"][0]["paper"]["error_max_mm"] > 30.0  # 36 slices of 1 mm hold points
 
 
-def test_a_step_that_takes_more_than_noise_is_refused(
-    device: Any, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+def test_rule_that_keeps_the_smaller_ball_may_take_more_than_half_of_the_points(
+    scan: Path, tmp_path: Path, cloud_command: Any
 ) -> None:
-    voxels = np.zeros((24, 24, 24), np.int16)
-    voxels[::3, ::3, ::3] = 500  # lone voxels
-    voxels[5:9, 5:9, 5:9] = 500
-    write_nrrd(tmp_path / "scan.nrrd", voxels, np.eye(4))
-    given = ["--hu", BAND, "--cluster", "eps=1.5,min=5"]
-    assert cloud_command(tmp_path / "scan.nrrd", *given) == 4
-    error = capsys.readouterr().err
-    assert "points gone (" in error and "more than half is no noise" in error and "--allow-point-loss" in error
-    assert {path.name for path in tmp_path.iterdir()} == {"scan.nrrd"}
-    assert cloud_command(tmp_path / "scan.nrrd", *given, "--allow-point-loss") == 0
-    assert "and was allowed" in capsys.readouterr().err
-    settings = CloudSettings(hu=(200, 3000), clusters=Clustering(1.5, 5), device=str(device.index))
-    with refused(RefusedInputError, "allow_point_loss=True"):
-        make_cloud(tmp_path / "scan.nrrd", CloudFiles(tmp_path / "b.ply"), settings)
-
-
-def test_a_rule_may_take_what_it_likes(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
     """The smaller ball alone: most points go, because they were asked to."""
     centre = ",".join(str(number) for number in AFFINE[:3] @ (34, 16, 26, 1))
     assert cloud_command(scan, "--hu", BAND, "--keep", f"seed:{centre}", "--report", str(tmp_path / "r.json")) == 0
@@ -319,7 +310,7 @@ WRONG = (
 
 
 @pytest.mark.parametrize(("options", "says"), WRONG, ids=[" ".join(options) for options, _ in WRONG])
-def test_wrong_options_are_one_line(
+def test_wrong_option_of_cloud_is_refused_in_one_line_and_writes_nothing(
     options: list[str], says: str, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cloud_command(scan, *options) == 3
@@ -367,17 +358,21 @@ def first(scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer) -> P
     return tmp_path / "first.npz"
 
 
-def test_a_cloud_is_read_and_cleaned(first: Path, tmp_path: Path, cloud_command: Any, printed: Printer) -> None:
+def test_cloud_of_a_file_keeps_its_largest_cluster_and_its_affine(
+    first: Path, tmp_path: Path, cloud_command: Any, printed: Printer
+) -> None:
     assert cloud_command(first, "--keep", "largest", "--json", output="second.ply") == 0
-    report = printed().report()
-    assert report["cloud_read"]["points"] == report["points_first"] and report["volume"] == {}
-    assert report["kind"] is None and np.allclose(report["affine_ijk_to_lps_mm"], AFFINE)
+
     before, after = (clrecon.read_points(path) for path in (first, tmp_path / "second.ply"))
     assert 0 < len(after) < len(before)
+    report = printed().report()
+    assert report["cloud_read"]["points"] == report["points_first"] == len(before)
+    assert np.allclose(report["affine_ijk_to_lps_mm"], AFFINE)
+    assert (report["volume"], report["kind"]) == ({}, None)  # of a scan
 
 
 @pytest.mark.parametrize("option", ["--remove-table", "--hu=200", "--points=shell", "--series=1"])
-def test_options_about_scans_are_refused_for_a_cloud(
+def test_option_about_scans_is_refused_for_a_cloud_of_a_file(
     first: Path, cloud_command: Any, option: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cloud_command(first, option, output="third.ply") == 3
@@ -402,114 +397,58 @@ def test_cloud_without_a_frame_is_turned_by_input_space(tmp_path: Path, cloud_co
     assert np.array_equal(clrecon.read_points(tmp_path / "out.ply").points[0], (-1.0, -2.0, 3.0))
 
 
-FILTERED = ("--normals", "--denoise", "bilateral", "--outliers", "3", "--points", "shell", "--hu", "250")
+def test_points_of_a_surface_are_clustered_and_chosen_by_a_seed(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
+    large_ball = AFFINE[:3] @ (15, 16, 14, 1)
+    seed = ",".join(str(number) for number in large_ball)
+
+    assert cloud_command(scan, "--cluster", "eps=1.5,min=5", "--keep", f"seed:{seed}", output="a.ply") == 0
+
+    cloud = clrecon.read_points(tmp_path / "a.ply")
+    assert len(np.unique(cloud.labels)) == 1
+    assert np.linalg.norm(cloud.points - large_ball, axis=1).max() < 10.0  # mm: its radius is 9.3 voxels
 
 
-def test_outliers_filter_and_normals_give_what_the_functions_give(device: Any, scan: Path, tmp_path: Path) -> None:
-    run_with_report(tmp_path, device, scan, *FILTERED)
-    volume = clrecon.read_volume(scan)
-    cloud = clrecon.extract_points(volume, 250, kind="shell", device=device)
-    cloud = clrecon.remove_outliers(cloud, deviations=3.0, device=device).cloud
-    cloud = clrecon.denoise_points(cloud, device=device).cloud
-    cloud = clrecon.estimate_normals(cloud, volume=volume, device=device).cloud
-    written = clrecon.read_points(tmp_path / "out.npz")
-    assert np.array_equal(written.points, cloud.points)
-    assert np.array_equal(written.normals, cloud.normals)
-
-
-def test_steps_of_a_filtered_cloud_are_reported_in_their_order(
-    scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cloud_command(scan, *FILTERED, "--report", str(tmp_path / "r.json"), output="out.npz") == 0
-    report = json.loads((tmp_path / "r.json").read_text())
-    steps = [step["step"] for step in report["steps"]]
-    assert steps == ["points", "outliers", "bilateral", "normals"] == sorted(steps, key=list(STEPS).index)
-    assert report["removed"]["outlier"] > 0
-    assert [gate["name"] for gate in report["gates"]] == ["points_kept_outliers"]
-    said = capsys.readouterr().out
-    assert "mm rms, at most" in said and "oriented by gradient" in said
-
-
-def test_doubtful_normals_of_far_slices_are_warned_of(
-    tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_nrrd(tmp_path / "far.nrrd", make_voxels()[::6], AFFINE @ np.diag([1.0, 1.0, 6.0, 1.0]))
-    options = ["--points", "shell", "--hu", "250", "--normals", "--report", str(tmp_path / "r.json")]
-    assert cloud_command(tmp_path / "far.nrrd", *options) == 0
-    report = json.loads((tmp_path / "r.json").read_text())
-    share = report["steps"][-1]["doubtful"] / report["points"]
-    said = f"normals ({100.0 * share:.0f} %) are doubtful and follow the HU alone"
-    assert share > 0.1 and said in capsys.readouterr().err
-    assert any(said in warning and "(--points surface)" in warning for warning in report["warnings"])
-
-
-def test_points_of_a_surface_keep_the_normals_of_its_field(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
-    assert cloud_command(scan, output="a.ply") == 0
-    assert cloud_command(scan, "--normals", output="b.ply") == 0
-    assert cloud_command(scan, "--denoise", "bilateral", output="c.ply") == 0
-    one, two, moved = (clrecon.read_points(tmp_path / f"{name}.ply") for name in "abc")
-    assert np.array_equal(one.normals, two.normals) and moved.normals is None
-
-
-THINNED = ("--spacing", "1.2", "--denoise", "grid")
-
-
-def test_thinned_cloud_and_its_surface_are_those_of_the_functions(device: Any, scan: Path, tmp_path: Path) -> None:
-    report = run_with_report(tmp_path, device, scan, *THINNED, "--surface", str(tmp_path / "out.stl"))
-    cloud = clrecon.extract_points(clrecon.read_volume(scan), PRESETS[DEFAULT_PRESET].iso_value, device=device)
-    cloud = clrecon.remove_sparse_cells(cloud, device=device).cloud
-    cloud = clrecon.thin_points(cloud, 1.2, device=device).cloud
-    assert np.array_equal(clrecon.read_points(tmp_path / "out.npz").points, cloud.points)
-    mesh = clrecon.reconstruct_surface(cloud, device=device)
-    triangles_in_file = ((tmp_path / "out.stl").stat().st_size - 84) // 50  # binary STL: header of 84 bytes, 50 each
-    assert report["surface"]["triangles"] == mesh.triangle_count == triangles_in_file
-
-
-def test_report_of_a_thinned_cloud_with_surface_has_steps_and_outputs(device: Any, scan: Path, tmp_path: Path) -> None:
-    report = run_with_report(tmp_path, device, scan, *THINNED, "--surface", str(tmp_path / "out.stl"))
-    assert [step["step"] for step in report["steps"]] == ["points", "sparse cells", "spacing"]
-    assert [output["what"] for output in report["outputs"]] == ["cloud", "surface"]
-
-
-def test_steps_of_a_thinned_cloud_with_surface_are_printed(
-    scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cloud_command(scan, *THINNED, "--surface", str(tmp_path / "out.stl")) == 0
-    said = capsys.readouterr().out
-    assert "closed, " in said and "sparse cells: " in said and "spacing: " in said
-
-
-def test_free_points_are_clustered(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
-    centre = ",".join(str(number) for number in AFFINE[:3] @ (15, 16, 14, 1))
-    assert cloud_command(scan, "--cluster", "eps=1.5,min=5", "--keep", f"seed:{centre}", output="a.ply") == 0
-    ball = clrecon.read_points(tmp_path / "a.ply")
-    assert np.linalg.norm(ball.points - AFFINE[:3] @ (15, 16, 14, 1), axis=1).max() < 10.0
-    assert len(np.unique(ball.labels)) == 1
-
-
-def test_a_cancelled_job_leaves_nothing(device: Any, scan: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def made_cloud(device: Any, scan: Path, tmp_path: Path) -> tuple[Any, list[tuple[str, int, int]]]:
+    """A function that makes the files of a cloud again, and the calls of progress when they were first made."""
     settings = CloudSettings(hu=(200, 3000), keep=("largest",), device=str(device.index))
     files = CloudFiles(tmp_path / "a.ply", tmp_path / "b.ply", report=tmp_path / "r.json")
     calls: list[tuple[str, int, int]] = []
     make_cloud(scan, files, settings, progress=lambda *call: calls.append(call))
+    return lambda **own: make_cloud(scan, files, settings, **own), list(dict.fromkeys(calls))
+
+
+def test_cloud_job_cancelled_at_any_progress_leaves_older_files(made_cloud: Any, tmp_path: Path) -> None:
+    make_again, calls = made_cloud
     assert {"device", "write"} <= {stage for stage, _, _ in calls}
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    for moment in dict.fromkeys(calls):
+
+    for moment in calls:
 
         def cancel(*call: Any, moment: Any = moment) -> None:
             if call == moment:
                 raise clrecon.Cancelled
 
         with pytest.raises(clrecon.Cancelled):
-            make_cloud(scan, files, settings, progress=cancel)
+            make_again(progress=cancel)
         assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_cloud_job_over_older_files_is_refused_with_no_clobber(made_cloud: Any, tmp_path: Path) -> None:
+    make_again, _ = made_cloud
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
     with pytest.raises(clrecon.OutputError):
-        make_cloud(scan, files, settings, no_clobber=True)
+        make_again(no_clobber=True)
+
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_cloud_settings_refuse_half_a_band_and_a_step_twice() -> None:
+def test_band_of_hu_with_one_end_is_refused() -> None:
     with refused(UsageError, "band", 1):
         CloudSettings(hu=(1.0,))
+
+
+def test_filter_of_points_named_twice_is_refused() -> None:
     with refused(UsageError, "bilateral"):
         CloudSettings(denoise=("bilateral", "bilateral"))
