@@ -35,51 +35,88 @@ def cloud() -> PointCloud:
 
 
 @pytest.fixture(scope="module")
-def file(cloud: PointCloud, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cloud_file(cloud: PointCloud, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("clouds") / "ball.ply"
     cloud.save(path)
     return path
 
 
-def test_the_command_draws_what_the_function_draws(device: Any, file: Path, tmp_path: Path, printed: Printer) -> None:
-    given = ["--device", str(device.index), "--size", SIZE, "--color", "removed", "--letters"]
-    files = ["-o", str(tmp_path / "a.png"), "--depth", str(tmp_path / "d.npy"), "--report", str(tmp_path / "r.json")]
-    assert main(["render", str(file), *files, *given, "--view", "20,30", "--point-radius", "0.4"]) == 0
-    said = printed()
-    said.assert_output(6000, 1, 1)
-    cloud = clrecon.read_points(file)
-    own = clrecon.render(
-        cloud, color_by="removed", radius_mm=0.4, view=(20, 30), size=(80, 64), device=device
-    ).annotated(letters=True)
-    assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png").convert("RGBA")), own.image)
-    assert np.array_equal(np.load(tmp_path / "d.npy"), own.depth, equal_nan=True)
-    report = json.loads((tmp_path / "r.json").read_text())
-    points = report["pictures"][0]["points"]
-    assert points["radius_mm"] == 0.4 and points["color_by"] == "removed" and points["shading"] == "normals"
-    assert [entry["name"] for entry in points["legend"]] == [None, "kept", None, None][: len(points["legend"])]
-    assert sum(entry["points"] for entry in points["legend"]) == report["cloud"]["points"] == 6000
-    assert report["cloud"]["file"]["kind"] == "PLY" and report["volume"] == {}
+@pytest.fixture(scope="module")
+def drawn_folder(device: Any, cloud_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """a.png, d.npy and r.json of a picture of the cloud, coloured by what was removed."""
+    folder = tmp_path_factory.mktemp("drawn")
+    look = ["--size", SIZE, "--color", "removed", "--letters", "--view", "20,30", "--point-radius", "0.4", "-q"]
+    files = ["-o", str(folder / "a.png"), "--depth", str(folder / "d.npy"), "--report", str(folder / "r.json")]
+    assert main(["render", str(cloud_file), *files, *look, "--device", str(device.index)]) == 0
+    return folder
 
 
-def test_views_turntables_and_lights_of_a_cloud_are_drawn(device: Any, file: Path, tmp_path: Path) -> None:
-    given = ["--device", str(device.index), "--size", "64", "-q"]
-    assert main(["render", str(file), "-o", str(tmp_path / "a.png"), "--view", "left,anterior", *given]) == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"a_left.png", "a_anterior.png"}
-    turn = ["--turntable", str(tmp_path / "t"), "--frames", "3", "--color", "hu", "--window=-300,300"]
-    assert main(["render", str(file), *turn, *given]) == 0
-    assert len(list((tmp_path / "t").glob("*.png"))) == 3
-    for light in ("none", "left"):
-        out = tmp_path / f"{light}.png"
-        assert main(["render", str(file), "-o", str(out), "--color", "white", "--light", light, *given]) == 0
-    flat, lit = (np.asarray(Image.open(tmp_path / f"{light}.png").convert("L")) for light in ("none", "left"))
-    assert set(np.unique(flat)) == {0, 255} and len(np.unique(lit)) > 20
-
-
-def test_options_about_scans_are_refused_for_clouds(
-    device: Any, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+def test_picture_and_depths_of_a_cloud_by_the_command_are_those_of_the_function(
+    device: Any, cloud_file: Path, drawn_folder: Path
 ) -> None:
-    out = ["-o", str(tmp_path / "a.png"), "--device", str(device.index)]
-    for option, says in (
+    cloud = clrecon.read_points(cloud_file)
+
+    picture = clrecon.render(cloud, color_by="removed", radius_mm=0.4, view=(20, 30), size=(80, 64), device=device)
+
+    image = np.asarray(Image.open(drawn_folder / "a.png").convert("RGBA"))
+    assert np.array_equal(image, picture.annotated(letters=True).image)
+    assert np.array_equal(np.load(drawn_folder / "d.npy"), picture.depth, equal_nan=True)
+
+
+def test_report_of_a_cloud_in_a_picture_has_the_names_of_the_contract(drawn_folder: Path) -> None:
+    report = json.loads((drawn_folder / "r.json").read_text())
+
+    assert set(report) == names_in("clrecon render INPUT")
+    of_picture = names_in("clrecon render INPUT", "For each picture:")
+    assert set(report["pictures"][0]) == of_picture - {"values_output"}
+
+
+def test_report_of_a_picture_of_a_cloud_has_its_look_and_counts_the_points_of_each_colour(drawn_folder: Path) -> None:
+    report = json.loads((drawn_folder / "r.json").read_text())
+
+    points = report["pictures"][0]["points"]
+    assert (points["radius_mm"], points["color_by"], points["shading"]) == (0.4, "removed", "normals")
+    reasons = [entry["name"] for entry in points["legend"]]
+    assert reasons == [None, "kept", None, None][: len(reasons)]  # of the labels -1 to 2 only 0 has a name
+    assert sum(entry["points"] for entry in points["legend"]) == report["cloud"]["points"] == 6000
+    assert (report["cloud"]["file"]["kind"], report["volume"]) == ("PLY", {})
+
+
+def test_words_of_a_picture_of_a_cloud_count_its_points(
+    device: Any, cloud_file: Path, tmp_path: Path, printed: Printer
+) -> None:
+    command = ["render", str(cloud_file), "-o", str(tmp_path / "a.png"), "--size", SIZE]
+    assert main([*command, "--device", str(device.index)]) == 0
+    printed().assert_output(6000)
+
+
+def test_views_of_a_cloud_are_pictures_named_after_them(device: Any, cloud_file: Path, tmp_path: Path) -> None:
+    look = ["--view", "left,anterior", "--device", str(device.index), "--size", "64", "-q"]
+    assert main(["render", str(cloud_file), "-o", str(tmp_path / "a.png"), *look]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"a_left.png", "a_anterior.png"}
+
+
+def test_turntable_of_a_cloud_has_the_given_number_of_frames(device: Any, cloud_file: Path, tmp_path: Path) -> None:
+    look = ["--color", "hu", "--window=-300,300", "--device", str(device.index), "--size", "64", "-q"]
+    assert main(["render", str(cloud_file), "--turntable", str(tmp_path / "t"), "--frames", "3", *look]) == 0
+    assert len(list((tmp_path / "t").glob("*.png"))) == 3
+
+
+@pytest.mark.parametrize(("light", "is_shaded"), [("none", False), ("left", True)])
+def test_white_cloud_has_shades_of_grey_only_with_a_light(
+    light: str, is_shaded: bool, device: Any, cloud_file: Path, tmp_path: Path
+) -> None:
+    look = ["--color", "white", "--light", light, "--device", str(device.index), "--size", "64", "-q"]
+
+    assert main(["render", str(cloud_file), "-o", str(tmp_path / "a.png"), *look]) == 0
+
+    greys = set(np.unique(np.asarray(Image.open(tmp_path / "a.png").convert("L"))))
+    assert len(greys) > 20 if is_shaded else greys == {0, 255}  # the background, and white
+
+
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
         (["--mode", "mip"], "which mode points shows, and not mode mip"),
         (["--remove-table"], "--remove-table is about a scan"),
         (["--phase", "2"], "--phase is about a scan"),
@@ -88,36 +125,67 @@ def test_options_about_scans_are_refused_for_clouds(
         (["--color", "hue"], "unknown colour 'hue'"),
         (["--point-radius", "0"], "the radius of points is a length in mm"),
         (["--color", "label", "--window", "0,9"], "--color hu"),
-        (["--values", str(tmp_path / "v.npy")], "--values does not apply to mode points"),
-    ):
-        assert main(["render", str(file), *out, *option]) == 3, option
-        assert says in capsys.readouterr().err
+        (["--values", "v.npy"], "--values does not apply to mode points"),
+    ],
+)
+def test_option_without_meaning_for_a_cloud_is_refused_and_no_picture_is_written(
+    option: list[str], says: str, device: Any, cloud_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+
+    assert main(["render", str(cloud_file), "-o", "a.png", "--device", str(device.index), *option]) == 3
+
+    assert says in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_files_that_are_no_clouds_are_refused_and_nothing_is_written(device: Any, file: Path, tmp_path: Path) -> None:
-    own = {"device": str(device.index), "size": (64, 64)}
-    files = PictureFiles(tmp_path / "a.png")
+def test_folder_in_mode_points_is_refused(device: Any, tmp_path: Path) -> None:
+    settings = RenderSettings.of("points", device=str(device.index), size=(64, 64))
     with refused(UsageError, "points", "cloud"):
-        make_pictures(tmp_path, files, RenderSettings.of("points", **own))
+        make_pictures(tmp_path, PictureFiles(tmp_path / "a.png"), settings)
+    assert not list(tmp_path.iterdir())
+
+
+def test_folder_without_a_scan_is_refused(device: Any, tmp_path: Path) -> None:
+    settings = RenderSettings.of(device=str(device.index), size=(64, 64))
     with pytest.raises(NoDicomError):
-        make_pictures(tmp_path, files, RenderSettings.of(**own))
+        make_pictures(tmp_path, PictureFiles(tmp_path / "a.png"), settings)
+    assert not list(tmp_path.iterdir())
+
+
+def test_ply_without_points_is_refused(device: Any, tmp_path: Path) -> None:
     (tmp_path / "b.ply").write_text("ply\nformat ascii 1.0\nend_header\n")
+    settings = RenderSettings.of("points", device=str(device.index), size=(64, 64))
     with pytest.raises(RefusedInputError):
-        make_pictures(tmp_path / "b.ply", files, RenderSettings.of("points", **own))
-    with refused(UsageError, "report", "ball.ply"):
-        make_pictures(file, PictureFiles(tmp_path / "a.png", report=file), RenderSettings.of("points", **own))
+        make_pictures(tmp_path / "b.ply", PictureFiles(tmp_path / "a.png"), settings)
     assert {path.name for path in tmp_path.iterdir()} == {"b.ply"}
 
 
-def test_clouds_are_told_by_their_names(tmp_path: Path) -> None:
-    assert all(is_cloud_file(f"a{extension}") and is_cloud_file(f"a{extension.upper()}") for extension in CLOUD_INPUTS)
-    assert not is_cloud_file("a.nii.gz") and not is_cloud_file("folder")
+def test_report_of_a_picture_over_its_cloud_is_refused(device: Any, cloud_file: Path, tmp_path: Path) -> None:
+    settings = RenderSettings.of("points", device=str(device.index), size=(64, 64))
+    with refused(UsageError, "report", "ball.ply"):
+        make_pictures(cloud_file, PictureFiles(tmp_path / "a.png", report=cloud_file), settings)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("extension", CLOUD_INPUTS)
+def test_file_with_an_extension_of_clouds_in_any_case_is_taken_for_one(extension: str) -> None:
+    assert is_cloud_file(f"a{extension}")
+    assert is_cloud_file(f"a{extension.upper()}")
+
+
+def test_volume_or_folder_is_not_taken_for_a_cloud(tmp_path: Path) -> None:
     (tmp_path / "scan.ply").mkdir()
+
+    assert not is_cloud_file("a.nii.gz")
+    assert not is_cloud_file("folder")
     assert not is_cloud_file(tmp_path / "scan.ply")
 
 
-def test_a_mesh_drawn_as_points_names_the_mode_of_its_faces(device: Any, tmp_path: Path, printed: Printer) -> None:
+def test_mesh_drawn_as_points_is_warned_of_with_the_mode_that_draws_its_faces(
+    device: Any, tmp_path: Path, printed: Printer
+) -> None:
     vertices = np.array([(0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (0.0, 9.0, 0.0)])
     clrecon.Mesh(vertices, np.array([(0, 1, 2)])).save(tmp_path / "bone.ply")
     files = [str(tmp_path / "bone.ply"), "-o", str(tmp_path / "a.png")]

@@ -36,14 +36,14 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_kind_of_an_input_is_told_by_its_file(files):
+def test_kind_of_an_input_of_a_view_follows_from_its_file(files):
     names = ["scan.nii.gz", "lps.stl", "ras.ply", "cloud.ply", "cloud.xyz", "labels.nii.gz"]
     opened = open_inputs([files / name for name in names])
     kinds = [type(each.subject) for each in opened]
     assert kinds == [Volume, Mesh, Mesh, PointCloud, PointCloud, LabelMap]
 
 
-def test_a_scan_and_labels_are_opened_at_their_place(files):
+def test_scan_and_label_map_of_a_view_lie_at_the_place_of_their_files(files):
     opened = open_inputs([files / "scan.nii.gz", files / "labels.nii.gz"])
     scan, labels = opened[0].subject, opened[1].subject
     assert isinstance(scan, Volume) and isinstance(labels, LabelMap)
@@ -52,7 +52,7 @@ def test_a_scan_and_labels_are_opened_at_their_place(files):
     assert labels.numbers == (5,)
 
 
-def test_integers_of_few_values_are_taken_for_labels_and_told(files):
+def test_volume_of_few_integers_is_taken_for_a_label_map_with_a_remark(files):
     (labels,) = open_inputs([files / "labels.nii.gz"])
     assert "taken for a label map" in " ".join(labels.said)
 
@@ -66,60 +66,78 @@ def points_of(subject):
 @pytest.mark.parametrize(
     ("in_lps", "in_ras"), [("lps.stl", "ras.ply"), ("cloud.xyz", "cloud.ply")], ids=["mesh", "cloud"]
 )
-def test_an_input_in_ras_is_turned_and_that_is_told(files, in_lps, in_ras):
+def test_input_of_a_view_in_ras_is_turned_to_lps_with_a_remark(files, in_lps, in_ras):
     lps, ras = open_inputs([files / in_lps, files / in_ras])
     assert np.allclose(points_of(lps.subject), points_of(ras.subject), atol=1e-3)
     assert f"{in_ras} was turned from RAS to LPS" in " ".join(ras.said)
     assert "turned" not in " ".join(lps.said)
 
 
-def test_inputs_are_shown_under_given_names_or_kind_and_number(files):
+def test_inputs_of_a_view_have_given_names_or_kind_and_number(files):
     shown = wrap_inputs(open_inputs([files / "scan.nii.gz", files / "ras.ply", files / "labels.nii.gz"]), ["knee"])
     assert [each.name for each in shown] == ["knee", "mesh 2", "labels 3"]
 
 
-def test_labels_are_shown_within_their_scan_with_what_was_told(files):
+def test_label_map_of_a_view_is_shown_within_the_first_scan_with_its_remarks(files):
     opened = open_inputs([files / "scan.nii.gz", files / "labels.nii.gz"])
     _, labels = wrap_inputs(opened)
     assert isinstance(labels, ShownLabels) and labels.within == 1
     assert labels.said == opened[1].said
 
 
-def test_a_frame_is_said_by_the_caller_where_the_file_names_none(files):
-    opened = open_inputs([files / "plain.xyz"], ViewSettings(mesh_space="ras"))
-    assert isinstance(opened[0].subject, PointCloud)
-    assert np.allclose(opened[0].subject.points[:, :2], -scenes.make_cloud().points[:, :2], atol=1e-4)
-    assert "plain.xyz was turned from RAS to LPS" in opened[0].said
-    (assumed,) = open_inputs([files / "plain.xyz"])
-    assert any("taken as LPS" in text for text in assumed.said)
+def test_cloud_that_names_no_frame_is_read_in_the_given_one(files):
+    (opened,) = open_inputs([files / "plain.xyz"], ViewSettings(mesh_space="ras"))
+
+    assert isinstance(opened.subject, PointCloud)
+    assert np.allclose(opened.subject.points[:, :2], -scenes.make_cloud().points[:, :2], atol=1e-4)  # float32, mm
+    assert "plain.xyz was turned from RAS to LPS" in opened.said
 
 
-def test_label_map_of_the_settings_comes_last_and_needs_one_scan(files):
-    settings = ViewSettings(scan=MeshSettings(labels=LabelChoice(files / "labels.nii.gz")))
-    opened = open_inputs([files / "scan.nii.gz"], settings)
+def test_cloud_that_names_no_frame_is_taken_as_lps_with_a_remark(files):
+    (opened,) = open_inputs([files / "plain.xyz"])
+    assert any("taken as LPS" in text for text in opened.said)
+
+
+@pytest.fixture
+def with_labels(files):
+    return ViewSettings(scan=MeshSettings(labels=LabelChoice(files / "labels.nii.gz")))
+
+
+def test_label_map_of_the_settings_is_the_last_input_of_a_view(files, with_labels):
+    opened = open_inputs([files / "scan.nii.gz"], with_labels)
     assert [type(each.subject) for each in opened] == [Volume, LabelMap]
+
+
+def test_label_map_of_the_settings_may_be_the_only_input_of_a_view(with_labels):
+    assert [type(each.subject) for each in open_inputs([], with_labels)] == [LabelMap]
+
+
+def test_label_map_of_the_settings_is_refused_for_two_scans(files, with_labels):
     with refused(UsageError, 2):
-        open_inputs([files / "scan.nii.gz", files / "scan.nii.gz"], settings)
-    assert [type(each.subject) for each in open_inputs([], settings)] == [LabelMap]
+        open_inputs([files / "scan.nii.gz", files / "scan.nii.gz"], with_labels)
 
 
-def test_dicom_labels_are_an_input_too(real_data):
-    (opened,) = open_inputs([real_data / "seg_and_labels" / "liver.dcm"])
-    assert isinstance(opened.subject, LabelMap)
-    (scan,) = open_inputs([real_data / "seg_and_labels" / "enhanced_24x38x3"])
-    assert isinstance(scan.subject, Volume)
+@pytest.mark.parametrize(
+    ("name", "kind"), [("liver.dcm", LabelMap), ("enhanced_24x38x3", Volume)], ids=["segmentation", "scan"]
+)
+def test_dicom_segmentation_or_scan_of_real_data_is_an_input_of_a_view(real_data, name, kind):
+    (opened,) = open_inputs([real_data / "seg_and_labels" / name])
+    assert isinstance(opened.subject, kind)
+
+
+def test_dicom_segmentation_with_overlapping_labels_is_refused_by_a_view(real_data):
     with refused(RefusedInputError, "overlap"):
         open_inputs([real_data / "seg_and_labels" / "partial_overlaps.dcm"])
 
 
-def test_a_scan_is_cropped_and_masked_as_it_is_asked_for(files):
+def test_scan_of_a_view_is_cropped_and_masked_as_its_settings_say(files):
     settings = ViewSettings(scan=MeshSettings(between=(205.0, 215.0), field_of_view=15.0))
     (opened,) = open_inputs([files / "scan.nii.gz"], settings)
     assert isinstance(opened.subject, Volume) and opened.subject.shape_ijk[2] < scenes.SHAPE[0]
     assert any("is air now" in text for text in opened.said)
 
 
-def test_inputs_are_told_one_by_one_meshes_before_scans(files):
+def test_inputs_of_a_view_are_ready_one_by_one_meshes_before_scans(files):
     told = []
     open_inputs([files / "scan.nii.gz", files / "lps.stl"], ready=lambda each: told.append(type(each.subject)))
     assert told == [Mesh, Volume]
