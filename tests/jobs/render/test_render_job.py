@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,12 @@ from variants import daily, daily_rows
 
 from clrecon.errors import DeviceError, OutputError, RefusedInputError, UsageError
 from clrecon.jobs.render.job import PictureFiles, make_pictures, name_view, path_of
-from clrecon.jobs.render.picture_taker import read_function
+from clrecon.jobs.render.picture_taker import PictureTaker, read_function
 from clrecon.jobs.render.settings import LabelLook, RenderSettings, Turntable
+from clrecon.labels import LabelMap
+from clrecon.labels.label_map import encode_nifti
 from clrecon.proof.phantom import PhantomSettings, write_phantom
+from clrecon.reading import read_volume
 from clrecon.rendering.pictures.styles import Projection, VolumeLook
 
 SIZE = (48, 40)
@@ -35,28 +38,49 @@ def sphere(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, An
     return folder, write_phantom(folder, settings)
 
 
-def test_a_sphere_is_a_disc_of_its_size_from_every_side(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
-    folder, truth = sphere
-    surface = truth["surface"]
-    files = PictureFiles(tmp_path / "a.png", depth=tmp_path / "d.npy", report=tmp_path / "r.json")
+@pytest.fixture(scope="module")
+def views_of_sphere(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path_factory: Any) -> tuple[Path, Any]:
+    """The folder with r.json and the depths d_VIEW.npy of the sphere from three sides, and the report."""
+    folder = tmp_path_factory.mktemp("views")
+    files = PictureFiles(folder / "a.png", depth=folder / "d.npy", report=folder / "r.json")
     settings = RenderSettings.of(views=("anterior", "left", "40,-25"), size=SIZE, device=str(device.index))
-    report = make_pictures(folder, files, settings)
-    assert json.loads((tmp_path / "r.json").read_text()) == json.loads(json.dumps(report))
+    return folder, make_pictures(sphere[0], files, settings)
+
+
+def test_sphere_is_a_disc_of_its_area_from_every_side(views_of_sphere: tuple[Path, Any], sphere: Any) -> None:
+    folder, report = views_of_sphere
+    radius_mm = sphere[1]["surface"]["radius_mm"]
+
+    areas = [
+        np.isfinite(np.load(folder / f"d_{picture['name']}.npy")).sum() * picture["pixel_mm"] ** 2
+        for picture in report["pictures"]
+    ]
+
+    assert areas == [pytest.approx(np.pi * radius_mm**2, rel=0.08)] * 3  # pixels of a tenth of the radius
+
+
+def test_least_depth_of_a_sphere_is_that_of_its_nearest_point_from_every_side(
+    views_of_sphere: tuple[Path, Any], sphere: Any
+) -> None:
+    folder, report = views_of_sphere
+    surface = sphere[1]["surface"]
+
     for picture in report["pictures"]:
-        depth = np.load(tmp_path / f"d_{picture['name']}.npy")
-        hit = np.isfinite(depth)
-        area = hit.sum() * picture["pixel_mm"] ** 2
-        assert area == pytest.approx(np.pi * surface["radius_mm"] ** 2, rel=0.08)
-        position, focal = (np.array(picture["camera"][f"{what}_lps_mm"]) for what in ("position", "focal_point"))
+        camera = picture["camera"]
+        position, focal = np.array(camera["position_lps_mm"]), np.array(camera["focal_point_lps_mm"])
         forward = (focal - position) / np.linalg.norm(focal - position)
-        nearest = (np.array(surface["center_lps_mm"]) - position) @ forward - surface["radius_mm"]
-        assert float(np.nanmin(depth)) == pytest.approx(nearest, abs=0.7)
+        nearest_mm = (np.array(surface["center_lps_mm"]) - position) @ forward - surface["radius_mm"]
+        depth = np.load(folder / f"d_{picture['name']}.npy")
+        assert float(np.nanmin(depth)) == pytest.approx(nearest_mm, abs=0.7)  # voxels of up to 1 mm
+
+
+def test_written_report_of_pictures_is_the_returned_one(views_of_sphere: tuple[Path, Any]) -> None:
+    folder, report = views_of_sphere
+    assert json.loads((folder / "r.json").read_text()) == json.loads(json.dumps(report))
 
 
 @pytest.mark.parametrize("mode", daily(1, ["dvr", "slice"]))
-def test_views_have_scales_of_their_own_until_zoom_makes_them_one(
+def test_views_fit_scales_of_their_own_which_zoom_makes_one(
     mode: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     files = PictureFiles(tmp_path / "a.png")
@@ -69,24 +93,47 @@ def test_views_have_scales_of_their_own_until_zoom_makes_them_one(
         assert alone["pictures"][0]["pixel_mm"] == pytest.approx(largest, rel=1e-4)
 
 
-def test_report_of_pictures_has_mode_device_volume_seconds_and_sizes(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
-    files = PictureFiles(tmp_path / "a.png", turntable=tmp_path / "frames", depth=tmp_path / "a.npy")
+@pytest.fixture(scope="module")
+def mip_and_turntable(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path_factory: Any) -> tuple[Path, Any]:
+    """The folder of a.png, a.npy and two frames in frames/ of a maximum intensity projection, and the report."""
+    folder = tmp_path_factory.mktemp("mip")
+    files = PictureFiles(folder / "a.png", turntable=folder / "frames", depth=folder / "a.npy")
     settings = RenderSettings.of(
         "mip", window=(-100, 100), size=SIZE, turntable=Turntable(2), device=str(device.index), memory=10**9
     )
-    report = make_pictures(sphere[0], files, settings)
+    return folder, make_pictures(sphere[0], files, settings)
+
+
+def test_report_of_pictures_has_the_names_of_the_contract(mip_and_turntable: tuple[Path, Any]) -> None:
+    _, report = mip_and_turntable
+
+    assert set(report) == names_in("clrecon render INPUT")
+    of_picture = set(report["pictures"][0])
+    optional = {"depth_output", "values_output"}
+    assert of_picture | optional == names_in("clrecon render INPUT", "For each picture:")
+
+
+def test_report_of_pictures_has_mode_device_memory_and_tilt(mip_and_turntable: tuple[Path, Any], device: Any) -> None:
+    _, report = mip_and_turntable
+
     assert (report["mode"], report["device"], report["memory_allowed_bytes"]) == ("mip", device.label, 10**9)
-    assert report["volume"]["tilt_deg"] == pytest.approx(15.0, abs=1e-3)
-    seconds = dict(report["seconds"])
-    assert seconds.pop("total") == pytest.approx(sum(seconds.values()), abs=0.01)
-    assert report["turntable"]["output"]["bytes"] == sum(
-        path.stat().st_size for path in (tmp_path / "frames").iterdir()
-    )
+    assert report["volume"]["tilt_deg"] == pytest.approx(15.0, abs=1e-3)  # directions of 9 decimals
 
 
-def test_progress_tells_the_stages_of_pictures_in_order(
+def test_times_of_pictures_sum_to_the_total(mip_and_turntable: tuple[Path, Any]) -> None:
+    seconds = dict(mip_and_turntable[1]["seconds"])
+    total = seconds.pop("total")
+    assert total == pytest.approx(sum(seconds.values()), abs=0.01)  # each is rounded to 0.1 ms
+
+
+def test_report_of_a_turntable_has_the_bytes_of_its_frames(mip_and_turntable: tuple[Path, Any]) -> None:
+    folder, report = mip_and_turntable
+    sizes = [path.stat().st_size for path in (folder / "frames").iterdir()]
+    assert len(sizes) == 2
+    assert report["turntable"]["output"]["bytes"] == sum(sizes)
+
+
+def test_progress_of_pictures_names_its_stages_in_order_and_counts_frames(
     device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     stages: list[tuple[str, int, int]] = []
@@ -97,90 +144,131 @@ def test_progress_tells_the_stages_of_pictures_in_order(
     assert [step for step in stages if step[0] == "frames"] == [("frames", done, 3) for done in range(4)]
 
 
-def test_pictures_refuse_outputs_then_files_then_device_before_the_input(tmp_path: Path) -> None:
-    nowhere = tmp_path / "nowhere"
-    bad = RenderSettings.of(device="abacus", transfer_function=str(tmp_path / "none.json"))
-    with refused(OutputError, "nowhere"):
-        make_pictures(nowhere, PictureFiles(nowhere / "a.png"), bad)
-    with refused(UsageError, "none.json"):
-        make_pictures(nowhere, PictureFiles(tmp_path / "a.png"), bad)
-    with refused(DeviceError, "abacus"):
-        make_pictures(nowhere, PictureFiles(tmp_path / "a.png"), RenderSettings.of(device="abacus"))
+@pytest.mark.parametrize(
+    ("output", "function", "error", "fact"),
+    [
+        pytest.param("nowhere/a.png", "none.json", OutputError, "nowhere", id="output folder first"),
+        pytest.param("a.png", "none.json", UsageError, "none.json", id="then files of settings"),
+        pytest.param("a.png", None, DeviceError, "abacus", id="then the device"),
+    ],
+)
+def test_pictures_of_a_missing_scan_are_refused_for_other_faults_before_it(
+    output: str, function: str | None, error: type[Exception], fact: str, tmp_path: Path
+) -> None:
+    settings = RenderSettings.of(device="abacus", transfer_function=function and str(tmp_path / function))
+
+    with refused(error, fact):
+        make_pictures(tmp_path / "no scan", PictureFiles(tmp_path / output), settings)
+
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("fails", ["encode_floats", "stage_report", "stage_animation", "second view", "commit"])
-def test_a_step_that_fails_leaves_the_old_files(
-    fails: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def fail(*_: Any, **__: Any) -> Any:
+    raise OutputError("the disk is full")
+
+
+@pytest.mark.parametrize(
+    "failing_step",
+    [
+        "clrecon.jobs.render.job.encode_floats",
+        "clrecon.jobs.run.stage_report",
+        "clrecon.jobs.render.job.stage_animation",
+        "clrecon.system.files.StagedFile.commit",
+    ],
+    ids=["depths", "report", "movie", "last step"],
+)
+def test_older_files_of_a_picture_stay_where_one_of_them_cannot_be_written(
+    failing_step: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names = {"picture": "a_left.png", "depth": "a_left.npy", "report": "a.json", "turntable": "a.gif"}
-    for name in names.values():
+    names = ["a.png", "a.npy", "a.json", "a.gif"]
+    for name in names:
         (tmp_path / name).write_bytes(b"old")
-    views = ("left", "right") if fails == "second view" else ("left",)
-    moving = None if fails == "second view" else tmp_path / "a.gif"
-    stem = "a" if fails == "second view" else "a_left"
-    files = PictureFiles(tmp_path / f"{stem}.png", tmp_path / f"{stem}.npy", None, moving, tmp_path / "a.json")
-    settings = RenderSettings.of(
-        views=views, size=SIZE, turntable=Turntable(2) if moving else None, device=str(device.index)
-    )
+    picture, depth, report, movie = (tmp_path / name for name in names)
+    settings = RenderSettings.of(views=("left",), size=SIZE, turntable=Turntable(2), device=str(device.index))
 
-    def fail(*_: Any, **__: Any) -> Any:
-        raise OutputError("the disk is full")
-
-    if fails == "second view":
-        from clrecon.jobs.render.picture_taker import PictureTaker
-
-        real = PictureTaker.take_view
-        monkeypatch.setattr(
-            PictureTaker, "take_view", lambda taker, view: fail() if view == "right" else real(taker, view)
-        )
-    else:
-        home = {
-            "encode_floats": "clrecon.jobs.render.job.encode_floats",
-            "stage_report": "clrecon.jobs.run.stage_report",
-            "stage_animation": "clrecon.jobs.render.job.stage_animation",
-            "commit": "clrecon.system.files.StagedFile.commit",
-        }[fails]
-        monkeypatch.setattr(home, fail)
+    monkeypatch.setattr(failing_step, fail)
     with refused(OutputError, "full"):
-        make_pictures(sphere[0], files, settings)
-    kept = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    assert kept == dict.fromkeys(names.values(), b"old")
+        make_pictures(sphere[0], PictureFiles(picture, depth, None, movie, report), settings)
+
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == dict.fromkeys(names, b"old")
 
 
-def test_a_folder_of_frames_waits_for_the_report(
+def test_older_picture_of_a_first_view_stays_where_the_second_cannot_be_taken(
     device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    frames = tmp_path / "frames"
+    (tmp_path / "a_left.png").write_bytes(b"old")
+    settings = RenderSettings.of(views=("left", "right"), size=SIZE, device=str(device.index))
+    take_view = PictureTaker.take_view
+
+    monkeypatch.setattr(
+        PictureTaker, "take_view", lambda taker, view: fail() if view == "right" else take_view(taker, view)
+    )
+    with refused(OutputError, "full"):
+        make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), settings)
+
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a_left.png": b"old"}
+
+
+@pytest.fixture
+def two_frames(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> tuple[Path, RenderSettings]:
+    """The folder of a turntable of two frames, and settings for one of three."""
     settings = RenderSettings.of(size=SIZE, turntable=Turntable(2), device=str(device.index))
-    make_pictures(sphere[0], PictureFiles(turntable=frames), settings)
+    make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "frames"), settings)
+    return tmp_path / "frames", replace(settings, turntable=Turntable(3), views=("left",))
+
+
+def test_older_folder_of_frames_stays_where_the_report_cannot_be_written(
+    two_frames: tuple[Path, RenderSettings], sphere: tuple[Path, dict[str, Any]], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    frames, settings = two_frames
     older = {path.name: path.read_bytes() for path in frames.iterdir()}
 
-    def fail(*_: Any) -> Any:
-        raise OutputError("the disk is full")
+    monkeypatch.setattr("clrecon.jobs.run.stage_report", fail)
+    with refused(OutputError, "full"):
+        make_pictures(sphere[0], PictureFiles(turntable=frames, report=tmp_path / "a.json"), settings)
 
-    other = replace(settings, turntable=Turntable(3), views=("left",))
-    with monkeypatch.context() as patch, refused(OutputError, "full"):
-        patch.setattr("clrecon.jobs.run.stage_report", fail)
-        make_pictures(sphere[0], PictureFiles(turntable=frames, report=tmp_path / "a.json"), other)
     assert {path.name: path.read_bytes() for path in frames.iterdir()} == older
     assert [path.name for path in tmp_path.iterdir()] == ["frames"]
-    make_pictures(sphere[0], PictureFiles(turntable=frames, report=tmp_path / "a.json"), other)
+
+
+def test_folder_of_frames_is_replaced_together_with_the_report(
+    two_frames: tuple[Path, RenderSettings], sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    frames, settings = two_frames
+
+    make_pictures(sphere[0], PictureFiles(turntable=frames, report=tmp_path / "a.json"), settings)
+
     assert sorted(path.name for path in frames.iterdir()) == [f"frame_000{number}.png" for number in range(3)]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.json", "frames"]
 
 
-def test_the_report_calls_a_folder_a_folder(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["v1.2/", "v1.2"], ids=["slash at the end", "no slash"])
+def test_folder_of_frames_with_a_dot_in_its_name_is_reported_as_a_folder(
+    name: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    (tmp_path / "v1.2").mkdir()
     settings = RenderSettings.of(size=SIZE, turntable=Turntable(2), background="transparent", device=str(device.index))
-    made = make_pictures(sphere[0], PictureFiles(turntable=f"{tmp_path}/v1.2/"), settings)
-    again = make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "v1.2"), settings)
-    assert [report["turntable"]["output"]["format"] for report in (made, again)] == ["folder", "folder"]
-    (tmp_path / "v1.2").rename(tmp_path / "v1.gif")
-    assert make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "v1.gif"), settings)["turntable"]["frames"] == 2
+
+    report = make_pictures(sphere[0], PictureFiles(turntable=f"{tmp_path}/{name}"), settings)
+
+    assert report["turntable"]["output"]["format"] == "folder"
+
+
+def test_earlier_folder_of_frames_named_as_a_movie_takes_new_frames(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    settings = RenderSettings.of(size=SIZE, turntable=Turntable(2), background="transparent", device=str(device.index))
+    make_pictures(sphere[0], PictureFiles(turntable=f"{tmp_path}/frames/"), settings)
+    (tmp_path / "frames").rename(tmp_path / "v1.gif")
+
+    report = make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "v1.gif"), settings)
+
+    assert report["turntable"]["frames"] == len(list((tmp_path / "v1.gif").iterdir())) == 2
 
 
 @pytest.mark.skipif(os.name != "posix", reason="the limit of open files is that of POSIX systems")
-def test_many_views_raise_the_limit_of_open_files(
+def test_more_views_than_open_files_are_allowed_are_written_where_the_limit_can_be_raised(
     device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     import resource
@@ -196,7 +284,7 @@ def test_many_views_raise_the_limit_of_open_files(
     assert len(report["pictures"]) == 60 and len(list(tmp_path.iterdir())) == 120
 
 
-def test_nothing_else_goes_into_the_folder_of_frames(tmp_path: Path) -> None:
+def test_report_within_the_folder_of_frames_is_refused(tmp_path: Path) -> None:
     (tmp_path / "frames").mkdir()
     files = PictureFiles(turntable=tmp_path / "frames", report=tmp_path / "frames" / "a.json")
     with refused(UsageError, "frames", "report"):
@@ -204,85 +292,136 @@ def test_nothing_else_goes_into_the_folder_of_frames(tmp_path: Path) -> None:
     assert list((tmp_path / "frames").iterdir()) == []
 
 
-def test_a_volume_in_slabs_is_the_same_picture(
+def test_picture_of_a_volume_in_slabs_is_that_of_the_whole(
     device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
-    found = []
-    for memory in (None, 130_000):
+    def draw_with(memory: int | None) -> tuple[int, np.ndarray]:
         settings = RenderSettings.of(size=SIZE, views=("30,20",), device=str(device.index), memory=memory)
         report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), settings)
-        found.append((report["pictures"][0]["slabs"], np.asarray(Image.open(tmp_path / "a.png")).astype(int)))
-    assert found[0][0] == 1 < found[1][0]
-    assert np.abs(found[0][1] - found[1][1]).max() <= 2
+        return report["pictures"][0]["slabs"], np.asarray(Image.open(tmp_path / "a.png")).astype(int)
+
+    slabs_of_whole, whole = draw_with(memory=None)
+    slabs, in_slabs = draw_with(memory=130_000)
+
+    assert slabs_of_whole == 1
+    assert slabs > 1
+    assert np.abs(in_slabs - whole).max() <= 2  # of 255: rounding at the borders of slabs
 
 
-def test_an_x_ray_is_a_sum_in_mm_of_water(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    """The window runs over the rays that meet the body, and is in mm of water where it is given too."""
+def test_x_ray_is_a_sum_in_mm_of_water_with_a_window_within_its_values(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    settings = RenderSettings.of(preset="x-ray", size=SIZE, device=str(device.index))
+
+    report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy"), settings)
+
+    picture, most_mm = report["pictures"][0], float(np.load(tmp_path / "v.npy").max())
+    assert report["mode"] == "drr"
+    assert (picture["values_hu"], picture["window_hu"]) == (None, None)
+    assert picture["values_mm_water"] == [0.0, pytest.approx(most_mm)]
+    low, high = picture["window_mm_water"]
+    assert 0.05 * most_mm < low < high <= most_mm  # of the rays that meet the body
+
+
+def test_given_window_of_an_x_ray_is_in_mm_of_water(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
     files = PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy")
     settings = RenderSettings.of(preset="x-ray", size=SIZE, device=str(device.index))
-    report = make_pictures(sphere[0], files, settings)
-    picture, values = report["pictures"][0], np.load(tmp_path / "v.npy")
-    most = float(values.max())
-    assert report["mode"] == "drr" and picture["values_hu"] is None and picture["window_hu"] is None
-    assert picture["values_mm_water"] == [0.0, pytest.approx(most)]
-    low, high = picture["window_mm_water"]
-    assert 0.05 * most < low < high <= most
-    windowed = replace(settings, style=Projection("drr", window=(0.0, 2.0 * most)))
-    told = make_pictures(sphere[0], files, windowed)["pictures"][0]
-    assert told["window_mm_water"] == [0.0, pytest.approx(2.0 * most)]
-    assert np.asarray(Image.open(tmp_path / "a.png").convert("L")).max() in (127, 128)
+    make_pictures(sphere[0], files, settings)
+    twice_the_most_mm = 2.0 * float(np.load(tmp_path / "v.npy").max())
+
+    windowed = replace(settings, style=Projection("drr", window=(0.0, twice_the_most_mm)))
+    picture = make_pictures(sphere[0], files, windowed)["pictures"][0]
+
+    assert picture["window_mm_water"] == [0.0, pytest.approx(twice_the_most_mm)]
+    middle_grey = (127, 128)
+    assert np.asarray(Image.open(tmp_path / "a.png").convert("L")).max() in middle_grey
 
 
 FAR = (5000, 0, 0, 1, 0, 0)
 """A clip plane that leaves nothing of the scan."""
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    daily_rows(
-        4,
-        [
-            ({"preset": "x-ray", "clip_planes": [FAR]}, "black.*mm of water"),
-            ({"iso_value": 30000.0}, "mode surface"),
-            ({"clip_planes": [FAR]}, "mode dvr"),
-            ({"clip_planes": [FAR], "mode": "mip"}, "mode mip"),
-            ({"preset": "minip", "keep_air": True}, "picture is black.*do not keep it"),
-            ({"mode": "slice", "window": (20000, 30000)}, "picture is black"),
-            ({"mode": "slice", "window": (-30000, -20000)}, "picture is white"),
-        ],
-    ),
+EMPTY_LOOKS = daily_rows(
+    4,
+    [
+        ({"preset": "x-ray", "clip_planes": [FAR]}, "black.*mm of water"),
+        ({"iso_value": 30000.0}, "mode surface"),
+        ({"clip_planes": [FAR]}, "mode dvr"),
+        ({"clip_planes": [FAR], "mode": "mip"}, "mode mip"),
+        ({"preset": "minip", "keep_air": True}, "picture is black.*do not keep it"),
+        ({"mode": "slice", "window": (20000, 30000)}, "picture is black"),
+        ({"mode": "slice", "window": (-30000, -20000)}, "picture is white"),
+    ],
 )
-def test_a_picture_of_nothing_says_so(
+"""Settings of a picture that shows nothing, and what its warning says."""
+
+
+@pytest.mark.parametrize(("settings", "words"), EMPTY_LOOKS)
+def test_picture_that_shows_nothing_is_warned_of(
     device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, settings: dict[str, Any], words: str
 ) -> None:
     looks = RenderSettings.of(size=SIZE, device=str(device.index), **settings)
     report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), looks)
-    assert [text for text in report["warnings"] if re.search(words, text)]
-    if looks.mode != "slice":
-        turning = replace(looks, turntable=Turntable(2))
-        report = make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "b.gif"), turning)
-        assert [text for text in report["warnings"] if re.search(words, text)]
-    fine = make_pictures(
-        sphere[0], PictureFiles(tmp_path / "a.png"), RenderSettings.of(size=SIZE, device=str(device.index))
-    )
-    assert not [text for text in fine["warnings"] if "picture is" in text or "nothing" in text]
+    assert any(re.search(words, text) for text in report["warnings"])
 
 
-def test_views_name_their_files() -> None:
-    assert [name_view(view, ("left", "30,-5.50")) for view in ("left", "30,-5.50")] == ["left", "az30_el-5.5"]
+@pytest.mark.parametrize(("settings", "words"), EMPTY_LOOKS[:5])  # a slice does not turn
+def test_turntable_that_shows_nothing_is_warned_of(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, settings: dict[str, Any], words: str
+) -> None:
+    looks = RenderSettings.of(size=SIZE, turntable=Turntable(2), device=str(device.index), **settings)
+    report = make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "b.gif"), looks)
+    assert any(re.search(words, text) for text in report["warnings"])
+
+
+def test_picture_that_shows_a_sphere_has_no_warning_of_emptiness(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    settings = RenderSettings.of(size=SIZE, device=str(device.index))
+    report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), settings)
+    assert not any("picture is" in text or "nothing" in text for text in report["warnings"])
+
+
+def test_several_views_name_their_files_by_their_word_or_angles() -> None:
+    views = ("left", "30,-5.50")
+    assert [name_view(view, views) for view in views] == ["left", "az30_el-5.5"]
+    assert path_of("x/a.png", "left") == "x/a_left.png"
+
+
+def test_single_view_does_not_name_its_file() -> None:
     assert name_view("left", ("left",)) == ""
-    assert (path_of("x/a.png", "left"), path_of("x/a.png", "")) == ("x/a_left.png", "x/a.png")
+    assert path_of("x/a.png", "") == "x/a.png"
 
 
-def test_render_settings_choose_mode_preset_and_view() -> None:
-    assert [settings.mode for settings in (
-        RenderSettings.of(), RenderSettings.of(preset="x-ray"), RenderSettings.of(iso_value=0.0),
-        RenderSettings.of(curve="auto"), RenderSettings.of(preset="x-ray", mode="dvr"),
-    )] == ["dvr", "drr", "surface", "cpr", "dvr"]  # fmt: skip
-    assert (RenderSettings.of().preset_used, RenderSettings.of("mip").preset_used) == ("bone", None)
-    assert (RenderSettings.of("slice").views_used, RenderSettings.of().views_used) == (("axial",), ("anterior",))
+@pytest.mark.parametrize(
+    ("settings", "mode"),
+    [
+        ({}, "dvr"),
+        ({"preset": "x-ray"}, "drr"),
+        ({"iso_value": 0.0}, "surface"),
+        ({"curve": "auto"}, "cpr"),
+        ({"preset": "x-ray", "mode": "dvr"}, "dvr"),
+    ],
+)
+def test_mode_of_a_picture_follows_from_its_settings_where_it_is_not_given(settings: Any, mode: str) -> None:
+    assert RenderSettings.of(**settings).mode == mode
+
+
+@pytest.mark.parametrize(
+    ("mode", "preset", "views"),
+    [("dvr", "bone", ("anterior",)), ("mip", None, ("anterior",)), ("slice", None, ("axial",))],
+)
+def test_preset_and_view_by_default_follow_from_the_mode(mode: str, preset: str | None, views: tuple[str, ...]) -> None:
+    settings = RenderSettings.of(mode)
+    assert (settings.preset_used, settings.views_used) == (preset, views)
+
+
+def test_crop_of_a_picture_clips_its_rays() -> None:
     style = RenderSettings.of(clip_box=(-1, 1, -2, 2, 0, float("inf"))).style
-    assert isinstance(style, VolumeLook) and style.clip is not None
+    assert isinstance(style, VolumeLook)
+    assert len(style.clip.planes) == 5  # one side is open
 
 
 @pytest.mark.parametrize(
@@ -303,84 +442,157 @@ def test_render_settings_choose_mode_preset_and_view() -> None:
         ({"clip_box": (0, 1)}, "six numbers"),
     ],
 )
-def test_impossible_settings_are_refused(wrong: dict[str, Any], words: str) -> None:
+def test_impossible_settings_of_a_picture_are_refused(wrong: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         RenderSettings.of(**wrong)
 
 
-def test_impossible_labels_are_refused() -> None:
+def test_unknown_colour_of_a_label_in_a_picture_is_refused() -> None:
     with refused(UsageError, "octarine"):
         LabelLook("a.nii", {"L1": "octarine"})
+
+
+def test_opacity_of_a_label_above_1_is_refused() -> None:
     with refused(UsageError, "L1", 1.5):
         LabelLook("a.nii", {}, {"L1": 1.5})
 
 
-def test_functions_are_named_by_file_and_name(tmp_path: Path) -> None:
-    points = [{"hu": hu, "color": [1, 1, 1], "opacity": opacity} for hu, opacity in ((0, 0), (9, 1))]
+@pytest.fixture
+def glass_file(tmp_path: Path) -> Path:
+    """A transfer function of the name `glass`, in a file with a colon in its name."""
+    points = [{"hu": 0, "color": [1, 1, 1], "opacity": 0}, {"hu": 9, "color": [1, 1, 1], "opacity": 1}]
     content = {"format": "clrecon transfer function", "version": 1, "name": "glass", "points": points}
     path = tmp_path / "a:b.json"
     path.write_text(json.dumps(content))
-    for named in (str(path), f"{path}:glass"):
-        function = read_function(named)
-        assert function is not None and function.points[1, 0] == 9
+    return path
+
+
+@pytest.mark.parametrize("form", ["{path}", "{path}:glass"], ids=["file", "file and name"])
+def test_transfer_function_is_read_by_its_file_or_file_and_name(form: str, glass_file: Path) -> None:
+    function = read_function(form.format(path=glass_file))
+    assert function.points[:, 0].tolist() == [0.0, 9.0]
+
+
+def test_transfer_function_of_another_name_than_in_its_file_is_refused(glass_file: Path) -> None:
     with refused(UsageError, "glass"):
-        read_function(f"{path}:stone")
+        read_function(f"{glass_file}:stone")
+
+
+def test_file_without_a_transfer_function_is_refused(tmp_path: Path) -> None:
     (tmp_path / "bad.json").write_text("{}")
     with refused(RefusedInputError, "bad.json"):
         read_function(str(tmp_path / "bad.json"))
+
+
+def test_no_transfer_function_is_read_where_none_is_named() -> None:
     assert read_function(None) is None
 
 
-def test_slices_show_by_default_and_the_report_names_their_view(
+def test_slices_in_space_are_seen_obliquely_by_default_without_a_warning(
     device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     settings = RenderSettings.of("slices", size=SIZE, device=str(device.index))
+
     report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), settings)
-    assert report["pictures"][0]["hit_share"] > 0.1 and not [text for text in report["warnings"] if "edge-on" in text]
+
     assert report["pictures"][0]["view"] == "30,30"
+    assert report["pictures"][0]["hit_share"] > 0.1
+    assert not any("edge-on" in text for text in report["warnings"])
 
 
-def test_a_sheet_is_reported_with_its_slices_and_labels(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
-    from clrecon.labels import LabelMap
-    from clrecon.labels.label_map import encode_nifti
-    from clrecon.reading import read_volume
-
+@pytest.fixture
+def sheet_settings(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> RenderSettings:
+    """Settings of a sheet of six slices with a label map of what lies above 100 HU, in red."""
     volume = read_volume(sphere[0])
-    numbers = (volume.voxels > 100).astype(np.uint8)
-    ball = encode_nifti(LabelMap(numbers, volume.affine, {1: "ball"}), packed=True)
-    (tmp_path / "ball.nii.gz").write_bytes(ball)
+    above_100_hu = LabelMap((volume.voxels > 100).astype(np.uint8), volume.affine, {1: "ball"})
+    (tmp_path / "ball.nii.gz").write_bytes(encode_nifti(above_100_hu, packed=True))
     labels = LabelLook(str(tmp_path / "ball.nii.gz"), {"1": "#ff0000"})
-    settings = RenderSettings.of(sheet=6, labels=labels, letters=True, scale_bar=True, device=str(device.index))
-    assert settings.mode == "slice" and settings.size_used == (1600, 1200) and settings.is_sheet
-    report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy"), settings)
+    return RenderSettings.of(sheet=6, labels=labels, letters=True, scale_bar=True, device=str(device.index))
+
+
+def test_report_of_a_sheet_has_its_size_slices_and_colours_of_labels(
+    sheet_settings: RenderSettings, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    assert (sheet_settings.mode, sheet_settings.is_sheet, sheet_settings.size_used) == ("slice", True, (1600, 1200))
+
+    report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), sheet_settings)
+
     picture = report["pictures"][0]
-    assert picture["size"] == [1600, 1200] and len(picture["tiles"]) == 6 and picture["camera"] is None
+    assert picture["size"] == [1600, 1200]
+    assert len(picture["tiles"]) == 6
+    assert picture["camera"] is None
     assert [entry["color"] for entry in picture["labels"]] == ["#ff0000"]
-    image, values = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int), np.load(tmp_path / "v.npy")
-    assert ((image[..., 0] - image[..., 1]) > 30).sum() == pytest.approx((values > 100).sum(), rel=0.15)
+
+
+def test_red_pixels_of_a_sheet_are_those_of_its_label(
+    sheet_settings: RenderSettings, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    make_pictures(sphere[0], PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy"), sheet_settings)
+
+    image = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
+    is_red = (image[..., 0] - image[..., 1]) > 30
+    in_label = np.load(tmp_path / "v.npy") > 100  # HU
+    assert is_red.sum() == pytest.approx(in_label.sum(), rel=0.15)  # voxels of the label against interpolated HU
+
+
+def test_depths_of_a_sheet_are_refused(
+    sheet_settings: RenderSettings, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
     with refused(UsageError, "sheet", "depths"):
-        make_pictures(sphere[0], PictureFiles(tmp_path / "a.png", depth=tmp_path / "d.npy"), settings)
+        make_pictures(sphere[0], PictureFiles(tmp_path / "a.png", depth=tmp_path / "d.npy"), sheet_settings)
 
 
-def test_a_minimum_says_what_it_leaves_out_and_regions_go_too(device: Any, tmp_path: Path) -> None:
-    """A ball of tissue in air; a region leaves a part of it, and no air round that."""
-    folder = tmp_path / "ct"
-    truth = write_phantom(
-        folder, PhantomSettings(kind="sphere", size=(60, 60), slices=40, spacing=(2.0, 2.0, 2.0), noise=0, seed=1)
-    )
-    x, y, z = truth["surface"]["center_lps_mm"]
+@dataclass
+class DrawnMinimum:
+    """A minimum intensity projection of a ball of tissue in air: its report, and its values in HU."""
+
+    report: Any
+    values: np.ndarray
+
+    @property
+    def left_out(self) -> dict[str, Any]:
+        return self.report["pictures"][0]["left_out"]
+
+
+@pytest.fixture(scope="module")
+def draw_minimum(device: Any, tmp_path_factory: Any) -> Any:
+    """A function that draws the ball whole, or with a region: a box of 40 mm in its middle."""
+    folder = tmp_path_factory.mktemp("minimum")
+    ball = PhantomSettings(kind="sphere", size=(60, 60), slices=40, spacing=(2.0, 2.0, 2.0), noise=0, seed=1)
+    x, y, z = write_phantom(folder / "ct", ball)["surface"]["center_lps_mm"]
     box = f"box:{x - 20},{x + 20},{y - 20},{y + 20},{z - 20},{z + 20}"
-    found = []
-    for region in (None, [box]):
-        files = PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy")
-        settings = RenderSettings.of("minip", size=SIZE, device=str(device.index), region=region)
-        report = make_pictures(folder, files, settings)
-        values, said = np.load(tmp_path / "v.npy"), report["pictures"][0]["left_out"]
-        assert said["body"] and said["region"] == (region is not None)
-        assert any("is left out:" in text for text in report["warnings"]) == (region is not None)
-        assert np.nanmin(values) > -300.0 and report["volume"]["hu_range"][0] < -900.0
-        assert report["volume"]["hu_range"][1] < 5000.0
-        found.append((said["share"], int(np.isfinite(values).sum())))
-    assert 0.5 < found[0][0] < found[1][0] < 1.0 and found[1][1] > 20
+
+    def draw(has_region: bool) -> DrawnMinimum:
+        files = PictureFiles(folder / "a.png", values=folder / "v.npy")
+        settings = RenderSettings.of("minip", size=SIZE, device=str(device.index), region=[box] if has_region else None)
+        return DrawnMinimum(make_pictures(folder / "ct", files, settings), np.load(folder / "v.npy"))
+
+    return draw
+
+
+@pytest.mark.parametrize("has_region", [False, True], ids=["whole", "region"])
+def test_minimum_shows_tissue_and_leaves_out_the_air_about_it(has_region: bool, draw_minimum: Any) -> None:
+    drawn = draw_minimum(has_region)
+
+    assert np.nanmin(drawn.values) > -300.0
+    low, high = drawn.report["volume"]["hu_range"]
+    assert low < -900.0  # of the scan, which is read whole
+    assert high < 5000.0
+    assert drawn.left_out["body"]
+
+
+@pytest.mark.parametrize("has_region", [False, True], ids=["whole", "region"])
+def test_minimum_reports_and_warns_that_what_is_outside_of_a_region_is_left_out(
+    has_region: bool, draw_minimum: Any
+) -> None:
+    drawn = draw_minimum(has_region)
+
+    assert drawn.left_out["region"] == has_region
+    assert any("is left out:" in text for text in drawn.report["warnings"]) == has_region
+
+
+def test_minimum_with_a_region_leaves_out_more_than_without(draw_minimum: Any) -> None:
+    whole, region = draw_minimum(False), draw_minimum(True)
+
+    assert 0.5 < whole.left_out["share"] < region.left_out["share"] < 1.0
+    assert np.isfinite(region.values).sum() > 20  # pixels that show the region

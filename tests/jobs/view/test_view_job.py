@@ -20,6 +20,7 @@ MIDDLE = np.array([40.0, -25.0, -800.0])
 
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
+    """DOE_JANE.stl, a ball of 10 mm about `MIDDLE` in LPS, and b.ply in RAS, one of 5 mm, 30 mm to the left of it."""
     vertices, triangles = ball(10.0, 30)
     found = {name: tmp_path / name for name in ("DOE_JANE.stl", "b.ply", "none.stl", "empty.ply")}
     Mesh(vertices + MIDDLE, triangles).save(found["DOE_JANE.stl"])
@@ -33,23 +34,36 @@ def read_page(path: Path):
 
 
 @pytest.mark.unit
-def test_two_meshes_lie_where_they_are_and_the_turned_one_is_said(files, tmp_path, printed):
+def test_meshes_of_a_page_lie_at_their_places_in_lps_and_the_turned_one_is_named(files, tmp_path, printed):
     page = tmp_path / "both.html"
-    inputs = [str(files["DOE_JANE.stl"]), str(files["b.ply"])]
-    assert main(["view", *inputs, "--html", str(page), "--name", "bone", "--name", "screw"]) == 0
-    said = printed()
-    said.assert_output("RAS", "LPS")
+
+    assert main(["view", str(files["DOE_JANE.stl"]), str(files["b.ply"]), "--html", str(page)]) == 0
+
+    printed().assert_output("RAS", "LPS")
     facts, vertices, _, triangles = read_page(page)
-    assert [part["name"] for part in facts["parts"]] == ["bone", "screw"]
-    assert facts["parts"][0]["color"] != facts["parts"][1]["color"]
-    assert facts["parts"][0]["ml"] == pytest.approx(8.0 * facts["parts"][1]["ml"], rel=1e-3)
-    for part, middle in zip(facts["parts"], (MIDDLE, MIDDLE + (30.0, 0.0, 0.0)), strict=True):
-        own = vertices[triangles[part["first"] : part["first"] + part["count"]].reshape(-1)]
-        np.testing.assert_allclose((own.min(axis=0) + own.max(axis=0)) / 2, middle, atol=0.05)
+    first, second = (
+        vertices[triangles[part["first"] : part["first"] + part["count"]].reshape(-1)] for part in facts["parts"]
+    )
+    step_mm = 0.05  # of the coordinates on a page, and the facets of the balls
+    np.testing.assert_allclose((first.min(axis=0) + first.max(axis=0)) / 2, MIDDLE, atol=step_mm)
+    np.testing.assert_allclose((second.min(axis=0) + second.max(axis=0)) / 2, MIDDLE + (30, 0, 0), atol=step_mm)
 
 
 @pytest.mark.unit
-def test_names_of_files_are_not_on_the_page(files, tmp_path, printed):
+def test_meshes_of_a_page_have_their_given_names_colours_and_volumes(files, tmp_path):
+    page = tmp_path / "both.html"
+    names = ["--name", "bone", "--name", "screw"]
+
+    assert main(["view", str(files["DOE_JANE.stl"]), str(files["b.ply"]), "--html", str(page), *names]) == 0
+
+    bone, screw = read_page(page)[0]["parts"]
+    assert (bone["name"], screw["name"]) == ("bone", "screw")
+    assert bone["color"] != screw["color"]
+    assert bone["ml"] == pytest.approx(2**3 * screw["ml"], rel=1e-3)  # twice the radius
+
+
+@pytest.mark.unit
+def test_page_and_report_have_numbers_in_place_of_names_of_files(files, tmp_path, printed):
     page = tmp_path / "both.html"
     assert main(["view", str(files["DOE_JANE.stl"]), str(files["b.ply"]), "--html", str(page), "--json"]) == 0
     report = printed().report()
@@ -61,48 +75,59 @@ def test_names_of_files_are_not_on_the_page(files, tmp_path, printed):
     assert report["device"] is None
 
 
-def scan(tmp_path: Path) -> tuple[Path, Path]:
+def write_two_balls(tmp_path: Path) -> tuple[Path, Path]:
     """Two balls of 500 HU in air with 1 mm voxels, and a label map that names one of them."""
     k, j, i = np.indices((30, 32, 60)).astype(float)
     one, other = (np.sqrt((k - 15) ** 2 + (j - 16) ** 2 + (i - x) ** 2) for x in (15, 45))
     voxels = np.where(np.minimum(one, other + 3) < 11, 500, -1000).astype(np.int16)
     affine = np.eye(4)
-    Volume(voxels, affine).save(tmp_path / "scan.nii.gz")
+    Volume(voxels, affine).save(tmp_path / "write_two_balls.nii.gz")
     clrecon.write_volume(Volume(((one < 12) + 2 * (other < 9)).astype(np.int16), affine), tmp_path / "labels.nii.gz")
-    return tmp_path / "scan.nii.gz", tmp_path / "labels.nii.gz"
+    return tmp_path / "write_two_balls.nii.gz", tmp_path / "labels.nii.gz"
 
 
 @pytest.mark.opencl
-def test_a_scan_is_shown_by_its_components_and_with_labels_by_these(tmp_path, printed, device):
-    source, labels = scan(tmp_path)
+def test_page_of_a_scan_has_its_surface_by_components_with_their_volumes(tmp_path, printed, device):
+    source, _ = write_two_balls(tmp_path)
     page = tmp_path / "scan.html"
+
     assert main(["view", str(source), "--html", str(page), "--hu", "0"]) == 0
+
     facts = read_page(page)[0]
     assert [part["name"] for part in facts["parts"]] == ["part 1", "part 2"]
     mesh = clrecon.extract_isosurface(clrecon.read_volume(source), 0)
     assert facts["triangles"] == mesh.triangle_count
-    assert sum(part["ml"] for part in facts["parts"]) == pytest.approx(mesh.volume / 1000.0, rel=1e-5)
+    assert sum(part["ml"] for part in facts["parts"]) == pytest.approx(mesh.volume / 1000.0, rel=1e-5)  # float32
     assert facts["about"][0] == "Surface: iso value 0 HU."
     printed().assert_output(0)
-    options = ["--labels", str(labels), "--hu", "0", "--label-color", "2=#ff0000"]
-    assert main(["view", str(source), "--html", str(page), *options]) == 0
-    parts = read_page(page)[0]["parts"]
-    assert len(parts) == 2 and parts[1]["color"] == "#ff0000" != parts[0]["color"]
 
 
 @pytest.mark.opencl
-def test_page_shows_a_scan_and_a_mesh_and_says_that_they_lie_apart(tmp_path, files, printed, device):
+def test_page_of_a_scan_with_labels_has_a_part_of_each_in_its_colour(tmp_path, device):
+    source, labels = write_two_balls(tmp_path)
+    page = tmp_path / "scan.html"
+    options = ["--labels", str(labels), "--hu", "0", "--label-color", "2=#ff0000"]
+
+    assert main(["view", str(source), "--html", str(page), *options]) == 0
+
+    first, second = read_page(page)[0]["parts"]
+    assert second["color"] == "#ff0000"
+    assert first["color"] != "#ff0000"
+
+
+@pytest.mark.opencl
+def test_page_of_a_scan_and_a_mesh_apart_from_it_is_written_with_a_warning(tmp_path, files, printed, device):
     page = tmp_path / "both.html"
-    source = scan(tmp_path)[0]
+    source = write_two_balls(tmp_path)[0]
     assert main(["view", str(source), str(files["b.ply"]), "--html", str(page), "--hu", "0"]) == 0
     assert [part["name"] for part in read_page(page)[0]["parts"]] == ["surface 1", "surface 2"]
     printed().assert_error("lie")  # the boxes lie apart
 
 
 @pytest.mark.opencl
-def test_the_mesh_job_writes_pages_too(tmp_path, device):
+def test_mesh_command_writes_a_page(tmp_path, device):
     page = tmp_path / "mesh.html"
-    assert main(["mesh", str(scan(tmp_path)[0]), "-o", str(page), "--hu", "0", "--keep-largest", "1"]) == 0
+    assert main(["mesh", str(write_two_balls(tmp_path)[0]), "-o", str(page), "--hu", "0", "--keep-largest", "1"]) == 0
     assert [part["name"] for part in read_page(page)[0]["parts"]] == ["surface"]
 
 
@@ -124,7 +149,7 @@ def test_the_mesh_job_writes_pages_too(tmp_path, device):
         (["{a}", "--html", "{page}", "--label", "L1"], "--labels"),
     ],
 )
-def test_views_without_inputs_or_sense_are_refused(arguments, fact, files, tmp_path, printed):
+def test_wrong_usage_of_view_is_refused_in_one_line_and_writes_no_page(arguments, fact, files, tmp_path, printed):
     page = tmp_path / "page.html"
     filled = [word.format(a=files["DOE_JANE.stl"], page=page) for word in arguments]
     check_refused(["view", *filled], 3, fact, tmp_path, printed)
@@ -132,13 +157,23 @@ def test_views_without_inputs_or_sense_are_refused(arguments, fact, files, tmp_p
 
 
 @pytest.mark.unit
-def test_a_cut_mesh_leaves_the_older_page(files, tmp_path, printed):
+def test_page_of_a_mesh_file_that_ends_early_is_refused_and_an_older_page_stays(files, tmp_path, printed):
     page = tmp_path / "page.html"
     page.write_bytes(b"older")
     path = files["b.ply"]
     path.write_bytes(path.read_bytes()[:-100])
+
     check_refused(["view", str(path), "--html", str(page)], 4, "b.ply", tmp_path, printed)
-    check_refused(
-        ["view", str(files["DOE_JANE.stl"]), "--html", str(page), "--no-clobber"], 6, "exists", tmp_path, printed
-    )
+
+    assert page.read_bytes() == b"older"
+
+
+@pytest.mark.unit
+def test_existing_page_of_a_view_stays_with_no_clobber(files, tmp_path, printed):
+    page = tmp_path / "page.html"
+    page.write_bytes(b"older")
+
+    command = ["view", str(files["DOE_JANE.stl"]), "--html", str(page), "--no-clobber"]
+    check_refused(command, 6, "exists", tmp_path, printed)
+
     assert page.read_bytes() == b"older"
