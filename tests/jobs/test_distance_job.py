@@ -246,13 +246,11 @@ def test_wrong_usage_of_distance_is_refused_in_one_line_and_writes_nothing(
     check_refused(["distance", files["a.stl"], *given], code, fact, tmp_path, printed)
 
 
-def test_mesh_whose_triangles_have_no_area_is_refused(
-    files: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mesh_whose_triangles_have_no_area_is_refused(files: dict[str, str], tmp_path: Path, printed: Printer) -> None:
     vertices, triangles = box()
     flat = tmp_path / "flat.stl"
     Mesh(vertices * (0.0, 0.0, 1.0), triangles).save(flat)  # a line
 
     assert main(["distance", files["a.stl"], str(flat), "-q"]) == 2
 
-    assert "no triangle with an area" in capsys.readouterr().err
+    printed().assert_error("triangle", "area")

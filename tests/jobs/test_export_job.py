@@ -112,9 +112,7 @@ def test_report_of_an_export_has_the_gates_of_the_series_and_no_hash_of_it(tmp_p
     assert volume["series"]["uid_hash"] is None
 
 
-def test_exported_region_has_air_outside_of_it_and_words_that_say_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_exported_region_has_air_outside_of_it_and_words_that_say_so(tmp_path: Path, printed: Printer) -> None:
     scan = write_ct(tmp_path)
     voxels = read_volume(scan).voxels
     middle_hu = float(np.median(voxels))
@@ -123,9 +121,9 @@ def test_exported_region_has_air_outside_of_it_and_words_that_say_so(
 
     exported = sitk.GetArrayFromImage(sitk.ReadImage(str(tmp_path / "a.nrrd")))
     assert np.array_equal(exported, np.where(voxels >= middle_hu, voxels, -1024))
-    output, error = capsys.readouterr()
-    assert "region   what lies outside has -1024 HU" in output
-    assert "outside of the region" in error
+    said = printed()
+    said.assert_output("region", -1024, "HU")
+    said.assert_error("outside", "region")
 
 
 @pytest.fixture

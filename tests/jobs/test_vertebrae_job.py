@@ -92,10 +92,10 @@ def test_front_and_back_come_from_the_affine_where_no_patient_position_is_stated
 
 
 def test_vertebrae_without_a_landmark_are_said_to_be_numbers_from_the_head(
-    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scan: Path, tmp_path: Path, printed: Printer
 ) -> None:
     assert main(["vertebrae", str(scan), "-o", str(tmp_path / "a.nii.gz")]) == 0
-    assert "numbers, counted from the head" in capsys.readouterr().out
+    printed().assert_output("numbers", "counted", "head")
 
 
 def test_level_in_a_map_of_numbers_is_refused_and_they_are_listed(
@@ -113,7 +113,7 @@ NUMBER_OF_L1 = 20
 
 
 def test_vertebrae_with_a_first_level_are_the_same_voxels_with_the_names_of_levels(
-    scan: Path, written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scan: Path, written: Path, tmp_path: Path, printed: Printer
 ) -> None:
     path = tmp_path / "a.nii.gz"
 
@@ -123,7 +123,7 @@ def test_vertebrae_with_a_first_level_are_the_same_voxels_with_the_names_of_leve
     assert named.names == {20: "L1", 21: "L2", 22: "L3"}
     from_1_on = np.where(named.voxels, named.voxels - (NUMBER_OF_L1 - 1), 0)
     assert np.array_equal(from_1_on, read_labels(written / "a.nii.gz").voxels)
-    assert "numbers, counted from the head" not in capsys.readouterr().out
+    assert "counted from the head" not in printed().everything
 
 
 @pytest.fixture(scope="module")
@@ -193,12 +193,12 @@ def test_vertebra_of_low_confidence_is_left_out_with_its_reasons_and_exit_code_8
 @pytest.mark.usefixtures("doubted_middle")
 @pytest.mark.seconds
 def test_vertebra_of_low_confidence_is_kept_on_request_with_exit_code_8(
-    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scan: Path, tmp_path: Path, printed: Printer
 ) -> None:
     assert main(["vertebrae", str(scan), "-o", str(tmp_path / "a.nii.gz"), "--keep-unsure"]) == 8
 
     assert read_labels(tmp_path / "a.nii.gz").numbers == (1, 2, 3)
-    assert "is in the label map all the same" in capsys.readouterr().err
+    printed().assert_error("vertebra_2", 0.42)
 
 
 @pytest.mark.parametrize(

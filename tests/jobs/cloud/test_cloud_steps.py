@@ -11,6 +11,7 @@ import pytest
 from cloud_scans import AFFINE, BAND, make_voxels, run_with_report
 from contract_tables import names_in
 from label_files import write_nrrd
+from printed_text import Printer
 from refusals import refused
 
 import clrecon
@@ -47,7 +48,7 @@ def test_cloud_without_outliers_filtered_with_normals_is_that_of_the_functions(
 
 
 def test_steps_of_a_filtered_cloud_are_reported_in_their_order(
-    scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+    scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer
 ) -> None:
     assert cloud_command(scan, *FILTERED, "--report", str(tmp_path / "r.json"), output="out.npz") == 0
     report = json.loads((tmp_path / "r.json").read_text())
@@ -55,8 +56,7 @@ def test_steps_of_a_filtered_cloud_are_reported_in_their_order(
     assert steps == ["points", "outliers", "bilateral", "normals"] == sorted(steps, key=list(STEPS).index)
     assert report["removed"]["outlier"] > 0
     assert [gate["name"] for gate in report["gates"]] == ["points_kept_outliers"]
-    said = capsys.readouterr().out
-    assert "mm rms, at most" in said and "oriented by gradient" in said
+    printed().assert_output("rms", "oriented", "gradient")
 
 
 def test_doubtful_normals_of_far_slices_are_warned_of(
@@ -111,11 +111,10 @@ def test_report_of_a_thinned_cloud_with_surface_has_steps_outputs_and_names(
 
 
 def test_steps_of_a_thinned_cloud_with_surface_are_printed(
-    scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+    scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer
 ) -> None:
     assert cloud_command(scan, *THINNED, "--surface", str(tmp_path / "out.stl")) == 0
-    said = capsys.readouterr().out
-    assert "closed, " in said and "sparse cells: " in said and "spacing: " in said
+    printed().assert_output("closed", "sparse", "spacing")
 
 
 @pytest.fixture
@@ -132,22 +131,19 @@ LOSSY = ("--hu", BAND, "--cluster", "eps=1.5,min=5")
 
 
 def test_clustering_that_takes_more_than_half_of_the_points_as_noise_is_refused_and_writes_nothing(
-    noisy_scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+    noisy_scan: Path, tmp_path: Path, cloud_command: Any, printed: Printer
 ) -> None:
     assert cloud_command(noisy_scan, *LOSSY) == 4
 
-    error = capsys.readouterr().err
-    assert "points gone (" in error
-    assert "more than half is no noise" in error
-    assert "--allow-point-loss" in error
+    printed().assert_error("points", "half", "--allow-point-loss")
     assert {path.name for path in tmp_path.iterdir()} == {"scan.nrrd"}
 
 
 def test_clustering_that_takes_more_than_half_of_the_points_is_done_with_a_warning_where_it_is_allowed(
-    noisy_scan: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+    noisy_scan: Path, cloud_command: Any, printed: Printer
 ) -> None:
     assert cloud_command(noisy_scan, *LOSSY, "--allow-point-loss") == 0
-    assert "and was allowed" in capsys.readouterr().err
+    printed().assert_error("half", "allowed")
 
 
 def test_clustering_that_takes_too_much_is_refused_from_python_with_the_parameter(

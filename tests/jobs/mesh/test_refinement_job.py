@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
+from printed_text import Printer
 from variants import daily
 
 from clrecon.cli.main import main
@@ -213,13 +214,13 @@ def coarse_torus_command(device: Any, noisy_torus: Any, tmp_path: Path) -> list[
 @pytest.mark.release
 @pytest.mark.seconds
 def test_mesh_that_fails_a_gate_is_written_with_a_warning(
-    coarse_torus_command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    coarse_torus_command: list[str], tmp_path: Path, printed: Printer
 ) -> None:
     assert main(coarse_torus_command) == 0
 
-    printed = capsys.readouterr()
-    assert "clrecon: warning: gate deviation_p95 failed: distance from the surface before" in printed.err
-    assert "% of the triangles removed" in printed.out
+    said = printed()
+    said.assert_error("warning", "deviation_p95", "failed")
+    said.assert_output("triangles", "removed")
     assert (tmp_path / "a.stl").exists()
 
 
@@ -247,16 +248,16 @@ def test_strict_writes_the_same_mesh_with_exit_code_8_and_a_line_for_each_failed
 
 @pytest.mark.release
 def test_strict_command_with_a_good_mesh_ends_with_0_and_names_no_gate(
-    device: Any, noisy_torus: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    device: Any, noisy_torus: Any, tmp_path: Path, printed: Printer
 ) -> None:
     level = f"{noisy_torus[1]['iso_value_hu']:g}"
     arguments = ["mesh", str(noisy_torus[0]), "-o", str(tmp_path / "a.stl"), "--hu", level, "--keep-largest", "1"]
 
     assert main([*arguments, "--device", str(device.index), "--smooth", "--strict"]) == 0
 
-    printed = capsys.readouterr()
-    assert "smoothed (20 iterations; roughness " in printed.out
-    assert "gate" not in printed.err
+    said = printed()
+    said.assert_output("smoothed", 20)  # iterations
+    assert "gate" not in said.everything
 
 
 @pytest.mark.parametrize(

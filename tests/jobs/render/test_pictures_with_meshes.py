@@ -43,17 +43,17 @@ def files(tmp_path: Path) -> dict[str, Path]:
 
 
 def test_mesh_file_alone_is_rendered_in_mode_mesh(
-    device: Any, files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    device: Any, files: dict[str, Path], tmp_path: Path, printed: Printer
 ) -> None:
     out = tmp_path / "out.png"
     look = ["--mode", "mesh", "--size", "64x48", "--color", "orange"]
 
     assert main(["render", str(files["ras.ply"]), "-o", str(out), *look]) == 0
 
-    printed = capsys.readouterr()
     assert out.exists()
-    assert "mode mesh" in printed.out and "triangles" in printed.out
-    assert printed.err == ""
+    said = printed()
+    said.assert_output("mode", "mesh", "triangles")
+    assert said.error_lines == 0
 
 
 def test_picture_of_meshes_in_two_frames_is_centred_between_them(
@@ -200,10 +200,10 @@ def test_colour_by_values_that_the_mesh_has_not_is_refused(device: Any, walls_fi
 
 
 def test_colour_by_thickness_of_a_plain_mesh_is_refused_with_the_kind_that_has_it(
-    files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    files: dict[str, Path], tmp_path: Path, printed: Printer
 ) -> None:
     assert main(["render", str(files["lps.stl"]), "-o", str(tmp_path / "a.png"), "--color", "thickness"]) == 3
-    assert "a mesh fitted to the cortex has them" in capsys.readouterr().err
+    printed().assert_error("fitted", "cortex")
 
 
 def test_turntable_of_a_mesh_writes_the_given_number_of_frames(
