@@ -31,7 +31,7 @@ def target(tmp_path: Path) -> Path:
     return folder / "bone.stl"
 
 
-def check_refused(arguments: list[str], code: int, fact: str | float, target: Path, printed: Printer) -> None:
+def check_one_line_of_error(arguments: list[str], code: int, fact: str | float, target: Path, printed: Printer) -> None:
     found = main(arguments)
     said = printed()
     assert found == code, said
@@ -41,22 +41,22 @@ def check_refused(arguments: list[str], code: int, fact: str | float, target: Pa
         assert list(target.parent.iterdir()) == []
 
 
-def make_empty(folder: Path) -> None:
+def make_empty_folder(folder: Path) -> None:
     folder.mkdir()
 
 
-def make_text(folder: Path) -> None:
+def make_text_files(folder: Path) -> None:
     folder.mkdir()
     (folder / "notes.txt").write_text("no image here\n" * 50)
     (folder / "IM0001").write_text("x")
 
 
-def make_png(folder: Path) -> None:
+def make_picture(folder: Path) -> None:
     folder.mkdir()
     (folder / "picture.png").write_bytes(PNG)
 
 
-def make_truncated(folder: Path) -> None:
+def make_cut_slices(folder: Path) -> None:
     write_series(folder)
     for path in folder.iterdir():
         path.write_bytes(path.read_bytes()[:-700])
@@ -66,12 +66,12 @@ def make_one_slice(folder: Path) -> None:
     write_series(folder, sphere_voxels()[8:9])
 
 
-def make_two_equal(folder: Path) -> None:
+def make_two_series_of_one_size(folder: Path) -> None:
     write_series(folder, number=1)
     write_series(folder, number=2)
 
 
-def make_mr(folder: Path) -> None:
+def make_mr_series(folder: Path) -> None:
     write_series(folder, modality="MR")
 
 
@@ -80,29 +80,33 @@ def make_nothing(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "code", "fact"),
+    ("make_input", "code", "fact"),
     [
         (make_nothing, 2, "exist"),
-        (make_empty, 2, "DICOM"),
-        (make_text, 2, "DICOM"),
-        (make_png, 2, "DICOM"),
-        (make_truncated, 4, "s1_000.dcm"),
+        (make_empty_folder, 2, "DICOM"),
+        (make_text_files, 2, "DICOM"),
+        (make_picture, 2, "DICOM"),
+        (make_cut_slices, 4, "s1_000.dcm"),
         (make_one_slice, 4, "slice"),
-        (make_two_equal, 4, "--series"),
-        (make_mr, 2, "MR"),
+        (make_two_series_of_one_size, 4, "--series"),
+        (make_mr_series, 2, "MR"),
     ],
 )
 @pytest.mark.usefixtures("no_device_needed")
-def test_mesh_refuses_input(make: Any, code: int, fact: str, tmp_path: Path, target: Path, printed: Printer) -> None:
+def test_mesh_of_an_input_without_a_usable_ct_series_is_refused_in_one_line_and_writes_nothing(
+    make_input: Any, code: int, fact: str, tmp_path: Path, target: Path, printed: Printer
+) -> None:
     folder = tmp_path / "ein ordner mit ä"
-    make(folder)
+    make_input(folder)
     report = target.with_suffix(".json")
-    check_refused(["mesh", str(folder), "-o", str(target), "--report", str(report)], code, fact, target, printed)
+    check_one_line_of_error(
+        ["mesh", str(folder), "-o", str(target), "--report", str(report)], code, fact, target, printed
+    )
 
 
 @pytest.mark.usefixtures("no_device_needed")
-def test_a_truncated_file_leaves_the_old_mesh(tmp_path: Path, target: Path) -> None:
-    make_truncated(tmp_path / "ct")
+def test_slices_that_end_early_are_refused_and_an_older_mesh_stays(tmp_path: Path, target: Path) -> None:
+    make_cut_slices(tmp_path / "ct")
     target.write_bytes(b"the old mesh")
     assert main(["mesh", str(tmp_path / "ct"), "-o", str(target)]) == 4
     assert target.read_bytes() == b"the old mesh"
@@ -115,28 +119,32 @@ def test_folder_without_permission_is_refused(tmp_path: Path, target: Path, prin
     folder = write_series(tmp_path / "ct")
     folder.chmod(0)
     try:
-        check_refused(["mesh", str(folder), "-o", str(target)], 2, "read", target, printed)
+        check_one_line_of_error(["mesh", str(folder), "-o", str(target)], 2, "read", target, printed)
     finally:
         folder.chmod(0o700)
 
 
-def test_an_iso_value_above_all_voxels_is_refused(device: Any, tmp_path: Path, target: Path, printed: Printer) -> None:
+def test_iso_value_above_all_voxels_is_refused_with_the_highest_of_the_scan(
+    device: Any, tmp_path: Path, target: Path, printed: Printer
+) -> None:
     folder = write_series(tmp_path / "ct")
     arguments = ["mesh", str(folder), "-o", str(target), "--hu", "900", "--device", str(device.index)]
-    check_refused(arguments, 2, 700, target, printed)
+    check_one_line_of_error(arguments, 2, 700, target, printed)
 
 
-def test_a_constant_volume_has_no_surface(device: Any, tmp_path: Path, target: Path, printed: Printer) -> None:
+def test_volume_of_one_value_is_refused(device: Any, tmp_path: Path, target: Path, printed: Printer) -> None:
     folder = write_series(tmp_path / "ct", np.full((4, 9, 7), -1000, np.int16))
-    check_refused(
-        ["mesh", str(folder), "-o", str(target), "--device", str(device.index)], 4, 252,
+    check_one_line_of_error(
+        ["mesh", str(folder), "-o", str(target), "--device", str(device.index)], 4, 4 * 9 * 7,
         target, printed,
     )  # fmt: skip
 
 
-def test_an_unknown_device_is_refused(device: Any, tmp_path: Path, target: Path, printed: Printer) -> None:
+def test_unknown_device_is_refused_by_the_mesh_command(
+    device: Any, tmp_path: Path, target: Path, printed: Printer
+) -> None:
     arguments = ["mesh", str(tmp_path), "-o", str(target), "--device", "abacus"]
-    check_refused(arguments, 5, "abacus", target, printed)
+    check_one_line_of_error(arguments, 5, "abacus", target, printed)
 
 
 @pytest.mark.parametrize(
@@ -150,7 +158,7 @@ def test_an_unknown_device_is_refused(device: Any, tmp_path: Path, target: Path,
         ("a" * 300 + ".stl", 6, "long"),
     ],
 )
-def test_an_output_that_cannot_be_written_is_refused_before_all_work(
+def test_output_that_cannot_be_written_is_refused_before_the_input_is_looked_for(
     output: str, code: int, fact: str, tmp_path: Path, printed: Printer
 ) -> None:
     (tmp_path / "folder.stl").mkdir()
@@ -164,12 +172,14 @@ def test_an_output_that_cannot_be_written_is_refused_before_all_work(
 
 def test_report_in_a_missing_folder_is_refused(tmp_path: Path, target: Path, printed: Printer) -> None:
     report = str(tmp_path / "nowhere" / "report.json")
-    check_refused(["mesh", str(tmp_path), "-o", str(target), "--report", report], 6, "nowhere", target, printed)
+    check_one_line_of_error(
+        ["mesh", str(tmp_path), "-o", str(target), "--report", report], 6, "nowhere", target, printed
+    )
 
 
-def test_report_and_mesh_are_two_files(tmp_path: Path, target: Path, printed: Printer) -> None:
+def test_report_named_as_the_mesh_is_refused(tmp_path: Path, target: Path, printed: Printer) -> None:
     same = str(target)
-    check_refused(["mesh", str(tmp_path), "-o", same, "--report", same], 3, "same", target, printed)
+    check_one_line_of_error(["mesh", str(tmp_path), "-o", same, "--report", same], 3, "same", target, printed)
 
 
 @pytest.mark.parametrize(
@@ -191,8 +201,10 @@ def test_report_and_mesh_are_two_files(tmp_path: Path, target: Path, printed: Pr
         (["-q", "-v"], "-q/--quiet"),
     ],
 )
-def test_wrong_options_exit_with_3(extra: list[str], fact: str, tmp_path: Path, target: Path, printed: Printer) -> None:
-    check_refused(["mesh", str(tmp_path), "-o", str(target), *extra], 3, fact, target, printed)
+def test_wrong_option_of_mesh_is_refused_in_one_line_with_exit_code_3(
+    extra: list[str], fact: str, tmp_path: Path, target: Path, printed: Printer
+) -> None:
+    check_one_line_of_error(["mesh", str(tmp_path), "-o", str(target), *extra], 3, fact, target, printed)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +217,7 @@ def test_wrong_options_exit_with_3(extra: list[str], fact: str, tmp_path: Path, 
         (["phantom", "out", "--spacing", "1", "2"], "expected 3 arguments"),
     ],
 )
-def test_wrong_commands_exit_with_3_and_a_line(
+def test_wrong_command_is_refused_in_one_line_with_exit_code_3(
     arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(arguments) == 3
@@ -216,13 +228,18 @@ def test_wrong_commands_exit_with_3_and_a_line(
 
 
 @pytest.mark.parametrize(
-    ("make", "code", "words"),
-    [(make_empty, 2, "no DICOM"), (make_mr, 2, "MR"), (make_one_slice, 4, "slice"), (make_truncated, 4, "s1_0")],
+    ("make_input", "code", "words"),
+    [
+        (make_empty_folder, 2, "no DICOM"),
+        (make_mr_series, 2, "MR"),
+        (make_one_slice, 4, "slice"),
+        (make_cut_slices, 4, "s1_0"),
+    ],
 )
-def test_info_refuses_input(
-    make: Any, code: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_info_of_an_input_without_a_usable_ct_series_is_refused(
+    make_input: Any, code: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    make(tmp_path / "in")
+    make_input(tmp_path / "in")
     assert main(["info", str(tmp_path / "in")]) == code
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("clrecon: error: ")

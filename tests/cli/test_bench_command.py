@@ -30,7 +30,9 @@ def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_series(tmp_path_factory.mktemp("bench") / "Scan von Jane")
 
 
-def test_the_table_names_stages_kernels_and_the_peer(device: Any, ct: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_of_a_bench_names_scan_device_stages_kernels_and_peer(
+    device: Any, ct: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["bench", str(ct), "--hu", "-150", "--runs", "2", "--device", str(device.index)]) == 0
     out = capsys.readouterr().out
     assert "17 slices of 31 x 25, spacing 0.8 x 1.1 x 1.5 mm" in out
@@ -40,21 +42,28 @@ def test_the_table_names_stages_kernels_and_the_peer(device: Any, ct: Path, caps
         assert words in out
 
 
-def test_json_and_report_of_a_bench_have_the_names_of_the_contract(
+def test_json_and_report_of_a_bench_have_the_names_of_the_contract_and_none_of_the_patient(
     device: Any, ct: Path, tmp_path: Path, printed: Printer
 ) -> None:
     report = tmp_path / "b.json"
-    arguments = ["bench", str(ct), "--runs", "1", "--device", str(device.index), "--json", "--report", str(report)]
-    assert main(arguments) == 0
+    command = ["bench", str(ct), "--runs", "1", "--device", str(device.index), "--json", "--report", str(report)]
+
+    assert main(command) == 0
+
     said = printed()
     result = said.report()
-    assert CONTRACT <= set(result) and result == json.loads(report.read_text())
+    assert result == json.loads(report.read_text())
+    assert CONTRACT <= set(result)
     assert OF_A_DEVICE <= set(result["devices"][0])
-    assert result["iso_value_hu"] == 200.0
     assert find_words(said.everything) == []
 
 
-def test_a_failed_device_is_partly_done(
+def test_bench_without_an_iso_value_is_of_bone_at_200_hu(device: Any, ct: Path, printed: Printer) -> None:
+    assert main(["bench", str(ct), "--runs", "1", "--device", str(device.index), "--json"]) == 0
+    assert printed().report()["iso_value_hu"] == 200.0
+
+
+def test_bench_on_a_device_that_fails_is_partly_done_with_the_reason(
     device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("clrecon.opencl.list_devices", lambda: [BurntDevice(device), device])
@@ -75,7 +84,9 @@ def test_a_failed_device_is_partly_done(
         (["--iso", "3"], 3, "unrecognized"),
     ],
 )
-def test_wrong_arguments_are_one_line(extra: list[str], code: int, fact: str | int, ct: Path, printed: Printer) -> None:
+def test_wrong_argument_of_bench_is_refused_in_one_line(
+    extra: list[str], code: int, fact: str | int, ct: Path, printed: Printer
+) -> None:
     assert main(["bench", str(ct), *extra]) == code
     said = printed()
     assert (said.output_lines, said.error_lines) == (0, 1)
@@ -88,7 +99,7 @@ def test_bench_of_a_missing_input_names_it(device: Any, tmp_path: Path, printed:
     printed().assert_error("gone")
 
 
-def test_the_default_of_the_command_is_that_of_the_job() -> None:
+def test_bench_command_runs_as_often_by_default_as_the_function() -> None:
     from clrecon.proof.bench import DEFAULT_RUNS
 
     assert command._RUNS == DEFAULT_RUNS

@@ -19,41 +19,59 @@ def run_shell(arguments: str, redirect: str) -> subprocess.CompletedProcess[str]
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
 
 
-@pytest.mark.parametrize("redirect", [">&-", "2>&-", ">&- 2>&-"])
-def test_closed_streams_keep_the_exit_code(redirect: str, tmp_path: Path) -> None:
-    for arguments, code in ((f"info '{tmp_path}'", 2), ("mesh nowhere", 3)):
-        done = run_shell(arguments, redirect)
-        assert done.returncode == code, done.stderr
-        assert "Traceback" not in done.stderr
-        assert len(done.stderr.splitlines()) == int("2>&-" not in redirect)
-
-
+@pytest.mark.parametrize(("arguments", "code"), [("info '{empty}'", 2), ("mesh nowhere", 3)], ids=["info", "mesh"])
 @pytest.mark.parametrize(
-    "arguments", daily(2, ["--version", "info '{scan}'", "info '{scan}' --json", "completion bash"])
+    ("redirect", "error_lines"), [(">&-", 1), ("2>&-", 0), (">&- 2>&-", 0)], ids=["output", "errors", "both"]
 )
-def test_a_result_that_nobody_can_get_is_exit_code_6(arguments: str, tmp_path: Path) -> None:
-    scan = tmp_path / "scan"
-    if "scan" in arguments:
-        assert run_shell(f"phantom '{scan}' --size 16 --slices 4", "").returncode == 0
-    done = run_shell(arguments.format(scan=scan), ">&-")
+def test_refused_command_with_closed_streams_keeps_its_exit_code_and_its_line_where_there_is_one(
+    redirect: str, error_lines: int, arguments: str, code: int, tmp_path: Path
+) -> None:
+    done = run_shell(arguments.format(empty=tmp_path), redirect)
+
+    assert done.returncode == code
+    assert "Traceback" not in done.stderr
+    assert len(done.stderr.splitlines()) == error_lines
+
+
+WITH_A_RESULT = daily(2, ["--version", "info '{scan}'", "info '{scan}' --json", "completion bash"])
+
+
+@pytest.fixture(scope="module")
+def phantom(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("closed") / "scan"
+    assert run_shell(f"phantom '{folder}' --size 16 --slices 4", "").returncode == 0
+    return folder
+
+
+@pytest.mark.parametrize("arguments", WITH_A_RESULT)
+def test_result_for_a_closed_standard_output_ends_with_6_and_one_line(arguments: str, phantom: Path) -> None:
+    done = run_shell(arguments.format(scan=phantom), ">&-")
+
     assert (done.returncode, done.stdout) == (6, "")
     assert done.stderr.startswith("clrecon: error: cannot write to standard output: it is closed")
-    assert run_shell(arguments.format(scan=scan), "2>&-").returncode == 0
+
+
+@pytest.mark.parametrize("arguments", WITH_A_RESULT)
+def test_result_is_printed_with_a_closed_standard_error(arguments: str, phantom: Path) -> None:
+    done = run_shell(arguments.format(scan=phantom), "2>&-")
+
+    assert done.returncode == 0
+    assert done.stdout
 
 
 @pytest.mark.parametrize("arguments", ["-o -", "-o mesh.stl --report -"])
-def test_a_file_for_a_closed_stream_is_refused_before_any_work(arguments: str) -> None:
+def test_file_for_a_closed_standard_output_is_refused_before_any_work(arguments: str) -> None:
     done = run_shell(f"mesh nowhere {arguments}", ">&-")
     assert done.returncode == 6 and "standard output is closed" in done.stderr
 
 
-def test_nothing_is_missing_of_a_quiet_command(tmp_path: Path) -> None:
+def test_quiet_command_with_a_closed_standard_output_writes_its_files(tmp_path: Path) -> None:
     made = tmp_path / "made"
     done = run_shell(f"phantom '{made}' --size 16 --slices 4 -q", ">&-")
     assert (done.returncode, done.stderr) == (0, "") and len(list(made.iterdir())) == 5
 
 
-def test_files_are_not_written_over_a_closed_stream() -> None:
+def test_file_opened_with_closed_streams_does_not_become_standard_output() -> None:
     """The next file that is opened would be standard output for a library in C, and get its words."""
     code = (
         "import os; from clrecon.system.foreign_words import own_streams\n"

@@ -14,6 +14,7 @@ import tolerances
 from ct_files import ORIGIN, RADIUS_MM, SPACING, find_words, write_series
 from printed_text import Printer
 
+from clrecon.cli.common import Parser
 from clrecon.cli.main import COMMANDS, main
 
 CONTRACT = {
@@ -39,7 +40,7 @@ def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.every_device
 @pytest.mark.parametrize(("space", "signs"), [("lps", (1, 1, 1)), ("ras", (-1, -1, 1))])
-def test_mesh_writes_the_sphere_where_it_is(
+def test_mesh_of_a_sphere_lies_at_its_place_in_lps_and_ras(
     device: Any, space: str, signs: tuple[int, ...], ct: Path, tmp_path: Path
 ) -> None:
     output = tmp_path / "a.stl"
@@ -50,21 +51,35 @@ def test_mesh_writes_the_sphere_where_it_is(
     np.testing.assert_allclose(0.5 * (corners.min(axis=0) + corners.max(axis=0)), centre, atol=0.05)
 
 
-def test_mesh_reports_the_sphere_and_its_file(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
+def test_report_of_a_sphere_has_its_volume_bounds_and_file(
+    device: Any, ct: Path, tmp_path: Path, printed: Printer
+) -> None:
     output, report_path = tmp_path / "Kugel ä.stl", tmp_path / "a report.json"
-    arguments = ["mesh", str(ct), "-o", str(output), "--report", str(report_path), "--hu", "-150", "--space", "lps"]
-    assert main([*arguments, "--device", str(device.index)]) == 0
-    captured = printed()
-    assert captured.error_lines == 0
-    captured.assert_output(17, 31, 25, -150, "Kugel")
+    command = ["mesh", str(ct), "-o", str(output), "--report", str(report_path), "--hu", "-150", "-q"]
+
+    assert main([*command, "--device", str(device.index)]) == 0
+
     report, corners = json.loads(report_path.read_text()), read_stl(output)
     assert (report["closed"], report["manifold"], report["components"]) == (True, True, 1)
-    assert report["volume_ml"] == pytest.approx(TRUE_VOLUME_ML, rel=tolerances.CLI_SPHERE_VOLUME_SHARE)
     assert (report["iso_value_hu"], report["preset"], report["space"]) == (-150.0, None, "lps")
-    assert (report["output"], report["triangles"]) == ({"format": "stl", "bytes": output.stat().st_size}, len(corners))
+    assert report["volume_ml"] == pytest.approx(TRUE_VOLUME_ML, rel=tolerances.CLI_SPHERE_VOLUME_SHARE)
     bounds = [corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)]
-    np.testing.assert_allclose(report["bounds_mm"], bounds, atol=1e-4)
+    np.testing.assert_allclose(report["bounds_mm"], bounds, atol=1e-4)  # float32 in the file
+    assert report["triangles"] == len(corners)
+    assert report["output"] == {"format": "stl", "bytes": output.stat().st_size}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["Kugel ä.stl", "a report.json"]
+
+
+def test_words_of_mesh_have_the_shape_of_the_scan_the_iso_value_and_the_file(
+    device: Any, ct: Path, tmp_path: Path, printed: Printer
+) -> None:
+    assert (
+        main(["mesh", str(ct), "-o", str(tmp_path / "Kugel ä.stl"), "--hu", "-150", "--device", str(device.index)]) == 0
+    )
+
+    said = printed()
+    said.assert_output(17, 31, 25, -150, "Kugel")
+    assert said.error_lines == 0
 
 
 def test_report_of_a_mesh_has_the_names_of_the_contract_and_the_affine_of_the_scan(
@@ -81,7 +96,9 @@ def test_report_of_a_mesh_has_the_names_of_the_contract_and_the_affine_of_the_sc
     np.testing.assert_allclose(report["affine_ijk_to_lps_mm"], expected, atol=1e-9)
 
 
-def test_mesh_says_nothing_of_the_patient(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
+def test_files_and_words_of_mesh_do_not_name_the_patient(
+    device: Any, ct: Path, tmp_path: Path, printed: Printer
+) -> None:
     output, report = tmp_path / "a.ply", tmp_path / "a.json"
     arguments = ["mesh", str(ct), "-o", str(output), "--report", str(report), "-v", "--device", str(device.index)]
     assert main(arguments) == 0
@@ -89,7 +106,7 @@ def test_mesh_says_nothing_of_the_patient(device: Any, ct: Path, tmp_path: Path,
     assert find_words(written) == []
 
 
-def test_mesh_json_is_the_report(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
+def test_mesh_with_json_prints_its_report_alone(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
     output = tmp_path / "a.glb"
     assert main(["mesh", str(ct), "-o", str(output), "--json", "--device", str(device.index)]) == 0
     captured = printed()
@@ -99,26 +116,30 @@ def test_mesh_json_is_the_report(device: Any, ct: Path, tmp_path: Path, printed:
     assert captured.error_lines == 0
 
 
-def test_mesh_quiet_prints_nothing(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
+def test_quiet_mesh_prints_nothing_and_writes_its_file(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
     output = tmp_path / "a.obj"
     assert main(["mesh", str(ct), "-o", str(output), "-q", "--device", str(device.index)]) == 0
     assert printed().is_silent
     assert output.stat().st_size > 1000
 
 
-def test_mesh_without_report_measures_nothing(
+def test_mesh_without_a_report_is_not_measured(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
+    assert main(["mesh", str(ct), "-o", str(tmp_path / "a.stl"), "--device", str(device.index)]) == 0
+    assert "component" not in printed().everything
+
+
+def test_verbose_mesh_is_measured_and_its_components_are_printed(
     device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["mesh", str(ct), "-o", str(tmp_path / "a.stl"), "--device", str(device.index)]) == 0
-    assert "component" not in capsys.readouterr().out
     assert main(["mesh", str(ct), "-o", str(tmp_path / "a.stl"), "-v", "--device", str(device.index)]) == 0
-    captured = capsys.readouterr()
-    assert "1 component, closed, manifold" in captured.out
-    assert "measuring the mesh" in captured.err
+
+    printed = capsys.readouterr()
+    assert "1 component, closed, manifold" in printed.out
+    assert "measuring the mesh" in printed.err
 
 
 @pytest.mark.parametrize(("level", "said"), [(["--preset", "skin"], "-500 HU (preset skin)"), (["--hu", "-400"], "")])
-def test_skin_warns_that_a_face_shows(
+def test_mesh_of_skin_is_warned_of_as_one_that_can_show_a_face(
     device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], level: list[str], said: str
 ) -> None:
     assert main(["mesh", str(ct), "-o", str(tmp_path / "a.stl"), *level, "--device", str(device.index)]) == 0
@@ -127,28 +148,46 @@ def test_skin_warns_that_a_face_shows(
     assert captured.err.startswith("clrecon: warning: a surface of the skin can show a face")
 
 
-@pytest.mark.release
-def test_mesh_keeps_components_by_size(device: Any, tmp_path: Path, printed: Printer) -> None:
+@pytest.fixture(scope="module")
+def two_boxes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scan of a box of 5 x 10 x 12 voxels and one of 2 x 3 x 3, of 1.32 cubic mm each."""
     voxels = np.full((9, 20, 24), -1000, np.int16)
     voxels[2:7, 2:12, 2:14] = 800
     voxels[2:4, 15:18, 18:21] = 800
-    folder = write_series(tmp_path / "ct", voxels)
-    found = {}
-    for name, extra in {
-        "all": [], "largest": ["--keep-largest", "1"], "big": ["--min-volume", "0.1"],
-    }.items():  # fmt: skip
-        arguments = ["mesh", str(folder), "-o", str(tmp_path / "m.stl"), "--json", "--device", str(device.index)]
-        assert main([*arguments, *extra]) == 0
-        found[name] = printed().report()
-    assert [found[name]["components"] for name in found] == [2, 1, 1]
-    assert found["largest"]["volume_ml"] == found["big"]["volume_ml"] < found["all"]["volume_ml"]
-    arguments = ["mesh", str(folder), "-o", str(tmp_path / "none.stl"), "--min-volume", "50"]
-    assert main([*arguments, "--device", str(device.index)]) == 2
+    return write_series(tmp_path_factory.mktemp("boxes") / "ct", voxels)
+
+
+@pytest.mark.release
+def test_options_of_size_keep_the_large_component_of_two(
+    device: Any, two_boxes: Path, tmp_path: Path, printed: Printer
+) -> None:
+    def mesh_with(*options: str) -> tuple[int, float]:
+        command = ["mesh", str(two_boxes), "-o", str(tmp_path / "m.stl"), "--json", "--device", str(device.index)]
+        assert main([*command, *options]) == 0
+        report = printed().report()
+        return report["components"], report["volume_ml"]
+
+    components, ml = mesh_with()
+    largest, largest_ml = mesh_with("--keep-largest", "1")
+    big, big_ml = mesh_with("--min-volume", "0.1")
+
+    assert (components, largest, big) == (2, 1, 1)
+    assert largest_ml == big_ml < ml
+
+
+@pytest.mark.release
+def test_least_volume_above_all_components_is_refused_and_writes_nothing(
+    device: Any, two_boxes: Path, tmp_path: Path, printed: Printer
+) -> None:
+    command = ["mesh", str(two_boxes), "-o", str(tmp_path / "none.stl"), "--min-volume", "50"]
+
+    assert main([*command, "--device", str(device.index)]) == 2
+
     printed().assert_error("ml", 50)
     assert not (tmp_path / "none.stl").exists()
 
 
-def test_several_meshes_are_shown_one_by_one(
+def test_several_meshes_of_one_job_are_printed_one_by_one(
     device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["mesh", str(ct), "-o", str(tmp_path / "a.stl"), "--split", "-v", "--device", str(device.index)]
@@ -163,7 +202,9 @@ def test_several_meshes_are_shown_one_by_one(
 
 
 @pytest.mark.parametrize("spaced", [True, False])
-def test_seeds_may_be_negative(spaced: bool, device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
+def test_seed_with_a_negative_first_number_is_read_as_a_value(
+    spaced: bool, device: Any, ct: Path, tmp_path: Path, printed: Printer
+) -> None:
     centre = np.array(ORIGIN) + np.array(SPACING) * np.array([15, 12, 8])
     seeds = [",".join(f"{value:.3f}" for value in centre + [0, 0, step]) for step in (0, RADIUS_MM)]
     assert seeds[0].startswith("-")
@@ -179,34 +220,48 @@ def test_seeds_may_be_negative(spaced: bool, device: Any, ct: Path, tmp_path: Pa
     )
 
 
-def test_lists_of_negative_numbers_are_values() -> None:
-    from clrecon.cli.common import Parser
-
+@pytest.mark.parametrize(
+    ("words", "seeds", "rest"),
+    [
+        pytest.param(["--seed", "-1.5,2,3", "-q"], ["-1.5,2,3"], [], id="after a space"),
+        pytest.param(["--seed=-1e3,.5,0"], ["-1e3,.5,0"], [], id="after an equals sign"),
+        pytest.param(["--seed", "-.5,2"], ["-.5,2"], [], id="no digit before the point"),
+        pytest.param(["--", "--seed", "-4,5"], None, ["--seed", "-4,5"], id="after two dashes"),
+    ],
+)
+def test_list_that_begins_with_a_negative_number_is_the_value_of_its_option(
+    words: list[str], seeds: list[str] | None, rest: list[str]
+) -> None:
     parser = Parser()
     parser.add_argument("--seed", action="append")
     parser.add_argument("-q", action="store_true")
     parser.add_argument("rest", nargs="*")
-    options = parser.parse_args(["--seed", "-1.5,2,3", "-q", "--seed=-1e3,.5,0", "--", "--seed", "-4,5"])
-    assert (options.seed, options.q) == (["-1.5,2,3", "-1e3,.5,0"], True)
-    assert options.rest == ["--seed", "-4,5"]
-    assert parser.parse_args(["--seed", "-.5,2"]).seed == ["-.5,2"]
+
+    options = parser.parse_args(words)
+
+    assert (options.seed, options.rest, options.q) == (seeds, rest, "-q" in words)
 
 
-def test_open_leaves_the_border_open(device: Any, tmp_path: Path, printed: Printer) -> None:
+@pytest.mark.parametrize(("options", "is_closed"), [([], True), (["--open"], False)], ids=["by default", "--open"])
+def test_mesh_of_bone_that_leaves_the_scan_is_closed_unless_asked_to_be_open(
+    options: list[str], is_closed: bool, device: Any, tmp_path: Path, printed: Printer
+) -> None:
     voxels = np.full((5, 8, 9), -1000, np.int16)
-    voxels[:, 2:6, 3:6] = 600
+    voxels[:, 2:6, 3:6] = 600  # in all slices
     folder = write_series(tmp_path / "ct", voxels)
-    arguments = ["mesh", str(folder), "-o", str(tmp_path / "m.stl"), "--json", "--device", str(device.index)]
-    closed = []
-    for extra in ([], ["--open"]):
-        assert main([*arguments, *extra]) == 0
-        report = printed().report()
-        closed.append((report["closed"], report["volume_ml"] is None))
-    assert closed == [(True, False), (False, True)]
+    command = ["mesh", str(folder), "-o", str(tmp_path / "m.stl"), "--json", "--device", str(device.index)]
+
+    assert main([*command, *options]) == 0
+
+    report = printed().report()
+    assert report["closed"] == is_closed
+    assert (report["volume_ml"] is not None) == is_closed
 
 
 @pytest.mark.release
-def test_topology_joins_what_the_trilinear_field_joins(device: Any, tmp_path: Path, printed: Printer) -> None:
+def test_trilinear_topology_joins_voxels_that_touch_at_an_edge_which_the_default_separates(
+    device: Any, tmp_path: Path, printed: Printer
+) -> None:
     voxels = np.full((5, 8, 9), -1000, np.int16)
     voxels[2, 3, 3] = voxels[2, 4, 4] = 600  # the saddle between them is at -200
     folder = write_series(tmp_path / "ct", voxels)
@@ -219,16 +274,25 @@ def test_topology_joins_what_the_trilinear_field_joins(device: Any, tmp_path: Pa
     assert found == [("separated", 2, True, True), ("trilinear", 1, True, True)]
 
 
-def test_largest_of_two_series_is_taken_and_an_unknown_one_is_refused(
-    device: Any, tmp_path: Path, printed: Printer
+@pytest.fixture(scope="module")
+def two_series(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of series 1 of 17 slices, and 2 of 6."""
+    folder = write_series(tmp_path_factory.mktemp("series") / "ct", number=1)
+    return write_series(folder, np.full((6, 9, 9), -1000, np.int16), number=2)
+
+
+def test_largest_of_two_series_is_taken_with_a_warning(
+    device: Any, two_series: Path, tmp_path: Path, printed: Printer
 ) -> None:
-    folder = write_series(tmp_path / "ct", number=1)
-    write_series(folder, np.full((6, 9, 9), -1000, np.int16), number=2)
-    assert main(["mesh", str(folder), "-o", str(tmp_path / "a.stl"), "--device", str(device.index)]) == 0
+    assert main(["mesh", str(two_series), "-o", str(tmp_path / "a.stl"), "--device", str(device.index)]) == 0
+
     said = printed()
     said.assert_output(17)
     said.assert_error(2, "CT")
-    assert main(["mesh", str(folder), "-o", str(tmp_path / "a.stl"), "--series", "9"]) == 3
+
+
+def test_series_that_is_not_there_is_refused(two_series: Path, tmp_path: Path, printed: Printer) -> None:
+    assert main(["mesh", str(two_series), "-o", str(tmp_path / "a.stl"), "--series", "9"]) == 3
     printed().assert_error("series", 9)
 
 
@@ -252,7 +316,7 @@ def test_devices_marks_the_chosen_device_and_says_why(device: Any, capsys: pytes
 
 
 @pytest.mark.parametrize("command", ["devices", "selftest", "mesh"])
-def test_no_driver_says_how_to_get_one(
+def test_command_without_a_driver_is_refused_in_one_line_that_says_how_to_get_one(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from clrecon.opencl import select
@@ -268,7 +332,9 @@ def test_no_driver_says_how_to_get_one(
 
 
 @pytest.mark.slow
-def test_selftest_passes(device: Any, monkeypatch: pytest.MonkeyPatch, printed: Printer) -> None:
+def test_selftest_reports_each_operator_as_passed(
+    device: Any, monkeypatch: pytest.MonkeyPatch, printed: Printer
+) -> None:
     """With the first checks of the table; all of them run in tests/proof."""
     from clrecon.proof import run as table
 
@@ -281,7 +347,7 @@ def test_selftest_passes(device: Any, monkeypatch: pytest.MonkeyPatch, printed: 
     assert all(set(result) == {"operator", "passed", "detail", "seconds"} for result in outcome["operators"])
 
 
-def test_selftest_that_fails_exits_5(
+def test_selftest_with_an_operator_that_fails_names_it_and_exits_with_5(
     device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from clrecon.proof import run
@@ -294,23 +360,43 @@ def test_selftest_that_fails_exits_5(
     assert captured.err.startswith("clrecon: error: the self-test failed on ")
 
 
-def test_info_reads_the_geometry_that_the_truth_of_a_phantom_states(tmp_path: Path, printed: Printer) -> None:
-    folder = tmp_path / "ph"
-    arguments = ["phantom", str(folder), "--kind", "sphere", "--size", "40x32", "--slices", "24", "--tilt", "-12"]
-    arguments += ["--spacing", "0.7", "0.5", "1.0", "--oblique", "10", "-5", "30", "--noise", "0", "--seed", "3"]
-    assert main([*arguments, "--json"]) == 0
+PHANTOM = [
+    "--kind", "sphere", "--size", "40x32", "--slices", "24", "--tilt", "-12", "--spacing", "0.7", "0.5", "1.0",
+    "--oblique", "10", "-5", "30", "--noise", "0", "--seed", "3",
+]  # fmt: skip
+
+
+def test_phantom_with_json_prints_the_truth_that_it_writes(tmp_path: Path, printed: Printer) -> None:
+    assert main(["phantom", str(tmp_path / "ph"), *PHANTOM, "--json"]) == 0
+
     truth = printed().report()
+    assert truth == json.loads((tmp_path / "ph" / "truth.json").read_text())
     assert truth["shape_ijk"] == [40, 32, 24]
-    assert truth == json.loads((folder / "truth.json").read_text())
+
+
+def test_info_of_a_phantom_has_the_affine_and_tilt_of_its_truth(tmp_path: Path, printed: Printer) -> None:
+    folder = tmp_path / "ph"
+    assert main(["phantom", str(folder), *PHANTOM, "-q"]) == 0
+
     assert main(["info", str(folder), "--json"]) == 0
-    (entry,) = printed().report()["series"]
-    np.testing.assert_allclose(entry["affine_ijk_to_lps_mm"], truth["affine_ijk_to_lps_mm"], atol=1e-6)
-    assert entry["tilt_deg"] == pytest.approx(-12.0, abs=1e-4) == truth["tilt_deg"]
-    assert main([*arguments, "--seed", "4"]) == 0
+
+    (series,) = printed().report()["series"]
+    truth = json.loads((folder / "truth.json").read_text())
+    affine = truth["affine_ijk_to_lps_mm"]
+    np.testing.assert_allclose(series["affine_ijk_to_lps_mm"], affine, atol=tolerances.AFFINE_MM)
+    assert truth["tilt_deg"] == -12.0
+    assert series["tilt_deg"] == pytest.approx(-12.0, abs=1e-4)  # directions have 9 decimals
+
+
+def test_phantom_over_an_earlier_one_is_written_with_its_shape_in_words(tmp_path: Path, printed: Printer) -> None:
+    assert main(["phantom", str(tmp_path / "ph"), *PHANTOM, "-q"]) == 0
+
+    assert main(["phantom", str(tmp_path / "ph"), *PHANTOM, "--seed", "4"]) == 0
+
     printed().assert_output(24, 40, 32)
 
 
-def test_phantom_refuses_a_folder_with_other_files(tmp_path: Path, printed: Printer) -> None:
+def test_phantom_in_a_folder_with_other_files_is_refused_and_they_stay(tmp_path: Path, printed: Printer) -> None:
     (tmp_path / "thesis.txt").write_text("years of work")
     assert main(["phantom", str(tmp_path), "--kind", "sphere"]) == 3
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
@@ -320,21 +406,25 @@ def test_phantom_refuses_a_folder_with_other_files(tmp_path: Path, printed: Prin
 @pytest.mark.parametrize(
     ("extra", "fact"), [(["--kind", "cat"], "sphere"), (["--size", "huge"], "huge"), (["--tilt", "80"], "80")]
 )
-def test_phantom_command_refuses_wrong_settings(extra: list[str], fact: str, tmp_path: Path, printed: Printer) -> None:
+def test_wrong_setting_of_phantom_is_refused_and_writes_nothing(
+    extra: list[str], fact: str, tmp_path: Path, printed: Printer
+) -> None:
     assert main(["phantom", str(tmp_path / "ph"), *extra]) == 3
     printed().assert_error(fact)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_every_command_has_help_and_the_common_options(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_of_every_command_has_the_common_options_and_exit_codes(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([command, "--help-all"]) == 0
     text = capsys.readouterr().out
     for option in ("--json", "--quiet", "--verbose", "--debug", "exit codes: 0 done"):
         assert option in text
 
 
-def test_version_is_printed_alone(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_option_prints_name_and_version_alone(capsys: pytest.CaptureFixture[str]) -> None:
     import clrecon
 
     assert main(["--version"]) == 0

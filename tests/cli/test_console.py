@@ -36,7 +36,7 @@ class FullDisk(ClosedPipe):
         pass
 
 
-def raising(error: BaseException):  # noqa: ANN201
+def make_raising_action(error: BaseException):  # noqa: ANN201
     def action() -> int:
         raise error
 
@@ -54,7 +54,7 @@ def raising(error: BaseException):  # noqa: ANN201
         ("nul\0", "nul\\x00"),
     ],
 )
-def test_texts_from_files_cannot_steer_the_terminal(text: str, shown: str) -> None:
+def test_control_characters_of_a_text_are_printed_as_codes(text: str, shown: str) -> None:
     assert printable(text) == shown
 
 
@@ -73,31 +73,31 @@ def test_texts_from_files_cannot_steer_the_terminal(text: str, shown: str) -> No
         ),
     ],
 )
-def test_an_error_is_one_line_and_a_code(
+def test_error_is_one_line_on_standard_error_and_its_exit_code(
     error: BaseException, code: int, line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert guard(raising(error), Console(), debug=False) == code
+    assert guard(make_raising_action(error), Console(), debug=False) == code
     captured = capsys.readouterr()
     assert captured.err.splitlines() == [line]
     assert captured.out == ""
 
 
-def test_debug_shows_the_traceback_and_keeps_the_code(capsys: pytest.CaptureFixture[str]) -> None:
-    assert guard(raising(DeviceError("no driver")), Console(), debug=True) == 5
+def test_error_with_debug_has_its_traceback_and_the_same_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+    assert guard(make_raising_action(DeviceError("no driver")), Console(), debug=True) == 5
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "Traceback (most recent call last):"
     assert lines[-1] == "clrecon: error: no driver"
 
 
-def test_an_error_is_an_object_with_json(capsys: pytest.CaptureFixture[str]) -> None:
-    assert guard(raising(DeviceError("no driver")), Console(as_json=True), debug=False) == 5
+def test_error_with_json_is_an_object_on_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
+    assert guard(make_raising_action(DeviceError("no driver")), Console(as_json=True), debug=False) == 5
     captured = capsys.readouterr()
     error = json.loads(captured.out)["error"]
     assert error == {"kind": "DeviceError", "exit_code": 5, "message": "no driver"}
     assert captured.err == "clrecon: error: no driver\n"
 
 
-def test_stdout_holds_one_object_at_most(capsys: pytest.CaptureFixture[str]) -> None:
+def test_error_after_a_result_leaves_it_the_only_object_on_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
     console = Console(as_json=True)
 
     def action() -> int:
@@ -112,7 +112,7 @@ def test_stdout_holds_one_object_at_most(capsys: pytest.CaptureFixture[str]) -> 
     assert captured.err == "clrecon: error: late\n"
 
 
-def test_a_reader_that_leaves_is_no_error(monkeypatch: pytest.MonkeyPatch, printed: Printer) -> None:
+def test_pipe_that_its_reader_closed_is_no_error(monkeypatch: pytest.MonkeyPatch, printed: Printer) -> None:
     monkeypatch.setattr(sys, "stdout", ClosedPipe())
     console = Console()
 
@@ -125,7 +125,7 @@ def test_a_reader_that_leaves_is_no_error(monkeypatch: pytest.MonkeyPatch, print
     assert printed().error_lines == 0
 
 
-def test_a_full_disk_behind_stdout_is_an_error(
+def test_full_disk_behind_standard_output_ends_with_6(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "stdout", FullDisk())
@@ -139,7 +139,9 @@ def test_a_full_disk_behind_stdout_is_an_error(
     assert capsys.readouterr().err == "clrecon: error: cannot write to standard output: No space left on device\n"
 
 
-def test_missing_stdout_is_code_6_only_where_something_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_standard_output_ends_with_6_only_where_something_is_printed_and_nothing_else_failed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(sys, "stdout", None)
     console = Console()
     assert guard(lambda: 0, console, debug=False) == 0
@@ -176,7 +178,9 @@ def test_progress_moves_on_a_terminal_and_is_removed(monkeypatch: pytest.MonkeyP
         (36, "clrecon: looking through the 25/95"),  # what is done stays in sight
     ],
 )
-def test_the_count_stays_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch, columns: int, expected: str) -> None:
+def test_progress_on_a_narrow_terminal_keeps_its_count(
+    monkeypatch: pytest.MonkeyPatch, columns: int, expected: str
+) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
@@ -185,7 +189,7 @@ def test_the_count_stays_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch, c
     assert terminal.getvalue().strip() == expected and len(expected) < columns
 
 
-def test_quiet_shows_no_progress_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quiet_console_shows_no_progress_and_no_warnings_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     console = Console()
@@ -195,7 +199,7 @@ def test_quiet_shows_no_progress_on_a_terminal(monkeypatch: pytest.MonkeyPatch) 
     assert terminal.getvalue() == ""
 
 
-def test_verbose_prints_a_line_a_stage(capsys: pytest.CaptureFixture[str]) -> None:
+def test_verbose_console_prints_a_line_for_each_stage(capsys: pytest.CaptureFixture[str]) -> None:
     console = Console()
     console.set_loudness(quiet=False, verbose=True)
     for done in range(4):
@@ -205,7 +209,7 @@ def test_verbose_prints_a_line_a_stage(capsys: pytest.CaptureFixture[str]) -> No
     assert [line.split("  ")[-1] for line in lines] == ["reading slices", "writing"]
 
 
-def test_table_aligns_columns() -> None:
+def test_columns_of_a_table_are_aligned_left_or_right() -> None:
     assert table([("n", "name"), (12, "b"), (3, "long")], right=(0,)) == [" n  name", "12  b", " 3  long"]
 
 
