@@ -384,7 +384,7 @@ def test_info_of_a_phantom_has_the_affine_and_tilt_of_its_truth(tmp_path: Path, 
     truth = json.loads((folder / "truth.json").read_text())
     affine = truth["affine_ijk_to_lps_mm"]
     np.testing.assert_allclose(series["affine_ijk_to_lps_mm"], affine, atol=tolerances.AFFINE_MM)
-    assert truth["tilt_deg"] == -12.0
+    assert truth["tilt_deg"] == pytest.approx(-12.0)
     assert series["tilt_deg"] == pytest.approx(-12.0, abs=1e-4)  # directions have 9 decimals
 
 

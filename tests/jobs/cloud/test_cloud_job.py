@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from cloud_scans import AFFINE, BAND, make_voxels, run_with_report
-from contract_tables import names_in
 from label_files import write_nrrd
 from printed_text import Printer
 from refusals import refused

@@ -63,14 +63,6 @@ def test_picture_and_depths_of_a_cloud_by_the_command_are_those_of_the_function(
     assert np.array_equal(np.load(drawn_folder / "d.npy"), picture.depth, equal_nan=True)
 
 
-def test_report_of_a_cloud_in_a_picture_has_the_names_of_the_contract(drawn_folder: Path) -> None:
-    report = json.loads((drawn_folder / "r.json").read_text())
-
-    assert set(report) == names_in("clrecon render INPUT")
-    of_picture = names_in("clrecon render INPUT", "For each picture:")
-    assert set(report["pictures"][0]) == of_picture - {"values_output"}
-
-
 def test_report_of_a_picture_of_a_cloud_has_its_look_and_counts_the_points_of_each_colour(drawn_folder: Path) -> None:
     report = json.loads((drawn_folder / "r.json").read_text())
 
