@@ -21,6 +21,9 @@ MM = 1.5
 AFFINE = np.diag((MM, MM, MM, 1.0))
 
 
+BLOCK_CENTRE = 4.5  # of the first block, voxels from 2 to 7
+
+
 @pytest.fixture(scope="module")
 def two_blocks() -> tuple[Volume, LabelMap]:
     """Blocks of 600 HU in opposite corners, labels 1 and 2: 6 and 8 voxels wide in 40 x 40 x 40."""
@@ -31,13 +34,18 @@ def two_blocks() -> tuple[Volume, LabelMap]:
     return Volume(voxels, AFFINE), LabelMap(labels, AFFINE)
 
 
-def filled(picture: clrecon.Rendering) -> float:
+def first_block(volume: Volume, device: object) -> Volume:
+    """The volume with air in place of all but the first block."""
+    return clrecon.Mask.from_box(volume, (0, 20, 0, 20, 0, 20), device=device).apply(volume)
+
+
+def seen_share(picture: clrecon.Rendering) -> float:
     """Return the larger share of width and height over which something is seen."""
     seen = np.argwhere(np.isfinite(picture.depth))
     return float(((np.ptp(seen, axis=0) + 1) / picture.depth.shape).max())
 
 
-def test_the_whole_volume_fits_where_nothing_is_taken_away(two_blocks, device):
+def test_camera_of_a_whole_volume_fits_its_box(two_blocks, device):
     volume, _ = two_blocks
     picture = clrecon.render(volume, "surface", size=(60, 60), device=device)
     assert picture.camera == Camera.fit(volume, size=(60, 60))
@@ -49,64 +57,98 @@ def test_the_whole_volume_fits_where_nothing_is_taken_away(two_blocks, device):
         3, [*each_value(["clip", "mask"], ["dvr", "slices", "surface", "mip"]), ("label", "surface"), ("label", "dvr")]
     ),
 )
-def test_rest_of_a_masked_volume_fills_the_picture(two_blocks, device, kind, mode):
+def test_first_of_two_blocks_is_in_the_middle_and_fills_the_picture_where_the_other_is_hidden(
+    two_blocks, device, kind, mode
+):
     volume, labels = two_blocks
-    look: dict[str, object] = {"iso_value": 200.0} if mode == "surface" else {}
+    options: dict[str, object] = {"iso_value": 200.0} if mode == "surface" else {}
     if kind == "label":
-        look |= {"labels": labels, "label_opacity": {2: 0.0}}
+        options |= {"labels": labels, "label_opacity": {2: 0.0}}
     elif kind == "clip":
-        look["clip"] = Clip.box((0, 0, 0), (30, 30, 30))
+        options["clip"] = Clip.box((0, 0, 0), (30, 30, 30))
     else:
-        volume = clrecon.Mask.from_box(volume, (0, 20, 0, 20, 0, 20), device=device).apply(volume)
-    picture = clrecon.render(volume, mode, view="superior", size=(80, 80), device=device, **look)
-    assert np.abs(np.subtract(picture.camera.focal_point, 4.5 * MM)).max() < 1.6 * MM
+        volume = first_block(volume, device)
+
+    picture = clrecon.render(volume, mode, view="superior", size=(80, 80), device=device, **options)
+
+    off_mm = np.abs(np.subtract(picture.camera.focal_point, BLOCK_CENTRE * MM)).max()
+    assert off_mm < 1.6 * MM  # the box is one of bricks of four voxels
     if mode != "mip":
-        assert filled(picture) >= 0.6  # the block and a voxel around it: 6 of 8, less the blur of its edge
+        assert seen_share(picture) >= 0.6  # the block and a voxel around it: 6 of 8, less the blur of its edge
 
 
-def test_a_slice_goes_through_the_middle_of_what_is_left(two_blocks, device):
+def test_slice_of_a_masked_volume_goes_through_the_middle_of_what_is_left(two_blocks, device):
     volume, _ = two_blocks
-    left = clrecon.Mask.from_box(volume, (0, 20, 0, 20, 0, 20), device=device).apply(volume)
-    picture = clrecon.render(left, "slice", view="axial", size=(64, 64), device=device)
-    assert np.allclose(picture.camera.focal_point, 4.5 * MM) and picture.values[32, 32] == 600.0
-    assert (picture.values > 0.0).mean() > 0.5
-    moved = clrecon.render(volume, "slice", view="axial", size=(64, 64), center=(51, 50, 49), device=device)
-    assert moved.camera.focal_point == (51.0, 50.0, 49.0) and moved.values[32, 32] == 600.0
-    assert moved.camera.parallel_scale == pytest.approx(0.5 * 40 * MM)
+    picture = clrecon.render(first_block(volume, device), "slice", view="axial", size=(64, 64), device=device)
+    assert np.allclose(picture.camera.focal_point, BLOCK_CENTRE * MM)
+    assert picture.values[32, 32] == 600.0
+    assert (picture.values > 0.0).mean() > 0.5  # the block fills most of the picture
 
 
-def test_a_centre_is_in_the_middle_and_zoom_goes_with_it(two_blocks, device):
+def test_slice_through_a_given_centre_shows_the_whole_volume_around_it(two_blocks, device):
     volume, _ = two_blocks
-    at = (33.5 * MM, 33.5 * MM, 33.5 * MM)
-    picture = clrecon.render(volume, "surface", center=at, zoom=4.0, size=(64, 64), device=device)
-    plain = Camera.fit(volume, size=(64, 64))
-    assert picture.camera.focal_point == at and picture.camera.parallel_scale == plain.parallel_scale / 4.0
+    in_second_block = (51.0, 50.0, 49.0)
+    picture = clrecon.render(volume, "slice", view="axial", size=(64, 64), center=in_second_block, device=device)
+    assert picture.camera.focal_point == in_second_block
+    assert picture.values[32, 32] == 600.0
+    assert picture.camera.parallel_scale == pytest.approx(0.5 * 40 * MM)
+
+
+SECOND_BLOCK_MM = (33.5 * MM,) * 3
+
+
+def test_picture_around_a_given_centre_is_zoomed_about_it(two_blocks, device):
+    volume, _ = two_blocks
+    size = (64, 64)
+    picture = clrecon.render(volume, "surface", center=SECOND_BLOCK_MM, zoom=4.0, size=size, device=device)
+    assert picture.camera.focal_point == SECOND_BLOCK_MM
+    assert picture.camera.parallel_scale == Camera.fit(volume, size=size).parallel_scale / 4.0
     hit = np.argwhere(np.isfinite(picture.depth))
-    assert np.allclose(hit.mean(axis=0), 31.5, atol=1.0) and len(hit) > 900
+    assert len(hit) > 900  # of 4096 pixels
+    assert np.allclose(hit.mean(axis=0), 31.5, atol=1.0)  # the middle of 64
+
+
+def test_a_centre_outside_of_the_volume_is_refused(two_blocks, device):
     with refused(UsageError, 900, "outside"):
-        clrecon.render(volume, "surface", center=(0, 0, 900), device=device)
+        clrecon.render(two_blocks[0], "surface", center=(0, 0, 900), device=device)
+
+
+def test_a_centre_beside_a_camera_is_refused(two_blocks, device):
+    volume, _ = two_blocks
     with refused(UsageError, "center"):
-        clrecon.render(volume, "surface", center=at, camera=plain, device=device)
+        clrecon.render(volume, "surface", center=SECOND_BLOCK_MM, camera=Camera.fit(volume), device=device)
+
+
+def test_a_centre_of_a_curved_reformation_is_refused(two_blocks, device):
     with refused(UsageError, "center", "cpr"):
-        clrecon.render(volume, "cpr", center=at, device=device)
+        clrecon.render(two_blocks[0], "cpr", center=SECOND_BLOCK_MM, device=device)
 
 
-def test_a_scene_fits_what_is_left_and_its_meshes(two_blocks):
+def test_box_of_a_scene_holds_the_rest_of_a_clipped_volume_and_its_meshes(two_blocks):
+    """The first block ends before 8 voxels, the mesh at 30 mm along x and 9 mm along y and z."""
     volume, _ = two_blocks
     look = clrecon.VolumeLook(clip=Clip.box((0, 0, 0), (30, 30, 30)))
     mesh = clrecon.Mesh([(20.0, 0, 0), (30, 0, 0), (30, 9, 9)], [(0, 1, 2)])
     box = _box_of([(volume, look), (mesh, clrecon.MeshLook())])
-    assert np.allclose(box.affine[:3, 3] + 0.5 * np.diag(box.affine)[:3], (30.0, 8 * MM, 8 * MM))
+    ends = box.affine[:3, 3] + 0.5 * np.diag(box.affine)[:3]
+    assert np.allclose(ends, (30.0, 8 * MM, 8 * MM))
 
 
-def test_transfer_functions_show_bands(two_blocks):
-    volume, _ = two_blocks
-    cut = Clip.box((-99, -99, -99), (99, 99, 99))
+def width_of_shown_box(volume: Volume, rows: list) -> float:
+    """Of a volume in a clip box that holds all of it, mm along x."""
+    look = clrecon.VolumeLook(clrecon.TransferFunction(rows), clip=Clip.box((-99, -99, -99), (99, 99, 99)))
+    return float(np.diag(shown_box(volume, look).affine)[0])
+
+
+def test_box_of_a_transfer_function_holds_the_edges_of_blocks_where_it_shows_the_hu_between(two_blocks):
+    """From -200 to 100 HU only edges are seen: from voxel 1 to voxel 38."""
     rows = [(-200.0, 1, 1, 1, 0.0), (-100.0, 1, 1, 1, 0.5), (100.0, 1, 1, 1, 0.0)]
-    between = clrecon.VolumeLook(clrecon.TransferFunction(rows), clip=cut)  # -200 to 100 HU: only edges of the blocks
-    nothing = clrecon.VolumeLook(clrecon.TransferFunction([(0.0, 1, 1, 1, 0.0), (9.0, 1, 1, 1, 0.0)]), clip=cut)
-    assert np.diag(shown_box(volume, between).affine)[0] == pytest.approx(37 * MM)  # from voxel 1 to voxel 38
-    assert np.diag(shown_box(volume, nothing).affine)[0] == pytest.approx(40 * MM)
+    assert width_of_shown_box(two_blocks[0], rows) == pytest.approx((38 - 1) * MM)
+
+
+def test_box_of_a_transparent_transfer_function_is_that_of_the_volume(two_blocks):
+    rows = [(0.0, 1, 1, 1, 0.0), (9.0, 1, 1, 1, 0.0)]
+    assert width_of_shown_box(two_blocks[0], rows) == pytest.approx(40 * MM)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +161,7 @@ def test_transfer_functions_show_bands(two_blocks):
         ("surface", {"label_opacity": {1: 0.0}}),
     ],
 )
-def test_the_box_of_equal_styles_is_found_once(two_blocks, device, monkeypatch, style, look):
+def test_the_box_of_equal_styles_is_found_once_for_three_pictures(two_blocks, device, monkeypatch, style, look):
     """Keywords make a new style for each picture."""
     volume, labels = two_blocks
     found = []
@@ -131,7 +173,7 @@ def test_the_box_of_equal_styles_is_found_once(two_blocks, device, monkeypatch, 
     assert pictures[0].camera == pictures[1].camera == pictures[2].camera
 
 
-def test_another_part_of_the_volume_gets_another_box(two_blocks, device):
+def test_a_renderer_finds_the_box_of_each_style_after_another(two_blocks, device):
     volume, labels = two_blocks
     looks = [
         {"clip": Clip.box((0, 0, 0), (30, 30, 30))},
@@ -144,4 +186,4 @@ def test_another_part_of_the_volume_gets_another_box(two_blocks, device):
     with clrecon.VolumeRenderer(volume, device=device) as renderer:
         for look in looks:
             style = clrecon.SurfaceLook(300, **look)
-            assert (renderer.frame(style).affine == shown_box(volume, style).affine).all()
+            assert (renderer.frame(style).affine == shown_box(volume, style).affine).all(), look

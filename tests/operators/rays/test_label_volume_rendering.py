@@ -21,7 +21,7 @@ LABEL_TINT = 0.8
 """Share of a label's colour, as in cl/rays/label_color.h."""
 
 
-def block() -> tuple[Volume, LabelMap]:
+def labelled_block() -> tuple[Volume, LabelMap]:
     """All of one HU; label 1 on the left half along i, label 3 on a quarter, none elsewhere."""
     affine = np.diag([*SPACING, 1.0])
     numbers = np.zeros(SHAPE, np.uint8)
@@ -30,37 +30,50 @@ def block() -> tuple[Volume, LabelMap]:
     return Volume(np.full(SHAPE, 100, np.int16), affine), LabelMap(numbers, affine)
 
 
-def ahead(volume: Volume) -> Camera:
-    """Along j, one pixel a voxel of i."""
+def camera_along_j(volume: Volume) -> Camera:
+    """One pixel a voxel of i, in pictures of 20 x 4."""
     middle = volume.ijk_to_lps([(9.5, 4.5, 20.5)])[0]
     return Camera(middle - (0, 50, 0), middle, (0, 0, 1), parallel_scale=2 * SPACING[0])
 
 
+@pytest.fixture(params=daily(1, [None, 12_000]), ids=["whole", "slabs"])
+def row_of_labels(request, device):
+    """A row of the picture of the block: label 1 with a quarter of its opacity, label 3 red with a half."""
+    volume, labels = labelled_block()
+    made = render(
+        volume, transfer_function=GREY, camera=camera_along_j(volume), size=(20, 4), ray_step=0.3, device=device,
+        memory=request.param, lighting=UNSHADED, background="transparent", labels=labels,
+        label_colors={3: "red"}, label_opacity={1: 0.25, 3: 0.5},
+    )  # fmt: skip
+    assert (made.report["slabs"] > 1) == (request.param is not None)
+    return made.image[2].astype(float)
+
+
 @pytest.mark.seconds
 @pytest.mark.oclgrind
-@pytest.mark.parametrize("memory", daily(1, [None, 12_000]))
-def test_labels_change_opacity_and_colour_as_they_say(device, memory):
-    volume, labels = block()
-    options = {"label_colors": {3: "red"}, "label_opacity": {1: 0.25, 3: 0.5}}
-    made = render(
-        volume, transfer_function=GREY, camera=ahead(volume), size=(20, 4), ray_step=0.3, device=device, memory=memory,
-        lighting=UNSHADED, background="transparent", labels=labels, **options,
-    )  # fmt: skip
-    assert (made.report["slabs"] > 1) == (memory is not None)
-    row = made.image[2].astype(float)
-    through = SHAPE[1] * SPACING[1] / GREY.unit_distance
-    for columns, factor in ((slice(1, 9), 0.25), (slice(11, 15 + GROWN), 0.5), (slice(15 + GROWN, 19), 1.0)):
-        expected = 255.0 * (1.0 - (1.0 - factor * 0.1) ** through)
-        assert np.abs(row[columns, 3] - expected).max() <= tolerances.RAY_SAME_255, factor
-    grey, red = row[1:9, :3], row[11:14, :3]
-    assert np.abs(grey - 127.5).max() <= tolerances.LABEL_COLOR_255
+@pytest.mark.parametrize(
+    ("columns", "factor"),
+    [(slice(1, 9), 0.25), (slice(11, 15 + GROWN), 0.5), (slice(15 + GROWN, 19), 1.0)],
+    ids=["label 1", "label 3", "no label"],
+)
+def test_opacity_of_a_label_is_a_factor_on_that_of_each_unit_of_way(row_of_labels, columns, factor):
+    units = SHAPE[1] * SPACING[1] / GREY.unit_distance
+    expected = 255.0 * (1.0 - (1.0 - factor * 0.1) ** units)
+    assert np.abs(row_of_labels[columns, 3] - expected).max() <= tolerances.RAY_SAME_255
+
+
+@pytest.mark.seconds
+@pytest.mark.oclgrind
+def test_colour_of_a_label_is_mixed_with_that_of_the_transfer_function(row_of_labels):
+    without_colour, red = row_of_labels[1:9, :3], row_of_labels[11:14, :3]
+    assert np.abs(without_colour - 0.5 * 255.0).max() <= tolerances.LABEL_COLOR_255
     mixed = 255.0 * ((1.0 - LABEL_TINT) * 0.5 + LABEL_TINT * np.array([1.0, 0.0, 0.0]))
     assert np.abs(red - mixed).max() <= tolerances.LABEL_COLOR_255
 
 
-def test_a_label_without_opacity_shows_what_is_behind(device):
-    volume, labels = block()
-    settings = {"camera": ahead(volume), "size": (20, 4), "device": device, "background": "transparent"}
+def test_a_label_with_an_opacity_of_0_is_not_seen_and_others_look_as_without_labels(device):
+    volume, labels = labelled_block()
+    settings = {"camera": camera_along_j(volume), "size": (20, 4), "device": device, "background": "transparent"}
     hidden = render(volume, transfer_function=GREY, labels=labels, label_colors={}, label_opacity={1: 0.0}, **settings)
     plain = render(volume, transfer_function=GREY, **settings)
     assert (hidden.image[:, 1:9, 3] == 0).all()
@@ -69,6 +82,6 @@ def test_a_label_without_opacity_shows_what_is_behind(device):
 
 
 def test_colours_of_labels_without_labels_are_refused(device):
-    volume, _ = block()
+    volume, _ = labelled_block()
     with refused(UsageError, "label_opacity", "labels"):
         render(volume, device=device, size=(8, 8), label_opacity={1: 0.5})

@@ -24,7 +24,7 @@ from clrecon.rendering.views.clip import Clip
 BRIGHT = TransferFunction([(400.0, 1.0, 1.0, 1.0, 0.0), (500.0, 1.0, 0.5, 0.2, 1.0)])
 
 
-def take(volume: Volume, device, camera: Camera, **settings) -> Rendering:
+def take_picture(volume: Volume, device, camera: Camera, **settings) -> Rendering:
     return render(
         volume, transfer_function=BRIGHT, camera=camera, device=device, lighting=UNSHADED, background="transparent",
         **settings,
@@ -44,7 +44,7 @@ def take_every_sample(monkeypatch, *arguments, **settings) -> Rendering:
     with monkeypatch.context() as patch:
         patch.setattr(ray_slabs, "find_leaps", show_all)
         patch.setattr(composite, "enter_tiles", enter_at_once)
-        return take(*arguments, **settings)
+        return take_picture(*arguments, **settings)
 
 
 def assert_same(one: Rendering, other: Rendering) -> None:
@@ -55,7 +55,7 @@ def assert_same(one: Rendering, other: Rendering) -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_thin_slices_of_wide_voxels_are_seen_at_a_wide_angle(device, monkeypatch, seed):
+def test_leaps_hide_no_thin_slice_of_wide_voxels_at_a_wide_angle(device, monkeypatch, seed):
     """Rays of a tile that are as far along are at other heights: some voxels where these are thin."""
     rng = np.random.default_rng(seed)
     voxels = np.zeros((300, 12, 12), np.int16)
@@ -67,7 +67,8 @@ def test_thin_slices_of_wide_voxels_are_seen_at_a_wide_angle(device, monkeypatch
     camera = Camera(tuple(position), tuple(position + (0.0, 0.0, 1.0)), (0.0, 1.0, 0.0), view_angle=angle)
     settings = {"size": (16, 40), "ray_step": 2.0 * thin}
     assert_same(
-        take(volume, device, camera, **settings), take_every_sample(monkeypatch, volume, device, camera, **settings)
+        take_picture(volume, device, camera, **settings),
+        take_every_sample(monkeypatch, volume, device, camera, **settings),
     )
 
 
@@ -94,7 +95,7 @@ def scattered(rng, uneven: bool) -> Volume:
 
 
 @pytest.mark.parametrize("uneven", daily(1, [False, True]))
-def test_scattered_voxels_are_seen_from_anywhere(device, monkeypatch, uneven):
+def test_leaps_hide_no_scattered_voxel_from_anywhere(device, monkeypatch, uneven):
     """The last sample of a ray lies before its place in the row: with few samples a brick alone may hold it."""
     shown = 0
     for seed in range(40):
@@ -110,7 +111,7 @@ def test_scattered_voxels_are_seen_from_anywhere(device, monkeypatch, uneven):
         whole = take_every_sample(monkeypatch, volume, device, camera, **settings)
         if (whole.image[..., 3] > 0).any():
             shown += 1
-            assert_same(take(volume, device, camera, **settings), whole)
+            assert_same(take_picture(volume, device, camera, **settings), whole)
     assert shown > 20
 
 
@@ -150,24 +151,24 @@ LOST_ONCE = (4406, 7282, 8362, 9701, 13084)
 
 @pytest.mark.release
 @pytest.mark.seconds
-def test_free_space_ahead_hides_nothing(device, monkeypatch):
+def test_leaps_along_free_ways_hide_no_voxel_from_anywhere(device, monkeypatch):
     shown = 0
     for seed in (*range(200), *LOST_ONCE):
         volume, camera, settings = scene(seed)
         whole = take_every_sample(monkeypatch, volume, device, camera, **settings)
         if (whole.image[..., 3] > 0).any():
             shown += 1
-            assert_same(take(volume, device, camera, **settings), whole)
+            assert_same(take_picture(volume, device, camera, **settings), whole)
     assert shown > 100
 
 
 @pytest.mark.oclgrind
-def test_opaque_voxels_are_so_in_the_shortest_last_segment(device):
+def test_opaque_voxels_are_opaque_in_the_shortest_last_segment_of_a_ray(device):
     voxels = np.zeros((20, 6, 6), np.int16)
     voxels[10:] = 1000
     camera = Camera((2.5, 2.5, -20.0), (2.5, 2.5, 0.0), (0.0, -1.0, 0.0), parallel_scale=2.0)
     clip = Clip.plane((0.0, 0.0, 9.51), (0.0, 0.0, -1.0))  # a hundredth of a step over the samples at whole numbers
-    picture = take(Volume(voxels, np.eye(4)), device, camera, size=(4, 4), ray_step=1.0, clip=clip)
+    picture = take_picture(Volume(voxels, np.eye(4)), device, camera, size=(4, 4), ray_step=1.0, clip=clip)
     assert (picture.image[..., 3] == 255).all()
 
 
@@ -180,28 +181,31 @@ def test_slabs_of_rays_almost_along_the_slices_give_the_picture_of_the_whole(dev
     volume = Volume(voxels, np.eye(4))
     camera = Camera((7.5, -50.0, 31.5 - 69.5 * tilt), (7.5, 19.5, 31.5), (0.0, 0.0, 1.0), parallel_scale=32.0)
     settings = {"size": (8, 64), "ray_step": 0.5}  # rows at whole k
-    whole = take(volume, device, camera, **settings)
+    whole = take_picture(volume, device, camera, **settings)
     monkeypatch.setattr(ray_slabs, "plan_ray_slabs", lambda *_, **__: 8)
-    parts = take(volume, device, camera, **settings)
+    parts = take_picture(volume, device, camera, **settings)
     assert parts.report["slabs"] == 8
     assert_same(parts, whole)
 
 
-def test_labels_of_a_single_slice_stay_until_the_picture_is_made(device):
-    """A single slice is doubled on its way to the device: CPU devices read the copy in place."""
+def test_labels_of_a_single_slice_colour_every_picture(device):
+    """A single slice is doubled on its way to the device: CPU devices read the copy in place, and it must stay."""
     labels = LabelMap(np.ones((1, 1100, 1100), np.uint8), np.eye(4))
     volume = Volume(np.full((1, 1100, 1100), 1000, np.int16), np.eye(4))
+    blue = (0.0, 0.0, 1.0)
     with VolumeRenderer(volume, device=device) as renderer:
         for _ in range(4):
             picture = renderer.render(
-                transfer_function=BRIGHT, labels=labels, label_colors={1: (0.0, 0.0, 1.0)}, view="superior",
+                transfer_function=BRIGHT, labels=labels, label_colors={1: blue}, view="superior",
                 size=(96, 96), ray_step=2.0, lighting=UNSHADED,
             )  # fmt: skip
             middle = picture.image[10:-10, 10:-10].reshape(-1, 4)
-            assert (middle == middle[0]).all() and middle[0, 2] > 200
+            assert (middle == middle[0]).all()
+            assert middle[0, 2] > 200
 
 
-def test_more_samples_than_float32_counts_are_refused(device):
+def test_more_samples_than_float32_counts_are_refused_with_the_least_step(device):
+    """Rays of 4500 mm may have 2^15 samples of 0.137 mm."""
     volume = Volume(np.zeros((900, 4, 4), np.int16), np.diag([0.01, 0.01, 5.0, 1.0]))
     with refused(UsageError, "spacing", "volume", 0.137):
         render(volume, device=device, ray_step=1e-4, size=(4, 4))

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from refusals import refused
 from scipy.special import ndtr
-from surface_volumes import MIDDLE as BALL
-from surface_volumes import hollow_ball
+from surface_volumes import MIDDLE, hollow_ball
 
 import clrecon
 from clrecon.errors import NoSurfaceError, UsageError
@@ -26,7 +25,7 @@ from clrecon.operators.surface import cortex, decimation
 from clrecon.operators.surface.cortex_mesh import CortexFit, calm_vertices, choose_shifts, find_turned, fit_walls
 from clrecon.operators.surface.extract import extract_isosurface
 
-MIDDLE = np.array([19.5, 19.0, 18.0])
+RADIUS = 13.0  # of the outer surface of the shell, mm
 
 
 @pytest.fixture(scope="module")
@@ -41,57 +40,88 @@ def shell() -> Volume:
 
 
 @pytest.fixture(scope="module")
-def level(shell, device):
+def level_mesh(shell, device):
+    """The surface of the shell at 300 HU, which lies outside of the bone."""
     return extract_isosurface(shell, 300.0, device=device).keep_largest()
 
 
 @pytest.fixture(scope="module")
-def fitted(level, shell, device):
-    return clrecon.fit_cortex(level, shell, device=device)
+def fitted(level_mesh, shell, device):
+    """The same, moved onto the bone."""
+    return clrecon.fit_cortex(level_mesh, shell, device=device)
 
 
-def test_the_surface_lies_on_the_bone(level, fitted):
-    before, after = (np.linalg.norm(mesh.vertices - MIDDLE, axis=1) - 13.0 for mesh in (level, fitted))
-    assert before.mean() > 0.3
+def from_bone(mesh) -> np.ndarray:
+    """Signed distances of the vertices from the outer surface of the shell, mm."""
+    return np.linalg.norm(mesh.vertices - MIDDLE, axis=1) - RADIUS
+
+
+def test_fitted_surface_lies_on_the_bone_and_that_of_a_level_outside(level_mesh, fitted):
+    assert from_bone(level_mesh).mean() > 0.3
     # Blur moves the edge of a ball inwards, by 0.04 mm here: the square of its width over the radius.
-    assert -0.08 < after.mean() < 0.02 and np.abs(after).mean() < 0.1
+    assert from_bone(fitted).mean() == pytest.approx(-(0.7**2) / RADIUS, abs=0.05)
+    assert np.abs(from_bone(fitted)).mean() < 0.1
+
+
+def test_fitted_surface_knows_the_thickness_of_its_wall(fitted):
     assert np.median(fitted.values["thickness_mm"]) == pytest.approx(3.0, abs=0.3)
-    error = fitted.values["error_mm"]
-    assert (np.abs(after) < 1.96 * error).mean() > 0.93
 
 
-def test_fitting_keeps_triangles_and_topology(level, fitted):
-    assert np.array_equal(fitted.triangles, level.triangles)
-    quality, old = fitted.quality(), level.quality()
-    assert all(quality[name] == old[name] for name in ("closed", "manifold", "components", "euler_number"))
+def test_errors_of_a_fitted_surface_hold_93_percent_of_its_distances_from_the_bone(fitted):
+    """Standard errors: 1.96 of them hold 95 % of a normal distribution."""
+    assert (np.abs(from_bone(fitted)) < 1.96 * fitted.values["error_mm"]).mean() > 0.93
+
+
+def test_fitting_keeps_triangles_and_topology_without_self_intersections(level_mesh, fitted):
+    assert np.array_equal(fitted.triangles, level_mesh.triangles)
+    quality, before = fitted.quality(), level_mesh.quality()
+    for name in ("closed", "manifold", "components", "euler_number"):
+        assert quality[name] == before[name], name
     assert len(find_self_intersections(fitted.vertices, fitted.triangles)) == 0
 
 
-def test_report_of_a_fitted_cortex_counts_every_vertex(fitted, level):
-    found = fitted.report["cortex"]
-    assert found["moved"] and found["vertices"] == level.vertex_count
-    assert sum(found[name] for name in ("fitted", "not_bone", "metal", "badly_fitted", "no_room")) == found["vertices"]
-    assert found["fitted"] > 0.97 * found["vertices"]
-    assert found["outside_mm"]["p5"] < found["outside_mm"]["mean"] < found["outside_mm"]["p95"]
-    assert found["constants"]["cortex_hu"] == pytest.approx(1000.0, rel=0.05)
-    assert 0.0 < found["bias_mm"] < 0.05
-    json.dumps(found.as_dict(), allow_nan=False)
-    assert "cortex" not in level.report
+def test_report_of_a_fitted_cortex_counts_the_vertices_of_each_state(fitted, level_mesh):
+    report = fitted.report["cortex"]
+    states = ("fitted", "not_bone", "metal", "badly_fitted", "no_room")
+    assert report["vertices"] == level_mesh.vertex_count == sum(report[state] for state in states)
+    assert report["fitted"] > 0.97 * report["vertices"]
 
 
-def test_triangles_that_would_turn_over_are_calmed(level):
+def test_report_of_a_fitted_cortex_has_its_distances_bias_and_density(fitted):
+    report = fitted.report["cortex"]
+    assert report["moved"]
+    assert report["outside_mm"]["p5"] < report["outside_mm"]["mean"] < report["outside_mm"]["p95"]
+    assert 0.0 < report["bias_mm"] < 0.05
+    assert report["constants"]["cortex_hu"] == pytest.approx(1000.0, rel=0.05)
+
+
+def test_report_of_a_fitted_cortex_is_valid_json(fitted):
+    report = fitted.report["cortex"].as_dict()
+    assert json.loads(json.dumps(report, allow_nan=False)).keys() == report.keys()
+
+
+def test_mesh_that_is_fitted_gets_no_report_of_a_cortex(fitted, level_mesh):
+    assert "cortex" in fitted.report
+    assert "cortex" not in level_mesh.report
+
+
+def test_triangles_that_would_turn_over_are_moved_less(level_mesh):
     random = np.random.default_rng(4)
-    wild = level.vertices + random.normal(0.0, 0.4, level.vertices.shape)
-    fans = Fans(level.triangles, level.vertex_count)
-    calm = calm_vertices(level.vertices, wild, level.triangles, fans)
-    assert find_turned(level.vertices, wild, level.triangles).mean() > 0.05
-    assert not find_turned(level.vertices, calm, level.triangles).any()
-    same = calm_vertices(level.vertices, level.vertices, level.triangles, fans)
-    assert np.array_equal(same, level.vertices)
+    wild = level_mesh.vertices + random.normal(0.0, 0.4, level_mesh.vertices.shape)
+    assert find_turned(level_mesh.vertices, wild, level_mesh.triangles).mean() > 0.05
+    fans = Fans(level_mesh.triangles, level_mesh.vertex_count)
+    calm = calm_vertices(level_mesh.vertices, wild, level_mesh.triangles, fans)
+    assert not find_turned(level_mesh.vertices, calm, level_mesh.triangles).any()
 
 
-def test_walls_that_thick_slices_hide_follow_their_neighbours():
-    """A sheet of 9 x 9 vertices, three columns of them fitted: three more if they are hidden, else one."""
+def test_vertices_that_stay_are_left_as_they_are(level_mesh):
+    fans = Fans(level_mesh.triangles, level_mesh.vertex_count)
+    same = calm_vertices(level_mesh.vertices, level_mesh.vertices, level_mesh.triangles, fans)
+    assert np.array_equal(same, level_mesh.vertices)
+
+
+def test_hidden_walls_follow_their_fitted_neighbours_three_vertices_far_and_others_one():
+    """A sheet of 9 x 9 vertices, the first three columns fitted by -0.5 mm; the others of the first 5 rows hidden."""
     rows, columns = np.indices((9, 9))
     corner = (9 * rows + columns)[:8, :8].ravel()
     triangles = np.concatenate([corner[:, None] + [0, 1, 10], corner[:, None] + [0, 10, 9]]).astype(np.uint32)
@@ -99,157 +129,224 @@ def test_walls_that_thick_slices_hide_follow_their_neighbours():
     shift, error = np.where(states == 0, -0.5, 9.0).astype(np.float32), np.full(81, 0.1, np.float32)
     hidden = (states == 3) & (rows < 5).ravel()
     fit = CortexFit(None, (), states, hidden, shift, error, error, error)
+
     shifts = choose_shifts(fit, triangles, Fans(triangles, 81)).reshape(9, 9)
-    np.testing.assert_allclose(shifts[:4], np.where(columns < 6, -0.5, 0.0)[:4], rtol=1e-6)
-    np.testing.assert_allclose(shifts[6:], np.where(columns < 4, -0.5, 0.0)[6:], rtol=1e-6)
+
+    np.testing.assert_allclose(shifts[:4], np.where(columns < 3 + 3, -0.5, 0.0)[:4], rtol=1e-6)
+    np.testing.assert_allclose(shifts[6:], np.where(columns < 3 + 1, -0.5, 0.0)[6:], rtol=1e-6)
 
 
-def test_thick_slices_are_fitted_again_along_the_normals_of_the_moved_surface(device):
-    """Slices of 3 mm make steps of a ball: their field's normals are off where it is slanted."""
+def test_second_fit_of_thick_slices_is_nearer_to_the_bone_than_the_first(device):
+    """Slices of 3 mm make steps of a ball: normals of their field are off where it is slanted.
+
+    A second fit follows those of the moved surface.
+    """
     volume = hollow_ball(thickness=1.5, spacing=(1.0, 1.0, 3.0))
-    level = extract_isosurface(volume, 200.0, device=device)
+    mesh = extract_isosurface(volume, 200.0, device=device)
     with DeviceVolume(volume, device=device) as resident:
-        once = fit_walls(resident, level.vertices, level.normals, stopwatch=Stopwatch())
-    shifts = choose_shifts(once, level.triangles, Fans(level.triangles, level.vertex_count))
-    outer = np.linalg.norm(level.vertices - BALL, axis=1) > 11.5
+        once = fit_walls(resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch())
+    shifts = choose_shifts(once, mesh.triangles, Fans(mesh.triangles, mesh.vertex_count))
+    outer = np.linalg.norm(mesh.vertices - MIDDLE, axis=1) > RADIUS - 1.5
 
     def mean_error(vertices):
-        return np.abs(np.linalg.norm(vertices[outer] - BALL, axis=1) - 13.0).mean()
+        return np.abs(np.linalg.norm(vertices[outer] - MIDDLE, axis=1) - RADIUS).mean()
 
-    twice = clrecon.fit_cortex(level, volume, device=device)
-    assert mean_error(twice.vertices) < 0.9 * mean_error(level.vertices + shifts[:, None] * level.normals)
-
-
-def test_sums_over_triangles_are_twice_those_over_neighbours(level):
-    fans, some = Fans(level.triangles, level.vertex_count + 1), np.array([4, 7, level.vertex_count, 90])
-    values = np.random.default_rng(1).normal(size=(level.vertex_count + 1, 2))
-    for vertex, found in zip(some, fans.sums(values, level.triangles, some), strict=True):
-        own = level.triangles[(level.triangles == vertex).any(axis=1)]
-        beside = np.setdiff1d(own, [vertex])
-        np.testing.assert_allclose(found, len(own) * values[vertex] + 2.0 * values[beside].sum(axis=0), atol=1e-12)
+    twice = clrecon.fit_cortex(mesh, volume, device=device)
+    assert mean_error(twice.vertices) < 0.9 * mean_error(mesh.vertices + shifts[:, None] * mesh.normals)
 
 
-def test_values_go_with_their_vertices_into_parts_and_files(fitted, tmp_path):
+def test_sums_over_fans_are_those_of_each_vertex_and_twice_those_of_its_neighbours(level_mesh):
+    """A vertex is in each of its triangles, a neighbour in two of them; the last vertex has none."""
+    vertices = level_mesh.vertex_count + 1
+    fans, chosen = Fans(level_mesh.triangles, vertices), np.array([4, 7, vertices - 1, 90])
+    values = np.random.default_rng(1).normal(size=(vertices, 2))
+    sums = fans.sums(values, level_mesh.triangles, chosen)
+    assert len(sums) == len(chosen)
+    for vertex, found in zip(chosen, sums, strict=True):
+        around = level_mesh.triangles[(level_mesh.triangles == vertex).any(axis=1)]
+        neighbours = np.setdiff1d(around, [vertex])
+        expected = len(around) * values[vertex] + 2.0 * values[neighbours].sum(axis=0)
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_mesh_of_arrays_has_no_values(fitted):
     assert clrecon.Mesh(fitted.vertices, fitted.triangles).values == {}
-    part = fitted.split()[0]
-    assert np.array_equal(part.values["thickness_mm"], fitted.values["thickness_mm"])
-    ply = tmp_path / "a.ply"
-    fitted.save(ply)
-    head, _, data = ply.read_bytes().partition(b"end_header\n")
+
+
+def test_values_of_a_fitted_surface_go_into_its_components(fitted):
+    (component,) = fitted.split()
+    assert np.array_equal(component.values["thickness_mm"], fitted.values["thickness_mm"])
+
+
+def test_ply_of_a_fitted_surface_holds_its_vertices_and_values(fitted, tmp_path):
+    path = tmp_path / "a.ply"
+    fitted.save(path)
+    head, _, data = path.read_bytes().partition(b"end_header\n")
     names = [line.split()[-1].decode() for line in head.splitlines() if line.startswith(b"property float")]
-    assert names[-2:] == ["scalar_thickness_mm", "scalar_error_mm"]
     rows = np.frombuffer(data, "<f4", fitted.vertex_count * len(names)).reshape(-1, len(names))
-    assert np.array_equal(rows[:, -2], fitted.values["thickness_mm"], equal_nan=True)
-    assert np.array_equal(clrecon.read_mesh(ply).vertices, fitted.vertices)
-    vtp = tmp_path / "a.vtp"
-    fitted.save(vtp)
-    assert b'Name="thickness_mm"' in vtp.read_bytes() and b'Name="error_mm"' in vtp.read_bytes()
-    assert np.array_equal(clrecon.read_mesh(vtp).vertices, fitted.vertices)
+    thickness = rows[:, names.index("scalar_thickness_mm")]
+    assert np.array_equal(thickness, fitted.values["thickness_mm"], equal_nan=True)
+    assert "scalar_error_mm" in names
+    assert np.array_equal(clrecon.read_mesh(path).vertices, fitted.vertices)
 
 
-def test_glb_holds_values_without_nan(fitted, tmp_path):
-    glb = tmp_path / "a.glb"
+def test_vtp_of_a_fitted_surface_holds_its_vertices_and_names_its_values(fitted, tmp_path):
+    path = tmp_path / "a.vtp"
+    fitted.save(path)
+    written = path.read_bytes()
+    assert b'Name="thickness_mm"' in written
+    assert b'Name="error_mm"' in written
+    assert np.array_equal(clrecon.read_mesh(path).vertices, fitted.vertices)
+
+
+def test_glb_of_a_fitted_surface_holds_minus_one_for_values_of_nan(fitted, tmp_path):
+    path = tmp_path / "a.glb"
     fitted.values["error_mm"][:3] = np.nan
-    fitted.save(glb)
-    raw = glb.read_bytes()
-    length = struct.unpack("<I", raw[12:16])[0]
-    document = json.loads(raw[20 : 20 + length])
-    attributes = document["meshes"][0]["primitives"][0]["attributes"]
-    view = document["bufferViews"][document["accessors"][attributes["_ERROR_MM"]]["bufferView"]]
-    begin = 28 + length + view["byteOffset"]
+    fitted.save(path)
+
+    raw = path.read_bytes()
+    json_bytes = struct.unpack("<I", raw[12:16])[0]  # after a header of 12 bytes; then 8 bytes of each chunk's head
+    document = json.loads(raw[20 : 20 + json_bytes])
+    accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["_ERROR_MM"]]
+    begin = 20 + json_bytes + 8 + document["bufferViews"][accessor["bufferView"]]["byteOffset"]
     found = np.frombuffer(raw, "<f4", fitted.vertex_count, begin)
-    assert (found[:3] == -1.0).all() and np.array_equal(found[3:], fitted.values["error_mm"][3:])
-    assert np.allclose(clrecon.read_mesh(glb).vertices, fitted.vertices, atol=1e-4)
+    assert found[:3].tolist() == [-1.0] * 3
+    assert np.array_equal(found[3:], fitted.values["error_mm"][3:])
 
 
-def test_fitting_refuses_soft_scans_and_surfaces_below_a_level(shell, level, device):
+def test_glb_of_a_fitted_surface_holds_its_vertices(fitted, tmp_path):
+    fitted.save(tmp_path / "a.glb")
+    assert np.allclose(clrecon.read_mesh(tmp_path / "a.glb").vertices, fitted.vertices, atol=1e-4)  # metres in float32
+
+
+def test_fitting_in_a_scan_without_bone_is_refused(shell, level_mesh, device):
     soft = shell.with_voxels(np.full(shell.shape, 40, np.int16))
     with refused(NoSurfaceError, "walls", "bone"):
-        clrecon.fit_cortex(level, soft, device=device)
+        clrecon.fit_cortex(level_mesh, soft, device=device)
+
+
+def test_fitting_of_a_surface_below_a_level_is_refused(shell, device):
     below = extract_isosurface(shell, 300.0, below=True, device=device)
     with refused(UsageError, "level", "below"):
         clrecon.fit_cortex(below, shell, device=device)
 
 
-def run(*arguments) -> int:
+def run_mesh_command(*arguments) -> int:
     from clrecon.cli.main import main
 
     return main(["mesh", *map(str, arguments)])
 
 
-def test_surface_cortex_moves_the_vertices_of_the_command(shell, tmp_path, capsys):
+@pytest.fixture
+def ct_file(shell, tmp_path):
     shell.save(tmp_path / "ct.nii.gz")
-    given = (tmp_path / "ct.nii.gz", "-o", tmp_path / "a.ply", "--report", tmp_path / "a.json")
-    assert run(*given, "--surface", "cortex") == 0
-    assert "vertices lie on the bone" in capsys.readouterr().out
-    report = json.loads((tmp_path / "a.json").read_text("utf-8"))
-    assert report["cortex"]["moved"] and report["iso_distance"] is None and report["seconds"]["cortex"] > 0.0
-    assert run(*given) == 0
-    assert "outside of the bone" in capsys.readouterr().out
-    report = json.loads((tmp_path / "a.json").read_text("utf-8"))
-    assert not report["cortex"]["moved"] and report["cortex"]["outside_mm"]["mean"] > 0.2
+    return tmp_path / "ct.nii.gz"
 
 
-@pytest.mark.parametrize("labels", [False, True])
-def test_the_trial_run_launches_the_kernels_of_the_cortex(labels, device, monkeypatch):
+def read_report(path):
+    return json.loads(path.read_text("utf-8"))
+
+
+def test_command_with_surface_cortex_moves_the_vertices_onto_the_bone_and_says_so(ct_file, tmp_path, printed):
+    report_file = tmp_path / "a.json"
+    output = ("-o", tmp_path / "a.ply", "--report", report_file)
+    assert run_mesh_command(ct_file, *output, "--surface", "cortex") == 0
+    assert "vertices lie on the bone" in printed().everything
+    report = read_report(report_file)
+    assert report["cortex"]["moved"]
+    assert report["seconds"]["cortex"] > 0.0
+    assert report["iso_distance"] is None  # the surface is no longer one of a level
+
+
+def test_command_without_surface_cortex_says_how_far_the_surface_lies_outside_of_the_bone(ct_file, tmp_path, printed):
+    report_file = tmp_path / "a.json"
+    assert run_mesh_command(ct_file, "-o", tmp_path / "a.ply", "--report", report_file) == 0
+    assert "outside of the bone" in printed().everything
+    cortex_report = read_report(report_file)["cortex"]
+    assert not cortex_report["moved"]
+    assert cortex_report["outside_mm"]["mean"] > 0.2
+
+
+@pytest.mark.parametrize("labels", [False, True], ids=["scan", "labels"])
+def test_the_trial_run_launches_the_kernels_of_the_cortex_and_of_crossings(labels, device, monkeypatch):
     launched = set()
 
-    def note(opened, kernel, *more, **arguments):
+    def note_launch(opened, kernel, *more, **arguments):
         launched.add(kernel.name)
         launch(opened, kernel, *more, **arguments)
 
     for module in (cortex, decimation.ocl):
-        monkeypatch.setattr(module, "launch", note)
+        monkeypatch.setattr(module, "launch", note_launch)
     choice = LabelChoice("labels.nii.gz") if labels else None
     _try_steps(device, MeshSettings(surface="cortex", labels=choice))
     assert {"sample_profiles", "fit_profiles", "enter_triangles", "mark_crossings"} <= launched
 
 
-def test_a_print_lies_on_the_bone(shell, tmp_path, printed):
-    """A ball with a radius of 13 mm, once marrow is filled; 200 HU makes it more than 10 % larger."""
-    shell.save(tmp_path / "ct.nii.gz")
-    given = (tmp_path / "ct.nii.gz", "-o", tmp_path / "a.stl", "--for", "print", "--surface", "cortex")
-    assert run(*given) == 0, printed()
-    ball = 4.0 * np.pi / 3e3 * 13.0**3
-    assert clrecon.read_mesh(tmp_path / "a.stl").quality()["volume_ml"] == pytest.approx(ball, rel=0.02)
+def test_mesh_for_printing_with_surface_cortex_has_the_volume_of_the_bone(ct_file, tmp_path, printed):
+    """A ball of 13 mm, once its marrow is filled; 200 HU makes it more than 10 % larger."""
+    path = tmp_path / "a.stl"
+    assert run_mesh_command(ct_file, "-o", path, "--for", "print", "--surface", "cortex") == 0, printed()
+    ball_ml = 4.0 / 3.0 * np.pi * RADIUS**3 / 1000
+    assert clrecon.read_mesh(path).quality()["volume_ml"] == pytest.approx(ball_ml, rel=0.02)
 
 
-def test_a_dry_specimen_wants_a_low_level(shell, tmp_path, capsys):
-    """The same shell in air, with air within it: at 200 HU a thin wall would be lost, which is said."""
+def dry_shell(shell: Volume) -> Volume:
+    """The same shell in air, with air within it."""
     dry = shell.voxels.astype(float)
     dry = np.where(dry < 500, -1000.0 + 3.0 * (dry - 50.0), dry)
-    shell.with_voxels(np.clip(dry, -1010, 1100).astype(np.int16)).save(tmp_path / "dry.nii.gz")
-    shell.save(tmp_path / "ct.nii.gz")
-    for name, level, warned in (("dry", [], True), ("dry", ["--hu", "-200"], False), ("ct", [], False)):
-        given = (tmp_path / f"{name}.nii.gz", "-o", tmp_path / f"{name}{len(level)}.ply", "--surface", "cortex")
-        assert run(*given, *level) == 0
-        said = capsys.readouterr()
-        assert ("dry specimen" in said.out + said.err) == warned
-        assert not warned or "stay below 200 HU" in said.err and "--hu -200 finds them" in said.err
+    return shell.with_voxels(np.clip(dry, -1010, 1100).astype(np.int16))
 
 
-def test_cortex_of_a_scan_without_bone_says_its_reason(shell, tmp_path, capsys):
+def test_cortex_of_a_dry_specimen_at_200_hu_is_warned_of_with_a_lower_level(shell, tmp_path, printed):
+    """A thin wall would be lost."""
+    dry_shell(shell).save(tmp_path / "dry.nii.gz")
+    assert run_mesh_command(tmp_path / "dry.nii.gz", "-o", tmp_path / "a.ply", "--surface", "cortex") == 0
+    text = printed().everything
+    assert "dry specimen" in text
+    assert "stay below 200 HU" in text
+    assert "--hu -200 finds them" in text
+
+
+@pytest.mark.parametrize(
+    ("is_dry", "level"), [(True, ["--hu", "-200"]), (False, [])], ids=["dry, low level", "patient"]
+)
+def test_cortex_is_not_warned_of_at_a_low_level_or_in_a_patient(shell, tmp_path, printed, is_dry, level):
+    (dry_shell(shell) if is_dry else shell).save(tmp_path / "ct.nii.gz")
+    assert run_mesh_command(tmp_path / "ct.nii.gz", "-o", tmp_path / "a.ply", "--surface", "cortex", *level) == 0
+    assert "dry specimen" not in printed().everything
+
+
+@pytest.fixture
+def soft_ct(shell, tmp_path):
+    """The file of a scan whose highest HU are 250."""
     soft = shell.with_voxels(np.where(shell.voxels > 500, 250, shell.voxels // 2).astype(np.int16))
     soft.save(tmp_path / "ct.nii.gz")
-    given = (tmp_path / "ct.nii.gz", "-o", tmp_path / "a.stl", "--report", tmp_path / "a.json")
-    assert run(*given) == 0
-    report = json.loads((tmp_path / "a.json").read_text("utf-8"))
-    assert list(report["cortex"]) == ["reason"] and "no walls of bone" in report["cortex"]["reason"]
-    assert "of the bone (" not in capsys.readouterr().out
-    (tmp_path / "a.stl").unlink()
-    assert run(*given, "--surface", "cortex") == 2
-    assert "no walls of bone" in capsys.readouterr().err and not (tmp_path / "a.stl").exists()
+    return tmp_path / "ct.nii.gz"
+
+
+def test_report_of_a_scan_without_bone_says_why_it_has_no_cortex(soft_ct, tmp_path, printed):
+    assert run_mesh_command(soft_ct, "-o", tmp_path / "a.stl", "--report", tmp_path / "a.json") == 0
+    cortex_report = read_report(tmp_path / "a.json")["cortex"]
+    assert list(cortex_report) == ["reason"]
+    assert "no walls of bone" in cortex_report["reason"]
+    assert "of the bone (" not in printed().everything
+
+
+def test_surface_cortex_of_a_scan_without_bone_is_refused_without_a_file(soft_ct, tmp_path, printed):
+    assert run_mesh_command(soft_ct, "-o", tmp_path / "a.stl", "--surface", "cortex") == 2
+    printed().assert_error("walls", "bone")
+    assert not (tmp_path / "a.stl").exists()
 
 
 @pytest.mark.release
-def test_a_label_lies_on_the_bone(shell, tmp_path):
-    ct, labels = tmp_path / "ct.nii.gz", tmp_path / "labels.nii.gz"
-    shell.save(ct)
+def test_command_with_surface_cortex_moves_the_vertices_of_a_label(shell, ct_file, tmp_path):
+    labels = tmp_path / "labels.nii.gz"
     shell.with_voxels((shell.voxels > 300).astype(np.uint8)).save(labels)
-    given = (ct, "-o", tmp_path / "a.stl", "--labels", labels, "--surface", "cortex", "--report", tmp_path / "a.json")
-    assert run(*given) == 0
-    report = json.loads((tmp_path / "a.json").read_text("utf-8"))
-    assert report["meshes"][0]["label_number"] == 1 and report["cortex"]["moved"]
+    output = ("-o", tmp_path / "a.stl", "--report", tmp_path / "a.json")
+    assert run_mesh_command(ct_file, *output, "--labels", labels, "--surface", "cortex") == 0
+    report = read_report(tmp_path / "a.json")
+    assert report["meshes"][0]["label_number"] == 1
+    assert report["cortex"]["moved"]
 
 
 @pytest.mark.parametrize(
@@ -262,6 +359,6 @@ def test_a_label_lies_on_the_bone(shell, tmp_path):
         (["--surface", "cortex", "--method", "skimage"], "vertices of one mesh"),
     ],
 )
-def test_cortex_options_without_sense_are_refused(options, words, tmp_path, capsys):
-    assert run(tmp_path, "-o", tmp_path / "a.stl", *options) == 3
-    assert words in capsys.readouterr().err
+def test_options_that_do_not_go_with_a_cortex_are_refused(options, words, tmp_path, printed):
+    assert run_mesh_command(tmp_path, "-o", tmp_path / "a.stl", *options) == 3
+    assert words in printed().everything

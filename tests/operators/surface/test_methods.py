@@ -25,48 +25,72 @@ def sorted_corners(mesh: Any) -> np.ndarray:
     return flat[np.lexsort(np.round(flat, 2).T)]
 
 
-@pytest.mark.parametrize("affine", [OBLIQUE, MIRRORED])
+@pytest.fixture(params=[OBLIQUE, MIRRORED], ids=["oblique", "mirrored"])
+def smooth(request: pytest.FixtureRequest) -> Any:
+    return smooth_volume((9, 10, 24), request.param)
+
+
 @pytest.mark.parametrize("closed", [True, False])
-def test_the_soup_is_the_same_surface(affine: np.ndarray, closed: bool, device: Any) -> None:
-    volume = smooth_volume((9, 10, 24), affine)
-    soup = extract_by_method(volume, 100.5, "t-mc-soup", closed=closed)
-    whole = extract_by_method(volume, 100.5, "t-mc", closed=closed, device=device)
-    assert soup.vertex_count == whole.vertex_count and soup.triangle_count == whole.triangle_count
-    assert np.abs(np.sort(soup.vertices, 0) - np.sort(whole.vertices, 0)).max() < 8 * float32_unit(whole.vertices)
-    ours, theirs = (mesh.quality() for mesh in (whole, soup))
-    assert theirs["closed"] == ours["closed"] == closed and theirs["manifold"]
-    assert theirs["volume_ml"] == pytest.approx(ours["volume_ml"], rel=1e-4)
-    assert soup.report["cells"] == whole.report["cells"] and soup.report["method"] == "t-mc-soup"
+def test_welded_triangle_soup_has_the_vertices_and_cells_of_marching_cubes(
+    smooth: Any, closed: bool, device: Any
+) -> None:
+    soup = extract_by_method(smooth, 100.5, "t-mc-soup", closed=closed)
+    whole = extract_by_method(smooth, 100.5, "t-mc", closed=closed, device=device)
+    assert (soup.vertex_count, soup.triangle_count) == (whole.vertex_count, whole.triangle_count)
+    off = np.abs(np.sort(soup.vertices, 0) - np.sort(whole.vertices, 0)).max()
+    assert off < 8 * float32_unit(whole.vertices)  # sums of four rounded products
+    assert soup.report["method"] == "t-mc-soup"
+    assert soup.report["cells"] == whole.report["cells"]
 
 
-def test_the_soup_of_uneven_slices_lies_at_their_places(device: Any) -> None:
-    values = smooth_volume((6, 12, 20)).voxels
-    volume = uneven(values)
+@pytest.mark.parametrize("closed", [True, False])
+def test_welded_triangle_soup_is_as_closed_as_marching_cubes_with_its_volume(
+    smooth: Any, closed: bool, device: Any
+) -> None:
+    soup = extract_by_method(smooth, 100.5, "t-mc-soup", closed=closed).quality()
+    whole = extract_by_method(smooth, 100.5, "t-mc", closed=closed, device=device).quality()
+    assert soup["closed"] == whole["closed"] == closed
+    assert soup["manifold"]
+    assert soup["volume_ml"] == pytest.approx(whole["volume_ml"], rel=1e-4)  # float32
+
+
+def test_vertices_of_a_triangle_soup_of_uneven_slices_are_those_of_marching_cubes(device: Any) -> None:
+    volume = uneven(smooth_volume((6, 12, 20)).voxels)
     soup = extract_by_method(volume, 100.5, "t-mc-soup")
     whole = extract_isosurface(volume, 100.5, device=device)
-    assert np.abs(np.sort(soup.vertices, 0) - np.sort(whole.vertices, 0)).max() < 8 * float32_unit(whole.vertices)
+    off = np.abs(np.sort(soup.vertices, 0) - np.sort(whole.vertices, 0)).max()
+    assert off < 8 * float32_unit(whole.vertices)
 
 
-@pytest.mark.parametrize("affine", [OBLIQUE, MIRRORED, None])
-def test_scikit_image_is_placed_and_wound_alike(affine: np.ndarray | None, device: Any) -> None:
+@pytest.mark.parametrize("affine", [OBLIQUE, MIRRORED, None], ids=["oblique", "mirrored", "uneven"])
+def test_surface_by_scikit_image_has_the_volume_and_area_of_the_trilinear_topology(
+    affine: np.ndarray | None, device: Any
+) -> None:
     pytest.importorskip("skimage")
     volume = uneven(smooth_volume((6, 12, 20)).voxels) if affine is None else smooth_volume((12, 14, 24), affine)
     theirs = extract_by_method(volume, 100.5, "skimage").quality()
     ours = extract_isosurface(volume, 100.5, device=device, topology="trilinear").quality()
-    assert theirs["volume_ml"] > 0 and theirs["volume_ml"] == pytest.approx(ours["volume_ml"], rel=0.02)
+    assert theirs["volume_ml"] > 0  # wound outward
+    assert theirs["volume_ml"] == pytest.approx(ours["volume_ml"], rel=0.02)
     assert theirs["area_mm2"] == pytest.approx(ours["area_mm2"], rel=0.02)
 
 
-def test_methods_that_grow_or_decimate_do_so(device: Any) -> None:
-    volume = smooth_volume()
-    grown = extract_by_method(volume, 250, "i-mc", device=device)
+def test_method_i_mc_grows_a_sound_surface_from_the_largest_component(device: Any) -> None:
+    grown = extract_by_method(smooth_volume(), 250, "i-mc", device=device)
     assert_sound(grown)
     assert grown.report["growing"]["from"] == ["auto"]
-    fewer = extract_by_method(volume, 250, "s-mc", decimate=0.3, device=device)
-    assert fewer.report["method"] == "s-mc" and "decimate" in fewer.report["refinement"]
-    whole = extract_isosurface(volume, 250, device=device)
-    collapsed = extract_by_method(volume, 250, "g-mc", decimate=0.3, device=device)
-    assert collapsed.triangle_count == pytest.approx(0.7 * whole.triangle_count, rel=0.02)
+
+
+def test_method_s_mc_decimates_and_reports_it(device: Any) -> None:
+    report = extract_by_method(smooth_volume(), 250, "s-mc", decimate=0.3, device=device).report
+    assert report["method"] == "s-mc"
+    assert "decimate" in report["refinement"]
+
+
+def test_method_g_mc_removes_the_share_of_triangles_that_is_asked_for(device: Any) -> None:
+    whole = extract_isosurface(smooth_volume(), 250, device=device)
+    decimated = extract_by_method(smooth_volume(), 250, "g-mc", decimate=0.3, device=device)
+    assert decimated.triangle_count == pytest.approx((1 - 0.3) * whole.triangle_count, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -84,8 +108,11 @@ def test_methods_refuse_options_that_they_do_not_have(method: str, options: dict
         check_method(method, **options)
 
 
-def test_share_of_triangles_is_refused_by_methods_that_do_not_decimate() -> None:
+def test_methods_that_decimate_are_g_mc_and_s_mc() -> None:
     assert [name for name, method in METHODS.items() if method.decimates] == ["g-mc", "s-mc"]
+
+
+def test_share_of_triangles_is_refused_by_a_method_that_does_not_decimate() -> None:
     with refused(UsageError, "triangles", "t-mc-soup"):
         extract_by_method(smooth_volume((4, 5, 6)), 0, "t-mc-soup", decimate=0.5)
 
