@@ -39,16 +39,16 @@ def damaged(request, tmp_path):
     return str(write_damaged(tmp_path / "ct", row)), gate, row.words
 
 
-def test_command_info_shows_the_gate_that_damaged_values_fail(damaged, capsys):
+def test_command_info_shows_the_gate_that_damaged_values_fail(damaged, printed):
     folder, gate, _ = damaged
     assert main(["info", folder, "--pixels"]) == 0
-    assert f"FAILED     {gate}: " in capsys.readouterr().out
+    printed().assert_output("FAILED", gate)
 
 
-def test_command_info_refuses_damaged_values_with_strict(damaged, capsys):
+def test_command_info_refuses_damaged_values_with_strict(damaged, printed):
     folder, gate, _ = damaged
     assert main(["info", folder, "--pixels", "--strict"]) == RefusedInputError.exit_code
-    assert f"{gate}: " in capsys.readouterr().err
+    printed().assert_error(gate)
 
 
 def test_command_mesh_warns_of_damaged_values_and_writes_the_failed_gate_into_the_mesh(
@@ -61,11 +61,11 @@ def test_command_mesh_warns_of_damaged_values_and_writes_the_failed_gate_into_th
     assert f"comment CERTIFICATE gate_failed {gate}: ".encode() in output.read_bytes()
 
 
-def test_command_mesh_fails_for_damaged_values_with_strict(damaged, tmp_path, device, capsys):
+def test_command_mesh_fails_for_damaged_values_with_strict(damaged, tmp_path, device, printed):
     folder, gate, _ = damaged
     mesh = ["mesh", folder, "-o", str(tmp_path / "a.ply"), "--hu", "300", "--device", str(device.index)]
     assert main([*mesh, "--strict"]) == SCAN_GATE_FAILED
-    assert f"gate {gate} failed" in capsys.readouterr().err
+    printed().assert_error("gate", gate, "failed")
 
 
 @pytest.mark.parametrize(
