@@ -30,14 +30,14 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     9: ("duplicate slices: equal ones dropped and told, else phases", (TRAPS,)),
     10: (
         "two phases or times in one series: refused with their list; --phase",
-        (TRAPS, "reading/dicom/test_phases.py::test_phases_are_listed_and_chosen"),
+        (TRAPS, "reading/dicom/test_phases.py::test_series_of_two_phases_is_refused_with_their_list"),
     ),
     11: ("localizer in the series: left out and told", (TRAPS, SERIES + "test_a_localizer_in_the_series_is_parted")),
     12: (
         "two series or patients: refused with their list; --series",
         (
             SERIES + "test_two_series_of_equal_size_need_a_choice",
-            "reading/dicom/test_phases.py::test_of_several_patients_none_is_taken_unasked",
+            "reading/dicom/test_phases.py::test_series_of_two_patients_are_refused_with_their_list_and_without_their_ids",
         ),
     ),
     13: ("two FrameOfReferenceUIDs: refused", (TRAPS, GEOMETRY + "test_mixed_values_are_refused")),

@@ -26,18 +26,24 @@ def write_phase(folder, number, shift=0, plan=None, **elements):
     return write_series(folder, plan or Plan(name=f"phase{number}-{{}}".format), change)
 
 
-def test_identical_slices_are_dropped_with_a_warning(tmp_path):
+def test_copies_of_all_slices_are_dropped_with_a_warning(tmp_path):
     plan = write_series(tmp_path, Plan())
     write_series(tmp_path, Plan(name="again{}".format), set_values(ContentTime="101010"))
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu())
     assert volume.report["warnings"] == ["7 duplicate slices dropped: same place, same pixels as another"]
     assert volume.report["files"]["used"] == 7
-    entry = list_series(tmp_path).series[0]
-    assert entry.slices == 14 and entry.shape_ijk == [6, 5, 7] and entry.problems == [] and entry.phases == []
 
 
-def test_one_identical_slice_is_dropped(tmp_path):
+def test_series_with_copies_of_all_slices_is_listed_without_a_problem_or_phases(tmp_path):
+    write_series(tmp_path, Plan())
+    write_series(tmp_path, Plan(name="again{}".format), set_values(ContentTime="101010"))
+    series = list_series(tmp_path).series[0]
+    assert (series.slices, series.shape_ijk) == (14, [6, 5, 7])
+    assert (series.problems, series.phases) == ([], [])
+
+
+def test_copy_of_one_slice_is_dropped_with_a_warning(tmp_path):
     plan = write_series(tmp_path, Plan())
     (tmp_path / "copy").write_bytes((tmp_path / "slice003.dcm").read_bytes())
     volume = read_volume(tmp_path)
@@ -45,7 +51,7 @@ def test_one_identical_slice_is_dropped(tmp_path):
     assert volume.report["warnings"] == ["1 duplicate slice dropped: same place, same pixels as another"]
 
 
-@pytest.mark.parametrize(
+TWO_PHASES = pytest.mark.parametrize(
     ("first", "second", "keyword", "values"),
     daily_rows(
         2,
@@ -65,44 +71,69 @@ def test_one_identical_slice_is_dropped(tmp_path):
         ],
     ),
 )
-def test_phases_are_listed_and_chosen(tmp_path, first, second, keyword, values):
-    plan = write_phase(tmp_path, 1, **first)
+
+
+@TWO_PHASES
+def test_two_slices_at_each_place_are_listed_as_phases_with_the_element_that_differs(
+    tmp_path, first, second, keyword, values
+):
+    write_phase(tmp_path, 1, **first)
     write_phase(tmp_path, 2, 500, **second)
-    shifts = [500, 0] if values[-1] == "(none)" else [0, 500]
-    entry = list_series(tmp_path).series[0]
-    assert entry.phases == [
+    series = list_series(tmp_path).series[0]
+    assert series.phases == [
         {"number": n, "keyword": keyword, "value": value, "slices": 7} for n, value in enumerate(values, start=1)
     ]
-    assert entry.affine_ijk_to_lps_mm is None and entry.slices == 14
+    assert series.affine_ijk_to_lps_mm is None
+    assert series.slices == 14
+
+
+@TWO_PHASES
+def test_series_of_two_phases_is_refused_with_their_list(tmp_path, first, second, keyword, values):
+    write_phase(tmp_path, 1, **first)
+    write_phase(tmp_path, 2, 500, **second)
     with refused(RefusedInputError, "phases", "phase", keyword, 2, 7):
         read_volume(tmp_path)
+
+
+@TWO_PHASES
+def test_each_of_two_phases_is_read_by_its_number(tmp_path, first, second, keyword, values):
+    plan = write_phase(tmp_path, 1, **first)
+    write_phase(tmp_path, 2, 500, **second)
+    shifts = [500, 0] if values[-1] == "(none)" else [0, 500]  # slices without the element are the last phase
     for number, shift in enumerate(shifts, start=1):
         volume = read_volume(tmp_path, phase=number)
         assert np.array_equal(volume.voxels, plan.hu() + shift)
         assert volume.ijk_to_lps([(2, 3, 4)])[0] == pytest.approx(plan.truth([(2, 3, 4)])[0])
-        told = f"phase {number} of 2 ({keyword} {values[number - 1]}) read, 7 slices of others left"
-        assert told in volume.report["warnings"]
-        assert volume.report["phase"] == {"number": number, "of": 2, "keyword": keyword, "value": values[number - 1]}
-        assert not any("2020" in text or "2021" in text for text in volume.report["warnings"])
 
 
-def test_phases_of_different_extent_are_read_each(tmp_path):
+@TWO_PHASES
+def test_report_of_a_phase_says_which_one_it_is_without_a_date(tmp_path, first, second, keyword, values):
+    write_phase(tmp_path, 1, **first)
+    write_phase(tmp_path, 2, 500, **second)
+    report = read_volume(tmp_path, phase=2).report
+    assert report["phase"] == {"number": 2, "of": 2, "keyword": keyword, "value": values[1]}
+    assert f"phase 2 of 2 ({keyword} {values[1]}) read, 7 slices of others left" in report["warnings"]
+    assert not any("2020" in warning or "2021" in warning for warning in report["warnings"])
+
+
+def test_phases_of_different_lengths_are_listed_and_read(tmp_path):
     write_phase(tmp_path, 1, AcquisitionNumber=1)
     write_phase(tmp_path, 2, 9, Plan(shape=(4, 5, 6), name="b{}".format), AcquisitionNumber=2)
     assert [phase["slices"] for phase in list_series(tmp_path).series[0].phases] == [7, 4]
     assert read_volume(tmp_path, phase=2).shape_ijk == (6, 5, 4)
 
 
-def test_two_elements_together_tell_four_phases_apart(tmp_path):
+def test_four_phases_that_two_elements_tell_apart_together_are_listed_and_read(tmp_path):
     for number, (kernel, phase) in enumerate([("A", 1), ("A", 2), ("B", 1), ("B", 2)]):
         write_phase(tmp_path, number, 100 * number, ConvolutionKernel=kernel, AcquisitionNumber=phase)
     phases = list_series(tmp_path).series[0].phases
     assert [phase["value"] for phase in phases] == ["1, A", "1, B", "2, A", "2, B"]
     assert {phase["keyword"] for phase in phases} == {"AcquisitionNumber and ConvolutionKernel"}
-    assert read_volume(tmp_path, phase=2).voxels[0, 0, 0] == 900 - 1024 + 200
+    shift_of_b_1 = 200
+    assert read_volume(tmp_path, phase=2).voxels[0, 0, 0] == Plan().hu()[0, 0, 0] + shift_of_b_1
 
 
-def test_a_time_of_its_own_for_every_slice_ranks_the_visits(tmp_path):
+def test_slices_with_a_time_each_are_phases_by_the_order_of_their_times(tmp_path):
     plan = write_phase(tmp_path, 1, AcquisitionTime=lambda k: f"1010{10 + k}")
     write_phase(tmp_path, 2, 300, AcquisitionTime=lambda k: f"1010{30 - k}")
     phases = list_series(tmp_path).series[0].phases
@@ -113,14 +144,14 @@ def test_a_time_of_its_own_for_every_slice_ranks_the_visits(tmp_path):
     assert np.array_equal(read_volume(tmp_path, phase=2).voxels, plan.hu() + 300)
 
 
-def test_different_slices_that_nothing_tells_apart_are_refused(tmp_path):
-    write_series(tmp_path, Plan(offsets={3: -1.25}))
-    with pytest.raises(RefusedInputError) as caught:
+def test_two_different_slices_at_one_place_that_no_element_tells_apart_are_refused(tmp_path):
+    write_series(tmp_path, Plan(offsets={3: -1.25}))  # slice 3 lies where slice 2 does
+    with refused(RefusedInputError, "duplicate", "slice002.dcm", "slice003.dcm", 1) as refusal:
         read_volume(tmp_path)
-    assert_one_line(caught.value, "duplicate", "slice002.dcm", "slice003.dcm", 1)
+    assert_one_line(refusal.value)
 
 
-def test_copies_within_phases_are_dropped_first(tmp_path):
+def test_copy_of_a_slice_of_a_phase_is_dropped_with_a_warning(tmp_path):
     write_phase(tmp_path, 1, AcquisitionNumber=1)
     write_phase(tmp_path, 2, 500, AcquisitionNumber=2)
     (tmp_path / "copy").write_bytes((tmp_path / "phase2-3").read_bytes())
@@ -132,21 +163,21 @@ def test_copies_within_phases_are_dropped_first(tmp_path):
 @pytest.mark.parametrize(
     ("phase", "says"), [(3, "no phase 3"), (0, "number from 1"), ("2", "number"), (True, "number")]
 )
-def test_phases_that_are_not_there_are_refused(tmp_path, phase, says):
+def test_phase_that_is_not_there_or_no_number_is_refused(tmp_path, phase, says):
     write_phase(tmp_path, 1, AcquisitionNumber=1)
     write_phase(tmp_path, 2, 500, AcquisitionNumber=2)
     with pytest.raises(UsageError, match=says):
         read_volume(tmp_path, phase=phase)
 
 
-def test_a_series_of_one_volume_has_a_first_phase_only(tmp_path):
+def test_series_of_one_volume_is_read_as_its_first_phase_and_refused_as_its_second(tmp_path):
     plan = write_series(tmp_path, Plan())
     assert np.array_equal(read_volume(tmp_path, phase=1).voxels, plan.hu())
     with refused(UsageError, "slice", "phase", 2):
         read_volume(tmp_path, phase=2)
 
 
-def test_copies_whose_pixels_cannot_be_read_are_refused(tmp_path, monkeypatch):
+def test_two_slices_at_one_place_whose_pixels_cannot_be_compared_are_refused(tmp_path, monkeypatch):
     write_series(tmp_path, Plan())
     write_series(tmp_path, Plan(name="again{}".format))
 
@@ -159,76 +190,107 @@ def test_copies_whose_pixels_cannot_be_read_are_refused(tmp_path, monkeypatch):
     assert list_series(tmp_path).series[0].phases == []
 
 
-def test_the_same_stored_values_with_another_rescale_are_no_copies(tmp_path):
-    write_series(tmp_path / "a", Plan())
+def test_slices_of_the_same_stored_values_with_another_rescale_are_no_copies(tmp_path):
+    write_series(tmp_path / "a", Plan(intercept=-1024))
     write_series(tmp_path / "b", Plan(intercept=-1000))
     one, other = (scan_path(tmp_path / name).slices[0] for name in "ab")
     assert have_same_pixels(one, one)
     assert not have_same_pixels(one, other)
 
 
-def test_of_several_patients_none_is_taken_unasked(tmp_path):
+@pytest.fixture
+def series_of_two_patients(tmp_path):
+    """7 slices of the patient with the ID ONE, and 4 of TWO."""
     write_series(tmp_path / "a", Plan(series=1), set_values(PatientID="ONE"))
     write_series(tmp_path / "b", Plan(series=2, shape=(4, 5, 6)), set_values(PatientID="TWO"))
-    with pytest.raises(RefusedInputError) as caught:
-        read_volume(tmp_path)
-    assert "CT series of 2 patients, choose one with series" in str(caught.value)
-    assert "patient 1, series 1" in str(caught.value) and "ONE" not in str(caught.value)
-    assert read_volume(tmp_path, 2).shape_ijk == (6, 5, 4)
-    listing = list_series(tmp_path)
+    return tmp_path
+
+
+def test_series_of_two_patients_are_refused_with_their_list_and_without_their_ids(series_of_two_patients):
+    with pytest.raises(RefusedInputError) as refusal:
+        read_volume(series_of_two_patients)
+    text = str(refusal.value)
+    assert "CT series of 2 patients, choose one with series" in text
+    assert "patient 1, series 1" in text
+    assert "ONE" not in text
+
+
+def test_series_of_one_of_two_patients_is_read_by_its_number(series_of_two_patients):
+    assert read_volume(series_of_two_patients, 2).shape_ijk == (6, 5, 4)
+
+
+def test_series_of_two_patients_are_listed_with_none_chosen(series_of_two_patients):
+    listing = list_series(series_of_two_patients)
     assert listing.chosen is None
-    assert [(entry.patient, entry.kind) for entry in listing.series] == [(1, "stack"), (2, "stack")]
+    assert [(series.patient, series.kind) for series in listing.series] == [(1, "stack"), (2, "stack")]
 
 
-def test_studies_are_numbered_and_never_mixed(tmp_path):
+def test_series_of_two_studies_are_listed_with_the_number_of_each(tmp_path):
     write_series(tmp_path / "a", Plan(series=1), set_values(StudyInstanceUID="1.2.1"))
     write_series(tmp_path / "b", Plan(series=2, shape=(4, 5, 6)), set_values(StudyInstanceUID="1.2.2"))
-    assert [entry.study for entry in list_series(tmp_path).series] == [1, 2]
-    write_series(tmp_path / "a", Plan(series=1), set_values(3, StudyInstanceUID="1.2.9"))
+    assert [series.study for series in list_series(tmp_path).series] == [1, 2]
+
+
+def test_slice_of_another_study_within_a_series_is_refused(tmp_path):
+    write_series(tmp_path, Plan(series=1), set_values(StudyInstanceUID="1.2.1"))
+    write_series(tmp_path, Plan(series=1), set_values(3, StudyInstanceUID="1.2.9"))
     with refused(RefusedInputError, "StudyInstanceUID", "series"):
         read_volume(tmp_path, 1)
 
 
-def test_localizers_at_one_place_and_broken_directions_are_no_phases(tmp_path):
+def test_three_localizers_at_one_place_are_listed_without_phases(tmp_path):
     for number in range(3):
         write_series(
             tmp_path / f"scout{number}",
             Plan(series=1, shape=(1, 5, 6), name=f"scout{number}-{{}}".format),
             set_values(ImageType=["ORIGINAL", "PRIMARY", "LOCALIZER"]),
         )
-
-    def skew(ds, k):
-        ds.ImageOrientationPatient = [
-            float(v) + 0.002 * (axis == 2) for axis, v in enumerate(ds.ImageOrientationPatient)
-        ]
-
-    write_series(tmp_path / "ct", Plan(series=2, angles=(0, 90, 90)), skew)
-    scout, stack = list_series(tmp_path).series
+    (scout,) = list_series(tmp_path).series
     assert (scout.kind, scout.slices, scout.phases) == ("localizer", 3, [])
-    assert any("off unit length or right angle" in text for text in stack.problems)
-    assert not any("duplicate" in text for text in stack.problems) and stack.phases == []
 
 
-def test_a_slice_that_two_phases_have_alike_belongs_to_both(tmp_path):
+def test_series_whose_directions_are_not_at_right_angles_is_listed_with_that_problem_and_without_phases(tmp_path):
+    def skew(ds, k):
+        x, y, z, *column = map(float, ds.ImageOrientationPatient)
+        ds.ImageOrientationPatient = [x, y, z + 0.002, *column]
+
+    write_series(tmp_path, Plan(angles=(0, 90, 90)), skew)
+    (stack,) = list_series(tmp_path).series
+    assert any("off unit length or right angle" in problem for problem in stack.problems)
+    assert not any("duplicate" in problem for problem in stack.problems)
+    assert stack.phases == []
+
+
+def test_slices_that_are_the_same_in_two_phases_belong_to_both(tmp_path):
     plan = write_phase(tmp_path, 1, AcquisitionNumber=1)
     write_phase(tmp_path, 2, 500, AcquisitionNumber=2)
-    for k in (0, 6):
+    for k in (0, 6):  # first and last slice of phase 2: the pixels of phase 1
         ds = make_dataset(plan, k)
         ds.AcquisitionNumber = 2
         save_dataset(ds, tmp_path / f"phase2-{k}")
-    (tmp_path / "copy").write_bytes((tmp_path / "phase2-3").read_bytes())
     expected = plan.hu()
     expected[1:6] += 500
     volume = read_volume(tmp_path, phase=2)
     assert np.array_equal(volume.voxels, expected)
     assert volume.ijk_to_lps([(0, 0, 0)])[0] == pytest.approx(plan.position(0))
+
+
+def test_copy_beside_slices_that_are_the_same_in_two_phases_is_dropped_with_a_warning(tmp_path):
+    plan = write_phase(tmp_path, 1, AcquisitionNumber=1)
+    write_phase(tmp_path, 2, 500, AcquisitionNumber=2)
+    ds = make_dataset(plan, 0)
+    ds.AcquisitionNumber = 2
+    save_dataset(ds, tmp_path / "phase2-0")
+    (tmp_path / "copy").write_bytes((tmp_path / "phase2-3").read_bytes())
+    volume = read_volume(tmp_path, phase=2)
+    assert volume.shape_ijk == (6, 5, 7)
     assert "1 duplicate slice dropped: same place, same pixels as another" in volume.report["warnings"]
 
 
-def test_visits_are_ranked_where_two_of_them_are_alike(tmp_path):
+def test_phases_by_the_order_of_times_may_have_a_slice_in_common(tmp_path):
     plan = write_phase(tmp_path, 1, AcquisitionTime=lambda k: f"1010{10 + k}")
     write_phase(tmp_path, 2, 300, AcquisitionTime=lambda k: f"1010{30 + k}")
-    ds = make_dataset(plan, 0)
+    ds = make_dataset(plan, 0)  # the first slice of the second phase: the pixels of the first
     ds.AcquisitionTime = "101030"
     save_dataset(ds, tmp_path / "phase2-0")
     expected = plan.hu()
@@ -246,7 +308,7 @@ def test_visits_are_ranked_where_two_of_them_are_alike(tmp_path):
     ],
     ids=["spacing", "frame", "moved sideways", "turned"],
 )
-def test_slices_with_equal_pixels_and_another_geometry_are_no_copies(tmp_path, elements, plan):
+def test_slices_of_equal_pixels_and_another_geometry_are_not_dropped_but_refused(tmp_path, elements, plan):
     write_series(tmp_path, Plan())
     write_phase(tmp_path, 2, plan=Plan(name="b{}".format, **plan), **elements)
     with refused(RefusedInputError, "series"):
@@ -268,88 +330,128 @@ def test_slices_with_equal_pixels_and_another_geometry_are_no_copies(tmp_path, e
     ],
     ids=["midnight", "order of reconstruction", "neither passes nor stops"],
 )
-def test_times_that_tell_no_passes_apart_are_not_ranked(tmp_path, first, second):
+def test_slices_whose_times_tell_no_passes_apart_are_refused(tmp_path, first, second):
     write_phase(tmp_path, 1, **first)
     write_phase(tmp_path, 2, 500, **second)
     with refused(RefusedInputError, "element", "headers", 2):
         read_volume(tmp_path)
 
 
-def test_stops_with_all_visits_each_are_ranked(tmp_path):
-    plan = write_phase(tmp_path, 1, AcquisitionTime=lambda k: f"10{10 + k // 3}10")
+def test_slices_of_a_table_that_stops_for_both_phases_are_read_by_the_order_of_their_times(tmp_path):
+    plan = write_phase(tmp_path, 1, AcquisitionTime=lambda k: f"10{10 + k // 3}10")  # three slices at each stop
     write_phase(tmp_path, 2, 500, AcquisitionTime=lambda k: f"10{10 + k // 3}20")
     assert np.array_equal(read_volume(tmp_path, phase=2).voxels, plan.hu() + 500)
 
 
-@pytest.mark.parametrize(
+BETWEEN = pytest.mark.parametrize(
     ("keyword", "values", "along"),
     [("ConvolutionKernel", ("A", "B"), 0.625), ("KVP", (80, 120), 0.4), ("AcquisitionNumber", (1, 2), 5 * 1.25 + 0.5)],
     ids=["half a gap apart", "uneven", "overlapping acquisitions"],
 )
-def test_volumes_whose_slices_lie_between_each_other_are_phases(tmp_path, keyword, values, along):
+
+
+def write_two_volumes(folder, keyword, values, along):
+    """Two volumes, the second with pixels 500 higher and `along` mm towards the head."""
     plans = [Plan(name=f"{n}-{{}}".format, origin=(-12.5, 31.25, -400 + n * along)) for n in (0, 1)]
     for number, value in enumerate(values):
-        write_phase(tmp_path, number, 500 * number, plans[number], **{keyword: value})
-    with pytest.raises(RefusedInputError) as caught:
+        write_phase(folder, number, 500 * number, plans[number], **{keyword: value})
+    return plans
+
+
+@BETWEEN
+def test_two_volumes_whose_slices_lie_between_each_other_are_refused_as_phases(tmp_path, keyword, values, along):
+    write_two_volumes(tmp_path, keyword, values, along)
+    with refused(RefusedInputError, "phases", "phase", keyword, 2, 1) as refusal:
         read_volume(tmp_path)
-    assert_one_line(caught.value, "phases", "phase", keyword, 2, 1)
-    for number, plan in enumerate(plans):
+    assert_one_line(refusal.value)
+
+
+@BETWEEN
+def test_each_of_two_volumes_whose_slices_lie_between_each_other_is_read_evenly(tmp_path, keyword, values, along):
+    for number, plan in enumerate(write_two_volumes(tmp_path, keyword, values, along)):
         volume = read_volume(tmp_path, phase=number + 1)
-        assert np.array_equal(volume.voxels, plan.hu() + 500 * number) and not volume.uneven
+        assert not volume.uneven
+        assert np.array_equal(volume.voxels, plan.hu() + 500 * number)
         assert volume.ijk_to_lps([(2, 3, 4)])[0] == pytest.approx(plan.truth([(2, 3, 4)])[0])
 
 
 @pytest.mark.parametrize(
-    ("elements", "told"),
+    ("elements", "words"),
     [
-        (
+        pytest.param(
             {"AcquisitionNumber": lambda k: (1, 2, 1, 1, 2, 2, 1)[k]},
             "AcquisitionNumber alternates along the stack: maybe several",
+            id="by turns",
         ),
-        ({"KVP": lambda k: (80, 120)[k > 3]}, "KVP differs along the stack: maybe parts"),
-        ({"SliceThickness": lambda k: 2.0 + (k == 3)}, "SliceThickness differs along the stack (1 of 7"),
-        ({"AcquisitionNumber": lambda k: 1 + k // 2}, None),
-        ({"AcquisitionNumber": lambda k: k}, None),
+        pytest.param({"KVP": lambda k: (80, 120)[k > 3]}, "KVP differs along the stack: maybe parts", id="two parts"),
+        pytest.param(
+            {"SliceThickness": lambda k: 2.0 + (k == 3)},
+            "SliceThickness differs along the stack (1 of 7",
+            id="one slice",
+        ),
     ],
 )
-def test_elements_that_differ_along_a_stack_are_told(tmp_path, elements, told):
+def test_element_that_differs_along_a_stack_is_warned_of(tmp_path, elements, words):
     write_phase(tmp_path, 1, **elements)
-    warnings = read_volume(tmp_path).report["warnings"]
-    assert len(warnings) == (told is not None)
-    assert told is None or told in warnings[0]
+    (warning,) = read_volume(tmp_path).report["warnings"]
+    assert words in warning
 
 
-def test_a_phase_that_is_shorter_than_another_is_said(tmp_path):
+@pytest.mark.parametrize("number", [lambda k: 1 + k // 2, lambda k: k], ids=["two slices each", "a slice each"])
+def test_acquisition_number_that_counts_along_a_stack_is_not_warned_of(tmp_path, number):
+    write_phase(tmp_path, 1, AcquisitionNumber=number)
+    assert read_volume(tmp_path).report["warnings"] == []
+
+
+def test_phase_that_is_shorter_than_another_is_warned_of(tmp_path):
     write_phase(tmp_path, 1, AcquisitionNumber=1)
     write_phase(tmp_path, 2, 500, Plan(name="b{}".format, leave_out=(6,)), AcquisitionNumber=2)
     assert "phase 2 has 6 slices, another one 7" in read_volume(tmp_path, phase=2).report["warnings"]
-    assert not any("another one" in text for text in read_volume(tmp_path, phase=1).report["warnings"])
+    assert not any("another one" in warning for warning in read_volume(tmp_path, phase=1).report["warnings"])
 
 
-@pytest.mark.parametrize(
-    ("elements", "told"),
-    [
-        ({"AcquisitionNumber": lambda k: k + 1}, "7 phases of one slice each, which differ in AcquisitionNumber"),
-        ({}, "7 of them with different pixels, and no element of their headers parts them into phases"),
-        ({"PixelData": lambda k: Plan().stored(0).tobytes()}, "copies of each other"),
-    ],
-)
-def test_images_that_all_lie_at_one_place_are_no_volume(tmp_path, elements, told):
+ONE_PLACE = {
+    "phases": (
+        {"AcquisitionNumber": lambda k: k + 1}, "7 phases of one slice each, which differ in AcquisitionNumber"
+    ),
+    "different pixels": (
+        {}, "7 of them with different pixels, and no element of their headers parts them into phases"
+    ),
+    "copies": ({"PixelData": lambda k: Plan().stored(0).tobytes()}, "copies of each other"),
+}  # fmt: skip
+
+
+@pytest.fixture(params=ONE_PLACE)
+def images_at_one_place(request, tmp_path):
+    """A folder of 7 images that all lie at one place, and what is said of them."""
+    elements, words = ONE_PLACE[request.param]
+
     def change(ds, k):
         ds.ImagePositionPatient = list(Plan().origin)
         for keyword, value in elements.items():
             setattr(ds, keyword, value(k))
 
     write_series(tmp_path, Plan(), change)
-    entry = list_series(tmp_path).series[0]
-    assert len(entry.problems) == 1
-    for phase in (None, 1):
-        with pytest.raises(RefusedInputError) as caught:
-            read_volume(tmp_path, phase=phase)
-        text = str(caught.value)
-        assert f"all 7 images lie in one plane, at ImagePositionPatient (-12.5, 31.25, -400) mm ({told})" in text
-        assert "a single slice cannot make a volume" in text and "export the series again" in text
-        assert "choose one with" not in text
-        assert ("choosing a phase does not help" in text) == bool(entry.phases)
+    return tmp_path, words
+
+
+@pytest.mark.parametrize("phase", [None, 1])
+def test_images_at_one_place_are_refused_with_what_they_are_and_what_to_do(images_at_one_place, phase):
+    folder, words = images_at_one_place
+    with pytest.raises(RefusedInputError) as refusal:
+        read_volume(folder, phase=phase)
+    text = str(refusal.value)
+    assert f"all 7 images lie in one plane, at ImagePositionPatient (-12.5, 31.25, -400) mm ({words})" in text
+    assert "a single slice cannot make a volume" in text
+    assert "export the series again" in text
+    assert "choose one with" not in text
+    assert ("choosing a phase does not help" in text) == ("7 phases" in words)
+
+
+def test_images_at_one_place_are_listed_with_one_problem(images_at_one_place):
+    assert len(list_series(images_at_one_place[0]).series[0].problems) == 1
+
+
+def test_phase_beyond_the_images_at_one_place_is_refused(images_at_one_place):
     with refused(UsageError, "phase", 8, 7):
-        read_volume(tmp_path, phase=8)
+        read_volume(images_at_one_place[0], phase=8)
