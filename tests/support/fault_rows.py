@@ -85,7 +85,10 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     ),
     25: (
         "slope and intercept slice by slice: right; slope 0, NaN, infinite, text: refused",
-        (PIXELS + "test_rescale_goes_slice_by_slice", GEOMETRY + "test_bad_values_name_file_and_tag"),
+        (
+            PIXELS + "test_each_slice_is_rescaled_by_its_own_slope_and_intercept",
+            GEOMETRY + "test_bad_values_name_file_and_tag",
+        ),
     ),
     26: (
         "padding of -2000 with a skin threshold: no tube",
@@ -99,13 +102,16 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
         "MONOCHROME1: told; colour, palette, secondary capture: refused",
         (
             PIXELS + "test_doubtful_values_are_kept_with_a_warning",
-            PIXELS + "test_images_that_are_no_ct_slice_are_refused",
+            PIXELS + "test_image_that_is_no_ct_slice_is_refused_with_its_element",
             "reading/dicom/test_doubtful_headers.py::test_a_secondary_capture_with_a_position_is_refused",
         ),
     ),
     29: (
         "RescaleType not HU, rescale missing: told",
-        (PIXELS + "test_missing_rescale_is_not_hu", PIXELS + "test_doubtful_values_are_kept_with_a_warning"),
+        (
+            PIXELS + "test_values_without_a_rescale_are_kept_with_a_warning",
+            PIXELS + "test_doubtful_values_are_kept_with_a_warning",
+        ),
     ),
     30: (
         "iso value outside of the data: refused with the range, no empty file",
@@ -150,7 +156,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     42: (
         "big endian; implicit under explicit: right, told",
         (
-            PIXELS + "test_native_syntaxes_give_the_same_hu",
+            PIXELS + "test_native_transfer_syntaxes_give_the_same_hu",
             HOSTILE + "test_implicit_elements_under_an_explicit_syntax_are_read_with_a_warning",
         ),
     ),

@@ -90,6 +90,11 @@ TILT_DEG = 1e-6  # from positions with 9 decimals
 DIRECTION = 1e-8  # direction cosines with 9 decimals
 INVERSE_AFFINE_VOXEL = 1e-5  # positions with 9 decimals through the inverse, in voxels of half a mm and more
 
+REAL_AFFINE_MM = 5e-4  # decimal strings of pixel spacings with six digits over 512 pixels
+REAL_MEAN_HU = 1e-3  # the known mean has four decimals
+REAL_FAR_CORNER_MM = 1e-3  # PixelSpacing has six decimals, 511 pixels away
+REAL_TILT_DEG = 0.05  # the known tilt has one decimal
+
 THOUSAND_FRAMES_S = 1.0  # of processors, for headers of 1000 frames in one file; measured 0.11
 
 # --- labels ---
