@@ -66,9 +66,9 @@ def show(
     """Show objects in a window of pyvista, until it is closed.
 
     A plain ``pyvista.Plotter``: drag turns, Shift and drag pans, the wheel zooms.  A slider sets the iso value of
-    volumes, whose surfaces are extracted on the device; ``c`` adds a plane that clips everything, ``m`` measures a
-    distance by two clicks, ``1`` to ``6`` are the sides of the patient, ``q`` closes the window.  ``clrecon view``
-    shows more, in the browser.
+    volumes, whose surfaces are extracted on the device; ``t`` fits them to the bone, ``T`` colours those by thickness
+    or error, ``c`` adds a plane that clips everything, ``m`` measures a distance by two clicks, ``1`` to ``6`` are the
+    sides of the patient, ``q`` closes the window.  ``clrecon view`` shows more, in the browser.
 
     Parameters
     ----------
@@ -108,9 +108,9 @@ def show_inputs(
     check_view_settings(settings)
     display = _wait_for_display(probe)
     objects = read_objects(inputs, settings, progress)
-    iso_value = choose_iso(objects, settings.scan, progress)
     scan = settings.scan
-    with open_plotter(objects, iso_value=iso_value, device=scan.device, memory=scan.memory) as plotter:
+    fitted, iso_value = scan.surface == "cortex", choose_iso(objects, scan, progress)
+    with open_plotter(objects, iso_value=iso_value, fitted=fitted, device=scan.device, memory=scan.memory) as plotter:
         ready(list(dict.fromkeys(chain(*(each.said for each in objects)))))
         _run(plotter, display)
 
@@ -120,6 +120,7 @@ def open_plotter(
     objects: Sequence[ShownObject],
     *,
     iso_value: float | None = None,
+    fitted: bool = False,
     device: Any = None,
     memory: int | None = None,
     off_screen: bool = False,
@@ -144,7 +145,7 @@ def open_plotter(
                 extractor = opened.enter_context(SurfaceExtractor(shown.volume, device=device, memory=memory))
                 extractors.append((shown.name, extractor))
         if extractors:
-            surfaces = _Surfaces(plotter, extractors, find_iso_range(scans), iso_value)
+            surfaces = _Surfaces(plotter, extractors, find_iso_range(scans), iso_value, fitted=fitted)
             plotter.add_key_event("t", surfaces.toggle_fitted)
             plotter.add_key_event("T", surfaces.step_color_by)
         plotter.add_axes(xlabel="L", ylabel="P", zlabel="S", color="white")
@@ -173,11 +174,13 @@ class _Surfaces:
         extractors: Sequence[tuple[str, SurfaceExtractor]],
         limits: tuple[float, float],
         iso_value: float | None,
+        *,
+        fitted: bool,
     ) -> None:
         import pyvista
 
         self._plotter, self._extractors = plotter, extractors
-        self._fitted, self._color_by = False, 0
+        self._fitted, self._color_by = fitted, 0
         self._surfaces = {name: pyvista.PolyData() for name, _ in extractors}
         self._actors: dict[str, Any] = {}
         self._hu = min(max(DEFAULT_ISO_VALUE if iso_value is None else iso_value, limits[0]), limits[1])

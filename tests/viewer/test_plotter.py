@@ -125,6 +125,15 @@ def test_the_scan_of_a_scene_is_its_isosurface(scene, device):
 
 
 @pytest.mark.opencl
+def test_scene_that_is_to_be_fitted_begins_on_the_bone(device):
+    need_screen()
+    with open_plotter(
+        show_objects([make_scan()]), iso_value=ISO, fitted=True, device=device, off_screen=True
+    ) as plotter:
+        assert "thickness_mm" in plotter.renderer.actors["scan 1"].mapper.dataset.point_data
+
+
+@pytest.mark.opencl
 def test_keys_of_a_scene_fit_the_scan_to_the_bone_and_colour_it(scene):
     actor = scene.plotter.renderer.actors["scan 1"]
     level = np.array(actor.mapper.dataset.points)

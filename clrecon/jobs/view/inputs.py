@@ -38,6 +38,8 @@ def check_view_settings(settings: ViewSettings) -> None:
     """Refuse settings that a view has no meaning for, before anything is read."""
     scan = settings.scan
     ignored = {own.name for own in fields(InputSettings)} | _OF_A_VIEW
+    if scan.surface == "cortex":
+        ignored.add("surface")
     for name in changed_fields(scan):
         if name not in ignored:
             raise UsageError(

@@ -43,10 +43,11 @@ class OpenedView(Closing):
         self.said = list(dict.fromkeys(chain(*(each.said for each in self.objects))))
         self._iso_value = choose_iso(self.objects, scan, progress)
         self._space, self._keep_ids = scan.space, scan.keep_ids
+        self._fitted = scan.surface == "cortex" and any(isinstance(each, ShownScan) for each in self.objects)
         self.painter = Painter(self.objects, device=scan.device, memory=scan.memory)
 
     def session(self, on_change: Callable[[], None] | None = None) -> ViewSession:
-        return ViewSession(
+        session = ViewSession(
             self.objects,
             self.painter,
             space=self._space,
@@ -54,6 +55,9 @@ class OpenedView(Closing):
             keep_ids=self._keep_ids,
             on_change=on_change,
         )
+        if self._fitted:
+            session.set_fitted(True)
+        return session
 
     def close(self) -> None:
         self.painter.close()

@@ -16,7 +16,10 @@ from surface_volumes import MIDDLE, hollow_ball
 from clrecon import read_mesh
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.view import ViewSettings
 from clrecon.rendering import Rendering
+from clrecon.viewer.session.opening import open_view
 from clrecon.viewer.session.session import ViewSession
 
 pytestmark = pytest.mark.opencl
@@ -68,6 +71,14 @@ def test_the_fit_is_announced_and_lies_on_the_bone(session) -> None:
     assert picked_radius(view) == pytest.approx(13.0, abs=0.15)
     assert do(view, "toggle_fitted")["fitted"] is False
     assert picked_radius(view) > 13.4
+
+
+def test_a_view_asked_for_the_surface_of_the_cortex_begins_with_it(device, tmp_path: Path) -> None:
+    hollow_ball(thickness=3.0).save(tmp_path / "ct.nii.gz")
+    scan = MeshSettings(surface="cortex", device=str(device.index))
+    with open_view([tmp_path / "ct.nii.gz"], ViewSettings(scan=scan)) as opened, opened.session() as view:
+        assert view.wait(PATIENCE)
+        assert view.facts()["fitted"] is True and view.facts()["error"] is None
 
 
 def test_a_surface_is_fitted_once_for_each_iso_value(session) -> None:
