@@ -347,10 +347,10 @@ def eighth_zeroed(whole):
     return whole[:half] + bytes(eighth) + whole[half + eighth :]
 
 
-@pytest.fixture(params=["70", "80", "90"], ids=["JPEG lossless", "JPEG-LS", "JPEG 2000"])
+@pytest.fixture(params=["RLE", "JPEGLS", "JPEG2000"])
 def compressed_stack(request, real_data, tmp_path):
     """A folder of two slices, 0 and 1, in one of the lossless codings."""
-    (source,) = (real_data / SYNTAXES).glob(f"*Lossless*4.{request.param}.dcm")
+    (source,) = (real_data / SYNTAXES).glob(f"*_{request.param}Lossless*.dcm")
     copy_as_stack(source, tmp_path)
     return tmp_path
 
