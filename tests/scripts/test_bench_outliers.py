@@ -1,4 +1,4 @@
-"""The list of commands that are timed on an ugly scan, and what makes one of them stand out."""
+"""The commands that are timed on an unusual scan, and when one of them stands out by its time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clrecon.errors import NoDicomError
 import outliers  # isort: skip
 
 
-def _run(cpu_s: float, error: str | None = None) -> outliers.Run:
+def run_of(cpu_s: float, error: str | None = None) -> outliers.Run:
     return outliers.Run(wall_s=9.0, cpu_s=cpu_s, memory_bytes=10**9, error=error)
 
 
@@ -25,24 +25,33 @@ def test_timed_command_is_understood_up_to_its_missing_input(
     assert main([*words, "-q"]) == NoDicomError.exit_code
 
 
+def test_command_of_more_than_5_s_stands_out() -> None:
+    assert "over 5 s" in outliers.judge(run_of(5.1), None)
+
+
+def test_command_of_more_than_three_times_its_peer_stands_out_with_the_factor() -> None:
+    assert "3.2 times" in outliers.judge(run_of(3.2), run_of(1.0))
+
+
 @pytest.mark.parametrize(
-    ("cpu_s", "peer_s", "said"), [(4.9, None, ""), (5.1, None, "over 5 s"), (2.9, 1.0, ""), (3.2, 1.0, "3.2 times")]
+    ("run", "peer"),
+    [
+        pytest.param(run_of(4.9), None, id="below 5 s"),
+        pytest.param(run_of(2.9), run_of(1.0), id="below three times its peer"),
+        pytest.param(run_of(3.2), run_of(1.0, "exit 1: no module"), id="its peer has failed"),
+    ],
 )
-def test_command_stands_out_by_seconds_or_by_its_peer(cpu_s: float, peer_s: float | None, said: str) -> None:
-    peer = None if peer_s is None else _run(peer_s)
-    why = outliers.judge(_run(cpu_s), peer)
-    assert (said in why) if said else why == ""
+def test_command_within_both_limits_or_beside_a_peer_that_failed_does_not_stand_out(
+    run: outliers.Run, peer: outliers.Run | None
+) -> None:
+    assert outliers.judge(run, peer) == ""
 
 
-def test_failed_peer_is_no_measure() -> None:
-    assert outliers.judge(_run(3.2), _run(1.0, "exit 1: no module")) == ""
-
-
-def test_process_that_fails_says_so_by_its_last_line(tmp_path: Path) -> None:
+def test_error_of_a_process_that_fails_is_its_exit_code_and_last_line(tmp_path: Path) -> None:
     run = outliers.time_process(["sh", "-c", "echo first >&2; echo last >&2; exit 5"], str(tmp_path), 60.0)
     assert run.error == "exit 5: last"
 
 
-def test_process_over_its_limit_is_ended(tmp_path: Path) -> None:
+def test_process_over_its_time_limit_is_ended_with_an_error(tmp_path: Path) -> None:
     run = outliers.time_process(["sleep", "3600"], str(tmp_path), 0.2)
     assert run.error == "over 0.2 s"

@@ -26,45 +26,57 @@ def make_job(folder: Path, tmp_path: Path) -> Any:
     return registry.Job(given, 226.0, 1, SimpleNamespace(index=0), 1, 60.0)
 
 
-def test_a_tree_holds_series_that_can_be_read(tmp_path: Path) -> None:
-    assert trees.write_tree(tmp_path / "tree", 3, 4) == 12
-    listing = list_series(tmp_path / "tree")
-    assert [entry.slices for entry in listing.series] == [4, 4, 4]
-    assert {entry.gap_mm["max"] for entry in listing.series} == {trees.GAP_MM}
-    assert (
-        len({entry.uid_hash for entry in listing.series}) == len({entry.description for entry in listing.series}) == 3
-    )
+def test_written_tree_has_three_different_series_of_four_slices(tmp_path: Path) -> None:
+    assert trees.write_tree(tmp_path / "tree", 3, 4) == 3 * 4  # files
+    series = list_series(tmp_path / "tree").series
+    assert [entry.slices for entry in series] == [4, 4, 4]
+    assert len({entry.uid_hash for entry in series}) == 3
+    assert len({entry.description for entry in series}) == 3
+
+
+def test_slices_of_a_written_tree_are_a_gap_apart(tmp_path: Path) -> None:
+    trees.write_tree(tmp_path / "tree", 1, 4)
+    [entry] = list_series(tmp_path / "tree").series
+    assert entry.gap_mm["max"] == trees.GAP_MM
+
+
+@pytest.fixture
+def series_folder(tmp_path: Path) -> Path:
+    """A series of 12 slices of 32 x 40 pixels."""
+    write_series(tmp_path / "ct", PLAN)
+    return tmp_path / "ct"
 
 
 @pytest.mark.release
-def test_all_readers_of_the_bench_read_the_same(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["clrecon", "pydicom", "simpleitk"])
+def test_reader_of_the_bench_reads_the_voxels_of_the_library(name: str, series_folder: Path) -> None:
     pytest.importorskip("SimpleITK")
     from peers.read_series import READERS
 
-    write_series(tmp_path / "ct", PLAN)
-    expected = read_volume(tmp_path / "ct").voxels
-    assert set(READERS) == {"clrecon", "pydicom", "simpleitk"}
-    for read in READERS.values():
-        assert np.array_equal(read(str(tmp_path / "ct")), expected)
+    assert np.array_equal(READERS[name](str(series_folder)), read_volume(series_folder).voxels)
 
 
 @pytest.mark.release
-def test_reading_is_measured(tmp_path: Path) -> None:
+def test_reading_of_a_series_is_timed_against_pydicom_and_simpleitk_warm_and_in_a_process(
+    series_folder: Path, tmp_path: Path
+) -> None:
     pytest.importorskip("SimpleITK")
-    write_series(tmp_path / "ct", PLAN)
-    figures = reading.measure_reading(make_job(tmp_path / "ct", tmp_path))
+    figures = reading.measure_reading(make_job(series_folder, tmp_path))
     assert {"pydicom_warm", "simpleitk_warm", "pydicom_process", "simpleitk_process"} <= set(figures["ratios"])
-    assert figures["equal_shapes"] and figures["shapes"]["clrecon"] == [12, 32, 40] and figures["files"] == 12
+    assert figures["equal_shapes"]
+    assert figures["shapes"]["clrecon"] == list(PLAN.shape)
+    assert figures["files"] == PLAN.shape[0]
     assert 0 < figures["scan_seconds_a_file"]["median"] < 1
 
 
 @pytest.mark.release
-def test_scans_of_trees_are_measured(tmp_path: Path) -> None:
-    write_series(tmp_path / "ct", PLAN)
-    figures = reading.measure_scan_tree(make_job(tmp_path / "ct", tmp_path), ((2, 3), (4, 5)), 1)
-    assert [(tree["files"], tree["series"]) for tree in figures["trees"]] == [(6, 2), (20, 4)]
-    assert set(figures["ratios"]) == {"pydicom_headers"} and figures["processor_seconds_a_file_growth"] > 0
+def test_scan_of_trees_is_timed_against_pydicom_for_each_size(series_folder: Path, tmp_path: Path) -> None:
+    sizes = ((2, 3), (4, 5))  # series, slices of each
+    figures = reading.measure_scan_tree(make_job(series_folder, tmp_path), sizes, 1)
+    assert [(tree["series"], tree["files"]) for tree in figures["trees"]] == [(2, 2 * 3), (4, 4 * 5)]
+    assert set(figures["ratios"]) == {"pydicom_headers"}
+    assert figures["processor_seconds_a_file_growth"] > 0
 
 
-def test_the_folder_of_the_bench_is_the_one_tested() -> None:
+def test_modules_of_the_bench_are_those_of_this_project() -> None:
     assert Path(reading.__file__).parent == FOLDER
