@@ -1,6 +1,6 @@
-"""scripts/proof/check_gpu.py: what graphics cards' compilers make of the kernels, and that the check can fail.
+"""scripts/proof/check_gpu.py: registers, stack and spills of the kernels by the compilers for graphics cards.
 
-The compilers of LLVM are there with the drivers of `.ci/run`; a tool that is not skips its tests, unless
+The compilers of LLVM are installed with the drivers of `.ci/run`; the tests of a missing tool are skipped, unless
 CLRECON_REQUIRE_GPU_TOOLS=1.  All kernels for all targets are compiled before a release."""
 
 from __future__ import annotations
@@ -41,17 +41,24 @@ def many_values(count: int) -> str:
     return " ".join(["const uint i = get_global_id(0), s = (uint)in[0];", *lines, turns, *outs])
 
 
+def compile_kernel(target: str, statement: str, folder: Path) -> check_gpu.Figures:
+    """Compile a kernel `run` of one statement, which has the arrays `in` and `out`."""
+    folder.mkdir(exist_ok=True)
+    return compile_for(target, Text.write(folder, PLAIN.replace("STATEMENT", statement)))
+
+
 @pytest.mark.parametrize("target", ["gfx1030", "sm_86"])
-def test_an_array_with_indices_of_run_time_raises_the_stack(tmp_path: Path, target: str) -> None:
-    before = compile_for(target, Text.write(tmp_path, PLAIN.replace("STATEMENT", COPY)))
-    (tmp_path / "more").mkdir()
-    after = compile_for(target, Text.write(tmp_path / "more", PLAIN.replace("STATEMENT", INDEXED)))
-    assert check_gpu.compare(before, before) == []
-    assert any("stack, recorded are 0" in fault for fault in check_gpu.compare(after, before))
+def test_array_with_indices_known_at_run_time_alone_raises_the_stack_above_its_record(
+    tmp_path: Path, target: str
+) -> None:
+    recorded = compile_kernel(target, COPY, tmp_path / "copy")
+    figures = compile_kernel(target, INDEXED, tmp_path / "indexed")
+    assert any("stack, recorded are 0" in fault for fault in check_gpu.compare(figures, recorded))
 
 
-def test_three_hundred_living_numbers_spill(tmp_path: Path) -> None:
-    figures = compile_for("gfx1030", Text.write(tmp_path, PLAIN.replace("STATEMENT", many_values(300))))
+def test_more_numbers_at_once_than_registers_are_found_to_spill(tmp_path: Path) -> None:
+    registers_of_gfx1030 = 256
+    figures = compile_kernel("gfx1030", many_values(registers_of_gfx1030 + 44), tmp_path)
     assert any("run spills" in fault for fault in check_gpu.compare(figures, None))
 
 
@@ -59,61 +66,89 @@ def test_three_hundred_living_numbers_spill(tmp_path: Path) -> None:
     ("statement", "fault"),
     [("out[0] = (float)((double)in[0] / 3.0);", "double"), ("int unused; out[0] = in[0];", "unused variable")],
 )
-def test_a_double_and_a_warning_are_faults(tmp_path: Path, statement: str, fault: str) -> None:
+def test_kernel_with_double_precision_or_a_warning_is_not_compiled(tmp_path: Path, statement: str, fault: str) -> None:
     with pytest.raises(CompileError, match=fault):
-        compile_for("syntax", Text.write(tmp_path, PLAIN.replace("STATEMENT", statement)))
+        compile_kernel("syntax", statement, tmp_path)
 
 
-def test_figures_that_grew_are_faults() -> None:
-    recorded = {"run": {"registers": 40, "stack": 0, "spills": 0}, "walk": {"lanes": 16, "scratch": 0}}
-    same = {"run": {"registers": 48, "stack": 0, "spills": 0}, "walk": {"lanes": 32, "scratch": 0}}
-    assert check_gpu.compare(same, recorded) == []
-    worse = {"run": {"registers": 49, "stack": 0, "spills": 0}, "walk": {"lanes": 8, "scratch": 64}}
-    assert check_gpu.compare(worse, recorded) == [
-        "run has 49 registers, recorded are 40",
-        "walk has 64 scratch, recorded are 0",
-        "walk has 8 lanes, recorded are 16",
-    ]
-    assert check_gpu.compare({"other": {"stack": 0}}, recorded) == [
+RECORDED = {"run": {"registers": 40, "stack": 0, "spills": 0}, "walk": {"lanes": 16, "scratch": 0}}
+
+
+@pytest.mark.parametrize(
+    ("kernel", "figures", "faults"),
+    [
+        pytest.param("run", {"registers": 48}, [], id="8 more registers: a compiler's newer version"),
+        pytest.param("run", {"registers": 49}, ["run has 49 registers, recorded are 40"], id="9 more registers"),
+        pytest.param("walk", {"lanes": 32}, [], id="more lanes"),
+        pytest.param("walk", {"lanes": 8}, ["walk has 8 lanes, recorded are 16"], id="fewer lanes"),
+        pytest.param("walk", {"scratch": 64}, ["walk has 64 scratch, recorded are 0"], id="scratch memory"),
+    ],
+)
+def test_figure_of_a_kernel_that_is_worse_than_its_record_is_a_fault(
+    kernel: str, figures: dict[str, int], faults: list[str]
+) -> None:
+    found = {**RECORDED, kernel: {**RECORDED[kernel], **figures}}
+    assert check_gpu.compare(found, RECORDED) == faults
+
+
+def test_kernels_of_the_source_or_the_record_alone_are_faults() -> None:
+    assert check_gpu.compare({"other": {"stack": 0}}, RECORDED) == [
         "other is not recorded", "run is recorded and not there", "walk is recorded and not there"
     ]  # fmt: skip
 
 
-def test_a_missing_tool_and_a_kernel_that_does_not_build_are_named(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (CompileError("no such word"), "syntax: primitives/scan.cl: no such word"),
+        (NoToolError("ptxas"), "syntax: ptxas is not installed"),
+    ],
+    ids=["compile error", "missing tool"],
+)
+def test_kernel_that_does_not_compile_and_missing_tool_are_printed_as_faults(
+    error: Exception, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def refuse(text: Text) -> check_gpu.Figures:
-        raise CompileError("no such word")
+    def fail(text: Text) -> check_gpu.Figures:
+        raise error
 
-    def miss(text: Text) -> check_gpu.Figures:
-        raise NoToolError("ptxas")
-
-    for target, compile_text in {"syntax": refuse, "spirv": miss}.items():
-        monkeypatch.setitem(check_gpu.TARGETS, target, ("", compile_text))
-    assert check_gpu.main(["--only", "primitives/scan.cl", "--targets", "syntax,spirv"]) == 1
-    said = capsys.readouterr()
-    assert "syntax: primitives/scan.cl: no such word" in said.err
-    assert "spirv: ptxas is not installed" in said.err and said.out.endswith("2 faults\n")
+    monkeypatch.setitem(check_gpu.TARGETS, "syntax", ("", fail))
+    assert check_gpu.main(["--only", "primitives/scan.cl", "--targets", "syntax"]) == 1
+    output = capsys.readouterr()
+    assert line in output.err
+    assert output.out.endswith("1 faults\n")
 
 
-def test_every_kernel_of_every_variant_is_recorded() -> None:
-    kernels = set()
-    for variant in check_gpu.find_variants():
-        named = find_signatures(read_kernel_source(variant.file), definitions_of(tuple(variant.options())))
-        kernels |= {(variant.name, kernel) for kernel in named}
-    assert {kernel for _, kernel in kernels} == set(find_kernels())
-    for target, variants in check_gpu.read_record()["figures"].items():
-        recorded = {(variant, kernel) for variant, figures in variants.items() for kernel in figures}
-        assert recorded == kernels, f"{target}: scripts/proof/check_gpu.py --record --only FILE"
+@pytest.fixture(scope="module")
+def variants_and_kernels() -> set[tuple[str, str]]:
+    """The name of each variant of a kernel file with that of each of its kernels."""
+    return {
+        (variant.name, kernel)
+        for variant in check_gpu.find_variants()
+        for kernel in find_signatures(read_kernel_source(variant.file), definitions_of(tuple(variant.options())))
+    }
 
 
-def test_no_kernel_keeps_an_array_in_memory() -> None:
-    """But for the results of a function that one calls four times, which makers' compilers put in its place."""
-    figures = check_gpu.read_record()["figures"]
-    for target in ("gfx90a", "gfx1030", "gfx1100", "sm_86", "sm_90"):
-        kernels = [kernel for variant in figures[target].values() for kernel in variant.items()]
-        assert len(kernels) > 100
-        assert {name for name, told in kernels if told["stack"] or told["spills"]} <= {"fit_profiles"}
+def test_variants_that_are_compiled_have_every_kernel(variants_and_kernels: set[tuple[str, str]]) -> None:
+    assert {kernel for _, kernel in variants_and_kernels} == set(find_kernels())
+
+
+FIGURES = check_gpu.read_record()["figures"]
+
+
+@pytest.mark.parametrize("target", FIGURES)
+def test_every_kernel_of_every_variant_is_recorded_for_a_target(
+    target: str, variants_and_kernels: set[tuple[str, str]]
+) -> None:
+    recorded = {(variant, kernel) for variant, figures in FIGURES[target].items() for kernel in figures}
+    assert recorded == variants_and_kernels, "scripts/proof/check_gpu.py --record --only FILE"
+
+
+@pytest.mark.parametrize("target", ["gfx90a", "gfx1030", "gfx1100", "sm_86", "sm_90"])
+def test_no_kernel_but_fit_profiles_has_a_stack_or_spills_on_record(target: str) -> None:
+    """fit_profiles calls a function four times, whose results the compilers of card makers put in its place."""
+    kernels = [kernel for variant in FIGURES[target].values() for kernel in variant.items()]
+    assert len(kernels) > 100
+    assert {name for name, figures in kernels if figures["stack"] or figures["spills"]} <= {"fit_profiles"}
 
 
 SAMPLE = [Variant("surface/marching_cubes.cl"), Variant("surface/cells.cl"), Variant("rays/surface.cl", ("UNEVEN",))]
@@ -122,7 +157,9 @@ SAMPLE = [Variant("surface/marching_cubes.cl"), Variant("surface/cells.cl"), Var
 
 @pytest.mark.parametrize("variant", SAMPLE, ids=lambda variant: variant.name)
 @pytest.mark.parametrize("target", ["gfx1030", "sm_86"])
-def test_the_largest_kernels_keep_to_their_record(tmp_path: Path, target: str, variant: Variant) -> None:
+def test_compiled_figures_of_the_largest_kernels_are_no_worse_than_their_record(
+    tmp_path: Path, target: str, variant: Variant
+) -> None:
     text = Text.write(tmp_path, read_kernel_source(variant.file), variant.options())
     record = check_gpu.read_record()
     recorded = record["figures"][target][variant.name]
@@ -134,9 +171,8 @@ def test_the_largest_kernels_keep_to_their_record(tmp_path: Path, target: str, v
     assert check_gpu.compare(figures, recorded if known else None) == []
 
 
-def test_all_kernels_build_without_extensions(tmp_path: Path) -> None:
+@pytest.mark.parametrize("file", kernel_files())
+def test_kernel_file_compiles_without_extensions_of_opencl(file: str, tmp_path: Path) -> None:
     """Their variants do too, before a release."""
-    files = kernel_files()
-    for file in files:
-        compile_for("syntax", Text.write(tmp_path, read_kernel_source(file), Variant(file).options()))
-    assert len(files) > 40
+    text = Text.write(tmp_path, read_kernel_source(file), Variant(file).options())
+    assert compile_for("syntax", text) == {}

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
+import pytest
 from house import ROOT
 from refusals import refused
 
@@ -12,41 +14,77 @@ import make_constants_table  # isort: skip
 import marked_tables  # isort: skip
 
 
-def test_the_page_has_the_constants_as_they_are() -> None:
+def test_page_of_limits_has_the_table_of_constants_of_the_code() -> None:
     text = make_constants_table.PAGE.read_text(encoding="utf-8")
-    found = marked_tables.find_table(text, make_constants_table.NAME)
-    assert found == make_constants_table.make_table(), "python scripts/guide/make_constants_table.py"
-    assert found.count("\n") > 90
+    table = marked_tables.find_table(text, make_constants_table.NAME)
+    assert table == make_constants_table.make_table(), "python scripts/guide/make_constants_table.py"
 
 
-def test_constants_are_found_with_their_first_sentence() -> None:
-    source = 'A_MM, B = 1.0, 2\n"""How far.  And more."""\nC_HU: float = -3.0\nD = 4\n_E_MM = 5\nBONE_HU_MOST = 6\n'
-    assert list(make_constants_table.find_constants(source)) == [
-        ("A_MM, B", "(1.0, 2)", "How far"),
-        ("C_HU", "-3.0", ""),
-        ("BONE_HU_MOST", "6", ""),
-    ]
+@pytest.mark.parametrize(
+    ("source", "constants"),
+    [
+        ('A_MM, B = 1.0, 2\n"""How far.  And more."""\n', [("A_MM, B", "(1.0, 2)", "How far")]),
+        ("C_HU: float = -3.0\n", [("C_HU", "-3.0", "")]),
+        ("BONE_HU_MOST = 6\n", [("BONE_HU_MOST", "6", "")]),
+        ("D = 4\n", []),
+        ("_E_MM = 5\n", []),
+    ],
+    ids=["two with a docstring", "annotated", "unit within the name", "no unit", "private"],
+)
+def test_public_constant_with_a_unit_in_its_name_is_found_with_its_first_sentence(
+    source: str, constants: list[tuple[str, str, str]]
+) -> None:
+    assert list(make_constants_table.find_constants(source)) == constants
 
 
-def test_what_is_said_to_follow_is_there_in_its_unit_and_shown_by_a_test() -> None:
-    units: dict[str, set[str]] = {}
-    for row in make_constants_table.make_table().splitlines()[2:]:
-        module, names, _, _, follows = (cell.strip() for cell in row.strip("|").split(" | "))
-        own = {match[1] for match in map(make_constants_table.UNITS.match, names.split(", ")) if match}
-        units.setdefault(f"{module}.py", set()).update(own)
-        assert ("values:" in follows) == ("HU" in own), row
-        assert any(word in follows for word in ("voxel", "object", "files", "nothing")) == (own != {"HU"}), row
-    lengths, values = make_constants_table.LENGTHS, make_constants_table.VALUES
-    assert set(lengths) == {module for module, own in units.items() if own != {"HU"}}
-    assert all("HU" in units[module] for module in values)
-    follow = {module for module, text in lengths.items() if re.search(r"voxel|step|spacing|share", text)} | set(values)
-    assert set(make_constants_table.SHOWN_BY) == follow
-    for place in make_constants_table.SHOWN_BY.values():
-        file, name = place.split("::")
-        assert f"def {name}(" in (ROOT / "tests" / file).read_text(encoding="utf-8"), place
+class Row(NamedTuple):
+    """A row of the table: its module, the units in the names of its constants, and what its values follow."""
+
+    module: str
+    units: frozenset[str]
+    follows: str
+
+    @classmethod
+    def read(cls, line: str) -> Row:
+        module, names, _, _, follows = (cell.strip() for cell in line.strip("|").split(" | "))
+        matches = map(make_constants_table.UNITS.match, names.split(", "))
+        return cls(f"{module}.py", frozenset(match[1] for match in matches if match), follows)
 
 
-def test_a_module_that_nothing_is_said_of_is_found(tmp_path: Path) -> None:
+ROWS = [Row.read(line) for line in make_constants_table.make_table().splitlines()[2:]]
+WITH_LENGTHS = {row.module for row in ROWS if row.units != {"HU"}}
+WITH_VALUES = {row.module for row in ROWS if "HU" in row.units}
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.module)
+def test_row_of_constants_says_what_values_follow_exactly_if_one_is_in_hu(row: Row) -> None:
+    assert ("values:" in row.follows) == ("HU" in row.units)
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.module)
+def test_row_of_constants_says_what_lengths_follow_exactly_if_one_is_not_in_hu(row: Row) -> None:
+    says_lengths = any(word in row.follows for word in ("voxel", "object", "files", "nothing"))
+    assert says_lengths == (row.units != {"HU"})
+
+
+def test_modules_of_which_lengths_or_values_are_explained_are_those_with_such_constants() -> None:
+    assert set(make_constants_table.LENGTHS) == WITH_LENGTHS
+    assert set(make_constants_table.VALUES) <= WITH_VALUES
+
+
+def test_modules_whose_constants_are_said_to_follow_the_scan_have_a_test_that_shows_it() -> None:
+    lengths = make_constants_table.LENGTHS
+    following = {module for module, text in lengths.items() if re.search(r"voxel|step|spacing|share", text)}
+    assert set(make_constants_table.SHOWN_BY) == following | set(make_constants_table.VALUES)
+
+
+@pytest.mark.parametrize("place", sorted(set(make_constants_table.SHOWN_BY.values())))
+def test_test_that_shows_what_constants_follow_exists(place: str) -> None:
+    file, name = place.split("::")
+    assert f"def {name}(" in (ROOT / "tests" / file).read_text(encoding="utf-8")
+
+
+def test_module_with_constants_that_is_not_explained_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "anatomy").mkdir()
     (tmp_path / "anatomy" / "new.py").write_text("A_MM = 1\n", encoding="utf-8")
     with refused(KeyError, "new.py"):
