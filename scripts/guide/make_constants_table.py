@@ -69,7 +69,9 @@ SHOWN_BY = {
     "::test_iso_value_of_any_scale_lies_half_way_between_two_materials",
     "anatomy/materials.py": "anatomy/test_iso_choice.py"
     "::test_iso_value_of_any_scale_lies_half_way_between_two_materials",
-    "labels/structures.py": "labels/test_structure_sets.py::test_contour_within_a_tenth_of_the_step_of_its_slice_is_read_with_a_warning",
+    "labels/structures.py": (
+        "labels/test_structure_sets.py::test_contour_within_a_tenth_of_the_step_of_its_slice_is_read_with_a_warning"
+    ),
     "operators/masks/enclosed.py": "operators/masks/test_enclosed.py::test_the_default_seal_follows_voxels_and_bone",
     "operators/rays/point_pictures.py": "operators/rays/test_point_pictures.py"
     "::test_discs_are_as_large_as_points_lie_apart",
