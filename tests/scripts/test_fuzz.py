@@ -1,6 +1,6 @@
-"""Some harmed input of every family; and each kind of fault is one for the fuzzer.
+"""The fuzzer: some damaged input of every family, and each kind of fault that it must notice.
 
-The campaign over many more cases is one of scripts/release_checks.py; what is found is found again by its case.
+The campaign over many more cases is one of scripts/release_checks.py; a fault is reproduced by the name of its case.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import random
-import tempfile
 import time
 from collections import Counter
 from functools import partial
@@ -21,6 +20,7 @@ import numpy as np
 import pytest
 import slices
 from fuzz import Campaign, Case, NamedCases, Schedule, Worker, run_campaign
+from refusals import refused
 from trials import FAULTS, MEMORY_LIMIT_BYTES, Answer, Judge, Outcome, Trial, WrongOutcome
 from variants import daily_rows
 
@@ -31,174 +31,226 @@ CASES = {
 }  # fmt: skip
 """The first cases of each family, about as the time of a campaign is shared."""
 UNHARMED = Answer({"voxels": "a"}, ("known",))
+"""What undamaged input gives: the hash of its voxels, and one warning."""
+
+
+@pytest.fixture(scope="module")
+def short_campaign() -> Campaign:
+    """The outcomes of the first cases of each family."""
+    cases = [Case(family, number) for family, count in CASES.items() for number in range(count)]
+    return run_campaign(NamedCases(cases), seconds=float("inf"))
 
 
 @pytest.mark.fuzz
-def test_harmed_input_is_refused_or_told() -> None:
-    cases = [Case(family, number) for family, count in CASES.items() for number in range(count)]
-    campaign = run_campaign(NamedCases(cases), seconds=float("inf"))
-    assert [f"{case} {outcome.kind}: {outcome.trial}: {outcome.text}" for case, outcome in campaign.faults] == []
+def test_no_damaged_input_is_read_without_a_warning_or_ends_otherwise_badly(short_campaign: Campaign) -> None:
+    faults = [f"{case} {outcome.kind}: {outcome.trial}: {outcome.text}" for case, outcome in short_campaign.faults]
+    assert faults == []
+
+
+@pytest.mark.fuzz
+def test_campaign_over_named_cases_counts_an_outcome_of_each(short_campaign: Campaign) -> None:
+    assert {family: counter.total() for family, counter in short_campaign.counts.items()} == CASES
+
+
+def test_short_campaign_has_cases_of_every_family() -> None:
     assert set(CASES) == set(fuzz.SHARES)
-    assert {family: counter.total() for family, counter in campaign.counts.items()} == CASES
 
 
-def judge(run, contradicted=True, limit_s=5.0):
-    return Judge().judge(Trial("a trial", run, UNHARMED, lambda answer: contradicted, limit_s)).kind
+def kind_of_outcome(run, is_contradicted=True, limit_s=5.0):
+    """The kind of the outcome of damaged input whose reading is `run`; other files may contradict another answer."""
+    return Judge().judge(Trial("a trial", run, UNHARMED, lambda answer: is_contradicted, limit_s)).kind
 
 
 def fail(error):
     raise error
 
 
-def say(stream):
+def print_to(stream):
     os.write(stream, b"libraries talk")
     return UNHARMED
 
 
-def hoard():
-    np.ones(MEMORY_LIMIT_BYTES // 4)
+def allocate_too_much():
+    np.ones(MEMORY_LIMIT_BYTES // 4)  # of 8 bytes each: twice the limit
     return UNHARMED
 
 
 @pytest.mark.parametrize(
     ("kind", "run"),
     [
-        ("same", lambda: UNHARMED),
-        ("warned", lambda: Answer({"voxels": "b"}, ("known", "beware"))),
-        ("refused", lambda: fail(RefusedInputError("no"))),
-        ("silent", lambda: Answer({"voxels": "b"}, ("known",))),
-        ("silent", lambda: Answer({}, ())),
-        ("foreign", lambda: fail(KeyError("made up"))),
-        ("foreign", lambda: fail(RefusedInputError("two\nlines"))),
-        ("secret", lambda: Answer({"voxels": "a"}, (), "SECRET^NAME")),
-        ("secret", lambda: fail(RefusedInputError("of SECRET^NAME"))),
-        ("noise", lambda: say(1)),
-        ("noise", lambda: say(2)),
-        ("memory", hoard),
-        ("files", lambda: fail(WrongOutcome("files", "left behind"))),
+        pytest.param("same", lambda: UNHARMED, id="same answer"),
+        pytest.param("warned", lambda: Answer({"voxels": "b"}, ("known", "beware")), id="new warning"),
+        pytest.param("refused", lambda: fail(RefusedInputError("no")), id="refused in one line"),
+        pytest.param("silent", lambda: Answer({"voxels": "b"}, ("known",)), id="other voxels without a new warning"),
+        pytest.param("silent", lambda: Answer({}, ()), id="no voxels and no warning"),
+        pytest.param("foreign", lambda: fail(KeyError("made up")), id="an error that is not clrecon's"),
+        pytest.param("foreign", lambda: fail(RefusedInputError("two\nlines")), id="refused in two lines"),
+        pytest.param(
+            "secret", lambda: Answer({"voxels": "a"}, (), "SECRET^NAME"), id="name of the patient in a report"
+        ),
+        pytest.param(
+            "secret", lambda: fail(RefusedInputError("of SECRET^NAME")), id="name of the patient in a message"
+        ),
+        pytest.param("noise", lambda: print_to(1), id="printed on standard output"),
+        pytest.param("noise", lambda: print_to(2), id="printed on standard error"),
+        pytest.param("memory", allocate_too_much, id="more memory than the limit"),
+        pytest.param("files", lambda: fail(WrongOutcome("files", "left behind")), id="a file left behind"),
     ],
 )
-def test_outcomes_are_told_apart(kind, run) -> None:
-    assert judge(run) == kind
+def test_outcome_of_damaged_input_has_its_kind(kind, run) -> None:
+    assert kind_of_outcome(run) == kind
 
 
-def test_change_that_nothing_contradicts_is_no_fault() -> None:
-    assert judge(lambda: Answer({"voxels": "b"}), contradicted=False) == "agreed"
+def test_other_voxels_that_nothing_contradicts_are_no_fault() -> None:
+    assert kind_of_outcome(lambda: Answer({"voxels": "b"}), is_contradicted=False) == "agreed"
 
 
-def test_a_case_over_its_time_hangs() -> None:
-    def work():
+def test_reading_over_its_limit_of_processor_time_is_a_hang() -> None:
+    def compute():
         start = time.process_time()
         while time.process_time() - start < 0.3:
             pass
         return UNHARMED
 
-    assert judge(work, limit_s=0.1) == "hang"
+    assert kind_of_outcome(compute, limit_s=0.1) == "hang"
 
 
-def test_time_on_a_busy_machine_is_no_fault() -> None:
+def test_reading_that_waits_longer_than_its_limit_of_processor_time_is_no_hang() -> None:
+    """As on a busy machine."""
+
     def wait():
         time.sleep(0.3)
         return UNHARMED
 
-    assert judge(wait, limit_s=0.1) == "same"
+    assert kind_of_outcome(wait, limit_s=0.1) == "same"
 
 
 @pytest.mark.parametrize(
-    ("program", "kind", "words"),
+    ("program", "limits", "kind", "words"),
     daily_rows(
         2,
         [
-            ("import os; os.abort()", "crash", "SIGABRT"),
-            ("raise SystemExit('no such thing')", "crash", "no such thing"),
-            ("import time; time.sleep(60)", "hang", "no answer in 1 s"),
-            ("while True: pass", "hang", "over 1 s of processor time"),
+            ("import os; os.abort()", {}, "crash", "SIGABRT"),
+            ("raise SystemExit('no such thing')", {}, "crash", "no such thing"),
+            ("import time; time.sleep(60)", {"stall_limit_s": 1.0}, "hang", "no answer in 1 s"),
+            ("while True: pass", {"start_limit_s": 1.0}, "hang", "over 1 s of processor time"),
         ],
     ),
 )
-def test_a_worker_that_dies_or_hangs_is_a_fault(tmp_path, program, kind, words) -> None:
+def test_worker_that_dies_or_hangs_is_a_fault_of_its_case(tmp_path, program, limits, kind, words) -> None:
     (tmp_path / "worker.py").write_text(program)
-    limit = {"stall_limit_s" if "sleep" in program else "start_limit_s": 1.0}
-    start = partial(Worker.start, program=tmp_path / "worker.py", **limit)
-    campaign = run_campaign(NamedCases([Case("values", 7)]), seconds=30, start_worker=start)
-    ((case, outcome),) = campaign.faults
-    assert str(case) == "values:7" and outcome.kind == kind and words in outcome.text
+    start_worker = partial(Worker.start, program=tmp_path / "worker.py", **limits)
+    campaign = run_campaign(NamedCases([Case("values", 7)]), seconds=30, start_worker=start_worker)
+    [(case, outcome)] = campaign.faults
+    assert (str(case), outcome.kind) == ("values:7", kind)
+    assert words in outcome.text
     assert campaign.as_dict()["counts"] == {"values": {kind: 1}}
 
 
-def test_a_worker_is_replaced(tmp_path, monkeypatch) -> None:
-    answer = json.dumps(Outcome("same", "a trial").as_dict())
-    program = f"""
+ENDS_AT_CASE_2 = f"""
 import sys
 for line in sys.stdin:
     assert line.split()[1] != "2"
-    print({answer!r}, flush=True)
+    print({json.dumps(Outcome("same", "a trial").as_dict())!r}, flush=True)
 """
-    (tmp_path / "worker.py").write_text(program)
-    start = partial(Worker.start, program=tmp_path / "worker.py")
-    campaign = run_campaign(Schedule(["values"], 5), seconds=30, start_worker=start)
+
+
+def test_campaign_goes_on_with_a_new_worker_after_one_that_died(tmp_path) -> None:
+    (tmp_path / "worker.py").write_text(ENDS_AT_CASE_2)
+    start_worker = partial(Worker.start, program=tmp_path / "worker.py")
+    campaign = run_campaign(Schedule(["values"], 5), seconds=30, start_worker=start_worker)
     assert campaign.counts == {"values": Counter(same=4, crash=1)}
     assert [str(case) for case, _ in campaign.faults] == ["values:2"]
-    assert "same" in campaign.table() and all(kind in campaign.table() for kind in FAULTS)
 
 
-def test_families_share_the_time() -> None:
-    schedule = Schedule(["values", "environment"])
+def test_table_of_a_campaign_has_a_column_of_each_kind_of_fault() -> None:
+    table = Campaign().table()
+    assert [kind for kind in FAULTS if kind not in table] == []
+
+
+def test_families_get_their_shares_of_the_time_although_their_cases_take_different_times() -> None:
+    seconds = {"values": 0.1, "environment": 10.0}
+    schedule = Schedule(list(seconds))
     for _ in range(1000):
         case = schedule.draw()
-        schedule.spend(case, 10.0 if case.family == "environment" else 0.1)
-    values, environment = schedule.spent["values"], schedule.spent["environment"]
-    assert values / environment == pytest.approx(fuzz.SHARES["values"] / fuzz.SHARES["environment"], rel=0.2)
+        schedule.spend(case, seconds[case.family])
+    ratio = schedule.spent["values"] / schedule.spent["environment"]
+    assert ratio == pytest.approx(fuzz.SHARES["values"] / fuzz.SHARES["environment"], rel=0.2)
+
+
+def test_schedule_of_no_cases_draws_none() -> None:
     assert Schedule(["values"], 0).draw() is None
 
 
-def test_a_case_is_made_again(tmp_path) -> None:
-    for trial in (slices.values_trial, slices.bytes_trial, slices.ends_trial, clouds.clouds_trial):
-        words = {trial(20_000, tmp_path, random.Random("1")).words for _ in range(2)}
-        assert len(words) == 1
+@pytest.mark.parametrize(
+    "make_trial", [slices.values_trial, slices.bytes_trial, slices.ends_trial, clouds.clouds_trial]
+)
+def test_trial_of_the_same_case_and_seed_is_the_same(make_trial, tmp_path) -> None:
+    first, second = (make_trial(20_000, tmp_path, random.Random("1")).words for _ in range(2))
+    assert first == second
 
 
-def test_clouds_are_read_and_given_to_the_command(tmp_path) -> None:
-    said = []
-    for number in range(12):
-        trial = clouds.clouds_trial(number, tmp_path, random.Random(f"1 clouds {number}"))
-        assert (tmp_path / "ct" / trial.words.partition(":")[0]).is_file()
-        said.append(trial.words)
-    assert 2 < sum("'-" in words for words in said) < 11
-    assert {"same", "refused"} <= {Judge().judge(plain_cloud(name)).kind for name in ("full.ply", "none.ply")}
+@pytest.fixture(scope="module")
+def cloud_trials(tmp_path_factory):
+    """Descriptions of twelve trials of clouds, and the folder with their files."""
+    folder = tmp_path_factory.mktemp("clouds")
+    trials = [clouds.clouds_trial(number, folder, random.Random(f"1 clouds {number}")).words for number in range(12)]
+    return trials, folder
 
 
-def plain_cloud(name):
-    """A trial of a file as it was written, or of one that is not there."""
-    path = Path(tempfile.mkdtemp()) / name
+def test_trial_of_a_cloud_has_its_damaged_file(cloud_trials) -> None:
+    trials, folder = cloud_trials
+    assert [words for words in trials if not (folder / "ct" / words.partition(":")[0]).is_file()] == []
+
+
+def test_some_damaged_clouds_are_given_to_the_command_and_some_to_the_reader(cloud_trials) -> None:
+    trials, _ = cloud_trials
+    given_to_command = ["'-" in words for words in trials]  # options of the command line
+    assert set(given_to_command) == {True, False}
+
+
+@pytest.mark.parametrize(("name", "kind"), [("full.ply", "same"), ("none.ply", "refused")])
+def test_undamaged_cloud_is_read_and_a_missing_one_refused(name, kind, tmp_path) -> None:
+    path = tmp_path / name
     if name in clouds.clouds():
         path.write_bytes(clouds.clouds()[name])
-    return Trial(name, lambda: clouds.answer_of_cloud(path), clouds.unharmed_cloud("full.ply"), lambda answer: True)
+    unharmed = clouds.unharmed_cloud("full.ply")
+    trial = Trial(name, lambda: clouds.answer_of_cloud(path), unharmed, lambda answer: True)
+    assert Judge().judge(trial).kind == kind
 
 
-def test_values_harm_one_element() -> None:
-    data = slices.series()[0]
-    harmed = slices.put(data, "RescaleIntercept", b"-24 ")
-    assert slices.value_in(data, "RescaleIntercept").strip() == b"-1024.0"
-    assert slices.value_in(harmed, "RescaleIntercept").strip() == b"-24"
-    assert slices.value_in(slices.put(data, "RescaleIntercept", None), "RescaleIntercept") == b""
-    assert slices.value_in(slices.put(data, "GantryDetectorTilt", b"12"), "GantryDetectorTilt") == b"12"
+SLICE = slices.series()[0]
+"""The bytes of an undamaged slice."""
 
 
-def test_an_element_behind_all_others_is_put_at_the_end() -> None:
-    data = slices.series()[0]
-    pixels = next(element for element in slices.find_elements(data) if data[element.start :].startswith(b"\xe0\x7f"))
-    cut = data[: pixels.start]
-    assert slices.put(cut, "PixelData", b"12") == cut + slices.element_bytes("PixelData", b"12")
+@pytest.mark.parametrize(
+    ("keyword", "before", "value", "after"),
+    [
+        ("RescaleIntercept", b"-1024.0", b"-24 ", b"-24"),
+        ("RescaleIntercept", b"-1024.0", None, b""),
+        ("GantryDetectorTilt", b"", b"12", b"12"),
+    ],
+    ids=["changed", "removed", "added"],
+)
+def test_value_of_an_element_of_a_slice_is_changed_removed_or_added(keyword, before, value, after) -> None:
+    assert slices.value_in(SLICE, keyword).strip() == before
+    assert slices.value_in(slices.put(SLICE, keyword, value), keyword).strip() == after
+
+
+def test_element_with_the_largest_tag_is_added_at_the_end_of_a_slice() -> None:
+    tag_of_pixels = b"\xe0\x7f"
+    pixels = next(each for each in slices.find_elements(SLICE) if SLICE[each.start :].startswith(tag_of_pixels))
+    without_pixels = SLICE[: pixels.start]
+    with_pixels = without_pixels + slices.element_bytes("PixelData", b"12")
+    assert slices.put(without_pixels, "PixelData", b"12") == with_pixels
 
 
 @pytest.mark.parametrize("keyword", [*slices.GEOMETRY, *slices.PIXELS])
-def test_a_harmed_value_leaves_the_other_elements_readable(keyword) -> None:
+def test_changed_value_leaves_the_number_of_elements_and_an_added_one_raises_it_by_one(keyword) -> None:
     """A VR that depends on other elements is written as one of its two."""
-    data = slices.series()[0]
-    was_there = slices.value_in(data, keyword) != b""
-    harmed = slices.put(data, keyword, b"12")
-    assert len(slices.find_elements(harmed)) == len(slices.find_elements(data)) + (not was_there)
+    is_added = slices.value_in(SLICE, keyword) == b""
+    harmed = slices.put(SLICE, keyword, b"12")
+    assert len(slices.find_elements(harmed)) == len(slices.find_elements(SLICE)) + is_added
 
 
 @pytest.mark.parametrize(
@@ -211,30 +263,58 @@ def test_a_harmed_value_leaves_the_other_elements_readable(keyword) -> None:
         (["mesh"], 0, "", "vtk says\n", "noise"),
         (["mesh", "--json"], 0, "vtk says {}", "", "noise"),
     ],
+    ids=[
+        "ended by a signal",
+        "unexpected error",
+        "no message",
+        "two messages",
+        "words on success",
+        "words before JSON",
+    ],
 )
-def test_calls_that_went_wrong_are_told_by_their_kind(given, code, out, err, kind) -> None:
+def test_command_that_went_wrong_has_the_kind_of_its_fault(given, code, out, err, kind) -> None:
     with pytest.raises(WrongOutcome) as caught:
         commands.check_call(given, code, out, err)
     assert caught.value.kind == kind
 
 
-def test_words_on_stderr_beside_an_output_on_stdout_are_right() -> None:
+def test_words_on_standard_error_beside_a_mesh_on_standard_output_are_no_fault() -> None:
     commands.check_call(["mesh", "ct", "-o", "-"], 0, "solid", "wrote    standard output\n")
 
 
-@pytest.mark.parametrize(("code", "name"), [(3, "out.stl"), (0, ".out.stl.tmp")])
-def test_files_that_are_left_behind_are_a_fault(code, name) -> None:
-    with pytest.raises(WrongOutcome, match="left"):
+@pytest.mark.parametrize(
+    ("code", "name"), [(3, "out.stl"), (0, ".out.stl.tmp")], ids=["output of a failed command", "temporary file"]
+)
+def test_file_that_a_command_leaves_behind_is_a_fault(code, name) -> None:
+    with refused(WrongOutcome, "left"):
         commands.check_files(code, [Path(name)])
+
+
+def test_output_of_a_command_that_succeeds_is_no_fault() -> None:
     commands.check_files(0, [Path("out.stl")])
 
 
-def test_a_fault_is_the_exit_status(tmp_path, monkeypatch, printed) -> None:
+@pytest.fixture
+def campaign_with_fault(monkeypatch) -> None:
+    """The fuzzer finds a fault in case 3 of the family of values."""
     campaign = Campaign()
     campaign.add(Case("values", 3), Outcome("silent", "a value", "slice 1"))
     monkeypatch.setattr(fuzz, "run_campaign", lambda *args, **kwargs: campaign)
-    assert fuzz.main(["--seconds", "1", "--json", str(tmp_path / "found.json")]) == 1
-    printed().assert_output(3)
-    assert json.loads((tmp_path / "found.json").read_text())["faults"][0]["case"] == "values:3"
+
+
+@pytest.mark.usefixtures("campaign_with_fault")
+def test_fuzzer_that_finds_a_fault_exits_with_1_and_prints_its_case(printed) -> None:
+    assert fuzz.main(["--seconds", "1"]) == 1
+    printed().assert_output("values", 3)
+
+
+@pytest.mark.usefixtures("campaign_with_fault")
+def test_fault_is_written_to_json_with_its_case(tmp_path) -> None:
+    fuzz.main(["--seconds", "1", "--json", str(tmp_path / "found.json")])
+    [fault] = json.loads((tmp_path / "found.json").read_text())["faults"]
+    assert fault["case"] == "values:3"
+
+
+def test_fuzzer_that_finds_no_fault_exits_with_0(monkeypatch) -> None:
     monkeypatch.setattr(fuzz, "run_campaign", lambda *args, **kwargs: Campaign())
     assert fuzz.main([]) == 0
