@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,15 +45,15 @@ def test_command_list_prints_the_names_of_the_cases(printed: Printer) -> None:
 
 
 @pytest.fixture
-def own_case(monkeypatch: pytest.MonkeyPatch) -> Any:
+def own_case() -> Iterator[Any]:
     """The measuring function of a case that is registered under the name "own" while the test runs."""
-    monkeypatch.setattr(registry, "CASES", dict(registry.CASES))
 
     @registry.case("own", "what it is")
     def measure_own(job: registry.Job) -> dict[str, Any]:
         return {"ratios": {}}
 
-    return measure_own
+    yield measure_own
+    del registry.CASES["own"]
 
 
 def test_decorated_function_is_registered_as_a_case(own_case: Any) -> None:
