@@ -77,7 +77,7 @@ def test_every_row_of_the_list_of_faults_has_a_test() -> None:
 def test_row_missing_or_without_an_existing_test_is_reported(
     rows: dict[int, tuple[str, tuple[str, ...]]], fault: str
 ) -> None:
-    assert find_faults(rows, read_tests(ROOT / "tests")) == [fault]
+    assert fault in find_faults(rows, read_tests(ROOT / "tests"))
 
 
 def test_pending_rows_are_not_listed_and_give_a_reason() -> None:

@@ -68,7 +68,10 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     ),
     20: (
         "a single slice: refused",
-        (GEOMETRY + "test_stacks_that_are_no_grid_are_refused_by_name", BAD_INPUT + "test_mesh_refuses_input"),
+        (
+            GEOMETRY + "test_stacks_that_are_no_grid_are_refused_by_name",
+            BAD_INPUT + "test_mesh_of_an_input_without_a_usable_ct_series_is_refused_in_one_line_and_writes_nothing",
+        ),
     ),
     21: (
         "Rows or Columns differ between slices: refused, the odd ones named",
@@ -116,7 +119,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     30: (
         "iso value outside of the data: refused with the range, no empty file",
         (
-            BAD_INPUT + "test_an_iso_value_above_all_voxels_is_refused",
+            BAD_INPUT + "test_iso_value_above_all_voxels_is_refused_with_the_highest_of_the_scan",
             "operators/surface/test_isosurface.py::test_an_iso_value_outside_the_data_is_refused_with_the_range",
         ),
     ),
@@ -127,7 +130,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     32: (
         "constant volume, NaN, infinite voxels: refused",
         (
-            BAD_INPUT + "test_a_constant_volume_has_no_surface",
+            BAD_INPUT + "test_volume_of_one_value_is_refused",
             "geometry/test_iso_rule.py::test_values_that_are_not_finite_are_refused",
         ),
     ),
@@ -136,7 +139,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     35: (
         "empty, text, PNG, cut at every byte: refused or passed over, never a traceback",
         (
-            BAD_INPUT + "test_mesh_refuses_input",
+            BAD_INPUT + "test_mesh_of_an_input_without_a_usable_ct_series_is_refused_in_one_line_and_writes_nothing",
             "reading/dicom/test_truncation.py::test_series_with_a_slice_cut_anywhere_is_refused_unless_no_pixel_is_lost",
             "reading/dicom/test_lost_slices.py::test_file_that_may_be_left_of_a_slice_refuses_the_series",
         ),
@@ -182,7 +185,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
         "no platform or driver: refused with what to install",
         (
             "opencl/test_select.py::test_error_without_a_device_says_how_to_get_a_driver",
-            "cli/test_commands.py::test_no_driver_says_how_to_get_one",
+            "cli/test_commands.py::test_command_without_a_driver_is_refused_in_one_line_that_says_how_to_get_one",
         ),
     ),
     50: ("a simulator such as Oclgrind: never chosen silently", ()),
@@ -242,7 +245,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     66: (
         "closed streams, no terminal: no traceback, plain progress",
         (
-            "cli/test_closed_streams.py::test_closed_streams_keep_the_exit_code",
+            "cli/test_closed_streams.py::test_refused_command_with_closed_streams_keeps_its_exit_code_and_its_line_where_there_is_one",
             "cli/test_process.py::test_reader_that_leaves_early_is_no_error",
         ),
     ),
