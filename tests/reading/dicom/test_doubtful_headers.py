@@ -22,7 +22,7 @@ from clrecon.reading import list_series, read_volume
     ],
     ids=["intercept", "slope"],
 )
-def test_half_a_rescale_is_doubtful(tmp_path, change, shift, words):
+def test_series_without_slope_or_intercept_is_read_with_a_warning(tmp_path, change, shift, words):
     plan = write_series(tmp_path, change=change)
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu() + shift)
@@ -38,21 +38,20 @@ def test_half_a_rescale_is_doubtful(tmp_path, change, shift, words):
         ("PixelRepresentation", 0, "1"),
     ],
 )
-def test_coding_of_its_own_makes_a_slice_doubtful(tmp_path, keyword, value, usual):
+def test_slice_whose_pixels_are_coded_unlike_those_of_the_others_is_warned_of(tmp_path, keyword, value, usual):
     write_series(tmp_path, change=set_values(2, **{keyword: value}))
-    told = read_volume(tmp_path).report["warnings"]
     words = f"{keyword} is not {usual} as in the other slices: the HU may be wrong (1 of 7 slices, at -397.50 mm)"
-    assert told == [words]
+    assert read_volume(tmp_path).report["warnings"] == [words]
     assert words in list_series(tmp_path).series[0].warnings
 
 
 @pytest.mark.parametrize("usual", [None, -2000])
 @pytest.mark.parametrize("value", [None, 24, -2000])
-def test_padding_of_its_own_makes_a_slice_doubtful(tmp_path, usual, value):
+def test_slice_whose_declared_padding_is_not_that_of_the_others_is_warned_of(tmp_path, usual, value):
     def change(ds, k):
-        own = value if k == 2 else usual
-        if own is not None:
-            ds.PixelPaddingValue = own
+        padding = value if k == 2 else usual
+        if padding is not None:
+            ds.PixelPaddingValue = padding
 
     write_series(tmp_path, change=change)
     words = (
@@ -62,19 +61,27 @@ def test_padding_of_its_own_makes_a_slice_doubtful(tmp_path, usual, value):
     assert read_volume(tmp_path).report["warnings"] == ([words] if value != usual else [])
 
 
-def test_slices_that_each_have_their_own_rescale_are_not_doubtful(tmp_path):
+def test_slices_that_each_have_another_intercept_are_not_warned_of(tmp_path):
     write_series(tmp_path, change=lambda ds, k: set_values(RescaleIntercept=-1024 - k)(ds, k))
     assert read_volume(tmp_path).report["warnings"] == []
 
 
-@pytest.mark.parametrize("ending", ["", ".1", ".2", ".3", ".4"])
-def test_a_secondary_capture_with_a_position_is_refused(tmp_path, ending):
+SECONDARY_CAPTURES = pytest.mark.parametrize("ending", ["", ".1", ".2", ".3", ".4"])
+
+
+@SECONDARY_CAPTURES
+def test_secondary_capture_with_a_position_is_refused(tmp_path, ending):
     sop_class = SecondaryCaptureImageStorage + ending
     write_series(tmp_path, change=set_values(SOPClassUID=sop_class))
     with refused(RefusedInputError, "slice000.dcm", sop_class):
         read_volume(tmp_path)
     reason = f"slice000.dcm: secondary capture (SOP class {sop_class}): its pixels are a picture, not measured HU"
     assert list_series(tmp_path).series[0].problems[0] == reason
+
+
+@SECONDARY_CAPTURES
+def test_series_of_ct_beside_secondary_captures_is_read(tmp_path, ending):
+    write_series(tmp_path, change=set_values(SOPClassUID=SecondaryCaptureImageStorage + ending))
     plan = write_series(tmp_path, Plan(series=2, shape=(3, 5, 6), name="ct{}".format))
     assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
 
@@ -86,35 +93,48 @@ def test_a_secondary_capture_with_a_position_is_refused(tmp_path, ending):
         ("DERIVED\\PRIMARY\\AXIAL\\CT_SOM5 MIP", "MIP"),
         ("derived\\SECONDARY\\PROJECTION IMAGE", "PROJECTION"),
         ("DERIVED\\SECONDARY\\REFORMATTED\\AVERAGE", "REFORMATTED"),
-        ("DERIVED\\SECONDARY\\AXIAL", None),
-        ("ORIGINAL\\PRIMARY\\AXIAL\\MPR", None),
     ],
 )
-def test_derived_images_are_told(tmp_path, image_type, word):
+def test_derived_images_are_kept_with_a_warning(tmp_path, image_type, word):
     plan = write_series(tmp_path, change=set_raw("ImageType", image_type))
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu())
-    said = f"derived images (ImageType has DERIVED and {word}): maybe not measured HU (all slices)"
-    assert volume.report["warnings"] == ([said] if word else [])
+    assert volume.report["warnings"] == [
+        f"derived images (ImageType has DERIVED and {word}): maybe not measured HU (all slices)"
+    ]
 
 
-def test_slices_of_two_patients_are_refused_without_their_ids(tmp_path):
+@pytest.mark.parametrize("image_type", ["DERIVED\\SECONDARY\\AXIAL", "ORIGINAL\\PRIMARY\\AXIAL\\MPR"])
+def test_images_that_are_derived_or_reformatted_but_not_both_are_not_warned_of(tmp_path, image_type):
+    write_series(tmp_path, change=set_raw("ImageType", image_type))
+    assert read_volume(tmp_path).report["warnings"] == []
+
+
+def test_series_with_a_slice_of_another_patient_is_refused_by_its_name(tmp_path):
     write_series(tmp_path, change=set_values(only=4, PatientID="OTHERSECRET"))
     with refused(RefusedInputError, "PatientID", "slice004.dcm"):
         read_volume(tmp_path)
+
+
+def test_listing_of_a_series_of_two_patients_says_so_without_their_ids(tmp_path):
+    write_series(tmp_path, change=set_values(only=4, PatientID="OTHERSECRET"))
     listing = list_series(tmp_path)
     assert "PatientID differs within the series" in listing.series[0].problems[0]
-    assert "SECRET" not in json.dumps([entry.as_dict() for entry in listing.series])
+    assert "SECRET" not in json.dumps([series.as_dict() for series in listing.series])
 
 
 @pytest.mark.parametrize("patient", ["", " SECRETID "], ids=["missing", "with spaces"])
-def test_the_same_patient_written_otherwise_is_one(tmp_path, patient):
+def test_slice_whose_patient_id_is_missing_or_has_spaces_is_of_the_same_patient(tmp_path, patient):
     plan = write_series(tmp_path, change=set_raw("PatientID", patient, only=4))
     assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
 
 
-@pytest.mark.parametrize(("count", "top", "told"), [(3, 3071, True), (1, 3071, False), (3, 3072, False)])
-def test_saturated_metal_is_told(tmp_path, count, top, told):
+@pytest.mark.parametrize(
+    ("count", "top", "is_warned_of"),
+    [(3, 3071, True), (1, 3071, False), (3, 3072, False)],
+    ids=["three voxels a slice", "one voxel a slice", "another value"],
+)
+def test_metal_at_3071_hu_is_warned_of_from_a_few_voxels_on(tmp_path, count, top, is_warned_of):
     def saturate(ds, k):
         stored = np.frombuffer(ds.PixelData, np.int16).copy()
         stored[:count] = top + 1024
@@ -123,8 +143,8 @@ def test_saturated_metal_is_told(tmp_path, count, top, told):
     write_series(tmp_path, change=saturate)
     report = read_volume(tmp_path).report
     assert report["hu_range"][1] == top
-    said = "21 voxels are at 3071 HU, the ceiling of 12 bits: metal is saturated, its surface displaced"
-    assert report["warnings"] == ([said] if told else [])
+    warning = "21 voxels are at 3071 HU, the ceiling of 12 bits: metal is saturated, its surface displaced"
+    assert report["warnings"] == ([warning] if is_warned_of else [])
 
 
 @pytest.mark.parametrize("modality", ["ct", " Ct "])
@@ -135,19 +155,28 @@ def test_modality_in_other_letters_is_ct(tmp_path, modality):
     assert volume.report["series"]["modality"] == "CT"
 
 
-def test_free_text_where_terms_belong_is_not_repeated(tmp_path):
-    """People's names are found in any field; refusals are for the terminal, warnings go into reports."""
-    name = "DOE^JOHN"
-    plan = write_series(tmp_path, change=set_raw("SliceThickness", name))
-    write_series(tmp_path, Plan(series=2, name="other{}".format), set_raw("Modality", name))
-    write_series(tmp_path, Plan(series=3, name="more{}".format, shape=(3, 5, 6)), set_raw("RescaleType", name))
+NAME = "DOE^JOHN"
+"""People's names are found in any field; refusals are for the terminal, warnings go into reports."""
+
+
+def test_text_in_place_of_a_thickness_is_warned_of_and_not_repeated(tmp_path):
+    plan = write_series(tmp_path, change=set_raw("SliceThickness", NAME))
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu())
-    thickness, *_ = volume.report["warnings"]
-    assert thickness == (
+    assert volume.report["warnings"][0] == (
         "SliceThickness (0018,0050) is no finite number; ignored, it plays no part in the geometry (all slices)"
     )
-    assert "other" in (list_series(tmp_path).series[1].modality or "")
-    for number in (1, 3):
-        assert "DOE" not in json.dumps(read_volume(tmp_path, series=number).report)
-    assert "DOE" not in json.dumps([entry.as_dict() for entry in list_series(tmp_path).series])
+    assert "DOE" not in json.dumps(volume.report)
+
+
+@pytest.mark.parametrize("keyword", ["Modality", "RescaleType"])
+def test_text_in_place_of_a_term_is_not_repeated_in_the_listing(tmp_path, keyword):
+    write_series(tmp_path, change=set_raw(keyword, NAME))
+    series = list_series(tmp_path).series[0]
+    assert "DOE" not in json.dumps(series.as_dict())
+    assert series.modality == "CT" or "other" in series.modality
+
+
+def test_text_in_place_of_a_rescale_type_is_not_repeated_in_the_report(tmp_path):
+    write_series(tmp_path, change=set_raw("RescaleType", NAME))
+    assert "DOE" not in json.dumps(read_volume(tmp_path).report)

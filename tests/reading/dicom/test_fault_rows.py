@@ -36,7 +36,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pydicom")  # it wri
         ("ImagePositionPatient", "", "missing"),
     ],
 )
-def test_row_15_places_without_sense_in_all_slices_are_refused(tmp_path, keyword, text, fact):
+def test_row_15_position_or_orientation_that_is_no_place_in_all_slices_is_refused(tmp_path, keyword, text, fact):
     write_series(tmp_path, Plan(**PLAN), set_raw(keyword, text))
     with refused(RefusedInputError, keyword, fact, "slice000.dcm"):
         read_volume(tmp_path)
@@ -55,20 +55,23 @@ def stack_of(directions, origin, hu, folder):
     write_series(folder, plan, change)
 
 
-def test_row_17_object_lies_in_its_place_however_it_is_stored(tmp_path):
-    """Every axis reversed, left-handed orders too: the same HU at the same LPS places."""
+@pytest.mark.parametrize("flips_kji", list(np.ndindex(2, 2, 2)), ids=str)
+def test_row_17_object_lies_in_its_place_with_any_axes_reversed(tmp_path, flips_kji):
+    """Left-handed orders too: each HU at its LPS place, once."""
     hu = np.arange(3 * 4 * 5).reshape(3, 4, 5)
-    expected = {int(hu[k, j, i]): (10.0 + i, 20.0 + j, 30.0 + k) for k, j, i in np.ndindex(hu.shape)}
-    for number, signs in enumerate(np.ndindex(2, 2, 2)):
-        flips = tuple(slice(None, None, -1) if sign else slice(None) for sign in signs)
-        directions = [(1 - 2 * signs[2], 0, 0), (0, 1 - 2 * signs[1], 0), (0, 0, 1 - 2 * signs[0])]
-        origin = (10 + 4 * signs[2], 20 + 3 * signs[1], 30 + 2 * signs[0])
-        stack_of(directions, origin, hu[flips], tmp_path / f"{number}")
-        volume = read_volume(tmp_path / f"{number}")
-        assert np.linalg.det(volume.affine[:3, :3]) > 0
-        kji = np.array(list(np.ndindex(volume.voxels.shape)))
-        truth = np.array([expected[int(value)] for value in volume.voxels.ravel()])
-        assert np.abs(volume.ijk_to_lps(kji[:, ::-1]) - truth).max() < AFFINE_MM
+    place_of_hu = {int(hu[k, j, i]): (10.0 + i, 20.0 + j, 30.0 + k) for k, j, i in np.ndindex(hu.shape)}
+    flip_k, flip_j, flip_i = flips_kji
+    directions = [(1 - 2 * flip_i, 0, 0), (0, 1 - 2 * flip_j, 0), (0, 0, 1 - 2 * flip_k)]
+    origin = (10 + 4 * flip_i, 20 + 3 * flip_j, 30 + 2 * flip_k)
+    reversed_hu = hu[tuple(slice(None, None, -1) if flip else slice(None) for flip in flips_kji)]
+    stack_of(directions, origin, reversed_hu, tmp_path)
+
+    volume = read_volume(tmp_path)
+
+    assert np.linalg.det(volume.affine[:3, :3]) > 0
+    ijk = np.array(list(np.ndindex(volume.voxels.shape)))[:, ::-1]
+    expected = np.array([place_of_hu[int(value)] for value in volume.voxels.ravel()])
+    assert np.abs(volume.ijk_to_lps(ijk) - expected).max() < AFFINE_MM
 
 
 def write_dicomdir(path, file_ids):
@@ -86,7 +89,9 @@ def write_dicomdir(path, file_ids):
     save_dataset(ds, path)
 
 
-def test_row_43_nothing_out_of_the_folder_is_opened(tmp_path):
+@pytest.fixture
+def folder_of_traps(tmp_path):
+    """A series among a DICOMDIR, links out, in a circle and to nothing, a pipe and a socket; another series outside."""
     outside, inside = tmp_path / "outside", tmp_path / "in"
     write_series(outside, Plan(series=2, shape=(9, 3, 5)))
     plan = write_series(inside / "x.dcm", Plan(**PLAN))
@@ -99,23 +104,33 @@ def test_row_43_nothing_out_of_the_folder_is_opened(tmp_path):
     os.mkfifo(inside / "pipe.dcm")
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(os.path.relpath(inside / "s"))
-    try:
-        volume = read_volume(inside)
-        skipped = volume.report["files"]["skipped"]
-        assert np.array_equal(volume.voxels, plan.hu()) and len(list_series(inside).series) == 1
-        assert skipped["DICOMDIR"] == 1 and skipped["link out of the folder"] == 2
-        assert skipped["link inside the folder"] == 1 and skipped["not a regular file"] == 2
-        assert skipped["link to a file that is not there"] == 2
-        assert "2 skipped: link out of the folder" in volume.report["warnings"]
-        for name in ("a", "pipe.dcm", "s"):
-            with refused(NoDicomError, "regular"):
-                read_volume(inside / name)
-    finally:
-        listener.close()
+    yield plan, inside
+    listener.close()
+
+
+def test_row_43_series_among_links_pipes_and_sockets_is_read_without_opening_them(folder_of_traps):
+    plan, folder = folder_of_traps
+    volume = read_volume(folder)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert len(list_series(folder).series) == 1  # not that outside
+    assert volume.report["files"]["skipped"] == {
+        "DICOMDIR": 1,
+        "link out of the folder": 2,
+        "link inside the folder": 1,
+        "link to a file that is not there": 2,
+        "not a regular file": 2,
+    }
+    assert "2 skipped: link out of the folder" in volume.report["warnings"]
+
+
+@pytest.mark.parametrize("name", ["a", "pipe.dcm", "s"], ids=["link in a circle", "pipe", "socket"])
+def test_row_43_link_in_a_circle_pipe_and_socket_are_refused_by_themselves(folder_of_traps, name):
+    with refused(NoDicomError, "regular"):
+        read_volume(folder_of_traps[1] / name)
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="there is no device that never ends")
-def test_row_43_a_device_is_not_read():
+def test_row_43_device_is_refused_without_reading_it():
     with refused(NoDicomError, "regular"):
         read_volume("/dev/zero")
 
@@ -134,7 +149,7 @@ HOSTILE_TEXTS = {
 HOSTILE_FIELDS = "SeriesDescription SeriesInstanceUID StudyInstanceUID ConvolutionKernel PatientID RescaleType".split()
 
 
-def both(first, second):
+def one_after_the_other(first, second):
     """Two changes of a data set, one after the other."""
 
     def change(ds, k):
@@ -144,33 +159,50 @@ def both(first, second):
     return change
 
 
-@pytest.mark.parametrize("text", daily(2, HOSTILE_TEXTS.values()), ids=HOSTILE_TEXTS)
-def test_row_45_hostile_texts_are_escaped_and_name_no_file(tmp_path, monkeypatch, printed, text):
-    folder, utf8 = tmp_path / "ct", set_values(SpecificCharacterSet="ISO_IR 192")
+HOSTILE_TEXT = pytest.mark.parametrize("text", daily(2, HOSTILE_TEXTS.values()), ids=HOSTILE_TEXTS)
+
+
+@HOSTILE_TEXT
+@pytest.mark.parametrize("keyword", HOSTILE_FIELDS)
+def test_row_45_hostile_text_in_an_element_is_escaped_in_the_listing_and_kept_out_of_the_report(
+    tmp_path, keyword, text
+):
+    utf8 = set_values(SpecificCharacterSet="ISO_IR 192")
+    write_series(tmp_path, Plan(**PLAN), one_after_the_other(set_raw(keyword, text), utf8))
+    series = list_series(tmp_path).series[0]
+    for line in (*series.warnings, *series.problems, series.description, series.modality):
+        assert line.isprintable()
+        assert len(line) < 400
+    report = json.dumps(read_volume(tmp_path).report)
+    is_term = keyword in ("RescaleType", "ConvolutionKernel")  # reports quote these
+    assert is_term or ("passwd" not in report and "title" not in report)
+
+
+@HOSTILE_TEXT
+def test_row_45_hostile_text_in_a_refusal_is_one_printable_line(tmp_path, text):
+    two_phases, no_ct = tmp_path / "phases", tmp_path / "modality"
+    write_series(two_phases, Plan(**PLAN), set_raw("ConvolutionKernel", text))
+    write_series(two_phases, Plan(slope=2, name="p{}".format, **PLAN), set_raw("ConvolutionKernel", "B30f"))
+    write_series(no_ct, Plan(**PLAN), set_raw("Modality", text))
+    for folder in (two_phases, no_ct):
+        with pytest.raises(ClreconError) as refusal:
+            read_volume(folder)
+        assert_one_line(refusal.value, letters=10_000)
+
+
+@HOSTILE_TEXT
+def test_row_45_command_info_prints_hostile_texts_escaped_and_writes_no_file(tmp_path, monkeypatch, printed, text):
     monkeypatch.chdir(tmp_path)
     for keyword in HOSTILE_FIELDS:
-        write_series(folder / keyword, Plan(**PLAN), both(set_raw(keyword, text), utf8))
-        told = json.dumps(read_volume(folder / keyword).report)
-        entry = list_series(folder / keyword).series[0]
-        for line in (*entry.warnings, *entry.problems, entry.description, entry.modality):
-            assert line.isprintable() and len(line) < 400
-        assert "passwd" not in told and "title" not in told or keyword in ("RescaleType", "ConvolutionKernel")
-    # Two phases and a broken modality: the texts come out in refusals.
-    write_series(folder / "phases", Plan(**PLAN), set_raw("ConvolutionKernel", text))
-    write_series(folder / "phases", Plan(slope=2, name="p{}".format, **PLAN), set_raw("ConvolutionKernel", "B30f"))
-    write_series(folder / "modality", Plan(**PLAN), set_raw("Modality", text))
-    for name in ("phases", "modality"):
-        with pytest.raises(ClreconError) as caught:
-            read_volume(folder / name)
-        assert_one_line(caught.value, letters=10_000)
-    for name in (*HOSTILE_FIELDS, "phases"):
-        main(["info", str(folder / name)])
-    shown = printed().everything
-    assert all(line.isprintable() for line in shown.splitlines()) and "\u202e" not in shown
-    assert [path.name for path in tmp_path.iterdir()] == ["ct"]
+        write_series(tmp_path / "ct" / keyword, Plan(**PLAN), set_raw(keyword, text))
+        main(["info", str(tmp_path / "ct" / keyword)])
+    lines = printed().everything.splitlines()
+    assert len(lines) > len(HOSTILE_FIELDS)
+    assert all(line.isprintable() and "\u202e" not in line for line in lines)
+    assert list(tmp_path.iterdir()) == [tmp_path / "ct"]
 
 
-def test_row_45_a_hostile_transfer_syntax_is_escaped(tmp_path):
+def test_row_45_hostile_transfer_syntax_is_escaped_in_the_refusal(tmp_path):
     for k, data in enumerate(phantom_seeds()["RLE"].series):
         (tmp_path / f"{k}").write_bytes(data.replace(b"1.2.840.10008.1.2.5\0", b"\x1b[31m8.10008.1.2.5\n "))
     with refused(RefusedInputError, "x1b") as caught:

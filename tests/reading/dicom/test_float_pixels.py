@@ -33,7 +33,7 @@ def keep(array, k):
 
 @pytest.mark.parametrize("width", [32, 64])
 @pytest.mark.parametrize("syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian, DeflatedExplicitVRLittleEndian])
-def test_float_pixels_are_hu(tmp_path, width, syntax):
+def test_float_pixels_are_read_as_hu_in_float32(tmp_path, width, syntax):
     plan = write_series(tmp_path, Plan(syntax=syntax), set_floats(keep, width))
     volume = read_volume(tmp_path)
     assert volume.voxels.dtype == np.float32
@@ -42,8 +42,10 @@ def test_float_pixels_are_hu(tmp_path, width, syntax):
 
 
 @pytest.mark.parametrize("width", [32, 64])
-@pytest.mark.parametrize(("value", "limit"), [(-3000.5, None), (-3000.5, -2990), (np.nan, None)])
-def test_float_padding_becomes_air(tmp_path, width, value, limit):
+@pytest.mark.parametrize(
+    ("value", "limit"), [(-3000.5, None), (-3000.5, -2990), (np.nan, None)], ids=["value", "range", "NaN"]
+)
+def test_declared_float_padding_is_read_as_air(tmp_path, width, value, limit):
     def pad(array, k):
         array[0, :3] = value
         if limit is not None:
@@ -55,12 +57,15 @@ def test_float_padding_becomes_air(tmp_path, width, value, limit):
     if limit is not None:
         values[f"{prefix}FloatPixelPaddingRangeLimit"] = limit
     plan = write_series(tmp_path, change=set_floats(pad, width, **values))
+
     volume = read_volume(tmp_path)
+
+    air_hu = volume.report["padding_hu"]
+    assert -1024 <= air_hu <= -900
     expected = (plan.hu() + 1024) * 0.5 - 1474
-    expected[:, 0, :3] = volume.report["padding_hu"]
-    assert -1024 <= volume.report["padding_hu"] <= -900
+    expected[:, 0, :3] = air_hu
     assert np.array_equal(volume.voxels, expected)
-    assert volume.report["padding_share"] == pytest.approx(3 / 30)
+    assert volume.report["padding_share"] == pytest.approx(3 / (5 * 6))
 
 
 @pytest.mark.parametrize(
@@ -71,7 +76,7 @@ def test_float_padding_becomes_air(tmp_path, width, value, limit):
         (3e38, "values from -964 to 3e\\+38"),
     ],
 )
-def test_row_32_nan_infinite_and_huge_voxels_are_refused(tmp_path, value, words):
+def test_row_32_slice_with_a_nan_infinite_or_huge_voxel_is_refused_by_its_name(tmp_path, value, words):
     def spoil(array, k):
         if k == 3:
             array[2, 2] = value
@@ -96,7 +101,7 @@ def test_row_32_volume_of_nan_is_refused(tmp_path):
         (set_floats(lambda array, k: array * 0 + 3.5), "all 210 voxels are 3.5 HU"),
     ],
 )
-def test_row_32_constant_volumes_are_refused(tmp_path, change, words):
+def test_row_32_volume_of_one_value_or_of_padding_alone_is_refused(tmp_path, change, words):
     write_series(tmp_path, change=change)
     with pytest.raises(RefusedInputError, match=words):
         read_volume(tmp_path)
@@ -111,7 +116,7 @@ def test_row_32_constant_volumes_are_refused(tmp_path, change, words):
         ({"Rows": 6}, ("truncated", 144, 120)),
     ],
 )
-def test_float_pixels_without_sense_are_refused(tmp_path, values, facts):
+def test_float_pixels_with_a_rescale_or_another_size_are_refused(tmp_path, values, facts):
     write_series(tmp_path, change=set_floats(keep, **values))
     with refused(RefusedInputError, "slice000.dcm", *facts):
         read_volume(tmp_path)

@@ -48,81 +48,86 @@ def copy_series(folder: Path, series: int, slices: int) -> int:
 @pytest.mark.release
 @pytest.mark.slow
 @pytest.mark.parametrize(("series", "slices"), [(300, 10), pytest.param(3, 1000, marks=FOR_RELEASE)])
-def test_row_47_many_files_are_walked_once_and_stay_small(
+def test_row_47_each_header_of_a_large_tree_is_read_once_from_its_start_in_little_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, series: int, slices: int
 ) -> None:
-    """Every header is read once, from its first bytes, with no pixels; what is kept of it is bounded."""
+    """No pixels are read; what is kept of a header is bounded."""
     (tmp_path / "tree").mkdir()
     count = copy_series(tmp_path / "tree", series, slices)
-    starts: list[int] = []
+    start_lengths: list[int] = []
     parses: list[int] = []
     heads = header.read_headers
 
     def count_start(file: str, limit: int = PREFIX_BYTES) -> disk.FileStart:
-        starts.append(limit)
+        start_lengths.append(limit)
         return read_start(file, limit)
 
     monkeypatch.setattr(disk, "read_start", count_start)
     monkeypatch.setattr(scan, "read_headers", lambda *given, **how: parses.append(1) or heads(*given, **how))  # type: ignore[func-returns-value]
     monkeypatch.setattr(elements, "parse_carefully", None)
     calls: list[tuple[str, int, int]] = []
+
     gc.collect()
     tracemalloc.start()
-    found = scan_path(tmp_path / "tree", lambda *call: calls.append(call))
+    tree = scan_path(tmp_path / "tree", lambda *call: calls.append(call))
     peak = tracemalloc.get_traced_memory()[1]
     gc.collect()  # in a large process Python itself comes late to what is left in circles
     kept = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
-    assert len(found.slices) == count and starts == [PREFIX_BYTES] * count and len(parses) == count
+
+    assert len(tree.slices) == len(parses) == count
+    assert start_lengths == [PREFIX_BYTES] * count
     assert kept / count < HEADER_BYTES
     assert peak / count < SCAN_PEAK_BYTES_A_FILE
-    assert len(calls) <= scan.PROGRESS_STEPS + 1 and calls[-1] == ("scan", count, count)
-    assert [len(part.headers) for part in group_series(found)] == [slices] * series
+    assert len(calls) <= scan.PROGRESS_STEPS + 1
+    assert calls[-1] == ("scan", count, count)
+    assert [len(part.headers) for part in group_series(tree)] == [slices] * series
 
 
-def test_slices_share_what_they_have_in_common(tmp_path: Path) -> None:
+def test_headers_of_one_series_share_the_objects_of_what_they_have_in_common(tmp_path: Path) -> None:
     write_series(tmp_path)
     first, second, *_ = scan_path(tmp_path).slices
     for name in ("series", "phase", "row_cosines", "patient_hash", "frame_of_reference", "transfer_syntax", "warnings"):
         assert getattr(first, name) is getattr(second, name), name
-    assert not hasattr(first, "__dict__")
+    assert not hasattr(first, "__dict__")  # slots
 
 
-def test_bad_files_beside_many_series_are_looked_at_once(tmp_path: Path) -> None:
+def test_corrupt_files_beside_many_series_are_described_by_the_first_five_in_each(tmp_path: Path) -> None:
     """Work grows with files and series, not with their product."""
     (tmp_path / "tree").mkdir()
-    copy_series(tmp_path / "tree", 50, 1)
-    found = scan_path(tmp_path / "tree")
-    shown: list[CorruptFile] = []
+    copy_series(tmp_path / "tree", series=50, slices=1)
+    tree = scan_path(tmp_path / "tree")
+    texts_made: list[CorruptFile] = []
 
     class Watched(CorruptFile):
         def __str__(self) -> str:
-            shown.append(self)
+            texts_made.append(self)
             return super().__str__()
 
-    found.corrupt = [Watched(tmp_path / "bad" / f"{k}", "cut") for k in range(100)]
-    series = group_series(found)
+    tree.corrupt = [Watched(tmp_path / "bad" / f"{k}", "cut") for k in range(100)]
+    series = group_series(tree)
+    assert series[0].corrupt == tree.corrupt
     assert all(part.corrupt is series[0].corrupt for part in series)
-    assert series[0].corrupt == found.corrupt
     assert all("and 95 more" in part.problems[0] for part in series)
-    assert len(shown) == 5 * len(series)
+    assert len(texts_made) == 5 * len(series)
 
 
-def test_of_other_files_only_the_start_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_series(tmp_path)
+def test_of_files_that_are_no_dicom_only_the_start_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_series(tmp_path)  # 7 slices
     for k in range(100):
         (tmp_path / f"{k}.png").write_bytes(b"\x89PNG" + bytes(100_000))
-    read: list[int] = []
+    lengths_read: list[int] = []
     system_read = os.read
 
     def count_bytes(descriptor: int, limit: int) -> bytes:
         data = system_read(descriptor, limit)
-        read.append(len(data))
+        lengths_read.append(len(data))
         return data
 
     monkeypatch.setattr(os, "read", count_bytes)
     assert scan_path(tmp_path).skipped == {"not DICOM": 100}
-    assert len(read) == 107 and max(read) <= PREFIX_BYTES
+    assert len(lengths_read) == 7 + 100
+    assert max(lengths_read) <= PREFIX_BYTES
 
 
 @pytest.fixture
@@ -130,7 +135,9 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(disk, "DiskReader", partial(disk.DiskReader, notice_s=0.02, give_up_s=0.1))
 
 
-def test_row_46_a_file_that_hangs_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurried: None) -> None:
+def test_row_46_series_with_a_file_whose_disk_does_not_answer_is_refused_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurried: None
+) -> None:
     write_series(tmp_path)
     answer = threading.Event()
 
@@ -149,7 +156,9 @@ def test_row_46_a_file_that_hangs_is_named(tmp_path: Path, monkeypatch: pytest.M
     assert ("no answer yet from slice003.dcm", 0, 7) in calls
 
 
-def test_row_46_a_folder_that_hangs_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurried: None) -> None:
+def test_row_46_tree_with_a_folder_whose_disk_does_not_answer_is_refused_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurried: None
+) -> None:
     write_series(tmp_path / "there")
     (tmp_path / "gone").mkdir()
     answer = threading.Event()
@@ -168,34 +177,39 @@ def test_row_46_a_folder_that_hangs_is_named(tmp_path: Path, monkeypatch: pytest
         answer.set()
 
 
-def test_a_slow_disk_is_waited_for_by_several_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_of_a_slow_disk_are_read_in_order_by_several_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     files = []
     for k in range(3 * disk.CHUNK + 5):
         (tmp_path / f"{k}").write_bytes(b"%d" % k)
         files.append(str(tmp_path / f"{k}"))
     (tmp_path / "7").unlink()
-    here: list[int] = []
+    reading: list[int] = []
     at_once: list[int] = []
 
     def slow(file: str, limit: int = PREFIX_BYTES) -> disk.FileStart:
-        here.append(1)
-        at_once.append(len(here))
+        reading.append(1)
+        at_once.append(len(reading))
         time.sleep(0.002)
-        here.pop()
+        reading.pop()
         return read_start(file, limit)
 
     monkeypatch.setattr(disk, "read_start", slow)
     with disk.DiskReader() as reader:
-        found = list(reader.read_starts(files))
-    assert isinstance(found.pop(7), FileNotFoundError)
+        starts = list(reader.read_starts(files))
+
+    assert isinstance(starts.pop(7), FileNotFoundError)
     del files[7]
-    assert [start.prefix for start in found if isinstance(start, disk.FileStart)] == [
-        Path(file).name.encode() for file in files
-    ]
-    assert max(at_once[: disk.CHUNK]) == 1 and 2 < max(at_once) <= disk.MOST_THREADS
+    prefixes = [start.prefix for start in starts if isinstance(start, disk.FileStart)]
+    assert prefixes == [Path(file).name.encode() for file in files]
+    assert max(at_once[: disk.CHUNK]) == 1  # the first files tell that the disk is slow
+    assert 2 < max(at_once) <= disk.MOST_THREADS
 
 
-def test_row_46_a_file_that_vanishes_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_row_46_series_with_a_file_that_vanishes_is_refused_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_series(tmp_path)
 
     def vanish(file: str, limit: int = PREFIX_BYTES) -> disk.FileStart:
@@ -209,14 +223,14 @@ def test_row_46_a_file_that_vanishes_is_named(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes on this system")
-def test_row_46_a_pipe_in_the_place_of_a_file_is_not_waited_for(tmp_path: Path) -> None:
+def test_row_46_pipe_in_the_place_of_a_file_is_refused_without_waiting(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     assert stat.S_ISFIFO(os.stat(tmp_path / "pipe").st_mode)
     with refused(OSError, "regular", "file"):
         read_start(tmp_path / "pipe")
 
 
-def test_errors_beside_the_caller_reach_him() -> None:
+def test_error_in_the_thread_of_a_disk_reader_reaches_its_caller() -> None:
     def fail() -> None:
         raise KeyError("inside")
 
@@ -224,8 +238,10 @@ def test_errors_beside_the_caller_reach_him() -> None:
         reader.run(fail)
 
 
-def test_the_plain_parser_reads_every_test_series(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_series(tmp_path)
+def test_headers_of_a_plain_series_are_parsed_by_the_plain_parser_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_series(tmp_path)  # 7 slices
     answers = []
     parse = plain.parse_plainly
 
@@ -235,4 +251,5 @@ def test_the_plain_parser_reads_every_test_series(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr("clrecon.reading.dicom.parse.elements.parse_plainly", watch)
     assert len(scan_path(tmp_path).slices) == 7
-    assert len(answers) == 7 and None not in answers
+    assert len(answers) == 7
+    assert None not in answers  # None leaves a header to the careful parser

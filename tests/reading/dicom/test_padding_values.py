@@ -14,22 +14,22 @@ from clrecon.reading import read_volume
 
 
 @pytest.mark.parametrize(
-    ("bits", "vr", "raw", "cell"),
+    ("bits", "vr", "raw", "stored"),
     [
-        (16, "UL", (63536).to_bytes(4, "little"), 0xF830),
-        (16, "SL", (-2000).to_bytes(4, "little", signed=True), 0xF830),
-        (12, "US", (0x0830).to_bytes(2, "little"), 0xF830),
-        (12, "US", (0x0830).to_bytes(2, "little"), 0x0830),
-        (12, "US", (0xF830).to_bytes(2, "little"), 0x0830),
-        (12, "US", (0x8000).to_bytes(2, "little"), 0x8000),
+        pytest.param(16, "UL", (63536).to_bytes(4, "little"), 0xF830, id="unsigned, 32 bits"),
+        pytest.param(16, "SL", (-2000).to_bytes(4, "little", signed=True), 0xF830, id="signed, 32 bits"),
+        pytest.param(12, "US", (0x0830).to_bytes(2, "little"), 0xF830, id="12 bits, pixels with their sign extended"),
+        pytest.param(12, "US", (0x0830).to_bytes(2, "little"), 0x0830, id="12 bits, as the pixels"),
+        pytest.param(12, "US", (0xF830).to_bytes(2, "little"), 0x0830, id="sign extended, pixels without"),
+        pytest.param(12, "US", (0x8000).to_bytes(2, "little"), 0x8000, id="beyond 12 bits, as the pixels"),
     ],
 )
-def test_padding_is_masked_in_any_writing_of_its_bits(tmp_path, bits, vr, raw, cell):
-    """Signed pixels, with and without the sign in the unused bits, and the value in another width or sign."""
+def test_padding_is_masked_in_any_width_and_sign_of_its_value(tmp_path, bits, vr, raw, stored):
+    """Signed pixels, with and without the sign in the unused bits; three of them in each slice are `stored`."""
 
     def change(ds, k):
         array = plan.stored(k).astype(np.uint16) & ((1 << bits) - 1)
-        array[0, :3] = cell
+        array[0, :3] = stored
         set_values(BitsStored=bits, HighBit=bits - 1, PixelData=array.astype(np.uint16).tobytes())(ds, k)
         tag = Tag("PixelPaddingValue")
         ds[tag] = RawDataElement(tag, vr, len(raw), raw, 0, False, True)
@@ -40,13 +40,13 @@ def test_padding_is_masked_in_any_writing_of_its_bits(tmp_path, bits, vr, raw, c
     expected = plan.hu()
     expected[:, 0, :3] = volume.report["padding_hu"]
     assert np.array_equal(volume.voxels, expected)
-    assert volume.report["padding_share"] == pytest.approx(3 / 30)
+    assert volume.report["padding_share"] == pytest.approx(3 / (5 * 6))
 
 
 @pytest.mark.parametrize(
     ("vr", "raw"), [("DS", b"-200"), ("IS", b"-2000 "), ("US", b"\x30\xf8" * 2)], ids=["DS", "IS", "two values"]
 )
-def test_padding_that_is_no_binary_number_is_refused(tmp_path, vr, raw):
+def test_padding_value_that_is_no_binary_number_is_refused(tmp_path, vr, raw):
     def change(ds, k):
         tag = Tag("PixelPaddingValue")
         ds[tag] = RawDataElement(tag, vr, len(raw), raw, 0, False, True)
