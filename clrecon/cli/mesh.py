@@ -394,6 +394,7 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
             lines.append(
                 f"         walls of the {of}: {wall['median_mm']:.1f} mm (median), 5 % below"
                 f" {format_digits(wall['p5_mm'], 2)} mm, {100 * wall['thin_share']:.1f} % below {wall['thin_mm']:g} mm"
+                + (f", known at {100 * (1 - wall['not_measured'] / wall['samples']):.0f} %" if of != "print" else "")
             )
     pieces = f"{count_of(left_out['pieces'], 'piece')} of {format_ml(left_out['pieces_ml'])} together"
     cavities = (

@@ -448,8 +448,8 @@ def measure_bone_walls(
 ) -> Float64Array:  # fmt: skip
     """Return how thick bone is along rays through the walls of a surface, see `cast_walls`: from fit to fit, mm.
 
-    The thickness of a fit is that of one cortex; bone has two of them, and marrow between.  NaN where a face is not
-    fitted, unless the rays are so long that no shift makes the wall as thin as `thin_mm`.
+    The thickness of a fit is that of one cortex; bone has two of them, and marrow between.  Faces that would lie behind
+    each other leave 0 mm.  NaN where a face is not fitted, unless no shift makes so long a ray as short as `thin_mm`.
     """
     rows = np.flatnonzero(np.isfinite(lengths))
     along, thickness = normals[rows], np.full(len(lengths), np.nan)
@@ -458,7 +458,7 @@ def measure_bone_walls(
         with attempt:
             fits = [fit_walls(resident, *end, stopwatch=Stopwatch(), constants=constants) for end in ends]
     shifts = [np.where(fit.states == FITTED, fit.shift_mm, np.float32(np.nan)) for fit in fits]
-    bone = lengths[rows] + shifts[0] + shifts[1]
+    bone = np.maximum(lengths[rows] + shifts[0] + shifts[1], 0.0)
     thickness[rows] = np.where(np.isnan(bone) & (lengths[rows] > thin_mm + 2.0 * MOST_SHIFT_MM), lengths[rows], bone)
     return thickness
 

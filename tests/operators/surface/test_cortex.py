@@ -23,6 +23,7 @@ from clrecon.operators.surface.cortex_mesh import (
     NOT_BONE,
     fit_walls,
     judge_walls,
+    measure_bone_walls,
     standard_errors,
 )
 from clrecon.operators.surface.extract import extract_isosurface
@@ -299,3 +300,16 @@ def test_profiles_half_a_millimetre_outside_of_a_wall_find_it(device):
         sampler = ProfileSampler(resident, Stopwatch())
         walls = sampler.take(sampler.values(points, ways)).fit(0.75, 0.75, 1000.0, 10.0)
     assert walls.shift_mm == pytest.approx([-0.5] * 3, abs=0.15)
+
+
+def test_walls_of_bone_reach_from_fit_to_fit_and_are_unknown_where_a_face_is_none(device):
+    """Rays through a ball of 26 mm from 0.5 mm outside of it; one that meets nothing, and one that ends in tissue."""
+    volume = hollow_ball(thickness=4.0)
+    directions = np.repeat(np.eye(3), 2, axis=0) * np.tile([[1.0], [-1.0]], (3, 1))
+    lengths = np.array([27.0, 27.0, 27.0, 27.0, np.nan, 0.2])
+    with DeviceVolume(volume, device=device) as resident:
+        constants = fit_surface(volume, device)[1].constants
+        points = MIDDLE + 13.5 * directions
+        found = measure_bone_walls(points, directions, lengths, resident, constants, thin_mm=1.0)
+    np.testing.assert_allclose(found[:4], 26.0, atol=0.3)
+    assert np.isnan(found[4:]).all()
