@@ -182,6 +182,7 @@ SPHERE_SAGITTA_MM = 0.004  # triangles of 0.49 mm on a sphere of 10 mm sag 0.003
 BALL_SAGITTA_MM = 0.011  # triangles of up to 0.8 mm on balls of 10 mm sag 0.0097 mm, tori of 0.4 mm less
 SMOOTHED_NOISE_SHARE = 0.5  # white noise through a filter that passes a tenth of the band; measured 0.33 to 0.42
 SMOOTHED_RADIUS_MM = 0.01  # noise of 0.1 mm on 20 mm; a Laplacian of as many steps loses 0.2 mm
+SHELL_VOLUME = 1e-5  # a wall of 0.3 mm, whose volume is restored; measured 4e-7
 SMOOTHED_VOLUME = 2e-3  # the gate is 5e-3
 DECIMATED_VOLUME = 2e-3  # triangles of 3 mm on a sphere of 20 mm lie on both sides of it
 SAMPLED_PLANE_MM = 0.01  # quantiles and means of 20,000 even samples of 30 mm

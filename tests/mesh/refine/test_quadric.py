@@ -20,92 +20,150 @@ pytestmark = pytest.mark.unit
 FAR = np.array([-150.25, 1071.5, -846.0])
 
 
-def of_shapes(*shapes: samples.Arrays) -> Mesh:
+def joined_mesh(*shapes: samples.Arrays) -> Mesh:
     return Mesh(*samples.join(*shapes), None, {"iso_value_hu": 300.0})
 
 
-def test_a_sphere_and_a_torus_stay_what_they_are():
-    mesh = of_shapes(samples.sphere(FAR, 20.0, 5), samples.torus(60, 24))
-    small = collapse_quadric(mesh, 0.8)
-    said = small.report["refinement"]["quadric"]
-    assert small.triangle_count == pytest.approx(0.2 * mesh.triangle_count, abs=2)
-    assert (said["fraction"], said["triangles_before"]) == (0.8, mesh.triangle_count)
-    assert said["reached"] == pytest.approx(1 - small.triangle_count / mesh.triangle_count)
-    found, quality = said["topology"], small.quality()
-    assert (found.euler_number_before, found.euler_number_after) == (2, 2) == (2, quality["euler_number"])
-    assert (found.components_before, found.components_lost, found.loose_edges_after) == (2, 0, 0)
-    assert (found.components_changed, found.changes) == (0, [])
-    assert all(gate.ok for gate in said["gates"]) and "warnings" not in small.report
+@pytest.fixture(scope="module")
+def sphere_and_torus():
+    """A mesh of both, and the same with a fifth of its triangles."""
+    mesh = joined_mesh(samples.sphere(FAR, 20.0, 5), samples.torus(60, 24))
+    return mesh, collapse_quadric(mesh, 0.8)
+
+
+def test_collapsing_reaches_the_share_asked_for_and_reports_it(sphere_and_torus):
+    mesh, small = sphere_and_torus
+    facts = small.report["refinement"]["quadric"]
+    assert small.triangle_count == pytest.approx(0.2 * mesh.triangle_count, abs=2)  # an edge takes two
+    assert (facts["fraction"], facts["triangles_before"]) == (0.8, mesh.triangle_count)
+    assert facts["reached"] == pytest.approx(1 - small.triangle_count / mesh.triangle_count)
+
+
+def test_a_sphere_and_a_torus_keep_their_topology_which_is_reported(sphere_and_torus):
+    _, small = sphere_and_torus
+    topology = small.report["refinement"]["quadric"]["topology"]
+    assert small.quality()["euler_number"] == 2 + 0
+    assert (topology.euler_number_before, topology.euler_number_after) == (2, 2)
+    assert (topology.components_before, topology.components_lost, topology.loose_edges_after) == (2, 0, 0)
+    assert (topology.components_changed, topology.changes) == (0, [])
+
+
+def test_a_collapse_that_changed_no_topology_passes_its_gates_without_a_warning(sphere_and_torus):
+    _, small = sphere_and_torus
+    assert [gate.ok for gate in small.report["refinement"]["quadric"]["gates"]] == [True, True]
+    assert "warnings" not in small.report
     assert small.report["iso_value_hu"] == 300.0
-    assert 0.0 < said["farthest_mm"] < 1.0
 
 
-@pytest.mark.parametrize("shares", [(0.9, "components_lost"), (0.7, "edges_opened")])
-def test_lost_or_opened_components_are_warned_of(shares):
-    """Three specks lie 30 mm from all else: only their own vertices say how far away a result without them is."""
-    fraction, name = shares
+def test_the_largest_distance_of_a_collapsed_sphere_and_torus_is_reported(sphere_and_torus):
+    _, small = sphere_and_torus
+    assert 0.0 < small.report["refinement"]["quadric"]["farthest_mm"] < 1.0  # measured 0.15
+
+
+@pytest.fixture(scope="module")
+def sphere_and_three_specks():
+    """A sphere of 10 mm, and three specks 30 mm from it: only their vertices say how far away a result without is."""
     specks = [samples.sphere((40.0, 4.0 * i, 0.0), 0.05, 0) for i in range(3)]
-    mesh = of_shapes(samples.sphere((0.0, 4.0, 0.0), 10.0, 5), *specks)
-    small = collapse_quadric(mesh, fraction)
-    said, quality = small.report["refinement"]["quadric"], small.quality()
-    found = said["topology"]
-    assert found.components_lost == 4 - quality["components"]
-    assert found.loose_edges_after == quality["boundary_edges"] + quality["nonmanifold_edges"]
-    assert found.euler_number_after == quality["euler_number"]
-    assert [gate.name for gate in said["gates"] if not gate.ok] == [name]
+    return joined_mesh(samples.sphere((0.0, 4.0, 0.0), 10.0, 5), *specks)
+
+
+def test_components_that_a_collapse_loses_are_counted_and_fail_their_gate_with_a_warning(sphere_and_three_specks):
+    small = collapse_quadric(sphere_and_three_specks, 0.9)
+    facts = small.report["refinement"]["quadric"]
+    assert facts["topology"].components_lost == 4 - small.quality()["components"] == 3
+    assert [gate.name for gate in facts["gates"] if not gate.ok] == ["components_lost"]
+    assert small.report["warnings"] == [
+        "components of 4 that collapsing edges by their quadric error has lost: 3, none allowed"
+    ]
+    assert facts["farthest_mm"] == pytest.approx(30.0, abs=0.5)
+
+
+def test_edges_that_a_collapse_opens_are_counted_and_fail_their_gate_with_a_warning(sphere_and_three_specks):
+    small = collapse_quadric(sphere_and_three_specks, 0.7)
+    facts, quality = small.report["refinement"]["quadric"], small.quality()
+    loose_edges = quality["boundary_edges"] + quality["nonmanifold_edges"]
+    assert facts["topology"].loose_edges_after == loose_edges > 0
+    assert facts["topology"].components_changed > 0
+    assert facts["topology"].euler_number_after == quality["euler_number"]
+    assert [gate.name for gate in facts["gates"] if not gate.ok] == ["edges_opened"]
     (warning,) = small.report["warnings"]
-    if name == "components_lost":
-        assert warning == "components of 4 that collapsing edges by their quadric error has lost: 3, none allowed"
-        assert said["farthest_mm"] == pytest.approx(30.0, abs=0.5)
-    else:
-        assert "edges that collapsing has made" in warning and found.components_changed > 0
-        assert said["farthest_mm"] < 0.1
+    assert "edges that collapsing has made" in warning
 
 
-def test_the_euler_number_is_that_of_each_component():
-    """One sphere loses a triangle (a disc: 1), the other part is gone, a torus becomes a sphere."""
+def test_a_collapse_that_keeps_all_components_stays_near_the_surface(sphere_and_three_specks):
+    small = collapse_quadric(sphere_and_three_specks, 0.7)
+    assert small.report["refinement"]["quadric"]["farthest_mm"] < 0.1
+
+
+@pytest.fixture
+def two_spheres_and_a_torus():
+    """The number of faces of each, all triangles, the component of each vertex, and the topology."""
     parts = (samples.sphere(rounds=1), samples.sphere((30.0, 0, 0), 5.0, 1), samples.torus())
     vertices, triangles = samples.join(*parts)
-    count, labels = label_components(triangles.astype(np.uint32), len(vertices))
-    before = measure_topology(triangles.astype(np.uint32), labels, count)
-    np.testing.assert_array_equal(before.euler, [2, 2, 0])
-    np.testing.assert_array_equal(before.faces, [len(part[1]) for part in parts])
-    first, second = len(parts[0][1]), len(parts[0][1]) + len(parts[1][1])
-    after = measure_topology(np.delete(triangles, range(first - 1, second), 0).astype(np.uint32), labels, count)
-    found = compare_topology(before, after)
-    assert (found.euler_number_before, found.euler_number_after) == (4, 1)
-    assert (found.components_before, found.components_lost, found.components_changed) == (3, 1, 1)
-    assert (found.loose_edges_before, found.loose_edges_after) == (0, 3)
-    assert found.changes == [{"component": 0, "euler_number_before": 2, "euler_number_after": 1}]
+    triangles = triangles.astype(np.uint32)
+    count, labels = label_components(triangles, len(vertices))
+    return [len(faces) for _, faces in parts], triangles, labels, measure_topology(triangles, labels, count)
 
 
-def test_the_farthest_of_points_is_exact():
+def test_each_component_has_its_euler_number_and_its_faces(two_spheres_and_a_torus):
+    faces, _, _, topology = two_spheres_and_a_torus
+    assert topology.euler.tolist() == [2, 2, 0]
+    assert topology.faces.tolist() == faces
+
+
+def test_a_component_that_lost_a_triangle_is_changed_and_one_without_triangles_is_lost(two_spheres_and_a_torus):
+    """The first sphere becomes a disc, with an Euler number of 1 and three loose edges; the second is gone."""
+    (first, second, _), triangles, labels, before = two_spheres_and_a_torus
+    left = np.delete(triangles, range(first - 1, first + second), axis=0)
+    change = compare_topology(before, measure_topology(left, labels, 3))
+    assert (change.euler_number_before, change.euler_number_after) == (2 + 2 + 0, 1 + 0)
+    assert (change.components_before, change.components_lost, change.components_changed) == (3, 1, 1)
+    assert (change.loose_edges_before, change.loose_edges_after) == (0, 3)
+    assert change.changes == [{"component": 0, "euler_number_before": 2, "euler_number_after": 1}]
+
+
+def test_the_largest_distance_of_points_from_a_surface_is_exact():
     vertices, triangles = samples.sphere(FAR, 20.0, 3)
     points = FAR + np.random.default_rng(5).normal(0.0, 15.0, (500, 3))
-    there = SurfaceDistance(vertices, triangles.astype(np.uint32))(points).max()
-    found = _farthest_point(points - FAR, vertices - FAR, triangles.astype(np.uint32))
-    assert found == pytest.approx(there, abs=tolerances.FLOAT32_POINT_MM)
+    farthest = _farthest_point(points - FAR, vertices - FAR, triangles.astype(np.uint32))
+    exact = SurfaceDistance(vertices, triangles.astype(np.uint32))(points)
+    assert farthest == pytest.approx(exact.max(), abs=tolerances.FLOAT32_POINT_MM)
 
 
-def test_vertices_without_faces_are_in_no_component_that_is_lost():
+@pytest.fixture
+def two_boxes_and_a_lone_vertex():
     vertices, triangles = samples.join(samples.box(), samples.box())
-    mesh = Mesh(np.vstack((vertices, FAR)), triangles)
-    names = np.arange(len(mesh.vertices))
-    found, lost = _compare_topology(mesh, mesh.triangles, names)
-    assert (found.components_lost, lost.tolist()) == (0, [])
-    names[8:16] = 8  # the second box shrinks to a point
-    found, lost = _compare_topology(mesh, mesh.triangles[:12], names)
-    assert (found.components_lost, lost.tolist()) == (1, list(range(8, 16)))
+    return Mesh(np.vstack((vertices, FAR)), triangles)
+
+
+def test_a_vertex_without_triangles_is_no_lost_component(two_boxes_and_a_lone_vertex):
+    mesh = two_boxes_and_a_lone_vertex
+    change, lost_vertices = _compare_topology(mesh, mesh.triangles, np.arange(17))
+    assert change.components_lost == 0
+    assert lost_vertices.tolist() == []
+
+
+def test_a_box_that_shrinks_to_a_point_is_a_lost_component_with_its_eight_vertices(two_boxes_and_a_lone_vertex):
+    mesh = two_boxes_and_a_lone_vertex
+    vertex_of = np.arange(17)
+    vertex_of[8:16] = 8
+    triangles_of_the_first = mesh.triangles[:12]
+    change, lost_vertices = _compare_topology(mesh, triangles_of_the_first, vertex_of)
+    assert change.components_lost == 1
+    assert lost_vertices.tolist() == list(range(8, 16))
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -0.1, 90.0, float("nan")])
-def test_impossible_shares_are_refused(fraction):
+def test_shares_that_are_not_between_0_and_1_are_refused(fraction):
     with refused(UsageError, 0, 1):
         collapse_quadric(Mesh(*samples.sphere()), fraction)
 
 
-def test_meshes_with_nothing_to_collapse_or_nothing_left_are_refused():
+def test_collapsing_an_empty_mesh_is_refused():
     with refused(NoSurfaceError, "refine"):
         collapse_quadric(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.uint32)), 0.5)
+
+
+def test_a_collapse_that_leaves_nothing_is_refused():
     with refused(NoSurfaceError, 12, 0.99):
         collapse_quadric(Mesh(*samples.box()), 0.99)

@@ -34,12 +34,14 @@ RADIUS = 20.0
 
 
 def noisy_sphere(noise: float, seed: int = 1) -> Mesh:
+    """A sphere of 20 mm with noise of its radius, in mm."""
     vertices, triangles = samples.sphere((0, 0, 0), 1.0, 5)
     lengths = RADIUS + np.random.default_rng(seed).normal(scale=noise, size=len(vertices))
     return Mesh(CENTRE + vertices * lengths[:, None], triangles, None, {"iso_value_hu": 300.0})
 
 
-def plane(noise: float, size: int = 30) -> Mesh:
+def noisy_plane(noise: float, size: int = 30) -> Mesh:
+    """A square of vertices 1 mm apart, with noise of their z."""
     x, y = (grid.ravel() for grid in np.meshgrid(np.arange(size), np.arange(size)))
     z = np.random.default_rng(2).normal(scale=noise, size=size * size)
     corner = (x + size * y)[(x < size - 1) & (y < size - 1)]
@@ -52,165 +54,225 @@ def radial_error(mesh: Mesh) -> np.ndarray:
     return np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS
 
 
-def test_noise_on_a_sphere_goes_and_the_radius_stays():
-    rough = noisy_sphere(0.1)
-    smooth = smooth_mesh(rough, max_deviation_mm=0.5)
-    assert np.std(radial_error(smooth)) < tolerances.SMOOTHED_NOISE_SHARE * 0.1
-    assert abs(radial_error(smooth).mean()) < tolerances.SMOOTHED_RADIUS_MM
-    quality = smooth.quality()
+NOISE_MM = 0.1
+
+
+@pytest.fixture(scope="module")
+def rough_sphere() -> Mesh:
+    return noisy_sphere(NOISE_MM)
+
+
+@pytest.fixture(scope="module")
+def smooth_sphere(rough_sphere) -> Mesh:
+    return smooth_mesh(rough_sphere, max_deviation_mm=0.5)
+
+
+def test_noise_on_a_sphere_is_halved_and_the_radius_stays(smooth_sphere):
+    error = radial_error(smooth_sphere)
+    assert np.std(error) < tolerances.SMOOTHED_NOISE_SHARE * NOISE_MM
+    assert abs(error.mean()) < tolerances.SMOOTHED_RADIUS_MM
+
+
+def test_a_smoothed_sphere_is_closed_and_manifold_with_its_volume_and_triangles(rough_sphere, smooth_sphere):
+    quality = smooth_sphere.quality()
     assert (quality["closed"], quality["manifold"], quality["zero_area_faces"]) == (True, True, 0)
-    assert quality["volume_ml"] == pytest.approx(4 / 3 * np.pi * 8.0, rel=tolerances.SMOOTHED_VOLUME)
-    np.testing.assert_array_equal(smooth.triangles, rough.triangles)
-    outward = (smooth.vertices - CENTRE) / np.linalg.norm(smooth.vertices - CENTRE, axis=1, keepdims=True)
-    assert np.einsum("na,na->n", smooth.normals, outward).min() > 0.99
-    assert smooth.report["iso_value_hu"] == 300.0
-    assert smooth.report["refinement"]["smooth"]["iterations"] == 20
+    volume_ml = 4 / 3 * np.pi * RADIUS**3 / 1000
+    assert quality["volume_ml"] == pytest.approx(volume_ml, rel=tolerances.SMOOTHED_VOLUME)
+    np.testing.assert_array_equal(smooth_sphere.triangles, rough_sphere.triangles)
 
 
-def test_more_iterations_smooth_more():
-    rough = noisy_sphere(0.1)
-    few, many = (np.std(radial_error(smooth_mesh(rough, n, 1.0))) for n in (5, 20))
-    assert many < few < 0.1
+def test_normals_of_a_smoothed_sphere_point_outward(smooth_sphere):
+    outward = smooth_sphere.vertices - CENTRE
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    assert np.einsum("na,na->n", smooth_sphere.normals, outward).min() > 0.99  # cosine of 8 degrees
+
+
+def test_report_of_a_smoothed_mesh_keeps_entries_and_has_the_default_number_of_iterations(smooth_sphere):
+    assert smooth_sphere.report["iso_value_hu"] == 300.0
+    assert smooth_sphere.report["refinement"]["smooth"]["iterations"] == 20
+
+
+def test_more_iterations_smooth_more(rough_sphere):
+    after_5, after_20 = (np.std(radial_error(smooth_mesh(rough_sphere, count, 1.0))) for count in (5, 20))
+    assert after_20 < after_5 < NOISE_MM
+
+
+@pytest.fixture(scope="module", params=daily(1, [0.02, 0.1]), ids=lambda bound: f"{bound:g} mm")
+def bounded(request):
+    """The bound, a sphere with noise of 0.2 mm, and the same smoothed within the bound."""
+    rough = noisy_sphere(0.2)
+    return request.param, rough, smooth_mesh(rough, 20, request.param)
 
 
 @pytest.mark.release
-@pytest.mark.parametrize("bound", daily(1, [0.02, 0.1]))
-def test_no_point_of_either_surface_is_further_than_the_bound(bound):
-    rough = noisy_sphere(0.2)
-    free, smooth = smooth_mesh(rough, 20, 10.0), smooth_mesh(rough, 20, bound)
-    assert SurfaceDistance(rough.vertices, rough.triangles)(free.vertices.astype(float)).max() > 3 * bound
+def test_a_noisy_sphere_that_is_smoothed_freely_moves_by_more_than_three_times_the_bound(bounded):
+    bound, rough, _ = bounded
+    free = smooth_mesh(rough, 20, 10.0)
     assert free.report["refinement"]["smooth"]["vertices_held_back"] == 0
-    assert smooth.report["refinement"]["smooth"]["vertices_held_back"] > 100
+    assert SurfaceDistance(rough.vertices, rough.triangles)(free.vertices.astype(float)).max() > 3 * bound
+
+
+@pytest.mark.release
+def test_no_vertex_is_moved_by_more_than_the_bound_and_those_held_back_are_counted(bounded):
+    bound, rough, smooth = bounded
     step = smooth.vertices.astype(float) - rough.vertices
     assert np.linalg.norm(step, axis=1).max() <= bound
+    assert smooth.report["refinement"]["smooth"]["vertices_held_back"] > 100
+
+
+@pytest.mark.release
+def test_no_point_of_either_surface_is_further_from_the_other_than_the_bound(bounded):
+    """Vertices, and four random points of each triangle."""
+    bound, rough, smooth = bounded
     shares = np.random.default_rng(3).dirichlet((1, 1, 1), 4)
-    for one, other in ((rough, smooth), (smooth, rough)):
-        within = np.einsum("wi,nia->nwa", shares, one.vertices[one.triangles].astype(float)).reshape(-1, 3)
-        points = np.concatenate([one.vertices.astype(float), within])
+    for mesh, other in ((rough, smooth), (smooth, rough)):
+        on_triangles = np.einsum("wi,nia->nwa", shares, mesh.vertices[mesh.triangles].astype(float)).reshape(-1, 3)
+        points = np.concatenate([mesh.vertices.astype(float), on_triangles])
         assert SurfaceDistance(other.vertices, other.triangles)(points).max() <= bound
 
 
-def test_sheets_that_nearly_touch_do_not_cut_each_other():
-    """The filter swings below zero beside a peak, as every steep low pass does: here through the sheet below."""
-    lower, upper = plane(0.0), plane(0.0)
+@pytest.fixture(scope="module")
+def sheets_that_nearly_touch() -> Mesh:
+    """Two sheets 0.02 mm apart, the upper with a peak of 3 mm.
+
+    The filter swings below zero beside a peak, as every steep low pass does: here through the sheet below.
+    """
+    lower, upper = noisy_plane(0.0), noisy_plane(0.0)
     peak = ((upper.vertices[:, :2] - 15) ** 2).sum(axis=1) < 5
-    sheets = samples.join(
-        (lower.vertices, lower.triangles),
-        (upper.vertices + np.where(peak, 3.02, 0.02)[:, None] * [0, 0, 1] + [0.31, 0.17, 0], upper.triangles),
-    )
-    mesh = Mesh(*sheets)
-    assert len(find_self_intersections(mesh.vertices, mesh.triangles)) == 0
-    free = Filter(Rings.of(mesh.triangles, mesh.vertex_count))
-    step = free.find_steps(free.measure_bends(mesh.vertices)[0], sinc_terms(20))
-    assert len(find_self_intersections(mesh.vertices + step, mesh.triangles)) > 0
-    smooth = smooth_mesh(mesh, 20, 1.0)
-    assert len(find_self_intersections(smooth.vertices, smooth.triangles)) == 0
-    assert 0 < smooth.report["refinement"]["smooth"]["vertices_taken_back"] < 0.2 * mesh.vertex_count
+    raised = upper.vertices + np.where(peak, 3.02, 0.02)[:, None] * [0, 0, 1] + [0.31, 0.17, 0]
+    return Mesh(*samples.join((lower.vertices, lower.triangles), (raised, upper.triangles)))
+
+
+def count_crossings(vertices: np.ndarray, mesh: Mesh) -> int:
+    return len(find_self_intersections(vertices, mesh.triangles))
+
+
+def test_the_filter_alone_moves_a_sheet_through_another(sheets_that_nearly_touch):
+    mesh = sheets_that_nearly_touch
+    low_pass = Filter(Rings.of(mesh.triangles, mesh.vertex_count))
+    step = low_pass.find_steps(low_pass.measure_bends(mesh.vertices)[0], sinc_terms(20))
+    assert count_crossings(mesh.vertices, mesh) == 0
+    assert count_crossings(mesh.vertices + step, mesh) > 0
+
+
+def test_vertices_are_taken_back_so_that_smoothed_sheets_do_not_cut_each_other(sheets_that_nearly_touch):
+    smooth = smooth_mesh(sheets_that_nearly_touch, 20, 1.0)
+    taken_back = smooth.report["refinement"]["smooth"]["vertices_taken_back"]
+    assert count_crossings(smooth.vertices, smooth) == 0
+    assert 0 < taken_back < 0.2 * smooth.vertex_count  # those beside the peak
 
 
 def test_a_thin_shell_keeps_its_volume():
-    """Of a wall of 0.3 mm that the filter moves by hundredths, a large share of the volume would be gone."""
-    outer, inner = noisy_sphere(0.05), noisy_sphere(0.05, 2)
-    shell = samples.join(
-        (outer.vertices, outer.triangles),
-        (CENTRE + (inner.vertices - CENTRE) * (19.7 / 20.0), inner.triangles[:, ::-1]),
-    )
-    mesh = Mesh(*shell)
-    before, after = mesh.quality(), smooth_mesh(mesh, 20, 0.3).quality()
-    assert after["volume_ml"] == pytest.approx(before["volume_ml"], rel=1e-4)
+    """A wall of 0.3 mm that the filter alone, which moves it by hundredths, would make thinner by a large share."""
+    outer, inner = noisy_sphere(0.05), noisy_sphere(0.05, seed=2)
+    shrunken = CENTRE + (inner.vertices - CENTRE) * ((RADIUS - 0.3) / RADIUS)
+    mesh = Mesh(*samples.join((outer.vertices, outer.triangles), (shrunken, inner.triangles[:, ::-1])))
+    smooth = smooth_mesh(mesh, 20, 0.3)
+    assert smooth.volume == pytest.approx(mesh.volume, rel=tolerances.SHELL_VOLUME)
 
 
-def test_vertices_that_would_share_a_place_stay():
-    """Far from the origin, where float32 is coarse: STL would join them, and be open."""
-    vertices, triangles = samples.sphere((800.0, -790.0, 805.0), 2.0**-9, 3)
-    mesh = Mesh(vertices, triangles)
-    assert len(find_coincident(smooth_mesh(mesh, 100, 1.0).vertices)) <= len(find_coincident(mesh.vertices))
+def test_smoothing_joins_no_vertices_where_float32_is_coarse():
+    """A sphere of 2 micrometres 1400 mm from the origin: STL would join vertices at one place, and be open."""
+    mesh = Mesh(*samples.sphere((800.0, -790.0, 805.0), 2.0**-9, 3))
+    smooth = smooth_mesh(mesh, 100, 1.0)
+    assert len(find_coincident(smooth.vertices)) <= len(find_coincident(mesh.vertices))
 
 
-def test_a_plane_becomes_flat_and_keeps_its_border():
-    rough = plane(0.1)
+def test_a_noisy_plane_is_flattened_and_its_border_stays():
+    rough = noisy_plane(0.1)
     smooth = smooth_mesh(rough, 40, 1.0)
-    border = np.isin(rough.vertices[:, :2], (0.0, 29.0)).any(axis=1)
+    x_y = rough.vertices[:, :2]
+    border = np.isin(x_y, (0.0, 29.0)).any(axis=1)
+    inner = ((x_y > 6) & (x_y < 23)).all(axis=1)
     np.testing.assert_array_equal(smooth.vertices[border], rough.vertices[border])
-    inner = ((rough.vertices[:, :2] > 6) & (rough.vertices[:, :2] < 23)).all(axis=1)
     assert np.std(smooth.vertices[inner, 2]) < tolerances.SMOOTHED_NOISE_SHARE * np.std(rough.vertices[inner, 2])
-    even = smooth_mesh(plane(0.0), 20, 1.0)
-    assert np.abs(even.vertices[:, 2]).max() == 0.0
 
 
-def test_a_torus_keeps_its_volume():
+def test_a_flat_plane_stays_flat():
+    assert smooth_mesh(noisy_plane(0.0), 20, 1.0).vertices[:, 2].tolist() == [0.0] * 30**2
+
+
+def test_a_torus_keeps_its_volume_and_its_handle():
     torus = Mesh(*samples.torus(120, 48))
-    before, after = torus.quality(), smooth_mesh(torus, 20, 1.0).quality()
-    assert after["volume_ml"] == pytest.approx(before["volume_ml"], rel=tolerances.SMOOTHED_VOLUME)
-    assert after["genus"] == 1
+    quality = smooth_mesh(torus, 20, 1.0).quality()
+    assert quality["volume_ml"] == pytest.approx(torus.quality()["volume_ml"], rel=tolerances.SMOOTHED_VOLUME)
+    assert quality["genus"] == 1
 
 
-def test_faces_that_would_lose_their_area_stay():
-    vertices, triangles = samples.box((1000, 0, 0), (2.0**-12, 2.0**-12, 2.0**-12))  # a few units of float32
-    smooth = smooth_mesh(Mesh(vertices, triangles), 100, 1.0)
+def test_no_face_of_a_tiny_box_loses_its_area():
+    """Its edges are 4 steps of float32 at 1000 mm long."""
+    edge = 2.0**-12
+    smooth = smooth_mesh(Mesh(*samples.box((1000, 0, 0), (edge, edge, edge))), 100, 1.0)
     assert smooth.quality()["zero_area_faces"] == 0
 
 
-def test_the_default_bound_is_a_quarter_of_the_shortest_step():
+def test_the_default_bound_is_a_quarter_of_the_shortest_step_of_the_affine():
     rough = noisy_sphere(0.1)
-    with refused(UsageError, "max_deviation_mm"):
-        smooth_mesh(rough)
     rough.report["affine_ijk_to_lps_mm"] = np.diag([0.5, 0.4, 2.0, 1.0]).tolist()
-    assert smooth_mesh(rough).report["refinement"]["smooth"]["max_deviation_mm"] == pytest.approx(0.1)
+    bound = smooth_mesh(rough).report["refinement"]["smooth"]["max_deviation_mm"]
+    assert bound == pytest.approx(0.4 / 4)
 
 
-def test_the_step_of_a_sheared_affine_is_the_length_of_a_column():
+def test_smoothing_a_mesh_without_an_affine_needs_a_bound():
+    with refused(UsageError, "max_deviation_mm"):
+        smooth_mesh(noisy_sphere(0.1))
+
+
+def test_the_default_bound_of_a_sheared_affine_is_a_quarter_of_its_shortest_column():
+    """The columns are 0.5, 0.4 and 2 mm long, the rows 0.3, 0.57 and 2."""
     report = {"affine_ijk_to_lps_mm": [[0.3, 0, 0, 5], [0.4, 0.4, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]]}
-    assert default_deviation(Mesh(*samples.box(), None, report)) == 0.25 * 0.4  # the rows are 0.3, 0.57 and 2 long
+    assert default_deviation(Mesh(*samples.box(), None, report)) == 0.4 / 4
 
 
-def test_long_steps_are_shortened_and_keep_their_direction():
-    step = np.array([[3.0, 4.0, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -4.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    assert shorten_steps(step, 1.0) == 2
-    np.testing.assert_allclose(
-        step, [[0.6, 0.8, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]], rtol=1e-15
-    )
+def test_steps_longer_than_the_bound_are_shortened_in_their_direction_and_counted():
+    steps = np.array([[3.0, 4.0, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -4.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    within_1_mm = [[0.6, 0.8, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    assert shorten_steps(steps, 1.0) == 2
+    np.testing.assert_allclose(steps, within_1_mm, rtol=tolerances.FLOAT64_SHARE)
 
 
-def test_only_vertices_at_a_fault_are_taken_back_at_first():
+def test_only_vertices_at_a_fault_are_taken_back_by_half_a_step_at_first():
+    """Corner 0 of a box goes to the place of corner 1: two triangles lose their area, with four corners."""
     vertices, triangles = samples.box()
     step = np.zeros((8, 3))
-    step[0] = (1.0, 0.0, 0.0)  # to the place of corner 1: two triangles lose their area
+    step[0] = (1.0, 0.0, 0.0)
     step[7] = 0.125
     moved, taken_back = move_vertices(vertices.astype(np.float32), triangles.astype(np.uint32), step)
-    assert moved[0].tolist() == [0.5, 0.0, 0.0] and moved[7].tolist() == [1.125, 1.125, 1.125]
-    assert taken_back == 4  # the corners of these two triangles
+    assert moved[0].tolist() == [0.5, 0.0, 0.0]
+    assert moved[7].tolist() == [1.125, 1.125, 1.125]
+    assert taken_back == 4
 
 
 @pytest.mark.parametrize("iterations", [0, -1, 1001, 20.0])
-def test_impossible_iterations_are_refused(iterations):
+def test_iterations_that_are_no_whole_number_from_1_to_1000_are_refused(iterations):
     with refused(UsageError, 1, 1000):
         smooth_mesh(noisy_sphere(0.1), iterations, 1.0)
 
 
 @pytest.mark.parametrize("bound", [0.0, -1.0, float("nan"), float("inf")])
-def test_impossible_bounds_are_refused(bound):
+def test_bounds_that_are_no_finite_length_above_0_are_refused(bound):
     with refused(UsageError, "length", 0):
         smooth_mesh(noisy_sphere(0.1), 20, bound)
 
 
-def test_an_empty_surface_is_refused():
+def test_smoothing_an_empty_mesh_is_refused():
     with pytest.raises(NoSurfaceError, match="nothing to refine"):
         smooth_mesh(Mesh([], []), 20, 1.0)
 
 
-def test_normals_do_not_depend_on_the_diagonals():
+def test_normals_at_corners_of_a_box_lie_along_its_diagonals_however_its_faces_are_cut():
     vertices, triangles = samples.box()
     normals = vertex_normals(vertices.astype(np.float32), triangles.astype(np.uint32))
     np.testing.assert_allclose(normals, (vertices * 2 - 1) / np.sqrt(3), atol=tolerances.MESH_UNIT_NORMAL)
 
 
-def test_a_vertex_without_faces_has_a_unit_normal():
+def test_vertices_without_an_area_around_them_have_the_normal_0_0_1():
+    """Three corners of a triangle without area, and a vertex of no triangle."""
     normals = vertex_normals(np.zeros((4, 3), np.float32), np.array([[0, 1, 2]], np.uint32))
     np.testing.assert_array_equal(normals, [[0, 0, 1]] * 4)
 
 
-def test_vertices_that_stay_in_the_way_are_taken_back_wholly():
+def test_vertices_that_stay_in_the_way_at_every_share_of_their_step_are_taken_back_wholly():
     """A corner that would go into a larger box by a whole, a half and a quarter step stays where it was."""
     vertices, triangles = samples.join(samples.box(), samples.box((1.25, -5, -5), (10, 10, 10)))
     step = np.zeros((16, 3))
@@ -239,10 +301,10 @@ def move_by_looking_at_all(vertices, triangles, step):
     return moved, int(np.count_nonzero(share < 1.0))
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_steps_are_taken_back_as_if_all_triangles_were_looked_at_after_each_round(seed):
-    """Shells in each other, with wild steps, a flat triangle and vertices at one place: later rounds look at few."""
-    random = np.random.default_rng(seed)
+@pytest.fixture(scope="module", params=range(4))
+def shells_with_wild_steps(request):
+    """Vertices, triangles and steps: two shells in each other and a sphere, a flat triangle, vertices at one place."""
+    random = np.random.default_rng(request.param)
     shells = [samples.sphere((0, 0, 0), radius, 5) for radius in (10.0, 10.4)]
     vertices, triangles = samples.join(*shells, samples.sphere((25, 0, 0), 10.0, 5))
     vertices, triangles = vertices.astype(np.float32), triangles.astype(np.uint32)
@@ -250,21 +312,35 @@ def test_steps_are_taken_back_as_if_all_triangles_were_looked_at_after_each_roun
     vertices[-1] = vertices[7]
     step = random.normal(0.0, 1.0, vertices.shape) * np.where(random.random((len(vertices), 1)) < 0.1, 0.5, 0.04)
     step[(random.random(len(vertices)) < 0.3) & (vertices[:, 0] > 12)] = 0.0
-    looked_at = []
+    return vertices, triangles, step
 
-    def find_crossings(places, faces, *more):
-        looked_at.append(len(faces))
-        return find_self_intersections(places, faces, *more)
 
-    moved, taken_back = move_vertices(vertices, triangles, step, find_crossings)
+def test_steps_are_taken_back_as_if_all_triangles_were_looked_at_after_each_round(shells_with_wild_steps):
+    vertices, triangles, step = shells_with_wild_steps
+    moved, taken_back = move_vertices(vertices, triangles, step)
     expected, count = move_by_looking_at_all(vertices, triangles, step)
     np.testing.assert_array_equal(moved, expected)
     assert taken_back == count > 100
-    assert looked_at[0] == len(triangles) and len(looked_at) > 5
-    assert max(looked_at[2:]) < 0.5 * len(triangles) and looked_at[-1] < 0.05 * len(triangles)
 
 
-def test_vertices_in_the_way_back_are_found():
+def test_rounds_after_the_second_look_at_less_than_half_and_the_last_at_a_twentieth_of_the_triangles(
+    shells_with_wild_steps,
+):
+    vertices, triangles, step = shells_with_wild_steps
+    looked_at = []
+
+    def count_and_find_crossings(places, faces, *more):
+        looked_at.append(len(faces))
+        return find_self_intersections(places, faces, *more)
+
+    move_vertices(vertices, triangles, step, count_and_find_crossings)
+    assert len(looked_at) > 5
+    assert looked_at[0] == len(triangles)
+    assert max(looked_at[2:]) < 0.5 * len(triangles)
+    assert looked_at[-1] < 0.05 * len(triangles)
+
+
+def test_vertices_that_would_stop_in_the_way_back_of_others_are_taken_back_again():
     """Boxes that would go into a wall find another half way, of which nothing lies where they were to go.
 
     Boxes and walls have blocks of 64 triangles of their own.
@@ -280,69 +356,117 @@ def test_vertices_in_the_way_back_are_found():
 
 
 def test_smoothing_tells_its_three_steps():
-    told = []
-    smooth_mesh(Mesh(*samples.sphere()), 5, 1.0, progress=lambda *said: told.append(said))
-    assert told == [("smooth", step, 3) for step in range(4)]
+    steps = []
+    smooth_mesh(Mesh(*samples.sphere()), 5, 1.0, progress=lambda *step: steps.append(step))
+    assert steps == [("smooth", done, 3) for done in range(4)]
 
 
-@pytest.mark.parametrize("iterations", [1, 20, 100, 1000])
-def test_a_speck_that_the_filter_draws_into_a_point_keeps_its_volume(iterations):
-    """An octahedron whose volume has no gradient after the filter: its steps are shorter, as in a larger mesh."""
-    speck = np.concatenate([np.eye(3), -np.eye(3)]) * [0.11, 0.2, 0.3] + [50.0, 0.0, 0.0]
+@pytest.fixture(scope="module", params=[1, 20, 100, 1000], ids=lambda count: f"{count} iterations")
+def speck(request):
+    """An octahedron whose volume has no gradient after the filter, and the same beside a sphere: before and after."""
+    corners = np.concatenate([np.eye(3), -np.eye(3)]) * [0.11, 0.2, 0.3] + [50.0, 0.0, 0.0]
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
-    alone = Mesh(speck, faces)
-    mesh = Mesh(*samples.join((speck, np.array(faces)), samples.sphere((0, 0, 0), RADIUS, 3)))
-    smoothed = [smooth_mesh(each, iterations, 0.25) for each in (alone, mesh)]
-    for each, smooth in zip((alone, mesh), smoothed, strict=True):
-        assert np.isfinite(smooth.vertices).all()
-        assert np.linalg.norm(smooth.vertices.astype(float) - each.vertices, axis=1).max() <= 0.25
-        assert smooth.quality()["volume_ml"] == pytest.approx(each.quality()["volume_ml"], rel=1e-5)
-        assert smooth.report["refinement"]["smooth"]["components_left"] == 0
-    np.testing.assert_allclose(smoothed[0].vertices, smoothed[1].vertices[:6], atol=1e-5)
-    assert not np.array_equal(smoothed[1].vertices[6:], mesh.vertices[6:])
+    alone = Mesh(corners, faces)
+    beside_a_sphere = Mesh(*samples.join((corners, np.array(faces)), samples.sphere((0, 0, 0), RADIUS, 3)))
+    return [(mesh, smooth_mesh(mesh, request.param, 0.25)) for mesh in (alone, beside_a_sphere)]
 
 
-def test_a_component_whose_volume_no_shift_restores_is_left():
+@pytest.mark.parametrize("which", [0, 1], ids=["alone", "beside a sphere"])
+def test_a_speck_that_the_filter_draws_into_a_point_keeps_its_volume_within_the_bound(speck, which):
+    rough, smooth = speck[which]
+    step = smooth.vertices.astype(float) - rough.vertices
+    assert np.linalg.norm(step, axis=1).max() <= 0.25  # which no NaN is
+    assert smooth.volume == pytest.approx(rough.volume, rel=tolerances.PEER_MEASURE)
+    assert smooth.report["refinement"]["smooth"]["components_left"] == 0
+
+
+def test_a_speck_is_smoothed_alone_as_beside_a_sphere(speck):
+    (_, alone), (_, beside_a_sphere) = speck
+    np.testing.assert_allclose(alone.vertices, beside_a_sphere.vertices[:6], atol=tolerances.MOVED_VERTEX_MM)
+
+
+def test_a_sphere_beside_a_speck_is_smoothed(speck):
+    rough, smooth = speck[1]
+    assert not np.array_equal(smooth.vertices[6:], rough.vertices[6:])
+
+
+def test_a_component_is_left_as_it_was_or_keeps_its_volume_where_the_bound_leaves_little_room():
     """A tetrahedron of a hundredth of the bound: half of it beyond the room that its sharp corners leave."""
-    flat = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1e-4]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    faces = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
+    flat = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1e-4]], faces)
     smooth = smooth_mesh(flat, 20, 0.01)
     left = smooth.report["refinement"]["smooth"]["components_left"]
-    assert left == int(np.array_equal(smooth.vertices, flat.vertices))
-    assert smooth.quality()["volume_ml"] == pytest.approx(flat.quality()["volume_ml"], rel=2e-3)
+    assert left == np.array_equal(smooth.vertices, flat.vertices)
+    assert smooth.volume == pytest.approx(flat.volume, rel=tolerances.SMOOTHED_VOLUME)
 
 
-@pytest.mark.parametrize("iterations", [1, 2, 3, 7, 20, 150, 1000])
-def test_the_filter_keeps_what_is_constant_and_takes_away_what_is_rough(iterations):
-    """A ring of vertices, whose waves are the eigenvectors of the mean of neighbours."""
-    count = 64
-    ring = np.arange(count)
-    rings = Rings(
-        2 * np.arange(count + 1, dtype=np.int32),
-        np.column_stack([ring + 1, ring - 1]).reshape(-1).astype(np.uint32) % count,
-        np.column_stack([ring - 1, ring + 1]).reshape(-1).astype(np.uint32) % count,
-        np.full(count, 0.5, np.float32),
-    )
-    waves = (0, 1, 3, 32)
-    low_pass, gains = Filter(rings), []
-    for turns in waves:
-        places = np.zeros((count, 3), np.float32)
-        places[:, 0] = np.cos(2.0 * np.pi * turns * ring / count)
-        step = low_pass.find_steps(low_pass.measure_bends(places)[0], sinc_terms(iterations))
-        filtered = places[:, 0].astype(float) + step[:, 0]
-        gains.append(float(filtered @ places[:, 0]) / float(places[:, 0] @ places[:, 0]))
-        np.testing.assert_allclose(filtered, gains[-1] * places[:, 0], atol=2e-5 * iterations**0.5)
-    assert gains[0] == 1.0 and gains[1] == pytest.approx(1.0, abs=2e-3) and gains[2] == pytest.approx(1.0, abs=3e-3)
-    assert gains[3] < (1.0 if iterations < 20 else 0.01)
+RING = 64
+"""Vertices of a ring, whose waves are the eigenvectors of the mean of neighbours."""
 
 
-def test_vertices_at_borders_and_where_triangles_run_against_each_other_stay():
+def filter_wave(turns: int, iterations: int) -> tuple[np.ndarray, np.ndarray]:
+    """A cosine with so many turns around the ring, before and after the filter."""
+    ring = np.arange(RING)
+    neighbours = [np.column_stack([ring + 1, ring - 1]), np.column_stack([ring - 1, ring + 1])]
+    before_after = [pair.reshape(-1).astype(np.uint32) % RING for pair in neighbours]
+    rings = Rings(2 * np.arange(RING + 1, dtype=np.int32), *before_after, np.full(RING, 0.5, np.float32))
+    places = np.zeros((RING, 3), np.float32)
+    places[:, 0] = np.cos(2.0 * np.pi * turns * ring / RING)
+    low_pass = Filter(rings)
+    step = low_pass.find_steps(low_pass.measure_bends(places)[0], sinc_terms(iterations))
+    return places[:, 0], places[:, 0].astype(float) + step[:, 0]
+
+
+def measure_gain(turns: int, iterations: int) -> float:
+    wave, filtered = filter_wave(turns, iterations)
+    return float(filtered @ wave) / float(wave @ wave)
+
+
+for_few_and_many_iterations = pytest.mark.parametrize("iterations", [1, 2, 3, 7, 20, 150, 1000])
+
+
+@for_few_and_many_iterations
+@pytest.mark.parametrize("turns", [0, 1, 3, 32])
+def test_a_wave_around_a_ring_stays_a_wave(turns, iterations):
+    wave, filtered = filter_wave(turns, iterations)
+    rounding = 2e-5 * iterations**0.5  # of float32, in each iteration
+    np.testing.assert_allclose(filtered, measure_gain(turns, iterations) * wave, atol=rounding)
+
+
+@for_few_and_many_iterations
+def test_the_filter_keeps_a_constant_exactly_and_long_waves_within_3_per_mille(iterations):
+    assert measure_gain(0, iterations) == 1.0
+    assert measure_gain(1, iterations) == pytest.approx(1.0, abs=2e-3)
+    assert measure_gain(3, iterations) == pytest.approx(1.0, abs=3e-3)
+
+
+@for_few_and_many_iterations
+def test_the_filter_damps_the_shortest_wave_and_removes_it_from_20_iterations_on(iterations):
+    """Neighbours with opposite signs."""
+    assert measure_gain(RING // 2, iterations) < (1.0 if iterations < 20 else 0.01)
+
+
+@pytest.fixture
+def sphere_triangles():
     vertices, triangles = samples.sphere((0, 0, 0), 1.0, 3)
-    turned = triangles.astype(np.uint32).copy()
-    turned[5] = turned[5, ::-1]
-    still = np.flatnonzero(Rings.of(turned, len(vertices) + 1).weights == 0.0)
-    assert still.tolist() == [*sorted(set(turned[5].tolist())), len(vertices)]
-    opened = np.delete(triangles.astype(np.uint32), 5, axis=0)
-    assert set(np.flatnonzero(Rings.of(opened, len(vertices)).weights == 0.0)) == set(triangles[5].tolist())
+    return len(vertices), triangles.astype(np.uint32)
+
+
+def list_still(triangles: np.ndarray, count: int) -> set[int]:
+    """Vertices that the filter does not move."""
+    return set(np.flatnonzero(Rings.of(triangles, count).weights == 0.0).tolist())
+
+
+def test_vertices_of_a_flipped_triangle_and_of_none_stay(sphere_triangles):
+    count, triangles = sphere_triangles
+    corners = triangles[5].tolist()
+    triangles[5] = corners[::-1]
+    assert list_still(triangles, count + 1) == {*corners, count}
+
+
+def test_vertices_at_a_border_stay(sphere_triangles):
+    count, triangles = sphere_triangles
+    assert list_still(np.delete(triangles, 5, axis=0), count) == set(triangles[5].tolist())
 
 
 def test_a_component_that_loses_its_volume_where_steps_are_taken_back_is_left_as_it_was():
@@ -353,7 +477,7 @@ def test_a_component_that_loses_its_volume_where_steps_are_taken_back_is_left_as
     step[:8] = (0.4, 0.0, 0.0)
     step[0] = 0.0
 
-    def find_changed(now, share):
+    def find_changed(now, share):  # the whole box, once a step of one of its corners is taken back
         return np.arange(8) if (share[:8] < 1.0).any() else np.zeros(0, np.int64)
 
     moved, taken_back = move_vertices(vertices, triangles, step, find_changed=find_changed)
