@@ -67,7 +67,7 @@ def volume(page, tmp_path_factory) -> Volume:
     return read_volume(folder)
 
 
-def from_the_code(page, volume: Volume) -> dict[str, np.ndarray]:
+def compute_page(page, volume: Volume) -> dict[str, np.ndarray]:
     """Everything on the page, as clrecon has it."""
     report, affine = volume.report, volume.affine
     positions = np.array([page[f"S_{k}"][0] for k in range(5)])
@@ -110,7 +110,7 @@ def from_the_code(page, volume: Volume) -> dict[str, np.ndarray]:
     }
 
 
-def from_uneven_slices(page) -> dict[str, np.ndarray]:
+def compute_uneven_slices(page) -> dict[str, np.ndarray]:
     in_plane = np.array(page["ImageOrientationPatient"][0]).reshape(2, 3)
     dj, di = page["PixelSpacing"][0]
     positions = np.array([page[f"U_{k}"][0] for k in range(3)])
@@ -130,31 +130,45 @@ def from_uneven_slices(page) -> dict[str, np.ndarray]:
     return found
 
 
-def test_every_number_of_the_page_is_what_the_code_gives(page, volume):
-    computed = from_the_code(page, volume) | from_uneven_slices(page)
+@pytest.fixture(scope="module")
+def computed(page, volume) -> dict[str, np.ndarray]:
+    return compute_page(page, volume) | compute_uneven_slices(page)
+
+
+def test_the_page_has_the_inputs_and_every_number_that_the_code_gives(page, computed):
     assert set(page) == set(computed) | INPUTS | UNEVEN_INPUTS
+
+
+def test_every_number_of_the_page_is_what_the_code_gives_to_its_last_digit(page, computed):
     for name, values in computed.items():
         printed, half_a_digit = page[name]
         np.testing.assert_allclose(printed, values, rtol=0, atol=half_a_digit * 1.001, err_msg=name)
+
+
+def test_the_worked_case_is_right_handed_and_warned_of_with_the_tilt_of_the_page(page, volume):
     assert not is_left_handed(volume.affine)
     assert any(f"gantry tilt -{page['tilt'][0]:.2f} degrees" in text for text in volume.report["warnings"])
 
 
-def test_the_code_agrees_with_the_standard_alone(page, volume):
-    """PS3.3 C.7.6.2.1.1 slice by slice, with nothing of clrecon in it; what is left is the fit's residual."""
+@pytest.mark.parametrize("k", range(5))
+def test_corners_of_each_slice_lie_where_the_standard_puts_them(page, volume, k):
+    """PS3.3 C.7.6.2.1.1 with nothing of clrecon in it; what is left is the residual of the fit."""
     cosines, (dj, di) = page["ImageOrientationPatient"][0], page["PixelSpacing"][0]
-    for k in range(5):
-        for i, j in ((0, 0), (5, 0), (0, 3), (5, 3)):
-            truth = page[f"S_{k}"][0] + np.array(cosines[:3]) * di * i + np.array(cosines[3:]) * dj * j
-            off = np.linalg.norm(volume.ijk_to_lps([(i, j, k)])[0] - truth)
-            assert off <= page["residual_max"][0] + page["residual_max"][1]
+    residual, half_a_digit = page["residual_max"]
+    for i, j in ((0, 0), (5, 0), (0, 3), (5, 3)):
+        expected = page[f"S_{k}"][0] + np.array(cosines[:3]) * di * i + np.array(cosines[3:]) * dj * j
+        assert np.linalg.norm(volume.ijk_to_lps([(i, j, k)])[0] - expected) <= residual + half_a_digit
 
 
-def test_a_wrong_number_on_the_page_is_found(page, volume):
+def test_indented_numbers_of_a_page_are_read_with_half_a_unit_of_their_last_digit():
     text = "    s = (0.493, -0.655, 0.980)\n    A = [ 1 2 ]\n        [ 3.5 4 ]\n    tilt = 13.5\nno = 3\n"
-    found = read_numbers(text)
-    assert set(found) == {"s", "A", "tilt"}
-    assert found["A"][0].tolist() == [[1, 2], [3.5, 4]] and found["A"][1] == 0.5
-    printed, half_a_digit = found["s"]
-    assert half_a_digit == pytest.approx(0.0005)
-    assert np.abs(printed - from_the_code(page, volume)["s"]).max() > half_a_digit
+    numbers = read_numbers(text)
+    assert set(numbers) == {"s", "A", "tilt"}
+    assert numbers["A"][0].tolist() == [[1, 2], [3.5, 4]]
+    assert numbers["A"][1] == 0.5
+    assert numbers["s"][1] == pytest.approx(0.0005)
+
+
+def test_a_slice_step_that_is_wrong_in_its_third_digit_is_off_by_more_than_its_last_digit(computed):
+    wrong, half_a_digit = read_numbers("    s = (0.493, -0.655, 0.980)\n")["s"]
+    assert np.abs(wrong - computed["s"]).max() > half_a_digit

@@ -13,61 +13,62 @@ from clrecon.geometry.iso_rule import ValueRange, choose_iso_rule, layer_margins
 
 
 def make_volume(low: float, high: float, dtype: str = "int16") -> Volume:
+    """Voxels of 0.7 x 0.5 x 2.5 mm of a low value, one of them of a high one."""
     voxels = np.full((3, 4, 5), low, dtype)
     voxels[1, 2, 3] = high
     return Volume(voxels, np.diag((0.7, 0.5, 2.5, 1.0)))
 
 
-def test_an_integer_level_lies_between_the_integers():
+def test_an_integer_level_of_integers_lies_half_a_unit_below_it():
     rule = choose_iso_rule(make_volume(-1000, 900), 200)
     assert (rule.lowest_inside, rule.iso_level) == (200, 199.5)
 
 
-def test_a_fractional_level_of_integers_is_kept():
+def test_a_fractional_level_of_integers_is_kept_and_the_next_integer_is_inside():
     rule = choose_iso_rule(make_volume(-1000, 900), 200.25)
     assert (rule.lowest_inside, rule.iso_level) == (201, 200.25)
 
 
-def test_floats_use_the_level_itself():
+def test_floats_are_inside_from_the_level_on():
     rule = choose_iso_rule(make_volume(-1.0, 1.0, "float32"), 0.25)
     assert (rule.lowest_inside, rule.iso_level) == (0.25, 0.25)
 
 
 @pytest.mark.parametrize(("low", "outside"), [(-3024, AIR_HU), (-1000, -1000), (3, 3)])
-def test_outside_is_the_lowest_value_but_not_below_air(low, outside):
+def test_the_value_outside_is_the_lowest_of_the_volume_but_not_below_air(low, outside):
     assert choose_iso_rule(make_volume(low, 900), 200).outside == outside
 
 
 @pytest.mark.parametrize(("low", "iso_value"), [(300, 200), (-1024, -1500), (200, 200)])
-def test_outside_stays_outside_when_everything_is_inside(low, iso_value):
+def test_the_value_outside_lies_below_the_level_where_all_voxels_are_inside(low, iso_value):
     rule = choose_iso_rule(make_volume(low, 900), iso_value)
     assert rule.outside < rule.iso_level
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_outside_is_found_wherever_the_lowest_value_lies(order):
+def test_the_value_outside_is_found_in_the_first_and_in_the_last_slice(order):
     voxels = np.arange(60, dtype=np.int16).reshape(3, 4, 5)[::order] - 7
     assert choose_iso_rule(Volume(voxels, np.eye(4)), 20).outside == -7
 
 
 @pytest.mark.parametrize(("value", "dtype"), [(300, "int16"), (1e8, "float32"), (-1e8, "float32"), (1e-20, "float32")])
-def test_outside_differs_from_a_constant_volume_in_float32(value, dtype):
+def test_the_value_outside_of_a_constant_volume_lies_below_the_level_in_float32(value, dtype):
     rule = choose_iso_rule(Volume(np.full((2, 2, 2), value, dtype), np.eye(4)), value)
     assert np.float32(rule.outside) < np.float32(rule.iso_level) <= np.float32(value)
-    if dtype == "int16":
-        assert rule.outside == rule.iso_level - 0.5
+
+
+def test_the_value_outside_of_constant_integers_lies_half_a_unit_below_the_level():
+    rule = choose_iso_rule(Volume(np.full((2, 2, 2), 300, np.int16), np.eye(4)), 300)
+    assert (rule.iso_level, rule.outside) == (299.5, 299.0)
 
 
 @pytest.mark.parametrize(
     ("level", "outside"),
-    [
-        # At 2^24 float32 comes in steps of 2: the share of 2^-20 is 16.
-        (2.0**24, 2.0**24 - 16.0),
-        (-(2.0**24), -(2.0**24) - 16.0),
-        (100.0, 99.5),
-    ],
+    [(2.0**24, 2.0**24 - 16.0), (-(2.0**24), -(2.0**24) - 16.0), (100.0, 99.5)],
+    ids=["high", "low", "small"],
 )
-def test_outside_lies_half_a_unit_or_a_share_of_the_level_below_it(level, outside):
+def test_the_value_outside_lies_half_a_unit_or_2_to_the_minus_20_of_the_level_below_it(level, outside):
+    """At 2^24, where float32 comes in steps of 2, that share is 16."""
     volume = Volume(np.full((2, 2, 2), 2.0**24, np.float32), np.eye(4))
     assert choose_iso_rule(volume, level).outside == outside
 
@@ -82,7 +83,9 @@ def test_outside_lies_half_a_unit_or_a_share_of_the_level_below_it(level, outsid
         ("int16", 300, 200, 200.0),
     ],
 )
-def test_outside_of_what_lies_below_mirrors_the_lowest_value(dtype, low, level, outside):
+def test_the_value_outside_of_a_surface_below_a_level_is_as_far_above_as_the_lowest_is_below(
+    dtype, low, level, outside
+):
     assert choose_iso_rule(make_volume(low, 900, dtype), level, below=True).outside == outside
 
 
@@ -90,12 +93,13 @@ def test_outside_of_what_lies_below_mirrors_the_lowest_value(dtype, low, level, 
     ("level", "below", "outside"),
     [(-(2**29), False, -(2**29) - 1), (-(2**31), False, -(2**30)), (2**29, True, 2**29), (2**31, True, 2**30)],
 )
-def test_outside_differs_from_integers_by_32_bits_at_most(level, below, outside):
+def test_the_value_outside_fits_32_bits_with_every_integer(level, below, outside):
     assert choose_iso_rule(make_volume(-1000, 900), level, below=below).outside == outside
 
 
 @pytest.mark.parametrize(("figure", "slices"), [("ends", 3), ("lowest", 2)])
-def test_slices_are_released_one_by_one(monkeypatch, figure, slices):
+def test_slices_are_released_one_by_one_up_to_the_first_that_holds_air(monkeypatch, figure, slices):
+    """For the lowest value; for both ends all are looked at."""
     released = []
     monkeypatch.setattr(Volume, "release_slices", lambda self, first, end: released.append((first, end)))
     voxels = np.zeros((3, 4, 5), np.int16)
@@ -105,8 +109,11 @@ def test_slices_are_released_one_by_one(monkeypatch, figure, slices):
 
 
 @pytest.mark.parametrize(("value", "scale"), [(1.0, 0.5), (900.0, 2.0**-10), (1e-40, 2.0**126)])
-def test_floats_are_scaled_by_a_power_of_two_that_float32_holds(value, scale):
+def test_floats_are_scaled_below_one_by_a_power_of_two_that_float32_holds(value, scale):
     assert choose_iso_rule(Volume(np.full((2, 2, 2), value, np.float32), np.eye(4)), value).value_scale == scale
+
+
+def test_integers_are_not_scaled():
     assert choose_iso_rule(make_volume(0, 900), 200).value_scale == 1.0
 
 
@@ -120,57 +127,71 @@ def test_floats_are_scaled_by_a_power_of_two_that_float32_holds(value, scale):
         (0, 1, "float32", 1e31),
         (0, 9, "int16", -1e300),
     ],
+    ids=["high integers", "low integers", "high floats", "low floats", "level of floats", "level of integers"],
 )
-def test_values_beyond_float32_interpolation_are_refused(low, high, dtype, iso_value):
+def test_values_and_levels_between_which_float32_cannot_interpolate_are_refused(low, high, dtype, iso_value):
     with pytest.raises(UsageError, match="supported|interpolated"):
         choose_iso_rule(make_volume(low, high, dtype), iso_value)
 
 
 @pytest.mark.parametrize("bad", ["abc", None, {}])
-def test_an_iso_value_is_a_number(bad):
+def test_an_iso_value_that_is_no_number_is_refused(bad):
     with refused(UsageError, "number"):
         choose_iso_rule(make_volume(0, 1), bad)
 
 
-def test_a_size_for_which_float32_is_too_coarse_is_refused():
-    steps = np.diag((1e4, 1e4, 1e-3, 1.0))
+def test_a_volume_whose_steps_float32_cannot_hold_beside_its_size_is_refused():
+    affine = np.diag((1e4, 1e4, 1e-3, 1.0))  # rows of 40 m, slices of a micrometre
     with refused(UsageError, "float32", 30000):
-        vertex_margin(Volume(np.zeros((3, 4, 5), np.int16), steps), 1)
+        vertex_margin(Volume(np.zeros((3, 4, 5), np.int16), affine), 1)
 
 
-def test_the_margin_does_not_grow_with_the_distance():
-    spacing = np.diag((0.1, 0.1, 0.1, 1.0))
-    far = Volume(np.zeros((3, 4, 5), np.int16), spacing + np.eye(4, k=3) * 1e6)
-    assert vertex_margin(far, 1).max() < 1e-4
-    near = Volume(np.zeros((3, 4, 5), np.int16), spacing + np.eye(4, k=3) * 4000.0)
-    assert vertex_margin(near, 1) == pytest.approx(4.0 * 2.0**-12 / 0.1)
+def margin_at(x_mm: float) -> np.ndarray:
+    """The margin of vertices, in voxels of 0.1 mm, of a volume so far from the origin."""
+    affine = np.diag((0.1, 0.1, 0.1, 1.0)) + np.eye(4, k=3) * x_mm
+    return vertex_margin(Volume(np.zeros((3, 4, 5), np.int16), affine), 1)
+
+
+def test_the_margin_near_the_origin_is_four_steps_of_float32():
+    step_at_4000_mm = 2.0**-12
+    assert margin_at(4000.0) == pytest.approx(4.0 * step_at_4000_mm / 0.1)
+
+
+def test_the_margin_far_from_the_origin_is_that_of_coordinates_from_the_centre():
+    assert margin_at(1e6).max() < 1e-4  # a step of float32 is 0.06 mm there, 0.6 voxels
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_values_that_are_not_finite_are_refused(bad):
+def test_an_iso_value_that_is_not_finite_is_refused(bad):
     with pytest.raises(UsageError, match="finite"):
         choose_iso_rule(make_volume(0, 1), bad)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_voxels_that_are_not_finite_are_refused(bad):
     with pytest.raises(NoSurfaceError, match="NaN|infinite"):
         choose_iso_rule(make_volume(0.0, bad, "float32"), 0.5)
 
 
-def test_the_margin_is_four_units_in_the_last_place():
-    volume = Volume(np.zeros((3, 4, 5), np.int16), np.array(
-        [[0.5, 0, 0, -800.0], [0, 0.25, 0, 0], [0, 0, 2.0, 0], [0, 0, 0, 1]]))  # fmt: skip
-    unit = 2.0**-14  # float32 between 512 and 1024
-    assert vertex_margin(volume, 1) == pytest.approx(np.array((8, 16, 2)) * unit)
+def test_the_margin_is_four_steps_of_float32_in_voxels_of_each_axis():
+    affine = np.diag((0.5, 0.25, 2.0, 1.0))
+    affine[0, 3] = -800.0
+    step_at_800_mm = 2.0**-14
+    margin = vertex_margin(Volume(np.zeros((3, 4, 5), np.int16), affine), 1)
+    assert margin == pytest.approx(4 * step_at_800_mm / np.array((0.5, 0.25, 2.0)))
 
 
 @pytest.mark.parametrize(
     ("dtype", "lowest", "level", "highest", "upper"),
     [("int16", 200, 199.5, 300, 300.5), ("float32", 200.0, 200.0, 300.0, 300.0)],
 )
-def test_a_range_has_two_ends(dtype, lowest, level, highest, upper):
+def test_the_ends_of_a_range_of_integers_lie_half_a_unit_beyond_and_those_of_floats_at_the_values(
+    dtype, lowest, level, highest, upper
+):
     rule = choose_iso_rule(make_volume(-1000, 900, dtype), [200, 300])
     assert (rule.inside, rule.iso_value, rule.upper_value) == ("between", 200, 300)
-    assert (rule.lowest_inside, rule.iso_level, rule.highest_inside, rule.upper_level) == (
-        *(lowest, level, highest, upper),
-    )
+    assert (rule.lowest_inside, rule.iso_level) == (lowest, level)
+    assert (rule.highest_inside, rule.upper_level) == (highest, upper)
 
 
 @pytest.mark.parametrize("level", [200, 200.0, np.int16(200), np.float32(200.0), np.array(200)])
@@ -186,8 +207,9 @@ def test_a_number_of_any_kind_is_one_level(level):
         ((200, 200), False, (200, "HU")),
         ((200, 300), True, (200, 300)),
     ],
+    ids=["three numbers", "upper end below", "equal ends", "range and below"],
 )
-def test_ranges_that_are_none_are_refused(level, below, words):
+def test_levels_that_are_no_range_of_two_are_refused(level, below, words):
     with refused(UsageError, *words):
         choose_iso_rule(make_volume(-1000, 900), level, below=below)
 
@@ -208,6 +230,6 @@ def test_each_layer_has_a_margin_of_four_steps_of_float32(border):
         ([200, 300], False, [False, True, True, True, False]),
     ],
 )
-def test_values_are_inside_up_to_the_ends(level, below, inside):
+def test_values_at_the_ends_are_inside_above_and_between_and_outside_below(level, below, inside):
     rule = choose_iso_rule(make_volume(-1000, 900), level, below=below)
     assert rule.mark_inside(np.array([199, 200, 250, 300, 301])).tolist() == inside

@@ -18,8 +18,9 @@ VOLUME = Volume(np.array([[[-1000, 900]]], np.int16), np.eye(4))
         (-400.5, True, "below -400.5 HU", "of what lies below -400.5 HU"),
         ((100, 300), False, "100 to 300 HU", "at 100 to 300 HU"),
     ],
+    ids=["above", "below", "between"],
 )
-def test_a_rule_says_what_is_asked_for(level, below, words, place):
+def test_a_rule_describes_its_level_and_phrases_where_its_surface_lies(level, below, words, place):
     rule = choose_iso_rule(VOLUME, level, below=below)
     assert (rule.describe(), rule.phrase()) == (words, place)
 
@@ -31,15 +32,20 @@ def test_a_rule_says_what_is_asked_for(level, below, words, place):
         (200, True, (200, 199.5, "below", "linear", [None, 200], [None, 199.5])),
         ((100, 300), False, (None, None, "between", "linear", [100, 300], [99.5, 300.5])),
     ],
+    ids=["above", "below", "between"],
 )
-def test_a_report_names_both_ends_of_what_is_inside(level, below, expected):
+def test_the_report_of_a_rule_has_its_level_and_both_ends_of_what_is_inside(level, below, expected):
     report = choose_iso_rule(VOLUME, level, below=below).as_report()
     assert list(report) == ["iso_value_hu", "iso_level_hu", "inside", "vertex_rule", "inside_hu", "inside_levels_hu"]
     assert tuple(report.values()) == expected
 
 
-def test_a_rule_made_by_hand_scales_nothing_and_has_one_level():
+def test_a_rule_made_by_hand_has_one_level_above_which_is_inside_and_scales_nothing():
     rule = IsoRule(0.5, 1, 0.5, 0.0, True)
-    assert (rule.value_scale, rule.topology, rule.inside, rule.border) == (1.0, "separated", "above", 1)
     assert rule.levels == (0.5,)
-    assert IsoRule(0.5, 1, 0.5, 0.0, False).border == 0
+    assert (rule.value_scale, rule.topology, rule.inside) == (1.0, "separated", "above")
+
+
+@pytest.mark.parametrize(("closed", "border"), [(True, 1), (False, 0)])
+def test_a_rule_that_closes_the_surface_has_a_layer_around_the_volume(closed, border):
+    assert IsoRule(0.5, 1, 0.5, 0.0, closed).border == border

@@ -12,26 +12,35 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import layer_normal_matrices, slice_normal_matrices
 
+upwards_and_downwards = pytest.mark.parametrize("sign", [1.0, -1.0], ids=["upwards", "downwards"])
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_every_voxel_lies_at_its_slice(sign):
+
+@upwards_and_downwards
+def test_every_voxel_lies_in_its_slice_by_rows_and_columns(sign):
     volume = uneven(sign=sign)
     i, j, k = (axis.ravel() for axis in np.mgrid[:4, :5, :6])
-    points = volume.ijk_to_lps(np.stack([i, j, k], axis=1))
-    truth = positions(sign)[k] + np.stack([i, j], axis=1) @ IN_PLANE.T
-    assert np.abs(points - truth).max() <= tolerances.FLOAT64_PLACE_MM
+    expected = positions(sign)[k] + np.stack([i, j], axis=1) @ IN_PLANE.T
+    assert np.abs(volume.ijk_to_lps(np.stack([i, j, k], axis=1)) - expected).max() <= tolerances.FLOAT64_PLACE_MM
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_map_is_linear_in_each_layer_and_has_an_inverse(sign):
-    volume = uneven(sign=sign)
-    ijk = np.random.default_rng(5).uniform((-2, -2, -2), (6, 7, 8), (400, 3))
-    lps = volume.ijk_to_lps(ijk)
-    assert np.abs(volume.lps_to_ijk(lps) - ijk).max() <= tolerances.FLOAT64_PLACE_MM
-    layer = np.clip(np.floor(ijk[:, 2]).astype(int), 0, 4)
+def random_ijk() -> np.ndarray:
+    """400 places in and up to two voxels around a volume of 4 x 5 x 6."""
+    return np.random.default_rng(5).uniform((-2, -2, -2), (6, 7, 8), (400, 3))
+
+
+@upwards_and_downwards
+def test_points_of_uneven_slices_are_mapped_back_to_their_indices(sign):
+    volume, ijk = uneven(sign=sign), random_ijk()
+    assert np.abs(volume.lps_to_ijk(volume.ijk_to_lps(ijk)) - ijk).max() <= tolerances.FLOAT64_PLACE_MM
+
+
+@upwards_and_downwards
+def test_points_between_two_uneven_slices_lie_on_a_straight_line_from_one_to_the_other(sign):
+    volume, ijk = uneven(sign=sign), random_ijk()
+    layer = np.clip(np.floor(ijk[:, 2]).astype(int), 0, 4)  # beyond the ends the first and last layer go on
     low, high = (volume.ijk_to_lps(np.column_stack([ijk[:, :2], layer + end])) for end in (0, 1))
-    part = (ijk[:, 2] - layer)[:, None]
-    assert np.abs(low + part * (high - low) - lps).max() <= tolerances.FLOAT64_PLACE_MM
+    expected = low + (ijk[:, 2] - layer)[:, None] * (high - low)
+    assert np.abs(volume.ijk_to_lps(ijk) - expected).max() <= tolerances.FLOAT64_PLACE_MM
 
 
 def test_steps_of_the_ends_go_on_beyond_an_uneven_stack():
@@ -43,39 +52,70 @@ def test_steps_of_the_ends_go_on_beyond_an_uneven_stack():
     assert steps[-2:] == pytest.approx(np.tile(steps[-3], (2, 1)))
 
 
-def test_gradients_of_a_linear_field_come_out_exact():
-    slope = np.array([3.0, -2.0, 5.0])
-    volume = uneven()
-    values = volume.slice_origins(border=1) @ slope
-    at_samples, in_layers = slice_normal_matrices(volume, 0), layer_normal_matrices(volume, 0)
-    in_plane = IN_PLANE.T @ slope
-    for k in range(6):
-        before, here, after = values[k : k + 3]
-        assert at_samples[k] @ (*in_plane, (after - before) / 2) == pytest.approx(slope)
-        assert in_layers[k] @ (*in_plane, after - here) == pytest.approx(slope)
+SLOPE_A_MM = np.array([3.0, -2.0, 5.0])
+"""Of a field that is linear in space."""
 
 
-def test_even_positions_are_the_affine():
+@pytest.mark.parametrize("k", range(6))
+def test_gradients_of_a_linear_field_from_central_differences_are_exact_in_each_slice(k):
+    before, _, after = uneven().slice_origins(border=1)[k : k + 3] @ SLOPE_A_MM
+    differences = (*(IN_PLANE.T @ SLOPE_A_MM), (after - before) / 2)
+    assert slice_normal_matrices(uneven(), 0)[k] @ differences == pytest.approx(SLOPE_A_MM)
+
+
+@pytest.mark.parametrize("k", range(6))
+def test_gradients_of_a_linear_field_from_one_slice_to_the_next_are_exact_in_each_layer(k):
+    here, after = uneven().slice_origins(border=1)[k + 1 : k + 3] @ SLOPE_A_MM
+    differences = (*(IN_PLANE.T @ SLOPE_A_MM), after - here)
+    assert layer_normal_matrices(uneven(), 0)[k] @ differences == pytest.approx(SLOPE_A_MM)
+
+
+@pytest.fixture
+def affine_and_positions():
+    """The same even slices by an affine alone, and by a table of their positions."""
     affine = np.array([[0.5, 0.1, 0.0, -30.0], [0.0, 0.7, -0.4, 20.0], [0.1, 0.0, 1.25, 5.0], [0, 0, 0, 1]])
-    even = Volume(np.zeros((6, 5, 4), np.int16), affine)
-    table = Volume(np.zeros((6, 5, 4), np.int16), affine, slice_positions=even.slice_origins())
+    by_affine = Volume(np.zeros((6, 5, 4), np.int16), affine)
+    by_positions = Volume(np.zeros((6, 5, 4), np.int16), affine, slice_positions=by_affine.slice_origins())
+    return by_affine, by_positions
+
+
+def test_even_slices_by_their_positions_lie_where_their_affine_puts_them(affine_and_positions):
+    by_affine, by_positions = affine_and_positions
     ijk = np.random.default_rng(8).uniform(-3, 9, (50, 3))
-    assert table.ijk_to_lps(ijk) == pytest.approx(even.ijk_to_lps(ijk))
-    assert table.lps_to_ijk(even.ijk_to_lps(ijk)) == pytest.approx(ijk)
-    assert slice_normal_matrices(table, 1) == pytest.approx(slice_normal_matrices(even, 1))
-    assert even.uneven is False and table.uneven is True
+    assert by_positions.ijk_to_lps(ijk) == pytest.approx(by_affine.ijk_to_lps(ijk))
+    assert by_positions.lps_to_ijk(by_affine.ijk_to_lps(ijk)) == pytest.approx(ijk)
 
 
-def test_volume_with_other_voxels_keeps_places_and_warnings():
+def test_even_slices_by_their_positions_have_the_gradients_of_their_affine(affine_and_positions):
+    by_affine, by_positions = affine_and_positions
+    assert slice_normal_matrices(by_positions, 1) == pytest.approx(slice_normal_matrices(by_affine, 1))
+
+
+def test_a_volume_with_a_table_of_positions_counts_as_uneven(affine_and_positions):
+    by_affine, by_positions = affine_and_positions
+    assert (by_affine.uneven, by_positions.uneven) == (False, True)
+
+
+def test_a_volume_with_other_voxels_keeps_its_places():
+    volume = uneven()
+    other = volume.with_voxels(np.full((6, 5, 4), 7.5, np.float32))
+    assert other.uneven
+    assert other.ijk_to_lps([(1, 2, 3.5)]) == pytest.approx(volume.ijk_to_lps([(1, 2, 3.5)]))
+    assert (other.voxels == 7.5).all()
+
+
+def test_a_volume_with_other_voxels_has_a_copy_of_the_warnings():
     volume = uneven()
     volume.report["warnings"].append("kept")
     other = volume.with_voxels(np.full((6, 5, 4), 7.5, np.float32))
-    assert other.ijk_to_lps([(1, 2, 3.5)]) == pytest.approx(volume.ijk_to_lps([(1, 2, 3.5)]))
-    assert other.uneven and other.voxels.max() == 7.5 and other.report["warnings"] == ["kept"]
+    assert other.report["warnings"] == ["kept"]
     other.report["warnings"].append("its own")
     assert volume.report["warnings"] == ["kept"]
+
+
+def test_other_voxels_of_another_shape_are_refused():
     with refused(UsageError, "shape", 6, 5):
-        volume.with_voxels(np.zeros((6, 5, 3)))
+        uneven().with_voxels(np.zeros((6, 5, 3)))
 
 
 @pytest.mark.parametrize(
@@ -86,20 +126,26 @@ def test_volume_with_other_voxels_keeps_places_and_warnings():
         (lambda table: table[::-1], "advance"),
         (lambda table: np.where(np.arange(6)[:, None] == 2, np.nan, table), "NaN"),
     ],
+    ids=["one missing", "two exchanged", "reversed", "NaN"],
 )
-def test_what_is_no_stack_is_refused(change, says):
+def test_positions_that_do_not_advance_slice_by_slice_are_refused(change, says):
     affine = uneven().affine
     with pytest.raises(UsageError, match=says):
         Volume(np.zeros((6, 5, 4), np.int16), affine, slice_positions=change(positions()))
 
 
-def test_a_volume_says_that_its_slices_are_uneven():
+def test_repr_of_an_uneven_volume_says_so_with_its_size_type_and_spacing():
     assert repr(uneven()) == "Volume(4 x 5 x 6 int16, spacing 0.5 x 0.7 x 1.822 mm, uneven slices)"
+
+
+def test_repr_of_an_even_volume_has_its_size_type_and_spacing():
     assert repr(Volume(np.zeros((2, 3, 4), np.uint8), np.eye(4))) == "Volume(4 x 3 x 2 uint8, spacing 1 x 1 x 1 mm)"
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_point_that_is_not_finite_has_no_place():
+def test_a_point_that_is_not_finite_has_no_finite_indices_and_changes_no_other():
     volume = Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), None, [(0, 0, z) for z in (0.0, 1.0, 2.5, 3.0)])
-    places = volume.lps_to_ijk([[np.nan, 0, 0], [0, 0, np.inf], [1, 2, 2.5]])
-    assert not np.isfinite(places[:2]).all(axis=1).any() and places[2].tolist() == [1.0, 2.0, 2.0]
+    nan, infinite, finite = volume.lps_to_ijk([[np.nan, 0, 0], [0, 0, np.inf], [1, 2, 2.5]])
+    assert not np.isfinite(nan).all()
+    assert not np.isfinite(infinite).all()
+    assert finite.tolist() == [1.0, 2.0, 2.0]  # slice 2 lies at z = 2.5

@@ -24,6 +24,8 @@ CLOUD_PLACE_MM = 1.6e-5  # half a step of float32 below 512 mm
 CLOUD_BALL_MM = 0.02  # a ball of 20 mm in voxels of 0.64 to 0.8 mm and whole HU: measured 0.009
 BALL_OF_VOXELS = 2e-3  # relative volume of such a ball by counting voxels
 
+CUT_SPLINE_HU = 1e-5  # a cubic spline of part of a volume; coefficients fade by 0.27 a voxel
+
 # --- geometry: images of pyvista ---
 IMAGE_POINT_MM = 1e-9  # VTK places points by direction and spacing in float64
 IMAGE_SURFACE_MM = 1e-4  # float32 vertices some 200 mm from the origin, placed by another program: measured 2e-5

@@ -1,4 +1,4 @@
-"""Signed distances: known bodies, the winding_number number as another opinion, and the figures of `compare_meshes`."""
+"""Signed distances: known bodies, the winding number as another opinion, and the figures of `compare_meshes`."""
 
 from __future__ import annotations
 

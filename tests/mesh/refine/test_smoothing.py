@@ -286,7 +286,7 @@ def move_by_looking_at_all(vertices, triangles, step):
     """Move vertices as `move_vertices` does, with a look at each triangle that has a changed vertex in each round."""
     share = np.ones(len(vertices))
     moved = as_stored(vertices + step)
-    changed = np.ones(len(triangles), bool)
+    changed: np.ndarray = np.ones(len(triangles), bool)
     for turn in range(_ROUNDS):
         spoilt = _find_spoilt(moved, triangles, changed, find_self_intersections)
         if turn >= _ROUNDS_OF_ITS_OWN:
@@ -407,9 +407,12 @@ RING = 64
 def filter_wave(turns: int, iterations: int) -> tuple[np.ndarray, np.ndarray]:
     """A cosine with so many turns around the ring, before and after the filter."""
     ring = np.arange(RING)
-    neighbours = [np.column_stack([ring + 1, ring - 1]), np.column_stack([ring - 1, ring + 1])]
-    before_after = [pair.reshape(-1).astype(np.uint32) % RING for pair in neighbours]
-    rings = Rings(2 * np.arange(RING + 1, dtype=np.int32), *before_after, np.full(RING, 0.5, np.float32))
+    after_before, before_after = (
+        np.column_stack(pair).reshape(-1).astype(np.uint32) % RING
+        for pair in ([ring + 1, ring - 1], [ring - 1, ring + 1])
+    )
+    begin = 2 * np.arange(RING + 1, dtype=np.int32)
+    rings = Rings(begin, after_before, before_after, np.full(RING, 0.5, np.float32))
     places = np.zeros((RING, 3), np.float32)
     places[:, 0] = np.cos(2.0 * np.pi * turns * ring / RING)
     low_pass = Filter(rings)
