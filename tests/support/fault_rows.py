@@ -131,7 +131,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
         "constant volume, NaN, infinite voxels: refused",
         (
             BAD_INPUT + "test_volume_of_one_value_is_refused",
-            "geometry/test_iso_rule.py::test_values_that_are_not_finite_are_refused",
+            "geometry/test_iso_rule.py::test_voxels_that_are_not_finite_are_refused",
         ),
     ),
     33: (
