@@ -31,32 +31,35 @@ from clrecon.cli.console import Console
 from clrecon.errors import ClreconError, UsageError
 
 
-def runs(count: int) -> list[dict[str, Any]]:
+def make_gap_runs(count: int) -> list[dict[str, Any]]:
     return [{"count": 3, "gap_mm": float(n + 1)} for n in range(count)]
 
 
 @pytest.mark.parametrize(
     ("found", "words"),
     [
-        (runs(2), "3 of 1, then 3 of 2 mm; SpacingBetweenSlices says 2"),
-        (runs(info._RUNS_SHOWN), ", then ".join(f"3 of {n + 1}" for n in range(info._RUNS_SHOWN)) + " mm; Spac"),
-        (runs(info._RUNS_SHOWN + 1), "1 to 9 mm, usually 2; SpacingBetweenSlices says 2"),
+        (make_gap_runs(2), "3 of 1, then 3 of 2 mm; SpacingBetweenSlices says 2"),
+        (
+            make_gap_runs(info._RUNS_SHOWN),
+            ", then ".join(f"3 of {n + 1}" for n in range(info._RUNS_SHOWN)) + " mm; Spac",
+        ),
+        (make_gap_runs(info._RUNS_SHOWN + 1), "1 to 9 mm, usually 2; SpacingBetweenSlices says 2"),
         ([], "1 to 9 mm, usually 2; SpacingBetweenSlices says 2"),
     ],
 )
-def test_gaps_are_told_by_their_runs_where_those_are_few(found: list[dict[str, Any]], words: str) -> None:
+def test_gaps_between_slices_are_listed_by_their_runs_up_to_a_number(found: list[dict[str, Any]], words: str) -> None:
     of = {"gap_mm": {"min": 1.0, "max": 9.0, "median": 2.0}, "stated_gap_mm": 2.0, "gap_runs": found}
     assert info._describe_gaps(of).startswith(words)
 
 
-def test_patients_are_parted_in_a_table_of_series() -> None:
+def test_patients_are_separated_by_a_line_in_the_table_of_series() -> None:
     entries = [{"number": n, "patient": who} for n, who in enumerate(("a", "a", "b"), start=1)]
     columns = [info._Column("series", [str(n) for n in (1, 2, 3)])]
     table = info._make_table(columns, entries, 1)
     assert [row.end_section for row in table.rows] == [False, True, False]
 
 
-def test_colours_of_distances_say_what_lies_beyond() -> None:
+def test_words_of_distance_have_the_range_of_its_colours_and_the_share_beyond() -> None:
     mesh = {
         "triangles": 4,
         "volume_ml": None,
@@ -78,7 +81,7 @@ def test_colours_of_distances_say_what_lies_beyond() -> None:
     assert "colours  -2 to +2 mm, beyond them 25.0 % of A's vertices" in distance._describe_distance(report)
 
 
-def test_the_ranges_of_a_corridor_are_both_ends() -> None:
+def test_words_of_a_corridor_have_both_ends_of_the_ranges_of_its_angles() -> None:
     point = [1.0, 2.0, 3.0]
     side = {
         "side": "left", "refused": None, "level_bias_mm": None, "sagittal_angle_range_deg": [-9.0, 8.0],
@@ -93,51 +96,75 @@ def test_the_ranges_of_a_corridor_are_both_ends() -> None:
     )
 
 
-def test_lines_that_are_one_text_are_put_together() -> None:
-    full = "  " + "x" * (console.FULL - 2)
-    labelled = ["  --one N   words", "            more", "  --two N   others"]
-    assert console._find_paragraphs(labelled) == [labelled[:2], labelled[2:]]
-    assert console._find_paragraphs([full, "  more", "", "  other"]) == [[full, "  more"], [""], ["  other"]]
-    assert console._find_paragraphs(["a", "b"]) == [["a"], ["b"]]
+FULL_LINE = "  " + "x" * (console.FULL - 2)
 
 
 @pytest.mark.parametrize(
-    ("as_json", "quiet", "with_json", "is_said"),
+    ("lines", "paragraphs"),
     [
-        (False, False, False, True), (False, False, True, True), (True, False, False, False), (True, False, True, True),
-        (False, True, True, False),
+        pytest.param(
+            ["  --one N   words", "            more", "  --two N   others"],
+            [["  --one N   words", "            more"], ["  --two N   others"]],
+            id="help of two options",
+        ),
+        pytest.param(
+            [FULL_LINE, "  more", "", "  other"],
+            [[FULL_LINE, "  more"], [""], ["  other"]],
+            id="a full line goes on, an empty one ends it",
+        ),
+        pytest.param(["a", "b"], [["a"], ["b"]], id="short lines"),
     ],
-)  # fmt: skip
-def test_warnings_are_said_once(
-    as_json: bool, quiet: bool, with_json: bool, is_said: bool, capsys: pytest.CaptureFixture[str]
+)
+def test_lines_of_one_text_are_one_paragraph_to_be_wrapped(lines: list[str], paragraphs: list[list[str]]) -> None:
+    assert console._find_paragraphs(lines) == paragraphs
+
+
+@pytest.mark.parametrize(
+    ("as_json", "quiet", "with_json", "is_printed"),
+    [
+        pytest.param(False, False, False, True, id="words"),
+        pytest.param(False, False, True, True, id="words, of what JSON has not"),
+        pytest.param(True, False, False, False, id="JSON that has it"),
+        pytest.param(True, False, True, True, id="JSON that has it not"),
+        pytest.param(False, True, True, False, id="quiet"),
+    ],
+)
+def test_warning_is_printed_unless_it_is_in_the_json_or_quiet(
+    as_json: bool, quiet: bool, with_json: bool, is_printed: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = Console(as_json=as_json)
     made.set_loudness(quiet, False)
+
     made.warn("cold", with_json=with_json)
-    assert capsys.readouterr().err == ("clrecon: warning: cold\n" if is_said else "")
+
+    assert capsys.readouterr().err == ("clrecon: warning: cold\n" if is_printed else "")
 
 
-def test_a_new_console_draws_at_once() -> None:
+def test_new_console_draws_its_first_progress_at_once() -> None:
     assert Console()._last_draw == 0.0
 
 
-def test_two_files_cannot_share_standard_output() -> None:
-    def use(**given: Any) -> None:
-        options = argparse.Namespace(**{"output": "a.stl", "report": None, "json": False, "one_file": False, **given})
-        with console.filled_streams("cloud", options, Console()):
-            pass
+def use_standard_output(**given: Any) -> None:
+    """Do what ``clrecon cloud`` does with its options before its work."""
+    options = argparse.Namespace(**{"output": "a.stl", "report": None, "json": False, "one_file": False, **given})
+    with console.filled_streams("cloud", options, Console()):
+        pass
 
+
+def test_output_and_report_to_standard_output_are_refused() -> None:
     with refused(UsageError, "--report", "output"):
-        use(output="-", report="-")
+        use_standard_output(output="-", report="-")
+
+
+def test_output_to_standard_output_with_json_is_refused() -> None:
     with refused(UsageError, "--json", "output"):
-        use(output="-", json=True)
-    use(json=True)
+        use_standard_output(output="-", json=True)
 
 
 @pytest.mark.parametrize(
     ("levels", "words"), [((200.0, 300.0), "several iso values"), ((200.0,), ""), (None, ""), ([200.0, 300.0], "")]
 )
-def test_several_levels_make_several_files(levels: Any, words: str) -> None:
+def test_tuple_of_iso_values_is_said_to_make_several_meshes(levels: Any, words: str) -> None:
     options = argparse.Namespace(
         one_file=False, split=False, below=None, iso_value={"iso_value": levels}, path=None, grow_from=None, label=None
     )
@@ -159,7 +186,7 @@ def test_errors_are_printed_in_a_line_with_their_exit_code(
     assert capsys.readouterr().err.startswith(words)
 
 
-def test_files_have_their_units() -> None:
+def test_space_of_a_file_is_metres_for_glb_and_mm_of_its_frame_for_others() -> None:
     assert common.describe_space("a.GLB", "ras") == "metres, Y up"
     assert common.describe_space("a.glb.stl", "ras") == "RAS mm"
 
@@ -171,10 +198,20 @@ def test_comparison_at_two_levels_or_a_range_is_refused(levels: Any, monkeypatch
         compare.run(argparse.Namespace(), Console())
 
 
-def test_a_method_is_missed_if_it_failed_or_was_asked_for() -> None:
-    cases = [("failed", ()), ("left out", ()), ("left out", ("a",)), ("done", ("a",)), ("done", ())]
-    missed = [compare._is_missed({"state": state, "name": "a"}, asked) for state, asked in cases]
-    assert missed == [True, False, True, False, False]
+@pytest.mark.parametrize(
+    ("state", "asked_for", "is_missed"),
+    [
+        ("failed", (), True),
+        ("left out", (), False),
+        ("left out", ("a",), True),
+        ("done", ("a",), False),
+        ("done", (), False),
+    ],
+)
+def test_method_of_a_comparison_is_missed_where_it_failed_or_was_asked_for_and_left_out(
+    state: str, asked_for: tuple[str, ...], is_missed: bool
+) -> None:
+    assert compare._is_missed({"state": state, "name": "a"}, asked_for) == is_missed
 
 
 def test_filled_volume_is_printed_in_a_line() -> None:
@@ -186,7 +223,7 @@ def test_filled_volume_is_printed_in_a_line() -> None:
 
 
 @pytest.mark.parametrize(("closed", "words"), [(True, "closed"), (False, "not closed")])
-def test_the_quality_of_a_mesh_is_a_line(closed: bool, words: str) -> None:
+def test_quality_of_a_mesh_is_printed_in_a_line(closed: bool, words: str) -> None:
     report = {"components": 2, "closed": closed, "manifold": True, "area_mm2": 1234.0, "volume_ml": None}
     assert mesh_command._describe_quality(report) == [f"         2 components, {words}, manifold, 1,234 mm2"]
 
@@ -200,7 +237,7 @@ def test_the_quality_of_a_mesh_is_a_line(closed: bool, words: str) -> None:
         (False, -0.06, " 0.06 mm inside of the bone"),
     ],
 )
-def test_the_side_of_the_bone_is_a_word_and_no_sign(moved: bool, mean: float, words: str) -> None:
+def test_side_of_a_fitted_surface_is_a_word_without_a_sign(moved: bool, mean: float, words: str) -> None:
     spread = {"p5": -0.2, "p50": 0.0, "p95": 0.3}
     cortex = {
         "moved": moved, "constants": {"blur_mm": 0.6}, "vertices": 200, "fitted": 100, "bias_mm": 0.05,
@@ -216,22 +253,24 @@ def test_volume_of_a_label_mesh_is_printed_beside_that_of_the_label() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scan", "of_mesh", "strict", "code"),
+    ("scan_passes", "mesh_passes", "strict", "code"),
     [
-        (False, False, True, 8),
-        (False, True, True, 7),
-        (True, False, True, 8),
-        (True, True, True, 0),
-        (False, False, False, 0),
+        pytest.param(False, False, True, 8, id="both fail"),
+        pytest.param(False, True, True, 7, id="that of the scan fails"),
+        pytest.param(True, False, True, 8, id="that of the mesh fails"),
+        pytest.param(True, True, True, 0, id="both pass"),
+        pytest.param(False, False, False, 0, id="both fail, not strict"),
     ],
 )
-def test_a_gate_of_the_mesh_decides_the_code(scan: bool, of_mesh: bool, strict: bool, code: int) -> None:
+def test_strict_exit_code_is_that_of_a_failed_gate_of_the_mesh_before_one_of_the_scan(
+    scan_passes: bool, mesh_passes: bool, strict: bool, code: int
+) -> None:
     def gate(name: str, ok: bool, **more: str) -> dict[str, Any]:
         return {"name": name, "ok": ok, "text": "t", "measured": 1, "bound": 0, "unit": None, **more}
 
     report = {
-        "volume": {"gates": [gate("lossless", scan), gate("grid_residual", False)]},
-        "gates": [gate("closed", of_mesh, mesh="m")],
+        "volume": {"gates": [gate("lossless", scan_passes), gate("grid_residual", False)]},
+        "gates": [gate("closed", mesh_passes, mesh="m")],
         "warnings": [],
     }
     assert mesh_command.finish_with_gates(report, Console(), strict) == code
@@ -240,13 +279,15 @@ def test_a_gate_of_the_mesh_decides_the_code(scan: bool, of_mesh: bool, strict: 
 @pytest.mark.parametrize(
     ("name", "own_units", "code"), [("hu_scale", True, 0), ("hu_scale", False, 7), ("lossless", True, 7)]
 )
-def test_a_level_in_the_values_own_units_leaves_gates_of_hu_warnings(name: str, own_units: bool, code: int) -> None:
+def test_failed_gate_of_hu_is_a_warning_where_the_level_is_in_the_values_own_units(
+    name: str, own_units: bool, code: int
+) -> None:
     gate = {"name": name, "ok": False, "text": "t", "measured": 1, "bound": 0, "unit": None}
     report = {"volume": {"gates": [gate]}, "gates": [], "warnings": []}
     assert mesh_command.finish_with_gates(report, Console(), True, own_units=own_units) == code
 
 
-def test_a_simulator_is_named_as_one() -> None:
+def test_simulated_device_is_listed_as_a_simulator() -> None:
     device = {
         "chosen": True, "simulator": True, "type": "cpu", "has_own_memory": False, "memory_bytes": 10**6,
         "max_allocation_bytes": 10**6, "index": 0, "name": "N", "compute_units": 2, "platform": "P", "version": "V",
@@ -264,14 +305,17 @@ def test_a_simulator_is_named_as_one() -> None:
     ]
 
 
-def test_word_help_becomes_the_option_of_the_command_behind_it() -> None:
-    assert main._as_help_option(["help", "mesh"]) == ["mesh", "--help-all"]
-    assert main._as_help_option(["help"]) == ["--help"]
-    assert main._as_help_option(["mesh", "help"]) == ["mesh", "help"]
+@pytest.mark.parametrize(
+    ("words", "read_as"),
+    [(["help", "mesh"], ["mesh", "--help-all"]), (["help"], ["--help"]), (["mesh", "help"], ["mesh", "help"])],
+    ids=["before a command", "alone", "after a command"],
+)
+def test_word_help_before_a_command_becomes_its_option(words: list[str], read_as: list[str]) -> None:
+    assert main._as_help_option(words) == read_as
 
 
 @pytest.mark.parametrize(("ml", "words"), [(None, "0 ml"), (2.0, "2.00 ml")])
-def test_a_trabecular_volume_that_is_not_there_is_0_ml(ml: float | None, words: str) -> None:
+def test_missing_trabecular_volume_is_printed_as_0_ml(ml: float | None, words: str) -> None:
     vertebra = {
         "volumes_ml": {"canal": None, "solid": 9.0, "dense": 3.0, "trabecular": ml}, "dense_hu": (300.0, None),
         "iso_value_hu": 200.0, "canal_height_mm": None, "cortex": None, "name": "L3",
@@ -281,7 +325,7 @@ def test_a_trabecular_volume_that_is_not_there_is_0_ml(ml: float | None, words: 
     assert lines[2].endswith(f"(300 HU and above), trabecular {words}")
 
 
-def test_options_without_help_have_none_in_fish() -> None:
+def test_option_without_help_has_no_description_in_the_completion_of_fish() -> None:
     def option(**given: Any) -> Any:
         return SimpleNamespace(**{"names": ["--a"], "words": [], "takes_value": False, "help": "", **given})
 
@@ -294,7 +338,7 @@ def test_options_without_help_have_none_in_fish() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, render._LABELS_LISTED, render._LABELS_LISTED + 1])
-def test_labels_over_slices_are_listed_up_to_a_number(count: int) -> None:
+def test_labels_over_slices_are_listed_up_to_a_number_and_the_rest_counted(count: int) -> None:
     labels = [{"color": "#fff", "label": f"l{n}", "label_number": n} for n in range(count)]
     lines = render._describe_labels([{"labels": labels}, {"labels": None}])
     assert len(lines) == min(count, render._LABELS_LISTED + 1)
@@ -304,12 +348,12 @@ def test_labels_over_slices_are_listed_up_to_a_number(count: int) -> None:
 @pytest.mark.parametrize(
     ("value", "words"), [(None, "none"), (1.26, "1.3"), (-0.04, "0"), (2.0, "2"), (99999.94, "99999.9"), (1e5, "1e+05")]
 )
-def test_hu_have_a_decimal_where_there_is_one(value: float | None, words: str) -> None:
+def test_hu_are_printed_with_a_decimal_where_there_is_one(value: float | None, words: str) -> None:
     assert stats._format_hu(value) == words
 
 
 @pytest.mark.parametrize("resident", [None, {"median": 0.5, "q1": 0.4, "q3": 0.6, "min": 0.3, "max": 0.7}])
-def test_a_volume_on_the_device_has_its_row(resident: dict[str, float] | None) -> None:
+def test_time_of_a_new_iso_value_is_printed_where_it_was_measured(resident: dict[str, float] | None) -> None:
     times = {"median": 1.0, "q1": 0.9, "q3": 1.1, "min": 0.8, "max": 1.2}
     entry = {
         "device": {"index": 0, "name": "N", "platform": "P", "driver": "D"}, "vertices": 5, "triangles": 6,
@@ -321,25 +365,28 @@ def test_a_volume_on_the_device_has_its_row(resident: dict[str, float] | None) -
     assert any("new iso value" in line for line in lines) is (resident is not None)
 
 
-def test_meshes_are_made_of_a_part_of_a_scan(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_of_mesh_names_the_options_that_cut_a_scan(printed: Printer) -> None:
     assert main.main(["help", "mesh"]) == 0
-    told = capsys.readouterr().out
-    assert all(option in told for option in ("--clip-box", "--between", "--around", "--fov", "--remove-table"))
+    printed().assert_output("--clip-box", "--between", "--around", "--fov", "--remove-table")
 
 
-def test_the_picture_of_distances_is_among_the_first_options(printed: Printer) -> None:
+def test_short_help_of_distance_names_the_picture(printed: Printer) -> None:
     assert main.main(["distance", "--help"]) == 0
     printed().assert_output("--picture", "FILE")
 
 
-@pytest.mark.parametrize("given", [{}, {"report": "a.json"}, {"json": True}, {"verbose": True}])
-def test_a_mesh_is_measured_for_whoever_sees_the_figures(
-    given: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("given", "is_measured"),
+    [({}, False), ({"report": "a.json"}, True), ({"json": True}, True), ({"verbose": True}, True)],
+    ids=["words", "report", "JSON", "verbose"],
+)
+def test_mesh_is_measured_where_its_figures_are_reported_or_printed(
+    given: dict[str, Any], is_measured: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[bool] = []
+    measured: list[bool] = []
 
     def make_mesh(*names: object, measure: bool, **how: object) -> None:
-        told.append(measure)
+        measured.append(measure)
         raise UsageError("enough")
 
     monkeypatch.setattr("clrecon.jobs.mesh.job.make_mesh", make_mesh)
@@ -347,10 +394,11 @@ def test_a_mesh_is_measured_for_whoever_sees_the_figures(
     options = {"input": "a", "output": "b.stl", "report": None, "json": False, "verbose": False, "no_clobber": False}
     with refused(UsageError, "enough"):
         mesh_command.run(argparse.Namespace(**options | given), Console())
-    assert told == [bool(given)]
+
+    assert measured == [is_measured]
 
 
-def test_a_moving_line_has_20_characters_at_least(
+def test_progress_on_a_very_narrow_terminal_has_20_characters(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(os, "get_terminal_size", lambda _: os.terminal_size((5, 24)))
@@ -358,6 +406,6 @@ def test_a_moving_line_has_20_characters_at_least(
     assert capsys.readouterr().err == "\rclrecon: " + "x" * 11
 
 
-def test_a_turntable_needs_no_picture(printed: Printer) -> None:
+def test_help_of_render_names_its_output(printed: Printer) -> None:
     assert main.main(["help", "render"]) == 0
     printed().assert_output("OUT")

@@ -24,7 +24,12 @@ def sphere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_output_of_a_library_goes_to_stderr_and_own_output_to_stdout(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("options", "errors"), [([], "foreign "), (["show"], "foreign hushed hushed ")], ids=["hidden", "shown"]
+)
+def test_words_of_a_library_go_to_standard_error_or_are_hidden_and_own_ones_to_standard_output(
+    options: list[str], errors: str
+) -> None:
     code = (
         "import os, sys; from clrecon.system.foreign_words import hush, own_streams\n"
         "with own_streams(show='show' in sys.argv):\n"
@@ -32,19 +37,19 @@ def test_output_of_a_library_goes_to_stderr_and_own_output_to_stdout(tmp_path: P
         "    with hush(): os.write(1, b'hushed '); os.write(2, b'hushed ')\n"
         "os.write(1, b'after ')"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (done.stdout, done.stderr) == ("own\nafter ", "foreign ")
-    done = subprocess.run([sys.executable, "-c", code, "show"], capture_output=True, text=True)
-    assert (done.stdout, done.stderr) == ("own\nafter ", "foreign hushed hushed ")
+
+    done = subprocess.run([sys.executable, "-c", code, *options], capture_output=True, text=True)
+
+    assert (done.stdout, done.stderr) == ("own\nafter ", errors)
 
 
-def test_streams_of_a_caller_are_left_alone(capfd: pytest.CaptureFixture[str]) -> None:
+def test_words_of_a_library_are_not_hidden_from_a_caller_in_python(capfd: pytest.CaptureFixture[str]) -> None:
     with hush():
         os.write(1, b"mine")
     assert capfd.readouterr().out == "mine"
 
 
-def test_warnings_of_libraries_are_left_out_and_logged(
+def test_warning_of_a_library_is_logged_by_its_kind_and_not_printed(
     capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level("INFO", "clrecon"), own_streams():

@@ -26,7 +26,9 @@ def run(ct: Path, device: Any, tmp_path: Path, *arguments: str) -> int:
     return main(["mesh", str(ct), "-o", str(tmp_path / "b.stl"), "--device", str(device.index), *arguments])
 
 
-def test_auto_says_what_it_chose(ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_words_of_auto_have_the_iso_value_and_the_materials_it_lies_half_way_between(
+    ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(ct, device, tmp_path, "--hu", "auto") == 0
     shown = capsys.readouterr().out
     (line,) = [line for line in shown.splitlines() if line.startswith("surface")]
@@ -35,16 +37,25 @@ def test_auto_says_what_it_chose(ct: Path, device: Any, tmp_path: Path, capsys: 
     assert "HU (auto: half way between tissue 0 and bone 700 HU), closed" in line
 
 
-def test_half_takes_the_materials_given(ct: Path, device: Any, tmp_path: Path, printed: Printer) -> None:
+def test_half_of_two_given_materials_is_reported_with_a_warning_where_the_scan_has_not_one(
+    ct: Path, device: Any, tmp_path: Path, printed: Printer
+) -> None:
     assert run(ct, device, tmp_path, "--hu", "half:700,-100", "--json") == 0
+
     report = printed().report()
-    assert (report["iso_value_hu"], report["iso_value_choice"]["method"]) == (300.0, "half")
+    assert report["iso_value_hu"] == (700 - 100) / 2
+    assert report["iso_value_choice"]["method"] == "half"
     assert "tissue was given as -100 HU, but the volume runs from 0 to 700 HU" in report["warnings"][0]
+
+
+def test_words_of_half_have_the_iso_value_and_both_materials(
+    ct: Path, device: Any, tmp_path: Path, printed: Printer
+) -> None:
     assert run(ct, device, tmp_path, "--hu", "half:700,0") == 0
     printed().assert_output(350, 0, 700)
 
 
-def test_auto_without_bone_ends_with_2_and_the_modes(device: Any, tmp_path: Path, printed: Printer) -> None:
+def test_auto_without_bone_ends_with_2_and_writes_nothing(device: Any, tmp_path: Path, printed: Printer) -> None:
     voxels = ct_files.sphere_voxels() * 0 + 8
     voxels[0, 0, 0] = 9
     water = ct_files.write_series(tmp_path / "water", voxels)
@@ -64,18 +75,24 @@ def test_auto_without_bone_ends_with_2_and_the_modes(device: Any, tmp_path: Path
         ("Auto", "'Auto' is no number of HU"),
     ],
 )
-def test_values_of_hu_that_are_no_levels_are_refused(text: str, words: str) -> None:
+def test_text_that_is_no_iso_value_and_no_pair_of_materials_is_refused(text: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         parse_hu(text)
 
 
-def test_hu_takes_levels_auto_and_two_materials() -> None:
-    assert parse_hu("200,350.5") == {"iso_value": (200.0, 350.5)}
-    assert parse_hu("-150") == {"iso_value": (-150.0,)}
-    assert parse_hu("auto") == {"half_way": "auto"}
-    assert parse_hu("half:1200,-40") == {"half_way": (1200.0, -40.0)}
+@pytest.mark.parametrize(
+    ("text", "setting"),
+    [
+        ("200,350.5", {"iso_value": (200.0, 350.5)}),
+        ("-150", {"iso_value": (-150.0,)}),
+        ("auto", {"half_way": "auto"}),
+        ("half:1200,-40", {"half_way": (1200.0, -40.0)}),
+    ],
+)
+def test_option_hu_takes_iso_values_auto_or_two_materials(text: str, setting: dict[str, Any]) -> None:
+    assert parse_hu(text) == setting
 
 
-def test_bone_below_tissue_is_wrong_usage(ct: Path, tmp_path: Path, printed: Printer) -> None:
+def test_bone_with_fewer_hu_than_tissue_is_refused(ct: Path, tmp_path: Path, printed: Printer) -> None:
     assert main(["mesh", str(ct), "-o", str(tmp_path / "b.stl"), "--hu", "half:40,1200"]) == 3
     printed().assert_error(40, 1200)

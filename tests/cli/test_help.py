@@ -25,7 +25,8 @@ def parser_of(command: str) -> Parser:
     return parser
 
 
-def shown(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+def help_of(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """What a command that asks for help prints."""
     assert main(arguments) == 0
     captured = capsys.readouterr()
     assert captured.err == ""
@@ -33,11 +34,11 @@ def shown(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_short_help_fits_one_screen_and_says_where_the_rest_is(
+def test_short_help_fits_one_screen_and_names_the_full_help_where_there_is_more(
     command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text, whole = shown([command, "-h"], capsys), shown(["help", command], capsys)
-    assert shown([command, "--help"], capsys) == text
+    text, whole = help_of([command, "-h"], capsys), help_of(["help", command], capsys)
+    assert help_of([command, "--help"], capsys) == text
     lines = text.split("\n")
     assert len(lines) <= SCREEN_LINES and max(map(len, lines)) <= 100
     assert lines[0].startswith(f"usage: clrecon {command} ")
@@ -48,9 +49,9 @@ def test_short_help_fits_one_screen_and_says_where_the_rest_is(
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_full_help_has_each_option(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    text = shown(["help", command], capsys)
-    assert shown([command, "--help-all"], capsys) == text
+def test_full_help_names_each_option(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    text = help_of(["help", command], capsys)
+    assert help_of([command, "--help-all"], capsys) == text
     words = set(text.replace(",", " ").split())
     for action in parser_of(command)._actions:
         if action.help != argparse.SUPPRESS:
@@ -59,7 +60,7 @@ def test_full_help_has_each_option(command: str, capsys: pytest.CaptureFixture[s
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_examples_of_the_short_help_are_understood(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    parts = shown([command, "-h"], capsys).replace("\\\n", "").partition("examples:\n")
+    parts = help_of([command, "-h"], capsys).replace("\\\n", "").partition("examples:\n")
     lines = [line for line in parts[2].split("\n\n")[0].split("\n") if line]
     assert not parts[1] or 2 <= len(lines) <= 3
     for line in lines:
@@ -69,8 +70,8 @@ def test_examples_of_the_short_help_are_understood(command: str, capsys: pytest.
             parse_command(arguments)
 
 
-def test_mesh_shows_the_twelve_options_that_most_people_need(capsys: pytest.CaptureFixture[str]) -> None:
-    text = shown(["mesh", "-h"], capsys)
+def test_short_help_of_mesh_has_twelve_options_and_three_examples(capsys: pytest.CaptureFixture[str]) -> None:
+    text = help_of(["mesh", "-h"], capsys)
     first = [line.split()[0] for line in text.split("\n") if line.startswith("  -")]
     assert len(first) == 12 and {"-o", "--hu", "--for", "--labels", "--device"} <= set(first)
     assert "--topology" not in text and text.count("  clrecon mesh CT_FOLDER") == 3

@@ -25,7 +25,9 @@ def command_line(command: str, device, tmp_path: Path) -> tuple[str, ...]:
     ("command", "kernel", "number"),
     daily_rows(1, [("mesh", "emit_vertices", signal.SIGINT), ("render", "composite_rays", signal.SIGTERM)]),
 )
-def test_row_56_a_signal_ends_a_command_whose_kernel_hangs(device, tmp_path, command, kernel, number):
+def test_row_56_command_whose_kernel_hangs_is_ended_by_a_signal_with_130_and_leaves_nothing(
+    device, tmp_path, command, kernel, number
+):
     process = start_command(kernel, *command_line(command, device, tmp_path))
     assert process.stderr is not None
     assert process.stderr.readline() == "the kernel spins\n"
@@ -43,7 +45,9 @@ def test_row_56_a_signal_ends_a_command_whose_kernel_hangs(device, tmp_path, com
 @pytest.mark.parametrize(
     ("command", "kernel"), daily_rows(1, [("mesh", "emit_triangles"), ("render", "composite_rays")])
 )
-def test_row_56_the_time_limit_ends_a_command_whose_kernel_hangs(device, tmp_path, command, kernel):
+def test_row_56_command_whose_kernel_hangs_is_ended_by_its_time_limit_with_5_and_advice(
+    device, tmp_path, command, kernel
+):
     process = start_command(kernel, *command_line(command, device, tmp_path), "--timeout", "1")
     assert process.stderr is not None
     assert process.stderr.readline() == "the kernel spins\n"

@@ -51,7 +51,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Any:
     return make
 
 
-def entry(number: int, **changes: Any) -> dict[str, Any]:
+def make_entry(number: int, **changes: Any) -> dict[str, Any]:
     return {
         "number": number, "uid_hash": f"{number:016x}", "description": "", "modality": "CT", "kind": "stack",
         "shape_ijk": [512, 512, 99], "spacing_mm": [0.9766, 0.9766, 4.25], "extent_mm": [500.0, 500.0, 421.0],
@@ -60,7 +60,7 @@ def entry(number: int, **changes: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def listing(*entries: dict[str, Any], chosen: int | None = 1) -> dict[str, Any]:
+def make_listing(*entries: dict[str, Any], chosen: int | None = 1) -> dict[str, Any]:
     return {"series": list(entries), "chosen": chosen, "certificate": None}
 
 
@@ -81,7 +81,7 @@ def test_json_of_info_neither_warns_nor_names_the_patient(ct: Path, printed: Pri
     assert PATIENT.split("^")[0] not in said.everything
 
 
-def test_pixels_are_read_on_request(ct: Path, printed: Printer) -> None:
+def test_info_with_pixels_has_their_padding_and_range_in_json(ct: Path, printed: Printer) -> None:
     assert main(["info", str(ct), "--json", "--pixels"]) == 0
     certificate = printed().report()["certificate"]
     assert (certificate["padding_share"], certificate["hu_range"]) == (0.0, [-1000, 700])
@@ -100,19 +100,21 @@ def bright_slice(tmp_path: Path) -> str:
     return str(tmp_path)
 
 
-def test_warnings_of_pixels_are_not_made_without_pixels(bright_slice: str, printed: Printer) -> None:
+def test_info_without_pixels_has_no_warning_of_their_values(bright_slice: str, printed: Printer) -> None:
     assert main(["info", bright_slice]) == 0
     assert CEILING_WARNING not in printed().everything
 
 
-def test_warnings_of_pixels_are_printed_once(bright_slice: str, printed: Printer) -> None:
+def test_info_with_pixels_prints_a_warning_of_their_values_once(bright_slice: str, printed: Printer) -> None:
     assert main(["info", bright_slice, "--pixels"]) == 0
     said = printed()
     assert said.error_lines == 0
     assert said.everything.count(CEILING_WARNING) == 1
 
 
-def test_warnings_of_pixels_are_those_of_series_and_certificate(bright_slice: str, printed: Printer) -> None:
+def test_warning_of_the_values_of_pixels_is_in_the_series_and_in_the_certificate(
+    bright_slice: str, printed: Printer
+) -> None:
     assert main(["info", bright_slice, "--pixels", "--json"]) == 0
     facts = printed().report()
     assert facts["series"][0]["warnings"] == facts["certificate"]["warnings"]
@@ -130,13 +132,13 @@ def table_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
     return capsys.readouterr().out.splitlines()
 
 
-def test_the_table_marks_the_largest_ct(table_rows: list[str]) -> None:
+def test_table_of_series_marks_the_largest_ct_and_has_its_shape_and_spacing(table_rows: list[str]) -> None:
     assert table_rows[0].split()[:4] == ["series", "hash", "kind", "slices"]
     assert table_rows[2].split()[:2] == ["*", "1"] and table_rows[3].split()[0] == "2"
     assert "31 x 25" in table_rows[2] and "0.8 x 1.1 x 1.5" in table_rows[2]
 
 
-def test_below_the_table_stand_what_is_not_read_and_the_choice(table_rows: list[str]) -> None:
+def test_info_lists_series_that_are_not_read_and_describes_the_chosen_one(table_rows: list[str]) -> None:
     assert "series 3-5: not read: modality MR is not CT" in table_rows
     assert "series 1, as clrecon mesh would read it" in table_rows
     assert any(re.fullmatch(r"  slices +17 used, none dropped", row) for row in table_rows)
@@ -148,7 +150,9 @@ def equal_series(tmp_path: Path) -> str:
     return str(write_series(folder, number=2))
 
 
-def test_of_equal_series_none_is_chosen_and_the_option_named(equal_series: str, printed: Printer) -> None:
+def test_of_two_equal_series_none_is_chosen_and_the_option_that_chooses_is_named(
+    equal_series: str, printed: Printer
+) -> None:
     assert main(["info", equal_series, "--json"]) == 0
     said = printed()
     facts = said.report()
@@ -156,13 +160,13 @@ def test_of_equal_series_none_is_chosen_and_the_option_named(equal_series: str, 
     said.assert_error("--series")
 
 
-def test_equal_series_are_chosen_by_number(equal_series: str, printed: Printer) -> None:
+def test_one_of_two_equal_series_is_chosen_by_its_number(equal_series: str, printed: Printer) -> None:
     assert main(["info", equal_series, "--series", "2", "--json"]) == 0
     facts = printed().report()
     assert facts["chosen"] == facts["certificate"]["series"]["number"] == 2
 
 
-def test_equal_series_are_chosen_by_hash(equal_series: str, printed: Printer) -> None:
+def test_one_of_two_equal_series_is_chosen_by_its_hash(equal_series: str, printed: Printer) -> None:
     assert main(["info", equal_series, "--json"]) == 0
     uid_hash = printed().report()["series"][1]["uid_hash"]
     assert main(["info", equal_series, "--series", uid_hash, "--json"]) == 0
@@ -181,7 +185,9 @@ def test_equal_series_are_refused_without_a_choice(
     printed().assert_error(*facts)
 
 
-def test_strict_passes_a_series_that_keeps_its_gates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_strict_info_of_a_series_that_passes_its_gates_ends_with_0_and_counts_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_plan(tmp_path)
     assert main(["info", str(tmp_path), "--strict"]) == 0
     unmeasured = (
@@ -197,11 +203,11 @@ def lossy(tmp_path: Path) -> str:
     return str(tmp_path)
 
 
-def test_without_strict_a_series_that_fails_gates_is_no_error(lossy: str) -> None:
+def test_info_of_a_series_that_fails_gates_ends_with_0_without_strict(lossy: str) -> None:
     assert main(["info", lossy]) == 0
 
 
-def test_strict_fails_with_the_gates_that_failed(lossy: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_strict_info_ends_with_4_and_the_gates_that_failed(lossy: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", lossy, "--strict"]) == 4
     captured = capsys.readouterr()
     assert "FAILED     lossless: slices with lossy compression: 7, none allowed" in captured.out
@@ -218,7 +224,9 @@ def test_strict_with_json_prints_the_report_beside_its_error(lossy: str, printed
     said.assert_error("series", 1, "gates", 2)
 
 
-def test_a_refused_series_has_its_certificate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_of_a_refused_series_prints_its_certificate_and_ends_with_4(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_plan(tmp_path / "hole", Plan(shape=(9, 5, 6), leave_out=(4,)))
     assert main(["info", str(tmp_path / "hole")]) == 4
     captured = capsys.readouterr()
@@ -228,61 +236,111 @@ def test_a_refused_series_has_its_certificate(tmp_path: Path, capsys: pytest.Cap
     assert "series 1 cannot be used: 1 slice missing" in captured.err
 
 
-def test_info_prints_nothing_when_quiet(ct: Path, printed: Printer) -> None:
+def test_quiet_info_prints_nothing(ct: Path, printed: Printer) -> None:
     assert main(["info", str(ct), "-q"]) == 0
     assert printed().is_silent
 
 
-def test_a_file_gets_plain_text_of_any_width(ct: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+def test_listing_for_a_file_is_plain_text_in_lines_of_any_length(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "40")
     monkeypatch.setenv("FORCE_COLOR", "1")
-    lines = render_listing(listing(entry(1, description="long " * 60, warnings=["word " * 60])), [])
+    long, word = "long " * 60, "word " * 60
+
+    lines = render_listing(make_listing(make_entry(1, description=long, warnings=[word])), [])
+
     assert not ANSI.search("".join(lines))
-    assert any("long " * 59 in line for line in lines) and any("word " * 59 in line for line in lines)
+    assert any(long.strip() in line for line in lines)
+    assert any(word.strip() in line for line in lines)
+
+
+def test_info_into_a_file_has_no_colours_and_leaves_no_column_out(
+    ct: Path, printed: Printer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+
     assert main(["info", str(ct)]) == 0
-    captured = capsys.readouterr()
-    assert not ANSI.search(captured.out) and "left out" not in captured.out
+
+    text = printed().everything
+    assert not ANSI.search(text)
+    assert "left out" not in text
+
+
+WORDS_OF_A_LISTING = ("LUMBAR", "SPINE", "0.9766 x 0.9766 x 4.25", "512 x 512", "gantry")
+
+
+@pytest.fixture
+def long_listing() -> dict[str, Any]:
+    return make_listing(
+        make_entry(1, description="LUMBAR SPINE 0.8 BONE"), make_entry(12, warnings=["gantry tilt " * 9], tilt_deg=12.5)
+    )
 
 
 @pytest.mark.parametrize("columns", [200, 120, 80, 60, 30])
-def test_a_terminal_gets_lines_that_fit(terminal: Any, columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_of_a_listing_fit_a_terminal_and_keep_its_words(
+    columns: int, terminal: Any, long_listing: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     terminal(columns)
-    entries = [entry(1, description="LUMBAR SPINE 0.8 BONE"), entry(12, warnings=["gantry tilt " * 9], tilt_deg=12.5)]
-    words = describe_certificate(None)
-    assert any(ANSI.search(line) for line in render_listing(listing(*entries), words)) == (columns >= 80)
     monkeypatch.setenv("NO_COLOR", "1")
-    lines = render_listing(listing(*entries), words)
+
+    lines = render_listing(long_listing, describe_certificate(None))
+
     assert not ANSI.search("".join(lines))
     assert max(map(len, lines)) <= columns
     text = " ".join(" ".join(lines).split())
-    assert all(word in text for word in ("LUMBAR", "SPINE", "0.9766 x 0.9766 x 4.25", "512 x 512", "gantry"))
-    assert ("tilt" in lines[0]) == (columns >= 120)
-    assert ("left out: a wider window" in text) == (columns in (120, 80))
+    assert [word for word in WORDS_OF_A_LISTING if word not in text] == []
 
 
-def test_a_hostile_description_is_shown_as_it_is(terminal: Any) -> None:
+@pytest.mark.parametrize(
+    ("columns", "has_tilt", "says_left_out"),
+    [(200, True, False), (120, True, True), (80, False, True), (60, False, False), (30, False, False)],
+)
+def test_listing_for_a_terminal_leaves_columns_out_and_says_so_where_it_is_a_table(
+    columns: int, has_tilt: bool, says_left_out: bool, terminal: Any, long_listing: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Below 80 columns it is no table, and nothing is left out."""
+    terminal(columns)
+    monkeypatch.setenv("NO_COLOR", "1")
+
+    lines = render_listing(long_listing, describe_certificate(None))
+
+    assert ("tilt" in lines[0]) == has_tilt
+    assert ("left out: a wider window" in " ".join(" ".join(lines).split())) == says_left_out
+
+
+@pytest.mark.parametrize(("columns", "is_coloured"), [(200, True), (80, True), (60, False), (30, False)])
+def test_listing_for_a_terminal_is_coloured_where_it_is_a_table(
+    columns: int, is_coloured: bool, terminal: Any, long_listing: dict[str, Any]
+) -> None:
+    terminal(columns)
+    lines = render_listing(long_listing, describe_certificate(None))
+    assert any(ANSI.search(line) for line in lines) == is_coloured
+
+
+def test_markup_and_control_characters_of_a_description_are_shown_as_text(terminal: Any) -> None:
     hostile = "[bold red]x[/] :smile: \x1b[31mred\x07\u202e"
-    (_, _, row, *_) = render_listing(listing(entry(1, description=hostile, modality="[i]")), [])
+    (_, _, row, *_) = render_listing(make_listing(make_entry(1, description=hostile, modality="[i]")), [])
     assert "[bold red]x[/] :smile: \\x1b[31mred\\x07\\u202e" in row and "[i]" in row
     terminal(200)
-    shown = "".join(render_listing(listing(entry(1, description=hostile, problems=[hostile])), []))
+    shown = "".join(render_listing(make_listing(make_entry(1, description=hostile, problems=[hostile])), []))
     assert "\x1b[31mred" not in shown and "\x07" not in shown and "\u202e" not in shown
 
 
-def test_a_plain_encoding_draws_no_lines_that_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_listing_for_ascii_has_ascii_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding="ascii"))
-    assert "\n".join(render_listing(listing(entry(1)), [])).isascii()
+    assert "\n".join(render_listing(make_listing(make_entry(1)), [])).isascii()
 
 
-def test_patients_and_studies_stand_apart() -> None:
+def test_listing_of_several_patients_has_their_numbers_and_those_of_studies() -> None:
     entries = [
-        entry(1),
-        entry(2, study=3, phases=[{"number": 1}, {"number": 2}]),
-        entry(3, patient=28, study=2),
-        entry(4, patient=28, study=2, modality="SEG", kind="other"),
-        entry(5, patient=None, study=None),
+        make_entry(1),
+        make_entry(2, study=3, phases=[{"number": 1}, {"number": 2}]),
+        make_entry(3, patient=28, study=2),
+        make_entry(4, patient=28, study=2, modality="SEG", kind="other"),
+        make_entry(5, patient=None, study=None),
     ]
-    lines = render_listing(listing(*entries), [])
+    lines = render_listing(make_listing(*entries), [])
     assert lines[0].split()[:3] == ["series", "patient", "study"] and "phases" in lines[0]
     rows = [line.removeprefix("*").split()[:3] for line in lines if re.match(r"[* ] +\d", line)]
     assert rows == [["1", "1", "1"], ["2", "1", "3"], ["3", "28", "2"], ["4", "28", "2"], ["5", "-", "-"]]
@@ -291,9 +349,9 @@ def test_patients_and_studies_stand_apart() -> None:
 @pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.untraced
-def test_thousands_of_series_take_one_line_each() -> None:
-    entries = [entry(number, modality="MR", problems=["modality MR is not CT"]) for number in range(1, 2001)]
-    lines = render_listing(listing(*entries, chosen=None), [])
+def test_two_thousand_series_take_a_line_each_and_one_for_their_common_problem() -> None:
+    entries = [make_entry(number, modality="MR", problems=["modality MR is not CT"]) for number in range(1, 2001)]
+    lines = render_listing(make_listing(*entries, chosen=None), [])
     assert len(lines) == 2 + 2000 + 1
     assert lines[-1] == "series 1-2000: problem: modality MR is not CT"
 
@@ -345,7 +403,7 @@ def test_commands_of_the_certificate_page_print_what_it_shows(
 
 
 @pytest.mark.release
-def test_mesh_strict_passes_a_scan_whose_gates_pass(tmp_path: Path, device: Any) -> None:
+def test_strict_mesh_of_a_scan_that_passes_its_gates_is_written_with_their_number(tmp_path: Path, device: Any) -> None:
     folder = write_series(tmp_path / "ct")
     arguments = ["mesh", str(folder), "-o", str(tmp_path / "a.ply"), "--hu", "100", "--device", str(device.index)]
     assert main([*arguments, "--strict"]) == 0
@@ -365,7 +423,7 @@ def lossy_mesh(tmp_path: Path, device: Any) -> list[str]:
     return ["mesh", str(folder), "-o", str(tmp_path / "a.ply"), "--hu", "100", "--device", str(device.index)]
 
 
-def test_mesh_strict_exits_with_7_where_a_gate_of_the_scan_fails(
+def test_strict_mesh_of_a_scan_that_fails_a_gate_ends_with_7_and_the_gate(
     lossy_mesh: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*lossy_mesh, "--strict", "-q"]) == 7
@@ -382,7 +440,9 @@ def test_report_and_file_of_a_mesh_tell_the_failed_gate_of_the_scan(
     assert b"comment CERTIFICATE gate_failed lossless: slices with lossy" in (tmp_path / "a.ply").read_bytes()
 
 
-def test_mesh_strict_takes_slices_that_are_placed_one_by_one(tmp_path: Path, device: Any, printed: Printer) -> None:
+def test_strict_mesh_of_unevenly_spaced_slices_is_written_which_strict_info_refuses(
+    tmp_path: Path, device: Any, printed: Printer
+) -> None:
     import pydicom
 
     folder = write_series(tmp_path / "ct")

@@ -42,37 +42,64 @@ def labels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(write_nifti(tmp_path_factory.mktemp("labels") / "a.nii.gz", voxels, AFFINE, extension=NAMES))
 
 
-def run(*arguments: object, device: Any = None) -> int:
+def run_mesh(*arguments: object, device: Any = None) -> int:
     chosen = [] if device is None else ["--device", device.index]
     return main([str(argument) for argument in ("mesh", *arguments, *chosen)])
 
 
+@pytest.fixture(scope="module")
+def halves_folder(device: Any, ct: Path, labels: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Meshes of the labels at -150 HU, and r.json."""
+    folder = tmp_path_factory.mktemp("halves")
+    options = ("--labels", labels, "--hu", -150, "--report", folder / "r.json", "-q")
+    assert run_mesh(ct, "-o", folder / "bone.stl", *options, device=device) == 0
+    return folder
+
+
 @pytest.mark.seconds
-def test_each_label_gets_a_file_of_its_name(
-    device: Any, ct: Path, labels: Path, tmp_path: Path, printed: Printer
-) -> None:
-    options = ("--labels", labels, "--hu", -150, "--report", tmp_path / "r.json")
-    assert run(ct, "-o", tmp_path / "bone.stl", *options, device=device) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["bone_RIGHT_half.stl", "bone_left_half.stl", "r.json"]
-    captured = printed()
-    captured.assert_output("labels", 2)
-    captured.assert_error("CT", "Doe_Jane_x1b_31m", 1, -150, 3)
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert [(mesh["name"], mesh["label"], mesh["label_number"]) for mesh in report["meshes"]] == [
-        ("left_half", "left_half", 1), ("RIGHT_half", "RIGHT_half", 2),
-    ]  # fmt: skip
+def test_each_label_is_one_file_named_after_it(halves_folder: Path) -> None:
+    names = sorted(path.name for path in halves_folder.iterdir())
+    assert names == ["bone_RIGHT_half.stl", "bone_left_half.stl", "r.json"]  # the third label lies in air
+
+
+def test_report_of_labels_has_their_names_numbers_and_places(halves_folder: Path) -> None:
+    left, right = json.loads((halves_folder / "r.json").read_text())["meshes"]
+
+    assert (left["name"], left["label"], left["label_number"]) == ("left_half", "left_half", 1)
+    assert (right["name"], right["label"], right["label_number"]) == ("RIGHT_half", "RIGHT_half", 2)
+    for mesh in (left, right):
+        assert mesh["label_inside_share"] == 1.0  # of the voxels in the CT
+        assert 0.5 < mesh["vertices_by_hu_share"] < 1.0  # but those of the cut between the halves
+        assert (mesh["grow_mm"], mesh["solid"]) == (None, False)
+
+
+def test_closed_meshes_of_two_halves_have_the_volume_of_the_whole(halves_folder: Path) -> None:
+    report = json.loads((halves_folder / "r.json").read_text())
+
     assert report["closed"] and report["manifold"]
     assert report["volume_ml"] == pytest.approx(SPHERE_ML, rel=tolerances.CLI_SPHERE_VOLUME_SHARE)
-    for mesh in report["meshes"]:
-        assert mesh["label_inside_share"] == 1.0 and 0.5 < mesh["vertices_by_hu_share"] < 1.0
-        assert mesh["grow_mm"] is None and mesh["solid"] is False
-    assert PATIENT not in (tmp_path / "r.json").read_text()
 
 
-def test_one_label_is_the_output_itself(device: Any, ct: Path, labels: Path, tmp_path: Path) -> None:
-    for label in ("left half", "1", "LEFT"):
-        options = ("--labels", labels, "--label", label, "--solid", "--grow", "0.9", "--hu", -150)
-        assert run(ct, "-o", tmp_path / "one.stl", *options, device=device) == 0
+def test_report_of_labels_does_not_name_the_patient_after_whom_one_is_called(halves_folder: Path) -> None:
+    assert PATIENT not in (halves_folder / "r.json").read_text()
+
+
+def test_label_without_a_surface_is_warned_of_with_its_name_and_number(
+    device: Any, ct: Path, labels: Path, tmp_path: Path, printed: Printer
+) -> None:
+    assert run_mesh(ct, "-o", tmp_path / "b.stl", "--labels", labels, "--hu", -150, device=device) == 0
+
+    said = printed()
+    said.assert_error("CT", "Doe_Jane_x1b_31m", -150, 3)
+    said.assert_output("labels", 2)
+
+
+@pytest.mark.parametrize("label", ["left half", "1", "LEFT"], ids=["name", "number", "part of the name"])
+def test_mesh_of_one_label_has_the_name_of_the_output(
+    label: str, device: Any, ct: Path, labels: Path, tmp_path: Path
+) -> None:
+    options = ("--labels", labels, "--label", label, "--solid", "--grow", "0.9", "--hu", -150)
+    assert run_mesh(ct, "-o", tmp_path / "one.stl", *options, device=device) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["one.stl"]
 
 
@@ -88,20 +115,25 @@ def large(tmp_path: Path) -> tuple[object, ...]:
     return "-o", tmp_path / "b.stl", "--labels", map_file, "--hu", -150, "--report", tmp_path / "r.json"
 
 
-def test_mesh_far_smaller_than_its_label_is_warned_of(
+def test_mesh_far_smaller_than_its_label_is_warned_of_with_options_for_it(
     device: Any, ct: Path, large: tuple[object, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(ct, *large[:-2], device=device) == 0  # without a report too
-    captured = capsys.readouterr()
-    assert "gate label_volume failed: the mesh has" in captured.err
-    assert "what lies below -150 HU is left out; --solid" in captured.err and "--surface mask" in captured.err
-    assert "ml of mesh for" in captured.out
+    without_a_report = large[:-2]
+
+    assert run_mesh(ct, *without_a_report, device=device) == 0
+
+    printed = capsys.readouterr()
+    assert "gate label_volume failed: the mesh has" in printed.err
+    assert "what lies below -150 HU is left out; --solid" in printed.err
+    assert "--surface mask" in printed.err
+    assert "ml of mesh for" in printed.out
 
 
-def test_mesh_far_smaller_than_its_label_fails_its_gate(
+def test_mesh_far_smaller_than_its_label_fails_its_gate_with_the_missing_percent(
     device: Any, ct: Path, large: tuple[object, ...], tmp_path: Path
 ) -> None:
-    assert run(ct, *large, "--strict", device=device) == 8
+    assert run_mesh(ct, *large, "--strict", device=device) == 8
+
     report = json.loads((tmp_path / "r.json").read_text())
     (mesh,) = report["meshes"]
     label_ml = np.count_nonzero(LARGE_LABEL) * np.prod(SPACING) / 1000.0
@@ -109,44 +141,72 @@ def test_mesh_far_smaller_than_its_label_fails_its_gate(
     assert mesh["label_taken_ml"] == pytest.approx(label_ml, rel=1e-6)
     assert mesh["label_mesh_ml"] == pytest.approx(SPHERE_ML, rel=tolerances.CLI_SPHERE_VOLUME_SHARE)
     (gate,) = (gate for gate in report["gates"] if gate["name"] == "label_volume")
-    assert gate["measured"] == pytest.approx(100 * (1 - mesh["label_mesh_ml"] / label_ml)) and gate["ok"] is False
+    assert gate["ok"] is False
+    assert gate["measured"] == pytest.approx(100 * (1 - mesh["label_mesh_ml"] / label_ml))
 
 
-def test_open_mesh_of_a_label_has_no_volume_to_judge(
+def test_open_mesh_of_a_label_has_no_volume_and_its_gate_is_not_judged(
     device: Any, ct: Path, large: tuple[object, ...], tmp_path: Path
 ) -> None:
-    assert run(ct, *large, "--open", device=device) == 0
+    assert run_mesh(ct, *large, "--open", device=device) == 0
     report = json.loads((tmp_path / "r.json").read_text())
     assert [gate["ok"] for gate in report["gates"] if gate["name"] == "label_volume"] == [None]
     assert report["meshes"][0]["label_mesh_ml"] is None
 
 
-def test_the_labels_own_surface_does_not_depend_on_hu(
+@pytest.fixture(scope="module")
+def masks_report(device: Any, ct: Path, labels: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The report of meshes of the masks of the three labels."""
+    folder = tmp_path_factory.mktemp("masks")
+    options = ("--labels", labels, "--surface", "mask", "--strict", "--report", folder / "r.json", "-q")
+    assert run_mesh(ct, "-o", folder / "b.ply", *options, device=device) == 0
+    return dict(json.loads((folder / "r.json").read_text()))
+
+
+def test_masks_of_all_labels_are_meshed_whatever_their_hu(masks_report: dict[str, Any]) -> None:
+    names = [mesh["name"] for mesh in masks_report["meshes"]]
+    assert names == ["left_half", "RIGHT_half", "Doe_Jane_x1b_31m"]  # the last lies in air
+    hu = [masks_report[name] for name in ("iso_value_hu", "preset", "inside_hu")]
+    assert hu == [None, None, None]
+
+
+@pytest.mark.parametrize("place", [0, 1, 2], ids=["left half", "right half", "label in air"])
+def test_mesh_of_the_mask_of_a_label_has_the_volume_of_its_voxels(place: int, masks_report: dict[str, Any]) -> None:
+    mesh = masks_report["meshes"][place]
+
+    assert mesh["surface"] == "mask"
+    assert 0.0 < mesh["mask_level"] < 1.0
+    assert mesh["label_taken_ml"] is None  # nothing was taken by HU
+    assert mesh["volume_ml"] == pytest.approx(mesh["label_ml"], rel=tolerances.MASK_VOLUME)
+
+
+def test_words_of_masks_say_that_they_do_not_depend_on_hu(
     device: Any, ct: Path, labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = ("--labels", labels, "--surface", "mask", "--strict", "--report", tmp_path / "r.json")
-    assert run(ct, "-o", tmp_path / "b.ply", *options, device=device) == 0
-    captured = capsys.readouterr()
-    assert "surface  masks of labels, whatever their HU, closed" in captured.out
-    assert "labels   3 labels, by their own mask" in captured.out and "(+0.0 %)" in captured.out
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert [mesh["name"] for mesh in report["meshes"]] == ["left_half", "RIGHT_half", "Doe_Jane_x1b_31m"]
-    assert report["iso_value_hu"] is None and report["preset"] is None and report["inside_hu"] is None
-    for mesh in report["meshes"]:
-        assert mesh["surface"] == "mask" and 0.0 < mesh["mask_level"] < 1.0 and mesh["label_taken_ml"] is None
-        assert mesh["volume_ml"] == pytest.approx(mesh["label_ml"], rel=tolerances.MASK_VOLUME)
+    options = ("--labels", labels, "--surface", "mask", "-v")
+    assert run_mesh(ct, "-o", tmp_path / "b.ply", *options, device=device) == 0
+
+    output = capsys.readouterr().out
+    assert "surface  masks of labels, whatever their HU, closed" in output
+    assert "labels   3 labels, by their own mask" in output
+    assert "(+0.0 %)" in output
 
 
-def test_a_mask_that_leaves_the_ct_goes_on_there(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:
-    shifted = AFFINE.copy()
-    shifted[2, 3] += 6 * SPACING[2]
-    map_file = write_nifti(tmp_path / "a.nii.gz", (sphere_voxels() >= 0).astype(np.uint8), shifted)
-    arguments = ("-o", tmp_path / "b.stl", "--labels", map_file, "--surface", "mask", "--report", tmp_path / "r.json")
-    assert run(ct, *arguments, device=device) == 0
-    printed().assert_error("CT", 1)
+def test_mask_of_a_label_that_leaves_the_ct_is_meshed_whole_with_a_warning(
+    device: Any, ct: Path, tmp_path: Path, printed: Printer
+) -> None:
+    six_slices_higher = AFFINE.copy()
+    six_slices_higher[2, 3] += 6 * SPACING[2]
+    sphere = (sphere_voxels() >= 0).astype(np.uint8)
+    map_file = write_nifti(tmp_path / "a.nii.gz", sphere, six_slices_higher)
+    options = ("--labels", map_file, "--surface", "mask", "--report", tmp_path / "r.json")
+
+    assert run_mesh(ct, "-o", tmp_path / "b.stl", *options, device=device) == 0
+
     (mesh,) = json.loads((tmp_path / "r.json").read_text())["meshes"]
     assert mesh["label_inside_share"] < 1.0
     assert mesh["volume_ml"] == pytest.approx(mesh["label_ml"], rel=tolerances.MASK_VOLUME)
+    printed().assert_error("CT", 1)
 
 
 @pytest.mark.parametrize(
@@ -159,17 +219,19 @@ def test_a_mask_that_leaves_the_ct_goes_on_there(device: Any, ct: Path, tmp_path
         (["--surface", "nets"], "labels have no surface 'nets': it is hu or mask"),
     ],
 )
-def test_options_that_masks_do_not_look_at_are_refused(
+def test_option_without_meaning_for_the_mask_of_a_label_is_refused(
     options: list[str], words: str, ct: Path, labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(ct, "-o", tmp_path / "b.stl", "--labels", labels, "--surface", "mask", *options) == 3
+    assert run_mesh(ct, "-o", tmp_path / "b.stl", "--labels", labels, "--surface", "mask", *options) == 3
     assert words in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_components_of_a_label_count_together(device: Any, ct: Path, labels: Path, tmp_path: Path) -> None:
+def test_volume_of_a_split_label_is_judged_once_for_all_its_components(
+    device: Any, ct: Path, labels: Path, tmp_path: Path
+) -> None:
     options = ("--labels", labels, "--label", 2, "--hu", -150, "--split", "--report", tmp_path / "r.json")
-    assert run(ct, "-o", tmp_path / "b.stl", *options, device=device) == 0
+    assert run_mesh(ct, "-o", tmp_path / "b.stl", *options, device=device) == 0
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["volume_ml"] == pytest.approx(report["meshes"][0]["label_mesh_ml"], rel=1e-6)
     assert [gate["mesh"] for gate in report["gates"] if gate["name"] == "label_volume"] == [None]
@@ -187,13 +249,11 @@ def pieces(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(write_nifti(tmp_path_factory.mktemp("pieces") / "a.nii.gz", voxels, AFFINE))
 
 
-def mask_job(ct: Path, pieces: Path, folder: Path, options: list[str], device: Any) -> dict[str, Any]:
-    """The report of a job on labels' own surfaces that must end well."""
+def report_of_masks(ct: Path, pieces: Path, folder: Path, options: list[str], device: Any) -> dict[str, Any]:
+    """Mesh the masks of the labels `pieces` with further options; return the report."""
     arguments = ("--labels", pieces, "--surface", "mask", "--report", folder / "r.json", *options)
-    assert run(ct, "-o", folder / "b.stl", *arguments, device=device) == 0
-    report: dict[str, Any] = json.loads((folder / "r.json").read_text())
-    assert report["closed"] and report["manifold"]
-    return report
+    assert run_mesh(ct, "-o", folder / "b.stl", *arguments, device=device) == 0
+    return dict(json.loads((folder / "r.json").read_text()))
 
 
 def failed_volumes(report: dict[str, Any]) -> list[str]:
@@ -204,30 +264,47 @@ CORNER = ",".join(str(value) for value in np.array(ORIGIN) + SPACING * np.array(
 
 
 @pytest.mark.parametrize(
-    ("options", "names", "failed"),
+    ("options", "names"),
     daily_rows(
-        4,
+        2,
         [
-            (["--split"], ["label_1_001", "label_2_001", "label_2_002", "label_3_001"], []),
-            (["--keep-largest", "1"], ["label_1", "label_2", "label_3"], ["label_2"]),
-            (["--min-volume", "0.5", "--label", "1", "--label", "2"], ["label_1", "label_2"], ["label_2"]),
-            (["--seed", CORNER, "--label", "2"], [None], [None]),
-            (["--smooth"], ["label_1", "label_2", "label_3"], []),
-            (["--smooth", "--decimate", "0.5"], ["label_1", "label_2", "label_3"], []),
-            (["--for", "print", "--label", "1"], [None], []),
+            (["--split"], ["label_1_001", "label_2_001", "label_2_002", "label_3_001"]),
+            (["--smooth", "--decimate", "0.5"], ["label_1", "label_2", "label_3"]),
+            (["--smooth"], ["label_1", "label_2", "label_3"]),
+            (["--for", "print", "--label", "1"], [None]),
         ],
     ),
 )
-def test_masks_are_split_filtered_smoothed_and_printed_label_by_label(
-    options: list[str], names: list[str], failed: list[str], device: Any, ct: Path, pieces: Path, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    """What leaves components out makes the gate of the volume fail, and it says why; refinement keeps it."""
-    report = mask_job(ct, pieces, tmp_path, options, device)
+def test_masks_of_labels_are_split_refined_or_printed_one_by_one_with_their_volume(
+    options: list[str], names: list[str], device: Any, ct: Path, pieces: Path, tmp_path: Path
+) -> None:
+    report = report_of_masks(ct, pieces, tmp_path, options, device)
+
     assert [mesh["name"] for mesh in report["meshes"]] == names
-    assert failed_volumes(report) == failed
-    captured = capsys.readouterr()
-    assert ("1 of its 2 components were kept" in captured.err) == bool(failed) and " -0 ml" not in captured.out
+    assert report["closed"] and report["manifold"]
+    assert failed_volumes(report) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "failed"),
+    daily_rows(
+        2,
+        [
+            (["--keep-largest", "1"], "label_2"),
+            (["--min-volume", "0.5", "--label", "1", "--label", "2"], "label_2"),
+            (["--seed", CORNER, "--label", "2"], None),  # a single mesh has no name
+        ],
+    ),
+)
+def test_mask_of_a_label_without_one_of_its_components_fails_its_gate_and_says_why(
+    options: list[str], failed: str | None, device: Any, ct: Path, pieces: Path, tmp_path: Path, printed: Printer
+) -> None:
+    report = report_of_masks(ct, pieces, tmp_path, options, device)
+
+    assert failed_volumes(report) == [failed]
+    said = printed()
+    assert "1 of its 2 components were kept" in said.everything
+    assert " -0 ml" not in said.everything
 
 
 @pytest.mark.parametrize(
@@ -246,50 +323,57 @@ def test_masks_are_split_filtered_smoothed_and_printed_label_by_label(
         (["--topology", "trilinear"], 3, "the topology trilinear follows HU"),
     ],
 )
-def test_options_that_masks_cannot_take_are_refused_in_one_line(
+def test_impossible_option_for_the_mask_of_a_label_is_refused_in_one_line(
     options: list[str], code: int, words: str, device: Any, ct: Path, pieces: Path, tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     arguments = ("--labels", pieces, "--surface", "mask", *options)
-    assert run(ct, "-o", tmp_path / "b.stl", *arguments, device=device) == code
+    assert run_mesh(ct, "-o", tmp_path / "b.stl", *arguments, device=device) == code
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.seconds
-def test_labels_that_miss_their_volume_fail_the_gate(
+def test_masks_of_small_labels_that_fill_a_map_fail_their_gates_with_the_missing_percent(
     device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Small cells that fill the map: notches between three of them take 3 %, which no level brings back."""
+    """Notches between three of these cells take 3 % of them, which no level brings back."""
     shape = sphere_voxels().shape
     points = np.random.default_rng(0).random((60, 3)) * shape
     away = np.linalg.norm(np.moveaxis(np.indices(shape), 0, -1)[..., None, :] - points, axis=-1)
     cells = Path(write_nifti(tmp_path / "a.nii.gz", (away.argmin(axis=-1) + 1).astype(np.uint8), AFFINE))
-    arguments = ("-o", tmp_path / "b.stl", "--labels", cells, "--surface", "mask", "--report", tmp_path / "r.json")
-    assert run(ct, *arguments, "--strict", device=device) == 8
-    said = capsys.readouterr().err
-    assert "gate label_volume failed: the mesh has" in said
-    assert "labels that fill the map" not in said  # what the gate says is not said twice
+    options = ("--labels", cells, "--surface", "mask", "--report", tmp_path / "r.json", "--strict")
+
+    assert run_mesh(ct, "-o", tmp_path / "b.stl", *options, device=device) == 8
+
     report = json.loads((tmp_path / "r.json").read_text())
     gates = [gate for gate in report["gates"] if gate["name"] == "label_volume"]
-    assert len(gates) == 60 and sum(gate["ok"] is False for gate in gates) >= 50
+    assert len(gates) == 60
+    assert sum(gate["ok"] is False for gate in gates) >= 50
     for gate, mesh in zip(gates, report["meshes"], strict=True):
-        missing = 100 * abs(mesh["volume_ml"] / mesh["label_ml"] - 1)
-        assert gate["measured"] == pytest.approx(missing, abs=1e-6) and gate["ok"] == (missing <= gate["bound"] == 1.0)
+        missing_percent = 100 * abs(mesh["volume_ml"] / mesh["label_ml"] - 1)
+        assert gate["measured"] == pytest.approx(missing_percent, abs=1e-6)
+        assert gate["bound"] == 1.0
+        assert gate["ok"] == (missing_percent <= 1.0)
+    error = capsys.readouterr().err
+    assert "gate label_volume failed: the mesh has" in error
+    assert "labels that fill the map" not in error  # what the gate says is not printed again
 
 
-def test_the_memory_that_is_allowed_counts_for_labels_too(
+def test_label_map_beyond_the_allowed_memory_is_refused(
     device: Any, ct: Path, labels: Path, tmp_path: Path, printed: Printer
 ) -> None:
     options = ("--labels", labels, "--hu", -150, "--memory", "20kB")
-    assert run(ct, "-o", tmp_path / "bone.stl", *options, device=device) == 5
+    assert run_mesh(ct, "-o", tmp_path / "bone.stl", *options, device=device) == 5
     printed().assert_error(20000)
 
 
-def test_each_label_and_iso_value_gets_a_file(device: Any, ct: Path, labels: Path, tmp_path: Path) -> None:
+def test_each_label_and_iso_value_is_one_file_named_after_both(
+    device: Any, ct: Path, labels: Path, tmp_path: Path
+) -> None:
     options = ("--labels", labels, "--label", 2, "--label", 1, "--hu", "-150,300")
-    assert run(ct, "-o", tmp_path / "b.ply", *options, device=device) == 0
+    assert run_mesh(ct, "-o", tmp_path / "b.ply", *options, device=device) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "b_RIGHT_half_-150hu.ply", "b_RIGHT_half_300hu.ply", "b_left_half_-150hu.ply", "b_left_half_300hu.ply",
     ]  # fmt: skip
@@ -305,47 +389,48 @@ def test_each_label_and_iso_value_gets_a_file(device: Any, ct: Path, labels: Pat
         (["--hu", "-1000"], 2, "every voxel is inside"),
     ],
 )
-def test_impossible_labels_levels_and_growth_are_refused_in_one_line(
+def test_impossible_label_level_or_growth_is_refused_in_one_line(
     options: list[str], code: int, words: str, device: Any, ct: Path, labels: Path, tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     level = [] if "--hu" in options else ["--hu", "-150"]
-    assert run(ct, "-o", tmp_path / "b.stl", "--labels", labels, *level, *options, device=device) == code
+    assert run_mesh(ct, "-o", tmp_path / "b.stl", "--labels", labels, *level, *options, device=device) == code
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1 and "\x1b" not in error
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("options", [["--label", "1"], ["--grow", "1"]])
-def test_label_options_without_labels_are_refused(
+def test_option_of_labels_without_a_label_map_is_refused(
     options: list[str], ct: Path, tmp_path: Path, printed: Printer
 ) -> None:
-    assert run(ct, "-o", tmp_path / "b.stl", *options) == 3
+    assert run_mesh(ct, "-o", tmp_path / "b.stl", *options) == 3
     printed().assert_error(options[0])
 
 
 @pytest.mark.parametrize(("content", "code"), [(None, 3), (b"", 4), (b"\x1f\x8b\x08\0", 4)])
-def test_a_label_map_that_cannot_be_read_ends_the_job(
+def test_label_map_that_cannot_be_read_is_refused(
     content: bytes | None, code: int, device: Any, ct: Path, tmp_path: Path, printed: Printer,
 ) -> None:  # fmt: skip
     if content is not None:
         (tmp_path / "a.nii.gz").write_bytes(content)
-    assert run(ct, "-o", tmp_path / "b.stl", "--labels", tmp_path / "a.nii.gz", device=device) == code
+    assert run_mesh(ct, "-o", tmp_path / "b.stl", "--labels", tmp_path / "a.nii.gz", device=device) == code
     printed().assert_error("a.nii.gz")
     assert not (tmp_path / "b.stl").exists()
 
 
-def test_a_label_none_of_whose_centres_lies_in_the_ct_is_compared_with_what_was_taken(
+def test_label_with_no_centre_of_a_voxel_in_the_ct_is_compared_with_what_was_taken_of_it(
     device: Any, ct: Path, tmp_path: Path, printed: Printer
 ) -> None:
-    """The centre of the large voxel of label 2 lies a millimetre beside the scan, and half of it in the scan."""
     extent = (np.array(sphere_voxels().shape[::-1]) - 1) * SPACING
     affine = np.diag([14.0, 90.0, 90.0, 1.0])
     affine[:3, 3] = ORIGIN + 0.5 * extent
-    affine[0, 3] = ORIGIN[0] + extent[0] + 1.0 - 14.0
+    affine[0, 3] = ORIGIN[0] + extent[0] + 1.0 - 14.0  # label 2: its centre 1 mm beside the scan, half of it within
     map_file = write_nifti(tmp_path / "a.nii.gz", np.array([[[1, 2]]], np.uint8), affine)
     options = ("--labels", map_file, "--label", 2, "--hu", -150, "--report", tmp_path / "r.json")
-    assert run(ct, "-o", tmp_path / "b.stl", *options, device=device) == 0
+
+    assert run_mesh(ct, "-o", tmp_path / "b.stl", *options, device=device) == 0
+
     (mesh,) = json.loads((tmp_path / "r.json").read_text())["meshes"]
     assert mesh["label_inside_share"] == 0.0
     assert mesh["label_compared_ml"] == mesh["label_taken_ml"] > 0.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from clrecon.cli.main import main
@@ -30,18 +32,24 @@ def ct_folder(tmp_path_factory):
     return folder
 
 
-def test_a_small_budget_gives_the_same_file_in_slabs(ct_folder, tmp_path, printed):
+def test_mesh_within_little_memory_is_made_in_slabs_and_its_file_is_that_of_the_whole(ct_folder, tmp_path, printed):
     assert main(["mesh", str(ct_folder), "-o", str(tmp_path / "whole.stl"), "--json"]) == 0
     whole = printed().report()
-    arguments = ["mesh", str(ct_folder), "-o", str(tmp_path / "slabs.stl"), "--memory", "200kB"]
-    assert main([*arguments, "--json"]) == 0
-    slabs = printed().report()
+    command = ["mesh", str(ct_folder), "-o", str(tmp_path / "slabs.stl"), "--memory", "200kB", "--json"]
+    assert main(command) == 0
+    in_slabs = printed().report()
+
+    assert (whole["slabs"], whole["memory_allowed_bytes"]) == (1, None)
+    assert in_slabs["slabs"] > 1
+    assert in_slabs["memory_allowed_bytes"] == 200_000
+    assert sum(in_slabs["device_bytes"].values()) <= 200_000
     assert (tmp_path / "whole.stl").read_bytes() == (tmp_path / "slabs.stl").read_bytes()
-    assert whole["slabs"] == 1 and whole["memory_allowed_bytes"] is None
-    assert slabs["slabs"] > 1 and slabs["memory_allowed_bytes"] == 200_000
-    assert sum(slabs["device_bytes"].values()) <= 200_000
-    assert main(arguments) == 0
-    printed().assert_output(slabs["slabs"])
+
+
+def test_words_of_a_mesh_within_little_memory_have_the_number_of_slabs(ct_folder, tmp_path, printed):
+    command = ["mesh", str(ct_folder), "-o", str(tmp_path / "slabs.stl"), "--memory", "200kB"]
+    assert main([*command, "--report", str(tmp_path / "r.json")]) == 0
+    printed().assert_output(json.loads((tmp_path / "r.json").read_text())["slabs"])
 
 
 @pytest.mark.parametrize(("memory", "code", "fact"), [

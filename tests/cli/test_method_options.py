@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from printed_text import Printer
-from variants import daily
+from variants import daily_rows
 
 from clrecon.cli.main import main
 from clrecon.jobs.mesh.settings import METHOD_NAMES
@@ -33,50 +33,82 @@ def bones(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(bones: Path, out: Path, *options: str) -> tuple[int, dict[str, Any]]:
+def mesh_bones(bones: Path, out: Path, *options: str) -> tuple[int, dict[str, Any]]:
     report = out / "report.json"
     code = main(["mesh", str(bones / "bones.nii.gz"), "-o", str(out / "a.stl"), "--report", str(report), *options])
     return code, json.loads(report.read_text()) if report.exists() else {}
 
 
-def test_the_names_are_those_of_the_table() -> None:
+def test_names_of_methods_in_settings_are_those_of_the_table_of_methods() -> None:
     assert tuple(METHODS) == METHOD_NAMES
 
 
-def test_seeds_choose_and_are_reported(bones: Path, tmp_path: Path, printed: Printer, device: Any) -> None:
-    code, report = run(bones, tmp_path, "--grow-from", "auto", "-v")
-    said = printed()
+@pytest.fixture
+def grown(bones: Path, tmp_path: Path, printed: Printer, device: Any) -> tuple[dict[str, Any], Any]:
+    """The report of a mesh grown from seeds that are found by themselves, and what was printed."""
+    code, report = mesh_bones(bones, tmp_path, "--grow-from", "auto", "-v")
     assert code == 0
-    assert report["method"] == "i-mc" and report["grow_from"] == ["auto"] and report["vertex_rule"] == "linear"
-    assert report["components"] == 2 and report["growing"]["components"] == 3
+    return report, printed()
+
+
+def test_mesh_grown_from_seeds_found_by_themselves_keeps_two_blocks_and_leaves_the_crumb(
+    grown: tuple[dict[str, Any], Any],
+) -> None:
+    report, _ = grown
+    assert (report["method"], report["grow_from"], report["vertex_rule"]) == ("i-mc", ["auto"], "linear")
+    assert (report["components"], report["growing"]["components"]) == (2, 3)
+
+
+def test_report_and_words_of_a_grown_mesh_count_its_cells(grown: tuple[dict[str, Any], Any]) -> None:
+    report, said = grown
     cells = report["cells"]
-    assert cells["all"] == 41 * 31 * 21 and cells["active"] == cells["grown"] + 8
-    said.assert_output(cells["visited"], cells["active"], cells["all"], 2, 3, 8)
+
+    of_the_crumb = 8  # about a single voxel
+    assert cells["all"] == 41 * 31 * 21  # of 40 x 30 x 20 voxels in a layer of air
+    assert cells["active"] == cells["grown"] + of_the_crumb
     assert report["meshes"][0]["growing"] == report["growing"]
+    said.assert_output(cells["visited"], cells["active"], cells["all"], 2, 3, of_the_crumb)
 
 
-def test_points_and_labels_choose_one(bones: Path, tmp_path: Path, device: Any) -> None:
-    point, label, ras = tmp_path / "point", tmp_path / "label", tmp_path / "ras"
-    for folder in (point, label, ras):
-        folder.mkdir()
-    _, by_point = run(bones, point, "--grow-from", "30,10,20")
-    _, by_label = run(bones, label, "--grow-from", "label:7", "--labels", str(bones / "labels.nii.gz"))
-    _, by_ras = run(bones, ras, "--grow-from=-30,-10,20", "--space", "ras")
-    assert by_point["growing"]["from"] == ["30,10,20"] and by_ras["triangles"] == by_point["triangles"]
-    assert by_label["meshes"][0]["label"] is None and by_label["growing"]["from"] == ["label label_7"]
+def test_mesh_grown_from_a_point_is_that_grown_from_a_label_about_it(bones: Path, tmp_path: Path, device: Any) -> None:
+    point, label = tmp_path / "point", tmp_path / "label"
+    point.mkdir()
+    label.mkdir()
+
+    _, by_point = mesh_bones(bones, point, "--grow-from", "30,10,20")
+    _, by_label = mesh_bones(bones, label, "--grow-from", "label:7", "--labels", str(bones / "labels.nii.gz"))
+
+    assert by_point["components"] == 1  # the small block
+    assert (by_point["growing"]["from"], by_label["growing"]["from"]) == (["30,10,20"], ["label label_7"])
+    assert by_label["meshes"][0]["label"] is None  # it is no mesh of the label
+    assert by_point["cells"] == by_label["cells"]
     assert (point / "a.stl").read_bytes() == (label / "a.stl").read_bytes()
-    assert by_point["components"] == 1 and by_point["cells"] == by_label["cells"]
 
 
-@pytest.mark.parametrize("method", daily(2, ["t-mc-soup", "skimage", "s-mc", "g-mc"]))
-def test_mesh_is_written_by_every_other_method(method: str, bones: Path, tmp_path: Path, device: Any) -> None:
+def test_point_in_ras_grows_the_mesh_of_the_point_in_lps(bones: Path, tmp_path: Path, device: Any) -> None:
+    _, in_lps = mesh_bones(bones, tmp_path, "--grow-from", "30,10,20")
+    _, in_ras = mesh_bones(bones, tmp_path, "--grow-from=-30,-10,20", "--space", "ras")
+    assert in_ras["triangles"] == in_lps["triangles"]
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    daily_rows(
+        2, [("t-mc-soup", []), ("skimage", []), ("s-mc", ["--decimate", "0.3"]), ("g-mc", ["--decimate", "0.3"])]
+    ),
+)
+def test_mesh_of_every_other_method_has_the_volume_of_the_blocks(
+    method: str, options: list[str], bones: Path, tmp_path: Path, device: Any
+) -> None:
     if method == "skimage":
         pytest.importorskip("skimage")
-    more = ["--decimate", "0.3"] if method in ("s-mc", "g-mc") else []
-    code, report = run(bones, tmp_path, "--method", method, *more)
-    assert code == 0 and report["method"] == method
-    assert report["volume_ml"] == pytest.approx(2e-3 * (20 * 20 * 14 + 8 * 10 * 10), rel=0.1)
-    assert (report["refinement"] is not None) == bool(more)
+
+    code, report = mesh_bones(bones, tmp_path, "--method", method, *options)
+
+    assert (code, report["method"]) == (0, method)
+    blocks_ml = (20 * 20 * 14 + 8 * 10 * 10) * 2 / 1000  # voxels of 2 cubic mm
+    assert report["volume_ml"] == pytest.approx(blocks_ml, rel=0.1)
+    assert (report["refinement"] is not None) == bool(options)
 
 
 @pytest.mark.parametrize(
@@ -99,12 +131,12 @@ def test_mesh_is_written_by_every_other_method(method: str, bones: Path, tmp_pat
         (["--grow-from", "label:7", "--labels", "LABELS", "--label", "7"], "leave the labels for meshes out"),
     ],
 )
-def test_methods_and_options_that_exclude_each_other_are_refused_in_one_line(
+def test_method_and_option_that_exclude_each_other_are_refused(
     options: list[str], words: str, bones: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], device: Any
 ) -> None:
     given = [str(bones / "labels.nii.gz") if option == "LABELS" else option for option in options]
     try:
-        code, _ = run(bones, tmp_path, *given)
+        code, _ = mesh_bones(bones, tmp_path, *given)
     except SystemExit as error:
         code = int(error.code or 0)
     said = capsys.readouterr().err

@@ -77,7 +77,7 @@ def untranslated(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
     ids=[f"{command}{action.option_strings[-1]}" for command, action in OPTIONS],
 )
-def test_odd_values_are_no_unexpected_error(
+def test_odd_values_of_an_option_are_refused_in_one_line_each_and_write_nothing(
     command: str, action: argparse.Action, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "scan").mkdir()
@@ -97,7 +97,7 @@ def test_odd_values_are_no_unexpected_error(
 
 
 @pytest.mark.parametrize("value", ["--", "---", "-", "--json"])
-def test_a_value_of_dashes_is_the_value(value: str) -> None:
+def test_value_of_dashes_after_an_equals_sign_is_the_value(value: str) -> None:
     parser = Parser(prog="clrecon")
     parser.add_argument("--text")
     parser.add_argument("--number", nargs="?", type=str.upper)

@@ -42,10 +42,17 @@ def parse(*words: str) -> Settings:
     return make_settings(Settings, parser.parse_args(list(words)))
 
 
-def test_option_that_is_not_given_is_the_default_of_its_field() -> None:
-    assert parse() == Settings()
-    assert parse("--count", "5", "--even", "4", "--open", "--no-solid") == Settings(count=5, even=4, is_open=True)
-    assert parse("--name", "a", "--name", "b", "--solid") == Settings(names=("a", "b"), is_solid=True)
+@pytest.mark.parametrize(
+    ("words", "settings"),
+    [
+        pytest.param([], Settings(), id="defaults"),
+        pytest.param(["--count", "5", "--even", "4"], Settings(count=5, even=4), id="numbers"),
+        pytest.param(["--open", "--no-solid"], Settings(is_open=True, is_solid=False), id="flags"),
+        pytest.param(["--name", "a", "--name", "b", "--solid"], Settings(names=("a", "b"), is_solid=True), id="a list"),
+    ],
+)
+def test_options_are_the_fields_of_their_settings_or_their_defaults(words: list[str], settings: Settings) -> None:
+    assert parse(*words) == settings
 
 
 @pytest.mark.parametrize(
@@ -56,7 +63,7 @@ def test_option_that_is_not_given_is_the_default_of_its_field() -> None:
         (["--count", "x"], "argument --count: 'x' is no whole number (see: clrecon --help)"),
     ],
 )
-def test_a_value_is_refused_in_the_words_of_its_reader(words: list[str], said: str) -> None:
+def test_value_that_cannot_be_read_is_refused_in_the_words_of_its_reader(words: list[str], said: str) -> None:
     with pytest.raises(UsageError) as caught:
         parse(*words)
     assert str(caught.value) == said
@@ -68,22 +75,34 @@ class Part:
     grow: float | None = option("--grow MM", "how far")
 
 
-def test_options_of_a_part_need_the_one_that_it_is_about() -> None:
+@pytest.fixture
+def part_parser() -> Parser:
     parser = Parser(prog="clrecon")
     add_fields(parser, Part)
-    made = [
-        make_part(Part, given, given.path, "is about labels")
-        for given in (parser.parse_args([]), parser.parse_args(["--labels", "a", "--grow", "2"]))
-    ]
-    assert made == [None, Part(path="a", grow=2.0)]
-    lone = parser.parse_args(["--grow", "0"])
+    return parser
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [([], None), (["--labels", "a", "--grow", "2"], Part(path="a", grow=2.0))],
+    ids=["nothing given", "given with its file"],
+)
+def test_part_of_settings_is_made_where_the_option_that_it_is_about_is_given(
+    words: list[str], part: Part | None, part_parser: Parser
+) -> None:
+    given = part_parser.parse_args(words)
+    assert make_part(Part, given, given.path, "is about labels") == part
+
+
+def test_option_of_a_part_without_the_one_that_it_is_about_is_refused(part_parser: Parser) -> None:
+    given = part_parser.parse_args(["--grow", "0"])
     with refused(UsageError, "--grow", "labels"):
-        make_part(Part, lone, lone.path, "is about labels")
+        make_part(Part, given, given.path, "is about labels")
 
 
-def test_a_view_takes_the_kinds_of_surface_that_a_mesh_takes() -> None:
-    for name in ("mesh", "view"):
-        parser = Parser(prog=name)
-        import_module(COMMANDS[name].module).add_arguments(parser)
-        given = parser.parse_args(["ct", *(("-o", "a.stl") if name == "mesh" else ()), "--surface", "CORTEX"])
-        assert given.surface == "cortex"
+@pytest.mark.parametrize("words", [["mesh", "ct", "-o", "a.stl"], ["view", "ct"]], ids=["mesh", "view"])
+def test_mesh_and_view_take_a_fitted_surface_in_capitals(words: list[str]) -> None:
+    command, *arguments = words
+    parser = Parser(prog=command)
+    import_module(COMMANDS[command].module).add_arguments(parser)
+    assert parser.parse_args([*arguments, "--surface", "CORTEX"]).surface == "cortex"

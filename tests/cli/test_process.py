@@ -23,7 +23,7 @@ def run(*arguments: str, **options: object) -> subprocess.CompletedProcess[str]:
     )  # type: ignore[call-overload]
 
 
-def test_help_goes_to_stdout_in_little_time() -> None:
+def test_help_is_on_standard_output_within_three_seconds() -> None:
     start = time.perf_counter()
     done = run("--help")
     elapsed = time.perf_counter() - start
@@ -39,7 +39,7 @@ def test_help_imports_neither_numpy_nor_a_driver() -> None:
     assert imported & {"numpy", "pydicom", "pyopencl", "vtk", "vtkmodules", "pyvista", "skimage", "scipy"} == set()
 
 
-def test_an_error_is_one_line_on_stderr_and_the_exit_code(tmp_path: Path) -> None:
+def test_error_of_a_process_is_one_line_on_standard_error_and_its_exit_code(tmp_path: Path) -> None:
     done = run("info", str(tmp_path / "nothing here"))
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 1
@@ -64,7 +64,7 @@ def test_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
-def test_full_disk_behind_stdout_exits_with_6(tmp_path: Path) -> None:
+def test_process_with_a_full_disk_behind_standard_output_ends_with_6(tmp_path: Path) -> None:
     write_series(tmp_path / "ct")
     root = Path(__file__).resolve().parents[2]
     with open("/dev/full", "w") as full:
@@ -80,7 +80,7 @@ def test_full_disk_behind_stdout_exits_with_6(tmp_path: Path) -> None:
     assert process.stderr == "clrecon: error: cannot write to standard output: No space left on device\n"
 
 
-def test_a_plain_locale_shows_escapes(tmp_path: Path) -> None:
+def test_letters_that_a_plain_locale_has_not_are_printed_as_codes(tmp_path: Path) -> None:
     done = run("info", str(tmp_path / "größe"), environment={"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"})
     assert done.returncode == 2
     assert "gr\\xf6\\xdfe" in done.stderr
@@ -88,7 +88,7 @@ def test_a_plain_locale_shows_escapes(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="pipes and signals of POSIX")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)])
-def test_an_interrupt_leaves_nothing(number: signal.Signals, tmp_path: Path) -> None:
+def test_interrupted_phantom_ends_with_130_and_leaves_no_files(number: signal.Signals, tmp_path: Path) -> None:
     root = Path(__file__).resolve().parents[2]
     process = subprocess.Popen(
         [*COMMAND, "phantom", str(tmp_path / "ph"), "--slices", "300", "-v"],
@@ -107,7 +107,7 @@ def test_an_interrupt_leaves_nothing(number: signal.Signals, tmp_path: Path) -> 
 
 
 @pytest.mark.seconds
-def test_pillow_is_hidden_from_all_but_what_makes_pictures(tmp_path: Path) -> None:
+def test_pillow_is_imported_by_render_and_not_by_info(tmp_path: Path) -> None:
     write_series(tmp_path / "ct")
     told = "import sys; print(sys.modules.get('PIL') is not None, flush=True)"
     code = f"import atexit; from clrecon.cli import main; atexit.register(lambda: exec({told!r})); main.run()"

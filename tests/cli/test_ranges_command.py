@@ -32,7 +32,7 @@ def run(ct: Path, device: Any, tmp_path: Path, *arguments: str) -> int:
     return main(["mesh", str(ct), "-o", str(tmp_path / "b.stl"), "--device", str(device.index), *arguments])
 
 
-def test_option_below_gives_the_lung_without_the_air_outside(
+def test_mesh_below_a_level_is_the_lung_without_the_air_about_the_body(
     ct: Path, device: Any, tmp_path: Path, printed: Printer
 ) -> None:
     assert run(ct, device, tmp_path, "--below", "-400", "--strict", "--json") == 0
@@ -44,7 +44,7 @@ def test_option_below_gives_the_lung_without_the_air_outside(
     assert not any("face" in text for text in report["warnings"])
 
 
-def test_option_below_with_the_air_outside_warns_of_a_face(
+def test_mesh_below_a_level_with_the_air_about_the_body_is_warned_of_as_one_that_can_show_a_face(
     ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(ct, device, tmp_path, "--below", "-400", "--keep-outside") == 0
@@ -53,7 +53,9 @@ def test_option_below_with_the_air_outside_warns_of_a_face(
     assert "can show a face" in shown.err
 
 
-def test_range_and_iso_value_get_a_file_each(ct: Path, device: Any, tmp_path: Path, printed: Printer) -> None:
+def test_range_and_iso_value_of_one_command_are_a_file_each(
+    ct: Path, device: Any, tmp_path: Path, printed: Printer
+) -> None:
     assert run(ct, device, tmp_path, "--hu", "-900:-700,0", "-v") == 0
     printed().assert_output(-900, -700, 0)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b_-900to-700hu.stl", "b_0hu.stl"]
@@ -89,13 +91,18 @@ def test_text_that_is_no_range_is_refused(text: str, said: str) -> None:
         ({"keep_outside": True}, "only left out of what lies below"),
     ],
 )
-def test_settings_that_exclude_each_other_are_refused(settings: Any, said: str) -> None:
+def test_range_or_level_below_with_a_setting_that_excludes_it_is_refused(settings: Any, said: str) -> None:
     with pytest.raises(UsageError, match=said):
         MeshSettings(**settings)
 
 
-def test_options_that_exclude_each_other_end_with_3(ct: Path, device: Any, tmp_path: Path, printed: Printer) -> None:
-    assert run(ct, device, tmp_path, "--below", "-400", "--hu", "200") == 3
-    printed().assert_error("--below", "--hu")
-    assert run(ct, device, tmp_path, "--hu", "300:100") == 3
-    printed().assert_error(300, 100)
+@pytest.mark.parametrize(
+    ("options", "facts"),
+    [(["--below", "-400", "--hu", "200"], ("--below", "--hu")), (["--hu", "300:100"], (300, 100))],
+    ids=["below and above", "range upside down"],
+)
+def test_levels_that_exclude_each_other_are_refused_with_exit_code_3(
+    options: list[str], facts: tuple[str | int, ...], ct: Path, device: Any, tmp_path: Path, printed: Printer
+) -> None:
+    assert run(ct, device, tmp_path, *options) == 3
+    printed().assert_error(*facts)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 from dicom_series import Plan, write_series
@@ -13,45 +11,68 @@ from clrecon.cli.main import main
 SHAPE = (8, 10, 11)
 
 
-def block(ds, k, hu=1500):
-    """A block of bone in the middle of air."""
-    pixels = np.full(SHAPE[1:], 24, "i2")
-    pixels[3:7, 3:8] = hu if 2 <= k <= 5 else 24
+def set_block(ds, k, hu=476):
+    """A block of bone in the middle of air, from slice 2 to slice 5."""
+    air = 24  # stored: HU and 1024
+    pixels = np.full(SHAPE[1:], air, "i2")
+    pixels[3:7, 3:8] = hu + 1024 if 2 <= k <= 5 else air
     ds.PixelData = pixels.tobytes()
 
 
-def test_a_gap_is_refused_and_then_allowed(tmp_path, printed):
-    write_series(tmp_path / "ct", Plan(shape=SHAPE, leave_out=(4,)), block)
+@pytest.fixture
+def ct_with_a_gap(tmp_path):
+    """The CT of the block without its slice 4; slices are 1.25 mm apart."""
+    write_series(tmp_path / "ct", Plan(shape=SHAPE, leave_out=(4,)), set_block)
+    return str(tmp_path / "ct")
+
+
+def test_series_with_a_missing_slice_is_refused_with_the_option_that_allows_it(ct_with_a_gap, tmp_path, printed):
     out = tmp_path / "bone.stl"
-    assert main(["mesh", str(tmp_path / "ct"), "-o", str(out)]) == 4
-    said = printed()
-    said.assert_error(1, "--allow-gaps")
+
+    assert main(["mesh", ct_with_a_gap, "-o", str(out)]) == 4
+
+    printed().assert_error(1, "--allow-gaps")
     assert not out.exists()
-    report = tmp_path / "report.json"
-    assert main(["mesh", str(tmp_path / "ct"), "-o", str(out), "--allow-gaps", "--report", str(report)]) == 0
-    told = json.loads(report.read_text())
-    assert any("1 slice missing between" in text for text in told["warnings"])
-    assert told["volume"]["slices_missing"] == 1 and told["volume"]["uneven"] is True
-    # As tall as it was written, the bridged gap included; beyond its ends the level lies a part of a step out.
-    low, high = np.array(told["bounds_mm"])[:, 2]
-    part = (476 - told["iso_level_hu"]) / (476 + 1000)
+
+
+def test_mesh_over_an_allowed_gap_is_as_tall_as_the_bone_with_a_warning(ct_with_a_gap, tmp_path, printed):
+    assert main(["mesh", ct_with_a_gap, "-o", str(tmp_path / "bone.stl"), "--allow-gaps", "--json"]) == 0
+
+    report = printed().report()
+    assert (report["volume"]["slices_missing"], report["volume"]["uneven"]) == (1, True)
+    assert any("1 slice missing between" in text for text in report["warnings"])
+    # Three gaps from slice 2 to slice 5; beyond its ends the level lies a part of a gap out, towards air.
+    part = (476 - report["iso_level_hu"]) / (476 + 1000)
+    low, high = np.array(report["bounds_mm"])[:, 2]
     assert high - low == pytest.approx((3 + 2 * part) * 1.25, abs=1e-3)
 
 
-def test_a_phase_is_chosen(tmp_path, printed):
-    for number, hu in ((1, 1500), (2, 1300)):
+@pytest.fixture
+def ct_of_two_phases(tmp_path):
+    """Two phases of the block: 476 HU in the first, 276 HU in the second."""
+    for number, hu in ((1, 476), (2, 276)):
 
         def change(ds, k, number=number, hu=hu):
-            block(ds, k, hu)
+            set_block(ds, k, hu)
             ds.AcquisitionNumber = number
 
         write_series(tmp_path / "ct", Plan(shape=SHAPE, name=f"{number}-{{}}".format), change)
-    out = tmp_path / "bone.stl"
-    assert main(["mesh", str(tmp_path / "ct"), "-o", str(out)]) == 4
-    printed().assert_error("--phase", 2)
-    assert main(["mesh", str(tmp_path / "ct"), "-o", str(out), "--phase", "3"]) == 3
-    printed().assert_error("phase", 3)
-    assert main(["mesh", str(tmp_path / "ct"), "-o", str(out), "--phase", "2", "--json"]) == 0
-    told = printed().report()
-    assert told["volume"]["hu_range"] == [-1000, 276]
-    assert told["volume"]["phase"]["number"] == 2
+    return str(tmp_path / "ct")
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "facts"),
+    [([], 4, ("--phase", 2)), (["--phase", "3"], 3, ("phase", 3))],
+    ids=["none chosen", "not there"],
+)
+def test_series_of_two_phases_is_refused_without_one_of_them(options, code, facts, ct_of_two_phases, tmp_path, printed):
+    assert main(["mesh", ct_of_two_phases, "-o", str(tmp_path / "bone.stl"), *options]) == code
+    printed().assert_error(*facts)
+
+
+def test_chosen_phase_of_a_series_is_read(ct_of_two_phases, tmp_path, printed):
+    assert main(["mesh", ct_of_two_phases, "-o", str(tmp_path / "bone.stl"), "--phase", "2", "--json"]) == 0
+
+    volume = printed().report()["volume"]
+    assert volume["phase"]["number"] == 2
+    assert volume["hu_range"] == [-1000, 276]

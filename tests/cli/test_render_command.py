@@ -60,12 +60,12 @@ def render(ct: Path, tmp_path: Path, device: Any, capsys: pytest.CaptureFixture[
     return Renders(ct, tmp_path, device, capsys)
 
 
-def lit(image: np.ndarray) -> np.ndarray:
+def is_lit(image: np.ndarray) -> np.ndarray:
     return np.asarray(image[..., :3].max(axis=-1) > 20)
 
 
-def lit_mm2(image: np.ndarray, report: dict[str, Any]) -> float:
-    return float(lit(image).sum() * report["pictures"][0]["pixel_mm"] ** 2)
+def area_mm2(image: np.ndarray, report: dict[str, Any]) -> float:
+    return float(is_lit(image).sum() * report["pictures"][0]["pixel_mm"] ** 2)
 
 
 def side_of(mask: np.ndarray) -> tuple[str, str]:
@@ -78,7 +78,7 @@ def side_of(mask: np.ndarray) -> tuple[str, str]:
     )
 
 
-SEEN = {
+PLACE_IN_VIEW = {
     "anterior": ("right", "top"),
     "posterior": ("left", "top"),
     "left": ("left", "top"),
@@ -92,13 +92,16 @@ SEEN = {
 
 
 @pytest.mark.parametrize("mode", daily(1, [["--mode", "dvr"], ["--preset", "mip"], ["--iso", ISO]]))
-def test_sides_of_the_patient_are_where_they_should_be(mode: list[Any], render: Renders) -> None:
-    for view, expected in SEEN.items():
-        image, report = render(*mode, "--view", view)
-        shown = lit(image)
-        assert 10 < shown.sum() < 0.2 * shown.size
-        assert side_of(shown) == expected, view
-        assert report["pictures"][0]["view"] == view
+@pytest.mark.parametrize(("view", "place"), PLACE_IN_VIEW.items(), ids=PLACE_IN_VIEW)
+def test_view_shows_the_block_on_the_side_of_the_patient_that_it_lies_on(
+    view: str, place: tuple[str, str], mode: list[Any], render: Renders
+) -> None:
+    image, report = render(*mode, "--view", view)
+
+    shown = is_lit(image)
+    assert 10 < shown.sum() < 0.2 * shown.size  # the block is a small part of the volume
+    assert side_of(shown) == place
+    assert report["pictures"][0]["view"] == view
 
 
 OFFSETS = {"axial": 4.5 * SPACING[2], "coronal": -6.5 * SPACING[1], "sagittal": -9.5 * SPACING[0]}
@@ -106,15 +109,16 @@ OFFSETS = {"axial": 4.5 * SPACING[2], "coronal": -6.5 * SPACING[1], "sagittal": 
 
 
 @pytest.mark.parametrize(("plane", "view"), [("axial", "inferior"), ("coronal", "anterior"), ("sagittal", "left")])
-def test_slices_are_seen_as_radiologists_see_them(plane: str, view: str, render: Renders) -> None:
+def test_slice_through_the_block_shows_it_where_radiologists_expect_it(plane: str, view: str, render: Renders) -> None:
     image, report = render("--mode", "slice", "--view", plane, "--offset", OFFSETS[plane])
-    assert side_of(lit(image)) == SEEN[view]
+    assert side_of(is_lit(image)) == PLACE_IN_VIEW[view]
     assert (report["mode"], report["offset_mm"]) == ("slice", OFFSETS[plane])
     assert report["pictures"][0]["values_hu"] == [AIR_HU, BLOCK_HU]
-    assert not lit(render("--mode", "slice", "--view", plane)[0]).any()
+    through_the_middle, _ = render("--mode", "slice", "--view", plane)
+    assert not is_lit(through_the_middle).any()  # it misses the block
 
 
-def test_several_views_are_several_files(render: Renders) -> None:
+def test_several_views_are_written_to_files_named_after_them(render: Renders) -> None:
     report = render.report("-o", render.folder / "a.png", "--view", "anterior,left", "--view", "-30,15.5")
     assert sorted(path.name for path in render.folder.iterdir()) == [
         "a_anterior.png", "a_az-30_el15.5.png", "a_left.png",
@@ -122,58 +126,95 @@ def test_several_views_are_several_files(render: Renders) -> None:
     assert [picture["name"] for picture in report["pictures"]] == ["anterior", "left", "az-30_el15.5"]
 
 
-def test_zoom_shows_everything_larger(render: Renders) -> None:
-    small, large = (lit(render("--zoom", zoom)[0]).sum() for zoom in (0.5, 1.0))
+def test_zoom_of_2_magnifies_the_block_about_four_times_in_area(render: Renders) -> None:
+    small, large = (is_lit(render("--zoom", zoom)[0]).sum() for zoom in (0.5, 1.0))
     assert 3.0 < large / small < 5.0
 
 
-def test_up_turns_the_picture(render: Renders) -> None:
-    assert side_of(lit(render("--up", "left")[0])) == ("left", "top")
-    assert side_of(lit(render("--up", "0,0,-1")[0])) == ("left", "bottom")
+@pytest.mark.parametrize(
+    ("up", "place"), [("left", ("left", "top")), ("0,0,-1", ("left", "bottom"))], ids=["the patient's left", "the feet"]
+)
+def test_option_up_turns_the_picture(up: str, place: tuple[str, str], render: Renders) -> None:
+    assert side_of(is_lit(render("--up", up)[0])) == place
 
 
-def test_size_and_perspective_set_the_camera(render: Renders) -> None:
+def test_size_and_perspective_are_those_of_the_picture_and_its_camera(render: Renders) -> None:
     image, report = render("--size", "80x64", "--perspective", "20")
+
     assert image.shape == (64, 80, 4)
     (picture,) = report["pictures"]
-    assert (picture["camera"]["view_angle_deg"], picture["pixel_mm"]) == (20.0, None)
+    assert picture["camera"]["view_angle_deg"] == 20.0
+    assert picture["pixel_mm"] is None  # it differs over the picture
+
+
+def test_perspective_without_a_number_has_an_angle_of_30_degrees(render: Renders) -> None:
     assert render("--perspective")[1]["pictures"][0]["camera"]["view_angle_deg"] == 30.0
 
 
-def test_background_colour_fills_the_corner_of_the_picture(render: Renders) -> None:
-    assert render()[0][0, 0].tolist() == [0, 0, 0, 255]
-    assert render("--background", "#ff8000")[0][0, 0].tolist() == [255, 128, 0, 255]
-    transparent = render("--background", "transparent")[0]
-    assert transparent[0, 0, 3] == 0 and transparent[..., 3].max() > 200
+@pytest.mark.parametrize(
+    ("options", "rgba"),
+    [
+        pytest.param([], [0, 0, 0, 255], id="by default black"),
+        pytest.param(["--background", "#ff8000"], [255, 128, 0, 255], id="orange"),
+    ],
+)
+def test_background_colour_fills_the_corner_of_the_picture(
+    options: list[str], rgba: list[int], render: Renders
+) -> None:
+    image, _ = render(*options)
+    assert image[0, 0].tolist() == rgba
 
 
-def test_clip_box_and_plane_leave_out_their_sides(render: Renders) -> None:
-    low, high = lps((21.5, -0.5, -0.5)), lps((24.5, 25, 17))
-    whole = lit_mm2(*render())
-    half, report = render("--clip-box", f",{high[0]},,,,")
-    assert 0.4 < lit_mm2(half, report) / whole < 0.65
-    assert report["clip_planes_lps_mm"] == [[-1.0, 0.0, 0.0, pytest.approx(-high[0])]]
-    other = lit_mm2(*render("--clip", f"{high[0]},0,0,1,0,0"))
-    assert lit_mm2(half, report) + other == pytest.approx(whole, abs=0.15 * whole)
-    nothing = render("--clip", f"{low[0]},0,0,-1,0,0", "--clip", f"{low[0]},0,0,-2,0,0")[1]
-    assert nothing["pictures"][0]["hit_share"] == 0.0 and nothing["pictures"][0]["depth_mm"] is None
+def test_transparent_background_is_seen_through_beside_an_opaque_block(render: Renders) -> None:
+    image, _ = render("--background", "transparent")
+    assert image[0, 0, 3] == 0
+    assert image[..., 3].max() > 200
 
 
-def test_light_option_chooses_the_lighting(render: Renders) -> None:
-    flat, report = render("--iso", ISO, "--light", "none", "--view", "30,30")
-    assert report["lighting"]["diffuse"] == 0.0
-    assert len(np.unique(flat[lit(flat)], axis=0)) == 1
-    head = render("--iso", ISO, "--view", "30,30")[0]
-    side, report = render("--iso", ISO, "--view", "30,30", "--light", "superior")
+MIDDLE_OF_BLOCK_X, BESIDE_BLOCK_X = lps((24.5, 25, 17))[0], lps((21.5, -0.5, -0.5))[0]
+
+
+def test_clip_box_and_clip_plane_leave_a_half_of_the_block_each(render: Renders) -> None:
+    whole_mm2 = area_mm2(*render())
+
+    of_box, report = render("--clip-box", f",{MIDDLE_OF_BLOCK_X},,,,")
+    of_plane_mm2 = area_mm2(*render("--clip", f"{MIDDLE_OF_BLOCK_X},0,0,1,0,0"))
+
+    assert report["clip_planes_lps_mm"] == [[-1.0, 0.0, 0.0, pytest.approx(-MIDDLE_OF_BLOCK_X)]]
+    of_box_mm2 = area_mm2(of_box, report)
+    assert 0.4 < of_box_mm2 / whole_mm2 < 0.65
+    assert of_box_mm2 + of_plane_mm2 == pytest.approx(whole_mm2, rel=0.15)  # pixels of some 0.7 mm
+
+
+def test_clip_planes_that_leave_nothing_give_an_empty_picture_without_depths(render: Renders) -> None:
+    away_from_block = f"{BESIDE_BLOCK_X},0,0,-1,0,0"
+
+    _, report = render("--clip", away_from_block, "--clip", f"{BESIDE_BLOCK_X},0,0,-2,0,0")
+
+    assert report["pictures"][0]["hit_share"] == 0.0
+    assert report["pictures"][0]["depth_mm"] is None
+
+
+def test_surface_without_a_light_has_one_colour(render: Renders) -> None:
+    image, report = render("--iso", ISO, "--light", "none", "--view", "30,30")
+
+    assert (report["lighting"]["diffuse"], report["lighting"]["ambient"]) == (0.0, 1.0)
+    assert len(np.unique(image[is_lit(image)], axis=0)) == 1
+
+
+@pytest.mark.parametrize("light", ["superior", "0,0,5"], ids=["by its side", "by its direction"])
+def test_light_from_above_is_reported_with_its_direction_and_changes_the_picture(light: str, render: Renders) -> None:
+    of_camera, _ = render("--iso", ISO, "--view", "30,30")
+
+    from_above, report = render("--iso", ISO, "--view", "30,30", "--light", light)
+
     assert report["lighting"]["direction"] == [0.0, 0.0, 1.0]
-    assert render("--iso", ISO, "--light", "0,0,5")[1]["lighting"]["direction"] == [0.0, 0.0, 1.0]
-    assert (head != side).any()
-    assert render("--light", "none")[1]["lighting"]["ambient"] == 1.0
+    assert (of_camera != from_above).any()
 
 
-def test_depth_cue_darkens_what_is_far(render: Renders) -> None:
+def test_depth_cue_darkens_the_surface_and_brightens_nothing(render: Renders) -> None:
     plain, cued = (render("--iso", ISO, *extra)[0].astype(int) for extra in ([], ["--depth-cue", "0.6"]))
-    assert (cued <= plain).all() and cued[lit(plain)].mean() < 0.95 * plain[lit(plain)].mean()
+    assert (cued <= plain).all() and cued[is_lit(plain)].mean() < 0.95 * plain[is_lit(plain)].mean()
 
 
 def test_shadows_darken_a_part_of_the_floor_and_brighten_nothing(
@@ -191,14 +232,23 @@ def test_shadows_darken_a_part_of_the_floor_and_brighten_nothing(
     assert 20 < (dark < plain - 20).any(axis=-1).sum() < 0.3 * dark.shape[0] * dark.shape[1]
 
 
-def test_ray_step_is_reported_and_jitter_changes_the_picture(render: Renders) -> None:
-    plain, report = render("--ray-step", "0.9")
+def test_given_ray_step_is_reported(render: Renders) -> None:
+    _, report = render("--ray-step", "0.9")
     assert report["pictures"][0]["ray_step_mm"] == pytest.approx(0.9)
+
+
+def test_ray_step_by_default_is_half_of_the_smallest_spacing(render: Renders) -> None:
+    _, report = render()
+    assert report["pictures"][0]["ray_step_mm"] == pytest.approx(0.5 * min(SPACING))
+
+
+def test_jitter_is_reported_and_changes_the_picture(render: Renders) -> None:
+    plain, _ = render("--ray-step", "0.9")
+
     jittered, report = render("--ray-step", "0.9", "--jitter")
+
     assert report["jitter"] is True
     assert (plain != jittered).any()
-    default = render()[1]["pictures"][0]["ray_step_mm"]
-    assert default == pytest.approx(0.5 * min(SPACING))
 
 
 def test_window_maps_its_ends_to_black_and_white(render: Renders) -> None:
@@ -210,28 +260,41 @@ def test_window_maps_its_ends_to_black_and_white(render: Renders) -> None:
     assert image[..., :3].max() == round(expected)
 
 
-def test_depth_file_holds_millimetres_from_the_camera(render: Renders) -> None:
-    report = render("--iso", ISO, "--depth", render.folder / "d.npy")[1]
+def test_depth_file_holds_the_mm_from_the_camera_to_the_surface(render: Renders) -> None:
+    _, report = render("--iso", ISO, "--depth", render.folder / "d.npy")
+
     depth = np.load(render.folder / "d.npy")
-    assert depth.dtype == np.float32 and depth.shape == (SIDE, SIDE)
+    assert (depth.dtype, depth.shape) == (np.float32, (SIDE, SIDE))
     front = lps((0, 2.5, 0))[1]  # ISO lies half way between air and the block, between voxels 2 and 3
-    position = report["pictures"][0]["camera"]["position_lps_mm"][1]
-    assert float(np.nanmedian(depth)) == pytest.approx(front - position, abs=0.02)
+    camera = report["pictures"][0]["camera"]["position_lps_mm"][1]
+    assert float(np.nanmedian(depth)) == pytest.approx(front - camera, abs=0.02)  # crossings sought along the ray
+
+
+def test_depths_in_a_tif_file_are_those_in_an_npy_file(render: Renders) -> None:
+    render("--iso", ISO, "--depth", render.folder / "d.npy")
     render("--iso", ISO, "--depth", render.folder / "d.tif")
+
+    depth = np.load(render.folder / "d.npy")
     assert np.array_equal(np.asarray(Image.open(render.folder / "d.tif")), depth, equal_nan=True)
 
 
-def test_slabs_combine_by_mean_maximum_and_minimum(render: Renders) -> None:
-    middle = lps((0, 12, 0))[1] - lps((0, 5.5, 0))[1]
-    found = {}
-    for combine in ("mean", "max", "min"):
-        report = render(
-            *("--mode", "slice", "--view", "coronal", "--offset", -middle, "--thickness", 12.0, "--combine", combine)
-        )[1]
-        assert (report["thickness_mm"], report["combine"]) == (12.0, combine)
-        found[combine] = report["pictures"][0]["values_hu"][1]
-    assert found["max"] == BLOCK_HU and found["min"] == AIR_HU
-    assert AIR_HU < found["mean"] < BLOCK_HU
+@pytest.mark.parametrize(
+    ("combine", "low_hu", "high_hu"),
+    [("mean", AIR_HU + 1, BLOCK_HU - 1), ("max", BLOCK_HU, BLOCK_HU), ("min", AIR_HU, AIR_HU)],
+    ids=["mean", "max", "min"],
+)
+def test_slab_of_a_slice_is_combined_by_mean_maximum_or_minimum(
+    combine: str, low_hu: int, high_hu: int, render: Renders
+) -> None:
+    to_the_block = lps((0, 5.5, 0))[1] - lps((0, 12, 0))[1]
+    thicker_than_the_block = 12.0
+    slab = ("--offset", to_the_block, "--thickness", thicker_than_the_block, "--combine", combine)
+
+    _, report = render("--mode", "slice", "--view", "coronal", *slab)
+
+    assert (report["thickness_mm"], report["combine"]) == (thicker_than_the_block, combine)
+    _, highest = report["pictures"][0]["values_hu"]
+    assert low_hu <= highest <= high_hu
 
 
 @pytest.mark.parametrize("kind", ["straightened", "stretched"])
@@ -242,7 +305,7 @@ def test_curve_of_a_file_is_straightened_or_stretched_at_its_length(kind: str, r
     assert (report["mode"], report["pictures"][0]["curve"]["kind"]) == ("cpr", kind)
     assert report["pictures"][0]["curve"]["length_mm"] == pytest.approx(14 * SPACING[2])
     assert report["pictures"][0]["camera"] is None
-    assert side_of(lit(image))[1] == "top"
+    assert side_of(is_lit(image))[1] == "top"
 
 
 def test_transfer_function_of_a_file_colours_the_picture(render: Renders) -> None:
@@ -259,12 +322,21 @@ def test_transfer_function_of_a_file_colours_the_picture(render: Renders) -> Non
     assert image[..., 1].max() > 240 and image[..., [0, 2]].max() == 0
 
 
-def test_chosen_slices_are_shown_at_their_place_in_space(render: Renders) -> None:
+def test_chosen_slice_in_space_shows_the_block_at_its_place(render: Renders) -> None:
     image, report = render("--mode", "slices", "--slices", "13,", "--slice-opacity", 1.0, "--view", "superior")
+
     assert report["pictures"][0]["slices"] == [13]
-    assert side_of(lit(image)) == SEEN["superior"]
-    assert render("--mode", "slices", "--slices", "4")[1]["pictures"][0]["slices"] == [0, 4, 8, 12, 16]
-    assert not lit(render("--mode", "slices", "--slices", "1,2", "--view", "superior")[0]).any()
+    assert side_of(is_lit(image)) == PLACE_IN_VIEW["superior"]
+
+
+def test_slices_in_space_beside_the_block_show_nothing(render: Renders) -> None:
+    image, _ = render("--mode", "slices", "--slices", "1,2", "--view", "superior")
+    assert not is_lit(image).any()
+
+
+def test_single_number_of_slices_in_space_is_their_distance(render: Renders) -> None:
+    _, report = render("--mode", "slices", "--slices", "4")
+    assert report["pictures"][0]["slices"] == [0, 4, 8, 12, 16]  # of 17
 
 
 @pytest.fixture
@@ -280,59 +352,69 @@ def label_20(render: Renders) -> Path:
 
 @pytest.mark.seconds
 @pytest.mark.parametrize("mode", [["--iso", ISO], []], ids=["surface", "volume"])
-def test_label_has_the_colour_that_is_given(render: Renders, label_20: Path, mode: list[Any]) -> None:
+def test_label_has_the_given_colour(render: Renders, label_20: Path, mode: list[Any]) -> None:
     image, report = render(*mode, "--light", "none", "--labels", label_20, "--label-color", "20=blue")
     (label,) = report["labels"]
     assert (label["label_number"], label["color"], label["opacity"]) == (20, "blue", None)
-    assert image[lit(image)][:, 2].mean() > 2.0 * image[lit(image)][:, 0].mean()
+    assert image[is_lit(image)][:, 2].mean() > 2.0 * image[is_lit(image)][:, 0].mean()
 
 
 @pytest.mark.seconds
-def test_label_of_opacity_0_leaves_pixels_dark(render: Renders, label_20: Path) -> None:
-    shown = lit(render("--labels", label_20)[0])
-    assert not lit(render("--labels", label_20, "--label-opacity", "20=0")[0])[shown].all()
+def test_label_of_opacity_0_darkens_pixels_that_it_lit(render: Renders, label_20: Path) -> None:
+    shown = is_lit(render("--labels", label_20)[0])
+    assert not is_lit(render("--labels", label_20, "--label-opacity", "20=0")[0])[shown].all()
 
 
 @pytest.mark.seconds
-def test_label_of_opacity_0_3_is_fainter(render: Renders, label_20: Path) -> None:
+def test_label_of_opacity_0_3_is_fainter_than_an_opaque_one(render: Renders, label_20: Path) -> None:
     surface = ("--iso", ISO, "--light", "none", "--labels", label_20, "--label-color", "20=blue")
     whole, faint = render(*surface)[0], render(*surface, "--label-opacity", "20=0.3")[0]
-    assert faint[lit(whole)][:, 2].mean() < 0.8 * whole[lit(whole)][:, 2].mean()
+    assert faint[is_lit(whole)][:, 2].mean() < 0.8 * whole[is_lit(whole)][:, 2].mean()
 
 
 @pytest.mark.seconds
-def test_surface_has_the_colour_that_is_given(render: Renders) -> None:
+def test_surface_has_the_given_colour(render: Renders) -> None:
     image = render("--iso", ISO, "--light", "none", "--color", "red")[0]
-    assert image[..., :3][lit(image)].mean(axis=0) == pytest.approx([255, 0, 0], abs=5)
+    assert image[..., :3][is_lit(image)].mean(axis=0) == pytest.approx([255, 0, 0], abs=5)
 
 
-def test_letters_scale_bar_and_caption_are_drawn_beside_the_middle(render: Renders) -> None:
-    plain = render("--size", "128")[0]
-    for extra in (["--letters"], ["--scale-bar"], ["--caption", "T12"]):
-        drawn = render("--size", "128", *extra)[0]
-        assert (drawn != plain).any() and not lit(drawn)[60:68, 60:68].any()
+@pytest.mark.parametrize("option", [["--letters"], ["--scale-bar"], ["--caption", "T12"]], ids=lambda words: words[0])
+def test_annotation_is_drawn_beside_the_middle_of_the_picture(option: list[str], render: Renders) -> None:
+    plain, _ = render("--size", "128")
+
+    drawn, _ = render("--size", "128", *option)
+
+    assert (drawn != plain).any()
+    assert not is_lit(drawn)[60:68, 60:68].any()
 
 
-def test_turntable_writes_a_gif_or_a_folder_of_frames(render: Renders) -> None:
+def test_turntable_into_a_gif_has_its_frames_and_bytes_in_the_report(render: Renders) -> None:
     report = render.report("--turntable", render.folder / "a.gif", "--frames", "3", "--fps", "10")
+
+    turntable = report["turntable"]
+    assert (turntable["frames"], turntable["fps"]) == (3, 10.0)
+    assert turntable["output"] == {"format": "gif", "bytes": (render.folder / "a.gif").stat().st_size}
+    assert Image.open(render.folder / "a.gif").n_frames == 3
     assert report["pictures"] == []
-    assert report["turntable"]["output"] == {"format": "gif", "bytes": (render.folder / "a.gif").stat().st_size}
-    assert (report["turntable"]["frames"], report["turntable"]["fps"]) == (3, 10.0)
-    picture: Any = Image.open(render.folder / "a.gif")
-    assert picture.n_frames == 3
-    report = render("--turntable", render.folder / "frames", "--frames", "4")[1]
+
+
+def test_turntable_into_a_folder_has_frames_from_all_sides(render: Renders) -> None:
+    _, report = render("--turntable", render.folder / "frames", "--frames", "4")
+
+    assert report["turntable"]["output"]["format"] == "folder"
     names = sorted(path.name for path in (render.folder / "frames").iterdir())
     assert names == [f"frame_{number:04d}.png" for number in range(4)]
-    frames = [np.asarray(Image.open(render.folder / "frames" / name)) for name in names]
-    assert [side_of(lit(frame))[0] for frame in (frames[0], frames[2])] == ["right", "left"]
-    assert report["turntable"]["output"]["format"] == "folder"
+    front, _, back, _ = (np.asarray(Image.open(render.folder / "frames" / name)) for name in names)
+    assert (side_of(is_lit(front))[0], side_of(is_lit(back))[0]) == ("right", "left")
 
 
-def test_slabs_make_the_same_picture(render: Renders) -> None:
-    whole = render()[0]
-    parts, report = render("--memory", "100kB")
+def test_picture_within_little_memory_is_that_of_the_whole_volume(render: Renders) -> None:
+    whole, _ = render()
+
+    in_slabs, report = render("--memory", "100kB")
+
     assert report["memory_allowed_bytes"] == 100_000
-    assert np.abs(whole.astype(int) - parts).max() <= 2
+    assert np.abs(whole.astype(int) - in_slabs).max() <= 2  # of 255: rounding at the borders of slabs
 
 
 def test_voxels_outside_the_field_of_view_are_masked_before_rendering(render: Renders) -> None:
@@ -342,18 +424,23 @@ def test_voxels_outside_the_field_of_view_are_masked_before_rendering(render: Re
     assert any("outside of 5 mm" in warning for warning in report["warnings"])
 
 
-def test_volume_mode_and_files_are_printed_unless_quiet(render: Renders) -> None:
+def test_words_of_render_have_volume_mode_views_and_files(render: Renders) -> None:
     assert render.code("-o", render.folder / "a.png", "--view", "anterior,left", "--letters", "-v") == 0
-    captured = render.capsys.readouterr()
-    assert "17 slices of 31 x 25, spacing 0.8 x 1.1 x 1.5 mm" in captured.out
-    assert "mode dvr, preset bone" in captured.out
-    assert "anterior: 64 x 64" in captured.out and "a_left.png" in captured.out
-    assert "rendering" in captured.err
+
+    printed = render.capsys.readouterr()
+    assert "17 slices of 31 x 25, spacing 0.8 x 1.1 x 1.5 mm" in printed.out
+    assert "mode dvr, preset bone" in printed.out
+    assert "anterior: 64 x 64" in printed.out
+    assert "a_left.png" in printed.out
+    assert "rendering" in printed.err
+
+
+def test_quiet_render_prints_nothing(render: Renders) -> None:
     assert render.code("-o", render.folder / "a.png", "-q") == 0
     assert render.capsys.readouterr() == ("", "")
 
 
-def test_nothing_is_said_of_the_patient(render: Renders) -> None:
+def test_files_and_words_of_render_do_not_name_the_patient(render: Renders) -> None:
     outputs = [render.folder / name for name in ("a.png", "a.npy", "a.json", "a.apng")]
     picture, depth, report, turntable = outputs
     assert render.code("-o", picture, "--depth", depth, "--report", report, "--turntable", turntable,
@@ -364,7 +451,9 @@ def test_nothing_is_said_of_the_patient(render: Renders) -> None:
 
 
 @pytest.mark.parametrize(("preset", "warns"), [("skin", True), ("bone", False), ("x-ray", False)])
-def test_a_face_is_warned_of(preset: str, warns: bool, render: Renders) -> None:
+def test_picture_of_skin_alone_is_warned_of_as_one_that_can_show_a_face(
+    preset: str, warns: bool, render: Renders
+) -> None:
     report = render("--preset", preset)[1]
     assert any("can show a face" in warning for warning in report["warnings"]) == warns
 
@@ -437,11 +526,10 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("name", WRONG)
-def test_wrong_arguments_are_one_line_and_leave_nothing(
-    name: str, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("extra", "code", "words"), WRONG.values(), ids=WRONG)
+def test_wrong_argument_of_render_is_refused_in_one_line_and_leaves_nothing(
+    extra: list[str], code: int, words: str, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    extra, code, words = WRONG[name]
     out = tmp_path / "out"
     out.mkdir()
     (tmp_path / "far.txt").write_text("0 0 9000\n0 0 9100\n")
@@ -457,8 +545,14 @@ def test_wrong_arguments_are_one_line_and_leave_nothing(
     assert list(out.iterdir()) == []
 
 
-def test_nothing_to_write_is_wrong_usage(ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_render_without_a_picture_or_turntable_is_refused(ct: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["render", str(ct)]) == 3
     assert "name a picture (-o out.png) or a turntable" in capsys.readouterr().err
-    assert main(["render", str(ct), "--turntable", str(tmp_path / "a.gif"), "--depth", str(tmp_path / "d.npy")]) == 3
+
+
+def test_depths_of_a_turntable_without_a_picture_are_refused(
+    ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = ["--turntable", str(tmp_path / "a.gif"), "--depth", str(tmp_path / "d.npy")]
+    assert main(["render", str(ct), *files]) == 3
     assert "belong to a picture" in capsys.readouterr().err

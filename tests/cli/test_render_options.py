@@ -28,7 +28,7 @@ def parser() -> Parser:
 
 
 @pytest.mark.parametrize("name", GIVEN_TWICE)
-def test_options_that_may_be_given_again_make_a_list(name: str, parser: Parser) -> None:
+def test_option_of_render_that_is_given_twice_makes_a_list(name: str, parser: Parser) -> None:
     texts, values = GIVEN_TWICE[name]
     option = f"--{name.replace('_', '-')}"
     (action,) = (action for action in parser._actions if option in action.option_strings)
@@ -38,7 +38,7 @@ def test_options_that_may_be_given_again_make_a_list(name: str, parser: Parser) 
     assert str(action.help).endswith("; may be given again")
 
 
-def test_no_encoder_is_said_before_anything_is_read(
+def test_mp4_without_an_encoder_is_refused_before_the_input_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Printer
 ) -> None:
     from clrecon.rendering import movies
@@ -61,7 +61,7 @@ def test_no_encoder_is_said_before_anything_is_read(
         (["-o", "a.gif"], (".gif", "--turntable", ".png")),
     ],
 )
-def test_a_message_names_the_option_that_was_meant(
+def test_wrong_option_of_render_is_refused_with_the_one_that_was_meant(
     arguments: list[str], facts: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Printer
 ) -> None:
     monkeypatch.chdir(tmp_path)

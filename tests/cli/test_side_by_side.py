@@ -53,21 +53,24 @@ def make_targets(folder: Path, extension: str) -> list[Path]:
     return targets
 
 
-def figures(value: Any) -> Any:
+def without_unequal_facts(value: Any) -> Any:
     """A report without what differs from run to run."""
     if isinstance(value, dict):
-        return {key: figures(own) for key, own in value.items() if key not in UNEQUAL}
-    return [figures(own) for own in value] if isinstance(value, list) else value
+        return {key: without_unequal_facts(own) for key, own in value.items() if key not in UNEQUAL}
+    return [without_unequal_facts(own) for own in value] if isinstance(value, list) else value
 
 
-def made(target: Path) -> tuple[str, Any]:
+def read_output(target: Path) -> tuple[str, Any]:
+    """The checksum of a mesh, and its report without what differs from run to run."""
     text = target.with_suffix(".json").read_text().replace(str(target.parent), "")
-    return hashlib.sha256(target.read_bytes()).hexdigest(), figures(json.loads(text))
+    return hashlib.sha256(target.read_bytes()).hexdigest(), without_unequal_facts(json.loads(text))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("extension", daily(1, [".stl", ".vtp"]))
-def test_rows_60_and_72_every_run_writes_the_same_bytes(device, ct: Path, tmp_path: Path, extension: str) -> None:
+def test_rows_60_and_72_mesh_and_report_are_the_same_with_other_threads_locale_time_zone_and_umask(
+    device, ct: Path, tmp_path: Path, extension: str
+) -> None:
     plain, odd = make_targets(tmp_path, extension)
     finish(start(ct, plain, device))
     finish(
@@ -85,12 +88,14 @@ def test_rows_60_and_72_every_run_writes_the_same_bytes(device, ct: Path, tmp_pa
             PYTHONHASHSEED="1",
         )
     )
-    assert made(plain) == made(odd)
+    assert read_output(plain) == read_output(odd)
 
 
 @pytest.mark.release
 @pytest.mark.seconds
-def test_row_58_processes_share_a_device(device, ct: Path, tmp_path: Path) -> None:
+def test_row_58_two_processes_on_one_device_at_once_write_the_same_mesh_and_report(
+    device, ct: Path, tmp_path: Path
+) -> None:
     """Both begin with an empty cache of kernels."""
     cache = tmp_path / "cache"
     cache.mkdir(mode=0o700)
@@ -99,4 +104,4 @@ def test_row_58_processes_share_a_device(device, ct: Path, tmp_path: Path) -> No
     processes = [start(ct, target, device, **variables) for target in targets]
     for process in processes:
         finish(process)
-    assert made(targets[0]) == made(targets[1])
+    assert read_output(targets[0]) == read_output(targets[1])

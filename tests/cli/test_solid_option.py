@@ -11,6 +11,9 @@ import pytest
 from clrecon.cli.main import main
 from clrecon.geometry import Volume
 
+SOLID_ML = 1.1 * 4 / 3 * np.pi * 18.0**3 / 1000
+"""The volume within the surface at 400 HU of the egg, 36 mm wide and 1.1 times as long."""
+
 
 @pytest.fixture(scope="module")
 def bone(tmp_path_factory):
@@ -27,40 +30,47 @@ def bone(tmp_path_factory):
     return path
 
 
-def run(*arguments: object, device=None) -> int:
+def mesh_egg(bone, folder, *options: object, device=None) -> int:
+    """Mesh the egg to a.stl with further options; return the exit code."""
     given = [] if device is None else ["--device", device.index]
-    return main(["mesh", *map(str, (*arguments, *given))])
+    return main(["mesh", *map(str, (bone, "-o", folder / "a.stl", *options, *given))])
 
 
-def test_solid_fills_and_says_how_much(device, bone, tmp_path, printed):
-    reports = {}
-    for option in ("--no-solid", "--solid"):
-        path = tmp_path / f"{option}.json"
-        assert run(bone, "-o", tmp_path / "a.stl", "--hu", 400, option, "--report", path, device=device) == 0
-        reports[option] = json.loads(path.read_text())
-    said = printed()
-    assert "solid" not in reports["--no-solid"]["volume"]
-    facts = reports["--solid"]["volume"]["solid"]
-    said.assert_output(round(facts["filled_ml"], 1), round(100 * facts["filled_share"], 0))
-    true_ml = 1.1 * 4 / 3 * np.pi * 18.0**3 / 1000
-    assert reports["--solid"]["volume_ml"] == pytest.approx(true_ml, rel=0.01)
-    assert reports["--no-solid"]["volume_ml"] < 0.65 * true_ml
-    assert reports["--solid"]["seconds"]["solid"] > 0.0
-    assert [gate for gate in reports["--solid"]["gates"] if gate["ok"] is False] == []
+def report_of_egg(bone, folder, *options: object, device) -> dict:
+    assert mesh_egg(bone, folder, "--hu", 400, *options, "--report", folder / "r.json", device=device) == 0
+    return json.loads((folder / "r.json").read_text())
+
+
+def test_solid_mesh_of_a_hollow_egg_has_its_whole_volume_and_passes_its_gates(device, bone, tmp_path):
+    report = report_of_egg(bone, tmp_path, "--solid", device=device)
+
+    assert report["volume_ml"] == pytest.approx(SOLID_ML, rel=0.01)  # voxels of 1 mm
+    assert report["seconds"]["solid"] > 0.0
+    assert [gate["name"] for gate in report["gates"] if gate["ok"] is False] == []
+
+
+def test_mesh_of_a_hollow_egg_that_is_not_solid_has_the_volume_of_its_wall(device, bone, tmp_path):
+    report = report_of_egg(bone, tmp_path, "--no-solid", device=device)
+
+    wall_ml = SOLID_ML - 1.1 * 4 / 3 * np.pi * 14.0**3 / 1000
+    assert report["volume_ml"] == pytest.approx(wall_ml, rel=0.03)
+    assert "solid" not in report["volume"]
+
+
+def test_words_of_a_solid_mesh_have_the_volume_and_share_that_was_filled(device, bone, tmp_path, printed):
+    report = report_of_egg(bone, tmp_path, "--solid", device=device)
+
+    facts = report["volume"]["solid"]
+    printed().assert_output(round(facts["filled_ml"], 1), round(100 * facts["filled_share"], 0))
 
 
 @pytest.mark.release
 @pytest.mark.seconds
-def test_for_print_is_solid_unless_it_shall_not_be(device, bone, tmp_path, printed):
-    ml = {}
-    for option in ([], ["--no-solid"]):
-        path = tmp_path / "r.json"
-        code = run(
-            bone, "-o", tmp_path / "a.stl", "--for", "print", "--hu", 400, *option, "--report", path, device=device
-        )
-        assert code == 0, printed()
-        ml[bool(option)] = json.loads(path.read_text())["volume_ml"]
-    assert ml[False] > 1.5 * ml[True]
+def test_print_of_a_hollow_egg_is_solid_unless_it_is_asked_to_be_hollow(device, bone, tmp_path):
+    solid = report_of_egg(bone, tmp_path, "--for", "print", device=device)
+    hollow = report_of_egg(bone, tmp_path, "--for", "print", "--no-solid", device=device)
+
+    assert solid["volume_ml"] > 1.5 * hollow["volume_ml"]  # the hollow is 14 of 18 mm wide
 
 
 @pytest.mark.parametrize(
@@ -75,8 +85,9 @@ def test_for_print_is_solid_unless_it_shall_not_be(device, bone, tmp_path, print
         (["--solid", "--seal", "2mm"], "'2mm' is no number: write the length in mm, without a unit"),
     ],
 )
-def test_options_that_exclude_solid_are_refused_in_one_line(options, words, bone, tmp_path, capsys):
-    assert run(bone, "-o", tmp_path / "a.stl", *options) == 3
+def test_option_that_excludes_solid_is_refused_in_one_line(options, words, bone, tmp_path, capsys):
+    assert mesh_egg(bone, tmp_path, *options) == 3
     error = capsys.readouterr().err
-    assert words in error and error.count("\n") == 1
+    assert words in error
+    assert error.count("\n") == 1
     assert not list(Path(tmp_path).iterdir())

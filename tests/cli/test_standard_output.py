@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import subprocess
 import sys
+import zipfile
 
+import numpy as np
 import pytest
 from variants import daily_rows
 
@@ -26,24 +29,44 @@ def run(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
 
 
-@pytest.mark.parametrize(
-    ("name", "start"), daily_rows(1, [("-", None), ("-.ply", b"ply\n"), ("-.glb", b"glTF"), ("-.3mf", b"PK")])
-)
-def test_a_mesh_goes_to_standard_output_as_the_file_has_it(device, ct, tmp_path, capfdbinary, name, start):
-    common = ("mesh", ct, "--hu", 200, "--device", device.index)
-    extension = ".stl" if name == "-" else name[1:]
-    assert run(*common, "-o", tmp_path / f"a{extension}") == 0
+@pytest.mark.parametrize(("output", "extension"), daily_rows(1, [("-", ".stl"), ("-.ply", ".ply"), ("-.glb", ".glb")]))
+def test_mesh_on_standard_output_has_the_bytes_of_a_file_in_its_format(
+    device, ct, tmp_path, capfdbinary, output, extension
+):
+    command = ("mesh", ct, "--hu", 200, "--device", device.index)
+    assert run(*command, "-o", tmp_path / f"a{extension}") == 0
     capfdbinary.readouterr()
-    assert run(*common, "-o", name) == 0
-    out, err = capfdbinary.readouterr()
-    assert out == (tmp_path / f"a{extension}").read_bytes() or name == "-.3mf"  # which holds the time
-    assert start is None or out.startswith(start)
-    assert b"wrote    standard output, " in err and b"clrecon-" not in err and b"input    " in err
-    assert (b"metres, Y up" in err) == (name == "-.glb")
+
+    assert run(*command, "-o", output) == 0
+
+    streamed, _ = capfdbinary.readouterr()
+    assert streamed == (tmp_path / f"a{extension}").read_bytes()
 
 
 @pytest.mark.release
-def test_a_report_goes_to_standard_output_and_the_remarks_to_standard_error(device, ct, tmp_path, printed):
+def test_mesh_on_standard_output_in_3mf_is_a_package_of_it(device, ct, capfdbinary):
+    assert run("mesh", ct, "--hu", 200, "--device", device.index, "-o", "-.3mf") == 0
+
+    streamed, _ = capfdbinary.readouterr()
+    with zipfile.ZipFile(io.BytesIO(streamed)) as package:  # whose bytes hold the time
+        assert b"<triangle " in package.read("3D/3dmodel.model")
+
+
+@pytest.mark.parametrize(("output", "is_in_metres"), daily_rows(1, [("-", False), ("-.glb", True)]))
+def test_words_of_a_mesh_on_standard_output_go_to_standard_error_with_its_unit(
+    device, ct, capfdbinary, output, is_in_metres
+):
+    assert run("mesh", ct, "--hu", 200, "--device", device.index, "-o", output) == 0
+
+    _, words = capfdbinary.readouterr()
+    assert b"input    " in words
+    assert b"wrote    standard output, " in words
+    assert b"clrecon-" not in words  # the name of the file behind it
+    assert (b"metres, Y up" in words) == is_in_metres
+
+
+@pytest.mark.release
+def test_report_on_standard_output_is_that_in_a_file_and_words_go_to_standard_error(device, ct, tmp_path, printed):
     common = ("mesh", ct, "--hu", 200, "-o", tmp_path / "a.stl", "--device", device.index)
     assert run(*common, "--report", tmp_path / "r.json") == 0
     written = json.loads((tmp_path / "r.json").read_text())
@@ -58,22 +81,30 @@ def test_a_report_goes_to_standard_output_and_the_remarks_to_standard_error(devi
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("arguments", "start"),
     [
-        ("cloud", "--hu", 200, "-o", "-"),
-        ("cloud", "--hu", 200, "-o", "-.xyz"),
-        ("export", "-o", "-.nrrd"),
-        ("render", "--size", "40x40", "-o", "-"),
+        (("cloud", "--hu", 200, "-o", "-"), b"ply"),
+        (("export", "-o", "-.nrrd"), b"NRRD"),
+        (("render", "--size", "40x40", "-o", "-"), b"\x89PNG"),
     ],
 )
-def test_results_of_other_commands_go_to_standard_output(device, ct, capfdbinary, arguments):
-    command, *rest = arguments
+def test_result_of_another_command_goes_to_standard_output(device, ct, capfdbinary, arguments, start):
+    command, *options = arguments
     at = [] if command == "export" else ["--device", device.index]
-    assert run(command, ct, *rest, *at) == 0
-    out, err = capfdbinary.readouterr()
-    starts = {"-.nrrd": b"NRRD", "-.xyz": b""}.get(rest[-1], b"ply" if command == "cloud" else b"\x89PNG")
-    assert out.startswith(starts) and len(out) > 500
-    assert b"wrote    " in err
+
+    assert run(command, ct, *options, *at) == 0
+
+    streamed, words = capfdbinary.readouterr()
+    assert streamed.startswith(start)
+    assert len(streamed) > 500
+    assert b"wrote    " in words
+
+
+def test_cloud_on_standard_output_in_xyz_is_three_coordinates_a_line(device, ct, capfdbinary):
+    assert run("cloud", ct, "--hu", 200, "-o", "-.xyz", "--device", device.index) == 0
+
+    streamed, _ = capfdbinary.readouterr()
+    assert np.loadtxt(io.BytesIO(streamed))[:, :3].shape[0] > 100
 
 
 @pytest.mark.parametrize(
@@ -98,7 +129,7 @@ def test_results_of_other_commands_go_to_standard_output(device, ct, capfdbinary
         (("mesh", "-o", "-", "--hu", "5000"), 2, "the volume runs from"),
     ],
 )
-def test_outputs_that_one_stream_cannot_hold_are_refused_in_one_line(ct, capfdbinary, arguments, code, words):
+def test_output_that_one_stream_cannot_hold_is_refused_in_one_line(ct, capfdbinary, arguments, code, words):
     command, *rest = arguments
     assert run(command, ct, *rest) == code
     out, err = capfdbinary.readouterr()
@@ -147,30 +178,36 @@ def test_report_of_each_command_goes_to_standard_output(
     assert not any(path.name == "-" for path in tmp_path.iterdir())
 
 
-def test_the_table_of_labels_goes_to_standard_output(spine, capfdbinary):
+def test_table_of_labels_goes_to_standard_output_with_a_line_for_each(spine, capfdbinary):
     assert run("stats", spine, "--labels", spine / "levels.nrrd", "--csv", "-") == 0
     out, err = capfdbinary.readouterr()
     assert out.startswith(b"number,name,") and out.count(b"\n") == 4  # the head, and a line for each label
     assert b"wrote    standard output" in err
 
 
-def test_a_label_map_goes_to_standard_output_without_a_picture(spine, capfdbinary):
+def test_label_map_goes_to_standard_output_without_a_picture(spine, capfdbinary):
     assert run("vertebrae", spine, "-o", "-") in (0, 8)  # 8: a vertebra of coarse voxels may be unsure
     out, err = capfdbinary.readouterr()
     assert out[:2] == b"\x1f\x8b"  # a NIfTI in gzip
     assert b"wrote    standard output" in err and b"picture" not in err
 
 
-def test_a_failed_job_streams_no_report_and_a_terminal_gets_no_bytes(ct, tmp_path, capsys, monkeypatch):
+def test_report_of_a_failed_job_is_not_on_standard_output(ct, tmp_path, printed):
     assert run("mesh", ct, "-o", tmp_path / "a.stl", "--hu", 5000, "--report", "-") == 2
-    assert capsys.readouterr().out == ""
+    assert printed().output_lines == 0
+
+
+def test_mesh_for_a_terminal_is_refused(ct, capsys, monkeypatch):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+
     assert run("mesh", ct, "-o", "-") == 3
-    said = capsys.readouterr()
-    assert "standard output is a terminal" in said.err and said.out == ""
+
+    printed = capsys.readouterr()
+    assert "standard output is a terminal" in printed.err
+    assert printed.out == ""
 
 
-def test_a_reader_that_closes_early_is_no_error(device, ct):
+def test_reader_that_closes_standard_output_early_is_no_error(device, ct):
     command = [
         sys.executable,
         "-m",
@@ -196,7 +233,9 @@ def test_a_reader_that_closes_early_is_no_error(device, ct):
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
 @pytest.mark.parametrize("command", ["mesh", "stats"])
-def test_a_full_disk_behind_standard_output_is_no_written_file(device, ct, spine, command):
+def test_result_for_a_full_disk_behind_standard_output_ends_with_6_and_is_not_said_to_be_written(
+    device, ct, spine, command
+):
     """A table fits the buffer of the stream: its error comes with the last flush."""
     given = {
         "mesh": [ct, "--hu", 200, "-o", "-", "--device", device.index],
@@ -209,7 +248,7 @@ def test_a_full_disk_behind_standard_output_is_no_written_file(device, ct, spine
     assert "wrote" not in done.stderr and done.stderr.count("cannot write to standard output") == 1
 
 
-def test_each_streamed_command_has_the_option():
+def test_each_command_with_a_result_for_standard_output_exists():
     from clrecon.cli.main import COMMANDS
 
     assert set(console.STREAMED) <= set(COMMANDS)

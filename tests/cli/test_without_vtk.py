@@ -22,24 +22,43 @@ def without_vtk(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, name, None)
 
 
-def test_meshes_are_smoothed_decimated_printed_compared_and_written(
-    device: Any, without_vtk: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def ct_without_vtk(without_vtk: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A CT in the folder ct of the working folder, where VTK cannot be imported."""
     with pytest.raises(ModuleNotFoundError):
         from vtkmodules import vtkCommonCore  # noqa: F401
     monkeypatch.chdir(tmp_path)
     write_phantom(tmp_path / "ct", PhantomSettings(size=(80, 80), slices=30, spacing=(2.4, 2.4, 3.0)))
-    for command in (
+
+
+@pytest.mark.usefixtures("ct_without_vtk")
+@pytest.mark.parametrize(
+    "command",
+    [
         "mesh ct -o a.vtp --smooth",
         "mesh ct -o b.ply --decimate 0.5",
         "mesh ct -o c.stl --for print",
         "cloud ct -o d.vtp",
-        "distance b.ply a.vtp -o e.ply --picture e.png",
-    ):
-        assert main([*command.split(), *([] if "distance" in command else ["--device", str(device.index)])]) == 0, (
-            command
-        )
+    ],
+)
+def test_command_that_refines_or_writes_files_of_vtk_works_without_it(device: Any, command: str) -> None:
+    assert main([*command.split(), "--device", str(device.index)]) == 0
+
+
+@pytest.mark.usefixtures("ct_without_vtk")
+def test_distances_between_meshes_are_measured_and_drawn_without_vtk(device: Any) -> None:
+    for output in ("a.vtp", "b.ply"):
+        assert main(["mesh", "ct", "-o", output, "--decimate", "0.5", "--device", str(device.index), "-q"]) == 0
+    assert main("distance b.ply a.vtp -o e.ply --picture e.png".split()) == 0
+
+
+@pytest.mark.usefixtures("ct_without_vtk")
+def test_nearest_points_and_rays_of_a_mesh_are_found_without_vtk(device: Any) -> None:
+    assert main(["mesh", "ct", "-o", "b.ply", "--device", str(device.index), "-q"]) == 0
     mesh = read_mesh("b.ply")
-    assert mesh.closest_points(mesh.vertices[:3])[1] == pytest.approx(0.0, abs=1e-6)
-    middle = mesh.vertices[mesh.triangles[:3]].mean(axis=1)
-    assert np.isfinite(mesh.ray(middle + [0.0, 0.0, 500.0], middle - (middle + [0.0, 0.0, 500.0]))).all()
+
+    _, distances = mesh.closest_points(mesh.vertices[:3])[:2]
+    assert distances == pytest.approx(0.0, abs=1e-6)  # of vertices in float32
+    middles = mesh.vertices[mesh.triangles[:3]].mean(axis=1)
+    above = middles + [0.0, 0.0, 500.0]
+    assert np.isfinite(mesh.ray(above, middles - above)).all()

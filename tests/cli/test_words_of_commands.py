@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from printed_text import Printer
@@ -35,12 +36,12 @@ def test_help_of_mesh_has_its_options(printed: Printer) -> None:
     printed().assert_output("--keep-largest")
 
 
-def test_help_of_help_is_there() -> None:
+def test_help_of_the_command_help_ends_with_0() -> None:
     assert main(["help", "help"]) == 0
 
 
 @pytest.mark.parametrize("option", ["-V", "--version"])
-def test_version_has_a_short_option(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_is_printed_by_its_long_and_its_short_option(option: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([option]) == 0
     assert capsys.readouterr().out == f"clrecon {package_version()}\n"
 
@@ -68,7 +69,7 @@ def test_version_has_a_short_option(option: str, capsys: pytest.CaptureFixture[s
         ("cloud ct -o a.pyl", "did you mean .ply?"),
     ],
 )
-def test_a_misspelt_word_is_guessed(
+def test_misspelt_word_of_a_command_is_refused_with_the_nearest_one(
     arguments: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -79,37 +80,56 @@ def test_a_misspelt_word_is_guessed(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_word_like_none_is_not_guessed(printed: Printer) -> None:
+def test_word_like_no_command_is_refused_with_all_of_them_and_no_guess(printed: Printer) -> None:
     assert main(["xyzzy"]) == 3
+
     said = printed()
     said.assert_error(*COMMANDS)
     assert "mean" not in said.everything
-    assert guess_word("qqq", ["bone"]) == guess_word(3, ["3"]) == guess_word("b" * 99, ["b" * 98]) == ""
-    assert guess_word("BNOE", ["bone", "skin"]) == " (did you mean bone?)"
 
 
-def test_options_after_two_dashes_are_names(tmp_path: Path, printed: Printer) -> None:
+@pytest.mark.parametrize(
+    ("word", "words", "guess"),
+    [
+        pytest.param("BNOE", ["bone", "skin"], " (did you mean bone?)", id="letters in another order and case"),
+        pytest.param("qqq", ["bone"], "", id="no letter of it"),
+        pytest.param(3, ["3"], "", id="no text"),
+        pytest.param("b" * 99, ["b" * 98], "", id="longer than a word"),
+    ],
+)
+def test_nearest_word_is_guessed_where_it_is_near(word: Any, words: list[str], guess: str) -> None:
+    assert guess_word(word, words) == guess
+
+
+def test_word_after_two_dashes_is_a_name_and_no_option(tmp_path: Path, printed: Printer) -> None:
     assert main(["info", "--", "--kep"]) == 2
     printed().assert_error("--kep")
 
 
-def test_presets_are_found_in_any_case() -> None:
-    assert find_level("Cortical-BONE") is find_level("cortical-bone")
-    assert find_look("X-Ray") is find_look("x-ray")
-    assert MeshSettings(preset="BONE").preset_used == "bone"
-    assert MeshSettings(preset="BONE").levels == MeshSettings(preset="bone").levels
-    settings = RenderSettings.of(preset="SPINE")
-    assert (settings.mode, settings.style) == ("dvr", RenderSettings.of(preset="spine").style)
-    for find in (find_level, find_look):
-        with refused(UsageError, "unknown"):
-            find(None)  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("find_preset", "name"), [(find_level, "Cortical-BONE"), (find_look, "X-Ray")], ids=["iso value", "look"]
+)
+def test_preset_is_found_in_any_case(find_preset: Any, name: str) -> None:
+    assert find_preset(name) is find_preset(name.lower())
 
 
-def test_counts_have_the_noun_of_their_number() -> None:
-    assert [count_of(number, "slice") for number in (0, 1, 2, 1200)] == [
-        "0 slices",
-        "1 slice",
-        "2 slices",
-        "1,200 slices",
-    ]
+@pytest.mark.parametrize("find_preset", [find_level, find_look], ids=["iso value", "look"])
+def test_preset_that_is_no_text_is_refused(find_preset: Any) -> None:
+    with refused(UsageError, "unknown"):
+        find_preset(None)
+
+
+def test_settings_with_a_preset_in_capitals_are_those_in_small_letters() -> None:
+    mesh, picture = MeshSettings(preset="BONE"), RenderSettings.of(preset="SPINE")
+
+    assert (mesh.preset_used, mesh.levels) == ("bone", MeshSettings(preset="bone").levels)
+    assert (picture.mode, picture.style) == ("dvr", RenderSettings.of(preset="spine").style)
+
+
+@pytest.mark.parametrize(("count", "words"), [(0, "0 slices"), (1, "1 slice"), (2, "2 slices"), (1200, "1,200 slices")])
+def test_noun_of_a_count_is_singular_for_1_alone(count: int, words: str) -> None:
+    assert count_of(count, "slice") == words
+
+
+def test_noun_of_a_count_has_the_given_plural() -> None:
     assert count_of(2, "body", "bodies") == "2 bodies"

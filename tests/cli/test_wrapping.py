@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from clrecon.cli import console
@@ -19,19 +21,40 @@ def narrow(monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
 
 
-def test_lines_break_between_words_and_go_on_under_their_text(narrow):
-    line = "surface  200 HU (as given), closed at the border of the volume, and more words that are too long for it"
-    parts = console.fit(line, Terminal()).split("\n")
-    assert max(map(len, parts)) <= 60 and len(parts) == 2
-    assert parts[1].startswith(" " * 9) and parts[1][9] != " "
-    assert " ".join(part.strip() for part in parts) == line
-    assert console.fit(line, None) == line and console.fit("short", Terminal()) == "short"
-    styled = "\x1b[1m" + "table  " * 20
-    assert console.fit(styled, Terminal()) == styled
-    path = "wrote    /" + "x" * 80
-    assert console.fit(path, Terminal()).replace("\n", " ").split() == path.split()  # a word stays whole
-    warning = "clrecon: warning: " + "word " * 20
-    assert all(part.startswith("  word") for part in console.fit(warning, Terminal()).split("\n")[1:])
+LONG_LINE = "surface  200 HU (as given), closed at the border of the volume, and more words that are too long for it"
+
+
+def test_long_line_is_broken_between_words_and_goes_on_under_its_text(narrow):
+    first, second = console.fit(LONG_LINE, Terminal()).split("\n")
+
+    assert max(len(first), len(second)) <= 60
+    assert first.startswith("surface  ")
+    under_the_text = " " * len("surface  ")
+    assert second.startswith(under_the_text) and not second.startswith(under_the_text + " ")
+    assert f"{first} {second.strip()}" == LONG_LINE
+
+
+def test_long_warning_goes_on_two_letters_in(narrow):
+    first, *others = console.fit("clrecon: warning: " + "word " * 20, Terminal()).split("\n")
+    assert others
+    assert all(line.startswith("  word") for line in others)
+
+
+def test_word_longer_than_the_terminal_stays_whole(narrow):
+    path = "/" + "x" * 80
+    assert console.fit(f"wrote    {path}", Terminal()).split() == ["wrote", path]
+
+
+@pytest.mark.parametrize(
+    ("text", "stream"),
+    [
+        pytest.param(LONG_LINE, None, id="into a file"),
+        pytest.param("short", Terminal(), id="short"),
+        pytest.param("\x1b[1m" + "table  " * 20, Terminal(), id="with colours"),
+    ],
+)
+def test_line_that_needs_no_break_stays_as_it_is(text, stream, narrow):
+    assert console.fit(text, stream) == text
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
@@ -45,18 +68,31 @@ def test_help_fits_60_columns_and_its_examples_can_be_pasted(command, narrow, ca
             assert following.startswith("    ")
 
 
-def test_texts_of_help_are_broken_anew_as_a_whole(narrow, capsys):
-    """Lines that were full are one text: no short rest of a line before the next."""
+def is_filled(lines: list[str], columns: int) -> bool:
+    """Whether the first word of each line would not have fitted into the line before it."""
+    return all(len(line) + 1 + len(after.split()[0]) > columns for line, after in pairwise(lines))
+
+
+def test_paragraph_of_help_is_broken_anew_as_a_whole_in_a_narrow_terminal(narrow, capsys):
     assert main(["view", "--help-all"]) == 0
     lines = capsys.readouterr().out.split("\n")
-    at = next(place for place, line in enumerate(lines) if line.startswith("The page of --html is one file"))
-    text = lines[at : lines.index("", at)]
-    assert len(text) > 3 and all(line[0] != " " for line in text)
-    assert all(len(line) + 1 + len(after.split()[0]) > 60 for line, after in zip(text, text[1:], strict=False))
-    at = next(place for place, line in enumerate(lines) if line.startswith("exit codes: 0 done"))
-    codes = [line for line in lines[at:] if line]
-    assert all(line.startswith(" " * 12) for line in codes[1:])
-    assert all(len(line) + 1 + len(after.split()[0]) > 60 for line, after in zip(codes, codes[1:], strict=False))
+
+    start = next(place for place, line in enumerate(lines) if line.startswith("The page of --html is one file"))
+    paragraph = lines[start : lines.index("", start)]
+    assert len(paragraph) > 3
+    assert all(line[0] != " " for line in paragraph)
+    assert is_filled(paragraph, 60)
+
+
+def test_exit_codes_of_help_go_on_under_their_text_in_a_narrow_terminal(narrow, capsys):
+    assert main(["view", "--help-all"]) == 0
+    lines = capsys.readouterr().out.split("\n")
+
+    start = next(place for place, line in enumerate(lines) if line.startswith("exit codes: 0 done"))
+    codes = [line for line in lines[start:] if line]
+    assert len(codes) > 1
+    assert all(line.startswith(" " * len("exit codes: ")) for line in codes[1:])
+    assert is_filled(codes, 60)
 
 
 @pytest.mark.parametrize(
@@ -67,19 +103,21 @@ def test_texts_of_help_are_broken_anew_as_a_whole(narrow, capsys):
         ("inside", ["  solid  ", "  dense  ", "  trabecular  ", "  canal  "]),
     ],
 )
-def test_each_row_of_a_list_keeps_a_line_of_its_own(command, rows, narrow, capsys):
+def test_each_row_of_a_list_in_help_begins_a_line(command, rows, narrow, capsys):
     assert main([command, "--help-all"]) == 0
     lines = capsys.readouterr().out.split("\n")
-    for row in rows:
-        assert len([line for line in lines if line.startswith(row)]) == 1, row
+    assert {row: sum(line.startswith(row) for line in lines) for row in rows} == dict.fromkeys(rows, 1)
 
 
-def test_words_with_hyphens_stay_whole_and_prose_has_one_margin(narrow, capsys):
-    for command in ("mesh", "compare"):
-        assert main([command, "--help-all"]) == 0
-        lines = capsys.readouterr().out.split("\n")
-        assert not [line for line in lines if line.rstrip().endswith(("bilateral-", "soft-", "non-"))]
+@pytest.mark.parametrize("command", ["mesh", "compare"])
+def test_word_with_a_hyphen_stays_whole_in_a_narrow_help(command, narrow, capsys):
+    assert main([command, "--help-all"]) == 0
+    lines = capsys.readouterr().out.split("\n")
+    assert not [line for line in lines if line.rstrip().endswith(("bilateral-", "soft-", "non-"))]
+
+
+def test_prose_of_a_narrow_help_has_no_margin(narrow, capsys):
     assert main(["inside", "--help-all"]) == 0
     lines = capsys.readouterr().out.split("\n")
-    at = lines.index("measure dense and trabecular bone and canal of vertebrae, as")
-    assert lines[at + 1] == "meshes"
+    start = lines.index("measure dense and trabecular bone and canal of vertebrae, as")
+    assert lines[start + 1] == "meshes"

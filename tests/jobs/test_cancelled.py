@@ -48,7 +48,7 @@ def pick_calls(work: Callable[[Progress], object]) -> Calls:
 
 
 def cancel_at(work: Callable[[Progress], object], moment: tuple[str, int, int]) -> None:
-    """Run `work` until `moment`; what arrives must be the error that was raised files_in, not another in its place."""
+    """Run `work` until `moment`; what arrives must be the error that was raised there, not another in its place."""
     raised = clrecon.Cancelled(f"enough at {moment}")
     caller = threading.get_ident()
 

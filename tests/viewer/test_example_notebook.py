@@ -14,7 +14,7 @@ NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
 KINDS = {"list_series": "<table>", "volume": "<img", "mesh": "<iframe sandbox=", "extract_points": "<img"}
 
 
-def shown(notebook) -> list[tuple[str, dict[str, str]]]:
+def list_outputs(notebook) -> list[tuple[str, dict[str, str]]]:
     """The last line of each cell that shows something, and what it shows by type."""
     return [
         (cell.source.splitlines()[-1], output.data)
@@ -26,7 +26,7 @@ def shown(notebook) -> list[tuple[str, dict[str, str]]]:
 
 
 def check_outputs(notebook) -> None:
-    outputs = shown(notebook)
+    outputs = list_outputs(notebook)
     for name, start in KINDS.items():
         (html,) = [data["text/html"] for source, data in outputs if source == name or f"clrecon.{name}(" in source]
         assert start in html
@@ -47,7 +47,7 @@ def test_notebook_runs_and_shows_what_the_kept_one_shows(device):
         cell.outputs = [] if cell.cell_type == "code" else cell.get("outputs", [])
     nbclient.NotebookClient(fresh, timeout=300, kernel_name="python3", resources={"metadata": {"path": ROOT}}).execute()
     check_outputs(fresh)
-    assert [source for source, _ in shown(fresh)] == [source for source, _ in shown(kept)]
+    assert [source for source, _ in list_outputs(fresh)] == [source for source, _ in list_outputs(kept)]
     assert os.path.getsize(NOTEBOOK) < 2_000_000
 
 

@@ -49,7 +49,7 @@ def shows_bone(seen: np.ndarray) -> bool:
 
 
 @pytest.mark.release
-def test_window_turns_clips_and_steps_the_level(display, scan, tmp_path):
+def test_keys_and_slider_of_a_window_turn_clip_and_change_the_iso_value(display, scan, tmp_path):
     with open_view(display, [scan, "--window", "--hu", f"{ISO:g}"], tmp_path) as window:
         before = window.wait(shows_bone, "the surface")
         assert before.shape[:2] == SIZE[::-1]
@@ -68,7 +68,7 @@ def test_window_turns_clips_and_steps_the_level(display, scan, tmp_path):
 
 
 @pytest.mark.release
-def test_a_distance_is_measured_between_two_clicks(display, tmp_path):
+def test_distance_between_two_clicks_is_written_into_the_window(display, tmp_path):
     make_mesh().save(tmp_path / "ball.stl")
     with open_view(display, ["ball.stl", "--window"], tmp_path) as window:
         before = window.wait(shows_bone, "the ball")
@@ -111,14 +111,14 @@ def scene(device, monkeypatch):
 
 
 @pytest.mark.opencl
-def test_every_object_is_an_actor_of_one_scene(scene):
+def test_each_object_is_an_actor_of_the_scene_by_its_name(scene):
     actors = scene.plotter.renderer.actors
     assert {"scan 1", "front", "cloud 3", "labels 4 one", "labels 4 two"} <= set(actors)
     assert actors["cloud 3"].prop.point_size == 3
 
 
 @pytest.mark.opencl
-def test_the_scan_of_a_scene_is_its_isosurface(scene, device):
+def test_scan_in_a_scene_is_its_isosurface(scene, device):
     shown = scene.plotter.renderer.actors["scan 1"].mapper.dataset
     mesh = clrecon.extract_isosurface(make_scan(), ISO, device=device)
     np.testing.assert_array_equal(np.sort(shown.points, axis=0), np.sort(mesh.vertices, axis=0))
@@ -134,30 +134,48 @@ def test_scene_that_is_to_be_fitted_begins_on_the_bone(device):
 
 
 @pytest.mark.opencl
-def test_keys_of_a_scene_fit_the_scan_to_the_bone_and_colour_it(scene):
+def test_key_t_fits_the_scan_to_its_bone_and_back(scene):
     actor = scene.plotter.renderer.actors["scan 1"]
-    level = np.array(actor.mapper.dataset.points)
-    scene.keys["T"]()
-    assert not actor.mapper.scalar_visibility and not scene.plotter.scalar_bars.keys()
+    at_level = np.array(actor.mapper.dataset.points)
+
     scene.keys["t"]()
-    fitted = actor.mapper.dataset
-    assert np.linalg.norm(fitted.points - level, axis=1).mean() > 0.05
-    scene.keys["T"]()
-    assert actor.mapper.scalar_visibility and fitted.point_data.active_scalars_name == "thickness_mm"
-    assert list(scene.plotter.scalar_bars.keys()) == ["mm thick"]
+    fitted = np.array(actor.mapper.dataset.points)
     scene.keys["t"]()
-    assert not actor.mapper.scalar_visibility and not scene.plotter.scalar_bars.keys()
-    np.testing.assert_array_equal(actor.mapper.dataset.points, level)
+
+    assert np.linalg.norm(fitted - at_level, axis=1).mean() > 0.05  # mm
+    np.testing.assert_array_equal(actor.mapper.dataset.points, at_level)
 
 
 @pytest.mark.opencl
-def test_a_scene_is_first_seen_from_anterior(scene):
+def test_key_capital_t_colours_a_fitted_scan_by_its_thickness_with_a_scale(scene):
+    actor = scene.plotter.renderer.actors["scan 1"]
+
+    scene.keys["t"]()
+    scene.keys["T"]()
+
+    assert actor.mapper.scalar_visibility
+    assert actor.mapper.dataset.point_data.active_scalars_name == "thickness_mm"
+    assert list(scene.plotter.scalar_bars.keys()) == ["mm thick"]
+
+
+@pytest.mark.opencl
+@pytest.mark.parametrize("keys", ["T", "tTt"], ids=["never fitted", "no longer fitted"])
+def test_scan_that_is_not_fitted_is_not_coloured_by_its_thickness(keys, scene):
+    for key in keys:
+        scene.keys[key]()
+
+    assert not scene.plotter.renderer.actors["scan 1"].mapper.scalar_visibility
+    assert not scene.plotter.scalar_bars.keys()
+
+
+@pytest.mark.opencl
+def test_scene_is_first_seen_from_anterior(scene):
     camera = scene.plotter.camera
     assert camera.position[1] < camera.focal_point[1]
 
 
 @pytest.mark.opencl
-def test_keys_of_a_scene_put_widgets_on_and_off(scene):
+def test_keys_m_and_c_put_measure_and_clip_widgets_on_and_off(scene):
     for key in "mmcc":
         scene.keys[key]()
     assert scene.asked == [
@@ -171,7 +189,7 @@ def test_keys_of_a_scene_put_widgets_on_and_off(scene):
     [("3", 0, 1), ("4", 0, -1), ("5", 2, 1), ("6", 2, -1)],
     ids=["left", "right", "above", "below"],
 )
-def test_keys_of_a_scene_turn_the_view(scene, key, axis, sign):
+def test_key_of_a_side_turns_the_view_to_it(scene, key, axis, sign):
     scene.keys[key]()
     away = np.subtract(scene.plotter.camera.position, scene.plotter.camera.focal_point)
     assert np.argmax(np.abs(away)) == axis
@@ -187,7 +205,9 @@ def test_show_by_method_and_by_function_is_the_same_picture(monkeypatch):
     assert asked == [((volume,), {"iso_value": 250}), ((mesh,), {})]
 
 
-def refusal(arguments: list[str | Path], folder: Path, environment: dict[str, str], *before: str) -> tuple[int, str]:
+def run_refused_view(
+    arguments: list[str | Path], folder: Path, environment: dict[str, str], *before: str
+) -> tuple[int, str]:
     done = subprocess.run(
         [*before, sys.executable, "-m", "clrecon", "view", "--window", *map(str, arguments)],
         cwd=folder, env=environment, capture_output=True, text=True, timeout=60,
@@ -204,18 +224,18 @@ def check_refusal(found: tuple[int, str], words: str) -> None:
         assert way_out in complained
 
 
-def test_without_a_display_the_other_ways_are_said(tmp_path, monkeypatch):
+def test_window_without_a_display_is_refused_with_the_other_ways(tmp_path, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    check_refusal(refusal([tmp_path], tmp_path, dict(os.environ)), "there is no display here")
+    check_refusal(run_refused_view([tmp_path], tmp_path, dict(os.environ)), "there is no display here")
     with refused(NoDisplayError, "window", "DISPLAY"):
         clrecon.show(make_mesh())
 
 
 @pytest.mark.release
-def test_a_display_that_does_not_answer_is_said(tmp_path, monkeypatch):
+def test_window_on_a_display_that_does_not_answer_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":4711")
-    check_refusal(refusal([tmp_path], tmp_path, dict(os.environ)), "the display :4711 does not answer")
+    check_refusal(run_refused_view([tmp_path], tmp_path, dict(os.environ)), "the display :4711 does not answer")
 
 
 @pytest.mark.seconds
@@ -231,4 +251,4 @@ def test_without_opengl_no_process_dies_of_a_signal(display, tmp_path, monkeypat
     tried = subprocess.run([*before, "true"], capture_output=True)
     if tried.returncode:
         pytest.skip(f"libraries cannot be hidden here: {tried.stderr.decode()[-200:]}")
-    check_refusal(refusal([tmp_path], tmp_path, dict(os.environ), *before), "OpenGL does not work")
+    check_refusal(run_refused_view([tmp_path], tmp_path, dict(os.environ), *before), "OpenGL does not work")

@@ -38,7 +38,7 @@ def ball(camera: Camera, center=CENTRE, radius=RADIUS, color=(250, 40, 10)) -> R
 @pytest.mark.seconds
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("form", daily(1, ["points", "plane"]))
-def test_seen_by_its_own_camera_a_picture_in_a_scene_is_the_picture(plotter, camera, form):
+def test_picture_in_a_scene_is_itself_seen_by_its_own_camera(plotter, camera, form):
     made = ball(camera)
     made.image[..., 1] = np.arange(SIZE[1], dtype=np.uint8)[:, None]
     made.image[..., 2] = np.arange(SIZE[0], dtype=np.uint8)
@@ -50,43 +50,44 @@ def test_seen_by_its_own_camera_a_picture_in_a_scene_is_the_picture(plotter, cam
     assert Camera.from_pyvista(plotter).position == camera.position
 
 
-def test_a_camera_can_stay_where_it_is(plotter):
+def test_picture_added_to_a_scene_leaves_the_camera_where_it_is_on_request(plotter):
     plotter.camera = CAMERAS[1].orbit(30.0).to_pyvista()
     add_rendering(plotter, ball(CAMERAS[1]), move_camera=False)
     assert Camera.from_pyvista(plotter).position == CAMERAS[1].orbit(30.0).position
 
 
-def test_from_the_side_points_still_lie_on_the_ball(plotter):
+def test_points_of_a_picture_in_a_scene_lie_on_the_ball_that_it_shows(plotter):
     camera = CAMERAS[0]
     actor = add_rendering(plotter, ball(camera))
     points = np.asarray(actor.mapper.dataset.points)
     assert np.linalg.norm(points - CENTRE, axis=1) == pytest.approx(RADIUS, abs=tolerances.FLOAT32_POINT_MM)
 
 
-@pytest.mark.parametrize("camera", daily(1, CAMERAS))
-def test_a_mesh_and_a_picture_cover_each_other_as_in_space(plotter, camera):
-    right, _, forward = camera.basis()
-    places = {  # of a green ball of a mesh beside the red one of the picture
-        "before": CENTRE - 30.0 * forward + 8.0 * right,
-        "behind": CENTRE + 30.0 * forward + 8.0 * right,
-        "within": CENTRE + 14.0 * right,
-    }
-    for place, center in places.items():
-        plotter.clear()
-        mesh = pyvista.Sphere(radius=RADIUS, center=center, theta_resolution=120, phi_resolution=120)
-        plotter.add_mesh(mesh, color=(0, 200, 0), lighting=False)
-        made = merge_scene(plotter, ball(camera))
-        other = ball(camera, center, color=(0, 200, 0))
-        red, green = (np.nan_to_num(each.depth, nan=np.inf) for each in (ball(camera), other))
-        seen_red, seen_green = made.image[..., 0] > 200, made.image[..., 1] > 150
-        differs = (seen_red != ((red < green) & np.isfinite(red))) | (seen_green != (green < red))
-        assert differs.mean() <= tolerances.DRAWN_OUTLINE_SHARE, place
-        both = np.isfinite(np.minimum(red, green)) & ~differs & (made.image[..., 3] == 255)
-        assert np.abs(made.depth - np.minimum(red, green))[both].max() <= tolerances.DRAWN_DEPTH_MM, place
+RIGHT, _, FORWARD = CAMERAS[0].basis()
+
+
+@pytest.mark.parametrize(
+    "center",
+    [CENTRE - 30.0 * FORWARD + 8.0 * RIGHT, CENTRE + 30.0 * FORWARD + 8.0 * RIGHT, CENTRE + 14.0 * RIGHT],
+    ids=["before", "behind", "within"],
+)
+def test_green_ball_of_a_mesh_and_red_one_of_a_picture_cover_each_other_as_in_space(plotter, center):
+    mesh = pyvista.Sphere(radius=RADIUS, center=center, theta_resolution=120, phi_resolution=120)
+    plotter.add_mesh(mesh, color=(0, 200, 0), lighting=False)
+    red_ball, green_ball = ball(CAMERAS[0]), ball(CAMERAS[0], center, color=(0, 200, 0))
+
+    merged = merge_scene(plotter, red_ball)
+
+    red, green = (np.nan_to_num(picture.depth, nan=np.inf) for picture in (red_ball, green_ball))
+    is_red, is_green = merged.image[..., 0] > 200, merged.image[..., 1] > 150
+    differs = (is_red != ((red < green) & np.isfinite(red))) | (is_green != (green < red))
+    assert differs.mean() <= tolerances.DRAWN_OUTLINE_SHARE
+    hit = np.isfinite(np.minimum(red, green)) & ~differs & (merged.image[..., 3] == 255)
+    assert np.abs(merged.depth - np.minimum(red, green))[hit].max() <= tolerances.DRAWN_DEPTH_MM
 
 
 @pytest.mark.parametrize("background", ["black", "white", "steelblue"])
-def test_a_translucent_mesh_keeps_its_colour_on_any_background(plotter, background):
+def test_translucent_mesh_before_a_picture_keeps_its_colour_on_any_background(plotter, background):
     plotter.set_background(background)
     before = CENTRE - 50.0 * CAMERAS[0].basis().forward
     sheet = pyvista.Plane(center=before, direction=CAMERAS[0].basis().forward, i_size=500.0, j_size=500.0)
@@ -99,17 +100,25 @@ def test_a_translucent_mesh_keeps_its_colour_on_any_background(plotter, backgrou
     assert plotter.background_color == pyvista.Color(background)
 
 
-def test_what_cannot_be_merged_is_refused(plotter):
-    plotter.add_mesh(pyvista.Sphere())
+def test_picture_without_a_projection_is_not_merged(plotter):
+    without_camera = Rendering(np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2, 2)), camera=None)
     with pytest.raises(UsageError, match="no projection"):
-        merge_scene(plotter, Rendering(np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2, 2)), camera=None))
+        merge_scene(plotter, without_camera)
+
+
+def test_picture_is_not_merged_into_a_scene_of_several_views():
     two = pyvista.Plotter(off_screen=True, window_size=SIZE, shape=(1, 2))
     with pytest.raises(UsageError, match="several views"):
         merge_scene(two, ball(CAMERAS[0]))
     two.close()
+
+
+def test_picture_is_not_merged_into_a_scene_of_another_size(plotter):
     plotter.window_size = (100, 90)
     with pytest.raises(UsageError, match="100 x 90 pixels, the picture 120 x 90"):
         merge_scene(plotter, ball(CAMERAS[0]))
-    empty = ball(CAMERAS[0], CENTRE + 1000.0)
+
+
+def test_empty_picture_is_not_added_to_a_scene(plotter):
     with pytest.raises(UsageError, match="hits nothing"):
-        add_rendering(plotter, empty)
+        add_rendering(plotter, ball(CAMERAS[0], CENTRE + 1000.0))

@@ -38,7 +38,7 @@ def write_manifest(folder: Path, inputs: Mapping[str, str]) -> None:
 
 @pytest.fixture
 def forty_cases(tmp_path: Path) -> list[str]:
-    """Names of so forty_cases small cases that none of these tests meets the last one."""
+    """Names of so many small cases that none of these tests meets the last one."""
     write_ball(tmp_path / "small", 24)
     names = [f"case{number}" for number in range(40)]
     write_manifest(tmp_path, dict.fromkeys(names, "small"))

@@ -81,9 +81,9 @@ def write_two_balls(tmp_path: Path) -> tuple[Path, Path]:
     one, other = (np.sqrt((k - 15) ** 2 + (j - 16) ** 2 + (i - x) ** 2) for x in (15, 45))
     voxels = np.where(np.minimum(one, other + 3) < 11, 500, -1000).astype(np.int16)
     affine = np.eye(4)
-    Volume(voxels, affine).save(tmp_path / "write_two_balls.nii.gz")
+    Volume(voxels, affine).save(tmp_path / "scan.nii.gz")
     clrecon.write_volume(Volume(((one < 12) + 2 * (other < 9)).astype(np.int16), affine), tmp_path / "labels.nii.gz")
-    return tmp_path / "write_two_balls.nii.gz", tmp_path / "labels.nii.gz"
+    return tmp_path / "scan.nii.gz", tmp_path / "labels.nii.gz"
 
 
 @pytest.mark.opencl

@@ -25,14 +25,16 @@ SIZE = (96, 80)
 
 
 @pytest.fixture
-def view(device):
+def open_model_and_painter(device):
     with open_painters(device) as make:
         yield make
 
 
 @pytest.mark.release
-def test_every_mode_makes_a_picture_sharp_and_coarse(view):
-    model, painter = view(scenes.make_scan(), scenes.make_mesh(), scenes.make_cloud(), scenes.make_labels())
+def test_each_mode_is_drawn_sharp_and_coarse(open_model_and_painter):
+    model, painter = open_model_and_painter(
+        scenes.make_scan(), scenes.make_mesh(), scenes.make_cloud(), scenes.make_labels()
+    )
     for mode in model.modes:
         model.set_mode(mode)
         sharp = painter.picture(model.state, SIZE)
@@ -43,8 +45,8 @@ def test_every_mode_makes_a_picture_sharp_and_coarse(view):
         assert shown_pixels(coarse) > 50
 
 
-def test_a_surface_picture_is_that_of_render(view, device):
-    model, painter = view()
+def test_picture_of_a_surface_in_a_view_is_that_of_render(open_model_and_painter, device):
+    model, painter = open_model_and_painter()
     mine = painter.picture(model.state, SIZE)
     other = render(
         model.objects[0].volume, "surface", iso_value=scenes.ISO, camera=model.camera, size=SIZE,
@@ -53,64 +55,110 @@ def test_a_surface_picture_is_that_of_render(view, device):
     assert np.array_equal(mine.image, other.image)
 
 
-@pytest.mark.parametrize("mode", ["surface", "bone", "mip", "drr", "slices"])
-def test_a_large_picture_in_strips_is_the_same(view, monkeypatch, mode):
+LARGE = (512, 520)
+"""A size that is drawn in two strips."""
+
+
+@pytest.fixture
+def in_strips_and_whole(request, open_model_and_painter, monkeypatch):
+    """The same picture in a mode, drawn in strips and in one piece."""
     from clrecon.viewer.drawing import painter as module
 
-    model, painter = view()
-    model.set_mode(mode)
+    model, painter = open_model_and_painter()
+    model.set_mode(request.param)
     model.turn(0.1, 0.05)
-    large = 512, 520
-    parts = painter.picture(model.state, large)
+    in_strips = painter.picture(model.state, LARGE)
     monkeypatch.setattr(module, "take_strips", lambda take, camera, size: take(camera, size))
-    whole = painter.picture(model.state, large)
-    monkeypatch.undo()
-    assert parts.report.get("strips", 1) == (1 if mode == "drr" else 2) and parts.camera == whole.camera
-    apart = np.abs(parts.image.astype(int) - whole.image.astype(int)).max(axis=2)
-    assert (apart > 3).mean() < (0.3 if mode == "bone" else 0.002)  # samples of volume rendering lie at random places
-    both = ~np.isnan(parts.depth) & ~np.isnan(whole.depth)
-    assert both.any() == (mode != "drr")  # a radiograph has no depth
-    if both.any():
-        assert np.median(np.abs(parts.depth[both] - whole.depth[both])) < (0.3 if mode == "bone" else 1e-3)
-    if mode != "drr":
-        asked = []
-        with pytest.raises(Cancelled):
-            painter.picture(model.state, large, cancelled=lambda: bool(asked.append(1)) or len(asked) > 2)
+    return in_strips, painter.picture(model.state, LARGE)
 
 
-def test_a_cancelled_picture_raises(view):
-    model, painter = view()
+@pytest.mark.parametrize("in_strips_and_whole", ["surface", "mip", "slices"], indirect=True)
+def test_large_picture_in_two_strips_is_that_in_one_piece(in_strips_and_whole):
+    in_strips, whole = in_strips_and_whole
+
+    assert in_strips.report["strips"] == 2
+    assert in_strips.camera == whole.camera
+    apart = np.abs(in_strips.image.astype(int) - whole.image.astype(int)).max(axis=2)
+    assert (apart > 3).mean() < 0.002  # of pixels, at edges: other rays in float32
+    both = ~np.isnan(in_strips.depth) & ~np.isnan(whole.depth)
+    assert both.any()
+    assert np.median(np.abs(in_strips.depth[both] - whole.depth[both])) < 1e-3
+
+
+@pytest.mark.parametrize("in_strips_and_whole", ["bone"], indirect=True)
+def test_large_volume_rendering_in_two_strips_differs_by_the_random_places_of_its_samples(in_strips_and_whole):
+    in_strips, whole = in_strips_and_whole
+
+    assert in_strips.report["strips"] == 2
+    apart = np.abs(in_strips.image.astype(int) - whole.image.astype(int)).max(axis=2)
+    assert (apart > 3).mean() < 0.3
+    both = ~np.isnan(in_strips.depth) & ~np.isnan(whole.depth)
+    assert both.any()
+    assert np.median(np.abs(in_strips.depth[both] - whole.depth[both])) < 0.3  # mm: a step of the rays
+
+
+@pytest.mark.parametrize("in_strips_and_whole", ["drr"], indirect=True)
+def test_large_radiograph_is_drawn_in_one_piece_without_depths(in_strips_and_whole):
+    picture, whole = in_strips_and_whole
+
+    assert picture.report.get("strips", 1) == 1
+    assert np.array_equal(picture.image, whole.image)
+    assert np.isnan(picture.depth).all()
+
+
+@pytest.mark.parametrize("mode", ["surface", "bone", "mip", "slices"])
+def test_large_picture_is_cancelled_between_its_strips(open_model_and_painter, mode):
+    model, painter = open_model_and_painter()
+    model.set_mode(mode)
+    asked = []
+    with pytest.raises(Cancelled):
+        painter.picture(model.state, LARGE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 2)
+
+
+def test_picture_of_a_view_asks_twice_whether_it_is_cancelled_and_ends_where_it_is(open_model_and_painter):
+    model, painter = open_model_and_painter()
     asked = []
     with pytest.raises(Cancelled):
         painter.picture(model.state, SIZE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 1)
     assert len(asked) == 2  # before it begins, and when the device is about to work
 
 
-def test_nothing_shown_is_an_empty_picture(view):
-    model, painter = view()
+def test_picture_of_a_view_that_shows_nothing_is_empty(open_model_and_painter):
+    model, painter = open_model_and_painter()
     model.show("1", False)
+
     picture = painter.picture(model.state, SIZE)
-    assert shown_pixels(picture) == 0 and np.isnan(picture.depth).all()
+
+    assert shown_pixels(picture) == 0
+    assert np.isnan(picture.depth).all()
+
+
+def test_mesh_of_a_view_that_shows_nothing_is_refused(open_model_and_painter):
+    model, painter = open_model_and_painter()
+    model.show("1", False)
     with pytest.raises(NoSurfaceError, match="nothing"):
         painter.mesh_of_shown(model.state)
 
 
-def test_picks_lie_on_the_mesh(view):
-    model, painter = view()
+def test_picked_points_lie_on_the_surface_at_the_depth_of_their_pixels(open_model_and_painter):
+    model, painter = open_model_and_painter()
     (mesh,) = painter.mesh_of_shown(model.state)
     picture = painter.picture(model.state, SIZE)
     rows, columns = np.nonzero(picture.image[..., 3])
-    picks = []
+    origins, directions = model.camera.rays(SIZE)
+
+    picked = []
     for place in np.random.default_rng(3).choice(len(rows), 60, replace=False):
-        pick = painter.pick(model.state, SIZE, columns[place] + 0.5, rows[place] + 0.5)
-        assert pick is not None and pick.object == 1 and pick.part == "1"
-        picks.append(pick.point)
-        depth = float(picture.depth[rows[place], columns[place]])
-        origins, directions = model.camera.rays(SIZE)
-        at = origins[rows[place], columns[place]] + depth * directions[rows[place], columns[place]]
-        assert pick.point == pytest.approx(at, abs=0.02)
-    away = SurfaceDistance(mesh.vertices, mesh.triangles)(np.array(picks))
-    assert away.max() <= 0.3 and np.median(away) <= 0.02
+        row, column = rows[place], columns[place]
+        pick = painter.pick(model.state, SIZE, column + 0.5, row + 0.5)
+        assert (pick.object, pick.part) == (1, "1")
+        at_its_depth = origins[row, column] + float(picture.depth[row, column]) * directions[row, column]
+        assert pick.point == pytest.approx(at_its_depth, abs=0.02)  # mm: the way along a ray in float32
+        picked.append(pick.point)
+
+    away_mm = SurfaceDistance(mesh.vertices, mesh.triangles)(np.array(picked))
+    assert np.median(away_mm) <= 0.02
+    assert away_mm.max() <= 0.3  # between triangles the field is bent
 
 
 MIDDLE_OF_THE_MESH = scenes.middle(0) + (0.0, -25.0, 0.0)
@@ -119,77 +167,108 @@ MIDDLE_OF_THE_MESH = scenes.middle(0) + (0.0, -25.0, 0.0)
 
 @pytest.mark.parametrize("perspective", [False, True], ids=["parallel", "perspective"])
 @pytest.mark.parametrize(("number", "point"), [(1, scenes.middle(2)), (2, MIDDLE_OF_THE_MESH)], ids=["scan", "mesh"])
-def test_a_pick_finds_the_nearest_object_in_each_projection(view, perspective, number, point):
-    model, painter = view(scenes.make_scan(), scenes.make_mesh())
+def test_pick_finds_the_nearest_object_in_each_projection(open_model_and_painter, perspective, number, point):
+    model, painter = open_model_and_painter(scenes.make_scan(), scenes.make_mesh())
     model.set_perspective(perspective)
     x, y = model.camera.project([point], SIZE)[0][0]
     pick = painter.pick(model.state, SIZE, x, y)
     assert (pick.object, pick.part) == (number, str(number))
 
 
-def test_a_pick_beside_everything_finds_nothing(view):
-    model, painter = view(scenes.make_scan(), scenes.make_mesh())
+def test_pick_beside_all_objects_finds_nothing(open_model_and_painter):
+    model, painter = open_model_and_painter(scenes.make_scan(), scenes.make_mesh())
     assert painter.pick(model.state, SIZE, 0.5, 0.5) is None
 
 
-def test_a_pick_of_a_cloud_is_one_of_its_points_without_hu(view):
+def test_pick_of_a_cloud_is_one_of_its_points_without_hu(open_model_and_painter):
     cloud = scenes.make_cloud()
-    model, painter = view(cloud)
+    model, painter = open_model_and_painter(cloud)
     nearest = cloud.points[np.argmin(cloud.points[:, 1])]  # the view is from anterior
     pick = painter.pick(model.state, SIZE, *model.camera.project([nearest], SIZE)[0][0])
     assert pick.point == pytest.approx(nearest, abs=0.2)
     assert (pick.object, pick.hu) == (1, None)
 
 
-def test_slices_map_pixels_to_the_patient_and_show_the_scan(view):
-    model, painter = view()
-    model.set_cross(tuple(scenes.middle(0)))
-    for plane, normal in (("axial", (0, 0, 1)), ("coronal", (0, 1, 0)), ("sagittal", (1, 0, 0))):
-        picture = painter.slice(model.state, plane, SIZE)
-        (pixel,), (depth,) = picture.camera.project([scenes.middle(0)], SIZE)
-        assert picture.values[int(pixel[1]), int(pixel[0])] > 900.0
-        assert abs(np.dot(np.subtract(picture.camera.focal_point, scenes.middle(0)), normal)) < 1e-6
-        assert depth > 0.0
-        pick = painter.pick_slice(model.state, plane, SIZE, *pixel)
-        assert pick.point == pytest.approx(scenes.middle(0), abs=1e-6) and pick.hu > 900.0
-        edge = painter.slice_camera(model.state, plane, SIZE)
-        assert edge.focal_point == pytest.approx(picture.camera.focal_point)
+PLANES = pytest.mark.parametrize(
+    ("plane", "normal"), [("axial", (0, 0, 1)), ("coronal", (0, 1, 0)), ("sagittal", (1, 0, 0))]
+)
+BALL_HU = 900.0
+"""The first ball of the scan has more."""
+
+
+@PLANES
+def test_slice_lies_at_the_cross_and_shows_the_scan_there(open_model_and_painter, plane, normal):
+    model, painter = open_model_and_painter()
+    cross = scenes.middle(0)
+    model.set_cross(tuple(cross))
+
+    picture = painter.slice(model.state, plane, SIZE)
+
+    (pixel,), (depth,) = picture.camera.project([cross], SIZE)
+    assert picture.values[int(pixel[1]), int(pixel[0])] > BALL_HU
+    assert abs(np.dot(np.subtract(picture.camera.focal_point, cross), normal)) < 1e-6  # float64
+    assert depth > 0.0
+    assert painter.slice_camera(model.state, plane, SIZE).focal_point == pytest.approx(picture.camera.focal_point)
+
+
+@PLANES
+def test_pick_in_a_slice_is_the_place_of_its_pixel_with_its_hu(open_model_and_painter, plane, normal):
+    model, painter = open_model_and_painter()
+    cross = scenes.middle(0)
+    model.set_cross(tuple(cross))
+    (pixel,), _ = painter.slice_camera(model.state, plane, SIZE).project([cross], SIZE)
+
+    pick = painter.pick_slice(model.state, plane, SIZE, *pixel)
+
+    assert pick.point == pytest.approx(cross, abs=1e-6)  # float64
+    assert pick.hu > BALL_HU
+
+
+def test_slice_in_an_unknown_plane_is_refused(open_model_and_painter):
+    model, painter = open_model_and_painter()
     with refused(UsageError, "axial", "oblique"):
         painter.slice(model.state, "oblique", SIZE)
 
 
-def test_a_slice_without_a_scan_is_empty_and_one_of_labels_is_not(view):
-    model, painter = view(scenes.make_mesh())
+def test_slice_of_a_mesh_alone_is_empty(open_model_and_painter):
+    model, painter = open_model_and_painter(scenes.make_mesh())
     assert shown_pixels(painter.slice(model.state, "axial", SIZE)) == 0
-    model, painter = view(scenes.make_labels())
+
+
+def test_slice_of_labels_alone_is_coloured(open_model_and_painter):
+    model, painter = open_model_and_painter(scenes.make_labels())
     picture = painter.slice(model.state, "axial", SIZE)
-    assert np.ptp(picture.image[..., :3].astype(int), axis=2).max() > 20  # coloured
+    assert np.ptp(picture.image[..., :3].astype(int), axis=2).max() > 20  # of 255, between the channels
 
 
-def test_a_whole_scan_is_translucent_before_its_parts_are_known(view):
-    model, painter = view()
+def test_whole_scan_is_translucent_before_its_parts_are_known(open_model_and_painter):
+    model, painter = open_model_and_painter()
     model.set_opacity("1", 0.4)
     image = painter.picture(model.state, SIZE).image
     assert 0 < image[..., 3][image[..., 3] > 0].min() < 200
 
 
-def test_a_clip_cuts_picture_and_mesh_flat_and_closed(view, device):
-    model, painter = view()
+def test_clip_through_a_ball_leaves_a_closed_half_of_it_in_mesh_and_picture(open_model_and_painter, device):
+    model, painter = open_model_and_painter()
     model.add_clip("left")
     (clip,) = model.state.clips
-    model.move_clip(0, (scenes.middle(0)[0] - clip.low) / (clip.high - clip.low))
-    state = model.state
-    (mesh,) = painter.mesh_of_shown(state)
-    assert mesh.quality()["closed"] and mesh.bounds[1, 0] == pytest.approx(scenes.middle(0)[0], abs=0.02)
-    half = 2 / 3 * np.pi * scenes.BALLS[0][1] ** 3 / 1000.0
-    assert mesh.quality()["volume_ml"] == pytest.approx(half, rel=0.05)
-    picture = painter.picture(state, SIZE)
+    middle_x = scenes.middle(0)[0]
+    model.move_clip(0, (middle_x - clip.low) / (clip.high - clip.low))
+
+    (mesh,) = painter.mesh_of_shown(model.state)
+    picture = painter.picture(model.state, SIZE)
+
+    quality = mesh.quality()
+    assert quality["closed"]
+    assert mesh.bounds[1, 0] == pytest.approx(middle_x, abs=0.02)  # vertices in float32, held off samples
+    half_ball_ml = 2 / 3 * np.pi * scenes.BALLS[0][1] ** 3 / 1000.0
+    assert quality["volume_ml"] == pytest.approx(half_ball_ml, rel=0.05)  # in voxels of about 1 mm
     drawn = render([(mesh, MeshLook())], camera=model.camera, size=SIZE, background="transparent", device=device)
-    assert ((picture.image[..., 3] > 0) != (drawn.image[..., 3] > 0)).mean() < 0.005
+    assert ((picture.image[..., 3] > 0) != (drawn.image[..., 3] > 0)).mean() < 0.005  # of pixels, at outlines
 
 
-def test_an_oblique_clip_of_a_mesh_cuts_its_triangles_at_the_plane(view):
-    model, painter = view(scenes.make_mesh())
+def test_oblique_clip_of_a_mesh_cuts_its_triangles_at_the_plane(open_model_and_painter):
+    model, painter = open_model_and_painter(scenes.make_mesh())
     model.add_clip((1.0, 2.0, 0.5))
     (mesh,) = painter.mesh_of_shown(model.state)
     (*normal, offset) = model.state.clip.planes[0]
@@ -198,8 +277,8 @@ def test_an_oblique_clip_of_a_mesh_cuts_its_triangles_at_the_plane(view):
     assert mesh.area == pytest.approx(0.5 * scenes.make_mesh().area, rel=0.02)
 
 
-def test_a_large_mesh_is_coarse_while_it_moves(view):
-    model, painter = view(Mesh(*samples.torus(1000, 120)))
+def test_large_mesh_is_drawn_with_fewer_triangles_while_it_moves(open_model_and_painter):
+    model, painter = open_model_and_painter(Mesh(*samples.torus(1000, 120)))
     full = painter.picture(model.state, SIZE)
     painter.make_coarse()
     coarse = painter.picture(model.state, SIZE, sharp=False)
@@ -208,32 +287,56 @@ def test_a_large_mesh_is_coarse_while_it_moves(view):
     assert shown_pixels(coarse) == pytest.approx(shown_pixels(full), rel=0.2)
 
 
-def test_a_translucent_mesh_is_opaque_while_it_moves(view):
-    model, painter = view(scenes.make_mesh())
+@pytest.fixture
+def translucent_mesh(open_model_and_painter):
+    model, painter = open_model_and_painter(scenes.make_mesh())
     model.set_opacity("1", 0.3)
-    assert painter.picture(model.state, SIZE).image[..., 3].max() < 250
-    assert painter.picture(model.state, SIZE, sharp=False).image[..., 3].max() == 255
+    return model, painter
+
+
+@pytest.mark.parametrize(("is_sharp", "is_opaque"), [(True, False), (False, True)], ids=["at rest", "moving"])
+def test_translucent_mesh_is_drawn_opaque_while_it_moves(is_sharp, is_opaque, translucent_mesh):
+    model, painter = translucent_mesh
+    opacity = painter.picture(model.state, SIZE, sharp=is_sharp).image[..., 3].max()
+    assert (opacity == 255) == is_opaque
+
+
+def test_picture_of_a_translucent_mesh_is_cancelled_between_its_layers(translucent_mesh):
+    model, painter = translucent_mesh
     asked = []
-    with pytest.raises(Cancelled):  # between its layers
+    with pytest.raises(Cancelled):
         painter.picture(model.state, SIZE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 4)
-    assert painter.pick(model.state, SIZE, 48, 40).point[1] < scenes.middle(0)[1] - 28.0
 
 
-def test_a_curve_straightens_the_scan(view):
-    model, painter = view()
-    with refused(UsageError, "curve", "points"):
-        painter.curve_picture(model.state, SIZE)
+def test_pick_of_a_translucent_mesh_is_on_its_front(translucent_mesh):
+    model, painter = translucent_mesh
+    middle_of_picture = SIZE[0] / 2, SIZE[1] / 2
+    in_front_of_its_middle = MIDDLE_OF_THE_MESH[1] - 3.0  # y grows to the back
+    assert painter.pick(model.state, SIZE, *middle_of_picture).point[1] < in_front_of_its_middle
+
+
+def test_picture_along_a_curve_of_two_points_shows_the_bone_between_them(open_model_and_painter):
+    model, painter = open_model_and_painter()
     model.start_tool("curve")
     for number in (0, 1):
         model.add_point(Pick(point=tuple(scenes.middle(number))))
+
     picture = painter.curve_picture(model.state, SIZE)
-    assert picture.size == SIZE and np.nanmax(picture.values) > 900.0
+
+    assert picture.size == SIZE
+    assert np.nanmax(picture.values) > BALL_HU
 
 
-def test_without_the_table_another_volume_is_shown(view, monkeypatch):
+def test_picture_along_a_curve_without_points_is_refused(open_model_and_painter):
+    model, painter = open_model_and_painter()
+    with refused(UsageError, "curve", "points"):
+        painter.curve_picture(model.state, SIZE)
+
+
+def test_view_without_the_table_draws_the_scan_without_its_voxels(open_model_and_painter, monkeypatch):
     from clrecon.viewer.drawing import stage
 
-    model, painter = view()
+    model, painter = open_model_and_painter()
     bare = scenes.make_scan().voxels.copy()
     bare[:, :, 24:] = -800
 
@@ -252,8 +355,8 @@ def test_without_the_table_another_volume_is_shown(view, monkeypatch):
     assert shown_pixels(painter.picture(model.state, SIZE)) == before
 
 
-def test_two_views_share_a_painter_without_disturbing_each_other(view):
-    one, painter = view()
+def test_two_views_of_one_painter_draw_their_own_pictures_in_turn(open_model_and_painter):
+    one, painter = open_model_and_painter()
     other = ViewModel(one.objects, iso_value=-200.0)
     find(one, painter)
     find(other, painter)
@@ -266,7 +369,7 @@ def test_two_views_share_a_painter_without_disturbing_each_other(view):
     assert not np.array_equal(*pictures)
 
 
-def test_a_scan_in_slabs_is_shown_too(device):
+def test_picture_of_a_scan_in_slabs_is_that_of_the_whole(device):
     objects = show_objects([scenes.make_scan()])
     model = ViewModel(objects, iso_value=scenes.ISO)
     with Painter(objects, device=device) as whole, Painter(objects, device=device, memory=80_000) as slabs:
@@ -276,7 +379,7 @@ def test_a_scan_in_slabs_is_shown_too(device):
 
 
 @pytest.mark.release
-def test_kernels_are_built_for_every_kind_of_voxels(device):
+def test_preparation_of_a_painter_builds_kernels_and_finds_parts(device):
     objects = show_objects([scenes.make_scan(), scenes.make_scan(dtype=np.float32), scenes.make_mesh()])
     told = []
     with Painter(objects, device=device) as painter:
@@ -285,7 +388,7 @@ def test_kernels_are_built_for_every_kind_of_voxels(device):
 
 
 @pytest.mark.unit
-def test_a_coarse_mesh_is_near_the_fine_one():
+def test_coarse_mesh_has_few_triangles_near_the_fine_ones_and_their_area():
     from clrecon.viewer.drawing.stage import coarsen_mesh
 
     fine = scenes.make_mesh(radius=20.0)

@@ -23,17 +23,17 @@ SIZE = (96, 80)
 
 
 @pytest.fixture
-def view(device):
+def open_model_and_painter(device):
     with open_painters(device) as make:
         yield make
 
 
 @pytest.mark.parametrize("plane", ["coronal", "sagittal"])
-def test_parts_lie_over_their_bone_in_slices_of_an_uneven_scan(view, plane):
+def test_parts_lie_over_their_bone_in_slices_of_an_uneven_scan(open_model_and_painter, plane):
     scan = scenes.make_scan()
     steps = 0.4 + 1.2 * np.arange(22) / 21
     heights = scan.affine[:3, 3] + np.cumsum(steps)[:, None] * scan.affine[:3, 2]
-    model, painter = view(Volume(scan.voxels, scan.affine, slice_positions=heights))
+    model, painter = open_model_and_painter(Volume(scan.voxels, scan.affine, slice_positions=heights))
     find(model, painter)
     model.set_color("1/1", (1.0, 0.0, 0.0))
     at = painter.objects[0].volume.ijk_to_lps([scenes.BALLS[0][0]])[0]
@@ -44,28 +44,42 @@ def test_parts_lie_over_their_bone_in_slices_of_an_uneven_scan(view, plane):
     assert tinted[bone].mean() > 0.97 and bone[tinted].mean() > 0.6  # parts are grown by a voxel
 
 
-def test_parts_are_the_balls_with_their_size(view):
-    model, painter = view()
+def test_parts_of_a_scan_are_its_balls_by_size_and_the_rest(open_model_and_painter):
+    model, painter = open_model_and_painter()
+
     find(model, painter)
-    parts = {each.key: each for each in model.state.parts}
-    assert list(parts) == ["1", "1/1", "1/2", "1/3", "1/0"]
-    for number, (_, radius) in enumerate(scenes.BALLS):
-        part = parts[f"1/{number + 1}"]
-        assert part.ml == pytest.approx(4 / 3 * np.pi * radius**3 / 1000.0, rel=0.12)
-        low, high = np.array(part.box)
-        assert (low <= scenes.middle(number) - radius + 1.5).all() and (
-            high >= scenes.middle(number) + radius - 1.5
-        ).all()
-        assert np.linalg.norm(np.subtract(part.inside, scenes.middle(number))) < radius
-    assert model.parts_known and painter.has_parts(model.state)
+
+    assert [part.key for part in model.state.parts] == ["1", "1/1", "1/2", "1/3", "1/0"]
+    assert model.parts_known
+    assert painter.has_parts(model.state)
+
+
+@pytest.mark.parametrize("number", [0, 1, 2], ids=["first ball", "second ball", "third ball"])
+def test_part_of_a_ball_has_its_volume_its_box_and_a_point_in_it(open_model_and_painter, number):
+    model, painter = open_model_and_painter()
+    find(model, painter)
+    middle, radius = scenes.middle(number), scenes.BALLS[number][1]
+
+    (part,) = (part for part in model.state.parts if part.key == f"1/{number + 1}")
+
+    assert part.ml == pytest.approx(4 / 3 * np.pi * radius**3 / 1000.0, rel=0.12)  # counted in voxels of about 1 mm
+    low, high = np.array(part.box)
+    voxel_mm = 1.5
+    assert (low <= middle - radius + voxel_mm).all()
+    assert (high >= middle + radius - voxel_mm).all()
+    assert np.linalg.norm(np.subtract(part.inside, middle)) < radius
+
+
+def test_parts_of_a_scan_are_found_once(open_model_and_painter):
+    model, painter = open_model_and_painter()
     assert painter.find_parts(model.state)[0] is painter.find_parts(model.state)[0]
 
 
-def test_many_parts_are_twenty_and_the_rest_together(view):
+def test_parts_beyond_the_twenty_largest_are_one_of_them_together(open_model_and_painter):
     voxels = np.full((9, 30, 40), -500, np.int16)
     voxels[1::3, 1::3, 1::3] = 700
     voxels[1, 1, 1:3] = 700
-    model, painter = view(Volume(voxels, np.eye(4)))
+    model, painter = open_model_and_painter(Volume(voxels, np.eye(4)))
     find(model, painter)
     clusters = [each for each in model.state.parts if each.kind == "cluster"]
     count = 3 * 10 * 13
@@ -76,8 +90,8 @@ def test_many_parts_are_twenty_and_the_rest_together(view):
     assert mesh.bounds[1] - mesh.bounds[0] == pytest.approx([2.0, 1.0, 1.0], abs=0.4)
 
 
-def test_parts_and_looks_of_long_ago_are_dropped(view):
-    model, painter = view()
+def test_parts_and_looks_of_the_six_last_iso_values_are_kept(open_model_and_painter):
+    model, painter = open_model_and_painter()
     for hu in range(200, 1000, 100):
         model.set_iso(float(hu))
         find(model, painter)
@@ -88,8 +102,8 @@ def test_parts_and_looks_of_long_ago_are_dropped(view):
     assert [style.iso_value for style in kept] == [400.0, 500.0, 600.0, 700.0, 800.0, 900.0]
 
 
-def test_two_sets_of_parts_are_kept_whatever_their_size(view):
-    model, painter = view()
+def test_parts_of_the_two_last_iso_values_are_kept_whatever_their_size(open_model_and_painter):
+    model, painter = open_model_and_painter()
     for hu in (200.0, 300.0, 400.0):
         model.set_iso(hu)
         find(model, painter)
@@ -99,22 +113,22 @@ def test_two_sets_of_parts_are_kept_whatever_their_size(view):
     assert [key[1] for key in painter._found] == [300.0, 400.0]
 
 
-def test_no_voxel_at_the_iso_value_is_no_part(view):
-    model, painter = view(Volume(np.full((4, 5, 6), -900, np.int16), np.eye(4)))
+def test_scan_without_a_voxel_at_the_iso_value_has_no_parts_of_bone(open_model_and_painter):
+    model, painter = open_model_and_painter(Volume(np.full((4, 5, 6), -900, np.int16), np.eye(4)))
     find(model, painter)
     assert [each.kind for each in model.state.parts] == ["scan", "rest"]
 
 
 @pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
 @pytest.mark.parametrize("hidden", daily(1, [1, 2, 3]))
-def test_hidden_parts_are_neither_in_the_picture_nor_in_the_mesh(view, device, hidden, uneven):
+def test_hidden_part_is_neither_in_the_picture_nor_in_the_mesh(open_model_and_painter, device, hidden, uneven):
     scan = scenes.make_scan()
     if uneven:
         heights = (
             scan.affine[:3, 3] + (np.arange(22)[:, None] + 0.3 * (np.arange(22) % 2)[:, None]) * scan.affine[:3, 2]
         )
         scan = Volume(scan.voxels, scan.affine, slice_positions=heights)
-    model, painter = view(scan)
+    model, painter = open_model_and_painter(scan)
     find(model, painter)
     model.show(f"1/{hidden}", False)
     state = model.state
@@ -134,8 +148,8 @@ def test_hidden_parts_are_neither_in_the_picture_nor_in_the_mesh(view, device, h
         assert np.abs(picture.depth[seen] - mesh.depth[seen]).mean() < 0.05
 
 
-def test_volume_rendering_leaves_hidden_parts_out_with_their_edges(view):
-    model, painter = view()
+def test_volume_rendering_leaves_hidden_parts_out_with_their_edges(open_model_and_painter):
+    model, painter = open_model_and_painter()
     find(model, painter)
     model.set_mode("bone")
     before = shown_pixels(painter.picture(model.state, SIZE))
@@ -147,41 +161,77 @@ def test_volume_rendering_leaves_hidden_parts_out_with_their_edges(view):
     assert np.hypot(columns + 0.5 - spot[0], rows + 0.5 - spot[1]).max() * model.camera.pixel_mm(SIZE) < 6.5
 
 
-def test_a_colour_and_an_opacity_of_a_part_are_seen(view):
-    model, painter = view()
+@pytest.fixture
+def first_part(open_model_and_painter):
+    """The model, the painter, the plain picture, and the pixel (row, column) of the middle of part 1."""
+    model, painter = open_model_and_painter()
     find(model, painter)
-    plain = painter.picture(model.state, SIZE)
+    x, y = model.camera.project([scenes.middle(0)], SIZE)[0][0].astype(int)
+    return model, painter, painter.picture(model.state, SIZE), (y, x)
+
+
+def test_part_of_a_scan_is_drawn_in_its_colour_and_opacity(first_part):
+    model, painter, plain, pixel = first_part
+
     model.set_color("1/1", (1.0, 0.0, 0.0))
     red = painter.picture(model.state, SIZE)
-    x, y = model.camera.project([scenes.middle(0)], SIZE)[0][0].astype(int)
-    assert red.image[y, x, 0] > 60 and red.image[y, x, 1] < 70 < plain.image[y, x, 1]
     model.set_opacity("1/1", 0.5)
-    assert 90 < painter.picture(model.state, SIZE).image[y, x, 3] < 240
-    parts = painter.mesh_of_shown(model.state)
-    assert [each.report["part_name"] for each in parts] == ["part 1", "scan 1"]
-    assert parts[0].report["color"] == [1.0, 0.0, 0.0]
+    translucent = painter.picture(model.state, SIZE)
+
+    assert red.image[pixel][0] > 60 and red.image[pixel][1] < 70  # of 255: red in the light
+    assert plain.image[pixel][1] > 70
+    assert 90 < translucent.image[pixel][3] < 240
+
+
+def test_mesh_of_a_coloured_part_is_apart_from_the_rest_with_its_colour(first_part):
+    model, painter, _, _ = first_part
+    model.set_color("1/1", (1.0, 0.0, 0.0))
+
+    part, rest = painter.mesh_of_shown(model.state)
+
+    assert (part.report["part_name"], rest.report["part_name"]) == ("part 1", "scan 1")
+    assert part.report["color"] == [1.0, 0.0, 0.0]
+
+
+def test_undo_takes_colour_and_opacity_of_a_part_back(first_part):
+    model, painter, plain, _ = first_part
+    model.set_color("1/1", (1.0, 0.0, 0.0))
+    model.set_opacity("1/1", 0.5)
+
     model.undo()
     model.undo()
+
     assert np.array_equal(painter.picture(model.state, SIZE).image, plain.image)
 
 
-def test_a_label_map_divides_the_scan_that_it_lies_in(view):
-    model, painter = view(scenes.make_scan(), scenes.make_labels())
-    assert painter.find_parts(model.state) == [] and model.parts_known
-    left = model.camera.project([scenes.middle(0)], SIZE)[0][0]
-    right = model.camera.project([scenes.middle(1)], SIZE)[0][0]
-    assert painter.pick(model.state, SIZE, *left).part == "2/1"
-    assert painter.pick(model.state, SIZE, *right).part == "2/2"
+@pytest.fixture
+def labelled(open_model_and_painter):
+    """The model and painter of a scan with a label map, and the pixels of the middles of labels 1 and 2."""
+    model, painter = open_model_and_painter(scenes.make_scan(), scenes.make_labels())
+    assert painter.find_parts(model.state) == []
+    assert model.parts_known
+    one, two = model.camera.project([scenes.middle(0), scenes.middle(1)], SIZE)[0]
+    return model, painter, one, two
+
+
+def test_labels_of_a_map_are_the_parts_of_the_scan_that_it_lies_in(labelled):
+    model, painter, one, two = labelled
+    assert painter.pick(model.state, SIZE, *one).part == "2/1"
+    assert painter.pick(model.state, SIZE, *two).part == "2/2"
+
+
+@pytest.mark.parametrize("mode", ["surface", "labels"])
+def test_hidden_label_is_neither_picked_nor_meshed(labelled, mode):
+    model, painter, _, two = labelled
     model.show("2/2", False)
-    assert painter.pick(model.state, SIZE, *right) is None
-    meshes = painter.mesh_of_shown(model.state)
-    assert [each.report["part_name"] for each in meshes] == ["one"]
-    model.set_mode("labels")
-    assert [each.report["part_name"] for each in painter.mesh_of_shown(model.state)] == ["one"]
+    model.set_mode(mode)
+
+    assert painter.pick(model.state, SIZE, *two) is None
+    assert [mesh.report["part_name"] for mesh in painter.mesh_of_shown(model.state)] == ["one"]
 
 
 @pytest.mark.unit
-def test_labels_grow_by_one_voxel_to_all_sides():
+def test_labels_grow_by_one_voxel_to_all_sides_within_the_map():
     voxels = np.zeros((5, 6, 7), np.uint8)
     voxels[2, 2, 2], voxels[4, 5, 6] = 3, 9
     grow_labels(voxels)
@@ -189,6 +239,6 @@ def test_labels_grow_by_one_voxel_to_all_sides():
     assert (voxels[3:, 4:, 5:] == 9).all() and (voxels == 9).sum() == 8
 
 
-def test_the_box_of_a_part_ends_with_its_voxels() -> None:
+def test_box_of_a_part_ends_with_its_voxels_in_mm() -> None:
     volume = Volume(np.zeros((9, 9, 9), np.int16), np.diag((0.5, -1.0, 2.0, 1.0)))
     assert _box_of(volume, (1, 2, 3), (4, 6, 5)) == ((0.25, -6.5, 5.0), (2.25, -1.5, 11.0))

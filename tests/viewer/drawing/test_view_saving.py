@@ -26,7 +26,7 @@ def session(device):
 
 @pytest.mark.opencl
 @pytest.mark.parametrize("name", ["a.stl", "a.ply", "a.glb", "a.3mf", "a.obj", "a.vtp", "a.html"])
-def test_shown_meshes_are_saved_to_every_mesh_format(session, tmp_path, name):
+def test_shown_meshes_are_saved_to_each_mesh_format(session, tmp_path, name):
     view = session()
     view.do({"do": "find_parts"})
     assert view.wait(PATIENCE)
@@ -53,7 +53,7 @@ def test_object_behind_a_hidden_one_is_saved(session):
 
 @pytest.mark.opencl
 @pytest.mark.parametrize("name", ["a.ply", "a.npz", "a.xyz", "a.vtp"])
-def test_clouds_are_saved_to_every_cloud_format(session, tmp_path, name):
+def test_cloud_is_saved_to_each_cloud_format(session, tmp_path, name):
     view = session(scenes.make_cloud())
     view.do({"do": "save", "path": str(tmp_path / name)})
     assert view.wait(PATIENCE) and view.facts()["error"] is None
@@ -61,7 +61,7 @@ def test_clouds_are_saved_to_every_cloud_format(session, tmp_path, name):
 
 
 @pytest.mark.opencl
-def test_a_cloud_of_a_scan_is_the_vertices_of_its_surface(session, tmp_path):
+def test_scan_saved_as_a_cloud_is_the_vertices_of_its_surface(session, tmp_path):
     view = session(scenes.make_scan())
     view.do({"do": "save", "path": str(tmp_path / "a.npz")})
     assert view.wait(PATIENCE) and view.facts()["error"] is None
@@ -70,7 +70,7 @@ def test_a_cloud_of_a_scan_is_the_vertices_of_its_surface(session, tmp_path):
 
 
 @pytest.mark.opencl
-def test_a_volume_is_saved_without_hidden_parts_cut_and_cropped(session, tmp_path):
+def test_scan_is_saved_without_hidden_parts_and_cropped_to_the_clip_box(session, tmp_path):
     view = session(scenes.make_scan())
     view.do({"do": "find_parts"})
     assert view.wait(PATIENCE)
@@ -82,12 +82,14 @@ def test_a_volume_is_saved_without_hidden_parts_cut_and_cropped(session, tmp_pat
     saved = read_volume(tmp_path / "a.nii.gz")
     assert saved.voxels.size < 0.9 * scenes.make_scan().voxels.size
     values = [saved.voxels[tuple(np.rint(saved.lps_to_ijk([scenes.middle(n)])[0]).astype(int)[::-1])] for n in range(3)]
-    assert values[0] == 1000 and values[1] < -800 and values[2] > 500
+    in_first, in_hidden, in_third = values
+    assert in_first == 1000 and in_third > 500
+    assert in_hidden < -800
 
 
 @pytest.mark.opencl
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif"])
-def test_a_screenshot_is_as_large_as_asked_for(session, tmp_path, name):
+def test_screenshot_has_the_given_size(session, tmp_path, name):
     from PIL import Image
 
     view = session()
@@ -97,28 +99,42 @@ def test_a_screenshot_is_as_large_as_asked_for(session, tmp_path, name):
 
 
 @pytest.mark.opencl
-def test_views_that_cannot_be_saved_are_refused(session, tmp_path):
-    view = session(scenes.make_mesh())
+def test_volume_of_a_view_without_a_scan_is_refused(session, tmp_path):
     with pytest.raises(UsageError, match="no scan"):
-        view.do({"do": "save", "path": str(tmp_path / "a.nii.gz")})
-    view.do({"do": "show", "key": "1", "visible": False})
-    with pytest.raises(UsageError, match="nothing that has a surface"):
-        view.do({"do": "save", "path": str(tmp_path / "a.stl")})
-    view.do({"do": "undo"})
-    view.do({"do": "save", "path": str(tmp_path / "none" / "a.stl")})
-    assert view.wait(PATIENCE)
-    assert "none" in view.facts()["error"] and not list(tmp_path.iterdir())
+        session(scenes.make_mesh()).do({"do": "save", "path": str(tmp_path / "a.nii.gz")})
 
 
 @pytest.mark.opencl
-def test_a_file_that_exists_stays_where_that_is_asked_for(session, tmp_path):
+def test_mesh_of_a_view_with_all_objects_hidden_is_refused(session, tmp_path):
+    view = session(scenes.make_mesh())
+    view.do({"do": "show", "key": "1", "visible": False})
+    with pytest.raises(UsageError, match="nothing that has a surface"):
+        view.do({"do": "save", "path": str(tmp_path / "a.stl")})
+
+
+@pytest.mark.opencl
+def test_mesh_for_a_missing_folder_is_an_error_of_the_view(session, tmp_path):
+    view = session(scenes.make_mesh())
+
+    view.do({"do": "save", "path": str(tmp_path / "none" / "a.stl")})
+
+    assert view.wait(PATIENCE)
+    assert "none" in view.facts()["error"]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.opencl
+def test_existing_file_stays_and_a_new_one_is_saved_with_no_clobber(session, tmp_path):
     view = session(scenes.make_mesh(), no_clobber=True)
     (tmp_path / "a.stl").write_text("mine")
+
     for name in ("a.stl", "b.stl"):
         view.do({"do": "save", "path": str(tmp_path / name)})
         assert view.wait(PATIENCE)
-    assert (tmp_path / "a.stl").read_text() == "mine" and (tmp_path / "b.stl").exists()
+
+    assert (tmp_path / "a.stl").read_text() == "mine"
     assert "a.stl" in view.facts()["error"] and "exists" in view.facts()["error"]
+    assert (tmp_path / "b.stl").exists()
 
 
 @pytest.mark.unit
@@ -130,7 +146,7 @@ def test_a_file_that_exists_stays_where_that_is_asked_for(session, tmp_path):
         ("a.b.stl", "a.b-2.stl", "a.b-3.stl"),
     ],
 )
-def test_names_are_counted_until_one_is_free(tmp_path, wanted, second, third):
+def test_number_is_put_to_a_name_until_one_is_free(tmp_path, wanted, second, third):
     assert free_name(tmp_path / wanted) == tmp_path / wanted
     (tmp_path / wanted).touch()
     assert free_name(tmp_path / wanted) == tmp_path / second
@@ -139,19 +155,27 @@ def test_names_are_counted_until_one_is_free(tmp_path, wanted, second, third):
 
 
 @pytest.mark.opencl
-def test_measures_are_saved_to_a_table_and_numbered_where_it_exists(session, tmp_path):
+@pytest.mark.parametrize("name", ["a.csv", "a.json", "a.mrk.json"])
+def test_measures_are_saved_to_a_table_json_or_markups(session, tmp_path, name):
     view = session()
     view.model.add_seed(Pick(point=(1.0, 2.0, 3.0)))
-    for name in ("a.csv", "a.json", "a.mrk.json"):
-        view.do({"do": "save", "path": str(tmp_path / name)})
-        assert view.wait(PATIENCE)
-        assert view.facts()["error"] is None and f"{name}: 1 measure" in view.facts()["said"]
-        assert "place 1" in (tmp_path / name).read_text(encoding="utf-8")
+
+    view.do({"do": "save", "path": str(tmp_path / name)})
+
+    assert view.wait(PATIENCE)
+    assert view.facts()["error"] is None
+    assert f"{name}: 1 measure" in view.facts()["said"]
+    assert "place 1" in (tmp_path / name).read_text(encoding="utf-8")
+
+
+@pytest.mark.unit
+def test_number_is_put_before_both_extensions_of_markups(tmp_path):
+    (tmp_path / "a.mrk.json").touch()
     assert free_name(tmp_path / "a.mrk.json").name == "a-2.mrk.json"
 
 
 @pytest.mark.opencl
-def test_a_table_without_measures_is_refused(session, tmp_path):
+def test_table_of_a_view_without_measures_is_refused(session, tmp_path):
     with refused(UsageError, "measure"):
         session().do({"do": "save", "path": str(tmp_path / "a.csv")})
     assert not (tmp_path / "a.csv").exists()

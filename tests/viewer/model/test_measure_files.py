@@ -20,7 +20,7 @@ MEASURES = (
 )
 
 
-def test_the_table_has_a_row_for_each_measure() -> None:
+def test_csv_of_measures_has_a_row_for_each_with_value_unit_and_points() -> None:
     text = encode_measures(MEASURES, "a.csv", "lps").decode()
     rows = list(csv.DictReader(io.StringIO(text)))
     assert [row["name"] for row in rows] == ['L3, "height"', "Winkel für T12", "place 1"]
@@ -28,7 +28,7 @@ def test_the_table_has_a_row_for_each_measure() -> None:
     assert rows[0]["points_mm"] == "1.000 2.000 3.000; 4.000 6.000 15.000"
 
 
-def test_json_says_its_frame_and_turns_points_to_it() -> None:
+def test_json_of_measures_names_its_frame_and_has_its_points_in_it() -> None:
     content = json.loads(encode_measures(MEASURES, "A.JSON", "ras"))
     assert (content["space"], content["points_unit"]) == ("RAS", "mm")
     assert content["measures"][2] == {
@@ -36,7 +36,7 @@ def test_json_says_its_frame_and_turns_points_to_it() -> None:
     }  # fmt: skip
 
 
-def test_markups_are_in_lps_whatever_the_frame_of_the_view() -> None:
+def test_markups_of_measures_have_their_types_names_and_points_in_lps_whatever_the_frame() -> None:
     content = json.loads(encode_measures(MEASURES, "a.mrk.json", "ras"))
     assert content["@schema"].endswith("markups-schema-v1.0.3.json#")
     markups = content["markups"]

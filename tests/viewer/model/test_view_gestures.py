@@ -17,62 +17,80 @@ BOTH = pytest.mark.parametrize("camera", [PARALLEL, PERSPECTIVE], ids=["parallel
 pytestmark = pytest.mark.unit
 
 
-def seen_at(camera: Camera, point) -> np.ndarray:
+def pixel_of(camera: Camera, point) -> np.ndarray:
     return camera.project([point], SIZE)[0][0]
 
 
 @BOTH
-def test_the_place_under_the_pointer_goes_with_a_shift(camera):
-    before = seen_at(camera, camera.focal_point)
+def test_shift_of_the_camera_moves_a_place_with_the_pointer(camera):
+    before = pixel_of(camera, camera.focal_point)
     moved = pan_camera(camera, 0.25, -0.1)
-    assert seen_at(moved, camera.focal_point) == pytest.approx(before + np.array([0.25, -0.1]) * SIZE[1])
+    assert pixel_of(moved, camera.focal_point) == pytest.approx(before + np.array([0.25, -0.1]) * SIZE[1])
 
 
 @BOTH
-def test_the_place_under_the_pointer_stays_at_a_zoom(camera):
+@pytest.mark.parametrize("factor", [3.0, 0.4], ids=["in", "out"])
+def test_zoom_of_the_camera_keeps_the_place_under_the_pointer_and_scales_pixels(camera, factor):
     right, up, _ = camera.basis()
-    point = np.array(camera.focal_point) + 30.0 * right - 12.0 * up
-    before = seen_at(camera, point)
-    at = (before - 0.5 * np.array(SIZE)) / SIZE[1]
-    for factor in (3.0, 0.4):
-        zoomed = zoom_camera(camera, factor, tuple(at))
-        assert seen_at(zoomed, point) == pytest.approx(before, abs=1e-6)
-        assert zoomed.pixel_mm(SIZE) == pytest.approx(camera.pixel_mm(SIZE) / factor)
+    place = np.array(camera.focal_point) + 30.0 * right - 12.0 * up
+    pixel = pixel_of(camera, place)
+    pointer = (pixel - 0.5 * np.array(SIZE)) / SIZE[1]  # from the middle, in heights of the picture
+
+    zoomed = zoom_camera(camera, factor, tuple(pointer))
+
+    assert pixel_of(zoomed, place) == pytest.approx(pixel, abs=1e-6)
+    assert zoomed.pixel_mm(SIZE) == pytest.approx(camera.pixel_mm(SIZE) / factor)
 
 
-def test_a_zoom_ends_before_numbers_do():
+def test_zoom_of_the_camera_ends_at_a_hundredth_of_a_mm():
     camera = PARALLEL
     for _ in range(200):
         camera = zoom_camera(camera, 10.0)
     assert camera.parallel_scale == pytest.approx(0.01)
-    for wrong in (0.0, -1.0, float("nan"), float("inf")):
-        with refused(UsageError, 0):
-            zoom_camera(PARALLEL, wrong)
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, float("nan"), float("inf")])
+def test_zoom_of_the_camera_by_no_factor_above_0_is_refused(factor):
+    with refused(UsageError, 0):
+        zoom_camera(PARALLEL, factor)
 
 
 @BOTH
-def test_a_gesture_over_the_height_is_half_a_turn_that_follows_the_pointer(camera):
+def test_turn_of_the_camera_by_the_height_of_the_picture_is_half_a_turn_at_its_distance(camera):
     turned = turn_camera(camera, 1.0, 0.0)
+
     assert turned.basis().forward == pytest.approx(-camera.basis().forward)
-    front = np.array(camera.focal_point) - 40.0 * camera.basis().forward
-    moved = seen_at(turn_camera(camera, 0.05, 0.0), front) - seen_at(camera, front)
-    assert moved[0] > 1.0 and moved[1] == pytest.approx(0.0, abs=1e-6)
-    moved = seen_at(turn_camera(camera, 0.0, 0.05), front) - seen_at(camera, front)
-    assert moved[1] > 1.0 and moved[0] == pytest.approx(0.0, abs=1e-6)
-    again = turn_camera(turn_camera(camera, 0.3, 0.0), -0.3, 0.0)
-    assert again.position == pytest.approx(camera.position) and turned.distance == pytest.approx(camera.distance)
+    assert turned.distance == pytest.approx(camera.distance)
 
 
 @BOTH
-def test_a_roll_turns_the_picture_clockwise(camera):
+@pytest.mark.parametrize(("dx", "dy"), [(0.05, 0.0), (0.0, 0.05)], ids=["to the right", "down"])
+def test_turn_of_the_camera_moves_the_front_of_an_object_with_the_pointer(camera, dx, dy):
+    front = np.array(camera.focal_point) - 40.0 * camera.basis().forward
+
+    moved = pixel_of(turn_camera(camera, dx, dy), front) - pixel_of(camera, front)
+
+    along, across = (0, 1) if dx else (1, 0)
+    assert moved[along] > 1.0  # pixels
+    assert moved[across] == pytest.approx(0.0, abs=1e-6)
+
+
+@BOTH
+def test_turn_of_the_camera_and_back_is_where_it_was(camera):
+    back = turn_camera(turn_camera(camera, 0.3, 0.0), -0.3, 0.0)
+    assert back.position == pytest.approx(camera.position)
+
+
+@BOTH
+def test_roll_of_the_camera_turns_the_picture_clockwise(camera):
     right, up, _ = camera.basis()
     top = np.array(camera.focal_point) + 20.0 * up
     rolled = roll_camera(camera, 90.0)
-    assert seen_at(rolled, top)[0] > seen_at(rolled, camera.focal_point)[0] + 1.0
+    assert pixel_of(rolled, top)[0] > pixel_of(rolled, camera.focal_point)[0] + 1.0
 
 
 @BOTH
-def test_the_camera_of_a_pixel_looks_along_its_ray(camera):
+def test_camera_of_a_pixel_looks_along_its_ray(camera):
     origins, directions = camera.rays(SIZE)
     for x, y in ((0, 0), (319, 199), (200, 30)):
         one = pixel_camera(camera, SIZE, x + 0.5, y + 0.5)

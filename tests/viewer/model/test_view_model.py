@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import view_scenes as scenes
 from refusals import refused
+from view_models import make_model
 
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.geometry import Volume
 from clrecon.labels.resample import ResampledLabels
 from clrecon.points import PointCloud
 from clrecon.viewer.drawing.painter import Painter
@@ -26,19 +26,7 @@ from clrecon.viewer.model.state import ClipPlane, Pick, ShownPart
 pytestmark = pytest.mark.unit
 
 
-class Clock:
-    now = 0.0
-
-    def __call__(self) -> float:
-        self.now += 10.0
-        return self.now
-
-
-def make_model(*subjects, **given) -> ViewModel:
-    return ViewModel(show_objects(subjects or [scenes.make_scan(), scenes.make_mesh()]), clock=Clock(), **given)
-
-
-def found(iso: float = 300.0) -> FoundParts:
+def make_parts(iso: float = 300.0) -> FoundParts:
     volume, labels = scenes.make_scan(), scenes.make_labels()
     parts = tuple(
         ShownPart(
@@ -81,9 +69,9 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
-def test_every_change_grows_the_version_and_can_be_undone(change):
+def test_each_change_raises_the_version_and_is_undone_in_one_step(change):
     model = make_model()
-    model.take_parts([found()])
+    model.take_parts([make_parts()])
     before, version = model.state, model.version
     change(model)
     assert model.state != before and model.version == version + 1
@@ -121,7 +109,7 @@ def test_every_change_grows_the_version_and_can_be_undone(change):
         (lambda m: m.set_clip_box((1.0, 0.0, 0.0), None), "two corners"),
     ],
 )
-def test_a_wrong_value_is_refused_and_changes_nothing(change, words):
+def test_wrong_value_is_refused_and_leaves_state_version_and_undo(change, words):
     model = make_model()
     before, version = model.state, model.version
     with pytest.raises(UsageError, match=words):
@@ -194,19 +182,31 @@ def test_facts_hold_the_modes_and_the_range_of_the_level():
     assert {"surface", "bone", "mip", "minip", "drr", "slices", "labels"} <= {each["name"] for each in facts["modes"]}
 
 
-def test_facts_note_a_mesh_that_the_mode_does_not_show():
+def test_facts_name_a_mesh_that_the_mode_does_not_show():
     model = make_model(scenes.make_scan(), scenes.make_mesh())
     model.set_mode("mip")
     assert "mesh 2" in model.facts()["notes"][0]
 
 
-def test_view_without_a_scan_has_only_what_means_something():
-    meshes, labels = make_model(scenes.make_mesh()), make_model(scenes.make_labels())
-    assert list(meshes.modes) == ["surface"] and meshes.facts()["iso"] is None
-    assert list(labels.modes) == ["labels"] and labels.state.mode == "labels"
-    for change in (lambda m: m.set_iso(200.0), lambda m: m.set_table(False)):
-        with pytest.raises(UsageError, match="no scan"):
-            change(meshes)
+def test_view_of_a_mesh_alone_has_one_mode_and_no_iso_value():
+    model = make_model(scenes.make_mesh())
+    assert list(model.modes) == ["surface"]
+    assert model.facts()["iso"] is None
+
+
+def test_view_of_labels_alone_is_in_its_one_mode():
+    model = make_model(scenes.make_labels())
+    assert list(model.modes) == ["labels"]
+    assert model.state.mode == "labels"
+
+
+@pytest.mark.parametrize("change", [lambda m: m.set_iso(200.0), lambda m: m.set_table(False)], ids=["iso", "table"])
+def test_change_of_a_scan_in_a_view_without_one_is_refused(change):
+    with pytest.raises(UsageError, match="no scan"):
+        change(make_model(scenes.make_mesh()))
+
+
+def test_view_without_objects_is_refused():
     with pytest.raises(UsageError, match="nothing to show"):
         ViewModel([])
 
@@ -223,146 +223,9 @@ def test_a_shown_mesh_gets_normals():
 
 
 @pytest.mark.parametrize(("objects", "fact"), [([], "nothing"), ([3], "int")], ids=["none", "a number"])
-def test_what_cannot_be_shown_as_an_object_is_refused(objects, fact):
+def test_view_of_nothing_or_of_a_number_is_refused(objects, fact):
     with refused(UsageError, fact):
         show_objects(objects)
-
-
-def measure(model, tool, *points):
-    """Return what the last of the points, or the end of a curve, makes."""
-    model.start_tool(tool)
-    made = [model.add_point(Pick(point=point)) for point in points]
-    return model.end_tool() if tool == "curve" else made[-1]
-
-
-def test_a_distance_is_made_of_two_points_in_mm():
-    model = make_model()
-    model.start_tool("distance")
-    assert model.add_point(Pick(point=(0.0, 0.0, 0.0))) is None
-    distance = model.add_point(Pick(point=(3.0, 4.0, 12.0)))
-    assert distance.value == pytest.approx(13.0)  # 9 + 16 + 144 = 13 * 13
-    assert distance.text == "13.0 mm"
-
-
-def test_an_angle_is_made_at_the_second_of_three_points_in_degrees():
-    angle = measure(make_model(), "angle", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 2.0, 0.0))
-    assert angle.value == pytest.approx(90.0)
-    assert angle.unit == "degrees"
-
-
-def test_a_curve_is_made_of_its_points_when_its_tool_ends():
-    model = make_model()
-    points = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.0, 0.0, 0.0), (3.0, 0.0, 0.0))
-    model.start_tool("curve")
-    assert [model.add_point(Pick(point=point)) for point in points] == [None] * 4
-    assert model.end_tool().value == pytest.approx(3.0)
-    assert model.state.curve == points
-    assert model.state.tool is None
-
-
-def test_a_seed_is_made_of_one_point_and_has_its_place_as_text():
-    model = make_model()
-    assert measure(model, "seed", (1.0, 2.0, 3.0)).value is None
-    assert model.facts()["measures"][0]["text"] == "1.0, 2.0, 3.0 mm LPS"
-
-
-def test_measures_are_undone_one_by_one_and_cleared_together():
-    model = make_model()
-    measure(model, "seed", (1.0, 2.0, 3.0))
-    measure(model, "distance", (0.0, 0.0, 0.0), (3.0, 4.0, 12.0))
-    measure(model, "seed", (4.0, 5.0, 6.0))
-    model.undo()
-    assert [each.kind for each in model.state.measures] == ["seed", "distance"]
-    model.clear_measures()
-    assert list(model.state.measures) == []
-    assert model.undo() == "the measures"
-    assert [each.kind for each in model.state.measures] == ["seed", "distance"]
-
-
-def test_measures_are_named_by_their_kind_with_the_first_free_number():
-    model = make_model()
-    for x in (1.0, 2.0, 3.0):
-        measure(model, "seed", (x, 0.0, 0.0))
-    measure(model, "distance", (0.0, 0.0, 0.0), (3.0, 4.0, 12.0))
-    model.remove_measure(1)
-    measure(model, "seed", (4.0, 0.0, 0.0))
-    assert [each.name for each in model.state.measures] == ["place 1", "place 3", "distance 1", "place 2"]
-
-
-def test_a_measure_is_renamed_without_spaces_around_and_undone():
-    model = make_model()
-    measure(model, "distance", (0.0, 0.0, 0.0), (3.0, 4.0, 12.0))
-    model.rename_measure(0, "  L3 height ")
-    assert model.facts()["measures"][0]["name"] == "L3 height"
-    assert model.undo() == "the name L3 height"
-    assert model.facts()["measures"][0]["name"] == "distance 1"
-
-
-def test_a_removed_measure_comes_back_by_undo_in_its_order():
-    model = make_model()
-    for x in (1.0, 2.0, 3.0):
-        measure(model, "seed", (x, 0.0, 0.0))
-    before = model.state
-    model.remove_measure(1)
-    assert [each.name for each in model.state.measures] == ["place 1", "place 3"]
-    model.undo()
-    assert model.state == before
-
-
-@pytest.mark.parametrize("name", ["", "   ", "a" * 81, "two\nlines", "turned\u202eround", 3], ids=repr)
-def test_a_name_that_cannot_be_read_is_refused(name):
-    model = make_model()
-    measure(model, "seed", (1.0, 2.0, 3.0))
-    with refused(UsageError, "name", 80):
-        model.rename_measure(0, name)
-    assert model.state.measures[0].name == "place 1"
-
-
-@pytest.mark.parametrize("n", [-1, 1, True, 0.0])
-def test_a_number_without_a_measure_is_refused(n):
-    model = make_model()
-    measure(model, "seed", (1.0, 2.0, 3.0))
-    with refused(UsageError, "measure", repr(n)):
-        model.remove_measure(n)
-    assert len(model.state.measures) == 1
-
-
-def test_the_curve_of_a_view_is_the_one_that_was_made_last():
-    model = make_model()
-    for length in (3.0, 5.0):
-        model.start_tool("curve")
-        for x in (0.0, length):
-            model.add_point(Pick(point=(x, 0.0, 0.0)))
-        model.end_tool()
-    assert model.state.curve == ((0.0, 0.0, 0.0), (5.0, 0.0, 0.0))
-
-
-def test_an_angle_of_points_in_one_place_is_refused():
-    model = make_model()
-    model.start_tool("angle")
-    model.add_point(Pick(point=(0.0, 0.0, 0.0)))
-    model.add_point(Pick(point=(0.0, 0.0, 0.0)))
-    with refused(UsageError, "angle", "points"):
-        model.add_point(Pick(point=(1.0, 0.0, 0.0)))
-
-
-def test_slices_are_numbered_away_from_the_eye():
-    affine = np.diag([-1.0, 1.0, 2.0, 1.0])  # i runs to the right, j to the back, k up
-    model = make_model(Volume(np.zeros((5, 4, 3), np.int16), affine))
-    model.set_cross((-2.0, 1.0, 0.0))
-    slices = model.facts()["slices"]
-    assert slices == {
-        "axial": {"place": "I 0.0 mm", "number": 1, "count": 5},
-        "coronal": {"place": "P 1.0 mm", "number": 2, "count": 4},
-        "sagittal": {"place": "R 2.0 mm", "number": 3, "count": 3},
-    }
-    model.scroll("axial", 3)
-    assert model.facts()["slices"]["axial"] == {"place": "S 6.0 mm", "number": 4, "count": 5}
-
-
-def test_slices_without_a_scan_have_a_place_and_no_number():
-    model = make_model(scenes.make_mesh())
-    assert set(model.facts()["slices"]["sagittal"]) == {"place"}
 
 
 @pytest.fixture
@@ -397,42 +260,63 @@ def test_a_removed_clip_plane_is_gone(clipped):
     assert model.state.clip is None and model.state.clips == ()
 
 
-def test_a_view_fits_what_is_shown():
+def test_window_of_a_view_follows_from_its_parts_when_they_are_found():
     model = make_model()
     version = model.version
-    model.take_parts([found()])
-    assert model.version == version + 1 and model.state.window == (-450.0, 1050.0)
-    whole = model.camera.parallel_scale
+
+    model.take_parts([make_parts()])
+
+    assert model.version == version + 1
+    assert model.state.window == (-450.0, 1050.0)
+
+
+def test_view_from_a_side_fits_the_parts_that_are_shown():
+    model = make_model()
+    model.take_parts([make_parts()])
+    of_all = model.camera.parallel_scale
     box = ((-50.0, -30.0, 205.0), (-45.0, -25.0, 210.0))
     parts = tuple(
-        ShownPart(**{**vars(each), "box": box}) if each.kind == "cluster" else each for each in model.state.parts
+        ShownPart(**{**vars(part), "box": box}) if part.kind == "cluster" else part for part in model.state.parts
     )
     model._change("test", "a test", parts=parts)
+
     model.only("1/1")
     model.look("anterior")
-    assert model.camera.parallel_scale < 0.5 * whole
-    assert model.camera.focal_point == pytest.approx((-47.5, -27.5, 207.5))
+
+    assert model.camera.parallel_scale < 0.5 * of_all
+    assert model.camera.focal_point == pytest.approx((-47.5, -27.5, 207.5))  # the middle of the box
 
 
-def test_only_and_show_all_switch_every_part():
+@pytest.fixture
+def three_parts():
+    """A model of a scan, its parts 1/1, 1/2 and the rest 1/0, and a mesh 2."""
     model = make_model(scenes.make_scan(), scenes.make_mesh())
-    model.take_parts([found()])
-    model.only("1/2")
-    assert {each.key for each in model.state.parts if each.visible} == {"1", "1/2"}
-    model.only("1")
-    assert {each.key for each in model.state.parts if each.visible} == {"1", "1/1", "1/2", "1/0"}
-    model.show_all()
-    assert all(each.visible for each in model.state.parts)
+    model.take_parts([make_parts()])
+    return model
+
+
+@pytest.mark.parametrize(
+    ("key", "visible"), [("1/2", {"1", "1/2"}), ("1", {"1", "1/1", "1/2", "1/0"})], ids=["a part", "a scan"]
+)
+def test_part_alone_is_shown_with_its_scan_and_a_scan_with_its_parts(three_parts, key, visible):
+    three_parts.only(key)
+    assert {part.key for part in three_parts.state.parts if part.visible} == visible
+
+
+def test_all_parts_are_shown_again_together(three_parts):
+    three_parts.only("1/2")
+    three_parts.show_all()
+    assert all(part.visible for part in three_parts.state.parts)
 
 
 def test_looks_of_parts_go_over_to_another_iso_value_by_their_place():
     model = make_model(scenes.make_scan())
-    model.take_parts([found(300.0)])
+    model.take_parts([make_parts(300.0)])
     model.show("1/2", False)
     model.set_color("1/1", (1.0, 0.0, 0.0))
     model.set_iso(310.0)
     assert not model.parts_known
-    fresh = found(310.0)
+    fresh = make_parts(310.0)
     swapped = {1: 2, 2: 1, 0: 0}
     voxels = np.array([0, 2, 1], np.uint8)[fresh.labels.voxels]
     labels = type(fresh.labels)(voxels, fresh.labels.affine.copy())
@@ -446,126 +330,103 @@ def test_looks_of_parts_go_over_to_another_iso_value_by_their_place():
     assert model.state.part("1/2").visible and model.state.part("1/1").color is None
 
 
-def test_slices_begin_in_the_middle_of_the_scan_whatever_lies_beside_it():
-    far = scenes.make_mesh(np.array([500.0, 0.0, 0.0]))
-    cross = make_model(far, scenes.make_scan()).state.cross
-    assert scenes.make_scan().lps_to_ijk(cross) == pytest.approx([22.0, 20.0, 11.0])  # of 44 x 40 x 22 voxels
-
-
-def paged(affine, plane: str, positions=None) -> list[tuple[int, float]]:
-    """Number and index along k of every position that paging reaches, the way back included, of 3 x 4 x 5 voxels."""
-    volume = Volume(np.zeros((5, 4, 3), np.int16), np.array(affine), slice_positions=positions)
-    model = make_model(volume)
-    model.set_cross(volume.ijk_to_lps([1.0, 2.0, 2.3]))
-    model.scroll(plane, -1e308)
-    places = []
-    for step in (1, -1):
-        version = -1
-        while version != model.version:
-            version = model.version
-            number = model.facts()["slices"][plane]["number"]
-            places.append((number, round(float(volume.lps_to_ijk(model.state.cross)[2]), 6)))
-            model.scroll(plane, step)
-    assert places[: len(places) // 2] == places[len(places) // 2 :][::-1]
-    return places[: len(places) // 2]
-
-
-TURNED = [[0.0, 0.0, 2.5, 0.0], [0.7, 0.0, 0.0, 0.0], [0.0, 0.7, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]  # k runs to the left
-TILTED = [[0.7, 0.0, 0.0, 0.0], [0.0, 0.7, 0.7, 0.0], [0.0, 0.0, 2.5, 0.0], [0.0, 0.0, 0.0, 1.0]]  # gantry tilt
-UNEVEN = np.outer([0.0, 2.5, 3.0, 9.0, 10.0], [0.0, 0.0, 1.0])
-
-
 @pytest.mark.parametrize(
-    ("affine", "plane", "positions", "last_first"),
+    ("plane", "facts", "row"),
     [
-        (np.diag([0.7, 0.7, 2.5, 1.0]), "axial", None, False),
-        (np.diag([0.7, 0.7, -2.5, 1.0]), "axial", None, True),
-        (np.diag([0.7, 0.7, 2.5, 1.0]), "axial", UNEVEN, False),
-        (TURNED, "sagittal", None, True),
-        (TILTED, "axial", None, False),
+        pytest.param(
+            ClipPlane(direction=(1.0, 0.0, 0.0), name="left", low=-10.0, high=30.0, share=0.25),
+            {"words": "left side", "direction": [1.0, 0.0, 0.0], "at_mm": 0.0, "flipped": False},
+            (-1.0, 0.0, 0.0, 0.0),
+            id="from a side by its name",
+        ),
+        pytest.param(
+            ClipPlane(direction=(0.0, 0.0, 1.0), name="0,0,1", low=-10.0, high=30.0, share=0.5, flipped=True),
+            {"words": "S side", "direction": [0.0, 0.0, 1.0], "at_mm": 10.0, "flipped": True},
+            (0.0, 0.0, 1.0, 10.0),
+            id="flipped",
+        ),
     ],
-    ids=["upwards", "downwards", "uneven", "turned", "tilted"],
 )
-def test_paging_shows_each_layer_once_at_its_middle(affine, plane, positions, last_first):
-    layers = [4.0, 3.0, 2.0, 1.0, 0.0] if last_first else [0.0, 1.0, 2.0, 3.0, 4.0]
-    assert paged(affine, plane, positions) == list(zip([1, 2, 3, 4, 5], layers, strict=True))
+def test_clip_plane_has_its_side_in_words_its_place_in_mm_and_the_row_of_its_plane(plane, facts, row):
+    assert facts.items() <= plane.describe().items()
+    assert plane.row == row
 
 
-def test_paging_an_oblique_scan_goes_to_the_middle_of_the_next_layer_at_the_cross():
-    scan = scenes.make_scan()
-    model = make_model(scan)
-    model.set_cross(scan.ijk_to_lps([22.0, 20.0, 11.3]))
-    for plane, axis, layers in (("axial", 2, [10.0, 11.0]), ("sagittal", 0, [21.0, 20.0])):
-        model.scroll(plane, -1 if plane == "axial" else 1)
-        first = scan.lps_to_ijk(model.state.cross)[axis]
-        model.scroll(plane, 1)
-        assert [first, scan.lps_to_ijk(model.state.cross)[axis]] == pytest.approx(layers), plane
-
-
-def test_slices_without_a_scan_scroll_by_mm_and_stay_within():
-    model = make_model(scenes.make_mesh())
-    before = model.state.cross[2]
-    model.scroll("axial", 1)
-    assert model.state.cross[2] == pytest.approx(before + 1.0)
-    model.scroll("axial", 10_000)
-    assert model.state.cross[2] == pytest.approx(model.objects[0].corners[:, 2].max())
-
-
-def test_a_clip_plane_says_its_side():
-    def say(name, direction, share=0.25, flipped=False):
-        plane = ClipPlane(direction=direction, name=name, low=-10.0, high=30.0, share=share, flipped=flipped)
-        return plane.describe() | {"row": plane.row}
-
-    assert say("left", (1.0, 0.0, 0.0)) == {
-        "name": "left", "words": "left side", "direction": [1.0, 0.0, 0.0], "share": 0.25, "at_mm": 0.0,
-        "flipped": False, "row": (-1.0, 0.0, 0.0, 0.0),
-    }  # fmt: skip
-    oblique = say("0,0,1", (0.0, 0.0, 1.0), 0.5, True)
-    assert (oblique["words"], oblique["row"]) == ("S side", (0.0, 0.0, 1.0, 10.0))
-
-
-def test_a_perspective_camera_sees_the_focal_plane_as_the_parallel_one_did():
+def test_perspective_camera_shows_the_focal_plane_as_large_as_the_parallel_one():
     model = make_model()
-    before = model.state.camera
+    parallel = model.state.camera
+
     model.set_perspective(True)
-    after = model.state.camera
-    assert after.view_angle == 30.0 and after.focal_point == before.focal_point
-    assert after.half_height() * after.distance == pytest.approx(before.parallel_scale)
+
+    perspective = model.state.camera
+    assert perspective.view_angle == 30.0
+    assert perspective.focal_point == parallel.focal_point
+    assert perspective.half_height() * perspective.distance == pytest.approx(parallel.parallel_scale)
+
+
+def test_camera_that_is_parallel_again_has_its_scale():
+    model = make_model()
+    before = model.state.camera.parallel_scale
+    model.set_perspective(True)
     model.set_perspective(False)
-    assert model.state.camera.parallel_scale == pytest.approx(before.parallel_scale)
+    assert model.state.camera.parallel_scale == pytest.approx(before)
 
 
-@pytest.mark.parametrize(("number", "key", "of"), [(2, "1/2", 7), (3, None, None)])
-def test_a_place_in_a_slice_is_of_the_part_that_lies_there(number, key, of):
-    look = SimpleNamespace(parts=[SimpleNamespace(number=2, key="1/2")])
+def pick_in_middle(sliced, number):
+    """Pick the middle of a slice in which `number` lies there, by a painter that has part 2 of object 7 alone."""
     camera = make_model().state.camera
     painter = SimpleNamespace(
         lock=nullcontext(), hu_at=lambda point: 55.0, slice_camera=lambda *given: camera,
-        _sliced=lambda state: ("scan", look), _number_at=lambda scan, labelled, point: number,
+        _sliced=lambda state: sliced, _number_at=lambda scan, labelled, point: number,
     )  # fmt: skip
     state = SimpleNamespace(part=lambda key: SimpleNamespace(object=7))
-    middle = Painter.pick_slice(painter, state, "axial", (40, 30), 20.0, 15.0)
-    assert (middle.part, middle.object, middle.hu) == (key, of, 55.0)
-    assert middle.point == pytest.approx(camera.focal_point)
-    for found in (None, ("scan", None)):  # no scan, or no parts
-        painter._sliced = lambda state, found=found: found
-        assert Painter.pick_slice(painter, state, "axial", (40, 30), 20.0, 15.0).part is None
+    return Painter.pick_slice(painter, state, "axial", (40, 30), 20.0, 15.0), camera
 
 
-def test_clouds_that_are_shown_are_one_with_what_all_of_them_have():
-    one = PointCloud(np.zeros((2, 3)), hu=np.array([1.0, 2.0]), labels=np.array([1, 2]))
-    other = PointCloud(np.ones((3, 3)), hu=np.array([3.0, 4.0, 5.0]))
-    model = make_model(one, other)
-    painter = SimpleNamespace(objects=show_objects([one, other]))
-    both = shown_cloud(painter, model.state)
-    assert both.points[:, 0].tolist() == [0, 0, 1, 1, 1] and both.hu.tolist() == [1, 2, 3, 4, 5] and both.labels is None
-    model.show("1", False)
-    assert shown_cloud(painter, model.state).hu.tolist() == [3, 4, 5]
-    painter.objects = show_objects([one])
-    assert shown_cloud(painter, make_model(one).state).labels.tolist() == [1, 2]
+@pytest.mark.parametrize(("number", "key", "number_of_object"), [(2, "1/2", 7), (3, None, None)], ids=["part", "none"])
+def test_pick_in_a_slice_is_of_the_part_that_lies_there(number, key, number_of_object):
+    parts = SimpleNamespace(parts=[SimpleNamespace(number=2, key="1/2")])
+
+    pick, camera = pick_in_middle(("scan", parts), number)
+
+    assert (pick.part, pick.object, pick.hu) == (key, number_of_object, 55.0)
+    assert pick.point == pytest.approx(camera.focal_point)
 
 
-def test_the_search_for_parts_tells_every_step(monkeypatch):
+@pytest.mark.parametrize("sliced", [None, ("scan", None)], ids=["no scan", "no parts"])
+def test_pick_in_a_slice_without_parts_is_of_none(sliced):
+    pick, _ = pick_in_middle(sliced, 2)
+    assert pick.part is None
+
+
+CLOUD_OF_2 = PointCloud(np.zeros((2, 3)), hu=np.array([1.0, 2.0]), labels=np.array([1, 2]))
+CLOUD_OF_3 = PointCloud(np.ones((3, 3)), hu=np.array([3.0, 4.0, 5.0]))
+
+
+def cloud_of_shown(*clouds, hidden=None):
+    model = make_model(*clouds)
+    if hidden:
+        model.show(hidden, False)
+    return shown_cloud(SimpleNamespace(objects=show_objects(clouds)), model.state)
+
+
+def test_clouds_that_are_shown_are_one_with_the_values_that_all_of_them_have():
+    together = cloud_of_shown(CLOUD_OF_2, CLOUD_OF_3)
+
+    assert together.points[:, 0].tolist() == [0, 0, 1, 1, 1]
+    assert together.hu.tolist() == [1, 2, 3, 4, 5]
+    assert together.labels is None  # one of them has none
+
+
+def test_hidden_cloud_is_not_among_the_points_that_are_shown():
+    assert cloud_of_shown(CLOUD_OF_2, CLOUD_OF_3, hidden="1").hu.tolist() == [3, 4, 5]
+
+
+def test_single_cloud_that_is_shown_keeps_its_labels():
+    assert cloud_of_shown(CLOUD_OF_2).labels.tolist() == [1, 2]
+
+
+def test_progress_of_the_search_for_parts_names_each_step(monkeypatch):
     def find_nothing(resident, band):
         raise NoSurfaceError("no voxel is so dense")
 
@@ -573,26 +434,3 @@ def test_the_search_for_parts_tells_every_step(monkeypatch):
     told = []
     parts.find_clusters(SimpleNamespace(volume=scenes.make_scan()), 1, 300.0, True, lambda *step: told.append(step))
     assert told == [("parts", done, parts.STEPS) for done in range(parts.STEPS + 1)]
-
-
-def test_slices_that_are_edge_on_turn_the_camera_and_are_told():
-    model = make_model(scenes.make_scan())
-    start = model.camera
-    model.set_mode("slices")
-    normal = np.cross(*model.scans[0].volume.affine[:3, :2].T)
-    along = model.camera.basis().forward @ normal / np.linalg.norm(normal)
-    assert abs(along) >= 0.25, along
-    assert model.facts()["notes"] == []
-    model.look("anterior")
-    assert "turn the picture" in model.facts()["notes"][0]
-    model.undo()
-    model.undo()
-    assert (model.camera, model.state.mode) == (start, "surface"), "one change has mode and camera"
-
-
-def test_slices_that_are_seen_leave_the_camera():
-    model = make_model(scenes.make_scan())
-    model.look("superior")
-    start = model.camera
-    model.set_mode("slices")
-    assert model.camera == start

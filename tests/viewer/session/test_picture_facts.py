@@ -21,34 +21,44 @@ CAMERA = Camera((0.0, -100.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), parallel_s
 SIZE = (100, 100)
 
 
-def wall(left: int, right: int, mm: float) -> Rendering:
-    """A picture of a wall over some columns, so far from the eye."""
+def picture_of_wall(left: int, right: int, mm: float) -> Rendering:
+    """A picture of a picture_of_wall over some columns, so far from the eye."""
     depth = np.full(SIZE[::-1], np.nan, np.float32)
     depth[:, left:right] = mm
     image = np.zeros((*SIZE[::-1], 4), np.uint8)
     return Rendering(image, depth, depth, CAMERA, None, "surface", {})
 
 
-def lengths(pieces: list[list[list[float]]]) -> list[float]:
+def lengths_mm(pieces: list[list[list[float]]]) -> list[float]:
     return [float(np.linalg.norm(np.subtract(last, first))) for first, last in pieces]
 
 
-def test_a_line_is_hidden_behind_a_wall_and_seen_beside_it():
-    line = np.array([[-40.0, 0.0, 0.0], [40.0, 0.0, 0.0]])  # 100 mm from the eye, 80 columns wide
-    assert lengths(seen_pieces(wall(40, 60, 50.0), [line], expected=False)) == pytest.approx([30.0, 30.0], abs=1.5)
-    assert lengths(seen_pieces(wall(40, 60, 150.0), [line], expected=False)) == pytest.approx([80.0])
-    assert seen_pieces(wall(0, 100, 50.0), [line], expected=False) == []
+LINE_OF_80_MM = np.array([[-40.0, 0.0, 0.0], [40.0, 0.0, 0.0]])
+"""100 mm from the eye; a pixel is 1 mm wide."""
 
 
-def test_a_line_on_the_surface_and_one_beside_the_picture_are_seen():
+@pytest.mark.parametrize(
+    ("columns", "wall_mm", "seen_mm"),
+    [
+        pytest.param((40, 60), 50.0, [30.0, 30.0], id="behind a narrow wall"),
+        pytest.param((40, 60), 150.0, [80.0], id="before a wall"),
+        pytest.param((0, 100), 50.0, [], id="behind a wide wall"),
+    ],
+)
+def test_line_is_hidden_behind_a_wall_and_seen_beside_and_before_it(columns, wall_mm, seen_mm):
+    pieces = seen_pieces(picture_of_wall(*columns, wall_mm), [LINE_OF_80_MM], expected=False)
+    assert lengths_mm(pieces) == pytest.approx(seen_mm, abs=1.5)  # pixels at its ends
+
+
+def test_line_on_a_surface_and_line_beside_the_picture_are_seen():
     on, beside = np.array([[-40.0, 0, 0], [40.0, 0, 0]]), np.array([[100.0, 0, 0], [200.0, 0, 0]])
-    assert len(seen_pieces(wall(0, 100, 100.0), [on, beside], expected=True)) == 2
+    assert len(seen_pieces(picture_of_wall(0, 100, 100.0), [on, beside], expected=True)) == 2
 
 
 @pytest.mark.parametrize(("behind", "count"), [(2.4, 1), (2.6, 0)])
-def test_a_line_may_lie_half_a_mm_and_two_pixels_behind_what_is_seen(behind, count):
+def test_line_up_to_half_a_mm_and_two_pixels_behind_a_wall_is_seen(behind, count):
     line = np.array([[-40.0, 0, 0], [40.0, 0, 0]])
-    assert len(seen_pieces(wall(0, 100, 100.0 - behind), [line], expected=False)) == count
+    assert len(seen_pieces(picture_of_wall(0, 100, 100.0 - behind), [line], expected=False)) == count
 
 
 def changed_views(**changes: object) -> set[str]:
@@ -68,10 +78,10 @@ def changed_views(**changes: object) -> set[str]:
         ({"parts_at": 300.0, "tool": "seed", "points": (), "measures": ()}, set()),
     ],
 )
-def test_a_picture_is_stale_by_what_it_shows(changes, views):
+def test_change_of_the_view_makes_the_pictures_stale_that_show_it(changes, views):
     assert changed_views(**changes) == views
 
 
-def test_in_mode_slices_the_cross_leaves_the_picture():
+def test_change_of_the_cross_leaves_the_scene_in_mode_slices_fresh():
     state = replace(ViewModel(show_objects([scenes.make_scan()])).state, mode="slices")
     assert picture_key(state, "scene") == picture_key(replace(state, cross=(1.0, 2.0, 3.0)), "scene")

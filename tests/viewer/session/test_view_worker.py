@@ -36,7 +36,7 @@ class Held:
         self.done = True
 
 
-def test_of_a_kind_the_latest_waits_and_others_are_dropped(worker):
+def test_latest_work_of_a_kind_waits_and_earlier_ones_are_dropped(worker):
     held, done = Held(), []
     worker.ask("other", held)
     held.begun.wait(5.0)
@@ -47,18 +47,21 @@ def test_of_a_kind_the_latest_waits_and_others_are_dropped(worker):
     assert worker.wait(5.0) and done == [4] and held.done
 
 
-def test_running_work_is_cancelled_by_the_next_only_if_it_gives_way(worker):
-    for gives_way in (True, False):
-        held = Held()
-        worker.ask("picture", held, gives_way=gives_way)
-        held.begun.wait(5.0)
-        worker.ask("picture", lambda job: None)
-        held.go.set()
-        assert worker.wait(5.0) and held.done is not gives_way
+@pytest.mark.parametrize("gives_way", [True, False])
+def test_running_work_is_cancelled_by_the_next_of_its_kind_only_if_it_gives_way(worker, gives_way):
+    held = Held()
+    worker.ask("picture", held, gives_way=gives_way)
+    held.begun.wait(5.0)
+
+    worker.ask("picture", lambda job: None)
+    held.go.set()
+
+    assert worker.wait(5.0)
+    assert held.done is not gives_way
     assert worker.errors == []
 
 
-def test_lower_ranks_come_first(worker):
+def test_waiting_work_of_a_lower_rank_is_done_first(worker):
     held, done = Held(), []
     worker.ask("first", held)
     held.begun.wait(5.0)
@@ -68,24 +71,40 @@ def test_lower_ranks_come_first(worker):
     assert worker.wait(5.0) and done == ["a", "b", "c"]
 
 
-def test_errors_are_words_and_the_thread_goes_on(worker):
-    def fail(error):
-        def work(job):
-            raise error
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        pytest.param(DeviceError("the device has no room"), ["the device has no room"], id="of clrecon"),
+        pytest.param(ZeroDivisionError("by zero"), ["ZeroDivisionError: by zero", "fault of clrecon"], id="unexpected"),
+    ],
+)
+def test_error_of_work_is_told_in_words_and_the_worker_goes_on(worker, error, told):
+    def fail(job):
+        raise error
 
-        return work
-
-    worker.ask("one", fail(DeviceError("the device has no room")))
+    worker.ask("one", fail)
     assert worker.wait(5.0)
-    worker.ask("two", fail(ZeroDivisionError("by zero")))
+    done = []
+    worker.ask("two", lambda job: done.append(1))
     assert worker.wait(5.0)
-    worker.ask("three", fail(Cancelled()))
-    assert worker.wait(5.0)
-    assert worker.errors[0] == ("one", "the device has no room") and len(worker.errors) == 2
-    assert "ZeroDivisionError: by zero" in worker.errors[1][1] and "fault of clrecon" in worker.errors[1][1]
+
+    ((kind, words),) = worker.errors
+    assert kind == "one"
+    assert [text for text in told if text not in words] == []
+    assert done == [1]
 
 
-def test_closing_cancels_what_runs_and_takes_nothing_more(worker):
+def test_cancelled_work_is_no_error(worker):
+    def be_cancelled(job):
+        raise Cancelled
+
+    worker.ask("one", be_cancelled)
+
+    assert worker.wait(5.0)
+    assert worker.errors == []
+
+
+def test_closed_worker_cancels_what_runs_and_takes_no_more_work(worker):
     steps = []
 
     def work(job):
@@ -103,7 +122,7 @@ def test_closing_cancels_what_runs_and_takes_nothing_more(worker):
     assert len(steps) == count and worker.busy == []
 
 
-def test_a_kind_can_be_cancelled(worker):
+def test_running_and_waiting_work_is_cancelled_by_its_kind(worker):
     held, done = Held(), []
     worker.ask("long", held)
     held.begun.wait(5.0)
