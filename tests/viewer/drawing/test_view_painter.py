@@ -113,6 +113,7 @@ def test_large_picture_is_cancelled_between_its_strips(open_model_and_painter, m
     asked = []
     with pytest.raises(Cancelled):
         painter.picture(model.state, LARGE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 2)
+    assert len(asked) == 3  # before it begins, before the first strip, and before the second
 
 
 def test_picture_of_a_view_asks_twice_whether_it_is_cancelled_and_ends_where_it_is(open_model_and_painter):
@@ -306,6 +307,7 @@ def test_picture_of_a_translucent_mesh_is_cancelled_between_its_layers(transluce
     asked = []
     with pytest.raises(Cancelled):
         painter.picture(model.state, SIZE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 4)
+    assert len(asked) == 5
 
 
 def test_pick_of_a_translucent_mesh_is_on_its_front(translucent_mesh):

@@ -26,7 +26,7 @@ AT = {"size": list(SIZE)}
 
 
 @pytest.fixture
-def session(device):
+def open_session(device):
     with open_sessions(device) as make:
         yield make
 
@@ -37,7 +37,8 @@ def pixel(session: ViewSession, number: int) -> dict:
     return {"x": float(x), "y": float(y), **AT}
 
 
-def picture(session: ViewSession, moving: bool = False):
+def wait_for_picture(session: ViewSession, moving: bool = False):
+    """Return the next picture of the scene."""
     found: list[Any] = []
     session.picture(SIZE, moving, found.append)
     assert session.wait(PATIENCE)
@@ -109,9 +110,9 @@ RIGHT: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.opencl
-def test_every_command_is_done_and_undone(session):
+def test_each_command_is_done_and_what_it_changes_is_undone(open_session):
     assert set(RIGHT) | {"save"} == set(COMMANDS)
-    view = session()
+    view = open_session()
     view.do({"do": "find_parts"})
     assert view.wait(PATIENCE)
     for name, arguments in RIGHT.items():
@@ -171,8 +172,8 @@ def test_every_command_is_done_and_undone(session):
         ({"do": "save", "path": ""}, "extension"),
     ],
 )
-def test_a_wrong_command_is_refused_and_changes_nothing(session, command, words):
-    view = session()
+def test_wrong_command_is_refused_and_leaves_state_and_version(open_session, command, words):
+    view = open_session()
     before, version = view.model.state, view.model.version
     with pytest.raises(UsageError, match=words):
         view.do(command)
@@ -180,8 +181,8 @@ def test_a_wrong_command_is_refused_and_changes_nothing(session, command, words)
 
 
 @pytest.mark.opencl
-def test_pictures_and_slices_come_from_its_threads(session):
-    view = session()
+def test_pictures_and_slices_of_a_session_are_drawn_by_its_thread_with_their_timing(open_session):
+    view = open_session()
     names = []
     view.picture(SIZE, False, lambda made: names.append((threading.current_thread().name, made.size)))
     for plane in ("axial", "coronal", "sagittal"):
@@ -194,43 +195,59 @@ def test_pictures_and_slices_come_from_its_threads(session):
 
 
 @pytest.mark.opencl
-def test_a_coarse_picture_is_steered_and_the_latest_state_is_drawn(session, monkeypatch):
-    view = session(scenes.make_scan())
-    paint, took_ms = view.painter.picture, 1.0
+@pytest.mark.parametrize(("took_ms", "size"), [(1.0, SIZE), (1e9, (77, 64))], ids=["fast", "slow"])
+def test_coarse_picture_is_smaller_after_one_that_took_long(open_session, monkeypatch, took_ms, size):
+    view = open_session(scenes.make_scan())
+    paint = view.painter.picture
 
-    def paint_for(*given, **how):
+    def paint_in(*given, **how):
         painted = paint(*given, **how)
         painted.report["ms"] = took_ms
         return painted
 
-    monkeypatch.setattr(view.painter, "picture", paint_for)
-    picture(view, moving=True)
-    assert picture(view, moving=True).size == SIZE
-    took_ms = 1e9
-    picture(view, moving=True)
-    assert picture(view, moving=True).size == (77, 64)
+    monkeypatch.setattr(view.painter, "picture", paint_in)
+    wait_for_picture(view, moving=True)
+
+    assert wait_for_picture(view, moving=True).size == size
+
+
+@pytest.mark.opencl
+def test_coarse_picture_shows_the_latest_state(open_session):
+    view = open_session(scenes.make_scan())
+    wait_for_picture(view, moving=True)
+
     view.do({"do": "look", "view": "left"})
-    assert picture(view, moving=True).camera == view.model.camera
+
+    assert wait_for_picture(view, moving=True).camera == view.model.camera
 
 
 @pytest.mark.opencl
-def test_a_part_at_a_pixel_is_hidden_once_the_parts_are_found(session):
-    view = session()
+def test_part_at_a_pixel_is_hidden_when_the_parts_are_found(open_session):
+    view = open_session()
+
     facts = view.do({"do": "hide_at", **pixel(view, 2)})
-    assert facts["pick"]["part"] == "1"
+    assert facts["pick"]["part"] == "1"  # the scan: its parts are not known yet
     assert view.wait(PATIENCE)
-    assert view.model.state.part("1/3").visible is False and view.model.state.part("1/1").visible
-    view.do({"do": "only_at", **pixel(view, 1)})
-    assert [each.key for each in view.model.state.parts if each.visible] == ["1", "1/2"]
-    assert view.do({"do": "pick", **pixel(view, 0)})["pick"] is None
-    view.do({"do": "undo"})
-    view.do({"do": "undo"})
-    assert view.model.state.part("1/3").visible
+
+    assert not view.model.state.part("1/3").visible
+    assert view.model.state.part("1/1").visible
 
 
 @pytest.mark.opencl
-def test_parts_are_found_again_at_another_iso_value_when_nothing_moves(session):
-    view = session(scenes.make_scan())
+def test_part_at_a_pixel_is_shown_alone_and_others_are_not_picked(open_session):
+    view = open_session()
+    view.do({"do": "find_parts"})
+    assert view.wait(PATIENCE)
+
+    view.do({"do": "only_at", **pixel(view, 1)})
+
+    assert [part.key for part in view.model.state.parts if part.visible] == ["1", "1/2"]
+    assert view.do({"do": "pick", **pixel(view, 0)})["pick"] is None
+
+
+@pytest.mark.opencl
+def test_parts_are_found_again_at_another_iso_value_when_the_view_rests(open_session):
+    view = open_session(scenes.make_scan())
     view.do({"do": "find_parts"})
     assert view.wait(PATIENCE)
     view.do({"do": "show", "key": "1/1", "visible": False})
@@ -243,27 +260,52 @@ def test_parts_are_found_again_at_another_iso_value_when_nothing_moves(session):
     assert view.wait(PATIENCE) and view.facts()["parts_known"] and view.model.state.iso_value == scenes.ISO
 
 
-@pytest.mark.opencl
-def test_points_of_a_tool_are_picks_in_picture_and_slices(session):
-    view = session(scenes.make_scan())
+@pytest.fixture
+def scan_view(open_session):
+    """A session of a scan, its cross in the middle of the first ball."""
+    view = open_session(scenes.make_scan())
     view.do({"do": "set_cross", "point": scenes.middle(0).tolist()})
-    view.do({"do": "start_tool", "name": "distance"})
-    assert view.do({"do": "add_point", "x": 1, "y": 1, **AT})["measure"] is None
-    assert view.facts()["points"] == []
-    for number in (0, 1):
-        facts = view.do({"do": "add_point", **pixel(view, number)})
-    assert facts["measure"]["unit"] == "mm" and facts["measures"][0]["text"].endswith(" mm")
-    camera = view.painter.slice_camera(view.model.state, "axial", SIZE)
-    x, y = camera.project([scenes.middle(0)], SIZE)[0][0]
-    view.do({"do": "start_tool", "name": "seed"})
-    facts = view.do({"do": "add_point", "x": x, "y": y, **AT, "plane": "axial"})
-    assert facts["measure"]["points"][0] == pytest.approx(scenes.middle(0), abs=1e-3)
-    facts = view.do({"do": "cross_at", **pixel(view, 1)})
-    assert facts["cross"] == pytest.approx(facts["pick"]["point"], abs=1e-3)
+    return view
 
 
 @pytest.mark.opencl
-def test_the_table_goes_in_the_background_and_it_is_said_how_much(session, monkeypatch):
+def test_two_points_picked_in_the_picture_make_a_distance(scan_view):
+    scan_view.do({"do": "start_tool", "name": "distance"})
+    scan_view.do({"do": "add_point", **pixel(scan_view, 0)})
+    facts = scan_view.do({"do": "add_point", **pixel(scan_view, 1)})
+
+    assert facts["measure"]["unit"] == "mm"
+    assert facts["measures"][0]["text"].endswith(" mm")
+
+
+@pytest.mark.opencl
+def test_point_of_a_tool_beside_all_objects_is_none(scan_view):
+    scan_view.do({"do": "start_tool", "name": "distance"})
+
+    assert scan_view.do({"do": "add_point", "x": 1, "y": 1, **AT})["measure"] is None
+
+    assert scan_view.facts()["points"] == []
+
+
+@pytest.mark.opencl
+def test_point_of_a_tool_in_a_slice_is_the_place_of_its_pixel(scan_view):
+    camera = scan_view.painter.slice_camera(scan_view.model.state, "axial", SIZE)
+    x, y = camera.project([scenes.middle(0)], SIZE)[0][0]
+    scan_view.do({"do": "start_tool", "name": "seed"})
+
+    facts = scan_view.do({"do": "add_point", "x": x, "y": y, **AT, "plane": "axial"})
+
+    assert facts["measure"]["points"][0] == pytest.approx(scenes.middle(0), abs=1e-3)  # facts have 3 decimals
+
+
+@pytest.mark.opencl
+def test_cross_is_moved_to_the_place_that_is_picked(scan_view):
+    facts = scan_view.do({"do": "cross_at", **pixel(scan_view, 1)})
+    assert facts["cross"] == pytest.approx(facts["pick"]["point"], abs=1e-3)  # facts have 3 decimals
+
+
+@pytest.mark.opencl
+def test_table_is_removed_in_the_background_and_its_share_is_said(open_session, monkeypatch):
     from clrecon.viewer.drawing import stage
 
     def remove(volume, progress=None):
@@ -272,28 +314,39 @@ def test_the_table_goes_in_the_background_and_it_is_said_how_much(session, monke
         return made
 
     monkeypatch.setattr(stage, "remove_table", remove)
-    view = session(scenes.make_scan())
+    view = open_session(scenes.make_scan())
+
     view.do({"do": "set_table", "shown": False})
     assert view.wait(PATIENCE)
+
     facts = view.facts()
-    assert facts["table"] is False and "25 % of the voxels" in facts["said"] and "1,200" in facts["said"]
-    view.do({"do": "undo"})
-    assert view.facts()["table"]
+    assert facts["table"] is False
+    assert "25 % of the voxels" in facts["said"]
+    assert "1,200" in facts["said"]
+    assert view.do({"do": "undo"})["table"]
+
+
+@pytest.mark.opencl
+def test_table_that_cannot_be_removed_stays_with_an_error_that_can_be_dismissed(open_session, monkeypatch):
+    from clrecon.viewer.drawing import stage
 
     def refuse(volume, progress=None):
         raise RefusedInputError("no body found")
 
     monkeypatch.setattr(stage, "remove_table", refuse)
-    other = session(scenes.make_scan())
-    other.do({"do": "set_table", "shown": False})
-    assert other.wait(PATIENCE)
-    assert other.facts()["error"] == "no body found" and other.facts()["table"]
-    assert other.do({"do": "dismiss"})["error"] is None
+    view = open_session(scenes.make_scan())
+
+    view.do({"do": "set_table", "shown": False})
+    assert view.wait(PATIENCE)
+
+    assert view.facts()["error"] == "no body found"
+    assert view.facts()["table"]
+    assert view.do({"do": "dismiss"})["error"] is None
 
 
 @pytest.mark.opencl
-def test_session_closes_within_a_second_while_it_works(session, monkeypatch):
-    view = session()
+def test_session_that_is_closed_while_it_works_ends_its_threads(open_session, monkeypatch):
+    view = open_session()
 
     monkeypatch.setattr(view.painter, "find_parts", search_for_ever)
     view.do({"do": "find_parts"})
@@ -307,8 +360,8 @@ def test_session_closes_within_a_second_while_it_works(session, monkeypatch):
 
 
 @pytest.mark.opencl
-def test_work_is_cancelled_by_a_command(session, monkeypatch):
-    view = session()
+def test_command_cancel_ends_the_search_for_parts(open_session, monkeypatch):
+    view = open_session()
 
     monkeypatch.setattr(view.painter, "find_parts", search_for_ever)
     view.do({"do": "find_parts"})
@@ -319,30 +372,30 @@ def test_work_is_cancelled_by_a_command(session, monkeypatch):
 
 
 @pytest.mark.opencl
-def test_several_sessions_share_a_painter_and_do_not_disturb_each_other(device):
+def test_sessions_of_one_painter_draw_their_own_pictures_in_turn(device):
     objects = show_objects([scenes.make_scan(), scenes.make_mesh()])
     with Painter(objects, device=device) as painter:
         views = [ViewSession(objects, painter, iso_value=iso) for iso in (300.0, 0.0, 700.0)]
         try:
             for view in views:
-                picture(view)  # the view knows the size of its picture now
+                wait_for_picture(view)  # the view knows the size of its wait_for_picture now
                 view.do({"do": "look", "view": "left"})
-            alone = [picture(view).image for view in views]
+            alone = [wait_for_picture(view).image for view in views]
             for view in views:
                 for _ in range(4):
                     view.do({"do": "turn", "dx": 0.05, "dy": 0.02})
                     view.picture(SIZE, True, lambda made: None)
                 view.do({"do": "look", "view": "left"})
             for view, before in zip(views, alone, strict=True):
-                assert np.array_equal(picture(view).image, before)
+                assert np.array_equal(wait_for_picture(view).image, before)
             views[0].close()
-            assert np.array_equal(picture(views[1]).image, alone[1])
+            assert np.array_equal(wait_for_picture(views[1]).image, alone[1])
         finally:
             for view in views:
                 view.close()
 
 
-def test_a_mesh_of_many_triangles_is_said_to_be_slow():
+def test_mesh_of_more_than_two_million_triangles_is_warned_of_as_slow():
     def warnings_of(triangles):
         mesh: Any = SimpleNamespace(triangle_count=triangles)
         shown = ShownMesh(number=1, name="mesh 1", mesh=mesh)
@@ -355,35 +408,62 @@ def test_a_mesh_of_many_triangles_is_said_to_be_slow():
 
 
 @pytest.mark.opencl
-def test_a_scan_that_goes_through_in_slabs_is_said_to_be_slow(session):
-    view = session(scenes.make_scan(), memory=80_000)
-    found: list[Any] = []
-    view.picture((24, 20), False, found.append)
-    assert view.wait(PATIENCE) and found and view.facts()["error"] is None
+def test_scan_that_is_drawn_in_slabs_is_warned_of_as_slow(open_session):
+    view = open_session(scenes.make_scan(), memory=80_000)
+    pictures: list[Any] = []
+
+    view.picture((24, 20), False, pictures.append)
+
+    assert view.wait(PATIENCE)
+    assert len(pictures) == 1
+    assert view.facts()["error"] is None
     assert any("in slabs, which is slow" in text for text in view.facts()["warnings"])
-    view.picture((800, 800), False, found.append)
-    assert view.wait(PATIENCE) and len(found) == 1
+
+
+@pytest.mark.opencl
+def test_picture_too_large_for_the_allowed_memory_is_an_error(open_session):
+    view = open_session(scenes.make_scan(), memory=80_000)
+    pictures: list[Any] = []
+
+    view.picture((800, 800), False, pictures.append)
+
+    assert view.wait(PATIENCE)
+    assert pictures == []
     assert "80,000 bytes are allowed" in view.facts()["error"]
 
 
 @pytest.mark.opencl
-def test_the_first_view_fits_the_size_of_the_picture(session):
-    view = session()
-    wide = (200, 80)
-    found: list[Any] = []
+def test_first_picture_of_a_view_is_fitted_to_its_size_without_a_step_of_undo(open_session):
+    view = open_session()
     before = view.model.camera.parallel_scale
-    view.picture(wide, False, found.append)
-    assert view.wait(PATIENCE) and found[0].camera.parallel_scale < before and view.model.undo() is None
-    view.do({"do": "zoom", "factor": 2})
-    zoomed = view.model.camera
-    view.picture((80, 80), False, found.append)
-    assert view.wait(PATIENCE) and found[1].camera == zoomed
+    pictures: list[Any] = []
+
+    view.picture((200, 80), False, pictures.append)  # wide
+
+    assert view.wait(PATIENCE)
+    assert pictures[0].camera.parallel_scale < before
+    assert view.model.undo() is None
 
 
 @pytest.mark.opencl
-def test_news_of_the_background_are_told(session):
+def test_camera_that_was_changed_is_not_fitted_to_another_size(open_session):
+    view = open_session()
+    pictures: list[Any] = []
+    view.picture((200, 80), False, pictures.append)
+    assert view.wait(PATIENCE)
+    view.do({"do": "zoom", "factor": 2})
+    zoomed = view.model.camera
+
+    view.picture((80, 80), False, pictures.append)
+
+    assert view.wait(PATIENCE)
+    assert pictures[1].camera == zoomed
+
+
+@pytest.mark.opencl
+def test_work_in_the_background_tells_of_its_changes(open_session):
     told = []
-    view = session(scenes.make_scan(), on_change=lambda: told.append(1))
+    view = open_session(scenes.make_scan(), on_change=lambda: told.append(1))
     view.prepare()
     view.do({"do": "find_parts"})
     assert view.wait(PATIENCE) and len(told) >= 4 and view.facts()["error"] is None
@@ -393,24 +473,41 @@ def place_in_slice(view: ViewSession, x: float, y: float) -> list[float]:
     return view.do({"do": "pick", "x": x, "y": y, "plane": "coronal", **AT})["pick"]["point"]
 
 
+POINTER, MIDDLE = (70.0, 20.0), (48.0, 40.0)
+"""Pixels (x, y) of a slice of 96 x 80."""
+FACTS_MM = 2e-3
+"""Of places in facts, which have three decimals."""
+
+
 @pytest.mark.opencl
-def test_a_slice_is_zoomed_about_what_is_under_the_pointer(session):
-    view = session()
-    before, middle = place_in_slice(view, 70.0, 20.0), place_in_slice(view, 48.0, 40.0)
-    about = [(70.0 - 48.0) / 80.0, (20.0 - 40.0) / 80.0]
+def test_slice_is_zoomed_about_what_is_under_the_pointer(open_session):
+    view = open_session()
+    at_pointer, in_middle = place_in_slice(view, *POINTER), place_in_slice(view, *MIDDLE)
+    about = [(POINTER[0] - MIDDLE[0]) / 80.0, (POINTER[1] - MIDDLE[1]) / 80.0]  # in heights, from the middle
+
     for factor in (2.0, 1.5):
         view.do({"do": "zoom_slice", "plane": "coronal", "factor": factor, "about": about, **AT})
-    assert place_in_slice(view, 70.0, 20.0) == pytest.approx(before, abs=2e-3)
-    away = np.subtract(place_in_slice(view, 48.0, 40.0), before)
-    assert away == pytest.approx(np.subtract(middle, before) / 3.0, abs=2e-3)
+
+    assert place_in_slice(view, *POINTER) == pytest.approx(at_pointer, abs=FACTS_MM)
+    away = np.subtract(place_in_slice(view, *MIDDLE), at_pointer)
+    assert away == pytest.approx(np.subtract(in_middle, at_pointer) / (2.0 * 1.5), abs=FACTS_MM)
+
+
+@pytest.mark.opencl
+def test_slice_that_was_zoomed_is_fitted_again_by_a_command(open_session):
+    view = open_session()
+    in_middle = place_in_slice(view, *MIDDLE)
+    view.do({"do": "zoom_slice", "plane": "coronal", "factor": 2.0, "about": [0.3, -0.2], **AT})
+
     view.do({"do": "fit_slices"})
-    assert place_in_slice(view, 48.0, 40.0) == pytest.approx(middle, abs=2e-3)
+
+    assert place_in_slice(view, *MIDDLE) == pytest.approx(in_middle, abs=FACTS_MM)
 
 
 @pytest.mark.opencl
 @pytest.mark.parametrize("factor", [3.0, 0.6])
-def test_a_slice_of_a_thin_stack_is_zoomed_about_the_pointer_beside_it(session, factor):
-    view = session(Volume(np.zeros((3, 60, 60), np.int16), np.diag([3.0, 3.0, 5.0, 1.0])))
+def test_slice_of_a_thin_stack_is_zoomed_about_the_pointer_beside_it(open_session, factor):
+    view = open_session(Volume(np.zeros((3, 60, 60), np.int16), np.diag([3.0, 3.0, 5.0, 1.0])))
     before = place_in_slice(view, 64.0, 32.0)
     assert before[2] > 12.5
     view.do({"do": "zoom_slice", "plane": "coronal", "factor": factor, "about": [0.2, -0.1], **AT})
@@ -418,25 +515,35 @@ def test_a_slice_of_a_thin_stack_is_zoomed_about_the_pointer_beside_it(session, 
 
 
 @pytest.mark.opencl
-def test_a_slice_that_is_shifted_far_stays_at_the_border_of_the_picture(session):
-    view = session(Volume(np.zeros((3, 60, 60), np.int16), np.diag([3.0, 3.0, 5.0, 1.0])))
+def test_slice_that_is_shifted_far_stays_at_the_border_of_the_picture(open_session):
+    view = open_session(Volume(np.zeros((3, 60, 60), np.int16), np.diag([3.0, 3.0, 5.0, 1.0])))
     view.do({"do": "pan_slice", "plane": "coronal", "dx": 0, "dy": 1000, **AT})
     assert place_in_slice(view, 48.0, 80.0)[2] == pytest.approx(12.5)
 
 
 @pytest.mark.opencl
-def test_a_probe_at_either_end_of_paging_and_at_the_borders_is_inside(session):
+@pytest.mark.parametrize(
+    "end",
+    [
+        {"do": "scroll", "plane": "axial", "steps": -99},
+        {"do": "scroll", "plane": "axial", "steps": 99},
+        {"do": "set_cross", "point": [-1e6, -1e6, -1e6]},
+        {"do": "set_cross", "point": [1e6, 1e6, 1e6]},
+    ],
+    ids=["lowest slice", "highest slice", "first corner", "last corner"],
+)
+def test_probe_at_the_end_of_a_scan_is_inside_of_it(open_session, end):
     affine = [[0.7123457, 0, 0, -3.1415926], [0, 0.4, 0, 2.7182818], [0, 0, 1.2345678, -100.00049], [0, 0, 0, 1]]
-    view = session(Volume(np.full((4, 6, 8), 70, np.int16), np.array(affine)))
-    ends = [{"do": "scroll", "plane": "axial", "steps": -99}, {"do": "scroll", "plane": "axial", "steps": 99}]
-    ends += [{"do": "set_cross", "point": [-1e6, -1e6, -1e6]}, {"do": "set_cross", "point": [1e6, 1e6, 1e6]}]
-    for end in ends:
-        assert view.do({"do": "probe", "point": view.do(end)["cross"]})["probe"]["hu"] == pytest.approx(70.0), end
+    view = open_session(Volume(np.full((4, 6, 8), 70, np.int16), np.array(affine)))
+
+    cross = view.do(end)["cross"]
+
+    assert view.do({"do": "probe", "point": cross})["probe"]["hu"] == pytest.approx(70.0)
 
 
 @pytest.mark.opencl
-def test_a_slice_is_shifted_by_shares_of_its_height(session):
-    view = session()
+def test_slice_is_shifted_by_shares_of_its_height(open_session):
+    view = open_session()
     view.do({"do": "zoom_slice", "plane": "coronal", "factor": 3.0, **AT})
     before = place_in_slice(view, 48.0, 40.0)
     view.do({"do": "pan_slice", "plane": "coronal", "dx": 0.1, "dy": 0.05, **AT})
@@ -444,8 +551,8 @@ def test_a_slice_is_shifted_by_shares_of_its_height(session):
 
 
 @pytest.mark.opencl
-def test_a_zoom_beyond_the_largest_leaves_a_slice_as_it_is(session):
-    view = session()
+def test_zoom_of_a_slice_beyond_the_largest_leaves_it(open_session):
+    view = open_session()
     view.do({"do": "zoom_slice", "plane": "axial", "factor": 40.0, **AT})
     before = view.model.state
     view.do({"do": "zoom_slice", "plane": "axial", "factor": 2.0, "about": [0.2, 0.2], **AT})
@@ -453,11 +560,18 @@ def test_a_zoom_beyond_the_largest_leaves_a_slice_as_it_is(session):
 
 
 @pytest.mark.opencl
-def test_a_probe_says_hu_and_place_and_changes_nothing(session):
-    view = session()
+def test_probe_of_a_place_has_its_hu_and_its_words_and_leaves_the_state(open_session):
+    view = open_session()
     before = view.model.state
+
     inside = view.do({"do": "probe", "point": scenes.middle(0).tolist()})["probe"]
-    outside = view.do({"do": "probe", "point": [500.0, 0.0, 0.0]})["probe"]
-    assert inside["hu"] == pytest.approx(1000.0, abs=1.0) and inside["words"].endswith("mm LPS")
-    assert outside == {"hu": None, "words": "500.0, 0.0, 0.0 mm LPS"}
+
+    assert inside["hu"] == pytest.approx(1000.0, abs=1.0)  # whole HU, interpolated
+    assert inside["words"].endswith("mm LPS")
     assert view.model.state == before
+
+
+@pytest.mark.opencl
+def test_probe_outside_of_the_scan_has_no_hu(open_session):
+    outside = open_session().do({"do": "probe", "point": [500.0, 0.0, 0.0]})["probe"]
+    assert outside == {"hu": None, "words": "500.0, 0.0, 0.0 mm LPS"}
