@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,9 @@ def older(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", [".", "./", "../turn"])
-def test_the_current_folder_is_not_replaced(name: str, older: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_animation_into_the_current_folder_is_refused_and_it_stays(
+    name: str, older: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whoever stands in it would stand in a folder that was removed."""
     monkeypatch.chdir(older)
     with pytest.raises(UsageError, match="which is the current one"):
@@ -43,43 +46,71 @@ def test_the_current_folder_is_not_replaced(name: str, older: Path, monkeypatch:
     assert len(names(older)) == 3 and os.path.samefile(older, ".")
 
 
-def test_no_name_is_not_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_animation_without_a_name_is_refused_and_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError, match="name of the animation is empty"):
         write_animation(frames(), "")
     assert names(tmp_path) == []
 
 
-def test_what_cannot_be_replaced_is_said_before_anything_is_drawn(
-    older: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_folder_that_is_a_mounted_disk_is_refused_before_anything_is_drawn(
+    older: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch, pytest.raises(OutputError, match="a disk is mounted there"):
         patch.setattr("os.path.ismount", lambda path: os.path.samefile(path, older))
         check_animation(older)
+    assert len(names(older)) == 3
+
+
+def test_folder_that_is_write_protected_is_refused_before_anything_is_drawn(
+    older: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with monkeypatch.context() as patch, pytest.raises(OutputError, match="write-protected"):
         patch.setattr("os.access", lambda path, _: not os.path.samefile(path, older))
         check_animation(older)
+    assert len(names(older)) == 3
+
+
+def test_link_that_leads_back_to_itself_is_refused_as_a_folder_of_frames(tmp_path: Path) -> None:
     (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(OutputError, match="leads back to itself"):
         check_animation(tmp_path / "loop")
-    assert names(tmp_path) == ["loop", "turn"]
+    assert names(tmp_path) == ["loop"]
+
+
+@pytest.fixture
+def umask_027() -> Iterator[None]:
+    """New folders have the permissions 750."""
+    before = os.umask(0o027)
+    yield
+    os.umask(before)
+
+
+def permissions(folder: Path) -> int:
+    return folder.stat().st_mode & 0o777
 
 
 @pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
-def test_permissions_are_those_of_the_folder_that_is_replaced(tmp_path: Path) -> None:
-    umask = os.umask(0o027)
-    try:
-        write_animation(frames(), tmp_path / "turn")
-        assert (tmp_path / "turn").stat().st_mode & 0o777 == 0o750
-        (tmp_path / "turn").chmod(0o700)
-        with stage_animation(frames(), tmp_path / "turn") as staged:
-            (made,) = (path for path in tmp_path.iterdir() if path.name.startswith(".clrecon-"))
-            assert made.stat().st_mode & 0o777 == 0o700
-            staged.commit()
-    finally:
-        os.umask(umask)
-    assert (tmp_path / "turn").stat().st_mode & 0o777 == 0o700
-    assert names(tmp_path) == ["turn"] and names(tmp_path / "turn") == NAMES
+@pytest.mark.usefixtures("umask_027")
+def test_new_folder_of_frames_has_the_permissions_of_the_umask(tmp_path: Path) -> None:
+    write_animation(frames(), tmp_path / "turn")
+    assert permissions(tmp_path / "turn") == 0o750
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
+@pytest.mark.usefixtures("umask_027")
+def test_folder_of_frames_has_the_permissions_of_the_one_that_it_replaces_from_the_start(older: Path) -> None:
+    older.chmod(0o700)
+
+    with stage_animation(frames(), older) as staged:
+        (staged_folder,) = (path for path in older.parent.iterdir() if path.name.startswith(".clrecon-"))
+        assert permissions(staged_folder) == 0o700
+        staged.commit()
+
+    assert permissions(older) == 0o700
+    assert names(older) == NAMES
 
 
 @pytest.mark.parametrize("when", ["before", "after"])
@@ -106,7 +137,9 @@ def test_interrupt_between_two_renames_leaves_one_whole_folder(
 
 
 @pytest.mark.parametrize("place", [1, 2])
-def test_a_rename_that_fails_leaves_the_older_folder(place: int, older: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rename_that_fails_leaves_the_older_folder_of_frames(
+    place: int, older: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     true_way, done = os.rename, []
 
     def rename(source: Path, target: Path) -> None:
@@ -123,7 +156,9 @@ def test_a_rename_that_fails_leaves_the_older_folder(place: int, older: Path, mo
 
 @pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
 @pytest.mark.parametrize("writes", ["frames", "a file"])
-def test_what_a_killed_process_left_is_removed_by_the_next(writes: str, tmp_path: Path) -> None:
+def test_folder_of_a_killed_process_is_removed_by_the_next_writer_when_its_lock_is_free(
+    writes: str, tmp_path: Path
+) -> None:
     import fcntl
 
     def write() -> None:
@@ -146,7 +181,7 @@ def test_what_a_killed_process_left_is_removed_by_the_next(writes: str, tmp_path
     assert names(tmp_path) == [".clrecon-notes.folder", "turn"]
 
 
-def test_a_folder_that_is_being_written_is_locked(tmp_path: Path) -> None:
+def test_folder_of_frames_that_is_being_written_stays_beside_other_writers(tmp_path: Path) -> None:
     with stage_animation(frames(), tmp_path / "turn") as staged:
         during = names(tmp_path)
         replace_file(tmp_path / "other", lambda stream: stream.write(b"x"))

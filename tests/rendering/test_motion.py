@@ -38,47 +38,65 @@ def moving_frames(count=5, size=(63, 40), channels=3):
         yield frame
 
 
-def left_over(folder) -> list[str]:
+def names_in(folder) -> list[str]:
     return sorted(entry.name for entry in folder.iterdir())
 
 
-def test_a_whole_turn_ends_one_step_before_its_beginning():
+def test_cameras_of_a_whole_turn_end_one_step_before_its_beginning():
     cameras = turntable_cameras(PARALLEL, 8)
     assert cameras[0] == PARALLEL
     assert cameras[2].position == pytest.approx((300.0, 0.0, 0.0))  # a quarter: from the patient's left
     assert cameras[7].position == pytest.approx(PARALLEL.orbit(-45.0).position)
 
 
-def test_a_part_of_a_turn_ends_at_its_end():
+def test_cameras_of_a_quarter_turn_end_at_its_end():
     cameras = turntable_cameras(PARALLEL, 4, -90.0)
     assert cameras[-1].position == pytest.approx((-300.0, 0.0, 0.0))
     assert cameras[1].position == pytest.approx(PARALLEL.orbit(-30.0).position)
+
+
+def test_single_camera_of_a_turn_is_at_its_beginning():
     assert turntable_cameras(PARALLEL, 1, 90.0) == [PARALLEL]
 
 
 @pytest.mark.parametrize(("frames", "degrees"), [(0, 360), (10**6, 360), (2.5, 360), (10, np.nan)])
-def test_impossible_turntables_are_refused(frames, degrees):
+def test_turntable_of_an_impossible_number_of_frames_or_degrees_is_refused(frames, degrees):
     with pytest.raises(UsageError, match="a turntable"):
         turntable_cameras(PARALLEL, frames, degrees)
 
 
-def test_mp4_shows_the_frames(tmp_path, encoder):
+SIX_FRAMES = list(moving_frames(6))
+
+
+@pytest.fixture
+def mp4(tmp_path, encoder):
+    """An MP4 of `SIX_FRAMES`, 20 a second."""
     path = tmp_path / "turn.mp4"
-    frames = list(moving_frames(6))
-    assert write_animation(iter(frames), path, 20.0) == path.stat().st_size
-    assert left_over(tmp_path) == ["turn.mp4"]
-    command = [encoder, "-loglevel", "error", "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    assert write_animation(iter(SIX_FRAMES), path, 20.0) == path.stat().st_size
+    return path
+
+
+def test_mp4_shows_its_frames(mp4, encoder):
+    command = [encoder, "-loglevel", "error", "-i", mp4, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     data = subprocess.run(command, capture_output=True, check=True).stdout
+
     read = np.frombuffer(data, np.uint8).reshape(-1, 40, 64, 3)  # the odd width is made even
     assert len(read) == 6
-    difference = np.abs(read[:, :, :63].astype(int) - np.array(frames))
+    difference = np.abs(read[:, :, :63].astype(int) - np.array(SIX_FRAMES))
     assert difference.mean() <= tolerances.MP4_MEAN_GREY
-    said = subprocess.run([encoder, "-i", path], capture_output=True, text=True).stderr
-    assert "h264" in said and "yuv420p(tv, bt709" in said and "20 fps" in said
+
+
+def test_mp4_is_h264_in_bt_709_with_the_given_frames_a_second(mp4, encoder):
+    described = subprocess.run([encoder, "-i", mp4], capture_output=True, text=True).stderr
+    assert [words for words in ("h264", "yuv420p(tv, bt709", "20 fps") if words not in described] == []
+
+
+def test_mp4_is_written_alone(mp4):
+    assert names_in(mp4.parent) == ["turn.mp4"]
 
 
 @pytest.mark.parametrize("color", [(227, 60, 40), (30, 160, 70), (40, 60, 200)])
-def test_mp4_keeps_colours(tmp_path, encoder, color):
+def test_mp4_keeps_colours_and_their_luma_of_bt_709(tmp_path, encoder, color):
     frame = np.full((64, 64, 3), color, np.uint8)
     write_animation(iter([frame] * 2), tmp_path / "a.mp4")
     command = [encoder, "-loglevel", "error", "-i", tmp_path / "a.mp4", "-f", "rawvideo", "-pix_fmt"]
@@ -89,22 +107,38 @@ def test_mp4_keeps_colours(tmp_path, encoder, color):
     assert abs(np.frombuffer(data, np.uint8)[:4096].mean() - luma) <= 1.0
 
 
-def test_gif_shows_the_frames_and_repeats(tmp_path):
-    path = tmp_path / "turn.gif"
+@pytest.fixture
+def gif_of_seven(tmp_path):
+    """A GIF of seven frames, 30 a second, and the frames."""
     frames = list(moving_frames(7))
-    assert write_animation(iter(frames), path, 30.0) == path.stat().st_size
-    with Image.open(path) as read:
-        assert (read.n_frames, read.info["loop"], read.size) == (7, 0, (63, 40))
-        durations = []
-        for number, frame in enumerate(frames):
-            read.seek(number)
-            durations.append(read.info["duration"])
-            difference = np.abs(np.array(read.convert("RGB")).astype(int) - frame)
-            assert difference.mean() <= tolerances.GIF_MEAN_GREY
-    assert sum(durations) == 230  # seven thirtieths of a second, in hundredths
+    write_animation(iter(frames), tmp_path / "turn.gif", 30.0)
+    with Image.open(tmp_path / "turn.gif") as read:
+        yield read, frames
 
 
-def test_a_large_frame_of_a_gif_is_as_near_as_one_whose_every_pixel_chose_the_colours(tmp_path):
+def test_gif_shows_its_frames(gif_of_seven):
+    read, frames = gif_of_seven
+
+    assert (read.n_frames, read.size) == (7, (63, 40))
+    for number, frame in enumerate(frames):
+        read.seek(number)
+        difference = np.abs(np.array(read.convert("RGB")).astype(int) - frame)
+        assert difference.mean() <= tolerances.GIF_MEAN_GREY
+
+
+def test_gif_repeats_and_takes_the_time_of_its_frames_in_hundredths_of_a_second(gif_of_seven):
+    read, _ = gif_of_seven
+
+    durations_ms = []
+    for number in range(7):
+        read.seek(number)
+        durations_ms.append(read.info["duration"])
+
+    assert read.info["loop"] == 0  # without an end
+    assert sum(durations_ms) == 230  # 7 / 30 s are 233 ms
+
+
+def test_large_frame_of_a_gif_is_as_near_as_one_whose_colours_all_pixels_chose(tmp_path):
     j, i = np.indices((520, 600)) / 600.0
     frame = np.stack([255 * i, 200 * j, 128 + 127 * np.sin(9 * i * j)], axis=-1).astype(np.uint8)
     write_animation(iter([frame, frame]), tmp_path / "a.gif")
@@ -160,26 +194,33 @@ def test_animation_to_a_folder_writes_its_frames(tmp_path, name):
     pictures = [make_picture(background=(0, 0, 0, opacity)) for opacity in (0, 120, 255)]
     size = write_animation(iter(pictures), f"{tmp_path}/{name}")
     folder = tmp_path / name
-    assert left_over(tmp_path) == [folder.name]
-    assert left_over(folder) == ["frame_0000.png", "frame_0001.png", "frame_0002.png"]
+    assert names_in(tmp_path) == [folder.name]
+    assert names_in(folder) == ["frame_0000.png", "frame_0001.png", "frame_0002.png"]
     assert size == sum(entry.stat().st_size for entry in folder.iterdir())
     for number, picture in enumerate(pictures):
         assert np.array_equal(np.array(Image.open(folder / f"frame_{number:04d}.png")), picture.image)
 
 
-def test_frames_of_an_earlier_run_are_replaced_and_nothing_else(tmp_path):
-    folder = tmp_path / "turn"
-    write_animation(moving_frames(5), folder)
-    write_animation(moving_frames(2), folder)
-    assert left_over(folder) == ["frame_0000.png", "frame_0001.png"]
-    (folder / "notes.txt").write_text("mine")
+def test_folder_of_an_earlier_animation_is_replaced_by_one_with_fewer_frames(tmp_path):
+    write_animation(moving_frames(5), tmp_path / "turn")
+    write_animation(moving_frames(2), tmp_path / "turn")
+
+    assert names_in(tmp_path / "turn") == ["frame_0000.png", "frame_0001.png"]
+    assert names_in(tmp_path) == ["turn"]
+
+
+def test_folder_of_an_animation_with_another_file_is_refused_and_stays(tmp_path):
+    write_animation(moving_frames(2), tmp_path / "turn")
+    (tmp_path / "turn" / "notes.txt").write_text("mine")
+
     with refused(UsageError, "notes.txt", 1):
-        write_animation(moving_frames(2), folder)
-    assert len(left_over(folder)) == 3 and left_over(tmp_path) == ["turn"]
+        write_animation(moving_frames(2), tmp_path / "turn")
+
+    assert names_in(tmp_path / "turn") == ["frame_0000.png", "frame_0001.png", "notes.txt"]
 
 
 @pytest.mark.parametrize("name", ["turn.mp4", "turn.gif", "turn.apng", "turn"])
-def test_an_interrupted_run_leaves_nothing_and_the_older_file(tmp_path, name, request, monkeypatch):
+def test_interrupted_animation_leaves_no_files_but_an_older_animation(tmp_path, name, request, monkeypatch):
     if name.endswith("mp4"):
         request.getfixturevalue("encoder")
     scratch = tmp_path / "scratch"
@@ -194,35 +235,46 @@ def test_an_interrupted_run_leaves_nothing_and_the_older_file(tmp_path, name, re
 
     with pytest.raises(KeyboardInterrupt):
         write_animation(interrupted(), place / name)
-    assert left_over(place) == []
+    assert names_in(place) == []
     write_animation(moving_frames(2), place / name)
     with pytest.raises(KeyboardInterrupt):
         write_animation(interrupted(), place / name)
-    assert left_over(place) == [name] and left_over(scratch) == []
+    assert names_in(place) == [name] and names_in(scratch) == []
     if name == "turn":
-        assert len(left_over(place / name)) == 2
+        assert len(names_in(place / name)) == 2
 
 
 @pytest.mark.parametrize("name", ["turn.gif", "turn"])
-def test_animation_that_is_not_committed_leaves_the_older_one(tmp_path, name):
+def test_staged_animation_replaces_the_older_one_only_when_it_is_committed(tmp_path, name):
     write_animation(moving_frames(2), tmp_path / name)
+
     with stage_animation(moving_frames(3), tmp_path / name) as staged:
-        assert count_frames(tmp_path / name) == 2 and staged.size > 0
-    assert (left_over(tmp_path), count_frames(tmp_path / name)) == ([name], 2)
-    with stage_animation(moving_frames(3), tmp_path / name) as staged:
+        assert staged.size > 0
+        assert count_frames(tmp_path / name) == 2
         staged.commit()
-    assert (left_over(tmp_path), count_frames(tmp_path / name)) == ([name], 3)
+
+    assert (names_in(tmp_path), count_frames(tmp_path / name)) == ([name], 3)
+
+
+@pytest.mark.parametrize("name", ["turn.gif", "turn"])
+def test_staged_animation_that_is_not_committed_leaves_the_older_one(tmp_path, name):
+    write_animation(moving_frames(2), tmp_path / name)
+
+    with stage_animation(moving_frames(3), tmp_path / name):
+        pass
+
+    assert (names_in(tmp_path), count_frames(tmp_path / name)) == ([name], 2)
 
 
 def count_frames(path) -> int:
     if path.is_dir():
-        return len(left_over(path))
+        return len(names_in(path))
     with Image.open(path) as read:
         return read.n_frames
 
 
 @pytest.mark.parametrize("name", ["turn.mp4", "turn.gif", "turn.apng", "turn"])
-def test_frames_are_written_as_they_come(tmp_path, name, request):
+def test_frames_of_an_animation_are_asked_for_one_by_one_with_their_progress(tmp_path, name, request):
     if name.endswith("mp4"):
         request.getfixturevalue("encoder")
     asked: list = []
@@ -256,11 +308,11 @@ def never():
         ("file", 25, OutputError, "it is a file"),
     ],
 )
-def test_what_cannot_be_written_is_said_before_the_first_frame(tmp_path, name, fps, error, message):
+def test_animation_that_cannot_be_written_is_refused_before_the_first_frame(tmp_path, name, fps, error, message):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(error, match=message):
         write_animation(never(), tmp_path / name, fps)
-    assert left_over(tmp_path) == ["file"]
+    assert names_in(tmp_path) == ["file"]
 
 
 @pytest.fixture
@@ -271,11 +323,17 @@ def no_encoder(monkeypatch):
     movies.find_encoder.cache_clear()
 
 
-def test_without_an_encoder_the_message_says_what_to_install(tmp_path, no_encoder):
+def test_mp4_without_an_encoder_is_refused_before_the_first_frame(tmp_path, no_encoder):
     no_encoder.setenv("PATH", str(tmp_path))
+
     with refused(UsageError, "MP4"):
         write_animation(never(), tmp_path / "turn.mp4")
-    assert left_over(tmp_path) == []
+
+    assert names_in(tmp_path) == []
+
+
+def test_gif_needs_no_encoder(tmp_path, no_encoder):
+    no_encoder.setenv("PATH", str(tmp_path))
     assert check_animation(tmp_path / "turn.gif") == ".gif"
 
 
@@ -285,19 +343,19 @@ def fake_ffmpeg(folder, script: str):
     program.chmod(0o755)
 
 
-def test_an_ffmpeg_without_h264_is_refused(tmp_path, no_encoder):
+def test_mp4_by_an_ffmpeg_without_h264_is_refused(tmp_path, no_encoder):
     fake_ffmpeg(tmp_path, "echo ' V..... mpeg4'")
     no_encoder.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     with refused(UsageError, "H.264"):
         check_animation(tmp_path / "turn.mp4")
 
 
-def test_an_encoder_that_dies_is_quoted(tmp_path, no_encoder):
+def test_mp4_by_an_encoder_that_fails_is_refused_and_leaves_no_file(tmp_path, no_encoder):
     fake_ffmpeg(tmp_path, 'case "$*" in *-encoders) echo " V libx264 "; exit;; esac; echo "No space left" >&2; exit 1')
     no_encoder.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     with refused(OutputError, "MP4"):
         write_animation(moving_frames(9, (640, 480)), tmp_path / "turn.mp4")
-    assert left_over(tmp_path) == ["ffmpeg"]
+    assert names_in(tmp_path) == ["ffmpeg"]
 
 
 @pytest.mark.parametrize(
@@ -311,12 +369,12 @@ def test_an_encoder_that_dies_is_quoted(tmp_path, no_encoder):
         ([np.zeros((4, 4, 4), np.uint8)], "a.gif", "GIF cannot hold a transparent background"),
     ],
 )
-def test_wrong_frames_are_refused(tmp_path, frames, name, message):
+def test_frames_of_no_common_form_are_refused(tmp_path, frames, name, message):
     with pytest.raises(UsageError, match=message):
         write_animation(iter(frames), tmp_path / name)
-    assert left_over(tmp_path) == []
+    assert names_in(tmp_path) == []
 
 
-def test_a_name_must_be_a_name():
+def test_number_as_the_name_of_an_animation_is_refused():
     with refused(UsageError, "path", "int"):
         motion.check_animation(5)

@@ -1,4 +1,4 @@
-"""Sheets of slices: where panels, lines and circles lie, and what is refused."""
+"""Sheets of slices: pixels_from_centre panels, lines and circles lie, and what is refused."""
 
 from __future__ import annotations
 
@@ -14,42 +14,68 @@ pytest.importorskip("PIL")
 RED, GREEN = (255, 0, 0), (0, 255, 0)
 
 
-def panel(*strokes: Stroke, value: float = 300.0) -> Panel:
+def make_panel(*strokes: Stroke, value: float = 300.0) -> Panel:
     return Panel(np.full((101, 201), value, np.float32), 0.5, (), strokes)
 
 
-def where(image: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
-    """Rows and columns of the pixels of a colour, within the first panel, from its centre."""
+def pixels_from_centre(image: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
+    """Rows and columns of the pixels of a colour, within the first make_panel, from its centre."""
     found = np.argwhere((image[..., :3] == color).all(axis=-1))
     return np.asarray(found - GAP_PIXELS - np.array([50, 100]))
 
 
-def test_strokes_lie_where_their_mm_say() -> None:
+def test_line_lies_at_its_mm_in_a_panel() -> None:
     line = Stroke(np.array([[-20.0, 10.0], [20.0, 10.0]]), RED)
+
+    sheet = draw_sheet([[make_panel(line)]])
+
+    assert sheet.pixel_mm == 0.5
+    rows, columns = pixels_from_centre(sheet.image, RED).T
+    assert abs(rows.mean() - 10.0 / 0.5) <= 1.0  # pixel
+    assert (columns.min(), columns.max()) == pytest.approx((-20.0 / 0.5, 20.0 / 0.5), abs=1)
+
+
+def test_circle_lies_at_its_mm_in_a_panel() -> None:
     circle = Stroke(np.array([5.0, 0.0]), GREEN, 10.0)
-    sheet = draw_sheet([[panel(line, circle)]])
-    rows, columns = where(sheet.image, RED).T
-    assert abs(rows.mean() - 20.0) <= 1.0
-    assert (columns.min(), columns.max()) == pytest.approx((-40, 40), abs=1)
-    off = where(sheet.image, GREEN) - np.array([0, 10])
-    radii = np.linalg.norm(off, axis=1)
-    assert len(radii) > 60 and radii.min() > 17.5 and radii.max() < 21.5
-    assert sheet.pixel_mm == 0.5 and sheet.is_opaque
+
+    sheet = draw_sheet([[make_panel(circle)]])
+
+    middle = np.array([0.0, 5.0 / 0.5])  # row, column
+    radii = np.linalg.norm(pixels_from_centre(sheet.image, GREEN) - middle, axis=1)
+    assert len(radii) > 60
+    width = 2.5  # pixels of the stroke, to each side
+    assert np.abs(radii - 10.0 / 0.5).max() < width
 
 
-def test_panels_stand_side_by_side() -> None:
-    sheet = draw_sheet([[panel(value=1050.0), panel(value=-450.0)], [panel(value=300.0)]], window=(-450.0, 1050.0))
-    assert sheet.size == (2 * 201 + 3 * GAP_PIXELS, 2 * 101 + 3 * GAP_PIXELS)
-    middles = [(GAP_PIXELS + 50, GAP_PIXELS + 100), (GAP_PIXELS + 50, 2 * GAP_PIXELS + 301)]
-    assert [int(sheet.image[place][0]) for place in middles] == [255, 0]
-    assert int(sheet.image[2 * GAP_PIXELS + 151, GAP_PIXELS + 100][0]) == 128
-    taller = draw_sheet([[panel()]], ["one", "two"])
-    assert taller.size[1] > draw_sheet([[panel()]]).size[1]
-    assert encode_image(taller, ".png") == encode_image(draw_sheet([[panel()]], ["one", "two"]), ".png")
+def test_sheet_of_panels_is_opaque() -> None:
+    assert draw_sheet([[make_panel()]]).is_opaque
 
 
-def test_letters_and_captions_are_drawn() -> None:
-    plain = panel()
+def test_panels_stand_side_by_side_in_rows_with_gaps_in_the_greys_of_the_window() -> None:
+    height, width = 101, 201
+
+    sheet = draw_sheet(
+        [[make_panel(value=1050.0), make_panel(value=-450.0)], [make_panel(value=300.0)]], window=(-450.0, 1050.0)
+    )
+
+    assert sheet.size == (2 * width + 3 * GAP_PIXELS, 2 * height + 3 * GAP_PIXELS)
+    first_row, second_row = GAP_PIXELS + height // 2, 2 * GAP_PIXELS + height + height // 2
+    left, right = GAP_PIXELS + width // 2, 2 * GAP_PIXELS + width + width // 2
+    greys = [int(sheet.image[place][0]) for place in ((first_row, left), (first_row, right), (second_row, left))]
+    assert greys == [255, 0, 128]  # the ends of the window, and its middle
+
+
+def test_captions_of_a_sheet_make_it_taller() -> None:
+    assert draw_sheet([[make_panel()]], ["one", "two"]).size[1] > draw_sheet([[make_panel()]]).size[1]
+
+
+def test_sheet_that_is_drawn_again_has_the_same_bytes() -> None:
+    first, again = (encode_image(draw_sheet([[make_panel()]], ["one", "two"]), ".png") for _ in range(2))
+    assert first == again
+
+
+def test_letters_and_caption_of_a_panel_are_drawn_at_its_edges() -> None:
+    plain = make_panel()
     told = Panel(plain.values, 0.5, ["caption"], (), ("L", "R", "A", "P"))
     difference = (draw_sheet([[told]]).image != draw_sheet([[plain]]).image).any(axis=-1)
     rows, columns = np.nonzero(difference)
@@ -57,7 +83,7 @@ def test_letters_and_captions_are_drawn() -> None:
     assert columns.min() < 25 and columns.max() > 185
 
 
-@pytest.mark.parametrize("rows", [[], [[]], [[panel(), Panel(np.zeros((50, 50), np.float32), 0.5)]]])
-def test_panels_of_different_size_are_refused(rows: list[list[Panel]]) -> None:
+@pytest.mark.parametrize("rows", [[], [[]], [[make_panel(), Panel(np.zeros((50, 50), np.float32), 0.5)]]])
+def test_sheet_of_no_panels_or_of_different_sizes_is_refused(rows: list[list[Panel]]) -> None:
     with refused(UsageError, "sheet", "size"):
         draw_sheet(rows)

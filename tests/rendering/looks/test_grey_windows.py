@@ -7,7 +7,7 @@ import pytest
 from refusals import refused
 
 from clrecon.errors import UsageError
-from clrecon.rendering.looks.window import BONE_WINDOW, WINDOWS, checked_window, grey_image
+from clrecon.rendering.looks.window import WINDOWS, checked_window, grey_image
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Projection, SlicesInSpace
 
 
@@ -16,22 +16,31 @@ from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Projection, Sl
     [("lung", -600, 1500), ("soft", 50, 400), ("abdomen", 50, 400), ("mediastinum", 50, 350), ("brain", 40, 80),
      ("bone", 300, 1500)],
 )  # fmt: skip
-def test_names_stand_for_levels_and_widths(name, level, width):
+def test_name_of_a_window_in_any_case_stands_for_its_level_and_width(name, level, width):
     assert checked_window(name) == (level - width / 2, level + width / 2) == WINDOWS[name]
     assert checked_window(f" {name.upper()} ") == WINDOWS[name]
 
 
-def test_every_style_with_a_window_takes_names():
-    for style in (Projection("mip", window="Lung"), PlaneCut(window="lung"), SlicesInSpace(window="LUNG")):
-        assert style.window == WINDOWS["lung"]
-    assert CurveCut(window="bone").window == BONE_WINDOW
-    grey = grey_image(np.array([[-1350.0, -600.0, 150.0]]), "lung")
+@pytest.mark.parametrize(
+    "style",
+    [Projection("mip", window="Lung"), PlaneCut(window="lung"), SlicesInSpace(window="LUNG"), CurveCut(window="lung")],
+    ids=["projection", "slice", "slices in space", "curve"],
+)
+def test_style_with_a_window_takes_its_name(style):
+    assert style.window == WINDOWS["lung"]
+
+
+def test_grey_image_in_a_named_window_is_black_grey_and_white_over_it():
+    grey = grey_image(np.array([[-1350.0, -600.0, 150.0]]), "lung")  # level -600, width 1500
     assert grey[0, :, 0].tolist() == [0, 128, 255]
 
 
-def test_names_that_are_none_are_listed():
+def test_unknown_name_of_a_window_is_refused():
     with refused(UsageError, "liver", "window"):
         checked_window("liver")
+
+
+def test_name_of_a_window_for_a_radiograph_in_mm_of_water_is_refused():
     with refused(UsageError, "lung", "water"):
         Projection("drr", window="lung")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.labels import LabelMap
@@ -14,34 +15,64 @@ LABELS = LabelMap(
 )
 
 
-def test_named_labels_have_their_colours_and_the_others_keep_the_pictures():
+FROM_THE_PICTURE = -1
+"""In place of a colour: the label keeps that of the picture."""
+
+
+def test_labels_have_their_given_colours_and_opacities():
     style = LabelStyle.of(LABELS, {"L2": "red", 9: (0, 0.5, 1)}, {"rib_left_1": 0.25})
-    assert style.table.shape == (10, 4) and style.table.dtype == np.float32
-    assert style.table[4].tolist() == [1, 0, 0, 1] and style.table[9].tolist() == [0, 0.5, 1, 0.25]
-    assert (style.table[[0, 1, 2, 3], :3] < 0).all() and (style.table[[0, 2], 3] == 1).all()
-    assert not style.is_opaque and LabelStyle.of(LABELS).is_opaque
+
+    assert (style.table.shape, style.table.dtype) == ((10, 4), np.float32)  # to the largest number
+    assert style.table[4].tolist() == [1, 0, 0, 1]
+    assert style.table[9].tolist() == [0, 0.5, 1, 0.25]
 
 
-def test_without_colours_each_label_has_its_own():
+def test_labels_without_a_given_colour_keep_that_of_the_picture_and_are_opaque():
+    table = LabelStyle.of(LABELS, {"L2": "red", 9: (0, 0.5, 1)}).table
+    assert (table[[0, 1, 2, 3], :3] == FROM_THE_PICTURE).all()
+    assert (table[[0, 2], 3] == 1).all()
+
+
+def test_style_of_labels_is_opaque_without_an_opacity_below_1():
+    assert LabelStyle.of(LABELS).is_opaque
+    assert not LabelStyle.of(LABELS, opacity={"rib_left_1": 0.25}).is_opaque
+
+
+def test_labels_have_different_colours_where_none_is_given():
     table = LabelStyle.of(LABELS).table
-    colors = table[[2, 4, 9], :3]
-    assert (colors >= 0).all() and (table[[0, 1, 3], :3] < 0).all()
+
+    colors = table[[2, 4, 9], :3]  # the numbers in the map
+    assert (colors >= 0).all()
     assert (np.linalg.norm(colors[:, None] - colors, axis=-1) + np.eye(3) > 0.3).all()
-    assert (LabelStyle.of(LABELS, {}).table[:, :3] < 0).all()
+    assert (table[[0, 1, 3], :3] == FROM_THE_PICTURE).all()
 
 
-def test_an_opacity_leaves_all_colours_as_they_are():
+def test_labels_keep_the_colours_of_the_picture_where_an_empty_mapping_is_given():
+    assert (LabelStyle.of(LABELS, {}).table[:, :3] == FROM_THE_PICTURE).all()
+
+
+def test_opacity_of_a_label_changes_no_colour_and_no_other_label():
     plain, faint = LabelStyle.of(LABELS).table, LabelStyle.of(LABELS, opacity={"L2": 0.2, 0: 0.0}).table
+
     assert np.array_equal(plain[:, :3], faint[:, :3])
-    assert faint[:, 3].tolist() == [0.0, 1.0, 1.0, 1.0, np.float32(0.2), 1.0, 1.0, 1.0, 1.0, 1.0]
-    assert np.array_equal(LabelStyle.of(LABELS, opacity={"0": 0.5}).table[0], np.array([-1, -1, -1, 0.5], np.float32))
+    opacities = np.ones(10, np.float32)
+    opacities[[0, 4]] = 0.0, 0.2  # what has no label, and L2
+    assert np.array_equal(faint[:, 3], opacities)
 
 
-def test_many_labels_keep_colours_apart():
+def test_opacity_of_what_has_no_label_is_given_by_the_text_0_too():
+    table = LabelStyle.of(LABELS, opacity={"0": 0.5}).table
+    assert table[0].tolist() == [*[FROM_THE_PICTURE] * 3, 0.5]
+
+
+def test_thirty_labels_have_colours_apart_from_each_other():
     colors = distinct_colors(30)
     assert (colors >= 0).all() and (colors <= 1).all()
     assert (np.linalg.norm(colors[:, None] - colors, axis=-1) + np.eye(30) > 0.02).all()
-    assert np.array_equal(colors[:7], distinct_colors(7))
+
+
+def test_colours_of_labels_do_not_depend_on_how_many_there_are():
+    assert np.array_equal(distinct_colors(30)[:7], distinct_colors(7))
 
 
 @pytest.mark.parametrize(
@@ -60,8 +91,11 @@ def test_many_labels_keep_colours_apart():
         ({"opacity": {"L2": 0.5, 4: 0.6}}, "label 4 vertebrae_L2 is named twice"),
     ],
 )
-def test_bad_input_is_refused(wrong, says):
+def test_wrong_colour_or_opacity_of_a_label_is_refused(wrong, says):
     with pytest.raises(UsageError, match=says):
         LabelStyle.of(LABELS, **wrong)
-    with pytest.raises(UsageError, match="LabelMap"):
+
+
+def test_style_of_an_array_in_place_of_a_label_map_is_refused():
+    with refused(UsageError, "LabelMap"):
         LabelStyle.of(LABELS.voxels)

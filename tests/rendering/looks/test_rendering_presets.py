@@ -20,32 +20,47 @@ DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "transfer_functions.md
 NAMES = ["bone", "spine", "skin", "lung", "vessels", "muscle", "metal", "x-ray", "mip", "minip"]
 
 
-def passes(name: str, hu: float, mm: float) -> float:
+def transmitted_share(name: str, hu: float, mm: float) -> float:
     """Share of the light that a layer of `mm` of one value lets through."""
     function = PRESETS[name].transfer_function
     return float((1 - function([hu])[0, 3]) ** (mm / function.unit_distance))
 
 
-def test_presets_are_found_by_name_and_unknown_ones_refused() -> None:
+def test_presets_are_listed_in_order_and_bone_is_the_default() -> None:
     assert list(PRESETS) == NAMES
     assert find_preset(DEFAULT_PRESET).name == "bone"
-    for name in ("bonne", "xyz", "", None):
-        with refused(UsageError, repr(name), "bone", "spine", "skin"):
-            find_preset(name)
 
 
-def test_every_preset_has_a_name_source_and_range() -> None:
-    for name, preset in PRESETS.items():
-        assert preset.name == preset.transfer_function.name == name
-        assert preset.description and preset.source
-        assert preset.lighting == preset.transfer_function.lighting
-        assert preset.lighting.shades == (preset.mode == "dvr")
-        assert preset.window is None or preset.window[0] < preset.window[1]
-        low, high = preset.transfer_function.range_hu
-        assert -1100 < low < high < 3100
+@pytest.mark.parametrize("name", ["bonne", "xyz", "", None])
+def test_unknown_preset_is_refused_with_those_that_there_are(name: str | None) -> None:
+    with refused(UsageError, repr(name), "bone", "spine", "skin"):
+        find_preset(name)
 
 
-def test_presets_have_their_modes_and_windows() -> None:
+@pytest.mark.parametrize("name", NAMES)
+def test_preset_has_name_description_and_source(name: str) -> None:
+    preset = PRESETS[name]
+    assert preset.name == preset.transfer_function.name == name
+    assert preset.description
+    assert preset.source
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_preset_has_the_light_of_its_function_which_shades_volume_rendering_alone(name: str) -> None:
+    preset = PRESETS[name]
+    assert preset.lighting == preset.transfer_function.lighting
+    assert preset.lighting.shades == (preset.mode == "dvr")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_preset_has_a_range_of_hu_of_ct_and_a_window_that_rises(name: str) -> None:
+    preset = PRESETS[name]
+    low, high = preset.transfer_function.range_hu
+    assert -1100 < low < high < 3100  # around air and the end of 12 bits
+    assert preset.window is None or preset.window[0] < preset.window[1]
+
+
+def test_presets_of_projections_have_their_modes_and_windows() -> None:
     modes = {name: preset.mode for name, preset in PRESETS.items() if preset.mode != "dvr"}
     assert modes == {"x-ray": "drr", "mip": "mip", "minip": "minip"}
     assert PRESETS["mip"].window == (0, 1000)
@@ -69,7 +84,7 @@ def test_presets_have_their_modes_and_windows() -> None:
         ("spine", 50, 100, 0.3, 0.8),
         ("lung", -850, 100, 0.3, 0.8),
         ("metal", 1000, 10, 0.3, 0.8),
-        # Solid: next to nothing passes.
+        # Solid: next to nothing transmitted_share.
         ("bone", 400, 10, 0, 0.05),
         ("spine", 400, 10, 0, 0.05),
         ("skin", -300, 2, 0, 0.01),
@@ -78,28 +93,33 @@ def test_presets_have_their_modes_and_windows() -> None:
         ("metal", 2800, 3, 0, 0.01),
     ],
 )
-def test_tissues_show_as_they_should(name: str, hu: float, mm: float, low: float, high: float) -> None:
-    assert low <= passes(name, hu, mm) <= high
+def test_layer_of_a_tissue_is_as_clear_or_solid_as_its_preset_promises(
+    name: str, hu: float, mm: float, low: float, high: float
+) -> None:
+    assert low <= transmitted_share(name, hu, mm) <= high
 
 
-def test_thin_cortex_in_thick_slices_shows_in_bone() -> None:
+def test_thin_cortex_averaged_in_a_slice_of_4_mm_is_seen_in_preset_bone() -> None:
     """A slice of 4 mm averages a thin cortex with its surroundings: 150 to 200 HU."""
-    assert passes("bone", hu=175, mm=4) < 0.95
+    assert transmitted_share("bone", hu=175, mm=4) < 0.95
 
 
-def test_dense_bone_is_white_and_contrast_medium_red() -> None:
-    red, green, blue, _ = PRESETS["bone"].transfer_function([1000])[0]
-    assert min(red, green, blue) > 0.8
+def test_dense_bone_is_nearly_white_in_preset_bone() -> None:
+    color = PRESETS["bone"].transfer_function([1000])[0, :3]
+    assert min(color) > 0.8
+
+
+def test_contrast_medium_is_red_in_preset_vessels() -> None:
     red, green, blue, _ = PRESETS["vessels"].transfer_function([250])[0]
     assert red > 2 * max(green, blue)
 
 
-def test_x_ray_grows_with_attenuation() -> None:
+def test_opacity_of_preset_x_ray_grows_with_hu() -> None:
     opacity = PRESETS["x-ray"].transfer_function(np.arange(-1000, 1500, 10))[:, 3]
     assert opacity[0] == 0 and np.all(np.diff(opacity) > 0)
 
 
-def test_page_describes_every_preset_as_it_is() -> None:
+def test_page_of_transfer_functions_has_mode_and_first_hu_of_each_preset() -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([\w-]+)` \| (.*?) \| (\w+) \| (.*?) ?\|$", text, re.MULTILINE)
     assert [row[0] for row in rows] == NAMES
@@ -128,7 +148,7 @@ POINTS = {
 
 @pytest.mark.golden
 @pytest.mark.parametrize("name", NAMES)
-def test_a_preset_shows_what_it_showed_in_earlier_versions(name: str) -> None:
+def test_points_of_a_preset_are_those_of_earlier_versions(name: str) -> None:
     """Who changes one on purpose says so in CHANGELOG.md, and writes the new figure here."""
     points = PRESETS[name].transfer_function.points.tolist()
     assert f"{zlib.crc32(json.dumps(points).encode()):08X}" == f"{POINTS[name]:08X}"
