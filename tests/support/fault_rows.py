@@ -18,7 +18,10 @@ SLABS = "operators/surface/test_slabs.py::"
 ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     1: ("row and column spacing differ: right", (TRAPS, GEOMETRY + "test_voxels_lie_where_they_were_written")),
     2: ("random order, no extension, lying InstanceNumber: right", (TRAPS,)),
-    3: ("tilt of 1, 2.5, 12, -20 degrees: exact by shear, told", (TRAPS, GEOMETRY + "test_gantry_tilt_is_reported")),
+    3: (
+        "tilt of 1, 2.5, 12, -20 degrees: exact by shear, told",
+        (TRAPS, GEOMETRY + "test_gantry_tilt_is_in_the_report_and_warned_of"),
+    ),
     4: (
         "one slice missing: refused; --allow-gaps: true positions, told",
         (TRAPS, "reading/dicom/test_trap_matrix.py::test_refused_row_is_read_on_request_within_its_bound"),
@@ -26,7 +29,10 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     5: ("spacing changes half way: exact positions, told", (TRAPS,)),
     6: ("drift of 0.19 mm a gap: exact positions, told", (TRAPS,)),
     7: ("one step off by 0.15 mm: told with its figures", (TRAPS,)),
-    8: ("positions rounded to 0.01 mm: right, no warning", (GEOMETRY + "test_rounded_positions_pass_without_a_word",)),
+    8: (
+        "positions rounded to 0.01 mm: right, no warning",
+        (GEOMETRY + "test_positions_rounded_to_a_hundredth_of_a_mm_are_even_without_a_warning",),
+    ),
     9: ("duplicate slices: equal ones dropped and told, else phases", (TRAPS,)),
     10: (
         "two phases or times in one series: refused with their list; --phase",
@@ -36,28 +42,31 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     12: (
         "two series or patients: refused with their list; --series",
         (
-            SERIES + "test_two_series_of_equal_size_need_a_choice",
+            SERIES + "test_two_series_of_equal_size_are_refused_with_their_list",
             "reading/dicom/test_phases.py::test_series_of_two_patients_are_refused_with_their_list_and_without_their_ids",
         ),
     ),
-    13: ("two FrameOfReferenceUIDs: refused", (TRAPS, GEOMETRY + "test_mixed_values_are_refused")),
+    13: (
+        "two FrameOfReferenceUIDs: refused",
+        (TRAPS, GEOMETRY + "test_slice_with_another_frame_spacing_or_orientation_is_refused"),
+    ),
     14: (
         "directions not unit or orthogonal: refused; a little: made orthonormal, told",
         (
-            GEOMETRY + "test_mixed_values_are_refused",
+            GEOMETRY + "test_slice_with_another_frame_spacing_or_orientation_is_refused",
             GEOMETRY + "test_skewed_directions_are_made_orthonormal_with_a_warning",
         ),
     ),
     15: (
         "orientation or position zero, NaN, short, missing: refused with file and tag",
-        (GEOMETRY + "test_bad_values_name_file_and_tag",),
+        (GEOMETRY + "test_unsound_geometry_or_rescale_is_refused_by_file_and_element",),
     ),
     16: (
         "SliceThickness or SpacingBetweenSlices wrong or negative: not used, told",
         (
             TRAPS,
-            GEOMETRY + "test_stated_spacing_is_ignored_with_a_warning",
-            GEOMETRY + "test_a_wrong_thickness_is_only_a_warning",
+            GEOMETRY + "test_spacing_between_slices_that_the_positions_contradict_is_not_used_and_warned_of",
+            GEOMETRY + "test_thickness_that_is_no_number_is_not_used_and_warned_of",
         ),
     ),
     17: ("feet first, prone, reversed, left-handed: the same in LPS", (TRAPS,)),
@@ -69,28 +78,28 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     20: (
         "a single slice: refused",
         (
-            GEOMETRY + "test_stacks_that_are_no_grid_are_refused_by_name",
+            GEOMETRY + "test_stack_with_holes_or_of_one_slice_is_refused_in_one_line",
             BAD_INPUT + "test_mesh_of_an_input_without_a_usable_ct_series_is_refused_in_one_line_and_writes_nothing",
         ),
     ),
     21: (
         "Rows or Columns differ between slices: refused, the odd ones named",
-        (GEOMETRY + "test_rows_and_columns_that_differ_are_refused",),
+        (GEOMETRY + "test_slice_with_another_number_of_rows_is_refused",),
     ),
     22: ("enhanced CT, geometry and rescale of each frame, unsorted frames: right", (TRAPS,)),
     23: (
         "PixelSpacing 0, negative, huge, with a decimal comma: refused",
-        (TRAPS, GEOMETRY + "test_bad_values_name_file_and_tag"),
+        (TRAPS, GEOMETRY + "test_unsound_geometry_or_rescale_is_refused_by_file_and_element"),
     ),
     24: (
         "orientation jitter of 0.001 degrees: right",
-        (TRAPS, GEOMETRY + "test_small_jitter_of_the_directions_is_averaged"),
+        (TRAPS, GEOMETRY + "test_directions_that_jitter_by_a_thousandth_of_a_degree_are_averaged"),
     ),
     25: (
         "slope and intercept slice by slice: right; slope 0, NaN, infinite, text: refused",
         (
             PIXELS + "test_each_slice_is_rescaled_by_its_own_slope_and_intercept",
-            GEOMETRY + "test_bad_values_name_file_and_tag",
+            GEOMETRY + "test_unsound_geometry_or_rescale_is_refused_by_file_and_element",
         ),
     ),
     26: (

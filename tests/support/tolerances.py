@@ -97,6 +97,11 @@ REAL_MEAN_HU = 1e-3  # the known mean has four decimals
 REAL_FAR_CORNER_MM = 1e-3  # PixelSpacing has six decimals, 511 pixels away
 REAL_TILT_DEG = 0.05  # the known tilt has one decimal
 
+JITTER_DIRECTION = 0.5e-5  # 0.001 degrees are 1.7e-5, of which an average over eight slices leaves none
+RIGHT_ANGLE = 1e-9  # products of direction cosines in float64
+PLANES_S = 10.0  # of processors, for 3,000 planes; 18 s where each is compared with all others
+GRID_RESIDUAL_MM = 1e-9  # positions with 9 decimals of an even plan
+
 THOUSAND_FRAMES_S = 1.0  # of processors, for headers of 1000 frames in one file; measured 0.11
 
 # --- labels ---
