@@ -1,9 +1,10 @@
-"""Figures of iso values: the page and the printed line say what was measured, and the measure knows a sphere."""
+"""Figures of iso values: the page and a printed line have what was measured, and the measure knows planes and a leg."""
 
 from __future__ import annotations
 
 import json
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,44 +21,76 @@ FIGURES = json.loads((measure_levels.FIGURES / "phantoms.json").read_text(encodi
 
 
 @pytest.mark.parametrize("name", list(measure_levels.tables()))
-def test_the_page_has_the_figures(name: str) -> None:
+def test_page_of_iso_values_has_the_table_of_the_recorded_figures(name: str) -> None:
     assert marked_tables.find_table(PAGE, name) == measure_levels.tables()[name]
 
 
-def test_the_printed_line_says_what_the_default_costs_in_soft_tissue() -> None:
-    biases = [one["preset"]["bias_mm"] for one in FIGURES if one["group"] not in level_phantoms.NOT_IN_TISSUE]
-    low, high = re.findall(r"\d\.\d", WHAT_BONE_COSTS)
-    assert (f"{min(biases):.1f}", f"{max(biases):.1f}") == (low, high)
-    assert f"{min(biases):.2f} to {max(biases):.2f} mm outside the bone" in PAGE
+BIASES = [one["preset"]["bias_mm"] for one in FIGURES if one["group"] not in level_phantoms.NOT_IN_TISSUE]
+"""How far the default iso value lies outside the bone, for the phantoms with soft tissue."""
 
 
-def test_figures_are_of_the_phantoms_that_are_there() -> None:
+def test_printed_line_on_the_default_iso_value_has_its_least_and_largest_measured_error() -> None:
+    assert re.findall(r"\d\.\d", WHAT_BONE_COSTS) == [f"{min(BIASES):.1f}", f"{max(BIASES):.1f}"]
+
+
+def test_page_of_iso_values_has_the_least_and_largest_measured_error_of_the_default() -> None:
+    assert f"{min(BIASES):.2f} to {max(BIASES):.2f} mm outside the bone" in PAGE
+
+
+def test_recorded_figures_are_of_the_phantoms_of_the_script() -> None:
     assert [one["name"] for one in FIGURES] == [phantom.name for phantom in level_phantoms.PHANTOMS]
 
 
-def test_profiles_across_a_plane_have_known_errors() -> None:
-    way = level_phantoms.Profiles(np.empty((0, 0), np.float32)).way_mm
-    ramp = np.clip(500.0 - 200.0 * way, 0.0, 1000.0)  # half way at 0, 200 HU a mm
-    step = np.where(np.abs(way) < 0.5, 300.0, 0.0)  # a thin wall that never reaches 400
-    profiles = level_phantoms.Profiles(np.stack((ramp, step)).astype(np.float32))
-    np.testing.assert_allclose(profiles.errors(500.0), [0.0, np.nan], atol=1e-4)
-    np.testing.assert_allclose(profiles.errors(200.0), [1.5, 0.48], atol=0.04)
-    measured = measure_levels.measure_errors(profiles, 500.0)
+@pytest.fixture
+def two_profiles() -> Any:
+    """HU along the normals of a plane: a ramp of 200 HU a mm through 500 HU, and a wall of 1 mm with 300 HU."""
+    way_mm = level_phantoms.Profiles(np.empty((0, 0), np.float32)).way_mm
+    ramp = np.clip(500.0 - 200.0 * way_mm, 0.0, 1000.0)
+    wall = np.where(np.abs(way_mm) < 0.5, 300.0, 0.0)
+    return level_phantoms.Profiles(np.stack((ramp, wall)).astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("iso_value", "ramp_mm", "wall_mm"),
+    [
+        pytest.param(500.0, 0.0, np.nan, id="half way up the ramp, above the wall"),
+        pytest.param(200.0, (500.0 - 200.0) / 200.0, 0.48, id="300 HU below, and in the last step of the wall"),
+    ],
+)
+def test_error_of_a_profile_is_where_it_crosses_the_iso_value(
+    two_profiles: Any, iso_value: float, ramp_mm: float, wall_mm: float
+) -> None:
+    step_mm = 0.04
+    np.testing.assert_allclose(two_profiles.errors(iso_value), [ramp_mm, wall_mm], atol=step_mm)
+
+
+def test_share_of_profiles_that_never_reach_the_iso_value_is_lost(two_profiles: Any) -> None:
+    measured = measure_levels.measure_errors(two_profiles, 500.0)  # above the wall, one of two
     assert (measured["lost_share"], measured["close_share"]) == (0.5, 0.5)
 
 
-def test_profiles_of_a_leg_are_level_with_its_bone() -> None:
+@pytest.fixture(scope="module")
+def leg_profiles() -> Any:
+    """HU along the normals of the bone of a synthetic leg, which is half way to soft tissue at 725 HU."""
     leg = level_phantoms.Phantom(
         "leg", level_phantoms.BODIES, {"kind": "limb", "size": (96, 96), "slices": 24, "spacing": (1.4, 1.4, 2.0)}
     )
-    volume = level_phantoms.draw_phantom(leg)
-    profiles = level_phantoms.sample_profiles(leg, volume)
-    measured = measure_levels.measure_errors(profiles, 725.0)
-    assert len(profiles.values) > 500 and abs(measured["bias_mm"]) < 0.15 and measured["lost_share"] < 0.05
-    assert measure_levels.measure_errors(profiles, 200.0)["bias_mm"] > 0.5
+    profiles = level_phantoms.sample_profiles(leg, level_phantoms.draw_phantom(leg))
+    assert len(profiles.values) > 500
+    return profiles
 
 
-def test_a_mesh_is_met_where_it_crosses_the_true_normals() -> None:
+def test_surface_of_a_leg_half_way_to_soft_tissue_is_that_of_its_bone(leg_profiles: Any) -> None:
+    measured = measure_levels.measure_errors(leg_profiles, 725.0)
+    assert abs(measured["bias_mm"]) < 0.15  # a tenth of a voxel
+    assert measured["lost_share"] < 0.05
+
+
+def test_surface_of_a_leg_at_a_low_iso_value_lies_outside_its_bone(leg_profiles: Any) -> None:
+    assert measure_levels.measure_errors(leg_profiles, 200.0)["bias_mm"] > 0.5
+
+
+def test_mesh_is_met_where_it_crosses_the_true_normals_in_their_direction() -> None:
     corners = np.array(
         [[0.0, 0.0, 0.4], [9.0, 0.0, 0.4], [0.0, 9.0, 0.4], [0.0, 0.0, -1.0], [9.0, 0.0, -1.0], [0.0, 9.0, -1.0]]
     )
@@ -71,8 +104,14 @@ def test_a_mesh_is_met_where_it_crosses_the_true_normals() -> None:
     assert rows.tolist() == [0, 1, -1]
 
 
-def test_tables_need_their_markers() -> None:
-    text = "a\n<!-- x: made by me -->\nold\n<!-- end of x -->\nb"
-    assert marked_tables.find_table(marked_tables.put_table(text, "x", "new"), "x") == "new"
+MARKED = "a\n<!-- x: made by me -->\nold\n<!-- end of x -->\nb"
+
+
+def test_table_is_put_between_its_markers_in_place_of_the_old_one() -> None:
+    assert marked_tables.find_table(MARKED, "x") == "old"
+    assert marked_tables.put_table(MARKED, "x", "new") == MARKED.replace("old", "new")
+
+
+def test_table_without_its_markers_is_refused() -> None:
     with refused(ValueError, 0, "tables"):
-        marked_tables.put_table(text, "y", "new")
+        marked_tables.put_table(MARKED, "y", "new")

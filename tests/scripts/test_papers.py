@@ -1,9 +1,10 @@
-"""The page on both papers: what it names is there, and it says what the figures say."""
+"""The page on both papers: the names, tests and commands in it exist, and its figures are the recorded ones."""
 
 from __future__ import annotations
 
 import shlex
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from command_lines import parse_command
@@ -16,24 +17,24 @@ PAGE = papers.PAGE.read_text(encoding="utf-8")
 ROWS = paper_functions.load_functions()
 
 
-def test_each_function_has_its_place_test_and_figure() -> None:
+def test_each_function_of_the_papers_has_its_name_test_and_figure() -> None:
     assert paper_functions.find_faults(ROWS, PAGE) == []
 
 
 @pytest.mark.parametrize("row", [row for row in ROWS if row.command], ids=lambda row: str(row.number))
-def test_commands_of_the_papers_are_understood(row: paper_functions.PaperFunction) -> None:
+def test_command_of_a_function_of_the_papers_is_understood(row: paper_functions.PaperFunction) -> None:
     assert row.command is not None
     parse_command(shlex.split(row.command))
 
 
-def test_the_page_is_what_the_script_makes() -> None:
+def test_page_on_the_papers_is_what_the_script_makes_of_the_figures() -> None:
     assert papers.make_page_from(papers.FIGURES) == PAGE
 
 
-def test_figures_name_no_folder() -> None:
-    for path in papers.FIGURES.glob("*.json"):
-        text = path.read_text(encoding="utf-8")
-        assert "/work" not in text and str(ROOT) not in text and "PatientName" not in text, path.name
+@pytest.mark.parametrize("path", sorted(papers.FIGURES.glob("*.json")), ids=lambda path: path.stem)
+def test_recorded_figures_of_the_papers_name_no_folder_and_no_patient(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert [word for word in ("/work", str(ROOT), "PatientName") if word in text] == []
 
 
 @pytest.mark.parametrize(
@@ -48,5 +49,5 @@ def test_figures_name_no_folder() -> None:
         ({"number": 3}, "the rows are not 1 to 62"),
     ],
 )
-def test_a_wrong_row_is_found(change: dict, words: str) -> None:
+def test_fault_of_a_row_of_the_functions_of_the_papers_is_named(change: dict, words: str) -> None:
     assert words in paper_functions.find_faults([replace(ROWS[0], **change), *ROWS[1:]], PAGE)

@@ -26,21 +26,26 @@ def make_command(text, code=0):
 
 @pytest.mark.parametrize("closing", ["3 passed, 1 skipped in 2.10s (0:00:02)", "=== 1 failed, 3 passed in 61.00s ===",
                                      "no tests ran in 0.12s"])  # fmt: skip
-def test_closing_line_comes_last(runner, capfd, closing):
-    steps = {"one": make_command("of one"), "two": make_command("of two", 3)}
-    failed = runner.run_beside(steps, make_command(f"....  [100%]\n{closing}\nafterwards"), dict(os.environ), [])
-    lines = capfd.readouterr().out.splitlines()
+def test_closing_line_of_pytest_is_printed_after_the_output_of_the_other_checks(runner, capfd, closing):
+    checks = {"one": make_command("of one"), "two": make_command("of two", 3)}
+    pytest_command = make_command(f"....  [100%]\n{closing}\nafterwards")
+    failed = runner.run_beside(checks, pytest_command, dict(os.environ), [])
     assert failed == ["two"]
+    lines = capfd.readouterr().out.splitlines()
     assert lines == ["== pytest", "....  [100%]", "afterwards", "== one", "of one", "== two", "of two", closing]
 
 
-def test_tests_that_fail_are_named_and_print_all(runner, capfd):
+def test_tests_that_fail_are_run_again_with_all_their_output(runner, capfd):
     again = make_command("its values", 1)
-    assert runner.run_beside({}, make_command("no closing line", 4), dict(os.environ), again) == ["pytest"]
-    said = capfd.readouterr().out.splitlines()
-    assert said[:2] == ["== pytest", "no closing line"] and said[2].startswith("== ") and said[3:] == ["its values"]
+    failed = runner.run_beside({}, make_command("no closing line", 4), dict(os.environ), again)
+    assert failed == ["pytest"]
+    first_title, first_output, second_title, second_output = capfd.readouterr().out.splitlines()
+    assert (first_title, first_output) == ("== pytest", "no closing line")
+    assert second_title.startswith("== ")
+    assert second_output == "its values"
 
 
-def test_steps_run_in_turn(runner, capfd):
-    assert runner.run_in_turn({"a": make_command("A", 1), "b": make_command("B")}, dict(os.environ)) == ["a"]
+def test_checks_run_one_after_the_other_also_after_one_that_fails(runner, capfd):
+    failed = runner.run_in_turn({"a": make_command("A", 1), "b": make_command("B")}, dict(os.environ))
+    assert failed == ["a"]
     assert capfd.readouterr().out.splitlines() == ["== a", "A", "== b", "B"]

@@ -1,4 +1,4 @@
-"""Whole processes: the tables of README and docs/benchmarks.md have the figures, and a mesh is judged rightly."""
+"""Times of whole processes: the tables of README and docs/benchmarks.md have them, and meshes are judged rightly."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ TABLES = [(page, name) for page, made in whole_processes.tables().items() for na
 
 
 @pytest.mark.parametrize(("page", "name"), TABLES, ids=lambda value: getattr(value, "name", value))
-def test_the_pages_have_the_figures(page: Path, name: str) -> None:
+def test_page_has_the_table_of_the_recorded_times(page: Path, name: str) -> None:
     assert marked_tables.find_table(page.read_text(encoding="utf-8"), name) == whole_processes.tables()[page][name]
 
 
-def test_figures_name_no_folder() -> None:
-    for path in whole_processes.FIGURES.glob("*.json"):
-        assert str(whole_processes.ROOT) not in path.read_text(encoding="utf-8"), path.name
+@pytest.mark.parametrize("path", sorted(whole_processes.FIGURES.glob("*.json")), ids=lambda path: path.stem)
+def test_recorded_times_name_no_folder_of_this_machine(path: Path) -> None:
+    assert str(whole_processes.ROOT) not in path.read_text(encoding="utf-8")
 
 
 def tetrahedron(folder: Path, name: str, *, shift: float = 0.0, turned: bool = False, faces: int = 4) -> Path:
@@ -36,26 +36,47 @@ def tetrahedron(folder: Path, name: str, *, shift: float = 0.0, turned: bool = F
     return path
 
 
-def test_a_mesh_is_judged(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("change", "closed", "in_place", "inside_out"),
+    [
+        pytest.param({}, True, True, False, id="same"),
+        pytest.param({"shift": 50.0}, True, False, False, id="50 mm away"),
+        pytest.param({"turned": True}, True, True, True, id="faces turned"),
+    ],
+)
+def test_mesh_of_another_program_is_judged_by_its_place_and_the_side_of_its_faces(
+    change: dict[str, Any], closed: bool, in_place: bool, inside_out: bool, tmp_path: Path
+) -> None:
     own = tetrahedron(tmp_path, "own.stl")
-    judged = {
-        name: whole_processes.judge_mesh(tetrahedron(tmp_path, f"{name}.stl", **how), own, 1.0)
-        for name, how in {"same": {}, "away": {"shift": 50.0}, "turned": {"turned": True}, "open": {"faces": 3}}.items()
-    }
-    assert [one["closed"] for one in judged.values()] == [True, True, True, False]
-    assert [one["in_place"] for one in judged.values()] == [True, False, True, True]
-    assert [judged[name]["inside_out"] for name in ("same", "away", "turned")] == [False, False, True]
+    judged = whole_processes.judge_mesh(tetrahedron(tmp_path, "other.stl", **change), own, 1.0)
+    assert (judged["closed"], judged["in_place"], judged["inside_out"]) == (closed, in_place, inside_out)
 
 
-def test_a_program_that_is_not_there_or_fails_is_a_row_that_says_why(tmp_path: Path, monkeypatch: Any) -> None:
+def test_mesh_of_another_program_that_lacks_a_face_is_judged_as_open(tmp_path: Path) -> None:
+    own = tetrahedron(tmp_path, "own.stl")
+    judged = whole_processes.judge_mesh(tetrahedron(tmp_path, "other.stl", faces=3), own, 1.0)
+    assert (judged["closed"], judged["in_place"]) == (False, True)
+
+
+MISSING = whole_processes.Program("gone", "Gone", ("no-such-program",), ("no-such-program",))
+FAILING = whole_processes.Program("fails", "Fails", (sys.executable, "-c", "raise SystemExit('no luck')"))
+
+
+@pytest.fixture
+def figures(tmp_path: Path) -> dict[str, Any]:
+    """Figures of two programs that make no mesh of a synthetic scan."""
     write_phantom(tmp_path / "ct", PhantomSettings(kind="sphere", size=(24, 24), slices=16))
-    known = [
-        whole_processes.Program("gone", "Gone", ("no-such-program",), ("no-such-program",)),
-        whole_processes.Program("fails", "Fails", (sys.executable, "-c", "raise SystemExit('no luck')")),
-    ]
-    figures = whole_processes.measure_input("a", tmp_path / "ct", known, 1, tmp_path)
-    assert figures["programs"]["gone"]["why"] == "not here: no-such-program"
-    assert figures["programs"]["fails"]["why"] == "exit code 1: no luck"
+    return whole_processes.measure_input("a", tmp_path / "ct", [MISSING, FAILING], 1, tmp_path)
+
+
+@pytest.mark.parametrize(("name", "why"), [("gone", "not here: no-such-program"), ("fails", "exit code 1: no luck")])
+def test_program_that_is_missing_or_fails_has_the_reason_in_its_figures(
+    name: str, why: str, figures: dict[str, Any]
+) -> None:
+    assert figures["programs"][name]["why"] == why
+
+
+def test_program_that_is_missing_has_a_row_with_the_reason(figures: dict[str, Any], monkeypatch: Any) -> None:
     figures["machine"] = {"processor": "P", "cores": 2, "load_average": None}
-    monkeypatch.setattr(whole_processes, "programs", lambda *_: known)
+    monkeypatch.setattr(whole_processes, "programs", lambda *_: [MISSING, FAILING])
     assert "| Gone | not run (not here: no-such-program) |" in whole_processes.table_of(figures, figures)
