@@ -246,7 +246,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
         "SIGINT, SIGTERM, SIGKILL in the middle: the older file intact, temporary files removed by the next run",
         (
             FILES + "test_process_that_is_stopped_while_writing_leaves_the_older_file",
-            "cli/test_process.py::test_an_interrupt_leaves_nothing",
+            "cli/test_process.py::test_interrupted_phantom_ends_with_130_and_leaves_no_files",
         ),
     ),
     63: ("the target exists: replaced as a whole; --no-clobber: refused before any work", ()),
