@@ -102,6 +102,9 @@ RIGHT_ANGLE = 1e-9  # products of direction cosines in float64
 PLANES_S = 10.0  # of processors, for 3,000 planes; 18 s where each is compared with all others
 GRID_RESIDUAL_MM = 1e-9  # positions with 9 decimals of an even plan
 
+PADDING_BORDER_SHARE = 0.03  # of pairs of neighbours: chance over some hundred pairs at the circle
+REAL_TUBE_SHARE = 0.15  # of pairs of neighbours at the circle that noise of air crosses
+
 THOUSAND_FRAMES_S = 1.0  # of processors, for headers of 1000 frames in one file; measured 0.11
 
 # --- labels ---
