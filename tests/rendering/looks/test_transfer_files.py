@@ -87,7 +87,7 @@ PARAVIEW: list[dict[str, Any]] = [
 ]
 
 
-def put(folder: Path, value: Any, name: str = "file.json") -> Path:
+def write_file(folder: Path, value: Any, name: str = "file.json") -> Path:
     path = folder / name
     if isinstance(value, bytes):
         path.write_bytes(value)
@@ -109,11 +109,12 @@ def changed(value: Any, place: list[Any], new: Any) -> Any:
     return copy
 
 
-def test_saved_transfer_functions_load_bit_for_bit(tmp_path: Path) -> None:
+def make_full_function() -> TransferFunction:
+    """A transfer function with every field, numbers of all digits, and letters that JSON escapes."""
     rng = np.random.default_rng(3)
     points = np.column_stack([np.sort(rng.uniform(-1000, 3000, 50)), rng.uniform(size=(50, 4))])
-    points[7, 0] = points[6, 0]
-    full = TransferFunction(
+    points[7, 0] = points[6, 0]  # a step
+    return TransferFunction(
         points,
         unit_distance=1 / 3,
         gradient_opacity=[(0, 0.1), (1 / 7, 1)],
@@ -121,28 +122,54 @@ def test_saved_transfer_functions_load_bit_for_bit(tmp_path: Path) -> None:
         name='a "b" \u00e4\n',
         description="d\\e",
     )
-    plain = TransferFunction([(1, 0, 0, 0, 0), (2, 1, 1, 1, 1)])
-    for function in (full, plain, *(preset.transfer_function for preset in PRESETS.values())):
-        function.save(tmp_path / "f.json")
-        found = load_transfer_function(tmp_path / "f.json")
-        assert found == function
-        assert (found.name, found.description) == (function.name, function.description)
-        assert found.points.tobytes() == function.points.tobytes()
-        assert json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))["version"] == 1
 
 
-def test_the_example_of_the_document_is_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "function",
+    [
+        pytest.param(make_full_function(), id="every field"),
+        pytest.param(TransferFunction([(1, 0, 0, 0, 0), (2, 1, 1, 1, 1)]), id="points alone"),
+        *(pytest.param(preset.transfer_function, id=name) for name, preset in PRESETS.items()),
+    ],
+)
+def test_saved_transfer_function_is_loaded_bit_for_bit(function: TransferFunction, tmp_path: Path) -> None:
+    function.save(tmp_path / "f.json")
+
+    loaded = load_transfer_function(tmp_path / "f.json")
+
+    assert loaded == function
+    assert (loaded.name, loaded.description) == (function.name, function.description)
+    assert loaded.points.tobytes() == function.points.tobytes()
+
+
+def test_saved_transfer_function_states_version_1(tmp_path: Path) -> None:
+    make_full_function().save(tmp_path / "f.json")
+    assert json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))["version"] == 1
+
+
+@pytest.fixture(scope="module")
+def example() -> tuple[str, str]:
+    """The JSON of the page on transfer functions, and its table of fields."""
     text = (ROOT / "docs" / "transfer_functions.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
-    function = load_transfer_function(put(tmp_path, example))
+    (content,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    return content, text.split("| field |")[1]
+
+
+def test_example_of_the_page_on_transfer_functions_is_read(example: tuple[str, str], tmp_path: Path) -> None:
+    function = load_transfer_function(write_file(tmp_path, example[0]))
+
     assert (function.name, function.unit_distance, len(function.points)) == ("glass bone", 1.0, 3)
     assert function([150])[0].tolist() == pytest.approx([204 / 255, 128 / 255, 102 / 255, 0], abs=FLOAT64_SHARE)
     assert function.gradient_factor([50]).tolist() == pytest.approx([0.6])
-    assert function.lighting is not None and function.lighting.specular == 0.3
-    assert {f"`{field}`" for field in json.loads(example)} <= set(re.findall(r"`\w+`", text.split("| field |")[1]))
+    assert function.lighting.specular == 0.3
 
 
-def test_the_python_of_the_document_runs() -> None:
+def test_page_on_transfer_functions_lists_the_fields_of_its_example(example: tuple[str, str]) -> None:
+    content, table = example
+    assert {f"`{field}`" for field in json.loads(content)} <= set(re.findall(r"`\w+`", table))
+
+
+def test_python_of_the_page_on_transfer_functions_gives_the_figures_that_it_states() -> None:
     text = (ROOT / "docs" / "transfer_functions.md").read_text(encoding="utf-8")
     code = text.split("    from clrecon import", 1)[1].split("    volume = ")[0]
     names: dict[str, Any] = {}
@@ -153,24 +180,30 @@ def test_the_python_of_the_document_runs() -> None:
     assert said in " ".join(text.split())
 
 
-def test_transfer_function_that_cannot_be_written_leaves_no_file(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["gone/f.json", "."], ids=["missing folder", "a folder"])
+def test_transfer_function_that_cannot_be_saved_is_refused_and_leaves_no_file(name: str, tmp_path: Path) -> None:
     function = TransferFunction([(1, 0, 0, 0, 0), (2, 1, 1, 1, 1)])
-    with refused(OutputError, "f.json", "folder"):
-        function.save(tmp_path / "gone" / "f.json")
     with refused(OutputError, "folder"):
-        function.save(tmp_path)
+        function.save(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_fields_left_out_of_a_transfer_file_have_their_defaults(tmp_path: Path) -> None:
-    function = load_transfer_function(put(tmp_path, OWN))
+@pytest.mark.parametrize(
+    "content",
+    [
+        pytest.param(OWN, id="left out"),
+        pytest.param({**OWN, "lighting": None, "gradient_opacity": None}, id="null"),
+        pytest.param(b"\xef\xbb\xbf" + json.dumps(OWN).encode(), id="with the mark of UTF-8"),
+    ],
+)
+def test_fields_left_out_of_a_transfer_file_have_their_defaults(content: Any, tmp_path: Path) -> None:
+    function = load_transfer_function(write_file(tmp_path, content))
     assert function == TransferFunction([(100, 1, 0.5, 0, 0), (300, 1, 1, 1, 0.5)])
-    nothing = {**OWN, "lighting": None, "gradient_opacity": None}
-    assert load_transfer_function(put(tmp_path, nothing)) == function
-    dim = load_transfer_function(put(tmp_path, {**OWN, "lighting": {"ambient": 0.1}}))
-    assert dim.lighting == Lighting(ambient=0.1)
-    marked = b"\xef\xbb\xbf" + json.dumps(OWN).encode()
-    assert load_transfer_function(put(tmp_path, marked)) == function
+
+
+def test_fields_left_out_of_the_lighting_of_a_transfer_file_have_their_defaults(tmp_path: Path) -> None:
+    function = load_transfer_function(write_file(tmp_path, {**OWN, "lighting": {"ambient": 0.1}}))
+    assert function.lighting == Lighting(ambient=0.1)
 
 
 @pytest.mark.parametrize(
@@ -206,9 +239,11 @@ def test_fields_left_out_of_a_transfer_file_have_their_defaults(tmp_path: Path) 
         (["lighting"], {"direction": [0, 0]}, "three finite numbers in LPS"),
     ],
 )
-def test_wrong_fields_of_our_transfer_files_are_named(tmp_path: Path, place: list[Any], new: Any, message: str) -> None:
+def test_wrong_field_of_a_transfer_file_is_refused_by_its_name_in_one_line(
+    tmp_path: Path, place: list[Any], new: Any, message: str
+) -> None:
     with pytest.raises(RefusedInputError, match=f"^'file.json': .*{message}") as caught:
-        load_transfer_function(put(tmp_path, changed(OWN, place, new)))
+        load_transfer_function(write_file(tmp_path, changed(OWN, place, new)))
     assert "\n" not in str(caught.value)
 
 
@@ -232,42 +267,66 @@ def test_wrong_fields_of_our_transfer_files_are_named(tmp_path: Path, place: lis
         ('<?xml version="1.0" encoding="no-such"?><MRML/>', ("XML",)),
     ],
 )
-def test_files_that_are_no_transfer_functions_are_refused(
+def test_file_that_is_no_transfer_function_is_refused(
     tmp_path: Path, content: str | bytes, facts: tuple[str | int, ...]
 ) -> None:
     with refused(RefusedInputError, "file.json", *facts):
-        load_transfer_function(put(tmp_path, content))
+        load_transfer_function(write_file(tmp_path, content))
 
 
-def test_missing_files_folders_and_pipes_are_refused_as_transfer_functions(tmp_path: Path) -> None:
+def test_missing_transfer_file_is_refused(tmp_path: Path) -> None:
     with refused(UsageError, "gone.json"):
         load_transfer_function(tmp_path / "gone.json")
+
+
+def test_folder_as_a_transfer_file_is_refused(tmp_path: Path) -> None:
     with refused(UsageError, "folder"):
         load_transfer_function(tmp_path)
+
+
+def test_name_of_a_transfer_file_with_a_zero_byte_is_refused() -> None:
     with refused(RefusedInputError, "cannot"):
         load_transfer_function("a\0b")
-    if hasattr(os, "mkfifo"):
-        os.mkfifo(tmp_path / "pipe")
-        with refused(RefusedInputError, "regular"):
-            load_transfer_function(tmp_path / "pipe")
 
 
-def test_slicer_text_is_read_with_any_line_ends(tmp_path: Path) -> None:
-    for text in (TEXT, TEXT.replace("\n", "\r\n"), TEXT.rstrip()):
-        function = load_transfer_function(put(tmp_path, text, "a.vp"))
-        assert function.lighting == Lighting(0.15, 0.8, 0.3, 12)
-        assert (function.gradient_opacity, function.unit_distance) == (None, 1.0)
-        opacity = function([-2000, 79.9, 80, 490, 900, 3000])[:, 3]
-        np.testing.assert_allclose(opacity, [0, 0, 0.25, 0.5, 0.75, 0.75], atol=FLOAT64_SHARE)
-        np.testing.assert_allclose(function([-450, 500])[:, :3], [[0.5, 0.25, 0], [1, 0.75, 0.5]], atol=FLOAT64_SHARE)
-    # Points of both functions, the step alone twice.
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes of POSIX")
+def test_pipe_as_a_transfer_file_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with refused(RefusedInputError, "regular"):
+        load_transfer_function(tmp_path / "pipe")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [TEXT, TEXT.replace("\n", "\r\n"), TEXT.rstrip()],
+    ids=["line feeds", "carriage returns", "no end of the last line"],
+)
+def test_slicer_text_is_read_with_its_opacities_colours_and_light(text: str, tmp_path: Path) -> None:
+    function = load_transfer_function(write_file(tmp_path, text, "a.vp"))
+
+    assert function.lighting == Lighting(0.15, 0.8, 0.3, 12)
+    assert (function.gradient_opacity, function.unit_distance) == (None, 1.0)
+    opacity = function([-2000, 79.9, 80, 490, 900, 3000])[:, 3]  # 490 lies half way from 80 to 900
+    np.testing.assert_allclose(opacity, [0, 0, 0.25, 0.5, 0.75, 0.75], atol=FLOAT64_SHARE)
+    colors = function([-450, 500])[:, :3]  # half way from -1000 to 100, and from 100 to 900
+    np.testing.assert_allclose(colors, [[0.5, 0.25, 0], [1, 0.75, 0.5]], atol=FLOAT64_SHARE)
+
+
+def test_slicer_text_gives_points_at_the_hu_of_both_functions_and_steps_twice(tmp_path: Path) -> None:
+    function = load_transfer_function(write_file(tmp_path, TEXT, "a.vp"))
     assert function.points[:, 0].tolist() == [-1000, 80, 80, 100, 900]
-    unshaded = load_transfer_function(put(tmp_path, TEXT.replace("1\n1\n", "1\n0\n", 1), "a.vp"))
-    assert unshaded.lighting == UNSHADED
-    silent = TEXT.splitlines()
-    silent[2] = silent[7] = ""
-    found = load_transfer_function(put(tmp_path, "\n".join(silent), "a.vp"))
-    assert found.lighting == Lighting(0.15, 0.7, 0.3, 12)  # VTK's diffuse
+
+
+def test_slicer_text_without_shading_is_unshaded(tmp_path: Path) -> None:
+    function = load_transfer_function(write_file(tmp_path, TEXT.replace("1\n1\n", "1\n0\n", 1), "a.vp"))
+    assert function.lighting == UNSHADED
+
+
+def test_slicer_text_without_a_diffuse_part_has_that_of_vtk(tmp_path: Path) -> None:
+    lines = TEXT.splitlines()
+    lines[2] = lines[7] = ""  # diffuse, and the gradient opacity
+    function = load_transfer_function(write_file(tmp_path, "\n".join(lines), "a.vp"))
+    assert function.lighting == Lighting(0.15, 0.7, 0.3, 12)
 
 
 @pytest.mark.parametrize(
@@ -285,59 +344,106 @@ def test_slicer_text_is_read_with_any_line_ends(tmp_path: Path) -> None:
         (9, "0", (9, "colorTransfer", 0)),
     ],
 )
-def test_wrong_lines_of_slicer_text_are_named(
+def test_wrong_line_of_slicer_text_is_refused_with_its_number_and_field(
     tmp_path: Path, line: int, new: str, facts: tuple[str | int, ...]
 ) -> None:
     lines = TEXT.splitlines()
     lines[line - 1] = new
     with refused(RefusedInputError, "a.vp", *facts):
-        load_transfer_function(put(tmp_path, "\n".join(lines), "a.vp"))
+        load_transfer_function(write_file(tmp_path, "\n".join(lines), "a.vp"))
+
+
+def test_slicer_text_that_ends_before_its_colours_is_refused(tmp_path: Path) -> None:
+    without_colours = "\n".join(TEXT.splitlines()[:8])
     with refused(RefusedInputError, "a.vp", 9, "colorTransfer"):
-        load_transfer_function(put(tmp_path, "\n".join(TEXT.splitlines()[:8]), "a.vp"))
+        load_transfer_function(write_file(tmp_path, without_colours, "a.vp"))
 
 
-def test_presets_of_slicer_are_chosen_by_name_or_number(tmp_path: Path) -> None:
-    path = put(tmp_path, XML, "presets.xml")
-    one = load_transfer_function(path, "ct-one")
-    assert (one.name, one.lighting) == ("CT-One", Lighting(0.1, 0.9, 0.2, 10))
-    assert one.points.tolist() == [[100, 1, 0, 0, 0], [400, 1, 1, 1, 0.5]]
-    assert np.array_equal(one.gradient_opacity, [[0, 0.5], [200, 1]])
-    two = load_transfer_function(path, "2")
-    assert (two.name, two.lighting) == ("CT-Two", UNSHADED)
-    assert two([0, 25, 50]).tolist() == [[0.2, 0.4, 0.6, 0], [0.2, 0.4, 0.6, 0.5], [0.2, 0.4, 0.6, 1]]
+@pytest.fixture
+def presets_xml(tmp_path: Path) -> Path:
+    """Presets of Slicer: CT-One, CT-Two, and one that is broken."""
+    return write_file(tmp_path, XML, "presets.xml")
+
+
+def test_preset_of_slicer_is_read_by_its_name_in_any_case(presets_xml: Path) -> None:
+    function = load_transfer_function(presets_xml, "ct-one")
+
+    assert (function.name, function.lighting) == ("CT-One", Lighting(0.1, 0.9, 0.2, 10))
+    assert function.points.tolist() == [[100, 1, 0, 0, 0], [400, 1, 1, 1, 0.5]]
+    assert np.array_equal(function.gradient_opacity, [[0, 0.5], [200, 1]])
+
+
+def test_preset_of_slicer_is_read_by_its_number(presets_xml: Path) -> None:
+    function = load_transfer_function(presets_xml, "2")
+
+    assert (function.name, function.lighting) == ("CT-Two", UNSHADED)
+    assert function([0, 25, 50]).tolist() == [[0.2, 0.4, 0.6, opacity] for opacity in (0, 0.5, 1)]
+
+
+def test_preset_of_slicer_in_utf_16_is_that_in_utf_8(presets_xml: Path, tmp_path: Path) -> None:
+    utf_16 = write_file(tmp_path, XML.replace("utf-8", "utf-16").encode("utf-16"), "16.xml")
+    assert load_transfer_function(utf_16, "CT-One") == load_transfer_function(presets_xml, "CT-One")
+
+
+def test_presets_of_slicer_without_a_choice_are_refused_with_their_names(presets_xml: Path) -> None:
     with refused(UsageError, "CT-One", "CT-Two", 3):
-        load_transfer_function(path)
-    for name in ("CT-Three", "4", "0", "\u00b2"):
-        with refused(UsageError, name, "CT-One"):
-            load_transfer_function(path, name)
+        load_transfer_function(presets_xml)
+
+
+@pytest.mark.parametrize("name", ["CT-Three", "4", "0", "\u00b2"])
+def test_preset_of_slicer_that_is_not_there_is_refused(name: str, presets_xml: Path) -> None:
+    with refused(UsageError, name, "CT-One"):
+        load_transfer_function(presets_xml, name)
+
+
+def test_broken_preset_of_slicer_is_refused_with_its_line_and_count(presets_xml: Path) -> None:
     with refused(RefusedInputError, "broken", "scalarOpacity", 7, 5):
-        load_transfer_function(path, "broken")
-    assert (
-        load_transfer_function(put(tmp_path, XML.replace("utf-8", "utf-16").encode("utf-16"), "16.xml"), "CT-One")
-        == one
-    )
-    twice = put(tmp_path, XML.replace("CT-Two", "CT-One"), "twice.xml")
+        load_transfer_function(presets_xml, "broken")
+
+
+def test_name_of_two_presets_of_slicer_is_refused(tmp_path: Path) -> None:
+    twice = write_file(tmp_path, XML.replace("CT-Two", "CT-One"), "twice.xml")
     with refused(UsageError, "CT-One", 2):
         load_transfer_function(twice, "CT-One")
 
 
-def test_json_of_slicer_is_read_with_lighting_gradient_and_steps(tmp_path: Path) -> None:
-    function = load_transfer_function(put(tmp_path, SLICER, "a.vp.json"))
+COMPONENT = ["volumeProperties", 0, "components", 0]
+
+
+def test_json_of_slicer_is_read_with_its_distance_light_gradient_and_step_of_opacity(tmp_path: Path) -> None:
+    function = load_transfer_function(write_file(tmp_path, SLICER, "a.vp.json"))
+
     assert (function.unit_distance, function.lighting) == (2.5, Lighting(0.2, 1, 0, 1))
     assert np.array_equal(function.gradient_opacity, [[0, 0.25], [100, 1]])
     opacity = function([0, 100, 199.9999, 200.0001, 1000])[:, 3]
     np.testing.assert_allclose(opacity, [0, 0.3, 0.6, 0.1, 0.1], atol=STEP_SIDE)
-    # Sharpness 1 is a step at the midpoint.
-    assert function([99.9, 100.1])[:, 0].tolist() == [0, 1]
-    off = changed(SLICER, ["volumeProperties", 0, "components", 0, "disableGradientOpacity"], True)
-    off = changed(off, ["volumeProperties", 0, "components", 0, "shade"], False)
-    found = load_transfer_function(put(tmp_path, off))
-    assert (found.gradient_opacity, found.lighting) == (None, UNSHADED)
+
+
+def test_colours_of_slicer_with_sharpness_1_have_a_step_at_their_midpoint(tmp_path: Path) -> None:
+    function = load_transfer_function(write_file(tmp_path, SLICER, "a.vp.json"))
+    midpoint = 0.25 * 400
+    assert function([midpoint - 0.1, midpoint + 0.1])[:, 0].tolist() == [0, 1]
+
+
+def test_json_of_slicer_with_gradient_and_shading_off_has_neither(tmp_path: Path) -> None:
+    off = changed(SLICER, [*COMPONENT, "disableGradientOpacity"], True)
+    off = changed(off, [*COMPONENT, "shade"], False)
+
+    function = load_transfer_function(write_file(tmp_path, off))
+
+    assert (function.gradient_opacity, function.lighting) == (None, UNSHADED)
+
+
+def test_json_of_slicer_with_a_grey_function_is_read(tmp_path: Path) -> None:
     component = dict(SLICER["volumeProperties"][0]["components"][0])
     component["grayTransferFunction"] = component["scalarOpacity"]
     del component["rgbTransferFunction"]
-    grey = load_transfer_function(put(tmp_path, changed(SLICER, ["volumeProperties", 0, "components"], [component])))
-    assert grey([100])[0].tolist() == pytest.approx([0.3] * 4, abs=STEP_SIDE)
+    value = changed(SLICER, ["volumeProperties", 0, "components"], [component])
+
+    function = load_transfer_function(write_file(tmp_path, value))
+
+    half_way_to_200 = 100
+    assert function([half_way_to_200])[0].tolist() == pytest.approx([0.6 / 2] * 4, abs=STEP_SIDE)
 
 
 @pytest.mark.parametrize(
@@ -354,34 +460,45 @@ def test_json_of_slicer_is_read_with_lighting_gradient_and_steps(tmp_path: Path)
         ([0, "components", 0, "lighting"], 3, "lighting"),
     ],
 )
-def test_wrong_fields_of_slicer_json_are_named(tmp_path: Path, place: list[Any], new: Any, field: str) -> None:
+def test_wrong_field_of_slicer_json_is_refused_by_its_name(
+    tmp_path: Path, place: list[Any], new: Any, field: str
+) -> None:
     value = changed(SLICER, ["volumeProperties", *place], new) if place else {**SLICER, "volumeProperties": []}
     with refused(RefusedInputError, "file.json", field):
-        load_transfer_function(put(tmp_path, value))
+        load_transfer_function(write_file(tmp_path, value))
 
 
-def test_paraview_files_are_read_and_wrong_ones_refused(tmp_path: Path) -> None:
-    function = load_transfer_function(put(tmp_path, PARAVIEW))
+def test_paraview_file_is_read_with_its_name_colours_and_opacities(tmp_path: Path) -> None:
+    function = load_transfer_function(write_file(tmp_path, PARAVIEW))
+
     assert (function.name, function.lighting) == ("Bone CT", None)
-    np.testing.assert_allclose(function([300]), [[0.75, 0.5, 0.5, 0.4]], atol=FLOAT64_SHARE)
-    for place, new, fact in (
+    half_way = 300  # from 100 to 500
+    np.testing.assert_allclose(function([half_way]), [[0.75, 0.5, 0.5, 0.4]], atol=FLOAT64_SHARE)
+
+
+@pytest.mark.parametrize(
+    ("field", "new", "fact"),
+    [
         ("Points", None, "opacities"),
         ("ColorSpace", "Lab", "Lab"),
         ("RGBPoints", [1, 2, 3], "1.RGBPoints"),
         ("RGBPoints", None, "RGBPoints"),
-    ):
-        with refused(RefusedInputError, fact):
-            load_transfer_function(put(tmp_path, changed(PARAVIEW, [0, place], new)))
+    ],
+    ids=["no opacities", "another colour space", "three numbers", "no colours"],
+)
+def test_wrong_field_of_a_paraview_file_is_refused(field: str, new: Any, fact: str, tmp_path: Path) -> None:
+    with refused(RefusedInputError, fact):
+        load_transfer_function(write_file(tmp_path, changed(PARAVIEW, [0, field], new)))
 
 
 @pytest.mark.fuzz
 @pytest.mark.parametrize(
     "sample", daily(2, [OWN, TEXT, XML, SLICER, PARAVIEW]), ids=["own", "vp", "xml", "vp.json", "paraview"]
 )
-def test_mutated_files_are_read_or_refused_in_one_line(tmp_path: Path, sample: Any) -> None:
+def test_mutated_transfer_file_is_read_or_refused_in_one_line(tmp_path: Path, sample: Any) -> None:
     rng = np.random.default_rng(5)
     words = (b"-1", b"1e999", b"nan", b"null", b"[]", b"{}", b'""', b"9" * 40, b"\xff", b"\x00", b"<", b"-1e308", b"\n")
-    start = put(tmp_path, sample).read_bytes()
+    start = write_file(tmp_path, sample).read_bytes()
     read = 0
     for _ in range(400):
         data = bytearray(start)
@@ -392,7 +509,7 @@ def test_mutated_files_are_read_or_refused_in_one_line(tmp_path: Path, sample: A
             else:
                 del data[at : at + int(rng.integers(1, 20))]
         try:
-            function = load_transfer_function(put(tmp_path, bytes(data)), "1")
+            function = load_transfer_function(write_file(tmp_path, bytes(data)), "1")
             assert np.isfinite(function.table(*function.range_hu, 16)).all()
             read += 1
         except (RefusedInputError, UsageError) as error:

@@ -27,19 +27,35 @@ def make_property(opacity, colors):
     return made
 
 
-def test_vtk_says_what_the_function_says() -> None:
+@pytest.fixture
+def of_stepped():
+    """A transfer function with a step at 100 HU and one of its gradient opacity, and its property of VTK."""
     function = TransferFunction(
         STEPPED, unit_distance=2.5, lighting=LIGHT, gradient_opacity=[(0, 0.1), (40, 0.1), (40, 1)]
     )
-    made = function.to_vtk(voxel_mm=0.5)
+    return function, function.to_vtk(voxel_mm=0.5)
+
+
+def test_colours_and_opacities_of_vtk_are_those_of_the_transfer_function(of_stepped) -> None:
+    function, prop = of_stepped
     hu = np.array([-10, 0, 50, 99.9999, 100, 100.0001, 200, 300, 900.0])
-    found = [[*made.GetRGBTransferFunction().GetColor(x), made.GetScalarOpacity().GetValue(x)] for x in hu]
-    np.testing.assert_allclose(found, function(hu), atol=FLOAT64_SHARE)
-    # VTK's gradient is in HU per voxel of 0.5 mm: 19.9 of them are 39.8 HU per mm.
-    assert [made.GetGradientOpacity().GetValue(x) for x in (19.9, 20.0, 30)] == pytest.approx([0.1, 1, 1])
-    assert made.GetScalarOpacityUnitDistance() == 2.5
-    assert (made.GetShade(), made.GetAmbient(), made.GetDiffuse(), made.GetSpecular()) == (1, 0.1, 0.9, 0.3)
-    assert made.GetSpecularPower() == 20
+    in_vtk = [[*prop.GetRGBTransferFunction().GetColor(x), prop.GetScalarOpacity().GetValue(x)] for x in hu]
+    np.testing.assert_allclose(in_vtk, function(hu), atol=FLOAT64_SHARE)
+
+
+def test_gradient_opacity_of_vtk_is_in_hu_per_voxel(of_stepped) -> None:
+    _, prop = of_stepped
+    step = 40 * 0.5  # HU per mm times mm per voxel
+    factors = [prop.GetGradientOpacity().GetValue(x) for x in (step - 0.1, step, step + 10)]
+    assert factors == pytest.approx([0.1, 1, 1])
+
+
+def test_unit_distance_and_light_of_vtk_are_those_of_the_transfer_function(of_stepped) -> None:
+    _, prop = of_stepped
+    assert prop.GetScalarOpacityUnitDistance() == 2.5
+    light = (prop.GetAmbient(), prop.GetDiffuse(), prop.GetSpecular(), prop.GetSpecularPower())
+    assert light == (0.1, 0.9, 0.3, 20)
+    assert prop.GetShade() == 1
 
 
 @pytest.mark.parametrize("gradient", [None, [(0, 0), (50, 1), (50, 0.5)]])
@@ -50,19 +66,15 @@ def test_transfer_function_comes_back_from_vtk_unchanged(gradient: object, light
     assert TransferFunction.from_vtk(function.to_vtk(voxel_mm=0.5), voxel_mm=0.5) == function
 
 
-def test_every_preset_goes_there_and_back() -> None:
-    for preset in PRESETS.values():
-        function = preset.transfer_function
-        phong = replace(function.lighting, soft_gradient=0.0)  # VTK has no other
-        kept = TransferFunction(
-            function.points, unit_distance=function.unit_distance, gradient_opacity=function.gradient_opacity,
-            lighting=phong,
-        )  # fmt: skip
-        assert TransferFunction.from_vtk(function.to_vtk()) == kept
+@pytest.mark.parametrize("name", PRESETS)
+def test_preset_comes_back_from_vtk_with_its_plain_light(name: str) -> None:
+    function = PRESETS[name].transfer_function
+    phong = replace(function.lighting, soft_gradient=0.0)  # VTK has no other
+    assert TransferFunction.from_vtk(function.to_vtk()) == function.changed(lighting=phong)
 
 
 @pytest.mark.parametrize("clamped", [True, False])
-def test_bent_functions_of_vtk_are_read_with_their_ends(clamped: bool) -> None:
+def test_bent_functions_of_vtk_are_read_with_their_values_and_ends(clamped: bool) -> None:
     rng = np.random.default_rng(7)
     at = rng.uniform(-1500, 2500, 500)
     for _ in range(40):
@@ -79,7 +91,7 @@ def test_bent_functions_of_vtk_are_read_with_their_ends(clamped: bool) -> None:
 
 
 @pytest.mark.parametrize("space", ["HSV", "Lab", "Diverging"])
-def test_functions_of_vtk_in_other_colour_spaces_are_read(space: str) -> None:
+def test_colours_of_vtk_in_another_colour_space_are_read(space: str) -> None:
     colors, opacity = vtk_core.vtkColorTransferFunction(), vtk_data.vtkPiecewiseFunction()
     getattr(colors, f"SetColorSpaceTo{space}")()
     for x, color in ((-100, (0.2, 0.3, 0.8)), (200, (0.8, 0.8, 0.3)), (900, (0.7, 0.1, 0.1))):
@@ -104,16 +116,31 @@ def test_grey_property_of_vtk_without_shading_is_read() -> None:
     assert (found.lighting, found.gradient_opacity, found.name) == (UNSHADED, None, "grey")
 
 
-def test_properties_of_vtk_that_cannot_be_read_are_refused() -> None:
+def test_property_of_vtk_without_points_is_refused() -> None:
     empty = make_property(vtk_data.vtkPiecewiseFunction(), vtk_core.vtkColorTransferFunction())
     with pytest.raises(UsageError, match="its colour function has no points"):
         TransferFunction.from_vtk(empty)
+
+
+def test_text_in_place_of_a_property_of_vtk_is_refused() -> None:
     with pytest.raises(UsageError, match="no vtkVolumeProperty"):
         TransferFunction.from_vtk("bone")
+
+
+@pytest.mark.parametrize(
+    "convert",
+    [
+        lambda: TransferFunction.from_vtk(TransferFunction(STEPPED).to_vtk(), voxel_mm=0),
+        lambda: TransferFunction(STEPPED).to_vtk(voxel_mm=np.nan),
+    ],
+    ids=["from VTK", "to VTK"],
+)
+def test_mean_spacing_that_is_no_length_is_refused(convert) -> None:
     with pytest.raises(UsageError, match="mean spacing of a volume is a length"):
-        TransferFunction.from_vtk(TransferFunction(STEPPED).to_vtk(), voxel_mm=0)
-    with pytest.raises(UsageError, match="mean spacing of a volume is a length"):
-        TransferFunction(STEPPED).to_vtk(voxel_mm=np.nan)
+        convert()
+
+
+def test_colours_of_vtk_on_a_logarithmic_scale_are_refused() -> None:
     colors = vtk_core.vtkColorTransferFunction()
     colors.AddRGBPoint(1, 0, 0, 0)
     colors.AddRGBPoint(9, 1, 1, 1)
@@ -123,7 +150,7 @@ def test_properties_of_vtk_that_cannot_be_read_are_refused() -> None:
 
 
 @pytest.mark.parametrize("opacity", ["sigmoid_5", "linear_r", 0.3, [0, 0.1, 0.9], list(np.linspace(0, 0.9, 256))])
-def test_pyvista_gives_what_its_scene_shows(opacity: object) -> None:
+def test_transfer_function_of_pyvista_is_what_its_scene_shows(opacity: object) -> None:
     pyvista = pytest.importorskip("pyvista")
     image = pyvista.ImageData(dimensions=(4, 4, 4))
     image["hu"] = np.linspace(-200, 1200, 64)
@@ -151,7 +178,7 @@ def test_pyvista_gives_what_its_scene_shows(opacity: object) -> None:
         ("bone", "linear", (0, np.nan), "a lower and a higher HU"),
     ],
 )
-def test_maps_and_limits_that_pyvista_does_not_take_are_refused(
+def test_colour_map_opacity_or_limits_that_pyvista_does_not_take_are_refused(
     cmap: str, opacity: object, clim: tuple[float, float], message: str
 ) -> None:
     pytest.importorskip("pyvista")
