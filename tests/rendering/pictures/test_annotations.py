@@ -1,4 +1,4 @@
-"""What is drawn into pictures: the right letters, bars of the right length, and room for both."""
+"""What is changed_pixels into pictures: the right letters, bars of the right length, and room for both."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_letters_come_from_the_largest_component_to_the_smallest(direction, lett
     assert orientation_letters(direction) == letters
 
 
-def _arc(degrees: float) -> Curve:
+def bent_curve(degrees: float) -> Curve:
     """Return a curve downwards that bends to the front by an angle, seen from the left."""
     turns = np.radians(np.linspace(0.0, degrees, 40))
     return Curve(np.column_stack([0.0 * turns, 80.0 * (np.cos(turns) - 1.0), -80.0 * np.sin(turns)]))
@@ -74,32 +74,43 @@ def _arc(degrees: float) -> Curve:
         (80.0, {"left": "", "right": "", "top": "", "bottom": ""}),  # from A to IA: nothing is true everywhere
     ],
 )
-def test_letters_along_a_curve_are_true_for_every_row_or_left_out(degrees, letters):
-    made = straightened_sheet(_arc(degrees), np.array([0.0, 1.0, 0.0]), (40, 60), 2.0)
+def test_letter_at_an_edge_along_a_curve_is_true_for_every_row_or_left_out(degrees, letters):
+    made = straightened_sheet(bent_curve(degrees), np.array([0.0, 1.0, 0.0]), (40, 60), 2.0)
     shown = ~np.isnan(made.arc)
     assert sheet_letters(made.sheet, shown) == letters
 
 
-def test_the_rows_of_a_stretched_picture_have_one_direction():
-    made = stretched_sheet(_arc(60.0), np.array([1.0, 0.0, 0.0]), (40, 60), 2.0)
+def test_stretched_picture_has_letters_at_its_sides_alone():
+    made = stretched_sheet(bent_curve(60.0), np.array([1.0, 0.0, 0.0]), (40, 60), 2.0)
     letters = sheet_letters(made.sheet, ~np.isnan(made.arc))
     assert (letters["left"], letters["right"]) == ("R", "L") and letters["top"] == letters["bottom"] == ""
 
 
-def test_bars_are_round_and_as_long_as_they_may_be():
-    for width in np.geomspace(1e-3, 1e5, 1000):
-        length = bar_length(width)
-        digit = length / 10.0 ** np.floor(np.log10(length) + 1e-9)
-        assert min(abs(digit - one) for one in (1, 2, 5)) <= tolerances.ROUND_BAR
-        assert 0.14 * width <= length <= LONGEST_BAR_SHARE * width * (1 + tolerances.ROUND_BAR)
-    assert bar_length(1000 / 3.5) == 100.0
+WIDTHS_MM = np.geomspace(1e-3, 1e5, 1000)
 
 
-def drawn(before, after) -> np.ndarray:
+def test_length_of_a_scale_bar_is_1_2_or_5_times_a_power_of_ten() -> None:
+    lengths = np.array([bar_length(width) for width in WIDTHS_MM])
+    digits = lengths / 10.0 ** np.floor(np.log10(lengths) + 1e-9)
+    assert np.abs(digits[:, None] - (1, 2, 5)).min(axis=1).max() <= tolerances.ROUND_BAR
+
+
+def test_scale_bar_takes_from_two_fifths_of_its_largest_share_of_the_width_to_all_of_it() -> None:
+    """From 2 to the next length, 5, is the largest step."""
+    shares = np.array([bar_length(width) / width for width in WIDTHS_MM])
+    assert shares.min() >= 0.4 * LONGEST_BAR_SHARE * (1 - tolerances.ROUND_BAR)
+    assert shares.max() <= LONGEST_BAR_SHARE * (1 + tolerances.ROUND_BAR)
+
+
+def test_scale_bar_that_fits_exactly_is_taken() -> None:
+    assert bar_length(100.0 / LONGEST_BAR_SHARE) == 100.0
+
+
+def changed_pixels(before, after) -> np.ndarray:
     return (before.image != after.image).any(axis=2)
 
 
-def bar_pixels(picture, ink) -> np.ndarray:
+def longest_run_of_ink(picture, ink) -> np.ndarray:
     """The longest run of the ink's colour in each of the lower rows."""
     runs = []
     for row in (picture.image[picture.image.shape[0] * 3 // 4 :, :, :3] == ink).all(axis=2):
@@ -110,7 +121,7 @@ def bar_pixels(picture, ink) -> np.ndarray:
 
 @pytest.mark.parametrize("size", [(300, 200), (301, 333), (640, 480), (1024, 700)])
 @pytest.mark.parametrize(("background", "ink"), [(BLACK, 255), (CLEAR, 255)])
-def test_the_bar_is_as_long_as_it_says(size, background, ink):
+def test_scale_bar_is_as_long_as_its_mm_in_pixels(size, background, ink):
     rng = np.random.default_rng(size[0])
     for scale in rng.uniform(1.0, 400.0, 5):
         camera = Camera((0, -900, 0), (0, 0, 0), (0, 0, 1), parallel_scale=scale)
@@ -118,18 +129,22 @@ def test_the_bar_is_as_long_as_it_says(size, background, ink):
         picture.image[:] = background
         marked = picture.annotated(scale_bar=True)
         pixel = 2 * scale / size[1]
-        assert abs(bar_pixels(marked, ink).max() - bar_length(pixel * size[0]) / pixel) <= 0.5
+        assert abs(longest_run_of_ink(marked, ink).max() - bar_length(pixel * size[0]) / pixel) <= 0.5
 
 
-def test_scale_bar_on_white_is_black():
-    picture = make_picture((300, 200), WHITE)
+def test_scale_bar_on_white_is_black_and_leaves_the_other_pixels():
+    picture = make_picture((300, 200), WHITE)  # 1 mm a pixel
+
     marked = picture.annotated(scale_bar=True)
-    bar = bar_pixels(marked, 0)
-    assert bar.max() == 100.0 and np.count_nonzero(bar == 100.0) == 2  # 100 mm at 1 mm a pixel, 2 pixels thick
-    assert marked.image[~drawn(picture, marked)].tolist() == picture.image[~drawn(picture, marked)].tolist()
+
+    runs = longest_run_of_ink(marked, 0)
+    assert runs.max() == 100.0  # mm
+    assert np.count_nonzero(runs == 100.0) == 2  # pixels thick
+    unchanged = ~changed_pixels(picture, marked)
+    assert np.array_equal(marked.image[unchanged], picture.image[unchanged])
 
 
-def test_a_perspective_bar_holds_in_the_focal_plane(monkeypatch):
+def test_scale_bar_of_a_perspective_picture_is_true_in_the_focal_plane_and_says_so(monkeypatch):
     picture = make_picture((400, 300), BLACK, PERSPECTIVE)
     picture.image[:] = BLACK
     texts = []
@@ -142,44 +157,62 @@ def test_a_perspective_bar_holds_in_the_focal_plane(monkeypatch):
     marked = picture.annotated(scale_bar=True)
     assert set(texts) == {"100 mm (focal plane)"}
     ends, _ = PERSPECTIVE.project([(0, 0, 0), (100, 0, 0)], (400, 300))
-    assert abs(bar_pixels(marked, 255).max() - (ends[1, 0] - ends[0, 0])) <= 0.5
+    assert abs(longest_run_of_ink(marked, 255).max() - (ends[1, 0] - ends[0, 0])) <= 0.5
 
 
 @pytest.mark.parametrize("background", [BLACK, WHITE, CLEAR, (128, 128, 128, 255)])
-def test_letters_stand_out_at_every_edge(background):
+def test_letters_stand_at_each_edge_and_stand_out_from_the_background(background):
     picture = make_picture((400, 300), background)
+
     marked = picture.annotated(letters=True)
-    changed = drawn(picture, marked)
-    y, x = np.nonzero(changed)
-    assert x.min() <= 20 and x.max() >= 380 and y.min() <= 20 and y.max() >= 280
-    near_left = marked.image[140:160, :20].reshape(-1, 4)
-    opaque = near_left[near_left[:, 3] == 255]
-    assert np.ptp(opaque[:, 0].astype(int)) >= 120
+
+    changed = changed_pixels(picture, marked)
+    rows, columns = np.nonzero(changed)
+    assert columns.min() <= 20 and columns.max() >= 380
+    assert rows.min() <= 20 and rows.max() >= 280
     assert (marked.image[..., 3][changed] > 0).all()
-    assert np.array_equal(picture.image, make_picture((400, 300), background).image)
+    at_the_left = marked.image[140:160, :20].reshape(-1, 4)
+    greys = at_the_left[at_the_left[:, 3] == 255, 0].astype(int)
+    assert np.ptp(greys) >= 120  # of 255: ink and its rim
 
 
-def test_the_smallest_picture_has_room_for_all():
+def test_annotations_leave_the_picture_that_they_are_drawn_from():
+    picture = make_picture((400, 300), BLACK)
+    picture.annotated(letters=True)
+    assert np.array_equal(picture.image, make_picture((400, 300), BLACK).image)
+
+
+def test_picture_of_64_pixels_has_room_for_letters_and_scale_bar():
     picture = make_picture((64, 64))
     marked = picture.annotated(letters=True, scale_bar=True)
-    assert drawn(picture, marked).any()
+    assert changed_pixels(picture, marked).any()
 
 
 @pytest.mark.parametrize("caption", ["größe", "\u8179", "T12 \u00b2"])
-def test_what_the_font_lacks_is_refused_and_not_drawn_as_boxes(caption):
+def test_caption_with_a_letter_that_the_font_lacks_is_refused(caption):
     absent = next(letter for letter in caption if ord(letter) > 127)
     with pytest.raises(UsageError, match=absent):
         make_picture((400, 300)).annotated(caption=caption)
-    check_caption("T12 ~ 5 mm, 30\u00b0 (a_b)\ttab")
 
 
-def test_a_caption_is_cut_where_the_picture_ends():
+def test_caption_of_ascii_and_a_degree_sign_is_accepted():
+    assert check_caption("T12 ~ 5 mm, 30\u00b0 (a_b)\ttab") is None
+
+
+def test_long_caption_is_cut_where_the_picture_ends():
     picture = make_picture((200, 100))
-    short, long = (drawn(picture, picture.annotated(caption=text)) for text in ("Ab", "A long line " * 20))
+    short, long = (changed_pixels(picture, picture.annotated(caption=text)) for text in ("Ab", "A long line " * 20))
+
     assert np.nonzero(short)[1].max() < 40
     assert 150 < np.nonzero(long)[1].max() < 200
-    with_letters = picture.annotated(letters=True, caption="A long line " * 20)
-    assert np.nonzero(drawn(picture.annotated(letters=True), with_letters))[1].max() < 100
+
+
+def test_long_caption_is_cut_before_the_letter_at_the_top():
+    with_letters = make_picture((200, 100)).annotated(letters=True)
+    with_caption = make_picture((200, 100)).annotated(letters=True, caption="A long line " * 20)
+
+    middle_of_the_width = 100
+    assert np.nonzero(changed_pixels(with_letters, with_caption))[1].max() < middle_of_the_width
 
 
 def test_annotations_that_are_not_asked_for_leave_the_picture():

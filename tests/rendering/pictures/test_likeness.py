@@ -13,82 +13,113 @@ from clrecon.rendering.pictures.likeness import make_control_pictures, measure_p
 pytestmark = pytest.mark.unit
 
 
-def picture(shape=(40, 50), top=10, left=12, size=20) -> np.ndarray:
+def make_drawn_square(shape=(40, 50), top=10, left=12, size=20) -> np.ndarray:
+    """A black picture with a square of random greys above 0."""
     pixels = np.zeros(shape, np.uint8)
     pixels[top : top + size, left : left + size] = np.random.default_rng(3).integers(1, 256, (size, size))
     return pixels
 
 
-def test_equal_pictures_have_no_error():
-    found = measure_pictures(picture(), picture())
+def test_equal_pictures_have_no_error_and_a_likeness_of_1():
+    found = measure_pictures(make_drawn_square(), make_drawn_square())
     assert (found.mse, found.ssim, found.box) == (0.0, 1.0, (10, 12, 30, 32))
 
 
-def test_the_box_holds_what_is_drawn_in_either():
-    one, other = picture(), picture(top=15, left=5)
-    assert measure_pictures(one, other).box == (10, 5, 35, 32)
-    assert measure_pictures(one, other, whole=True).box == (0, 0, 40, 50)
+def test_pictures_are_compared_in_the_box_of_what_is_drawn_in_either():
+    one, other = make_drawn_square(), make_drawn_square(top=15, left=5)
+    assert measure_pictures(one, other).box == (10, 5, 15 + 20, 12 + 20)
 
 
-def test_figures_are_those_of_scikit_image_and_by_hand():
+def test_pictures_are_compared_as_a_whole_on_request():
+    assert measure_pictures(make_drawn_square(), make_drawn_square(), whole=True).box == (0, 0, 40, 50)
+
+
+def test_likeness_of_pictures_is_that_of_scikit_image_and_their_error_the_mean_square():
     from skimage.metrics import structural_similarity
 
-    one, other = picture(), np.roll(picture(), 1, axis=0)
+    one, other = make_drawn_square(), np.roll(make_drawn_square(), 1, axis=0)
+
     found = measure_pictures(one, other)
-    inner = np.s_[10:31, 12:32]
-    assert found.ssim == pytest.approx(structural_similarity(one[inner], other[inner], win_size=7, data_range=255))
-    assert found.mse == pytest.approx(np.mean((one[inner].astype(float) - other[inner]) ** 2))
+
+    box = np.s_[10:31, 12:32]  # of both squares
+    assert found.ssim == pytest.approx(structural_similarity(one[box], other[box], win_size=7, data_range=255))
+    assert found.mse == pytest.approx(np.mean((one[box].astype(float) - other[box]) ** 2))
+
+
+def test_likeness_of_even_pictures_is_that_of_their_means():
     flat = np.full((20, 20), 100, np.uint8)
+
     brighter = measure_pictures(flat, flat + np.uint8(10))
-    assert brighter.mse == 100.0
-    c1 = (0.01 * 255) ** 2
-    assert brighter.ssim == pytest.approx((2 * 100 * 110 + c1) / (100**2 + 110**2 + c1))  # without structure
+
+    c1 = (0.01 * 255) ** 2  # of the definition of SSIM
+    assert brighter.mse == 10.0**2
+    assert brighter.ssim == pytest.approx((2 * 100 * 110 + c1) / (100**2 + 110**2 + c1))
 
 
-def test_a_small_thing_gets_the_window_of_ssim():
-    one = np.zeros((9, 30), np.uint8)
-    one[8, 29] = 200
-    assert measure_pictures(one, one).box == (2, 23, 9, 30)
-    assert measure_pictures(one[::-1, ::-1], one[::-1, ::-1]).box == (0, 0, 7, 7)
+def test_box_of_a_single_pixel_grows_to_the_seven_pixels_of_the_window_of_ssim():
+    in_last_corner = np.zeros((9, 30), np.uint8)
+    in_last_corner[8, 29] = 200
+    in_first_corner = in_last_corner[::-1, ::-1]
+
+    assert measure_pictures(in_last_corner, in_last_corner).box == (2, 23, 9, 30)
+    assert measure_pictures(in_first_corner, in_first_corner).box == (0, 0, 7, 7)
 
 
-def test_pictures_are_compared_in_grey_over_the_background():
-    grey = picture()
-    colour = np.stack([grey] * 3, axis=2)
-    clear = np.dstack([np.where(grey[:, :, None] > 0, colour, 77), np.where(grey > 0, 255, 0)]).astype(np.uint8)
-    assert measure_pictures(colour, clear).as_dict() == {"mse": 0.0, "ssim": 1.0, "box": [10, 12, 30, 32]}
-    white = np.where(colour > 0, colour, 255).astype(np.uint8)
-    assert measure_pictures(white, clear, background=(255, 255, 255)).mse == 0.0
+@pytest.mark.parametrize("background", [0, 255], ids=["black", "white"])
+def test_transparent_pictures_are_compared_in_grey_over_the_background(background):
+    grey = make_drawn_square()
+    is_drawn = grey[:, :, None] > 0
+    in_colour = np.where(is_drawn, np.stack([grey] * 3, axis=2), background).astype(np.uint8)
+    hidden = 77  # of pixels without opacity
+    transparent = np.dstack([np.where(is_drawn, in_colour, hidden), np.where(grey > 0, 255, 0)]).astype(np.uint8)
+
+    found = measure_pictures(in_colour, transparent, background=(background,) * 3)
+
+    assert found.as_dict() == {"mse": 0.0, "ssim": 1.0, "box": [10, 12, 30, 32]}
 
 
-def test_control_pictures_are_unlike_the_original():
-    grey = picture()
-    controls = make_control_pictures(grey, picture(top=11))
+def test_control_pictures_have_the_form_of_the_original():
+    grey = make_drawn_square()
+    controls = make_control_pictures(grey, make_drawn_square(top=11))
     assert list(controls) == ["black", "white", "noise", "shifted", "next"]
-    assert all(control.shape == grey.shape and control.dtype == np.uint8 for control in controls.values())
-    assert np.array_equal(controls["shifted"][:, 5:], grey[:, :-5])
-    assert measure_pictures(controls["white"], grey, whole=True).mse > measure_pictures(controls["black"], grey).mse
+    assert {(control.shape, control.dtype) for control in controls.values()} == {(grey.shape, grey.dtype)}
+
+
+def test_shifted_control_picture_is_the_original_five_pixels_on():
+    grey = make_drawn_square()
+    assert np.array_equal(make_control_pictures(grey)["shifted"][:, 5:], grey[:, :-5])
+
+
+def test_control_pictures_of_white_and_noise_are_unlike_the_original():
+    grey = make_drawn_square()
+    controls = make_control_pictures(grey)
+    errors = {name: measure_pictures(controls[name], grey, whole=True).mse for name in ("white", "black")}
+    assert errors["white"] > errors["black"]  # most of the original is black
     assert measure_pictures(controls["noise"], grey).ssim < 0.1
-    assert np.array_equal(controls["noise"], make_control_pictures(grey)["noise"])
+
+
+def test_control_picture_of_noise_is_the_same_each_time():
+    grey = make_drawn_square()
+    assert np.array_equal(make_control_pictures(grey)["noise"], make_control_pictures(grey)["noise"])
 
 
 @pytest.mark.parametrize(
     ("one", "other", "said"),
     [
         (np.zeros((8, 8), np.uint8), np.zeros((8, 8), np.uint8), "nothing is drawn"),
-        (picture(), picture((41, 50)), r"these have \(40, 50, 1\) and \(41, 50, 1\)"),
+        (make_drawn_square(), make_drawn_square((41, 50)), r"these have \(40, 50, 1\) and \(41, 50, 1\)"),
         (np.ones((6, 50), np.uint8), np.ones((6, 50), np.uint8), "50 x 6 pixels is smaller than the window"),
-        (picture().astype(float), picture(), "type uint8, this one has .* and float64"),
+        (make_drawn_square().astype(float), make_drawn_square(), "type uint8, this one has .* and float64"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(one, other, said):
+def test_pictures_that_cannot_be_compared_are_refused(one, other, said):
     with pytest.raises(UsageError, match=said):
         measure_pictures(one, other)
 
 
-def test_a_background_that_is_no_colour_is_refused():
+def test_background_that_is_no_colour_is_refused():
     with refused(UsageError, 0, 255):
-        measure_pictures(picture(), picture(), background=300)
+        measure_pictures(make_drawn_square(), make_drawn_square(), background=300)
 
 
 def test_controls_of_a_real_slice_are_those_of_the_documents(real_data):

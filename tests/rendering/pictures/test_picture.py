@@ -20,7 +20,7 @@ CLEAR = (10, 20, 30, 0)
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.PNG", "a.tif", "a.tiff"])
-def test_colours_and_opacity_come_back(tmp_path, name):
+def test_saved_picture_has_its_colours_opacity_and_resolution(tmp_path, name):
     picture = make_picture(background=(10, 20, 30, 77))
     size = picture.save(tmp_path / name)
     assert size == (tmp_path / name).stat().st_size
@@ -31,7 +31,7 @@ def test_colours_and_opacity_come_back(tmp_path, name):
     assert millimetres == pytest.approx(200.0 / 80, rel=tolerances.PNG_RESOLUTION)
 
 
-def test_the_resolution_is_in_whole_pixels_a_metre(tmp_path):
+def test_png_has_its_resolution_in_whole_pixels_a_metre(tmp_path):
     make_picture().save(tmp_path / "a.png")
     data = (tmp_path / "a.png").read_bytes()
     at = data.index(b"pHYs") + 4
@@ -39,12 +39,12 @@ def test_the_resolution_is_in_whole_pixels_a_metre(tmp_path):
     assert data[at + 8] == 1  # the metre
 
 
-def test_a_perspective_picture_tells_no_resolution(tmp_path):
+def test_png_of_a_perspective_picture_has_no_resolution(tmp_path):
     make_picture(camera=PERSPECTIVE).save(tmp_path / "a.png")
     assert b"pHYs" not in (tmp_path / "a.png").read_bytes()
 
 
-def test_a_picture_without_a_camera_takes_its_pixels_from_the_report(tmp_path):
+def test_png_without_a_camera_has_a_resolution_where_the_report_has_the_size_of_pixels(tmp_path):
     picture = make_picture(camera=None)
     assert picture.pixel_mm is None
     picture.save(tmp_path / "a.png")
@@ -55,7 +55,7 @@ def test_a_picture_without_a_camera_takes_its_pixels_from_the_report(tmp_path):
 
 
 @pytest.mark.parametrize(("pixel_mm", "told"), [(4.7e-7, True), (4.6e-7, False), (999.0, True), (1001.0, False)])
-def test_a_zoom_beyond_what_files_can_say_is_no_error(tmp_path, pixel_mm, told):
+def test_pixels_too_small_or_large_for_the_resolution_of_png_are_saved_without_it(tmp_path, pixel_mm, told):
     """PNG has 32 bits for pixels a metre."""
     picture = make_picture(camera=None)
     picture.report["pixel_mm"] = pixel_mm
@@ -67,7 +67,7 @@ def test_a_zoom_beyond_what_files_can_say_is_no_error(tmp_path, pixel_mm, told):
         assert np.array_equal(np.array(read), picture.image)
 
 
-def test_png_says_how_it_was_made(tmp_path):
+def test_png_names_its_software_mode_view_pixel_and_camera(tmp_path):
     make_picture(camera=PARALLEL.orbit(30.0, 10.0)).save(tmp_path / "a.png")
     with Image.open(tmp_path / "a.png") as read:
         text = read.text
@@ -79,10 +79,10 @@ def test_png_says_how_it_was_made(tmp_path):
     assert text["Camera"].endswith("parallel scale 100 mm")
 
 
-def test_the_same_picture_gives_the_same_bytes(tmp_path):
-    for extension in image_files.IMAGE_FORMATS:
-        first, second = (image_files.encode_image(make_picture(), extension) for _ in range(2))
-        assert first == second
+@pytest.mark.parametrize("extension", image_files.IMAGE_FORMATS)
+def test_same_picture_has_the_same_bytes_in_a_format(extension):
+    first, second = (image_files.encode_image(make_picture(), extension) for _ in range(2))
+    assert first == second
 
 
 def test_jpeg_keeps_an_opaque_picture(tmp_path):
@@ -93,43 +93,66 @@ def test_jpeg_keeps_an_opaque_picture(tmp_path):
     assert difference.mean() <= tolerances.JPEG_MEAN_GREY
 
 
-def test_jpeg_loses_no_opacity_silently(tmp_path):
+def test_transparent_picture_is_refused_by_jpeg(tmp_path):
     with refused(UsageError, "PNG", "background"):
         make_picture(background=CLEAR).save(tmp_path / "a.jpg")
     assert not list(tmp_path.iterdir())
+
+
+def test_transparent_picture_on_a_background_is_saved_as_jpeg(tmp_path):
     make_picture(background=CLEAR).with_background("white").save(tmp_path / "a.jpg")
     with Image.open(tmp_path / "a.jpg") as read:
         assert min(read.getpixel((0, 0))) >= 250
 
 
-def test_a_background_is_mixed_in_by_opacity():
+def test_background_is_mixed_into_a_picture_by_its_opacity():
+    a_fifth = 51  # of 255
+    picture = make_picture(background=(200, 100, 0, a_fifth))
+
+    on_white = picture.with_background((1.0, 1.0, 1.0))
+
+    expected = [0.2 * channel + 0.8 * 255 for channel in (200, 100, 0)]
+    assert on_white.image[0, 0].tolist() == [*expected, 255]
+    opaque = (40, 60)  # a pixel of what is drawn
+    assert np.array_equal(on_white.image[opaque], picture.image[opaque])
+    assert on_white.is_opaque
+
+
+def test_picture_that_gets_a_background_stays_and_shares_its_depths():
     picture = make_picture(background=(200, 100, 0, 51))
-    white = picture.with_background((1.0, 1.0, 1.0))
-    assert white.image[0, 0].tolist() == [244, 224, 204, 255]  # a fifth of the colour, four of white
-    assert np.array_equal(white.image[40, 60], picture.image[40, 60])
-    assert white.is_opaque and not picture.is_opaque
+
+    on_white = picture.with_background((1.0, 1.0, 1.0))
+
     assert picture.image[0, 0, 3] == 51
-    assert white.depth is picture.depth
+    assert not picture.is_opaque
+    assert on_white.depth is picture.depth
 
 
 @pytest.mark.parametrize("extension", [".npy", ".tif"])
-def test_depths_come_back_with_their_gaps(tmp_path, extension):
-    picture = make_picture()
+@pytest.mark.parametrize("expected", [False, True], ids=["first hits", "expected depths"])
+def test_saved_depths_are_read_with_their_gaps(tmp_path, extension, expected):
+    picture = make_picture()  # its expected depths are 1 mm behind the first hits
     path = tmp_path / f"depth{extension}"
-    for expected in (False, True):
-        picture.save_depth(path, expected=expected)
-        read = np.load(path) if extension == ".npy" else np.array(Image.open(path))
-        assert read.dtype == np.float32
-        assert np.array_equal(read, picture.depth + expected, equal_nan=True)
+
+    picture.save_depth(path, expected=expected)
+
+    read = np.load(path) if extension == ".npy" else np.array(Image.open(path))
+    assert read.dtype == np.float32
+    assert np.array_equal(read, picture.depth + (1 if expected else 0), equal_nan=True)
 
 
-def test_values_are_saved_where_there_are_any(tmp_path):
+def test_values_of_a_picture_are_saved(tmp_path):
     picture = make_picture()
-    with refused(UsageError, "dvr", "values"):
-        picture.save_values(tmp_path / "hu.npy")
     picture.values = np.arange(80 * 120, dtype=np.float32).reshape(80, 120)
+
     picture.save_values(tmp_path / "hu.npy")
+
     assert np.array_equal(np.load(tmp_path / "hu.npy"), picture.values)
+
+
+def test_values_of_a_picture_without_any_are_refused(tmp_path):
+    with refused(UsageError, "dvr", "values"):
+        make_picture().save_values(tmp_path / "hu.npy")
 
 
 @pytest.mark.parametrize(
@@ -142,18 +165,18 @@ def test_values_are_saved_where_there_are_any(tmp_path):
         (lambda picture, folder: picture.save_depth(folder / "a.png"), "use one of .npy, .tif"),
     ],
 )
-def test_wrong_names_are_refused(tmp_path, save, message):
+def test_picture_with_a_wrong_name_or_quality_is_refused_and_writes_nothing(tmp_path, save, message):
     with pytest.raises(UsageError, match=message):
         save(make_picture(), tmp_path)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_missing_folder_is_said(tmp_path):
+def test_picture_in_a_missing_folder_is_refused(tmp_path):
     with refused(OutputError, "a.png", "none", "folder"):
         make_picture().save(tmp_path / "none" / "a.png")
 
 
-def test_a_full_disk_leaves_the_older_picture(tmp_path, monkeypatch):
+def test_picture_on_a_full_disk_is_refused_and_the_older_one_stays(tmp_path, monkeypatch):
     path = tmp_path / "a.png"
     path.write_bytes(b"older")
 
@@ -167,11 +190,11 @@ def test_a_full_disk_leaves_the_older_picture(tmp_path, monkeypatch):
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.png"]
 
 
-def test_a_notebook_gets_a_png():
+def test_picture_in_a_notebook_is_a_png():
     assert make_picture()._repr_png_().startswith(b"\x89PNG")
 
 
-def test_pillow_is_found_where_the_command_line_hides_it(tmp_path):
+def test_picture_is_saved_where_the_command_line_hides_pillow(tmp_path):
     code = f"""
 import sys
 sys.modules["PIL"] = None
@@ -184,7 +207,7 @@ Rendering(image, image[..., 0], image[..., 0], None).save({str(tmp_path / "a.png
     assert (tmp_path / "a.png").exists()
 
 
-def test_a_missing_pillow_is_said(monkeypatch):
+def test_picture_without_pillow_is_refused_by_its_name(monkeypatch):
     monkeypatch.setitem(sys.modules, "PIL", None)
     monkeypatch.setattr(sys, "path", [])
     monkeypatch.setattr(sys, "path_importer_cache", {})
@@ -192,21 +215,35 @@ def test_a_missing_pillow_is_said(monkeypatch):
         make_picture().save("a.png")
 
 
-def test_colours_are_found_by_name_and_number():
-    for color in ("orange", " Orange ", "#ffa500", "#FFA500", (1.0, 165 / 255, 0.0)):
-        assert find_color(color) == pytest.approx([1.0, 165 / 255, 0.0])
-    assert find_color("#f0a") == pytest.approx([1.0, 0.0, 170 / 255])
+@pytest.mark.parametrize("color", ["orange", " Orange ", "#ffa500", "#FFA500", (1.0, 165 / 255, 0.0)])
+def test_orange_is_found_by_name_hexadecimal_number_or_shares(color):
+    assert find_color(color) == pytest.approx([1.0, 165 / 255, 0.0])
+
+
+def test_colour_of_three_hexadecimal_digits_has_each_twice():
+    assert find_color("#f0a") == pytest.approx([1.0, 0.0, 0xAA / 255])
+
+
+def test_grey_is_spelt_in_both_ways():
     assert find_color("Grey") == pytest.approx(find_color("gray"))
-    for name in COLORS:
-        assert find_color(name).shape == (3,)
+
+
+@pytest.mark.parametrize("name", COLORS)
+def test_named_colour_has_three_shares_from_0_to_1(name):
+    color = find_color(name)
+    assert color.shape == (3,)
+    assert ((color >= 0) & (color <= 1)).all()
 
 
 @pytest.mark.parametrize("color", ["", "blakc", "#12", "ff0000", "#gggggg", (1, 2, 3), (1, 0), None, (0, 0, np.nan)])
-def test_unknown_colours_list_the_known_ones(color):
+def test_unknown_colour_is_refused_with_the_known_ones(color):
     with refused(UsageError, "black"):
         find_color(color)
 
 
-def test_a_picture_is_told_in_one_line():
-    told = repr(make_picture((40, 30)))
-    assert "40 x 30" in told and "dvr" in told and "\n" not in told and len(told) < 400
+def test_picture_is_described_in_one_short_line_with_size_and_mode():
+    described = repr(make_picture((40, 30)))
+    assert "40 x 30" in described
+    assert "dvr" in described
+    assert "\n" not in described
+    assert len(described) < 400

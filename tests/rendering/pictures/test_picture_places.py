@@ -11,27 +11,41 @@ from refusals import refused
 import clrecon
 from clrecon.errors import UsageError
 
+CENTRE_MM, RADIUS_MM = 11.5, 8.0
+
 
 @pytest.fixture(scope="module")
 def shot(device):
-    k, j, i = np.indices((24, 24, 24))
-    ball = 200.0 - 20.0 * np.sqrt((k - 11.5) ** 2 + (j - 11.5) ** 2 + (i - 11.5) ** 2)
-    volume = clrecon.Volume(ball.astype(np.float32), np.eye(4))
-    return clrecon.render(volume, mode="surface", iso_value=40.0, view=(30.0, 20.0), size=(60, 50), device=device)
+    """A picture of a ball of 8 mm in voxels of 1 mm: its HU fall by 20 a mm, the iso value lies at its radius."""
+    k, j, i = np.indices((24, 24, 24)) - CENTRE_MM
+    volume = clrecon.Volume((200.0 - 20.0 * np.sqrt(k**2 + j**2 + i**2)).astype(np.float32), np.eye(4))
+    level = 200.0 - 20.0 * RADIUS_MM
+    return clrecon.render(volume, mode="surface", iso_value=level, view=(30.0, 20.0), size=(60, 50), device=device)
 
 
-def test_pixels_of_a_ball_lie_on_it(shot):
-    points = shot.world_points()
-    assert points.shape == (50, 60, 3)
+def test_places_of_the_pixels_of_a_ball_lie_on_it(shot):
+    places = shot.world_points()
+
+    assert places.shape == (50, 60, 3)
     hit = np.isfinite(shot.depth)
-    assert hit.sum() > 300 and np.isnan(points[~hit]).all()
-    assert np.linalg.norm(points[hit] - 11.5, axis=1) == pytest.approx(8.0, abs=0.05)
-    np.testing.assert_allclose(points[hit], shot.to_pyvista().points, atol=1e-4)
+    assert hit.sum() > 300
+    assert np.linalg.norm(places[hit] - CENTRE_MM, axis=1) == pytest.approx(RADIUS_MM, abs=0.05)  # h^2 / 8 R is 0.02
+    assert np.isnan(places[~hit]).all()
 
 
-def test_a_picture_is_an_array(shot):
-    assert np.asarray(shot) is shot.image or np.shares_memory(np.asarray(shot), shot.image)
-    assert np.asarray(shot, dtype=float).max() == shot.image.max()
+def test_places_of_pixels_are_the_points_of_the_picture_in_pyvista(shot):
+    hit = np.isfinite(shot.depth)
+    points = shot.to_pyvista().points
+    np.testing.assert_allclose(shot.world_points()[hit], points, atol=1e-4)  # mm in float32
+
+
+def test_picture_is_taken_for_an_array_of_its_image_without_a_copy(shot):
+    assert np.shares_memory(np.asarray(shot), shot.image)
+    assert np.array_equal(np.asarray(shot), shot.image)
+
+
+def test_picture_is_copied_into_an_array_of_another_type_or_on_request(shot):
+    assert np.array_equal(np.asarray(shot, dtype=float), shot.image)
     assert not np.shares_memory(np.array(shot, copy=True), shot.image)
 
 
@@ -46,12 +60,12 @@ def test_edges_of_a_plane_are_mm_of_the_axes_that_it_runs_along(device, plane, m
     assert cut.extent == pytest.approx((across - 5 * right, across + 5 * right, down + 2.5 * below, down - 2.5 * below))
 
 
-def test_a_perspective_picture_has_no_edges_in_mm(shot):
+def test_edges_in_mm_of_a_perspective_picture_are_refused(shot):
     with refused(UsageError, "axes", "mm"):
         _ = replace(shot, camera=replace(shot.camera, parallel_scale=None, view_angle=30.0)).extent
 
 
-def test_a_cut_has_no_places_of_depth(device):
+def test_places_of_a_picture_along_a_curve_are_refused(device):
     volume = clrecon.Volume(np.zeros((8, 8, 8), np.int16), np.eye(4))
     line = [(1.0, 3.0, 1.0), (3.0, 4.0, 4.0), (5.0, 3.0, 6.5)]
     made = clrecon.reformat_curve(volume, line, device=device)
