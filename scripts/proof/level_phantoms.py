@@ -45,11 +45,14 @@ __all__ = [
     "PHANTOMS",
     "REACH_MM",
     "SCANNING",
+    "STEP_MM",
     "THIN",
+    "TRUNK",
     "Phantom",
     "Profiles",
     "draw_phantom",
     "find_on_mesh",
+    "sample_along",
     "sample_profiles",
 ]
 
@@ -88,12 +91,12 @@ class Phantom:
         return 1.0 if finest >= FINE_MM else finest / 0.8
 
 
-_TRUNK = {"size": (240, 240), "slices": 96, "spacing": (1.0, 1.0, 1.25)}
+TRUNK: dict[str, Any] = {"size": (240, 240), "slices": 96, "spacing": (1.0, 1.0, 1.25)}
 """240 x 240 x 120 mm: the same body, however it is scanned."""
 
 
 def _trunk(**changes: Any) -> dict[str, Any]:
-    return {**_TRUNK, **changes}
+    return {**TRUNK, **changes}
 
 
 SCANNING, BODIES, DRY, NOTHING, KINDS_OF_SCAN, THIN = (
@@ -290,8 +293,6 @@ def _truth_of(phantom: Phantom, volume: Volume) -> tuple[IsBone, IsBone, NDArray
 
 def sample_profiles(phantom: Phantom, volume: Volume, seed: int = 1) -> Profiles:
     """Sample the volume across the true surface, at places where edges of the grid cross it."""
-    from scipy.ndimage import map_coordinates
-
     is_bone, is_metal, bone, metal = _truth_of(phantom, volume)
     affine = volume.affine
     generator = np.random.default_rng(seed)
@@ -335,13 +336,19 @@ def sample_profiles(phantom: Phantom, volume: Volume, seed: int = 1) -> Profiles
     far = points[:, None] + phantom.scale * np.array((-2.5, -1.25, 1.25, 2.5))[None, :, None] * normals[:, None]
     clean = ~is_metal(far.reshape(-1, 3)).reshape(len(points), -1).any(axis=1)
     points, normals = points[clean], normals[clean]
+    values = sample_along(volume, points, normals, way)
+    whole = np.isfinite(values).all(axis=1)
+    return Profiles(values[whole], points[whole], normals[whole], way.astype(np.float32))
+
+
+def sample_along(volume: Volume, points: Points, normals: Points, way: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return the HU at ways in mm along the normals from points, shape (n, ways); NaN beyond the outermost voxels."""
+    from scipy.ndimage import map_coordinates
+
     along = points[:, None] + way[None, :, None] * normals[:, None]
-    inverse = np.linalg.inv(affine)
+    inverse = np.linalg.inv(volume.affine)
     ijk = along.reshape(-1, 3) @ inverse[:3, :3].T + inverse[:3, 3]
-    limits = np.array(volume.voxels.shape[::-1]) - 1
-    whole = ((ijk >= 0) & (ijk <= limits)).all(axis=1).reshape(len(points), -1).all(axis=1)
-    kji = ijk.reshape(len(points), -1, 3)[whole].reshape(-1, 3)[:, ::-1].T
-    values = map_coordinates(volume.voxels.astype(np.float32), kji, order=1)
-    return Profiles(
-        values.reshape(int(whole.sum()), -1).astype(np.float32), points[whole], normals[whole], way.astype(np.float32)
-    )
+    is_within = ((ijk >= 0) & (ijk <= np.array(volume.voxels.shape[::-1]) - 1)).all(axis=1)
+    values = np.full(len(ijk), np.nan, np.float32)
+    values[is_within] = map_coordinates(volume.voxels.astype(np.float32), ijk[is_within, ::-1].T, order=1)
+    return values.reshape(len(points), -1)

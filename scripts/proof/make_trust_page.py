@@ -47,8 +47,9 @@ def _percent(share: float) -> str:
 def accuracy_table() -> str:
     """Return the distance of surfaces from the true one: mean over phantoms, worst phantom, and lost walls."""
     rows = []
-    for title, name in (("", "phantoms"), (" (seed 23)", "phantoms_23")):
-        figures = json.loads((BENCHMARKS / "levels" / f"{name}.json").read_text(encoding="utf-8"))
+    for path in sorted((BENCHMARKS / "levels").glob("phantoms*.json")):
+        figures = json.loads(path.read_text(encoding="utf-8"))
+        title = path.stem.replace("phantoms_", " (seed ") + ")" if "_" in path.stem else ""
         for group in dict.fromkeys(one["group"] for one in figures if "best" in one):
             phantoms = [one for one in figures if one["group"] == group]
             cells = []

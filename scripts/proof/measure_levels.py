@@ -7,10 +7,11 @@
 
 `phantoms` measures every phantom of `level_phantoms.py` (about five minutes on one core) at the preset bone, at
 `--hu auto`, at `--hu half:BONE,TISSUE` with the phantom's own materials, at the best of the levels from 100 to 1200 HU,
-and the surface of `--surface cortex` itself; `--seed` draws other bodies, whose figures are in phantoms_SEED.  `scans`
-does what can be done without a truth: the level that auto picks in the scan, in its two halves and in every other
-slice, and how the surface differs.  Both keep their figures in docs/benchmarks/levels; `page` writes them into
-docs/iso_value.md.  The scans and the fitted surfaces need an OpenCL device.
+the surface of `--surface cortex` itself, and surfaces as others make them (`level_peers.py`); `--seed` draws other
+bodies, whose figures are in phantoms_SEED.  `scans` does what can be done without a truth: the level that auto picks in
+the scan, in its two halves and in every other slice, and how the surface differs.  Both keep their figures in
+docs/benchmarks/levels; `page` writes them into docs/iso_value.md.  The scans and the fitted surfaces need an OpenCL
+device.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from numpy.typing import NDArray
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(ROOT / "scripts" / "guide")]
 
+from level_peers import PEER_LEVELS, move_to_half_heights  # noqa: E402
 from level_phantoms import (  # noqa: E402
     DRY,
     KINDS_OF_SCAN,
@@ -51,6 +53,7 @@ from clrecon.anatomy.iso_choice import IsoChoice, choose_iso_value, half_iso_val
 from clrecon.errors import ClreconError, NoSurfaceError  # noqa: E402
 from clrecon.geometry import Volume  # noqa: E402
 from clrecon.jobs.presets import PRESETS  # noqa: E402
+from clrecon.mesh import Mesh  # noqa: E402
 
 FIGURES = ROOT / "docs" / "benchmarks" / "levels"
 PAGE = ROOT / "docs" / "iso_value.md"
@@ -61,6 +64,10 @@ FITTED_AT = {DRY: -200.0}
 """Level of the surface that is moved onto the cortex, where it is not the preset's: dry bones lie in air."""
 SHARES = (0.3, 0.35, 0.4, 0.45)
 """Levels at these shares of the way from tissue to bone, both as auto measures them."""
+NO_HU = ("jaw", "longbone")
+"""Phantoms whose values are not HU: no surface of theirs is fitted from a level in HU."""
+AT_EACH_VERTEX = "50 % at each vertex"
+PEERS = (*PEER_LEVELS, AT_EACH_VERTEX)
 
 
 def measure_errors(profiles: Profiles, level: float) -> dict[str, float]:
@@ -68,14 +75,25 @@ def measure_errors(profiles: Profiles, level: float) -> dict[str, float]:
     return describe_errors(profiles.errors(level), level, float(profiles.way_mm[-1]) / REACH_MM)
 
 
-def measure_fitted(phantom: Phantom, volume: Volume, profiles: Profiles) -> dict[str, float]:
+def level_of_start(phantom: Phantom) -> float:
+    """Return the level of the surface whose vertices are moved."""
+    return FITTED_AT.get(phantom.group, PRESETS["bone"].iso_value)
+
+
+def measure_peers(phantom: Phantom, volume: Volume, profiles: Profiles, surface: Mesh) -> dict[str, dict[str, float]]:
+    """Measure what others make of the phantom; `surface` is that whose vertices go to 50 %."""
+    measured = {name: measure_errors(profiles, find(volume)) for name, find in PEER_LEVELS.items()}
+    errors, _ = find_on_mesh(profiles, move_to_half_heights(surface, volume, phantom.scale), surface.triangles)
+    return {**measured, AT_EACH_VERTEX: describe_errors(errors, level_of_start(phantom), phantom.scale)}
+
+
+def measure_fitted(phantom: Phantom, volume: Volume, profiles: Profiles, surface: Mesh) -> dict[str, float]:
     """Measure the surface of `clrecon mesh --surface cortex` itself, with the shares of places within 1 and 1.96 of the
     errors that it says.
     """
     import clrecon
 
-    level = FITTED_AT.get(phantom.group, PRESETS["bone"].iso_value)
-    surface, start = clrecon.extract_isosurface(volume, level), time.perf_counter()
+    level, start = level_of_start(phantom), time.perf_counter()
     mesh = clrecon.fit_cortex(surface, volume)
     seconds = time.perf_counter() - start
     errors, rows = find_on_mesh(profiles, mesh.vertices, mesh.triangles)
@@ -129,6 +147,8 @@ def _level(choice: IsoChoice | None) -> float | None:
 
 def measure_phantom(phantom: Phantom) -> dict[str, Any]:
     """Measure all rules on one phantom; "best" has the largest share within `CLOSE_MM`."""
+    import clrecon
+
     volume = draw_phantom(phantom)
     choice, reason, seconds = choose(volume)
     level = _level(choice)
@@ -150,8 +170,10 @@ def measure_phantom(phantom: Phantom) -> dict[str, Any]:
         if hu is not None:
             figures[rule] = {**figures.get(rule, {}), **measure_errors(profiles, hu)}
     figures["best"] = max(tried.values(), key=lambda one: one["close_share"])
+    surface = clrecon.extract_isosurface(volume, level_of_start(phantom))
+    figures["peers"] = measure_peers(phantom, volume, profiles, surface)
     try:
-        figures["fitted"] = measure_fitted(phantom, volume, profiles)
+        figures["fitted"] = measure_fitted(phantom, volume, profiles, surface)
     except NoSurfaceError as error:
         figures["fitted"] = {"refused": str(error)}
     if choice is not None:
@@ -224,10 +246,10 @@ def summarise(figures: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
     shares = [f"{100.0 * float(share):.0f} % of the way" for share in with_bone[0]["shares"]]
     flat = [
         {**one, **{f"{hu} HU": row for hu, row in one["fixed"].items()},
-         **dict(zip(shares, one.get("shares", {}).values(), strict=False))}
+         **dict(zip(shares, one.get("shares", {}).values(), strict=False)), **one["peers"]}
         for one in with_bone
     ]  # fmt: skip
-    for rule in (*RULES, *(f"{hu} HU" for hu in with_bone[0]["fixed"]), *shares):
+    for rule in (*RULES, *PEERS, *(f"{hu} HU" for hu in with_bone[0]["fixed"]), *shares):
         rows = [one.get(rule, {}) for one in flat]
         measured = [row for row in rows if "bias_mm" in row]
         same = [row["bias_mm"] for row, one in zip(rows, with_bone, strict=True)
@@ -254,12 +276,30 @@ def _cell(figures: dict[str, Any], digits: int = 2) -> str:
 
 def phantom_table(figures: Sequence[dict[str, Any]]) -> str:
     """Return the table of phantoms."""
-    head = ("phantom", "preset bone", "auto", "half", "best", "fitted to the cortex")
+    head = ("phantom", "preset bone", "auto", "half", "best", "fitted to the cortex", *PEERS)
     rows = []
     for one in figures:
         digits = 2 if min(one["spacing_mm"]) > 0.2 else 4
-        cells = [_cell(one[rule], digits) if rule in one else "" for rule in RULES]
+        measured = {**one, **one.get("peers", {})}
+        cells = [_cell(measured[rule], digits) if rule in measured else "" for rule in (*RULES, *PEERS)]
         rows.append((one["name"], *cells))
+    return markdown_table(head, rows)
+
+
+def error_table(bodies: dict[str, Sequence[dict[str, Any]]]) -> str:
+    """Return the table of the errors that fits state, by seed of the bodies: shares of places within them."""
+    rows = []
+    for seed, figures in bodies.items():
+        for title, others in (("in the means above", False), ("other kinds of scan, thin walls", True)):
+            fits = [
+                one["fitted"] for one in figures
+                if (one["group"] in (KINDS_OF_SCAN, THIN)) == others and one["name"] not in NO_HU
+                and "within_error" in one.get("fitted", {})
+            ]  # fmt: skip
+            within = [fit["within_196_errors"] for fit in fits]
+            means = [np.mean([fit["within_error"] for fit in fits]), np.mean(within), min(within)]
+            rows.append((seed, title, len(fits), *(f"{100.0 * share:.0f} %" for share in means)))
+    head = ("seed", "phantoms", "number", "within 1 stated error", "within 1.96", "worst phantom within 1.96")
     return markdown_table(head, rows)
 
 
@@ -307,8 +347,11 @@ def scan_table(figures: Sequence[dict[str, Any]]) -> str:
 def tables() -> dict[str, str]:
     """Return all tables of docs/iso_value.md by the names of their markers."""
     phantoms, scans = (json.loads((FIGURES / f"{name}.json").read_text("utf-8")) for name in ("phantoms", "scans"))
+    others = {path.stem.removeprefix("phantoms_"): path for path in sorted(FIGURES.glob("phantoms_*.json"))}
+    bodies = {"of the tables": phantoms, **{seed: json.loads(path.read_text("utf-8")) for seed, path in others.items()}}
     return {
         "levels of phantoms": phantom_table(phantoms),
+        "stated errors": error_table(bodies),
         "levels in all": summary_table(phantoms),
         "levels of scans": scan_table(scans),
     }

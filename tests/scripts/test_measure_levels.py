@@ -11,10 +11,14 @@ import pytest
 from refusals import refused
 
 from clrecon.cli.mesh import WHAT_BONE_COSTS
+from clrecon.geometry import Volume
+from clrecon.mesh import Mesh
 
+import level_peers  # isort: skip
 import level_phantoms  # isort: skip
 import marked_tables  # isort: skip
 import measure_levels  # isort: skip
+import measure_reconstructions  # isort: skip
 
 PAGE = measure_levels.PAGE.read_text(encoding="utf-8")
 FIGURES = json.loads((measure_levels.FIGURES / "phantoms.json").read_text(encoding="utf-8"))
@@ -23,6 +27,12 @@ FIGURES = json.loads((measure_levels.FIGURES / "phantoms.json").read_text(encodi
 @pytest.mark.parametrize("name", list(measure_levels.tables()))
 def test_page_of_iso_values_has_the_table_of_the_recorded_figures(name: str) -> None:
     assert marked_tables.find_table(PAGE, name) == measure_levels.tables()[name]
+
+
+def test_page_of_iso_values_has_the_reconstructions_that_were_measured() -> None:
+    figures = json.loads(measure_reconstructions.FIGURES.read_text(encoding="utf-8"))
+    table = marked_tables.find_table(PAGE, measure_reconstructions.TABLE)
+    assert table == measure_reconstructions.make_table(figures)
 
 
 BIASES = [one["preset"]["bias_mm"] for one in FIGURES if one["group"] not in level_phantoms.NOT_IN_TISSUE]
@@ -102,6 +112,28 @@ def test_mesh_is_met_where_it_crosses_the_true_normals_in_their_direction() -> N
     errors, rows = level_phantoms.find_on_mesh(profiles, corners, triangles)
     np.testing.assert_allclose(errors, [0.4, 0.1, np.nan], atol=1e-6)
     assert rows.tolist() == [0, 1, -1]
+
+
+def test_vertices_go_to_half_the_height_of_their_own_profiles() -> None:
+    edge = np.array([1000, 1000, 1000, 1000, 1000, 700, 200, 0, 0, 0, 0, 0], np.int16)  # half of 1000 HU: x = 5.4
+    wall = np.array([0, 0, 0, 0, 300, 600, 300, 0, 0, 0, 0, 0], np.int16)  # half of 600 HU: x = 6
+    volume = Volume(np.stack([[edge, edge], [wall, wall]]), np.eye(4))
+    vertices = np.array([[6.5, 0.0, 0.0], [6.3, 0.0, 1.0], [6.5, 1.0, 0.0]], np.float32)
+    surface = Mesh(vertices, np.array([[0, 1, 2]], np.uint32), np.tile(np.float32([1.0, 0.0, 0.0]), (3, 1)))
+    moved = level_peers.move_to_half_heights(surface, volume)
+    np.testing.assert_allclose(moved, [[5.4, 0.0, 0.0], [6.0, 0.0, 1.0], [5.4, 1.0, 0.0]], atol=1e-4)
+
+
+def test_surfaces_of_two_reconstructions_are_compared_where_both_are_met() -> None:
+    def places(*met: float) -> measure_reconstructions.Places:
+        surfaces = dict.fromkeys(measure_reconstructions.RULES, np.array(met))
+        return measure_reconstructions.Places(surfaces, np.full(4, 0.1), np.ones(4, bool))
+
+    one, other = places(0.0, 0.1, np.nan, 0.5), places(0.1, 0.1, 0.2, 0.1)
+    measured = measure_reconstructions.compare(one, other)["fitted"]
+    assert measured["median_mm"] == 0.1
+    assert measured["lost_share"] == 0.25
+    assert measured["within_196_errors"] == pytest.approx(2 / 3, abs=1e-4)
 
 
 MARKED = "a\n<!-- x: made by me -->\nold\n<!-- end of x -->\nb"
