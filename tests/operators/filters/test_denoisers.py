@@ -18,7 +18,7 @@ from clrecon.operators.filters.denoisers import DENOISERS, ITK_TIME_STEP
 SPACING = np.diag((0.7, 0.7, 1.0, 1.0))
 
 
-def noisy(noise: float = 20.0) -> tuple[Volume, np.ndarray]:
+def noisy_ball(noise: float = 20.0) -> tuple[Volume, np.ndarray]:
     """A ball of 120 HU in 20 HU, and the same without noise."""
     k, j, i = np.indices((14, 50, 60))
     clean = np.where((k - 6.5) ** 2 + (j - 24.5) ** 2 + (i - 29.5) ** 2 < 30.0, 120.0, 20.0)
@@ -26,49 +26,68 @@ def noisy(noise: float = 20.0) -> tuple[Volume, np.ndarray]:
     return Volume(np.rint(voxels).astype(np.int16), SPACING), clean
 
 
-@pytest.mark.parametrize("name", DENOISERS)
-def test_noise_goes_and_the_report_says_how(name):
-    volume, clean = noisy()
+NAMES = pytest.mark.parametrize("name", DENOISERS)
+
+
+@NAMES
+def test_a_filter_takes_three_tenths_off_the_noise_and_keeps_type_and_place(name):
+    volume, clean = noisy_ball()
+    made = clrecon.filter_volume(volume, name)
+    beside_the_ball = (slice(2, -2), slice(2, 12), slice(2, -2))
+    before, after = ((each.voxels - clean)[beside_the_ball].std() for each in (volume, made))
+    assert after < 0.7 * before
+    assert made.voxels.dtype == np.int16
+    assert np.array_equal(made.affine, volume.affine)
+
+
+@NAMES
+def test_report_of_a_filter_names_it_and_its_package(name):
+    (step,) = clrecon.filter_volume(noisy_ball()[0], name).report["filtered"]["steps"]
+    assert step["filter"] == name
+    assert step["package"].split()[0] in ("SimpleITK", "skimage")
+
+
+@NAMES
+def test_progress_of_a_filter_is_told_from_no_slice_to_all(name):
     told = []
-    made = clrecon.filter_volume(volume, name, progress=lambda *step: told.append(step))
-    assert made.voxels.dtype == np.int16 and np.array_equal(made.affine, volume.affine)
-    even = (slice(2, -2), slice(2, 12), slice(2, -2))
-    assert (made.voxels - clean)[even].std() < 0.7 * (volume.voxels - clean)[even].std()
-    (step,) = made.report["filtered"]["steps"]
-    assert step["filter"] == name and step["package"].split()[0] in ("SimpleITK", "skimage")
-    assert told[0] == ("filter", 0, 14) and told[-1] == ("filter", 14, 14)
+    clrecon.filter_volume(noisy_ball()[0], name, progress=lambda *step: told.append(step))
+    assert told[0] == ("filter", 0, 14)
+    assert told[-1] == ("filter", 14, 14)
 
 
-def test_lengths_of_filters_are_in_mm():
-    """An impulse spreads as far in mm along each axis."""
+@pytest.mark.parametrize(("axis", "step_mm"), [(0, 1.0), (1, 0.7), (2, 0.7)], ids="kji")
+def test_a_gaussian_spreads_an_impulse_by_its_sigma_in_mm_along_each_axis(axis, step_mm):
     voxels = np.zeros((31, 41, 41), np.float32)
     voxels[15, 20, 20] = 1.0
     made = clrecon.filter_volume(Volume(voxels, SPACING), "gaussian", sigma_mm=2.0).voxels.astype(np.float64)
-    for axis, step in ((0, 1.0), (1, 0.7), (2, 0.7)):
-        places = (np.arange(made.shape[axis]) - (made.shape[axis] - 1) / 2) * step
-        along = made.sum(axis=tuple({0, 1, 2} - {axis}))
-        assert np.sqrt((along * places**2).sum() / along.sum()) == pytest.approx(2.0, rel=0.01)
-    wide = clrecon.filter_volume(noisy()[0], "median", radius_mm=1.4)
-    assert wide.report["filtered"]["steps"][0]["window"] == [5, 5, 3]
+    places = (np.arange(made.shape[axis]) - (made.shape[axis] - 1) / 2) * step_mm
+    along = made.sum(axis=tuple({0, 1, 2} - {axis}))
+    assert np.sqrt((along * places**2).sum() / along.sum()) == pytest.approx(2.0, rel=0.01)
 
 
 def test_filter_of_a_device_volume_gives_a_device_volume(device):
-    volume, _ = noisy()
+    volume, _ = noisy_ball()
     with clrecon.DeviceVolume(volume, device=device) as resident:
         made = clrecon.filter_volume(resident, "median")
         assert isinstance(made, clrecon.DeviceVolume) and made.device is resident.device
         np.testing.assert_array_equal(made.volume.voxels, clrecon.filter_volume(volume, "median").voxels)
 
 
-@pytest.mark.parametrize(
+ODD_STACKS = pytest.mark.parametrize(
     "volume", [uneven(), Volume(np.zeros((4, 5, 6), np.int16), OBLIQUE)], ids=["uneven", "sheared"]
 )
+
+
+@ODD_STACKS
 @pytest.mark.parametrize("name", ["median", "gaussian", "curvature-flow"])
-def test_odd_stacks_are_refused(volume, name):
+def test_uneven_and_sheared_stacks_are_refused_by_filters_of_itk(volume, name):
     with pytest.raises(UsageError, match=f"unevenly spaced|sheared by .* degrees, and {name} takes them"):
         clrecon.filter_volume(volume, name)
-    made = clrecon.filter_volume(volume, "non-local-means", sigma_hu=10.0)
-    assert made.uneven is volume.uneven
+
+
+@ODD_STACKS
+def test_uneven_and_sheared_stacks_stay_so_through_non_local_means(volume):
+    assert clrecon.filter_volume(volume, "non-local-means", sigma_hu=10.0).uneven is volume.uneven
 
 
 @pytest.mark.parametrize(
@@ -86,34 +105,42 @@ def test_odd_stacks_are_refused(volume, name):
         ("non-local-means", {"sigma_hu": -1.0}, "sigma_hu is a number above 0"),
     ],
 )
-def test_bad_parameters_are_refused_in_one_line(name, parameters, words):
+def test_wrong_parameters_of_filters_of_other_packages_are_refused_in_one_line(name, parameters, words):
     with pytest.raises(UsageError, match=words) as refused:
-        clrecon.filter_volume(noisy()[0], name, **parameters)
+        clrecon.filter_volume(noisy_ball()[0], name, **parameters)
     assert "\n" not in str(refused.value)
 
 
-def test_nan_and_missing_packages_are_told(monkeypatch):
+def test_filter_of_voxels_of_nan_is_refused():
     voxels = np.zeros((3, 4, 5), np.float32)
     voxels[1, 2, 3] = np.nan
     with refused(UsageError, "NaN", "voxels"):
         clrecon.filter_volume(Volume(voxels, SPACING), "median")
+
+
+def test_filter_of_an_array_is_refused():
     with refused(UsageError, "Volume"):
-        clrecon.filter_volume(voxels, "median")  # type: ignore[type-var]
+        clrecon.filter_volume(np.zeros((3, 4, 5), np.float32), "median")  # type: ignore[type-var]
+
+
+def test_filter_without_its_package_is_refused_with_its_name(monkeypatch):
     monkeypatch.setitem(sys.modules, "SimpleITK", None)
     with refused(UsageError, "SimpleITK", "median"):
-        clrecon.filter_volume(noisy()[0], "median")
+        clrecon.filter_volume(noisy_ball()[0], "median")
 
 
-@pytest.mark.parametrize(("radius_mm", "window"), [(0.35, [3, 3, 1]), (0.5, [3, 3, 3]), (1.05, [5, 5, 3])])
+@pytest.mark.parametrize(
+    ("radius_mm", "window"), [(0.35, [3, 3, 1]), (0.5, [3, 3, 3]), (1.05, [5, 5, 3]), (1.4, [5, 5, 3])]
+)
 def test_a_median_takes_the_voxels_nearest_to_its_radius(radius_mm, window):
-    made = clrecon.filter_volume(noisy()[0], "median", radius_mm=radius_mm)
+    made = clrecon.filter_volume(noisy_ball()[0], "median", radius_mm=radius_mm)
     (step,) = made.report["filtered"]["steps"]
     assert step["window"] == window and step["radius_mm"] == radius_mm
 
 
-@pytest.mark.parametrize(("spacing", "share"), [((0.7, 0.7, 1.0), 0.49), ((2.0, 3.0, 2.5), 1.0)])
-def test_curvature_flow_takes_the_longest_stable_step(spacing, share):
-    volume = Volume(noisy()[0].voxels, np.diag((*spacing, 1.0)))
+@pytest.mark.parametrize(("spacing", "share"), [((0.7, 0.7, 1.0), 0.7**2), ((2.0, 3.0, 2.5), 1.0)])
+def test_curvature_flow_takes_the_longest_step_that_is_stable_for_its_smallest_spacing(spacing, share):
+    volume = Volume(noisy_ball()[0].voxels, np.diag((*spacing, 1.0)))
     (step,) = clrecon.filter_volume(volume, "curvature-flow", iterations=1).report["filtered"]["steps"]
     assert step["time_step"] == pytest.approx(share * ITK_TIME_STEP, rel=1e-12)
 

@@ -33,7 +33,9 @@ def ball(shape=(20, 30, 50), noise=25.0, dtype="int16", affine=None) -> Volume:
     return Volume(whole, np.eye(4) if affine is None else affine)
 
 
-def run(device, volume, sigma_hu=40.0, sigma_mm=None, dimensions=3, near=None, normals=False, taps=None):
+def filter_with_settings(
+    device, volume, sigma_hu=40.0, sigma_mm=None, dimensions=3, near=None, normals=False, taps=None
+):
     settings = BilateralSettings.checked(volume, sigma_mm, sigma_hu, dimensions, near, normals, taps)
     with DeviceVolume(volume, device=device) as resident:
         return run_bilateral(resident, settings), settings
@@ -47,25 +49,25 @@ def expected_of(volume, settings):
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)
-def test_bilateral_filter_equals_its_twin(device, dtype):
+@pytest.mark.parametrize(("dimensions", "taps"), [(3, 150), (2, 13)], ids=["3D", "2D"])
+def test_bilateral_filter_equals_its_twin(device, dtype, dimensions, taps):
     """Rows of 1 to 70 voxels: ends of rows overlap in the short ones."""
+    allowed = FILTER_FLOAT_HU if dtype == "float32" else FILTER_ROUNDED_HU
     for shape in SHAPES:
         voxels = np.random.default_rng(5).integers(0, 120, shape).astype(dtype)
         if dtype == "float32":
             voxels += np.float32(0.37)
         volume = Volume(voxels, OBLIQUE)
-        for dimensions, taps in ((3, 150), (2, 13)):
-            found, settings = run(device, volume, 30.0, dimensions=dimensions, taps=taps)
-            allowed = FILTER_FLOAT_HU if dtype == "float32" else FILTER_ROUNDED_HU
-            assert found.voxels.dtype == volume.voxels.dtype
-            assert np.abs(found.voxels - expected_of(volume, settings)).max() <= allowed
+        found, settings = filter_with_settings(device, volume, 30.0, dimensions=dimensions, taps=taps)
+        assert found.voxels.dtype == volume.voxels.dtype
+        assert np.abs(found.voxels - expected_of(volume, settings)).max() <= allowed, shape
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_bilateral_filter_equals_its_twin_in_uneven_stacks(device, sign):
     shape = uneven(sign=sign).voxels.shape
     volume = uneven(np.random.default_rng(6).integers(0, 120, shape).astype(np.float32), sign)
-    found, settings = run(device, volume, 30.0, 0.9)
+    found, settings = filter_with_settings(device, volume, 30.0, 0.9)
     assert len(settings.window.exponents) == shape[0]
     assert np.abs(found.voxels - expected_of(volume, settings)).max() <= FILTER_FLOAT_HU
 
@@ -75,16 +77,16 @@ def test_filter_gives_the_same_bits_on_every_device(device):
     others = [one for one in list_devices() if one.type == "cpu" and not one.is_simulator and not one.shortcoming]
     if len(others) < 2:
         pytest.skip("one device")
-    first, *rest = (run(one, ball(dtype="float32"))[0].voxels for one in others)
+    first, *rest = (filter_with_settings(one, ball(dtype="float32"))[0].voxels for one in others)
     for voxels in rest:
         np.testing.assert_array_equal(voxels, first)
 
 
 @pytest.mark.oclgrind
-def test_filter_runs_cleanly_under_a_simulator(device):
-    found, settings = run(device, ball((3, 4, 35)), taps=27)
-    near, _ = run(device, ball((3, 4, 35)), taps=27, near=100)
-    assert found.voxels.shape == near.voxels.shape == (3, 4, 35)
+@pytest.mark.parametrize("near", [None, 100])
+def test_small_volume_filtered_as_a_whole_or_near_a_level_keeps_its_shape(device, near):
+    found, _ = filter_with_settings(device, ball((3, 4, 35)), taps=27, near=near)
+    assert found.voxels.shape == (3, 4, 35)
 
 
 def test_bilateral_filter_equals_itk_at_equal_taps(device):
@@ -93,7 +95,7 @@ def test_bilateral_filter_equals_itk_at_equal_taps(device):
     image = sitk.GetImageFromArray(volume.voxels)
     image.SetSpacing(volume.spacing)
     theirs = sitk.GetArrayFromImage(sitk.Bilateral(image, 0.56, 75.0, 100))
-    found, settings = run(device, volume, 75.0, 0.56)
+    found, settings = filter_with_settings(device, volume, 75.0, 0.56)
     assert settings.window.taps == 75
     assert np.abs(found.voxels - theirs).max() <= FILTER_ITK_HU
 
@@ -102,14 +104,14 @@ def test_bilateral_filter_equals_opencv(device):
     cv2 = pytest.importorskip("cv2")
     volume = ball((2, 30, 50), dtype="float32")
     theirs = [cv2.bilateralFilter(layer, 5, 75.0, 1.3, borderType=cv2.BORDER_REPLICATE) for layer in volume.voxels]
-    found, _ = run(device, volume, 75.0, 1.3, 2, taps=13)
+    found, _ = filter_with_settings(device, volume, 75.0, 1.3, 2, taps=13)
     assert np.abs(found.voxels - theirs).max() <= FILTER_OPENCV_HU
 
 
 def test_filter_of_one_voxel_equals_the_sum_by_hand(device):
     """One voxel of 10 HU in a row of zeros: exp(-1/2) for the step and exp(-1/2) for the difference, twice."""
     volume = Volume(np.array([[[0, 0, 0, 10, 0, 0, 0]]], np.float32), np.eye(4))
-    found, settings = run(device, volume, 10.0, 1.0, 2, taps=5)
+    found, settings = filter_with_settings(device, volume, 10.0, 1.0, 2, taps=5)
     # Above and below lie repeated edges: the disc of five has two taps of the voxel's own value.
     far = np.exp(-0.5)
     middle = 10.0 - 2 * far * far * 10.0 / (1.0 + 2 * far + 2 * far * far)
@@ -117,23 +119,23 @@ def test_filter_of_one_voxel_equals_the_sum_by_hand(device):
     assert found.voxels[0, 0] == pytest.approx([0, 0, beside, middle, beside, 0, 0], abs=1e-4)
 
 
-def test_a_large_sigma_hu_is_a_gaussian(device):
+def test_bilateral_filter_with_a_large_sigma_hu_is_a_gaussian(device):
     volume = ball()
-    found, settings = run(device, volume, 1e7)
+    found, settings = filter_with_settings(device, volume, 1e7)
     weights = np.exp2(settings.window.exponents[0])
     inner = np.zeros(volume.voxels.shape)
     for (i, j, k), weight in zip(settings.window.offsets.tolist(), weights / weights.sum(), strict=True):
         inner += weight * np.roll(volume.voxels.astype(np.float64), (-k, -j, -i), (0, 1, 2))
-    core = (slice(4, -4),) * 3
+    core = (slice(4, -4),) * 3  # the roll is wrong at the borders
     assert np.abs(found.voxels - inner)[core].max() <= FILTER_ROUNDED_HU
 
 
-def test_nan_and_infinite_voxels_stay_and_count_nowhere(device):
+def test_voxels_that_are_no_values_stay_and_others_are_filtered_as_by_the_twin(device):
     volume = ball(dtype="float32")
     voxels = volume.voxels.copy()
     voxels[5, 6, 7], voxels[10, 15, 25], voxels[3, 3, 49], voxels[0, 0, 0] = np.nan, np.inf, -np.inf, 3e38
     broken = Volume(voxels, volume.affine)
-    found, settings = run(device, broken)
+    found, settings = filter_with_settings(device, broken)
     expected = expected_of(broken, settings)
     np.testing.assert_array_equal(np.isfinite(found.voxels), np.isfinite(voxels))
     there = np.isfinite(voxels) & (voxels < 1e38)
@@ -157,37 +159,64 @@ NEAR = {
 }
 
 
-@pytest.mark.parametrize("dimensions", [2, 3])
-@pytest.mark.parametrize("make", NEAR)
-def test_filter_near_a_level_is_exact_there(device, make, dimensions):
-    """Sides of the level everywhere; values at both ends of every crossed edge; with normals those around, too."""
-    volume, level = NEAR[make](), 100.0
-    whole, _ = run(device, volume, 20.0, dimensions=dimensions)
-    for normals in (False, True):
-        near, settings = run(device, volume, 20.0, dimensions=dimensions, near=level, normals=normals)
-        inside = whole.voxels >= level
-        np.testing.assert_array_equal(near.voxels >= level, inside)
-        decide = np.zeros(inside.shape, np.bool_)
-        for axis in range(3):
-            one, other = (np.moveaxis(decide, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
-            crossed = np.diff(np.moveaxis(inside, axis, 0).astype(np.int8), axis=0) != 0
-            one |= crossed
-            other |= crossed
-        if normals:  # central differences at both ends
-            ring = decide.copy()
-            for axis in range(3):
-                for step in (1, -1):
-                    ring |= np.roll(decide, step, axis)
-            decide = ring if make != "row" else decide
-        np.testing.assert_array_equal(near.voxels[decide], whole.voxels[decide])
-        same = (near.voxels == whole.voxels) | (near.voxels == volume.voxels)
-        assert same.all()
-    if make in ("ball", "wide"):
-        assert near.share < 0.7
+def beside_crossed_edges(inside):
+    """Voxels at both ends of an edge from inside to outside."""
+    beside = np.zeros(inside.shape, np.bool_)
+    for axis in range(3):
+        one, other = (np.moveaxis(beside, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
+        crossed = np.diff(np.moveaxis(inside, axis, 0).astype(np.int8), axis=0) != 0
+        one |= crossed
+        other |= crossed
+    return beside
+
+
+@pytest.fixture(params=[(name, dimensions) for name in NEAR for dimensions in (2, 3)], ids=str)
+def near_and_whole(request, device):
+    """A volume filtered as a whole, and a function that filters it near 100 HU, with or without normals."""
+    name, dimensions = request.param
+    volume = NEAR[name]()
+
+    def filter_near(normals):
+        return filter_with_settings(device, volume, 20.0, dimensions=dimensions, near=100.0, normals=normals)[0]
+
+    whole, _ = filter_with_settings(device, volume, 20.0, dimensions=dimensions)
+    return name, volume, whole, filter_near
 
 
 @pytest.mark.parametrize("normals", [False, True])
-def test_surfaces_of_a_near_filter_are_those_of_the_whole_one(device, normals):
+def test_filter_near_a_level_has_its_sides_and_the_values_beside_it_of_the_whole_filter(near_and_whole, normals):
+    """At both ends of every crossed edge; all other voxels are filtered or as they were."""
+    _, volume, whole, filter_near = near_and_whole
+    near = filter_near(normals)
+    inside = whole.voxels >= 100.0
+    np.testing.assert_array_equal(near.voxels >= 100.0, inside)
+    beside = beside_crossed_edges(inside)
+    np.testing.assert_array_equal(near.voxels[beside], whole.voxels[beside])
+    assert ((near.voxels == whole.voxels) | (near.voxels == volume.voxels)).all()
+
+
+def test_filter_near_a_level_for_normals_has_the_values_a_voxel_farther_of_the_whole_filter(near_and_whole):
+    """Normals are central differences at both ends of a crossed edge."""
+    name, _, whole, filter_near = near_and_whole
+    if name == "row":
+        pytest.skip("a roll along a single row meets its other end")
+    near = filter_near(normals=True)
+    beside = beside_crossed_edges(whole.voxels >= 100.0)
+    around = beside.copy()
+    for axis in range(3):
+        for step in (1, -1):
+            around |= np.roll(beside, step, axis)
+    np.testing.assert_array_equal(near.voxels[around], whole.voxels[around])
+
+
+@pytest.mark.parametrize("name", ["ball", "wide"])
+def test_filter_near_a_level_filters_less_than_seven_tenths_of_a_ball(device, name):
+    near, _ = filter_with_settings(device, NEAR[name](), 20.0, near=100.0, normals=True)
+    assert near.share < 0.7
+
+
+@pytest.mark.parametrize("normals", [False, True])
+def test_surface_of_a_volume_filtered_near_its_level_is_that_of_the_whole_filter(device, normals):
     volume = ball(noise=10.0)
     meshes = []
     for near in (None, 100):
@@ -199,14 +228,23 @@ def test_surfaces_of_a_near_filter_are_those_of_the_whole_one(device, normals):
         np.testing.assert_array_equal(meshes[0].normals, meshes[1].normals)
 
 
-@pytest.mark.parametrize("closed", [True, False])
-def test_report_says_that_a_closed_surface_differs_where_the_volume_ends(device, closed):
-    """A bar through the volume: its open surface is the same, its closed ends are not."""
+@pytest.fixture(scope="module")
+def filtered_bars(device):
+    """A bar through all 12 slices of a volume, filtered as a whole and near 100 HU."""
     bar = np.repeat(ball(noise=10.0).voxels[10:11], 12, axis=0) + np.arange(12, dtype=np.int16)[:, None, None]
     volume = Volume(bar, np.eye(4))
-    made = [clrecon.filter_bilateral(volume, sigma_hu=30.0, near=near, device=device) for near in (None, 100)]
-    assert [each.report["filtered"]["steps"][-1]["exact_at_ends"] for each in made] == [None, False]
-    whole, near = (clrecon.extract_isosurface(each, 100, closed=closed, device=device) for each in made)
+    return [clrecon.filter_bilateral(volume, sigma_hu=30.0, near=near, device=device) for near in (None, 100)]
+
+
+def test_report_of_a_filter_near_a_surface_that_leaves_the_volume_says_that_its_ends_are_not_exact(filtered_bars):
+    whole, near = (volume.report["filtered"]["steps"][-1]["exact_at_ends"] for volume in filtered_bars)
+    assert whole is None
+    assert near is False
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_only_the_closed_ends_of_a_surface_filtered_near_its_level_are_moved(device, filtered_bars, closed):
+    whole, near = (clrecon.extract_isosurface(each, 100, closed=closed, device=device) for each in filtered_bars)
     np.testing.assert_array_equal(whole.triangles, near.triangles)
     moved = (whole.vertices != near.vertices).any(axis=1)
     assert moved.any() == closed
@@ -238,7 +276,7 @@ def test_groups_near_a_level_equal_the_twin(device, reach):
 
 @pytest.mark.parametrize("near", [None, 100.0])
 @pytest.mark.parametrize("make", ["ball", "uneven"])
-def test_slabs_give_the_same_bits(device, make, near):
+def test_filter_in_slabs_gives_the_same_bits_until_memory_is_refused(device, make, near):
     volume = NEAR[make]()
     whole = clrecon.filter_bilateral(volume, sigma_hu=20.0, near=near, device=device)
     assert whole.report["filtered"]["steps"][0]["slabs"] == 1
@@ -255,42 +293,86 @@ def test_slabs_give_the_same_bits(device, make, near):
     assert max(slabs) > 2 or make == "uneven"
 
 
-def test_filter_of_a_device_volume_gives_one_that_is_held_there(device):
-    volume = ball()
-    with DeviceVolume(volume, device=device) as resident:
-        filtered = clrecon.filter_bilateral(resident, sigma_hu=30.0)
-        assert isinstance(filtered, DeviceVolume) and filtered.is_held and filtered.uploaded_bytes == 0
-        again = clrecon.filter_bilateral(filtered, sigma_hu=30.0, near=100)
-        mesh = clrecon.extract_isosurface(again, 100)
-        assert filtered.uploaded_bytes == again.uploaded_bytes == 0
-        assert resident.volume is volume
-    apart = clrecon.filter_bilateral(
-        clrecon.filter_bilateral(volume, sigma_hu=30.0, device=device), sigma_hu=30.0, near=100, device=device
-    )
-    np.testing.assert_array_equal(mesh.vertices, clrecon.extract_isosurface(apart, 100, device=device).vertices)
-    assert [step["near_hu"] for step in again.volume.report["filtered"]["steps"]] == [None, 100.0]
-    again.release()  # what the device held is uploaded again
-    np.testing.assert_array_equal(clrecon.extract_isosurface(again, 100).vertices, mesh.vertices)
+@pytest.fixture
+def filtered_twice(device):
+    """A volume on the device, filtered, and filtered again near 100 HU, all on the device."""
+    with DeviceVolume(ball(), device=device) as resident:
+        once = clrecon.filter_bilateral(resident, sigma_hu=30.0)
+        yield once, clrecon.filter_bilateral(once, sigma_hu=30.0, near=100)
 
 
-def test_the_report_says_what_was_done(device):
-    volume = ball(noise=12.0)
-    made = clrecon.filter_bilateral(volume, device=device)
-    (step,) = made.report["filtered"]["steps"]
-    assert step["filter"] == "bilateral" and step["dimensions"] == 3 and step["sigma_mm"] == 1.0
+@pytest.fixture(scope="module")
+def mesh_of_filtered_twice(device):
+    """The surface at 100 HU of a volume that is filtered twice by way of the host."""
+    once = clrecon.filter_bilateral(ball(), sigma_hu=30.0, device=device)
+    twice = clrecon.filter_bilateral(once, sigma_hu=30.0, near=100, device=device)
+    return clrecon.extract_isosurface(twice, 100, device=device)
+
+
+def test_filter_of_a_device_volume_gives_one_that_is_held_there_without_an_upload(filtered_twice):
+    once, twice = filtered_twice
+    assert isinstance(once, DeviceVolume)
+    assert once.is_held
+    clrecon.extract_isosurface(twice, 100)
+    assert once.uploaded_bytes == twice.uploaded_bytes == 0
+
+
+def test_surface_of_a_volume_filtered_on_the_device_is_that_of_one_filtered_by_the_host(
+    filtered_twice, mesh_of_filtered_twice
+):
+    _, twice = filtered_twice
+    np.testing.assert_array_equal(clrecon.extract_isosurface(twice, 100).vertices, mesh_of_filtered_twice.vertices)
+
+
+def test_a_filtered_volume_that_the_device_has_lost_is_uploaded_again(filtered_twice, mesh_of_filtered_twice):
+    _, twice = filtered_twice
+    twice.release()
+    np.testing.assert_array_equal(clrecon.extract_isosurface(twice, 100).vertices, mesh_of_filtered_twice.vertices)
+
+
+def test_report_of_a_volume_filtered_twice_has_both_steps(filtered_twice):
+    _, twice = filtered_twice
+    assert [step["near_hu"] for step in twice.volume.report["filtered"]["steps"]] == [None, 100.0]
+
+
+@pytest.fixture(scope="module")
+def default_step(device):
+    """The report of a filter with all defaults on voxels of 1 mm, and its warnings."""
+    report = clrecon.filter_bilateral(ball(noise=12.0), device=device).report
+    (step,) = report["filtered"]["steps"]
+    return step, report["warnings"]
+
+
+def test_filter_has_by_default_a_sigma_of_a_voxel_and_of_three_times_the_noise(default_step):
+    step, warnings = default_step
+    assert (step["filter"], step["dimensions"], step["sigma_mm"]) == ("bilateral", 3, 1.0)
     assert step["sigma_hu"] == pytest.approx(3 * step["noise_hu"], abs=0.01)
-    assert (step["taps"], step["window"], step["whole_window_taps"]) == (123, [7, 7, 7], 343)
-    assert step["filtered_share"] == 1.0 and step["near_hu"] is None and made.report["warnings"] == []
+    assert warnings == []
+
+
+def test_report_of_a_filter_tells_its_window_and_the_share_that_it_filtered(default_step):
+    step, _ = default_step
+    assert (step["taps"], step["window"], step["whole_window_taps"]) == (123, [7, 7, 7], 7**3)  # within three steps
+    assert step["filtered_share"] == 1.0
+    assert step["near_hu"] is None
+
+
+def test_filter_adds_nothing_to_the_report_of_its_volume(device):
+    volume = ball(noise=12.0)
+    clrecon.filter_bilateral(volume, sigma_hu=30.0, device=device)
     assert "filtered" not in volume.report
-    few = clrecon.filter_bilateral(volume, sigma_hu=30.0, taps=7, near=100, device=device)
-    assert "the window of 7 taps holds" in few.report["warnings"][0]
-    assert 0.0 < few.report["filtered"]["steps"][0]["filtered_share"] < 1.0
 
 
-def test_filter_tells_its_progress_by_slices(device):
+def test_a_window_of_few_taps_is_warned_of(device):
+    report = clrecon.filter_bilateral(ball(), sigma_hu=30.0, taps=7, device=device).report
+    assert "the window of 7 taps holds" in report["warnings"][0]
+
+
+def test_progress_of_the_bilateral_filter_is_told_from_no_slice_to_all(device):
     told = []
     clrecon.filter_bilateral(ball(), sigma_hu=30.0, device=device, progress=lambda *step: told.append(step))
-    assert told[0] == ("filter", 0, 20) and told[-1] == ("filter", 20, 20)
+    assert told[0] == ("filter", 0, 20)
+    assert told[-1] == ("filter", 20, 20)
 
 
 def test_progress_near_a_level_goes_on_over_the_slabs(device):
@@ -300,27 +382,32 @@ def test_progress_near_a_level_goes_on_over_the_slabs(device):
         progress=lambda *step: told.append(step),
     )  # fmt: skip
     counts = [count for stage, count, _ in told if stage == "filter"]
-    assert counts == sorted(set(counts)) and counts[-1] == 20 and len(counts) > 2
+    assert counts == sorted(set(counts))
+    assert len(counts) > 2
+    assert counts[-1] == 20
 
 
 def test_slab_near_a_level_needs_the_memory_of_its_groups(device):
-    """Of 700 voxels in a row: 44 groups in 2 words.  Four masks of the rows that are there, one of the core, a list."""
+    """Four masks of the rows that are there, one of the core, and a list of the groups of 16 voxels."""
     volume = ball((9, 6, 700))
+    rows, groups, words = 6, -(-700 // 16), 2  # a slice has so many rows, a row so many groups, in words of 32
     settings = BilateralSettings.checked(volume, None, 40.0, 3, 100.0, False, 27)
     with DeviceVolume(volume, device=device) as resident:
         run = _Run(resident, settings, Stopwatch(), lambda *step: None)
-        there = 2 + 2 * run.halo
-        groups = 4 * 2 * (4 * there * 6 + 2 * 6) + 4 * 44 * 2 * 6
-        assert there < 9 and run.needs(2)["groups near the level"] == groups
+        core = 2  # slices
+        there = core + 2 * run.halo
+        assert there < 9
+        needed = 4 * words * (4 * there * rows + core * rows) + 4 * groups * core * rows
+        assert run.needs(core)["groups near the level"] == needed
 
 
-def refuse(stage, done, total):
+def cancel(stage, done, total):
     raise clrecon.Cancelled("enough")
 
 
 def test_filter_is_ended_by_its_progress(device):
     with refused(clrecon.Cancelled, "enough"):
-        clrecon.filter_bilateral(ball(), sigma_hu=30.0, device=device, progress=refuse)
+        clrecon.filter_bilateral(ball(), sigma_hu=30.0, device=device, progress=cancel)
 
 
 NAN = float("nan")
@@ -346,21 +433,23 @@ NAN = float("nan")
         ({"near": NAN}, "nan"),
     ],
 )
-def test_bad_parameters_are_refused_in_one_line(device, parameters, words):
+def test_wrong_parameters_of_the_bilateral_filter_are_refused_in_one_line(device, parameters, words):
     with pytest.raises(UsageError, match=words) as refused:
         clrecon.filter_bilateral(ball(), device=device, **{"sigma_hu": 30.0, **parameters})
     assert "\n" not in str(refused.value)
 
 
-def test_what_cannot_be_filtered_is_refused(device):
-    huge = Volume(np.full((2, 2, 2), 1 << 24, np.int32), np.eye(4))
-    with pytest.raises(UsageError, match="cannot be filtered exactly"):
-        clrecon.filter_bilateral(huge, sigma_hu=3.0, device=device)
-    with pytest.raises(NoSurfaceError, match="no voxel can lie near 40000 HU: voxels are int16"):
-        clrecon.filter_bilateral(ball(), sigma_hu=3.0, near=40000, device=device)
-    with pytest.raises(UsageError, match="the noise cannot be measured.*give sigma_hu=HU"):
-        clrecon.filter_bilateral(Volume(np.zeros((2, 2, 2)), np.eye(4)), device=device)
-    with pytest.raises(UsageError, match="has no noise: give sigma_hu=HU"):
-        clrecon.filter_bilateral(Volume(np.zeros((9, 60, 60)), np.eye(4)), device=device)
-    with pytest.raises(UsageError, match="a filter needs a Volume, not ndarray"):
-        clrecon.filter_bilateral(np.zeros((2, 2, 2)), device=device)  # type: ignore[type-var]
+@pytest.mark.parametrize(
+    ("volume", "options", "error", "words"),
+    [
+        (Volume(np.full((2, 2, 2), 1 << 24, np.int32), np.eye(4)), {"sigma_hu": 3.0}, UsageError, "exactly"),
+        (ball(), {"sigma_hu": 3.0, "near": 40000}, NoSurfaceError, "no voxel can lie near 40000 HU: voxels are int16"),
+        (Volume(np.zeros((2, 2, 2)), np.eye(4)), {}, UsageError, "the noise cannot be measured.*give sigma_hu=HU"),
+        (Volume(np.zeros((9, 60, 60)), np.eye(4)), {}, UsageError, "has no noise: give sigma_hu=HU"),
+        (np.zeros((2, 2, 2)), {}, UsageError, "a filter needs a Volume, not ndarray"),
+    ],
+    ids=["beyond float32", "level beyond int16", "too small to measure noise", "no noise", "array"],
+)
+def test_volumes_that_cannot_be_filtered_are_refused(device, volume, options, error, words):
+    with pytest.raises(error, match=words):
+        clrecon.filter_bilateral(volume, **options, device=device)

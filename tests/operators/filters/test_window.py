@@ -25,7 +25,8 @@ def test_window_holds_the_disc_of_opencv(diameter, taps):
     steps = np.arange(-(diameter // 2), diameter // 2 + 1)
     disc = {(i, j, 0) for i in steps for j in steps if i * i + j * j <= (diameter // 2) ** 2}
     assert {tuple(offset) for offset in window.offsets.tolist()} == disc
-    assert window.taps == taps and window.reach == (diameter // 2, diameter // 2, 0)
+    assert window.taps == taps
+    assert window.reach == (diameter // 2, diameter // 2, 0)
 
 
 @pytest.mark.parametrize(
@@ -40,32 +41,38 @@ def test_window_holds_the_box_of_itk(spacing, sigma, reach):
     assert window.share == 1.0
 
 
-def test_a_cap_leaves_whole_rings():
+def test_a_cap_of_taps_leaves_the_whole_rings_within_it():
+    """Of 7 x 7 x 7 taps 123 lie within three steps; the next ring would pass the cap of 125."""
     window = choose_window(cube(), 1.0, 3, 125)
-    squares = (window.offsets**2).sum(axis=1)
-    assert window.taps == 123 and window.whole_taps == 343
-    assert squares.max() == 9 and 0.95 < window.share < 1.0
-    assert choose_window(cube(), 1.0, 3, 6).taps == 1
-    assert choose_window(cube(), 1.0, 3, 7).taps == 7
+    within_three = sum(i * i + j * j + k * k <= 9 for i in range(-3, 4) for j in range(-3, 4) for k in range(-3, 4))
+    assert (window.taps, window.whole_taps) == (within_three, 7**3)
+    assert (window.offsets**2).sum(axis=1).max() == 3**2
+    assert 0.95 < window.share < 1.0
+
+
+@pytest.mark.parametrize(("cap", "taps"), [(6, 1), (7, 7)], ids=["less than the first ring", "the first ring"])
+def test_a_cap_below_the_first_ring_leaves_the_voxel_alone(cap, taps):
+    assert choose_window(cube(), 1.0, 3, cap).taps == taps
 
 
 def test_window_of_a_large_sigma_ends_at_the_largest_reach():
     window = choose_window(cube(), 100.0, 2, 4096)
     assert max(window.reach) == LARGEST_REACH == 14
-    assert window.share == pytest.approx(29**2 / (2 * np.pi * 100.0**2), rel=0.01)
-    assert len(window.rows()) == 29
+    side = 2 * 14 + 1
+    assert window.share == pytest.approx(side**2 / (2 * np.pi * 100.0**2), rel=0.01)  # of a nearly flat Gaussian
+    assert len(window.rows()) == side
 
 
 @pytest.mark.parametrize("volume", [Volume(np.zeros((6, 5, 4)), OBLIQUE), uneven()], ids=["oblique", "uneven"])
-def test_weights_are_those_of_true_distances(volume):
+def test_weights_of_taps_are_those_of_their_distances_in_mm_for_each_uneven_slice(volume):
     window = choose_window(volume, 0.9, 3, 90)
     expected = spatial_weights(volume, window.offsets, 0.9)
     np.testing.assert_allclose(np.broadcast_to(np.exp2(window.exponents), expected.shape), expected, rtol=1e-9)
     assert len(window.exponents) == (volume.shape_ijk[2] if volume.uneven else 1)
 
 
-def test_a_sheared_window_holds_the_ball():
-    """The nearest voxel of the next slice lies two columns away."""
+def test_window_of_a_sheared_volume_holds_the_nearest_voxels_in_mm():
+    """Slices are shifted by two columns: the nearest voxel of the next slice has the index two columns before."""
     affine = np.diag((1.0, 1.0, 1.0, 1.0))
     affine[0, 2] = 2.0
     window = choose_window(Volume(np.zeros((4, 4, 4)), affine), 1.0, 3, 7)

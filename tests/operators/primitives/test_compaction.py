@@ -68,20 +68,26 @@ def test_scan_of_more_blocks_than_group_items_equals_the_twin(device, monkeypatc
     assert np.array_equal(offsets, twin.exclusive_scan(counts)[0])
 
 
-def test_sizes_that_do_not_fit_are_refused(device):
-    with refused(UsageError, 0, "elements"):
-        exclusive_scan(device, None, 0)
-    with refused(UsageError, "scan"):
-        exclusive_scan(device, None, 2**32)
+@pytest.mark.parametrize(("size", "facts"), [(0, (0, "elements")), (2**32, ("scan",))])
+def test_scan_of_none_or_of_more_than_32_bits_count_is_refused(device, size, facts):
+    with refused(UsageError, *facts):
+        exclusive_scan(device, None, size)
+
+
+def test_compaction_whose_positions_need_more_than_32_bits_is_refused(device):
     with refused(UsageError, 32, "positions"):
-        compact(device, None, 2**27 + 1)
+        compact(device, None, 2**32 // 32 + 1)
 
 
-def test_twins_of_scan_and_compact_are_right_by_hand():
+def test_twin_of_scan_sums_what_stands_before_each_count():
     offsets, total = twin.exclusive_scan(np.array([3, 0, 2, 7], np.uint32))
-    assert offsets.tolist() == [0, 3, 3, 5]
-    assert total == 12
-    assert twin.compact(np.array([0b101, 0, 1 << 31], np.uint32)).tolist() == [0, 2, 95]
+    assert offsets.tolist() == [0, 3, 3 + 0, 3 + 0 + 2]
+    assert total == 3 + 0 + 2 + 7
+
+
+def test_twin_of_compact_lists_the_places_of_bits():
+    words = np.array([0b101, 0, 1 << 31], np.uint32)
+    assert twin.compact(words).tolist() == [0, 2, 2 * 32 + 31]
 
 
 @pytest.mark.every_device

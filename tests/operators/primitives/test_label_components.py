@@ -20,7 +20,7 @@ from clrecon.proof.volumes import volume_twins as twin
 AFFINE = np.diag((0.5, 0.7, 2.5, 1.0))
 
 
-def soup(vertices: int, triangles: int, seed: int = 7) -> np.ndarray:
+def random_triangles(vertices: int, triangles: int, seed: int = 7) -> np.ndarray:
     """Random triangles, some of them with one vertex two or three times."""
     return np.random.default_rng(seed).integers(0, vertices, (triangles, 3)).astype(np.uint32)
 
@@ -30,13 +30,20 @@ def strip(vertices: int) -> np.ndarray:
     return np.arange(vertices - 2, dtype=np.uint32)[:, None] + np.arange(3, dtype=np.uint32)
 
 
-def check_equal(device, triangles: np.ndarray, vertex_count: int, other=twin.label_components) -> None:
-    before = triangles.copy()
+def assert_components_equal(device, triangles: np.ndarray, vertex_count: int, other=twin.label_components) -> int:
+    """Count and labels are those of another implementation, the twin or scipy's; return the count."""
     count, labels = label_components(device, triangles, vertex_count)
     expected_count, expected = other(triangles, vertex_count)
     assert count == expected_count
     assert labels.dtype == np.int64
     np.testing.assert_array_equal(labels, expected)
+    return count
+
+
+def test_labelling_components_leaves_the_triangles_as_they_are(device):
+    triangles = random_triangles(65, 22)
+    before = triangles.copy()
+    label_components(device, triangles, 65)
     np.testing.assert_array_equal(triangles, before)
 
 
@@ -44,43 +51,58 @@ def check_equal(device, triangles: np.ndarray, vertex_count: int, other=twin.lab
 @pytest.mark.parametrize("vertices", [1, 2, 31, 63, 64, 65, 1023, 1024, 1025])
 @pytest.mark.parametrize("share", [0.1, 0.35, 3.0])
 def test_components_of_random_triangles_equal_the_twin(device, vertices, share):
-    check_equal(device, soup(vertices, max(1, int(share * vertices))), vertices)
+    assert_components_equal(device, random_triangles(vertices, max(1, int(share * vertices))), vertices)
 
 
-@pytest.mark.parametrize("order", daily(1, ["ascending", "descending", "shuffled"]))
-def test_a_long_strip_is_one_component(device, order):
-    """Chains of labels are as long as they can be: several passes of jumps."""
+ORDERS = pytest.mark.parametrize("order", daily(1, ["ascending", "descending", "shuffled"]))
+
+
+def long_strip(order: str) -> np.ndarray:
+    """2999 triangles whose 3001 vertices are one path: chains of labels are as long as they can be."""
     n = 3001
     number = {
         "ascending": np.arange(n),
         "descending": np.arange(n)[::-1],
         "shuffled": np.random.default_rng(3).permutation(n),
     }[order].astype(np.uint32)
-    triangles = number[strip(n)]
-    assert label_components(device, triangles, n)[0] == 1
-    check_equal(device, triangles, n)
-    check_equal(device, triangles[np.arange(n - 2) % 7 != 6], n)  # every seventh left out: still joined by the others
-    check_equal(device, triangles[np.arange(n - 2) % 7 < 4], n)  # pieces of six vertices, one between two unused
+    return number[strip(n)]
+
+
+@ORDERS
+def test_a_long_strip_is_one_component(device, order):
+    assert assert_components_equal(device, long_strip(order), 3001) == 1
+
+
+@ORDERS
+def test_a_long_strip_without_every_seventh_triangle_is_one_component_of_the_twin(device, order):
+    """The others still join all vertices."""
+    triangles = long_strip(order)
+    assert assert_components_equal(device, triangles[np.arange(len(triangles)) % 7 != 6], 3001) == 1
+
+
+@ORDERS
+def test_pieces_of_a_long_strip_are_the_components_of_the_twin(device, order):
+    """Four triangles of each seven: pieces of six vertices, one between two unused."""
+    triangles = long_strip(order)
+    assert assert_components_equal(device, triangles[np.arange(len(triangles)) % 7 < 4], 3001) == -(-2999 // 7)
 
 
 @pytest.mark.parametrize("centre", [0, 500, 1000])
-def test_a_fan_hooks_in_any_order(device, centre):
+def test_a_fan_is_one_component_whatever_the_number_of_its_centre(device, centre):
     rim = np.delete(np.arange(1001, dtype=np.uint32), centre)
     triangles = np.column_stack([np.full(500, centre, np.uint32), rim[0::2], rim[1::2]])
-    assert label_components(device, triangles, 1001)[0] == 1
-    check_equal(device, triangles, 1001)
+    assert assert_components_equal(device, triangles, 1001) == 1
 
 
 @pytest.mark.parametrize("basins", [5, 20, 200, 2000])
-def test_a_row_of_basins_is_a_chain_of_roots(device, basins):
+def test_a_chain_of_roots_is_one_component(device, basins):
     """0 - n - 1 - n+1 - 2 ...: the first round leaves the roots 0, 1, 2 ..., each of which hooks to the one before."""
     path = np.arange(2 * basins).reshape(2, basins).T.ravel().astype(np.uint32)
     edges = np.column_stack([path[:-1], path[1:], path[1:]])
-    assert label_components(device, edges, 2 * basins)[0] == 1
-    check_equal(device, edges, 2 * basins)
+    assert assert_components_equal(device, edges, 2 * basins) == 1
 
 
-def test_a_device_that_never_ends_is_an_error(device):
+def test_a_device_that_hooks_without_end_is_refused_after_a_thousand_passes(device):
     def hook_again(labels_d, hooked_d, flags_d, number):
         copy_buffer(device, upload(device, np.array([0, number], np.uint32)), flags_d, 8)
 
@@ -89,7 +111,8 @@ def test_a_device_that_never_ends_is_an_error(device):
         hook_in_rounds(device, labels_d, other_d, 4, hook_again)
 
 
-def test_roots_are_the_smallest_vertices_and_unused_ones_are_none(device):
+def test_components_are_numbered_by_their_smallest_vertex_and_unused_vertices_have_none(device):
+    """Vertices 1 and 8, 3 alone, and 4, 5, 7 and 9."""
     triangles = np.array([[9, 4, 7], [3, 3, 3], [8, 1, 1], [5, 9, 9]], dtype=np.uint32)
     count, labels = label_components(device, triangles, 11)
     assert count == 3
@@ -97,7 +120,7 @@ def test_roots_are_the_smallest_vertices_and_unused_ones_are_none(device):
 
 
 def test_the_order_of_triangles_does_not_matter(device):
-    triangles = soup(400, 160)
+    triangles = random_triangles(400, 160)
     shuffled = np.random.default_rng(1).permuted(np.random.default_rng(2).permutation(triangles), axis=1)
     np.testing.assert_array_equal(
         label_components(device, shuffled, 400)[1], label_components(device, triangles, 400)[1]
@@ -105,10 +128,10 @@ def test_the_order_of_triangles_does_not_matter(device):
 
 
 @pytest.mark.parametrize("density", [0.03, 0.2, 0.5])
-def test_noisy_surfaces_equal_scipy(device, density):
+def test_components_of_noisy_surfaces_equal_scipy(device, density):
     voxels = (np.random.default_rng(11).random((20, 33, 40)) < density).astype(np.int16)
     mesh = clrecon.extract_isosurface(Volume(voxels, AFFINE), 1, device=device)
-    check_equal(device, mesh.triangles, mesh.vertex_count, connectivity.label_components)
+    assert_components_equal(device, mesh.triangles, mesh.vertex_count, connectivity.label_components)
 
 
 def test_sheets_through_one_cell_are_two_components(device):
@@ -123,49 +146,55 @@ def test_sheets_through_one_cell_are_two_components(device):
 @pytest.mark.parametrize("group", daily(1, [1, 16]))
 def test_components_on_devices_with_small_work_groups_equal_the_twin(device, group, monkeypatch):
     monkeypatch.setattr(device, "max_work_group_size", group)
-    check_equal(device, soup(500, 200), 500)
+    assert_components_equal(device, random_triangles(500, 200), 500)
 
 
 @pytest.mark.oclgrind
-def test_components_after_several_rounds_under_a_simulator_equal_the_twin(device):
+def test_components_of_a_small_strip_and_a_chain_of_roots_equal_the_twin(device):
     """A shuffled strip takes several rounds, a row of basins several passes; unused vertices and one alone."""
     number = np.random.default_rng(6).permutation(70).astype(np.uint32)
     path = 70 + np.arange(40).reshape(2, 20).T.ravel()
     edges = np.column_stack([path[:-1], path[1:], path[1:]])
     triangles = np.concatenate([number[strip(60)], [[number[61]] * 3], edges]).astype(np.uint32)
-    check_equal(device, triangles, 112)
+    assert_components_equal(device, triangles, 112)
 
 
-def test_mesh_without_triangles_has_no_components(device):
-    assert label_components(device, np.empty((0, 3), np.uint32), 0)[0] == 0
-    count, labels = label_components(device, [], 3)
-    assert (count, labels.tolist()) == (0, [-1, -1, -1])
+@pytest.mark.parametrize("triangles", [np.empty((0, 3), np.uint32), []], ids=["empty array", "empty list"])
+@pytest.mark.parametrize("vertices", [0, 3])
+def test_mesh_without_triangles_has_no_components(device, triangles, vertices):
+    count, labels = label_components(device, triangles, vertices)
+    assert count == 0
+    assert labels.tolist() == [-1] * vertices
 
 
-def test_vertices_that_are_not_there_are_refused(device):
-    with refused(UsageError, 5, "vertex"):
-        label_components(device, np.array([[0, 1, 5]], np.uint32), 5)
-    with refused(UsageError, 0, "vertex"):
-        label_components(device, np.zeros((1, 3), np.uint32), 0)
-    with pytest.raises(UsageError, match="components are found in up to"):
+@pytest.mark.parametrize(
+    ("triangle", "vertices", "vertex"), [([0, 1, 5], 5, 5), ([0, 0, 0], 0, 0)], ids=["beyond the last", "of none"]
+)
+def test_vertices_that_are_not_there_are_refused(device, triangle, vertices, vertex):
+    with refused(UsageError, vertex, "vertex"):
+        label_components(device, np.array([triangle], np.uint32), vertices)
+
+
+def test_components_of_more_vertices_than_31_bits_count_are_refused(device):
+    with refused(UsageError, "components"):
         label_components(device, np.zeros((1, 3), np.uint32), 2**31 + 1)
 
 
-def test_too_little_memory_is_said_before_it_is_taken(device, monkeypatch):
+def test_a_device_too_small_for_components_is_refused_before_memory_is_taken(device, monkeypatch):
     monkeypatch.setattr(device, "memory_bytes", 16_000)
     monkeypatch.setattr(components.ocl, "allocate", lambda *_: pytest.fail("memory was taken"))
-    with refused(DeviceMemoryError, "component", "offsets", 16000):
-        label_components(device, soup(1000, 10), 1000)
-    monkeypatch.setattr(device, "memory_bytes", 17_000)
-    with refused(DeviceMemoryError, 15000):
-        label_components(device, soup(1000, 10), 1000, memory=15_000)
+    with refused(DeviceMemoryError, "component", "offsets", 16_000):
+        label_components(device, random_triangles(1000, 10), 1000)
+
+
+def test_too_little_memory_allowed_for_components_is_refused(device):
+    with refused(DeviceMemoryError, 15_000):
+        label_components(device, random_triangles(1000, 10), 1000, memory=15_000)
 
 
 @pytest.mark.release
-def test_real_ct_equals_scipy(device, real_data):
+def test_components_of_bone_in_a_real_scan_equal_scipy(device, real_data):
     volume = clrecon.read_volume(real_data / "thoracic_0p8mm")
     mesh = clrecon.extract_isosurface(volume, 226, device=device)
-    count, labels = label_components(device, mesh.triangles, mesh.vertex_count)
-    expected_count, expected = connectivity.label_components(mesh.triangles, mesh.vertex_count)
-    assert count == expected_count > 1000
-    np.testing.assert_array_equal(labels, expected)
+    found = assert_components_equal(device, mesh.triangles, mesh.vertex_count, connectivity.label_components)
+    assert found > 1000, "too few components to compare"

@@ -70,14 +70,14 @@ def test_impossible_pictures_are_refused_in_one_line(device, name):
 
 
 @pytest.mark.parametrize("what", [None, np.zeros((4, 4, 4)), "folder"])
-def test_what_is_no_volume_is_refused(device, what):
+def test_picture_of_what_is_no_volume_is_refused(device, what):
     from clrecon.operators.rays.render import render
 
     with refused(UsageError, "Volume"):
         render(what, size=(8, 8), device=device)
 
 
-def test_voxels_that_are_no_numbers_are_refused_or_not_seen(device):
+def test_a_voxel_of_nan_is_refused_or_changes_its_own_pixels_alone(device):
     """NaN must neither end in a driver nor spread over pixels whose rays do not meet it."""
     from clrecon.operators.rays.render import render
 
@@ -92,4 +92,4 @@ def test_voxels_that_are_no_numbers_are_refused_or_not_seen(device):
     except UsageError as error:
         assert_one_line(error, "NaN")
     else:
-        assert (image != plain).any(axis=-1).sum() <= 9
+        assert (image != plain).any(axis=-1).sum() <= 9  # pixels whose rays meet a cell of the voxel

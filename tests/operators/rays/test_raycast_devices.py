@@ -127,7 +127,7 @@ def test_raycast_by_kernels_of_users_equals_its_twin(device, name):
 
 
 @pytest.mark.every_device
-def test_flat_places_are_not_lit_by_rounding(device):
+def test_flat_places_are_lit_as_by_the_twin(device):
     """A mask of two values: where it is flat, differences of float32 are noise."""
     volume = even_volume(lambda p: np.where(np.abs(p).max(axis=1) < 7.0, 2613.0, -300.0), "oblique", 18.0, np.int16)
     settings = scene(volume, "dvr", SOFT, lighting=FIXED)[1]
@@ -144,7 +144,7 @@ def test_flat_places_are_not_lit_by_rounding(device):
         *((mode, None, even) for mode in ("mip", "mean", "drr") for even in (True, False)),
     ],
 )
-def test_raycast_of_few_voxels_is_its_twin(device, mode, function, even):
+def test_raycast_of_few_voxels_equals_its_twin(device, mode, function, even):
     """Small enough for a simulator: odd sizes, rays past the volume, clip planes, a light that stands still."""
     volume = (
         even_volume(blobs, "oblique", 6.0, np.int16) if even else uneven_volume(blobs, (9, 7), (1.0, 0.4, 1.9, 1.0))
@@ -165,7 +165,7 @@ def test_raycast_of_few_voxels_is_its_twin(device, mode, function, even):
 
 @pytest.mark.release  # each is compared with the twin
 @pytest.mark.parametrize("name", ["soft", "steep", "gradient opacity", "uneven", "mip", "mean", "drr"])
-def test_all_devices_give_one_picture(name):
+def test_all_devices_give_the_picture_of_the_first(name):
     from skimage.metrics import structural_similarity
 
     devices, _ = conftest.Devices.get()
@@ -181,7 +181,7 @@ def test_all_devices_give_one_picture(name):
 
 
 @pytest.mark.every_device
-def test_jitter_has_the_same_bits_on_devices(device):
+def test_jitter_of_pixels_has_the_bits_of_numpy(device):
     import pyopencl
 
     width, height = 37, 19
@@ -213,7 +213,8 @@ def test_jitter_has_the_same_bits_on_devices(device):
 def test_pictures_of_one_camera_are_the_same_each_time(device):
     volume, settings = SCENES["steep"]()
     first, again = (DeviceCaster(device)(volume, **settings) for _ in range(2))
-    assert np.array_equal(first.image, again.image) and np.array_equal(first.depth, again.depth, equal_nan=True)
+    assert np.array_equal(first.image, again.image)
+    assert np.array_equal(first.depth, again.depth, equal_nan=True)
 
 
 @pytest.mark.every_device

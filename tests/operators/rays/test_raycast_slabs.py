@@ -19,7 +19,7 @@ from clrecon.rendering.pictures.styles import PROJECTIONS
 @pytest.mark.parametrize("mode", ["dvr", *PROJECTIONS])
 @pytest.mark.parametrize("towards", [(0.1, 0.3, 1.0), (-0.1, 0.2, -1.0), (0.5, 1.0, 0.05)])
 @pytest.mark.parametrize("even", [True, False])
-def test_slabs_give_the_picture_of_the_whole(device, mode, towards, even):
+def test_slabs_give_the_picture_depths_and_values_of_the_whole(device, mode, towards, even):
     volume = even_volume(blobs, "oblique", 30.0, np.int16) if even else uneven_volume(blobs)
     settings = {"mode": mode, "camera": look(volume, towards, 16.0, perspective=True), "size": (32, 24)}
     if mode == "dvr":
@@ -34,8 +34,10 @@ def test_slabs_give_the_picture_of_the_whole(device, mode, towards, even):
 
 @pytest.mark.parametrize("lanes", ["1", "8"])
 @pytest.mark.parametrize(("most_slices", "most"), [(19, 19 - 5), (20, 20), (21, 21)])
-def test_a_slab_needs_its_slices_with_two_before_and_three_behind(lanes, most_slices, most):
-    """The forecast and the bound of kernels with several lanes, by hand: 20 large slices with voxels of two bytes."""
+def test_a_slab_of_rays_needs_its_slices_with_two_before_and_three_behind_up_to_the_most_voxels(
+    lanes, most_slices, most
+):
+    """By hand: 20 large slices with voxels of two bytes; kernels with several lanes have a bound on their voxels."""
     ni, nj, nk = 10_000, MOST_VOXELS // (10_000 * most_slices), 20
     asked: dict[str, Any] = {}
     resident = SimpleNamespace(

@@ -25,24 +25,35 @@ SIZE = (16, 16)
 HARD = TransferFunction([(0, 1, 0, 0, 0.0), (200, 1, 1, 0, 0.6)])
 
 
-def body(shape: tuple[int, int, int] = (12, 16, 20), spacing: tuple[float, float, float] = (0.9, 0.8, 1.2)) -> Volume:
+def random_body(
+    shape: tuple[int, int, int] = (12, 16, 20), spacing: tuple[float, float, float] = (0.9, 0.8, 1.2)
+) -> Volume:
+    """HU from 100 to 1499 at random, in air."""
     voxels = np.full(shape, -1000, np.int16)
     inner = voxels[2:-2, 3:-3, 4:-4]
     inner[...] = np.random.default_rng(1).integers(100, 1500, inner.shape)
     return Volume(voxels, np.diag([*spacing, 1.0]))
 
 
-def along_k(volume: Volume, scale: float, away: float = 1000.0) -> Camera:
+def camera_along_k(volume: Volume, scale: float, away: float = 1000.0) -> Camera:
     centre = 0.5 * (np.array(volume.shape_ijk) - 1) * volume.spacing
     return Camera(tuple(centre - [0, 0, away]), tuple(centre), (1, 0, 0), parallel_scale=scale)
 
 
-@pytest.mark.parametrize("mode", ["dvr", "mip", "mean", "surface"])
-def test_rays_of_a_thousand_million_steps_end(device, mode):
-    """Half the smallest spacing is 5e-6 of the way between two slices: float32 would count without ever arriving."""
-    volume = body((24, 16, 20), (1e-4, 1.0, 1000.0))
-    picture = clrecon.render(volume, mode, camera=along_k(volume, 1e-3), size=(4, 4), device=device)
+MODES = pytest.mark.parametrize("mode", ["dvr", "mip", "mean", "surface"])
+
+
+@MODES
+def test_picture_of_slices_ten_million_pixels_apart_is_made(device, mode):
+    """Half the smallest spacing is 5e-8 of the way between two slices: float32 would count without ever arriving."""
+    volume = random_body((24, 16, 20), (1e-4, 1.0, 1000.0))
+    picture = clrecon.render(volume, mode, camera=camera_along_k(volume, 1e-3), size=(4, 4), device=device)
     assert picture.image[..., :3].any()
+
+
+@MODES
+def test_a_given_ray_step_of_too_many_samples_is_refused(device, mode):
+    volume = random_body((24, 16, 20), (1e-4, 1.0, 1000.0))
     with refused(UsageError, "step"):
         clrecon.render(volume, mode, ray_step=5e-5, size=(4, 4), device=device)
 
@@ -56,10 +67,10 @@ ABSURD = {
 }
 
 
-@pytest.mark.parametrize("what", ABSURD)
-def test_what_float32_cannot_hold_is_refused(what):
+@pytest.mark.parametrize("number", ABSURD)
+def test_cameras_and_units_that_float32_cannot_hold_are_refused(number):
     with pytest.raises(UsageError) as error:
-        ABSURD[what]()
+        ABSURD[number]()
     assert "1e+" in str(error.value) or "kilometres" in str(error.value)
 
 
@@ -85,56 +96,61 @@ REFUSED: dict[str, dict[str, Any]] = {
 def test_arrays_and_text_in_place_of_numbers_are_refused(device, name):
     settings = {"view": "axial"} if str(REFUSED[name].get("mode")).startswith("slice") else {}
     with pytest.raises(UsageError) as error:
-        clrecon.render(body(), size=SIZE, device=device, **settings, **REFUSED[name])
+        clrecon.render(random_body(), size=SIZE, device=device, **settings, **REFUSED[name])
     assert_one_line(error.value)
 
 
-def test_colours_may_be_arrays(device):
-    red = np.array([1.0, 0.0, 0.0])
-    for mode in ("dvr", "slice"):
-        settings = {"view": "axial"} if mode == "slice" else {}
-        given = clrecon.render(body(), mode, background=red, size=SIZE, device=device, **settings)
-        named = clrecon.render(body(), mode, background="red", size=SIZE, device=device, **settings)
-        assert np.array_equal(given.image, named.image)
+@pytest.mark.parametrize(("mode", "options"), [("dvr", {}), ("slice", {"view": "axial"})])
+def test_a_background_by_an_array_is_that_by_name(device, mode, options):
+    by_array, by_name = (
+        clrecon.render(random_body(), mode, background=red, size=SIZE, device=device, **options).image
+        for red in (np.array([1.0, 0.0, 0.0]), "red")
+    )
+    assert np.array_equal(by_array, by_name)
 
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("mode", ["dvr", "mip", "surface"])
-def test_numbers_at_the_ends_of_their_ranges_make_pictures(device, mode):
-    volume = body()
-    for options in (
+@pytest.mark.parametrize(
+    "options",
+    [
         {"ray_step": 1e300},
         {"clip": Clip([(0, 0, 1, -1e300)])},
         {"clip": Clip.plane((0, 0, 0), (0, 0, 1e300))},
-        {"camera": along_k(volume, 1e9)},
-        {"camera": along_k(volume, 1e-9)},
+        {"camera": camera_along_k(random_body(), 1e9)},
+        {"camera": camera_along_k(random_body(), 1e-9)},
         {"camera": Camera((0, 0, 0), (1, 0, 0), (0, 0, 1e200), view_angle=179.0)},
-    ):
-        picture = clrecon.render(volume, mode, size=SIZE, device=device, **options)
-        assert picture.image[..., 3].min() == 255
+    ],
+    ids=["ray step", "clip offset", "clip normal", "wide", "narrow", "up and angle"],
+)
+def test_numbers_at_the_ends_of_their_ranges_make_opaque_pictures_without_a_warning(device, mode, options):
+    picture = clrecon.render(random_body(), mode, size=SIZE, device=device, **options)
+    assert picture.image[..., 3].min() == 255
 
 
-def test_slabs_come_in_the_order_of_the_rays_wherever_a_parallel_camera_is(device):
-    """Its position only measures depths: beside the volume, behind it or far away, the picture is the same."""
-    volume = body((40, 16, 20))
+@pytest.mark.parametrize("away", [-3e5, 3e5], ids=["beyond", "far before"])
+def test_picture_in_slabs_is_the_same_wherever_a_parallel_camera_is_along_its_rays(device, away):
+    """Its position only measures depths: slabs come in the order of the rays."""
+    volume = random_body((40, 16, 20))
     centre = 0.5 * (np.array(volume.shape_ijk) - 1) * volume.spacing
     forward = np.array([0.0, 0.6, 0.8])
-    settings = {"transfer_function": HARD, "size": SIZE, "device": device}
-    pictures = []
-    for away in (-3e5, 0.0, 3e5):
-        place = centre - away * forward
+
+    def take_in_slabs(distance):
+        place = centre - distance * forward
         camera = Camera(tuple(place), tuple(place + 100.0 * forward), (0, -1, 0), parallel_scale=20.0)
         assert entry_slice(volume, camera) < -40  # rays go up
-        pictures.append(clrecon.render(volume, camera=camera, memory=25_000, **settings))
-        assert pictures[-1].report["slabs"] > 2
-    assert all(np.array_equal(picture.image, pictures[1].image) for picture in pictures)
+        picture = clrecon.render(volume, camera=camera, memory=25_000, transfer_function=HARD, size=SIZE, device=device)
+        assert picture.report["slabs"] > 2
+        return picture.image
+
+    assert np.array_equal(take_in_slabs(away), take_in_slabs(0.0))
 
 
 @pytest.mark.parametrize("mode", ["dvr", "mip", "surface", "slices"])
 def test_after_a_failure_the_next_picture_is_made_on_a_fresh_device(device, monkeypatch, mode):
     import pyopencl as cl
 
-    with clrecon.VolumeRenderer(body(), device=device) as renderer:
+    with clrecon.VolumeRenderer(random_body(), device=device) as renderer:
         good = renderer.render(mode, size=SIZE, view=(20, 30)).image
         lost = renderer.device.context
 
@@ -154,43 +170,47 @@ def _fail(device, cl):
     raise device.fail("a kernel failed", cl.RuntimeError("the device is gone"))
 
 
-def test_a_device_that_is_too_small_is_named(device, monkeypatch):
+@pytest.mark.parametrize(
+    ("mode", "options"), [("dvr", {}), ("mip", {}), ("surface", {}), ("slices", {}), ("slice", {"view": "axial"})]
+)
+def test_a_device_with_too_little_memory_is_refused_with_its_bytes(device, monkeypatch, mode, options):
     monkeypatch.setattr(device, "memory_bytes", 1000)
-    for mode in ("dvr", "mip", "surface", "slices", "slice"):
-        settings = {"view": "axial"} if mode == "slice" else {}
-        with pytest.raises(DeviceError, match="1,000 bytes"):
-            clrecon.render(body(), mode, size=SIZE, device=device, **settings)
-    monkeypatch.undo()
+    with refused(DeviceError, 1000, "bytes"):
+        clrecon.render(random_body(), mode, size=SIZE, device=device, **options)
+
+
+def test_a_device_with_small_buffers_makes_a_picture_in_slabs(device, monkeypatch):
     monkeypatch.setattr(device, "max_allocation_bytes", 6000)
-    small = clrecon.render(body(), size=(8, 8), device=device)  # in slabs
-    monkeypatch.undo()
-    assert small.report["slabs"] > 1
-    # Of the largest picture of 16384 x 16384 pixels nothing is taken before the sum is known; which buffer is too large
-    # by itself depends on the device, and PoCL's largest on the memory that is free when it starts.
+    assert clrecon.render(random_body(), size=(8, 8), device=device).report["slabs"] > 1
+
+
+def test_the_largest_picture_is_refused_with_the_buffer_that_is_too_large(device):
+    """Nothing is taken before the sum is known; which buffer is too large depends on the device, and PoCL's largest
+    on the memory that is free when it starts."""
     with pytest.raises(DeviceError, match="picture|states of the rays"):
-        clrecon.render(body(), size=(16384, 16384), device=device, memory=1 << 28)
+        clrecon.render(random_body(), size=(16384, 16384), device=device, memory=2**28)
 
 
 def test_pictures_are_not_changed_by_later_ones(device):
     """Their pages are lent from a pool, and later pictures of the same size come from the same pool."""
-    with clrecon.VolumeRenderer(body(), device=device) as renderer:
+    with clrecon.VolumeRenderer(random_body(), device=device) as renderer:
         kept = renderer.render("mip", size=(640, 512), view=(10, 20))
         arrays: tuple[np.ndarray, ...] = (kept.image, kept.depth, kept.values)
         copies = [array.copy() for array in arrays]
         for azimuth in range(4):
             renderer.render("dvr", size=(640, 512), view=(azimuth, 0))
-    clrecon.render(body(), "surface", size=(640, 512), device=device)
+    clrecon.render(random_body(), "surface", size=(640, 512), device=device)
     for array, copy in zip(arrays, copies, strict=True):
         assert np.array_equal(array, copy, equal_nan=array.dtype.kind == "f")
 
 
-def test_threads_share_a_renderer(device):
+def test_three_threads_that_share_a_renderer_get_the_picture_of_their_own_function(device):
     functions = [HARD, HARD.shifted(100.0), HARD.shifted(300.0)]
-    with clrecon.VolumeRenderer(body(), device=device) as renderer:
+    with clrecon.VolumeRenderer(random_body(), device=device) as renderer:
         alone = [renderer.render(transfer_function=f, size=SIZE, jitter=True).image for f in functions]
         wrong: list[object] = []
 
-        def work(number: int) -> None:
+        def render_six_times(number: int) -> None:
             try:
                 for _ in range(6):
                     image = renderer.render(transfer_function=functions[number], size=SIZE, jitter=True).image
@@ -199,7 +219,7 @@ def test_threads_share_a_renderer(device):
             except Exception as error:  # noqa: BLE001
                 wrong.append(error)
 
-        threads = [threading.Thread(target=work, args=(number,)) for number in range(3)]
+        threads = [threading.Thread(target=render_six_times, args=(number,)) for number in range(3)]
         for thread in threads:
             thread.start()
         for thread in threads:
@@ -209,7 +229,7 @@ def test_threads_share_a_renderer(device):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 def test_a_forked_process_is_told_so_and_does_not_wait_forever(device, monkeypatch):
-    clrecon.render(body(), size=SIZE, device=device)
+    clrecon.render(random_body(), size=SIZE, device=device)
     monkeypatch.setattr(os, "getpid", lambda: -1)
     with refused(DeviceError, "spawn"):
-        clrecon.render(body(), size=SIZE, device=device)
+        clrecon.render(random_body(), size=SIZE, device=device)

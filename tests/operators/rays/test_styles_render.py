@@ -77,7 +77,7 @@ SAME: dict[str, tuple[Style, dict[str, Any]]] = {
 }  # fmt: skip
 
 
-def test_every_mode_is_drawn() -> None:
+def test_table_of_styles_has_every_mode_of_volumes() -> None:
     of_others = {"points", "mesh"}  # tests/operators/rays/test_splats.py, test_triangles.py
     assert {style.mode for style, _ in SAME.values()} == set(MODES) - of_others
 
@@ -97,60 +97,84 @@ def test_a_style_and_keywords_make_the_same_picture(device: Any, name: str) -> N
             assert (one is None and two is None) or one.tobytes() == two.tobytes()
 
 
-def test_pixel_width_and_angle_of_a_cut_change_its_picture(device: Any) -> None:
-    with VolumeRenderer(body(), device=device) as renderer:
-        assert renderer.render(PlaneCut(pixel_mm=0.7), size=SIZE).pixel_mm == pytest.approx(0.7)
-        assert renderer.render(CurveCut(LINE, width_mm=20.0, pixel_mm=0.5), view="left").size[0] == 40
-        straight, turned = (renderer.render(CurveCut(LINE, angle=angle), view="left").values for angle in (0.0, 45.0))
-    assert straight is not None and turned is not None and not np.array_equal(straight, turned, equal_nan=True)
+def test_cut_has_the_pixels_that_are_asked_for(device: Any) -> None:
+    assert clrecon.render(body(), PlaneCut(pixel_mm=0.7), size=SIZE, device=device).pixel_mm == pytest.approx(0.7)
 
 
-def test_keywords_beside_a_style_are_refused_where_they_mean_nothing(device: Any) -> None:
-    with VolumeRenderer(body(), device=device) as renderer:
-        with pytest.raises(UsageError, match="leave out color, or the style"):
-            renderer.render(SurfaceLook(), color="red")
-        with pytest.raises(UsageError, match="view_angle does not apply to mode slice"):
-            renderer.render(PlaneCut(), view_angle=20.0)
-        with pytest.raises(UsageError, match="a curved reformation has no camera"):
-            renderer.render(CurveCut(LINE), camera=clrecon.Camera.fit(renderer.volume))
-        with pytest.raises(UsageError, match="ray step is a length in mm, at least"):
-            renderer.render(VolumeLook(ray_step=1e-4), size=SIZE)
-        with pytest.raises(UsageError, match="slices 0 to 19"):
-            renderer.render(SlicesInSpace([20]), size=SIZE)
+def test_curved_cut_is_as_wide_as_is_asked_for(device: Any) -> None:
+    picture = clrecon.render(body(), CurveCut(LINE, width_mm=20.0, pixel_mm=0.5), view="left", device=device)
+    assert picture.size[0] == 20.0 / 0.5
 
 
-@pytest.mark.parametrize("name", ["preset", "mip", "surface", "slices", "slice", "cpr"])
-def test_slabs_are_told_and_what_progress_raises_ends_the_picture(device: Any, name: str) -> None:
+def test_angle_of_a_curved_cut_changes_its_picture(device: Any) -> None:
+    straight, turned = (
+        clrecon.render(body(), CurveCut(LINE, angle=angle), view="left", device=device).values for angle in (0.0, 45.0)
+    )
+    assert straight is not None and turned is not None
+    assert not np.array_equal(straight, turned, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("style", "keywords", "words"),
+    [
+        (SurfaceLook(), {"color": "red"}, "leave out color, or the style"),
+        (PlaneCut(), {"view_angle": 20.0}, "view_angle does not apply to mode slice"),
+        (CurveCut(LINE), {"camera": clrecon.Camera.fit(body())}, "a curved reformation has no camera"),
+        (VolumeLook(ray_step=1e-4), {"size": SIZE}, "ray step is a length in mm, at least"),
+        (SlicesInSpace([20]), {"size": SIZE}, "slices 0 to 19"),
+    ],
+    ids=["colour", "view angle", "camera", "ray step", "slices"],
+)
+def test_styles_and_keywords_that_do_not_go_together_are_refused(
+    device: Any, style: Style, keywords: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(UsageError, match=words):
+        clrecon.render(body(), style, device=device, **keywords)
+
+
+TOLD_STYLES = pytest.mark.parametrize("name", ["preset", "mip", "surface", "slices", "slice", "cpr"])
+
+
+def style_without_shadows(name: str) -> Style:
+    """Shadows need the whole volume."""
     style = SAME[name][0]
-    style = replace(style, shadows=False) if isinstance(style, clrecon.SurfaceLook) else style
+    return replace(style, shadows=False) if isinstance(style, SurfaceLook) else style
+
+
+@TOLD_STYLES
+def test_progress_of_a_picture_is_told_in_slabs_up_to_all(device: Any, name: str) -> None:
     calls: list[tuple[str, int, int]] = []
     place: dict[str, Any] = {"view": (20, 30), "size": SIZE, "device": device}
-    whole = clrecon.render(body(), style, **place, progress=lambda *call: calls.append(call))
-    assert whole.image[..., :3].any()
+    picture = clrecon.render(body(), style_without_shadows(name), **place, progress=lambda *call: calls.append(call))
+    assert picture.image[..., :3].any()
     assert {stage for stage, _, _ in calls} == {"slabs"}
     assert [done for _, done, _ in calls] == sorted(done for _, done, _ in calls)
     assert calls[-1][1] == calls[-1][2] > 0
 
+
+@TOLD_STYLES
+def test_an_error_that_progress_raises_ends_the_picture(device: Any, name: str) -> None:
     raised = clrecon.Cancelled("enough")
 
     def progress(stage: str, done: int, total: int) -> None:
         if done == total:
             raise raised
 
-    with pytest.raises(clrecon.Cancelled) as error:
-        clrecon.render(body(), style, **place, progress=progress)
+    with pytest.raises(clrecon.Cancelled, match="enough") as error:
+        clrecon.render(body(), style_without_shadows(name), view=(20, 30), size=SIZE, device=device, progress=progress)
     assert error.value is raised
 
 
-def test_a_picture_in_slabs_tells_each(device: Any) -> None:
+def test_progress_of_a_picture_in_slabs_is_told_at_the_start_and_after_each(device: Any) -> None:
     calls: list[int] = []
     made = clrecon.render(
         body(), size=(8, 8), device=device, memory=30_000, progress=lambda stage, done, total: calls.append(done)
     )
     assert made.report["slabs"] == len(calls) - 1 > 1
-    assert calls == sorted(calls) and calls[-1] == 20
+    assert calls == sorted(calls)
+    assert calls[-1] == 20  # slices
 
 
-def test_names_of_kinds_are_those_of_the_kernels() -> None:
+def test_projections_and_combinations_of_styles_are_those_of_the_kernels() -> None:
     assert tuple(ray_pictures.PROJECTIONS) == styles.PROJECTIONS
     assert tuple(sheets.COMBINATIONS) == styles.COMBINATIONS

@@ -20,13 +20,13 @@ AFFINE = np.diag([2.0, 2.0, 3.0, 1.0])
 AFFINE[:3, 3] = (-40.0, -50.0, 100.0)
 
 
-def steps(axis: int = 0) -> Volume:
-    """A volume whose HU are ten times the index along an axis of its array."""
+def volume_of_steps(axis: int = 0) -> Volume:
+    """HU are ten times the index along an axis of the array; voxels of 2 x 2 x 3 mm, the first slice at 100 mm."""
     voxels = 10 * np.indices((20, 40, 36))[axis]
     return Volume(voxels.astype(np.int16), AFFINE)
 
 
-def take(volume: Volume, device: Any, view: str = "axial", **style: Any) -> clrecon.Rendering:
+def take_sheet(volume: Volume, device: Any, view: str = "axial", **style: Any) -> clrecon.Rendering:
     return clrecon.render(volume, PlaneCut(**style), view=view, size=SIZE, device=device)
 
 
@@ -38,100 +38,174 @@ def tiles_of(picture: clrecon.Rendering) -> list[np.ndarray]:
     ]
 
 
+@pytest.fixture(params=[("axial", 0, 18), ("coronal", 1, 0), ("sagittal", 2, 0)], ids=["axial", "coronal", "sagittal"])
+def every_third_plane(request: pytest.FixtureRequest, device: Any) -> Any:
+    """A sheet of every third plane, the axis of the array that it runs along, and the first that is shown."""
+    view, axis, first = request.param
+    return take_sheet(volume_of_steps(axis), device, view, slices=3), axis, first
+
+
 @pytest.mark.every_device
-@pytest.mark.parametrize(("view", "axis", "first"), [("axial", 0, 19), ("coronal", 1, 0), ("sagittal", 2, 0)])
-def test_every_n_th_plane_of_voxels_has_its_values(device: Any, view: str, axis: int, first: int) -> None:
-    """From the head down, from the front, from the right."""
-    picture = take(steps(axis), device, view, slices=3)
-    count = (20, 40, 36)[axis]
+def test_every_third_plane_of_voxels_is_shown_from_head_front_or_right(every_third_plane: Any) -> None:
+    picture, axis, first = every_third_plane
     numbers = [tile["slice"] for tile in picture.report["tiles"]]
-    assert sorted(numbers) == list(range(0, count, 3)) and numbers[0] == (18 if first else 0)
-    for number, values in zip(numbers, tiles_of(picture), strict=True):
+    assert sorted(numbers) == list(range(0, (20, 40, 36)[axis], 3))
+    assert numbers[0] == first
+    tiles = tiles_of(picture)
+    assert len(tiles) == len(numbers)
+    for number, values in zip(numbers, tiles, strict=True):
         assert np.nanmin(values) == np.nanmax(values) == 10 * number
         assert np.isfinite(values).mean() > 0.9
-    places = np.array([tile["middle_lps_mm"][2 - axis] for tile in picture.report["tiles"]])
-    truth = AFFINE[2 - axis, 3] + AFFINE[2 - axis, 2 - axis] * np.array(numbers)
-    assert np.allclose(places, truth, atol=1e-3)
-    assert picture.camera is None and np.isnan(picture.depth).all() and picture.mode == "slice"
+
+
+@pytest.mark.every_device
+def test_tiles_tell_the_places_of_their_planes(every_third_plane: Any) -> None:
+    picture, axis, _ = every_third_plane
+    places = [tile["middle_lps_mm"][2 - axis] for tile in picture.report["tiles"]]
+    numbers = np.array([tile["slice"] for tile in picture.report["tiles"]])
+    assert np.allclose(places, AFFINE[2 - axis, 3] + AFFINE[2 - axis, 2 - axis] * numbers, atol=1e-3)
+
+
+@pytest.mark.every_device
+def test_a_sheet_has_no_camera_and_no_depths(every_third_plane: Any) -> None:
+    picture, _, _ = every_third_plane
+    assert picture.camera is None
+    assert np.isnan(picture.depth).all()
+    assert picture.mode == "slice"
 
 
 def test_a_number_of_slices_is_spread_over_the_scan_on_planes_of_voxels(device: Any) -> None:
-    picture = take(steps(), device, sheet=5)
+    picture = take_sheet(volume_of_steps(), device, sheet=5)
     assert [tile["slice"] for tile in picture.report["tiles"]] == [17, 13, 9, 5, 1]
 
 
-def test_slices_lie_at_multiples_of_a_distance(device: Any) -> None:
-    picture = take(steps(), device, sheet="10mm")
-    assert [tile["middle_lps_mm"][2] for tile in picture.report["tiles"]] == [150.0, 140.0, 130.0, 120.0, 110.0, 100.0]
+def test_slices_at_a_distance_lie_at_its_multiples_and_have_no_number(device: Any) -> None:
+    """Slices at 100, 103 ... 157 mm have 0, 10 ... 190 HU."""
+    picture = take_sheet(volume_of_steps(), device, sheet="10mm")
+    heights = [tile["middle_lps_mm"][2] for tile in picture.report["tiles"]]
+    assert heights == [150.0, 140.0, 130.0, 120.0, 110.0, 100.0]
     assert {tile["slice"] for tile in picture.report["tiles"]} == {None}
-    assert np.allclose(tiles_of(picture)[1][20, 20], 10 * 40.0 / 3.0, atol=1e-3)
+    second = tiles_of(picture)[1]
+    assert second[20, 20] == pytest.approx(10 * (140.0 - 100.0) / 3.0, abs=1e-3)
 
 
-def test_uneven_slices_are_where_they_are(device: Any) -> None:
-    volume = steps()
+def test_uneven_slices_have_their_places_and_values(device: Any) -> None:
+    volume = volume_of_steps()
     kept = [0, 1, 4, 5, 11, 19]
     uneven = Volume(volume.voxels[kept], AFFINE, slice_positions=volume.slice_origins()[kept])
-    picture = take(uneven, device, slices=1)
-    assert [tile["middle_lps_mm"][2] for tile in picture.report["tiles"]] == [157.0, 133.0, 115.0, 112.0, 103.0, 100.0]
-    assert [float(np.nanmax(values)) for values in tiles_of(picture)] == [190, 110, 50, 40, 10, 0]
+    picture = take_sheet(uneven, device, slices=1)
+    heights = [tile["middle_lps_mm"][2] for tile in picture.report["tiles"]]
+    assert heights == [100.0 + 3.0 * slice_ for slice_ in kept[::-1]]  # from the head down
+    assert [float(np.nanmax(values)) for values in tiles_of(picture)] == [10 * slice_ for slice_ in kept[::-1]]
 
 
-def test_oblique_slices_have_a_distance_and_no_number(device: Any) -> None:
+@pytest.fixture
+def turned_volume() -> Volume:
     turned = np.eye(4)
     turned[:3, :3] = rotation((20.0, 0.0, 0.0))
-    oblique = Volume(steps().voxels, turned @ AFFINE)
-    picture = take(oblique, device, sheet=4)
-    assert {tile["slice"] for tile in picture.report["tiles"]} == {None} and len(picture.report["tiles"]) == 4
+    return Volume(volume_of_steps().voxels, turned @ AFFINE)
+
+
+def test_slices_across_a_turned_volume_have_no_number(device: Any, turned_volume: Volume) -> None:
+    picture = take_sheet(turned_volume, device, sheet=4)
+    assert [tile["slice"] for tile in picture.report["tiles"]] == [None] * 4
+
+
+def test_every_second_slice_of_an_oblique_view_is_refused(device: Any, turned_volume: Volume) -> None:
     with refused(UsageError, "planes", "voxels"):
-        take(oblique, device, (45, 45), slices=2)
+        take_sheet(turned_volume, device, (45, 45), slices=2)
 
 
-def test_slices_of_a_tilted_gantry_are_shown_as_they_were_taken(device: Any) -> None:
+@pytest.fixture
+def tilted_sheet(device: Any) -> clrecon.Rendering:
+    """Slices 3 and 12 of a volume by a gantry tilted by 18.5 degrees."""
     tilted = AFFINE.copy()
     tilted[:3, 1] = 2.0 * np.array([0.0, np.cos(np.radians(18.5)), np.sin(np.radians(18.5))])
-    picture = take(Volume(steps().voxels, tilted), device, slices=[3, 12])
-    assert [tile["slice"] for tile in picture.report["tiles"]] == [12, 3]
-    for number, values in zip((12, 3), tiles_of(picture), strict=True):
-        there = values[np.isfinite(values)]
-        assert np.allclose(there, 10 * number, atol=0.05) and np.isfinite(values).mean() > 0.5
-    assert [text for text in picture.report["warnings"] if "tilted by 18.5 degrees from the plane asked for" in text]
-    assert picture.report["edges"]["right"] == "L" and picture.report["edges"]["top"][0] == "A"
+    return take_sheet(Volume(volume_of_steps().voxels, tilted), device, slices=[3, 12])
 
 
-def test_sides_scale_and_zoom_are_those_of_a_single_slice(device: Any) -> None:
-    """The patient's left is at the right; a block at the left of the patient lies there in every tile."""
+def test_slices_of_a_tilted_gantry_are_shown_as_they_were_taken(tilted_sheet: clrecon.Rendering) -> None:
+    assert [tile["slice"] for tile in tilted_sheet.report["tiles"]] == [12, 3]
+    for number, values in zip((12, 3), tiles_of(tilted_sheet), strict=True):
+        assert np.isfinite(values).mean() > 0.5
+        assert np.allclose(values[np.isfinite(values)], 10 * number, atol=0.05)
+
+
+def test_sheet_of_a_tilted_gantry_warns_of_the_tilt_and_names_its_sides(tilted_sheet: clrecon.Rendering) -> None:
+    report = tilted_sheet.report
+    assert any("tilted by 18.5 degrees from the plane asked for" in text for text in report["warnings"])
+    assert report["edges"]["right"] == "L"
+    assert report["edges"]["top"][0] == "A"
+
+
+@pytest.fixture
+def block_at_the_left() -> Volume:
+    """900 HU from column 30 of 36 on, at the patient's left."""
     voxels = np.zeros((20, 40, 36), np.int16)
     voxels[:, :, 30:] = 900
-    volume = Volume(voxels, AFFINE)
-    picture = take(volume, device, sheet=4)
-    assert picture.report["edges"]["right"] == "L" and picture.report["edges"]["top"] == "A"
-    for values in tiles_of(picture):
-        assert np.nanmean(values[:, -20:]) > 700 and np.nanmean(values[:, :20]) == 0
-    width = picture.report["tile_size"][0]
-    assert width * picture.report["pixel_mm"] == pytest.approx(72.0, rel=0.03)
-    near = clrecon.render(volume, PlaneCut(sheet=4), view="axial", zoom=2.0, size=SIZE, device=device)
-    assert near.report["pixel_mm"] == pytest.approx(0.5 * picture.report["pixel_mm"], rel=1e-6)
+    return Volume(voxels, AFFINE)
 
 
-def test_labels_are_drawn_on_their_slices_alone(device: Any) -> None:
+def test_the_left_of_the_patient_is_at_the_right_of_every_tile(device: Any, block_at_the_left: Volume) -> None:
+    picture = take_sheet(block_at_the_left, device, sheet=4)
+    assert (picture.report["edges"]["right"], picture.report["edges"]["top"]) == ("L", "A")
+    tiles = tiles_of(picture)
+    assert len(tiles) == 4
+    for values in tiles:
+        assert np.nanmean(values[:, -20:]) > 700  # but for the blurred edge of the block
+        assert np.nanmean(values[:, :20]) == 0
+
+
+def test_tiles_are_as_wide_as_the_volume(device: Any, block_at_the_left: Volume) -> None:
+    report = take_sheet(block_at_the_left, device, sheet=4).report
+    assert report["tile_size"][0] * report["pixel_mm"] == pytest.approx(36 * 2.0, rel=0.03)
+
+
+def test_zoom_of_two_halves_the_pixels_of_a_sheet(device: Any, block_at_the_left: Volume) -> None:
+    pixel, zoomed_pixel = (
+        clrecon.render(
+            block_at_the_left, PlaneCut(sheet=4), view="axial", zoom=zoom, size=SIZE, device=device
+        ).report["pixel_mm"]
+        for zoom in (1.0, 2.0)
+    )  # fmt: skip
+    assert zoomed_pixel == pytest.approx(0.5 * pixel, rel=1e-6)
+
+
+@pytest.fixture
+def labels_in_four_slices() -> LabelMap:
+    """A label of 10 x 10 voxels of 2 mm in slices 8 to 11."""
     numbers = np.zeros((20, 40, 36), np.uint8)
     numbers[8:12, 10:20, 10:20] = 3
-    labels = LabelMap(numbers, AFFINE, {3: "vertebrae_L3"})
-    picture = take(steps(), device, slices=4, labels=labels, label_colors={3: "#00ff00"})
-    single = clrecon.render(
-        steps(), PlaneCut(labels=labels, label_colors={3: "#00ff00"}), view="axial", size=(80, 80), device=device,
-        center=(-10.0, -10.0, 127.0),
-    )  # fmt: skip
-    assert picture.report["labels"][0] | {"pixels": 0} == {
-        "label_number": 3, "label": "vertebrae_L3", "color": "#00ff00", "pixels": 0,
-    }  # fmt: skip
+    return LabelMap(numbers, AFFINE, {3: "vertebrae_L3"})
+
+
+def is_green(image: np.ndarray) -> np.ndarray:
+    return np.asarray(image[..., 1].astype(int) > image[..., 0].astype(int) + 30)
+
+
+def test_labels_are_drawn_on_their_slices_alone(device: Any, labels_in_four_slices: LabelMap) -> None:
+    colors = {3: "#00ff00"}
+    picture = take_sheet(volume_of_steps(), device, slices=4, labels=labels_in_four_slices, label_colors=colors)
     width, height = picture.report["tile_size"]
-    for tile in picture.report["tiles"]:
-        part = picture.image[tile["top"] : tile["top"] + height, tile["left"] : tile["left"] + width].astype(int)
-        assert (part[..., 1] > part[..., 0] + 30).any() == (tile["slice"] == 8)
-    green = single.image[..., 1].astype(int) > single.image[..., 0].astype(int) + 30
-    assert green.sum() * single.pixel_mm**2 == pytest.approx(20.0 * 20.0, rel=0.1)
-    assert single.report["labels"][0]["pixels"] == pytest.approx(green.sum(), rel=0.02)
+    green_slices = [
+        tile["slice"]
+        for tile in picture.report["tiles"]
+        if is_green(picture.image[tile["top"] : tile["top"] + height, tile["left"] : tile["left"] + width]).any()
+    ]
+    assert green_slices == [8]  # of 0, 4, 8, 12 and 16
+    (entry,) = picture.report["labels"]
+    assert (entry["label_number"], entry["label"], entry["color"]) == (3, "vertebrae_L3", "#00ff00")
+
+
+def test_a_label_on_a_slice_has_its_area_and_the_report_its_pixels(
+    device: Any, labels_in_four_slices: LabelMap
+) -> None:
+    style = PlaneCut(labels=labels_in_four_slices, label_colors={3: "#00ff00"})
+    in_slice_9 = (-10.0, -10.0, 127.0)
+    picture = clrecon.render(volume_of_steps(), style, view="axial", size=(80, 80), device=device, center=in_slice_9)
+    pixels = np.count_nonzero(is_green(picture.image))
+    assert pixels * picture.pixel_mm**2 == pytest.approx((10 * 2.0) ** 2, rel=0.1)  # its outline is a pixel wide
+    assert picture.report["labels"][0]["pixels"] == pytest.approx(pixels, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +218,7 @@ def test_labels_are_drawn_on_their_slices_alone(device: Any) -> None:
 )
 def test_slices_that_are_not_there_are_refused(device: Any, style: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
-        take(steps(), device, **style)
+        take_sheet(volume_of_steps(), device, **style)
 
 
 @pytest.mark.parametrize(
@@ -157,12 +231,17 @@ def test_slices_that_are_not_there_are_refused(device: Any, style: dict[str, Any
         ({"sheet": 4, "pixel_mm": 1.0}, ("pixel_mm",)),
     ],
 )
-def test_sheets_that_cannot_be_are_refused(wrong: dict[str, Any], words: str) -> None:
+def test_wrong_numbers_and_distances_of_sheets_are_refused(wrong: dict[str, Any], words: str) -> None:
     with refused(UsageError, *words):
         PlaneCut(**wrong)
 
 
-def test_numbers_and_distances_are_read_from_text() -> None:
-    sheets = [PlaneCut(sheet=given).sheet for given in (True, 7, "7", "5mm", " 2.50 MM")]
-    assert sheets == [20, 7, 7, "5 mm", "2.5 mm"]
-    assert PlaneCut(slices=4).sheet == 20 and PlaneCut().sheet is None
+@pytest.mark.parametrize(
+    ("given", "sheet"), [(True, 20), (7, 7), ("7", 7), ("5mm", "5 mm"), (" 2.50 MM", "2.5 mm"), (None, None)]
+)
+def test_number_or_distance_of_a_sheet_is_read_from_text_and_is_20_by_default(given: Any, sheet: Any) -> None:
+    assert PlaneCut(sheet=given).sheet == sheet
+
+
+def test_every_fourth_slice_makes_a_sheet_of_20() -> None:
+    assert PlaneCut(slices=4).sheet == 20

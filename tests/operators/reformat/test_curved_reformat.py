@@ -57,22 +57,41 @@ def edges(values, pixel):
     return np.array(found)
 
 
-@pytest.mark.parametrize("grid", [0, 1])
-@pytest.mark.parametrize("kind", ["straightened", "stretched"])
-def test_a_bent_tube_stands_straight_and_is_as_wide_and_long_as_it_is(device, grid, kind):
+GRIDS = pytest.mark.parametrize("grid", [0, 1], ids=["sheared", "uneven"])
+KINDS = pytest.mark.parametrize("kind", ["straightened", "stretched"])
+TUBE_SIZE = (60, 150)
+
+
+@GRIDS
+@KINDS
+def test_picture_of_a_bent_tube_is_as_long_as_its_arc_and_each_row_at_its_way_along_it(device, grid, kind):
     volume = list(grids())[grid]
-    distance, way = coordinates(volume)
+    _, way = coordinates(volume)
+    marked = volume.with_voxels(way.astype(np.float32))
+    seen = reformat_curve(marked, centre_line(), kind, TUBE_SIZE, device=device, view="anterior")
+    pixel, arc = seen.report["pixel_mm"], BEND * TURN
+    assert 150 * pixel == pytest.approx(arc, rel=tolerances.TUBE_ARC)
+    assert seen.report["curve"]["length_mm"] == pytest.approx(arc, rel=tolerances.TUBE_ARC)
+    middle = seen.values[:, 30]
+    assert np.abs(middle - (np.arange(150) + 0.5) * pixel).max() <= tolerances.TUBE_ARC * arc
+
+
+def test_curved_reformation_runs_from_the_upper_end_and_has_no_camera_and_no_depths(device):
+    """The points of the centre line run upward."""
+    seen = reformat_curve(next(grids()), centre_line(), "straightened", TUBE_SIZE, device=device, view="anterior")
+    assert seen.report["curve"]["reversed"]
+    assert seen.camera is None
+    assert np.isnan(seen.depth).all()
+
+
+@GRIDS
+@KINDS
+def test_a_bent_tube_is_straight_and_has_its_width(device, grid, kind):
+    volume = list(grids())[grid]
+    distance, _ = coordinates(volume)
     tube = volume.with_voxels((100.0 * (TUBE - distance)).astype(np.float32))
-    seen = reformat_curve(tube, centre_line(), kind, (60, 150), device=device, view="anterior")
-    pixel = seen.report["pixel_mm"]
-    assert 150 * pixel == pytest.approx(BEND * TURN, rel=tolerances.TUBE_ARC)
-    assert seen.report["curve"]["length_mm"] == pytest.approx(BEND * TURN, rel=tolerances.TUBE_ARC)
-    assert seen.report["curve"]["reversed"] and seen.camera is None and np.isnan(seen.depth).all()
-    assert np.abs(edges(seen.values, pixel) - (-TUBE, TUBE)).max() <= tolerances.TUBE_EDGE_MM
-    marked = reformat_curve(volume.with_voxels(way.astype(np.float32)), centre_line(), kind, (60, 150), device=device,
-                            view="anterior")  # fmt: skip
-    truth = (np.arange(150) + 0.5) * pixel
-    assert np.abs(marked.values[:, 30] - truth).max() <= tolerances.TUBE_ARC * BEND * TURN
+    seen = reformat_curve(tube, centre_line(), kind, TUBE_SIZE, device=device, view="anterior")
+    assert np.abs(edges(seen.values, seen.report["pixel_mm"]) - (-TUBE, TUBE)).max() <= tolerances.TUBE_EDGE_MM
 
 
 @pytest.mark.parametrize("angle", [90.0, 30.0])
@@ -85,35 +104,54 @@ def test_a_round_tube_is_as_wide_from_every_side(device, angle):
     assert np.abs(edges(seen.values, 0.5) - (-TUBE, TUBE)).max() <= tolerances.TUBE_EDGE_MM
 
 
-def test_both_ends_and_sides_are_where_they_belong(device):
-    """From the left the front is at the left of the picture, the head at its top, however the points run."""
+@KINDS
+@pytest.mark.parametrize("upward", [True, False])
+@pytest.mark.parametrize(
+    ("view", "axis", "sign"),
+    [("left", 1, 1), ("anterior", 0, 1), ("right", 1, -1), ("posterior", 0, -1)],
+    ids=["left: back at the right", "anterior: left at the right", "right: front at the right",
+         "posterior: right at the right"],
+)  # fmt: skip
+def test_sides_of_a_curved_reformation_are_those_of_its_view_and_the_head_is_at_its_top(
+    device, kind, upward, view, axis, sign
+):
+    """However the points run: the volume shows its own coordinates."""
     volume = next(grids())
     nk, nj, ni = volume.voxels.shape
     k, j, i = np.indices((nk, nj, ni)).reshape(3, -1)
-    places = volume.ijk_to_lps(np.stack([i, j, k], axis=1)).reshape(nk, nj, ni, 3)
+    places = volume.ijk_to_lps(np.stack([i, j, k], axis=1)).reshape(nk, nj, ni, 3).astype(np.float32)
     line = CENTRE + np.array([(0.0, 30.0, z) for z in (-20.0, 5.0, 20.0)])
-    for points in (line, line[::-1]):
-        for kind in ("straightened", "stretched"):
-            for view, column, axis in [("left", 1, 1), ("anterior", 0, 0), ("right", 1, -1), ("posterior", 0, -1)]:
-                across = volume.with_voxels(places[..., column].astype(np.float32))
-                upward = volume.with_voxels(places[..., 2].astype(np.float32))
-                right = reformat_curve(across, points, kind, (8, 12), device=device, view=view).values
-                up = reformat_curve(upward, points, kind, (8, 12), device=device, view=view).values
-                assert np.sign(right[6, 7] - right[6, 0]) == (1 if axis >= 0 else -1)
-                assert up[0, 4] > up[11, 4]
+    points = line if upward else line[::-1]
+
+    across, heights = (
+        reformat_curve(volume.with_voxels(places[..., shown]), points, kind, (8, 12), device=device, view=view).values
+        for shown in (axis, 2)
+    )
+
+    assert np.sign(across[6, 7] - across[6, 0]) == sign
+    assert heights[0, 4] > heights[11, 4]
 
 
-def test_a_slab_lies_across_the_picture(device):
-    """Highest value of a slab of 6 mm: a wire 2 mm into the picture is seen, one 5 mm into it is not."""
+@pytest.fixture(scope="module")
+def two_wires():
+    """Wires of 500 and 900 HU beside the column at i = 20, j = 20: 2 and 5 mm into the picture."""
     voxels = np.zeros((40, 40, 40), np.int16)
-    voxels[:, 20, 18], voxels[:, 24, 15] = 500, 900  # beside the line at i = 20: 2 and 5 mm towards the right
-    volume = Volume(voxels, np.eye(4))
-    line = [(20.0, 20.0, 2.0), (20.0, 20.0, 38.0)]
-    for kind in ("straightened", "stretched"):
-        thick = reformat_curve(volume, line, kind, (21, 36), device=device, thickness=6.0, combine="max", pixel_mm=1.0)
-        thin = reformat_curve(volume, line, kind, (21, 36), device=device, pixel_mm=1.0)
-        assert (thick.values[:, 10] == 500).all() and thick.values.max() == 500
-        assert thin.values.max() == 0
+    voxels[:, 20, 18], voxels[:, 24, 15] = 500, 900
+    return Volume(voxels, np.eye(4)), [(20.0, 20.0, 2.0), (20.0, 20.0, 38.0)]
+
+
+@KINDS
+def test_a_slab_of_6_mm_shows_the_wire_within_3_mm_of_the_picture_alone(device, two_wires, kind):
+    volume, line = two_wires
+    slab = reformat_curve(volume, line, kind, (21, 36), device=device, thickness=6.0, combine="max", pixel_mm=1.0)
+    assert (slab.values[:, 10] == 500).all()
+    assert slab.values.max() == 500
+
+
+@KINDS
+def test_a_picture_without_thickness_shows_no_wire_beside_it(device, two_wires, kind):
+    volume, line = two_wires
+    assert reformat_curve(volume, line, kind, (21, 36), device=device, pixel_mm=1.0).values.max() == 0
 
 
 def test_curved_reformation_equals_its_twin(device):
@@ -142,6 +180,6 @@ def test_curved_reformation_equals_its_twin(device):
         ({"kind": "stretched", "curve": CENTRE + [(0, 20, 0), (0, 40, 0.1)], "view": "left"}, "another view"),
     ],
 )
-def test_bad_input_is_refused(device, arguments, says):
+def test_wrong_arguments_of_a_curved_reformation_are_refused(device, arguments, says):
     with pytest.raises(UsageError, match=says):
         reformat_curve(**{"volume": next(grids()), "curve": centre_line(), "device": device, **arguments})
