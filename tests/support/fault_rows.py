@@ -211,7 +211,10 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     52: ("a kernel that does not build, a kernel file that is missing: refused with the log or the file", ()),
     53: (
         "a volume above the memory of the device: slabs, the same bytes",
-        (SLABS + "test_slabs_of_any_thickness_give_the_same_mesh", SLABS + "test_the_limits_of_the_device_make_slabs"),
+        (
+            SLABS + "test_slabs_of_any_thickness_give_the_same_mesh",
+            SLABS + "test_a_volume_beyond_the_largest_buffer_of_the_device_goes_through_in_slabs",
+        ),
     ),
     54: (
         "an allocation or launch that fails late: halved, tried again, then the CPU, told",
@@ -221,8 +224,8 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
         "2^31 triangles, counters that wrap: 64-bit counts, refused by budget",
         (
             "operators/primitives/test_compaction.py::test_a_total_beyond_32_bits_is_exact",
-            SLABS + "test_counts_over_32_bits_are_refused",
-            SLABS + "test_too_many_words_for_32_bits_make_slabs_too",
+            SLABS + "test_a_slab_with_counts_over_32_bits_is_refused",
+            SLABS + "test_slabs_have_as_many_slices_as_have_fewer_than_2_to_the_32_words",
         ),
     ),
     56: ("a kernel that hangs, a device that is lost: signals work, a time limit, a fresh context, then the CPU", ()),

@@ -42,7 +42,8 @@ CAMERAS = {
 }
 
 
-def block(dtype: Any = np.int16) -> Volume:
+def block_of_fog(dtype: Any = np.int16) -> Volume:
+    """A cube of 50 HU, 20 mm wide around the origin; its fog lets 0.95 of the light through each mm."""
     return Volume(np.full((SIDE, SIDE, SIDE), 50, dtype), AFFINE)
 
 
@@ -64,63 +65,132 @@ def ways(camera: Camera, y: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.clip(plane, enter, leave) - enter, leave - np.clip(plane, enter, leave), plane
 
 
+SCREEN_Y = 3.0
+
+
+class ScreenInFog:
+    """A green screen of some opacity at y = 3 mm in red fog: the picture, the slabs it took, and mm of each ray."""
+
+    def __init__(self, device: Any, camera: Camera, opacity: float, in_slabs: bool, monkeypatch: pytest.MonkeyPatch):
+        self.opacity, self.slabs = opacity, 0
+        self.before, self.behind, self.plane = ways(camera, SCREEN_Y)
+
+        def count_slabs(*arguments: Any) -> Any:
+            for slab in ray_slabs(*arguments):
+                self.slabs += 1
+                yield slab
+
+        monkeypatch.setattr("clrecon.operators.rays.ray_slabs.ray_slabs", count_slabs)
+        look = MeshLook((0.0, 1.0, 0.0), opacity=opacity, lighting=UNSHADED)
+        fog = VolumeLook(FOG, lighting=UNSHADED)
+        self.picture = clrecon.render(
+            [(block_of_fog(), fog), (screen(SCREEN_Y), look)], camera=camera, size=SIZE, device=device,
+            memory=PIXEL_BYTES * SIZE[0] * SIZE[1] + 14_000 if in_slabs else None, background="transparent",
+        )  # fmt: skip
+
+
+@pytest.fixture(
+    params=[
+        pytest.param(row.values, marks=row.marks)
+        for row in daily_rows(3, each_value(CAMERAS, [0.4, 1.0], [False, True]))
+    ],
+    ids=str,
+)
+def screen_in_fog(request: pytest.FixtureRequest, device: Any, monkeypatch: pytest.MonkeyPatch) -> ScreenInFog:
+    name, opacity, in_slabs = request.param
+    return ScreenInFog(device, CAMERAS[name], opacity, in_slabs, monkeypatch)
+
+
 @pytest.mark.seconds
 @pytest.mark.every_device
-@pytest.mark.parametrize(("name", "opacity", "in_slabs"), daily_rows(3, each_value(CAMERAS, [0.4, 1.0], [False, True])))
-def test_fog_before_and_behind_a_screen_is_a_closed_form(
-    device: Any, name: str, opacity: float, in_slabs: bool, monkeypatch: pytest.MonkeyPatch
+def test_fog_before_and_behind_a_screen_is_as_red_and_the_screen_as_green_as_the_way_through_it(
+    screen_in_fog: ScreenInFog,
 ) -> None:
-    camera, y = CAMERAS[name], 3.0
-    before, behind, plane = ways(camera, y)
-    lets = [0.95**length for length in (before, behind)]
-    sure = (before > 0.2) & (behind > 0.2) & (plane > 0.0)
-    look = MeshLook((0.0, 1.0, 0.0), opacity=opacity, lighting=UNSHADED)
-    slabs = []
-
-    def count(*arguments: Any) -> Any:
-        for slab in ray_slabs(*arguments):
-            slabs.append(slab)
-            yield slab
-
-    monkeypatch.setattr("clrecon.operators.rays.ray_slabs.ray_slabs", count)
-    memory = PIXEL_BYTES * SIZE[0] * SIZE[1] + 14_000 if in_slabs else None
-    picture = clrecon.render(
-        [(block(), VolumeLook(FOG, lighting=UNSHADED)), (screen(y), look)], camera=camera, size=SIZE, device=device,
-        memory=memory, background="transparent",
-    )  # fmt: skip
-    passes = 1 if opacity == 1.0 else 2
-    assert len(slabs) >= 2 * passes if in_slabs else len(slabs) == passes
-    red = 1.0 - lets[0] + lets[0] * (1.0 - opacity) * (1.0 - lets[1])
-    green = lets[0] * opacity
-    total = red + green
-    shown = picture.image.astype(float)
-    assert sure.mean() > 0.2
-    assert np.abs(shown[..., 3] - 255.0 * total)[sure].max() <= tolerances.LAYER_LEVELS
-    for channel, share in ((0, red), (1, green)):
-        away = np.abs(shown[..., channel] * shown[..., 3] / 255.0 - 255.0 * share)
-        assert away[sure].max() <= tolerances.LAYER_LEVELS
-    beside = (before + behind == 0.0) & (plane > 0.0)
-    assert np.abs(shown[beside] - (0, 255, 0, 255 * opacity)).max(initial=0.0) <= 0.5
-    if opacity == 1.0 and name == "parallel":
-        deep = (0.0 < before) & (before < 0.02) | (beside & sure)
-        assert np.allclose(picture.depth[deep], plane[deep], atol=1e-3)
-    assert picture.report["objects"] == ["dvr", "mesh"] and picture.mode == "dvr"
+    """By analysis: the fog before, what the screen lets through of the fog behind, and the screen behind the first."""
+    scene, shown = screen_in_fog, screen_in_fog.picture.image.astype(float)
+    through_before, through_behind = 0.95**scene.before, 0.95**scene.behind
+    red = 1.0 - through_before + through_before * (1.0 - scene.opacity) * (1.0 - through_behind)
+    green = through_before * scene.opacity
+    off_edges = (scene.before > 0.2) & (scene.behind > 0.2) & (scene.plane > 0.0)
+    assert off_edges.mean() > 0.2
+    opacity = shown[..., 3] / 255.0
+    for found, expected in (
+        (opacity, red + green), (shown[..., 0] / 255.0 * opacity, red), (shown[..., 1] / 255.0 * opacity, green)
+    ):  # fmt: skip
+        assert 255.0 * np.abs(found - expected)[off_edges].max() <= tolerances.LAYER_LEVELS
 
 
-def test_volume_without_a_mesh_before_it_looks_as_alone(device: Any) -> None:
-    volume, camera = block(), CAMERAS["perspective"]
-    look = VolumeLook(FOG)
-    alone = clrecon.render(volume, look, camera=camera, size=SIZE, device=device, background="transparent")
-    speck = Mesh(np.array(ball(1.0, 12)[0]) + (4.5, -20.0, 6.0), ball(1.0, 12)[1])
-    both = clrecon.render([(volume, look), speck], camera=camera, size=SIZE, device=device, background="transparent")
-    only = clrecon.render(speck, camera=camera, size=SIZE, device=device, background="transparent")
-    hidden = only.image[..., 3] > 0
-    assert 5 < hidden.sum() < 500
-    assert np.abs(both.image.astype(int) - alone.image)[~hidden].max() <= 1
-    assert np.allclose(both.depth[~hidden], alone.depth[~hidden], atol=1e-3, equal_nan=True)
-    assert np.allclose(both.expected_depth[~hidden], alone.expected_depth[~hidden], atol=1e-3, equal_nan=True)
-    assert np.array_equal(both.image[hidden], only.image[hidden])
-    assert np.array_equal(both.depth[hidden], only.depth[hidden])
+@pytest.mark.seconds
+@pytest.mark.every_device
+def test_a_screen_beside_fog_has_its_own_colour_and_opacity(screen_in_fog: ScreenInFog) -> None:
+    scene = screen_in_fog
+    beside = (scene.before + scene.behind == 0.0) & (scene.plane > 0.0)
+    off = np.abs(scene.picture.image[beside] - (0, 255, 0, 255 * scene.opacity))
+    assert off.max(initial=0.0) <= 0.5
+
+
+@pytest.mark.seconds
+@pytest.mark.every_device
+def test_a_scene_takes_a_pass_over_the_volume_for_an_opaque_screen_and_two_for_a_translucent_one(
+    screen_in_fog: ScreenInFog, request: pytest.FixtureRequest
+) -> None:
+    passes = 1 if screen_in_fog.opacity == 1.0 else 2
+    _, _, in_slabs = request.node.callspec.params["screen_in_fog"]
+    assert screen_in_fog.slabs >= 2 * passes if in_slabs else screen_in_fog.slabs == passes
+
+
+def test_depth_of_an_opaque_screen_beside_or_hardly_in_fog_is_its_own(
+    device: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = ScreenInFog(device, CAMERAS["parallel"], 1.0, False, monkeypatch)
+    beside = (scene.before + scene.behind == 0.0) & (scene.plane > 0.0)
+    hardly_in = (scene.before > 0.0) & (scene.before < 0.02)
+    clear = beside | hardly_in
+    assert clear.any()
+    assert np.allclose(scene.picture.depth[clear], scene.plane[clear], atol=tolerances.SLICE_DEPTH_MM)
+
+
+def test_report_of_a_scene_names_its_objects_and_its_mode_is_that_of_the_volume(
+    device: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    picture = ScreenInFog(device, CAMERAS["parallel"], 1.0, False, monkeypatch).picture
+    assert picture.report["objects"] == ["dvr", "mesh"]
+    assert picture.mode == "dvr"
+
+
+class SpeckInFog:
+    """Fog alone, a speck of 1 mm alone, and both in one picture; pixels where the speck hides the fog."""
+
+    def __init__(self, device: Any) -> None:
+        camera = CAMERAS["perspective"]
+        vertices, triangles = ball(1.0, 12)
+        speck = Mesh(np.array(vertices) + (4.5, -20.0, 6.0), triangles)
+        fog = block_of_fog(), VolumeLook(FOG)
+        settings: dict[str, Any] = {"camera": camera, "size": SIZE, "device": device, "background": "transparent"}
+        self.fog = clrecon.render(*fog, **settings)
+        self.speck = clrecon.render(speck, **settings)
+        self.both = clrecon.render([fog, speck], **settings)
+        self.hidden = self.speck.image[..., 3] > 0
+        assert 5 < np.count_nonzero(self.hidden) < 500
+
+
+@pytest.fixture(scope="module")
+def speck_in_fog(device: Any) -> SpeckInFog:
+    return SpeckInFog(device)
+
+
+def test_a_volume_beside_a_mesh_looks_as_alone(speck_in_fog: SpeckInFog) -> None:
+    both, alone, beside = speck_in_fog.both, speck_in_fog.fog, ~speck_in_fog.hidden
+    assert np.abs(both.image.astype(int) - alone.image)[beside].max() <= tolerances.RAY_SAME_255
+    for name in ("depth", "expected_depth"):
+        found, expected = getattr(both, name)[beside], getattr(alone, name)[beside]
+        assert np.allclose(found, expected, atol=tolerances.SLICE_DEPTH_MM, equal_nan=True), name
+
+
+def test_an_opaque_mesh_before_a_volume_looks_as_alone(speck_in_fog: SpeckInFog) -> None:
+    both, speck, hidden = speck_in_fog.both, speck_in_fog.speck, speck_in_fog.hidden
+    assert np.array_equal(both.image[hidden], speck.image[hidden])
+    assert np.array_equal(both.depth[hidden], speck.depth[hidden])
 
 
 @pytest.mark.every_device
@@ -130,7 +200,7 @@ def test_slices_before_and_behind_a_mesh_are_blended_in_order(device: Any, name:
     camera, chosen = CAMERAS[name], [2, 7, 12, 17]
     mesh, opacity = screen(1.0), 0.3
     look = SlicesInSpace(chosen, opacity=0.5, window=(0, 100))
-    shown = [(block(), look), (mesh, MeshLook((0, 1, 0), opacity=opacity, lighting=UNSHADED))]
+    shown = [(block_of_fog(), look), (mesh, MeshLook((0, 1, 0), opacity=opacity, lighting=UNSHADED))]
     picture = clrecon.render(shown, camera=camera, size=SIZE, device=device, background="transparent")
     origins, directions = camera.rays(SIZE)
     plane = (1.0 - origins[..., 1]) / directions[..., 1]
@@ -155,80 +225,125 @@ def test_slices_before_and_behind_a_mesh_are_blended_in_order(device: Any, name:
     assert len(np.unique(np.argwhere(order.reshape(5, -1).T == 0)[:, 1])) >= 3  # places of the mesh among the slices
 
 
-def test_points_and_surfaces_hide_and_are_hidden(device: Any) -> None:
-    camera = CAMERAS["parallel"]
+LEFT_POINT, RIGHT_POINT = (-9.0, -20.0, 0.0), (9.0, 20.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def red_points_glass_bone_and_blue_screen(device: Any) -> clrecon.Rendering:
+    """From the front: red points at y = -20, green glass at -10, white bone from -5 to 5, a blue screen at 15, and a
+    red point at 20."""
     voxels = np.zeros((SIDE, SIDE, SIDE), np.int16)
     voxels[5:15, 5:15, 5:15] = 1000
-    solid = Volume(voxels, AFFINE)
-    cloud = PointCloud([(-9.0, -20.0, 0.0), (0.0, -20.0, 0.0), (9.0, 20.0, 0.0)])
-    dots = PointLook(radius_mm=2.0, color="red", lighting=UNSHADED)
-    glass = MeshLook((0, 1, 0), opacity=0.25, lighting=UNSHADED)
-    surface = SurfaceLook(500, color="white", lighting=UNSHADED)
     shown = [
-        (cloud, dots),
-        (screen(-10.0), glass),
-        (solid, surface),
+        (PointCloud([LEFT_POINT, (0.0, -20.0, 0.0), RIGHT_POINT]),
+         PointLook(radius_mm=2.0, color="red", lighting=UNSHADED)),
+        (screen(-10.0), MeshLook((0, 1, 0), opacity=0.25, lighting=UNSHADED)),
+        (Volume(voxels, AFFINE), SurfaceLook(500, color="white", lighting=UNSHADED)),
         (screen(15.0), MeshLook("blue", lighting=UNSHADED)),
-    ]
-    picture = clrecon.render(shown, camera=camera, size=(120, 80), device=device)
-
-    def at(point: tuple[float, float, float]) -> tuple[tuple[int, ...], float]:
-        (column, row), _ = camera.project([point], (120, 80))[0][0], None
-        place = int(row), int(column)
-        return tuple(picture.image[place][:3].tolist()), float(picture.depth[place])
-
-    (red, depth), far = at((-9.0, -20.0, 0.0)), camera.project([(-9.0, -20.0, 0.0)], SIZE)[1][0]
-    assert red == (255, 0, 0) and depth == pytest.approx(far, abs=1e-3)
-    hidden, _ = at((9.0, 20.0, 0.0))
-    assert hidden == (0, 64, 191)  # the blue screen hides the point, the glass is before both
-    bone, depth = at((1.0, -5.0, 2.5))
-    assert bone == (191, 255, 191)
-    assert depth == pytest.approx(camera.project([(1.0, -10.0, 2.5)], SIZE)[1][0], abs=0.5)
-    assert picture.report["objects"] == ["points", "mesh", "surface", "mesh"]
+    ]  # fmt: skip
+    return clrecon.render(shown, camera=CAMERAS["parallel"], size=(120, 80), device=device)
 
 
-def test_cameras_fit_all_objects(device: Any) -> None:
-    volume, inside = block(), Mesh(*ball(5.0, 10))
-    outside = Mesh(np.array(ball(5.0, 10)[0]) + (80.0, 0.0, 0.0), ball(5.0, 10)[1])
-    alone = clrecon.render(volume, VolumeLook(FOG), size=SIZE, device=device)
-    both = clrecon.render([(volume, VolumeLook(FOG)), inside], size=SIZE, device=device)
-    assert both.camera == alone.camera
-    wide = clrecon.render([(volume, VolumeLook(FOG)), outside], size=SIZE, device=device)
-    assert wide.camera is not None
-    pixels, _ = wide.camera.project([(85.0, 0.0, 0.0), (-10.0, 0.0, 0.0)], SIZE)
+def color_and_depth(picture: clrecon.Rendering, place: tuple[float, float, float]) -> tuple[tuple[int, ...], float]:
+    """Of the pixel where the camera projects a place."""
+    pixels, _ = CAMERAS["parallel"].project([place], (120, 80))
+    column, row = pixels[0].astype(int)
+    return tuple(picture.image[row, column, :3].tolist()), float(picture.depth[row, column])
+
+
+def depth_of(place: tuple[float, float, float]) -> float:
+    return float(CAMERAS["parallel"].project([place], SIZE)[1][0])
+
+
+def test_a_point_before_all_is_seen_at_its_depth(red_points_glass_bone_and_blue_screen: clrecon.Rendering) -> None:
+    color, depth = color_and_depth(red_points_glass_bone_and_blue_screen, LEFT_POINT)
+    assert color == (255, 0, 0)
+    assert depth == pytest.approx(depth_of(LEFT_POINT), abs=tolerances.SLICE_DEPTH_MM)
+
+
+def test_a_point_behind_a_screen_is_hidden_and_the_screen_seen_through_glass(
+    red_points_glass_bone_and_blue_screen: clrecon.Rendering,
+) -> None:
+    color, _ = color_and_depth(red_points_glass_bone_and_blue_screen, RIGHT_POINT)
+    assert color == (0, round(0.25 * 255), round(0.75 * 255))
+
+
+def test_bone_is_seen_through_glass_whose_depth_comes_first(
+    red_points_glass_bone_and_blue_screen: clrecon.Rendering,
+) -> None:
+    color, depth = color_and_depth(red_points_glass_bone_and_blue_screen, (1.0, -5.0, 2.5))
+    assert color == (round(0.75 * 255), 255, round(0.75 * 255))
+    assert depth == pytest.approx(depth_of((1.0, -10.0, 2.5)), abs=0.5)
+
+
+def test_report_of_a_scene_lists_its_objects_in_their_order(
+    red_points_glass_bone_and_blue_screen: clrecon.Rendering,
+) -> None:
+    assert red_points_glass_bone_and_blue_screen.report["objects"] == ["points", "mesh", "surface", "mesh"]
+
+
+def test_camera_of_a_scene_with_a_mesh_within_its_volume_is_that_of_the_volume(device: Any) -> None:
+    fog = block_of_fog(), VolumeLook(FOG)
+    alone = clrecon.render(*fog, size=SIZE, device=device)
+    assert clrecon.render([fog, Mesh(*ball(5.0, 10))], size=SIZE, device=device).camera == alone.camera
+
+
+def test_camera_of_a_scene_sees_a_mesh_beside_its_volume_and_the_volume(device: Any) -> None:
+    vertices, triangles = ball(5.0, 10)
+    beside = Mesh(np.array(vertices) + (80.0, 0.0, 0.0), triangles)
+    camera = clrecon.render([(block_of_fog(), VolumeLook(FOG)), beside], size=SIZE, device=device).camera
+    assert camera is not None
+    ends = [(80.0 + 5.0, 0.0, 0.0), (-0.5 * SIDE, 0.0, 0.0)]
+    pixels, _ = camera.project(ends, SIZE)
     assert ((pixels > 0.0) & (pixels < SIZE)).all()
 
 
 def test_pictures_of_one_scene_are_the_same_each_time_and_from_the_device(device: Any) -> None:
-    with ScenePictures([(block(), VolumeLook(FOG)), (Mesh(*ball(5.0, 10)), MeshLook())], device=device) as pictures:
+    with ScenePictures(
+        [(block_of_fog(), VolumeLook(FOG)), (Mesh(*ball(5.0, 10)), MeshLook())], device=device
+    ) as pictures:
         one = pictures.take(CAMERAS["parallel"], SIZE)
         other = pictures.take(CAMERAS["inside"], SIZE)
         again = pictures.take(CAMERAS["parallel"], SIZE)
         assert pictures.device is device
     assert one.image.tobytes() == again.image.tobytes() != other.image.tobytes()
-    resident = clrecon.DeviceVolume(block(), device=device)
+    resident = clrecon.DeviceVolume(block_of_fog(), device=device)
     with ScenePictures([(resident, VolumeLook(FOG)), (Mesh(*ball(5.0, 10)), MeshLook())], device=device) as pictures:
         assert pictures.take(CAMERAS["parallel"], SIZE).image.tobytes() == one.image.tobytes()
 
 
-def test_what_cannot_be_shown_together_is_refused(device: Any) -> None:
-    mesh, volume = Mesh(*ball(5.0, 10)), block()
-    for shown, text in (
+BALL, FOG_VOLUME = Mesh(*ball(5.0, 10)), block_of_fog()
+
+
+@pytest.mark.parametrize(
+    ("shown", "text"),
+    [
         ([], "at least one object"),
-        ([(volume, clrecon.Projection("mip")), mesh], "not mode mip"),
-        ([(mesh, VolumeLook())], "a Mesh has the style MeshLook"),
-        ([(volume, VolumeLook()), (volume, SlicesInSpace())], "2 volumes"),
-        ([(mesh, "red")], "in a pair"),
-        ([(mesh, MeshLook(), 3)], "in a pair"),
-        ([mesh, "left"], "not str"),
+        ([(FOG_VOLUME, clrecon.Projection("mip")), BALL], "not mode mip"),
+        ([(BALL, VolumeLook())], "a Mesh has the style MeshLook"),
+        ([(FOG_VOLUME, VolumeLook()), (FOG_VOLUME, SlicesInSpace())], "2 volumes"),
+        ([(BALL, "red")], "in a pair"),
+        ([(BALL, MeshLook(), 3)], "in a pair"),
+        ([BALL, "left"], "not str"),
         ([PointCloud(np.zeros((0, 3)))], "no points"),
         ([Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))], "no triangles"),
-    ):
-        with pytest.raises(UsageError, match=text):
-            clrecon.render(shown, device=device)
+    ],
+    ids=["nothing", "mode of values", "style of a volume", "two volumes", "a colour for a style", "three in a pair",
+         "text", "no points", "no triangles"],
+)  # fmt: skip
+def test_objects_that_cannot_be_shown_together_are_refused(device: Any, shown: list[Any], text: str) -> None:
+    with pytest.raises(UsageError, match=text):
+        clrecon.render(shown, device=device)
+
+
+@pytest.mark.parametrize(("style", "options"), [((MeshLook(),), {}), ((), {"color": "red"})], ids=["style", "keyword"])
+def test_a_style_beside_a_list_of_objects_is_refused(
+    device: Any, style: tuple[Any, ...], options: dict[str, Any]
+) -> None:
     with pytest.raises(UsageError, match="its own style"):
-        clrecon.render([mesh], MeshLook(), device=device)
-    with pytest.raises(UsageError, match="its own style"):
-        clrecon.render([mesh], color="red", device=device)
+        clrecon.render([BALL], *style, **options, device=device)
+
+
+def test_a_scene_without_room_for_its_triangles_is_refused(device: Any) -> None:
     with pytest.raises(DeviceError, match="triangles"):
-        clrecon.render([(volume, VolumeLook(FOG)), mesh], size=SIZE, memory=1000, device=device)
+        clrecon.render([(FOG_VOLUME, VolumeLook(FOG)), BALL], size=SIZE, memory=1000, device=device)

@@ -30,7 +30,7 @@ def overlay_slices(resident, camera, size, *, background=None, **look):
     return operator.overlay_slices(resident, SlicesInSpace(**look), Shot(camera, size, background))
 
 
-def assert_twin(device, volume, camera, slices, clip=None, opacity=0.4, lowest=-300.0, **settings):
+def assert_overlay_equals_twin(device, volume, camera, slices, clip=None, opacity=0.4, lowest=-300.0, **settings):
     style = SlicesInSpace(slices, opacity=opacity, lowest_hu=lowest, window=WINDOW, clip=clip, **settings)
     found = operator.overlay_slices(DeviceVolume(volume, device=device), style, Shot(camera, SIZE))
     rgba, depth = overlay_twin(volume, camera, SIZE, style)
@@ -49,68 +49,97 @@ def assert_twin(device, volume, camera, slices, clip=None, opacity=0.4, lowest=-
 @pytest.mark.parametrize("grid", GRIDS)
 def test_slice_overlay_equals_its_twin(device, grid, perspective):
     volume = make_volume(blobs, grid, dtype=np.int16)
-    assert_twin(device, volume, look(volume, (0.4, 0.8, -0.7), 14.0, perspective), [1, 4, 7, 12])
+    assert_overlay_equals_twin(device, volume, look(volume, (0.4, 0.8, -0.7), 14.0, perspective), [1, 4, 7, 12])
 
 
 def test_slices_from_below_behind_a_clip_plane_equal_the_twin(device):
     volume = make_volume(blobs, "uneven")
     clip = Clip.plane(centre_of(volume), (0.5, 0.4, 1.0))
-    assert_twin(device, volume, look(volume, (0.3, -0.6, 0.8), 14.0), [2, 3, 9, 14, 15], clip)
+    assert_overlay_equals_twin(device, volume, look(volume, (0.3, -0.6, 0.8), 14.0), [2, 3, 9, 14, 15], clip)
 
 
-def test_a_camera_between_the_slices_sees_them_on_both_sides(device):
+def test_a_camera_between_bright_upper_and_dark_lower_slices_sees_both_as_the_twin(device):
     volume = make_volume(lambda p: 100.0 + 20.0 * p[:, 2], "even", 22.0, np.int16)
     centre = centre_of(volume) + (0.0, 0.0, 0.4)
     camera = Camera(tuple(centre), tuple(centre + (0.0, 1.0, 0.0)), (0, 0, 1), view_angle=120.0)
-    found = assert_twin(device, volume, camera, [3, 9, 15, 21], opacity=1.0)
+    found = assert_overlay_equals_twin(device, volume, camera, [3, 9, 15, 21], opacity=1.0)
     assert found.image[:20, :, 0].mean() > found.image[-20:, :, 0].mean() + 10  # bright above, dark below
 
 
 @pytest.mark.oclgrind
-def test_few_slices_under_the_simulator_equal_the_twin(device):
+def test_overlay_of_few_slices_equals_the_twin(device):
     volume = make_volume(blobs, "sheared", 6.0, np.int16)
     camera = look(volume, (0.4, 0.8, -0.7), 5.0)
     found = overlay_slices(DeviceVolume(volume, device=device), camera, (12, 9), slices=[0, 2, 4], window=WINDOW)
     rgba, _ = overlay_twin(volume, camera, (12, 9), SlicesInSpace([0, 2, 4], window=WINDOW))
-    assert (np.abs(premultiplied(found.image) - 255.0 * rgba).max(axis=-1) <= 2.0).mean() > 0.95
+    away = np.abs(premultiplied(found.image) - 255.0 * rgba).max(axis=-1)
+    assert (away <= 2.0).mean() > 0.95  # levels of 255; other pixels are at rims of slices
 
 
-@pytest.mark.parametrize("grid", GRIDS)
-@pytest.mark.parametrize("perspective", [False, True])
-def test_a_marked_voxel_is_where_the_camera_projects_it(device, grid, perspective):
+@pytest.fixture(params=[(grid, perspective) for grid in GRIDS for perspective in (False, True)], ids=str)
+def marked_voxels(request, device):
+    """A volume of air with a patch of 3 x 3 voxels of 600 HU in slice k, its place, a camera, and k."""
+    grid, perspective = request.param
     volume = make_volume(lambda p: np.full(len(p), -900.0), grid, 16.0, np.int16)
     k, j, i = volume.voxels.shape[0] // 3, volume.voxels.shape[1] // 2, 5
     voxels = volume.voxels.copy()
     voxels[k, j - 1 : j + 2, i - 1 : i + 2] = 600
-    volume = volume.with_voxels(voxels)
-    camera, size = look(volume, (0.2, 0.5, 0.9), 12.0, perspective), (160, 160)
-    pixels, depths = camera.project(volume.ijk_to_lps([(i, j, k)]), size)
-    found = overlay_slices(DeviceVolume(volume, device=device), camera, size, slices=[0, k, k + 1], opacity=0.7)
-    x, y = pixels[0]
-    assert found.image[int(y), int(x), 3] == round(0.7 * 255)
-    assert abs(found.depth[int(y), int(x)] - depths[0]) < camera.pixel_mm(size)
-    shown = np.argwhere(found.image[..., 3] > 0)
-    assert np.abs(shown.mean(axis=0)[::-1] + 0.5 - pixels[0]).max() < 1.0  # a patch around it, and nothing else
-    others = overlay_slices(DeviceVolume(volume, device=device), camera, size, slices=[0, k + 2])
-    assert not others.image.any() and np.isnan(others.depth).all()
+    camera = look(volume, (0.2, 0.5, 0.9), 12.0, perspective)
+    resident = DeviceVolume(volume.with_voxels(voxels), device=device)
+    return resident, volume.ijk_to_lps([(i, j, k)]), camera, k
 
 
-def test_opacity_adds_up_and_front_hides_back(device):
+def test_marked_voxels_are_seen_alone_where_the_camera_projects_them(marked_voxels):
+    resident, place, camera, k = marked_voxels
+    size = (160, 160)
+    found = overlay_slices(resident, camera, size, slices=[0, k, k + 1], opacity=0.7)
+    pixels, depths = camera.project(place, size)
+    column, row = pixels[0].astype(int)
+    assert found.image[row, column, 3] == round(0.7 * 255)
+    assert found.depth[row, column] == pytest.approx(depths[0], abs=camera.pixel_mm(size))
+    seen = np.argwhere(found.image[..., 3] > 0)
+    assert np.abs(seen.mean(axis=0)[::-1] + 0.5 - pixels[0]).max() < 1.0  # a patch around it, and nothing else
+
+
+def test_overlay_of_other_slices_than_that_of_marked_voxels_is_empty(marked_voxels):
+    resident, _, camera, k = marked_voxels
+    found = overlay_slices(resident, camera, (160, 160), slices=[0, k + 2])
+    assert not found.image.any()
+    assert np.isnan(found.depth).all()
+
+
+@pytest.fixture
+def stair(device):
+    """Slices 2 mm apart with 0, 100 ... 700 HU, and a function that overlays some of them, seen from a side."""
     voxels = np.zeros((8, 12, 12), np.int16) + 100 * np.arange(8, dtype=np.int16)[:, None, None]
     volume = Volume(voxels, np.diag([1.0, 1.0, 2.0, 1.0]))
-    above, below = (look(volume, (0.0, 0.01, z), 4.0) for z in (-1.0, 1.0))
-    settings = {"window": (0.0, 700.0), "lowest_hu": -1000.0}
-    found = overlay_slices(
-        DeviceVolume(volume, device=device), above, (8, 8), slices=[1, 3, 6], opacity=0.25, **settings
-    )
+
+    def overlay(from_side, slices, opacity):
+        camera = look(volume, (0.0, 0.01, -1.0 if from_side == "head" else 1.0), 4.0)
+        return overlay_slices(
+            DeviceVolume(volume, device=device), camera, (8, 8), slices=slices, opacity=opacity,
+            window=(0.0, 700.0), lowest_hu=-1000.0,
+        )  # fmt: skip
+
+    return overlay
+
+
+def test_three_slices_let_through_what_each_lets_through(stair):
+    found = stair("head", [1, 3, 6], opacity=0.25)
     assert (found.image[..., 3] == round(255 * (1.0 - 0.75**3))).all()
-    hidden = [
-        overlay_slices(DeviceVolume(volume, device=device), camera, (8, 8), slices=3, opacity=1.0, **settings)
-        for camera in (above, below)
-    ]
-    assert (hidden[0].image[..., 0] == round(255 * 600 / 700)).all()  # slices 0, 3 and 6, from the head: 6
-    assert (hidden[1].image[..., 0] == 0).all() and (hidden[1].image[..., 3] == 255).all()
-    assert np.abs(hidden[0].depth - (150.0 - 5.0)).max() < 0.1  # slice 6 lies 5 mm above the middle
+
+
+@pytest.mark.parametrize(("from_side", "front"), [("head", 6), ("feet", 0)])
+def test_the_front_slice_of_opaque_ones_hides_the_others(stair, from_side, front):
+    """Every third slice: 0, 3 and 6."""
+    found = stair(from_side, 3, opacity=1.0)
+    assert (found.image[..., 0] == round(255 * 100 * front / 700)).all()
+    assert (found.image[..., 3] == 255).all()
+
+
+def test_depth_of_opaque_slices_is_that_of_the_front_one(stair):
+    """Slice 6 lies 5 mm above the middle, which is 150 mm away."""
+    assert stair("head", 3, opacity=1.0).depth == pytest.approx(np.full((8, 8), 150.0 - 5.0), abs=0.1)  # it leans
 
 
 def test_slices_take_the_colours_of_a_transfer_function(device):
@@ -127,48 +156,62 @@ def test_slices_take_the_colours_of_a_transfer_function(device):
     assert np.abs(found.image[..., :3].astype(int) - (128, 128, 0)).max() <= 1
 
 
-def test_parts_that_fit_the_memory_give_the_same_picture(device):
+@pytest.fixture
+def ten_slices():
+    """A volume, a camera and settings of ten slices; bytes of the picture and of a slice."""
     volume = make_volume(blobs, "oblique", 26.0, np.int16)
-    camera, slices, size = look(volume, (0.4, 0.8, -0.7), 14.0, True), list(range(0, 20, 2)), (16, 12)
+    camera, size = look(volume, (0.4, 0.8, -0.7), 14.0, True), (16, 12)
+    bytes_a_pixel = 44
+    return volume, camera, size, list(range(0, 20, 2)), bytes_a_pixel * size[0] * size[1], volume.voxels[0].nbytes
+
+
+def test_slices_that_do_not_fit_together_give_the_same_picture(device, ten_slices):
+    volume, camera, size, slices, picture_bytes, slice_bytes = ten_slices
+    memory = picture_bytes + 3 * slice_bytes
+    assert memory < 10 * slice_bytes
     whole = overlay_slices(DeviceVolume(volume, device=device), camera, size, slices=slices)
-    picture, one = 44 * size[0] * size[1], volume.voxels[0].nbytes
-    assert picture + 3 * one < 10 * one
-    parts = overlay_slices(DeviceVolume(volume, device=device, memory=picture + 3 * one), camera, size, slices=slices)
+    parts = overlay_slices(DeviceVolume(volume, device=device, memory=memory), camera, size, slices=slices)
     assert np.array_equal(whole.image, parts.image)
     assert np.array_equal(whole.depth, parts.depth, equal_nan=True)
+
+
+def test_an_overlay_without_room_for_a_slice_is_refused(device, ten_slices):
+    volume, camera, size, slices, picture_bytes, _ = ten_slices
     with refused(DeviceError, "slices"):
-        overlay_slices(DeviceVolume(volume, device=device, memory=picture), camera, size, slices=slices)
+        overlay_slices(DeviceVolume(volume, device=device, memory=picture_bytes), camera, size, slices=slices)
 
 
-def test_slices_that_are_seen_edge_on_are_warned_of(device):
+@pytest.mark.parametrize(("view", "warned"), [("anterior", True), ((30, 20), False)], ids=["edge-on", "slanted"])
+def test_slices_that_are_seen_edge_on_are_warned_of(device, view, warned):
     volume = make_volume(blobs, "even", 8.0, np.int16)
-    camera = Camera.fit(volume, "anterior")
-    assert "edge-on" in overlay_slices(DeviceVolume(volume, device=device), camera, (8, 8)).report["warnings"][0]
-    assert not overlay_slices(DeviceVolume(volume, device=device), Camera.fit(volume, (30, 20)), (8, 8)).report[
-        "warnings"
-    ]
+    found = overlay_slices(DeviceVolume(volume, device=device), Camera.fit(volume, view), (8, 8))
+    assert ["edge-on" in text for text in found.report["warnings"]] == [True] * warned
 
 
+@pytest.mark.parametrize("in_scene", [False, True], ids=["alone", "in a scene"])
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_slices_show_without_a_view_and_in_a_scene_too(device, axis):
+def test_slices_without_a_view_are_seen_at_a_slant(device, axis, in_scene):
     """Slices across each axis of the patient, all tissue: edge-on from the front, unless they are coronal."""
     affine = np.diag([2.0, 2.0, 2.0, 1.0])
     affine[:3, :3] = np.roll(affine[:3, :3], axis, axis=1)
     volume = Volume(np.full((16, 16, 16), 100, np.int16), affine)
-    for shown in (volume, [(volume, SlicesInSpace())]):
-        style = {} if shown is not volume else {"mode": "slices"}
-        picture = clrecon.render(shown, size=(64, 64), device=device, **style)
-        assert not [text for text in picture.report["warnings"] if "edge-on" in text]
-        assert np.isfinite(picture.depth).mean() > 0.25
-        assert np.allclose(picture.camera.basis().forward, -find_view((30, 30))[0])
+    if in_scene:
+        picture = clrecon.render([(volume, SlicesInSpace())], size=(64, 64), device=device)
+    else:
+        picture = clrecon.render(volume, "slices", size=(64, 64), device=device)
+    assert not [text for text in picture.report["warnings"] if "edge-on" in text]
+    assert np.isfinite(picture.depth).mean() > 0.25
+    assert np.allclose(picture.camera.basis().forward, -find_view((30, 30))[0])
 
 
-def test_slices_are_chosen_evenly_or_by_number():
-    volume = Volume(np.zeros((100, 2, 2), np.int16), np.eye(4))
-    assert choose_slices(volume) == [0, 9, 18, 27, 36, 45, 54, 63, 72, 81, 90, 99]
-    assert choose_slices(volume, 40) == [0, 40, 80]
-    assert choose_slices(volume, [7, 3]) == [3, 7]
-    assert choose_slices(Volume(np.zeros((3, 2, 2), np.int16), np.eye(4))) == [0, 1, 2]
+@pytest.mark.parametrize(
+    ("slices", "given", "chosen"),
+    [(100, None, list(range(0, 100, 9))), (3, None, [0, 1, 2]), (100, 40, [0, 40, 80]), (100, [7, 3], [3, 7])],
+    ids=["twelve by default", "all of few", "every n-th", "listed"],
+)
+def test_slices_are_chosen_evenly_or_by_number(slices, given, chosen):
+    volume = Volume(np.zeros((slices, 2, 2), np.int16), np.eye(4))
+    assert choose_slices(volume, given) == chosen
 
 
 @pytest.mark.parametrize(
@@ -187,7 +230,7 @@ def test_slices_are_chosen_evenly_or_by_number():
         ({"window": (0, 9), "transfer_function": TransferFunction([(0, 0, 0, 0, 0), (1, 1, 1, 1, 1)])}, "not by both"),
     ],
 )
-def test_bad_input_is_refused(device, wrong, says):
+def test_wrong_arguments_of_an_overlay_are_refused(device, wrong, says):
     volume = make_volume(blobs, "even", 8.0, np.int16)
     with pytest.raises(UsageError, match=says):
         overlay_slices(DeviceVolume(volume, device=device), Camera.fit(volume), (8, 8), **wrong)

@@ -43,7 +43,7 @@ CAMERAS = {
 
 
 @pytest.mark.parametrize(("name", "radius"), each_value(CAMERAS, [0.01, 0.4, 2.0]))
-def test_every_pixel_shows_the_point_of_the_twin(device: Any, name: str, radius: float) -> None:
+def test_every_pixel_shows_the_point_and_depth_of_the_twin(device: Any, name: str, radius: float) -> None:
     points, _ = ball(300)
     camera = CAMERAS[name]
     depth, numbers = find_splats(points, camera, SIZE, radius)
@@ -71,7 +71,7 @@ def test_every_pixel_shows_the_point_of_the_twin(device: Any, name: str, radius:
     ],
 )
 @pytest.mark.parametrize("has_normals", [True, False])
-def test_the_light_is_that_of_the_twin(device: Any, has_normals: bool, lighting: Lighting) -> None:
+def test_light_of_points_is_that_of_the_twin(device: Any, has_normals: bool, lighting: Lighting) -> None:
     points, normals = ball(700)
     rng = np.random.default_rng(3)
     colors = rng.integers(0, 256, (len(points), 4)).astype(np.uint8)
@@ -88,22 +88,40 @@ def test_the_light_is_that_of_the_twin(device: Any, has_normals: bool, lighting:
         assert found.shading == ("none" if not lighting.shades else "normals" if has_normals else "depths")
 
 
-def test_disc_of_a_point_covers_its_radius_and_hides_farther_ones(device: Any) -> None:
-    """A disc of 3 mm before a larger one; the nearer hides the other, and of equals the first is seen."""
+@pytest.fixture(scope="module")
+def two_discs(device: Any) -> Any:
+    """Discs of 3 mm at depth 45, two in one place, and 60, to the right; mm of each pixel from the middle."""
     points = np.array([(0, 0, 0), (0, -5, 0), (0, -5, 0), (3.1, 10, 0)], np.float32)
     cloud = PointCloud(points, labels=[7, 3, 5, 1])
     look = PointLook(radius_mm=3.0, lighting=UNSHADED)
     picture = clrecon.render(cloud, look, camera=FRONT, size=(95, 47), device=device)
-    x, y = np.meshgrid(0.5 * (np.arange(95) - 47.0), 0.5 * (23.0 - np.arange(47)))
-    near, far = x * x + y * y <= 9.0, (x - 3.1) ** 2 + y * y <= 9.0
-    assert np.array_equal(picture.depth == 45.0, near)
-    assert np.array_equal(picture.depth == 60.0, far & ~near)
+    x, z = np.meshgrid(0.5 * (np.arange(95) - 47.0), 0.5 * (23.0 - np.arange(47)))
+    return picture, x, z
+
+
+def test_disc_of_a_point_covers_its_radius_and_hides_farther_ones(two_discs: Any) -> None:
+    picture, x, z = two_discs
+    near, far = x * x + z * z <= 3.0**2, (x - 3.1) ** 2 + z * z <= 3.0**2
+    assert np.array_equal(picture.depth == 50.0 - 5.0, near)
+    assert np.array_equal(picture.depth == 50.0 + 10.0, far & ~near)
     assert np.isnan(picture.depth[~near & ~far]).all()
-    legend = {entry["label"]: entry for entry in picture.report["legend"]}
-    assert picture.image[23, 47, :3].tobytes().hex() == legend[3]["color"][1:]
-    assert picture.image[23, 55, :3].tobytes().hex() == legend[1]["color"][1:]
-    assert {entry["points"] for entry in legend.values()} == {1}
-    assert picture.expected_depth is picture.depth and picture.values is None
+
+
+def test_first_of_points_in_one_place_is_seen_in_the_colour_of_the_legend(two_discs: Any) -> None:
+    picture, _, _ = two_discs
+    color_of = {entry["label"]: entry["color"] for entry in picture.report["legend"]}
+    middle, right = picture.image[23, 47, :3], picture.image[23, 55, :3]
+    assert "#" + middle.tobytes().hex() == color_of[3]
+    assert "#" + right.tobytes().hex() == color_of[1]
+
+
+def test_legend_counts_the_points_of_each_label(two_discs: Any) -> None:
+    assert [entry["points"] for entry in two_discs[0].report["legend"]] == [1, 1, 1, 1]
+
+
+def test_picture_of_points_has_one_depth_and_no_values(two_discs: Any) -> None:
+    assert two_discs[0].expected_depth is two_discs[0].depth
+    assert two_discs[0].values is None
 
 
 def test_points_smaller_than_a_pixel_are_seen(device: Any) -> None:
@@ -115,27 +133,52 @@ def test_points_smaller_than_a_pixel_are_seen(device: Any) -> None:
     assert np.isfinite(picture.depth).mean() < 0.5
 
 
-@pytest.mark.parametrize("name", ["parallel", "perspective"])
-def test_parts_and_permutations_give_the_same_picture(device: Any, name: str) -> None:
-    points, normals = ball(250_000)
-    colors = np.full((250_000, 4), 255, np.uint8)
-    colors[:, 0] = np.arange(250_000) % 256
-    camera, calls = CAMERAS[name], []
-    discs, shot = Discs(points, colors, normals, 0.5, Lighting()), Shot(camera, SIZE)
+MANY = 250_000
+
+
+@pytest.fixture(params=["parallel", "perspective"])
+def many_discs(request: pytest.FixtureRequest) -> Any:
+    """Discs of 250,000 points, and a shot of them."""
+    points, normals = ball(MANY)
+    colors = np.full((MANY, 4), 255, np.uint8)
+    colors[:, 0] = np.arange(MANY) % 256
+    return Discs(points, colors, normals, 0.5, Lighting()), Shot(CAMERAS[request.param], SIZE)
+
+
+PICTURE_BYTES, POINT_BYTES = 16 * SIZE[0] * SIZE[1], 28
+
+
+def test_points_in_parts_give_the_same_picture_and_progress_after_each(device: Any, many_discs: Any) -> None:
+    discs, shot = many_discs
     whole = draw_splats(device, discs, shot)
-    memory = 16 * SIZE[0] * SIZE[1] + 28 * 80_000
+    calls: list[tuple[str, int, int]] = []
+    memory = PICTURE_BYTES + POINT_BYTES * 80_000
     parts = draw_splats(device, discs, shot._replace(progress=lambda *call: calls.append(call)), memory=memory)
     assert (whole.parts, parts.parts) == (1, 4)
-    assert parts.image.tobytes() == whole.image.tobytes() and parts.depth.tobytes() == whole.depth.tobytes()
-    assert calls[0] == ("points", 0, 750_000) and calls[-1] == ("points", 750_000, 750_000)
-    order = np.random.default_rng(5).permutation(250_000)
-    other = draw_splats(device, Discs(points[order], colors[order], normals[order], 0.5, Lighting()), shot)
-    assert other.image.tobytes() == whole.image.tobytes()
+    assert parts.image.tobytes() == whole.image.tobytes()
+    assert parts.depth.tobytes() == whole.depth.tobytes()
+    passes = 3
+    assert calls[0] == ("points", 0, passes * MANY)
+    assert calls[-1] == ("points", passes * MANY, passes * MANY)
+
+
+def test_permuted_points_give_the_same_picture(device: Any, many_discs: Any) -> None:
+    discs, shot = many_discs
+    points, normals = ball(MANY)
+    order = np.random.default_rng(5).permutation(MANY)
+    colors = np.full((MANY, 4), 255, np.uint8)
+    colors[:, 0] = np.arange(MANY) % 256
+    permuted = draw_splats(device, Discs(points[order], colors[order], normals[order], 0.5, Lighting()), shot)
+    assert permuted.image.tobytes() == draw_splats(device, discs, shot).image.tobytes()
+
+
+def test_points_without_room_beside_their_picture_are_refused(device: Any, many_discs: Any) -> None:
+    discs, shot = many_discs
     with refused(DeviceError, "points"):
-        draw_splats(device, discs, shot, memory=16 * SIZE[0] * SIZE[1] + 1000)
+        draw_splats(device, discs, shot, memory=PICTURE_BYTES + 1000)
 
 
-def test_a_cloud_far_away_looks_the_same(device: Any) -> None:
+def test_a_cloud_far_from_the_origin_looks_the_same(device: Any) -> None:
     points, normals = ball()
     near = clrecon.render(PointCloud(points, normals), size=SIZE, view=(20, 30), radius_mm=0.5, device=device)
     away = PointCloud(points.astype(np.float64) + 1e5, normals)
@@ -155,25 +198,35 @@ def colors_of_four(device: Any, **look: Any) -> tuple[list[tuple[int, ...]], dic
     return [tuple(picture.image[23, at, :3].tolist()) for at in (11, 19, 27, 35)], picture.report
 
 
-def test_points_are_grey_by_hu(device: Any) -> None:
+def test_points_are_grey_by_their_hu_within_the_window(device: Any) -> None:
+    """0, 100, 200 and 300 HU in a window of 0 to 200."""
     colors, report = colors_of_four(device, color_by="hu", window=(0, 200))
-    assert colors == [(0,) * 3, (128,) * 3, (255,) * 3, (255,) * 3] and report["window_hu"] == (0.0, 200.0)
+    assert colors == [(0,) * 3, (128,) * 3, (255,) * 3, (255,) * 3]
+    assert report["window_hu"] == (0.0, 200.0)
+
+
+NOISE_GREY, KEPT_GREY = (112,) * 3, (160,) * 3
 
 
 def test_points_have_the_colours_of_their_labels_and_noise_is_grey(device: Any) -> None:
-    colors, report = colors_of_four(device)
-    assert report["color_by"] == "label" and colors[1] == colors[3] != colors[2] and colors[0] == (112,) * 3
-    assert [(e["label"], e["name"], e["points"]) for e in report["legend"]] == [
-        (-1, "noise", 1),
-        (0, None, 2),
-        (2, "sheet", 1),
-    ]
+    (noise, first, sheet, second), report = colors_of_four(device)
+    assert report["color_by"] == "label"
+    assert noise == NOISE_GREY
+    assert first == second != sheet
 
 
-def test_kept_points_are_grey_beside_removed_ones(device: Any) -> None:
-    colors, report = colors_of_four(device, color_by="removed")
-    assert colors[1] == colors[3] == (160,) * 3 and colors[2] not in ((160,) * 3, (112,) * 3)
-    assert [e["name"] for e in report["legend"]] == [None, "kept", "sheet"]
+def test_legend_of_labels_has_their_numbers_names_and_points(device: Any) -> None:
+    _, report = colors_of_four(device)
+    legend = [(entry["label"], entry["name"], entry["points"]) for entry in report["legend"]]
+    assert legend == [(-1, "noise", 1), (0, None, 2), (2, "sheet", 1)]
+
+
+def test_kept_points_are_grey_beside_coloured_removed_ones(device: Any) -> None:
+    """Label 0 stands for points that are kept, others for the reasons of removal."""
+    (_, first_kept, removed, second_kept), report = colors_of_four(device, color_by="removed")
+    assert first_kept == second_kept == KEPT_GREY
+    assert removed not in (KEPT_GREY, NOISE_GREY)
+    assert [entry["name"] for entry in report["legend"]] == [None, "kept", "sheet"]
 
 
 def test_points_have_the_one_colour_that_is_given(device: Any) -> None:
@@ -188,7 +241,8 @@ def test_points_without_labels_are_coloured_by_hu_if_they_have_some(device: Any,
 def test_legend_names_the_largest_labels_and_counts_the_rest(device: Any) -> None:
     many = PointCloud(np.repeat(FOUR, 10, axis=0), labels=np.arange(40))
     report = clrecon.render(many, size=SIZE, device=device).report
-    assert len(report["legend"]) == MOST_NAMED and report["legend_left_out"] == 40 - MOST_NAMED
+    assert len(report["legend"]) == MOST_NAMED
+    assert report["legend_left_out"] == 40 - MOST_NAMED
 
 
 def test_labels_as_far_apart_as_32_bits_are_told_apart(device: Any) -> None:
@@ -196,49 +250,80 @@ def test_labels_as_far_apart_as_32_bits_are_told_apart(device: Any) -> None:
     assert [entry["points"] for entry in wide.report["legend"]] == [1, 2, 1]
 
 
-def test_clipped_points_do_not_show(device: Any) -> None:
+@pytest.fixture(scope="module")
+def ball_cloud() -> PointCloud:
     points, normals = ball()
-    cloud = PointCloud(points, normals, hu=points[:, 0])
-    cut = Clip.plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-    found = clrecon.render(cloud, camera=FRONT, size=SIZE, radius_mm=0.5, clip=cut, device=device)
-    own = cloud.select(points[:, 2] >= 0.0)
+    return PointCloud(points, normals, hu=points[:, 0])
+
+
+def test_picture_of_a_clipped_cloud_is_that_of_the_points_that_are_kept(device: Any, ball_cloud: PointCloud) -> None:
+    upper_half = Clip.plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    found = clrecon.render(ball_cloud, camera=FRONT, size=SIZE, radius_mm=0.5, clip=upper_half, device=device)
+    kept = ball_cloud.select(ball_cloud.points[:, 2] >= 0.0)
     window = found.report["window_hu"]
-    alone = clrecon.render(own, camera=FRONT, size=SIZE, radius_mm=0.5, window=window, device=device)
+    alone = clrecon.render(kept, camera=FRONT, size=SIZE, radius_mm=0.5, window=window, device=device)
     assert found.image.tobytes() == alone.image.tobytes()
-    nothing = Clip.plane((0.0, 0.0, 99.0), (0.0, 0.0, 1.0))
-    empty = clrecon.render(cloud, camera=FRONT, size=SIZE, clip=nothing, background="red", device=device)
-    assert np.isnan(empty.depth).all() and (empty.image == (255, 0, 0, 255)).all()
 
 
-def test_the_camera_sees_the_whole_cloud(device: Any) -> None:
+def test_picture_of_a_cloud_that_is_clipped_away_is_its_background(device: Any, ball_cloud: PointCloud) -> None:
+    beyond = Clip.plane((0.0, 0.0, 99.0), (0.0, 0.0, 1.0))
+    empty = clrecon.render(ball_cloud, camera=FRONT, size=SIZE, clip=beyond, background="red", device=device)
+    assert np.isnan(empty.depth).all()
+    assert (empty.image == (255, 0, 0, 255)).all()
+
+
+@pytest.mark.parametrize(
+    "place", [{"view": "left"}, {"view": (20, 30), "view_angle": 40.0}, {"view": "superior", "zoom": 0.5}]
+)
+def test_the_camera_sees_the_whole_cloud(device: Any, place: dict[str, Any]) -> None:
     points, _ = ball()
-    for place in ({"view": "left"}, {"view": (20, 30), "view_angle": 40.0}, {"view": "superior", "zoom": 0.5}):
-        camera = clrecon.render(PointCloud(points), size=SIZE, device=device, **place).camera
-        pixels, _ = camera.project(points, SIZE)
-        assert (pixels > 0).all() and (pixels < SIZE).all()
-    flat = cloud_box(PointCloud([(1.0, 2.0, 3.0)]))
-    assert np.allclose(flat.affine[:3, 3], (1.0, 2.0, 3.0)) and min(flat.spacing) > 0.0
-    lone = clrecon.render(PointCloud([(1.0, 2.0, 3.0)]), size=SIZE, device=device)
-    assert np.isfinite(lone.depth).any()
+    camera = clrecon.render(PointCloud(points), size=SIZE, device=device, **place).camera
+    pixels, _ = camera.project(points, SIZE)
+    assert ((0 < pixels) & (pixels < SIZE)).all()
 
 
-def test_what_cannot_be_shown_is_refused(device: Any) -> None:
-    cloud = PointCloud(ball(50)[0])
-    with refused(UsageError, "nothing"):
-        clrecon.render(PointCloud(np.empty((0, 3))), device=device)
-    with refused(UsageError, "color_by", "labels"):
-        clrecon.render(cloud, color_by="removed", device=device)
-    with refused(UsageError, "color_by"):
-        clrecon.render(cloud, color_by="hu", device=device)
-    with refused(UsageError, "point", "cloud"):
-        clrecon.render(cloud, "mip", device=device)
-    volume = clrecon.Volume(np.zeros((4, 4, 4), np.int16), np.eye(4))
-    with refused(UsageError, "volume", "cloud"):
-        clrecon.render(volume, PointLook(), device=device)
+def test_box_of_a_single_point_has_a_size(device: Any) -> None:
+    box = cloud_box(PointCloud([(1.0, 2.0, 3.0)]))
+    assert np.allclose(box.affine[:3, 3], (1.0, 2.0, 3.0))
+    assert min(box.spacing) > 0.0
+
+
+def test_a_single_point_is_seen(device: Any) -> None:
+    assert np.isfinite(clrecon.render(PointCloud([(1.0, 2.0, 3.0)]), size=SIZE, device=device).depth).any()
+
+
+SMALL_CLOUD = PointCloud(ball(50)[0])
+
+
+@pytest.mark.parametrize(
+    ("shown", "style", "options", "facts"),
+    [
+        (PointCloud(np.empty((0, 3))), None, {}, ("nothing",)),
+        (SMALL_CLOUD, None, {"color_by": "removed"}, ("color_by", "labels")),
+        (SMALL_CLOUD, None, {"color_by": "hu"}, ("color_by",)),
+        (SMALL_CLOUD, "mip", {}, ("point", "cloud")),
+        (clrecon.Volume(np.zeros((4, 4, 4), np.int16), np.eye(4)), PointLook(), {}, ("volume", "cloud")),
+    ],
+    ids=["no points", "no labels", "no HU", "mode of volumes", "volume as points"],
+)
+def test_pictures_of_points_that_cannot_be_made_are_refused(
+    device: Any, shown: Any, style: Any, options: dict[str, Any], facts: tuple[str, ...]
+) -> None:
+    with refused(UsageError, *facts):
+        clrecon.render(shown, style, **options, device=device)
+
+
+def test_pictures_of_points_with_no_memory_are_refused(device: Any) -> None:
     with refused(UsageError, "number"):
-        PointPictures(cloud, device=device, memory=0)
-    near = clrecon.render(cloud, camera=FRONT, size=(64, 64), radius_mm=80.0, device=device)
+        PointPictures(SMALL_CLOUD, device=device, memory=0)
+
+
+def test_discs_of_few_points_larger_than_are_drawn_are_warned_of(device: Any) -> None:
+    near = clrecon.render(SMALL_CLOUD, camera=FRONT, size=(64, 64), radius_mm=80.0, device=device)
     assert "are drawn with 128" in near.report["warnings"][-1]
-    large = PointCloud(ball(1_400_000)[0])
+
+
+def test_large_discs_of_many_points_are_refused(device: Any) -> None:
+    many = PointCloud(ball(1_400_000)[0])
     with refused(UsageError, "radius", "zoom", 1_400_000):
-        clrecon.render(large, camera=FRONT, size=(64, 64), radius_mm=80.0, device=device)
+        clrecon.render(many, camera=FRONT, size=(64, 64), radius_mm=80.0, device=device)

@@ -30,7 +30,7 @@ def assert_equals_twin(volume, level, device, **options) -> None:
     assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_CELL_NORMAL
 
 
-def rows_of(vertices: np.ndarray) -> set[bytes]:
+def vertex_bytes(vertices: np.ndarray) -> set[bytes]:
     return {row.tobytes() for row in vertices}
 
 
@@ -47,42 +47,40 @@ def ball(radius: float, size: int = 33) -> Volume:
         1, [("int16", OBLIQUE), ("float32", MIRRORED), ("int16", MIRRORED), ("uint8", OBLIQUE), ("int32", MIRRORED)]
     ),
 )
-def test_surface_of_a_range_equals_its_twin_for_voxel_types(device, dtype, affine):
+@pytest.mark.parametrize(("level", "options"), CASES)
+def test_surface_of_a_range_equals_its_twin_for_voxel_types(device, dtype, affine, level, options):
     """Of whole numbers one of each kind: with a sign, without one, and beyond what float32 holds."""
     volume = random_volume((5, 6, 37), dtype, high=100, affine=affine)
-    for level, options in CASES:
-        assert_equals_twin(volume, level, device, **options)
+    assert_equals_twin(volume, level, device, **options)
 
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("closed", daily(1, [True, False]))
 @pytest.mark.parametrize("shape", SHAPES)
-def test_surface_of_a_range_equals_its_twin_at_word_borders(device, shape, closed):
-    volume = random_volume(shape)
-    assert_equals_twin(volume, (2, 3), device, closed=closed)
-    assert_equals_twin(volume, 3, device, closed=closed, below=True)
+@pytest.mark.parametrize(("level", "options"), [((2, 3), {}), (3, {"below": True})], ids=["range", "below"])
+def test_surfaces_of_a_range_and_below_a_level_equal_their_twin_at_word_borders(device, shape, closed, level, options):
+    assert_equals_twin(random_volume(shape), level, device, closed=closed, **options)
 
 
 @pytest.mark.parametrize("high", daily(2, [3, 12, 2, 6]))
-def test_random_integers_in_every_range_are_sound(device, high):
-    for seed, shape in enumerate([(7, 9, 11), (5, 4, 35)]):
-        volume = random_volume(shape, high=high, seed=seed)
-        for low in range(1, high):
-            assert_sound(extract_isosurface(volume, low, device=device, below=True))
-            assert_sound(extract_isosurface(volume, low, device=device, below=True, topology="trilinear"))
-            assert_sound(extract_isosurface(volume, (low - 0.5, low + 0.5), device=device))
-            assert_sound(extract_isosurface(volume, (low, low + 1), device=device))
+@pytest.mark.parametrize(("seed", "shape"), [(0, (7, 9, 11)), (1, (5, 4, 35))], ids=["short rows", "long rows"])
+def test_surfaces_of_random_integers_below_every_level_and_in_every_range_are_sound(device, high, seed, shape):
+    volume = random_volume(shape, high=high, seed=seed)
+    for low in range(1, high):
+        assert_sound(extract_isosurface(volume, low, device=device, below=True))
+        assert_sound(extract_isosurface(volume, low, device=device, below=True, topology="trilinear"))
+        assert_sound(extract_isosurface(volume, (low - 0.5, low + 0.5), device=device))
+        assert_sound(extract_isosurface(volume, (low, low + 1), device=device))
 
 
-def test_random_floats_in_ranges_are_sound(device):
-    volume = random_volume((7, 8, 40), "float32", 4)
-    for low, high in [(1.0, 2.0), (0.5, 2.0), (1.0, 2.5), (0.0, 1.0)]:
-        assert_sound(extract_isosurface(volume, (low, high), device=device))
+@pytest.mark.parametrize("band", [(1.0, 2.0), (0.5, 2.0), (1.0, 2.5), (0.0, 1.0)])
+def test_surfaces_of_random_floats_in_ranges_are_sound(device, band):
+    assert_sound(extract_isosurface(random_volume((7, 8, 40), "float32", 4), band, device=device))
 
 
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
 @pytest.mark.parametrize("topology", ["separated", "trilinear"])
-def test_surface_below_a_level_is_that_of_the_iso_value_turned_round(device, dtype, topology):
+def test_open_surface_below_a_level_is_that_of_the_iso_value_with_faces_and_normals_reversed(device, dtype, topology):
     volume = random_volume((7, 9, 40), dtype, high=50)
     above = extract_isosurface(volume, 20, device=device, closed=False, topology=topology)
     below = extract_isosurface(volume, 20, device=device, closed=False, topology=topology, below=True)
@@ -91,75 +89,86 @@ def test_surface_below_a_level_is_that_of_the_iso_value_turned_round(device, dty
     assert np.array_equal(below.normals, -above.normals)
 
 
-def test_a_range_has_the_vertices_of_both_its_ends(device):
-    """In a smooth field no edge jumps across the range, so it has all of them."""
-    volume = smooth_volume()
-    mesh = extract_isosurface(volume, (-200, 400), device=device, closed=False)
-    lower = extract_isosurface(volume, -200, device=device, closed=False)
-    upper = extract_isosurface(volume, 401, device=device, closed=False)
-    jumping = len(rows_of(lower.vertices) | rows_of(upper.vertices)) - len(rows_of(mesh.vertices))
-    assert rows_of(mesh.vertices) <= rows_of(lower.vertices) | rows_of(upper.vertices)
-    assert jumping == 0
-    # The lower end faces as the iso value does, the upper end the other way.
-    at = {row.tobytes(): normal for row, normal in zip(mesh.vertices, mesh.normals, strict=True)}
-    assert all(np.array_equal(at[row.tobytes()], n) for row, n in zip(lower.vertices, lower.normals, strict=True))
-    assert all(np.array_equal(at[row.tobytes()], -n) for row, n in zip(upper.vertices, upper.normals, strict=True))
+@pytest.fixture(scope="module")
+def range_and_its_ends(device):
+    """Open surfaces of a smooth field from -200 to 400 HU, and at both ends: no edge jumps across the range."""
+    return [
+        extract_isosurface(smooth_volume(), level, device=device, closed=False) for level in ((-200, 400), -200, 401)
+    ]
 
 
-def test_an_edge_crosses_the_end_that_its_outer_voxel_lies_beyond(device):
-    """Also where the inner voxel is nearer the other end: 110 of 100 to 300 beside 500, and beside 0."""
+def test_a_range_has_the_vertices_of_both_its_ends(range_and_its_ends):
+    mesh, lower, upper = range_and_its_ends
+    assert vertex_bytes(mesh.vertices) == vertex_bytes(lower.vertices) | vertex_bytes(upper.vertices)
+
+
+def test_lower_end_of_a_range_faces_as_the_iso_value_does_and_the_upper_end_the_other_way(range_and_its_ends):
+    mesh, lower, upper = range_and_its_ends
+    normal_at = {row.tobytes(): normal for row, normal in zip(mesh.vertices, mesh.normals, strict=True)}
+    for end, sign in ((lower, 1.0), (upper, -1.0)):
+        found = np.array([normal_at[row.tobytes()] for row in end.vertices])
+        assert np.array_equal(found, sign * end.normals)
+
+
+def test_an_edge_crosses_the_end_of_a_range_that_its_outer_voxel_lies_beyond(device):
+    """Also where the inner voxel is nearer to the other end: 110 of 100 to 300 beside 500, and beside 0."""
     voxels = np.zeros((3, 3, 5), np.int16)
     voxels[1, 1] = (0, 0, 110, 500, 500)
     mesh = extract_isosurface(Volume(voxels, np.eye(4)), (100, 300), device=device)
-    along = mesh.vertices[(mesh.vertices[:, 1:] == 1.0).all(axis=1), 0]
-    assert sorted(along) == pytest.approx([1.0 + 99.5 / 110.0, 2.0 + (300.5 - 110.0) / 390.0], abs=1e-6)
+    along_the_row = mesh.vertices[(mesh.vertices[:, 1:] == 1.0).all(axis=1), 0]
+    from_0_to_110, from_110_to_500 = 1.0 + 99.5 / 110.0, 2.0 + (300.5 - 110.0) / (500 - 110)  # half a HU beyond
+    assert sorted(along_the_row) == pytest.approx([from_0_to_110, from_110_to_500], abs=1e-6)
 
 
-def test_a_shell_between_two_spheres_has_their_volume(device):
+def test_surface_of_a_range_of_depths_of_a_ball_is_a_shell_with_its_volume(device):
     volume = ball(12.0)  # values are the depth under the surface of radius 12
     found = extract_isosurface(volume, (2.0, 7.0), device=device).quality()
     assert found["components"] == 2
     assert found["outward"]
-    truth = 4.0 / 3.0 * np.pi * (10.0**3 - 5.0**3) * 0.7 * 0.5 * 0.9 / 1000.0
-    assert found["volume_ml"] == pytest.approx(truth, rel=0.01)
+    voxel_ml = 0.7 * 0.5 * 0.9 / 1000.0
+    assert found["volume_ml"] == pytest.approx(4.0 / 3.0 * np.pi * (10.0**3 - 5.0**3) * voxel_ml, rel=0.01)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "int16"])
-def test_bodies_below_and_above_a_level_fill_the_box(device, dtype):
+def test_volumes_below_and_above_a_level_add_up_to_that_of_the_box(device, dtype):
     field = 100.0 * np.maximum(ball(10.0).voxels, -2.0)
     volume = Volume(field.astype(dtype), np.diag((0.7, 0.5, 0.9, 1.0)))
     empty = volume.with_voxels(np.full_like(volume.voxels, -200))
-    parts = [
-        extract_isosurface(volume, 100, device=device, below=below).quality()["volume_ml"] for below in (False, True)
-    ]
-    box = extract_isosurface(empty, 100, device=device, below=True).quality()["volume_ml"]
-    assert sum(parts) == pytest.approx(box, rel=1e-5)
-    steps = 33**3 * 0.7 * 0.5 * 0.9 / 1000.0
-    assert box == pytest.approx(steps, rel=2e-3)  # half a voxel beyond the last ones, edges and corners cut off
+
+    def ml(volume, below):
+        return extract_isosurface(volume, 100, device=device, below=below).quality()["volume_ml"]
+
+    assert ml(volume, below=False) + ml(volume, below=True) == pytest.approx(ml(empty, below=True), rel=1e-5)  # float32
 
 
-@pytest.mark.parametrize(("level", "options"), [((2, 3), {}), (3, {"below": True})])
+def test_surface_below_a_level_of_an_empty_volume_ends_half_a_voxel_beyond_it(device):
+    """Edges and corners are cut off."""
+    empty = Volume(np.full((33, 33, 33), -200, np.int16), np.diag((0.7, 0.5, 0.9, 1.0)))
+    box_ml = extract_isosurface(empty, 100, device=device, below=True).quality()["volume_ml"]
+    assert box_ml == pytest.approx(33**3 * 0.7 * 0.5 * 0.9 / 1000.0, rel=2e-3)
+
+
+@pytest.mark.parametrize(("level", "options"), [((2, 3), {}), (3, {"below": True})], ids=["range", "below"])
 @pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
-def test_slabs_of_any_thickness_give_the_same_mesh(device, dtype, level, options):
+@pytest.mark.parametrize("slices", [1, 2, 3, 5])
+def test_slabs_of_any_thickness_give_the_same_surface_of_a_range(device, dtype, level, options, slices):
     volume = random_volume((9, 7, 40), dtype, affine=MIRRORED if dtype == "uint8" else OBLIQUE)
-    expected = extract_isosurface(volume, level, device=device, **options)
-    for slices in (1, 2, 3, 5):
-        mesh = extract_in_slabs(volume, level, device, slices, **options)
-        assert mesh.report["slabs"] == -(-11 // slices)
-        assert_same(mesh, expected)
+    mesh = extract_in_slabs(volume, level, device, slices, **options)
+    assert mesh.report["slabs"] == -(-(9 + 2) // slices)  # with a border at both ends
+    assert_same(mesh, extract_isosurface(volume, level, device=device, **options))
 
 
 @pytest.mark.every_device
-def test_uneven_slices_equal_the_twin(device):
+@pytest.mark.parametrize(("level", "options"), [((30, 60), {}), (40, {"below": True})], ids=["range", "below"])
+def test_surface_of_a_range_in_uneven_slices_equals_the_twin(device, level, options):
     positions = np.array([0.0, 1.0, 1.4, 3.3, 4.0, 6.5])[:, None] * (0.1, 0.2, 0.9)
     affine = np.array([[0.7, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 1.3, 0], [0, 0, 0, 1.0]])
     affine[:3, 2] = (positions[-1] - positions[0]) / 5
     volume = Volume(random_volume((6, 7, 37), high=100).voxels, affine, slice_positions=positions)
-    assert_equals_twin(volume, (30, 60), device)
-    assert_equals_twin(volume, 40, device, below=True)
+    assert_equals_twin(volume, level, device, **options)
 
 
-def test_a_resident_volume_gives_the_same_in_any_order(device):
+def test_surfaces_of_a_resident_volume_are_those_of_the_volume_in_any_order(device):
     volume = smooth_volume()
     asked = [(100, {}), ((-50, 120), {}), (-50, {"below": True}), (100, {}), ((-50, 120), {})]
     with SurfaceExtractor(volume, device=device) as extractor:
@@ -170,30 +179,37 @@ def test_a_resident_volume_gives_the_same_in_any_order(device):
 
 
 @pytest.mark.release
-def test_the_variant_of_gpus_gives_the_same_mesh(device, monkeypatch):
+@pytest.mark.parametrize(("level", "options"), [((-100, 100), {}), (100, {"below": True})], ids=["range", "below"])
+def test_surface_of_a_range_by_the_kernels_of_gpus_equals_the_twin(device, monkeypatch, level, options):
     volume = smooth_volume((9, 11, 75), affine=MIRRORED)
     monkeypatch.setattr(device, "kernel_variants", {**device.kernel_variants, "LANES": "1", "WORDS_PER_ITEM": "1"})
-    assert_equals_twin(volume, (-100, 100), device)
-    assert_equals_twin(volume, 100, device, below=True)
+    assert_equals_twin(volume, level, device, **options)
 
 
-def test_the_scale_of_float_values_does_not_matter(device):
+def test_surface_of_a_range_is_the_same_at_a_large_scale_of_float_values(device):
+    scale = 2.0**80
     voxels = smooth_volume((9, 10, 40)).voxels.astype(np.float32)
-    expected = extract_isosurface(Volume(voxels, OBLIQUE), (-100.0, 100.0), device=device)
-    large = Volume(voxels * np.float32(2.0**80), OBLIQUE)
-    scaled = extract_isosurface(large, (-100 * 2.0**80, 100 * 2.0**80), device=device, closed=False)
-    opened = extract_isosurface(Volume(voxels, OBLIQUE), (-100.0, 100.0), device=device, closed=False)
-    assert np.array_equal(scaled.vertices, opened.vertices)
-    assert np.abs(scaled.normals - opened.normals).max() < 1e-5
-    assert expected.triangle_count > opened.triangle_count
+    expected = extract_isosurface(Volume(voxels, OBLIQUE), (-100.0, 100.0), device=device, closed=False)
+    large = Volume(voxels * np.float32(scale), OBLIQUE)
+    scaled = extract_isosurface(large, (-100 * scale, 100 * scale), device=device, closed=False)
+    assert np.array_equal(scaled.vertices, expected.vertices)
+    assert np.abs(scaled.normals - expected.normals).max() < 1e-5  # float32
 
 
-@pytest.mark.parametrize(("level", "options"), [((-100, 150), {}), (100, {"below": True})])
-def test_distances_are_those_to_the_nearer_end(device, level, options):
+def test_closed_surface_of_a_range_has_more_triangles_than_the_open_one(device):
+    volume = smooth_volume((9, 10, 40))
+    closed, opened = (
+        extract_isosurface(volume, (-100, 100), device=device, closed=closed).triangle_count for closed in (True, False)
+    )
+    assert closed > opened
+
+
+@pytest.mark.parametrize(("level", "options"), [((-100, 150), {}), (100, {"below": True})], ids=["range", "below"])
+def test_vertices_of_a_range_lie_on_the_nearer_end_as_distances_measure_it(device, level, options):
     volume = smooth_volume()
     mesh = extract_isosurface(volume, level, device=device, **options)
     found = measure_iso_distances([mesh], volume, rule_of_report(mesh.report))[0]
-    assert found["vertices_voxel"]["max"] < 1e-3
+    assert found["vertices_voxel"]["max"] < 1e-3  # held off samples, and float32
     assert found["not_found"] < 0.01 * found["samples"]["centres"]
 
 
@@ -208,26 +224,40 @@ def test_distances_are_those_to_the_nearer_end(device, level, options):
         ((100, 300), {"topology": "trilinear"}, "follows one level, a range has two"),
     ],
 )
-def test_what_is_no_range_is_refused(device, level, options, said):
+def test_levels_that_are_no_range_are_refused(device, level, options, said):
     with pytest.raises(UsageError, match=said):
         extract_isosurface(random_volume((3, 4, 5), high=500), level, device=device, **options)
 
 
-def test_a_range_that_holds_nothing_says_the_range_of_the_data(device):
-    volume = random_volume((5, 6, 7))
-    for level in [(8, 9), (-9, -8), (3.2, 3.8), (40_000, 50_000)]:
-        with refused(NoSurfaceError, 0, 5):
-            extract_isosurface(volume, level, device=device)
+SMALL = random_volume((5, 6, 7))  # whole HU from 0 to 5
+
+
+@pytest.mark.parametrize("level", [(8, 9), (-9, -8), (3.2, 3.8), (40_000, 50_000)])
+def test_a_range_without_a_voxel_is_refused_with_the_range_of_the_data(device, level):
+    with refused(NoSurfaceError, 0, 5):
+        extract_isosurface(SMALL, level, device=device)
+
+
+def test_an_open_surface_of_a_range_of_all_voxels_is_refused(device):
     with refused(NoSurfaceError, "voxel", 5):
-        extract_isosurface(volume, (0, 5), device=device, closed=False)
-    assert_sound(extract_isosurface(volume, (0, 5), device=device))
+        extract_isosurface(SMALL, (0, 5), device=device, closed=False)
+
+
+def test_a_closed_surface_of_a_range_of_all_voxels_is_sound(device):
+    assert_sound(extract_isosurface(SMALL, (0, 5), device=device))
+
+
+def test_a_surface_below_the_lowest_value_is_refused(device):
     with refused(NoSurfaceError, 0, "surface"):
-        extract_isosurface(volume, 0, device=device, below=True)
+        extract_isosurface(SMALL, 0, device=device, below=True)
+
+
+def test_a_range_whose_ends_are_one_number_of_float32_is_refused(device):
     with refused(UsageError, "float32"):
         extract_isosurface(random_volume((3, 4, 5), "float32"), (1.0, 1.0 + 1e-12), device=device)
 
 
-def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
+def test_a_device_that_finds_no_surface_of_a_range_where_one_must_be_is_refused(device, monkeypatch):
     def find_nothing(device, slab, *_):
         mask = np.zeros(slab.mask_rows * slab.grid.words, np.uint32)
         extents = np.zeros(2 * slab.mask_rows, np.uint16)
@@ -238,34 +268,49 @@ def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
         extract_isosurface(random_volume((5, 6, 7)), (2, 3), device=device)
 
 
-def test_the_report_says_what_is_inside(device):
-    volume = random_volume((5, 6, 7))
-    names = ("inside", "inside_hu", "inside_levels_hu", "iso_value_hu", "iso_level_hu")
-    expected = [
-        (3, {}, ("above", [3.0, None], [2.5, None], 3.0, 2.5)),
-        (3, {"below": True}, ("below", [None, 3.0], [None, 2.5], 3.0, 2.5)),
-        ((2, 3), {}, ("between", [2.0, 3.0], [1.5, 3.5], None, None)),
-    ]
-    for level, options, facts in expected:
-        report = extract_isosurface(volume, level, device=device, **options).report
-        assert tuple(report[name] for name in names) == facts
+@pytest.mark.parametrize(
+    ("level", "options", "inside", "inside_hu", "inside_levels_hu", "iso_value_hu", "iso_level_hu"),
+    [
+        (3, {}, "above", [3.0, None], [2.5, None], 3.0, 2.5),
+        (3, {"below": True}, "below", [None, 3.0], [None, 2.5], 3.0, 2.5),
+        ((2, 3), {}, "between", [2.0, 3.0], [1.5, 3.5], None, None),
+    ],
+    ids=["above", "below", "between"],
+)
+def test_report_tells_which_hu_are_inside_and_the_levels_half_way_to_the_next_whole_number(
+    device, level, options, inside, inside_hu, inside_levels_hu, iso_value_hu, iso_level_hu
+):
+    report = extract_isosurface(random_volume((5, 6, 7)), level, device=device, **options).report
+    assert (report["inside"], report["inside_hu"]) == (inside, inside_hu)
+    assert report["inside_levels_hu"] == inside_levels_hu
+    assert (report["iso_value_hu"], report["iso_level_hu"]) == (iso_value_hu, iso_level_hu)
 
 
 @pytest.mark.oclgrind
-def test_every_pass_over_a_small_range_equals_the_twin(device):
-    for shape in [(3, 4, 33), (2, 3, 5)]:
-        assert_equals_twin(random_volume(shape), (2, 3), device)
-        assert_equals_twin(random_volume(shape), 3, device, below=True)
+@pytest.mark.parametrize("shape", [(3, 4, 33), (2, 3, 5)], ids=["a word and more", "less than a word"])
+@pytest.mark.parametrize(("level", "options"), [((2, 3), {}), (3, {"below": True})], ids=["range", "below"])
+def test_surface_of_a_range_in_a_small_volume_equals_the_twin(device, shape, level, options):
+    assert_equals_twin(random_volume(shape), level, device, **options)
 
 
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
-def test_an_open_end_of_a_range_is_none(device, dtype):
+def test_a_range_without_an_upper_end_has_the_surface_of_its_lower_end(device, dtype):
     volume = random_volume((5, 6, 37), dtype, high=100)
-    above, up_to = (extract_isosurface(volume, level, device=device) for level in ((40, None), (None, 40)))
-    assert_same(above, extract_isosurface(volume, 40, device=device))
-    beyond = 41 if dtype == "int16" else np.nextafter(np.float32(40), np.float32(np.inf))
-    assert_same(up_to, extract_isosurface(volume, beyond, below=True, device=device))
-    with refused(UsageError, "leaves"):
-        extract_isosurface(volume, (None, None), device=device)
-    with refused(UsageError, "value"):
-        extract_isosurface(volume, (None, 40), below=True, device=device)
+    assert_same(extract_isosurface(volume, (40, None), device=device), extract_isosurface(volume, 40, device=device))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "next_value"), [("int16", 41), ("float32", np.nextafter(np.float32(40), np.float32(np.inf)))]
+)
+def test_a_range_without_a_lower_end_has_the_surface_below_the_next_value(device, dtype, next_value):
+    volume = random_volume((5, 6, 37), dtype, high=100)
+    up_to = extract_isosurface(volume, (None, 40), device=device)
+    assert_same(up_to, extract_isosurface(volume, next_value, below=True, device=device))
+
+
+@pytest.mark.parametrize(
+    ("level", "options", "fact"), [((None, None), {}, "leaves"), ((None, 40), {"below": True}, "value")]
+)
+def test_a_range_without_both_ends_or_below_an_end_is_refused(device, level, options, fact):
+    with refused(UsageError, fact):
+        extract_isosurface(random_volume((5, 6, 37), high=100), level, device=device, **options)

@@ -26,21 +26,21 @@ from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
 @pytest.mark.parametrize("shape", [(9, 7, 40), (2, 3, 70), (20, 9, 33)])
-def test_slabs_of_any_thickness_give_the_same_mesh(device, shape, dtype, closed):
+@pytest.mark.parametrize("slices", [1, 2, 3, 5])
+def test_slabs_of_any_thickness_give_the_same_mesh(device, shape, dtype, closed, slices):
     volume = random_volume(shape, dtype, affine=MIRRORED if dtype == "uint8" else OBLIQUE)
-    expected = extract_isosurface(volume, 3, device=device, closed=closed)
-    for slices in (1, 2, 3, 5):
-        mesh = extract_in_slabs(volume, 3, device, slices, closed)
-        assert mesh.report["slabs"] == -(-(shape[0] + 2 * closed) // slices)
-        assert_same(mesh, expected)
+    mesh = extract_in_slabs(volume, 3, device, slices, closed)
+    with_border = shape[0] + 2 * closed
+    assert mesh.report["slabs"] == -(-with_border // slices)
+    assert_same(mesh, extract_isosurface(volume, 3, device=device, closed=closed))
 
 
-def test_a_single_slice_goes_through_in_slabs_of_one(device):
+def test_a_single_slice_in_slabs_of_one_gives_the_same_mesh(device):
     volume = random_volume((1, 6, 40))
     assert_same(extract_in_slabs(volume, 3, device, 1), extract_isosurface(volume, 3, device=device))
 
 
-def test_a_resident_volume_can_be_asked_for_a_surface_that_does_not_fit_as_a_whole(device, monkeypatch):
+def test_a_resident_volume_gives_the_same_surfaces_in_slabs_and_as_a_whole_in_turn(device, monkeypatch):
     """An open surface fits, a closed one needs a little more: in slabs, and not from the wrong slices."""
     volume = smooth_volume()
     with SurfaceExtractor(volume, device=device) as extractor:
@@ -55,26 +55,28 @@ def test_a_resident_volume_can_be_asked_for_a_surface_that_does_not_fit_as_a_who
 
 
 @pytest.mark.parametrize(("slices", "read"), [(1, 4), (3, 6), (20, 20), (22, 20)])
-def test_slabs_are_planned_by_one_in_the_middle(slices, read):
-    """Of 20 slices with a border those with one voxel slice before and two behind, as far as there are."""
-    volume = smooth_volume((20, 6, 33))
+def test_a_slab_in_the_middle_needs_its_voxels_with_one_slice_before_and_two_behind_and_room_for_a_mesh(slices, read):
+    """Of 20 slices with a border, as far as there are; the whole volume needs no room beside its own mesh."""
+    volume, most_bytes = smooth_volume((20, 6, 33)), 900
     asked: dict[str, Any] = {}
-    limits = SimpleNamespace(total_bytes=8000, buffer_bytes=900)
+    limits = SimpleNamespace(total_bytes=8000, buffer_bytes=most_bytes)
     resident = SimpleNamespace(
         limits=limits, plan=lambda kind, gk, needs, **more: asked.update(more, gk=gk, needs=needs) or 7
     )
     assert plan_slabs(SampleGrid(volume, choose_iso_rule(volume, 100)), resident) == 7
-    assert asked["gk"] == 22 and asked["most"] is None
+    assert (asked["gk"], asked["most"]) == (20 + 2, None)
     needs = asked["needs"](slices)
-    assert needs["volume"] == read * 6 * 33 * 2 and needs.get("mesh") == (None if slices == 22 else 900)
+    assert needs["volume"] == read * 6 * 33 * 2
+    assert needs.get("mesh") == (None if slices == 22 else most_bytes)
 
 
-def test_the_bytes_of_a_surface_are_told(device):
+def test_report_of_a_surface_has_the_bytes_of_volume_mesh_and_scratch(device):
     volume = smooth_volume((9, 10, 33))
     mesh = extract_isosurface(volume, 100, device=device)
     taken = mesh.report["device_bytes"]
-    assert (taken["volume"], taken["output"]) == (5940, 24 * len(mesh.vertices) + 12 * len(mesh.triangles))
-    scratch = Slab(SampleGrid(volume, choose_iso_rule(volume, 100)), 0, 11).scratch()
+    assert taken["volume"] == 9 * 10 * 33 * 2
+    assert taken["output"] == 2 * 3 * 4 * len(mesh.vertices) + 3 * 4 * len(mesh.triangles)
+    scratch = Slab(SampleGrid(volume, choose_iso_rule(volume, 100)), 0, 9 + 2).scratch()
     active = scratch.pop("active words")  # as many as there may be: only those that are crossed are taken
     assert 0 < taken["scratch"] - sum(scratch.values()) <= active
 
@@ -84,23 +86,31 @@ def test_vertices_alone_are_those_of_the_mesh(device, more):
     """At -400 HU much of the border is inside, where it is closed, and other vertices enclose what is below."""
     with SurfaceExtractor(smooth_volume((9, 10, 11)), device=device) as extractor:
         mesh, cloud = extractor.extract(-400, **more), extractor.extract_vertices(-400, **more)
-    assert np.array_equal(cloud.points, mesh.vertices) and np.array_equal(cloud.normals, mesh.normals)
+    assert np.array_equal(cloud.points, mesh.vertices)
+    assert np.array_equal(cloud.normals, mesh.normals)
 
 
-def test_building_and_slices_that_are_done_are_told(device, monkeypatch):
-    """Slices are those of the samples, one beyond the volume at each end."""
+BUILDING = [("build", 0, 1), ("build", 1, 1)]
+
+
+def progress_of_surface(device):
+    """Of a volume of 23 slices, with one beyond it at each end."""
     told: list[tuple[str, int, int]] = []
     volume = smooth_volume((23, 9, 10))
     extract_isosurface(volume, 100, device=device, progress=lambda *step: told.append(step))
-    building = [("build", 0, 1), ("build", 1, 1)]
-    assert told == building
-    told.clear()
+    return told
+
+
+def test_progress_of_a_surface_of_one_slab_tells_building_alone(device):
+    assert progress_of_surface(device) == BUILDING
+
+
+def test_progress_of_a_surface_in_slabs_tells_building_and_the_slices_that_are_done(device, monkeypatch):
     monkeypatch.setattr(extraction, "plan_slabs", lambda *_: 10)
-    extract_isosurface(volume, 100, device=device, progress=lambda *step: told.append(step))
-    assert told == [*building, ("slabs", 10, 25), ("slabs", 20, 25), ("slabs", 25, 25)]
+    assert progress_of_surface(device) == [*BUILDING, ("slabs", 10, 25), ("slabs", 20, 25), ("slabs", 25, 25)]
 
 
-def test_empty_slabs_in_between_do_no_harm(device):
+def test_slabs_without_a_surface_between_others_give_the_same_mesh(device):
     voxels = np.zeros((30, 8, 40), np.int16)
     voxels[3:6, 2:5, 5:9] = voxels[20:24, 3:6, 20:36] = 100
     volume = Volume(voxels, OBLIQUE)
@@ -108,7 +118,7 @@ def test_empty_slabs_in_between_do_no_harm(device):
 
 
 @pytest.mark.every_device
-def test_a_budget_makes_slabs(device):
+def test_a_volume_beyond_the_memory_allowed_goes_through_in_slabs_within_it(device):
     volume = smooth_volume((40, 60, 70))
     expected = extract_isosurface(volume, 100, device=device)
     memory = volume.voxels.nbytes // 2
@@ -118,7 +128,7 @@ def test_a_budget_makes_slabs(device):
     assert_same(mesh, expected)
 
 
-def test_the_limits_of_the_device_make_slabs(device, monkeypatch):
+def test_a_volume_beyond_the_largest_buffer_of_the_device_goes_through_in_slabs(device, monkeypatch):
     volume = smooth_volume((40, 60, 70))
     expected = extract_isosurface(volume, 100, device=device)
     monkeypatch.setattr(device, "max_allocation_bytes", volume.voxels.nbytes // 3)
@@ -127,7 +137,7 @@ def test_the_limits_of_the_device_make_slabs(device, monkeypatch):
     assert_same(mesh, expected)
 
 
-def test_the_forecast_is_what_then_happens(device):
+def test_forecast_of_a_surface_has_the_slabs_and_bytes_that_it_then_takes(device):
     k, j, i = np.indices((40, 60, 70))
     volume = Volume((1000 - 100 * np.hypot(np.hypot(k - 20, j - 30), i - 35)).astype(np.int16), OBLIQUE)
     with SurfaceExtractor(volume, device=device, memory=volume.voxels.nbytes // 2) as extractor:
@@ -140,32 +150,34 @@ def test_the_forecast_is_what_then_happens(device):
     assert taken["scratch"] <= 1.3 * forecast["scratch_bytes"]  # one slice more of the mask
 
 
-def test_a_budget_for_less_than_a_slice_is_refused_before_anything_is_allocated(device, monkeypatch):
+def test_memory_for_less_than_a_slice_is_refused_before_anything_is_allocated(device, monkeypatch):
     monkeypatch.setattr(device_volume.ocl, "upload", lambda *_: pytest.fail("allocated"))
     with refused(DeviceError, 10000, "room"):
         extract_isosurface(smooth_volume((40, 60, 70)), 100, device=device, memory=10_000)
 
 
 @pytest.mark.parametrize("slices", [2, 3, 5])
-def test_a_refusal_says_the_bytes_of_one_slice_with_its_neighbours(device, slices):
+def test_memory_for_less_than_a_slice_is_refused_with_the_bytes_of_one_with_its_neighbours(device, slices):
     """Of an open surface of 33 x 6 samples in a slice: a slice in the middle, or the last of two."""
     volume = smooth_volume((slices, 6, 33))
     read = {2: 2, 3: 2, 5: 4}[slices]  # one before, two behind, where there are so many
     classified, counted = {2: (1, 1), 3: (1, 1), 5: (3, 2)}[slices]
-    words = 2 * 6
-    scratch = 4 * words * classified + 4 * words * counted + 4 * 6 * classified + 12 * 6 * counted + 4 * 6 * counted
-    needed = volume.voxels.itemsize * 6 * 33 * read + scratch + 4 * words
+    rows, words = 6, 2 * 6  # two words hold the 33 samples of a row
+    masks, extents = 4 * words * classified, 4 * rows * classified
+    counts, flags = (4 * words + 3 * 4 * rows) * counted, 4 * rows * counted
+    active = 4 * words
+    needed = volume.voxels.itemsize * rows * 33 * read + masks + extents + counts + flags + active
     with refused(DeviceError, needed):
         extract_isosurface(volume, 100, device=device, memory=100, closed=False)
 
 
 @pytest.mark.parametrize("memory", [0, -1, 1.5, "2", True])
-def test_a_budget_is_a_number_of_bytes(device, memory):
+def test_memory_that_is_no_positive_number_of_bytes_is_refused(device, memory):
     with refused(UsageError, "number"):
         extract_isosurface(smooth_volume(), 100, device=device, memory=memory)
 
 
-def test_a_mesh_over_the_budget_halves_the_slab(device):
+def test_a_mesh_beyond_the_memory_allowed_is_made_in_smaller_slabs_with_a_warning(device):
     """A noisy volume: what is planned for does not hold the mesh of so many slices."""
     volume = random_volume((24, 40, 64), high=2)
     grid = SampleGrid(volume, choose_iso_rule(volume, 1))
@@ -177,7 +189,7 @@ def test_a_mesh_over_the_budget_halves_the_slab(device):
 
 
 @pytest.mark.parametrize("fails", [1, 2, 5])
-def test_memory_that_runs_out_late_halves_the_slab(device, monkeypatch, fails):
+def test_memory_that_runs_out_late_halves_the_slab_with_a_warning_and_gives_the_same_mesh(device, monkeypatch, fails):
     """The driver says at the n-th allocation that there is no more: smaller slabs, a warning, the same mesh."""
     volume = smooth_volume((24, 30, 40))
     expected = extract_isosurface(volume, 100, device=device)
@@ -196,7 +208,7 @@ def test_memory_that_runs_out_late_halves_the_slab(device, monkeypatch, fails):
     assert_same(mesh, expected)
 
 
-def test_memory_that_never_suffices_is_an_error_in_the_end(device, monkeypatch):
+def test_memory_that_runs_out_for_every_slab_is_refused(device, monkeypatch):
     def allocate(*_):
         raise DeviceMemoryError("no room for 1 byte")
 
@@ -205,7 +217,7 @@ def test_memory_that_never_suffices_is_an_error_in_the_end(device, monkeypatch):
         extract_isosurface(smooth_volume((9, 10, 11)), 100, device=device)
 
 
-def test_counts_over_32_bits_are_refused(device, monkeypatch):
+def test_a_slab_with_counts_over_32_bits_is_refused(device, monkeypatch):
     true_scan = cells.enqueue_scan
 
     def scan(*arguments, **options):
@@ -217,7 +229,7 @@ def test_counts_over_32_bits_are_refused(device, monkeypatch):
         extract_isosurface(random_volume((5, 6, 7)), 3, device=device)
 
 
-def test_vertices_of_all_slabs_together_must_fit_32_bits(device, monkeypatch):
+def test_slabs_whose_vertices_together_exceed_32_bits_are_refused(device, monkeypatch):
     """Each slab has few; the sum is refused, as soon as it is reached."""
     true_run = marching_cubes.Emission.run
 
@@ -232,11 +244,11 @@ def test_vertices_of_all_slabs_together_must_fit_32_bits(device, monkeypatch):
         return tuple(Long(array) for array in true_run(*arguments))
 
     monkeypatch.setattr(marching_cubes.Emission, "run", run)
-    with refused(DeviceError, 4294967296, "vertices"):
+    with refused(DeviceError, 2**32, "vertices"):
         extract_in_slabs(random_volume((9, 6, 7)), 3, device, 3)
 
 
-def test_too_many_words_for_32_bits_make_slabs_too(device):
+def test_slabs_have_as_many_slices_as_have_fewer_than_2_to_the_32_words(device):
     class Tall:
         shape_ijk = (40, 2**12, 2**16)
         voxels = np.zeros((1, 1, 1), np.int16)
@@ -256,7 +268,7 @@ def test_too_many_words_for_32_bits_make_slabs_too(device):
 
 
 @pytest.mark.every_device
-def test_a_mapped_file_goes_through_and_leaves_memory(device, tmp_path):
+def test_a_memory_mapped_file_in_slabs_gives_the_same_mesh(device, tmp_path):
     volume = smooth_volume((23, 64, 128))
     np.save(tmp_path / "voxels.npy", volume.voxels)
     mapped = Volume(np.load(tmp_path / "voxels.npy", mmap_mode="r"), volume.affine)
@@ -264,9 +276,9 @@ def test_a_mapped_file_goes_through_and_leaves_memory(device, tmp_path):
 
 
 @pytest.mark.oclgrind
-def test_slabs_stay_within_their_buffers(device):
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("slices", [1, 2])
+def test_slabs_of_a_small_volume_give_the_same_mesh(device, closed, slices):
     volume = random_volume((5, 4, 40))
-    for closed in (True, False):
-        expected = extract_isosurface(volume, 3, device=device, closed=closed)
-        for slices in (1, 2):
-            assert_same(extract_in_slabs(volume, 3, device, slices, closed), expected)
+    expected = extract_isosurface(volume, 3, device=device, closed=closed)
+    assert_same(extract_in_slabs(volume, 3, device, slices, closed), expected)

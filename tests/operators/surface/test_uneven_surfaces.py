@@ -44,25 +44,41 @@ def centre_of(volume: Volume) -> np.ndarray:
     return volume.ijk_to_lps([(np.array(volume.shape_ijk) - 1) / 2])[0]
 
 
-def test_a_sphere_keeps_its_shape_through_a_change_of_feed(device):
-    radius = 10.0
-    volume = make_volume(lambda p: radius - np.linalg.norm(p, axis=1), (66, 50))
-    mesh = extract_isosurface(volume, 0.0, device=device)
-    away = mesh.vertices - centre_of(volume)
-    assert np.abs(np.linalg.norm(away, axis=1) - radius).max() <= tolerances.SPHERE_DISTANCE_FIELD_VOXEL * max(GAPS)
-    quality = mesh.quality()
-    assert quality["closed"] and quality["manifold"] and quality["genus"] == 0
-    exact = 4 / 3 * np.pi * radius**3 / 1000
-    assert exact * 0.96 < quality["volume_ml"] < exact
-    nominal = Volume(volume.voxels, volume.affine)  # the check can fail: evenly spaced slices distort it
-    wrong = extract_isosurface(nominal, 0.0, device=device).vertices - nominal.ijk_to_lps(
-        [(np.array(volume.shape_ijk) - 1) / 2]
-    )
-    assert np.abs(np.linalg.norm(wrong, axis=1) - radius).max() > 0.5
+RADIUS = 10.0
+
+
+@pytest.fixture(scope="module")
+def sphere_in_uneven_slices():
+    """The distance field of a sphere of 10 mm."""
+    return make_volume(lambda p: RADIUS - np.linalg.norm(p, axis=1), (66, 50))
+
+
+def off_sphere(mesh, volume) -> np.ndarray:
+    return np.abs(np.linalg.norm(mesh.vertices - centre_of(volume), axis=1) - RADIUS)
+
+
+def test_surface_of_a_sphere_in_uneven_slices_lies_on_it(device, sphere_in_uneven_slices):
+    mesh = extract_isosurface(sphere_in_uneven_slices, 0.0, device=device)
+    off = off_sphere(mesh, sphere_in_uneven_slices)
+    assert off.max() <= tolerances.SPHERE_DISTANCE_FIELD_VOXEL * max(GAPS)
+
+
+def test_surface_of_a_sphere_in_uneven_slices_is_closed_with_its_volume(device, sphere_in_uneven_slices):
+    """Chords and facets lie inside a sphere."""
+    quality = extract_isosurface(sphere_in_uneven_slices, 0.0, device=device).quality()
+    assert (quality["closed"], quality["manifold"], quality["genus"]) == (True, True, 0)
+    exact_ml = 4 / 3 * np.pi * RADIUS**3 / 1000
+    assert 0.96 * exact_ml < quality["volume_ml"] < exact_ml
+
+
+def test_surface_of_the_same_slices_at_even_places_is_no_sphere(device, sphere_in_uneven_slices):
+    """The tests above can fail."""
+    nominal = Volume(sphere_in_uneven_slices.voxels, sphere_in_uneven_slices.affine)
+    assert off_sphere(extract_isosurface(nominal, 0.0, device=device), nominal).max() > 0.5
 
 
 @pytest.mark.oclgrind
-def test_random_cells_go_through_within_their_bounds(device):
+def test_trilinear_surface_of_a_few_uneven_slices_equals_the_twin(device):
     rng = np.random.default_rng(13)
     volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), (4, 9), GAPS[7:11], dtype=np.int16)
     mesh = extract_isosurface(volume, 25, device=device, topology="trilinear")
@@ -72,7 +88,7 @@ def test_random_cells_go_through_within_their_bounds(device):
 
 
 @pytest.mark.parametrize("topology", ["separated", "trilinear"])
-def test_planes_have_their_places_and_normals_everywhere(device, topology):
+def test_surface_of_a_linear_field_in_uneven_slices_is_a_plane_with_its_normal(device, topology):
     slope = TURN @ np.array([0.35, -0.2, 0.9])
     slope /= np.linalg.norm(slope)
     volume = make_volume(lambda p: -(p @ slope))
@@ -99,17 +115,18 @@ THIN = (*GAPS[:10], 0.002, *GAPS[10:18])
 """With two slices that are hardly apart: rounding takes a good share of that layer, and only of that one."""
 
 
-def test_a_thin_layer_does_not_move_the_surface_in_others(device):
+@pytest.mark.parametrize("share", [0.01, 0.99], ids=["at its lower end", "at its upper end"])
+def test_a_thin_layer_does_not_move_a_plane_in_another_layer(device, share):
     slope = TURN[:, 2]
     volume = make_volume(lambda p: -(p @ slope), gaps=THIN, noise=0.0)
-    for share in (0.01, 0.99):
-        across = (volume.slice_origins()[5] * (1 - share) + volume.slice_origins()[6] * share) @ slope
-        mesh = extract_isosurface(volume, float(centre_of(volume) @ slope - across), device=device, closed=False)
-        assert np.abs(mesh.vertices @ slope - across).max() <= tolerances.LINEAR_FIELD_MM
+    lower, upper = volume.slice_origins()[5:7]
+    height = (lower * (1 - share) + upper * share) @ slope
+    mesh = extract_isosurface(volume, float(centre_of(volume) @ slope - height), device=device, closed=False)
+    assert np.abs(mesh.vertices @ slope - height).max() <= tolerances.LINEAR_FIELD_MM
 
 
 @pytest.mark.parametrize("topology", ["separated", "trilinear"])
-def test_the_twin_has_a_thin_layer_too(device, topology):
+def test_surface_through_a_thin_layer_equals_the_twin(device, topology):
     rng = np.random.default_rng(12)
     volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), (9, 11), THIN[5:15], noise=0.0)
     mesh = extract_isosurface(volume, 25, device=device, topology=topology)
@@ -119,16 +136,16 @@ def test_the_twin_has_a_thin_layer_too(device, topology):
 
 
 @pytest.mark.oclgrind
-def test_slabs_give_the_same_surface_bit_for_bit(device):
+@pytest.mark.parametrize("slices", [1, 2, 3])
+def test_slabs_of_uneven_slices_give_the_same_surface_bit_for_bit(device, slices):
     rng = np.random.default_rng(12)
     shape, gaps = ((4, 9), GAPS[7:11]) if device.is_simulator else ((9, 70), GAPS[5:15])
     volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), shape, gaps, dtype=np.int16)
     whole = extract_isosurface(volume, 10, device=device)
-    for slices in (1, 2, 3):
-        assert_same(extract_in_slabs(volume, 10, device, slices), whole)
+    assert_same(extract_in_slabs(volume, 10, device, slices), whole)
 
 
-def test_distances_to_the_surface_are_right_in_every_layer():
+def test_distances_to_a_plane_in_uneven_slices_are_those_of_analysis():
     slope = TURN @ np.array([0.3, 0.5, 0.8])
     slope /= np.linalg.norm(slope)
     volume = make_volume(lambda p: -(p @ slope))
@@ -142,18 +159,28 @@ def test_distances_to_the_surface_are_right_in_every_layer():
     assert np.abs(distances - np.abs(away[near])).max() <= tolerances.LINEAR_FIELD_MM
 
 
-@pytest.mark.seconds
-def test_labels_lie_where_the_slices_lie(device):
-    radius = 7.0
+@pytest.fixture(scope="module")
+def ball_with_fine_labels(device):
+    """A ball of 7 mm in uneven slices, its surface, and that of its label on an even map of 0.4 mm."""
+    radius, step = 7.0, 0.4
     volume = make_volume(lambda p: 40.0 * (radius - np.linalg.norm(p, axis=1)), (60, 50), dtype=np.int16)
-    plain = extract_isosurface(volume, 0, device=device)
-    # The map is finer than the gaps and even: it is brought to the slices by their own places.
-    affine = np.diag([0.4, 0.4, 0.4, 1.0])
-    affine[:3, 3] = centre_of(volume) - 0.4 * 30
+    affine = np.diag([step, step, step, 1.0])
+    affine[:3, 3] = centre_of(volume) - step * 30
     k, j, i = np.mgrid[:61, :61, :61]
-    inside = np.sqrt((k - 30) ** 2 + (j - 30) ** 2 + (i - 30) ** 2) * 0.4 < radius
-    meshes = extract_labels(volume, LabelMap(inside.astype(np.uint8), affine), 0, device=device)
-    own = next(iter(meshes.values()))
-    assert np.array_equal(own.triangles, plain.triangles)
-    assert np.array_equal(own.vertices, plain.vertices)
-    assert any("growth of the labels" in text for text in own.report["warnings"])
+    inside = np.sqrt((k - 30) ** 2 + (j - 30) ** 2 + (i - 30) ** 2) * step < radius
+    (of_label,) = extract_labels(volume, LabelMap(inside.astype(np.uint8), affine), 0, device=device).values()
+    return extract_isosurface(volume, 0, device=device), of_label
+
+
+@pytest.mark.seconds
+def test_surface_of_a_label_of_an_even_map_is_that_of_the_uneven_slices(ball_with_fine_labels):
+    """The map is finer than the gaps: it is brought to the slices by their own places."""
+    plain, of_label = ball_with_fine_labels
+    assert np.array_equal(of_label.triangles, plain.triangles)
+    assert np.array_equal(of_label.vertices, plain.vertices)
+
+
+@pytest.mark.seconds
+def test_growth_of_labels_in_uneven_slices_is_warned_of(ball_with_fine_labels):
+    _, of_label = ball_with_fine_labels
+    assert any("growth of the labels" in text for text in of_label.report["warnings"])
