@@ -46,7 +46,7 @@ def assert_equal(found, expected, work: str) -> None:
 
 
 @pytest.mark.parametrize(("work", "kind"), daily_rows(6, each_value(WORK, ["buffer", "launch"])))
-def test_whatever_buffer_or_launch_fails_the_result_is_the_same(device, volume, labels, monkeypatch, work, kind):
+def test_result_is_the_same_whichever_buffer_or_launch_fails(device, volume, labels, monkeypatch, work, kind):
     with monkeypatch.context() as patch, DeviceVolume(volume, device=device) as resident:
         counted = Failing(patch, kind, 0)
         expected = WORK[work](resident, labels)
@@ -60,27 +60,29 @@ def test_whatever_buffer_or_launch_fails_the_result_is_the_same(device, volume, 
         assert_equal(found, expected, work)
 
 
-def test_a_failure_is_said_in_the_report(device, volume, monkeypatch):
+@pytest.mark.parametrize(
+    ("fails", "work"),
+    [
+        (1, lambda volume: clrecon.render(volume, "mip", size=SIZE)),
+        (1, lambda volume: clrecon.cut_slice(volume, "coronal", SIZE)),
+        (2, lambda volume: clrecon.extract_isosurface(volume, 100)),
+    ],
+    ids=["mip", "slice", "surface"],
+)
+def test_a_buffer_that_fails_is_warned_of_with_the_slabs_that_follow(device, volume, monkeypatch, fails, work):
     with DeviceVolume(volume, device=device) as resident:
-        for fails, make in (
-            (1, lambda: clrecon.render(resident, "mip", size=SIZE)),
-            (1, lambda: clrecon.cut_slice(resident, "coronal", SIZE)),
-            (2, lambda: clrecon.extract_isosurface(resident, 100)),
-        ):
-            resident.close()
-            with monkeypatch.context() as patch:
-                Failing(patch, "buffer", fails)
-                warnings = make().report["warnings"]
-            assert any("injected: continued with slabs of" in warning for warning in warnings)
+        Failing(monkeypatch, "buffer", fails)
+        warnings = work(resident).report["warnings"]
+    assert any("injected: continued with slabs of" in warning for warning in warnings)
 
 
-def test_a_device_without_any_room_is_an_error_in_the_end(device, volume, labels, monkeypatch):
-    for work, do in WORK.items():
-        with DeviceVolume(volume, device=device) as resident, monkeypatch.context() as patch:
-            Failing(patch, "buffer", 1, 10**6)
-            with refused(DeviceError, "bytes", "injected"):
-                do(resident, labels)
-            assert resident.uploaded_bytes == 0, work
+@pytest.mark.parametrize("work", WORK)
+def test_a_device_without_any_room_is_refused_and_holds_nothing(device, volume, labels, monkeypatch, work):
+    with DeviceVolume(volume, device=device) as resident:
+        Failing(monkeypatch, "buffer", 1, 10**6)
+        with refused(DeviceError, "bytes", "injected"):
+            WORK[work](resident, labels)
+        assert resident.uploaded_bytes == 0
 
 
 def test_a_mesh_a_rendering_and_three_slices_upload_the_volume_once(device, volume):
@@ -94,10 +96,14 @@ def test_a_mesh_a_rendering_and_three_slices_upload_the_volume_once(device, volu
         assert resident.uploaded_bytes == volume.voxels.nbytes
 
 
-def test_slices_alone_upload_what_they_meet_and_not_more_than_twice_the_volume(device, volume):
+def test_one_slice_uploads_less_than_half_of_the_volume(device, volume):
     with DeviceVolume(volume, device=device) as resident:
         clrecon.cut_slice(resident, "axial", SIZE)
         assert resident.uploaded_bytes < volume.voxels.nbytes / 2
+
+
+def test_forty_slices_upload_the_volume_no_more_than_twice_and_keep_it(device, volume):
+    with DeviceVolume(volume, device=device) as resident:
         for offset in np.linspace(-8.0, 8.0, 40):
             clrecon.cut_slice(resident, "axial", SIZE, offset_mm=offset)
         assert resident.uploaded_bytes <= 2 * volume.voxels.nbytes
@@ -105,7 +111,7 @@ def test_slices_alone_upload_what_they_meet_and_not_more_than_twice_the_volume(d
 
 
 @pytest.mark.parametrize("work", WORK)
-def test_a_shared_volume_gives_what_one_of_its_own_does(device, volume, labels, work):
+def test_a_volume_on_which_other_work_was_done_gives_what_a_fresh_one_does(device, volume, labels, work):
     with DeviceVolume(volume, device=device) as own:
         expected = WORK[work](own, labels)
     with DeviceVolume(volume, device=device) as shared:
@@ -125,7 +131,7 @@ def test_a_turntable_of_labels_brings_the_map_to_the_grid_once(device, volume, m
     assert len(calls) == 1
 
 
-def test_kept_buffers_make_room_for_needed_ones(device, volume):
+def test_kept_buffers_make_room_for_a_surface_after_a_picture(device, volume):
     """Enough memory for any of them alone, not for what all would like to keep."""
     voxels = volume.voxels.nbytes
     with DeviceVolume(volume, device=device, memory=3 * voxels) as resident:
@@ -144,7 +150,8 @@ def test_kept_buffers_count_for_the_mesh_of_another_operator(device, volume):
         resident.whole(Stopwatch())
         resident.keep("made up", None, 200_000, object)
         mesh = clrecon.extract_isosurface(resident, 100)
-        assert mesh.report["slabs"] == 1 and not mesh.report["warnings"]
+        assert mesh.report["slabs"] == 1
+        assert not mesh.report["warnings"]
         assert resident.kept_bytes("made up") == 0
 
 
@@ -171,35 +178,43 @@ def test_slices_in_space_keep_to_the_memory_where_the_volume_is_held(device, vol
     assert np.array_equal(found.image, expected.image)
 
 
-def test_a_device_volume_has_its_own_device_and_memory(device, volume):
-    with DeviceVolume(volume, device=device) as resident:
-        for call in (
-            lambda: clrecon.extract_isosurface(resident, 100, device=device),
-            lambda: clrecon.render(resident, memory=10**9),
-            lambda: clrecon.VolumeRenderer(resident, device=device),
-            lambda: clrecon.SurfaceExtractor(resident, memory=10**9),
-            lambda: clrecon.cut_slice(resident, device=device),
-        ):
-            with pytest.raises(UsageError, match="has its device and its memory already"):
-                call()
-    for wrong in (None, volume.voxels):
-        with pytest.raises(UsageError, match="made of a Volume"):
-            DeviceVolume(wrong, device=device)
-    with pytest.raises(UsageError, match="whole number of bytes"):
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda resident, device: clrecon.extract_isosurface(resident, 100, device=device),
+        lambda resident, device: clrecon.render(resident, memory=10**9),
+        lambda resident, device: clrecon.VolumeRenderer(resident, device=device),
+        lambda resident, device: clrecon.SurfaceExtractor(resident, memory=10**9),
+        lambda resident, device: clrecon.cut_slice(resident, device=device),
+    ],
+    ids=["surface", "picture", "renderer", "extractor", "slice"],
+)
+def test_device_or_memory_beside_a_device_volume_is_refused(device, volume, call):
+    with DeviceVolume(volume, device=device) as resident, refused(UsageError, "device", "memory"):
+        call(resident, device)
+
+
+@pytest.mark.parametrize("wrong", [None, np.zeros((2, 3, 4), np.int16)], ids=["none", "array"])
+def test_a_device_volume_of_what_is_no_volume_is_refused(device, wrong):
+    with refused(UsageError, "Volume"):
+        DeviceVolume(wrong, device=device)
+
+
+def test_a_device_volume_with_no_memory_is_refused(device, volume):
+    with refused(UsageError, "bytes"):
         DeviceVolume(volume, device=device, memory=0)
 
 
-def test_halving_is_logged_and_buffers_are_not_pickled(device, volume, monkeypatch, caplog):
-    with (
-        DeviceVolume(volume, device=device) as resident,
-        monkeypatch.context() as patch,
-        caplog.at_level("INFO", "clrecon"),
-    ):
-        Failing(patch, "buffer", 1)
+def test_a_buffer_that_fails_is_logged(device, volume, monkeypatch, caplog):
+    with DeviceVolume(volume, device=device) as resident, caplog.at_level("INFO", "clrecon"):
+        Failing(monkeypatch, "buffer", 1)
         clrecon.render(resident, "mip", size=SIZE)
-        assert any("rays: no room on" in record.getMessage() for record in caplog.records)
-        with refused(TypeError, "DeviceVolume"):
-            pickle.dumps(resident)
+    assert any("rays: no room on" in record.getMessage() for record in caplog.records)
+
+
+def test_pickling_a_device_volume_is_refused(device, volume):
+    with DeviceVolume(volume, device=device) as resident, refused(TypeError, "DeviceVolume"):
+        pickle.dumps(resident)
 
 
 def test_renderers_and_extractors_leave_a_volume_that_was_given_on_the_device(device, volume):
@@ -212,14 +227,14 @@ def test_renderers_and_extractors_leave_a_volume_that_was_given_on_the_device(de
     assert not resident.is_held
 
 
-def test_labels_beside_others_are_not_mixed_up(device, volume, labels):
+def test_a_renderer_shows_each_of_two_label_maps_in_its_own_colours_in_turn(device, volume, labels):
     swapped = LabelMap(np.where(labels.voxels == 1, 2, np.where(labels.voxels == 2, 1, 0)).astype(np.uint8), OBLIQUE)
     colors = {1: (1.0, 0.0, 0.0), 2: (0.0, 0.0, 1.0)}
     with clrecon.VolumeRenderer(volume, device=device) as renderer:
-        looks = [
-            renderer.render(preset="muscle", labels=which, label_colors=colors, size=SIZE)
-            for which in (labels, swapped, labels, swapped)
-        ]
-    seen = [look.image for look in looks]
-    assert np.array_equal(seen[0], seen[2]) and np.array_equal(seen[1], seen[3])
-    assert not np.array_equal(seen[0], seen[1])
+        first, second, first_again, second_again = (
+            renderer.render(preset="muscle", labels=each, label_colors=colors, size=SIZE).image
+            for each in (labels, swapped, labels, swapped)
+        )
+    assert not np.array_equal(first, second)
+    assert np.array_equal(first, first_again)
+    assert np.array_equal(second, second_again)

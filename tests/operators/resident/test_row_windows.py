@@ -66,7 +66,7 @@ def windows(device):
 
 
 @pytest.mark.every_device
-def test_compilers_for_avx2_make_windows(device):
+def test_windows_are_made_by_compilers_that_know_avx2_alone(device):
     """PoCL's does, where it knows the CPU."""
     import pyopencl
 
@@ -79,7 +79,7 @@ def test_compilers_for_avx2_make_windows(device):
 
 
 @pytest.mark.every_device
-def test_a_window_shows_every_pair_of_its_row(windows):
+def test_a_window_mixes_every_pair_of_neighbours_in_its_row_by_its_weight(windows):
     rng = np.random.default_rng(2)
     row = np.concatenate([[-32768, 32767, -32768], rng.integers(-32768, 32768, 13)]).astype(np.int16)
     at = np.stack([rng.permutation(15)[:8] for _ in range(200)]).astype(np.int32)
@@ -91,7 +91,7 @@ def test_a_window_shows_every_pair_of_its_row(windows):
     build_checks(windows).look_at_rows(windows.queue, (len(at),), None, *arrays_d, raw(values_d))
     low, high = row[at].astype(np.float64), row[at + 1].astype(np.float64)
     error = np.abs(download(windows, values, values_d) - (low + part * (high - low)))
-    assert (error <= tolerances.WINDOW_SHARE * np.abs(high - low) + 0.01).all()
+    assert (error <= tolerances.WINDOW_SHARE * np.abs(high - low) + 0.01).all()  # and float32
 
 
 @pytest.mark.seconds
@@ -99,7 +99,9 @@ def test_a_window_shows_every_pair_of_its_row(windows):
     ("columns", "towards", "perspective"),
     daily_rows(3, each_value([14, 16, 17, 40], [ALONG_J, ALONG_K, NEARLY_J], [False, True])),
 )
-def test_pictures_with_and_without_windows_are_one(windows, monkeypatch, columns, towards, perspective):
+def test_pictures_of_random_voxels_are_the_same_with_and_without_windows(
+    windows, monkeypatch, columns, towards, perspective
+):
     volume = noise_volume((24, 20, columns))
     # A pixel is half a voxel, or more voxels lie beside each other than a window has.
     cameras = [look(volume, towards, half_height, perspective=perspective) for half_height in (9.0, 60.0)]
@@ -116,7 +118,7 @@ def test_pictures_with_and_without_windows_are_one(windows, monkeypatch, columns
 
 @pytest.mark.parametrize("towards", [(1.0, 0.0, 0.0), (1.0, 0.02, 0.03), (0.3, 1.0, 0.02), (0.3, 0.02, 1.0)])
 @pytest.mark.parametrize("shape", [(1, 20, 40), (2, 20, 40), (3, 20, 40), (20, 1, 40), (20, 2, 40), (20, 3, 40)])
-def test_no_place_has_all_its_neighbours_in_few_rows_or_slices(windows, monkeypatch, shape, towards):
+def test_pictures_of_few_rows_or_slices_are_the_same_with_and_without_windows(windows, monkeypatch, shape, towards):
     """Inner places lie between the second voxel from each side: of three and fewer there are none."""
     volume = noise_volume(shape)
     view = {"camera": look(volume, towards, 2.0), "size": (32, 32), "lighting": Lighting(), "ray_step": 0.1}
@@ -131,7 +133,7 @@ def test_no_place_has_all_its_neighbours_in_few_rows_or_slices(windows, monkeypa
 
 @pytest.mark.parametrize("slices", [1, 2, 4, 6])
 @pytest.mark.parametrize("towards", [(0.0, 1.0, 0.0), (0.0, 1.0, 0.1), (0.0, 0.3, -1.0)])
-def test_slabs_with_a_single_slice_at_the_end_take_no_sample_of_their_neighbours(windows, monkeypatch, towards, slices):
+def test_slabs_with_a_single_slice_at_the_end_give_the_picture_of_the_whole(windows, monkeypatch, towards, slices):
     volume = noise_volume((13, 20, 40))
     view = {"camera": look(volume, towards, 6.0), "size": (48, 41), "lighting": Lighting(), "ray_step": 0.2}
     whole = DeviceCaster(windows)(volume, "dvr", FUNCTION, **view)

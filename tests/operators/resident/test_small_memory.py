@@ -1,4 +1,4 @@
-"""Row 53: what does not fit the device goes through in slabs, labels and uneven slices too, with the same bytes."""
+"""What does not fit the device goes through in slabs, labels and uneven slices too, with the same bytes."""
 
 from __future__ import annotations
 
@@ -50,19 +50,23 @@ SURFACES: dict[str, Callable] = {
 }
 
 
+@pytest.mark.fault_row(53)
 @pytest.mark.parametrize(("work", "spacing"), each_value(SURFACES, ["uneven", "even"]))
-def test_row_53_small_memory_gives_the_same_bytes(device, volumes, labels, work, spacing):
+def test_surfaces_in_less_memory_have_the_same_bytes_in_slabs_until_memory_is_refused(
+    device, volumes, labels, work, spacing
+):
     """The limit falls until not even one slice or label fits; before that there are slabs."""
-    volume, make = volumes[spacing], SURFACES[work]
+    volume, make_surfaces = volumes[spacing], SURFACES[work]
     if work == "masks" and spacing == "uneven":
         pytest.skip("label maps have a grid of their own")
-    expected = make(volume, labels, device=device)
+    expected = make_surfaces(volume, labels, device=device)
     assert all(mesh.report["slabs"] == 1 for mesh in expected)
     memory = max(sum(mesh.report["device_bytes"].values()) for mesh in expected)
+
     slabs = set()
     for share in (0.95, 0.8, 0.55, 0.4):
         try:
-            found = make(volume, labels, device=device, memory=int(share * memory))
+            found = make_surfaces(volume, labels, device=device, memory=int(share * memory))
         except clrecon.DeviceError as error:
             assert_one_line(error, "memory")
             break
@@ -73,8 +77,9 @@ def test_row_53_small_memory_gives_the_same_bytes(device, volumes, labels, work,
     assert max(slabs) > 1
 
 
+@pytest.mark.fault_row(53)
 @pytest.mark.parametrize("work", ["slice", "thick slice", "cpr"])
-def test_row_53_slices_through_uneven_volumes_are_the_same_in_slabs(device, volumes, work):
+def test_slices_through_uneven_volumes_are_the_same_in_slabs(device, volumes, work):
     with clrecon.DeviceVolume(volumes["uneven"], device=device) as resident:
         expected = WORK[work](resident, None)
     with clrecon.DeviceVolume(

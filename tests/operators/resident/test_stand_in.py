@@ -1,4 +1,4 @@
-"""Rows 54 and 56: a device without room or lost in the middle; the CPU device takes over where no device was named."""
+"""A device without room or lost in the middle; the CPU device takes over where no device was named."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ def gpu(device):
     return pretended_gpu(device)
 
 
+@pytest.mark.fault_row(54)
 @pytest.mark.parametrize(("work", "kind"), daily_rows(3, each_value(WORK, ["launch", "buffer"])))
-def test_row_54_the_cpu_device_takes_over_from_any_buffer_or_launch_on(
+def test_the_cpu_device_takes_over_from_any_buffer_or_launch_on_with_the_same_result(
     device, gpu, volume, labels, monkeypatch, work, kind
 ):
     with DeviceVolume(volume, device=device) as resident:
@@ -59,34 +60,36 @@ def test_row_54_the_cpu_device_takes_over_from_any_buffer_or_launch_on(
             assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
 
 
-def test_row_54_the_warning_names_both_devices_and_the_reason(device, volume, labels, monkeypatch):
-    makers: tuple[Callable, ...] = (
-        lambda gpu: clrecon.extract_isosurface(volume, 100, device=gpu).report,
-        lambda gpu: clrecon.extract_labels(volume, labels, 100, device=gpu)[1].report,
-        lambda gpu: clrecon.extract_label_masks(labels, device=gpu)[1].report,
-        lambda gpu: clrecon.render(volume, "mip", size=SIZE, device=gpu).report,
-        lambda gpu: clrecon.render(volume, "slices", size=SIZE, device=gpu).report,
-        lambda gpu: clrecon.cut_slice(volume, "coronal", SIZE, device=gpu).report,
-    )
-    for make in makers:
-        gpu = pretended_gpu(device)
-        with monkeypatch.context() as patch:
-            Failing(patch, "buffer", 3, NEVER_LAST, label=gpu.label)
-            report = make(gpu)
-        said = [text for text in report["warnings"] if "all was done on" in text]
-        assert len(said) == 1
-        assert said[0].endswith(f"injected: all was done on {device.label} instead of {gpu.label}")
-        assert report["device"] == device.label
+REPORTS: dict[str, Callable] = {
+    "surface": lambda volume, labels, gpu: clrecon.extract_isosurface(volume, 100, device=gpu).report,
+    "labels": lambda volume, labels, gpu: clrecon.extract_labels(volume, labels, 100, device=gpu)[1].report,
+    "masks": lambda volume, labels, gpu: clrecon.extract_label_masks(labels, device=gpu)[1].report,
+    "mip": lambda volume, labels, gpu: clrecon.render(volume, "mip", size=SIZE, device=gpu).report,
+    "slices": lambda volume, labels, gpu: clrecon.render(volume, "slices", size=SIZE, device=gpu).report,
+    "slice": lambda volume, labels, gpu: clrecon.cut_slice(volume, "coronal", SIZE, device=gpu).report,
+}
 
 
-def test_row_54_masks_of_labels_are_the_same_on_the_cpu_device(device, labels, monkeypatch):
+@pytest.mark.fault_row(54)
+@pytest.mark.parametrize("work", REPORTS)
+def test_warning_of_a_device_that_handed_over_names_the_reason_and_both_devices(
+    device, gpu, volume, labels, monkeypatch, work
+):
+    Failing(monkeypatch, "buffer", 3, NEVER_LAST, label=gpu.label)
+    report = REPORTS[work](volume, labels, gpu)
+    (warning,) = [text for text in report["warnings"] if "all was done on" in text]
+    assert warning.endswith(f"injected: all was done on {device.label} instead of {gpu.label}")
+    assert report["device"] == device.label
+
+
+@pytest.mark.fault_row(54)
+@pytest.mark.parametrize("kind", ["buffer", "launch"])
+def test_masks_of_labels_are_the_same_on_the_cpu_device_that_took_over(device, gpu, labels, monkeypatch, kind):
     expected = mesh_arrays(*clrecon.extract_label_masks(labels, device=device).values())
-    gpu = pretended_gpu(device)
-    for kind in ("buffer", "launch"):
-        with monkeypatch.context() as patch:
-            Failing(patch, kind, 12, NEVER_LAST, label=gpu.label)
-            found = mesh_arrays(*clrecon.extract_label_masks(labels, device=gpu).values())
-        assert all(np.array_equal(one, other) for one, other in zip(found, expected, strict=True))
+    Failing(monkeypatch, kind, 12, NEVER_LAST, label=gpu.label)
+    found = mesh_arrays(*clrecon.extract_label_masks(labels, device=gpu).values())
+    for one, other in zip(found, expected, strict=True):
+        assert np.array_equal(one, other)
 
 
 SMALL_WORK: dict[str, Callable] = {
@@ -96,17 +99,23 @@ SMALL_WORK: dict[str, Callable] = {
 }
 
 
+@pytest.mark.fault_row(54)
 @pytest.mark.parametrize("work", SMALL_WORK)
-def test_row_54_a_device_that_is_too_small_for_one_slice_hands_over(device, gpu, volume, work):
+def test_a_device_that_is_too_small_for_one_slice_hands_over(device, gpu, volume, work):
     gpu.memory_bytes = 500
     assert SMALL_WORK[work](volume, device=gpu).report["device"] == device.label
-    gpu = pretended_gpu(device)
-    with refused(DeviceError, 400):  # of the user: no other device helps
+
+
+@pytest.mark.fault_row(54)
+@pytest.mark.parametrize("work", SMALL_WORK)
+def test_memory_of_the_user_below_one_slice_is_refused_without_another_device(gpu, volume, work):
+    with refused(DeviceError, 400):
         SMALL_WORK[work](volume, device=gpu, memory=400)
     assert gpu.handed_over == []
 
 
-def test_row_54_a_named_device_fails_and_names_the_cpu_device(device, gpu, volume, monkeypatch):
+@pytest.mark.fault_row(54)
+def test_a_device_that_the_user_named_fails_and_names_the_cpu_device(device, gpu, volume, monkeypatch):
     gpu.stand_in = None
     Failing(monkeypatch, "buffer", 1, NEVER_LAST, label=gpu.label)
     cpu = max((each for each in list_devices() if each.type == "cpu"), key=lambda each: each.score)
@@ -115,36 +124,55 @@ def test_row_54_a_named_device_fails_and_names_the_cpu_device(device, gpu, volum
     assert str(caught.value).endswith(f"injected; {cpu.label} may do it: device={cpu.index}")
 
 
-def test_row_54_a_cpu_device_never_hands_over(device, volume, monkeypatch):
+@pytest.mark.fault_row(54)
+def test_a_cpu_device_never_hands_over(device, volume, monkeypatch):
     Failing(monkeypatch, "buffer", 1, NEVER_LAST)
     with refused(DeviceMemoryError, "injected"):
         clrecon.extract_isosurface(volume, 100, device=device)
 
 
-def test_row_54_only_a_device_that_nobody_named_has_a_stand_in(device, gpu, monkeypatch):
+@pytest.fixture
+def cpu_and_gpu(device, gpu, monkeypatch):
+    """The only devices are a CPU and a better GPU, and no variable names one."""
     gpu.stand_in = None
-    monkeypatch.setattr("clrecon.opencl.select.list_devices", lambda: [device, gpu])
     monkeypatch.setattr("clrecon.opencl.select.list_devices", lambda: [device, gpu])
     for variable in ("CLRECON_DEVICE", "PYOPENCL_CTX"):
         monkeypatch.delenv(variable, raising=False)
-    for name in (None, "auto", "AUTO"):
-        taken = take_device(name)
-        assert (taken.label, taken.stand_in) == (gpu.label, device)
-        assert taken.context is gpu.context
-    for name in (gpu, "gpu", "pretended"):
-        assert take_device(name).stand_in is None
-    assert take_device(device.index).stand_in is None
-    monkeypatch.setenv("CLRECON_DEVICE", "gpu")
-    assert take_device(None).stand_in is None
-    monkeypatch.setenv("CLRECON_DEVICE", "cpu")
-    assert take_device(None) is device
+    return device, gpu
+
+
+@pytest.mark.fault_row(54)
+@pytest.mark.parametrize("name", [None, "auto", "AUTO"])
+def test_a_device_that_nobody_named_has_the_cpu_device_for_a_stand_in(cpu_and_gpu, name):
+    cpu, gpu = cpu_and_gpu
+    taken = take_device(name)
+    assert (taken.label, taken.stand_in) == (gpu.label, cpu)
+    assert taken.context is gpu.context
+
+
+@pytest.mark.fault_row(54)
+@pytest.mark.parametrize("name", ["gpu", "pretended", "the device itself", "the number of the CPU"])
+def test_a_device_that_is_named_has_no_stand_in(cpu_and_gpu, name):
+    cpu, gpu = cpu_and_gpu
+    given = {"the device itself": gpu, "the number of the CPU": cpu.index}.get(name, name)
+    assert take_device(given).stand_in is None
+
+
+@pytest.mark.fault_row(54)
+@pytest.mark.parametrize("kind", ["gpu", "cpu"])
+def test_a_device_that_the_environment_names_has_no_stand_in(cpu_and_gpu, monkeypatch, kind):
+    monkeypatch.setenv("CLRECON_DEVICE", kind)
+    taken = take_device(None)
+    assert taken.type == kind
+    assert taken.stand_in is None
 
 
 SEVERAL_LAUNCHES = ("surface", "labels", "dvr")
 
 
+@pytest.mark.fault_row(56)
 @pytest.mark.parametrize("work", [*SEVERAL_LAUNCHES, "slices", "slice"])
-def test_row_56_a_lost_device_gets_a_fresh_context_once(device, gpu, volume, labels, monkeypatch, work):
+def test_a_lost_device_gets_a_fresh_context_and_gives_the_same_result(device, gpu, volume, labels, monkeypatch, work):
     with DeviceVolume(volume, device=gpu) as resident:
         expected = WORK[work](resident, labels)
         lost = gpu.context
@@ -157,21 +185,23 @@ def test_row_56_a_lost_device_gets_a_fresh_context_once(device, gpu, volume, lab
     assert all(np.array_equal(one, other, equal_nan=True) for one, other in zip(found, expected, strict=True))
 
 
-def test_row_56_a_device_that_is_lost_again_hands_over_to_the_cpu_device(device, gpu, volume, monkeypatch):
+@pytest.mark.fault_row(56)
+def test_a_device_that_is_lost_again_hands_over_to_the_cpu_device_with_a_warning(device, gpu, volume, monkeypatch):
     Failing(monkeypatch, "launch", 2, NEVER_LAST, label=gpu.label, error=lost_error())
     report = clrecon.extract_isosurface(volume, 100, device=gpu).report
     assert report["device"] == device.label
     assert [text for text in report["warnings"] if "INVALID_COMMAND_QUEUE" in text and "all was done on" in text]
 
 
-def test_row_56_a_lost_device_is_told_in_the_report(device, gpu, volume, monkeypatch):
+@pytest.mark.fault_row(56)
+def test_a_device_that_was_lost_once_is_warned_of(device, gpu, volume, monkeypatch):
     Failing(monkeypatch, "launch", 2, label=gpu.label, error=lost_error())
     report = clrecon.extract_isosurface(volume, 100, device=gpu).report
     assert report["device"] == gpu.label
     assert [text for text in report["warnings"] if "started again with a fresh context" in text]
 
 
-def test_the_stand_in_is_asked_once(device, gpu):
+def test_the_stand_in_of_a_failing_device_is_tried_once_and_the_first_failure_is_raised(device, gpu):
     asked = []
 
     with pytest.raises(DeviceFailedError, match=f"^{re.escape(gpu.label)} fails$"):
