@@ -10,7 +10,7 @@ from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import add_labels, add_levels, describe_volume, mesh_fields
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.options import space_option
+from clrecon.jobs.options import size_option, space_option
 from clrecon.jobs.view import ViewSettings
 from clrecon.system.records import name_schema
 from clrecon.system.text import format_volume
@@ -29,6 +29,8 @@ examples:
   clrecon view CT_FOLDER bone.stl cloud.ply --labels spine.nii.gz --save-as shown.3mf
   clrecon view CT_FOLDER --no-open --port 8000
   clrecon view CT_FOLDER --window
+  clrecon view CT_FOLDER --state shown.view.json
+  clrecon view CT_FOLDER --state shown.view.json --picture shown.png
   clrecon view CT_FOLDER --html page.html
   clrecon view CT_FOLDER --html spine.html --labels spine.nii.gz
   clrecon view bone.stl implant.ply --html both.html --name bone --name implant"""
@@ -45,6 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     shown = parser.add_argument_group("what is shown")
     shown.add_argument("--html", metavar="FILE", help="write a page that shows the inputs: .html", first=True)
+    common.add_picture(shown, "draw what the view begins with into a file: .png, .jpg or .tif")
+    common.add_option(shown, "size", size_option("pixels of the picture"))
     shown.add_argument(
         "--window", action="store_true", help="open a plain window of PyVista instead of the browser", first=True
     )
@@ -76,6 +80,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     _check_faces(options)
     if options.window:
         return _show_window(options, console)
+    if options.picture is not None:
+        return _draw_picture(options, console)
     if options.html is None:
         return _serve(options, _settings(options), console)
     from clrecon.jobs.view.job import write_view
@@ -94,17 +100,23 @@ def _settings(options: argparse.Namespace) -> ViewSettings:
 
 def _check_faces(options: argparse.Namespace) -> None:
     """Refuse options that say two things, or nothing."""
-    if options.window and options.html is not None:
-        raise UsageError("--window opens a window and --html writes a page: ask for one of them")
-    if options.window or options.html is not None:
+    faces = {"--window": options.window, "--html": options.html, "--picture": options.picture}
+    given = [name for name, value in faces.items() if value]
+    if len(given) > 1:
+        raise UsageError(f"{' and '.join(given)} show the inputs in different ways: ask for one of them")
+    if options.state is not None and given in (["--window"], ["--html"]):
+        raise UsageError(f"--state belongs to the view in the browser and to --picture: leave out {given[0]}, or it")
+    if options.size is not None and options.picture is None:
+        raise UsageError("--size is that of the picture: name its file with --picture")
+    if given:
         for name, is_given in (
             ("--port", options.port is not None), ("--no-open", not options.opens), ("--save-as", options.save_as)
         ):  # fmt: skip
             if is_given:
-                raise UsageError(f"{name} belongs to the view in the browser: leave out --window and --html, or it")
+                raise UsageError(f"{name} belongs to the view in the browser: leave out {given[0]}, or it")
     elif options.quiet and not (options.opens or options.json):
         raise UsageError("-q hides the address that is to be opened: leave it out, or --no-open")
-    if options.html is None and options.no_clobber:
+    if options.html is None and options.picture is None and options.no_clobber:
         raise UsageError("a view replaces no file: leave --no-clobber out")
 
 
@@ -131,6 +143,21 @@ def _show_window(options: argparse.Namespace, console: Console) -> int:
             " draws pictures"
         ) from error
     console.result(name_schema("view", {"warnings": warnings}))
+    return 0
+
+
+def _draw_picture(options: argparse.Namespace, console: Console) -> int:
+    from clrecon.viewer.session.opening import draw_view
+
+    warnings, lines = draw_view(
+        options.inputs, _settings(options), options.picture, options.size or (1024, 1024),
+        no_clobber=options.no_clobber, progress=console.progress,
+    )  # fmt: skip
+    console.result(name_schema("view", {"warnings": warnings}))
+    for warning in warnings:
+        console.warn(warning)
+    for line in lines:
+        console.say(f"wrote    {printable(line)}")
     return 0
 
 

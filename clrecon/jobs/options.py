@@ -238,6 +238,19 @@ def mesh_space_option(text: str, group: str = "") -> Any:
     return option("--mesh-space lps|ras", text, group=group, parse=str.lower)
 
 
+def _parse_size(text: str) -> tuple[int, int]:
+    parts = text.lower().split("x")
+    try:
+        width, height = (int(part) for part in (parts if len(parts) == 2 else (*parts, *parts)))
+    except ValueError:
+        raise ValueError(f"{text!r} is no size in pixels: write it as 1024 or 1024x768") from None
+    return width, height
+
+
+def size_option(text: str, **how: Any) -> Any:
+    return option("--size W[xH]", f"{text} (default: 1024x1024)", parse=_parse_size, **how)
+
+
 def label_color_option(text: str) -> Any:
     text = f"set the colour of a label{text}; may be given again"
     return option("--label-color LABEL=COLOUR", text, default=(), parse=parse_label_color, action="append")

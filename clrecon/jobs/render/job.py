@@ -34,6 +34,7 @@ from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.picture import check_float_path, check_image_path, encode_floats
 from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Projection, Style, SurfaceLook, VolumeLook
+from clrecon.rendering.views.camera import describe_camera
 from clrecon.system.arguments import name_parameter
 from clrecon.system.files import allow_open_files
 from clrecon.system.light_dataclass import asdict, dataclass
@@ -47,21 +48,7 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.points import PointCloud
     from clrecon.rendering import Rendering, TransferFunction
-    from clrecon.rendering.views.camera import Camera
     from clrecon.system.files import StagedFile
-
-
-def describe_camera(camera: Camera | None) -> dict[str, Any] | None:
-    """Describe a camera by the arguments of `Camera`, LPS mm; None for a picture without a camera."""
-    if camera is None:
-        return None
-    return {
-        "position_lps_mm": list(camera.position),
-        "focal_point_lps_mm": list(camera.focal_point),
-        "up_lps": list(camera.up),
-        "view_angle_deg": camera.view_angle,
-        "parallel_scale_mm": camera.parallel_scale,
-    }
 
 
 def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]:
@@ -74,7 +61,7 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
         "name": name or None,
         "view": view,
         "size": list(picture.size),
-        "camera": describe_camera(picture.camera),
+        "camera": None if picture.camera is None else describe_camera(picture.camera),
         "pixel_mm": picture.pixel_mm,
         "hit_share": float(hit.mean()) if picture.camera is not None else None,
         "depth_mm": _range(picture.depth[hit]),

@@ -15,7 +15,14 @@ from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.blocks import CROPS, Box, crop_box
 from clrecon.geometry.grid import Grid
-from clrecon.jobs.options import InputSettings, label_color_option, label_map_option, mesh_space_option, view_option
+from clrecon.jobs.options import (
+    InputSettings,
+    label_color_option,
+    label_map_option,
+    mesh_space_option,
+    size_option,
+    view_option,
+)
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import COLORS as COLORS
 from clrecon.rendering.looks.colors import find_color
@@ -52,15 +59,6 @@ _LIGHTS = ("head", "none")
 
 _CALLED = {"light": "lighting", "labels": "labels", "clip_planes": "clip"}
 """Settings that make a field of the style under another name: the name of the setting, and that of the field."""
-
-
-def _parse_size(text: str) -> tuple[int, int]:
-    parts = text.lower().split("x")
-    try:
-        width, height = (int(part) for part in (parts if len(parts) == 2 else (*parts, *parts)))
-    except ValueError:
-        raise ValueError(f"{text!r} is no size in pixels: write it as 1024 or 1024x768") from None
-    return width, height
 
 
 def _parse_views(text: str) -> tuple[str, ...]:
@@ -202,9 +200,7 @@ class RenderSettings(InputSettings):
         "LPS mm at the centre of the picture, also of a slice (default: the centre of what is shown)",
         parse=numbers_reader(3, "is not a place X,Y,Z in LPS mm, such as -12,40,310"),
     )
-    size: tuple[int, int] | None = _camera_option(
-        "--size W[xH]", "pixels of the picture (default: 1024x1024)", parse=_parse_size, first=True
-    )
+    size: tuple[int, int] | None = size_option("pixels of the picture", group="camera", first=True)
     view_angle: float | None = _camera_option(
         "--perspective DEGREES",
         f"perspective of this many degrees from bottom to top ({DEFAULT_VIEW_ANGLE:g} without a number; default:"

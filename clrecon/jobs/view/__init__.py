@@ -31,6 +31,9 @@ class ViewSettings:
         action="append",
     )
     mesh_space: Space | None = mesh_space_option("mesh files that do not name theirs")
+    state: str | None = option(
+        "--state FILE", "begin as a view was saved: a file .view.json of the key s, of the same inputs", first=True
+    )
 
     def __post_init__(self) -> None:
         check_space(self.mesh_space)

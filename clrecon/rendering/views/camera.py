@@ -377,3 +377,14 @@ def rotation_about(axis: ArrayLike, degrees: float) -> Float64Array:
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     radians = np.radians(degrees)
     return np.eye(3) + np.sin(radians) * cross + (1.0 - np.cos(radians)) * cross @ cross
+
+
+def describe_camera(camera: Camera) -> dict[str, Any]:
+    """Return a camera as entries of JSON, by the arguments of `Camera`."""
+    return {
+        "position_lps_mm": list(camera.position),
+        "focal_point_lps_mm": list(camera.focal_point),
+        "up_lps": list(camera.up),
+        "view_angle_deg": camera.view_angle,
+        "parallel_scale_mm": camera.parallel_scale,
+    }

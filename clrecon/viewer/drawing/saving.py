@@ -28,9 +28,11 @@ from clrecon.system.text import count_of, escape_text
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.measures import MEASURE_FORMATS, encode_measures
 from clrecon.viewer.model.objects import ShownCloud, ShownScan
+from clrecon.viewer.model.saved_view import VIEW_FORMAT, encode_view
 from clrecon.viewer.model.state import ViewState
 
 KINDS: dict[str, tuple[str, ...]] = {
+    "view": (VIEW_FORMAT,),
     "picture": tuple(IMAGE_FORMATS),
     "mesh": tuple(FORMATS),
     "cloud": tuple(CLOUD_FORMATS),
@@ -63,7 +65,7 @@ def check_target(path: str | os.PathLike[str], painter: Painter, state: ViewStat
 def free_name(wanted: str | Path) -> Path:
     """Return the wanted name, or where it is taken with the first free number: ``bone-2.nii.gz``."""
     path = Path(wanted)
-    is_double = path.name.lower().endswith((".nii.gz", ".xyz.gz", ".seg.nrrd", ".mrk.json"))
+    is_double = path.name.lower().endswith((".nii.gz", ".xyz.gz", ".seg.nrrd", ".mrk.json", VIEW_FORMAT))
     ends = "".join(path.suffixes[-2:]) if is_double else path.suffix
     stem = path.name.removesuffix(ends)
     number, tried = 1, path
@@ -107,11 +109,14 @@ def save_shown(
             picture = add_scale(picture, scale, MESH_COLORS[state.color_by])
         written = picture.save(path, no_clobber=no_clobber)
         return [f"{name}: picture of {picture.size[0]} x {picture.size[1]} pixels, {_megabytes(written)}"]
-    if kind == "measures":
-        content = encode_measures(state.measures, name, space)
+    if kind in ("measures", "view"):
+        content = encode_view(state, painter.objects)
+        if kind == "measures":
+            content = encode_measures(state.measures, name, space)
         with keep_existing(keep=no_clobber):
             written = replace_file(path, lambda stream: stream.write(content), expected_bytes=len(content))
-        return [f"{name}: {count_of(len(state.measures), 'measure')}, {_megabytes(written)}"]
+        words = "what is shown" if kind == "view" else count_of(len(state.measures), "measure")
+        return [f"{name}: {words}, {_megabytes(written)}"]
     if kind == "volume":
         volume = shown_volume(painter, state, progress)
         ni, nj, nk = volume.shape_ijk

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from time import monotonic
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -346,6 +347,10 @@ class ChangingView:
         self.state = changed
         self.version += 1
 
+    def show_state(self, state: ViewState, words: str) -> None:
+        """Show another state; as one step of undo."""
+        self._change("state", words, **vars(state))
+
     def _change_part(self, part: ShownPart, words: str, kind: str = "part", **changes: Any) -> None:
         changed = replace(part, **changes)
         parts = tuple(changed if each.key == part.key else each for each in self.state.parts)
@@ -373,6 +378,16 @@ class ChangingView:
         if state.clip_box is not None:
             points = np.clip(points, *np.array(state.clip_box))
         return points
+
+
+View = TypeVar("View", bound=ChangingView)
+
+
+def copy_view(view: View) -> View:
+    """Return a copy of a view for trials: its changes are none of the view's."""
+    copied = copy(view)
+    copied._undo = []
+    return copied
 
 
 def checked_numbers(subject: str, *values: Any) -> list[float]:

@@ -88,7 +88,7 @@ def clip_direction(direction: str | Sequence[float]) -> tuple[Point, str]:
     length = float(np.linalg.norm(vector))
     if length < 1e-9:
         raise UsageError("the direction of a clip plane has a length above 0")
-    x, y, z = (vector / length).tolist()
+    x, y, z = (vector if abs(length - 1.0) < 1e-12 else vector / length).tolist()  # a saved one stays as it is
     return (x, y, z), f"{x:.2f}, {y:.2f}, {z:.2f}"
 
 
@@ -141,6 +141,10 @@ class ShownPart:
             "opacity": self.opacity,
             "visible": self.visible,
         }
+
+
+LEAST_ZOOM, MOST_ZOOM = 0.5, 50.0
+"""Of slices, by how they fit."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,10 +11,18 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import choose_level
 from clrecon.jobs.view import ViewSettings
 from clrecon.jobs.view.inputs import check_view_settings, open_inputs
+from clrecon.rendering.pictures.picture import check_image_path
+from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.system.base_classes import Closing
+from clrecon.system.files import check_writable
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.viewer.drawing.painter import Painter
+from clrecon.viewer.drawing.saving import save_shown
+from clrecon.viewer.drawing.shown_meshes import shows_fits
+from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownObject, ShownScan, wrap_inputs
+from clrecon.viewer.model.saved_view import read_view, restore_view
 from clrecon.viewer.session.session import ViewSession
 
 
@@ -43,7 +51,9 @@ class OpenedView(Closing):
         self.said = list(dict.fromkeys(chain(*(each.said for each in self.objects))))
         self._iso_value = choose_iso(self.objects, scan, progress)
         self._space, self._keep_ids = scan.space, scan.keep_ids
+        self._progress = progress
         self._fitted = scan.surface == "cortex" and any(isinstance(each, ShownScan) for each in self.objects)
+        self._saved = None if settings.state is None else read_view(settings.state)
         self.painter = Painter(self.objects, device=scan.device, memory=scan.memory)
 
     def session(self, on_change: Callable[[], None] | None = None) -> ViewSession:
@@ -55,9 +65,23 @@ class OpenedView(Closing):
             keep_ids=self._keep_ids,
             on_change=on_change,
         )
-        if self._fitted:
+        if self._saved is not None:
+            session.restore(self._saved)
+        elif self._fitted:
             session.set_fitted(True)
         return session
+
+    def model(self, aspect: float) -> ViewModel:
+        """Return what a view begins with, with the table taken away where the saved view says so."""
+        model = ViewModel(self.objects, space=self._space, iso_value=self._iso_value)
+        model.set_aspect(aspect)
+        if self._saved is not None:
+            if model.scans and self._saved.get("table_shown") is False:
+                self.painter.remove_table(self._progress)
+            restore_view(self._saved, model)
+        elif self._fitted:
+            model.set_fitted(True)
+        return model
 
     def close(self) -> None:
         self.painter.close()
@@ -70,3 +94,27 @@ def open_view(
     settings = settings or ViewSettings()
     check_view_settings(settings)
     return OpenedView(inputs, settings, progress or ignore_progress)
+
+
+def draw_view(
+    inputs: Sequence[str | Path],
+    settings: ViewSettings,
+    output: str | Path,
+    size: Sequence[int] = (1024, 1024),
+    *,
+    no_clobber: bool = False,
+    progress: Progress = ignore_progress,
+) -> tuple[list[str], list[str]]:
+    """Draw what a view of the inputs begins with, as its key p saves it; return warnings, and lines about the file."""
+    check_image_path(output)
+    load_pillow()
+    with keep_existing(keep=no_clobber):
+        check_writable(output)
+    with open_view(inputs, settings, progress=progress) as view:
+        model, painter = view.model(size[0] / size[1]), view.painter
+        if any(each.kind in ("cluster", "rest") and not each.is_plain for each in model.state.parts):
+            model.take_parts(painter.find_parts(model.state, progress))
+        if shows_fits(model.state):
+            painter.fit_scans(model.state, progress)
+        lines = save_shown(output, painter, model.state, size=size, no_clobber=no_clobber, progress=progress)
+        return view.said, lines

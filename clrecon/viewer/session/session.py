@@ -34,15 +34,12 @@ from clrecon.viewer.model.changes import pan_camera, zoom_camera
 from clrecon.viewer.model.measures import seen_pieces
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownMesh, ShownObject
-from clrecon.viewer.model.state import SCENE, Pick, picture_key
+from clrecon.viewer.model.saved_view import restore_view
+from clrecon.viewer.model.state import LEAST_ZOOM, MOST_ZOOM, SCENE, Pick, picture_key
 from clrecon.viewer.session.commands import check_command
 
 REST_SECONDS = 0.2
 """After the last change until pictures are drawn sharp."""
-
-_LEAST_ZOOM, _MOST_ZOOM = 0.5, 50.0
-"""Of slices, by how they fit."""
-
 
 log = get_logger(__name__)
 
@@ -233,6 +230,15 @@ class ViewSession(Closing):
         if not fitted and "fit" not in self._work.busy:
             self._fit()
 
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Show what a saved view says; table, fit and parts follow in the background."""
+        with self._lock:
+            bare = not saved.get("table_shown", True)
+            restore_view({**saved, "table_shown": not bare or self.painter.knows_table}, self.model)
+            if bare and self.model.scans:
+                self.set_table(False)
+            self.rest()
+
     def find_parts(self, then: Callable[[], None] | None = None) -> None:
         """Find the parts of the scans in the background; `then` is called in its thread with the lock held."""
 
@@ -351,7 +357,7 @@ class ViewSession(Closing):
         frame, (right, up, _) = self.model.state.frame(plane), np.abs(camera.basis())
         reach = camera.half_height() * (up + size[0] / size[1] * right)
         zoom = factor if frame is None else factor * frame.zoom
-        if _LEAST_ZOOM <= zoom <= _MOST_ZOOM:
+        if LEAST_ZOOM <= zoom <= MOST_ZOOM:
             self.model.frame_slice(plane, zoom, camera.focal_point, reach)
 
     def mark_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:

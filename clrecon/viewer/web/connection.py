@@ -249,7 +249,7 @@ class Connection:
         """Serve the browser until it leaves."""
         from aiohttp import WSMsgType
 
-        kinds = ("mesh", "cloud", "volume", "picture") if self._session.model.scans else ("mesh", "cloud", "picture")
+        kinds = ["mesh", "cloud", *["volume" for _ in self._session.model.scans[:1]], "picture", "view"]
         fixed = {**page_words(), "formats": {kind: list(KINDS[kind]) for kind in kinds}, "save_as": self._save_as}
         await self._socket.send_str(json.dumps({"fixed": fixed}))
         tasks = [asyncio.ensure_future(work()) for work in (self._write, self._command)]

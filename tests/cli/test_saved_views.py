@@ -1,0 +1,125 @@
+"""``clrecon view --state`` and ``--picture``: a saved view is opened and drawn again, and wrong options are refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from printed_text import Printer
+
+from clrecon.cli.main import main
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.view import ViewSettings
+from clrecon.proof.phantom import PhantomSettings, write_phantom
+from clrecon.viewer.session.opening import OpenedView, open_view
+from clrecon.viewer.session.session import ViewSession
+
+PATIENCE = 60.0
+"""Seconds for work in the background of a busy machine."""
+
+SIZE = (160, 120)
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A spine of several components."""
+    folder = tmp_path_factory.mktemp("view") / "ct"
+    write_phantom(folder, PhantomSettings(kind="spine", size=(96, 96), slices=40, spacing=(1.6, 1.6, 2.0)))
+    return folder
+
+
+def open_scan(scan: Path, device: Any, state: Path | None = None) -> OpenedView:
+    settings = MeshSettings(device=str(device.index))
+    return open_view([scan], ViewSettings(scan=settings, state=None if state is None else str(state)))
+
+
+def save(session: ViewSession, path: Path) -> None:
+    session.do({"do": "save", "path": str(path), "size": list(SIZE)})
+    assert session.wait(PATIENCE)
+    assert session.facts()["error"] is None
+
+
+@pytest.fixture(scope="module")
+def saved(device: Any, scan: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with shown.view.json and shown.png: from the left, a part red, one hidden, cut, without the table."""
+    folder = tmp_path_factory.mktemp("saved")
+    with open_scan(scan, device) as view, view.session() as session:
+        session.do({"do": "set_table", "shown": False})
+        assert session.wait(PATIENCE)
+        session.do({"do": "find_parts"})
+        assert session.wait(PATIENCE)
+        session.do({"do": "look", "view": "left"})
+        session.do({"do": "set_color", "key": "1/1", "rgb": [1.0, 0.0, 0.0]})
+        session.do({"do": "show", "key": "1/2", "visible": False})
+        session.do({"do": "add_clip", "direction": "superior"})
+        save(session, folder / "shown.view.json")
+        save(session, folder / "shown.png")
+    return folder
+
+
+@pytest.mark.opencl
+def test_picture_of_a_saved_view_is_the_one_that_the_view_saved(
+    device: Any, scan: Path, saved: Path, tmp_path: Path
+) -> None:
+    arguments = ["view", str(scan), "--state", str(saved / "shown.view.json"), "--picture", str(tmp_path / "again.png")]
+
+    assert main([*arguments, "--size", "160x120", "--device", str(device.index)]) == 0
+
+    assert (tmp_path / "again.png").read_bytes() == (saved / "shown.png").read_bytes()
+
+
+@pytest.mark.opencl
+def test_view_opened_with_a_saved_view_shows_its_parts_and_saves_the_same_again(
+    device: Any, scan: Path, saved: Path, tmp_path: Path
+) -> None:
+    with open_scan(scan, device, saved / "shown.view.json") as view, view.session() as session:
+        assert session.wait(PATIENCE)
+        save(session, tmp_path / "again.view.json")
+
+    before, after = (json.loads((folder / name).read_text()) for folder, name in
+                     ((saved, "shown.view.json"), (tmp_path, "again.view.json")))  # fmt: skip
+    assert after == before
+
+
+@pytest.mark.opencl
+def test_picture_without_a_saved_view_is_the_first_of_the_view(device: Any, scan: Path, tmp_path: Path) -> None:
+    with open_scan(scan, device) as view, view.session() as session:
+        session.fit(SIZE)
+        save(session, tmp_path / "first.png")
+
+    arguments = ["view", str(scan), "--picture", str(tmp_path / "drawn.png"), "--size", "160x120"]
+    assert main([*arguments, "--device", str(device.index)]) == 0
+
+    assert (tmp_path / "drawn.png").read_bytes() == (tmp_path / "first.png").read_bytes()
+
+
+REFUSED = {
+    "picture and page": (["--picture", "a.png", "--html", "a.html"], 3, "--html"),
+    "picture and window": (["--picture", "a.png", "--window"], 3, "--window"),
+    "saved view and page": (["--state", "a.view.json", "--html", "a.html"], 3, "--state"),
+    "size without a picture": (["--size", "100"], 3, "--picture"),
+    "size that is none": (["--picture", "a.png", "--size", "large"], 3, "large"),
+    "picture of an animation": (["--picture", "a.gif"], 3, ".gif"),
+    "picture and port": (["--picture", "a.png", "--port", "8000"], 3, "--port"),
+    "saved view that is missing": (["--state", "gone.view.json", "--picture", "a.png"], 4, "gone.view.json"),
+}
+
+
+@pytest.mark.parametrize(("options", "code", "fact"), REFUSED.values(), ids=REFUSED)
+def test_options_that_make_no_sense_are_refused_and_nothing_is_written(
+    options: list[str],
+    code: int,
+    fact: str,
+    scan: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    printed: Printer,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    assert main(["view", str(scan), *options]) == code
+
+    printed().assert_error(fact)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,219 @@
+"""Saved views: what a view shows goes into a file and comes back; damaged files and those of other inputs do not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import view_scenes as scenes
+from refusals import refused
+from report_schemas import find_faults
+
+from clrecon.errors import RefusedInputError
+from clrecon.viewer.model.model import ViewModel
+from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.model.saved_view import encode_view, read_view, restore_view
+from clrecon.viewer.model.state import Pick, ShownPart
+
+pytestmark = pytest.mark.unit
+
+SCAN, MESH, LABELS = scenes.make_scan, scenes.make_mesh, scenes.make_labels
+
+
+def make_model(*subjects: Any) -> ViewModel:
+    return ViewModel(show_objects(subjects or [SCAN(), MESH()]))
+
+
+def save(model: ViewModel) -> dict[str, Any]:
+    """The entries of the file that the state of a model becomes."""
+    return dict(json.loads(encode_view(model.state, model.objects)))
+
+
+def change_camera(model: ViewModel) -> None:
+    model.look("left")
+    model.turn(0.1, 0.2)
+    model.set_perspective(True)
+
+
+def add_measures(model: ViewModel) -> None:
+    for tool, count in (("distance", 2), ("angle", 3), ("seed", 1)):
+        model.start_tool(tool)
+        for n in range(count):
+            model.add_point(Pick(point=(float(n), float(n * n), 3.0)))
+    model.end_tool()
+    model.rename_measure(0, "height of the body")
+
+
+def cut(model: ViewModel) -> None:
+    model.add_clip("superior")
+    model.move_clip(0, 0.3)
+    model.add_clip((1.0, 1.0, 0.0))
+    model.flip_clip(1)
+    model.set_clip_box((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0))
+
+
+def move_slices(model: ViewModel) -> None:
+    model.set_cross(scenes.middle(1))
+    model.frame_slice("coronal", 3.0, scenes.middle(1))
+    model.set_window(-100.0, 300.0)
+
+
+def show_projection(model: ViewModel) -> None:
+    model.set_mode("mip")
+    model.set_window(0.0, 900.0, of="picture")
+
+
+def show_fit(model: ViewModel) -> None:
+    model.set_iso(250.0)
+    model.set_fitted(True)
+    model.set_color_by("thickness")
+
+
+def change_looks(model: ViewModel) -> None:
+    model.show("1", False)
+    model.set_color("2", (0.2, 0.4, 0.6))
+    model.set_opacity("2", 0.5)
+
+
+CHANGES = {
+    "nothing": lambda model: None,
+    "camera": change_camera,
+    "measures": add_measures,
+    "clips": cut,
+    "slices": move_slices,
+    "projection": show_projection,
+    "fitted surface": show_fit,
+    "looks of parts": change_looks,
+    "table": lambda model: model.set_table(False),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_restored_view_is_the_saved_one(change: Any) -> None:
+    model, other = make_model(), make_model()
+    change(model)
+
+    restore_view(save(model), other)
+
+    assert other.state == model.state
+
+
+def test_restored_labels_have_the_saved_colors() -> None:
+    model, other = (make_model(SCAN(), LABELS()) for _ in range(2))
+    model.set_color("2/1", (1.0, 0.0, 0.0))
+    model.show("2/2", False)
+
+    restore_view(save(model), other)
+
+    assert other.state.parts == model.state.parts
+
+
+def test_restored_cluster_waits_with_its_look_for_the_clusters_to_be_found() -> None:
+    model, other = make_model(), make_model()
+    cluster = ShownPart(
+        key="1/3", name="part 3", kind="cluster", object=1, number=3, inside=(1.0, 2.0, 3.0), color=(1.0, 0.0, 0.0)
+    )
+    model.state = model.state.__class__(**{**vars(model.state), "parts": (*model.state.parts, cluster)})
+
+    restore_view(save(model), other)
+
+    assert other.state.part("1/3") == cluster
+    assert not other.parts_known
+
+
+def test_restoring_is_one_step_of_undo() -> None:
+    model, other = make_model(), make_model()
+    cut(model)
+    before = other.state
+
+    restore_view(save(model), other)
+    other.undo()
+
+    assert other.state == before
+
+
+def test_file_of_a_view_matches_its_schema() -> None:
+    model = make_model()
+    for change in (change_camera, add_measures, cut, move_slices, change_looks):
+        change(model)
+
+    assert find_faults(save(model)) == []
+
+
+def test_view_of_other_inputs_is_refused_with_both_kinds() -> None:
+    saved = save(make_model(SCAN(), MESH()))
+
+    with refused(RefusedInputError, "mesh", "labels"):
+        restore_view(saved, make_model(SCAN(), LABELS()))
+
+
+DAMAGED: dict[str, dict[str, Any]] = {
+    "mode unknown": {"mode": "x-ray vision"},
+    "iso value outside of the slider": {"iso_value_hu": 1e9},
+    "iso value as text": {"iso_value_hu": "high"},
+    "window turned round": {"window_hu": [300, -100]},
+    "window of one number": {"window_hu": [300]},
+    "cross of two numbers": {"cross_lps_mm": [1, 2]},
+    "zoom of a slice below its least": {"slices": [{"plane": "axial", "zoom": 0, "center_lps_mm": [0, 0, 0]}]},
+    "plane unknown": {"slices": [{"plane": "oblique", "zoom": 1, "center_lps_mm": [0, 0, 0]}]},
+    "clip beyond its ends": {"clips": [{"direction": "left", "share": 2, "flipped": False}]},
+    "clip without a share": {"clips": [{"direction": "left", "flipped": False}]},
+    "measure of one point": {"measures": [{"kind": "distance", "name": "a", "points_lps_mm": [[0, 0, 0]]}]},
+    "measure of an unknown kind": {"measures": [{"kind": "area", "name": "a", "points_lps_mm": []}]},
+    "part of no object": {
+        "parts": [
+            {"key": "7", "kind": "mesh", "number": 0, "inside_lps_mm": None, "color": None, "opacity": 1, "visible": 0}
+        ]
+    },
+    "opacity above 1": {
+        "parts": [
+            {"key": "2", "kind": "mesh", "number": 0, "inside_lps_mm": None, "color": None, "opacity": 2, "visible": 1}
+        ]
+    },
+    "camera in its focal point": {
+        "camera": {
+            "position_lps_mm": [0, 0, 0],
+            "focal_point_lps_mm": [0, 0, 0],
+            "up_lps": [0, 0, 1],
+            "view_angle_deg": None,
+            "parallel_scale_mm": 9,
+        }
+    },
+    "camera missing": {"camera": None},
+    "clips that are no list": {"clips": 3},
+}
+
+
+@pytest.mark.parametrize("entries", DAMAGED.values(), ids=DAMAGED)
+def test_damaged_view_is_refused_and_changes_nothing(entries: dict[str, Any]) -> None:
+    model = make_model()
+    saved, before = {**save(model), **entries}, model.state
+
+    with refused(RefusedInputError, "view"):
+        restore_view(saved, model)
+
+    assert model.state is before
+
+
+FILES = {
+    "no JSON": "camera",
+    "another schema": '{"schema": "clrecon-mesh-1"}',
+    "a list": "[]",
+    "deeply nested": "[" * 100_000,
+}
+
+
+@pytest.mark.parametrize("text", FILES.values(), ids=FILES)
+def test_file_that_is_no_saved_view_is_refused_by_name(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "shown.view.json"
+    path.write_text(text)
+
+    with refused(RefusedInputError, "shown.view.json"):
+        read_view(path)
+
+
+def test_missing_file_of_a_view_is_refused_by_name(tmp_path: Path) -> None:
+    with refused(RefusedInputError, "gone.view.json"):
+        read_view(tmp_path / "gone.view.json")
