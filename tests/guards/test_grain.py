@@ -12,8 +12,8 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 94_502,
-    "modules": 4120,
+    "lines": 94_507,
+    "modules": 412,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,
     "options_in_several_files": 8,

@@ -110,7 +110,12 @@ def measure_constants(
 
 def _fit_with(sampler: ProfileSampler, values: Float32Array, noise: float | None) -> _Fit:
     profiles, known = sampler.take(values), SILENT_HU if noise is None else noise
-    return functools.cache(lambda trial, spread: profiles.fit(*trial, known, cortex_spread=spread))
+
+    @functools.cache
+    def fit_trial(trial: _Trial, spread: float) -> WallFits:
+        return profiles.fit(trial.blur_mm, trial.across_mm, trial.cortex_hu, known, cortex_spread=spread)
+
+    return fit_trial
 
 
 def _measure_errors(fit: _Fit, values: Float32Array, trial: _Trial, thick: int, noise: float | None) -> CortexConstants:
