@@ -24,34 +24,75 @@ def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_every_stage_of_a_series_is_timed(device: Any, ct: Path, tmp_path: Path) -> None:
-    stages: list[str] = []
-    result = bench.run_bench(
-        ct, iso_value=0.0, device=str(device.index), runs=3, report_path=tmp_path / "b.json",
-        progress=lambda stage, done, total: stages.append(stage),
-    )  # fmt: skip
-    assert json.loads((tmp_path / "b.json").read_text())["runs"] == 3
-    assert (result["input"]["kind"], result["input"]["voxels"]) == ("series", 48 * 40 * 24)
-    assert (result["iso_value_hu"], result["iso_level_hu"]) == (0.0, -0.5)
-    assert set(result["seconds"]) == {"read", "bench", "total"}
-    (entry,) = result["devices"]
-    assert entry["device"]["name"] == device.name and entry["error"] is None
-    peer_entry = entry["peer"]
-    assert (entry["vertices"], entry["triangles"]) == (peer_entry["vertices"], peer_entry["triangles"])
-    warm, ratio = entry["warm_seconds"], entry["ratio"]
+VOXELS = 48 * 40 * 24
+"""Of the series."""
+
+
+class RunOfBench:
+    """A bench of three runs on the series: its result, its written report and the stages that it reported."""
+
+    def __init__(self, ct: Path, device: Any, report_path: Path):
+        self.stages: list[str] = []
+        self.result: Any = bench.run_bench(
+            ct, iso_value=0.0, device=str(device.index), runs=3, report_path=report_path,
+            progress=lambda stage, done, total: self.stages.append(stage),
+        )  # fmt: skip
+        self.report: Any = json.loads(report_path.read_text())
+        [self.entry] = self.result["devices"]
+
+
+@pytest.fixture(scope="module")
+def run(device: Any, ct: Path, tmp_path_factory: pytest.TempPathFactory) -> RunOfBench:
+    return RunOfBench(ct, device, tmp_path_factory.mktemp("run") / "b.json")
+
+
+def test_bench_of_a_series_has_its_input_times_and_stages(run: RunOfBench) -> None:
+    assert (run.result["input"]["kind"], run.result["input"]["voxels"]) == ("series", VOXELS)
+    assert (run.result["iso_value_hu"], run.result["iso_level_hu"]) == (0.0, -0.5)  # of whole HU: half a step below
+    assert set(run.result["seconds"]) == {"read", "bench", "total"}
+    assert (run.stages[0], run.stages[-1]) == ("device", "bench")
+    assert "read" in run.stages
+
+
+def test_report_of_the_bench_is_written_with_the_number_of_runs(run: RunOfBench) -> None:
+    assert run.report["runs"] == 3
+
+
+def test_surface_of_the_timed_device_has_as_many_vertices_and_triangles_as_that_of_the_peer(
+    run: RunOfBench, device: Any
+) -> None:
+    peer = run.entry["peer"]
+    assert (run.entry["device"]["name"], run.entry["error"]) == (device.name, None)
+    assert (run.entry["vertices"], run.entry["triangles"]) == (peer["vertices"], peer["triangles"])
+
+
+def test_warm_times_of_a_device_are_positive_and_in_order_and_give_its_voxels_a_second(run: RunOfBench) -> None:
+    warm = run.entry["warm_seconds"]
     assert 0 < warm["min"] <= warm["q1"] <= warm["median"] <= warm["q3"] <= warm["max"]
-    lowest, highest = peer_entry["seconds"]["min"] / warm["max"], peer_entry["seconds"]["max"] / warm["min"]
-    assert lowest <= ratio["min"] <= ratio["max"] <= highest
-    assert entry["mvoxels_per_s"] == pytest.approx(1e-6 * 48 * 40 * 24 / warm["median"])
-    assert {"upload", "build", "kernels", "download"} <= set(entry["part_seconds"])
-    assert 0 < entry["resident_seconds"]["min"] <= entry["resident_seconds"]["median"]
-    assert bool(entry["kernel_seconds"]) == device.has_event_times
-    assert sum(entry["kernel_seconds"].values()) <= 1.5 * entry["part_seconds"]["kernels"]
-    assert entry["first_seconds"]["total"] >= entry["first_seconds"]["open"] > 0
-    assert stages[0] == "device" and stages[-1] == "bench" and "read" in stages
+    assert run.entry["mvoxels_per_s"] == pytest.approx(1e-6 * VOXELS / warm["median"])
 
 
-def test_without_an_input_a_spine_is_made(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ratio_of_the_bench_lies_between_those_of_the_extreme_times(run: RunOfBench) -> None:
+    warm, peer, ratio = run.entry["warm_seconds"], run.entry["peer"]["seconds"], run.entry["ratio"]
+    assert peer["min"] / warm["max"] <= ratio["min"] <= ratio["max"] <= peer["max"] / warm["min"]
+
+
+def test_first_call_and_calls_on_a_resident_volume_are_timed(run: RunOfBench) -> None:
+    first, resident = run.entry["first_seconds"], run.entry["resident_seconds"]
+    assert 0 < first["open"] <= first["total"]
+    assert 0 < resident["min"] <= resident["median"]
+
+
+def test_parts_of_the_time_of_a_device_and_its_kernels_are_measured(run: RunOfBench, device: Any) -> None:
+    parts, kernels = run.entry["part_seconds"], run.entry["kernel_seconds"]
+    assert {"upload", "build", "kernels", "download"} <= set(parts)
+    assert bool(kernels) == device.has_event_times
+    assert sum(kernels.values()) <= 1.5 * parts["kernels"]  # medians of different runs
+
+
+def test_bench_without_an_input_makes_a_synthetic_spine_of_512_x_512_x_149_voxels(
+    device: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked = []
 
     def make_small(settings: PhantomSettings, progress: Any) -> Any:
@@ -67,7 +108,9 @@ def test_without_an_input_a_spine_is_made(device: Any, monkeypatch: pytest.Monke
     assert "make" in result["seconds"]
 
 
-def test_without_vtk_there_is_no_ratio(device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bench_without_vtk_has_times_and_a_warning_but_no_ratio(
+    device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_: Any) -> None:
         raise ImportError("no VTK")
 
@@ -79,7 +122,7 @@ def test_without_vtk_there_is_no_ratio(device: Any, ct: Path, monkeypatch: pytes
     assert "VTK is not installed: there is nothing to compare with" in result["warnings"]
 
 
-def test_a_device_that_fails_is_told_and_the_others_go_on(
+def test_bench_of_all_devices_goes_on_after_one_that_fails_with_a_warning(
     device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("clrecon.opencl.list_devices", lambda: [BurntDevice(device), device])
@@ -88,7 +131,7 @@ def test_a_device_that_fails_is_told_and_the_others_go_on(
     assert f"{device.name} failed: it caught fire" in result["warnings"]
 
 
-def test_where_all_devices_fail_the_first_error_is_raised(
+def test_error_of_the_first_device_is_raised_where_all_devices_fail(
     device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("clrecon.opencl.list_devices", lambda: [BurntDevice(device)])
@@ -96,7 +139,9 @@ def test_where_all_devices_fail_the_first_error_is_raised(
         bench.run_bench(ct, device="all", runs=1)
 
 
-def test_unequal_surfaces_are_told(device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_peer_with_another_number_of_triangles_is_warned_of(
+    device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     real = bench.FlyingEdges.run
     monkeypatch.setattr(bench.FlyingEdges, "run", lambda self, level: real(self, level)._replace(triangles=7))
     result = bench.run_bench(ct, device=str(device.index), runs=1)
@@ -124,18 +169,26 @@ class FakeExtractor:
         self.asked.append(iso_value)
 
 
-def test_no_iso_value_of_a_resident_volume_comes_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_iso_values_of_a_resident_volume_go_outwards_and_none_comes_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     from clrecon.operators.surface import extract as isosurface
 
     monkeypatch.setattr(isosurface, "SurfaceExtractor", FakeExtractor)
     nothing: Any = None
-    found = bench._time_resident(nothing, nothing, 0.0, 7)
+    bench._time_resident(nothing, nothing, 0.0, 7)
     assert FakeExtractor.asked == [0.0, 1.0, -1.0, 2.0, -2.0, -3.0]  # 3 and 4 are beyond the scan
-    assert found is not None and found["min"] > 0
+
+
+def test_no_runs_on_a_resident_volume_have_no_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    from clrecon.operators.surface import extract as isosurface
+
+    monkeypatch.setattr(isosurface, "SurfaceExtractor", FakeExtractor)
+    nothing: Any = None
     assert bench._time_resident(nothing, nothing, 0.0, 0) is None
 
 
-def test_all_devices_leave_simulators_and_unusable_ones(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_devices_named_all_are_those_without_simulators_and_unusable_ones(
+    device: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from types import SimpleNamespace
 
     from clrecon import opencl
@@ -147,10 +200,13 @@ def test_all_devices_leave_simulators_and_unusable_ones(device: Any, monkeypatch
     assert bench._choose_devices("all") == [good]
 
 
-def test_all_devices_are_those_that_can_be_used(device: Any) -> None:
+def test_all_devices_of_this_machine_that_can_be_used_are_chosen_by_all_in_any_case(device: Any) -> None:
     chosen = bench._choose_devices(" ALL ")
     assert device in chosen or device.is_simulator
     assert not any(one.is_simulator or one.shortcoming for one in chosen)
+
+
+def test_one_device_of_the_bench_is_chosen_by_its_index(device: Any) -> None:
     assert bench._choose_devices(str(device.index)) == [choose_device(str(device.index))]
 
 
@@ -163,20 +219,23 @@ def test_all_devices_are_those_that_can_be_used(device: Any) -> None:
         ({"series": "2"}, "name a DICOM folder"),
     ],
 )
-def test_wrong_arguments_are_refused_first(arguments: dict[str, Any], words: str) -> None:
+def test_wrong_argument_of_the_bench_is_refused_before_an_unknown_device(arguments: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         bench.run_bench(None, device="abacus", **arguments)
 
 
-def test_bench_refuses_outputs_then_device_before_the_input(tmp_path: Path) -> None:
+def test_report_that_cannot_be_written_is_refused_before_an_unknown_device_and_a_missing_input(tmp_path: Path) -> None:
     nowhere = tmp_path / "nowhere"
     with refused(OutputError, "nowhere"):
         bench.run_bench(nowhere, device="abacus", report_path=nowhere / "b.json")
+
+
+def test_unknown_device_of_the_bench_is_refused_before_a_missing_input(tmp_path: Path) -> None:
     with refused(DeviceError, "abacus"):
-        bench.run_bench(nowhere, device="abacus")
+        bench.run_bench(tmp_path / "nowhere", device="abacus")
 
 
-def test_no_surface_leaves_no_report(device: Any, ct: Path, tmp_path: Path) -> None:
+def test_bench_without_a_surface_is_refused_and_writes_no_report(device: Any, ct: Path, tmp_path: Path) -> None:
     with refused(NoSurfaceError, 5000):
         bench.run_bench(ct, iso_value=5000.0, device=str(device.index), runs=1, report_path=tmp_path / "b.json")
     assert list(tmp_path.iterdir()) == []

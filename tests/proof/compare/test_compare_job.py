@@ -129,7 +129,7 @@ def test_every_method_has_its_row_and_its_picture(device: Any, whole: Path) -> N
 
 @pytest.mark.release
 @pytest.mark.long
-def test_parts_of_the_time_of_a_method_add_up(device: Any, whole: Path) -> None:
+def test_parts_of_the_first_time_of_a_method_add_up_to_it(device: Any, whole: Path) -> None:
     for method in read_report(whole)["methods"]:
         parts = method["first_parts_s"]
         assert set(parts) == {"read", "build", "upload", "kernels", "host", "download", "draw"}
@@ -139,7 +139,7 @@ def test_parts_of_the_time_of_a_method_add_up(device: Any, whole: Path) -> None:
 
 @pytest.mark.release
 @pytest.mark.long
-def test_the_page_stands_alone(device: Any, whole: Path) -> None:
+def test_page_of_a_comparison_has_all_its_pictures_within_and_is_valid_html(device: Any, whole: Path) -> None:
     page = (whole / "index.html").read_text(encoding="utf-8")
     assert find_faults(page) == []
     assert len(page.encode()) < MOST_BYTES

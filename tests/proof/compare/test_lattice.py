@@ -43,7 +43,7 @@ def points_of(lattice: Lattice) -> np.ndarray:
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize(("finer", "offsets"), [(1, (0.0, 0.0, 0.0)), (3, (0.137, 0.271, 0.389)), (2, (0.0, 0.5, 0.9))])
 @pytest.mark.parametrize("made", [smooth_volume, noise, uneven_noise])
-def test_runs_are_those_of_the_trilinear_field(made, finer, offsets, closed):
+def test_runs_of_lattice_points_inside_are_those_of_the_trilinear_field(made, finer, offsets, closed):
     volume = made()
     level = float(np.median(volume.voxels)) + 0.37  # which no point has: float32 and float64 agree
     rule = choose_iso_rule(volume, level, closed=closed)
@@ -68,7 +68,7 @@ def test_lattice_counts_no_point_or_all_of_a_constant_volume():
         assert found == (4 * 5 * 6 if closed and inside else inside)
 
 
-def test_exclusive_or_of_runs_holds_what_one_alone_has():
+def test_exclusive_or_of_runs_has_the_points_of_one_alone():
     one, other = np.array([1, 4, 6, 9]), np.array([2, 4, 6, 7, 20, 21])
     apart = exclusive_or(one, other)
     assert apart.tolist() == [1, 2, 7, 9, 20, 21]
@@ -76,7 +76,7 @@ def test_exclusive_or_of_runs_holds_what_one_alone_has():
     assert exclusive_or(one, one).tolist() == []
 
 
-def test_a_mesh_is_filled_as_vtk_does():
+def test_lattice_points_inside_a_mesh_are_those_that_vtk_finds():
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkFiltersModeling import vtkSelectEnclosedPoints
 

@@ -30,7 +30,7 @@ def placed(mesh: samples.Arrays, on: Volume) -> Mesh:
 
 @pytest.mark.parametrize("affine", [np.eye(4), SHEARED], ids=["even", "sheared"])
 @pytest.mark.parametrize("finer", [1, 2, 3, 5])
-def test_points_in_a_box_are_counted(affine, finer):
+def test_lattice_points_inside_a_box_are_counted_as_by_its_bounds(affine, finer):
     on = block(affine)
     offsets = (0.137, 0.271, 0.389)
     found = measure_slices(placed(samples.box((2.6,) * 3, (5.8,) * 3), on), on, 50.0, finer=finer, offsets=offsets)
@@ -41,17 +41,26 @@ def test_points_in_a_box_are_counted(affine, finer):
     assert found.dice == 2.0 * found.points_common / (found.points_mesh + found.points_hu)
 
 
-def test_rows_through_edges_and_vertices_pierce_once():
-    # corners, edges and the diagonals of faces lie on points of the lattice
+@pytest.mark.parametrize(
+    ("mesh", "finer"),
+    [
+        pytest.param(samples.box((3.0,) * 3, (5.0,) * 3), 1, id="box with edges on rows"),
+        pytest.param(samples.sphere((5.0, 5.0, 5.0), 3.0, 0), 2, id="octahedron with corners on rows"),
+    ],
+)
+def test_rows_through_edges_and_corners_of_a_mesh_cross_it_an_even_number_of_times(mesh, finer):
     on = block()
-    found = measure_slices(placed(samples.box((3.0,) * 3, (5.0,) * 3), on), on, 50.0, finer=1, offsets=(0, 0, 0))
-    assert found.points_mesh == 5**3  # half open: from 3 up to, but without, 8
-    assert found.rows_odd == 0
-    pyramid = samples.sphere((5.0, 5.0, 5.0), 3.0, 0)
-    assert measure_slices(placed(pyramid, on), on, 50.0, finer=2, offsets=(0, 0, 0)).rows_odd == 0
+    assert measure_slices(placed(mesh, on), on, 50.0, finer=finer, offsets=(0, 0, 0)).rows_odd == 0
 
 
-def test_an_open_mesh_is_refused():
+def test_lattice_points_on_the_lower_faces_of_a_box_are_inside_and_on_the_upper_outside():
+    on = block()
+    from_3_to_8 = samples.box((3.0,) * 3, (5.0,) * 3)
+    found = measure_slices(placed(from_3_to_8, on), on, 50.0, finer=1, offsets=(0, 0, 0))
+    assert found.points_mesh == len([3, 4, 5, 6, 7]) ** 3
+
+
+def test_mesh_that_is_open_across_many_rows_is_refused():
     on = block()
     vertices, triangles = samples.box((2.6,) * 3, (5.8,) * 3)
     faced = np.flatnonzero(np.ptp(vertices[triangles][:, :, 0], axis=1) == 0.0)  # across the rows
@@ -59,7 +68,7 @@ def test_an_open_mesh_is_refused():
         measure_slices(placed((vertices, np.delete(triangles, faced[0], axis=0)), on), on, 50.0)
 
 
-def test_the_rows_through_a_small_hole_are_left_out():
+def test_rows_through_a_small_hole_are_left_out_of_mesh_and_volume():
     on = block(size=20, low=5, high=14)
     vertices, triangles = samples.sphere((9.5, 9.5, 9.5), 6.0, 3)
     # The triangle nearest to the pole of the rows: they leave the ball through the hole.
@@ -67,22 +76,35 @@ def test_the_rows_through_a_small_hole_are_left_out():
     whole = measure_slices(placed((vertices, triangles), on), on, 50.0, finer=5)
     holed = measure_slices(placed((vertices, np.delete(triangles, hole, axis=0)), on), on, 50.0, finer=5)
     assert whole.rows_odd == 0
-    assert 1 <= holed.rows_odd < 20
-    # each of these rows is as long as the ball is thick, or as the block
-    assert (whole.points_mesh - holed.points_mesh) / holed.rows_odd == pytest.approx(5 * 12.0, abs=2.0)
-    assert (whole.points_hu - holed.points_hu) / holed.rows_odd == pytest.approx(5 * 10.0, abs=1.0)
+    assert 1 <= holed.rows_odd < 20  # a facet is three rows wide
+    points_a_voxel, ball_voxels, block_voxels = 5, 2 * 6.0, 10.0
+    lost_mesh, lost_hu = whole.points_mesh - holed.points_mesh, whole.points_hu - holed.points_hu
+    assert lost_mesh / holed.rows_odd == pytest.approx(points_a_voxel * ball_voxels, abs=2.0)  # rows end within a step
+    assert lost_hu / holed.rows_odd == pytest.approx(points_a_voxel * block_voxels, abs=1.0)
 
 
-def test_what_cannot_be_sliced_is_refused():
-    on, empty = block(), Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.uint32))
-    box = placed(samples.box((2.6,) * 3, (5.8,) * 3), on)
+def test_empty_mesh_is_refused():
     with refused(NoSurfaceError, "triangles", "mesh"):
-        measure_slices(empty, on, 50.0)
+        measure_slices(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.uint32)), block(), 50.0)
+
+
+def test_mesh_beyond_the_volume_is_refused_with_its_bounds():
+    on = block()
+    beyond = placed(samples.box((2.6, 30.0, 2.6), (5.8,) * 3), on)
     with refused(UsageError, "volume", 2.6, 30.0):
-        measure_slices(placed(samples.box((2.6, 30.0, 2.6), (5.8,) * 3), on), on, 50.0)
-    with refused(UsageError, 1, 16, 0):
-        measure_slices(box, on, 50.0, finer=0)
-    with refused(UsageError, "offsets", 0.1, 0.2):
-        measure_slices(box, on, 50.0, offsets=(0.1, 0.2, 1.0))
-    with refused(UsageError, 50.0, 70.0):
-        measure_slices(box, on, (50.0, 70.0))
+        measure_slices(beyond, on, 50.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "facts"),
+    [
+        ({"iso_value": 50.0, "finer": 0}, (1, 16, 0)),
+        ({"iso_value": 50.0, "offsets": (0.1, 0.2, 1.0)}, ("offsets", 0.1, 0.2)),
+        ({"iso_value": (50.0, 70.0)}, (50.0, 70.0)),
+    ],
+    ids=["no points", "offset of a whole step", "two iso values"],
+)
+def test_wrong_argument_of_a_comparison_of_slices_is_refused_with_its_value(arguments, facts):
+    on = block()
+    with refused(UsageError, *facts):
+        measure_slices(placed(samples.box((2.6,) * 3, (5.8,) * 3), on), on, **arguments)

@@ -48,7 +48,7 @@ def ball(radius=RADIUS, shift=(0.0, 0.0, 0.0), rounds=5) -> Mesh:
 
 
 @pytest.mark.parametrize("more", [0.3, -0.4])
-def test_a_level_that_is_off_is_bias_alone(more):
+def test_larger_or_smaller_ball_has_its_difference_as_bias_and_no_scatter(more):
     found = measure_truth(ball(RADIUS + more), Ball())
     assert found.bias_mm == pytest.approx(more, abs=tolerances.BALL_SAGITTA_MM)
     assert found.scatter_mm < tolerances.BALL_SAGITTA_MM
@@ -58,7 +58,7 @@ def test_a_level_that_is_off_is_bias_alone(more):
     assert found.normals_p95_deg < 2.0  # facets of 0.6 mm on a ball of 10 mm turn by 1.1 degrees to their rim
 
 
-def test_a_shift_is_scatter_alone():
+def test_shifted_ball_has_no_bias_and_the_scatter_of_its_shift():
     # s cos(theta) has the mean 0 and the standard deviation s / sqrt(3) on a ball
     found = measure_truth(ball(shift=(0.3, 0.0, 0.0)), Ball())
     assert found.bias_mm == pytest.approx(0.0, abs=tolerances.BALL_SAGITTA_MM)
@@ -72,7 +72,7 @@ def test_torus_with_a_thicker_tube_has_that_bias_and_no_scatter():
     assert found.scatter_mm < tolerances.BALL_SAGITTA_MM
 
 
-def test_the_wall_of_a_cavity_is_not_the_outer_side():
+def test_wall_of_a_cavity_is_not_measured_as_outer_surface():
     outer, inner = ball(RADIUS + 0.2), ball(RADIUS - 0.8)
     vertices, triangles = samples.join((outer.vertices, outer.triangles), (inner.vertices, inner.triangles[:, ::-1]))
     found = measure_truth(Mesh(vertices, triangles), Ball())
@@ -85,16 +85,22 @@ def test_mesh_beyond_the_reach_of_its_truth_is_left_out():
     both = Mesh(*samples.join((one.vertices, one.triangles), (other.vertices, other.triangles)))
     found = measure_truth(both, Ball())
     assert found.max_mm < tolerances.BALL_SAGITTA_MM
-    assert found.outer_share == pytest.approx(100 / 109, abs=2e-3)
+    assert found.outer_share == pytest.approx(RADIUS**2 / (RADIUS**2 + 3.0**2), abs=2e-3)  # areas
     assert found.reach_mm == 1.5
+
+
+def test_mesh_that_is_wholly_beyond_the_reach_of_its_truth_is_refused():
     with refused(NoSurfaceError, 1.5, "surface"):
-        measure_truth(other, Ball())
-    inside_out = Mesh(one.vertices, one.triangles[:, ::-1])
+        measure_truth(ball(radius=3.0, shift=(40.0, 0.0, 0.0), rounds=3), Ball())
+
+
+def test_mesh_whose_faces_look_inwards_is_refused():
+    mesh = ball()
     with refused(NoSurfaceError, 1.5):
-        measure_truth(inside_out, Ball())
+        measure_truth(Mesh(mesh.vertices, mesh.triangles[:, ::-1]), Ball())
 
 
-def test_a_cut_at_the_border_of_the_scan_is_left_out():
+def test_flat_cut_at_the_border_of_the_scan_is_left_out_of_the_measures():
     grid = Volume(np.zeros((21, 41, 41), np.int16), np.diag([1.0, 1.0, 2.0, 1.0]))
     truth = Ball((20.0, 20.0, 4.0))
     vertices, triangles = samples.sphere((20.0, 20.0, 4.0), 10.2, 5)
@@ -106,22 +112,31 @@ def test_a_cut_at_the_border_of_the_scan_is_left_out():
     assert measure_truth(cut, truth).scatter_mm > 10 * found.scatter_mm
 
 
-def test_bad_arguments_are_refused():
+def test_truth_without_a_distance_is_refused_by_its_type():
     with refused(UsageError, "dict", "distance"):
         measure_truth(ball(), {})
     with refused(UsageError, "dict", "distance"):
         find_cut_cells({}, Volume(np.zeros((3, 3, 3), np.int16), np.eye(4)))
+
+
+def test_measure_of_no_samples_is_refused():
     with refused(UsageError, 1, "sample"):
         measure_truth(ball(), Ball(), 0)
-    for reach in (0.0, -1.0, np.nan, np.inf):
-        with refused(UsageError, 0, "reach"):
-            measure_truth(ball(), Ball(), reach_mm=reach)
-    with pytest.raises(NoSurfaceError):
+
+
+@pytest.mark.parametrize("reach_mm", [0.0, -1.0, np.nan, np.inf])
+def test_reach_that_is_not_positive_and_finite_is_refused(reach_mm):
+    with refused(UsageError, 0, "reach"):
+        measure_truth(ball(), Ball(), reach_mm=reach_mm)
+
+
+def test_empty_mesh_is_refused_where_it_is_compared_with_a_truth():
+    with refused(NoSurfaceError, "surface"):
         measure_truth(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.uint32)), Ball())
 
 
 @pytest.mark.parametrize("affine", [np.eye(4), SHEARED], ids=["even", "sheared"])
-def test_cut_cells_are_those_of_all_points_asked(affine):
+def test_cells_cut_by_a_truth_are_those_of_a_search_of_all_their_points_with_a_tenth_of_them(affine):
     grid = Volume(np.zeros((19, 33, 40), np.int16), affine)
     truth = Ball(grid.ijk_to_lps([[24.0, 18.0, 8.0]])[0], 7.5)
     low = np.array(list(itertools.product(range(-1, 40), range(-1, 33), range(-1, 19))))
@@ -137,7 +152,7 @@ def test_cut_cells_are_those_of_all_points_asked(affine):
 
 
 @pytest.mark.parametrize("kind", ["sphere", "torus"])
-def test_cells_of_a_phantom_are_near_its_surface(kind):
+def test_cells_cut_by_the_surface_of_a_phantom_lie_within_half_their_diagonal_of_it(kind):
     truth = phantom_truth(PhantomSettings(kind=kind, size=(64, 64), slices=48, oblique=(20.0, 10.0, 5.0)))
     grid = Volume(np.zeros((48, 64, 64), np.int16), truth.affine)
     cut = find_cut_cells(truth, grid)
@@ -146,7 +161,7 @@ def test_cells_of_a_phantom_are_near_its_surface(kind):
     assert np.abs(truth.signed_distance(grid.ijk_to_lps(cut.ijk + 0.5))).max() <= half
 
 
-def test_cells_of_a_mesh_agree_with_those_of_its_truth():
+def test_cells_of_a_fine_mesh_of_a_ball_are_those_cut_by_the_ball():
     grid = Volume(np.zeros((33, 33, 33), np.int16), np.eye(4))
     truth = Ball((16.2, 15.9, 16.4))
     mesh = Mesh(*samples.sphere((16.2, 15.9, 16.4), RADIUS, 6))
@@ -158,7 +173,7 @@ def test_cells_of_a_mesh_agree_with_those_of_its_truth():
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("at", [-0.5, 4.5, 5.5])
-def test_a_wall_between_the_border_and_the_voxels_is_in_cells_to_the_last(axis, at):
+def test_wall_beside_the_outermost_voxels_cuts_the_cells_of_the_border(axis, at):
     class Wall:
         def signed_distance(self, points_mm):
             return np.asarray(points_mm)[:, axis] - at
