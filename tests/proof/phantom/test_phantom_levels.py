@@ -46,7 +46,7 @@ def gaps(vertebrae: list[Vertebra]) -> list[float]:
         ("C1-L5", LEVELS),
     ],
 )
-def test_levels_are_read_in_any_order(text: str, names: tuple[str, ...]) -> None:
+def test_levels_are_read_in_any_order_and_written_again(text: str, names: tuple[str, ...]) -> None:
     assert parse_levels(text) == names
     assert parse_levels(format_levels(names)) == names
 
@@ -68,7 +68,7 @@ def test_levels_have_their_numbers_and_shortest_words() -> None:
         ("L\u0661", "levels are a text like"),
     ],
 )
-def test_other_levels_are_refused(text: str, says: str) -> None:
+def test_text_that_names_no_levels_is_refused_with_the_reason(text: str, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         PhantomSettings(levels=text)
 
@@ -86,12 +86,12 @@ def test_other_levels_are_refused(text: str, says: str) -> None:
         ({"kind": "skull", "scoliosis_deg": 3.0}, "a skull has no scoliosis: it is for the spine"),
     ],
 )
-def test_levels_that_cannot_be_are_refused_with_their_numbers(given: dict, says: str) -> None:
+def test_settings_of_a_spine_that_cannot_be_drawn_are_refused_with_their_numbers(given: dict, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         PhantomSettings(**{**COARSE, **given})
 
 
-def test_nothing_is_written_where_levels_do_not_fit(tmp_path: Path) -> None:
+def test_levels_that_do_not_fit_into_the_slices_are_refused_and_no_file_written(tmp_path: Path) -> None:
     with refused(UsageError, "C1-L5", 20):
         write_phantom(tmp_path / "ct", PhantomSettings(levels="C1-L5", slices=20))
     assert list(tmp_path.iterdir()) == []
@@ -172,7 +172,7 @@ def test_cervical_vertebrae_have_their_own_shapes() -> None:
     assert bone("C7", (0.0, rear + 22.0, -8.0)) == [True]
 
 
-def test_boxes_hold_whole_vertebrae() -> None:
+def test_local_bounds_of_a_vertebra_have_it_all() -> None:
     for vertebra in planned("C1-T1,L5"):
         low, high = (np.array(corner) for corner in local_bounds(vertebra))
         lattice = np.random.default_rng(3).uniform(low - 6.0, high + 6.0, (60_000, 3))
@@ -181,13 +181,13 @@ def test_boxes_hold_whole_vertebrae() -> None:
 
 
 @pytest.mark.parametrize("levels", daily(1, ["C1-C3", "C7-T1", "L4-L5"]))
-def test_vertebrae_of_any_levels_lie_apart(levels: str) -> None:
+def test_neighbouring_vertebrae_are_more_than_2_mm_apart_without_facet_joints(levels: str) -> None:
     assert min(gaps(planned(levels))) > 2.0
 
 
 @pytest.mark.release
 @pytest.mark.parametrize(("levels", "gap"), daily_rows(1, [("C1-C3", 0.3), ("T6-T7", 0.0), ("L4-L5", 0.8)]))
-def test_facets_come_as_near_as_asked(levels: str, gap: float) -> None:
+def test_least_distance_of_neighbouring_vertebrae_is_the_gap_of_their_facet_joints(levels: str, gap: float) -> None:
     found = gaps(planned(levels, facet_gap_mm=gap, scoliosis_deg=10.0))
     assert found == pytest.approx([gap] * len(found), abs=tolerances.PHANTOM_FACET_MM)
 

@@ -61,7 +61,7 @@ def test_values_are_those_of_the_scanner(kind: str) -> None:
     assert part["volume_mm3"] == pytest.approx(part["voxels"] * np.prod(settings.spacing), rel=1e-4)
 
 
-def test_cupping_falls_with_the_square_of_the_radius() -> None:
+def test_cupping_is_deepest_at_the_centre_and_falls_with_the_square_of_the_radius() -> None:
     field = np.zeros((2, 41, 61), np.float32)
     add_cupping(field, np.diag((0.5, 0.5, 1.0, 1.0)), 100.0)
     assert field[1, 20, 30] == -100.0 and field[0, 0, 30] == pytest.approx(-100.0 * (1 - (20 / 20.5) ** 2), abs=1e-3)

@@ -29,13 +29,13 @@ def settings_of(kind: str, **given: object) -> PhantomSettings:
     return PhantomSettings(kind=kind, **{**size, **given})  # type: ignore[arg-type]
 
 
-def test_the_tables_name_the_same_things() -> None:
+def test_plans_and_couches_are_those_of_the_settings() -> None:
     assert set(PLANS) == set(SCENES)
     assert tuple(TABLES) == TABLE_NAMES
 
 
 @pytest.mark.parametrize("kind", daily(3, SCENES))
-def test_voxels_are_of_what_the_labels_say(kind: str) -> None:
+def test_parts_of_the_truth_count_the_voxels_of_their_labels(kind: str) -> None:
     settings = settings_of(kind, **CLEAN)
     voxels, affine, truth = make_phantom(settings)
     labels = label_materials(settings)
@@ -54,7 +54,7 @@ def test_voxels_are_of_what_the_labels_say(kind: str) -> None:
     assert np.median(voxels[labels == 0]) == pytest.approx(scanner.to_values(-1000.0), abs=cupping)
 
 
-def test_metal_ends_at_the_ceiling_of_twelve_bits() -> None:
+def test_metal_has_the_largest_value_of_12_bits() -> None:
     settings = settings_of("pelvis", **CLEAN)
     values = make_phantom(settings)[0][label_materials(settings) == MATERIALS.index("metal")]
     assert np.median(values) == values.max() == 3071
@@ -79,7 +79,7 @@ def test_contrast_is_larger_and_brighter_than_the_marrow_of_the_spine() -> None:
 
 @pytest.mark.parametrize("table", ["flat", "curved", "headrest"])
 @pytest.mark.parametrize("prone", daily(1, [False, True]))
-def test_a_table_lies_under_the_body_at_its_gap(table: str, prone: bool) -> None:
+def test_couch_lies_below_the_body_and_lower_with_a_gap(table: str, prone: bool) -> None:
     places = []
     for gap in (0.0, 12.0):
         settings = settings_of("skull", table=table, table_gap_mm=gap, prone=prone)
@@ -107,7 +107,7 @@ def test_prone_turns_the_image_and_not_the_patient(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("table", "changed"), daily_rows(1, [("none", True), ("flat", True), (None, False)]))
-def test_a_spine_may_lie_on_another_table(table: str | None, changed: bool) -> None:
+def test_another_couch_changes_the_voxels_of_a_spine(table: str | None, changed: bool) -> None:
     size = {"size": (80, 72), "slices": 6, "spacing": (4.5, 4.0, 5.0)}
     own = make_phantom(PhantomSettings(**size))[0]
     assert np.array_equal(make_phantom(PhantomSettings(**size, table=table))[0], own) != changed
@@ -136,11 +136,11 @@ def test_a_written_scene_has_its_materials_in_place(tmp_path: Path) -> None:
         ({"kind": "skull", "table": "flat", "table_gap_mm": 900.0}, "gap.*from -100 to 500 mm, got 900"),
     ],
 )
-def test_impossible_tables_are_refused(given: dict, says: str) -> None:
+def test_couch_that_a_phantom_cannot_have_is_refused_with_the_reason(given: dict, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         PhantomSettings(**given)
 
 
-def test_shapes_have_no_materials() -> None:
+def test_materials_of_a_single_shape_are_refused() -> None:
     with refused(UsageError, "scene", "sphere"):
         label_materials(PhantomSettings(kind="sphere"))

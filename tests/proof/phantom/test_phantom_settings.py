@@ -35,7 +35,7 @@ from clrecon.proof.phantom.series import format_decimal
         ({"transfer_syntax": "jpeg"}, "'jpeg'"),
     ],
 )
-def test_bad_settings_are_refused_with_their_numbers(given: dict, says: str) -> None:
+def test_wrong_setting_of_a_phantom_is_refused_with_its_name_and_value(given: dict, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         PhantomSettings(**given)
 
@@ -59,12 +59,12 @@ def test_defaults_depend_on_the_kind() -> None:
 
 
 @pytest.mark.parametrize(("text", "size"), [("256", (256, 256)), ("256x192", (256, 192)), ("64 X 32", (64, 32))])
-def test_sizes_are_columns_then_rows(text: str, size: tuple[int, int]) -> None:
+def test_size_of_a_phantom_is_read_as_columns_then_rows(text: str, size: tuple[int, int]) -> None:
     assert parse_size(text) == size
 
 
 @pytest.mark.parametrize("text", ["", "a", "1x2x3", "256x", "-5", "2.5"])
-def test_other_sizes_are_refused(text: str) -> None:
+def test_text_that_is_no_size_is_refused(text: str) -> None:
     with refused(UsageError, "columns", "rows"):
         parse_size(text)
 

@@ -71,7 +71,7 @@ def is_inside(body, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("body", daily(1, BODIES), ids=IDS)
-def test_distance_equals_nearest_surface_point(body) -> None:
+def test_signed_distance_of_a_body_is_that_of_the_nearest_point_of_its_surface(body) -> None:
     points = CENTRE + np.random.default_rng(3).uniform(-14.0, 14.0, (500, 3))
     surface = surface_points(body)
     nearest = np.array([np.sqrt(((surface - point) ** 2).sum(axis=1).min()) for point in points])
@@ -85,7 +85,7 @@ def test_distance_equals_nearest_surface_point(body) -> None:
 
 
 @pytest.mark.parametrize("body", BODIES, ids=IDS)
-def test_area_is_derivative_of_volume_and_bounds_are_tight(body) -> None:
+def test_volume_area_and_bounds_of_a_body_are_those_counted_from_random_points(body) -> None:
     low, high = body.bounds_mm
     points = np.random.default_rng(4).uniform(low, high, (400_000, 3))
     distance = body.signed_distance(points)
@@ -118,6 +118,6 @@ def test_descriptions_hold_plain_numbers() -> None:
         (lambda: SPHERE.signed_distance(np.zeros((3, 2))), r"\(3, 2\)"),
     ],
 )
-def test_bad_bodies_are_refused(make, says: str) -> None:
+def test_body_with_a_wrong_argument_is_refused_by_its_name(make, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         make()

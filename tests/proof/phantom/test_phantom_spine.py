@@ -43,7 +43,7 @@ def test_histogram_has_air_soft_tissue_and_bone(spine: tuple) -> None:
 
 
 @pytest.mark.parametrize("dk", daily(1, [3.0, 8.0]))
-def test_tissues_of_one_value_have_it_in_thin_and_thick_slices(dk: float) -> None:
+def test_most_frequent_values_are_those_of_the_tissues_in_thin_and_thick_slices(dk: float) -> None:
     voxels, _, _ = make_phantom(PhantomSettings(size=(96, 80), slices=12, spacing=(3.0, 3.0, dk), **CLEAN))
     values, counts = np.unique(voxels, return_counts=True)
     assert {-1000, -930, -860, -105, 54} == set(values[np.argsort(-counts)[:5]].tolist())
@@ -92,7 +92,7 @@ def test_spine_has_the_same_anatomy_in_tilted_and_oblique_slices() -> None:
     assert np.median(np.abs(pair[0] - pair[1])) < 25.0
 
 
-def test_interfaces_are_ramps_not_steps() -> None:
+def test_voxels_between_muscle_and_cortex_have_many_values_of_partial_volume() -> None:
     made = make_phantom(PhantomSettings(size=(120, 120), slices=20, spacing=(1.0, 1.0, 1.0), **CLEAN))
     levels = [v for v in made[2]["spine"]["vertebrae"] if v["name"] == "T12"]
     i, j, k = np.rint(apply_affine(np.linalg.inv(made[1]), [levels[0]["center_lps_mm"]])[0]).astype(int)
@@ -102,7 +102,7 @@ def test_interfaces_are_ramps_not_steps() -> None:
     assert len(between) > 60
 
 
-def test_vertebra_is_closed_round_its_canal() -> None:
+def test_bone_of_a_vertebra_surrounds_its_canal_and_leaves_it_free() -> None:
     anatomy = plan_anatomy((250.0, 250.0, 150.0), np.eye(3), seed=1)
     for vertebra in (anatomy.vertebrae[5], anatomy.vertebrae[14]):
         middle = vertebra.depth / 2.0 + vertebra.canal_half_depth - 0.8
@@ -119,7 +119,7 @@ def test_vertebra_is_closed_round_its_canal() -> None:
         assert (bone[:, canal_distance(vertebra, x, y) > 0.0] < 0.0).all()
 
 
-def test_levels_form_a_kyphosis_and_a_lordosis() -> None:
+def test_thoracic_levels_curve_backwards_and_lumbar_levels_forwards() -> None:
     anatomy = plan_anatomy((300.0, 300.0, 450.0), np.eye(3), seed=0)
     at = {vertebra.name: vertebra.center for vertebra in anatomy.vertebrae}
 

@@ -28,7 +28,7 @@ def test_there_are_256_cases_of_820_triangles_and_at_most_5_each():
 
 
 @pytest.mark.parametrize("case", range(256))
-def test_loops_use_every_crossed_edge_once(case):
+def test_loops_of_a_case_pass_every_crossed_edge_once(case):
     used = Counter(edge for loop in case_loops(case) for edge in loop)
     assert used == {edge: 1 for edge in range(12) if is_crossed(case, edge)}
 
@@ -43,7 +43,7 @@ def face_segments(case: int, face: frozenset) -> set:
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_neighbours_agree_on_every_face(axis):
+def test_surfaces_of_two_neighbouring_cells_meet_on_their_common_face_in_every_case(axis):
     """Whatever the states of two cells that share a face, the segments on it are each other's reverse."""
     low = [c for c in range(8) if CORNERS[c][axis] == 0]
     high = [c | 1 << axis for c in low]
@@ -67,7 +67,7 @@ def edges_across(edge: int, axis: int) -> int:
 
 
 @pytest.mark.parametrize("case", range(256))
-def test_no_triangle_edge_inside_a_case_lies_in_a_face(case):
+def test_no_inner_triangle_edge_of_a_case_lies_in_a_face_of_the_cell(case):
     """Else the neighbour could have the same chord, and the edge four triangles."""
     directed: Counter = Counter()
     for a, b, c in case_table()[case]:
@@ -91,7 +91,7 @@ def test_diagonal_inside_corners_of_a_face_stay_apart():
     assert len(case_loops(case)) == 2
 
 
-def test_packing_keeps_every_triangle():
+def test_packed_case_table_has_every_triangle_of_the_table():
     for case, word in enumerate(pack_case_table()):
         word = int(word)
         edges = [word >> 4 * place & 15 for place in range(1, 16)]
@@ -130,7 +130,7 @@ def test_the_first_cases_have_the_volumes_of_elementary_geometry():
 
 
 @pytest.mark.parametrize("case", range(128))
-def test_a_case_and_its_complement_err_to_opposite_sides(case):
+def test_volumes_of_a_case_and_its_complement_add_up_to_the_cell(case):
     """Else every surface would enclose too much or too little: 0.1 % on bone, 0.5 % on thin parts."""
     if not has_diagonal_face(case):  # there the inside corners are kept apart, in the complement the others
         assert volume_inside(case) + volume_inside(255 - case) == pytest.approx(1)

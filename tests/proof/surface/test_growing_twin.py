@@ -34,7 +34,7 @@ def scenes() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", scenes())
-def test_the_frontier_grows_the_components_that_hold_a_seed_cell_for_cell(name: str) -> None:
+def test_growing_from_seeds_finds_all_cells_of_their_components_and_no_others(name: str) -> None:
     inside = scenes()[name]
     count, numbers = label_cells(inside)
     assert count == numbers.max() + 1 and ((numbers >= 0) == find_active(inside)).all()
@@ -47,7 +47,7 @@ def test_the_frontier_grows_the_components_that_hold_a_seed_cell_for_cell(name: 
     assert grown.cells.sum() <= grown.visited <= numbers.size
 
 
-def test_components_are_numbered_by_their_first_cell() -> None:
+def test_components_of_cells_are_numbered_in_the_order_of_their_first_cells() -> None:
     _, numbers = label_cells(scenes()["sparse noise"])
     firsts = np.unique(numbers[numbers >= 0], return_index=True)[1]
     assert (np.diff(firsts) > 0).all() and len(firsts) > 5
@@ -62,7 +62,7 @@ def test_components_of_blocks_are_counted_as_known() -> None:
     assert label_cells(inside)[0] == 2
 
 
-def test_a_face_is_mixed_where_one_to_three_corners_are_inside() -> None:
+def test_face_is_mixed_exactly_where_one_to_three_of_its_corners_are_inside() -> None:
     for bits in range(16):
         inside = np.zeros((3, 2, 2), bool)
         inside[1] = np.array([bits >> n & 1 for n in range(4)], bool).reshape(2, 2)

@@ -129,7 +129,7 @@ def test_a_thousand_random_cells_have_the_topology_of_their_trilinear_field():
 
 
 @pytest.mark.parametrize(("dtype", "low", "high"), [("int16", -32768, 32767), ("uint16", 0, 65535)])
-def test_voxels_of_16_bits_lose_nothing(dtype, low, high):
+def test_scaled_heights_of_16_bit_voxels_are_exact(dtype, low, high):
     level = np.float32((low + high) // 2 - 0.5)
     voxels = np.concatenate([[low, high], np.random.default_rng(3).integers(low, high, 6)]).astype(dtype)
     heights = voxels.astype(np.float32) - level
@@ -161,7 +161,7 @@ def test_faces_are_decided_by_the_sign_at_the_saddle():
             assert bool(joined >> face & 1) == (saddle > 0)
 
 
-def test_both_cells_of_a_face_decide_it_alike():
+def test_two_cells_decide_their_common_face_in_the_same_way():
     rng = np.random.default_rng(5)
     for axis in range(3):
         upper, lower = 2 * axis + 1, 2 * axis
@@ -317,7 +317,7 @@ def test_a_hundred_surfaces_have_the_topology_of_the_field():
 
 @pytest.mark.parametrize("high", [2, 3, 5])
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
-def test_ties_leave_surfaces_closed_and_manifold(dtype, high):
+def test_surfaces_with_saddles_or_samples_at_the_iso_value_are_closed_and_manifold(dtype, high):
     """Whole numbers half a unit from the level give saddles at the level; floats also samples at it."""
     for seed in range(4):
         voxels = np.random.default_rng(seed).integers(0, high, (5, 5, 6)).astype(dtype)
@@ -330,7 +330,7 @@ def test_ties_leave_surfaces_closed_and_manifold(dtype, high):
             assert quality["zero_area_faces"] == 0 and quality["unused_vertices"] == 0
 
 
-def test_the_faces_of_masks_keep_their_parts_apart():
+def test_ambiguous_faces_of_masks_separate_their_inside_corners():
     """Every saddle of a mask of 0 and 1 lies at the level."""
     for case in range(256):
         assert decide_faces(case, [0.5 if case >> corner & 1 else -0.5 for corner in range(8)]) == 0

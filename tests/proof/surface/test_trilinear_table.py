@@ -70,7 +70,7 @@ def test_the_tunnels_are_those_of_marching_cubes_33():
     assert found == {expected[name]: sizes[name] for name in expected}
 
 
-def test_the_rest_of_marching_cubes_33_is_there():
+def test_states_of_ambiguous_faces_are_those_of_marching_cubes_33():
     """Loops of the states with ambiguous faces, by inside or outside corners and ambiguous faces."""
     found: Counter = Counter()
     for state in all_states():
@@ -108,7 +108,7 @@ def test_every_row_has_discs_and_at_most_one_tube():
         assert euler == len(case_loops(state.case, state.joined)) - (0 if tunnel is None else 2)
 
 
-def test_no_chord_lies_in_a_face():
+def test_no_inner_triangle_edge_of_a_row_lies_in_a_face_of_the_cell():
     """Else the neighbour could have the same chord, and the edge four triangles."""
     for state, _, row in all_rows():
         chords = set(directed_edges(row.triangles)) - loop_edges(case_loops(state.case, state.joined))
@@ -160,7 +160,7 @@ def test_regions_are_joined_by_edges_and_decided_faces():
     assert len(set(apart)) == 3 and len(set(joined)) == 2
 
 
-def test_packing_keeps_every_row():
+def test_packed_trilinear_tables_have_every_row_of_the_table():
     tables = pack_trilinear_tables()
     number = 0
     for case in range(256):
