@@ -166,7 +166,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     40: ("garbage for JPEG 2000 or JPEG-LS, a decoder that crashes: that file refused", ()),
     41: (
         "unknown, retired, private transfer syntax: refused with its UID",
-        (HOSTILE + "test_unknown_transfer_syntax_is_named",),
+        (HOSTILE + "test_slices_of_an_unknown_transfer_syntax_are_refused_by_its_uid",),
     ),
     42: (
         "big endian; implicit under explicit: right, told",

@@ -31,7 +31,7 @@ def write(folder, change, missing=(), **plan):
     return write_series(folder, Plan(shape=(SLICES, 4, 5), **{"gap": 1.0, "leave_out": tuple(missing), **plan}), change)
 
 
-def judge(folder, **options):
+def judge_completeness(folder, **options):
     """The gate as `info` and a volume have it, and that a failed one is said."""
     report = read_volume(folder, **options).report
     (gate,) = (gate for gate in report["gates"] if gate["name"] == "complete_series")
@@ -75,10 +75,10 @@ LOST = {
 
 
 @pytest.mark.parametrize("case", LOST.values(), ids=LOST)
-def test_slices_that_are_missing_are_counted(tmp_path, case):
+def test_slices_missing_by_numbers_or_stated_counts_fail_the_gate_with_their_count(tmp_path, case):
     change, missing, count, words, *plan = case
     write(tmp_path, change, missing, **(plan[0] if plan else {}))
-    gate = judge(tmp_path)
+    gate = judge_completeness(tmp_path)
     assert (gate["ok"], gate["measured"], gate["bound"]) == (False, count, 0)
     assert words in gate["text"]
 
@@ -103,35 +103,35 @@ KEPT = {
 
 
 @pytest.mark.parametrize("case", KEPT.values(), ids=KEPT)
-def test_odd_numbering_is_no_loss(tmp_path, case):
+def test_series_with_odd_but_complete_numbers_passes_the_gate(tmp_path, case):
     change, missing, *plan = case
     write(tmp_path, change, missing, **(plan[0] if plan else {}))
-    gate = judge(tmp_path)
+    gate = judge_completeness(tmp_path)
     assert (gate["ok"], gate["measured"]) == (True, 0), gate["text"]
 
 
-def test_numbers_out_of_order_and_no_count_are_not_judged(tmp_path):
+def test_completeness_is_not_judged_by_numbers_out_of_order_without_a_stated_count(tmp_path):
     write(tmp_path, numbered(lambda k: 7 * k % 23))
-    gate = judge(tmp_path)
+    gate = judge_completeness(tmp_path)
     assert (gate["ok"], gate["measured"]) == (None, None)
 
 
 @pytest.mark.parametrize("wider", [False, True])
-def test_numbers_that_skip_count_from_a_bound_of_the_gap_on(tmp_path, wider):
+def test_every_second_number_fails_where_slices_lie_wider_apart_than_a_bound(tmp_path, wider):
     write(tmp_path, numbered(up), ODD, gap=0.5 * WIDER * (1.01 if wider else 0.99))
-    assert judge(tmp_path)["ok"] is not wider
+    assert judge_completeness(tmp_path)["ok"] is not wider
 
 
 @pytest.mark.parametrize("far", [False, True])
-def test_steps_of_numbers_count_up_to_a_bound_of_the_gap(tmp_path, far):
+def test_numbers_in_steps_fail_where_slices_lie_closer_than_a_bound_for_each_number(tmp_path, far):
     write(tmp_path, numbered(lambda k: 5 * k), gap=5 * CLOSEST * (1.01 if far else 0.99))
-    assert judge(tmp_path)["ok"] is not far
+    assert judge_completeness(tmp_path)["ok"] is not far
 
 
 @pytest.mark.parametrize("lost", [LOCALIZERS, LOCALIZERS + 1, SLICES // 2 - 1, SLICES // 2])
-def test_slices_lost_at_the_start_count_between_localizers_and_half(tmp_path, lost):
+def test_numbers_that_begin_late_fail_between_the_most_localizers_and_half_of_the_slices(tmp_path, lost):
     write(tmp_path, numbered(up), range(lost))
-    assert judge(tmp_path)["ok"] is (lost in (LOCALIZERS, SLICES // 2))
+    assert judge_completeness(tmp_path)["ok"] is (lost in (LOCALIZERS, SLICES // 2))
 
 
 def scout(ds, k):
@@ -139,13 +139,22 @@ def scout(ds, k):
     ds.InstanceNumber = k + 1
 
 
-def test_localizers_of_the_series_have_numbers_and_are_counted(tmp_path):
-    write_series(tmp_path / "scouts", Plan(shape=(6, 4, 5), angles=(0, 90, 90)), scout)
+def write_with_localizers(folder):
+    """6 localizers with the numbers 1 to 6, 24 slices with 7 to 30, and 30 images by their headers."""
+    write_series(folder / "scouts", Plan(shape=(6, 4, 5), angles=(0, 90, 90)), scout)
     stated = set_values(ImagesInAcquisition=SLICES + 6, NumberOfSeriesRelatedInstances=str(SLICES + 6))
-    write(tmp_path / "ct", numbered(lambda k: k + 7, stated))
-    assert judge(tmp_path)["ok"] is True
+    write(folder / "ct", numbered(lambda k: k + 7, stated))
+
+
+def test_localizers_of_a_series_are_counted_as_its_images(tmp_path):
+    write_with_localizers(tmp_path)
+    assert judge_completeness(tmp_path)["ok"] is True
+
+
+def test_localizers_that_are_missing_fail_the_gate(tmp_path):
+    write_with_localizers(tmp_path)
     shutil.rmtree(tmp_path / "scouts")
-    gate = judge(tmp_path)
+    gate = judge_completeness(tmp_path)
     assert (gate["ok"], gate["measured"]) == (False, 6)
 
 
@@ -162,40 +171,57 @@ def test_all_phases_have_their_numbers_and_are_counted(tmp_path, together):
 
         write(tmp_path / str(phase), numbered(number, another, thickness=0.6))
     for phase in (1, 2):
-        assert judge(tmp_path, phase=phase)["ok"] is True
+        assert judge_completeness(tmp_path, phase=phase)["ok"] is True
 
 
 def test_copies_do_not_make_up_for_what_is_missing(tmp_path):
     write(tmp_path / "ct", numbered(up, STATED))
     shutil.copytree(tmp_path / "ct", tmp_path / "again")
-    assert judge(tmp_path)["ok"] is True
+    assert judge_completeness(tmp_path)["ok"] is True
     for k in range(14, SLICES):
         for folder in ("ct", "again"):
             (tmp_path / folder / f"slice{k:03}.dcm").unlink()
-    assert judge(tmp_path)["measured"] == 10
+    assert judge_completeness(tmp_path)["measured"] == 10
 
 
-def test_an_acquisition_that_was_reconstructed_twice_is_counted_once(tmp_path):
+def test_images_of_an_acquisition_reconstructed_as_two_series_are_counted_in_both(tmp_path):
     stated = set_values(ImagesInAcquisition=2 * SLICES, StudyInstanceUID=f"{ROOT}.77")
     for series in (1, 2):
         write(tmp_path / str(series), numbered(up, stated), series=series)
-    assert judge(tmp_path, series=1)["ok"] is True
+    assert judge_completeness(tmp_path, series=1)["ok"] is True
+
+
+def test_images_missing_of_the_other_series_of_an_acquisition_fail_the_gate(tmp_path):
+    stated = set_values(ImagesInAcquisition=2 * SLICES, StudyInstanceUID=f"{ROOT}.77")
+    for series in (1, 2):
+        write(tmp_path / str(series), numbered(up, stated), series=series)
     (tmp_path / "2" / "slice000.dcm").unlink()
-    assert judge(tmp_path, series=1)["measured"] == SLICES
+    assert judge_completeness(tmp_path, series=1)["measured"] == SLICES
 
 
-def test_series_numbered_on_from_another_is_complete(tmp_path):
+def write_numbered_on(folder):
+    """Series 1 with the numbers 1 to 10, and series 2 of the study with 11 to 34."""
     study = set_values(StudyInstanceUID=f"{ROOT}.77")
-    write(tmp_path / "1", numbered(up, study), range(10, SLICES))
-    write(tmp_path / "2", numbered(lambda k: k + 11, study), series=2)
-    assert judge(tmp_path, series=2)["ok"] is True
+    write(folder / "1", numbered(up, study), range(10, SLICES))
+    write(folder / "2", numbered(lambda k: k + 11, study), series=2)
+
+
+def test_series_numbered_on_from_another_of_its_study_passes_the_gate(tmp_path):
+    write_numbered_on(tmp_path)
+    assert judge_completeness(tmp_path, series=2)["ok"] is True
+
+
+def test_series_numbered_on_from_another_that_lacks_a_slice_fails_the_gate(tmp_path):
+    write_numbered_on(tmp_path)
     (tmp_path / "1" / "slice009.dcm").unlink()
-    assert judge(tmp_path, series=2)["measured"] == 10
+    assert judge_completeness(tmp_path, series=2)["measured"] == 10
 
 
-def test_files_with_many_frames_count_once(tmp_path):
+def test_file_with_many_frames_counts_as_one_stated_instance(tmp_path):
     write_enhanced(tmp_path / "a.dcm", change=lambda ds: setattr(ds, "NumberOfSeriesRelatedInstances", "3"))
-    assert "(NumberOfSeriesRelatedInstances says 3, there is 1): 2, none allowed" in judge(tmp_path)["text"]
+    assert (
+        "(NumberOfSeriesRelatedInstances says 3, there is 1): 2, none allowed" in judge_completeness(tmp_path)["text"]
+    )
 
 
 def test_certificate_holds_the_figures_of_the_numbering(tmp_path):

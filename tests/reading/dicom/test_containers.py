@@ -45,14 +45,14 @@ PACKED = {
 
 
 @pytest.mark.parametrize("kind", PACKED)
-def test_row_48_a_packed_series_is_named_with_what_to_do(tmp_path, kind):
+def test_row_48_packed_series_is_refused_with_its_kind_and_the_advice_to_unpack(tmp_path, kind):
     plan = write_series(tmp_path / "ct", Plan(shape=(2, 5, 6)))
     (tmp_path / "packed").write_bytes(PACKED[kind]((tmp_path / "ct" / plan.name(0)).read_bytes()))
     with refused(NoDicomError, 1, kind.split()[0], "unpack"):
         read_volume(tmp_path / "packed")
 
 
-def test_row_48_an_archive_beside_the_slices_is_counted(tmp_path):
+def test_row_48_archive_beside_the_slices_is_counted_as_skipped(tmp_path):
     write_series(tmp_path, Plan(shape=(2, 5, 6)))
     (tmp_path / "backup").write_bytes(make_zip(b"x"))
     assert read_volume(tmp_path).report["files"]["skipped"] == {"zip archive": 1}
@@ -74,26 +74,39 @@ def test_row_48_an_archive_beside_the_slices_is_counted(tmp_path):
         (bytes(257), ""),
     ],
 )
-def test_containers_are_named_by_their_first_bytes(start, kind):
+def test_kind_of_a_file_is_told_by_its_first_bytes(start, kind):
     assert describe_container(start) == kind
 
 
-def test_a_mesh_in_place_of_a_scan_is_called_one(tmp_path):
+@pytest.mark.parametrize(("extension", "kind"), [(".3mf", "3MF"), (".glb", "GLB")])
+def test_mesh_in_place_of_a_scan_is_refused_as_a_mesh(tmp_path, extension, kind):
     mesh = Mesh([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
-    for extension, kind in ((".3mf", "3MF"), (".glb", "GLB")):
-        mesh.save(tmp_path / f"a{extension}")
-        with refused(NoDicomError, kind, "mesh", 1):
-            read_volume(tmp_path / f"a{extension}")
+    mesh.save(tmp_path / f"a{extension}")
+    with refused(NoDicomError, kind, "mesh", 1):
+        read_volume(tmp_path / f"a{extension}")
 
 
-def test_advice_is_for_what_can_be_unpacked():
-    assert advise_on(["PNG image", "not DICOM"]) == ""
-    assert advise_on(["zip archive", "PNG image", "tar archive"]) == (
-        "unpack each tar archive and zip archive and name the folder"
-    )
-    assert advise_on(["NRRD volume", "MetaImage volume"]) == (
-        "a MetaImage volume or NRRD volume is read when the file itself is named"
-    )
+@pytest.mark.parametrize(
+    ("kinds", "advice"),
+    [
+        pytest.param(["PNG image", "not DICOM"], "", id="nothing to unpack"),
+        pytest.param(
+            ["zip archive", "PNG image", "tar archive"],
+            "unpack each tar archive and zip archive and name the folder",
+            id="archives",
+        ),
+        pytest.param(
+            ["NRRD volume", "MetaImage volume"],
+            "a MetaImage volume or NRRD volume is read when the file itself is named",
+            id="volumes",
+        ),
+    ],
+)
+def test_advice_on_skipped_files_is_to_unpack_archives_or_to_name_volumes(kinds, advice):
+    assert advise_on(kinds) == advice
+
+
+def test_advice_on_a_gzip_file_is_also_that_it_may_be_a_nifti():
     assert advise_on(["gzip file"]).endswith("; a NIfTI volume (.nii.gz) is read when the file itself is named")
 
 
@@ -106,7 +119,7 @@ def test_advice_is_for_what_can_be_unpacked():
         (bytes(range(256)), (1, "DICOM", "NIfTI", "NRRD")),
     ],
 )
-def test_a_single_file_is_named_as_what_it_is(tmp_path, content, words):
+def test_single_file_that_is_no_scan_is_refused_with_what_it_is(tmp_path, content, words):
     (tmp_path / "a.asc").write_bytes(content)
     with refused(NoDicomError, *words):
         read_volume(tmp_path / "a.asc")

@@ -47,7 +47,7 @@ def test_implicit_elements_under_an_explicit_syntax_are_read_with_a_warning(tmp_
     assert "parsed as found" in volume.report["warnings"][0]
 
 
-def test_executable_preambles_are_read_as_dicom(tmp_path):
+def test_dicom_whose_preamble_starts_a_program_is_read(tmp_path):
     plan = write_series(tmp_path, Plan(**PLAN))
     for file in tmp_path.iterdir():
         data = file.read_bytes()
@@ -55,7 +55,7 @@ def test_executable_preambles_are_read_as_dicom(tmp_path):
     assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
 
 
-def test_unknown_transfer_syntax_is_named(tmp_path):
+def test_slices_of_an_unknown_transfer_syntax_are_refused_by_its_uid(tmp_path):
     plan = Plan(**PLAN)
     for k in range(3):
         ds = make_dataset(plan, k)

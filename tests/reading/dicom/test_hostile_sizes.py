@@ -40,19 +40,19 @@ def spoil(folder, data, behind=b"", size=None):
 
 @pytest.mark.seconds
 @pytest.mark.parametrize("vr", daily(1, [b"OB", b"UN"]), ids=str)
-def test_the_end_of_a_value_is_not_looked_for_in_all_of_a_large_file(tmp_path, vr):
+def test_value_of_undefined_length_in_a_file_of_64_gib_is_refused_without_reading_all(tmp_path, vr):
     spoil(tmp_path, element(0x27, 0x1001, vr, UNDEFINED), size=1 << 36)
     with refused(RefusedInputError, "slice003.dcm"):
         read_volume(tmp_path)
 
 
-def test_a_value_of_gigabytes_is_not_read(tmp_path):
+def test_text_of_gigabytes_is_refused_without_reading_it(tmp_path):
     spoil(tmp_path, element(0x28, 0x1053, b"UT", 0xF0000000), size=1 << 33)
     with refused(RefusedInputError, "slice003.dcm", 4194304):
         read_volume(tmp_path)
 
 
-def test_no_more_of_a_deflated_file_is_read_than_its_header_takes(tmp_path):
+def test_deflated_slice_in_a_file_of_64_gib_is_read_without_reading_all(tmp_path):
     def lengthen(ds, k):
         ds.private_block(0x27, "OWN", create=True).add_new(1, "OB", np.random.default_rng(k).bytes(300_000))
 
@@ -63,7 +63,7 @@ def test_no_more_of_a_deflated_file_is_read_than_its_header_takes(tmp_path):
 
 @pytest.mark.release
 @pytest.mark.seconds
-def test_long_sequences_are_stepped_over_without_objects(tmp_path):
+def test_slice_with_a_sequence_of_200_000_items_is_read(tmp_path):
     """What contours and segments are: pydicom takes 50 times their size for them."""
     item = struct.pack("<HHL", 0xFFFE, 0xE000, UNDEFINED) + struct.pack("<HH2sH", 9, 0x1001, b"LO", 2) + b"ab"
     item += struct.pack("<HHL", 0xFFFE, 0xE00D, 0)
@@ -74,16 +74,24 @@ def test_long_sequences_are_stepped_over_without_objects(tmp_path):
     assert read_volume(tmp_path).voxels.shape == (7, 5, 6)
 
 
-@pytest.mark.release
-@pytest.mark.seconds
-def test_long_sequences_deep_in_others_are_refused(tmp_path):
-    """They are left to the careful parser, which makes objects: few of them are stepped over."""
+def nested_sequence_of_items(count):
+    """A sequence of so many items within nine others."""
     start, end = struct.pack("<HHL", 0xFFFE, 0xE000, UNDEFINED), struct.pack("<HHL", 0xFFFE, 0xE00D, 0)
     item = start + struct.pack("<HH2sH", 9, 0x1001, b"LO", 2) + b"ab" + end
     head, tail = element(0x27, 0x1001, b"SQ", UNDEFINED), struct.pack("<HHL", 0xFFFE, 0xE0DD, 0)
-    spoil(tmp_path, 9 * (head + start) + head + 100 * item + tail + 9 * (end + tail))
+    return 9 * (head + start) + head + count * item + tail + 9 * (end + tail)
+
+
+def test_slice_with_a_sequence_of_100_items_deep_in_others_is_read(tmp_path):
+    spoil(tmp_path, nested_sequence_of_items(100))
     assert read_volume(tmp_path).voxels.shape == (7, 5, 6)
-    spoil(tmp_path, 9 * (head + start) + head + 200_000 * item + tail + 9 * (end + tail))
+
+
+@pytest.mark.release
+@pytest.mark.seconds
+def test_slice_with_a_sequence_of_200_000_items_deep_in_others_is_refused(tmp_path):
+    """It is left to the careful parser, which makes objects of items."""
+    spoil(tmp_path, nested_sequence_of_items(200_000))
     with refused(RefusedInputError, "slice003.dcm"):
         read_volume(tmp_path)
 
@@ -97,7 +105,7 @@ def write_compressed(path, frame):
     return path.read_bytes()
 
 
-def test_row_38_a_compressed_frame_of_gigabytes_is_not_read(tmp_path):
+def test_row_38_compressed_frame_of_gigabytes_for_60_bytes_of_pixels_is_refused(tmp_path):
     write_series(tmp_path)
     path = tmp_path / "slice003.dcm"
     start = b"\xff\x4f\xff\x51"
@@ -107,11 +115,12 @@ def test_row_38_a_compressed_frame_of_gigabytes_is_not_read(tmp_path):
         file.write(data[: place - 4] + struct.pack("<L", length) + start)
         file.seek(place + length)
         file.write(struct.pack("<HHL", 0xFFFE, 0xE0DD, 0))
-    with refused(RefusedInputError, "slice003.dcm", 4026531840, 60):
+    pixel_bytes = 5 * 6 * 2
+    with refused(RefusedInputError, "slice003.dcm", length, pixel_bytes):
         read_volume(tmp_path)
 
 
-def test_row_38_empty_fragments_are_counted(tmp_path):
+def test_row_38_frame_of_5000_empty_fragments_is_refused(tmp_path):
     write_series(tmp_path)
     path = tmp_path / "slice003.dcm"
     start = b"\xff\x4f\xff\x51"
@@ -122,7 +131,7 @@ def test_row_38_empty_fragments_are_counted(tmp_path):
         read_volume(tmp_path)
 
 
-def test_no_memory_is_an_error_of_the_file(tmp_path, monkeypatch):
+def test_deflated_series_for_which_memory_runs_out_is_refused(tmp_path, monkeypatch):
     def fail(read, most, step):
         raise MemoryError
 

@@ -19,7 +19,7 @@ from clrecon import read_volume
 SAID = "Modality LUT Sequence (0028,3000), which is not applied: slope 1, intercept -1024 taken"
 
 
-def judge(path, **options):
+def measure_hu_known(path, **options):
     report = read_volume(path, **options).report
     (known,) = (gate for gate in report["gates"] if gate["name"] == "hu_known")
     return known["measured"], [text for text in report["warnings"] if SAID in text]
@@ -29,7 +29,7 @@ def judge(path, **options):
 @pytest.mark.parametrize(
     "syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian]
 )
-def test_a_table_is_told_in_any_encoding(tmp_path, syntax, undefined):
+def test_modality_lut_of_one_slice_fails_the_gate_of_hu_with_a_warning_in_any_encoding(tmp_path, syntax, undefined):
     def change(ds, k):
         if k != 3:
             return
@@ -40,18 +40,18 @@ def test_a_table_is_told_in_any_encoding(tmp_path, syntax, undefined):
 
     plan = Plan(syntax=syntax)
     write_series(tmp_path, plan, change)
-    measured, said = judge(tmp_path)
+    measured, said = measure_hu_known(tmp_path)
     assert measured == 1
     assert len(said) == 1 and said[0].endswith("(1 of 7 slices, at -396.25 mm)")
 
 
-def test_a_table_without_items_is_none(tmp_path):
+def test_modality_lut_without_items_is_not_warned_of(tmp_path):
     empty = Sequence()
     empty.is_undefined_length = True
     write_series(tmp_path, change=set_values(ModalityLUTSequence=empty))
-    assert judge(tmp_path) == (0, [])
+    assert measure_hu_known(tmp_path) == (0, [])
 
 
-def test_a_given_rescale_stands_in_place_of_the_table(tmp_path):
+def test_modality_lut_is_not_warned_of_where_a_rescale_is_given(tmp_path):
     write_series(tmp_path, change=set_values(ModalityLUTSequence=make_table()))
-    assert judge(tmp_path, rescale=(1, -1024)) == (0, [])
+    assert measure_hu_known(tmp_path, rescale=(1, -1024)) == (0, [])

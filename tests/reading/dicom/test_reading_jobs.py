@@ -18,30 +18,30 @@ from clrecon.reading.dicom.pixels.stored import StoredPixels
 from clrecon.system import memory
 
 
-def test_an_interrupt_ends_reading_while_slices_are_still_being_handed_out(tmp_path, monkeypatch):
+def test_interrupt_ends_reading_while_slices_are_still_being_handed_out(tmp_path, monkeypatch):
     write_series(tmp_path, Plan(shape=(60, 5, 6)))
-    read, submitted, submit = [], [], ThreadPoolExecutor.submit
+    slices_read, submitted, submit = [], [], ThreadPoolExecutor.submit
 
     def load_slowly(source, header, out):
-        read.append(header)
+        slices_read.append(header)
         time.sleep(0.05)
         return out
 
-    def interrupt(*arguments):
+    def interrupt_the_50th(*arguments):
         submitted.append(arguments)
         if len(submitted) == 50:
             raise KeyboardInterrupt
         return submit(*arguments)
 
     monkeypatch.setattr(StoredPixels, "load", load_slowly)
-    monkeypatch.setattr(ThreadPoolExecutor, "submit", interrupt)
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", interrupt_the_50th)
     with pytest.raises(KeyboardInterrupt):
         read_volume(tmp_path)
-    assert len(read) <= 2 * pixels.MAX_READERS
+    assert len(slices_read) <= 2 * pixels.MAX_READERS  # those at work, and as many that had been handed out
 
 
 @pytest.mark.parametrize(("slices", "expected"), [(2, 1), (7, 1), (40, 6)])
-def test_few_frames_start_few_decoders(tmp_path, monkeypatch, slices, expected):
+def test_number_of_decoder_processes_grows_with_the_slices(tmp_path, monkeypatch, slices, expected):
     """A process takes longer to start than a frame of half a MiB to decode."""
     counts = []
     monkeypatch.setattr(pixels, "count_readers", lambda slices, most: counts.append(most) or 1)
@@ -68,7 +68,7 @@ def test_few_frames_start_few_decoders(tmp_path, monkeypatch, slices, expected):
     ],
     ids=["group around it", "its own as the root", "version 1", "no limit", "another group"],
 )  # fmt: skip
-def test_row_39_memory_is_that_of_the_container(tmp_path, line, files):
+def test_row_39_available_memory_is_that_of_the_container_where_it_has_a_limit(tmp_path, line, files):
     proc, groups = tmp_path / "proc", tmp_path / "groups"
     (proc / "self").mkdir(parents=True)
     (proc / "meminfo").write_text("MemTotal: 2097152 kB\nMemAvailable: 1048576 kB\n")

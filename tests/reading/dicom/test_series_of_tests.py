@@ -13,7 +13,7 @@ from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
 @pytest.mark.parametrize(
     "plan", [{}, {"signed": True, "pixel_spacing": (1.25, 0.3), "tilt_deg": 12.0, "series": 1234567}], ids=str
 )
-def test_files_are_those_that_pydicom_writes(syntax: str, plan: dict, tmp_path: Path) -> None:
+def test_files_of_remembered_bytes_are_those_that_pydicom_writes(syntax: str, plan: dict, tmp_path: Path) -> None:
     plan = Plan(syntax=syntax, **plan)
     for k in range(3):
         save_dataset(make_dataset(plan, k), tmp_path / "remembered.dcm")
