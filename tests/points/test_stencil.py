@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
 from refusals import refused
 from uneven_volume import uneven
 
@@ -15,7 +16,7 @@ SHEARED = np.array([[0.7, 0.1, 0.05, -50.0], [-0.1, 0.5, 0.62, -30.0], [0.0, 0.0
 THORACIC = np.diag((0.644531, 0.644531, 0.8, 1.0))
 
 
-def volume_of(affine: np.ndarray, shape: tuple[int, int, int] = (7, 9, 11)) -> Volume:
+def empty_volume(affine: np.ndarray, shape: tuple[int, int, int] = (7, 9, 11)) -> Volume:
     return Volume(np.zeros(shape, np.int8), affine)
 
 
@@ -37,93 +38,121 @@ def offsets_by_search(volume: Volume, k: int, eps: float) -> set[tuple[int, int,
     return found
 
 
-@pytest.mark.parametrize("eps", [0.3, 0.644531, 0.8, 1.2, 2.0, 3.7, 50.0])
-@pytest.mark.parametrize("which", ["thoracic", "sheared", "mirrored", "uneven", "uneven mirrored"])
-def test_members_are_those_within_eps(which: str, eps: float) -> None:
-    volume = {
-        "thoracic": lambda: volume_of(THORACIC),
-        "sheared": lambda: volume_of(SHEARED),
-        "mirrored": lambda: volume_of(SHEARED @ np.diag((1.0, -1.0, -1.0, 1.0))),
-        "uneven": uneven,
-        "uneven mirrored": lambda: uneven(sign=-1.0),
-    }[which]()
-    stencil = make_stencil(Lattice.of(volume), eps)
-    nk = volume.shape_ijk[2]
-    assert stencil.tables.shape == (nk, 2)
-    for k in range(nk):
-        within = {offset for offset in offsets_of(stencil, k) if 0 <= k + offset[2] < nk}
-        assert within == offsets_by_search(volume, k, eps)
+VOLUMES = {
+    "thoracic": empty_volume(THORACIC),
+    "sheared": empty_volume(SHEARED),
+    "mirrored": empty_volume(SHEARED @ np.diag((1.0, -1.0, -1.0, 1.0))),
+    "uneven": uneven(),
+    "uneven mirrored": uneven(sign=-1.0),
+}
 
 
-def test_two_voxels_see_each_other_or_neither_does() -> None:
+@pytest.mark.parametrize("eps_mm", [0.3, 0.644531, 0.8, 1.2, 2.0, 3.7, 50.0])
+@pytest.mark.parametrize("volume", VOLUMES.values(), ids=VOLUMES)
+def test_members_of_a_stencil_are_the_voxels_within_eps(volume: Volume, eps_mm: float) -> None:
+    stencil = make_stencil(Lattice.of(volume), eps_mm)
+    slices = range(volume.shape_ijk[2])
+    assert stencil.tables.shape == (len(slices), 2)
+    for k in slices:
+        in_the_volume = {offset for offset in offsets_of(stencil, k) if k + offset[2] in slices}
+        assert in_the_volume == offsets_by_search(volume, k, eps_mm), k
+
+
+def test_two_voxels_are_members_of_each_other_or_neither_is() -> None:
     volume = uneven()
     stencil = make_stencil(Lattice.of(volume), 1.9)
-    seen = {(k, di, dj, dk) for k in range(volume.shape_ijk[2]) for di, dj, dk in offsets_of(stencil, k)}
-    assert {(k + dk, -di, -dj, -dk) for k, di, dj, dk in seen} == seen
-    assert any(dk for _, _, _, dk in seen)
+    pairs = {(k, di, dj, dk) for k in range(volume.shape_ijk[2]) for di, dj, dk in offsets_of(stencil, k)}
+    assert any(dk for _, _, _, dk in pairs), "some lie in other slices"
+    assert {(k + dk, -di, -dj, -dk) for k, di, dj, dk in pairs} == pairs
 
 
-def test_stencils_of_known_scans_have_the_members_of_the_design() -> None:
-    """Members that the design of the clusters names: 19 at 0.8 mm gaps and eps 1.2, 275 at 4.25 mm and eps 6.4."""
-    thoracic = make_stencil(Lattice((512, 512, 95), THORACIC), 1.2)
-    assert (thoracic.in_plane, thoracic.members) == (9, (19, 19))
-    lumbar = Lattice((512, 512, 99), np.diag((0.976562, 0.976562, 4.25, 1.0)))
-    assert lumbar.default_eps == pytest.approx(6.375)
-    assert make_stencil(lumbar, 6.4).members == (275, 275)
+@pytest.mark.parametrize(
+    ("spacing", "eps_mm", "members"),
+    [((0.644531, 0.644531, 0.8), 1.2, 19), ((0.976562, 0.976562, 4.25), 6.4, 275)],
+    ids=["thoracic", "lumbar"],
+)
+def test_stencils_of_known_scans_have_as_many_members_as_counted(
+    spacing: tuple[float, ...], eps_mm: float, members: int
+) -> None:
+    stencil = make_stencil(Lattice((512, 512, 99), np.diag((*spacing, 1.0))), eps_mm)
+    offsets = np.indices([2 * int(eps_mm / step) + 1 for step in spacing]).reshape(3, -1).T
+    offsets -= [int(eps_mm / step) for step in spacing]
+    assert np.count_nonzero(np.linalg.norm(offsets * spacing, axis=1) <= eps_mm) == members
+    assert stencil.members == (members, members)
 
 
-def test_an_eps_of_one_slice_gap_reaches_the_next_slice() -> None:
-    gap = 0.1 + 0.2  # not 0.3
-    lattice = Lattice((5, 5, 5), np.diag((1.0, 1.0, gap, 1.0)))
-    assert make_stencil(lattice, 0.3).members == (3, 3)
-    assert make_stencil(lattice, 0.3 * (1 - 3e-6)).is_alone
+def test_members_in_the_plane_of_a_stencil_are_counted() -> None:
+    """Steps of 0.645 mm: with the diagonal ones, 0.91 mm away, nine lie within 1.2 mm."""
+    assert make_stencil(Lattice((512, 512, 95), THORACIC), 1.2).in_plane == 9
 
 
-def test_the_diagonal_decides_whether_a_volume_lies_within_eps() -> None:
-    """Of a box of 3 x 4 x 5 steps of 1 mm, and of an uneven stack of 6 slices."""
+@pytest.mark.parametrize(
+    ("eps_mm", "members"), [(0.3, 3), (0.3 * (1 - 3e-6), 1)], ids=["the gap but for rounding", "less than the gap"]
+)
+def test_an_eps_of_one_slice_gap_reaches_the_next_slices_despite_rounding(eps_mm: float, members: int) -> None:
+    gap_mm = 0.1 + 0.2  # not 0.3
+    stencil = make_stencil(Lattice((5, 5, 5), np.diag((1.0, 1.0, gap_mm, 1.0))), eps_mm)
+    assert stencil.members == (members, members)
+    assert stencil.is_alone == (members == 1)
+
+
+@pytest.mark.parametrize(("eps_mm", "holds"), [(np.sqrt(3**2 + 4**2 + 5**2), True), (7.0, False)])
+def test_a_volume_lies_within_eps_where_its_diagonal_does(eps_mm: float, holds: bool) -> None:
     box = Lattice((4, 5, 6), np.eye(4))
-    assert make_stencil(box, 50.0**0.5).holds((4, 5, 6)) and not make_stencil(box, 7.0).holds((4, 5, 6))
+    assert make_stencil(box, eps_mm).holds((4, 5, 6)) == holds
+
+
+@pytest.mark.parametrize(("shorter_mm", "holds"), [(0.0, True), (0.001, False)])
+def test_an_uneven_volume_lies_within_eps_where_its_longest_distance_does(shorter_mm: float, holds: bool) -> None:
     volume = uneven()
     corners = volume.ijk_to_lps([(i, j, k) for i in (0, 3) for j in (0, 4) for k in range(6)])
-    longest = np.linalg.norm(corners[:, None] - corners, axis=2).max()
-    lattice = Lattice.of(volume)
-    assert make_stencil(lattice, longest).holds(volume.shape_ijk)
-    assert not make_stencil(lattice, longest - 0.001).holds(volume.shape_ijk)
+    longest_mm = np.linalg.norm(corners[:, None] - corners, axis=2).max()
+    assert make_stencil(Lattice.of(volume), longest_mm - shorter_mm).holds(volume.shape_ijk) == holds
 
 
 def test_slices_with_the_same_neighbours_share_a_table() -> None:
-    places = np.array([(0.0, 0.0, z) for z in (0, 1, 2, 3, 4, 9)])
-    tables = make_stencil(Lattice((3, 3, 6), np.eye(4), places), 1.0).tables.tolist()
+    """Slices at 0, 1, 2, 3, 4 and 9 mm, of which 1, 2 and 3 have one above and one below within 1 mm."""
+    positions = np.array([(0.0, 0.0, z) for z in (0, 1, 2, 3, 4, 9)])
+    tables = make_stencil(Lattice((3, 3, 6), np.eye(4), positions), 1.0).tables.tolist()
     assert tables[1] == tables[2] == tables[3]
     assert len({tuple(table) for table in tables}) == 4
 
 
-def test_rows_are_sorted_by_distance() -> None:
-    stencil = make_stencil(Lattice((30, 30, 30), THORACIC), 3.0)
-    middle = np.stack([(stencil.rows[:, 2] + stencil.rows[:, 3]) / 2, stencil.rows[:, 0], stencil.rows[:, 1]], axis=1)
-    assert (np.diff(np.linalg.norm(middle * np.diag(THORACIC)[:3], axis=1)) > -1e-9).all()
+def test_rows_of_a_stencil_are_sorted_by_the_distance_of_their_middle() -> None:
+    dj, dk, low, high = make_stencil(Lattice((30, 30, 30), THORACIC), 3.0).rows.T
+    middles = np.stack([(low + high) / 2, dj, dk], axis=1) * np.diag(THORACIC)[:3]
+    distances = np.linalg.norm(middles, axis=1)
+    assert (np.diff(distances) > -tolerances.FLOAT64_PLACE_MM).all()
 
 
-def test_forward_rows_and_their_mirror_are_the_whole_stencil() -> None:
-    for lattice in (Lattice((30, 30, 30), SHEARED), Lattice.of(uneven())):
-        stencil = make_stencil(lattice, 2.4)
-        forward = stencil.forward()
-        for k in range(lattice.shape_ijk[2]):
-            ahead = offsets_of(forward, k)
-            assert all((dk, dj, di) > (0, 0, 0) for di, dj, dk in ahead)
-            assert {offset for offset in offsets_of(stencil, k) if offset[::-1] > (0, 0, 0)} == ahead
+@pytest.mark.parametrize("lattice", [Lattice((30, 30, 30), SHEARED), Lattice.of(uneven())], ids=["sheared", "uneven"])
+def test_forward_rows_hold_the_members_after_a_voxel_in_the_order_of_the_array(lattice: Lattice) -> None:
+    stencil = make_stencil(lattice, 2.4)
+    forward = stencil.forward()
+    for k in range(lattice.shape_ijk[2]):
+        after = {(di, dj, dk) for di, dj, dk in offsets_of(stencil, k) if (dk, dj, di) > (0, 0, 0)}
+        assert offsets_of(forward, k) == after, k
 
 
-def test_default_eps_takes_the_largest_step() -> None:
-    assert Lattice((4, 4, 4), np.diag((2.0, 0.5, 1.0, 1.0))).default_eps == 3.0
-    assert Lattice((4, 4, 1), np.diag((0.5, 0.5, 9.0, 1.0))).default_eps == 0.75  # a single slice has no gap
-    own = uneven()
-    assert Lattice.of(own).default_eps == pytest.approx(1.5 * 5.0)  # the widest gap of the uneven slices
+LATTICES = {
+    "columns 2 mm apart": (Lattice((4, 4, 4), np.diag((2.0, 0.5, 1.0, 1.0))), 1.5 * 2.0),
+    "a single slice, which has no gap": (Lattice((4, 4, 1), np.diag((0.5, 0.5, 9.0, 1.0))), 1.5 * 0.5),
+    "uneven slices, the widest gap 5 mm": (Lattice.of(uneven()), 1.5 * 5.0),
+    "slices 4.25 mm apart": (Lattice((512, 512, 99), np.diag((0.976562, 0.976562, 4.25, 1.0))), 1.5 * 4.25),
+}
+
+
+@pytest.mark.parametrize(("lattice", "eps_mm"), LATTICES.values(), ids=LATTICES)
+def test_the_default_eps_is_one_and_a_half_times_the_largest_step(lattice: Lattice, eps_mm: float) -> None:
+    assert lattice.default_eps == pytest.approx(eps_mm)
+
+
+def test_the_gap_of_tilted_slices_is_their_distance_and_not_their_step() -> None:
     tilted = np.array([[0.5, 0, 0, 0], [0, 0.5, 1.0, 0], [0, 0, 2.0, 0], [0, 0, 0, 1.0]])
     assert Lattice((4, 4, 4), tilted).largest_gap == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("eps", [0.0, -1.0, float("nan"), float("inf"), "1", True, None])
-def test_bad_eps_is_refused(eps) -> None:
+def test_an_eps_that_is_no_finite_length_above_0_is_refused(eps) -> None:
     with refused(UsageError, 0.0, "distance"):
         make_stencil(Lattice((4, 4, 4), np.eye(4)), eps)
