@@ -198,6 +198,7 @@ def test_circles_without_a_voxel_are_refused(radius):
 
 
 # --- real scans ---
+@pytest.mark.parametrize(("folder", "table_voxels"), [("lumbar_4p25mm", 40_000), ("thoracic_0p8mm", 2_000)])
 def test_of_real_scans_only_dense_voxels_below_the_back_and_at_the_rims_of_the_table_are_removed(
     real_data, folder, table_voxels
 ):
