@@ -76,7 +76,7 @@ def test_the_gate_on_kept_bone_has_the_share_of_the_report_and_its_bound(
     _, _, cleaned = cleaned_body
     gate = gate_of(cleaned)
     assert (gate["ok"], gate["bound"]) == (True, 0.98)
-    assert gate["measured"] == pytest.approx(cleaned.report["remove_table"]["bone_kept"], abs=1e-6)
+    assert gate["measured"] == pytest.approx(cleaned.report["remove_table"]["bone_kept"], abs=1e-6)  # six digits
 
 
 def test_a_trough_of_foam_that_fits_closely_is_removed_and_not_taken_for_a_lung() -> None:

@@ -110,7 +110,8 @@ def test_lungs_that_the_field_of_view_cuts_stay():
 
 def test_fat_stays_below_a_level_above_it():
     hu, patient = make_patient()
-    hu[:, patient & ~ellipse(0, -10, 112, 67)] = -100.0
+    inside_of_the_skin = ellipse(0, -10, 112, 67)
+    hu[:, patient & ~inside_of_the_skin] = -100.0
     volume = as_volume(hu)
     changed = leave_outside_air(volume, [LEVEL_HU, -50.0])
     fat = (volume.voxels < -50) & (volume.voxels > -200)

@@ -198,8 +198,8 @@ def test_the_line_of_a_real_scan_lies_in_the_cord_that_a_network_drew(real_data)
 def test_the_line_of_a_real_scan_lies_in_the_holes_that_labelled_vertebrae_enclose(real_data):
     from scipy.ndimage import binary_fill_holes, label
 
-    folder = real_data / "thoracolumbar_labels" / "spine_report"
-    labels = read_labels(folder / "totalseg.nii.gz")
+    folder = real_data / "thoracolumbar_labels"
+    labels = read_labels(folder / "spine_report" / "totalseg.nii.gz")
     last_label_of_the_sacrum, fewest_pixels = 26, 9
     middles = []
     for k, plane in enumerate(labels.voxels > last_label_of_the_sacrum):

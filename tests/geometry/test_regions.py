@@ -124,6 +124,7 @@ shapes = pytest.mark.parametrize("shape", [(5, 13, 17), (4, 9, 64), (1, 1, 9), (
 @shares
 @shapes
 def test_components_are_numbered_as_by_scipy(random_regions):
+    """Each component is chosen by a mask of all numbers, and painted with its own."""
     mask, regions, labels, count = random_regions
     numbers = range(1, count + 1)
     painted = sum(number * regions.cells_of(np.arange(count + 1) == number) for number in numbers)

@@ -82,7 +82,11 @@ def test_a_spline_of_a_few_points_is_that_of_the_whole_volume():
     assert volume.sample(volume.ijk_to_lps(ijk), order=3) == pytest.approx(whole, abs=tolerances.CUT_SPLINE_HU)
 
 
-@pytest.mark.parametrize("ijk", [(-0.51, 3, 3), (3, 3, 11.51), (np.nan, 0, 0), (np.inf, 0, 0)])
+@pytest.mark.parametrize(
+    "ijk",
+    [(-0.51, 3, 3), (3, 3, 11.51), (np.nan, 0, 0), (np.inf, 0, 0)],
+    ids=["before i = 0", "beyond k = 11", "NaN", "infinity"],
+)
 def test_samples_beyond_half_a_voxel_or_at_no_place_have_the_given_value(ijk):
     volume = VOLUMES["tilted"]
     with np.errstate(invalid="ignore"):
@@ -90,7 +94,9 @@ def test_samples_beyond_half_a_voxel_or_at_no_place_have_the_given_value(ijk):
     assert volume.sample(point, outside=-7.0) == -7.0
 
 
-@pytest.mark.parametrize(("ijk", "kji"), [((-0.49, 3, 3), (3, 3, 0)), ((3, 3, 11.49), (11, 3, 3))])
+@pytest.mark.parametrize(
+    ("ijk", "kji"), [((-0.49, 3, 3), (3, 3, 0)), ((3, 3, 11.49), (11, 3, 3))], ids=["before i = 0", "beyond k = 11"]
+)
 def test_samples_within_half_a_voxel_beyond_the_last_centre_have_its_value(ijk, kji):
     volume = VOLUMES["tilted"]
     assert volume.sample(volume.ijk_to_lps(ijk), outside=-7.0) == pytest.approx(volume.voxels[kji])

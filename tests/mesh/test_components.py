@@ -218,8 +218,9 @@ def test_split_into_as_many_components_as_allowed_is_not_refused():
 
 
 def test_split_into_more_components_than_allowed_is_refused():
-    with refused(UsageError, "min_volume_ml=ML", 3, 0.1, 2):
-        split_components(three_boxes(), most=2)
+    found, allowed, advised_ml = 3, 2, 0.1
+    with refused(UsageError, "min_volume_ml=ML", found, allowed, advised_ml):
+        split_components(three_boxes(), most=allowed)
 
 
 @pytest.mark.parametrize(
@@ -343,5 +344,6 @@ def test_a_component_of_exactly_the_least_volume_is_kept_wherever_it_lies(seed):
 
 
 def test_a_component_a_per_mille_below_the_least_volume_is_removed():
+    one_ml = Mesh(*samples.box((0.05, 0.05, 0.05), (10, 10, 10)))
     with refused(NoSurfaceError, 1.001):
-        select_components(Mesh(*samples.box((0.05, 0.05, 0.05), (10, 10, 10))), min_volume_ml=1.001)
+        select_components(one_ml, min_volume_ml=1.001)

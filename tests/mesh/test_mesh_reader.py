@@ -103,8 +103,9 @@ def test_a_ply_of_text_with_vertex_index_in_place_of_vertex_indices_is_read(tmp_
 
 
 def test_only_scalars_of_a_ply_whose_name_is_plain_become_values(tmp_path: Path) -> None:
-    columns = "".join(f"property float {name}\n" for name in ("confidence", "scalar_HU", "scalar_2nd", "scalar_"))
-    rows = "".join(f"{point} 1 {number} 3 4\n" for number, point in enumerate(("0 0 0", "1 0 0", "0 1 0")))
+    names = ("confidence", "scalar_HU", "scalar_2nd", "scalar_")
+    columns = "".join(f"property float {name}\n" for name in names)
+    rows = "".join(f"{point} 1 {hu} 3 4\n" for hu, point in enumerate(("0 0 0", "1 0 0", "0 1 0")))
     path = tmp_path / "a.ply"
     path.write_text(f"{PLY_VERTICES}{columns}{PLY_FACES}{rows}3 0 1 2\n")
     assert {name: values.tolist() for name, values in clrecon.read_mesh(path).values.items()} == {"HU": [0, 1, 2]}

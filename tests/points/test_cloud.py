@@ -59,6 +59,7 @@ def test_points_that_are_no_rows_of_three_are_refused_with_their_shape(shape: tu
 
 @pytest.mark.parametrize("key", [np.array([False, True, False, True, True]), [1, 3, 4]], ids=["mask", "numbers"])
 def test_a_selection_takes_points_hu_labels_and_voxels_along(key: Any) -> None:
+    """Point k has x = 3 k, 100 k HU, the label k - 1, and a voxel in slice 3 k + 2."""
     chosen = numbered_cloud().select(key)
     assert chosen.points[:, 0].tolist() == [3.0, 9.0, 12.0]
     assert chosen.hu.tolist() == [100.0, 300.0, 400.0]

@@ -364,10 +364,14 @@ def test_a_binary_ply_without_its_last_byte_is_refused_with_the_bytes_that_it_ha
         read_points(write_file(tmp_path / "b.ply", binary_ply()[:-1]))
 
 
-@pytest.mark.parametrize("line", [b"1;2;3\n4;5;6\n", b"# x y z\n1 2 3\n4 5 6\n", b"x,y,z\n1,2,3\n4,5,6\n"])
-def test_the_first_point_after_a_byte_order_mark_is_read_without_a_warning(tmp_path, line):
+@pytest.mark.parametrize(
+    "text",
+    [b"1;2;3\n4;5;6\n", b"# x y z\n1 2 3\n4 5 6\n", b"x,y,z\n1,2,3\n4,5,6\n"],
+    ids=["numbers", "comment", "names of columns"],
+)
+def test_every_point_after_a_byte_order_mark_is_read_without_a_warning(tmp_path, text):
     file = tmp_path / "a.xyz"
-    file.write_bytes(b"\xef\xbb\xbf" + line)
+    file.write_bytes(b"\xef\xbb\xbf" + text)
     cloud = read_points(file)
     assert cloud.points.tolist() == [[1, 2, 3], [4, 5, 6]]
     assert cloud.report["file"]["warnings"] == []

@@ -114,6 +114,7 @@ def test_height_volume_and_inside_of_a_vertebra_follow_neighbours_ends_and_discs
 
 
 def test_each_trait_of_a_vertebra_is_described_with_its_figure() -> None:
+    """The figures stand beside `TRAITS_OF_WHOLE`."""
     assert [text for _, text in judge_piece(WHOLE, USUAL_GAPS_MM, {20: 36.0}).values()] == [
         "the disc at its upper end is 40 HU darker than bone",
         "the disc at its lower end is 20 HU darker than bone",

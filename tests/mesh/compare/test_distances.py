@@ -38,21 +38,23 @@ def concentric_spheres():
     return compare_meshes(outer, inner, samples=5000)
 
 
+PLANES_APART_MM = 1.25
+
+
 @pytest.fixture(scope="module")
 def parallel_planes():
-    """The comparison of two equal rectangles 1.25 mm apart."""
-    below, above = (Mesh(rectangle(z)[0] + FAR, rectangle(z)[1]) for z in (0.0, 1.25))
+    below, above = (Mesh(rectangle(z)[0] + FAR, rectangle(z)[1]) for z in (0.0, PLANES_APART_MM))
     return compare_meshes(below, above, samples=1000)
 
 
 @pytest.mark.parametrize("side", ["to_reference_mm", "from_reference_mm"])
 def test_every_figure_of_parallel_planes_is_their_distance_from_either_side(parallel_planes, side):
-    assert parallel_planes[side] == pytest.approx(dict.fromkeys(("mean", "rms", "p95", "max"), 1.25))
+    assert parallel_planes[side] == pytest.approx(dict.fromkeys(("mean", "rms", "p95", "max"), PLANES_APART_MM))
 
 
 def test_figures_of_both_sides_of_parallel_planes_are_their_distance(parallel_planes):
     figures = [parallel_planes[name] for name in ("hd95_mm", "assd_mm", "max_mm")]
-    assert figures == pytest.approx([1.25, 1.25, 1.25])
+    assert figures == pytest.approx([PLANES_APART_MM] * 3)
 
 
 @pytest.mark.parametrize("figure", ["hd95_mm", "assd_mm", "max_mm"])
@@ -194,11 +196,12 @@ def test_triangles_have_samples_in_proportion_to_their_area(two_triangles_of_one
 def test_samples_lie_within_their_triangle_and_evenly_about_its_centre(
     two_triangles_of_one_and_three_parts_of_the_area,
 ):
+    """Of the larger: right-angled at (10, 0), with legs of 9 mm along x and 1 mm along y."""
     vertices, triangles = two_triangles_of_one_and_three_parts_of_the_area
     points = sample_surface(vertices, triangles, 4000)
     x, y, z = points[points[:, 0] >= 10.0].T
     assert (y <= 1 - (x - 10) / 9 + tolerances.NEAREST_MM).all()
-    centre = [(10 + 19 + 10) / 3, 1 / 3, 0.0]
+    centre = [10 + 9 / 3, 1 / 3, 0.0]
     np.testing.assert_allclose([x.mean(), y.mean(), z.mean()], centre, atol=tolerances.SAMPLED_CENTRE_MM)
 
 
