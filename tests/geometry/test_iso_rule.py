@@ -163,7 +163,7 @@ def test_the_margin_far_from_the_origin_is_that_of_coordinates_from_the_centre()
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_an_iso_value_that_is_not_finite_is_refused(bad):
-    with pytest.raises(UsageError, match="finite"):
+    with refused(UsageError, "finite"):
         choose_iso_rule(make_volume(0, 1), bad)
 
 

@@ -276,7 +276,7 @@ def test_a_seed_19_mm_from_a_component_keeps_it():
 
 @pytest.mark.parametrize("seed", [(1.0, 2.0), (1.0, 2.0, float("nan")), (1, 2, 3, 4)], ids=["two", "nan", "four"])
 def test_a_seed_that_is_not_three_finite_numbers_is_refused(seed):
-    with pytest.raises(UsageError, match="point of three numbers"):
+    with refused(UsageError, "point", "three", "numbers"):
         select_components(three_boxes(), seeds=[seed])
 
 

@@ -256,7 +256,7 @@ def test_bounds_that_are_no_finite_length_above_0_are_refused(bound):
 
 
 def test_smoothing_an_empty_mesh_is_refused():
-    with pytest.raises(NoSurfaceError, match="nothing to refine"):
+    with refused(NoSurfaceError, "nothing", "refine"):
         smooth_mesh(Mesh([], []), 20, 1.0)
 
 
