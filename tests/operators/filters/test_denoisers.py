@@ -35,7 +35,7 @@ def test_a_filter_takes_three_tenths_off_the_noise_and_keeps_type_and_place(name
     made = clrecon.filter_volume(volume, name)
     beside_the_ball = (slice(2, -2), slice(2, 12), slice(2, -2))
     before, after = ((each.voxels - clean)[beside_the_ball].std() for each in (volume, made))
-    assert after < 0.7 * before
+    assert after < 0.7 * before  # measured 0.11 to 0.43 of it
     assert made.voxels.dtype == np.int16
     assert np.array_equal(made.affine, volume.affine)
 
@@ -153,4 +153,4 @@ def test_a_volume_of_one_column_is_filtered_as_one_of_one_row():
         for axis in (2, 1)
     )
     np.testing.assert_array_equal(column[:, :, 0], row[:, 0, :])
-    assert column.std() < 0.5 * plane.std()
+    assert column.std() < 0.5 * plane.std()  # measured 0.37 of it

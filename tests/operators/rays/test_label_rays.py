@@ -72,7 +72,7 @@ def balls_behind_each_other(request):
     camera = look(volume, (0.0, 1.0, 0.1), 8.0)
     front, back = (depth_of_ball(camera, centre_of(volume) + (0, y, 0), r) for y, r in ((-5.0, 4.0), (7.0, 6.0)))
     both = np.isfinite(front) & np.isfinite(back)
-    assert both.sum() > 60
+    assert both.sum() > 60  # enough pixels to judge: measured 162
     return volume, labels, camera, front, back, both
 
 
@@ -127,7 +127,7 @@ def test_border_of_a_label_whose_neighbour_is_hidden_is_seen_head_on_half_way_be
     camera = look(volume, (0.0, 1.0, 0.0), 8.0)
     found = cast_labels(device, volume, camera, options, lighting=Lighting(0.2, 0.8, 0.0))
     border = np.abs(found.depth - (150.0 + 9.5 - 11.5)) <= 0.5
-    assert border.sum() > 400
+    assert border.sum() > 400  # measured 432
     inner = border.copy()  # two pixels from its edge
     for axis in (0, 1):
         inner &= np.roll(border, 2, axis) & np.roll(border, -2, axis)
@@ -181,7 +181,7 @@ def test_shadow_of_a_label_with_an_opacity_of_a_half_is_half_as_dark(device):
 
     in_shadow, lit, half = take_red(1.0, True), take_red(1.0, False), take_red(0.5, True)
     dark = (in_shadow == ambient * 255) & (lit > 150)  # of the ball behind
-    assert dark.sum() > 20
+    assert dark.sum() > 20  # measured 75
     assert np.median(np.abs(half - 0.5 * (in_shadow + lit))[dark]) <= tolerances.RAY_SAME_255
 
 
@@ -208,7 +208,7 @@ def test_small_surface_of_labels_clipped_and_in_shadow_is_seen(device):
         device, volume, look(volume, (0.1, 1.0, -0.3), 8.0), style, size=(12, 9), clip=clip, shadows=True,
         lighting=Lighting(direction=(0.5, -0.5, 1.0)),
     )  # fmt: skip
-    assert 20 < (found.image[..., 3] > 0).sum()
+    assert 20 < (found.image[..., 3] > 0).sum()  # measured 31 of 108
 
 
 @pytest.fixture(scope="module")
@@ -223,8 +223,8 @@ def unlabelled_block(device):
     whole = take(None)
     white = (whole[..., :3].min(axis=-1) > 200) & (whole[..., 3] > 0)
     red = (whole[..., 0] > 200) & (whole[..., 2] < 50)
-    assert white.mean() > 0.02
-    assert red.mean() > 0.05
+    assert white.mean() > 0.02  # measured 0.058
+    assert red.mean() > 0.05  # measured 0.117
     return take, whole, white, red
 
 
@@ -267,7 +267,7 @@ def holey_mask(request, device):
 
 def test_colour_of_a_hit_is_that_of_the_label_that_meshes_have_there(holey_mask):
     image, hit_labels, clear = holey_mask
-    assert clear.sum() > 200
+    assert clear.sum() > 200  # measured 274
     colors = np.array([(255, 255, 255), tuple(RED), tuple(BLUE)])[hit_labels]
     np.testing.assert_allclose(image[clear, :3], colors[clear], atol=1)
 
@@ -296,7 +296,7 @@ def test_volume_rendering_leaves_no_fringe_around_a_label_that_ends_before_the_b
     whole, _ = red_ball
     color, opacity = premultiplied(whole.image)[..., :3], whole.image[..., 3:] / 255.0
     seen = opacity[..., 0] > 0.3
-    assert seen.sum() > 200
+    assert seen.sum() > 200  # measured 648
     mixed = 0.8 * RED + 0.2 * 255.0  # with the picture's white
     expected = np.broadcast_to(mixed, (seen.sum(), 3))
     np.testing.assert_allclose(color[seen] / opacity[seen], expected, atol=tolerances.LABEL_COLOR_255)

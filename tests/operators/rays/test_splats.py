@@ -130,7 +130,7 @@ def test_points_smaller_than_a_pixel_are_seen(device: Any) -> None:
     pixels, _ = FRONT.project(places, (47, 47))
     column, row = np.floor(pixels).astype(int).T
     assert np.isfinite(picture.depth[row, column]).all()
-    assert np.isfinite(picture.depth).mean() < 0.5
+    assert np.isfinite(picture.depth).mean() < 0.5  # measured 0.29
 
 
 MANY = 250_000

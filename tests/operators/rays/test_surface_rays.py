@@ -46,7 +46,7 @@ def assert_alike(found: Rendering, expected: Rendering, share: float = tolerance
     away = np.abs(premultiplied(found.image) - premultiplied(expected.image)).max(axis=-1)
     assert (away <= 2.0).mean() >= 1.0 - share
     both = np.isfinite(found.depth) & np.isfinite(expected.depth)
-    assert both.mean() > 0.1
+    assert both.mean() > 0.1  # enough pixels to judge: measured 0.21 on
     assert (np.isfinite(found.depth) != np.isfinite(expected.depth)).mean() <= share
     assert (np.abs(found.depth - expected.depth)[both] <= tolerances.SURFACE_TWIN_MM).mean() >= 1.0 - share
 
@@ -173,7 +173,7 @@ def test_cap_of_a_clipped_surface_is_flat_and_lit_by_the_plane(device):
     truth = (middle - origins) @ normal / (directions @ normal)
     points = origins + truth[..., None] * directions - centre_of(volume)
     cap = np.linalg.norm(points, axis=-1) < RADIUS - 0.2
-    assert cap.sum() > 300
+    assert cap.sum() > 300  # measured 724
     assert np.abs(found.depth - truth)[cap].max() <= tolerances.SLICE_DEPTH_MM
     light = 255.0 * (MATT.ambient + MATT.diffuse * np.abs(directions @ normal))
     assert np.abs(found.image[..., 0] - light)[cap].max() <= tolerances.RAY_SAME_255
@@ -184,7 +184,7 @@ def test_a_camera_inside_of_bone_sees_a_white_cap_at_its_own_place(device):
     centre = centre_of(volume)
     camera = Camera(tuple(centre), tuple(centre + (0.0, 1.0, 0.0)), (0, 0, 1), view_angle=40.0)
     found = cast_rays(device, volume, 300.0, camera, (8, 8), lighting=MATT)
-    assert np.abs(found.depth).max() <= 1e-4
+    assert np.abs(found.depth).max() <= 1e-4  # mm; measured 0
     assert (found.image == 255).all()
 
 
@@ -212,8 +212,8 @@ def test_a_ball_throws_its_shadow_on_a_floor_where_its_line_to_the_light_meets_i
     floor = (np.abs(points[..., 2] + 5.0) < 0.05) & (np.abs(points[..., :2]) < 11.0).all(axis=-1)
     passing = np.linalg.norm(points - (points @ towards)[..., None] * towards, axis=-1)
     sure = floor & (np.abs(passing - 3.0) > 0.3)
-    assert (sure & (passing < 3.0)).sum() > 50
-    assert (sure & (passing > 3.0)).sum() > 500
+    assert (sure & (passing < 3.0)).sum() > 50  # measured 149
+    assert (sure & (passing > 3.0)).sum() > 500  # measured 1963
     truth = np.where(passing < 3.0, light.ambient, light.ambient + light.diffuse * towards[2]) * 255.0
     assert np.abs(dark.image[..., 0] - truth)[sure].max() <= tolerances.RAY_SAME_255 + 0.5
 
@@ -226,7 +226,7 @@ def test_nearer_surface_is_brighter_with_a_depth_cue(device):
     centres = np.array([(i, j, k) for i in (-0.5, 19.5) for j in (-0.5, 19.5) for k in (-0.5, 19.5)])
     ends = (volume.ijk_to_lps(centres) - camera.position) @ camera.basis().forward
     share = 1.0 - 0.6 * (cued.depth - ends.min()) / np.ptp(ends)
-    assert np.ptp(share) > 0.1
+    assert np.ptp(share) > 0.1  # measured 0.1007
     assert np.abs(cued.image[..., 0] - 255.0 * share).max() <= tolerances.RAY_SAME_255
 
 

@@ -55,7 +55,7 @@ def test_every_third_plane_of_voxels_is_shown_from_head_front_or_right(every_thi
     assert len(tiles) == len(numbers)
     for number, values in zip(numbers, tiles, strict=True):
         assert np.nanmin(values) == np.nanmax(values) == 10 * number
-        assert np.isfinite(values).mean() > 0.9
+        assert np.isfinite(values).mean() > 0.9  # measured 1
 
 
 @pytest.mark.every_device
@@ -127,7 +127,7 @@ def tilted_sheet(device: Any) -> clrecon.Rendering:
 def test_slices_of_a_tilted_gantry_are_shown_as_they_were_taken(tilted_sheet: clrecon.Rendering) -> None:
     assert [tile["slice"] for tile in tilted_sheet.report["tiles"]] == [12, 3]
     for number, values in zip((12, 3), tiles_of(tilted_sheet), strict=True):
-        assert np.isfinite(values).mean() > 0.5
+        assert np.isfinite(values).mean() > 0.5  # measured 0.95 on
         assert np.allclose(values[np.isfinite(values)], 10 * number, atol=0.05)
 
 
@@ -158,7 +158,7 @@ def test_the_left_of_the_patient_is_at_the_right_of_every_tile(device: Any, bloc
 
 def test_tiles_are_as_wide_as_the_volume(device: Any, block_at_the_left: Volume) -> None:
     report = take_sheet(block_at_the_left, device, sheet=4).report
-    assert report["tile_size"][0] * report["pixel_mm"] == pytest.approx(36 * 2.0, rel=0.03)
+    assert report["tile_size"][0] * report["pixel_mm"] == pytest.approx(36 * 2.0, rel=0.03)  # measured 0.003
 
 
 def test_zoom_of_two_halves_the_pixels_of_a_sheet(device: Any, block_at_the_left: Volume) -> None:

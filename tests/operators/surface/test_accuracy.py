@@ -79,7 +79,7 @@ def test_surface_of_the_distance_field_of_a_sphere_has_its_volume_and_area(devic
     quality = extract_isosurface(volume, 0.0, device=device).quality()
     exact_ml = 4 / 3 * np.pi * radius**3 / 1000
     assert 0.96 * exact_ml < quality["volume_ml"] < exact_ml
-    assert quality["area_mm2"] == pytest.approx(4 * np.pi * radius**2, rel=0.02)
+    assert quality["area_mm2"] == pytest.approx(4 * np.pi * radius**2, rel=0.02)  # measured 0.013
 
 
 def test_error_of_a_sphere_falls_to_a_quarter_where_voxels_are_halved(device):
@@ -91,8 +91,8 @@ def test_error_of_a_sphere_falls_to_a_quarter_where_voxels_are_halved(device):
         return np.sqrt(np.mean((np.linalg.norm(vertices, axis=1) - radius) ** 2))
 
     coarse, halved, quartered = (rms_error(refine) for refine in (1, 2, 4))
-    assert coarse / halved == pytest.approx(4.0, rel=0.15)
-    assert halved / quartered == pytest.approx(4.0, rel=0.15)
+    assert coarse / halved == pytest.approx(4.0, rel=0.15)  # measured 4.016
+    assert halved / quartered == pytest.approx(4.0, rel=0.15)  # measured 3.999
 
 
 @pytest.mark.parametrize("grid", GRIDS)
@@ -108,8 +108,8 @@ def test_closed_surface_of_a_torus_has_its_genus_area_and_volume(device, grid):
     quality = extract_isosurface(sample(distance, steps, major + minor), 0.0, device=device).quality()
     assert (quality["closed"], quality["genus"]) == (True, 1)
     # voxels of up to 0.63 mm on a tube of 3 mm
-    assert quality["volume_ml"] == pytest.approx(2 * np.pi**2 * major * minor**2 / 1000, rel=0.02)
-    assert quality["area_mm2"] == pytest.approx(4 * np.pi**2 * major * minor, rel=0.02)
+    assert quality["volume_ml"] == pytest.approx(2 * np.pi**2 * major * minor**2 / 1000, rel=0.02)  # measured 0.006
+    assert quality["area_mm2"] == pytest.approx(4 * np.pi**2 * major * minor, rel=0.02)  # measured 0.0014
 
 
 @pytest.mark.parametrize("grid", GRIDS)
@@ -125,8 +125,8 @@ def test_closed_surface_of_a_cylinder_has_its_area_and_volume(device, grid):
     quality = extract_isosurface(sample(distance, steps, np.hypot(radius, length / 2)), 0.0, device=device).quality()
     assert (quality["closed"], quality["genus"]) == (True, 0)
     # voxels of up to 0.63 mm, which cut the edges of the cylinder
-    assert quality["volume_ml"] == pytest.approx(np.pi * radius**2 * length / 1000, rel=0.02)
-    assert quality["area_mm2"] == pytest.approx(2 * np.pi * radius * (radius + length), rel=0.03)
+    assert quality["volume_ml"] == pytest.approx(np.pi * radius**2 * length / 1000, rel=0.02)  # measured 0.005
+    assert quality["area_mm2"] == pytest.approx(2 * np.pi * radius * (radius + length), rel=0.03)  # measured 0.013
 
 
 OFFSET = 0.123  # of a plane along its normal from the centre, mm
@@ -161,7 +161,7 @@ def test_surface_of_the_twin_of_a_linear_field_is_a_plane_with_its_normal(plane)
     vertices, normals, _ = twin.extract_isosurface(volume, 0.0, closed=False)
     off = np.abs((vertices - (-120.0, 340.0, -846.0) - (0.31, -0.17, 0.23)) @ normal - OFFSET)
     assert off.max() <= margin
-    assert np.abs(normals @ -normal - 1.0).max() < 1e-6
+    assert np.abs(normals @ -normal - 1.0).max() < 1e-6  # float64; measured 1e-15
 
 
 def test_vertices_of_a_partial_volume_sphere_are_right_to_a_fraction_of_a_voxel(device):

@@ -71,15 +71,15 @@ def test_fitted_shell_is_nearer_to_bone_than_the_level(fitted_shell):
     _, mesh, fit = fitted_shell
     away, rows = outer_places(mesh, fit)
     away_of_level = np.linalg.norm(mesh.vertices[rows] - MIDDLE, axis=1) - OUTER_RADIUS
-    assert len(rows) > 1000
-    assert np.abs(away_of_level).mean() > 0.4
-    assert np.abs(away).mean() < 0.12
+    assert len(rows) > 1000  # of 3500 to 4700 vertices
+    assert np.abs(away_of_level).mean() > 0.4  # mm; measured 0.73 to 0.78
+    assert np.abs(away).mean() < 0.12  # mm; measured 0.02 to 0.05
 
 
 def test_fitted_shell_has_its_thickness_to_a_third_of_a_voxel(fitted_shell):
     thickness, mesh, fit = fitted_shell
     _, rows = outer_places(mesh, fit)
-    assert np.median(fit.thickness_mm[rows]) == pytest.approx(thickness, abs=0.35)
+    assert np.median(fit.thickness_mm[rows]) == pytest.approx(thickness, abs=0.35)  # mm; measured 0.06
 
 
 def test_errors_of_a_fitted_shell_hold_nine_tenths_of_its_distances_from_the_truth(fitted_shell):
@@ -95,13 +95,13 @@ def test_constants_are_the_blur_and_density_of_the_scan(device):
     blur_mm = np.hypot(0.8, 0.37)  # interpolation between voxels of 1 mm blurs further: measured 0.88
     assert constants.blur_mm == pytest.approx(blur_mm, abs=0.08)
     assert constants.blur_across_mm == pytest.approx(blur_mm, abs=0.08)
-    assert constants.cortex_hu == pytest.approx(1000.0, rel=0.04)
+    assert constants.cortex_hu == pytest.approx(1000.0, rel=0.04)  # measured 1009
 
 
 def test_constants_are_taken_from_the_most_walls_allowed_and_many_thick_ones(device):
     _, fit = fit_surface(hollow_ball(thickness=4.0, blur=0.8), device)
     assert fit.constants.places == MOST_WALLS
-    assert fit.constants.thick > 100
+    assert fit.constants.thick > 100  # measured 500
 
 
 def test_noise_makes_the_cortex_neither_denser_nor_moves_it(device):
@@ -112,10 +112,10 @@ def test_noise_makes_the_cortex_neither_denser_nor_moves_it(device):
 
     mesh, fit = fit_surface(noisy, device, level=500.0)
 
-    assert fit.constants.cortex_hu == pytest.approx(1000.0, rel=0.04)
+    assert fit.constants.cortex_hu == pytest.approx(1000.0, rel=0.04)  # measured 1013
     assert fit.constants.blur_mm == pytest.approx(np.hypot(0.5, 0.4), abs=0.08)  # with that of the interpolation
     away, _ = outer_places(mesh, fit)
-    assert abs(np.mean(away)) < 0.05
+    assert abs(np.mean(away)) < 0.05  # mm; measured 0.03
 
 
 @pytest.mark.parametrize("name", ["shift_mm", "thickness_mm", "error_mm"])
@@ -123,13 +123,13 @@ def test_lengths_of_a_fit_scale_with_the_voxels(device, name):
     voxels = hollow_ball(thickness=3.0).voxels
     large, small = (fit_surface(Volume(voxels, np.diag([mm, mm, mm, 1.0])), device)[1] for mm in (1.0, 0.02))
     of_large, of_small = (getattr(fit, name)[fit.states == FITTED].mean() for fit in (large, small))
-    assert of_small / 0.02 == pytest.approx(of_large, rel=0.03, abs=0.01)
+    assert of_small / 0.02 == pytest.approx(of_large, rel=0.03, abs=0.01)  # measured 0.019, and 0.005 mm
 
 
 def test_blur_of_a_fit_scales_with_the_voxels(device):
     voxels = hollow_ball(thickness=3.0).voxels
     large, small = (fit_surface(Volume(voxels, np.diag([mm, mm, mm, 1.0])), device)[1] for mm in (1.0, 0.02))
-    assert small.constants.blur_mm / 0.02 == pytest.approx(large.constants.blur_mm, rel=0.05)
+    assert small.constants.blur_mm / 0.02 == pytest.approx(large.constants.blur_mm, rel=0.05)  # measured 0.019
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_vertices_on_a_vessel_are_no_bone(surface_with_vessel_and_metal):
     mesh, fit = surface_with_vessel_and_metal
     x, y, z = mesh.vertices.T
     on_vessel = (np.hypot(x - 4, y - 4) < 4) & (z > 3) & (z < 36)
-    assert (fit.states[on_vessel] == NOT_BONE).mean() > 0.95
+    assert (fit.states[on_vessel] == NOT_BONE).mean() > 0.95  # measured 1
 
 
 def test_vertices_on_metal_are_told_as_metal(surface_with_vessel_and_metal):
@@ -218,7 +218,7 @@ CONSTANTS_OF_THICK_SLICES = CortexConstants(0.7, 2.0, 1000.0, 0.02, 0.05, 50.0, 
 
 def test_thick_slices_hide_thin_walls_that_lie_across_them(device):
     mesh, fit = fit_surface(THICK_SLICES, device, constants=CONSTANTS_OF_THICK_SLICES)
-    assert np.count_nonzero(fit.hidden) > 20
+    assert np.count_nonzero(fit.hidden) > 20  # measured 88
     assert np.abs(mesh.normals[fit.hidden, 2]).min() > 0.2  # walls along the slices' axis have 0
     assert {_STATES[state] for state in fit.states[fit.hidden]} == {"badly fitted"}
 
@@ -232,7 +232,7 @@ def test_slices_that_blur_no_more_than_their_pixels_hide_no_wall(device):
 def test_thin_walls_alone_are_taken_for_thicker_and_less_dense_ones(device):
     """Walls of 0.8 mm and 1000 HU in a blur of 0.7 mm."""
     mesh, fit = fit_surface(hollow_ball(thickness=0.8), device)
-    assert fit.constants.cortex_hu < 800.0
+    assert fit.constants.cortex_hu < 800.0  # measured 566
     away, _ = outer_places(mesh, fit)
     assert 0.1 < np.mean(away) < 0.35  # mm outside of the bone
 
@@ -248,9 +248,9 @@ def test_sheets_of_a_couch_around_a_shell_leave_the_constants_of_its_bone(device
 
     _, fit = fit_surface(Volume(voxels, np.eye(4)), device)
 
-    assert fit.constants.cortex_hu == pytest.approx(1000.0, rel=0.05)
+    assert fit.constants.cortex_hu == pytest.approx(1000.0, rel=0.05)  # measured 985
     assert fit.constants.blur_mm == pytest.approx(np.hypot(0.7, 0.4), abs=0.1)  # with that of the interpolation
-    assert fit.constants.thick > 300
+    assert fit.constants.thick > 300  # measured 494
 
 
 @pytest.fixture(scope="module")
@@ -283,7 +283,7 @@ def test_the_less_dense_of_two_bones_is_found_nearer_to_the_truth_by_its_own_cor
         places = mesh.vertices + fit.shift_mm[:, None] * mesh.normals
         return np.abs(np.linalg.norm(places[outer] - middle, axis=1) - OUTER_RADIUS).mean()
 
-    assert mean_distance(is_second) < 0.06 < mean_distance(None)
+    assert mean_distance(is_second) < 0.06 < mean_distance(None)  # mm; 0.19 for None
 
 
 def test_a_scan_without_bone_is_refused(device):

@@ -57,14 +57,14 @@ def from_bone(mesh) -> np.ndarray:
 
 
 def test_fitted_surface_lies_on_the_bone_and_that_of_a_level_outside(level_mesh, fitted):
-    assert from_bone(level_mesh).mean() > 0.3
+    assert from_bone(level_mesh).mean() > 0.3  # mm; measured 0.48
     # Blur moves the edge of a ball inwards, by 0.04 mm here: the square of its width over the radius.
     assert from_bone(fitted).mean() == pytest.approx(-(0.7**2) / RADIUS, abs=0.05)
-    assert np.abs(from_bone(fitted)).mean() < 0.1
+    assert np.abs(from_bone(fitted)).mean() < 0.1  # mm; measured 0.04
 
 
 def test_fitted_surface_knows_the_thickness_of_its_wall(fitted):
-    assert np.median(fitted.values["thickness_mm"]) == pytest.approx(3.0, abs=0.3)
+    assert np.median(fitted.values["thickness_mm"]) == pytest.approx(3.0, abs=0.3)  # mm; measured 2.92
 
 
 def test_errors_of_a_fitted_surface_hold_93_percent_of_its_distances_from_the_bone(fitted):
@@ -84,15 +84,15 @@ def test_report_of_a_fitted_cortex_counts_the_vertices_of_each_state(fitted, lev
     report = fitted.report["cortex"]
     states = ("fitted", "not_bone", "metal", "badly_fitted", "no_room")
     assert report["vertices"] == level_mesh.vertex_count == sum(report[state] for state in states)
-    assert report["fitted"] > 0.97 * report["vertices"]
+    assert report["fitted"] > 0.97 * report["vertices"]  # measured all
 
 
 def test_report_of_a_fitted_cortex_has_its_distances_bias_and_density(fitted):
     report = fitted.report["cortex"]
     assert report["moved"]
     assert report["outside_mm"]["p5"] < report["outside_mm"]["mean"] < report["outside_mm"]["p95"]
-    assert 0.0 < report["bias_mm"] < 0.05
-    assert report["constants"]["cortex_hu"] == pytest.approx(1000.0, rel=0.05)
+    assert 0.0 < report["bias_mm"] < 0.05  # measured 0.014
+    assert report["constants"]["cortex_hu"] == pytest.approx(1000.0, rel=0.05)  # measured 1015
 
 
 def test_report_of_a_fitted_cortex_is_valid_json(fitted):
@@ -108,7 +108,7 @@ def test_mesh_that_is_fitted_gets_no_report_of_a_cortex(fitted, level_mesh):
 def test_triangles_that_would_turn_over_are_moved_less(level_mesh):
     random = np.random.default_rng(4)
     wild = level_mesh.vertices + random.normal(0.0, 0.4, level_mesh.vertices.shape)
-    assert find_turned(level_mesh.vertices, wild, level_mesh.triangles).mean() > 0.05
+    assert find_turned(level_mesh.vertices, wild, level_mesh.triangles).mean() > 0.05  # measured 0.27
     fans = Fans(level_mesh.triangles, level_mesh.vertex_count)
     calm = calm_vertices(level_mesh.vertices, wild, level_mesh.triangles, fans)
     assert not find_turned(level_mesh.vertices, calm, level_mesh.triangles).any()
@@ -166,7 +166,7 @@ def test_sums_over_fans_are_those_of_each_vertex_and_twice_those_of_its_neighbou
         around = level_mesh.triangles[(level_mesh.triangles == vertex).any(axis=1)]
         neighbours = np.setdiff1d(around, [vertex])
         expected = len(around) * values[vertex] + 2.0 * values[neighbours].sum(axis=0)
-        np.testing.assert_allclose(found, expected, atol=1e-12)
+        np.testing.assert_allclose(found, expected, atol=1e-12)  # sums of some ten numbers in float64
 
 
 def test_mesh_of_arrays_has_no_values(fitted):
@@ -264,7 +264,7 @@ def test_command_without_surface_cortex_says_how_far_the_surface_lies_outside_of
     assert "outside of the bone" in printed().everything
     cortex_report = read_report(report_file)["cortex"]
     assert not cortex_report["moved"]
-    assert cortex_report["outside_mm"]["mean"] > 0.2
+    assert cortex_report["outside_mm"]["mean"] > 0.2  # mm; measured 1.04
 
 
 @pytest.mark.parametrize("labels", [False, True], ids=["scan", "labels"])
@@ -287,7 +287,7 @@ def test_mesh_for_printing_with_surface_cortex_has_the_volume_of_the_bone(ct_fil
     path = tmp_path / "a.stl"
     assert run_mesh_command(ct_file, "-o", path, "--for", "print", "--surface", "cortex") == 0, printed()
     ball_ml = 4.0 / 3.0 * np.pi * RADIUS**3 / 1000
-    assert clrecon.read_mesh(path).quality()["volume_ml"] == pytest.approx(ball_ml, rel=0.02)
+    assert clrecon.read_mesh(path).quality()["volume_ml"] == pytest.approx(ball_ml, rel=0.02)  # measured 0.006 less
 
 
 def dry_shell(shell: Volume) -> Volume:

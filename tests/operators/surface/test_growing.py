@@ -367,9 +367,9 @@ def rms_by_rule(device: Any) -> dict[str, float]:
 
 
 def test_vertices_at_a_golden_section_lie_ten_times_farther_off_than_linear_ones(rms_by_rule: dict[str, float]) -> None:
-    assert rms_by_rule["linear"] < 0.02
-    assert rms_by_rule["golden"] > 0.2
+    assert rms_by_rule["linear"] < 0.02  # measured 0.005
+    assert rms_by_rule["golden"] > 0.2  # measured 0.22
 
 
 def test_vertices_by_a_golden_search_lie_nearly_as_well_as_linear_ones(rms_by_rule: dict[str, float]) -> None:
-    assert rms_by_rule["golden-search"] == pytest.approx(rms_by_rule["linear"], abs=0.03)
+    assert rms_by_rule["golden-search"] == pytest.approx(rms_by_rule["linear"], abs=0.03)  # measured 0.005 apart

@@ -74,8 +74,8 @@ def test_cells_and_voxels_of_a_surface_do_not_depend_on_the_vertex_rule(by_verte
 def test_dice_of_fine_slices_is_lower_for_vertices_at_a_golden_section(by_vertex_rule: Any) -> None:
     volume, linear, golden = by_vertex_rule
     better, worse = (measure_slices(mesh, volume, 100).dice for mesh in (linear, golden))
-    assert better > 0.985
-    assert worse < better - 0.02
+    assert better > 0.985  # measured 0.992 and 0.996
+    assert worse < better - 0.02  # measured 0.096 and 0.111 less
 
 
 def test_progress_of_measured_slices_is_told_from_0_to_all(by_vertex_rule: Any) -> None:
@@ -109,14 +109,14 @@ def measures(request: pytest.FixtureRequest, device: Any) -> Any:
 @pytest.mark.parametrize("rule", ["linear", "golden"])
 def test_bias_of_a_surface_is_that_of_its_level_by_any_vertex_rule(measures: Any, rule: str) -> None:
     moved = measures[-100, rule].bias_mm - measures[0, rule].bias_mm
-    assert moved == pytest.approx(100 / HU_A_MM, abs=0.03)
+    assert moved == pytest.approx(100 / HU_A_MM, abs=0.03)  # mm; measured 0.006 off
 
 
 @pytest.mark.parametrize("level", [0, -100])
 def test_scatter_of_a_surface_is_that_of_its_vertex_rule_at_any_level(measures: Any, level: int) -> None:
     linear, golden = measures[level, "linear"], measures[level, "golden"]
-    assert linear.scatter_mm < 0.03
-    assert golden.scatter_mm > 0.15
+    assert linear.scatter_mm < 0.03  # mm; measured up to 0.009
+    assert golden.scatter_mm > 0.15  # mm; measured from 0.21 on
     assert linear.normals_median_deg < golden.normals_median_deg / 2
 
 

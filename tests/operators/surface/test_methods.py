@@ -59,7 +59,7 @@ def test_vertices_of_a_triangle_soup_of_uneven_slices_are_those_of_marching_cube
     soup = extract_by_method(volume, 100.5, "t-mc-soup")
     whole = extract_isosurface(volume, 100.5, device=device)
     off = np.abs(np.sort(soup.vertices, 0) - np.sort(whole.vertices, 0)).max()
-    assert off < 8 * float32_unit(whole.vertices)
+    assert off < 8 * float32_unit(whole.vertices)  # sums of rounded products
 
 
 @pytest.mark.parametrize("affine", [OBLIQUE, MIRRORED, None], ids=["oblique", "mirrored", "uneven"])
@@ -71,8 +71,8 @@ def test_surface_by_scikit_image_has_the_volume_and_area_of_the_trilinear_topolo
     theirs = extract_by_method(volume, 100.5, "skimage").quality()
     ours = extract_isosurface(volume, 100.5, device=device, topology="trilinear").quality()
     assert theirs["volume_ml"] > 0  # wound outward
-    assert theirs["volume_ml"] == pytest.approx(ours["volume_ml"], rel=0.02)
-    assert theirs["area_mm2"] == pytest.approx(ours["area_mm2"], rel=0.02)
+    assert theirs["volume_ml"] == pytest.approx(ours["volume_ml"], rel=0.02)  # measured 0.001
+    assert theirs["area_mm2"] == pytest.approx(ours["area_mm2"], rel=0.02)  # measured 2e-4
 
 
 def test_method_i_mc_grows_a_sound_surface_from_the_largest_component(device: Any) -> None:

@@ -61,8 +61,8 @@ def test_solid_and_dense_volumes_are_those_of_the_phantom_and_what_their_levels_
     """450 HU is not half of the cortex's 850 to 1050 HU and the marrow's 190 to 330: the band is the thicker one."""
     inside, cortex, _ = inside_at_400
     _, labels = spine
-    assert 1.0 <= inside.volumes_ml["solid"] / (labels.counts[20] * VOXEL_ML) <= 1.05
-    assert 1.12 <= inside.volumes_ml["dense"] / (np.count_nonzero(cortex) * VOXEL_ML) <= 1.21
+    assert 1.0 <= inside.volumes_ml["solid"] / (labels.counts[20] * VOXEL_ML) <= 1.05  # measured 1.028
+    assert 1.12 <= inside.volumes_ml["dense"] / (np.count_nonzero(cortex) * VOXEL_ML) <= 1.21  # measured 1.164
     assert inside.warnings == []
 
 
@@ -71,16 +71,16 @@ def test_canal_of_the_phantom_covers_its_true_canal_and_hardly_any_bone(spine, i
     inside, _, true_canal = inside_at_400
     canal = inside.canal.to_numpy()
     slices = canal.any(axis=(1, 2))
-    assert np.count_nonzero(canal & true_canal) >= 0.98 * np.count_nonzero(true_canal[slices])
+    assert np.count_nonzero(canal & true_canal) >= 0.98 * np.count_nonzero(true_canal[slices])  # measured 0.992
     bone = clrecon.Mask.from_labels(inside.volume, spine[1], ["L1"], device=device).to_numpy()
-    assert np.count_nonzero(canal & bone) < 0.01 * np.count_nonzero(canal)
+    assert np.count_nonzero(canal & bone) < 0.01 * np.count_nonzero(canal)  # measured 3e-4
     assert inside.canal_found.height_mm == pytest.approx(13.0, abs=3.0)  # its pedicles are 14 mm high
 
 
 @pytest.mark.seconds
 def test_canal_of_a_grown_solid_is_that_of_the_true_bone(inside_at_400, inside_20):
     inside, _, _ = inside_at_400
-    assert inside.volumes_ml["canal"] == pytest.approx(inside_20.volumes_ml["canal"], rel=0.1)
+    assert inside.volumes_ml["canal"] == pytest.approx(inside_20.volumes_ml["canal"], rel=0.1)  # measured 0.001
 
 
 @pytest.fixture(scope="module")
@@ -115,13 +115,13 @@ def test_mesh_of_a_part_is_closed_and_encloses_its_volume(inside_20, meshes_of_2
     mesh = meshes_of_20[part]
     quality = mesh.quality()
     assert quality.closed and quality.manifold
-    assert quality.volume_ml == pytest.approx(inside_20.volumes_ml[part], rel=0.01)
+    assert quality.volume_ml == pytest.approx(inside_20.volumes_ml[part], rel=0.01)  # measured 2e-4
     assert mesh.report["label_name"] == part
 
 
 def test_meshes_of_dense_and_trabecular_bone_share_the_vertices_of_their_border(meshes_of_20):
     dense, trabecular = ({tuple(vertex) for vertex in meshes_of_20[part].vertices} for part in ("dense", "trabecular"))
-    assert len(dense & trabecular) > 1000
+    assert len(dense & trabecular) > 1000  # measured 15,789
 
 
 def test_label_map_of_a_vertebra_has_its_parts(spine, inside_20, device):
@@ -283,8 +283,8 @@ def test_volume_canal_and_cortex_of_a_real_vertebra_are_plausible(real_scan, nam
     volume, labels = real_scan
     inside = clrecon.vertebra_inside(volume, labels, name, dense=(300, None), device=device)
     assert inside.volumes_ml["solid"] == pytest.approx(labels.counts[inside.label] * 3.0**3 / 1000, rel=0.01)
-    assert 3.0 <= inside.volumes_ml["canal"] <= 6.0
-    assert 12.0 <= inside.canal_found.height_mm <= 21.0
+    assert 3.0 <= inside.volumes_ml["canal"] <= 6.0  # measured 3.9 to 4.6
+    assert 12.0 <= inside.canal_found.height_mm <= 21.0  # measured 15 to 18
     assert inside.thickness.resolved_share < 0.3  # cortex is thinner than a voxel
 
 
@@ -325,6 +325,6 @@ def test_volume_and_canal_of_each_real_mask_are_plausible(real_data, device):
     assert len(labels.numbers) > 1
     for number in labels.numbers:
         inside = clrecon.vertebra_inside(volume, labels, number, device=device)
-        assert inside.volumes_ml["solid"] == pytest.approx(labels.counts[number] * 2e-3, rel=0.01)
-        assert 1.5 <= inside.volumes_ml["canal"] <= 5.0
-        assert 10.0 <= inside.canal_found.height_mm <= 18.0
+        assert inside.volumes_ml["solid"] == pytest.approx(labels.counts[number] * 2e-3, rel=0.01)  # measured 0.003
+        assert 1.5 <= inside.volumes_ml["canal"] <= 5.0  # measured 1.8 to 4.1
+        assert 10.0 <= inside.canal_found.height_mm <= 18.0  # measured 11 to 17

@@ -107,8 +107,8 @@ def test_solid_bone_of_the_cortex_has_the_volume_of_the_bone_and_that_of_a_level
     volume, labels = ball_with_a_small_label
     true_mm3 = 4.0 / 3.0 * np.pi * 13.0**3  # as many voxels of 1 mm
     level, cortex = (vertebra_solid(volume, labels, 1, 200, surface=kind, device=device) for kind in ("hu", "cortex"))
-    assert level.count > 1.09 * true_mm3
-    assert cortex.count == pytest.approx(true_mm3, rel=0.015)
+    assert level.count > 1.09 * true_mm3  # measured 1.17
+    assert cortex.count == pytest.approx(true_mm3, rel=0.015)  # measured 0.991
 
 
 def test_solid_bone_of_the_cortex_without_a_level_is_refused(ball_with_a_small_label, device):
