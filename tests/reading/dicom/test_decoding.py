@@ -51,14 +51,15 @@ from clrecon.reading.dicom.pixels.decoder_pool import DecoderPool
 
 
 @pytest.mark.parametrize("name", daily(5, ENCODERS))
-def test_lossless_codecs_give_back_every_bit(tmp_path, name):
+def test_pixels_of_every_lossless_coding_are_decoded_bit_for_bit(tmp_path, name):
     syntax, encode = ENCODERS[name]
     (pixels,) = place(tmp_path, encapsulate([encode(IMAGES[0])]) + END, syntax)
-    assert pixels.dtype == np.uint16 and np.array_equal(pixels, IMAGES[0])
+    assert pixels.dtype == np.uint16
+    assert np.array_equal(pixels, IMAGES[0])
 
 
 @pytest.mark.parametrize("decoder", decoder_process.DECODERS)
-def test_every_decoder_of_a_format_gives_the_same(decoder):
+def test_every_decoder_gives_the_pixels_that_were_encoded(decoder):
     """Which one is taken depends on what is installed."""
     name = {
         "openjpeg": "JPEG 2000",
@@ -75,25 +76,46 @@ def test_every_decoder_of_a_format_gives_the_same(decoder):
     assert np.array_equal(out, IMAGES[1])
 
 
-def test_a_decoder_that_is_not_installed_is_named(monkeypatch):
+def test_coding_whose_decoder_is_not_installed_is_refused(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with refused(RefusedInputError, "decoder", "installed"):
         codecs.choose_decoder(JPEG + "80")
 
 
-@pytest.mark.parametrize("name", ["JPEG lossless 6", "JPEG-LS", "JPEG 2000", "RLE"])
-def test_signed_values_and_eight_bits_are_decoded(tmp_path, name):
+CODINGS = pytest.mark.parametrize("name", ["JPEG lossless 6", "JPEG-LS", "JPEG 2000", "RLE"])
+
+
+@CODINGS
+def test_signed_pixels_are_decoded(tmp_path, name):
     syntax, encode = ENCODERS[name]
     signed = (IMAGES[0].astype(np.int16) - 2000) * 7
     (pixels,) = place(tmp_path, encapsulate([encode(signed.view(np.uint16))]) + END, syntax, signed=True)
-    assert pixels.dtype == np.int16 and np.array_equal(pixels, signed)
-    narrow = (IMAGES[0] % 256).astype(np.uint8)
-    data = encode_lossless(narrow, 6, 8) if name.startswith("JPEG lossless") else encode(narrow)
-    (pixels,) = place(tmp_path, encapsulate([data]) + END, syntax, bits_allocated=8, bits_stored=8, high_bit=7)
-    assert pixels.dtype == np.uint8 and np.array_equal(pixels, narrow)
-    if name != "RLE":  # 8 bits of a codestream in a cell of 16
-        (pixels,) = place(tmp_path, encapsulate([data]) + END, syntax, bits_stored=8, high_bit=7)
-        assert pixels.dtype == np.uint16 and np.array_equal(pixels, narrow)
+    assert pixels.dtype == np.int16
+    assert np.array_equal(pixels, signed)
+
+
+def encode_8_bits(name):
+    """Pixels of 8 bits, and their codestream."""
+    pixels = (IMAGES[0] % 256).astype(np.uint8)
+    return pixels, encode_lossless(pixels, 6, 8) if name.startswith("JPEG lossless") else ENCODERS[name][1](pixels)
+
+
+@CODINGS
+def test_pixels_of_8_bits_are_decoded(tmp_path, name):
+    expected, data = encode_8_bits(name)
+    (pixels,) = place(
+        tmp_path, encapsulate([data]) + END, ENCODERS[name][0], bits_allocated=8, bits_stored=8, high_bit=7
+    )
+    assert pixels.dtype == np.uint8
+    assert np.array_equal(pixels, expected)
+
+
+@pytest.mark.parametrize("name", ["JPEG lossless 6", "JPEG-LS", "JPEG 2000"])
+def test_codestream_of_8_bits_is_decoded_into_16_allocated_ones(tmp_path, name):
+    expected, data = encode_8_bits(name)
+    (pixels,) = place(tmp_path, encapsulate([data]) + END, ENCODERS[name][0], bits_stored=8, high_bit=7)
+    assert pixels.dtype == np.uint16
+    assert np.array_equal(pixels, expected)
 
 
 TWELVE_SIGNED_BITS = {
@@ -104,14 +126,14 @@ TWELVE_SIGNED_BITS = {
 
 
 @pytest.mark.parametrize("name", TWELVE_SIGNED_BITS)
-def test_values_whose_sign_cannot_be_told_are_refused(tmp_path, name):
+def test_codestream_without_a_sign_for_signed_pixels_of_more_bits_is_refused(tmp_path, name):
     syntax, encode = TWELVE_SIGNED_BITS[name]
     with refused(RefusedInputError, 12, 16):
         place(tmp_path, encapsulate([encode(IMAGES[0])]) + END, syntax, signed=True)
 
 
 @pytest.mark.parametrize("name", TWELVE_SIGNED_BITS)
-def test_values_below_the_doubtful_sign_are_decoded(tmp_path, name):
+def test_codestream_without_a_sign_is_decoded_where_its_highest_bit_is_not_used(tmp_path, name):
     syntax, encode = TWELVE_SIGNED_BITS[name]
     low = IMAGES[0] % 2048  # 11 bits
     (pixels,) = place(tmp_path, encapsulate([encode(low)]) + END, syntax, signed=True)
@@ -119,7 +141,7 @@ def test_values_below_the_doubtful_sign_are_decoded(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", TWELVE_SIGNED_BITS)
-def test_all_twelve_stored_bits_of_signed_values_are_kept(tmp_path, name):
+def test_codestream_of_all_twelve_stored_bits_of_signed_pixels_is_decoded(tmp_path, name):
     """The bits above them get the sign later."""
     syntax, encode = TWELVE_SIGNED_BITS[name]
     data = encapsulate([encode(IMAGES[0])]) + END
@@ -133,7 +155,9 @@ def test_all_twelve_stored_bits_of_signed_values_are_kept(tmp_path, name):
 @pytest.mark.parametrize("table", [True, False])
 @pytest.mark.parametrize("pieces", [1, 3])
 @pytest.mark.parametrize("name", ["JPEG-LS", "JPEG 2000", "RLE"])
-def test_frames_are_found_in_every_layout(tmp_path, name, pieces, table):
+def test_compressed_frames_are_found_with_and_without_offsets_in_one_or_several_fragments(
+    tmp_path, name, pieces, table
+):
     if name == "RLE" and pieces > 1:
         pytest.skip("an RLE frame is one fragment")
     syntax, encode = ENCODERS[name]
@@ -142,68 +166,78 @@ def test_frames_are_found_in_every_layout(tmp_path, name, pieces, table):
         assert np.array_equal(pixels, image)
 
 
-def test_an_extended_offset_table_is_not_needed(tmp_path):
+def test_compressed_frames_with_an_extended_offset_table_are_found(tmp_path):
     data, _, _ = encapsulate_extended([encode_jpeg_2000(image) for image in IMAGES])
     assert np.array_equal(place(tmp_path, data + END, frames=4), IMAGES)
 
 
-def test_one_frame_in_many_fragments_or_as_jp2_is_decoded(tmp_path):
-    data = encode_jpeg_2000(IMAGES[0])
-    (pixels,) = place(tmp_path, encapsulate([data], fragments_per_frame=5, has_bot=False) + END)
+def test_one_frame_in_five_fragments_is_decoded(tmp_path):
+    data = encapsulate([encode_jpeg_2000(IMAGES[0])], fragments_per_frame=5, has_bot=False) + END
+    (pixels,) = place(tmp_path, data)
     assert np.array_equal(pixels, IMAGES[0])
-    wrapped = bytes(imagecodecs.jpeg2k_encode(IMAGES[0], level=0, reversible=True, codecformat="jp2"))
-    (pixels,) = place(tmp_path, encapsulate([wrapped]) + END)
+
+
+def test_frame_that_is_a_jp2_file_is_decoded(tmp_path):
+    jp2 = bytes(imagecodecs.jpeg2k_encode(IMAGES[0], level=0, reversible=True, codecformat="jp2"))
+    (pixels,) = place(tmp_path, encapsulate([jp2]) + END)
     assert np.array_equal(pixels, IMAGES[0])
 
 
 @pytest.mark.parametrize(
-    ("fragments", "frames", "table", "words"),
+    ("fragments", "frames", "table", "facts"),
     [
-        (1, 2, b"", (2, 1)),
-        (0, 1, b"", ("compressed",)),
-        (3, 2, b"", (2, 3)),
-        (2, 1, b"", (1, 2)),
-        (3, 2, struct.pack("<2L", 0, 9), (2, 3)),
-        (3, 2, struct.pack("<2L", 8, 0), (2, 3)),
+        pytest.param(1, 2, b"", (2, 1), id="2 frames in 1 fragment"),
+        pytest.param(0, 1, b"", ("compressed",), id="no fragment"),
+        pytest.param(3, 2, b"", (2, 3), id="2 frames in 3 fragments"),
+        pytest.param(2, 1, b"", (1, 2), id="1 frame that ends in the first of 2"),
+        pytest.param(3, 2, struct.pack("<2L", 0, 9), (2, 3), id="offset within a fragment"),
+        pytest.param(3, 2, struct.pack("<2L", 8, 0), (2, 3), id="offsets that fall"),
     ],
 )
-def test_frames_that_cannot_be_told_apart_are_refused(tmp_path, fragments, frames, table, words):
+def test_fragments_that_do_not_tell_their_frames_apart_are_refused(tmp_path, fragments, frames, table, facts):
     data = item(table) + item(even(encode_jpeg_2000(IMAGES[0]))) * fragments + END
-    with refused(RefusedInputError, *words):
+    with refused(RefusedInputError, *facts):
         place(tmp_path, data, frames=frames)
 
 
-def test_damaged_items_are_refused(tmp_path):
-    frame = even(encode_jpeg_2000(IMAGES[0]))
-    whole = item(b"") + item(frame)
-    with refused(RefusedInputError, "pixels", "truncated", "mark"):
-        place(tmp_path, whole)
-    with refused(RefusedInputError, "truncated", len(frame), len(frame) - 4):
-        place(tmp_path, whole[:-4])
-    with refused(RefusedInputError, "0000,0000"):
-        place(tmp_path, item(b"") + bytes(50))
-    with refused(RefusedInputError, 2000, "fragments"):  # of one frame
-        place(tmp_path, item(b"") * 2500 + END)
+FRAME = even(encode_jpeg_2000(IMAGES[0]))
+
+
+@pytest.mark.parametrize(
+    ("data", "facts"),
+    [
+        pytest.param(item(b"") + item(FRAME), ("pixels", "truncated", "mark"), id="no end mark"),
+        pytest.param((item(b"") + item(FRAME))[:-4], ("truncated", len(FRAME), len(FRAME) - 4), id="cut"),
+        pytest.param(item(b"") + bytes(50), ("0000,0000"), id="zeros in place of an item"),
+        pytest.param(item(b"") * 2500 + END, (2000, "fragments"), id="2500 fragments of one frame"),
+    ],
+)
+def test_compressed_pixels_with_damaged_items_are_refused(tmp_path, data, facts):
+    with refused(RefusedInputError, *([facts] if isinstance(facts, str) else facts)):
+        place(tmp_path, data)
 
 
 class CountingFile(io.BytesIO):
-    """How much is read of a file."""
+    """Counts the bytes that are read of it."""
 
     count = 0
 
     def read(self, size=-1):
         data = super().read(size)
-        CountingFile.count += len(data)
+        self.count += len(data)
         return data
 
 
-def test_items_are_walked_once_and_nothing_else_is_read(monkeypatch, tmp_path):
+def test_frames_are_found_by_the_heads_of_their_items_alone():
     data = encapsulate([bytes(1000)] * 500, has_bot=False) + END
     file = CountingFile(data)
     frames = transfer_syntaxes.find_frames(file, 0, len(data), 500, RLE)
-    assert CountingFile.count == 502 * 8
+    assert file.count == (1 + 500 + 1) * 8  # table, fragments and end mark
     assert transfer_syntaxes.read_pieces(file, frames[499]) == bytes(1000)
-    assert CountingFile.count == 502 * 8 + 1000
+    assert file.count == (1 + 500 + 1) * 8 + 1000
+
+
+def test_frames_of_a_file_are_found_once_for_all_of_them(monkeypatch, tmp_path):
     path = tmp_path / "pixels"
     path.write_bytes(encapsulate([encode_rle(image) for image in IMAGES]) + END)
     calls = []
@@ -212,18 +246,24 @@ def test_items_are_walked_once_and_nothing_else_is_read(monkeypatch, tmp_path):
     assert len(calls) == 1
 
 
-def test_frames_of_plain_and_deflated_files_are_found(tmp_path, monkeypatch):
-    head, pixels = b"head" * 5, IMAGES.tobytes()
-    plain = tmp_path / "plain"
-    plain.write_bytes(head + pixels)
-    headers = make_headers(plain, "1.2.840.10008.1.2.1", 4)
+def test_frames_of_an_uncompressed_file_are_read(tmp_path):
+    pixels = IMAGES.tobytes()
+    path = tmp_path / "plain"
+    path.write_bytes(bytes(20) + pixels)
+    headers = make_headers(path, "1.2.840.10008.1.2.1", 4)
     headers = [dataclasses.replace(header, pixel_offset=20, pixel_length=len(pixels)) for header in headers]
     assert np.array_equal(load(headers), IMAGES)
 
-    deflated = tmp_path / "deflated"
+
+def test_frames_of_a_deflated_file_are_read_and_it_is_inflated_once(tmp_path, monkeypatch):
+    pixels = IMAGES.tobytes()
+    path = tmp_path / "deflated"
     deflater = zlib.compressobj(wbits=-15)
-    deflated.write_bytes(b"meta" + deflater.compress(head + pixels) + deflater.flush())
-    headers = [dataclasses.replace(header, file=deflated, inflate_from=4) for header in headers]
+    path.write_bytes(b"meta" + deflater.compress(bytes(20) + pixels) + deflater.flush())
+    headers = [
+        dataclasses.replace(header, pixel_offset=20, pixel_length=len(pixels), inflate_from=4)
+        for header in make_headers(path, "1.2.840.10008.1.2.1", 4)
+    ]
     calls = []
     inflate = stored.inflate
     monkeypatch.setattr(stored, "inflate", lambda *a: calls.append(a) or inflate(*a))
@@ -267,7 +307,7 @@ def drop_unused_bits(pixels, ds):
 
 
 @pytest.mark.parametrize("name", daily(5, [*COMPRESSED, *PLAIN]))
-def test_pydicoms_files_give_pydicoms_pixels(tmp_path, name):
+def test_files_of_pydicom_have_the_pixels_that_pydicom_reads(tmp_path, name):
     found = get_testdata_file(name, download=False)
     if found is None:
         pytest.skip(f"pydicom has no {name} here")
@@ -279,7 +319,7 @@ def test_pydicoms_files_give_pydicoms_pixels(tmp_path, name):
 
 
 @pytest.mark.parametrize("ending", daily(2, ["90", "91", "80", "81", "57", "70", "5"]))
-def test_another_library_gives_the_same_pixels(tmp_path, real_data, ending):
+def test_real_slice_has_the_hu_that_simpleitk_reads(tmp_path, real_data, ending):
     """SimpleITK (GDCM), which decodes with code of its own."""
     itk = pytest.importorskip("SimpleITK")
     (path,) = (real_data / "transfer_syntaxes").glob(f"CTImage*.{ending}.dcm")

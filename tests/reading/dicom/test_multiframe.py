@@ -36,7 +36,6 @@ from variants import daily
 from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.headers.header import read_headers
 from clrecon.reading.dicom.headers.multiframe import DIMENSIONS_OF_PLACE
-from clrecon.reading.dicom.headers.slice_header import OtherImage
 
 SHUFFLED = (4, 0, 6, 2, 5, 1, 3)
 PLANS = {
@@ -51,7 +50,7 @@ PLANS = {
 # --- right ---
 
 
-def split_headers(path):
+def headers_of_ct(path):
     """The headers of a file that is CT."""
     headers = read_headers(path)
     assert isinstance(headers, list)
@@ -71,10 +70,15 @@ def test_fault_22_frames_lie_where_they_were_written(tmp_path, plan, order):
     write_enhanced(tmp_path / "mf", plan, order=order)
     volume = read_volume(tmp_path)
     assert_right(volume, plan)
+    assert volume.spacing[:2] == pytest.approx(plan.pixel_spacing[::-1])  # di, dj
+    assert [warning for warning in volume.report["warnings"] if "tilt" not in warning] == []
+
+
+def test_frames_of_one_file_are_counted_as_slices(tmp_path):
+    write_enhanced(tmp_path / "mf")
+    volume = read_volume(tmp_path)
     assert volume.voxels.dtype == np.int16
-    assert volume.spacing[:2] == pytest.approx((0.5, 0.7))
-    assert volume.report["files"]["used"] == 1 and volume.report["slices"] == 7
-    assert [text for text in volume.report["warnings"] if "tilt" not in text] == []
+    assert (volume.report["files"]["used"], volume.report["slices"]) == (1, 7)
 
 
 @pytest.mark.parametrize(
@@ -86,7 +90,7 @@ def test_fault_22_frames_lie_where_they_were_written(tmp_path, plan, order):
     ],
     ids=["all per frame", "all shared", "some shared"],
 )
-def test_groups_are_shared_or_per_frame(tmp_path, shared):
+def test_frames_are_placed_by_groups_that_are_shared_or_per_frame(tmp_path, shared):
     plan = write_enhanced(tmp_path / "mf", Plan(angles=(5, 7, -11)), shared=shared, order=SHUFFLED)
     assert_right(read_volume(tmp_path), plan)
 
@@ -133,74 +137,86 @@ def test_compressed_frames_of_enhanced_images_are_read(tmp_path, syntax, table, 
     assert volume.report["transfer_syntaxes"] == [str(syntax)]
 
 
-def test_several_files_make_one_stack(tmp_path):
+def test_frames_in_several_files_are_read_as_one_stack(tmp_path):
     plan = Plan(angles=(20, -35, 50))
     for number, order in enumerate([(6, 2), (0, 4, 5), (3, 1)]):
         write_enhanced(tmp_path / f"mf{number}", plan, order=order)
     volume = read_volume(tmp_path)
     assert_right(volume, plan)
-    assert volume.report["files"]["used"] == 3 and volume.report["slices"] == 7
+    assert (volume.report["files"]["used"], volume.report["slices"]) == (3, 7)
 
 
-def test_frames_and_classic_slices_make_one_stack(tmp_path):
+def test_frames_and_single_slices_of_one_series_are_read_as_one_stack(tmp_path):
     plan = write_series(tmp_path, Plan(leave_out=(2, 3, 4)))
     write_enhanced(tmp_path / "mf", plan, order=(3, 2, 4))
     assert_right(read_volume(tmp_path), plan)
 
 
-def test_a_single_frame_makes_a_slice(tmp_path):
+def test_files_of_a_single_frame_are_read_as_one_stack(tmp_path):
     plan = Plan()
     for k in range(7):
         write_enhanced(tmp_path / f"{k}", plan, order=[k])
     assert_right(read_volume(tmp_path), plan)
-    headers = split_headers(tmp_path / "3")
-    assert [header.name for header in headers] == ["3"]
 
 
-def test_padding_stands_for_all_frames(tmp_path):
+def test_single_frame_is_named_by_its_file_alone(tmp_path):
+    write_enhanced(tmp_path / "3", Plan(), order=[3])
+    assert [header.name for header in headers_of_ct(tmp_path / "3")] == ["3"]
+
+
+def test_padding_value_of_the_file_is_masked_in_its_frames(tmp_path):
     plan = write_enhanced(tmp_path / "mf", change=lambda ds: setattr(ds, "PixelPaddingValue", 905))
     volume = read_volume(tmp_path)
+    (k, j, i), *others = np.argwhere(plan.hu() == 905 - 1024)  # one voxel has that value
+    assert others == []
+    assert volume.voxels[k, j, i] != 905 - 1024
     assert volume.report["padding_share"] == pytest.approx(1 / plan.hu().size)
-    assert volume.voxels[0, 0, 5] != 905 - 1024
 
 
-def test_of_multi_frame_and_single_slices_the_larger_series_is_taken(tmp_path):
+def test_larger_one_of_a_series_of_frames_and_a_series_of_slices_is_read(tmp_path):
     write_series(tmp_path, Plan(series=1, shape=(5, 5, 6)))
     plan = write_enhanced(tmp_path / "mf", Plan(series=2))
     assert_right(read_volume(tmp_path), plan)
-    assert list_series(tmp_path).chosen == 2
-    assert [entry.slices for entry in list_series(tmp_path).series] == [5, 7]
+    listing = list_series(tmp_path)
+    assert listing.chosen == 2
+    assert [series.slices for series in listing.series] == [5, 7]
 
 
 # --- what frames say ---
 
 
-def test_frames_are_named_and_numbered(tmp_path):
+def test_frames_are_named_by_their_file_and_number_from_1(tmp_path):
     write_enhanced(tmp_path / "mf", order=SHUFFLED)
-    headers = split_headers(tmp_path / "mf")
+    headers = headers_of_ct(tmp_path / "mf")
     assert [header.frame for header in headers] == list(range(7))
     assert [header.name for header in headers] == [f"mf frame {number}" for number in range(1, 8)]
     assert {header.frames for header in headers} == {7}
 
 
-def test_localizer_frames_are_parted(tmp_path):
+def write_with_localizer_frames(path):
+    """Frames 1 and 7 of 7 are localizers."""
+
     def spoil(ds):
         for number in (0, 6):
-            frame_groups(ds, number).CTImageFrameTypeSequence[0].FrameType = [
-                "ORIGINAL",
-                "PRIMARY",
-                "LOCALIZER",
-                "NONE",
-            ]
+            frame_type = frame_groups(ds, number).CTImageFrameTypeSequence[0]
+            frame_type.FrameType = ["ORIGINAL", "PRIMARY", "LOCALIZER", "NONE"]
 
-    write_enhanced(tmp_path / "mf", change=spoil, shared=("PixelMeasuresSequence",))
-    entries = list_series(tmp_path).series
-    assert [entry.slices for entry in entries] == [5, 2]
-    assert entries[1].problems == ["localizer images, not a stack"]
+    write_enhanced(path, change=spoil, shared=("PixelMeasuresSequence",))
+
+
+def test_localizer_frames_are_listed_as_another_series(tmp_path):
+    write_with_localizer_frames(tmp_path / "mf")
+    stack, localizers = list_series(tmp_path).series
+    assert (stack.slices, localizers.slices) == (5, 2)
+    assert localizers.problems == ["localizer images, not a stack"]
+
+
+def test_frames_beside_localizers_are_read_without_them(tmp_path):
+    write_with_localizer_frames(tmp_path / "mf")
     assert np.array_equal(read_volume(tmp_path).voxels, Plan().hu()[1:6])
 
 
-def test_two_orientations_in_one_file_are_two_stacks(tmp_path):
+def test_frames_of_two_orientations_in_one_file_are_listed_as_two_series(tmp_path):
     def turn(ds):
         for number in (0, 1):
             frame_groups(ds, number).PlaneOrientationSequence[0].ImageOrientationPatient = [0, 1, 0, 0, 0, -1]
@@ -260,9 +276,9 @@ PHASES = {
 }
 
 
-@pytest.mark.parametrize("syntax", daily(1, [ExplicitVRLittleEndian, ImplicitVRLittleEndian, ExplicitVRBigEndian]))
-@pytest.mark.parametrize("sequence, keyword, values, name, expected", PHASES.values(), ids=PHASES)
-def test_frames_at_one_place_are_told_apart(tmp_path, syntax, sequence, keyword, values, name, expected):
+def write_two_phases(path, syntax, sequence, keyword, values):
+    """Seven frames, and again at the same places with other pixels; an element is one value, then the other."""
+
     def spoil(ds):
         ds.DimensionIndexSequence.append(item(DimensionIndexPointer=0x00189337, FunctionalGroupPointer=0x00189341))
         for number, groups in enumerate(ds.PerFrameFunctionalGroupsSequence):
@@ -274,22 +290,42 @@ def test_frames_at_one_place_are_told_apart(tmp_path, syntax, sequence, keyword,
         pixels[pixels.size // 2 :] ^= 1  # else they are copies
         ds.PixelData = pixels.tobytes()
 
-    plan = write_enhanced(tmp_path / "mf", Plan(syntax=syntax), spoil, order=[*range(7), *range(7)])
-    headers = split_headers(tmp_path / "mf")
+    return write_enhanced(path, Plan(syntax=syntax), spoil, order=[*range(7), *range(7)])
+
+
+PHASE_SYNTAXES = pytest.mark.parametrize(
+    "syntax", daily(1, [ExplicitVRLittleEndian, ImplicitVRLittleEndian, ExplicitVRBigEndian])
+)
+TWO_PHASES = pytest.mark.parametrize("sequence, keyword, values, name, expected", PHASES.values(), ids=PHASES)
+
+
+@PHASE_SYNTAXES
+@TWO_PHASES
+def test_frames_have_the_element_that_tells_phases_apart(tmp_path, syntax, sequence, keyword, values, name, expected):
+    write_two_phases(tmp_path / "mf", syntax, sequence, keyword, values)
+    headers = headers_of_ct(tmp_path / "mf")
     assert [dict(header.phase).get(name) for header in headers] == [expected[0]] * 7 + [expected[1]] * 7
-    assert "DimensionIndexValues ImagePositionPatient" not in dict(headers[0].phase)
+    assert "DimensionIndexValues ImagePositionPatient" not in dict(headers[0].phase)  # a number of places
+
+
+@PHASE_SYNTAXES
+@TWO_PHASES
+def test_two_frames_at_each_place_are_refused_as_phases_and_read_by_number(
+    tmp_path, syntax, sequence, keyword, values, name, expected
+):
+    plan = write_two_phases(tmp_path / "mf", syntax, sequence, keyword, values)
     assert f"2 phases at the same places, choose one with phase: [1: {name} " in refusal(tmp_path)
     assert_right(read_volume(tmp_path, phase=1), plan)
     assert [phase["slices"] for phase in list_series(tmp_path).series[0].phases] == [7, 7]
 
 
-def test_elements_of_a_frame_stand_over_shared_ones(tmp_path):
+def test_element_of_a_frame_goes_before_the_shared_one(tmp_path):
     def spoil(ds):
         ds.SharedFunctionalGroupsSequence[0].CTReconstructionSequence = [item(ConvolutionKernel="B30")]
         frame_groups(ds, 2).CTReconstructionSequence = [item(ConvolutionKernel="B70")]
 
     write_enhanced(tmp_path / "mf", change=spoil)
-    kernels = [dict(header.phase)["ConvolutionKernel"] for header in split_headers(tmp_path / "mf")]
+    kernels = [dict(header.phase)["ConvolutionKernel"] for header in headers_of_ct(tmp_path / "mf")]
     assert kernels == ["B30", "B30", "B70", "B30", "B30", "B30", "B30"]
 
 
@@ -297,7 +333,7 @@ def test_elements_of_a_frame_stand_over_shared_ones(tmp_path):
 
 
 @pytest.mark.parametrize("kind", [None, "US"])
-def test_real_world_values_in_hu_stand_in_for_the_rescale(tmp_path, kind):
+def test_frames_without_a_rescale_are_in_hu_by_their_real_world_values_with_a_warning(tmp_path, kind):
     mappings = [real_world(0.1, 7.0, "mg/cm3"), real_world(2.0, -1000.0)]
     plan = write_enhanced(tmp_path / "mf", change=without_rescale(mappings, kind))
     volume = read_volume(tmp_path)
@@ -309,19 +345,19 @@ def test_real_world_values_in_hu_stand_in_for_the_rescale(tmp_path, kind):
     ]
 
 
-def test_real_world_values_do_not_stand_over_a_rescale_to_hu(tmp_path):
+def test_rescale_to_hu_goes_before_real_world_values(tmp_path):
     plan = write_enhanced(tmp_path / "mf", change=without_rescale([real_world(2.0, -1000.0)], "HU"))
     assert_right(read_volume(tmp_path), plan)
 
 
-def test_frames_without_any_rescale_are_warned_of(tmp_path):
+def test_frames_without_a_rescale_and_values_in_hu_are_kept_with_a_warning(tmp_path):
     plan = write_enhanced(tmp_path / "mf", change=without_rescale([real_world(0.1, 7.0, "mg/cm3")]))
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu() + 1024)
     assert "no RescaleSlope" in volume.report["warnings"][0]
 
 
-def test_an_intercept_from_elsewhere_does_not_meet_the_slope_of_the_macro(tmp_path):
+def test_intercept_outside_of_the_group_with_the_slope_is_not_used_and_warned_of(tmp_path):
     def spoil(ds):
         ds.RescaleIntercept = 500
         for groups in ds.PerFrameFunctionalGroupsSequence:
@@ -333,7 +369,7 @@ def test_an_intercept_from_elsewhere_does_not_meet_the_slope_of_the_macro(tmp_pa
     assert "no RescaleIntercept" in volume.report["warnings"][0]
 
 
-def test_lossy_of_one_frame_is_warned_of(tmp_path):
+def test_lossy_compression_of_one_frame_is_warned_of(tmp_path):
     def spoil(ds):
         frame_groups(ds, 2).UnassignedPerFrameConvertedAttributesSequence = [item(LossyImageCompression="01")]
 
@@ -367,19 +403,19 @@ def write_parts(folder, plan, parts, leave_out=(), change=None, **how):
 
 
 @pytest.mark.parametrize("say_total", [True, False], ids=["total", "no total"])
-def test_a_concatenation_is_one_stack(tmp_path, say_total):
+def test_parts_of_a_concatenation_are_read_as_one_stack(tmp_path, say_total):
     plan = Plan(angles=(20, -35, 50))
     write_parts(tmp_path, plan, [(6, 2, 0), (4, 5), (3, 1)], say_total=say_total)
     assert_right(read_volume(tmp_path), plan)
 
 
 @pytest.mark.parametrize("lost, say_total", [(1, True), (2, True), (3, True), (1, False), (2, False)])
-def test_a_lost_file_of_a_concatenation_is_missed(tmp_path, lost, say_total):
+def test_concatenation_that_lacks_a_file_is_refused_with_its_number(tmp_path, lost, say_total):
     write_parts(tmp_path, Plan(), [(0, 1), (2, 3, 4), (5, 6)], leave_out=(lost,), say_total=say_total)
     assert f"file {lost} of the 3 of a concatenation is missing" in refusal(tmp_path)
 
 
-def test_frames_lost_within_a_concatenation_are_missed(tmp_path):
+def test_concatenation_whose_part_starts_too_late_is_refused_with_its_frames(tmp_path):
     def shift(ds, number):
         if number == 3:
             ds.ConcatenationFrameOffsetNumber = 6
@@ -410,7 +446,7 @@ def test_highdicom_reads_the_same_volume_of_an_enhanced_image(tmp_path):
 
 
 @pytest.mark.parametrize("plan", [Plan(), Plan(tilt_deg=12, angles=(5, 7, -11))], ids=["straight", "tilted"])
-def test_a_series_that_highdicom_converts_reads_the_same(tmp_path, plan):
+def test_series_that_highdicom_converts_to_frames_is_read_as_the_same_volume(tmp_path, plan):
     from highdicom.legacy import LegacyConvertedEnhancedCTImage
 
     def complete(ds, k):
@@ -432,7 +468,7 @@ def test_a_series_that_highdicom_converts_reads_the_same(tmp_path, plan):
     assert np.array_equal(volume.voxels, expected.voxels)
     assert np.array_equal(volume.affine, expected.affine)
     assert volume.report["warnings"] == expected.report["warnings"]
-    assert ("FrameAcquisitionNumber", "4") in split_headers(tmp_path / "mf")[0].phase
+    assert ("FrameAcquisitionNumber", "4") in headers_of_ct(tmp_path / "mf")[0].phase
 
 
 def test_real_legacy_converted_image_lies_in_its_place(real_data):
@@ -447,11 +483,11 @@ def test_real_legacy_converted_image_lies_in_its_place(real_data):
 
 @pytest.mark.release
 @pytest.mark.untraced
-def test_a_thousand_frames_are_split_at_once(tmp_path):
+def test_headers_of_a_thousand_frames_are_read_within_a_second_of_the_processor(tmp_path):
     plan = write_enhanced(tmp_path / "mf", Plan(shape=(1000, 2, 2)))
-    read_headers(tmp_path / "mf")
+    read_headers(tmp_path / "mf")  # modules are loaded
     start = time.process_time()
-    headers = split_headers(tmp_path / "mf")
+    headers = headers_of_ct(tmp_path / "mf")
     assert time.process_time() - start < THOUSAND_FRAMES_S
-    assert not isinstance(headers, OtherImage) and len(headers) == 1000
+    assert len(headers) == 1000
     assert headers[999].position_mm == pytest.approx(tuple(plan.position(999)))

@@ -177,7 +177,7 @@ def test_faults_of_multi_frame_images_are_refused_by_name(tmp_path, change, word
     assert list_series(tmp_path).series[0].problems
 
 
-def test_a_broken_multi_frame_series_is_not_passed_over(tmp_path):
+def test_larger_series_of_frames_that_is_faulty_is_refused_and_not_passed_over(tmp_path):
     write_series(tmp_path, Plan(series=1, shape=(5, 5, 6)))
     write_enhanced(tmp_path / "mf", Plan(series=2), drop("PlanePositionSequence"), shared=())
     assert "series 2: mf frame 3: ImagePositionPatient" in refusal(tmp_path)
@@ -185,7 +185,7 @@ def test_a_broken_multi_frame_series_is_not_passed_over(tmp_path):
 
 
 @pytest.mark.parametrize("frames", [3, 300])
-def test_old_multi_frame_images_have_no_places(tmp_path, frames):
+def test_classic_image_of_many_frames_is_refused_as_their_places_are_not_known(tmp_path, frames):
     ds = make_dataset(Plan(), 0)
     ds.NumberOfFrames = frames
     ds.add_new(0x00201041, "DS", "1")
@@ -196,16 +196,18 @@ def test_old_multi_frame_images_have_no_places(tmp_path, frames):
     )
 
 
-def test_one_slice_that_says_one_frame_is_a_slice(tmp_path):
+def test_slices_that_each_state_one_frame_are_read(tmp_path):
     plan = write_series(tmp_path, change=set_values(NumberOfFrames=1))
     assert_right(read_volume(tmp_path), plan)
 
 
-def test_multi_frame_captures_and_other_modalities_are_refused(tmp_path):
+def test_frames_of_mr_are_refused(tmp_path):
     write_enhanced(tmp_path / "mf", change=lambda ds: setattr(ds, "Modality", "MR"))
     with refused(NoDicomError, "MR", "CT", 1):
         read_volume(tmp_path)
 
+
+def test_frames_of_a_secondary_capture_are_refused(tmp_path):
     def to_capture(ds):
         ds.SOPClassUID = ds.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.7.3"
 
@@ -216,7 +218,7 @@ def test_multi_frame_captures_and_other_modalities_are_refused(tmp_path):
 # --- hostile bytes ---
 
 
-def nest(levels):
+def nested_sequences(levels):
     """A private sequence of undefined length, `levels` deep, to stand in place of an element of the same length."""
     head = b"\x11\x00\x10\x10SQ\0\0\xff\xff\xff\xff"
     opened, closed = b"\xfe\xff\x00\xe0\xff\xff\xff\xff", b"\xfe\xff\x0d\xe0\0\0\0\0"
@@ -224,22 +226,28 @@ def nest(levels):
     return head + (opened + head) * levels + end + (closed + end) * levels
 
 
-@pytest.mark.parametrize("levels", [10, 300, 5000])
-def test_fault_37_nests_in_the_groups_are_read_or_refused(tmp_path, levels):
-    payload = nest(levels)
+def write_nested(path, levels):
+    payload = nested_sequences(levels)
     marker = bytes([0xA5]) * (len(payload) - 12)
-
-    plan = write_enhanced(tmp_path / "mf", change=lambda ds: frame_groups(ds, 1).add_new(0x00111010, "OB", marker))
-    data = (tmp_path / "mf").read_bytes()
+    plan = write_enhanced(path, change=lambda ds: frame_groups(ds, 1).add_new(0x00111010, "OB", marker))
+    data = path.read_bytes()
     place = data.index(marker) - 12
-    (tmp_path / "mf").write_bytes(data[:place] + payload + data[place + len(payload) :])
-    if levels == 10:
-        assert_right(read_volume(tmp_path), plan)
-    else:
-        assert "sequences are nested too deep" in refusal(tmp_path)
+    path.write_bytes(data[:place] + payload + data[place + len(payload) :])
+    return plan
 
 
-def test_every_cut_of_the_groups_is_refused(tmp_path):
+def test_fault_37_sequences_nested_10_deep_in_the_groups_are_read(tmp_path):
+    plan = write_nested(tmp_path / "mf", 10)
+    assert_right(read_volume(tmp_path), plan)
+
+
+@pytest.mark.parametrize("levels", [300, 5000])
+def test_fault_37_sequences_nested_deeper_in_the_groups_are_refused(tmp_path, levels):
+    write_nested(tmp_path / "mf", levels)
+    assert "sequences are nested too deep" in refusal(tmp_path)
+
+
+def test_frames_whose_file_is_cut_anywhere_in_their_groups_are_refused(tmp_path):
     write_enhanced(tmp_path / "mf", Plan(shape=(2, 2, 2)))
     data = (tmp_path / "mf").read_bytes()
     for end in range(len(data) - 700, len(data), 7):
@@ -248,24 +256,23 @@ def test_every_cut_of_the_groups_is_refused(tmp_path):
 
 
 @pytest.mark.untraced
-def test_wrong_bytes_in_the_groups_do_no_harm(tmp_path):
-    """Each byte of the groups wrong in turn: the volume, or a refusal."""
+def test_frames_with_any_wrong_byte_in_their_groups_are_read_or_refused(tmp_path):
     plan = write_enhanced(tmp_path / "mf", Plan(shape=(2, 2, 2)))
     data = bytearray((tmp_path / "mf").read_bytes())
-    start = data.index(b"\x00\x52\x29\x92")
-    refused = 0
+    start = data.index(b"\x00\x52\x29\x92")  # SharedFunctionalGroupsSequence
+    refusals = 0
     for place in range(start, len(data), 3):
         old, data[place] = data[place], data[place] ^ 0xFF
         (tmp_path / "mf").write_bytes(data)
         try:
             assert read_volume(tmp_path).voxels.shape == plan.shape
         except (RefusedInputError, NoDicomError):
-            refused += 1
+            refusals += 1
         data[place] = old
-    assert refused > 100
+    assert refusals > 100  # of some 500
 
 
-def test_items_without_end_are_not_all_taken(tmp_path):
+def test_frames_with_thousands_of_empty_items_are_refused(tmp_path):
     """Empty items cost 8 bytes each: as many as a file holds must not become objects."""
     plan = Plan()
     ds = make_enhanced(plan)
@@ -274,7 +281,7 @@ def test_items_without_end_are_not_all_taken(tmp_path):
     assert f"the sequences hold more than {multiframe.ITEMS_PER_FRAME * 8} items" in refusal(tmp_path)
 
 
-def test_long_headers_are_not_read(tmp_path):
+def test_header_of_frames_beyond_256_mib_is_refused_without_reading_it(tmp_path):
     long: Any = SimpleNamespace(pixel_offset=2**28 + 1)
     with refused(ValueProblem, 2**28 + 1, 2**28):
         multiframe._read_header_bytes(tmp_path / "no file", long)
