@@ -149,7 +149,7 @@ def test_label_map_that_is_missing_is_refused(tmp_path):
 
 
 def test_empty_folder_is_refused_as_a_folder_of_masks(tmp_path):
-    with pytest.raises(RefusedInputError, match="is a folder without masks: one NIfTI, NRRD or MetaImage file"):
+    with refused(RefusedInputError, "folder", "masks", "NIfTI"):
         read_labels(tmp_path)
 
 

@@ -26,13 +26,13 @@ IDENTITY = set_values(
 )  # fmt: skip
 
 
-def certify(folder, **options):
+def read_certificate(folder, **options):
     certificate = list_series(folder, **options).certificate
     assert certificate is not None
     return certificate
 
 
-def failed(certificate) -> set[str]:
+def failed_gates(certificate) -> set[str]:
     return {gate["name"] for gate in certificate["gates"] if gate["ok"] is False}
 
 
@@ -42,10 +42,23 @@ def unmeasured(certificate) -> set[str]:
 
 def test_certificate_has_the_names_of_the_contract(tmp_path):
     write_series(tmp_path)
-    from_headers, from_pixels, report = certify(tmp_path), certify(tmp_path, pixels=True), read_volume(tmp_path).report
-    assert find_faults(from_headers, "certificate") == find_faults(report, "certificate") == []
-    assert from_pixels == report
+    from_headers, report = read_certificate(tmp_path), read_volume(tmp_path).report
+    assert set(from_headers) == set(report) == names_in("The certificate")
+    assert {gate["name"] for gate in report["gates"]} == names_in("The certificate", "Each gate has")
+    assert {key for gate in report["gates"] for key in gate} == {"name", "measured", "bound", "unit", "ok", "text"}
+
+
+def test_certificate_of_a_listing_that_reads_pixels_is_the_report_of_the_volume_in_json(tmp_path):
+    write_series(tmp_path)
+    report = read_volume(tmp_path).report
+    assert read_certificate(tmp_path, pixels=True) == report
     assert json.loads(json.dumps(report)) == report
+
+
+def test_series_of_a_listing_has_the_names_of_the_contract(tmp_path):
+    write_series(tmp_path)
+    (series,) = list_series(tmp_path).series
+    assert set(series.as_dict()) == names_in("clrecon info", "For each series:")
 
 
 def test_certificate_has_the_gates_of_the_contract(tmp_path):
@@ -57,14 +70,14 @@ def test_certificate_has_the_gates_of_the_contract(tmp_path):
     assert {gate["name"] for gate in read_volume(tmp_path).report["gates"]} == named
 
 
-def test_headers_alone_say_nothing_of_pixels(tmp_path, monkeypatch):
+def test_certificate_of_headers_alone_measures_no_gate_of_pixels_and_reads_none(tmp_path, monkeypatch):
     write_series(tmp_path)
 
     def refuse(*_):
         raise AssertionError("pixels were read")
 
     monkeypatch.setattr(reader, "read_voxels", refuse)
-    certificate = certify(tmp_path)
+    certificate = read_certificate(tmp_path)
     assert (certificate["padding_share"], certificate["hu_range"]) == (None, None)
     assert unmeasured(certificate) == {
         "stated_gap",
@@ -77,7 +90,7 @@ def test_headers_alone_say_nothing_of_pixels(tmp_path, monkeypatch):
         "stored_sign",
     }
     with refused(AssertionError, "pixels"):
-        certify(tmp_path, pixels=True)
+        read_certificate(tmp_path, pixels=True)
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +125,7 @@ def test_certificate_of_an_even_series_misses_nothing_and_passes_its_gates(obliq
     _, report = oblique_tilted
     assert (report["uneven"], report["gap_runs"], report["slice_positions_mm"]) == (False, None, None)
     assert (report["slices"], report["slices_missing"], report["dropped"]) == (7, 0, {})
-    assert failed(report) == set()
+    assert failed_gates(report) == set()
 
 
 def test_slices_thicker_than_their_gap_overlap(oblique_tilted):
@@ -123,17 +136,20 @@ def test_slices_thicker_than_their_gap_overlap(oblique_tilted):
     }  # fmt: skip
 
 
-def test_thickness_that_leaves_tissue_unmeasured_has_a_negative_overlap(tmp_path):
+def test_slices_thinner_than_their_gap_have_a_negative_overlap(tmp_path):
     def thin(ds, k):
         ds.SliceThickness = 1.0 if k < 3 else 0.5
 
-    write_series(tmp_path, change=thin)
-    thickness = certify(tmp_path)["thickness"]
+    write_series(tmp_path, change=thin)  # every 1.25 mm
+    thickness = read_certificate(tmp_path)["thickness"]
     assert (thickness["min_mm"], thickness["max_mm"], thickness["median_mm"]) == (0.5, 1.0, 0.5)
-    assert thickness["overlap_mm"] == pytest.approx({"min": -0.75, "max": -0.25, "median": -0.625})
+    assert thickness["overlap_mm"] == pytest.approx({"min": 0.5 - 1.25, "max": 1.0 - 1.25, "median": -0.625})
     assert thickness["overlap_percent"] == pytest.approx(-50.0)
+
+
+def test_thickness_that_one_slice_does_not_state_is_not_in_the_certificate(tmp_path):
     write_series(tmp_path, change=set_values(only=2, SliceThickness=None))
-    assert certify(tmp_path)["thickness"] is None
+    assert read_certificate(tmp_path)["thickness"] is None
 
 
 @pytest.mark.parametrize(
@@ -147,14 +163,14 @@ def test_thickness_that_leaves_tissue_unmeasured_has_a_negative_overlap(tmp_path
         (((1, 0, 0), (0, 0.8, 0.6), (0, -0.6, 0.8)), "LPS", True, 36.8698976),
     ],
 )
-def test_directions_are_named_in_the_patient(steps, axes, right_handed, off_axis):
+def test_directions_of_the_axes_are_named_by_letters_of_the_patient(steps, axes, right_handed, off_axis):
     i_step, j_step, k_step = steps
     found = facts_of_orientation(compose_affine(i_step, j_step, k_step, (0, 0, 0)))
     assert (found["axes"], found["right_handed"]) == (axes, right_handed)
     assert found["off_axis_deg"] == pytest.approx(off_axis)
 
 
-def test_runs_of_equal_gaps_are_summed_up():
+def test_runs_of_equal_gaps_are_listed_with_their_count():
     distances = np.cumsum([0.0, *[4.002] * 3, 1.081, *[6.999] * 2])
     assert summarise_gaps(distances) == [
         {"count": 3, "gap_mm": pytest.approx(4.002)},
@@ -164,13 +180,14 @@ def test_runs_of_equal_gaps_are_summed_up():
     assert summarise_gaps(distances[:1]) == []
 
 
-def test_an_uneven_series_says_where_each_slice_is(tmp_path):
+def test_certificate_of_an_uneven_series_has_the_position_of_each_slice(tmp_path):
     plan = write_series(tmp_path, Plan(offsets={3: 0.15}))
-    found = certify(tmp_path)
-    assert found["uneven"] and "grid_residual" in failed(found)
-    assert [run["count"] for run in found["gap_runs"]] == [2, 1, 1, 2]
+    certificate = read_certificate(tmp_path)
+    assert certificate["uneven"]
+    assert "grid_residual" in failed_gates(certificate)
+    assert [run["count"] for run in certificate["gap_runs"]] == [2, 1, 1, 2]
     expected = [list(plan.position(k)) for k in range(7)]
-    np.testing.assert_allclose(found["slice_positions_mm"], expected, atol=tolerances.AFFINE_MM)
+    np.testing.assert_allclose(certificate["slice_positions_mm"], expected, atol=tolerances.AFFINE_MM)
 
 
 SKEWED = "1\\0\\0\\5e-4\\0.9999999\\0"
@@ -190,40 +207,38 @@ def test_series_that_fails_one_gate_is_read_with_a_warning(tmp_path, case):
     plan, change = ONE_GATE[case]
     write_series(tmp_path, plan, change)
     report = read_volume(tmp_path).report
-    assert failed(report) == {case.partition(",")[0]}
+    assert failed_gates(report) == {case.partition(",")[0]}
     assert report["warnings"] != []  # who does not ask for gates is told all the same
     assert report["problems"] == []
 
 
-def test_the_gap_may_be_stated_along_the_table(tmp_path):
-    along = 1.25 / np.cos(np.radians(20))
-    write_series(tmp_path / "table", Plan(tilt_deg=20), set_values(SpacingBetweenSlices=round(along, 4)))
-    write_series(tmp_path / "normal", Plan(tilt_deg=20), set_values(SpacingBetweenSlices=1.25))
-    for folder in ("table", "normal"):
-        certificate = certify(tmp_path / folder)
-        assert failed(certificate) == set()
-        assert not [text for text in certificate["warnings"] if "SpacingBetweenSlices" in text]
+@pytest.mark.parametrize(
+    "stated", [round(1.25 / np.cos(np.radians(20)), 4), 1.25], ids=["along the table", "along the normal"]
+)
+def test_gap_of_tilted_slices_may_be_stated_along_table_or_normal(tmp_path, stated):
+    write_series(tmp_path, Plan(tilt_deg=20, gap=1.25), set_values(SpacingBetweenSlices=stated))
+    certificate = read_certificate(tmp_path)
+    assert failed_gates(certificate) == set()
+    assert not [warning for warning in certificate["warnings"] if "SpacingBetweenSlices" in warning]
 
 
-def test_a_hole_and_a_doubled_slice_are_counted(tmp_path):
-    write_series(tmp_path / "hole", Plan(shape=(9, 5, 6), leave_out=(4, 5)))
-    hole = certify(tmp_path / "hole")
-    assert hole["slices_missing"] == 2 and failed(hole) >= {"usable", "missing_slices"}
-    write_series(tmp_path / "doubled")
-    write_series(tmp_path / "doubled", Plan(shape=(1, 5, 6), name="again{}".format), set_values(RescaleIntercept=7))
-    doubled = list_series(tmp_path / "doubled").certificate
-    assert doubled is None or failed(doubled) >= {"usable", "duplicate_slices"}
-    assert hole["affine_ijk_to_lps_mm"] is None and hole["problems"] != []
+def test_series_with_a_hole_of_two_slices_fails_the_gate_of_missing_slices_and_has_no_affine(tmp_path):
+    write_series(tmp_path, Plan(shape=(9, 5, 6), leave_out=(4, 5)))
+    certificate = read_certificate(tmp_path)
+    assert certificate["slices_missing"] == 2
+    assert failed_gates(certificate) >= {"usable", "missing_slices"}
+    assert certificate["affine_ijk_to_lps_mm"] is None
+    assert certificate["problems"] != []
 
 
-def test_files_that_cannot_be_read_fail_a_gate(tmp_path):
+def test_series_with_a_cut_file_fails_the_gates_of_files_and_of_use(tmp_path):
     write_series(tmp_path)
     first = tmp_path / "slice000.dcm"
     first.write_bytes(first.read_bytes()[:500])
-    assert failed(certify(tmp_path)) == {"usable", "readable"}
+    assert failed_gates(read_certificate(tmp_path)) == {"usable", "readable"}
 
 
-def test_padding_that_masks_nearly_all_fails_its_gate(tmp_path):
+def test_padding_of_four_fifths_of_the_voxels_fails_its_gate_where_pixels_are_read(tmp_path):
     def pad(ds, k):
         ds.PixelPaddingValue = -2000
         pixels = np.full(30, -2000, "i2")
@@ -233,12 +248,12 @@ def test_padding_that_masks_nearly_all_fails_its_gate(tmp_path):
     write_series(tmp_path, change=pad)
     report = read_volume(tmp_path).report
     assert report["padding_share"] == pytest.approx(0.8)
-    assert failed(report) == {"padding_share"}
+    assert failed_gates(report) == {"padding_share"}
     assert any("padding" in text for text in report["warnings"])
-    assert failed(certify(tmp_path)) == set()
+    assert failed_gates(read_certificate(tmp_path)) == set()
 
 
-def test_certificate_holds_nothing_of_the_patient(tmp_path):
+def test_certificate_holds_no_patient_no_date_and_no_folder(tmp_path):
     def spoil(ds, k):
         IDENTITY(ds, k)
         ds.RescaleType = "US"
@@ -259,31 +274,34 @@ def test_certificate_holds_nothing_of_the_patient(tmp_path):
     assert "SECRET" not in text and "1901" not in text and str(tmp_path) not in text
 
 
-def test_real_series_keep_their_gates(real_data):
-    for name, slices in (("lumbar_4p25mm", 99), ("thoracic_0p8mm", 95)):
-        certificate = certify(real_data / name, pixels=True)
-        assert (certificate["slices"], failed(certificate)) == (slices, set())
-    gaps = certify(real_data / "head_tilt_gaps")
-    assert [(run["count"], round(run["gap_mm"], 3)) for run in gaps["gap_runs"]] == [
-        (13, 4.002),
-        (1, 1.081),
-        (13, 6.999),
-    ]
-    assert "grid_residual" in failed(gaps)
+@pytest.mark.parametrize(("name", "slices"), [("lumbar_4p25mm", 99), ("thoracic_0p8mm", 95)])
+def test_real_series_passes_all_gates(real_data, name, slices):
+    certificate = read_certificate(real_data / name, pixels=True)
+    assert certificate["slices"] == slices
+    assert failed_gates(certificate) == set()
 
 
-@pytest.mark.parametrize("orientation", [[1, 0.01, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0]])
-def test_a_stack_without_directions_has_a_certificate_in_strict_json(tmp_path, orientation):
+def test_real_series_with_three_gaps_has_them_as_runs_and_fails_the_gate_of_the_grid(real_data):
+    certificate = read_certificate(real_data / "head_tilt_gaps")
+    runs = [(run["count"], round(run["gap_mm"], 3)) for run in certificate["gap_runs"]]
+    assert runs == [(13, 4.002), (1, 1.081), (13, 6.999)]
+    assert "grid_residual" in failed_gates(certificate)
+
+
+@pytest.mark.parametrize(
+    "orientation", [[1, 0.01, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0]], ids=["not at right angles", "zeros"]
+)
+def test_stack_without_sound_directions_fails_that_gate_in_strict_json(tmp_path, orientation):
     write_series(tmp_path, change=set_values(ImageOrientationPatient=orientation))
     certificate = list_series(tmp_path, 1).certificate
-    json.dumps(certificate, allow_nan=False)
+    assert json.dumps(certificate, allow_nan=False)
     gates = {gate["name"]: gate for gate in certificate["gates"]}
     assert gates["orientation_exact"]["ok"] is False
-    assert gates["orientation_same"]["ok"] is None and gates["orientation_same"]["measured"] is None
+    assert (gates["orientation_same"]["ok"], gates["orientation_same"]["measured"]) == (None, None)
 
 
 @pytest.mark.parametrize(("value", "told"), [("QUADRUPED", True), ("BIPED", False), (None, False)])
-def test_animals_on_four_legs_are_said(tmp_path, capsys, value, told):
+def test_directions_of_a_quadruped_are_warned_of_and_explained_by_info(tmp_path, printed, value, told):
     """The letters of directions mean other ones, in pictures too."""
     change = set_values(AnatomicalOrientationType=value) if value else set_values()
     write_series(tmp_path, Plan(), change)
@@ -291,4 +309,4 @@ def test_animals_on_four_legs_are_said(tmp_path, capsys, value, told):
     assert report["anatomical_orientation"] == ("QUADRUPED" if told else None)
     assert any("QUADRUPED" in text and "A as ventral" in text for text in report["warnings"]) is told
     assert main(["info", str(tmp_path)]) == 0
-    assert ("back is dorsal" in capsys.readouterr().out) is told
+    assert ("back is dorsal" in printed().everything) is told

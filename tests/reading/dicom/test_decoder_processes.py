@@ -50,7 +50,7 @@ def wait_for_end(pids, seconds=10.0):
     return not any(map(is_alive, pids))
 
 
-def test_frames_come_back_as_they_went():
+def test_frames_are_decoded_one_after_the_other_in_one_process():
     with make_pool() as pool:
         assert np.array_equal(decode(pool), PIXELS)
         assert np.array_equal(decode(pool), PIXELS)
@@ -66,7 +66,7 @@ def test_frames_come_back_as_they_went():
         ("fail", r"do not decode \(ValueError: no such\\nmarker \\x1b\[31m\)"),
     ],
 )
-def test_row_40_a_decoder_that_fails_is_one_error_and_the_next_frame_decodes(name, words):
+def test_row_40_decoder_that_fails_refuses_its_frame_and_the_next_one_is_decoded(name, words):
     with make_pool(name) as pool:
         assert np.array_equal(decode(pool), PIXELS)
         with pytest.raises(DecoderError, match=words):
@@ -74,7 +74,7 @@ def test_row_40_a_decoder_that_fails_is_one_error_and_the_next_frame_decodes(nam
         assert np.array_equal(decode(pool), PIXELS)
 
 
-def test_row_40_a_decoder_that_hangs_is_ended():
+def test_row_40_decoder_that_hangs_is_ended_in_time_and_the_next_frame_is_decoded():
     with make_pool("hang", seconds=1.5) as pool:
         assert np.array_equal(decode(pool), PIXELS)
         start = time.monotonic()
@@ -85,7 +85,7 @@ def test_row_40_a_decoder_that_hangs_is_ended():
 
 
 @LINUX
-def test_a_process_may_wait_for_its_next_frame():
+def test_decoder_process_waits_for_its_next_frame_longer_than_a_frame_may_take():
     """A disk or network drive may be slower than any decoder."""
     with make_pool(seconds=0.9) as pool:
         assert np.array_equal(decode(pool), PIXELS)
@@ -93,7 +93,7 @@ def test_a_process_may_wait_for_its_next_frame():
         assert np.array_equal(decode(pool), PIXELS)
 
 
-def test_time_in_which_the_whole_program_stood_still_counts_for_nothing(monkeypatch):
+def test_time_in_which_the_whole_program_stood_still_is_not_counted_for_a_frame(monkeypatch):
     """Ctrl-Z and fg, or a debugger: the processes stood still with it."""
     clock, stood_still = time.monotonic, [0.0]
     monkeypatch.setattr(decoder_pool.time, "monotonic", lambda: clock() + stood_still[0])
@@ -105,26 +105,28 @@ def test_time_in_which_the_whole_program_stood_still_counts_for_nothing(monkeypa
         assert np.array_equal(decode(pool, "nap"), PIXELS)
 
 
-def test_row_38_a_decoder_that_takes_all_memory_is_stopped():
+def test_row_38_decoder_that_takes_too_much_memory_is_stopped_and_the_next_frame_is_decoded():
     with make_pool("allocate", memory_bytes=100 * 2**20) as pool:
         with refused(DecoderError, 100, "MiB"):
             decode(pool, "allocate")
         assert np.array_equal(decode(pool), PIXELS)
 
 
-def test_limits_grow_with_the_frame():
-    small, large = DecoderPool([], 512 * 512 * 2), DecoderPool([], 8192 * 8192 * 2)
-    assert 60 <= small.seconds < 61 and 2**28 <= small.memory_bytes < 2**29
-    assert 180 < large.seconds < 200 and 2**32 <= large.memory_bytes < 2**33
+def test_limits_of_time_and_memory_grow_with_the_bytes_of_a_frame():
+    small, large = DecoderPool([], 512 * 512 * 2), DecoderPool([], 8192 * 8192 * 2)  # 0.5 and 128 MiB
+    assert 60 <= small.seconds < 61  # a minute, and about one second a MiB
+    assert 180 < large.seconds < 200
+    assert 2**28 <= small.memory_bytes < 2**29  # 256 MiB, and some times the frame
+    assert 2**32 <= large.memory_bytes < 2**33
 
 
-def test_output_of_a_decoder_disturbs_nothing(capfd):
+def test_what_a_decoder_prints_is_dropped(capfd):
     with make_pool("print_much") as pool:
         assert np.array_equal(decode(pool, "print_much"), PIXELS)
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_decoder_that_cannot_be_imported_is_said():
+def test_decoder_that_cannot_be_imported_is_refused_with_its_module():
     with (
         DecoderPool(["no_such_module:decode"], 8) as pool,
         refused(DecoderError, "ModuleNotFoundError", "no_such_module"),
@@ -133,7 +135,7 @@ def test_a_decoder_that_cannot_be_imported_is_said():
 
 
 @pytest.mark.parametrize("executable", ["/no/such/python", "", "/bin/false"])
-def test_no_process_is_an_error_and_nothing_decodes_here(monkeypatch, executable):
+def test_frame_is_refused_and_not_decoded_in_this_process_where_no_other_can_be_started(monkeypatch, executable):
     monkeypatch.setattr(sys, "executable", executable)
     words = r"no process can be started|has none|the process for it does not start \(exit code 1\)"
     with make_pool() as pool:
@@ -157,7 +159,7 @@ def test_processes_inherit_no_handles_and_leave_none(tmp_path):
 
 
 @LINUX
-def test_many_threads_have_a_process_each_and_all_end():
+def test_threads_have_at_most_a_decoder_process_each_and_all_of_them_end():
     with make_pool() as pool:
         barrier = threading.Barrier(3)
         results: list = []
@@ -176,22 +178,22 @@ def test_many_threads_have_a_process_each_and_all_end():
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
 
 
-def test_stopping_ends_a_decoder_in_another_thread():
+def test_killing_a_pool_ends_the_decoder_of_another_thread_and_refuses_further_frames():
     with make_pool("hang") as pool:
-        caught = []
+        errors = []
 
-        def work():
+        def decode_for_ever():
             try:
                 decode(pool, "hang")
             except DecoderError as error:
-                caught.append(str(error))
+                errors.append(str(error))
 
-        thread = threading.Thread(target=work)
+        thread = threading.Thread(target=decode_for_ever)
         thread.start()
         time.sleep(0.3)
         pool.kill()
         thread.join(10)
-        assert caught == ["are not decoded: reading was stopped"]
+        assert errors == ["are not decoded: reading was stopped"]
         with refused(DecoderError, "stopped"):
             decode(pool)
 
@@ -228,13 +230,13 @@ os._exit(0 if out.tobytes() == bytes(range(8)) else 9)
 
 @pytest.mark.skipif(os.name != "posix", reason="numbers of open files")
 @pytest.mark.parametrize("numbers", [(0,), (1,), (0, 1, 2), (0, 2)])
-def test_closed_standard_streams_disturb_nothing(numbers):
+def test_frames_are_decoded_in_a_program_with_closed_standard_streams(numbers):
     """Services start programs so; what is opened next takes the numbers of the streams."""
     code = STREAMS_CLOSED.format(path=[entry for entry in sys.path if entry], numbers=numbers)
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 
 
-def test_no_module_comes_from_the_current_folder(tmp_path, monkeypatch):
+def test_decoder_process_imports_no_module_from_the_current_folder(tmp_path, monkeypatch):
     """A folder of scans is anybody's: a numpy.py in it must not run."""
     (tmp_path / "numpy.py").write_text("open('ran', 'w')")
     (tmp_path / "own_decoder.py").write_text("open('ran', 'w')")
@@ -250,7 +252,7 @@ def test_no_module_comes_from_the_current_folder(tmp_path, monkeypatch):
 
 @LINUX
 @pytest.mark.parametrize("name", ["hostile_decoders:copy", "hostile_decoders:hang"], ids=["idle", "in a decoder"])
-def test_processes_end_with_a_parent_that_is_killed(name):
+def test_decoder_process_ends_with_a_parent_that_is_killed(name):
     """A script without a guard around its start, killed while its decoder is idle or at work."""
     code = SCRIPT.format(path=[entry for entry in sys.path if entry], name=name)
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
@@ -260,27 +262,29 @@ def test_processes_end_with_a_parent_that_is_killed(name):
         assert wait_for_end(pids)
 
 
-def test_the_process_imports_neither_clrecon_nor_pydicom():
-    code = Path(decoder_pool.SCRIPT).read_text(encoding="utf-8")
-    assert "import clrecon" not in code and "from clrecon" not in code and "pydicom import" not in code
+@pytest.mark.parametrize("words", ["import clrecon", "from clrecon", "pydicom import"])
+def test_script_of_the_decoder_process_imports_neither_clrecon_nor_pydicom(words):
+    assert words not in Path(decoder_pool.SCRIPT).read_text(encoding="utf-8")
 
 
 @LINUX
-def test_the_lifeline_tells_this_process_when_its_other_end_closes():
-    """The steps of the process, taken in this one, which is told by the same signal and does not end."""
+def test_process_is_signalled_when_the_other_end_of_its_lifeline_closes_and_exits_if_it_is_closed_already():
+    """The steps of the decoder process, taken in this one, which gets the same signal and does not end."""
     import fcntl
 
-    told = []
-    before = signal.signal(signal.SIGIO, lambda number, frame: told.append(number))
+    signals = []
+    before = signal.signal(signal.SIGIO, lambda number, frame: signals.append(number))
     ours, theirs = os.pipe()
     try:
         fcntl.fcntl(ours, fcntl.F_SETFL, fcntl.fcntl(ours, fcntl.F_GETFL) | os.O_NONBLOCK)
         decoder_process.end_with(ours)
-        assert fcntl.fcntl(ours, fcntl.F_GETFL) & os.O_ASYNC and not os.get_blocking(ours)
-        assert fcntl.fcntl(ours, fcntl.F_GETOWN) == os.getpid() and not told
+        assert fcntl.fcntl(ours, fcntl.F_GETFL) & os.O_ASYNC
+        assert not os.get_blocking(ours)
+        assert fcntl.fcntl(ours, fcntl.F_GETOWN) == os.getpid()
+        assert signals == []
         os.close(theirs)
-        assert told == [signal.SIGIO]
-        with monkeypatch_exit() as codes:
+        assert signals == [signal.SIGIO]
+        with record_exits() as codes:
             decoder_process.end_with(ours)
         assert codes == [1]  # it had ended before we asked
     finally:
@@ -289,7 +293,7 @@ def test_the_lifeline_tells_this_process_when_its_other_end_closes():
 
 
 @contextmanager
-def monkeypatch_exit():
+def record_exits():
     codes: list[int] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "_exit", codes.append)
@@ -297,7 +301,9 @@ def monkeypatch_exit():
 
 
 @pytest.mark.parametrize(("lifeline", "is_orphan"), [(-1, True), (0, False), (3, False)])
-def test_only_a_process_without_a_lifeline_needs_the_alarm(monkeypatch, lifeline, is_orphan):
+def test_decoder_process_without_a_lifeline_is_limited_as_an_orphan_and_answers_with_pixels(
+    monkeypatch, lifeline, is_orphan
+):
     """The main function in this process, with what changes the process itself put aside."""
     settings = {"path": sys.path, "decoders": ["hostile_decoders:copy"], "memory_bytes": 1, "seconds": 4.0}
     request = {"decoder": "hostile_decoders:copy", "dtype": "<i2", "rows": 12, "columns": 9, "length": PIXELS.nbytes}

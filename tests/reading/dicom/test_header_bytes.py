@@ -57,9 +57,12 @@ def check_tail(tail: bytes) -> None:
         element(0x7FE10010) + long_element(0xFFFCFFFC),
         long_element(0xFFFCFFFB) + long_element(0xFFFCFFFD),
     ],
+    ids=["shortest", "two", "padding", "private and padding", "around padding"],
 )
 def test_private_and_padding_elements_behind_the_pixels_are_accepted(tail):
     check_tail(tail)
+    with refused(CorruptFileError, len(tail) - 1, "DICOM"):
+        check_tail(tail[:-1])  # a byte less is no element
 
 
 @pytest.mark.parametrize(
@@ -76,36 +79,52 @@ def test_private_and_padding_elements_behind_the_pixels_are_accepted(tail):
     ],
     ids=["cut", "two", "before", "cut-value", "after-padding", "no-letter", "no-capital", "cut-long"],
 )
-def test_bytes_that_are_no_elements_behind_the_pixels_are_told_apart(tail):
+def test_bytes_behind_the_pixels_that_are_no_elements_are_refused(tail):
     with refused(CorruptFileError, len(tail), "DICOM"):
         check_tail(tail)
 
 
-@pytest.mark.parametrize("vr", [b"AA", b"DA", b"AZ", b"ZZ", b"LO"])
-def test_two_capital_letters_are_a_value_representation(vr):
+CAPITALS = pytest.mark.parametrize("vr", [b"AA", b"DA", b"AZ", b"ZZ", b"LO"])
+
+
+@CAPITALS
+def test_head_with_two_capital_letters_has_them_as_value_representation(vr):
     assert _Walk(element(0x00100010, vr), 0).read_head(0, 8, EXPLICIT) == (0x00100010, vr, 0, 8)
+
+
+@CAPITALS
+def test_data_set_whose_first_head_has_two_capital_letters_is_explicit(vr):
     assert _looks_implicit(io.BytesIO(element(0x00080005, vr)), 0) is False
     assert restore_start(element(0x00080005, vr)) is not None
 
 
-@pytest.mark.parametrize("vr", [b"@A", b"A@", b"[A", b"A[", b"aa"])
-def test_other_bytes_are_no_value_representation(vr):
+NO_CAPITALS = pytest.mark.parametrize("vr", [b"@A", b"A@", b"[A", b"A[", b"aa"])
+
+
+@NO_CAPITALS
+def test_head_without_two_capital_letters_is_refused_in_explicit_vr(vr):
     with refused(ValueProblem, "VR"):
         _Walk(element(0x00100010, vr), 0).read_head(0, 8, EXPLICIT)
+
+
+@NO_CAPITALS
+def test_data_set_whose_first_head_has_no_two_capital_letters_is_implicit(vr):
     assert _looks_implicit(io.BytesIO(element(0x00080005, vr)), 0) is True
 
 
-def test_head_of_pixel_data_is_read_or_left_open():
-    assert read_pixel_head(b"", 500, False, True) == (None, -1, 0, "")
-    assert read_pixel_head(element(0x7FE10010), 500, False, True) == (None, -1, 0, "")
-    assert read_pixel_head(long_element(0x7FE00010, b"OW", bytes(4))[:12], 500, False, True) == (
-        0x7FE00010,
-        512,
-        4,
-        "OW",
-    )
-    head = struct.pack("<HHL", 0x7FE0, 0x0010, 0xFFFFFFFF) + bytes(4)
-    assert read_pixel_head(head, 500, True, True) == (0x7FE00010, 508, -1, "")
+@pytest.mark.parametrize("start", [b"", element(0x7FE10010)], ids=["nothing", "another element"])
+def test_start_that_is_no_head_of_pixel_data_is_left_open(start):
+    assert read_pixel_head(start, 500, False, True) == (None, -1, 0, "")
+
+
+def test_head_of_pixel_data_in_explicit_vr_has_tag_place_length_and_vr():
+    head = long_element(0x7FE00010, b"OW", bytes(4))[:12]
+    assert read_pixel_head(head, 500, False, True) == (0x7FE00010, 500 + len(head), 4, "OW")
+
+
+def test_head_of_pixel_data_of_undefined_length_in_implicit_vr_has_length_minus_1():
+    head = struct.pack("<HHL", 0x7FE0, 0x0010, 0xFFFFFFFF)
+    assert read_pixel_head(head + bytes(4), 500, True, True) == (0x7FE00010, 500 + len(head), -1, "")
 
 
 def fragments(count: int) -> io.BytesIO:
@@ -113,28 +132,48 @@ def fragments(count: int) -> io.BytesIO:
     return io.BytesIO(items + struct.pack("<HHL", 0xFFFE, 0xE0DD, 0))
 
 
-def test_more_than_a_thousand_fragments_a_frame_and_a_thousand_are_refused():
+def test_frame_of_1999_fragments_is_found():
     """The first item is the table of offsets; a frame in RLE may have several fragments."""
-    file = fragments(2000)
-    assert [len(pieces) for pieces in transfer_syntaxes.find_frames(file, 0, len(file.getvalue()), 1, RLE)] == [1999]
-    file = fragments(2001)
+    file = fragments(1 + 1999)
+    frames = transfer_syntaxes.find_frames(file, 0, len(file.getvalue()), 1, RLE)
+    assert [len(pieces) for pieces in frames] == [1999]
+
+
+def test_frame_of_2000_fragments_is_refused():
+    file = fragments(1 + 2000)
     with refused(RefusedInputError, 2000):
         transfer_syntaxes.find_frames(file, 0, len(file.getvalue()), 1, RLE)
 
 
-def test_a_table_of_offsets_tells_the_first_fragment_of_each_frame():
-    table = struct.pack("<3L", 0, 20, 30)
-    pieces = [(100, 2), (110, 2), (120, 2), (130, 2)]
-    assert transfer_syntaxes._firsts_by_table(io.BytesIO(table), (0, 12), pieces, 3) == [0, 2, 3]
-    for offsets in ((10, 20, 30), (0, 20, 20), (0, 30, 20), (0, 5, 20)):
-        file = io.BytesIO(struct.pack("<3L", *offsets))
-        assert transfer_syntaxes._firsts_by_table(file, (0, 12), pieces, 3) == []
-    assert transfer_syntaxes._firsts_by_table(io.BytesIO(table), (0, 12), pieces, 2) == []
+FRAGMENTS = [(100, 2), (110, 2), (120, 2), (130, 2)]
+"""Places and lengths; each begins 10 bytes behind the one before."""
 
 
-@pytest.mark.parametrize(("more", "said"), [(0, False), (1, True), (2, True)])
-def test_an_even_number_of_bytes_has_no_byte_of_padding(tmp_path, more, said):
-    """32 bytes of pixels; a rest of zeros is told from its first byte on."""
+def firsts_by_table(*offsets, frames=3):
+    table = io.BytesIO(struct.pack(f"<{len(offsets)}L", *offsets))
+    return transfer_syntaxes._firsts_by_table(table, (0, 4 * len(offsets)), FRAGMENTS, frames)
+
+
+def test_table_of_offsets_gives_the_first_fragment_of_each_frame():
+    assert firsts_by_table(0, 20, 30) == [0, 2, 3]
+
+
+@pytest.mark.parametrize(
+    "offsets",
+    [(10, 20, 30), (0, 20, 20), (0, 30, 20), (0, 5, 20)],
+    ids=["not from 0", "one twice", "falling", "within a fragment"],
+)
+def test_table_of_impossible_offsets_gives_no_fragments(offsets):
+    assert firsts_by_table(*offsets) == []
+
+
+def test_table_of_offsets_of_another_number_of_frames_gives_no_fragments():
+    assert firsts_by_table(0, 20, 30, frames=2) == []
+
+
+@pytest.mark.parametrize(("more", "is_warned_of"), [(0, False), (1, True), (2, True)])
+def test_zeros_behind_an_even_number_of_pixel_bytes_are_warned_of_from_the_first_on(tmp_path, more, is_warned_of):
+    """32 bytes of pixels: an odd number would have one byte of padding."""
     (tmp_path / "a").write_bytes(b"\1" * 40 + bytes(32 + more))
     header: Any = SimpleNamespace(
         transfer_syntax="1.2.840.10008.1.2.1",
@@ -143,16 +182,18 @@ def test_an_even_number_of_bytes_has_no_byte_of_padding(tmp_path, more, said):
         **{"little_endian": True, "file": tmp_path / "a"},
     )
     warnings = check_surplus(SimpleNamespace(), header)  # type: ignore[arg-type]
-    assert [f"Pixel Data has {32 + more} bytes" in text and "taken as padding" in text for text in warnings] == (
-        [True] * said
-    )
+    assert len(warnings) == is_warned_of
+    assert all(f"Pixel Data has {32 + more} bytes" in text and "taken as padding" in text for text in warnings)
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(0, 5), (5, 0), (0, 0)])
-def test_images_without_rows_or_columns_are_refused(rows, columns):
-    _check_matrix(1, "MONOCHROME2", 1, 1)
+def test_image_without_rows_or_columns_is_refused(rows, columns):
     with refused(ValueProblem, rows, columns):
         _check_matrix(1, "MONOCHROME2", rows, columns)
+
+
+def test_image_of_one_pixel_is_accepted():
+    assert _check_matrix(1, "MONOCHROME2", 1, 1) is None
 
 
 def values_of(**raw: tuple[int, bytes, str]) -> Values:
@@ -164,60 +205,94 @@ def values_of(**raw: tuple[int, bytes, str]) -> Values:
     return Values(elements)
 
 
-def test_a_single_slice_may_say_that_it_has_one_frame():
-    for text in (b"", b"0 ", b"1 "):
-        assert count_frames(values_of(frames=(0x00280008, text, "IS")), "1.2") == 1
-    assert count_frames(values_of(frames=(0x00280008, b"2 ", "IS")), "1.2") == 2
+@pytest.mark.parametrize(
+    ("text", "frames"), [(b"", 1), (b"0 ", 1), (b"1 ", 1), (b"2 ", 2)], ids=["empty", "0", "1", "2"]
+)
+def test_number_of_frames_is_at_least_one(text, frames):
+    assert count_frames(values_of(frames=(0x00280008, text, "IS")), "1.2") == frames
+
+
+def test_number_of_frames_beyond_65536_is_refused():
     with refused(ValueProblem, 65537, "image"):
         count_frames(values_of(frames=(0x00280008, b"65537", "IS")), "1.2")
 
 
-def test_unsigned_numbers_have_two_bytes_or_four_as_ul():
-    assert values_of(rows=(0x00280010, b"\1\2", "US")).unsigned("Rows") == 513
-    assert values_of(rows=(0x00280010, b"\1\2\0\0", "UL")).unsigned("Rows") == 513
-    for raw, vr in ((b"\1\2\0\0", "US"), (b"\1\2", "UL"), (b"\1\2\0\0\0", "UL"), (b"\1", "US")):
-        with refused(ValueProblem, "Rows", "number"):
-            values_of(rows=(0x00280010, raw, vr)).unsigned("Rows")
+@pytest.mark.parametrize(("raw", "vr"), [(b"\1\2", "US"), (b"\1\2\0\0", "UL")], ids=["US", "UL"])
+def test_unsigned_number_of_two_bytes_or_of_four_as_ul_is_read(raw, vr):
+    assert values_of(rows=(0x00280010, raw, vr)).unsigned("Rows") == 1 + 2 * 256
 
 
-def test_padding_values_are_binary_numbers():
-    for raw, vr in ((b"\x30\xf8", "SS"), (b"\x30\xf8", "US"), (b"\x30\xf8\xff\xff", "UL"), (b"\x30\xf8", "OW")):
-        assert values_of(padding=(0x00280120, raw, vr)).padding(16, 16, True) == (-2000, -2000)
-    for raw, vr in ((b"-2", "IS"), (b"-2000 ", "DS"), (b"\x30\xf8\xff\xff", "US"), (b"\x30", "US"), (b"\0\0\0", "OW")):
-        with refused(ValueProblem, "number"):
-            values_of(padding=(0x00280120, raw, vr)).padding(16, 16, True)
+@pytest.mark.parametrize(
+    ("raw", "vr"),
+    [(b"\1\2\0\0", "US"), (b"\1\2", "UL"), (b"\1\2\0\0\0", "UL"), (b"\1", "US")],
+    ids=["US of 4", "UL of 2", "UL of 5", "US of 1"],
+)
+def test_unsigned_number_of_another_length_is_refused(raw, vr):
+    with refused(ValueProblem, "Rows", "number"):
+        values_of(rows=(0x00280010, raw, vr)).unsigned("Rows")
 
 
-def test_tags_of_overlays_are_the_sixteen_even_groups():
+@pytest.mark.parametrize(
+    ("raw", "vr"), [(b"\x30\xf8", "SS"), (b"\x30\xf8", "US"), (b"\x30\xf8\xff\xff", "UL"), (b"\x30\xf8", "OW")]
+)
+def test_padding_value_is_read_as_signed_from_any_binary_form(raw, vr):
+    assert values_of(padding=(0x00280120, raw, vr)).padding(16, 16, True) == (-2000, -2000)  # lowest and highest
+
+
+@pytest.mark.parametrize(
+    ("raw", "vr"),
+    [(b"-2", "IS"), (b"-2000 ", "DS"), (b"\x30\xf8\xff\xff", "US"), (b"\x30", "US"), (b"\0\0\0", "OW")],
+    ids=["IS", "DS", "US of 4", "US of 1", "OW of 3"],
+)
+def test_padding_value_that_is_text_or_of_another_length_is_refused(raw, vr):
+    with refused(ValueProblem, "number"):
+        values_of(padding=(0x00280120, raw, vr)).padding(16, 16, True)
+
+
+def test_elements_with_the_bits_of_overlays_are_those_of_the_sixteen_even_groups():
     assert [f"{tag:08X}" for tag in OVERLAY_BITS] == [f"60{group:02X}0102" for group in range(0, 32, 2)]
+
+
+def test_slices_without_stray_bits_have_no_text_about_them():
     assert describe_stray_bits([None], [SimpleNamespace()]) == (0, "")  # type: ignore[list-item]
 
 
-def test_elements_that_converters_leave_over_are_listed_and_the_data_set_found():
+def test_elements_that_converters_leave_unassigned_are_those_that_are_read_of_classic_slices():
     assert {keyword_for_tag(tag) for tag in multiframe._UNASSIGNED} == {
         *("AcquisitionDate", "ContentDate", "AcquisitionTime", "ContentTime", "KVP", "TriggerTime"),
         *("ConvolutionKernel", "AcquisitionNumber", "TemporalPositionIdentifier", "PixelPaddingValue"),
         *("PixelPaddingRangeLimit", "RescaleIntercept", "RescaleSlope", "RescaleType", "LossyImageCompression"),
     }
+
+
+def test_data_set_begins_behind_the_meta_header_or_the_mark():
     meta = element(0x00020010, b"UI", b"1.2.840.10008.1.2.1\0") + long_element(0x00020102, b"OB", b"abc\0")
-    assert multiframe.find_data_set(bytes(132) + meta + element(0x00080005, b"CS")) == 132 + len(meta)
-    assert multiframe.find_data_set(bytes(140)) == 132
+    behind_mark = 132
+    assert multiframe.find_data_set(bytes(132) + meta + element(0x00080005, b"CS")) == behind_mark + len(meta)
+    assert multiframe.find_data_set(bytes(140)) == behind_mark
 
 
-def test_a_header_of_more_than_256_mib_is_not_read():
-    with refused(ValueProblem, 268435457, 268435456):
+def test_header_of_more_than_256_mib_is_refused_before_its_file_is_opened():
+    with refused(ValueProblem, 2**28 + 1, 2**28):
         multiframe._read_header_bytes(Path("none"), SimpleNamespace(pixel_offset=2**28 + 1))  # type: ignore[arg-type]
-    with pytest.raises(OSError):
+
+
+def test_file_of_a_header_of_256_mib_is_opened():
+    with refused(OSError, "none"):  # there is no such file
         multiframe._read_header_bytes(Path("none"), SimpleNamespace(pixel_offset=2**28))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("tag", sorted(plain.SEQUENCE_TAGS)[::9])
-def test_known_sequences_of_undefined_length_are_sequences_in_implicit_vr(tag):
-    key = (tag & 0xFFFF) << 16 | tag >> 16
+def test_known_sequence_of_undefined_length_is_one_in_implicit_vr(tag):
+    key = (tag & 0xFFFF) << 16 | tag >> 16  # group and element as they stand in a file
     assert plain._is_sequence(b"", 0, key)
-    assert not plain._is_sequence(bytes(4), 0, key ^ 0x40000000)
-    private = struct.unpack("<L", struct.pack("<HH", 0x0009, 0x1001))[0]
-    assert plain._is_sequence(struct.pack("<HH", 0xFFFE, 0xE000), 0, private)
+    assert not plain._is_sequence(bytes(4), 0, key ^ 0x40000000)  # another element
+
+
+def test_private_element_of_undefined_length_is_a_sequence_where_an_item_follows():
+    private = 0x1001 << 16 | 0x0009
+    item_tag = struct.pack("<HH", 0xFFFE, 0xE000)
+    assert plain._is_sequence(item_tag, 0, private)
     assert not plain._is_sequence(bytes(4), 0, private)
 
 
@@ -230,17 +305,24 @@ def box(kind: bytes, value: bytes, form: str) -> bytes:
 @pytest.mark.parametrize("form", ["short", "long", "to the end"])
 @pytest.mark.parametrize("before", ["short", "long"])
 def test_codestream_in_a_jp2_file_is_found(form, before):
+    codestream = b"\xff\x4f\xff\x51 codes"
     start = stored._JP2_START + box(b"ftyp", b"jp2 12", before)
     after = b"" if form == "to the end" else box(b"uuid", b"more", "short")
-    assert stored._unwrap_jp2(start + box(b"jp2c", b"\xff\x4f\xff\x51 codes", form) + after) == (
-        b"\xff\x4f\xff\x51 codes"
-    )
-    for data in (start, start + bytes(7), start + struct.pack(">L4s", 7, b"uuid") + bytes(20)):
-        with refused(RefusedInputError, "JP2"):
-            stored._unwrap_jp2(data)
+    assert stored._unwrap_jp2(start + box(b"jp2c", codestream, form) + after) == codestream
 
 
-def test_replies_of_decoders_are_written_whole():
+@pytest.mark.parametrize(
+    "rest",
+    [b"", bytes(7), struct.pack(">L4s", 7, b"uuid") + bytes(20)],
+    ids=["nothing", "half a head", "length below 8"],
+)
+def test_jp2_file_without_a_codestream_is_refused(rest):
+    start = stored._JP2_START + box(b"ftyp", b"jp2 12", "short")
+    with refused(RefusedInputError, "JP2"):
+        stored._unwrap_jp2(start + rest)
+
+
+def test_reply_of_a_decoder_is_written_whole_to_a_full_pipe():
     class Narrow(io.BytesIO):
         """Takes three bytes at a time, as a pipe that is full may do."""
 
@@ -279,7 +361,7 @@ def test_problems_of_a_series_are_listed_without_those_that_hide_the_cause(kind,
     assert Series.problems.func(series) == expected  # type: ignore[attr-defined]
 
 
-def worker(*replies: tuple[int, int]) -> Any:
+def worker_that_answers(*replies: tuple[int, int]) -> Any:
     """A process that answers with these statuses and counts."""
     answers = iter(replies)
     made = SimpleNamespace(ready=False, why=None, deadline=0.0, _settings={}, _write=lambda data: None)
@@ -289,36 +371,55 @@ def worker(*replies: tuple[int, int]) -> Any:
     return made
 
 
-def test_a_decoder_answers_with_as_many_bytes_as_it_was_asked_for():
+ASK = decoder_pool._Worker.ask
+
+
+def test_pixels_of_a_decoder_are_written_into_the_array_that_was_given():
     out = np.zeros(4, np.uint16)
-    ask = decoder_pool._Worker.ask
-    assert ask(worker((READY, 0), (DONE, 8)), {}, b"", out, 1.0) == (DONE, "")
+    assert ASK(worker_that_answers((READY, 0), (DONE, 8)), {}, b"", out, 1.0) == (DONE, "")
     assert out.view(np.uint8).tolist() == list(range(8))
-    for count in (7, 9):
-        with pytest.raises(decoder_pool._WorkerEndedError):
-            ask(worker((READY, 0), (DONE, count)), {}, b"", out, 1.0)
-    for status in (FAILED, NO_MEMORY):
-        assert ask(worker((READY, 0), (status, 5)), {}, b"", out, 1.0) == (status, "5 letters")
 
 
-def test_worker_that_ends_says_why_only_without_a_decoder():
-    for status, why in ((NO_DECODER, "5 letters"), (FAILED, ""), (NO_MEMORY, ""), (DONE, "")):
-        process = worker((status, 5))
-        with pytest.raises(decoder_pool._WorkerEndedError):
-            decoder_pool._Worker.ask(process, {}, b"", np.zeros(4, np.uint16), 1.0)
-        assert (process.why, process.ready) == (why, False)
+@pytest.mark.parametrize("count", [7, 9], ids=["a byte less", "a byte more"])
+def test_decoder_that_answers_with_another_number_of_bytes_is_given_up(count):
+    with pytest.raises(decoder_pool._WorkerEndedError):
+        ASK(worker_that_answers((READY, 0), (DONE, count)), {}, b"", np.zeros(4, np.uint16), 1.0)
+
+
+@pytest.mark.parametrize("status", [FAILED, NO_MEMORY], ids=["failed", "no memory"])
+def test_decoder_that_fails_answers_with_its_text(status):
+    worker = worker_that_answers((READY, 0), (status, 5))
+    assert ASK(worker, {}, b"", np.zeros(4, np.uint16), 1.0) == (status, "5 letters")
+
+
+@pytest.mark.parametrize(
+    ("status", "why"),
+    [(NO_DECODER, "5 letters"), (FAILED, ""), (NO_MEMORY, ""), (DONE, "")],
+    ids=["no decoder", "failed", "no memory", "done"],
+)
+def test_worker_that_ends_before_it_is_ready_keeps_its_text_only_without_a_decoder(status, why):
+    worker = worker_that_answers((status, 5))
+    with pytest.raises(decoder_pool._WorkerEndedError):
+        ASK(worker, {}, b"", np.zeros(4, np.uint16), 1.0)
+    assert (worker.why, worker.ready) == (why, False)
+
+
+def parse_three_elements(wanted):
+    meta = element(0x00020010, b"UI", b"1.2.840.10008.1.2.1\0")
+    three = element(0x00080060, b"CS", b"CT") + element(0x00090010, b"LO", b"us") + element(0x00180060, b"DS", b"120 ")
+    data = bytes(128) + b"DICM" + meta + three + long_element(0x7FE00010, b"OW", bytes(4))
+    parsed = plain.parse_plainly(data, len(data), wanted)
+    assert parsed is not None
+    return parsed
 
 
 def test_all_elements_are_kept_where_none_are_named():
-    meta = element(0x00020010, b"UI", b"1.2.840.10008.1.2.1\0")
-    own = element(0x00080060, b"CS", b"CT") + element(0x00090010, b"LO", b"us") + element(0x00180060, b"DS", b"120 ")
-    data = bytes(128) + b"DICM" + meta + own + long_element(0x7FE00010, b"OW", bytes(4))
-    found = plain.parse_plainly(data, len(data), None)
-    assert found is not None
-    assert found.values == {0x00080060: b"CT", 0x00090010: b"us", 0x00180060: b"120 "}
-    some = plain.parse_plainly(data, len(data), (0x00080005, 0x00180060))
-    assert some is not None
-    assert (some.values, some.vrs) == ({0x00180060: b"120 "}, {0x00180060: "DS"})
+    assert parse_three_elements(None).values == {0x00080060: b"CT", 0x00090010: b"us", 0x00180060: b"120 "}
+
+
+def test_only_the_named_elements_are_kept():
+    parsed = parse_three_elements((0x00080005, 0x00180060))
+    assert (parsed.values, parsed.vrs) == ({0x00180060: b"120 "}, {0x00180060: "DS"})
 
 
 @pytest.mark.parametrize(
@@ -332,7 +433,7 @@ def test_all_elements_are_kept_where_none_are_named():
         ("other", 9, ["bad"], []),
     ],
 )
-def test_larger_stacks_that_cannot_be_used_are_told(kind, count, problems, said):
+def test_other_stacks_are_warned_of_and_larger_faulty_ones_as_not_usable(kind, count, problems, said):
     identity = SimpleNamespace(modality="SR")
     other: Any = SimpleNamespace(
         kind=kind, count=count, problems=problems, describe=lambda: "2: CT", key="b", identity=identity, headers=()
@@ -357,7 +458,7 @@ def test_larger_stacks_that_cannot_be_used_are_told(kind, count, problems, said)
     ],
 )
 @pytest.mark.parametrize("wanted", [None, "1"])
-def test_files_that_may_be_harmed_slices_are_told(kind, modality, key, told, wanted):
+def test_series_that_may_be_harmed_slices_of_the_chosen_one_are_warned_of(kind, modality, key, told, wanted):
     """A slice that lost its modality, its UID or its class leaves no hole at the end of a stack."""
     identity = SimpleNamespace(modality=modality)
     other: Any = SimpleNamespace(kind=kind, count=1, problems=[], describe=lambda: "2: x", key=key, identity=identity)
@@ -367,7 +468,7 @@ def test_files_that_may_be_harmed_slices_are_told(kind, modality, key, told, wan
     assert choice.describe_left([chosen, other], choice.Choice(chosen, ""), wanted) == (said if told else [])
 
 
-def test_a_scout_of_the_same_series_that_runs_across_is_not_told():
+def test_localizer_of_the_same_series_that_runs_across_is_not_warned_of():
     def header(row, column):
         return [SimpleNamespace(row_cosines=row, column_cosines=column)]
 
