@@ -381,9 +381,11 @@ def test_pixels_of_a_decoder_are_written_into_the_array_that_was_given():
 
 
 @pytest.mark.parametrize("count", [7, 9], ids=["a byte less", "a byte more"])
-def test_decoder_that_answers_with_another_number_of_bytes_is_given_up(count):
+def test_decoder_that_answers_with_another_number_of_bytes_is_given_up_and_nothing_written(count):
+    out = np.zeros(4, np.uint16)
     with pytest.raises(decoder_pool._WorkerEndedError):
-        ASK(worker_that_answers((READY, 0), (DONE, count)), {}, b"", np.zeros(4, np.uint16), 1.0)
+        ASK(worker_that_answers((READY, 0), (DONE, count)), {}, b"", out, 1.0)
+    assert not out.any()
 
 
 @pytest.mark.parametrize("status", [FAILED, NO_MEMORY], ids=["failed", "no memory"])
