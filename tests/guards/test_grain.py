@@ -12,7 +12,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 94_507,
+    "lines": 94_538,
     "modules": 412,
     "small_modules_with_one_reader": 9,
     "docstrings_with_raises": 136,

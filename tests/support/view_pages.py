@@ -42,6 +42,7 @@ def open_view_page(browser: Any, served: WebServer) -> Iterator[Any]:
     browser.get(served.address)
     wait_for(browser, SETTLED)
     yield browser
+    browser.execute_script("sessionStorage.clear()")  # the next test begins anew
     assert severe_lines(browser) == []
     own = (f"http://127.0.0.1:{served.port}/", f"ws://127.0.0.1:{served.port}/")
     assert [address for address in outside_requests(browser) if not address.startswith(own)] == []

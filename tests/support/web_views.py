@@ -179,14 +179,14 @@ class Client:
 
 
 @contextlib.asynccontextmanager
-async def browsing(server: WebServer) -> AsyncIterator[Client]:
-    """A client that is connected as the page is."""
+async def browsing(server: WebServer, tab: str = "") -> AsyncIterator[Client]:
+    """A client that is connected as the page is, in a tab of the browser."""
     import aiohttp
 
     base = f"http://127.0.0.1:{server.port}"
     secret = server.address.partition("?")[2]
     async with (
         aiohttp.ClientSession() as web,
-        web.ws_connect(f"{base}/socket?{secret}", headers={"Origin": base}) as socket,
+        web.ws_connect(f"{base}/socket?{secret}&tab={tab}", headers={"Origin": base}) as socket,
     ):
         yield Client(socket)

@@ -35,7 +35,7 @@ from clrecon.viewer.model.measures import seen_pieces
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownMesh, ShownObject
 from clrecon.viewer.model.saved_view import restore_view
-from clrecon.viewer.model.state import LEAST_ZOOM, MOST_ZOOM, SCENE, Pick, picture_key
+from clrecon.viewer.model.state import LEAST_ZOOM, MOST_ZOOM, SCENE, Pick, ViewState, picture_key
 from clrecon.viewer.session.commands import check_command
 
 REST_SECONDS = 0.2
@@ -238,6 +238,11 @@ class ViewSession(Closing):
             if bare and self.model.scans:
                 self.set_table(False)
             self.rest()
+
+    def resume(self, state: ViewState) -> None:
+        """Show the state of another session of the same objects."""
+        with self._lock:
+            self.model.show_state(state, "the view before the page was loaded again")
 
     def find_parts(self, then: Callable[[], None] | None = None) -> None:
         """Find the parts of the scans in the background; `then` is called in its thread with the lock held."""

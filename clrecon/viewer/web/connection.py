@@ -29,7 +29,7 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.viewer.drawing.saving import KINDS, free_name
-from clrecon.viewer.model.state import SCENE, SLICES, VIEWS
+from clrecon.viewer.model.state import SCENE, SLICES, VIEWS, ViewState
 from clrecon.viewer.session.commands import page_words
 from clrecon.viewer.session.session import REST_SECONDS
 
@@ -244,6 +244,15 @@ class Connection:
         # Commands wait for the device where they ask what is seen at a pixel: not in the thread of the server.
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="view-commands")
         self._closed = False
+
+    @property
+    def state(self) -> ViewState:
+        return self._session.model.state
+
+    def resume(self, state: ViewState | None) -> None:
+        """Go on with what the browser showed before it loaded the page again; None: it begins."""
+        if state is not None:
+            self._session.resume(state)
 
     async def serve(self) -> None:
         """Serve the browser until it leaves."""

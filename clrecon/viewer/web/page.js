@@ -12,7 +12,9 @@
 
   // The connection: commands as JSON, pictures and facts back.
 
-  const socket = new WebSocket(`ws://${location.host}/socket${location.search}`);
+  const tab = sessionStorage.getItem("clrecon-tab") || crypto.randomUUID();  // a reload goes on with its view
+  sessionStorage.setItem("clrecon-tab", tab);
+  const socket = new WebSocket(`ws://${location.host}/socket${location.search}&tab=${tab}`);
   socket.binaryType = "arraybuffer";
   const tell = (what) => { if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(what)); };
   const run = (name, more) => tell({ do: name, ...more });

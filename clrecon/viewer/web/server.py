@@ -26,6 +26,7 @@ import sys
 import tempfile
 import threading
 import webbrowser
+from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from functools import cache
 from html import escape
@@ -40,6 +41,7 @@ from clrecon.system.arguments import name_parameter
 from clrecon.system.log import get_logger
 from clrecon.system.progress import Progress
 from clrecon.viewer.drawing.saving import check_names
+from clrecon.viewer.model.state import ViewState
 from clrecon.viewer.session.opening import OpenedView, open_view
 from clrecon.viewer.session.session import ViewSession
 from clrecon.viewer.web.connection import Connection, Download, ignore_line
@@ -172,6 +174,9 @@ _SECONDS_TO_END = 0.4
 _MOST_REASON = 120
 """Bytes of the reason for closing a WebSocket."""
 
+_MOST_TAB = 64
+"""Characters of the name that a page gives its tab."""
+
 Handler = Callable[[Any], Awaitable[Any]]
 OpenSession = Callable[[Callable[[], None]], ViewSession]
 
@@ -188,6 +193,7 @@ class WebServer:
         self.port: int = self._listener.getsockname()[1]
         self.address = f"http://{_LOOPBACK}:{self.port}/?secret={self._secret}"
         self._connections: dict[Connection, Any] = {}
+        self._left: OrderedDict[str, ViewState] = OrderedDict()  # what tabs showed that closed, or load again
         self._downloads: Path = Path()
         self._end: Callable[[], object] | None = None
 
@@ -292,6 +298,8 @@ class WebServer:
             connection = Connection(
                 self._open_session, socket, self._downloads, save_as=self._save_as, wrote=self._wrote, quit=self.stop
             )
+            tab = request.query.get("tab", "")[:_MOST_TAB]
+            connection.resume(self._left.get(tab))
         except ClreconError as error:
             await socket.close(code=1011, message=str(error).encode()[:_MOST_REASON])
             return socket
@@ -300,8 +308,17 @@ class WebServer:
             await connection.serve()
         finally:
             self._connections.pop(connection, None)
+            self._keep(tab, connection.state)
             await connection.close()
         return socket
+
+    def _keep(self, tab: str, state: ViewState) -> None:
+        """Keep what a tab showed, and forget the tab that left first of too many."""
+        if tab:
+            self._left[tab] = state
+            self._left.move_to_end(tab)
+        while len(self._left) > MOST_BROWSERS:
+            self._left.popitem(last=False)
 
     async def _send_saved(self, request: web.Request) -> web.StreamResponse:
         from aiohttp import web

@@ -416,3 +416,13 @@ def test_without_the_secret_there_is_no_page(view_browser, view_server) -> None:
     view_browser.get(f"http://127.0.0.1:{view_server.port}/")
     assert "the secret is missing or wrong" in view_browser.find_element("tag name", "body").text
     severe_lines(view_browser)
+
+
+def test_page_that_is_loaded_again_keeps_its_view(page) -> None:
+    page.execute_script("clrecon.run('set_iso', { hu: 250 })")
+    wait_for(page, "return clrecon.facts.iso.hu === 250")
+
+    page.refresh()
+
+    wait_for(page, SETTLED)
+    assert facts(page)["iso"]["hu"] == 250

@@ -379,6 +379,42 @@ def test_a_file_is_fetched_once_with_its_ticket(views: Views, monkeypatch: pytes
     assert len(written) == 2 and not any(path.parent.exists() for path in written)
 
 
+def read_iso_of(served: WebServer, tab: str, change: float | None = None) -> float:
+    """Connect as a tab, change the iso value if asked to, and return it as the tab leaves."""
+
+    async def look() -> float:
+        async with browsing(served, tab) as client:
+            await client.lay_out()
+            await client.until(lambda: client.pictures)
+            if change is not None:
+                await client.tell(do="set_iso", hu=change)
+                await client.until(lambda: client.facts["iso"]["hu"] == change)
+            return float(client.facts["iso"]["hu"])
+
+    return asyncio.run(look())
+
+
+def test_a_tab_that_loads_the_page_again_goes_on_with_its_view(served: WebServer) -> None:
+    read_iso_of(served, "one", change=120.0)
+
+    assert read_iso_of(served, "one") == 120.0
+
+
+@pytest.mark.parametrize("tab", ["other", ""], ids=["another tab", "a page without a tab"])
+def test_another_tab_begins_anew(served: WebServer, tab: str) -> None:
+    read_iso_of(served, "one", change=120.0)
+
+    assert read_iso_of(served, tab) == 200.0
+
+
+def test_views_of_as_many_tabs_are_kept_as_browsers_may_be_open(served: WebServer) -> None:
+    for number in range(server.MOST_BROWSERS + 1):
+        read_iso_of(served, f"tab {number}", change=120.0 + number)
+
+    assert read_iso_of(served, "tab 1") == 121.0
+    assert read_iso_of(served, "tab 0") == 200.0
+
+
 # Ends
 
 
