@@ -99,7 +99,7 @@ def test_report_has_about_the_section_of_an_airway_that_was_cut(open_airway):
     assert 0.5 * TUBE_SECTION_MM2 <= opening_mm2 <= 4.0 * TUBE_SECTION_MM2  # the mouth is a curved surface of cells
 
 
-def test_lungs_that_the_field_of_view_cuts_stay():
+def test_lungs_that_the_field_of_view_cuts_stay_and_the_padding_around_is_left_out():
     hu, _ = make_patient(lungs=True, arms=False)
     circle = X_MM**2 + Y_MM**2 > 95.0**2
     hu[:, circle] = -1000.0  # padding: one value

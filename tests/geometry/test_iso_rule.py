@@ -141,8 +141,9 @@ def test_an_iso_value_that_is_no_number_is_refused(bad):
 
 
 def test_a_volume_whose_steps_float32_cannot_hold_beside_its_size_is_refused():
-    affine = np.diag((1e4, 1e4, 1e-3, 1.0))  # rows of 40 m, slices of a micrometre
-    with refused(UsageError, "float32", 30000):
+    affine = np.diag((1e4, 1e4, 1e-3, 1.0))  # columns 10 m apart, slices a micrometre
+    from_the_centre_mm = 3 * 1e4  # two of five columns, and the layer around
+    with refused(UsageError, "float32", from_the_centre_mm):
         vertex_margin(Volume(np.zeros((3, 4, 5), np.int16), affine), 1)
 
 

@@ -82,14 +82,14 @@ def test_a_screw_whose_tip_lies_in_the_body_does_not_stand_out_in_front(breachin
 def test_a_screw_in_the_middle_of_a_pedicle_has_grade_a_without_a_breach(
     bone_and_frame: tuple[SolidBone, VertebraFrame],
 ) -> None:
-    grade = grade_screw(*bone_and_frame, place_screw(1.0, 0.0, 0.0, 5.0), "L3")
+    grade = grade_screw(*bone_and_frame, place_screw(side=1.0, outward=0.0, up=0.0, diameter=5.0), "L3")
     assert (grade.grade, grade.breach_mm, grade.direction) == ("A", 0.0, None)
     assert set(grade.breaches_mm.values()) == {0.0}
     assert grade.margins_mm["medial"] == pytest.approx(RADIUS - 5.0 / 2, abs=BREACH_MM)
 
 
 def test_a_screw_through_the_canal_has_grade_e(bone_and_frame: tuple[SolidBone, VertebraFrame]) -> None:
-    grade = grade_screw(*bone_and_frame, place_screw(1.0, -12.0, 0.0, 6.0), "L3")
+    grade = grade_screw(*bone_and_frame, place_screw(side=1.0, outward=-12.0, up=0.0, diameter=6.0), "L3")
     assert (grade.grade, grade.direction) == ("E", "medial")
     assert grade.breach_mm > 6.0
 
@@ -98,7 +98,7 @@ def test_a_tip_beyond_the_front_of_the_body_is_measured_and_changes_no_grade(
     bone_and_frame: tuple[SolidBone, VertebraFrame],
 ) -> None:
     """The body ends at y = -15 mm."""
-    grade = grade_screw(*bone_and_frame, place_screw(-1.0, 0.0, 0.0, 5.0, front=-20.0), "L3")
+    grade = grade_screw(*bone_and_frame, place_screw(side=-1.0, outward=0.0, up=0.0, diameter=5.0, front=-20.0), "L3")
     assert grade.grade == "A"
     assert grade.front_mm == pytest.approx(20.0 - BODY_HALF[1], abs=BREACH_MM)
 
@@ -111,7 +111,7 @@ def test_grades_change_at_0_2_4_and_6_mm_of_breach(breach: float, grade: str) ->
     assert grade_breach(breach) == grade
 
 
-SCREW = place_screw(1.0, 0.0, 0.0, 5.0)
+SCREW = place_screw(side=1.0, outward=0.0, up=0.0, diameter=5.0)
 
 
 @pytest.mark.parametrize("up_mm", [0.0, -40.0, 40.0], ids=["in the pedicle", "below", "above"])
@@ -132,8 +132,11 @@ def test_a_screw_beside_the_vertebra_is_refused_with_its_distance(
 
 
 def test_a_screw_whose_tip_lies_behind_the_body_is_refused(bone_and_frame: tuple[SolidBone, VertebraFrame]) -> None:
+    behind_the_body = BODY_HALF[1] + 15.0
     with refused(UsageError, "tip", "behind", "body", "L3"):
-        grade_screw(*bone_and_frame, place_screw(1.0, 0.0, 0.0, 5.0, front=30.0), "L3")
+        grade_screw(
+            *bone_and_frame, place_screw(side=1.0, outward=0.0, up=0.0, diameter=5.0, front=behind_the_body), "L3"
+        )
 
 
 @pytest.mark.parametrize(

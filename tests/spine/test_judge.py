@@ -162,7 +162,8 @@ def test_a_wall_in_front_alone_lies_in_12_of_18_directions(wall: float, beyond: 
 
 
 def test_a_part_of_a_vertebra_without_a_lower_end_is_not_judged_by_lower_disc_height_and_arch() -> None:
-    whole, part = traits_of(WHOLE, (28.0,)), traits_of(replace(WHOLE, lower=None), (28.0,))
+    usual_height_mm = (28.0,)
+    whole, part = traits_of(WHOLE, usual_height_mm), traits_of(replace(WHOLE, lower=None), usual_height_mm)
     assert set(whole) - set(part) == {"lower disc", "height", "arch"}
 
 

@@ -73,7 +73,8 @@ def test_a_wall_of_1_2_mm_is_thin_below_1_5_mm_and_not_below_1_mm(thickness_of_a
 
 def test_an_open_sheet_has_no_wall():
     vertices = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0]])
-    walls = WallFigures.of(cast_walls(vertices, np.array([[0, 1, 2]], np.uint32), 50)[2], 1.0)
+    _, _, thickness = cast_walls(vertices, np.array([[0, 1, 2]], np.uint32), 50)
+    walls = WallFigures.of(thickness, 1.0)
     assert (walls["min_mm"], walls["thin_share"], walls["not_measured"]) == (None, None, 50)
 
 
