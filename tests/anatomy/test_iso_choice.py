@@ -492,7 +492,7 @@ def test_iso_value_is_the_same_with_voxels_of_plus_and_minus_infinity() -> None:
 
 # --- given materials ---
 @pytest.mark.parametrize(("bone", "tissue", "level"), [(1200, 40, 620.0), (0.5, -1000.5, -500.0), (101, 100, 100.5)])
-def test_iso_value_of_given_materials_lies_half_way(bone, tissue, level) -> None:
+def test_iso_value_of_given_materials_lies_half_way_and_the_reason_names_both(bone, tissue, level) -> None:
     chosen = half_iso_value(bone, tissue)
     assert (chosen.iso_value, chosen.bone_hu, chosen.tissue_hu, chosen.method) == (level, bone, tissue, "half")
     assert chosen.reason == f"half way between tissue {tissue:g} and bone {bone:g} HU, as given"

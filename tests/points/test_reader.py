@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tolerances
 from refusals import assert_one_line, refused
 from sample_meshes import LongTable
 
@@ -180,7 +181,8 @@ def cloud_of_a_surface(tmp_path):
 def test_a_surface_of_vtp_is_read_as_its_vertices_with_their_normals(cloud_of_a_surface):
     ball, cloud = cloud_of_a_surface
     assert len(cloud) == ball.n_points
-    assert cloud.normals is not None
+    np.testing.assert_array_equal(cloud.points, ball.points)
+    np.testing.assert_allclose(cloud.normals, ball.point_data["Normals"], atol=tolerances.MESH_UNIT_NORMAL)
 
 
 def test_faces_of_a_vtp_that_are_left_out_are_warned_of_with_the_mode_that_draws_them(cloud_of_a_surface):
