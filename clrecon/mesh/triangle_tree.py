@@ -54,7 +54,7 @@ class TriangleTree:
             np.nextafter(np.minimum(np.minimum(a, b), c), -np.inf, out=lows[axis], dtype=np.float32)
             np.nextafter(np.maximum(np.maximum(a, b), c), np.inf, out=highs[axis], dtype=np.float32)
         self._slack = 2.0 * float(np.spacing(np.abs(lows).max() + np.abs(highs).max()))
-        self._curve = _Curve(lows + highs)
+        self._curve = Curve(lows + highs)
         codes = self._curve.codes(lows + highs)
         order = np.argsort(codes, kind="stable")
         order = np.concatenate([order, np.full(-len(order) % _LEAF, order[-1])])
@@ -183,7 +183,7 @@ class TriangleTree:
         return items, nodes, bounds
 
 
-class _Curve:
+class Curve:
     """A Morton curve through the box around points (3, k)."""
 
     def __init__(self, columns: NDArray[np.floating]):

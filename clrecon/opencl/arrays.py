@@ -248,13 +248,16 @@ def allocate(device: Device, size: int) -> Any:
     return _make_buffer(device, cl.mem_flags.READ_WRITE, max(size, 4))
 
 
-def upload(device: Device, array: NDArray[Any]) -> Any:
-    """Return a read-only buffer with the contents of `array`, which must not change while the buffer is used."""
+def upload(device: Device, array: NDArray[Any], *, writable: bool = False) -> Any:
+    """Return a buffer with the contents of `array`, which must not change while the buffer is used.
+
+    Kernels may write to a `writable` buffer alone; the array does not get what they write.
+    """
     cl = import_pyopencl()
     array = np.ascontiguousarray(array)
-    flags = cl.mem_flags.READ_ONLY
+    flags = cl.mem_flags.READ_WRITE if writable else cl.mem_flags.READ_ONLY
     # float4 and similar types need an alignment that numpy does not guarantee: small tables are copied.
-    if array.nbytes >= LEAST_BYTES and _shares_memory(device, array):
+    if array.nbytes >= LEAST_BYTES and not writable and _shares_memory(device, array):
         return _make_buffer(device, flags | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
     if device.shares_host_memory or device.is_simulator:
         return _make_buffer(device, flags | cl.mem_flags.COPY_HOST_PTR, array.nbytes, array)

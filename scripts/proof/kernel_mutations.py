@@ -24,6 +24,7 @@ EQUIVALENT = {
     ("scan_block_sums", "items beyond 500"): ONE_GROUP,
     ("total_counts", "every 7th item"): ONE_ITEM,
     ("total_counts", "items beyond 500"): ONE_ITEM,
+    ("find_first_edges", "inverted dirty"): "vertices beside which nothing has changed are looked at again",
 }
 """Mutations that change nothing, with the reason."""
 
@@ -151,13 +152,35 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "normals": (("normals[vertex] = (float4)(normal", "normals[vertex] = (float4)(-normal"),),
     },
     "filter_bends": {"sums": (("* sum)) - sums[vertex];", "* sum)) + sums[vertex];"),)},
-    "find_near_faces": {
-        "squares": (("squares[number] = least;", "squares[number] = -least;"),),
-        "rows": (("rows[number] = nearest;", "rows[number] = ~nearest;"),),
+    "sum_quadrics": {
+        "quadrics": (
+            ("store_quadric(quadrics, vertex, sum);", "sum.mixed = -sum.mixed; store_quadric(quadrics, vertex, sum);"),
+        )
     },
-    "find_witnesses": {
-        "witnesses": (("witnesses[number] = row.x;", "witnesses[number] = ~row.x;"),),
-        "left": (("left[number] = (uchar)undecided;", "left[number] = (uchar)~undecided;"),),
+    "rank_edges": {"octaves": (("octaves[edge] = octave;", "octaves[edge] = (uchar)~octave;"),)},
+    "hang_points": {
+        "points": (("(float4)(start.xyz, as_float(head))", "(float4)(-start.xyz, as_float(head))"),),
+        "heads": (("heads[face] = count + face;", "heads[face] = LAST_POINT;"),),
+    },
+    "find_first_edges": {
+        "firsts": (("firsts[vertex] = first;", "firsts[vertex] = NONE;"),),
+        "dirty": (("dirty[vertex] = 0;", "dirty[vertex] = 1;"),),
+    },
+    "select_edges": {"chosen": (("= edge;\n}", "= opposite[edge];\n}"),)},
+    "collapse_edges": {
+        "places": (("places[u] = (float4)(place, 0.0f);", "places[u] = (float4)(-place, 0.0f);"),),
+        "into": (("(uint4)(u, round, entry, own.size)", "(uint4)(w, round, entry, own.size)"),),
+        "octaves": (("octaves[number] = octave_of(", "octaves[number] = (uchar)~octave_of("),),
+        "earlier": (("earlier[w] = places[u];", "earlier[w] = -places[u];"),),
+        "neighbours": (("neighbours[entry + i] = own.vertices[i];", "neighbours[entry + i] = u;"),),
+        "homes": (("homes[u] = home;", "homes[u] = count - 1u - home;"),),
+    },
+    "frame_faces": {"frames": (("(float4)(one, 0.0f)", "(float4)(-one, 0.0f)"),)},
+    "gather_stars": {"stars": (("star[0] = p.x;", "star[0] = -p.x;"),)},
+    "find_near_faces": {"witnesses": (("(int4)(SEVERAL) : used", "(int4)(SEVERAL) : ~used"),)},
+    "pair_faces": {
+        "faces_at": (("faces_at[one] = (int)face;", "faces_at[one] = (int)(faces - 1u - face);"),),
+        "below": (("below[face] = one;", "below[face] = NO_FACE;"),),
     },
     "sample_profiles": {"profiles": (("? under + fk * (over - under) : NAN", "? -under - fk * (over - under) : NAN"),)},
     "fit_profiles": {"fits": (("store_lanes(now.x0, fit);", "store_lanes(-now.x0, fit);"),)},

@@ -12,9 +12,9 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 94_538,
+    "lines": 93_827,
     "modules": 412,
-    "small_modules_with_one_reader": 9,
+    "small_modules_with_one_reader": 8,
     "docstrings_with_raises": 136,
     "options_in_several_files": 8,
     "modules_with_own_all": 0,
@@ -23,7 +23,7 @@ CEILINGS = {
 
 HABITS = {
     "functions_with_pronouns": 29,
-    "functions_without_object": 46,
+    "functions_without_object": 45,
     "assignments_of_three": 19,
     "nested_conditionals": 0,
     "comprehensions_of_two_loops": 23,

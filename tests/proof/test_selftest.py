@@ -36,8 +36,8 @@ OF_ONE_GROUP = frozenset({"scan_block_sums", "total_counts"})
 ASKED_BY_OPERATORS = frozenset({
     "exclusive_scan", "compact", "radix_sort", "label_components", "bricks", "extract_isosurface", "types of voxels",
     "uneven slices", "ranges", "below a level", "trilinear topology", "triangles that cut each other", "extract_labels",
-    "survey of labels", "extract_label_masks", "volumes of masks", "distances to a surface",
-    "witnesses of triangles near a surface", "leaps of rays", "entries of tiles", "volume rendering",
+    "survey of labels", "extract_label_masks", "volumes of masks", "collapses of edges", "the first round of collapses",
+    "triangles near a surface", "leaps of rays", "entries of tiles", "volume rendering",
     "gradient opacity", "steep transfer functions", "volume rendering of uneven slices", "labels in volume rendering",
     "projections", "radiographs", "projections of uneven slices", "surfaces without a mesh",
     "surfaces of uneven slices", "labels on surfaces", "slices in space", "points as discs",
@@ -52,7 +52,7 @@ ASKED_BY_OPERATORS = frozenset({
 device, for a release on all.  They too are for a release: a driver takes minutes to build what they need, and their
 twins are slow."""
 
-EVERY_DAY = frozenset({"exclusive_scan", "distances to a surface", "radiographs", "slices"})
+EVERY_DAY = frozenset({"exclusive_scan", "triangles near a surface", "radiographs", "slices"})
 """Those of them that run every day on further devices: of each room one that is built in seconds.  Surfaces, points and
 masks are made by what no operator's test asks: golden sections, links of free points, logic of masks."""
 

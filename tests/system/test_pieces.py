@@ -7,6 +7,7 @@ import threading
 import numpy as np
 import pytest
 
+from clrecon.system import pieces
 from clrecon.system.pieces import list_distinct, side_by_side
 
 pytestmark = pytest.mark.unit
@@ -43,3 +44,32 @@ def test_distinct_numbers_of_an_array_are_listed_once_in_rising_order_with_its_t
     found = list_distinct(np.array(numbers, dtype=np.int32))
     assert found.dtype == np.int32
     assert found.tolist() == distinct
+
+
+with_one_and_three_threads = pytest.mark.parametrize("threads", [1, 3])
+
+
+@with_one_and_three_threads
+@pytest.mark.parametrize("count", [1000, 0])
+def test_work_in_threads_covers_each_row_once(monkeypatch, threads, count):
+    monkeypatch.setattr(pieces, "count_readers", lambda *_: threads)
+    calls_of_row = np.zeros(1000, dtype=int)
+
+    def count_call(rows: slice) -> None:
+        calls_of_row[rows] += 1
+
+    pieces.in_threads(count_call, count, 64)
+    assert (calls_of_row[:count] == 1).all()
+    assert (calls_of_row[count:] == 0).all()
+
+
+@with_one_and_three_threads
+def test_an_error_in_one_piece_is_raised_by_the_whole(monkeypatch, threads):
+    monkeypatch.setattr(pieces, "count_readers", lambda *_: threads)
+
+    def fail_late(rows: slice) -> None:
+        if rows.start > 500:
+            raise ValueError("this piece")
+
+    with pytest.raises(ValueError, match="this piece"):
+        pieces.in_threads(fail_late, 1000, 64)

@@ -154,7 +154,7 @@ def _try_steps(device: Device, settings: MeshSettings) -> None:
             label_components(device.current, meshes[0].triangles, meshes[0].vertex_count)
     if meshes and settings.surface == "cortex":
         _try_cortex(device, meshes[0])
-    if meshes and settings.decimate_used is not None and settings.method != "g-mc" and settings.memory is None:
+    if meshes and settings.decimate_used is not None and settings.method != "g-mc":
         from clrecon.operators.surface.decimation import decimate_mesh
 
         decimate_mesh(meshes[0], settings.decimate_used, device=device)

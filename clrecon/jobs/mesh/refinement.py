@@ -29,7 +29,7 @@ _SHIFT_SHARE, _FEWEST_TOLD = 0.1, 0.5
 
 
 def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress: Progress = ignore_progress) -> Mesh:
-    """Smooth and decimate as asked, on the device unless its memory is limited; else return the mesh itself."""
+    """Smooth and decimate as asked; else return the mesh itself.  Where memory is limited, the host smooths."""
     if not settings.refines:
         return mesh
     from clrecon.mesh.compare.distances import compare_meshes
@@ -38,14 +38,15 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress:
     from clrecon.operators.surface.decimation import decimate_mesh
     from clrecon.operators.surface.smoothing import smooth_mesh
 
-    raw, mesh_device = mesh, device if settings.memory is None else None
+    raw, bound = mesh, settings.max_deviation_mm
     if settings.smooth is not None:
-        mesh = smooth_mesh(mesh, settings.smooth, settings.max_deviation_mm, device=mesh_device, progress=progress)
+        smoother = device if settings.memory is None else None
+        mesh = smooth_mesh(mesh, settings.smooth, bound, device=smoother, progress=progress)
     share = settings.decimate_used
     if share is not None and settings.method == "g-mc":
         mesh = collapse_quadric(mesh, share, progress=progress)
     elif share is not None:
-        mesh = decimate_mesh(mesh, share, settings.max_deviation_mm, device=mesh_device, progress=progress)
+        mesh = decimate_mesh(mesh, share, bound, device=device, memory=settings.memory, progress=progress)
     mesh.report["refinement"] |= {
         "deviation": compare_meshes(mesh, raw, progress=progress),
         "voxel_mm": default_deviation(raw) / BOUND_VOXEL,

@@ -1,10 +1,8 @@
-"""Exact distances from points of one surface to the triangles of another, to those near a vertex or single ones with
-their upper bounds, and between the walls of a closed surface.
+"""Exact distances from points of one surface to the triangles of another, or to those near a vertex, and between the
+walls of a closed surface.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -218,120 +216,26 @@ class WallFigures(Record):
 _PIECE = 1 << 13
 """Points in a piece: with six triangles each they take about 8 MB."""
 
-_PIECE_OF_BOUNDS = 1 << 11
-"""Points in a piece for upper bounds, which take 2 MB with six triangles each."""
-
 IntArray = NDArray[np.integer]
 Columns = NDArray[np.float64]
 """Shape (3, k): one row each for x, y, z."""
 
 
 class NearDistance:
-    """Distances from points to a surface, where a vertex of the surface near each point is known.
+    """Distances from points to the triangles around vertices near each: never less than that to the surface."""
 
-    If a triangle around that vertex is near enough, its distance is returned; it is never less than the distance to the
-    surface.  For the other points all triangles are searched, and the result is exact.
-    """
-
-    def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans | None = None):
-        self._vertices, self._triangles = vertices, triangles
-        self._fans = fans or Fans(triangles, len(vertices))
-        self._exact: SurfaceDistance | None = None
-        self._all_columns: Columns | None = None
-        self._frames: FaceFrames | None = None
-
-    def __call__(self, points: Points, near: NDArray[np.integer], limit: float) -> NDArray[np.float64]:
-        """Return distances in mm, shape (k,), from points (k, 3) with a vertex near each, shape (k,).
-
-        Up to `limit` mm they may be too large, as only nearby triangles are examined.
-        """
-        lengths, _ = self.find_within(points, near, limit)
-        rest = np.flatnonzero(~(lengths <= limit))
-        if len(rest):
-            self._exact = self._exact or SurfaceDistance(self._vertices, self._triangles)
-            lengths[rest] = self._exact(points[rest])
-        return lengths
-
-    def find_within(
-        self, points: Points, near: NDArray[np.integer], limit: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return distances to the triangles around one vertex only, and their rows; up to `limit` as `__call__`."""
-        lengths, rows = self._around(points, near, _perpendicular)
-        rest = np.flatnonzero(~(lengths <= limit))
-        if len(rest):
-            lengths[rest], rows[rest] = self._around(points[rest], near[rest], triangle_distances)
-        return lengths, rows
-
-    def find_surely_within(
-        self, points: Points, near: NDArray[np.integer], limit: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """As `find_within`, but by upper bounds first: up to `limit` distances may be too large and rows others."""
-        lengths, rows = self.find_upper_bounds(points, near)
-        rest = np.flatnonzero(~(lengths <= limit))
-        if len(rest):
-            lengths[rest], rows[rest] = self._around(points[rest], near[rest], triangle_distances)
-        return lengths, rows
-
-    def find_upper_bounds(
-        self, points: Points, near: NDArray[np.integer]
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return upper bounds of the distances to the triangles around one vertex, and the rows of these."""
-        lengths, rows = np.full(len(points), np.inf), np.full(len(points), -1)
-        self.prepare()
-
-        def bound_piece(piece: slice) -> None:
-            lengths[piece], rows[piece] = self.upper_bounds(points[piece].T.astype(np.float32), near[piece])
-
-        in_threads(bound_piece, len(points), _PIECE_OF_BOUNDS)
-        return lengths, rows
-
-    def upper_bounds(
-        self, columns: NDArray[np.float32], near: NDArray[np.integer]
-    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """As `find_upper_bounds`, for one piece: points in columns, shape (3, k), float32."""
-        pair, row, start, some = self._pairs(near)
-        square = self.frames.squares(columns.take(pair, axis=1, mode="clip"), row)
-        least = np.full(len(some), np.inf, dtype=np.float32)
-        rows = np.full(len(some), -1)
-        if some.any():
-            least[some] = np.minimum.reduceat(square, start[some])
-        best = np.flatnonzero(square == least[pair])[::-1]  # backwards: the first of equals wins
-        rows[pair[best]] = row[best]
-        np.sqrt(least, out=least)
-        least += np.float32(self.slack)
-        return least, rows
-
-    @property
-    def slack(self) -> float:
-        """mm by which rounding may make the root of a square too short for an upper bound."""
-        return self.frames.slack
-
-    def prepare(self) -> None:
-        """Make what upper bounds need, before threads use it."""
-        assert self.frames is not None and len(self._columns) == 3
-
-    @property
-    def frames(self) -> FaceFrames:
-        """Frames of the triangles, made when they are first asked for."""
-        if self._frames is None:
-            self._frames = FaceFrames(self._vertices, self._triangles)
-        return self._frames
+    def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
+        self._triangles, self._fans = triangles, Fans(triangles, len(vertices))
+        self._columns: Columns = np.ascontiguousarray(vertices.T, dtype=np.float64)
 
     def find_around(self, points: Points, near: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return distances to the triangles around several vertices of each point, (k, v), and their rows."""
-        lengths, rows = self._around(points, near[:, 0], triangle_distances)
+        lengths, rows = self._around(points, near[:, 0])
         for others in near.T[1:]:
-            length, row = self._around(points, others, triangle_distances)
+            length, row = self._around(points, others)
             rows = np.where(length < lengths, row, rows)
             lengths = np.minimum(lengths, length)
         return lengths, rows
-
-    @property
-    def _columns(self) -> Columns:
-        """Vertices in columns, made when they are first asked for."""
-        if self._all_columns is None:
-            self._all_columns = np.ascontiguousarray(self._vertices.T, dtype=np.float64)
-        return self._all_columns
 
     def _corners(self, rows: NDArray[np.integer]) -> tuple[Columns, Columns, Columns]:
         a, b, c = self._triangles[rows].T.astype(np.intp)
@@ -339,29 +243,22 @@ class NearDistance:
         first, second, third = (self._columns.take(corner, axis=1, mode="clip") for corner in (a, b, c))
         return first, second, third
 
-    def _around(
-        self, points: Points, near: NDArray[np.integer], measure: Callable[..., NDArray[np.float64]]
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the smallest value of a measure among the triangles around the vertices, and the rows of these."""
+    def _around(self, points: Points, near: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the least distance to the triangles around one vertex of each point, and their rows."""
         lengths, rows = np.full(len(points), np.inf), np.full(len(points), -1)
-        assert len(self._columns) == 3  # before threads use them
 
         def measure_piece(piece: slice) -> None:
-            pair, row, start, some = self._pairs(near[piece])
+            row, count = self._fans.around(near[piece])
+            pair, some = np.repeat(np.arange(len(count)), count), count > 0
             columns = np.ascontiguousarray(points[piece].T)
-            length = measure(columns.take(pair, axis=1, mode="clip"), *self._corners(row))
+            length = triangle_distances(columns.take(pair, axis=1, mode="clip"), *self._corners(row))
             if some.any():
-                lengths[piece][some] = np.minimum.reduceat(length, start[some])
+                lengths[piece][some] = np.minimum.reduceat(length, (np.cumsum(count) - count)[some])
                 shortest = np.flatnonzero(length == lengths[piece][pair])[::-1]  # backwards: the first of equals wins
                 rows[piece][pair[shortest]] = row[shortest]
 
         in_threads(measure_piece, len(points), _PIECE)
         return lengths, rows
-
-    def _pairs(self, near: NDArray[np.integer]) -> tuple[IntArray, IntArray, IntArray, NDArray[np.bool_]]:
-        """List pairs of a place in `near` and a triangle around it; where each vertex's pairs begin, if it has any."""
-        row, count = self._fans.around(near)
-        return np.repeat(np.arange(len(count)), count), row, np.cumsum(count) - count, count > 0
 
 
 def _perpendicular(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
@@ -401,45 +298,3 @@ _ROUNDINGS = 16.0
 def rounding_of_bounds(largest: float) -> float:
     """Return by how many mm a distance in float32 may be too short, from the largest coordinate in mm."""
     return _ROUNDINGS * float(np.spacing(np.float32(largest)))
-
-
-class FaceFrames:
-    """A frame in each triangle near zero: a corner, two edges, and what gives the coordinates along them."""
-
-    def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
-        columns = np.ascontiguousarray(vertices.T, dtype=np.float64)
-        corner, to_b, to_c = (columns.take(index, axis=1) for index in triangles.T.astype(np.intp))
-        to_b -= corner
-        to_c -= corner
-        cross = cross_product(to_b, to_c)
-        square = np.einsum("ij,ij->j", cross, cross)
-        inverse = np.divide(1.0, square, out=np.zeros_like(square), where=square > 0.0)
-        along = (cross_product(to_c, cross) * inverse, cross_product(cross, to_b) * inverse)
-        # One row a triangle, 16 numbers: they lie side by side, and a look-up costs one access to memory.
-        self._rows = np.zeros((len(triangles), 16), dtype=np.float32)
-        for column, part in enumerate((corner, *along, to_b, to_c)):
-            self._rows[:, 3 * column : 3 * column + 3] = part.T
-        self.slack = rounding_of_bounds(float(np.abs(columns).max(initial=0.0)))
-
-    def squares(self, points: NDArray[np.float32], rows: NDArray[np.integer]) -> NDArray[np.float32]:
-        """Return squares of upper bounds, but for `slack` mm by rounding, of distances (k,) to triangles."""
-        frames = np.ascontiguousarray(self._rows.take(rows, axis=0, mode="clip").T)
-        away = points - frames[0:3]
-        u = away[0] * frames[3]
-        v = away[0] * frames[6]
-        for axis in (1, 2):
-            u += away[axis] * frames[3 + axis]
-            v += away[axis] * frames[6 + axis]
-        # Whatever u and v are by now, the point with these shares of the edges lies in the triangle.
-        np.maximum(u, 0.0, out=u)
-        np.maximum(v, 0.0, out=v)
-        both = u + v
-        np.maximum(both, 1.0, out=both)
-        u /= both
-        v /= both
-        away -= u * frames[9:12]
-        away -= v * frames[12:15]
-        away *= away
-        squared: NDArray[np.float32] = away[0] + away[1]
-        squared += away[2]
-        return squared

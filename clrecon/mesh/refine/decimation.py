@@ -1,65 +1,38 @@
-"""Decimation by fast-simplification within a bound in mm: what violates bound or topology is undone."""
+"""Decimation within a bound in mm: edges collapse in rounds, and what the result shows to be at fault is undone."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.exchange.coordinates import as_stored, rounding_step
+from clrecon.exchange.coordinates import as_stored, find_coincident, rounding_step
+from clrecon.mesh.compare.distances import rounding_of_bounds
+from clrecon.mesh.connectivity import find_edges, find_used, label_components, number_used, order_by_number
 from clrecon.mesh.intersections import FindCrossings, find_self_intersections
 from clrecon.mesh.mesh import Mesh
-from clrecon.mesh.refine.clusters import Clusters
-from clrecon.mesh.refine.deviation import Deviation, MakeBounds, SurfaceBounds
-from clrecon.mesh.refine.shifts import Volumes, measure_volumes, move_vertices, restore_volumes
-from clrecon.mesh.triangles import vertex_normals
+from clrecon.mesh.refine.collapse import FAR, SEVERAL, Collapser, Surface, collapse_in_rounds
+from clrecon.mesh.refine.topology import TopologyChange, any_corner, compare_topology, measure_topology
+from clrecon.mesh.triangle_tree import Curve
+from clrecon.mesh.triangles import cross_products, vertex_normals
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress
 
 BOUND_VOXEL = 0.25
 """Default bound in shortest voxel steps; a mean of 0.1 voxel is then kept too."""
 
-_AGGRESSIVENESS = 3.0
-"""How fast fast-simplification lets its error grow.  With the bound, 2 to 7 give the same surface, and 3 is fastest."""
-
-_FIRST_AGGRESSIVENESS = 4.0
-"""The same for the first round, with half the iterations of `_AGGRESSIVENESS` up to a tenth of the triangles."""
-
-_LAST_ITERATION = 99
-_FIRST_ERROR = 20.0
-"""Largest quadric error of the first round, in squares of the bound.  The error sums the squared distances to dozens of
-planes that meet in a vertex.  With 3800 twice as much has to be undone, and 2 to 3 % more triangles are left."""
-
-_FIRST_SHARE = 0.1
-"""Least share of the triangles that the first round leaves: with less of a head, 2 % more were left in the end."""
-
-_ERROR = 4.0
-"""The same for later rounds, which start from a surface that is nearly as it can be.  With 2 or 16 more is left."""
-
-_ROUGH_TURNS = 3
-"""Repairs after the first round: faults and vertices only, as the next round changes nearly all of the surface."""
-
-_TRIES = 200
-"""Most attempts to repair a round; each undoes some collapses, and CT needs 30 to 50."""
-
-_ROUNDS = 12
-_LEAST_GAIN = 0.15
-"""Rounds of collapses continue while each removes more than this share of the triangles.  Where less than it would do,
-there is one more: it costs little, as little changes."""
-
 _SHARE_SLACK = 0.005
 """The wanted number of triangles counts as reached when it is exceeded by this share or less."""
 
-_MOVES = 3
-"""Most attempts to restore volumes beside vertices that cannot move as far."""
+_SHARE_OF_BOUND = 0.93
+"""Of the bound within which points are kept while edges collapse: between them it may be a little more."""
 
-_SHARE_FOR_VOLUME = 0.1
-"""Share of the bound that is kept for the shift that restores the volume of components."""
+IntArray = NDArray[np.integer]
+MakeCollapser = Callable[[Surface, float], Collapser]
 
 
 def default_deviation(mesh: Mesh) -> float:
@@ -103,21 +76,17 @@ def decimate_mesh(
     max_deviation_mm: float | None = None,
     *,
     progress: Progress | None = None,
-    make_bounds: MakeBounds = SurfaceBounds,
+    make_collapser: MakeCollapser,
     find_crossings: FindCrossings = find_self_intersections,
 ) -> Mesh:
     """Remove triangles within a bound, see `clrecon.operators.surface.decimation.decimate_mesh`.
 
-    make_bounds, find_crossings: `SurfaceBounds` and `find_self_intersections`, or what does the same elsewhere.
+    make_collapser: Makes a `Collapser` from a surface and the square of a distance, mm2.
+    find_crossings: `find_self_intersections`, or what finds the same elsewhere.
     """
     check_share(fraction)
     bound = check_refinement(mesh, max_deviation_mm)
-    origin = local_origin(mesh.vertices)
-    clusters = Clusters(mesh.vertices - origin, mesh.triangles, origin, find_crossings)
-    # Both surfaces are stored rounded, each coordinate by at most half a step.
-    longest = max(_SHARE_FOR_VOLUME * bound - rounding_step(mesh.vertices), 0.0)
-    deviation_bound = (1.0 - _SHARE_FOR_VOLUME) * bound
-    deviation = Deviation(mesh.vertices - origin, mesh.triangles, deviation_bound, make_bounds, clusters.fans)
+    decimation = _Decimation(mesh, bound, make_collapser, find_crossings)
     wanted = (1.0 - fraction) * mesh.triangle_count
 
     def tell_left(left: int) -> None:
@@ -125,8 +94,9 @@ def decimate_mesh(
             to_go = math.ceil(mesh.triangle_count - wanted)
             progress("decimate", min(mesh.triangle_count - left, to_go), to_go)
 
-    rounds, taken_back = _collapse_in_rounds(clusters, deviation, wanted, bound, tell_left)
-    vertices, triangles, undone = _with_volumes(clusters, deviation, mesh, origin, longest, find_crossings)
+    rounds = decimation.collapse(wanted, tell_left)
+    taken_back = decimation.mend()
+    vertices, triangles, topology = decimation.finish()
     facts = {
         "fraction": fraction,
         "reached": 1.0 - len(triangles) / mesh.triangle_count,
@@ -134,8 +104,8 @@ def decimate_mesh(
         "rounds": rounds,
         "max_deviation_mm": bound,
         "triangles_before": mesh.triangle_count,
-        "vertices_taken_back": taken_back + undone,
-        "topology": clusters.compare_topology(),
+        "vertices_taken_back": taken_back,
+        "topology": topology,
     }
     return Mesh(vertices, triangles, vertex_normals(vertices, triangles), carry_on(mesh, "decimate", facts))
 
@@ -144,135 +114,128 @@ def _nearly(wanted: float) -> float:
     return wanted * (1.0 + _SHARE_SLACK) + 2
 
 
-def _collapse_in_rounds(
-    clusters: Clusters, deviation: Deviation, wanted: float, bound: float, tell: Callable[[int], None]
-) -> tuple[int, int]:
-    """Collapse and repair until few triangles are left, or hardly any more go; return rounds and undone collapses."""
-    left, is_last = len(clusters.faces()), False
-    rounds, taken_back = 0, 0
-    while left > _nearly(wanted) and rounds < _ROUNDS:
-        tell(left)
-        if rounds == 0:
-            share = max(wanted / left, _FIRST_SHARE)
-            _collapse(clusters, share, bound, _FIRST_ERROR, _FIRST_AGGRESSIVENESS)
-            collapsed = clusters.collapsed_count
-            # the rest of the faults is left to the next round
-            for _ in range(_ROUGH_TURNS):
-                clusters.undo(clusters.find_faults())
-                if not clusters.undo(clusters.find_left_behind(deviation)):
-                    break
-            taken_back += collapsed - clusters.collapsed_count
-            left, rounds = len(clusters.faces()), 1
-        if left > wanted:
-            _collapse(clusters, wanted / left, bound)
-            rounds += 1
-        collapsed, before = clusters.collapsed_count, left
-        _mend(clusters, deviation, partial(tell, left))
-        taken_back += collapsed - clusters.collapsed_count
-        left = len(clusters.faces())
-        is_near = wanted >= (1.0 - _LEAST_GAIN) * left
-        if left > (1.0 - _LEAST_GAIN) * before and (is_last or not is_near):
-            break
-        is_last = is_near
-    tell(left)
-    return rounds, taken_back
+def _sort_along_curve(mesh: Mesh) -> tuple[Mesh, IntArray, IntArray]:
+    """Return a mesh whose neighbours are near in memory too, and the vertices and triangles from which its own come."""
+    columns = mesh.vertices.T
+    order = np.argsort(Curve(columns).codes(columns), kind="stable")
+    number = np.empty(len(order), np.uint32)
+    number[order] = np.arange(len(order), dtype=np.uint32)
+    triangles = number[mesh.triangles]
+    order_of_faces = order_by_number(triangles.min(axis=1), len(order))
+    return Mesh(mesh.vertices[order], triangles[order_of_faces], None, {}, trusted=True), order, order_of_faces
 
 
-def _with_volumes(
-    clusters: Clusters,
-    deviation: Deviation,
-    mesh: Mesh,
-    origin: NDArray[np.float64],
-    longest: float,
-    find_crossings: FindCrossings,
-) -> tuple[NDArray[np.floating], NDArray[np.uint32], int]:
-    """Return the surface with its components' volumes, and the collapses undone where that moves over `longest`."""
-    count, labels, border = clusters.components()
-    wanted = measure_volumes(mesh.vertices - origin, mesh.triangles, count, labels, border)
-    collapsed, steps = clusters.collapsed_count, np.zeros((mesh.vertex_count, 3))
-    fresh = np.zeros(count, dtype=bool)
-    for _ in range(_TRIES):
-        standing, triangles = clusters.take_changed()
-        fresh[labels[standing]] = True
-        places, step = clusters.places[standing], np.zeros((len(standing), 3))
-        restore_volumes(places, step, triangles, labels[standing], wanted, longest)
-        steps[standing] = step
-        now = measure_volumes(places + step, triangles, count, labels[standing], border[standing])
-        if not clusters.undo(standing[wanted.differ(now)[labels[standing]]]):
-            vertices, triangles, stuck, spoilt = _move(clusters, wanted, origin, longest, steps, fresh, find_crossings)
-            fresh[:] = False
-            fresh[labels[spoilt]] = True
-            if not clusters.undo(stuck) and not clusters.undo(spoilt):
-                break
-        _mend(clusters, deviation)
-    return vertices, triangles, collapsed - clusters.collapsed_count
+class _Decimation:
+    """A mesh whose edges collapse, and come back where the result would be at fault."""
 
+    def __init__(self, mesh: Mesh, bound: float, make_collapser: MakeCollapser, find_crossings: FindCrossings):
+        self._find_crossings = find_crossings
+        mesh, self._order, self._order_of_faces = _sort_along_curve(mesh)
+        self._mesh = mesh
+        self._origin = local_origin(mesh.vertices)
+        places = (mesh.vertices - self._origin).astype(np.float32)
+        self._edges = find_edges(mesh.triangles, len(places))
+        self._given = Surface.of(places, mesh.triangles, self._edges)
+        # Both surfaces are stored rounded, each coordinate by at most half a step, and distances are in float32.
+        slack = 2.0 * rounding_step(mesh.vertices) + rounding_of_bounds(float(np.abs(places).max()))
+        self._limit = max(bound - slack, 0.0) ** 2
+        self._collapser = make_collapser(self._given, _SHARE_OF_BOUND**2 * self._limit)
 
-def _move(
-    clusters: Clusters,
-    wanted: Volumes,
-    origin: NDArray[np.float64],
-    longest: float,
-    steps: NDArray[np.float64],
-    fresh: NDArray[np.bool_],
-    find_crossings: FindCrossings,
-) -> tuple[NDArray[np.floating], NDArray[np.uint32], NDArray[np.integer], NDArray[np.integer]]:
-    """Move the surface by the steps; what one of a component is held back by, the others make up for.
+    def collapse(self, wanted: float, tell: Callable[[int], None]) -> int:
+        """Collapse edges; return the number of rounds."""
+        rounds = collapse_in_rounds(self._collapser, self._mesh.triangle_count, wanted, tell)
+        self._history, self._pairing = self._collapser.finish()
+        return rounds
 
-    steps: Of each vertex of the given surface, mm; changed in place to those that were made, but where volume is lost.
-    fresh: Components whose steps have not been made.
-    Returns the surface; of components that have still lost their volume so the vertices held back, and all.
-    """
-    standing, triangles = clusters.numbered()
-    count, labels, border = clusters.components()
-    labels, places = labels[standing], clusters.places[standing]
-    step = steps[standing]
-    stuck, look_at = np.zeros(len(standing), dtype=bool), fresh[labels[triangles[:, 0]]]
-    for _ in range(_MOVES):
-        vertices = move_vertices(as_stored(places + origin), triangles, step, find_crossings, look_at=look_at)[0]
-        moved = vertices - origin - places
-        stuck |= np.abs(moved - step).max(axis=1) > rounding_step(vertices)
-        now = measure_volumes(places + moved, triangles, count, labels, border[standing])
-        spoilt = wanted.differ(now) & (np.bincount(labels[stuck], minlength=count) > 0)
-        if not spoilt.any():
-            break
-        step, look_at = moved, spoilt[labels[triangles[:, 0]]]
-        restore_volumes(places, step, triangles[look_at], labels, wanted, longest, stuck | ~spoilt[labels])
-    is_sound = ~spoilt[labels]
-    steps[standing[is_sound]] = moved[is_sound]
-    return vertices, triangles, standing[~is_sound & stuck], standing[~is_sound]
+    def mend(self) -> int:
+        """Undo collapses until no fault is left; return their number."""
+        before = self._history.count
+        self._witnesses = np.full((self._mesh.triangle_count, 4), SEVERAL, np.int32)
+        self._is_new = np.ones(self._mesh.vertex_count, dtype=bool)
+        while True:
+            self._name()
+            collapses = self._latest_of([*self._find_far(), *self._find_unsound()])
+            if len(collapses) == 0:
+                return before - self._history.count
+            self._is_new[:] = False
+            self._is_new[self._history.undo(collapses)] = True
 
+    def _name(self) -> None:
+        """Find the present faces, the given triangles that they come from, and the places as they will be stored."""
+        self._names = self._history.names()
+        named = self._names.astype(np.uint32)[self._mesh.triangles]
+        a, b, c = named.T
+        self._rows = np.flatnonzero((a != b) & (b != c) & (c != a))
+        self._faces = named[self._rows]
+        stored = as_stored(self._history.places + self._origin)
+        self._has_moved = (self._history.places != self._given.places).any(axis=1)
+        self._stored = np.where(self._has_moved[:, None], stored, self._mesh.vertices)
+        self._has_moved |= self._names != np.arange(len(self._names))
 
-def _mend(clusters: Clusters, deviation: Deviation, tell: Callable[[], None] = lambda: None) -> None:
-    """Undo collapses until the surface is sound and within the bound; cheap checks with large effect come first."""
-    for _ in range(_TRIES):
-        tell()
-        if clusters.undo(clusters.find_faults()):
-            continue
-        if clusters.undo(clusters.find_far(deviation)):
-            continue
-        if clusters.undo(clusters.find_crossing()):
-            continue
-        if not clusters.undo(clusters.find_faults(everywhere=True)):
-            break
+    def _find_far(self) -> Iterator[IntArray]:
+        """Find the names at triangles that are not seen to lie within the bound of the other surface.
 
+        Given triangles are looked at again if one of the faces that were near has changed.
+        """
+        triangles, places = self._mesh.triangles, self._history.places
+        is_new = any_corner(self._is_new, self._faces)
+        rows = self._find_unseen(is_new)
+        number = np.full(len(triangles) + 1, -1, np.int32)
+        number[self._rows] = np.arange(len(self._rows), dtype=np.int32)
+        standing = find_used(self._faces, len(places))
+        row = np.zeros(len(places), np.uint32)
+        row[standing] = np.arange(len(standing), dtype=np.uint32)
+        present = Surface.of_faces(places[standing], row[self._faces])
+        hints = np.column_stack([number[self._pairing.faces_at[rows]], row[self._names[triangles[rows]]]]).astype(
+            np.int32
+        )
+        near = self._collapser.find_near_faces(self._given.places[triangles[rows]], hints, present, self._limit)
+        self._witnesses[rows] = np.where(near >= 0, np.append(self._rows, -1)[near], near)
+        yield self._names[triangles[rows[near[:, 0] == FAR]]]
+        faces = np.flatnonzero(is_new & any_corner(self._has_moved, self._faces))
+        corners = self._faces[faces]
+        hints = np.column_stack([self._pairing.below[self._rows[faces]], self._pairing.homes[corners]]).astype(np.int32)
+        near = self._collapser.find_near_faces(places[corners], hints, self._given, self._limit)
+        yield corners[near[:, 0] == FAR]
 
-def _collapse(
-    clusters: Clusters, left_share: float, bound: float, error: float = _ERROR, aggressiveness: float = _AGGRESSIVENESS
-) -> None:
-    """Make one round of fast-simplification, to `left_share` of the triangles or an `error` of squares of the bound."""
-    from fast_simplification import simplify
+    def _find_unseen(self, is_new: NDArray[np.bool_]) -> IntArray:
+        """Find given triangles that have moved and that no face that is still there shows to be near."""
+        has_changed = np.ones(self._mesh.triangle_count + 1, dtype=bool)
+        has_changed[self._rows] = is_new
+        has_changed[-1] = False  # no face
+        is_unseen = np.zeros(self._mesh.triangle_count, dtype=bool)
+        for faces in self._witnesses.T:
+            is_unseen |= (faces < -1) | has_changed[np.maximum(faces, -1)]
+        return np.flatnonzero(is_unseen & any_corner(self._has_moved, self._mesh.triangles))
 
-    # In iteration i it collapses edges of an error up to 1e-9 * (i + 3)**agg.  Coordinates are scaled so that the last
-    # iteration reaches the bound's error.
-    largest_error = 1e-9 * (_LAST_ITERATION + 3) ** aggressiveness
-    scale = math.sqrt(largest_error / error) / bound
-    standing, triangles = clusters.numbered()
-    points, faces, collapses = simplify(
-        clusters.places[standing] * scale,
-        triangles.view(np.int32),
-        target_reduction=1.0 - left_share,
-        agg=aggressiveness,
-        return_collapses=True,
-    )
-    clusters.collapse(collapses, points / scale, faces)
+    def _find_unsound(self) -> Iterator[IntArray]:
+        """Find the names at faces that cut each other or have no area, and at vertices that coincide."""
+        pairs = self._find_crossings(self._stored, self._faces, any_corner(self._is_new, self._faces))
+        yield self._faces[pairs].reshape(-1, 6)
+        for piece, _, cross in cross_products(self._stored, self._faces, self._origin):
+            yield self._faces[piece][~cross.any(axis=0)]
+        standing = find_used(self._faces, len(self._stored))
+        yield standing[find_coincident(self._stored[standing])][:, None]
+
+    def _latest_of(self, places: list[IntArray]) -> IntArray:
+        """Return the last collapse into any vertex of each place, shape (k, v); none where it is as it was given."""
+        latest = self._history.latest()
+        lists = [np.zeros(0, dtype=np.int64)]
+        for names in places:
+            collapses = latest[names]
+            rounds = np.where(collapses >= 0, self._history.rounds[collapses], -1)
+            lists.append(collapses[np.arange(len(names)), rounds.argmax(axis=1)])
+        latest_ones = np.unique(np.concatenate(lists))
+        return latest_ones[latest_ones >= 0]
+
+    def finish(self) -> tuple[NDArray[np.floating], NDArray[np.uint32], TopologyChange]:
+        """Return vertices and triangles, in the order of the given ones, and what became of the topology."""
+        triangles, count = self._mesh.triangles, self._mesh.vertex_count
+        components, labels = label_components(triangles, count, self._edges)
+        before = measure_topology(triangles, labels, components, self._edges)
+        after = measure_topology(self._faces, labels, components)
+        corners = self._order[self._faces[np.argsort(self._order_of_faces[self._rows])]].astype(np.uint32)
+        standing, faces = number_used(corners, count)
+        stored = np.empty_like(self._stored)
+        stored[self._order] = self._stored
+        return as_stored(stored[standing]), faces, compare_topology(before, after)

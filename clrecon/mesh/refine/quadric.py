@@ -16,7 +16,6 @@ from clrecon.exchange.coordinates import as_stored
 from clrecon.mesh.compare.distances import SAMPLES, NearDistance, SurfaceDistance, sample_surface
 from clrecon.mesh.connectivity import find_edges, find_used, label_components
 from clrecon.mesh.mesh import Mesh
-from clrecon.mesh.refine.clusters import last_of_collapses
 from clrecon.mesh.refine.decimation import carry_on, check_share, check_triangles
 from clrecon.mesh.refine.topology import TopologyChange, compare_topology, measure_topology
 from clrecon.mesh.triangles import vertex_normals
@@ -100,6 +99,17 @@ def collapse_quadric(mesh: Mesh, fraction: float, *, progress: Progress | None =
     if failed:
         report["warnings"] = [*report.get("warnings", []), *failed]
     return Mesh(vertices, triangles, vertex_normals(vertices, triangles), report)
+
+
+def last_of_collapses(collapses: NDArray[np.integer], count: int) -> NDArray[np.int64]:
+    """Return for each vertex the one that it was merged into in the end; the second of a pair goes into the first."""
+    into = np.arange(count)
+    into[collapses[:, 1]] = collapses[:, 0]
+    while True:
+        further = into[into]
+        if np.array_equal(further, into):
+            return into
+        into = further
 
 
 def _compare_topology(

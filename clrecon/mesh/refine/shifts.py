@@ -1,4 +1,4 @@
-"""Small shifts of vertices: to restore the volume of components, and without spoiling the surface."""
+"""Small shifts of vertices that do not spoil the surface, and the volume of its components."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import as_stored, find_coincident
-from clrecon.mesh.connectivity import Fans, find_edges, find_used, label_components, number_used, order_by_number
+from clrecon.mesh.connectivity import Fans, find_used, number_used, order_by_number
 from clrecon.mesh.intersections import (
     FindCrossings,
     find_beside,
@@ -18,15 +18,7 @@ from clrecon.mesh.intersections import (
     find_self_intersections,
 )
 from clrecon.mesh.triangles import cross_products
-from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import find_bounds
-
-_VOLUME_STEPS = 4
-"""Newton steps along the normals; the first leaves about a hundredth of the missing volume."""
-
-_VOLUME_SLACK = 0.0005
-"""Share of its volume by which a component may differ where that shift is too short: collapses are undone then.  Of a
-speck the rounding of its coordinates can be more."""
 
 _ROUNDS = 40
 """Most rounds of taking steps back; each halves steps or widens the place, and CT needs 2 to 5."""
@@ -44,107 +36,14 @@ Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
 
 
-@dataclass(frozen=True)
-class Volumes:
-    """Components of a surface, and the volumes that they enclose.
-
-    labels: ndarray, shape (n,). Component of each vertex; -1 for vertices that no triangle uses.
-    mm3: ndarray, shape (count,). Negative for walls of cavities; meaningless for open components.
-    """
-
-    labels: NDArray[np.int64]
-    mm3: Float64Array
-    is_open: NDArray[np.bool_]
-
-    def differ(self, now: Volumes) -> NDArray[np.bool_]:
-        """Mark the closed components, shape (count,), that no longer enclose what they did; NaN is no volume."""
-        return ~self.is_open & ~(np.abs(now.mm3 - self.mm3) <= _VOLUME_SLACK * np.abs(self.mm3))
-
-
-def measure_volumes(
-    vertices: Float64Array,
-    triangles: NDArray[np.uint32],
-    count: int | None = None,
-    labels: NDArray[np.int64] | None = None,
-    border: NDArray[np.bool_] | None = None,
-) -> Volumes:
-    """Measure the components of a surface, in mm from a point near it.
-
-    count, labels, border: Number of components, component of each vertex, and which vertices lie at edges of one
-        triangle, if they are known.
-    """
-    if count is None or labels is None or border is None:
-        edges = find_edges(triangles, len(vertices))
-        count, labels = label_components(triangles, len(vertices), edges)
-        border = edges.border(len(vertices))
-    is_open = np.zeros(count, dtype=bool)
-    is_open[labels[border]] = True
-    return Volumes(labels, enclosed_mm3(vertices, triangles, count, labels), is_open)
-
-
 def enclosed_mm3(
-    vertices: Float64Array, triangles: NDArray[np.uint32], count: int, labels: NDArray[np.int64],
-    cross_of: Float64Array | None = None,
-) -> Float64Array:  # fmt: skip
-    """Return the volume of each component, vertices in mm near 0; `cross_of` (3, m) gets the cross products."""
+    vertices: Float64Array, triangles: NDArray[np.uint32], count: int, labels: NDArray[np.int64]
+) -> Float64Array:
+    """Return the volume of each component, vertices in mm near 0: negative for walls of cavities."""
     six_volumes = np.zeros(count)
     for piece, corner, cross in cross_products(vertices, triangles, np.zeros(3), max(count, 1 << 14)):
         six_volumes += np.bincount(labels[triangles[piece, 0]], np.einsum("ij,ij->j", corner, cross), count)
-        if cross_of is not None:
-            cross_of[:, piece] = cross
     return six_volumes / 6.0
-
-
-def restore_volumes(
-    vertices: Float64Array,
-    step: Float64Array,
-    triangles: NDArray[np.uint32],
-    labels: NDArray[np.int64],
-    wanted: Volumes,
-    longest: float,
-    stuck: NDArray[np.bool_] | None = None,
-) -> None:
-    """Change steps so that each closed component gets the volume it had, by a shift along the normals.
-
-    A small shift is a large share of the volume of a thin sheet: in a thin-walled bone at voxels of 3 mm, 6 % of the
-    volume were 0.03 voxel.
-
-    step: ndarray, shape (n, 3), mm. Changed in place; no step becomes longer than `longest`, and those `stuck` stay.
-    """
-    count = len(wanted.mm3)
-    moving = np.flatnonzero(~np.append(wanted.is_open, True)[labels] & ~(np.zeros(1, bool) if stuck is None else stuck))
-    for _ in range(_VOLUME_STEPS):
-        volumes, gradient = _volumes(vertices + step, triangles, labels, count)
-        length = np.sqrt(np.einsum("an,an->n", gradient, gradient))
-        total = np.bincount(labels[moving], length[moving], count)
-        # Of a component that the filter has drawn into a point the gradient is all but zero, and the shift without end.
-        with np.errstate(over="ignore"):
-            shift = np.divide(wanted.mm3 - volumes, total, out=np.zeros(count), where=total > 0.0)
-        shift = shift.clip(-2.0 * longest, 2.0 * longest)
-        normal = np.divide(gradient, length, out=np.zeros_like(gradient), where=length > 0.0)
-        step[moving] += (normal[:, moving] * shift[labels[moving]]).T
-        shorten_steps(step, longest)
-
-
-def _volumes(
-    vertices: Float64Array, triangles: NDArray[np.uint32], labels: NDArray[np.int64], count: int
-) -> tuple[Float64Array, Float64Array]:
-    """Return the volume of each component in mm3, and its gradient by the places of the vertices, shape (3, n), mm2."""
-    cross_of = np.empty((3, len(triangles)))
-    volumes = enclosed_mm3(vertices, triangles, count, labels, cross_of)
-    gradient = np.zeros((3, len(vertices)))
-    for corners in triangles.T:
-        for axis in range(3):
-            gradient[axis] += np.bincount(corners, cross_of[axis], len(vertices))
-    return volumes, gradient / 6.0
-
-
-def shorten_steps(step: Float64Array, longest: float) -> int:
-    """Shorten steps, shape (n, 3), to `longest` mm, in place; return how many were longer."""
-    length = np.sqrt(np.einsum("na,na->n", step, step))
-    far = np.flatnonzero(length > longest)
-    step[far] *= (longest / length[far])[:, None]
-    return len(far)
 
 
 def move_vertices(

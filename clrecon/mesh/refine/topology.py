@@ -1,19 +1,11 @@
-"""Topology of a surface whose vertices were merged: Euler numbers by component, and where it is no manifold."""
+"""Topology of a surface whose vertices were merged: Euler numbers by component."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.mesh.connectivity import (
-    Edges,
-    find_duplicate_faces,
-    find_edges,
-    find_faces_back_to_back,
-    find_split_vertices,
-    find_used,
-    opposite_half_edges,
-)
+from clrecon.mesh.connectivity import Edges, find_edges
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.records import Record
 
@@ -93,72 +85,3 @@ def any_corner(flags: NDArray[np.bool_], triangles: IntArray) -> NDArray[np.bool
     # "clip" avoids checking each index, which takes longer than the look-up.
     first, second, third = flags.take(triangles, mode="clip").T
     return np.asarray(first | second | third)
-
-
-def find_sheets(faces: NDArray[np.uint32], size: int, edges: Edges) -> list[IntArray]:
-    """Find the vertices at edges with several sheets, of doubled faces and of several fans of faces."""
-    faults = _find_ridges(faces, edges)
-    opposite = opposite_half_edges(faces, edges)
-    if opposite is not None:
-        faults.append(faces[find_faces_back_to_back(opposite)].reshape(-1))
-    split = find_split_vertices(faces, size, edges, opposite)
-    # The waist can be a vertex without a cluster: the cluster beside it touches it twice.
-    return [*faults, split, faces[np.isin(faces, split).any(axis=1)].reshape(-1) if len(split) else split]
-
-
-def _find_ridges(faces: NDArray[np.uint32], edges: Edges) -> list[IntArray]:
-    """Find the ends of edges along which two faces run in one direction, as at every edge with three faces."""
-    if edges.oriented:
-        return []
-    upward = (faces.reshape(-1) < faces[:, (1, 2, 0)].reshape(-1))[edges.half_edges]
-    ups = np.add.reduceat(upward, edges.first, dtype=np.int64)
-    return list(edges.ends[:, (ups > 1) | (edges.uses - ups > 1)])
-
-
-def find_faults_beside(faces: NDArray[np.uint32], new: NDArray[np.bool_]) -> IntArray:
-    """Find the faults of `find_sheets` that the vertices `new`, which every new face has one of, can have made."""
-    touched = np.zeros(len(new), dtype=bool)
-    touched[faces[any_corner(new, faces)]] = True
-    # With their neighbours: the fans around the touched vertices and the faces along their edges are complete.
-    around = faces[any_corner(touched, faces)]
-    numbers = find_used(around, len(new))
-    number = np.empty(len(new), dtype=np.uint32)
-    number[numbers] = np.arange(len(numbers), dtype=np.uint32)
-    local = number[around]
-    if len(local) == 0:
-        return np.zeros(0, dtype=np.int64)
-    edges = find_edges(local, len(numbers))
-    faults = _find_ridges(local, edges)
-    faults.append(local[find_duplicate_faces(local, len(numbers))].reshape(-1))
-    split = find_split_vertices(local, len(numbers), edges)
-    split = split[touched[numbers[split]]]
-    faults += [split, local[np.isin(local, split).any(axis=1)].reshape(-1) if len(split) else split]
-    return numbers[find_used(np.concatenate(faults).astype(np.int64), len(numbers))]
-
-
-def find_torn(triangles: NDArray[np.uint32], names: IntArray) -> IntArray:
-    """Find the names at which merging vertices has changed the Euler number.
-
-    It stays as it was where the triangles that shrank to a vertex form a disc, and those that shrank to an edge a strip
-    from one side of it to the other: their vertices - edges + faces are then 1 and, as they have no vertices, -1.
-
-    names: For each vertex the one that it was merged into.
-    """
-    size = len(names)
-    edges = find_edges(triangles, size)
-    first, second = names[edges.ends]
-    low, high = np.minimum(first, second), np.maximum(first, second)
-    named = np.sort(names[triangles], axis=1).T
-    within, two = named[0] == named[2], (named[0] == named[1]) ^ (named[1] == named[2])
-    used = find_used(triangles, size)
-    disc = np.bincount(names[used], minlength=size) - np.bincount(low[low == high], minlength=size)
-    disc += np.bincount(named[0, within], minlength=size)
-    standing = find_used(names[used], size)
-    torn = standing[disc[standing] != 1]
-
-    apart = low != high
-    strips = np.concatenate([low[apart] * size + high[apart], named[0, two] * size + named[2, two]])
-    weight = np.concatenate([np.ones(np.count_nonzero(apart), int), np.full(np.count_nonzero(two), -1)])
-    key, number = np.unique(strips, return_inverse=True)
-    key = key[np.bincount(number, weight, minlength=len(key)) != 1]
-    return find_used(np.concatenate([torn, key // size, key % size]), size)

@@ -1,25 +1,22 @@
-"""Decimation within a bound, and what a device finds for it: triangles that may cut others; distances."""
+"""Decimation within a bound on a device, and triangles that cut each other."""
 
 from __future__ import annotations
 
-from functools import cached_property, partial
-from typing import Any
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon import opencl as ocl
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare.distances import rounding_of_bounds
-from clrecon.mesh.connectivity import Fans, number_used
+from clrecon.mesh.connectivity import number_used
 from clrecon.mesh.intersections import find_boxes, find_self_intersections
 from clrecon.mesh.refine import decimation
-from clrecon.mesh.refine.deviation import WITNESSES, SurfaceBounds
-from clrecon.opencl import Device, Program
+from clrecon.opencl import Device
 from clrecon.operators.masks.voxel_mask import zero_words
+from clrecon.operators.surface.collapse import DeviceCollapser
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import chunks
 from clrecon.system.progress import Progress, Steps
 
 _FEWEST = 20_000
@@ -159,109 +156,6 @@ def find_crossings(
     return marked[find_self_intersections(vertices[used], corners, None if changed is None else changed[marked])]
 
 
-_PART = 1 << 20
-"""Points or triangles of a launch: each stays short, and its arrays fit beside the surface."""
-
-if ocl.kernel_constant("surface/near_faces.cl", "WITNESSES") != WITNESSES:
-    raise ImportError("cl/surface/near_faces.cl and clrecon.mesh.refine.deviation differ in the number of witnesses")
-
-Float64Array = NDArray[np.float64]
-IntArray = NDArray[np.integer]
-
-
-class DeviceBounds(SurfaceBounds):
-    """A surface, in mm near zero, to which distances are bounded on a device; its twin is `SurfaceBounds`.
-
-    The nearest point of each triangle is found, where the twin may take one near it: bounds are as short or shorter, or
-    within the limit.  `fans` are as for `NearDistance`.
-    """
-
-    def __init__(
-        self, device: Device, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans | None = None
-    ):
-        super().__init__(vertices, triangles, fans)
-        self._device, self.part = device, _PART
-
-    def prepare(self) -> None:
-        """Bring the surface to the device, before threads use it."""
-        assert self._surface
-
-    @cached_property
-    def slack(self) -> float:  # type: ignore[override]
-        return rounding_of_bounds(max(float(self._vertices.max(initial=0)), -float(self._vertices.min(initial=0))))
-
-    @cached_property
-    def _program(self) -> Program:
-        return ocl.load_program(self._device, "surface/near_faces.cl")
-
-    @cached_property
-    def _surface(self) -> dict[str, Any]:
-        arrays = {
-            "places": self._vertices.astype(np.float32),
-            "faces": self._triangles,
-            "begin": self._fans.begin.astype(np.int32),
-            "around": self._fans.rows.astype(np.int32, copy=False),
-        }
-        part = {"points of a launch": 64 * self.part, "vertices": 20 * len(self._vertices)}
-        ocl.check_budget(self._device, {name: array.nbytes for name, array in arrays.items()} | part)
-        return {
-            name: ocl.upload(self._device, array if len(array) else np.zeros(4, array.dtype))
-            for name, array in arrays.items()
-        }
-
-    def find_upper_bounds(self, points: Float64Array, near: IntArray) -> tuple[Float64Array, NDArray[np.int64]]:
-        length, rows = self.find_bounds(points, near[:, None], 0.0)
-        return length.astype(np.float64), rows.astype(np.int64)
-
-    def find_bounds(
-        self, points: Float64Array, near: IntArray, limit: float, walks: int = 0
-    ) -> tuple[Float32Array, IntArray]:
-        device, surface = self._device, self._surface
-        squares = np.empty(len(points), np.float32)
-        rows = np.empty(len(points), np.int32)
-        for piece in chunks(len(points), self.part):
-            count = piece.stop - piece.start
-            here = (
-                ocl.upload(device, points[piece].astype(np.float32)),
-                ocl.upload(device, near[piece].astype(np.int32)),
-            )
-            buffers = ocl.empty_output(device, (count,), np.float32), ocl.empty_output(device, (count,), np.int32)
-            ocl.launch(
-                device, self._program["find_near_faces"], count, points=here[0], near=here[1], **surface,
-                squares=buffers[0][1], rows=buffers[1][1], hints=near.shape[1], walks=walks, enough=self._most(limit),
-                count=count,
-            )  # fmt: skip
-            squares[piece], rows[piece] = ocl.download(device, *buffers[0]), ocl.download(device, *buffers[1])
-        length = np.sqrt(squares) + np.float32(self.slack)
-        length[rows < 0] = np.inf
-        return length, rows
-
-    def find_witnesses(
-        self, places: Float32Array, triangles: IntArray, names: IntArray, beside: IntArray, limit: float
-    ) -> tuple[IntArray, NDArray[np.uint8]]:
-        device = self._device
-        witnesses: NDArray[np.int32] = np.empty((WITNESSES, len(triangles)), np.int32)
-        left = np.empty(len(triangles), np.uint8)
-        of_vertices = {
-            "vertices": ocl.upload(device, places),
-            "names": ocl.upload(device, names.astype(np.int32)),
-            "beside": ocl.upload(device, beside),
-        }
-        for piece in chunks(len(triangles), self.part):
-            count = piece.stop - piece.start
-            faces = ocl.upload(device, triangles[piece])
-            buffers = (
-                ocl.empty_output(device, (WITNESSES, count), np.int32),
-                ocl.empty_output(device, (count,), np.uint8),
-            )
-            ocl.launch(
-                device, self._program["find_witnesses"], count, triangles=faces, **of_vertices, **self._surface,
-                witnesses=buffers[0][1], left=buffers[1][1], enough=self._most(limit), count=count,
-            )  # fmt: skip
-            witnesses[:, piece], left[piece] = ocl.download(device, *buffers[0]), ocl.download(device, *buffers[1])
-        return witnesses, left
-
-
 @explains_arguments
 def decimate_mesh(
     mesh: Mesh,
@@ -269,12 +163,14 @@ def decimate_mesh(
     max_deviation_mm: float | None = None,
     *,
     device: Device | str | int | None = None,
+    memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
     """Remove triangles by collapsing edges in order of their quadric error (Garland and Heckbert 1997).
 
-    Collapses are undone where the result would exceed the bound, not be manifold, have faces without area, cut itself,
-    or lose a component or a tunnel.  So the share is not always reached: the bound decides how many triangles are left.
+    Each collapse is checked before it is made, and undone where the result would exceed the bound, cut itself or have
+    faces without area; components, tunnels and volumes stay.  So the share is not always reached: the bound decides how
+    many triangles are left.  Vertices at an open border stay.
 
     Parameters
     ----------
@@ -282,13 +178,13 @@ def decimate_mesh(
     fraction : float
         Share of the triangles to remove, above 0 and below 1. The bound may allow only less.
     max_deviation_mm : float, optional
-        No vertex and no middle of an edge or a triangle of either surface lies farther than this from the other; a
-        point between them can.
-        Default: a quarter of the shortest voxel step.
+        No point of either surface lies farther than this from the other one.  Default: a quarter of the shortest voxel
+        step.
     device : Device, str or int, optional
-        Bounds distances and finds triangles that cut each other, see `clrecon.device`.  None: numpy does it, which
-        takes longer and needs no device.  The
-        result is the same but for rounding: another triangle may have been found to be near enough first.
+        Collapses edges and finds triangles that cut each other, see `clrecon.device`.  The result is the same on all,
+        bit for bit.
+    memory : int, optional
+        Most bytes to use on the device; all of its memory by default.
     progress : callable, optional
         Called as ``progress("decimate", triangles removed, triangles to remove)``, several times in a round.
 
@@ -307,16 +203,15 @@ def decimate_mesh(
     NoSurfaceError
         The mesh is empty.
     DeviceError
-        The device does not exist, has no room for both surfaces, or fails.
+        The device does not exist, fails, or has no room for both surfaces, or less is allowed.
     """
     decimation.check_share(fraction)
     decimation.check_refinement(mesh, max_deviation_mm)
-    if device is None:
-        return decimation.decimate_mesh(mesh, fraction, max_deviation_mm, progress=progress)
     for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, _):
             decimated = decimation.decimate_mesh(
-                mesh, fraction, max_deviation_mm, progress=progress, make_bounds=partial(DeviceBounds, current),
-                find_crossings=partial(find_crossings, current),
+                mesh, fraction, max_deviation_mm, progress=progress,
+                make_collapser=partial(DeviceCollapser, current, memory=memory),
+                find_crossings=partial(find_crossings, current, memory=memory),
             )  # fmt: skip
     return decimated

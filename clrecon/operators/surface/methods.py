@@ -231,8 +231,8 @@ def extract_by_method(
         share = DECIMATED_SHARE if decimate is None else decimate
         if chosen.decimates == "quadric":
             mesh = collapse_quadric(mesh, share, progress=progress)
-        else:  # what may be taken on the device is for the surface
-            mesh = decimate_mesh(mesh, share, device=extractor.device if memory is None else None, progress=progress)
+        else:
+            mesh = decimate_mesh(mesh, share, device=extractor.device, memory=memory, progress=progress)
     mesh.report.update(measured, method=method)
     return mesh
 

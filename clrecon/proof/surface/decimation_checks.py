@@ -1,15 +1,17 @@
-"""Checks of smoothing, and of what decimation asks: which triangles cut each other, and bounds of distances."""
+"""Checks of smoothing, and of decimation: collapses, triangles near a surface, and those that cut each other."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.mesh.compare.distances import NearDistance, triangle_distances
-from clrecon.mesh.refine.deviation import MIDDLES, SurfaceBounds
+from clrecon.mesh.compare.distances import SurfaceDistance, triangle_distances
+from clrecon.mesh.connectivity import find_edges
+from clrecon.mesh.refine.collapse import FAR, REFUSED, History, Surface, collapse_in_rounds
 from clrecon.mesh.refine.smoothing import Filter, Rings, sinc_terms
 from clrecon.opencl import Device
-from clrecon.operators.surface.decimation import DeviceBounds, mark_crossings, plan_crossings
+from clrecon.operators.surface.collapse import DeviceCollapser
+from clrecon.operators.surface.decimation import mark_crossings, plan_crossings
 from clrecon.operators.surface.smoothing import DeviceFilter
 from clrecon.proof.checking import Check, require_close, require_equal
 from clrecon.proof.surface import crossings as twin
@@ -39,80 +41,203 @@ CROSSING_CHECKS = (
 )
 
 
-SIZE = 40
-"""Vertices along each side of the sheet: 3042 triangles."""
+_SIZE, _LARGE = 40, 150
+"""Vertices along each side of the sheet, and of one of which more than 500 edges collapse in a round."""
 
 ROUNDING_MM = 3e-4
 """Slack of bounds at coordinates up to 40 mm, and the rounding of float32."""
 
 _LIMIT_MM = 0.16
+_PULL, _LENGTH_WEIGHT = 1e-3, 1e-4
+"""As in cl/surface/collapse.h: of the middle of an edge, and of its length."""
+
+_EXPONENT_BIAS = 127
+"""What float32 adds to exponents of 2."""
 
 
-def _rough_sheet(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
-    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(SIZE), np.arange(SIZE)))
-    corner = (x + SIZE * y)[(x < SIZE - 1) & (y < SIZE - 1)]
-    lower = np.column_stack([corner, corner + 1, corner + SIZE + 1])
-    upper = np.column_stack([corner, corner + SIZE + 1, corner + SIZE])
-    flat = np.column_stack([x, y, np.zeros(SIZE * SIZE)]).astype(np.float64)
-    vertices: NDArray[np.float64] = flat + rng.normal(0.0, 0.25, (SIZE * SIZE, 3))
+def _rough_sheet(rng: np.random.Generator, size: int = _SIZE) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(size), np.arange(size)))
+    corner = (x + size * y)[(x < size - 1) & (y < size - 1)]
+    lower = np.column_stack([corner, corner + 1, corner + size + 1])
+    upper = np.column_stack([corner, corner + size + 1, corner + size])
+    flat = np.column_stack([x, y, np.zeros(size * size)]).astype(np.float64)
+    vertices: NDArray[np.float64] = flat + rng.normal(0.0, 0.25, (size * size, 3))
     return vertices, np.concatenate([lower, upper]).astype(np.uint32)
 
 
-def _check_distances(device: Device) -> str:
-    """Compare distances around hints, and after walks, with those of the triangles."""
-    rng = np.random.default_rng(12)
-    vertices, triangles = _rough_sheet(rng)
-    count = 2000
-    points = rng.uniform(0.0, SIZE - 1.0, (count, 3)) * [1.0, 1.0, 0.1]
-    near = rng.integers(0, len(vertices), (count, 3))
-    bounds = DeviceBounds(device, vertices, triangles)
-    expected, _ = NearDistance(vertices, triangles).find_around(points, near)
-    worst = 0.0
-    for walks in (0, 40):
-        length, rows = bounds.find_bounds(points, near, 0.0, walks)
-        require_equal((rows >= 0) & (rows < len(triangles)), np.ones(count, dtype=bool), "rows of nearest triangles")
-        exact = triangle_distances(points.T, *vertices[triangles[rows]].transpose(1, 2, 0))
-        worst = max(worst, require_close(length, exact, ROUNDING_MM, "distances to the nearest triangles, in mm"))
-        if walks == 0:
-            require_close(length, expected, ROUNDING_MM, "distances to triangles around vertices, in mm")
-        else:
-            require_equal(length <= expected + ROUNDING_MM, np.ones(count, dtype=bool), "distances after walks")
-            moved = int(np.count_nonzero(length < 0.5 * expected))
-            require_equal(moved > count // 2, True, "points that are nearer after walks")
-    return f"{count:,} points within {worst:.1e} mm"
+def _measure_octaves(
+    vertices: NDArray[np.float64], triangles: NDArray[np.uint32], ends: NDArray[np.uint32]
+) -> NDArray[np.float64]:
+    """Return the base-2 logarithm of the cost of each edge: the least quadric error, and a share of its length."""
+    a, b, c = vertices[triangles].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    planes = np.einsum("ka,kb->kab", normal, normal / np.linalg.norm(normal, axis=1, keepdims=True))
+    of_vertices = np.zeros((len(vertices), 3, 3))
+    for corner in triangles.T:
+        np.add.at(of_vertices, corner, planes)
+    start, end = of_vertices[ends]
+    half = 0.5 * (vertices[ends[1]] - vertices[ends[0]])
+    both = start + end
+    weight = np.trace(both, axis1=1, axis2=2)
+    pulled = both + _PULL * weight[:, None, None] * np.eye(3)
+    best = np.linalg.solve(pulled, np.einsum("kab,kb->ka", end - start, half)[:, :, None])[:, :, 0]
+    cost = np.einsum("ka,kab,kb->k", best + half, start, best + half)
+    cost += np.einsum("ka,kab,kb->k", best - half, end, best - half)
+    return np.log2(cost + _LENGTH_WEIGHT * weight * np.einsum("ka,ka->k", half, half))
 
 
-def _check_witnesses(device: Device) -> str:
-    """Compare what is left of triangles near a surface with distances to it."""
+def _select_edges(
+    octaves: NDArray[np.uint8], ends: NDArray[np.uint32], numbers: NDArray[np.intp], highest: int, count: int
+) -> NDArray[np.bool_]:
+    """Mark the edges that come first at their ends and at all neighbours of these."""
+    mixed = numbers.astype(np.uint32) * np.uint32(0x9E3779B1)
+    mixed ^= mixed >> np.uint32(15)
+    mixed *= np.uint32(0x85EBCA77)
+    mixed ^= mixed >> np.uint32(13)
+    rank = octaves.astype(np.uint64) << np.uint64(32) | mixed
+    rank[octaves == REFUSED] = np.iinfo(np.uint64).max
+    first = np.full(count, np.iinfo(np.uint64).max)
+    for end in ends:
+        np.minimum.at(first, end, rank)
+    least = first.copy()
+    for end, neighbour in (ends, ends[::-1]):
+        np.minimum.at(least, end, first[neighbour])
+    selected: NDArray[np.bool_] = (octaves <= highest) & (rank == least[ends[0]]) & (rank == least[ends[1]])
+    return selected
+
+
+def _check_rings(history: History, ends: NDArray[np.uint32]) -> None:
+    """Compare the rings of collapses of one round with the edges from both of their ends."""
+    gone, count = np.flatnonzero(history.into >= 0), len(history.into)
+    of_vertex = np.full(count, -1)
+    of_vertex[gone] = of_vertex[history.into[gone]] = gone
+    start, end = np.concatenate([ends, ends[::-1]], axis=1).astype(np.int64)
+    is_beside = (of_vertex[start] >= 0) & (of_vertex[start] != of_vertex[end])
+    expected = np.unique(of_vertex[start[is_beside]] * count + end[is_beside])
+    size = history.size[gone]
+    entries = np.repeat(history.begin[gone] - (np.cumsum(size) - size), size) + np.arange(size.sum())
+    rings = np.repeat(gone, size) * count + history.neighbours[entries]
+    require_equal(np.sort(rings), expected, "rings of collapses")
+
+
+def _check_first_round(device: Device) -> str:
+    """Compare costs of edges and which are selected with numpy; each of these collapses or is refused."""
+    vertices, triangles = _rough_sheet(np.random.default_rng(11), _LARGE)
+    places = vertices.astype(np.float32)
+    given = Surface.of(places, triangles, find_edges(triangles, len(places)))
+    collapser = DeviceCollapser(device, given, _LIMIT_MM**2)
+    start, end = triangles.reshape(-1), triangles[:, (1, 2, 0)].reshape(-1)
+    numbers = np.flatnonzero(np.arange(len(start)) < given.opposite.astype(np.int64))
+    octaves, ends = collapser.octaves()[numbers], np.stack([start[numbers], end[numbers]])
+    ranked = octaves != REFUSED
+    expected = _measure_octaves(places.astype(np.float64), triangles, ends) + _EXPONENT_BIAS
+    require_close(octaves[ranked] + 0.5, expected[ranked], 0.51, "octaves of costs")
+    highest = int(np.percentile(octaves[ranked], 50))
+    selected = _select_edges(octaves, ends, numbers, highest, len(places))
+    collapser.look_at_standing()
+    require_equal(collapser.run_round(0, highest, len(places))[0], int(selected.sum()), "edges that are selected")
+    is_refused = collapser.octaves()[numbers] == REFUSED
+    history = collapser.finish()[0]
+    gone = history.into[ends] >= 0
+    require_equal((gone.any(axis=0) | is_refused)[selected].all(), True, "selected edges collapse or are refused")
+    _check_rings(history, ends)
+    beside = np.zeros(len(places), bool)
+    beside[ends[:, selected]] = True
+    require_equal(beside[ends][gone].all(), True, "no other edges collapse")
+    return f"{int(selected.sum()):,} edges, of which {int((gone.any(axis=0) & selected).sum()):,} collapse"
+
+
+def _check_collapses(device: Device) -> str:
+    """Collapse edges, and check what stands: names, faces, volume beneath, points within the limit, pairs of faces."""
+    vertices, triangles = _rough_sheet(np.random.default_rng(12))
+    places = vertices.astype(np.float32)
+    given = Surface.of(places, triangles, find_edges(triangles, len(places)))
+    collapser = DeviceCollapser(device, given, _LIMIT_MM**2)
+    collapse_in_rounds(collapser, len(triangles), 0.0, lambda left: None)
+    history, pairing = collapser.finish()
+    corners = history.names()[triangles].astype(np.uint32)
+    rows = np.flatnonzero((corners != corners[:, (1, 2, 0)]).all(axis=1))
+    require_equal(len(rows), len(triangles) - 2 * history.count, "faces that are left")
+    require_equal(history.count > len(places) // 4, True, "enough edges have collapsed")
+    edges = find_edges(corners[rows], len(places))
+    before = find_edges(triangles, len(places))
+    require_equal(
+        (edges.boundary, edges.nonmanifold, edges.oriented), (before.boundary, 0, True), "edges that are left"
+    )
+    beneath = [
+        float(np.einsum("ij,ij->", at[faces[:, 0]], np.cross(at[faces[:, 1]], at[faces[:, 2]]))) / 6.0
+        for at, faces in ((vertices, triangles), (history.places.astype(np.float64), corners[rows]))
+    ]
+    require_close(beneath[1], beneath[0], 1e-3, "volume beneath the sheet, in mm3")
+    is_face = np.zeros(len(triangles), bool)
+    is_face[rows] = True
+    require_equal(is_face[pairing.faces_at], np.ones(len(triangles), bool), "faces at the middles of given ones")
+    middles = vertices[triangles].mean(axis=1)
+    apart = triangle_distances(
+        middles.T, *history.places[corners[pairing.faces_at]].transpose(1, 2, 0).astype(np.float64)
+    )
+    require_equal(apart <= _LIMIT_MM + ROUNDING_MM, np.ones(len(triangles), bool), "middles within the limit")
+    below = pairing.below[rows]
+    require_equal((below >= 0).mean() > 0.5, True, "most of those that are left have a given face")
+    require_equal(pairing.faces_at[below[below >= 0]], rows[below >= 0], "given faces at those that are left")
+    standing = np.flatnonzero(history.into < 0)
+    away = np.linalg.norm(history.places[standing] - places[pairing.homes[standing]], axis=1)
+    require_equal(away.max() < 2.0, True, "given vertices beside those that are left")
+    count = history.count
+    history.undo(np.flatnonzero(history.into >= 0)[::9])
+    corners = history.names()[triangles].astype(np.uint32)
+    rows = np.flatnonzero((corners != corners[:, (1, 2, 0)]).all(axis=1))
+    edges = find_edges(corners[rows], len(places))
+    require_equal(
+        (edges.boundary, edges.nonmanifold, edges.oriented), (before.boundary, 0, True), "edges after some are undone"
+    )
+    history.undo(np.flatnonzero(history.into >= 0))
+    require_equal(history.places, places, "places after all are undone")
+    return f"{count:,} collapses"
+
+
+def _check_near_faces(device: Device) -> str:
+    """Compare what is near a surface at all points with distances of points on a lattice."""
     rng = np.random.default_rng(13)
     vertices, triangles = _rough_sheet(rng)
-    places = (vertices + rng.normal(0.0, 0.15, vertices.shape)).astype(np.float32)
-    names = np.arange(len(vertices))
-    exact = NearDistance(vertices, triangles)
-    length, rows = exact.find_around(places.astype(np.float64), names[:, None])
-    beside = np.where(length <= _LIMIT_MM, rows, -1).astype(np.int32)
-    arguments = (places, triangles, names, beside, _LIMIT_MM)
-    witnesses, left = DeviceBounds(device, vertices, triangles).find_witnesses(*arguments)
-    _, of_twin = SurfaceBounds(vertices, triangles).find_witnesses(*arguments)
-    require_equal(witnesses[:3], beside[triangles].T, "witnesses of corners")
-    require_equal(left & ~of_twin, np.zeros(len(left), np.uint8), "middles that are left")
-    known = (beside[triangles] >= 0).all(axis=1)
-    for middle, weights in enumerate(MIDDLES):
-        points = np.einsum("i,kia->ka", weights, places[triangles].astype(np.float64))
-        around, _ = exact.find_around(points, triangles.astype(np.int64))
-        is_left = (left >> middle & 1).astype(bool)
-        require_equal(around[is_left] > _LIMIT_MM - ROUNDING_MM, np.ones(int(is_left.sum()), bool), "middles left")
-        of = np.flatnonzero(known & ~is_left & (witnesses[3 + middle] != witnesses[0]))
-        shown = triangle_distances(points[of].T, *vertices[triangles[witnesses[3 + middle, of]]].transpose(1, 2, 0))
-        require_equal(shown <= _LIMIT_MM, np.ones(len(of), bool), "witnesses of middles")
-        require_equal(witnesses[3 + middle][~known], witnesses[0][~known], "witnesses of triangles without one")
-    return f"{len(triangles):,} triangles, {np.count_nonzero(left)} with middles left"
+    moved = (vertices + rng.normal(0.0, 0.05, vertices.shape)).astype(np.float32)
+    given = Surface.of(vertices.astype(np.float32), triangles, find_edges(triangles, len(vertices)))
+    hints = np.column_stack([np.full(len(triangles), -1), triangles]).astype(np.int32)
+    corners = moved[triangles]
+    near = DeviceCollapser(device, given, _LIMIT_MM**2).find_near_faces(corners, hints, given, _LIMIT_MM**2)
+    first, second = (share.ravel() / 3.0 for share in np.mgrid[:4, :4])
+    weights = np.column_stack([first, second, 1.0 - first - second])[first + second < 1.0 + 1e-9]
+    points = np.einsum("wc,kca->kwa", weights, corners[::4].astype(np.float64))
+    distance = SurfaceDistance(vertices, triangles)(points.reshape(-1, 3)).reshape(len(points), -1).max(axis=1)
+    is_far = near[:, 0] == FAR
+    require_equal(is_far[::4][distance > _LIMIT_MM + ROUNDING_MM].all(), True, "triangles beyond the limit")
+    require_equal(is_far[::4][distance < 0.8 * _LIMIT_MM].any(), False, "triangles within the limit")
+    alone = (near[:, 0] >= 0) & (near[:, 1] < 0)
+    require_equal(alone.sum() > 500, True, "triangles near one face")
+    shown = triangle_distances(
+        corners[alone].reshape(-1, 3).T.astype(np.float64),
+        *vertices[triangles[np.repeat(near[alone, 0], 3)]].transpose(1, 2, 0),
+    )
+    require_equal(shown <= _LIMIT_MM + ROUNDING_MM, np.ones(len(shown), bool), "faces near all corners")
+    return f"{len(triangles):,} triangles, {int(is_far.sum()):,} beyond the limit"
 
 
 DISTANCE_CHECKS: tuple[Check, ...] = (
-    Check("distances to a surface", ("find_near_faces",), _check_distances),
-    Check("witnesses of triangles near a surface", ("find_witnesses",), _check_witnesses),
-)
+    Check(
+        "collapses of edges",
+        (
+            "sum_quadrics", "rank_edges", "hang_points", "find_first_edges", "select_edges", "collapse_edges",
+            "pair_faces",
+        ),
+        _check_collapses,
+    ),
+    Check(
+        "the first round of collapses",
+        ("sum_quadrics", "rank_edges", "find_first_edges", "select_edges", "collapse_edges"),
+        _check_first_round,
+    ),
+    Check("triangles near a surface", ("frame_faces", "gather_stars", "find_near_faces"), _check_near_faces),
+)  # fmt: skip
 
 
 def _check_smoothing(device: Device) -> str:

@@ -113,7 +113,7 @@ def test_surface_distance_to_one_triangle_is_that_to_its_face_edge_or_corner(poi
 def test_distance_near_any_corner_of_one_triangle_is_that_to_its_face_edge_or_corner(point, distance, vertex):
     vertices, triangles = TRIANGLE
     measure = NearDistance(vertices + FAR, triangles)
-    measured = measure(np.array([point]) + FAR, np.array([vertex]), 0.5)
+    measured, _ = measure.find_around(np.array([point]) + FAR, np.array([[vertex]]))
     assert measured == pytest.approx([distance], abs=tolerances.FLOAT64_PLACE_MM)
 
 
@@ -157,27 +157,10 @@ def test_distance_counts_only_the_triangles_around_the_vertex():
     near = NearDistance(vertices, triangles.astype(np.uint32))
     on_the_face, beside_it, beyond_an_edge, above = [1, 0.75, 0.75], [1.25, 0.75, 0.75], [3, 2, 1], [3, 2, 3]
     points = np.array([on_the_face, beside_it, beyond_an_edge, above], float)
-    distances, rows = near.find_within(points, np.full(4, 7), 0.5)
+    distances, rows = near.find_around(points, np.full((4, 1), 7))
     expected = [0.0, 0.25, np.hypot(2, 1), np.sqrt(2**2 + 1**2 + 2**2)]
     np.testing.assert_allclose(distances, expected, rtol=tolerances.FLOAT64_SHARE)
     assert (triangles[rows] == 7).any(axis=1).all()
-
-
-def test_distances_near_a_vertex_are_upper_bounds_and_exact_where_beyond_the_limit():
-    limit_mm = 0.8
-    vertices, triangles = samples.torus(40, 24)
-    triangles = triangles.astype(np.uint32)
-    rng = np.random.default_rng(3)
-    near = rng.integers(0, len(vertices), 500)
-    points = vertices[near] + rng.normal(scale=1.5, size=(500, 3))
-
-    exact = SurfaceDistance(vertices, triangles)(points)
-    bounds = NearDistance(vertices, triangles)(points, near, limit_mm)
-
-    beyond = bounds > limit_mm
-    assert 50 < beyond.sum() < 450, "points on both sides of the limit"
-    assert (bounds >= exact - tolerances.FLOAT64_PLACE_MM).all()
-    np.testing.assert_allclose(bounds[beyond], exact[beyond], rtol=0, atol=tolerances.FLOAT64_PLACE_MM)
 
 
 @pytest.fixture(scope="module")

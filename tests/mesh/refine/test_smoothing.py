@@ -22,7 +22,6 @@ from clrecon.mesh.refine.shifts import (
     _find_spoilt,
     as_stored,
     move_vertices,
-    shorten_steps,
 )
 from clrecon.mesh.refine.smoothing import Filter, Rings, sinc_terms, smooth_mesh
 from clrecon.mesh.triangles import vertex_normals
@@ -222,13 +221,6 @@ def test_the_default_bound_of_a_sheared_affine_is_a_quarter_of_its_shortest_colu
     """The columns are 0.5, 0.4 and 2 mm long, the rows 0.3, 0.57 and 2."""
     report = {"affine_ijk_to_lps_mm": [[0.3, 0, 0, 5], [0.4, 0.4, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]]}
     assert default_deviation(Mesh(*samples.box(), None, report)) == 0.4 / 4
-
-
-def test_steps_longer_than_the_bound_are_shortened_in_their_direction_and_counted():
-    steps = np.array([[3.0, 4.0, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -4.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    within_1_mm = [[0.6, 0.8, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
-    assert shorten_steps(steps, 1.0) == 2
-    np.testing.assert_allclose(steps, within_1_mm, rtol=tolerances.FLOAT64_SHARE)
 
 
 def test_only_vertices_at_a_fault_are_taken_back_by_half_a_step_at_first():

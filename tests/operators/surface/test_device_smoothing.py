@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import sample_meshes as samples
-from near_surfaces import sheet
+from flat_sheets import sheet
 
 import clrecon
 from clrecon.mesh import Mesh
