@@ -416,7 +416,7 @@ FAR_VOXELS = np.array([[0, 0, 0], [2047, 2047, 0], [0, 0, 1024]], np.int32)
 """In a box of 2048 x 2048 x 1025: the number of the last is 2^32, in 32 bits that of the first."""
 
 
-def test_voxels_in_their_order_need_no_other():
+def test_voxels_that_lie_in_their_order_are_not_put_into_another():
     assert _order_voxels(FAR_VOXELS)[0] is None
 
 

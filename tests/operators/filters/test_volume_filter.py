@@ -212,7 +212,7 @@ def test_filter_near_a_level_for_normals_has_the_values_a_voxel_farther_of_the_w
 @pytest.mark.parametrize("name", ["ball", "wide"])
 def test_filter_near_a_level_filters_less_than_seven_tenths_of_a_ball(device, name):
     near, _ = filter_with_settings(device, NEAR[name](), 20.0, near=100.0, normals=True)
-    assert near.share < 0.7
+    assert near.share < 0.7  # measured 0.04 to 0.62
 
 
 @pytest.mark.parametrize("normals", [False, True])
@@ -346,7 +346,7 @@ def default_step(device):
 def test_filter_has_by_default_a_sigma_of_a_voxel_and_of_three_times_the_noise(default_step):
     step, warnings = default_step
     assert (step["filter"], step["dimensions"], step["sigma_mm"]) == ("bilateral", 3, 1.0)
-    assert step["sigma_hu"] == pytest.approx(3 * step["noise_hu"], abs=0.01)
+    assert step["sigma_hu"] == pytest.approx(3 * step["noise_hu"], abs=0.01)  # digits of the report
     assert warnings == []
 
 

@@ -45,7 +45,7 @@ def test_gas_covers_the_disc_of_its_ball(lowest_in_trunk: clrecon.Rendering) -> 
 
 def test_trunk_is_counted_without_its_skin(lowest_in_trunk: clrecon.Rendering) -> None:
     width = np.count_nonzero(np.isfinite(lowest_in_trunk.values[30])) * lowest_in_trunk.pixel_mm
-    assert 2 * 60.0 - 16.0 <= width <= 2 * 60.0
+    assert 2 * 60.0 - 16.0 <= width <= 2 * 60.0  # measured 106.6
 
 
 def test_pixels_beside_the_body_are_black_and_have_no_depth(lowest_in_trunk: clrecon.Rendering) -> None:

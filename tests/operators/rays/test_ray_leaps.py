@@ -112,7 +112,7 @@ def test_leaps_hide_no_scattered_voxel_from_anywhere(device, monkeypatch, uneven
         if (whole.image[..., 3] > 0).any():
             shown += 1
             assert_same(take_picture(volume, device, camera, **settings), whole)
-    assert shown > 20
+    assert shown > 20  # measured 25
 
 
 def larger(rng, affine) -> Volume:
@@ -201,7 +201,7 @@ def test_labels_of_a_single_slice_colour_every_picture(device):
             )  # fmt: skip
             middle = picture.image[10:-10, 10:-10].reshape(-1, 4)
             assert (middle == middle[0]).all()
-            assert middle[0, 2] > 200
+            assert middle[0, 2] > 200  # measured 214
 
 
 def test_more_samples_than_float32_counts_are_refused_with_the_least_step(device):

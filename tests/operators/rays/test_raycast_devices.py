@@ -105,7 +105,7 @@ def assert_alike(found: Any, expected: Any, mode: str) -> None:
         assert (away <= tolerances.RAY_TWIN_HU).mean() >= 1.0 - share, f"up to {away.max():.3g} HU"
     if mode not in ("mean", "drr"):
         hit = np.isfinite(expected.depth) & np.isfinite(found.depth)
-        assert hit.mean() > 0.05
+        assert hit.mean() > 0.05  # measured 0.18 on
         assert (np.isfinite(expected.depth) != np.isfinite(found.depth)).mean() <= share
         for name in ("depth", "expected_depth"):
             away = np.abs(getattr(found, name) - getattr(expected, name))[hit]
@@ -228,4 +228,4 @@ def test_pictures_of_any_size_have_all_their_pixels(device, size):
     )
     assert found.image.shape == (size[1], size[0], 4)
     assert expected.image[..., 3].max() > 100
-    assert np.abs(found.image[..., 3].astype(int) - expected.image[..., 3]).max() <= 2
+    assert np.abs(found.image[..., 3].astype(int) - expected.image[..., 3]).max() <= 2  # of 255; measured 0

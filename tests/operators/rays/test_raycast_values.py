@@ -116,7 +116,7 @@ def test_a_radiograph_is_transparent_where_there_is_no_water_at_all(device):
     camera = look(volume, (0.0, 1.0, 0.0), 14.0)
     found = DeviceCaster(device)(volume, mode="drr", camera=camera, size=size)
     passing, _ = distances_from(centre_of(volume), camera, size)
-    assert 0.0 < found.values[passing < 4.0].max() < 1.0
+    assert 0.0 < found.values[passing < 4.0].max() < 1.0  # measured 0.16
     assert (found.image[passing < 4.0][:, 3] == 255).all()
     assert (found.image[passing > 11.0][:, 3] == 0).all()
 
@@ -280,10 +280,10 @@ def window_of_mip(voxels, device):
 
 def test_the_window_of_mip_runs_from_soft_tissue_to_bone_without_air_and_blanket(device):
     low, high = window_of_mip(body_beside_a_blanket(), device)
-    assert -500.0 <= low <= 60.0
-    assert 800.0 < high <= 900.0
+    assert -500.0 <= low <= 60.0  # measured -412
+    assert 800.0 < high <= 900.0  # measured 900
 
 
 def test_the_window_of_mip_of_a_scan_without_a_body_begins_at_air(device):
     low, _ = window_of_mip(np.minimum(body_beside_a_blanket(), -700), device)
-    assert low < -900.0
+    assert low < -900.0  # measured -1000

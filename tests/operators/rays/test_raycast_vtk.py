@@ -89,7 +89,7 @@ def test_smooth_bodies_look_as_vtk_draws_them(device, axes, shaded, view_angle):
     volume = blobs(axes)
     camera = Camera.fit(volume, (30, 20), 1.5, view_angle=view_angle, size=SIZE)
     ours, theirs = draw_by_clrecon_and_vtk(volume, camera, shaded, device)
-    assert (theirs.max(axis=2) > 20).mean() > 0.1
+    assert (theirs.max(axis=2) > 20).mean() > 0.1  # measured 0.31 on
     assert likeness(ours, theirs) >= tolerances.VTK_LIKENESS_SMOOTH
     assert likeness(np.roll(ours, 2, axis=1), theirs) < tolerances.VTK_LIKENESS_SMOOTH  # so small a shift is seen
 

