@@ -61,6 +61,7 @@ def test_voxels_of_two_masks_belong_to_the_first_in_alphabetical_order(tmp_path)
 
 
 def test_empty_and_overlapping_masks_are_warned_of(tmp_path):
+    """L3 and aorta share slice 1, aorta and liver slice 2: 2 x 42 voxels."""
     assert read_labels(write_masks(tmp_path / "masks")).warnings == (
         "1 of 4 masks holds no voxel: spleen",
         "the masks overlap in 84 voxels: each belongs to the first of its masks in alphabetical order, labels that were"
