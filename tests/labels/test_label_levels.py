@@ -27,56 +27,59 @@ STEP = 1.0 / (FACES_PER_AREA * STEEPNESS * FULL)
 """Voxels that a label loses by one face towards no label, when its level rises by one."""
 
 
+# Trials are levels and the volumes that they gave; `wanted` is the volume, `rise` its change when the level rises by 1.
+
+
 def test_first_level_tried_is_the_start():
-    assert next_level([], 100.0, -1.0) == START
+    assert next_level([], wanted=100.0, rise=-1.0) == START
 
 
 def test_step_beyond_the_lowest_or_highest_level_goes_half_way_to_it():
     flat = -1e-9  # so small a change of volume a level that Newton's step would be far beyond either end
-    assert next_level([(START, 50.0)], 100.0, flat) == (LEVELS[0] - 1 + START) // 2
-    assert next_level([(START, 100.0)], 50.0, flat) == (START + LEVELS[1] + 1) // 2
+    assert next_level([(START, 50.0)], wanted=100.0, rise=flat) == (LEVELS[0] - 1 + START) // 2
+    assert next_level([(START, 100.0)], wanted=50.0, rise=flat) == (START + LEVELS[1] + 1) // 2
 
 
 def test_second_level_tried_is_that_of_newton():
     # 10 voxels too many at -2 voxels a level
-    assert next_level([(START, 110.0)], 100.0, -2.0) == START + 5
+    assert next_level([(START, 110.0)], wanted=100.0, rise=-2.0) == START + 5
 
 
 def test_level_less_than_3_in_10_000_off_its_volume_is_kept():
-    assert next_level([(START, 100.01)], 100.0, -2.0) == START
+    assert next_level([(START, 100.01)], wanted=100.0, rise=-2.0) == START
 
 
 def test_between_levels_on_either_side_the_next_one_is_interpolated():
     # 30 of the 40 voxels between them: three quarters of the way
-    assert next_level([(1000, 130.0), (1100, 90.0)], 100.0, -2.0) == 1075
+    assert next_level([(1000, 130.0), (1100, 90.0)], wanted=100.0, rise=-2.0) == 1075
 
 
 def test_two_levels_on_one_side_are_continued_along_their_secant():
     # From (1050, 190) to (1100, 180) the volume falls by 0.2 a level: 80 more are 400 levels on.
-    assert next_level([(0, 300.0), (1050, 190.0), (1100, 180.0)], 100.0, -0.1) == 1500
+    assert next_level([(0, 300.0), (1050, 190.0), (1100, 180.0)], wanted=100.0, rise=-0.1) == 1500
     # From (1050, 50) to (1000, 60), the two best, it rises by 0.2 a level: 40 more are 200 levels back.
-    assert next_level([(1000, 60.0), (1050, 50.0), (1200, 40.0)], 100.0, -0.1) == 800
+    assert next_level([(1000, 60.0), (1050, 50.0), (1200, 40.0)], wanted=100.0, rise=-0.1) == 800
 
 
 def test_secant_flatter_than_a_tenth_of_the_expected_slope_is_not_followed():
     # 80 voxels at a tenth of 2 voxels a level
-    assert next_level([(1050, 180.001), (1100, 180.0)], 100.0, -2.0) == 1100 + 400
+    assert next_level([(1050, 180.001), (1100, 180.0)], wanted=100.0, rise=-2.0) == 1100 + 400
 
 
 def test_interpolated_level_keeps_a_tenth_of_the_way_from_either_end():
-    assert next_level([(1000, 100.1), (1100, 0.0)], 100.0, -2.0) == 1010  # the first is all but right
-    assert next_level([(1000, 1100.0), (1100, 99.9)], 100.0, -2.0) == 1090
+    assert next_level([(1000, 100.1), (1100, 0.0)], wanted=100.0, rise=-2.0) == 1010  # the first is all but right
+    assert next_level([(1000, 1100.0), (1100, 99.9)], wanted=100.0, rise=-2.0) == 1090
 
 
 def test_best_level_is_kept_between_neighbours_and_at_the_highest():
-    assert next_level([(1000, 120.0), (1001, 90.0)], 100.0, -2.0) == 1001
-    assert next_level([(LEVELS[1], 120.0)], 100.0, -2.0) == LEVELS[1]
+    assert next_level([(1000, 120.0), (1001, 90.0)], wanted=100.0, rise=-2.0) == 1001
+    assert next_level([(LEVELS[1], 120.0)], wanted=100.0, rise=-2.0) == LEVELS[1]
 
 
 def test_best_level_is_kept_after_the_most_trials():
     trials = [(1000 + number, 120.0) for number in range(MOST_TRIALS - 1)] + [(1500, 110.0)]
-    assert next_level(trials, 100.0, -2.0) == 1500
-    assert next_level(trials[1:], 100.0, -2.0) != 1500  # one trial less
+    assert next_level(trials, wanted=100.0, rise=-2.0) == 1500
+    assert next_level(trials[1:], wanted=100.0, rise=-2.0) != 1500  # one trial less
 
 
 def row(*numbers: int) -> np.ndarray:

@@ -105,7 +105,7 @@ def test_map_that_is_missing_is_not_called_large(tmp_path: Path) -> None:
 
 
 def test_large_map_of_8_times_the_voxels_of_its_scan_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("clrecon.labels.reader.LARGE_BYTES", 100)
+    monkeypatch.setattr("clrecon.labels.reader.LARGE_BYTES", 100)  # the map has 1,024 bytes
     path = write_map_of_16_slices(tmp_path / "a.nii.gz")
     scan_of_2_slices = Volume(np.zeros((2, 8, 8), np.int16), np.eye(4))
     assert clrecon.read_labels(path, volume=scan_of_2_slices).numbers == (1,)
@@ -114,7 +114,7 @@ def test_large_map_of_8_times_the_voxels_of_its_scan_is_read(tmp_path: Path, mon
 def test_large_map_of_16_times_the_voxels_of_its_scan_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("clrecon.labels.reader.LARGE_BYTES", 100)
+    monkeypatch.setattr("clrecon.labels.reader.LARGE_BYTES", 100)  # the map has 1,024 bytes
     path = write_map_of_16_slices(tmp_path / "a.nii.gz")
     scan_of_1_slice = Volume(np.zeros((1, 8, 8), np.int16), np.eye(4))
     with refused(RefusedInputError, 16, "times"):
