@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from refusals import refused
@@ -12,43 +14,96 @@ from clrecon.rendering.pictures.sheets import LEAST_TILE, lay_out, write_on_tile
 pytestmark = pytest.mark.unit
 
 
-@pytest.mark.parametrize("count", [1, 2, 7, 20, 31])
-@pytest.mark.parametrize("mm", [(400.0, 400.0), (500.0, 200.0), (100.0, 380.0)])
-@pytest.mark.parametrize("size", [(1600, 1200), (900, 1400)])
+of_many_sheets = [
+    pytest.mark.parametrize("count", [1, 2, 7, 20, 31]),
+    pytest.mark.parametrize("mm", [(400.0, 400.0), (500.0, 200.0), (100.0, 380.0)], ids=["square", "wide", "tall"]),
+    pytest.mark.parametrize("size", [(1600, 1200), (900, 1400)], ids=["landscape", "portrait"]),
+]
+
+
+def of_each_sheet(test: Callable[..., None]) -> Callable[..., None]:
+    for mark in of_many_sheets:
+        test = mark(test)
+    return test
+
+
+@of_each_sheet
 def test_tiles_lie_side_by_side_within_the_picture(count: int, mm: tuple[float, float], size: tuple[int, int]) -> None:
     layout = lay_out(count, mm, size)
+
     width, height = layout.tile
-    taken = np.zeros(size[::-1], int)
+    taken = np.zeros((size[1] + height, size[0] + width), int)  # with room for tiles that would stick out
     for left, top in layout.corners:
-        assert 0 <= left <= size[0] - width and 0 <= top <= size[1] - height
         taken[top : top + height, left : left + width] += 1
-    assert len(layout.corners) == count and taken.max() == 1
-    assert width * layout.pixel_mm == pytest.approx(mm[0], rel=0.02)
-    assert height * layout.pixel_mm == pytest.approx(mm[1], rel=0.02)
+    assert taken[: size[1], : size[0]].sum() == taken.sum() == count * width * height
+    assert taken.max() == 1
 
 
-def test_tiles_are_as_large_as_they_can_be_and_zoom_shows_less_of_them() -> None:
-    assert lay_out(4, (100.0, 100.0), (402, 402)).tile == (200, 200)
-    assert lay_out(4, (100.0, 100.0), (402, 402), 2.0).pixel_mm == pytest.approx(0.25)
-    assert list(lay_out(3, (100.0, 100.0), (402, 402)).corners) == [(0, 0), (202, 0), (0, 202)]
+@of_each_sheet
+def test_tiles_show_the_whole_slice(count: int, mm: tuple[float, float], size: tuple[int, int]) -> None:
+    layout = lay_out(count, mm, size)
+
+    shown = [pixels * layout.pixel_mm for pixels in layout.tile]
+    assert shown == pytest.approx(mm, rel=0.02)  # to the whole pixel, of tiles of 50 pixels and more
 
 
-def test_too_many_slices_are_refused() -> None:
+def test_tiles_are_as_large_as_they_can_be_two_pixels_apart() -> None:
+    layout = lay_out(4, (100.0, 100.0), (402, 402))
+
+    assert layout.tile == (200, 200)  # two tiles and the gap fill 402 pixels
+    assert list(layout.corners) == [(0, 0), (202, 0), (0, 202), (202, 202)]
+
+
+def test_zoom_of_two_halves_the_mm_of_a_pixel() -> None:
+    layout = lay_out(4, (100.0, 100.0), (402, 402), 2.0)
+
+    assert layout.pixel_mm == pytest.approx(100.0 / 200 / 2.0)
+
+
+def test_last_row_of_tiles_starts_at_the_left() -> None:
+    layout = lay_out(3, (100.0, 100.0), (402, 402))
+
+    assert list(layout.corners) == [(0, 0), (202, 0), (0, 202)]
+
+
+def test_slices_that_would_be_smaller_than_the_least_tile_are_refused() -> None:
     with refused(UsageError, 500, 640, 480, LEAST_TILE):
         lay_out(500, (100.0, 100.0), (640, 480))
 
 
-def test_the_longest_text_that_fits_is_written_and_small_tiles_have_no_letters() -> None:
-    edges = {"left": "R", "right": "L", "top": "A", "bottom": "P"}
+EDGES = {"left": "R", "right": "L", "top": "A", "bottom": "P"}
+LONG, SHORT = "34: z -612.5 mm", "-612.5"
+LARGE, SMALL = 200, 70  # pixels: LONG and the letters fit on the large tile alone
 
-    def inked(side: int, texts: tuple[str, ...]) -> np.ndarray:
-        blank = np.zeros((side, side, 4), np.uint8)
-        made = write_on_tile(blank, texts, edges)
-        assert not blank.any() and made.shape == blank.shape
-        return np.asarray(made[..., 3] > 0)
 
-    long, short = "34: z -612.5 mm", "-612.5"
-    large, small = inked(200, (long, short)), inked(70, (long, short))
-    assert large[:30].any() and large[80:120, :30].any() and large[80:120, -30:].any()
-    assert small[:20].any() and not small[25:].any()
-    assert np.array_equal(small, inked(70, (short,))) and not np.array_equal(large, inked(200, (short,)))
+def inked(side: int, texts: tuple[str, ...]) -> np.ndarray:
+    """Where texts and the letters of the edges are written on an empty tile of so many pixels."""
+    return np.asarray(write_on_tile(np.zeros((side, side, 4), np.uint8), texts, EDGES)[..., 3] > 0)
+
+
+def test_small_tile_carries_the_shorter_text_where_the_longer_does_not_fit() -> None:
+    assert np.array_equal(inked(SMALL, (LONG, SHORT)), inked(SMALL, (SHORT,)))
+    assert inked(SMALL, (SHORT,))[:20].any()
+
+
+def test_large_tile_carries_the_longest_text() -> None:
+    assert np.array_equal(inked(LARGE, (LONG, SHORT)), inked(LARGE, (LONG,)))
+    assert not np.array_equal(inked(LARGE, (LONG, SHORT)), inked(LARGE, (SHORT,)))
+
+
+@pytest.mark.parametrize("columns", [slice(0, 30), slice(-30, None)], ids=["left", "right"])
+def test_large_tile_has_the_letters_of_its_edges(columns: slice) -> None:
+    assert inked(LARGE, (SHORT,))[80:120, columns].any()
+
+
+def test_small_tile_has_no_letters() -> None:
+    assert not inked(SMALL, (SHORT,))[25:].any()
+
+
+def test_tile_that_is_written_on_is_left_as_it_was() -> None:
+    blank = np.zeros((LARGE, LARGE, 4), np.uint8)
+
+    made = write_on_tile(blank, (SHORT,), EDGES)
+
+    assert not blank.any()
+    assert made.shape == blank.shape

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import re
+from collections.abc import Callable
 from dataclasses import FrozenInstanceError, fields, replace
 from typing import Any, get_args
 
@@ -36,6 +37,7 @@ from clrecon.system.arguments import ModeName, PresetName, ViewName, WindowName
 GLASS = TransferFunction([(0, 1, 1, 1, 0.1), (500, 1, 1, 1, 0.4)])
 LABELS = LabelMap(np.array([[[0, 1], [2, 2]]], np.uint8), np.eye(4), {1: "L1", 2: "L2"})
 TWO = np.array([1.0, 2.0])
+LONGEST_REFUSAL = 400  # characters, some four lines of a terminal
 LINE = [(0.0, 0.0, 0.0), (0.0, 0.0, 9.0)]
 
 Wrong = dict[str, list[tuple[Any, str | None]]]
@@ -130,68 +132,147 @@ EVERY_WRONG = [
 ]
 
 
-def test_every_field_of_every_style_is_tried() -> None:
+def test_table_of_wrong_values_has_every_style() -> None:
     assert {mode.style for mode in MODES.values()} == set(WRONG)
-    for style, wrong in WRONG.items():
-        assert {own.name for own in fields(style)} == set(wrong)
-        assert {own.name for own in fields(style) if "check" not in own.metadata} == set()
+
+
+@pytest.mark.parametrize("style", WRONG)
+def test_table_of_wrong_values_has_every_field_of_a_style(style: type[Style]) -> None:
+    assert {own.name for own in fields(style)} == set(WRONG[style])
+
+
+@pytest.mark.parametrize("style", WRONG)
+def test_every_field_of_a_style_has_a_check(style: type[Style]) -> None:
+    assert [own.name for own in fields(style) if "check" not in own.metadata] == []
 
 
 @pytest.mark.parametrize(("style", "name", "value", "says"), EVERY_WRONG)
-def test_impossible_values_are_refused_when_a_style_is_made(
+def test_impossible_value_is_refused_in_one_short_line_when_a_style_is_made(
     style: type[Style], name: str, value: Any, says: str
 ) -> None:
     with pytest.raises(UsageError) as error:
         style(**{name: value})
-    assert says in str(error.value)
-    assert "\n" not in str(error.value) and len(str(error.value)) < 400
-    with pytest.raises(UsageError):
-        replace(style(), **{name: value})
+
+    said = str(error.value)
+    assert says in said
+    assert "\n" not in said
+    assert len(said) < LONGEST_REFUSAL
+
+
+@pytest.mark.parametrize(("style", "name", "value", "says"), EVERY_WRONG)
+def test_impossible_value_is_refused_when_a_style_is_replaced(
+    style: type[Style], name: str, value: Any, says: str
+) -> None:
+    made = style()
+
+    with pytest.raises(UsageError) as error:
+        replace(made, **{name: value})
+
+    said = str(error.value)
+    assert says in said
+
+
+def clipped_where_it_can_be(style: type[Style]) -> Style:
+    options: dict[str, Any] = {"clip": Clip.box((0, 0, 0), (9, 9, 9))} if "clip" in WRONG[style] else {}
+    return style(**options)
 
 
 @pytest.mark.parametrize("style", WRONG)
-def test_styles_do_not_change_and_travel(style: type[Style]) -> None:
-    options: dict[str, Any] = {"clip": Clip.box((0, 0, 0), (9, 9, 9))} if "clip" in WRONG[style] else {}
-    made = style(**options)
-    with pytest.raises(FrozenInstanceError):
+def test_style_does_not_change(style: type[Style]) -> None:
+    made = clipped_where_it_can_be(style)
+
+    with pytest.raises(FrozenInstanceError, match=fields(style)[0].name):
         setattr(made, fields(style)[0].name, None)
-    for other in (pickle.loads(pickle.dumps(made)), copy.deepcopy(made), replace(made)):
-        assert type(other) is style and other == made
 
 
-def test_fields_of_a_style_that_exclude_each_other_are_refused() -> None:
-    with refused(UsageError, "window", "function"):
-        SlicesInSpace(window=(0, 9), transfer_function=GLASS)
-    with refused(UsageError, "angle", "pictures", 5.0):
-        CurveCut(LINE, kind="stretched", angle=5.0)
-    with refused(UsageError, "colour", "coloured"):
-        PointLook(color="red", color_by="hu")
-    for look in ({"color": "red"}, {"color_by": "label"}):
-        with refused(UsageError, "colour", "points", "color_by"):
-            PointLook(window=(0, 1), **look)
-    with refused(UsageError, "L2", 2):
-        VolumeLook(labels=LABELS, label_colors={"L2": "red", 2: "blue"})
-    with refused(UsageError, "L9", "L2"):
-        SurfaceLook(labels=LABELS, label_opacity={"L9": 0.5})
+COPIES: dict[str, Callable[[Style], Style]] = {
+    "pickled": lambda made: pickle.loads(pickle.dumps(made)),
+    "copied": copy.deepcopy,
+    "replaced": replace,
+}
 
 
-def test_fields_are_brought_to_one_form() -> None:
+@pytest.mark.parametrize("style", WRONG)
+@pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)
+def test_copy_of_a_style_equals_it(style: type[Style], copied: Callable[[Style], Style]) -> None:
+    made = clipped_where_it_can_be(style)
+
+    other = copied(made)
+
+    assert type(other) is style
+    assert other == made
+
+
+EXCLUDED: dict[str, tuple[Callable[[], Style], list[Any]]] = {
+    "a window and a function": (
+        lambda: SlicesInSpace(window=(0, 9), transfer_function=GLASS), ["window", "function"],
+    ),
+    "an angle of a stretched curve": (
+        lambda: CurveCut(LINE, kind="stretched", angle=5.0), ["angle", "pictures", 5.0],
+    ),
+    "a colour and a quantity": (lambda: PointLook(color="red", color_by="hu"), ["colour", "coloured"]),
+    "a window and a colour": (lambda: PointLook(window=(0, 1), color="red"), ["colour", "points", "color_by"]),
+    "a window and labels": (lambda: PointLook(window=(0, 1), color_by="label"), ["colour", "points", "color_by"]),
+    "a label twice": (lambda: VolumeLook(labels=LABELS, label_colors={"L2": "red", 2: "blue"}), ["L2", 2]),
+    "an unknown label": (lambda: SurfaceLook(labels=LABELS, label_opacity={"L9": 0.5}), ["L9", "L2"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "says"), EXCLUDED.values(), ids=EXCLUDED)
+def test_fields_of_a_style_that_exclude_each_other_are_refused(make: Callable[[], Style], says: list[Any]) -> None:
+    with refused(UsageError, *says):
+        make()
+
+
+def test_window_becomes_two_floats() -> None:
     assert Projection(window=[np.float32(-100), 300]).window == (-100.0, 300.0)
+
+
+def test_slices_become_ascending_whole_numbers() -> None:
     assert SlicesInSpace(np.array([7, 3])).slices == (3, 7)
-    assert SurfaceLook(300).iso_value == 300.0
+
+
+def test_iso_value_becomes_a_float() -> None:
+    assert isinstance(SurfaceLook(300).iso_value, float)
+
+
+def test_switch_of_numpy_becomes_a_bool() -> None:
     assert SurfaceLook(shadows=np.bool_(False)).shadows is False
-    assert CurveCut(LINE).curve.length == pytest.approx(9.0)  # type: ignore[union-attr]
 
 
-def test_style_resolves_function_light_and_labels() -> None:
-    assert VolumeLook().function is find_preset("bone").transfer_function
-    assert VolumeLook(GLASS).function is GLASS
-    assert VolumeLook().light == find_preset("bone").lighting
-    assert VolumeLook(GLASS).light == SurfaceLook().light == Lighting()
-    assert VolumeLook(lighting=Lighting(ambient=1.0)).light.ambient == 1.0
+def test_points_of_a_curve_become_a_line_of_their_length() -> None:
+    style = CurveCut(LINE)
+
+    assert style.curve.length == pytest.approx(9.0)  # type: ignore[union-attr]  # LINE runs from z = 0 to 9 mm
+
+
+def test_volume_without_a_function_is_drawn_as_bone() -> None:
+    style = VolumeLook()
+
+    assert style.function is find_preset("bone").transfer_function
+    assert style.light == find_preset("bone").lighting
+
+
+def test_volume_of_a_function_is_drawn_with_it_in_the_light_of_surfaces() -> None:
+    style = VolumeLook(GLASS)
+
+    assert style.function is GLASS
+    assert style.light == SurfaceLook().light == Lighting()
+
+
+def test_lighting_of_a_volume_takes_the_place_of_that_of_its_preset() -> None:
+    assert VolumeLook(lighting=Lighting(ambient=1.0)).light == Lighting(ambient=1.0)
+
+
+def test_volume_without_labels_has_no_label_style() -> None:
     assert VolumeLook().label_style is None
+
+
+def test_opacity_of_a_label_is_that_asked_for_and_of_the_others_one() -> None:
     style = SurfaceLook(labels=LABELS, label_colors={}, label_opacity={"L1": 0.25}).label_style
-    assert style is not None and style.table[:, 3].tolist() == [1.0, 0.25, 1.0]
+
+    assert style is not None
+    assert style.table[:, 3].tolist() == [1.0, 0.25, 1.0]  # the background, L1 and L2
 
 
 ASKED: dict[str, tuple[dict[str, Any], Style]] = {
@@ -228,11 +309,12 @@ ASKED: dict[str, tuple[dict[str, Any], Style]] = {
 }
 
 
-@pytest.mark.parametrize("name", ASKED)
-def test_names_and_keywords_come_to_a_style(name: str) -> None:
-    look, expected = ASKED[name]
-    assert make_style(**look) == expected
-    assert make_style(**look).mode == expected.mode
+@pytest.mark.parametrize(("look", "expected"), ASKED.values(), ids=ASKED)
+def test_names_and_keywords_come_to_the_style_that_they_ask_for(look: dict[str, Any], expected: Style) -> None:
+    made = make_style(**look)
+
+    assert made == expected
+    assert made.mode == expected.mode
 
 
 @pytest.mark.parametrize(
@@ -259,38 +341,69 @@ def test_names_and_keywords_that_cannot_be_are_refused(look: dict[str, Any], say
     assert says in str(error.value)
 
 
-def test_style_is_found_by_object_or_name_and_takes_no_other_keywords() -> None:
+def test_style_is_found_as_it_is() -> None:
     style = SurfaceLook()
+
     assert find_style(style, {}) is style
+
+
+def test_style_is_found_by_the_name_of_its_mode_and_keywords() -> None:
     assert find_style("mip", {"window": (1, 2)}) == Projection(window=(1.0, 2.0))
+
+
+def test_style_is_found_by_its_keywords_alone() -> None:
     assert find_style(None, {"mode": "mip"}) == Projection()
+
+
+def test_keywords_beside_a_style_are_refused() -> None:
     with refused(UsageError, "color", "preset"):
-        find_style(style, {"color": "red", "preset": "bone"})
+        find_style(SurfaceLook(), {"color": "red", "preset": "bone"})
+
+
+def test_mode_beside_another_mode_is_refused() -> None:
     with refused(UsageError, "mip", "dvr"):
         find_style("mip", {"mode": "dvr"})
 
 
-def test_keywords_of_pictures_are_fields_of_their_styles() -> None:
+def test_kind_of_a_curve_has_the_keyword_cpr() -> None:
     assert keywords_of("cpr")["cpr"] == "kind"
-    for mode, kind in MODES.items():
-        assert set(keywords_of(mode).values()) == {own.name for own in fields(kind.style)}
-    check_known("mip", "values")
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_keywords_of_a_mode_are_the_fields_of_its_style(mode: str) -> None:
+    assert set(keywords_of(mode).values()) == {own.name for own in fields(MODES[mode].style)}
+
+
+def test_keyword_of_no_mode_is_refused_with_those_that_are_known() -> None:
     with refused(UsageError, "clip_box", "mode"):
         check_known("cpr", "clip", "clip_box")
 
 
-def test_the_typed_keywords_of_render_are_those_of_all_styles_with_the_types_of_their_fields():
-    def parts(annotation: str) -> set[str]:
-        return {part.strip() for part in re.sub(r"Literal\[(.*?)\]", r"\1", annotation).replace(",", "|").split("|")}
+def parts_of_type(annotation: object) -> set[str]:
+    """The alternatives of a type as it is written, beside None."""
+    written = str(getattr(annotation, "__forward_arg__", annotation))
+    flat = re.sub(r"Literal\[(.*?)\]", r"\1", written).replace(",", "|")
+    return {part.strip() for part in flat.split("|")} - {"None"}
 
-    typed = {name: parts(str(getattr(each, "__forward_arg__", each))) for name, each in Look.__annotations__.items()}
-    fields_of: dict[str, set[str]] = {}
+
+def test_typed_keywords_of_render_are_those_of_all_styles_with_the_types_of_their_fields() -> None:
+    asked: dict[str, set[str]] = {}
     for mode in MODES.values():
         for own in fields(mode.style):
-            fields_of.setdefault(own.metadata.get("keyword", own.name), set()).update(parts(str(own.type)))
-    beside = {"mode": {"ModeName", "None"}, "preset": {"PresetName", "None"}}
-    assert {name: each | {"None"} for name, each in typed.items()} == {
-        name: each | {"None"} for name, each in (fields_of | beside).items()
-    }
-    assert get_args(ModeName) == tuple(MODES) and get_args(PresetName) == tuple(PRESETS)
-    assert get_args(WindowName) == tuple(WINDOWS) and {*DIRECTIONS, *PLANES} == set(get_args(ViewName))
+            asked.setdefault(own.metadata.get("keyword", own.name), set()).update(parts_of_type(own.type))
+
+    of_every_mode = {"mode": {"ModeName"}, "preset": {"PresetName"}}
+    assert {name: parts_of_type(each) for name, each in Look.__annotations__.items()} == asked | of_every_mode
+
+
+NAMES: dict[str, tuple[Any, set[str]]] = {
+    "modes": (ModeName, set(MODES)),
+    "presets": (PresetName, set(PRESETS)),
+    "windows": (WindowName, set(WINDOWS)),
+    "views": (ViewName, {*DIRECTIONS, *PLANES}),
+}
+
+
+@pytest.mark.parametrize(("typed", "known"), NAMES.values(), ids=NAMES)
+def test_typed_names_are_those_that_are_known(typed: Any, known: set[str]) -> None:
+    assert set(get_args(typed)) == known
