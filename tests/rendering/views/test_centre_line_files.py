@@ -42,18 +42,29 @@ FILES = {
 }
 
 
-@pytest.mark.parametrize("name", FILES)
-def test_all_kinds_of_files_give_the_points(tmp_path, name):
-    (tmp_path / name).write_text(FILES[name], encoding="utf-8")
+@pytest.mark.parametrize(("name", "text"), FILES.items(), ids=FILES)
+def test_file_of_every_kind_gives_its_points_in_lps(tmp_path, name, text):
+    (tmp_path / name).write_text(text, encoding="utf-8")
+
     assert np.array_equal(read_curve_points(tmp_path / name), POINTS)
 
 
-def test_the_frame_of_a_text_is_what_one_says(tmp_path):
+def test_frame_of_a_text_is_the_one_that_is_said(tmp_path):
     (tmp_path / "ras.txt").write_text(rows(RAS, " "))
+
     assert np.array_equal(read_curve_points(tmp_path / "ras.txt", "ras"), POINTS)
+
+
+def test_frame_other_than_that_of_the_file_is_refused(tmp_path):
     (tmp_path / "said.mrk.json").write_text(json.dumps(markups(POINTS)))
+
     with refused(UsageError, "LPS", "RAS"):
         read_curve_points(tmp_path / "said.mrk.json", "ras")
+
+
+def test_unknown_frame_is_refused(tmp_path):
+    (tmp_path / "ras.txt").write_text(rows(RAS, " "))
+
     with refused(UsageError, "lps", "ras"):
         read_curve_points(tmp_path / "ras.txt", "world")
 
@@ -82,16 +93,24 @@ def test_the_frame_of_a_text_is_what_one_says(tmp_path):
         ("a.fcsv", FCSV.format("LPS") + "a,1,2,3\nb,4,5\n", "line 5"),
     ],
 )
-def test_what_holds_no_points_is_refused(tmp_path, name, text, says):
+def test_file_that_holds_no_points_is_refused_with_the_place_of_its_fault(tmp_path, name, text, says):
     (tmp_path / name).write_text(text)
     with pytest.raises(RefusedInputError, match=says):
         read_curve_points(tmp_path / name)
 
 
-def test_files_that_cannot_be_read_are_refused(tmp_path):
+def test_file_that_is_no_text_is_refused(tmp_path):
     (tmp_path / "bytes.txt").write_bytes(b"\xff\xfe\x00")
-    for name, says in [("bytes.txt", "no text"), (".", "cannot be read")]:
-        with pytest.raises(RefusedInputError, match=says):
-            read_curve_points(tmp_path / name)
+
+    with pytest.raises(RefusedInputError, match="no text"):
+        read_curve_points(tmp_path / "bytes.txt")
+
+
+def test_folder_of_points_is_refused(tmp_path):
+    with pytest.raises(RefusedInputError, match="cannot be read"):
+        read_curve_points(tmp_path)
+
+
+def test_absent_file_of_points_is_refused(tmp_path):
     with pytest.raises(UsageError, match=r"there is no file .*/"):
         read_curve_points(tmp_path / "absent.txt")
