@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 from tolerances import BENT_WAY, COLOR_SPACE_WAY, FLOAT64_SHARE
 
 from clrecon.errors import UsageError
@@ -118,12 +119,12 @@ def test_grey_property_of_vtk_without_shading_is_read() -> None:
 
 def test_property_of_vtk_without_points_is_refused() -> None:
     empty = make_property(vtk_data.vtkPiecewiseFunction(), vtk_core.vtkColorTransferFunction())
-    with pytest.raises(UsageError, match="its colour function has no points"):
+    with refused(UsageError, "colour", "points"):
         TransferFunction.from_vtk(empty)
 
 
 def test_text_in_place_of_a_property_of_vtk_is_refused() -> None:
-    with pytest.raises(UsageError, match="no vtkVolumeProperty"):
+    with refused(UsageError, "vtkVolumeProperty"):
         TransferFunction.from_vtk("bone")
 
 
@@ -136,7 +137,7 @@ def test_text_in_place_of_a_property_of_vtk_is_refused() -> None:
     ids=["from VTK", "to VTK"],
 )
 def test_mean_spacing_that_is_no_length_is_refused(convert) -> None:
-    with pytest.raises(UsageError, match="mean spacing of a volume is a length"):
+    with refused(UsageError, "spacing", "length"):
         convert()
 
 

@@ -160,16 +160,15 @@ def test_impossible_value_is_refused_in_one_short_line_when_a_style_is_made(
 
 
 @pytest.mark.parametrize(("style", "name", "value", "says"), EVERY_WRONG)
-def test_impossible_value_is_refused_when_a_style_is_replaced(
+def test_impossible_value_is_refused_in_the_same_words_when_a_style_is_replaced(
     style: type[Style], name: str, value: Any, says: str
 ) -> None:
-    made = style()
+    with pytest.raises(UsageError) as making:
+        style(**{name: value})
+    with pytest.raises(UsageError) as replacing:
+        replace(style(), **{name: value})
 
-    with pytest.raises(UsageError) as error:
-        replace(made, **{name: value})
-
-    said = str(error.value)
-    assert says in said
+    assert replacing.value.args == making.value.args
 
 
 def clipped_where_it_can_be(style: type[Style]) -> Style:
@@ -181,7 +180,7 @@ def clipped_where_it_can_be(style: type[Style]) -> Style:
 def test_style_does_not_change(style: type[Style]) -> None:
     made = clipped_where_it_can_be(style)
 
-    with pytest.raises(FrozenInstanceError, match=fields(style)[0].name):
+    with refused(FrozenInstanceError, fields(style)[0].name):
         setattr(made, fields(style)[0].name, None)
 
 

@@ -137,7 +137,7 @@ def test_picture_of_a_view_that_shows_nothing_is_empty(open_model_and_painter):
 def test_mesh_of_a_view_that_shows_nothing_is_refused(open_model_and_painter):
     model, painter = open_model_and_painter()
     model.show("1", False)
-    with pytest.raises(NoSurfaceError, match="nothing"):
+    with refused(NoSurfaceError, "nothing"):
         painter.mesh_of_shown(model.state)
 
 

@@ -202,12 +202,12 @@ def test_view_of_labels_alone_is_in_its_one_mode():
 
 @pytest.mark.parametrize("change", [lambda m: m.set_iso(200.0), lambda m: m.set_table(False)], ids=["iso", "table"])
 def test_change_of_a_scan_in_a_view_without_one_is_refused(change):
-    with pytest.raises(UsageError, match="no scan"):
+    with refused(UsageError, "scan"):
         change(make_model(scenes.make_mesh()))
 
 
 def test_view_without_objects_is_refused():
-    with pytest.raises(UsageError, match="nothing to show"):
+    with refused(UsageError, "nothing", "show"):
         ViewModel([])
 
 
