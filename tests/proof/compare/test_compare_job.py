@@ -107,23 +107,50 @@ def _first_device() -> str | None:
 
 @pytest.mark.release
 @pytest.mark.long
-def test_every_method_has_its_row_and_its_picture(device: Any, whole: Path) -> None:
+def test_methods_of_a_comparison_have_the_figures_that_follow_from_their_algorithms(device: Any, whole: Path) -> None:
     report = read_report(whole)
     assert {m["name"]: m["error"] for m in report["methods"]} == dict.fromkeys(COMPARED)
     truth = {m["name"]: m["truth"]["scatter_mm"] for m in report["methods"] if m["makes"] == "mesh"}
-    assert truth["t-mc"] < 0.05 < truth["i-mc-golden"]
+    assert truth["t-mc"] < 0.05 < truth["i-mc-golden"]  # vertices at the golden section lie beside the ball
     rows = {m["name"]: m for m in report["methods"]}
     assert rows["t-mc"]["triangles"] == rows["vtk-fe"]["triangles"] == rows["t-mc-soup"]["triangles"]
-    assert rows["g-mc"]["triangles"] < 0.2 * rows["t-mc"]["triangles"]
-    assert rows["t-mc-soup"]["surfaces"]["max_mm"] < 1e-4
+    assert rows["g-mc"]["triangles"] < 0.2 * rows["t-mc"]["triangles"]  # cells of two voxels, and more
+    assert rows["t-mc-soup"]["surfaces"]["max_mm"] < 1e-4  # float32
     assert rows["t-mc"]["cells"]["dice"] == rows["vtk-mc"]["cells"]["dice"] == 1.0
     assert rows["i-mc"]["cells_visited"] < rows["i-mc"]["cells_all"] == rows["t-mc"]["cells_visited"]
     assert rows["i-mc-golden"]["slices"]["dice"] < rows["i-mc"]["slices"]["dice"] - 0.01
-    assert rows["t-mc-soup"]["pictures"]["mse"] < 1e-3 and rows["t-mc-soup"]["pictures"]["ssim"] > 0.9999
-    assert rows["cloud"]["points"] and rows["cloud"]["points_mm"]["to_reference_mm"]["mean"] > 0.0
-    assert all(m["memory_bytes"] > 3e7 and m["first_s"] > 0 and m["warm_s"] > 0 for m in report["methods"])
-    for method in report["methods"]:
-        assert (whole / method["picture"]).read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.release
+@pytest.mark.long
+def test_triangle_soup_of_a_surface_has_the_picture_of_the_surface(device: Any, whole: Path) -> None:
+    [soup] = [m for m in read_report(whole)["methods"] if m["name"] == "t-mc-soup"]
+    assert soup["pictures"]["mse"] < 1e-3
+    assert soup["pictures"]["ssim"] > 0.9999
+
+
+@pytest.mark.release
+@pytest.mark.long
+def test_cloud_of_a_comparison_has_points_and_their_distance_from_the_reference(device: Any, whole: Path) -> None:
+    [cloud] = [m for m in read_report(whole)["methods"] if m["name"] == "cloud"]
+    assert cloud["points"] > 0
+    assert cloud["points_mm"]["to_reference_mm"]["mean"] > 0.0
+
+
+@pytest.mark.release
+@pytest.mark.long
+@pytest.mark.parametrize("name", COMPARED)
+def test_method_of_a_comparison_has_its_times_memory_and_picture(name: str, device: Any, whole: Path) -> None:
+    [method] = [m for m in read_report(whole)["methods"] if m["name"] == name]
+    assert method["first_s"] > 0
+    assert method["warm_s"] > 0
+    assert method["memory_bytes"] > 3e7  # Python and numpy
+    assert (whole / method["picture"]).read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.release
+@pytest.mark.long
+def test_folder_of_a_comparison_has_its_pictures_of_slices(device: Any, whole: Path) -> None:
     assert {path.name for path in whole.iterdir()} >= {"slice-k.png", "slice-k-detail.png", "slice-i.png"}
 
 
@@ -152,7 +179,7 @@ def test_page_of_a_comparison_has_all_its_pictures_within_and_is_valid_html(devi
 
 @pytest.mark.release
 @pytest.mark.long
-def test_numbers_of_the_page_are_those_of_the_report(device: Any, whole: Path) -> None:
+def test_table_of_the_page_has_the_numbers_of_the_report(device: Any, whole: Path) -> None:
     report = read_report(whole)
     check = PageCheck((whole / "index.html").read_text(encoding="utf-8"))
     table = {row[0]: row[1:] for row in check.tables[0] if len(row) > 2}
@@ -169,7 +196,7 @@ def test_numbers_of_the_page_are_those_of_the_report(device: Any, whole: Path) -
 
 @pytest.mark.release
 @pytest.mark.long
-def test_the_paper_is_compared_with_controls(device: Any, whole: Path) -> None:
+def test_methods_are_compared_with_the_paper_and_with_control_pictures(device: Any, whole: Path) -> None:
     paper = read_report(whole)["paper"]
     assert list(paper["controls"]) == ["black", "white", "noise", "next", "shifted"]
     assert set(paper["methods"]) == {name for name in COMPARED if name != "rays-cpu"}
@@ -178,7 +205,7 @@ def test_the_paper_is_compared_with_controls(device: Any, whole: Path) -> None:
 
 @pytest.mark.release
 @pytest.mark.long
-def test_the_report_is_read_again_as_records(device: Any, whole: Path) -> None:
+def test_written_report_of_a_comparison_is_read_again_unchanged(device: Any, whole: Path) -> None:
     told = read_report(whole)
     told["methods"] = [MethodRecord(**method) for method in told["methods"]]
     report = CompareReport(**told)
@@ -193,7 +220,7 @@ def without_time(value: Any) -> Any:
 
 @pytest.mark.release
 @pytest.mark.long
-def test_only_times_and_memory_differ_between_runs(
+def test_two_comparisons_differ_in_times_and_memory_alone(
     device: Any, ball: Path, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     settings = CompareSettings(methods=("t-mc", "vtk-fe", "cloud"), repeat=1, device=str(device.index))
@@ -215,12 +242,16 @@ def test_only_times_and_memory_differ_between_runs(
         ("declined", ("vtk-mc",), 8), ("missing", ("vtk-mc",), 8), ("declined", ("skimage",), 0),
     ],
 )  # fmt: skip
-def test_a_method_that_nobody_named_may_decline(state: str, asked: tuple[str, ...], code: int) -> None:
+def test_only_a_failed_method_or_a_named_one_that_did_not_run_fails_the_comparison(
+    state: str, asked: tuple[str, ...], code: int
+) -> None:
     assert 8 * _is_missed({"name": "vtk-mc", "state": state}, asked) == code
 
 
 @pytest.mark.parametrize(("error", "state"), [(UsageError("no"), "declined"), (DeviceError("no"), "failed")])
-def test_a_refusal_is_no_failure(error: Exception, state: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_method_that_refuses_its_input_has_declined_and_one_without_a_device_has_failed(
+    error: Exception, state: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(folder: Path) -> Any:
         raise error
 
@@ -230,14 +261,16 @@ def test_a_refusal_is_no_failure(error: Exception, state: str, monkeypatch: pyte
 
 
 @pytest.mark.seconds
-def test_a_crash_and_a_missing_library_are_rows(
+def test_method_that_crashes_or_lacks_its_library_has_a_row_with_the_reason(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Printer
 ) -> None:
     run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.child", ONE_CRASHES)
     arguments = ["compare", str(ball), "-o", str(tmp_path / "r"), "--device", str(device.index), "--repeat", "1"]
     assert main([*arguments, "--methods", "skimage,vtk-mc,t-mc"]) == 8
     rows = {m["name"]: m for m in read_report(tmp_path / "r")["methods"]}
-    assert [rows[name]["state"] for name in ("t-mc", "skimage", "vtk-mc")] == ["done", "failed", "missing"]
+    assert {name: row["state"] for name, row in rows.items()} == {
+        "t-mc": "done", "skimage": "failed", "vtk-mc": "missing",
+    }  # fmt: skip
     assert "crashed with SIGABRT" in rows["skimage"]["error"]
     assert rows["vtk-mc"]["error"] == "vtkmodules is not installed"
     page = (tmp_path / "r" / "index.html").read_text()
@@ -247,7 +280,7 @@ def test_a_crash_and_a_missing_library_are_rows(
 
 
 @pytest.mark.release
-def test_without_its_reference_the_page_says_what_is_left(
+def test_page_without_its_reference_has_the_measures_that_need_none(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.child", ONE_CRASHES)
@@ -258,7 +291,7 @@ def test_without_its_reference_the_page_says_what_is_left(
     assert find_faults((tmp_path / "r" / "index.html").read_text()) == []
 
 
-def test_where_no_method_works_there_is_no_folder(
+def test_comparison_in_which_every_method_crashes_is_an_error_and_leaves_no_folder(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.child", NOBODY_TELLS)
@@ -269,7 +302,7 @@ def test_where_no_method_works_there_is_no_folder(
 
 
 @pytest.mark.release
-def test_measures_of_a_crashed_process_are_missing_with_a_reason(
+def test_measures_whose_process_crashes_are_missing_with_the_reason(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.judge", NOBODY_TELLS)
@@ -282,7 +315,7 @@ def test_measures_of_a_crashed_process_are_missing_with_a_reason(
 @pytest.mark.parametrize(
     ("hu", "words"), [(5000.0, "no surface at 5000 HU: the volume runs from"), (-3000.0, "every voxel is inside")]
 )
-def test_no_surface_is_said_before_any_method_runs(
+def test_iso_value_without_a_surface_is_refused_before_any_method_runs(
     hu: float, words: str, device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.child", NOBODY_TELLS)
@@ -318,7 +351,7 @@ def test_wrong_arguments_are_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_with_other_things_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_of_a_comparison_with_other_files_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CLRECON_DEVICE", "no such device")
     (tmp_path / "r").mkdir()
     (tmp_path / "r" / "notes.txt").write_text("mine")

@@ -58,7 +58,7 @@ def surface_of(volume: Volume, device: Any = None) -> Mesh:
     return clrecon.extract_isosurface(volume, 200, device=device)
 
 
-def test_a_ball_is_cut_in_a_circle(device: Any) -> None:
+def test_cut_of_a_ball_is_one_closed_circle(device: Any) -> None:
     volume = make_ball()
     plane = Plane("", 2, 14.2 + 4.0, 0, 1, False)
     lines = cut_mesh(surface_of(volume, device), volume, plane)
@@ -68,15 +68,20 @@ def test_a_ball_is_cut_in_a_circle(device: Any) -> None:
     assert (many == 2).all() and len(ends) == len(lines) > 50  # one closed line
 
 
-def test_planes_go_through_the_middle_and_show_the_voxels() -> None:
+def test_planes_of_a_comparison_go_through_the_middle_of_the_object() -> None:
     volume = make_ball(np.diag([1.0, 1.0, 1.0, 1.0]))
     planes, box = find_planes(volume, 200)
-    np.testing.assert_array_equal(box, [[7, 6, 5], [25, 24, 23]])
+    np.testing.assert_array_equal(box, [[7, 6, 5], [25, 24, 23]])  # corners about the ball, i, j, k
     assert [(plane.axis, int(plane.at), plane.flip) for plane in planes] == [(2, 14, False), (0, 16, True)]
-    grey = read_plane(volume, planes[1])
-    assert grey.shape == (28, 30)  # down along k, across along j
-    expected = 255 * ((1 - 0.487) * volume.voxels[:, :, 16] + 0.487 * volume.voxels[:, :, 17] + 200.0) / 1000.0
-    np.testing.assert_allclose(grey, np.clip(expected, 0, 255), atol=0.51)
+
+
+def test_grey_of_a_plane_is_interpolated_between_voxels_from_minus_200_to_800_hu() -> None:
+    volume = make_ball(np.diag([1.0, 1.0, 1.0, 1.0]))
+    plane = Plane("", 0, 16 + 0.487, 1, 2, True)
+    between = (1 - 0.487) * volume.voxels[:, :, 16] + 0.487 * volume.voxels[:, :, 17]
+    expected = 255 * (between + 200.0) / 1000.0  # down along k, across along j
+    rounding = 0.51
+    np.testing.assert_allclose(read_plane(volume, plane), np.clip(expected, 0, 255), atol=rounding)
 
 
 @pytest.mark.parametrize("affine", daily(1, [OBLIQUE, np.diag([-1.0, 1.0, 1.0, 1.0]) @ OBLIQUE]))
@@ -92,32 +97,45 @@ def test_peers_lie_where_the_scan_is_and_face_outward(name: str, affine: Any, de
     assert peer.report["cells"] == {"visited": 33 * 31 * 29, "all": 33 * 31 * 29}
 
 
-def test_a_peer_is_closed_where_the_object_leaves_the_volume(device: Any) -> None:
+def test_surface_of_vtk_is_closed_at_the_border_of_the_volume_on_request(device: Any) -> None:
     volume = make_ball(radius=20.0)
     assert extract_by_vtk(volume, 200, "vtk-fe", True).quality().closed
     assert not extract_by_vtk(volume, 200, "vtk-fe", False).quality().closed
 
 
-def test_the_camera_along_the_slices_sees_the_slice_pixel_for_pixel(device: Any) -> None:
+def draw_along_slices(volume: Volume, device: Any) -> Any:
+    """The picture of the surface of a volume by the camera that looks along its slices, a pixel for each voxel."""
     from clrecon.proof.compare.makers import draw_mesh
     from clrecon.rendering.views.camera import Camera
 
-    volume = make_ball(np.diag([0.8, 0.8, 1.0, 1.0]))
     along = along_slices(volume)
     size = tuple(along["size"])
-    assert size == (32, 30)
-    picture = draw_mesh(surface_of(volume, device), Camera(**along["camera"]), size, device=device)
-    drawn, inside = picture.max(axis=2) > 0, volume.voxels.max(axis=0) >= 200
-    assert (drawn != inside).mean() < 0.02
-    lopsided = volume.voxels.copy()
-    lopsided[:, :, 16:] = -1000
-    half = surface_of(Volume(lopsided, volume.affine), device)
-    drawn = draw_mesh(half, Camera(**along["camera"]), size, device=device).max(axis=2)
-    assert drawn[:, :14].any() and not drawn[:, 18:].any()
-    assert middle_slice(volume, size).shape == (30, 32)
+    return draw_mesh(surface_of(volume, device), Camera(**along["camera"]), size, device=device).max(axis=2) > 0
 
 
-def test_a_volume_and_a_mesh_arrive_as_they_were(tmp_path: Path, device: Any) -> None:
+def test_camera_along_the_slices_draws_a_pixel_for_each_column_of_voxels(device: Any) -> None:
+    volume = make_ball(np.diag([0.8, 0.8, 1.0, 1.0]))
+    drawn, inside = draw_along_slices(volume, device), volume.voxels.max(axis=0) >= 200
+    assert drawn.shape == inside.shape
+    assert (drawn != inside).mean() < 0.02  # pixels on the outline
+
+
+def test_camera_along_the_slices_draws_low_columns_on_the_left(device: Any) -> None:
+    volume = make_ball(np.diag([0.8, 0.8, 1.0, 1.0]))
+    volume.voxels[:, :, 16:] = -1000
+    drawn = draw_along_slices(volume, device)
+    assert drawn[:, :14].any()
+    assert not drawn[:, 18:].any()
+
+
+def test_middle_slice_has_the_size_of_the_picture_along_the_slices() -> None:
+    volume = make_ball(np.diag([0.8, 0.8, 1.0, 1.0]))
+    width, height = along_slices(volume)["size"]
+    assert (width, height) == (32, 30)
+    assert middle_slice(volume, (width, height)).shape == (height, width)
+
+
+def test_uneven_volume_for_other_processes_is_read_again_without_its_report(tmp_path: Path) -> None:
     positions = np.cumsum(np.r_[[[0, 0, 0.0]], np.tile([[0, 0, 1.0], [0, 0, 1.5]], (14, 1))[:27]], axis=0)
     volume = Volume(make_ball().voxels, np.diag([1, 1, 1.25, 1]), {"secret": "name"}, positions)
     save_volume(tmp_path, volume)
@@ -125,12 +143,19 @@ def test_a_volume_and_a_mesh_arrive_as_they_were(tmp_path: Path, device: Any) ->
     np.testing.assert_array_equal(again.voxels, volume.voxels)
     np.testing.assert_allclose(again.slice_origins(), volume.slice_origins(), atol=1e-12)
     assert "secret" not in again.report
-    mesh = surface_of(volume, device)
+
+
+def test_mesh_of_another_process_is_read_again_by_its_method(tmp_path: Path, device: Any) -> None:
+    mesh = surface_of(make_ball(), device)
     save_mesh(tmp_path, "t-mc", mesh)
-    back = load_mesh(tmp_path, "t-mc")
-    assert back is not None and load_mesh(tmp_path, "s-mc") is None
-    np.testing.assert_array_equal(back.vertices, mesh.vertices)
-    np.testing.assert_array_equal(back.triangles, mesh.triangles)
+    again = load_mesh(tmp_path, "t-mc")
+    assert again is not None
+    np.testing.assert_array_equal(again.vertices, mesh.vertices)
+    np.testing.assert_array_equal(again.triangles, mesh.triangles)
+
+
+def test_method_without_a_written_mesh_has_none(tmp_path: Path) -> None:
+    assert load_mesh(tmp_path, "s-mc") is None
 
 
 @pytest.fixture
@@ -145,20 +170,20 @@ def judge(tmp_path: Path, device: Any) -> Judge:
     return Judge({"folder": tmp_path, "reference": "t-mc", "iso_value": 200, "closed": True, "truth": None})
 
 
-def test_the_judge_measures_the_reference_as_equal_to_itself(judge: Judge) -> None:
+def test_reference_is_measured_as_equal_to_itself(judge: Judge) -> None:
     reference = judge.measure("t-mc")
     assert (reference["reasons"], reference["truth"], reference["points"]) == ({}, None, None)
     assert reference["cells"]["dice"] == 1.0 and reference["surfaces"]["max_mm"] < 1e-4
     assert reference["slices"]["dice"] > 0.98 and reference["slices"]["voxel_dice"] == 1.0
 
 
-def test_the_judge_measures_half_of_a_mesh_as_open_and_incomplete(judge: Judge) -> None:
+def test_half_of_a_mesh_is_measured_as_open_and_incomplete(judge: Judge) -> None:
     half = judge.measure("vtk-mc")
     assert half["slices"] is None and "open" in half["reasons"]["slices"] and not half["quality"]["closed"]
     assert half["cells"]["recall"] < 0.7 < 0.9 < half["cells"]["precision"]
 
 
-def test_the_judge_measures_how_far_a_cloud_lies_from_the_reference(judge: Judge) -> None:
+def test_cloud_is_measured_by_its_distance_from_the_reference(judge: Judge) -> None:
     cloud = judge.measure("cloud")
     assert cloud["points"]["to_reference_mm"]["max"] == pytest.approx(50.0, abs=1.0)
     assert (cloud["points"]["bias_mm"], cloud["slices"]) == (None, None)
@@ -177,22 +202,46 @@ def record_of(name: str, **more: Any) -> MethodRecord:
     return make_record(COMPARED[name], told, {}, {"first": 2.0, "warm": 1.0}).changed(**more)
 
 
-def test_a_row_is_made_of_medians_without_reading_and_drawing() -> None:
+def test_first_time_of_a_method_is_the_sum_of_its_parts_without_reading_and_drawing() -> None:
     row = record_of("t-mc")
-    assert row.first_s == pytest.approx(1.0) and row.warm_s == pytest.approx(0.6) and row.warm_runs == 3
-    assert row.first_parts_s == {"read": 2.0, **PARTS} and row.warm_parts_s["host"] == 0.4
-    assert row.kernels_ms == pytest.approx(15.0) and row.memory_own_bytes == 2e8
-    assert row.small == {"size": [128, 128], "first_s": 0.4, "warm_s": 0.2, "scaled_s": None}
+    assert row.first_s == pytest.approx(sum(PARTS.values()) - PARTS["draw"])
+    assert row.first_parts_s == {"read": 2.0, **PARTS}
+
+
+def test_warm_time_of_a_method_is_the_median_of_its_runs() -> None:
+    row = record_of("t-mc")  # its host part takes 0.3, 0.7 and 0.4 s
+    assert row.warm_runs == 3
+    assert row.warm_parts_s["host"] == 0.4
+    assert row.warm_s == pytest.approx(0.1 + 0.02 + 0.4 + 0.08)  # upload, kernels, host, download
+
+
+def test_kernels_of_a_method_take_the_sum_of_their_times() -> None:
+    assert record_of("t-mc").kernels_ms == pytest.approx(1000 * (0.01 + 0.005))
+
+
+def test_own_memory_of_a_method_is_the_peak_above_that_before() -> None:
+    assert record_of("t-mc").memory_own_bytes == 3e8 - 1e8
+
+
+def test_small_picture_of_a_method_has_its_times() -> None:
+    assert record_of("t-mc").small == {"size": [128, 128], "first_s": 0.4, "warm_s": 0.2, "scaled_s": None}
+
+
+def test_small_picture_of_ray_casting_on_the_cpu_is_scaled_to_the_pixels_of_the_whole() -> None:
     assert record_of("rays-cpu").small["scaled_s"] == pytest.approx(0.2 * (480 / 128) ** 2)
+
+
+def test_failed_method_has_its_error_and_no_times() -> None:
     failed = make_record(COMPARED["s-mc"], {"state": "failed", "error": "no"}, {}, {"first": 1.0, "warm": 1.0})
-    assert (failed.first_s, failed.warm_s, failed.is_done, failed.error) == (None, None, False, "no")
+    assert (failed.is_done, failed.error) == (False, "no")
+    assert (failed.first_s, failed.warm_s) == (None, None)
 
 
 DISTANCES = {"hd95_mm": 0.1, "max_mm": 0.2, "assd_mm": 0.05, "volume_change_percent": -1.0}
 
 
-def test_findings_say_the_numbers() -> None:
-    rows = [
+def rows_of_eight_methods() -> list[MethodRecord]:
+    return [
         record_of("t-mc", warm_s=0.1, slices={"dice": 0.99, "voxel_dice": 1.0}, triangles=1000),
         record_of("t-mc-soup", warm_s=2.0, surfaces={**DISTANCES, "hd95_mm": 0.0}),
         record_of("vtk-fe", warm_s=0.4, surfaces=DISTANCES, cells={"dice": 0.9995}),
@@ -204,8 +253,13 @@ def test_findings_say_the_numbers() -> None:
         record_of("rays"),
         record_of("rays-cpu", small={"size": [128, 128], "first_s": 9.0, "warm_s": 6.0, "scaled_s": 84.0}),
     ]
-    said = find_findings(rows, "t-mc", with_truth=False)
-    assert said == [
+
+
+T_MC, _, _, I_MC, _, S_MC, _, _ = rows_of_eight_methods()
+
+
+def test_findings_of_a_comparison_have_the_numbers_of_its_methods() -> None:
+    assert find_findings(rows_of_eight_methods(), "t-mc", with_truth=False) == [
         "T-MC is the fastest surface: 100 ms from voxels to mesh when warm, 1.0 s the first time; S-MC is the slowest"
         " with 8.0 s, 80 times as long.",
         "T-MC is 4.0 times as fast as the fastest peer, VTK FE (400 ms), when both are warm.",
@@ -223,57 +277,92 @@ def test_findings_say_the_numbers() -> None:
         " 8.0 s.",
         "Ray casting on the device is 30 times as fast as in numpy at 128 x 128 pixels (0.20 and 6.0 s).",
     ]
-    assert find_findings([rows[0]], "t-mc", with_truth=True) == []
-    grown = rows[3].changed(growing={"cells_left_out_share": 0.0}, warm_s=None)
-    assert find_findings([grown], "t-mc", with_truth=False) == [
+
+
+def test_reference_alone_has_no_findings() -> None:
+    assert find_findings([T_MC], "t-mc", with_truth=True) == []
+
+
+def test_finding_of_growing_that_reaches_every_component_says_so() -> None:
+    complete = I_MC.changed(growing={"cells_left_out_share": 0.0}, warm_s=None)
+    assert find_findings([complete], "t-mc", with_truth=False) == [
         "I-MC visits 50 of 2,000 cells, 1 in 40, and leaves nothing out."
     ]
-    assert find_worse(rows[5], rows[0]) == ["80 times slower", "Dice lower by 0.0150"]
-    assert find_worse(rows[0], rows[0]) == find_worse(rows[5], None) == []
-    broken = rows[5].changed(quality={"closed": False}, memory_bytes=5e8, truth={"scatter_mm": 0.3})
-    whole = rows[0].changed(quality={"closed": True}, truth={"scatter_mm": 0.1})
-    assert find_worse(broken, whole)[1:] == [
-        "200 MB more",
-        "Dice lower by 0.0150",
-        "scatter wider by 0.200 mm",
-        "not closed",
-    ]
 
 
-def test_numbers_have_the_digits_that_count() -> None:
-    assert [seconds(value) for value in (0.0213, 0.387, 7.21, 41.9)] == ["0.021", "0.39", "7.2", "42"]
-    assert [milliseconds(value) for value in (3.14, 214.3)] == ["3.1", "214"]
-    assert (megabytes(2.345e9), count(12345.6), signed(0.5, 2)) == ("2,345", "12,346", "+0.50")
-    assert [share(value) for value in (1.0, 0.999999, 0.5)] == ["1", "1.0000", "0.5000"]
-    assert [ratio(value) for value in (1.25, 214.2, float("inf"))] == ["1.2", "214", "inf"]
-    assert [join(names) for names in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == ["", "a", "a and b", "a, b and c"]
+def test_slower_and_less_like_method_is_worse_by_its_factor_and_its_difference() -> None:
+    assert find_worse(S_MC, T_MC) == ["80 times slower", "Dice lower by 0.0150"]
 
 
-def test_methods_come_in_the_order_of_the_table_with_the_reference() -> None:
+def test_larger_scattered_and_open_mesh_is_worse_by_memory_scatter_and_not_closed() -> None:
+    broken = S_MC.changed(quality={"closed": False}, memory_bytes=5e8, truth={"scatter_mm": 0.3})
+    whole = T_MC.changed(quality={"closed": True}, truth={"scatter_mm": 0.1})
+    _, *others = find_worse(broken, whole)
+    assert others == ["200 MB more", "Dice lower by 0.0150", "scatter wider by 0.200 mm", "not closed"]
+
+
+@pytest.mark.parametrize(("row", "reference"), [(T_MC, T_MC), (S_MC, None)], ids=["itself", "no reference"])
+def test_method_is_in_nothing_worse_than_itself_or_no_reference(
+    row: MethodRecord, reference: MethodRecord | None
+) -> None:
+    assert find_worse(row, reference) == []
+
+
+@pytest.mark.parametrize(
+    ("write", "value", "text"),
+    [
+        (seconds, 0.0213, "0.021"), (seconds, 0.387, "0.39"), (seconds, 7.21, "7.2"), (seconds, 41.9, "42"),
+        (milliseconds, 3.14, "3.1"), (milliseconds, 214.3, "214"),
+        (megabytes, 2.345e9, "2,345"), (count, 12345.6, "12,346"), (lambda value: signed(value, 2), 0.5, "+0.50"),
+        (share, 1.0, "1"), (share, 0.999999, "1.0000"), (share, 0.5, "0.5000"),
+        (ratio, 1.25, "1.2"), (ratio, 214.2, "214"), (ratio, float("inf"), "inf"),
+    ],
+)  # fmt: skip
+def test_number_of_a_comparison_is_written_with_the_digits_of_its_kind(write: Any, value: float, text: str) -> None:
+    assert write(value) == text
+
+
+@pytest.mark.parametrize(
+    ("names", "text"), [([], ""), (["a"], "a"), (["a", "b"], "a and b"), (["a", "b", "c"], "a, b and c")]
+)
+def test_names_are_joined_with_commas_and_a_last_and(names: list[str], text: str) -> None:
+    assert join(names) == text
+
+
+def test_chosen_methods_are_in_the_order_of_the_table_with_the_reference() -> None:
     assert [m.name for m in choose_methods(("s-mc", "cloud"), "vtk-fe")] == ["vtk-fe", "s-mc", "cloud"]
     assert [m.name for m in choose_methods((), "t-mc")] == list(COMPARED) == list(COLORS)
 
 
-def test_a_difference_is_black_where_pictures_agree() -> None:
+def test_difference_of_pictures_is_black_where_they_agree_and_four_times_as_bright_elsewhere() -> None:
     one = np.zeros((2, 2, 3), np.uint8)
     other = one.copy()
     other[0, 0, 1], other[1, 1, 2] = 10, 200
     np.testing.assert_array_equal(difference_of(one, other), [[40, 0], [0, 255]])
 
 
-def test_memory_is_that_of_this_program_alone(tmp_path: Path) -> None:
+def test_peak_memory_is_the_resident_high_water_mark_of_the_status_of_a_process(tmp_path: Path) -> None:
     status = tmp_path / "status"
     status.write_text("Name:\tpython\nVmPeak:\t  900 kB\nVmHWM:\t  123456 kB\nVmRSS:\t  5 kB\n")
     assert peak_memory_bytes(status) == 123456 * 1024
-    assert (peak_memory_bytes(tmp_path / "none") or 0) > 1e6
 
 
-def test_a_request_says_its_views() -> None:
-    camera = {"position": [0, 0, 9.0], "focal_point": [0, 0, 0.0], "up": [0, 1.0, 0], "parallel_scale": 3.0}
-    request = Request("t-mc", "f", 200.0, True, 0, None, 3, 60.0, camera, (48, 40))
-    assert list(request.views()) == ["view"] and request.views()["view"][1] == (48, 40)
-    both = Request(**{**request.as_dict(), "along": {"camera": camera, "size": [8, 9]}}).views()
-    assert both["along"][1] == (8, 9) and both["view"][0].parallel_scale == 3.0
+def test_peak_memory_without_a_status_is_asked_of_the_system(tmp_path: Path) -> None:
+    assert (peak_memory_bytes(tmp_path / "none") or 0) > 1e6  # Python alone takes ten times as much
+
+
+CAMERA = {"position": [0, 0, 9.0], "focal_point": [0, 0, 0.0], "up": [0, 1.0, 0], "parallel_scale": 3.0}
+REQUEST = Request("t-mc", "f", 200.0, True, 0, None, 3, 60.0, CAMERA, (48, 40))
+
+
+def test_request_of_one_camera_has_the_view_of_its_size() -> None:
+    [(name, (camera, size))] = REQUEST.views().items()
+    assert (name, size, camera.parallel_scale) == ("view", (48, 40), 3.0)
+
+
+def test_request_with_a_camera_along_the_slices_has_both_views() -> None:
+    views = Request(**{**REQUEST.as_dict(), "along": {"camera": CAMERA, "size": [8, 9]}}).views()
+    assert {name: size for name, (_, size) in views.items()} == {"view": (48, 40), "along": (8, 9)}
 
 
 @pytest.mark.parametrize(
@@ -289,6 +378,9 @@ def test_a_request_says_its_views() -> None:
         ('<svg><use href="#x"></use></svg>', "#x is nowhere"),
     ],
 )
-def test_faults_of_a_page_are_found(page: str, fault: str) -> None:
+def test_fault_of_a_page_is_found(page: str, fault: str) -> None:
     assert any(found.startswith(fault) for found in find_faults("<!DOCTYPE html>" + page))
+
+
+def test_valid_page_has_no_faults() -> None:
     assert find_faults("<!DOCTYPE html><p>1 < 2</p>") == []
