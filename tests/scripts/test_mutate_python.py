@@ -1,4 +1,4 @@
-"""scripts/proof/mutate_python.py counts changes of a small package by what its tests notice, and harms nothing.
+"""scripts/proof/mutate_python.py tries changes of a small package, and counts how many of them its tests notice.
 
 The changes are written here: cosmic-ray, which finds them in clrecon, is not part of the extra ``test``.
 """
@@ -139,7 +139,7 @@ def names(trace: Trace, changed: Change) -> set[str]:
 
 
 @pytest.mark.release
-def test_the_tests_of_a_line_are_found_through_fixtures_and_caches(trace: Trace) -> None:
+def test_tests_that_run_a_line_are_found_through_fixtures_and_caches(trace: Trace) -> None:
     runs = {line: {test.partition("::test_")[2] for test in tests} for line, tests in trace.lines[TIMES.file].items()}
     assert runs[TIMES.line] == {"area", "square_is_positive", "small"}
     assert runs[EQUAL.line] == {"count"}
@@ -153,19 +153,37 @@ def test_the_tests_of_a_line_are_found_through_fixtures_and_caches(trace: Trace)
     }
 
 
-def test_short_tests_come_first_and_time_is_limited() -> None:
-    trace = Trace({"a.py": {3: ["x", "y"], 4: ["z"]}}, {"x": 2.0, "y[2]": 0.5, "y[1]": 0.7, "z": 1.0}, 1.5)
-    assert trace.tests_of("a.py", [3, 4, 5]) == ["y[2]", "y[1]", "z", "x"]
-    assert trace.tests_of("b.py", [3]) == []
-    assert trace.limit_s(["x", "y[2]"]) == 4 * (1.5 + 2.5) + 10
-    tests = ["x", "y[2]", "z"]
-    found = [trace.shortest(tests, seconds) for seconds in (0.1, 1.4, 1.5, 3.5)]
-    assert found == [["y[2]"], ["y[2]"], ["y[2]", "z"], ["y[2]", "z", "x"]]
-    long = Trace({"a.py": {3: ["x", "y"]}}, {"x": 59.0, "y": 1.5}, 1.5)
-    assert long.tests_of("a.py", [3]) == ["y"]
+START_S = 1.5
+SECONDS = {"x": 2.0, "y[2]": 0.5, "y[1]": 0.7, "z": 1.0}
+TRACED = Trace({"a.py": {3: ["x", "y"], 4: ["z"]}}, SECONDS, START_S)
+"""Tests by the lines of a file that they run, with their seconds."""
 
 
-def test_tests_that_import_the_changed_file_come_first(tmp_path: Path) -> None:
+def test_tests_of_changed_lines_run_from_short_to_long_each_of_their_parameters() -> None:
+    assert TRACED.tests_of("a.py", [3, 4, 5]) == ["y[2]", "y[1]", "z", "x"]
+
+
+def test_file_that_no_test_runs_has_no_tests() -> None:
+    assert TRACED.tests_of("b.py", [3]) == []
+
+
+def test_time_limit_of_tests_is_four_times_theirs_with_the_start_and_10_seconds() -> None:
+    assert TRACED.limit_s(["x", "y[2]"]) == 4 * (START_S + SECONDS["x"] + SECONDS["y[2]"]) + 10
+
+
+@pytest.mark.parametrize(
+    ("seconds", "shortest"), [(0.1, ["y[2]"]), (1.4, ["y[2]"]), (1.5, ["y[2]", "z"]), (3.5, ["y[2]", "z", "x"])]
+)
+def test_shortest_tests_within_some_seconds_are_chosen_and_at_least_one(seconds: float, shortest: list[str]) -> None:
+    assert TRACED.shortest(["x", "y[2]", "z"], seconds) == shortest
+
+
+def test_test_of_a_minute_is_left_out_where_a_shorter_one_runs_the_line() -> None:
+    trace = Trace({"a.py": {3: ["x", "y"]}}, {"x": 59.0, "y": 1.5}, START_S)
+    assert trace.tests_of("a.py", [3]) == ["y"]
+
+
+def test_tests_whose_imports_are_nearer_to_the_changed_file_run_first(tmp_path: Path) -> None:
     texts = {
         "toy/deep.py": "",
         "toy/middle.py": "def f():\n    from toy import deep\n",
@@ -188,7 +206,7 @@ def test_tests_that_import_the_changed_file_come_first(tmp_path: Path) -> None:
 
 
 @pytest.mark.release
-def test_a_trace_is_kept_while_nothing_but_tests_changes(
+def test_kept_trace_is_used_again_and_only_changed_tests_are_traced_anew(
     copy: Copy, trace: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     traced: list[list[str]] = []
@@ -217,7 +235,7 @@ def test_a_trace_is_kept_while_nothing_but_tests_changes(
     assert found.still_good(Digests("of another package", found.digests.tests)) == (None, [*found.digests.tests])
 
 
-def test_caches_are_emptied_though_they_are_frozen(tmp_path: Path) -> None:
+def test_caches_of_modules_of_a_folder_are_emptied_also_when_frozen(tmp_path: Path) -> None:
     gc.freeze()
     try:
         module = ModuleType("cached_toy")
@@ -248,38 +266,46 @@ def test_caches_are_emptied_though_they_are_frozen(tmp_path: Path) -> None:
         (MINUS, "not run"),
     ],
 )
-def test_a_change_is_noticed_or_not(copy: Copy, trace: Trace, changed: Change, outcome: str) -> None:
+def test_change_of_code_has_the_outcome_of_its_tests_and_the_file_is_restored(
+    copy: Copy, trace: Trace, changed: Change, outcome: str
+) -> None:
     assert copy.try_change(changed, trace)[0] == outcome
     assert room_texts(copy.root, "toy", "flat")["toy/flat/shapes.py"] == ROOM
 
 
 @pytest.mark.release
-def test_a_change_that_never_ends_is_caught(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_change_that_makes_a_test_run_on_is_caught_by_its_processor_time(
+    copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Trace, "limit_s", lambda self, tests: 3.0)
     assert copy.try_change(change("n -= 1", "n += 1"), trace) == ("time", 6)
 
 
 @pytest.mark.release
-def test_a_change_that_waits_for_ever_is_not_known(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_change_that_makes_a_test_wait_is_late_and_neither_caught_nor_survived(
+    copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(copy, "times_wall", 0.0)
     monkeypatch.setattr(copy, "and_wall_s", 1.0)
     assert copy.try_change(change("n -= 1", "__import__('time').sleep(60.0)"), trace) == ("late", 6)
 
 
 @pytest.mark.release
-def test_a_change_that_ends_the_process_is_caught(copy: Copy, trace: Trace) -> None:
+def test_change_that_ends_the_process_of_its_tests_is_caught_as_a_crash(copy: Copy, trace: Trace) -> None:
     assert copy.try_change(change("n -= 1", "__import__('os').abort()"), trace) == ("crash", 6)
 
 
 @pytest.mark.release
-def test_later_tests_are_tried_when_the_first_pass(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_remaining_tests_are_run_when_the_first_pass(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(copy, "first_tests", 1)
     assert copy.try_change(change("width * height", "width + height"), trace) == ("caught", 6)
     assert copy.try_change(TIMES, trace) == ("survived", 6)
 
 
 @pytest.mark.release
-def test_the_process_that_forks_has_imported_what_lies_outside(copy: Copy, trace: Trace, tmp_path: Path) -> None:
+def test_process_that_forks_for_tests_has_imported_the_libraries_and_no_module_of_the_project(
+    copy: Copy, trace: Trace, tmp_path: Path
+) -> None:
     assert "pytest" in trace.modules and not any(name.startswith(("toy", "test_shapes")) for name in trace.modules)
     (copy.root / "tests" / "flat" / "test_warm.py").write_text(
         "import sys\n\nLOADED = {*sys.modules}\n\n\n"
@@ -319,29 +345,41 @@ def test_rows_are_kept_and_equivalent_changes_are_named(
     assert (project / "toy" / "flat" / "shapes.py").read_text() == ROOM
 
 
-def test_more_than_one_in_twenty_is_too_much() -> None:
-    rows = [{"outcome": "caught"}] * 37 + [{"outcome": "equivalent"}, {"outcome": "time"}, {"outcome": "survived"}]
-    result = RoomResult("flat", rows)
-    assert result.is_good
-    assert RoomResult("flat", [*rows, {"outcome": "not run"}]).is_good
-    assert not RoomResult("flat", [*rows, {"outcome": "not run"}, {"outcome": "survived"}]).is_good
-    assert "40 changes, 38 caught (1 by time, 0 by a crash), 1 equivalent, 1 survive (0 of them" in result.sentence()
+FORTY = [{"outcome": "caught"}] * 37 + [{"outcome": "equivalent"}, {"outcome": "time"}, {"outcome": "survived"}]
+"""Outcomes of 40 changes, one of which no test has noticed."""
+
+
+@pytest.mark.parametrize(
+    ("more", "is_good"),
+    [
+        pytest.param([], True, id="1 of 40 missed"),
+        pytest.param(["not run"], True, id="2 of 41 missed"),
+        pytest.param(["not run", "survived"], False, id="3 of 42 missed"),
+    ],
+)
+def test_room_is_good_if_its_tests_miss_at_most_one_change_in_twenty(more: list[str], is_good: bool) -> None:
+    assert RoomResult("flat", FORTY + [{"outcome": outcome} for outcome in more]).is_good is is_good
+
+
+def test_sentence_of_a_room_counts_its_changes_by_outcome() -> None:
+    sentence = RoomResult("flat", FORTY).sentence()
+    assert "40 changes, 38 caught (1 by time, 0 by a crash), 1 equivalent, 1 survive (0 of them" in sentence
 
 
 @pytest.mark.release
-def test_a_room_that_fails_without_a_change_is_refused(project: Path, tmp_path: Path) -> None:
+def test_room_whose_tests_fail_without_a_change_is_refused(project: Path, tmp_path: Path) -> None:
     copy = Copy.make(project, tmp_path, "toy")
     (copy.root / "tests" / "flat" / "test_shapes.py").write_text("def test_it():\n    assert 1 == 2\n")
     with pytest.raises(BrokenRoomError, match="fail without a change"):
         copy.trace("flat")
 
 
-def test_the_lines_of_a_statement_are_those_before_its_body() -> None:
+def test_lines_of_a_statement_are_those_of_it_before_its_body() -> None:
     text = "if (a and\n    b):\n    c = [\n        1,\n        2,\n    ]\n    d = 3\n"
     assert [list(statement_lines(text, line)) for line in (1, 2, 4, 7)] == [[1, 2], [1, 2], [3, 4, 5, 6], [7]]
 
 
-def test_equivalent_changes_are_of_lines_that_are_there() -> None:
+def test_equivalent_changes_are_of_lines_that_exist_and_have_a_reason() -> None:
     for entry in read_equivalents(mutate_python.EQUIVALENTS):
         lines = (mutate_python.ROOT / entry.file).read_text(encoding="utf-8").splitlines()
         assert entry.before in " ".join(line.strip() for line in lines), entry
@@ -349,13 +387,13 @@ def test_equivalent_changes_are_of_lines_that_are_there() -> None:
 
 
 @pytest.mark.parametrize("words", [["--rooms", "nowhere"], ["--changes", "0"], ["--resume"]])
-def test_wrong_options_are_refused(words: list[str], printed: Printer) -> None:
+def test_wrong_option_of_the_mutation_script_is_refused_by_name(words: list[str], printed: Printer) -> None:
     with refused(SystemExit, 2):
         mutate_python.main(words)
     printed().assert_error(words[-1] if words[0] == "--rooms" else words[0])
 
 
-def test_kernels_are_those_of_the_copy(tmp_path: Path) -> None:
+def test_kernels_that_tests_of_a_copy_load_are_those_of_the_copy(tmp_path: Path) -> None:
     """Not those of the folder that an editable installation points to."""
     for name in ("clrecon", "cl", "tests"):
         (tmp_path / "project" / name).mkdir(parents=True)
@@ -369,17 +407,39 @@ def test_kernels_are_those_of_the_copy(tmp_path: Path) -> None:
     assert said.stdout == "own\n", said.stderr
 
 
-def test_changes_are_chosen_by_the_seed() -> None:
+FUNCTION = "def f(x: int | None = 1) -> int | str:\n    y: int | str = -x\n    return (x < 2) + y\n"
+"""Five places to change: 1, -, <, 2 and +, and none in annotations."""
+
+
+def test_places_to_change_are_numbers_and_operators_and_no_annotations() -> None:
     pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
-    text = "def f(x: int | None = 1) -> int | str:\n    y: int | str = -x\n    return (x < 2) + y\n"
-    kinds = {place.operator.partition("_")[0] for place in find_places(text)}
-    assert kinds == {*("NumberReplacer", "ReplaceBinaryOperator", "ReplaceComparisonOperator", "ReplaceUnaryOperator")}
-    assert {place.start for place in find_places(text)} == {(1, 22), (2, 19), (3, 14), (3, 16), (3, 19)}
+    assert {(place.start, place.operator.partition("_")[0]) for place in find_places(FUNCTION)} == {
+        ((1, 22), "NumberReplacer"), ((2, 19), "ReplaceUnaryOperator"), ((3, 14), "ReplaceComparisonOperator"),
+        ((3, 16), "NumberReplacer"), ((3, 19), "ReplaceBinaryOperator"),
+    }  # fmt: skip
+
+
+def test_strictness_of_a_zip_in_a_loop_is_no_place_to_change() -> None:
+    pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
     assert find_places("for a, b in zip(c, d, strict=True):\n    pass\n")[-1].operator == "ZeroIterationForLoop"
-    one, two = (choose_changes({"a.py": text}, 3, "1") for _ in range(2))
-    assert one == two and len({change.text for change in one}) == 3
-    assert len(choose_changes({"a.py": text}, 99, "1")) == 5
-    assert any(choose_changes({"a.py": text}, 3, str(seed)) != one for seed in range(5))
+
+
+def test_changes_of_the_same_seed_are_the_same_and_different_from_each_other() -> None:
+    pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
+    first, second = (choose_changes({"a.py": FUNCTION}, 3, "1") for _ in range(2))
+    assert first == second
+    assert len({change.text for change in first}) == 3
+
+
+def test_changes_of_another_seed_are_others() -> None:
+    pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
+    chosen = [choose_changes({"a.py": FUNCTION}, 3, str(seed)) for seed in range(5)]
+    assert any(changes != chosen[0] for changes in chosen)
+
+
+def test_no_more_changes_are_chosen_than_there_are_places() -> None:
+    pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
+    assert len(choose_changes({"a.py": FUNCTION}, 99, "1")) == 5
 
 
 def test_an_edit_draws_no_other_changes_elsewhere() -> None:
@@ -401,16 +461,24 @@ def test_an_edit_draws_no_other_changes_elsewhere() -> None:
     assert len(same) == 8 and len(set(same)) > 5
 
 
-def test_the_definition_around_a_line_is_named() -> None:
+def test_each_line_of_a_module_has_the_name_of_its_innermost_definition() -> None:
     text = "a = 1\nclass A:\n    b = 2\n    def f(self):\n        def g():\n            return 3\n        return 4\n"
     assert definition_names(text) == {2: "A", 3: "A", 4: "A.f", 5: "A.f.g", 6: "A.f.g", 7: "A.f"}
 
 
-def test_a_change_says_its_lines() -> None:
+def test_change_has_its_line_before_and_after() -> None:
     pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
     text = "a = [\n    1,\n    x <= 2,\n]\n"
     changes = [make_change("a.py", text, place) for place in find_places(text)]
     found = {(one.line, one.before, one.after) for one in changes if one}
     assert {(3, "x <= 2,", "x < 2,"), (2, "1,", "2,"), (2, "1,", "0,"), (3, "x <= 2,", "x <= 3,")} <= found
-    assert choose_changes({"a.py": "@dataclass(frozen=True)\nclass A:\n    pass\n"}, 9, "1") == []
-    assert choose_changes({"a.py": "def f(\n    a,\n    *,\n    b,\n):\n    pass\n"}, 9, "1") == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["@dataclass(frozen=True)\nclass A:\n    pass\n", "def f(\n    a,\n    *,\n    b,\n):\n    pass\n"],
+    ids=["flag of a decorator", "mark of keyword arguments"],
+)
+def test_decorators_and_marks_of_keyword_arguments_are_not_changed(text: str) -> None:
+    pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
+    assert choose_changes({"a.py": text}, 9, "1") == []
