@@ -233,7 +233,7 @@ def test_name_of_a_cpu_is_written_over_the_unknown_one(memory: MemoryWithText) -
 @pytest.mark.parametrize("present", [b"a", b"znver4"])
 def test_name_of_a_cpu_is_not_written_over_another_one(present: bytes, memory: MemoryWithText) -> None:
     memory.text = present
-    with pytest.raises(LookupError, match="has changed"):
+    with refused(LookupError, "changed"):
         pocl.NameOfCpu.write(NAME_AT_ADDRESS_7)
     assert memory.written == []
 

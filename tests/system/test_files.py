@@ -148,7 +148,7 @@ def test_interrupt_while_verifying_leaves_the_older_file(older):
     def interrupt(temporary: Path) -> None:
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt, match="^$"):
+    with pytest.raises(KeyboardInterrupt):
         replace_file(older, lambda stream: stream.write(b"newer"), interrupt)
     check_untouched(older)
 
@@ -289,7 +289,7 @@ class TestRefusedTargets:
 
     def test_write_protected_file_is_refused_and_left(self, action, older, monkeypatch):
         monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write to everything
-        with pytest.raises(OutputError, match="write-protected"):
+        with refused(OutputError, "write-protected"):
             action(older)
         check_untouched(older)
 

@@ -256,14 +256,14 @@ def test_folder_with_files_that_are_no_phantom_is_refused_and_left(
 
 
 def test_phantom_below_a_missing_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="does not exist"):
+    with refused(OutputError, "exist"):
         write_phantom(tmp_path / "missing" / "ct", SPHERE)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_phantom_in_place_of_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(OutputError, match="a file of that name"):
+    with refused(OutputError, "notes.txt", "file"):
         write_phantom(tmp_path / "notes.txt", SPHERE)
     assert files_in(tmp_path) == {"notes.txt": b"mine"}
 
@@ -283,14 +283,14 @@ def test_earlier_phantom_stays_when_writing_another_fails(folder: Path, full_dis
     write_phantom(folder, SPHERE)
     before = files_in(folder)
     full_disk()
-    with pytest.raises(OutputError, match="No space left"):
+    with refused(OutputError, "space"):
         write_phantom(folder, PhantomSettings(kind="sphere", **AWKWARD, seed=5))
     assert files_in(folder) == before
 
 
 def test_no_folder_is_left_when_writing_a_new_phantom_fails(tmp_path: Path, full_disk: Callable[[], None]) -> None:
     full_disk()
-    with pytest.raises(OutputError, match="No space left"):
+    with refused(OutputError, "space"):
         write_phantom(tmp_path / "new", SPHERE)
     assert list(tmp_path.iterdir()) == []
 
