@@ -97,6 +97,7 @@ def test_row_36_one_bare_slice_refuses_the_series_unless_it_is_forced(tmp_path):
 @pytest.mark.parametrize(
     "content",
     [b"\x89PNG\r\n\x1a\n" + bytes(300), b"plain text\n" * 40, b"PK\x03\x04" + bytes(300), b"\x08\0", bytes(500)],
+    ids=["PNG", "text", "zip", "two bytes", "zeros"],
 )
 def test_row_36_files_that_are_no_dicom_are_refused_with_force_too(tmp_path, content):
     (tmp_path / "file").write_bytes(content)
@@ -118,17 +119,27 @@ def test_row_36_command_names_the_option_that_reads_bare_data_sets_and_reads_the
     printed().assert_output("VR")
 
 
-def test_bare_slices_with_long_headers_are_read_with_force_and_refused_where_a_byte_is_lost(tmp_path):
-    """Bytes are counted in the file itself, not in what stands for its start."""
+def write_bare_with_long_headers(folder):
+    """Three bare slices of 3 x 4 pixels with 40 kB of a private element; bytes are counted behind them."""
     plan = Plan(shape=(3, 3, 4))
     for k in range(3):
         ds = make_dataset(plan, k)
         ds.add_new(0x00091001, "OB", bytes(40_000))
-        save_dataset(ds, tmp_path / f"{k}")
-        (tmp_path / f"{k}").write_bytes(cut_all((tmp_path / f"{k}").read_bytes()))
+        save_dataset(ds, folder / f"{k}")
+        (folder / f"{k}").write_bytes(cut_all((folder / f"{k}").read_bytes()))
+    return plan
+
+
+def test_bare_slices_with_long_headers_are_read_with_force(tmp_path):
+    plan = write_bare_with_long_headers(tmp_path)
     assert np.array_equal(read_volume(tmp_path, force=True).voxels, plan.hu())
+
+
+def test_bare_slice_with_a_long_header_that_lacks_its_last_byte_is_refused_with_both_sizes(tmp_path):
+    write_bare_with_long_headers(tmp_path)
     (tmp_path / "1").write_bytes((tmp_path / "1").read_bytes()[:-1])
-    with refused(RefusedInputError, 1, 24, 23):
+    pixel_bytes = 3 * 4 * 2
+    with refused(RefusedInputError, 1, pixel_bytes, pixel_bytes - 1):
         read_volume(tmp_path, force=True)
 
 
