@@ -77,7 +77,7 @@ def test_large_triangles_are_divided_without_loss():
         assert len(met) > 64
 
 
-def test_boxes_are_met_as_clipped_polygons_are():
+def test_triangles_that_meet_a_box_are_those_of_which_clipping_leaves_a_part():
     rng = np.random.default_rng(1)
     corners = rng.normal(0.0, 0.8, (2000, 3, 3))
     assert np.array_equal(meets_box(corners, 0.5), [clip(triangle).size > 0 for triangle in corners])
@@ -99,7 +99,7 @@ def clip(polygon: np.ndarray) -> np.ndarray:
     return polygon
 
 
-def test_overlap_of_cells_is_counted():
+def test_overlap_of_cells_has_recall_precision_dice_and_jaccard_by_hand():
     one = GridCells([[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 0, 0]])
     other = GridCells([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0], [-1, 0, 0]], "t-mc")
     found = measure_cells(one, other, grid())
@@ -108,14 +108,14 @@ def test_overlap_of_cells_is_counted():
     assert measure_cells(other, one, grid()).recall == pytest.approx(2 / 3)
 
 
-def test_cells_keep_their_corners():
+def test_cells_are_packed_and_unpacked_by_their_lowest_corners():
     corners = [[5, -1, 2], [0, 0, -70], [900_000, 3, 0]]
     assert sorted(GridCells(corners).ijk.tolist()) == sorted(corners)
     assert len(GridCells([])) == 0
     assert repr(GridCells(corners, "truth")) == "GridCells(3 cells of truth)"
 
 
-def test_what_cannot_be_compared_is_refused():
+def test_cells_of_empty_distant_or_huge_meshes_are_refused():
     on, empty = grid(), Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.uint32))
     box = placed(samples.box((2.5,) * 3, (5.0,) * 3), on)
     far = placed(samples.box((14.5,) * 3, (5.0,) * 3), on)

@@ -118,6 +118,6 @@ def test_descriptions_hold_plain_numbers() -> None:
         (lambda: SPHERE.signed_distance(np.zeros((3, 2))), r"\(3, 2\)"),
     ],
 )
-def test_body_with_a_wrong_argument_is_refused_by_its_name(make, says: str) -> None:
+def test_body_with_a_wrong_argument_is_refused_with_the_reason(make, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         make()

@@ -110,7 +110,7 @@ def test_levels_and_names_are_those_of_the_settings() -> None:
     assert said.tolist() == [21, 22] == [level["label"] for level in made]
 
 
-def test_the_default_spine_has_a_truth_too() -> None:
+def test_truth_of_the_default_spine_has_17_levels_and_labels_of_those_in_view() -> None:
     truth = clrecon.phantom_truth(PhantomSettings(**SMALL))
     assert truth.levels[0] == "T1" and truth.levels[-1] == "L5" and len(truth.names) == 17
     labels = truth.label_map()

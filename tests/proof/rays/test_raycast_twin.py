@@ -88,19 +88,22 @@ def test_a_ray_that_enters_through_a_clip_plane_says_so():
     assert np.abs(t_in[:2] - (50.0, 50.0 - 6.3)).max() < 1e-9 and t_out[2] < t_in[2]
 
 
-def test_the_table_has_the_values_of_its_nodes_and_exact_ends():
+def test_values_of_a_transfer_function_are_those_of_the_nearest_node_of_its_table():
     ramp = TransferFunction([(-1000, 0, 0.5, 1, 0.0), (3000, 1, 0.5, 0, 0.8)])
-    width = 4000 / (TABLE_NODES - 1)
-    hu = np.array([-2000.0, -1000.0, -1000 + 0.4 * width, -1000 + 1.7 * width, 3000 - 0.6 * width, 3000.0, 9000.0])
-    opacity = look_up(ramp, hu)[:, 3] * (TABLE_NODES - 1) / 0.8
     last = TABLE_NODES - 1
-    assert np.abs(opacity - (0.0, 0.0, 0.0, 2.0, last - 1.0, last, last)).max() < 1e-3
+    width = 4000 / last  # between two nodes, HU
+    hu = np.array([-2000.0, -1000.0, -1000 + 0.4 * width, -1000 + 1.7 * width, 3000 - 0.6 * width, 3000.0, 9000.0])
+    nodes = look_up(ramp, hu)[:, 3] / 0.8 * last
+    assert np.abs(nodes - (0.0, 0.0, 0.0, 2.0, last - 1.0, last, last)).max() < 1e-3  # of a node, in float32
+
+
+def test_values_below_and_above_the_steps_of_a_transfer_function_are_those_of_its_ends():
     step = TransferFunction([(300, 1, 1, 1, 0.0), (300, 1, 1, 1, 0.7), (400, 1, 1, 1, 0.7), (400, 1, 1, 1, 0.1)])
     assert np.allclose(look_up(step, np.array([-1000.0, 301.0, 399.0, 5000.0]))[:, 3], [0.0, 0.7, 0.7, 0.1])
 
 
 @pytest.mark.parametrize("direction", [None, (0.3, -2.0, 1.0)])
-def test_shading_is_that_of_phong(direction):
+def test_shade_of_a_colour_is_that_of_the_phong_formula_towards_the_viewer(direction):
     lighting = Lighting(0.1, 0.6, 0.3, 9.0, direction)
     rng = np.random.default_rng(8)
     gradients, directions = rng.normal(size=(2, 20, 3))
@@ -158,7 +161,7 @@ def test_one_ray_is_the_sum_written_out():
     assert np.isclose(picture.depth[1, 2], depth) and np.isclose(picture.expected_depth[1, 2], weighted / opacity)
 
 
-def test_a_ray_ends_when_it_is_opaque():
+def test_ray_shows_nothing_behind_the_sample_that_makes_it_opaque():
     volume = even_volume(lambda p: np.where(p[:, 1] < 0.0, 100.0, 900.0), "even", 30.0)
     wall = TransferFunction([(0, 1, 0, 0, 0.4), (400, 1, 0, 0, 0.4), (400, 0, 1, 0, 1), (1000, 0, 1, 0, 1)])
     picture = cast_rays(volume, VolumeLook(wall, lighting=UNSHADED, ray_step=0.5), look(volume, (0, 1, 0), 5.0), (4, 4))
@@ -166,7 +169,7 @@ def test_a_ray_ends_when_it_is_opaque():
     assert not picture.rgba[..., 1].any()  # nothing of the green wall behind
 
 
-def test_the_default_step_is_half_the_smallest_spacing():
+def test_default_step_of_a_ray_is_half_the_smallest_spacing():
     volume = even_volume(lambda p: 50.0 * p[:, 1], "anisotropic", 12.0)
     camera = look(volume, (0.3, 1.0, 0.2), 5.0)
     styles = [Projection("mean", ray_step=step) for step in (None, 0.225)]
@@ -174,7 +177,7 @@ def test_the_default_step_is_half_the_smallest_spacing():
     assert np.array_equal(default, given)
 
 
-def test_jitter_is_a_hash_of_the_pixel():
+def test_jitter_of_a_pixel_is_its_hash_even_and_unlike_its_neighbours():
     def mix(bits):  # lowbias32 in whole numbers without end
         bits = (bits ^ bits >> 16) * 0x7FEB352D % 2**32
         bits = (bits ^ bits >> 15) * 0x846CA68B % 2**32

@@ -147,7 +147,7 @@ def test_scaling_rounds_towards_zero_and_never_overflows():
     assert max(scale_heights(heights, 18)) < 2**18
 
 
-def test_faces_are_decided_by_the_sign_at_the_saddle():
+def test_ambiguous_face_joins_its_inside_corners_where_its_saddle_is_inside():
     rng = np.random.default_rng(4)
     for _ in range(500):
         case = int(rng.choice(ambiguous_cases()))

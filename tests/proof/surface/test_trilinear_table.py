@@ -140,19 +140,19 @@ def test_neighbours_agree_on_every_face_that_they_decide_alike(axis):
     assert all(len(found) == 1 for found in seen.values())
 
 
-def test_undecided_cells_are_those_of_the_case_table():
+def test_rows_of_cells_without_joined_faces_are_those_of_the_case_table():
     for case in range(256):
         assert cell_state(case, 0).plain.triangles == case_table()[case]
 
 
-def test_joining_all_faces_is_the_complement_turned_round():
+def test_loops_of_a_case_with_all_faces_joined_are_those_of_its_complement_reversed():
     for case in range(256):
         every = sum(1 << face for face in find_ambiguous_faces(case))
         turned = {(b, a) for a, b in loop_edges(case_loops(255 - case, every))}
         assert turned == loop_edges(case_loops(case))
 
 
-def test_regions_are_joined_by_edges_and_decided_faces():
+def test_inside_corners_across_a_face_are_one_region_only_if_the_face_joins_them():
     diagonal = 1 << FACES[0][0] | 1 << FACES[0][2]
     apart, joined = find_regions(diagonal, 0), find_regions(diagonal, 1)
     assert apart[FACES[0][0]] != apart[FACES[0][2]]
@@ -180,6 +180,6 @@ def test_packed_trilinear_tables_have_every_row_of_the_table():
     assert number == len(tables.states)
 
 
-def test_a_waist_has_the_corners_off_its_diagonal():
+def test_ring_of_a_waist_has_the_six_corners_off_its_diagonal():
     assert ring_corners(0) == [1, 2, 3, 4, 5, 6]
     assert ring_corners(2) == [0, 1, 3, 4, 6, 7]
