@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import http.client
 import io
 import json
 import threading
@@ -190,3 +191,20 @@ async def browsing(server: WebServer, tab: str = "") -> AsyncIterator[Client]:
         web.ws_connect(f"{base}/socket?{secret}&tab={tab}", headers={"Origin": base}) as socket,
     ):
         yield Client(socket)
+
+
+def get_path(running: WebServer, path: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], str]:
+    """Ask for a path; headers take the place of those of a browser."""
+    connection = http.client.HTTPConnection("127.0.0.1", running.port, timeout=PATIENCE)
+    connection.putrequest(method, path, skip_host=True)
+    for name, value in {"Host": f"127.0.0.1:{running.port}", **headers}.items():
+        connection.putheader(name.replace("_", "-"), value)
+    connection.endheaders()
+    answer = connection.getresponse()
+    found = answer.status, dict(answer.headers), answer.read().decode()
+    connection.close()
+    return found
+
+
+def secret_of(running: WebServer) -> str:
+    return running.address.partition("secret=")[2]

@@ -11,14 +11,14 @@ pytestmark = pytest.mark.unit
 SECRET = "a-SECRET_of-43-characters-as-they-are-made-0"
 
 
-def test_a_secret_is_long_and_never_the_same() -> None:
+def test_secret_is_long_and_never_the_same() -> None:
     made = {make_secret() for _ in range(100)}
     assert len(made) == 100
     assert min(map(len, made)) >= 43  # 256 bits, 6 a letter
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:8000", "localhost:1", "LOCALHOST:65535", "[::1]:80", "127.0.0.1"])
-def test_a_request_of_this_machine_is_let_in(host: str) -> None:
+def test_request_of_this_machine_is_let_in(host: str) -> None:
     assert refuse_request(host, None, SECRET, SECRET) is None
     assert refuse_request(host, f"http://{host}", SECRET, SECRET, by_page=True) is None
 
@@ -30,7 +30,7 @@ def test_a_request_of_this_machine_is_let_in(host: str) -> None:
         "127.0.0.1:8000@evil.example", "192.168.0.7:8000", "0.0.0.0:8000", "127.0.0.1:8000 ", "xlocalhost:8000",
     ],
 )  # fmt: skip
-def test_a_foreign_host_is_refused(host: str | None) -> None:
+def test_foreign_host_is_refused(host: str | None) -> None:
     assert "127.0.0.1 and localhost alone" in refuse_request(host, None, SECRET, SECRET)
 
 
@@ -41,17 +41,17 @@ def test_a_foreign_host_is_refused(host: str | None) -> None:
         "http://127.0.0.1:8000.evil.example",
     ],
 )  # fmt: skip
-def test_a_foreign_origin_is_refused_with_the_right_secret(origin: str) -> None:
+def test_foreign_origin_is_refused_with_the_right_secret(origin: str) -> None:
     assert "another server" in refuse_request("127.0.0.1:8000", origin, SECRET, SECRET)
 
 
-def test_requests_that_only_pages_make_need_an_origin() -> None:
+def test_request_that_only_pages_make_needs_an_origin() -> None:
     assert refuse_request("127.0.0.1:8000", None, SECRET, SECRET) is None
     assert "another server" in refuse_request("127.0.0.1:8000", None, SECRET, SECRET, by_page=True)
 
 
 @pytest.mark.parametrize("given", [None, "", SECRET[:-1], SECRET + "x", SECRET.swapcase(), "é", "\udcff"])
-def test_a_wrong_secret_is_refused_in_a_line_that_does_not_hold_it(given: str | None) -> None:
+def test_wrong_secret_is_refused_in_a_line_that_does_not_hold_it(given: str | None) -> None:
     said = refuse_request("127.0.0.1:8000", None, given, SECRET)
     assert said.startswith("refused: the secret is missing or wrong")
     assert SECRET not in said and "\n" not in said

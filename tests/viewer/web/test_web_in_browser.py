@@ -31,7 +31,7 @@ def page(view_browser, view_server):
         yield opened
 
 
-def test_a_drag_turns_the_picture_and_leaves_the_slices(page) -> None:
+def test_drag_turns_the_picture_and_leaves_the_slices_and_undo_turns_it_back(page) -> None:
     before, slice_before = picture(page), picture(page, "axial")
     count = page.execute_script("window.first = JSON.stringify(clrecon.facts.camera); return clrecon.pictures")
     drag(page, page.find_element("id", "scene"), 0, 0, 150, 30)
@@ -57,7 +57,7 @@ def test_undo_stays_where_it_is_while_lists_grow(page) -> None:
     assert page.execute_script(place) == before > 0
 
 
-def test_the_slider_sets_the_iso_value_and_the_picture_follows(page) -> None:
+def test_slider_sets_the_iso_value_and_the_picture_follows(page) -> None:
     before = picture(page)
     drag(page, page.find_element("id", "hu"), 0, 0, 150, 0)
     settle(page)
@@ -67,7 +67,7 @@ def test_the_slider_sets_the_iso_value_and_the_picture_follows(page) -> None:
     assert f"{hu:g} HU" in page.find_element("id", "status").text
 
 
-def test_an_iso_value_that_is_none_changes_nothing(page) -> None:
+def test_text_that_is_no_iso_value_is_put_back_and_a_number_is_taken(page) -> None:
     from selenium.webdriver.common.keys import Keys
 
     exact = page.find_element("id", "exact")
@@ -83,7 +83,7 @@ def test_an_iso_value_that_is_none_changes_nothing(page) -> None:
     assert page.find_element("id", "hu").get_attribute("value") == "321"
 
 
-def test_the_surface_is_fitted_to_the_bone_and_coloured_with_a_scale(page) -> None:
+def test_surface_is_fitted_to_the_bone_and_coloured_with_a_scale(page) -> None:
     before, bars = picture(page), "return document.querySelectorAll('#scene rect').length"
     assert not page.find_element("id", "shade").is_displayed() and page.execute_script(bars) == 0
     press(page, "t")
@@ -120,7 +120,7 @@ def test_keys_look_from_the_sides_with_their_letters(page) -> None:
 
 
 @pytest.mark.release
-def test_a_distance_by_two_clicks_is_that_of_the_places(page) -> None:
+def test_distance_by_two_clicks_is_that_of_the_places(page) -> None:
     page.find_element("id", "distance").click()
     for number in (0, 1):
         click(page, "scene", scenes.middle(number))
@@ -137,7 +137,7 @@ def test_a_distance_by_two_clicks_is_that_of_the_places(page) -> None:
     wait_for(page, "return !clrecon.facts.measures.length")
 
 
-def test_a_part_is_hidden_by_a_click_and_listed_with_its_ml(page) -> None:
+def test_part_is_hidden_by_a_click_and_listed_with_its_ml(page) -> None:
     wait_for(page, PARTS)
     settle(page)
     before = picture(page)
@@ -169,7 +169,7 @@ def test_shift_click_names_the_part_and_moves_the_slices_there(page) -> None:
     assert page.find_elements("css selector", "#parts li.chosen") == []
 
 
-def test_the_cross_is_seen_in_the_picture_and_slices_have_names_and_colours(page) -> None:
+def test_cross_is_seen_in_the_picture_and_slices_have_names_and_colours(page) -> None:
     def colors(name: str) -> set[str]:
         return set(
             page.execute_script(
@@ -231,7 +231,7 @@ def test_keys_use_what_lies_under_the_pointer_in_slices_too(page) -> None:
     ]
 
 
-def test_a_line_is_faint_where_bone_lies_before_it(page) -> None:
+def test_line_is_faint_where_bone_lies_before_it(page) -> None:
     page.find_element("id", "distance").click()
     for number in (0, 1):
         click(page, "scene", scenes.middle(number))
@@ -250,7 +250,7 @@ def test_a_line_is_faint_where_bone_lies_before_it(page) -> None:
     assert np.linalg.norm(seen[:, 1] - seen[:, 0], axis=1).sum() > 0.7 * np.linalg.norm(last - first)
 
 
-def test_a_clip_box_lies_about_the_cross_and_an_oblique_plane_is_named_by_letters(page) -> None:
+def test_clip_box_lies_about_the_cross_and_an_oblique_plane_is_named_by_letters(page) -> None:
     press(page, "C")
     box = np.array(wait_for(page, "return clrecon.facts.clip_box"))
     low, high = np.array(facts(page)["bounds"])
@@ -264,7 +264,7 @@ def test_a_clip_box_lies_about_the_cross_and_an_oblique_plane_is_named_by_letter
     assert re.match(r"[APLR]{2} side", page.find_element("id", "clips").text)
 
 
-def test_a_part_gets_its_own_look_back_and_a_mesh_says_its_triangles(page) -> None:
+def test_part_gets_its_own_look_back_and_a_mesh_says_its_triangles(page) -> None:
     page.execute_script("clrecon.run('set_color', { key: '2', rgb: [1, 0, 0] })")
     wait_for(page, "return clrecon.facts.parts.find(({ key }) => key === '2').color")
     (row,) = [each for each in page.find_elements("css selector", "#parts li") if "mesh" in each.text]
@@ -307,7 +307,7 @@ def test_page_shows_the_description_and_what_was_removed(page) -> None:
     wait_for(page, "return /of the voxels are air now/.test(document.getElementById('hint').textContent)")
 
 
-def test_the_list_of_keys_is_that_of_the_session(page) -> None:
+def test_list_of_keys_is_that_of_the_session(page) -> None:
     press(page, "h")
     text = page.find_element("id", "keys").text
     for key in KEYS.values():
@@ -317,7 +317,7 @@ def test_the_list_of_keys_is_that_of_the_session(page) -> None:
     assert not page.find_element("id", "keys").is_displayed()
 
 
-def test_the_wheel_scrolls_a_slice_and_a_right_drag_is_its_window(page) -> None:
+def test_wheel_scrolls_a_slice_and_a_right_drag_is_its_window(page) -> None:
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
 
@@ -399,7 +399,7 @@ def test_files_that_were_named_are_written_here_and_q_ends_it(view_browser, devi
 
 
 @pytest.mark.release
-def test_another_browser_has_a_view_of_its_own(page, view_server) -> None:
+def test_another_tab_has_a_view_of_its_own(page, view_server) -> None:
     page.execute_script("clrecon.run('set_iso', { hu: 350 })")
     wait_for(page, "return clrecon.facts.iso.hu === 350")
     first = page.current_window_handle
@@ -412,7 +412,7 @@ def test_another_browser_has_a_view_of_its_own(page, view_server) -> None:
     assert facts(page)["iso"]["hu"] == 350
 
 
-def test_without_the_secret_there_is_no_page(view_browser, view_server) -> None:
+def test_address_without_the_secret_shows_the_refusal_alone(view_browser, view_server) -> None:
     view_browser.get(f"http://127.0.0.1:{view_server.port}/")
     assert "the secret is missing or wrong" in view_browser.find_element("tag name", "body").text
     severe_lines(view_browser)

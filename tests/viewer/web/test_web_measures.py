@@ -32,7 +32,7 @@ def names(page) -> list[str]:
     return page.execute_script("return [...document.querySelectorAll('#measures input')].map((one) => one.value)")
 
 
-def test_a_measure_is_renamed_in_its_row_and_on_the_slice(page) -> None:
+def test_measure_is_renamed_in_its_row_and_on_the_slice(page) -> None:
     from selenium.webdriver.common.keys import Keys
 
     field = page.find_element("css selector", "#measures li:nth-child(2) input")
@@ -54,7 +54,7 @@ def test_escape_and_an_empty_name_leave_the_name(page) -> None:
     assert [measure["name"] for measure in facts(page)["measures"]] == ["place 1", "place 2"]
 
 
-def test_one_measure_is_removed_and_the_focus_stays_in_the_list(page) -> None:
+def test_measure_is_removed_and_brought_back_and_the_focus_stays_in_the_list(page) -> None:
     from selenium.webdriver.common.keys import Keys
 
     (first, _) = page.find_elements("css selector", "#measures button[aria-label^='remove']")
@@ -68,7 +68,7 @@ def test_one_measure_is_removed_and_the_focus_stays_in_the_list(page) -> None:
     assert names(page) == ["place 1", "place 2"]
 
 
-def test_the_slices_go_to_a_measure_of_the_list(page) -> None:
+def test_slices_go_to_a_measure_of_the_list(page) -> None:
     page.execute_script("clrecon.run('set_cross', { point: arguments[0] })", scenes.middle(1).tolist())
     wait_for(page, f"return Math.abs(clrecon.facts.cross[0] - {scenes.middle(1)[0]}) < 0.01")
     point = facts(page)["measures"][1]["points"][0]
@@ -77,7 +77,7 @@ def test_the_slices_go_to_a_measure_of_the_list(page) -> None:
     assert np.allclose(facts(page)["cross"], point, atol=0.01)
 
 
-def test_measures_are_saved_as_markups_and_buttons_come_with_the_first(page, downloads: Path) -> None:
+def test_measures_are_saved_as_markups_and_the_buttons_go_with_the_last(page, downloads: Path) -> None:
     page.find_element("css selector", "#exports [data-format='.mrk.json']").click()
     end = time.monotonic() + PATIENCE
     while not (downloads / "view.mrk.json").exists():

@@ -35,14 +35,29 @@ def test_each_view_that_is_shown_is_drawn_once(pace: Pace) -> None:
 
 def test_changing_view_is_coarse_first_and_sharp_at_rest(pace: Pace) -> None:
     drain(pace)
-    assert pace.is_done
+
     pace.change([SCENE])
-    assert drain(pace) == [Asked(SCENE, SIZE, True)]
-    assert not pace.is_done
+    moving = drain(pace)
     pace.rest()
-    assert not pace.is_done
-    assert drain(pace) == [Asked(SCENE, SIZE, False)]
-    assert drain(pace) == [] and pace.is_done
+    resting = drain(pace)
+
+    assert moving == [Asked(SCENE, SIZE, True)]
+    assert resting == [Asked(SCENE, SIZE, False)]
+
+
+def test_pace_is_done_once_the_sharp_picture_of_a_change_is_drawn(pace: Pace) -> None:
+    drain(pace)
+    done = [pace.is_done]
+
+    pace.change([SCENE])
+    drain(pace)
+    done.append(pace.is_done)
+    pace.rest()
+    done.append(pace.is_done)
+    drain(pace)
+    done.append(pace.is_done)
+
+    assert done == [True, False, False, True]
 
 
 def test_views_take_turns_while_both_change_all_the_time(pace: Pace) -> None:
@@ -69,16 +84,30 @@ def test_only_a_new_size_is_drawn_again(pace: Pace) -> None:
     assert drain(pace) == [Asked("axial", (120, 100), False)]
 
 
-def test_a_sharp_picture_gives_way_to_a_moving_one_of_the_same_view(pace: Pace) -> None:
+SHARP, COARSE = Asked(SCENE, SIZE, False), Asked(SCENE, SIZE, True)
+
+
+def test_sharp_picture_gives_way_to_a_moving_one_of_its_view(pace: Pace) -> None:
     drain(pace)
-    sharp, slow = Asked(SCENE, SIZE, False), Asked(SCENE, SIZE, True)
-    assert pace.instead(sharp) is None  # nothing is stale
-    pace.change(["axial"])
-    assert pace.instead(sharp) is None  # another view waits until it is drawn
-    pace.change([SCENE])
-    assert pace.instead(slow) is None  # one that moves is finished
-    assert pace.instead(sharp) == slow
+    pace.change(["axial", SCENE])
+
+    assert pace.instead(SHARP) == COARSE
     assert [asked.view for asked in drain(pace)] == ["axial"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "drawn"),
+    [
+        pytest.param([], SHARP, id="nothing is stale"),
+        pytest.param(["axial"], SHARP, id="another view waits"),
+        pytest.param([SCENE], COARSE, id="one that moves is finished"),
+    ],
+)
+def test_picture_that_is_drawn_is_finished(pace: Pace, changed: list[str], drawn: Asked) -> None:
+    drain(pace)
+    pace.change(changed)
+
+    assert pace.instead(drawn) is None
 
 
 @pytest.mark.parametrize("ground", [(0, 0, 0), (255, 255, 255), (13, 140, 201)])

@@ -46,7 +46,7 @@ def mm_of_pixel(page, name: str) -> float:
     return 10.0 / float(np.linalg.norm(np.subtract(*pixels)))
 
 
-def test_a_slice_says_number_place_window_and_what_is_under_the_mouse(page) -> None:
+def test_slice_says_number_place_window_and_what_is_under_the_mouse(page) -> None:
     go_to(page, scenes.middle(0))
     shown = facts(page)["slices"]["axial"]
     assert f"axial {shown['number']} / {shown['count']}" in words_of(page, "axial")
@@ -63,7 +63,7 @@ def test_a_slice_says_number_place_window_and_what_is_under_the_mouse(page) -> N
 
 
 @pytest.mark.parametrize(("stage", "lines"), [(700, 2), (400, 1)])
-def test_a_narrow_slice_says_hu_and_what_else_has_room(page, stage: int, lines: int) -> None:
+def test_narrow_slice_says_hu_and_what_else_has_room(page, stage: int, lines: int) -> None:
     go_to(page, scenes.middle(0))
     page.execute_script("document.getElementById('stage').style.maxWidth = `${arguments[0]}px`", stage)
     wait_for(page, f"return axial.clientWidth < {stage / 3} && clrecon.facts.settled")
@@ -72,7 +72,7 @@ def test_a_narrow_slice_says_hu_and_what_else_has_room(page, stage: int, lines: 
     assert "1000 HU" in words_of(page, "axial") and "axial" in words_of(page, "axial")
 
 
-def test_the_wheel_with_ctrl_zooms_a_slice_about_the_mouse_and_0_fits_it(page) -> None:
+def test_wheel_with_ctrl_zooms_a_slice_and_0_fits_it(page) -> None:
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
     from selenium.webdriver.common.keys import Keys
@@ -122,7 +122,7 @@ def test_two_fingers_zoom_and_move_a_slice(page) -> None:
     assert before / mm_of_pixel(page, "axial") == pytest.approx(3.0, rel=0.4)
 
 
-def test_a_double_click_shows_one_view_at_full_size_and_back(page) -> None:
+def test_double_click_shows_one_view_at_full_size_and_back(page) -> None:
     from selenium.webdriver import ActionChains
 
     every = page.execute_script(SHOWN)
@@ -137,7 +137,7 @@ def test_a_double_click_shows_one_view_at_full_size_and_back(page) -> None:
     assert page.execute_script(SHOWN) == every
 
 
-def test_a_double_click_with_a_tool_sets_points_alone(page) -> None:
+def test_double_click_with_a_tool_sets_points_alone(page) -> None:
     from selenium.webdriver import ActionChains
 
     page.find_element("id", "trace").click()
@@ -147,7 +147,7 @@ def test_a_double_click_with_a_tool_sets_points_alone(page) -> None:
     assert len(page.execute_script(SHOWN)) > 1
 
 
-def test_the_button_of_a_view_is_named_and_pressed_at_full_size(page) -> None:
+def test_button_of_a_view_is_named_and_pressed_at_full_size(page) -> None:
     button = page.find_element("css selector", "#sagittal .enlarge")
     cross = facts(page)["cross"]
     assert (button.accessible_name, button.get_attribute("aria-pressed")) == ("sagittal at full size", "false")
@@ -159,7 +159,7 @@ def test_the_button_of_a_view_is_named_and_pressed_at_full_size(page) -> None:
     assert page.execute_script(SHOWN) == ["scene"]
 
 
-def test_a_slice_with_the_focus_is_used_by_keys_and_says_what_it_shows(page) -> None:
+def test_slice_with_the_focus_is_used_by_keys_and_says_what_it_shows(page) -> None:
     from selenium.webdriver.common.keys import Keys
 
     go_to(page, scenes.middle(0))
