@@ -408,7 +408,14 @@ def test_option_of_labels_without_a_label_map_is_refused(
     printed().assert_error(options[0])
 
 
-@pytest.mark.parametrize(("content", "code"), [(None, 3), (b"", 4), (b"\x1f\x8b\x08\0", 4)])
+@pytest.mark.parametrize(
+    ("content", "code"),
+    [
+        pytest.param(None, 3, id="no file"),
+        pytest.param(b"", 4, id="empty"),
+        pytest.param(b"\x1f\x8b\x08\0", 4, id="cut off after the head of gzip"),
+    ],
+)
 def test_label_map_that_cannot_be_read_is_refused(
     content: bytes | None, code: int, device: Any, ct: Path, tmp_path: Path, printed: Printer,
 ) -> None:  # fmt: skip

@@ -146,8 +146,10 @@ def test_colours_of_vtk_on_a_logarithmic_scale_are_refused() -> None:
     colors.AddRGBPoint(1, 0, 0, 0)
     colors.AddRGBPoint(9, 1, 1, 1)
     colors.SetScaleToLog10()
+    made = make_property(vtk_data.vtkPiecewiseFunction(), colors)
+
     with pytest.raises(UsageError, match="logarithm"):
-        TransferFunction.from_vtk(make_property(vtk_data.vtkPiecewiseFunction(), colors))
+        TransferFunction.from_vtk(made)
 
 
 @pytest.mark.parametrize("opacity", ["sigmoid_5", "linear_r", 0.3, [0, 0.1, 0.9], list(np.linspace(0, 0.9, 256))])

@@ -18,6 +18,17 @@ from clrecon.viewer.web.server import WebServer, bind_port
 pytestmark = pytest.mark.unit
 
 
+@pytest.fixture
+def views() -> Views:
+    return Views()
+
+
+@pytest.fixture
+def served(views: Views):
+    with serving(views.open) as running:
+        yield running
+
+
 @pytest.mark.parametrize("method", ["HEAD", "POST"])
 @pytest.mark.parametrize("path", ["/?secret={}", "/saved/x?secret={}"], ids=["page", "file"])
 def test_method_other_than_get_is_not_allowed(served: WebServer, path: str, method: str) -> None:

@@ -23,6 +23,17 @@ pytestmark = pytest.mark.unit
 JPEG_GREYS = 2  # what a flat grey changes by in a picture for the browser
 
 
+@pytest.fixture
+def views() -> Views:
+    return Views()
+
+
+@pytest.fixture
+def served(views: Views):
+    with serving(views.open) as running:
+        yield running
+
+
 def grey(picture: tuple[dict[str, Any], Any]) -> int:
     """The iso value that a picture of the painter shows."""
     return int(np.asarray(picture[1])[5, 5, 0])
