@@ -41,6 +41,11 @@ CHECKS = {
         (".ci/run",),
         {"CLRECON_RELEASE_TESTS": "1", "CLRECON_COVERAGE": "1"},
     ),
+    "package": ReleaseCheck(
+        "the source distribution holds the whole project, the wheel built from it is pure Python and has full metadata,"
+        " and writes a mesh from an environment of its own; needs the extra release and the package index",
+        ("scripts/proof/check_package.py", str(KEPT / "package")),
+    ),
     "kernels": ReleaseCheck(
         "every mutation of every kernel is caught by the self-test, where .ci/run draws a few; on PoCL 3.1",
         ("scripts/proof/mutate_kernels.py", "--device", "0", "--results", str(KEPT / "kernels.json")),

@@ -11,6 +11,7 @@ import sysconfig
 import venv
 import zipfile
 from collections.abc import Callable
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -78,6 +79,20 @@ def test_files_that_patterns_of_package_data_match_are_found(
     for name in ("top.cl", "theme/a.cl", "theme/b.h", "theme/c.clh"):
         (tmp_path / name).write_text("")
     assert matched_files(tmp_path, patterns) == matched
+
+
+def test_source_distribution_takes_every_file_of_the_project() -> None:
+    lines = [line.split() for line in (ROOT / "MANIFEST.in").read_text(encoding="utf-8").splitlines()]
+    folders = {name for word, *names in lines if word == "graft" for name in names} | {"clrecon"}
+    patterns = [name for word, *names in lines if word == "include" for name in names]
+    by_setuptools = {"LICENSE", "MANIFEST.in", "pyproject.toml", "setup.cfg"}
+    left_out = {
+        name
+        for path in project_files()
+        if (name := path.relative_to(ROOT).parts[0]) not in folders | by_setuptools
+        and not any(fnmatch(name, pattern) for pattern in patterns)
+    }
+    assert left_out == set()
 
 
 def test_pocl_is_required_on_linux_for_x86_64_and_pyopencl_alone_on_every_other_system() -> None:
