@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.reading.archives import unpacked
 from clrecon.reading.common.selection import Selection, check_rescale
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.progress import ignore_progress
 from clrecon.system.text import escape_text
 
 if TYPE_CHECKING:
@@ -25,15 +27,16 @@ _NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha"
 def read_selected(path: str | os.PathLike[str], selection: Selection, *, progress: Progress | None = None) -> Volume:
     """Read the part of an input that a selection names, see `read_volume`."""
     rescale = check_rescale(selection.rescale)
-    kind = tell_format(path)
-    if kind is None:
-        from clrecon.reading.dicom.reader import read_series
+    with unpacked(path, progress or ignore_progress) as inside:
+        kind = tell_format(inside)
+        if kind is None:
+            from clrecon.reading.dicom.reader import read_series
 
-        return read_series(path, selection, progress)
-    _refuse_options(kind, selection)
-    from clrecon.reading.grids import read_grid
+            return read_series(inside, selection, progress)
+        _refuse_options(kind, selection)
+        from clrecon.reading.grids import read_grid
 
-    return read_grid(Path(path), kind, rescale=rescale, progress=progress)
+        return read_grid(Path(inside), kind, rescale=rescale, progress=progress)
 
 
 def list_selected(
@@ -41,15 +44,16 @@ def list_selected(
 ) -> SeriesListing:
     """List an input, with the certificate of the part that a selection names, see `list_series`."""
     rescale = check_rescale(selection.rescale)
-    kind = tell_format(path)
-    if kind is None:
-        from clrecon.reading.dicom.reader import list_scan
+    with unpacked(path, progress or ignore_progress) as inside:
+        kind = tell_format(inside)
+        if kind is None:
+            from clrecon.reading.dicom.reader import list_scan
 
-        return list_scan(path, selection, pixels=pixels, progress=progress)
-    _refuse_options(kind, selection)
-    from clrecon.reading.grids import list_grid
+            return list_scan(inside, selection, pixels=pixels, progress=progress)
+        _refuse_options(kind, selection)
+        from clrecon.reading.grids import list_grid
 
-    return list_grid(Path(path), kind, rescale=rescale, pixels=pixels, progress=progress)
+        return list_grid(Path(inside), kind, rescale=rescale, pixels=pixels, progress=progress)
 
 
 @explains_arguments
@@ -71,7 +75,7 @@ def read_volume(
     path : str or path-like
         A folder of DICOM files, searched with its subfolders; one DICOM file; or a file with a grid and its affine:
         NIfTI (.nii, .nii.gz, .hdr with .img), NRRD (.nrrd, .nhdr), MetaImage (.mha, .mhd), which needs the
-        package SimpleITK.  Told from the content.
+        package SimpleITK; or a zip or tar file of these.  Told from the content.
     series : int or str, optional
         Which series of a DICOM folder: its number in the listing (from 1), SeriesInstanceUID, its hash, the start of
         one of these, or description.  Default: the CT series with most slices; of those with a similar number original
