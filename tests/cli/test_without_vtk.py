@@ -37,7 +37,7 @@ def ct_without_vtk(without_vtk: None, tmp_path: Path, monkeypatch: pytest.Monkey
     [
         "mesh ct -o a.vtp --smooth",
         "mesh ct -o b.ply --decimate 0.5",
-        "mesh ct -o c.stl --for print --decimate 0.7",
+        "mesh ct -o c.stl --for print",
         "cloud ct -o d.vtp",
     ],
 )
