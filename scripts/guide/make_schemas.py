@@ -149,6 +149,8 @@ def _read_word(word: str, name: str, section: Section) -> Schema:
     if word == "certificate":
         return {"$ref": "certificate.json"}
     if found := re.fullmatch(r"list(?: of (.+?)s?)?", word):
+        if found[1] == "object":  # not those of a table
+            return {"type": "array", "items": {"type": "object"}}
         return {"type": "array", **({"items": _read_word(found[1], name, section)} if found[1] else {})}
     if found := re.fullmatch(r"(\d+) (int|number)s?", word):
         return _array(int(found[1]), {"type": WORDS[found[2]]})

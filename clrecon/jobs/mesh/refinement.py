@@ -29,8 +29,8 @@ _SHIFT_SHARE, _FEWEST_TOLD = 0.1, 0.5
 
 
 _PRINT_BOUND = 0.8
-"""Of the default bound, for decimation of prints: of a few hundred vertices more than 5 % lie near the bound, and the gate
-of 0.25 voxel at 95 % of the surface failed at 0.9.
+"""Of the default bound, for decimation of prints: of a few hundred vertices more than 5 % lie near the bound, and the
+gate of 0.25 voxel at 95 % of the surface failed at 0.9.
 """
 
 
