@@ -134,18 +134,15 @@ def judge_components(
     fewest: int = FEWEST_VERTICES,
 ) -> list[WallLook | None]:  # fmt: skip
     """Judge each component of a surface with normals; None for crumbs of less than the `fewest` vertices."""
-    order = np.argsort(label_of_vertex, kind="stable")
-    ends = np.searchsorted(label_of_vertex[order], np.arange(count + 1))
-    sizes = np.diff(ends)
-    large = np.flatnonzero(sizes >= fewest)
-    chosen = [order[ends[one] : ends[one + 1] : -(-sizes[one] // _MOST_COMPONENT_SAMPLES)] for one in large]
+    is_large = np.bincount(label_of_vertex[label_of_vertex >= 0], minlength=count) >= fewest
     judged: list[WallLook | None] = [None] * count
-    if len(large) == 0:
+    if not is_large.any():
         return judged
+    chosen = [rows[:: -(-len(rows) // _MOST_COMPONENT_SAMPLES)] for rows in _rows_of(label_of_vertex, is_large)]
     rows = np.concatenate(chosen)
     walls = sample_walls(mesh.vertices[rows], normals_of(mesh)[rows], volume, rule)
     first = 0
-    for component, samples in zip(large, chosen, strict=True):
+    for component, samples in zip(np.flatnonzero(is_large), chosen, strict=True):
         judged[component] = judge_walls(walls.where(slice(first, first + len(samples))))
         first += len(samples)
     return judged
@@ -164,16 +161,24 @@ def find_rails(
     """
     rails = np.zeros(len(chosen), dtype=bool)
     last = volume.shape_ijk[2] - 1
-    if last * volume.spacing[2] < STRAIGHT_MM:
+    if last * volume.spacing[2] < STRAIGHT_MM or not chosen.any():
         return rails
-    order = np.argsort(label_of_vertex, kind="stable")
-    ends = np.searchsorted(label_of_vertex[order], np.arange(len(chosen) + 1))
-    for number in np.flatnonzero(chosen):
-        rows = order[ends[number] : ends[number + 1]]
+    for number, rows in zip(np.flatnonzero(chosen), _rows_of(label_of_vertex, chosen), strict=True):
         # it is blurred by about a voxel
         width = _measure_section(volume.lps_to_ijk(mesh.vertices[rows].astype(np.float64)), volume.spacing, last)
         rails[number] = width is not None and bool((width - volume.spacing[:2]).min() <= RAIL_MM)
     return rails
+
+
+def _rows_of(label_of_vertex: NDArray[np.int64], chosen: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """Return the vertices of each of the chosen components, at least one, in their order."""
+    count = int(np.count_nonzero(chosen))
+    rank = np.full(len(chosen) + 1, -1, np.int16 if count < 2**15 else np.int64)  # sorted in linear time in 16 bits
+    rank[:-1][chosen] = np.arange(count)
+    ranks = rank[label_of_vertex]  # the last entry is for vertices that no triangle uses, -1
+    rows = np.flatnonzero(ranks >= 0)
+    ranks = ranks[rows]
+    return np.split(rows[np.argsort(ranks, kind="stable")], np.cumsum(np.bincount(ranks, minlength=count))[:-1])
 
 
 def is_straight(points: NDArray[np.float64], volume: Volume) -> bool:
