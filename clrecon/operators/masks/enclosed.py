@@ -49,13 +49,7 @@ class Spaces:
 
     def choose(self, wanted: NDArray[np.bool_]) -> Mask:
         """Return the voxels of some of the spaces; `wanted` has shape (n,)."""
-        mask, components = self._mask, self._found
-        words_d = zero_words(mask.device, mask_bytes(mask.shape_ijk)["mask of the voxels"] // 4)
-        if wanted.any():
-            marks = np.zeros(4 * -(-components.count // 4), np.uint8)
-            marks[self.numbers[wanted]] = 1
-            write_runs(mask.device, components, upload(mask.device, marks), words_d, mask.shape_ijk)
-        return Mask(mask.scan, words_d, f"spaces in ({mask.name})", device=mask.device, memory=mask.memory)
+        return _write_components(self._mask, self._found, self.numbers[wanted], f"spaces in ({self._mask.name})")
 
     def are_wide(self, radius_mm: float) -> NDArray[np.bool_]:
         """Tell of each space whether a ball of this radius fits into it and what lies beyond ends that cut it."""
@@ -73,6 +67,16 @@ class Spaces:
         middle = _find_middle(self._runs.of(self.numbers[largest]))
         position = self.volume.ijk_to_lps(np.array([middle], np.float64))[0]
         return {**facts, "largest_ml": float(self.ml[largest]), "at_mm": [round(float(x), 1) for x in position]}
+
+
+def _write_components(mask: Mask, components: Components, numbers: NDArray[np.intp], name: str) -> Mask:
+    """Return the voxels of some components of what is in a mask, or of what is not."""
+    device, words_d = mask.device, zero_words(mask.device, mask_bytes(mask.shape_ijk)["mask of the voxels"] // 4)
+    if len(numbers):
+        marks = np.zeros(4 * -(-components.count // 4), np.uint8)
+        marks[numbers] = 1
+        write_runs(device, components, upload(device, marks), words_d, mask.shape_ijk)
+    return Mask(mask.scan, words_d, name, device=device, memory=mask.memory)
 
 
 def _sum_hu(runs: RunList, volume: Volume, count: int) -> NDArray[np.float64]:
@@ -141,47 +145,36 @@ def find_spaces(mask: Mask) -> Spaces:
 def find_joints(mask: Mask, reach_mm: float, least_ml: float) -> Mask:
     """Choose what lies within a distance of two pieces of a mask that are apart and have some volume each."""
     device, shape = mask.device, mask.shape_ijk
-    volume = mask.scan
     words = mask_bytes(shape)["mask of the voxels"]
     components = find_components(device, mask.bits, beside=3 * words, memory=mask.memory)
-    joints = Mask(volume, zero_words(device, words // 4), "joints", device=device, memory=mask.memory)
+    joints = _write_components(mask, components, np.empty(0, np.intp), "joints")
     if components.count < 2:
         return joints
     runs = RunList.read(device, components, shape)
-    large = np.flatnonzero(runs.sum_ml(volume, components.count) >= least_ml)
+    large = np.flatnonzero(runs.sum_ml(mask.scan, components.count) >= least_ml)
     # Two pieces differ in at least one bit of their places in the list.
     for bit in range(max(len(large) - 1, 0).bit_length()):
-        sides = []
-        for value in (0, 1):
-            marks = np.zeros(4 * -(-components.count // 4), np.uint8)
-            marks[large[(np.arange(len(large)) >> bit & 1) == value]] = 1
-            side_d = zero_words(device, words // 4)
-            write_runs(device, components, upload(device, marks), side_d, shape)
-            sides.append(Mask(volume, side_d, "bones", device=device, memory=mask.memory).dilate(reach_mm))
+        upper = (np.arange(len(large)) >> bit & 1) == 1
+        sides = [_write_components(mask, components, large[side], "bones").dilate(reach_mm) for side in (upper, ~upper)]
         joints = joints | (sides[0] & sides[1])
         wait(device)  # the masks of commands that wait in the queue are all in memory
     return joints
 
 
 def _open_ends(mask: Mask) -> NDArray[np.int32]:
-    """Return i, j, k of the voxels of the six ends of the volume that the mask does not enclose there, shape (n, 3)."""
+    """Return i, j, k of a voxel of each run in the ends of the volume that a mask does not enclose there, (n, 3)."""
     ni, nj, nk = mask.shape_ijk
     words = download(mask.device, np.empty((nk, nj, -(-ni // 32)), "<u4"), mask._mask_d)
+    rows = [(2, k, words[k]) for k in (0, nk - 1)] + [(1, j, np.ascontiguousarray(words[:, j])) for j in (0, nj - 1)]
+    faces = [(axis, edge, np.unpackbits(row.view(np.uint8), 1, ni, "little")) for axis, edge, row in rows]
+    faces += [(0, i, (words[:, :, i // 32] >> np.uint32(i % 32)) & 1) for i in (0, ni - 1)]
     ends = []
-    for edge in (0, nk - 1):
-        face = np.unpackbits(words[edge].view(np.uint8), axis=1, count=ni, bitorder="little")
-        j, i = np.nonzero(find_open_places(face))
-        ends.append((i, j, np.full_like(i, edge)))
-    for edge in (0, nj - 1):
-        rows = np.ascontiguousarray(words[:, edge])
-        face = np.unpackbits(rows.view(np.uint8), axis=1, count=ni, bitorder="little")
-        k, i = np.nonzero(find_open_places(face))
-        ends.append((i, np.full_like(i, edge), k))
-    for edge in (0, ni - 1):
-        face = (words[:, :, edge // 32] >> np.uint32(edge % 32)) & 1
-        k, j = np.nonzero(find_open_places(face))
-        ends.append((np.full_like(j, edge), j, k))
-    return np.concatenate([np.stack(axes, axis=1) for axes in ends]).astype(np.int32)
+    for axis, edge, face in faces:
+        is_open = find_open_places(face)
+        if axis:  # the others of a run along i are in the same component
+            is_open[:, 1:] &= ~is_open[:, :-1]
+        ends.append(np.insert(np.stack(np.nonzero(is_open)[::-1], axis=1), axis, edge, axis=1))
+    return np.concatenate(ends).astype(np.int32)
 
 
 LEAST_SAID_ML = 0.1
