@@ -19,13 +19,14 @@ from clrecon.jobs.run import JobReport, Run
 from clrecon.jobs.settings import FITTED_FROM_HU, DistanceSettings
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SAMPLES, DistanceSummary
-from clrecon.mesh.compare.signed import SideDistance, measure_distance, measure_vertex_distances
+from clrecon.mesh.compare.signed import Ruler, SideDistance, compare_sides
 from clrecon.mesh.mesh_reader import read_mesh
 from clrecon.system.arguments import Space
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.text import escape_text, format_digits
 
 if TYPE_CHECKING:
+    from clrecon.mesh.quality import MeshQuality
     from clrecon.opencl import Device
     from clrecon.rendering import Rendering
     from clrecon.rendering.looks.colors import ColorScale
@@ -87,27 +88,29 @@ def measure_meshes(
             meshes.append(read_side(reference, settings.mesh_space))
         else:
             meshes.append(_make_side(run, reference, device))
-        entries = [describe_mesh(own, path) for own, path in zip(meshes, (mesh, reference), strict=True)]
+        qualities = [own.quality() for own in meshes]
+        entries = [describe_mesh(*each) for each in zip(meshes, (mesh, reference), qualities, strict=True)]
         for entry in entries:
             if not entry["area_mm2"]:
                 raise NoSurfaceError(f"{entry['name']} has no triangle with an area: there is nothing to measure")
         run.lap("read")
         names = (entries[0]["name"], entries[1]["name"])
-        apart = measure_distance(meshes[0], meshes[1], settings.samples or SAMPLES, names=names, progress=run.progress)
+        rulers = [Ruler.of(meshes[side], names[side], qualities[side]) for side in (1, 0)]
+        apart = compare_sides(meshes, rulers, settings.samples or SAMPLES, run.progress)
         colored = None
         if files.output is not None or files.picture is not None:
             from clrecon.rendering.looks.colors import ColorScale, round_up
 
-            distances, signed = measure_vertex_distances(meshes[0], meshes[1], progress=run.progress)
+            distances = rulers[0].measure(meshes[0].vertices, run.progress)
             limit = settings.range_mm or round_up(max(apart.to_reference_mm.p95, _LEAST_RANGE_MM))
-            colored = _Colored(distances, ColorScale(limit, signed))
+            colored = _Colored(distances, ColorScale(limit, rulers[0].signed))
         run.lap("measure")
         drawn = None
         if device is not None and colored is not None and files.picture is not None:
             run.progress("render", 0, 0)
             drawn = _draw_mesh(meshes[0], colored, names[1], settings, device)
             run.lap("render")
-        outputs = _write_files(run, meshes[0], colored, drawn, files, settings)
+        outputs = _write_files(run, meshes[0], colored, drawn, files)
         run.lap("write")
         warnings = list(chain(*(mesh.report["file"]["warnings"] for mesh in meshes)))
         report = run.report(
@@ -115,14 +118,11 @@ def measure_meshes(
             [*warnings, *doubt_frames(meshes, entries), *apart.warnings],
             a=entries[0],
             b=entries[1],
-            hausdorff_mm=apart.hausdorff_mm,
-            hd95_mm=apart.hd95_mm,
-            assd_mm=apart.assd_mm,
+            **{name: apart[name] for name in ("hausdorff_mm", "hd95_mm", "assd_mm", "samples")},
             a_to_b_mm=apart.to_reference_mm,
             b_to_a_mm=apart.from_reference_mm,
             a_to_b_signed_mm=apart.to_reference_signed_mm,
             b_to_a_signed_mm=apart.from_reference_signed_mm,
-            samples=apart.samples,
             colors=None if colored is None else colored.describe(),
             outputs=outputs,
             device=None if device is None else device.current.label,
@@ -161,20 +161,12 @@ def _draw_mesh(mesh: Mesh, colored: _Colored, reference: str, settings: Distance
 
 
 def _write_files(
-    run: Run,
-    mesh: Mesh,
-    colored: _Colored | None,
-    drawn: Rendering | None,
-    files: MeshFiles,
-    settings: DistanceSettings,
+    run: Run, mesh: Mesh, colored: _Colored | None, drawn: Rendering | None, files: MeshFiles
 ) -> list[dict[str, Any]]:
     written: list[tuple[str, str | Path, StagedFile]] = []
     if files.output is not None and colored is not None:
-        content = replace(
-            mesh.describe(settings.space),
-            vertex_colors=colored.colors,
-            values={"distance_mm": colored.distances.astype(np.float32)},
-        )
+        values = {"distance_mm": colored.distances.astype(np.float32)}
+        content = replace(mesh.describe(run.settings.space), vertex_colors=colored.colors, values=values)
         counted = f"{mesh.triangle_count} triangles"
         file = run.stage(stage_content(content, files.output, FORMATS[".ply"], counted, "fewer triangles"))
         written.append(("mesh", files.output, file))
@@ -218,9 +210,8 @@ def _make_side(run: Run, source: str | Path, device: Device) -> Mesh:
     return mesh
 
 
-def describe_mesh(mesh: Mesh, path: str | Path) -> dict[str, Any]:
+def describe_mesh(mesh: Mesh, path: str | Path, quality: MeshQuality) -> dict[str, Any]:
     """Return the report's entry of a mesh; the name of its file without folders."""
-    quality = mesh.quality()
     file = mesh.report["file"]
     closed = quality.closed and quality.oriented
     return {

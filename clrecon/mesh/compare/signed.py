@@ -7,6 +7,8 @@ the normals of both faces, at a vertex the sum of those around it weighted by th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +23,7 @@ from clrecon.mesh.compare.distances import (
 )
 from clrecon.mesh.connectivity import find_edges, opposite_half_edges
 from clrecon.mesh.mesh import Mesh
-from clrecon.mesh.quality import MeshQuality, measure_quality
+from clrecon.mesh.quality import MeshQuality
 from clrecon.mesh.triangle_tree import TriangleTree
 from clrecon.mesh.triangles import cross_products, vertex_normals
 from clrecon.system.arguments import explains_arguments
@@ -61,7 +63,7 @@ class SignedDistance:
             length = np.sqrt(np.einsum("ij,ij->j", cross, cross))
             faces[piece] = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0.0).T
         self._faces = faces
-        self._edges = faces[np.arange(len(opposite)) // 3] + faces[opposite // 3]
+        self._opposite = opposite
         self._corners = vertex_normals(vertices, triangles).astype(np.float64)
 
     def __call__(self, points: Points) -> NDArray[np.float64]:
@@ -93,11 +95,46 @@ class SignedDistance:
         on_edge = np.flatnonzero(count == 1)
         # Half-edge i runs from corner i to the next one: the corner that is absent is the one before.
         half = (absent[on_edge].argmax(axis=1) + 1) % 3
-        normals[on_edge] = self._edges[3 * rows[on_edge] + half]
+        normals[on_edge] += self._faces[self._opposite[3 * rows[on_edge] + half] // 3]
         at_corner = np.flatnonzero(count >= 2)
         corner = self._triangles[rows[at_corner], near[at_corner].argmin(axis=1)]
         normals[at_corner] = self._corners[corner]
         return np.asarray(normals)
+
+
+@dataclass(frozen=True, eq=False)
+class Ruler:
+    """What measures distances from a surface, `signed` where it is closed, and `warnings` of what was found in it."""
+
+    distances_of: SignedDistance | SurfaceDistance
+    signed: bool
+    warnings: list[str]
+
+    @classmethod
+    def of(cls, mesh: Mesh, name: str, quality: MeshQuality | None = None) -> Ruler:
+        """Make the ruler of a mesh that warnings call `name`; its `quality` is measured where it is not known."""
+        mesh.check()
+        if not mesh.triangle_count:
+            raise NoSurfaceError(f"{name} has no triangles: there is nothing to measure from")
+        quality = quality or mesh.quality()
+        why = why_unsigned(quality, name)
+        if why is not None:
+            return cls(SurfaceDistance(mesh.vertices, mesh.triangles), False, [why])
+        inverted = f"{name} is turned inside out: the sign of distances from it is turned back"
+        signed = SignedDistance(mesh.vertices, mesh.triangles, outward=quality.outward)
+        return cls(signed, True, [] if quality.outward else [inverted])
+
+    def measure(
+        self, points: NDArray[np.floating], progress: Progress | None, side: tuple[int, int] = (0, 1)
+    ) -> NDArray[np.float64]:
+        """Measure points (k, 3), mm; `side`: its number and how many there are, for `progress`."""
+        report, distances = progress or ignore_progress, np.empty(len(points))
+        before, total = (number * len(points) for number in side)
+        for piece in chunks(len(points), _PIECE):
+            report("compare", before + piece.start, total)
+            distances[piece] = self.distances_of(points[piece].astype(np.float64))
+        report("compare", before + len(points), total)
+        return distances
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,21 +224,20 @@ def measure_distance(
     """
     if samples < 1:
         raise UsageError(f"distances need at least 1 sample, not {samples}")
-    report, done = progress or ignore_progress, 0
+    rulers = Ruler.of(reference, names[1]), Ruler.of(mesh, names[0])
+    return compare_sides((mesh, reference), rulers, samples, progress)
+
+
+def compare_sides(
+    meshes: Sequence[Mesh], rulers: Sequence[Ruler], samples: int, progress: Progress | None = None
+) -> MeshDeviation:
+    """Measure two meshes as `measure_distance` does, points of each with the ruler of the other."""
     sides, signed = [], []
-    warnings = []
-    for source, target, name in ((mesh, reference, names[1]), (reference, mesh, names[0])):
+    for number, (source, ruler) in enumerate(zip(meshes, rulers, strict=True)):
         points = sample_surface(source.vertices, source.triangles, samples)
-        measure, has_sign, remark = _measurer_of(target, name)
-        distances = np.empty(samples)
-        for piece in chunks(samples, _PIECE):
-            report("compare", done + piece.start, 2 * samples)
-            distances[piece] = measure(points[piece])
-        done += samples
+        distances = ruler.measure(points, progress, (number, 2))
         sides.append(summarise_distances(np.abs(distances)))
-        signed.append(_summarise_sides(distances) if has_sign else None)
-        warnings += remark
-    report("compare", done, 2 * samples)
+        signed.append(_summarise_sides(distances) if ruler.signed else None)
     return MeshDeviation(
         hausdorff_mm=max(side.max for side in sides),
         hd95_mm=max(side.p95 for side in sides),
@@ -210,7 +246,7 @@ def measure_distance(
         from_reference_mm=sides[1],
         to_reference_signed_mm=signed[0],
         from_reference_signed_mm=signed[1],
-        warnings=warnings,
+        warnings=[*rulers[0].warnings, *rulers[1].warnings],
         samples=samples,
     )
 
@@ -239,38 +275,12 @@ def measure_vertex_distances(
     NoSurfaceError
         The reference is empty.
     """
-    report = progress or ignore_progress
-    measure, has_sign, _ = _measurer_of(reference, "the reference")
-    distances = np.empty(mesh.vertex_count)
-    for piece in chunks(mesh.vertex_count, _PIECE):
-        report("compare", piece.start, mesh.vertex_count)
-        distances[piece] = measure(mesh.vertices[piece].astype(np.float64))
-    report("compare", mesh.vertex_count, mesh.vertex_count)
-    return distances, has_sign
-
-
-def _measurer_of(mesh: Mesh, name: str) -> tuple[SignedDistance | SurfaceDistance, bool, list[str]]:
-    """Return what measures distances from a mesh, whether they have a sign, and what is to be said of it."""
-    mesh.check()
-    if not mesh.triangle_count:
-        raise NoSurfaceError(f"{name} has no triangles: there is nothing to measure from")
-    quality = measure_quality(mesh.vertices, mesh.triangles)
-    remark = why_unsigned(quality, name)
-    if remark is not None:
-        return SurfaceDistance(mesh.vertices, mesh.triangles), False, [remark]
-    turned = [] if quality.outward else [f"{name} is turned inside out: the sign of distances from it is turned back"]
-    return SignedDistance(mesh.vertices, mesh.triangles, outward=quality.outward), True, turned
+    ruler = Ruler.of(reference, "the reference")
+    return ruler.measure(mesh.vertices, progress), ruler.signed
 
 
 def _summarise_sides(distances: NDArray[np.float64]) -> SideDistance:
     p5, median, p95 = np.percentile(distances, (5, 50, 95)).tolist()
-    return SideDistance(
-        mean=float(distances.mean()),
-        sd=float(distances.std()),
-        p5=p5,
-        median=median,
-        p95=p95,
-        min=float(distances.min()),
-        max=float(distances.max()),
-        outside_share=float(np.mean(distances > 0.0)),
-    )
+    low, high = float(distances.min()), float(distances.max())
+    outside = float(np.mean(distances > 0.0))
+    return SideDistance(float(distances.mean()), float(distances.std()), p5, median, p95, low, high, outside)

@@ -185,7 +185,7 @@ WHOLE_BOX, NO_TRIANGLES = Mesh(CORNERS, FACES), Mesh(np.zeros((3, 3)), np.zeros(
     [
         (WHOLE_BOX, WHOLE_BOX, 0, UsageError, "at least 1 sample"),
         (WHOLE_BOX, NO_TRIANGLES, 100, NoSurfaceError, "no triangles"),
-        (NO_TRIANGLES, WHOLE_BOX, 100, NoSurfaceError, "without area"),
+        (NO_TRIANGLES, WHOLE_BOX, 100, NoSurfaceError, "the mesh has no triangles"),
     ],
     ids=["no samples", "reference without triangles", "mesh without triangles"],
 )
