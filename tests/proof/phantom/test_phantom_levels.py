@@ -11,6 +11,7 @@ from refusals import refused
 from variants import daily, daily_rows
 
 from clrecon.errors import UsageError
+from clrecon.geometry import apply_affine
 from clrecon.labels import read_labels
 from clrecon.proof.phantom import PhantomSettings, make_phantom, phantom_truth, write_phantom
 from clrecon.proof.phantom.build import facts_of_spine
@@ -23,14 +24,20 @@ from clrecon.proof.phantom.vertebra import local_bounds, vertebra_distance
 from clrecon.reading import read_volume
 
 COARSE = {"size": (64, 60), "spacing": (3.4, 3.2, 3.0)}
+OLDER_SETTINGS = {
+    "kind", "size", "slices", "spacing", "tilt", "oblique", "noise", "point_spread_mm", "seed", "inside_hu",
+    "outside_hu", "radius_mm", "transfer_syntax",
+}  # fmt: skip
+"""What truth files named before a spine had levels, bends and couches."""
 
 
-def planned(levels: str, **choice: object) -> list[Vertebra]:
+def plan_vertebrae(levels: str, **choice: object) -> list[Vertebra]:
+    """Vertebrae of a spine in the middle of a field of 500 mm."""
     chosen = SpineChoice(parse_levels(levels), **choice)  # type: ignore[arg-type]
     return plan_anatomy((250.0, 250.0, 0.0), np.eye(3), 0, chosen).vertebrae
 
 
-def gaps(vertebrae: list[Vertebra]) -> list[float]:
+def distances_of_neighbours(vertebrae: list[Vertebra]) -> list[float]:
     """Least distance of each vertebra from the one above, mm."""
     covers = [BoneSurface([v]) for v in vertebrae]
     return [float(upper.distance(lower._tree.data).min()) for upper, lower in zip(covers, covers[1:], strict=False)]
@@ -51,8 +58,11 @@ def test_levels_are_read_in_any_order_and_written_again(text: str, names: tuple[
     assert parse_levels(format_levels(names)) == names
 
 
-def test_levels_have_their_numbers_and_shortest_words() -> None:
+def test_levels_are_numbered_from_1_at_c1_to_24_at_l5() -> None:
     assert [level_number(name) for name in ("C1", "C7", "T1", "T12", "L1", "L5")] == [1, 7, 8, 19, 20, 24]
+
+
+def test_levels_that_follow_each_other_are_written_as_a_range() -> None:
     assert format_levels(("C7", "T1", "L1", "L4", "L5")) == "C7-T1,L1,L4-L5"
 
 
@@ -105,117 +115,245 @@ def test_sets_of_four_twelve_and_seventeen_levels_fit_into_usual_stacks(slices: 
     assert settings.slices == slices
 
 
-def test_defaults_stay_as_they_were() -> None:
-    assert set(PhantomSettings().as_dict()) == {
-        "kind", "size", "slices", "spacing", "tilt", "oblique", "noise", "point_spread_mm", "seed", "inside_hu",
-        "outside_hu", "radius_mm", "transfer_syntax",
-    }  # fmt: skip
-    assert PhantomSettings().slices == 120 and PhantomSettings().spine_choice is None
+def test_settings_without_choices_for_a_spine_are_described_as_before_there_were_any() -> None:
+    settings = PhantomSettings()
+    assert settings.spine_choice is None
+    assert set(settings.as_dict()) == OLDER_SETTINGS
+
+
+def test_chosen_levels_are_described_in_capitals() -> None:
     assert PhantomSettings(levels="l5").as_dict()["levels"] == "L5"
 
 
 @pytest.mark.release
-def test_slices_follow_the_levels_and_hold_whole_bones() -> None:
-    counts = {}
-    for levels in ("L4-L5", "C3-C7,T1-T2"):
-        settings = PhantomSettings(**COARSE, levels=levels, noise=0.0, tilt=8.0)
-        truth = make_phantom(settings)[2]["spine"]
-        counts[levels] = settings.slices
-        assert [level["name"] for level in truth["vertebrae"]] == list(parse_levels(levels))
-        assert all(level["inside"] and level["whole"] for level in truth["vertebrae"])
-        assert PhantomSettings(**settings.as_dict()) == settings
-    assert 25 < counts["L4-L5"] < 35 < counts["C3-C7,T1-T2"] < 45
+@pytest.mark.parametrize("levels", ["L4-L5", "C3-C7,T1-T2"])
+def test_vertebrae_of_the_chosen_levels_lie_whole_within_the_slices(levels: str) -> None:
+    settings = PhantomSettings(**COARSE, levels=levels, noise=0.0, tilt=8.0)
+
+    vertebrae = make_phantom(settings)[2]["spine"]["vertebrae"]
+
+    assert [vertebra["name"] for vertebra in vertebrae] == list(parse_levels(levels))
+    assert all(vertebra["inside"] and vertebra["whole"] for vertebra in vertebrae)
+
+
+@pytest.mark.parametrize(
+    ("levels", "fewest", "most"),
+    [("L4-L5", 26, 34), ("C3-C7,T1-T2", 36, 44)],  # 80 to 100 mm of two lumbar levels, 110 to 130 mm of seven smaller
+    ids=["two lumbar levels", "seven levels of the neck"],
+)
+def test_number_of_slices_follows_from_the_levels(levels: str, fewest: int, most: int) -> None:
+    assert fewest <= PhantomSettings(**COARSE, levels=levels).slices <= most
+
+
+def test_settings_made_from_a_description_of_settings_equal_them() -> None:
+    settings = PhantomSettings(**COARSE, levels="L4-L5", noise=0.0, tilt=8.0)
+    assert PhantomSettings(**settings.as_dict()) == settings
+
+
+@pytest.fixture(scope="module")
+def oblique_spine(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PhantomSettings, dict]:
+    """Folder, settings and truth of a written spine of four levels."""
+    settings = PhantomSettings(**COARSE, levels="C6-T1,L5", noise=0.0, oblique=(4.0, -3.0, 9.0))
+    folder = tmp_path_factory.mktemp("oblique-spine") / "ct"
+    return folder, settings, write_phantom(folder, settings)
 
 
 @pytest.mark.release
 @pytest.mark.seconds
-def test_a_written_label_map_has_the_levels_by_name(tmp_path: Path) -> None:
-    settings = PhantomSettings(**COARSE, levels="C6-T1,L5", noise=0.0, oblique=(4.0, -3.0, 9.0))
-    truth = write_phantom(tmp_path / "ct", settings)
-    labels = read_labels(tmp_path / "ct" / "levels.nrrd")
+def test_written_label_map_is_that_of_the_truth_with_the_names_of_its_levels(
+    oblique_spine: tuple[Path, PhantomSettings, dict],
+) -> None:
+    folder, settings, truth = oblique_spine
+
+    labels = read_labels(folder / "levels.nrrd")
+
     assert labels.names == {6: "C6", 7: "C7", 8: "T1", 24: "L5"}
     assert np.array_equal(labels.voxels, phantom_truth(settings).label_map())
-    assert labels.affine == pytest.approx(np.array(truth["affine_ijk_to_lps_mm"]), abs=1e-9)
-    volume = read_volume(tmp_path / "ct")
-    for level in truth["spine"]["vertebrae"]:
-        inside = labels.voxels == level["label"]
-        assert np.median(volume.voxels[inside]) > 250.0
-        middle = volume.lps_to_ijk([level["center_lps_mm"]])[0]
-        near = np.rint(middle).astype(int)[::-1]
-        assert labels.voxels[tuple(near)] == level["label"] or level["name"] == "C1"
-    write_phantom(tmp_path / "ct", PhantomSettings(**COARSE, levels="L5"))  # an earlier phantom, label map and all
+    expected_affine = np.array(truth["affine_ijk_to_lps_mm"])
+    assert labels.affine == pytest.approx(expected_affine, abs=tolerances.DECIMAL_PLACE_MM)
 
 
-def test_cervical_vertebrae_have_their_own_shapes() -> None:
-    by_name = {v.name: v for v in planned("C1-C7")}
+@pytest.mark.release
+def test_written_label_of_a_vertebra_covers_voxels_of_bone(oblique_spine: tuple[Path, PhantomSettings, dict]) -> None:
+    folder, _, truth = oblique_spine
+    voxels, labels = read_volume(folder).voxels, read_labels(folder / "levels.nrrd").voxels
 
-    def bone(name: str, *points: tuple[float, float, float]) -> list[bool]:
-        return [bool(d > 0) for d in vertebra_distance(by_name[name], *np.array(points).T)]
+    medians = [np.median(voxels[labels == level["label"]]) for level in truth["spine"]["vertebrae"]]
 
-    # the ring of C1: arches before and behind, a foramen in the transverse process, nothing in the middle
-    assert bone("C1", (0, -12, 0), (0, 26, 0), (16, 0, 0), (0, -1.5, 0), (0, 10, 0), (25, 0.8, 0), (31, 2, 0)) == [
-        True, True, True, False, False, False, True,
-    ]  # fmt: skip
-    # the dens stands on C2 and within the ring of C1
-    top = by_name["C2"].height / 2.0 + 10.0
-    assert bone("C2", (0, -1, top), (0, 8, top), (4.6, by_name["C2"].depth / 2 + 33, -8)) == [True, False, True]
-    for name in ("C3", "C5", "C7"):
-        v = by_name[name]
-        beside = v.width / 2.0 + 4.4
-        assert bone(name, (beside, v.depth / 8.0, -1.0), (0, v.depth / 2 + v.canal_half_depth, 0)) == [False, False]
-        assert bone(name, (beside, v.depth / 8.0 + 3.6, -1.0), (beside, v.depth / 8.0 - 3.4, -1.0)) == [True, True]
-    rear = by_name["C5"].depth / 2.0 + 2.0 * by_name["C5"].canal_half_depth
-    assert bone("C5", (3.4, rear + 13.0, -4.0), (0.0, rear + 13.0, -4.0), (0.0, rear + 20.0, -7.0)) == [
-        True, False, False,
-    ]  # fmt: skip
-    rear = by_name["C7"].depth / 2.0 + 2.0 * by_name["C7"].canal_half_depth
-    assert bone("C7", (0.0, rear + 22.0, -8.0)) == [True]
+    assert len(medians) == 4
+    assert min(medians) > 250.0  # HU; muscle has 54
 
 
-def test_local_bounds_of_a_vertebra_have_it_all() -> None:
-    for vertebra in planned("C1-T1,L5"):
-        low, high = (np.array(corner) for corner in local_bounds(vertebra))
-        lattice = np.random.default_rng(3).uniform(low - 6.0, high + 6.0, (60_000, 3))
-        outside = ((lattice < low) | (lattice > high)).any(axis=1)
-        assert (vertebra_distance(vertebra, *lattice[outside].T) < 0.0).all(), vertebra.name
+@pytest.mark.release
+def test_written_label_of_a_vertebra_is_at_the_centre_of_its_body(
+    oblique_spine: tuple[Path, PhantomSettings, dict],
+) -> None:
+    folder, _, truth = oblique_spine  # all levels but C1, a ring, have a body at their centre
+    labels = read_labels(folder / "levels.nrrd")
+    vertebrae = truth["spine"]["vertebrae"]
+    lps_to_ijk = np.linalg.inv(labels.affine)
+
+    centres_ijk = apply_affine(lps_to_ijk, [vertebra["center_lps_mm"] for vertebra in vertebrae])
+    i, j, k = np.rint(centres_ijk).astype(int).T
+
+    assert labels.voxels[k, j, i].tolist() == [vertebra["label"] for vertebra in vertebrae]
+
+
+@pytest.mark.release
+def test_phantom_is_written_over_an_earlier_one_with_its_label_map(tmp_path: Path) -> None:
+    write_phantom(tmp_path / "ct", PhantomSettings(**COARSE, levels="L4"))
+
+    write_phantom(tmp_path / "ct", PhantomSettings(**COARSE, levels="L5"))
+
+    assert read_labels(tmp_path / "ct" / "levels.nrrd").names == {24: "L5"}
+
+
+@pytest.fixture(scope="module")
+def neck() -> dict[str, Vertebra]:
+    return {vertebra.name: vertebra for vertebra in plan_vertebrae("C1-C7")}
+
+
+def is_bone(vertebra: Vertebra, x: float, y: float, z: float) -> bool:
+    """Whether a point is bone: mm to the left, backwards and upwards from the middle of the body."""
+    return bool(vertebra_distance(vertebra, *np.array([[x, y, z]]).T)[0] > 0.0)
+
+
+def canal_end(vertebra: Vertebra) -> float:
+    """How far behind the middle of its body the canal of a vertebra ends, mm."""
+    return vertebra.depth / 2.0 + 2.0 * vertebra.canal_half_depth
+
+
+@pytest.mark.parametrize(
+    ("point_mm", "bone"),
+    [
+        pytest.param((0, -12, 0), True, id="front arch"),
+        pytest.param((0, 26, 0), True, id="rear arch"),
+        pytest.param((16, 0, 0), True, id="lateral mass"),
+        pytest.param((0, -1.5, 0), False, id="place of the dens"),
+        pytest.param((0, 10, 0), False, id="canal"),
+        pytest.param((25, 0.8, 0), False, id="foramen of the transverse process"),
+        pytest.param((31, 2, 0), True, id="tip of the transverse process"),
+    ],
+)
+def test_c1_is_a_ring_without_a_body_and_with_foramina(
+    neck: dict[str, Vertebra], point_mm: tuple[float, float, float], bone: bool
+) -> None:
+    assert is_bone(neck["C1"], *point_mm) == bone
+
+
+def test_dens_stands_on_c2_in_front_of_its_canal(neck: dict[str, Vertebra]) -> None:
+    above_the_body = neck["C2"].height / 2.0 + 10.0
+    assert is_bone(neck["C2"], 0, -1, above_the_body)
+    assert not is_bone(neck["C2"], 0, 8, above_the_body)
+
+
+@pytest.mark.parametrize("name", ["C3", "C5", "C7"])
+def test_transverse_process_of_a_cervical_vertebra_surrounds_its_foramen(neck: dict[str, Vertebra], name: str) -> None:
+    vertebra = neck[name]
+    beside, along = vertebra.width / 2.0 + 4.4, vertebra.depth / 8.0  # the middle of the foramen, mm
+    assert not is_bone(vertebra, beside, along, -1.0)
+    assert is_bone(vertebra, beside, along + 3.6, -1.0)
+    assert is_bone(vertebra, beside, along - 3.4, -1.0)
+
+
+@pytest.mark.parametrize("name", ["C3", "C5", "C7"])
+def test_canal_of_a_cervical_vertebra_is_free_of_bone(neck: dict[str, Vertebra], name: str) -> None:
+    vertebra = neck[name]
+    assert not is_bone(vertebra, 0, vertebra.depth / 2 + vertebra.canal_half_depth, 0)
+
+
+def test_spinous_process_of_c2_ends_in_a_tip_beside_the_middle(neck: dict[str, Vertebra]) -> None:
+    assert is_bone(neck["C2"], 4.6, neck["C2"].depth / 2.0 + 33.0, -8.0)
+
+
+def test_spinous_process_of_c5_is_split_at_its_end(neck: dict[str, Vertebra]) -> None:
+    near_the_end = canal_end(neck["C5"]) + 13.0
+    assert is_bone(neck["C5"], 3.4, near_the_end, -4.0)
+    assert not is_bone(neck["C5"], 0.0, near_the_end, -4.0)
+
+
+def test_spinous_process_of_c7_is_longer_than_that_of_c5(neck: dict[str, Vertebra]) -> None:
+    assert is_bone(neck["C7"], 0.0, canal_end(neck["C7"]) + 22.0, -8.0)
+    assert not is_bone(neck["C5"], 0.0, canal_end(neck["C5"]) + 20.0, -7.0)
+
+
+@pytest.mark.parametrize("number", range(9), ids=[*LEVELS[:8], "L5"])
+def test_no_bone_of_a_vertebra_lies_outside_of_its_local_bounds(number: int) -> None:
+    vertebra = plan_vertebrae("C1-T1,L5")[number]
+    low, high = (np.array(corner) for corner in local_bounds(vertebra))
+    points = np.random.default_rng(3).uniform(low - 6.0, high + 6.0, (60_000, 3))
+
+    outside = points[((points < low) | (points > high)).any(axis=1)]
+
+    assert len(outside) > 10_000
+    assert (vertebra_distance(vertebra, *outside.T) < 0.0).all()
 
 
 @pytest.mark.parametrize("levels", daily(1, ["C1-C3", "C7-T1", "L4-L5"]))
 def test_neighbouring_vertebrae_are_more_than_2_mm_apart_without_facet_joints(levels: str) -> None:
-    assert min(gaps(planned(levels))) > 2.0
+    assert min(distances_of_neighbours(plan_vertebrae(levels))) > 2.0
 
 
 @pytest.mark.release
 @pytest.mark.parametrize(("levels", "gap"), daily_rows(1, [("C1-C3", 0.3), ("T6-T7", 0.0), ("L4-L5", 0.8)]))
 def test_least_distance_of_neighbouring_vertebrae_is_the_gap_of_their_facet_joints(levels: str, gap: float) -> None:
-    found = gaps(planned(levels, facet_gap_mm=gap, scoliosis_deg=10.0))
+    found = distances_of_neighbours(plan_vertebrae(levels, facet_gap_mm=gap, scoliosis_deg=10.0))
     assert found == pytest.approx([gap] * len(found), abs=tolerances.PHANTOM_FACET_MM)
 
 
+def facts_of_thoracolumbar_spine(**bend: float) -> dict:
+    """What the truth says of the spine from T1 to L5."""
+    settings = PhantomSettings(**COARSE, levels="T1-L5", **bend)  # type: ignore[arg-type]
+    affine = place_slices(settings).affine
+    return facts_of_spine(plan_spine(settings, affine)[0], affine, settings)
+
+
 @pytest.mark.release
-def test_a_bent_spine_has_the_angles_asked_and_rigid_vertebrae() -> None:
-    described = []
-    for bend in ({}, {"kyphosis_deg": 20.0, "scoliosis_deg": -35.0}):
-        settings = PhantomSettings(**COARSE, levels="T1-L5", **bend)
-        affine = place_slices(settings).affine
-        described.append(facts_of_spine(plan_spine(settings, affine)[0], affine, settings))
-    plain, bent = described
+def test_kyphosis_and_scoliosis_add_to_the_angles_of_a_spine_as_many_degrees_as_asked() -> None:
+    plain = facts_of_thoracolumbar_spine()
+    bent = facts_of_thoracolumbar_spine(kyphosis_deg=20.0, scoliosis_deg=-35.0)
     assert bent["coronal_angle_deg"] - plain["coronal_angle_deg"] == pytest.approx(-35.0)
     assert bent["sagittal_angle_deg"] - plain["sagittal_angle_deg"] == pytest.approx(20.0)
-    x = np.array([level["center_lps_mm"][0] for level in bent["vertebrae"]])
-    assert x[8] < min(x[0], x[-1]) - 25.0  # the middle lies to the right
-    straight, turned = planned("T1-L5"), planned("T1-L5", kyphosis_deg=20.0, scoliosis_deg=-35.0)
-    for one, other in zip(straight, turned, strict=True):
-        assert other.axes @ other.axes.T == pytest.approx(np.eye(3), abs=1e-12)
-        assert (one.width, one.depth, one.height, one.room) == (other.width, other.depth, other.height, other.room)
-    assert min(gaps(turned[5:8])) > 1.5
 
 
-def test_a_bent_spine_stays_in_the_middle_and_no_level_goes_back() -> None:
-    straight, bent = (
-        planned("T1-L5", centred=False),
-        planned("T1-L5", centred=False, kyphosis_deg=30.0, scoliosis_deg=35.0),
-    )
-    moved = np.array([other.center for other in bent]) - np.array([one.center for one in straight])
-    assert moved[:, 0].max() == pytest.approx(-moved[:, 0].min()) and moved[:, 0].max() > 5.0
-    assert moved[:, 1].max() == pytest.approx(0.0, abs=1e-9) and moved[:, 1].min() < -5.0
+@pytest.mark.release
+def test_negative_scoliosis_bends_the_middle_of_a_spine_to_the_right() -> None:
+    bent = facts_of_thoracolumbar_spine(scoliosis_deg=-35.0)
+    x = [level["center_lps_mm"][0] for level in bent["vertebrae"]]  # grows to the left
+    middle = len(x) // 2
+    assert x[middle] < min(x[0], x[-1]) - 25.0
+
+
+@pytest.mark.release
+def test_vertebrae_of_a_bent_spine_keep_their_sizes_and_orthonormal_axes() -> None:
+    straight, bent = plan_vertebrae("T1-L5"), plan_vertebrae("T1-L5", kyphosis_deg=20.0, scoliosis_deg=-35.0)
+    sizes, bent_sizes = ([(v.width, v.depth, v.height, v.room) for v in spine] for spine in (straight, bent))
+    assert bent_sizes == sizes
+    axes = np.array([vertebra.axes for vertebra in bent])
+    assert axes @ axes.transpose(0, 2, 1) == pytest.approx(np.broadcast_to(np.eye(3), axes.shape), abs=1e-12)
+
+
+@pytest.mark.release
+def test_vertebrae_at_the_apex_of_a_bent_spine_do_not_touch() -> None:
+    bent = plan_vertebrae("T1-L5", kyphosis_deg=20.0, scoliosis_deg=-35.0)
+    assert min(distances_of_neighbours(bent[5:8])) > 1.5  # T6 to T8, where it bends most; mm
+
+
+@pytest.fixture(scope="module")
+def moves_of_bent_spine() -> np.ndarray:
+    """Where kyphosis and scoliosis move the vertebrae from T1 to L5, LPS mm."""
+    straight = plan_vertebrae("T1-L5", centred=False)
+    bent = plan_vertebrae("T1-L5", centred=False, kyphosis_deg=30.0, scoliosis_deg=35.0)
+    return np.array([other.center for other in bent]) - np.array([one.center for one in straight])
+
+
+def test_scoliosis_moves_vertebrae_as_far_to_the_left_as_to_the_right(moves_of_bent_spine: np.ndarray) -> None:
+    x = moves_of_bent_spine[:, 0]
+    assert x.max() > 5.0
+    assert x.max() == pytest.approx(-x.min())
+
+
+def test_kyphosis_moves_vertebrae_forwards_and_none_backwards(moves_of_bent_spine: np.ndarray) -> None:
+    y = moves_of_bent_spine[:, 1]  # grows backwards
+    assert y.min() < -5.0
+    assert y.max() == pytest.approx(0.0, abs=tolerances.DECIMAL_PLACE_MM)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tolerances
 from refusals import refused
 from variants import daily
 
@@ -20,111 +21,200 @@ SMALL = {"size": (24, 20), "slices": 20, "spacing": (11.0, 10.0, 2.5)}
 CLEAN = {"noise": 0.0, "point_spread_mm": 0.0}
 
 
-@pytest.mark.parametrize(
-    "extra", daily(1, [{}, {"tilt": 12.0, "oblique": (5.0, 0.0, 10.0)}]), ids=["straight", "tilted"]
+@pytest.fixture(
+    scope="module", params=daily(1, [{}, {"tilt": 12.0, "oblique": (5.0, 0.0, 10.0)}]), ids=["straight", "tilted"]
 )
-def test_uneven_slices_lie_where_the_truth_says(tmp_path: Path, extra: dict) -> None:
-    settings = PhantomSettings(**SMALL, **extra, uneven_mm=0.8)
-    truth = write_phantom(tmp_path / "ct", settings)
-    volume = read_volume(tmp_path / "ct")
-    places = np.array(truth["series"]["slice_positions_lps_mm"])
+def uneven_series(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, PhantomSettings, dict]:
+    """Folder, settings and truth of a series whose slices lie up to 0.8 mm beside an even plan of 2.5 mm."""
+    settings = PhantomSettings(**SMALL, **request.param, uneven_mm=0.8)
+    folder = tmp_path_factory.mktemp("uneven") / "ct"
+    return folder, settings, write_phantom(folder, settings)
+
+
+def test_uneven_slices_lie_where_the_truth_says(uneven_series: tuple[Path, PhantomSettings, dict]) -> None:
+    folder, settings, truth = uneven_series
+    volume = read_volume(folder)
+
+    found = volume.ijk_to_lps([(0, 0, k) for k in range(settings.slices)])
+
+    expected = np.array(truth["series"]["slice_positions_lps_mm"])
     assert volume.uneven
-    assert volume.ijk_to_lps([(0, 0, k) for k in range(20)]) == pytest.approx(places, abs=1e-6)
-    normal = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
-    steps = np.diff(places @ normal / np.linalg.norm(normal))
-    assert 0.3 < np.abs(steps - 2.5).max() <= 0.8
-    warned = list_series(tmp_path / "ct").series[0].warnings
-    assert any("unevenly spaced" in text for text in warned)
-    assert np.array_equal(volume.voxels, make_phantom(settings)[0])
+    assert found == pytest.approx(expected, abs=tolerances.DICOM_PLACE_MM)
+
+
+def test_gaps_of_uneven_slices_differ_from_the_mean_by_no_more_than_asked(
+    uneven_series: tuple[Path, PhantomSettings, dict],
+) -> None:
+    folder, _, truth = uneven_series
+    affine = read_volume(folder).affine
+    normal = np.cross(affine[:3, 0], affine[:3, 1])
+
+    heights = np.array(truth["series"]["slice_positions_lps_mm"]) @ normal / np.linalg.norm(normal)
+
+    largest_difference = np.abs(np.diff(heights) - 2.5).max()
+    assert 0.3 < largest_difference <= 0.8
+
+
+def test_uneven_slices_are_warned_of(uneven_series: tuple[Path, PhantomSettings, dict]) -> None:
+    warnings = list_series(uneven_series[0]).series[0].warnings
+    assert any("unevenly spaced" in text for text in warnings)
+
+
+def test_voxels_of_written_uneven_slices_are_those_of_the_phantom(
+    uneven_series: tuple[Path, PhantomSettings, dict],
+) -> None:
+    folder, settings, _ = uneven_series
+    assert np.array_equal(read_volume(folder).voxels, make_phantom(settings)[0])
 
 
 @pytest.mark.release
 def test_uneven_slices_show_what_is_at_their_place() -> None:
     settings = PhantomSettings(size=(40, 36), slices=5, spacing=(6.0, 6.0, 2.5), **CLEAN)
     affine = place_slices(settings).affine
-    moved = affine.copy()
-    moved[:3, 3] += 0.4 * affine[:3, 2]
-    by_place = draw_spine(settings, affine, places=np.arange(5) + 0.4)[0]
-    by_affine = draw_spine(settings, moved)[0]
-    assert np.abs(by_place - by_affine).max() < 0.5  # float32 of coordinates
-    assert np.abs(by_place - draw_spine(settings, affine)[0]).max() > 100.0
+    moved_affine = affine.copy()
+    moved_affine[:3, 3] += 0.4 * affine[:3, 2]
+
+    moved_by_places = draw_spine(settings, affine, places=np.arange(5) + 0.4)[0]
+
+    moved_by_affine, unmoved = (draw_spine(settings, given)[0] for given in (moved_affine, affine))
+    assert np.abs(moved_by_places - moved_by_affine).max() < 0.5  # HU: coordinates in float32
+    assert np.abs(moved_by_places - unmoved).max() > 100.0
 
 
-def test_blur_between_uneven_slices_weighs_by_distance() -> None:
-    affine, rng = np.diag((1.0, 1.0, 2.0, 1.0)), np.random.default_rng(0)
-    field = rng.normal(0.0, 100.0, (9, 6, 5)).astype(np.float32)
-    even = apply_point_spread(field.copy(), affine, 1.5)
-    again = apply_point_spread(field.copy(), affine, 1.5, places=np.arange(9.0))
-    assert again[4] == pytest.approx(even[4], abs=0.2)  # beyond four sigma the one has nothing
-    line = np.broadcast_to(np.arange(9, dtype=np.float32)[:, None, None] * 0.0 + 7.0, field.shape).copy()
-    places = np.arange(9) + np.array([0, 0.2, -0.1, 0.1, 0, -0.2, 0.1, 0, 0])
-    assert apply_point_spread(line, affine, 1.5, places=places) == pytest.approx(np.full(field.shape, 7.0), abs=1e-5)
+def test_blur_of_slices_at_even_places_is_that_of_an_even_volume() -> None:
+    affine = np.diag((1.0, 1.0, 2.0, 1.0))
+    noise = np.random.default_rng(0).normal(0.0, 100.0, (9, 6, 5)).astype(np.float32)
+
+    by_affine = apply_point_spread(noise.copy(), affine, 1.5)
+    by_places = apply_point_spread(noise.copy(), affine, 1.5, places=np.arange(9.0))
+
+    middle = 4  # the ends differ: beyond them one of both has nothing
+    assert by_places[middle] == pytest.approx(by_affine[middle], abs=0.2)  # HU; weights end at four sigma
 
 
-def test_missing_slices_are_told_and_read_when_allowed(tmp_path: Path) -> None:
-    settings = PhantomSettings(**SMALL, missing=(9, 8, 15))
-    truth = write_phantom(tmp_path / "ct", settings)
-    names = sorted(path.name for path in (tmp_path / "ct").glob("*.dcm"))
-    assert len(names) == truth["shape_ijk"][2] == 17
-    assert {"IM0008.dcm", "IM0009.dcm", "IM0015.dcm"}.isdisjoint(names)
+def test_blur_between_uneven_slices_leaves_a_constant_volume_as_it_is() -> None:
+    affine = np.diag((1.0, 1.0, 2.0, 1.0))
+    constant = np.full((9, 6, 5), 7.0, np.float32)
+    uneven_places = np.arange(9) + np.array([0, 0.2, -0.1, 0.1, 0, -0.2, 0.1, 0, 0])
+    blurred = apply_point_spread(constant.copy(), affine, 1.5, places=uneven_places)
+    assert blurred == pytest.approx(constant, abs=1e-5)  # sums in float32
+
+
+@pytest.fixture(scope="module")
+def series_with_gaps(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """Folder and truth of a series of 20 slices without the 8th, the 9th and the 15th."""
+    folder = tmp_path_factory.mktemp("gaps") / "ct"
+    return folder, write_phantom(folder, PhantomSettings(**SMALL, missing=(9, 8, 15)))
+
+
+def test_missing_slices_have_no_files(series_with_gaps: tuple[Path, dict]) -> None:
+    folder, truth = series_with_gaps
+    numbers = {int(path.stem.removeprefix("IM")) for path in folder.glob("IM*.dcm")}
+    assert numbers == {*range(1, 21)} - {8, 9, 15}
+    assert truth["shape_ijk"][2] == 20 - 3
+
+
+def test_series_with_missing_slices_is_refused_with_its_two_gaps(series_with_gaps: tuple[Path, dict]) -> None:
     with refused(RefusedInputError, "allow_gaps=True", 2):
-        read_volume(tmp_path / "ct")
-    volume = read_volume(tmp_path / "ct", allow_gaps=True)
-    assert volume.report["slices_missing"] == 3
+        read_volume(series_with_gaps[0])
+
+
+def test_series_with_allowed_gaps_has_the_other_slices_and_the_number_of_missing_ones(
+    series_with_gaps: tuple[Path, dict],
+) -> None:
+    volume = read_volume(series_with_gaps[0], allow_gaps=True)
+
     whole = make_phantom(PhantomSettings(**SMALL))[0]
-    kept = [k for k in range(20) if k + 1 not in (8, 9, 15)]
-    assert np.array_equal(volume.voxels, make_phantom(settings)[0])
-    assert np.array_equal(volume.voxels, whole[kept])
+    assert np.array_equal(volume.voxels, np.delete(whole, [8 - 1, 9 - 1, 15 - 1], axis=0))
+    assert volume.report["slices_missing"] == 3
+
+
+def test_voxels_of_a_phantom_with_missing_slices_are_those_of_the_others() -> None:
+    whole = make_phantom(PhantomSettings(**SMALL))[0]
+    with_gaps = make_phantom(PhantomSettings(**SMALL, missing=(9, 8, 15)))[0]
+    assert np.array_equal(with_gaps, np.delete(whole, [8 - 1, 9 - 1, 15 - 1], axis=0))
+
+
+@pytest.fixture(scope="module")
+def series_of_three_phases(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("phases") / "ct"
+    write_phantom(folder, PhantomSettings(**SMALL, **CLEAN, phases=3))
+    return folder
 
 
 @pytest.mark.release
-def test_phases_are_listed_and_differ_in_their_vessels(tmp_path: Path) -> None:
-    settings = PhantomSettings(**SMALL, **CLEAN, phases=3)
-    write_phantom(tmp_path / "ct", settings)
-    entry = list_series(tmp_path / "ct").series[0]
-    assert entry.slices == 60 and [phase["slices"] for phase in entry.phases] == [20, 20, 20]
+def test_series_of_three_phases_is_listed_with_the_slices_of_each(series_of_three_phases: Path) -> None:
+    entry = list_series(series_of_three_phases).series[0]
+    assert [phase["slices"] for phase in entry.phases] == [20, 20, 20]
+    assert entry.slices == 60
+
+
+@pytest.mark.release
+def test_series_of_three_phases_is_refused_unless_one_is_named(series_of_three_phases: Path) -> None:
     with refused(RefusedInputError, "phases", 3):
-        read_volume(tmp_path / "ct")
-    first, last = (read_volume(tmp_path / "ct", phase=n).voxels for n in (1, 3))
+        read_volume(series_of_three_phases)
+
+
+@pytest.mark.release
+def test_last_phase_differs_from_the_first_in_vessels_that_are_180_hu_brighter(series_of_three_phases: Path) -> None:
+    first, last = (read_volume(series_of_three_phases, phase=n).voxels for n in (1, 3))
     assert np.array_equal(first, make_phantom(PhantomSettings(**SMALL, **CLEAN))[0])
-    changed = (last - first)[first != last]
-    assert 0.001 < (first != last).mean() < 0.2 and changed.max() == 180
+    assert 0.001 < (first != last).mean() < 0.2  # of the voxels
+    assert (last - first).max() == 180  # HU
 
 
 @pytest.mark.parametrize(("text", "numbers"), [("20-22,40", (20, 21, 22, 40)), (" 3 ", (3,)), ("5-5", (5,))])
-def test_numbers_of_slices_are_read(text: str, numbers: tuple[int, ...]) -> None:
+def test_missing_slices_are_read_from_numbers_and_ranges(text: str, numbers: tuple[int, ...]) -> None:
     assert parse_missing(text) == numbers
 
 
 @pytest.mark.parametrize("text", ["", "a", "3-", "5-3", "1.5", "-2", "3,,4", "\u0663"])
-def test_other_numbers_of_slices_are_refused(text: str) -> None:
-    with refused(UsageError, 20, 22):
+def test_text_that_names_no_slices_is_refused_with_an_example(text: str) -> None:
+    with refused(UsageError, 20, 22):  # "such as 20-22"
         parse_missing(text)
 
 
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ({"missing": (1,)}, "missing slice must be a whole number from 2 to 19, got 1"),
-        ({"missing": (20,)}, "from 2 to 19, got 20"),
-        ({"missing": (5, 5)}, "named more than once"),
-        ({"missing": ("5",)}, "whole number.*got 5"),
-        ({"uneven_mm": 1.01}, r"from 0 to 1 mm \(0.4 of the mean gap\), got 1.01"),
-        ({"uneven_mm": -0.1}, "unevenness.*got -0.1"),
-        ({"phases": 0}, "phases must be a whole number from 1 to 20, got 0"),
-        ({"phases": 20, "slices": 500}, "20 phases of 500 slices are more than 9999 files"),
-        ({"ghosts": True, "phases": 2}, "ghosts are for an even series of one phase"),
-        ({"kind": "sphere", "uneven_mm": 0.5}, "a sphere has no uneven slices: they are for the spine"),
-        ({"kind": "sphere", "phases": 2}, "a sphere has no phases: they are for the spine"),
+        pytest.param({"missing": (1,)}, "missing slice must be a whole number from 2 to 19, got 1", id="first missing"),
+        pytest.param({"missing": (20,)}, "from 2 to 19, got 20", id="last missing"),
+        pytest.param({"missing": (5, 5)}, "named more than once", id="missing twice"),
+        pytest.param({"missing": ("5",)}, "whole number.*got 5", id="number as text"),
+        pytest.param({"uneven_mm": 1.01}, r"from 0 to 1 mm \(0.4 of the mean gap\), got 1.01", id="too uneven"),
+        pytest.param({"uneven_mm": -0.1}, "unevenness.*got -0.1", id="negative unevenness"),
+        pytest.param({"phases": 0}, "phases must be a whole number from 1 to 20, got 0", id="no phase"),
+        pytest.param(
+            {"phases": 20, "slices": 500}, "20 phases of 500 slices are more than 9999 files", id="too many files"
+        ),
+        pytest.param(
+            {"ghosts": True, "phases": 2}, "ghosts are for an even series of one phase", id="ghosts in two phases"
+        ),
+        pytest.param(
+            {"kind": "sphere", "uneven_mm": 0.5},
+            "a sphere has no uneven slices: they are for the spine",
+            id="uneven sphere",
+        ),
+        pytest.param(
+            {"kind": "sphere", "phases": 2}, "a sphere has no phases: they are for the spine", id="phases of a sphere"
+        ),
     ],
 )
-def test_impossible_series_are_refused_with_their_numbers(given: dict, says: str) -> None:
+def test_settings_of_an_impossible_series_are_refused_with_their_numbers(given: dict, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         PhantomSettings(**{**SMALL, **given})
 
 
-def test_the_lines_of_a_screen_capture_are_a_24th_of_it_high_and_as_far_apart() -> None:
-    voxels = np.zeros((12, 96, 128), np.int16)
-    (capture, _) = [each["slice"] for each in draw_ghosts(voxels, 0)["slices"]]
-    lines = np.flatnonzero((voxels[capture][8:-8, 8:-8] == TEXT_HU).any(axis=1)) + 8
-    assert lines.tolist() == [row for top in range(12, 88, 8) for row in range(top, top + 4)]
+def test_text_of_a_screen_capture_has_lines_of_a_24th_of_its_height_as_far_apart() -> None:
+    rows, margin = 96, 8
+    voxels = np.zeros((12, rows, 128), np.int16)
+
+    capture = draw_ghosts(voxels, 0)["slices"][0]["slice"]
+
+    within_the_margin = voxels[capture, margin:-margin, margin:-margin]
+    text_rows = margin + np.flatnonzero((within_the_margin == TEXT_HU).any(axis=1))
+    height = rows // 24
+    expected = [row for top in range(12, rows - margin, 2 * height) for row in range(top, top + height)]
+    assert text_rows.tolist() == expected
