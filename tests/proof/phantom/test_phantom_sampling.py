@@ -30,23 +30,41 @@ BODIES = [
 IDS = ["sphere", "torus", "cylinder", "box"]
 
 
-@pytest.mark.parametrize("body", BODIES, ids=IDS)
-def test_partial_volumes_add_up_to_the_analytic_volume(body) -> None:
-    share = sample_occupancy(body, SHEARED, SHAPE)
-    assert share.dtype == np.float32 and share.shape == SHAPE
-    assert share.min() == 0.0 and share.max() == 1.0
-    assert ((share > 0.0) & (share < 1.0)).sum() > 1000
-    assert not any(face.any() for axis in range(3) for face in (share.take(0, axis), share.take(-1, axis)))
+@pytest.fixture(scope="module", params=BODIES, ids=IDS)
+def sampled_body(request: pytest.FixtureRequest) -> tuple[Any, np.ndarray]:
+    """A body, and the share of it in each voxel of the sheared grid."""
+    return request.param, sample_occupancy(request.param, SHEARED, SHAPE)
+
+
+def test_partial_volumes_add_up_to_the_analytic_volume(sampled_body: tuple[Any, np.ndarray]) -> None:
+    body, share = sampled_body
     voxel_ml = abs(np.linalg.det(SHEARED[:3, :3])) / 1000.0
-    total = float(share.sum(dtype=np.float64)) * voxel_ml
-    assert total == pytest.approx(body.volume_ml, rel=tolerances.PHANTOM_VOLUME_RATIO)
+    total_ml = float(share.sum(dtype=np.float64)) * voxel_ml
+    assert total_ml == pytest.approx(body.volume_ml, rel=tolerances.PHANTOM_VOLUME_RATIO)
 
 
-def test_small_sphere_still_adds_up() -> None:
-    affine = compose_affine((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.4, 1.0), (0.0, 0.0, 0.0))
-    body = Sphere(apply_affine(affine, [(8.2, 7.9, 7.6)])[0], 5.0)
-    total = float(sample_occupancy(body, affine, (16, 17, 18)).sum(dtype=np.float64)) / 1000.0
-    assert total == pytest.approx(body.volume_ml, rel=tolerances.PHANTOM_VOLUME_RATIO)
+def test_shares_of_voxels_are_float32_from_0_to_1_with_parts_at_the_surface(
+    sampled_body: tuple[Any, np.ndarray],
+) -> None:
+    _, share = sampled_body
+    assert share.dtype == np.float32
+    assert (share.min(), share.max()) == (0.0, 1.0)
+    assert ((share > 0.0) & (share < 1.0)).sum() > 1000  # voxels at the surface of bodies of some 10 voxels
+
+
+def test_body_within_the_grid_has_no_share_of_the_outermost_voxels(sampled_body: tuple[Any, np.ndarray]) -> None:
+    _, share = sampled_body
+    assert share.shape == SHAPE
+    assert not np.delete(share, slice(1, -1), axis=0).any()
+    assert not np.delete(share, slice(1, -1), axis=1).any()
+    assert not np.delete(share, slice(1, -1), axis=2).any()
+
+
+def test_partial_volumes_of_a_sphere_of_five_voxels_add_up_to_its_volume() -> None:
+    affine = compose_affine((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.4, 1.0), (0.0, 0.0, 0.0))  # voxels of 1 mm3
+    sphere = Sphere(apply_affine(affine, [(8.2, 7.9, 7.6)])[0], 5.0)
+    total_ml = float(sample_occupancy(sphere, affine, (16, 17, 18)).sum(dtype=np.float64)) / 1000.0
+    assert total_ml == pytest.approx(sphere.volume_ml, rel=tolerances.PHANTOM_VOLUME_RATIO)
 
 
 class HalfSpace(Sphere):
@@ -63,75 +81,120 @@ class HalfSpace(Sphere):
         return np.array(((-np.inf,) * 3, (np.inf,) * 3))
 
 
-def test_plane_gives_the_exact_share_of_a_voxel() -> None:
-    affine = compose_affine((0.5, 0.0, 0.0), (0.0, 0.7, 0.0), (0.0, 0.0, 2.5), (0.0, 0.0, 0.0))
-    for height in np.linspace(-1.2, 1.2, 9):
-        share = sample_occupancy(HalfSpace((0.0, 0.0, height), (0.0, 0.0, 1.0)), affine, (3, 4, 5))
-        assert share[0] == pytest.approx(0.5 + height / 2.5, abs=1e-6)
-        assert share[2].max() == 0.0
-    oblique = HalfSpace((0.1, -0.05, 0.3), AXIS)
-    fine = (np.arange(60) + 0.5) / 60.0 - 0.5
+@pytest.mark.parametrize("height", np.linspace(-1.2, 1.2, 9))
+def test_share_of_a_voxel_below_a_level_plane_is_exact(height: float) -> None:
+    gap = 2.5  # between slices, mm; the first reaches from -1.25 to 1.25
+    affine = np.diag((0.5, 0.7, gap, 1.0))
+    share = sample_occupancy(HalfSpace((0.0, 0.0, height), (0.0, 0.0, 1.0)), affine, (3, 4, 5))
+    assert share[0] == pytest.approx(0.5 + height / gap, abs=1e-6)
+    assert share[2].max() == 0.0
+
+
+def test_share_of_a_voxel_below_an_oblique_plane_is_that_of_points_within_it() -> None:
+    affine = np.diag((0.5, 0.7, 2.5, 1.0))
+    below = HalfSpace((0.1, -0.05, 0.3), AXIS)
+    fine = (np.arange(60) + 0.5) / 60.0 - 0.5  # places in a voxel along one axis
     points = apply_affine(affine, np.array(list(itertools.product(fine, fine, fine))))
-    counted = (oblique.signed_distance(points) >= 0.0).mean()
+
+    share = sample_occupancy(below, affine, (1, 1, 1)).item()
+
+    counted = (below.signed_distance(points) >= 0.0).mean()
     assert 0.2 < counted < 0.8
-    assert sample_occupancy(oblique, affine, (1, 1, 1))[0, 0, 0] == pytest.approx(
-        counted, abs=tolerances.PHANTOM_PLANE_SHARE
-    )
+    assert share == pytest.approx(counted, abs=tolerances.PHANTOM_PLANE_SHARE)
 
 
-@pytest.mark.parametrize("body", BODIES[:3], ids=IDS[:3])
-def test_marching_cubes_finds_area_and_volume(body) -> None:
+TURNED = compose_affine((0.48, 0.36, 0.0), (-0.42, 0.56, 0.0), (0.1, 0.25, 0.9), (5.0, 6.0, 7.0))
+TURNED_SHAPE = (45, 60, 63)
+TURNED_MIDDLE = apply_affine(TURNED, [(31.2, 29.6, 22.3)])[0]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        pytest.param(Sphere(TURNED_MIDDLE, 9.5), id="sphere"),
+        pytest.param(Torus(TURNED_MIDDLE, AXIS, 9.0, 4.6), id="torus"),
+        pytest.param(Cylinder(TURNED_MIDDLE, AXIS, 6.5, 16.0), id="cylinder"),
+    ],
+)
+def test_half_share_surface_of_a_body_has_its_area_and_volume_and_lies_on_it(body) -> None:
     measure = pytest.importorskip("skimage.measure")
-    affine = compose_affine((0.48, 0.36, 0.0), (-0.42, 0.56, 0.0), (0.1, 0.25, 0.9), (5.0, 6.0, 7.0))
-    shape = (45, 60, 63)
-    moved = {"center": apply_affine(affine, [(31.2, 29.6, 22.3)])[0]}
-    if isinstance(body, Sphere):
-        body = Sphere(radius=9.5, **moved)
-    elif isinstance(body, Torus):
-        body = Torus(axis=AXIS, major=9.0, minor=4.6, **moved)
-    else:
-        body = Cylinder(axis=AXIS, radius=6.5, length=16.0, **moved)
-    share = sample_occupancy(body, affine, shape)
-    corners, faces, _, _ = measure.marching_cubes(share, 0.5)
-    triangles = apply_affine(affine, corners[:, ::-1])[faces]
+    share = sample_occupancy(body, TURNED, TURNED_SHAPE)
+
+    corners_kji, faces, _, _ = measure.marching_cubes(share, 0.5)
+
+    corners = apply_affine(TURNED, corners_kji[:, ::-1])
+    triangles = corners[faces]
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    area = np.linalg.norm(cross, axis=1).sum() / 2.0
-    volume = abs(np.einsum("ij,ij->", triangles[:, 0] - moved["center"], cross)) / 6000.0
-    assert area == pytest.approx(body.area_mm2, rel=2.5 * tolerances.PHANTOM_MESH_AREA_RATIO)
-    assert volume == pytest.approx(body.volume_ml, rel=tolerances.PHANTOM_MESH_VOLUME_RATIO)
-    off = np.abs(body.signed_distance(apply_affine(affine, corners[:, ::-1])))
-    assert np.sqrt((off**2).mean()) < 0.1
+    area_mm2 = np.linalg.norm(cross, axis=1).sum() / 2.0
+    volume_mm3 = abs(np.einsum("ij,ij->", triangles[:, 0] - TURNED_MIDDLE, cross)) / 6.0
+    assert area_mm2 == pytest.approx(body.area_mm2, rel=2.5 * tolerances.PHANTOM_MESH_AREA_RATIO)  # edges, a torus
+    assert volume_mm3 / 1000.0 == pytest.approx(body.volume_ml, rel=tolerances.PHANTOM_MESH_VOLUME_RATIO)
+    rms_distance_mm = np.sqrt((body.signed_distance(corners) ** 2).mean())
+    assert rms_distance_mm < 0.1  # a sixth of a pixel
 
 
-def test_point_spread_equals_scipy_and_keeps_the_sum() -> None:
-    affine = compose_affine((0.7, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 2.5), (0.0, 0.0, 0.0))
+def draw_noise_volume() -> tuple[np.ndarray, np.ndarray]:
+    """White noise of 1000 HU in voxels of 0.7 x 0.5 x 2.5 mm, and their affine."""
     voxels = np.random.default_rng(6).normal(0.0, 1000.0, (13, 21, 17)).astype(np.float32)
+    return voxels, np.diag((0.7, 0.5, 2.5, 1.0))
+
+
+def test_point_spread_is_the_gaussian_filter_of_scipy_in_mm() -> None:
+    voxels, affine = draw_noise_volume()
     expected = gaussian_filter(voxels.astype(np.float64), (0.9 / 2.5, 0.9 / 0.5, 0.9 / 0.7), mode="nearest")
     blurred = apply_point_spread(voxels.copy(), affine, 0.9)
     assert np.abs(blurred - expected).max() < tolerances.PHANTOM_BLUR_HU
+
+
+def test_point_spread_of_0_mm_changes_no_voxel() -> None:
+    voxels, affine = draw_noise_volume()
     assert np.array_equal(apply_point_spread(voxels.copy(), affine, 0.0), voxels)
+
+
+def test_negative_point_spread_is_refused_with_its_value() -> None:
+    voxels, affine = draw_noise_volume()
     with refused(UsageError, -1):
         apply_point_spread(voxels, affine, -1.0)
 
 
-def test_noise_has_the_asked_deviation_and_depends_on_the_seed() -> None:
-    first, again, other = (add_noise(np.zeros((9, 64, 71), np.float32), 25.0, seed) for seed in (1, 1, 2))
-    assert first.std() == pytest.approx(25.0, rel=0.02) and abs(first.mean()) < 0.5
+def draw_noise(seed: int) -> np.ndarray:
+    """Noise of 25 HU alone."""
+    return add_noise(np.zeros((9, 64, 71), np.float32), 25.0, seed)
+
+
+def test_noise_has_the_asked_deviation_about_0() -> None:
+    noise = draw_noise(1)
+    assert noise.std() == pytest.approx(25.0, rel=0.02)  # of 40,000 values: the standard error is 0.4 %
+    assert abs(noise.mean()) < 0.5  # HU: four standard errors
+
+
+def test_noise_of_one_seed_is_the_same_and_that_of_another_uncorrelated() -> None:
+    first, again, other = draw_noise(1), draw_noise(1), draw_noise(2)
     assert np.array_equal(first, again)
-    assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.02
-    assert abs(np.corrcoef(first[0].ravel(), first[1].ravel())[0, 1]) < 0.06
+    assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.02  # four standard errors of 40,000 pairs
 
 
-def test_slices_report_progress_in_order() -> None:
+def test_noise_of_two_slices_is_uncorrelated() -> None:
+    noise = draw_noise(1)
+    assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 0.06  # four standard errors of 4,500 pairs
+
+
+def test_progress_of_slices_is_told_in_order_with_their_number() -> None:
     told: list[tuple[str, int, int]] = []
     map_slices(lambda k: None, 4, "draw", lambda *what: told.append(what))
     assert told == [("draw", 1, 4), ("draw", 2, 4), ("draw", 3, 4), ("draw", 4, 4)]
 
 
-def test_bad_arguments_are_refused() -> None:
+def test_shares_under_a_singular_affine_are_refused() -> None:
     with pytest.raises(UsageError, match="singular"):
         sample_occupancy(BODIES[0], np.diag((1.0, 0.0, 1.0, 1.0)), SHAPE)
+
+
+def test_shares_of_a_grid_without_voxels_are_refused() -> None:
     with pytest.raises(UsageError, match="at least 1"):
         sample_occupancy(BODIES[0], SHEARED, (3, 0, 3))
+
+
+def test_shares_from_no_subsamples_are_refused() -> None:
     with pytest.raises(UsageError, match="subsamples"):
         sample_occupancy(BODIES[0], SHEARED, SHAPE, subsamples=0)
