@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pydicom
 import pytest
+import tolerances
 from refusals import refused
-from variants import daily, daily_rows
+from variants import daily
 
 from clrecon.errors import UsageError
 from clrecon.geometry import apply_affine
@@ -22,54 +23,74 @@ SCENES = {name: kind for name, kind in KINDS.items() if kind.is_scene}
 CLEAN = {"noise": 0.0, "point_spread_mm": 0.0}
 
 
-def settings_of(kind: str, **given: object) -> PhantomSettings:
+def coarse_settings(kind: str, **given: object) -> PhantomSettings:
     """A coarse phantom: steps of three times those of the kind, of two lengths in the slice."""
     di, dj, dk = (3.0 * step for step in KINDS[kind].spacing)
     size = {"size": (86, 80), "slices": 34, "spacing": (1.07 * dj, di, dk)}
     return PhantomSettings(kind=kind, **{**size, **given})  # type: ignore[arg-type]
 
 
-def test_plans_and_couches_are_those_of_the_settings() -> None:
+def test_every_scene_of_the_settings_has_a_plan_and_no_other() -> None:
     assert set(PLANS) == set(SCENES)
+
+
+def test_couches_that_are_drawn_are_those_of_the_settings() -> None:
     assert tuple(TABLES) == TABLE_NAMES
 
 
-@pytest.mark.parametrize("kind", daily(3, SCENES))
-def test_parts_of_the_truth_count_the_voxels_of_their_labels(kind: str) -> None:
-    settings = settings_of(kind, **CLEAN)
-    voxels, affine, truth = make_phantom(settings)
-    labels = label_materials(settings)
-    assert labels.shape == voxels.shape
+@pytest.fixture(scope="module", params=daily(3, SCENES))
+def clean_scene(request: pytest.FixtureRequest) -> tuple[str, np.ndarray, np.ndarray, dict]:
+    """Kind, voxels, affine and truth of a scene without noise and blur."""
+    return request.param, *make_phantom(coarse_settings(request.param, **CLEAN))
+
+
+def test_parts_of_the_truth_count_the_voxels_of_their_labels(
+    clean_scene: tuple[str, np.ndarray, np.ndarray, dict],
+) -> None:
+    kind, voxels, affine, truth = clean_scene
+    labels = label_materials(coarse_settings(kind, **CLEAN))
     voxel_ml = abs(np.linalg.det(affine[:3, :3])) / 1000.0
     assert set(truth["parts"]) == {MATERIALS[label] for label in np.unique(labels)}
+
     for part in truth["parts"].values():
         mask = labels == part["label"]
         assert part["voxels"] == np.count_nonzero(mask)
-        assert part["volume_ml"] == pytest.approx(part["voxels"] * voxel_ml, abs=1e-3)
+        assert part["volume_ml"] == pytest.approx(part["voxels"] * voxel_ml, abs=1e-3)  # written with three digits
         assert part["voxels_above_300_hu"] == np.count_nonzero(voxels[mask] > 300)
-    expected = {"air", "table"} if kind == "empty" else {"air", "water"} if kind == "water" else {"air", "bone"}
-    assert expected <= set(truth["parts"])
+
+
+def test_scene_has_air_and_the_material_that_it_is_for(clean_scene: tuple[str, np.ndarray, np.ndarray, dict]) -> None:
+    kind, _, _, truth = clean_scene
+    assert {"air", {"empty": "table", "water": "water"}.get(kind, "bone")} <= set(truth["parts"])
+
+
+def test_median_of_air_in_a_scene_is_minus_1000_hu_in_the_unit_of_its_scanner(
+    clean_scene: tuple[str, np.ndarray, np.ndarray, dict],
+) -> None:
+    kind, voxels, _, _ = clean_scene
+    air = voxels[label_materials(coarse_settings(kind, **CLEAN)) == MATERIALS.index("air")]
     scanner = KINDS[kind].scanner
-    cupping = 5.0 * (scanner.cupping_hu > 0.0)
-    assert np.median(voxels[labels == 0]) == pytest.approx(scanner.to_values(-1000.0), abs=cupping)
+    cupping = 5.0 if scanner.cupping_hu > 0.0 else 0.0  # HU by which it darkens most of the air
+    assert np.median(air) == pytest.approx(scanner.to_values(-1000.0), abs=cupping)
 
 
 def test_metal_has_the_largest_value_of_12_bits() -> None:
-    settings = settings_of("pelvis", **CLEAN)
-    values = make_phantom(settings)[0][label_materials(settings) == MATERIALS.index("metal")]
-    assert np.median(values) == values.max() == 3071
+    settings = coarse_settings("pelvis", **CLEAN)
+    metal = make_phantom(settings)[0][label_materials(settings) == MATERIALS.index("metal")]
+    assert np.median(metal) == metal.max() == 2**12 - 1 - 1024
 
 
-def test_a_dry_skull_has_no_soft_tissue_and_a_head_has_it() -> None:
-    dry, whole = (make_phantom(settings_of(kind))[2]["parts"] for kind in ("skull", "head"))
-    assert "tissue" not in dry and whole["tissue"]["volume_ml"] > 1500.0
-    assert dry["bone"]["voxels"] == whole["bone"]["voxels"]
+def test_dry_skull_is_the_bone_of_a_head_without_its_soft_tissue() -> None:
+    skull, head = (make_phantom(coarse_settings(kind))[2]["parts"] for kind in ("skull", "head"))
+    assert skull["bone"]["voxels"] == head["bone"]["voxels"]
+    assert "tissue" not in skull
+    assert head["tissue"]["volume_ml"] > 1500.0  # a head has some 4000 ml
 
 
 @pytest.mark.release
 @pytest.mark.seconds
-def test_contrast_is_larger_and_brighter_than_the_marrow_of_the_spine() -> None:
-    settings = settings_of("contrast", **CLEAN)
+def test_contrast_medium_has_250_to_450_hu_and_more_voxels_above_300_hu_than_bone() -> None:
+    settings = coarse_settings("contrast", **CLEAN)
     voxels, _, truth = make_phantom(settings)
     contrast = voxels[label_materials(settings) == MATERIALS.index("contrast")]
     assert 250 <= np.median(contrast) <= 450
@@ -77,52 +98,98 @@ def test_contrast_is_larger_and_brighter_than_the_marrow_of_the_spine() -> None:
     assert parts["contrast"]["voxels_above_300_hu"] > parts["bone"]["voxels_above_300_hu"]
 
 
+def rows_of_material(settings: PhantomSettings, name: str) -> np.ndarray:
+    """Rows of the image, which run downwards, in which a material is."""
+    return np.flatnonzero((label_materials(settings) == MATERIALS.index(name)).any(axis=(0, 2)))
+
+
 @pytest.mark.parametrize("table", ["flat", "curved", "headrest"])
-@pytest.mark.parametrize("prone", daily(1, [False, True]))
-def test_couch_lies_below_the_body_and_lower_with_a_gap(table: str, prone: bool) -> None:
-    places = []
-    for gap in (0.0, 12.0):
-        settings = settings_of("skull", table=table, table_gap_mm=gap, prone=prone)
-        labels = label_materials(settings)
-        rows = {name: np.flatnonzero((labels == MATERIALS.index(name)).any(axis=(0, 2))) for name in ("bone", "table")}
-        assert rows["table"].max() > rows["bone"].max()  # rows run downwards, prone too
-        places.append(np.median(rows["table"]))
-    assert places[1] > places[0]
+@pytest.mark.parametrize("prone", daily(1, [False, True]), ids=["supine", "prone"])
+def test_couch_lies_below_the_body(table: str, prone: bool) -> None:
+    settings = coarse_settings("skull", table=table, prone=prone)
+    assert rows_of_material(settings, "table").max() > rows_of_material(settings, "bone").max()
 
 
-def test_prone_turns_the_image_and_not_the_patient(tmp_path: Path) -> None:
-    made = [make_phantom(settings_of("head", prone=prone, table="flat", **CLEAN)) for prone in (False, True)]
-    assert np.sign(np.diag(made[1][1])[:3]).tolist() == [-1.0, -1.0, 1.0]
-    points = np.random.default_rng(2).uniform((-60.0, -60.0, -40.0), (60.0, 60.0, 40.0), (3000, 3))
-    points += (-3.5, -142.25, -418.75)
+@pytest.mark.parametrize("table", ["flat", "curved", "headrest"])
+@pytest.mark.parametrize("prone", daily(1, [False, True]), ids=["supine", "prone"])
+def test_couch_lies_lower_with_a_gap(table: str, prone: bool) -> None:
+    without, with_gap = (
+        np.median(rows_of_material(coarse_settings("skull", table=table, table_gap_mm=gap, prone=prone), "table"))
+        for gap in (0.0, 12.0)
+    )
+    assert with_gap > without
+
+
+def test_prone_head_has_the_same_values_at_the_same_places_in_a_turned_image() -> None:
+    supine, prone = (
+        make_phantom(coarse_settings("head", prone=prone, table="flat", **CLEAN)) for prone in (False, True)
+    )
+    centre_lps_mm = (-3.5, -142.25, -418.75)
+    offsets = np.random.default_rng(2).uniform((-60.0, -60.0, -40.0), (60.0, 60.0, 40.0), (3000, 3))
+
     values = []
-    for voxels, affine, _ in made:
-        i, j, k = np.rint(apply_affine(np.linalg.inv(affine), points)).astype(int).T
+    for voxels, affine, _ in (supine, prone):
+        i, j, k = np.rint(apply_affine(np.linalg.inv(affine), centre_lps_mm + offsets)).astype(int).T
         values.append(voxels[k, j, i].astype(float))
-    assert np.corrcoef(values)[0, 1] > 0.9
-    write_phantom(tmp_path / "ct", settings_of("limb", prone=True))
+
+    assert np.sign(np.diag(prone[1])[:3]).tolist() == [-1.0, -1.0, 1.0]
+    assert np.corrcoef(values)[0, 1] > 0.9  # nearest voxels of two grids
+
+
+def test_header_of_a_prone_scan_has_its_position_and_rows_and_columns_turned(tmp_path: Path) -> None:
+    write_phantom(tmp_path / "ct", coarse_settings("limb", prone=True))
     header = pydicom.dcmread(tmp_path / "ct" / "IM0001.dcm")
     assert header.PatientPosition == "HFP"
     assert [float(value) for value in header.ImageOrientationPatient] == [-1.0, 0.0, 0.0, 0.0, -1.0, 0.0]
 
 
-@pytest.mark.parametrize(("table", "changed"), daily_rows(1, [("none", True), ("flat", True), (None, False)]))
-def test_another_couch_changes_the_voxels_of_a_spine(table: str | None, changed: bool) -> None:
+@pytest.mark.parametrize("table", daily(1, ["none", "flat"]))
+def test_couch_other_than_its_own_changes_the_voxels_of_a_spine(table: str) -> None:
     size = {"size": (80, 72), "slices": 6, "spacing": (4.5, 4.0, 5.0)}
-    own = make_phantom(PhantomSettings(**size))[0]
-    assert np.array_equal(make_phantom(PhantomSettings(**size, table=table))[0], own) != changed
+    own, other = (make_phantom(PhantomSettings(**size, **given))[0] for given in ({}, {"table": table}))
+    assert not np.array_equal(other, own)
 
 
-def test_a_written_scene_has_its_materials_in_place(tmp_path: Path) -> None:
-    settings = settings_of("limb", tilt=9.0, oblique=(4.0, -3.0, 8.0), table="curved", table_gap_mm=5.0)
-    truth = write_phantom(tmp_path / "ct", settings)
-    label_map = read_labels(tmp_path / "ct" / "materials.nrrd")
+@pytest.mark.release
+def test_spine_without_a_named_couch_lies_on_its_own() -> None:
+    size = {"size": (80, 72), "slices": 6, "spacing": (4.5, 4.0, 5.0)}
+    own, unnamed = (make_phantom(PhantomSettings(**size, **given))[0] for given in ({}, {"table": None}))
+    assert np.array_equal(unnamed, own)
+
+
+@pytest.fixture(scope="module")
+def written_limb(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PhantomSettings, dict]:
+    """Folder, settings and truth of a tilted and oblique limb above a couch."""
+    settings = coarse_settings("limb", tilt=9.0, oblique=(4.0, -3.0, 8.0), table="curved", table_gap_mm=5.0)
+    folder = tmp_path_factory.mktemp("limb") / "ct"
+    return folder, settings, write_phantom(folder, settings)
+
+
+def test_written_label_map_of_a_scene_has_its_materials_in_place(
+    written_limb: tuple[Path, PhantomSettings, dict],
+) -> None:
+    folder, settings, truth = written_limb
+    label_map = read_labels(folder / "materials.nrrd")
+    expected_affine = np.array(truth["affine_ijk_to_lps_mm"])
     assert np.array_equal(label_map.voxels, label_materials(settings))
-    assert label_map.affine == pytest.approx(np.array(truth["affine_ijk_to_lps_mm"]), abs=1e-9)
-    first = (tmp_path / "ct" / "materials.nrrd").read_bytes()
-    write_phantom(tmp_path / "ct", settings)  # an earlier phantom is replaced
-    assert (tmp_path / "ct" / "materials.nrrd").read_bytes() == first
-    assert truth["settings"]["table_gap_mm"] == 5.0 and "prone" not in truth["settings"]
+    assert label_map.affine == pytest.approx(expected_affine, abs=tolerances.DECIMAL_PLACE_MM)
+
+
+def test_scene_is_written_over_an_earlier_one_with_the_same_bytes(
+    written_limb: tuple[Path, PhantomSettings, dict],
+) -> None:
+    folder, settings, _ = written_limb
+    first = (folder / "materials.nrrd").read_bytes()
+    write_phantom(folder, settings)
+    assert (folder / "materials.nrrd").read_bytes() == first
+
+
+def test_truth_of_a_scene_names_the_settings_that_were_chosen_alone(
+    written_limb: tuple[Path, PhantomSettings, dict],
+) -> None:
+    chosen = written_limb[2]["settings"]
+    assert chosen["table_gap_mm"] == 5.0
+    assert "prone" not in chosen
 
 
 @pytest.mark.parametrize(

@@ -41,21 +41,31 @@ def test_wrong_setting_of_a_phantom_is_refused_with_its_name_and_value(given: di
 
 
 @pytest.mark.parametrize("kind", ["sphere", "torus", "cylinder", "plane"])
-def test_bodies_that_do_not_fit_are_refused_with_their_numbers(kind: str) -> None:
-    small = {"kind": kind, "size": (40, 40), "slices": 40, "spacing": (1.0, 1.0, 1.0)}
-    with refused(UsageError, 30, "radius"):
-        make_phantom(PhantomSettings(**small, radius_mm=30.0))
-    with refused(UsageError, 1, "voxels"):
-        make_phantom(PhantomSettings(**small, radius_mm=0.9))
-    with refused(UsageError, 4, "voxels"):
-        make_phantom(PhantomSettings(**{**small, "slices": 3}))
+@pytest.mark.parametrize(
+    ("given", "facts"),
+    [
+        pytest.param({"radius_mm": 30.0}, (30, "radius"), id="larger than the field"),
+        pytest.param({"radius_mm": 0.9}, (1, "voxels"), id="smaller than a voxel"),
+        pytest.param({"slices": 3}, (4, "voxels"), id="three slices"),
+    ],
+)
+def test_body_that_does_not_fit_is_refused_with_its_numbers(kind: str, given: dict, facts: tuple) -> None:
+    field_of_40_mm = {"size": (40, 40), "slices": 40, "spacing": (1.0, 1.0, 1.0)}
+    with refused(UsageError, *facts):
+        make_phantom(PhantomSettings(**{"kind": kind, **field_of_40_mm, **given}))
 
 
-def test_defaults_depend_on_the_kind() -> None:
-    spine, sphere = PhantomSettings(), PhantomSettings(kind="sphere")
-    assert (spine.noise, spine.point_spread_mm) == (12.0, 0.5)
-    assert (sphere.noise, sphere.point_spread_mm) == (0.0, 0.0)
-    assert PhantomSettings(kind="sphere", size=[20, 30]).shape_kji == (120, 30, 20)
+@pytest.mark.parametrize(("kind", "noise_hu", "point_spread_mm"), [("spine", 12.0, 0.5), ("sphere", 0.0, 0.0)])
+def test_default_noise_and_point_spread_are_those_of_the_kind(
+    kind: str, noise_hu: float, point_spread_mm: float
+) -> None:
+    settings = PhantomSettings(kind=kind)
+    assert (settings.noise, settings.point_spread_mm) == (noise_hu, point_spread_mm)
+
+
+def test_shape_of_the_voxels_is_slices_then_rows_then_columns() -> None:
+    columns, rows, slices = 20, 30, 120  # 120 slices by default
+    assert PhantomSettings(kind="sphere", size=[columns, rows]).shape_kji == (slices, rows, columns)
 
 
 @pytest.mark.parametrize(("text", "size"), [("256", (256, 256)), ("256x192", (256, 192)), ("64 X 32", (64, 32))])
@@ -69,11 +79,17 @@ def test_text_that_is_no_size_is_refused(text: str) -> None:
         parse_size(text)
 
 
-@pytest.mark.parametrize(
-    "value",
-    [0.0, -0.0, 1.0, -1 / 3, 1e-17, -123.456789012345678, -1234.56789012345678, 0.1 + 0.2, -6.123233995736766e-17],
-)
-def test_decimal_strings_are_short_and_close(value: float) -> None:
+NUMBERS = (0.0, -0.0, 1.0, -1 / 3, 1e-17, -123.456789012345678, -1234.56789012345678, 0.1 + 0.2, -6.123233995736766e-17)
+
+
+@pytest.mark.parametrize("value", NUMBERS, ids=repr)
+def test_decimal_string_of_a_number_has_at_most_16_letters_and_reads_as_nearly_the_same(value: float) -> None:
     text = format_decimal(value)
-    assert len(text) <= 16 and float(text) == pytest.approx(value, rel=1e-8, abs=1e-30)
+    assert len(text) <= 16  # the most of DICOM
+    assert float(text) == pytest.approx(value, rel=1e-8, abs=1e-30)  # 8 digits fit beside sign, point and exponent
+
+
+@pytest.mark.parametrize("value", NUMBERS, ids=repr)
+def test_decimal_string_read_and_written_again_is_the_same(value: float) -> None:
+    text = format_decimal(value)
     assert format_decimal(float(text)) == text

@@ -25,7 +25,7 @@ BODIES = [SPHERE, TORUS, CYLINDER, BOX]
 IDS = ["sphere", "torus", "cylinder", "box"]
 
 
-def place(u, v, w) -> np.ndarray:
+def place_points(u, v, w) -> np.ndarray:
     """Points from coordinates along the two directions across the axis and the axis itself."""
     u, v, w = np.broadcast_arrays(u, v, w)
     return CENTRE + u.ravel()[:, None] * ACROSS + v.ravel()[:, None] * THIRD + w.ravel()[:, None] * AXIS
@@ -35,15 +35,17 @@ def surface_points(body) -> np.ndarray:
     turn = np.linspace(0.0, 2.0 * np.pi, 361)[:-1]
     if isinstance(body, Sphere):
         polar = np.linspace(0.0, np.pi, 181)[:, None]
-        return place(*(9.0 * f for f in (np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar))))
+        return place_points(
+            *(9.0 * f for f in (np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)))
+        )
     if isinstance(body, Torus):
         tube = turn[::3, None]
         ring = 11.0 + 4.0 * np.cos(tube)
-        return place(ring * np.cos(turn), ring * np.sin(turn), 4.0 * np.sin(tube))
+        return place_points(ring * np.cos(turn), ring * np.sin(turn), 4.0 * np.sin(tube))
     if isinstance(body, Cylinder):
-        wall = place(6.0 * np.cos(turn), 6.0 * np.sin(turn), np.linspace(-8.5, 8.5, 120)[:, None])
+        wall = place_points(6.0 * np.cos(turn), 6.0 * np.sin(turn), np.linspace(-8.5, 8.5, 120)[:, None])
         radius = np.linspace(0.0, 6.0, 60)[:, None]
-        caps = [place(radius * np.cos(turn), radius * np.sin(turn), height) for height in (-8.5, 8.5)]
+        caps = [place_points(radius * np.cos(turn), radius * np.sin(turn), height) for height in (-8.5, 8.5)]
         return np.vstack((wall, *caps))
     faces = []
     half = np.array((6.0, 8.0, 2.5))
@@ -54,7 +56,7 @@ def surface_points(body) -> np.ndarray:
             coordinates = [np.zeros_like(grid[0])] * 3
             coordinates[axis] = np.full_like(grid[0], sign * half[axis])
             coordinates[a], coordinates[b] = grid
-            faces.append(place(*coordinates))
+            faces.append(place_points(*coordinates))
     return np.vstack(faces)
 
 
@@ -73,37 +75,57 @@ def is_inside(body, points: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("body", daily(1, BODIES), ids=IDS)
 def test_signed_distance_of_a_body_is_that_of_the_nearest_point_of_its_surface(body) -> None:
     points = CENTRE + np.random.default_rng(3).uniform(-14.0, 14.0, (500, 3))
+
+    distance = np.abs(body.signed_distance(points))
+
     surface = surface_points(body)
-    nearest = np.array([np.sqrt(((surface - point) ** 2).sum(axis=1).min()) for point in points])
-    distance = body.signed_distance(points)
-    assert np.array_equal(distance > 0.0, is_inside(body, points))
-    assert 15 < (distance > 0.0).sum() < 480
-    # a cloud of samples is never nearer than the surface, and farther by little where the surface is not touched
-    assert (nearest - np.abs(distance)).min() > -1e-9
-    far = np.abs(distance) > 1.0
-    assert (nearest - np.abs(distance))[far].max() < tolerances.PHANTOM_DISTANCE_MM
+    nearest_sample = np.array([np.sqrt(((surface - point) ** 2).sum(axis=1).min()) for point in points])
+    # samples of a surface are never nearer than the surface, and little farther where a point is away from it
+    assert (nearest_sample - distance).min() > -1e-9
+    away = distance > 1.0
+    assert (nearest_sample - distance)[away].max() < tolerances.PHANTOM_DISTANCE_MM
 
 
 @pytest.mark.parametrize("body", BODIES, ids=IDS)
-def test_volume_area_and_bounds_of_a_body_are_those_counted_from_random_points(body) -> None:
+def test_signed_distance_of_a_body_is_positive_exactly_inside(body) -> None:
+    points = CENTRE + np.random.default_rng(3).uniform(-14.0, 14.0, (500, 3))
+    inside = is_inside(body, points)
+    assert 15 < inside.sum() < 480  # of 500: there are points on both sides
+    assert np.array_equal(body.signed_distance(points) > 0.0, inside)
+
+
+@pytest.mark.parametrize("body", BODIES, ids=IDS)
+def test_volume_and_area_of_a_body_are_those_counted_from_random_points(body) -> None:
     low, high = body.bounds_mm
     points = np.random.default_rng(4).uniform(low, high, (400_000, 3))
+    box_mm3 = float(np.prod(high - low))
+
     distance = body.signed_distance(points)
-    box_ml = float(np.prod(high - low)) / 1000.0
-    assert (distance >= 0.0).mean() * box_ml == pytest.approx(body.volume_ml, rel=0.01)
-    shell = (np.abs(distance) < 0.2).mean() * box_ml * 1000.0 / 0.4
-    assert shell == pytest.approx(body.area_mm2, rel=0.03)
-    surface = surface_points(body)
-    assert surface.min(axis=0) == pytest.approx(low, abs=0.02)
+
+    volume_mm3 = (distance >= 0.0).mean() * box_mm3
+    area_mm2 = (np.abs(distance) < 0.2).mean() * box_mm3 / (2 * 0.2)  # a shell of 0.2 mm on both sides
+    assert volume_mm3 / 1000.0 == pytest.approx(body.volume_ml, rel=0.01)  # chance of 400,000 points
+    assert area_mm2 == pytest.approx(body.area_mm2, rel=0.03)  # a tenth of the points; edges are rounded
+
+
+@pytest.mark.parametrize("body", BODIES, ids=IDS)
+def test_bounds_of_a_body_are_those_of_its_surface(body) -> None:
+    surface, (low, high) = surface_points(body), body.bounds_mm
+    assert surface.min(axis=0) == pytest.approx(low, abs=0.02)  # mm; samples 0.5 mm apart
     assert surface.max(axis=0) == pytest.approx(high, abs=0.02)
 
 
-def test_descriptions_hold_plain_numbers() -> None:
-    described = TORUS.describe()
-    assert described["major_radius_mm"] == 11.0 and described["minor_radius_mm"] == 4.0
+def test_description_of_a_torus_has_its_radii_unit_axis_and_volume() -> None:
+    described = TORUS.describe()  # made with an axis of length 2
+    assert (described["major_radius_mm"], described["minor_radius_mm"]) == (11.0, 4.0)
     assert described["axis_lps"] == pytest.approx(AXIS.tolist())
-    assert described["volume_ml"] == pytest.approx(2.0 * math.pi**2 * 11.0 * 16.0 / 1000.0)
-    assert BOX.describe()["thickness_mm"] == 5.0 and BOX.describe()["edge_lps"] == pytest.approx(ACROSS.tolist())
+    assert described["volume_ml"] == pytest.approx(2.0 * math.pi**2 * 11.0 * 4.0**2 / 1000.0)
+
+
+def test_description_of_a_box_has_its_thickness_and_its_edge_across_the_axis() -> None:
+    described = BOX.describe()  # made with an edge that leans to the axis
+    assert described["thickness_mm"] == 5.0
+    assert described["edge_lps"] == pytest.approx(ACROSS.tolist())
 
 
 @pytest.mark.parametrize(

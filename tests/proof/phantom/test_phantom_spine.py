@@ -8,6 +8,7 @@ from variants import daily
 
 from clrecon.geometry import apply_affine
 from clrecon.proof.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom.spine_parts import Anatomy
 from clrecon.proof.phantom.spine_plan import plan_anatomy
 from clrecon.proof.phantom.vertebra import canal_distance, vertebra_distance
 
@@ -26,58 +27,103 @@ def values_at(made: tuple, points_mm: np.ndarray) -> np.ndarray:
     return voxels[k, j, i]
 
 
+def most_frequent(voxels: np.ndarray, low: float, high: float) -> float:
+    """The middle of the fullest bin of 10 HU between two values."""
+    count, edges = np.histogram(voxels, bins=np.arange(low - 5.0, high + 6.0, 10.0))
+    return float(edges[np.argmax(count)] + 5.0)
+
+
 @pytest.mark.release
-def test_histogram_has_air_soft_tissue_and_bone(spine: tuple) -> None:
+@pytest.mark.parametrize(
+    ("between_hu", "peak_hu"),
+    [
+        pytest.param((-1100, -200), (-1010, -990), id="air"),
+        pytest.param((-150, -60), (-115, -80), id="fat"),
+        pytest.param((-20, 150), (35, 70), id="soft tissue"),
+    ],
+)
+def test_histogram_of_a_spine_peaks_at_the_value_of_a_tissue(
+    spine: tuple, between_hu: tuple[float, float], peak_hu: tuple[float, float]
+) -> None:
+    assert peak_hu[0] <= most_frequent(spine[0], *between_hu) <= peak_hu[1]
+
+
+@pytest.mark.release
+def test_one_to_six_percent_of_the_voxels_of_a_spine_are_bone_some_above_1000_hu(spine: tuple) -> None:
     voxels = spine[0]
-    count, edges = np.histogram(voxels, bins=np.arange(-1105, 1500, 10))
-    middles = (edges[:-1] + edges[1:]) / 2.0
-    assert abs(middles[np.argmax(count)] + 1000.0) <= 10.0
-    soft = np.where((middles > -20.0) & (middles < 150.0), count, 0)
-    assert 35.0 <= middles[np.argmax(soft)] <= 70.0
-    fat = np.where((middles > -150.0) & (middles < -60.0), count, 0)
-    assert -115.0 <= middles[np.argmax(fat)] <= -80.0
-    share_of_bone = (voxels > 226).mean()
-    assert 0.01 < share_of_bone < 0.06
-    assert (voxels > 500).sum() > 5000 and voxels.max() > 1000
-    assert voxels[0, :3, :3].std() < 40.0 and voxels.min() > -1100
+    assert 0.01 < (voxels > 226).mean() < 0.06  # HU of the default preset of bone
+    assert (voxels > 500).sum() > 5000  # of 1.9 million: cortex
+    assert voxels.max() > 1000
 
 
-@pytest.mark.parametrize("dk", daily(1, [3.0, 8.0]))
-def test_most_frequent_values_are_those_of_the_tissues_in_thin_and_thick_slices(dk: float) -> None:
+@pytest.mark.release
+def test_air_of_a_spine_has_noise_of_less_than_40_hu(spine: tuple) -> None:
+    air = spine[0][0, :3, :3]  # the corner of a slice
+    assert air.std() < 40.0
+    assert spine[0].min() > -1100
+
+
+@pytest.mark.parametrize("dk", daily(1, [3.0, 8.0]), ids=["thin slices", "thick slices"])
+def test_most_frequent_values_are_those_of_air_couch_lung_fat_and_muscle(dk: float) -> None:
     voxels, _, _ = make_phantom(PhantomSettings(size=(96, 80), slices=12, spacing=(3.0, 3.0, dk), **CLEAN))
     values, counts = np.unique(voxels, return_counts=True)
-    assert {-1000, -930, -860, -105, 54} == set(values[np.argsort(-counts)[:5]].tolist())
+    five_most_frequent = set(values[np.argsort(-counts)[:5]].tolist())
+    assert five_most_frequent == {-1000, -930, -860, -105, 54}
 
 
-def test_bodies_are_trabecular_inside_and_discs_lie_between(spine: tuple) -> None:
-    levels = [level for level in spine[2]["spine"]["vertebrae"] if level["inside"]]
-    assert [level["name"] for level in levels] == ["T10", "T11", "T12", "L1", "L2"]
-    centres = np.array([level["center_lps_mm"] for level in levels])
-    assert np.all(np.diff(centres[:, 2]) < -24.0)
-    front = centres - (0.0, 6.0, 0.0)
-    around = np.vstack([front + offset for offset in np.random.default_rng(1).uniform(-4.0, 4.0, (60, 3))])
-    assert 150.0 < values_at(spine, around).mean() < 240.0
-    discs = (centres[1:] + centres[:-1]) / 2.0
-    assert 70.0 < values_at(spine, discs - (0.0, 4.0, 0.0)).mean() < 130.0
+def centres_in_view(spine: tuple) -> np.ndarray:
+    """Centres of the vertebral bodies within the slices from above, LPS mm."""
+    return np.array([level["center_lps_mm"] for level in spine[2]["spine"]["vertebrae"] if level["inside"]])
 
 
-def test_left_marker_and_missing_left_rib_show_which_side_is_left(spine: tuple) -> None:
-    truth = spine[2]["spine"]
-    marker = np.array(truth["left_marker_lps_mm"])
-    assert truth["absent"] == ["left rib 12"] and truth["left_marker_inside"]
-    lumbar = np.array(next(v["center_lps_mm"] for v in truth["vertebrae"] if v["name"] == "T12"))
-    assert marker[0] > lumbar[0] + 50.0
-    mirrored = marker.copy()
-    mirrored[0] = 2.0 * -3.5 - marker[0]
+def test_spine_of_150_mm_shows_five_levels_from_above_more_than_24_mm_apart(spine: tuple) -> None:
+    names = [level["name"] for level in spine[2]["spine"]["vertebrae"] if level["inside"]]
+    assert names == ["T10", "T11", "T12", "L1", "L2"]
+    assert np.all(np.diff(centres_in_view(spine)[:, 2]) < -24.0)  # z grows upwards
+
+
+def test_vertebral_bodies_have_the_values_of_trabecular_bone_inside(spine: tuple) -> None:
+    front = centres_in_view(spine) - (0.0, 6.0, 0.0)  # away from the canal
+    offsets = np.random.default_rng(1).uniform(-4.0, 4.0, (60, 3))
+    points = (front + offsets[:, None]).reshape(-1, 3)
+    assert 150.0 < values_at(spine, points).mean() < 240.0  # HU
+
+
+def test_half_way_between_vertebral_bodies_is_a_disc(spine: tuple) -> None:
+    centres = centres_in_view(spine)
+    half_way = (centres[1:] + centres[:-1]) / 2.0 - (0.0, 4.0, 0.0)
+    assert 70.0 < values_at(spine, half_way).mean() < 130.0  # HU
+
+
+def centre_of_t12(spine: tuple) -> np.ndarray:
+    return np.array(next(v["center_lps_mm"] for v in spine[2]["spine"]["vertebrae"] if v["name"] == "T12"))
+
+
+def test_left_marker_lies_on_the_left_alone(spine: tuple) -> None:
+    marker = np.array(spine[2]["spine"]["left_marker_lps_mm"])
+    middle_x = -3.5  # of the phantom
+    mirrored = marker * (-1, 1, 1) + (2.0 * middle_x, 0, 0)
+
+    assert spine[2]["spine"]["left_marker_inside"]
+    assert marker[0] > centre_of_t12(spine)[0] + 50.0  # x grows to the left
     assert values_at(spine, marker[None])[0] > 1200
     assert values_at(spine, mirrored[None])[0] < 200
-    voxels, affine, _ = spine
+
+
+def test_twelfth_rib_is_on_the_right_alone(spine: tuple) -> None:
+    voxels, affine, truth = spine
+    x, y, z = centre_of_t12(spine)
     k, j, i = np.nonzero(voxels > 400)
-    points = apply_affine(affine, np.stack((i, j, k), axis=1))
-    beside = points[(np.abs(points[:, 2] - lumbar[2]) < 22.0) & (np.abs(points[:, 1] - lumbar[1] - 40.0) < 30.0)]
-    right = ((beside[:, 0] < lumbar[0] - 35.0) & (beside[:, 0] > lumbar[0] - 60.0)).sum()
-    left = ((beside[:, 0] > lumbar[0] + 35.0) & (beside[:, 0] < lumbar[0] + 60.0)).sum()
-    assert right > 60 and left < right / 3
+    bone = apply_affine(affine, np.stack((i, j, k), axis=1))
+
+    near_the_rib = bone[(np.abs(bone[:, 2] - z) < 22.0) & (np.abs(bone[:, 1] - y - 40.0) < 30.0)]
+    to_the_left = near_the_rib[:, 0] - x
+    on_the_left = ((to_the_left > 35.0) & (to_the_left < 60.0)).sum()
+    on_the_right = ((to_the_left < -35.0) & (to_the_left > -60.0)).sum()
+
+    assert truth["spine"]["absent"] == ["left rib 12"]
+    assert on_the_right > 60  # voxels
+    assert on_the_left < on_the_right / 3  # a little of the 11th rib
 
 
 @pytest.mark.release
@@ -85,49 +131,74 @@ def test_spine_has_the_same_anatomy_in_tilted_and_oblique_slices() -> None:
     size = {"size": (150, 140), "slices": 60, "spacing": (1.7, 1.6, 2.0)}
     straight = make_phantom(PhantomSettings(**size, **CLEAN))
     turned = make_phantom(PhantomSettings(**size, **CLEAN, tilt=14.0, oblique=(6.0, -9.0, 12.0)))
-    points = np.random.default_rng(2).uniform((-70.0, -70.0, -35.0), (70.0, 70.0, 35.0), (4000, 3))
-    points += (-3.5, -142.25, -418.75)
-    pair = np.stack([values_at(made, points) for made in (straight, turned)]).astype(float)
+    centre_lps_mm = (-3.5, -142.25, -418.75)
+    offsets = np.random.default_rng(2).uniform((-70.0, -70.0, -35.0), (70.0, 70.0, 35.0), (4000, 3))
+
+    pair = np.stack([values_at(made, centre_lps_mm + offsets) for made in (straight, turned)]).astype(float)
+
+    # the nearest voxels of two grids differ at edges
     assert np.corrcoef(pair)[0, 1] > 0.85
     assert np.median(np.abs(pair[0] - pair[1])) < 25.0
 
 
 def test_voxels_between_muscle_and_cortex_have_many_values_of_partial_volume() -> None:
-    made = make_phantom(PhantomSettings(size=(120, 120), slices=20, spacing=(1.0, 1.0, 1.0), **CLEAN))
-    levels = [v for v in made[2]["spine"]["vertebrae"] if v["name"] == "T12"]
-    i, j, k = np.rint(apply_affine(np.linalg.inv(made[1]), [levels[0]["center_lps_mm"]])[0]).astype(int)
-    shell = made[0][k, j - 25 : j + 10, i - 30 : i + 30]
+    voxels, affine, truth = make_phantom(PhantomSettings(size=(120, 120), slices=20, spacing=(1.0, 1.0, 1.0), **CLEAN))
+    i, j, k = np.rint(apply_affine(np.linalg.inv(affine), [centre_of_t12((voxels, affine, truth))])[0]).astype(int)
+    around_the_body = voxels[k, j - 25 : j + 10, i - 30 : i + 30]
+
+    between = np.unique(around_the_body[(around_the_body > 240) & (around_the_body < 840)])
+
     # a thresholded drawing has few values at the rims; partial volume has all between muscle and cortex
-    between = np.unique(shell[(shell > 240) & (shell < 840)])
     assert len(between) > 60
 
 
-def test_bone_of_a_vertebra_surrounds_its_canal_and_leaves_it_free() -> None:
+@pytest.mark.parametrize("name", ["T6", "L3"])
+def test_bone_of_a_vertebra_surrounds_its_canal_and_leaves_it_free(name: str) -> None:
     anatomy = plan_anatomy((250.0, 250.0, 150.0), np.eye(3), seed=1)
-    for vertebra in (anatomy.vertebrae[5], anatomy.vertebrae[14]):
-        middle = vertebra.depth / 2.0 + vertebra.canal_half_depth - 0.8
-        angles = np.linspace(0.0, 2.0 * np.pi, 73)[None, :]
-        reach = np.linspace(0.0, 30.0, 301)[:, None]
-        x = (reach * np.sin(angles)).astype(np.float32)
-        y = (middle + reach * np.cos(angles)).astype(np.float32)
-        # at the height of the pedicles in front and at the sides, lower at the laminae behind
-        bone = np.stack([
-            vertebra_distance(vertebra, x, y, np.full_like(x, height * vertebra.height))
-            for height in (0.2, 0.1, 0.0, -0.1, -0.2)
-        ])  # fmt: skip
-        assert (bone.max(axis=(0, 1)) > 0.5).all()
-        assert (bone[:, canal_distance(vertebra, x, y) > 0.0] < 0.0).all()
+    [vertebra] = [each for each in anatomy.vertebrae if each.name == name]
+    middle_of_canal = vertebra.depth / 2.0 + vertebra.canal_half_depth - 0.8
+    angles = np.linspace(0.0, 2.0 * np.pi, 73)[None, :]
+    reach_mm = np.linspace(0.0, 30.0, 301)[:, None]
+    x = (reach_mm * np.sin(angles)).astype(np.float32)
+    y = (middle_of_canal + reach_mm * np.cos(angles)).astype(np.float32)
+
+    # at the height of the pedicles in front and at the sides, lower at the laminae behind
+    heights = vertebra.height * np.array((0.2, 0.1, 0.0, -0.1, -0.2))
+    depth_mm = np.stack([vertebra_distance(vertebra, x, y, np.full_like(x, height)) for height in heights])
+
+    in_every_direction = depth_mm.max(axis=(0, 1)) > 0.5
+    assert in_every_direction.all()
+    in_the_canal = canal_distance(vertebra, x, y) > 0.0
+    assert in_the_canal.any()
+    assert (depth_mm[:, in_the_canal] < 0.0).all()
 
 
-def test_thoracic_levels_curve_backwards_and_lumbar_levels_forwards() -> None:
-    anatomy = plan_anatomy((300.0, 300.0, 450.0), np.eye(3), seed=0)
-    at = {vertebra.name: vertebra.center for vertebra in anatomy.vertebrae}
+@pytest.fixture(scope="module")
+def whole_spine() -> Anatomy:
+    return plan_anatomy((300.0, 300.0, 450.0), np.eye(3), seed=0)
 
-    def off_chord(top: str, apex: str, bottom: str) -> float:
-        share = (at[apex][2] - at[bottom][2]) / (at[top][2] - at[bottom][2])
-        return float(at[apex][1] - (at[bottom][1] + share * (at[top][1] - at[bottom][1])))
 
-    assert off_chord("T1", "T6", "T12") > 5.0  # backwards
-    assert off_chord("L1", "L3", "L5") < -2.0  # forwards
-    assert len(anatomy.ribs) == 23 and "left rib 12" not in {rib.name for rib in anatomy.ribs}
-    assert all(abs(centre[0] - 1.7) < 25.0 for centre in at.values())
+def behind_the_chord(spine: Anatomy, top: str, apex: str, bottom: str) -> float:
+    """How far behind the line between two levels a third one lies, mm."""
+    centres = {vertebra.name: vertebra.center for vertebra in spine.vertebrae}
+    (_, y_top, z_top), (_, y, z), (_, y_bottom, z_bottom) = (centres[name] for name in (top, apex, bottom))
+    return float(y - np.interp(z, (z_bottom, z_top), (y_bottom, y_top)))
+
+
+def test_thoracic_levels_curve_backwards(whole_spine: Anatomy) -> None:
+    assert behind_the_chord(whole_spine, "T1", "T6", "T12") > 5.0
+
+
+def test_lumbar_levels_curve_forwards(whole_spine: Anatomy) -> None:
+    assert behind_the_chord(whole_spine, "L1", "L3", "L5") < -2.0
+
+
+def test_spine_has_all_ribs_but_the_left_twelfth(whole_spine: Anatomy) -> None:
+    names = {rib.name for rib in whole_spine.ribs}
+    assert names == {f"{side} rib {n}" for side in ("left", "right") for n in range(1, 13)} - {"left rib 12"}
+
+
+def test_levels_of_a_straight_spine_lie_near_the_middle_plane(whole_spine: Anatomy) -> None:
+    x = np.array([vertebra.center[0] for vertebra in whole_spine.vertebrae])
+    middle_x = 1.7  # mm, of the planned spine
+    assert np.abs(x - middle_x).max() < 25.0
