@@ -46,6 +46,11 @@ CHECKS = {
         " and writes a mesh from an environment of its own; needs the extra release and the package index",
         ("scripts/proof/check_package.py", str(KEPT / "package")),
     ),
+    "versions": ReleaseCheck(
+        "quick tests under each Python with the newest libraries, and with the oldest under the oldest: the table in"
+        " docs/guide/development/releases.md; needs uv, of the extra release, and the package index",
+        ("scripts/proof/check_versions.py",),
+    ),
     "kernels": ReleaseCheck(
         "every mutation of every kernel is caught by the self-test, where .ci/run draws a few; on PoCL 3.1",
         ("scripts/proof/mutate_kernels.py", "--device", "0", "--results", str(KEPT / "kernels.json")),

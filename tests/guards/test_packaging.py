@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import configparser
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -101,6 +102,29 @@ def test_pocl_is_required_on_linux_for_x86_64_and_pyopencl_alone_on_every_other_
     markers = {requirement.split()[0]: marker.strip() for requirement, _, marker in requirements}
     assert markers["pyopencl[pocl]"] == 'platform_system == "Linux" and platform_machine == "x86_64"'
     assert markers["pyopencl"] == 'platform_system != "Linux" or platform_machine != "x86_64"'
+
+
+PACKAGES = ROOT / "scripts" / "package"
+
+
+def test_container_copies_only_files_and_folders_that_exist() -> None:
+    lines = [line.split() for line in (PACKAGES / "Containerfile").read_text(encoding="utf-8").splitlines()]
+    copied = [name for line in lines if line[:1] == ["COPY"] and "--from=build" not in line for name in line[1:-1]]
+    assert "clrecon" in copied
+    assert [name for name in copied if not (ROOT / name).exists()] == []
+
+
+def test_conda_recipe_requires_what_setup_cfg_does_and_a_driver() -> None:
+    lines = read_setup()["options"]["install_requires"].splitlines()
+    stated = [line.partition(";")[0].replace("[pocl]", "").split() for line in lines if ">=" in line]
+    recipe = (PACKAGES / "recipe.yaml").read_text(encoding="utf-8").partition("  run:\n")[2].partition("\n\n")[0]
+    required = re.findall(r"^    - (.+)$", recipe, re.MULTILINE)
+    assert set(required) == {f"{name} >={version}" for name, _, version in stated} | {"python >=3.10", "pocl"}
+
+
+def test_version_of_the_conda_recipe_is_that_of_setup_cfg() -> None:
+    recipe = (PACKAGES / "recipe.yaml").read_text(encoding="utf-8")
+    assert f'version: "{read_setup()["metadata"]["version"]}"' in recipe
 
 
 CITATION = (ROOT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
