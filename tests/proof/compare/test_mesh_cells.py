@@ -42,10 +42,15 @@ def shell(low: int, high: int) -> set[tuple[int, ...]]:
 
 
 @pytest.mark.parametrize("affine", [np.eye(4), SHEARED], ids=["even", "sheared"])
-def test_a_box_passes_through_the_shell_of_its_cells(affine):
-    on = grid(affine=affine)
-    assert cells_of(samples.box((2.5,) * 3, (5.0,) * 3), on) == shell(2, 7)
-    assert cells_of(samples.box((2.25,) * 3, (0.5,) * 3), on) == {(2, 2, 2)}
+def test_cells_of_a_box_are_those_of_its_six_faces(affine):
+    box_from_2_5_to_7_5 = samples.box((2.5,) * 3, (5.0,) * 3)
+    assert cells_of(box_from_2_5_to_7_5, grid(affine=affine)) == shell(2, 7)
+
+
+@pytest.mark.parametrize("affine", [np.eye(4), SHEARED], ids=["even", "sheared"])
+def test_box_within_a_cell_passes_through_that_cell_alone(affine):
+    box_from_2_25_to_2_75 = samples.box((2.25,) * 3, (0.5,) * 3)
+    assert cells_of(box_from_2_25_to_2_75, grid(affine=affine)) == {(2, 2, 2)}
 
 
 @pytest.mark.parametrize("affine", [np.eye(4), SHEARED, FAR], ids=["even", "sheared", "far"])
@@ -60,21 +65,22 @@ def test_faces_between_cells_belong_to_the_upper_ones(affine):
     assert cells_of(samples.box((2.0,) * 3, (5.0,) * 3), grid(affine=affine)) == wanted
 
 
-def test_a_diagonal_plane_passes_beside_the_corners_it_touches():
+def test_cells_that_a_diagonal_plane_touches_at_a_corner_alone_are_not_its_cells():
     # x + y + z = 4: the cells whose lowest corner has the sum 2 or 3, its highest then 5 or 6
     corners = np.array([[4.0, 0, 0], [0, 4, 0], [0, 0, 4]])
     cells = cells_of((corners, np.array([[0, 1, 2]])), grid())
     assert cells == {cell for cell in itertools.product(range(4), repeat=3) if sum(cell) in (2, 3)}
 
 
-def test_large_triangles_are_divided_without_loss():
-    rng = np.random.default_rng(5)
-    on = grid((16, 16, 16), SHEARED)
-    for corners in rng.uniform(0.5, 14.5, (3, 3, 3)):
-        every = itertools.product(*(range(int(n.min()), int(n.max()) + 1) for n in corners.T))
-        met = {cell for cell in every if clip(corners - np.array(cell) - 0.5).size}
-        assert cells_of((corners, np.array([[0, 1, 2]])), on) == met
-        assert len(met) > 64
+@pytest.mark.parametrize("number", range(3))
+def test_cells_of_a_triangle_across_the_grid_are_those_of_which_clipping_leaves_a_part(number):
+    corners = np.random.default_rng(5).uniform(0.5, 14.5, (3, 3, 3))[number]
+    within_its_bounds = itertools.product(*(range(int(n.min()), int(n.max()) + 1) for n in corners.T))
+
+    expected = {cell for cell in within_its_bounds if clip(corners - np.array(cell) - 0.5).size}
+
+    assert len(expected) > 64  # more than one part of the search
+    assert cells_of((corners, np.array([[0, 1, 2]])), grid((16, 16, 16), SHEARED)) == expected
 
 
 def test_triangles_that_meet_a_box_are_those_of_which_clipping_leaves_a_part():
@@ -99,53 +105,89 @@ def clip(polygon: np.ndarray) -> np.ndarray:
     return polygon
 
 
-def test_overlap_of_cells_has_recall_precision_dice_and_jaccard_by_hand():
-    one = GridCells([[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 0, 0]])
-    other = GridCells([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0], [-1, 0, 0]], "t-mc")
-    found = measure_cells(one, other, grid())
+ONE = GridCells([[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 0, 0]])
+OTHER = GridCells([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0], [-1, 0, 0]], "t-mc")
+"""Three and five different cells, of which two are common."""
+
+
+def test_different_and_common_cells_of_two_surfaces_are_counted():
+    found = measure_cells(ONE, OTHER, grid())
     assert (found.cells, found.reference_cells, found.common_cells, found.reference) == (3, 5, 2, "t-mc")
-    assert (found.recall, found.precision, found.dice, found.jaccard) == pytest.approx((2 / 5, 2 / 3, 4 / 8, 2 / 6))
-    assert measure_cells(other, one, grid()).recall == pytest.approx(2 / 3)
 
 
-def test_cells_are_packed_and_unpacked_by_their_lowest_corners():
+def test_overlap_of_cells_has_recall_precision_dice_and_jaccard_by_hand():
+    found = measure_cells(ONE, OTHER, grid())
+    assert found.recall == pytest.approx(2 / 5)
+    assert found.precision == pytest.approx(2 / 3)
+    assert found.dice == pytest.approx(2 * 2 / (3 + 5))
+    assert found.jaccard == pytest.approx(2 / (3 + 5 - 2))
+
+
+def test_recall_of_cells_is_the_precision_where_surface_and_reference_are_exchanged():
+    assert measure_cells(OTHER, ONE, grid()).recall == measure_cells(ONE, OTHER, grid()).precision
+
+
+def test_cells_have_the_lowest_corners_that_they_were_made_of():
     corners = [[5, -1, 2], [0, 0, -70], [900_000, 3, 0]]
     assert sorted(GridCells(corners).ijk.tolist()) == sorted(corners)
+
+
+def test_cells_of_no_corners_are_none():
     assert len(GridCells([])) == 0
-    assert repr(GridCells(corners, "truth")) == "GridCells(3 cells of truth)"
 
 
-def test_cells_of_empty_distant_or_huge_meshes_are_refused():
-    on, empty = grid(), Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.uint32))
-    box = placed(samples.box((2.5,) * 3, (5.0,) * 3), on)
-    far = placed(samples.box((14.5,) * 3, (5.0,) * 3), on)
+def test_cells_show_their_number_and_name():
+    assert repr(GridCells([[5, -1, 2], [0, 0, -70], [9, 3, 0]], "truth")) == "GridCells(3 cells of truth)"
+
+
+EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.uint32))
+
+
+def test_surface_without_cells_is_not_measured():
     with pytest.raises(NoSurfaceError, match="the surface passes through no cell"):
-        measure_cells(empty, box, on)
+        measure_cells(EMPTY, placed(samples.box((2.5,) * 3, (5.0,) * 3), grid()), grid())
+
+
+def test_reference_without_cells_is_not_measured():
     with pytest.raises(NoSurfaceError, match="the reference passes through no cell"):
-        measure_cells(box, empty, on)
+        measure_cells(placed(samples.box((2.5,) * 3, (5.0,) * 3), grid()), EMPTY, grid())
+
+
+def test_surface_outside_of_the_grid_is_refused_with_its_extent():
+    box_from_14_to_19 = placed(samples.box((14.5,) * 3, (5.0,) * 3), grid())
+    box = placed(samples.box((2.5,) * 3, (5.0,) * 3), grid())
     with refused(UsageError, 14, 19):
-        measure_cells(far, box, on)
+        measure_cells(box_from_14_to_19, box, grid())
+
+
+def test_mesh_of_kilometres_is_refused_as_of_another_grid():
     with pytest.raises(UsageError, match="does not belong to this grid"):
-        find_mesh_cells(Mesh([[0, 0, 0], [3e6, 0, 0], [0, 1, 0]], [[0, 1, 2]]), on)
-    with refused(UsageError, 1048576):
+        find_mesh_cells(Mesh([[0, 0, 0], [3e6, 0, 0], [0, 1, 0]], [[0, 1, 2]]), grid())
+
+
+def test_cell_beyond_20_bits_is_refused():
+    with refused(UsageError, 1 << 20):
         GridCells([[0, 0, 1 << 20]])
+
+
+def test_cell_of_part_numbers_is_refused():
     with refused(UsageError, "shape", 3):
         GridCells([[0.5, 1, 2]])
 
 
-def test_cells_beyond_the_grid_are_counted():
+def test_cells_of_a_box_beyond_the_grid_are_counted_apart():
     on = grid((6, 6, 6))
     found = measure_cells(placed(samples.box((2.5,) * 3, (5.0,) * 3), on), GridCells([[2, 2, 2]]), on)
     inside = {cell for cell in shell(2, 7) if max(cell) < 6}
     assert found.cells_outside == found.cells - len(inside)
-    assert found.common_cells == 1
+    assert found.common_cells == 1  # (2, 2, 2) is the first corner of the box
 
 
-def test_search_for_cells_tells_its_progress():
+def test_search_for_cells_tells_its_progress_in_triangles():
     told = []
     on = grid()
     find_mesh_cells(placed(samples.box(), on), on, progress=lambda *what: told.append(what))
-    assert told == [("cells", 0, 12), ("cells", 12, 12)]
+    assert told == [("cells", 0, 12), ("cells", 12, 12)]  # a box has 12
 
 
 def test_index_steps_of_a_millimetre_are_those_of_the_narrowest_slices():

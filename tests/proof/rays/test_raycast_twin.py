@@ -29,63 +29,107 @@ SLOPE = np.array([3.0, -2.0, 5.0])
 
 
 @pytest.mark.parametrize("shape", [(5, 6, 7), (1, 4, 3), (1, 1, 1), (2, 1, 5)])
-def test_the_field_is_that_of_scipy(shape):
+def test_field_between_and_beyond_voxels_is_the_linear_interpolation_of_scipy(shape):
     rng = np.random.default_rng(3)
     voxels = rng.integers(-1000, 2000, shape).astype(np.int16)
     ijk = rng.uniform(-1.5, np.array(shape[::-1]) + 0.5, (500, 3))
     expected = map_coordinates(voxels.astype(np.float64), ijk.T[::-1], order=1, mode="nearest")
-    assert np.abs(sample_field(voxels, ijk) - expected).max() <= tolerances.TRILINEAR * 1000
-    assert np.array_equal(sample_field(voxels, np.argwhere(voxels > -9999)[:, ::-1].astype(float)), voxels.ravel())
+    assert np.abs(sample_field(voxels, ijk) - expected).max() <= tolerances.TRILINEAR * 1000  # of some 1000 HU
+
+
+@pytest.mark.parametrize("shape", [(5, 6, 7), (1, 4, 3), (1, 1, 1), (2, 1, 5)])
+def test_field_at_a_voxel_is_its_value_exactly(shape):
+    voxels = np.random.default_rng(3).integers(-1000, 2000, shape).astype(np.int16)
+    all_ijk = np.argwhere(np.ones(shape, bool))[:, ::-1].astype(float)
+    assert np.array_equal(sample_field(voxels, all_ijk), voxels.ravel())
+
+
+def linear_volume(steps):
+    field = lambda p: p @ SLOPE  # noqa: E731
+    volume = uneven_volume(field, (9, 8), (1.0, 0.4, 1.9, 1.0)) if steps == "uneven" else even_volume(field, steps, 9.0)
+    return volume.with_voxels(volume.voxels.astype(np.float32))
 
 
 @pytest.mark.parametrize("steps", [*STEPS, "uneven"])
-def test_gradients_of_linear_fields_are_exact(steps):
-    field = lambda p: p @ SLOPE  # noqa: E731
-    volume = uneven_volume(field, (9, 8), (1.0, 0.4, 1.9, 1.0)) if steps == "uneven" else even_volume(field, steps, 9.0)
-    volume = volume.with_voxels(volume.voxels.astype(np.float32))
+def test_gradient_of_a_linear_field_is_its_slope_within_the_volume(steps):
+    volume = linear_volume(steps)
     gradients = voxel_gradients(volume.voxels, slice_normal_matrices(volume, 0))
-    assert np.abs(gradients[1:-1, 1:-1, 1:-1] - SLOPE).max() <= 1e-4
-    flat = voxel_gradients(volume.voxels[:, :, :1], slice_normal_matrices(volume, 0))
-    assert np.isfinite(flat).all()
+    assert np.abs(gradients[1:-1, 1:-1, 1:-1] - SLOPE).max() <= 1e-4  # HU per mm: float32 values of some 50 HU
 
 
-def test_gradients_at_the_border_are_half_a_step_to_the_inside():
+@pytest.mark.parametrize("steps", [*STEPS, "uneven"])
+def test_gradient_of_a_volume_of_one_column_is_finite(steps):
+    volume = linear_volume(steps)
+    gradients = voxel_gradients(volume.voxels[:, :, :1], slice_normal_matrices(volume, 0))
+    assert np.isfinite(gradients).all()
+
+
+def test_gradients_at_the_border_are_half_the_difference_to_the_inside():
     voxels = np.array([[[1.0, 4.0, 9.0]]])
     gradients = voxel_gradients(voxels, np.eye(3)[None])
-    assert np.array_equal(gradients[0, 0, :, 0], [1.5, 4.0, 2.5])
+    assert gradients[0, 0, :, 0].tolist() == [(4 - 1) / 2, (9 - 1) / 2, (9 - 4) / 2]
     assert not gradients[..., 1:].any()
 
 
-@pytest.mark.parametrize("steps", [*STEPS, "uneven"])
-def test_intervals_end_where_the_indices_do(steps):
-    field = lambda p: p[:, 0]  # noqa: E731
-    volume = uneven_volume(field, (20, 18), noise=0.0) if steps == "uneven" else even_volume(field, steps, 12.0)
+def draw_rays(volume):
+    """Origins and unit directions of 200 rays from near the centre of a volume."""
     rng = np.random.default_rng(4)
     origins = centre_of(volume) + rng.uniform(-10.0, 10.0, (200, 3))
     directions = rng.normal(size=(200, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def compare_intervals(volume):
+    """Samples along rays that lie among the voxels, and those within the interval of their ray."""
+    origins, directions = draw_rays(volume)
     t_in, t_out, _ = find_interval(origins, directions, box_of(volume))
     t = np.linspace(-60.0, 60.0, 1001)
     points = origins[:, None] + t[:, None] * directions[:, None]
     ijk = volume.lps_to_ijk(points.reshape(-1, 3)).reshape(*points.shape)
-    there = np.asarray(((ijk >= -0.5) & (ijk <= np.array(volume.shape_ijk) - 0.5)).all(axis=-1))
-    within = (t >= t_in[:, None]) & (t <= t_out[:, None])
-    assert 0.01 < there.mean() and there.any(axis=1).mean() < 0.9
-    if steps == "uneven":  # its box is the smallest around all slices
-        assert within[there].all() and there.sum() > 0.3 * within.sum()
-    else:
-        assert np.array_equal(within, there)
+    among_voxels = np.asarray(((ijk >= -0.5) & (ijk <= np.array(volume.shape_ijk) - 0.5)).all(axis=-1))
+    assert 0.01 < among_voxels.mean()  # some rays pass through
+    assert among_voxels.any(axis=1).mean() < 0.9  # and some beside
+    return among_voxels, (t >= t_in[:, None]) & (t <= t_out[:, None])
 
 
-def test_a_ray_that_enters_through_a_clip_plane_says_so():
-    volume = even_volume(lambda p: p[:, 0], "even", 12.0)
+@pytest.mark.parametrize("steps", STEPS)
+def test_interval_of_a_ray_reaches_half_a_voxel_beyond_the_outermost_voxels(steps):
+    among_voxels, in_interval = compare_intervals(even_volume(lambda p: p[:, 0], steps, 12.0))
+    assert np.array_equal(in_interval, among_voxels)
+
+
+def test_interval_of_a_ray_through_uneven_slices_is_that_of_the_smallest_box_around_them():
+    among_voxels, in_interval = compare_intervals(uneven_volume(lambda p: p[:, 0], (20, 18), noise=0.0))
+    assert in_interval[among_voxels].all()
+    assert among_voxels.sum() > 0.3 * in_interval.sum()  # slices that lean fill about half of their box
+
+
+@pytest.fixture(scope="module")
+def clipped_rays():
+    """Enters, exits and planes of rays to, from and beside the kept quarter y > 0, z > 0 of a volume of 12.6 mm."""
+    volume = even_volume(lambda p: p[:, 0], "even", 12.0)  # 14 voxels of 0.9 mm
     centre = centre_of(volume)
     clip = Clip.plane(centre, (0, 0, 1.0)) & Clip.plane(centre, (0, 1.0, 0))
     origins = centre + np.array([(0.0, -50.0, 3.0), (0.0, 50.0, 3.0), (0.0, -50.0, -3.0)])
     directions = np.array([(0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)])
-    t_in, t_out, entered_by = find_interval(origins, directions, box_of(volume), clip)
-    assert entered_by.tolist()[:2] == [1, -1]
-    assert np.abs(t_in[:2] - (50.0, 50.0 - 6.3)).max() < 1e-9 and t_out[2] < t_in[2]
+    return find_interval(origins, directions, box_of(volume), clip)
+
+
+def test_ray_that_enters_through_a_clip_plane_has_its_number_and_another_ray_minus_1(clipped_rays):
+    _, _, entered_by = clipped_rays
+    second_plane, face_of_the_volume = 1, -1
+    assert entered_by[:2].tolist() == [second_plane, face_of_the_volume]
+
+
+def test_ray_enters_a_clipped_volume_at_the_plane_or_at_its_face(clipped_rays):
+    t_in, _, _ = clipped_rays
+    half_the_volume = 14 * 0.9 / 2
+    assert t_in[:2] == pytest.approx([50.0, 50.0 - half_the_volume], abs=1e-9)
+
+
+def test_ray_beside_the_kept_part_of_a_clipped_volume_has_an_empty_interval(clipped_rays):
+    t_in, t_out, _ = clipped_rays
+    assert t_out[2] < t_in[2]
 
 
 def test_values_of_a_transfer_function_are_those_of_the_nearest_node_of_its_table():
@@ -125,75 +169,99 @@ def test_shade_of_a_colour_is_that_of_the_phong_formula_towards_the_viewer(direc
         assert np.allclose(shaded[n], np.minimum(expected, 1.0))
 
 
-def test_one_ray_is_the_sum_written_out():
+def test_colour_opacity_and_depths_of_a_ray_are_the_sums_over_its_samples_written_out():
     """Compositing, opacity over a part of a step, gradient opacity, shading and both depths, along a single ray."""
     rng = np.random.default_rng(9)
     volume = even_volume(lambda p: rng.uniform(-200.0, 900.0, len(p)), "oblique", 11.0)
+    gradient_nodes, gradient_opacities, unit_mm = [50.0, 600.0], [0.2, 1.0], 1.3
     function = TransferFunction(
         [(-100, 0.2, 0.4, 0.9, 0.0), (300, 1, 0.6, 0.3, 0.1), (800, 1, 1, 1, 0.5)],
-        unit_distance=1.3,
-        gradient_opacity=[(50.0, 0.2), (600.0, 1.0)],
+        unit_distance=unit_mm,
+        gradient_opacity=list(zip(gradient_nodes, gradient_opacities, strict=True)),
     )
     lighting, step = Lighting(direction=(0.2, -1.0, 0.4)), 0.37
     camera = look(volume, (0.4, 1.0, 0.2), 4.0, perspective=True)
+    row, column = 1, 2
+
     picture = cast_rays(volume, VolumeLook(function, lighting=lighting, ray_step=step), camera, (3, 3))
-    origin, direction = (rays[1, 2] for rays in camera.rays((3, 3)))
+
+    origin, direction = (rays[row, column] for rays in camera.rays((3, 3)))
     (t_in,), (t_out,), _ = find_interval(origin[None], direction[None], box_of(volume))
-    matrices = slice_normal_matrices(volume, 0)
+    gradients = voxel_gradients(volume.voxels, slice_normal_matrices(volume, 0))
     colour, opacity, weighted, depth, start = np.zeros(3), 0.0, 0.0, np.nan, t_in
     while start < t_out and opacity < 0.99:
         length = min(step, t_out - start)
         t = start + 0.5 * length
         ijk = volume.lps_to_ijk([origin + t * direction])
-        hu = sample_field(volume.voxels, ijk)
-        slope = sample_field(voxel_gradients(volume.voxels, matrices), ijk)
-        *rgb, alpha = look_up(function, hu)[0]
-        alpha *= np.interp(np.linalg.norm(slope), [50.0, 600.0], [0.2, 1.0])
-        alpha = 1.0 - (1.0 - alpha) ** (length / 1.3)
+        slope = sample_field(gradients, ijk)
+        *rgb, alpha = look_up(function, sample_field(volume.voxels, ijk))[0]
+        alpha *= np.interp(np.linalg.norm(slope), gradient_nodes, gradient_opacities)
+        alpha = 1.0 - (1.0 - alpha) ** (length / unit_mm)
         weight = (1.0 - opacity) * alpha
         colour = colour + weight * shade(np.array([rgb]), slope, direction[None], lighting)[0]
         opacity += weight
         weighted += weight * t
         depth = t if np.isnan(depth) and opacity > 1 / 255 else depth
         start += step
-    assert 0.3 < opacity < 0.99
-    assert np.allclose(picture.rgba[1, 2], [*colour, opacity])
-    assert np.isclose(picture.depth[1, 2], depth) and np.isclose(picture.expected_depth[1, 2], weighted / opacity)
+    assert 0.3 < opacity < 0.99  # the ray sees bodies and does not end in one
+    assert np.allclose(picture.rgba[row, column], [*colour, opacity])
+    assert np.isclose(picture.depth[row, column], depth)
+    assert np.isclose(picture.expected_depth[row, column], weighted / opacity)
 
 
 def test_ray_shows_nothing_behind_the_sample_that_makes_it_opaque():
     volume = even_volume(lambda p: np.where(p[:, 1] < 0.0, 100.0, 900.0), "even", 30.0)
-    wall = TransferFunction([(0, 1, 0, 0, 0.4), (400, 1, 0, 0, 0.4), (400, 0, 1, 0, 1), (1000, 0, 1, 0, 1)])
+    red, green = (1, 0, 0), (0, 1, 0)  # red fog in front of an opaque green wall
+    wall = TransferFunction([(0, *red, 0.4), (400, *red, 0.4), (400, *green, 1), (1000, *green, 1)])
+
     picture = cast_rays(volume, VolumeLook(wall, lighting=UNSHADED, ray_step=0.5), look(volume, (0, 1, 0), 5.0), (4, 4))
-    assert (picture.rgba[..., 3] >= 0.99).all() and (picture.rgba[..., 3] < 1.0).all()
-    assert not picture.rgba[..., 1].any()  # nothing of the green wall behind
+
+    assert (picture.rgba[..., 3] >= 0.99).all()
+    assert (picture.rgba[..., 3] < 1.0).all()  # the wall would make it 1
+    assert not picture.rgba[..., 1].any()
 
 
 def test_default_step_of_a_ray_is_half_the_smallest_spacing():
+    smallest_spacing = np.linalg.norm(STEPS["anisotropic"], axis=0).min()  # 0.45 mm
     volume = even_volume(lambda p: 50.0 * p[:, 1], "anisotropic", 12.0)
     camera = look(volume, (0.3, 1.0, 0.2), 5.0)
-    styles = [Projection("mean", ray_step=step) for step in (None, 0.225)]
-    default, given = (cast_rays(volume, style, camera, (6, 6)).values for style in styles)
+    default, given = (
+        cast_rays(volume, Projection("mean", ray_step=step), camera, (6, 6)).values
+        for step in (None, smallest_spacing / 2)
+    )
     assert np.array_equal(default, given)
 
 
-def test_jitter_of_a_pixel_is_its_hash_even_and_unlike_its_neighbours():
-    def mix(bits):  # lowbias32 in whole numbers without end
+def test_hash_of_a_pixel_is_lowbias32_of_its_column_and_the_hash_of_its_row():
+    def lowbias32(bits):  # in whole numbers without end
         bits = (bits ^ bits >> 16) * 0x7FEB352D % 2**32
         bits = (bits ^ bits >> 15) * 0x846CA68B % 2**32
         return bits ^ bits >> 16
 
     pixels = [(0, 0), (1, 7), (1023, 4095), (65535, 3)]
     x, y = np.array(pixels).T
-    assert hash_pixels(x, y).tolist() == [mix((a + mix((b + 0x9E3779B9) % 2**32)) % 2**32) for a, b in pixels]
-    part = jitter_pixels(256, 256)
-    assert 0.0 <= part.min() < 1e-3 and 0.999 < part.max() < 1.0
-    assert np.array_equal(part.astype(np.float32), part)
-    assert abs(part.mean() - 0.5) < 4.0 / np.sqrt(12.0) / 256.0
-    centred = part - 0.5
-    for shift in ((0, 1), (1, 0), (1, 1), (0, 2), (16, 0)):  # neighbours know nothing of each other
-        assert abs((centred * np.roll(centred, shift, (0, 1))).mean()) < 4.0 / 12.0 / 256.0
-    assert np.array_equal(part[:50, :60], jitter_pixels(60, 50))
+    expected = [lowbias32((a + lowbias32((b + 0x9E3779B9) % 2**32)) % 2**32) for a, b in pixels]
+    assert hash_pixels(x, y).tolist() == expected
+
+
+def test_jitter_is_spread_evenly_from_0_to_1_in_float32():
+    jitter = jitter_pixels(256, 256)
+    assert 0.0 <= jitter.min() < 1e-3
+    assert 0.999 < jitter.max() < 1.0
+    four_standard_errors = 4.0 / np.sqrt(12.0) / 256.0  # of the mean of 256 x 256 even numbers
+    assert abs(jitter.mean() - 0.5) < four_standard_errors
+    assert np.array_equal(jitter.astype(np.float32), jitter)
+
+
+@pytest.mark.parametrize("shift", [(0, 1), (1, 0), (1, 1), (0, 2), (16, 0)])
+def test_jitter_of_a_pixel_is_uncorrelated_with_that_of_a_neighbour(shift):
+    centred = jitter_pixels(256, 256) - 0.5
+    four_standard_errors = 4.0 / 12.0 / 256.0  # of the mean product
+    assert abs((centred * np.roll(centred, shift, (0, 1))).mean()) < four_standard_errors
+
+
+def test_jitter_of_a_pixel_does_not_depend_on_the_size_of_the_picture():
+    assert np.array_equal(jitter_pixels(256, 256)[:50, :60], jitter_pixels(60, 50))
 
 
 def test_jitter_lies_within_each_segment_the_last_one_too():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from surface_volumes import smooth_volume
 
-from clrecon.proof.surface.case_table import CORNERS, EDGES, case_table
+from clrecon.proof.surface.case_table import EDGES, case_table
 from clrecon.proof.surface.growing import (
     choose_largest,
     count_visited,
@@ -18,7 +18,7 @@ from clrecon.proof.surface.growing import (
 )
 
 
-def scenes() -> dict[str, np.ndarray]:
+def inside_masks() -> dict[str, np.ndarray]:
     k, j, i = np.indices((11, 12, 13))
     apart = ((i < 4) | (i > 8)) & (j > 2) & (j < 8) & (k > 2) & (k < 8)
     hollow = (np.abs(np.stack([i - 6, j - 6, k - 5])).max(0) < 5) & (np.abs(np.stack([i - 6, j - 6, k - 5])).max(0) > 1)
@@ -33,65 +33,100 @@ def scenes() -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("name", scenes())
+@pytest.mark.parametrize("name", inside_masks())
 def test_growing_from_seeds_finds_all_cells_of_their_components_and_no_others(name: str) -> None:
-    inside = scenes()[name]
+    inside = inside_masks()[name]
     count, numbers = label_cells(inside)
-    assert count == numbers.max() + 1 and ((numbers >= 0) == find_active(inside)).all()
     rng = np.random.default_rng(5)
-    wanted = np.unique(rng.integers(0, count, 3))
-    seeds = [tuple(rng.permutation(np.argwhere(numbers == component))[0]) for component in wanted]
+    seeded_components = np.unique(rng.integers(0, count, 3))
+    seeds = [tuple(rng.permutation(np.argwhere(numbers == component))[0]) for component in seeded_components]
+
     grown = grow_cells(inside, seeds)
-    assert (grown.cells == np.isin(numbers, wanted)).all()
+
+    assert (grown.cells == np.isin(numbers, seeded_components)).all()
+
+
+@pytest.mark.parametrize("name", inside_masks())
+def test_growing_visits_as_many_cells_as_are_counted_for_its_result_and_no_more_than_all(name: str) -> None:
+    inside = inside_masks()[name]
+    first_and_last_cell = [tuple(cell) for cell in np.argwhere(find_active(inside))[[0, -1]]]
+
+    grown = grow_cells(inside, first_and_last_cell)
+
     assert grown.visited == count_visited(grown.cells)
-    assert grown.cells.sum() <= grown.visited <= numbers.size
+    assert grown.cells.sum() <= grown.visited <= find_active(inside).size
+
+
+@pytest.mark.parametrize("name", inside_masks())
+def test_components_have_numbers_from_0_at_the_active_cells_alone(name: str) -> None:
+    inside = inside_masks()[name]
+    count, numbers = label_cells(inside)
+    assert count == numbers.max() + 1
+    assert ((numbers >= 0) == find_active(inside)).all()
 
 
 def test_components_of_cells_are_numbered_in_the_order_of_their_first_cells() -> None:
-    _, numbers = label_cells(scenes()["sparse noise"])
-    firsts = np.unique(numbers[numbers >= 0], return_index=True)[1]
-    assert (np.diff(firsts) > 0).all() and len(firsts) > 5
+    _, numbers = label_cells(inside_masks()["sparse noise"])
+    first_cells = np.unique(numbers[numbers >= 0], return_index=True)[1]
+    assert len(first_cells) > 5
+    assert (np.diff(first_cells) > 0).all()
 
 
-def test_components_of_blocks_are_counted_as_known() -> None:
-    assert label_cells(scenes()["two blocks"])[0] == 2
-    assert label_cells(scenes()["a hollow block"])[0] == 2
-    # Two cells that share an edge alone: the faces between them and their neighbours are all alike or mixed.
+# the hollow block has a surface outside and one within
+@pytest.mark.parametrize("name", ["two blocks", "a hollow block"])
+def test_two_blocks_and_a_hollow_block_have_two_components(name: str) -> None:
+    assert label_cells(inside_masks()[name])[0] == 2
+
+
+def test_blocks_whose_cells_share_an_edge_alone_are_two_components() -> None:
     inside = np.zeros((2, 3, 3), bool)
-    inside[:, 0, 0] = inside[:, 2, 2] = True
+    inside[:, 0, 0] = inside[:, 2, 2] = True  # no face between the cells around them has corners of both kinds
     assert label_cells(inside)[0] == 2
 
 
-def test_face_is_mixed_exactly_where_one_to_three_of_its_corners_are_inside() -> None:
-    for bits in range(16):
-        inside = np.zeros((3, 2, 2), bool)
-        inside[1] = np.array([bits >> n & 1 for n in range(4)], bool).reshape(2, 2)
-        assert find_mixed(inside, 0)[0, 0, 0] == (bits not in (0, 15))
+@pytest.mark.parametrize("bits", range(16))
+def test_face_is_mixed_exactly_where_one_to_three_of_its_corners_are_inside(bits: int) -> None:
+    corners_inside = np.array([bits >> n & 1 for n in range(4)], bool)
+    inside = np.zeros((3, 2, 2), bool)
+    inside[1] = corners_inside.reshape(2, 2)
+    assert find_mixed(inside, 0)[0, 0, 0] == (1 <= corners_inside.sum() <= 3)
 
 
 def test_cells_beside_a_crossed_edge_belong_to_one_component() -> None:
     inside = np.random.default_rng(6).random((6, 7, 8)) < 0.4
     _, numbers = label_cells(inside)
-    for k, j, i in np.argwhere(inside[1:-1, 1:-1, :-1] != inside[1:-1, 1:-1, 1:]):
-        around = numbers[k : k + 2, j : j + 2, i]
-        assert len(np.unique(around)) == 1 and around.min() >= 0
+
+    crossed_edges = np.argwhere(inside[1:-1, 1:-1, :-1] != inside[1:-1, 1:-1, 1:])  # along i
+
+    assert len(crossed_edges) > 50
+    around = np.array([numbers[k : k + 2, j : j + 2, i].ravel() for k, j, i in crossed_edges])
+    assert (around == around[:, :1]).all()
+    assert around.min() >= 0
 
 
-def test_every_crossed_edge_of_an_active_cell_has_a_corner_of_its_triangles() -> None:
-    for case, triangles in enumerate(case_table()):
-        crossed = {
-            number for number, (_, low, high) in enumerate(EDGES) if (case >> low & 1) != (case >> high & 1)
-        }  # fmt: skip
-        assert {edge for triangle in triangles for edge in triangle} == crossed
-    assert len(CORNERS) == 8
+@pytest.mark.parametrize("case", range(256))
+def test_corners_of_the_triangles_of_a_case_lie_on_its_crossed_edges_and_on_each_of_them(case: int) -> None:
+    crossed = {number for number, (_, low, high) in enumerate(EDGES) if (case >> low & 1) != (case >> high & 1)}
+    assert {edge for triangle in case_table()[case] for edge in triangle} == crossed
 
 
-def test_seeds_choose_by_inside_corners_and_shares_by_size() -> None:
-    inside = scenes()["two blocks"]
+@pytest.mark.parametrize(
+    ("seed_kji", "chosen"),
+    [
+        pytest.param((5, 5, 6), [False, False], id="seed outside between both blocks"),
+        pytest.param((5, 5, 3), [True, False], id="seed in the first block"),
+    ],
+)
+def test_seed_chooses_the_component_of_which_it_is_an_inside_corner(
+    seed_kji: tuple[int, int, int], chosen: list[bool]
+) -> None:
+    inside = inside_masks()["two blocks"]
     count, numbers = label_cells(inside)
     seeds = np.zeros(inside.shape, bool)
-    seeds[5, 5, 6] = True  # outside, between both
-    assert not find_seeded(inside, seeds, numbers, count).any()
-    seeds[5, 5, 3] = True
-    assert find_seeded(inside, seeds, numbers, count).tolist() == [True, False]
-    assert choose_largest(np.array([100, 5, 4, 40]), 0.05).tolist() == [True, True, False, True]
+    seeds[seed_kji] = True
+    assert find_seeded(inside, seeds, numbers, count).tolist() == chosen
+
+
+def test_components_of_at_least_a_share_of_the_largest_are_chosen() -> None:
+    sizes = np.array([100, 5, 4, 40])
+    assert choose_largest(sizes, 0.05).tolist() == [True, True, False, True]
