@@ -19,13 +19,14 @@ def command_line(command: str, device, tmp_path: Path) -> tuple[str, ...]:
     return command, str(tmp_path / "ct"), *own[command], "--device", str(device.index)
 
 
+@pytest.mark.fault_row(56)
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize(
     ("command", "kernel", "number"),
     daily_rows(1, [("mesh", "emit_vertices", signal.SIGINT), ("render", "composite_rays", signal.SIGTERM)]),
 )
-def test_row_56_command_whose_kernel_hangs_is_ended_by_a_signal_with_130_and_leaves_nothing(
+def test_command_whose_kernel_hangs_is_ended_by_a_signal_with_130_and_leaves_nothing(
     device, tmp_path, command, kernel, number
 ):
     process = start_command(kernel, *command_line(command, device, tmp_path))
@@ -40,14 +41,13 @@ def test_row_56_command_whose_kernel_hangs_is_ended_by_a_signal_with_130_and_lea
     assert [path.name for path in tmp_path.iterdir()] == ["ct"]
 
 
+@pytest.mark.fault_row(56)
 @pytest.mark.release
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "kernel"), daily_rows(1, [("mesh", "emit_triangles"), ("render", "composite_rays")])
 )
-def test_row_56_command_whose_kernel_hangs_is_ended_by_its_time_limit_with_5_and_advice(
-    device, tmp_path, command, kernel
-):
+def test_command_whose_kernel_hangs_is_ended_by_its_time_limit_with_5_and_advice(device, tmp_path, command, kernel):
     process = start_command(kernel, *command_line(command, device, tmp_path), "--timeout", "1")
     assert process.stderr is not None
     assert process.stderr.readline() == "the kernel spins\n"

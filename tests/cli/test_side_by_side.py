@@ -66,9 +66,10 @@ def read_output(target: Path) -> tuple[str, Any]:
     return hashlib.sha256(target.read_bytes()).hexdigest(), without_unequal_facts(json.loads(text))
 
 
+@pytest.mark.fault_row(60, 72)
 @pytest.mark.slow
 @pytest.mark.parametrize("extension", daily(1, [".stl", ".vtp"]))
-def test_rows_60_and_72_mesh_and_report_are_the_same_with_other_threads_locale_time_zone_and_umask(
+def test_mesh_and_report_are_the_same_with_other_threads_locale_time_zone_and_umask(
     device, ct: Path, tmp_path: Path, extension: str
 ) -> None:
     plain, odd = make_targets(tmp_path, extension)
@@ -91,11 +92,10 @@ def test_rows_60_and_72_mesh_and_report_are_the_same_with_other_threads_locale_t
     assert read_output(plain) == read_output(odd)
 
 
+@pytest.mark.fault_row(58)
 @pytest.mark.release
 @pytest.mark.seconds
-def test_row_58_two_processes_on_one_device_at_once_write_the_same_mesh_and_report(
-    device, ct: Path, tmp_path: Path
-) -> None:
+def test_two_processes_on_one_device_at_once_write_the_same_mesh_and_report(device, ct: Path, tmp_path: Path) -> None:
     """Both begin with an empty cache of kernels."""
     cache = tmp_path / "cache"
     cache.mkdir(mode=0o700)

@@ -14,13 +14,12 @@ from house import ROOT, statements_of
 
 LAST_ROW = 72
 EXPECTED = [row for row in range(1, LAST_ROW + 1) if row not in PENDING]
-ROW_IN_NAME = re.compile(r"test_rows?_(\d+(?:_and_\d+)*)_")
 ROW_IN_MARK = re.compile(r"^@pytest\.mark\.fault_row\(([\d, ]+)\)", re.MULTILINE)
 
 
 @dataclass
 class FoundTests:
-    """The names of the tests of each file, and the rows that tests hold by their mark or their name."""
+    """The names of the tests of each file, and the rows that tests hold by their mark."""
 
     names: dict[str, set[str]] = field(default_factory=dict)
     held_rows: set[int] = field(default_factory=set)
@@ -28,9 +27,6 @@ class FoundTests:
     def add(self, file: str, source: str) -> None:
         functions = [node for node in statements_of(source) if isinstance(node, ast.FunctionDef)]
         self.names[file] = {function.name for function in functions if function.name.startswith("test_")}
-        for name in self.names[file]:
-            if match := ROW_IN_NAME.match(name):
-                self.held_rows.update(map(int, match[1].split("_and_")))
         for rows in ROW_IN_MARK.findall(source):
             self.held_rows.update(map(int, rows.split(",")))
 
@@ -88,13 +84,12 @@ def test_pending_rows_are_not_listed_and_give_a_reason() -> None:
 @pytest.mark.parametrize(
     "source",
     [
-        "def test_rows_38_and_40_streams(): pass",
-        "def test_row_40_streams(): pass\ndef test_row_38_bombs(): pass",
+        "@pytest.mark.fault_row(40)\ndef test_streams(): pass\n\n@pytest.mark.fault_row(38)\ndef test_bombs(): pass",
         "@pytest.mark.fault_row(38, 40)\ndef test_streams(): pass",
     ],
-    ids=["two rows in one name", "a row in each name", "two rows in a mark"],
+    ids=["a row in each mark", "two rows in a mark"],
 )
-def test_rows_are_read_from_marks_and_names_of_tests(source: str) -> None:
+def test_rows_are_read_from_marks_of_tests(source: str) -> None:
     tests = FoundTests()
     tests.add("test_a.py", source)
     assert tests.held_rows == {38, 40}

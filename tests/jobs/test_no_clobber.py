@@ -42,8 +42,9 @@ COMMANDS = {
 """Commands, and the file that each would replace."""
 
 
+@pytest.mark.fault_row(63)
 @pytest.mark.parametrize(("command", "existing"), COMMANDS.values(), ids=COMMANDS)
-def test_row_63_command_with_no_clobber_is_refused_before_any_work_where_a_file_exists(
+def test_command_with_no_clobber_is_refused_before_any_work_where_a_file_exists(
     command: str, existing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Neither the input nor a device is looked for: there is none of either."""
@@ -62,7 +63,8 @@ def test_row_63_command_with_no_clobber_is_refused_before_any_work_where_a_file_
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == {old: MADE_BEFORE}
 
 
-def test_row_63_existing_mesh_of_a_label_is_refused_with_no_clobber_before_the_scan_is_read(
+@pytest.mark.fault_row(63)
+def test_existing_mesh_of_a_label_is_refused_with_no_clobber_before_the_scan_is_read(
     tmp_path: Path, device: object
 ) -> None:
     from clrecon.jobs.mesh.job import make_mesh
@@ -82,19 +84,22 @@ def test_row_63_existing_mesh_of_a_label_is_refused_with_no_clobber_before_the_s
 PHANTOM = ["--kind=sphere", "--size=16", "--slices=8", "-q"]
 
 
-def test_row_63_phantom_in_a_new_folder_is_written_with_no_clobber(tmp_path: Path) -> None:
+@pytest.mark.fault_row(63)
+def test_phantom_in_a_new_folder_is_written_with_no_clobber(tmp_path: Path) -> None:
     assert main(["phantom", str(tmp_path / "ct"), *PHANTOM, "--no-clobber"]) == 0
     assert (tmp_path / "ct" / "truth.json").exists()
 
 
-def test_row_63_phantom_over_an_earlier_one_is_refused_with_no_clobber_alone(tmp_path: Path) -> None:
+@pytest.mark.fault_row(63)
+def test_phantom_over_an_earlier_one_is_refused_with_no_clobber_alone(tmp_path: Path) -> None:
     assert main(["phantom", str(tmp_path / "ct"), *PHANTOM]) == 0
 
     assert main(["phantom", str(tmp_path / "ct"), *PHANTOM, "--no-clobber"]) == 6
     assert main(["phantom", str(tmp_path / "ct"), *PHANTOM]) == 0
 
 
-def test_row_63_frames_in_an_empty_folder_are_written_with_no_clobber(tmp_path: Path) -> None:
+@pytest.mark.fault_row(63)
+def test_frames_in_an_empty_folder_are_written_with_no_clobber(tmp_path: Path) -> None:
     (tmp_path / "turn").mkdir()
 
     assert write_animation(FRAMES, tmp_path / "turn", no_clobber=True) > 0
@@ -102,7 +107,8 @@ def test_row_63_frames_in_an_empty_folder_are_written_with_no_clobber(tmp_path: 
     assert len(list((tmp_path / "turn").iterdir())) == len(FRAMES)
 
 
-def test_row_63_frames_over_earlier_ones_are_refused_with_no_clobber(tmp_path: Path) -> None:
+@pytest.mark.fault_row(63)
+def test_frames_over_earlier_ones_are_refused_with_no_clobber(tmp_path: Path) -> None:
     write_animation(FRAMES, tmp_path / "turn")
     with refused(OutputError, "turn", "no_clobber=True"):
         write_animation(FRAMES, tmp_path / "turn", no_clobber=True)
@@ -119,8 +125,9 @@ def file_system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
         monkeypatch.setattr(os, "link", refuse)
 
 
+@pytest.mark.fault_row(63)
 @pytest.mark.usefixtures("file_system")
-def test_row_63_file_that_comes_before_the_last_step_stays_with_no_clobber(tmp_path: Path) -> None:
+def test_file_that_comes_before_the_last_step_stays_with_no_clobber(tmp_path: Path) -> None:
     target = tmp_path / "a.stl"
 
     with keep_existing(), stage_file(target, lambda stream: stream.write(b"new")) as staged:
@@ -132,8 +139,9 @@ def test_row_63_file_that_comes_before_the_last_step_stays_with_no_clobber(tmp_p
     assert [path.name for path in tmp_path.iterdir()] == ["a.stl"]
 
 
+@pytest.mark.fault_row(63)
 @pytest.mark.usefixtures("file_system")
-def test_row_63_new_file_is_written_with_no_clobber(tmp_path: Path) -> None:
+def test_new_file_is_written_with_no_clobber(tmp_path: Path) -> None:
     target = tmp_path / "a.stl"
 
     with keep_existing():
@@ -144,7 +152,8 @@ def test_row_63_new_file_is_written_with_no_clobber(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a.stl"]
 
 
-def test_row_63_frames_that_come_before_the_last_step_stay_with_no_clobber(tmp_path: Path) -> None:
+@pytest.mark.fault_row(63)
+def test_frames_that_come_before_the_last_step_stay_with_no_clobber(tmp_path: Path) -> None:
     with keep_existing(), stage_animation(FRAMES, tmp_path / "turn") as staged:
         write_animation(FRAMES[:1], tmp_path / "turn")
         with refused(OutputError, "turn", "no_clobber=True"):
@@ -154,7 +163,8 @@ def test_row_63_frames_that_come_before_the_last_step_stay_with_no_clobber(tmp_p
     assert [path.name for path in tmp_path.iterdir()] == ["turn"]
 
 
-def test_row_63_one_of_many_writers_at_once_writes_with_no_clobber(tmp_path: Path) -> None:
+@pytest.mark.fault_row(63)
+def test_one_of_many_writers_at_once_writes_with_no_clobber(tmp_path: Path) -> None:
     target = tmp_path / "a.stl"
     written: list[int] = []
     together = threading.Barrier(8)
@@ -185,8 +195,9 @@ SAVING = {
 }
 
 
+@pytest.mark.fault_row(63)
 @pytest.mark.parametrize("name", SAVING)
-def test_row_63_save_from_python_is_refused_with_no_clobber_where_the_file_exists(name: str, tmp_path: Path) -> None:
+def test_save_from_python_is_refused_with_no_clobber_where_the_file_exists(name: str, tmp_path: Path) -> None:
     path, save = tmp_path / name, SAVING[name]
     path.write_bytes(b"older")
 
@@ -196,8 +207,9 @@ def test_row_63_save_from_python_is_refused_with_no_clobber_where_the_file_exist
     assert path.read_bytes() == b"older"
 
 
+@pytest.mark.fault_row(63)
 @pytest.mark.parametrize("name", SAVING)
-def test_row_63_save_from_python_writes_a_new_file_with_no_clobber_as_without_it(name: str, tmp_path: Path) -> None:
+def test_save_from_python_writes_a_new_file_with_no_clobber_as_without_it(name: str, tmp_path: Path) -> None:
     new, again, save = tmp_path / name, tmp_path / f"again_{name}", SAVING[name]
     again.write_bytes(b"older")
 
@@ -207,7 +219,8 @@ def test_row_63_save_from_python_writes_a_new_file_with_no_clobber_as_without_it
     assert new.read_bytes() == again.read_bytes()
 
 
-def test_row_63_numbered_file_is_refused_with_no_clobber_alone(tmp_path: Path) -> None:
+@pytest.mark.fault_row(63)
+def test_numbered_file_is_refused_with_no_clobber_alone(tmp_path: Path) -> None:
     (tmp_path / "bone_001.stl").write_bytes(b"")
 
     refuse_numbered(tmp_path / "bone.stl")

@@ -86,8 +86,9 @@ def command_for(device: Any, scan: Path, tmp_path: Path, monkeypatch: pytest.Mon
     return lambda what: [*COMMANDS[what].format(scan=scan).split(), "--series", "1", "--device", str(device.index)]
 
 
+@pytest.mark.fault_row(69)
 @pytest.mark.parametrize("what", but_seldom(COMMANDS, ("mesh .obj", "mesh .glb", "mesh .vtp", "bench", "compare")))
-def test_row_69_files_words_and_log_of_a_command_do_not_name_the_patient(
+def test_files_words_and_log_of_a_command_do_not_name_the_patient(
     what: str, command_for: Any, tmp_path: Path, printed: Printer, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.DEBUG):
@@ -97,8 +98,9 @@ def test_row_69_files_words_and_log_of_a_command_do_not_name_the_patient(
     assert find_words(tmp_path, printed().everything, caplog.text) == []
 
 
+@pytest.mark.fault_row(69)
 @pytest.mark.parametrize("what", but_seldom(MESHES_AND_PICTURES, ("mesh .obj", "mesh .glb", "mesh .vtp")))
-def test_row_69_report_has_hashes_of_series_and_frame_of_reference_where_they_are_asked_for(
+def test_report_has_hashes_of_series_and_frame_of_reference_where_they_are_asked_for(
     what: str, command_for: Any, tmp_path: Path, printed: Printer
 ) -> None:
     assert main([*command_for(what), "--json", "--keep-ids"]) == 0
@@ -108,8 +110,9 @@ def test_row_69_report_has_hashes_of_series_and_frame_of_reference_where_they_ar
     assert find_words(tmp_path) == [SERIES_HASH, FRAME_HASH]  # and no word of the patient
 
 
+@pytest.mark.fault_row(69)
 @pytest.mark.parametrize("kind", daily(1, ["ply", "obj", "glb", "vtp"]))
-def test_row_69_comment_of_a_mesh_has_the_hash_of_its_frame_of_reference_where_it_is_asked_for(
+def test_comment_of_a_mesh_has_the_hash_of_its_frame_of_reference_where_it_is_asked_for(
     kind: str, command_for: Any, tmp_path: Path
 ) -> None:
     assert main([*command_for(f"mesh .{kind}"), "--keep-ids"]) == 0
@@ -118,7 +121,8 @@ def test_row_69_comment_of_a_mesh_has_the_hash_of_its_frame_of_reference_where_i
     assert find_words(tmp_path) == [FRAME_HASH]
 
 
-def test_row_69_model_of_a_3mf_has_the_hash_of_its_frame_of_reference_where_it_is_asked_for(
+@pytest.mark.fault_row(69)
+def test_model_of_a_3mf_has_the_hash_of_its_frame_of_reference_where_it_is_asked_for(
     command_for: Any, tmp_path: Path
 ) -> None:
     assert main([*command_for("mesh .3mf"), "--keep-ids"]) == 0
@@ -127,14 +131,16 @@ def test_row_69_model_of_a_3mf_has_the_hash_of_its_frame_of_reference_where_it_i
         assert FRAME_HASH.encode() in archive.read("3D/3dmodel.model")
 
 
+@pytest.mark.fault_row(69)
 @pytest.mark.parametrize("what", ["mesh .stl", "picture", "movie"])
-def test_row_69_file_without_room_for_a_comment_has_no_hash(what: str, command_for: Any, tmp_path: Path) -> None:
+def test_file_without_room_for_a_comment_has_no_hash(what: str, command_for: Any, tmp_path: Path) -> None:
     assert main([*command_for(what), "--keep-ids"]) == 0
 
     (tmp_path / "r.json").unlink()
     assert find_words(tmp_path) == []
 
 
+@pytest.mark.fault_row(69)
 @pytest.mark.parametrize("form", ["--json", "--debug"])
 @pytest.mark.parametrize(
     ("arguments", "code"),
@@ -147,7 +153,7 @@ def test_row_69_file_without_room_for_a_comment_has_no_hash(what: str, command_f
     ],
     ids=["no series", "both series", "missing phase", "no choice", "slice as label map"],
 )
-def test_row_69_errors_do_not_name_the_patient_in_json_nor_with_their_traceback(
+def test_errors_do_not_name_the_patient_in_json_nor_with_their_traceback(
     arguments: list[str], code: int, form: str, device: Any, scan: Path, tmp_path: Path, printed: Printer
 ) -> None:
     given = [argument.format(scan=scan) for argument in arguments]
@@ -161,8 +167,9 @@ def test_row_69_errors_do_not_name_the_patient_in_json_nor_with_their_traceback(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.fault_row(69)
 @pytest.mark.parametrize("form", ["--pixels", "--json"])
-def test_row_69_info_shows_description_and_hashes_of_a_series_and_nothing_else_of_the_patient(
+def test_info_shows_description_and_hashes_of_a_series_and_nothing_else_of_the_patient(
     form: str, scan: Path, tmp_path: Path, printed: Printer
 ) -> None:
     assert main(["info", str(scan), "--series", "1", form]) == 0

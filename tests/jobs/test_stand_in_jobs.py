@@ -30,10 +30,11 @@ def gpu(device, monkeypatch):
     return gpu
 
 
+@pytest.mark.fault_row(54)
 @pytest.mark.seconds
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("first", daily(1, [1, 2]))
-def test_row_54_job_whose_device_fails_is_done_again_on_the_cpu_device_with_a_warning(
+def test_job_whose_device_fails_is_done_again_on_the_cpu_device_with_a_warning(
     device, gpu, tmp_path, capsys, monkeypatch, command, first
 ):
     output, options = COMMANDS[command]
@@ -53,8 +54,9 @@ def test_row_54_job_whose_device_fails_is_done_again_on_the_cpu_device_with_a_wa
     assert (tmp_path / output).read_bytes() == (tmp_path / "alone" / output).read_bytes()
 
 
+@pytest.mark.fault_row(54)
 @pytest.mark.parametrize("command", daily(1, COMMANDS))
-def test_row_54_job_on_a_named_device_that_fails_is_refused_with_the_number_of_the_cpu_device(
+def test_job_on_a_named_device_that_fails_is_refused_with_the_number_of_the_cpu_device(
     device, gpu, tmp_path, printed, monkeypatch, command
 ):
     name, options = COMMANDS[command]
@@ -66,7 +68,8 @@ def test_row_54_job_on_a_named_device_that_fails_is_refused_with_the_number_of_t
     assert not output.exists()
 
 
-def test_row_56_job_whose_device_is_lost_is_done_again_on_it_in_a_new_context(gpu, tmp_path, printed, monkeypatch):
+@pytest.mark.fault_row(56)
+def test_job_whose_device_is_lost_is_done_again_on_it_in_a_new_context(gpu, tmp_path, printed, monkeypatch):
     write_series(tmp_path / "ct")
     # nothing is tried beside the reading: the launch that fails is one of the work
     monkeypatch.setattr("clrecon.jobs.mesh.make._try_steps", lambda device, settings: None)

@@ -1,7 +1,7 @@
 """The list of faults, rows 1 to 72: what each is, what is expected, and which tests hold it.
 
-A test marked ``fault_row(NN)``, or whose own name begins with ``test_row_NN_``, is found by that; the others are listed
-here as "file::function", the file below tests/.  The guard is guards/test_fault_list.py.
+A test marked ``fault_row(NN)`` is found by its mark; the others are listed here as "file::function", the file below
+tests/.  The guard is guards/test_fault_list.py.
 """
 
 from __future__ import annotations

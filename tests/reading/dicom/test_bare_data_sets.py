@@ -53,17 +53,19 @@ def write_cut(folder, files, cut):
 BARE = pytest.mark.parametrize("cut", [cut_all, cut_meta], ids=["no preamble and meta header", "no meta header"])
 
 
+@pytest.mark.fault_row(36)
 @BARE
 @pytest.mark.parametrize("name", ENCODINGS)
-def test_row_36_bare_data_sets_are_refused_with_the_parameter_that_reads_them(tmp_path, name, cut):
+def test_bare_data_sets_are_refused_with_the_parameter_that_reads_them(tmp_path, name, cut):
     folder = write_cut(tmp_path / "ct", make_series(NATIVE[name]), cut)
     with refused(NoDicomError if cut is cut_all else RefusedInputError, "force=True"):
         read_volume(folder)
 
 
+@pytest.mark.fault_row(36)
 @BARE
 @pytest.mark.parametrize("name", ENCODINGS)
-def test_row_36_bare_data_sets_are_read_with_force_and_a_warning(tmp_path, name, cut):
+def test_bare_data_sets_are_read_with_force_and_a_warning(tmp_path, name, cut):
     folder = write_cut(tmp_path / "ct", make_series(NATIVE[name]), cut)
     volume = read_volume(folder, force=True)
     assert np.array_equal(volume.voxels, PLAN.hu())
@@ -71,9 +73,10 @@ def test_row_36_bare_data_sets_are_read_with_force_and_a_warning(tmp_path, name,
     assert list_series(folder, force=True).series[0].slices == 3
 
 
+@pytest.mark.fault_row(36)
 @pytest.mark.parametrize("cut", [cut_preamble, cut_zeros])
 @pytest.mark.parametrize("syntax", [*NATIVE.values(), JPEG2000Lossless])
-def test_row_36_meta_header_without_preamble_is_refused_unless_it_is_forced(tmp_path, syntax, cut):
+def test_meta_header_without_preamble_is_refused_unless_it_is_forced(tmp_path, syntax, cut):
     files = make_series(syntax)
     whole = read_volume(write_cut(tmp_path / "whole", files, bytes))
     folder = write_cut(tmp_path / "ct", files, cut)
@@ -84,7 +87,8 @@ def test_row_36_meta_header_without_preamble_is_refused_unless_it_is_forced(tmp_
     assert "no preamble: read on demand (all slices)" in volume.report["warnings"]
 
 
-def test_row_36_one_bare_slice_refuses_the_series_unless_it_is_forced(tmp_path):
+@pytest.mark.fault_row(36)
+def test_one_bare_slice_refuses_the_series_unless_it_is_forced(tmp_path):
     folder = write_cut(tmp_path / "ct", make_series(NATIVE["explicit"]), bytes)
     (folder / "2").write_bytes(cut_all((folder / "2").read_bytes()))
     with refused(RefusedInputError, "force=True", 2):
@@ -94,24 +98,27 @@ def test_row_36_one_bare_slice_refuses_the_series_unless_it_is_forced(tmp_path):
     assert "explicit VR little endian taken (1 of 3 slices, at -397.50 mm)" in volume.report["warnings"][0]
 
 
+@pytest.mark.fault_row(36)
 @pytest.mark.parametrize(
     "content",
     [b"\x89PNG\r\n\x1a\n" + bytes(300), b"plain text\n" * 40, b"PK\x03\x04" + bytes(300), b"\x08\0", bytes(500)],
     ids=["PNG", "text", "zip", "two bytes", "zeros"],
 )
-def test_row_36_files_that_are_no_dicom_are_refused_with_force_too(tmp_path, content):
+def test_files_that_are_no_dicom_are_refused_with_force_too(tmp_path, content):
     (tmp_path / "file").write_bytes(content)
     with refused(NoDicomError, "DICOM", "images"):
         read_volume(tmp_path, force=True)
 
 
-def test_row_36_bare_enhanced_image_is_refused_with_force_too(tmp_path):
+@pytest.mark.fault_row(36)
+def test_bare_enhanced_image_is_refused_with_force_too(tmp_path):
     (tmp_path / "image").write_bytes(cut_all(save_bytes(make_enhanced(PLAN))))
     with refused(RefusedInputError, "image", "header"):
         read_volume(tmp_path, force=True)
 
 
-def test_row_36_command_names_the_option_that_reads_bare_data_sets_and_reads_them_with_it(tmp_path, printed):
+@pytest.mark.fault_row(36)
+def test_command_names_the_option_that_reads_bare_data_sets_and_reads_them_with_it(tmp_path, printed):
     folder = write_cut(tmp_path / "ct", make_series(NATIVE["implicit"]), cut_all)
     assert main(["info", str(folder)]) == 2
     printed().assert_error("--force")
@@ -143,8 +150,9 @@ def test_bare_slice_with_a_long_header_that_lacks_its_last_byte_is_refused_with_
         read_volume(tmp_path, force=True)
 
 
+@pytest.mark.fault_row(44)
 @pytest.mark.parametrize(("start", "kind"), [(b"MZ\x90\0", "Windows"), (b"\x7fELF\x02", "Linux")])
-def test_row_44_program_in_the_preamble_is_warned_of(tmp_path, start, kind):
+def test_program_in_the_preamble_is_warned_of(tmp_path, start, kind):
     plan = write_series(tmp_path, Plan(name="{}".format))
     for k in (0, 3):
         data = (tmp_path / f"{k}").read_bytes()
@@ -155,7 +163,8 @@ def test_row_44_program_in_the_preamble_is_warned_of(tmp_path, start, kind):
     assert volume.report["warnings"] == [said]
 
 
-def test_row_44_tiff_picture_in_the_preamble_is_not_warned_of(tmp_path):
+@pytest.mark.fault_row(44)
+def test_tiff_picture_in_the_preamble_is_not_warned_of(tmp_path):
     """Files that are TIFF pictures too are a use that the standard names."""
     plan = write_series(tmp_path, Plan(name="{}".format))
     for k in range(7):

@@ -44,15 +44,17 @@ PACKED = {
 }
 
 
+@pytest.mark.fault_row(48)
 @pytest.mark.parametrize("kind", PACKED)
-def test_row_48_packed_series_is_refused_with_its_kind_and_the_advice_to_unpack(tmp_path, kind):
+def test_packed_series_is_refused_with_its_kind_and_the_advice_to_unpack(tmp_path, kind):
     plan = write_series(tmp_path / "ct", Plan(shape=(2, 5, 6)))
     (tmp_path / "packed").write_bytes(PACKED[kind]((tmp_path / "ct" / plan.name(0)).read_bytes()))
     with refused(NoDicomError, 1, kind.split()[0], "unpack"):
         read_volume(tmp_path / "packed")
 
 
-def test_row_48_archive_beside_the_slices_is_counted_as_skipped(tmp_path):
+@pytest.mark.fault_row(48)
+def test_archive_beside_the_slices_is_counted_as_skipped(tmp_path):
     write_series(tmp_path, Plan(shape=(2, 5, 6)))
     (tmp_path / "backup").write_bytes(make_zip(b"x"))
     assert read_volume(tmp_path).report["files"]["skipped"] == {"zip archive": 1}

@@ -57,6 +57,7 @@ def test_frames_are_decoded_one_after_the_other_in_one_process():
         assert len(pool.process_ids()) == 1
 
 
+@pytest.mark.fault_row(40)
 @pytest.mark.parametrize(
     ("name", "words"),
     [
@@ -66,7 +67,7 @@ def test_frames_are_decoded_one_after_the_other_in_one_process():
         ("fail", r"do not decode \(ValueError: no such\\nmarker \\x1b\[31m\)"),
     ],
 )
-def test_row_40_decoder_that_fails_refuses_its_frame_and_the_next_one_is_decoded(name, words):
+def test_decoder_that_fails_refuses_its_frame_and_the_next_one_is_decoded(name, words):
     with make_pool(name) as pool:
         assert np.array_equal(decode(pool), PIXELS)
         with pytest.raises(DecoderError, match=words):
@@ -74,7 +75,8 @@ def test_row_40_decoder_that_fails_refuses_its_frame_and_the_next_one_is_decoded
         assert np.array_equal(decode(pool), PIXELS)
 
 
-def test_row_40_decoder_that_hangs_is_ended_in_time_and_the_next_frame_is_decoded():
+@pytest.mark.fault_row(40)
+def test_decoder_that_hangs_is_ended_in_time_and_the_next_frame_is_decoded():
     with make_pool("hang", seconds=1.5) as pool:
         assert np.array_equal(decode(pool), PIXELS)
         start = time.monotonic()
@@ -105,7 +107,8 @@ def test_time_in_which_the_whole_program_stood_still_is_not_counted_for_a_frame(
         assert np.array_equal(decode(pool, "nap"), PIXELS)
 
 
-def test_row_38_decoder_that_takes_too_much_memory_is_stopped_and_the_next_frame_is_decoded():
+@pytest.mark.fault_row(38)
+def test_decoder_that_takes_too_much_memory_is_stopped_and_the_next_frame_is_decoded():
     with make_pool("allocate", memory_bytes=100 * 2**20) as pool:
         with refused(DecoderError, 100, "MiB"):
             decode(pool, "allocate")

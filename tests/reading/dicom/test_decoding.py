@@ -329,7 +329,8 @@ def test_real_slice_has_the_hu_that_simpleitk_reads(tmp_path, real_data, ending)
     assert np.array_equal(pixels.astype(int) * int(ds.RescaleSlope) + int(ds.RescaleIntercept), other)
 
 
-def test_row_42_big_endian_pixels_are_read(tmp_path):
+@pytest.mark.fault_row(42)
+def test_big_endian_pixels_are_read(tmp_path):
     plan = Plan(shape=(2, 5, 6), syntax=ExplicitVRBigEndian)
     for k in range(2):
         ds = make_dataset(plan, k)

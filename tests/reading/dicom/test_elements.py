@@ -294,10 +294,11 @@ def test_pydicom_is_loaded_only_where_it_is_needed(tmp_path: Path, syntax: str, 
     assert done.stdout.strip() == str([careful, False, False])
 
 
+@pytest.mark.fault_row(46)
 @pytest.mark.parametrize(
     "charset", ["ISO_IR 100", "NOT_A_CHARSET", "ISO 2022 IR 6\\ISO 2022 IR 87", "\\ISO 2022 IR 149", "UTF-8", "latin1 "]
 )
-def test_row_46_series_with_a_bad_character_set_is_read(tmp_path: Path, charset: str) -> None:
+def test_series_with_a_bad_character_set_is_read(tmp_path: Path, charset: str) -> None:
     from dicom_series import set_raw
 
     plan = write_series(tmp_path, change=set_raw("SpecificCharacterSet", charset))

@@ -25,6 +25,7 @@ PLAN = {"shape": (4, 3, 5)}
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pydicom")  # it writes what no one should
 
 
+@pytest.mark.fault_row(15)
 @pytest.mark.parametrize(
     ("keyword", "text", "fact"),
     [
@@ -36,7 +37,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pydicom")  # it wri
         ("ImagePositionPatient", "", "missing"),
     ],
 )
-def test_row_15_position_or_orientation_that_is_no_place_in_all_slices_is_refused(tmp_path, keyword, text, fact):
+def test_position_or_orientation_that_is_no_place_in_all_slices_is_refused(tmp_path, keyword, text, fact):
     write_series(tmp_path, Plan(**PLAN), set_raw(keyword, text))
     with refused(RefusedInputError, keyword, fact, "slice000.dcm"):
         read_volume(tmp_path)
@@ -55,8 +56,9 @@ def stack_of(directions, origin, hu, folder):
     write_series(folder, plan, change)
 
 
+@pytest.mark.fault_row(17)
 @pytest.mark.parametrize("flips_kji", list(np.ndindex(2, 2, 2)), ids=str)
-def test_row_17_object_lies_in_its_place_with_any_axes_reversed(tmp_path, flips_kji):
+def test_object_lies_in_its_place_with_any_axes_reversed(tmp_path, flips_kji):
     """Left-handed orders too: each HU at its LPS place, once."""
     hu = np.arange(3 * 4 * 5).reshape(3, 4, 5)
     place_of_hu = {int(hu[k, j, i]): (10.0 + i, 20.0 + j, 30.0 + k) for k, j, i in np.ndindex(hu.shape)}
@@ -108,7 +110,8 @@ def folder_of_traps(tmp_path):
     listener.close()
 
 
-def test_row_43_series_among_links_pipes_and_sockets_is_read_without_opening_them(folder_of_traps):
+@pytest.mark.fault_row(43)
+def test_series_among_links_pipes_and_sockets_is_read_without_opening_them(folder_of_traps):
     plan, folder = folder_of_traps
     volume = read_volume(folder)
     assert np.array_equal(volume.voxels, plan.hu())
@@ -123,14 +126,16 @@ def test_row_43_series_among_links_pipes_and_sockets_is_read_without_opening_the
     assert "2 skipped: link out of the folder" in volume.report["warnings"]
 
 
+@pytest.mark.fault_row(43)
 @pytest.mark.parametrize("name", ["a", "pipe.dcm", "s"], ids=["link in a circle", "pipe", "socket"])
-def test_row_43_link_in_a_circle_pipe_and_socket_are_refused_by_themselves(folder_of_traps, name):
+def test_link_in_a_circle_pipe_and_socket_are_refused_by_themselves(folder_of_traps, name):
     with refused(NoDicomError, "regular"):
         read_volume(folder_of_traps[1] / name)
 
 
+@pytest.mark.fault_row(43)
 @pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="there is no device that never ends")
-def test_row_43_device_is_refused_without_reading_it():
+def test_device_is_refused_without_reading_it():
     with refused(NoDicomError, "regular"):
         read_volume("/dev/zero")
 
@@ -162,11 +167,10 @@ def one_after_the_other(first, second):
 HOSTILE_TEXT = pytest.mark.parametrize("text", daily(2, HOSTILE_TEXTS.values()), ids=HOSTILE_TEXTS)
 
 
+@pytest.mark.fault_row(45)
 @HOSTILE_TEXT
 @pytest.mark.parametrize("keyword", HOSTILE_FIELDS)
-def test_row_45_hostile_text_in_an_element_is_escaped_in_the_listing_and_kept_out_of_the_report(
-    tmp_path, keyword, text
-):
+def test_hostile_text_in_an_element_is_escaped_in_the_listing_and_kept_out_of_the_report(tmp_path, keyword, text):
     utf8 = set_values(SpecificCharacterSet="ISO_IR 192")
     write_series(tmp_path, Plan(**PLAN), one_after_the_other(set_raw(keyword, text), utf8))
     series = list_series(tmp_path).series[0]
@@ -178,8 +182,9 @@ def test_row_45_hostile_text_in_an_element_is_escaped_in_the_listing_and_kept_ou
     assert is_term or ("passwd" not in report and "title" not in report)
 
 
+@pytest.mark.fault_row(45)
 @HOSTILE_TEXT
-def test_row_45_hostile_text_in_a_refusal_is_one_printable_line(tmp_path, text):
+def test_hostile_text_in_a_refusal_is_one_printable_line(tmp_path, text):
     two_phases, no_ct = tmp_path / "phases", tmp_path / "modality"
     write_series(two_phases, Plan(**PLAN), set_raw("ConvolutionKernel", text))
     write_series(two_phases, Plan(slope=2, name="p{}".format, **PLAN), set_raw("ConvolutionKernel", "B30f"))
@@ -190,8 +195,9 @@ def test_row_45_hostile_text_in_a_refusal_is_one_printable_line(tmp_path, text):
         assert_one_line(refusal.value, letters=10_000)
 
 
+@pytest.mark.fault_row(45)
 @HOSTILE_TEXT
-def test_row_45_command_info_prints_hostile_texts_escaped_and_writes_no_file(tmp_path, monkeypatch, printed, text):
+def test_command_info_prints_hostile_texts_escaped_and_writes_no_file(tmp_path, monkeypatch, printed, text):
     monkeypatch.chdir(tmp_path)
     for keyword in HOSTILE_FIELDS:
         write_series(tmp_path / "ct" / keyword, Plan(**PLAN), set_raw(keyword, text))
@@ -202,7 +208,8 @@ def test_row_45_command_info_prints_hostile_texts_escaped_and_writes_no_file(tmp
     assert list(tmp_path.iterdir()) == [tmp_path / "ct"]
 
 
-def test_row_45_hostile_transfer_syntax_is_escaped_in_the_refusal(tmp_path):
+@pytest.mark.fault_row(45)
+def test_hostile_transfer_syntax_is_escaped_in_the_refusal(tmp_path):
     for k, data in enumerate(phantom_seeds()["RLE"].series):
         (tmp_path / f"{k}").write_bytes(data.replace(b"1.2.840.10008.1.2.5\0", b"\x1b[31m8.10008.1.2.5\n "))
     with refused(RefusedInputError, "x1b") as caught:

@@ -68,6 +68,7 @@ def test_declared_float_padding_is_read_as_air(tmp_path, width, value, limit):
     assert volume.report["padding_share"] == pytest.approx(3 / (5 * 6))
 
 
+@pytest.mark.fault_row(32)
 @pytest.mark.parametrize(
     ("value", "words"),
     [
@@ -76,7 +77,7 @@ def test_declared_float_padding_is_read_as_air(tmp_path, width, value, limit):
         (3e38, "values from -964 to 3e\\+38"),
     ],
 )
-def test_row_32_slice_with_a_nan_infinite_or_huge_voxel_is_refused_by_its_name(tmp_path, value, words):
+def test_slice_with_a_nan_infinite_or_huge_voxel_is_refused_by_its_name(tmp_path, value, words):
     def spoil(array, k):
         if k == 3:
             array[2, 2] = value
@@ -87,12 +88,14 @@ def test_row_32_slice_with_a_nan_infinite_or_huge_voxel_is_refused_by_its_name(t
         read_volume(tmp_path)
 
 
-def test_row_32_volume_of_nan_is_refused(tmp_path):
+@pytest.mark.fault_row(32)
+def test_volume_of_nan_is_refused(tmp_path):
     write_series(tmp_path, change=set_floats(lambda array, k: array * np.nan))
     with refused(RefusedInputError, "NaN", 30, 0):
         read_volume(tmp_path)
 
 
+@pytest.mark.fault_row(32)
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -101,7 +104,7 @@ def test_row_32_volume_of_nan_is_refused(tmp_path):
         (set_floats(lambda array, k: array * 0 + 3.5), "all 210 voxels are 3.5 HU"),
     ],
 )
-def test_row_32_volume_of_one_value_or_of_padding_alone_is_refused(tmp_path, change, words):
+def test_volume_of_one_value_or_of_padding_alone_is_refused(tmp_path, change, words):
     write_series(tmp_path, change=change)
     with pytest.raises(RefusedInputError, match=words):
         read_volume(tmp_path)

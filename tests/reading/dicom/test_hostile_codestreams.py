@@ -36,6 +36,7 @@ def cut_end(data):
     return data[:-2] + b"\0\0"
 
 
+@pytest.mark.fault_row(38, 40)
 @pytest.mark.parametrize(
     ("name", "spoil", "words"),
     [
@@ -58,14 +59,15 @@ def cut_end(data):
         ("RLE", lambda d: d[:-200], "do not decode"),
     ],
 )
-def test_rows_38_and_40_codestream_that_contradicts_its_header_or_is_cut_is_refused(tmp_path, name, spoil, words):
+def test_codestream_that_contradicts_its_header_or_is_cut_is_refused(tmp_path, name, spoil, words):
     syntax, encode = ENCODERS[name]
     data = item(b"") + item(even(spoil(encode(IMAGES[0])))) + END
     with pytest.raises(RefusedInputError, match=f"^pixels: .*({words})"):
         place(tmp_path, data, syntax)
 
 
-def test_row_38_codestream_far_too_small_for_its_size_is_refused(tmp_path):
+@pytest.mark.fault_row(38)
+def test_codestream_far_too_small_for_its_size_is_refused(tmp_path):
     """Head of codestream and header have the same lie."""
     data = encode_jpeg_2000(IMAGES[0])
     data = data[:8] + struct.pack(">2L", 65535, 65535) + data[16:]
@@ -80,8 +82,9 @@ def test_codestream_of_air_alone_is_decoded_though_it_is_small(tmp_path):
     assert not pixels.any()
 
 
+@pytest.mark.fault_row(40)
 @pytest.mark.parametrize("name", daily(3, ["JPEG-LS", "JPEG 2000", "JPEG lossless 1", "RLE", "HTJ2K"]))
-def test_row_40_frame_with_random_damage_is_refused_or_decodes_to_its_size_and_harms_no_other(tmp_path, name):
+def test_frame_with_random_damage_is_refused_or_decodes_to_its_size_and_harms_no_other(tmp_path, name):
     random = np.random.default_rng(11)
     syntax, encode = ENCODERS[name]
     good = even(encode(IMAGES[0]))
@@ -109,7 +112,8 @@ def test_row_40_frame_with_random_damage_is_refused_or_decodes_to_its_size_and_h
     assert refusals > 0
 
 
-def test_row_40_slice_that_does_not_decode_is_refused_by_its_name(tmp_path):
+@pytest.mark.fault_row(40)
+def test_slice_that_does_not_decode_is_refused_by_its_name(tmp_path):
     plan = Plan(shape=(3, ROWS, COLUMNS), signed=False)
     for k in range(3):
         ds = make_dataset(plan, k)
@@ -122,6 +126,7 @@ def test_row_40_slice_that_does_not_decode_is_refused_by_its_name(tmp_path):
         read_volume(tmp_path)
 
 
+@pytest.mark.fault_row(41)
 @pytest.mark.parametrize(
     ("uid", "name"),
     [
@@ -133,7 +138,7 @@ def test_row_40_slice_that_does_not_decode_is_refused_by_its_name(tmp_path):
         ("1.2.3.4.5", "unknown"),
     ],
 )
-def test_row_41_transfer_syntax_that_is_not_read_is_refused_by_its_uid_and_name(tmp_path, uid, name):
+def test_transfer_syntax_that_is_not_read_is_refused_by_its_uid_and_name(tmp_path, uid, name):
     plan = write_series(tmp_path, Plan(shape=(2, 5, 6)))
     for k in range(2):
         file = tmp_path / plan.name(k)

@@ -105,7 +105,8 @@ def write_compressed(path, frame):
     return path.read_bytes()
 
 
-def test_row_38_compressed_frame_of_gigabytes_for_60_bytes_of_pixels_is_refused(tmp_path):
+@pytest.mark.fault_row(38)
+def test_compressed_frame_of_gigabytes_for_60_bytes_of_pixels_is_refused(tmp_path):
     write_series(tmp_path)
     path = tmp_path / "slice003.dcm"
     start = b"\xff\x4f\xff\x51"
@@ -120,7 +121,8 @@ def test_row_38_compressed_frame_of_gigabytes_for_60_bytes_of_pixels_is_refused(
         read_volume(tmp_path)
 
 
-def test_row_38_frame_of_5000_empty_fragments_is_refused(tmp_path):
+@pytest.mark.fault_row(38)
+def test_frame_of_5000_empty_fragments_is_refused(tmp_path):
     write_series(tmp_path)
     path = tmp_path / "slice003.dcm"
     start = b"\xff\x4f\xff\x51"

@@ -45,10 +45,11 @@ def copy_series(folder: Path, series: int, slices: int) -> int:
     return series * slices
 
 
+@pytest.mark.fault_row(47)
 @pytest.mark.release
 @pytest.mark.slow
 @pytest.mark.parametrize(("series", "slices"), [(300, 10), pytest.param(3, 1000, marks=FOR_RELEASE)])
-def test_row_47_each_header_of_a_large_tree_is_read_once_from_its_start_in_little_memory(
+def test_each_header_of_a_large_tree_is_read_once_from_its_start_in_little_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, series: int, slices: int
 ) -> None:
     """No pixels are read; what is kept of a header is bounded."""
@@ -135,7 +136,8 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(disk, "DiskReader", partial(disk.DiskReader, notice_s=0.02, give_up_s=0.1))
 
 
-def test_row_46_series_with_a_file_whose_disk_does_not_answer_is_refused_by_its_name(
+@pytest.mark.fault_row(46)
+def test_series_with_a_file_whose_disk_does_not_answer_is_refused_by_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurried: None
 ) -> None:
     write_series(tmp_path)
@@ -156,7 +158,8 @@ def test_row_46_series_with_a_file_whose_disk_does_not_answer_is_refused_by_its_
     assert ("no answer yet from slice003.dcm", 0, 7) in calls
 
 
-def test_row_46_tree_with_a_folder_whose_disk_does_not_answer_is_refused_by_its_name(
+@pytest.mark.fault_row(46)
+def test_tree_with_a_folder_whose_disk_does_not_answer_is_refused_by_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurried: None
 ) -> None:
     write_series(tmp_path / "there")
@@ -207,7 +210,8 @@ def test_files_of_a_slow_disk_are_read_in_order_by_several_threads(
     assert 2 < max(at_once) <= disk.MOST_THREADS
 
 
-def test_row_46_series_with_a_file_that_vanishes_is_refused_by_its_name(
+@pytest.mark.fault_row(46)
+def test_series_with_a_file_that_vanishes_is_refused_by_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_series(tmp_path)
@@ -222,8 +226,9 @@ def test_row_46_series_with_a_file_that_vanishes_is_refused_by_its_name(
         read_volume(tmp_path)
 
 
+@pytest.mark.fault_row(46)
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes on this system")
-def test_row_46_pipe_in_the_place_of_a_file_is_refused_without_waiting(tmp_path: Path) -> None:
+def test_pipe_in_the_place_of_a_file_is_refused_without_waiting(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     assert stat.S_ISFIFO(os.stat(tmp_path / "pipe").st_mode)
     with refused(OSError, "regular", "file"):

@@ -232,7 +232,8 @@ def test_slice_whose_pixels_are_cut_is_refused_with_its_name_and_size(tmp_path):
         read_volume(tmp_path)
 
 
-def test_row_39_series_that_does_not_fit_into_memory_is_refused_with_its_size(tmp_path, monkeypatch):
+@pytest.mark.fault_row(39)
+def test_series_that_does_not_fit_into_memory_is_refused_with_its_size(tmp_path, monkeypatch):
     write_series(tmp_path)
     monkeypatch.setattr(memory, "available_memory_bytes", lambda: 100.0)
     with refused(RefusedInputError, 6, 5, 7):
@@ -243,7 +244,8 @@ def test_available_memory_is_more_than_10_mb_and_no_more_than_there_is():
     assert 1e7 < memory.available_memory_bytes() <= memory.physical_memory_bytes()
 
 
-def test_row_38_deflated_slices_far_larger_than_their_files_are_refused(tmp_path, monkeypatch):
+@pytest.mark.fault_row(38)
+def test_deflated_slices_far_larger_than_their_files_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(stored, "INFLATED_LIMIT", 1_000_000)
     plan = Plan(syntax=DeflatedExplicitVRLittleEndian)
     for k in range(2):

@@ -56,6 +56,7 @@ def test_number_of_decoder_processes_grows_with_the_slices(tmp_path, monkeypatch
     assert set(counts) == {expected}
 
 
+@pytest.mark.fault_row(39)
 @pytest.mark.parametrize(
     ("line", "files"),
     [
@@ -68,7 +69,7 @@ def test_number_of_decoder_processes_grows_with_the_slices(tmp_path, monkeypatch
     ],
     ids=["group around it", "its own as the root", "version 1", "no limit", "another group"],
 )  # fmt: skip
-def test_row_39_available_memory_is_that_of_the_container_where_it_has_a_limit(tmp_path, line, files):
+def test_available_memory_is_that_of_the_container_where_it_has_a_limit(tmp_path, line, files):
     proc, groups = tmp_path / "proc", tmp_path / "groups"
     (proc / "self").mkdir(parents=True)
     (proc / "meminfo").write_text("MemTotal: 2097152 kB\nMemAvailable: 1048576 kB\n")
