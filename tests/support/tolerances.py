@@ -237,6 +237,18 @@ PHANTOM_SPHERE_VOLUME_SHARE = 0.01  # sphere of about 12 mm in voxels of 0.5 x 0
 CLI_SPHERE_VOLUME_SHARE = 0.02  # sphere of 9 mm in voxels of 0.8 x 1.1 x 1.5 mm, its edge a ramp of 1 mm
 CLI_SPHERE_RADIUS_MM = 0.3  # sagitta of chords of 1.8 mm and the bent ramp; measured -0.26
 
+# --- views in a browser ---
+VIEW_CHANGED_SHARE = 0.01  # of pixels; measured 0.04 where a ball of 5 mm is hidden, 0.12 where the view is turned
+VIEW_REDRAWN_SHARE = 0.002  # of pixels of the same view, drawn and compressed again; measured 0
+VIEW_LEVEL_HU = 0.5  # ends of a window are whole HU
+VIEW_PART_ML = 0.03  # relative; 0.113 ml is listed as 0.11
+VIEW_CLICK_MM = 0.3  # a click lies in the middle of a pixel, on a sphere of 3 mm and more
+VIEW_POINTED_MM = 0.6  # the mouse lies in the middle of a pixel, and places are said in tenths
+VIEW_MOVED_PIXELS = 1.0  # the mouse moves by whole pixels
+VIEW_BOX_MM = 0.01  # facts hold places in hundredths
+VIEW_LINE_SEEN_MM = 2.0  # of a line of 24 mm that two balls hide from behind; measured 4.6
+VIEW_LINE_SEEN_SHARE = 0.7  # of the same line from the front; measured 0.81
+
 # --- rendering: files of pictures and what is drawn into them ---
 PNG_RESOLUTION = 1.3e-3  # relative; PNG holds whole pixels a metre, half of one of 400 at 2.5 mm a pixel
 JPEG_MEAN_GREY = 3.0  # of 255, quality 95 on a sharp edge between saturated colours; measured 0.9

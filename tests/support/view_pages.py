@@ -8,12 +8,13 @@ import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import view_scenes as scenes
 from browser import outside_requests, severe_lines, wait_for
-from web_views import serving
+from web_views import PATIENCE, serving
 
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.objects import show_objects
@@ -48,23 +49,30 @@ def open_view_page(browser: Any, served: WebServer) -> Iterator[Any]:
     assert [address for address in outside_requests(browser) if not address.startswith(own)] == []
 
 
-def picture(page: Any, name: str = "scene") -> np.ndarray:
+def screenshot(page: Any, view: str = "scene") -> np.ndarray:
     """What a view shows, (h, w, 3), with what lies over it."""
     from PIL import Image
 
-    content = page.find_element("id", name).screenshot_as_png
+    content = page.find_element("id", view).screenshot_as_png
     return np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
 
 
-def changed_share(one: np.ndarray, other: np.ndarray) -> float:
+def share_of_changed_pixels(one: np.ndarray, other: np.ndarray) -> float:
+    """Share of the pixels whose colour differs by more than 24 of 255, which is more than what JPEG loses."""
     return float((np.abs(one - other).max(axis=2) > 24).mean())
 
 
 def facts(page: Any) -> dict[str, Any]:
+    """What the server has told the page of its view."""
     return json.loads(page.execute_script("return JSON.stringify(clrecon.facts)"))
 
 
-def settle(page: Any) -> None:
+def run_command(page: Any, name: str, **named: Any) -> None:
+    """Have the page send a command to its view."""
+    page.execute_script("clrecon.run(arguments[0], arguments[1])", name, named)
+
+
+def wait_until_drawn(page: Any) -> None:
     """Wait until everything is shown as it is after what was done."""
     time.sleep(0.3)  # a change needs a frame and the way to the server
     wait_for(page, SETTLED)
@@ -80,22 +88,30 @@ def drag(page: Any, element: Any, x: int, y: int, dx: int, dy: int, steps: int =
     actions.release().perform()
 
 
-def point_at(page: Any, name: str, point: np.ndarray) -> None:
+def wait_for_file(page: Any, path: Path) -> None:
+    """Wait until a file is there; fail with what the page says of its saving."""
+    end = time.monotonic() + PATIENCE
+    while not path.exists():
+        assert time.monotonic() < end, page.find_element("id", "saved").text
+        time.sleep(0.05)
+
+
+def point_at(page: Any, view: str, point: np.ndarray) -> None:
     """Move the pointer to the place of a point of the patient."""
     from selenium.webdriver import ActionChains
 
-    element = page.find_element("id", name)
-    x, y = page.execute_script("return clrecon.project(arguments[0], arguments[1])", name, [float(v) for v in point])
+    element = page.find_element("id", view)
+    x, y = page.execute_script("return clrecon.project(arguments[0], arguments[1])", view, [float(v) for v in point])
     ActionChains(page).move_to_element_with_offset(
         element, round(x - element.size["width"] / 2), round(y - element.size["height"] / 2)
     ).perform()
 
 
-def click(page: Any, name: str, point: np.ndarray, *held: str) -> None:
+def click_point(page: Any, view: str, point: np.ndarray, *held: str) -> None:
     """Click at the place of a point of the patient, with keys held."""
     from selenium.webdriver import ActionChains
 
-    point_at(page, name, point)
+    point_at(page, view, point)
     actions = ActionChains(page)
     for key in held:
         actions.key_down(key)
@@ -105,7 +121,7 @@ def click(page: Any, name: str, point: np.ndarray, *held: str) -> None:
     actions.perform()
 
 
-def press(page: Any, *keys: str) -> None:
+def press_keys(page: Any, *keys: str) -> None:
     """Press keys with the pointer where it is."""
     from selenium.webdriver import ActionChains
 

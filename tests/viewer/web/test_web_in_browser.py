@@ -1,19 +1,30 @@
-"""The page of the view in a real browser: it draws, turns, slides, measures, saves, and talks to its server alone."""
+"""The page of the view in a real browser: it draws, turns, slides, saves, and talks to its server alone."""
 
 from __future__ import annotations
 
-import re
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
+import tolerances
 import view_scenes as scenes
 from browser import severe_lines, wait_for
-from open_views import search_for_ever
-from view_pages import SETTLED, changed_share, click, drag, facts, open_view_page, picture, point_at, press, settle
+from view_pages import (
+    SETTLED,
+    drag,
+    facts,
+    open_view_page,
+    point_at,
+    press_keys,
+    run_command,
+    screenshot,
+    share_of_changed_pixels,
+    wait_for_file,
+    wait_until_drawn,
+)
 from web_views import PATIENCE, serving
 
+from clrecon.mesh.mesh_reader import read_mesh
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.objects import show_objects
 from clrecon.viewer.session.commands import KEYS
@@ -21,7 +32,6 @@ from clrecon.viewer.session.session import ViewSession
 
 pytestmark = [pytest.mark.slow, pytest.mark.opencl]
 
-PARTS = "return clrecon.facts.parts.filter((part) => part.kind === 'cluster').length === 3"
 ISO = scenes.ISO
 
 
@@ -31,351 +41,315 @@ def page(view_browser, view_server):
         yield opened
 
 
-def test_drag_turns_the_picture_and_leaves_the_slices_and_undo_turns_it_back(page) -> None:
-    before, slice_before = picture(page), picture(page, "axial")
-    count = page.execute_script("window.first = JSON.stringify(clrecon.facts.camera); return clrecon.pictures")
-    drag(page, page.find_element("id", "scene"), 0, 0, 150, 30)
-    settle(page)
-    assert changed_share(before, picture(page)) > 0.01
-    assert changed_share(slice_before, picture(page, "axial")) == 0.0
-    assert page.execute_script("return clrecon.pictures") > count + 1  # coarse ones on the way
-    page.execute_script("window.shown = clrecon.pictures")
+# Turning
+
+
+def drag_scene_to_the_right(page) -> None:
+    drag(page, page.find_element("id", "scene"), 0, 0, 150, 30)  # pixels, from the middle
+
+
+def test_drag_turns_the_picture_and_leaves_the_slices(page) -> None:
+    scene, axial = screenshot(page, "scene"), screenshot(page, "axial")
+
+    drag_scene_to_the_right(page)
+
+    wait_until_drawn(page)
+    assert share_of_changed_pixels(scene, screenshot(page, "scene")) > tolerances.VIEW_CHANGED_SHARE
+    assert share_of_changed_pixels(axial, screenshot(page, "axial")) == 0.0
+
+
+def test_pictures_are_shown_while_a_drag_goes_on(page) -> None:
+    before = page.execute_script("return clrecon.pictures")
+
+    drag_scene_to_the_right(page)
+
+    wait_until_drawn(page)
+    assert page.execute_script("return clrecon.pictures") > before + 1  # more than the sharp one at the end
+
+
+def test_undo_turns_a_dragged_picture_back(page) -> None:
+    before = screenshot(page)
+    page.execute_script("window.first = JSON.stringify(clrecon.facts.camera)")
+    drag_scene_to_the_right(page)
+    wait_until_drawn(page)
+
     page.find_element("id", "undo").click()
-    wait_for(page, "return JSON.stringify(clrecon.facts.camera) === window.first && clrecon.pictures > window.shown")
-    wait_for(page, SETTLED)
-    assert changed_share(before, picture(page)) < 0.002
+
+    wait_for(page, "return JSON.stringify(clrecon.facts.camera) === window.first")
+    wait_until_drawn(page)
+    assert share_of_changed_pixels(before, screenshot(page)) < tolerances.VIEW_REDRAWN_SHARE
 
 
 def test_undo_stays_where_it_is_while_lists_grow(page) -> None:
-    place = "return document.getElementById('undo').getBoundingClientRect().top"
-    before = page.execute_script(place)
+    top_of_undo = "return document.getElementById('undo').getBoundingClientRect().top"
+    before = page.execute_script(top_of_undo)
+
     page.execute_script(
         "for (const id of ['measures', 'parts', 'clips'])"
         "  for (let n = 0; n < 5; n++) document.getElementById(id).append(document.createElement('li'));"
         "document.getElementById('hint').textContent = 'a hint of several lines '.repeat(9);"
     )
-    assert page.execute_script(place) == before > 0
+
+    assert page.execute_script(top_of_undo) == before > 0
 
 
-def test_slider_sets_the_iso_value_and_the_picture_follows(page) -> None:
-    before = picture(page)
+@pytest.mark.parametrize(
+    ("key", "up_down_left_right"),
+    [pytest.param("1", ["S", "I", "R", "L"], id="front"), pytest.param("3", ["S", "I", "A", "P"], id="left side")],
+)
+def test_number_key_shows_a_side_with_the_letters_of_its_edges(page, key: str, up_down_left_right: list[str]) -> None:
+    page.find_element("id", "scene").send_keys(key)
+
+    wait_until_drawn(page)
+    letters = page.execute_script(
+        "return [...document.querySelectorAll('#scene .side')].slice(0, 4).map((one) => one.textContent)"
+    )
+    assert letters == up_down_left_right
+
+
+# The iso value
+
+
+def drag_slider_of_the_iso_value(page) -> float:
+    """Drag the slider to the right, and return the new iso value."""
     drag(page, page.find_element("id", "hu"), 0, 0, 150, 0)
-    settle(page)
-    hu = facts(page)["iso"]["hu"]
-    assert hu != ISO and page.find_element("id", "exact").get_attribute("value") == f"{hu:g}"
-    assert changed_share(before, picture(page)) > 0.001
+    wait_until_drawn(page)
+    return facts(page)["iso"]["hu"]
+
+
+def test_slider_sets_the_iso_value_that_its_field_and_the_status_show(page) -> None:
+    hu = drag_slider_of_the_iso_value(page)
+
+    assert hu > ISO
+    assert page.find_element("id", "exact").get_attribute("value") == f"{hu:g}"
     assert f"{hu:g} HU" in page.find_element("id", "status").text
 
 
-def test_text_that_is_no_iso_value_is_put_back_and_a_number_is_taken(page) -> None:
+def test_picture_follows_the_slider_of_the_iso_value(page) -> None:
+    before = screenshot(page)
+
+    drag_slider_of_the_iso_value(page)
+
+    assert share_of_changed_pixels(before, screenshot(page)) > tolerances.VIEW_CHANGED_SHARE
+
+
+def type_iso_value(page, *keys: str) -> None:
     from selenium.webdriver.common.keys import Keys
 
     exact = page.find_element("id", "exact")
-    for wrong in ("", "99999", "-5000"):
-        exact.send_keys(Keys.CONTROL, "a")
-        exact.send_keys(wrong or Keys.DELETE, Keys.ENTER)
+    exact.send_keys(Keys.CONTROL, "a")
+    exact.send_keys(*keys, Keys.ENTER)
+
+
+def test_text_that_is_no_iso_value_is_put_back(page) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    for wrong in (Keys.DELETE, "99999", "-5000"):  # nothing, above and below every HU
+        type_iso_value(page, wrong)
         wait_for(page, f"return document.getElementById('exact').value === '{ISO:g}'")
+
     assert "The iso value runs from" in page.find_element("id", "hint").text
     assert facts(page)["iso"]["hu"] == ISO
-    exact.send_keys(Keys.CONTROL, "a")
-    exact.send_keys("321", Keys.ENTER)
+
+
+def test_number_that_is_typed_becomes_the_iso_value_of_the_slider(page) -> None:
+    type_iso_value(page, "321")
+
     wait_for(page, "return clrecon.facts.iso.hu === 321")
     assert page.find_element("id", "hu").get_attribute("value") == "321"
 
 
-def test_surface_is_fitted_to_the_bone_and_coloured_with_a_scale(page) -> None:
-    before, bars = picture(page), "return document.querySelectorAll('#scene rect').length"
-    assert not page.find_element("id", "shade").is_displayed() and page.execute_script(bars) == 0
-    press(page, "t")
-    wait_for(page, "return clrecon.facts.fitted === true")
-    settle(page)
-    assert page.find_element("id", "fitted").is_selected()
-    assert changed_share(before, picture(page)) > 0.001
-    page.find_element("css selector", "#shade option[value=thickness]").click()
-    wait_for(page, "return clrecon.facts.scale !== null")
-    settle(page)
-    assert page.execute_script(bars) == 64
-    assert "mm thick" in page.find_element("css selector", "#scene svg").text
-    page.find_element("id", "fitted").click()
-    wait_for(page, "return clrecon.facts.fitted === false && clrecon.facts.scale === null")
-    page.find_element("css selector", "#mode option[value=drr]").click()
-    wait_for(page, "return document.getElementById('fitting').hidden")
-
-
-def test_keys_look_from_the_sides_with_their_letters(page) -> None:
-    from selenium.webdriver.common.keys import Keys
-
-    def letters() -> list[str]:
-        return page.execute_script(
-            "return [...document.querySelectorAll('#scene .side')].slice(0, 4).map((one) => one.textContent)"
-        )
-
-    page.find_element("id", "scene").send_keys("1")
-    settle(page)
-    assert letters() == ["S", "I", "R", "L"]  # up, down, left and right edge
-    page.find_element("id", "scene").send_keys("3")
-    settle(page)
-    assert letters() == ["S", "I", "A", "P"]
-    page.find_element("id", "scene").send_keys(Keys.ESCAPE)
+HU_OF_ONE_STEP = 5
 
 
 @pytest.mark.release
-def test_distance_by_two_clicks_is_that_of_the_places(page) -> None:
-    page.find_element("id", "distance").click()
-    for number in (0, 1):
-        click(page, "scene", scenes.middle(number))
-        wait_for(page, f"return clrecon.facts.points.length + 2 * clrecon.facts.measures.length === {number + 1}")
-    (measure,) = facts(page)["measures"]
-    first, last = (np.array(point) for point in measure["points"])
-    assert measure["text"] == f"{np.linalg.norm(last - first):.1f} mm"
-    for number, point in enumerate((first, last)):  # on the balls, within the roundings of a click to pixels
-        away = np.linalg.norm(point - scenes.middle(number))
-        assert abs(away - scenes.BALLS[number][1]) < 1.0 or np.abs(point - scenes.middle(number))[1] > 5.0
-    settle(page)
-    assert measure["text"] in page.find_element("css selector", "#scene svg").text
-    page.find_element("id", "clear").click()
-    wait_for(page, "return !clrecon.facts.measures.length")
-
-
-def test_part_is_hidden_by_a_click_and_listed_with_its_ml(page) -> None:
-    wait_for(page, PARTS)
-    settle(page)
-    before = picture(page)
-    page.find_element("id", "hide").click()
-    click(page, "scene", scenes.middle(1))
-    wait_for(page, "return clrecon.facts.parts.some((part) => part.kind === 'cluster' && !part.visible)")
-    (hidden,) = [part for part in facts(page)["parts"] if not part["visible"]]
-    assert hidden["ml"] == pytest.approx(4.0 / 3.0 * np.pi * 5.0**3 / 1000.0, rel=0.1)
-    settle(page)
-    assert changed_share(before, picture(page)) > 0.001
-    assert re.search(r"0\.\d+ ml", page.find_element("id", "parts").text)
-    page.find_element("id", "all").click()
-    wait_for(page, "return clrecon.facts.parts.every((part) => part.visible)")
-
-
-def test_shift_click_names_the_part_and_moves_the_slices_there(page) -> None:
-    from selenium.webdriver.common.keys import Keys
-
-    wait_for(page, PARTS)
-    click(page, "scene", scenes.middle(1), Keys.SHIFT)
-    wait_for(page, "return document.getElementById('hint').textContent.endsWith('mm LPS')")
-    said = page.find_element("id", "hint").text
-    assert re.match(r"part 2, 0\.\d+ ml, (299|300|301) HU, ", said), said
-    assert np.linalg.norm(np.array(facts(page)["cross"]) - scenes.middle(1)) == pytest.approx(5.0, abs=0.3)
-    (row,) = page.find_elements("css selector", "#parts li.chosen")
-    assert "part 2" in row.text
-    page.find_element("id", "level").send_keys(Keys.TAB)  # the pointer stays, the focus goes
-    row.find_element("css selector", ".name").click()
-    assert page.find_elements("css selector", "#parts li.chosen") == []
-
-
-def test_cross_is_seen_in_the_picture_and_slices_have_names_and_colours(page) -> None:
-    def colors(name: str) -> set[str]:
-        return set(
-            page.execute_script(
-                "const lines = document.querySelectorAll(`#${arguments[0]} .cross`);"
-                "return [...lines].map((line) => getComputedStyle(line).stroke)",
-                name,
-            )
-        )
-
-    every = colors("scene")
-    assert len(every) == 3
-    for name in ("axial", "coronal", "sagittal"):
-        label = page.find_element("css selector", f"#{name} .name")
-        assert label.text.split()[0] == name
-        own = page.execute_script("return getComputedStyle(arguments[0]).fill", label)
-        assert colors(name) == every - {own}
-    marks = page.find_elements("css selector", "#marks span")
-    assert 4 < len(marks) < 20 and "0" in [mark.text for mark in marks]
-
-
-@pytest.mark.release
-def test_left_right_and_the_wheel_step_the_iso_value(page) -> None:
-    from selenium.webdriver import ActionChains
-    from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
+def test_arrow_keys_step_the_iso_value_down_and_up(page) -> None:
     from selenium.webdriver.common.keys import Keys
 
     point_at(page, "scene", scenes.middle(0))
-    press(page, Keys.ARROW_RIGHT)
-    wait_for(page, f"return clrecon.facts.iso.hu === {ISO + 5}")
-    press(page, Keys.ARROW_LEFT, Keys.ARROW_LEFT)
-    wait_for(page, f"return clrecon.facts.iso.hu === {ISO - 5}")
-    hu = page.find_element("id", "hu")
-    ActionChains(page).scroll_from_origin(ScrollOrigin.from_element(hu), 0, -100).perform()
-    wait_for(page, f"return clrecon.facts.iso.hu === {ISO}")
-    assert hu.get_attribute("value") == f"{ISO:g}"
+
+    press_keys(page, Keys.ARROW_RIGHT)
+    wait_for(page, f"return clrecon.facts.iso.hu === {ISO + HU_OF_ONE_STEP}")
+    press_keys(page, Keys.ARROW_LEFT, Keys.ARROW_LEFT)
+    assert wait_for(page, f"return clrecon.facts.iso.hu === {ISO - HU_OF_ONE_STEP}")
 
 
-def test_keys_use_what_lies_under_the_pointer_in_slices_too(page) -> None:
-    wait_for(page, PARTS)
-    point_at(page, "scene", scenes.middle(1))
-    press(page, "e")
-    wait_for(page, "return clrecon.facts.measures.length === 1")
-    (seed,) = facts(page)["measures"]
-    assert (seed["kind"], facts(page)["tool"]) == ("seed", None)
-    assert page.find_element("css selector", "#measures input").get_attribute("value") == "place 1"
-    page.execute_script("clrecon.run('set_cross', { point: arguments[0] })", scenes.middle(0).tolist())
-    wait_for(page, f"return Math.abs(clrecon.facts.cross[2] - {scenes.middle(0)[2]}) < 0.01")
-    settle(page)
-    point_at(page, "axial", scenes.middle(0))
-    press(page, "x")
-    wait_for(page, "return clrecon.facts.parts.some((part) => part.name === 'part 1' && !part.visible)")
-    press(page, "A")
-    wait_for(page, "return clrecon.facts.parts.every((part) => part.visible)")
-    page.find_element("xpath", "//ul[@id='parts']//span[text()='part 2']").click()  # away from the pictures
-    press(page, "X")
-    wait_for(page, "return clrecon.facts.parts.filter((part) => part.kind === 'cluster' && part.visible).length === 1")
-    assert [part["name"] for part in facts(page)["parts"] if part["visible"] and part["kind"] == "cluster"] == [
-        "part 2"
-    ]
-
-
-def test_line_is_faint_where_bone_lies_before_it(page) -> None:
-    page.find_element("id", "distance").click()
-    for number in (0, 1):
-        click(page, "scene", scenes.middle(number))
-        wait_for(page, f"return clrecon.facts.points.length + 2 * clrecon.facts.measures.length === {number + 1}")
-    page.execute_script("clrecon.run('look', { view: 'posterior' })")
-    settle(page)
-    (measure,) = facts(page)["measures"]
-    first, last = (np.array(point) for point in measure["points"])
-    seen = np.array(facts(page)["seen_lines"])
-    assert len(seen) == 1  # between the balls, not behind them
-    assert 2.0 < np.linalg.norm(seen[0, 1] - seen[0, 0]) < np.linalg.norm(last - first) - 6.0
-    assert len(page.find_elements("css selector", "#scene .line.seen")) == 1
-    page.execute_script("clrecon.run('look', { view: 'anterior' })")
-    settle(page)
-    seen = np.array(facts(page)["seen_lines"])
-    assert np.linalg.norm(seen[:, 1] - seen[:, 0], axis=1).sum() > 0.7 * np.linalg.norm(last - first)
-
-
-def test_clip_box_lies_about_the_cross_and_an_oblique_plane_is_named_by_letters(page) -> None:
-    press(page, "C")
-    box = np.array(wait_for(page, "return clrecon.facts.clip_box"))
-    low, high = np.array(facts(page)["bounds"])
-    assert box[1] - box[0] == pytest.approx(0.5 * (high - low), abs=0.01)
-    assert box.mean(axis=0) == pytest.approx(facts(page)["cross"], abs=0.01)
-    press(page, "C")
-    wait_for(page, "return !clrecon.facts.clip_box")
-    page.execute_script("clrecon.run('turn', { dx: 0.2, dy: 0 })")
-    press(page, "c")
-    wait_for(page, "return clrecon.facts.clips.length === 1")
-    assert re.match(r"[APLR]{2} side", page.find_element("id", "clips").text)
-
-
-def test_part_gets_its_own_look_back_and_a_mesh_says_its_triangles(page) -> None:
-    page.execute_script("clrecon.run('set_color', { key: '2', rgb: [1, 0, 0] })")
-    wait_for(page, "return clrecon.facts.parts.find(({ key }) => key === '2').color")
-    (row,) = [each for each in page.find_elements("css selector", "#parts li") if "mesh" in each.text]
-    assert re.search(r"\d,\d{3}", row.text)
-    row.find_element("xpath", ".//button[text()='plain']").click()
-    wait_for(page, "return !clrecon.facts.parts.find(({ key }) => key === '2').color")
-
-
-def test_k_makes_a_curve_shows_its_picture_and_takes_that_away(page) -> None:
-    curve = page.find_element("id", "curve")
-    press(page, "k")
-    for number in (1, 2):
-        click(page, "scene", scenes.middle(number))
-        wait_for(page, f"return clrecon.facts.points.length === {number}")
-    press(page, "k")
-    wait_for(page, "return clrecon.facts.measures.length === 1 && !clrecon.facts.tool")
-    settle(page)
-    assert curve.is_displayed() and curve.find_element("css selector", ".name").text == "along the curve"
-    press(page, "k")
-    assert not curve.is_displayed()
-    page.find_element("id", "along").click()
-    assert curve.is_displayed()
-
-
-def test_escape_stops_the_work(page, view_server, monkeypatch) -> None:
-    from selenium.webdriver.common.keys import Keys
-
-    wait_for(page, PARTS)
-    monkeypatch.setattr(Painter, "find_parts", lambda self, state, progress: search_for_ever(state, progress))
-    page.execute_script("clrecon.run('set_iso', { hu: 310 })")
-    wait_for(page, "return clrecon.facts.busy.includes('finding parts')")
-    press(page, Keys.ESCAPE)
-    wait_for(page, "return !clrecon.facts.busy.length")
-    assert not facts(page)["parts_known"]
-
-
-def test_page_shows_the_description_and_what_was_removed(page) -> None:
-    assert "a ball of triangles" in page.find_element("id", "about").text
-    page.find_element("id", "table").click()
-    wait_for(page, "return /of the voxels are air now/.test(document.getElementById('hint').textContent)")
-
-
-def test_list_of_keys_is_that_of_the_session(page) -> None:
-    press(page, "h")
-    text = page.find_element("id", "keys").text
-    for key in KEYS.values():
-        assert key.words in text
-    press(page, "h")  # keys do nothing while it is open
-    page.find_element("id", "closekeys").click()
-    assert not page.find_element("id", "keys").is_displayed()
-
-
-def test_wheel_scrolls_a_slice_and_a_right_drag_is_its_window(page) -> None:
+@pytest.mark.release
+def test_wheel_over_the_slider_steps_it_and_the_iso_value_up(page) -> None:
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
 
-    axial, before = page.find_element("id", "axial"), facts(page)
+    slider = page.find_element("id", "hu")
+
+    ActionChains(page).scroll_from_origin(ScrollOrigin.from_element(slider), 0, -100).perform()
+
+    wait_for(page, f"return clrecon.facts.iso.hu === {ISO + HU_OF_ONE_STEP}")
+    assert slider.get_attribute("value") == f"{ISO + HU_OF_ONE_STEP:g}"
+
+
+# The fitted surface
+
+BARS_OF_SCALE = "return document.querySelectorAll('#scene rect').length"
+
+
+def test_key_t_fits_the_surface_to_the_bone_and_ticks_its_box(page) -> None:
+    press_keys(page, "t")
+
+    wait_for(page, "return clrecon.facts.fitted === true")
+    wait_until_drawn(page)
+    assert page.find_element("id", "fitted").is_selected()
+
+
+def test_fitted_surface_is_drawn_in_place_of_the_iso_surface(page) -> None:
+    before = screenshot(page)
+
+    run_command(page, "set_fitted", shown=True)
+
+    wait_for(page, "return clrecon.facts.fitted === true")
+    wait_until_drawn(page)
+    assert share_of_changed_pixels(before, screenshot(page)) > tolerances.VIEW_CHANGED_SHARE
+
+
+def test_surface_that_is_not_fitted_has_no_scale_and_no_choice_of_colours(page) -> None:
+    assert page.execute_script(BARS_OF_SCALE) == 0
+    assert not page.find_element("id", "shade").is_displayed()
+
+
+def colour_fitted_surface_by_thickness(page) -> None:
+    run_command(page, "set_fitted", shown=True)
+    wait_for(page, "return clrecon.facts.fitted === true && document.getElementById('shade').offsetParent")
+    page.find_element("css selector", "#shade option[value=thickness]").click()
+    wait_for(page, "return clrecon.facts.scale !== null")
+    wait_until_drawn(page)
+
+
+def test_thickness_of_a_fitted_surface_is_shown_with_a_scale_of_64_bars_in_mm(page) -> None:
+    colour_fitted_surface_by_thickness(page)
+
+    assert page.execute_script(BARS_OF_SCALE) == 64
+    assert "mm thick" in page.find_element("css selector", "#scene svg").text
+
+
+def test_scale_of_thickness_goes_with_the_fitted_surface(page) -> None:
+    colour_fitted_surface_by_thickness(page)
+
+    page.find_element("id", "fitted").click()
+
+    assert wait_for(page, "return clrecon.facts.fitted === false && clrecon.facts.scale === null")
+
+
+def test_projection_offers_no_fitted_surface(page) -> None:
+    page.find_element("css selector", "#mode option[value=drr]").click()
+
+    assert wait_for(page, "return document.getElementById('fitting').hidden")
+
+
+# Slices and the cross
+
+
+def colors_of_cross(page, view: str) -> set[str]:
+    lines = "document.querySelectorAll(`#${arguments[0]} .cross`)"
+    return set(page.execute_script(f"return [...{lines}].map((line) => getComputedStyle(line).stroke)", view))
+
+
+def test_cross_has_three_colours_in_the_picture(page) -> None:
+    assert len(colors_of_cross(page, "scene")) == 3
+
+
+@pytest.mark.parametrize("plane", ["axial", "coronal", "sagittal"])
+def test_slice_is_named_in_its_colour_and_crossed_by_the_colours_of_the_others(page, plane: str) -> None:
+    label = page.find_element("css selector", f"#{plane} .name")
+    own = page.execute_script("return getComputedStyle(arguments[0]).fill", label)
+
+    assert label.text.split()[0] == plane
+    assert colors_of_cross(page, plane) == colors_of_cross(page, "scene") - {own}
+
+
+def test_slider_of_the_iso_value_has_some_marks_one_of_them_at_zero(page) -> None:
+    marks = [mark.text for mark in page.find_elements("css selector", "#marks span")]
+
+    assert 4 < len(marks) < 20  # enough to read between them, few enough not to touch
+    assert "0" in marks
+
+
+def test_wheel_moves_a_slice_along_its_own_axis_alone(page) -> None:
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
+
+    x, y, z = facts(page)["cross"]
+    axial = page.find_element("id", "axial")
+
     ActionChains(page).scroll_from_origin(ScrollOrigin.from_element(axial), 0, 300).perform()
-    wait_for(page, f"return clrecon.facts.cross[2] !== {before['cross'][2]}")
+
+    wait_for(page, f"return clrecon.facts.cross[2] !== {z}")
+    assert facts(page)["cross"][:2] == pytest.approx([x, y])
+
+
+def test_drag_to_the_side_with_the_right_button_widens_the_window_and_leaves_its_level(page) -> None:
+    low, high = facts(page)["window"]
+
     page.execute_script(
-        """const box = arguments[0], at = box.getBoundingClientRect();
+        """const box = document.getElementById("axial"), at = box.getBoundingClientRect();
         const fire = (name, x, y, buttons) => box.dispatchEvent(new PointerEvent(name,
             { pointerId: 1, clientX: at.left + x, clientY: at.top + y, button: 2, buttons, bubbles: true }));
         box.setPointerCapture = () => {};
         fire("pointerdown", 40, 40, 2);
         for (let n = 1; n < 12; n++) fire("pointermove", 40 + 5 * n, 40, 2);
-        fire("pointerup", 95, 40, 0);""",
-        axial,
+        fire("pointerup", 95, 40, 0);"""
     )
-    low, high = before["window"]
+
     wait_for(page, f"return clrecon.facts.window[1] - clrecon.facts.window[0] > {1.1 * (high - low)}")
-    after = facts(page)
-    assert sum(after["window"]) == pytest.approx(low + high, abs=1.0)  # a drag to the side leaves the level
-    assert after["cross"][:2] == pytest.approx(before["cross"][:2])
+    assert sum(facts(page)["window"]) / 2 == pytest.approx((low + high) / 2, abs=tolerances.VIEW_LEVEL_HU)
 
 
-@pytest.mark.release
-def test_clip_planes_and_a_box_cut(page) -> None:
-    before = picture(page)
-    page.find_element("id", "cut").click()
-    wait_for(page, "return clrecon.facts.clips.length === 1")
-    settle(page)
-    cut = picture(page)
-    assert changed_share(before, cut) > 0.005
-    drag(page, page.find_element("css selector", "#clips input"), 0, 0, 45, 0)
-    settle(page)
-    assert facts(page)["clips"][0]["share"] > 0.5
-    page.find_element("css selector", "#clips li button:last-of-type").click()
-    page.find_element("id", "boxed").click()
-    wait_for(page, "return clrecon.facts.clip_box && !clrecon.facts.clips.length")
-    assert page.find_element("id", "box").is_displayed()
+# What is said
 
 
-def test_shown_view_is_saved_as_a_download(page, downloads: Path) -> None:
+def test_page_shows_the_description_of_its_objects(page) -> None:
+    assert "a ball of triangles" in page.find_element("id", "about").text  # said of the mesh by serve_scene
+
+
+def test_removal_of_the_table_says_what_became_air(page) -> None:
+    page.find_element("id", "table").click()
+
+    assert wait_for(page, "return /of the voxels are air now/.test(document.getElementById('hint').textContent)")
+
+
+def test_key_h_lists_the_words_of_every_key(page) -> None:
+    press_keys(page, "h")
+
+    listed = page.find_element("id", "keys").text
+    assert [key.words for key in KEYS.values() if key.words not in listed] == []
+
+
+def test_list_of_keys_takes_the_keys_until_it_is_closed(page) -> None:
+    press_keys(page, "h")
+    press_keys(page, "h")
+    assert page.find_element("id", "keys").is_displayed()
+
+    page.find_element("id", "closekeys").click()
+
+    assert not page.find_element("id", "keys").is_displayed()
+
+
+# Files
+
+
+def test_shown_surface_is_saved_as_a_download(page, downloads: Path) -> None:
     from selenium.webdriver.support.ui import Select
-
-    from clrecon.mesh.mesh_reader import read_mesh
 
     Select(page.find_element("id", "format")).select_by_value(".stl")
     page.find_element("id", "save").click()
-    end = time.monotonic() + PATIENCE
-    while not (downloads / "view.stl").exists():
-        assert time.monotonic() < end, page.find_element("id", "saved").text
-        time.sleep(0.05)
-    mesh = read_mesh(downloads / "view.stl", space="lps")
-    assert mesh.triangle_count > 1000
+
+    wait_for_file(page, downloads / "view.stl")
+    surface = read_mesh(downloads / "view.stl", space="lps")
+    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+    assert (low <= scenes.middle(0)).all() and (scenes.middle(0) <= high).all()  # the largest ball of the scan
 
 
-def test_files_that_were_named_are_written_here_and_q_ends_it(view_browser, device, tmp_path: Path) -> None:
-    from clrecon.mesh.mesh_reader import read_mesh
-
+@pytest.fixture
+def named_files(view_browser, device, tmp_path: Path):
+    """A function that presses s and waits, in a page of a mesh that was started with --save-as shown.ply shown.png."""
     objects = show_objects([scenes.make_mesh()])
     wrote: list[str] = []
     names = [str(tmp_path / name) for name in ("shown.ply", "shown.png")]
@@ -383,28 +357,67 @@ def test_files_that_were_named_are_written_here_and_q_ends_it(view_browser, devi
         Painter(objects, device=device) as painter,
         serving(lambda heard: ViewSession(objects, painter, on_change=heard), save_as=names, wrote=wrote.append) as own,
     ):
-        view_browser.get(own.address)
-        wait_for(view_browser, SETTLED)
-        for count in (2, 4):
-            press(view_browser, "s")
-            end = time.monotonic() + PATIENCE
-            while len(wrote) < count:
+
+        def save_by_key() -> None:
+            wanted, end = len(wrote) + len(names), time.monotonic() + PATIENCE
+            press_keys(view_browser, "s")
+            while len(wrote) < wanted:
                 assert time.monotonic() < end, view_browser.find_element("id", "saved").text
                 time.sleep(0.05)
-        press(view_browser, "q")
-        wait_for(view_browser, "return document.documentElement.dataset.closed === '1001'")
-        assert "the server has ended" in view_browser.find_element("id", "message").text
+
+        view_browser.get(own.address)
+        wait_for(view_browser, SETTLED)
+        yield save_by_key
+        press_keys(view_browser, "q")
+        wait_for(view_browser, "return document.documentElement.dataset.closed")
+        severe_lines(view_browser)  # no later test is to find what the end of the server logs
+
+
+def test_key_s_writes_the_named_files_each_time_under_names_of_their_own(named_files, tmp_path: Path) -> None:
+    named_files()
+    named_files()
+
     assert sorted(path.name for path in tmp_path.iterdir()) == ["shown-2.ply", "shown-2.png", "shown.ply", "shown.png"]
-    assert read_mesh(tmp_path / "shown-2.ply", space="lps").triangle_count == scenes.make_mesh().triangle_count
+
+
+def test_named_file_of_a_mesh_holds_its_triangles(named_files, tmp_path: Path) -> None:
+    named_files()
+
+    assert read_mesh(tmp_path / "shown.ply", space="lps").triangle_count == scenes.make_mesh().triangle_count
+
+
+CLOSED_BY_A_SERVER_THAT_GOES_AWAY = "1001"  # a code of WebSocket, RFC 6455
+
+
+def test_key_q_ends_the_server_and_the_page_says_so(view_browser, device) -> None:
+    objects = show_objects([scenes.make_mesh()])
+    with (
+        Painter(objects, device=device) as painter,
+        serving(lambda heard: ViewSession(objects, painter, on_change=heard)) as own,
+    ):
+        view_browser.get(own.address)
+        wait_for(view_browser, SETTLED)
+
+        press_keys(view_browser, "q")
+
+        closed = wait_for(view_browser, "return document.documentElement.dataset.closed")
+        assert closed == CLOSED_BY_A_SERVER_THAT_GOES_AWAY
+        assert "the server has ended" in view_browser.find_element("id", "message").text
+        severe_lines(view_browser)  # no later test is to find what the end of the server logs
+
+
+# Tabs and the secret
 
 
 @pytest.mark.release
 def test_another_tab_has_a_view_of_its_own(page, view_server) -> None:
-    page.execute_script("clrecon.run('set_iso', { hu: 350 })")
+    run_command(page, "set_iso", hu=350)
     wait_for(page, "return clrecon.facts.iso.hu === 350")
     first = page.current_window_handle
+
     page.switch_to.new_window("tab")
     page.get(view_server.address)
+
     wait_for(page, SETTLED)
     assert facts(page)["iso"]["hu"] == ISO
     page.close()
@@ -414,12 +427,14 @@ def test_another_tab_has_a_view_of_its_own(page, view_server) -> None:
 
 def test_address_without_the_secret_shows_the_refusal_alone(view_browser, view_server) -> None:
     view_browser.get(f"http://127.0.0.1:{view_server.port}/")
+
     assert "the secret is missing or wrong" in view_browser.find_element("tag name", "body").text
-    severe_lines(view_browser)
+    assert view_browser.find_elements("id", "scene") == []
+    severe_lines(view_browser)  # the browser logs the refusal: no later test is to find it
 
 
-def test_page_that_is_loaded_again_keeps_its_view(page) -> None:
-    page.execute_script("clrecon.run('set_iso', { hu: 250 })")
+def test_page_that_is_loaded_again_keeps_its_iso_value(page) -> None:
+    run_command(page, "set_iso", hu=250)
     wait_for(page, "return clrecon.facts.iso.hu === 250")
 
     page.refresh()

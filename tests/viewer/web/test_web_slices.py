@@ -6,176 +6,321 @@ import re
 
 import numpy as np
 import pytest
+import tolerances
 import view_scenes as scenes
 from browser import wait_for
-from view_pages import SETTLED, changed_share, facts, open_view_page, picture, point_at, press
+from view_pages import (
+    SETTLED,
+    facts,
+    open_view_page,
+    point_at,
+    press_keys,
+    run_command,
+    screenshot,
+    share_of_changed_pixels,
+)
 
 pytestmark = [pytest.mark.slow, pytest.mark.opencl]
+
+VIEWS = ["scene", "axial", "coronal", "sagittal"]
+HU_IN_A_BALL = "1000 HU"  # of view_scenes
 
 
 @pytest.fixture
 def page(view_browser, view_server):
+    """The page with its slices through the middle of the largest ball of bone."""
     with open_view_page(view_browser, view_server) as opened:
+        middle = scenes.middle(0)
+        run_command(opened, "set_cross", point=middle.tolist())
+        wait_for(opened, f"return Math.abs(clrecon.facts.cross[0] - {middle[0]}) < 0.01")  # mm
+        wait_for(opened, SETTLED)
         yield opened
 
 
-SHOWN = "return [...document.querySelectorAll('.view')].filter((box) => box.clientWidth).map((box) => box.id)"
-
-
-def words_of(page, name: str) -> list[str]:
+def shown_views(page) -> list[str]:
     return page.execute_script(
-        "return [...document.querySelectorAll(`#${arguments[0]} svg text`)].map((one) => one.textContent)", name
+        "return [...document.querySelectorAll('.view')].filter((box) => box.clientWidth).map((box) => box.id)"
     )
 
 
-def wait_for_picture(page, change: str) -> None:
-    """Run a command and wait until a slice is drawn anew."""
-    count = page.execute_script(f"const count = clrecon.pictures; {change}; return count")
-    wait_for(page, f"return clrecon.pictures > {count} && clrecon.facts.settled")
+def words_on(page, view: str) -> list[str]:
+    return page.execute_script(
+        "return [...document.querySelectorAll(`#${arguments[0]} svg text`)].map((one) => one.textContent)", view
+    )
 
 
-def go_to(page, point: np.ndarray) -> None:
-    page.execute_script("clrecon.run('set_cross', { point: arguments[0] })", point.tolist())
-    wait_for(page, f"return Math.abs(clrecon.facts.cross[0] - {point[0]}) < 0.01")
-    wait_for(page, SETTLED)
+def wait_for_zoom(page, plane: str) -> None:
+    wait_for(page, f"return clrecon.facts.settled && clrecon.facts.undo === 'the zoom of the {plane} slice'")
 
 
-def mm_of_pixel(page, name: str) -> float:
+def mm_of_pixel(page, view: str) -> float:
+    """By where the ends of 10 mm towards the patient's left are drawn."""
     ends = [scenes.middle(0).tolist(), (scenes.middle(0) + (10.0, 0.0, 0.0)).tolist()]
-    pixels = page.execute_script("return arguments[1].map((end) => clrecon.project(arguments[0], end))", name, ends)
+    pixels = page.execute_script("return arguments[1].map((end) => clrecon.project(arguments[0], end))", view, ends)
     return 10.0 / float(np.linalg.norm(np.subtract(*pixels)))
 
 
-def test_slice_says_number_place_window_and_what_is_under_the_mouse(page) -> None:
-    go_to(page, scenes.middle(0))
+# What a slice says
+
+
+def test_slice_says_its_number_place_and_window(page) -> None:
     shown = facts(page)["slices"]["axial"]
-    assert f"axial {shown['number']} / {shown['count']}" in words_of(page, "axial")
-    assert shown["place"] in words_of(page, "axial") and "L 300 W 1500" in words_of(page, "axial")
-    cross = facts(page)["cross"]
-    point_at(page, "axial", scenes.middle(0) + (3.0, 0.0, 0.0))
+
+    said = words_on(page, "axial")
+
+    assert f"axial {shown['number']} / {shown['count']}" in said
+    assert shown["place"] in said
+    assert "L 300 W 1500" in said  # the window that a view begins with
+
+
+def test_slice_says_hu_and_place_of_the_point_under_the_mouse(page) -> None:
+    point = scenes.middle(0) + (3.0, 0.0, 0.0)  # within the ball of 9 mm
+
+    point_at(page, "axial", point)
+
     wait_for(page, "return document.querySelectorAll('#axial .probe').length === 2")
     hu, place = (each.text for each in page.find_elements("css selector", "#axial .probe"))
-    x, y, z = (float(value) for value in re.findall(r"-?[0-9.]+", place))
-    assert (x, y, z) == pytest.approx(tuple(scenes.middle(0) + (3.0, 0.0, 0.0)), abs=0.6)
-    assert hu == "1000 HU" and facts(page)["cross"] == cross
-    point_at(page, "scene", scenes.middle(0))
-    wait_for(page, "return !document.querySelector('#axial .probe')")
+    assert hu == HU_IN_A_BALL
+    said_mm = [float(value) for value in re.findall(r"-?[0-9.]+", place)]
+    assert said_mm == pytest.approx(point.tolist(), abs=tolerances.VIEW_POINTED_MM)
 
 
-@pytest.mark.parametrize(("stage", "lines"), [(700, 2), (400, 1)])
-def test_narrow_slice_says_hu_and_what_else_has_room(page, stage: int, lines: int) -> None:
-    go_to(page, scenes.middle(0))
-    page.execute_script("document.getElementById('stage').style.maxWidth = `${arguments[0]}px`", stage)
-    wait_for(page, f"return axial.clientWidth < {stage / 3} && clrecon.facts.settled")
+def test_mouse_over_a_slice_leaves_the_cross(page) -> None:
+    cross = facts(page)["cross"]
+
+    point_at(page, "axial", scenes.middle(0) + (3.0, 0.0, 0.0))
+
+    wait_for(page, "return document.querySelector('#axial .probe')")
+    assert facts(page)["cross"] == cross
+
+
+def test_slice_says_nothing_of_a_point_once_the_mouse_has_left_it(page) -> None:
     point_at(page, "axial", scenes.middle(0))
+    wait_for(page, "return document.querySelector('#axial .probe')")
+
+    point_at(page, "scene", scenes.middle(0))
+
+    assert wait_for(page, "return !document.querySelector('#axial .probe')")
+
+
+@pytest.mark.parametrize(
+    ("stage_width", "lines"),
+    [pytest.param(700, 2, id="room for HU and place"), pytest.param(400, 1, id="room for HU alone")],
+)
+def test_narrow_slice_says_hu_and_the_place_only_where_it_has_room(page, stage_width: int, lines: int) -> None:
+    page.execute_script("document.getElementById('stage').style.maxWidth = `${arguments[0]}px`", stage_width)
+    wait_for(page, f"return axial.clientWidth < {stage_width / 3} && clrecon.facts.settled")
+
+    point_at(page, "axial", scenes.middle(0))
+
     wait_for(page, f"return document.querySelectorAll('#axial .probe').length === {lines}")
-    assert "1000 HU" in words_of(page, "axial") and "axial" in words_of(page, "axial")
+    assert {HU_IN_A_BALL, "axial"} <= set(words_on(page, "axial"))
 
 
-def test_wheel_with_ctrl_zooms_a_slice_and_0_fits_it(page) -> None:
+# Zoom and move
+
+
+def zoom_axial_by_the_wheel(page) -> None:
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
     from selenium.webdriver.common.keys import Keys
 
-    go_to(page, scenes.middle(0))
-    before, cross, first = mm_of_pixel(page, "axial"), facts(page)["cross"], picture(page, "axial")
-    axial = page.find_element("id", "axial")
-    origin = ScrollOrigin.from_element(axial, 30, 10)
+    origin = ScrollOrigin.from_element(page.find_element("id", "axial"), 30, 10)
     ActionChains(page).key_down(Keys.CONTROL).scroll_from_origin(origin, 0, -400).key_up(Keys.CONTROL).perform()
-    wait_for(page, "return clrecon.facts.settled && clrecon.facts.undo === 'the zoom of the axial slice'")
-    assert before / mm_of_pixel(page, "axial") > 1.1
-    assert changed_share(first, picture(page, "axial")) > 0.01 and facts(page)["cross"] == cross
-    wait_for_picture(page, "document.dispatchEvent(new KeyboardEvent('keydown', { key: '0' }))")
-    assert mm_of_pixel(page, "axial") == pytest.approx(before, rel=1e-6)
+    wait_for_zoom(page, "axial")
 
 
-def test_shift_and_drag_moves_a_slice(page) -> None:
+def test_wheel_with_ctrl_zooms_a_slice_and_its_picture(page) -> None:
+    before, picture = mm_of_pixel(page, "axial"), screenshot(page, "axial")
+
+    zoom_axial_by_the_wheel(page)
+
+    assert mm_of_pixel(page, "axial") < before
+    assert share_of_changed_pixels(picture, screenshot(page, "axial")) > tolerances.VIEW_CHANGED_SHARE
+
+
+def test_wheel_with_ctrl_leaves_the_cross(page) -> None:
+    cross = facts(page)["cross"]
+
+    zoom_axial_by_the_wheel(page)
+
+    assert facts(page)["cross"] == cross
+
+
+def test_key_0_fits_a_zoomed_slice_again(page) -> None:
+    fitted = mm_of_pixel(page, "axial")
+    zoom_axial_by_the_wheel(page)
+    drawn = page.execute_script("return clrecon.pictures")
+
+    page.execute_script("document.dispatchEvent(new KeyboardEvent('keydown', { key: '0' }))")
+
+    wait_for(page, f"return clrecon.pictures > {drawn} && clrecon.facts.settled")
+    assert mm_of_pixel(page, "axial") == pytest.approx(fitted)
+
+
+def test_drag_with_shift_moves_a_slice_by_as_many_pixels_and_leaves_the_cross(page) -> None:
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.keys import Keys
 
-    go_to(page, scenes.middle(0))
-    cross = facts(page)["cross"]
-    place = "return clrecon.project('coronal', arguments[0])"
-    before = page.execute_script(place, scenes.middle(0).tolist())
+    pixel_of_ball, ball = "return clrecon.project('coronal', arguments[0])", scenes.middle(0).tolist()
+    cross, before = facts(page)["cross"], page.execute_script(pixel_of_ball, ball)
+
     actions = ActionChains(page, duration=15).move_to_element(page.find_element("id", "coronal"))
     actions.key_down(Keys.SHIFT).click_and_hold()
     for _ in range(8):
         actions.move_by_offset(5, 3)
     actions.release().key_up(Keys.SHIFT).perform()
-    wait_for(page, "return clrecon.facts.settled && clrecon.facts.undo === 'the zoom of the coronal slice'")
-    after = page.execute_script(place, scenes.middle(0).tolist())
-    assert np.subtract(after, before) == pytest.approx((40.0, 24.0), abs=1.0)
+
+    wait_for_zoom(page, "coronal")
+    moved = np.subtract(page.execute_script(pixel_of_ball, ball), before)
+    assert moved == pytest.approx((8 * 5, 8 * 3), abs=tolerances.VIEW_MOVED_PIXELS)
     assert facts(page)["cross"] == cross
 
 
-def test_two_fingers_zoom_and_move_a_slice(page) -> None:
-    go_to(page, scenes.middle(0))
-    before = mm_of_pixel(page, "axial")
+def test_two_fingers_at_three_times_their_distance_zoom_a_slice_about_threefold(page) -> None:
     box = page.find_element("id", "axial").rect
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    for kind, apart in (("touchStart", 20), *(("touchMove", 20 + 5 * n) for n in range(1, 9)), ("touchEnd", 0)):
-        points = [{"x": x + sign * apart, "y": y, "id": number} for number, sign in enumerate((-1, 1))]
-        page.execute_cdp_cmd(
-            "Input.dispatchTouchEvent", {"type": kind, "touchPoints": [] if kind == "touchEnd" else points}
-        )
-    wait_for(page, "return clrecon.facts.settled && clrecon.facts.undo === 'the zoom of the axial slice'")
-    assert before / mm_of_pixel(page, "axial") == pytest.approx(3.0, rel=0.4)
+    before = mm_of_pixel(page, "axial")
+
+    def touch(kind: str, *half_distances: int) -> None:
+        fingers = [
+            {"x": x + side * half, "y": y, "id": number}
+            for half in half_distances
+            for number, side in enumerate((-1, 1))
+        ]
+        page.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers})
+
+    touch("touchStart", 20)
+    for half in range(25, 61, 5):
+        touch("touchMove", half)
+    touch("touchEnd")
+
+    wait_for_zoom(page, "axial")
+    assert before / mm_of_pixel(page, "axial") == pytest.approx(60 / 20, rel=tolerances.PAGE_TOUCH_ZOOM)
 
 
-def test_double_click_shows_one_view_at_full_size_and_back(page) -> None:
+# Full size
+
+
+def test_double_click_shows_a_slice_alone_at_more_than_twice_its_width(page) -> None:
     from selenium.webdriver import ActionChains
 
-    every = page.execute_script(SHOWN)
-    assert every == ["scene", "axial", "coronal", "sagittal"]
     axial = page.find_element("id", "axial")
     width = axial.size["width"]
+
     ActionChains(page).double_click(axial).perform()
+
     wait_for(page, f"return axial.clientWidth > {2 * width} && clrecon.facts.settled")
-    assert page.execute_script(SHOWN) == ["axial"]
+    assert shown_views(page) == ["axial"]
+
+
+def test_double_click_on_a_slice_at_full_size_brings_all_views_back(page) -> None:
+    from selenium.webdriver import ActionChains
+
+    axial = page.find_element("id", "axial")
+    width = axial.size["width"]
+    page.find_element("css selector", "#axial .enlarge").click()
+    wait_for(page, "return document.querySelector('#axial.large') && clrecon.facts.settled")
+
     ActionChains(page).double_click(axial).perform()
+
     wait_for(page, f"return axial.clientWidth === {width}")
-    assert page.execute_script(SHOWN) == every
+    assert shown_views(page) == VIEWS
 
 
-def test_double_click_with_a_tool_sets_points_alone(page) -> None:
+def test_double_click_with_a_tool_sets_two_points_and_enlarges_nothing(page) -> None:
     from selenium.webdriver import ActionChains
 
     page.find_element("id", "trace").click()
     wait_for(page, "return clrecon.facts.tool === 'curve'")
+
     ActionChains(page).double_click(page.find_element("id", "axial")).perform()
+
     wait_for(page, "return clrecon.facts.points.length === 2")
-    assert len(page.execute_script(SHOWN)) > 1
+    assert shown_views(page) == [*VIEWS, "curve"]
 
 
-def test_button_of_a_view_is_named_and_pressed_at_full_size(page) -> None:
+def test_button_at_full_size_is_named_and_not_pressed(page) -> None:
     button = page.find_element("css selector", "#sagittal .enlarge")
-    cross = facts(page)["cross"]
-    assert (button.accessible_name, button.get_attribute("aria-pressed")) == ("sagittal at full size", "false")
-    button.click()
+
+    assert button.accessible_name == "sagittal at full size"
+    assert button.get_attribute("aria-pressed") == "false"
+
+
+def enlarge_sagittal(page) -> None:
+    page.find_element("css selector", "#sagittal .enlarge").click()
     wait_for(page, "return document.querySelector('#sagittal .enlarge').getAttribute('aria-pressed') === 'true'")
-    assert page.execute_script(SHOWN) == ["sagittal"] and facts(page)["cross"] == cross
-    page.find_element("id", "sliced").click()  # without slices it has no place
+
+
+def test_button_of_a_slice_shows_it_alone_and_leaves_the_cross(page) -> None:
+    cross = facts(page)["cross"]
+
+    enlarge_sagittal(page)
+
+    assert shown_views(page) == ["sagittal"]
+    assert facts(page)["cross"] == cross
+
+
+def test_scene_is_shown_in_place_of_a_slice_at_full_size_when_slices_are_switched_off(page) -> None:
+    enlarge_sagittal(page)
+
+    page.find_element("id", "sliced").click()
+
     wait_for(page, "return document.querySelector('#sagittal .enlarge').getAttribute('aria-pressed') === 'false'")
-    assert page.execute_script(SHOWN) == ["scene"]
+    assert shown_views(page) == ["scene"]
 
 
-def test_slice_with_the_focus_is_used_by_keys_and_says_what_it_shows(page) -> None:
+# Keys
+
+
+@pytest.fixture
+def page_with_focus_on_coronal(page):
+    """The mouse lies over the axial slice, which does not take the keys from the coronal one."""
     from selenium.webdriver.common.keys import Keys
 
-    go_to(page, scenes.middle(0))
-    point_at(page, "axial", scenes.middle(0))  # the mouse does not take the keys from it
-    coronal = page.find_element("id", "coronal")
-    page.find_element("id", "scene").send_keys(4 * Keys.TAB)  # each view is followed by its button
-    number, before = facts(page)["slices"]["coronal"]["number"], mm_of_pixel(page, "coronal")
-    press(page, Keys.PAGE_DOWN)
+    point_at(page, "axial", scenes.middle(0))
+    page.find_element("id", "scene").send_keys(4 * Keys.TAB)  # scene, its button, axial, its button, coronal
+    return page
+
+
+def test_page_down_shows_the_next_slice_of_the_view_with_the_focus(page_with_focus_on_coronal) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    number = facts(page_with_focus_on_coronal)["slices"]["coronal"]["number"]
+
+    press_keys(page_with_focus_on_coronal, Keys.PAGE_DOWN)
+
+    assert wait_for(page_with_focus_on_coronal, f"return clrecon.facts.slices.coronal.number === {number + 1}")
+
+
+def test_plus_zooms_the_slice_with_the_focus_by_a_quarter(page_with_focus_on_coronal) -> None:
+    before = mm_of_pixel(page_with_focus_on_coronal, "coronal")
+
+    press_keys(page_with_focus_on_coronal, "+")
+
+    wait_for_zoom(page_with_focus_on_coronal, "coronal")
+    assert before / mm_of_pixel(page_with_focus_on_coronal, "coronal") == pytest.approx(1.25)
+
+
+def test_slice_is_described_for_screen_readers_after_it_was_scrolled(page_with_focus_on_coronal) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    page = page_with_focus_on_coronal
+    number = facts(page)["slices"]["coronal"]["number"]
+
+    press_keys(page, Keys.PAGE_DOWN)
+
     wait_for(page, f"return clrecon.facts.slices.coronal.number === {number + 1}")
-    press(page, "+")
-    wait_for(page, "return clrecon.facts.settled && clrecon.facts.undo === 'the zoom of the coronal slice'")
-    assert before / mm_of_pixel(page, "coronal") == pytest.approx(1.25, rel=1e-3)
+    wait_for(page, SETTLED)
     shown = facts(page)["slices"]["coronal"]
-    said = f"coronal slice {number + 1} of {shown['count']}, {shown['place']}, level 300, width 1500 HU"
-    assert coronal.find_element("tag name", "canvas").get_attribute("aria-label") == said
-    press(page, "z")
-    wait_for(page, "return document.querySelector('#coronal.large')")
-    press(page, "z")
-    wait_for(page, "return !document.querySelector('.large')")
+    label = page.find_element("css selector", "#coronal canvas").get_attribute("aria-label")
+    window = "level 300, width 1500 HU"  # the one that a view begins with
+    assert label == f"coronal slice {number + 1} of {shown['count']}, {shown['place']}, {window}"
+
+
+def test_key_z_shows_the_slice_with_the_focus_at_full_size_and_back(page_with_focus_on_coronal) -> None:
+    press_keys(page_with_focus_on_coronal, "z")
+    wait_for(page_with_focus_on_coronal, "return document.querySelector('#coronal.large')")
+
+    press_keys(page_with_focus_on_coronal, "z")
+    assert wait_for(page_with_focus_on_coronal, "return !document.querySelector('.large')")
