@@ -207,20 +207,15 @@ def test_mesh_for_a_terminal_is_refused(ct, capsys, monkeypatch):
     assert printed.out == ""
 
 
-def test_reader_that_closes_standard_output_early_is_no_error(device, ct):
-    command = [
-        sys.executable,
-        "-m",
-        "clrecon",
-        "mesh",
-        str(ct),
-        "--hu",
-        "200",
-        "-o",
-        "-",
-        "--device",
-        str(device.index),
-    ]
+MOST_BYTES_IN_A_PIPE = 65_536  # of Linux; fewer elsewhere
+
+
+def test_reader_that_closes_standard_output_before_all_is_written_is_no_error(device, ct, tmp_path):
+    mesh = ["mesh", str(ct), "--hu", "200", "--device", str(device.index)]
+    assert run(*mesh, "-o", tmp_path / "whole.stl") == 0
+    assert (tmp_path / "whole.stl").stat().st_size > MOST_BYTES_IN_A_PIPE  # 268,484: the command has to wait
+
+    command = [sys.executable, "-m", "clrecon", *mesh, "-o", "-"]
     job = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert job.stdout is not None and job.stderr is not None
     job.stdout.read(10)

@@ -315,10 +315,13 @@ def test_none_or_all_triangles_lie_beside_where_none_or_all_have_changed(changed
     assert (find_beside(*row_of_triangles(axis=0), np.full(40, changed)) == changed).all()
 
 
-def test_coarse_cells_of_a_speck_are_enlarged_to_a_64th_of_the_mesh():
-    """A cube of 10 mm has 4096 cells at most, of 10/64 mm: a speck 0.05 mm off lies in that of the changed one."""
+def test_a_speck_beside_a_changed_one_is_found_as_cells_do_not_get_as_small_as_specks():
+    """The 10 mm of a mesh of few triangles have at most 4096 = 16**3 cells, which grow from a speck's size by 1.25."""
+    smallest_cell = 10.0 / (16 - 1)  # mm; the last of 16 cells begins where the mesh ends
+    largest_cell = 1.25 * smallest_cell
     speck = np.array([[0.0, 0.0, 0.0], [1e-6, 0.0, 0.0], [0.0, 1e-6, 1e-6]])
-    vertices = np.concatenate([speck, speck + [0.05, 0.0, 0.0], speck + [2.0, 2.0, 0.0], speck + 10.0])
+    places = [(0.0, 0.0, 0.0), (0.99 * smallest_cell, 0.0, 0.0), (1.01 * largest_cell, 0.0, 0.0), (10.0, 10.0, 10.0)]
+    vertices = np.concatenate([speck + place for place in places])
     triangles = np.arange(12, dtype=np.uint32).reshape(-1, 3)
     assert list_beside(vertices, triangles, 0) == [0, 1]
 

@@ -168,53 +168,88 @@ def test_argument_names_and_types_read_from_sources_are_those_of_the_compiler(op
     assert by_reader == by_compiler
 
 
-SOURCE = """
+def read_arguments(source: str, *options: str) -> str:
+    """The arguments of the only kernel `work` of a source as "name:type", buffers as "name:type*"."""
+    signatures = find_signatures(source, definitions_of(options))
+    assert list(signatures) == ["work"]
+    return " ".join(f"{each.name}:{each.type}{'*' * each.is_buffer}" for each in signatures["work"])
+
+
+def test_arguments_of_a_kernel_have_their_names_and_types_whatever_qualifiers_attributes_and_comments_say():
+    source = """
+/* A __kernel in a comment, void of meaning (really) { */
+__kernel __attribute__((vec_type_hint(int))) /* why */
+void work(__global const float *restrict data, // the data
+    const int count)
+{
+}
+"""
+    assert read_arguments(source) == "data:float* count:int"
+
+
+@pytest.mark.parametrize(("options", "type_of_data"), [((), "int"), (("-DWIDE",), "long")], ids=["first", "second"])
+def test_argument_has_the_type_that_its_macro_was_defined_as_last(options, type_of_data):
+    source = """
 #define TYPE int
 #ifdef WIDE
 #undef TYPE
 #define TYPE long /* of all numbers */
 #endif
-#define ADDED_PARAMETERS \\
-    , const float added
-#define HELPER(a) (a)
-#if !defined(WIDE) && LANES > 1
-#define MORE_PARAMETERS ADDED_PARAMETERS
-#else
-#define MORE_PARAMETERS
-#endif
-/* A __kernel in a comment, void of meaning (really) { */
-__kernel __attribute__((vec_type_hint(int))) /* why */
-void work(__global const TYPE *restrict data, // the data
-    const TYPE count
+__kernel void work(__global const TYPE *data, const TYPE count) { }
+"""
+    assert read_arguments(source, *options) == f"data:{type_of_data}* count:{type_of_data}"
+
+
+@pytest.mark.parametrize(
+    ("options", "arguments"),
+    [
+        ((), "count:int"),
+        (("-DLANES=4",), "count:int four:uint"),
+        (("-DLANES=8",), "count:int"),
+        (("-DNAMED=1",), "count:int place:float4"),
+        (("-DNAMED", "-cl-mad-enable"), "count:int place:float4"),
+        (("-DNAMED=1", "-DLANES=4"), "count:int place:float4"),
+    ],
+    ids=["neither", "elif", "elif of another value", "ifdef", "ifdef without a value", "both"],
+)
+def test_kernel_has_the_arguments_of_the_branch_that_its_options_choose(options, arguments):
+    source = """
+__kernel void work(const int count
 #ifdef NAMED
     , const float4 place
 #elif LANES == 4
     , const uint four
 #endif
-    MORE_PARAMETERS)
-{
-}
-#if 0
-__kernel void never(const int a) { }
-#endif
+    ) { }
 """
+    assert read_arguments(source, *options) == arguments
 
 
 @pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ((), "data:int* count:int"),
-        (("-DWIDE",), "data:long* count:long"),
-        (("-DLANES=4",), "data:int* count:int four:uint added:float"),
-        (("-DLANES=8", "-DNAMED=1"), "data:int* count:int place:float4 added:float"),
-        (("-DLANES=8", "-DNAMED", "-DWIDE", "-cl-mad-enable"), "data:long* count:long place:float4"),
-    ],
+    ("options", "arguments"),
+    [(("-DLANES=8",), "count:int added:float"), (("-DLANES=1",), "count:int"), (("-DLANES=8", "-DWIDE"), "count:int")],
+    ids=["holds", "second part fails", "first part fails"],
 )
-def test_kernel_arguments_are_those_that_the_preprocessor_leaves(options, expected):
-    signatures = find_signatures(SOURCE, definitions_of(options))
-    assert list(signatures) == ["work"]
-    arguments = [f"{each.name}:{each.type}{'*' * each.is_buffer}" for each in signatures["work"]]
-    assert " ".join(arguments) == expected
+def test_kernel_has_the_arguments_of_a_macro_of_several_lines_where_its_condition_holds(options, arguments):
+    source = """
+#define ADDED_PARAMETERS \\
+    , const float added
+#if !defined(WIDE) && LANES > 1
+#define MORE_PARAMETERS ADDED_PARAMETERS
+#else
+#define MORE_PARAMETERS
+#endif
+__kernel void work(const int count MORE_PARAMETERS) { }
+"""
+    assert read_arguments(source, *options) == arguments
+
+
+def test_macro_with_parameters_does_not_replace_an_argument_of_its_name():
+    source = """
+#define count(a) (a)
+__kernel void work(const int count) { }
+"""
+    assert read_arguments(source) == "count:int"
 
 
 @pytest.mark.parametrize(

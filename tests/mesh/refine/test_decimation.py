@@ -153,14 +153,29 @@ def test_mesh_refinement_is_public():
     assert {"smooth_mesh", "decimate_mesh", "compare_meshes"} <= set(clrecon.__all__)
 
 
-def test_a_mesh_of_2_to_the_31_corners_is_too_large():
-    def of(vertices: int, triangles: int) -> Any:
-        return SimpleNamespace(vertex_count=vertices, triangle_count=triangles, check=lambda: None)
+MOST_TRIANGLES = (2**31 - 1) // 3
+"""Whose three corners each an int32 can number."""
 
-    assert check_refinement(of(1, 715_827_882), 1.0) == check_refinement(of(2**31 - 1, 1), 1.0) == 1.0
-    for large in (of(1, 715_827_883), of(2**31, 1)):
-        with refused(UsageError, 715827882):
-            check_refinement(large, 1.0)
+
+def mesh_of_counts(vertices: int, triangles: int) -> Any:
+    """What a check of the size of a mesh looks at: a mesh itself would take 26 GB."""
+    return SimpleNamespace(vertex_count=vertices, triangle_count=triangles, check=lambda: None)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "triangles"), [(2**31, 1), (1, MOST_TRIANGLES + 1)], ids=["vertices", "corners of triangles"]
+)
+def test_a_mesh_of_2_to_the_31_vertices_or_corners_is_refused_with_the_most_triangles(vertices, triangles):
+    with refused(UsageError, MOST_TRIANGLES):
+        check_refinement(mesh_of_counts(vertices, triangles), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "triangles"), [(2**31 - 1, 1), (1, MOST_TRIANGLES)], ids=["vertices", "corners of triangles"]
+)
+def test_a_mesh_of_one_vertex_or_triangle_fewer_than_is_refused_keeps_its_bound(vertices, triangles):
+    bound_mm = 1.0
+    assert check_refinement(mesh_of_counts(vertices, triangles), bound_mm) == bound_mm
 
 
 def test_an_open_surface_keeps_its_border():

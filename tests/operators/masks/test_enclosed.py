@@ -76,7 +76,9 @@ def test_pore_of_a_hollow_sphere_is_filled_except_for_its_mouth(pierced_sphere, 
 
 def test_report_of_a_filled_sphere_tells_its_space_and_volume(pierced_sphere, filled_sphere):
     facts = filled_sphere.report["solid"]
-    assert facts["filled_ml"] == pytest.approx(np.count_nonzero(inner_voxels(pierced_sphere)) / 1000, rel=0.005)
+    inside_ml = np.count_nonzero(inner_voxels(pierced_sphere)) / 1000  # voxels of 1 mm
+    # What is filled of the pore beyond the middle of the wall is a voxel or two of 13,951; measured: none.
+    assert facts["filled_ml"] == pytest.approx(inside_ml, rel=2e-4)
     assert (facts["spaces"], facts["at_ends"], facts["filled_air_ml"]) == (1, 0, 0)
     assert filled_sphere.report["warnings"] == []
 

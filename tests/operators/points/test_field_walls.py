@@ -34,15 +34,25 @@ BODY = np.ones((20, 20, 20), bool)
 NO_NODE = ~BODY
 
 
-def test_the_walls_of_a_void_without_support_enclose_its_volume():
-    """A box of 6 x 8 x 10 nodes without points within a body."""
+@pytest.fixture
+def walls_of_a_void():
+    """Of a box of 6 x 8 x 10 nodes without points within a body of 20 nodes, which lies in one cube of 32."""
     inside = BODY.copy()
     inside[4:10, 5:13, 6:16] = False
-    walls = find_walls(pack_bits(inside), pack_bits(NO_NODE), pack_bits(inside), 20)
-    assert walls.faces.sum() == walls.walls.sum() == 2 * (6 * 8 + 8 * 10 + 6 * 10)
-    assert walls.lost == pytest.approx(6 * 8 * 10)
-    assert walls.share == 1.0
-    assert walls.worst(3) == [(0, 0, 0)]  # the only cube of 32 nodes
+    return find_walls(pack_bits(inside), pack_bits(NO_NODE), pack_bits(inside), 20)
+
+
+def test_the_walls_of_a_void_without_support_enclose_its_volume(walls_of_a_void):
+    assert walls_of_a_void.lost == pytest.approx(6 * 8 * 10)
+
+
+def test_all_faces_of_a_void_without_support_are_walls(walls_of_a_void):
+    assert walls_of_a_void.faces.sum() == walls_of_a_void.walls.sum() == 2 * (6 * 8 + 8 * 10 + 6 * 10)
+    assert walls_of_a_void.share == 1.0
+
+
+def test_the_only_cube_with_walls_is_the_worst(walls_of_a_void):
+    assert walls_of_a_void.worst(3) == [(0, 0, 0)]
 
 
 HALF = np.repeat(np.arange(20) >= 10, 20 * 20).reshape(20, 20, 20)

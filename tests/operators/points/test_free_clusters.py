@@ -105,6 +105,7 @@ def test_points_too_far_apart_for_cells_of_eps_are_refused():
 
 POINTS_OF_PASSES = scattered_points(5000, BOX, seed=3)
 EPS_OF_PASSES = 0.9
+WIDENED_EPS = 1.0 + 1e-6  # within it points are neighbours, so that those at eps are, however it is rounded
 
 
 def start_search(device):
@@ -119,24 +120,29 @@ def test_pairs_of_a_search_are_counted_as_by_the_twin(device, kernel_form):
     assert np.array_equal(search.count_pairs(), twin.count_pairs(grid, edge, 3))
 
 
-def test_core_points_joined_within_chunks_equal_the_twin(device, kernel_form):
+@pytest.fixture
+def search_joined_in_chunks(device, kernel_form):
+    """A search whose core points within chunks of 64 are joined, its grid, and the roots that the twin finds."""
     search, grid, _ = start_search(device)
     search.find_cores()
     search.join_within()
     _, _, cores = twin.cluster_points(POINTS_OF_PASSES, EPS_OF_PASSES, 3)
-    expected = twin.join_chunks(grid, cores[grid.order], EPS_OF_PASSES * (1 + 1e-6), 64)
-    found = module.ocl.download(device, np.empty(len(expected), np.uint32), search.labels_d)
-    assert np.array_equal(found, expected)
+    return search, grid, twin.join_chunks(grid, cores[grid.order], EPS_OF_PASSES * WIDENED_EPS, 64)
 
 
-def test_words_of_the_grid_note_the_root_of_their_points_as_the_twin_does(device, kernel_form):
-    search, grid, _ = start_search(device)
-    search.find_cores()
-    search.join_within()
-    search.note_words()
-    _, _, cores = twin.cluster_points(POINTS_OF_PASSES, EPS_OF_PASSES, 3)
-    expected = twin.note_words(grid, twin.join_chunks(grid, cores[grid.order], EPS_OF_PASSES * (1 + 1e-6), 64))
+def test_core_points_joined_within_chunks_equal_the_twin(device, search_joined_in_chunks):
+    search, _, expected = search_joined_in_chunks
+    assert np.array_equal(module.ocl.download(device, np.empty(len(expected), np.uint32), search.labels_d), expected)
+
+
+def test_roots_of_the_clusters_in_32_cells_of_a_word_are_those_of_the_twin_or_several(device, search_joined_in_chunks):
+    """A union-find has a root for each cluster of core points; a word of the grid stands for 32 cells side by side."""
+    search, grid, joined = search_joined_in_chunks
+    expected = twin.note_words(grid, joined)
     assert (expected == twin.SEVERAL_ROOTS).any(), "no word has several roots"
+
+    search.note_words()
+
     assert np.array_equal(module.ocl.download(device, np.empty(len(expected), np.uint32), search.roots_d), expected)
 
 
@@ -161,7 +167,7 @@ def test_clusters_of_a_lattice_whose_distances_round_to_eps_equal_the_twin(devic
 def test_distances_at_the_limit_are_decided_as_in_exact_arithmetic(device, kernel_form):
     """3000 pairs of points within 1e-7 of eps of being eps apart, each pair 5 mm from the next."""
     rng, eps, n = np.random.default_rng(4), 1.25, 3000
-    limit = eps * (1.0 + 1e-6)
+    limit = eps * WIDENED_EPS
     ways = rng.normal(size=(n, 3))
     ways *= limit * (1.0 + rng.uniform(-1e-7, 1e-7, (n, 1))) / np.linalg.norm(ways, axis=1, keepdims=True)
     places = 5.0 * np.stack(np.unravel_index(np.arange(n), (15, 15, 15)), axis=1) - 35.0 + rng.random((n, 3))

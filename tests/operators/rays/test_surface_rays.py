@@ -163,20 +163,36 @@ def test_depths_of_rays_to_a_surface_and_its_caps_are_those_of_the_extracted_mes
     assert near.mean() >= 1.0 - tolerances.SURFACE_OUTLINE_SHARE
 
 
-def test_cap_of_a_clipped_surface_is_flat_and_lit_by_the_plane(device):
+@pytest.fixture(scope="module")
+def clipped_ball(device):
+    """A picture of a ball that a slanted plane 2 mm from its middle clips, and of each pixel on the cap:
+
+    which these are, the depth of the plane, and the cosine between the ray and the normal of the plane.
+    """
     volume = make_volume(ball, "mirrored", 20.0)
     normal = np.array([0.3, 1.0, 0.2]) / np.linalg.norm([0.3, 1.0, 0.2])
-    middle = centre_of(volume) + 2.0 * normal
+    on_plane = centre_of(volume) + 2.0 * normal
     camera = look(volume, (-0.2, 1.0, -0.3), 9.0, perspective=True)
-    found = cast_rays(device, volume, 300.0, camera, clip=Clip.plane(middle, normal), lighting=MATT)
+    picture = cast_rays(device, volume, 300.0, camera, clip=Clip.plane(on_plane, normal), lighting=MATT)
     origins, directions = camera.rays(SIZE)
-    truth = (middle - origins) @ normal / (directions @ normal)
-    points = origins + truth[..., None] * directions - centre_of(volume)
-    cap = np.linalg.norm(points, axis=-1) < RADIUS - 0.2
-    assert cap.sum() > 300  # measured 724
-    assert np.abs(found.depth - truth)[cap].max() <= tolerances.SLICE_DEPTH_MM
-    light = 255.0 * (MATT.ambient + MATT.diffuse * np.abs(directions @ normal))
-    assert np.abs(found.image[..., 0] - light)[cap].max() <= tolerances.RAY_SAME_255
+    cosine = directions @ normal
+    depth_of_plane = (on_plane - origins) @ normal / cosine
+    hits = origins + depth_of_plane[..., None] * directions - centre_of(volume)
+    on_cap = np.linalg.norm(hits, axis=-1) < RADIUS - 0.2  # mm: pixels at its rim are left out
+    assert on_cap.sum() > 300  # measured 724
+    return picture, on_cap, depth_of_plane, cosine
+
+
+def test_cap_of_a_clipped_surface_lies_on_the_plane(clipped_ball):
+    picture, on_cap, depth_of_plane, _ = clipped_ball
+    assert np.abs(picture.depth - depth_of_plane)[on_cap].max() <= tolerances.SLICE_DEPTH_MM
+
+
+def test_cap_of_a_clipped_surface_has_the_light_of_the_plane(clipped_ball):
+    """The lamp is at the camera, so that light falls by the cosine between ray and normal."""
+    picture, on_cap, _, cosine = clipped_ball
+    light_of_255 = 255.0 * (MATT.ambient + MATT.diffuse * np.abs(cosine))
+    assert np.abs(picture.image[..., 0] - light_of_255)[on_cap].max() <= tolerances.RAY_SAME_255
 
 
 def test_a_camera_inside_of_bone_sees_a_white_cap_at_its_own_place(device):

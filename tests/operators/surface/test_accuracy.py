@@ -78,7 +78,8 @@ def test_surface_of_the_distance_field_of_a_sphere_has_its_volume_and_area(devic
     volume = sample(lambda p: radius - np.linalg.norm(p, axis=1), steps, radius)
     quality = extract_isosurface(volume, 0.0, device=device).quality()
     exact_ml = 4 / 3 * np.pi * radius**3 / 1000
-    assert 0.96 * exact_ml < quality["volume_ml"] < exact_ml
+    # Chords of a voxel h sag by h^2 / 8 R = R / 200, diagonals twice as far: 1.5 to 3 % of volume; measured 1.1 to 2.4.
+    assert 0.97 * exact_ml < quality["volume_ml"] < exact_ml
     assert quality["area_mm2"] == pytest.approx(4 * np.pi * radius**2, rel=0.02)  # measured 0.013
 
 

@@ -118,6 +118,7 @@ def test_crossings_among_triangles_without_area_are_those_of_the_host(device):
     vertices, triangles = scattered(400)
     vertices[::7] = vertices[1::7][: len(vertices[::7])]  # two corners in one place
     found = find_crossings(device, vertices, triangles, fewest=1)
+    assert len(found) > 10  # measured 221
     assert pairs(found) == pairs(find_self_intersections(vertices, triangles))
 
 

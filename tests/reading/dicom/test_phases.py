@@ -106,14 +106,31 @@ def test_each_of_two_phases_is_read_by_its_number(tmp_path, first, second, keywo
         assert volume.ijk_to_lps([(2, 3, 4)])[0] == pytest.approx(plan.truth([(2, 3, 4)])[0])
 
 
-@TWO_PHASES
-def test_report_of_a_phase_says_which_one_it_is_without_a_date(tmp_path, first, second, keyword, values):
+@pytest.fixture
+def report_of_phase_2(tmp_path, first, second):
+    """The report of the second of two phases of 7 slices each, which are told apart by an element."""
+    slices = Plan().shape[0]
+    assert slices == 7
     write_phase(tmp_path, 1, **first)
-    write_phase(tmp_path, 2, 500, **second)
-    report = read_volume(tmp_path, phase=2).report
-    assert report["phase"] == {"number": 2, "of": 2, "keyword": keyword, "value": values[1]}
-    assert f"phase 2 of 2 ({keyword} {values[1]}) read, 7 slices of others left" in report["warnings"]
-    assert not any("2020" in warning or "2021" in warning for warning in report["warnings"])
+    write_phase(tmp_path, 2, shift=500, **second)  # HU, so that its slices are no copies of the first phase's
+    return read_volume(tmp_path, phase=2).report
+
+
+@TWO_PHASES
+def test_report_of_a_phase_says_which_one_it_is(report_of_phase_2, keyword, values):
+    assert report_of_phase_2["phase"] == {"number": 2, "of": 2, "keyword": keyword, "value": values[1]}
+
+
+@TWO_PHASES
+def test_warning_of_a_phase_tells_how_many_slices_of_others_are_left_out(report_of_phase_2, keyword, values):
+    expected = f"phase 2 of 2 ({keyword} {values[1]}) read, 7 slices of others left"
+    assert expected in report_of_phase_2["warnings"]
+
+
+@TWO_PHASES
+def test_warnings_of_a_phase_hold_no_date_of_its_slices(report_of_phase_2, keyword, values):
+    assert report_of_phase_2["warnings"]
+    assert not any("2020" in warning or "2021" in warning for warning in report_of_phase_2["warnings"])
 
 
 def test_phases_of_different_lengths_are_listed_and_read(tmp_path):

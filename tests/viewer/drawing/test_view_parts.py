@@ -44,12 +44,25 @@ def test_parts_lie_over_their_bone_in_slices_of_an_uneven_scan(open_model_and_pa
     assert tinted[bone].mean() > 0.97 and bone[tinted].mean() > 0.6  # parts are grown by a voxel
 
 
-def test_parts_of_a_scan_are_its_balls_by_size_and_the_rest(open_model_and_painter):
+def test_parts_of_a_scan_are_the_scan_its_three_balls_from_the_largest_on_and_the_rest(open_model_and_painter):
     model, painter = open_model_and_painter()
 
     find(model, painter)
 
-    assert [part.key for part in model.state.parts] == ["1", "1/1", "1/2", "1/3", "1/0"]
+    scan, *balls, rest = model.state.parts  # their keys: the number of the object, and that of the part in it
+    assert (scan.key, scan.kind) == ("1", "scan")
+    assert [part.key for part in balls] == ["1/1", "1/2", "1/3"]
+    assert balls[0].ml > balls[1].ml > balls[2].ml  # their radii are 9, 5 and 3 mm
+    assert (rest.key, rest.kind) == ("1/0", "rest")
+
+
+def test_model_and_painter_know_that_parts_are_found(open_model_and_painter):
+    model, painter = open_model_and_painter()
+    assert not model.parts_known
+    assert not painter.has_parts(model.state)
+
+    find(model, painter)
+
     assert model.parts_known
     assert painter.has_parts(model.state)
 
