@@ -166,32 +166,61 @@ def test_parts_of_the_first_time_of_a_method_add_up_to_it(device: Any, whole: Pa
 
 @pytest.mark.release
 @pytest.mark.long
-def test_page_of_a_comparison_has_all_its_pictures_within_and_is_valid_html(device: Any, whole: Path) -> None:
+def test_page_of_a_comparison_is_valid_html_of_less_than_2_mb(device: Any, whole: Path) -> None:
     page = (whole / "index.html").read_text(encoding="utf-8")
     assert find_faults(page) == []
     assert len(page.encode()) < MOST_BYTES
-    check = PageCheck(page)
-    assert len(check.pictures) == 14 + 12 + 4
-    assert all(picture["src"].startswith("data:image/webp;base64,") for picture in check.pictures)
-    assert page.count("<svg") == 3 and "<text" in page and page.count("<style") == 1
-    assert "prefers-color-scheme: dark" in page and "@media print" in page
+
+
+@pytest.mark.release
+@pytest.mark.long
+def test_page_of_a_comparison_has_all_its_pictures_within(device: Any, whole: Path) -> None:
+    pictures = PageCheck((whole / "index.html").read_text(encoding="utf-8")).pictures
+    assert len(pictures) == 14 + 12 + 4  # methods, differences from the reference, two slices with a detail of each
+    assert {picture["src"].partition(",")[0] for picture in pictures} == {"data:image/webp;base64"}
+
+
+@pytest.mark.release
+@pytest.mark.long
+def test_page_of_a_comparison_has_three_drawings_and_one_style_for_dark_screens_and_print(
+    device: Any, whole: Path
+) -> None:
+    page = (whole / "index.html").read_text(encoding="utf-8")
+    assert page.count("<svg") == 3
+    assert "<text" in page
+    assert page.count("<style") == 1
+    assert "prefers-color-scheme: dark" in page
+    assert "@media print" in page
 
 
 @pytest.mark.release
 @pytest.mark.long
 def test_table_of_the_page_has_the_numbers_of_the_report(device: Any, whole: Path) -> None:
-    report = read_report(whole)
-    check = PageCheck((whole / "index.html").read_text(encoding="utf-8"))
-    table = {row[0]: row[1:] for row in check.tables[0] if len(row) > 2}
-    for method in report["methods"]:
+    page = PageCheck((whole / "index.html").read_text(encoding="utf-8"))
+    rows = {row[0]: row[1:] for row in page.tables[0] if len(row) > 2}
+    for method in read_report(whole)["methods"]:
         record = MethodRecord(**method)
-        expected = [(value, column) for column in COLUMNS for value in [column.take(record)]]
-        texts = ["\N{EN DASH}" if value is None else column.write(value) for value, column in expected]
-        assert table[method["title"]][: len(COLUMNS)] == texts
+        values = [(column.take(record), column.write) for column in COLUMNS]
+        expected = ["\N{EN DASH}" if value is None else write(value) for value, write in values]
+        assert rows[method["title"]][: len(COLUMNS)] == expected
+
+
+@pytest.mark.release
+@pytest.mark.long
+def test_page_of_a_comparison_has_every_finding_of_the_report(device: Any, whole: Path) -> None:
     page = (whole / "index.html").read_text(encoding="utf-8")
-    assert all(finding.replace("'", "&#x27;") in page for finding in report["findings"])
-    paper = {row[0]: row for row in check.tables[2] if len(row) > 2}
-    assert paper["all black"][3] == f"{report['paper']['controls']['black']['ssim']:.3f}"
+    findings = read_report(whole)["findings"]
+    assert findings
+    assert [finding for finding in findings if finding.replace("'", "&#x27;") not in page] == []
+
+
+@pytest.mark.release
+@pytest.mark.long
+def test_table_of_the_paper_has_the_likeness_of_a_black_picture(device: Any, whole: Path) -> None:
+    page = PageCheck((whole / "index.html").read_text(encoding="utf-8"))
+    rows = {row[0]: row for row in page.tables[2] if len(row) > 2}
+    likeness_column = 3
+    assert rows["all black"][likeness_column] == f"{read_report(whole)['paper']['controls']['black']['ssim']:.3f}"
 
 
 @pytest.mark.release
@@ -236,16 +265,16 @@ def test_two_comparisons_differ_in_times_and_memory_alone(
 
 
 @pytest.mark.parametrize(
-    ("state", "asked", "code"),
+    ("state", "named", "is_missed"),
     [
-        ("done", (), 0), ("declined", (), 0), ("missing", (), 0), ("failed", (), 8),
-        ("declined", ("vtk-mc",), 8), ("missing", ("vtk-mc",), 8), ("declined", ("skimage",), 0),
+        ("done", (), False), ("declined", (), False), ("missing", (), False), ("failed", (), True),
+        ("declined", ("vtk-mc",), True), ("missing", ("vtk-mc",), True), ("declined", ("skimage",), False),
     ],
 )  # fmt: skip
 def test_only_a_failed_method_or_a_named_one_that_did_not_run_fails_the_comparison(
-    state: str, asked: tuple[str, ...], code: int
+    state: str, named: tuple[str, ...], is_missed: bool
 ) -> None:
-    assert 8 * _is_missed({"name": "vtk-mc", "state": state}, asked) == code
+    assert _is_missed({"name": "vtk-mc", "state": state}, named) == is_missed
 
 
 @pytest.mark.parametrize(("error", "state"), [(UsageError("no"), "declined"), (DeviceError("no"), "failed")])
@@ -261,33 +290,40 @@ def test_method_that_refuses_its_input_has_declined_and_one_without_a_device_has
 
 
 @pytest.mark.seconds
-def test_method_that_crashes_or_lacks_its_library_has_a_row_with_the_reason(
+def test_method_that_crashes_or_lacks_its_library_is_told_with_the_reason_in_report_and_page(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Printer
 ) -> None:
     run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.child", ONE_CRASHES)
     arguments = ["compare", str(ball), "-o", str(tmp_path / "r"), "--device", str(device.index), "--repeat", "1"]
-    assert main([*arguments, "--methods", "skimage,vtk-mc,t-mc"]) == 8
-    rows = {m["name"]: m for m in read_report(tmp_path / "r")["methods"]}
-    assert {name: row["state"] for name, row in rows.items()} == {
-        "t-mc": "done", "skimage": "failed", "vtk-mc": "missing",
-    }  # fmt: skip
-    assert "crashed with SIGABRT" in rows["skimage"]["error"]
-    assert rows["vtk-mc"]["error"] == "vtkmodules is not installed"
+
+    code = main([*arguments, "--methods", "skimage,vtk-mc,t-mc"])
+
+    assert code == 8
+    rows = {method["name"]: (method["state"], method["error"]) for method in read_report(tmp_path / "r")["methods"]}
+    assert rows["t-mc"] == ("done", None)
+    assert rows["vtk-mc"] == ("missing", "vtkmodules is not installed")
+    state, reason = rows["skimage"]
+    assert (state, "crashed with SIGABRT" in reason) == ("failed", True)
     page = (tmp_path / "r" / "index.html").read_text()
     assert find_faults(page) == []
-    assert "failed: its process crashed with SIGABRT" in page and "not installed: vtkmodules" in page
+    assert "failed: its process crashed with SIGABRT" in page
+    assert "not installed: vtkmodules" in page
     printed().assert_output("VTK", "MC")
 
 
 @pytest.mark.release
-def test_page_without_its_reference_has_the_measures_that_need_none(
+def test_comparison_whose_reference_crashes_has_the_measures_that_need_none(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.child", ONE_CRASHES)
     settings = CompareSettings(methods=("t-mc",), reference="skimage", repeat=1, device=str(device.index))
+
     report = make_comparison(ball, tmp_path / "r", settings)
-    rows = {m.name: m for m in report.methods}
-    assert rows["skimage"].state == "failed" and rows["t-mc"].surfaces is None and rows["t-mc"].slices is not None
+
+    methods = {method.name: method for method in report.methods}
+    assert methods["skimage"].state == "failed"
+    assert methods["t-mc"].surfaces is None
+    assert methods["t-mc"].slices is not None
     assert find_faults((tmp_path / "r" / "index.html").read_text()) == []
 
 
@@ -339,50 +375,92 @@ def test_iso_value_without_a_surface_is_refused_before_any_method_runs(
         ("--truth nowhere/truth.json", "truth.json cannot be read"),
     ],
 )
-def test_wrong_arguments_are_one_line(
+def test_wrong_option_of_a_comparison_is_refused_in_one_line_before_input_and_device_are_looked_for(
     options: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Neither input nor device is looked for: there is none of either."""
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.chdir(tmp_path)  # there is no scan
     monkeypatch.setenv("CLRECON_DEVICE", "no such device")
-    assert main(["compare", "scan", "-o", "r", *options.split()]) == 3
-    said = capsys.readouterr().err
-    assert words in said and said.count("\n") == 1
+
+    code = main(["compare", "scan", "-o", "r", *options.split()])
+
+    told = capsys.readouterr().err
+    assert code == 3
+    assert words in told
+    assert told.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
-def test_folder_of_a_comparison_with_other_files_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CLRECON_DEVICE", "no such device")
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        pytest.param("notes.txt", "holds other things", id="another file"),
+        pytest.param("t-mc.png", "pictures without the page", id="a picture without the page"),
+    ],
+)
+def test_folder_of_a_comparison_with_other_files_is_refused_and_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, words: str
+) -> None:
+    monkeypatch.setenv("CLRECON_DEVICE", "no such device")  # it is not looked for
     (tmp_path / "r").mkdir()
-    (tmp_path / "r" / "notes.txt").write_text("mine")
-    with pytest.raises(UsageError, match="holds other things"):
+    (tmp_path / "r" / name).write_text("mine")
+    with pytest.raises(UsageError, match=words):
         make_comparison(tmp_path, tmp_path / "r")
-    (tmp_path / "r" / "notes.txt").rename(tmp_path / "r" / "t-mc.png")
-    with pytest.raises(UsageError, match="pictures without the page"):
-        make_comparison(tmp_path, tmp_path / "r")
+    assert (tmp_path / "r" / name).read_text() == "mine"
+
+
+def test_file_in_place_of_the_folder_of_a_comparison_is_refused_and_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CLRECON_DEVICE", "no such device")
+    (tmp_path / "r").write_text("mine")
     with pytest.raises(OutputError, match="it is a file"):
-        make_comparison(tmp_path, tmp_path / "r" / "t-mc.png")
+        make_comparison(tmp_path, tmp_path / "r")
+    assert (tmp_path / "r").read_text() == "mine"
+
+
+def test_folder_of_a_comparison_in_a_folder_that_does_not_exist_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CLRECON_DEVICE", "no such device")
     with pytest.raises(OutputError, match="does not exist, make it first"):
         make_comparison(tmp_path, tmp_path / "none" / "r")
-    assert (tmp_path / "r" / "t-mc.png").read_text() == "mine"
 
 
-@pytest.mark.seconds
-@pytest.mark.usefixtures("in_this_process")
-def test_an_earlier_comparison_is_replaced_as_a_whole(device: Any, ball: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def earlier_comparison(tmp_path: Path) -> Path:
+    """A folder with page, report and one picture of an earlier comparison."""
     folder = tmp_path / "r"
     folder.mkdir()
     for name in ("index.html", "report.json", "s-mc.png"):
         (folder / name).write_text("old")
-    settings = CompareSettings(methods=("t-mc",), repeat=1, device=str(device.index), keep_ids=True)
+    return folder
+
+
+def test_earlier_comparison_is_kept_and_the_new_one_refused_with_no_clobber(
+    device: Any, ball: Path, earlier_comparison: Path
+) -> None:
+    settings = CompareSettings(methods=("t-mc",), repeat=1, device=str(device.index))
     with refused(OutputError, "no_clobber=True"):
-        make_comparison(ball, folder, settings, no_clobber=True)
+        make_comparison(ball, earlier_comparison, settings, no_clobber=True)
+    assert (earlier_comparison / "report.json").read_text() == "old"
+
+
+@pytest.mark.seconds
+@pytest.mark.usefixtures("in_this_process")
+def test_earlier_comparison_is_replaced_as_a_whole_by_a_folder_with_the_rights_of_any_other(
+    device: Any, ball: Path, earlier_comparison: Path
+) -> None:
+    settings = CompareSettings(methods=("t-mc",), repeat=1, device=str(device.index), keep_ids=True)
     stages: list[str] = []
-    report = make_comparison(ball, folder, settings, progress=lambda stage, done, total: stages.append(stage))
-    assert not (folder / "s-mc.png").exists() and read_report(folder)["methods"][0]["name"] == "t-mc"
-    assert report.volume["series"]["uid_hash"] and [entry.name for entry in tmp_path.iterdir()] == ["r"]
+
+    report = make_comparison(ball, earlier_comparison, settings, progress=lambda stage, *_: stages.append(stage))
+
+    assert [entry.name for entry in earlier_comparison.parent.iterdir()] == ["r"]  # nothing of the work beside it
+    assert not (earlier_comparison / "s-mc.png").exists()
+    assert read_report(earlier_comparison)["methods"][0]["name"] == "t-mc"
+    assert oct(earlier_comparison.stat().st_mode & 0o777) == oct(0o777 & ~_umask())
     assert {"read", "compare methods", "measure methods", "report"} <= set(stages)
-    assert oct(folder.stat().st_mode & 0o777) == oct(0o777 & ~_umask())
+    assert report.volume["series"]["uid_hash"]  # keep_ids
 
 
 def _umask() -> int:

@@ -50,22 +50,39 @@ def test_runs_of_lattice_points_inside_are_those_of_the_trilinear_field(made, fi
     lattice = Lattice.over(volume, rule, finer, offsets)
     wanted = trilinear_values(volume, rule, points_of(lattice)) >= rule.iso_level
     ni, nj, _ = volume.shape_ijk
-    told: list[int] = []
-    keys = find_level_runs(volume, rule, lattice, told.append, most=4 * ni * nj)
-    assert (np.diff(keys) > 0).all()
-    assert told == list(range(0, lattice.cells_ijk[2], 4))
-    found = filled(keys, lattice)
-    assert np.array_equal(found.ravel(), wanted)
+    layers_at_once = 4
+
+    keys = find_level_runs(volume, rule, lattice, lambda _: None, most=layers_at_once * ni * nj)
+
+    assert (np.diff(keys) > 0).all()  # ends of runs in rising order
+    assert np.array_equal(filled(keys, lattice).ravel(), wanted)
     assert count_points(keys) == np.count_nonzero(wanted)
 
 
-def test_lattice_counts_no_point_or_all_of_a_constant_volume():
-    for value, closed, inside in ((0, True, 0), (0, False, 0), (9, False, 3 * 4 * 5), (9, True, 3 * 4 * 5)):
-        volume = Volume(np.full((4, 5, 6), value, np.int16), OBLIQUE)
-        rule = choose_iso_rule(volume, 5.0, closed=closed)
-        lattice = Lattice.over(volume, rule, 1, (0.0, 0.0, 0.0))
-        found = count_points(find_level_runs(volume, rule, lattice, lambda _: None))
-        assert found == (4 * 5 * 6 if closed and inside else inside)
+def test_search_for_runs_tells_the_first_layer_of_each_part():
+    volume = noise()
+    ni, nj, _ = volume.shape_ijk
+    rule = choose_iso_rule(volume, float(np.median(volume.voxels)) + 0.37)
+    lattice = Lattice.over(volume, rule, 3, (0.137, 0.271, 0.389))
+    told: list[int] = []
+    find_level_runs(volume, rule, lattice, told.append, most=4 * ni * nj)  # four layers of cells at once
+    assert told == list(range(0, lattice.cells_ijk[2], 4))
+
+
+@pytest.mark.parametrize(
+    ("value", "closed", "inside"),
+    [
+        pytest.param(0, True, 0, id="below the level, closed"),
+        pytest.param(0, False, 0, id="below the level, open"),
+        pytest.param(9, True, 4 * 5 * 6, id="above the level, closed"),
+        pytest.param(9, False, 3 * 4 * 5, id="above the level, open: the points of its cells"),
+    ],
+)
+def test_lattice_counts_no_point_of_a_constant_volume_below_the_level_and_all_of_one_above(value, closed, inside):
+    volume = Volume(np.full((4, 5, 6), value, np.int16), OBLIQUE)
+    rule = choose_iso_rule(volume, 5.0, closed=closed)
+    lattice = Lattice.over(volume, rule, 1, (0.0, 0.0, 0.0))
+    assert count_points(find_level_runs(volume, rule, lattice, lambda _: None)) == inside
 
 
 def test_exclusive_or_of_runs_has_the_points_of_one_alone():
