@@ -15,6 +15,7 @@ import json
 import os
 import platform
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -103,7 +104,7 @@ def _find_fault(device: Device) -> str:
     known = read_binary(key) or b""
     if known == _PASSED:
         return ""
-    if known == _BEGUN or known.startswith(_CRASHED):
+    if known == _BEGUN or known.startswith(_CRASHED) or _lacks_linker(device):
         fault, verdict = _check_apart(device)
     else:
         store_binary(key, _BEGUN)
@@ -142,7 +143,14 @@ def _check_apart(device: Device) -> tuple[str, bytes]:
     names = {-number: number.name for number in signal.Signals}
     how = names.get(ended.returncode, f"exit code {ended.returncode}")
     fault = f"its driver ends the process ({how})"
+    if _lacks_linker(device):
+        fault += ", because there is no linker ld on the PATH (Debian: apt install binutils libc6-dev libgcc-12-dev)"
     return fault, _CRASHED + fault.encode()
+
+
+def _lacks_linker(device: Device) -> bool:
+    """Tell whether this is a PoCL that may need the program ld and does not find it; newer ones bring a linker."""
+    return "Portable Computing" in device.platform and sys.platform == "linux" and shutil.which("ld") is None
 
 
 def _key(device: Device) -> str:

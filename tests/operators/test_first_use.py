@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from refusals import refused
+from refusals import assert_facts, refused
 from sample_meshes import sphere
 from variants import daily_rows
 
@@ -225,6 +225,35 @@ def test_a_check_that_a_process_did_not_end_is_made_again_by_a_child(
     assert select.find_fault(fake_device(index=0)) == fault
     assert cached_files[key] == mark + fault.encode()
     assert checked == []  # not by this process
+
+
+@pytest.fixture
+def no_linker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A PATH without ld, which PoCL calls when it builds a kernel."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have other linkers")
+def test_pocl_without_a_linker_is_checked_by_a_child_and_the_fault_names_ld(
+    checked: list[Any], cached_files: dict[str, bytes], no_linker: None
+) -> None:
+    select.register(check_ball, "-c", "import os; os.abort()")
+
+    fault = select.find_fault(fake_device(index=0, platform="Portable Computing Language"))
+
+    assert_facts(fault, "SIGABRT", "ld", "binutils")
+    assert checked == []  # not by this process, which would have been ended
+
+
+@pytest.mark.parametrize("platform", ["NVIDIA CUDA", "rusticl"])
+def test_other_drivers_without_a_linker_are_checked_by_this_process(
+    checked: list[Any], no_linker: None, platform: str
+) -> None:
+    device = fake_device(platform=platform)
+
+    assert select.find_fault(device) == ""
+
+    assert checked == [device]
 
 
 def test_a_check_that_a_process_did_not_end_stays_a_fault_where_no_child_can_be_started(
