@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from refusals import assert_facts
-from web_views import PATIENCE, Views, browsing, get_path, serving
+from web_views import PATIENCE, Client, Views, browsing, get_path, serving
 
 from clrecon.viewer.web import connection, server
 from clrecon.viewer.web.server import WebServer
@@ -43,13 +43,13 @@ def grey(picture: tuple[dict[str, Any], Any]) -> int:
 
 
 def test_browser_gets_the_facts_of_its_view(served: WebServer) -> None:
-    async def look() -> tuple[dict[str, Any], dict[str, Any]]:
+    async def browse() -> tuple[dict[str, Any], dict[str, Any]]:
         async with browsing(served) as client:
             await client.lay_out()
             await client.until(lambda: client.pictures and client.facts["settled"])
             return client.facts, client.fixed
 
-    facts, fixed = asyncio.run(look())
+    facts, fixed = asyncio.run(browse())
 
     assert (facts["iso"]["hu"], facts["device"]) == (200.0, "no device")  # of the painter of web_views
     assert fixed["formats"]["mesh"][0] == ".stl"
@@ -58,33 +58,33 @@ def test_browser_gets_the_facts_of_its_view(served: WebServer) -> None:
 def test_browser_gets_a_picture_of_the_size_that_each_of_its_views_has(served: WebServer) -> None:
     sizes = {"scene": [120, 90], "axial": [40, 30]}
 
-    async def look() -> list:
+    async def browse() -> list:
         async with browsing(served) as client:
             await client.lay_out(**sizes)
             await client.until(lambda: {head["view"] for head, _ in client.pictures} == set(sizes))
             return client.pictures
 
-    pictures = asyncio.run(look())
+    pictures = asyncio.run(browse())
 
     assert {head["view"]: list(image.size) for head, image in pictures} == sizes
     assert {head["view"]: list(head["size"]) for head, _ in pictures} == sizes
 
 
 def test_browser_gets_pictures_of_the_iso_value_and_their_camera(served: WebServer) -> None:
-    async def look() -> tuple[dict[str, Any], Any]:
+    async def browse() -> tuple[dict[str, Any], Any]:
         async with browsing(served) as client:
             await client.lay_out(scene=[120, 90])
             await client.until(lambda: client.pictures)
             return client.pictures[0]
 
-    picture = asyncio.run(look())
+    picture = asyncio.run(browse())
 
     assert picture[0]["camera"]["parallel"]
     assert grey(picture) == pytest.approx(200, abs=JPEG_GREYS)
 
 
 def test_colours_of_a_fitted_surface_come_with_their_scale_and_a_picture(served: WebServer) -> None:
-    async def look() -> dict[str, Any]:
+    async def browse() -> dict[str, Any]:
         async with browsing(served) as client:
             await client.lay_out()
             await client.tell(do="set_fitted", shown=True)
@@ -95,11 +95,11 @@ def test_colours_of_a_fitted_surface_come_with_their_scale_and_a_picture(served:
             await client.until(lambda: client.facts["scale"] is not None and len(client.pictures) > before)
             return client.facts["scale"]
 
-    assert asyncio.run(look())["ticks"] == [0.0, 0.5, 1.0, 1.5, 2.0]
+    assert asyncio.run(browse())["ticks"] == [0.0, 0.5, 1.0, 1.5, 2.0]
 
 
 def test_unknown_quantity_of_a_fitted_surface_is_said(served: WebServer) -> None:
-    async def look() -> list[str]:
+    async def browse() -> list[str]:
         async with browsing(served) as client:
             await client.lay_out()
             await client.tell(do="set_fitted", shown=True)
@@ -108,148 +108,221 @@ def test_unknown_quantity_of_a_fitted_surface_is_said(served: WebServer) -> None
             await client.until(lambda: any("error" in note for note in client.notes))
             return [note["error"] for note in client.notes if "error" in note]
 
-    (said,) = asyncio.run(look())
+    (said,) = asyncio.run(browse())
 
     assert_facts(said, "hardness")
 
 
 def test_fit_that_fails_is_said_and_leaves_the_surface_as_it_is(served: WebServer, views: Views) -> None:
-    views.painter.has_bone = False
+    views.painter.has_bone = False  # its fit says "no walls of bone"
 
-    async def look() -> None:
+    async def browse() -> tuple[str, bool]:
         async with browsing(served) as client:
             await client.lay_out()
             await client.tell(do="set_fitted", shown=True)
-            await client.until(lambda: any("walls" in note.get("error", "") for note in client.notes))
-            assert client.facts["fitted"] is False
+            await client.until(lambda: any("error" in note for note in client.notes))
+            return client.notes[-1]["error"], client.facts["fitted"]
 
-    asyncio.run(look())
+    error, is_fitted = asyncio.run(browse())
+
+    assert_facts(error, "walls", "bone")
+    assert is_fitted is False
 
 
-def test_moving_view_is_coarse_and_sharp_at_rest(served: WebServer, views: Views) -> None:
-    async def look() -> None:
+def test_view_that_changes_is_drawn_coarse_and_then_sharp_at_rest(served: WebServer) -> None:
+    async def browse() -> list[tuple[dict[str, Any], Any]]:
         async with browsing(served) as client:
             await client.lay_out()
             await client.until(lambda: client.pictures and client.pictures[-1][0]["sharp"])
             before = len(client.pictures)
             await client.tell(do="set_iso", hu=250)
-            await client.until(lambda: [head["sharp"] for head, _ in client.pictures[before:]] == [False, True])
-            assert grey(client.pictures[-1]) == pytest.approx(250, abs=JPEG_GREYS)
+            await client.until(lambda: len(client.pictures) > before and client.pictures[-1][0]["sharp"])
+            return client.pictures[before:]
 
-    asyncio.run(look())
+    pictures = asyncio.run(browse())
+
+    assert [head["sharp"] for head, _ in pictures] == [False, True]
+    assert grey(pictures[-1]) == pytest.approx(250, abs=JPEG_GREYS)
 
 
-def test_browser_that_shows_nothing_gets_one_picture_and_the_newest_once_it_shows_that(
-    served: WebServer, views: Views
-) -> None:
-    async def look() -> None:
+async def change_iso_40_times_unshown(client: Client) -> None:
+    """Change the iso value from 200 to 240 HU for a browser that does not say that it has shown its first picture."""
+    client.shows = False
+    await client.lay_out()
+    await client.until(lambda: client.pictures)
+    for hu in range(201, 241):
+        await client.tell(do="set_iso", hu=hu)
+    await client.until(lambda: client.facts["iso"]["hu"] == 240)
+    await asyncio.sleep(2 * connection.REST_SECONDS)
+
+
+def test_browser_that_shows_no_picture_gets_no_second_one(served: WebServer, views: Views) -> None:
+    async def browse() -> int:
         async with browsing(served) as client:
-            client.shows = False
-            await client.lay_out()
-            await client.until(lambda: client.pictures)
-            for hu in range(201, 241):
-                await client.tell(do="set_iso", hu=hu)
-            await client.until(lambda: client.facts["iso"]["hu"] == 240)
-            await asyncio.sleep(2 * connection.REST_SECONDS)
-            assert len(client.pictures) == 1
-            assert len(views.painter.drawn) <= 3  # one is under way, one waits, one may have given way
+            await change_iso_40_times_unshown(client)
+            return len(client.pictures)
+
+    assert asyncio.run(browse()) == 1
+    assert len(views.painter.drawn) <= 3  # of 41: one is under way, one waits, one may have given way
+
+
+def test_browser_that_shows_its_picture_late_gets_the_newest(served: WebServer) -> None:
+    async def browse() -> tuple[dict[str, Any], Any]:
+        async with browsing(served) as client:
+            await change_iso_40_times_unshown(client)
             client.shows = True
             await client.tell(shown=client.pictures[0][0]["number"])
             await client.until(lambda: client.pictures[-1][0]["sharp"] and len(client.pictures) > 1)
-            assert grey(client.pictures[-1]) == pytest.approx(240, abs=JPEG_GREYS)
+            return client.pictures[-1]
 
-    asyncio.run(look())
+    assert grey(asyncio.run(browse())) == pytest.approx(240, abs=JPEG_GREYS)
 
 
-def test_browser_that_turns_its_view_leaves_that_of_another(served: WebServer, views: Views) -> None:
-    async def look() -> None:
+def test_browser_that_changes_its_view_leaves_that_of_another(served: WebServer) -> None:
+    def seen(client: Client) -> tuple[float, dict[str, Any], int]:
+        return client.facts["iso"]["hu"], client.facts["camera"], len(client.pictures)
+
+    async def browse() -> list[tuple[float, dict[str, Any], int]]:
         async with browsing(served) as one, browsing(served) as other:
             for client in (one, other):
                 await client.lay_out()
                 await client.until(lambda client=client: client.pictures and client.pictures[-1][0]["sharp"])
-            before, camera = len(other.pictures), other.facts["camera"]
+            before = seen(other)
             await one.tell(do="set_iso", hu=120)
             await one.tell(do="turn", dx=0.2, dy=0.1)
-            await one.until(lambda: one.facts["iso"]["hu"] == 120 and one.facts["camera"] != camera)
-            await one.until(lambda: one.pictures[-1][0]["sharp"] and grey(one.pictures[-1]) < 130)
-            assert (other.facts["iso"]["hu"], other.facts["camera"]) == (200.0, camera)
-            assert len(other.pictures) == before
-        assert len(views.sessions) == 2
+            await one.until(lambda: one.facts["iso"]["hu"] == 120 and one.facts["camera"] != before[1])
+            await one.until(lambda: one.pictures[-1][0]["sharp"] and grey(one.pictures[-1]) < 130)  # of 120 HU
+            return [before, seen(other)]
 
-    asyncio.run(look())
+    before, after = asyncio.run(browse())
+
+    assert after == before
 
 
-def test_picture_that_fails_is_said_and_the_next_one_comes(served: WebServer, views: Views) -> None:
-    async def look() -> None:
+def test_fault_of_a_picture_is_said(served: WebServer, views: Views) -> None:
+    views.painter.fault = RuntimeError("the device burns")
+
+    async def browse() -> str:
         async with browsing(served) as client:
-            views.painter.fault = RuntimeError("the device burns")
             await client.lay_out()
             await client.until(lambda: client.notes)
-            assert "the device burns" in client.notes[0]["error"]
+            return client.notes[0]["error"]
+
+    assert "the device burns" in asyncio.run(browse())
+
+
+def test_picture_after_one_that_failed_is_shown(served: WebServer, views: Views) -> None:
+    views.painter.fault = RuntimeError("the device burns")  # once
+
+    async def browse() -> tuple[dict[str, Any], Any]:
+        async with browsing(served) as client:
+            await client.lay_out()
+            await client.until(lambda: client.notes)
             await client.tell(do="set_iso", hu=222)
-            await client.until(lambda: client.pictures)
+            await client.until(lambda: client.pictures and client.pictures[-1][0]["sharp"])
+            return client.pictures[-1]
 
-    asyncio.run(look())
+    assert grey(asyncio.run(browse())) == pytest.approx(222, abs=JPEG_GREYS)
 
 
-@pytest.mark.parametrize(
-    ("message", "said"),
-    [
-        ({"do": "save", "path": "/tmp/x.stl"}, "the command save is not for browsers"),
-        ({"do": "dance"}, "unknown command 'dance'"),
-        ({"do": "set_iso"}, "needs hu"),
-        ({"do": "set_iso", "hu": 1e9}, "the iso value runs from"),
-        ({"save": "../../x"}, "a format is an extension"),
-        ({"save": ".exe"}, "the extension says as what"),
-        ({"sizes": {"scene": "large"}, "ground": [0, 0, 0]}, "a size is width and height"),
-        ({"save": ".png", "size": 7}, "a size is width and height"),
-        ({"save": ".png", "size": ["wide", None]}, "a size is width and height"),
-        ({"save": ".png", "size": [1, 2, 3]}, "a size is width and height"),
-        ({"sizes": {}, "ground": "red"}, "cannot be read"),
-        ([1, 2], "cannot be read"),
-    ],
-)
-def test_wrong_message_is_answered_and_the_connection_goes_on(served: WebServer, message: object, said: str) -> None:
-    async def look() -> None:
+WRONG_MESSAGES: dict[str, tuple[object, str]] = {
+    "command of files": ({"do": "save", "path": "/tmp/x.stl"}, "the command save is not for browsers"),
+    "unknown command": ({"do": "dance"}, "unknown command 'dance'"),
+    "no iso value": ({"do": "set_iso"}, "needs hu"),
+    "iso value beyond HU": ({"do": "set_iso", "hu": 1e9}, "the iso value runs from"),
+    "path as a format": ({"save": "../../x"}, "a format is an extension"),
+    "unknown format": ({"save": ".exe"}, "the extension says as what"),
+    "size of a view in words": ({"sizes": {"scene": "large"}, "ground": [0, 0, 0]}, "a size is width and height"),
+    "size of a file of one number": ({"save": ".png", "size": 7}, "a size is width and height"),
+    "size of a file in words": ({"save": ".png", "size": ["wide", None]}, "a size is width and height"),
+    "size of a file of three": ({"save": ".png", "size": [1, 2, 3]}, "a size is width and height"),
+    "background in words": ({"sizes": {}, "ground": "red"}, "cannot be read"),
+    "list": ([1, 2], "cannot be read"),
+}
+
+
+@pytest.mark.parametrize(("message", "said"), WRONG_MESSAGES.values(), ids=WRONG_MESSAGES)
+def test_wrong_message_is_answered_with_its_fault(served: WebServer, message: object, said: str) -> None:
+    async def browse() -> str:
         async with browsing(served) as client:
             await client.socket.send_str(json.dumps(message))
             await client.until(lambda: client.notes)
-            assert said in client.notes[0]["error"]
+            return client.notes[0]["error"]
+
+    assert said in asyncio.run(browse())
+
+
+@pytest.mark.parametrize("message", [message for message, _ in WRONG_MESSAGES.values()], ids=WRONG_MESSAGES)
+def test_command_after_a_wrong_message_is_obeyed(served: WebServer, message: object) -> None:
+    async def browse() -> float:
+        async with browsing(served) as client:
+            await client.socket.send_str(json.dumps(message))
+            await client.until(lambda: client.notes)
             await client.tell(do="set_iso", hu=210)
-            await client.until(lambda: client.facts and client.facts["iso"]["hu"] == 210)
+            await client.until(lambda: client.facts and client.facts["iso"]["hu"] != 200.0)
+            return client.facts["iso"]["hu"]
 
-    asyncio.run(look())
+    assert asyncio.run(browse()) == 210
 
 
-def test_clicks_of_a_distance_tell_their_hu_and_make_a_measure(served: WebServer) -> None:
-    async def look() -> None:
+async def measure_distance_of_30_mm(client: Client) -> None:
+    """Click at two pixels 30 apart: the painter of web_views takes pixels for mm, and finds 50 HU everywhere."""
+    await client.tell(do="start_tool", name="distance")
+    for x in (10, 40):
+        await client.tell(do="add_point", x=x, y=20, size=[120, 90], plane=None)
+    await client.until(lambda: client.facts and client.facts["measures"] and len(client.notes) == 2)
+
+
+def test_two_clicks_of_a_distance_make_a_measure_in_mm(served: WebServer) -> None:
+    async def browse() -> list[str]:
         async with browsing(served) as client:
-            await client.tell(do="start_tool", name="distance")
-            for x in (10, 40):
-                await client.tell(do="add_point", x=x, y=20, size=[120, 90], plane=None)
-            await client.until(lambda: client.facts and client.facts["measures"] and len(client.notes) == 2)
-            assert client.facts["measures"][0]["text"] == "30.0 mm"
-            assert [note["pick"]["hu"] for note in client.notes] == [50.0, 50.0]
+            await measure_distance_of_30_mm(client)
+            return [measure["text"] for measure in client.facts["measures"]]
 
-    asyncio.run(look())
+    assert asyncio.run(browse()) == ["30.0 mm"]
 
 
-def test_cross_that_moves_and_parts_that_look_plain_leave_the_picture(served: WebServer, views: Views) -> None:
-    async def look() -> None:
+def test_each_click_of_a_distance_is_answered_with_its_hu(served: WebServer) -> None:
+    async def browse() -> list[float]:
         async with browsing(served) as client:
-            await client.tell(do="set_mode", name="slices")
-            await client.lay_out(scene=[120, 90], axial=[40, 30])
-            await client.until(lambda: client.facts and client.facts["settled"] and len(client.pictures) >= 2)
-            views.painter.drawn.clear()
+            await measure_distance_of_30_mm(client)
+            return [note["pick"]["hu"] for note in client.notes]
+
+    assert asyncio.run(browse()) == [50.0, 50.0]
+
+
+async def show_slices_in_space(client: Client, views: Views) -> None:
+    """Wait until the scene and the axial slice are drawn, and forget how often."""
+    await client.tell(do="set_mode", name="slices")
+    await client.lay_out(scene=[120, 90], axial=[40, 30])
+    await client.until(lambda: client.facts and client.facts["settled"] and len(client.pictures) >= 2)
+    views.painter.drawn.clear()
+
+
+def test_slice_that_is_scrolled_is_drawn_alone(served: WebServer, views: Views) -> None:
+    async def browse() -> None:
+        async with browsing(served) as client:
+            await show_slices_in_space(client, views)
             await client.tell(do="scroll", plane="axial", steps=1)
             await client.until(lambda: ("axial", True) in views.painter.drawn and client.facts["settled"])
+
+    asyncio.run(browse())
+
+    assert {view for view, _ in views.painter.drawn} == {"axial"}
+
+
+def test_parts_that_are_known_and_a_tool_that_starts_leave_the_pictures(served: WebServer, views: Views) -> None:
+    async def browse() -> str:
+        async with browsing(served) as client:
+            await show_slices_in_space(client, views)
             views.sessions[0].model.state = dataclasses.replace(views.sessions[0].model.state, parts_at=200.0)
             await client.tell(do="dismiss")
             await client.tell(do="start_tool", name="seed")
             await client.until(lambda: client.facts["tool"] == "seed" and client.facts["settled"])
-            assert {view for view, _ in views.painter.drawn} == {"axial"}
+            return client.facts["tool"]
 
-    asyncio.run(look())
+    assert asyncio.run(browse()) == "seed"
+    assert views.painter.drawn == []
 
 
 # Files
@@ -266,18 +339,20 @@ def test_named_files_are_written_one_after_the_other_and_said(
     wrote: list[str] = []
     names = [str(tmp_path / name) for name in ("a.stl", "b.png")]
 
-    async def look(running: WebServer) -> None:
+    async def browse(running: WebServer) -> list[str]:
         async with browsing(running) as client:
             await client.tell(save=None)
             await client.until(lambda: len(client.notes) == 2)
-            assert list(client.fixed["save_as"]) == names
             await client.tell(save=None)
             await client.until(lambda: len(client.notes) == 4)
+            return list(client.fixed["save_as"])
 
     with serving(views.open, save_as=names, wrote=wrote.append) as running:
-        asyncio.run(look(running))
+        told = asyncio.run(browse(running))
+
+    assert told == names
     assert wrote == ["wrote a.stl", "wrote b.png", "wrote a-2.stl", "wrote b-2.png"]
-    assert len(list(tmp_path.iterdir())) == 4
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a-2.stl", "a.stl", "b-2.png", "b.png"]
 
 
 SAVED_BYTES = 700_000  # more than a buffer of the server
@@ -305,32 +380,32 @@ async def save_view(client) -> dict[str, Any]:
 
 
 def test_browser_is_told_the_name_and_size_of_a_saved_file(served: WebServer, written: list[Path]) -> None:
-    async def look() -> dict[str, Any]:
+    async def browse() -> dict[str, Any]:
         async with browsing(served) as client:
             return await save_view(client)
 
-    told = asyncio.run(look())
+    told = asyncio.run(browse())
 
     assert (told["name"], told["bytes"]) == ("view.stl", SAVED_BYTES)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="modes of POSIX")
 def test_saved_file_is_hidden_from_other_users(served: WebServer, written: list[Path]) -> None:
-    async def look() -> list[int]:
+    async def browse() -> list[int]:
         async with browsing(served) as client:
             await save_view(client)
             return [path.stat().st_mode & 0o077 for path in (written[0], written[0].parent)]
 
-    assert 0 in asyncio.run(look())  # the file or its folder
+    assert 0 in asyncio.run(browse())  # the file or its folder
 
 
 def test_saved_file_is_fetched_as_a_download_once(served: WebServer, written: list[Path]) -> None:
-    async def look() -> list[tuple[int, dict[str, str], str]]:
+    async def browse() -> list[tuple[int, dict[str, str], str]]:
         async with browsing(served) as client:
             path = f"/saved/{(await save_view(client))['ticket']}"
             return [await asyncio.to_thread(get_path, served, path) for _ in range(2)]
 
-    (status, headers, content), (again, _, _) = asyncio.run(look())
+    (status, headers, content), (again, _, _) = asyncio.run(browse())
 
     assert (status, again) == (200, 404)
     assert content == "x" * SAVED_BYTES
@@ -338,32 +413,32 @@ def test_saved_file_is_fetched_as_a_download_once(served: WebServer, written: li
 
 
 def test_saved_file_is_refused_to_a_foreign_page(served: WebServer, written: list[Path]) -> None:
-    async def look() -> int:
+    async def browse() -> int:
         async with browsing(served) as client:
             path = f"/saved/{(await save_view(client))['ticket']}"
             return (await asyncio.to_thread(get_path, served, path, Origin="http://evil.example"))[0]
 
-    assert asyncio.run(look()) == 403
+    assert asyncio.run(browse()) == 403
 
 
 def test_saved_file_is_removed_once_it_is_fetched(served: WebServer, written: list[Path]) -> None:
-    async def look() -> bool:
+    async def browse() -> bool:
         async with browsing(served) as client:
             path = f"/saved/{(await save_view(client))['ticket']}"
             await asyncio.to_thread(get_path, served, path)
             await client.until(lambda: not written[0].exists())
             return written[0].exists()
 
-    assert asyncio.run(look()) is False
+    assert asyncio.run(browse()) is False
 
 
 def test_saved_files_that_are_not_fetched_are_removed_with_the_server(views: Views, written: list[Path]) -> None:
-    async def look(running: WebServer) -> None:
+    async def browse(running: WebServer) -> None:
         async with browsing(running) as client:
             await save_view(client)
 
     with serving(views.open) as running:
-        asyncio.run(look(running))
+        asyncio.run(browse(running))
 
     assert [path.parent.exists() for path in written] == [False]
 
@@ -371,7 +446,7 @@ def test_saved_files_that_are_not_fetched_are_removed_with_the_server(views: Vie
 def read_iso_of(served: WebServer, tab: str, change: float | None = None) -> float:
     """Connect as a tab, change the iso value if asked to, and return it as the tab leaves."""
 
-    async def look() -> float:
+    async def browse() -> float:
         async with browsing(served, tab) as client:
             await client.lay_out()
             await client.until(lambda: client.pictures)
@@ -380,7 +455,7 @@ def read_iso_of(served: WebServer, tab: str, change: float | None = None) -> flo
                 await client.until(lambda: client.facts["iso"]["hu"] == change)
             return float(client.facts["iso"]["hu"])
 
-    return asyncio.run(look())
+    return asyncio.run(browse())
 
 
 def test_a_tab_that_loads_the_page_again_goes_on_with_its_view(served: WebServer) -> None:
@@ -408,7 +483,7 @@ def test_views_of_as_many_tabs_are_kept_as_browsers_may_be_open(served: WebServe
 
 
 def test_session_of_a_browser_that_dies_is_closed(served: WebServer, views: Views) -> None:
-    async def look() -> None:
+    async def browse() -> None:
         async with browsing(served) as client:
             await client.lay_out()
             await client.until(lambda: client.pictures)
@@ -417,47 +492,69 @@ def test_session_of_a_browser_that_dies_is_closed(served: WebServer, views: View
         while not views.sessions[0]._closed and asyncio.get_running_loop().time() < end:
             await asyncio.sleep(0.05)
 
-    asyncio.run(look())
+    asyncio.run(browse())
     assert views.sessions[0]._closed
 
 
-def test_browsers_are_told_when_the_server_ends(views: Views) -> None:
-    async def look(running: WebServer) -> None:
+GOING_AWAY, TRY_AGAIN_LATER = 1001, 1013  # codes with which a WebSocket is closed
+
+
+def test_browser_is_told_when_the_server_ends_and_its_session_is_closed(views: Views) -> None:
+    async def browse(running: WebServer) -> int | None:
         async with browsing(running) as client:
             await client.until(lambda: client.facts)
             running.stop()
             await client.until(lambda: client.close_code is not None)
-            assert client.close_code == 1001
+            return client.close_code
 
     with serving(views.open) as running:
-        asyncio.run(look(running))
+        code = asyncio.run(browse(running))
+
+    assert code == GOING_AWAY
     assert views.sessions[0]._closed
 
 
 def test_server_that_a_browser_ends_tells_every_browser(views: Views) -> None:
-    async def look(running: WebServer) -> None:
+    async def browse(running: WebServer) -> list[int | None]:
         async with browsing(running) as one, browsing(running) as other:
             await other.until(lambda: other.facts)
             await one.tell(quit=True)
             for client in (one, other):
                 await client.until(lambda client=client: client.close_code is not None)
-            assert (one.close_code, other.close_code) == (1001, 1001)
+            return [one.close_code, other.close_code]
 
     with serving(views.open) as running:
-        asyncio.run(look(running))
+        codes = asyncio.run(browse(running))
+
+    assert codes == [GOING_AWAY, GOING_AWAY]
 
 
-def test_browser_beyond_the_most_is_turned_away_and_the_others_go_on(views: Views) -> None:
-    async def look(running: WebServer) -> None:
+async def open_as_many_as_may(stack: AsyncExitStack, running: WebServer) -> list[Client]:
+    browsers = [await stack.enter_async_context(browsing(running)) for _ in range(server.MOST_BROWSERS)]
+    for one in browsers:
+        await one.until(lambda one=one: one.facts)
+    return browsers
+
+
+def test_browser_beyond_the_most_is_turned_away(served: WebServer) -> None:
+    async def browse() -> int | None:
         async with AsyncExitStack() as stack:
-            browsers = [await stack.enter_async_context(browsing(running)) for _ in range(server.MOST_BROWSERS)]
-            for one in browsers:
-                await one.until(lambda one=one: one.facts)
-            async with browsing(running) as other:
-                await other.until(lambda: other.close_code is not None)
-                assert other.close_code == 1013
-            await one.tell(do="set_iso", hu=230)
-            await one.until(lambda: one.facts["iso"]["hu"] == 230)
+            await open_as_many_as_may(stack, served)
+            async with browsing(served) as one_more:
+                await one_more.until(lambda: one_more.close_code is not None)
+                return one_more.close_code
 
-    with serving(views.open) as running:
-        asyncio.run(look(running))
+    assert asyncio.run(browse()) == TRY_AGAIN_LATER
+
+
+def test_browsers_go_on_when_one_beyond_the_most_is_turned_away(served: WebServer) -> None:
+    async def browse() -> float:
+        async with AsyncExitStack() as stack:
+            browsers = await open_as_many_as_may(stack, served)
+            async with browsing(served) as one_more:
+                await one_more.until(lambda: one_more.close_code is not None)
+            await browsers[-1].tell(do="set_iso", hu=230)
+            await browsers[-1].until(lambda: browsers[-1].facts["iso"]["hu"] != 200.0)
+            return browsers[-1].facts["iso"]["hu"]
+
+    assert asyncio.run(browse()) == 230
