@@ -316,24 +316,39 @@ def test_names_and_keywords_come_to_the_style_that_they_ask_for(look: dict[str, 
     assert made.mode == expected.mode
 
 
-@pytest.mark.parametrize(
-    ("look", "says"),
-    [
-        ({"mode": "xray"}, "unknown mode 'xray': use one of dvr, mip, minip, mean, drr, surface, slices, slice, cpr"),
-        ({"mode": TWO}, "unknown mode array"),
-        ({"zooom": 2}, "a picture has no option 'zooom': it is one of "),
-        ({"letters": True}, "a picture has no option 'letters'"),
-        ({"mode": "mean", "shadows": True}, "shadows does not apply to mode mean, only to surface"),
-        ({"window": (0, 1)}, "does not apply to mode dvr, only to mip, minip, mean, drr, slices, slice, cpr"),
-        ({"mode": "slice", "clip": Clip()}, "only to dvr, mip, minip, mean, drr, surface, slices"),
-        ({"mode": "surface", "transfer_function": GLASS}, "only to dvr, mip, minip, mean, drr, slices"),
-        ({"mode": "surface", "preset": "bone"}, "preset does not apply to mode surface"),
-        ({"mode": "slice", "lighting": Lighting()}, "lighting does not apply to mode slice"),
-        ({"mode": "mip", "kind": "mean"}, "kind"),
-        ({"preset": "bones"}, "unknown rendering preset 'bones'"),
-        ({"preset": "bone", "transfer_function": GLASS}, "has a preset (bone) or a transfer function, not both"),
-    ],
-)  # fmt: skip
+REFUSED_LOOKS: dict[str, tuple[dict[str, Any], str]] = {
+    "unknown mode": (
+        {"mode": "xray"},
+        "unknown mode 'xray': use one of dvr, mip, minip, mean, drr, surface, slices, slice, cpr",
+    ),
+    "mode of numbers": ({"mode": TWO}, "unknown mode array"),
+    "misspelt option": ({"zooom": 2}, "a picture has no option 'zooom': it is one of "),
+    "option of another call": ({"letters": True}, "a picture has no option 'letters'"),
+    "option of another mode": (
+        {"mode": "mean", "shadows": True},
+        "shadows does not apply to mode mean, only to surface",
+    ),
+    "window of a volume": (
+        {"window": (0, 1)},
+        "does not apply to mode dvr, only to mip, minip, mean, drr, slices, slice, cpr",
+    ),
+    "clip of a slice": ({"mode": "slice", "clip": Clip()}, "only to dvr, mip, minip, mean, drr, surface, slices"),
+    "function of a surface": (
+        {"mode": "surface", "transfer_function": GLASS},
+        "only to dvr, mip, minip, mean, drr, slices",
+    ),
+    "preset of a surface": ({"mode": "surface", "preset": "bone"}, "preset does not apply to mode surface"),
+    "lighting of a slice": ({"mode": "slice", "lighting": Lighting()}, "lighting does not apply to mode slice"),
+    "name of a field": ({"mode": "mip", "kind": "mean"}, "kind"),
+    "unknown preset": ({"preset": "bones"}, "unknown rendering preset 'bones'"),
+    "preset and function": (
+        {"preset": "bone", "transfer_function": GLASS},
+        "has a preset (bone) or a transfer function, not both",
+    ),
+}
+
+
+@pytest.mark.parametrize(("look", "says"), REFUSED_LOOKS.values(), ids=REFUSED_LOOKS)
 def test_names_and_keywords_that_cannot_be_are_refused(look: dict[str, Any], says: str) -> None:
     with pytest.raises(UsageError) as error:
         make_style(**look)

@@ -81,6 +81,7 @@ def test_sides_of_the_patient_lie_on_the_middle_lines_of_each_view(view, perspec
     ("angles", "name"),
     [((0, 0), "anterior"), ((90, 0), "left"), ((180, 0), "posterior"), ((-90, 0), "right"), ([270, 0], "right")]
     + [((0.0, 90.0), "superior"), ((0, -90), "inferior"), (" Anterior ", "anterior")],
+    ids=str,
 )
 def test_angles_of_a_side_are_the_view_that_it_names(angles, name):
     assert Camera.fit(box(), angles) == Camera.fit(box(), name)
@@ -351,40 +352,40 @@ def test_unknown_view_is_refused_with_how_to_say_one(view):
         Camera.fit(box(), view)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"up": "top"}, "anterior, posterior, left"),
-        ({"up": (1, 2)}, "three finite numbers"),
-        ({"up": "posterior"}, "runs along its view"),
-        ({"zoom": 0}, "zoom is a positive number"),
-        ({"zoom": "big"}, "zoom is a positive number"),
-        ({"view_angle": 180}, "between 0.001 and 179"),
-        ({"size": (0, 10)}, "from 1 to 16384"),
-        ({"size": (10, 1e6)}, "from 1 to 16384"),
-        ({"size": (10.5, 10)}, "from 1 to 16384"),
-        ({"size": 10}, "from 1 to 16384"),
-    ],
-)
+IMPOSSIBLE_FITS = {
+    "unknown top": ({"up": "top"}, "anterior, posterior, left"),
+    "top of two numbers": ({"up": (1, 2)}, "three finite numbers"),
+    "top along the view": ({"up": "posterior"}, "runs along its view"),
+    "zoom 0": ({"zoom": 0}, "zoom is a positive number"),
+    "zoom in words": ({"zoom": "big"}, "zoom is a positive number"),
+    "view angle 180": ({"view_angle": 180}, "between 0.001 and 179"),
+    "width 0": ({"size": (0, 10)}, "from 1 to 16384"),
+    "height beyond the most": ({"size": (10, 1e6)}, "from 1 to 16384"),
+    "width of half pixels": ({"size": (10.5, 10)}, "from 1 to 16384"),
+    "size of one number": ({"size": 10}, "from 1 to 16384"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "message"), IMPOSSIBLE_FITS.values(), ids=IMPOSSIBLE_FITS)
 def test_impossible_fit_is_refused(arguments, message):
     with pytest.raises(UsageError, match=message):
         Camera.fit(box(), **arguments)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {"position": (0, 0, 0)},
-        {"position": (0, 0, np.nan)},
-        {"up": (0, 1, 0)},
-        {"up": (0, 0, 0)},
-        {"view_angle": 30, "parallel_scale": 10},
-        {"view_angle": 0},
-        {"view_angle": "wide"},
-        {"parallel_scale": -1},
-        {"parallel_scale": np.inf},
-    ],
-)
+IMPOSSIBLE_CAMERAS = {
+    "position at the focal point": {"position": (0, 0, 0)},
+    "position of no number": {"position": (0, 0, np.nan)},
+    "top along the view": {"up": (0, 1, 0)},
+    "top of no direction": {"up": (0, 0, 0)},
+    "perspective and parallel": {"view_angle": 30, "parallel_scale": 10},
+    "view angle 0": {"view_angle": 0},
+    "view angle in words": {"view_angle": "wide"},
+    "negative scale": {"parallel_scale": -1},
+    "infinite scale": {"parallel_scale": np.inf},
+}
+
+
+@pytest.mark.parametrize("arguments", IMPOSSIBLE_CAMERAS.values(), ids=IMPOSSIBLE_CAMERAS)
 def test_impossible_camera_is_refused(arguments):
     with refused(UsageError, "camera"):
         Camera(**{"position": (0, -100, 0), "focal_point": (0, 0, 0), "up": (0, 0, 1), **arguments})
@@ -399,19 +400,19 @@ HUGE = 10**400
 """A whole number that no float holds."""
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda camera: Camera((0, -9, 0), (0, 0, 0), (0, 0, 1), view_angle=HUGE), "view angle"),
-        (lambda camera: Camera((0, -9, 0), (0, 0, 0), (0, 0, 1), parallel_scale=HUGE), "parallel scale"),
-        (lambda camera: Camera((0, -HUGE, 0), (0, 0, 0), (0, 0, 1)), "position of a camera"),
-        (lambda camera: camera.zoomed(HUGE), "zoom"),
-        (lambda camera: camera.orbit(HUGE), "orbits by"),
-        (lambda camera: camera.project([(HUGE, 0, 0)], SIZE), "points"),
-        (lambda camera: Camera.fit(box(), (HUGE, 0)), "view"),
-        (lambda camera: Camera.fit(box(), center=(0, 0, HUGE)), "centre"),
-    ],
-)
+TOO_LARGE = {
+    "view angle": (lambda camera: Camera((0, -9, 0), (0, 0, 0), (0, 0, 1), view_angle=HUGE), "view angle"),
+    "parallel scale": (lambda camera: Camera((0, -9, 0), (0, 0, 0), (0, 0, 1), parallel_scale=HUGE), "parallel scale"),
+    "position": (lambda camera: Camera((0, -HUGE, 0), (0, 0, 0), (0, 0, 1)), "position of a camera"),
+    "zoom": (lambda camera: camera.zoomed(HUGE), "zoom"),
+    "orbit": (lambda camera: camera.orbit(HUGE), "orbits by"),
+    "point": (lambda camera: camera.project([(HUGE, 0, 0)], SIZE), "points"),
+    "view": (lambda camera: Camera.fit(box(), (HUGE, 0)), "view"),
+    "centre": (lambda camera: Camera.fit(box(), center=(0, 0, HUGE)), "centre"),
+}
+
+
+@pytest.mark.parametrize(("make", "words"), TOO_LARGE.values(), ids=TOO_LARGE)
 def test_number_too_large_for_a_float_is_refused(make, words):
     with pytest.raises(UsageError, match=words):
         make(Camera.fit(box()))

@@ -69,30 +69,30 @@ def test_unknown_frame_is_refused(tmp_path):
         read_curve_points(tmp_path / "ras.txt", "world")
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "says"),
-    [
-        ("a.txt", "1 2 3\n4 five 6\n", "line 2 is not three numbers"),
-        ("a.txt", "1 2 3\n4 5\n", "line 2"),
-        ("a.txt", "1 2 3\n", "1 point,"),
-        ("a.txt", "", "0 points"),
-        ("a.txt", "1 2 3\nnan 2 3\n", "point 1"),
-        ("a.csv", "a,b,c\n1,2,3\n4,5,6\n", "x, y and z"),
-        ("a.csv", "x,y,z\n1,2,3\n4,5\n", "line 3"),
-        ("a.json", "[[1, 2, 3], [1, 2", "no JSON"),
-        ("a.json", "[" * 100000, "no JSON"),
-        ("a.json", '{"point": []}', "no points"),
-        ("a.json", "[[1, 2, 3], [1, true, 3]]", "point 1"),
-        ("a.json", "[[1, 2, 3], [1, 2, 1" + "0" * 400 + "]]", "point 1"),
-        ("a.json", '{"points": [[1, 2, 3], [4, 5, 6]], "space": "IJK"}', "neither LPS nor RAS"),
-        ("a.mrk.json", json.dumps({"markups": []}), "0 markups"),
-        ("a.mrk.json", json.dumps({"markups": markups(POINTS)["markups"] * 2}), "2 markups"),
-        ("a.mrk.json", json.dumps(markups(POINTS, coordinateUnits="m")), "not mm"),
-        ("a.mrk.json", json.dumps({"markups": [{"type": "Curve"}]}), "controlPoints"),
-        ("a.fcsv", FCSV.format("2") + "a,1,2,3\n", "neither"),
-        ("a.fcsv", FCSV.format("LPS") + "a,1,2,3\nb,4,5\n", "line 5"),
-    ],
-)
+FAULTY_FILES = {
+    "word in a row": ("a.txt", "1 2 3\n4 five 6\n", "line 2 is not three numbers"),
+    "row of two numbers": ("a.txt", "1 2 3\n4 5\n", "line 2"),
+    "one point": ("a.txt", "1 2 3\n", "1 point,"),
+    "empty file": ("a.txt", "", "0 points"),
+    "nan in a row": ("a.txt", "1 2 3\nnan 2 3\n", "point 1"),
+    "columns of other names": ("a.csv", "a,b,c\n1,2,3\n4,5,6\n", "x, y and z"),
+    "short row of a table": ("a.csv", "x,y,z\n1,2,3\n4,5\n", "line 3"),
+    "cut JSON": ("a.json", "[[1, 2, 3], [1, 2", "no JSON"),
+    "deep JSON": ("a.json", "[" * 100000, "no JSON"),
+    "JSON without points": ("a.json", '{"point": []}', "no points"),
+    "JSON of a truth value": ("a.json", "[[1, 2, 3], [1, true, 3]]", "point 1"),
+    "JSON of a huge number": ("a.json", "[[1, 2, 3], [1, 2, 1" + "0" * 400 + "]]", "point 1"),
+    "JSON in a grid": ("a.json", '{"points": [[1, 2, 3], [4, 5, 6]], "space": "IJK"}', "neither LPS nor RAS"),
+    "no markups": ("a.mrk.json", json.dumps({"markups": []}), "0 markups"),
+    "two markups": ("a.mrk.json", json.dumps({"markups": markups(POINTS)["markups"] * 2}), "2 markups"),
+    "markups in metres": ("a.mrk.json", json.dumps(markups(POINTS, coordinateUnits="m")), "not mm"),
+    "markups without points": ("a.mrk.json", json.dumps({"markups": [{"type": "Curve"}]}), "controlPoints"),
+    "FCSV in an unknown frame": ("a.fcsv", FCSV.format("2") + "a,1,2,3\n", "neither"),
+    "short row of FCSV": ("a.fcsv", FCSV.format("LPS") + "a,1,2,3\nb,4,5\n", "line 5"),
+}
+
+
+@pytest.mark.parametrize(("name", "text", "says"), FAULTY_FILES.values(), ids=FAULTY_FILES)
 def test_file_that_holds_no_points_is_refused_with_the_place_of_its_fault(tmp_path, name, text, says):
     (tmp_path / name).write_text(text)
     with pytest.raises(RefusedInputError, match=says):

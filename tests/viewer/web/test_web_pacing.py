@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tolerances
 
 from clrecon.viewer.model.state import SCENE
 from clrecon.viewer.web.connection import Asked, Connection, Pace, _lay_over
@@ -19,12 +20,14 @@ SIZE = (400, 300)
 
 @pytest.fixture
 def pace() -> Pace:
+    """Of a browser that shows the scene and an axial slice."""
     made = Pace()
     made.resize({SCENE: SIZE, "axial": (100, 100)})
     return made
 
 
 def drain(pace: Pace) -> list[Asked]:
+    """Take what is to be drawn until nothing is."""
     return list(iter(pace.next, None))
 
 
@@ -110,16 +113,17 @@ def test_picture_that_is_drawn_is_finished(pace: Pace, changed: list[str], drawn
     assert pace.instead(drawn) is None
 
 
-@pytest.mark.parametrize("ground", [(0, 0, 0), (255, 255, 255), (13, 140, 201)])
+@pytest.mark.parametrize("ground", [(0, 0, 0), (255, 255, 255), (13, 140, 201)], ids=["black", "white", "blue"])
 def test_pictures_lie_over_their_ground_rounded_to_whole_numbers(ground: tuple[int, int, int]) -> None:
     image = np.random.default_rng(4).integers(0, 256, (20, 256, 4)).astype(np.uint8)
-    image[..., 3] = np.arange(256)
+    image[..., 3] = np.arange(256)  # every opacity
     share = image[..., 3:] / 255.0
     exact = image[..., :3] * share + np.array(ground) * (1.0 - share)
-    assert np.abs(_lay_over(image, ground) - exact).max() <= 0.5 + 1e-9
+    half_a_step = 0.5 * (1 + tolerances.FLOAT64_SHARE)
+    assert np.abs(_lay_over(image, ground) - exact).max() <= half_a_step
 
 
-def test_pictures_waiting_in_a_closing_connection_are_cancelled() -> None:
+def test_connection_that_is_closed_twice_ends_downloads_waiting_pictures_and_session_once() -> None:
     told: list[object] = []
 
     async def close() -> None:

@@ -45,7 +45,7 @@ def scan(tmp_path_factory) -> Path:
 
 
 @contextmanager
-def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
+def start_view(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
     """A process whose server is ready, with what it printed; without VTK and without a screen."""
     screens = ("DISPLAY", "WAYLAND_DISPLAY")
     environment = {name: value for name, value in os.environ.items() if name not in screens}
@@ -69,32 +69,36 @@ def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, 
 @pytest.mark.opencl
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize("number", daily(1, [signal.SIGINT, signal.SIGTERM]))
-def test_signal_ends_the_server_while_pictures_are_drawn(device, scan: Path, number: int) -> None:
-    with running(str(scan), "--device", str(device.index), "--hu", "321") as (process, said):
+def test_signal_ends_the_server_without_a_word_while_pictures_are_drawn(device, scan: Path, number: int) -> None:
+    with start_view(str(scan), "--device", str(device.index), "--hu", "321") as (process, said):
         server = SimpleNamespace(port=said["port"], address=said["address"])
 
-        async def look() -> None:
+        async def end_while_the_view_turns() -> float:
             async with browsing(server) as client:
                 await client.lay_out(scene=[300, 200], axial=[100, 100])
                 await client.until(lambda: client.pictures)
-                assert client.facts["iso"]["hu"] == 321.0
                 await client.tell(do="turn", dx=0.1, dy=0.1)
                 process.send_signal(number)
                 await client.until(lambda: client.close_code is not None)
+                return client.facts["iso"]["hu"]
 
-        asyncio.run(look())
+        hu = asyncio.run(end_while_the_view_turns())
+
         assert process.wait(SECONDS_TO_END) == 0
         assert process.stderr.read() == ""
+        assert hu == 321.0  # the view that was asked for was there
 
 
 @pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.opencl
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-def test_server_leaves_no_file_and_opens_no_browser_without_a_screen(device, scan: Path, tmp_path: Path) -> None:
+def test_server_without_a_screen_warns_of_no_browser_and_removes_its_folder_when_it_ends(
+    device, scan: Path, tmp_path: Path
+) -> None:
     os.environ["TMPDIR"], before = str(tmp_path), os.environ.get("TMPDIR")
     try:
-        with running(str(scan), "--device", str(device.index)) as (process, said):
+        with start_view(str(scan), "--device", str(device.index)) as (process, said):
             assert any("there is no screen" in warning for warning in said["warnings"])
             assert len(list(tmp_path.glob("clrecon-*"))) == 1
             process.send_signal(signal.SIGINT)
@@ -106,22 +110,22 @@ def test_server_leaves_no_file_and_opens_no_browser_without_a_screen(device, sca
             os.environ["TMPDIR"] = before
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--port", "0"], "a port is a whole number from 1 to 65535, not 0"),
-        (["--port", "x"], "'x' is no whole number"),
-        (["--html", "page.html", "--port", "8000"], "--port belongs to the view in the browser"),
-        (["--html", "page.html", "--no-open"], "--no-open belongs to the view in the browser"),
-        (["--window", "--save-as", "a.stl"], "--save-as belongs to the view in the browser"),
-        (["--window", "--html", "page.html"], "ask for one of them"),
-        (["--no-open", "-q"], "-q hides the address"),
-        (["--no-clobber"], "leave --no-clobber out"),
-        (["--solid"], "--solid says how a mesh is made"),
-        (["--hu", "100,200"], "a view begins with one iso value"),
-    ],
-)
-def test_wrong_arguments_are_said_before_anything_is_read(
+WRONG_ARGUMENTS = {
+    "port 0": (["--port", "0"], "a port is a whole number from 1 to 65535, not 0"),
+    "port in words": (["--port", "x"], "'x' is no whole number"),
+    "port of a page file": (["--html", "page.html", "--port", "8000"], "--port belongs to the view in the browser"),
+    "no-open of a page file": (["--html", "page.html", "--no-open"], "--no-open belongs to the view in the browser"),
+    "names in a window": (["--window", "--save-as", "a.stl"], "--save-as belongs to the view in the browser"),
+    "window and page file": (["--window", "--html", "page.html"], "ask for one of them"),
+    "quiet without a browser": (["--no-open", "-q"], "-q hides the address"),
+    "no-clobber": (["--no-clobber"], "leave --no-clobber out"),
+    "solid": (["--solid"], "--solid says how a mesh is made"),
+    "two iso values": (["--hu", "100,200"], "a view begins with one iso value"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "said"), WRONG_ARGUMENTS.values(), ids=WRONG_ARGUMENTS)
+def test_wrong_arguments_are_said_in_one_line_before_anything_is_read(
     capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
 ) -> None:
     assert main(["view", "no_such_folder", *arguments]) == 3
@@ -129,20 +133,20 @@ def test_wrong_arguments_are_said_before_anything_is_read(
     assert said in error and error.count("\n") == 1
 
 
-def test_a_port_that_is_taken_is_said_before_anything_is_read(printed: Printer) -> None:
+def test_port_that_is_taken_is_said_before_anything_is_read(printed: Printer) -> None:
     with bind_port() as listener:
         port = listener.getsockname()[1]
         assert main(["view", "no_such_folder", "--port", str(port)]) == 3
     printed().assert_error(port, "--port")
 
 
-def test_an_input_that_is_not_there_ends_the_command(printed: Printer) -> None:
-    assert main(["view", "no_such_folder"]) in (2, 3)
+def test_input_that_is_not_there_is_named_with_an_exit_code_of_input(printed: Printer) -> None:
+    assert main(["view", "no_such_folder"]) in (2, 3)  # refused input or usage
     printed().assert_error("no_such_folder")
 
 
 @pytest.mark.unit
-def test_a_fault_behind_the_page_is_shown_with_its_trace(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_fault_that_the_view_logs_is_printed_with_its_trace(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     def serve(*given: Any, **named: Any) -> None:
         try:
             raise ValueError("a number of another kind")
