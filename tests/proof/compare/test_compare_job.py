@@ -290,7 +290,7 @@ def test_method_that_refuses_its_input_has_declined_and_one_without_a_device_has
 
 
 @pytest.mark.seconds
-def test_method_that_crashes_or_lacks_its_library_is_told_with_the_reason_in_report_and_page(
+def test_comparison_with_a_crashed_and_a_missing_method_ends_with_8_and_tells_why_in_report_and_page(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Printer
 ) -> None:
     run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.child", ONE_CRASHES)
@@ -343,8 +343,12 @@ def test_measures_whose_process_crashes_are_missing_with_the_reason(
 ) -> None:
     run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.judge", NOBODY_TELLS)
     settings = CompareSettings(methods=("t-mc",), repeat=1, device=str(device.index))
+
     (record,) = make_comparison(ball, tmp_path / "r", settings).methods
-    assert record.is_done and record.slices is None and "SIGABRT" in record.reasons["all"]
+
+    assert record.is_done
+    assert record.slices is None
+    assert "SIGABRT" in record.reasons["all"]
     assert "SIGABRT" in (tmp_path / "r" / "index.html").read_text()
 
 

@@ -140,8 +140,10 @@ def test_streaks_of_one_seed_are_the_same() -> None:
 
 def test_streaks_join_two_pieces_of_metal_by_a_dark_band() -> None:
     streaks = draw_streaks(mark_two_pieces_of_metal())[1]
-    between, above = streaks[29:35, 26:38].mean(), streaks[10:16, 26:38].mean()
-    assert between < -20.0 < above  # HU
+    columns_between = slice(26, 38)
+    in_line = streaks[29:35, columns_between].mean()  # the rows of both pieces
+    above = streaks[10:16, columns_between].mean()
+    assert in_line < -20.0 < above  # HU
 
 
 def test_streaks_beside_metal_of_8000_hu_stay_below_3000_hu() -> None:

@@ -150,13 +150,6 @@ def test_couch_other_than_its_own_changes_the_voxels_of_a_spine(table: str) -> N
     assert not np.array_equal(other, own)
 
 
-@pytest.mark.release
-def test_spine_without_a_named_couch_lies_on_its_own() -> None:
-    size = {"size": (80, 72), "slices": 6, "spacing": (4.5, 4.0, 5.0)}
-    own, unnamed = (make_phantom(PhantomSettings(**size, **given))[0] for given in ({}, {"table": None}))
-    assert np.array_equal(unnamed, own)
-
-
 @pytest.fixture(scope="module")
 def written_limb(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PhantomSettings, dict]:
     """Folder, settings and truth of a tilted and oblique limb above a couch."""
@@ -184,12 +177,10 @@ def test_scene_is_written_over_an_earlier_one_with_the_same_bytes(
     assert (folder / "materials.nrrd").read_bytes() == first
 
 
-def test_truth_of_a_scene_names_the_settings_that_were_chosen_alone(
-    written_limb: tuple[Path, PhantomSettings, dict],
-) -> None:
-    chosen = written_limb[2]["settings"]
-    assert chosen["table_gap_mm"] == 5.0
-    assert "prone" not in chosen
+def test_truth_of_a_scene_names_the_settings_that_were_chosen_and_no_default() -> None:
+    truth = make_phantom(coarse_settings("limb", table="curved", table_gap_mm=5.0))[2]
+    assert truth["settings"]["table_gap_mm"] == 5.0
+    assert "prone" not in truth["settings"]
 
 
 @pytest.mark.parametrize(

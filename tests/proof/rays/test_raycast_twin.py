@@ -123,8 +123,9 @@ def test_ray_that_enters_through_a_clip_plane_has_its_number_and_another_ray_min
 
 def test_ray_enters_a_clipped_volume_at_the_plane_or_at_its_face(clipped_rays):
     t_in, _, _ = clipped_rays
-    half_the_volume = 14 * 0.9 / 2
-    assert t_in[:2] == pytest.approx([50.0, 50.0 - half_the_volume], abs=1e-9)
+    to_the_plane = 50.0  # mm, through the centre of the volume
+    to_the_face = 50.0 - 14 * 0.9 / 2  # half of 14 voxels of 0.9 mm in front of it
+    assert t_in[:2] == pytest.approx([to_the_plane, to_the_face], abs=1e-9)
 
 
 def test_ray_beside_the_kept_part_of_a_clipped_volume_has_an_empty_interval(clipped_rays):
@@ -141,9 +142,19 @@ def test_values_of_a_transfer_function_are_those_of_the_nearest_node_of_its_tabl
     assert np.abs(nodes - (0.0, 0.0, 0.0, 2.0, last - 1.0, last, last)).max() < 1e-3  # of a node, in float32
 
 
-def test_values_below_and_above_the_steps_of_a_transfer_function_are_those_of_its_ends():
-    step = TransferFunction([(300, 1, 1, 1, 0.0), (300, 1, 1, 1, 0.7), (400, 1, 1, 1, 0.7), (400, 1, 1, 1, 0.1)])
-    assert np.allclose(look_up(step, np.array([-1000.0, 301.0, 399.0, 5000.0]))[:, 3], [0.0, 0.7, 0.7, 0.1])
+@pytest.mark.parametrize(
+    ("hu", "opacity"),
+    [
+        pytest.param(-1000.0, 0.0, id="below the first step"),
+        pytest.param(301.0, 0.7, id="just above the first step"),
+        pytest.param(399.0, 0.7, id="just below the last step"),
+        pytest.param(5000.0, 0.1, id="above the last step"),
+    ],
+)
+def test_opacity_of_a_transfer_function_of_steps_is_that_of_the_side_of_the_step(hu, opacity):
+    white = (1, 1, 1)
+    steps = TransferFunction([(300, *white, 0.0), (300, *white, 0.7), (400, *white, 0.7), (400, *white, 0.1)])
+    assert look_up(steps, np.array([hu]))[0, 3] == pytest.approx(opacity)
 
 
 @pytest.mark.parametrize("direction", [None, (0.3, -2.0, 1.0)])

@@ -45,19 +45,21 @@ def face_segments(case: int, face: frozenset) -> set:
 @pytest.mark.parametrize("axis", range(3))
 def test_surfaces_of_two_neighbouring_cells_meet_on_their_common_face_in_every_case(axis):
     """Whatever the states of two cells that share a face, the segments on it are each other's reverse."""
-    low = [c for c in range(8) if CORNERS[c][axis] == 0]
-    high = [c | 1 << axis for c in low]
-    low_face, high_face = frozenset(low), frozenset(high)
-    to_high = {edge: edges_across(edge, axis) for edge in range(12) if {EDGES[edge][1], EDGES[edge][2]} <= low_face}
-    by_state: dict = {}
+    lower_corners = [c for c in range(8) if CORNERS[c][axis] == 0]
+    upper_corners = [c | 1 << axis for c in lower_corners]
+    lower_face, upper_face = frozenset(lower_corners), frozenset(upper_corners)
+    opposite = {edge: edges_across(edge, axis) for edge in range(12) if {EDGES[edge][1], EDGES[edge][2]} <= lower_face}
+
+    # what the upper of two cells draws on the common face, its lower one, reversed and with the edges of the lower cell
+    of_upper_cell: dict = {}
     for case in range(256):
-        state = tuple(case >> c & 1 for c in low)
-        by_state.setdefault(state, set()).add(
-            frozenset((to_high[b], to_high[a]) for a, b in face_segments(case, low_face))
-        )
+        state = tuple(case >> c & 1 for c in lower_corners)
+        reversed_segments = frozenset((opposite[b], opposite[a]) for a, b in face_segments(case, lower_face))
+        of_upper_cell.setdefault(state, set()).add(reversed_segments)
+
     for case in range(256):
-        state = tuple(case >> c & 1 for c in high)
-        assert by_state[state] == {frozenset(face_segments(case, high_face))}
+        state = tuple(case >> c & 1 for c in upper_corners)
+        assert of_upper_cell[state] == {frozenset(face_segments(case, upper_face))}
 
 
 def edges_across(edge: int, axis: int) -> int:
@@ -99,11 +101,15 @@ def test_packed_case_table_has_every_triangle_of_the_table():
         assert triangles == list(case_table()[case])
 
 
-def test_corners_and_edges_are_numbered_as_documented():
+def test_corners_are_numbered_with_x_fastest_and_z_slowest():
     assert CORNERS == tuple((x, y, z) for z, y, x in product((0, 1), repeat=3))
-    assert [axis for axis, _, _ in EDGES] == [0] * 4 + [1] * 4 + [2] * 4
-    assert EDGES[5] == (1, 1, 3)
-    assert EDGES[11] == (2, 3, 7)
+
+
+def test_edges_are_numbered_by_their_axis_and_then_by_their_lower_corner():
+    x_axis, y_axis, z_axis = range(3)
+    assert [axis for axis, _, _ in EDGES] == [x_axis] * 4 + [y_axis] * 4 + [z_axis] * 4
+    assert [(low, high) for axis, low, high in EDGES if axis == y_axis] == [(0, 2), (1, 3), (4, 6), (5, 7)]
+    assert [(low, high) for axis, low, high in EDGES if axis == z_axis] == [(0, 4), (1, 5), (2, 6), (3, 7)]
 
 
 def volume_inside(case: int) -> float:

@@ -101,7 +101,8 @@ def test_euler_numbers_are_those_of_scikit_image(connectivity):
         assert count_euler(solid, connectivity) == euler_number(solid, connectivity=connectivity)
 
 
-def compare_cells(seed: int, count: int) -> Counter:
+def count_right_cells(seed: int, count: int) -> Counter:
+    """How many random cells have the `right` and the `wrong` topology, or a field that sampling leaves `unclear`."""
     found: Counter = Counter()
     for case, heights in draw_cells(seed, count):
         truth = find_topology(heights.astype(np.float64).reshape(2, 2, 2), (20, 31, 48, 64))
@@ -115,7 +116,7 @@ def compare_cells(seed: int, count: int) -> Counter:
 @pytest.mark.seconds
 @pytest.mark.untraced
 def test_150_random_cells_have_the_topology_of_their_trilinear_field():
-    found = compare_cells(1, 150)
+    found = count_right_cells(1, 150)
     assert found["wrong"] == 0
     assert found["right"] >= 140  # of some the sampling is too coarse to say it
     assert found["tunnels"] >= 45  # a third of the cells have one
@@ -124,7 +125,7 @@ def test_150_random_cells_have_the_topology_of_their_trilinear_field():
 @pytest.mark.release
 @pytest.mark.slow
 def test_1000_random_cells_have_the_topology_of_their_trilinear_field():
-    found = compare_cells(2, 1000)
+    found = count_right_cells(2, 1000)
     assert found["wrong"] == 0
     assert found["right"] >= 975  # of some the sampling is too coarse to say it
     assert found["tunnels"] >= 300  # a third of the cells have one
@@ -288,8 +289,8 @@ def draw_volume(seed: int) -> Volume:
     return Volume(voxels, np.eye(4))
 
 
-def compare_volumes(seeds) -> Counter:
-    """Components and Euler number of surfaces of random fields against those of the field itself."""
+def count_right_surfaces(seeds) -> Counter:
+    """How many fields have a `clear` topology, and how many surfaces of them have it, by the topology asked for."""
     found: Counter = Counter()
     for seed in seeds:
         volume = draw_volume(seed)
@@ -310,7 +311,7 @@ def compare_volumes(seeds) -> Counter:
 
 
 def test_surfaces_of_12_random_fields_have_the_topology_of_the_field_unlike_separated_ones():
-    found = compare_volumes(range(12))
+    found = count_right_surfaces(range(12))
     assert found["clear"] >= 11  # of 12 fields sampling says the topology
     assert found["trilinear"] == found["clear"]
     assert found["separated"] < found["clear"] / 4
@@ -319,7 +320,7 @@ def test_surfaces_of_12_random_fields_have_the_topology_of_the_field_unlike_sepa
 @pytest.mark.release
 @pytest.mark.slow
 def test_surfaces_of_100_random_fields_have_the_topology_of_the_field_unlike_separated_ones():
-    found = compare_volumes(range(100, 200))
+    found = count_right_surfaces(range(100, 200))
     assert found["clear"] >= 95  # of 100 fields sampling says the topology
     assert found["trilinear"] == found["clear"]
     assert found["separated"] < found["clear"] / 10
