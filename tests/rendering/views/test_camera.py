@@ -320,7 +320,7 @@ def test_camera_is_fitted_to_a_square_picture_unless_a_size_is_given():
     flat = box(size=(40, 50, 5))  # its width decides the scale
 
     assert Camera.fit(flat) == Camera.fit(flat, size=(7, 7))
-    assert Camera.fit(flat) != Camera.fit(flat, size=(1025, 1024))
+    assert Camera.fit(flat) != Camera.fit(flat, size=(1025, 1024))  # nearly square
 
 
 of_zoomed_projections = pytest.mark.parametrize("perspective", [None, 60.0], ids=["parallel", "perspective"])

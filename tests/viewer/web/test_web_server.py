@@ -80,7 +80,7 @@ def test_browser_gets_pictures_of_the_iso_value_and_their_camera(served: WebServ
     picture = asyncio.run(browse())
 
     assert picture[0]["camera"]["parallel"]
-    assert grey(picture) == pytest.approx(200, abs=JPEG_GREYS)
+    assert grey(picture) == pytest.approx(200, abs=JPEG_GREYS)  # the iso value that Views begin with
 
 
 def test_colours_of_a_fitted_surface_come_with_their_scale_and_a_picture(served: WebServer) -> None:
