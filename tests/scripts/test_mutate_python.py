@@ -183,7 +183,9 @@ def test_test_of_a_minute_is_left_out_where_a_shorter_one_runs_the_line() -> Non
     assert trace.tests_of("a.py", [3]) == ["y"]
 
 
-def test_tests_whose_imports_are_nearer_to_the_changed_file_run_first(tmp_path: Path) -> None:
+@pytest.fixture
+def imports_of_three_tests(tmp_path: Path) -> Imports:
+    """Of test_near, which imports toy.deep, test_far, which does over a helper and toy.middle, and test_apart."""
     texts = {
         "toy/deep.py": "",
         "toy/middle.py": "def f():\n    from toy import deep\n",
@@ -195,12 +197,22 @@ def test_tests_whose_imports_are_nearer_to_the_changed_file_run_first(tmp_path: 
     for name, text in texts.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    imports = Imports.read(tmp_path, ["toy", "tests"])
-    steps = [imports.steps("toy/deep.py", f"tests/test_{name}.py") for name in ("near", "far", "apart")]
-    assert steps == [1, 3, FAR]
+    return Imports.read(tmp_path, ["toy", "tests"])
+
+
+@pytest.mark.parametrize(("name", "steps"), [("near", 1), ("far", 3), ("apart", FAR)])
+def test_imports_between_a_test_and_a_changed_file_are_counted(
+    imports_of_three_tests: Imports, name: str, steps: int
+) -> None:
+    assert imports_of_three_tests.steps("toy/deep.py", f"tests/test_{name}.py") == steps
+
+
+def test_tests_whose_imports_are_nearer_to_the_changed_file_run_first_and_those_of_other_lines_last(
+    imports_of_three_tests: Imports,
+) -> None:
     near, far, apart = (f"tests/test_{name}.py::test_it" for name in ("near", "far", "apart"))
     seconds = {apart: 0.1, far: 0.2, near: 3.0, f"{near}_too": 0.1, f"{far}_too": 0.1}
-    trace = Trace({"toy/deep.py": {1: [near, far, apart]}}, seconds, 1.0, imports=imports)
+    trace = Trace({"toy/deep.py": {1: [near, far, apart]}}, seconds, 1.0, imports=imports_of_three_tests)
     # Those that do not run the line come last: they may use what the others have kept.
     assert trace.tests_of("toy/deep.py", [1]) == [near, far, apart, f"{near}_too", f"{far}_too"]
 
@@ -442,23 +454,38 @@ def test_no_more_changes_are_chosen_than_there_are_places() -> None:
     assert len(choose_changes({"a.py": FUNCTION}, 99, "1")) == 5
 
 
-def test_an_edit_draws_no_other_changes_elsewhere() -> None:
+def chosen_lines(texts: dict[str, str], count: int) -> list[tuple[str, str, str]]:
+    """File, line before and line after of the changes that are chosen."""
+    return [(change.file, change.before, change.after) for change in choose_changes(texts, count, "1")]
+
+
+EIGHT_FUNCTIONS = "\n\n".join(f"def f{n}(x):\n    y = 2 * x + {n}\n    return y < 1 or y > 5" for n in range(8)) + "\n"
+
+
+def test_edit_of_a_line_draws_no_other_changes_elsewhere() -> None:
     pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
-    text = "\n\n".join(f"def f{n}(x):\n    y = 2 * x + {n}\n    return y < 1 or y > 5" for n in range(8)) + "\n"
-    edited = "import math\n\n" + text.replace("2 * x + 3", "math.exp(x) - 3")
+    edited = "import math\n\n" + EIGHT_FUNCTIONS.replace("2 * x + 3", "math.exp(x) - 3")
 
-    def chosen(texts: dict[str, str], count: int) -> list[tuple[str, str, str]]:
-        return [(one.file, one.before, one.after) for one in choose_changes(texts, count, "1")]
+    before = chosen_lines({"a.py": EIGHT_FUNCTIONS, "b.py": EIGHT_FUNCTIONS}, 999)  # more than there are
+    after = chosen_lines({"a.py": edited, "b.py": EIGHT_FUNCTIONS}, 999)
 
-    texts = {"a.py": text, "b.py": text}
-    before, after = chosen(texts, 999), chosen({**texts, "a.py": edited}, 999)
-    kept = [row for row in before if row[:2] != ("a.py", "y = 2 * x + 3")]
-    assert [row for row in after if row[:2] != ("a.py", "y = math.exp(x) - 3")] == kept
-    assert len(before) - len(kept) == 4
-    # Equal lines of two functions, and equal places of a line, are told apart.
-    assert before[:20] == chosen(texts, 20)
-    same = chosen({"a.py": "def f(x):\n    return x + x + x + x + x + x + x\n\n\ndef g(x):\n    return x + x + x\n"}, 9)
-    assert len(same) == 8 and len(set(same)) > 5
+    elsewhere = [row for row in before if row[:2] != ("a.py", "y = 2 * x + 3")]
+    assert [row for row in after if row[:2] != ("a.py", "y = math.exp(x) - 3")] == elsewhere
+    assert len(before) - len(elsewhere) == 4  # 2, *, + and 3
+
+
+def test_fewer_changes_of_a_seed_are_the_first_of_more() -> None:
+    pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
+    texts = {"a.py": EIGHT_FUNCTIONS, "b.py": EIGHT_FUNCTIONS}
+    assert chosen_lines(texts, 20) == chosen_lines(texts, 999)[:20]
+
+
+def test_changes_of_equal_lines_and_of_equal_places_of_a_line_are_told_apart() -> None:
+    pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
+    text = "def f(x):\n    return x + x + x + x + x + x + x\n\n\ndef g(x):\n    return x + x + x\n"
+    chosen = chosen_lines({"a.py": text}, 9)
+    assert len(chosen) == 6 + 2  # every + of both lines
+    assert len(set(chosen)) > 5  # some of them change to the same
 
 
 def test_each_line_of_a_module_has_the_name_of_its_innermost_definition() -> None:
