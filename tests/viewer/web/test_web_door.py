@@ -54,7 +54,7 @@ def test_policy_of_the_page_allows_its_own_socket_alone(served: WebServer, page_
     policy = page_headers["Content-Security-Policy"]
 
     assert policy.startswith("default-src 'none'; ")
-    assert re.findall(r"ws://[^ ;]+", policy)[0] == f"ws://127.0.0.1:{served.port}"
+    assert re.findall(r"wss?://[^ ;]+", policy) == [f"ws://127.0.0.1:{served.port}"]
 
 
 @pytest.mark.parametrize("name", ["script", "style"])

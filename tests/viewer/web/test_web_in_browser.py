@@ -141,7 +141,7 @@ def type_iso_value(page, *keys: str) -> None:
     exact.send_keys(*keys, Keys.ENTER)
 
 
-def test_text_that_is_no_iso_value_is_put_back(page) -> None:
+def test_text_that_is_no_iso_value_is_put_back_and_the_range_is_said(page) -> None:
     from selenium.webdriver.common.keys import Keys
 
     for wrong in (Keys.DELETE, "99999", "-5000"):  # nothing, above and below every HU
@@ -348,7 +348,7 @@ def test_shown_surface_is_saved_as_a_download(page, downloads: Path) -> None:
 
 
 @pytest.fixture
-def named_files(view_browser, device, tmp_path: Path):
+def save_by_key_s(view_browser, device, tmp_path: Path):
     """A function that presses s and waits, in a page of a mesh that was started with --save-as shown.ply shown.png."""
     objects = show_objects([scenes.make_mesh()])
     wrote: list[str] = []
@@ -358,7 +358,7 @@ def named_files(view_browser, device, tmp_path: Path):
         serving(lambda heard: ViewSession(objects, painter, on_change=heard), save_as=names, wrote=wrote.append) as own,
     ):
 
-        def save_by_key() -> None:
+        def press_and_wait() -> None:
             wanted, end = len(wrote) + len(names), time.monotonic() + PATIENCE
             press_keys(view_browser, "s")
             while len(wrote) < wanted:
@@ -367,21 +367,21 @@ def named_files(view_browser, device, tmp_path: Path):
 
         view_browser.get(own.address)
         wait_for(view_browser, SETTLED)
-        yield save_by_key
+        yield press_and_wait
         press_keys(view_browser, "q")
         wait_for(view_browser, "return document.documentElement.dataset.closed")
         severe_lines(view_browser)  # no later test is to find what the end of the server logs
 
 
-def test_key_s_writes_the_named_files_each_time_under_names_of_their_own(named_files, tmp_path: Path) -> None:
-    named_files()
-    named_files()
+def test_key_s_writes_the_named_files_each_time_under_names_of_their_own(save_by_key_s, tmp_path: Path) -> None:
+    save_by_key_s()
+    save_by_key_s()
 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["shown-2.ply", "shown-2.png", "shown.ply", "shown.png"]
 
 
-def test_named_file_of_a_mesh_holds_its_triangles(named_files, tmp_path: Path) -> None:
-    named_files()
+def test_named_file_of_a_mesh_holds_its_triangles(save_by_key_s, tmp_path: Path) -> None:
+    save_by_key_s()
 
     assert read_mesh(tmp_path / "shown.ply", space="lps").triangle_count == scenes.make_mesh().triangle_count
 

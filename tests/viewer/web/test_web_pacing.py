@@ -32,7 +32,7 @@ def drain(pace: Pace) -> list[Asked]:
 
 
 def test_each_view_that_is_shown_is_drawn_once(pace: Pace) -> None:
-    assert drain(pace) == [Asked(SCENE, SIZE, False), Asked("axial", (100, 100), False)]
+    assert drain(pace) == [Asked(SCENE, SIZE, moving=False), Asked("axial", (100, 100), moving=False)]
     assert drain(pace) == []
 
 
@@ -44,8 +44,8 @@ def test_changing_view_is_coarse_first_and_sharp_at_rest(pace: Pace) -> None:
     pace.rest()
     resting = drain(pace)
 
-    assert moving == [Asked(SCENE, SIZE, True)]
-    assert resting == [Asked(SCENE, SIZE, False)]
+    assert moving == [Asked(SCENE, SIZE, moving=True)]
+    assert resting == [Asked(SCENE, SIZE, moving=False)]
 
 
 def test_pace_is_done_once_the_sharp_picture_of_a_change_is_drawn(pace: Pace) -> None:
@@ -84,10 +84,10 @@ def test_views_that_are_not_shown_are_not_drawn(pace: Pace) -> None:
 def test_only_a_new_size_is_drawn_again(pace: Pace) -> None:
     drain(pace)
     pace.resize({SCENE: SIZE, "axial": (120, 100)})
-    assert drain(pace) == [Asked("axial", (120, 100), False)]
+    assert drain(pace) == [Asked("axial", (120, 100), moving=False)]
 
 
-SHARP, COARSE = Asked(SCENE, SIZE, False), Asked(SCENE, SIZE, True)
+SHARP, COARSE = Asked(SCENE, SIZE, moving=False), Asked(SCENE, SIZE, moving=True)
 
 
 def test_sharp_picture_gives_way_to_a_moving_one_of_its_view(pace: Pace) -> None:
