@@ -321,6 +321,7 @@ def test_colours_of_the_transfer_table_have_ten_bits_a_channel(monkeypatch, node
     monkeypatch.setattr(ray_pictures, "upload", lambda device, table: table)
     function = TransferFunction([(0, 1.0, 0.5, 0.0, 0.0), (100, 0.0, 0.5, 1.0, 1.0)])  # HU, colour, opacity
     color = int(ray_pictures.TransferTables.of(device(1), function, 1.0).colors_d[node])
+    # A step of ten bits; measured half.
     assert [color >> 20, color >> 10 & 1023, color & 1023] == pytest.approx(1023 * np.array(channels), abs=1.0)
 
 
@@ -347,6 +348,7 @@ def test_edge_of_cells_follows_the_density_of_points(k, size):
     points = np.random.default_rng(7).random((20_000, 3)).astype(np.float32)
     share_of_points = max(40.0, 5.6 * k) / len(points)
     side_of_27_cells = share_of_points ** (1 / 3)
+    # Estimated from a sample; measured 0.077.
     assert choose_cell_edge(size * points, k) == pytest.approx(size * side_of_27_cells / 3.0, rel=0.1)
 
 
@@ -457,7 +459,7 @@ def test_table_of_an_uneven_stack_has_heights_shifts_and_inverse_gaps(stack_of_u
     table = stack_of_uneven.arguments["stack_slices"]
     np.testing.assert_allclose(table[:, 0, 0], HEIGHTS, atol=TABLE_MM)
     np.testing.assert_allclose(table[:, 0, 1:3], np.column_stack([0.0 * SIDEWAYS, SIDEWAYS]), atol=TABLE_MM)
-    np.testing.assert_allclose(table[:, 0, 3], [*(1.0 / GAPS), 0.0], rtol=1e-5)
+    np.testing.assert_allclose(table[:, 0, 3], [*(1.0 / GAPS), 0.0], rtol=1e-5)  # float32; measured 3e-8
 
 
 def test_table_of_an_uneven_stack_has_the_normal_matrix_of_each_slice(stack_of_uneven):
@@ -470,7 +472,7 @@ def test_table_of_an_uneven_stack_has_the_steepest_shift_and_the_smallest_gap(st
     np.testing.assert_allclose(stack_of_uneven.slope, [0.0, steepest, 1 / GAPS.min(), 0.0], atol=TABLE_MM)
     way = np.array([1.0, 2.0, 0.5])  # along columns, rows and height
     steps = [1.0, 2.0 + 0.5 * steepest, 0.5 / GAPS.min()]
-    np.testing.assert_allclose(stack_of_uneven.index_steps(way), steps, rtol=1e-6)
+    np.testing.assert_allclose(stack_of_uneven.index_steps(way), steps, rtol=1e-6)  # float64
 
 
 def test_table_of_an_uneven_stack_counts_slices_and_layers(stack_of_uneven):

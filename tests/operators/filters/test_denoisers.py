@@ -62,7 +62,7 @@ def test_a_gaussian_spreads_an_impulse_by_its_sigma_in_mm_along_each_axis(axis, 
     made = clrecon.filter_volume(Volume(voxels, SPACING), "gaussian", sigma_mm=2.0).voxels.astype(np.float64)
     places = (np.arange(made.shape[axis]) - (made.shape[axis] - 1) / 2) * step_mm
     along = made.sum(axis=tuple({0, 1, 2} - {axis}))
-    assert np.sqrt((along * places**2).sum() / along.sum()) == pytest.approx(2.0, rel=0.01)
+    assert np.sqrt((along * places**2).sum() / along.sum()) == pytest.approx(2.0, rel=0.01)  # measured 0.0005
 
 
 def test_filter_of_a_device_volume_gives_a_device_volume(device):
@@ -142,7 +142,7 @@ def test_a_median_takes_the_voxels_nearest_to_its_radius(radius_mm, window):
 def test_curvature_flow_takes_the_longest_step_that_is_stable_for_its_smallest_spacing(spacing, share):
     volume = Volume(noisy_ball()[0].voxels, np.diag((*spacing, 1.0)))
     (step,) = clrecon.filter_volume(volume, "curvature-flow", iterations=1).report["filtered"]["steps"]
-    assert step["time_step"] == pytest.approx(share * ITK_TIME_STEP, rel=1e-12)
+    assert step["time_step"] == pytest.approx(share * ITK_TIME_STEP, rel=1e-12)  # float64
 
 
 def test_a_volume_of_one_column_is_filtered_as_one_of_one_row():

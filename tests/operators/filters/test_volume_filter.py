@@ -116,6 +116,7 @@ def test_filter_of_one_voxel_equals_the_sum_by_hand(device):
     far = np.exp(-0.5)
     middle = 10.0 - 2 * far * far * 10.0 / (1.0 + 2 * far + 2 * far * far)
     beside = far * far * 10.0 / (1.0 + 3 * far + far * far)
+    # Float32; measured 1.5e-6.
     assert found.voxels[0, 0] == pytest.approx([0, 0, beside, middle, beside, 0, 0], abs=1e-4)
 
 

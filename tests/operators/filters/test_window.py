@@ -47,7 +47,7 @@ def test_a_cap_of_taps_leaves_the_whole_rings_within_it():
     within_three = sum(i * i + j * j + k * k <= 9 for i in range(-3, 4) for j in range(-3, 4) for k in range(-3, 4))
     assert (window.taps, window.whole_taps) == (within_three, 7**3)
     assert (window.offsets**2).sum(axis=1).max() == 3**2
-    assert 0.95 < window.share < 1.0
+    assert 0.95 < window.share < 1.0  # measured 0.977: the corners have 2 % of the weight
 
 
 @pytest.mark.parametrize(("cap", "taps"), [(6, 1), (7, 7)], ids=["less than the first ring", "the first ring"])
@@ -67,6 +67,7 @@ def test_window_of_a_large_sigma_ends_at_the_largest_reach():
 def test_weights_of_taps_are_those_of_their_distances_in_mm_for_each_uneven_slice(volume):
     window = choose_window(volume, 0.9, 3, 90)
     expected = spatial_weights(volume, window.offsets, 0.9)
+    # Float64.
     np.testing.assert_allclose(np.broadcast_to(np.exp2(window.exponents), expected.shape), expected, rtol=1e-9)
     assert len(window.exponents) == (volume.shape_ijk[2] if volume.uneven else 1)
 

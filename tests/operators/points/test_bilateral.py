@@ -61,6 +61,7 @@ def test_points_that_are_no_features_are_filtered_by_their_whole_cell_as_by_the_
     assert np.mean(away > TWIN_FILTER_MM) < 0.002  # ratios that float32 puts on the other side of the threshold
     assert 0 < step.facts["feature_points"] < len(points)
     by_neighbours_alone = filter_by_twin(points)
+    # In mm; measured 0.33.
     assert np.abs(expected - by_neighbours_alone).max() > 0.05, "the choice of features does nothing here"
 
 

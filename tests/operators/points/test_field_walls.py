@@ -27,7 +27,7 @@ def test_walls_at_random_equal_their_twin(shape):
     assert found.faces.sum() == sum(faces for faces, _, _ in expected.values())
     for place, (faces, walls, enclosed) in expected.items():
         assert (found.faces[place], found.walls[place]) == (faces, walls)
-        assert found.enclosed[place] == pytest.approx(enclosed, abs=1e-9)
+        assert found.enclosed[place] == pytest.approx(enclosed, abs=1e-9)  # float64
 
 
 BODY = np.ones((20, 20, 20), bool)
@@ -99,7 +99,7 @@ def one_open_ball(device):
 def test_balls_without_holes_have_no_lost_volume_and_no_warning(whole_balls):
     report = whole_balls.report
     assert (report["warnings"], report["open_cubes"], report["lost_share"]) == ([], [], 0.0)
-    assert report["wall_share"] < 0.01
+    assert report["wall_share"] < 0.01  # measured 0.0008
 
 
 def test_one_open_ball_of_twelve_is_warned_of_with_its_place(one_open_ball):
@@ -109,13 +109,13 @@ def test_one_open_ball_of_twelve_is_warned_of_with_its_place(one_open_ball):
     assert "of the surface are walls that no points support, most of it within 10.4 mm of" in warning  # 16 nodes
     worst = report["open_cubes"][0]
     assert np.linalg.norm(worst["centre_mm"]) < 20.0  # the open ball is the one around the origin
-    assert worst["wall_share"] > 1.0 / 3.0
+    assert worst["wall_share"] > 1.0 / 3.0  # the share a cube is listed from; measured 0.47
 
 
 def test_the_volume_that_an_open_ball_loses_is_reported_within_half_of_it(whole_balls, one_open_ball):
     lost = 1.0 - one_open_ball.quality().volume_ml / whole_balls.quality().volume_ml
-    assert lost > 0.02
-    assert one_open_ball.report["lost_share"] == pytest.approx(lost, rel=0.5)
+    assert lost > 0.02  # warned of from 0.003 on; measured 0.072
+    assert one_open_ball.report["lost_share"] == pytest.approx(lost, rel=0.5)  # measured 0.16 below
 
 
 @pytest.mark.parametrize(("shape", "spacing"), [(sphere_cloud, 0.65), (cube_cloud, 0.64)])
@@ -128,7 +128,7 @@ def test_holes_of_one_millimetre_are_bridged_without_a_warning(device, shape, sp
 
     report = reconstruct_surface(cloud.select(np.flatnonzero(keep)), spacing, device=device).report
 
-    assert report["wall_share"] < 0.03
+    assert report["wall_share"] < 0.03  # measured 0.002 for the ball, 0.016 for the cube
     assert report["lost_share"] == 0.0
     assert report["warnings"] == []
 
@@ -153,10 +153,10 @@ PLATE_ML = 24 * 34 * 3 / 1000
 def test_lost_volume_is_warned_of_where_lines_lie_farther_apart_than_nodes_bridge(device):
     """The outside reaches in between lines 4.25 mm apart, where no vote is against it."""
     mesh = reconstruct_surface(plate_in_lines(), 1.2, bridge=2.5, device=device)
-    assert mesh.quality().volume_ml < 0.5 * PLATE_ML
-    assert mesh.report["votes_against_share"] < 0.001
-    assert mesh.report["wall_share"] > 0.4
-    assert mesh.report["lost_share"] > 0.2
+    assert mesh.quality().volume_ml < 0.5 * PLATE_ML  # measured 0.34 of it
+    assert mesh.report["votes_against_share"] < 0.001  # measured none
+    assert mesh.report["wall_share"] > 0.4  # measured 0.48
+    assert mesh.report["lost_share"] > 0.2  # measured 0.38
     assert "of the volume are lost" in mesh.report["warnings"][0]
 
 
@@ -164,5 +164,5 @@ def test_plate_of_lines_that_nodes_bridge_keeps_its_volume_without_a_warning_of_
     """Lines 4.25 mm apart are within 2.5 mm of every node between them."""
     mesh = reconstruct_surface(plate_in_lines(), 2.5, bridge=2.5, device=device)
     assert mesh.quality().volume_ml == pytest.approx(PLATE_ML, rel=0.12)  # nodes 2.5 mm apart in a plate of 3 mm
-    assert mesh.report["wall_share"] < 0.05
+    assert mesh.report["wall_share"] < 0.05  # measured 0.022
     assert not any("walls" in text for text in mesh.report["warnings"])

@@ -212,4 +212,4 @@ def test_27_cells_around_a_point_hold_about_5p6_candidates_for_each_neighbour(cl
     cells = np.floor(points / edge).astype(int)
     candidates = (np.abs(cells - cells[15_000]) <= 1).all(axis=1).sum()
     wanted = max(40, 5.6 * k)  # and no fewer than 40
-    assert 0.5 < candidates / wanted < 2.0
+    assert 0.5 < candidates / wanted < 2.0  # of one point: measured 0.6 to 1.6

@@ -221,13 +221,14 @@ def test_doubtful_normals_are_warned_of_where_slices_lie_ten_pixels_apart(device
     volume, shell = shell_of_a_cylinder(device, slice_gap)
     step = estimate_normals(shell, volume=volume, device=device)
     share = step.facts["doubtful"] / len(shell)
-    assert (share > 0.1) == warned
+    assert (share > 0.1) == warned  # measured none, and 0.129
     assert [f"({100.0 * share:.0f} %) are doubtful" in warning for warning in step.warnings] == [True] * warned
 
 
 def test_few_normals_are_doubtful_after_thinning_to_the_slice_gap(device):
     volume, shell = shell_of_a_cylinder(device, slice_gap=5.0)
     thinned = clrecon.thin_points(shell, 5.0, device=device).cloud
+    # Measured none: the nearest points lie in other slices too.
     assert estimate_normals(thinned, volume=volume, device=device).facts["doubtful"] < 0.1 * len(thinned)
 
 

@@ -104,7 +104,7 @@ def test_the_default_edge_is_twice_the_median_distance_to_the_sixteenth_neighbou
 
 
 def test_cells_of_the_default_edge_hold_some_sixteen_points(device):
-    assert 5.0 < remove_sparse_cells(scattered_points(3000), device=device).facts["points_a_cell"] < 40.0
+    assert 5.0 < remove_sparse_cells(scattered_points(3000), device=device).facts["points_a_cell"] < 40.0  # measured 25
 
 
 EDGE = 1.75  # mm

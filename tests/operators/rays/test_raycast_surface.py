@@ -104,7 +104,7 @@ def test_depths_of_a_surface_and_of_its_caps_are_those_of_the_extracted_mesh(cas
     shot = cast(volume, "surface", iso_value=100.0, camera=camera, size=size, ray_step=0.1)
     depth, cosine = mesh_depths(cast, volume, 100.0, camera, size)
     both = np.isfinite(depth) & np.isfinite(shot.depth)
-    assert both.mean() > 0.4
+    assert both.mean() > 0.4  # of the pixels: enough to judge; measured 0.91
     assert (np.isfinite(depth) != np.isfinite(shot.depth)).mean() <= tolerances.RAY_OUTLINE_SHARE
     steep = both & (cosine > 0.4)
     away = np.abs(shot.depth - depth)[steep] * cosine[steep] / (1.9 if steps == "uneven" else max(volume.spacing))

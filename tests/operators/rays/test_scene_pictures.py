@@ -126,7 +126,7 @@ def test_a_screen_beside_fog_has_its_own_colour_and_opacity(screen_in_fog: Scree
     scene = screen_in_fog
     beside = (scene.before + scene.behind == 0.0) & (scene.plane > 0.0)
     off = np.abs(scene.picture.image[beside] - (0, 255, 0, 255 * scene.opacity))
-    assert off.max(initial=0.0) <= 0.5
+    assert off.max(initial=0.0) <= 0.5  # of 255: rounding; measured 0
 
 
 @pytest.mark.seconds

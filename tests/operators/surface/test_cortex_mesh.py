@@ -69,7 +69,7 @@ def test_fitted_surface_knows_the_thickness_of_its_wall(fitted):
 
 def test_errors_of_a_fitted_surface_hold_93_percent_of_its_distances_from_the_bone(fitted):
     """Standard errors: 1.96 of them hold 95 % of a normal distribution."""
-    assert (np.abs(from_bone(fitted)) < 1.96 * fitted.values["error_mm"]).mean() > 0.93
+    assert (np.abs(from_bone(fitted)) < 1.96 * fitted.values["error_mm"]).mean() > 0.93  # measured 1
 
 
 def test_fitting_keeps_triangles_and_topology_without_self_intersections(level_mesh, fitted):
@@ -132,8 +132,8 @@ def test_hidden_walls_follow_their_fitted_neighbours_three_vertices_far_and_othe
 
     shifts = choose_shifts(fit, triangles, Fans(triangles, 81)).reshape(9, 9)
 
-    np.testing.assert_allclose(shifts[:4], np.where(columns < 3 + 3, -0.5, 0.0)[:4], rtol=1e-6)
-    np.testing.assert_allclose(shifts[6:], np.where(columns < 3 + 1, -0.5, 0.0)[6:], rtol=1e-6)
+    np.testing.assert_allclose(shifts[:4], np.where(columns < 3 + 3, -0.5, 0.0)[:4], rtol=1e-6)  # float32
+    np.testing.assert_allclose(shifts[6:], np.where(columns < 3 + 1, -0.5, 0.0)[6:], rtol=1e-6)  # float32
 
 
 def test_second_fit_of_thick_slices_is_nearer_to_the_bone_than_the_first(device):
@@ -152,6 +152,7 @@ def test_second_fit_of_thick_slices_is_nearer_to_the_bone_than_the_first(device)
         return np.abs(np.linalg.norm(vertices[outer] - MIDDLE, axis=1) - RADIUS).mean()
 
     twice = clrecon.fit_cortex(mesh, volume, device=device)
+    # In mm; measured 0.166 and 0.202.
     assert mean_error(twice.vertices) < 0.9 * mean_error(mesh.vertices + shifts[:, None] * mesh.normals)
 
 

@@ -46,7 +46,7 @@ def test_edges_of_levels_double_and_hold_the_longest_side_of_their_triangles():
     plan = plan_crossings(*scattered(700, sizes=MANY_SMALL_TRIANGLES), most_rows=100)
     edges, longest = plan.edges.T
     assert len(edges) == len(plan.levels) > 1
-    np.testing.assert_allclose(edges, edges[0] * 2.0 ** np.arange(len(edges)), rtol=1e-6)
+    np.testing.assert_allclose(edges, edges[0] * 2.0 ** np.arange(len(edges)), rtol=1e-6)  # float32
     assert (longest <= edges).all()
 
 

@@ -229,7 +229,7 @@ def test_report_of_a_label_names_it_and_has_the_warnings_of_its_map(report_of_t1
 
 def test_report_of_a_label_has_its_shares_and_settings(report_of_t12):
     assert report_of_t12["label_inside_share"] == 1.0
-    assert 0.1 < report_of_t12["vertices_by_hu_share"] < 0.9
+    assert 0.1 < report_of_t12["vertices_by_hu_share"] < 0.9  # some, not all; measured 0.83
     assert (report_of_t12["solid"], report_of_t12["grow_mm"]) == (False, None)
 
 

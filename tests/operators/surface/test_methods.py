@@ -90,6 +90,7 @@ def test_method_s_mc_decimates_and_reports_it(device: Any) -> None:
 def test_method_g_mc_removes_the_share_of_triangles_that_is_asked_for(device: Any) -> None:
     whole = extract_isosurface(smooth_volume(), 250, device=device)
     decimated = extract_by_method(smooth_volume(), 250, "g-mc", decimate=0.3, device=device)
+    # A collapse takes two; measured 0.0001.
     assert decimated.triangle_count == pytest.approx((1 - 0.3) * whole.triangle_count, rel=0.02)
 
 

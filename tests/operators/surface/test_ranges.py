@@ -117,7 +117,7 @@ def test_an_edge_crosses_the_end_of_a_range_that_its_outer_voxel_lies_beyond(dev
     mesh = extract_isosurface(Volume(voxels, np.eye(4)), (100, 300), device=device)
     along_the_row = mesh.vertices[(mesh.vertices[:, 1:] == 1.0).all(axis=1), 0]
     from_0_to_110, from_110_to_500 = 1.0 + 99.5 / 110.0, 2.0 + (300.5 - 110.0) / (500 - 110)  # half a HU beyond
-    assert sorted(along_the_row) == pytest.approx([from_0_to_110, from_110_to_500], abs=1e-6)
+    assert sorted(along_the_row) == pytest.approx([from_0_to_110, from_110_to_500], abs=1e-6)  # float32; measured 4e-8
 
 
 def test_surface_of_a_range_of_depths_of_a_ball_is_a_shell_with_its_volume(device):
@@ -126,6 +126,7 @@ def test_surface_of_a_range_of_depths_of_a_ball_is_a_shell_with_its_volume(devic
     assert found["components"] == 2
     assert found["outward"]
     voxel_ml = 0.7 * 0.5 * 0.9 / 1000.0
+    # Chords; measured 0.0034.
     assert found["volume_ml"] == pytest.approx(4.0 / 3.0 * np.pi * (10.0**3 - 5.0**3) * voxel_ml, rel=0.01)
 
 
@@ -145,7 +146,7 @@ def test_surface_below_a_level_of_an_empty_volume_ends_half_a_voxel_beyond_it(de
     """Edges and corners are cut off."""
     empty = Volume(np.full((33, 33, 33), -200, np.int16), np.diag((0.7, 0.5, 0.9, 1.0)))
     box_ml = extract_isosurface(empty, 100, device=device, below=True).quality()["volume_ml"]
-    assert box_ml == pytest.approx(33**3 * 0.7 * 0.5 * 0.9 / 1000.0, rel=2e-3)
+    assert box_ml == pytest.approx(33**3 * 0.7 * 0.5 * 0.9 / 1000.0, rel=2e-3)  # measured 0.0014
 
 
 @pytest.mark.parametrize(("level", "options"), [((2, 3), {}), (3, {"below": True})], ids=["range", "below"])

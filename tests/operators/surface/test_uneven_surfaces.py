@@ -74,7 +74,7 @@ def test_surface_of_a_sphere_in_uneven_slices_is_closed_with_its_volume(device, 
 def test_surface_of_the_same_slices_at_even_places_is_no_sphere(device, sphere_in_uneven_slices):
     """The tests above can fail."""
     nominal = Volume(sphere_in_uneven_slices.voxels, sphere_in_uneven_slices.affine)
-    assert off_sphere(extract_isosurface(nominal, 0.0, device=device), nominal).max() > 0.5
+    assert off_sphere(extract_isosurface(nominal, 0.0, device=device), nominal).max() > 0.5  # mm; measured 4.6
 
 
 @pytest.mark.oclgrind

@@ -315,7 +315,7 @@ def test_solid_and_canal_in_tilted_and_oblique_scans_are_those_in_straight_ones(
     inside = clrecon.vertebra_inside(Volume(voxels, affine), labels, "L1", device=device)
     # Measured in straight slices.
     assert inside.volumes_ml["solid"] == pytest.approx(35.76, rel=0.01)
-    assert inside.volumes_ml["canal"] == pytest.approx(5.5, rel=0.1)
+    assert inside.volumes_ml["canal"] == pytest.approx(5.5, rel=0.1)  # measured 5.24
     assert inside.canal_found.height_mm == pytest.approx(13.8, abs=1.8)  # a slice and a half
 
 

@@ -137,7 +137,7 @@ def test_solid_bone_of_sagittal_slices_is_given_in_axial_ones(spine, device):
     volume, labels, _ = spine
     sagittal = Volume(volume.voxels.transpose(2, 0, 1), volume.affine[:, [1, 2, 0, 3]])
     normal = np.cross(*vertebra_solid(sagittal, labels, 20, 300, device=device).scan.affine[:3, :2].T)
-    assert abs(normal[2]) > 0.99 * np.linalg.norm(normal)
+    assert abs(normal[2]) > 0.99 * np.linalg.norm(normal)  # along the axis of the body
 
 
 def test_solid_bone_of_an_uneven_stack_has_the_voxels_and_places_of_its_label(device):
