@@ -192,7 +192,7 @@ def test_doubtful_normals_of_a_thin_wall_follow_the_gradient(device, points_of_a
 
     axes, _ = principal_axes(points, find_neighbours(points.astype(np.float32), 16)[0])
     expected, doubtful = orient_by_gradients(axes, gradients_twin(volume, points, -50.0))
-    assert step.facts["doubtful"] == doubtful.sum() > 20
+    assert step.facts["doubtful"] == doubtful.sum() > 20  # measured 30
     found = step.cloud.normals[doubtful]
     assert np.all(np.sign(found[:, 0]) == np.sign(points[doubtful, 0] - WALL_AT))
     assert degrees_between(found, expected[doubtful]).max() < 0.01  # float32

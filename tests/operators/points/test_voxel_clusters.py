@@ -205,7 +205,7 @@ def test_clusters_of_a_shuffled_cloud_are_numbered_in_its_order_as_by_scikit_lea
     cloud = voxel_cloud(Volume(random_voxels((8, 16, 33), 0.12), FINE))
     shuffled = cloud.select(np.random.default_rng(8).permutation(len(cloud)))
     expected = sklearn.DBSCAN(eps=0.9, min_samples=3).fit(shuffled.points.astype(np.float64))
-    assert expected.labels_.max() > 20, "too few clusters for an order"
+    assert expected.labels_.max() > 20, "too few clusters for an order"  # measured 62
 
     step = cluster_points(shuffled, 0.9, 3, device=device)
 

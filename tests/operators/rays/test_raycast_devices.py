@@ -94,7 +94,7 @@ def assert_alike(found: Any, expected: Any, mode: str) -> None:
     """Two pictures by float32 and float64, or by two compilers."""
     share = tolerances.RAY_TWIN_SHARE
     if mode == "dvr":
-        assert expected.image[..., 3].max() > 100
+        assert expected.image[..., 3].max() > 100  # of 255: something is shown; measured 249 on
         away = np.abs(premultiplied(found.image) - premultiplied(expected.image)).max(axis=-1)
         assert (away <= 2.0).mean() >= 1.0 - share, f"{(away > 2.0).sum()} pixels differ, by up to {away.max():.1f}"
         assert away.max() <= tolerances.RAY_TWIN_WORST_255
@@ -227,5 +227,5 @@ def test_pictures_of_any_size_have_all_their_pixels(device, size):
         cast(volume, "dvr", fog, camera=camera, size=size) for cast in (DeviceCaster(device), TwinCaster())
     )
     assert found.image.shape == (size[1], size[0], 4)
-    assert expected.image[..., 3].max() > 100
+    assert expected.image[..., 3].max() > 100  # of 255: something is shown; measured 249 on
     assert np.abs(found.image[..., 3].astype(int) - expected.image[..., 3]).max() <= 2  # of 255; measured 0

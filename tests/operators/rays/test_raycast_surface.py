@@ -140,7 +140,7 @@ def test_surface_cut_by_a_clip_plane_has_a_cap_with_the_depth_and_light_of_the_p
     truth = (centre_of(volume) + 2.0 * normal - origins) @ normal / (directions @ normal)
     points = origins + truth[..., None] * directions - centre_of(volume)
     on_cap = np.linalg.norm(points, axis=-1) < radius - 0.2
-    assert on_cap.sum() > 300
+    assert on_cap.sum() > 300  # pixels; measured 593
     assert np.abs(shot.depth - truth)[on_cap].max() <= tolerances.SLICE_DEPTH_MM
     light = 255.0 * (MATT.ambient + MATT.diffuse * np.abs(directions @ normal))
     assert np.abs(shot.image[..., 0] - light)[on_cap].max() <= tolerances.RAY_SAME_255
@@ -177,8 +177,8 @@ def test_a_ball_throws_its_shadow_on_a_floor_where_its_line_to_the_light_meets_i
     to_line = np.linalg.norm(points - (points @ TOWARDS_LIGHT)[..., None] * TOWARDS_LIGHT, axis=-1)
     in_shadow = floor & (to_line < BALL_RADIUS - 0.3)  # 0.3 mm off the rim of the shadow
     in_light = floor & (to_line > BALL_RADIUS + 0.3)
-    assert in_shadow.sum() > 50
-    assert in_light.sum() > 500
+    assert in_shadow.sum() > 50  # pixels; measured 148
+    assert in_light.sum() > 500  # pixels; measured 1746
 
     lit = 255.0 * (lighting.ambient + lighting.diffuse * TOWARDS_LIGHT[2])
     rounding = tolerances.RAY_SAME_255 + 0.5

@@ -336,7 +336,7 @@ def test_uneven_and_even_samplings_of_one_field_look_alike(cast):
     settings = {"camera": camera, "size": (40, 40), "ray_step": 0.4}
     images = [cast(volume, "dvr", soft, **settings).image for volume in (uneven, even)]
     assert np.abs(images[0][..., 3].astype(int) - images[1][..., 3]).max() <= tolerances.RAY_RESAMPLED_255
-    assert images[0][..., 3].max() > 150
+    assert images[0][..., 3].max() > 150  # of 255; measured 193
 
 
 def waves(dtype):
@@ -357,7 +357,7 @@ def test_every_voxel_type_gives_the_colours_of_float32(cast, dtype):
     found, expected = (
         cast(waves(kind), "dvr", soft, camera=camera, size=(32, 32)).image for kind in (dtype, "float32")
     )
-    assert found[..., 3].max() > 60
+    assert found[..., 3].max() > 60  # of 255; measured 240
     assert np.abs(found.astype(int) - expected).max() <= tolerances.RAY_SAME_255
 
 

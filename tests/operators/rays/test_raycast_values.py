@@ -42,7 +42,7 @@ def test_mean_tells_the_chords_of_a_ball(cast, steps, perspective):
         mean = cast(volume, "mean", camera=camera, size=size).values
         chords = (mean + 500.0) / 1500.0 * ways_through(volume, camera, size)
         well_inside = passing < 0.7 * radius
-        assert well_inside.sum() > 50
+        assert well_inside.sum() > 50  # pixels; measured 88 and 216
         truth = ball_chords(radius, ramp, passing[well_inside])
         assert np.abs(chords[well_inside] / truth - 1.0).max() <= tolerances.RAY_CHORD
 
@@ -62,7 +62,7 @@ def test_mean_tells_the_chords_of_a_box(cast, steps, perspective):
         mean = cast(volume, "mean", camera=camera, size=size).values
         chords = (mean + 200.0) / 1000.0 * ways_through(volume, camera, size)
         clear = rays_off_edges(volume, camera, size, low, high)
-        assert clear.sum() > 30
+        assert clear.sum() > 30  # pixels; measured 139 on
         ways = ways_through(volume, camera, size, low, high)
         assert np.abs(chords[clear] / ways[clear] - 1.0).max() <= tolerances.RAY_CHORD
 
@@ -104,7 +104,7 @@ def test_a_radiograph_tells_the_water_in_a_ball(cast, steps, perspective):
         water = cast(volume, "drr", camera=camera, size=size).values
         assert not water[passing > radius + 0.5 * ramp + 2.0 * spacing].any()
         well_inside = passing < 0.7 * radius
-        assert well_inside.sum() > 50
+        assert well_inside.sum() > 50  # pixels; measured 88 and 216
         truth = 1.5 * ball_chords(radius, ramp, passing[well_inside])
         assert np.abs(water[well_inside] / truth - 1.0).max() <= tolerances.RAY_CHORD
 
@@ -137,7 +137,7 @@ def test_a_radiograph_tells_the_water_in_a_block_beside_padding(cast, steps, per
         water = cast(volume, "drr", camera=camera, size=size).values
         ways = ways_through(volume, camera, size, low, high)
         clear = rays_off_edges(volume, camera, size, low, high)
-        assert clear.sum() > 30
+        assert clear.sum() > 30  # pixels; measured 139 on
         assert np.abs(water[clear] / ways[clear] - 1.0).max() <= tolerances.RAY_CHORD
         beside = ways_through(volume, camera, size, low - 1.0, high + 1.0) == 0.0
         assert not water[beside].any()
@@ -251,7 +251,7 @@ def test_the_depth_of_a_highest_value_is_where_the_ray_passes_it_nearest(cast, p
     shot = cast(volume, "mip", camera=camera, size=size, ray_step=0.1)
     passing, along = distances_from(centre_of(volume) + place, camera, size)
     off_tip = passing > 1.5  # nearer, the trilinear field has no sharp tip
-    assert off_tip.sum() > 100
+    assert off_tip.sum() > 100  # pixels; measured 535
     assert np.abs(shot.depth - along)[off_tip].max() <= tolerances.RAY_TIP_VOXEL * max(volume.spacing)
 
 

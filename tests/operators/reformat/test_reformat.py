@@ -195,7 +195,7 @@ def test_an_oblique_slice_equals_that_of_simpleitk(device):
     origins, directions = cut.camera.rays((60, 50))
     ijk = volume.lps_to_ijk((origins + cut.camera.distance * directions).reshape(-1, 3)).reshape(50, 60, 3)
     within = ((ijk >= 0.0) & (ijk <= (15, 13, 11))).all(axis=2)
-    assert within.sum() > 300
+    assert within.sum() > 300  # pixels; measured 1112
     assert np.abs(cut.values - other)[within].max() <= tolerances.TWIN_SLICE_HU
 
 

@@ -111,7 +111,7 @@ def test_pictures_of_random_voxels_are_the_same_with_and_without_windows(
     monkeypatch.setattr(resident, "ray_variants", lambda *args: {**ray_variants(*args), "NO_WINDOWS": "1"})
     without = [DeviceCaster(windows)(volume, "dvr", FUNCTION, **view) for view in views]
     for found, expected in zip(with_windows, without, strict=True):
-        assert expected.image[..., 3].max() > 100
+        assert expected.image[..., 3].max() > 100  # of 255: something is shown; measured 124 on
         assert np.abs(premultiplied(found.image) - premultiplied(expected.image)).max() <= tolerances.RAY_SAME_255
         assert np.array_equal(np.isnan(found.depth), np.isnan(expected.depth))
 
@@ -126,7 +126,7 @@ def test_pictures_of_few_rows_or_slices_are_the_same_with_and_without_windows(wi
     ray_variants = resident.ray_variants
     monkeypatch.setattr(resident, "ray_variants", lambda *args: {**ray_variants(*args), "NO_WINDOWS": "1"})
     expected = DeviceCaster(windows)(volume, "dvr", FUNCTION, **view)
-    assert expected.image[..., 3].max() > 100
+    assert expected.image[..., 3].max() > 100  # of 255: something is shown; measured 124 on
     assert np.abs(premultiplied(found.image) - premultiplied(expected.image)).max() <= tolerances.RAY_SAME_255
     assert np.array_equal(found.depth, expected.depth, equal_nan=True)
 
@@ -139,7 +139,7 @@ def test_slabs_with_a_single_slice_at_the_end_give_the_picture_of_the_whole(wind
     whole = DeviceCaster(windows)(volume, "dvr", FUNCTION, **view)
     monkeypatch.setattr(ray_slabs, "plan_ray_slabs", lambda *_, **__: slices)
     parts = DeviceCaster(windows)(volume, "dvr", FUNCTION, **view)
-    assert whole.image[..., 3].max() > 100
+    assert whole.image[..., 3].max() > 100  # of 255: something is shown; measured 253
     assert np.abs(premultiplied(whole.image) - premultiplied(parts.image)).max() <= tolerances.RAY_SAME_255
     for name in ("depth", "expected_depth"):
         found, expected = getattr(parts, name), getattr(whole, name)

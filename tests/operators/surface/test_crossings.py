@@ -53,7 +53,7 @@ def test_edges_of_levels_double_and_hold_the_longest_side_of_their_triangles():
 def test_finest_level_has_no_more_rows_than_allowed_and_more_than_half_of_them():
     plan = plan_crossings(*scattered(700, sizes=MANY_SMALL_TRIANGLES), most_rows=100)
     rows = plan.levels[:, 1].astype(int) * plan.levels[:, 2]
-    assert 50 < rows[0] <= 100
+    assert 50 < rows[0] <= 100  # measured 90
 
 
 @pytest.mark.oclgrind

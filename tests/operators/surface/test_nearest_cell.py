@@ -57,4 +57,4 @@ def test_nearest_cell_to_a_point_is_the_nearest_of_all_within_10_mm_and_refused_
         cell = np.array([find_cell_near(device, grid, classified, point)[::-1]])
         centre = volume.ijk_to_lps(cell + 0.5 - rule.border)
         assert np.linalg.norm(centre - point) == pytest.approx(nearest_mm, abs=1e-6)  # mm in float64; measured 1e-14
-    assert found > 10
+    assert found > 10  # measured 40
