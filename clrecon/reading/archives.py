@@ -21,6 +21,9 @@ _DEEPEST = 2
 """Archives in archives."""
 
 _TARS = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
+_OTHER_ZIPS = (".3mf", ".npz")
+"""Files of meshes and clouds that are zip files too."""
+
 _PIECE = 1 << 20
 
 
@@ -77,17 +80,25 @@ def unpacked(
 
 
 def is_archive(path: str | os.PathLike[str]) -> bool:
-    """Tell whether a path is a zip file, by its first bytes, or a tar file, by its name."""
+    """Tell whether a path is a zip or tar file, by its first bytes, or a packed tar file, by its name."""
     try:
         file = Path(path)
         if not file.is_file():
             return False
-        if file.name.lower().endswith(_TARS):
-            return True
-        with file.open("rb") as stream:
-            return stream.read(4) in (b"PK\x03\x04", b"PK\x05\x06")
+        if file.name.lower().endswith((*_TARS, *_OTHER_ZIPS)):
+            return file.name.lower().endswith(_TARS)
+        return _starts_as_zip(file) or _read_start(file)[257:] == b"ustar"
     except (TypeError, ValueError, OSError):
         return False  # reading says what is wrong
+
+
+def _read_start(file: Path) -> bytes:
+    with file.open("rb") as stream:
+        return stream.read(262)
+
+
+def _starts_as_zip(file: Path) -> bool:
+    return _read_start(file)[:4] in (b"PK\x03\x04", b"PK\x05\x06")
 
 
 class _Unpacking:
@@ -102,7 +113,7 @@ class _Unpacking:
 
     def unpack(self, file: Path, folder: Path, depth: int = 1) -> None:
         """Unpack an archive, and those in it, into a folder."""
-        reader = _Tar(file) if file.name.lower().endswith(_TARS) else _Zip(file, self._name)
+        reader = _Zip(file, self._name) if _starts_as_zip(file) else _Tar(file)
         with reader as archive:
             entries = archive.find_entries(self._limits.entries)
             self._check(entries)

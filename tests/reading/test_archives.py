@@ -80,7 +80,8 @@ def zip_twice(folder: Path, path: Path) -> Path:
 
 PACKED = {
     "scan.zip": zip_folder,
-    "without an extension": zip_folder,
+    "zip without an extension": zip_folder,
+    "tar without an extension": tar_folder,
     "twice.zip": zip_twice,
     "scan.tar": tar_folder,
     "scan.tar.gz": tar_folder,
