@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import IO, NamedTuple
 
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
 
@@ -93,7 +94,7 @@ def is_archive(path: str | os.PathLike[str]) -> bool:
 
 
 def _read_start(file: Path) -> bytes:
-    with file.open("rb") as stream:
+    with open_regular(file) as stream:
         return stream.read(262)
 
 

@@ -22,4 +22,5 @@ class Clock:
 
 def make_model(*subjects: Any, **given: Any) -> ViewModel:
     """Return the model of a view of these objects, of a scan and a mesh by default."""
-    return ViewModel(show_objects(subjects or [scenes.make_scan(), scenes.make_mesh()]), clock=Clock(), **given)
+    shown: list[Any] = list(subjects) or [scenes.make_scan(), scenes.make_mesh()]
+    return ViewModel(show_objects(shown), clock=Clock(), **given)

@@ -119,6 +119,7 @@ OPENING_MODULES = {
     "exchange/threemf.py": "what it has just written",
     "exchange/vtp.py": "what it has just written",
     "__init__.py": "its own list of names",
+    "reading/archives.py": "members of an archive, and its own files of them",
     "reading/grids/metaimage.py": "what it has just written",
     "proof/timing.py": "the system",
     "proof/compare/job.py": "what it has just written",

@@ -104,7 +104,7 @@ def test_cells_of_the_plane_carry_the_colours_and_hu_of_the_pixels():
 @pytest.mark.parametrize(
     ("camera", "asked", "says"),
     [
-        pytest.param(None, {}, ["no projection"], id="a picture without a camera"),
+        pytest.param(None, {}, ["projection"], id="a picture without a camera"),
         pytest.param(CAMERAS[0], {"form": "mesh"}, ["points", "plane", "mesh"], id="an unknown form"),
         pytest.param(CAMERAS[0], {"form": "plane", "distance": -3.0}, ["distance", -3], id="a plane behind the camera"),
         pytest.param(CAMERAS[0], {"distance": 3.0}, ["distance", "plane"], id="points at a distance"),
