@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import stat
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
-from clrecon.errors import RefusedInputError, UsageError
+from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
@@ -25,7 +25,11 @@ _TARS = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
 _OTHER_ZIPS = (".3mf", ".npz")
 """Files of meshes and clouds that are zip files too."""
 
+_ZIP_STARTS = (b"PK\x03\x04", b"PK\x05\x06")
 _PIECE = 1 << 20
+
+_LARGEST_HEADER = 1 << 24
+"""Bytes; the headers of a tar file are read as a whole, and files in pieces."""
 
 
 class Limits(NamedTuple):
@@ -77,29 +81,31 @@ def unpacked(
             reason = escape_text(getattr(error, "strerror", None) or str(error), 120)
             raise RefusedInputError(f"{escape_text(file.name)} cannot be unpacked: {reason}") from None
         inside = list(Path(folder).iterdir())
-        yield inside[0] if len(inside) == 1 else Path(folder)
+        try:
+            yield inside[0] if len(inside) == 1 else Path(folder)
+        except ClreconError as error:  # the folder is none that the user knows
+            raise type(error)(str(error).replace(folder, escape_text(file.name))) from error
 
 
 def is_archive(path: str | os.PathLike[str]) -> bool:
     """Tell whether a path is a zip or tar file, by its first bytes, or a packed tar file, by its name."""
     try:
         file = Path(path)
-        if not file.is_file():
+        if not file.is_file() or file.name.lower().endswith(_OTHER_ZIPS):
             return False
-        if file.name.lower().endswith((*_TARS, *_OTHER_ZIPS)):
-            return file.name.lower().endswith(_TARS)
-        return _starts_as_zip(file) or _read_start(file)[257:] == b"ustar"
+        return file.name.lower().endswith(_TARS) or _starts_as_archive(file)
     except (TypeError, ValueError, OSError):
         return False  # reading says what is wrong
+
+
+def _starts_as_archive(file: Path) -> bool:
+    start = _read_start(file)
+    return start.startswith(_ZIP_STARTS) or start[257:] == b"ustar"
 
 
 def _read_start(file: Path) -> bytes:
     with open_regular(file) as stream:
         return stream.read(262)
-
-
-def _starts_as_zip(file: Path) -> bool:
-    return _read_start(file)[:4] in (b"PK\x03\x04", b"PK\x05\x06")
 
 
 class _Unpacking:
@@ -108,23 +114,26 @@ class _Unpacking:
     def __init__(self, file: Path, folder: Path, progress: Progress, limits: Limits):
         self._name = escape_text(file.name)
         self._folder, self._progress = folder, progress
-        self._entries = self._bytes = 0
         self._limits = limits
         self._allowed = max(limits.ratio * file.stat().st_size, float(limits.free_bytes))
+        self._files = self._bytes = 0
 
     def unpack(self, file: Path, folder: Path, depth: int = 1) -> None:
-        """Unpack an archive, and those in it, into a folder."""
-        reader = _Zip(file, self._name) if _starts_as_zip(file) else _Tar(file)
-        with reader as archive:
-            entries = archive.find_entries(self._limits.entries)
-            self._check(entries)
+        """Unpack an archive into a folder; one that holds only archives stands for what is in these."""
+        from shutil import copyfileobj
+
+        with _Zip(file, self._name) if _read_start(file).startswith(_ZIP_STARTS) else _Tar(file) as archive:
+            before = self._bytes
+            entries = [self._count(entry) for entry in archive.find_entries()]
+            self._check_room(self._bytes - before)
             for number, entry in enumerate(entries):
                 self._progress("unpack", number, len(entries))
                 target = folder.joinpath(*_parts(entry.name, self._name))
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with archive.open(entry) as source, target.open("xb") as written:
-                    self._copy(source, written)
-        for inner in [path for path in folder.rglob("*") if is_archive(path)]:
+                    copyfileobj(source, written, _PIECE)
+        files = [path for path in folder.rglob("*") if path.is_file()]
+        for inner in files if all(map(is_archive, files)) else []:
             if depth == _DEEPEST:
                 raise RefusedInputError(f"{self._name} holds archives in archives in archives: unpack it first")
             packed = inner.rename(inner.with_name(f"{inner.name}{inner.suffix}"))
@@ -132,38 +141,32 @@ class _Unpacking:
             self.unpack(packed, inner, depth + 1)
             packed.unlink()
 
-    def _check(self, entries: list[_Entry]) -> None:
-        self._entries += len(entries)
-        if self._entries > self._limits.entries:
-            raise RefusedInputError(f"{self._name} holds more than {self._limits.entries:,} files")
-        special = [entry.name for entry in entries if entry.is_special]
-        if special:
+    def _count(self, entry: _Entry) -> _Entry:
+        """Refuse an entry with which the archive goes beyond its limits, before anything behind it is looked at."""
+        self._files += 1
+        self._bytes += entry.size
+        if entry.is_special:
             raise RefusedInputError(
-                f"{self._name} holds {escape_text(special[0], 80)}, which is a link or a device: unpack it yourself"
+                f"{self._name} holds {escape_text(entry.name, 80)}, which is a link or a device: unpack it yourself"
             )
-        wanted = self._bytes + sum(entry.size for entry in entries)
-        self._check_size(wanted)
+        if self._files > self._limits.entries:
+            raise RefusedInputError(f"{self._name} holds more than {self._limits.entries:,} files")
+        if self._bytes > self._allowed:
+            raise RefusedInputError(
+                f"{self._name} becomes more than {self._bytes / 1e9:.1f} GB, over {self._limits.ratio:g} times its"
+                " size: no scan packs like that; unpack it yourself if you trust it"
+            )
+        return entry
+
+    def _check_room(self, wanted: int) -> None:
         from shutil import disk_usage
 
         free = disk_usage(self._folder).free
-        if wanted - self._bytes > free:
+        if wanted > free:
             raise RefusedInputError(
                 f"{self._name} takes {wanted / 1e9:.1f} GB unpacked, and the folder for temporary files has"
                 f" {free / 1e9:.1f} GB: name another with TMPDIR"
             )
-
-    def _check_size(self, wanted: int) -> None:
-        if wanted > self._allowed:
-            raise RefusedInputError(
-                f"{self._name} becomes {wanted / 1e9:.1f} GB, more than {self._limits.ratio:g} times its size: no scan"
-                " packs like that; unpack it yourself if you trust it"
-            )
-
-    def _copy(self, source: IO[bytes], target: IO[bytes]) -> None:
-        while piece := source.read(_PIECE):
-            self._bytes += len(piece)
-            self._check_size(self._bytes)
-            target.write(piece)
 
 
 def _parts(name: str, archive: str) -> tuple[str, ...]:
@@ -175,6 +178,8 @@ def _parts(name: str, archive: str) -> tuple[str, ...]:
 
 
 class _Zip:
+    """A zip file; no entry gives more bytes than its size says."""
+
     def __init__(self, file: Path, name: str):
         from zipfile import ZipFile
 
@@ -187,12 +192,12 @@ class _Zip:
     def __exit__(self, *_: object) -> None:
         self._zip.close()
 
-    def find_entries(self, _: int) -> list[_Entry]:
-        files = [entry for entry in self._zip.infolist() if not entry.is_dir()]
-        if any(entry.flag_bits & 1 for entry in files):
-            self._password = _ask_password(self._name)
-        links = [stat.S_ISLNK(entry.external_attr >> 16) for entry in files]
-        return [_Entry(entry.filename, entry.file_size, link) for entry, link in zip(files, links, strict=True)]
+    def find_entries(self) -> Iterator[_Entry]:
+        for entry in self._zip.infolist():
+            if entry.flag_bits & 1 and self._password is None:
+                self._password = _ask_password(self._name)
+            if not entry.is_dir():
+                yield _Entry(entry.filename, entry.file_size, stat.S_ISLNK(entry.external_attr >> 16))
 
     def open(self, entry: _Entry) -> IO[bytes]:
         try:
@@ -205,11 +210,32 @@ class _Zip:
             ) from None
 
 
+class _Headers:
+    """A stream of which a tar file is read: a header that claims more than `_LARGEST_HEADER` bytes is damaged."""
+
+    def __init__(self, stream: IO[bytes]):
+        self.stream = stream
+        self.seek, self.tell = stream.seek, stream.tell
+        self.close = stream.close
+
+    def read(self, size: int = -1) -> bytes:
+        if not 0 <= size <= _LARGEST_HEADER:
+            raise EOFError(f"a header of {size:,} bytes")
+        return self.stream.read(size)
+
+
 class _Tar:
+    """A tar file, whose entries are looked at one after the other: to skip one is to unpack it."""
+
     def __init__(self, file: Path):
+        import bz2
+        import gzip
+        import lzma
         import tarfile
 
-        self._tar = tarfile.open(file)  # noqa: SIM115 (closed at the end of the block)
+        openers: dict[bytes, Callable[[Path], Any]] = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open}
+        self._stream = openers.get(_read_start(file)[:2], open_regular)(file)
+        self._tar = tarfile.open(fileobj=_Headers(self._stream), mode="r:")  # type: ignore[call-overload]  # noqa: SIM115
         self._members: dict[str, tarfile.TarInfo] = {}
 
     def __enter__(self) -> _Tar:
@@ -217,21 +243,16 @@ class _Tar:
 
     def __exit__(self, *_: object) -> None:
         self._tar.close()
+        self._stream.close()
 
-    def find_entries(self, most: int) -> list[_Entry]:
-        entries: list[_Entry] = []
+    def find_entries(self) -> Iterator[_Entry]:
         for member in self._tar:
-            if len(entries) > most:
-                break
             if not member.isdir():
                 self._members[member.name] = member
-                entries.append(_Entry(member.name, member.size, not member.isfile()))
-        stream = self._tar.fileobj
-        assert stream is not None
-        stream.seek(self._tar.offset)  # of the block of zeros at the end, where one that was cut has nothing
-        if len(entries) <= most and not stream.read(1):
+                yield _Entry(member.name, member.size, not member.isfile())
+        self._stream.seek(self._tar.offset)  # of the block of zeros at the end, where one that was cut has nothing
+        if not self._stream.read(1):
             raise EOFError("it ends early: files are missing")
-        return entries
 
     def open(self, entry: _Entry) -> IO[bytes]:
         stream = self._tar.extractfile(self._members[entry.name])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import os
 import subprocess
@@ -205,6 +206,62 @@ def test_archives_three_deep_are_refused(tmp_path: Path) -> None:
         read_volume(tmp_path / "deep.zip")
 
 
+def test_archive_beside_the_slices_of_an_archive_is_skipped_as_in_a_folder(scan: Path, tmp_path: Path) -> None:
+    (tmp_path / "both").mkdir()
+    zip_folder(scan, tmp_path / "both" / "backup.zip")
+    write_series(tmp_path / "both" / "ct", Plan(tilt_deg=12, angles=(3, 4, -5)))
+
+    of_archive = read_volume(zip_folder(tmp_path / "both", tmp_path / "both.zip"))
+
+    assert of_archive.report == read_volume(tmp_path / "both").report
+    assert of_archive.report["files"]["skipped"] == {"zip archive": 1}
+
+
+class Reads:
+    """A stream that notes how many bytes were read of it."""
+
+    def __init__(self, stream: Any):
+        self._stream, self.count = stream, 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def read(self, size: int = -1) -> bytes:
+        piece = bytes(self._stream.read(size))
+        self.count += len(piece)
+        return piece
+
+
+def test_packed_tar_file_beyond_its_limits_is_refused_before_it_is_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tar_zeros(tmp_path / "bomb.tar.gz", 1 << 26)
+    opened: list[Reads] = []
+
+    def open_noted(path: Path) -> Reads:
+        opened.append(Reads(gzip.GzipFile(path)))
+        return opened[-1]
+
+    monkeypatch.setattr("gzip.open", open_noted)
+    with refused(RefusedInputError, "bomb.tar.gz", 100):
+        unpack(tmp_path / "bomb.tar.gz", free_bytes=0)
+
+    assert sum(stream.count for stream in opened) == tarfile.BLOCKSIZE  # the first header
+
+
+@pytest.mark.parametrize(("size", "kind"), [(1 << 20, NoDicomError), ((1 << 24) + 1, RefusedInputError)])
+def test_tar_file_is_damaged_where_a_header_has_more_than_16_mib(
+    size: int, kind: type[Exception], tmp_path: Path
+) -> None:
+    with tarfile.open(tmp_path / "header.tar.gz", "w:gz") as tar:
+        entry = tarfile.TarInfo("letter.txt")
+        entry.pax_headers = {"comment": "x" * size}  # a header of its own before that of the file, read as a whole
+        tar.addfile(entry)
+
+    with refused(kind, "header.tar.gz"):
+        read_volume(tmp_path / "header.tar.gz")
+
+
 def test_two_entries_of_one_name_are_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "twins.zip", "w") as archive, pytest.warns(UserWarning):
         archive.writestr("a.dcm", "1")
@@ -239,7 +296,7 @@ def test_tar_file_that_ends_between_two_files_is_refused(scan: Path, tmp_path: P
 def test_archive_without_a_scan_is_no_dicom(tmp_path: Path) -> None:
     (tmp_path / "letter.zip").write_bytes(zip_bytes({"letter.txt": b"hello"}))
 
-    with refused(NoDicomError, "letter.txt"):
+    with refused(NoDicomError, "letter.zip/letter.txt"):
         read_volume(tmp_path / "letter.zip")
 
 

@@ -39,7 +39,9 @@ KINDS: dict[str, tuple[str, ...]] = {
     "volume": tuple(VOLUME_FORMATS),
     "measures": MEASURE_FORMATS,
 }
-"""What is written, and the extensions of its files; those of meshes and clouds both are meshes where one is shown."""
+"""What is written, and the extensions of its files, the first that fits: .view.json comes before .json.  Those of
+meshes and clouds both are meshes where one is shown.
+"""
 
 
 def check_target(path: str | os.PathLike[str], painter: Painter, state: ViewState) -> str:

@@ -25,7 +25,6 @@ from clrecon.rendering.views.directions import checked_size, checked_vector
 from clrecon.system.arguments import Space
 from clrecon.system.base_classes import Closing
 from clrecon.system.log import get_logger
-from clrecon.system.progress import CLOSE_S, Job, Worker
 from clrecon.system.text import format_volume
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.drawing.saving import check_target, save_shown
@@ -37,6 +36,7 @@ from clrecon.viewer.model.objects import ShownMesh, ShownObject
 from clrecon.viewer.model.saved_view import restore_view
 from clrecon.viewer.model.state import LEAST_ZOOM, MOST_ZOOM, SCENE, Pick, ViewState, picture_key
 from clrecon.viewer.session.commands import check_command
+from clrecon.viewer.session.worker import CLOSE_S, Job, Worker
 
 REST_SECONDS = 0.2
 """After the last change until pictures are drawn sharp."""

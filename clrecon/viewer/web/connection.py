@@ -258,7 +258,8 @@ class Connection:
         """Serve the browser until it leaves."""
         from aiohttp import WSMsgType
 
-        kinds = ["mesh", "cloud", *["volume" for _ in self._session.model.scans[:1]], "picture", "view"]
+        has_scan = bool(self._session.model.scans)
+        kinds = [kind for kind in ("mesh", "cloud", "volume", "picture", "view") if has_scan or kind != "volume"]
         fixed = {**page_words(), "formats": {kind: list(KINDS[kind]) for kind in kinds}, "save_as": self._save_as}
         await self._socket.send_str(json.dumps({"fixed": fixed}))
         tasks = [asyncio.ensure_future(work()) for work in (self._write, self._command)]

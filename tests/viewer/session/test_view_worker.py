@@ -8,7 +8,7 @@ import time
 import pytest
 
 from clrecon.errors import Cancelled, DeviceError
-from clrecon.system.progress import Worker
+from clrecon.viewer.session.worker import Worker
 
 pytestmark = pytest.mark.unit
 
