@@ -375,11 +375,11 @@ def _find_name(memory: _Memory, address: int) -> int:
     names = (UNKNOWN, *(name.encode() for name, _ in CPU_NAMES))
     content = memory.read(address, _STRUCT_BYTES)
     pointers = [place for (place,) in _POINTER.iter_unpack(content[: len(content) // _POINTER.size * _POINTER.size])]
-    places = [
+    places = {
         cpu
         for target, cpu in zip(pointers, pointers[1:], strict=False)
         if memory.read_text(target).startswith(b"x86_64-") and memory.read_text(cpu) in names
-    ]
+    }
     if len(places) != 1:
         raise LookupError(f"{len(places)} names of CPUs were found in its memory, not one")
-    return places[0]
+    return places.pop()

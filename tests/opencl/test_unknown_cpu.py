@@ -23,12 +23,17 @@ TARGET = b"x86_64-unknown-linux-gnu"
 
 
 class DriverStructure:
-    """What a driver's structure of a device looks like: numbers, and pointers to strings."""
+    """What a driver's structure of a device looks like: numbers, and pointers to strings.
+
+    It is as large as what is searched: behind a smaller one lies whatever the process has freed, older structures too.
+    """
+
+    WORDS = 256
 
     def __init__(self, *texts: bytes):
         self.strings = [ctypes.create_string_buffer(text) for text in texts]
         addresses = [ctypes.addressof(string) for string in self.strings]
-        self.words = (ctypes.c_uint64 * 64)(1, 0, 2**63, 8, *addresses, 4096, 2**48)
+        self.words = (ctypes.c_uint64 * self.WORDS)(1, 0, 2**63, 8, *addresses, 4096, 2**48)
         self.address = ctypes.addressof(self.words)
 
     @property
@@ -106,6 +111,14 @@ def test_name_of_the_cpu_that_another_device_object_has_written_is_found_and_wri
 
     assert second.name == first.name
     assert structure.texts == [TARGET, first.name.encode()]
+
+
+@linux_only
+def test_name_with_two_pointers_behind_the_target_is_found():
+    structure = DriverStructure(TARGET, UNKNOWN)
+    structure.words[100:102] = structure.words[4:6]
+    NameOfCpu(structure.address).write()
+    assert structure.texts[1] != UNKNOWN
 
 
 @linux_only
