@@ -389,7 +389,7 @@ class Mesh(BaseMesh, ShownAsHtml):
                 f"a {type(mesh).__name__} is no trimesh.Trimesh: of a Scene take scene.to_geometry() first"
             )
         units = getattr(mesh, "units", None)
-        if units not in (None, "mm", "millimeter", "millimeters"):
+        if units not in (None, "none", "mm", "millimeter", "millimeters"):  # trimesh stores None as a text
             raise UsageError(f"the mesh is in {units}, clrecon's are in mm: call its convert_units('mm') first")
         facts = getattr(mesh, "metadata", None) or {}
         frame = choose_space(space, facts.get("SPACE"), "the Trimesh")

@@ -220,6 +220,12 @@ def test_a_trimesh_in_ras_becomes_a_mesh_in_lps() -> None:
     assert turned.volume == pytest.approx(mesh.volume, rel=tolerances.MESH_VOLUME)
 
 
+def test_trimesh_whose_units_were_set_to_none_is_taken_as_mm() -> None:
+    other = trimesh.creation.box()
+    other.units = None  # trimesh stores the text "none"
+    assert Mesh.from_trimesh(other).volume == pytest.approx(1.0, rel=tolerances.MESH_VOLUME)
+
+
 def test_vertices_in_double_precision_come_back_from_trimesh_to_the_bit() -> None:
     far = Mesh(np.eye(3) + 1e5 + 1e-7, [[0, 1, 2]])  # a step of float32 is 0.008 mm there
     back = Mesh.from_trimesh(far.to_trimesh())
