@@ -146,11 +146,11 @@ class Client:
         self._news = asyncio.Event()
         self._reader = asyncio.ensure_future(self._read())
 
-    async def tell(self, **message: Any) -> None:
-        await self.socket.send_str(json.dumps(message))
+    async def tell(self, type: str = "command", **message: Any) -> None:
+        await self.socket.send_str(json.dumps({"type": type, **message}))
 
     async def lay_out(self, **sizes: Any) -> None:
-        await self.tell(sizes=sizes or {"scene": [120, 90]}, ground=[10, 20, 30])
+        await self.tell("layout", sizes=sizes or {"scene": [120, 90]}, ground=[10, 20, 30])
 
     async def until(self, holds: Any) -> None:
         """Wait until something holds, of the messages or of what the server does without one."""
@@ -168,7 +168,7 @@ class Client:
                 head = json.loads(message.data[4 : 4 + length])
                 self.pictures.append((head, Image.open(io.BytesIO(message.data[4 + length :])).convert("RGB")))
                 if self.shows:
-                    await self.tell(shown=head["number"])
+                    await self.tell("shown", number=head["number"])
             else:
                 told = json.loads(message.data)
                 self.facts = told.pop("facts", self.facts)

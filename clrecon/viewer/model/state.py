@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Sequence
 from typing import Any, Literal
 
@@ -86,8 +87,8 @@ def clip_direction(direction: str | Sequence[float]) -> tuple[Point, str]:
         return DIRECTIONS[direction], direction
     vector = np.array(checked_vector("the direction of a clip plane", direction))
     length = float(np.linalg.norm(vector))
-    if length < 1e-9:
-        raise UsageError("the direction of a clip plane has a length above 0")
+    if not 1e-9 <= length < math.inf:
+        raise UsageError(f"the direction of a clip plane has a length above 0, not {length:g}")
     x, y, z = (vector if abs(length - 1.0) < 1e-12 else vector / length).tolist()  # a saved one stays as it is
     return (x, y, z), f"{x:.2f}, {y:.2f}, {z:.2f}"
 

@@ -272,8 +272,8 @@ class Connection:
                     await self._take(json.loads(message.data))
                 except UsageError as error:
                     self._say(error=str(error))
-                except (ValueError, TypeError, KeyError, AttributeError):
-                    self._say(error="this message cannot be read: load the page again")
+                except (ValueError, RecursionError):
+                    self._say(error="this message cannot be read, it is no JSON: load the page again")
         finally:
             for task in tasks:
                 task.cancel()
@@ -302,40 +302,46 @@ class Connection:
     # From the browser
 
     async def _take(self, message: Any) -> None:
-        """Take a message: what concerns the connection at once, commands one after the other."""
-        if not isinstance(message, Mapping):
-            raise TypeError("a message is a mapping")
-        if "do" in message:  # set_table has an argument `shown` too
-            await self._waiting.put(message)
-        elif "shown" in message:
+        """Take a message: what concerns the connection at once, commands and files one after the other."""
+        kind = message.get("type") if isinstance(message, Mapping) else None
+        if kind == "shown":
             self._under_way = False
             self._wake.set()
             self._draw()
-        elif "sizes" in message:
-            red, green, blue = (min(255, max(0, int(value))) for value in message["ground"])
-            if (red, green, blue) != self._ground:
-                self._ground = (red, green, blue)
-                self._keys.clear()
-            sizes = {view: _fit_size(size) for view, size in message["sizes"].items() if view in VIEWS}
-            if SCENE in sizes:
-                self._session.fit(sizes[SCENE])
-            self._pace.resize(sizes)
-            self._look_again()
-        elif "quit" in message:
+        elif kind == "layout":
+            self._lay_out(message.get("sizes"), message.get("ground"))
+        elif kind == "quit":
             self._quit()
-        else:
+        elif kind in ("command", "save"):
             await self._waiting.put(message)
+        else:
+            raise UsageError("this message cannot be read, its type is unknown: load the page again")
+
+    def _lay_out(self, sizes: Any, ground: Any) -> None:
+        """Take the sizes of the views of the page, and the colour behind them."""
+        color = _check_color(ground)
+        if not isinstance(sizes, Mapping):
+            raise UsageError(f"the sizes of the views go by their names, not {sizes!r:.60}")
+        fitting = {view: _fit_size(size) for view, size in sizes.items() if view in VIEWS}
+        if color != self._ground:
+            self._ground = color
+            self._keys.clear()
+        if SCENE in fitting:
+            self._session.fit(fitting[SCENE])
+        self._pace.resize(fitting)
+        self._look_again()
 
     async def _command(self) -> None:
         while True:
             message = await self._waiting.get()
             try:
-                if "save" in message:
-                    self._save(message["save"], _fit_size(message.get("size") or (1024, 1024)))
+                if message["type"] == "save":
+                    self._save(message.get("format"), _fit_size(message.get("size") or (1024, 1024)))
                     continue
-                if message.get("do") in _NOT_FOR_BROWSERS:
-                    raise UsageError(f"the command {message['do']} is not for browsers")
-                answer = await self._loop.run_in_executor(self._thread, self._session.do, message)
+                command = {key: value for key, value in message.items() if key != "type"}
+                if (name := command.get("do")) in tuple(_NOT_FOR_BROWSERS):
+                    raise UsageError(f"the command {name} is not for browsers")
+                answer = await self._loop.run_in_executor(self._thread, self._session.do, command)
             except ClreconError as error:
                 self._say(error=str(error))
             except Exception as error:  # a fault of ours: the other browsers, and this one, go on
@@ -494,7 +500,15 @@ def _fit_size(size: Any) -> tuple[int, int]:
     """Return a size that a picture may have, of the same shape."""
     try:
         width, height = (min(max(1.0, float(value)), 1e6) for value in size)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise UsageError(f"a size is width and height in pixels, not {size!r:.60}") from error
     share = min(1.0, LARGEST_SIDE / max(width, height))
     return max(1, round(share * width)), max(1, round(share * height))
+
+
+def _check_color(ground: Any) -> tuple[int, int, int]:
+    try:
+        red, green, blue = (min(255, max(0, int(value))) for value in ground)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise UsageError(f"the ground of the views is red, green and blue from 0 to 255, not {ground!r:.60}") from error
+    return red, green, blue

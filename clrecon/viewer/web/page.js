@@ -16,8 +16,8 @@
   sessionStorage.setItem("clrecon-tab", tab);
   const socket = new WebSocket(`ws://${location.host}/socket${location.search}&tab=${tab}`);
   socket.binaryType = "arraybuffer";
-  const tell = (what) => { if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(what)); };
-  const run = (name, more) => tell({ do: name, ...more });
+  const tell = (type, what) => { if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ type, ...what })); };
+  const run = (name, more) => tell("command", { do: name, ...more });
   socket.onopen = () => { message.textContent = "Building kernels: the first picture takes seconds."; layOut(); };
   socket.onclose = (event) => {
     const reason = { 1001: "clrecon has ended", 1006: "the connection was lost: is clrecon still running?" };
@@ -81,7 +81,8 @@
       sizes[view.name] = [view.box.clientWidth, view.box.clientHeight].map((value) => Math.round(value * sharp));
     }
     const ground = getComputedStyle(document.body).backgroundColor.match(/\d+/g).slice(0, 3).map(Number);
-    tell({ sizes, ground });
+    tell("layout", { sizes, ground });
+    if (facts && facts.iso) showIso();  // as many marks as there is room for
     for (const view of Object.values(views)) annotate(view);
   }
 
@@ -95,7 +96,7 @@
       view.pen.transferFromImageBitmap(bitmap);
       view.camera = head.camera;
     } finally {
-      tell({ shown: head.number });
+      tell("shown", { number: head.number });
     }
     pictures += 1;
     message.textContent = "";
@@ -238,7 +239,7 @@
       if (held === input || document.activeElement === find("exact") && id === "exact") continue;
       Object.assign(input, { min: Math.ceil(facts.iso.low), max: Math.floor(facts.iso.high), value: Math.round(facts.iso.hu) });
     }
-    const { low, high } = facts.iso, step = roundLength((high - low) / 5), marks = [];
+    const { low, high } = facts.iso, step = roundLength((high - low) / Math.max(1, find("marks").clientWidth / 110)), marks = [];
     for (let hu = Math.ceil(low / step) * step; hu <= high; hu += step) marks.push(hu);
     find("marks").replaceChildren(...marks.map((hu) => {
       const mark = element("span", String(hu).replace("-", "\u2212"));
@@ -379,7 +380,7 @@
 
   function save(format) {
     find("saved").textContent = "The file is being made.";
-    tell({ save: format || null, size: [views.scene.box.clientWidth, views.scene.box.clientHeight].map((value) => 2 * value) });
+    tell("save", { format: format || null, size: [views.scene.box.clientWidth, views.scene.box.clientHeight].map((value) => 2 * value) });
   }
 
   function fetchSaved({ ticket, name, bytes }) {
@@ -463,7 +464,7 @@
     distance: press("distance"), angle: press("angle"), save: press("save"), photo: press("photo"), help: press("help"),
     curve: () => { if (choosing === "curve" || find("curved").hidden) find("trace").click(); else find("along").click(); },
     escape: () => { if (choosing) choose(""); else { run("cancel"); run("dismiss"); hint(""); } },
-    quit: () => tell({ quit: true }),
+    quit: () => tell("quit"),
     full: () => setFull((aimed() || views.scene).name),
     before: () => scrollAimed(-1),
     behind: () => scrollAimed(1),
@@ -491,7 +492,7 @@
     if (event.key.startsWith("Page")) event.preventDefault();
     if (typeof does === "string") OWN[does]();
     else if (fixed.at_pointer.includes(event.key)) runAtPointer(does.do);
-    else tell(does);
+    else tell("command", does);
   });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", layOut);
   new ResizeObserver(layOut).observe(find("stage"));

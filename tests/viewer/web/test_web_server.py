@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import json
+import math
 import os
 from contextlib import AsyncExitStack
 from pathlib import Path
@@ -171,7 +172,7 @@ def test_browser_that_shows_its_picture_late_gets_the_newest(served: WebServer) 
         async with browsing(served) as client:
             await change_iso_40_times_unshown(client)
             client.shows = True
-            await client.tell(shown=client.pictures[0][0]["number"])
+            await client.tell("shown", number=client.pictures[0][0]["number"])
             await client.until(lambda: client.pictures[-1][0]["sharp"] and len(client.pictures) > 1)
             return client.pictures[-1]
 
@@ -226,17 +227,21 @@ def test_picture_after_one_that_failed_is_shown(served: WebServer, views: Views)
 
 
 WRONG_MESSAGES: dict[str, tuple[object, str]] = {
-    "command of files": ({"do": "save", "path": "/tmp/x.stl"}, "the command save is not for browsers"),
-    "unknown command": ({"do": "dance"}, "unknown command 'dance'"),
-    "no iso value": ({"do": "set_iso"}, "needs hu"),
-    "iso value beyond HU": ({"do": "set_iso", "hu": 1e9}, "the iso value runs from"),
-    "path as a format": ({"save": "../../x"}, "a format is an extension"),
-    "unknown format": ({"save": ".exe"}, "the extension says as what"),
-    "size of a view in words": ({"sizes": {"scene": "large"}, "ground": [0, 0, 0]}, "a size is width and height"),
-    "size of a file of one number": ({"save": ".png", "size": 7}, "a size is width and height"),
-    "size of a file in words": ({"save": ".png", "size": ["wide", None]}, "a size is width and height"),
-    "size of a file of three": ({"save": ".png", "size": [1, 2, 3]}, "a size is width and height"),
-    "background in words": ({"sizes": {}, "ground": "red"}, "cannot be read"),
+    "command of files": ({"type": "command", "do": "save", "path": "x.stl"}, "the command save is not for browsers"),
+    "unknown command": ({"type": "command", "do": "dance"}, "unknown command 'dance'"),
+    "no iso value": ({"type": "command", "do": "set_iso"}, "needs hu"),
+    "iso value beyond HU": ({"type": "command", "do": "set_iso", "hu": 1e9}, "the iso value runs from"),
+    "path as a format": ({"type": "save", "format": "../../x"}, "a format is an extension"),
+    "unknown format": ({"type": "save", "format": ".exe"}, "the extension says as what"),
+    "size of a view as text": ({"type": "layout", "sizes": {"scene": "large"}, "ground": [0, 0, 0]}, "a size is width"),
+    "size of a file of one number": ({"type": "save", "format": ".png", "size": 7}, "a size is width and height"),
+    "size of a file in words": ({"type": "save", "format": ".png", "size": ["wide", None]}, "a size is width"),
+    "size of a file of three": ({"type": "save", "format": ".png", "size": [1, 2, 3]}, "a size is width and height"),
+    "background in words": ({"type": "layout", "sizes": {}, "ground": "red"}, "the ground of the views is red, green"),
+    "endless background": ({"type": "layout", "sizes": {}, "ground": [0, math.inf, 0]}, "the ground of the views is"),
+    "size beyond all numbers": ({"type": "layout", "sizes": {"axial": [10**400, 1]}, "ground": [0, 0, 0]}, "a size is"),
+    "list as a command": ({"type": "command", "do": [1]}, "unknown command"),
+    "command without a type": ({"do": "undo"}, "its type is unknown"),
     "list": ([1, 2], "cannot be read"),
 }
 
@@ -341,9 +346,9 @@ def test_named_files_are_written_one_after_the_other_and_said(
 
     async def browse(running: WebServer) -> list[str]:
         async with browsing(running) as client:
-            await client.tell(save=None)
+            await client.tell("save", format=None)
             await client.until(lambda: len(client.notes) == 2)
-            await client.tell(save=None)
+            await client.tell("save", format=None)
             await client.until(lambda: len(client.notes) == 4)
             return list(client.fixed["save_as"])
 
@@ -374,7 +379,7 @@ def written(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 
 async def save_view(client) -> dict[str, Any]:
     """Have the view saved as .stl, and return what the browser is told of the file."""
-    await client.tell(save=".stl")
+    await client.tell("save", format=".stl")
     await client.until(lambda: client.notes)
     return client.notes[0]["saved"]
 
@@ -518,7 +523,7 @@ def test_server_that_a_browser_ends_tells_every_browser(views: Views) -> None:
     async def browse(running: WebServer) -> list[int | None]:
         async with browsing(running) as one, browsing(running) as other:
             await other.until(lambda: other.facts)
-            await one.tell(quit=True)
+            await one.tell("quit")
             for client in (one, other):
                 await client.until(lambda client=client: client.close_code is not None)
             return [one.close_code, other.close_code]
