@@ -85,7 +85,7 @@ class Looks:
 
     def plane(self, state: ViewState, labelled: LabelledLook | None, offset_mm: float) -> PlaneCut:
         """Return the style of a slice; labels are drawn over it where they have a colour."""
-        key = ("plane", state.window, _key(labelled))
+        key = ("plane", state.window, state.slab_mm, state.combine, _key(labelled))
         known = self._known(key)
         if known is None:
             fields: dict[str, Any] = {}
@@ -97,7 +97,9 @@ class Looks:
                         "label_colors": {each.number: each.color for each in drawn},
                         "label_opacity": {each.number: 0.3 * each.opacity for each in drawn},
                     }
-            known = self._keep(key, PlaneCut(window=state.window, **fields))
+            known = self._keep(
+                key, PlaneCut(window=state.window, thickness=state.slab_mm, combine=state.combine, **fields)
+            )
         assert isinstance(known, PlaneCut)
         return replace(known, offset_mm=offset_mm)
 

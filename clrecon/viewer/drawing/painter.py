@@ -23,10 +23,9 @@ from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.pictures.styles import CurveCut, Projection, SlicesInSpace, Style, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import as_point, checked_size
-from clrecon.rendering.views.reformation import PLANES, find_plane
+from clrecon.rendering.views.reformation import find_plane
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress
-from clrecon.system.text import unknown_name
 from clrecon.viewer.drawing.looks import LEAST_OPACITY, LabelledLook, Looks, to_voxels
 from clrecon.viewer.drawing.shown_meshes import divide_surface, make_meshes
 from clrecon.viewer.drawing.stage import (
@@ -49,6 +48,7 @@ from clrecon.viewer.model.objects import (
     find_modes,
 )
 from clrecon.viewer.model.parts import number_at
+from clrecon.viewer.model.planes import check_plane, turn_plane
 from clrecon.viewer.model.state import Pick, ShownPart, ViewState
 
 SMALLEST_SIDE = 64
@@ -138,11 +138,11 @@ class Painter(Stage):
 
     def slice_camera(self, state: ViewState, plane: str, size: Sequence[int]) -> Camera:
         """Return the camera of a slice: its focal point lies in the slice, so that places can be told from pixels."""
-        if plane not in PLANES:
-            raise UsageError(unknown_name("plane", plane, PLANES))
         sliced = self._sliced(state)
         grid = sliced[0].volume if sliced is not None else box_around([each.corners for each in self.objects])
-        camera = find_plane(grid, plane, size)
+        camera = find_plane(grid, check_plane(plane), size)
+        if state.turn is not None:
+            camera = turn_plane(camera, state.turn)
         frame, forward = state.frame(plane), camera.basis().forward
         center = np.array(camera.focal_point if frame is None else frame.center)
         center += float(forward @ (state.cross - center)) * forward

@@ -15,16 +15,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from clrecon.errors import UsageError
-from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.operators.rays.mesh_pictures import box_around
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.views.camera import Camera, rotation_about
-from clrecon.rendering.views.directions import DIRECTIONS, as_point, checked_vector
-from clrecon.rendering.views.reformation import PLANES
+from clrecon.rendering.views.directions import as_point, checked_vector
 from clrecon.system.arguments import DirectionName
 from clrecon.system.text import unknown_name
-from clrecon.viewer.model.objects import ShownObject, ShownScan
+from clrecon.viewer.model.objects import ShownObject
 from clrecon.viewer.model.parts import FoundParts, carry_looks
 from clrecon.viewer.model.state import Color, ShownPart, ViewState
 
@@ -38,56 +36,6 @@ def fit_camera(
     """Return a camera from a side of the patient so that points (n, 3) fit; `aspect` is width by height."""
     size = (max(1, round(aspect * _FIT_PIXELS)), _FIT_PIXELS)
     return Camera.fit(box_around([points]), view, view_angle=view_angle, size=size)
-
-
-def near_layers(volume: Volume, point: Sequence[float] | Float64Array) -> Float64Array:
-    """Return the index (i, j, k) of the layers of voxels at a place; beside the volume they go on."""
-    return np.floor(np.round(volume.lps_to_ijk(point), 6) + 0.5)
-
-
-def _layers_across(volume: Volume, normal: Float64Array) -> tuple[int, Float64Array]:
-    """Return the axis whose layers of voxels lie most across a normal, and by what its index grows along x, y and z."""
-    growths = np.linalg.inv(volume.affine[:3, :3])
-    axis = int(np.argmax(np.abs(growths @ normal) / np.linalg.norm(growths, axis=1)))
-    return axis, growths[axis]
-
-
-def move_to_layer(scans: Sequence[ShownScan], plane: str, cross: Sequence[float], steps: float) -> Float64Array:
-    """Return a cross (3,) moved away from the eye by layers of the first scan, to the middle of one; else by mm."""
-    normal, point = -np.array(DIRECTIONS[PLANES[plane]]), np.array(cross)
-    if not scans:
-        return point + steps * normal
-    heights = np.concatenate([_outer_layers(scan, normal) @ normal for scan in scans])
-    volume, index = scans[0].volume, scans[0].volume.lps_to_ijk(point)
-    axis, growth = _layers_across(volume, normal)
-    index[axis] = near_layers(volume, point)[axis] + np.sign(growth @ normal) * np.clip(steps, -1e6, 1e6)
-    distance = growth @ (volume.ijk_to_lps(index) - point) / (growth @ normal)
-    return point + np.clip(distance, heights.min() - point @ normal, heights.max() - point @ normal) * normal
-
-
-def _outer_layers(scan: ShownScan, normal: Float64Array) -> Float64Array:
-    """Return corners (n, 3) of a scan from the middle of its first layer across a normal to that of the last."""
-    ends, (axis, _) = scan.volume.lps_to_ijk(scan.corners), _layers_across(scan.volume, normal)
-    ends[:, axis] = np.clip(ends[:, axis], 0, scan.volume.shape_ijk[axis] - 1)
-    return scan.volume.ijk_to_lps(ends)
-
-
-def describe_slice(scans: Sequence[ShownScan], plane: str, cross: Sequence[float]) -> dict[str, Any]:
-    """Return the side and mm of a slice through a cross, and which of the first scan's layers it cuts there, from 1.
-
-    Layers are counted away from the eye, as `move_to_layer` goes.
-    """
-    normal = np.array(DIRECTIONS[PLANES[plane]])
-    axis = int(np.argmax(np.abs(normal)))
-    side = ("RL", "AP", "IS")[axis][cross[axis] > 0.0]
-    described: dict[str, Any] = {"place": f"{side} {abs(cross[axis]):.1f} mm"}
-    if scans:
-        volume = scans[0].volume
-        ordinal, growth = _layers_across(volume, normal)
-        count = volume.shape_ijk[ordinal]
-        layer = min(max(int(near_layers(volume, cross)[ordinal]), 0), count - 1)
-        described |= {"number": layer + 1 if growth @ normal < 0.0 else count - layer, "count": count}
-    return described
 
 
 _TURN_DEGREES = 180.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from time import monotonic
@@ -20,15 +21,7 @@ from clrecon.rendering.views.directions import as_point, checked_vector, default
 from clrecon.rendering.views.reformation import PLANES
 from clrecon.system.arguments import Space
 from clrecon.system.text import format_hu, unknown_name
-from clrecon.viewer.model.changes import (
-    ChangingView,
-    checked_numbers,
-    describe_slice,
-    fit_camera,
-    height_mm,
-    move_to_layer,
-    near_layers,
-)
+from clrecon.viewer.model.changes import ChangingView, checked_numbers, fit_camera, height_mm
 from clrecon.viewer.model.measures import (
     POINTS_OF,
     TOOLS,
@@ -47,9 +40,30 @@ from clrecon.viewer.model.objects import (
     find_modes,
     first_parts,
 )
-from clrecon.viewer.model.state import FIT_COLORS, Box, ClipPlane, Pick, SliceFrame, ViewState, clip_direction
+from clrecon.viewer.model.planes import (
+    check_plane,
+    describe_slice,
+    find_forward,
+    move_to_layer,
+    near_layers,
+    turn_cross,
+)
+from clrecon.viewer.model.state import (
+    COMBINATIONS,
+    FIT_COLORS,
+    LAYOUTS,
+    Box,
+    ClipPlane,
+    Pick,
+    SliceFrame,
+    ViewState,
+    clip_direction,
+)
 
 _Item = TypeVar("_Item")
+
+_SLAB_MM, _MOST_SLAB_MM = 10.0, 100.0
+"""Thickness of slices that a key makes thick, and the most."""
 
 _BOX_SHARE = 0.5
 """Of what there is along each axis, in a clip box about the cross."""
@@ -198,10 +212,9 @@ class ViewModel(ChangingView):
 
     def scroll(self, plane: str, steps: float) -> None:
         """Move the cross by layers of the first scan, to the middle of one; positive steps go away from the eye."""
-        if plane not in PLANES:
-            raise UsageError(unknown_name("plane", plane, PLANES))
         (count,) = checked_numbers("steps", steps)
-        moved = np.clip(move_to_layer(self.scans, plane, self.state.cross, count), *self._span())
+        turn = self.state.turn
+        moved = np.clip(move_to_layer(self.scans, check_plane(plane), self.state.cross, count, turn), *self._span())
         self._change(f"scroll {plane}", "the slice", cross=as_point(moved))
 
     def set_cross(self, point: Sequence[float]) -> None:
@@ -221,6 +234,42 @@ class ViewModel(ChangingView):
     def fit_slices(self) -> None:
         """Show the slices as they fit."""
         self._change("fit", "the fit of the slices", frames=())
+
+    def turn_cross(self, plane: str, degrees: float) -> None:
+        """Turn the cross on a slice clockwise: the other two slices go with it."""
+        (angle,) = checked_numbers("the turn of the slices", degrees)
+        turn = turn_cross(self.state.turn, check_plane(plane), math.remainder(angle, 360.0))
+        self._change(f"turn {plane}", "the turn of the slices", turn=turn)
+
+    def straighten(self) -> None:
+        """Let the slices lie along the axes of the patient again."""
+        self._change("straighten", "the straight slices", turn=None)
+
+    def set_slab(self, thickness: float, combine: str | None = None) -> None:
+        """Show slices of so many mm, 0 for planes: the mean, the most or the least of what is in them."""
+        (mm,) = checked_numbers("the thickness of the slices", thickness)
+        if not 0.0 <= mm <= _MOST_SLAB_MM:
+            raise UsageError(f"slices are 0 to {_MOST_SLAB_MM:g} mm thick, not {mm:g} mm")
+        how = self.state.combine if combine is None else combine
+        if how not in COMBINATIONS:
+            raise UsageError(unknown_name("thick slice", how, COMBINATIONS))
+        self._change("slab", "the thickness of the slices", slab_mm=mm, combine=how)
+
+    def step_slab(self) -> None:
+        """Go from planes to thick slices, first their mean, then the most, and back."""
+        steps = ((0.0, "mean"), (_SLAB_MM, "mean"), (_SLAB_MM, "max"))
+        state = self.state
+        shown = (_SLAB_MM if state.slab_mm else 0.0, state.combine)
+        self.set_slab(*steps[(steps.index(shown) + 1) % len(steps) if shown in steps else 0])
+
+    def set_layout(self, name: str) -> None:
+        """Lay the views out in one of the ways of `LAYOUTS`."""
+        if name not in LAYOUTS:
+            raise UsageError(unknown_name("layout", name, LAYOUTS))
+        self._change("layout", "the layout", layout=name)
+
+    def step_layout(self) -> None:
+        self.set_layout(LAYOUTS[(LAYOUTS.index(self.state.layout) + 1) % len(LAYOUTS)])
 
     # Tools
 
@@ -242,6 +291,11 @@ class ViewModel(ChangingView):
         measure = self._measured(tool, [each.point for each in points])
         self._change("point", f"the {tool}", points=(), measures=(*self.state.measures, measure))
         return measure
+
+    def add_curve(self, points: Sequence[Point], word: str) -> None:
+        """Add a curve through places that were found, such as along the spine."""
+        measure = measure_points("curve", points, free_measure_name(word, self.state.measures))
+        self._change("point", f"the curve {measure.name}", measures=(*self.state.measures, measure))
 
     def add_seed(self, pick: Pick) -> None:
         """Keep a place as a seed, whatever tool is used."""
@@ -356,7 +410,11 @@ class ViewModel(ChangingView):
             "fitted": state.fitted if self.scans and mode.kind == "surface" else None,
             "color_by": state.color_by,
             "cross": [round(value, 3) for value in state.cross],
-            "slices": {plane: describe_slice(self.scans, plane, state.cross) for plane in PLANES},
+            "slices": {plane: describe_slice(self.scans, plane, state.cross, state.turn) for plane in PLANES},
+            "forward": {plane: find_forward(plane, state.turn).tolist() for plane in PLANES},
+            "turned": state.turn is not None,
+            "slab": {"mm": state.slab_mm, "combine": state.combine},
+            "layout": state.layout,
             "cross_text": self.say_place(state.cross),
             "parts": [each.describe() for each in state.parts],
             "parts_known": self.parts_known,

@@ -13,14 +13,14 @@ import numpy as np
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.rendering.views.camera import Camera, describe_camera
 from clrecon.rendering.views.directions import checked_vector
-from clrecon.rendering.views.reformation import PLANES
 from clrecon.system.paths import read_regular
 from clrecon.system.records import name_schema
-from clrecon.system.text import escape_text, unknown_name
+from clrecon.system.text import escape_text
 from clrecon.viewer.model.changes import copy_view
 from clrecon.viewer.model.measures import POINTS_OF, Measure, checked_measure_name, measure_points
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownObject, first_parts
+from clrecon.viewer.model.planes import check_plane, checked_turn
 from clrecon.viewer.model.state import LEAST_ZOOM, MOST_ZOOM, ClipPlane, ShownPart, SliceFrame, ViewState
 
 VIEW_FORMAT = ".view.json"
@@ -41,6 +41,9 @@ def encode_view(state: ViewState, objects: Sequence[ShownObject]) -> bytes:
         "fitted": state.fitted,
         "color_by": state.color_by,
         "cross_lps_mm": list(state.cross),
+        "turn": None if state.turn is None else [list(row) for row in state.turn],
+        "slab": {"thickness_mm": state.slab_mm, "combine": state.combine},
+        "layout": state.layout,
         "slices": [_describe_frame(each) for each in state.frames],
         "parts": [_describe_look(each) for each in state.parts if not each.is_plain],
         "measures": [
@@ -127,9 +130,11 @@ def _apply(saved: Mapping[str, Any], trial: ViewModel) -> None:
         trial.set_fitted(True)
         trial.set_color_by(saved["color_by"])
     trial.set_cross(saved["cross_lps_mm"])
+    trial.state = replace(trial.state, turn=checked_turn(saved["turn"]))
+    trial.set_slab(saved["slab"]["thickness_mm"], saved["slab"]["combine"])
+    trial.set_layout(saved["layout"])
     for frame in saved["slices"]:
-        if frame["plane"] not in PLANES:
-            raise UsageError(unknown_name("plane", frame["plane"], PLANES))
+        check_plane(frame["plane"])
         if not LEAST_ZOOM <= frame["zoom"] <= MOST_ZOOM:
             raise UsageError(f"the zoom of a slice is {LEAST_ZOOM:g} to {MOST_ZOOM:g}, not {frame['zoom']!r:.40}")
         trial.frame_slice(frame["plane"], frame["zoom"], frame["center_lps_mm"], np.inf)

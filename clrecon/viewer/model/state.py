@@ -20,8 +20,16 @@ from clrecon.viewer.model.measures import Measure, Point
 FIT_COLORS: tuple[Literal["thickness", "error"], ...] = ("thickness", "error")
 """Numbers at the vertices of a fitted surface that colours can show, in mm."""
 
+LAYOUTS = ("1", "1+3", "4")
+"""Ways to lay the views out: the picture alone, with the slices beside it, four of one size."""
+
+COMBINATIONS: tuple[Literal["mean", "max", "min"], ...] = ("mean", "max", "min")
+"""What a thick slice shows of its samples."""
+
 Color = tuple[float, float, float]
 Box = tuple[Point, Point]
+Turn = tuple[Point, Point, Point]
+"""Rows of a rotation in LPS."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,6 +176,9 @@ class ViewState:
     fitted: The surfaces of scans lie where they were fitted to the bone, in the mode "surface".
     color_by: Number at the vertices of fitted surfaces that their colours show, one of `FIT_COLORS`.
     cross: Where the three slices go through.
+    turn: Of the three slices, about the cross; None: they lie along the axes of the patient.
+    slab_mm: Thickness of the slices, 0 for planes; `combine` is what is shown of its samples.
+    layout: One of `LAYOUTS`.
     frames: Of the slices that were zoomed or shifted; the others fit.
     parts_at: Iso value of the clusters; None: they are not known.
     parts_table: Of which volume, see `table`.
@@ -179,6 +190,10 @@ class ViewState:
     iso_value: float
     window: tuple[float, float]
     cross: Point
+    turn: Turn | None = None
+    slab_mm: float = 0.0
+    combine: Literal["mean", "max", "min"] = "mean"
+    layout: str = "1+3"
     frames: tuple[SliceFrame, ...] = ()
     picture_window: tuple[float, float] | None = None
     table: bool = True
@@ -237,5 +252,14 @@ def picture_key(state: ViewState, view: str) -> Hashable:
             *(state.fitted, state.color_by, parts, cut),
         )
     if view in SLICES:
-        return (state.cross, state.frame(view), state.window, state.table, parts)
+        return (
+            state.cross,
+            state.turn,
+            state.frame(view),
+            state.window,
+            state.slab_mm,
+            state.combine,
+            state.table,
+            parts,
+        )
     return (state.curve, state.window, state.table)

@@ -114,6 +114,14 @@ _session("zoom_slice", "show a slice of a size larger; about: from the middle, i
          plane=_text, factor=_check_number, size=_size, takes={"about": _check_numbers(2)})  # fmt: skip
 _session("pan_slice", "shift a slice of a size, in shares of the height", "pan_slice",
          plane=_text, dx=_check_number, dy=_check_number, size=_size)  # fmt: skip
+_model("turn_cross", "turn the cross on a slice clockwise, degrees", "turn_cross", plane=_text, degrees=_check_number)
+_model("straighten", "slices along the axes of the patient again", "straighten")
+_model("set_slab", "slices of so many mm: mean, max or min of them", "set_slab",
+       thickness=_check_number, takes={"combine": _text})  # fmt: skip
+_model("step_slab", "thick slices: mean, max, or planes again", "step_slab")
+_model("set_layout", "lay the views out: 1, 1+3 or 4", "set_layout", name=_text)
+_model("step_layout", "lay the views out in the next way", "step_layout")
+_session("find_spine", "find the canal of the spine, and make it a curve", "find_spine")
 _model("fit_slices", "show the slices as they fit", "fit_slices")
 _session("probe", "HU at a place, LPS mm", "probe", point=_check_numbers(3))
 _model("set_cross", "move the slices to a place, LPS mm", "set_cross", point=_check_numbers(3))
@@ -210,6 +218,7 @@ _SECTIONS: dict[str, dict[str, Key]] = {
         "5": _look_from("superior"),
         "6": _look_from("inferior"),
         "f": Key("parallel or perspective", {"do": "toggle_perspective"}),
+        "g": Key("layout: picture alone, slices beside it, four views", {"do": "step_layout"}),
     },
     "Scan": {
         "o": Key("next mode; O: the one before", {"do": "step_mode", "steps": 1}),
@@ -227,11 +236,16 @@ _SECTIONS: dict[str, dict[str, Key]] = {
         "+": Key("larger; -: smaller", "larger"),
         "-": Key("", "smaller"),
         "0": Key("slices as they fit", {"do": "fit_slices"}),
+        "[": Key("turn the cross on the slice by 5°; ]: clockwise", "turn_left"),
+        "]": Key("", "turn_right"),
+        "r": Key("slices along the axes of the patient again", {"do": "straighten"}),
+        "j": Key("slices of 10 mm: mean, max; or planes again", {"do": "step_slab"}),
     },
     "Measure": {
         "m": Key("distance: two clicks", "distance"),
         "a": Key("angle: three clicks", "angle"),
         "k": Key("curve: clicks, then k: picture along it; again: without", "curve"),
+        "K": Key("curve along the spine, found in the scan", {"do": "find_spine"}),
         "e": Key("place under the pointer, as a seed point", {"do": "mark_at"}, at_pointer=True),
         "M": Key("remove all measures", {"do": "clear_measures"}),
     },
@@ -267,6 +281,7 @@ _MOUSE = {
     ),
     "Mouse on a slice": (
         ("click, drag", "the other slices go there"),
+        ("drag an end of the cross", "turn it: the other slices become oblique"),
         ("wheel", "scroll; touch: one finger"),
         ("Ctrl and wheel", "zoom; touch: two fingers, which move it too"),
         ("Shift and drag", "move; also with the middle button"),

@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from clrecon.anatomy.spine_line import find_spine_line
 from clrecon.errors import ClreconError, UsageError
 from clrecon.opencl import Device
 from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.object_looks import MESH_COLORS
 from clrecon.rendering.views.camera import Camera
-from clrecon.rendering.views.directions import checked_size, checked_vector
+from clrecon.rendering.views.directions import as_point, checked_size, checked_vector
 from clrecon.system.arguments import Space
 from clrecon.system.base_classes import Closing
 from clrecon.system.log import get_logger
@@ -62,6 +63,7 @@ _WORDS = {
     "parts": "finding parts",
     "table": "taking the table away",
     "fit": "fitting the surface to the bone",
+    "spine": "finding the spine",
     "coarse": "making coarse meshes",
     "save": "writing",
 }
@@ -320,6 +322,22 @@ class ViewSession(Closing):
             self._changed()
 
         self._work.ask("fit", fit_scans, rank=3)
+
+    def find_spine(self) -> None:
+        """Find the canal of the spine in the first scan in the background, and add it as a curve."""
+        if not self.model.scans:
+            raise UsageError("there is no scan: a spine is found in one")
+        volume = self.model.scans[0].volume
+
+        def find_line(job: Job) -> None:
+            line = find_spine_line(volume, progress=job.progress)
+            with self._lock:
+                if not job.cancelled():
+                    self.model.add_curve([as_point(point) for point in line.points], "spine")
+                    self._said = "the picture along the spine follows the middle of its canal"
+            self._changed()
+
+        self._work.ask("spine", find_line, rank=3)
 
     def pick(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Return what is seen at a pixel of the picture, or of a slice."""

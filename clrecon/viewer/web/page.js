@@ -2,9 +2,8 @@
   const TOOLS = { distance: "distance", angle: "angle", trace: "curve", seed: "seed", only: "only", hide: "hide" };
   const SVG = "http://www.w3.org/2000/svg";
 
-  // Axis of the patient across each slice, and the colour of its plane.
-  const ACROSS = { sagittal: 0, coronal: 1, axial: 2 };
-  const CROSS_PIXELS = 11, GAP = 7;
+  const CROSS_PIXELS = 11, GAP = 7, INSET = 32;  // of the cross in the picture, around its middle, of its ends from the border
+  const TURN_DEGREES = 5;  // of the cross by a key
 
   let fixed = null, facts = null, choosing = "", chosen = "", curveOff = false, pictures = 0, asked = false, held = 0;
   let full = "", probed = null, seen = null;
@@ -66,9 +65,10 @@
   }
 
   function layOut() {
-    const alone = !find("sliced").checked || !facts || !facts.iso;
+    const alone = !facts || !facts.iso || facts.layout === "1";
     if (full && (views[full].box.hidden || (alone && SLICES.includes(full)))) full = "";
     find("stage").classList.toggle("alone", alone);
+    find("stage").classList.toggle("four", !alone && facts.layout === "4");
     find("stage").classList.toggle("full", full !== "");
     for (const { name, box, enlarge } of Object.values(views)) {
       box.classList.toggle("large", name === full);
@@ -194,7 +194,7 @@
     facts = now;
     const told = (name) => !before || JSON.stringify(before[name]) !== JSON.stringify(now[name]);
     if (now.tool !== choosing && !["only", "hide"].includes(choosing)) choosing = now.tool || "";
-    for (const id of ["iso", "tabled", "slicing", "windows"]) find(id).hidden = !now.iso;
+    for (const id of ["iso", "tabled", "layouts", "spine", "windows"]) find(id).hidden = !now.iso;
     find("mode").hidden = now.modes.length < 2;
     if (told("iso") && now.iso) showIso();
     if (told("modes")) {
@@ -210,6 +210,9 @@
     find("undo").disabled = !now.undo;
     find("undo").title = now.undo ? `take back ${now.undo} (u)` : "nothing to take back (u)";
     if (told("window")) showWindow();
+    if (told("slab")) showSlab();
+    find("straighten").hidden = !now.turned;
+    for (const button of find("layouts").children) button.setAttribute("aria-pressed", String(button.dataset.layout === now.layout));
     if (told("parts") && !held) showParts();
     const clusters = now.parts.filter(({ kind }) => kind === "cluster");
     find("colors").hidden = !clusters.length;
@@ -225,7 +228,7 @@
     const curved = Boolean(now.iso && (curves(now) || (now.tool === "curve" && now.points.length > 1)));
     find("curved").hidden = !curved;
     find("along").checked = !curveOff;
-    if (views.curve.box.hidden === (curved && !curveOff) || !before) {
+    if (views.curve.box.hidden === (curved && !curveOff) || !before || told("layout")) {
       views.curve.box.hidden = !curved || curveOff;
       layOut();
     }
@@ -253,6 +256,12 @@
     for (const [id, value] of [["level", (low + high) / 2], ["width", high - low]]) {
       if (document.activeElement !== find(id)) find(id).value = Math.round(value);
     }
+  }
+
+  function showSlab() {
+    if (document.activeElement !== find("thick")) find("thick").value = Math.round(10 * facts.slab.mm) / 10;
+    find("combine").value = facts.slab.combine;
+    find("combine").disabled = !facts.slab.mm;
   }
 
   // An input that is dragged keeps its value until it is let go, whatever comes back meanwhile.
@@ -417,6 +426,14 @@
     run("set_window", { low: level - half, high: level + half });
   };
   find("level").onchange = find("width").onchange = setWindow;
+  find("thick").onchange = find("combine").onchange = () => {
+    const mm = Number(find("thick").value), { min, max } = find("thick");
+    if (find("thick").value !== "" && mm >= min && mm <= max) run("set_slab", { thickness: mm, combine: find("combine").value });
+    else { hint(`Slices are ${min} to ${max} mm thick.`, true); document.activeElement.blur(); showSlab(); }
+  };
+  find("straighten").onclick = () => run("straighten");
+  find("spine").onclick = () => run("find_spine");
+  for (const button of find("layouts").children) button.onclick = () => run("set_layout", { name: button.dataset.layout });
   find("mode").onchange = () => run("set_mode", { name: find("mode").value });
   find("table").onchange = () => run("set_table", { shown: find("table").checked });
   find("fitted").onchange = () => run("set_fitted", { shown: find("fitted").checked });
@@ -427,7 +444,6 @@
     const by = -Math.sign(event.deltaY) * fixed.iso_step;
     gather("step_iso", (old) => ({ do: "step_iso", more: { by: by + (old ? old.more.by : 0) } }));
   }, { passive: false });
-  find("sliced").onchange = layOut;
   find("end").onclick = () => choose("");
   find("along").onchange = () => { curveOff = !find("along").checked; takeFacts(facts); };
   for (const button of find("exports").children) button.onclick = () => save(button.dataset.format);
@@ -452,6 +468,12 @@
     else hint("Point at a slice first.");
   }
 
+  function turnAimed(degrees) {
+    const view = aimed();
+    if (view && SLICES.includes(view.name)) run("turn_cross", { plane: view.name, degrees });
+    else hint("Point at a slice first.");
+  }
+
   function zoomAimed(factor) {
     const view = aimed();
     if (view && view.name !== "curve") zoomBy(view, factor, ...middleOf(view));
@@ -470,6 +492,8 @@
     behind: () => scrollAimed(1),
     larger: () => zoomAimed(1.25),
     smaller: () => zoomAimed(0.8),
+    turn_left: () => turnAimed(-TURN_DEGREES),
+    turn_right: () => turnAimed(TURN_DEGREES),
   };
 
   // A command for what lies under the pointer; elsewhere what is like it for the part that was chosen in the list.

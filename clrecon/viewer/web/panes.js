@@ -48,7 +48,7 @@
     line([[14, low - 6], [14, low], [end, low], [end, low - 6]], "bar");
     write(sayLength(length) + (camera.parallel ? "" : " in the middle"), 14, low - 17, "side", "start");
     if (facts && facts.scale && view.name === "scene") annotateScale(make, write, width, height);
-    if (facts && facts.iso) annotateCross(view, segments, width, height);
+    if (facts && facts.iso) annotateCross(view, make, segments, width, height);
     if (facts) annotateMeasures(view, line, write, width, height);
     view.over.replaceChildren(...drawn);
   }
@@ -61,13 +61,17 @@
     write(wide ? `${view.name} ${which}` : view.name, wide ? 10 : 5, 14, `name ${wide ? "" : "small "}${view.name}`, "start");
     if (!facts) return;
     write(wide ? place : which, wide ? 10 : 5, 32, "words", "start");
+    view.canvas.role = "img";
     view.canvas.ariaLabel = `${view.name} slice ${count ? `${number} of ${count}` : ""}, ${place}, level ${level}, width ${span} HU`;
     const lines = width >= FAIR ? [`L ${level} W ${span}`] : [];
+    const { mm, combine } = facts.slab;
+    if (mm) lines.push(`${{ mean: "mean", max: "most", min: "least" }[combine]} of ${mm} mm`);
     if (view.pointer && probed) {
       lines.push(probed.hu === null ? "outside" : `${probed.hu.toFixed(0)} HU`);
       if (width >= FAIR) lines.push(probed.words);  // above the words of the scale
     }
-    lines.forEach((line, n) => write(line, width - 8, height - 14 - 17 * n, n || width < FAIR ? "words probe" : "words", "end"));
+    const plain = lines.length - (view.pointer && probed ? (width >= FAIR ? 2 : 1) : 0);
+    lines.forEach((line, n) => write(line, width - 8, height - 14 - 17 * n, n < plain ? "words" : "words probe", "end"));
   }
 
   // The scale of the colours of a surface, its numbers in mm beside it.
@@ -78,22 +82,43 @@
     write(title, width - 12, top - 18, "words", "end");
   }
 
-  // Where the slices meet: in a slice the lines of the two others, in the picture a short line along each axis.
-  function annotateCross(view, segments, width, height) {
-    const [x, y] = project(view, facts.cross) || [];
-    if (x === undefined) return;
-    for (const [plane, axis] of Object.entries(ACROSS)) {
+  // Where the slices meet: in a slice the lines of the two others, whose ends turn them, in the picture a short line
+  // across each.
+  function annotateCross(view, make, segments, width, height) {
+    const middle = project(view, facts.cross);
+    view.handles = [];
+    if (!middle) return;
+    for (const plane of SLICES) {
+      const forward = facts.forward[plane];
       if (view.name === "scene") {
         const mm = (facts.camera.height_mm / height) * CROSS_PIXELS;
-        const ends = [-mm, mm].map((by) => project(view, facts.cross.map((value, at) => value + (at === axis ? by : 0))));
+        const ends = [-mm, mm].map((by) => project(view, facts.cross.map((value, at) => value + by * forward[at])));
         if (ends.every(Boolean)) segments([ends], `cross ${plane}`);
       } else if (plane !== view.name) {
-        const upright = Math.abs(view.camera.right[axis]) > Math.abs(view.camera.up[axis]);
-        segments(upright ? [[[x, 0], [x, y - GAP]], [[x, y + GAP], [x, height]]]
-          : [[[0, y], [x - GAP, y]], [[x + GAP, y], [width, y]]], `cross ${plane}`);
+        const along = cross(forward, view.camera.forward), x = dot(along, view.camera.right), y = -dot(along, view.camera.up);
+        const sides = [-1, 1].map((sign) => [sign * x, sign * y]).map((way) => [way, lengthWithin(middle, way, width, height)]);
+        const ahead = ([way], far) => middle.map((value, axis) => value + far * way[axis]);
+        segments(sides.filter(([, far]) => far > GAP).map((side) => [ahead(side, GAP), ahead(side, side[1])]), `cross ${plane}`);
+        view.handles.push(...sides.filter(([, far]) => far > 2 * INSET).map((side) => ahead(side, side[1] - INSET)));
+        if (!view.pointer && !view.turning && !COARSE_POINTER.matches) continue;
+        for (const [cx, cy] of view.handles.slice(-2)) make("circle", { cx, cy, r: 4.5, class: `handle ${plane}` });
       }
     }
   }
+
+  const COARSE_POINTER = matchMedia("(pointer: coarse)");
+
+  // How far a way of length 1 goes from a place to the border of a view.
+  function lengthWithin(place, way, width, height) {
+    const sizes = [width, height];
+    if (place.some((value, axis) => value < 0 || value > sizes[axis])) return 0;
+    return Math.min(...way.map((by, axis) => {
+      if (Math.abs(by) < 1e-9) return Infinity;
+      return ((by > 0 ? sizes[axis] : 0) - place[axis]) / by;
+    }));
+  }
+
+  const isHandle = (view, [x, y], reach) => (view.handles || []).some((end) => Math.hypot(end[0] - x, end[1] - y) < reach);
 
   // Texts of measures stand in the nearer upper corner, with a thin line to what they belong to: bone stays free.
   function annotateMeasures(view, line, write, width, height) {
@@ -191,12 +216,17 @@
     showWindow();
   }
 
-  function turnAt(view, x, y) {  // Ctrl and drag: about the middle of the picture
-    const now = Math.atan2(y - view.box.clientHeight / 2, x - view.box.clientWidth / 2);
+  // A drag about the middle of the picture rolls it, about that of the cross it turns the slices.
+  function turnAt(view, x, y, slice) {
+    const middle = slice ? project(view, facts.cross) : middleOf(view);
+    const now = Math.atan2(y - middle[1], x - middle[0]);
     const by = view.angle === undefined ? 0 : ((now - view.angle) * 180) / Math.PI;
     view.angle = now;
     const degrees = by > 180 ? by - 360 : by < -180 ? by + 360 : by;
-    gather("roll", (old) => ({ do: "roll", more: { degrees: degrees + (old ? old.more.degrees : 0) } }));
+    const more = slice ? { plane: view.name } : {};
+    gather(slice ? "turn_cross" : "roll", (old) => (
+      { do: slice ? "turn_cross" : "roll", more: { ...more, degrees: degrees + (old ? old.more.degrees : 0) } }
+    ));
   }
 
   for (const view of Object.values(views)) {
@@ -214,11 +244,17 @@
       steps = 0;
       last("hold", { on: true });
       delete view.angle;
+      const reach = event.pointerType === "touch" ? INSET : INSET / 2;
+      view.turning = slice && !choosing && !event.shiftKey && event.button === 0 && fingers.size === 1
+        && isHandle(view, at(event), reach);
+      if (view.turning) turnAt(view, ...at(event), true);  // from here on
     });
+    view.box.addEventListener("pointerenter", () => annotate(view));
     view.box.addEventListener("pointermove", (event) => {
       view.pointer = at(event);
       const before = fingers.get(event.pointerId);
       if (!before) probe(view);
+      if (!before && slice) view.box.classList.toggle("turns", !choosing && isHandle(view, view.pointer, INSET / 2));
       if (!before || view.name === "curve") return;
       const now = at(event), x = now[0] - before[0], y = now[1] - before[1], height = view.box.clientHeight;
       moved += Math.hypot(x, y);
@@ -228,7 +264,8 @@
         const apart = (finger) => Math.max(Math.hypot(finger[0] - other[0], finger[1] - other[1]), 1);
         panBy(view, x / 2, y / 2);
         zoomBy(view, apart(now) / apart(before), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
-      } else if (slice && event.buttons & 2) windowBy(x, y);
+      } else if (view.turning) turnAt(view, ...now, true);
+      else if (slice && event.buttons & 2) windowBy(x, y);
       else if (slice && (event.shiftKey || event.buttons & 4)) panBy(view, x, y);
       else if (slice && event.pointerType === "touch") {
         steps += y / 6;
@@ -247,7 +284,9 @@
       view.box.addEventListener(name, (event) => {
         if (!fingers.delete(event.pointerId)) return;
         if (!fingers.size) last("hold", { on: false }, "release");
-        if (name === "pointerup" && moved < 4 && event.button === 0) click(view, at(event), event.shiftKey);
+        const turned = view.turning;
+        view.turning = false;
+        if (name === "pointerup" && moved < 4 && event.button === 0 && !turned) click(view, at(event), event.shiftKey);
       });
     }
     view.box.addEventListener("pointerleave", () => { view.pointer = null; annotate(view); });

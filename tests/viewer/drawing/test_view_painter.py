@@ -225,6 +225,30 @@ def test_pick_in_a_slice_is_the_place_of_its_pixel_with_its_hu(open_model_and_pa
     assert pick.hu > BALL_HU
 
 
+def test_pick_in_a_turned_slice_lies_in_its_plane(open_model_and_painter):
+    model, painter = open_model_and_painter()
+    model.turn_cross("sagittal", 30.0)
+    forward = painter.slice_camera(model.state, "axial", SIZE).basis().forward
+
+    pick = painter.pick_slice(model.state, "axial", SIZE, 10.0, 15.0)
+
+    assert abs(forward @ np.subtract(pick.point, model.state.cross)) < 1e-9  # mm, of places of some 200 mm
+
+
+def test_thick_slice_of_the_most_shows_a_ball_that_lies_beside_its_plane(open_model_and_painter):
+    model, painter = open_model_and_painter()
+    model.set_cross(scenes.middle(1) + (0.0, 0.0, 8.0))  # the ball has a radius of 5 mm
+    thin = painter.slice(model.state, "axial", SIZE)
+
+    model.set_slab(20.0, "max")
+
+    thick = painter.slice(model.state, "axial", SIZE)
+    (pixel,), _ = thick.camera.project([scenes.middle(1)], SIZE)
+    column, row = np.floor(pixel).astype(int)
+    assert thin.image[row, column, 0] == 0  # air
+    assert thick.image[row, column, 0] > 200  # 1000 HU in a window from -450 to 1050 HU
+
+
 def test_slice_in_an_unknown_plane_is_refused(open_model_and_painter):
     model, painter = open_model_and_painter()
     with refused(UsageError, "axial", "oblique"):

@@ -58,6 +58,9 @@ def move_slices(model: ViewModel) -> None:
     model.set_cross(scenes.middle(1))
     model.frame_slice("coronal", 3.0, scenes.middle(1))
     model.set_window(-100.0, 300.0)
+    model.turn_cross("axial", 30.0)
+    model.set_slab(7.5, "max")
+    model.set_layout("4")
 
 
 def show_projection(model: ViewModel) -> None:
@@ -158,6 +161,10 @@ DAMAGED: dict[str, dict[str, Any]] = {
     "cross of two numbers": {"cross_lps_mm": [1, 2]},
     "zoom of a slice below its least": {"slices": [{"plane": "axial", "zoom": 0, "center_lps_mm": [0, 0, 0]}]},
     "plane unknown": {"slices": [{"plane": "oblique", "zoom": 1, "center_lps_mm": [0, 0, 0]}]},
+    "turn that is none": {"turn": [[1, 0, 0], [0, 2, 0], [0, 0, 1]]},
+    "slab of an unknown kind": {"slab": {"thickness_mm": 5, "combine": "median"}},
+    "slab of a metre": {"slab": {"thickness_mm": 1000, "combine": "mean"}},
+    "layout unknown": {"layout": "9"},
     "clip beyond its ends": {"clips": [{"direction": "left", "share": 2, "flipped": False}]},
     "clip without a share": {"clips": [{"direction": "left", "flipped": False}]},
     "measure of one point": {"measures": [{"kind": "distance", "name": "a", "points_lps_mm": [[0, 0, 0]]}]},

@@ -75,6 +75,12 @@ RIGHT: dict[str, dict[str, Any]] = {
     "fit_slices": {},
     "pan_slice": {"plane": "axial", "dx": 0.1, "dy": 0.1, **AT},
     "probe": {"point": [-40, -20, 210]},
+    "turn_cross": {"plane": "axial", "degrees": 12.5},
+    "straighten": {},
+    "set_slab": {"thickness": 6, "combine": "max"},
+    "step_slab": {},
+    "set_layout": {"name": "4"},
+    "step_layout": {},
     "show": {"key": "2", "visible": False},
     "only": {"key": "2"},
     "show_all": {},
@@ -111,7 +117,7 @@ RIGHT: dict[str, dict[str, Any]] = {
 
 @pytest.mark.opencl
 def test_each_command_is_done_and_what_it_changes_is_undone(open_session):
-    assert set(RIGHT) | {"save"} == set(COMMANDS)
+    assert set(RIGHT) | {"save", "find_spine"} == set(COMMANDS)  # those have tests of their own
     view = open_session()
     view.do({"do": "find_parts"})
     assert view.wait(PATIENCE)
@@ -575,3 +581,14 @@ def test_probe_of_a_place_has_its_hu_and_its_words_and_leaves_the_state(open_ses
 def test_probe_outside_of_the_scan_has_no_hu(open_session):
     outside = open_session().do({"do": "probe", "point": [500.0, 0.0, 0.0]})["probe"]
     assert outside == {"hu": None, "words": "500.0, 0.0, 0.0 mm LPS"}
+
+
+@pytest.mark.opencl
+def test_spine_that_is_not_found_is_said_and_no_curve_is_made(open_session) -> None:
+    view = open_session()  # balls
+
+    view.do({"do": "find_spine"})
+
+    assert view.wait(PATIENCE)
+    assert "no spine" in view.facts()["error"]
+    assert view.model.state.measures == ()

@@ -261,13 +261,84 @@ def test_button_of_a_slice_shows_it_alone_and_leaves_the_cross(page) -> None:
     assert facts(page)["cross"] == cross
 
 
-def test_scene_is_shown_in_place_of_a_slice_at_full_size_when_slices_are_switched_off(page) -> None:
+def test_scene_is_shown_in_place_of_a_slice_at_full_size_in_the_layout_of_one(page) -> None:
     enlarge_sagittal(page)
 
-    page.find_element("id", "sliced").click()
+    page.find_element("css selector", "#layouts [data-layout='1']").click()
 
     wait_for(page, "return document.querySelector('#sagittal .enlarge').getAttribute('aria-pressed') === 'false'")
     assert shown_views(page) == ["scene"]
+
+
+# Layouts, and the cross that is turned
+
+
+def test_layout_of_four_gives_each_view_the_size_of_the_others(page) -> None:
+    page.find_element("css selector", "#layouts [data-layout='4']").click()
+
+    wait_for(page, "return clrecon.facts.layout === '4' && clrecon.facts.settled")
+    sizes = [page.find_element("id", view).size for view in VIEWS]
+    assert max(each["width"] for each in sizes) - min(each["width"] for each in sizes) <= 1  # pixel, of a division
+
+
+def test_key_g_goes_from_slices_beside_the_picture_to_four_views(page) -> None:
+    press_keys(page, "g")
+
+    assert wait_for(page, "return clrecon.facts.layout === '4'")
+
+
+def test_drag_of_an_end_of_the_cross_by_a_quarter_turns_the_two_other_slices(page) -> None:
+    from selenium.webdriver import ActionChains
+
+    axial = page.find_element("id", "axial")
+    x, y = page.execute_script("return clrecon.project('axial', clrecon.facts.cross)")
+    point_at(page, "axial", scenes.middle(0))
+    ends = "[...document.querySelectorAll('#axial .handle')]"
+    right = max(page.execute_script(f"return {ends}.map(({{ cx, cy }}) => [cx.baseVal.value, cy.baseVal.value])"))
+    middle = (axial.size["width"] / 2, axial.size["height"] / 2)
+    far = right[0] - x
+
+    ActionChains(page).move_to_element_with_offset(
+        axial, round(right[0] - middle[0]), round(right[1] - middle[1])
+    ).click_and_hold().move_by_offset(-5, round(far / 2)).move_by_offset(
+        round(-far) + 5, round(far / 2)
+    ).release().perform()
+
+    wait_for(page, "return clrecon.facts.turned && clrecon.facts.settled")
+    assert facts(page)["slices"]["axial"]["place"][0] in "IS"
+    degrees = float(facts(page)["slices"]["coronal"]["place"].split()[1].rstrip("°"))
+    assert degrees == pytest.approx(90.0, abs=3.0)  # of a drag in whole pixels that begins after the first four
+
+
+def test_key_r_straightens_turned_slices(page) -> None:
+    run_command(page, "turn_cross", plane="axial", degrees=30)
+    wait_for(page, "return clrecon.facts.turned")
+
+    press_keys(page, "r")
+
+    assert wait_for(page, "return !clrecon.facts.turned && straighten.hidden")
+
+
+def test_bracket_turns_the_cross_on_the_slice_under_the_mouse_by_five_degrees(page) -> None:
+    point_at(page, "axial", scenes.middle(0))
+
+    press_keys(page, "]")
+
+    assert wait_for(page, "return clrecon.facts.slices.coronal.place === 'turned 5.0°'")
+
+
+def test_thickness_that_is_typed_makes_thick_slices_that_say_it(page) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    before = screenshot(page, "axial")
+
+    page.find_element("id", "thick").send_keys(Keys.CONTROL, "a")
+    page.find_element("id", "thick").send_keys("12", Keys.ENTER)
+
+    wait_for(page, "return clrecon.facts.slab.mm === 12 && clrecon.facts.settled")
+    wait_for(page, SETTLED)
+    assert "mean of 12 mm" in words_on(page, "axial")
+    assert share_of_changed_pixels(before, screenshot(page, "axial")) > tolerances.VIEW_REDRAWN_SHARE
 
 
 # Keys
