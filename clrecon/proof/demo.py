@@ -20,6 +20,7 @@ from clrecon.proof.phantom import PhantomSettings, make_phantom, write_phantom
 from clrecon.system import paths
 from clrecon.system.files import hold_interrupts, temporary_folder
 from clrecon.system.progress import Progress
+from clrecon.system.records import name_schema
 
 if TYPE_CHECKING:
     from clrecon.opencl import Device
@@ -60,7 +61,7 @@ def make_demo(
                 raise OutputError(str(error).replace(str(staged), str(output))) from error
             with hold_interrupts():
                 _put_in_place(staged, folder, output)
-    return {"folder": str(output), **outcome}
+    return name_schema("demo", {"folder": str(output), **outcome})
 
 
 def _fill_folder(folder: Path, chosen: Device, progress: Progress | None) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import pytest
 import tolerances
 from PIL import Image
 from refusals import assert_facts, refused
+from report_schemas import find_faults
 from variants import daily
 
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
@@ -169,6 +170,7 @@ def test_demo_checks_the_affine_of_its_phantom_and_the_volume_and_radius_of_a_sp
     _, made = demo
     check = made["check"]
 
+    assert find_faults(made, "demo") == []
     assert made["affine_error_mm"] < tolerances.AFFINE_MM
     assert check["volume_ml"] == pytest.approx(check["true_volume_ml"], rel=tolerances.PHANTOM_SPHERE_VOLUME_SHARE)
     assert check["radius_error_max_mm"] < 0.15 * max(check["spacing_mm"])  # of a voxel: partial volume bends its edge

@@ -113,7 +113,9 @@ class MethodRecord(Record):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CompareReport(RunReport):
-    """The report of a comparison: a `RunReport` with further entries, which docs/compare.md explains."""
+    """The report of a comparison: a `RunReport` with further entries, which docs/contract.md explains."""
+
+    SCHEMA = "compare"
 
     date: str
     shape_ijk: list[int]

@@ -144,7 +144,8 @@ def _make_voxels(
     if scanner.padding is not None:
         voxels[:, sampling.outside_disc(field.shape[1:], affine)] = scanner.padding
     ghosts = draw_ghosts(voxels, settings.seed) if settings.ghosts else None
-    truth = {
+    truth: dict[str, Any] = {
+        "schema": "clrecon-phantom-1",
         "generator": _GENERATOR,
         "version": package_version(),
         "kind": settings.kind,

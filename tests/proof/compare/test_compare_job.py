@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import report_schemas
 from child_code import run_instead
 from conftest import is_set
 from html_check import PageCheck, find_faults
@@ -63,7 +64,11 @@ def ball(shared_folder: Path) -> Path:
 
 
 def read_report(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "report.json").read_text())
+    """The report of a comparison, which is as its schema says."""
+    report = json.loads((folder / "report.json").read_text())
+    assert report["schema"] == "clrecon-compare-1"
+    assert report_schemas.find_faults(report) == []
+    return report
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tolerances
 from refusals import refused
+from report_schemas import find_faults
 from variants import daily
 
 from clrecon.errors import RefusedInputError, UsageError
@@ -219,3 +220,19 @@ def test_text_of_a_screen_capture_has_lines_of_a_24th_of_its_height_as_far_apart
     height = rows // 24
     expected = [row for top in range(12, rows - margin, 2 * height) for row in range(top, top + height)]
     assert text_rows.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        pytest.param({"kind": "sphere", "radius_mm": 30.0}, id="shape"),
+        pytest.param({"kind": "limb"}, id="scene"),
+        pytest.param({"levels": "L3-L4", "facet_gap_mm": 0.5}, id="chosen levels"),
+        pytest.param({"ghosts": True}, id="ghosts"),
+        pytest.param({"uneven_mm": 0.5, "missing": (3,), "phases": 2}, id="uneven, gapped and phased"),
+    ],
+)
+def test_truth_of_a_phantom_is_as_its_schema_says(given: dict) -> None:
+    truth = make_phantom(PhantomSettings(size=(20, 20), slices=12, spacing=(8.0, 8.0, 8.0), **given))[2]
+
+    assert find_faults(truth, "phantom") == []
