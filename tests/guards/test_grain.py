@@ -12,7 +12,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 94_345,
+    "lines": 94_373,
     "modules": 415,
     "small_modules_with_one_reader": 8,
     "docstrings_with_raises": 136,

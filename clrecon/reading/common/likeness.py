@@ -36,7 +36,8 @@ _MOST_ALIKE, _LEAST_ALIKE = 12, 4
 """Number of consecutive slices that must all reach it; of fewer slices all, but at least the second number."""
 _MOST_ALIKE_PART, _LEAST_ALIKE_PART = 20, 6
 HU_RANGE = (-1000, 2000)
-"""Values are limited to this range; beyond are padding and metal.  Sums over a cell then fit 16 bits."""
+"""Values are limited to this range; beyond are padding and metal.  Sums over a cell, of values above the lowest, then
+fit 16 bits."""
 _CELL = 4
 _FINE_CELL = 2
 _COARSE_CELLS = 32
@@ -116,16 +117,17 @@ def measure_likeness(voxels: NDArray[Any], *, parts: bool = True) -> Likeness | 
     cells = _average_cells(voxels)
     if cells.shape[1] * cells.shape[2] < FEWEST_CELLS:
         return None
-    differences = [np.square(cells[step:] - cells[:-step]) for step in range(1, max(PERIODS) + 1)]
+    parts = parts and len(voxels) >= min(PERIODS) + _LEAST_ALIKE_PART
+    steps = [_compare_cells(cells, step, parts=parts and step <= 2) for step in range(1, max(PERIODS) + 1)]
     likenesses = []
     for period in PERIODS:
         if len(voxels) < period + _LEAST_ALIKE:
             break
-        whole = [one.mean(axis=(1, 2)) for one in differences[:period]]
+        whole = [of_slices for of_slices, _ in steps[:period]]
         likenesses.append(Likeness(period, float(_steadily(_ratios(whole, _NOISE_HU2))), None))
     part = None
-    if parts and len(voxels) >= min(PERIODS) + _LEAST_ALIKE_PART:
-        tiles = [_average(one, PART) for one in differences[:2]]
+    if parts:
+        tiles = [of_parts for _, of_parts in steps[:2]]
         if tiles[0].size:
             ratios = _ratios(tiles, _PART_NOISE_HU2)
             reached = np.sort(_steadily(ratios), axis=None)
@@ -134,6 +136,26 @@ def measure_likeness(voxels: NDArray[Any], *, parts: bool = True) -> Likeness | 
     if best.whole <= _LEAST_LIKENESS:
         best = likenesses[0]
     return Likeness(best.period, best.whole, part)
+
+
+def _compare_cells(
+    cells: NDArray[np.float32], step: int, *, parts: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the mean squared differences of slices `step` apart, (n,), and those of `parts` of the picture, or none.
+
+    Slice by slice: the differences stay in the cache of the processor.
+    """
+    count = max(len(cells) - step, 0)
+    whole = np.empty(count, np.float32)
+    tiles = np.empty((count, *(side // PART * parts for side in cells.shape[1:])), np.float32)
+    apart = np.empty(cells.shape[1:], np.float32)
+    for k in range(count):
+        np.subtract(cells[k + step], cells[k], out=apart)
+        np.square(apart, out=apart)
+        whole[k] = apart.mean()
+        if parts:
+            tiles[k] = _average(apart, PART)
+    return whole, tiles
 
 
 def _ratios(differences: Sequence[NDArray[np.float32]], noise: float) -> NDArray[np.float32]:
@@ -158,29 +180,33 @@ def _average_cells(voxels: NDArray[Any]) -> NDArray[np.float32]:
     least = min(voxels.shape[1:])
     side = next((side for side in (_CELL, _FINE_CELL) if least >= side * _COARSE_CELLS), 1)
     rows, columns = voxels.shape[1] // side, voxels.shape[2] // side
-    cells = np.zeros((len(voxels), rows, columns), np.float32)
+    cells = np.empty((len(voxels), rows, columns), np.float32)
+    word, ones = np.dtype(f"u{2 * side}"), sum(1 << 16 * place for place in range(side))
 
     def average(k: int) -> None:
         picture = np.empty((rows * side, columns * side), np.int16)
         np.clip(voxels[k, : rows * side, : columns * side], *HU_RANGE, out=picture, casting="unsafe")
-        band = picture[::side]
+        picture -= HU_RANGE[0]
+        band = picture[::side].copy()
         for row in range(1, side):
-            band = band + picture[row::side]
-        for column in range(side):
-            cells[k] += band[:, column::side]
+            band += picture[row::side]
+        # A cell's pixels of a row of sums are one word: this product has their sum in its highest 16 bits.
+        words = band.view(word) * word.type(ones)
+        cells[k] = words >> word.type(16 * (side - 1))
 
     with ThreadPoolExecutor(count_readers(len(voxels), READERS)) as pool:
         for _ in pool.map(average, range(len(voxels))):
             pass
+    cells += side * side * HU_RANGE[0]
     cells /= side * side
     return cells
 
 
-def _average(pictures: NDArray[np.float32], side: int) -> NDArray[np.float32]:
-    """Average over squares of pictures (n, rows, columns), leaving out the rest at the ends."""
-    rows, columns = pictures.shape[1] // side, pictures.shape[2] // side
-    cut = pictures[:, : rows * side, : columns * side].reshape(len(pictures), rows, side, columns, side)
-    return cut.mean(axis=(2, 4))
+def _average(picture: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """Average over squares of a picture (rows, columns), leaving out the rest at the ends."""
+    rows, columns = picture.shape[0] // side, picture.shape[1] // side
+    bands = picture[: rows * side, : columns * side].reshape(rows, side, columns * side).sum(axis=1)
+    return np.asarray(bands.reshape(rows, columns, side).sum(axis=2) / np.float32(side * side))
 
 
 SHOWN_SAID = "pictures that are not where their headers put them: slices in each other's place, rows of a wrong length"
@@ -224,8 +250,10 @@ def _sample_rows(voxels: NDArray[Any]) -> NDArray[np.int16]:
     samples = np.empty((nk, len(rows) * (ni // side)), np.int16)
 
     def sample(k: int) -> None:
-        pieces = voxels[k, side // 2 :: side, : ni // side * side].reshape(len(rows), -1, side)
-        np.rint(np.clip(pieces, *HU_RANGE).mean(axis=2).ravel(), out=samples[k], casting="unsafe")
+        chosen = np.clip(voxels[k, side // 2 :: side, : ni // side * side], *HU_RANGE)
+        exact = np.int32 if chosen.dtype.kind == "i" else chosen.dtype
+        sums = sum(chosen[:, place::side].astype(exact) for place in range(side))
+        np.rint(sums.ravel() / side, out=samples[k], casting="unsafe")
 
     with ThreadPoolExecutor(count_readers(nk, READERS)) as pool:
         for _ in pool.map(sample, range(nk)):

@@ -315,28 +315,28 @@ def _read_columns(headers: Sequence[SliceHeader]) -> dict[int, list[bytes]]:
     for k, header in enumerate(headers):
         values = _read_values(header)
         first = values if k == 0 else first
-        if values != first:
-            for tag in values.keys() | first.keys():
-                if tag not in columns and values.get(tag) != first.get(tag):
-                    columns[tag] = [first.get(tag, b"")] * k
+        differing = {tag for tag, _ in values.items() ^ first.items() if tag not in columns}
+        for tag in filter(_is_compared, differing):
+            if _shorten(values.get(tag)) != _shorten(first.get(tag)):
+                columns[tag] = [_shorten(first.get(tag))] * k
         for tag, column in columns.items():
-            column.append(values.get(tag, b""))
+            column.append(_shorten(values.get(tag)))
     return columns
 
 
 def _read_values(header: SliceHeader) -> dict[int, bytes]:
-    """Read the elements of a file that are compared: none if it changed since the scan, which its pixels will tell."""
+    """Read the elements of a file: none if it changed since the scan, which its pixels will tell."""
     try:
         # A file that needed `force` is read with it again; for other files it changes nothing.
-        values = read_elements(header.file, None, force=True).values
+        return read_elements(header.file, None, force=True).values
     except (OSError, CorruptFileError, NotDicomError):
         return {}
-    return {tag: _shorten(raw.strip(b" \0")) for tag, raw in values.items() if _is_compared(tag)}
 
 
-def _shorten(raw: bytes) -> bytes:
-    """Shorten a long value to what distinguishes it from others: vendors keep whole files in one element."""
-    return raw if len(raw) <= LONGEST_VALUE else hash(raw).to_bytes(8, "little", signed=True) + b"..."
+def _shorten(raw: bytes | None) -> bytes:
+    """Return a value without its filling, a long one as what distinguishes it: vendors keep files in one element."""
+    value = b"" if raw is None else raw.strip(b" \0")
+    return value if len(value) <= LONGEST_VALUE else hash(value).to_bytes(8, "little", signed=True) + b"..."
 
 
 def _is_compared(tag: int) -> bool:
