@@ -20,8 +20,8 @@ from clrecon.system.light_dataclass import dataclass
 
 Point = tuple[float, float, float]
 
-POINTS_OF = {"distance": 2, "angle": 3, "curve": None, "seed": 1}
-"""Tools, and the points that make a measure of each; a curve has as many as it gets."""
+POINTS_OF = {"distance": 2, "angle": 3, "curve": None, "seed": 1, "circle": 2, "box": 2}
+"""Tools, and the clicks that make a measure of each; a curve has as many as it gets."""
 
 TOOLS = tuple(POINTS_OF)
 
@@ -30,9 +30,11 @@ TOOLS = tuple(POINTS_OF)
 class Measure:
     """What was measured between points in LPS mm.
 
-    kind: "distance", "angle", "curve" (its length) or "seed", which has no value.
-    unit: "mm", "degrees" or "".
+    kind: "distance", "angle", "curve" (its length), "seed", which has no value, "circle" or "box" (its mean HU).
+    unit: "mm", "degrees", "HU" or "".
     text: As it is written beside the picture, behind the name.
+    sd, voxels, area_mm2: Of a circle or box: deviation of the HU of its voxels, how many there are, and its area.
+    thickness_mm: Of the slice that a circle or box was drawn on; 0: one layer of voxels.
     """
 
     kind: str
@@ -41,11 +43,34 @@ class Measure:
     unit: str
     text: str
     name: str = ""
+    sd: float | None = None
+    voxels: int | None = None
+    area_mm2: float | None = None
+    thickness_mm: float = 0.0
+
+    @property
+    def outline(self) -> tuple[Point, ...]:
+        """Its line in the patient, closed around a region; of other measures their points."""
+        if self.kind not in REGIONS:
+            return self.points
+        corner, *ends = np.array(self.points)
+        if self.kind == "circle":
+            angles = np.linspace(0.0, 2.0 * np.pi, _OUTLINE + 1)
+            places = corner + np.stack([np.cos(angles), np.sin(angles)], axis=1) @ (np.array(ends) - corner)
+        else:
+            corners = np.array([*self.points, self.points[0]])
+            shares = np.linspace(0.0, 4.0, _OUTLINE + 1)
+            places = np.stack([np.interp(shares, np.arange(5), column) for column in corners.T], axis=1)
+        return tuple((x, y, z) for x, y, z in places.tolist())
 
     def describe(self) -> dict[str, Any]:
         points = [[round(value, 3) for value in point] for point in self.points]
-        fields = {"name": self.name, "kind": self.kind, "points": points}
-        return {**fields, "value": self.value, "unit": self.unit, "text": self.text}
+        fields: dict[str, Any] = {"name": self.name, "kind": self.kind, "points": points}
+        fields |= {"value": self.value, "unit": self.unit, "text": self.text}
+        return fields if self.voxels is None else {**fields, **{name: getattr(self, name) for name in _OF_REGIONS}}
+
+
+_OF_REGIONS = ("sd", "voxels", "area_mm2", "thickness_mm")
 
 
 def measure_points(kind: str, points: Sequence[Point], name: str = "") -> Measure:
@@ -104,7 +129,16 @@ _SCHEMA = (
 )
 """The name by which 3D Slicer knows its files; nothing is fetched from there."""
 
-_MARKUPS = {"distance": "Line", "angle": "Angle", "curve": "Curve", "seed": "Fiducial"}
+_MARKUPS = {
+    "distance": "Line", "angle": "Angle", "curve": "Curve", "seed": "Fiducial", "circle": "ClosedCurve",
+    "box": "ClosedCurve",
+}  # fmt: skip
+
+REGIONS = {"circle": 3, "box": 4}
+"""Measures on slices, and the points of each: a middle and two a quarter apart, or corners one after the other."""
+
+_OUTLINE = 48
+"""Points of the outline of a region."""
 
 
 def encode_measures(measures: Sequence[Measure], name: str, space: Space) -> bytes:
@@ -121,19 +155,23 @@ def encode_measures(measures: Sequence[Measure], name: str, space: Space) -> byt
         return _encode_json({"space": space.upper(), "points_unit": "mm", "measures": rows})
     stream = io.StringIO()
     table = csv.writer(stream, lineterminator="\n")
-    table.writerow(["name", "kind", "value", "unit", "space", "points_mm"])
+    table.writerow(["name", "kind", "value", "unit", *_OF_REGIONS, "space", "points_mm"])
     for row in rows:
         points = "; ".join(" ".join(f"{value:.3f}" for value in point) for point in row["points"])
-        table.writerow([row["name"], row["kind"], row["value"], row["unit"], space.upper(), points])
+        region = [row.get(name) for name in _OF_REGIONS]
+        table.writerow([row["name"], row["kind"], row["value"], row["unit"], *region, space.upper(), points])
     return stream.getvalue().encode()
 
 
 def _describe_markup(measure: Measure) -> dict[str, Any]:
+    places = measure.outline[:-1] if measure.kind in REGIONS else measure.points
     points = [
-        {"id": str(number), "label": measure.name if len(measure.points) == 1 else f"{measure.name}-{number}",
+        {"id": str(number), "label": measure.name if len(places) == 1 else f"{measure.name}-{number}",
          "position": [round(value, 3) for value in point]}
-        for number, point in enumerate(measure.points, 1)
+        for number, point in enumerate(places, 1)
     ]  # fmt: skip
+    if measure.kind in REGIONS:
+        points[0]["description"] = f"{measure.text}, {measure.voxels} voxels, {measure.area_mm2} mm2"
     return {
         "type": _MARKUPS[measure.kind],
         "name": measure.name,

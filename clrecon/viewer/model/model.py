@@ -24,6 +24,7 @@ from clrecon.system.text import format_hu, unknown_name
 from clrecon.viewer.model.changes import ChangingView, checked_numbers, fit_camera, height_mm
 from clrecon.viewer.model.measures import (
     POINTS_OF,
+    REGIONS,
     TOOLS,
     Measure,
     Point,
@@ -48,6 +49,7 @@ from clrecon.viewer.model.planes import (
     near_layers,
     turn_cross,
 )
+from clrecon.viewer.model.regions import measure_region, place_region
 from clrecon.viewer.model.state import (
     COMBINATIONS,
     FIT_COLORS,
@@ -247,9 +249,7 @@ class ViewModel(ChangingView):
 
     def set_slab(self, thickness: float, combine: str | None = None) -> None:
         """Show slices of so many mm, 0 for planes: the mean, the most or the least of what is in them."""
-        (mm,) = checked_numbers("the thickness of the slices", thickness)
-        if not 0.0 <= mm <= _MOST_SLAB_MM:
-            raise UsageError(f"slices are 0 to {_MOST_SLAB_MM:g} mm thick, not {mm:g} mm")
+        mm = checked_slab(thickness)
         how = self.state.combine if combine is None else combine
         if how not in COMBINATIONS:
             raise UsageError(unknown_name("thick slice", how, COMBINATIONS))
@@ -279,16 +279,25 @@ class ViewModel(ChangingView):
             raise UsageError(unknown_name("tool", name, TOOLS))
         self._change("tool", f"the tool {name}", tool=name, points=())
 
-    def add_point(self, pick: Pick) -> Measure | None:
-        """Add a point to the tool; returns the measure that it completes."""
+    def add_point(self, pick: Pick, axes: tuple[Float64Array, Float64Array] | None = None) -> Measure | None:
+        """Add a point to the tool; returns the measure that it completes.
+
+        axes: Directions to the right and up of the slice that was clicked in; None: it was the picture.
+        """
         tool = self.state.tool
         if tool is None:
             raise UsageError(f"no tool takes points: start one of {', '.join(TOOLS)} first")
+        if tool in REGIONS and axes is None:
+            raise UsageError(f"a {tool} is drawn on a slice: click in one")
         points = (*self.state.points, pick)
         if len(points) != POINTS_OF[tool]:
             self._change("point", "the point", points=points)
             return None
-        measure = self._measured(tool, [each.point for each in points])
+        places = [each.point for each in points]
+        if axes is not None and tool in REGIONS:
+            measure = self.measure_region(tool, place_region(tool, places[0], places[1], *axes), self.state.slab_mm)
+        else:
+            measure = self._measured(tool, places)
         self._change("point", f"the {tool}", points=(), measures=(*self.state.measures, measure))
         return measure
 
@@ -311,6 +320,13 @@ class ViewModel(ChangingView):
         measures = self.state.measures if measure is None else (*self.state.measures, measure)
         self._change("end tool", f"the end of the {tool}", tool=None, points=(), measures=measures)
         return measure
+
+    def measure_region(self, kind: str, points: Sequence[Point], thickness_mm: float, name: str = "") -> Measure:
+        """Measure a circle or box in the first scan, whatever of it is shown."""
+        if not self.scans:
+            raise UsageError(f"there is no scan: a {kind} measures the HU of one")
+        called = name or free_measure_name(kind, self.state.measures)
+        return measure_region(self.scans[0].volume, kind, points, called, thickness_mm)
 
     def _measured(self, tool: str, points: Sequence[Point]) -> Measure:
         return measure_points(tool, points, free_measure_name(tool, self.state.measures))
@@ -421,7 +437,11 @@ class ViewModel(ChangingView):
             "tool": state.tool,
             "points": [each.describe() for each in state.points],
             "measures": [
-                {**each.describe(), "text": self.say_place(each.points[0]) if each.kind == "seed" else each.text}
+                {
+                    **each.describe(),
+                    "text": self.say_place(each.points[0]) if each.kind == "seed" else each.text,
+                    "outline": np.round(each.outline, 3).tolist(),
+                }
                 for each in state.measures
             ],
             "clips": [each.describe() for each in state.clips],
@@ -462,6 +482,13 @@ class ViewModel(ChangingView):
         """Return the lowest and highest corner of the box around objects; by default the scans, if there are any."""
         corners = np.concatenate([each.corners for each in objects or self.scans or self.objects])
         return corners.min(axis=0), corners.max(axis=0)
+
+
+def checked_slab(thickness: Any) -> float:
+    (mm,) = checked_numbers("the thickness of the slices", thickness)
+    if not 0.0 <= mm <= _MOST_SLAB_MM:
+        raise UsageError(f"slices are 0 to {_MOST_SLAB_MM:g} mm thick, not {mm:g} mm")
+    return mm
 
 
 def _numbered(noun: str, items: Sequence[_Item], n: int) -> _Item:

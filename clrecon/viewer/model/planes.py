@@ -77,7 +77,7 @@ def near_layers(volume: Volume, point: Sequence[float] | Float64Array) -> Float6
     return np.floor(np.round(volume.lps_to_ijk(point), 6) + 0.5)
 
 
-def _layers_across(volume: Volume, normal: Float64Array) -> tuple[int, Float64Array]:
+def layers_across(volume: Volume, normal: Float64Array) -> tuple[int, Float64Array]:
     """Return the axis whose layers of voxels lie most across a normal, and by what its index grows along x, y and z."""
     growths = np.linalg.inv(volume.affine[:3, :3])
     axis = int(np.argmax(np.abs(growths @ normal) / np.linalg.norm(growths, axis=1)))
@@ -93,7 +93,7 @@ def move_to_layer(
         return point + steps * normal
     heights = np.concatenate([_outer_layers(scan, normal) @ normal for scan in scans])
     volume, index = scans[0].volume, scans[0].volume.lps_to_ijk(point)
-    axis, growth = _layers_across(volume, normal)
+    axis, growth = layers_across(volume, normal)
     index[axis] = near_layers(volume, point)[axis] + np.sign(growth @ normal) * np.clip(steps, -1e6, 1e6)
     distance = growth @ (volume.ijk_to_lps(index) - point) / (growth @ normal)
     return point + np.clip(distance, heights.min() - point @ normal, heights.max() - point @ normal) * normal
@@ -101,7 +101,7 @@ def move_to_layer(
 
 def _outer_layers(scan: ShownScan, normal: Float64Array) -> Float64Array:
     """Return corners (n, 3) of a scan from the middle of its first layer across a normal to that of the last."""
-    ends, (axis, _) = scan.volume.lps_to_ijk(scan.corners), _layers_across(scan.volume, normal)
+    ends, (axis, _) = scan.volume.lps_to_ijk(scan.corners), layers_across(scan.volume, normal)
     ends[:, axis] = np.clip(ends[:, axis], 0, scan.volume.shape_ijk[axis] - 1)
     return scan.volume.ijk_to_lps(ends)
 
@@ -122,7 +122,7 @@ def describe_slice(
     described: dict[str, Any] = {"place": f"{side} {abs(cross[axis]):.1f} mm"}
     if scans:
         volume = scans[0].volume
-        ordinal, growth = _layers_across(volume, straight)
+        ordinal, growth = layers_across(volume, straight)
         count = volume.shape_ijk[ordinal]
         layer = min(max(int(near_layers(volume, cross)[ordinal]), 0), count - 1)
         described |= {"number": layer + 1 if growth @ straight > 0.0 else count - layer, "count": count}

@@ -17,8 +17,8 @@ from clrecon.system.paths import read_regular
 from clrecon.system.records import name_schema
 from clrecon.system.text import escape_text
 from clrecon.viewer.model.changes import copy_view
-from clrecon.viewer.model.measures import POINTS_OF, Measure, checked_measure_name, measure_points
-from clrecon.viewer.model.model import ViewModel
+from clrecon.viewer.model.measures import POINTS_OF, REGIONS, Measure, checked_measure_name, measure_points
+from clrecon.viewer.model.model import ViewModel, checked_slab
 from clrecon.viewer.model.objects import ShownObject, first_parts
 from clrecon.viewer.model.planes import check_plane, checked_turn
 from clrecon.viewer.model.state import LEAST_ZOOM, MOST_ZOOM, ClipPlane, ShownPart, SliceFrame, ViewState
@@ -47,7 +47,12 @@ def encode_view(state: ViewState, objects: Sequence[ShownObject]) -> bytes:
         "slices": [_describe_frame(each) for each in state.frames],
         "parts": [_describe_look(each) for each in state.parts if not each.is_plain],
         "measures": [
-            {"kind": each.kind, "name": each.name, "points_lps_mm": [list(point) for point in each.points]}
+            {
+                "kind": each.kind,
+                "name": each.name,
+                "points_lps_mm": [list(point) for point in each.points],
+                "thickness_mm": each.thickness_mm,
+            }
             for each in state.measures
         ],
         "clips": [_describe_clip(each) for each in state.clips],
@@ -144,7 +149,7 @@ def _apply(saved: Mapping[str, Any], trial: ViewModel) -> None:
         if clip["flipped"]:
             trial.flip_clip(number)
     trial.set_clip_box(*(saved["clip_box_lps_mm"] or (None, None)))
-    trial.state = replace(trial.state, measures=tuple(_read_measure(each) for each in saved["measures"]))
+    trial.state = replace(trial.state, measures=tuple(_read_measure(each, trial) for each in saved["measures"]))
     for look in saved["parts"]:
         _apply_look(look, trial)
     camera = saved["camera"]
@@ -161,11 +166,14 @@ def _say_kinds(kinds: Sequence[str]) -> str:
     return ", ".join(kinds) or "nothing"
 
 
-def _read_measure(saved: Mapping[str, Any]) -> Measure:
+def _read_measure(saved: Mapping[str, Any], trial: ViewModel) -> Measure:
     kind, points = saved["kind"], [checked_vector("a point of a measure", each) for each in saved["points_lps_mm"]]
+    name = checked_measure_name(saved["name"])
+    if kind in REGIONS:
+        return trial.measure_region(kind, points, checked_slab(saved["thickness_mm"]), name)
     if kind not in POINTS_OF or (POINTS_OF[kind] or len(points)) != len(points):
         raise UsageError(f"a measure of {len(points)} points is no {kind}")
-    return measure_points(kind, points, checked_measure_name(saved["name"]))
+    return measure_points(kind, points, name)
 
 
 def _apply_look(look: Mapping[str, Any], trial: ViewModel) -> None:

@@ -140,7 +140,7 @@ _session("only_at", "show the part at a pixel alone", "only_at", takes={"plane":
 _session("cross_at", "move the slices to what is seen at a pixel", "cross_at", takes={"plane": _or_none(_text)}, **_AT)
 _session("add_point", "add what is seen at a pixel to the tool", "add_point", takes={"plane": _or_none(_text)}, **_AT)
 _session("mark_at", "keep the place at a pixel as a seed", "mark_at", takes={"plane": _or_none(_text)}, **_AT)
-_model("start_tool", "take points for: distance, angle, curve, seed", "start_tool", name=_text)
+_model("start_tool", "take points for: distance, angle, curve, seed, circle, box", "start_tool", name=_text)
 _model("end_tool", "put the tool away; a curve is made", "end_tool")
 _model("rename_measure", "name a measure by its number, from 0", "rename_measure", n=_whole, name=_text)
 _model("remove_measure", "drop one measure", "remove_measure", n=_whole)
@@ -244,6 +244,8 @@ _SECTIONS: dict[str, dict[str, Key]] = {
     "Measure": {
         "m": Key("distance: two clicks", "distance"),
         "a": Key("angle: three clicks", "angle"),
+        "d": Key("circle on a slice: middle and edge; B: box, two corners", "circle"),
+        "B": Key("", "box"),
         "k": Key("curve: clicks, then k: picture along it; again: without", "curve"),
         "K": Key("curve along the spine, found in the scan", {"do": "find_spine"}),
         "e": Key("place under the pointer, as a seed point", {"do": "mark_at"}, at_pointer=True),
@@ -295,6 +297,8 @@ _HINTS = {
     "angle": "Click three points; the angle is at the second.",
     "curve": "Click points along a curve, then end: the scan is shown along it.",
     "seed": "Click a place.",
+    "circle": "Click the middle of a circle on a slice, then a point of its edge.",
+    "box": "Click two opposite corners on a slice.",
     "only": "Click the part to keep.",
     "hide": "Click the parts to hide, then end.",
 }

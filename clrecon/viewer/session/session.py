@@ -355,7 +355,10 @@ class ViewSession(Closing):
         picked = self._pick(x, y, size, plane)
         if picked is None:
             return {"pick": None, "measure": None}
-        measure = self.model.add_point(picked)
+        axes = None
+        if plane is not None:
+            axes = self.painter.slice_camera(self.model.state, plane, checked_size(size)).basis()[:2]
+        measure = self.model.add_point(picked, axes)
         return {"pick": self._facts_of_pick(picked), "measure": None if measure is None else measure.describe()}
 
     def probe(self, point: Sequence[float]) -> dict[str, Any]:
@@ -497,7 +500,7 @@ class ViewSession(Closing):
     def _seen_lines(self) -> list[list[list[float]]]:
         """Return the pieces of measured lines that are not hidden in the picture that was taken last."""
         state = self.model.state
-        lines = [*(each.points for each in state.measures), tuple(each.point for each in state.points)]
+        lines = [*(each.outline for each in state.measures), tuple(each.point for each in state.points)]
         if self._shown is None or not any(len(line) > 1 for line in lines):
             return []
         mode = self.model.modes[state.mode]

@@ -1,5 +1,5 @@
   const SLICES = ["axial", "coronal", "sagittal"];
-  const TOOLS = { distance: "distance", angle: "angle", trace: "curve", seed: "seed", only: "only", hide: "hide" };
+  const TOOLS = { distance: "distance", angle: "angle", trace: "curve", circle: "circle", square: "box", seed: "seed", only: "only", hide: "hide" };
   const SVG = "http://www.w3.org/2000/svg";
 
   const CROSS_PIXELS = 11, GAP = 7, INSET = 32;  // of the cross in the picture, around its middle, of its ends from the border
@@ -320,6 +320,7 @@
       const [name, text, drop] = list.children[n].children;
       if (document.activeElement !== name) name.value = measure.name;
       text.textContent = measure.text;
+      text.title = measure.voxels ? `${measure.voxels} voxels, ${measure.area_mm2.toFixed(1)} mm²; slices go there` : "slices go there";
       name.ariaLabel = `name of ${measure.name}`;
       text.ariaLabel = `${measure.name}, ${measure.text}: slices go there`;
       drop.ariaLabel = `remove ${measure.name}`;
@@ -330,7 +331,7 @@
   function makeMeasureRow(n) {
     const row = element("li");
     const name = element("input", "", { type: "text", maxLength: 80, title: "name" });
-    const text = element("button", "", { type: "button", title: "slices go there" });
+    const text = element("button", "", { type: "button" });
     const drop = element("button", "×", { type: "button", title: "remove this measure" });
     name.onchange = () => {
       if (name.value.trim()) run("rename_measure", { n, name: name.value });
@@ -341,7 +342,8 @@
       if (key === "Escape" || key === "Enter") name.blur();
     };
     text.onclick = () => {
-      const { points } = facts.measures[n];
+      const { points, kind } = facts.measures[n];
+      if (kind === "circle") { run("set_cross", { point: points[0] }); return; }
       run("set_cross", { point: [0, 1, 2].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length) });
     };
     drop.onclick = () => run("remove_measure", { n });
@@ -483,7 +485,7 @@
   // What the page does itself at a key; what else keys do are commands of the session.
   const press = (id) => () => { if (!find(id).hidden) find(id).click(); };
   const OWN = {
-    distance: press("distance"), angle: press("angle"), save: press("save"), photo: press("photo"), help: press("help"),
+    distance: press("distance"), angle: press("angle"), circle: press("circle"), box: press("square"), save: press("save"), photo: press("photo"), help: press("help"),
     curve: () => { if (choosing === "curve" || find("curved").hidden) find("trace").click(); else find("along").click(); },
     escape: () => { if (choosing) choose(""); else { run("cancel"); run("dismiss"); hint(""); } },
     quit: () => tell("quit"),

@@ -50,6 +50,7 @@
     if (facts && facts.scale && view.name === "scene") annotateScale(make, write, width, height);
     if (facts && facts.iso) annotateCross(view, make, segments, width, height);
     if (facts) annotateMeasures(view, line, write, width, height);
+    if (facts && view.pointer && SLICES.includes(view.name)) annotateRegion(view, make);
     view.over.replaceChildren(...drawn);
   }
 
@@ -123,13 +124,13 @@
   // Texts of measures stand in the nearer upper corner, with a thin line to what they belong to: bone stays free.
   function annotateMeasures(view, line, write, width, height) {
     const placed = SLICES.includes(view.name) ? { start: 2, end: 1 } : { start: 0, end: 1 };  // words, and the button
-    const unfinished = facts.points.length ? [{ points: facts.points.map(({ point }) => point), text: "" }] : [];
+    const unfinished = facts.points.length ? [{ outline: facts.points.map(({ point }) => point), text: "" }] : [];
     for (const measure of [...facts.measures, ...unfinished]) {
-      const points = measure.points.map((point) => project(view, point)).filter(Boolean);
-      if (points.length !== measure.points.length || !isNear(view, measure.points)) continue;
+      const points = measure.outline.map((point) => project(view, point)).filter(Boolean), closed = Boolean(measure.voxels);
+      if (points.length !== measure.outline.length || !isNear(view, measure.outline)) continue;
       for (const name of ["halo", "line"]) {
         if (points.length > 1) line(points, view.name === "scene" ? `${name} behind` : name);
-        for (const [x, y] of points) { line([[x - 5, y], [x + 5, y]], name); line([[x, y - 5], [x, y + 5]], name); }
+        for (const [x, y] of closed ? [] : points) { line([[x - 5, y], [x + 5, y]], name); line([[x, y - 5], [x, y + 5]], name); }
       }
       if (!measure.text) continue;
       const wide = width >= WIDE, value = measure.kind === "seed" ? "" : measure.text;
@@ -146,6 +147,16 @@
     for (const piece of facts.seen_lines) {  // what no bone hides
       const ends = piece.map((point) => project(view, point));
       if (ends.every(Boolean)) line(ends, "line seen");
+    }
+  }
+
+  // A circle or box that is being drawn.
+  function annotateRegion(view, make) {
+    const [first] = facts.points, [x, y] = (first && project(view, first.point)) || [], [toX, toY] = view.pointer;
+    if (x === undefined || !["circle", "box"].includes(facts.tool)) return;
+    for (const name of ["halo", "line"]) {
+      if (facts.tool === "circle") make("circle", { cx: x, cy: y, r: Math.hypot(toX - x, toY - y), class: name });
+      else make("rect", { x: Math.min(x, toX), y: Math.min(y, toY), width: Math.abs(toX - x), height: Math.abs(toY - y), class: name });
     }
   }
 
@@ -254,6 +265,7 @@
       view.pointer = at(event);
       const before = fingers.get(event.pointerId);
       if (!before) probe(view);
+      if (facts && facts.points.length) annotate(view);
       if (!before && slice) view.box.classList.toggle("turns", !choosing && isHandle(view, view.pointer, INSET / 2));
       if (!before || view.name === "curve") return;
       const now = at(event), x = now[0] - before[0], y = now[1] - before[1], height = view.box.clientHeight;

@@ -6,10 +6,13 @@ import csv
 import io
 import json
 
+import numpy as np
 import pytest
 
+from clrecon.geometry import Volume
 from clrecon.rendering.views.centre_line import read_curve_points
-from clrecon.viewer.model.measures import encode_measures, measure_points
+from clrecon.viewer.model.measures import Measure, encode_measures, measure_points
+from clrecon.viewer.model.regions import measure_region
 
 pytestmark = pytest.mark.unit
 
@@ -53,3 +56,30 @@ def test_markups_of_one_curve_are_read_as_a_centre_line(tmp_path) -> None:
     path = tmp_path / "curve.mrk.json"
     path.write_bytes(encode_measures([measure_points("curve", points, "canal")], path.name, "lps"))
     assert read_curve_points(path).tolist() == [list(point) for point in points]
+
+
+def measured_circle() -> Measure:
+    """A circle of 5 mm in a scan of 100 HU in one half and 200 HU in the other, on a grid of 1 mm."""
+    hu = np.full((3, 21, 21), 100, np.int16)
+    hu[:, :, 11:] = 200
+    return measure_region(
+        Volume(hu, np.eye(4)), "circle", [(10.5, 10.0, 1.0), (15.5, 10.0, 1.0), (10.5, 15.0, 1.0)], "L2"
+    )
+
+
+def test_csv_of_a_circle_has_its_deviation_voxels_and_area() -> None:
+    (row,) = csv.DictReader(io.StringIO(encode_measures([measured_circle()], "a.csv", "lps").decode()))
+
+    assert (row["value"], row["unit"], row["voxels"]) == ("150.0", "HU", "78")
+    assert float(row["sd"]) == pytest.approx(50.0 * (78 / 77) ** 0.5, abs=1e-3)  # two equal halves, written to 0.001
+    assert float(row["area_mm2"]) == pytest.approx(78.54, abs=0.01)  # 25 pi
+
+
+def test_markups_of_a_circle_are_a_closed_curve_of_points_at_its_radius() -> None:
+    content = json.loads(encode_measures([measured_circle()], "a.mrk.json", "lps"))
+
+    (markup,) = content["markups"]
+    points = np.array([each["position"] for each in markup["controlPoints"]])
+    assert markup["type"] == "ClosedCurve"
+    assert np.linalg.norm(points - (10.5, 10.0, 1.0), axis=1) == pytest.approx(5.0, abs=1e-3)  # as it is rounded
+    assert len(np.unique(points, axis=0)) == len(points) == 48

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import view_scenes as scenes
 from refusals import refused
@@ -44,6 +45,10 @@ def add_measures(model: ViewModel) -> None:
             model.add_point(Pick(point=(float(n), float(n * n), 3.0)))
     model.end_tool()
     model.rename_measure(0, "height of the body")
+    model.start_tool("circle")
+    for x in (0.0, 4.0):
+        model.add_point(Pick(point=tuple(scenes.middle(0) + (x, 0.0, 0.0))), (np.eye(3)[0], np.eye(3)[1]))
+    model.end_tool()
 
 
 def cut(model: ViewModel) -> None:
@@ -169,6 +174,11 @@ DAMAGED: dict[str, dict[str, Any]] = {
     "clip without a share": {"clips": [{"direction": "left", "flipped": False}]},
     "measure of one point": {"measures": [{"kind": "distance", "name": "a", "points_lps_mm": [[0, 0, 0]]}]},
     "measure of an unknown kind": {"measures": [{"kind": "area", "name": "a", "points_lps_mm": []}]},
+    "circle of two radii": {
+        "measures": [
+            {"kind": "circle", "name": "a", "points_lps_mm": [[0, 0, 0], [5, 0, 0], [0, 6, 0]], "thickness_mm": 0}
+        ]
+    },
     "part of no object": {
         "parts": [
             {"key": "7", "kind": "mesh", "number": 0, "inside_lps_mm": None, "color": None, "opacity": 1, "visible": 0}

@@ -9,7 +9,7 @@ import pytest
 import tolerances
 import view_scenes as scenes
 from browser import wait_for
-from view_pages import facts, open_view_page, press_keys, run_command, screenshot, wait_for_file
+from view_pages import click_point, facts, open_view_page, point_at, press_keys, run_command, screenshot, wait_for_file
 
 pytestmark = [pytest.mark.slow, pytest.mark.opencl]
 
@@ -122,3 +122,47 @@ def test_buttons_that_save_measures_go_with_the_last_measure(page_with_two_place
     page_with_two_places.find_element("id", "clear").click()
 
     wait_for(page_with_two_places, "return document.getElementById('exports').hidden")
+
+
+def test_circle_of_two_clicks_on_a_slice_is_listed_with_its_mean_and_a_closed_line(page_with_two_places) -> None:
+    page, middle = page_with_two_places, scenes.middle(0)
+    run_command(page, "clear_measures")
+    run_command(page, "set_cross", point=middle.tolist())
+    wait_for(page, f"return Math.abs(clrecon.facts.cross[0] - {middle[0]}) < 0.01 && clrecon.facts.settled")  # mm
+
+    press_keys(page, "d")
+    wait_for(page, "return clrecon.facts.tool === 'circle'")
+    click_point(page, "axial", middle)
+    wait_for(page, "return clrecon.facts.points.length === 1")
+    click_point(page, "axial", middle + (5.0, 0.0, 0.0))  # in a ball of 9 mm
+
+    wait_for(page, "return clrecon.facts.measures.length === 1")
+    assert page.execute_script("return measures.querySelector('button').textContent") == "1000 ± 0 HU"
+    line = page.execute_script(
+        "return document.querySelector('#axial polyline.line').getAttribute('points').split(' ')"
+    )
+    assert line[0] == line[-1]
+    assert len(set(line)) > 20
+
+
+def test_box_that_is_drawn_follows_the_mouse_from_its_first_corner(page_with_two_places) -> None:
+    page, middle = page_with_two_places, scenes.middle(0)
+    page.find_element("id", "square").click()
+    wait_for(page, "return clrecon.facts.tool === 'box'")
+    click_point(page, "axial", middle)
+    wait_for(page, "return clrecon.facts.points.length === 1")
+
+    point_at(page, "axial", middle + (6.0, 0.0, 0.0))
+
+    assert wait_for(page, "return document.querySelector('#axial rect.line').width.baseVal.value > 10")  # pixels
+
+
+def test_circle_is_not_drawn_in_the_picture(page_with_two_places) -> None:
+    page = page_with_two_places
+    page.find_element("id", "circle").click()
+    wait_for(page, "return clrecon.facts.tool === 'circle'")
+
+    click_point(page, "scene", scenes.middle(0))
+
+    assert wait_for(page, "return hint.textContent.includes('click in one')")
+    assert facts(page)["points"] == []
