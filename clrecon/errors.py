@@ -74,6 +74,12 @@ class OutputError(ClreconError):
     exit_code = 6
 
 
+class UnreachableError(ClreconError):
+    """Another computer does not answer, or no longer: another time the same command may work."""
+
+    exit_code = 9
+
+
 class Cancelled(ClreconError):
     """The caller wants to stop: raised by a ``progress`` function, and passed on unchanged.
 

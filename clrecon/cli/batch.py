@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from functools import partial
 from typing import TYPE_CHECKING
 
 from clrecon.cli import common
@@ -68,7 +69,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
             console.warn(f"{outcome.case.name}: {answer.status}{before}, {printable(reason)}", with_json=True)
 
     try:
-        report = run_batch(cases, plan, tell=tell_outcome, progress=console.progress)
+        report = run_batch(
+            cases, plan, tell=tell_outcome, warn=partial(console.warn, with_json=True), progress=console.progress
+        )
     except KeyboardInterrupt:
         console.warn("cases that are whole stay, and --resume goes on", with_json=True)
         raise

@@ -41,7 +41,7 @@ exit codes: 0 done; 1 unexpected error; 2 no usable DICOM or no surface; 3 wrong
             4 corrupt or refused input, or "info --strict" found a failed gate; 5 no device or
             device failure; 6 output cannot be written; 7 and 8 all is written, but with "mesh
             --strict" a gate failed, of the scan (7) or of a mesh (8); 8 also partly done;
-            130 interrupted"""
+            9 another computer cannot be reached; 130 interrupted"""
 
 
 _MEANT = {"--spacing": "--resample", "--threshold": "--hu", "--iso": "--hu"}

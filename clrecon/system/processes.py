@@ -19,26 +19,38 @@ def list_cores() -> list[int]:
 
 
 def start_python(
-    command: Sequence[str], subject: str, environment: Mapping[str, str] | None = None
+    command: Sequence[str], subject: str, environment: Mapping[str, str | None] | None = None
 ) -> subprocess.Popen[bytes]:
     """Start this Python with pipes to its input and output; its errors are dropped, since drivers print there.
 
     subject: What the process is for, for the message where there is no interpreter, or no process can be started.
-    environment: Variables beside those of this process.
+    environment: Variables beside those of this process; None leaves one of them out.
     """
     if getattr(sys, "frozen", False) or not sys.executable:
         raise DeviceError(f"{subject} in processes of a Python interpreter, and this program has none")
+    variables = {**os.environ, **(environment or {})}
     try:
         return subprocess.Popen(
             [sys.executable, *command],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, **(environment or {})},
+            env={name: value for name, value in variables.items() if value is not None},
             creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
         )
     except OSError as error:
         raise DeviceError(f"{subject} in processes, and none can be started: {error.strerror or error}") from error
+
+
+def share_machine(devices: Sequence[str | None], number: int) -> tuple[dict[str, str], list[int] | None]:
+    """Return the variables of one of so many workers, and its cores; None where they cannot be shared."""
+    cores = list_cores()
+    device, workers = devices[number], len(devices)
+    environment = {} if device is None else {"CLRECON_DEVICE": device}
+    if workers > 1 and "POCL_MAX_PTHREAD_COUNT" not in os.environ:
+        environment["POCL_MAX_PTHREAD_COUNT"] = str(max(1, len(cores) // workers))
+    is_shared = 1 < workers <= len(cores) and hasattr(os, "sched_setaffinity")
+    return environment, cores[number::workers] if is_shared else None
 
 
 def describe_end(code: int) -> str:

@@ -133,7 +133,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "opencl": frozenset({"pyopencl"}),
     # typing_extensions: for type checkers alone, which bring it.
     "operators": frozenset({"pyopencl", "SimpleITK", "skimage", "typing_extensions"}),
-    "jobs": frozenset({"PIL"}),
+    "jobs": frozenset({"PIL", "dask"}),
     "viewer": frozenset({"aiohttp", "PIL", "pyvista", "vtk", "vtkmodules"}),
     # vtkmodules: peers of the bench and of the comparison, whose page has plots and pictures.
     "proof": frozenset({"scipy", "pyvista", "skimage", "vtkmodules", "matplotlib", "PIL"}),

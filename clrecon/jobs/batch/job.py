@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
 
-from clrecon.errors import PARTLY_DONE, OutputError, UsageError
+from clrecon.errors import PARTLY_DONE, OutputError, UnreachableError, UsageError
 from clrecon.jobs.batch.case import DONE, LOST, fail_case, read_report
 from clrecon.jobs.batch.cohort import write_cohort
 from clrecon.jobs.batch.plan import PAGE, TABLE, Case, Plan, check_places
-from clrecon.jobs.batch.scheduler import LocalScheduler, Outcome, Scheduler
+from clrecon.jobs.batch.scheduler import DaskScheduler, LocalScheduler, Outcome, Scheduler
 from clrecon.jobs.outputs import check_files
 from clrecon.jobs.run import JobReport, Run
 from clrecon.system.arguments import name_parameter
@@ -46,13 +46,14 @@ def run_batch(
     cases: Sequence[Case],
     plan: Plan,
     *,
-    scheduler: Scheduler | None = None,
     tell: Callable[[Outcome], None] = lambda outcome: None,
+    warn: Callable[[str], None] = lambda text: None,
     progress: Progress = ignore_progress,
 ) -> BatchReport:
     """Make the cases that the plan asks for, each as a whole, and write the table and the page of all.
 
     tell: Gets the outcome of each case as it ends.
+    warn: Gets what the user should know at once, such as that a scheduler has no workers.
     """
     asked = plan.batch
     _check_choice(plan)
@@ -70,7 +71,10 @@ def run_batch(
             kept_count = len(chosen) - len(waiting)
         start = perf_counter()
         progress(_count_cases(0, len(waiting), None), 0, 0)
-        outcomes = (scheduler or LocalScheduler(plan)).run(waiting) if waiting else ()
+        scheduler: Scheduler = (
+            LocalScheduler(plan) if asked.scheduler is None else DaskScheduler(plan, asked.scheduler, warn)
+        )
+        outcomes = scheduler.run(waiting) if waiting else ()
         for number, outcome in enumerate(_with_advice(outcomes), start=1):
             if outcome.death:
                 error = {"kind": "WorkerDied", "exit_code": None, "message": outcome.death}
@@ -90,12 +94,12 @@ def run_batch(
 
 
 def _with_advice(outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
-    """Yield the outcomes; an output that takes no more is an error that says how to go on."""
+    """Yield the outcomes; an output that takes no more, or a lost scheduler, is an error that says how to go on."""
     try:
         yield from outcomes
-    except OutputError as error:
+    except (OutputError, UnreachableError) as error:
         more = f"; cases that are whole stay, and {name_parameter('resume', True)} goes on"
-        raise OutputError(f"{error}{more}") from error
+        raise type(error)(f"{error}{more}") from error
 
 
 def _check_choice(plan: Plan) -> None:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from clrecon.errors import NoDicomError, UsageError
 from clrecon.exchange.formats import MESH_INPUTS
+from clrecon.jobs.cluster import LOCAL, check_address
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.options import DeviceSettings, ScanSettings
 from clrecon.system.arguments import name_parameter
@@ -58,6 +59,13 @@ class BatchSettings:
         "OpenCL devices by index, assigned to the workers in turn (default: that of --device)",
         group="run",
     )
+    scheduler: str | None = option(
+        "--scheduler ADDRESS",
+        f"run the cases on the workers of this Dask scheduler, such as tls://host:8786; {LOCAL}: start a scheduler and"
+        " workers on this machine",
+        group="run",
+        parse=check_address,
+    )
     part: tuple[int, int] | None = option(
         "--part I/N",
         "make only every N-th case, from the I-th on, 1/N to N/N; write the table and the page with --collect",
@@ -79,6 +87,11 @@ class BatchSettings:
             raise UsageError(f"a batch takes 1 to {_MOST_WORKERS} workers, not {self.workers}")
         if self.devices is not None and not all(word.strip().isdecimal() for word in self.devices.split(",")):
             raise UsageError(f"{self.devices!r:.60} are no devices: their indexes with commas, such as 0,1")
+        if self.scheduler not in (None, LOCAL) and (self.workers, self.devices) != (None, None):
+            names = f"{name_parameter('workers', 'N')} and {name_parameter('devices', 'D,D')}"
+            raise UsageError(
+                f"{names} start workers on this machine: those of {self.scheduler!s:.60} are there already"
+            )
 
     def deal_devices(self) -> list[str | None]:
         """Return a device for each worker, None for the one that each job would choose."""

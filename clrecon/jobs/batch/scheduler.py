@@ -1,4 +1,4 @@
-"""Who deals cases to workers: here the processes of this machine, one case each at a time.
+"""Who deals cases to workers: the processes of this machine, or the workers of a Dask cluster, one case at a time each.
 
 A worker that dies takes its own case along and no other.  It may have been out of memory because of its neighbours: the
 case is made once more, alone, when all others are done.
@@ -11,15 +11,18 @@ import os
 import queue
 import subprocess
 import threading
-from collections.abc import Iterable, Iterator
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from clrecon import errors
 from clrecon.errors import ClreconError
 from clrecon.jobs.batch.case import LOST, Answer
 from clrecon.jobs.batch.plan import Case, Plan
-from clrecon.system.processes import describe_end, list_cores, start_python
+from clrecon.jobs.cluster import WITHOUT_DASK_DEFAULTS, Died, open_cluster
+from clrecon.system.light_dataclass import replace
+from clrecon.system.processes import describe_end, share_machine, start_python
 
 _COMMAND = ("-c", "from clrecon.jobs.batch.case import run_worker; run_worker()")
 _SECONDS_TO_END = 5.0
@@ -45,18 +48,20 @@ class Scheduler(Protocol):
         """
 
 
-class _Worker:
-    """A process that makes one case after another."""
+class CaseProcess:
+    """A process that makes one case after another.
 
-    def __init__(self, plan: Plan, number: int, device: str | None, workers: int):
-        cores = list_cores()
-        environment = {} if device is None else {"CLRECON_DEVICE": device}
-        if workers > 1 and "POCL_MAX_PTHREAD_COUNT" not in os.environ:
-            environment["POCL_MAX_PTHREAD_COUNT"] = str(max(1, len(cores) // workers))
+    environment: Variables beside those of this process, None for those to leave out.
+    cores: The only cores of its reading threads; None: all of this process.
+    """
+
+    def __init__(
+        self, plan: Plan, environment: Mapping[str, str | None] | None = None, cores: Sequence[int] | None = None
+    ):
         self.process = start_python(_COMMAND, "cases of a batch are made", environment)
-        if 1 < workers <= len(cores) and hasattr(os, "sched_setaffinity"):  # its reading threads follow
+        if cores is not None:
             with suppress(OSError):
-                os.sched_setaffinity(self.process.pid, cores[number::workers])
+                os.sched_setaffinity(self.process.pid, cores)
         self._send(plan.to_json())
 
     def _send(self, line: str) -> None:
@@ -89,6 +94,15 @@ class _Worker:
         self.process.wait()
         self.process.stdout.close()
 
+    def end(self) -> None:
+        """End the process in the middle of a case, whose folder it removes."""
+        self.process.terminate()
+        try:
+            self.process.wait(_SECONDS_TO_END)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
 
 class LocalScheduler:
     """Processes of this machine, each with its device and its share of the processor's cores."""
@@ -96,7 +110,7 @@ class LocalScheduler:
     def __init__(self, plan: Plan):
         self._plan, self._devices = plan, plan.batch.deal_devices()
         self._lock = threading.Lock()
-        self._workers: list[_Worker] = []
+        self._workers: list[CaseProcess] = []
         self._is_ending = False
 
     def run(self, cases: Iterable[Case]) -> Iterator[Outcome]:
@@ -119,7 +133,7 @@ class LocalScheduler:
                 else:
                     yield outcome
             for case in lost:
-                worker = self._start(0, 1)
+                worker = self._start(CaseProcess(self._plan, share_machine(self._devices[:1], 0)[0]))
                 yield worker.make(case)
                 worker.close()
         finally:
@@ -129,11 +143,11 @@ class LocalScheduler:
         self, number: int, waiting: Iterator[Case], outcomes: queue.SimpleQueue[Outcome | Exception | None]
     ) -> None:
         """Give one worker a case after another, and a new one where it has ended."""
-        worker: _Worker | None = None
+        worker: CaseProcess | None = None
         try:
             while (case := self._next_case(waiting)) is not None:
                 if worker is None or worker.has_ended:
-                    worker = self._start(number, len(self._devices))
+                    worker = self._start(CaseProcess(self._plan, *share_machine(self._devices, number)))
                 outcome = worker.make(case)
                 outcomes.put(outcome)
                 if outcome.answer.is_last:
@@ -148,8 +162,7 @@ class LocalScheduler:
         with self._lock:
             return None if self._is_ending else next(waiting, None)
 
-    def _start(self, number: int, workers: int) -> _Worker:
-        worker = _Worker(self._plan, number, self._devices[number], workers)
+    def _start(self, worker: CaseProcess) -> CaseProcess:
         with self._lock:
             self._workers = [other for other in self._workers if not other.has_ended] + [worker]
         return worker
@@ -158,12 +171,59 @@ class LocalScheduler:
         """End the workers that still work, and wait until their unfinished folders are removed."""
         with self._lock:
             self._is_ending = True
-            left = [worker.process for worker in self._workers if not worker.has_ended]
-        for process in left:
-            process.terminate()
-        for process in left:
+            left = [worker for worker in self._workers if not worker.has_ended]
+        for worker in left:
+            worker.process.terminate()
+        for worker in left:
+            worker.end()
+
+
+class DaskScheduler:
+    """Workers of Dask distributed, here or on other machines, which have a process each for the cases.
+
+    That process does without Dask's libraries and variables, and its death is that of a case and not of the worker.
+    """
+
+    def __init__(self, plan: Plan, address: str, warn: Callable[[str], None]):
+        self._address, self._warn = address, warn
+        self._devices = plan.batch.deal_devices()
+        self._plan = replace(plan, output=os.path.abspath(plan.output))
+
+    def run(self, cases: Iterable[Case]) -> Iterator[Outcome]:
+        batch = uuid.uuid4().hex
+        absolute = (case._replace(source=os.path.abspath(case.source)) for case in cases)
+        with open_cluster(self._address, self._devices, self._warn) as cluster:
             try:
-                process.wait(_SECONDS_TO_END)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+                for case, result in cluster.run_tasks(
+                    make_on_worker, absolute, batch, self._plan.to_json(), is_suspect=lambda outcome: outcome.death
+                ):
+                    yield Outcome(case, Answer(LOST), result.message) if isinstance(result, Died) else result
+            finally:
+                cluster.call_all(end_on_worker)
+
+
+_process_of_worker: dict[str, CaseProcess] = {}
+"""Of a worker: the process for the cases of a batch, by the batch; that of an older one has been ended."""
+
+_lock_of_worker = threading.Lock()
+
+
+def make_on_worker(case: Sequence[Any], batch: str, plan: str) -> Outcome:
+    """Make a case in the process of this worker, which is started by its first case; one after another."""
+    with _lock_of_worker:
+        process = _process_of_worker.get(batch)
+        if process is None or process.has_ended:
+            end_on_worker()
+            process = CaseProcess(Plan.from_json(plan), WITHOUT_DASK_DEFAULTS)
+            _process_of_worker[batch] = process
+        outcome = process.make(Case(*case))
+        if outcome.answer.is_last:
+            process.close()
+        return outcome
+
+
+def end_on_worker() -> None:
+    """End the process of this worker, in the middle of a case if need be."""
+    while _process_of_worker:
+        _, process = _process_of_worker.popitem()
+        process.end()
