@@ -64,7 +64,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     def tell_outcome(outcome: Outcome) -> None:
         answer = outcome.answer
-        if answer.status != "done":
+        if answer.status != "done" or answer.error:
             before, reason = " before" * answer.kept, outcome.death or answer.error or "see its report"
             console.warn(f"{outcome.case.name}: {answer.status}{before}, {printable(reason)}", with_json=True)
 

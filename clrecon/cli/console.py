@@ -103,6 +103,7 @@ def _wrap(line: str, width: int, hang: int) -> list[str]:
 _STAGES = {
     "device": "choosing a device",
     "scan": "looking through the files",
+    "fetch": "fetching files",
     "unpack": "unpacking files",
     "read": "reading slices",
     "build": "building kernels (takes seconds on the first run on this device), extracting the surface",

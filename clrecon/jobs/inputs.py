@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from clrecon.errors import UsageError
 from clrecon.exchange.formats import CLOUD_INPUTS, MESH_INPUTS
 from clrecon.jobs.options import InputSettings, changed_fields
+from clrecon.reading.urls import refuse_url
 from clrecon.system.arguments import name_parameter
 from clrecon.system.paths import extension_of
 
@@ -47,6 +48,8 @@ def may_be_mesh(source: str | Path) -> bool:
 def refuse_other_clouds(source: str | Path) -> None:
     """Refuse a file whose extension is that of a cloud of another kind; it would be looked through for a scan."""
     extension = extension_of(source)
+    if extension in (*CLOUD_INPUTS, *MESH_INPUTS, *_OTHER_CLOUDS):
+        refuse_url(source, f"cloud or mesh {extension}")
     if extension in _OTHER_CLOUDS and os.path.isfile(source):
         raise UsageError(
             f"clouds in files {extension} are not read: convert it to one of {', '.join(CLOUD_INPUTS)} first; text of"

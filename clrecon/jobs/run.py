@@ -12,7 +12,7 @@ from copy import copy
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 
 from clrecon.errors import Cancelled, ClreconError, DeviceError
 from clrecon.exchange.formats import stage_assembly, stage_mesh
@@ -287,6 +287,12 @@ class Run(Laps):
         with self.keeping():
             check_files(named)
         check_kept(named, *inputs)
+
+    def open(self, source: str | Path) -> str | Path:
+        """Return an input as a path that stays until the end of the run: what a URL or an archive holds."""
+        from clrecon.reading.sources import opened
+
+        return cast("str | Path", self._stack.enter_context(opened(source, self.progress)))
 
     def read(self, source: str | Path) -> Volume:
         from clrecon.reading import read_selected

@@ -58,8 +58,10 @@ def make_vertebrae(
     settings = settings or VertebraeSettings()
     picture = picture_beside(output) if picture_path is None and with_picture else picture_path
     with Run(settings, **how) as run:
-        _check_formats(source, output, picture)
         run.check([("the label map", output), ("the picture", picture), ("the report", report_path)], source)
+        if map_format(output) in _SEGMENTATION:  # whose slices are read twice
+            source = run.open(source)
+        _check_formats(source, output, picture)
         volume = run.read(source)
         run.lap("read")
         split = split_vertebrae(

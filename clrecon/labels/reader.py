@@ -20,6 +20,7 @@ from clrecon.labels.segments import Wanted
 from clrecon.labels.structures import STRUCTURE_SET, read_structures
 from clrecon.reading.grids.grid_file import LABEL_MAP, GridFile
 from clrecon.reading.grids.reader import name_of_grid, open_grid, tell_kind
+from clrecon.reading.urls import refuse_url
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
@@ -91,7 +92,7 @@ def read_labels(
         not say where it lies in space, or has segments that overlap.
     """
     wanted = check_wanted(label)
-    labels = _read_map(Path(path), Wanted(wanted, others=False), volume, follow_links, progress)
+    labels = _read_map(path, Wanted(wanted, others=False), volume, follow_links, progress)
     return labels if wanted is None else _keep(labels, [labels.find(label) for label in wanted])
 
 
@@ -104,7 +105,7 @@ def read_all_labels(
     progress: Progress | None = None,
 ) -> LabelMap:
     """Read a label map with all labels, which tell a surface where its own ends; `first` get voxels of several."""
-    return _read_map(Path(path), Wanted(check_wanted(first)), volume, follow_links, progress)
+    return _read_map(path, Wanted(check_wanted(first)), volume, follow_links, progress)
 
 
 def _keep(labels: LabelMap, numbers: Sequence[int]) -> LabelMap:
@@ -117,8 +118,10 @@ def _keep(labels: LabelMap, numbers: Sequence[int]) -> LabelMap:
 
 
 def _read_map(
-    path: Path, wanted: Wanted, volume: Grid | None, follow_links: bool, progress: Progress | None
+    path: str | Path, wanted: Wanted, volume: Grid | None, follow_links: bool, progress: Progress | None
 ) -> LabelMap:
+    refuse_url(path, "label map")
+    path = Path(path)
     try:
         if not path.exists():
             raise UsageError(f"there is no label map {escape_text(str(path), 200)}")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.reading.archives import unpacked
 from clrecon.reading.common.selection import Selection, check_rescale
+from clrecon.reading.sources import Source, opened
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import ignore_progress
 from clrecon.system.text import escape_text
@@ -24,10 +25,10 @@ _NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha"
 """File extensions of these formats, only for messages."""
 
 
-def read_selected(path: str | os.PathLike[str], selection: Selection, *, progress: Progress | None = None) -> Volume:
+def read_selected(path: Source, selection: Selection, *, progress: Progress | None = None) -> Volume:
     """Read the part of an input that a selection names, see `read_volume`."""
     rescale = check_rescale(selection.rescale)
-    with unpacked(path, progress or ignore_progress) as inside:
+    with opened(path, progress or ignore_progress) as inside:
         kind = tell_format(inside)
         if kind is None:
             from clrecon.reading.dicom.reader import read_series
@@ -40,11 +41,11 @@ def read_selected(path: str | os.PathLike[str], selection: Selection, *, progres
 
 
 def list_selected(
-    path: str | os.PathLike[str], selection: Selection, *, pixels: bool = False, progress: Progress | None = None
+    path: Source, selection: Selection, *, pixels: bool = False, progress: Progress | None = None
 ) -> SeriesListing:
     """List an input, with the certificate of the part that a selection names, see `list_series`."""
     rescale = check_rescale(selection.rescale)
-    with unpacked(path, progress or ignore_progress) as inside:
+    with opened(path, progress or ignore_progress) as inside:
         kind = tell_format(inside)
         if kind is None:
             from clrecon.reading.dicom.reader import list_scan
@@ -58,7 +59,7 @@ def list_selected(
 
 @explains_arguments
 def read_volume(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | bytes | Sequence[bytes],
     series: int | str | None = None,
     *,
     phase: int | None = None,
@@ -72,10 +73,12 @@ def read_volume(
 
     Parameters
     ----------
-    path : str or path-like
+    path : str, path-like, bytes or sequence of bytes
         A folder of DICOM files, searched with its subfolders; one DICOM file; or a file with a grid and its affine:
         NIfTI (.nii, .nii.gz, .hdr with .img), NRRD (.nrrd, .nhdr), MetaImage (.mha, .mhd), which needs the
-        package SimpleITK; or a zip or tar file of these.  Told from the content.
+        package SimpleITK; or a zip or tar file of these.  Told from the content.  A text such as
+        ``dicomweb+https://HOST/studies/UID/series/UID`` or ``s3://bucket/folder/`` is a URL; bytes are the content of
+        one file, or of several, such as the instances of a series.
     series : int or str, optional
         Which series of a DICOM folder: its number in the listing (from 1), SeriesInstanceUID, its hash, the start of
         one of these, or description.  Default: the CT series with most slices; of those with a similar number original
@@ -113,7 +116,9 @@ def read_volume(
         Files are corrupt, or geometry or values cannot be trusted; the message names files and figures.
     UsageError
         ``series`` matches no series or several; the ``phase`` does not exist; an option for DICOM is given with another
-        format; a package is missing; or ``path`` is empty.
+        format; a package is missing; ``path`` is empty; or a URL is wrong or wants other credentials.
+    UnreachableError
+        The server of a URL does not answer, or fails.
     """
     chosen = Selection(
         series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links, rescale=rescale
@@ -123,7 +128,7 @@ def read_volume(
 
 @explains_arguments
 def list_series(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | bytes | Sequence[bytes],
     series: int | str | None = None,
     *,
     phase: int | None = None,
@@ -153,6 +158,8 @@ def list_series(
     NoDicomError, RefusedInputError, UsageError
         There is nothing to list; all DICOM files, or a file of another format, are corrupt; ``series`` or ``phase``
         names nothing or several; a package is missing; or an option for DICOM is given with another format.
+    UnreachableError
+        As in `read_volume`.
     """
     chosen = Selection(
         series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links, rescale=rescale

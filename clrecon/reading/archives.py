@@ -38,11 +38,13 @@ class Limits(NamedTuple):
     entries: Files, with those of archives in it.
     ratio: How many times its size; voxels of air around bodies pack 20 times.
     free_bytes: Size up to which the ratio does not matter.
+    fetched_bytes: Size of what is fetched from a URL; the largest public series have 9 GB.
     """
 
     entries: int = 1_000_000
     ratio: float = 100.0
     free_bytes: int = 1 << 30
+    fetched_bytes: int = 1 << 36
 
 
 class _Entry(NamedTuple):
@@ -69,22 +71,30 @@ def unpacked(
         return
     import lzma  # these modules are loaded where there is an archive
     import tarfile
-    import tempfile
     import zipfile
     import zlib
 
     file = Path(path)
-    with tempfile.TemporaryDirectory(prefix="clrecon-") as folder:
+    with private_folder(escape_text(file.name)) as folder:
         try:
-            _Unpacking(file, Path(folder), progress, limits).unpack(file, Path(folder))
+            _Unpacking(file, folder, progress, limits).unpack(file, folder)
         except (zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError, EOFError, OSError) as error:
             reason = escape_text(getattr(error, "strerror", None) or str(error), 120)
             raise RefusedInputError(f"{escape_text(file.name)} cannot be unpacked: {reason}") from None
-        inside = list(Path(folder).iterdir())
+        inside = list(folder.iterdir())
+        yield inside[0] if len(inside) == 1 else folder
+
+
+@contextmanager
+def private_folder(name: str) -> Iterator[Path]:
+    """Give an empty temporary folder until the block ends; errors of clrecon call it by the `name` of its source."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory(prefix="clrecon-") as folder:
         try:
-            yield inside[0] if len(inside) == 1 else Path(folder)
+            yield Path(folder)
         except ClreconError as error:  # the folder is none that the user knows
-            raise type(error)(str(error).replace(folder, escape_text(file.name))) from error
+            raise type(error)(str(error).replace(folder, name)) from error
 
 
 def is_archive(path: str | os.PathLike[str]) -> bool:
@@ -128,7 +138,7 @@ class _Unpacking:
             self._check_room(self._bytes - before)
             for number, entry in enumerate(entries):
                 self._progress("unpack", number, len(entries))
-                target = folder.joinpath(*_parts(entry.name, self._name))
+                target = folder.joinpath(*safe_parts(entry.name, self._name))
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with archive.open(entry) as source, target.open("xb") as written:
                     copyfileobj(source, written, _PIECE)
@@ -169,7 +179,7 @@ class _Unpacking:
             )
 
 
-def _parts(name: str, archive: str) -> tuple[str, ...]:
+def safe_parts(name: str, archive: str) -> tuple[str, ...]:
     """Return the folders and the name of an entry; refuse one that leads out of the archive."""
     path = PurePosixPath(name.replace("\\", "/"))
     if path.is_absolute() or ".." in path.parts or PureWindowsPath(name).drive or not path.parts or "\0" in name:

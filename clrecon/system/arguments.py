@@ -180,6 +180,7 @@ _KINDS: dict[str, tuple[str, Accepts]] = {
     "int": ("a whole number", _is_whole),
     "float": ("a number", _is_number),
     "str": ("a text", lambda value: isinstance(value, str)),
+    "bytes": ("bytes", lambda value: isinstance(value, bytes | bytearray | memoryview)),
     "Path": ("a path", lambda value: hasattr(value, "__fspath__")),
     "os.PathLike": ("a path", lambda value: hasattr(value, "__fspath__")),
     "Progress": ("a function", callable),

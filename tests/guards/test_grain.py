@@ -12,8 +12,8 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 94_897,
-    "modules": 417,
+    "lines": 95_809,
+    "modules": 422,
     "small_modules_with_one_reader": 8,
     "docstrings_with_raises": 136,
     "options_in_several_files": 8,

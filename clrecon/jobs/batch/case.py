@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
-from clrecon.errors import ClreconError, DeviceError, OutputError
+from clrecon.errors import ClreconError, DeviceError, OutputError, UnreachableError
 from clrecon.jobs.batch.plan import REPORT, Case, Plan, make_key
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.options import DeviceSettings, ScanSettings
@@ -77,13 +77,16 @@ def make_case(case: Case, plan: Plan) -> Answer:
 
     Only what the output folder itself cannot take is an error, an `OutputError`: it ends the batch.
     """
-    key: str | None = None
-    with suppress(OSError):  # reading says what is wrong
+    key, silence = None, ""
+    try:
         key = make_key(case, plan)
-    if plan.batch.resume and key is not None:
-        earlier = read_report(plan.folder_of(case))
-        if earlier and earlier["key"] == key and earlier["status"] in (DONE, GATE, REFUSED):
-            return Answer(earlier["status"], kept=True, error=(earlier["error"] or {}).get("message", ""))
+    except UnreachableError as error:
+        silence = f"kept, and not compared with its input: {error}"
+    except (ClreconError, OSError):
+        pass  # reading says what is wrong
+    earlier = read_report(plan.folder_of(case)) if plan.batch.resume else None
+    if earlier and earlier["status"] in (DONE, GATE, REFUSED) and (silence or (key and earlier["key"] == key)):
+        return Answer(earlier["status"], kept=True, error=silence or (earlier["error"] or {}).get("message", ""))
     with _folder_in_place(case, plan) as folder:
         _forget_peak_memory()
         with Run(plan) as run:

@@ -17,6 +17,8 @@ from clrecon.exchange.formats import MESH_INPUTS
 from clrecon.jobs.cluster import LOCAL, check_address
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.options import DeviceSettings, ScanSettings
+from clrecon.reading.sources import open_remote
+from clrecon.reading.urls import check_url, is_url, refuse_url
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import asdict, dataclass, fields, replace
 from clrecon.system.options import option
@@ -168,15 +170,19 @@ _ANY_MACHINE = ("device", "memory", "labels")
 
 
 def make_key(case: Case, plan: Plan) -> str:
-    """Return a hash of the version, of all settings that matter, and of names, sizes and times of the files read."""
+    """Return a hash of the version, of all settings that matter, and of names, sizes and times of the files read.
+
+    The server of a URL is asked for them, of DICOMweb for the UIDs of the instances, which change with the content.
+    """
     settings = plan.settings_of(case)
     values = {own.name: getattr(settings, own.name) for own in fields(settings) if own.name not in _ANY_MACHINE}
     labels = None if settings.labels is None else replace(settings.labels, path="")
     asked = (_FORMAT, package_version(), values, labels, plan.batch.format, plan.batch.measure, plan.batch.picture)
     digest = hashlib.sha256(repr(asked).encode("utf-8", "replace"))
     for path in filter(None, (case.source, case.labels)):
-        for name, size, time_ns in _list_files(path, follow_links=settings.follow_links):
-            digest.update(f"{name}\0{size}\0{time_ns}\n".encode("utf-8", "surrogateescape"))
+        remote = open_remote(path).list_entries() if is_url(path) else None
+        for name, size, version in remote or _list_files(path, follow_links=settings.follow_links):
+            digest.update(f"{name}\0{size}\0{version}\n".encode("utf-8", "surrogateescape"))
     return digest.hexdigest()
 
 
@@ -203,6 +209,7 @@ _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,98}[A-Za-z0-9_-])?")
 
 def read_cases(manifest: str | Path, selection: ScanSettings) -> list[Case]:
     """Read the rows of a CSV file, or find the series of a folder, in order."""
+    refuse_url(manifest, "manifest")
     return _find_series(manifest, selection) if os.path.isdir(manifest) else _read_table(manifest)
 
 
@@ -259,11 +266,21 @@ def _read_rows(name: str, rows: Any, places: dict[str, int], folder: str) -> lis
             raise UsageError(f"lines {first} and {line} of the manifest {name} are both the case {case}: name one else")
         if not cells["input"]:
             raise UsageError(f"line {line} of the manifest {name}: the case {case} has no input")
-        source, labels = (
-            os.path.join(folder, path) if (path := cells.get(column, "")) else None for column in ("input", "labels")
-        )
+        try:
+            refuse_url(cells.get("labels"), "label map")
+            source, labels = (_find_path(folder, cells.get(column, "")) for column in ("input", "labels"))
+        except UsageError as error:
+            raise UsageError(f"line {line} of the manifest {name}: {error}") from None
         cases.append(Case(case, source or "", cells.get("series") or None, labels))
     return cases
+
+
+def _find_path(folder: str, text: str) -> str | None:
+    """Return what a cell names, a URL or a path below the folder; a URL must be sound, and hold no password."""
+    if is_url(text):
+        check_url(text)
+        return text
+    return os.path.join(folder, text) if text else None
 
 
 def _find_series(folder: str | Path, selection: ScanSettings) -> list[Case]:
@@ -290,6 +307,8 @@ def check_places(cases: Sequence[Case], output: str | Path) -> None:
     parents: dict[str, str] = {}
     for case in cases:
         for path in filter(None, (case.source, case.labels)):
+            if is_url(path):
+                continue
             parent, name = os.path.split(os.path.normpath(path))
             if parent not in parents:
                 parents[parent] = os.path.realpath(parent)

@@ -104,7 +104,7 @@ def open_inputs(
 def _tell_kind(path: str | Path) -> str:
     """Return "mesh", "cloud" or "scan" by the extension; a PLY or VTP file with faces is a mesh."""
     file = Path(path)
-    refuse_other_clouds(file)
+    refuse_other_clouds(path)
     suffix = file.suffix.lower()
     if suffix not in MESH_INPUTS and not is_cloud_file(file):
         return "scan"
