@@ -24,7 +24,7 @@ INDENTED = re.compile(r"(?:^ {4}\S.*\n(?:\n? {4,}\S.*\n)*)", re.MULTILINE)
 SHELL = re.compile(r"^(clrecon|python3?|pip) ", re.MULTILINE)
 FOR_A_RELEASE = {"clouds", "corridor", "inside", "measures", "tasks", "transfer_functions"}
 """Pages that take long; every day their calls are compared with the signatures, and jobs' own tests make the same."""
-ELSEWHERE = {"certificate", "python", "tour", "view"}
+ELSEWHERE = {"certificate", "cookbook", "python", "tour", "view"}
 """Pages with tests of their own, and without Python that begins by itself."""
 
 OPTIONAL = ("dask", "open3d", "pandas", "pyacvd", "tetgen")

@@ -428,7 +428,7 @@ def test_concatenation_whose_part_starts_too_late_is_refused_with_its_frames(tmp
 
 
 def test_highdicom_reads_the_same_volume_of_an_enhanced_image(tmp_path):
-    import highdicom
+    highdicom = pytest.importorskip("highdicom")  # not there for Python 3.14
 
     plan = Plan(tilt_deg=0, angles=(20, -35, 50))
     write_enhanced(tmp_path / "mf", plan, order=SHUFFLED, slopes=range(1, 8))
@@ -447,7 +447,7 @@ def test_highdicom_reads_the_same_volume_of_an_enhanced_image(tmp_path):
 
 @pytest.mark.parametrize("plan", [Plan(), Plan(tilt_deg=12, angles=(5, 7, -11))], ids=["straight", "tilted"])
 def test_series_that_highdicom_converts_to_frames_is_read_as_the_same_volume(tmp_path, plan):
-    from highdicom.legacy import LegacyConvertedEnhancedCTImage
+    legacy = pytest.importorskip("highdicom.legacy")
 
     def complete(ds, k):
         ds.StudyInstanceUID = f"{ROOT}.5"
@@ -460,7 +460,7 @@ def test_series_that_highdicom_converts_to_frames_is_read_as_the_same_volume(tmp
     classic = [pydicom.dcmread(path) for path in sorted((tmp_path / "classic").iterdir())]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        converted = LegacyConvertedEnhancedCTImage(
+        converted = legacy.LegacyConvertedEnhancedCTImage(
             classic, series_instance_uid=f"{ROOT}.6", series_number=2, sop_instance_uid=f"{ROOT}.7", instance_number=1
         )
         converted.save_as(tmp_path / "mf")
