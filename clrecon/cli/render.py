@@ -13,9 +13,11 @@ from typing import Any
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
+from clrecon.cli.view import draw_view
 from clrecon.errors import UsageError
 from clrecon.jobs.inputs import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_only_mesh
-from clrecon.jobs.options import preset_option
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
+from clrecon.jobs.options import InputSettings, preset_option
 from clrecon.jobs.render.settings import (
     COLORS,
     CURVED_KINDS,
@@ -32,8 +34,9 @@ from clrecon.jobs.render.settings import (
     describe_presets,
     parse_direction,
 )
+from clrecon.jobs.view import ViewSettings
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.options import numbers_reader, option
+from clrecon.system.options import numbers_reader, option, options_of
 from clrecon.system.text import count_of
 
 _LABELS_LISTED = 24
@@ -49,6 +52,7 @@ examples:
   clrecon render CT_FOLDER -o slices.png --sheet --view sagittal --labels map.nii.gz
   clrecon render CT_FOLDER -o spine.png --curve auto
   clrecon render CT_FOLDER --turntable bone.mp4
+  clrecon render CT_FOLDER --state shown.view.json -o shown.png
   clrecon render cloud.ply -o cloud.png --color label --point-radius 0.5
   clrecon render bone.stl -o bone.png --color orange --view left
   clrecon render --mesh l3.stl=orange --mesh l4.3mf -o both.png
@@ -218,7 +222,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = f"{common.SCAN_FOLDER}; {common.GRID_FILE}; {others} --mode mesh); may be left out with --mesh"
     common.add_input(parser, text, nargs="?")
     common.add_output(parser, "picture: .png, .jpg or .tif; may be left out with --turntable", required=False)
-    common.add_fields(parser.add_argument_group("what is shown"), Looks)
+    shown = parser.add_argument_group("what is shown")
+    common.add_fields(shown, Looks)
+    common.add_fields(shown, ViewSettings, "state")
     camera = parser.add_argument_group("camera and picture")
     common.add_fields(camera, RenderSettings, "camera")
     kinds = ".npy or .tif, float32"
@@ -265,6 +271,8 @@ def render_settings(options: argparse.Namespace) -> RenderSettings:
 def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.render.job import PictureFiles, make_pictures, path_of
 
+    if options.state is not None:
+        return _draw_saved(options, console)
     if options.input is None:
         _show_meshes_alone(options)
     files = PictureFiles(options.output, options.depth, options.values, options.turntable, options.report)
@@ -286,6 +294,35 @@ def run(options: argparse.Namespace, console: Console) -> int:
         lines.append(f"wrote    {printable(files.turntable)}, {size}")
     common.show_report(report, describe_report(report) + lines, options, console)
     return 0
+
+
+def _draw_saved(options: argparse.Namespace, console: Console) -> int:
+    """Draw a saved view of the input and the meshes with it; the saved view says all that is shown."""
+    looks = chain(*(options_of(Looks, group) for group in ("", "clipping", "slices")), options_of(LabelLook))
+    options_said = [*looks, *options_of(RenderSettings, "camera"), *options_of(Turntable)]
+    flags = {own.name: own.flags[0] for own in options_said if own.name not in ("size", "path")}
+    flags |= {name: f"--{name}" for name in ("depth", "values", "turntable", "report")}
+    refused = next((flag for name, flag in flags.items() if getattr(options, name) not in (None, False)), None)
+    if refused is None and any(color is not None or opacity < 1.0 for _, color, opacity in options.meshes):
+        refused = "a colour or opacity of --mesh"
+    if refused is not None:
+        raise UsageError(
+            f"{refused} does not go with --state: the saved view says what is shown, and one picture is drawn"
+        )
+    if options.output is None:
+        raise UsageError("--state draws a picture: name its file with -o")
+    inputs = [*filter(None, (options.input,)), *(path for path, _, _ in options.meshes)]
+    if not inputs:
+        raise UsageError("there is nothing to show: name the inputs of the saved view, meshes with --mesh")
+    labels = None if options.path is None else LabelChoice(options.path)
+    settings = ViewSettings(
+        scan=common.make_settings(
+            MeshSettings, argparse.Namespace(**common.pick(options, InputSettings)), labels=labels
+        ),
+        mesh_space=options.mesh_space,
+        state=options.state,
+    )
+    return draw_view(inputs, settings, options.output, console, size=options.size, no_clobber=options.no_clobber)
 
 
 def _show_meshes_alone(options: argparse.Namespace) -> None:

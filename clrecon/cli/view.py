@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import Any
 
 from clrecon.cli import common
@@ -65,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " numbered if it exists; may be given again (default: a download)",
         first=True,
     )
-    common.add_fields(shown, ViewSettings)
+    common.add_fields(shown, ViewSettings, "", "state")
     common.add_option(shown, "space", space_option("frame of picked points"))
     common.add_no_clobber(shown)
     common.add_reading(parser)
@@ -81,7 +82,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     if options.window:
         return _show_window(options, console)
     if options.picture is not None:
-        return _draw_picture(options, console)
+        how = {"size": options.size, "no_clobber": options.no_clobber}
+        return draw_view(options.inputs, _settings(options), options.picture, console, **how)
     if options.html is None:
         return _serve(options, _settings(options), console)
     from clrecon.jobs.view.job import write_view
@@ -146,13 +148,15 @@ def _show_window(options: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def _draw_picture(options: argparse.Namespace, console: Console) -> int:
-    from clrecon.viewer.session.opening import draw_view
+def draw_view(
+    inputs: Sequence[str], settings: ViewSettings, output: str, console: Console, *, size: Any, no_clobber: bool
+) -> int:
+    """Draw what a view begins with into a file: ``view --picture`` and ``render --state``."""
+    from clrecon.viewer.session import opening
 
-    warnings, lines = draw_view(
-        options.inputs, _settings(options), options.picture, options.size or (1024, 1024),
-        no_clobber=options.no_clobber, progress=console.progress,
-    )  # fmt: skip
+    warnings, lines = opening.draw_view(
+        inputs, settings, output, size or (1024, 1024), no_clobber=no_clobber, progress=console.progress
+    )
     console.result(name_schema("view", {"warnings": warnings}))
     for warning in warnings:
         console.warn(warning)

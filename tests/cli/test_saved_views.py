@@ -71,6 +71,38 @@ def test_picture_of_a_saved_view_is_the_one_that_the_view_saved(
 
 
 @pytest.mark.opencl
+def test_render_with_a_saved_view_draws_the_picture_that_the_view_saved(
+    device: Any, scan: Path, saved: Path, tmp_path: Path
+) -> None:
+    arguments = ["render", str(scan), "--state", str(saved / "shown.view.json"), "-o", str(tmp_path / "again.png")]
+
+    assert main([*arguments, "--size", "160x120", "--device", str(device.index)]) == 0
+
+    assert (tmp_path / "again.png").read_bytes() == (saved / "shown.png").read_bytes()
+
+
+RENDERED = {
+    "preset": (["-o", "a.png", "--preset", "spine"], "--preset"),
+    "camera": (["-o", "a.png", "--zoom", "2"], "--zoom"),
+    "report": (["-o", "a.png", "--report", "a.json"], "--report"),
+    "colour of a mesh": (["-o", "a.png", "--mesh", "a.stl=red"], "--mesh"),
+    "no picture": ([], "-o"),
+}
+
+
+@pytest.mark.parametrize(("options", "fact"), RENDERED.values(), ids=RENDERED)
+def test_render_with_a_saved_view_refuses_what_the_view_says_itself(
+    options: list[str], fact: str, scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Printer
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    assert main(["render", str(scan), "--state", "shown.view.json", *options]) == 3
+
+    printed().assert_error(fact)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.opencl
 def test_view_opened_with_a_saved_view_shows_its_parts_and_saves_the_same_again(
     device: Any, scan: Path, saved: Path, tmp_path: Path
 ) -> None:

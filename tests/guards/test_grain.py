@@ -12,7 +12,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 95_809,
+    "lines": 95_853,
     "modules": 422,
     "small_modules_with_one_reader": 8,
     "docstrings_with_raises": 136,

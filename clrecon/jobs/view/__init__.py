@@ -32,7 +32,10 @@ class ViewSettings:
     )
     mesh_space: Space | None = mesh_space_option("mesh files that do not name theirs")
     state: str | None = option(
-        "--state FILE", "begin as a view was saved: a file .view.json of the key s, of the same inputs", first=True
+        "--state FILE",
+        "show what a view showed when it was saved: a file .view.json of the key s, of the same inputs",
+        group="state",
+        first=True,
     )
 
     def __post_init__(self) -> None:
