@@ -21,36 +21,18 @@
  *   1. copy_row_ends
  *   2. filter_bilateral   all groups, or those of a list (cl/filters/near_level.cl) */
 #include "include/lanes.h"
+#include "include/power_of_two.h"
 #include "include/volume.h"
 
 #define GROUP 16 /* voxels of a group */
 #define IS_FLOAT ((VALUE)0.5f > (VALUE)0)
 #define LARGEST_FLOAT 3.40282347e38f
 #define LEAST_EXPONENT -120.0f /* weights below are 0 but for rounding, and those of floats are 0 */
-#define TO_WHOLE 12582912.0f /* 1.5 * 2^23: what is added to a small number loses its fraction */
-
-#if LANES == 8 && defined(__SSE__) && !defined(__FMA__)
-#define fused(a, b, c) ((a) * (b) + (c)) /* there fma() is a long function */
-#else
-#define fused(a, b, c) fma(a, b, c)
-#endif
 
 /* Sums over the taps for LANES voxels, and the lowest and highest value that counted, for floats alone. */
 typedef struct {
     floats weights, differences, low, high;
 } tap_sums;
-
-/* 2^e to a relative error of 4e-6, -120 <= e <= 0: the polynomial is that of least largest error on [-1/2, 1/2]. */
-static inline floats power_of_two(const floats e)
-{
-    const floats shifted = e + TO_WHOLE;
-    const floats f = e - (shifted - TO_WHOLE);
-    floats power = fused((floats)(0.0095701f), f, (floats)(0.0559176f));
-    power = fused(power, f, (floats)(0.2402478f));
-    power = fused(power, f, (floats)(0.6931201f));
-    power = fused(power, f, (floats)(0.9999993f));
-    return as_floats(as_ints(power) + (as_ints(shifted) << 23));
-}
 
 /* Differences count in units of 1 / range HU: for voxels of up to 16 bits it is one operation, exact to a unit in the
  * last place of the voxel's own value. */

@@ -87,6 +87,14 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
             ),
         )
     },
+    "average_patches": {
+        "scratch": (("store_lanes(sum, sums + row", "store_lanes(-sum, sums + row"),),
+        "weights": (
+            ("store_lanes(load_lanes(weights + entry) + weight", "store_lanes(load_lanes(weights + entry) - weight"),
+        ),
+        "changes": (("fused(weight, away, load_lanes", "fused(-weight, away, load_lanes"),),
+    },
+    "finish_means": {"filtered": (("+ changes[entry] /", "- changes[entry] /"),)},
     "classify_groups": {
         "some": (("some_bits |= (uint)(is_in != 0)", "some_bits |= (uint)(is_in == 0)"),),
         "every": (("all_bits |= (uint)(is_out == 0)", "all_bits |= (uint)(is_out != 0)"),),

@@ -1,4 +1,4 @@
-"""Filters of other packages under one name: SimpleITK and scikit-image, on the computer's processor."""
+"""Filters under one name: of SimpleITK and scikit-image on the computer's processor, and non-local means."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from clrecon.anatomy.noise import measure_noise
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.resample import shear_degrees
+from clrecon.opencl import Device
+from clrecon.operators.filters.means import MeansSettings, run_means
 from clrecon.operators.filters.settings import checked_length, report_filter
-from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.system.arguments import FilterName, explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.packages import install_command
-from clrecon.system.pieces import in_threads
 from clrecon.system.progress import Progress, ignore_progress
 
 VolumeKind = TypeVar("VolumeKind", Volume, DeviceVolume)
@@ -40,19 +41,27 @@ _INSTALLED_AS = {"skimage": "scikit-image"}
 
 @dataclass(frozen=True)
 class _Denoiser:
-    """A filter of the module `package`: `run` returns voxels as floats and its facts; it may need an even grid."""
+    """A filter: `run` returns voxels as floats and its facts.
 
-    package: str
+    package: Module that `run` is given; None for a filter that runs on a device, on grids of any kind.
+    """
+
+    package: str | None
     defaults: dict[str, Any]
-    run: Callable[[Any, Volume, dict[str, Any], Progress], tuple[NDArray[Any], dict[str, Any]]]
-    needs_grid: bool = True
+    run: Callable[..., tuple[NDArray[Any], dict[str, Any]]]
 
 
 @explains_arguments
 def filter_volume(
-    volume: VolumeKind, name: FilterName, *, progress: Progress | None = None, **parameters: float | None
+    volume: VolumeKind,
+    name: FilterName,
+    *,
+    device: Device | str | int | None = None,
+    memory: int | None = None,
+    progress: Progress | None = None,
+    **parameters: float | None,
 ) -> VolumeKind:
-    """Filter a volume by a filter of SimpleITK or scikit-image, on the computer's processor.
+    """Filter a volume by a filter of SimpleITK or scikit-image on the computer's processor, or by non-local means.
 
     For `clrecon.filter_bilateral`, which runs on the device, see there.
 
@@ -65,8 +74,13 @@ def filter_volume(
         gaussian: scikit-image, with ``sigma_mm`` (default 0.7).
         curvature-flow: SimpleITK, in mm, with ``iterations`` (default 5) of ``time_step`` (default 0.0625 for voxels of
         1 mm and more, less for smaller ones).
-        non-local-means: scikit-image, slice by slice, with ``sigma_hu`` (default the noise that `clrecon.measure_noise`
-        finds), patches of ``patch`` (default 5) voxels and ``reach`` (default 6) voxels around.
+        non-local-means: on the device, slice by slice, with ``sigma_hu`` (default the noise that
+        `clrecon.measure_noise` finds), patches of ``patch`` voxels (default 5; of even numbers the next one) and
+        ``reach`` (default 6) voxels around.
+    device : Device, str or int, optional
+        Of non-local-means, see `clrecon.device`; None is the best of the machine.  A `DeviceVolume` has its own.
+    memory : int, optional
+        Most bytes that non-local-means takes on the device; None is all that it has.
     progress : callable, optional
         Called as ``progress("filter", slices done, all slices)``.
     **parameters
@@ -76,13 +90,16 @@ def filter_volume(
     -------
     Volume or DeviceVolume
         As it was given, in the type of the voxels, whole numbers rounded; ``report["filtered"]["steps"]`` says the
-        name, the parameters and the package.
+        name, the parameters and the package, if it is another one's.
 
     Raises
     ------
     UsageError
         The name or a parameter is unknown or out of range; the package is not installed; float voxels hold NaN; the
-        slices are unevenly spaced, or sheared by more than 0.1 degrees, which only non-local-means takes.
+        slices are unevenly spaced, or sheared by more than 0.1 degrees, which only non-local-means takes; ``device`` or
+        ``memory`` is given to another filter.
+    DeviceError
+        Non-local-means: no device, no room for a slice, or the device fails.
     """
     resident = volume if isinstance(volume, DeviceVolume) else None
     source = resident.volume if resident is not None else volume
@@ -95,16 +112,43 @@ def filter_volume(
     if unknown:
         raise UsageError(f"{name} has no parameter {unknown[0]}: it has {', '.join(denoiser.defaults)}")
     _check_volume(source, name, denoiser)
-    package = _import_package(name, denoiser)
+    asked = {**denoiser.defaults, **parameters}
     tell = progress or ignore_progress
+    warnings: list[str] = []
     nk = source.shape_ijk[2]
     tell("filter", 0, nk)
-    voxels, used = denoiser.run(package, source, {**denoiser.defaults, **parameters}, tell)
+    if denoiser.package is None:
+        voxels, facts = _run_on_device(denoiser, volume, asked, (device, memory), warnings, tell)
+    else:
+        if device is not None or memory is not None:
+            raise UsageError(f"{name} runs on the computer's processor: leave out device and memory")
+        voxels, facts = denoiser.run(_import_package(name, denoiser.package), source, asked)
+        top = denoiser.package.split(".")[0]
+        facts["package"] = f"{top} {metadata.version(_DISTRIBUTIONS.get(top, top))}"
     tell("filter", nk, nk)
-    top = denoiser.package.split(".")[0]
-    facts = {"filter": name, **used, "package": f"{top} {metadata.version(_DISTRIBUTIONS.get(top, top))}"}
-    filtered = report_filter(source, _as_voxels(voxels, source), facts, [])
+    filtered = report_filter(source, _as_voxels(voxels, source), {"filter": name, **facts}, warnings)
     return filtered if resident is None else resident.follow(filtered)  # type: ignore[return-value]
+
+
+def _run_on_device(
+    denoiser: _Denoiser,
+    volume: Volume | DeviceVolume,
+    asked: dict[str, Any],
+    limits: tuple[Device | str | int | None, int | None],
+    warnings: list[str],
+    tell: Progress,
+) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Run a filter on the device of a volume, or on the one of `limits`, which has the memory too."""
+    resident, is_new = take_volume(volume, *limits, "a filter")
+    try:
+        for attempt in resident.with_fallback():
+            with attempt as (_, notes):
+                result, facts = denoiser.run(resident, asked, notes, tell)
+        warnings.extend(notes)
+        return result, facts
+    finally:
+        if is_new:
+            resident.close()
 
 
 def _check_volume(volume: Volume, name: str, denoiser: _Denoiser) -> None:
@@ -112,7 +156,7 @@ def _check_volume(volume: Volume, name: str, denoiser: _Denoiser) -> None:
         raise UsageError(
             f"the voxels hold NaN or infinite values, which {name} spreads: filter_bilateral leaves them out"
         )
-    if not denoiser.needs_grid:
+    if denoiser.package is None:
         return
     why = ""
     if volume.uneven:
@@ -125,11 +169,11 @@ def _check_volume(volume: Volume, name: str, denoiser: _Denoiser) -> None:
         )
 
 
-def _import_package(name: str, denoiser: _Denoiser) -> Any:
+def _import_package(name: str, module: str) -> Any:
     try:
-        return import_module(denoiser.package)
+        return import_module(module)
     except ImportError as error:
-        package = denoiser.package.split(".")[0]
+        package = module.split(".")[0]
         command = install_command(_INSTALLED_AS.get(package, package))
         raise UsageError(f"the filter {name} needs the package {package}: {command}") from error
 
@@ -162,9 +206,7 @@ def _image(sitk: Any, volume: Volume) -> Any:
     return image
 
 
-def _run_median(
-    sitk: Any, volume: Volume, asked: dict[str, Any], tell: Progress
-) -> tuple[NDArray[Any], dict[str, Any]]:
+def _run_median(sitk: Any, volume: Volume, asked: dict[str, Any]) -> tuple[NDArray[Any], dict[str, Any]]:
     if asked["radius_mm"] is None:
         radius, used = [1, 1, 1], {}
     else:
@@ -176,18 +218,14 @@ def _run_median(
     return result, {**used, "window": [2 * n + 1 for n in radius]}
 
 
-def _run_gaussian(
-    filters: Any, volume: Volume, asked: dict[str, Any], tell: Progress
-) -> tuple[NDArray[Any], dict[str, Any]]:
+def _run_gaussian(filters: Any, volume: Volume, asked: dict[str, Any]) -> tuple[NDArray[Any], dict[str, Any]]:
     sigma = checked_length("sigma_mm", asked["sigma_mm"], volume)
     steps = [sigma / step for step in reversed(volume.spacing)]
     result = filters.gaussian(volume.voxels.astype(np.float32), steps, mode="nearest", preserve_range=True)
     return result, {"sigma_mm": sigma}
 
 
-def _run_curvature_flow(
-    sitk: Any, volume: Volume, asked: dict[str, Any], tell: Progress
-) -> tuple[NDArray[Any], dict[str, Any]]:
+def _run_curvature_flow(sitk: Any, volume: Volume, asked: dict[str, Any]) -> tuple[NDArray[Any], dict[str, Any]]:
     iterations = _whole("iterations", asked["iterations"], 1, 1000)
     stable = ITK_TIME_STEP * min(1.0, min(volume.spacing)) ** 2
     step = stable if asked["time_step"] is None else _check_number("time_step", asked["time_step"], 1.0)
@@ -197,29 +235,20 @@ def _run_curvature_flow(
 
 
 def _run_non_local_means(
-    restoration: Any, volume: Volume, asked: dict[str, Any], tell: Progress
+    resident: DeviceVolume, asked: dict[str, Any], warnings: list[str], tell: Progress
 ) -> tuple[NDArray[Any], dict[str, Any]]:
+    volume, sigma = resident.volume, asked["sigma_hu"]
     patch, reach = _whole("patch", asked["patch"], 3, 31), _whole("reach", asked["reach"], 1, 31)
-    noise = measure_noise(volume).hu if asked["sigma_hu"] is None else _check_number("sigma_hu", asked["sigma_hu"], 1e6)
-    result = np.empty(volume.voxels.shape, np.float32)
-
-    def filter_slice(piece: slice) -> None:
-        layer = volume.voxels[piece.start]
-        plane = restoration.denoise_nl_means(
-            layer.astype(np.float32), patch, reach, 0.8 * noise, fast_mode=True, sigma=noise, preserve_range=True
-        )
-        result[piece.start] = np.reshape(plane, layer.shape)  # it drops the axis of a single column
-
-    in_threads(filter_slice, len(result), 1, lambda piece: tell("filter", piece.stop, len(result)))
-    return result, {"sigma_hu": noise, "patch": patch, "reach": reach, "dimensions": 2}
+    noise = measure_noise(volume).hu if sigma is None else _check_number("sigma_hu", sigma, 1e6)
+    settings = MeansSettings(patch | 1, reach, noise)
+    facts = {"sigma_hu": noise, "patch": settings.patch, "reach": reach, "dimensions": 2}
+    return run_means(resident, settings, warnings, tell), facts
 
 
 DENOISERS = {
     "median": _Denoiser("SimpleITK", {"radius_mm": None}, _run_median),
     "gaussian": _Denoiser("skimage.filters", {"sigma_mm": 0.7}, _run_gaussian),
     "curvature-flow": _Denoiser("SimpleITK", {"iterations": 5, "time_step": None}, _run_curvature_flow),
-    "non-local-means": _Denoiser(
-        "skimage.restoration", {"sigma_hu": None, "patch": 5, "reach": 6}, _run_non_local_means, needs_grid=False
-    ),
+    "non-local-means": _Denoiser(None, {"sigma_hu": None, "patch": 5, "reach": 6}, _run_non_local_means),
 }
 """The filters by name."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from clrecon.errors import DeviceError
 from clrecon.opencl import Device, Stopwatch, download, upload
 from clrecon.operators.filters.bilateral import SlicesThere, list_mixed_groups, row_words, run_bilateral
+from clrecon.operators.filters.means import MeansSettings, run_means
 from clrecon.operators.filters.settings import BilateralSettings
 from clrecon.operators.masks.mask import Mask
 from clrecon.operators.primitives.scan import compact, exclusive_scan, radix_sort
@@ -30,6 +31,7 @@ from clrecon.proof.checking import (
 from clrecon.proof.volumes import volume_twins as twin
 from clrecon.proof.volumes.volume_twins import reformat_sheet
 from clrecon.rendering.views.reformation import find_plane, plane_sheet, slab_samples
+from clrecon.system.progress import ignore_progress
 
 
 def _check_scan(device: Device) -> str:
@@ -238,6 +240,19 @@ def _check_bilateral(device: Device, types: tuple[str, ...], uneven: bool) -> st
     return f"{2 * len(types)} volumes within {worst:.2g} HU"
 
 
+def _check_means(device: Device) -> str:
+    """Compare non-local means of a ball in noise with float64; one case has more than 500 tiles, one an odd side."""
+    rng, worst = np.random.default_rng(15), 0.0
+    for patch, reach, shape in ((5, 6, (2, 37, 83)), (4, 2, (2, 37, 83)), (3, 1, (9, 240, 260))):
+        _, j, i = np.indices(shape)
+        values = np.where((j - 15.0) ** 2 + (i - 40.0) ** 2 < 150.0, 300.0, 40.0) + rng.normal(0.0, 20.0, shape)
+        volume, settings = stack(values.astype(np.float32), OBLIQUE), MeansSettings(patch, reach, 20.0)
+        means = run_means(DeviceVolume(volume, device=device), settings, [], ignore_progress)
+        layers = [twin.average_patches(layer, settings.side, reach, *settings.scale()) for layer in volume.voxels]
+        worst = max(worst, require_close(means, np.stack(layers), _FLOAT_HU, "non-local means, in HU"))
+    return f"13 slices within {worst:.2g} HU"
+
+
 def _check_near_level(device: Device) -> str:
     """Compare the listed groups with the twin's, and a filter of them alone with that of all."""
     k, j, i = np.indices((30, 40, 1100))
@@ -276,6 +291,7 @@ FILTER_CHECKS = (
         ("copy_row_ends", "filter_bilateral"),
         partial(_check_bilateral, types=("int16",), uneven=True),
     ),
+    Check("non-local means", ("average_patches", "finish_means"), _check_means),
     Check("filter near a level", ("classify_groups", "spread_groups", "mark_mixed_groups"), _check_near_level),
 )
 

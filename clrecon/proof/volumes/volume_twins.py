@@ -1,9 +1,11 @@
 """Twins of `clrecon.operators` in plain numpy: primitives, bricks of resident volumes, masks (boxes and tubes, where
-every voxel is asked; balls, one nearest voxel at a time), the bilateral filter in float64, and slices in float64.
+every voxel is asked; balls, one nearest voxel at a time), filters in float64, and slices in float64.
 """
 
 from __future__ import annotations
 
+import math
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -250,6 +252,31 @@ def filter_bilateral(
         filtered = centre + moved / total
     result: NDArray[np.float64] = np.where(np.isfinite(values), filtered, values)
     return result
+
+
+def average_patches(layer: NDArray[Any], side: int, reach: int, noise: float, scale: float) -> NDArray[np.float64]:
+    """Return the non-local means of a slice (nj, ni): of the voxels within `reach`, by patches of `side` voxels.
+
+    A patch begins (side - 1) // 2 voxels before its own.  noise, scale: Of sums of squares, as in cl/filters/means.cl.
+    """
+    before, frame = (side - 1) // 2, reach + side
+    framed = np.pad(layer.astype(np.float64), frame, mode="reflect")
+    inner = slice(frame, -frame)
+    centre = framed[inner, inner]
+    weights, changes = np.ones_like(centre), np.zeros_like(centre)
+    for up, along in product(range(-reach, reach + 1), repeat=2):
+        if up or along:
+            shifted = np.roll(framed, (-up, -along), (0, 1))
+            squares = (shifted - framed) ** 2
+            sums = np.zeros_like(framed)
+            for row, column in product(range(side), repeat=2):
+                sums += np.roll(squares, (before - row, before - column), (0, 1))
+            exponent = np.maximum(sums[inner, inner] - noise, 0.0) * scale
+            weight = np.where(exponent <= 5.0 / math.log(2.0), np.exp2(-exponent), 0.0)
+            weights += weight
+            changes += weight * (shifted[inner, inner] - centre)
+    means: NDArray[np.float64] = centre + changes / weights
+    return means
 
 
 EDGE = 2.0**-20

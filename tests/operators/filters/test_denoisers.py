@@ -11,7 +11,7 @@ from surface_volumes import OBLIQUE
 from uneven_volume import uneven
 
 import clrecon
-from clrecon.errors import UsageError
+from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.operators.filters.denoisers import DENOISERS, ITK_TIME_STEP
 
@@ -40,7 +40,7 @@ def test_a_filter_takes_three_tenths_off_the_noise_and_keeps_type_and_place(name
     assert np.array_equal(made.affine, volume.affine)
 
 
-@NAMES
+@pytest.mark.parametrize("name", [name for name, denoiser in DENOISERS.items() if denoiser.package])
 def test_report_of_a_filter_names_it_and_its_package(name):
     (step,) = clrecon.filter_volume(noisy_ball()[0], name).report["filtered"]["steps"]
     assert step["filter"] == name
@@ -71,6 +71,49 @@ def test_filter_of_a_device_volume_gives_a_device_volume(device):
         made = clrecon.filter_volume(resident, "median")
         assert isinstance(made, clrecon.DeviceVolume) and made.device is resident.device
         np.testing.assert_array_equal(made.volume.voxels, clrecon.filter_volume(volume, "median").voxels)
+
+
+FAST_EXP = 0.06
+"""Relative error of the weights of scikit-image, whose exponential is that of N. Schraudolph, 1999."""
+
+
+def test_non_local_means_are_those_of_scikit_image(device):
+    restoration = pytest.importorskip("skimage.restoration")
+    volume, _ = noisy_ball()
+    floats = Volume(volume.voxels.astype(np.float32), SPACING)
+    made = clrecon.filter_volume(floats, "non-local-means", sigma_hu=20.0, patch=5, reach=6, device=device)
+    expected = [
+        restoration.denoise_nl_means(layer, 5, 6, 0.8 * 20.0, sigma=20.0, preserve_range=True)
+        for layer in floats.voxels.astype(np.float64)
+    ]
+    # Means of voxels that differ from each other by the noise.
+    np.testing.assert_allclose(made.voxels, np.stack(expected), rtol=0.0, atol=FAST_EXP * 20.0)  # measured 0.87
+
+
+def test_one_lane_and_eight_find_the_same_means(device, monkeypatch):
+    floats = Volume(noisy_ball()[0].voxels.astype(np.float32), SPACING)
+    means = clrecon.filter_volume(floats, "non-local-means", sigma_hu=20.0, device=device)
+    lanes = "1" if device.kernel_variants["LANES"] == "8" else "8"
+    monkeypatch.setattr(device, "kernel_variants", {**device.kernel_variants, "LANES": lanes})
+    others = clrecon.filter_volume(floats, "non-local-means", sigma_hu=20.0, device=device)
+    np.testing.assert_array_equal(means.voxels, others.voxels)
+
+
+def test_non_local_means_are_the_same_in_slabs(device):
+    volume, _ = noisy_ball()
+    whole = clrecon.filter_volume(volume, "non-local-means", device=device)
+    in_slabs = clrecon.filter_volume(volume, "non-local-means", device=device, memory=500_000)  # of 14 slices three fit
+    np.testing.assert_array_equal(whole.voxels, in_slabs.voxels)
+
+
+def test_non_local_means_without_room_for_a_slice_are_refused(device):
+    with refused(DeviceError, "slice", "100,000"):
+        clrecon.filter_volume(noisy_ball()[0], "non-local-means", device=device, memory=100_000)
+
+
+def test_median_on_a_device_is_refused(device):
+    with refused(UsageError, "median", "device"):
+        clrecon.filter_volume(noisy_ball()[0], "median", device=device)
 
 
 ODD_STACKS = pytest.mark.parametrize(
