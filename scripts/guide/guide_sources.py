@@ -59,6 +59,7 @@ development/*
 print_a_vertebra
 labels_to_meshes
 other_programs
+napari
 devices
 ```
 """,

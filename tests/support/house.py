@@ -134,7 +134,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     # typing_extensions: for type checkers alone, which bring it.
     "operators": frozenset({"pyopencl", "SimpleITK", "skimage", "typing_extensions"}),
     "jobs": frozenset({"PIL", "dask"}),
-    "viewer": frozenset({"aiohttp", "PIL", "pyvista", "vtk", "vtkmodules"}),
+    "viewer": frozenset({"aiohttp", "PIL", "napari", "pyvista", "vtk", "vtkmodules"}),
     # vtkmodules: peers of the bench and of the comparison, whose page has plots and pictures.
     "proof": frozenset({"scipy", "pyvista", "skimage", "vtkmodules", "matplotlib", "PIL"}),
     "cli": frozenset({"rich"}),
