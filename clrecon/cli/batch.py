@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import add_mesh_options, mesh_fields
-from clrecon.jobs.batch.plan import COLUMNS, PAGE, TABLE, BatchSettings, Plan, read_cases
+from clrecon.jobs.batch.plan import ALL_DEVICES, COLUMNS, PAGE, TABLE, BatchSettings, Plan, read_cases
 from clrecon.jobs.mesh.purposes import settings_for
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.options import ScanSettings
@@ -49,6 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.batch.job import run_batch
 
+    if options.device == ALL_DEVICES and options.devices is None:
+        options.device, options.devices = None, ALL_DEVICES
     batch = common.make_settings(BatchSettings, options)
     cases = read_cases(options.input, common.make_settings(ScanSettings, options))
     is_labelled = {case.labels is not None for case in cases}

@@ -9,13 +9,14 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from clrecon.errors import ClreconError, DeviceError, OutputError, UnreachableError
-from clrecon.jobs.batch.plan import REPORT, Case, Plan, make_key
+from clrecon.jobs.batch.plan import REPORT, BatchSettings, Case, Plan, make_key
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.options import DeviceSettings, ScanSettings
+from clrecon.jobs.options import DeviceSettings, InputSettings, ScanSettings
 from clrecon.jobs.run import JobReport, Run, SharedScan, error_as_dict, stage_report
 from clrecon.system.arguments import OptionSpeaker, in_python, spoken_by
 from clrecon.system.files import hold_interrupts, temporary_folder
@@ -152,7 +153,7 @@ def _fill_folder(case: Case, plan: Plan, run: Run, folder: Path, key: str | None
     from clrecon.jobs.mesh.surfaces import names_level
 
     settings, asked = plan.settings_of(case), plan.batch
-    shared = SharedScan() if case.labels is not None else None
+    shared = None if case.labels is None and asked.cloud is None else SharedScan()
     mesh = make_mesh(case.source, folder / f"mesh{asked.format}", settings, measure=asked.measure, shared=shared)
     run.lap("mesh")
     warnings = list(mesh.warnings)
@@ -162,14 +163,20 @@ def _fill_folder(case: Case, plan: Plan, run: Run, folder: Path, key: str | None
         from clrecon.jobs.stats import measure_stats
 
         assert settings.labels is not None
-        scan = {own.name: getattr(settings, own.name) for own in (*fields(ScanSettings), *fields(DeviceSettings))}
+        scan = _settings_in(settings, ScanSettings, DeviceSettings)
         asked_of = StatsSettings(**scan, labels=case.labels, label=settings.labels.label)
         stats = measure_stats(case.source, asked_of, csv_path=folder / LABELS, shared=shared)
         warnings += stats.warnings
         run.lap("labels")
+    if asked.cloud is not None:
+        warnings += _write_cloud(case, folder, asked.cloud, settings, mesh.iso_value_hu, shared)
+        run.lap("cloud")
     if asked.picture:
-        warnings += _take_picture(folder, asked.format, settings)
+        warnings += _take_pictures(folder, asked, settings)
         run.lap("picture")
+    if not asked.mesh:
+        for path in folder.glob(f"mesh*{asked.format}"):
+            path.unlink()
     own_units = settings.is_for_print and names_level(settings)
     gates = find_failed(mesh, own_units=own_units) if settings.strict else ()
     return _write_report(
@@ -189,16 +196,36 @@ def _fill_folder(case: Case, plan: Plan, run: Run, folder: Path, key: str | None
     )
 
 
-def _take_picture(folder: Path, extension: str, settings: MeshSettings) -> list[str]:
-    """Take a picture of the meshes that were written; return its warnings."""
+def _settings_in(settings: MeshSettings, *classes: type) -> dict[str, Any]:
+    """Return those settings of the mesh that these classes have as well."""
+    shared = chain(*map(fields, classes))
+    return {field.name: getattr(settings, field.name) for field in shared}
+
+
+def _write_cloud(
+    case: Case, folder: Path, extension: str, settings: MeshSettings, level: float | None, shared: SharedScan | None
+) -> list[str]:
+    """Write the points of the surface that was extracted, from the same voxels; return the warnings."""
+    from clrecon.jobs.cloud.job import CloudFiles, make_cloud
+    from clrecon.jobs.cloud.settings import CloudSettings
+
+    files = CloudFiles(folder / f"cloud{extension}")
+    asked = CloudSettings(
+        **_settings_in(settings, InputSettings), hu=level, labels=case.labels, space=settings.space, normals=True
+    )
+    return make_cloud(case.source, files, asked, shared=shared).warnings
+
+
+def _take_pictures(folder: Path, asked: BatchSettings, settings: MeshSettings) -> list[str]:
+    """Take the pictures of the meshes that were written; return their warnings."""
     from clrecon.jobs.render.job import PictureFiles, make_pictures
     from clrecon.jobs.render.settings import MeshFile, RenderSettings
 
-    first, *others = sorted(folder.glob(f"mesh*{extension}"))
+    first, *others = sorted(folder.glob(f"mesh*{asked.format}"))
     meshes = tuple(MeshFile(str(path)) for path in others)
     look = RenderSettings.of(
         "mesh", meshes=meshes, mesh_space=settings.space, size=_PICTURE_SIZE, device=settings.device,
-        memory=settings.memory,
+        memory=settings.memory, views=asked.views,
     )  # fmt: skip
     return make_pictures(first, PictureFiles(folder / PICTURE), look).warnings
 

@@ -168,7 +168,8 @@ def _write_page(stream: BinaryIO, root: Path, counts: Counter[str]) -> None:
 def _lay_out_row(row: Mapping[str, str], root: Path) -> str:
     case, status = escape(row["case"]), escape(row["status"])
     folder, far = root / row["case"], row["outliers"].split()
-    picture = f'<img src="{case}/{PICTURE}" alt="" loading="lazy">' if (folder / PICTURE).is_file() else ""
+    pictures = sorted(folder.glob(PICTURE.replace(".", "*.")))
+    picture = "".join(f'<img src="{case}/{escape(path.name)}" alt="" loading="lazy">' for path in pictures)
     name = f'<a href="{case}/{REPORT}">{case}</a>' if row["status"] != _MISSING else case
     reason = f"<small>{escape(row['error'])}</small>" if row["error"] else ""
     kind = "" if row["status"] == DONE else ' class="bad"'

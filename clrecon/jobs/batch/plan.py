@@ -8,25 +8,30 @@ import io
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
-from clrecon.errors import NoDicomError, UsageError
-from clrecon.exchange.formats import MESH_INPUTS
+from clrecon.errors import DeviceError, NoDicomError, UsageError
+from clrecon.exchange.formats import CLOUD_FORMATS, MESH_INPUTS
 from clrecon.jobs.cluster import LOCAL, check_address
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
-from clrecon.jobs.options import DeviceSettings, ScanSettings
+from clrecon.jobs.options import DeviceSettings, ScanSettings, view_option
 from clrecon.reading.sources import open_remote
 from clrecon.reading.urls import check_url, is_url, refuse_url
-from clrecon.system.arguments import name_parameter
+from clrecon.system.arguments import DirectionName, name_parameter
 from clrecon.system.light_dataclass import asdict, dataclass, fields, replace
 from clrecon.system.options import option
+from clrecon.system.packages import import_package
 from clrecon.system.paths import find_extension, open_regular, shown_path
-from clrecon.system.text import escape_text, guess_word
+from clrecon.system.text import escape_text, guess_word, unknown_name
 from clrecon.version import package_version
 
 _MOST_WORKERS = 256
+
+ALL_DEVICES = "all"
+"""In place of indexes: each usable device of the machine, without simulators and those found to compute wrongly."""
 
 
 def _parse_part(text: str) -> tuple[int, int]:
@@ -34,6 +39,22 @@ def _parse_part(text: str) -> tuple[int, int]:
     if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise ValueError(f"{text!r:.40} is no part I/N of the cases: 1/4 is the first of four, 4/4 the last")
     return int(number), int(count)
+
+
+def _parse_extension(text: str) -> str:
+    return text.lower() if text.startswith(".") else f".{text.lower()}"
+
+
+_VIEWS: tuple[str, ...] = get_args(DirectionName)
+
+
+def _parse_views(text: str) -> tuple[str, ...]:
+    views = tuple(part.strip().lower() for part in text.split(","))
+    for view in views:
+        if view not in _VIEWS or views.count(view) > 1:
+            fault = unknown_name("view", view, _VIEWS) if view not in _VIEWS else f"the view {view} is given twice"
+            raise ValueError(fault)
+    return views
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,19 +67,41 @@ class BatchSettings:
         group="make",
         default=".stl",
         first=True,
-        parse=lambda text: text.lower() if text.startswith(".") else f".{text.lower()}",
+        parse=_parse_extension,
         words=tuple(extension[1:] for extension in MESH_INPUTS),
     )
     measure: bool = option(
         "--no-measure", "leave out area, volume, components and gates of the meshes", group="make", default=True
     )
-    picture: bool = option("--no-picture", "leave out the picture of each case", group="make", default=True)
+    mesh: bool = option(
+        "--no-mesh",
+        "delete the meshes of a case once they are measured and in its pictures",
+        group="make",
+        default=True,
+    )
+    cloud: str | None = option(
+        "--cloud EXT",
+        "also write a cloud of points of the same surface, with normals, as clrecon cloud --hu: format, such as ply",
+        group="make",
+        parse=_parse_extension,
+        words=tuple(extension[1:] for extension in CLOUD_FORMATS),
+    )
+    picture: bool = option("--no-picture", "leave out the pictures of each case", group="make", default=True)
+    views: Sequence[str] = view_option(
+        "V[,V...]",
+        f"sides of the patient from which pictures are taken: {', '.join(_VIEWS)} (default: {_VIEWS[0]})",
+        group="make",
+        default=(_VIEWS[0],),
+        parse=_parse_views,
+        words=_VIEWS,
+    )
     workers: int | None = option(
         "--workers N", "processes that run cases in parallel (default: one for each device)", group="run", first=True
     )
     devices: str | None = option(
         "--devices D,D",
-        "OpenCL devices by index, assigned to the workers in turn (default: that of --device)",
+        f"OpenCL devices by index, assigned to the workers in turn; {ALL_DEVICES}: those of this machine (default: the"
+        " one of --device)",
         group="run",
     )
     scheduler: str | None = option(
@@ -85,10 +128,16 @@ class BatchSettings:
 
     def __post_init__(self) -> None:
         find_extension(f"mesh{self.format}", MESH_INPUTS, "mesh")
+        if self.cloud is not None:
+            find_extension(f"cloud{self.cloud}", CLOUD_FORMATS, "cloud")
         if self.workers is not None and not 1 <= self.workers <= _MOST_WORKERS:
             raise UsageError(f"a batch takes 1 to {_MOST_WORKERS} workers, not {self.workers}")
-        if self.devices is not None and not all(word.strip().isdecimal() for word in self.devices.split(",")):
-            raise UsageError(f"{self.devices!r:.60} are no devices: their indexes with commas, such as 0,1")
+        if self.devices not in (None, ALL_DEVICES) and not all(
+            word.strip().isdecimal() for word in str(self.devices).split(",")
+        ):
+            raise UsageError(
+                f"{self.devices!r:.60} are no devices: their indexes with commas, such as 0,1, or {ALL_DEVICES}"
+            )
         if self.scheduler not in (None, LOCAL) and (self.workers, self.devices) != (None, None):
             names = f"{name_parameter('workers', 'N')} and {name_parameter('devices', 'D,D')}"
             raise UsageError(
@@ -97,7 +146,19 @@ class BatchSettings:
 
     def deal_devices(self) -> list[str | None]:
         """Return a device for each worker, None for the one that each job would choose."""
-        devices: list[str | None] = [None] if self.devices is None else [*map(str.strip, self.devices.split(","))]
+        devices: list[str | None] = [None]
+        if self.devices == ALL_DEVICES:
+            from clrecon.opencl import list_devices, remembered_fault
+
+            devices = [
+                str(device.index)
+                for device in list_devices()
+                if not (device.shortcoming or device.is_simulator or remembered_fault(device))
+            ]
+            if not devices:
+                raise DeviceError("there is no usable OpenCL device on this machine")
+        elif self.devices is not None:
+            devices = [*map(str.strip, self.devices.split(","))]
         return [devices[number % len(devices)] for number in range(self.workers or len(devices))]
 
 
@@ -162,7 +223,7 @@ def _with_tuples(value: Any) -> Any:
     return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
 
 
-_FORMAT = 1
+_FORMAT = 2
 """Rises when files of a case change their names or their meaning."""
 
 _ANY_MACHINE = ("device", "memory", "labels")
@@ -177,7 +238,8 @@ def make_key(case: Case, plan: Plan) -> str:
     settings = plan.settings_of(case)
     values = {own.name: getattr(settings, own.name) for own in fields(settings) if own.name not in _ANY_MACHINE}
     labels = None if settings.labels is None else replace(settings.labels, path="")
-    asked = (_FORMAT, package_version(), values, labels, plan.batch.format, plan.batch.measure, plan.batch.picture)
+    outputs = [getattr(plan.batch, name) for name in ("format", "mesh", "measure", "cloud", "picture", "views")]
+    asked = (_FORMAT, package_version(), values, labels, outputs)
     digest = hashlib.sha256(repr(asked).encode("utf-8", "replace"))
     for path in filter(None, (case.source, case.labels)):
         remote = open_remote(path).list_entries() if is_url(path) else None
@@ -214,12 +276,15 @@ def read_cases(manifest: str | Path, selection: ScanSettings) -> list[Case]:
 
 
 def _read_table(path: str | Path) -> list[Case]:
-    name = escape_text(os.path.basename(path))
+    name, folder = escape_text(os.path.basename(path)), os.path.dirname(os.path.abspath(path))
     try:
-        with io.TextIOWrapper(open_regular(path), "utf-8-sig", newline="") as stream:
-            rows = csv.reader(stream, strict=True)
-            places = _find_columns(name, next(rows, []))
-            cases = _read_rows(name, rows, places, os.path.dirname(os.path.abspath(path)))
+        if os.path.splitext(path)[1].lower() == ".parquet":
+            cases = _read_parquet(name, path, folder)
+        else:
+            with io.TextIOWrapper(open_regular(path), "utf-8-sig", newline="") as stream:
+                table = csv.reader(stream, strict=True)
+                places = _find_columns(name, next(table, []))
+                cases = _read_rows(name, ((table.line_num, row) for row in table), places, folder)
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"the manifest {name} is no table in UTF-8 with commas: {error}") from None
     except OSError as error:
@@ -227,6 +292,22 @@ def _read_table(path: str | Path) -> list[Case]:
     if not cases:
         raise UsageError(f"the manifest {name} has no case below its line of columns")
     return cases
+
+
+def _read_parquet(name: str, path: str | Path, folder: str) -> list[Case]:
+    """Read the rows of a Parquet file, which count as the lines of a table below its line of columns."""
+    parquet = import_package("pyarrow.parquet", "a manifest in Parquet", "pyarrow")
+    with open_regular(path) as stream:
+        try:
+            table = parquet.ParquetFile(stream)
+            places = _find_columns(name, table.schema_arrow.names)
+            rows = chain.from_iterable(batch.to_pylist() for batch in table.iter_batches(1000))
+            cells = (["" if cell is None else str(cell) for cell in row.values()] for row in rows)
+            return _read_rows(name, enumerate(cells, start=2), places, folder)
+        except (ValueError, OSError) as error:  # as pyarrow's errors are
+            if isinstance(error, UsageError):
+                raise
+            raise UsageError(f"the manifest {name} is no table in Parquet: {error!s:.200}") from None
 
 
 def _find_columns(name: str, header: Sequence[str]) -> dict[str, int]:
@@ -245,13 +326,12 @@ def _find_columns(name: str, header: Sequence[str]) -> dict[str, int]:
     return {word: place for place, word in enumerate(words)}
 
 
-def _read_rows(name: str, rows: Any, places: dict[str, int], folder: str) -> list[Case]:
+def _read_rows(name: str, rows: Iterable[tuple[int, Sequence[str]]], places: dict[str, int], folder: str) -> list[Case]:
     lines: dict[str, int] = {}
     cases: list[Case] = []
-    for row in rows:
+    for line, row in rows:
         if not any(cell.strip() for cell in row):
             continue
-        line = rows.line_num
         if len(row) != len(places):
             raise UsageError(f"line {line} of the manifest {name} has {len(row)} cells, its first line {len(places)}")
         cells = {column: row[place].strip() for column, place in places.items()}

@@ -21,6 +21,7 @@ from clrecon.errors import ClreconError
 from clrecon.jobs.batch.case import LOST, Answer
 from clrecon.jobs.batch.plan import Case, Plan
 from clrecon.jobs.cluster import WITHOUT_DASK_DEFAULTS, Died, open_cluster
+from clrecon.reading.urls import is_url
 from clrecon.system.light_dataclass import replace
 from clrecon.system.processes import describe_end, share_machine, start_python
 
@@ -191,7 +192,9 @@ class DaskScheduler:
 
     def run(self, cases: Iterable[Case]) -> Iterator[Outcome]:
         batch = uuid.uuid4().hex
-        absolute = (case._replace(source=os.path.abspath(case.source)) for case in cases)
+        absolute = (
+            case if is_url(case.source) else case._replace(source=os.path.abspath(case.source)) for case in cases
+        )
         with open_cluster(self._address, self._devices, self._warn) as cluster:
             try:
                 for case, result in cluster.run_tasks(

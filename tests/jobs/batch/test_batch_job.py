@@ -98,6 +98,28 @@ def test_row_of_a_case_in_the_table_has_the_figures_of_its_report(cohort: Path) 
     assert float(row["volume_ml"]) == pytest.approx(report["mesh"]["volume_ml"], abs=1e-6)  # six decimals
 
 
+def test_case_with_a_cloud_and_two_views_and_no_mesh_has_just_these_files(cohort: Path, tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text(f"case,input\nA,{cohort / 'ball1'}\n")
+    options = ["--cloud", "ply", "--no-mesh", "--view", "left,anterior"]
+
+    assert main(["batch", str(tmp_path / "m.csv"), "-o", str(tmp_path / "out"), "--hu", "0", "-q", *options]) == 0
+
+    files = files_of(tmp_path / "out" / "A")
+    assert {*files} == {"case.json", "cloud.ply", "picture_anterior.png", "picture_left.png"}
+    assert json.loads(files["case.json"])["mesh"]["triangles"] > 0
+    cloud = tmp_path / "cloud.ply"
+    assert main(["cloud", str(cohort / "ball1"), "-o", str(cloud), "--hu", "0", "--normals", "-q"]) == 0
+    assert files["cloud.ply"] == cloud.read_bytes()
+
+
+def test_cloud_of_two_levels_is_refused_before_any_case(cohort: Path, tmp_path: Path, printed: Any) -> None:
+    (tmp_path / "m.csv").write_text(f"case,input\nA,{cohort / 'ball1'}\n")
+    command = ["batch", str(tmp_path / "m.csv"), "-o", str(tmp_path / "out"), "--hu", "0,50", "--cloud", "ply"]
+    assert main(command) == 3
+    printed().assert_error("--cloud", "--hu")
+    assert not (tmp_path / "out").exists()
+
+
 @dataclass
 class PartialBatch:
     """Three balls and a case without a scan, of which the first two were made; then the mesh of A was cut off."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,9 @@ from refusals import refused
 
 from clrecon.cli.main import main
 from clrecon.errors import NoDicomError, UsageError
-from clrecon.jobs.batch.plan import Case, check_places, read_cases
+from clrecon.jobs.batch.plan import BatchSettings, Case, check_places, read_cases
 from clrecon.jobs.options import ScanSettings
+from clrecon.opencl import list_devices
 
 
 def read_table(folder: Path, text: str) -> list[Case]:
@@ -76,6 +78,30 @@ def test_manifest_of_a_hundred_thousand_rows_is_read_in_less_than_100_mb(tmp_pat
     tracemalloc.stop()
     assert len(cases) == 100_000 and cases[-1].name == "case-99999"
     assert peak < 100e6
+
+
+def test_manifest_in_parquet_names_the_cases_of_the_same_table_in_csv(tmp_path: Path) -> None:
+    pyarrow, parquet = (pytest.importorskip(name) for name in ("pyarrow", "pyarrow.parquet"))
+    columns = {"case": ["P-1", "P-2"], "input": ["ct/a", "ct/b"], "series": [None, 7]}
+    parquet.write_table(pyarrow.table(columns), tmp_path / "cohort.parquet")
+    expected = read_table(tmp_path, "case,input,series\nP-1,ct/a,\nP-2,ct/b,7\n")
+    assert read_cases(tmp_path / "cohort.parquet", ScanSettings()) == expected
+
+
+def test_manifest_in_parquet_without_pyarrow_is_refused_with_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    (tmp_path / "cohort.parquet").write_bytes(b"PAR1")
+    with refused(UsageError, "pyarrow", "install"):
+        read_cases(tmp_path / "cohort.parquet", ScanSettings())
+
+
+def test_all_devices_are_those_of_the_machine_that_are_no_simulators() -> None:
+    usable = [str(own.index) for own in list_devices() if not (own.is_simulator or own.shortcoming)]
+    assert BatchSettings(devices="all").deal_devices() == usable
+    assert BatchSettings(devices="all", workers=1).deal_devices() == usable[:1]
 
 
 def test_each_stack_of_a_folder_is_a_case_named_by_its_number(tmp_path: Path) -> None:
