@@ -26,6 +26,7 @@ outside and holds no patient data: files are numbered, not named, unless --name 
 and shows or hides each part (component, label, file). See docs/view.md.
 
 examples:
+  clrecon view
   clrecon view CT_FOLDER
   clrecon view CT_FOLDER bone.stl cloud.ply --labels spine.nii.gz --save-as shown.3mf
   clrecon view CT_FOLDER --no-open --port 8000
@@ -43,8 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "inputs",
         metavar="INPUT",
-        nargs="+",
-        help="file of a mesh or cloud, or a scan: DICOM folder or file, NIfTI, NRRD or MetaImage file",
+        nargs="*",
+        help="file of a mesh or cloud, or a scan: DICOM folder or file, NIfTI, NRRD or MetaImage file (default: a page"
+        " where files are dropped)",
     )
     shown = parser.add_argument_group("what is shown")
     shown.add_argument("--html", metavar="FILE", help="write a page that shows the inputs: .html", first=True)
@@ -110,6 +112,8 @@ def _check_faces(options: argparse.Namespace) -> None:
         raise UsageError(f"--state belongs to the view in the browser and to --picture: leave out {given[0]}, or it")
     if options.size is not None and options.picture is None:
         raise UsageError("--size is that of the picture: name its file with --picture")
+    if given and not options.inputs:
+        raise UsageError(f"{given[0]} needs an input: name a scan or a mesh")
     if given:
         for name, is_given in (
             ("--port", options.port is not None), ("--no-open", not options.opens), ("--save-as", options.save_as)
@@ -178,8 +182,8 @@ def _serve(options: argparse.Namespace, settings: ViewSettings, console: Console
     log = logging.getLogger("clrecon.viewer")
     log.addHandler(faults)
 
-    def ready(server: Any, view: Any, warnings: list[str]) -> None:
-        device = view.painter.device.label
+    def ready(server: Any, used: Any, warnings: list[str]) -> None:
+        device = used.label
         facts = {"address": server.address, "port": server.port, "device": device, "warnings": warnings}
         console.result(name_schema("view", facts))
         for warning in warnings:

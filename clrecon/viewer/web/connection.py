@@ -211,6 +211,7 @@ class Connection:
     save_as: Files on this computer that it may have written; numbered where they exist.
     wrote: Called with a line for each of these.
     quit: Ends the server.
+    has_start: There is a start page, where something else can be opened.
     """
 
     def __init__(
@@ -229,6 +230,7 @@ class Connection:
         self.downloads = Downloads(folder)
         self._save_as = tuple(save_as)
         self._wrote, self._quit = wrote, quit
+        self.has_start = False
         self._pace = Pace()
         self._keys: dict[str, Any] = {}
         self._ground = (0, 0, 0)
@@ -261,6 +263,7 @@ class Connection:
         has_scan = bool(self._session.model.scans)
         kinds = [kind for kind in ("mesh", "cloud", "volume", "picture", "view") if has_scan or kind != "volume"]
         fixed = {**page_words(), "formats": {kind: list(KINDS[kind]) for kind in kinds}, "save_as": self._save_as}
+        fixed["has_start"] = self.has_start
         await self._socket.send_str(json.dumps({"fixed": fixed}))
         tasks = [asyncio.ensure_future(work()) for work in (self._write, self._command)]
         try:

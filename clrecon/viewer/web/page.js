@@ -165,6 +165,7 @@
 
   function takeFixed(now) {
     fixed = now;
+    find("another").hidden = !now.has_start;
     const kinds = now.save_as.length ? { "--save-as": [""], ...now.formats } : now.formats;
     find("format").replaceChildren(...Object.entries(kinds).map(([kind, endings]) => {
       const group = element("optgroup", "", { label: kind });
@@ -457,6 +458,7 @@
   find("save").onclick = () => save(find("format").value);
   find("photo").onclick = () => save(".png");
   find("undo").onclick = () => run("undo");
+  find("another").onclick = () => { location.search += "&start"; };
   find("help").onclick = () => find("keys").showModal();
   find("closekeys").onclick = () => find("keys").close();
 

@@ -28,6 +28,7 @@ import threading
 import webbrowser
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import ExitStack
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -37,14 +38,17 @@ from clrecon.errors import ClreconError, UsageError
 from clrecon.exchange.page import hash_code, read_page_code
 from clrecon.jobs.view import ViewSettings
 from clrecon.jobs.view.inputs import check_view_settings
+from clrecon.opencl import Device
+from clrecon.operators import take_device
 from clrecon.system.arguments import name_parameter
 from clrecon.system.log import get_logger
 from clrecon.system.progress import Progress
 from clrecon.viewer.drawing.saving import check_names
 from clrecon.viewer.model.state import ViewState
-from clrecon.viewer.session.opening import OpenedView, open_view
+from clrecon.viewer.session.opening import open_view
 from clrecon.viewer.session.session import ViewSession
 from clrecon.viewer.web.connection import Connection, Download, ignore_line
+from clrecon.viewer.web.start_page import StartDoors, StartRoom
 
 if TYPE_CHECKING:
     from aiohttp import web
@@ -84,9 +88,13 @@ class Page(NamedTuple):
     policy: str
 
 
-def compose_page(host: str) -> Page:
+_VIEW, _START = ("page", ("page.js", "panes.js")), ("start", ("start.js",))
+"""Pages: the name of their document and style, and their scripts."""
+
+
+def compose_page(host: str, *, start: bool = False) -> Page:
     """Return the page for a server under `host`, with port: own script and style, pictures, this server alone."""
-    content, script, style = _compose()
+    content, script, style = _compose(*(_START if start else _VIEW))
     policy = (
         f"default-src 'none'; script-src '{script}'; style-src '{style}'; img-src blob: data:; connect-src 'self'"
         f" ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -95,13 +103,13 @@ def compose_page(host: str) -> Page:
 
 
 @cache
-def _compose() -> tuple[bytes, str, str]:
+def _compose(name: str, scripts: tuple[str, ...]) -> tuple[bytes, str, str]:
     """Return the document and the hashes of its script and style."""
-    parts = "\n".join(read_page_code(name, __package__) for name in ("page.js", "panes.js"))
+    parts = "\n".join(read_page_code(each, __package__) for each in scripts)
     script = f"{read_page_code('page_shared.js')}\n(() => {{\n{parts}}})();\n"
-    style = "\n".join((read_page_code("page.css"), read_page_code("page.css", __package__)))
+    style = "\n".join((read_page_code("page.css"), read_page_code(f"{name}.css", __package__)))
     filled = {"STYLE": style, "SCRIPT": script}
-    document = re.sub("@([A-Z]+)@", lambda place: filled[place[1]], read_page_code("page.html", __package__) + "\n")
+    document = re.sub("@([A-Z]+)@", lambda place: filled[place[1]], read_page_code(f"{name}.html", __package__) + "\n")
     return document.encode(), hash_code(script), hash_code(style)
 
 
@@ -182,11 +190,20 @@ OpenSession = Callable[[Callable[[], None]], ViewSession]
 
 
 class WebServer:
-    """The server of a view, a context manager; its port is taken at once, its `address` holds the secret."""
+    """The server of a view, a context manager; its port is taken at once, its `address` holds the secret.
+
+    start: What the start page drops and opens; None: there is a view from the beginning.
+    """
 
     def __init__(
-        self, port: int | None = None, *, save_as: Sequence[str] = (), wrote: Callable[[str], object] = ignore_line
+        self,
+        port: int | None = None,
+        *,
+        save_as: Sequence[str] = (),
+        wrote: Callable[[str], object] = ignore_line,
+        start: StartRoom | None = None,
     ) -> None:
+        self._start = start
         self._save_as, self._wrote = save_as, wrote
         self._listener = bind_port(port)
         self._secret = make_secret()
@@ -211,6 +228,8 @@ class WebServer:
         """
         with tempfile.TemporaryDirectory(prefix="clrecon-") as folder, contextlib.suppress(KeyboardInterrupt):
             self._downloads = Path(folder)
+            if self._start is not None:
+                self._start.settle(self._downloads)
             asyncio.run(self._serve(open_session, ready))
 
     def stop(self) -> None:
@@ -235,6 +254,8 @@ class WebServer:
         application.router.add_get("/", self._send_page, allow_head=False)
         application.router.add_get("/socket", self._connect, allow_head=False)
         application.router.add_get("/saved/{ticket}", self._send_saved, allow_head=False)
+        if self._start is not None:
+            StartDoors(self._start, self._leave_all).add_to(application)
         runner = web.AppRunner(
             application, access_log=None, logger=silent, handle_signals=False, shutdown_timeout=_SECONDS_TO_END
         )
@@ -245,11 +266,15 @@ class WebServer:
             await web.SockSite(runner, self._listener).start()
             ready(self._downloads)
             await ended.wait()
-            leaving = [asyncio.ensure_future(self._leave(*pair)) for pair in list(self._connections.items())]
-            if leaving:
-                await asyncio.wait(leaving, timeout=_SECONDS_TO_END)
+            await self._leave_all()
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(runner.cleanup(), 2 * _SECONDS_TO_END)
+
+    async def _leave_all(self) -> None:
+        leaving = [asyncio.ensure_future(self._leave(*pair)) for pair in list(self._connections.items())]
+        self._left.clear()
+        if leaving:
+            await asyncio.wait(leaving, timeout=_SECONDS_TO_END)
 
     async def _leave(self, connection: Connection, socket: Any) -> None:
         await connection.close()
@@ -266,7 +291,7 @@ class WebServer:
             request.headers.get("Origin"),
             given,
             self._secret,
-            by_page=request.path == "/socket",
+            by_page=request.path == "/socket" or (request.method == "POST" and request.path.startswith("/start/")),
         )
         if refused is not None:
             return web.Response(status=403, text=refused + "\n")
@@ -278,7 +303,8 @@ class WebServer:
     async def _send_page(self, request: web.Request) -> web.Response:
         from aiohttp import web
 
-        page = compose_page(request.headers["Host"])
+        start = self._start is not None and (self._start.view is None or "start" in request.query)
+        page = compose_page(request.headers["Host"], start=start)
         return web.Response(
             body=page.content,
             content_type="text/html",
@@ -296,8 +322,9 @@ class WebServer:
             return socket
         try:
             connection = Connection(
-                self._open_session, socket, self._downloads, save_as=self._save_as, wrote=self._wrote, quit=self.stop
-            )
+                self._open_session, socket, self._downloads, save_as=self._save_as, wrote=self._wrote, quit=self.stop,
+            )  # fmt: skip
+            connection.has_start = self._start is not None
             tab = request.query.get("tab", "")[:_MOST_TAB]
             connection.resume(self._left.get(tab))
         except ClreconError as error:
@@ -395,32 +422,43 @@ def serve_view(
     save_as: Sequence[str] = (),
     wrote: Callable[[str], object] = ignore_line,
     progress: Progress | None = None,
-    ready: Callable[[WebServer, OpenedView, list[str]], object] = lambda server, view, warnings: None,
+    ready: Callable[[WebServer, Device, list[str]], object] = lambda server, device, warnings: None,
 ) -> None:
-    """Show inputs in browsers, until SIGINT (Ctrl-C), SIGTERM or SIGHUP.
+    """Show inputs in browsers, until SIGINT (Ctrl-C), SIGTERM or SIGHUP; without inputs a page where they are dropped.
 
     save_as: Files that a save writes into the current folder, in place of a download; numbered where they exist.
     wrote: Called with a line for each of these.
-    ready: Called with the server, what was read and warnings, once the address can be opened.
+    ready: Called with the server, the device and warnings, once the address can be opened.
     """
     settings = settings or ViewSettings()
     check_view_settings(settings)
     check_names(save_as)
-    with (
-        WebServer(port, save_as=save_as, wrote=wrote) as server,
-        open_view(inputs, settings, progress=progress) as view,
-        view.session() as first,  # nobody looks through it: it builds kernels while the address is being opened
-    ):
+    given = [name for name, value in (("state", settings.state), ("labels", settings.scan.labels)) if value is not None]
+    if given and not inputs:
+        raise UsageError(f"{name_parameter(given[0])} belongs to an input: name a scan or a mesh too")
+    with ExitStack() as stack:
+        room = None if inputs else StartRoom(settings)
+        server = stack.enter_context(WebServer(port, save_as=save_as, wrote=wrote, start=room))
+        notes: list[str] = []
+        if room is not None:
+            device = take_device(settings.scan.device)
+            open_session: OpenSession = stack.enter_context(room).open_session
+        else:
+            view = stack.enter_context(open_view(inputs, settings, progress=progress))
+            first = stack.enter_context(view.session())  # nobody looks through it: it builds kernels meanwhile
+            device, notes = view.painter.device, view.said
+            open_session = view.session
 
         def begin(folder: Path) -> None:
-            first.prepare()
-            warnings = list(view.said)
+            if room is None:
+                first.prepare()
+            warnings = list(notes)
             if opens and has_screen():
                 open_browser(server.address, folder)
             elif opens:
                 warnings.append(
                     "no browser was opened: there is no screen; open the address on a computer that has one"
                 )
-            ready(server, view, warnings)
+            ready(server, device, warnings)
 
-        server.serve(view.session, begin)
+        server.serve(open_session, begin)
