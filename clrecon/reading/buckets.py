@@ -25,7 +25,11 @@ _AT_ONCE = 16
 _PIECE = 1 << 20
 
 _RETRIES = {"max_retries": 4, "retry_timeout": timedelta(minutes=1)}
-_TIMES = {"connect_timeout": timedelta(seconds=10), "timeout": timedelta(hours=1)}
+_TIMES = {
+    "connect_timeout": timedelta(seconds=10),
+    "read_timeout": timedelta(minutes=1),  # without a byte
+    "timeout": timedelta(hours=12),  # for a whole object
+}
 """Of the request for one object; obstore itself doubles the pauses."""
 
 
@@ -38,6 +42,7 @@ class Bucket:
         import_package("obstore.store", "a bucket", "obstore")
         folder, slash, key = parts.path.rpartition("/")
         self._key = unquote(key)
+        self._is_ending = False
         options = {**_TIMES, "allow_http": os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true")}
         url = parts._replace(path=folder + slash, query="", fragment="").geturl()
         try:
@@ -77,11 +82,13 @@ class Bucket:
                     done.result()
                     progress("fetch", number, len(entries))
         finally:
+            self._is_ending = True
             pool.shutdown(cancel_futures=True)
 
     def _fetch_one(self, entry: Entry, target: Path) -> None:
-        pieces = self._obstore.get(self._store, entry.name).stream(min_chunk_size=_PIECE)
-        _write_pieces(pieces, entry, target, self._name)
+        pieces = iter(self._obstore.get(self._store, entry.name).stream(min_chunk_size=_PIECE))
+        wanted = iter(lambda: b"" if self._is_ending else next(pieces, b""), b"")
+        _write_pieces(wanted, entry, target, self._name)
 
 
 def _as_entry(item: Any) -> Entry:

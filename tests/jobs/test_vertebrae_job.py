@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -128,12 +129,13 @@ def test_vertebrae_with_a_first_level_are_the_same_voxels_with_the_names_of_leve
 
 @pytest.fixture(scope="module")
 def segmentation(scan: Path, written: Path) -> Path:
-    """The folder of a run that wrote a DICOM SEG with L2 named at its centre, and other.png."""
+    """The folder of a run on a zip file that wrote a DICOM SEG, with L2 named at its centre, and other.png."""
     folder = scan.parent / "segmentation"
     folder.mkdir()
     middle = json.loads((written / "a.json").read_text())["vertebrae"][1]["centre_mm"]
     name = f"{','.join(str(value) for value in middle)}=L2"
-    command = ["vertebrae", str(scan), "-o", str(folder / "s.dcm"), "--picture", str(folder / "other.png"), "-q"]
+    packed = shutil.make_archive(str(scan.parent / "packed"), "zip", scan)
+    command = ["vertebrae", packed, "-o", str(folder / "s.dcm"), "--picture", str(folder / "other.png"), "-q"]
     assert main([*command, "--name-at", name]) == 0
     return folder
 

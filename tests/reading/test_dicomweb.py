@@ -189,6 +189,18 @@ def test_other_number_of_instances_than_listed_is_refused_with_it(sent: int, arc
         read_volume(archive.url)
 
 
+def test_parts_without_an_end_are_refused_where_there_are_more_than_listed(archive: Archive) -> None:
+    def send_on(handler: Any) -> None:
+        send(handler, b"", STORED, Content_Length="")
+        while True:
+            handler.wfile.write(join_parts([b"DICM"])[: -len(join_parts([]))])
+
+    archive.answers = [archive.answer, archive.answer, send_on]
+
+    with refused(RefusedInputError, archive.host, SLICES):
+        fetch(archive.url, fetched_bytes=1 << 20)
+
+
 def test_incomplete_series_is_refused_with_both_counts(archive: Archive) -> None:
     del archive.instances[2:]
 

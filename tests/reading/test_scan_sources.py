@@ -143,7 +143,14 @@ def test_path_is_no_url(text: str) -> None:
     assert not is_url(text)
 
 
-def test_messages_name_of_a_url_neither_its_query_nor_the_uids_of_an_archive() -> None:
+@pytest.mark.parametrize("what", ["password", "user", "password of a bucket"])
+def test_url_with_a_user_or_password_is_refused_and_the_netrc_file_named(what: str) -> None:
+    with refused(UsageError, "password", "netrc"):
+        check_url(WRONG_URLS[what])
+
+
+def test_messages_name_of_a_url_neither_user_nor_query_nor_the_uids_of_an_archive() -> None:
+    assert shown_url(f"abfs://{SECRET}@a.example/scan") == "abfs://a.example/scan"
     assert shown_url(f"https://a.example/scan.zip?key={SECRET}#b") == "https://a.example/scan.zip"
     assert shown_url("dicomweb+https://a.example:8/x/studies/1.2/series/3.4") == "a.example:8"
 
@@ -195,7 +202,7 @@ def test_file_of_the_web_that_is_not_there_is_no_dicom(server: Server) -> None:
 
 
 def test_file_of_the_web_larger_than_allowed_is_refused(server: Server) -> None:
-    server.answers = [answering(bytes(2000))]
+    server.answers = [answering(Content_Length="2000")]  # none of them arrives
 
     with (
         refused(RefusedInputError, "TMPDIR"),
@@ -234,8 +241,11 @@ def test_object_that_ends_early_is_refused_with_both_sizes(bucket: BucketServer)
         read_volume("s3://scans/scan.zip")
 
 
-def test_object_whose_name_leads_out_of_the_folder_is_refused(bucket: BucketServer) -> None:
-    bucket.objects = {"p/../../outside": b"x"}
+@pytest.mark.parametrize(
+    "name", ["../../outside", "..\\..\\outside", "C:\\outside"], ids=["slashes", "backslashes", "drive"]
+)
+def test_object_whose_name_leads_out_of_the_folder_is_refused(name: str, bucket: BucketServer) -> None:
+    bucket.objects = {f"p/{name}": b"x"}
 
     with refused(RefusedInputError, "s3://scans/p"):
         read_volume("s3://scans/p/")
