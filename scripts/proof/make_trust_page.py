@@ -52,14 +52,17 @@ def accuracy_table() -> str:
         title = path.stem.replace("phantoms_", " (seed ") + ")" if "_" in path.stem else ""
         for group in dict.fromkeys(one["group"] for one in figures if "best" in one):
             phantoms = [one for one in figures if one["group"] == group]
-            cells = []
-            for rule in RULES:
-                used = [one[rule] for one in phantoms if rule == "auto" or one["name"] not in NO_HU]
-                errors = [one["mean_mm"] for one in used]
-                lost = fmean(one["lost_share"] for one in used)
-                cells.append(f"{fmean(errors):.2f}, {max(errors):.2f}, {_percent(lost)}")
+            errors = (errors_of_rule(phantoms, rule) for rule in RULES)
+            cells = [f"{mean:.2f}, {worst:.2f}, {_percent(lost)}" for mean, worst, lost in errors]
             rows.append([f"{group}{title}", len(phantoms), *cells])
     return markdown_table(["phantoms with a known surface", "number", *RULES.values()], rows)
+
+
+def errors_of_rule(phantoms: Sequence[dict[str, Any]], rule: str) -> tuple[float, float, float]:
+    """Return the mean distance over phantoms and that of the worst, in mm, and the mean share of lost surface."""
+    figures = [one[rule] for one in phantoms if rule == "auto" or one["name"] not in NO_HU]
+    errors = [one["mean_mm"] for one in figures]
+    return fmean(errors), max(errors), fmean(one["lost_share"] for one in figures)
 
 
 def count_wrong(table: str) -> dict[str, tuple[int, int, int]]:
