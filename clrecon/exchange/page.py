@@ -40,8 +40,8 @@ STEPS = 65_535
 """Steps of a coordinate along a side of the bounding box."""
 
 _NORMAL_SCALE = 127.0
-_LEVEL = 6
-"""Of deflate: 9 takes four times as long, for files 1.5 % smaller."""
+_LEVEL = 4
+"""Of deflate: 6 takes twice as long, for files 2.5 % smaller."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import sys
 import time
 
 import dicom_series
@@ -48,6 +50,26 @@ def test_simpleitk_reads_a_written_volume_with_the_same_values_at_the_same_place
 @pytest.mark.parametrize("name", NAMES)
 def test_writing_a_volume_returns_the_bytes_of_its_file(tmp_path, name):
     assert write_volume(read_scan(tmp_path, "oblique"), tmp_path / name) == (tmp_path / name).stat().st_size
+
+
+def test_isal_and_zlib_pack_the_same_bytes(tmp_path, monkeypatch):
+    pytest.importorskip("isal")
+    volume = read_scan(tmp_path, "oblique")
+    write_volume(volume, tmp_path / "isal.nii.gz")
+    monkeypatch.setitem(sys.modules, "isal.igzip", None)
+    write_volume(volume, tmp_path / "zlib.nii.gz")
+    packed = [(tmp_path / name).read_bytes() for name in ("isal.nii.gz", "zlib.nii.gz")]
+    assert packed[0] != packed[1]  # both were used
+    assert gzip.decompress(packed[0]) == gzip.decompress(packed[1])
+
+
+def test_isal_packs_a_volume_twice_into_the_same_bytes(tmp_path, monkeypatch):
+    pytest.importorskip("isal")
+    volume = read_scan(tmp_path, "oblique")
+    for name in ("first.nii.gz", "second.nii.gz"):
+        write_volume(volume, tmp_path / name)
+        monkeypatch.setattr(time, "time", lambda: 1e9)  # no date in the file
+    assert (tmp_path / "first.nii.gz").read_bytes() == (tmp_path / "second.nii.gz").read_bytes()
 
 
 @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
