@@ -62,6 +62,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_output(parser, f"mesh file: {MESH_FILES}")
     checks = add_mesh_options(parser)
     common.add_report(checks, "affine, counts, quality, device and times")
+    parser.add_argument(
+        "--store",
+        metavar="URL",
+        help="also store the meshes in the DICOMweb archive dicomweb+https://HOST/PATH, as Encapsulated STL with the"
+        " name, ID and birth date of the patient",
+    )
 
 
 def add_mesh_options(parser: argparse.ArgumentParser, without: Container[str] = ()) -> argparse._ArgumentGroup:
@@ -122,6 +128,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         report_path=options.report,
         no_clobber=options.no_clobber,
         measure=bool(options.report or options.json or options.verbose),
+        store=options.store,
         progress=console.progress,
     )
     console.result(report)
@@ -129,6 +136,10 @@ def run(options: argparse.Namespace, console: Console) -> int:
         console.say(line)
     together = options.one_file or (options.all_parts and makes_objects(options.output))
     console.say(f"wrote    {_describe_files(options.output, report, together=together)}")
+    if report.stored is not None:
+        console.say(
+            f"stored   {common.megabytes(report.stored['bytes'])}, with the patient's name, as Encapsulated STL"
+        )
     if options.report:
         console.say(f"report   {printable(options.report)}")
     return finish_with_gates(

@@ -10,6 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack
 from copy import copy
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
@@ -395,3 +396,34 @@ class Run(Laps):
         commit_all(self.files)
         log_warnings(log, report.warnings, self.logged)
         return report
+
+
+class ArchiveTarget:
+    """An archive that gets the meshes of a run, each with the patient, the study and the slices of its scan.
+
+    source: The input as a path that stays until the end of the run.
+    """
+
+    def __init__(self, url: str, source: str | Path, run: Run):
+        from clrecon.reading.dicom.storing import read_origin
+        from clrecon.reading.dicomweb import Store
+
+        self._archive = Store(url)
+        self._archive.check()
+        self.source = run.open(source)
+        self._origin = read_origin(self.source, run.settings)
+
+    def store_meshes(self, meshes: Sequence[Mesh], *, is_modified: bool) -> dict[str, int]:
+        """Store each mesh as Encapsulated STL in the frame of the scan; return their number and bytes."""
+        from clrecon.exchange import stl
+        from clrecon.reading.dicom.storing import encode_model
+
+        size = 0
+        for mesh in meshes:
+            stream = BytesIO()
+            stl.write(stream, mesh.describe("lps"))
+            title = str(mesh.report.get("part_name") or "surface")
+            uid, instance = encode_model(stream.getvalue(), self._origin, title, is_modified=is_modified)
+            self._archive.store(uid, instance)
+            size += len(instance)
+        return {"instances": len(meshes), "bytes": size}

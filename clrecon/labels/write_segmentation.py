@@ -18,13 +18,13 @@ import numpy as np
 
 from clrecon.errors import RefusedInputError
 from clrecon.labels.label_map import LabelMap
+from clrecon.reading.dicom.storing import IMPLEMENTATION, ROOT, make_item
 from clrecon.version import package_version
 
 SourceSlice = tuple[Path, int, int]
 """File of a slice of the scan, its frame there from 0, and how many frames the file has."""
 
 _SEGMENTATION_CLASS = "1.2.840.10008.5.1.4.1.1.66.4"
-ROOT = "2.25."
 _KEPT = ("StudyInstanceUID", "SeriesInstanceUID", "FrameOfReferenceUID", "SOPClassUID", "SOPInstanceUID")
 _DATE, _TIME = "19700101", "000000"
 
@@ -55,7 +55,7 @@ def encode_segmentation(labels: LabelMap, slices: Sequence[SourceSlice], *, labe
     seg.SegmentSequence = Items([_segment(number, labels.name(number)) for number in numbers])
     seg.ReferencedSeriesSequence = Items([_references(sources)])
     organization = make_uid("dimensions")
-    seg.DimensionOrganizationSequence = Items([_item(DimensionOrganizationUID=organization)])
+    seg.DimensionOrganizationSequence = Items([make_item(DimensionOrganizationUID=organization)])
     seg.DimensionIndexSequence = Items(_dimensions(organization))
     seg.SharedFunctionalGroupsSequence = Items([_shared(labels)])
     seg.PerFrameFunctionalGroupsSequence = Items([_frame(labels, numbers, number, k, sources) for number, k in frames])
@@ -76,7 +76,7 @@ def _describe_series(make_uid: Callable[[str], str], first: dict[str, str]) -> A
     meta = FileMetaDataset()
     meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID = _SEGMENTATION_CLASS, make_uid("instance")
     meta.TransferSyntaxUID = ExplicitVRLittleEndian
-    meta.ImplementationClassUID = ROOT + "226127114137317107413166301416404110851"
+    meta.ImplementationClassUID = IMPLEMENTATION
     seg = FileDataset("", {}, file_meta=meta, preamble=b"\0" * 128)
     seg.SOPClassUID, seg.SOPInstanceUID = _SEGMENTATION_CLASS, meta.MediaStorageSOPInstanceUID
     for empty in ("PatientName", "PatientID", "PatientBirthDate", "PatientSex", "StudyDate", "StudyTime", "StudyID"):
@@ -105,7 +105,7 @@ def _describe_series(make_uid: Callable[[str], str], first: dict[str, str]) -> A
 def _dimensions(organization: str) -> list[Any]:
     """Return the order of the frames: by segment, then by place."""
     return [
-        _item(
+        make_item(
             DimensionOrganizationUID=organization,
             DimensionIndexPointer=pointer,
             FunctionalGroupPointer=group,
@@ -135,21 +135,12 @@ def _read_sources(slices: Sequence[SourceSlice]) -> list[tuple[dict[str, str], i
     return [(known[path], frame, frames) for path, frame, frames in slices]
 
 
-def _item(**values: Any) -> Any:
-    from pydicom import Dataset
-
-    item = Dataset()
-    for keyword, value in values.items():
-        setattr(item, keyword, value)
-    return item
-
-
 def _code(value: str, meaning: str, scheme: str = "SCT") -> list[Any]:
-    return [_item(CodeValue=value, CodingSchemeDesignator=scheme, CodeMeaning=meaning)]
+    return [make_item(CodeValue=value, CodingSchemeDesignator=scheme, CodeMeaning=meaning)]
 
 
 def _segment(number: int, name: str) -> Any:
-    return _item(
+    return make_item(
         SegmentNumber=number,
         SegmentLabel=name[:64],
         SegmentAlgorithmType="AUTOMATIC",
@@ -161,10 +152,10 @@ def _segment(number: int, name: str) -> Any:
 
 def _references(sources: Sequence[tuple[dict[str, str], int, int]]) -> Any:
     files = {uids["SOPInstanceUID"]: uids["SOPClassUID"] for uids, _, _ in sources}
-    return _item(
+    return make_item(
         SeriesInstanceUID=sources[0][0]["SeriesInstanceUID"],
         ReferencedInstanceSequence=[
-            _item(ReferencedSOPClassUID=kind, ReferencedSOPInstanceUID=uid) for uid, kind in files.items()
+            make_item(ReferencedSOPClassUID=kind, ReferencedSOPInstanceUID=uid) for uid, kind in files.items()
         ],
     )
 
@@ -179,10 +170,10 @@ def _shared(labels: LabelMap) -> Any:
     di, dj, _ = labels.spacing
     row, column = labels.affine[:3, 0] / di, labels.affine[:3, 1] / dj
     gap = _decimals([abs(float(np.cross(row, column) @ labels.affine[:3, 2]))])[0]
-    measures = _item(PixelSpacing=_decimals((dj, di)), SliceThickness=gap, SpacingBetweenSlices=gap)
-    return _item(
+    measures = make_item(PixelSpacing=_decimals((dj, di)), SliceThickness=gap, SpacingBetweenSlices=gap)
+    return make_item(
         PixelMeasuresSequence=[measures],
-        PlaneOrientationSequence=[_item(ImageOrientationPatient=_decimals([*row, *column]))],
+        PlaneOrientationSequence=[make_item(ImageOrientationPatient=_decimals([*row, *column]))],
     )
 
 
@@ -190,15 +181,15 @@ def _frame(
     labels: LabelMap, numbers: Sequence[int], number: int, k: int, sources: Sequence[tuple[dict[str, str], int, int]]
 ) -> Any:
     uids, frame, frames = sources[k]
-    source = _item(ReferencedSOPClassUID=uids["SOPClassUID"], ReferencedSOPInstanceUID=uids["SOPInstanceUID"])
+    source = make_item(ReferencedSOPClassUID=uids["SOPClassUID"], ReferencedSOPInstanceUID=uids["SOPInstanceUID"])
     source.SpatialLocationsPreserved = "YES"
     if frames > 1:
         source.ReferencedFrameNumber = frame + 1
     source.PurposeOfReferenceCodeSequence = _code("121322", "Source image for image processing operation", "DCM")
-    derivation = _item(SourceImageSequence=[source], DerivationCodeSequence=_code("113076", "Segmentation", "DCM"))
-    return _item(
-        FrameContentSequence=[_item(DimensionIndexValues=[list(numbers).index(number) + 1, k + 1])],
-        PlanePositionSequence=[_item(ImagePositionPatient=_decimals(labels.ijk_to_lps([(0, 0, k)])[0]))],
-        SegmentIdentificationSequence=[_item(ReferencedSegmentNumber=number)],
+    derivation = make_item(SourceImageSequence=[source], DerivationCodeSequence=_code("113076", "Segmentation", "DCM"))
+    return make_item(
+        FrameContentSequence=[make_item(DimensionIndexValues=[list(numbers).index(number) + 1, k + 1])],
+        PlanePositionSequence=[make_item(ImagePositionPatient=_decimals(labels.ijk_to_lps([(0, 0, k)])[0]))],
+        SegmentIdentificationSequence=[make_item(ReferencedSegmentNumber=number)],
         DerivationImageSequence=[derivation],
     )

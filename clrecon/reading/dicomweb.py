@@ -11,12 +11,13 @@ from collections.abc import Iterator
 from email.message import Message
 from functools import partial
 from pathlib import Path
-from urllib.parse import SplitResult
+from typing import Any
+from urllib.parse import SplitResult, urlsplit
 
-from clrecon.errors import NoDicomError, RefusedInputError
+from clrecon.errors import NoDicomError, OutputError, RefusedInputError, UsageError
 from clrecon.reading.archives import Limits
-from clrecon.reading.urls import Entry, Room, shown_url, web_url
-from clrecon.reading.web import Answer, Lost, Patience, ask_server, persist
+from clrecon.reading.urls import DICOMWEB, Entry, Room, check_url, shown_url, web_url
+from clrecon.reading.web import Answer, Content, Lost, Patience, ask_server, persist
 from clrecon.system.progress import Progress
 from clrecon.system.text import count_of, escape_text
 
@@ -91,6 +92,59 @@ class Instances:
                 f"{self._name} lists {count_of(expected, 'instance')} and sends {count:,}: the series is incomplete,"
                 " or still being stored"
             )
+
+
+class Store:
+    """An archive that is to store instances, by STOW-RS; its URL may be that of a study or series in it."""
+
+    def __init__(self, url: str, patience: Patience = Patience()):  # noqa: B008 (a tuple)
+        parts = urlsplit(url)
+        root = parts.path.partition("/studies")[0].rstrip("/")
+        check_url(parts._replace(path=f"{root}/studies/0").geturl())
+        if parts.scheme not in DICOMWEB:
+            raise UsageError("an archive that stores meshes is dicomweb+https://HOST/PATH")
+        self._url = web_url(parts._replace(path=f"{root}/studies", query="", fragment=""))
+        self._name, self._patience = shown_url(url), patience
+
+    def check(self) -> None:
+        """Ask for nothing, to find out before any work whether the archive answers and accepts the credentials."""
+        try:
+            persist(self._check, self._name, self._patience)
+        except NoDicomError:
+            raise UsageError(f"{self._name} has no DICOMweb archive at this path: it has no list of studies") from None
+
+    def _check(self) -> None:
+        with ask_server(f"{self._url}?limit=1", _LISTED, self._patience):
+            pass
+
+    def store(self, uid: str, instance: bytes) -> None:
+        """Store an instance; an `OutputError` where the archive does not say that it has it."""
+        border = f"clrecon-{uid}"  # with the hash of the instance
+        head = f"--{border}\r\nContent-Type: application/dicom\r\n\r\n".encode()
+        data = b"".join((head, instance, f"\r\n--{border}--\r\n".encode()))
+        content = Content(f'multipart/related; type="application/dicom"; boundary="{border}"', data)
+        reply = persist(partial(self._send, content), self._name, self._patience)
+        stored = [item["00081155"]["Value"][0] for item in _find_items(reply, "00081199")]
+        if uid not in stored:
+            reasons = [f"0x{item['00081197']['Value'][0]:04X}" for item in _find_items(reply, "00081198")]
+            raise OutputError(
+                f"{self._name} did not store the mesh{' (failure reason ' * bool(reasons)}{', '.join(reasons)}"
+                f"{')' * bool(reasons)}; no file was written"
+            )
+
+    def _send(self, content: Content) -> Any:
+        with ask_server(self._url, _LISTED, self._patience, content) as answer:
+            room = Room(self._name, _LARGEST_HEAD << 4, "that is no answer to a mesh")
+            try:
+                return json.loads(b"".join(answer.pieces(room)))
+            except (ValueError, RecursionError):
+                return {}
+
+
+def _find_items(reply: Any, tag: str) -> list[Any]:
+    """Return the items of a sequence in DICOM JSON."""
+    value = reply.get(tag, {}).get("Value", []) if isinstance(reply, dict) else []
+    return [item for item in value if isinstance(item, dict)]
 
 
 def _save_parts(answer: Answer, name: str, folder: Path, expected: int, progress: Progress, limits: Limits) -> int:

@@ -30,6 +30,8 @@ TOKEN_VARIABLE = "CLRECON_WEB_TOKEN"
 _TOKEN = re.compile(r"\s*(\S+)\s+([A-Za-z0-9._~+/=-]+)\s*")
 _MOST_REDIRECTS = 5
 _REDIRECTS = (301, 302, 303, 307, 308)
+_PARTLY = (202, 409)
+"""What was sent is stored with a warning, or not; the content of the answer says why."""
 _BUSY = (408, 425, 429)
 _PIECE = 1 << 20
 _LEAST_BYTES = 1 << 16
@@ -106,13 +108,26 @@ class Answer:
             yield piece
 
 
+class Content(NamedTuple):
+    """What is sent to a server."""
+
+    kind: str
+    data: bytes
+
+
 @contextmanager
-def ask_server(url: str, accept: str, patience: Patience) -> Iterator[Answer]:
-    """Ask for a URL and give the answer, where there is one; redirections to other hosts get no credentials."""
+def ask_server(url: str, accept: str, patience: Patience, content: Content | None = None) -> Iterator[Answer]:
+    """Ask for a URL and give the answer, where there is one; redirections to other hosts get no credentials.
+
+    content: Is sent along, and to no other place than this URL.
+    """
     origin, target = _origin(urlsplit(url)), url
     for _ in range(_MOST_REDIRECTS + 1):
         parts = urlsplit(target)
-        request = Request(target, headers={"Accept": accept, "User-Agent": "clrecon"})
+        headers = {"Accept": accept, "User-Agent": "clrecon"}
+        if content is not None:
+            headers["Content-Type"] = content.kind
+        request = Request(target, None if content is None else content.data, headers)
         credentials = _find_credentials(parts) if _origin(parts) == origin else None
         if credentials:
             request.add_unredirected_header("Authorization", credentials)
@@ -121,8 +136,9 @@ def ask_server(url: str, accept: str, patience: Patience) -> Iterator[Answer]:
         except (OSError, http.client.HTTPException, ValueError) as error:
             raise _lost(error) from error
         with response:
-            if response.status not in _REDIRECTS:
-                _refuse_status(response, parts, has_credentials=credentials is not None)
+            if response.status not in _REDIRECTS or content is not None:
+                if content is None or response.status not in _PARTLY:
+                    _refuse_status(response, parts, has_credentials=credentials is not None)
                 yield Answer(response, url, patience)
                 return
             target = _follow(target, response.headers.get("Location", ""))

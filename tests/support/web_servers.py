@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -31,6 +32,7 @@ class Server:
     def __init__(self) -> None:
         self.answers: list[Answer] = []
         self.asked: list[tuple[str, dict[str, str]]] = []
+        self.posted: list[bytes] = []
         server = self
 
         class Handling(BaseHTTPRequestHandler):
@@ -38,6 +40,8 @@ class Server:
 
             def do_GET(self) -> None:
                 server.asked.append((self.path, dict(self.headers)))
+                if self.command == "POST":
+                    server.posted.append(self.rfile.read(int(self.headers["Content-Length"])))
                 self.close_connection = True
                 answer = server.answers.pop(0) if server.answers else server.answer
                 try:
@@ -45,7 +49,7 @@ class Server:
                 except (BrokenPipeError, ConnectionResetError):
                     pass  # the reader has enough
 
-            do_HEAD = do_GET
+            do_HEAD = do_POST = do_GET
 
             def log_message(self, *_: Any) -> None:
                 pass
@@ -113,15 +117,26 @@ class Archive(Server):
 
     def answer(self, handler: Handler) -> None:
         parts = urlsplit(handler.path)
+        if handler.command == "POST":
+            uid = self.stored()[-1].SOPInstanceUID
+            send(handler, json.dumps({"00081199": {"vr": "SQ", "Value": [{"00081155": {"Value": [uid]}}]}}).encode())
+            return
         top = f"/dicom-web/studies/{STUDY}"
         if parts.path in (top, f"{top}/series/{SERIES}") and "transfer-syntax=*" in handler.headers["Accept"]:
             send(handler, join_parts(self.instances), STORED)
+        elif parts.path == "/dicom-web/studies":
+            send(handler, b"[]", "application/dicom+json")
         elif parts.path in (f"{top}/instances", f"{top}/series/{SERIES}/instances"):
             start = int(parse_qs(parts.query).get("offset", ["0"])[0])
             uids = self.uids[start : start + self.page]
             send(handler, json.dumps([list_entry(uid) for uid in uids]).encode(), "application/dicom+json")
         else:
             send(handler, b"", status=404)
+
+    def stored(self) -> list[pydicom.Dataset]:
+        """The instances that were posted, one a request."""
+        parts = [body.split(b"\r\n\r\n", 1)[1].rpartition(b"\r\n--clrecon")[0] for body in self.posted]
+        return [pydicom.dcmread(io.BytesIO(part)) for part in parts]
 
 
 def list_entry(uid: str) -> dict[str, Any]:

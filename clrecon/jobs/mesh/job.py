@@ -27,7 +27,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, describe_level, plan_surfaces
 from clrecon.jobs.outputs import check_kept, check_outputs, count_leftovers, name_outputs, refuse_files, refuse_numbered
 from clrecon.jobs.presets import find_iso_preset
-from clrecon.jobs.run import Run, RunReport
+from clrecon.jobs.run import ArchiveTarget, Run, RunReport
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.system.paths import extension_of
@@ -85,7 +85,7 @@ class MeshReport(RunReport):
 
     SCHEMA = "mesh"
 
-    _LEFT_OUT = ("preset_reason",)
+    _LEFT_OUT = ("preset_reason", "stored")
     _LAST = (
         *("device", "driver", "memory_allowed_bytes", "slabs", "device_bytes", "version", "platform", "warnings"),
         *("volume", *_OF_ONE, "meshes", "output", "preset_reason", "gates", "seconds", "peak_memory_bytes"),
@@ -142,6 +142,7 @@ class MeshReport(RunReport):
     output: Mapping[str, Any]
     preset_reason: str | None
     gates: list[dict[str, Any]]
+    stored: Mapping[str, int] | None = None
 
 
 _DEVICE_PARTS = ("upload", "build", "kernels", "download")
@@ -149,7 +150,12 @@ _DEVICE_PARTS = ("upload", "build", "kernels", "download")
 
 
 def report_of(
-    run: Run, result: MadeParts, meshes: Sequence[dict[str, Any]], gates: list[dict[str, Any]], warnings: Sequence[str]
+    run: Run,
+    result: MadeParts,
+    meshes: Sequence[dict[str, Any]],
+    gates: list[dict[str, Any]],
+    warnings: Sequence[str],
+    stored: Mapping[str, int] | None = None,
 ) -> MeshReport:
     """Make the report of a job; its `warnings` come after those of the volume and the meshes."""
     settings: MeshSettings = run.settings
@@ -193,6 +199,7 @@ def report_of(
         output={"format": meshes[0]["output"]["format"], "bytes": sum(file.size for file in run.files)},
         preset_reason=None if preset is None else find_iso_preset(preset).source,
         gates=gates,
+        stored=stored,
     )
     run.logged = result.volume.report.get("warnings", ())
     return report
@@ -252,6 +259,7 @@ def make_mesh(
     *,
     report_path: str | Path | None = None,
     measure: bool | None = None,
+    store: str | None = None,
     **how: Any,
 ) -> MeshReport:
     """Read a CT series, extract its surfaces, select components, measure them and write them.
@@ -260,6 +268,7 @@ def make_mesh(
     ``bone_200hu.stl``, ``bone_001.stl``, ``bone_200hu_001.stl``, ``bone_T12.stl``.
 
     measure: Measure the meshes, which costs time; without it those entries are None.  Default: with a `report_path`.
+    store: URL of a DICOMweb archive that gets the meshes too, before any file is in its place.
     """
     settings = settings or MeshSettings()
     if settings.all_parts and makes_objects(output):
@@ -280,7 +289,8 @@ def make_mesh(
             if settings.labels is not None and run.no_clobber and not settings.one_file:
                 refuse_files(name_outputs(output, name_label_files(labels, settings.labels, surfaces)))
 
-        result = make_parts(source, run, check_map)
+        target = None if store is None else ArchiveTarget(store, source, run)
+        result = make_parts(source if target is None else target.source, run, check_map)
         parts = result.parts
         paths = [output] * len(parts)
         if not settings.one_file:
@@ -311,7 +321,9 @@ def make_mesh(
         walls = warn_of_walls(parts, settings, result.choice)
         left = _warn_of_leftovers(output, paths) if settings.split else []
         entries = [describe_part(*each, settings.space) for each in zip(parts, files, paths, strict=True)]
-        report = report_of(run, result, entries, gates, [*left, *walls, *warnings])
+        is_modified = settings.refines or settings.solid or settings.surface == "cortex"
+        stored = None if target is None else target.store_meshes(meshes, is_modified=is_modified)
+        report = report_of(run, result, entries, gates, [*left, *walls, *warnings], stored)
         run.finish(report, report_path)
     log.info(
         "%d meshes made, %d triangles, %d slabs, on %s in %.3f s",
