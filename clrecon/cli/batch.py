@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import add_mesh_options, mesh_fields
-from clrecon.jobs.batch.plan import ALL_DEVICES, COLUMNS, PAGE, TABLE, BatchSettings, Plan, read_cases
+from clrecon.jobs.batch.plan import COLUMNS, PAGE, TABLE, BatchSettings, Plan, read_cases
 from clrecon.jobs.mesh.purposes import settings_for
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.options import ScanSettings
+from clrecon.jobs.options import ALL_DEVICES, ScanSettings
 from clrecon.system.arguments import current_speaker
 from clrecon.system.progress import DEFAULT_SECONDS
 
@@ -87,6 +87,7 @@ def _make_settings(options: argparse.Namespace, labels: str | None) -> MeshSetti
     """Make the settings of meshes without labels, or with a label map that each case names."""
     options.path = labels
     given = mesh_fields(options, f"in the column {COLUMNS[3]} of each row")
+    given.pop("scheduler", None)  # deals out cases here
     return MeshSettings(**settings_for(given.pop("purpose", None), given))
 
 

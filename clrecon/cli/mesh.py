@@ -61,6 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_input(parser, f"{common.SCAN_FOLDER}; or {common.GRID_FILE}")
     common.add_output(parser, f"mesh file: {MESH_FILES}")
     checks = add_mesh_options(parser)
+    common.add_fields(parser.add_argument_group("workers"), MeshSettings, "workers")
     common.add_report(checks, "affine, counts, quality, device and times")
     parser.add_argument(
         "--store",

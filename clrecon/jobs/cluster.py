@@ -142,10 +142,11 @@ class Cluster:
             f" install clrecon {package_version()} and the same packages there"
         ) from error
 
-    def call_all(self, function: Callable[..., Any], *arguments: Any) -> None:
-        """Call a function on all workers; those that cannot are left out."""
+    def call_all(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+        """Call a function on all workers and return the results; workers that cannot are left out."""
         with suppress(Exception):
-            self._client.run(function, *arguments, on_error="ignore")
+            return [*self._client.run(function, *arguments, on_error="ignore").values()]
+        return []
 
     def _lost(self) -> UnreachableError:
         return UnreachableError(f"lost the connection to the scheduler {self._address}: start it again")

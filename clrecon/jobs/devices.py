@@ -3,10 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import DeviceError
 from clrecon.system.records import name_schema
+
+if TYPE_CHECKING:
+    from clrecon.opencl import Device
+
+
+def list_usable() -> list[Device]:
+    """Return the devices of this machine without simulators, unusable ones and those found to compute wrongly."""
+    from clrecon.opencl import list_devices, remembered_fault
+
+    devices = [
+        device
+        for device in list_devices()
+        if not (device.shortcoming or device.is_simulator or remembered_fault(device))
+    ]
+    if not devices:
+        raise DeviceError("there is no usable OpenCL device on this machine")
+    return devices
 
 
 def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError | None]:

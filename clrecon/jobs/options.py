@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
+from clrecon.jobs.cluster import check_address
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 from clrecon.reading import Selection
 from clrecon.reading.common.selection import series_option as series_option
@@ -114,6 +115,10 @@ _masking_option = partial(option, group="masking")
 _crop_option = partial(option, group="crop")
 
 
+ALL_DEVICES = "all"
+"""In place of a device: all usable ones of the machine, for jobs that are shared out."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class DeviceSettings:
     device: str | None = option(
@@ -176,6 +181,19 @@ def hu_option(text: str, values: str = "N", **how: Any) -> Any:
 
 def seeds_option(text: str, **how: Any) -> Any:
     return option("--seed X,Y,Z", text, default=(), parse=parse_point, action="append", **how)
+
+
+def scheduler_option(text: str, **how: Any) -> Any:
+    return option("--scheduler ADDRESS", text, parse=check_address, **how)
+
+
+def refuse_changed(settings: Any, names: Sequence[str], scheduler: str | None) -> None:
+    """Refuse settings of surfaces that are made in one piece where they are shared out."""
+    defaults = {field.name: field.default for field in fields(settings)}
+    given = [name_parameter(name) for name in names if getattr(settings, name) != defaults[name]]
+    if given:
+        asked = name_parameter("device", ALL_DEVICES) if scheduler is None else name_parameter("scheduler", scheduler)
+        raise UsageError(f"{asked} shares out plain surfaces: leave out {' and '.join(given)}")
 
 
 def view_option(values: str, text: str, **how: Any) -> Any:

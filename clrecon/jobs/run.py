@@ -316,7 +316,7 @@ class Run(Laps):
     def read_beside(self, trial: Callable[[Device], object], read: Callable[[], Found]) -> tuple[Found, Device]:
         """Read the input while the device opens and builds its kernels, see `DeviceOpening`; return both."""
         self.progress("device", 0, 0)
-        with DeviceOpening(self.settings.device, trial) as opening:
+        with DeviceOpening(getattr(self.settings, "main_device", self.settings.device), trial) as opening:
             content = read()
             self.lap("read")
             device = opening.wait()
@@ -379,7 +379,8 @@ class Run(Laps):
         if issubclass(kind, ScanReport):
             entries["volume"] = certificate
         if on is not None:
-            entries.update(device=on.label, driver=on.driver, memory_allowed_bytes=self.settings.memory)
+            of_device = {"device": on.label, "driver": on.driver, "memory_allowed_bytes": self.settings.memory}
+            entries = of_device | entries
         return kind(
             version=package_version(),
             platform=platform_name(),

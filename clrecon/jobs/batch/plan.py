@@ -13,11 +13,12 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
-from clrecon.errors import DeviceError, NoDicomError, UsageError
+from clrecon.errors import NoDicomError, UsageError
 from clrecon.exchange.formats import CLOUD_FORMATS, MESH_INPUTS
-from clrecon.jobs.cluster import LOCAL, check_address
+from clrecon.jobs.cluster import LOCAL
+from clrecon.jobs.devices import list_usable
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
-from clrecon.jobs.options import DeviceSettings, ScanSettings, view_option
+from clrecon.jobs.options import ALL_DEVICES, DeviceSettings, ScanSettings, scheduler_option, view_option
 from clrecon.reading.sources import open_remote
 from clrecon.reading.urls import check_url, is_url, refuse_url
 from clrecon.system.arguments import DirectionName, name_parameter
@@ -29,9 +30,6 @@ from clrecon.system.text import escape_text, guess_word, unknown_name
 from clrecon.version import package_version
 
 _MOST_WORKERS = 256
-
-ALL_DEVICES = "all"
-"""In place of indexes: each usable device of the machine, without simulators and those found to compute wrongly."""
 
 
 def _parse_part(text: str) -> tuple[int, int]:
@@ -104,12 +102,10 @@ class BatchSettings:
         " one of --device)",
         group="run",
     )
-    scheduler: str | None = option(
-        "--scheduler ADDRESS",
+    scheduler: str | None = scheduler_option(
         f"run the cases on the workers of this Dask scheduler, such as tls://host:8786; {LOCAL}: start a scheduler and"
         " workers on this machine",
         group="run",
-        parse=check_address,
     )
     part: tuple[int, int] | None = option(
         "--part I/N",
@@ -148,15 +144,7 @@ class BatchSettings:
         """Return a device for each worker, None for the one that each job would choose."""
         devices: list[str | None] = [None]
         if self.devices == ALL_DEVICES:
-            from clrecon.opencl import list_devices, remembered_fault
-
-            devices = [
-                str(device.index)
-                for device in list_devices()
-                if not (device.shortcoming or device.is_simulator or remembered_fault(device))
-            ]
-            if not devices:
-                raise DeviceError("there is no usable OpenCL device on this machine")
+            devices = [str(device.index) for device in list_usable()]
         elif self.devices is not None:
             devices = [*map(str.strip, self.devices.split(","))]
         return [devices[number % len(devices)] for number in range(self.workers or len(devices))]

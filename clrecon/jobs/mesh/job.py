@@ -173,6 +173,7 @@ def report_of(
         [*_warn_of_meshes(parts, meshes), *level_warnings, *warnings],
         result.volume,
         on=result.device.current,
+        **{name: result.origins[0][name] for name in ("device", "driver") if settings.is_shared_out},
         affine_ijk_to_lps_mm=result.volume.affine.tolist(),
         **{name: _common(mesh[name] for mesh in meshes) for name in _OF_LEVEL},
         outside_hu=_common(part.mesh.report.get("outside_hu") for part in parts),

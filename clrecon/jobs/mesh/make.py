@@ -317,6 +317,10 @@ def extract_surfaces(
     levels = [surface.iso_value for surface in surfaces if surface.iso_value is not None]
     if settings.method_used in ("i-mc", "t-mc-soup", "skimage") or settings.vertex_rule != "linear":
         return [extract_one(volume, level, device, settings, labels, progress) for level in levels]
+    if settings.is_shared_out:
+        from clrecon.jobs.mesh.workers import extract_shared_out
+
+        return extract_shared_out(volume, levels, device, settings, progress)
     meshes: list[Mesh] = []
     with SurfaceExtractor(volume, device=device, memory=settings.memory) as extractor:
         for level in levels:

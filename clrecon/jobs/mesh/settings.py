@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs import options
+from clrecon.jobs.cluster import LOCAL
 from clrecon.jobs.outputs import OBJECT_FILES
 from clrecon.jobs.presets import DEFAULT_PRESET, PURPOSES, Purpose, find_iso_preset, find_purpose
 from clrecon.system.arguments import MethodName, Space, Topology, VertexRule, name_parameter
@@ -313,8 +314,15 @@ class MeshSettings(options.InputSettings):
         f' with {SCAN_GATE_FAILED} if only gates of the scan fail (see "clrecon info")',
         group="strict",
     )
+    scheduler: str | None = options.scheduler_option(
+        f"extract the surface on the workers of this Dask scheduler, such as tls://host:8786; {LOCAL}: start them on"
+        f" this machine. --device {options.ALL_DEVICES}: extract it on all devices of this machine",
+        group="workers",
+    )
 
     def __post_init__(self) -> None:
+        if self.is_shared_out:
+            options.refuse_changed(self, ("labels", "grow_from", "method", "vertex_rule", "surface"), self.scheduler)
         if self.iso_value is not None and self.preset is not None:
             raise UsageError("give either an iso value in HU or a preset, not both")
         self._check_masks()
@@ -502,6 +510,16 @@ class MeshSettings(options.InputSettings):
             raise UsageError("a largest deviation bounds smoothing and decimation: ask for one of them too")
         if not (math.isfinite(self.max_deviation_mm) and self.max_deviation_mm > 0.0):
             raise UsageError(f"the largest deviation is a length in mm above 0, not {self.max_deviation_mm:g}")
+
+    @property
+    def is_shared_out(self) -> bool:
+        """True where spans of slices go to several devices, or to workers."""
+        return self.scheduler is not None or self.device == options.ALL_DEVICES
+
+    @property
+    def main_device(self) -> str | None:
+        """The device of all that is not shared out."""
+        return None if self.device == options.ALL_DEVICES else self.device
 
     @property
     def levels(self) -> tuple[float | tuple[float, ...], ...]:

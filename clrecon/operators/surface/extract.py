@@ -98,7 +98,7 @@ class SurfaceExtractor(VolumeWorker):
     ) -> Mesh:
         """Extract the surface at one iso value, or of one range, see `extract_isosurface`."""
         level, chosen = settle_level(self.volume, iso_value, progress)
-        grid = self._choose_grid(level, closed, topology, below, vertex_rule)
+        grid = self.choose_grid(level, closed=closed, topology=topology, below=below, vertex_rule=vertex_rule)
         seeds = None
         if grow_from is not None:
             if topology != "separated":
@@ -128,7 +128,7 @@ class SurfaceExtractor(VolumeWorker):
             range have none.
         """
         level, chosen = settle_level(self.volume, iso_value, progress)
-        grid = self._choose_grid(level, closed, "separated", below)
+        grid = self.choose_grid(level, closed=closed, below=below)
         for attempt in self._resident.with_fallback():
             with attempt as (_, warnings):
                 run = Extraction(self._resident, grid, warnings, vertices_only=True)
@@ -139,8 +139,8 @@ class SurfaceExtractor(VolumeWorker):
                 cloud = PointCloud.of_known(run.placement.to_lps(positions), normals, hu, report=report)
         return cloud
 
-    def _choose_grid(
-        self, iso_value: Level, closed: bool, topology: str, below: bool, vertex_rule: str = "linear"
+    def choose_grid(
+        self, iso_value: Level, *, closed: bool, topology: str = "separated", below: bool, vertex_rule: str = "linear"
     ) -> SampleGrid:
         volume = self.volume
         rule = choose_iso_rule(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -29,6 +30,22 @@ from clrecon.system.text import format_hu
 
 Part = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
 """Positions, normals and triangles of one slab."""
+
+
+class SpanFacts(NamedTuple):
+    """How the part of a surface was made, for the report of the whole."""
+
+    label: str
+    driver: str
+    slabs: int
+    device_bytes: dict[str, int]
+    seconds: dict[str, float]
+    kernel_seconds: dict[str, float]
+    warnings: list[str]
+
+
+SpanPart = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32], SpanFacts]
+"""Positions, normals and triangles of one span of slices, whose indices begin with 0, and how they were made."""
 
 
 def _refuse_level(device: Device, volume: Volume, rule: IsoRule) -> ClreconError:
@@ -106,7 +123,11 @@ def keep_bricks(resident: DeviceVolume, voxels_d: Any) -> BrickRanges:
 
 
 class Extraction:
-    """One extraction, slab by slab, as the device has room; with `vertices_only` without triangles."""
+    """One extraction, slab by slab, as the device has room; with `vertices_only` without triangles.
+
+    span: First and end of the slices of the grid whose part of the surface is made; None: all of them.  Its vertices
+        are numbered from 0, and may be none.
+    """
 
     def __init__(
         self,
@@ -116,6 +137,7 @@ class Extraction:
         *,
         vertices_only: bool = False,
         seeds: Seeds | None = None,
+        span: tuple[int, int] | None = None,
     ):
         self.resident = resident
         self.device = resident.device
@@ -128,10 +150,13 @@ class Extraction:
         resident.surfaces += 1
         self.levels = _voxel_levels(resident.device, resident.volume, grid.rule)
         self.stopwatch = Stopwatch()
-        self.slabs = self.first = self.vertices = self.triangles = 0
+        self.slabs = self.vertices = self.triangles = 0
+        self.first, self._end = span or (0, grid.shape[2])
+        self._is_part = span is not None
         self.parts: list[Part] = []
         self.largest = {"volume": 0, "scratch": 0, "output": 0}
         self.warnings = warnings
+        self._made_on: dict[tuple[str, str], None] = {}
 
     def run(self, progress: Progress) -> Part:
         """Build the kernels, and process the grid, as many slices at a time as fit the device."""
@@ -151,16 +176,47 @@ class Extraction:
             with attempt as slices:  # what is done already stays
                 if self._seeds is not None and self._grown is None and slices < gk:
                     self._grow(self._seeds, slices)
-                while self.first < gk:
-                    self._add_slab(Slab(self.grid, self.first, min(self.first + slices, gk)))
+                while self.first < self._end:
+                    self._add_slab(Slab(self.grid, self.first, min(self.first + slices, self._end)))
                     if self.slabs > 1 or self.first < gk:
                         progress("slabs", self.first, gk)
-        if self.vertices == 0:
+        if self.vertices == 0 and not self._is_part:
             raise _refuse_level(self.device, self.grid.volume, self.grid.rule)
+        return self._join()
+
+    def _join(self) -> Part:
         try:
             return _join_parts(self.parts)
         except MemoryError as error:
             raise DeviceError(f"the mesh does not fit the memory of this computer: {error}") from error
+
+    def facts(self) -> SpanFacts:
+        """Return what `take_spans` adds to the report of the whole."""
+        seconds = dict(self.stopwatch.seconds), dict(self.stopwatch.by_kernel)
+        return SpanFacts(self.device.label, self.device.driver, self.slabs, self.largest, *seconds, self.warnings)
+
+    def take_spans(self, spans: Sequence[SpanPart]) -> Part:
+        """Join the parts of all spans, in their order, in place of `run`; their indices begin anew, and rise here."""
+        for positions, normals, triangles, facts in spans:
+            self.parts.append((positions, normals, triangles + np.uint32(self.vertices)))
+            self.vertices += len(positions)
+            self.triangles += len(triangles)
+            if max(self.vertices, self.triangles) >= 2**32:
+                raise marching_cubes.too_many(self.vertices, self.triangles)
+            self._take_facts(facts)
+        if self.vertices == 0:
+            raise _refuse_level(self.device, self.grid.volume, self.grid.rule)
+        return self._join()
+
+    def _take_facts(self, facts: SpanFacts) -> None:
+        self.slabs += facts.slabs
+        self._made_on[facts.label, facts.driver] = None
+        for kind, size in facts.device_bytes.items():
+            self.largest[kind] = max(self.largest[kind], size)
+        for mine, more in ((self.stopwatch.seconds, facts.seconds), (self.stopwatch.by_kernel, facts.kernel_seconds)):
+            for name, seconds in more.items():
+                mine[name] = mine.get(name, 0.0) + seconds
+        self.warnings += [warning for warning in facts.warnings if warning not in self.warnings]
 
     def _grow(self, seeds: Seeds, slices: int) -> None:
         """Find the cells of the part of the surface that is made, from the bits of the whole grid, slab by slab."""
@@ -264,8 +320,8 @@ class Extraction:
             "cells": cells,
             "growing": growing,
             "certificate": self.grid.volume.report,
-            "device": self.device.label,
-            "driver": self.device.driver,
+            "device": " and ".join(label for label, _ in self._made_on) or self.device.label,
+            "driver": " and ".join(driver for _, driver in self._made_on) or self.device.driver,
             "slabs": self.slabs,
             "device_bytes": dict(self.largest),
             "seconds": dict(self.stopwatch.seconds),
