@@ -21,7 +21,7 @@
  *   1. copy_row_ends
  *   2. filter_bilateral   all groups, or those of a list (cl/filters/near_level.cl) */
 #include "include/lanes.h"
-#include "include/power_of_two.h"
+#include "filters/power_of_two.h"
 #include "include/volume.h"
 
 #define GROUP 16 /* voxels of a group */

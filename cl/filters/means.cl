@@ -20,7 +20,7 @@
  * Passes
  *   1. average_patches   in turn for some of the steps
  *   2. finish_means      once */
-#include "include/power_of_two.h"
+#include "filters/power_of_two.h"
 
 #define WIDTH 64  /* voxels of a tile along i */
 #define HEIGHT 16 /* and along j */

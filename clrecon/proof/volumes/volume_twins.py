@@ -257,7 +257,7 @@ def filter_bilateral(
 def average_patches(layer: NDArray[Any], side: int, reach: int, noise: float, scale: float) -> NDArray[np.float64]:
     """Return the non-local means of a slice (nj, ni): of the voxels within `reach`, by patches of `side` voxels.
 
-    A patch begins (side - 1) // 2 voxels before its own.  noise, scale: Of sums of squares, as in cl/filters/means.cl.
+    A patch begins (side - 1) // 2 voxels before its own.  noise, scale: Arguments of `cl/filters/means.cl`.
     """
     before, frame = (side - 1) // 2, reach + side
     framed = np.pad(layer.astype(np.float64), frame, mode="reflect")
