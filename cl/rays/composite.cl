@@ -152,8 +152,9 @@ static inline floats find_opacity(const field *f, const slice_stack *stack, cons
     return weigh_by_label(f, stack, look, course, rays, *number, opacity);
 }
 
-/* Blend segment n of each ray where it has opacity; `value` and `opacity` are those at `number`. */
-static inline void blend_samples(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
+/* Blend segment n of each ray where it has opacity; `value` and `opacity` are those at `number`.  Light comes from the
+ * gradients of `smooth`. */
+static inline void blend_samples(const field *f, const field *smooth, const slice_stack *stack, const looks *look, const ray_lanes *course,
     const packet *rays, const float n, const int inner, const floats number, const floats value, floats opacity,
     sights *seen)
 {
@@ -162,10 +163,14 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
     floats share = 1.0f, highlight = 0.0f;
     if (look->shaded || IS_WEIGHED) {
         slopes s;
-        find_slopes(f, i, j, k, inner, &s);
         floats x, y, z;
+        if (IS_WEIGHED) {
+            find_slopes(f, i, j, k, inner, &s);
+            find_gradients(look->view, stack, &s, k, &x, &y, &z);
+            opacity = weigh_by_gradient(look, opacity, x, y, z);
+        }
+        find_slopes(smooth, i, j, k, inner, &s);
         find_gradients(look->view, stack, &s, k, &x, &y, &z);
-        opacity = weigh_by_gradient(look, opacity, x, y, z);
         if (look->shaded)
             find_light(look->view, look->highlights, x, y, z, rays->toward_x, rays->toward_y, rays->toward_z, &share,
                 &highlight);
@@ -275,6 +280,7 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
 }
 
 /* Parameters  voxels   in   (slices, nj, ni)
+ *             smoothed in   the same shape: the field whose gradients are lit, see rays/smooth.cl; or `voxels`
  *             ways     in   (bk, bj, bi) distances to visible bricks, see rays/look_ahead.h
  *             colors opacities clears changes factors  in  (NODES) each, (GRADIENT_NODES), see looks
  *             highlights in (HIGHLIGHTS) see rays/shade.h
@@ -300,8 +306,8 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
  * Launch      global = tiles * 64 / LANES rounded up by the host, any local
  * Guarantees  every pixel of image, depths and means is written with the last slab */
 __kernel void composite_rays(
-    __global const VOXEL *restrict voxels, __global const uchar *restrict ways,
-    __global const int *restrict colors, __global const float *restrict opacities,
+    __global const VOXEL *restrict voxels, __global const VOXEL *restrict smoothed,
+    __global const uchar *restrict ways, __global const int *restrict colors, __global const float *restrict opacities,
     __global const float *restrict clears, __global const float *restrict changes,
     __global const float *restrict factors, __global const float *restrict highlights,
     __global const float *restrict entries, __global const float4 *restrict view,
@@ -318,6 +324,7 @@ __kernel void composite_rays(
 {
     const uint first_pixel = (uint)get_global_id(0) * LANES;
     const field f = { voxels, ni, nj, first_k, end_k, last_place };
+    const field smooth = { smoothed, ni, nj, first_k, end_k, last_place };
     const leap_map map = { ways, bi, bj, bk, cells_k };
     const main_way way = { main_axis, ahead, eye, aside };
     const slice_stack stack = STACK_TABLE;
@@ -400,7 +407,7 @@ __kernel void composite_rays(
                         &f, &stack, &look, &course, &rays, segment, inner, counts, &v, &number, &seen_value);
                     const floats seen_here = choose(counts, opacity, (floats)(0.0f));
                     if (ANY_LANE(seen_here > 0.0f)) {
-                        blend_samples(&f, &stack, &look, &course, &rays, segment, inner, number, seen_value, seen_here,
+                        blend_samples(&f, &smooth, &stack, &look, &course, &rays, segment, inner, number, seen_value, seen_here,
                             &seen);
                         end = choose(seen.opacity < OPAQUE, end, (floats)(0.0f));
                     }

@@ -146,6 +146,11 @@ class Looks:
     )
     shadows: bool = option("--shadows", "draw shadows on a surface; needs a light away from the camera")
     jitter: bool = option("--jitter", "start each ray at an offset of its own: grain instead of rings")
+    smooth_light: float | None = option(
+        "--smooth-light MM",
+        "smooth the gradients that light a volume, without its colours and opacities (default: about a voxel, more for"
+        " noise; 0: none)",
+    )
     clip_planes: Sequence[Sequence[float]] = option(
         "--clip PX,PY,PZ,NX,NY,NZ",
         "keep the side of a plane to which its normal points; may be given again",

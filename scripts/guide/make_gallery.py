@@ -55,7 +55,8 @@ def draw_beside_vtk(renderer: clrecon.VolumeRenderer) -> np.ndarray:
     camera = clrecon.Camera.fit(volume, (25, 10), 1.2, size=BESIDE)
     step = 0.5 * min(volume.spacing)
     light = replace(bone.lighting, soft_gradient=0.0)  # as VTK does
-    ours = renderer.render(preset="bone", camera=camera, size=BESIDE, ray_step=step, lighting=light).image[..., :3]
+    look = clrecon.VolumeLook("bone", ray_step=step, lighting=light, smooth_light=0.0)
+    ours = renderer.render(look, camera=camera, size=BESIDE).image[..., :3]
     scene = scene_of(volume, camera, bone.transfer_function, light, size=BESIDE, ray_step=step)
     peer = FixedPointPeer(volume.voxels, scene, threads=1)
     peer.first_frame()

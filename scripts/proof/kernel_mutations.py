@@ -131,6 +131,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         )
     },
     "look_ahead": {"ways": (("(uchar)(free << 4 | own[0])", "(uchar)~(free << 4 | own[0])"),)},
+    "smooth_along": {"smoothed": (("= (VOXEL)value_of[lane];", "= (VOXEL)-value_of[lane];"),)},
     "enter_tiles": {"entries": (("= entry_of[lane];", "= -entry_of[lane];"),)},
     "composite_rays": {
         "image": (("image[place] = finish_color(color", "image[place] = (uchar4)(255) - finish_color(color"),),

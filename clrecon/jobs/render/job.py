@@ -69,7 +69,7 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
         "window_hu": report.get("window_hu"),
         "values_mm_water": values if is_water else None,
         "window_mm_water": report.get("window_mm_water"),
-        **{name: report.get(name) for name in ("ray_step_mm", "slices", "plane", "curve")},
+        **{name: report.get(name) for name in ("ray_step_mm", "smooth_light_mm", "slices", "plane", "curve")},
         "edges": report.get("edges") if picture.camera is None else edge_letters(picture.camera),
         "points": _describe_points(report),
         **{name: report.get(name) for name in ("left_out", "labels", "tiles", "tile_size")},

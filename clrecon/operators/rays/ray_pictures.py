@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy.noise import choose_smoothing
 from clrecon.anatomy.surroundings import LEFT_OUT, count_left_out
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import takes_parts
@@ -250,7 +251,7 @@ def take_with_layers(
     for attempt in resident.with_fallback():
         with attempt as (device, warnings):
             job = _Job(resident, style, shot, ray_step, warnings)
-            planned = ray_slabs.plan_ray_slabs(resident, beside, {}, job.labels)
+            planned = ray_slabs.plan_ray_slabs(resident, beside, {}, job.labels, job.smoothing)
             for slabs in resident.attempts(ray_slabs.RAYS, planned, job.warnings):
                 with slabs as slices:
                     sample = partial(job.sample_between, slices)
@@ -269,6 +270,11 @@ class _Job(ray_slabs.SlabPicture):
         self.lighting = style.light if isinstance(style, VolumeLook) else Lighting()
         self.box = volume_box(resident.volume)
         self.planes = None if style.clip is None else style.clip.planes
+        if isinstance(style, VolumeLook) and self.lighting.shades:
+            sigma = style.smooth_light
+            if sigma is None:
+                sigma = resident.keep("smoothing of light", None, 0, lambda: choose_smoothing(resident.volume))
+            self.smoothing = ray_slabs.Smoothing.of(resident.volume, sigma)
 
     def take(self, slices: int) -> Rendering:
         style = self.style
@@ -277,6 +283,7 @@ class _Job(ray_slabs.SlabPicture):
         if isinstance(style, Projection):
             return self._finish_projection(style, means, depths, report)
         report["unit_distance_mm"] = style.function.unit_distance
+        report["smooth_light_mm"] = 0.0 if self.smoothing is None else self.smoothing.sigma_mm
         return Rendering(image, depths, means, self.shot.camera, None, style.mode, report)
 
     def draw(self, slab: ray_slabs.RaySlab, output: PictureBuffers) -> None:
@@ -330,11 +337,12 @@ class _Job(ray_slabs.SlabPicture):
             entries_d = enter_tiles(resident, slab, view, leaps, output)
             ray = MainWay.of(resident, slab, view.camera)
             ways_d = look_ahead(resident, slab, ray, leaps)
+            smoothed_d = ray_slabs.slab_smoothed(resident, slab, self.smoothing)
             launch(
                 device, program["composite_rays"], output.items(queues, int(device.kernel_variants["LANES"])),
                 view.rays_a_launch(device),
-                ways=ways_d, entries=entries_d, highlights=upload(device, highlight_table(self.lighting)),
-                view=upload(device, view.table), last_place=last, slope=resident.stack.slope,
+                smoothed=smoothed_d, ways=ways_d, entries=entries_d, view=upload(device, view.table),
+                highlights=upload(device, highlight_table(self.lighting)), last_place=last, slope=resident.stack.slope,
                 shaded=self.lighting.shades, jitter=style.jitter, queues=queues, **more, **tables.arguments,
                 **output.arguments, **view.arguments, **ray.arguments, **resident.stack.arguments,
             )  # fmt: skip

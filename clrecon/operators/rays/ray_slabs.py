@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy.noise import gaussian_weights
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels import ResampledLabels
@@ -51,7 +52,55 @@ RAYS = "rays"
 """Purpose by which slabs are planned."""
 
 _BRICKS, _LABELS = "bricks for rays", "labels for rays"
+_SMOOTHED = "smoothed volume"
 """Names of the objects that are kept for a whole volume."""
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """A Gaussian along i, j, k: its standard deviation in mm, and for each axis the float32 weights of a voxel and of
+    those at each distance on either side.
+    """
+
+    sigma_mm: float
+    weights: tuple[NDArray[np.float32], ...]
+
+    @classmethod
+    def of(cls, volume: Volume, sigma_mm: float) -> Smoothing | None:
+        """Return the smoothing of a volume, None for one that changes nothing; uneven slices count as even ones."""
+        weights = tuple(gaussian_weights(sigma_mm / step) for step in volume.spacing)
+        return None if all(len(along) == 1 for along in weights) else cls(sigma_mm, weights)
+
+
+def _find_overlap(smoothing: Smoothing | None) -> int:
+    return _OVERLAP if smoothing is None else _OVERLAP + len(smoothing.weights[2]) - 1
+
+
+def smooth_voxels(resident: DeviceVolume, slab: RaySlab, smoothing: Smoothing) -> Any:
+    """Return the smoothed voxels of a slab on the device, its own where no axis is smoothed."""
+    device, (ni, nj, nk) = resident.device, slab.shape_ijk
+    kernel = resident.program("rays/smooth.cl")["smooth_along"]
+    groups = -(-ni // int(device.kernel_variants["LANES"]))
+    from_d = slab.voxels_d
+    for axis, weights in enumerate(smoothing.weights):
+        if len(weights) > 1:
+            to_d = allocate(device, ni * nj * nk * resident.dtype.itemsize)
+            launch(
+                device, kernel, groups * nj * nk, voxels=from_d, smoothed=to_d, weights=upload(device, weights),
+                reach=len(weights) - 1, axis=axis, whole=resident.dtype.kind != "f", ni=ni, nj=nj, nk=nk, groups=groups,
+            )  # fmt: skip
+            from_d = to_d
+    return from_d
+
+
+def slab_smoothed(resident: DeviceVolume, slab: RaySlab, smoothing: Smoothing | None) -> Any:
+    """Return the voxels of a slab whose gradients are lit; those of a whole one stay on the device."""
+    if smoothing is None:
+        return slab.voxels_d
+    if not slab.is_whole:
+        return smooth_voxels(resident, slab, smoothing)
+    nbytes = math.prod(slab.shape_ijk) * resident.dtype.itemsize
+    return resident.keep(_SMOOTHED, smoothing.sigma_mm, nbytes, lambda: smooth_voxels(resident, slab, smoothing))
 
 
 def entry_slice(volume: Volume, camera: Camera) -> float:
@@ -137,33 +186,42 @@ def pad_slices(voxels: NDArray[Any]) -> NDArray[Any]:
 
 
 def plan_ray_slabs(
-    resident: DeviceVolume, others: Mapping[str, int], extra: Mapping[str, int], labels: ResampledLabels | None = None
+    resident: DeviceVolume,
+    others: Mapping[str, int],
+    extra: Mapping[str, int],
+    labels: ResampledLabels | None = None,
+    smoothing: Smoothing | None = None,
 ) -> int:
     """Return the number of slices in a slab, all if everything fits beside labels and `others`, bytes of other buffers;
     `extra` are needed only with more than one slab.
     """
+    overlap = 2 * _find_overlap(smoothing) + 1
     ni, nj, nk = resident.volume.shape_ijk
     cells, size = choose_brick_cells(resident.volume), resident.dtype.itemsize
 
     def needs(slices: int) -> dict[str, int]:
-        held_slices = nk if slices >= nk else slices + 2 * _OVERLAP + 1
+        held_slices = nk if slices >= nk else slices + overlap
         shape = max(2, ni), max(2, nj), max(2, held_slices)
         bricks, samples = math.prod(-(-n // c) for n, c in zip(shape, cells, strict=True)), math.prod(shape)
         beside = {} if labels is None else {"labels": 2 * samples * labels.voxels.itemsize}  # they grow
+        if smoothing is not None:
+            beside |= {_SMOOTHED: samples * size, "smoothing": samples * size}  # a pass reads one and writes the other
         rest = {} if slices >= nk else extra
         return {"volume": samples * size, "bricks": bricks * (2 * size + 4), **beside, **others, **rest}
 
     most = None
     if int(resident.device.kernel_variants["LANES"]) > 1:
         most = MOST_VOXELS // (max(2, ni) * max(2, nj))
-        most = most if nk <= most else most - 2 * _OVERLAP - 1
-    slices = resident.plan(RAYS, nk, needs, counted=(_BRICKS, _LABELS), most=most)
+        most = most if nk <= most else most - overlap
+    slices = resident.plan(RAYS, nk, needs, counted=(_BRICKS, _LABELS, _SMOOTHED), most=most)
     if slices == 0:
         check_budget(resident.device, needs(1), resident.memory)
     return max(slices, 1)
 
 
-def ray_slabs(resident: DeviceVolume, slices: int, entry_k: float, stopwatch: Stopwatch) -> Iterator[RaySlab]:
+def ray_slabs(
+    resident: DeviceVolume, slices: int, entry_k: float, stopwatch: Stopwatch, smoothing: Smoothing | None = None
+) -> Iterator[RaySlab]:
     """Yield the volume in slabs of `slices` slices, ordered by their distance from `entry_k`, the slice coordinate of
     the camera, from which rays go away; infinite: slabs begin at that end.
     """
@@ -176,10 +234,10 @@ def ray_slabs(resident: DeviceVolume, slices: int, entry_k: float, stopwatch: St
         parts.sort(key=lambda part: max(part[0] - entry_k, entry_k - part[1], 0.0))
     elif entry_k > 0.0:
         parts.reverse()
-    cells = choose_brick_cells(resident.volume)
+    cells, overlap = choose_brick_cells(resident.volume), _find_overlap(smoothing)
     for number, (first, end) in enumerate(parts):
         low, high = (-np.inf if first == 0 else first), (np.inf if end == nk else end)
-        held_first, held_end = max(first - _OVERLAP, 0), min(end + _OVERLAP + 1, nk)
+        held_first, held_end = max(first - overlap, 0), min(end + overlap + 1, nk)
         voxels_d, shape = _upload_part(resident, held_first, held_end, stopwatch)
         stage = (number == 0) + 2 * (number == len(parts) - 1)
         yield RaySlab(voxels_d, shape, held_first, low, high, cells, stage)
@@ -321,6 +379,7 @@ class SlabPicture(ABC):
     """A picture of a volume whose slabs are drawn one after the other."""
 
     makes_image = True
+    smoothing: Smoothing | None = None
 
     def __init__(
         self, resident: DeviceVolume, shot: Shot, ray_step: float, style: LabelStyle | None, warnings: list[str]
@@ -341,7 +400,7 @@ class SlabPicture(ABC):
 
     def run(self) -> Rendering:
         """Take the picture, with thinner slabs if the device has no room for the planned ones."""
-        planned = plan_ray_slabs(self.resident, *PictureBuffers.needs(self.shot.size), self.labels)
+        planned = plan_ray_slabs(self.resident, *PictureBuffers.needs(self.shot.size), self.labels, self.smoothing)
         for attempt in self.resident.attempts(RAYS, planned, self.warnings):
             with attempt as slices:
                 picture = self.take(slices)
@@ -349,7 +408,7 @@ class SlabPicture(ABC):
 
     def slabs(self, slices: int) -> Iterator[RaySlab]:
         entry_k = entry_slice(self.resident.volume, self.shot.camera)
-        return ray_slabs(self.resident, slices, entry_k, self.stopwatch)
+        return ray_slabs(self.resident, slices, entry_k, self.stopwatch, self.smoothing)
 
     def draw_slabs(self, slices: int) -> tuple[Pixels, int]:
         """Return image, depths and means, and the number of slabs."""

@@ -22,9 +22,11 @@ from clrecon.operators.rays.ray_slabs import (
     GROWN,
     LeapMap,
     RaySlab,
+    Smoothing,
     find_leaps,
     measure_cells,
     ray_slabs,
+    smooth_voxels,
 )
 from clrecon.operators.rays.slices import overlay_slices
 from clrecon.operators.rays.surface_pictures import cast_surface
@@ -43,7 +45,7 @@ from clrecon.proof.checking import (
     stack,
 )
 from clrecon.proof.rays.objects import find_splats, shade_splats
-from clrecon.proof.rays.render import cast_rays
+from clrecon.proof.rays.render import cast_rays, smooth_field
 from clrecon.proof.rays.surface import cast_surface as surface_twin
 from clrecon.proof.rays.surface import overlay_slices as overlay_twin
 from clrecon.rendering import UNSHADED, Lighting, Rendering, TransferFunction
@@ -163,7 +165,25 @@ def _check_tiles(device: Device) -> str:
     return f"{2 * ni * nj:,} tiles begin up to {_BEFORE} slices before the first that shows"
 
 
+_SMOOTHED_SHAPE = (12, 15, 85)
+"""Voxels (k, j, i): rows of ten groups of eight voxels and a part of one; 1,980 work-items of eight voxels."""
+
+
+def _check_smoothing(device: Device) -> str:
+    rng, stopwatch = np.random.default_rng(49), Stopwatch()
+    for dtype in TYPES:
+        voxels = rng.normal(100.0, 30.0, _SMOOTHED_SHAPE).astype(dtype)
+        resident, slab = _open_slab(device, stack(voxels, np.diag([0.7, 0.9, 2.0, 1.0])))
+        smoothing = Smoothing.of(resident.volume, 1.3)
+        assert smoothing is not None
+        with stopwatch.running(device):
+            smoothed = download(device, np.empty_like(voxels), smooth_voxels(resident, slab, smoothing))
+        require_equal(smoothed, smooth_field(resident.volume, 1.3), f"smoothed {dtype} voxels")
+    return f"{len(TYPES)} x {voxels.size:,} voxels smoothed along three axes, the same bits"
+
+
 LEAP_CHECKS = (
+    Check("smoothed light", ("smooth_along",), _check_smoothing),
     Check(
         "leaps of rays", ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along", "look_ahead"), _check_leaps
     ),

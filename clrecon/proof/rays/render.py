@@ -218,8 +218,32 @@ class _Rays:
         return ijk, np.asarray(in_slice.all(axis=1))
 
 
-def cast_rays(volume: Volume, style: VolumeLook | Projection, camera: Camera, size: Sequence[int]) -> RayPicture:
-    """Send a ray through each pixel.
+def smooth_field(volume: Volume, sigma_mm: float | None) -> NDArray:
+    """Return the voxels smoothed by a Gaussian, to the bits of cl/rays/smooth.cl; None: of a voxel, as without noise.
+
+    In float32, one axis after the other, outwards from each voxel; whole numbers are rounded after each, halves down.
+    """
+    sigma = float(np.cbrt(np.prod(volume.spacing))) if sigma_mm is None else sigma_mm
+    voxels = volume.voxels
+    for axis, spacing in zip((2, 1, 0), volume.spacing, strict=True):
+        reach = int(np.ceil(2.5 * sigma / spacing)) if sigma >= 0.25 * spacing else 0
+        bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) * spacing / max(sigma, 1e-9)) ** 2)
+        weights = (bell / bell.sum())[reach:].astype(np.float32)
+        pads = [(reach, reach) if each == axis else (0, 0) for each in range(3)]
+        wide = np.moveaxis(np.pad(voxels.astype(np.float32), pads, mode="edge"), axis, 0)
+        count = len(wide) - 2 * reach
+        total = weights[0] * wide[reach : reach + count]
+        for step in range(1, reach + 1):
+            total += weights[step] * (wide[reach - step :][:count] + wide[reach + step :][:count])
+        total = np.moveaxis(total, 0, axis)
+        voxels = total if voxels.dtype.kind == "f" else np.ceil(total - np.float32(0.5)).astype(voxels.dtype)
+    return voxels
+
+
+def cast_rays(
+    volume: Volume, style: VolumeLook | Projection, camera: Camera, size: Sequence[int], lit: NDArray | None = None
+) -> RayPicture:
+    """Send a ray through each pixel; `lit` are the voxels whose gradients are lit, by default those of `smooth_field`.
 
     The field is trilinear between voxel centres; up to half a voxel beyond the outermost centres it has their values. A
     ray is divided into segments of the style's ray step, by default half the smallest spacing, from where it enters the
@@ -234,7 +258,9 @@ def cast_rays(volume: Volume, style: VolumeLook | Projection, camera: Camera, si
     width, height = size
     if isinstance(style, VolumeLook):
         part = jitter_pixels(width, height).ravel() if style.jitter else np.full(rays.count, 0.5)
-        result = _composite(rays, style.function, style.light, step, part)
+        if lit is None:
+            lit = smooth_field(volume, style.smooth_light if style.light.shades else 0.0)
+        result = _composite(rays, style.function, style.light, step, part, lit)
     elif style.kind in ("mean", "drr"):
         result = _integrate(rays, step, as_water=style.kind == "drr")
     else:
@@ -297,10 +323,11 @@ def shade(
 
 
 def _composite(
-    rays: _Rays, transfer_function: TransferFunction, lighting: Lighting, step: float, part: Float64Array
+    rays: _Rays, transfer_function: TransferFunction, lighting: Lighting, step: float, part: Float64Array, lit: NDArray
 ) -> Found:
     voxels = rays.volume.voxels
-    gradients = voxel_gradients(voxels, slice_normal_matrices(rays.volume, 0))
+    matrices = slice_normal_matrices(rays.volume, 0)
+    gradients, lit_gradients = voxel_gradients(voxels, matrices), voxel_gradients(lit, matrices)
     rgba = np.zeros((rays.count, 4))
     depth, weighted = np.full(rays.count, np.nan), np.zeros(rays.count)
     steep = _SteepSegments(rays, transfer_function, step, part)
@@ -316,8 +343,10 @@ def _composite(
         length, opacity = length[seen], opacity[seen]
         colour = look_up(transfer_function, values[seen])[:, :3]
         ijk, _ = rays.places(ray, t)
-        slope = sample_field(gradients, ijk)
-        opacity = opacity * transfer_function.gradient_factor(np.linalg.norm(slope, axis=1))
+        if transfer_function.gradient_opacity is not None:
+            slope = sample_field(gradients, ijk)
+            opacity = opacity * transfer_function.gradient_factor(np.linalg.norm(slope, axis=1))
+        slope = sample_field(lit_gradients, ijk)
         softness = max(lighting.soft_gradient, LEAST_SOFT_GRADIENT)
         colour = shade(colour, slope, rays.directions[ray], lighting, soft_gradient=softness)
         opacity = 1.0 - (1.0 - opacity) ** (length / transfer_function.unit_distance)

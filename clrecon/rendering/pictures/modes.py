@@ -68,6 +68,7 @@ class Look(TypedDict, total=False):
     label_colors: ByLabel[Color] | None
     label_opacity: ByLabel[float] | None
     jitter: bool
+    smooth_light: float | None
     window: Sequence[float] | WindowName | None
     keep_air: bool
     iso_value: float

@@ -135,4 +135,5 @@ def mapping(subject: str) -> Callable[[Any], Any]:
     return check_mapping
 
 
+smooth_light = number("the smoothing of light is a length in mm from 0 to 20, not", lambda mm: 0.0 <= mm <= 20.0)
 ray_step = number("the ray step is a length in mm above 0, not", lambda mm: 0.0 < mm < math.inf)

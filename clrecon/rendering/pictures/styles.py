@@ -143,6 +143,9 @@ class VolumeLook(_Lit):
         mm between samples; default: half the smallest spacing of the volume.
     jitter : bool
         Place each sample at random within its step: fine noise instead of rings.
+    smooth_light : float, optional
+        Light comes from gradients of the volume smoothed by a Gaussian of this standard deviation in mm; colours and
+        opacities are those of the volume itself.  0: no smoothing; default: about a voxel, more for a noisy scan.
     clip : Clip, optional
         The part of space that is shown.
     labels : LabelMap, optional
@@ -159,6 +162,7 @@ class VolumeLook(_Lit):
     transfer_function: TransferFunction | PresetName = style_field(DEFAULT_PRESET, checks.preset_or_function)
     _: KW_ONLY
     jitter: bool = style_field(False, partial(checks.flag, "jitter"))
+    smooth_light: float | None = style_field(None, checks.smooth_light)
 
     @property
     def function(self) -> TransferFunction:

@@ -74,7 +74,7 @@ def draw_by_clrecon_and_vtk(volume: Volume, camera: Camera, shaded: bool, device
     lighting = phong if shaded else UNSHADED
     ours = clrecon.render(
         volume, transfer_function=function, camera=camera, size=SIZE, ray_step=step, device=device,
-        lighting=lighting, clip=what_vtk_sees(volume), background="black",
+        lighting=lighting, smooth_light=0.0, clip=what_vtk_sees(volume), background="black",
     )  # fmt: skip
     scene = scene_of(volume, camera, function, phong, size=SIZE, ray_step=step, shade=shaded)
     peer = FixedPointPeer(volume.voxels, scene, threads=1)

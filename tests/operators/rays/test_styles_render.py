@@ -168,7 +168,7 @@ def test_an_error_that_progress_raises_ends_the_picture(device: Any, name: str) 
 def test_progress_of_a_picture_in_slabs_is_told_at_the_start_and_after_each(device: Any) -> None:
     calls: list[int] = []
     made = clrecon.render(
-        body(), size=(8, 8), device=device, memory=30_000, progress=lambda stage, done, total: calls.append(done)
+        body(), size=(8, 8), device=device, memory=90_000, progress=lambda stage, done, total: calls.append(done)
     )
     assert made.report["slabs"] == len(calls) - 1 > 1
     assert calls == sorted(calls)
