@@ -6,10 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from printed_text import Printer
 
+import clrecon
 from clrecon.cli.main import main
+from clrecon.geometry import Volume
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.view import ViewSettings
 from clrecon.proof.phantom import PhantomSettings, write_phantom
@@ -125,6 +128,42 @@ def test_picture_without_a_saved_view_is_the_first_of_the_view(device: Any, scan
     assert main([*arguments, "--device", str(device.index)]) == 0
 
     assert (tmp_path / "drawn.png").read_bytes() == (tmp_path / "first.png").read_bytes()
+
+
+@pytest.mark.opencl
+def test_view_of_a_scan_begins_with_bone_without_the_table_and_says_what_was_taken(device: Any, scan: Path) -> None:
+    with open_scan(scan, device) as view, view.session() as session:
+        facts = session.do({"do": "undo"})
+
+        assert (session.model.state.mode, session.model.state.table) == ("bone", False)
+        assert "without the table" in facts["said"]
+        assert facts["undone"] is None  # the table and the mode of the start are no step
+
+
+@pytest.mark.opencl
+def test_view_brings_the_table_of_the_first_picture_back_by_a_command(device: Any, scan: Path) -> None:
+    with open_scan(scan, device) as view, view.session() as session:
+        session.do({"do": "toggle_table"})
+
+        assert session.model.state.table
+
+
+@pytest.mark.opencl
+def test_view_with_an_iso_value_begins_with_the_surface_of_the_whole_scan(device: Any, scan: Path) -> None:
+    settings = MeshSettings(device=str(device.index), iso_value=250.0)
+    with open_view([scan], ViewSettings(scan=settings)) as view, view.session() as session:
+        assert (session.model.state.mode, session.model.state.table) == ("surface", True)
+
+
+@pytest.mark.opencl
+def test_view_of_a_scan_without_a_body_begins_with_all_of_it_and_says_why(device: Any, tmp_path: Path) -> None:
+    voxels = np.full((8, 16, 16), -1000, np.int16)
+    voxels[3:5, 7:9, 7:9] = 50
+    clrecon.write_volume(Volume(voxels, np.eye(4)), tmp_path / "ct.nii.gz")
+
+    with open_scan(tmp_path / "ct.nii.gz", device) as view, view.session() as session:
+        assert session.model.state.table
+        assert any("the table is shown" in words for words in view.said)
 
 
 REFUSED = {

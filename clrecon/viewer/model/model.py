@@ -13,6 +13,7 @@ import numpy as np
 from clrecon.errors import UsageError
 from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import Float64Array
+from clrecon.rendering.looks.presets import DEFAULT_PRESET
 from clrecon.rendering.looks.window import BONE_WINDOW
 from clrecon.rendering.pictures.annotations import edge_letters
 from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
@@ -130,6 +131,10 @@ class ViewModel(ChangingView):
         return {"labels": every["labels"]} if self.label_maps else {"surface": every["surface"]}
 
     # What is shown of scans
+
+    def begin_with_bone(self, *, bare: bool) -> None:
+        """Begin with the bone by volume rendering, `bare` without the table; no step of undo leads before this."""
+        self.state = replace(self.state, mode=DEFAULT_PRESET, table=not bare)
 
     def set_iso(self, hu: float) -> None:
         (value,) = checked_numbers("the iso value", hu)

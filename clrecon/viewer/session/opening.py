@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from itertools import chain
 from pathlib import Path
 
+from clrecon.errors import RefusedInputError
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import choose_level
 from clrecon.jobs.view import ViewSettings
@@ -55,6 +56,22 @@ class OpenedView(Closing):
         self._fitted = scan.surface == "cortex" and any(isinstance(each, ShownScan) for each in self.objects)
         self._saved = None if settings.state is None else read_view(settings.state)
         self.painter = Painter(self.objects, device=scan.device, memory=scan.memory)
+        self._begins_with_bone = (
+            self._saved is None
+            and not self._fitted
+            and self._iso_value is None
+            and any(isinstance(each, ShownScan) for each in self.objects)
+        )
+        self._begins_bare = self._begins_with_bone and not scan.remove_table and self._take_table(progress)
+
+    def _take_table(self, progress: Progress) -> bool:
+        """Take the tables of the scans away for the first picture; where a body is not sure they stay, with a word."""
+        try:
+            self.painter.remove_table(progress)
+        except RefusedInputError as error:
+            self.said.append(f"the table is shown: {error}")
+            return False
+        return True
 
     def session(self, on_change: Callable[[], None] | None = None) -> ViewSession:
         session = ViewSession(
@@ -69,6 +86,8 @@ class OpenedView(Closing):
             session.restore(self._saved)
         elif self._fitted:
             session.set_fitted(True)
+        elif self._begins_with_bone:
+            session.begin_with_bone(bare=self._begins_bare)
         return session
 
     def model(self, aspect: float) -> ViewModel:
@@ -81,6 +100,8 @@ class OpenedView(Closing):
             restore_view(self._saved, model)
         elif self._fitted:
             model.set_fitted(True)
+        elif self._begins_with_bone:
+            model.begin_with_bone(bare=self._begins_bare)
         return model
 
     def close(self) -> None:

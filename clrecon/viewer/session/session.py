@@ -282,18 +282,28 @@ class ViewSession(Closing):
 
         self._work.ask("table", remove, rank=3)
 
+    def begin_with_bone(self, *, bare: bool) -> None:
+        """Begin with the bone by volume rendering; `bare`: the painter took the table away, and its share is said."""
+        with self._lock:
+            self.model.begin_with_bone(bare=bare)
+            self._said = self._say_table() if bare else None
+
+    def _say_table(self) -> str:
+        """Return what was taken away with the tables, and the way back."""
+        shares = [
+            f"{100.0 * facts['removed_share']:.3g} % of the voxels are air now, {facts['dense_voxels_removed']:,}"
+            " of them dense"
+            for facts in self.painter.remove_table().values()
+        ]
+        return f"without the table: {'; '.join(shares)}: look whether the body is whole (b: table on or off)"
+
     def toggle_table(self) -> None:
         self.set_table(not self.model.state.table)
 
     def _apply_table(self, shown: bool) -> None:
         self.model.set_table(shown)
         if not shown:
-            by_scan = self.painter.remove_table()
-            self._said = "; ".join(
-                f"{100.0 * facts['removed_share']:.3g} % of the voxels are air now, {facts['dense_voxels_removed']:,}"
-                " of them dense: look whether the body is whole"
-                for facts in by_scan.values()
-            )
+            self._said = self._say_table()
         self.rest()
 
     def set_fitted(self, shown: bool) -> None:
