@@ -244,7 +244,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--turntable",
         metavar="OUT",
-        help="write an animation that turns around the patient: .mp4, .gif, .apng, or a folder of PNG files",
+        help="write an animation that turns around the patient: .mp4, .webm, .gif, .apng, or a folder of PNG files",
         first=True,
     )
     common.add_fields(group, Turntable)

@@ -4,9 +4,9 @@ Frames are taken from an iterator and written one by one, so that a thousand nee
 place and the encoder are checked before the first frame is computed.
 
 Pillow writes GIF and APNG, but holds all frames in memory until the end.  Here Pillow compresses each frame as a
-separate picture, whose compressed blocks are copied into the animation.  MP4 is written by the program ffmpeg: it gets
-frames through a pipe, and writes the file to a temporary folder.  Every browser and every slide program plays H.264 in
-yuv420p.
+separate picture, whose compressed blocks are copied into the animation.  MP4 and WebM are written by the program
+ffmpeg: it gets frames through a pipe, and writes the file to a temporary folder.  Every browser and every slide program
+plays H.264 in yuv420p; every browser plays VP9 in WebM, for which nobody needs a licence.
 
 Sources: CompuServe, Graphics Interchange Format, version 89a; W3C, Portable Network Graphics, third edition.
 """
@@ -43,13 +43,13 @@ from clrecon.system.pieces import side_by_side
 from clrecon.system.progress import Progress
 from clrecon.system.text import guess_word
 
-_ANIMATIONS = (".mp4", ".gif", ".apng")
+_ANIMATIONS = (".mp4", ".webm", ".gif", ".apng")
 """Extensions of animations; a name without extension is a folder of PNG files."""
 
 MOST_FRAMES = 10_000
 """Most frames: five minutes at 30 frames per second.  More are a typing error."""
 
-_FASTEST = {".mp4": 120.0, ".gif": 50.0, ".apng": 120.0, "": 120.0}
+_FASTEST = {".mp4": 120.0, ".webm": 120.0, ".gif": 50.0, ".apng": 120.0, "": 120.0}
 """Most frames per second.  GIF counts hundredths of a second; browsers slow down frames shorter than two."""
 
 _SLOWEST = 0.1
@@ -107,8 +107,8 @@ def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
     if not isinstance(fps, (int, float)) or not _SLOWEST <= fps <= _FASTEST[extension]:
         kind = extension[1:].upper() or "a folder of frames"
         raise UsageError(f"{kind} takes {_SLOWEST:g} to {_FASTEST[extension]:g} frames a second, not {fps!r}")
-    if extension == ".mp4":
-        find_encoder()
+    if extension in _ENCODERS:
+        find_encoder(extension)
     if extension:
         check_writable(text)
     else:
@@ -133,8 +133,8 @@ def write_animation(
     frames : iterable of Rendering or of ndarray, shape (h, w, 3) or (h, w, 4), uint8
         Frames of one size.  The next frame is requested after the one before has been written.
     path : str or path
-        ``.mp4``, ``.gif``, ``.apng``, or a folder: a name without extension, a name that ends with a slash, or an
-        existing folder.  MP4 is H.264 (BT.709, quality 18), an odd side made even by repeating its last row or
+        ``.mp4``, ``.webm``, ``.gif``, ``.apng``, or a folder: a name without extension, a name that ends with a slash,
+        or an existing folder.  MP4 is H.264 and WebM VP9 (BT.709), an odd side made even by repeating its last row or
         column.  GIF has a palette for each frame, dithered after Floyd and Steinberg, and repeats.  APNG repeats too,
         and keeps every colour and the opacity.  A folder gets frame_0000.png, frame_0001.png, ...
     fps : float
@@ -181,10 +181,12 @@ def stage_animation(
         with stage_frame_folder(checked, path) as folder:
             yield folder
         return
-    write = {".mp4": write_video, ".gif": write_gif, ".apng": write_apng}[extension]
 
     def write_all(stream: BinaryIO) -> None:
-        write(stream, checked, fps)
+        if extension in _ENCODERS:
+            write_video(stream, checked, fps, extension)
+        else:
+            (write_gif if extension == ".gif" else write_apng)(stream, checked, fps)
 
     with stage_file(path, write_all) as file:
         yield file
@@ -203,7 +205,7 @@ def _checked_frames(
         shape = shape or image.shape
         if image.shape != shape:
             raise UsageError(f"frame {done} has shape {image.shape}, the frames before it {shape}")
-        if extension in (".mp4", ".gif") and image.shape[2] == 4:
+        if extension in (*_ENCODERS, ".gif") and image.shape[2] == 4:
             if (image[..., 3] != 255).any():
                 raise UsageError(
                     f"{extension[1:].upper()} cannot hold a transparent background: choose a background colour,"
@@ -361,27 +363,31 @@ def _write_chunk(stream: BinaryIO, kind: bytes, body: bytes) -> None:
     stream.write(struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)))
 
 
-QUALITY = 18
-"""x264's constant rate factor; at 18 the loss is not visible."""
+_ENCODERS = {
+    ".mp4": ("libx264", "H.264", ("-preset", "medium", "-crf", "18", "-movflags", "+faststart")),
+    ".webm": ("libvpx-vp9", "VP9", ("-deadline", "good", "-cpu-used", "4", "-row-mt", "1", "-crf", "24", "-b:v", "0")),
+}
+"""Encoder of ffmpeg for a kind of video, its name, and its options: a quality at which the loss is not visible."""
 
 
-@lru_cache(maxsize=1)
-def find_encoder() -> str:
-    """Return the ffmpeg to call: that of imageio-ffmpeg, else the one on the PATH."""
-    program = _find_ffmpeg()
+@lru_cache(maxsize=2)
+def find_encoder(extension: str = ".mp4") -> str:
+    """Return the ffmpeg to call for a kind of video: that of imageio-ffmpeg, else the one on the PATH."""
+    program, (encoder, name, _) = _find_ffmpeg(), _ENCODERS[extension]
+    kind, advice = extension[1:].upper(), _advise_encoder(encoder)
     if program is None:
-        raise UsageError(f"no encoder for MP4: {_advise_encoder()}; GIF, APNG and a folder of PNG files need none")
+        raise UsageError(f"no encoder for {kind}: {advice}; GIF, APNG and a folder of PNG files need none")
     try:
         listed = subprocess.run([program, "-hide_banner", "-encoders"], capture_output=True, timeout=60).stdout
     except (OSError, subprocess.SubprocessError) as error:
-        raise UsageError(f"{program} does not run ({error}): {_advise_encoder()}") from error
-    if b" libx264 " not in listed:
-        raise UsageError(f"{program} has no H.264 encoder (libx264): {_advise_encoder()}")
+        raise UsageError(f"{program} does not run ({error}): {advice}") from error
+    if f" {encoder} ".encode() not in listed:
+        raise UsageError(f"{program} has no {name} encoder ({encoder}): {advice}")
     return program
 
 
-def _advise_encoder() -> str:
-    return f"{install_command('imageio-ffmpeg')}, or put an ffmpeg with libx264 on the PATH"
+def _advise_encoder(encoder: str) -> str:
+    return f"{install_command('imageio-ffmpeg')}, or put an ffmpeg with {encoder} on the PATH"
 
 
 def _find_ffmpeg() -> str | None:
@@ -393,14 +399,14 @@ def _find_ffmpeg() -> str | None:
         return shutil.which("ffmpeg")
 
 
-def write_video(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
+def write_video(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float, extension: str = ".mp4") -> None:
     """Encode frames (h, w, 3) and copy the finished file to a stream."""
     first = next(frames)
     height, width = first.shape[:2]
     with tempfile.TemporaryDirectory(prefix="clrecon-") as folder:
-        video = Path(folder) / "video.mp4"
+        video = Path(folder) / f"video{extension}"
         errors = Path(folder) / "errors.txt"
-        command = _encoder_command(find_encoder(), (width + width % 2, height + height % 2), fps, video)
+        command = _encoder_command(find_encoder(extension), (width + width % 2, height + height % 2), fps, video)
         with open(errors, "wb") as log, _start_encoder(command, log) as encoder:
             assert encoder.stdin is not None
             try:
@@ -420,7 +426,7 @@ def write_video(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: floa
         if code != 0 or not video.exists():
             lines = errors.read_text(errors="replace").split("\n")
             last_line = next((line.strip() for line in reversed(lines) if line.strip()), f"exit code {code}")
-            raise OutputError(f"the encoder of MP4 failed: {last_line}")
+            raise OutputError(f"the encoder of {extension[1:].upper()} failed: {last_line}")
         with open(video, "rb") as finished:
             shutil.copyfileobj(finished, stream, 1 << 20)
 
@@ -434,13 +440,14 @@ def _start_encoder(command: list[str], log: BinaryIO) -> subprocess.Popen[bytes]
 
 def _encoder_command(program: str, size: tuple[int, int], fps: float, path: Path) -> list[str]:
     width, height = size
+    encoder, _, options = _ENCODERS[path.suffix]
     # The colour matrix is both applied and named: ffmpeg's default is BT.601, but players assume BT.709 for large
     # pictures.
     colours = "scale=out_range=tv:out_color_matrix=bt709:flags=lanczos+accurate_rnd,format=yuv420p"
     return [
         *(program, "-hide_banner", "-loglevel", "error", "-nostdin", "-y"),
         *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:.6g}", "-i", "pipe:0"),
-        *("-an", "-vf", colours, "-c:v", "libx264", "-preset", "medium", "-crf", str(QUALITY)),
+        *("-an", "-vf", colours, "-c:v", encoder, *options),
         *("-color_primaries", "bt709", "-color_trc", "bt709", "-colorspace", "bt709", "-color_range", "tv"),
-        *("-movflags", "+faststart", "-fflags", "+bitexact", "-map_metadata", "-1", os.fspath(path)),
+        *("-fflags", "+bitexact", "-map_metadata", "-1", os.fspath(path)),
     ]

@@ -298,7 +298,7 @@ def never():
 @pytest.mark.parametrize(
     ("name", "fps", "error", "message"),
     [
-        ("turn.avi", 25, UsageError, "use one of .mp4, .gif, .apng, or a name without extension"),
+        ("turn.avi", 25, UsageError, "use one of .mp4, .webm, .gif, .apng, or a name without extension"),
         ("turn.png", 25, UsageError, "folder of PNG files"),
         ("turn.gif", 60, UsageError, "GIF takes 0.1 to 50 frames a second"),
         ("turn", 0, UsageError, "a folder of frames takes"),

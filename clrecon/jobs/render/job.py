@@ -418,7 +418,7 @@ def _take_turntable(run: Run, taker: PictureTaker, files: PictureFiles) -> dict[
     }
 
 
-_OPAQUE_ONLY = (".jpg", ".jpeg", ".mp4", ".gif")
+_OPAQUE_ONLY = (".jpg", ".jpeg", ".mp4", ".webm", ".gif")
 
 
 @dataclass(frozen=True)

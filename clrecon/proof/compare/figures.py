@@ -257,7 +257,7 @@ def measure_against_slice(
 
 VIEW: DirectionName = "anterior"
 SIZE = (480, 480)
-QUALITY = 80
+_QUALITY = 80
 """Of WebP; PNG beside the page is exact."""
 
 Image = NDArray[np.uint8]
@@ -294,7 +294,7 @@ def difference_of(picture: Image, reference: Image) -> Image:
 def embed(image: Any) -> str:
     """Return a picture as the address of a WebP inside the page."""
     stream = io.BytesIO()
-    _as_pillow(image).save(stream, "WEBP", quality=QUALITY, method=4)
+    _as_pillow(image).save(stream, "WEBP", quality=_QUALITY, method=4)
     return "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
 
 

@@ -309,7 +309,7 @@ _MOST_PER_METRE = 2**31 - 1
 
 def check_image_path(path: str | os.PathLike[str]) -> str:
     """Return the extension of a picture file in lower case."""
-    moves = str(path).lower().endswith((".gif", ".apng", ".mp4"))
+    moves = str(path).lower().endswith((".gif", ".apng", ".mp4", ".webm"))
     hint = f" of animations, for which there is {name_parameter('turntable')}" if moves else ""
     return find_extension(path, IMAGE_FORMATS, "picture", hint)
 
