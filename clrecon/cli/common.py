@@ -280,6 +280,22 @@ def add_report(container: argparse._ActionsContainer, content: str, *, first: bo
     container.add_argument("--report", metavar="FILE", help=f"write {content} as JSON", first=first)
 
 
+def add_store(container: argparse._ActionsContainer, result: str, form: str) -> None:
+    """Add --store, which puts the `result` into an archive in a `form` of DICOM."""
+    container.add_argument(
+        "--store",
+        metavar="URL",
+        help=f"also store the {result} in the DICOMweb archive dicomweb+https://HOST/PATH, as {form} with the name, ID"
+        " and birth date of the patient",
+    )
+
+
+def describe_stored(report: Any) -> list[str]:
+    """Say what an archive has got; nothing where it was not asked."""
+    stored = report.get("stored")
+    return [] if stored is None else [f"stored   {megabytes(stored['bytes'])}, with the name of the patient"]
+
+
 def add_no_clobber(container: argparse._ActionsContainer, *, with_ids: bool = True) -> None:
     """Add --no-clobber, and --keep-ids where something of a scan is written."""
     container.add_argument(

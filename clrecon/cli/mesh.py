@@ -63,12 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     checks = add_mesh_options(parser)
     common.add_fields(parser.add_argument_group("workers"), MeshSettings, "workers")
     common.add_report(checks, "affine, counts, quality, device and times")
-    parser.add_argument(
-        "--store",
-        metavar="URL",
-        help="also store the meshes in the DICOMweb archive dicomweb+https://HOST/PATH, as Encapsulated STL with the"
-        " name, ID and birth date of the patient",
-    )
+    common.add_store(checks, "meshes", "Encapsulated STL")
 
 
 def add_mesh_options(parser: argparse.ArgumentParser, without: Container[str] = ()) -> argparse._ArgumentGroup:
@@ -137,10 +132,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
         console.say(line)
     together = options.one_file or (options.all_parts and makes_objects(options.output))
     console.say(f"wrote    {_describe_files(options.output, report, together=together)}")
-    if report.stored is not None:
-        console.say(
-            f"stored   {common.megabytes(report.stored['bytes'])}, with the patient's name, as Encapsulated STL"
-        )
+    for line in common.describe_stored(report):
+        console.say(line)
     if options.report:
         console.say(f"report   {printable(options.report)}")
     return finish_with_gates(

@@ -38,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     checks = parser.add_argument_group("checks")
     common.add_no_clobber(checks)
     common.add_report(checks, "vertebrae, confidence, discs and times")
+    common.add_store(checks, "label map", "DICOM SEG")
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -52,6 +53,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         picture_path=options.picture,
         with_picture=with_picture,
         report_path=options.report,
+        store=options.store,
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
@@ -59,6 +61,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     if settings.name_at is None and settings.first is None:
         lines.append(f"names    {_NAMING}")
     lines.append(f"wrote    {printable(options.output)}, {common.megabytes(report['output']['bytes'])}")
+    lines += common.describe_stored(report)
     if with_picture:
         lines.append(f"picture  {printable(options.picture or picture_beside(options.output))}: look at it")
     common.show_report(report, lines, options, console)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack
 from copy import copy
@@ -400,7 +400,7 @@ class Run(Laps):
 
 
 class ArchiveTarget:
-    """An archive that gets the meshes of a run, each with the patient, the study and the slices of its scan.
+    """An archive that gets the results of a run, each with the patient, the study and the slices of its scan.
 
     source: The input as a path that stays until the end of the run.
     """
@@ -412,19 +412,26 @@ class ArchiveTarget:
         self._archive = Store(url)
         self._archive.check()
         self.source = run.open(source)
-        self._origin = read_origin(self.source, run.settings)
+        self.origin = read_origin(self.source, run.settings)
+
+    def store(self, instances: Iterable[tuple[str, bytes]]) -> dict[str, int]:
+        """Store instances, each with its UID; return their number and bytes."""
+        sizes = []
+        for uid, instance in instances:
+            self._archive.store(uid, instance)
+            sizes.append(len(instance))
+        return {"instances": len(sizes), "bytes": sum(sizes)}
 
     def store_meshes(self, meshes: Sequence[Mesh], *, is_modified: bool) -> dict[str, int]:
-        """Store each mesh as Encapsulated STL in the frame of the scan; return their number and bytes."""
+        """Store each mesh as Encapsulated STL in the frame of the scan."""
+        return self.store(self._encode_meshes(meshes, is_modified))
+
+    def _encode_meshes(self, meshes: Sequence[Mesh], is_modified: bool) -> Iterator[tuple[str, bytes]]:
         from clrecon.exchange import stl
         from clrecon.reading.dicom.storing import encode_model
 
-        size = 0
         for mesh in meshes:
             stream = BytesIO()
             stl.write(stream, mesh.describe("lps"))
             title = str(mesh.report.get("part_name") or "surface")
-            uid, instance = encode_model(stream.getvalue(), self._origin, title, is_modified=is_modified)
-            self._archive.store(uid, instance)
-            size += len(instance)
-        return {"instances": len(meshes), "bytes": size}
+            yield encode_model(stream.getvalue(), self.origin, title, is_modified=is_modified)

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.jobs.run import Run, ScanReport
+from clrecon.jobs.run import ArchiveTarget, Run, ScanReport
 from clrecon.jobs.settings import VertebraeSettings
 from clrecon.labels.label_map import encode_nifti, load_nibabel
-from clrecon.labels.write_segmentation import encode_segmentation
+from clrecon.labels.write_segmentation import encode_identified, encode_segmentation
 from clrecon.reading import tell_format
+from clrecon.reading.dicom.reader import list_slices
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
 from clrecon.system.light_dataclass import dataclass
@@ -33,6 +34,8 @@ class VertebraeReport(ScanReport):
 
     SCHEMA = "vertebrae"
 
+    _LEFT_OUT = ("stored",)
+
     vertebrae: list[Vertebra]
     low_confidence: int
     written: int
@@ -40,6 +43,7 @@ class VertebraeReport(ScanReport):
     left_out: list[str]
     level_hu: float
     output: Mapping[str, Any]
+    stored: Mapping[str, int] | None = None
 
 
 def make_vertebrae(
@@ -50,16 +54,23 @@ def make_vertebrae(
     picture_path: str | Path | None = None,
     with_picture: bool = True,
     report_path: str | Path | None = None,
+    store: str | None = None,
     **how: Any,
 ) -> VertebraeReport:
-    """Read a CT series, find its vertebrae, and write a label map, and a PNG, by default beside it."""
+    """Read a CT series, find its vertebrae, and write a label map, and a PNG, by default beside it.
+
+    store: URL of a DICOMweb archive that gets the label map too, before any file is in its place.
+    """
     from clrecon.spine import split_vertebrae
 
     settings = settings or VertebraeSettings()
     picture = picture_beside(output) if picture_path is None and with_picture else picture_path
     with Run(settings, **how) as run:
         run.check([("the label map", output), ("the picture", picture), ("the report", report_path)], source)
-        if map_format(output) in _SEGMENTATION:  # whose slices are read twice
+        target = None if store is None else ArchiveTarget(store, source, run)
+        if target is not None:
+            source = target.source
+        elif map_format(output) in _SEGMENTATION:  # whose slices are read twice
             source = run.open(source)
         _check_formats(source, output, picture)
         volume = run.read(source)
@@ -78,6 +89,9 @@ def make_vertebrae(
         file = run.write(output, _encode_map(split.labels, output, source, settings))
         if picture is not None:
             run.write(picture, draw_vertebrae(split))
+        stored = None
+        if target is not None:
+            stored = target.store([encode_identified(split.labels, list_slices(source, settings), target.origin)])
         run.lap("write")
         discs = [
             {"centre_mm": [round(float(v), 2) for v in centre], "normal": [round(float(v), 4) for v in normal]}
@@ -101,6 +115,7 @@ def make_vertebrae(
             left_out=split.left_out,
             level_hu=split.level_hu,
             output={"format": map_format(output), "bytes": file.size},
+            stored=stored,
         )
         return run.finish(report, report_path)
 
@@ -121,8 +136,6 @@ def _check_formats(source: str | Path, output: str | Path, picture: str | Path |
 def _encode_map(labels: LabelMap, output: str | Path, source: str | Path, settings: VertebraeSettings) -> bytes:
     kind = map_format(output)
     if kind in _SEGMENTATION:
-        from clrecon.reading.dicom.reader import list_slices
-
         return encode_segmentation(labels, list_slices(source, settings))
     return encode_nifti(labels, packed=kind.endswith(".gz"))
 

@@ -1,7 +1,8 @@
 """Label maps as DICOM SEG: binary segments that reference the slices of their scan, for 3D Slicer and archives.
 
 A SEG belongs to the study and the frame of reference of its scan, so it holds their UIDs and those of the slices.  It
-holds no name, identifier or date of the patient: those elements are empty, and dates that must be there are 1970.
+holds no name, identifier or date of the patient, unless it is made for an archive: those elements are empty, and dates
+that must be there are 1970.
 
 Source: DICOM PS3.3 A.51 and C.8.20 (Segmentation), C.7.6.16 (multi-frame functional groups), CID 7150 (categories).
 """
@@ -18,7 +19,7 @@ import numpy as np
 
 from clrecon.errors import RefusedInputError
 from clrecon.labels.label_map import LabelMap
-from clrecon.reading.dicom.storing import IMPLEMENTATION, ROOT, make_item
+from clrecon.reading.dicom.storing import IMPLEMENTATION, ROOT, Origin, copy_patient, make_item
 from clrecon.version import package_version
 
 SourceSlice = tuple[Path, int, int]
@@ -34,6 +35,22 @@ def encode_segmentation(labels: LabelMap, slices: Sequence[SourceSlice], *, labe
 
     `label` is the content label: upper case letters, digits and underscores, at most 16.
     """
+    return _write_bytes(_make_segmentation(labels, slices, label, None))
+
+
+def encode_identified(labels: LabelMap, slices: Sequence[SourceSlice], origin: Origin) -> tuple[str, bytes]:
+    """Return the UID and the bytes of a SEG for an archive, which names the patient and the study."""
+    seg = _make_segmentation(labels, slices, "VERTEBRAE", origin)
+    return str(seg.SOPInstanceUID), _write_bytes(seg)
+
+
+def _write_bytes(seg: Any) -> bytes:
+    stream = BytesIO()
+    seg.save_as(stream, enforce_file_format=True)
+    return stream.getvalue()
+
+
+def _make_segmentation(labels: LabelMap, slices: Sequence[SourceSlice], label: str, origin: Origin | None) -> Any:
     from pydicom.sequence import Sequence as Items
 
     sources = _read_sources(slices)
@@ -44,11 +61,15 @@ def encode_segmentation(labels: LabelMap, slices: Sequence[SourceSlice], *, labe
     numbers = labels.numbers
     frames = [(number, k) for number in numbers for k in range(nk) if (labels.voxels[k] == number).any()]
     digest = hashlib.sha256(labels.voxels.tobytes() + first["SeriesInstanceUID"].encode() + repr(labels.names).encode())
+    if origin is not None:  # the file without a patient is another
+        digest.update(str(origin.header.get("PatientID", "")).encode() + b"stored")
 
     def make_uid(role: str) -> str:
         return ROOT + str(int.from_bytes(hashlib.sha256(digest.digest() + role.encode()).digest()[:16], "big"))
 
     seg = _describe_series(make_uid, first)
+    if origin is not None:
+        copy_patient(seg, origin)
     seg.ContentLabel = label
     seg.Rows, seg.Columns = rows, columns
     seg.NumberOfFrames = len(frames)
@@ -63,9 +84,7 @@ def encode_segmentation(labels: LabelMap, slices: Sequence[SourceSlice], *, labe
     packed = np.packbits(bits, bitorder="little").tobytes()
     seg.PixelData = packed + b"\0" * (len(packed) % 2)
     seg["PixelData"].VR = "OB"
-    stream = BytesIO()
-    seg.save_as(stream, enforce_file_format=True)
-    return stream.getvalue()
+    return seg
 
 
 def _describe_series(make_uid: Callable[[str], str], first: dict[str, str]) -> Any:

@@ -128,7 +128,7 @@ class Store:
         if uid not in stored:
             reasons = [f"0x{item['00081197']['Value'][0]:04X}" for item in _find_items(reply, "00081198")]
             raise OutputError(
-                f"{self._name} did not store the mesh{' (failure reason ' * bool(reasons)}{', '.join(reasons)}"
+                f"{self._name} did not store the result{' (failure reason ' * bool(reasons)}{', '.join(reasons)}"
                 f"{')' * bool(reasons)}; no file was written"
             )
 

@@ -12,6 +12,7 @@ import pydicom
 import pytest
 from PIL import Image
 from printed_text import Printer
+from web_servers import Archive, running
 
 from clrecon.cli.main import main
 from clrecon.labels import read_labels, resample_labels
@@ -129,15 +130,30 @@ def test_vertebrae_with_a_first_level_are_the_same_voxels_with_the_names_of_leve
 
 @pytest.fixture(scope="module")
 def segmentation(scan: Path, written: Path) -> Path:
-    """The folder of a run on a zip file that wrote a DICOM SEG, with L2 named at its centre, and other.png."""
+    """The folder of a run on a zip file that wrote a DICOM SEG, with L2 named at its centre, and other.png.
+
+    Beside it is stored.dcm, what an archive got.
+    """
     folder = scan.parent / "segmentation"
     folder.mkdir()
     middle = json.loads((written / "a.json").read_text())["vertebrae"][1]["centre_mm"]
     name = f"{','.join(str(value) for value in middle)}=L2"
     packed = shutil.make_archive(str(scan.parent / "packed"), "zip", scan)
     command = ["vertebrae", packed, "-o", str(folder / "s.dcm"), "--picture", str(folder / "other.png"), "-q"]
-    assert main([*command, "--name-at", name]) == 0
+    with running(Archive(scan)) as archive:
+        assert main([*command, "--name-at", name, "--store", archive.study]) == 0
+    [stored] = archive.stored()
+    stored.save_as(scan.parent / "stored.dcm")
     return folder
+
+
+def test_stored_map_of_vertebrae_is_the_file_with_the_patient_of_the_scan(scan: Path, segmentation: Path) -> None:
+    stored, written = scan.parent / "stored.dcm", segmentation / "s.dcm"
+
+    np.testing.assert_array_equal(read_labels(stored).voxels, read_labels(written).voxels)
+    first = pydicom.dcmread(next(scan.glob("*.dcm")))
+    assert pydicom.dcmread(stored).PatientName == first.PatientName != ""
+    assert pydicom.dcmread(stored).SOPInstanceUID != pydicom.dcmread(written).SOPInstanceUID
 
 
 def test_dicom_seg_of_vertebrae_has_the_voxels_of_the_nifti_map_with_the_names_of_levels(

@@ -107,7 +107,7 @@ class Archive(Server):
     """The DICOM files of a folder as one series; `page` instances are listed at once."""
 
     def __init__(self, folder: Path):
-        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        files = sorted(folder.rglob("*.dcm"))
         self.instances = [path.read_bytes() for path in files]
         self.uids = [str(pydicom.dcmread(path, specific_tags=["SOPInstanceUID"]).SOPInstanceUID) for path in files]
         self.page = 1000

@@ -90,13 +90,18 @@ def encode_model(stl: bytes, origin: Origin, title: str, *, is_modified: bool) -
     return str(model.SOPInstanceUID), stream.getvalue()
 
 
-def _describe_origin(model: Any, origin: Origin) -> None:
-    """Copy patient, study and frame of reference, and refer to the slices."""
+def copy_patient(target: Any, origin: Origin) -> None:
+    """Copy what names the patient and the study of a scan."""
     for keyword in (*_PATIENT, *_STUDY):
-        setattr(model, keyword, origin.header.get(keyword, ""))
+        setattr(target, keyword, origin.header.get(keyword, ""))
     for keyword in _MORE:
         if keyword in origin.header:
-            setattr(model, keyword, origin.header.get(keyword))
+            setattr(target, keyword, origin.header.get(keyword))
+
+
+def _describe_origin(model: Any, origin: Origin) -> None:
+    """Copy patient, study and frame of reference, and refer to the slices."""
+    copy_patient(model, origin)
     model.StudyInstanceUID = origin.header.StudyInstanceUID
     model.FrameOfReferenceUID = origin.header.FrameOfReferenceUID
     model.PositionReferenceIndicator = ""
