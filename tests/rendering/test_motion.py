@@ -91,6 +91,17 @@ def test_mp4_is_h264_in_bt_709_with_the_given_frames_a_second(mp4, encoder):
     assert [words for words in ("h264", "yuv420p(tv, bt709", "20 fps") if words not in described] == []
 
 
+def test_webm_is_vp9_and_shows_its_frames(tmp_path, encoder):
+    write_animation(iter(SIX_FRAMES), tmp_path / "turn.webm", 20.0)
+
+    command = [encoder, "-i", tmp_path / "turn.webm", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    decoded = subprocess.run(command, capture_output=True, check=True)
+    assert [words for words in ("vp9", "yuv420p(tv, bt709", "20 fps") if words not in decoded.stderr.decode()] == []
+    read = np.frombuffer(decoded.stdout, np.uint8).reshape(-1, 40, 64, 3)[:, :, :63]
+    assert len(read) == 6
+    assert np.abs(read.astype(int) - np.array(SIX_FRAMES)).mean() <= tolerances.MP4_MEAN_GREY  # as of MP4
+
+
 def test_mp4_is_written_alone(mp4):
     assert names_in(mp4.parent) == ["turn.mp4"]
 
@@ -330,6 +341,13 @@ def test_mp4_without_an_encoder_is_refused_before_the_first_frame(tmp_path, no_e
         write_animation(never(), tmp_path / "turn.mp4")
 
     assert names_in(tmp_path) == []
+
+
+def test_webm_by_an_ffmpeg_without_vp9_is_refused(tmp_path, no_encoder):
+    fake_ffmpeg(tmp_path, "echo ' V..... libx264 '")
+    no_encoder.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    with refused(UsageError, "VP9"):
+        check_animation(tmp_path / "turn.webm")
 
 
 def test_gif_needs_no_encoder(tmp_path, no_encoder):

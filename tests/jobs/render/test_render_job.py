@@ -292,7 +292,7 @@ def test_picture_of_a_volume_in_slabs_is_that_of_the_whole(
         return report["pictures"][0]["slabs"], np.asarray(Image.open(tmp_path / "a.png")).astype(int)
 
     slabs_of_whole, whole = draw_with(memory=None)
-    slabs, in_slabs = draw_with(memory=130_000)
+    slabs, in_slabs = draw_with(memory=250_000)
 
     assert slabs_of_whole == 1
     assert slabs > 1

@@ -19,6 +19,7 @@ from clrecon.proof.rays.render import (
     look_up,
     sample_field,
     shade,
+    smooth_field,
     voxel_gradients,
 )
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
@@ -198,7 +199,9 @@ def test_colour_opacity_and_depths_of_a_ray_are_the_sums_over_its_samples_writte
 
     origin, direction = (rays[row, column] for rays in camera.rays((3, 3)))
     (t_in,), (t_out,), _ = find_interval(origin[None], direction[None], box_of(volume))
-    gradients = voxel_gradients(volume.voxels, slice_normal_matrices(volume, 0))
+    matrices = slice_normal_matrices(volume, 0)
+    gradients = voxel_gradients(volume.voxels, matrices)
+    lit_gradients = voxel_gradients(smooth_field(volume, None), matrices)
     colour, opacity, weighted, depth, start = np.zeros(3), 0.0, 0.0, np.nan, t_in
     while start < t_out and opacity < 0.99:
         length = min(step, t_out - start)
@@ -209,7 +212,9 @@ def test_colour_opacity_and_depths_of_a_ray_are_the_sums_over_its_samples_writte
         alpha *= np.interp(np.linalg.norm(slope), gradient_nodes, gradient_opacities)
         alpha = 1.0 - (1.0 - alpha) ** (length / unit_mm)
         weight = (1.0 - opacity) * alpha
-        colour = colour + weight * shade(np.array([rgb]), slope, direction[None], lighting)[0]
+        colour = (
+            colour + weight * shade(np.array([rgb]), sample_field(lit_gradients, ijk), direction[None], lighting)[0]
+        )
         opacity += weight
         weighted += weight * t
         depth = t if np.isnan(depth) and opacity > 1 / 255 else depth
