@@ -46,6 +46,19 @@ def test_command_that_refines_or_writes_files_of_vtk_works_without_it(device: An
 
 
 @pytest.mark.usefixtures("ct_without_vtk")
+def test_comparison_without_matplotlib_names_it_and_writes_nothing(
+    device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in {"matplotlib", *(name for name in sys.modules if name.split(".")[0] == "matplotlib")}:
+        monkeypatch.setitem(sys.modules, name, None)
+
+    assert main(["compare", "ct", "-o", "report", "--hu", "226", "--device", str(device.index), "-q"]) == 3
+
+    assert "package matplotlib" in capsys.readouterr().err
+    assert not Path("report").exists()
+
+
+@pytest.mark.usefixtures("ct_without_vtk")
 def test_distances_between_meshes_are_measured_and_drawn_without_vtk(device: Any) -> None:
     for output in ("a.vtp", "b.ply"):
         assert main(["mesh", "ct", "-o", output, "--decimate", "0.5", "--device", str(device.index), "-q"]) == 0

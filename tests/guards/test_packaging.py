@@ -122,6 +122,15 @@ def test_conda_recipe_requires_what_setup_cfg_does_and_a_driver() -> None:
     assert set(required) == {f"{name} >={version}" for name, _, version in stated} | {"python >=3.10", "pocl"}
 
 
+def test_list_without_vtk_is_what_setup_cfg_requires_but_for_vtk_pyvista_and_matplotlib() -> None:
+    required = read_setup()["options"]["install_requires"].splitlines()
+    left_out = ("vtk ", "pyvista ", "matplotlib ")
+    expected = [line for line in required if line and not line.startswith(("#", *left_out))]
+    assert len(expected) == len([line for line in required if line and line[0] != "#"]) - len(left_out)
+    listed = (PACKAGES / "without-vtk.txt").read_text(encoding="utf-8").splitlines()
+    assert [line for line in listed if line[0] != "#"] == expected
+
+
 def test_version_of_the_conda_recipe_is_that_of_setup_cfg() -> None:
     recipe = (PACKAGES / "recipe.yaml").read_text(encoding="utf-8")
     assert f'version: "{read_setup()["metadata"]["version"]}"' in recipe

@@ -40,6 +40,7 @@ from clrecon.proof.phantom import phantom_truth
 from clrecon.reading import read_selected
 from clrecon.system.files import StagedFolder, check_folder, temporary_folder
 from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.packages import import_package
 from clrecon.system.paths import final_mode, keep_existing, system_errors
 from clrecon.system.progress import Progress, device_seconds, ignore_progress
 from clrecon.system.text import format_hu
@@ -117,6 +118,7 @@ def make_comparison(
     progress = progress or ignore_progress
     watch = Laps()
     truth = None if settings.truth is None else _check_truth(Path(settings.truth))
+    import_package("matplotlib.figure", "the page of a comparison", "matplotlib")
     with keep_existing(keep=no_clobber):
         folder = check_report_folder(output)
     check_kept([("the report", output)], source, settings.truth)
