@@ -13,8 +13,8 @@
 #define REFUSED 255
 #define GROUP 64
 #define MOST_RING 16 /* numbers of its faces have 4 bits */
-#define PULL 1e-3f         /* weight of the middle of an edge: it decides where planes leave a direction open */
-#define LENGTH_WEIGHT 1e-4f /* of the square of the length of an edge, beside its cost */
+#define PULL 0.001f        /* weight of the middle of an edge: it decides where planes leave a direction open */
+#define LENGTH_WEIGHT 0.0001f /* of the square of the length of an edge, beside its cost */
 #define STEEPEST 0.2f      /* least cosine between the normals of a face before and after */
 #define SLENDER 0.01f      /* sine below which a normal is not looked at: twice the area beside the longest edge */
 #define EASY 0.36f         /* share of the limit within which a point stays at its face */

@@ -15,7 +15,7 @@ from clrecon.opencl import Device
 _STEP = 0.2
 """Least distance of the points of a new edge that are measured, in mean edges."""
 
-_LONG = 0.4
+LONG = 0.4
 """Square of the length from which the middle of an edge is measured, in squares of the mean edge."""
 
 _MOST_POINTS = 2**28 - 1
@@ -120,7 +120,7 @@ class DeviceCollapser:
         )
         self._launch(
             "hang_points", self._faces, **surface, leaving=leaving, **self._lists, faces=self._faces, count=self._count,
-            longest=_LONG * self._given.mean_edge**2,
+            longest=LONG * self._given.mean_edge**2,
         )  # fmt: skip
 
     def octaves(self) -> NDArray[np.uint8]:
