@@ -26,6 +26,8 @@ _STORED = 'multipart/related; type="application/dicom"; transfer-syntax=*'
 
 _LISTED = "application/dicom+json"
 _INSTANCE_UID = "00080018"
+_FAILED_ITEMS, _STORED_ITEMS = "00081198", "00081199"
+_SHOWN = 3
 _UID = re.compile(r"[0-9.]{1,64}")
 _LARGEST_LIST = 1 << 26
 _LARGEST_HEAD = 1 << 16
@@ -124,13 +126,10 @@ class Store:
         data = b"".join((head, instance, f"\r\n--{border}--\r\n".encode()))
         content = Content(f'multipart/related; type="application/dicom"; boundary="{border}"', data)
         reply = persist(partial(self._send, content), self._name, self._patience)
-        stored = [item["00081155"]["Value"][0] for item in _find_items(reply, "00081199")]
-        if uid not in stored:
-            reasons = [f"0x{item['00081197']['Value'][0]:04X}" for item in _find_items(reply, "00081198")]
-            raise OutputError(
-                f"{self._name} did not store the result{' (failure reason ' * bool(reasons)}{', '.join(reasons)}"
-                f"{')' * bool(reasons)}; no file was written"
-            )
+        if uid not in _find_values(reply, _STORED_ITEMS, "00081155"):
+            codes = [f"0x{code:04X}" for code in _find_values(reply, _FAILED_ITEMS, "00081197") if type(code) is int]
+            reasons = f" (failure reason {', '.join(codes[:_SHOWN])})" if codes else ""
+            raise OutputError(f"{self._name} did not store the result{reasons}; no file was written")
 
     def _send(self, content: Content) -> Any:
         with ask_server(self._url, _LISTED, self._patience, content) as answer:
@@ -141,10 +140,12 @@ class Store:
                 return {}
 
 
-def _find_items(reply: Any, tag: str) -> list[Any]:
-    """Return the items of a sequence in DICOM JSON."""
-    value = reply.get(tag, {}).get("Value", []) if isinstance(reply, dict) else []
-    return [item for item in value if isinstance(item, dict)]
+def _find_values(reply: Any, sequence: str, tag: str) -> list[Any]:
+    """Return the first value of an element in each item of a sequence in DICOM JSON; none where the form is another."""
+    try:
+        return [item[tag]["Value"][0] for item in reply[sequence]["Value"]]
+    except (LookupError, TypeError):
+        return []
 
 
 def _save_parts(answer: Answer, name: str, folder: Path, expected: int, progress: Progress, limits: Limits) -> int:
@@ -167,7 +168,7 @@ def _save_parts(answer: Answer, name: str, folder: Path, expected: int, progress
             for piece in parts.next_content():
                 size += stream.write(piece)
         stated = head.get("Content-Length", "").strip()
-        if size == 0 or (stated.isdecimal() and int(stated) != size):
+        if size == 0 or (stated.isdecimal() and stated.lstrip("0") != str(size)):
             raise RefusedInputError(
                 f"{name} sends part {count + 1} with {size:,} bytes and states {escape_text(stated, 20) or 'none'}: its"
                 " boundary or its length is wrong"

@@ -221,6 +221,10 @@ BAD_ANSWERS = {
     "headers that never end": (answering(join_parts([])[:-4] + bytes(70_000), STORED), (65_536,)),
     "length of a part too large": (answering(join_parts([b"DICM"], length=5), STORED), (4, 5)),
     "length of a part too small": (answering(join_parts([b"DICM"], length=3), STORED), (4, 3)),
+    "length of a part in more digits than Python reads": (
+        answering(join_parts([b"DICM"], length="9" * 5000), STORED),
+        (4,),
+    ),
     "empty part": (answering(join_parts([b""]), STORED), (1, 0)),
     "packed": (answering(b"", STORED, Content_Encoding="gzip"), ("gzip",)),
     "406": (answering(status=406), (406,)),

@@ -96,7 +96,7 @@ def answering(content: bytes = b"", kind: str = "text/plain", status: int = 200,
     return lambda handler: send(handler, content, kind, status, **headers)
 
 
-def join_parts(contents: Sequence[bytes], *, kind: str = "application/dicom", length: int | None = None) -> bytes:
+def join_parts(contents: Sequence[bytes], *, kind: str = "application/dicom", length: int | str | None = None) -> bytes:
     """Return the body of an answer in parts; with `length` each part states so many bytes."""
     stated = "" if length is None else f"\r\nContent-Length: {length}"
     head = f"--{BOUNDARY}\r\nContent-Type: {kind}{stated}\r\n\r\n".encode()

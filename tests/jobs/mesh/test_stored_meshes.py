@@ -83,6 +83,24 @@ def test_mesh_that_is_not_stored_is_not_written_either(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "reply",
+    [
+        "[]",
+        "{",
+        '{"00081199": 1}',
+        '{"00081199": {"Value": [{}]}}',
+        '{"00081198": {"Value": [{"00081197": {"Value": ["a"]}}]}}',
+    ],
+    ids=["list", "cut", "number", "empty item", "text as reason"],
+)
+def test_reply_that_does_not_confirm_is_no_success(reply: str, archive: Archive) -> None:
+    archive.answers = [answering(reply.encode())]
+
+    with refused(OutputError, archive.host):
+        Store(archive.study).store("1.2", b"DICM")
+
+
 def test_reason_of_an_archive_that_does_not_store_is_told(archive: Archive) -> None:
     reply = {"00081198": {"Value": [{"00081197": {"Value": [0x0110]}}]}}
     archive.answers = [answering(json.dumps(reply).encode(), status=409)]
