@@ -139,24 +139,24 @@ class DeviceCollapser:
         self._launch("find_first_edges", self._standing, **of_edges, leaving=self._leaving, dirty=self._dirty)
         counts = self._upload(np.array([0, *self._done], np.uint32))
         self._launch("select_edges", self._standing, **of_edges, chosen=self._chosen, counts=counts, limit=octave)
-        items = self._standing // 2  # no two edges have an end in common
+        items, chosen = self._standing // 2, self._chosen  # no two edges have an end in common
         if items > most:  # else none need be left out, and the host need not know how many there are
-            items = self._keep_first(most, counts)
+            edges = self._keep_first(most, counts)
+            items, chosen = len(edges), self._upload(np.append(edges, np.uint32(NONE)))
             counts = self._upload(np.array([items, *self._done], np.uint32))
         self._launch(
             "collapse_edges", items, **self._surface, leaving=self._leaving, **self._ranks, dirty=self._dirty,
-            **self._lists, **self._log, counts=counts, **self._target, chosen=self._chosen, count=self._count,
+            **self._lists, **self._log, counts=counts, **self._target, chosen=chosen, count=self._count,
             round=number, limit=self._limit, most=self._limit, step=_STEP * self._given.mean_edge,
         )  # fmt: skip
         selected, *self._done = (int(count) for count in self._read(counts, np.uint32, 3))
         return selected, self._done[1]
 
-    def _keep_first(self, most: int, counts: Any) -> int:
-        """Keep the first of the selected edges by their numbers; return how many."""
+    def _keep_first(self, most: int, counts: Any) -> NDArray[np.uint32]:
+        """Return the first of the selected edges by their numbers."""
         selected = int(self._read(counts, np.uint32, 3)[0])
-        edges = np.sort(self._read(self._chosen, np.uint32, selected))[:most]
-        self._chosen = self._upload(np.append(edges, np.full(self._count - len(edges), NONE, np.uint32)))
-        return len(edges)
+        edges: NDArray[np.uint32] = np.sort(self._read(self._chosen, np.uint32, selected))[:most]
+        return edges
 
     def _read(self, buffer: Any, kind: Any, *shape: int) -> NDArray[Any]:
         return ocl.download(self._device, np.empty(shape, kind), buffer)
