@@ -29,12 +29,12 @@ typedef struct {
 
 /* The parameters of a kernel for the upper end of a range, and what it compares with. */
 #ifdef RANGE
-#define RANGE_PARAMETERS , const VOXEL highest
-#define RANGE_BOUNDS { level, highest }
+#define HIGHEST_PARAMETER , const VOXEL highest
+#define BOUNDS { level, highest }
 #define IS_INSIDE(values, bounds) ((values) >= (bounds).level & (values) <= (bounds).highest)
 #else
-#define RANGE_PARAMETERS
-#define RANGE_BOUNDS { level }
+#define HIGHEST_PARAMETER
+#define BOUNDS { level }
 #define IS_INSIDE(values, bounds) ((values) >= (bounds).level)
 #endif
 
@@ -121,7 +121,7 @@ __kernel void classify_samples(
     __global const VOXEL *restrict voxels, __global uint *restrict mask, __global ushort2 *restrict row_extents,
     const VOXEL level,
     const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
-    const uint gk, const int words RANGE_PARAMETERS)
+    const uint gk, const int words HIGHEST_PARAMETER)
 {
     const uint gj = nj + 2 * border;
     const uint row = get_global_id(0);
@@ -136,7 +136,7 @@ __kernel void classify_samples(
         row_extents[row] = (ushort2)(0, BORDER_IS_INSIDE ? (ushort)words : 0);
         return;
     }
-    const inside_bounds bounds = RANGE_BOUNDS;
+    const inside_bounds bounds = BOUNDS;
     __global const VOXEL *row_voxels = voxels + voxel_index(0, j, k - first_slice, ni, nj);
     word_extent set = {words, 0};
     int w = 0;

@@ -125,15 +125,15 @@ static inline void prefetch_around(const volume_part *volume, int i, int j, int 
         return;
     const size_t row = ni, slice = row * (size_t)nj;
     __global const VOXEL *at = volume->voxels + voxel_index(i, j, k - volume->first_k, ni, nj);
-#define PREFETCH(place) __builtin_prefetch((const void *)(size_t)(at + (place)))
-    PREFETCH(0);
-    PREFETCH(row);
-    PREFETCH(slice - row);
-    PREFETCH(slice);
-    PREFETCH(slice + row);
-    PREFETCH(2 * slice);
-    PREFETCH(2 * slice + 31);
-#undef PREFETCH
+#define PREFETCH_AT(place) __builtin_prefetch((const void *)(size_t)(at + (place)))
+    PREFETCH_AT(0);
+    PREFETCH_AT(row);
+    PREFETCH_AT(slice - row);
+    PREFETCH_AT(slice);
+    PREFETCH_AT(slice + row);
+    PREFETCH_AT(2 * slice);
+    PREFETCH_AT(2 * slice + 31);
+#undef PREFETCH_AT
 #endif
 }
 

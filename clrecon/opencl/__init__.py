@@ -18,7 +18,7 @@ from clrecon.opencl.arrays import (
 from clrecon.opencl.cache import cache_warnings
 from clrecon.opencl.device import Device, has_hung_commands, keep_for_hung_commands
 from clrecon.opencl.launching import Stopwatch, launch, launcher, settle, wait
-from clrecon.opencl.program import Kernel, Program, load_program
+from clrecon.opencl.program import Kernel, Program, building_together, load_program
 from clrecon.opencl.select import (
     Attempt,
     choose_device,

@@ -80,13 +80,16 @@ def _inline(name: str, seen: set[str]) -> list[str]:
 
 
 @cache
-def read_kernel_source(name: str) -> str:
-    """Return the text of kernel file `name` (such as ``"primitives/scan.cl"``) with its includes inlined.
+def read_kernel_source(*names: str) -> str:
+    """Return the text of kernel files (such as ``"primitives/scan.cl"``) with their includes inlined, each once.
 
     What all compilers have to compute with the same bits stands before every kernel file: ``include/exact.h``.
     """
-    first = _inline(EXACT_HEADER, {EXACT_HEADER}) if name.endswith(".cl") else []
-    return "\n".join([*first, *_inline(name, {name})]) + "\n"
+    seen = set(names)
+    lines = _inline(EXACT_HEADER, seen) if names[0].endswith(".cl") else []
+    for name in names:
+        lines += _inline(name, seen)
+    return "\n".join(lines) + "\n"
 
 
 @cache

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clrecon.errors import DeviceFailedError, NoSurfaceError, UsageError
+from clrecon.errors import DeviceError, DeviceFailedError, NoSurfaceError, UsageError
 from clrecon.geometry import frame_from_lps
 from clrecon.geometry.certificate import amend
 from clrecon.jobs.inputs import read_with_labels
@@ -199,9 +199,31 @@ def _try_levels(device: Device, settings: MeshSettings) -> list[Mesh]:
         method=settings.method, vertex_rule=settings.vertex_rule,
         grow_from=("auto",) if settings.grow_from else (), seal_mm=settings.seal_mm, solid=settings.solid,
     )  # fmt: skip
+    _load_together(device, settings)
     if settings.solid:
         fill_solid(cube, [surface], small, device, ignore_progress)
     return extract_surfaces(cube, [surface], device, small, ignore_progress)
+
+
+def _load_together(device: Device, settings: MeshSettings) -> None:
+    """Build the kernels of most meshes as one program: those of the surface, of its components, and of walls.
+
+    The trial run tells of a device that fails.
+    """
+    from clrecon.opencl import building_together
+    from clrecon.operators.primitives.union_find import prepare_components
+    from clrecon.operators.surface.cortex import prepare_profiles
+    from clrecon.operators.surface.extraction import prepare_isosurface
+
+    with suppress(DeviceError), building_together(device.current):
+        prepare_isosurface(
+            device.current, topology=settings.topology, inside=settings.inside, vertex_rule=settings.vertex_rule,
+            grown=bool(settings.grow_from),
+        )  # fmt: skip
+        if settings.selects:
+            prepare_components(device.current)
+        if settings.half_way != "auto":
+            prepare_profiles(device.current)
 
 
 def _bands_of(surfaces: Sequence[Surface]) -> list[Band]:

@@ -22,7 +22,9 @@ _MOST_PASSES = 1000
 
 def prepare_components(device: Device) -> Program:
     """Build the kernels now, so that a later `label_components` does not wait for them."""
-    prepare_compact(device)
+    with ocl.building_together(device):
+        prepare_compact(device)
+        ocl.load_program(device, "primitives/union_find.cl")
     return ocl.load_program(device, "primitives/union_find.cl")
 
 

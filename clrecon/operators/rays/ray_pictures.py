@@ -14,7 +14,7 @@ from clrecon.anatomy.noise import choose_smoothing
 from clrecon.anatomy.surroundings import LEFT_OUT, count_left_out
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import takes_parts
-from clrecon.opencl import Device, allocate, kernel_constant, kernel_number, launch, upload
+from clrecon.opencl import Device, allocate, building_together, kernel_constant, kernel_number, launch, upload
 from clrecon.operators.rays import ray_slabs
 from clrecon.operators.rays.picture_buffers import (
     NEAR_ROW,
@@ -314,12 +314,8 @@ class _Job(ray_slabs.SlabPicture):
         stopwatch = self.stopwatch
         key = (style.function, self.ray_step)
         tables = resident.keep("transfer function", key, 0, lambda: TransferTables.of(device, *key))
-        with stopwatch.running(device):
-            leaps = ray_slabs.find_leaps(resident, slab, key, tables.shown, tables.low, tables.scale)
-        nothing = (self.box[1], self.box[1])
-        view = self._view(nothing if leaps.box is None else leaps.box)
         variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
-        if tables.steepness.is_steep and takes_parts(resident.volume, view.ray_step):
+        if tables.steepness.is_steep and takes_parts(resident.volume, self.ray_step):
             variants |= {"TAKES_PARTS": "1"}
         more: dict[str, Any] = {**slab.arguments}
         look = style.label_style
@@ -330,7 +326,14 @@ class _Job(ray_slabs.SlabPicture):
         if between is not None:
             variants |= {"BETWEEN": "1"}
             more |= {"nearest": between.nearest_d, "farthest": between.farthest_d, "stage": 0}
+        with building_together(device):
+            for name, of_file in {"rays/leaps.cl": {}, "rays/tiles.cl": {}, "rays/composite.cl": variants}.items():
+                resident.program(name, **of_file)
         program = resident.program("rays/composite.cl", **variants)
+        with stopwatch.running(device):
+            leaps = ray_slabs.find_leaps(resident, slab, key, tables.shown, tables.low, tables.scale)
+        nothing = (self.box[1], self.box[1])
+        view = self._view(nothing if leaps.box is None else leaps.box)
         queues = count_queues(device)
         last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
         with stopwatch.running(device):  # wait: CPU devices read host arrays that are freed here

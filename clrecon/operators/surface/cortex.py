@@ -15,11 +15,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import DeviceMemoryError
 from clrecon.geometry import Volume, slice_normal
 from clrecon.opencl import (
+    Device,
+    Program,
     Stopwatch,
     allocate,
     describe_shortage,
@@ -262,6 +264,11 @@ def expected_precisions(cortex_hu: float, noise_hu: float, cortex_spread: float)
     return outer, cortex, inner
 
 
+def prepare_profiles(device: Device, dtype: DTypeLike = np.int16) -> Program:
+    variants = {**voxel_variants(dtype), "LANES": device.kernel_variants["LANES"]}
+    return load_program(device, "surface/cortex.cl", variants)
+
+
 class ProfileSampler:
     """Samples profiles of a volume on a device, slab by slab where it does not fit as a whole; the same bits then."""
 
@@ -270,8 +277,7 @@ class ProfileSampler:
         self.device = resident.device
         self.scale, self.frame = ProfileScale.of(resident.volume), StackFrame(resident.volume)
         with stopwatch.timed("build"):
-            variants = {**voxel_variants(resident.dtype), "LANES": self.device.kernel_variants["LANES"]}
-            self.program = load_program(self.device, "surface/cortex.cl", variants)
+            self.program = prepare_profiles(self.device, resident.dtype)
 
     def pieces(
         self, points: NDArray[np.floating], normals: NDArray[np.floating]

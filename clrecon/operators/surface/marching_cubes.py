@@ -144,14 +144,10 @@ def prepare_marching_cubes(
 ) -> Program:
     """Build the kernels for `dtype`; return emit_vertices, which for labels has their variants, a macro of cl/surface/
     marching_cubes.cl among them."""
-    prepare_scan(device)
-    load_cells(device, grown=grown)
     variants = {**voxel_variants(dtype), **device.kernel_variants}
     if inside == "between":
         variants["RANGE"] = "1"
-    if labels is None:
-        prepare_classify(device, dtype, inside)
-    else:
+    if labels is not None:
         variants.update(labels)
     if grown:
         variants["GROWN"] = "1"
@@ -159,6 +155,12 @@ def prepare_marching_cubes(
         variants["UNEVEN"] = "1"
     if vertex_rule != "linear":
         variants[vertex_rule.upper().replace("-", "_")] = "1"
+    with ocl.building_together(device):
+        prepare_scan(device)
+        load_cells(device, grown=grown)
+        if labels is None:
+            prepare_classify(device, dtype, inside)
+        ocl.load_program(device, "surface/marching_cubes.cl", variants)
     return ocl.load_program(device, "surface/marching_cubes.cl", variants)
 
 
