@@ -204,6 +204,7 @@ class Device:
     keeps_binaries: The driver keeps no programs, so ``clrecon.opencl.cache`` keeps them for the next process.
     known_good: The check of the programs that PoCL keeps; None for other drivers, and where nothing is kept.
     lock: Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
+    builds_together: False where each kernel file is built alone, so that the text of one can be replaced.
     gathered: Kernel files to be built together, with their variants, in a block of ``building_together``.
     stand_in: The CPU device that takes over if this one fails (``clrecon.opencl.select``); None where one was named.
     handed_over: The warning that says so, once it did.
@@ -250,6 +251,7 @@ class Device:
         self.commands = Commands()
         self.trace: Callable[[str], None] | None = None
         self.programs: dict[tuple[str, tuple[str, ...]], Any] = {}
+        self.builds_together = True
         self.gathered: dict[str, dict[str, str]] | None = None
         self.stand_in: Device | None = None
         self.handed_over: list[str] = []

@@ -167,7 +167,7 @@ def building_together(device: Device) -> Iterator[None]:
     Files that are built together get the variants of all, so no other variant may change one of them.
     """
     with device.lock:
-        if device.gathered is not None:
+        if device.gathered is not None or not device.builds_together:
             yield
             return
         files: dict[str, dict[str, str]] = {}

@@ -116,7 +116,7 @@ def serve(device_index: int) -> None:
     from clrecon.opencl import list_devices, program
 
     device = list_devices()[device_index]
-    device.keeps_binaries = False
+    device.keeps_binaries = device.builds_together = False
     original = program.read_kernel_source
     for fields in json.load(sys.stdin):
         mutation = Mutation(*fields)

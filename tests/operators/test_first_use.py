@@ -59,6 +59,7 @@ def test_a_device_that_computes_the_surface_of_a_ball_wrongly_fails_with_the_fau
         program, "read_kernel_source", lambda asked: wrong_source if asked == file else read_source(asked)
     )
     monkeypatch.setattr(device, "programs", {})
+    monkeypatch.setattr(device, "builds_together", False)
     assert fault in check_ball(device)
 
 
