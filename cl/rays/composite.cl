@@ -164,13 +164,14 @@ static inline void blend_samples(const field *f, const field *smooth, const slic
     if (look->shaded || IS_WEIGHED) {
         slopes s;
         floats x, y, z;
-        if (IS_WEIGHED) {
-            find_slopes(f, i, j, k, inner, &s);
+        /* In a loop, for fewer registers: gradients of the volume weigh the opacity, smoothed ones are lit. */
+#pragma unroll 1
+        for (int is_lit = !IS_WEIGHED; is_lit < 2; ++is_lit) {
+            find_slopes(is_lit ? smooth : f, i, j, k, inner, &s);
             find_gradients(look->view, stack, &s, k, &x, &y, &z);
-            opacity = weigh_by_gradient(look, opacity, x, y, z);
+            if (!is_lit)
+                opacity = weigh_by_gradient(look, opacity, x, y, z);
         }
-        find_slopes(smooth, i, j, k, inner, &s);
-        find_gradients(look->view, stack, &s, k, &x, &y, &z);
         if (look->shaded)
             find_light(look->view, look->highlights, x, y, z, rays->toward_x, rays->toward_y, rays->toward_z, &share,
                 &highlight);
