@@ -33,7 +33,7 @@ examples:
   clrecon view CT_FOLDER --window
   clrecon view CT_FOLDER --state shown.view.json
   clrecon view CT_FOLDER --state shown.view.json --picture shown.png
-  clrecon view CT_FOLDER --html page.html
+  clrecon view CT_FOLDER --html page.html --with-slices
   clrecon view CT_FOLDER --html spine.html --labels spine.nii.gz
   clrecon view bone.stl implant.ply --html both.html --name bone --name implant"""
 _SHOWN_PARTS = 12
@@ -110,6 +110,8 @@ def _check_faces(options: argparse.Namespace) -> None:
         raise UsageError(f"{' and '.join(given)} show the inputs in different ways: ask for one of them")
     if options.state is not None and given in (["--window"], ["--html"]):
         raise UsageError(f"--state belongs to the view in the browser and to --picture: leave out {given[0]}, or it")
+    if options.with_slices and options.html is None:
+        raise UsageError("--with-slices belongs to the page of --html: name its file with --html")
     if options.size is not None and options.picture is None:
         raise UsageError("--size is that of the picture: name its file with --picture")
     if given and not options.inputs:

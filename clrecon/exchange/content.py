@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError
+from clrecon.exchange.page_slices import PackedSlices
 from clrecon.geometry import frame_from_lps
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.pieces import chunks, side_by_side
@@ -181,6 +182,8 @@ class Content(PointContent):
     """A mesh as it goes into a file, with name, colour (red, green, blue, 0 to 1) and pieces where a format has them.
 
     face_values: Numbers at the triangles by name, (m,), in PLY and VTP; NaN where there is none.
+    title: Name of the label as its file has it, on pages in place of `name`, which can be one of a file.
+    slices: Of the scan, on pages.
     color: None: the colour of the format's writer.
     vertex_colors: (n, 3). A colour for each vertex, in PLY, in place of `color`.
     """
@@ -188,9 +191,11 @@ class Content(PointContent):
     triangles: NDArray[np.uint32]
     face_values: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     name: str | None = None
+    title: str | None = None
     color: tuple[float, float, float] | None = None
     vertex_colors: NDArray[np.uint8] | None = None
     pieces: Pieces | None = None
+    slices: PackedSlices | None = None
 
 
 @dataclass(frozen=True)

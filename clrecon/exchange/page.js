@@ -4,8 +4,8 @@
 
   // The surface: what clrecon/exchange/page.py wrote.
 
-  async function unpack() {
-    const text = find("surface").textContent;
+  async function unpack(id) {
+    const text = find(id).textContent;
     let packed;
     if (Uint8Array.fromBase64) packed = Uint8Array.fromBase64(text);
     else {
@@ -13,7 +13,7 @@
       packed = new Uint8Array(letters.length);
       for (let i = 0; i < letters.length; i++) packed[i] = letters.charCodeAt(i);
     }
-    find("surface").remove();
+    find(id).remove();
     const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
     return new Uint8Array(await new Response(stream).arrayBuffer());
   }
@@ -95,6 +95,7 @@
   // Rows of turn: what points right, up and to the viewer, LPS.
   const camera = { turn: [], centre: middle, mm: 1, fits: "A" };
   const clip = { direction: "", along: [1, 0, 0], share: 0.5, flipped: false };
+  let slices = null;  // of a page that has some
   let measures = [], tool = "", picks = [], coarse = false, asked = false, shade, pick, pickTarget;
 
   const VIEWS = { A: [0, -1, 0], P: [0, 1, 0], L: [1, 0, 0], R: [-1, 0, 0], S: [0, 0, 1], I: [0, 0, -1] };
@@ -242,6 +243,11 @@
     line([[16, height - 22], [16, height - 16], [end, height - 16], [end, height - 22]]);
     pen.textAlign = "left";
     write(sayLength(length), 16, height - 32);
+    if (slices) {
+      const [x, y] = project(minus(slices.place(), facts.low));
+      line([[x - 9, y], [x + 9, y]]);
+      line([[x, y - 9], [x, y + 9]]);
+    }
     for (const measure of [...measures, { points: picks }]) {
       const points = measure.points.map(project);
       line(points);
@@ -264,8 +270,10 @@
   }
 
   function click(x, y) {
-    if (!tool) return;
+    if (!tool && !slices) return;
     const found = pickAt(x, y);
+    if (found && slices) slices.moveTo(toPatient(found.point));
+    if (!tool) return;
     if (!found) {
       find("hint").textContent = "There is no surface.";
       return;
@@ -418,7 +426,7 @@
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 
   try {
-    const { place, normal, index } = decode(await unpack());
+    const { place, normal, index } = decode(await unpack("surface"));
     shade = link(SHADE);
     pick = link(PICK);
     for (const [slot, kind, values, isUnit] of [[0, gl.UNSIGNED_SHORT, place, false], [1, gl.BYTE, normal, true]]) {
@@ -450,6 +458,8 @@
       facts, look, pick: (x, y) => { const found = pickAt(x, y); return found && { ...found, point: toPatient(found.point) }; },
       project: (point) => project(toBox(point)),
     });
+    if (facts.slices) slices = await openSlices(facts, unpack, inSpace, redraw);
+    redraw();
     document.documentElement.dataset.ready = Math.round(performance.now());
   } catch (error) {
     message.hidden = false;

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, check_same, parts_of, refuse_file
+from clrecon.exchange.page_slices import PackedSlices, describe_slices
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import side_by_side
 from clrecon.version import package_version
@@ -151,11 +152,11 @@ MOST_TRIANGLES = 10_000_000
 _LEAST_BYTES_A_TRIANGLE = 0.5
 """Of the surface: a regular one packs to 0.7, those of scans to 5 to 8."""
 
-_BLOCK = re.compile(r'<script id="(facts|surface)" type="[a-z/]+">([^<]*)</script>')
+_BLOCK = re.compile(r'<script id="(facts|surface|slices)" type="[a-z/]+">([^<]*)</script>')
 
 
 def estimate(content: Content | Assembly) -> int:
-    code_bytes = len(read_page_code("page.html")) + len(read_page_code("page.css")) + len(_script())
+    code_bytes = len(read_page_code("page.html")) + len(read_page_code("page.css")) + len(_script(None))
     return code_bytes + int(_LEAST_BYTES_A_TRIANGLE * sum(len(part.triangles) for part in parts_of(content)))
 
 
@@ -172,7 +173,8 @@ def compose_page(content: Content | Assembly) -> bytes:
             " only, or decimate the mesh, or write .glb or .ply"
         )
     coded, parts = _join_parts(meshes)
-    facts = {
+    slices = next((mesh.slices for mesh in meshes if mesh.slices is not None), None)
+    facts: dict[str, Any] = {
         "vertices": coded.vertices,
         "triangles": coded.triangles,
         "low": coded.low_mm,
@@ -182,14 +184,19 @@ def compose_page(content: Content | Assembly) -> bytes:
         "parts": parts,
         "about": _describe_meshes(meshes, coded),
     }
+    if slices is not None:
+        facts |= {"slices": slices.facts, "about": [describe_slices(slices.facts), *facts["about"]]}
     # "<" would end the block: in JSON it can stand as an escape.
     text = json.dumps(facts, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    style, script = read_page_code("page.css"), _script()
+    style, script = _style(slices), _script(slices)
     policy = (
         f"default-src 'none'; script-src '{hash_code(script)}'; style-src '{hash_code(style)}'; base-uri 'none';"
         " form-action 'none'"
     )
-    filled = {"POLICY": policy, "STYLE": style, "SCRIPT": script, "FACTS": text}
+    packed = "" if slices is None else base64.b64encode(slices.data).decode("ascii")
+    block = f'<script id="slices" type="text/plain">{packed}</script>\n' if packed else ""
+    planes = f"{read_page_code('page_slices.html')}\n" if packed else ""
+    filled = {"POLICY": policy, "STYLE": style, "SCRIPT": script, "FACTS": text, "PLANES": planes, "SLICES": block}
     before, after = (
         re.sub("@([A-Z]+)@", lambda place: filled[place[1]], half)  # at once: what is filled in is not looked at again
         for half in (read_page_code("page.html") + "\n").split("@SURFACE@")
@@ -200,11 +207,19 @@ def compose_page(content: Content | Assembly) -> bytes:
 def parse_page(page: bytes) -> tuple[dict[str, Any], CodedSurface]:
     """Return the facts and the surface that a page of `compose_page` holds."""
     blocks = dict(_BLOCK.findall(page.decode("utf-8")))
-    if set(blocks) != {"facts", "surface"} or not page.endswith(b"</html>\n"):
+    if set(blocks) - {"slices"} != {"facts", "surface"} or not page.endswith(b"</html>\n"):
         raise ValueError("this is no page of a surface")
     facts = json.loads(blocks["facts"])
     data = base64.b64decode(blocks["surface"], validate=True)
     return facts, CodedSurface(facts["vertices"], facts["triangles"], tuple(facts["low"]), tuple(facts["step"]), data)
+
+
+def parse_slices(page: bytes) -> PackedSlices | None:
+    """Return the slices that a page of `compose_page` holds, if it has some."""
+    blocks = dict(_BLOCK.findall(page.decode("utf-8")))
+    if "slices" not in blocks:
+        return None
+    return PackedSlices(json.loads(blocks["facts"])["slices"], base64.b64decode(blocks["slices"], validate=True))
 
 
 def read_facts(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -238,7 +253,8 @@ def _join_parts(meshes: Sequence[Content]) -> tuple[CodedSurface, list[dict[str,
         triangles.append(corners)
         before += len(mesh.vertices)
         for name, count, ml in _pieces(mesh):
-            named = " ".join(filter(None, (mesh.name or (f"surface {number}" if len(meshes) > 1 else ""), name)))
+            called = mesh.title or mesh.name or (f"surface {number}" if len(meshes) > 1 else "")
+            named = " ".join(filter(None, (called, name)))
             color = _hexadecimal(BONE_COLOR if mesh.color is None else mesh.color)
             parts.append({"name": named or "surface", "color": color, "ml": ml, "first": first, "count": count})
             first += count
@@ -285,8 +301,14 @@ def _hexadecimal(color: Sequence[float]) -> str:
     return "#" + "".join(f"{round(255 * min(max(value, 0.0), 1.0)):02x}" for value in color)
 
 
-def _script() -> str:
-    return "\n".join((read_page_code("page_shared.js"), read_page_code("page.js")))
+def _script(slices: PackedSlices | None) -> str:
+    parts = ("page_shared.js", "page.js") if slices is None else ("page_shared.js", "page_slices.js", "page.js")
+    return "\n".join(map(read_page_code, parts))
+
+
+def _style(slices: PackedSlices | None) -> str:
+    parts = ("page.css",) if slices is None else ("page.css", "page_slices.css")
+    return "\n".join(map(read_page_code, parts))
 
 
 def hash_code(text: str) -> str:

@@ -21,6 +21,7 @@ from clrecon.mesh.triangles import vertex_normals
 from clrecon.system.arguments import Space, explains_arguments
 from clrecon.system.base_classes import Message
 from clrecon.system.paths import keep_existing
+from clrecon.system.text import escape_text
 
 _MOST_VERTICES = 2**32
 
@@ -180,14 +181,17 @@ class BaseMesh(Message):
         vertices, normals = self.in_space(space)
         facts = facts_for_file(self.report, space, keep_ids=keep_ids)
         name, color = self.report.get("part_name"), self.report.get("color")
+        title = self.report.get("label_name")
         return Content(
             vertices=vertices,
             triangles=self.triangles,
             normals=normals,
             name=None if name is None else str(name),
+            title=None if title is None else escape_text(str(title)),
             color=None if color is None else (float(color[0]), float(color[1]), float(color[2])),
             values=self.checked_values(),
             face_values=self.checked_face_values(),
+            slices=self.report.get("page_slices"),
             **facts,
         )
 

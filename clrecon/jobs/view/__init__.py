@@ -31,6 +31,9 @@ class ViewSettings:
         action="append",
     )
     mesh_space: Space | None = mesh_space_option("mesh files that do not name theirs")
+    with_slices: bool = option(
+        "--with-slices", "put slices of the scan on the page of --html: 10 MB at most, or coarser", first=True
+    )
     state: str | None = option(
         "--state FILE",
         "show what a view showed when it was saved: a file .view.json of the key s, of the same inputs",

@@ -10,6 +10,7 @@ from typing import Any
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.exchange.page import read_facts
+from clrecon.exchange.page_slices import pack_slices
 from clrecon.geometry import Volume
 from clrecon.jobs.distance import doubt_frames, read_side
 from clrecon.jobs.inputs import may_be_mesh
@@ -20,6 +21,7 @@ from clrecon.jobs.outputs import commit_all
 from clrecon.jobs.run import JobReport, Run
 from clrecon.jobs.view import ViewSettings
 from clrecon.mesh import Mesh
+from clrecon.rendering.looks.window import WINDOWS
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
@@ -27,6 +29,8 @@ from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.text import escape_text
 
 log = get_logger(__name__)
+
+_PAGE_WINDOWS = ("bone", "soft", "lung", "brain")
 
 _OF_THE_MACHINE = ("device", "memory", "space", "keep_ids")
 """Settings of scans that may be given without one."""
@@ -107,6 +111,8 @@ def _check_inputs(inputs: Sequence[str | Path], output: str | Path, settings: Vi
             f"{name_parameter(changed[0])} says what is made of a scan, and all inputs are mesh files: leave it out, or"
             " name a scan"
         )
+    if settings.with_slices and len(scans) != 1:
+        raise UsageError(f"{name_parameter('with_slices')} shows those of one scan, {len(scans)} are given")
     if settings.scan.labels is not None and len(scans) > 1:
         raise UsageError(f"a label map belongs to one scan, {len(scans)} are given")
 
@@ -121,11 +127,16 @@ def _read_input(path: str | Path, settings: ViewSettings, run: Run) -> _ShownInp
     label = partial(label_parts, device=result.device, settings=settings.scan)
     judge_surfaces(result.parts, result.volume, settings.scan, label)
     run.lap("select")
+    windows = {name: WINDOWS[name] for name in _PAGE_WINDOWS}
+    slices = pack_slices(result.volume, windows) if settings.with_slices else None
+    run.lap("slices")
     meshes = []
     for part in result.parts:
         if len(result.parts) > 1 and "part_name" not in part.mesh.report:
             part.mesh.report["part_name"] = part.name.replace("_", " ")
         meshes.append(part.mesh)
+    if slices is not None:
+        meshes[0].report["page_slices"] = slices
     return _ShownInput(
         meshes,
         {
@@ -174,9 +185,9 @@ def _name_and_color(shown: Sequence[_ShownInput], settings: ViewSettings) -> lis
         given = settings.names[number - 1] if number <= len(settings.names) else ""
         name = given or (f"surface {number}" if len(shown) > 1 else "")
         for mesh in item.meshes:
-            words = " ".join(filter(None, (name, mesh.report.get("part_name"))))
-            if words:
-                mesh.report["part_name"] = words
+            for entry in ("part_name", "label_name"):
+                if words := " ".join(filter(None, (name, mesh.report.get(entry)))):
+                    mesh.report[entry] = words
             if len(shown) > 1 and "color" not in mesh.report:
                 mesh.report["color"] = [float(value) for value in colors[number - 1]]
     return list(chain(*(one.meshes for one in shown)))

@@ -211,6 +211,7 @@ class Connection:
     save_as: Files on this computer that it may have written; numbered where they exist.
     wrote: Called with a line for each of these.
     quit: Ends the server.
+    link: Keeps a state, and returns the word by which another page begins with it.
     has_start: There is a start page, where something else can be opened.
     """
 
@@ -231,6 +232,7 @@ class Connection:
         self._save_as = tuple(save_as)
         self._wrote, self._quit = wrote, quit
         self.has_start = False
+        self.link: Callable[[ViewState], str] = lambda state: ""
         self._pace = Pace()
         self._keys: dict[str, Any] = {}
         self._ground = (0, 0, 0)
@@ -315,6 +317,8 @@ class Connection:
             self._lay_out(message.get("sizes"), message.get("ground"))
         elif kind == "quit":
             self._quit()
+        elif kind == "link":
+            self._say(link=self.link(self.state))
         elif kind in ("command", "save"):
             await self._waiting.put(message)
         else:

@@ -32,6 +32,7 @@
     if (told.pick !== undefined) picked(told.pick);
     if (told.probe) { probed = told.probe; for (const view of Object.values(views)) if (view.pointer) annotate(view); }
     if (told.undone !== undefined) hint(told.undone ? `Taken back: ${told.undone}.` : "There is nothing to take back.");
+    if (told.link !== undefined) copyLink(told.link);
     if (told.saved) fetchSaved(told.saved);
     if (told.written !== undefined) find("saved").textContent = told.written;
   };
@@ -403,6 +404,16 @@
     link.remove();
   }
 
+  // A link holds the secret: it is for browsers of this computer, while clrecon runs.
+  async function copyLink(word) {
+    const link = new URL(location.href);
+    link.searchParams.set("view", word);
+    const copied = await navigator.clipboard.writeText(link.href).then(() => true, () => false);
+    const words = copied ? "The link is copied: " : "Copy this link: ";
+    find("saved").replaceChildren(words, element("a", "this view", { href: link.href, target: "_blank", rel: "noopener" }),
+      "; for this computer, while clrecon runs.");
+  }
+
   // Buttons and keys.
 
   const look = (letter) => run("look", { view: VIEW_NAMES[letter] });
@@ -457,6 +468,7 @@
   find("boxed").onclick = () => run("toggle_clip_box");
   find("save").onclick = () => save(find("format").value);
   find("photo").onclick = () => save(".png");
+  find("link").onclick = () => tell("link");
   find("undo").onclick = () => run("undo");
   find("another").onclick = () => { location.search += "&start"; };
   find("help").onclick = () => find("keys").showModal();
@@ -487,7 +499,7 @@
   // What the page does itself at a key; what else keys do are commands of the session.
   const press = (id) => () => { if (!find(id).hidden) find(id).click(); };
   const OWN = {
-    distance: press("distance"), angle: press("angle"), circle: press("circle"), box: press("square"), save: press("save"), photo: press("photo"), help: press("help"),
+    distance: press("distance"), angle: press("angle"), circle: press("circle"), box: press("square"), save: press("save"), photo: press("photo"), link: press("link"), help: press("help"),
     curve: () => { if (choosing === "curve" || find("curved").hidden) find("trace").click(); else find("along").click(); },
     escape: () => { if (choosing) choose(""); else { run("cancel"); run("dismiss"); hint(""); } },
     quit: () => tell("quit"),

@@ -61,7 +61,7 @@
     const which = count ? `${number} / ${count}` : "";
     write(wide ? `${view.name} ${which}` : view.name, wide ? 10 : 5, 14, `name ${wide ? "" : "small "}${view.name}`, "start");
     if (!facts) return;
-    write(wide ? place : which, wide ? 10 : 5, 32, "words", "start");
+    write(wide ? place : which || place, wide ? 10 : 5, 32, "words", "start");
     view.canvas.role = "img";
     view.canvas.ariaLabel = `${view.name} slice ${count ? `${number} of ${count}` : ""}, ${place}, level ${level}, width ${span} HU`;
     const lines = width >= FAIR ? [`L ${level} W ${span}`] : [];
@@ -72,7 +72,8 @@
       if (width >= FAIR) lines.push(probed.words);  // above the words of the scale
     }
     const plain = lines.length - (view.pointer && probed ? (width >= FAIR ? 2 : 1) : 0);
-    lines.forEach((line, n) => write(line, width - 8, height - 14 - 17 * n, n < plain ? "words" : "words probe", "end"));
+    const foot = height - (wide ? 14 : 31);  // beside the letter of the lower side there is no room in a narrow one
+    lines.forEach((line, n) => write(line, width - 8, foot - 17 * n, n < plain ? "words" : "words probe", "end"));
   }
 
   // The scale of the colours of a surface, its numbers in mm beside it.

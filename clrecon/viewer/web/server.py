@@ -182,6 +182,9 @@ _SECONDS_TO_END = 0.4
 _MOST_REASON = 120
 """Bytes of the reason for closing a WebSocket."""
 
+_MOST_LINKS = 64
+"""Copied views that are kept."""
+
 _MOST_TAB = 64
 """Characters of the name that a page gives its tab."""
 
@@ -211,6 +214,7 @@ class WebServer:
         self.address = f"http://{_LOOPBACK}:{self.port}/?secret={self._secret}"
         self._connections: dict[Connection, Any] = {}
         self._left: OrderedDict[str, ViewState] = OrderedDict()  # what tabs showed that closed, or load again
+        self._linked: OrderedDict[str, ViewState] = OrderedDict()
         self._downloads: Path = Path()
         self._end: Callable[[], object] | None = None
 
@@ -273,6 +277,7 @@ class WebServer:
     async def _leave_all(self) -> None:
         leaving = [asyncio.ensure_future(self._leave(*pair)) for pair in list(self._connections.items())]
         self._left.clear()
+        self._linked.clear()
         if leaving:
             await asyncio.wait(leaving, timeout=_SECONDS_TO_END)
 
@@ -324,9 +329,9 @@ class WebServer:
             connection = Connection(
                 self._open_session, socket, self._downloads, save_as=self._save_as, wrote=self._wrote, quit=self.stop,
             )  # fmt: skip
-            connection.has_start = self._start is not None
+            connection.has_start, connection.link = self._start is not None, self._keep_link
             tab = request.query.get("tab", "")[:_MOST_TAB]
-            connection.resume(self._left.get(tab))
+            connection.resume(self._left.get(tab) or self._linked.get(request.query.get("view", "")))
         except ClreconError as error:
             await socket.close(code=1011, message=str(error).encode()[:_MOST_REASON])
             return socket
@@ -346,6 +351,14 @@ class WebServer:
             self._left.move_to_end(tab)
         while len(self._left) > MOST_BROWSERS:
             self._left.popitem(last=False)
+
+    def _keep_link(self, state: ViewState) -> str:
+        """Keep a state for pages of a link, and forget the oldest of too many; returns the word of the link."""
+        word = secrets.token_urlsafe(12)
+        self._linked[word] = state
+        while len(self._linked) > _MOST_LINKS:
+            self._linked.popitem(last=False)
+        return word
 
     async def _send_saved(self, request: web.Request) -> web.StreamResponse:
         from aiohttp import web

@@ -11,7 +11,8 @@ from sample_meshes import ball
 
 import clrecon
 from clrecon.cli.main import main
-from clrecon.exchange.page import decode_surface, parse_page
+from clrecon.exchange.page import decode_surface, parse_page, parse_slices
+from clrecon.exchange.page_slices import unpack_slices
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 
@@ -116,6 +117,31 @@ def test_page_of_a_scan_with_labels_has_a_part_of_each_in_its_colour(tmp_path, d
 
 
 @pytest.mark.opencl
+def test_labels_of_a_page_have_the_names_of_their_files_as_they_are(tmp_path, device):
+    source, _ = write_two_balls(tmp_path)
+    folder, name = tmp_path / "masks", "<b>L3 & körper_1"
+    folder.mkdir()
+    mask = clrecon.read_volume(source).voxels > 0
+    mask[..., 30:] = False  # one ball
+    clrecon.write_volume(Volume(mask.astype(np.int16), np.eye(4)), folder / f"{name}.nii.gz")
+
+    assert main(["view", str(source), "--html", str(tmp_path / "a.html"), "--labels", str(folder), "--hu", "0"]) == 0
+
+    assert [part["name"] for part in read_page(tmp_path / "a.html")[0]["parts"]] == [name]
+
+
+@pytest.mark.opencl
+def test_page_with_slices_holds_those_of_its_scan(tmp_path, device):
+    source, _ = write_two_balls(tmp_path)
+    page = tmp_path / "scan.html"
+
+    assert main(["view", str(source), "--html", str(page), "--hu", "0", "--with-slices"]) == 0
+
+    slices = parse_slices(page.read_bytes())
+    assert unpack_slices(slices.facts, slices.data)[15, 16, 15] == 500.0  # HU in a ball
+
+
+@pytest.mark.opencl
 def test_page_of_a_scan_and_a_mesh_apart_from_it_is_written_with_a_warning(tmp_path, files, printed, device):
     page = tmp_path / "both.html"
     source = write_two_balls(tmp_path)[0]
@@ -146,6 +172,8 @@ def test_mesh_command_writes_a_page(tmp_path, device):
         (["{a}", "--html", "{page}", "--name", " "], 80),
         (["{a}", "--html", "{page}", "--mesh-space", "abc"], "abc"),
         (["folder/gone.stl", "--html", "{page}"], "folder/gone.stl"),
+        (["{a}", "--html", "{page}", "--with-slices"], "--with-slices"),
+        (["{a}", "--with-slices"], "--html"),
         (["{a}", "--html", "{page}", "--label", "L1"], "--labels"),
     ],
 )

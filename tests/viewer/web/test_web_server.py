@@ -563,3 +563,23 @@ def test_browsers_go_on_when_one_beyond_the_most_is_turned_away(served: WebServe
             return browsers[-1].facts["iso"]["hu"]
 
     assert asyncio.run(browse()) == 230
+
+
+def test_link_that_is_copied_begins_with_the_view_that_it_was_copied_from(served: WebServer) -> None:
+    async def browse() -> tuple[float, float]:
+        async with browsing(served) as client:
+            await client.tell(do="set_iso", hu=240)
+            await client.until(lambda: client.facts and client.facts["iso"]["hu"] == 240)
+            await client.tell("link")
+            await client.until(lambda: any("link" in note for note in client.notes))
+            word = next(note["link"] for note in client.notes if "link" in note)
+            await client.tell(do="set_iso", hu=210)  # what happens later is not in the link
+            await client.until(lambda: client.facts["iso"]["hu"] == 210)
+        begun = []
+        for tab in (f"&view={word}", "&view=unknown"):
+            async with browsing(served, tab) as other:
+                await other.until(lambda: other.facts)  # noqa: B023 (it is called in this turn)
+                begun.append(other.facts["iso"]["hu"])
+        return begun[0], begun[1]
+
+    assert asyncio.run(browse()) == (240, 200)  # a view begins at 200 HU

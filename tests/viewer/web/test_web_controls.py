@@ -1,0 +1,134 @@
+"""Every control of the page, driven in a real browser: what the server's view is afterwards."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import pytest
+import view_scenes as scenes
+from browser import wait_for
+from view_pages import SETTLED, open_view_page, run_command
+
+pytestmark = [pytest.mark.slow, pytest.mark.opencl]
+
+
+class Control(NamedTuple):
+    """What is done with a control, and what the page then knows of its view (JavaScript, with `f` for the facts).
+
+    chosen: Value of a list; typed: text of a field; None: a click.
+    before: Commands that have to be done before.
+    """
+
+    holds: str
+    chosen: str | None = None
+    typed: str | None = None
+    before: tuple[tuple[str, dict], ...] = ()
+
+
+SURFACE = ("set_mode", {"name": "surface"})
+PLACE = ("mark_at", {"x": 50, "y": 50, "size": [100, 100], "plane": "axial"})
+CURVE = (
+    ("start_tool", {"name": "curve"}),
+    ("add_point", {"x": 40, "y": 50, "size": [100, 100], "plane": "axial"}),
+    ("add_point", {"x": 60, "y": 50, "size": [100, 100], "plane": "axial"}),
+    ("end_tool", {}),
+)
+
+CONTROLS = {
+    "#mode": Control("f.mode === 'mip'", chosen="mip"),
+    "#table": Control("!f.table", before=(SURFACE, ("set_table", {"shown": True}))),
+    "#perspective": Control("!f.camera.parallel"),
+    "#fitted": Control("f.fitted", before=(SURFACE, ("set_fitted", {"shown": False}))),
+    "#shade": Control("f.color_by === 'thickness'", chosen="thickness"),
+    "#layouts [data-layout='1']": Control("f.layout === '1'"),
+    "#layouts [data-layout='4']": Control("f.layout === '4'"),
+    "#layouts [data-layout='1+3']": Control("f.layout === '1+3'"),
+    "#undo": Control("f.layout === '1'", before=(("set_layout", {"name": "1"}), ("set_layout", {"name": "4"}))),
+    "#help": Control("document.getElementById('keys').open"),
+    "#closekeys": Control("!document.getElementById('keys').open"),
+    "#views [title='left']": Control("f.camera.position[0] > f.bounds[1][0]"),
+    "#distance": Control("f.tool === 'distance'"),
+    "#angle": Control("f.tool === 'angle'"),
+    "#circle": Control("f.tool === 'circle'"),
+    "#square": Control("f.tool === 'box'"),
+    "#seed": Control("f.tool === 'seed'"),
+    "#trace": Control("f.tool === 'curve'"),
+    "#end": Control("f.tool === null"),
+    "#only": Control("document.getElementById('only').ariaPressed === 'true'"),
+    "#hide": Control("document.getElementById('hide').ariaPressed === 'true'"),
+    "#spine": Control("document.getElementById('hint').textContent.includes('no spine')", before=(("end_tool", {}),)),
+    "#along": Control("!document.getElementById('curve').clientWidth", before=CURVE),
+    "#measures button": Control("Math.abs(f.cross[0] - f.measures[0].points[0][0]) < 30"),
+    "#clear": Control("f.measures.length === 0", before=(PLACE,)),
+    "#exports [data-format='.csv']": Control("saved.textContent.includes('view.csv')", before=(PLACE,)),
+    "#exports [data-format='.json']": Control("saved.textContent.includes('view.json')"),
+    "#exports [data-format='.mrk.json']": Control("saved.textContent.includes('view.mrk.json')"),
+    "#all": Control("f.parts.every(({ visible }) => visible)", before=(("show", {"key": "2", "visible": False}),)),
+    "#colors": Control("f.parts.some(({ kind, color }) => kind === 'cluster' && color)"),
+    "#direction": Control("document.getElementById('direction').value === 'superior'", chosen="superior"),
+    "#cut": Control("f.clips.some(({ name }) => name === 'superior')"),
+    "#boxed": Control("f.clip_box"),
+    "#level": Control("f.window[0] + f.window[1] === 80", typed="40"),
+    "#width": Control("f.window[1] - f.window[0] === 400", typed="400"),
+    "#presets button": Control("f.window[0] === -450 && f.window[1] === 1050"),
+    "#thick": Control("f.slab.mm === 8", typed="8"),
+    "#combine": Control("f.slab.combine === 'max'", chosen="max"),
+    "#straighten": Control("!f.turned", before=(("turn_cross", {"plane": "axial", "degrees": 20}),)),
+    "#hu": Control("f.iso.hu === 305", typed="\ue014"),  # the arrow key to the right moves the slider
+    "#exact": Control("f.iso.hu === 333", typed="333"),
+    "#format": Control("document.getElementById('format').value === '.view.json'", chosen=".view.json"),
+    "#save": Control("saved.textContent.includes('view.view.json')"),
+    "#photo": Control("saved.textContent.includes('view.png')"),
+    "#link": Control("saved.querySelector('a')?.href.includes('view=')"),
+}
+"""Controls by their place on the page, in the order in which they are driven."""
+
+OF_OTHER_TESTS = {"another", "pickfiles"}
+"""Of the start page."""
+
+
+@pytest.fixture(scope="module")
+def page(view_browser, view_server):
+    with open_view_page(view_browser, view_server) as opened:
+        run_command(opened, "find_parts")
+        wait_for(opened, "return clrecon.facts.parts_known && !clrecon.facts.busy.length")
+        run_command(opened, "set_iso", hu=300)
+        run_command(opened, "set_cross", point=scenes.middle(0).tolist())
+        yield opened
+
+
+@pytest.mark.parametrize(("place", "control"), CONTROLS.items(), ids=CONTROLS)
+def test_control_of_the_page_does_what_it_says(page, place: str, control: Control) -> None:
+    from selenium.webdriver.common.keys import Keys
+    from selenium.webdriver.support.ui import Select
+
+    for name, named in control.before:
+        page.execute_script("clrecon.run(arguments[0], arguments[1])", name, named)
+    wait_for(page, f'const one = document.querySelector("{place}"); return one && !one.disabled && one.offsetWidth')
+    wait_for(page, SETTLED)
+    element = page.find_element("css selector", place)
+
+    if control.chosen is not None:
+        Select(element).select_by_value(control.chosen)
+    elif place == "#hu":
+        run_command(page, "set_iso", hu=304)
+        wait_for(page, "return document.getElementById('hu').value === '304'")
+        element.send_keys(control.typed)
+    elif control.typed is not None:
+        element.send_keys(Keys.CONTROL, "a")
+        element.send_keys(control.typed, Keys.ENTER)
+    else:
+        page.execute_script("arguments[0].scrollIntoView()", element)
+        element.click()
+
+    assert wait_for(page, f"const f = clrecon.facts, saved = document.getElementById('saved'); return {control.holds}")
+
+
+def test_table_of_controls_has_each_of_the_page(page) -> None:
+    on_page = page.execute_script(
+        "return [...document.querySelectorAll('fieldset button[id], fieldset input[id], fieldset select[id],"
+        " #iso input, dialog button')].map((one) => one.id)"
+    )
+
+    assert {f"#{name}" for name in on_page if name not in OF_OTHER_TESTS} - set(CONTROLS) == set()
+    assert len(on_page) > 30  # the pattern finds them
