@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import pytest
+import tolerances
 import view_scenes as scenes
 from browser import wait_for
 from view_pages import SETTLED, open_view_page, run_command
@@ -132,3 +133,38 @@ def test_table_of_controls_has_each_of_the_page(page) -> None:
 
     assert {f"#{name}" for name in on_page if name not in OF_OTHER_TESTS} - set(CONTROLS) == set()
     assert len(on_page) > 30  # the pattern finds them
+
+
+def test_each_control_that_is_seen_has_a_name_for_screen_readers(page) -> None:
+    seen = [one for one in page.find_elements("css selector", "button, input, select") if one.is_displayed()]
+
+    assert len(seen) > 40  # with those of the parts
+    assert [one.get_attribute("outerHTML") for one in seen if not one.accessible_name.strip()] == []
+
+
+def test_page_is_no_wider_than_a_narrow_window(page) -> None:
+    size = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        wait_for(page, "return innerWidth === 400")
+        assert page.execute_script("return document.documentElement.scrollWidth") == 400
+    finally:
+        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_two_fingers_at_three_times_their_distance_zoom_the_picture_threefold(page) -> None:
+    box, before = page.find_element("id", "scene").rect, page.execute_script("return clrecon.facts.camera.height_mm")
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+    def touch(kind: str, *halves: int) -> None:
+        fingers = [{"x": x + side * half, "y": y, "id": n} for half in halves for n, side in enumerate((-1, 1))]
+        page.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers})
+
+    touch("touchStart", 20)
+    for half in range(25, 61, 5):
+        touch("touchMove", half)
+    touch("touchEnd")
+
+    wait_for(page, f"return clrecon.facts.camera.height_mm < {before / 2} && clrecon.facts.settled")
+    after = page.execute_script("return clrecon.facts.camera.height_mm")
+    assert before / after == pytest.approx(3.0, rel=tolerances.PAGE_TOUCH_ZOOM)
