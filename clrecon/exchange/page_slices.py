@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
+from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
 
 MOST_BYTES = 10_000_000
@@ -47,7 +48,10 @@ def pack_slices(volume: Volume, windows: Mapping[str, Sequence[float]], most_byt
     windows: HU of black and white by name, the first of which the page begins with.
     """
     if volume.uneven:
-        raise UsageError("the slices of this scan are uneven, and a page shows even ones only: leave --with-slices out")
+        raise UsageError(
+            "the slices of this scan are uneven, and a page shows even ones only: leave"
+            f" {name_parameter('with_slices')} out"
+        )
     spacing = np.array(volume.spacing)
     target = float(spacing.min())
     while True:

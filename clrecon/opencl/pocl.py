@@ -193,13 +193,25 @@ class KnownGood:
                 fcntl.flock(self._handle, fcntl.LOCK_SH)
 
     def _is_alone(self) -> bool:
+        """Return whether no other process uses the folder; its lock is then this one's until `_share` is called.
+
+        A lock that is changed is lost for a moment, in which another process could take this one, at work, for gone:
+        so one process at a time may try.
+        """
         if sys.platform == "win32":
             return False
+        handle = os.open(self._folder / "trying", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
-            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            try:
+                fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                self._share()
+                return False
         except OSError:
-            self._share()  # a lock that cannot be changed is lost
             return False
+        finally:
+            os.close(handle)
         return True
 
     def _is_shared(self) -> bool:

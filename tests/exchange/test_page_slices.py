@@ -72,7 +72,7 @@ def test_averaged_voxel_lies_in_the_middle_of_those_it_was_made_of() -> None:
 def test_scan_with_uneven_slices_is_refused() -> None:
     positions = np.stack([np.zeros(4), np.zeros(4), [0.0, 1.0, 4.0, 5.0]], axis=1)
 
-    with refused(UsageError, "uneven", "--with-slices"):
+    with refused(UsageError, "uneven", "with_slices"):
         pack_slices(Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), slice_positions=positions), WINDOWS)
 
 

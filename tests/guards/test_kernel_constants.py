@@ -21,6 +21,9 @@ from clrecon.operators.reformat.sheets import COMBINATIONS
 
 PAIRS = [
     ("clrecon.labels.label_levels.REACH", "surface/label_masks.h", "REACH"),
+    ("clrecon.proof.surface.collapses.PULL", "surface/collapse.h", "PULL"),
+    ("clrecon.proof.surface.collapses.SLENDER", "surface/collapse.h", "SLENDER"),
+    ("clrecon.proof.surface.collapses.STEEPEST", "surface/collapse.h", "STEEPEST"),
     ("clrecon.rendering.looks.piecewise.DENSE", "rays/steep_segments.h", "DENSE"),
     ("clrecon.rendering.looks.piecewise.PARTS", "rays/steep_segments.h", "PARTS"),
     ("clrecon.rendering.looks.piecewise.STEEP", "rays/steep_segments.h", "STEEP"),

@@ -20,6 +20,7 @@ from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.options import InputSettings
 from clrecon.jobs.render.job import PictureFiles
 from clrecon.jobs.render.settings import RenderSettings
+from clrecon.jobs.view import ViewSettings
 from clrecon.system.arguments import _DESTINATIONS, in_python, name_parameter, spoken_by
 from clrecon.viewer.web.server import serve_view
 
@@ -135,6 +136,7 @@ def test_every_parameter_that_a_message_names_is_one_of_a_public_function_or_set
         RenderSettings.of,
         LabelChoice,
         PictureFiles,
+        ViewSettings,
         serve_view,
     )
     known = {name for own in (*functions, *settings) for name in inspect.signature(own).parameters}

@@ -270,14 +270,24 @@ def test_building_and_recording_in_a_removed_folder_raise_no_error(new_process, 
 
 
 @contextmanager
-def another_process_at_work(folder):
-    """Another process builds programs in this folder: it holds the lock of those that use it."""
-    handle = os.open(folder / "in-use", os.O_RDWR)
+def locked(path, kind):
+    """A file that another process has locked."""
+    handle = os.open(path, os.O_RDWR | os.O_CREAT)
     try:
-        pocl.fcntl.flock(handle, pocl.fcntl.LOCK_SH)
+        pocl.fcntl.flock(handle, kind)
         yield
     finally:
         os.close(handle)
+
+
+def another_process_at_work(folder):
+    """Another process builds programs in this folder: it holds the lock of those that use it."""
+    return locked(folder / "in-use", pocl.fcntl.LOCK_SH)
+
+
+def another_process_changing_its_lock(folder):
+    """Another process, at work too, tries whether it is alone, and has no lock of those that use it for a moment."""
+    return locked(folder / "trying", pocl.fcntl.LOCK_EX)
 
 
 def test_program_without_a_record_is_kept_while_another_process_is_at_work(new_process, tmp_path):
@@ -297,6 +307,15 @@ def test_temporary_files_are_removed_once_no_other_process_is_at_work(new_proces
         assert temporary.exists()
     new_process()
     assert not temporary.exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
+def test_temporary_files_stay_while_another_process_changes_its_lock(new_process, tmp_path):
+    temporary = tmp_path / "tempfile_abc.so"
+    temporary.write_bytes(b"")
+    with another_process_changing_its_lock(tmp_path):
+        new_process()
+    assert temporary.exists()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")

@@ -98,7 +98,9 @@ class SurfaceExtractor(VolumeWorker):
     ) -> Mesh:
         """Extract the surface at one iso value, or of one range, see `extract_isosurface`."""
         level, chosen = settle_level(self.volume, iso_value, progress)
-        grid = self.choose_grid(level, closed=closed, topology=topology, below=below, vertex_rule=vertex_rule)
+        grid = choose_grid(
+            self._resident, level, closed=closed, topology=topology, below=below, vertex_rule=vertex_rule
+        )
         seeds = None
         if grow_from is not None:
             if topology != "separated":
@@ -128,7 +130,7 @@ class SurfaceExtractor(VolumeWorker):
             range have none.
         """
         level, chosen = settle_level(self.volume, iso_value, progress)
-        grid = self.choose_grid(level, closed=closed, below=below)
+        grid = choose_grid(self._resident, level, closed=closed, below=below)
         for attempt in self._resident.with_fallback():
             with attempt as (_, warnings):
                 run = Extraction(self._resident, grid, warnings, vertices_only=True)
@@ -139,25 +141,32 @@ class SurfaceExtractor(VolumeWorker):
                 cloud = PointCloud.of_known(run.placement.to_lps(positions), normals, hu, report=report)
         return cloud
 
-    def choose_grid(
-        self, iso_value: Level, *, closed: bool, topology: str = "separated", below: bool, vertex_rule: str = "linear"
-    ) -> SampleGrid:
-        volume = self.volume
-        rule = choose_iso_rule(
-            volume,
-            iso_value,
-            closed=closed,
-            topology=topology,
-            below=below,
-            vertex_rule=vertex_rule,
-            values=self._resident.values,
-        )
-        grid = SampleGrid(volume, rule)
-        if topology == "trilinear":
-            check_row(volume)
-        if min(grid.shape) < 2:
-            raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
-        return grid
+
+def choose_grid(
+    resident: DeviceVolume,
+    iso_value: Level,
+    *,
+    closed: bool,
+    topology: str = "separated",
+    below: bool,
+    vertex_rule: str = "linear",
+) -> SampleGrid:
+    volume = resident.volume
+    rule = choose_iso_rule(
+        volume,
+        iso_value,
+        closed=closed,
+        topology=topology,
+        below=below,
+        vertex_rule=vertex_rule,
+        values=resident.values,
+    )
+    grid = SampleGrid(volume, rule)
+    if topology == "trilinear":
+        check_row(volume)
+    if min(grid.shape) < 2:
+        raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
+    return grid
 
 
 @explains_arguments

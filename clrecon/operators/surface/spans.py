@@ -21,7 +21,7 @@ from clrecon.geometry.iso_rule import IsoRule
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.surface.extract import SurfaceExtractor
+from clrecon.operators.surface.extract import choose_grid
 from clrecon.operators.surface.extraction import Extraction, SpanPart
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 from clrecon.system.progress import Progress, ignore_progress
@@ -49,7 +49,7 @@ def extract_by_spans(
     **how: Any,
 ) -> Mesh:
     """Extract a surface from about `count` spans; level and `how` as for `SurfaceExtractor.extract`."""
-    grid = SurfaceExtractor(resident).choose_grid(level, **how)
+    grid = choose_grid(resident, level, **how)
     slices = grid.shape[2]
     length = max(_FEWEST_SLICES, -(-slices // count))
     spans = [(first, min(first + length, slices)) for first in range(0, slices, length)]

@@ -13,10 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 PULL = 1e-3
-"""Weight of the middle of an edge, as in cl/surface/collapse.h."""
+"""Weight of the middle of an edge in cl/surface/collapse.h."""
 
-STEEPEST, SLENDER = 0.2, 0.01
-"""Least cosine between normals, and least sine of a normal, as there."""
+STEEPEST = 0.2
+"""Least cosine between the normals of a face before and after, of cl/surface/collapse.h."""
+
+SLENDER = 0.01
+"""Sine below which a normal is not looked at, of cl/surface/collapse.h."""
 
 _MOST_RING = 16
 
