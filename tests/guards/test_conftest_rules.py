@@ -275,6 +275,19 @@ def test_test_marked_long_runs_before_the_others(tmp_path: Path) -> None:
     assert done.stdout.index("test_long PASSED") < done.stdout.index("test_short PASSED"), done.stdout + done.stderr
 
 
+NAMED_BY_AN_ADDRESS = """
+import pytest
+@pytest.mark.parametrize("answer", [lambda: 1], ids=str)
+def test_answer(answer):
+    pass
+"""
+
+
+def test_row_that_is_named_by_an_address_ends_the_session(tmp_path: Path) -> None:
+    done = run_pytest(tmp_path, NAMED_BY_AN_ADDRESS)
+    assert (done.returncode, "give its rows ids" in done.stdout + done.stderr) == (pytest.ExitCode.USAGE_ERROR, True)
+
+
 def test_required_platforms_are_found_in_this_session(device: object) -> None:
     """Asks for the devices of this session, so that a platform that got lost shows in every run."""
     wanted = os.environ.get("CLRECON_REQUIRE_PLATFORMS", "")

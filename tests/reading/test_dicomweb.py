@@ -276,7 +276,11 @@ def test_more_instances_than_allowed_are_refused(archive: Archive) -> None:
         fetch(archive.url, entries=SLICES - 1)
 
 
-@pytest.mark.parametrize("answer", [answering(b"[]"), answering(status=204), answering(status=404)], ids=str)
+@pytest.mark.parametrize(
+    "answer",
+    [answering(b"[]"), answering(status=204), answering(status=404)],
+    ids=["empty list", "no content", "not found"],
+)
 def test_series_that_the_archive_does_not_have_is_no_dicom(answer: Any, archive: Archive) -> None:
     archive.answers = [answer]
 
