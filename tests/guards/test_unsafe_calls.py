@@ -38,7 +38,7 @@ def find_unsafe(source: str) -> list[str]:
 
 @pytest.mark.fault_row(71)
 def test_no_module_of_clrecon_calls_what_runs_its_input_as_code() -> None:
-    assert len(MODULES) > 300
+    assert len(MODULES) > 300  # all of clrecon, not one folder of it: counted 431
     found = {path.relative_to(ROOT).as_posix(): find_unsafe(path.read_text()) for path in MODULES}
     assert {path: calls for path, calls in found.items() if calls} == {}
 

@@ -198,7 +198,7 @@ def test_written_mesh_is_red_beyond_the_range_and_light_where_there_is_no_distan
     colors = np.asarray(trimesh.load(out, process=False).visual.vertex_colors)[:, :3].astype(int)
     dark_red, light_grey = (178, 24, 43), 222  # the end of the scale, and its middle
     assert (colors[far] == dark_red).all()
-    assert (np.abs(colors[near] - light_grey) < 8).all()
+    assert (np.abs(colors[near] - light_grey) < 8).all()  # 0.02 of the range of 1 mm: up to 6
 
 
 def test_picture_of_distances_is_red_at_the_ends_alone_with_its_scale_beside(

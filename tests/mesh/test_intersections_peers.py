@@ -24,7 +24,7 @@ def test_cgal_finds_the_same_pairs_of_triangles_that_cut_each_other(seed):
     theirs = cgal.remesh_self_intersections(vertices.astype(float), triangles.astype(np.int64), detect_only=True)[2]
     ours = find_self_intersections(vertices, triangles)
 
-    assert len(ours) > 100
+    assert len(ours) > 100  # pairs; measured 672 to 871
     assert {frozenset(pair) for pair in ours.tolist()} == {frozenset(pair) for pair in theirs.tolist()}
 
 

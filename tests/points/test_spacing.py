@@ -21,7 +21,8 @@ def test_the_spacing_of_a_flat_lattice_is_its_step(counts: tuple[int, int, int])
 
 def test_the_spacing_of_a_solid_lattice_is_less_than_its_step() -> None:
     """It is that of the surface that as many points would cover."""
-    assert 0.7 * 0.7 < mean_spacing(lattice(30, 40, 30, step=0.7)) < 0.7
+    step = 0.7
+    assert 0.7 * step < mean_spacing(lattice(30, 40, 30, step=step)) < step  # measured 0.84 of it
 
 
 BALL_POINTS = 40_000

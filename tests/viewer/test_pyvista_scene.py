@@ -92,12 +92,14 @@ def test_translucent_mesh_before_a_picture_keeps_its_colour_on_any_background(pl
     plotter.set_background(background)
     before = CENTRE - 50.0 * CAMERAS[0].basis().forward
     sheet = pyvista.Plane(center=before, direction=CAMERAS[0].basis().forward, i_size=500.0, j_size=500.0)
-    plotter.add_mesh(sheet, color=(0, 200, 0), opacity=0.4, lighting=False)
-    made = merge_scene(plotter, ball(CAMERAS[0]))
-    red = np.isfinite(ball(CAMERAS[0]).depth)
-    assert np.abs(made.image[~red] - np.array([0.0, 200.0, 0.0, 102.0])).max() <= tolerances.DRAWN_BLEND_LEVELS
-    both = 0.4 * np.array([0.0, 200.0, 0.0]) + 0.6 * np.array([250.0, 40.0, 10.0])
-    assert np.abs(made.image[red] - np.array([*both, 255.0])).max() <= tolerances.DRAWN_BLEND_LEVELS
+    green, red, opacity = (0, 200, 0), (250, 40, 10), 0.4
+    plotter.add_mesh(sheet, color=green, opacity=opacity, lighting=False)
+    picture = ball(CAMERAS[0], color=red)
+    made = merge_scene(plotter, picture)
+    on_ball = np.isfinite(picture.depth)
+    assert np.abs(made.image[~on_ball] - np.array([*green, 255.0 * opacity])).max() <= tolerances.DRAWN_BLEND_LEVELS
+    both = opacity * np.array(green) + (1.0 - opacity) * np.array(red)
+    assert np.abs(made.image[on_ball] - np.array([*both, 255.0])).max() <= tolerances.DRAWN_BLEND_LEVELS
     assert plotter.background_color == pyvista.Color(background)
 
 

@@ -51,7 +51,8 @@ def test_depth_and_light_of_a_plane_are_those_of_its_place_and_slope(cast, steps
     truth = ((centre_of(volume) - origins) @ SLOPE) / (directions @ SLOPE)
     assert np.abs(shot.depth - truth).max() <= 0.01 * max(volume.spacing)  # a linear field is linear between voxels
     light = 255.0 * (MATT.ambient + MATT.diffuse * np.abs(directions @ SLOPE))
-    assert np.abs(shot.image[..., :3] - light[..., None]).max() <= tolerances.RAY_SAME_255 + 0.5
+    rounding = tolerances.RAY_SAME_255 + 0.5  # the truth is no whole number, the picture is
+    assert np.abs(shot.image[..., :3] - light[..., None]).max() <= rounding
     assert (shot.image[..., 3] == 255).all()
 
 
@@ -109,7 +110,7 @@ def test_depths_of_a_surface_and_of_its_caps_are_those_of_the_extracted_mesh(cas
     steep = both & (cosine > 0.4)
     away = np.abs(shot.depth - depth)[steep] * cosine[steep] / (1.9 if steps == "uneven" else max(volume.spacing))
     assert (away <= tolerances.RAY_DEPTH_VOXEL).mean() >= 1.0 - tolerances.RAY_OUTLINE_SHARE
-    assert np.median(away) <= 0.2 * tolerances.RAY_DEPTH_VOXEL
+    assert np.median(away) <= 0.2 * tolerances.RAY_DEPTH_VOXEL  # most rays are far nearer than the bar: measured 7e-4
 
 
 @pytest.mark.parametrize("iso_value", [400.0, -800.0])
@@ -151,7 +152,8 @@ def test_a_camera_inside_a_surface_sees_a_cap_at_its_own_place(cast):
     centre = centre_of(volume)
     camera = Camera(tuple(centre), tuple(centre + (0.0, 1.0, 0.0)), (0, 0, 1), view_angle=40.0)
     shot = cast(volume, "surface", iso_value=300.0, camera=camera, size=(8, 8), lighting=MATT)
-    assert np.abs(shot.depth).max() <= 1e-6 and (shot.image == 255).all()
+    assert np.abs(shot.depth).max() <= 1e-6  # mm; measured 0
+    assert (shot.image == 255).all()  # a cap faces its ray: ambient and diffuse light, 0.2 + 0.8
 
 
 TOWARDS_LIGHT = np.array([0.5, 0.3, 1.0]) / np.linalg.norm([0.5, 0.3, 1.0])
@@ -182,7 +184,8 @@ def test_a_ball_throws_its_shadow_on_a_floor_where_its_line_to_the_light_meets_i
 
     lit = 255.0 * (lighting.ambient + lighting.diffuse * TOWARDS_LIGHT[2])
     rounding = tolerances.RAY_SAME_255 + 0.5
-    assert np.abs(shadowed.image[in_shadow, 0] - 255.0 * lighting.ambient).max() <= tolerances.RAY_SAME_255
+    in_ambient_light = 255.0 * lighting.ambient
+    assert np.abs(shadowed.image[in_shadow, 0] - in_ambient_light).max() <= tolerances.RAY_SAME_255
     assert np.abs(shadowed.image[in_light, 0] - lit).max() <= rounding
     assert np.abs(plain.image[in_shadow | in_light, 0] - lit).max() <= rounding
 

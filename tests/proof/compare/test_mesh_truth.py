@@ -157,7 +157,7 @@ def test_cells_cut_by_the_surface_of_a_phantom_lie_within_half_their_diagonal_of
     grid = Volume(np.zeros((48, 64, 64), np.int16), truth.affine)
     cut = find_cut_cells(truth, grid)
     half = 0.5 * np.linalg.norm(grid.spacing)
-    assert len(cut) > 500
+    assert len(cut) > 500  # measured 5870 and 6328
     assert np.abs(truth.signed_distance(grid.ijk_to_lps(cut.ijk + 0.5))).max() <= half
 
 

@@ -154,7 +154,8 @@ def test_scaled_heights_of_the_smallest_number_keep_it_above_0():
 
 
 def test_scaled_heights_from_the_smallest_to_the_largest_number_fit_into_their_bits():
-    assert max(scale_heights([1.0, 0.0, 1e-45, 3.4e38, -1e-30], 18)) < 2**18
+    bits = 18
+    assert max(scale_heights([1.0, 0.0, 1e-45, 3.4e38, -1e-30], bits)) < 2**bits  # float32 has 1e-45 to 3.4e38
 
 
 def test_ambiguous_face_joins_its_inside_corners_where_its_saddle_is_inside():
@@ -314,7 +315,7 @@ def test_surfaces_of_12_random_fields_have_the_topology_of_the_field_unlike_sepa
     found = count_right_surfaces(range(12))
     assert found["clear"] >= 11  # of 12 fields sampling says the topology
     assert found["trilinear"] == found["clear"]
-    assert found["separated"] < found["clear"] / 4
+    assert found["separated"] < found["clear"] / 4  # measured 0
 
 
 @pytest.mark.release

@@ -297,7 +297,7 @@ def test_isosurface_of_a_volume_is_the_same_from_every_kind_of_file(tilted_torus
     expected = clrecon.extract_isosurface(tilted_torus, 250, device=device)
     path = WRITERS[name](tmp_path / name, tilted_torus.voxels.astype(stored), tilted_torus.affine)
     mesh = clrecon.extract_isosurface(clrecon.read_volume(path), 250, device=device)
-    assert expected.vertex_count > 500
+    assert expected.vertex_count > 500  # measured 1542
     assert np.array_equal(mesh.triangles, expected.triangles)
     assert np.abs(mesh.vertices - expected.vertices).max() <= tolerances.FRAME_MM
 

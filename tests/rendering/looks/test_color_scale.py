@@ -15,9 +15,9 @@ from clrecon.rendering.pictures.sheets import add_scale
 def test_colours_of_signed_values_are_blue_below_zero_grey_at_it_and_red_above() -> None:
     below, zero, above = ColorScale(2.0).colors([-2.0, 0.0, 2.0]).astype(int)
 
-    assert below[2] > below[0] + 100
+    assert below[2] > below[0] + 100  # the ends of RdBu: (33, 102, 172)
     assert zero.tolist() == [222, 222, 222]
-    assert above[0] > above[2] + 100
+    assert above[0] > above[2] + 100  # (178, 24, 43)
 
 
 def test_colours_of_values_beyond_the_limit_are_those_at_it() -> None:
@@ -62,7 +62,7 @@ def with_scale() -> Rendering:
 
 def test_scale_is_added_at_the_right_of_an_opaque_picture(with_scale: Rendering) -> None:
     assert (with_scale.image[:, :300] == 255).all()
-    assert with_scale.image.shape[1] > 340
+    assert with_scale.image.shape[1] > 340  # 300 of the picture, and the strip; measured 378
     assert with_scale.is_opaque
 
 
