@@ -13,13 +13,16 @@ from printed_text import Printer
 from clrecon.cli.main import main
 from clrecon.jobs.options import parse_hu
 
+BONE_HU, TISSUE_HU = 700, 0
+
 
 @pytest.fixture(scope="module")
 def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A ball of 700 HU in water."""
     voxels = ct_files.sphere_voxels((17, 31, 37))
     inside = (voxels - ct_files.OUTSIDE_HU) / (ct_files.INSIDE_HU - ct_files.OUTSIDE_HU)
-    return ct_files.write_series(tmp_path_factory.mktemp("ct"), (inside * 700.0).round().astype("int16"))
+    hu = TISSUE_HU + inside * (BONE_HU - TISSUE_HU)
+    return ct_files.write_series(tmp_path_factory.mktemp("ct"), hu.round().astype("int16"))
 
 
 def run(ct: Path, device: Any, tmp_path: Path, *arguments: str) -> int:
@@ -33,7 +36,8 @@ def test_words_of_auto_have_the_iso_value_and_the_materials_it_lies_half_way_bet
     shown = capsys.readouterr().out
     (line,) = [line for line in shown.splitlines() if line.startswith("surface")]
     level = float(line.split()[1])
-    assert abs(level - 350.0) <= tolerances.HALF_WAY_STEP_SHARE * 700.0
+    half_way = (BONE_HU + TISSUE_HU) / 2
+    assert abs(level - half_way) <= tolerances.HALF_WAY_STEP_SHARE * (BONE_HU - TISSUE_HU)
     assert "HU (auto: half way between tissue 0 and bone 700 HU), closed" in line
 
 

@@ -25,7 +25,8 @@ SHAPE = (40, 44, 48)
 LARGE, SMALL = np.array([15.0, 16.0, 14.0]), np.array([37.0, 16.0, 14.0])
 """Centres (i, j, k) of a hollow ball of 9 voxels and of a full one of 5; a rod of 2 voxels joins them.  A block of
 3 x 3 x 3 voxels lies apart: the scan has three surfaces, that of the hollow counted."""
-"""Centres (i, j, k) of a hollow ball of 9 voxels and of a full one of 5; a rod of 2 voxels joins them."""
+BONE_HU = 200
+"""The iso value of `clrecon mesh` where none is given; the surfaces of balls and rod are where the scan has it."""
 
 
 def make_voxels() -> np.ndarray:
@@ -38,7 +39,7 @@ def make_voxels() -> np.ndarray:
     small = 5.2 - away(SMALL)
     rod = np.minimum(1.2 - np.sqrt((j - 16) ** 2 + (k - 14) ** 2), np.minimum(i - 15, 37 - i))
     rod = np.where(away(LARGE) < 5, -10.0, rod)
-    voxels = np.clip(np.rint(150.0 * np.maximum(np.maximum(large, small), rod) + 200.0), -100, 700)
+    voxels = np.clip(np.rint(150.0 * np.maximum(np.maximum(large, small), rod) + BONE_HU), -100, 700)
     voxels[32:35, 35:38, 40:43] = 600
     return voxels.astype(np.int16)
 
@@ -164,11 +165,11 @@ def test_report_of_opening_counts_the_bone_that_it_took_and_warns_of_it(mesh_wit
     report, _ = mesh_with("--preprocess", "open:2")
 
     (step,) = report["volume"]["preprocess"]
-    assert (step["step"], step["band_hu"]) == ("open:2", [200.0, None])
-    assert step["voxels"] == np.count_nonzero(make_voxels() >= 200)
+    assert (step["step"], step["band_hu"]) == ("open:2", [BONE_HU, None])
+    assert step["voxels"] == np.count_nonzero(make_voxels() >= BONE_HU)
     assert 0 < step["taken"] < 0.1 * step["voxels"]  # rod and block
     assert step["added"] == 0
-    assert step["outside_hu"] < 200 < step["inside_hu"]
+    assert step["outside_hu"] < BONE_HU < step["inside_hu"]
     assert any(f"open:2 took {step['taken']:,} of" in warning for warning in report["warnings"])
 
 
@@ -178,7 +179,7 @@ def test_filling_adds_the_voxels_of_the_hollow_of_a_ball(mesh_with: Any) -> None
     k, j, i = np.indices(SHAPE)
     in_the_hollow = np.sqrt((i - LARGE[0]) ** 2 + (j - LARGE[1]) ** 2 + (k - LARGE[2]) ** 2) < 5.0
     (step,) = report["volume"]["preprocess"]
-    assert (step["step"], step["added"]) == ("fill", np.count_nonzero(in_the_hollow & (make_voxels() < 200)))
+    assert (step["step"], step["added"]) == ("fill", np.count_nonzero(in_the_hollow & (make_voxels() < BONE_HU)))
     assert report["components"] == 1
 
 
@@ -245,7 +246,7 @@ def test_cloud_has_the_points_in_the_region(device: Any, scan: Path, tmp_path: P
 
     assert printed().report()["volume"]["region"]["rules"] == [str(parse_region_rules(box)[0])]
     points = np.asarray(read_points(str(tmp_path / "c.ply")).points)
-    assert len(points) > 100
+    assert len(points) > 100  # 568 were measured; the ball has 4/3 pi 5.2^3 = 589 voxels
     assert np.abs(points - to_lps(SMALL)).max() < HALF_SIDE_MM + VOXEL_MM
 
 
@@ -269,10 +270,12 @@ def test_picture_shows_the_region_alone_and_less_of_it_after_erosion(
 
 
 def test_surface_below_a_level_is_closed_at_its_region_by_a_value_above(mesh_with: Any) -> None:
-    report, vertices = mesh_with("--below", "0", "--keep-outside", "--region", box_around(SMALL, 9.0))
+    half_side_mm = 9.0
+    box = box_around(SMALL, half_side_mm)
+    report, vertices = mesh_with("--below", "0", "--keep-outside", "--region", box)
 
     assert report["closed"]
-    assert np.abs(vertices - to_lps(SMALL)).max() < 9.0 + VOXEL_MM
+    assert np.abs(vertices - to_lps(SMALL)).max() < half_side_mm + VOXEL_MM
     assert report["volume"]["region"]["outside_hu"] > 0
 
 

@@ -16,7 +16,8 @@ SPACING = (0.7, 0.5, 1.1)
 SHAPE = (40, 10, 20)
 """Voxels along k, j, i."""
 
-GREY = TransferFunction([(0, 0.5, 0.5, 0.5, 0.1), (200, 0.5, 0.5, 0.5, 0.1)], unit_distance=2.0)
+GREY_LEVEL, GREY_OPACITY = 0.5, 0.1
+GREY = TransferFunction([(hu, *[GREY_LEVEL] * 3, GREY_OPACITY) for hu in (0, 200)], unit_distance=2.0)
 LABEL_TINT = 0.8
 """Share of a label's colour, as in cl/rays/label_color.h."""
 
@@ -58,7 +59,7 @@ def row_of_labels(request, device):
 )
 def test_opacity_of_a_label_is_a_factor_on_that_of_each_unit_of_way(row_of_labels, columns, factor):
     units = SHAPE[1] * SPACING[1] / GREY.unit_distance
-    expected = 255.0 * (1.0 - (1.0 - factor * 0.1) ** units)
+    expected = 255.0 * (1.0 - (1.0 - factor * GREY_OPACITY) ** units)
     assert np.abs(row_of_labels[columns, 3] - expected).max() <= tolerances.RAY_SAME_255
 
 
@@ -66,8 +67,8 @@ def test_opacity_of_a_label_is_a_factor_on_that_of_each_unit_of_way(row_of_label
 @pytest.mark.oclgrind
 def test_colour_of_a_label_is_mixed_with_that_of_the_transfer_function(row_of_labels):
     without_colour, red = row_of_labels[1:9, :3], row_of_labels[11:14, :3]
-    assert np.abs(without_colour - 0.5 * 255.0).max() <= tolerances.LABEL_COLOR_255
-    mixed = 255.0 * ((1.0 - LABEL_TINT) * 0.5 + LABEL_TINT * np.array([1.0, 0.0, 0.0]))
+    assert np.abs(without_colour - 255.0 * GREY_LEVEL).max() <= tolerances.LABEL_COLOR_255
+    mixed = 255.0 * ((1.0 - LABEL_TINT) * GREY_LEVEL + LABEL_TINT * np.array([1.0, 0.0, 0.0]))
     assert np.abs(red - mixed).max() <= tolerances.LABEL_COLOR_255
 
 
