@@ -72,7 +72,7 @@ def test_picture_of_vertebrae_has_a_yellow_line_for_each_disc(written: Path) -> 
     with Image.open(written / "a.png") as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
 
-    assert pixels.shape[0] > 300
+    assert pixels.shape[0] > 3 * 100  # 3 rows a mm of the spine from L1 to L3; 354 were measured
     yellow_rows = np.flatnonzero((np.abs(pixels - [255, 230, 0]).max(axis=2) < 10).any(axis=1))
     lines = 1 + np.count_nonzero(np.diff(yellow_rows) > 20)  # rows apart
     assert lines >= 2

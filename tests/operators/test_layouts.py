@@ -360,7 +360,7 @@ TETRAHEDRON = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]])
 
 
 def test_closed_tetrahedron_has_no_open_edge():
-    assert _count_open_edges(TETRAHEDRON, 4) == 0
+    assert _count_open_edges(TETRAHEDRON, vertices=4) == 0
 
 
 @pytest.mark.parametrize(
@@ -369,7 +369,7 @@ def test_closed_tetrahedron_has_no_open_edge():
     ids=["a face less", "a face turned"],
 )
 def test_edges_of_a_missing_or_turned_face_are_open(triangles):
-    assert _count_open_edges(triangles, 4) > 0
+    assert _count_open_edges(triangles, vertices=4) > 0
 
 
 def test_edges_that_are_passed_twice_each_way_are_open():

@@ -159,7 +159,7 @@ def test_large_frame_of_a_gif_is_as_near_as_one_whose_colours_all_pixels_chose(t
     best = picture.quantize(256, Image.Quantize.MEDIANCUT)
     known = np.asarray(picture.quantize(palette=best, dither=Image.Dither.FLOYDSTEINBERG).convert("RGB"), np.float64)
     off, known_off = (np.sqrt(np.mean(np.square(one - frame))) for one in (shown, known))
-    assert off < 1.05 * known_off, (off, known_off)
+    assert off < 1.05 * known_off, (off, known_off)  # 0.997 was measured
 
 
 def test_gif_of_two_colours_keeps_them(tmp_path):
@@ -197,7 +197,7 @@ def test_frames_drawn_one_after_another_into_one_array_are_all_kept(tmp_path, na
     with Image.open(tmp_path / name) as animation:
         for number, value in enumerate((20, 120, 220)):
             animation.seek(number)
-            assert np.abs(np.asarray(animation.convert("RGB")).astype(int) - value).max() <= 4
+            assert (np.asarray(animation.convert("RGB")) == value).all()
 
 
 @pytest.mark.parametrize("name", ["turn", "turn/", "v1.2/"])

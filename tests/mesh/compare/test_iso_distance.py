@@ -141,7 +141,7 @@ def test_vertices_of_an_extracted_surface_lie_on_it_and_centres_of_its_flat_tria
     rule = choose_iso_rule(volume, iso_value, closed=closed)
     measured = measure_iso_distance(Mesh(vertices, triangles), volume, rule)
     assert measured["vertices_voxel"]["max"] < tolerances.ISO_VERTEX_VOXEL
-    assert measured["centres_voxel"]["p95"] > 100 * tolerances.ISO_VERTEX_VOXEL
+    assert measured["centres_voxel"]["p95"] > 100 * tolerances.ISO_VERTEX_VOXEL  # measured 0.47 to 0.59
 
 
 def test_distances_in_mm_are_those_in_voxels_times_the_shortest_step():
@@ -169,7 +169,7 @@ def test_iso_distance_takes_more_than_half_of_the_samples_asked_for_and_not_more
     volume = noise_volume()
     vertices, _, triangles = extract_isosurface(volume, 100)
     measured = measure_iso_distance(Mesh(vertices, triangles), volume, choose_iso_rule(volume, 100), samples=100)
-    assert 50 < measured["samples"][of] <= 100
+    assert 50 < measured["samples"][of] <= 100  # every n-th, n rounded up
 
 
 CLOSED_REPORT = {"iso_value_hu": 226.0, "iso_level_hu": 225.5, "closed_at_border": True, "outside_hu": -1024.0}

@@ -285,7 +285,7 @@ def test_no_bone_of_a_vertebra_lies_outside_of_its_local_bounds(number: int) -> 
 
     outside = points[((points < low) | (points > high)).any(axis=1)]
 
-    assert len(outside) > 10_000
+    assert len(outside) > 10_000  # of 60,000; 19,301 were measured for L5, more for others
     assert (vertebra_distance(vertebra, *outside.T) < 0.0).all()
 
 
@@ -321,7 +321,7 @@ def test_negative_scoliosis_bends_the_middle_of_a_spine_to_the_right() -> None:
     bent = facts_of_thoracolumbar_spine(scoliosis_deg=-35.0)
     x = [level["center_lps_mm"][0] for level in bent["vertebrae"]]  # grows to the left
     middle = len(x) // 2
-    assert x[middle] < min(x[0], x[-1]) - 25.0
+    assert x[middle] < min(x[0], x[-1]) - 25.0  # mm; 27.2 and 43.7 were measured
 
 
 @pytest.mark.release
@@ -349,7 +349,7 @@ def moves_of_bent_spine() -> np.ndarray:
 
 def test_scoliosis_moves_vertebrae_as_far_to_the_left_as_to_the_right(moves_of_bent_spine: np.ndarray) -> None:
     x = moves_of_bent_spine[:, 0]
-    assert x.max() > 5.0
+    assert x.max() > 5.0  # mm; 21.4 was measured
     assert x.max() == pytest.approx(-x.min())
 
 

@@ -43,7 +43,7 @@ def test_labels_have_different_colours_where_none_is_given():
 
     colors = table[[2, 4, 9], :3]  # the numbers in the map
     assert (colors >= 0).all()
-    assert (np.linalg.norm(colors[:, None] - colors, axis=-1) + np.eye(3) > 0.3).all()
+    assert (np.linalg.norm(colors[:, None] - colors, axis=-1) + np.eye(3) > 0.3).all()  # 0.54 was measured
     assert (table[[0, 1, 3], :3] == FROM_THE_PICTURE).all()
 
 
@@ -68,7 +68,7 @@ def test_opacity_of_what_has_no_label_is_given_by_the_text_0_too():
 def test_thirty_labels_have_colours_apart_from_each_other():
     colors = distinct_colors(30)
     assert (colors >= 0).all() and (colors <= 1).all()
-    assert (np.linalg.norm(colors[:, None] - colors, axis=-1) + np.eye(30) > 0.02).all()
+    assert (np.linalg.norm(colors[:, None] - colors, axis=-1) + np.eye(30) > 0.02).all()  # 0.11 was measured
 
 
 def test_colours_of_labels_do_not_depend_on_how_many_there_are():
