@@ -15,7 +15,7 @@ def package_imports() -> dict[str, set[str]]:
 
 
 def test_no_file_of_the_package_imports_itself_over_others() -> None:
-    assert len(package_imports()) > 300
+    assert len(package_imports()) > 300  # of some 430 files: the whole package is looked at
     assert find_circles(package_imports()) == []
 
 
@@ -35,7 +35,7 @@ def room_imports(imports: dict[str, set[str]], packages: set[str]) -> dict[str, 
 def test_no_folder_of_the_package_imports_itself_over_others() -> None:
     packages = {name for name, path in package_modules().items() if path.name == "__init__.py"}
     rooms = room_imports(package_imports(), packages)
-    assert len(rooms) > 30
+    assert len(rooms) > 30  # of some 55 folders: the whole package is looked at
     assert find_circles(rooms) == []
 
 

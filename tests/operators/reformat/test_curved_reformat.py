@@ -60,6 +60,7 @@ def edges(values, pixel):
 GRIDS = pytest.mark.parametrize("grid", [0, 1], ids=["sheared", "uneven"])
 KINDS = pytest.mark.parametrize("kind", ["straightened", "stretched"])
 TUBE_SIZE = (60, 150)
+"""Columns and rows of a picture of the whole tube."""
 
 
 @GRIDS
@@ -70,10 +71,11 @@ def test_picture_of_a_bent_tube_is_as_long_as_its_arc_and_each_row_at_its_way_al
     marked = volume.with_voxels(way.astype(np.float32))
     seen = reformat_curve(marked, centre_line(), kind, TUBE_SIZE, device=device, view="anterior")
     pixel, arc = seen.report["pixel_mm"], BEND * TURN
-    assert 150 * pixel == pytest.approx(arc, rel=tolerances.TUBE_ARC)
+    columns, rows = TUBE_SIZE
+    assert rows * pixel == pytest.approx(arc, rel=tolerances.TUBE_ARC)
     assert seen.report["curve"]["length_mm"] == pytest.approx(arc, rel=tolerances.TUBE_ARC)
-    middle = seen.values[:, 30]
-    assert np.abs(middle - (np.arange(150) + 0.5) * pixel).max() <= tolerances.TUBE_ARC * arc
+    middle = seen.values[:, columns // 2]
+    assert np.abs(middle - (np.arange(rows) + 0.5) * pixel).max() <= tolerances.TUBE_ARC * arc
 
 
 def test_curved_reformation_runs_from_the_upper_end_and_has_no_camera_and_no_depths(device):
@@ -96,12 +98,12 @@ def test_a_bent_tube_is_straight_and_has_its_width(device, grid, kind):
 
 @pytest.mark.parametrize("angle", [90.0, 30.0])
 def test_a_round_tube_is_as_wide_from_every_side(device, angle):
-    volume = next(grids())
+    volume, pixel_mm, width_mm = next(grids()), 0.5, 20.0
     tube = volume.with_voxels((100.0 * (TUBE - coordinates(volume)[0])).astype(np.float32))
     seen = reformat_curve(tube, centre_line(), "straightened", device=device, view="anterior", angle=angle,
-                          pixel_mm=0.5, width_mm=20.0)  # fmt: skip
-    assert seen.values.shape == (round(BEND * TURN / 0.5), 40)
-    assert np.abs(edges(seen.values, 0.5) - (-TUBE, TUBE)).max() <= tolerances.TUBE_EDGE_MM
+                          pixel_mm=pixel_mm, width_mm=width_mm)  # fmt: skip
+    assert seen.values.shape == (round(BEND * TURN / pixel_mm), width_mm / pixel_mm)
+    assert np.abs(edges(seen.values, pixel_mm) - (-TUBE, TUBE)).max() <= tolerances.TUBE_EDGE_MM
 
 
 @KINDS
@@ -122,14 +124,16 @@ def test_sides_of_a_curved_reformation_are_those_of_its_view_and_the_head_is_at_
     places = volume.ijk_to_lps(np.stack([i, j, k], axis=1)).reshape(nk, nj, ni, 3).astype(np.float32)
     line = CENTRE + np.array([(0.0, 30.0, z) for z in (-20.0, 5.0, 20.0)])
     points = line if upward else line[::-1]
+    size = columns, rows = 8, 12
 
     across, heights = (
-        reformat_curve(volume.with_voxels(places[..., shown]), points, kind, (8, 12), device=device, view=view).values
+        reformat_curve(volume.with_voxels(places[..., shown]), points, kind, size, device=device, view=view).values
         for shown in (axis, 2)
     )
 
-    assert np.sign(across[6, 7] - across[6, 0]) == sign
-    assert heights[0, 4] > heights[11, 4]
+    middle_row, middle_column = rows // 2, columns // 2
+    assert np.sign(across[middle_row, -1] - across[middle_row, 0]) == sign
+    assert heights[0, middle_column] > heights[-1, middle_column]
 
 
 @pytest.fixture(scope="module")

@@ -127,8 +127,9 @@ def test_page_of_transfer_functions_has_mode_and_first_hu_of_each_preset() -> No
         preset = PRESETS[name]
         assert preset.description.startswith(description) and preset.mode == mode
         if begins:
-            points = preset.transfer_function.points
-            assert float(begins.split()[0]) == points[np.flatnonzero(points[:, 4] > 0)[0] - 1, 0]
+            hu, *_, opacities = preset.transfer_function.points.T
+            first_opaque = np.flatnonzero(opacities > 0)[0]
+            assert float(begins.split()[0]) == hu[first_opaque - 1]
 
 
 POINTS = {
