@@ -79,5 +79,5 @@ def test_the_surface_variation_tells_edges_of_a_cube_from_its_faces(noisy_cube, 
 
 def test_the_limit_of_the_variation_is_passed_by_many_points_at_edges_and_none_on_faces(noisy_cube):
     is_feature = measure_variation(noisy_cube.clean) > VARIATION_OF_FEATURES
-    assert is_feature[noisy_cube.regions["edges"]].mean() > 0.4
+    assert is_feature[noisy_cube.regions["edges"]].mean() > 0.4  # measured 0.58: "edges" are 1 mm wide
     assert not is_feature[noisy_cube.regions["faces"]].any()

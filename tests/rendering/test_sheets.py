@@ -42,7 +42,7 @@ def test_circle_lies_at_its_mm_in_a_panel() -> None:
 
     middle = np.array([0.0, 5.0 / 0.5])  # row, column
     radii = np.linalg.norm(pixels_from_centre(sheet.image, GREEN) - middle, axis=1)
-    assert len(radii) > 60
+    assert len(radii) > 60  # half of the 2 pi 20 pixels of its outline; measured 228, of a stroke of 2 pixels
     width = 2.5  # pixels of the stroke, to each side
     assert np.abs(radii - 10.0 / 0.5).max() < width
 
@@ -77,10 +77,12 @@ def test_sheet_that_is_drawn_again_has_the_same_bytes() -> None:
 def test_letters_and_caption_of_a_panel_are_drawn_at_its_edges() -> None:
     plain = make_panel()
     told = Panel(plain.values, 0.5, ["caption"], (), ("L", "R", "A", "P"))
+    height, width = plain.values.shape
     difference = (draw_sheet([[told]]).image != draw_sheet([[plain]]).image).any(axis=-1)
     rows, columns = np.nonzero(difference)
-    assert rows.min() < 20 and rows.max() > 85
-    assert columns.min() < 25 and columns.max() > 185
+    near = 14  # pixels; the outlines of the letters begin 3 to 4 from the edges
+    assert rows.min() < GAP_PIXELS + near and rows.max() > GAP_PIXELS + height - near
+    assert columns.min() < GAP_PIXELS + near and columns.max() > GAP_PIXELS + width - near
 
 
 @pytest.mark.parametrize("rows", [[], [[]], [[make_panel(), Panel(np.zeros((50, 50), np.float32), 0.5)]]])

@@ -97,7 +97,7 @@ def test_surface_of_a_leg_half_way_to_soft_tissue_is_that_of_its_bone(leg_profil
 
 
 def test_surface_of_a_leg_at_a_low_iso_value_lies_outside_its_bone(leg_profiles: Any) -> None:
-    assert measure_levels.measure_errors(leg_profiles, 200.0)["bias_mm"] > 0.5
+    assert measure_levels.measure_errors(leg_profiles, 200.0)["bias_mm"] > 0.5  # measured 0.95
 
 
 def test_mesh_is_met_where_it_crosses_the_true_normals_in_their_direction() -> None:

@@ -176,7 +176,7 @@ def test_all_devices_give_the_picture_of_the_first(name):
     for other in others:
         a, b = premultiplied(first.image), premultiplied(other.image)
         assert (np.abs(a - b).max(axis=-1) <= 2.0).mean() >= 1.0 - tolerances.RAY_TWIN_SHARE
-        assert structural_similarity(a, b, channel_axis=-1, data_range=255.0) > 0.99
+        assert structural_similarity(a, b, channel_axis=-1, data_range=255.0) > 0.99  # measured 0.9999998 in "soft"
         assert_alike(other, first, settings["mode"])
 
 

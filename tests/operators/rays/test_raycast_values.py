@@ -220,7 +220,7 @@ def random_values(request, cast):
 def test_extremes_have_values_and_depths_where_rays_meet_the_volume(random_values):
     _, high, mean, low, way = random_values
     hit = way > 0.0
-    assert 100 < hit.sum() < hit.size
+    assert 100 < hit.sum() < hit.size  # measured 565 to 684 rays of 48 * 40
     assert np.array_equal(np.isfinite(mean.values), hit)
     for extreme in (high, low):
         assert np.array_equal(np.isfinite(extreme.values), hit)

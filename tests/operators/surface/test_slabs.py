@@ -133,7 +133,7 @@ def test_a_volume_beyond_the_largest_buffer_of_the_device_goes_through_in_slabs(
     expected = extract_isosurface(volume, 100, device=device)
     monkeypatch.setattr(device, "max_allocation_bytes", volume.voxels.nbytes // 3)
     mesh = extract_isosurface(volume, 100, device=device)
-    assert mesh.report["slabs"] >= 3  # a buffer holds a third of the voxels
+    assert mesh.report["slabs"] >= 3  # a buffer holds a third of the voxels; slabs share slices: measured 14
     assert_same(mesh, expected)
 
 

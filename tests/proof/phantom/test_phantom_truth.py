@@ -112,7 +112,7 @@ def test_labels_of_points_are_those_of_the_label_map_but_for_rounding(case: str)
     different = truth.label(points) != drawn
 
     assert set(np.unique(drawn)) == {0, *truth.names}
-    assert different.mean() < 0.001
+    assert different.mean() < 0.001  # of 3,000 to 6,000 points; measured 0
     assert (np.abs(truth.signed_distance(points[different])) < 1e-3).all()  # mm: the drawing has float32
 
 
@@ -168,7 +168,7 @@ def test_label_map_of_a_shape_is_1_where_its_voxels_are_at_least_half_inside(kin
     half_way_hu = 0  # between 1000 inside and -1000 outside
     # but for single voxels with curved surfaces
     assert (voxels[labels == 1] >= half_way_hu).mean() > 0.99
-    assert (voxels[labels == 0] <= half_way_hu).mean() > 0.99
+    assert (voxels[labels == 0] <= half_way_hu).mean() > 0.99  # measured 1.0
 
 
 def test_distance_at_the_centre_of_a_sphere_is_its_negative_radius() -> None:
@@ -257,5 +257,5 @@ def test_every_point_of_a_vertebra_has_one_of_the_cover_within_a_cell() -> None:
 
     apart = truth._bone._tree.query(vertebra.center + surface @ vertebra.axes)[0]
 
-    assert len(surface) > 500
+    assert len(surface) > 500  # measured 777 of 40,000 random points that lie near it
     assert apart.max() < cover._STEP_MM

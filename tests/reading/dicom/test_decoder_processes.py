@@ -83,7 +83,7 @@ def test_decoder_that_hangs_is_ended_in_time_and_the_next_frame_is_decoded():
         start = time.monotonic()
         with refused(DecoderError, limit_s):
             decode(pool, "hang")
-        assert time.monotonic() - start < 10
+        assert time.monotonic() - start < 10  # measured 1.5, the limit; more on a busy machine
         assert np.array_equal(decode(pool), PIXELS)
 
 

@@ -496,6 +496,6 @@ def test_3000_planes_are_found_again_in_linear_time_and_only_near_ones_joined():
         assert planes.find(tuple(np.add(plane, 1e-5).tolist())) == numbers[-1]  # rounded otherwise
     assert time.process_time() - started < tolerances.PLANES_S
     first_of = dict(reversed(list(zip(numbers, turned, strict=True))))
-    assert len(first_of) > 2900
+    assert len(first_of) > 2900  # few lie near one before them; measured 2993
     apart = max(np.linalg.norm(first_of[n] - axes, axis=1)[:2].max() for n, axes in zip(numbers, turned, strict=True))
     assert apart < SPLIT_ANGLE_RAD

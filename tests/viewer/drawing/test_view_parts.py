@@ -158,7 +158,7 @@ def test_hidden_part_is_neither_in_the_picture_nor_in_the_mesh(open_model_and_pa
         both = (picture.image[..., 3] > 0) != (mesh.image[..., 3] > 0)
         assert both.mean() < 0.004  # the edges of the silhouette
         seen = (picture.image[..., 3] > 0) & (mesh.image[..., 3] > 0)
-        assert np.abs(picture.depth[seen] - mesh.depth[seen]).mean() < 0.05
+        assert np.abs(picture.depth[seen] - mesh.depth[seen]).mean() < 0.05  # mm; measured 0.009 to 0.023
 
 
 def test_volume_rendering_leaves_hidden_parts_out_with_their_edges(open_model_and_painter):
@@ -170,8 +170,9 @@ def test_volume_rendering_leaves_hidden_parts_out_with_their_edges(open_model_an
     picture = painter.picture(model.state, SIZE)
     rows, columns = np.nonzero(picture.image[..., 3] > 8)
     spot = model.camera.project([scenes.middle(2)], SIZE)[0][0]
-    assert 0 < len(rows) < 0.3 * before
-    assert np.hypot(columns + 0.5 - spot[0], rows + 0.5 - spot[1]).max() * model.camera.pixel_mm(SIZE) < 6.5
+    assert 0 < len(rows) < 0.3 * before  # the smallest of three balls; measured 128 of 1394 pixels
+    away_mm = np.hypot(columns + 0.5 - spot[0], rows + 0.5 - spot[1]) * model.camera.pixel_mm(SIZE)
+    assert away_mm.max() < 6.5  # measured 6.4; with the ball beside it, 5.8 mm away and 5 mm in radius, 10.8
 
 
 @pytest.fixture
@@ -193,7 +194,7 @@ def test_part_of_a_scan_is_drawn_in_its_colour_and_opacity(first_part):
 
     assert red.image[pixel][0] > 60 and red.image[pixel][1] < 70  # of 255: red in the light
     assert plain.image[pixel][1] > 70
-    assert 90 < translucent.image[pixel][3] < 240
+    assert translucent.image[pixel][3] == pytest.approx(0.5 * 255, abs=1)
 
 
 def test_mesh_of_a_coloured_part_is_apart_from_the_rest_with_its_colour(first_part):
