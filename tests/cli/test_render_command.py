@@ -128,7 +128,7 @@ def test_several_views_are_written_to_files_named_after_them(render: Renders) ->
 
 def test_zoom_of_2_magnifies_the_block_about_four_times_in_area(render: Renders) -> None:
     small, large = (is_lit(render("--zoom", zoom)[0]).sum() for zoom in (0.5, 1.0))
-    assert 3.0 < large / small < 5.0
+    assert 3.0 < large / small < 5.0  # 2 * 2, with pixels at the rim: measured 174 / 41
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_background_colour_fills_the_corner_of_the_picture(
 def test_transparent_background_is_seen_through_beside_an_opaque_block(render: Renders) -> None:
     image, _ = render("--background", "transparent")
     assert image[0, 0, 3] == 0
-    assert image[..., 3].max() > 200
+    assert image[..., 3].max() > 200  # of 255; measured 254
 
 
 MIDDLE_OF_BLOCK_X, BESIDE_BLOCK_X = lps((24.5, 25, 17))[0], lps((21.5, -0.5, -0.5))[0]
@@ -182,7 +182,7 @@ def test_clip_box_and_clip_plane_leave_a_half_of_the_block_each(render: Renders)
 
     assert report["clip_planes_lps_mm"] == [[-1.0, 0.0, 0.0, pytest.approx(-MIDDLE_OF_BLOCK_X)]]
     of_box_mm2 = area_mm2(of_box, report)
-    assert 0.4 < of_box_mm2 / whole_mm2 < 0.65
+    assert 0.4 < of_box_mm2 / whole_mm2 < 0.65  # measured 0.47
     assert of_box_mm2 + of_plane_mm2 == pytest.approx(whole_mm2, rel=0.15)  # pixels of some 0.7 mm
 
 
@@ -214,7 +214,8 @@ def test_light_from_above_is_reported_with_its_direction_and_changes_the_picture
 
 def test_depth_cue_darkens_the_surface_and_brightens_nothing(render: Renders) -> None:
     plain, cued = (render("--iso", ISO, *extra)[0].astype(int) for extra in ([], ["--depth-cue", "0.6"]))
-    assert (cued <= plain).all() and cued[is_lit(plain)].mean() < 0.95 * plain[is_lit(plain)].mean()
+    assert (cued <= plain).all()
+    assert cued[is_lit(plain)].mean() < 0.95 * plain[is_lit(plain)].mean()  # measured 0.948; without a cue it is 1
 
 
 def test_shadows_darken_a_part_of_the_floor_and_brighten_nothing(
@@ -229,7 +230,8 @@ def test_shadows_darken_a_part_of_the_floor_and_brighten_nothing(
         for extra in ([], ["--shadows"])
     )
     assert (dark <= plain).all()
-    assert 20 < (dark < plain - 20).any(axis=-1).sum() < 0.3 * dark.shape[0] * dark.shape[1]
+    in_shadow = (dark < plain - 20).any(axis=-1)  # by up to 197 of 255
+    assert 20 < in_shadow.sum() < 0.3 * in_shadow.size  # measured 308 of 64 x 64 pixels
 
 
 def test_given_ray_step_is_reported(render: Renders) -> None:
@@ -319,7 +321,8 @@ def test_transfer_function_of_a_file_colours_the_picture(render: Renders) -> Non
     path.write_text(json.dumps(content))
     image, report = render("--transfer-function", path)
     assert (report["preset"], report["transfer_function"]["points"][1]) == (None, [200, 0, 1, 0, 1])
-    assert image[..., 1].max() > 240 and image[..., [0, 2]].max() == 0
+    assert image[..., 1].max() > 240  # green; measured 255
+    assert image[..., [0, 2]].max() == 0
 
 
 def test_chosen_slice_in_space_shows_the_block_at_its_place(render: Renders) -> None:
@@ -369,7 +372,7 @@ def test_label_of_opacity_0_darkens_pixels_that_it_lit(render: Renders, label_20
 def test_label_of_opacity_0_3_is_fainter_than_an_opaque_one(render: Renders, label_20: Path) -> None:
     surface = ("--iso", ISO, "--light", "none", "--labels", label_20, "--label-color", "20=blue")
     whole, faint = render(*surface)[0], render(*surface, "--label-opacity", "20=0.3")[0]
-    assert faint[is_lit(whole)][:, 2].mean() < 0.8 * whole[is_lit(whole)][:, 2].mean()
+    assert faint[is_lit(whole)][:, 2].mean() < 0.8 * whole[is_lit(whole)][:, 2].mean()  # measured 0.298
 
 
 @pytest.mark.seconds

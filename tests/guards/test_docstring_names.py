@@ -100,13 +100,13 @@ def public_docstrings() -> Iterator[tuple[str, str, type | None]]:
 
 def test_names_in_docstrings_of_public_names_can_be_linked_by_the_guide() -> None:
     unlinked = {name: find_unlinked(text, owner) for name, text, owner in public_docstrings()}
-    assert len(unlinked) > 200
+    assert len(unlinked) > 200  # measured 373: they are looked at
     assert {name: names for name, names in unlinked.items() if names} == {}
 
 
 def test_no_docstring_of_a_public_name_has_a_hanging_paragraph() -> None:
     docstrings = [(name, text) for name, text, _ in public_docstrings()]
-    assert len(docstrings) > 200
+    assert len(docstrings) > 200  # measured 373: they are looked at
     assert [name for name, text in docstrings if HANGING.search(text)] == []
 
 

@@ -53,7 +53,7 @@ def maps_of_zeros(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.parametrize("suffix", [".gz", ".nrrd"])
 def test_map_of_34_gb_in_33_mb_is_called_large(suffix: str, maps_of_zeros: dict[str, Path]) -> None:
-    assert maps_of_zeros[suffix].stat().st_size < 40e6
+    assert maps_of_zeros[suffix].stat().st_size < 34e6  # measured 33.4e6
     assert is_large_map(maps_of_zeros[suffix])
 
 

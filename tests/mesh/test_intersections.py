@@ -153,7 +153,7 @@ def test_random_triangles_have_as_many_pairs_as_edges_solved_for_faces():
     corners = rng.uniform(0, 10, (count, 1, 3)) + rng.normal(size=(count, 3, 3)) * sizes
     vertices = corners.reshape(-1, 3).astype(np.float32).astype(float)
     triangles = np.arange(3 * count).reshape(-1, 3)
-    assert count_pairs((vertices, triangles)) == count_by_solving(vertices, triangles) > 20
+    assert count_pairs((vertices, triangles)) == count_by_solving(vertices, triangles) > 20  # measured 141
 
 
 tiny_and_huge = pytest.mark.parametrize("scale", [2.0**-9, 2.0**9])
@@ -245,7 +245,8 @@ def test_as_many_pairs_touch_fold_and_overlap_as_in_exact_fractions(kind, seed):
     elif kind == "float64":
         places = 1e3 * places + 1.0 / 3.0
     triangles = np.array([random.choice(len(places), 3, replace=False) for _ in range(30)], np.uint32)
-    assert len(find_self_intersections(places, triangles)) == count_exactly(places, triangles) > 50
+    pairs = len(find_self_intersections(places, triangles))
+    assert pairs == count_exactly(places, triangles) > 50  # measured 53 (turned) to 281 (plane)
 
 
 @pytest.fixture

@@ -91,7 +91,7 @@ def test_a_screw_in_the_middle_of_a_pedicle_has_grade_a_without_a_breach(
 def test_a_screw_through_the_canal_has_grade_e(bone_and_frame: tuple[SolidBone, VertebraFrame]) -> None:
     grade = grade_screw(*bone_and_frame, place_screw(side=1.0, outward=-12.0, up=0.0, diameter=6.0), "L3")
     assert (grade.grade, grade.direction) == ("E", "medial")
-    assert grade.breach_mm > 6.0
+    assert grade.breach_mm > 6.0  # from here on a breach has grade E
 
 
 def test_a_tip_beyond_the_front_of_the_body_is_measured_and_changes_no_grade(

@@ -111,7 +111,7 @@ def test_each_disc_of_four_vertebrae_lies_half_way_between_two_true_centres(true
 def test_normals_of_discs_have_length_1_and_point_down() -> None:
     normals = split("T12-L3").disc_normals
     assert np.linalg.norm(normals, axis=1) == pytest.approx([1.0, 1.0, 1.0])
-    assert (normals[:, 2] < -0.8).all()
+    assert (normals[:, 2] < -0.8).all()  # the phantom stands upright: measured -0.99 and less
 
 
 def test_centres_of_vertebrae_lie_at_the_height_of_the_true_ones(true_centres: np.ndarray) -> None:
@@ -255,8 +255,8 @@ def test_a_disc_that_bone_fills_lowers_the_confidence_of_the_two_vertebrae_besid
         for result in (split("T12-L3"), second_disc_filled)
     )
     t12, l1, l2, l3 = before - after
-    assert min(l1, l2) > 0.03
-    assert max(abs(t12), abs(l3)) < 0.02
+    assert min(l1, l2) > 0.03  # measured 0.06
+    assert max(abs(t12), abs(l3)) < 0.02  # measured 0
 
 
 @pytest.mark.release
@@ -295,7 +295,7 @@ def test_two_vertebrae_whose_disc_is_missed_are_one_of_low_confidence_and_unusua
     assert any("usual beside it" in doubt for doubt in unsure.doubts)
     _, truth, _ = phantom("C3-T2")
     voxels_of_levels = np.bincount(truth[with_unsure.labels.voxels == unsure.number], minlength=8)[1:]
-    assert (voxels_of_levels > 0.3 * voxels_of_levels.max()).sum() == 2
+    assert (voxels_of_levels > 0.3 * voxels_of_levels.max()).sum() == 2  # measured 451 and 479; of others 8 at most
 
 
 @pytest.mark.release
@@ -370,7 +370,8 @@ def test_each_confident_vertebra_of_a_kyphotic_chest_holds_most_of_a_true_one() 
     for vertebra in confident:
         voxels_of_levels = np.bincount(truth[result.labels.voxels == vertebra.number], minlength=30)
         level = int(voxels_of_levels[1:].argmax()) + 1
-        assert voxels_of_levels[level] >= 0.8 * (truth == level).sum(), names.get(level)
+        of_true_voxels = voxels_of_levels[level] / (truth == level).sum()
+        assert of_true_voxels >= 0.8, names.get(level)  # measured 0.826, 0.897 and 0.976 on
 
 
 def test_a_single_vertebra_between_its_two_discs_is_found() -> None:
@@ -479,7 +480,7 @@ def test_vertebrae_of_sagittal_slices_have_the_voxels_of_those_of_axial_slices()
     sagittal = Volume(volume.voxels.transpose(1, 2, 0), volume.affine @ new_of_old_axes.T)
     labels = clrecon.split_vertebrae(sagittal, keep_unsure=True).labels.voxels.transpose(2, 0, 1)
     expected = split("T12-L3").labels.voxels
-    assert (labels == expected)[expected > 0].mean() > 0.97
+    assert (labels == expected)[expected > 0].mean() > 0.97  # measured 0.9995
 
 
 def test_each_vertebra_has_its_row_in_the_middle_plane_with_its_number_in_the_coronal_labels() -> None:
@@ -495,14 +496,14 @@ def test_the_canal_of_the_middle_plane_has_no_label_and_no_bone() -> None:
     plane = split("T12-L3").plane
     rows = [int(row) for row in plane.rows]
     assert plane.sagittal_labels[rows, plane.canal_column].tolist() == [0] * 4
-    assert (np.abs(plane.sagittal[rows, plane.canal_column]) < 130).all()
+    assert (np.abs(plane.sagittal[rows, plane.canal_column]) < 130).all()  # bone begins at 142 HU; measured 9 to 32
 
 
 def test_the_middle_plane_shows_scan_and_labels_of_one_size_and_a_line_for_each_disc() -> None:
     plane = split("T12-L3").plane
     assert plane.sagittal.shape == plane.sagittal_labels.shape
     assert len(plane.coronal) == len(plane.sagittal)
-    assert len(plane.lines) >= len(split("T12-L3").discs_mm) == 3
+    assert len(plane.lines) >= len(split("T12-L3").discs_mm) == 3  # discs; the ends of the spine have lines too
 
 
 @pytest.fixture(scope="module")
@@ -519,7 +520,7 @@ def test_a_given_level_is_used_and_above_the_chosen_one_leaves_less_bone(split_a
     at_260_hu, chosen = split_at_260_hu[0], split("T12-L3")
     given_ml, chosen_ml = (sum(part.volume_ml for part in result.vertebrae) for result in (at_260_hu, chosen))
     assert at_260_hu.level_hu == 260.0
-    assert 120.0 <= chosen.level_hu <= 226.0
+    assert 120.0 <= chosen.level_hu <= 226.0  # the limits that `split_vertebrae` documents
     assert given_ml < chosen_ml
 
 

@@ -87,7 +87,7 @@ def test_views_fit_scales_of_their_own_which_zoom_makes_one(
     settings = RenderSettings.of(mode, views=("anterior", "left", "superior"), size=SIZE, device=str(device.index))
     fitted = {made["view"]: made["pixel_mm"] for made in make_pictures(sphere[0], files, settings)["pictures"]}
     largest = max(fitted.values())
-    assert min(fitted.values()) < 0.95 * largest
+    assert min(fitted.values()) < 0.95 * largest  # measured 0.76: they differ
     for view, pixel_mm in fitted.items():
         alone = make_pictures(sphere[0], files, replace(settings, views=(view,), zoom=pixel_mm / largest))
         assert alone["pictures"][0]["pixel_mm"] == pytest.approx(largest, rel=1e-4)
@@ -487,7 +487,7 @@ def test_slices_in_space_are_seen_obliquely_by_default_without_a_warning(
     report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), settings)
 
     assert report["pictures"][0]["view"] == "30,30"
-    assert report["pictures"][0]["hit_share"] > 0.1
+    assert report["pictures"][0]["hit_share"] > 0.1  # measured 0.106; seen edge-on it is 0
     assert not any("edge-on" in text for text in report["warnings"])
 
 
@@ -565,7 +565,7 @@ def draw_minimum(device: Any, tmp_path_factory: Any) -> Any:
 def test_minimum_shows_tissue_and_leaves_out_the_air_about_it(has_region: bool, draw_minimum: Any) -> None:
     drawn = draw_minimum(has_region)
 
-    assert np.nanmin(drawn.values) > -300.0
+    assert np.nanmin(drawn.values) > -300.0  # tissue; measured 748 on, and air has -1000
     low, high = drawn.report["volume"]["hu_range"]
     assert low < -900.0  # of the scan, which is read whole
     assert high < 5000.0
@@ -585,5 +585,5 @@ def test_minimum_reports_and_warns_that_what_is_outside_of_a_region_is_left_out(
 def test_minimum_with_a_region_leaves_out_more_than_without(draw_minimum: Any) -> None:
     whole, region = draw_minimum(False), draw_minimum(True)
 
-    assert 0.5 < whole.left_out["share"] < region.left_out["share"] < 1.0
+    assert 0.5 < whole.left_out["share"] < region.left_out["share"] < 1.0  # measured 0.958 and 0.961
     assert np.isfinite(region.values).sum() > 20  # pixels that show the region

@@ -180,7 +180,7 @@ def test_a_device_with_too_little_memory_is_refused_with_its_bytes(device, monke
 
 
 def test_a_device_with_small_buffers_makes_a_picture_in_slabs(device, monkeypatch):
-    monkeypatch.setattr(device, "max_allocation_bytes", 7000)
+    monkeypatch.setattr(device, "max_allocation_bytes", 7000)  # the volume has 7,680
     assert clrecon.render(random_body(), size=(8, 8), device=device).report["slabs"] > 1
 
 

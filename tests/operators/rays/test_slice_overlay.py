@@ -144,7 +144,7 @@ def test_depth_of_opaque_slices_is_that_of_the_front_one(stair):
 
 def test_slices_take_the_colours_of_a_transfer_function(device):
     volume = make_volume(lambda p: np.full(len(p), 150.0), "even", 8.0, np.int16)
-    function = TransferFunction([(0, 1, 0, 0, 0), (300, 0, 1, 0, 0)])
+    function = TransferFunction([(0, 1, 0, 0, 0), (300, 0, 1, 0, 0)])  # red at 0 HU, green at 300 HU
     found = overlay_slices(
         DeviceVolume(volume, device=device),
         look(volume, (0.0, 0.1, -1.0), 2.0),
@@ -153,7 +153,7 @@ def test_slices_take_the_colours_of_a_transfer_function(device):
         opacity=1.0,
         transfer_function=function,
     )
-    assert np.abs(found.image[..., :3].astype(int) - (128, 128, 0)).max() <= 1
+    assert np.abs(found.image[..., :3].astype(int) - (128, 128, 0)).max() <= 1  # 150 HU are half way: 127.5 of 255
 
 
 @pytest.fixture
@@ -168,7 +168,7 @@ def ten_slices():
 def test_slices_that_do_not_fit_together_give_the_same_picture(device, ten_slices):
     volume, camera, size, slices, picture_bytes, slice_bytes = ten_slices
     memory = picture_bytes + 3 * slice_bytes
-    assert memory < 10 * slice_bytes
+    assert memory < len(slices) * slice_bytes
     whole = overlay_slices(DeviceVolume(volume, device=device), camera, size, slices=slices)
     parts = overlay_slices(DeviceVolume(volume, device=device, memory=memory), camera, size, slices=slices)
     assert np.array_equal(whole.image, parts.image)

@@ -93,7 +93,7 @@ def test_peers_lie_where_the_scan_is_and_face_outward(name: str, affine: Any, de
     quality = peer.quality()
     assert quality.closed and quality.outward
     assert quality.volume_ml == pytest.approx(own.quality().volume_ml, rel=2e-4)
-    assert clrecon.compare_meshes(peer, own).hd95_mm < 0.05
+    assert clrecon.compare_meshes(peer, own).hd95_mm < 0.05  # measured 0.0014
     assert peer.report["cells"] == {"visited": 33 * 31 * 29, "all": 33 * 31 * 29}
 
 
@@ -173,14 +173,15 @@ def judge(tmp_path: Path, device: Any) -> Judge:
 def test_reference_is_measured_as_equal_to_itself(judge: Judge) -> None:
     reference = judge.measure("t-mc")
     assert (reference["reasons"], reference["truth"], reference["points"]) == ({}, None, None)
-    assert reference["cells"]["dice"] == 1.0 and reference["surfaces"]["max_mm"] < 1e-4
+    assert reference["cells"]["dice"] == 1.0
+    assert reference["surfaces"]["max_mm"] < 1e-4  # rounding of distances in float64: measured 2e-12
     assert reference["slices"]["dice"] > 0.98 and reference["slices"]["voxel_dice"] == 1.0
 
 
 def test_half_of_a_mesh_is_measured_as_open_and_incomplete(judge: Judge) -> None:
     half = judge.measure("vtk-mc")
     assert half["slices"] is None and "open" in half["reasons"]["slices"] and not half["quality"]["closed"]
-    assert half["cells"]["recall"] < 0.7 < 0.9 < half["cells"]["precision"]
+    assert half["cells"]["recall"] < 0.7 < 0.9 < half["cells"]["precision"]  # measured 0.5 and 1
 
 
 def test_cloud_is_measured_by_its_distance_from_the_reference(judge: Judge) -> None:

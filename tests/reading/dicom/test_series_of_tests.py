@@ -19,4 +19,4 @@ def test_files_of_remembered_bytes_are_those_that_pydicom_writes(syntax: str, pl
         save_dataset(make_dataset(plan, k), tmp_path / "remembered.dcm")
         make_dataset(plan, k).save_as(tmp_path / "written.dcm", enforce_file_format=True)
         assert (tmp_path / "remembered.dcm").read_bytes() == (tmp_path / "written.dcm").read_bytes()
-    assert len(REMEMBERED) > 20
+    assert len(REMEMBERED) > 20  # heads and elements; measured 51 after the first plan

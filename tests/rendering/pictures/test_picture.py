@@ -102,7 +102,7 @@ def test_transparent_picture_is_refused_by_jpeg(tmp_path):
 def test_transparent_picture_on_a_background_is_saved_as_jpeg(tmp_path):
     make_picture(background=CLEAR).with_background("white").save(tmp_path / "a.jpg")
     with Image.open(tmp_path / "a.jpg") as read:
-        assert min(read.getpixel((0, 0))) >= 250
+        assert min(read.getpixel((0, 0))) >= 250  # white has 255, and JPEG may lose a little
 
 
 def test_background_is_mixed_into_a_picture_by_its_opacity():
@@ -246,4 +246,4 @@ def test_picture_is_described_in_one_short_line_with_size_and_mode():
     assert "40 x 30" in described
     assert "dvr" in described
     assert "\n" not in described
-    assert len(described) < 400
+    assert len(described) <= 80  # columns of a terminal

@@ -9,6 +9,7 @@ from open_views import open_sessions
 from refusals import refused
 
 from clrecon.errors import UsageError
+from clrecon.geometry import AIR_HU
 from clrecon.mesh.mesh_reader import read_mesh
 from clrecon.points.cloud_reader import read_points
 from clrecon.reading import read_volume
@@ -35,7 +36,7 @@ def test_shown_meshes_are_saved_to_each_mesh_format(session, tmp_path, name):
     assert view.wait(PATIENCE)
     facts = view.facts()
     assert facts["error"] is None and f"{name}: 2 meshes" in facts["said"]
-    assert (tmp_path / name).stat().st_size > 1000
+    assert (tmp_path / name).stat().st_size > 1000  # measured 41,003 bytes (.html) to 223,581 (.obj)
     if name.endswith((".stl", ".ply")):
         shown = view.painter.mesh_of_shown(view.model.state)
         assert read_mesh(tmp_path / name).triangle_count == sum(each.triangle_count for each in shown)
@@ -80,11 +81,11 @@ def test_scan_is_saved_without_hidden_parts_and_cropped_to_the_clip_box(session,
     view.do({"do": "save", "path": str(tmp_path / "a.nii.gz")})
     assert view.wait(PATIENCE) and view.facts()["error"] is None
     saved = read_volume(tmp_path / "a.nii.gz")
-    assert saved.voxels.size < 0.9 * scenes.make_scan().voxels.size
+    assert saved.voxels.size < 0.9 * scenes.make_scan().voxels.size  # measured 0.795
     values = [saved.voxels[tuple(np.rint(saved.lps_to_ijk([scenes.middle(n)])[0]).astype(int)[::-1])] for n in range(3)]
     in_first, in_hidden, in_third = values
-    assert in_first == 1000 and in_third > 500
-    assert in_hidden < -800
+    assert in_first == in_third == 1000  # the HU of all balls
+    assert in_hidden == AIR_HU  # in place of the ball
 
 
 @pytest.mark.opencl

@@ -132,7 +132,7 @@ def test_each_command_is_done_and_what_it_changes_is_undone(open_session):
             view.do({"do": name, **arguments})
             settle(view)
         assert view.facts()["error"] is None
-    assert view.model.version > 20
+    assert view.model.version > 20  # it grows with each change; measured 146
 
 
 @pytest.mark.opencl
@@ -515,7 +515,7 @@ def test_slice_that_was_zoomed_is_fitted_again_by_a_command(open_session):
 def test_slice_of_a_thin_stack_is_zoomed_about_the_pointer_beside_it(open_session, factor):
     view = open_session(Volume(np.zeros((3, 60, 60), np.int16), np.diag([3.0, 3.0, 5.0, 1.0])))
     before = place_in_slice(view, 64.0, 32.0)
-    assert before[2] > 12.5
+    assert before[2] > 2.5 * 5.0  # beside the stack, whose third slice of 5 mm ends there
     view.do({"do": "zoom_slice", "plane": "coronal", "factor": factor, "about": [0.2, -0.1], **AT})
     assert place_in_slice(view, 64.0, 32.0) == pytest.approx(before, abs=2e-3)
 
