@@ -142,7 +142,7 @@ def test_circle_of_two_clicks_on_a_slice_is_listed_with_its_mean_and_a_closed_li
         "return document.querySelector('#axial polyline.line').getAttribute('points').split(' ')"
     )
     assert line[0] == line[-1]
-    assert len(set(line)) > 20
+    assert len(set(line)) > 20  # the outline has 48 places, of which several may be one pixel
 
 
 def test_box_that_is_drawn_follows_the_mouse_from_its_first_corner(page_with_two_places) -> None:
