@@ -70,14 +70,14 @@ def test_rule_of_another_form_is_refused(text: str, words: str) -> None:
         parse_region_rules(text)
 
 
-def test_steps_of_one_text_are_read_in_their_order() -> None:
+def test_preprocessing_steps_of_one_text_are_read_in_their_order() -> None:
     steps = parse_preprocess("bilateral, Open:1.5,level:250,fill,bilateral-2d:0.7:36,region,fill-slices")
     assert [str(step) for step in steps] == [
         "bilateral", "open:1.5", "level:250", "fill", "bilateral-2d:0.7:36", "region", "fill-slices",
     ]  # fmt: skip
 
 
-def test_steps_of_several_texts_are_read_with_their_numbers() -> None:
+def test_preprocessing_steps_of_several_texts_are_read_with_their_numbers() -> None:
     erode, dilate = parse_preprocess(["erode:1", "dilate:2"])
     assert erode == PreprocessStep("erode", (1.0,))
     assert dilate == PreprocessStep("dilate", (2.0,))

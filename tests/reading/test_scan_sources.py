@@ -252,7 +252,7 @@ def test_object_whose_name_leads_out_of_the_folder_is_refused(name: str, bucket:
 
 
 def test_bucket_that_refuses_the_credentials_is_wrong_usage_without_quoting_its_answer(bucket: BucketServer) -> None:
-    bucket.is_closed = True
+    bucket.is_closed = True  # answers 403, and quotes the key AKIASECRET
 
     with refused(UsageError, "s3://scans/p") as caught:
         read_volume("s3://scans/p/")

@@ -502,6 +502,7 @@ def test_the_canal_of_the_middle_plane_has_no_label_and_no_bone() -> None:
 def test_the_middle_plane_shows_scan_and_labels_of_one_size_and_a_line_for_each_disc() -> None:
     plane = split("T12-L3").plane
     assert plane.sagittal.shape == plane.sagittal_labels.shape
+    assert plane.coronal.shape == plane.coronal_labels.shape
     assert len(plane.coronal) == len(plane.sagittal)
     assert len(plane.lines) >= len(split("T12-L3").discs_mm) == 3  # discs; the ends of the spine have lines too
 

@@ -90,20 +90,20 @@ def without_address(text: str) -> str:
 
 
 @pytest.mark.parametrize("call", CALLS)
-def test_object_has_the_fields_of_the_standard_one_in_their_order(call: str) -> None:
+def test_light_dataclass_has_the_fields_of_a_standard_one_in_their_order(call: str) -> None:
     ours, theirs = make_both(call)
     assert list(vars(ours).items()) == list(vars(theirs).items())
     assert dataclasses.asdict(ours) == dataclasses.asdict(theirs)
 
 
 @pytest.mark.parametrize("call", CALLS)
-def test_object_has_the_repr_of_the_standard_one(call: str) -> None:
+def test_light_dataclass_has_the_repr_of_a_standard_one(call: str) -> None:
     ours, theirs = make_both(call)
     assert without_address(repr(ours)) == without_address(repr(theirs))
 
 
 @pytest.mark.parametrize("call", CALLS)
-def test_objects_of_the_same_call_are_equal_exactly_where_standard_ones_are(call: str) -> None:
+def test_light_dataclasses_of_one_call_are_equal_exactly_where_standard_ones_are(call: str) -> None:
     ours, theirs = make_both(call)
     ours_again, theirs_again = make_both(call)
     assert (ours == ours_again) == (theirs == theirs_again)

@@ -240,7 +240,7 @@ def test_faint_bone_has_both_dense_walls_and_a_spread_of_them(wall_hu, looks_lik
     assert judge_walls(walls)["looks_like"] == looks_like
 
 
-def test_figures_of_walls_have_one_digit_and_shares_four():
+def test_hu_of_walls_is_rounded_to_one_decimal_and_shares_to_four():
     wall_hu = np.array([100.0, 200.06, 700.0])  # percentiles between them: 90 % at 600.01, 99 % at 690.0
     judged = judge_walls(Walls(np.zeros((3, 3)), wall_hu, np.array([True, False, False])))
     assert judged["wall_hu"] == {"median": 200.1, "p90": 600.0, "p99": 690.0}

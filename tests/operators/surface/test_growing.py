@@ -348,6 +348,7 @@ def test_growing_needs_bits_and_numbers_of_the_cells_of_each_row() -> None:
 
 
 def test_growing_without_room_for_the_bits_of_the_volume_is_refused(device: Any) -> None:
+    # Slabs of the volume fit; what growing needs of all its 66 x 42 rows of cells is 205,128 bytes.
     with refused(DeviceError, 150_000, "surface"):
         extract_isosurface(smooth_volume((40, 64, 64)), 300, device=device, grow_from="auto", memory=150_000)
 

@@ -385,7 +385,8 @@ def test_computed_frames_are_warned_of(tmp_path):
         frame_type.FrameType = ["DERIVED", "PRIMARY", "VOLUME", "SUBTRACTION"]
         frame_type.VolumeBasedCalculationTechnique = "MAX_IP"
 
-    write_enhanced(tmp_path / "mf", change=spoil, shared=())
+    write_enhanced(tmp_path / "mf", change=spoil, shared=())  # each frame has groups of its own
+    # The second frame lies 1.25 mm above the first, at -400.
     assert read_volume(tmp_path).report["warnings"] == [
         "computed frames (MAX_IP, SUBTRACTION): maybe not measured HU (1 of 7 slices, at -398.75 mm)"
     ]
