@@ -7,7 +7,6 @@ for a certificate that is made for it.
 
 from __future__ import annotations
 
-import logging
 import queue
 import re
 import socket
@@ -161,6 +160,8 @@ def open_cluster(
     warn: Gets what the user should know, such as that there are no workers to wait for.
     """
     distributed = import_package("distributed", name_parameter("scheduler", address))
+    import logging
+
     import dask.config
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is an error here, or a result
@@ -187,6 +188,8 @@ def _connect(distributed: Any, address: str) -> AbstractContextManager[Any]:
 def _start_workers(distributed: Any, devices: Sequence[str | None]) -> AbstractContextManager[Any]:
     """Start a scheduler that only this user's processes reach, and a worker for each device."""
     import_package("cryptography", name_parameter("scheduler", LOCAL))
+    import logging
+
     security = distributed.Security.temporary()
     workers = {}
     for number in range(len(devices)):

@@ -391,7 +391,8 @@ def test_mesh_is_measured_where_its_figures_are_reported_or_printed(
 
     monkeypatch.setattr("clrecon.jobs.mesh.job.make_mesh", make_mesh)
     monkeypatch.setattr(mesh_command, "mesh_fields", lambda options: {})
-    options = {"input": "a", "output": "b.stl", "report": None, "json": False, "verbose": False, "no_clobber": False}
+    paths = {"input": "a", "output": "b.stl", "report": None, "store": None}
+    options = {**paths, "json": False, "verbose": False, "no_clobber": False}
     with refused(UsageError, "enough"):
         mesh_command.run(argparse.Namespace(**options | given), Console())
 

@@ -69,6 +69,7 @@ WRONG: dict[type[Style], Wrong] = {
         **LABELLED,
         "transfer_function": [("bones", "unknown rendering preset 'bones'"), ([(0, 1, 1, 1, 1)], "not list")],
         "jitter": [("no", "jitter is True or False, not 'no'"), (1, "jitter")],
+        "smooth_light": [(-1.0, "a length in mm from 0 to 20, not -1"), (21.0, "smoothing"), (np.nan, "smoothing")],
     },
     Projection: {
         **RAYS,
