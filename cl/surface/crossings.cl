@@ -3,14 +3,13 @@
  * Reference: Moeller 1997, "A fast triangle-triangle intersection test"; the bound of rounding is that of Shewchuk 1997,
  * "Adaptive precision floating-point arithmetic and fast robust geometric predicates", orient3d, doubled.
  *
- * A triangle belongs to the level whose cells are 1.4 to 2.8 times as wide as its box, and to the cell
- * that holds the lowest corner of its box.  The cells of a row lie side by side, and so do their entries.  A box that
- * overlaps the box of an item at low, high therefore begins in the cells from low - reach to high, where the reach is the
- * longest side of the level's boxes:
+ * A triangle belongs to the level whose rows are as wide as its box, or up to twice as wide, and to the row (y, z) that
+ * holds the lowest corner of its box.  The entries of a row are sorted by that corner's x.  A box that overlaps the box
+ * of an item at low, high therefore begins in the rows from low - edge to high, between low.x - edge and high.x:
  *
  *     z   +-------+-------+
- *         |   +---|---+   |     the item looks at the cells that its box, longer by the reach towards the lower end,
- *         +---|---+---|---+     touches: one run of entries in each row along x
+ *         |   +---|---+   |     rows of one edge; the item looks at those that its box, longer by an edge towards
+ *         +---|---+---|---+     the lower end, touches
  *         |   +---|---+   |
  *         +-------+-------+  y
  *
@@ -25,7 +24,7 @@
 
 /* Share of a volume's sum of absolute terms that its rounding does not reach. */
 #define ROUNDING 0x1p-20f
-/* What boxes and cells are taken longer by, in edges: more than the rounding of coordinates in float32. */
+/* What boxes and rows are taken longer by, in edges: more than the rounding of coordinates in float32. */
 #define SLACK 1e-3f
 
 
@@ -48,9 +47,9 @@ static inline int side_of(const plane *flat, const float3 point)
     return (int)(volume > bound) - (int)(volume < -bound);
 }
 
-/* Planes of LANES triangles at once, with the sum of all absolute terms of the normal, and points. */
+/* Planes of LANES triangles at once, and points. */
 typedef struct { floats x, y, z; } points;
-typedef struct { points corner, normal; floats terms; } planes;
+typedef struct { points corner, normal, terms; } planes;
 
 static inline points spread(const float3 p)
 {
@@ -68,26 +67,25 @@ static inline planes planes_of(const points a, const points b, const points c)
 {
     const points p = away(b, a), q = away(c, a);
     const floats yz = p.y * q.z, zy = p.z * q.y, zx = p.z * q.x, xz = p.x * q.z, xy = p.x * q.y, yx = p.y * q.x;
-    const planes found = {a, {yz - zy, zx - xz, xy - yx},
-        (fabs(yz) + fabs(zy)) + (fabs(zx) + fabs(xz)) + (fabs(xy) + fabs(yx))};
+    const planes found = {
+        a, {yz - zy, zx - xz, xy - yx}, {fabs(yz) + fabs(zy), fabs(zx) + fabs(xz), fabs(xy) + fabs(yx)}};
     return found;
 }
 
-/* As side_of(), with a bound of the rounding that holds for all points near by. */
-static inline ints sides_of(const planes *flat, const points point, const floats bound)
+/* As side_of(). */
+static inline ints sides_of(const planes *flat, const points point)
 {
     const points r = away(point, flat->corner);
     const floats volume = flat->normal.x * r.x + flat->normal.y * r.y + flat->normal.z * r.z;
+    const floats bound
+        = ROUNDING * (flat->terms.x * fabs(r.x) + flat->terms.y * fabs(r.y) + flat->terms.z * fabs(r.z));
     return choose(volume > bound, (ints)(1), (ints)(0)) - choose(volume < -bound, (ints)(1), (ints)(0));
 }
 
-/* True where the corners a, b and c surely lie on one side, but for those that are common: float32 cannot tell of these.
- * None is farther from the plane's corner than `farthest` along an axis. */
-static inline ints lie_apart(
-    const planes *flat, const points a, const points b, const points c, const ints common, const float farthest)
+/* True where the corners a, b and c surely lie on one side, but for those that are common: float32 cannot tell of these. */
+static inline ints lie_apart(const planes *flat, const points a, const points b, const points c, const ints common)
 {
-    const floats bound = ROUNDING * farthest * flat->terms;
-    const ints sum = sides_of(flat, a, bound) + sides_of(flat, b, bound) + sides_of(flat, c, bound);
+    const ints sum = sides_of(flat, a) + sides_of(flat, b) + sides_of(flat, c);
     return (common + sum == 3) | (common - sum == 3);
 }
 
@@ -202,39 +200,36 @@ static inline int may_cut(const triangle one, const triangle two)
  * plane. */
 static inline ints not_apart(
     __global const float *places, __global const uint *names, const uint stride, const uint place,
-    const ints counts, const triangle *own, const plane *flat, const float3 begin, const float3 end, const float farthest)
+    const ints counts, const triangle *own, const plane *flat, const float3 begin, const float3 end)
 {
-    const size_t row = stride;
-    __global const float *low = places + 9 * row + place, *high = places + 12 * row + place;
-    ints left = counts & (load_lanes(low) <= end.x) & (load_lanes(high) >= begin.x);
-    left &= (load_lanes(low + row) <= end.y) & (load_lanes(high + row) >= begin.y);
-    left &= (load_lanes(low + 2 * row) <= end.z) & (load_lanes(high + 2 * row) >= begin.z);
+    floats at[9];
+    for (int n = 0; n < 9; ++n)
+        at[n] = load_lanes(places + (size_t)n * stride + place);
+    const points d = {at[0], at[1], at[2]}, e = {at[3], at[4], at[5]}, f = {at[6], at[7], at[8]};
+    ints left = counts & (greater(greater(d.x, e.x), f.x) >= begin.x) & (lesser(lesser(d.x, e.x), f.x) <= end.x);
+    left &= (greater(greater(d.y, e.y), f.y) >= begin.y) & (lesser(lesser(d.y, e.y), f.y) <= end.y);
+    left &= (greater(greater(d.z, e.z), f.z) >= begin.z) & (lesser(lesser(d.z, e.z), f.z) <= end.z);
     if (!ANY_LANE(left))
         return left;
     ints common = (ints)(0);
     for (int n = 0; n < 3; ++n) {
-        const ints name = load_lanes((__global const int *)names + n * row + place);
+        const ints name = load_lanes((__global const int *)names + (size_t)n * stride + place);
         common += choose(
             (name == (int)own->names.x) | (name == (int)own->names.y) | (name == (int)own->names.z), (ints)(1), (ints)(0));
     }
-    floats at[9];
-    for (int n = 0; n < 9; ++n)
-        at[n] = load_lanes(places + n * row + place);
-    const points d = {at[0], at[1], at[2]}, e = {at[3], at[4], at[5]}, f = {at[6], at[7], at[8]};
-    const floats terms = (floats)(flat->terms.x + flat->terms.y + flat->terms.z);
-    const planes here = {spread(flat->corner), spread(flat->normal), terms};
-    left &= (common != 3) & (lie_apart(&here, d, e, f, common, farthest) == 0);
+    const planes here = {spread(flat->corner), spread(flat->normal), spread(flat->terms)};
+    left &= (common != 3) & (lie_apart(&here, d, e, f, common) == 0);
     if (!ANY_LANE(left))
         return left;
     const planes there = planes_of(d, e, f);
-    return left & (lie_apart(&there, spread(own->a), spread(own->b), spread(own->c), common, farthest) == 0);
+    return left & (lie_apart(&there, spread(own->a), spread(own->b), spread(own->c), common) == 0);
 }
 
 /* Parameters  vertices   in   (vertices, 3) coordinates, of which the largest has a magnitude of 1024 to 2048
  *             triangles  in   (count, 3) their corners
  *             order      in   (count,) triangle of each entry
- *             places     out  (15, stride) coordinates of the corners of each entry, x y z of the first, of the second, of
- *                             the third; of its box x y z of the lowest and of the highest corner
+ *             places     out  (10, stride) coordinates of the corners of each entry, x y z of the first, of the second, of
+ *                             the third; the lowest x
  *             names      out  (3, stride) corners of each entry
  * Launch      global = stride rounded up by the host, any local
  * Guarantees  entries from count on lie at infinity */
@@ -245,7 +240,7 @@ __kernel void enter_triangles(
     const uint entry = get_global_id(0);
     if (entry >= stride)
         return;
-    float3 low = INFINITY, high = -INFINITY;
+    float low = INFINITY;
     for (uint corner = 0; corner < 3; ++corner) {
         const uint name = entry < count ? triangles[3 * (size_t)order[entry] + corner] : 0;
         const float3 at = entry < count ? vload3(name, vertices) : (float3)(INFINITY);
@@ -254,66 +249,69 @@ __kernel void enter_triangles(
         row[0] = at.x;
         row[stride] = at.y;
         row[2 * (size_t)stride] = at.z;
-        low = fmin(low, at);
-        high = fmax(high, at);
+        low = fmin(low, at.x);
     }
-    __global float *box = places + 9 * (size_t)stride + entry;
-    box[0] = low.x;
-    box[stride] = low.y;
-    box[2 * (size_t)stride] = low.z;
-    box[3 * (size_t)stride] = high.x;
-    box[4 * (size_t)stride] = high.y;
-    box[5 * (size_t)stride] = high.z;
+    places[9 * (size_t)stride + entry] = low;
 }
 
-/* Parameters  places names  in   (15, stride), (3, stride) see enter_triangles
- *             starts    in   (cells + 1,) first entry of each cell; those of a level side by side, (z * ny + y) * nx + x
- *             levels    in   (levels, 5) first cell, cells along x, y and z, and the end of the entries of each level
- *             edges     in   (levels, 2) width of the cells, ascending, and longest side of the boxes
- *             origin_x origin_y origin_z   lowest corner of all boxes
+/* Parameters  places names  in   (10, stride), (3, stride) see enter_triangles
+ *             starts    in   (rows + 1,) first entry of each row; those of a level side by side, z * ny + y
+ *             levels    in   (levels, 4) first row, rows along y, rows along z, and the end of the entries of each level
+ *             edges     in   (levels, 2) width of the rows, ascending, and longest side of the boxes
+ *             origin_y origin_z   lowest corner of all boxes
  *             marks     in and out  (n + 31 / 32,) bits of entries
  *             first items   the entries of this launch;  level_count: levels;  stride: at least n + LANES
  * Launch      global = items rounded up by the host, any local
- * Assumes     entries in the order of level and cell; at most 4096 cells along an axis
+ * Assumes     entries in the order of level, row and low x; at most 4096 rows along an axis
  * Guarantees  a bit is set for both triangles of each pair that cuts each other; bits are only added.
  *             Races: marks by atomic_or() alone */
 __kernel void mark_crossings(
     __global const float *restrict places, __global const uint *restrict names, __global const uint *restrict starts,
     __global const uint *restrict levels, __global const float *restrict edges, __global uint *restrict marks,
-    const float origin_x, const float origin_y, const float origin_z, const uint first, const uint items,
-    const uint level_count, const uint stride)
+    const float origin_y, const float origin_z, const uint first, const uint items, const uint level_count,
+    const uint stride)
 {
     if (get_global_id(0) >= items)
         return;
     const uint entry = first + get_global_id(0);
+    __global const float *low_x = places + 9 * (size_t)stride;
     const triangle own = triangle_at(places, names, stride, entry);
     const float3 begin = fmin(fmin(own.a, own.b), own.c), end = fmax(fmax(own.a, own.b), own.c);
-    const float3 origin = (float3)(origin_x, origin_y, origin_z);
     const plane flat = plane_of(own.a, own.b, own.c);
     uint own_level = 0;
-    while (entry >= levels[5 * own_level + 4])
+    while (entry >= levels[4 * own_level + 3])
         ++own_level;
     for (uint level = own_level > 0 ? own_level - 1 : 0; level < level_count; ++level) {
         if (level == own_level + 1)
             continue; /* its triangles look here */
-        const uint first_cell = levels[5 * level], nx = levels[5 * level + 1];
-        const int3 last = convert_int3((uint3)(nx, levels[5 * level + 2], levels[5 * level + 3])) - 1;
+        const uint first_row = levels[4 * level];
+        const int ny = (int)levels[4 * level + 1], nz = (int)levels[4 * level + 2];
         const float per_edge = 1.0f / edges[2 * level], reach = (1.0f + SLACK) * edges[2 * level + 1];
-        const float3 back = (float3)(reach, reach, level == own_level ? 0.0f : reach); /* below are entries before its own */
-        const int3 from = max(convert_int3(floor((begin - back - origin) * per_edge - SLACK)), 0);
-        const int3 to = min(convert_int3(floor((end - origin) * per_edge + SLACK)), last);
-        const float3 sides = end - begin;
-        const float farthest = fmax(fmax(sides.x, sides.y), sides.z) + reach;
-        for (int z = from.z; z <= to.z; ++z)
-            for (int y = from.y; y <= to.y; ++y) {
-                const uint row = first_cell + ((uint)z * (uint)(last.y + 1) + (uint)y) * nx;
-                const uint beyond = starts[row + (uint)to.x + 1u];
-                uint place = starts[row + (uint)from.x];
+        const float from_y = (begin.y - reach - origin_y) * per_edge;
+        const float from_z = (begin.z - (level == own_level ? 0.0f : reach) - origin_z) * per_edge;
+        const int y0 = max((int)floor(from_y - SLACK), 0);
+        const int y1 = min((int)floor((end.y - origin_y) * per_edge + SLACK), ny - 1);
+        const int z0 = max((int)floor(from_z - SLACK), 0);
+        const int z1 = min((int)floor((end.z - origin_z) * per_edge + SLACK), nz - 1);
+        const float least_x = begin.x - reach;
+        for (int z = z0; z <= z1; ++z)
+            for (int y = y0; y <= y1; ++y) {
+                const uint row = first_row + (uint)z * (uint)ny + (uint)y;
+                uint place = starts[row];
+                const uint row_end = starts[row + 1];
                 if (level == own_level)
                     place = max(place, entry + 1u);
-                for (; place < beyond; place += LANES) {
-                    const ints counts = LANE_NUMBERS < (float)(beyond - place);
-                    const ints left = not_apart(places, names, stride, place, counts, &own, &flat, begin, end, farthest);
+                uint beyond = row_end;
+                while (place < beyond) { /* the first entry that begins at least_x or later */
+                    const uint middle = place + (beyond - place) / 2u;
+                    if (low_x[middle] < least_x)
+                        place = middle + 1u;
+                    else
+                        beyond = middle;
+                }
+                for (; place < row_end && low_x[place] <= end.x; place += LANES) {
+                    const ints counts = LANE_NUMBERS < (float)(row_end - place);
+                    const ints left = not_apart(places, names, stride, place, counts, &own, &flat, begin, end);
                     if (!ANY_LANE(left))
                         continue;
                     int lanes[LANES];

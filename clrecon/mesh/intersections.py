@@ -18,7 +18,7 @@ _CELLS_A_TRIANGLE = 8
 """Largest mean number of cells for a triangle; cells are enlarged until it holds."""
 
 _PIECE = 1 << 16
-"""Pairs of triangles in one cell that are examined together; 16 times those that a thread tests exactly."""
+"""Pairs of triangles in one cell that are examined together."""
 
 _FEW = 0.05
 """Share of changed triangles up to which it is faster to search only around them."""
@@ -101,7 +101,7 @@ def _leave_cut(
         rows = rows[_cut_pairs(left, right, (left[:, None] == right).all(axis=3)) & _has_area(left) & _has_area(right)]
         cut[span.start + rows] = True
 
-    in_threads(test_pairs, len(pairs), _PIECE // 16)
+    in_threads(test_pairs, len(pairs), _PIECE)
     return pairs[cut]
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon import opencl as ocl
 from clrecon.mesh import Mesh
-from clrecon.mesh.connectivity import number_used, order_by_number
+from clrecon.mesh.connectivity import number_used
 from clrecon.mesh.intersections import find_boxes, find_self_intersections
 from clrecon.mesh.refine import decimation
 from clrecon.opencl import Device
@@ -22,14 +22,14 @@ from clrecon.system.progress import Progress, Steps
 _FEWEST = 20_000
 """Meshes with fewer triangles are looked at by the host alone, in less time than the device needs to begin."""
 
-_MOST_CELLS = 1 << 22
-"""Cells of the finest level; its edge is made longer until there are no more."""
+_MOST_ROWS = 1 << 22
+"""Rows of the finest level; its edge is made longer until there are no more."""
 
 _FINEST = 0.97
-"""Share of the triangles in the finest level; a half takes longer, as each level is searched."""
+"""Share of the triangles in the finest level; a half takes 1.2 to 1.5 times as long, as each level is searched."""
 
-_CELL_BOXES = 1.4
-"""Width of the cells in boxes as long as `_FINEST` has them; three take a tenth longer."""
+_ROW_BOXES = 2.0
+"""Width of the rows in boxes as long as `_FINEST` has them; one or three take a tenth longer."""
 
 _MOST_LANES = 8
 """Entries that the kernel looks at together."""
@@ -42,12 +42,12 @@ Float32Array = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class CrossingPlan:
-    """Triangles in the cells of levels, as the kernel reads them.
+    """Triangles in the rows of levels, as the kernel reads them.
 
     vertices: ndarray, shape (v, 3), float32. Scaled by a power of two, which changes no digit.
     triangles, order: ndarray, shapes (n, 3) and (n,), uint32. Of the order: the triangle of each entry.
-    starts: ndarray, uint32. First entry of each cell, and the number of entries.
-    levels, edges: ndarray, shape (levels, 5) uint32, (levels,) float32
+    starts: ndarray, uint32. First entry of each row, and the number of entries.
+    levels, edges: ndarray, shape (levels, 4) uint32, (levels,) float32
     """
 
     vertices: Float32Array
@@ -64,37 +64,38 @@ class CrossingPlan:
 
     def needs(self) -> dict[str, int]:
         given = self.vertices.nbytes + self.triangles.nbytes + self.order.nbytes
-        return {"triangles in cells": given + 72 * self.stride + self.starts.nbytes, "marks": len(self.order) // 8}
+        return {"triangles in rows": given + 52 * self.stride + self.starts.nbytes, "marks": len(self.order) // 8}
 
 
 def plan_crossings(
-    vertices: Float32Array, triangles: NDArray[np.uint32], *, most_cells: int = _MOST_CELLS
+    vertices: Float32Array, triangles: NDArray[np.uint32], *, most_rows: int = _MOST_ROWS
 ) -> CrossingPlan:
-    """Enter at least one triangle into cells."""
+    """Enter at least one triangle into rows."""
     scaled = np.ldexp(vertices, 11 - int(np.frexp(np.abs(vertices).max())[1]))
     low, high = (np.ascontiguousarray(corner.T) for corner in find_boxes(scaled, triangles))
     high -= low
     longest = np.maximum(np.maximum(high[0], high[1]), high[2])
     origin, beyond = low.min(axis=1).astype(np.float64), low.max(axis=1).astype(np.float64)
     some = longest[:: max(1, len(longest) // 10_000)].astype(np.float64)
-    finest = max(1.0 / _CELL_BOXES, float(np.quantile(some, _FINEST)))
-    while np.prod(np.floor((beyond - origin) / (_CELL_BOXES * finest)) + 1.0) > most_cells:
-        finest *= 1.25
+    edge = max(1.0, _ROW_BOXES * float(np.quantile(some, _FINEST)))
+    while np.prod(np.floor((beyond - origin)[1:] / edge) + 1.0) > most_rows:
+        edge *= 1.25
     level = np.zeros(len(longest), np.int8)
-    coarse = np.flatnonzero(longest > finest)
-    level[coarse] = np.ceil(np.log2(longest[coarse].astype(np.float64) / finest))
-    edges = (_CELL_BOXES * finest * 2.0 ** np.arange(int(level.max()) + 1)).astype(np.float32)
-    size = (np.floor((beyond - origin) / edges[:, None].astype(np.float64)) + 1.0).astype(np.int64)  # x, y, z
-    first_cell = np.concatenate([[0], np.cumsum(size.prod(axis=1))])
-    cell, longest_of = np.empty(len(longest), np.int64), np.zeros(len(edges))
+    coarse = np.flatnonzero(longest > edge)
+    level[coarse] = np.ceil(np.log2(longest[coarse].astype(np.float64) / edge))
+    edges = (edge * 2.0 ** np.arange(int(level.max()) + 1)).astype(np.float32)
+    size = (np.floor((beyond - origin)[1:] / edges[:, None].astype(np.float64)) + 1.0).astype(np.int64)  # y, z
+    first_row = np.concatenate([[0], np.cumsum(size.prod(axis=1))])
+    row, longest_of = np.empty(len(longest), np.int64), np.zeros(len(edges))
     for number, width in enumerate(edges.astype(np.float64)):
         rows = np.flatnonzero(level == number) if number else slice(None)  # coarse ones are entered anew
-        x, y, z = (((column[rows] - start) / width).astype(np.int64) for column, start in zip(low, origin, strict=True))
-        cell[rows] = first_cell[number] + x + size[number, 0] * (y + size[number, 1] * z)
+        y, z = (((low[axis, rows] - origin[axis]) / width).astype(np.int64) for axis in (1, 2))
+        row[rows] = first_row[number] + y + size[number, 0] * z
         longest_of[number] = longest[level == number].max(initial=0.0)
-    order = order_by_number(cell, int(first_cell[-1]))
-    starts = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=first_cell[-1]))]).astype(np.uint32)
-    levels = np.column_stack([first_cell[:-1], size, starts[first_cell[1:]]]).astype(np.uint32)
+    bits = low[0].view(np.int32)
+    order = np.argsort(row << 32 | np.where(bits < 0, ~bits, bits ^ np.int32(-(2**31))).view(np.uint32))
+    starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=first_row[-1]))]).astype(np.uint32)
+    levels = np.column_stack([first_row[:-1], size, starts[first_row[1:]]]).astype(np.uint32)
     table = np.column_stack([edges, longest_of]).astype(np.float32)
     return CrossingPlan(scaled, triangles, order.astype(np.uint32), origin.astype(np.float32), starts, levels, table)
 
@@ -105,7 +106,7 @@ def mark_crossings(
     """Mark the triangles that may cut another one, shape (n,), in the order of the mesh."""
     count = len(plan.order)
     program = ocl.load_program(device, "surface/crossings.cl", {"LANES": device.kernel_variants["LANES"]})
-    places_d, names_d = (ocl.allocate(device, 4 * rows * plan.stride) for rows in (15, 3))
+    places_d, names_d = (ocl.allocate(device, 4 * rows * plan.stride) for rows in (10, 3))
     ocl.launch(
         device, program["enter_triangles"], plan.stride, vertices=ocl.upload(device, plan.vertices),
         triangles=ocl.upload(device, plan.triangles), order=ocl.upload(device, plan.order), places=places_d,
@@ -117,8 +118,8 @@ def mark_crossings(
         items = min(piece, count - first)
         ocl.launch(
             device, program["mark_crossings"], items, places=places_d, names=names_d, starts=starts_d, levels=levels_d,
-            edges=edges_d, marks=marks_d, origin_x=plan.origin[0], origin_y=plan.origin[1], origin_z=plan.origin[2],
-            first=first, items=items, level_count=len(plan.edges), stride=plan.stride,
+            edges=edges_d, marks=marks_d, origin_y=plan.origin[1], origin_z=plan.origin[2], first=first, items=items,
+            level_count=len(plan.edges), stride=plan.stride,
         )  # fmt: skip
         if steps is not None:
             ocl.wait(device)
