@@ -189,7 +189,7 @@ def test_iso_values_for_scaling_go_from_few_triangles_in_bone_to_most_in_tissue(
     levels = scaling.choose_levels(ramp_in_tissue, points=5, most=1e9)
     counts = scaling.estimate_triangles(ramp_in_tissue, levels)
     assert len(levels) == 5
-    assert levels[0] > 500
+    assert levels[0] > 500  # in the upper half of the ramp from 50 to 950 HU; 663 was measured
     assert abs(levels[-1] - TISSUE_HU) < NOISE_HU / 2
     assert counts == sorted(counts)
 
@@ -308,8 +308,8 @@ def test_scaling_is_measured_from_a_part_to_the_whole_volume_with_lines_over_vox
 ) -> None:
     scaled = surface_results["scaling"]
     sizes = [size["voxels"] for size in scaled["sizes"]]
-    assert len(sizes) >= 5
-    assert sizes[0] < sizes[-1] == 32**3
+    assert len(sizes) == scaling.POINTS
+    assert (sizes[0], sizes[-1]) == (32**3 // 4, 32**3)  # fewer than 128 slices: from a quarter of them
     assert set(scaled["fits"]) == {"voxels", "triangles"}
 
 

@@ -15,6 +15,7 @@ from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.operators.rays.render import render
 from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.viewer.drawing.painter import Painter
+from clrecon.viewer.drawing.stage import COARSE_TRIANGLES
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import show_objects
 from clrecon.viewer.model.state import Pick
@@ -39,7 +40,7 @@ def test_each_mode_is_drawn_sharp_and_coarse(open_model_and_painter):
         model.set_mode(mode)
         sharp = painter.picture(model.state, SIZE)
         coarse = painter.picture(model.state, SIZE, sharp=False, share=0.5)
-        assert sharp.size == SIZE and shown_pixels(sharp) > 100, mode
+        assert sharp.size == SIZE and shown_pixels(sharp) > 100, mode  # of 7,680; the fewest, of slices, were 1,147
         assert sharp.report["sharp"] and sharp.report["ms"] > 0.0
         assert coarse.size == (77, 64) and not coarse.report["sharp"], mode  # the shorter side has 64 pixels at least
         assert shown_pixels(coarse) > 50
@@ -82,16 +83,16 @@ def test_large_picture_in_two_strips_is_that_in_one_piece(in_strips_and_whole):
     assert (apart > 3).mean() < 0.002  # of pixels, at edges: other rays in float32
     both = ~np.isnan(in_strips.depth) & ~np.isnan(whole.depth)
     assert both.any()
-    assert np.median(np.abs(in_strips.depth[both] - whole.depth[both])) < 1e-3
+    assert np.median(np.abs(in_strips.depth[both] - whole.depth[both])) < 1e-3  # mm; 0 was measured
 
 
 @pytest.mark.parametrize("in_strips_and_whole", ["bone"], indirect=True)
-def test_large_volume_rendering_in_two_strips_differs_by_the_random_places_of_its_samples(in_strips_and_whole):
+def test_large_volume_rendering_in_two_strips_is_nearly_that_in_one_piece(in_strips_and_whole):
     in_strips, whole = in_strips_and_whole
 
     assert in_strips.report["strips"] == 2
     apart = np.abs(in_strips.image.astype(int) - whole.image.astype(int)).max(axis=2)
-    assert (apart > 3).mean() < 0.3
+    assert (apart > 3).mean() < 0.3  # of pixels, where random places of samples differ; none was measured
     both = ~np.isnan(in_strips.depth) & ~np.isnan(whole.depth)
     assert both.any()
     assert np.median(np.abs(in_strips.depth[both] - whole.depth[both])) < 0.3  # mm: a step of the rays
@@ -158,7 +159,7 @@ def test_picked_points_lie_on_the_surface_at_the_depth_of_their_pixels(open_mode
         picked.append(pick.point)
 
     away_mm = SurfaceDistance(mesh.vertices, mesh.triangles)(np.array(picked))
-    assert np.median(away_mm) <= 0.02
+    assert np.median(away_mm) <= 0.02  # 0.005 was measured
     assert away_mm.max() <= 0.3  # between triangles the field is bent
 
 
@@ -270,7 +271,7 @@ def test_whole_scan_is_translucent_before_its_parts_are_known(open_model_and_pai
     model, painter = open_model_and_painter()
     model.set_opacity("1", 0.4)
     image = painter.picture(model.state, SIZE).image
-    assert 0 < image[..., 3][image[..., 3] > 0].min() < 200
+    assert 0 < image[..., 3][image[..., 3] > 0].min() < 200  # a surface alone has 0.4 * 255 = 102
 
 
 def test_clip_through_a_ball_leaves_a_closed_half_of_it_in_mesh_and_picture(open_model_and_painter, device):
@@ -298,7 +299,7 @@ def test_oblique_clip_of_a_mesh_cuts_its_triangles_at_the_plane(open_model_and_p
     (mesh,) = painter.mesh_of_shown(model.state)
     (*normal, offset) = model.state.clip.planes[0]
     heights = mesh.vertices @ normal - offset
-    assert heights.min() == pytest.approx(0.0, abs=1e-4) and mesh.triangle_count > 100
+    assert heights.min() == pytest.approx(0.0, abs=1e-4) and mesh.triangle_count > 100  # 1,264 of 2,208
     assert mesh.area == pytest.approx(0.5 * scenes.make_mesh().area, rel=0.02)
 
 
@@ -307,7 +308,7 @@ def test_large_mesh_is_drawn_with_fewer_triangles_while_it_moves(open_model_and_
     full = painter.picture(model.state, SIZE)
     painter.make_coarse()
     coarse = painter.picture(model.state, SIZE, sharp=False)
-    assert 100_000 < coarse.report["triangles"] <= 200_000 < full.report["triangles"]
+    assert COARSE_TRIANGLES / 2 < coarse.report["triangles"] <= COARSE_TRIANGLES < full.report["triangles"]
     assert np.array_equal(painter.picture(model.state, SIZE).image, full.image)
     assert shown_pixels(coarse) == pytest.approx(shown_pixels(full), rel=0.2)
 
@@ -410,7 +411,8 @@ def test_preparation_of_a_painter_builds_kernels_and_finds_parts(device):
     told = []
     with Painter(objects, device=device) as painter:
         painter.prepare(lambda stage, done, total: told.append(stage))
-    assert told.count("build") >= 14 and "parts" in told
+    assert told.count("build") == 2 * 8  # pictures and surfaces of int16 and float32
+    assert "parts" in told
 
 
 @pytest.mark.unit
@@ -419,6 +421,6 @@ def test_coarse_mesh_has_few_triangles_near_the_fine_ones_and_their_area():
 
     fine = scenes.make_mesh(radius=20.0)
     coarse, first = coarsen_mesh(fine, 500)
-    assert np.linalg.norm(coarse.vertices - fine.vertices[first], axis=1).max() < 8.0
-    assert 200 < coarse.triangle_count < 1200
+    assert np.linalg.norm(coarse.vertices - fine.vertices[first], axis=1).max() < 8.0  # mm; cells of 4.5 mm
+    assert 200 < coarse.triangle_count < 1200  # of 500 that are asked for; 564 were measured
     assert coarse.area == pytest.approx(fine.area, rel=0.1) and coarse.normals is not None
