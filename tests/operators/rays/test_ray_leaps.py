@@ -159,7 +159,7 @@ def test_leaps_along_free_ways_hide_no_voxel_from_anywhere(device, monkeypatch):
         if (whole.image[..., 3] > 0).any():
             shown += 1
             assert_same(take_picture(volume, device, camera, **settings), whole)
-    assert shown > 100
+    assert shown > 100  # of 205 scenes; measured 139
 
 
 @pytest.mark.oclgrind

@@ -228,7 +228,8 @@ def test_vertices_inside_cells_lie_on_the_surface_in_the_cell(cell_vertices, wit
         assert ((points >= margin) & (points <= 1 - margin)).all()
         for point, gradient in zip(points, gradients, strict=True):
             slope = slope_at(heights.astype(np.float64), point)
-            assert gradient @ slope / (np.linalg.norm(gradient) * np.linalg.norm(slope)) > 0.99
+            cosine = gradient @ slope / (np.linalg.norm(gradient) * np.linalg.norm(slope))
+            assert cosine > 0.99  # one direction, up to rounding: measured 1 - 2e-16
             near.append(abs(field_at(heights.astype(np.float64), point)) / np.linalg.norm(slope) < bound)
     assert np.mean(near) >= within
 
