@@ -9,6 +9,9 @@ import pytest
 from clrecon.cli import console
 from clrecon.cli.main import COMMANDS, main
 
+COLUMNS = 60
+"""Width of the terminal of these tests."""
+
 
 class Terminal:
     def isatty(self) -> bool:
@@ -17,7 +20,7 @@ class Terminal:
 
 @pytest.fixture
 def narrow(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setenv("COLUMNS", str(COLUMNS))
     monkeypatch.setenv("TERM", "xterm")
 
 
@@ -27,7 +30,7 @@ LONG_LINE = "surface  200 HU (as given), closed at the border of the volume, and
 def test_long_line_is_broken_between_words_and_goes_on_under_its_text(narrow):
     first, second = console.fit(LONG_LINE, Terminal()).split("\n")
 
-    assert max(len(first), len(second)) <= 60
+    assert max(len(first), len(second)) <= COLUMNS
     assert first.startswith("surface  ")
     under_the_text = " " * len("surface  ")
     assert second.startswith(under_the_text) and not second.startswith(under_the_text + " ")
@@ -62,7 +65,7 @@ def test_help_fits_60_columns_and_its_examples_can_be_pasted(command, narrow, ca
     assert main([command, "--help-all"]) == 0
     lines = capsys.readouterr().out.split("\n")
     # what is longer is one word with its indentation, or in brackets that argparse keeps whole
-    assert not [line for line in lines if len(line) > 60 and len(line.split()) > 1]
+    assert not [line for line in lines if len(line) > COLUMNS and len(line.split()) > 1]
     for line, following in zip(lines, lines[1:], strict=False):
         if line.endswith(" \\"):
             assert following.startswith("    ")
@@ -79,9 +82,9 @@ def test_paragraph_of_help_is_broken_anew_as_a_whole_in_a_narrow_terminal(narrow
 
     start = next(place for place, line in enumerate(lines) if line.startswith("The page of --html is one file"))
     paragraph = lines[start : lines.index("", start)]
-    assert len(paragraph) > 3
+    assert len(paragraph) > 3  # enough lines to see how they are filled: measured 6
     assert all(line[0] != " " for line in paragraph)
-    assert is_filled(paragraph, 60)
+    assert is_filled(paragraph, COLUMNS)
 
 
 def test_exit_codes_of_help_go_on_under_their_text_in_a_narrow_terminal(narrow, capsys):
@@ -92,7 +95,7 @@ def test_exit_codes_of_help_go_on_under_their_text_in_a_narrow_terminal(narrow, 
     codes = [line for line in lines[start:] if line]
     assert len(codes) > 1
     assert all(line.startswith(" " * len("exit codes: ")) for line in codes[1:])
-    assert is_filled(codes, 60)
+    assert is_filled(codes, COLUMNS)
 
 
 @pytest.mark.parametrize(

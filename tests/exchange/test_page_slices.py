@@ -49,7 +49,7 @@ def test_scan_that_is_too_large_is_averaged_until_it_fits_its_thin_axes_first() 
     packed = pack_slices(volume, WINDOWS, most)
 
     ci, cj, ck = packed.facts["averaged"]
-    assert 4 * len(packed.data) / 3 <= most
+    assert 4 * len(packed.data) / 3 <= most  # base64 writes 4 letters for 3 bytes
     assert (ci, cj) != (1, 1)
     assert ck == 1
     block = volume.voxels[3, 2 * cj : 3 * cj, 4 * ci : 5 * ci]

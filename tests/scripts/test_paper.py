@@ -19,7 +19,7 @@ CITED = set(re.findall(r"@(\w+)", BODY))
 
 
 def test_paper_has_the_length_that_joss_asks_for() -> None:
-    assert 750 <= len(BODY.split()) <= 1750
+    assert 750 <= len(BODY.split()) <= 1750  # words
 
 
 def test_references_of_the_paper_are_those_that_it_cites() -> None:

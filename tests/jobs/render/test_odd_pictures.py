@@ -90,8 +90,9 @@ def test_preset_of_soft_tissue_draws_all_voxels_above_its_level(drawn: DrawnBody
 
 @pytest.mark.parametrize("preset", DENSE)
 def test_preset_of_dense_material_draws_the_voxels_of_the_body_above_its_level(drawn: DrawnBody, preset: str) -> None:
-    if drawn.name == "water":  # a shell of 150 HU and noise
+    if drawn.name == "water":  # a shell of 120 HU and noise
         few = np.isfinite(drawn.pictures[preset].depth).sum()
+        # Of 1,600 pixels: measured 150 with the preset for vessels, from 120 HU on, and 15 with that for bone.
         assert few < 0.1 * np.isfinite(drawn.pictures["skin"].depth).sum()
         return
     alike = RAILS_ALIKE if drawn.name == "empty" else ALIKE
@@ -108,7 +109,8 @@ def test_values_of_mip_and_minip_reach_the_highest_and_lie_above_the_lowest_hu(d
 
 
 def test_largest_value_of_an_x_ray_is_the_water_along_its_ray(drawn: DrawnBody) -> None:
-    # A ray of d mm through voxels of mean HU m meets d (m + 1000) / 1000 mm of water; pixels miss thin peaks.
+    # A ray of d mm through voxels of mean HU m meets d (m + 1000) / 1000 mm of water; pixels miss thin peaks:
+    # measured 0.73 of it with loose bones, from 0.94 on with all others, and never more than it.
     density = (drawn.volume.voxels.astype(float) + 1000.0) / 1000.0
     most_mm = (density.sum(axis=1) * drawn.volume.spacing[1]).max()
 

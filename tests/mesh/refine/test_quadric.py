@@ -92,7 +92,7 @@ def test_edges_that_a_collapse_opens_are_counted_and_fail_their_gate_with_a_warn
 
 def test_a_collapse_that_keeps_all_components_stays_near_the_surface(sphere_and_three_specks):
     small = collapse_quadric(sphere_and_three_specks, 0.7)
-    assert small.report["refinement"]["quadric"]["farthest_mm"] < 0.1
+    assert small.report["refinement"]["quadric"]["farthest_mm"] < 0.1  # measured 0.03; a speck lost is 30 mm away
 
 
 @pytest.fixture

@@ -35,6 +35,7 @@ def test_normals_without_orientation_are_the_principal_axes_of_the_twin(device, 
     away = degrees_between(normals_found, axes)
     assert np.median(away) < TWIN_AXIS_DEGREES
     gap_of_smaller_eigenvalues = (eigenvalues[:, 1] - eigenvalues[:, 0]) / eigenvalues[:, 2]
+    # where the two are nearly equal, any axis in their plane is right
     assert away[gap_of_smaller_eigenvalues > 1e-3].max() < TWIN_AXIS_NEAR_DOUBLE_DEGREES
     assert np.allclose(np.linalg.norm(normals_found, axis=1), 1.0, atol=1e-6)  # float32
 
@@ -146,7 +147,7 @@ def test_slabs_have_the_same_gradients(device):
     )  # fmt: skip
 
     assert np.array_equal(parts, whole)
-    assert len(told) > 4
+    assert len(told) >= 7  # 40 slices, 6 at a time: of 9, one below and two above are neighbours
     assert told[-1] == ("gradients", 40, 40)
 
 

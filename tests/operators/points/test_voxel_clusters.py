@@ -82,7 +82,7 @@ def test_clusters_of_flat_volumes_equal_the_twin(device, shape):
 def test_clusters_of_uneven_and_oblique_stacks_equal_the_twin(device, stack, eps):
     voxels = random_voxels((6, 20, 33), 0.35)
     volume = uneven(voxels) if stack == "uneven" else Volume(voxels, OBLIQUE)
-    assert count_clusters(device, volume, eps, samples=3) > 0
+    assert count_clusters(device, volume, eps, samples=3) > 0  # some: measured 123 to 2, fewer with a larger eps
 
 
 def test_clusters_of_a_stencil_beyond_several_words_equal_the_twin(device):
@@ -161,7 +161,7 @@ def test_clusters_of_a_small_volume_equal_the_twin(device):
 def test_clusters_are_found_in_a_small_cloud_in_reversed_order(device):
     cloud = voxel_cloud(Volume(random_voxels((3, 4, 40), 0.4), FINE))
     reversed_cloud = cloud.select(np.arange(len(cloud))[::-1])
-    assert cluster_points(reversed_cloud, 1.0, 4, device=device).facts["clusters"] > 0
+    assert cluster_points(reversed_cloud, 1.0, 4, device=device).facts["clusters"] == 1  # so dense that all join
 
 
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)

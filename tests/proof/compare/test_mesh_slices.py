@@ -33,9 +33,10 @@ def placed(mesh: samples.Arrays, on: Volume) -> Mesh:
 def test_lattice_points_inside_a_box_are_counted_as_by_its_bounds(affine, finer):
     on = block(affine)
     offsets = (0.137, 0.271, 0.389)
-    found = measure_slices(placed(samples.box((2.6,) * 3, (5.8,) * 3), on), on, 50.0, finer=finer, offsets=offsets)
-    places = [(np.arange(-99, 99) + offset) / finer for offset in offsets]
-    assert found.points_mesh == np.prod([((2.6 < place) & (place < 8.4)).sum() for place in places])
+    low, side = 2.6, 5.8  # voxels
+    found = measure_slices(placed(samples.box((low,) * 3, (side,) * 3), on), on, 50.0, finer=finer, offsets=offsets)
+    places = [(np.arange(-99, 99) + offset) / finer for offset in offsets]  # from before the box to behind it
+    assert found.points_mesh == np.prod([((low < place) & (place < low + side)).sum() for place in places])
     assert found.rows_odd == 0
     assert found.voxel_dice == 1.0
     assert found.dice == 2.0 * found.points_common / (found.points_mesh + found.points_hu)

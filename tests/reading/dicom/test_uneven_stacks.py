@@ -82,6 +82,7 @@ def test_uneven_series_is_listed_without_a_problem_and_with_the_warning(tmp_path
 
 
 SIDEWAYS_MM = 3.0
+FIRST_SIDEWAYS = 4
 
 
 @pytest.fixture
@@ -89,7 +90,7 @@ def jump_sideways(tmp_path):
     """The plan of 7 slices, of which those from the fifth on were written 3 mm to the left, and their folder."""
 
     def change(ds, k):
-        if k >= 4:
+        if k >= FIRST_SIDEWAYS:
             x, y, z = map(float, ds.ImagePositionPatient)
             ds.ImagePositionPatient = [x + SIDEWAYS_MM, y, z]
 
@@ -101,7 +102,8 @@ def test_slices_that_jump_sideways_lie_at_their_own_positions(jump_sideways):
     volume = read_volume(folder)
     assert volume.uneven
     for k in range(7):
-        assert volume.ijk_to_lps([(0, 0, k)])[0] == pytest.approx(plan.position(k) + (SIDEWAYS_MM * (k >= 4), 0, 0))
+        sideways_mm = SIDEWAYS_MM if k >= FIRST_SIDEWAYS else 0.0
+        assert volume.ijk_to_lps([(0, 0, k)])[0] == pytest.approx(plan.position(k) + (sideways_mm, 0.0, 0.0))
 
 
 def test_slices_that_jump_sideways_are_warned_of_and_not_taken_for_a_tilt(jump_sideways):
@@ -176,7 +178,7 @@ def test_fitted_places_are_nearer_to_the_even_ones_than_noisy_positions_are(nois
     even = Plan(shape=(40, 3, 3))
     fitted = volume.ijk_to_lps([(0, 0, k) for k in range(40)])
     off_even = np.abs(fitted - [even.position(k) for k in range(40)])
-    assert off_even.max() < 0.5 * max(map(abs, offsets.values()))
+    assert off_even.max() < 0.5 * max(map(abs, offsets.values()))  # a fit averages: measured 0.0024 of 0.0077 mm
 
 
 FINE_THEN_COARSE = {k: 1.25 * (k - 10) for k in range(11, 40)}

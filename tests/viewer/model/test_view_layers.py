@@ -120,7 +120,7 @@ def test_mode_slices_turns_a_camera_that_sees_them_edge_on():
 
     normal = np.cross(*model.scans[0].volume.affine[:3, :2].T)
     cosine = model.camera.basis().forward @ normal / np.linalg.norm(normal)
-    assert abs(cosine) >= 0.25
+    assert abs(cosine) >= 0.25  # a quarter of their height is seen, the least of `clrecon.render`
     assert model.facts()["notes"] == []
 
 
