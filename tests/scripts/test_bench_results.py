@@ -205,7 +205,7 @@ def test_scaling_is_plotted_with_as_many_points_and_lines_of_clrecon_and_the_pee
     folder = write_results(tmp_path / "a", make_result(), make_scaling_result())
     bench.main(["plot", str(folder), "-o", str(tmp_path / "r.png")])
     blue, red = count_colours(tmp_path / "r-scaling-spine149-pocl-3.1-debian.png")
-    assert min(blue, red) > 500
+    assert min(blue, red) > 500  # pixels: measured 2,348 and 2,552
     assert 0.7 < blue / red < 1.4  # points of one colour cover some of the other
 
 

