@@ -26,13 +26,17 @@ SMALLER = {
 """What the machine of a test has not, or what takes long, and what stands for it."""
 
 
+BONE_HU = 226
+"""Label T12 of the examples is all voxels of the phantom from this value on, and their mesh is at it."""
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """A series, and a label map and a cloud with the names that the example asks for."""
     folder = tmp_path_factory.mktemp("examples")
     write_phantom(folder / "ct", PhantomSettings(size=(64, 64), slices=48, spacing=(3.0, 3.0, 3.0)))
     volume = clrecon.read_volume(folder / "ct")
-    bone = (volume.voxels >= 226).astype(np.uint8)
+    bone = (volume.voxels >= BONE_HU).astype(np.uint8)
     header = {"Segment0_LabelValue": "1", "Segment0_Layer": "0", "Segment0_Name": "T12", "Segment0_ID": "a"}
     write_nrrd(folder / "segmentation.seg.nrrd", bone, volume.affine, **header)
     clrecon.PointCloud(np.random.default_rng(1).normal(size=(500, 3))).save(folder / "scan.ply", "ras")
@@ -126,7 +130,7 @@ def of_python_page(folder, scan) -> dict[str, Any]:
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     blocks = re.findall(r"((?:^    .*\n)+)", text, re.MULTILINE)
     variables: dict[str, Any] = {"clrecon": clrecon, "numpy": np, "threading": threading, "volume": scan}
-    variables |= {"mesh": clrecon.extract_isosurface(scan, 226), "second_volume": scan[3:20, 5:]}
+    variables |= {"mesh": clrecon.extract_isosurface(scan, BONE_HU), "second_volume": scan[3:20, 5:]}
     variables |= {name: pytest.importorskip(name) for name in ("SimpleITK", "nibabel")}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -161,7 +165,7 @@ def test_surface_of_the_page_on_python_is_closed(of_python_page):
 
 
 def test_mean_of_the_bone_of_the_page_on_python_is_above_its_iso_value(of_python_page):
-    assert of_python_page["mean_hu"] >= 226
+    assert of_python_page["mean_hu"] >= BONE_HU
 
 
 def test_region_between_two_heights_of_the_page_on_python_has_its_slices(of_python_page):

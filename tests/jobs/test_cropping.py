@@ -25,7 +25,6 @@ AFFINE = np.diag((0.8, 0.8, 1.0, 1.0))
 AFFINE[:3, 3] = (-16.0, 30.0, 100.0)
 SHAPE = (40, 40, 40)
 CENTRE_MM, RADIUS_MM = np.array([0.0, 46.0, 120.0]), 12.0
-"""A ball, LPS."""
 """A ball, LPS mm."""
 
 
@@ -124,9 +123,10 @@ def test_mesh_of_a_label_ends_within_a_slice_below_the_crop(
 ) -> None:
     words = ["--labels", label_map, "--surface", surface, "-q"]
 
-    assert run("mesh", scan, "-o", tmp_path / "b.stl", *words, "--between", "120,") == 0
+    assert run("mesh", scan, "-o", tmp_path / "b.stl", *words, *UPPER_HALF) == 0
 
-    assert 119.0 <= read_mesh(tmp_path / "b.stl").vertices[:, 2].min() < 120.0
+    crop_mm, slice_mm = CENTRE_MM[2], 1.0
+    assert crop_mm - slice_mm <= read_mesh(tmp_path / "b.stl").vertices[:, 2].min() < crop_mm
 
 
 @pytest.mark.parametrize("surface", ["hu", "mask"])
@@ -143,12 +143,14 @@ def test_cloud_of_a_crop_has_the_points_within_it(scan: Path, tmp_path: Path) ->
     assert run(*words) == 0
     whole = read_points(tmp_path / "c.npz").points
 
-    assert run(*words, "--around", "0,46,132,8") == 0
+    top_of_the_ball, half_side_mm = CENTRE_MM + (0.0, 0.0, RADIUS_MM), 8.0
+    around = ",".join(f"{value:g}" for value in (*top_of_the_ball, half_side_mm))
+    assert run(*words, "--around", around) == 0
 
     part = read_points(tmp_path / "c.npz").points
     assert 0 < len(part) < len(whole)
-    half_side_mm, voxel_mm = 8.0, 1.0
-    assert (np.abs(part - (0, 46, 132)) <= half_side_mm + voxel_mm).all()
+    voxel_mm = 1.0  # its longest side: a point lies on an edge that begins within the crop
+    assert (np.abs(part - top_of_the_ball) <= half_side_mm + voxel_mm).all()
 
 
 def test_picture_of_a_crop_shows_it_larger_and_is_cut_at_its_six_sides(scan: Path, tmp_path: Path) -> None:

@@ -62,9 +62,10 @@ def test_every_triangle_of_an_octahedron_is_crossed(crossings):
 
 
 def test_points_in_a_cavity_are_not_filled():
-    (outer, outer_faces), (inner, inner_faces) = octahedron(6.3, 7.0), octahedron(3.3, 7.0)
+    outer_radius, inner_radius, middle = 6.3, 3.3, 7.0
+    (outer, outer_faces), (inner, inner_faces) = octahedron(outer_radius, middle), octahedron(inner_radius, middle)
     triangles = np.concatenate([outer_faces, inner_faces[:, ::-1] + len(outer)]).astype(np.uint32)
     shape = (15, 15, 15)
     inside = fill_surface(np.concatenate([outer, inner]), triangles, shape)
-    distance = octahedral_distance(shape, 7.0)
-    assert np.array_equal(inside, (distance < 6.3) & (distance > 3.3))
+    distance = octahedral_distance(shape, middle)
+    assert np.array_equal(inside, (distance < outer_radius) & (distance > inner_radius))

@@ -155,14 +155,15 @@ def test_numbered_files_of_an_earlier_run_are_left_with_a_warning_of_their_numbe
 
 @pytest.mark.usefixtures("boxes")
 def test_limits_and_split_are_applied_to_each_iso_value(device: Any, tmp_path: Path) -> None:
-    assert BOX_ML["large"] > 0.1 > BOX_ML["middle"]
+    limit_ml = 0.1
+    assert BOX_ML["large"] > limit_ml > BOX_ML["middle"]
 
-    report = mesh_boxes(tmp_path, device, iso_value=(200.0, 500.0), split=True, keep_largest=2, min_volume_ml=0.1)
+    report = mesh_boxes(tmp_path, device, iso_value=(200.0, 500.0), split=True, keep_largest=2, min_volume_ml=limit_ml)
 
     assert [mesh["name"] for mesh in report["meshes"]] == ["200hu_001", "500hu_001"]
     assert [mesh["components_found"] for mesh in report["meshes"]] == [3, 2]
     assert (report["components_found"], report["components_kept"], report["components"]) == (5, 2, 2)
-    assert (report["keep_largest"], report["min_volume_ml"], report["split"]) == (2, 0.1, True)
+    assert (report["keep_largest"], report["min_volume_ml"], report["split"]) == (2, limit_ml, True)
 
 
 @pytest.mark.usefixtures("boxes")

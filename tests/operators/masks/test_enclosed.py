@@ -455,8 +455,9 @@ def test_voxels_of_float32_are_filled_as_those_of_int16(device, shell_of_int16):
 
 
 def test_voxels_of_uint8_are_filled_with_a_value_they_can_hold(device):
-    volume = Volume(np.rint(SHELL_HU / 4).astype(np.uint8), np.eye(4))
-    assert 100 < clrecon.fill_enclosed(volume, 100, device=device).report["solid"]["filled_hu"] <= 255
+    volume, level = Volume(np.rint(SHELL_HU / 4).astype(np.uint8), np.eye(4)), 100
+    filled_hu = clrecon.fill_enclosed(volume, level, device=device).report["solid"]["filled_hu"]
+    assert level < filled_hu <= np.iinfo(np.uint8).max
 
 
 def test_a_resident_volume_is_filled_as_one_of_the_host(device, shell_of_int16):
@@ -514,8 +515,8 @@ def test_solid_surfaces_below_a_level_or_of_a_band_are_refused(device, level, op
     ("bone", "level", "filled"), [(800, 400, 800.0), (400, 400, 401.0)], ids=["mean", "at the level"]
 )
 def test_spaces_are_filled_with_the_mean_of_the_bone_or_just_over_the_level(device, bone, level, filled):
-    distance = distances((25, 25, 25))
-    volume = volume_of(np.where((distance < 10) & (distance > 6), bone, 0))
+    distance, outer, inner = distances((25, 25, 25)), 10, 6
+    volume = volume_of(np.where((distance < outer) & (distance > inner), bone, 0))
     made = clrecon.fill_enclosed(volume, level, device=device)
     assert made.report["solid"]["filled_hu"] == filled
-    assert set(np.unique(made.voxels[distance <= 6])) == {filled}
+    assert set(np.unique(made.voxels[distance <= inner])) == {filled}

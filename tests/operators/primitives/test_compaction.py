@@ -51,9 +51,10 @@ def test_scan_on_devices_with_small_work_groups_equals_the_twin(device, group, m
 @pytest.mark.every_device
 def test_a_total_beyond_32_bits_is_exact(device):
     n = 70 * BLOCK + 3  # more blocks than a work-group has items
-    counts = np.full(n, 2**21 - 1, np.uint32)  # a block still fits 32 bits
+    largest = 2**21 - 1  # the sum of a block still fits 32 bits
+    counts = np.full(n, largest, np.uint32)
     scanned = exclusive_scan(device, upload(device, counts), n)
-    assert scanned.total == n * (2**21 - 1) > 2**32
+    assert scanned.total == n * largest > 2**32
     offsets = download(device, np.empty(n, np.uint32), scanned.offsets_d)
     assert np.array_equal(offsets, twin.exclusive_scan(counts)[0])
 

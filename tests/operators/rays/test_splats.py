@@ -82,7 +82,7 @@ def test_light_of_points_is_that_of_the_twin(device: Any, has_normals: bool, lig
         depth, numbers = find_splats(points, camera, SIZE, 0.6)
         apart = int(np.clip(round(0.6 / camera.pixel_mm(SIZE)), 1, 8))
         rgba, _ = shade_splats(depth, numbers, colors[:, :3] / 255.0, own, camera, lighting, apart)
-        image = np.where(rgba[..., 3:] > 0.0, 255.0 * rgba[..., :3], (0.0, 0.0, 128.0))
+        image = np.where(rgba[..., 3:] > 0.0, 255.0 * rgba[..., :3], (0.0, 0.0, 128.0))  # navy
         assert np.abs(found.image[..., :3] - image).max() <= tolerances.SPLAT_COLOR_LEVELS
         assert (found.image[..., 3] == 255).all()
         assert found.shading == ("none" if not lighting.shades else "normals" if has_normals else "depths")

@@ -48,7 +48,7 @@ def test_volume_is_right_handed_with_the_pixel_spacing_of_its_slices(tmp_path, p
     write_series(tmp_path, plan)
     volume = read_volume(tmp_path)
     assert volume.voxels.dtype == np.int16
-    assert np.linalg.det(volume.affine[:3, :3]) > 0
+    assert np.linalg.det(volume.affine[:3, :3]) > 0  # below it: a mirrored, left-handed one
     assert volume.spacing[:2] == pytest.approx(plan.pixel_spacing[::-1])  # di, dj
 
 

@@ -1,4 +1,4 @@
-"""What is changed_pixels into pictures: the right letters, bars of the right length, and room for both."""
+"""What is drawn into pictures: the right letters, bars of the right length, and room for both."""
 
 from __future__ import annotations
 
@@ -106,6 +106,10 @@ def test_scale_bar_that_fits_exactly_is_taken() -> None:
     assert bar_length(100.0 / LONGEST_BAR_SHARE) == 100.0
 
 
+HALF_A_PIXEL = 0.5
+"""A bar is drawn in whole pixels, the nearest to its length."""
+
+
 def changed_pixels(before, after) -> np.ndarray:
     return (before.image != after.image).any(axis=2)
 
@@ -129,7 +133,7 @@ def test_scale_bar_is_as_long_as_its_mm_in_pixels(size, background, ink):
         picture.image[:] = background
         marked = picture.annotated(scale_bar=True)
         pixel = 2 * scale / size[1]
-        assert abs(longest_run_of_ink(marked, ink).max() - bar_length(pixel * size[0]) / pixel) <= 0.5
+        assert abs(longest_run_of_ink(marked, ink).max() - bar_length(pixel * size[0]) / pixel) <= HALF_A_PIXEL
 
 
 def test_scale_bar_on_white_is_black_and_leaves_the_other_pixels():
@@ -157,7 +161,7 @@ def test_scale_bar_of_a_perspective_picture_is_true_in_the_focal_plane_and_says_
     marked = picture.annotated(scale_bar=True)
     assert set(texts) == {"100 mm (focal plane)"}
     ends, _ = PERSPECTIVE.project([(0, 0, 0), (100, 0, 0)], (400, 300))
-    assert abs(longest_run_of_ink(marked, 255).max() - (ends[1, 0] - ends[0, 0])) <= 0.5
+    assert abs(longest_run_of_ink(marked, 255).max() - (ends[1, 0] - ends[0, 0])) <= HALF_A_PIXEL
 
 
 @pytest.mark.parametrize("background", [BLACK, WHITE, CLEAR, (128, 128, 128, 255)])

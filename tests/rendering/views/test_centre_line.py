@@ -13,7 +13,7 @@ from clrecon.geometry import Volume
 from clrecon.rendering.views.centre_line import Curve, rotation_minimising_normals
 from clrecon.rendering.views.reformation import straightened_sheet, stretched_length, stretched_sheet
 
-RADIUS = 80.0
+RADIUS, TURN_DEG = 80.0, 120.0
 
 
 def arc_points(degrees, count, radius=RADIUS):
@@ -27,19 +27,19 @@ def helix(t, radius=20.0, pitch=30.0):
 
 @pytest.fixture(scope="module")
 def third_of_a_circle() -> Curve:
-    """A curve through points 14 mm apart on 120 degrees of a circle."""
-    return Curve(arc_points(120.0, 13))
+    """A curve through points 14 mm apart on a third of a circle."""
+    return Curve(arc_points(TURN_DEG, 13))
 
 
 def test_curve_of_a_circle_is_as_long_as_its_arc(third_of_a_circle):
-    assert third_of_a_circle.length == pytest.approx(RADIUS * np.radians(120.0), rel=tolerances.ARC_LENGTH)
+    assert third_of_a_circle.length == pytest.approx(RADIUS * np.radians(TURN_DEG), rel=tolerances.ARC_LENGTH)
 
 
 def test_places_on_a_circle_turn_by_their_arc_length(third_of_a_circle):
     places = third_of_a_circle.at(np.linspace(0.0, third_of_a_circle.length, 200))
 
     angles = np.degrees(np.arctan2(places[:, 2], places[:, 1]))
-    assert np.abs(angles - np.linspace(0.0, 120.0, 200)).max() <= 120.0 * tolerances.ARC_LENGTH
+    assert np.abs(angles - np.linspace(0.0, TURN_DEG, 200)).max() <= TURN_DEG * tolerances.ARC_LENGTH
 
 
 def test_smallest_radius_of_a_circle_is_its_radius(third_of_a_circle):
@@ -49,7 +49,7 @@ def test_smallest_radius_of_a_circle_is_its_radius(third_of_a_circle):
 def test_curve_begins_and_ends_at_its_end_points(third_of_a_circle):
     ends = third_of_a_circle.at([0.0, third_of_a_circle.length])
 
-    assert ends == pytest.approx(arc_points(120.0, 13)[[0, -1]])
+    assert ends == pytest.approx(arc_points(TURN_DEG, 13)[[0, -1]])
 
 
 @pytest.fixture(scope="module")

@@ -349,12 +349,13 @@ def test_button_cut_clips_the_picture(page) -> None:
 @pytest.mark.release
 def test_slider_of_a_clip_plane_moves_it_on(page) -> None:
     cut_by_a_plane(page)
-    assert facts(page)["clips"][0]["share"] == 0.5
+    half_way = 0.5  # where a new plane lies
+    assert facts(page)["clips"][0]["share"] == half_way
 
     drag(page, page.find_element("css selector", "#clips input"), 0, 0, 45, 0)
 
     wait_until_drawn(page)
-    assert facts(page)["clips"][0]["share"] > 0.5
+    assert facts(page)["clips"][0]["share"] > half_way
 
 
 @pytest.mark.release
