@@ -165,12 +165,12 @@ def clean_and_noisy_ball():
 
 def test_spread_of_the_level_is_small_without_noise_and_less_than_the_noise(clean_and_noisy_ball) -> None:
     clean, noisy = clean_and_noisy_ball
-    assert clean.spread_hu < 5.0 < noisy.spread_hu < 50.0
+    assert clean.spread_hu < 5.0 < noisy.spread_hu < 50.0  # the noise; measured 1.5 and 25
 
 
 def test_noise_of_the_tissue_is_measured(clean_and_noisy_ball) -> None:
     clean, noisy = clean_and_noisy_ball
-    assert clean.noise_hu < 10.0
+    assert clean.noise_hu < 10.0  # measured 4.1
     assert noisy.noise_hu == pytest.approx(50.0, rel=0.1)
     assert clean.background_mode_hu == 40.0
 

@@ -80,7 +80,7 @@ def test_vertices_of_a_cropped_mesh_away_from_the_crop_are_those_of_the_whole(sc
     of_whole, of_half = (
         np.unique(mesh.vertices[mesh.vertices[:, 2] > half_a_slice_above], axis=0) for mesh in (whole, half)
     )
-    assert len(of_half) > 100
+    assert len(of_half) > 100  # measured 1753; two of none would be equal
     assert np.array_equal(of_half, of_whole)
 
 
@@ -149,7 +149,7 @@ def test_cloud_of_a_crop_has_the_points_within_it(scan: Path, tmp_path: Path) ->
 
     part = read_points(tmp_path / "c.npz").points
     assert 0 < len(part) < len(whole)
-    voxel_mm = 1.0  # its longest side: a point lies on an edge that begins within the crop
+    voxel_mm = 1.0  # its longest side: the surface closes beyond the last voxels; measured 0.41 mm
     assert (np.abs(part - top_of_the_ball) <= half_side_mm + voxel_mm).all()
 
 

@@ -312,7 +312,7 @@ def test_steps_are_taken_back_as_if_all_triangles_were_looked_at_after_each_roun
     moved, taken_back = move_vertices(vertices, triangles, step)
     expected, count = move_by_looking_at_all(vertices, triangles, step)
     np.testing.assert_array_equal(moved, expected)
-    assert taken_back == count > 100
+    assert taken_back == count > 100  # of 12,294 vertices; measured 2,700 and more
 
 
 def test_rounds_after_the_second_look_at_less_than_half_and_the_last_at_a_twentieth_of_the_triangles(
@@ -326,10 +326,10 @@ def test_rounds_after_the_second_look_at_less_than_half_and_the_last_at_a_twenti
         return find_self_intersections(places, faces, *more)
 
     move_vertices(vertices, triangles, step, count_and_find_crossings)
-    assert len(looked_at) > 5
+    assert len(looked_at) > 5  # rounds; measured 6 and 7
     assert looked_at[0] == len(triangles)
-    assert max(looked_at[2:]) < 0.5 * len(triangles)
-    assert looked_at[-1] < 0.05 * len(triangles)
+    assert max(looked_at[2:]) < 0.5 * len(triangles)  # measured 0.28 to 0.33, and 0.69 in the second round
+    assert looked_at[-1] < 0.05 * len(triangles)  # measured 0.013 to 0.018
 
 
 def test_vertices_that_would_stop_in_the_way_back_of_others_are_taken_back_again():
@@ -437,7 +437,10 @@ def test_the_filter_keeps_a_constant_exactly_and_long_waves_within_3_per_mille(i
 
 @for_few_and_many_iterations
 def test_the_filter_damps_the_shortest_wave_and_removes_it_from_20_iterations_on(iterations):
-    """Neighbours with opposite signs."""
+    """Neighbours with opposite signs.
+
+    Measured: 0.999 of the wave after 1 iteration, 0.47 after 7, and less than 1e-6, of float32, from 20 on.
+    """
     assert measure_gain(RING // 2, iterations) < (1.0 if iterations < 20 else 0.01)
 
 
@@ -477,4 +480,4 @@ def test_a_component_that_loses_its_volume_where_steps_are_taken_back_is_left_as
 
     moved, taken_back = move_vertices(vertices, triangles, step, find_changed=find_changed)
     np.testing.assert_array_equal(moved[:8], vertices[:8])
-    assert taken_back >= 8
+    assert taken_back >= 8  # the corners of the box; measured 12, with those of the wall that it cut

@@ -138,7 +138,9 @@ def test_blur_of_a_fit_scales_with_the_voxels(device):
 def test_cortex_fitted_in_slabs_is_that_of_the_whole(device, uneven, few):
     volume = stack(hollow_ball(thickness=2.0).voxels, OBLIQUE, uneven=uneven)
     mesh, whole = fit_surface(volume, device)
-    assert mesh.vertex_count > 4 * cortex.SMALLEST_PIECE  # so that few places at a time are several pieces
+    assert (
+        mesh.vertex_count > 4 * cortex.SMALLEST_PIECE
+    )  # so that few places at a time are several pieces; measured 3538
     places = cortex.SMALLEST_PIECE if few else cortex.stride_of(mesh.vertex_count)
     place_bytes = 140
     memory = volume.voxels.nbytes // 2 + place_bytes * places
@@ -181,7 +183,7 @@ def test_vertices_on_a_vessel_are_no_bone(surface_with_vessel_and_metal):
 def test_vertices_on_metal_are_told_as_metal(surface_with_vessel_and_metal):
     mesh, fit = surface_with_vessel_and_metal
     x, y, _ = mesh.vertices.T
-    on_the_block = (x > 32) & (y > 32)  # it begins at 34 mm; the shell, of 13 mm about (19.5, 19), has no such corner
+    on_the_block = (x > 32) & (y > 32)  # from 33 mm on; the shell, 13 mm about (19.5, 19), ends before this corner
     assert set(fit.states[on_the_block].tolist()) == {METAL}
 
 

@@ -104,7 +104,7 @@ def test_bench_without_an_input_makes_a_synthetic_spine_of_512_x_512_x_149_voxel
     assert asked == [((512, 512), 149, (0.7, 0.7, 1.0))]
     assert result["input"]["kind"] == "phantom"
     assert (result["iso_value_hu"], result["iso_level_hu"]) == (226.0, 225.5)
-    assert result["devices"][0]["triangles"] > 500
+    assert result["devices"][0]["triangles"] > 500  # of a small spine; measured 17,732
     assert "make" in result["seconds"]
 
 

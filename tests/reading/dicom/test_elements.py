@@ -80,7 +80,7 @@ def test_names_of_transfer_syntaxes_are_those_of_pydicom_and_all_can_be_decoded(
 def test_files_of_pydicom_are_parsed_alike_by_both_parsers_and_most_by_the_plain_one() -> None:
     files = corpus()
     taken = [name for name, data in files.items() if assert_parsed_alike(data, len(data))]
-    assert len(files) > 120
+    assert len(files) > 120  # measured 163: another version of pydicom may have fewer
     assert len(taken) > len(files) // 2
     assert {"CT_small.dcm", "MR_small.dcm", "MR_small_implicit.dcm", "J2K_pixelrep_mismatch.dcm"} <= set(taken)
 
@@ -99,7 +99,7 @@ def test_mutated_files_are_parsed_alike_by_both_parsers_or_left_by_the_plain_one
         for _ in range(dice.choice((1, 1, 1, 2, 3, 6))):
             mutate(mutated, dice)
         taken += assert_parsed_alike(bytes(mutated), len(mutated) + dice.choice((0, 5000)))
-    assert MUTATIONS // 10 < taken < MUTATIONS * 9 // 10
+    assert MUTATIONS // 10 < taken < MUTATIONS * 9 // 10  # both answers occur often; measured 24 % taken
 
 
 def mutate(data: bytearray, dice: random.Random) -> None:

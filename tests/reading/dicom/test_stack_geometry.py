@@ -75,7 +75,7 @@ def test_positions_rounded_to_a_hundredth_of_a_mm_are_even_without_a_warning(tmp
     assert np.abs(volume.ijk_to_lps(corners(plan)) - plan.truth(corners(plan))).max() < ROUNDED_AFFINE_MM
     assert volume.report["warnings"] == []
     assert volume.report["uneven"] is False
-    assert 0 < volume.report["grid_residual_max_mm"] <= 0.01
+    assert 0 < volume.report["grid_residual_max_mm"] <= 0.01  # the rounding; measured 0.005, half of it
 
 
 def test_directions_that_jitter_by_a_thousandth_of_a_degree_are_averaged(tmp_path):

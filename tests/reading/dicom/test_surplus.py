@@ -279,7 +279,7 @@ def test_compressed_slices_whose_line_ends_were_changed_as_of_text_are_refused(t
         if name in COMPRESSED:
             ds.compress(COMPRESSED[name], generate_instance_uid=False)
         data = save_bytes(ds)
-        assert data.count(b"\n") > 9
+        assert data.count(b"\n") > 9  # bytes that the change meets; measured 38 and more
         (tmp_path / NAME(k)).write_bytes(data[:132] + data[132:].replace(b"\n", b"\r\n"))
     assert_refused_with(tmp_path, "IM000")
 
