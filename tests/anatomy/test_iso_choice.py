@@ -154,7 +154,7 @@ def test_the_surface_of_a_spine_at_its_iso_value_is_nearly_as_near_to_the_truth_
 @pytest.mark.seconds
 def test_the_surface_of_a_spine_at_the_level_of_otsu_lies_farther_from_the_truth(spine_error, comparison) -> None:
     volume, error = spine_error
-    assert error(comparison.by_otsu(volume)) > error(choose_iso_value(volume).iso_value) + 0.2
+    assert error(comparison.by_otsu(volume)) > error(choose_iso_value(volume).iso_value) + 0.2  # 0.53, 0.24 mm
 
 
 @pytest.fixture(scope="module")

@@ -108,7 +108,9 @@ def test_a_noisy_sphere_that_is_smoothed_freely_moves_by_more_than_three_times_t
     bound, rough, _ = bounded
     free = smooth_mesh(rough, 20, 10.0)
     assert free.report["refinement"]["smooth"]["vertices_held_back"] == 0
-    assert SurfaceDistance(rough.vertices, rough.triangles)(free.vertices.astype(float)).max() > 3 * bound
+    assert (
+        SurfaceDistance(rough.vertices, rough.triangles)(free.vertices.astype(float)).max() > 3 * bound
+    )  # measured 0.51
 
 
 @pytest.mark.release
@@ -116,7 +118,7 @@ def test_no_vertex_is_moved_by_more_than_the_bound_and_those_held_back_are_count
     bound, rough, smooth = bounded
     step = smooth.vertices.astype(float) - rough.vertices
     assert np.linalg.norm(step, axis=1).max() <= bound
-    assert smooth.report["refinement"]["smooth"]["vertices_held_back"] > 100
+    assert smooth.report["refinement"]["smooth"]["vertices_held_back"] > 100  # of 4098; measured 2697
 
 
 @pytest.mark.release

@@ -401,20 +401,20 @@ def test_hollow_and_solid_surfaces_of_a_real_vertebra_are_closed_and_manifold(re
 def test_a_solid_real_vertebra_has_the_volume_of_its_mask_and_a_hollow_one_less(real_vertebrae):
     hollow, solid, mask_ml = real_vertebrae
     assert solid[T12].quality()["volume_ml"] == pytest.approx(mask_ml, rel=tolerances.REAL_SOLID_VOLUME)
-    assert hollow[T12].quality()["volume_ml"] < 0.7 * mask_ml
+    assert hollow[T12].quality()["volume_ml"] < 0.7 * mask_ml  # measured 0.64
 
 
 @pytest.mark.release
 def test_two_real_vertebrae_share_vertices_where_they_touch(real_vertebrae):
     _, solid, _ = real_vertebrae
     shared = {row.tobytes() for row in solid[T12].vertices} & {row.tobytes() for row in solid[T11].vertices}
-    assert len(shared) > 100
+    assert len(shared) > 100  # of 15,668 of T12; measured 1723
 
 
 @pytest.mark.release
 def test_most_vertices_of_a_real_vertebra_are_placed_by_hu(real_vertebrae):
     _, solid, _ = real_vertebrae
-    assert solid[T12].report["vertices_by_hu_share"] > 0.6
+    assert solid[T12].report["vertices_by_hu_share"] > 0.6  # measured 0.68
 
 
 @pytest.mark.parametrize(("missing", "slices"), [(0, (0, 40)), (1, (16, 26))], ids=["room", "a byte too few"])
