@@ -111,22 +111,24 @@ def test_torn_topology_is_mended(seed, bound):
     torn = Mesh(*simplify(mesh.vertices - FAR, mesh.triangles.view(np.int32), 0.6)).quality()
     assert not torn["manifold"] or torn["components"] < before["components"]  # else this tests nothing
 
-    small = decimate_mesh(mesh, 0.6, bound)
+    fraction = 0.6
+    small = decimate_mesh(mesh, fraction, bound)
     after = small.quality()
     assert (after["closed"], after["manifold"], after["oriented"], after["outward"]) == (True, True, True, True)
     assert (after["zero_area_faces"], after["duplicate_faces"], after["unused_vertices"]) == (0, 0, 0)
     assert after["components"] == before["components"]
-    assert 0.0 < small.report["refinement"]["decimate"]["reached"] < 0.6
+    assert 0.0 < small.report["refinement"]["decimate"]["reached"] < fraction
     assert len(find_self_intersections(small.vertices, small.triangles)) == 0
     check_within(small, mesh, 0.125 if bound is None else bound)
 
 
 def test_report_says_what_ended_the_decimation():
     sphere = Mesh(*samples.sphere(FAR, 20.0, 5))
-    said = [decimate_mesh(sphere, 0.9, bound).report["refinement"]["decimate"] for bound in (0.5, 0.001)]
+    fraction = 0.9
+    said = [decimate_mesh(sphere, fraction, bound).report["refinement"]["decimate"] for bound in (0.5, 0.001)]
     assert [each["ended_by"] for each in said] == ["share", "bound"]
-    assert said[0]["reached"] == pytest.approx(0.9, abs=2 / sphere.triangle_count)
-    assert said[1]["reached"] < 0.9
+    assert said[0]["reached"] == pytest.approx(fraction, abs=2 / sphere.triangle_count)
+    assert said[1]["reached"] < fraction
 
 
 def test_each_component_keeps_its_volume():

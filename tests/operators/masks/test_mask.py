@@ -317,17 +317,19 @@ def test_mask_is_neither_pickled_nor_copied(small_mask, duplicate):
 
 WIDE = random_volume((40, 50, 600))
 ONE_MASK = 40 * 50 * 19 * 4  # bytes of 19 words a row: 152,000
+ROOM_FOR_TWO_MASKS = 400_000  # bytes; the voxels alone take 2,400,000
 
 
 def test_mask_of_a_volume_beyond_the_memory_is_made_slab_by_slab(device):
-    few = clrecon.Mask.from_band(WIDE, (1, 3), device=device, memory=400_000)
-    assert WIDE.voxels.nbytes > 400_000 > 2 * ONE_MASK
-    assert few.count == np.count_nonzero((WIDE.voxels >= 1) & (WIDE.voxels <= 3))
+    low, high = 1, 3
+    few = clrecon.Mask.from_band(WIDE, (low, high), device=device, memory=ROOM_FOR_TWO_MASKS)
+    assert WIDE.voxels.nbytes > ROOM_FOR_TWO_MASKS > 2 * ONE_MASK
+    assert few.count == np.count_nonzero((WIDE.voxels >= low) & (WIDE.voxels <= high))
 
 
 def test_masks_without_room_for_three_are_not_joined(device):
-    few = clrecon.Mask.from_band(WIDE, (1, 3), device=device, memory=400_000)
-    with refused(DeviceError, "masks", "voxels", 3, 400_000):
+    few = clrecon.Mask.from_band(WIDE, (1, 3), device=device, memory=ROOM_FOR_TWO_MASKS)
+    with refused(DeviceError, "masks", "voxels", 3, ROOM_FOR_TWO_MASKS):
         few & few
 
 

@@ -40,9 +40,11 @@ def test_plane_is_its_unit_normal_and_the_height_of_its_point_along_it():
 
 
 def test_plane_keeps_the_side_of_its_normal():
-    kept = Clip.plane((1.0, 2.0, 3.0), (0.0, 3.0, 4.0)).contains(POINTS)
+    on_plane, normal = (1.0, 2.0, 3.0), (0.0, 3.0, 4.0)
 
-    assert np.array_equal(kept, (POINTS - (1, 2, 3)) @ (0.0, 3.0, 4.0) >= 0.0)
+    kept = Clip.plane(on_plane, normal).contains(POINTS)
+
+    assert np.array_equal(kept, (POINTS - on_plane) @ normal >= 0.0)
     assert 0 < kept.sum() < len(POINTS)
 
 
