@@ -45,7 +45,7 @@ def cleaned_body(odd: OddBodies, request: pytest.FixtureRequest) -> tuple[str, O
 
 def test_bone_stays_where_a_table_is_removed(cleaned_body: tuple[str, OddBody, Volume]) -> None:
     _, body, cleaned = cleaned_body
-    assert share_kept(body.volume, cleaned, body.dense) > 0.999
+    assert share_kept(body.volume, cleaned, body.dense) == 1.0
     less_dense = body.of("bone", "metal", "contrast") & (body.volume.voxels > 0)
     assert share_kept(body.volume, cleaned, less_dense) > 1.0 - RIMS_IN_THE_TABLE
 
@@ -61,13 +61,14 @@ def test_bodies_without_soft_tissue_are_reported_as_specimens(cleaned_body: tupl
     assert cleaned.report["remove_table"]["specimen"] == (name in SPECIMENS)
 
 
-def test_report_of_a_removed_table_counts_nearly_all_bone_and_says_that_it_stays(
+def test_report_of_a_removed_table_counts_all_bone_and_says_that_it_stays(
     cleaned_body: tuple[str, OddBody, Volume],
 ) -> None:
     _, body, cleaned = cleaned_body
     facts = cleaned.report["remove_table"]
-    assert facts["bone_kept"] > 0.999
-    assert facts["bone_voxels"] >= 0.97 * np.count_nonzero(body.dense)
+    assert facts["bone_kept"] == 1.0
+    # Voxels of the table above 300 HU that touch bone count with it: measured up to 79 of 3,004.
+    assert facts["bone_voxels"] >= np.count_nonzero(body.dense)
 
 
 def test_the_gate_on_kept_bone_has_the_share_of_the_report_and_its_bound(
@@ -112,7 +113,7 @@ def test_a_scan_of_a_table_alone_is_refused_as_it_has_no_bone(odd: OddBodies, ra
 def test_water_stays_and_its_gate_on_bone_is_not_judged(odd: OddBodies) -> None:
     body = odd["water"]
     cleaned = remove_table(body.volume)
-    assert share_kept(body.volume, cleaned, body.of("water")) > 0.99
+    assert share_kept(body.volume, cleaned, body.of("water")) == 1.0
     assert cleaned.report["remove_table"]["bone_kept"] is None
     assert gate_of(cleaned)["ok"] is None
 
@@ -138,15 +139,16 @@ def test_a_dry_skull_stays_and_its_table_goes_with_soft_bone_noise_or_aluminium(
     change(voxels, body.dense, table)
     volume = Volume(voxels, body.volume.affine)
     cleaned = remove_table(volume)
-    assert share_kept(volume, cleaned, (voxels > 300) & body.dense) > 0.999
-    assert share_kept(volume, cleaned, table & (voxels > -100)) < SURFACE_OF_THE_TABLE
+    assert share_kept(volume, cleaned, (voxels > 300) & body.dense) == 1.0
+    plates = table & (voxels > -100)  # HU; between them is foam of -930 HU
+    assert share_kept(volume, cleaned, plates) < SURFACE_OF_THE_TABLE
 
 
 def test_a_slab_of_a_skull_of_30_mm_is_kept_although_it_is_straight_from_end_to_end(odd: OddBodies) -> None:
     body, slab = odd["skull-prone"], slice(24, 32)
     volume = Volume(np.array(body.volume.voxels[slab]), body.volume.affine)
     cleaned = remove_table(volume)
-    assert share_kept(volume, cleaned, (volume.voxels > 300) & body.dense[slab]) > 0.999
+    assert share_kept(volume, cleaned, (volume.voxels > 300) & body.dense[slab]) == 1.0
 
 
 def dry_shafts() -> tuple[Volume, np.ndarray]:
@@ -170,14 +172,14 @@ def dry_shafts() -> tuple[Volume, np.ndarray]:
 def test_straight_dry_shafts_that_touch_a_table_stay_and_are_counted_as_bone() -> None:
     volume, bone = dry_shafts()
     cleaned = remove_table(volume)
-    assert share_kept(volume, cleaned, bone) > 0.999
+    assert share_kept(volume, cleaned, bone) == 1.0
     assert cleaned.report["remove_table"]["bone_voxels"] == pytest.approx(np.count_nonzero(bone), rel=0.05)
 
 
 def test_rails_of_a_table_under_dry_shafts_are_removed() -> None:
     volume, _ = dry_shafts()
-    rows_of_rails = np.s_[:, 76:]
-    assert (volume.voxels[rows_of_rails] > 300).any()
+    rows_of_rails = np.s_[:, 73:77]  # y of 63 to 69 mm
+    assert (volume.voxels[rows_of_rails] > 300).any()  # HU: dense as bone
     assert not (remove_table(volume).voxels[rows_of_rails] > 300).any()
 
 
@@ -255,7 +257,7 @@ def test_a_chosen_circle_reports_the_bone_that_it_cuts_and_has_no_gate(odd: OddB
     masked = mask_field_of_view(body.volume, 45.0)
     facts = masked.report["field_of_view"]
     cut = np.count_nonzero(body.dense & (masked.voxels != body.volume.voxels))
-    assert cut > 100
+    assert cut > 100  # enough voxels to judge shares: measured 3,701 and more
     # Pieces of the table are not counted as bone, and bone is counted to a cell of some 2 mm.
     assert facts["bone_voxels_removed"] == pytest.approx(cut, rel=0.05)
     assert facts["bone_kept"] == pytest.approx(1.0 - cut / np.count_nonzero(body.dense), abs=0.02)
@@ -273,4 +275,4 @@ def test_the_circle_of_the_scan_fails_its_gate_where_it_cuts_more_than_2_percent
     in_a_corner = Volume(np.roll(limb.voxels, (-45, 25), axis=(1, 2)), limb.affine)
     masked = mask_field_of_view(in_a_corner)
     assert gate_of(masked, "bone_in_circle")["ok"] is False
-    assert masked.report["field_of_view"]["bone_kept"] < 0.98
+    assert masked.report["field_of_view"]["bone_kept"] < 0.98  # measured 0: all of the limb lies in the corner

@@ -31,14 +31,14 @@ def test_air_around_a_trunk_the_plate_and_the_edge_of_the_skin_are_left_out(dtyp
     edge_of_the_skin = (radius > 58.0) & (radius <= 60.0)  # which real scans mix with the air outside
     assert out[radius > 60.0].all()
     assert out[:, 80:83].all()
-    assert out[edge_of_the_skin].mean() > 0.97
+    assert out[edge_of_the_skin].all()
 
 
 @pytest.mark.parametrize("dtype", [np.int16, np.int32, np.float32])
 def test_tissue_and_gas_inside_of_a_trunk_are_not_left_out(dtype: type) -> None:
     volume, radius, gas = make_trunk(dtype)
     out = leave_out_surroundings(volume).voxels > PLATE
-    assert not out[radius < 50.0].any()
+    assert not out[radius < 50.0].any()  # mm: the skin is left out down to 55.6 mm, measured; 3 mm and whole cells
     assert not out[gas].any()
 
 

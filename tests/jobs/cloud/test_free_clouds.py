@@ -98,7 +98,7 @@ def test_surface_of_an_uneven_cloud_is_warned_of_for_walls_that_no_points_suppor
     assert cloud_command(tmp_path / "free.xyz", *options, "--report", str(tmp_path / "r.json")) == 0
 
     report = json.loads((tmp_path / "r.json").read_text())
-    assert report["surface"]["wall_share"] > 0.1
+    assert report["surface"]["wall_share"] > 0.1  # measured 0.138
     assert report["surface"]["lost_share"] == 0.0
     assert any("walls that no points" in warning for warning in report["warnings"])
     said = printed()
@@ -122,5 +122,5 @@ def test_free_cloud_with_a_viewpoint_gets_outward_normals_and_a_surface(tmp_path
     assert np.einsum("ij,ij->i", cloud.normals, outward).min() > 0.9  # within 26 degrees: planes of some 15 points
     assert report["steps"][0]["oriented_by"] == "viewpoint"
     triangles = report["surface"]["triangles"]
-    assert triangles > 1000
+    assert triangles > 1000  # measured 16,716
     assert (tmp_path / "out.stl").stat().st_size == 84 + 50 * triangles  # header of a binary STL, and 50 bytes each

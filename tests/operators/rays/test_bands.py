@@ -83,5 +83,5 @@ def test_pictures_of_a_ball_are_taken_by_some_two_million_rays_a_launch_on_a_gpu
     device, monkeypatch
 ):
     built_in, card = (rays_of_ball(device, monkeypatch, "gpu", own) for own in (False, True))
-    assert 2**20 < built_in < 2**22
+    assert 2**20 < built_in < 2**22  # two million to a factor of two: measured 2,685,575
     assert card == pytest.approx(8 * built_in, abs=8)  # rounded down before
