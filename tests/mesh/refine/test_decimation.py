@@ -66,7 +66,7 @@ def test_a_sphere_loses_nine_of_ten_triangles_within_the_bound():
     assert (quality["closed"], quality["manifold"], quality["genus"], quality["unused_vertices"]) == (True, True, 0, 0)
     assert quality["volume_ml"] == pytest.approx(4 / 3 * np.pi * 8.0, rel=tolerances.DECIMATED_VOLUME)
     outward = (small.vertices - FAR) / np.linalg.norm(small.vertices - FAR, axis=1, keepdims=True)
-    assert np.einsum("na,na->n", small.normals, outward).min() > 0.98
+    assert np.einsum("na,na->n", small.normals, outward).min() > 0.98  # within 12 degrees; measured 0.9998
     said = small.report["refinement"]["decimate"]
     assert said["reached"] == pytest.approx(1 - small.triangle_count / sphere.triangle_count)
     assert (said["fraction"], said["triangles_before"], small.report["iso_value_hu"]) == (0.9, 32768, 300.0)
@@ -84,10 +84,11 @@ def test_the_bound_stops_the_decimation():
 
 
 def test_a_torus_stays_a_torus():
-    small = decimate_mesh(Mesh(*samples.torus(120, 48)), 0.8, 0.3)
+    torus = Mesh(*samples.torus(120, 48))
+    small = decimate_mesh(torus, 0.8, 0.3)
     quality = small.quality()
     assert (quality["closed"], quality["manifold"], quality["genus"]) == (True, True, 1)
-    assert quality["triangles"] < 3000
+    assert quality["triangles"] <= 0.2 * torus.triangle_count  # measured 2,302 of 11,520
 
 
 @pytest.mark.slow
@@ -193,7 +194,7 @@ def test_an_open_surface_keeps_its_border():
 def test_each_speck_keeps_its_volume(seed):
     mesh = noise_surface(seed)
     small = decimate_mesh(mesh, 0.6)
-    assert small.triangle_count < 0.7 * mesh.triangle_count
+    assert small.triangle_count < 0.7 * mesh.triangle_count  # measured 0.63 and 0.65: the bound ends it before 0.4
     before, after = (np.sort(volumes_of(each)) for each in (mesh, small))
     large = np.abs(before) > 0.1  # of smaller ones the rounding of coordinates is as large
     assert np.abs(after / before - 1.0)[large].max() <= 5e-4

