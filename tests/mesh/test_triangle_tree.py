@@ -125,7 +125,8 @@ def test_lines_first_meet_triangles_where_vtk_finds(
     starts, ends = rng.normal(0.0, 20.0, (2, 300, 3))
     theirs = np.array([hit_by_vtk(locator, start, end) for start, end in zip(starts, ends, strict=True)])
     ours = tree.first_hits(starts, ends)
-    assert 100 < np.isfinite(theirs[:, 0]).sum() < 300, "some lines meet a triangle, and some meet none"
+    met = np.isfinite(theirs[:, 0]).sum()
+    assert 100 < met < len(starts), "some lines meet a triangle, and some meet none"  # measured 252 of 300
     np.testing.assert_allclose(ours, theirs, atol=tolerances.VTK_HIT_MM)
 
 

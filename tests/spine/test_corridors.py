@@ -132,7 +132,7 @@ def test_the_canal_is_as_far_from_a_corridor_as_the_cylinder_is_wide(posed: Any)
 @pytest.mark.slow
 def test_walls_at_the_half_maximum_are_placed_by_hu_without_bias(posed: Any) -> None:
     for corridor, _, _ in posed.sides:
-        assert corridor.by_hu_share > 0.95
+        assert corridor.by_hu_share > 0.95  # measured 1.0 in the turned pose
         assert abs(corridor.bias.median_mm) <= 0.2  # a quarter of a voxel
 
 
@@ -310,7 +310,7 @@ def test_a_judge_keeps_less_than_a_quarter_of_the_surface_which_is_enough_for_li
     too_large_by = segment_distances(starts, ends, judge.walls) - judge.radius(lines)
     assert len(judge.walls) < len(surface) / 4
     assert (np.abs(too_large_by[:60]) < tolerances.SEGMENT_DISTANCE_MM).all()
-    assert too_large_by[60:].max() > 0.1, "lines farther away need the whole surface"
+    assert too_large_by[60:].max() > 0.1, "lines farther away need the whole surface"  # mm; measured 19
 
 
 def test_of_two_lines_as_far_from_the_surface_the_deeper_scores_higher() -> None:

@@ -50,7 +50,8 @@ def test_distances_are_negative_where_the_winding_number_says_inside(
 ) -> None:
     vertices, triangles, points = body_and_points
     is_inside = winding_number(points, vertices, triangles) > 0.5
-    assert 50 < is_inside.sum() < 1450, "points inside and outside"
+    enough = 50  # measured 95 to 369 points inside
+    assert enough < is_inside.sum() < len(points) - enough, "points inside and outside"
     np.testing.assert_array_equal(SignedDistance(vertices, triangles)(points) < 0.0, is_inside)
 
 

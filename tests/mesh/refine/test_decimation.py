@@ -80,6 +80,7 @@ def test_the_bound_stops_the_decimation():
         small = decimate_mesh(sphere, 0.97, bound)
         check_within(small, sphere, bound)
         reached.append(small.report["refinement"]["decimate"]["reached"])
+    # The share that was asked for is out of reach: the widest bound measured 0.925.
     assert 0.0 <= reached[0] < 0.5 < reached[1] < reached[2] < 0.97
 
 

@@ -68,7 +68,7 @@ def test_components_have_numbers_from_0_at_the_active_cells_alone(name: str) -> 
 def test_components_of_cells_are_numbered_in_the_order_of_their_first_cells() -> None:
     _, numbers = label_cells(inside_masks()["sparse noise"])
     first_cells = np.unique(numbers[numbers >= 0], return_index=True)[1]
-    assert len(first_cells) > 5
+    assert len(first_cells) > 5  # enough to be out of order: measured 24
     assert (np.diff(first_cells) > 0).all()
 
 

@@ -55,7 +55,8 @@ def test_grid_file_cut_anywhere_is_refused(tmp_path, name):
             part.write_bytes(content[:length])
             with pytest.raises(ClreconError) as caught:
                 clrecon.read_volume(path)
-            assert type(caught.value) is RefusedInputError or length < 16, (part.name, length)
+            # An empty file is no file of this kind; others begin at 29 bytes.
+            assert type(caught.value) is RefusedInputError or length == 0, (part.name, length)
         part.write_bytes(content)
     assert clrecon.read_volume(path).voxels.shape == (6, 12, 12)
 
