@@ -24,7 +24,7 @@ def test_each_include_of_a_kernel_file_is_inlined_once_with_a_line_mark(name):
     source = read_kernel_source(name)
     assert not re.search(r"^\s*#\s*include", source, re.MULTILINE)
     first, *others = re.findall(r'^#line 1 "(cl/[^"]+)"$', source, re.MULTILINE)
-    assert first == "cl/include/exact.h"
+    assert first == "cl/include/exact.h"  # stands before all kernels: it forbids inexact arithmetic
     assert f"cl/{name}" in others
     assert len({first, *others}) == 1 + len(others)
 

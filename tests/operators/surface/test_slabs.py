@@ -41,17 +41,19 @@ def test_a_single_slice_in_slabs_of_one_gives_the_same_mesh(device):
 
 
 def test_a_resident_volume_gives_the_same_surfaces_in_slabs_and_as_a_whole_in_turn(device, monkeypatch):
-    """An open surface fits, a closed one needs a little more: in slabs, and not from the wrong slices."""
     volume = smooth_volume()
     with SurfaceExtractor(volume, device=device) as extractor:
-        extractor.extract(100, closed=False)
-        monkeypatch.setattr(extraction, "plan_slabs", lambda *_: 4)
-        mesh = extractor.extract(100)
-        assert mesh.report["slabs"] > 1
-        again = extractor.extract(100, closed=False)
-    monkeypatch.undo()
-    assert_same(mesh, extract_isosurface(volume, 100, device=device))
-    assert_same(again, extract_isosurface(volume, 100, device=device, closed=False))
+        whole = extractor.extract(100, closed=False)
+        with monkeypatch.context() as less_memory:
+            less_memory.setattr(extraction, "plan_slabs", lambda *_: 4)  # slices a slab
+            in_slabs = extractor.extract(100)
+        whole_again = extractor.extract(100, closed=False)
+
+    assert [mesh.report["slabs"] for mesh in (whole, in_slabs, whole_again)] == [1, -(-(23 + 2) // 4), 1]  # of 23 slices
+    assert_same(in_slabs, extract_isosurface(volume, 100, device=device))
+    expected = extract_isosurface(volume, 100, device=device, closed=False)
+    assert_same(whole, expected)
+    assert_same(whole_again, expected)
 
 
 @pytest.mark.parametrize(("slices", "read"), [(1, 4), (3, 6), (20, 20), (22, 20)])

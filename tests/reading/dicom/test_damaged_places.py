@@ -100,6 +100,6 @@ def test_odd_slice_locations_and_diameters_are_not_warned_of(tmp_path, values):
     assert read_volume(tmp_path).report["warnings"] == []
 
 
-def test_page_lists_the_damaged_places():
+def test_page_of_the_certificate_lists_the_damaged_places():
     text = PAGE.read_text(encoding="utf-8")
     assert "\n".join(list_damages()) in text
