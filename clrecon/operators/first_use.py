@@ -80,8 +80,8 @@ def _compare_mesh(mesh: Mesh) -> str:
 def _count_open_edges(triangles: NDArray[np.int64], vertices: int) -> int:
     """Count the edges that are not passed once each way."""
     begin, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
-    there, back = np.sort(begin * vertices + end), np.sort(end * vertices + begin)
-    return int(np.count_nonzero(there != back)) + int(np.count_nonzero(np.diff(there) == 0))
+    _, edges = np.unique(np.minimum(begin, end) * vertices + np.maximum(begin, end), return_inverse=True)
+    return int(np.count_nonzero((np.bincount(edges) != 2) | (np.bincount(edges, np.sign(end - begin)) != 0.0)))
 
 
 def main(index: str) -> None:

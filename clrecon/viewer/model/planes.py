@@ -22,7 +22,7 @@ _LEAST_TURN = 0.05
 """Degrees by which a slice is said to be turned."""
 
 _LEAST_ROTATION = 1e-9
-"""Largest change of a direction of length 1 that is none."""
+"""Changes of a unit direction up to this size are rounding: the slice is not turned."""
 
 _LEAST_UPRIGHT = 0.3
 """Part of the upward direction that lies in a turned slice, below which it turns with the slice."""

@@ -8,12 +8,12 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from batch_processes import children_of, wait_until
 
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
@@ -40,18 +40,6 @@ def start(folder: Path, *options: str, **variables: str) -> subprocess.Popen[str
     return subprocess.Popen(
         command, cwd=folder, env=os.environ | variables, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-
-
-def children_of(parent: int) -> list[int]:
-    tasks = Path(f"/proc/{parent}/task")
-    return [int(word) for task in tasks.iterdir() for word in (task / "children").read_text().split()]
-
-
-def wait_until(process: subprocess.Popen[str], has_happened: Callable[[], bool]) -> None:
-    end = time.monotonic() + 120.0
-    while not has_happened():
-        assert process.poll() is None and time.monotonic() < end
-        time.sleep(0.002)
 
 
 def meshes(folder: Path) -> dict[str, bytes]:

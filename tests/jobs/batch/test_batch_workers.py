@@ -8,11 +8,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
+from batch_processes import children_of, wait_until
 
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
@@ -57,25 +57,13 @@ def statuses(folder: Path) -> dict[str, str]:
         return {row["case"]: row["status"] for row in csv.DictReader(stream)}
 
 
-def children_of(process: subprocess.Popen[str]) -> list[int]:
-    tasks = Path(f"/proc/{process.pid}/task")
-    return [int(word) for task in tasks.iterdir() for word in (task / "children").read_text().split()]
-
-
-def wait_until(process: subprocess.Popen[str], has_happened: Callable[[], bool]) -> None:
-    end = time.monotonic() + 120.0
-    while not has_happened():
-        assert process.poll() is None and time.monotonic() < end
-        time.sleep(0.002)
-
-
 def test_case_of_a_killed_worker_is_lost_alone_and_named_with_the_signal_and_resume_makes_it(
     tmp_path: Path, forty_cases: list[str]
 ) -> None:
     process = start(tmp_path)
     first_case = tmp_path / "out" / forty_cases[0]
     wait_until(process, first_case.exists)  # no kernel is built any more, whose file could be cut
-    (worker,) = children_of(process)
+    (worker,) = children_of(process.pid)
     os.kill(worker, signal.SIGKILL)
     _, errors = process.communicate(timeout=240)
 
@@ -98,8 +86,8 @@ def test_case_of_a_killed_worker_among_several_is_made_again_alone(tmp_path: Pat
     cases = ("first", "second", "third")
     write_manifest(tmp_path, dict.fromkeys(cases, "small"))
     process = start(tmp_path, "--workers", "2")
-    wait_until(process, lambda: len(children_of(process)) == 2)  # each has been given a case, and still starts
-    for worker in children_of(process):
+    wait_until(process, lambda: len(children_of(process.pid)) == 2)  # each has been given a case, and still starts
+    for worker in children_of(process.pid):
         os.kill(worker, signal.SIGKILL)
     process.communicate(timeout=240)
     assert process.returncode == 0

@@ -225,7 +225,9 @@ def two_layers(axis: int, first: int, low: float = 0.0, high: float = 900.0, cou
     [(1.5, 3, 1.0), (1.5, 4, np.nan), (4.5, 4, 1.0), (4.5, 3, np.nan)],
     ids=["rises in the next cell", "a cell further", "rose in the cell before", "a cell before that"],
 )
-def test_search_for_the_iso_surface_reaches_the_voxels_of_the_cell_and_of_its_neighbours(axis, along_axis, first, distance):
+def test_search_for_the_iso_surface_reaches_the_voxels_of_the_cell_and_of_its_neighbours(
+    axis, along_axis, first, distance
+):
     """In a flat cell the gradient is zero; the level lies half way to the voxels that differ."""
     volume = two_layers(axis, first)
     point = np.full((1, 3), 2.0)
