@@ -240,8 +240,8 @@ def table_of(figures: dict[str, Any], tilted: dict[str, Any]) -> str:
     """Return the table of one input; the last column is of the tilted phantom."""
     head = (
         "from a CT folder to an STL",
-        "seconds",
-        "memory",
+        "median time, s",
+        "peak memory",
         "closed",
         "in place",
         "inside out",
@@ -261,8 +261,8 @@ def table_of(figures: dict[str, Any], tilted: dict[str, Any]) -> str:
         ))  # fmt: skip
     machine = figures["machine"]
     load = machine["load_average"]
-    busy = "" if load is None else f", load average {load[1]:.1f} while it ran"
-    return f"{markdown_table(head, rows)}\n\n{machine['processor']}, {machine['cores']} cores{busy}."
+    busy = "" if load is None else f", load average {load[1]:.1f} during the runs"
+    return f"{markdown_table(head, rows)}\n\n{machine['processor']}, {machine['cores']} CPU cores{busy}."
 
 
 def _yes(value: bool) -> str:
