@@ -32,11 +32,11 @@ from clrecon.system.text import format_ml
 TISSUE_HU = -300
 """Cells with higher values are tissue: blankets and foam lie below this value, fat above it."""
 OPENING_MM = 7.0
-"""Half the thickness of plates that a morphological opening removes; table tops and shells are 2 to 12 mm thick."""
+"""Half the thickness of plates that a morphological opening removes; couch tops and shells are 2 to 12 mm thick."""
 THICK_MM = 11.0
 """A piece beside the body is kept if a circle of this radius fits into it (into a hand, not into a strap or edge)."""
 LONG_MM = 100.0
-"""Thin parts that are attached to the body are kept if they are shorter than this (an ear, not a table)."""
+"""Thin parts that are attached to the body are kept if they are shorter than this (an ear, not a couch)."""
 SMALL_MM2 = 2500.0
 """Enclosed regions of a slice up to this area are always filled: bowel gas, sinuses, the airways."""
 _LUNG_WALL, _AIR_WALL = 0.2, 0.7

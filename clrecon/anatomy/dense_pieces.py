@@ -114,9 +114,9 @@ _SOFT_PER_SOLID = 0.5
 _STRAIGHT_SHARE = 0.95
 """A column of cells belongs to a table when at least this share of it is dense enough."""
 STRAIGHT_MM = 60.0
-"""Tables are searched only in scans of at least this height; in shorter scans bones are as straight as a table."""
+"""Couches are searched only in scans of at least this height; in shorter scans bones are as straight as a couch."""
 UNIFORM_HU = 100.0
-"""Largest standard deviation of the HU along a table, due to noise and shadows; the cortex of a bone varies more."""
+"""Largest standard deviation of the HU along a couch, due to noise and shadows; the cortex of a bone varies more."""
 RAIL_MM = 10.0
 """Straight, uniform, hard pieces up to this thickness are rails or plates; shafts of long bones are thicker."""
 CABLE_MM, CABLE_ML = 5.0, 3.0

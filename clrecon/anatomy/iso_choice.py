@@ -170,7 +170,7 @@ def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float, float]:
 
 
 STREAKS_HU, FEWEST_METAL, METAL_SLICES, STREAKS_SPREAD = 3000, 20, 3, 0.7
-"""`FEWEST_METAL` voxels from `STREAKS_HU` on show metal, with streaks like bone up to `METAL_SLICES` slices away.
+"""`FEWEST_METAL` voxels of at least `STREAKS_HU` in a slice are metal; its streaks reach `METAL_SLICES` slices further.
 Streaks spread the levels of single edges: without metal slices the spread falls to `STREAKS_SPREAD` of it or less."""
 
 CONTRAST_SAID = 0.05

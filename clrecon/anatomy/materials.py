@@ -23,7 +23,7 @@ SAMPLED_VOXELS = 8_400_000
 """Approximate number of voxels that are examined: 32 slices of 512 x 512."""
 FEWEST_SLICES = 8
 LOWEST_HU, HIGHEST_HU = AIR_HU + 1, 3071
-"""Range of the histogram: from just above the padding to the end of the 12-bit scale."""
+"""Range of the histogram: from just above the padding (-1024 HU) to the end of the 12-bit scale."""
 SMOOTHING_HU = 8.0
 """Standard deviation of the Gaussian that smooths the histogram."""
 SOFT_TISSUE_HU = (-30, 150)

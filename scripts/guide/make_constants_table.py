@@ -29,9 +29,9 @@ HU = "values: only HU"
 SCALED = "values: scaled if they are not HU"
 WRITERS = "nothing: how programs round in files"
 LENGTHS = {
-    "anatomy/body.py": "voxel: a cell has at least one; otherwise chosen for adults and their tables",
-    "anatomy/body_cells.py": "voxel: a cell has at least one",
-    "anatomy/dense_pieces.py": "nothing: chosen for adults, their tables and cables",
+    "anatomy/body.py": "voxel: a cell has at least one voxel; otherwise chosen for adults",
+    "anatomy/body_cells.py": "voxel: a cell has at least one voxel",
+    "anatomy/dense_pieces.py": "nothing: chosen for adults and their equipment",
     "anatomy/head.py": "nothing: chosen for heads of people",
     "anatomy/spine_cells.py": ADULTS,
     "anatomy/spine_line.py": ADULTS,
@@ -40,7 +40,7 @@ LENGTHS = {
     "labels/contours.py": WRITERS,
     "labels/label_grids.py": WRITERS,
     "labels/segmentation.py": WRITERS,
-    "labels/structures.py": "voxel: step to the next slice; otherwise how programs round in files",
+    "labels/structures.py": "voxel: distance to the next slice; otherwise how programs round in files",
     "operators/masks/enclosed.py": "voxel: the ball of `--solid` has a radius of at most 8 steps; object: volume of the"
     " bone; otherwise chosen for marrow of adults",
     "operators/masks/regions.py": WRITERS,

@@ -202,7 +202,7 @@ def look_ahead(resident: DeviceVolume, slab: ray_slabs.RaySlab, ray: MainWay, le
 
 
 AIR_HU = kernel_number("rays/project.cl", "AIR_HU")
-"""Value that attenuates nothing; lower values are padding, or what a mask left."""
+"""Value (-1000 HU) that attenuates nothing; lower values are padding, or voxels that a mask removed."""
 
 PROJECTIONS = {
     mode: kernel_constant("rays/project.cl", macro)

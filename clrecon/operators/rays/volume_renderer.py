@@ -49,7 +49,7 @@ _MASKED_BY = ("field_of_view", "remove_table", "region", LEFT_OUT)
 """Entries of the report of a volume of which a part was turned into air, or left out."""
 
 AIR_ROOM_HU = 100.0
-"""Values less than this above the air that a mask leaves are of no interest in projections and slices."""
+"""Cameras of projections and slices fit the voxels at least this far above -1024 HU, the air of a mask."""
 
 
 def framing_key(volume: Volume, style: Style) -> tuple[object, ...]:

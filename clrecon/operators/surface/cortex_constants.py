@@ -35,7 +35,7 @@ MOST_WALLS, LOOKED_AT = 500, 4000
 
 LEAST_CONTRAST, LEAST_CORTEX_HU = 0.4, 350.0
 """Height and rise of a wall exceed this share of the 90th percentile of the heights of compact walls, or of all walls
-from `LEAST_CORTEX_HU` on; the shell of a table rises from air, but is low. Fewer than `_FEWEST_WALLS` show no bone."""
+from `LEAST_CORTEX_HU` on; the shell of a couch rises from air, but is low. Fewer than `_FEWEST_WALLS` show no bone."""
 
 _TRIMMED, _NARROW_SPREAD = 0.8, 0.02
 """Share of the profiles, those fitted best, by which blurs are compared: others touch a second bone or a vessel. Share
