@@ -1,7 +1,7 @@
-"""A cloud of points, cleaned.
+"""A point cloud, filtered.
 
-The voxels at the surface of all that has 200 HU and more, as points. Clusters by density tell the vertebrae from each
-other and from what lies beside them; the largest is kept, and of it one point in each cube of 2 mm.
+The points are the voxels at the surface of the region of 200 HU and more. Density-based clustering separates the
+vertebrae. The largest cluster is kept and thinned to one point in each cube of 2 mm.
 """
 
 import clrecon

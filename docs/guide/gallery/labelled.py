@@ -1,7 +1,7 @@
-"""Vertebrae by label, each in its colour.
+"""One mesh for each vertebra of a label map.
 
-The label selects the cells and HU place the vertices, so the meshes have no steps of the mask. The labels are those of
-the phantom; a map of another program is read in the same way.
+The label selects the cells and the HU place the vertices, so the meshes do not show the voxel steps of the label map.
+`clrecon.read_labels` reads label maps of other programs in the same way as that of the phantom.
 """
 
 import clrecon

@@ -1,7 +1,7 @@
 """One spine in four styles.
 
-The volume stays on the device, and each style is one call: bone by volume rendering, the lit surface, the brightest
-value along each ray, and a radiograph.
+The volume stays on the device. The four pictures are volume rendering with the preset "spine", a shaded surface, a
+maximum intensity projection, and a simulated radiograph.
 """
 
 import numpy as np

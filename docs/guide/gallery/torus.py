@@ -1,7 +1,7 @@
 """A torus, measured.
 
-A torus is sampled on voxels of 0.5 x 0.7 x 1.5 mm with a tilted gantry. Its surface is extracted at the half-way level
-and measured; its true volume is known.
+A torus is sampled on voxels of 0.7 x 0.5 x 1.5 mm with a gantry tilted by 12 degrees. The surface is extracted at the
+iso value half way between torus and background. Its volume is printed beside the true volume of the torus.
 """
 
 import clrecon
