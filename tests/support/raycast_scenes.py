@@ -30,6 +30,8 @@ STEPS = {
 }
 """Columns are the steps of i, j, k in mm."""
 
+GRIDS = (*STEPS, "uneven")
+
 GAPS = (1.0,) * 12 + (0.4,) * 6 + (1.9,) * 10 + (1.0,) * 9
 
 Field = Callable[[np.ndarray], np.ndarray]
@@ -40,10 +42,15 @@ def centre_of(volume: Volume) -> np.ndarray:
     return volume.ijk_to_lps([(np.array(volume.shape_ijk) - 1) / 2])[0]
 
 
-def fill(volume: Volume, field: Field, dtype: Any = np.float32) -> Volume:
+def positions(volume: Volume) -> np.ndarray:
+    """Voxel centres (nk, nj, ni, 3), mm from the centre of the volume."""
     k, j, i = np.indices(volume.voxels.shape).reshape(3, -1)
     points = volume.ijk_to_lps(np.stack([i, j, k], axis=1)) - centre_of(volume)
-    values = np.asarray(field(points), dtype=np.float64).reshape(volume.voxels.shape)
+    return points.reshape(*volume.voxels.shape, 3)
+
+
+def fill(volume: Volume, field: Field, dtype: Any = np.float32) -> Volume:
+    values = np.asarray(field(positions(volume).reshape(-1, 3)), dtype=np.float64).reshape(volume.voxels.shape)
     return volume.with_voxels(values.astype(dtype) if np.dtype(dtype).kind == "f" else np.rint(values).astype(dtype))
 
 
@@ -61,6 +68,7 @@ def uneven_volume(
     gaps: Sequence[float] = GAPS,
     sideways: float = 0.3,
     noise: float = 0.2,
+    dtype: Any = np.float32,
 ) -> Volume:
     """`field` in a turned stack whose slices lie unevenly, sheared along i and j, some `noise` mm beside a line."""
     heights = np.concatenate([[0.0], np.cumsum(gaps)])
@@ -70,7 +78,15 @@ def uneven_volume(
     affine = np.eye(4)
     affine[:3, :2] = TURN[:, :2] * (0.7, 0.8)
     affine[:3, 2], affine[:3, 3] = (table[-1] - table[0]) / len(gaps), table[0]
-    return fill(Volume(np.zeros((len(table), *shape), np.int8), affine, slice_positions=table), field)
+    return fill(Volume(np.zeros((len(table), *shape), np.int8), affine, slice_positions=table), field, dtype)
+
+
+def make_volume(field: Field, grid: str, extent: float = 22.0, dtype: Any = np.float32) -> Volume:
+    """`field` in a volume of about `extent` mm along each axis, of one of `GRIDS`."""
+    if grid != "uneven":
+        return even_volume(field, grid, extent, dtype)
+    gaps = np.resize((1.0, 1.0, 0.4, 0.4, 1.9, 1.0), int(extent))
+    return uneven_volume(field, (int(1.3 * extent / 0.8), int(extent / 0.7)), gaps, dtype=dtype)
 
 
 def ball(radius: float, ramp: float, inside: float = 1000.0, outside: float = -500.0) -> Field:
@@ -108,8 +124,8 @@ def look(
     volume: Volume,
     towards: Sequence[float],
     half_height: float,
-    up: Sequence[float] = (0.1, 0.2, 1.0),
     perspective: bool = False,
+    up: Sequence[float] = (0.1, 0.2, 1.0),
     distance: float = 200.0,
 ) -> Camera:
     """At the centre of a volume along a direction; `half_height` mm of it to the top of the picture."""

@@ -289,12 +289,10 @@ REAL_CANAL_MAX_MM = 4.0  # measured 1.6 and 2.7
 
 # --- operators: rays to surfaces and slices in space ---
 SLICE_EDGE_SHARE = 0.01  # of pixels: at edges of slices and at the lowest HU float32 takes the other side
-SLICE_DEPTH_MM = 1e-3  # depths of 150 mm in float32: 2e-5, over the cosine between ray and slice
+SLICE_DEPTH_MM = 1e-3  # depths of 200 mm in float32: 2e-5, over the cosine between ray and slice
 SURFACE_RAY_VOXEL = 0.1  # the bar; a ball of 7 mm sags h^2 / 8 R between voxels, more along grazing rays: measured 0.06
-SURFACE_LIGHT_255 = 6.0  # normals of a ball from differences over two voxels, of 255
 SURFACE_TWIN_SHARE = 0.01  # of pixels: outlines, and edges of shadows, that float32 puts on the other side
 SURFACE_TWIN_MM = 0.005  # a crossing is sought to 1e-3 of a step of up to 1.7 mm
-SURFACE_OUTLINE_SHARE = 0.02  # of pixels: at outlines triangles and the trilinear field between voxels part
 WINDOW_SHARE = 0.51 / 16384  # weights of 14 bits, rounded
 
 # --- points ---

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
-from ray_scenes import STEPS, centre_of, look, make_volume, positions, premultiplied
+from raycast_scenes import STEPS, centre_of, look, make_volume, positions, premultiplied
 
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
@@ -121,12 +121,12 @@ def test_labels_without_colours_keep_the_colour_of_the_picture(balls_side_by_sid
 
 
 def test_border_of_a_label_whose_neighbour_is_hidden_is_seen_head_on_half_way_between_their_voxels(device):
-    """Rays run along +y: label 2 begins half way between rows 9 and 10; the camera is 150 mm before row 11.5."""
+    """Rays run along +y: label 2 begins half way between rows 9 and 10; the camera is 200 mm before row 11.5."""
     volume, labels = two_blocks()
     options = label_options(labels, {"L1": "red", "L2": "blue"}, {"L1": 0.0})
     camera = look(volume, (0.0, 1.0, 0.0), 8.0)
     found = cast_labels(device, volume, camera, options, lighting=Lighting(0.2, 0.8, 0.0))
-    border = np.abs(found.depth - (150.0 + 9.5 - 11.5)) <= 0.5
+    border = np.abs(found.depth - (200.0 + 9.5 - 11.5)) <= 0.5
     assert border.sum() > 400  # measured 432
     inner = border.copy()  # two pixels from its edge
     for axis in (0, 1):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tolerances
-from ray_scenes import GRIDS, blobs, centre_of, look, make_volume, premultiplied
+from raycast_scenes import GRIDS, blobs, centre_of, look, make_volume, premultiplied
 from refusals import refused
 
 import clrecon
@@ -138,8 +138,8 @@ def test_the_front_slice_of_opaque_ones_hides_the_others(stair, from_side, front
 
 
 def test_depth_of_opaque_slices_is_that_of_the_front_one(stair):
-    """Slice 6 lies 5 mm above the middle, which is 150 mm away."""
-    assert stair("head", 3, opacity=1.0).depth == pytest.approx(np.full((8, 8), 150.0 - 5.0), abs=0.1)  # it leans
+    """Slice 6 lies 5 mm above the middle, which is 200 mm away."""
+    assert stair("head", 3, opacity=1.0).depth == pytest.approx(np.full((8, 8), 200.0 - 5.0), abs=0.1)  # it leans
 
 
 def test_slices_take_the_colours_of_a_transfer_function(device):
