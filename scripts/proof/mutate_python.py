@@ -6,11 +6,11 @@
 
 It needs the extras `test` and `mutation`.  A room is a folder of clrecon/ with its tests in the folder of that name in
 tests/ and those of ROOM_TESTS.  The changes are made in a private copy of the project.  The tests of a room are traced
-once; with --json the trace is kept beside FILE.  Each change is then tried with the tests that run the changed line,
-those of the files that import the changed one first, and of each file the shortest, until one fails.  Tests marked slow
-or fuzz are left out, and so are the last where all together would take more than a minute.  A change that no test
-notices survives, unless `equivalent_changes.json` says why it changes nothing.  A line that none of the tests runs is a
-survivor too.  Time is that of the processor: a busy machine makes no change look caught.
+once.  Each change is then tried with the tests that run the changed line, those of the files that import the changed
+one first, and of each file the shortest, until one fails.  Tests marked slow or fuzz are left out, and so are the last
+where all together would take more than a minute.  A change that no test notices survives, unless
+`equivalent_changes.json` says why it changes nothing.  A line that none of the tests runs is a survivor too.  Time is
+that of the processor: a busy machine makes no change look caught.
 
 With --resume, changes that FILE calls caught stay caught while their file is the same; survivors are tried again.
 The exit status is 1 if more than 5 % of the changes of a room survive.
@@ -19,6 +19,7 @@ The exit status is 1 if more than 5 % of the changes of a room survive.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import shutil
@@ -36,7 +37,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 
 from python_changes import Change, Equivalent, choose_changes, read_equivalents, statement_lines  # noqa: E402
-from room_traces import Digests, Imports, KeptTrace, Trace, digest  # noqa: E402
+from room_traces import Imports, Trace  # noqa: E402
 from warm_tests import PYTEST_OPTIONS, Run, WarmTests  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -118,29 +119,15 @@ class Copy:
             environment.pop(name, None)
         return environment
 
-    def trace(self, room: str, kept: Path | None = None) -> Trace:
+    def trace(self, room: str) -> Trace:
         """Run the tests of a room without a change, and see which lines they run.
-
-        Parameters
-        ----------
-        room : str
-        kept : Path, optional
-            File of an earlier trace: files of tests are traced again if they, or anything but tests, have changed.
 
         Raises
         ------
         BrokenRoomError
             There are none, one fails, or one fails in another order.
         """
-        tests = [f"tests/{room}", *ROOM_TESTS.get(room, ())]
-        now, earlier = Digests.of(self.root, self.package, tests), KeptTrace.read(kept)
-        trace, stale = earlier.still_good(now) if earlier else (None, tests)
-        if stale:
-            new = self._trace(room, stale if trace else tests)
-            trace = trace.joined(new) if trace else new
-        assert trace is not None
-        if kept is not None:
-            KeptTrace(now, trace).write(kept)
+        trace = self._trace(room, [f"tests/{room}", *ROOM_TESTS.get(room, ())])
         trace = replace(trace, imports=Imports.read(self.root, [self.package, "tests"]))
         self._check_order(room, trace)
         return trace
@@ -259,6 +246,11 @@ class RoomResult:
         )
 
 
+def digest(text: str) -> str:
+    """A short name of a text."""
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
 def room_texts(root: Path, package: str, room: str) -> dict[str, str]:
     """Read the files of a room: path below the root -> text."""
     files = sorted((root / package / room).rglob("*.py"))
@@ -273,7 +265,6 @@ def try_room(
     equivalents: Sequence[Equivalent] = (),
     known: Sequence[dict[str, Any]] = (),
     until: float = float("inf"),
-    kept: Path | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Try changes of a room one after the other.
 
@@ -288,8 +279,6 @@ def try_room(
         Earlier rows; what was caught then is not tried again while its file is the same.
     until : float
         Time of `time.monotonic` after which no change is begun.
-    kept : Path, optional
-        File of the trace, see `Copy.trace`.
 
     Yields
     ------
@@ -312,7 +301,7 @@ def try_room(
         elif found is not None:
             yield {**row, "outcome": found["outcome"], "tests": found["tests"]}
         elif time.monotonic() < until:
-            trace = trace or copy.trace(room, kept)
+            trace = trace or copy.trace(room)
             outcome, tests = copy.try_change(change, trace)
             yield {**row, "outcome": outcome, "tests": tests}
 
@@ -351,8 +340,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             result = RoomResult(room)
             results.append(result)
             changes = choose_changes(room_texts(copy.root, copy.package, room), options.changes, options.seed)
-            kept = options.json and options.json.with_name(f"{options.json.stem}-{room}-lines.json")
-            tried = try_room(copy, room, changes, equivalents=equivalents, known=known, until=until, kept=kept)
+            tried = try_room(copy, room, changes, equivalents=equivalents, known=known, until=until)
             try:
                 for row in tried:
                     result.rows.append(row)

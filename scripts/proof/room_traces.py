@@ -1,23 +1,15 @@
-"""Which tests of a room run which lines, kept from run to run, and which of them to try first.
-
-A trace is good for as long as the package, the kernels and the helpers of the tests are the same: then only files of
-tests that have changed are traced again.
-"""
+"""Which tests of a room run which lines, and which of them to try first."""
 
 from __future__ import annotations
 
 import ast
-import hashlib
-import json
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
-
-__all__ = ["Digests", "Imports", "KeptTrace", "Trace", "digest"]
 
 TIMES_PLAIN, AND_SECONDS = 4.0, 10.0
 """A change may make its tests this many times slower, and this much more; a change that takes longer is caught."""
@@ -25,11 +17,6 @@ MOST_SECONDS = 60.0
 """Traced seconds of the tests that a change is tried with."""
 FAR = 99
 """Steps to a file that no import leads to."""
-
-
-def digest(text: str) -> str:
-    """A short name of a text."""
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 class Imports:
@@ -107,13 +94,9 @@ class Trace:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Trace:
-        """The trace that the plugin has written, or `as_dict`."""
+        """The trace that the plugin has written."""
         lines = {file: {int(line): tests for line, tests in rows.items()} for file, rows in data["lines"].items()}
         return cls(lines, data["seconds"], data["start"], data["modules"])
-
-    def as_dict(self) -> dict[str, Any]:
-        """The trace as JSON, without the imports."""
-        return {"lines": self.lines, "seconds": self.seconds, "start": self.start, "modules": self.modules}
 
     def tests_of(self, file: str, lines: Sequence[int]) -> list[str]:
         """Tests that run one of the lines, and then the others of their files; as many as take MOST_SECONDS.
@@ -145,90 +128,7 @@ class Trace:
         """Processor time that these tests may take with a change, in seconds."""
         return TIMES_PLAIN * (self.start + sum(self.seconds[test] for test in tests)) + AND_SECONDS
 
-    def without(self, files: Iterable[str]) -> Trace:
-        """The trace without the tests of some files."""
-        gone = set(files)
-        lines: dict[str, dict[int, list[str]]] = {}
-        for file, rows in self.lines.items():
-            left = {line: [test for test in tests if file_of(test) not in gone] for line, tests in rows.items()}
-            # A line without tests is one of an import.
-            lines[file] = {line: tests for line, tests in left.items() if tests or not rows[line]}
-        seconds = {test: value for test, value in self.seconds.items() if file_of(test) not in gone}
-        return replace(self, lines=lines, seconds=seconds)
-
-    def joined(self, other: Trace) -> Trace:
-        """The trace with that of other tests."""
-        lines = {file: dict(rows) for file, rows in self.lines.items()}
-        for file, rows in other.lines.items():
-            mine = lines.setdefault(file, {})
-            for line, tests in rows.items():
-                mine[line] = sorted({*mine.get(line, ()), *tests})
-        modules = list(dict.fromkeys([*self.modules, *other.modules]))
-        start = max(self.start, other.start)
-        return replace(self, lines=lines, seconds={**self.seconds, **other.seconds}, start=start, modules=modules)
-
 
 def file_of(test: str) -> str:
     """The file of a test."""
     return test.partition("[")[0].partition("::")[0]
-
-
-@dataclass(frozen=True)
-class Digests:
-    """What a trace depends on.
-
-    Attributes
-    ----------
-    base : str
-        Of the package, the kernels and the helpers of the tests.
-    tests : dict
-        File of tests -> digest of its text.
-    """
-
-    base: str
-    tests: dict[str, str]
-
-    @classmethod
-    def of(cls, root: Path, package: str, tests: Sequence[str]) -> Digests:
-        """Read them; `tests` are folders and files below the root."""
-        folders = [root / package, root / "cl", root / "tests" / "support"]
-        paths = [
-            path for folder in folders for path in sorted(folder.rglob("*")) if path.suffix in (".py", ".cl", ".h")
-        ]
-        paths += [path for path in (root / "tests" / "conftest.py", root / "pyproject.toml") if path.exists()]
-        base = digest("".join(f"{path.relative_to(root)}\0{path.read_text(encoding='utf-8')}\0" for path in paths))
-        found = [
-            path
-            for name in tests
-            for path in ((root / name).rglob("test_*.py") if (root / name).is_dir() else [root / name])
-        ]
-        return cls(base, {path.relative_to(root).as_posix(): digest(path.read_text("utf-8")) for path in sorted(found)})
-
-
-@dataclass(frozen=True)
-class KeptTrace:
-    """A trace in a file, and what it depends on."""
-
-    digests: Digests
-    trace: Trace
-
-    @classmethod
-    def read(cls, path: Path | None) -> KeptTrace | None:
-        """Read one; None without a file."""
-        if path is None or not path.exists():
-            return None
-        data = json.loads(path.read_text(encoding="utf-8"))
-        return cls(Digests(**data["digests"]), Trace.from_json(data["trace"]))
-
-    def write(self, path: Path) -> None:
-        """Write it."""
-        data = {"digests": asdict(self.digests), "trace": self.trace.as_dict()}
-        path.write_text(json.dumps(data) + "\n", encoding="utf-8")
-
-    def still_good(self, now: Digests) -> tuple[Trace | None, list[str]]:
-        """What of it is good, and the files of tests that are to be traced."""
-        if now.base != self.digests.base:
-            return None, list(now.tests)
-        before = self.digests.tests
-        changed = [file for file, text in now.tests.items() if before.get(file) != text]
-        return self.trace.without({*changed, *(before.keys() - now.tests.keys())}), changed

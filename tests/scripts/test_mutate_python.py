@@ -29,7 +29,7 @@ from python_changes import (
     statement_lines,
 )
 from refusals import refused
-from room_traces import FAR, Digests, Imports, KeptTrace, Trace
+from room_traces import FAR, Imports, Trace
 from traced_tests import Caches
 from warm_tests import Run, WarmTests
 
@@ -217,36 +217,6 @@ def test_tests_whose_imports_are_nearer_to_the_changed_file_run_first_and_those_
     assert trace.tests_of("toy/deep.py", [1]) == [near, far, apart, f"{near}_too", f"{far}_too"]
 
 
-@pytest.mark.release
-def test_kept_trace_is_used_again_and_only_changed_tests_are_traced_anew(
-    copy: Copy, trace: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    traced: list[list[str]] = []
-    plain = Copy._trace
-    monkeypatch.setattr(
-        Copy, "_trace", lambda self, room, tests: traced.append(list(tests)) or plain(self, room, tests)
-    )
-    kept, more = tmp_path / "kept.json", copy.root / "tests" / "flat" / "test_more.py"
-    first = copy.trace("flat", kept)
-    assert (first.lines, first.seconds.keys()) == (trace.lines, trace.seconds.keys())
-    again = copy.trace("flat", kept)
-    assert (again.lines, again.seconds, again.modules) == (first.lines, first.seconds, first.modules)
-    assert traced == [["tests/flat"]]
-    more.write_text("from toy.flat.shapes import untested\n\n\ndef test_more():\n    assert untested(1)\n")
-    both = copy.trace("flat", kept)
-    assert traced.pop() == ["tests/flat/test_more.py"]
-    assert both.lines[MINUS.file][MINUS.line] == ["tests/flat/test_more.py::test_more"]
-    assert both.lines[TIMES.file][TIMES.line] == first.lines[TIMES.file][TIMES.line]
-    assert both.seconds.keys() - first.seconds.keys() == {"tests/flat/test_more.py::test_more"}
-    more.unlink()
-    left = copy.trace("flat", kept)
-    assert left.seconds == first.seconds and left.tests_of(MINUS.file, [MINUS.line]) == []
-    assert traced == [["tests/flat"]]
-    found = KeptTrace.read(kept)
-    assert found is not None
-    assert found.still_good(Digests("of another package", found.digests.tests)) == (None, [*found.digests.tests])
-
-
 def test_caches_of_modules_of_a_folder_are_emptied_also_when_frozen(tmp_path: Path) -> None:
     gc.freeze()
     try:
@@ -343,7 +313,7 @@ def test_rows_are_kept_and_equivalent_changes_are_named(
     copy: Copy, trace: Trace, project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried: list[Change] = []
-    monkeypatch.setattr(Copy, "trace", lambda self, room, kept: trace)
+    monkeypatch.setattr(Copy, "trace", lambda self, room: trace)
     monkeypatch.setattr(Copy, "try_change", lambda self, one, trace: tried.append(one) or ("caught", 1))
     same = [Equivalent(EQUAL.file, EQUAL.before, EQUAL.after, "n never falls below 0")]
     first = list(try_room(copy, "flat", [TIMES, EQUAL, MINUS], equivalents=same))
