@@ -65,7 +65,7 @@ def even_volume(field: Field, steps: str, extent: float, dtype: Any = np.float32
 def uneven_volume(
     field: Field,
     shape: tuple[int, int] = (66, 52),
-    gaps: Sequence[float] = GAPS,
+    gaps: Sequence[float] | np.ndarray = GAPS,
     sideways: float = 0.3,
     noise: float = 0.2,
     dtype: Any = np.float32,
