@@ -55,7 +55,8 @@ def accuracy_table() -> str:
             errors = (errors_of_rule(phantoms, rule) for rule in RULES)
             cells = [f"{mean:.2f}, {worst:.2f}, {_percent(lost)}" for mean, worst, lost in errors]
             rows.append([f"{group}{title}", len(phantoms), *cells])
-    return markdown_table(["phantoms with a known surface", "number", *RULES.values()], rows)
+    titles = (f"{title}: mean mm, worst mm, lost" for title in RULES.values())
+    return markdown_table(["phantoms with a known surface", "number", *titles], rows)
 
 
 def errors_of_rule(phantoms: Sequence[dict[str, Any]], rule: str) -> tuple[float, float, float]:
@@ -85,27 +86,25 @@ def matrix_table(text: str) -> str:
         cells = [f"{wrong} of {cases}, {refused} refused" for cases, wrong, refused in (own, *dict(others).values())]
         peers = "; ".join(f"{reader} {cell}" for (reader, _), cell in zip(others, cells[1:], strict=True))
         rows.append([title, cells[0], peers])
-    return markdown_table(["files", "wrong by clrecon", "wrong by other readers with their defaults"], rows)
+    return markdown_table(["files", "read wrongly by clrecon", "read wrongly by others with their defaults"], rows)
 
 
 def checks_table(checks: dict[str, Any]) -> str:
     """Return what tests and self-test noticed of faults that were made on purpose."""
     fuzz, kernels, python = checks["fuzz"], checks["kernels"], checks["python"]
     rows: list[Sequence[object]] = [
-        ["damaged input", f"{fuzz['cases']:,}", f"{fuzz['faults']:,} faults (crash, hang, silent difference)"],
-        ["changed kernels", f"{kernels['tried']:,} of {kernels['changes']:,}", _noticed(kernels, "the self-test")],
+        ["damaged input", f"{fuzz['cases']:,}", f"{fuzz['faults']:,} faults (crash, hang, silently wrong result)"],
+        ["kernel changes tried", f"{kernels['tried']:,} of {kernels['changes']:,}", _noticed(kernels, "the self-test")],
         *(
-            [f"changed code, `clrecon/{room}`", f"{counts['tried']:,}", _noticed(counts, "the tests")]
+            [f"code changes tried in `clrecon/{room}`", f"{counts['tried']:,}", _noticed(counts, "the tests")]
             for room, counts in sorted(python.items())
         ),
     ]
-    return markdown_table(["what was done", "cases", "what came of it"], rows)
+    return markdown_table(["test", "cases", "result"], rows)
 
 
 def _noticed(counts: dict[str, int], by: str) -> str:
-    return (
-        f"{counts['caught']:,} noticed by {by}, {counts['equivalent']:,} change no result, {counts['missed']:,} missed"
-    )
+    return f"{counts['caught']:,} noticed by {by}, {counts['equivalent']:,} without effect, {counts['missed']:,} missed"
 
 
 def device_table() -> str:

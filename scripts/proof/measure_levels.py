@@ -299,14 +299,15 @@ def error_table(bodies: dict[str, Sequence[dict[str, Any]]]) -> str:
             within = [fit["within_196_errors"] for fit in fits]
             means = [np.mean([fit["within_error"] for fit in fits]), np.mean(within), min(within)]
             rows.append((seed, title, len(fits), *(f"{100.0 * share:.0f} %" for share in means)))
-    head = ("seed", "phantoms", "number", "within 1 stated error", "within 1.96", "worst phantom within 1.96")
+    head = ("seed", "phantoms", "number", "within 1 estimated error", "within 1.96 estimated errors",
+            "within 1.96 in the worst phantom")  # fmt: skip
     return markdown_table(head, rows)
 
 
 def summary_table(figures: Sequence[dict[str, Any]]) -> str:
     """Return the table over all phantoms."""
-    head = ("level", "mean distance, mm", "worst phantom, mm", "lost", "worst phantom", "within 0.5 mm",
-            "spread over ten scans of one body, mm")  # fmt: skip
+    head = ("level", "mean distance, mm", "in the worst phantom, mm", "lost", "lost in the worst phantom",
+            "within 0.5 mm", "standard deviation over ten scans of one body, mm")  # fmt: skip
     rows = []
     for rule, row in summarise(figures).items():
         rows.append((
@@ -323,8 +324,8 @@ def _number(value: Any) -> str:
 
 def scan_table(figures: Sequence[dict[str, Any]]) -> str:
     """Return the table of scans."""
-    head = ("scan", "auto, HU", "halves; every other slice", "volume at 200 HU, auto", "pieces at 200 HU, auto",
-            "surface moves (median)")  # fmt: skip
+    head = ("scan", "auto, HU", "auto in each half; in every second slice, HU", "volume at 200 HU; at auto",
+            "components at 200 HU; at auto", "distance of the two surfaces (median)")  # fmt: skip
     rows: list[tuple[str, ...]] = []
     for one in figures:
         if "refused" in one:
@@ -337,8 +338,8 @@ def scan_table(figures: Sequence[dict[str, Any]]) -> str:
         rows.append((
             f"{one['name']}, {' x '.join(map(str, one['shape_ijk']))}, {one['spacing_mm'][2]:.3g} mm",
             _number(one["auto"]["level_hu"]), f"{', '.join(parts[:2])}; {parts[-1]}",
-            ", ".join("none" if v is None else f"{v:,.0f} ml" for v in volumes),
-            ", ".join("none" if v is None else f"{v:,}" for v in pieces),
+            "; ".join("none" if v is None else f"{v:,.0f} ml" for v in volumes),
+            "; ".join("none" if v is None else f"{v:,}" for v in pieces),
             "" if moved is None else f"{moved:.2f} mm",
         ))  # fmt: skip
     return markdown_table(head, rows)
@@ -348,7 +349,7 @@ def tables() -> dict[str, str]:
     """Return all tables of docs/iso_value.md by the names of their markers."""
     phantoms, scans = (json.loads((FIGURES / f"{name}.json").read_text("utf-8")) for name in ("phantoms", "scans"))
     others = {path.stem.removeprefix("phantoms_"): path for path in sorted(FIGURES.glob("phantoms_*.json"))}
-    bodies = {"of the tables": phantoms, **{seed: json.loads(path.read_text("utf-8")) for seed, path in others.items()}}
+    bodies = {"default": phantoms, **{seed: json.loads(path.read_text("utf-8")) for seed, path in others.items()}}
     return {
         "levels of phantoms": phantom_table(phantoms),
         "stated errors": error_table(bodies),

@@ -186,7 +186,7 @@ def make_table(figures: list[dict[str, Any]]) -> str:
             for one in (pair[rule] for rule in RULES)
         ]
         rows.append([pair["one"], pair["other"], *cells, f"{100.0 * pair['fitted']['within_196_errors']:.0f} %"])
-    return markdown_table(["one", "other", *RULES.values(), "within 1.96 stated errors"], rows)
+    return markdown_table(["first", "second", *RULES.values(), "within 1.96 estimated errors"], rows)
 
 
 def main() -> None:

@@ -45,7 +45,7 @@ def blank(ds: Any) -> None:
 
 LOST, BLANK = "a slice in the middle is missing", "a slice in the middle is blank"
 DAMAGES: dict[str, Callable[[Any], None]] = {
-    "sound": lambda ds: None,
+    "undamaged": lambda ds: None,
     "no slope and intercept": without_rescale,
     "intercept + 1024": rescale(intercept=1024.0),
     "intercept - 1024": rescale(intercept=-1024.0),
@@ -59,7 +59,7 @@ DAMAGES: dict[str, Callable[[Any], None]] = {
 
 KNOWN, SCALE, BOTH, REFUSED, WARNED = "hu_known", "hu_scale", "hu_known, hu_scale", "refused", "warned"
 SAID = {
-    "sound": (SCALE, KNOWN, "", "", "", ""),
+    "undamaged": (SCALE, KNOWN, "", "", "", ""),
     "no slope and intercept": (KNOWN, KNOWN, BOTH, BOTH, BOTH, BOTH),
     "intercept + 1024": (SCALE, KNOWN, SCALE, SCALE, SCALE, SCALE),
     "intercept - 1024": (SCALE, KNOWN, SCALE, SCALE, SCALE, SCALE),

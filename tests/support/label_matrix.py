@@ -187,11 +187,11 @@ add_text(
     "NRRD, quantised", "a.nrrd", b"encoding: raw", b"encoding: raw\nold min: 0", WARNED, "the values were quantised"
 )
 add_text(
-    ".nhdr, voxels out of its folder", "a.nhdr", b": a.raw", b": ../a.raw", REFUSED, "only files beside it are read"
+    ".nhdr, voxels in another folder", "a.nhdr", b": a.raw", b": ../a.raw", REFUSED, "only files beside it are read"
 )
 add_text(".nhdr, voxels missing", "a.nhdr", b": a.raw", b": b.raw", REFUSED, "which is not there")
 add_text(
-    ".nhdr, a file a slice", "a.nhdr", b": a.raw", b": a.%02d.raw 0 3 1", REFUSED, "has its voxels in several files"
+    ".nhdr, one file per slice", "a.nhdr", b": a.raw", b": a.%02d.raw 0 3 1", REFUSED, "has its voxels in several files"
 )
 add_text("MetaImage without Offset", "a.mha", b"Offset", b"Comment", REFUSED, "it does not say where it lies")
 add_text("MetaImage, spacing 0", "a.mha", b"ElementSpacing = 0.7", b"ElementSpacing = 0", REFUSED, "steps above 0 mm")
@@ -199,8 +199,8 @@ add_text(
     "MetaImage, two positions", "a.mha", b"Offset", b"Origin = 0 0 0\nOffset", REFUSED, "it says Offset and Origin"
 )
 add_text("MetaImage, text", "a.mha", b"BinaryData = True", b"BinaryData = False", REFUSED, "voxels written as text")
-add_text(".mhd, voxels out of its folder", "a.mhd", b"= a.raw", b"= ../a.raw", REFUSED, "only files beside it are read")
-add_text(".mhd, a file a slice", "a.mhd", b"= a.raw", b"= LIST", REFUSED, "LOCAL or one file, not several")
+add_text(".mhd, voxels in another folder", "a.mhd", b"= a.raw", b"= ../a.raw", REFUSED, "only files beside it are read")
+add_text(".mhd, one file per slice", "a.mhd", b"= a.raw", b"= LIST", REFUSED, "LOCAL or one file, not several")
 
 
 def add_layers(
@@ -223,10 +223,10 @@ def segment(n: int, **keys: Any) -> dict[str, str]:
 LAYERED = [segment(n, LabelValue=1, Layer=n) for n in (0, 1)]
 add_layers("layers", EXACT, "", *LAYERED)
 add_layers("layers that overlap", REFUSED, "share 1 voxels", *LAYERED, overlap=True)
-add_layers("layers that overlap, one asked for", EXACT, "", *LAYERED, overlap=True, only=["s0"])
+add_layers("layers that overlap, only one read", EXACT, "", *LAYERED, overlap=True, only=["s0"])
 add_layers("layers of 3D Slicer before 4.11", WARNED, "segment n is taken from layer n", segment(0), segment(1))
-add_layers("layers that no segment names", REFUSED, "have no Layer", *(segment(n, LabelValue=1) for n in (0, 1)))
-add_layers("values that no segment names", REFUSED, "have no LabelValue", *(segment(n, Layer=n) for n in (0, 1)))
+add_layers("layers to which no segment refers", REFUSED, "have no Layer", *(segment(n, LabelValue=1) for n in (0, 1)))
+add_layers("values to which no segment refers", REFUSED, "have no LabelValue", *(segment(n, Layer=n) for n in (0, 1)))
 add_layers("a layer that is not there", REFUSED, "is in layer 2", LAYERED[0], segment(1, LabelValue=1, Layer=2))
 add_layers("layers without segments", REFUSED, "does not say which segments they hold")
 
@@ -330,7 +330,7 @@ add_seg(
 add_seg(
     "fractional", REFUSED, "fractional ones do not say", change=lambda ds: setattr(ds, "SegmentationType", "FRACTIONAL")
 )
-add_seg("frames that are not described", REFUSED, "frames and", change=lambda ds: setattr(ds, "NumberOfFrames", 3))
+add_seg("frames without a description", REFUSED, "frames and", change=lambda ds: setattr(ds, "NumberOfFrames", 3))
 
 # --- RTSTRUCT ------------------------------------------------------------------------------------------------------
 
@@ -453,6 +453,6 @@ def link_out(masks: Path) -> None:
     (masks / "c.nii").symlink_to(path)
 
 
-add_folder("a link out of it", REFUSED, "is a link out of it (c.nii)", last=link_out)
+add_folder("a link to another folder", REFUSED, "is a link out of it (c.nii)", last=link_out)
 add_folder("a mask without voxels", WARNED, "1 of 3 masks holds no voxel: c",
            last=lambda path: write_nifti(path / "c.nii", np.zeros((4, 6, 7), np.uint8), STRAIGHT))  # fmt: skip

@@ -62,7 +62,7 @@ def add_byte_cases() -> None:
         change=lambda ds, k: setattr(ds, "Columns", ds.Columns - 1),
     )
     add_simple(
-        "zeros behind the pixels",
+        "zeros after the pixel data",
         WARNED,
         ("the rest is zeros, taken as padding",),
         harmless=True,
@@ -71,7 +71,7 @@ def add_byte_cases() -> None:
     media: dict[str, Any] = {"last": True, "plan": {"name": "IM{:04d}".format}}
     _spoiled("the last slice empty, no suffix", lambda file: os.truncate(file, 0), "but empty", **media)
     _spoiled(
-        "the last slice without its mark, no suffix",
+        "the last slice without the letters DICM, no suffix",
         lambda file: damage(file, 128, b"DIXM"),
         "DICOM by its header, but without the mark at byte 128",
         **media,

@@ -63,8 +63,8 @@ _simple("sagittal", plan={"angles": (0, 90, 90)})
 _simple("coronal", plan={"angles": (-90, 0, 0)})
 _simple("feet first", plan={"angles": (0, 180, 0)}, change=set_values(PatientPosition="FFS"))
 _simple("prone", plan={"angles": (0, 0, 180)}, change=set_values(PatientPosition="HFP"))
-_simple("normal to the feet", plan={"angles": (180, 0, 0)})
-_simple("names in reverse, InstanceNumber that lies", plan={"name": lambda k: f"{900 - k}"}, change=(
+_simple("slice normal towards the feet", plan={"angles": (180, 0, 0)})
+_simple("file names in reverse order, wrong InstanceNumber", plan={"name": lambda k: f"{900 - k}"}, change=(
     lambda ds, k: setattr(ds, "InstanceNumber", (7 * k) % 23)
 ))  # fmt: skip
 for degrees in (1.0, 2.5, 12.0, -20.0):
@@ -160,7 +160,7 @@ def _localizer(folder: Path, size: Size) -> Marks:
     return write_slices(folder, plan_for(size))
 
 
-@_case("localizer that does not say so", WARNED, ("1 other CT series not used",))
+@_case("localizer not marked as a localizer", WARNED, ("1 other CT series not used",))
 def _silent_localizer(folder: Path, size: Size) -> Marks:
     scout = plan_for(Size(1, size.rows, size.columns), angles=(0, 90, 90), first_hu=FOREIGN_HU)
     write_slices(folder, scout, _another_image(), "scout")

@@ -65,7 +65,7 @@ def add_mixture_cases() -> None:
     _interleaved("two acquisition dates", "AcquisitionDate", "20200101", "20200102")
     _interleaved("two content times", "ContentTime", "101500", "103000")
     _interleaved("before and after contrast agent", "ContrastBolusAgent", None, "IODINE")
-    _interleaved("an AcquisitionNumber and none", "AcquisitionNumber", None, 2)
+    _interleaved("AcquisitionNumber only in every second slice", "AcquisitionNumber", None, 2)
     _interleaved("two acquisition numbers", "AcquisitionNumber", 1, 2)
-    name = "two volumes that only their pixels tell apart, interleaved"
+    name = "two volumes that differ only in their pixels, interleaved"
     add_case(name, WARNED, ("maybe two volumes between each other",))(_write_moved)

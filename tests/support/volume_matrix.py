@@ -96,7 +96,7 @@ def _list_exports() -> Iterator[Export]:
     sheared, far = only("axes at right angles", ".mha"), only("numbers of single precision", ".nii", ".nii.gz")
     yield of_plan("axial, non-square pixels", Plan(shape=SHAPE))
     yield of_plan("oblique", Plan(shape=SHAPE, angles=OBLIQUE))
-    yield of_plan("normal to the feet", Plan(shape=SHAPE, angles=(180, 0, 0)))
+    yield of_plan("slice normal towards the feet", Plan(shape=SHAPE, angles=(180, 0, 0)))
     yield of_plan("sagittal", Plan(shape=SHAPE, angles=(-90, 0, 90)))
     yield of_plan("tilt 12 deg", Plan(shape=SHAPE, tilt_deg=12.0), refused=sheared)
     yield of_plan("tilt -20 deg, oblique", Plan(shape=SHAPE, tilt_deg=-20.0, angles=OBLIQUE), refused=sheared)
