@@ -9,8 +9,8 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.cli.mesh import describe_volume
 from clrecon.errors import PARTLY_DONE, UsageError
+from clrecon.exchange.content import describe_volume
 from clrecon.proof.compare.methods import COMPARED, CompareSettings
 
 

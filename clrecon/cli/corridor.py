@@ -8,8 +8,8 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.cli.mesh import describe_volume
 from clrecon.errors import PARTLY_DONE
+from clrecon.exchange.content import describe_volume
 from clrecon.jobs.outputs import MESH_FILES, MeshFiles, name_outputs
 from clrecon.jobs.settings import CorridorSettings
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
+from clrecon.exchange.content import describe_volume
 from clrecon.jobs.mesh.purposes import settings_for
 from clrecon.jobs.mesh.settings import GATE_FAILED, SCAN_GATE_FAILED, LabelChoice, MeshSettings, is_label_seed
 from clrecon.jobs.mesh.surfaces import VALUE_GATES, names_level
@@ -215,22 +216,6 @@ def _describe_costs(volume: dict[str, Any]) -> str:
         return "a level in HU, which these values are not; --hu auto measures the level of bone"
     fine = min(volume.get("spacing_mm") or (1.0,)) < FINE_MM
     return "in soft tissue about a voxel outside of the bone; --hu auto lies closer" if fine else WHAT_BONE_COSTS
-
-
-def describe_volume(volume: dict[str, Any]) -> str:
-    """Describe the input in one line, from the certificate of a report."""
-    parts = []
-    if volume.get("shape_ijk"):
-        ni, nj, nk = volume["shape_ijk"]
-        parts.append(f"{count_of(nk, 'slice')} of {ni} x {nj}")
-    if volume.get("spacing_mm"):
-        di, dj, dk = volume["spacing_mm"]
-        gaps = volume["gap_mm"]
-        along = f", uneven gaps of {gaps['min']:.4g} to {gaps['max']:.4g}" if volume["uneven"] else f" x {dk:.4g}"
-        parts.append(f"spacing {di:.4g} x {dj:.4g}{along} mm")
-    if volume.get("tilt_deg") and abs(volume["tilt_deg"]) >= 0.05:
-        parts.append(f"tilt {volume['tilt_deg']:+.2f} degrees")
-    return ", ".join(parts)
 
 
 def _describe_parts(meshes: list[dict[str, Any]]) -> list[str]:

@@ -12,9 +12,9 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.cli.mesh import describe_volume
 from clrecon.cli.view import draw_view
 from clrecon.errors import UsageError
+from clrecon.exchange.content import describe_volume
 from clrecon.jobs.inputs import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_only_mesh
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.options import InputSettings, preset_option

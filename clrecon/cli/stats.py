@@ -10,7 +10,7 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, is_terminal, printable
-from clrecon.cli.mesh import describe_volume
+from clrecon.exchange.content import describe_volume
 from clrecon.jobs.settings import StatsSettings
 
 _EPILOG = """\

@@ -7,7 +7,7 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.cli.mesh import describe_volume
+from clrecon.exchange.content import describe_volume
 from clrecon.jobs.settings import VertebraeSettings
 from clrecon.system.text import count_of
 

@@ -27,7 +27,12 @@ SETTLED = "return clrecon.facts && clrecon.facts.settled && clrecon.pictures > 0
 @contextmanager
 def serve_scene(device: Any) -> Iterator[WebServer]:
     """Serve a scan and a mesh."""
-    objects = show_objects([scenes.make_scan(), scenes.make_mesh()])
+    scan = scenes.make_scan()
+    scan.report["gates"] = [
+        {"name": "spacing", "ok": False, "text": "gaps of 1 to 3 mm"},
+        {"name": "units", "ok": True},
+    ]
+    objects = show_objects([scan, scenes.make_mesh()])
     objects[1] = dataclasses.replace(objects[1], said=("a ball of triangles",))
     with (
         Painter(objects, device=device) as painter,

@@ -157,10 +157,17 @@ class ViewModel(ChangingView):
         """Show a mode; slices that are edge-on as the camera stands are looked at as `clrecon.render` does."""
         if name not in self.modes:
             raise UsageError(unknown_name("mode", name, self.modes))
+        self._change("mode", f"the mode {self.state.mode}", **self._fields_of(name))
+
+    def in_mode(self, name: str) -> ViewState:
+        """Return the state as it would be after `set_mode`."""
+        return replace(self.state, **self._fields_of(name))
+
+    def _fields_of(self, mode: str) -> dict[str, Any]:
         camera = self.camera
-        if self._is_edge_on(self.modes[name]):
+        if self._is_edge_on(self.modes[mode]):
             camera = self._fitted(default_view("slices", self.scans[0].volume))
-        self._change("mode", f"the mode {self.state.mode}", mode=name, picture_window=None, camera=camera)
+        return {"mode": mode, "picture_window": None, "camera": camera}
 
     def _is_edge_on(self, mode: ViewMode) -> bool:
         """Tell whether slices in space would not be seen: the camera looks along them."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from clrecon.errors import UsageError
+from clrecon.exchange.content import certificate_lines, describe_volume
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels import LabelMap
@@ -80,6 +81,10 @@ class ShownObject:
         raise NotImplementedError
 
 
+_SAMPLED_SLICES, _BARS = 16, 100
+"""Of the histogram of a scan."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShownScan(ShownObject):
     """A scan: shown as a surface, by volume rendering, as a projection or in slices."""
@@ -90,6 +95,20 @@ class ShownScan(ShownObject):
     @property
     def corners(self) -> Float64Array:
         return box_corners(self.volume)
+
+    def describe(self, low: float, high: float) -> dict[str, Any]:
+        """Return what a page says of a scan: size, gates, certificate, and the histogram between two HU."""
+        report, voxels = self.volume.report, self.volume.voxels
+        judged = [gate["ok"] for gate in report.get("gates") or () if gate["ok"] is not None]
+        sample = voxels[:: max(1, len(voxels) // _SAMPLED_SLICES), ::4, ::4]
+        return {
+            "name": self.name,
+            "words": describe_volume(report),
+            "position": report.get("patient_position"),
+            "gates": [sum(judged), len(judged)],
+            "certificate": certificate_lines(report),
+            "counts": np.histogram(sample, bins=_BARS, range=(low, high))[0].tolist(),
+        }
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -194,8 +194,13 @@ def draw_thumbnail(volume: Volume) -> str:
     grey = np.clip((layer - low) * (255.0 / (high - low)), 0.0, 255.0).astype(np.uint8)
     mm = np.linalg.norm(volume.affine[:3, :2], axis=0) * volume.shape_ijk[:2]
     size = np.maximum(1, np.rint(_THUMBNAIL * mm / mm.max())).astype(int)
+    return to_address(Image.fromarray(grey).resize((int(size[0]), int(size[1]))))
+
+
+def to_address(image: Any) -> str:
+    """Return a picture of Pillow as an address with its data."""
     stream = io.BytesIO()
-    Image.fromarray(grey).resize((int(size[0]), int(size[1]))).save(stream, "JPEG", quality=80)
+    image.save(stream, "JPEG", quality=80)
     return "data:image/jpeg;base64," + b64encode(stream.getvalue()).decode("ascii")
 
 

@@ -58,6 +58,7 @@ _SCALE_STEPS = 64
 _MANY_TRIANGLES = 2_000_000
 """Triangles of a mesh above which it is said that pictures take their time."""
 
+_THUMBNAIL = (128, 96)
 _WORDS = {
     "prepare": "building kernels",
     "parts": "finding parts",
@@ -65,6 +66,7 @@ _WORDS = {
     "fit": "fitting the surface to the bone",
     "spine": "finding the spine",
     "coarse": "making coarse meshes",
+    "thumbnails": "drawing thumbnails",
     "save": "writing",
 }
 
@@ -187,6 +189,17 @@ class ViewSession(Closing):
         self._pictures.ask(
             "curve", lambda job: then(self.painter.curve_picture(state, checked)), rank=2, gives_way=False
         )
+
+    def draw_modes(self, then: Callable[[str, Rendering], None]) -> None:
+        """Draw a small picture in each mode in the background; `then` gets it with the name of the mode."""
+        with self._lock:
+            states = {name: self.model.in_mode(name) for name in self.model.modes}
+
+        def draw(job: Job) -> None:
+            for name, state in states.items():
+                then(name, self.painter.picture(state, _THUMBNAIL, cancelled=job.cancelled))
+
+        self._work.ask("thumbnails", draw, rank=4)
 
     def prepare(self) -> None:
         """Build the kernels that are needed soon, and the coarse meshes, in the background."""

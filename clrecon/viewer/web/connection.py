@@ -16,6 +16,7 @@ import shutil
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -30,6 +31,7 @@ from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.viewer.drawing.saving import KINDS, free_name
 from clrecon.viewer.model.state import SCENE, SLICES, VIEWS, ViewState
+from clrecon.viewer.session.choices import to_address
 from clrecon.viewer.session.commands import page_words
 from clrecon.viewer.session.session import REST_SECONDS
 
@@ -262,10 +264,15 @@ class Connection:
         """Serve the browser until it leaves."""
         from aiohttp import WSMsgType
 
-        has_scan = bool(self._session.model.scans)
-        kinds = [kind for kind in ("mesh", "cloud", "volume", "picture", "view") if has_scan or kind != "volume"]
-        fixed = {**page_words(), "formats": {kind: list(KINDS[kind]) for kind in kinds}, "save_as": self._save_as}
-        fixed["has_start"] = self.has_start
+        model = self._session.model
+        kinds = [kind for kind in ("mesh", "cloud", "volume", "picture", "view") if model.scans or kind != "volume"]
+        fixed = {
+            **page_words(),
+            "formats": {kind: list(KINDS[kind]) for kind in kinds},
+            "save_as": self._save_as,
+            "has_start": self.has_start,
+            "scans": [scan.describe(*model.iso_range) for scan in model.scans],
+        }
         await self._socket.send_str(json.dumps({"fixed": fixed}))
         tasks = [asyncio.ensure_future(work()) for work in (self._write, self._command)]
         try:
@@ -317,6 +324,8 @@ class Connection:
             self._lay_out(message.get("sizes"), message.get("ground"))
         elif kind == "quit":
             self._quit()
+        elif kind == "thumbnails":
+            self._session.draw_modes(self._send_thumbnail)
         elif kind == "link":
             self._say(link=self.link(self.state))
         elif kind in ("command", "save"):
@@ -405,6 +414,12 @@ class Connection:
         if len(self._notes) < _MOST_WAITING:
             self._notes.append(note)
         self._wake.set()
+
+    def _send_thumbnail(self, mode: str, picture: Rendering) -> None:
+        from PIL import Image
+
+        address = to_address(Image.fromarray(_lay_over(picture.image, (0, 0, 0))))
+        self._later(partial(self._say, thumbnail={"mode": mode, "address": address}))
 
     def _hear(self) -> None:
         """Take the news of the session: work began or ended, parts were found, something failed."""

@@ -5,7 +5,7 @@
   const CROSS_PIXELS = 11, GAP = 7, INSET = 32;  // of the cross in the picture, around its middle, of its ends from the border
   const TURN_DEGREES = 5;  // of the cross by a key
 
-  let fixed = null, facts = null, choosing = "", chosen = "", curveOff = false, pictures = 0, asked = false, held = 0;
+  let fixed = null, facts = null, choosing = "", chosen = "", curveOff = false, pictures = 0, asked = false, held = 0, pictured = false;
   let full = "", probed = null, seen = null;
   const message = find("message");
 
@@ -33,12 +33,13 @@
     if (told.probe) { probed = told.probe; for (const view of Object.values(views)) if (view.pointer) annotate(view); }
     if (told.undone !== undefined) hint(told.undone ? `Taken back: ${told.undone}.` : "There is nothing to take back.");
     if (told.link !== undefined) copyLink(told.link);
+    if (told.thumbnail) showThumbnail(told.thumbnail);
     if (told.saved) fetchSaved(told.saved);
     if (told.written !== undefined) find("saved").textContent = told.written;
   };
 
   function hint(text, wrong = false) {
-    find("hint").textContent = text;
+    find("hint").textContent = find("hint").title = text;
     find("hint").classList.toggle("wrong", wrong);
   }
 
@@ -158,7 +159,7 @@
 
   function showTools() {
     for (const [id, name] of Object.entries(TOOLS)) find(id).setAttribute("aria-pressed", String(choosing === name));
-    find("end").hidden = !choosing;
+    find("end").setAttribute("aria-pressed", String(!choosing));
     for (const view of Object.values(views)) view.box.classList.toggle("picks", choosing !== "");
   }
 
@@ -167,6 +168,7 @@
   function takeFixed(now) {
     fixed = now;
     find("another").hidden = !now.has_start;
+    showScans();
     const kinds = now.save_as.length ? { "--save-as": [""], ...now.formats } : now.formats;
     find("format").replaceChildren(...Object.entries(kinds).map(([kind, endings]) => {
       const group = element("optgroup", "", { label: kind });
@@ -189,6 +191,25 @@
     }));
   }
 
+  // The scan, without the name of a patient: its size, a chip for its gates that opens the certificate, its histogram.
+  function showScans() {
+    const [scan, ...more] = fixed.scans;
+    if (!scan) return;
+    find("title").textContent = [scan.words, scan.position, more.length && `and ${more.length} more`].filter(Boolean).join(" \u00b7 ");
+    const [passed, judged] = scan.gates, words = passed === judged ? `geometry: ${judged} gates passed` : `${judged - passed} of ${judged} gates failed`;
+    const chip = element("button", words, { type: "button", className: passed === judged ? "good" : "wrong",
+      title: "the certificate of the scan", onclick: () => find("certificate").showModal() });
+    find("chips").replaceChildren(...(judged ? [chip] : []));
+    find("certificate").firstElementChild.replaceChildren(...fixed.scans.flatMap(({ name, certificate }) => [
+      element("h2", name), ...certificate.map((line) => element("p", line)),
+    ]));
+    const most = Math.log(1 + Math.max(...scan.counts)), path = document.createElementNS(SVG, "path");
+    const tops = scan.counts.map((count, n) => `V${1 - Math.log(1 + count) / most}H${n + 1}`);
+    path.setAttribute("d", `M0 1${tops.join("")}V1z`);
+    find("counts").setAttribute("viewBox", `0 0 ${scan.counts.length} 1`);
+    find("counts").replaceChildren(path);
+  }
+
   // Facts: what the panels show.
 
   function takeFacts(now) {
@@ -197,12 +218,15 @@
     const told = (name) => !before || JSON.stringify(before[name]) !== JSON.stringify(now[name]);
     if (now.tool !== choosing && !["only", "hide"].includes(choosing)) choosing = now.tool || "";
     for (const id of ["iso", "tabled", "layouts", "spine", "windows"]) find(id).hidden = !now.iso;
-    find("mode").hidden = now.modes.length < 2;
+    find("modes").hidden = find("modewords").hidden = now.modes.length < 2;
     if (told("iso") && now.iso) showIso();
-    if (told("modes")) {
-      find("mode").replaceChildren(...now.modes.map(({ name, words }) => element("option", `${name}: ${words}`, { value: name })));
+    if (told("modes")) showModes();
+    for (const button of find("modes").children) button.setAttribute("aria-pressed", String(button.dataset.mode === now.mode));
+    find("modewords").textContent = now.modes.find(({ name }) => name === now.mode).words;
+    if (now.settled && now.iso && now.modes.length > 1 && !pictured) {
+      pictured = true;
+      tell("thumbnails");
     }
-    find("mode").value = now.mode;
     find("table").checked = now.table;
     find("fitting").hidden = now.fitted === null;
     find("fitted").checked = Boolean(now.fitted);
@@ -238,13 +262,27 @@
     if (now.busy.length && !pictures) message.textContent = now.busy.join(", ");
   }
 
+  function showModes() {
+    find("modes").replaceChildren(...facts.modes.map(({ name, words }) => {
+      const button = element("button", "", { type: "button", title: words, onclick: () => run("set_mode", { name }) });
+      button.dataset.mode = name;
+      button.append(element("div"), element("span", name));  // room for the thumbnail: nothing moves when it comes
+      return button;
+    }));
+  }
+
+  function showThumbnail({ mode, address }) {
+    const button = [...find("modes").children].find(({ dataset }) => dataset.mode === mode);
+    if (button) button.firstChild.replaceChildren(element("img", "", { src: address, alt: "" }));
+  }
+
   function showIso() {
     for (const id of ["hu", "exact"]) {
       const input = find(id);
       if (held === input || document.activeElement === find("exact") && id === "exact") continue;
       Object.assign(input, { min: Math.ceil(facts.iso.low), max: Math.floor(facts.iso.high), value: Math.round(facts.iso.hu) });
     }
-    const { low, high } = facts.iso, step = roundLength((high - low) / Math.max(1, find("marks").clientWidth / 110)), marks = [];
+    const { low, high } = facts.iso, step = roundLength((high - low) / Math.max(1, find("marks").clientWidth / 60)), marks = [];
     for (let hu = Math.ceil(low / step) * step; hu <= high; hu += step) marks.push(hu);
     find("marks").replaceChildren(...marks.map((hu) => {
       const mark = element("span", String(hu).replace("-", "\u2212"));
@@ -385,8 +423,8 @@
 
   function showAbout() {
     const lines = facts.objects.flatMap(({ name, said }) => [name, ...said]);
-    find("about").replaceChildren(...[...facts.notes, ...lines, ...facts.warnings.filter((text) => !lines.includes(text)),
-      "Not a medical device."].map((text) => element("p", text)));
+    find("about").replaceChildren(...[...facts.notes, ...lines, ...facts.warnings.filter((text) => !lines.includes(text))]
+      .map((text) => element("p", text)));
   }
 
   // Saving: the file is made by the program and then fetched by its ticket.
@@ -448,12 +486,11 @@
   find("straighten").onclick = () => run("straighten");
   find("spine").onclick = () => run("find_spine");
   for (const button of find("layouts").children) button.onclick = () => run("set_layout", { name: button.dataset.layout });
-  find("mode").onchange = () => run("set_mode", { name: find("mode").value });
   find("table").onchange = () => run("set_table", { shown: find("table").checked });
   find("fitted").onchange = () => run("set_fitted", { shown: find("fitted").checked });
   find("shade").onchange = () => run("set_color_by", { name: find("shade").value || null });
   find("perspective").onchange = () => run("set_perspective", { on: find("perspective").checked });
-  find("iso").addEventListener("wheel", (event) => {
+  find("hu").addEventListener("wheel", (event) => {
     event.preventDefault();
     const by = -Math.sign(event.deltaY) * fixed.iso_step;
     gather("step_iso", (old) => ({ do: "step_iso", more: { by: by + (old ? old.more.by : 0) } }));
@@ -472,7 +509,7 @@
   find("undo").onclick = () => run("undo");
   find("another").onclick = () => { location.search += "&start"; };
   find("help").onclick = () => find("keys").showModal();
-  find("closekeys").onclick = () => find("keys").close();
+  for (const name of ["keys", "certificate"]) find(`close${name}`).onclick = () => find(name).close();
 
   // The view that the Tab key went to, else the one under the pointer.
   const aimed = () => Object.values(views).find(({ box }) => box.matches(":focus-visible"))
@@ -523,7 +560,7 @@
   }
 
   document.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || !facts || find("keys").open) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || !facts || document.querySelector("dialog[open]")) return;
     const { tagName, type } = event.target, isRange = type === "range";
     if (/^(SELECT|INPUT)$/.test(tagName) && !isRange && type !== "checkbox") return;
     if (isRange && event.key.startsWith("Arrow")) return;

@@ -36,7 +36,7 @@ CURVE = (
 )
 
 CONTROLS = {
-    "#mode": Control("f.mode === 'mip'", chosen="mip"),
+    "#modes [data-mode='mip']": Control("f.mode === 'mip'"),
     "#table": Control("!f.table", before=(SURFACE, ("set_table", {"shown": True}))),
     "#perspective": Control("!f.camera.parallel"),
     "#fitted": Control("f.fitted", before=(SURFACE, ("set_fitted", {"shown": False}))),
@@ -47,6 +47,8 @@ CONTROLS = {
     "#undo": Control("f.layout === '1'", before=(("set_layout", {"name": "1"}), ("set_layout", {"name": "4"}))),
     "#help": Control("document.getElementById('keys').open"),
     "#closekeys": Control("!document.getElementById('keys').open"),
+    "#chips button": Control("document.getElementById('certificate').innerText.includes('gaps of 1 to 3 mm')"),
+    "#closecertificate": Control("!document.getElementById('certificate').open"),
     "#views [title='left']": Control("f.camera.position[0] > f.bounds[1][0]"),
     "#distance": Control("f.tool === 'distance'"),
     "#angle": Control("f.tool === 'angle'"),
@@ -127,8 +129,7 @@ def test_control_of_the_page_does_what_it_says(page, place: str, control: Contro
 
 def test_table_of_controls_has_each_of_the_page(page) -> None:
     on_page = page.execute_script(
-        "return [...document.querySelectorAll('fieldset button[id], fieldset input[id], fieldset select[id],"
-        " #iso input, dialog button')].map((one) => one.id)"
+        "return [...document.querySelectorAll('button[id], input[id], select[id]')].map((one) => one.id)"
     )
 
     assert {f"#{name}" for name in on_page if name not in OF_OTHER_TESTS} - set(CONTROLS) == set()

@@ -239,7 +239,7 @@ def test_scale_of_thickness_goes_with_the_fitted_surface(page) -> None:
 
 
 def test_projection_offers_no_fitted_surface(page) -> None:
-    page.find_element("css selector", "#mode option[value=drr]").click()
+    page.find_element("css selector", "#modes [data-mode=drr]").click()
 
     assert wait_for(page, "return document.getElementById('fitting').hidden")
 
@@ -303,6 +303,29 @@ def test_drag_to_the_side_with_the_right_button_widens_the_window_and_leaves_its
 
 
 # What is said
+
+
+def test_thumbnails_show_what_their_modes_draw(page) -> None:
+    modes = [mode["name"] for mode in facts(page)["modes"]]
+    brightest = (
+        "return Object.fromEntries([...document.querySelectorAll('#modes img')].map((one) => {"
+        "  const pen = Object.assign(document.createElement('canvas'), { width: 128, height: 96 }).getContext('2d');"
+        "  pen.drawImage(one, 0, 0);"
+        "  const colors = pen.getImageData(0, 0, 128, 96).data.filter((_, n) => n % 4 < 3);"
+        "  return [one.closest('button').dataset.mode, Math.max(...colors)];"
+        "}))"
+    )
+
+    wait_for(page, f"return document.querySelectorAll('#modes img').length === {len(modes)}")
+    wait_for(page, "return [...document.querySelectorAll('#modes img')].every((one) => one.complete)")
+    levels = page.execute_script(brightest)
+
+    assert set(levels) == set(modes)
+    assert min(levels[name] for name in ("surface", "bone", "mip", "drr")) > 60  # of 255; balls of 1000 HU on black
+
+
+def test_chip_of_the_header_says_how_many_gates_failed(page) -> None:
+    assert page.find_element("id", "chips").text == "1 of 2 gates failed"  # those of serve_scene
 
 
 def test_page_shows_the_description_of_its_objects(page) -> None:
