@@ -159,7 +159,7 @@ class ViewModel(ChangingView):
             raise UsageError(unknown_name("mode", name, self.modes))
         self._change("mode", f"the mode {self.state.mode}", **self._fields_of(name))
 
-    def in_mode(self, name: str) -> ViewState:
+    def state_in(self, name: str) -> ViewState:
         """Return the state as it would be after `set_mode`."""
         return replace(self.state, **self._fields_of(name))
 

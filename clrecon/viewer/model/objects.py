@@ -96,7 +96,7 @@ class ShownScan(ShownObject):
     def corners(self) -> Float64Array:
         return box_corners(self.volume)
 
-    def describe(self, low: float, high: float) -> dict[str, Any]:
+    def describe_scan(self, low: float, high: float) -> dict[str, Any]:
         """Return what a page says of a scan: size, gates, certificate, and the histogram between two HU."""
         report, voxels = self.volume.report, self.volume.voxels
         judged = [gate["ok"] for gate in report.get("gates") or () if gate["ok"] is not None]

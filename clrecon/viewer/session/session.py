@@ -193,13 +193,13 @@ class ViewSession(Closing):
     def draw_modes(self, then: Callable[[str, Rendering], None]) -> None:
         """Draw a small picture in each mode in the background; `then` gets it with the name of the mode."""
         with self._lock:
-            states = {name: self.model.in_mode(name) for name in self.model.modes}
+            states = {name: self.model.state_in(name) for name in self.model.modes}
 
-        def draw(job: Job) -> None:
+        def draw_thumbnails(job: Job) -> None:
             for name, state in states.items():
                 then(name, self.painter.picture(state, _THUMBNAIL, cancelled=job.cancelled))
 
-        self._work.ask("thumbnails", draw, rank=4)
+        self._work.ask("thumbnails", draw_thumbnails, rank=4)
 
     def prepare(self) -> None:
         """Build the kernels that are needed soon, and the coarse meshes, in the background."""

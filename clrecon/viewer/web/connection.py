@@ -271,7 +271,7 @@ class Connection:
             "formats": {kind: list(KINDS[kind]) for kind in kinds},
             "save_as": self._save_as,
             "has_start": self.has_start,
-            "scans": [scan.describe(*model.iso_range) for scan in model.scans],
+            "scans": [scan.describe_scan(*model.iso_range) for scan in model.scans],
         }
         await self._socket.send_str(json.dumps({"fixed": fixed}))
         tasks = [asyncio.ensure_future(work()) for work in (self._write, self._command)]
