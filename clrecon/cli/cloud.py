@@ -8,9 +8,9 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.exchange.content import describe_volume
 from clrecon.jobs.cloud.settings import STEPS, CloudSettings, Clustering
 from clrecon.jobs.inputs import CLOUD_INPUTS
+from clrecon.system.records import describe_volume
 from clrecon.system.text import count_of, format_band
 
 _EXAMPLES = """\

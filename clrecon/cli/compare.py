@@ -10,8 +10,8 @@ from typing import Any
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.errors import PARTLY_DONE, UsageError
-from clrecon.exchange.content import describe_volume
 from clrecon.proof.compare.methods import COMPARED, CompareSettings
+from clrecon.system.records import describe_volume
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

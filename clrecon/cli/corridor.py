@@ -9,9 +9,9 @@ from typing import Any
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.errors import PARTLY_DONE
-from clrecon.exchange.content import describe_volume
 from clrecon.jobs.outputs import MESH_FILES, MeshFiles, name_outputs
 from clrecon.jobs.settings import CorridorSettings
+from clrecon.system.records import describe_volume
 
 _EPILOG = """\
 For each side of a vertebra: the straight line whose least distance to the outside of the solid bone is largest, from

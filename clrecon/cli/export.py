@@ -7,8 +7,8 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.exchange.content import describe_volume
 from clrecon.jobs.settings import ExportSettings
+from clrecon.system.records import describe_volume
 
 _PARTS = ("read", "mask", "resample", "write")
 _EPILOG = """\

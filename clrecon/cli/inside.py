@@ -8,9 +8,9 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.exchange.content import describe_volume
 from clrecon.jobs.outputs import MESH_FILES, name_outputs
 from clrecon.jobs.settings import InsideSettings
+from clrecon.system.records import describe_volume
 from clrecon.system.text import format_volume
 
 _EPILOG = """\

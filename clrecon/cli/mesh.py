@@ -8,12 +8,12 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.exchange.content import describe_volume
 from clrecon.jobs.mesh.purposes import settings_for
 from clrecon.jobs.mesh.settings import GATE_FAILED, SCAN_GATE_FAILED, LabelChoice, MeshSettings, is_label_seed
 from clrecon.jobs.mesh.surfaces import VALUE_GATES, names_level
 from clrecon.jobs.outputs import MESH_FILES, name_outputs
 from clrecon.jobs.presets import PRESETS
+from clrecon.system.records import describe_volume
 from clrecon.system.text import count_of, format_digits, format_ml, format_volume
 
 _PARTS = (

@@ -14,7 +14,6 @@ from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.view import draw_view
 from clrecon.errors import UsageError
-from clrecon.exchange.content import describe_volume
 from clrecon.jobs.inputs import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_only_mesh
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.options import InputSettings, preset_option
@@ -37,6 +36,7 @@ from clrecon.jobs.render.settings import (
 from clrecon.jobs.view import ViewSettings
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.options import numbers_reader, option, options_of
+from clrecon.system.records import describe_volume
 from clrecon.system.text import count_of
 
 _LABELS_LISTED = 24

@@ -10,8 +10,8 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, is_terminal, printable
-from clrecon.exchange.content import describe_volume
 from clrecon.jobs.settings import StatsSettings
+from clrecon.system.records import describe_volume
 
 _EPILOG = """\
 Each voxel counts with its own volume, also in unevenly spaced slices. A label map on another grid is resampled to the

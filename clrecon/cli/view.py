@@ -10,11 +10,10 @@ from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import add_labels, add_levels, mesh_fields
 from clrecon.errors import UsageError
-from clrecon.exchange.content import describe_volume
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.options import size_option, space_option
 from clrecon.jobs.view import ViewSettings
-from clrecon.system.records import name_schema
+from clrecon.system.records import describe_volume, name_schema
 from clrecon.system.text import format_volume
 
 _EPILOG = """\

@@ -22,7 +22,6 @@ from clrecon.exchange.page_slices import PackedSlices
 from clrecon.geometry import frame_from_lps
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.pieces import chunks, side_by_side
-from clrecon.system.text import count_of
 
 LINE_LENGTH = 256
 """Longest line.  Readers of PLY keep comments in buffers of fixed size; a widely used one has 1024 bytes."""
@@ -48,22 +47,6 @@ def certificate_lines(report: Mapping[str, Any], *, keep_ids: bool = False) -> t
     They are printable ASCII, at most `LINE_LENGTH`, without ``=``: readers look for ``SPACE=`` anywhere.
     """
     return tuple(_plain(line) for line in (*_facts(report, keep_ids), *_faults(report)))
-
-
-def describe_volume(volume: Mapping[str, Any]) -> str:
-    """Describe a volume in one line, from its report."""
-    parts = []
-    if volume.get("shape_ijk"):
-        ni, nj, nk = volume["shape_ijk"]
-        parts.append(f"{count_of(nk, 'slice')} of {ni} x {nj}")
-    if volume.get("spacing_mm"):
-        di, dj, dk = volume["spacing_mm"]
-        gaps = volume["gap_mm"]
-        along = f", uneven gaps of {gaps['min']:.4g} to {gaps['max']:.4g}" if volume["uneven"] else f" x {dk:.4g}"
-        parts.append(f"spacing {di:.4g} x {dj:.4g}{along} mm")
-    if volume.get("tilt_deg") and abs(volume["tilt_deg"]) >= 0.05:
-        parts.append(f"tilt {volume['tilt_deg']:+.2f} degrees")
-    return ", ".join(parts)
 
 
 def plain_lines(lines: Iterable[object]) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar, NoReturn, TypeVar
 
 from clrecon.system.light_dataclass import dataclass, fields, replace
+from clrecon.system.text import count_of
 
 Own = TypeVar("Own", bound="Record")
 
@@ -113,3 +114,19 @@ def unmeasured(name: str, bound: float | bool, unit: str | None, why: str) -> Ga
 def failed_gates(gates: Iterable[Mapping[str, Any]]) -> list[str]:
     """Return one line for each gate that was measured and not kept."""
     return [f"gate {gate['name']} failed: {gate['text']}" for gate in gates if gate["ok"] is False]
+
+
+def describe_volume(volume: Mapping[str, Any]) -> str:
+    """Describe a volume in one line, from its report."""
+    parts = []
+    if volume.get("shape_ijk"):
+        ni, nj, nk = volume["shape_ijk"]
+        parts.append(f"{count_of(nk, 'slice')} of {ni} x {nj}")
+    if volume.get("spacing_mm"):
+        di, dj, dk = volume["spacing_mm"]
+        gaps = volume["gap_mm"]
+        along = f", uneven gaps of {gaps['min']:.4g} to {gaps['max']:.4g}" if volume["uneven"] else f" x {dk:.4g}"
+        parts.append(f"spacing {di:.4g} x {dj:.4g}{along} mm")
+    if volume.get("tilt_deg") and abs(volume["tilt_deg"]) >= 0.05:
+        parts.append(f"tilt {volume['tilt_deg']:+.2f} degrees")
+    return ", ".join(parts)

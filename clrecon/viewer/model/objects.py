@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from clrecon.errors import UsageError
-from clrecon.exchange.content import certificate_lines, describe_volume
+from clrecon.exchange.content import certificate_lines
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels import LabelMap
@@ -22,6 +22,7 @@ from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.views.camera import box_corners
 from clrecon.rendering.views.directions import as_point
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.records import describe_volume
 from clrecon.viewer.model.state import ShownPart
 
 if TYPE_CHECKING:
